@@ -265,12 +265,12 @@ def write_report(analysis: Analysis, path: Pathlike) -> Path:
     from px4fuse.results.build import results  # noqa: PLC0415
     from px4fuse.results.contract import to_json  # noqa: PLC0415
 
-    target = _require_suffix(path, ".pdf")
+    report_path = _require_suffix(path, ".pdf")
     serialisable_results = results(_require_request(analysis), analysis)
     results_json = to_json(serialisable_results)
     pdf = render_pdf(analysis, serialisable_results, results_json)
-    write_output_files({target: pdf, target.with_suffix(".json"): results_json.encode()})
-    return target
+    write_output_files({report_path: pdf, report_path.with_suffix(".json"): results_json.encode()})
+    return report_path
 
 
 def write_page(analysis: Analysis, path: Pathlike) -> Path:
@@ -285,10 +285,10 @@ def write_page(analysis: Analysis, path: Pathlike) -> Path:
     """
     from px4fuse.explore.page import make_analysis_page  # noqa: PLC0415 - slow import
 
-    target = _require_suffix(path, ".html")
+    page_path = _require_suffix(path, ".html")
     _require_request(analysis)
-    write_output_files({target: make_analysis_page(analysis).encode()})
-    return target
+    write_output_files({page_path: make_analysis_page(analysis).encode()})
+    return page_path
 
 
 @display_html.register
@@ -299,12 +299,12 @@ def _display_card(analysis: Analysis) -> str | None:
 
 
 def _require_suffix(path: Pathlike, suffix: str) -> Path:
-    target = Path(path)
-    if target.suffix.lower() != suffix:
+    output_path = Path(path)
+    if output_path.suffix.lower() != suffix:
         raise OutputError(
-            f"{target}: the name does not end in {suffix}. Give a name ending in {suffix}."
+            f"{output_path}: the name does not end in {suffix}. Give a name ending in {suffix}."
         )
-    return target
+    return output_path
 
 
 def _require_request(analysis: Analysis) -> request.ComparisonRequest:

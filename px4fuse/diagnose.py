@@ -113,26 +113,28 @@ def _refine_clock_offset(flight: Flight, analysis: Analysis) -> Flight | None:
     The offset from reading the file is relative to EKF2's positions, which may be late. Return None
     if there is no such offset, or if it agrees with the IMU.
     """
-    alignment, clock = analysis.source.alignment, analysis.clock
+    alignment, clock_offset = analysis.source.alignment, analysis.clock
     if (
         alignment is None
         or alignment.clock_offset_sigma_s is None
         or alignment.reference != "EKF2 position"
-        or not isinstance(clock, ClockOffset)
+        or not isinstance(clock_offset, ClockOffset)
         or all(finding.id != "source_time_offset" for finding in analysis.findings)
         or any(CONVENTION_KEY in finding.evidence for finding in analysis.findings)
     ):
         return None
-    delay_text = f"{abs(clock.offset_s):.3f} s {'late' if clock.offset_s < 0 else 'early'}"
+    delay_text = (
+        f"{abs(clock_offset.offset_s):.3f} s {'late' if clock_offset.offset_s < 0 else 'early'}"
+    )
     alignment = structs.replace(
         alignment,
-        clock_offset_s=alignment.clock_offset_s + clock.offset_s,
-        clock_offset_sigma_s=clock.sigma_s,
+        clock_offset_s=alignment.clock_offset_s + clock_offset.offset_s,
+        clock_offset_sigma_s=clock_offset.sigma_s,
         clock_reason=f"the offset was estimated with the IMU, because EKF2's position is "
         f"{delay_text} relative to the IMU",
     )
     file_track, *other_tracks = flight.positions
-    shifted_track = replace(shift_clock(file_track, clock.offset_s), alignment=alignment)
+    shifted_track = replace(shift_clock(file_track, clock_offset.offset_s), alignment=alignment)
     return replace(flight, positions=(shifted_track, *other_tracks))
 
 
@@ -177,16 +179,20 @@ def find_faults(comparison: Comparison, progress: Progress = ignore_progress) ->
     return replace(analysis, findings=find(analysis))
 
 
-def refine_delay(comparison: Comparison, clock: ClockOffset | Unavailable) -> Comparison:
-    """Replace the detected delay of the position timestamps by the more precise estimate ``clock``.
+def refine_delay(comparison: Comparison, clock_offset: ClockOffset | Unavailable) -> Comparison:
+    """Replace the detected delay of the position timestamps by the more precise ``clock_offset``.
 
     Only the reported delay changes. KF is not run again: :func:`prepare` has already corrected the
-    detected delay, and re-runs test the rest, ``clock.remaining_s``.
+    detected delay, and re-runs test the rest, ``clock_offset.remaining_s``.
     """
-    if comparison.convention is None or isinstance(clock, Unavailable) or not clock.is_determinable:
+    if (
+        comparison.convention is None
+        or isinstance(clock_offset, Unavailable)
+        or not clock_offset.is_determinable
+    ):
         return comparison
     # a time offset is negative for late timestamps
-    refined_convention = structs.replace(comparison.convention, late_s=-clock.offset_s)
+    refined_convention = structs.replace(comparison.convention, late_s=-clock_offset.offset_s)
     # If the refined delay is too small to be a fault, report the detected delay, because the
     # positions were corrected by it
     is_fault = all(
@@ -246,23 +252,25 @@ def prepare_comparison(
     # read_flight has already corrected the time offset of a position file
     if request.clock_offset_s != AUTO or request.position is not None:
         return prepared_comparison
-    _, clock = estimate_noises_and_clock(prepared_comparison, progress)
-    if isinstance(clock, Unavailable) or not clock.is_determinable:
+    _, clock_offset = estimate_noises_and_clock(prepared_comparison, progress)
+    if isinstance(clock_offset, Unavailable) or not clock_offset.is_determinable:
         raise MissingDataError(
             f"{flight.log.name}: the time offset cannot be estimated from this flight "
-            f"({clock.reason}).",
+            f"({clock_offset.reason}).",
             "State the offset (--clock-offset SECONDS), or omit --clock-offset.",
         )
-    if not clock.is_significant(clock.remaining_s):
-        low, high = (limit_s - clock.applied_s for limit_s in clock.interval_s)
-        note = (
-            f"--clock-offset auto: the time offset {clock.remaining_s:+.3f} s (95 % {low:+.3f} to "
-            f"{high:+.3f} s) is not significant and was not applied"
+    if not clock_offset.is_significant(clock_offset.remaining_s):
+        low_offset_s, high_offset_s = (
+            limit_s - clock_offset.applied_s for limit_s in clock_offset.interval_s
         )
-        if clock.applied_s:
-            note += f". The timestamps were already corrected by {clock.applied_s:+.3f} s"
+        note = (
+            f"--clock-offset auto: the time offset {clock_offset.remaining_s:+.3f} s (95 % "
+            f"{low_offset_s:+.3f} to {high_offset_s:+.3f} s) is not significant and was not applied"
+        )
+        if clock_offset.applied_s:
+            note += f". The timestamps were already corrected by {clock_offset.applied_s:+.3f} s"
         return replace(prepared_comparison, notes=(*prepared_comparison.notes, note))
-    request = structs.replace(request, clock_offset_s=clock.offset_s)
+    request = structs.replace(request, clock_offset_s=clock_offset.offset_s)
     return prepare(flight, request, keep_positions_as_sent=keep_positions_as_sent)
 
 
@@ -360,13 +368,13 @@ def run_what_if(
         if is_default_change:
             raise
     if comparison is not None:
-        tuning, clock = estimate_noises_and_clock(comparison, progress)
+        tuning, clock_offset = estimate_noises_and_clock(comparison, progress)
         estimated_settings = estimate_wrong_settings(comparison, tuning)
         explanation_by_axis = explain_ekf2_difference(
-            comparison, ekf2_model, clock, estimated_settings
+            comparison, ekf2_model, clock_offset, estimated_settings
         )
         if is_default_change:
-            changes = estimate_ekf2_parameters(comparison, ekf2_model, tuning, clock)
+            changes = estimate_ekf2_parameters(comparison, ekf2_model, tuning, clock_offset)
     parameter_sets = [changes] if changes or request.without else []
     parameter_sets += [changes | values for values in swept_settings]
     progress("replaying EKF2 with other parameters")

@@ -350,8 +350,8 @@ def format_settings_suffix(request: ComparisonRequest | EvaluationRequest | Loop
     """
     name_suffix = ""
     for option, value in _list_changed_options(request.with_file_names()):
-        text = PurePath(value).stem if option == "--position" and value is not None else value
-        name_suffix += f"_{option[2:]}" + ("" if text is None else f"-{text}")
+        value_text = PurePath(value).stem if option == "--position" and value is not None else value
+        name_suffix += f"_{option[2:]}" + ("" if value_text is None else f"-{value_text}")
     return re.sub(r"[^\w.,+-]+", "-", name_suffix)
 
 
@@ -362,10 +362,10 @@ def _list_changed_options(request: msgspec.Struct) -> Iterator[tuple[str, str | 
         value = getattr(request, field.name)
         if field.name not in option_names or value == field.default:
             continue
-        values = value if field.name in ("axes", "closures", "rpe") else (value,)
-        for single_value in values:
-            text = None if isinstance(single_value, bool) else _format_value(single_value)
-            yield option_names[field.name], text
+        option_values = value if field.name in ("axes", "closures", "rpe") else (value,)
+        for single_value in option_values:
+            value_text = None if isinstance(single_value, bool) else _format_value(single_value)
+            yield option_names[field.name], value_text
     if (position := getattr(request, "position", None)) is not None:
         yield from _list_changed_options(position)
 

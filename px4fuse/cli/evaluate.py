@@ -122,10 +122,10 @@ def evaluate(
             time_offset_s=request.time_offset_s,
         )
         results = make_evaluation_results(request, evaluation)
-        name = f"{make_file_stem(estimate)}_against_{make_file_stem(reference)}"
-        name += format_settings_suffix(request)
+        report_stem = f"{make_file_stem(estimate)}_against_{make_file_stem(reference)}"
+        report_stem += format_settings_suffix(request)
         contents = outputs.make_result_files(
-            results, json_path, output, evaluation, show_progress, name
+            results, json_path, output, evaluation, show_progress, report_stem
         )
     page = Page()
     write_evaluation(page, evaluation)

@@ -27,10 +27,10 @@ def explore(log: Path | None, output: Path | None, **option_values: Any) -> None
 
     log = log or sample_log()
     request = options.comparison_request(log, option_values)
-    target = outputs.choose_web_page_path(
+    page_path = outputs.choose_web_page_path(
         output, Path("reports", f"{log.stem}{format_settings_suffix(request)}.html")
     )
-    with outputs.progress(target) as show_progress:
+    with outputs.progress(page_path) as show_progress:
         analysis = diagnose(request, show_progress)
         show_progress("writing the page")
         # a slow import (Bokeh), which is not needed if the analysis fails
@@ -38,5 +38,5 @@ def explore(log: Path | None, output: Path | None, **option_values: Any) -> None
 
         page = make_analysis_page(analysis)
         if output is None:
-            outputs.check_default_page(target, page)
-    outputs.write_and_print_results({target: page.encode()})
+            outputs.check_default_page(page_path, page)
+    outputs.write_and_print_results({page_path: page.encode()})

@@ -79,11 +79,12 @@ def _require_same_flight(folder: Path, sha256: str) -> None:
         with suspend_input_registration():
             text = read_text(folder / "flight.json", OutputError, MAX_DESCRIPTION_BYTES)
         earlier_log = json.loads(text)["log"]
-        name, earlier_sha256 = earlier_log["name"], earlier_log["sha256"]
+        earlier_name, earlier_sha256 = earlier_log["name"], earlier_log["sha256"]
     # without a valid flight.json, the folder contains no tables of another log
     except (OutputError, ValueError, KeyError, TypeError):
         return
     if earlier_sha256 != sha256:
         raise OutputError(
-            f"{folder} contains the tables of another log, {name}. Choose another folder (-o)."
+            f"{folder} contains the tables of another log, {earlier_name}. Choose "
+            "another folder (-o)."
         )

@@ -62,7 +62,7 @@ class Interrupted(Exception):  # noqa: N818 - no error, because the user ends th
 
 
 @contextmanager
-def progress(*targets: Path | None) -> Iterator[ShowProgress]:
+def progress(*output_paths: Path | None) -> Iterator[ShowProgress]:
     """Check the output paths, and provide a function that shows the progress on a terminal.
 
     In a pipe, or if a target is standard output, the function shows nothing.
@@ -72,7 +72,7 @@ def progress(*targets: Path | None) -> Iterator[ShowProgress]:
     OutputError
         A target cannot be written, see :func:`check_output_paths`.
     """
-    check_output_paths(targets)
+    check_output_paths(output_paths)
     context = click.get_current_context(silent=True)
     if context and (send := context.meta.get(SEND_PROGRESS_KEY)):
         yield lambda activity, *_: send(activity)
@@ -81,7 +81,7 @@ def progress(*targets: Path | None) -> Iterator[ShowProgress]:
 
     console = Console(stderr=True)
     # no progress bar at all: in older versions of rich, a disabled bar prints an empty line
-    if not console.is_terminal or STANDARD_OUTPUT in targets:
+    if not console.is_terminal or STANDARD_OUTPUT in output_paths:
         yield lambda *_: None
         return
     from rich import progress as rich_progress
@@ -106,7 +106,7 @@ def progress(*targets: Path | None) -> Iterator[ShowProgress]:
         yield show
 
 
-def choose_default_report_path(name: str, results: Results) -> Path:
+def choose_default_report_path(report_stem: str, results: Results) -> Path:
     """Return the path of a report if the user gives none (-o); a long name is cut.
 
     Raises
@@ -117,10 +117,10 @@ def choose_default_report_path(name: str, results: Results) -> Path:
     from px4fuse.results.reading import read_results
     from px4fuse.verification.pdf_input import read_attached_results
 
-    if len(os.fsencode(name)) > MAX_NAME_BYTES:
-        short_stem = os.fsencode(name)[:CUT_STEM_BYTES].decode(errors="ignore")
-        name = f"{short_stem}_{hashlib.sha256(os.fsencode(name)).hexdigest()[:8]}"
-    path = Path("reports", f"{name}.pdf")
+    if len(os.fsencode(report_stem)) > MAX_NAME_BYTES:
+        short_stem = os.fsencode(report_stem)[:CUT_STEM_BYTES].decode(errors="ignore")
+        report_stem = f"{short_stem}_{hashlib.sha256(os.fsencode(report_stem)).hexdigest()[:8]}"
+    path = Path("reports", f"{report_stem}.pdf")
     mismatch_reason = (
         "it is not a report of this px4fuse version on the same input files and student"
     )
@@ -185,11 +185,13 @@ def choose_web_page_path(output: Path | None, default: Path) -> Path:
     OutputError
         The name does not end in .html or .htm, or the path cannot be written.
     """
-    target = output or default
-    if target.suffix.lower() not in (".html", ".htm") and target != STANDARD_OUTPUT:
-        raise OutputError(f"{target}: the output is a web page. Give a name ending in .html (-o).")
-    check_output_paths([target])
-    return target
+    page_path = output or default
+    if page_path.suffix.lower() not in (".html", ".htm") and page_path != STANDARD_OUTPUT:
+        raise OutputError(
+            f"{page_path}: the output is a web page. Give a name ending in .html (-o)."
+        )
+    check_output_paths([page_path])
+    return page_path
 
 
 def choose_report_paths(output: Path | None, json_path: Path | None) -> list[Path]:
@@ -277,7 +279,7 @@ def write_new(path: Path, content: bytes) -> None:
     write_and_print_results({path: content})
 
 
-def check_output_paths(targets: Iterable[Path | None]) -> None:
+def check_output_paths(output_paths: Iterable[Path | None]) -> None:
     """Check output paths before the analysis begins; None and standard output are ignored.
 
     Raises
@@ -286,20 +288,22 @@ def check_output_paths(targets: Iterable[Path | None]) -> None:
         Two outputs are the same file, an output is a folder or an input of this command, or a path
         cannot be written.
     """
-    files = [target for target in targets if target not in (None, STANDARD_OUTPUT)]
-    if len({file.resolve() for file in files}) < len(files):
+    file_paths = [
+        output_path for output_path in output_paths if output_path not in (None, STANDARD_OUTPUT)
+    ]
+    if len({file.resolve() for file in file_paths}) < len(file_paths):
         raise OutputError("two outputs have the same file name. Give different names.")
-    for target in files:
+    for output_path in file_paths:
         try:
-            if stat.S_ISDIR(target.stat().st_mode):
-                raise OutputError(f"{target} is a folder. Give a file name.")
+            if stat.S_ISDIR(output_path.stat().st_mode):
+                raise OutputError(f"{output_path} is a folder. Give a file name.")
         except FileNotFoundError:
             continue
         except OSError as error:  # the file name is too long, or a parent folder is a file
             raise OutputError(
-                f"{target} cannot be written ({error.strerror}). Choose another path."
+                f"{output_path} cannot be written ({error.strerror}). Choose another path."
             ) from error
-    check_outputs(files)
+    check_outputs(file_paths)
 
 
 def write_and_print_results(

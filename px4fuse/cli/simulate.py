@@ -224,15 +224,15 @@ def _read_secret(file: Path | None) -> bytes | None:
 
     if file is None:
         return None
-    name = f"--secret-file {file}"
+    option_text = f"--secret-file {file}"
     secret_text = read_text(
         file,
         SettingsError,
         MAX_SECRET_BYTES,
-        name=name,
+        name=option_text,
         remedy_if_too_large="Give a file with the secret as one line of text.",
     )
-    return parse_secret(secret_text, name)
+    return parse_secret(secret_text, option_text)
 
 
 def _write_assignment(

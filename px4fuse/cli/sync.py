@@ -35,10 +35,11 @@ def sync(log: Path, json_path: Path | None, **option_values: Any) -> None:
         _, time_offset = estimate_noises_and_clock(comparison, show_progress)
     advice = make_time_offset_advice(comparison, time_offset)
     if isinstance(time_offset, Unavailable) or not time_offset.is_determinable:
-        name = comparison.flight.log.name
+        log_name = comparison.flight.log.name
         remedy = time_offset.remedy if isinstance(time_offset, Unavailable) else advice["Action"]
         raise MissingDataError(
-            f"{name}: the time offset cannot be estimated from this flight: {time_offset.reason}",
+            f"{log_name}: the time offset cannot be estimated from this flight: "
+            f"{time_offset.reason}",
             remedy,
         )
     results = make_sync_results(request, comparison, time_offset)

@@ -94,10 +94,10 @@ def _make_offset_slider(request: ComparisonRequest, analysis: Analysis) -> PageD
     """Return range and estimate of the time offset, or the reason why it cannot be changed."""
     if request.position is not None:
         return {"why": "Not adjustable: this offset aligns the position file with the log."}
-    applied_offset_s, clock = analysis.settings.clock_offset_s, analysis.clock
+    applied_offset_s, clock_offset = analysis.settings.clock_offset_s, analysis.clock
     estimated_offset_s = None
-    if isinstance(clock, ClockOffset) and clock.is_determinable:
-        estimated_offset_s = applied_offset_s + clock.remaining_s
+    if isinstance(clock_offset, ClockOffset) and clock_offset.is_determinable:
+        estimated_offset_s = applied_offset_s + clock_offset.remaining_s
     return {
         "from": applied_offset_s - OFFSET_SLIDER_HALF_RANGE_S,
         "to": applied_offset_s + OFFSET_SLIDER_HALF_RANGE_S,

@@ -371,8 +371,8 @@ const Explore = (async () => {
       const text = values && format(values);
       return text ? `${name} ${text}` : [];
     }).join(", ");
-    title("innovation", `innovations ÷ √S outside ±2 (expected 5 %): ${both((x) => percent(x, 0))}`);
-    title("gain", "KF; solid: position gain (1), dotted: velocity gain (1/s)");
+    title("innovation", `innovations outside ±2 (expected 5 %): ${both((x) => percent(x, 0))}`);
+    title("gain", "KF: position gain (solid), velocity gain (dotted, 1/s)");
     if (kf === null) return;
     const gaps = flight.events.gap.length ? "; hatched: gap in the position source" : "";
     const shaded = `shaded: ±2σ reported by KF${gaps}`;

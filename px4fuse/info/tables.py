@@ -176,12 +176,12 @@ def _make_described_tables(flight: Flight) -> Iterator[DescribedTable]:
     acceleration = ned_acceleration(flight)
     if isinstance(acceleration, pd.DataFrame):
         acceleration = acceleration.set_axis(["north_m_s2", "east_m_s2", "down_m_s2"], axis=1)
-        imu_topics, clock = _find_topics_and_clock(flight, "imu")
+        imu_topics, imu_clock_name = _find_topics_and_clock(flight, "imu")
         attitude_topics, _ = _find_topics_and_clock(flight, "attitude")
         yield _describe_table(
             "acceleration_ned",
             _with_time_column(acceleration),
-            ((*imu_topics, *attitude_topics), clock),
+            ((*imu_topics, *attitude_topics), imu_clock_name),
         )
     for name, track in _name_tracks(flight):
         placeholder_values = {"frame": track.frame, "description": track.description}

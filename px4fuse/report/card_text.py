@@ -188,8 +188,13 @@ def draw_sigma_ratio(ratio: float | None, reference: Reference) -> str:
     >>> draw_sigma_ratio(128.0, "truth")
     '───────────────░░░░░░░──────────────▶'
     """
-    low, high = (_find_axis_column(end) for end in CONSISTENT_SIGMA_RATIOS[reference])
-    characters = ["░" if low <= column <= high else "─" for column in range(AXIS_WIDTH)]
+    first_band_column, last_band_column = (
+        _find_axis_column(end) for end in CONSISTENT_SIGMA_RATIOS[reference]
+    )
+    characters = [
+        "░" if first_band_column <= column <= last_band_column else "─"
+        for column in range(AXIS_WIDTH)
+    ]
     if ratio is not None:
         column, last_column = _find_axis_column(ratio), AXIS_WIDTH - 1
         symbol = (
@@ -357,13 +362,13 @@ def _format_verdict_line(verdict: Verdict) -> Paragraph:
     filter_label = FILTER_NAMES[verdict.filter] if verdict.against == "source" else ""
     label_text = f"  {filter_label:4} {QUANTITY_LABELS[verdict.against]:25}"
     if verdict.ratio is None:
-        text = f"{'–':>7}  not evaluated: {verdict.reason}"
-        return Paragraph(text, "", label_text, " " * 41, wraps=True)
+        verdict_text = f"{'–':>7}  not evaluated: {verdict.reason}"
+        return Paragraph(verdict_text, "", label_text, " " * 41, wraps=True)
     verdict_word = f"({verdict.word})" if verdict.is_explained else verdict.word
-    text = f"{label_text}{format_ratio(verdict.ratio):>7}  {verdict_word}"
+    verdict_text = f"{label_text}{format_ratio(verdict.ratio):>7}  {verdict_word}"
     style = "bold" if verdict.is_fault else ""
     return Paragraph(
-        f"{text:{AXIS_INDENT}}{draw_sigma_ratio(verdict.ratio, verdict.against)}", style
+        f"{verdict_text:{AXIS_INDENT}}{draw_sigma_ratio(verdict.ratio, verdict.against)}", style
     )
 
 

@@ -105,20 +105,20 @@ def make_time_offset_advice(
 def _format_delay_advice(
     comparison: PreparedComparison, time_offset: ClockOffset, logged_delay_ms: float
 ) -> str:
-    name, fitted_delay_ms = (
+    delay_parameter, fitted_delay_ms = (
         find_aid(comparison).delay,
         estimate_delay_if_wrong_ms(comparison, time_offset, logged_delay_ms),
     )
     if fitted_delay_ms is None:
-        return f"{name} {logged_delay_ms:g} ms agrees with the estimated time offset."
-    if limit_text := describe_delay_limit(name, fitted_delay_ms, logged_delay_ms):
+        return f"{delay_parameter} {logged_delay_ms:g} ms agrees with the estimated time offset."
+    if limit_text := describe_delay_limit(delay_parameter, fitted_delay_ms, logged_delay_ms):
         return (
-            f"The maximum-likelihood {name} is {fitted_delay_ms:.0f} ms, but {name} cannot "
-            f"{limit_text}. Correct the sender's clock."
+            f"The maximum-likelihood {delay_parameter} is {fitted_delay_ms:.0f} ms, but "
+            f"{delay_parameter} cannot {limit_text}. Correct the sender's clock."
         )
     return (
-        f"Set {name} to {max(fitted_delay_ms, 0.0):.0f} ms (now {logged_delay_ms:g} ms), or "
-        "correct the sender's clock."
+        f"Set {delay_parameter} to {max(fitted_delay_ms, 0.0):.0f} ms (now {logged_delay_ms:g} "
+        "ms), or correct the sender's clock."
     )
 
 
@@ -135,11 +135,11 @@ def draw_pages(analysis: Analysis, results: ComparisonResults) -> Iterator[Page]
         "is from the gyros, because the same positions have corrected EKF2's attitude.",
     )
     page.write_labelled_texts(make_time_offset_advice(analysis, time_offset))
-    (low, high), estimate_s = time_offset.interval_s, time_offset.offset_s
+    (low_offset_s, high_offset_s), estimate_s = time_offset.interval_s, time_offset.offset_s
     curve_sentence = (
         f"The log-likelihood of {time_offset.count} measurements has its maximum at "
-        f"{estimate_s:+.3f} s; 95 % interval {low:+.3f} to {high:+.3f} s. The curve does not "
-        "include the IMU noise, but the interval does, so the interval is wider."
+        f"{estimate_s:+.3f} s; 95 % interval {low_offset_s:+.3f} to {high_offset_s:+.3f} s. The "
+        "curve does not include the IMU noise, but the interval does, so the interval is wider."
     )
     title = "Decrease of the log-likelihood from its maximum (nats)"
     draw_offset_likelihood(

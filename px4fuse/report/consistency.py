@@ -137,9 +137,11 @@ def _write_causes(page: Page, analysis: Analysis) -> None:
     rows = []
     for trial, statistic in reruns_and_statistics:
         label, exponent = STATISTIC_LABELS_AND_POWERS[statistic]
-        values = [outcome.value(statistic) or 0.0 for outcome in (trial.before, trial.after)]
+        statistic_values = [
+            outcome.value(statistic) or 0.0 for outcome in (trial.before, trial.after)
+        ]
         cells = [FILTER_NAMES[trial.filter], format_change(analysis, trial), label]
-        cells += [format_number(value**exponent, 2) for value in values]
+        cells += [format_number(value**exponent, 2) for value in statistic_values]
         rows.append([*cells, format_explained_fraction(trial, statistic)])
     if not rows:
         return

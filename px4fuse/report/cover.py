@@ -175,12 +175,12 @@ def _format_causes_legend(causes: Sequence[Cause]) -> str:
     command_locations = {
         action.where for cause in causes for _, action in label_alternatives(cause)
     }
-    texts = [
+    legend_texts = [
         f"{location}: {text}"
         for location, text in COMMAND_LOCATIONS.items()
         if location in command_locations
     ]
-    return " · ".join([*texts, "[id]: `px4fuse explain ID` explains the finding"])
+    return " · ".join([*legend_texts, "[id]: `px4fuse explain ID` explains the finding"])
 
 
 def _make_cause_fields(number: int, cause: Cause) -> dict[str, Any]:

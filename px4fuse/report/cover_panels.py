@@ -271,10 +271,10 @@ def _compute_error_limit_m(errors: pd.DataFrame) -> float:
 
 def _format_sigma(sigma: pd.Series[float]) -> str:
     settled_sigma = sigma[sigma.index >= min(sigma.index[0] + SIGMA_SETTLING_S, sigma.index[-1])]
-    low, high = float(settled_sigma.min()), float(settled_sigma.max())
-    if high < MAX_CONSTANT_SIGMA_RATIO * low:
+    min_sigma_m, max_sigma_m = float(settled_sigma.min()), float(settled_sigma.max())
+    if max_sigma_m < MAX_CONSTANT_SIGMA_RATIO * min_sigma_m:
         return format_metres(float(settled_sigma.median()))
-    return f"{format_metres(low)} to {format_metres(high)}"
+    return f"{format_metres(min_sigma_m)} to {format_metres(max_sigma_m)}"
 
 
 def _make_innovation_plot(result: AxisComparison) -> TimePlot:

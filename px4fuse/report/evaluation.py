@@ -284,10 +284,10 @@ def describe_track(track: Trajectory) -> str:
 
 def describe_method(evaluation: Evaluation) -> str:
     association, offset_s = evaluation.association, evaluation.time_offset.offset_s
-    texts = [
+    method_texts = [
         f"alignment {evaluation.alignment} ({evaluation.alignment_reason.rstrip('.')})",
         f"{association.poses} pose pairs, which cover {association.coverage_estimate:.0%} of the "
         f"time of the estimate and {association.coverage_reference:.0%} of the time of the "
         "reference",
     ]
-    return "; ".join(texts + [f"time offset {offset_s:+.3f} s"] * bool(offset_s))
+    return "; ".join(method_texts + [f"time offset {offset_s:+.3f} s"] * bool(offset_s))

@@ -41,9 +41,9 @@ def make_finding_page(finding_id: str) -> Page:
     if example.message:
         page.write_labelled("Example", example.message)
         page.write_labelled("Action", example.remedy)
-    for label, names in {"Causes": causes, "Effects": effect_ids(name)}.items():
-        if names:
-            page.write_labelled(label, ", ".join(names))
+    for label, finding_ids in {"Causes": causes, "Effects": effect_ids(name)}.items():
+        if finding_ids:
+            page.write_labelled(label, ", ".join(finding_ids))
     rate_sentences = [
         "The rates of false alarms and of detection have not been measured for this finding."
     ]

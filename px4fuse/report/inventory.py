@@ -72,11 +72,11 @@ def _describe_log(inventory: Inventory) -> list[tuple[str, str]]:
         dropout_total_s = sum(dropout.duration_s for dropout in log.dropouts)
         longest_dropout_s = max(dropout.duration_s for dropout in log.dropouts)
         dropout_count = len(log.dropouts)
-        text = (
+        dropouts_text = (
             f"{dropout_count} logger dropouts of {dropout_total_s:.2f} s in total, at most "
             f"{longest_dropout_s:.2f} s"
         )
-        labelled_texts.append(("Dropouts", text))
+        labelled_texts.append(("Dropouts", dropouts_text))
     labelled_texts += [
         (file.role.capitalize(), f"{file.name}, SHA-256 {file.sha256[:12]}")
         for file in inventory.flight.inputs

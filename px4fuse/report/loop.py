@@ -141,7 +141,7 @@ def write_loop(page: Page, loop: Loop) -> None:
     """Write the closure error, the test of the closure, and the ATE of each corrected path."""
     odometry = loop.odometry.trajectory
     true_end = loop.true_end
-    texts = {
+    text_by_label = {
         "Track": f"{odometry.name}: {TRACK_TEXT_BY_KIND[odometry.kind]}, {len(odometry)} poses, "
         f"{loop.key_frames} key frames, spacing {loop.key_frame_spacing_m:.2g} m",
         "Segment": f"{_format_span(loop)}, {loop.part_reason}",
@@ -149,15 +149,15 @@ def write_loop(page: Page, loop: Loop) -> None:
         "True end": "not used" if isinstance(true_end, Unavailable) else true_end.source,
     }
     for closure in loop.closures[:1]:
-        texts["Gate"] = describe_gate(closure)
-    page.write_labelled_texts(texts)
+        text_by_label["Gate"] = describe_gate(closure)
+    page.write_labelled_texts(text_by_label)
     for note in (explain_distance_correction(loop), *list_missing_corrections(loop)):
         page.write_small_text(note)
-    names = [reference.name for reference in loop.references]
+    reference_names = [reference.name for reference in loop.references]
     head = [
         "path",
         "position correction\nRMS / max (m)",
-        *(f"ATE against\n{name} (m)" for name in names),
+        *(f"ATE against\n{reference_name} (m)" for reference_name in reference_names),
     ]
     rows = []
     for path in loop.select_reported_paths():
@@ -166,16 +166,16 @@ def write_loop(page: Page, loop: Loop) -> None:
             correction_text = f"{path.correction_rms_m:.2f} / {path.correction_max_m:.2f}"
         ate_texts = [
             _format_error(evaluation.ate.translation_m, evaluation.ate.interval_m)
-            if isinstance(evaluation := path.scores[name], Evaluation)
+            if isinstance(evaluation := path.scores[reference_name], Evaluation)
             else "–"
-            for name in names
+            for reference_name in reference_names
         ]
         rows.append([path.name, correction_text, *ate_texts])
     page.add_table(head, rows)
     page.write_small_text(
         "ATE: position RMSE after alignment, with its 95 % interval (block bootstrap) if the "
         "flight is long enough."
-        if names
+        if reference_names
         else "The error of the path is unknown without ground truth or reference trajectory. Add a "
         "reference trajectory with --reference FILE."
     )
@@ -242,14 +242,14 @@ def describe_closure_error(loop: Loop) -> str:
         return (
             f"not computed, because --open states that the path ({length_m:.1f} m) has an open end"
         )
-    text = (
+    error_text = (
         f"{error_m:.2f} m after {length_m:.1f} m ({error_m / length_m:.2%}): "
         f"{format_vector(error_components_m)}"
     )
     heading_error_deg = loop.heading_error_deg
     if isinstance(heading_error_deg, Unavailable):
-        return f"{text}; the heading error is unknown: {heading_error_deg.reason}"
-    return f"{text}; heading error {heading_error_deg:+.1f}°"
+        return f"{error_text}; the heading error is unknown: {heading_error_deg.reason}"
+    return f"{error_text}; heading error {heading_error_deg:+.1f}°"
 
 
 def describe_gate(closure: Closure) -> str:
@@ -313,11 +313,11 @@ def make_pose_graph_page(solved_graph: Graph) -> Page:
         f"{solved_graph.name}: {solved_graph.dimension}-D, {solved_graph.poses} poses, "
         f"{solved_graph.edges} edges; initial poses: {solved_graph.initialised}",
     )
-    low, high = solved_graph.reduced_chi2_interval
-    if high > 0.0:
+    expected_low, expected_high = solved_graph.reduced_chi2_interval
+    if expected_high > 0.0:
         fit_text = (
             f"χ² per degree of freedom {format_number(solved_graph.reduced_chi2)} (95 % "
-            f"{format_number(low)} to {format_number(high)} expected)"
+            f"{format_number(expected_low)} to {format_number(expected_high)} expected)"
         )
         if (factor := solved_graph.information_factor) > 1.0:
             fit_text += (
@@ -325,11 +325,11 @@ def make_pose_graph_page(solved_graph: Graph) -> Page:
                 f"{format_number(factor, 2)} times too large. Gate and robust optimisation use "
                 "the information divided by this factor."
             )
-        elif solved_graph.reduced_chi2 > high:
+        elif solved_graph.reduced_chi2 > expected_high:
             fit_text += (
                 ": too large. Possible causes: false closures, or too large information matrices."
             )
-        elif solved_graph.reduced_chi2 < low:
+        elif solved_graph.reduced_chi2 < expected_low:
             fit_text += ": too small information matrices, so the gate may accept false closures."
         page.write_labelled("Fit", fit_text)
     if isinstance(gates, Unavailable):

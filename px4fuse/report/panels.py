@@ -150,22 +150,24 @@ def _format_rmse(result: AxisComparison, quantity: QuantityColumns) -> list[str]
 
 
 def _describe_position_difference(result: AxisComparison) -> str:
-    difference, texts = result.difference, _format_rmse(result, POSITION_QUANTITY)
+    difference, difference_texts = result.difference, _format_rmse(result, POSITION_QUANTITY)
     if isinstance(difference, Unavailable):
-        texts.append(f"{difference.what}: {difference.reason}")
+        difference_texts.append(f"{difference.what}: {difference.reason}")
     else:
-        texts.append(
+        difference_texts.append(
             f"position KF - EKF2 RMS {difference.position_rms_m:.3f} m, mean "
             f"{difference.position_mean_m:+.3f} m, maximum {difference.position_maximum_m:.2f} m"
         )
-    return "; ".join(texts)
+    return "; ".join(difference_texts)
 
 
 def _describe_velocity_difference(result: AxisComparison) -> str:
-    texts = _format_rmse(result, VELOCITY_QUANTITY)
+    difference_texts = _format_rmse(result, VELOCITY_QUANTITY)
     if isinstance(result.difference, Difference):
-        texts.append(f"velocity KF - EKF2 RMS {result.difference.velocity_rms_m_s:.3f} m/s")
-    return "; ".join(texts)
+        difference_texts.append(
+            f"velocity KF - EKF2 RMS {result.difference.velocity_rms_m_s:.3f} m/s"
+        )
+    return "; ".join(difference_texts)
 
 
 def _find_innovation_limit_m(result: AxisComparison) -> float:
@@ -291,12 +293,12 @@ def describe_sigma_growth(analysis: Analysis, result: AxisComparison) -> str:
 
 
 def _format_median_sigma(result: AxisComparison, quantity: QuantityColumns) -> str:
-    texts = []
+    sigma_texts = []
     for name, filter_summary in get_statistics_by_filter(result).items():
         median_sigma = getattr(filter_summary, quantity.median_sigma_field)
-        text = "not logged" if median_sigma is None else f"{median_sigma:.3f} {quantity.unit}"
-        texts.append(f"{name} {text}")
-    return f"median: {', '.join(texts)}"
+        sigma_text = "not logged" if median_sigma is None else f"{median_sigma:.3f} {quantity.unit}"
+        sigma_texts.append(f"{name} {sigma_text}")
+    return f"median: {', '.join(sigma_texts)}"
 
 
 POSITION_PANEL = Panel(

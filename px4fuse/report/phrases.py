@@ -293,8 +293,8 @@ def format_noise_estimate(noise: NoiseEstimate) -> str:
     """Format a maximum-likelihood noise with its 95 % interval."""
     if noise.value is None:
         bounds = (("at most", noise.high), ("at least", noise.low))
-        texts = (f"{prefix} {bound:.2g}" for prefix, bound in bounds if bound is not None)
-        return next(texts, "not identifiable")
-    low = "0" if noise.low is None else f"{noise.low:.2g}"
-    high = "?" if noise.high is None else f"{noise.high:.2g}"
-    return f"{noise.value:.3g} ({low}-{high})"
+        bound_texts = (f"{prefix} {bound:.2g}" for prefix, bound in bounds if bound is not None)
+        return next(bound_texts, "not identifiable")
+    low_text = "0" if noise.low is None else f"{noise.low:.2g}"
+    high_text = "?" if noise.high is None else f"{noise.high:.2g}"
+    return f"{noise.value:.3g} ({low_text}-{high_text})"

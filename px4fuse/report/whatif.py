@@ -93,8 +93,8 @@ def _format_fusion_statistics(summary: Summary) -> dict[str, str]:
 
 def make_sweep_table(analysis: WhatIfAnalysis) -> tuple[list[str], list[list[str]]]:
     """Return the headings, and a row of statistics for each value of the swept parameter."""
-    name, rows = find_swept_parameter(analysis), []
-    unit = PARAMETERS[name].unit
+    parameter_name, rows = find_swept_parameter(analysis), []
+    unit = PARAMETERS[parameter_name].unit
     for summary in select_sweep_summaries(analysis):
         axes = summary.axes.values()
         cells = [
@@ -105,9 +105,9 @@ def make_sweep_table(analysis: WhatIfAnalysis) -> tuple[list[str], list[list[str
         ]
         if not summary.is_predictable:
             cells = [NOT_PREDICTABLE_TEXT, *[""] * 5]
-        rows.append([format_number(summary.changed[name]), *cells])
+        rows.append([format_number(summary.changed[parameter_name]), *cells])
     head = [
-        f"{name} ({unit})" if unit else name,
+        f"{parameter_name} ({unit})" if unit else parameter_name,
         "mean NIS N/E",
         "rejected",
         "longest gap (s)",
@@ -133,22 +133,24 @@ def describe_sweep(analysis: WhatIfAnalysis) -> list[str]:
     if summaries := [
         summary for summary in select_sweep_summaries(analysis) if summary.is_predictable
     ]:
-        name = find_swept_parameter(analysis)
+        parameter_name = find_swept_parameter(analysis)
         best_summary = min(summaries, key=lambda s: abs(math.log(s.nis_mean)))
         sentences.append(
-            f"The mean NIS is closest to 1 at {name} {format_number(best_summary.changed[name])} "
+            f"The mean NIS is closest to 1 at {parameter_name} "
+            f"{format_number(best_summary.changed[parameter_name])} "
             f"({format_number(best_summary.nis_mean)})."
         )
         value_by_rmse_m = {
-            rmse_m: summary.changed[name]
+            rmse_m: summary.changed[parameter_name]
             for summary in summaries
             if isinstance(rmse_m := summary.position_rmse_to_truth_m, float)
         }
         if value_by_rmse_m:
             min_rmse_m = min(value_by_rmse_m)
             sentences.append(
-                f"The horizontal position RMSE against ground truth is smallest at {name} "
-                f"{format_number(value_by_rmse_m[min_rmse_m])} ({min_rmse_m:.3f} m)."
+                "The horizontal position RMSE against ground truth is smallest at "
+                f"{parameter_name} {format_number(value_by_rmse_m[min_rmse_m])} "
+                f"({min_rmse_m:.3f} m)."
             )
     if not all(summary.is_predictable for summary in analysis.whatif.whatif):
         sentences.append(

@@ -69,7 +69,7 @@ class NormalEquations:
         dependent_counts = np.array([len(dependents) for dependents in dependents_by_group])
         dependent_starts = np.append(0, np.cumsum(dependent_counts))
         all_dependents = np.concatenate(dependents_by_group)
-        keys = (
+        group_and_pose_keys = (
             np.repeat(np.arange(len(dependents_by_group)), dependent_counts) * len(poses)
             + all_dependents
         )
@@ -79,7 +79,10 @@ class NormalEquations:
 
         def find_columns(group: IntArray, pose: IntArray) -> IntArray:
             """Return the d column indices of each pose in the matrix of its group, (poses, d)."""
-            index = np.searchsorted(keys, group * len(poses) + pose) - dependent_starts[group]
+            index = (
+                np.searchsorted(group_and_pose_keys, group * len(poses) + pose)
+                - dependent_starts[group]
+            )
             column = pose - group_starts[group]
             is_later_pose = column >= pose_counts[group]
             column = np.where(is_later_pose, pose_counts[group] + index, column)
@@ -164,52 +167,52 @@ class NormalEquations:
             rhs_products,
         )
         summed_terms = np.concatenate([product.ravel() for product in edge_products])
-        values = np.asarray(np.bincount(self._indices, summed_terms), dtype=float)
-        right_hand_sides = values[self._rhs_indices]
-        values[self._diagonal[self._position[0]]] = _FIXED_POSE_INFORMATION
-        return values, right_hand_sides
+        matrix_values = np.asarray(np.bincount(self._indices, summed_terms), dtype=float)
+        right_hand_sides = matrix_values[self._rhs_indices]
+        matrix_values[self._diagonal[self._position[0]]] = _FIXED_POSE_INFORMATION
+        return matrix_values, right_hand_sides
 
-    def solve(self, values: Array, damping: float = 0.0) -> Array | None:
+    def solve(self, matrix_values: Array, damping: float = 0.0) -> Array | None:
         """Solve the equations with damping on the diagonal; the result has the shape (n, d, k).
 
         Return None if the matrix is not positive definite.
         """
-        values = values.copy()
-        values[self._diagonal] += damping
+        matrix_values = matrix_values.copy()
+        matrix_values[self._diagonal] += damping
         rhs_count = self._rhs_indices.shape[2]
         schur_complements: dict[int, Array] = {}
         group_factors = []
         for index, group in enumerate(self._groups):
-            group_matrix = values[group.values].reshape(-1, group.unknown_count).T
+            group_matrix = matrix_values[group.values].reshape(-1, group.unknown_count).T
             cholesky_factor, failed_row = lapack.dpotrf(
                 group_matrix[:, : group.unknown_count], overwrite_a=1
             )
             if failed_row:
                 return None
-            rows = blas.dtrsm(
+            eliminated_rows = blas.dtrsm(
                 1.0,
                 cholesky_factor,
                 group_matrix[:, group.unknown_count :],
                 trans_a=1,
                 overwrite_b=1,
             )
-            group_factors.append((group, cholesky_factor, rows))
+            group_factors.append((group, cholesky_factor, eliminated_rows))
             if group is self._groups[-1]:
                 break
-            column_count = rows.shape[1]
+            column_count = eliminated_rows.shape[1]
             schur_complement = (
                 schur_complements.pop(index, np.zeros(column_count**2))
                 .reshape(column_count, column_count)
                 .T
             )
             schur_complement = blas.dsyrk(
-                -1.0, rows, 1.0, schur_complement, trans=1, overwrite_c=1
+                -1.0, eliminated_rows, 1.0, schur_complement, trans=1, overwrite_c=1
             ).T
             # only the lower triangle (row >= column) of the symmetric matrix is computed
             parent = self._groups[group.parent]
             columns = group.parent_columns
             own_column_count = np.searchsorted(columns, parent.unknown_count)
-            parent_values = values[parent.values]
+            parent_values = matrix_values[parent.values]
             parent_value_indices = (
                 columns[:, None] * parent.unknown_count + columns[:own_column_count]
             )
@@ -223,10 +226,10 @@ class NormalEquations:
                 own_column_count:, own_column_count:
             ]
         solution = np.empty((self._diagonal.size, rhs_count))
-        for group, cholesky_factor, rows in reversed(group_factors):
-            solved_terms = rows[:, :-rhs_count] @ solution[group.dependent_unknowns]
+        for group, cholesky_factor, eliminated_rows in reversed(group_factors):
+            solved_terms = eliminated_rows[:, :-rhs_count] @ solution[group.dependent_unknowns]
             solution[group.unknown_slice] = blas.dtrsm(
-                1.0, cholesky_factor, rows[:, -rhs_count:] - solved_terms
+                1.0, cholesky_factor, eliminated_rows[:, -rhs_count:] - solved_terms
             )
         solution = solution.reshape(self._rhs_indices.shape)[self._position]
         solution[0] = 0.0

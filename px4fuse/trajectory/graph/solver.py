@@ -152,7 +152,7 @@ def _minimise(
         first_pose_jacobian = second_pose_jacobian @ lie.adjoint(
             lie.inverse(residuals.relative_poses)
         )
-        values, gradient = graph.normal_equations.assemble(
+        matrix_values, gradient = graph.normal_equations.assemble(
             -first_pose_jacobian,
             second_pose_jacobian,
             weights[:, None, None] * graph.information,
@@ -162,7 +162,7 @@ def _minimise(
             cost_decrease = 0.0
             predicted_decrease = 0.0
             is_converged = False
-            step = graph.normal_equations.solve(values, damping)
+            step = graph.normal_equations.solve(matrix_values, damping)
             if step is not None:
                 predicted_decrease = 0.5 * float(np.sum(step * (damping * step + gradient)))
                 trial_residuals = model.residuals(
