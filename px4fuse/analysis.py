@@ -53,7 +53,7 @@ class Analysis(Comparison, Estimates, Reruns):
         return model if isinstance(model, Unavailable) else model.baseline_replay
 
     def select_main_trials(self) -> list[Trial]:
-        """Return the re-runs along the main axis that are compared with logged results."""
+        """Return the re-runs along the main axis whose results before the change are logged."""
         main_axis = self.main.axis.name
         return [trial for trial in self.trials if trial.axis == main_axis and trial.is_logged]
 
@@ -95,7 +95,8 @@ class WhatIfAnalysis:
     uses_estimates : bool
         True if ``changes`` are maximum-likelihood estimates.
     difference_steps : mapping from axis name to DifferenceExplanation or Unavailable
-        Causes of the difference between KF (default settings) and EKF2 (logged).
+        Causes of the difference between KF (default settings) and EKF2 (logged), which existed
+        before the change of parameters.
     without : mapping from PX4's name of an aiding source to float
         Time (s) from which EKF2 does not fuse the aiding source in the replays.
     """
@@ -111,11 +112,11 @@ class WhatIfAnalysis:
 
     @property
     def sweep_start_index(self) -> int:
-        """Index of the first replay that belongs to a parameter sweep."""
+        """Index in ``whatif.whatif`` of the first replay of a parameter sweep, if there is one."""
         return int(bool(self.changes or self.without))
 
 
-def failed_checks(analysis: Analysis | AidsOnlyAnalysis) -> dict[str, str]:
+def find_failed_checks(analysis: Analysis | AidsOnlyAnalysis) -> dict[str, str]:
     """Return the axes and aiding sources for which EKF2 is not consistent, with the reason.
 
     Reasons are: overconfident, or (only aiding sources) biased or not fused for a long time.
@@ -126,5 +127,7 @@ def failed_checks(analysis: Analysis | AidsOnlyAnalysis) -> dict[str, str]:
             ekf2 = axis.filters["ekf2"]
             if not isinstance(ekf2, Unavailable) and ekf2.verdict == "overconfident":
                 failed_verdicts[f"EKF2, {name}"] = ekf2.verdict
-    aids = {} if isinstance(analysis.aids, Unavailable) else analysis.aids
-    return failed_verdicts | {aid.label: aid.verdict for aid in aids.values() if aid.is_faulty}
+    results_by_aid = {} if isinstance(analysis.aids, Unavailable) else analysis.aids
+    return failed_verdicts | {
+        aid.label: aid.verdict for aid in results_by_aid.values() if aid.is_faulty
+    }

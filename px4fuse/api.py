@@ -11,7 +11,7 @@ from px4fuse import request
 from px4fuse.analysis import Analysis
 from px4fuse.comparison.model import FilterSummary, UntestedFilter
 from px4fuse.core.record import display_html
-from px4fuse.core.writing import write_all
+from px4fuse.core.writing import write_output_files
 from px4fuse.diagnose import diagnose, require_available, run_what_if
 from px4fuse.ekf2 import whatif
 from px4fuse.ekf2.model import prepare_ekf2_model
@@ -143,7 +143,7 @@ def table(analysis: Analysis) -> pd.DataFrame:
     the mean NIS. RMSE and NEES are against ground truth. Missing numbers are NaN.
     """
     row_by_axis_and_filter = {
-        (axis_name, filter_name): _summary_row(summary)
+        (axis_name, filter_name): _make_summary_row(summary)
         for axis_name, axis in analysis.axes.items()
         for filter_name, summary in axis.filters.items()
     }
@@ -157,7 +157,7 @@ def table(analysis: Analysis) -> pd.DataFrame:
     )
 
 
-def _summary_row(summary: FilterSummary | UntestedFilter) -> dict[str, Any]:
+def _make_summary_row(summary: FilterSummary | UntestedFilter) -> dict[str, Any]:
     truth = {} if isinstance(summary.truth, Unavailable) else structs.asdict(summary.truth)
     row = {"verdict": "", **truth, "count": None, **structs.asdict(summary)}
     row["nis_low"], row["nis_high"] = row.get("nis_band", (None, None))
@@ -265,12 +265,12 @@ def write_report(analysis: Analysis, path: Pathlike) -> Path:
     from px4fuse.results.build import results  # noqa: PLC0415
     from px4fuse.results.contract import to_json  # noqa: PLC0415
 
-    target = _require_suffix(path, ".pdf")
-    contract_results = results(_require_request(analysis), analysis)
-    results_json = to_json(contract_results)
-    pdf = render_pdf(analysis, contract_results, results_json)
-    write_all({target: pdf, target.with_suffix(".json"): results_json.encode()})
-    return target
+    report_path = _require_suffix(path, ".pdf")
+    serialisable_results = results(_require_request(analysis), analysis)
+    results_json = to_json(serialisable_results)
+    pdf = render_pdf(analysis, serialisable_results, results_json)
+    write_output_files({report_path: pdf, report_path.with_suffix(".json"): results_json.encode()})
+    return report_path
 
 
 def write_page(analysis: Analysis, path: Pathlike) -> Path:
@@ -283,12 +283,12 @@ def write_page(analysis: Analysis, path: Pathlike) -> Path:
     OutputError, SettingsError
         The page cannot be written, or the analysis is not from :func:`px4fuse.compare`.
     """
-    from px4fuse.explore.page import html_text  # noqa: PLC0415 - slow import
+    from px4fuse.explore.page import make_analysis_page  # noqa: PLC0415 - slow import
 
-    target = _require_suffix(path, ".html")
+    page_path = _require_suffix(path, ".html")
     _require_request(analysis)
-    write_all({target: html_text(analysis).encode()})
-    return target
+    write_output_files({page_path: make_analysis_page(analysis).encode()})
+    return page_path
 
 
 @display_html.register
@@ -299,20 +299,20 @@ def _display_card(analysis: Analysis) -> str | None:
 
 
 def _require_suffix(path: Pathlike, suffix: str) -> Path:
-    target = Path(path)
-    if target.suffix.lower() != suffix:
+    output_path = Path(path)
+    if output_path.suffix.lower() != suffix:
         raise OutputError(
-            f"{target}: the name does not end in {suffix}. Give a name ending in {suffix}."
+            f"{output_path}: the name does not end in {suffix}. Give a name ending in {suffix}."
         )
-    return target
+    return output_path
 
 
 def _require_request(analysis: Analysis) -> request.ComparisonRequest:
     if analysis.request is None:
         raise SettingsError(
-            "The analysis contains no command line for the report, because px4fuse.compare did not "
-            "make the analysis.",
-            "Make the analysis with px4fuse.compare.",
+            "A report or web page needs the settings of the analysis, but this analysis contains "
+            "none.",
+            "Pass an analysis from px4fuse.compare.",
         )
     return analysis.request
 

@@ -4,8 +4,8 @@
 2. prepare: position source, time span and axes
 3. filter: run KF along each axis
 4. compare: KF, EKF2 and ground truth
-5. estimate: noise σ, time offset, frame misalignment, biases. The estimated time offset replaces a
-   delay that step 2 detected, in the report only
+5. estimate: noise σ, time offset, frame misalignment, biases. If step 2 has corrected a delay of
+   the positions, the report states the more precise estimate of this step
 6. rerun: replay EKF2, explain KF - EKF2, re-run both filters with one change at a time
 7. analyse the rest of the flight: loop closure, EKF2's other aiding sources, events
 8. find: faults of the flight, with their causes
@@ -69,7 +69,7 @@ def diagnose(
     progress: Progress = ignore_progress,
     flight: Flight | None = None,
     *,
-    keep_as_sent: bool = False,
+    keep_positions_as_sent: bool = False,
 ) -> Analysis:
     """Read a flight, compare KF with EKF2, and find faults (steps 1 to 8 of this module).
 
@@ -80,7 +80,7 @@ def diagnose(
         Called with the name of each step of the computation.
     flight : Flight, optional
         Flight that was already read from the files of the request.
-    keep_as_sent : bool
+    keep_positions_as_sent : bool
         True to skip the check and correction of axes, unit and timestamps of the positions.
 
     Raises
@@ -89,16 +89,22 @@ def diagnose(
         A file cannot be read, the flight lacks required data, or a setting is out of range.
     """
     flight = flight or read_flight(request, progress)
-    analysis = _diagnose_flight(request, progress, flight, keep_as_sent=keep_as_sent)
+    analysis = _diagnose_flight(
+        request, progress, flight, keep_positions_as_sent=keep_positions_as_sent
+    )
     if refined_flight := _refine_clock_offset(flight, analysis):
-        analysis = _diagnose_flight(request, progress, refined_flight, keep_as_sent=keep_as_sent)
+        analysis = _diagnose_flight(
+            request, progress, refined_flight, keep_positions_as_sent=keep_positions_as_sent
+        )
     return analysis
 
 
 def _diagnose_flight(
-    request: ComparisonRequest, progress: Progress, flight: Flight, *, keep_as_sent: bool
+    request: ComparisonRequest, progress: Progress, flight: Flight, *, keep_positions_as_sent: bool
 ) -> Analysis:
-    prepared_comparison = prepare_comparison(flight, request, progress, keep_as_sent=keep_as_sent)
+    prepared_comparison = prepare_comparison(
+        flight, request, progress, keep_positions_as_sent=keep_positions_as_sent
+    )
     progress("running KF")
     kf_runs = run_kf(prepared_comparison)
     comparison = compare(prepared_comparison, kf_runs)
@@ -106,30 +112,33 @@ def _diagnose_flight(
 
 
 def _refine_clock_offset(flight: Flight, analysis: Analysis) -> Flight | None:
-    """Replace the clock offset of a position file by the estimate from the IMU, if it differs.
+    """Return the flight with the clock offset of a position file as estimated with the IMU.
 
-    The offset from reading the file is relative to EKF2's positions, which may be late.
+    The offset from reading the file is relative to EKF2's positions, which may be late. Return None
+    if there is no such offset, or if it agrees with the IMU.
     """
-    alignment, clock = analysis.source.alignment, analysis.clock
+    alignment, clock_offset = analysis.source.alignment, analysis.clock
     if (
         alignment is None
         or alignment.clock_offset_sigma_s is None
         or alignment.reference != "EKF2 position"
-        or not isinstance(clock, ClockOffset)
+        or not isinstance(clock_offset, ClockOffset)
         or all(finding.id != "source_time_offset" for finding in analysis.findings)
         or any(CONVENTION_KEY in finding.evidence for finding in analysis.findings)
     ):
         return None
-    delay_text = f"{abs(clock.offset_s):.3f} s {'late' if clock.offset_s < 0 else 'early'}"
+    delay_text = (
+        f"{abs(clock_offset.offset_s):.3f} s {'late' if clock_offset.offset_s < 0 else 'early'}"
+    )
     alignment = structs.replace(
         alignment,
-        clock_offset_s=alignment.clock_offset_s + clock.offset_s,
-        clock_offset_sigma_s=clock.sigma_s,
+        clock_offset_s=alignment.clock_offset_s + clock_offset.offset_s,
+        clock_offset_sigma_s=clock_offset.sigma_s,
         clock_reason=f"the offset was estimated with the IMU, because EKF2's position is "
         f"{delay_text} relative to the IMU",
     )
     file_track, *other_tracks = flight.positions
-    shifted_track = replace(shift_clock(file_track, clock.offset_s), alignment=alignment)
+    shifted_track = replace(shift_clock(file_track, clock_offset.offset_s), alignment=alignment)
     return replace(flight, positions=(shifted_track, *other_tracks))
 
 
@@ -174,18 +183,22 @@ def find_faults(comparison: Comparison, progress: Progress = ignore_progress) ->
     return replace(analysis, findings=find(analysis))
 
 
-def refine_delay(comparison: Comparison, clock: ClockOffset | Unavailable) -> Comparison:
-    """Replace the detected delay of the position timestamps by the more precise estimate ``clock``.
+def refine_delay(comparison: Comparison, clock_offset: ClockOffset | Unavailable) -> Comparison:
+    """Replace the detected delay of the position timestamps by the more precise ``clock_offset``.
 
-    KF is not run again: :func:`prepare_comparison_inputs` has already corrected the detected delay,
-    and later re-runs test the remaining offset ``clock.remaining_s``.
+    Only the reported delay changes. KF is not run again: :func:`prepare_comparison_inputs` has
+    already corrected the detected delay, and re-runs test the rest, ``clock_offset.remaining_s``.
     """
-    if comparison.convention is None or isinstance(clock, Unavailable) or not clock.is_determinable:
+    if (
+        comparison.convention is None
+        or isinstance(clock_offset, Unavailable)
+        or not clock_offset.is_determinable
+    ):
         return comparison
     # a time offset is negative for late timestamps
-    refined_convention = structs.replace(comparison.convention, late_s=-clock.offset_s)
-    # Positions were corrected by the detected delay, so the report must contain it: keep it if the
-    # refined delay is too small to be a fault
+    refined_convention = structs.replace(comparison.convention, late_s=-clock_offset.offset_s)
+    # If the refined delay is too small to be a fault, report the detected delay, because the
+    # positions were corrected by it
     is_fault = all(
         find_convention_faults(convention, comparison.flight, comparison.source.frame).late_s != 0.0
         for convention in (comparison.convention, refined_convention)
@@ -212,7 +225,7 @@ def read_flight(request: ComparisonRequest, progress: Progress = ignore_progress
     from px4fuse.alignment.placement import align_position_file  # noqa: PLC0415
     from px4fuse.readers.position_file import read_position_file  # noqa: PLC0415
 
-    position_file = read_position_file(
+    position_recording = read_position_file(
         requested_file.path,
         columns=requested_file.columns,
         body=requested_file.body,
@@ -221,7 +234,7 @@ def read_flight(request: ComparisonRequest, progress: Progress = ignore_progress
     )
     return align_position_file(
         flight,
-        position_file,
+        position_recording,
         frame=requested_file.frame,
         yaw_deg=requested_file.yaw_deg,
         clock_offset_s=None if isinstance(offset_s, str) else offset_s,
@@ -233,34 +246,38 @@ def prepare_comparison(
     request: ComparisonRequest,
     progress: Progress = ignore_progress,
     *,
-    keep_as_sent: bool = False,
+    keep_positions_as_sent: bool = False,
 ) -> PreparedComparison:
-    """Choose position source, time span, axes and time offset, before KF runs.
+    """Choose position source, time span, axes and time offset; the result is the input of KF.
 
     For arguments and errors see :func:`diagnose`.
     """
-    prepared_comparison = prepare_comparison_inputs(flight, request, keep_as_sent=keep_as_sent)
+    prepared_comparison = prepare_comparison_inputs(
+        flight, request, keep_positions_as_sent=keep_positions_as_sent
+    )
     # read_flight has already corrected the time offset of a position file
     if request.clock_offset_s != AUTO or request.position is not None:
         return prepared_comparison
-    _, clock = estimate_noises_and_clock(prepared_comparison, progress)
-    if isinstance(clock, Unavailable) or not clock.is_determinable:
+    _, clock_offset = estimate_noises_and_clock(prepared_comparison, progress)
+    if isinstance(clock_offset, Unavailable) or not clock_offset.is_determinable:
         raise MissingDataError(
             f"{flight.log.name}: the time offset cannot be estimated from this flight "
-            f"({clock.reason}).",
+            f"({clock_offset.reason}).",
             "State the offset (--clock-offset SECONDS), or omit --clock-offset.",
         )
-    if not clock.is_significant(clock.remaining_s):
-        low, high = (limit_s - clock.applied_s for limit_s in clock.interval_s)
-        note = (
-            f"--clock-offset auto: the time offset {clock.remaining_s:+.3f} s (95 % {low:+.3f} to "
-            f"{high:+.3f} s) is not significant and was not applied"
+    if not clock_offset.is_significant(clock_offset.remaining_s):
+        low_offset_s, high_offset_s = (
+            limit_s - clock_offset.applied_s for limit_s in clock_offset.interval_s
         )
-        if clock.applied_s:
-            note += f". The check of the timestamps has already applied {clock.applied_s:+.3f} s"
+        note = (
+            f"--clock-offset auto: the time offset {clock_offset.remaining_s:+.3f} s (95 % "
+            f"{low_offset_s:+.3f} to {high_offset_s:+.3f} s) is not significant and was not applied"
+        )
+        if clock_offset.applied_s:
+            note += f". The timestamps were already corrected by {clock_offset.applied_s:+.3f} s"
         return replace(prepared_comparison, notes=(*prepared_comparison.notes, note))
-    request = structs.replace(request, clock_offset_s=clock.offset_s)
-    return prepare_comparison_inputs(flight, request, keep_as_sent=keep_as_sent)
+    request = structs.replace(request, clock_offset_s=clock_offset.offset_s)
+    return prepare_comparison_inputs(flight, request, keep_positions_as_sent=keep_positions_as_sent)
 
 
 def rerun(
@@ -278,13 +295,13 @@ def rerun(
         ],
     )
     release_free_memory()
-    difference_steps = explain_ekf2_difference(
+    explanation_by_axis = explain_ekf2_difference(
         comparison, ekf2_model, estimates.clock, estimated_settings
     )
     trials = rerun_filters(comparison, estimates, ekf2_model)
     if isinstance(ekf2_model, Ekf2Model):  # to free memory
         ekf2_model = replace(ekf2_model, runs=(), intervals={})
-    return Reruns(ekf2_model=ekf2_model, difference_steps=difference_steps, trials=trials)
+    return Reruns(ekf2_model=ekf2_model, difference_steps=explanation_by_axis, trials=trials)
 
 
 def diagnose_or_check_aids(
@@ -300,7 +317,7 @@ def diagnose_or_check_aids(
     flight = flight or read_flight(request, progress)
     if request.position_source or any(track.origin.is_auto_candidate for track in flight.positions):
         return diagnose(request, progress, flight)
-    missing_source, aids = explain_missing_source(flight), evaluate_aids(flight)
+    missing_data, aids = explain_missing_source(flight), evaluate_aids(flight)
     if isinstance(aids, Unavailable):
         if flight.airborne == ():
             raise MissingDataError(
@@ -308,11 +325,11 @@ def diagnose_or_check_aids(
                 f"({aids.reason}). px4fuse info {flight.log.name} lists the logged data."
             )
         raise MissingDataError(
-            f"{flight.log.name}: {missing_source.reason}, and EKF2's aiding sources cannot be "
+            f"{flight.log.name}: {missing_data.reason}, and EKF2's aiding sources cannot be "
             f"checked: {aids.reason}",
-            missing_source.remedy,
+            missing_data.remedy,
         )
-    return AidsOnlyAnalysis(flight, aids, missing_source, find_aid_findings(aids, flight))
+    return AidsOnlyAnalysis(flight, aids, missing_data, find_aid_findings(aids, flight))
 
 
 def run_what_if(
@@ -341,34 +358,35 @@ def run_what_if(
     is_default_change = not changes and sweep is None and not request.without
     if flight.log.is_assessed and is_default_change:
         raise MissingDataError(
-            f"{flight.log.name}: {DIAGNOSIS_WITHHELD.reason}", "Give --set or --sweep."
+            f"{flight.log.name}: {DIAGNOSIS_WITHHELD.reason}",
+            "State the change to replay with --set or --sweep.",
         )
     progress("replaying EKF2")
     ekf2_model = require_available(prepare_ekf2_model(flight), flight)
-    difference_steps: Mapping[str, DifferenceExplanation | Unavailable] = {}
+    explanation_by_axis: Mapping[str, DifferenceExplanation | Unavailable] = {}
     comparison = None
     try:
         if ekf2_model.agreement.good and not flight.log.is_assessed:
             comparison_request = structs.replace(comparison_request, axes=("north", "east", AISLE))
             prepared_comparison = prepare_comparison_inputs(flight, comparison_request)
             comparison = compare(prepared_comparison, run_kf(prepared_comparison))
-    except MissingDataError:  # only needed to estimate the parameters, if the user gave none
+    except MissingDataError:  # without a comparison, only changes of the user can be replayed
         if is_default_change:
             raise
     if comparison is not None:
-        tuning, clock = estimate_noises_and_clock(comparison, progress)
+        tuning, clock_offset = estimate_noises_and_clock(comparison, progress)
         estimated_settings = estimate_wrong_settings(comparison, tuning)
-        difference_steps = explain_ekf2_difference(
-            comparison, ekf2_model, clock, estimated_settings
+        explanation_by_axis = explain_ekf2_difference(
+            comparison, ekf2_model, clock_offset, estimated_settings
         )
         if is_default_change:
-            changes = estimate_ekf2_parameters(comparison, ekf2_model, tuning, clock)
+            changes = estimate_ekf2_parameters(comparison, ekf2_model, tuning, clock_offset)
     parameter_sets = [changes] if changes or request.without else []
     parameter_sets += [changes | values for values in swept_settings]
     progress("replaying EKF2 with other parameters")
     what_if_result = require_available(what_if(ekf2_model, parameter_sets, request.without), flight)
     return WhatIfAnalysis(
-        flight, what_if_result, changes, is_default_change, difference_steps, request.without
+        flight, what_if_result, changes, is_default_change, explanation_by_axis, request.without
     )
 
 

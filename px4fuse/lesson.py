@@ -18,12 +18,12 @@ TRUE_VELOCITY_M_S = 1.0
 PREDICTION_COUNT = 30
 PREDICTIONS_PER_UPDATE = 5
 # Errors (m) of the six UWB positions in Example 1: fixed numbers instead of random noise
-UWB_NOISE_M = (0.08, -0.12, 0.05, 0.10, -0.06, -0.09)
+UWB_ERRORS_M = (0.08, -0.12, 0.05, 0.10, -0.06, -0.09)
 # Corners (m) of the odometry path in Example 2; the true path returns to its start
-ODOMETRY_M = ((0.0, 0.0), (20.3, 0.2), (20.6, 20.4), (0.8, 20.9), (1.2, 0.8))
+ODOMETRY_CORNERS_M = ((0.0, 0.0), (20.3, 0.2), (20.6, 20.4), (0.8, 20.9), (1.2, 0.8))
 
 
-def run_example_1() -> Replay:
+def run_aisle_example() -> Replay:
     """Run KF on Example 1: UWB every 0.5 s along an aisle at 1 m/s, initial velocity unknown."""
     settings = Settings(sigma_a_m_s2=0.5, sigma_z_m=0.10, dt_s=0.1, input="zero")
     time_s = settings.dt_s * np.arange(
@@ -35,7 +35,7 @@ def run_example_1() -> Replay:
         heading_deg=0.0,
         note="aisle of Example 1 in the course UAT 366",
         measurement_time_s=time_s,
-        measurement_m=TRUE_VELOCITY_M_S * time_s + np.array(UWB_NOISE_M),
+        measurement_m=TRUE_VELOCITY_M_S * time_s + np.array(UWB_ERRORS_M),
         acceleration=Unavailable(
             "acceleration",
             "Example 1 of the course UAT 366 has no acceleration",
@@ -47,7 +47,7 @@ def run_example_1() -> Replay:
 
 def format_kalman_lines() -> Iterator[str]:
     """Yield the lines of Example 1, as in the course: the state after each UWB update."""
-    kf_run = run_example_1()
+    kf_run = run_aisle_example()
     for index, state in kf_run.steps.loc[kf_run.updates.index].iterrows():
         time_s = float(str(index))
         yield (
@@ -60,7 +60,7 @@ def format_kalman_lines() -> Iterator[str]:
 
 def format_loop_lines() -> Iterator[str]:
     """Yield the lines of Example 2: the loop closure error, and the five corrected corners."""
-    odometry = np.array(ODOMETRY_M)
+    odometry = np.array(ODOMETRY_CORNERS_M)
     length_m = cumulative_distance(odometry)[-1]
     x_error_m, y_error_m = closure_error_m = odometry[-1] - odometry[0]
     yield (

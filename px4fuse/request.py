@@ -235,8 +235,8 @@ class EvaluationRequest(_BaseRequest, frozen=True, kw_only=True):
 Request = ComparisonRequest | LoopRequest | WhatIfRequest
 
 
-# Unit of a field, by the suffix of its name
-SUFFIX_UNITS = {"_m_s2": "m/s²", "_m": "m", "_s": "s", "_deg": "°"}
+# Unit of a field of a request, by the suffix of its name
+UNIT_BY_SUFFIX = {"_m_s2": "m/s²", "_m": "m", "_s": "s", "_deg": "°"}
 _POSITION_OPTIONS = {
     "path": "--position",
     "body": "--body",
@@ -256,7 +256,8 @@ def _make_option_names(
     ``renamed_options`` are exceptions from the rule ``max_gap_s`` → ``--max-gap``.
     """
     option_names = {
-        field.name: "--" + re.sub(f"({'|'.join(SUFFIX_UNITS)})$", "", field.name).replace("_", "-")
+        field.name: "--"
+        + re.sub(f"({'|'.join(UNIT_BY_SUFFIX)})$", "", field.name).replace("_", "-")
         for field in msgspec.structs.fields(request_type)
         if not field.required and field.name not in excluded_fields
     }
@@ -284,10 +285,10 @@ COMPARISON_OPTIONS = OPTION_NAMES[ComparisonRequest]
 _SHARED_OPTION_NAMES = {"position": "--position", "changes": "--set", "scheduler": "--scheduler"}
 
 
-def with_options(text: str, option_names: Mapping[str, str] = COMPARISON_OPTIONS) -> str:
+def replace_argument_names(text: str, option_names: Mapping[str, str] = COMPARISON_OPTIONS) -> str:
     """Replace Python arguments in backticks by command-line options.
 
-    >>> with_options("`sigma_z_m` 0 is out of range: give 0.0001 to 100 m.")
+    >>> replace_argument_names("`sigma_z_m` 0 is out of range: give 0.0001 to 100 m.")
     '--sigma-z 0 is out of range: give 0.0001 to 100 m.'
     """
     all_option_names = {**_SHARED_OPTION_NAMES, **option_names}
@@ -305,11 +306,11 @@ def command_line(
     command : str, optional
         Name of the command; by default from the type of ``request``.
     for_shell : bool
-        True: paths, quoted for the shell of this system. False: file names, quoted for a POSIX
-        shell.
+        True to run the command here: complete paths, quoted for the shell of this system. False to
+        print it in a report: file names only, quoted for a POSIX shell.
     """
     shown_request = request if for_shell else request.with_file_names()
-    # required fields are input files, and all other fields are options
+    # fields of the request without a default are input files, and all others are options
     files = [
         getattr(shown_request, field.name)
         for field in msgspec.structs.fields(shown_request)
@@ -349,8 +350,8 @@ def format_settings_suffix(request: ComparisonRequest | EvaluationRequest | Loop
     """
     name_suffix = ""
     for option, value in _list_changed_options(request.with_file_names()):
-        text = PurePath(value).stem if option == "--position" and value is not None else value
-        name_suffix += f"_{option[2:]}" + ("" if text is None else f"-{text}")
+        value_text = PurePath(value).stem if option == "--position" and value is not None else value
+        name_suffix += f"_{option[2:]}" + ("" if value_text is None else f"-{value_text}")
     return re.sub(r"[^\w.,+-]+", "-", name_suffix)
 
 
@@ -361,10 +362,10 @@ def _list_changed_options(request: msgspec.Struct) -> Iterator[tuple[str, str | 
         value = getattr(request, field.name)
         if field.name not in option_names or value == field.default:
             continue
-        values = value if field.name in ("axes", "closures", "rpe") else (value,)
-        for single_value in values:
-            text = None if isinstance(single_value, bool) else _format_value(single_value)
-            yield option_names[field.name], text
+        option_values = value if field.name in ("axes", "closures", "rpe") else (value,)
+        for single_value in option_values:
+            value_text = None if isinstance(single_value, bool) else _format_value(single_value)
+            yield option_names[field.name], value_text
     if (position := getattr(request, "position", None)) is not None:
         yield from _list_changed_options(position)
 

@@ -18,10 +18,14 @@ def request_of(settings: Settings | None = None, **choices: Any) -> ComparisonRe
 
 
 def prepare(
-    flight: Flight, settings: Settings | None = None, *, keep_as_sent: bool = False, **choices: Any
+    flight: Flight,
+    settings: Settings | None = None,
+    *,
+    keep_positions_as_sent: bool = False,
+    **choices: Any,
 ) -> PreparedComparison:
     return preparation.prepare_comparison_inputs(
-        flight, request_of(settings, **choices), keep_as_sent=keep_as_sent
+        flight, request_of(settings, **choices), keep_positions_as_sent=keep_positions_as_sent
     )
 
 

@@ -20,13 +20,15 @@ from px4fuse.request import ComparisonRequest
 @pytest.fixture(scope="session")
 def explored(sample_log: Path, tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, Analysis]:
     """Explore page and analysis of the sample flight."""
-    from px4fuse.explore.page import html_text  # imported here, because Bokeh is slow to import
+    from px4fuse.explore.page import (
+        make_analysis_page,
+    )  # imported here, because Bokeh is slow to import
 
     request = ComparisonRequest(log=str(sample_log))
     # looked up at run time, because a fixture replaces it
     analysis = px4fuse.diagnose.diagnose(request)
     file = tmp_path_factory.mktemp("explore") / "sample.html"
-    file.write_bytes(html_text(analysis).encode())
+    file.write_bytes(make_analysis_page(analysis).encode())
     return file, analysis
 
 

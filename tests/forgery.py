@@ -22,7 +22,7 @@ from pypdf.generic import (
     NumberObject,
 )
 
-from px4fuse.core.reading import files_by_sha256
+from px4fuse.core.reading import hash_files
 from px4fuse.errors import ResultsError
 from px4fuse.results.contract import ReportedResults, to_json
 from px4fuse.results.reading import read_results
@@ -244,7 +244,7 @@ class VerifiedReport:
 
 
 def make_verified_report(pdf: bytes, log: Path) -> VerifiedReport:
-    files = files_by_sha256([log])
+    files = hash_files([log])
     again = verification.recompute_report(read_attached_results(pdf), files)
     drawn = again[1]()
     return VerifiedReport(

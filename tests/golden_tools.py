@@ -22,7 +22,7 @@ from matplotlib.lines import Line2D
 from matplotlib.patches import Patch
 from matplotlib.text import Text
 
-from px4fuse.report.page import Block
+from px4fuse.report.page import PageBlock
 
 GOLDEN = Path(__file__).with_name("golden")
 # Fields of the results that depend on computer, file or command
@@ -185,7 +185,7 @@ def of_figure(figure: Figure) -> Iterator[str]:
         yield from of_axes(axes)
 
 
-def of_blocks(blocks: Sequence[Block]) -> Iterator[str]:
+def of_blocks(blocks: Sequence[PageBlock]) -> Iterator[str]:
     """Describe the blocks of pages, one line per block, table row and artist."""
     for block in blocks:
         inner = ("figure", "axes", "columns", "blocks", "rows")

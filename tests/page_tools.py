@@ -11,12 +11,12 @@ from matplotlib.axes import Axes
 from pypdf import PdfReader
 
 from px4fuse.report import fonts
-from px4fuse.report.page import Block, Page, to_typst_data
-from px4fuse.report.style import report_style
+from px4fuse.report.page import Page, PageBlock, to_typst_data
+from px4fuse.report.style import apply_report_style
 from px4fuse.report.typesetting import compile_pdf
 
 
-def every(blocks: Sequence[Block]) -> Iterator[Block]:
+def every(blocks: Sequence[PageBlock]) -> Iterator[PageBlock]:
     """Yield blocks and nested blocks in order."""
     for block in blocks:
         yield block
@@ -74,7 +74,7 @@ def set_by_typst(*pages: Page) -> list[str]:
 
 
 def pdf_of(*pages: Page) -> bytes:
-    with report_style():
+    with apply_report_style():
         blocks = to_typst_data([block for page in pages for block in page.blocks], "log.ulg")
     report = {
         "title": "t", "author": "a", "head": "", "student": "", "foot": "", "results": None,

@@ -14,7 +14,7 @@ from flights import aisle_flight
 from pypdf import PdfReader
 from ulog_tools import gnss_log, seconds_of, stamps
 
-from px4fuse.analysis import AidsOnlyAnalysis, failed_checks
+from px4fuse.analysis import AidsOnlyAnalysis, find_failed_checks
 from px4fuse.ekf2.aids import AidResult, evaluate_aids
 from px4fuse.errors import MissingDataError
 from px4fuse.findings import aids as aids_detector
@@ -293,7 +293,7 @@ def test_compare_with_checks_option_exits_with_1_on_sensor_fault(
 def test_checks_option_accepts_underconfident_aiding_source(sigma: float, bad: bool) -> None:
     made = with_aids(gnss_pos=aid_log(sigma=sigma))
     alone = AidsOnlyAnalysis(made, evaluate_aids(made), Unavailable("it", "not there", "Log it."))
-    assert failed_checks(alone) == ({"GNSS position": "overconfident"} if bad else {})
+    assert find_failed_checks(alone) == ({"GNSS position": "overconfident"} if bad else {})
 
 
 def test_compare_of_log_without_position_evaluates_other_sensors(tmp_path: Path) -> None:

@@ -335,18 +335,18 @@ def test_batch_log_changed_during_reading_is_reported_failed(flights, tmp_path, 
 def test_batch_interrupted_run_reuses_finished_results(
     flights, undisturbed, tmp_path, monkeypatch, ends
 ):
-    write_all, written = run.write_all, []
+    write_output_files, written = run.write_output_files, []
 
     def full(contents: dict[Path, bytes]) -> None:
         if written and (ends is OutputError or tmp_path / "fleet.csv" not in contents):
             raise ends("results/f.json: cannot be written (No space left on device).")
-        write_all(contents)
+        write_output_files(contents)
         written.append(contents)
 
-    monkeypatch.setattr(run, "write_all", full)
+    monkeypatch.setattr(run, "write_output_files", full)
     with pytest.raises(ends, match=r"No space left .*"):
         px4fuse.run_batch(flights, tmp_path)
-    monkeypatch.setattr(run, "write_all", write_all)
+    monkeypatch.setattr(run, "write_output_files", write_output_files)
     if ends is KeyboardInterrupt:  # the table has been written
         assert len(set(pd.read_parquet(tmp_path / "fleet.parquet")["name"])) == 1
     # a log without a valid cache file is compared again

@@ -21,7 +21,7 @@ from px4fuse.filter.settings import Settings
 from px4fuse.findings import Finding
 from px4fuse.flight.model import RECEIVED_ORIGIN
 from px4fuse.readers import read_log
-from px4fuse.report.card_text import card_lines
+from px4fuse.report.card_text import format_card_lines
 from px4fuse.request import ComparisonRequest
 from px4fuse.simulation.faults import parse_faults
 from px4fuse.simulation.flights import simulate_flight
@@ -172,8 +172,8 @@ def test_diagnosis_of_unreadable_log_shows_first_bytes_of_file(tmp_path) -> None
     path.write_bytes(b"\xa3\x95\x80\x01" * 300)
     with pytest.raises(LogError) as caught:
         read_log(path)
-    lines = [text for line in card_lines(build_unusable_log_card(caught.value, path)) for text in
-             line.wrap(100)]  # fmt: skip
+    card = build_unusable_log_card(caught.value, path)
+    lines = [text for line in format_card_lines(card) for text in line.wrap(100)]
     assert lines == [
         "error[log_unreadable]: a.bin: the file is an ArduPilot DataFlash log, not a PX4 ULog",
         "  read     1,200 bytes; first bytes A3 95 80 01 (of a ULog: 55 4C 6F 67)",

@@ -17,7 +17,7 @@ DELAY = Action("EKF2", "EKF2_EV_DELAY 0 → 264 ms", ("param set EKF2_EV_DELAY 2
 
 
 def text_of(card: Card) -> list[str]:
-    return [text for line in card_text.card_lines(card) for text in line.wrap(100)]
+    return [text for line in card_text.format_card_lines(card) for text in line.wrap(100)]
 
 
 @pytest.mark.parametrize(
@@ -65,7 +65,7 @@ def test_diagnosis_text_joins_alternative_actions_by_either_or() -> None:
     assert lines[first + 1].startswith("  OR EKF2 (console)  EKF2_EV_DELAY 0 → 264 ms")
     assert lines[first + 2].split() == ["param", "set", "EKF2_EV_DELAY", "264"]
     assert lines[first + 3].startswith("  KF (shell)  ")
-    closing = " ".join(line.text for line in card_text.closing_lines(card))
+    closing = " ".join(line.text for line in card_text.format_closing_lines(card))
     assert "Console means the MAVLink Console" in closing
     assert closing.endswith(f"px4fuse explain {card.id}")
 

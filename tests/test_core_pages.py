@@ -18,7 +18,7 @@ from px4fuse.findings import Finding
 from px4fuse.flight.model import Dropout, Reset
 from px4fuse.report import cover, event_marks, flight, panels
 from px4fuse.report.page import Page
-from px4fuse.report.style import report_style
+from px4fuse.report.style import apply_report_style
 from px4fuse.request import ComparisonRequest
 from px4fuse.results.build import results
 from px4fuse.results.contract import ComparisonResults
@@ -34,7 +34,7 @@ def document(
 
 
 def drawn(draw, of: tuple[Analysis, ComparisonResults]) -> list[Page]:
-    with report_style():
+    with apply_report_style():
         return list(draw(*of))
 
 
@@ -53,7 +53,7 @@ def eventful() -> Analysis:
 
 
 def test_event_symbols_in_plots_are_labelled_by_event_type(eventful: Analysis) -> None:
-    labels = [artist.get_label() for artist in event_marks.legend_entries(eventful)]
+    labels = [artist.get_label() for artist in event_marks.make_legend_entries(eventful)]
     assert labels == [
         "on the ground", "gap in position source", "log dropout",
         "EKF2 rejected", "outlier", "EKF2 reset", "take-off", "landing",
@@ -72,7 +72,7 @@ def test_event_symbols_in_plots_are_labelled_by_event_type(eventful: Analysis) -
     ]  # fmt: skip
     # rejected, outliers, resets, take-off, landing
     assert [len(line.get_xdata()) for line in axes.lines[2:]] == [1, 1, 1]
-    assert set(axes.lines[1].get_xdata()) <= set(event_marks.outlier_times(eventful))
+    assert set(axes.lines[1].get_xdata()) <= set(event_marks.find_outlier_times(eventful))
 
 
 def test_event_symbols_of_long_flight_do_not_overlap() -> None:

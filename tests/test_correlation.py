@@ -25,8 +25,8 @@ def test_cross_correlation_equals_direct_sum_at_each_lag(is_complex: bool) -> No
         x, y = a[both], b[[i + lag for i in both]]
         x, y = (v - v.mean() if len(v) else v for v in (x, y))
         np.testing.assert_allclose(found.covariance[k], np.sum(x.conj() * y), atol=1e-10)
-        np.testing.assert_allclose(found.energy_a[k], np.sum(np.abs(x) ** 2), atol=1e-10)
-        np.testing.assert_allclose(found.energy_b[k], np.sum(np.abs(y) ** 2), atol=1e-10)
+        np.testing.assert_allclose(found.square_sum_a[k], np.sum(np.abs(x) ** 2), atol=1e-10)
+        np.testing.assert_allclose(found.square_sum_b[k], np.sum(np.abs(y) ** 2), atol=1e-10)
 
 
 def test_autocovariance_equals_sum_of_products() -> None:

@@ -19,7 +19,7 @@ from px4fuse.card.model import Action, AidRow, Card, Cause, Note
 from px4fuse.flight.model import Reset
 from px4fuse.report import cover, cover_panels
 from px4fuse.report.page import Page
-from px4fuse.report.style import report_style
+from px4fuse.report.style import apply_report_style
 from px4fuse.request import ComparisonRequest
 from px4fuse.results.build import results
 
@@ -36,7 +36,7 @@ def text_of(card: Card) -> str:
 
 def drawn(analysis: Analysis) -> Page:
     made = results(ComparisonRequest(log="aisle.ulg"), analysis)
-    with report_style():
+    with apply_report_style():
         (page,) = cover.draw_pages(analysis, made)
     return page
 
@@ -225,7 +225,7 @@ def test_report_cover_from_same_input_is_byte_identical(eventful: Analysis) -> N
 @pytest.mark.parametrize("count", [3, 6])
 def test_report_cover_long_text_moves_plots_to_second_page(eventful: Analysis, count: int) -> None:
     page = page_of(replace(SMALL_SIGMA_A, causes=SMALL_SIGMA_A.causes * count))
-    with report_style():
+    with apply_report_style():
         cover_panels.write_panels(
             page.blocks[0], eventful, SMALL_SIGMA_A, cover.find_free_height(page)
         )
@@ -237,7 +237,7 @@ def test_report_cover_long_text_moves_plots_to_second_page(eventful: Analysis, c
 def test_report_section_title_is_on_page_of_its_first_plot() -> None:
     sections = [Page(f"Section {number}") for number in range(4)]
     for section in sections:
-        section.panel("Panel", 210.0)
+        section.add_panel("Panel", 210.0)
     sheets = set_by_typst(*sections)
     assert [sheet.count("Section") for sheet in sheets] == [2, 2]
     assert [sheet.count("Panel") for sheet in sheets] == [2, 2]

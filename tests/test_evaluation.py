@@ -26,11 +26,11 @@ from px4fuse.trajectory.scores import (
     MIN_BOOTSTRAP_BLOCKS,
     Delta,
     RmseInterval,
-    autocorrelation_time,
+    compute_autocorrelation_time,
     compute_relative_error,
     compute_statistics,
     estimate_rmse_interval,
-    find_pairs,
+    find_pose_pairs,
 )
 from px4fuse.trajectory.time_offset import compute_clock_offset_s, estimate_time_offset
 
@@ -285,7 +285,7 @@ def test_rpe_of_scaled_track_is_proportional_to_distance() -> None:
         transformed(reference, TURN, SHIFT, 1.02, kind="vio"), reference, alignment="se3"
     )
     for one in got.rpe:
-        start, end = find_pairs(got.reference_m, got.time_s, Delta(one.delta, one.unit))
+        start, end = find_pose_pairs(got.reference_m, got.time_s, Delta(one.delta, one.unit))
         chord = np.linalg.norm(got.reference_m[end] - got.reference_m[start], axis=1)
         assert asdict(one.translation_m) == pytest.approx(asdict(compute_statistics(0.02 * chord)))
 
@@ -304,9 +304,9 @@ def test_rpe_pose_pairs_have_the_requested_distance(steps: list[float], value: f
         j = int(np.argmin(miss))
         if miss[j] <= 0.1 * value:
             expected.append((i, i + 1 + j))
-    start, end = find_pairs(position, time, Delta(value, "m"))
+    start, end = find_pose_pairs(position, time, Delta(value, "m"))
     assert list(zip(start.tolist(), end.tolist(), strict=True)) == expected
-    start, end = find_pairs(position, time, Delta(2.0, "s"), all_pairs=False)
+    start, end = find_pose_pairs(position, time, Delta(2.0, "s"), all_pairs=False)
     np.testing.assert_array_equal(start, np.arange(0, len(along) - 2, 2))
     np.testing.assert_array_equal(end, start + 2)
 
@@ -585,8 +585,8 @@ def test_autocorrelation_time_of_ar1_series_equals_closed_form() -> None:
     white = np.random.default_rng(10).normal(size=200_000)
     for phi in (0.0, 0.5, 0.9):
         values = lfilter([1.0], [1.0, -phi], white)
-        assert autocorrelation_time(values) == pytest.approx((1 + phi) / (1 - phi), rel=0.1)
-    assert autocorrelation_time(np.ones(50)) == 1.0
+        assert compute_autocorrelation_time(values) == pytest.approx((1 + phi) / (1 - phi), rel=0.1)
+    assert compute_autocorrelation_time(np.ones(50)) == 1.0
 
 
 def test_rmse_interval_from_too_few_blocks_is_unavailable() -> None:

@@ -16,12 +16,12 @@ from trajectory_tools import flight, transformed
 from px4fuse.core.text import format_metres
 from px4fuse.loop.tracks import read_source
 from px4fuse.report.evaluation import (
+    describe_rpe_growth,
+    describe_unaligned_rmse,
     draw_pages,
-    rpe_growth_sentence,
-    unaligned_sentence,
 )
 from px4fuse.report.page import Page
-from px4fuse.report.style import report_style
+from px4fuse.report.style import apply_report_style
 from px4fuse.trajectory.evaluation import Evaluation, evaluate
 from px4fuse.trajectory.model import Trajectory
 from px4fuse.trajectory.scores import Delta
@@ -56,7 +56,7 @@ def across(values: np.ndarray) -> np.ndarray:
 
 
 def pages(score: Evaluation) -> list[Page]:
-    with report_style():
+    with apply_report_style():
         return list(draw_pages(score, None))
 
 
@@ -90,14 +90,14 @@ def test_unaligned_rmse_in_evaluation_report_equals_evo() -> None:
     ape = metrics.APE(metrics.PoseRelation.translation_part)
     ape.process_data(sync.associate_trajectories(of_evo(true), of_evo(estimate)))
     rmse = ape.get_statistic(metrics.StatisticsType.rmse)
-    sentence = unaligned_sentence(score)
+    sentence = describe_unaligned_rmse(score)
     assert f"RMSE before alignment {format_metres(rmse)} m" in sentence
     assert f"rotation {np.degrees(0.5):.1f}°" in sentence
     assert "scale" not in sentence
     centre = true.position_m.mean(axis=0) - estimate.position_m.mean(axis=0)
     assert f"translation {format_metres(np.linalg.norm(centre))} m" in sentence
     half = transformed(true, Rotation.identity(), np.zeros(3), 0.5, kind="slam")
-    assert ", scale 2 (" in unaligned_sentence(evaluate(half, true, alignment="sim3"))
+    assert ", scale 2 (" in describe_unaligned_rmse(evaluate(half, true, alignment="sim3"))
 
 
 @pytest.mark.parametrize(("kind", "times"), [("noise", 1.0), ("walk", 10**0.5), ("scale", 10.0)])
@@ -109,11 +109,11 @@ def test_rpe_growth_distinguishes_noise_from_drift(kind: str, times: float) -> N
         "walk": np.cumsum(rng.normal(0.0, 0.01, (n, 3)), axis=0),
         "scale": 0.05 * line(n).position_m,
     }[kind]
-    sentence = rpe_growth_sentence(evaluate_with_error(error).rpe)
+    sentence = describe_rpe_growth(evaluate_with_error(error).rpe)
     growth = re.search(r"From 1 to 10 m the RMSE grows ([\d.]+) times", sentence)
     assert float(growth[1]) == pytest.approx(times, rel=0.1)
     assert "1 for independent noise, 3.2 for a random walk, 10 for a scale" in sentence
-    assert "Give a second distance" in rpe_growth_sentence(evaluate_with_error(error).rpe[:1])
+    assert "Give a second distance" in describe_rpe_growth(evaluate_with_error(error).rpe[:1])
 
 
 # -- panels ----------------------------------------------------------------------------------------

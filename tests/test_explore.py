@@ -28,7 +28,7 @@ from px4fuse.comparison.model import FILTER_NAMES, AxisComparison
 from px4fuse.core.text import format_ratio
 from px4fuse.diagnose import prepare_comparison, read_flight
 from px4fuse.explore import page as pages
-from px4fuse.explore.page import html_text
+from px4fuse.explore.page import make_analysis_page
 from px4fuse.flight.model import Flight
 from px4fuse.request import ComparisonRequest
 
@@ -48,7 +48,7 @@ def bare(flight: Flight) -> Analysis:
 
 
 def page_of(analysis: Analysis, file: Path) -> Path:
-    file.write_bytes(html_text(analysis).encode())
+    file.write_bytes(make_analysis_page(analysis).encode())
     return file
 
 
@@ -318,7 +318,7 @@ def test_explore_page_without_ekf2_and_truth_shows_only_kf(
 @pytest.fixture
 def no_page(monkeypatch: pytest.MonkeyPatch) -> None:
     """Replace the page by an empty one, for tests of the output path."""
-    monkeypatch.setattr(pages, "html_text", lambda _: "")
+    monkeypatch.setattr(pages, "make_analysis_page", lambda _: "")
 
 
 @pytest.mark.usefixtures("no_page")

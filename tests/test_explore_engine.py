@@ -19,7 +19,7 @@ from flights import Imu, Uwb, aisle_flight
 from px4fuse.comparison.model import Comparison
 from px4fuse.comparison.preparation import shift_clock
 from px4fuse.explore.data import OFFSET_SLIDER_HALF_RANGE_S, make_kf_inputs, undo_time_offset
-from px4fuse.explore.packing import FINE_STEPS_PER_UNIT, Packer
+from px4fuse.explore.packing import FINE_STEPS_PER_UNIT, ArrayEncoder
 from px4fuse.filter.kalman import Replay, predict_state, replay
 from px4fuse.filter.settings import Settings
 from px4fuse.filter.signals import make_axes
@@ -70,11 +70,11 @@ def engine(browser: Browser, tmp_path_factory: pytest.TempPathFactory) -> Browse
 def in_browser(
     engine: Browser, comparison: Comparison, tries: list[tuple[int, Settings]]
 ) -> list[dict[str, dict[str, list[float]]]]:
-    packer = Packer()
-    flight = make_kf_inputs(comparison, packer)
+    encoder = ArrayEncoder()
+    flight = make_kf_inputs(comparison, encoder)
     tries_for_page = [(at, asdict(settings)) for at, settings in tries]
     values = {
-        "text": packer.text(), "specs": packer.array_specs, "flight": json.dumps(flight),
+        "text": encoder.text(), "specs": encoder.array_specs, "flight": json.dumps(flight),
         "tries": tries_for_page,
     }  # fmt: skip
     return list(ask(engine, SCRIPT % {name: json.dumps(one) for name, one in values.items()}))
@@ -148,17 +148,17 @@ def close(page: list[float], expected: Any, column: str, settings: Settings) -> 
 
 def test_javascript_unpack_restores_packed_arrays(engine: Browser) -> None:
     rng = np.random.default_rng(2)
-    packer = Packer()
+    encoder = ArrayEncoder()
     arrays = [
         rng.normal(0.0, 100.0, 500), np.empty(0), np.array([-1e9, 1e9, 0.0]),
         np.arange(1000) / 250.0, np.zeros(5),
     ]  # fmt: skip
     for values in arrays:
-        packer.add(values)
-    packer.add_times(np.array([0.1, 0.2, 123.456789]))
+        encoder.add(values)
+    encoder.add_times(np.array([0.1, 0.2, 123.456789]))
     unpacked = ask(
         engine,
-        f"Engine.unpack({json.dumps(packer.text())}, {json.dumps(packer.array_specs)})"
+        f"Engine.unpack({json.dumps(encoder.text())}, {json.dumps(encoder.array_specs)})"
         ".then((all) => all.map((one) => Array.from(one)))",
     )
     for back, values in zip(unpacked, arrays, strict=False):
@@ -170,8 +170,8 @@ def test_javascript_unpack_restores_packed_arrays(engine: Browser) -> None:
 
 def test_javascript_kf_with_too_few_measurements_returns_null(engine: Browser) -> None:
     comparison = compare(aisle_flight(duration_s=30.0))
-    packer = Packer()
-    flight = make_kf_inputs(comparison, packer)
+    encoder = ArrayEncoder()
+    flight = make_kf_inputs(comparison, encoder)
     flight["segment"] = [flight["segment"][0], flight["segment"][0] + 0.05]
     flight["axes"] = [{"time": [0.0, 1.0, 2.0], "z": [0.0, 0.0, 0.0]}]
     settings = asdict(Settings(input="zero"))

@@ -18,7 +18,7 @@ from px4fuse.card.model import map_ratio_to_axis
 from px4fuse.card.verdicts import make_sigma_verdicts
 from px4fuse.core.text import format_metres, format_ratio
 from px4fuse.diagnose import diagnose, prepare_comparison
-from px4fuse.explore.page import html_text
+from px4fuse.explore.page import make_analysis_page
 from px4fuse.report.card_html import make_diagnosis_card
 from px4fuse.request import ComparisonRequest
 
@@ -170,7 +170,7 @@ def test_explore_page_apply_button_takes_recommended_values(
 ) -> None:
     analysis = diagnose(ComparisonRequest(log=str(sample_log), sigma_a_m_s2=0.001))
     file = tmp_path / "small.html"
-    file.write_bytes(html_text(analysis).encode())
+    file.write_bytes(make_analysis_page(analysis).encode())
     show(browser, file)
     command = browser.ask("document.querySelector('[data-apply]').dataset.apply")
     assert shlex.split(command)[:3] == ["px4fuse", "compare", str(sample_log)]
@@ -179,7 +179,9 @@ def test_explore_page_apply_button_takes_recommended_values(
     value = browser.ask("document.getElementById('sigma-a-value').value")
     assert f"--sigma-a {value}" in command
     assert "KF is consistent with these settings" in text(browser, "card")
-    assert "Diagnosis with the original settings: ■ ERROR" in text(browser, "card")
+    assert "Diagnosis with the original settings (before your changes): ■ ERROR" in text(
+        browser, "card"
+    )
     assert browser.complaints() == []
 
 

@@ -14,7 +14,7 @@ from hypothesis import strategies as st
 from px4fuse.errors import TrajectoryError
 from px4fuse.readers.g2o import format_g2o, parse_g2o, read_g2o
 from px4fuse.trajectory.graph import lie, solver
-from px4fuse.trajectory.graph.model import POSES_FROM_FILE, PoseGraph
+from px4fuse.trajectory.graph.model import INITIAL_POSES_FROM_FILE, PoseGraph
 
 UNIT_2 = "1 0 0 1 0 1"
 UNIT_3 = "1 0 0 0 0 0 1 0 0 0 0 1 0 0 0 1 0 0 1 0 1"
@@ -37,7 +37,7 @@ def test_parse_g2o_reads_information_as_upper_triangle_by_rows(whole: str, unit:
     expected = np.zeros((size, size))
     expected[upper] = np.arange(len(upper[0])) + 100.0 * (upper[0] == upper[1])
     graph = parse_g2o(whole.replace(unit, " ".join(map(str, expected[upper]))), "a.g2o")
-    assert (graph.dimension, graph.initialised) == (size // 3 + 1, POSES_FROM_FILE)
+    assert (graph.dimension, graph.initialised) == (size // 3 + 1, INITIAL_POSES_FROM_FILE)
     np.testing.assert_array_equal(np.triu(graph.information[0]), expected)
     np.testing.assert_array_equal(graph.information[0], graph.information[0].T)
 
@@ -62,7 +62,7 @@ def test_parse_g2o_without_vertices_initialises_poses_from_edges() -> None:
     graph = parse_g2o(f"EDGE_SE2 7 9 1 0 0 {UNIT_2}\nEDGE_SE2 9 12 1 0 1 {UNIT_2}", "a.g2o")
     assert graph.ids.tolist() == [7, 9, 12]
     np.testing.assert_allclose(graph.poses, [[0, 0, 0], [1, 0, 0], [2, 0, 1]], atol=1e-12)
-    assert graph.initialised in {"composed odometry edges", "chordal initialisation"}
+    assert graph.initialised in {"composition of the odometry edges", "chordal initialisation"}
 
 
 EDGE = f"EDGE_SE2 0 1 1 0 0 {UNIT_2}"

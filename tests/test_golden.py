@@ -37,7 +37,7 @@ from px4fuse.cli.mcp import make_tools, run_command
 from px4fuse.core.text import to_json_types
 from px4fuse.explore.data import make_flight_data
 from px4fuse.explore.figures import make_document_json
-from px4fuse.explore.packing import Packer
+from px4fuse.explore.packing import ArrayEncoder
 from px4fuse.report import pdf
 from px4fuse.simulation.faults import FAULT_TYPES, parse_faults
 from px4fuse.simulation.flights import make_answer_key, simulate
@@ -249,7 +249,7 @@ def test_batch_page_matches_reference_file() -> None:
 @pytest.mark.usefixtures("cached_analyses")
 def test_explore_page_plots_match_reference_file(sample_log: Path) -> None:
     analysis = px4fuse.compare(str(sample_log))
-    data = make_flight_data(analysis, Packer())
+    data = make_flight_data(analysis, ArrayEncoder())
     document, _ = make_document_json(data)
     ids: dict[str, str] = {}
 

@@ -24,7 +24,7 @@ from px4fuse.classroom.grading.grade import GradeOutcome, grade
 from px4fuse.classroom.grading.model import Grade, GradedReport
 from px4fuse.classroom.grading.rubric import read_rubric
 from px4fuse.cli.outputs import Interrupted
-from px4fuse.core.reading import files_by_sha256
+from px4fuse.core.reading import hash_files
 from px4fuse.core.workers import JobFailure
 from px4fuse.verification import pages
 from px4fuse.verification.model import Verification
@@ -190,7 +190,7 @@ def test_grade_report_without_its_log_makes_points_pending(tmp_path) -> None:
     shutil.copy(REPORT, tmp_path / "in")
     (tmp_path / "logs").mkdir()
     (tmp_path / "logs" / "another.ulg").write_bytes(b"x")
-    (sha256,) = files_by_sha256([LOG])
+    (sha256,) = hash_files([LOG])
     rubric, logs = read_rubric(None), [tmp_path / "logs"]
     for given, status in ((sha256, "cannot verify"), ("0" * 64, "other log")):
         key = AnswerKey("aisle", (RightAnswers("1", "Ada", "1.ulg", given),))

@@ -134,18 +134,18 @@ def test_batch_refuses_output_folder_that_contains_logs(tmp_path, monkeypatch) -
 
 
 def test_write_to_protected_input_file_is_refused(tmp_path) -> None:
-    from px4fuse.core.input_files import inputs_protected
+    from px4fuse.core.input_files import protect_inputs
     from px4fuse.core.reading import read_text
-    from px4fuse.core.writing import write_all
+    from px4fuse.core.writing import write_output_files
 
     path, other = tmp_path / "a", tmp_path / "b"
     path.write_text("mine")
-    with inputs_protected():
+    with protect_inputs():
         read_text(path, OutputError, 100)
         with pytest.raises(OutputError, match="a is an input"):
-            write_all({other: b"x", path: b"x"})
+            write_output_files({other: b"x", path: b"x"})
         assert not other.exists()
-    write_all({path: b"x"})
+    write_output_files({path: b"x"})
     assert path.read_bytes() == b"x"
 
 
@@ -155,7 +155,7 @@ def test_input_file_without_inode_number_is_not_overwritten(tmp_path, monkeypatc
         add_input,
         check_output_folder,
         check_outputs,
-        inputs_protected,
+        protect_inputs,
     )
 
     real, real_names = Path.stat, Path.iterdir
@@ -172,7 +172,7 @@ def test_input_file_without_inode_number_is_not_overwritten(tmp_path, monkeypatc
     notes.write_text("mine")
     monkeypatch.setattr(Path, "stat", stat)
     monkeypatch.setattr(Path, "iterdir", lambda self: real_names(lower(self)))
-    with inputs_protected():
+    with protect_inputs():
         add_input(notes)
         check_outputs([notes.with_name("other.md")])
         with pytest.raises(OutputError):

@@ -14,7 +14,7 @@ from trajectory_tools import noisy_odometry, square
 from px4fuse.errors import SettingsError, TrajectoryError
 from px4fuse.findings import find_loop_findings
 from px4fuse.flight.model import Unavailable
-from px4fuse.lesson import ODOMETRY_M, format_loop_lines
+from px4fuse.lesson import ODOMETRY_CORNERS_M, format_loop_lines
 from px4fuse.loop.analysis import analyse, analyse_flight_loop
 from px4fuse.loop.corrections import (
     HEADINGS_CORRECTED_LABEL,
@@ -118,7 +118,7 @@ def test_loop_corrections_of_sample_flight_reduce_ate(sample_loop):
 
 
 def test_loop_command_on_lesson_example_2_equals_lesson_output() -> None:
-    corners = np.column_stack([np.array(ODOMETRY_M), np.zeros(len(ODOMETRY_M))])
+    corners = np.column_stack([np.array(ODOMETRY_CORNERS_M), np.zeros(len(ODOMETRY_CORNERS_M))])
     found = close_loop(Trajectory("corners", "vio", np.arange(5.0), corners, None, "FRD"))
     error, total = closure_error_vector_m(found), found.path_length_m
     corrected = path(found, "by_distance_plain").trajectory.position_m
@@ -127,7 +127,7 @@ def test_loop_command_on_lesson_example_2_equals_lesson_output() -> None:
         f"{found.closure_error_m / total:.1%}",
         *(
             f"({x:5.1f}, {y:5.1f}) -> ({a:5.2f}, {b:5.2f})"
-            for (x, y), (a, b, _) in zip(ODOMETRY_M, corrected, strict=True)
+            for (x, y), (a, b, _) in zip(ODOMETRY_CORNERS_M, corrected, strict=True)
         ),
     ]
 

@@ -18,12 +18,12 @@ from px4fuse.trajectory.graph import lie
 from px4fuse.trajectory.graph.covariance import gate_edges
 from px4fuse.trajectory.graph.initialisation import _initialise_chordal, initialise
 from px4fuse.trajectory.graph.model import (
-    POSES_FROM_CHORDAL,
-    POSES_FROM_ODOMETRY,
+    INITIAL_POSES_FROM_CHORDAL,
+    INITIAL_POSES_FROM_ODOMETRY,
     PoseGraph,
     compose_odometry,
+    compute_observed_directions,
     cost,
-    information_eigenvectors,
     residuals,
 )
 from px4fuse.trajectory.graph.solver import analyse_graph, solve
@@ -111,7 +111,7 @@ def test_chordal_initialisation_equals_dense_least_squares(dimension: int, seed:
     weights = [(-root, root) for root in roots]
     position = least_squares(weights, values, graph.poses[0, :d]).reshape(n - 1, d)
     made = _initialise_chordal(graph)
-    assert made.initialised == POSES_FROM_CHORDAL
+    assert made.initialised == INITIAL_POSES_FROM_CHORDAL
     np.testing.assert_array_equal(made.poses[0], graph.poses[0])
     np.testing.assert_allclose(lie.rotation_matrix(made.poses), rotation, atol=1e-7)
     np.testing.assert_allclose(made.poses[1:, :d], position, rtol=1e-6, atol=1e-6)
@@ -148,7 +148,7 @@ def test_pose_graph_minimum_cost_equals_gtsam(name: str) -> None:
 @pytest.mark.parametrize("name", ["SE-Sync_manhattan", "SE-Sync_CSAIL", "SE-Sync_kitti_00"])
 def test_g2o_without_vertices_starts_from_chordal_solution(name: str) -> None:
     graph = read_g2o(shared("pose_graphs") / f"{name}.g2o")
-    assert graph.initialised == POSES_FROM_CHORDAL
+    assert graph.initialised == INITIAL_POSES_FROM_CHORDAL
     assert cost(graph) < 1e-3 * cost(compose_odometry(graph))
     assert solve(graph).cost < 0.9 * cost(graph) or name == "SE-Sync_CSAIL"
 
@@ -180,7 +180,7 @@ def test_square_loop_closure_error_is_spread_by_distance(dimension: int) -> None
     graph = PoseGraph(
         dimension, np.arange(4 * side + 1), odometry, np.append(ends, 0),
         np.append(ends + 1, 4 * side), np.vstack([measured, back]), information,
-        POSES_FROM_ODOMETRY,
+        INITIAL_POSES_FROM_ODOMETRY,
     )  # fmt: skip
     solution = solve(graph)
     share = np.concatenate([[0.0], np.cumsum(length)]) / np.sum(length)
@@ -284,7 +284,7 @@ def laps(seed: int, false: int = 1) -> tuple[PoseGraph, np.ndarray, np.ndarray]:
     chain = np.arange(n - 1)
     graph = PoseGraph(
         3, np.arange(n), odometry, np.concatenate([chain, i]), np.concatenate([chain + 1, j]),
-        np.vstack([steps, closures]), information, POSES_FROM_ODOMETRY,
+        np.vstack([steps, closures]), information, INITIAL_POSES_FROM_ODOMETRY,
     )  # fmt: skip
     true = np.ones(len(graph.first_nodes), dtype=bool)
     true[n - 1 + count :] = False
@@ -308,7 +308,7 @@ def test_robust_pose_graph_removes_false_loop_closure() -> None:
             assert solution.converged or not robust
             off[robust].append(ate(solution.poses, truth) / known - 1.0)
             assert np.all((solution.weights >= 0.0) & (solution.weights <= 1.0))
-            assert np.all(solution.weights[graph.find_successive()] == 1.0)
+            assert np.all(solution.weights[graph.find_successive_edges()] == 1.0)
             squared = residuals(graph, solution.poses).chi2
             assert solution.cost == pytest.approx(0.5 * np.sum(solution.weights * squared))
             if robust:
@@ -391,7 +391,7 @@ def test_loop_closure_gate_distance_equals_gtsam(dimension: int, is_back: bool) 
     """For an exact closure the distance depends on the odometry covariance only."""
     gtsam = pytest.importorskip("gtsam")
     graph = odometry_graph(dimension, 1e-3)
-    chain = graph.select_edges(graph.find_successive())
+    chain = graph.select_edges(graph.find_successive_edges())
     factors, values = gtsam_problem(gtsam, chain)
     kind, free = "Pose2" if dimension == 2 else "Pose3", TANGENT[dimension]
     held = getattr(values, f"at{kind}")(0)
@@ -459,6 +459,6 @@ def test_information_eigenvectors_restore_information_matrix() -> None:
     """Correlated metres and radians of different size, two directions without information."""
     rng = np.random.default_rng(4)
     root = rng.normal(size=(6, 4)) * np.array([3.0, 2.0, 5.0, 40.0, 70.0, 20.0])[:, None]
-    directions, variance = information_eigenvectors(root @ root.T)
+    directions, variance = compute_observed_directions(root @ root.T)
     assert variance.shape == (4,)
     np.testing.assert_allclose((directions / variance) @ directions.T, root @ root.T, rtol=1e-9)

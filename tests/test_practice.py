@@ -26,7 +26,7 @@ from msgspec import structs
 
 from px4fuse.comparison.model import AxisComparison, Comparison
 from px4fuse.explore import practice
-from px4fuse.explore.practice import NOISY_UWB_FAULT, QUIZ_ANSWERS, QuizFault, draw_flights
+from px4fuse.explore.practice import NOISY_UWB_FAULT, QUIZ_ANSWERS, QuizFault, choose_random_flights
 from px4fuse.filter.settings import Settings
 from px4fuse.flight.model import Flight
 from px4fuse.simulation.faults import parse_faults
@@ -44,8 +44,8 @@ SEED, COUNT = 5, 3
 def test_practice_flights_contain_each_fault_equally_often(
     seed: int, level: int, count: int
 ) -> None:
-    rounds = draw_flights(seed, level, count)
-    assert draw_flights(seed, level, count) == rounds
+    rounds = choose_random_flights(seed, level, count)
+    assert choose_random_flights(seed, level, count) == rounds
     assert len(rounds) == count
     first = Counter(one.faults[0].choice if one.faults else "nothing" for one in rounds)
     assert max(first.values()) - min(first[name] for name in QUIZ_ANSWERS) <= 1
@@ -59,7 +59,7 @@ def test_practice_flights_contain_each_fault_equally_often(
 
 
 def test_practice_level_3_has_some_flights_with_two_faults() -> None:
-    rounds = [one for seed in range(5) for one in draw_flights(seed, 3, 12)]
+    rounds = [one for seed in range(5) for one in choose_random_flights(seed, 3, 12)]
     two = sum(len(one.faults) == 2 for one in rounds)
     assert 0.15 * len(rounds) < two < 0.5 * len(rounds)
 
@@ -72,7 +72,7 @@ def flown(mistake: QuizFault | None, level: int, seed: int) -> Flight:
     size = "" if mistake is None else mistake.sizes[level - 1]
     noisy = mistake is not None and mistake.name == NOISY_UWB_FAULT
     scenario = Scenario(
-        **practice.SCENARIO_VALUES,
+        **practice.SCENARIO_SETTINGS,
         length_m=9.0 + 0.7 * seed,
         heading_deg=50.0 * seed,
         seed=seed,
@@ -84,7 +84,7 @@ def flown(mistake: QuizFault | None, level: int, seed: int) -> Flight:
 
 def compared(flight: Flight, **settings: float) -> Comparison:
     chosen = Settings(**({"sigma_a_m_s2": practice.SIGMA_A_M_S2} | settings))
-    return compare(flight, chosen, keep_as_sent=True)
+    return compare(flight, chosen, keep_positions_as_sent=True)
 
 
 def kf_statistics(flight: Flight, **settings: float) -> Any:
@@ -198,7 +198,7 @@ def test_practice_page_html_source_does_not_show_solutions(quiz: Path) -> None:
     source = quiz.read_text(encoding="utf-8")
     answers = keys(quiz)
     assert [one["right"] for one in answers] == [
-        one.correct_answers for one in draw_flights(SEED, 1, COUNT)
+        one.correct_answers for one in choose_random_flights(SEED, 1, COUNT)
     ]
     for content in re.findall(r'id="content-\d+">([^<]+)<', source):
         flight = json.loads(content)["flight"]

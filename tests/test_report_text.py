@@ -22,14 +22,14 @@ from px4fuse.findings import Finding
 from px4fuse.flight.model import Unavailable
 from px4fuse.report import clock, fonts, notes
 from px4fuse.report.notes import write_markdown
-from px4fuse.report.page import Block, Page, replace_unprintable
+from px4fuse.report.page import Page, PageBlock, replace_unprintable
 from px4fuse.report.typesetting import compile_pdf
 from px4fuse.results.model import Student
 
 THAI, HAN, ARABIC = "สมชาย", "王小明", "محمد"
 
 
-def written(markdown: str) -> list[Block]:
+def written(markdown: str) -> list[PageBlock]:
     page = Page()
     write_markdown(page, markdown)
     return page.blocks
@@ -40,7 +40,7 @@ def _fresh(monkeypatch: pytest.MonkeyPatch) -> Any:
     """Clear the cached fonts before and after the test."""
 
     def clear_caches() -> None:
-        for cached in (fonts.find_font, fonts._other_fonts):
+        for cached in (fonts.find_font, fonts._list_fonts_except_dejavu):
             cached.cache_clear()
 
     clear_caches()
@@ -51,11 +51,11 @@ def _fresh(monkeypatch: pytest.MonkeyPatch) -> Any:
 
 def with_font(monkeypatch: pytest.MonkeyPatch, name: str, characters: str) -> None:
     """Pretend that one more font with these characters is installed."""
-    monkeypatch.setattr(fonts, "_other_fonts", lambda: ((name, "path"),))
-    own = fonts._font_characters
+    monkeypatch.setattr(fonts, "_list_fonts_except_dejavu", lambda: ((name, "path"),))
+    own = fonts._read_font_characters
     with_one_more = {"path": frozenset(map(ord, characters))}
     monkeypatch.setattr(
-        fonts, "_font_characters", lambda path: with_one_more.get(path) or own(path)
+        fonts, "_read_font_characters", lambda path: with_one_more.get(path) or own(path)
     )
 
 
@@ -63,8 +63,8 @@ def with_font(monkeypatch: pytest.MonkeyPatch, name: str, characters: str) -> No
 def test_characters_missing_in_dejavu_use_an_installed_font(monkeypatch) -> None:
     with_font(monkeypatch, "Some Thai", THAI)
     assert fonts.find_missing_characters(f"Ångström σ Жанна {ARABIC} 5 ≤ 6") == ""
-    assert fonts.font_names(f"Ångström {ARABIC}") == [fonts.FONT]
-    assert fonts.font_names(f"{THAI} and me") == [fonts.FONT, "Some Thai"]
+    assert fonts.find_font_names(f"Ångström {ARABIC}") == [fonts.FONT]
+    assert fonts.find_font_names(f"{THAI} and me") == [fonts.FONT, "Some Thai"]
     assert fonts.find_missing_characters(f"{THAI} {HAN}") == HAN
 
 
@@ -72,8 +72,8 @@ def test_characters_missing_in_dejavu_use_an_installed_font(monkeypatch) -> None
 def test_characters_without_any_font_are_printed_as_squares(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
-    monkeypatch.setattr(fonts, "_other_fonts", lambda: ())
-    assert fonts.font_names(THAI + HAN) == [fonts.FONT]
+    monkeypatch.setattr(fonts, "_list_fonts_except_dejavu", lambda: ())
+    assert fonts.find_font_names(THAI + HAN) == [fonts.FONT]
     assert replace_unprintable(f"a {HAN}\x1b b") == "a □□□ b"
     advice = fonts.format_font_advice(THAI + HAN)
     assert "characters สมชาย王小明;" in advice
@@ -90,7 +90,7 @@ def test_fonts_that_draw_only_boxes_are_ignored(monkeypatch: pytest.MonkeyPatch)
     manager = SimpleNamespace(ttflist=entries, addfont=lambda _: None)
     monkeypatch.setattr(font_manager, "fontManager", manager)
     monkeypatch.setattr(font_manager, "findSystemFonts", list)
-    assert [name for name, _ in fonts._other_fonts()] == [
+    assert [name for name, _ in fonts._list_fonts_except_dejavu()] == [
         "Noto Sans Thai",
         "An Alphabet Sans",
         "Zebra",
@@ -168,7 +168,7 @@ def test_typst_code_in_student_notes_is_printed_as_text() -> None:
     hostile = '#read("/etc/passwd") #sys.inputs $x$ = y *b* @ref <label> // c'
     page = Page("Notes")
     page.write(hostile)
-    page.table(["#panic()"], [[hostile]])
+    page.add_table(["#panic()"], [[hostile]])
     (sheet,) = set_by_typst(page)
     assert " ".join(sheet.split()).count(hostile) == 2
     assert "#panic()" in sheet
@@ -223,7 +223,7 @@ def test_report_omits_time_offset_page_if_not_significant() -> None:
         (with_clock(unknown), nothing), *((fine, each) for each in with_finding)
     ):  # fmt: skip
         line = clock.summarise_offset(analysis, results.findings)
-        assert line == "The appendix on the time offset contains the estimate."
+        assert line == "See the appendix on the time offset for the estimated time offset."
         assert len(list(clock.draw_pages(analysis, results))) == 1
     none = with_clock(Unavailable("clock offset", "no IMU", "Give the ULog."))
     assert (

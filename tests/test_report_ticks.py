@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 from matplotlib.figure import Figure
 
-from px4fuse.report.page import text_width
-from px4fuse.report.style import Axes, report_style, set_map_axes, set_plain_ticks
+from px4fuse.report.page import measure_text_width
+from px4fuse.report.style import Axes, apply_report_style, set_map_axes, set_plain_ticks
 from px4fuse.report.ticks import replace_ticks
 
 MAX_DISTANCE_POINTS = 3.0  # between the places of a text in both drawings
@@ -48,11 +48,11 @@ def drawn_texts(
     plot: Callable[[Axes], None], *, few_artists: bool
 ) -> list[tuple[str, float, float]]:
     """Return the texts of a plot, each with x and y (points) of its centre."""
-    with report_style():
+    with apply_report_style():
         axes = Figure(figsize=(4.0, 2.6), dpi=72.0).add_axes((0.3, 0.3, 0.6, 0.6))
         plot(axes)
         if few_artists:
-            replace_ticks(axes, text_width)
+            replace_ticks(axes, measure_text_width)
             texts = axes.texts
         else:
             axes.figure.draw_without_rendering()
@@ -80,11 +80,11 @@ def test_fast_tick_labels_have_matplotlib_texts_and_positions(plot: Callable[[Ax
 
 
 def test_replaced_ticks_keep_the_grid_of_each_axis() -> None:
-    with report_style():
+    with apply_report_style():
         for grid_axis, expected_count in (("y", 1), ("both", 2)):
             axes = Figure().add_axes((0.0, 0.0, 1.0, 1.0))
             axes.grid(visible=False)
             axes.grid(visible=True, axis=grid_axis)
-            replace_ticks(axes, text_width)
+            replace_ticks(axes, measure_text_width)
             colours = [line.get_color() for line in axes.lines]
             assert colours.count("#e3e3e3") == expected_count

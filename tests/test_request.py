@@ -11,7 +11,7 @@ from hypothesis import strategies as st
 
 from px4fuse import request as requests
 from px4fuse.cli.compare import compare
-from px4fuse.cli.loop import loop, loop_request
+from px4fuse.cli.loop import loop, make_loop_request
 from px4fuse.cli.options import comparison_request
 from px4fuse.request import ComparisonRequest, LoopRequest, PositionFile, Request, command_line
 
@@ -69,12 +69,12 @@ def parsed(command: str) -> Request:
     context = made.make_context(name, [*options, "--", file])
     own = (
         "output", "json_path", "fail_on", "checks", "student", "student_id", "notes", "answers",
-        "tum", "g2o", "verbose", "quiet",
+        "tum_path", "g2o_path", "verbose", "quiet",
     )  # fmt: skip
     values = {key: value for key, value in context.params.items() if key not in own}
     if name == "compare":
         return comparison_request(values.pop("log"), values)
-    return loop_request(values.pop("source"), values)
+    return make_loop_request(values.pop("source"), values)
 
 
 @settings(deadline=None)

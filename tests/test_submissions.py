@@ -24,7 +24,7 @@ from px4fuse.classroom.grading.submissions import (
     parse_submission_path,
     read_submission,
 )
-from px4fuse.core.reading import files_by_sha256
+from px4fuse.core.reading import hash_files
 from px4fuse.errors import ResultsError, SettingsError
 from px4fuse.verification.pdf_input import MAX_PDF_BYTES, read_report
 
@@ -253,7 +253,7 @@ def test_find_submissions_searches_1500_nested_folders(tmp_path):
     paths = [write(tmp_path / "in" / "a.pdf", PDF), write(folders[-1] / "b.pdf", PDF)]
     try:
         found, notes = find_submissions([tmp_path / "in"])
-        known = files_by_sha256([tmp_path / "in"])
+        known = hash_files([tmp_path / "in"])
     finally:  # shutil.rmtree, which removes temporary folders, is recursive
         for path in paths:
             path.unlink()

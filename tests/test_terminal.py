@@ -18,14 +18,14 @@ from exchange import replace
 from rich.console import Console
 
 from px4fuse.analysis import Analysis
-from px4fuse.cli.outputs import default_report_path, make_console, progress
+from px4fuse.cli.outputs import choose_default_report_path, make_console, progress
 from px4fuse.diagnose import diagnose as analyse
 from px4fuse.errors import OutputError
 from px4fuse.report import card_text, screen
-from px4fuse.report.card_text import card_lines, with_typed_path
+from px4fuse.report.card_text import format_card_lines, with_typed_path
 from px4fuse.report.page import Page
 from px4fuse.report.screen import extract_commands, print_paragraph
-from px4fuse.report.terminal import comparison_page
+from px4fuse.report.terminal import make_comparison_page
 from px4fuse.request import ComparisonRequest, PositionFile, command_line, format_settings_suffix
 from px4fuse.results.build import results
 from px4fuse.results.contract import ComparisonResults, to_json
@@ -80,12 +80,12 @@ def test_terminal_summary_wraps_without_cutting_text(document, monkeypatch) -> N
             monkeypatch.setenv("COLUMNS", str(width))
         console = make_console()
         with console.capture() as captured:
-            page = comparison_page(*document, verbose=True)
+            page = make_comparison_page(*document, verbose=True)
             screen.print_blocks(console, page.blocks, document[0].request)
         summaries[width] = captured.get()
     whole = summaries[None]
     card = with_typed_path(document[1].card, document[0].request.log)
-    drawn = [line.wrap(WIDTH)[0] for line in card_lines(card) if not line.wraps]
+    drawn = [line.wrap(WIDTH)[0] for line in format_card_lines(card) if not line.wraps]
     for width in (WIDTH, 60):
         assert "…" not in summaries[width]
         assert "--sigma-z" in summaries[width]
@@ -96,7 +96,7 @@ def test_terminal_summary_wraps_without_cutting_text(document, monkeypatch) -> N
     assert sorted(summaries[WIDTH].split()) == sorted(whole.split())
     assert "\x1b" not in whole
     # the card comes first, also in a pipe; below it a paragraph is one line there
-    first = [text for line in card_lines(card) for text in line.wrap(card_text.CARD_WIDTH)]
+    first = [text for line in format_card_lines(card) for text in line.wrap(card_text.CARD_WIDTH)]
     assert whole.splitlines()[: len(first) + 1] == [*first, ""]
     assert max(map(len, whole.splitlines()[len(first) :])) > card_text.CARD_WIDTH
 
@@ -111,7 +111,7 @@ def test_terminal_paragraph_has_hanging_indent(capsys) -> None:
 def test_table_on_narrow_terminal_keeps_words_whole(capsys) -> None:
     page = Page()
     topics = ["vehicle_visual_odometry", "estimator_aid_src_ev_pos"]
-    page.table(["data", "topic", "samples"], [["position", topic, "650"] for topic in topics])
+    page.add_table(["data", "topic", "samples"], [["position", topic, "650"] for topic in topics])
     screen.print_blocks(Console(width=40, highlight=False), page.blocks)
     words = capsys.readouterr().out.replace(",", "").split()
     assert [word for word in words if word in topics] == topics
@@ -214,7 +214,9 @@ def reported(made: ComparisonResults, **changes: object) -> str:
     student = Student(name=str(changes.pop("student", "")))
     request = replace(made.request, **changes)
     changed = replace(made, request=request.with_file_names(), student=student)
-    path = default_report_path(Path(request.log).stem + format_settings_suffix(request), changed)
+    path = choose_default_report_path(
+        Path(request.log).stem + format_settings_suffix(request), changed
+    )
     path.parent.mkdir(exist_ok=True)
     path.write_bytes(blank_page(None, to_json(changed)))
     path.with_suffix(".json").write_text(to_json(changed), encoding="utf-8")

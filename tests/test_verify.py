@@ -47,7 +47,7 @@ from pypdf.generic import (
 )
 from results_tools import finding
 
-from px4fuse.core.reading import files_by_sha256
+from px4fuse.core.reading import hash_files
 from px4fuse.errors import ResultsError
 from px4fuse.results.contract import to_json, to_json_dict
 from px4fuse.verification import pages, verification
@@ -582,10 +582,10 @@ def test_verify_finds_all_input_files_by_sha256(tmp_path: Path) -> None:
     report = read_attached_results(pdf)
     (tmp_path / "a").write_bytes(LOG.read_bytes())
     (tmp_path / "b").write_bytes(positions.read_bytes())
-    verdict = verify(report, pdf, files_by_sha256([tmp_path / "a"]))
+    verdict = verify(report, pdf, hash_files([tmp_path / "a"]))
     assert verdict.status == "cannot verify"
     assert "--position" in verdict.reasons[0]
-    both = files_by_sha256([tmp_path / "a", tmp_path / "b"])
+    both = hash_files([tmp_path / "a", tmp_path / "b"])
     assert verify(report, pdf, both).status == "verified"
 
 

@@ -23,7 +23,7 @@ from px4fuse.report.whatif import (
     make_column_headings,
     make_statistic_rows,
     make_sweep_table,
-    whatif_page,
+    make_whatif_page,
 )
 from px4fuse.request import Sweep, WhatIfRequest, command_line
 from px4fuse.results.contract import WhatIfResults, schema
@@ -94,7 +94,7 @@ def test_what_if_without_set_option_keeps_consistent_parameters(estimated: WhatI
     assert estimated.uses_estimates
     assert not estimated.changes
     assert not estimated.whatif.whatif
-    texts = [str(block) for block in whatif_page(estimated).blocks]
+    texts = [str(block) for block in make_whatif_page(estimated).blocks]
     assert any("no parameter is changed" in text for text in texts)
     table, found = (
         {label.strip(): cells for label, *cells in make_statistic_rows(estimated)},
@@ -200,5 +200,5 @@ def test_what_if_table_omits_numbers_if_not_predictable(sample_flight: Flight) -
     assert [line[1] for line in make_sweep_table(told)[1]] == [NOT_PREDICTABLE_TEXT] * 2
     said = " ".join(describe_sweep(told))
     assert "not predictable in three cases: EKF2 rejects more than 35% of the samples" in said
-    assert "2 mm of added position noise change its statistics" in said
+    assert "the statistics change much with 2 mm of added position noise" in said
     assert "closest to 1" not in said

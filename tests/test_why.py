@@ -25,7 +25,7 @@ from px4fuse.filter.kalman import predict_state
 from px4fuse.filter.settings import Settings
 from px4fuse.flight.model import Unavailable
 from px4fuse.report.difference_page import describe_missing_explanation, draw_pages
-from px4fuse.report.style import report_style
+from px4fuse.report.style import apply_report_style
 
 
 def of(analysis: Analysis, name: str = "aisle") -> DifferenceExplanation:
@@ -90,7 +90,7 @@ def test_kf_ekf2_difference_without_replay_gives_reason(sample: Analysis) -> Non
 
 
 def drawn(analysis: Analysis) -> list:
-    with report_style():
+    with apply_report_style():
         return list(draw_pages(analysis, None))
 
 

@@ -16,7 +16,7 @@ from px4fuse.classroom.assignment.roster import Person
 from px4fuse.classroom.grading.form_points import FLIGHT_POINTS_FRACTION, compute_form_points
 from px4fuse.classroom.grading.records import load_or_verify
 from px4fuse.classroom.grading.rubric import read_rubric, score_report
-from px4fuse.core.reading import files_by_sha256
+from px4fuse.core.reading import hash_files
 from px4fuse.flight.model import DIAGNOSIS_WITHHELD
 from px4fuse.readers.ulog_topics import ASSESSED_MARK_KEY
 from px4fuse.results.answer_form import CHOICE_NAMES, format_answer_form
@@ -88,7 +88,7 @@ def test_loop_report_on_student_assignment_has_no_loop_closure(
 def test_grade_adds_diagnosis_to_report_on_student_assignment(
     assigned: Assigned, tmp_path: Path
 ) -> None:
-    logs, pdf = files_by_sha256([assigned.log]), assigned.report.read_bytes()
+    logs, pdf = hash_files([assigned.log]), assigned.report.read_bytes()
     assigned_hashes = frozenset(logs)
     results, verdict, _ = load_or_verify(tmp_path, pdf, logs, assigned_hashes)
     assert verdict.status == "verified"

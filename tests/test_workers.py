@@ -23,7 +23,7 @@ def run(jobs, processes=2, timeout_s=60.0, max_memory_bytes=None):
         run_with_limits(
             run_job,
             jobs,
-            processes=processes,
+            process_count=processes,
             timeout_s=timeout_s,
             max_memory_bytes=max_memory_bytes,
         )
@@ -106,7 +106,7 @@ def test_worker_that_cannot_import_the_function_fails_each_job(monkeypatch):
 def test_closing_the_worker_pool_ends_all_processes():
     jobs = [("square", 1), ("hang", 0)]
     with closing(
-        run_with_limits(run_job, jobs, processes=2, timeout_s=60, max_memory_bytes=None)
+        run_with_limits(run_job, jobs, process_count=2, timeout_s=60, max_memory_bytes=None)
     ) as work:
         assert next(work) == (0, 1)
     assert not multiprocessing.active_children()
@@ -119,7 +119,7 @@ from px4fuse.core.workers import run_with_limits
 from failing_jobs import run_job
 
 if __name__ == "__main__":
-    for _, result in run_with_limits(run_job, [("process", 0), ("hang", 0)], processes=1,
+    for _, result in run_with_limits(run_job, [("process", 0), ("hang", 0)], process_count=1,
                                      timeout_s=500, max_memory_bytes=None):
         print(result, flush=True)
 """

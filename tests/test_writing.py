@@ -23,7 +23,7 @@ from exchange import replace
 from ulog_tools import make_log
 
 from px4fuse.core import writing
-from px4fuse.core.writing import STANDARD_OUTPUT, write_all
+from px4fuse.core.writing import STANDARD_OUTPUT, write_output_files
 from px4fuse.diagnose import prepare_comparison, read_flight
 from px4fuse.errors import OutputError
 from px4fuse.report import fonts, pdf
@@ -78,7 +78,7 @@ def test_output_to_device_does_not_replace_it_by_a_file(desk) -> None:
     """Use a link, so that a failure replaces the link and not the device."""
     link = desk / "null"
     link.symlink_to(os.devnull)
-    write_all({link: b"gone"})
+    write_output_files({link: b"gone"})
     assert link.is_symlink()
     assert Path(os.devnull).is_char_device()
 
@@ -99,13 +99,13 @@ def test_output_to_symbolic_link_keeps_link_and_writes_target(tmp_path) -> None:
     (tmp_path / "old").write_bytes(b"old")
     for link, target in (("a", "old"), ("b", "new"), ("c", "a")):
         (tmp_path / link).symlink_to(target)
-        write_all({tmp_path / link: link.encode()})
+        write_output_files({tmp_path / link: link.encode()})
         assert (tmp_path / link).is_symlink()
         assert (tmp_path / target).read_bytes() == link.encode()
     assert names(tmp_path) == ["a", "b", "c", "new", "old"]
     (tmp_path / "round").symlink_to("round")
     with pytest.raises(OutputError, match="round cannot be written"):
-        write_all({tmp_path / "round": b""})
+        write_output_files({tmp_path / "round": b""})
 
 
 @posix
@@ -127,7 +127,7 @@ def test_output_to_dev_stdout_appends_to_redirected_file(desk) -> None:
 
 def test_output_with_longest_file_name_is_written(tmp_path) -> None:
     path = tmp_path / ("n" * 250 + ".json")
-    write_all({path: b"x"})
+    write_output_files({path: b"x"})
     assert path.read_bytes() == b"x"
 
 
@@ -155,14 +155,14 @@ def test_write_error_lists_the_files_already_written(tmp_path, monkeypatch) -> N
     at_rename_to(b, monkeypatch, deny)
     placed: list[Path] = []
     with pytest.raises(OutputError) as caught:
-        write_all(dict.fromkeys((a, b, c), b"new"), placed.append)
+        write_output_files(dict.fromkeys((a, b, c), b"new"), placed.append)
     said = f"{b} cannot be written (Permission denied); outputs already written: {a}. "
     said += "Choose another output name."
     assert str(caught.value) == said
     assert placed == [a]
     assert contents(tmp_path) == {"a": b"new", "b": b"old", "c": b"old"}
     with pytest.raises(OutputError, match=r"\(Permission denied\)\. Choose"):
-        write_all({b: b"new"})
+        write_output_files({b: b"new"})
 
 
 def test_full_disk_leaves_no_empty_folder(tmp_path, monkeypatch) -> None:
@@ -172,7 +172,7 @@ def test_full_disk_leaves_no_empty_folder(tmp_path, monkeypatch) -> None:
     path = tmp_path / "new" / "imu.csv"
     at_rename_to(path, monkeypatch, fill)
     with pytest.raises(OutputError, match="Free disk space"):
-        write_all({path: b"1"})
+        write_output_files({path: b"1"})
     assert not path.parent.exists()
 
 
@@ -183,7 +183,7 @@ def test_output_to_locked_file_advises_to_close_the_program(tmp_path, monkeypatc
     for locks, said in ((True, "Close the program that has the file open, or c"), (False, "C")):
         monkeypatch.setattr(writing, "LOCKS_OPEN_FILES", locks)
         with pytest.raises(OutputError, match=rf"\. {said}hoose another"):
-            write_all({path: b"new"})
+            write_output_files({path: b"new"})
         assert path.read_bytes() == b"old"
 
 
@@ -201,7 +201,9 @@ def test_stop_signal_while_writing_leaves_only_complete_files(tmp_path, monkeypa
     placed: list[Path] = []
     try:
         with pytest.raises(KeyboardInterrupt):
-            write_all(dict.fromkeys((tmp_path / "a", tmp_path / "b"), b"new"), placed.append)
+            write_output_files(
+                dict.fromkeys((tmp_path / "a", tmp_path / "b"), b"new"), placed.append
+            )
     finally:
         signal.signal(number, before)
     assert contents(tmp_path) == {"a": b"new", "b": b"old"}
@@ -302,9 +304,9 @@ def test_json_to_closed_pipe_still_writes_the_other_files(desk) -> None:
 def test_output_to_existing_folder_name_is_refused(tmp_path, capsysbinary) -> None:
     (tmp_path / "folder").mkdir()
     with pytest.raises(OutputError, match=r"folder cannot be written \(Is a directory\)"):
-        write_all({tmp_path / "folder": b"", STANDARD_OUTPUT: b"{}"})
+        write_output_files({tmp_path / "folder": b"", STANDARD_OUTPUT: b"{}"})
     assert capsysbinary.readouterr().out == b""
-    write_all({tmp_path / "a": b"", STANDARD_OUTPUT: b"{}"})
+    write_output_files({tmp_path / "a": b"", STANDARD_OUTPUT: b"{}"})
     assert capsysbinary.readouterr().out == b"{}"
 
 
@@ -322,7 +324,7 @@ def test_compare_warns_if_no_font_can_print_student_name(
         return b"%PDF-"
 
     monkeypatch.setattr(pdf, "render_pdf", render_pdf)
-    monkeypatch.setattr(fonts, "_other_fonts", lambda: ())
+    monkeypatch.setattr(fonts, "_list_fonts_except_dejavu", lambda: ())
     fonts.find_font.cache_clear()
     run_main(monkeypatch, capsys, *f"compare l.ulg -o r.pdf --student {name}".split())
     fonts.find_font.cache_clear()

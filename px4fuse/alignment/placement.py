@@ -39,7 +39,7 @@ from px4fuse.flight.model import (
 )
 from px4fuse.readers.common import select_valid_rows
 from px4fuse.readers.position_file import PositionRecording
-from px4fuse.trajectory.model import NED_COMPONENTS
+from px4fuse.trajectory.model import NED_COMPONENTS_BY_FRAME
 
 # Maximum time span (s) of the data for a comparison of axes and unit with the IMU, which takes 1 s
 # per hour of data
@@ -211,8 +211,8 @@ def align_position_file(
 def _check_options(
     frame: str | None, yaw_deg: float | str | None, clock_offset_s: float | None
 ) -> None:
-    if frame not in (None, *NED_COMPONENTS):
-        remedy = f"Use one of {', '.join(NED_COMPONENTS)}."
+    if frame not in (None, *NED_COMPONENTS_BY_FRAME):
+        remedy = f"Use one of {', '.join(NED_COMPONENTS_BY_FRAME)}."
         raise SettingsError(f"`frame` {frame} is not a known coordinate frame.", remedy)
     if isinstance(yaw_deg, str) and yaw_deg != "auto":
         raise SettingsError(f"`yaw_deg` {yaw_deg} is neither a number (degrees) nor auto.")

@@ -22,8 +22,8 @@ from px4fuse.flight.model import (
     time_index,
 )
 from px4fuse.readers.common import select_valid_rows
-from px4fuse.trajectory.association import gap_limit, is_bracketed
-from px4fuse.trajectory.model import NED_COMPONENTS
+from px4fuse.trajectory.association import choose_gap_limit_s, is_bracketed
+from px4fuse.trajectory.model import NED_COMPONENTS_BY_FRAME
 from px4fuse.trajectory.time_offset import GRID_STEP_S
 
 EKF2_REFERENCE, IMU_REFERENCE = "EKF2 position", "IMU"
@@ -84,7 +84,7 @@ class SampledTrack:
 
 def convert_to_ned(samples: pd.DataFrame, frame: str) -> SampledTrack:
     """Convert the positions of a file to north, east, down, with times from the first sample."""
-    axis_order, axis_signs = NED_COMPONENTS[frame]
+    axis_order, axis_signs = NED_COMPONENTS_BY_FRAME[frame]
     position_m = samples[["x_m", "y_m", "z_m"]].to_numpy()[:, axis_order] * axis_signs
     return _make_gapless_track(samples.index.to_numpy() - samples.index[0], position_m)
 
@@ -96,7 +96,7 @@ def _make_gapless_track(time_s: Array, position_m: Array) -> SampledTrack:
 def resample_to_grid(track: SampledTrack) -> SampledTrack:
     """Resample a track to a regular time grid, and mark samples inside gaps as invalid."""
     grid_s = np.arange(track.time_s[0], track.time_s[-1], GRID_STEP_S)
-    is_known = is_bracketed(grid_s, track.time_s, gap_limit(track.time_s, MIN_GAP_LIMIT_S))
+    is_known = is_bracketed(grid_s, track.time_s, choose_gap_limit_s(track.time_s, MIN_GAP_LIMIT_S))
     return SampledTrack(grid_s, track.at(grid_s)[0], is_known)
 
 
@@ -194,7 +194,7 @@ def align_samples(
     """
     track = convert_to_ned(samples, frame)
     position_m = track.position_m
-    axis_order, _ = NED_COMPONENTS[frame]
+    axis_order, _ = NED_COMPONENTS_BY_FRAME[frame]
     variance_m2 = samples[["sigma_x_m", "sigma_y_m", "sigma_z_m"]].to_numpy()[:, axis_order] ** 2
     if yaw_rad:  # mixes north and east: both variances are NaN if σ of one axis is missing
         c, s = np.cos(yaw_rad), np.sin(yaw_rad)

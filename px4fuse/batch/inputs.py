@@ -7,7 +7,7 @@ from typing import Literal
 
 from msgspec.structs import replace
 
-from px4fuse.core.reading import display_name, files_by_sha256, read_bytes_limited, read_head
+from px4fuse.core.reading import display_name, hash_files, read_bytes_limited, read_head
 from px4fuse.diagnose import diagnose_or_check_aids
 from px4fuse.errors import LogError, ResultsError
 from px4fuse.filter.settings import Settings
@@ -64,7 +64,7 @@ def _read_given_results(path: Path) -> InputResults | None:
         return None
     limit_bytes = MAX_PDF_BYTES if is_report else MAX_RESULTS_BYTES
     remedy = "Give a report (PDF) or the results (JSON) of px4fuse compare."
-    content = read_bytes_limited(path, ResultsError, limit_bytes, size_remedy=remedy)
+    content = read_bytes_limited(path, ResultsError, limit_bytes, remedy_if_too_large=remedy)
     results = (read_attached_results if is_report else read_results)(content, name)
     if not isinstance(results, Results):
         raise ResultsError(
@@ -79,7 +79,7 @@ def _analyse_log(
 ) -> InputResults:
     request = ComparisonRequest(log=str(path))
     if other_input is not None:
-        is_same_log = other_input.results.log.sha256 in files_by_sha256([path])
+        is_same_log = other_input.results.log.sha256 in hash_files([path])
         copied_setting_names = (
             {*request.__struct_fields__} - _INPUT_FILE_SETTINGS if is_same_log else _FILTER_SETTINGS
         )

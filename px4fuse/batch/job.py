@@ -15,9 +15,9 @@ from px4fuse.batch.rows import (
     collect_log_values,
     make_axis_rows,
 )
-from px4fuse.core.reading import files_by_sha256, max_log_bytes
+from px4fuse.core.reading import hash_files, max_log_bytes
 from px4fuse.errors import LogError, MissingDataError, Px4FuseError
-from px4fuse.request import ComparisonRequest, with_options
+from px4fuse.request import ComparisonRequest, replace_argument_names
 
 
 @dataclass(frozen=True)
@@ -74,8 +74,8 @@ def analyse(job: Job) -> LogOutcome:
 
 def make_failure_row(error: Px4FuseError, status: str, name: str = "") -> Row:
     """Return the columns with status, reason and action for a log without results."""
-    reason = with_options(error.reason).removeprefix(f"{name}: ")
-    return {"status": status, "reason": reason, "remedy": with_options(error.remedy)}
+    reason = replace_argument_names(error.reason).removeprefix(f"{name}: ")
+    return {"status": status, "reason": reason, "remedy": replace_argument_names(error.remedy)}
 
 
 def _compare_log(job: Job, path: Path, sha256: str) -> LogOutcome:
@@ -114,7 +114,7 @@ def _compare_log(job: Job, path: Path, sha256: str) -> LogOutcome:
 
 
 def _compute_sha256(path: Path) -> str:
-    (sha256,) = files_by_sha256([path])
+    (sha256,) = hash_files([path])
     return sha256
 
 

@@ -10,14 +10,14 @@ import pandas as pd
 
 from px4fuse.batch.rows import DONE, FAILED, FINDING_SEPARATOR, NOT_COMPARED, RESULT_PATH_BY_COLUMN
 from px4fuse.card.model import RATIO_AXIS_ENDS
-from px4fuse.core.text import count_noun, format_metres, format_number, format_ratio, join_first
+from px4fuse.core.text import format_count, format_metres, format_number, format_ratio, join_first
 from px4fuse.filter.consistency import CONSISTENT_SIGMA_RATIOS
 from px4fuse.findings import finding_title
 from px4fuse.html import frame
 from px4fuse.html.frame import Cell, Column, Row, RowSection
 from px4fuse.html.safe import clean_text, load_template, make_relative_url
 from px4fuse.report.card_html import MARKER_SVG_PATHS
-from px4fuse.report.card_text import REFERENCE_MARKS, SEVERITY_SIGNS, format_consistent_ratios
+from px4fuse.report.card_text import SEVERITY_SIGNS, SYMBOL_BY_REFERENCE, format_consistent_ratios
 
 # Filter and reference of each σ ratio (source: innovations; truth: errors), as in Card.verdicts
 SIGMA_RATIO_COLUMNS = ("kf_source", "kf_truth", "ekf2_source", "ekf2_truth")
@@ -88,7 +88,7 @@ def format_html(table: pd.DataFrame, title: str, version_text: str) -> str:
     ]
     return frame.page(
         title=title,
-        subtitle=f"{count_noun(len(logs), 'log')}. Compared by {version_text}.",
+        subtitle=f"{format_count(len(logs), 'log')}. Compared by {version_text}.",
         html_above=load_template("batch/axis.html").render(limits=format_consistent_ratios()),
         row_nouns=("log", "logs"),
         columns=(
@@ -97,13 +97,13 @@ def format_html(table: pd.DataFrame, title: str, version_text: str) -> str:
             Column("Diagnosis and first action", "full"),
             *(
                 Column(
-                    f"{filter_name.upper()} {REFERENCE_MARKS[reference_name]}",
+                    f"{filter_name.upper()} {SYMBOL_BY_REFERENCE[reference_name]}",
                     "ratio",
-                    visible_from="tablet",
+                    min_screen_size="tablet",
                 )
                 for filter_name, reference_name in (name.split("_") for name in SIGMA_RATIO_COLUMNS)
             ),
-            Column("KF − EKF2 (m)", "number", visible_from="tablet"),
+            Column("KF − EKF2 (m)", "number", min_screen_size="tablet"),
             *(
                 Column(label, "line", EXTRA_COLUMN_GROUP)
                 for label in ("Date (UTC)", "Vehicle", "Firmware")

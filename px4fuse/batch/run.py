@@ -31,7 +31,7 @@ from px4fuse.batch.rows import (
 from px4fuse.core.input_files import check_output_folder
 from px4fuse.core.reading import max_log_bytes
 from px4fuse.core.workers import MAX_MEMORY_BYTES, JobFailure, run_with_limits
-from px4fuse.core.writing import write_all
+from px4fuse.core.writing import write_output_files
 from px4fuse.errors import LogError, Px4FuseError, SettingsError
 from px4fuse.filter.settings import requested_settings
 from px4fuse.request import ComparisonRequest, command_line
@@ -284,7 +284,9 @@ def _write_log(state: _RunState, log: LogAddress, outcome: LogOutcome) -> None:
     rows = [clean_row(row) | path_by_column for row in outcome.rows]
     cached_rows = CachedRows(outcome.sha256, state.version, state.settings, log.size_bytes, rows)
     contents = content_by_name | {cached_rows.relative_path: msgspec.json.encode(cached_rows)}
-    write_all({state.output / name: content for name, content in contents.items() if content})
+    write_output_files(
+        {state.output / name: content for name, content in contents.items() if content}
+    )
 
 
 def _write_table(state: _RunState, logs: Iterable[LogAddress]) -> BatchResult:
@@ -322,5 +324,5 @@ def _write_table(state: _RunState, logs: Iterable[LogAddress]) -> BatchResult:
         state.output / "fleet.csv": format_csv(table),
         state.output / "fleet.html": page.encode(),
     }
-    write_all(contents)
+    write_output_files(contents)
     return BatchResult(table, len(state.reused_log_hashes), frozenset(severities), tuple(contents))

@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING
 from px4fuse.batch.measures import ABSOLUTE_TOLERANCE, RELATIVE_TOLERANCE
 from px4fuse.batch.page import SIGMA_RATIO_COLUMNS, LogSummary, sort_logs, summarise_logs
 from px4fuse.batch.rows import FAILED
-from px4fuse.core.text import count_noun, format_number, format_ratio
+from px4fuse.core.text import format_count, format_number, format_ratio
 from px4fuse.report.card_text import SEVERITY_SIGNS
 from px4fuse.report.page import Cell, Page, styled_text
 from px4fuse.report.style import MUTED_COLOUR, SEVERITY_COLOURS
@@ -42,7 +42,7 @@ def format_summary(batch_result: BatchResult) -> Page:
     sorted_logs = sort_logs(summarise_logs(batch_result.table))
     if sorted_logs:
         rows = [_make_log_row(log) for log in sorted_logs[:MAX_LISTED_LOGS]]
-        page.table(
+        page.add_table(
             ("", "log", "diagnosis", "KF ●", "◆", "EKF2 ●", "◆"),
             rows,
             right_aligned_columns=(3, 4, 5, 6),
@@ -55,7 +55,7 @@ def format_summary(batch_result: BatchResult) -> Page:
     retry_note = " Run the same command to repeat failed logs." if FAILED in counts else ""
     page.write(
         f"{len(logs)} logs: {counts_text}. Results from an earlier run: "
-        f"{count_noun(batch_result.reused_count, 'log')}.{retry_note}"
+        f"{format_count(batch_result.reused_count, 'log')}.{retry_note}"
     )
     return page
 
@@ -85,7 +85,7 @@ def format_differences(results: ChangeResults) -> Page:
         for setting in results.settings
     ]
     if settings:
-        page.table(("setting", "A", "B"), settings)
+        page.add_table(("setting", "A", "B"), settings)
     rows = []
     for number in results.numbers:
         display_factor, unit = (100.0, "%") if number.unit == "share" else (1.0, number.unit)
@@ -96,7 +96,7 @@ def format_differences(results: ChangeResults) -> Page:
         ]
         rows.append((number.label, *cells, unit))
     if rows:
-        page.table(NUMBER_TABLE_TITLES, rows, right_aligned_columns=(1, 2, 3, 4))
+        page.add_table(NUMBER_TABLE_TITLES, rows, right_aligned_columns=(1, 2, 3, 4))
     tolerance_text = f"{100.0 * RELATIVE_TOLERANCE:g} % or {ABSOLUTE_TOLERANCE:g}"
     page.write(
         f"Numbers that differ by less than {tolerance_text} are not listed.", colour=MUTED_COLOUR

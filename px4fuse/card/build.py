@@ -61,7 +61,12 @@ from px4fuse.findings.model import format_count, format_percent, split_cause_gro
 from px4fuse.findings.source_positions import has_little_motion
 from px4fuse.flight.ekf2_parameters import PARAMETERS
 from px4fuse.flight.model import Ekf2, LogInfo, Unavailable, source_name
-from px4fuse.request import COMPARISON_OPTIONS, ComparisonRequest, command_line, with_options
+from px4fuse.request import (
+    COMPARISON_OPTIONS,
+    ComparisonRequest,
+    command_line,
+    replace_argument_names,
+)
 
 MAX_ACTIONS = 3
 # Minimum fraction of positions rejected by EKF2 for a sentence about rejections
@@ -185,7 +190,9 @@ def build_aids_card(
             for key, aid in analysis.aids.items()
             for name, axis in aid.axes.items()
         ),
-        facts={"KF": f"not run: {missing_data.reason}. {with_options(missing_data.remedy)}"},
+        facts={
+            "KF": f"not run: {missing_data.reason}. {replace_argument_names(missing_data.remedy)}"
+        },
         identity=_make_identity(analysis.flight.log, request, student, source="no position source"),
     )
 
@@ -200,11 +207,11 @@ def build_unusable_log_card(error: LogError | MissingDataError, path: Path) -> C
             f"{size_bytes:,} bytes; first bytes {first_bytes} (of a ULog: {ULOG_FIRST_BYTES})"
         )
     if error.remedy:
-        text_by_label["fix"] = with_options(with_log_name(error.remedy, str(path)))
+        text_by_label["fix"] = replace_argument_names(with_log_name(error.remedy, str(path)))
     return Card(
         severity="refused",
         id=error.id,
-        headline=with_options(error.reason),
+        headline=replace_argument_names(error.reason),
         facts=text_by_label,
         identity=Identity(file=display_name(path)),
     )

@@ -9,7 +9,7 @@ from px4fuse.classroom.assignment.random_assignment import (
     MAX_FAULT_DIFFICULTY,
 )
 from px4fuse.classroom.grading.grade import GradeOutcome
-from px4fuse.core.text import count_noun, one_line
+from px4fuse.core.text import format_count, one_line
 from px4fuse.errors import to_one_line
 from px4fuse.report.page import Page
 from px4fuse.report.style import GOOD_COLOUR, MUTED_COLOUR, SEVERITY_COLOURS
@@ -26,7 +26,7 @@ def assignment_page(key: AnswerKey, folder: Path, key_file: Path, written_count:
     folder_text, key_file_text = (to_one_line(str(path)) for path in (folder, key_file))
     flight_count = len(key.answers)
     text_by_label = {
-        "Class": f"{count_noun(flight_count, 'student')}, {key.kind}",
+        "Class": f"{format_count(flight_count, 'student')}, {key.kind}",
         "Faults": ", ".join(
             f"{name} {number}" for name, number in sorted(flight_count_by_fault.items())
         ),
@@ -60,7 +60,7 @@ def grading_page(outcome: GradeOutcome) -> Page:
         name = one_line(grade.student or grade.student_id, 60)
         flag_count_text = f"{len(grade.flags) or ''}"
         rows.append((name, grade.file_name, (status, status_colour), points_text, flag_count_text))
-    page.table(
+    page.add_table(
         ("student", "submission", "status", "points", "flags"), rows, right_aligned_columns=(3, 4)
     )
     report_count_by_status = Counter(report.status for report in outcome.reports)

@@ -14,8 +14,8 @@ from pathlib import Path
 
 import click
 
-from px4fuse.cli.outputs import Interrupted, written_files_sentence
-from px4fuse.core.input_files import inputs_protected
+from px4fuse.cli.outputs import Interrupted, describe_written_files
+from px4fuse.core.input_files import protect_inputs
 from px4fuse.core.threads import ONE_THREAD_ENVIRONMENT
 from px4fuse.errors import OutputError, Px4FuseError, SettingsError, suggest_name, to_one_line
 
@@ -87,18 +87,18 @@ class LazyGroup(click.Group):
     def invoke(self, ctx: click.Context) -> object:
         """Run a command; convert system errors and Ctrl-C to exceptions of px4fuse."""
         try:
-            with inputs_protected():
+            with protect_inputs():
                 return super().invoke(ctx)
         except Px4FuseError as error:
-            error.args = (_with_option_names(str(error), ctx.invoked_subcommand or ""),)
+            error.args = (_replace_argument_names(str(error), ctx.invoked_subcommand or ""),)
             raise
         except BrokenPipeError as error:
             # without errno, because click handles EPIPE with exit code 1
             raise BrokenPipeError from error
         except KeyboardInterrupt as interrupt:  # click would print an empty line
-            raise Interrupted(interrupt, written_files_sentence(ctx)) from None
+            raise Interrupted(interrupt, describe_written_files(ctx)) from None
         except (MemoryError, OSError) as error:
-            raise _make_system_error(error, written_files_sentence(ctx)) from error
+            raise _make_system_error(error, describe_written_files(ctx)) from error
 
     def format_commands(self, ctx: click.Context, formatter: click.HelpFormatter) -> None:
         with formatter.section("Commands"):
@@ -166,7 +166,7 @@ def main() -> None:
     # garbage collection needs 10 % of the run time of a short command, and 10 % more at exit
     gc.disable()
     atexit.register(gc.freeze)
-    _prepare_libraries()
+    _configure_libraries()
     _redirect_closed_streams()
     for stream in (sys.stdout, sys.stderr):
         if hasattr(stream, "reconfigure"):  # old Windows code pages lack σ and ν
@@ -199,7 +199,7 @@ def main() -> None:
     sys.exit(_flush_output(exit_code if isinstance(exit_code, int) else 0))
 
 
-def _prepare_libraries() -> None:
+def _configure_libraries() -> None:
     for name, value in ONE_THREAD_ENVIRONMENT.items():
         os.environ.setdefault(name, value)
     for name in IGNORED_ENVIRONMENT_VARIABLES:
@@ -234,7 +234,7 @@ def _redirect_closed_streams() -> None:
             setattr(sys, name, open(descriptor, "w", encoding="utf-8"))  # noqa: SIM115, PTH123 - must stay open
 
 
-def _with_option_names(text: str, command: str) -> str:
+def _replace_argument_names(text: str, command: str) -> str:
     """Replace names of Python arguments in an error text by the options of the command."""
     from px4fuse import request
 
@@ -242,7 +242,9 @@ def _with_option_names(text: str, command: str) -> str:
         "loop": request.OPTION_NAMES[request.LoopRequest],
         "evaluate": request.OPTION_NAMES[request.EvaluationRequest],
     }
-    return request.with_options(text, option_names.get(command, request.COMPARISON_OPTIONS))
+    return request.replace_argument_names(
+        text, option_names.get(command, request.COMPARISON_OPTIONS)
+    )
 
 
 def _print_error(text: str) -> None:
@@ -259,7 +261,7 @@ def _raise_signal_again(unraisable: "sys.UnraisableHookArgs") -> None:
     error = unraisable.exc_value
     if isinstance(error, KeyboardInterrupt):
         signal_number = error.args[0] if error.args else signal.SIGINT
-        # after 0.1 s the finaliser that received the signal has ended
+        # a delay of 0.1 s, so that the finaliser that received the signal has ended
         threading.Timer(
             0.1, signal.pthread_kill, [threading.main_thread().ident, signal_number]
         ).start()

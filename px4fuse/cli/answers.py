@@ -21,6 +21,6 @@ def answers(log: Path, output: Path | None) -> None:
     from px4fuse.core.reading import read_log_bytes
     from px4fuse.results.answer_form import form_name, format_answer_form
 
-    target = output or log.with_name(form_name(log.name))
+    form_path = output or log.with_name(form_name(log.name))
     sha256 = hashlib.sha256(read_log_bytes(log)).hexdigest()
-    write_new(target, format_answer_form(log.name, sha256).encode())
+    write_new(form_path, format_answer_form(log.name, sha256).encode())

@@ -34,7 +34,7 @@ FAIL_LEVELS = ("failed", *SEVERITIES)
     "[default: this computer]",
 )
 @options.settings_options
-@options.fail_option(
+@options.make_fail_on_option(
     FAIL_LEVELS, "Exit with code 1 if a log failed or has a finding of at least this severity."
 )
 @options.open_option
@@ -68,7 +68,7 @@ def batch(
         if (output / "rows").is_dir():
             message = f"results of finished logs are in {output}. Run the same command to continue."
         raise outputs.Interrupted(interrupt, message) from None
-    outputs.write_and_print(
+    outputs.write_and_print_results(
         {}, format_summary(batch_result), written_files=batch_result.written_paths
     )
     options.exit_for_severity(

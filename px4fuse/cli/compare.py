@@ -20,7 +20,7 @@ from px4fuse.request import format_settings_suffix
 @options.report_options(
     "Report to write (PDF).  [default: reports/LOG.pdf; the name contains changed settings]"
 )
-@options.fail_option(SEVERITIES, "Exit with code 1 on a finding of at least this severity.")
+@options.make_fail_on_option(SEVERITIES, "Exit with code 1 on a finding of at least this severity.")
 @options.flag_option(
     "--checks",
     help="Exit with code 1 if an EKF2 aiding source is overconfident, biased or not fused for a "
@@ -48,22 +48,24 @@ def compare(
     faults and their corrections. Writes a PDF report and the results as JSON, for example
     reports/LOG_sigma-z-0.05.pdf and .json.
     """
-    from px4fuse.analysis import failed_checks
+    from px4fuse.analysis import find_failed_checks
     from px4fuse.card.build import build_unusable_log_card
     from px4fuse.core.memory import release_free_memory
     from px4fuse.diagnose import diagnose_or_check_aids
-    from px4fuse.report.terminal import comparison_page, make_card_page
+    from px4fuse.report.terminal import make_card_page, make_comparison_page
     from px4fuse.results.build import make_outcome_results
 
     student = options.read_student(option_values, log)
     request = options.comparison_request(log, option_values)
-    outputs.report_paths(output, json_path)  # report an invalid path before the long analysis
+    # report an invalid path before the long analysis
+    outputs.choose_report_paths(output, json_path)
     try:
         with outputs.progress(json_path) as show_progress:
             outcome = diagnose_or_check_aids(request, show_progress)
             results = make_outcome_results(request, outcome, student)
-            release_free_memory()  # the import of the report modules needs memory
-            contents = outputs.result_files(
+            # keep the peak memory low: the next step imports the report modules
+            release_free_memory()
+            contents = outputs.make_result_files(
                 results,
                 json_path,
                 output,
@@ -72,17 +74,17 @@ def compare(
                 log.stem + format_settings_suffix(request),
             )
     except (LogError, MissingDataError) as error:
-        if not sys.stderr.isatty():  # a program reads the error: print one line, not a card
+        if not sys.stderr.isatty():  # a program reads the error: one line, no diagnosis card
             raise
         outputs.show_page(
-            make_card_page("card", build_unusable_log_card(error, log)), is_error=True
+            make_card_page("card", build_unusable_log_card(error, log)), uses_stderr=True
         )
         sys.exit(2)
-    page = comparison_page(outcome, results, verbose=verbose, quiet=quiet)
-    outputs.write_and_print(contents, page, request)
+    page = make_comparison_page(outcome, results, verbose=verbose, quiet=quiet)
+    outputs.write_and_print_results(contents, page, request)
     if not quiet and STANDARD_OUTPUT not in contents:
         outputs.show_page(make_card_page("closing", results.card))
-    failed_verdicts = failed_checks(outcome) if checks else {}
+    failed_verdicts = find_failed_checks(outcome) if checks else {}
     for name, verdict in failed_verdicts.items():
         click.echo(f"{name}: {verdict.replace('_', ' ')}", err=True)
     if failed_verdicts:

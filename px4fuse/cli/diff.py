@@ -29,6 +29,8 @@ def diff(a: Path, b: Path, json_path: Path | None) -> None:
 
     with outputs.progress(json_path) as show_progress:
         results = compare_inputs(a, b, progress=show_progress)
-    outputs.write_and_print(outputs.result_files(results, json_path), format_differences(results))
+    outputs.write_and_print_results(
+        outputs.make_result_files(results, json_path), format_differences(results)
+    )
     if results.worse:
         sys.exit(1)

@@ -96,16 +96,16 @@ def evaluate(
     from px4fuse.results.build import make_evaluation_results
     from px4fuse.trajectory.evaluation import evaluate as evaluate_trajectory
 
-    deltas = option_values.pop("rpe")
+    rpe_deltas = option_values.pop("rpe")
     request = EvaluationRequest(
         estimate=str(estimate),
         reference=str(reference),
-        rpe=tuple(map(str, deltas)),
+        rpe=tuple(map(str, rpe_deltas)),
         **option_values,
     )
     if request.max_gap_s is not None and request.max_gap_s <= 0.0:
         raise SettingsError(f"--max-gap {request.max_gap_s:g} is too small. Give a time above 0 s.")
-    outputs.report_paths(output, json_path)
+    outputs.choose_report_paths(output, json_path)
     with outputs.progress(json_path) as show_progress:
         show_progress("reading")
         estimate_source = read_source(request.estimate, system=request.system)
@@ -114,7 +114,7 @@ def evaluate(
         evaluation = evaluate_trajectory(
             estimate_source.trajectory,
             reference_source.trajectory,
-            rpe_deltas=deltas or None,
+            rpe_deltas=rpe_deltas or None,
             all_pairs=not request.consecutive,
             alignment=request.alignment,
             association=request.association,
@@ -122,9 +122,11 @@ def evaluate(
             time_offset_s=request.time_offset_s,
         )
         results = make_evaluation_results(request, evaluation)
-        name = f"{make_file_stem(estimate)}_against_{make_file_stem(reference)}"
-        name += format_settings_suffix(request)
-        contents = outputs.result_files(results, json_path, output, evaluation, show_progress, name)
+        report_stem = f"{make_file_stem(estimate)}_against_{make_file_stem(reference)}"
+        report_stem += format_settings_suffix(request)
+        contents = outputs.make_result_files(
+            results, json_path, output, evaluation, show_progress, report_stem
+        )
     page = Page()
     write_evaluation(page, evaluation)
-    outputs.write_and_print(contents, page)
+    outputs.write_and_print_results(contents, page)

@@ -2,7 +2,7 @@
 
 import click
 
-from px4fuse.cli.outputs import write_and_print
+from px4fuse.cli.outputs import write_and_print_results
 
 
 @click.command()
@@ -15,4 +15,6 @@ def explain(finding: str | None) -> None:
     """
     from px4fuse.report.explanation import make_finding_page, make_findings_list
 
-    write_and_print({}, make_findings_list() if finding is None else make_finding_page(finding))
+    write_and_print_results(
+        {}, make_findings_list() if finding is None else make_finding_page(finding)
+    )

@@ -27,16 +27,16 @@ def explore(log: Path | None, output: Path | None, **option_values: Any) -> None
 
     log = log or sample_log()
     request = options.comparison_request(log, option_values)
-    target = outputs.web_page_path(
+    page_path = outputs.choose_web_page_path(
         output, Path("reports", f"{log.stem}{format_settings_suffix(request)}.html")
     )
-    with outputs.progress(target) as show_progress:
+    with outputs.progress(page_path) as show_progress:
         analysis = diagnose(request, show_progress)
         show_progress("writing the page")
         # a slow import (Bokeh), which is not needed if the analysis fails
-        from px4fuse.explore.page import html_text
+        from px4fuse.explore.page import make_analysis_page
 
-        page = html_text(analysis)
+        page = make_analysis_page(analysis)
         if output is None:
-            outputs.check_default_page(target, page)
-    outputs.write_and_print({target: page.encode()})
+            outputs.check_default_page(page_path, page)
+    outputs.write_and_print_results({page_path: page.encode()})

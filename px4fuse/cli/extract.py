@@ -15,7 +15,7 @@ from px4fuse.cli.options import (
     output_option,
 )
 from px4fuse.cli.outputs import write_outputs
-from px4fuse.core.input_files import check_output_folder, inputs_not_registered
+from px4fuse.core.input_files import check_output_folder, suspend_input_registration
 from px4fuse.core.reading import read_text
 from px4fuse.errors import OutputError, to_one_line
 
@@ -54,7 +54,7 @@ def extract(
     from px4fuse.info import tables as extraction
     from px4fuse.results.contract import to_json
 
-    flight = extraction.with_source_innovations(read_flight(comparison_request(log, option_values)))
+    flight = extraction.add_source_innovations(read_flight(comparison_request(log, option_values)))
     _require_same_flight(output, flight.log.sha256)
     tables = extraction.tables(flight)
     contents = {
@@ -64,7 +64,7 @@ def extract(
     contents[output / "data_dictionary.csv"] = extraction.to_bytes(
         extraction.data_dictionary(flight), "csv"
     )
-    contents[output / "flight.json"] = to_json(extraction.description(flight)).encode()
+    contents[output / "flight.json"] = to_json(extraction.describe_flight(flight)).encode()
     write_outputs(contents)
     click.echo(f"Wrote to {to_one_line(str(output))}:")
     for name, table in tables.items():
@@ -76,14 +76,15 @@ def extract(
 
 def _require_same_flight(folder: Path, sha256: str) -> None:
     try:
-        with inputs_not_registered():
+        with suspend_input_registration():
             text = read_text(folder / "flight.json", OutputError, MAX_DESCRIPTION_BYTES)
         earlier_log = json.loads(text)["log"]
-        name, earlier_sha256 = earlier_log["name"], earlier_log["sha256"]
+        earlier_name, earlier_sha256 = earlier_log["name"], earlier_log["sha256"]
     # without a valid flight.json, the folder contains no tables of another log
     except (OutputError, ValueError, KeyError, TypeError):
         return
     if earlier_sha256 != sha256:
         raise OutputError(
-            f"{folder} contains the tables of another log, {name}. Choose another folder (-o)."
+            f"{folder} contains the tables of another log, {earlier_name}. Choose "
+            "another folder (-o)."
         )

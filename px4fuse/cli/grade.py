@@ -17,7 +17,7 @@ from px4fuse.cli.options import (
     open_option,
     output_option,
 )
-from px4fuse.cli.outputs import Interrupted, progress, write_and_print, write_new
+from px4fuse.cli.outputs import Interrupted, progress, write_and_print_results, write_new
 from px4fuse.core.input_files import add_input, check_output_folder
 from px4fuse.core.reading import files_below
 from px4fuse.errors import OutputError, SettingsError
@@ -182,7 +182,7 @@ def grade(
             f"results of verified reports are in {output}. Run the same command to continue."
         )
         raise Interrupted(interrupt, interruption_note) from None
-    write_and_print({}, grading_page(outcome), written_files=outcome.written_paths)
+    write_and_print_results({}, grading_page(outcome), written_files=outcome.written_paths)
 
 
 def _require_output_outside(output: Path, input_paths: tuple[Path, ...]) -> None:

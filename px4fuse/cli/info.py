@@ -12,7 +12,7 @@ from px4fuse.cli.options import (
     json_option,
     log_argument,
 )
-from px4fuse.cli.outputs import progress, result_files, write_and_print
+from px4fuse.cli.outputs import make_result_files, progress, write_and_print_results
 
 
 def _print_versions(context: click.Context, _: click.Parameter, is_requested: bool) -> None:
@@ -57,5 +57,5 @@ def info(log: Path, json_path: Path | None, **option_values: Any) -> None:
         flight = read_flight(request, show_progress)
         show_progress("reading the contents of the log")
         inventory = take_inventory(flight)
-    contents = result_files(to_json_dict(inventory), json_path)
-    write_and_print(contents, make_log_page(inventory, request))
+    contents = make_result_files(to_json_dict(inventory), json_path)
+    write_and_print_results(contents, make_log_page(inventory, request))

@@ -21,15 +21,17 @@ if TYPE_CHECKING:
 # Maximum distance (m) from take-off to landing place (--landed-at); more is a typing error
 MAX_LANDING_DISTANCE_M = 10_000.0
 # Parameters of the command that are allowed if SOURCE is a pose graph
-POSE_GRAPH_PARAMETERS = ("source", "json_path", "g2o", "robust")
+POSE_GRAPH_ARGUMENT_NAMES = ("source", "json_path", "g2o_path", "robust")
 
 
-def _parse_numbers(text: str, syntax: str, max_absolute: float) -> list[float]:
+def _parse_numbers(text: str, syntax: str, max_absolute_value: float) -> list[float]:
     try:
         numbers = [float(word) for word in text.split(",")]
     except ValueError:
         numbers = []
-    if len(numbers) not in (2, 3) or not all(abs(number) <= max_absolute for number in numbers):
+    if len(numbers) not in (2, 3) or not all(
+        abs(number) <= max_absolute_value for number in numbers
+    ):
         raise click.BadParameter(f"The value {text!r} is not {syntax}.")
     return numbers
 
@@ -38,7 +40,9 @@ def parse_landing(text: str) -> Landing:
     """Parse a landing place: ``FORWARD,RIGHT`` (m) or ``FORWARD,RIGHT,DEG``."""
     return Landing(
         *_parse_numbers(
-            text, "FORWARD,RIGHT (two distances in m) or FORWARD,RIGHT,DEG", MAX_LANDING_DISTANCE_M
+            text,
+            "FORWARD,RIGHT (m from take-off) or FORWARD,RIGHT,DEG (rotation in °)",
+            MAX_LANDING_DISTANCE_M,
         )
     )
 
@@ -123,12 +127,14 @@ _loop_option = partial(options.request_option, LoopRequest)
 @options.report_options("Report to write (PDF).  [default: reports/SOURCE_loop.pdf]")
 @click.option(
     "--tum",
+    "tum_path",
     type=options.NonEmptyPath(),
     metavar="FILE",
     help="Write the corrected path as a TUM file, in the frame of SOURCE.",
 )
 @click.option(
     "--g2o",
+    "g2o_path",
     type=options.NonEmptyPath(),
     metavar="FILE",
     help="Write the optimised pose graph as a g2o file.",
@@ -138,8 +144,8 @@ def loop(
     source: Path,
     output: Path | None,
     json_path: Path | None,
-    tum: Path | None,
-    g2o: Path | None,
+    tum_path: Path | None,
+    g2o_path: Path | None,
     **option_values: Any,
 ) -> None:
     """Measure and correct the loop closure error of odometry.
@@ -150,66 +156,72 @@ def loop(
     """
     from px4fuse.diagnose import analyse_loop_closure
     from px4fuse.loop.tracks import is_g2o, make_file_stem
-    from px4fuse.report.loop import loop_page
+    from px4fuse.report.loop import make_loop_page
     from px4fuse.results.build import make_loop_results
 
     log = split_path_and_part(str(source))[0]  # SOURCE may be LOG:TRACK
     student = options.read_student(option_values, log)
-    for name, path in (("--tum", tum), ("--g2o", g2o)):
+    for name, path in (("--tum", tum_path), ("--g2o", g2o_path)):
         if path == STANDARD_OUTPUT:
             raise SettingsError(
                 f"{name} cannot write to standard output, only --json can",
                 f"Give a file name after {name}.",
             )
     if is_g2o(log):
-        _solve_graph(source, json_path, g2o, option_values["robust"] or None)
+        _solve_graph(source, json_path, g2o_path, option_values["robust"] or None)
         return
-    request = loop_request(source, option_values)
-    outputs.check_targets([tum, g2o, *outputs.report_paths(output, json_path)])
+    request = make_loop_request(source, option_values)
+    outputs.check_output_paths(
+        [tum_path, g2o_path, *outputs.choose_report_paths(output, json_path)]
+    )
     with outputs.progress(json_path) as show_progress:
         loop_result = analyse_loop_closure(request, show_progress)
         results = make_loop_results(request, loop_result, student)
         name = f"{make_file_stem(source)}_loop{format_settings_suffix(request)}"
-        contents = _output_files(loop_result, tum, g2o) | outputs.result_files(
-            results, json_path, output, loop_result, show_progress, name
-        )
-    outputs.write_and_print(contents, loop_page(loop_result, results.findings), request)
+        contents = _format_output_files(
+            loop_result, tum_path, g2o_path
+        ) | outputs.make_result_files(results, json_path, output, loop_result, show_progress, name)
+    outputs.write_and_print_results(
+        contents, make_loop_page(loop_result, results.findings), request
+    )
 
 
-def loop_request(source: Path, option_values: dict[str, Any]) -> LoopRequest:
+def make_loop_request(source: Path, option_values: dict[str, Any]) -> LoopRequest:
     del option_values["robust"]
     return LoopRequest(
         source=str(source), closed_loop=not option_values.pop("is_open_path"), **option_values
     )
 
 
-def _output_files(loop_result: Loop, tum: Path | None, g2o: Path | None) -> dict[Path, bytes]:
+def _format_output_files(
+    loop_result: Loop, tum_path: Path | None, g2o_path: Path | None
+) -> dict[Path, bytes]:
     """Return the contents of the TUM file (corrected path) and the g2o file (pose graph)."""
     from px4fuse.loop.closure import from_z_down
     from px4fuse.readers.g2o import format_g2o
     from px4fuse.readers.trajectory import format_tum
 
     contents = {}
-    if tum is not None:
+    if tum_path is not None:
         best_path = loop_result.choose_best_path()
         if best_path is loop_result.odometry:
             raise MissingDataError(
-                f"--tum {display_name(tum)}: the path is not corrected, as no loop closure was "
-                "accepted. Give a loop closure (--closure) or the landing place (--landed-at)."
+                f"--tum {display_name(tum_path)}: the path is not corrected, as no loop closure "
+                "was accepted. Give a loop closure (--closure) or the landing place (--landed-at)."
             )
-        contents[tum] = format_tum(
+        contents[tum_path] = format_tum(
             from_z_down(best_path.trajectory, loop_result.original_frame)
         ).encode()
-    if g2o is not None:
-        contents[g2o] = format_g2o(loop_result.solved_graph()).encode()
+    if g2o_path is not None:
+        contents[g2o_path] = format_g2o(loop_result.solved_graph()).encode()
     return contents
 
 
 def _solve_graph(
-    source: Path, json_path: Path | None, g2o: Path | None, robust: bool | None
+    source: Path, json_path: Path | None, g2o_path: Path | None, robust: bool | None
 ) -> None:
     from px4fuse.readers.g2o import format_g2o, read_g2o
-    from px4fuse.report.loop import pose_graph_page
+    from px4fuse.report.loop import make_pose_graph_page
     from px4fuse.results.build import make_graph_results
     from px4fuse.trajectory.graph.solver import analyse_graph
 
@@ -219,17 +231,17 @@ def _solve_graph(
             f"{display_name(source)}: a pose graph has no track {track!r}", f"Omit :{track}."
         )
     for parameter in options.list_given_parameters():
-        if parameter.name not in POSE_GRAPH_PARAMETERS:
+        if parameter.name not in POSE_GRAPH_ARGUMENT_NAMES:
             raise SettingsError(
                 f"{display_name(source)}: {parameter.opts[-1]} is not available for a pose graph.",
                 "For a pose graph, use only --g2o FILE, --json FILE and --robust.",
             )
-    with outputs.progress(json_path, g2o) as show_progress:
+    with outputs.progress(json_path, g2o_path) as show_progress:
         show_progress(f"reading {display_name(source)}")
         results, solved_graph = analyse_graph(
             display_name(source), read_g2o(path), show_progress, run_robust=robust
         )
     command = command_line(LoopRequest(source=str(source))) + (" --robust" if robust else "")
-    contents = {} if g2o is None else {g2o: format_g2o(solved_graph).encode()}
-    contents |= outputs.result_files(make_graph_results(results, command), json_path)
-    outputs.write_and_print(contents, pose_graph_page(results))
+    contents = {} if g2o_path is None else {g2o_path: format_g2o(solved_graph).encode()}
+    contents |= outputs.make_result_files(make_graph_results(results, command), json_path)
+    outputs.write_and_print_results(contents, make_pose_graph_page(results))

@@ -25,11 +25,15 @@ from px4fuse.core.reading import (
 )
 from px4fuse.errors import SettingsError
 
-# Tool arguments with another name than the parameter of the command
-ARGUMENT_NAMES = {"finding": "finding_id", "parameter_texts": "parameters", "source": "log"}
+# Names of tool arguments that differ from the parameter of the command
+TOOL_ARGUMENT_BY_PARAMETER = {
+    "finding": "finding_id",
+    "parameter_texts": "parameters",
+    "source": "log",
+}
 # Command parameters that the tools of the server do not offer: outputs, exit codes, student data
-OMITTED_PARAMETERS = {
-    *("output", "json_path", "tum", "g2o", "fail_on", "checks"),
+OMITTED_COMMAND_PARAMETERS = {
+    *("output", "json_path", "tum_path", "g2o_path", "fail_on", "checks"),
     *("student", "student_id", "notes", "answers"),
 }
 
@@ -46,6 +50,7 @@ OMITTED_PARAMETERS = {
 )
 @click.option(
     "--out",
+    "report_folder",
     type=click.Path(file_okay=False, path_type=Path),
     metavar="DIR",
     help="Folder for the reports (PDF) of the tools.  [default: no file is written]",
@@ -53,7 +58,9 @@ OMITTED_PARAMETERS = {
 @options.timeout_option
 @options.memory_option
 @options.max_size_option
-def mcp(roots: tuple[Path, ...], out: Path | None, timeout_s: float, memory_gb: float) -> None:
+def mcp(
+    roots: tuple[Path, ...], report_folder: Path | None, timeout_s: float, memory_gb: float
+) -> None:
     """Serve px4fuse to assistants (Model Context Protocol).
 
     A program with a language model starts this command, and exchanges messages with it on standard
@@ -70,14 +77,14 @@ def mcp(roots: tuple[Path, ...], out: Path | None, timeout_s: float, memory_gb: 
         # an exception would not end the thread that reads standard input
         signal.signal(signal_number, lambda number, _: os._exit(128 + number))
     folders = tuple(root.resolve() for root in roots)
-    if out is not None:
-        out = out.resolve()
-        out.mkdir(parents=True, exist_ok=True)
-    run = partial(run_command, folders, max_log_bytes.get(), out)
+    if report_folder is not None:
+        report_folder = report_folder.resolve()
+        report_folder.mkdir(parents=True, exist_ok=True)
+    run = partial(run_command, folders, max_log_bytes.get(), report_folder)
     server = Server(make_tools(folders), run, timeout_s, int(memory_gb * 1e9))
     try:
         server.run()
-    except* BrokenPipeError:  # the client has ended
+    except* BrokenPipeError:  # the MCP client closed the pipe: end without an error
         pass
 
 
@@ -108,7 +115,7 @@ def run_command(
     # only in a worker process: commands in the server process write no files
     if report_folder and sender:
         os.chdir(report_folder)
-    output, results_json = io.StringIO(), list[str]()
+    output, results_json_texts = io.StringIO(), list[str]()
     try:
         with redirect_stdout(output), redirect_stderr(io.StringIO()):
             # without a folder, the results go to standard output ("-"), and no report is written
@@ -117,13 +124,13 @@ def run_command(
                 "px4fuse", [*command_words], default_map=default_options
             ) as context:
                 context.meta[outputs.SEND_PROGRESS_KEY] = sender and sender.send
-                context.meta[outputs.RESULTS_KEY] = results_json
+                context.meta[outputs.RESULTS_KEY] = results_json_texts
                 cli.invoke(context)
     except click.UsageError as error:
         raise SettingsError(error.format_message()) from error
-    if not results_json:
+    if not results_json_texts:
         return output.getvalue(), None
-    results = json.loads(results_json[0])
+    results = json.loads(results_json_texts[0])
     return output.getvalue(), results["card"] if command_words[0] == "compare" else results
 
 
@@ -170,9 +177,10 @@ def make_tools(folders: tuple[Path, ...]) -> list[tuple[Any, Any]]:
 def _list_parameters(command_name: str) -> dict[str, click.Parameter]:
     """Return the parameters of a command, by the name of the tool argument."""
     return {
-        ARGUMENT_NAMES.get(name, name): parameter
+        TOOL_ARGUMENT_BY_PARAMETER.get(name, name): parameter
         for parameter in find_command(command_name).params
-        if parameter.expose_value and (name := str(parameter.name)) not in OMITTED_PARAMETERS
+        if parameter.expose_value
+        and (name := str(parameter.name)) not in OMITTED_COMMAND_PARAMETERS
     }
 
 
@@ -238,7 +246,7 @@ def _parse_arguments(
     return command_words + operands, files
 
 
-def _find_file(file_text: str, folders: Sequence[Path]) -> str:
+def _find_file(file_argument: str, folders: Sequence[Path]) -> str:
     """Return the absolute path of ``FILE`` or ``FILE:PART`` in the first folder that contains it.
 
     Raises
@@ -246,7 +254,7 @@ def _find_file(file_text: str, folders: Sequence[Path]) -> str:
     LogError
         The file is outside the folders.
     """
-    paths = [str(folder / file_text) for folder in folders]
+    paths = [str(folder / file_argument) for folder in folders]
     path = next((path for path in paths if split_path_and_part(path)[0].exists()), paths[0])
     check_readable(split_path_and_part(path)[0], folders)
     return path

@@ -26,7 +26,7 @@ from px4fuse.core.text import replace_unencodable
 from px4fuse.core.units import UNIT_NAMES, convert_to_unit
 from px4fuse.errors import SettingsError
 from px4fuse.filter.settings import SETTING_RANGES
-from px4fuse.request import AUTO, OPTION_NAMES, SUFFIX_UNITS, ComparisonRequest, PositionFile
+from px4fuse.request import AUTO, OPTION_NAMES, UNIT_BY_SUFFIX, ComparisonRequest, PositionFile
 
 if TYPE_CHECKING:
     from px4fuse.results.model import Student
@@ -93,8 +93,8 @@ class TypedQuantity(click.ParamType["float | str"]):
         try:
             number = float(value)
         except ValueError:
-            converted = convert_to_unit(value, self.unit)
-            example = self.example if converted is None else converted
+            value_in_unit = convert_to_unit(value, self.unit)
+            example = self.example if value_in_unit is None else value_in_unit
             self.fail(
                 f"{value!r} is not a number{unit}. Give for example {example:.12g}"
                 f"{', or auto' if self.accepts_auto else ''}.",
@@ -177,11 +177,13 @@ def output_option(metavar: str, help_text: str, **details: Any) -> OptionDecorat
 
 def report_options(help_text: str) -> OptionDecorator:
     """Make the option -o for the PDF report, and the option --json for the results."""
-    json_text = " With --json and without -o, no report is written.  [default: beside the report]"
+    json_text = (
+        " Without -o, no report is then written.  [default: FILE.json for the report FILE.pdf]"
+    )
     return _combine_options(output_option("FILE.pdf", help_text), _json_option(json_text))
 
 
-def fail_option(levels: tuple[str, ...], help_text: str) -> OptionDecorator:
+def make_fail_on_option(levels: tuple[str, ...], help_text: str) -> OptionDecorator:
     return click.option("--fail-on", type=Choice(levels), help=help_text)
 
 
@@ -193,7 +195,7 @@ def exit_for_severity(
         sys.exit(1)
 
 
-def _open_flag(*names: str) -> OptionDecorator:
+def _make_open_option(*names: str) -> OptionDecorator:
     return flag_option(
         *names,
         expose_value=False,
@@ -203,9 +205,9 @@ def _open_flag(*names: str) -> OptionDecorator:
 
 
 #: Option --open of commands that write a report or a page
-open_option = _open_flag("--open", "--show", "opened")
+open_option = _make_open_option("--open", "--show", "opened")
 #: Option --show of px4fuse loop, where --open means that the path is open (not a loop)
-show_option = _open_flag("--show", "shown")
+show_option = _make_open_option("--show", "shown")
 #: Options for the student's name and id, notes and answer form
 student_options = _combine_options(
     click.option("--student", metavar="NAME", help="Name of the student, printed on the report."),
@@ -239,7 +241,7 @@ def request_option(
     types = (field.type, *get_args(field.type))
     literal_types = [each for each in types if get_origin(each) is Literal]
     if float in types:
-        unit = next(unit for suffix, unit in SUFFIX_UNITS.items() if name.endswith(suffix))
+        unit = next(unit for suffix, unit in UNIT_BY_SUFFIX.items() if name.endswith(suffix))
         details["type"] = TypedQuantity(
             unit, field.default or example, accepts_auto=bool(literal_types)
         )
@@ -366,10 +368,12 @@ def comparison_request(log: Path, option_values: dict[str, Any]) -> ComparisonRe
     SettingsError
         An option for a position file is given without --position.
     """
-    return ComparisonRequest(log=str(log), position=_position_file(option_values), **option_values)
+    return ComparisonRequest(
+        log=str(log), position=_parse_position_file(option_values), **option_values
+    )
 
 
-def _position_file(option_values: dict[str, Any]) -> PositionFile | None:
+def _parse_position_file(option_values: dict[str, Any]) -> PositionFile | None:
     option_names = OPTION_NAMES[PositionFile]
     fields = {
         field: option_values.pop(name[2:].replace("-", "_")) for field, name in option_names.items()

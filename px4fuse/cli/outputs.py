@@ -17,7 +17,7 @@ from typing import TYPE_CHECKING, Any
 import click
 
 from px4fuse.core.input_files import check_outputs
-from px4fuse.core.writing import STANDARD_OUTPUT, format_written_outputs, write_all
+from px4fuse.core.writing import STANDARD_OUTPUT, format_written_outputs, write_output_files
 from px4fuse.errors import OutputError, ResultsError, to_one_line
 
 if TYPE_CHECKING:
@@ -34,13 +34,13 @@ MAX_NAME_BYTES, CUT_STEM_BYTES = 200, 180
 NO_STUDENT_NAME = ("", "")
 # Line width (characters) in a pipe: longer than any paragraph
 UNWRAPPED_WIDTH = 10_000
-# Key in the click context of the list of written files
+# Key in the click context: paths of the files that the command has written
 WRITTEN_FILES_KEY = "px4fuse.written"
-# Key in the click context of a bool: True to open the output in its default program
+# Key in the click context: True to open the output in its default program
 OPENS_OUTPUT_KEY = "px4fuse.opens_output"
-# Key in the click context of the function that sends progress messages to px4fuse mcp
+# Key in the click context: function that sends progress messages to px4fuse mcp
 SEND_PROGRESS_KEY = "px4fuse.send"
-# Key in the click context of the list of results (JSON text) that px4fuse mcp returns
+# Key in the click context: list to which a command of px4fuse mcp adds its results (JSON text)
 RESULTS_KEY = "px4fuse.results"
 # Suffixes of files that --open can open, in order of preference
 OPENABLE_SUFFIXES = (".html", ".htm", ".pdf", ".png")
@@ -62,7 +62,7 @@ class Interrupted(Exception):  # noqa: N818 - no error, because the user ends th
 
 
 @contextmanager
-def progress(*targets: Path | None) -> Iterator[ShowProgress]:
+def progress(*output_paths: Path | None) -> Iterator[ShowProgress]:
     """Check the output paths, and provide a function that shows the progress on a terminal.
 
     In a pipe, or if a target is standard output, the function shows nothing.
@@ -70,9 +70,9 @@ def progress(*targets: Path | None) -> Iterator[ShowProgress]:
     Raises
     ------
     OutputError
-        A target cannot be written, see :func:`check_targets`.
+        A target cannot be written, see :func:`check_output_paths`.
     """
-    check_targets(targets)
+    check_output_paths(output_paths)
     context = click.get_current_context(silent=True)
     if context and (send := context.meta.get(SEND_PROGRESS_KEY)):
         yield lambda activity, *_: send(activity)
@@ -81,7 +81,7 @@ def progress(*targets: Path | None) -> Iterator[ShowProgress]:
 
     console = Console(stderr=True)
     # no progress bar at all: in older versions of rich, a disabled bar prints an empty line
-    if not console.is_terminal or STANDARD_OUTPUT in targets:
+    if not console.is_terminal or STANDARD_OUTPUT in output_paths:
         yield lambda *_: None
         return
     from rich import progress as rich_progress
@@ -106,7 +106,7 @@ def progress(*targets: Path | None) -> Iterator[ShowProgress]:
         yield show
 
 
-def default_report_path(name: str, results: Results) -> Path:
+def choose_default_report_path(report_stem: str, results: Results) -> Path:
     """Return the path of a report if the user gives none (-o); a long name is cut.
 
     Raises
@@ -117,12 +117,12 @@ def default_report_path(name: str, results: Results) -> Path:
     from px4fuse.results.reading import read_results
     from px4fuse.verification.pdf_input import read_attached_results
 
-    if len(os.fsencode(name)) > MAX_NAME_BYTES:
-        short_stem = os.fsencode(name)[:CUT_STEM_BYTES].decode(errors="ignore")
-        name = f"{short_stem}_{hashlib.sha256(os.fsencode(name)).hexdigest()[:8]}"
-    path = Path("reports", f"{name}.pdf")
+    if len(os.fsencode(report_stem)) > MAX_NAME_BYTES:
+        short_stem = os.fsencode(report_stem)[:CUT_STEM_BYTES].decode(errors="ignore")
+        report_stem = f"{short_stem}_{hashlib.sha256(os.fsencode(report_stem)).hexdigest()[:8]}"
+    path = Path("reports", f"{report_stem}.pdf")
     mismatch_reason = (
-        "this px4fuse version did not write the file for the same input files and student"
+        "it is not a report of this px4fuse version on the same input files and student"
     )
     for target, read in (path, read_attached_results), (path.with_suffix(".json"), read_results):
         _require_replaceable(target, mismatch_reason, partial(_is_same_report, results, read))
@@ -137,11 +137,11 @@ def check_default_page(path: Path, page: str) -> None:
     OutputError
         A file with this path exists, and is not a web page of this command and log.
     """
-    generators = GENERATOR_PATTERN.findall(page)
+    generator_tags = GENERATOR_PATTERN.findall(page)
     _require_replaceable(
         path,
-        "this px4fuse version did not write the file for the same command and log",
-        lambda content: GENERATOR_PATTERN.findall(content.decode()) == generators,
+        "it is not the output of this px4fuse version for the same command and log",
+        lambda content: GENERATOR_PATTERN.findall(content.decode()) == generator_tags,
     )
 
 
@@ -162,22 +162,22 @@ def _require_replaceable(
 def _is_same_report(
     new_results: Results, read: Callable[[bytes, str], Results], existing_content: bytes
 ) -> bool:
-    """Return True for equal input files and student; the existing report may have no student."""
+    """Return True if the existing report has the same input files and the same or no student."""
     from px4fuse.results.contract import find_file_hashes, to_json
 
     existing_results = read(existing_content, "report")
     existing_hashes = find_file_hashes(to_json(existing_results))
-    return existing_hashes == find_file_hashes(to_json(new_results)) and _student_name_and_id(
+    return existing_hashes == find_file_hashes(to_json(new_results)) and _get_student_name_and_id(
         existing_results
-    ) in (NO_STUDENT_NAME, _student_name_and_id(new_results))
+    ) in (NO_STUDENT_NAME, _get_student_name_and_id(new_results))
 
 
-def _student_name_and_id(results: Results) -> tuple[str, str]:
+def _get_student_name_and_id(results: Results) -> tuple[str, str]:
     student = getattr(results, "student", None)
     return NO_STUDENT_NAME if student is None else (student.name, student.id)
 
 
-def web_page_path(output: Path | None, default: Path) -> Path:
+def choose_web_page_path(output: Path | None, default: Path) -> Path:
     """Return the path of a web page (value of -o, or the default), and check it.
 
     Raises
@@ -185,14 +185,16 @@ def web_page_path(output: Path | None, default: Path) -> Path:
     OutputError
         The name does not end in .html or .htm, or the path cannot be written.
     """
-    target = output or default
-    if target.suffix.lower() not in (".html", ".htm") and target != STANDARD_OUTPUT:
-        raise OutputError(f"{target}: the output is a web page. Give a name ending in .html (-o).")
-    check_targets([target])
-    return target
+    page_path = output or default
+    if page_path.suffix.lower() not in (".html", ".htm") and page_path != STANDARD_OUTPUT:
+        raise OutputError(
+            f"{page_path}: the output is a web page. Give a name ending in .html (-o)."
+        )
+    check_output_paths([page_path])
+    return page_path
 
 
-def report_paths(output: Path | None, json_path: Path | None) -> list[Path]:
+def choose_report_paths(output: Path | None, json_path: Path | None) -> list[Path]:
     """Return the paths of a report (PDF) and its results (JSON), from the values of -o and --json.
 
     Without -o, the path of the report is missing: it depends on the analysis.
@@ -206,28 +208,28 @@ def report_paths(output: Path | None, json_path: Path | None) -> list[Path]:
         raise OutputError(f"{output}: the output is a PDF. Give a name ending in .pdf (-o).")
     results_path = json_path
     if output is not None and json_path in (None, STANDARD_OUTPUT):
-        results_path = output.with_suffix(".json")  # beside the report
+        results_path = output.with_suffix(".json")
     paths = [path for path in (output, results_path) if path is not None]
-    check_targets(paths)
+    check_output_paths(paths)
     return paths
 
 
-def result_files(
+def make_result_files(
     results: Any,
     json_path: Path | None,
     output: Path | None = None,
     analysis: object = None,
     show_progress: ShowProgress = lambda *_: None,
-    default_name: str = "",
+    default_stem: str = "",
 ) -> dict[Path, bytes]:
     """Return the contents of the results (JSON) and of the report (PDF) by path.
 
-    Without -o and --json, the report is named ``default_name``, or not made if this is "".
+    Without -o and --json, the report is named ``default_stem``, or not made if this is "".
     """
     from px4fuse.results.contract import to_json
 
-    if default_name and output is None and json_path is None:
-        output = default_report_path(default_name, results)
+    if default_stem and output is None and json_path is None:
+        output = choose_default_report_path(default_stem, results)
     json_text, contents = to_json(results), dict[Path, bytes]()
     if (recorded_texts := click.get_current_context().meta.get(RESULTS_KEY)) is not None:
         recorded_texts.append(json_text)
@@ -236,7 +238,7 @@ def result_files(
         from px4fuse.report.pdf import render_pdf
 
         show_progress("writing the report")
-        output, results_path = report_paths(output, json_path)
+        output, results_path = choose_report_paths(output, json_path)
         contents |= {
             output: render_pdf(analysis, results, json_text),
             results_path: json_text.encode(),
@@ -254,12 +256,12 @@ def write_outputs(contents: Mapping[Path, bytes]) -> None:
     OutputError
         An output cannot be written.
     """
-    check_targets(contents)
+    check_output_paths(contents)
     written_files: list[Path] = click.get_current_context().meta.setdefault(WRITTEN_FILES_KEY, [])
-    write_all(contents, written_files.append)
+    write_output_files(contents, written_files.append)
 
 
-def written_files_sentence(context: click.Context) -> str:
+def describe_written_files(context: click.Context) -> str:
     written_files: list[Path] = context.meta.get(WRITTEN_FILES_KEY, [])
     return f"{format_written_outputs(written_files)}." if written_files else "nothing was written."
 
@@ -274,10 +276,10 @@ def write_new(path: Path, content: bytes) -> None:
     """
     if path.exists():
         raise OutputError(f"{path} exists and was not overwritten. Choose another file name.")
-    write_and_print({path: content})
+    write_and_print_results({path: content})
 
 
-def check_targets(targets: Iterable[Path | None]) -> None:
+def check_output_paths(output_paths: Iterable[Path | None]) -> None:
     """Check output paths before the analysis begins; None and standard output are ignored.
 
     Raises
@@ -286,23 +288,25 @@ def check_targets(targets: Iterable[Path | None]) -> None:
         Two outputs are the same file, an output is a folder or an input of this command, or a path
         cannot be written.
     """
-    files = [target for target in targets if target not in (None, STANDARD_OUTPUT)]
-    if len({file.resolve() for file in files}) < len(files):
+    file_paths = [
+        output_path for output_path in output_paths if output_path not in (None, STANDARD_OUTPUT)
+    ]
+    if len({file.resolve() for file in file_paths}) < len(file_paths):
         raise OutputError("two outputs have the same file name. Give different names.")
-    for target in files:
+    for output_path in file_paths:
         try:
-            if stat.S_ISDIR(target.stat().st_mode):
-                raise OutputError(f"{target} is a folder. Give a file name.")
+            if stat.S_ISDIR(output_path.stat().st_mode):
+                raise OutputError(f"{output_path} is a folder. Give a file name.")
         except FileNotFoundError:
             continue
         except OSError as error:  # the file name is too long, or a parent folder is a file
             raise OutputError(
-                f"{target} cannot be written ({error.strerror}). Choose another path."
+                f"{output_path} cannot be written ({error.strerror}). Choose another path."
             ) from error
-    check_outputs(files)
+    check_outputs(file_paths)
 
 
-def write_and_print(
+def write_and_print_results(
     contents: Mapping[Path, bytes],
     page: Page | None = None,
     request: Request | None = None,
@@ -338,13 +342,13 @@ def write_and_print(
         click.launch(str(openable_files[0].resolve()))
 
 
-def show_page(page: Page, *, is_error: bool = False) -> None:
+def show_page(page: Page, *, uses_stderr: bool = False) -> None:
     from px4fuse.report.screen import print_blocks
 
-    print_blocks(make_console(is_error=is_error), page.blocks)
+    print_blocks(make_console(uses_stderr=uses_stderr), page.blocks)
 
 
-def make_console(*, is_error: bool = False) -> Console:
+def make_console(*, uses_stderr: bool = False) -> Console:
     """Return a console that raises BrokenPipeError if the reader of a pipe has ended.
 
     In a pipe, lines are not wrapped unless the environment variable COLUMNS contains a width.
@@ -355,10 +359,10 @@ def make_console(*, is_error: bool = False) -> Console:
         def on_broken_pipe(self) -> None:
             raise BrokenPipeError
 
-    console = PipeConsole(highlight=False, stderr=is_error)
+    console = PipeConsole(highlight=False, stderr=uses_stderr)
     columns_text = os.environ.get("COLUMNS", "")
     if not console.is_terminal and not (columns_text.isdecimal() and int(columns_text)):
         console.width = UNWRAPPED_WIDTH
-    elif console.width < 1:  # the environment variable COLUMNS is 0
+    elif console.width < 1:  # COLUMNS=0: rich would print nothing
         console.width = shutil.get_terminal_size().columns
     return console

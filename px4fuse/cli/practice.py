@@ -10,9 +10,9 @@ from px4fuse.cli.options import count_option, output_option
 from px4fuse.cli.outputs import (
     OPENS_OUTPUT_KEY,
     check_default_page,
+    choose_web_page_path,
     progress,
-    web_page_path,
-    write_and_print,
+    write_and_print_results,
 )
 
 
@@ -54,12 +54,12 @@ def practice(
     solution. Not for exams: the page contains the solutions.
     """
     seed = secrets.randbelow(10**6) if seed is None else seed
-    target = web_page_path(output, Path("reports", f"practice_{seed}.html"))
+    page_path = choose_web_page_path(output, Path("reports", f"practice_{seed}.html"))
     ctx.meta[OPENS_OUTPUT_KEY] = sys.stdout.isatty() if opens_browser is None else opens_browser
-    with progress(target) as show_progress:
+    with progress(page_path) as show_progress:
         from px4fuse.explore.practice import make_practice_page
 
         page = make_practice_page(seed, level, flights, show_progress)
         if output is None:
-            check_default_page(target, page)
-    write_and_print({target: page.encode()})
+            check_default_page(page_path, page)
+    write_and_print_results({page_path: page.encode()})

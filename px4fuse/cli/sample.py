@@ -5,7 +5,7 @@ from pathlib import Path
 import click
 
 from px4fuse.cli.options import output_option
-from px4fuse.cli.outputs import write_and_print
+from px4fuse.cli.outputs import write_and_print_results
 
 SAMPLES_FOLDER = Path("sample_logs")
 SAMPLE_LOG = "aisle_uwb.ulg"
@@ -61,8 +61,10 @@ def sample(output: Path) -> None:
                 f"{path} already exists with different contents. Nothing was written. Move that "
                 "file, or choose another folder (-o)."
             )
-    first_log = next(path for path in contents if path.suffix == ".ulg")
-    compare_command = command_line(ComparisonRequest(log=str(first_log)), "compare", for_shell=True)
+    first_log_path = next(path for path in contents if path.suffix == ".ulg")
+    compare_command = command_line(
+        ComparisonRequest(log=str(first_log_path)), "compare", for_shell=True
+    )
     page = Page()
     page.add("command", text=compare_command, label="Run")
-    write_and_print(contents, page)
+    write_and_print_results(contents, page)

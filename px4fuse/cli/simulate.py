@@ -16,7 +16,7 @@ from px4fuse.cli.options import (
     list_given_parameters,
     output_option,
 )
-from px4fuse.cli.outputs import check_targets, progress, write_and_print
+from px4fuse.cli.outputs import check_output_paths, progress, write_and_print_results
 from px4fuse.core.input_files import check_output_folder
 from px4fuse.core.reading import read_text
 from px4fuse.errors import OutputError, SettingsError
@@ -39,7 +39,7 @@ ASSIGNMENT_OPTIONS = (
     "output",
     "assignment",
     "kind",
-    "answer",
+    "answer_key_path",
     "no_truth",
     *ASSIGNMENT_ONLY_OPTIONS,
 )
@@ -125,6 +125,7 @@ class CommandWithFaultTable(click.Command):
 )
 @click.option(
     "--answer",
+    "answer_key_path",
     type=NonEmptyPath(),
     metavar="FILE.json",
     help="Answer key to write: injected faults, biases, outliers and clock offset; not for "
@@ -153,7 +154,7 @@ def simulate(
     secret_file: Path | None,
     mistakes: int | None,
     mistake: tuple[str, ...],
-    answer: Path | None,
+    answer_key_path: Path | None,
     no_truth: bool,
     no_ekf2: bool,
     kind: Any,
@@ -173,14 +174,14 @@ def simulate(
     _check_options(assignment)
     if assignment is not None:
         secret = _read_secret(secret_file)
-        _write_assignment(assignment, output, answer, secret, kind, mistakes, not no_truth)
+        _write_assignment(assignment, output, answer_key_path, secret, kind, mistakes, not no_truth)
         return
     if kind == MIXED_KIND:
         raise SettingsError(f"--kind {MIXED_KIND} requires --assignment ROSTER.csv.")
     if output.suffix.lower() != ".ulg":
         raise OutputError(f"{output}: the output is a ULog. Give a name ending in .ulg (-o).")
-    check_targets([output, answer])
-    mistake_sizes = parse_faults(mistake)
+    check_output_paths([output, answer_key_path])
+    fault_sizes = parse_faults(mistake)
     scenario = make_scenario(
         kind,
         truth=not no_truth,
@@ -192,12 +193,12 @@ def simulate(
 
     with progress() as show_progress:
         show_progress("simulating")
-        simulation = flights.simulate(scenario, mistake_sizes)
+        simulation = flights.simulate(scenario, fault_sizes)
         show_progress("writing the log")
         contents = {output: flights.to_ulog(simulation)}
-    if answer is not None:
-        contents[answer] = to_json(flights.make_answer_key(simulation)).encode()
-    write_and_print(contents, terminal.summary(simulation, answer))
+    if answer_key_path is not None:
+        contents[answer_key_path] = to_json(flights.make_answer_key(simulation)).encode()
+    write_and_print_results(contents, terminal.summary(simulation, answer_key_path))
 
 
 def _check_options(assignment: Path | None) -> None:
@@ -223,15 +224,15 @@ def _read_secret(file: Path | None) -> bytes | None:
 
     if file is None:
         return None
-    name = f"--secret-file {file}"
+    option_text = f"--secret-file {file}"
     secret_text = read_text(
         file,
         SettingsError,
         MAX_SECRET_BYTES,
-        name=name,
-        size_remedy="Give a file with the secret as one line of text.",
+        name=option_text,
+        remedy_if_too_large="Give a file with the secret as one line of text.",
     )
-    return derive_seed_from_secret(secret_text, name)
+    return derive_seed_from_secret(secret_text, option_text)
 
 
 def _write_assignment(
@@ -249,10 +250,10 @@ def _write_assignment(
 
     students = read_roster(roster)
     answer_key_path = assignment.answer_key_path(folder, answer_path)
-    check_targets([answer_key_path])
+    check_output_paths([answer_key_path])
     check_output_folder(folder)
     with progress() as show_progress:
-        key, written_count = assignment.write_assignment(
+        key, written_flight_count = assignment.write_assignment(
             students,
             folder,
             answer_key_path,
@@ -262,4 +263,4 @@ def _write_assignment(
             with_ground_truth,
             partial(show_progress, "simulating"),
         )
-    write_and_print({}, assignment_page(key, folder, answer_key_path, written_count))
+    write_and_print_results({}, assignment_page(key, folder, answer_key_path, written_flight_count))

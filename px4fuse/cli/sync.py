@@ -6,7 +6,7 @@ from typing import Any
 import click
 
 from px4fuse.cli.options import analysis_options, comparison_request, json_option, log_argument
-from px4fuse.cli.outputs import progress, result_files, write_and_print
+from px4fuse.cli.outputs import make_result_files, progress, write_and_print_results
 
 
 @click.command()
@@ -32,16 +32,17 @@ def sync(log: Path, json_path: Path | None, **option_values: Any) -> None:
     with progress(json_path) as show_progress:
         flight = read_flight(request, show_progress)
         comparison = prepare_comparison(flight, request, show_progress)
-        _, clock_result = estimate_noises_and_clock(comparison, show_progress)
-    advice = make_time_offset_advice(comparison, clock_result)
-    if isinstance(clock_result, Unavailable) or not clock_result.is_determinable:
-        name = comparison.flight.log.name
-        remedy = clock_result.remedy if isinstance(clock_result, Unavailable) else advice["Action"]
+        _, time_offset = estimate_noises_and_clock(comparison, show_progress)
+    advice = make_time_offset_advice(comparison, time_offset)
+    if isinstance(time_offset, Unavailable) or not time_offset.is_determinable:
+        log_name = comparison.flight.log.name
+        remedy = time_offset.remedy if isinstance(time_offset, Unavailable) else advice["Action"]
         raise MissingDataError(
-            f"{name}: the time offset cannot be estimated from this flight: {clock_result.reason}",
+            f"{log_name}: the time offset cannot be estimated from this flight: "
+            f"{time_offset.reason}",
             remedy,
         )
-    results = make_sync_results(request, comparison, clock_result)
+    results = make_sync_results(request, comparison, time_offset)
     page = Page()
     page.write_labelled_texts(advice)
-    write_and_print(result_files(results, json_path), page, request)
+    write_and_print_results(make_result_files(results, json_path), page, request)

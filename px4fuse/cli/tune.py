@@ -6,7 +6,7 @@ from typing import Any
 import click
 
 from px4fuse.cli.options import analysis_options, comparison_request, json_option, log_argument
-from px4fuse.cli.outputs import progress, result_files, write_and_print
+from px4fuse.cli.outputs import make_result_files, progress, write_and_print_results
 from px4fuse.core.record import Unavailable
 
 
@@ -23,7 +23,7 @@ def tune(log: Path, json_path: Path | None, **option_values: Any) -> None:
     from px4fuse.comparison.estimates import estimate_noises
     from px4fuse.diagnose import prepare_comparison, read_flight
     from px4fuse.errors import MissingDataError
-    from px4fuse.report.tuning import tuning_page
+    from px4fuse.report.tuning import make_tuning_page
     from px4fuse.results.build import make_tuning_results
 
     request = comparison_request(log, option_values)
@@ -39,4 +39,6 @@ def tune(log: Path, json_path: Path | None, **option_values: Any) -> None:
             unavailable[0].remedy,
         )
     results = make_tuning_results(request, comparison, tunings)
-    write_and_print(result_files(results, json_path), tuning_page(comparison, tunings), request)
+    write_and_print_results(
+        make_result_files(results, json_path), make_tuning_page(comparison, tunings), request
+    )

@@ -7,8 +7,13 @@ from pathlib import Path
 import click
 
 from px4fuse.cli.options import InputPath, json_option, max_size_option, open_option, output_option
-from px4fuse.cli.outputs import check_targets, progress, result_files, write_and_print
-from px4fuse.core.reading import display_name, files_by_sha256, read_bytes_limited
+from px4fuse.cli.outputs import (
+    check_output_paths,
+    make_result_files,
+    progress,
+    write_and_print_results,
+)
+from px4fuse.core.reading import display_name, hash_files, read_bytes_limited
 from px4fuse.errors import LogError
 
 # Maximum time (s) to repeat an analysis; a flight of 10 minutes takes about 60 s
@@ -40,13 +45,13 @@ def verify(
     from px4fuse.verification.verification import verify as verify_report
 
     content = read_bytes_limited(
-        report, LogError, MAX_PDF_BYTES, size_remedy="Give a report (PDF) of px4fuse."
+        report, LogError, MAX_PDF_BYTES, remedy_if_too_large="Give a report (PDF) of px4fuse."
     )
     recorded_results = read_report(content, display_name(report))
     with progress(json_path) as show_progress:
         show_progress("computing the SHA-256 of the logs")
-        file_by_sha256 = files_by_sha256(logs)
-        check_targets([json_path, output])
+        file_by_sha256 = hash_files(logs)
+        check_output_paths([json_path, output])
         if logs and not file_by_sha256:
             raise LogError("The folders LOG contain no files. Give the flight log or its folder.")
         show_progress("repeating the analysis")
@@ -57,11 +62,11 @@ def verify(
         )
     if isinstance(verification, JobFailure):
         raise LogError(f"{display_name(report)}: cannot be verified: {verification.reason}")
-    report_files = (
+    pdf_by_path = (
         {} if output is None or not verification.redrawn_pdf else {output: verification.redrawn_pdf}
     )
-    contents = report_files | result_files(
+    contents = pdf_by_path | make_result_files(
         make_verification_output(content, verification), json_path
     )
-    write_and_print(contents, verification_page(display_name(report), verification, output))
+    write_and_print_results(contents, verification_page(display_name(report), verification, output))
     sys.exit(0 if verification.outcome == "verified" else 1)

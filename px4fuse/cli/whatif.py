@@ -64,7 +64,7 @@ def whatif(
     on.
     """
     from px4fuse.diagnose import run_what_if
-    from px4fuse.report.whatif import whatif_page
+    from px4fuse.report.whatif import make_whatif_page
     from px4fuse.results.build import make_whatif_results
 
     if start_s is not None and not without:
@@ -79,7 +79,9 @@ def whatif(
     with outputs.progress(json_path) as show_progress:
         analysis = run_what_if(request, show_progress)
     results = make_whatif_results(request, analysis)
-    outputs.write_and_print(outputs.result_files(results, json_path), whatif_page(analysis))
+    outputs.write_and_print_results(
+        outputs.make_result_files(results, json_path), make_whatif_page(analysis)
+    )
 
 
 def _parse_parameters(parameter_texts: tuple[str, ...]) -> dict[str, float]:
@@ -97,7 +99,7 @@ def _parse_parameters(parameter_texts: tuple[str, ...]) -> dict[str, float]:
 
 
 def _parse_sweep(text: str) -> Sweep:
-    name, _, range_text = text.partition("=")
+    parameter_name, _, range_text = text.partition("=")
     range_fields = range_text.split(":")
     if len(range_fields) not in (2, 3) or (
         len(range_fields) == 3 and not range_fields[2].isdecimal()
@@ -106,8 +108,10 @@ def _parse_sweep(text: str) -> Sweep:
             f"--sweep {text} is not valid. Use NAME=LOW:HIGH or NAME=LOW:HIGH:COUNT, for "
             "example EKF2_EVP_NOISE=0.02:0.5."
         )
-    low, high = (_parse_number(f"--sweep {text}", name, field) for field in range_fields[:2])
-    return Sweep(name, low, high, *map(int, range_fields[2:]))
+    low, high = (
+        _parse_number(f"--sweep {text}", parameter_name, field) for field in range_fields[:2]
+    )
+    return Sweep(parameter_name, low, high, *map(int, range_fields[2:]))
 
 
 def _parse_number(option_text: str, name: str, value: str) -> float:

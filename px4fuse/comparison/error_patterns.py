@@ -14,11 +14,11 @@ from scipy.interpolate import CubicSpline
 from scipy.ndimage import median_filter, uniform_filter1d
 
 from px4fuse.comparison.model import Comparison
-from px4fuse.core.arrays import Array, cumulative_integral, rank_correlation
+from px4fuse.core.arrays import Array, integrate_cumulatively, rank_correlation
 from px4fuse.filter.signals import cut_to_segment
 from px4fuse.flight.model import Columns, Ekf2, Unavailable, rows_between
 from px4fuse.trajectory.rotation import conjugate, interpolate, multiply, to_vector
-from px4fuse.trajectory.scores import autocorrelation_time
+from px4fuse.trajectory.scores import compute_autocorrelation_time
 
 # Minimum number of positions to search for jitter and other error patterns
 MIN_POSITIONS = 100
@@ -334,7 +334,9 @@ def fit_errors(comparison: Comparison, local_residuals: LocalResiduals) -> Error
     parameters, residual_m = _fit_least_squares(columns, error_m)
     # The σ of the scale factor depends on the independent errors; successive errors are correlated
     interval_s = float(np.median(np.diff(time_s)))
-    independent_error_count = len(time_s) / max(*map(autocorrelation_time, residual_m.T), 1.0)
+    independent_error_count = len(time_s) / max(
+        *map(compute_autocorrelation_time, residual_m.T), 1.0
+    )
     scale_sigma = np.sqrt(np.mean(residual_m**2) / (path_mean_square_m2 * independent_error_count))
     if comparison.source.origin.may_drift:
         window_rows = max(1, round(DRIFT_WINDOW_S / interval_s))
@@ -476,7 +478,7 @@ def find_attitude_delay(imu: pd.DataFrame, attitude: pd.DataFrame) -> float | No
     rotation_rad = to_vector(
         multiply(conjugate(quaternions[:-rows_per_rotation]), quaternions[rows_per_rotation:])
     )
-    angle_rad = cumulative_integral(imu[Columns.ANGULAR_RATE].to_numpy(), imu_time_s)
+    angle_rad = integrate_cumulatively(imu[Columns.ANGULAR_RATE].to_numpy(), imu_time_s)
 
     def compute_mean_square_rad2(delay_s: float) -> float:
         delayed_angle_rad = np.array(

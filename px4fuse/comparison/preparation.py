@@ -55,11 +55,12 @@ HORIZONTAL_AXES = (AISLE, "north", "east")
 
 
 def prepare_comparison_inputs(
-    flight: Flight, request: ComparisonRequest, *, keep_as_sent: bool = False
+    flight: Flight, request: ComparisonRequest, *, keep_positions_as_sent: bool = False
 ) -> PreparedComparison:
     """Choose position source, segment and axes of a flight for the comparison of KF with EKF2.
 
-    With ``keep_as_sent``, axes, unit and clock of the positions are neither checked nor corrected.
+    With ``keep_positions_as_sent``, axes, unit and clock of the positions are neither checked nor
+    corrected.
 
     Raises
     ------
@@ -80,7 +81,7 @@ def prepare_comparison_inputs(
         )
     source_track = shift_clock(source_track, settings.clock_offset_s)
     is_in_ned = source_track.origin.is_gnss or source_track.origin.path == ALIGNED_ORIGIN.path
-    skips_convention_check = keep_as_sent or is_in_ned or flight.log.is_assessed
+    skips_convention_check = keep_positions_as_sent or is_in_ned or flight.log.is_assessed
     convention = None if skips_convention_check else check_convention(flight, source_track)
     # A time offset from the user replaces the detected one
     if convention is not None and settings.clock_offset_s:

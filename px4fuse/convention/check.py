@@ -35,7 +35,7 @@ from px4fuse.convention.motion import (
 from px4fuse.convention.orientation import check_orientation
 from px4fuse.convention.texts import format_axes
 from px4fuse.flight.model import Columns, Ekf2, Flight, PositionTrack
-from px4fuse.trajectory.association import gap_limit, is_bracketed
+from px4fuse.trajectory.association import choose_gap_limit_s, is_bracketed
 from px4fuse.trajectory.rotation import heading
 
 # Minimum lead (nats) in score of the best convention over the second best, for the verdict
@@ -215,7 +215,7 @@ def _rotate_to_gnss(
     time_s = gnss_positions.index.to_numpy() + hypothesis.delay_s
     source_time_s = positions.time_s
     has_near_source_samples = is_bracketed(
-        time_s, source_time_s, gap_limit(source_time_s, MIN_GAP_S)
+        time_s, source_time_s, choose_gap_limit_s(source_time_s, MIN_GAP_S)
     )
     if np.count_nonzero(has_near_source_samples) < MIN_GNSS_POSITIONS:
         return hypothesis

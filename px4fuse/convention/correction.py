@@ -21,7 +21,7 @@ from px4fuse.flight.model import (
     infer_position_kind,
     time_index,
 )
-from px4fuse.trajectory.rotation import from_elements, heading
+from px4fuse.trajectory.rotation import build_matrix, heading
 
 # Minimum rotation (°) that is corrected in addition to wrong axes; smaller rotations are reported
 # as a heading error
@@ -224,7 +224,7 @@ def _make_matrix_to_ned_metres(convention: Convention, faults: ConventionFaults)
     is_rotated = abs(convention.rotation_deg) > MIN_RESIDUAL_ROTATION_DEG
     rotation_rad = -np.radians(convention.rotation_deg) * is_rotated
     cosine, sine = np.cos(rotation_rad), np.sin(rotation_rad)
-    rotation = from_elements((cosine, -sine, 0.0), (sine, cosine, 0.0), (0.0, 0.0, 1.0))
+    rotation = build_matrix((cosine, -sine, 0.0), (sine, cosine, 0.0), (0.0, 0.0, 1.0))
     return np.asarray(metres_per_unit * rotation @ np.array(signed_permutation_matrix))
 
 

@@ -14,7 +14,7 @@ from px4fuse.convention.motion import (
 from px4fuse.core.arrays import Array
 from px4fuse.flight.model import Columns, Flight, PositionTrack, Truth, Unavailable
 from px4fuse.trajectory.rotation import interpolate, to_matrix
-from px4fuse.trajectory.scores import autocorrelation_time
+from px4fuse.trajectory.scores import compute_autocorrelation_time
 
 # Minimum lever arm (m) that is reported: twice the noise of good UWB (0.1 m)
 MIN_LEVER_ARM_M = 0.2
@@ -91,7 +91,7 @@ def _fit_lever_arm_to_truth(flight: Flight, truth: Truth, track: PositionTrack) 
         return None
     residual_m = (known_errors_m - design_rows @ fitted_parameters).reshape(-1, 2)
     # successive errors of a source may be correlated
-    variance_factor = max(map(autocorrelation_time, residual_m.T))
+    variance_factor = max(map(compute_autocorrelation_time, residual_m.T))
     covariance = (
         np.linalg.inv(design_rows.T @ design_rows) * np.mean(residual_m**2) * variance_factor
     )

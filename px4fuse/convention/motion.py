@@ -15,11 +15,11 @@ import numpy as np
 from scipy import constants
 
 from px4fuse.convention.model import HeadingSource
-from px4fuse.core.arrays import Array, BoolArray, cumulative_integral
+from px4fuse.core.arrays import Array, BoolArray, integrate_cumulatively
 from px4fuse.ekf2.replay import is_inside_spans
 from px4fuse.filter.signals import find_imu_gaps
 from px4fuse.flight.model import Columns, Flight, Unavailable
-from px4fuse.trajectory.association import gap_limit, is_bracketed
+from px4fuse.trajectory.association import choose_gap_limit_s, is_bracketed
 from px4fuse.trajectory.rotation import (
     conjugate,
     cumulative_product,
@@ -96,7 +96,9 @@ class SourceSecondDifferences:
         position_times_s = grid_s[0] + GRID_INTERVAL_S * np.arange(
             -window_steps, len(grid_s) + window_steps
         )
-        has_near_samples = is_bracketed(position_times_s, time_s, gap_limit(time_s, MIN_GAP_S))
+        has_near_samples = is_bracketed(
+            position_times_s, time_s, choose_gap_limit_s(time_s, MIN_GAP_S)
+        )
         interpolated_positions = np.column_stack(
             [np.interp(position_times_s, time_s, column) for column in position.T]
         )
@@ -152,7 +154,7 @@ def integrate_inertial_data(flight: Flight) -> InertialData | None:
     if len(time_s) < 4 * SECOND_DIFFERENCE_WINDOW_S / INTEGRATION_STEP_S:
         return None
     columns = [*Columns.SPECIFIC_FORCE, *Columns.ANGULAR_RATE]
-    imu_integrals = (cumulative_integral(imu[name].to_numpy(), imu_times_s) for name in columns)
+    imu_integrals = (integrate_cumulatively(imu[name].to_numpy(), imu_times_s) for name in columns)
     integral_increments = np.diff(
         [np.interp(time_s, imu_times_s, integral) for integral in imu_integrals]
     ).T

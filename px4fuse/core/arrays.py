@@ -22,12 +22,12 @@ def row_blocks(count: int) -> Iterator[slice]:
     return (slice(first, first + BLOCK_ROWS) for first in range(0, count, BLOCK_ROWS))
 
 
-def median_interval(time_s: Array) -> float:
+def compute_median_interval_s(time_s: Array) -> float:
     """Return the median interval (s) between successive times."""
     return float(np.median(np.diff(time_s)))
 
 
-def cumulative_integral(values: Array, time_s: Array) -> Array:
+def integrate_cumulatively(values: Array, time_s: Array) -> Array:
     """Integrate values over time up to each sample (trapezoidal rule, axis 0)."""
     integral = np.zeros(values.shape)
     intervals_s = np.diff(time_s).reshape(-1, *[1] * (values.ndim - 1))
@@ -46,10 +46,10 @@ def select_intervals(time_s: Array, is_selected: BoolArray) -> list[tuple[float,
     return list(zip(starts_s.tolist(), ends_s.tolist(), strict=True))
 
 
-def rank_correlation(first: Array, second: Array) -> float:
+def rank_correlation(first_values: Array, second_values: Array) -> float:
     """Return Spearman's rank correlation (without scipy.stats, whose import is slow).
 
     >>> rank_correlation(np.array([1.0, 2.0, 3.0]), np.array([1.0, 4.0, 9.0]))
     1.0
     """
-    return float(pd.Series(first).rank().corr(pd.Series(second).rank()))
+    return float(pd.Series(first_values).rank().corr(pd.Series(second_values).rank()))

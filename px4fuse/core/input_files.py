@@ -26,49 +26,52 @@ class _InputRegister:
     registered_folders: set[Path] = field(default_factory=set)
 
 
-_register: ContextVar[_InputRegister | None] = ContextVar("register", default=None)
+_input_register: ContextVar[_InputRegister | None] = ContextVar("register", default=None)
 
 
 @contextmanager
-def inputs_protected() -> Iterator[None]:
+def protect_inputs() -> Iterator[None]:
     """Register all files that are read inside this context; outputs cannot overwrite them."""
-    previous_register = _register.set(_InputRegister())
+    previous_register = _input_register.set(_InputRegister())
     try:
         yield
     finally:
-        _register.reset(previous_register)
+        _input_register.reset(previous_register)
 
 
 @contextmanager
-def inputs_not_registered() -> Iterator[None]:
-    """Do not protect the files that are read inside this context: outputs may overwrite them."""
-    previous_register = _register.set(None)
+def suspend_input_registration() -> Iterator[None]:
+    """Do not register files that are read inside this context, so outputs can overwrite them."""
+    previous_register = _input_register.set(None)
     try:
         yield
     finally:
-        _register.reset(previous_register)
+        _input_register.reset(previous_register)
 
 
 def add_input(path: Path) -> None:
     """Register an input file or folder, so that no output overwrites it."""
-    register = _register.get()
-    if register is None or (identity := _read_file_identity(path)) is None:
+    input_register = _input_register.get()
+    if input_register is None or (identity := _read_file_identity(path)) is None:
         return
-    register.inputs.add(identity)
-    for folder in {path.absolute().parent, path.resolve().parent} - register.registered_folders:
-        register.registered_folders.add(folder)
+    input_register.inputs.add(identity)
+    for folder in {
+        path.absolute().parent,
+        path.resolve().parent,
+    } - input_register.registered_folders:
+        input_register.registered_folders.add(folder)
         for parent in map(_read_file_identity, (folder, *folder.parents)):
             if parent is not None:
-                register.input_by_folder.setdefault(parent, path)
+                input_register.input_by_folder.setdefault(parent, path)
 
 
-def check_outputs(targets: Iterable[Path]) -> None:
-    """Raise an OutputError if an output is a registered input file or folder."""
-    register = _register.get() or _InputRegister()
-    for target in targets:
-        if _read_file_identity(target) in register.inputs:
+def check_outputs(output_paths: Iterable[Path]) -> None:
+    """Raise an OutputError if an output path is an input file or folder of this command."""
+    input_register = _input_register.get() or _InputRegister()
+    for output_path in output_paths:
+        if _read_file_identity(output_path) in input_register.inputs:
             raise OutputError(
-                f"{target} is an input of this command and was not overwritten. Choose "
+                f"{output_path} is an input of this command and was not overwritten. Choose "
                 "another output name."
             )
 
@@ -77,7 +80,7 @@ def check_output_folder(folder: Path) -> None:
     """Raise an OutputError if the output folder is a file, or contains a registered input."""
     if folder.exists() and not folder.is_dir():
         raise OutputError(f"the output folder {folder} is a file. Choose another name.")
-    register = _register.get() or _InputRegister()
+    input_register = _input_register.get() or _InputRegister()
     folder_entries = _list_folder(folder)
     for path in (
         folder,
@@ -86,7 +89,11 @@ def check_output_folder(folder: Path) -> None:
     ):
         if (identity := _read_file_identity(path)) is None:
             continue
-        input_path = path if identity in register.inputs else register.input_by_folder.get(identity)
+        input_path = (
+            path
+            if identity in input_register.inputs
+            else input_register.input_by_folder.get(identity)
+        )
         if input_path is not None:
             raise OutputError(
                 f"the output folder {folder} contains {input_path}, an input of this command",

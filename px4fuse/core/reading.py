@@ -105,13 +105,13 @@ def read_bytes_limited(
     limit_bytes: int,
     *,
     name: str = "",
-    size_remedy: str = "Cut the file to the time span of the flight.",
-    empty_remedy: str | None = None,
+    remedy_if_too_large: str = "Cut the file to the time span of the flight.",
+    remedy_if_empty: str | None = None,
 ) -> bytes:
     """Read all bytes of a regular file up to a size limit.
 
-    ``size_remedy`` and ``empty_remedy`` are advice to the user if the file is too large or empty.
-    Without ``empty_remedy``, empty files are accepted.
+    ``remedy_if_too_large`` and ``remedy_if_empty`` are advice to the user. Without
+    ``remedy_if_empty``, empty files are accepted.
 
     Raises
     ------
@@ -126,9 +126,11 @@ def read_bytes_limited(
     if len(content) > size_bytes:  # the file grew, or it is in /proc (size 0)
         content = _read_bytes(path, limit_bytes + 1, error_type, name)
     if (actual_size_bytes := max(size_bytes, len(content))) > limit_bytes:
-        raise error_type(format_size_limit(name, actual_size_bytes, limit_bytes), size_remedy)
-    if empty_remedy is not None and not content:
-        raise error_type(f"{name}: the file is empty", empty_remedy)
+        raise error_type(
+            format_size_limit(name, actual_size_bytes, limit_bytes), remedy_if_too_large
+        )
+    if remedy_if_empty is not None and not content:
+        raise error_type(f"{name}: the file is empty", remedy_if_empty)
     return content
 
 
@@ -144,8 +146,8 @@ def read_log_bytes(path: Path) -> bytes:
         path,
         LogError,
         max_log_bytes.get(),
-        size_remedy=LOG_SIZE_REMEDY,
-        empty_remedy="Copy the log from the vehicle again.",
+        remedy_if_too_large=LOG_SIZE_REMEDY,
+        remedy_if_empty="Copy the log from the vehicle again.",
     )
 
 
@@ -155,14 +157,16 @@ def read_text(
     limit_bytes: int,
     *,
     name: str = "",
-    size_remedy: str = "Shorten the file.",
+    remedy_if_too_large: str = "Shorten the file.",
 ) -> str:
     """Read a text file in UTF-8, or in UTF-16 as written by Windows shells.
 
     Arguments and errors are those of :func:`read_bytes_limited`.
     """
     name = name or display_name(path)
-    content = read_bytes_limited(path, error_type, limit_bytes, name=name, size_remedy=size_remedy)
+    content = read_bytes_limited(
+        path, error_type, limit_bytes, name=name, remedy_if_too_large=remedy_if_too_large
+    )
     is_utf16 = content.startswith((b"\xff\xfe", b"\xfe\xff"))
     try:
         return content.decode("utf-16" if is_utf16 else "utf-8-sig")
@@ -173,7 +177,7 @@ def read_text(
         ) from error
 
 
-def files_by_sha256(paths: Iterable[Path]) -> dict[str, Path]:
+def hash_files(paths: Iterable[Path]) -> dict[str, Path]:
     """Return files, and all regular files in folders, by their SHA-256.
 
     Files in folders that are larger than :data:`max_log_bytes` are ignored. Of identical files,

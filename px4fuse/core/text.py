@@ -74,10 +74,10 @@ def format_number(value: float, digits: int = 3) -> str:
     return f"{Decimal(f'{value:.{digits}g}'):,f}"
 
 
-def count_noun(count: int, noun: str) -> str:
+def format_count(count: int, noun: str) -> str:
     """Format a count with its noun.
 
-    >>> count_noun(1, "innovation"), count_noun(2, "innovation")
+    >>> format_count(1, "innovation"), format_count(2, "innovation")
     ('1 innovation', '2 innovations')
     """
     return f"{count} {noun}{'' if count == 1 else 's'}"

@@ -60,7 +60,7 @@ class _Worker:
         previous_environment = dict(os.environ)
         os.environ.update(_WORKER_ENVIRONMENT)
         try:
-            with _interrupts_blocked():
+            with _block_interrupts():
                 self.process.start()
         finally:
             os.environ.clear()
@@ -79,12 +79,12 @@ class _Worker:
 
 
 @contextmanager
-def _interrupts_blocked() -> Iterator[None]:
+def _block_interrupts() -> Iterator[None]:
     """Block Ctrl-C in this process and in processes that start meanwhile."""
     if not hasattr(signal, "pthread_sigmask"):  # Windows
         yield
         return
-    resource_tracker.ensure_running()  # now, because its start unblocks Ctrl-C
+    resource_tracker.ensure_running()  # before Ctrl-C is blocked, because its start unblocks it
     signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})
     try:
         yield
@@ -96,7 +96,7 @@ def run_with_limits(
     function: Callable[[Job], Result],
     jobs: Sequence[Job],
     *,
-    processes: int | None = None,
+    process_count: int | None = None,
     timeout_s: float = JOB_TIMEOUT_S,
     max_memory_bytes: int | None = MAX_MEMORY_BYTES,
 ) -> Generator[tuple[int, Result | JobFailure]]:
@@ -109,7 +109,7 @@ def run_with_limits(
     ----------
     function : callable
         Function at the top level of a module. Function, jobs and results are pickled.
-    processes : int, optional
+    process_count : int, optional
         Number of parallel processes; by default the number of cores.
     timeout_s : float
         Maximum time for one job, without the start of its process.
@@ -123,7 +123,7 @@ def run_with_limits(
         Index of a finished job, and its result or :class:`JobFailure`.
     """
     with closing(
-        poll_with_limits(function, jobs, processes, timeout_s, max_memory_bytes)
+        poll_with_limits(function, jobs, process_count, timeout_s, max_memory_bytes)
     ) as outcomes:
         yield from (outcome for outcome in outcomes if outcome is not None)
 
@@ -131,7 +131,7 @@ def run_with_limits(
 def poll_with_limits(
     function: Callable[[Job], Result],
     jobs: Sequence[Job],
-    processes: int | None,
+    process_count: int | None,
     timeout_s: float,
     max_memory_bytes: int | None,
     max_wait_s: float = math.inf,
@@ -141,7 +141,7 @@ def poll_with_limits(
     workers: dict[Connection, _Worker] = {}
     try:
         while waiting_indices or workers:
-            while waiting_indices and len(workers) < (processes or os.cpu_count() or 1):
+            while waiting_indices and len(workers) < (process_count or os.cpu_count() or 1):
                 # take the job first: if the process does not start, only this job fails
                 new_worker = _Worker(function, max_memory_bytes, waiting_indices.pop())
                 workers[new_worker.pipe] = new_worker
@@ -168,15 +168,15 @@ def poll_with_limits(
                             continue
                         worker.job_index = waiting_indices.pop()
                     worker.deadline = time.monotonic() + timeout_s
-                    # if the worker process has died, the next read of the pipe fails
+                    # a worker process that has died is found by the next read of its pipe
                     with suppress(BrokenPipeError, ConnectionResetError):
                         pipe.send(jobs[worker.job_index])
                 elif time.monotonic() >= worker.deadline:
-                    limit_s = timeout_s if worker.is_ready else START_TIMEOUT_S
+                    time_limit_s = timeout_s if worker.is_ready else START_TIMEOUT_S
                     workers.pop(pipe).end()
                     yield (
                         worker.job_index,
-                        JobFailure(f"the job exceeded the time limit of {limit_s:g} s."),
+                        JobFailure(f"the job exceeded the time limit of {time_limit_s:g} s."),
                     )
     finally:
         for worker in workers.values():
@@ -227,7 +227,7 @@ def _run_worker(
 
 
 def _run_and_pickle(function: Callable[[Any], Any], job: Any) -> bytes:
-    """Run a job; return (True if the process can run further jobs, result) as pickled bytes."""
+    """Run a job; return a pickled pair: True if further jobs can run, and the result."""
     try:
         return pickle.dumps((True, function(job)), pickle.HIGHEST_PROTOCOL)
     except MemoryError:

@@ -27,7 +27,7 @@ REMEDY_BY_ERRNO = {
 _MAX_LISTED_PATHS = 4
 
 
-def write_all(
+def write_output_files(
     contents: Mapping[Path, bytes], on_written: Callable[[Path], None] = lambda _: None
 ) -> None:
     """Write output files; create missing folders.
@@ -48,7 +48,7 @@ def write_all(
     for path, content in contents.items():
         try:
             _write_output(path, content)
-        except BrokenPipeError as error:  # the reader has ended (| head)
+        except BrokenPipeError as error:  # the program that reads the pipe has ended
             pipe_error = error
             continue
         except OSError as error:
@@ -65,8 +65,10 @@ def format_written_outputs(paths: Sequence[Path]) -> str:
     >>> format_written_outputs([Path("a.pdf"), Path("a.json")])
     'outputs already written: a.pdf, a.json'
     """
-    names = ", ".join(map(str, paths)) if len(paths) <= _MAX_LISTED_PATHS else f"{len(paths)} files"
-    return f"outputs already written: {names}"
+    paths_text = (
+        ", ".join(map(str, paths)) if len(paths) <= _MAX_LISTED_PATHS else f"{len(paths)} files"
+    )
+    return f"outputs already written: {paths_text}"
 
 
 def _write_output(path: Path, content: bytes) -> None:
@@ -127,9 +129,9 @@ def _open_pipe(path: Path) -> IO[bytes]:
 
 
 def _make_output_error(path: Path, error: OSError, written_files: Sequence[Path]) -> OutputError:
-    name = "standard output" if path == STANDARD_OUTPUT else path
+    output_name = "standard output" if path == STANDARD_OUTPUT else path
     reason = "no program reads the pipe" if error.errno == errno.ENXIO else error.strerror
-    faults = [f"{name} cannot be written ({reason})"]
+    faults = [f"{output_name} cannot be written ({reason})"]
     if written_files:
         faults.append(format_written_outputs(written_files))
     remedy = REMEDY_BY_ERRNO.get(error.errno or 0, "Choose another output name.")

@@ -11,7 +11,7 @@ from typing import Literal
 import numpy as np
 import pandas as pd
 
-from px4fuse.core.arrays import Array, BoolArray, median_interval
+from px4fuse.core.arrays import Array, BoolArray, compute_median_interval_s
 from px4fuse.core.record import Correlation, Count, NotNegative, Positive, Record, Share, Span
 from px4fuse.ekf2.heights import GNSS_HEIGHT_NOISE_FACTOR
 from px4fuse.filter.consistency import assess_innovations, classify_mean_nis, compute_nis_band
@@ -352,7 +352,7 @@ def _find_longest_gap(
 def _classify_aid(
     axes: dict[str, AidAxis], longest_gap_s: Span, fusion_times_s: Array
 ) -> AidVerdict:
-    interval_s = median_interval(fusion_times_s) if len(fusion_times_s) > 1 else 0.0
+    interval_s = compute_median_interval_s(fusion_times_s) if len(fusion_times_s) > 1 else 0.0
     if longest_gap_s[1] - longest_gap_s[0] > max(
         MAX_TIME_WITHOUT_FUSION_S, MAX_INTERVALS_WITHOUT_FUSION * interval_s
     ):

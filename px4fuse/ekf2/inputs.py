@@ -11,7 +11,7 @@ from types import MappingProxyType
 import numpy as np
 import pandas as pd
 
-from px4fuse.core.arrays import Array, BoolArray, IntArray, median_interval
+from px4fuse.core.arrays import Array, BoolArray, IntArray, compute_median_interval_s
 from px4fuse.ekf2.earth_model import compute_position_scale
 from px4fuse.ekf2.flow import add_flow_samples
 from px4fuse.ekf2.heights import add_heights
@@ -368,7 +368,7 @@ def compute_lost_imu_fraction(time_s: Array) -> float:
 
 
 def _explain_missing_imu(time_s: Array) -> Unavailable | None:
-    median_interval_s = median_interval(time_s)
+    median_interval_s = compute_median_interval_s(time_s)
     if median_interval_s > MAX_IMU_INTERVAL_S:
         return Unavailable(
             ANALYSIS_NAME,
@@ -553,10 +553,13 @@ def _read_vision_besides_gnss(
     received_positions = read_vision(flight, ekf2, fusion_record, attitude)
     if isinstance(received_positions, Unavailable):
         return received_positions
-    is_vision_disabled = sample_step_function(enabled_changes, received_positions.timestamp_s) == 0.0
+    is_vision_disabled = (
+        sample_step_function(enabled_changes, received_positions.timestamp_s) == 0.0
+    )
     position_m = received_positions.position_m * compute_position_scale(fusion_record)
     return replace(
-        received_positions, position_m=np.where(is_vision_disabled[:, None], np.nan, position_m))
+        received_positions, position_m=np.where(is_vision_disabled[:, None], np.nan, position_m)
+    )
 
 
 def _read_logged_decisions(
@@ -669,7 +672,7 @@ def _find_vision_track(flight: Flight) -> PositionTrack | Unavailable:
         if track.origin.is_vision and track.origin.has_all_samples:
             return track
         if track.name in VISION_REPETITION_INTERVALS_S:
-            median_interval_s = median_interval(track.samples.index.to_numpy())
+            median_interval_s = compute_median_interval_s(track.samples.index.to_numpy())
             if (
                 median_interval_s < 0.9 * VISION_REPETITION_INTERVALS_S[track.name]
                 and median_interval_s <= 0.25

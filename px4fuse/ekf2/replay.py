@@ -21,7 +21,7 @@ from px4fuse.core.record import (
     Share,
     Span,
 )
-from px4fuse.core.text import count_noun
+from px4fuse.core.text import format_count
 from px4fuse.ekf2.inputs import (
     ANALYSIS_NAME,
     find_matching_samples,
@@ -320,7 +320,7 @@ def _compare_innovations(
     replayed_innovations = replayed_innovations.iloc[update_rows[is_used]]
     if len(logged_innovations) < MIN_COMPARED_INNOVATIONS:
         return (
-            f"the log contains only {count_noun(len(logged_innovations), 'innovation')} in the "
+            f"the log contains only {format_count(len(logged_innovations), 'innovation')} in the "
             f"replayed time (at least {MIN_COMPARED_INNOVATIONS} are needed)"
         )
     axes = list_innovation_axes(replayed_innovations)

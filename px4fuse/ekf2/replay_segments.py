@@ -18,8 +18,8 @@ from px4fuse.core.arrays import (
     ArrayPair,
     BoolArray,
     IntArray,
+    compute_median_interval_s,
     cumulative_sums,
-    median_interval,
     row_blocks,
 )
 from px4fuse.core.record import Span
@@ -467,7 +467,7 @@ def _find_break_times_s(imu: pd.DataFrame, ekf2: Ekf2) -> list[float]:
             np.searchsorted(clipped_times_s, clipped_times_s + s) for s in (-0.5, 0.5)
         )
         heavy_clipping_times_s = clipped_times_s[
-            end_rows - begin_rows > MAX_CLIPPED_FRACTION / median_interval(imu_times_s)
+            end_rows - begin_rows > MAX_CLIPPED_FRACTION / compute_median_interval_s(imu_times_s)
         ]
         break_times_s += [*(heavy_clipping_times_s - 0.5), *(heavy_clipping_times_s + 0.5)]
     return break_times_s
@@ -595,7 +595,7 @@ def _find_field_fusion_span(fusion_record: FusionRecord) -> Span | None:
     )
     flag_times_s = is_fused_3d.index.to_numpy()
     is_fused = is_fused_3d.to_numpy() > 0.0
-    if not is_fused.any() or 1.0 / median_interval(flag_times_s) < MIN_MAG_LOG_HZ:
+    if not is_fused.any() or 1.0 / compute_median_interval_s(flag_times_s) < MIN_MAG_LOG_HZ:
         return None
     first_row, last_row = np.flatnonzero(is_fused)[[0, -1]]
     if not is_fused[first_row:last_row].all():
@@ -610,7 +610,7 @@ def _add_magnetic_field(
     field_gauss = fusion_record.magnetic_field_gauss
     sample_times_s = field_gauss.index.to_numpy()
     age_s = fusion_record.parameters.get("EKF2_MAG_DELAY", 0.0) * 1e-3 + 0.5 * step_s
-    fused_samples_per_row = max(MAG_FUSION_HZ * median_interval(sample_times_s), 1.0)
+    fused_samples_per_row = max(MAG_FUSION_HZ * compute_median_interval_s(sample_times_s), 1.0)
     measurement_times_s = sample_times_s - age_s
     extended_segment = add_field_states(
         segment,

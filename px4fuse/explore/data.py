@@ -15,7 +15,7 @@ from px4fuse.card.verdicts import make_sigma_verdicts
 from px4fuse.comparison.model import AxisComparison, Comparison, ErrorsAgainstTruth
 from px4fuse.comparison.preparation import shift_clock
 from px4fuse.comparison.remedy import find_aid
-from px4fuse.explore.packing import COARSE_STEPS_PER_UNIT, Packer
+from px4fuse.explore.packing import COARSE_STEPS_PER_UNIT, ArrayEncoder
 from px4fuse.filter.consistency import CONFIDENCE_LEVEL, CONSISTENT_SIGMA_RATIOS
 from px4fuse.filter.model import INITIAL_COVARIANCE
 from px4fuse.filter.settings import KF_NUMERIC_SETTINGS, SETTING_RANGES, Settings
@@ -33,9 +33,9 @@ PageData = dict[str, Any]
 OFFSET_SLIDER_HALF_RANGE_S = 0.6
 
 
-def make_flight_data(analysis: Analysis, packer: Packer) -> PageData:
+def make_flight_data(analysis: Analysis, encoder: ArrayEncoder) -> PageData:
     """Return the data of one flight for JSON; its arrays are encoded by the packer."""
-    inputs = make_kf_inputs(analysis, packer)
+    inputs = make_kf_inputs(analysis, encoder)
     events, request = analysis.events, analysis.request
     assert request is not None
     return {
@@ -45,10 +45,10 @@ def make_flight_data(analysis: Analysis, packer: Packer) -> PageData:
         "shown": [analysis.segment.flight.start_s, analysis.segment.flight.end_s],
         **inputs,
         "axes": [
-            axis_inputs | _make_axis_data(analysis, result, packer)
+            axis_inputs | _make_axis_data(analysis, result, encoder)
             for axis_inputs, result in zip(inputs["axes"], analysis.axes.values(), strict=True)
         ],
-        "likely": _collect_ml_noises(analysis),
+        "likely": _collect_estimated_noises(analysis),
         "events": {
             "gap": events.gaps,
             "dropout": events.dropouts,
@@ -61,15 +61,15 @@ def make_flight_data(analysis: Analysis, packer: Packer) -> PageData:
     }
 
 
-def make_kf_inputs(comparison: Comparison, packer: Packer) -> PageData:
+def make_kf_inputs(comparison: Comparison, encoder: ArrayEncoder) -> PageData:
     """Return the inputs of KF: positions, accelerations and initial covariance."""
     source = undo_time_offset(comparison)
     return {
         "segment": [comparison.segment.start_s, comparison.segment.end_s],
         "start": list(INITIAL_COVARIANCE),
-        "imu": _make_imu_data(comparison, packer),
+        "imu": _make_imu_data(comparison, encoder),
         "axes": [
-            _make_axis_inputs(comparison, axis, source, packer) for axis in comparison.input_axes
+            _make_axis_inputs(comparison, axis, source, encoder) for axis in comparison.input_axes
         ],
     }
 
@@ -94,10 +94,10 @@ def _make_offset_slider(request: ComparisonRequest, analysis: Analysis) -> PageD
     """Return range and estimate of the time offset, or the reason why it cannot be changed."""
     if request.position is not None:
         return {"why": "Not adjustable: this offset aligns the position file with the log."}
-    applied_offset_s, clock = analysis.settings.clock_offset_s, analysis.clock
+    applied_offset_s, clock_offset = analysis.settings.clock_offset_s, analysis.clock
     estimated_offset_s = None
-    if isinstance(clock, ClockOffset) and clock.is_determinable:
-        estimated_offset_s = applied_offset_s + clock.remaining_s
+    if isinstance(clock_offset, ClockOffset) and clock_offset.is_determinable:
+        estimated_offset_s = applied_offset_s + clock_offset.remaining_s
     return {
         "from": applied_offset_s - OFFSET_SLIDER_HALF_RANGE_S,
         "to": applied_offset_s + OFFSET_SLIDER_HALF_RANGE_S,
@@ -105,7 +105,7 @@ def _make_offset_slider(request: ComparisonRequest, analysis: Analysis) -> PageD
     }
 
 
-def _make_imu_data(comparison: Comparison, packer: Packer) -> PageData | str:
+def _make_imu_data(comparison: Comparison, encoder: ArrayEncoder) -> PageData | str:
     """Return sample times, gaps and time span (s) of the acceleration, or why it is missing."""
     acceleration = comparison.input_axes[0].acceleration
     if isinstance(acceleration, Unavailable):
@@ -115,7 +115,7 @@ def _make_imu_data(comparison: Comparison, packer: Packer) -> PageData | str:
     gap_bounds_s = np.stack([time_s[gap_start_indices], time_s[gap_start_indices + 1]], 1)
     gap_sum_s = np.cumsum(np.diff(gap_bounds_s, prepend=gap_bounds_s[:, :1]))
     return {
-        "time": packer.add_times(time_s[_find_segment_slice(comparison, acceleration)]),
+        "time": encoder.add_times(time_s[_find_segment_slice(comparison, acceleration)]),
         "span": [time_s[0], time_s[-1]],
         "gapEdges": gap_bounds_s.ravel().tolist(),
         # for each start and end of a gap: total duration (s) of the gaps until then
@@ -132,7 +132,7 @@ def _find_segment_slice(comparison: Comparison, acceleration: Acceleration) -> s
 
 
 def _make_axis_inputs(
-    comparison: Comparison, axis: Axis, source_track: PositionTrack, packer: Packer
+    comparison: Comparison, axis: Axis, source_track: PositionTrack, encoder: ArrayEncoder
 ) -> PageData:
     """Return position measurements (m) and integrated acceleration (m/s) along an axis.
 
@@ -145,55 +145,57 @@ def _make_axis_inputs(
     margin_s = OFFSET_SLIDER_HALF_RANGE_S + abs(comparison.settings.clock_offset_s)
     is_near_segment = (time_s >= segment.start_s - margin_s) & (time_s <= segment.end_s + margin_s)
     is_near_segment &= np.isfinite(position_m)
-    inputs: PageData = {
+    axis_data: PageData = {
         "name": axis.name,
-        "time": packer.add_times(time_s[is_near_segment]),
-        "z": packer.add(position_m[is_near_segment]),
+        "time": encoder.add_times(time_s[is_near_segment]),
+        "z": encoder.add(position_m[is_near_segment]),
     }
     if isinstance(axis.acceleration, Acceleration):
-        integral_m_s = axis.acceleration.compute_integral_m_s()[
+        acceleration_integral_m_s = axis.acceleration.compute_integral_m_s()[
             _find_segment_slice(comparison, axis.acceleration)
         ]
-        inputs |= {
-            "integral": packer.add(integral_m_s - integral_m_s[0]),
+        axis_data |= {
+            "integral": encoder.add(acceleration_integral_m_s - acceleration_integral_m_s[0]),
             "rms": axis.acceleration.compute_rms_m_s2(),
         }
-    return inputs
+    return axis_data
 
 
-def _make_axis_data(analysis: Analysis, result: AxisComparison, packer: Packer) -> PageData:
+def _make_axis_data(analysis: Analysis, result: AxisComparison, encoder: ArrayEncoder) -> PageData:
     name = result.axis.name
     return {
         "called": result.axis.label,
         "along": describe_axis(analysis, result),
         "ratios": [verdict.ratio for verdict in make_sigma_verdicts(result)],
         "note": result.axis.note,
-        "bands": _pack_nis_bands(len(result.axis.measurement_time_s), packer),
+        "bands": _pack_nis_bands(len(result.axis.measurement_time_s), encoder),
         # key of the noise estimate: north and east may have a common estimate
         "noises": HORIZONTAL if name != "down" and HORIZONTAL in analysis.tuning else name,
-        "ekf2": _make_ekf2_data(analysis, result.with_flight_tracks(), packer),
-        "truth": _make_truth_data(result.with_flight_tracks(), packer),
+        "ekf2": _make_ekf2_data(analysis, result.with_flight_tracks(), encoder),
+        "truth": _make_truth_data(result.with_flight_tracks(), encoder),
     }
 
 
-def _pack_nis_bands(innovation_count: int, packer: Packer) -> list[dict[str, int]]:
-    """Return the lower and the upper limits of the 95 % band of the mean NIS, packed.
+def _pack_nis_bands(innovation_count: int, encoder: ArrayEncoder) -> list[dict[str, int]]:
+    """Return lower and upper limits of the 95 % band of the mean NIS, encoded for the page.
 
-    Row n - 1 is for n innovations. There are twice ``innovation_count`` rows, because another time
-    offset can increase the number of innovations.
+    Row n - 1 is the limit for n innovations. There are twice ``innovation_count`` rows, because
+    another time offset can increase the number of innovations.
     """
     innovation_counts = np.arange(1, 2 * innovation_count + 1)
     bounds = stats.chi2.interval(CONFIDENCE_LEVEL, innovation_counts)
-    return [packer.add(bound / innovation_counts, COARSE_STEPS_PER_UNIT) for bound in bounds]
+    return [encoder.add(bound / innovation_counts, COARSE_STEPS_PER_UNIT) for bound in bounds]
 
 
-def _make_ekf2_data(analysis: Analysis, result: AxisComparison, packer: Packer) -> PageData | str:
+def _make_ekf2_data(
+    analysis: Analysis, result: AxisComparison, encoder: ArrayEncoder
+) -> PageData | str:
     if isinstance(result.ekf2_state, Unavailable):
         return result.ekf2_state.reason
     state = result.ekf2_state.dropna()
     summary = result.filters["ekf2"]
     ekf2_data: PageData = {
-        "state": _pack_frame(state, ["position_m", "velocity_m_s"], packer),
+        "state": _pack_frame(state, ["position_m", "velocity_m_s"], encoder),
         "variance": [],
         "innovations": [],
         "summary": {"why": summary.reason}
@@ -214,7 +216,7 @@ def _make_ekf2_data(analysis: Analysis, result: AxisComparison, packer: Packer) 
     if isinstance(result.ekf2_variance, pd.DataFrame):
         sigma = result.ekf2_variance.dropna().pow(0.5)
         ekf2_data["variance"] = _pack_frame(
-            sigma, ["position_variance_m2", "velocity_variance_m2_s2"], packer
+            sigma, ["position_variance_m2", "velocity_variance_m2_s2"], encoder
         )
     if isinstance(result.ekf2_innovations, pd.DataFrame):
         innovations = result.ekf2_innovations
@@ -226,30 +228,32 @@ def _make_ekf2_data(analysis: Analysis, result: AxisComparison, packer: Packer) 
             sigma=np.sqrt(valid_rows["innovation_variance_m2"]),
         )
         ekf2_data["innovations"] = _pack_frame(
-            packed_rows, ["innovation_m", "sigma", "rejected"], packer
+            packed_rows, ["innovation_m", "sigma", "rejected"], encoder
         )
         variance_m2 = innovations["observation_variance_m2"].dropna()
         ekf2_data["r"] = float(np.sqrt(variance_m2.median())) if len(variance_m2) else None
     return ekf2_data
 
 
-def _make_truth_data(result: AxisComparison, packer: Packer) -> PageData | str:
+def _make_truth_data(result: AxisComparison, encoder: ArrayEncoder) -> PageData | str:
     if isinstance(result.truth, Unavailable):
         return result.truth.reason
     position = result.truth[["position_m"]].dropna()
     velocity = result.truth[["velocity_m_s"]].dropna()
     return {
-        "p": _pack_frame(position, ["position_m"], packer),
-        "v": _pack_frame(velocity, ["velocity_m_s"], packer) if len(velocity) else None,
+        "p": _pack_frame(position, ["position_m"], encoder),
+        "v": _pack_frame(velocity, ["velocity_m_s"], encoder) if len(velocity) else None,
     }
 
 
-def _pack_frame(table: pd.DataFrame, columns: list[str], packer: Packer) -> list[dict[str, int]]:
-    values = [packer.add(table[column].to_numpy(), COARSE_STEPS_PER_UNIT) for column in columns]
-    return [packer.add_times(table.index.to_numpy()), *values]
+def _pack_frame(
+    table: pd.DataFrame, columns: list[str], encoder: ArrayEncoder
+) -> list[dict[str, int]]:
+    values = [encoder.add(table[column].to_numpy(), COARSE_STEPS_PER_UNIT) for column in columns]
+    return [encoder.add_times(table.index.to_numpy()), *values]
 
 
-def _collect_ml_noises(analysis: Analysis) -> PageData:
+def _collect_estimated_noises(analysis: Analysis) -> PageData:
     return {
         name: [axis_tuning.sigma_a_two_state.value, axis_tuning.sigma_z.value]
         for name, axis_tuning in analysis.tuning.items()

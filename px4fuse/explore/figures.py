@@ -16,17 +16,17 @@ from px4fuse.explore.data import PageData
 BokehStyle = dict[str, Any]
 # Columns of the Bokeh data sources, which JavaScript fills
 SOURCE_COLUMNS = (
-    "t p v sp sv "  # t: time; p: position, v: velocity, with σ sp and sv
-    "k0 k1 "  # KF gain: k0 of position, k1 of velocity
-    "e minus plus "  # e: position error; minus, plus: its ∓2σ limits
-    "x y "  # x: innovation ÷ √S; y: height of an arrow head at the edge of the plot
-    "z turn "  # z: measured position; turn: angle of an arrow head (rad)
-    "row left right"  # event: row, start (left) and end (right)
+    "t p v sp sv "  # t: time (s); p: position (m), v: velocity (m/s); sp, sv: their σ
+    "k0 k1 "  # KF gain: k0 of position, k1 of velocity (1/s)
+    "e minus plus "  # e: position error (m); minus, plus: -2σ and +2σ
+    "x y "  # x: innovation ÷ √S; y: ± plot limit, where an arrow head marks a larger |x|
+    "z turn "  # z: measured position (m); turn: angle (rad) of an arrow head
+    "row left right"  # row of the event plot; left, right: start and end (s) of the event
 )
 # JavaScript sets the colours by `name`. Line styles distinguish the filters without colour
-KF_LINE: BokehStyle = {"line_width": 1.6, "name": "kf"}
-EKF2_LINE: BokehStyle = {"line_width": 1.6, "line_dash": [6, 3], "name": "ekf2"}
-TRUTH_LINE: BokehStyle = {"line_width": 1.2, "line_dash": [1, 3], "name": "truth"}
+KF_LINE_STYLE: BokehStyle = {"line_width": 1.6, "name": "kf"}
+EKF2_LINE_STYLE: BokehStyle = {"line_width": 1.6, "line_dash": [6, 3], "name": "ekf2"}
+TRUTH_LINE_STYLE: BokehStyle = {"line_width": 1.2, "line_dash": [1, 3], "name": "truth"}
 HOLLOW_MARKER: BokehStyle = {"fill_color": None, "line_color": "black"}
 # Arrow head at the upper or lower edge of a plot, for a value outside the axis range
 ARROW_MARKER: BokehStyle = {"angle": "turn", "marker": "triangle"}
@@ -49,10 +49,10 @@ LEFT_MARGIN_PIXELS = 50
 # Left margin (pixels) of the event plot, which has long labels, and of the plot above
 EVENT_LEFT_MARGIN_PIXELS = 82
 LINE_STYLES = {
-    "kf": KF_LINE,
-    "dotted": KF_LINE | {"line_dash": [2, 2]},
-    "ekf2": EKF2_LINE,
-    "truth": TRUTH_LINE,
+    "kf": KF_LINE_STYLE,
+    "dotted": KF_LINE_STYLE | {"line_dash": [2, 2]},
+    "ekf2": EKF2_LINE_STYLE,
+    "truth": TRUTH_LINE_STYLE,
 }
 
 
@@ -70,22 +70,22 @@ class Plot(Record):
     unit: str = ""
 
 
-class View(Record):
+class PageTab(Record):
     """Tab of the web page, with the titles of its plots by name."""
 
     title: str
     plots: Mapping[str, str]
 
 
-class Figures(Record):
+class PageLayout(Record):
     """Tabs and plots of the web page (``figures.toml``)."""
 
     event_rows: list[str]
-    views: dict[str, View]
+    views: dict[str, PageTab]
     plots: dict[str, Plot]
 
 
-FIGURES = read_toml(__file__, Figures)
+FIGURES = read_toml(__file__, PageLayout)
 
 
 def make_document_json(data: PageData) -> tuple[Any, dict[str, str]]:
@@ -115,7 +115,7 @@ def _make_plots(data: PageData, time_range: Range1d) -> dict[str, Any]:
     for name, plot in FIGURES.plots.items():
         if name == "error" and not has_reference(data):
             continue
-        get_source = cache(lambda source, plot=name: _make_source(f"{plot}:{source}"))
+        get_source = cache(lambda source, plot=name: _make_data_source(f"{plot}:{source}"))
         plot_figure = plots[name] = _make_figure(
             name,
             215,
@@ -155,7 +155,7 @@ def _make_plots(data: PageData, time_range: Range1d) -> dict[str, Any]:
 
 
 def _draw_innovations(
-    plot_figure: Any, sources: Callable[[str], ColumnDataSource], *, with_ekf2: bool
+    plot_figure: Any, get_source: Callable[[str], ColumnDataSource], *, with_ekf2: bool
 ) -> None:
     plot_figure.y_range = Range1d(start=-PLOT_LIMIT_SIGMAS, end=PLOT_LIMIT_SIGMAS)
     plot_figure.add_layout(
@@ -163,18 +163,18 @@ def _draw_innovations(
             bottom=-CONSISTENT_LIMIT_SIGMAS, top=CONSISTENT_LIMIT_SIGMAS, **CONSISTENT_BAND_STYLE
         )
     )
-    kf_dots = _draw_dots(plot_figure, sources("updates"), "t x", 4, name="kf")
-    _add_hover(plot_figure, kf_dots, "KF", "@x{0.00}")
-    _draw_dots(plot_figure, sources("beyond"), "t y", 9, name="kf", **ARROW_MARKER)
+    kf_renderer = _draw_dots(plot_figure, get_source("updates"), "t x", 4, name="kf")
+    _add_hover(plot_figure, kf_renderer, "KF", "@x{0.00}")
+    _draw_dots(plot_figure, get_source("beyond"), "t y", 9, name="kf", **ARROW_MARKER)
     if with_ekf2:
         style: BokehStyle = {"marker": "square", "name": "ekf2"}
-        fused_dots = _draw_dots(plot_figure, sources("fused"), "t x", 4, **style)
-        rejected_dots = _draw_dots(
-            plot_figure, sources("rejected"), "t x", 7, **style, **HOLLOW_MARKER
+        fused_renderer = _draw_dots(plot_figure, get_source("fused"), "t x", 4, **style)
+        rejected_renderer = _draw_dots(
+            plot_figure, get_source("rejected"), "t x", 7, **style, **HOLLOW_MARKER
         )
-        _add_hover(plot_figure, fused_dots, "EKF2", "@x{0.00}")
-        _add_hover(plot_figure, rejected_dots, "EKF2 rejected", "@x{0.00}")
-        _draw_dots(plot_figure, sources("beyond_ekf2"), "t y", 9, name="ekf2", **ARROW_MARKER)
+        _add_hover(plot_figure, fused_renderer, "EKF2", "@x{0.00}")
+        _add_hover(plot_figure, rejected_renderer, "EKF2 rejected", "@x{0.00}")
+        _draw_dots(plot_figure, get_source("beyond_ekf2"), "t y", 9, name="ekf2", **ARROW_MARKER)
 
 
 def _add_hover(plot_figure: Any, renderer: Any, label: str, value: str) -> None:
@@ -203,14 +203,14 @@ def _make_range(name: str | None = None) -> Range1d:
     return Range1d(start=0.1, end=1.0, name=name)
 
 
-def _make_source(name: str) -> ColumnDataSource:
+def _make_data_source(name: str) -> ColumnDataSource:
     return ColumnDataSource(
         {column: [] for column in SOURCE_COLUMNS.split()}, name=f"{name}-source"
     )
 
 
 def _make_event_plot(data: PageData, time_range: Range1d) -> Any:
-    source = _make_source("strip")
+    data_source = _make_data_source("strip")
     rows = FIGURES.event_rows if _has_track(data, "ekf2") else FIGURES.event_rows[2:]
     plot_figure = _make_figure(
         "strip",
@@ -226,7 +226,7 @@ def _make_event_plot(data: PageData, time_range: Range1d) -> Any:
         left="left",
         right="right",
         height=0.55,
-        source=source,
+        source=data_source,
         color="#7d8894",
         name="event",
     )
@@ -235,10 +235,10 @@ def _make_event_plot(data: PageData, time_range: Range1d) -> Any:
 
 
 def _draw_dots(
-    plot_figure: Any, source: ColumnDataSource, xy_columns: str, size: int, **style: Any
+    plot_figure: Any, data_source: ColumnDataSource, xy_column_names: str, size: int, **style: Any
 ) -> Any:
-    x, y = xy_columns.split()
-    return plot_figure.scatter(x, y, source=source, size=size, **{"line_color": None} | style)
+    x, y = xy_column_names.split()
+    return plot_figure.scatter(x, y, source=data_source, size=size, **{"line_color": None} | style)
 
 
 def _make_phase_plot() -> Any:
@@ -256,7 +256,9 @@ def _make_phase_plot() -> Any:
         BoxAnnotation(name="band", fill_alpha=0.25, line_color=None, visible=False)
     )
     _add_cursor(plot_figure, "measurement", line_dash=[2, 2])
-    plot_figure.line("p", "v", source=_make_source("before"), **KF_LINE | {"line_dash": [6, 3]})
-    plot_figure.patch("p", "v", source=_make_source("now"), fill_alpha=0.25, **KF_LINE)
-    _draw_dots(plot_figure, _make_source("mean"), "p v", 7, name="kf")
+    plot_figure.line(
+        "p", "v", source=_make_data_source("before"), **KF_LINE_STYLE | {"line_dash": [6, 3]}
+    )
+    plot_figure.patch("p", "v", source=_make_data_source("now"), fill_alpha=0.25, **KF_LINE_STYLE)
+    _draw_dots(plot_figure, _make_data_source("mean"), "p v", 7, name="kf")
     return plot_figure

@@ -15,14 +15,14 @@ from px4fuse.core.arrays import Array
 # Inputs of KF are rounded to this many steps per m, m/s or s, because integers are smaller when
 # compressed. The rounding error is 1 % of the tolerance between KF in JavaScript and KF in Python
 FINE_STEPS_PER_UNIT = 2.0**36
-# The same for values that are only drawn or averaged
+# Rounding steps per unit for values that are only drawn or averaged
 COARSE_STEPS_PER_UNIT = 1e6
 # Limit of the rounded values: half of the largest integer that JavaScript represents exactly
 MAX_EXACT_INTEGER = 2.0**52
 
 
 @dataclass
-class Packer:
+class ArrayEncoder:
     """Encoder of arrays; ``array_specs`` are (length, bytes per value, scale) of each array."""
 
     array_specs: list[tuple[int, int, float]] = field(default_factory=list)
@@ -49,8 +49,8 @@ class Packer:
         return {"array": len(self.array_specs) - 1}
 
     def add_times(self, time_s: Array) -> dict[str, int]:
-        is_microseconds = bool(np.all(np.abs(np.rint(time_s * 1e6) / 1e6 - time_s) < 1e-10))
-        return self.add(time_s, 1e6 if is_microseconds else FINE_STEPS_PER_UNIT)
+        has_whole_microseconds = bool(np.all(np.abs(np.rint(time_s * 1e6) / 1e6 - time_s) < 1e-10))
+        return self.add(time_s, 1e6 if has_whole_microseconds else FINE_STEPS_PER_UNIT)
 
     def text(self) -> str:
         """Return all arrays, compressed, as one base64 text."""

@@ -16,7 +16,7 @@ const Explore = (async () => {
     { id: "sigma-z", key: "sigma_z_m", title: "SIGMA_Z", unit: "m", log: [0.001, 10],
       hint: "measurement noise", likely: () => likelyNow()[1] },
     { id: "clock-offset", key: "clock_offset_s", title: "Time offset", unit: "s",
-      hint: "added to the position timestamps", likely: () => flight.offset.likely },
+      hint: "time added to the position timestamps", likely: () => flight.offset.likely },
     { id: "dt", key: "dt_s", title: "DT", unit: "s", log: [0.01, 1], hint: "prediction step" },
   ];
   const TICKS = 600;
@@ -371,8 +371,8 @@ const Explore = (async () => {
       const text = values && format(values);
       return text ? `${name} ${text}` : [];
     }).join(", ");
-    title("innovation", `values outside ±2 (expected 5 %): ${both((x) => percent(x, 0))}`);
-    title("gain", "solid: position gain, dotted: velocity gain (1/s)");
+    title("innovation", `innovations outside ±2 (expected 5 %): ${both((x) => percent(x, 0))}`);
+    title("gain", "KF: position gain (solid), velocity gain (dotted, 1/s)");
     if (kf === null) return;
     const gaps = flight.events.gap.length ? "; hatched: gap in the position source" : "";
     const shaded = `shaded: ±2σ reported by KF${gaps}`;

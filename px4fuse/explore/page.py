@@ -8,7 +8,7 @@ from bokeh.resources import Resources
 from px4fuse.analysis import Analysis
 from px4fuse.explore.data import PageData, make_flight_data, make_page_constants
 from px4fuse.explore.figures import FIGURES, has_reference, make_document_json
-from px4fuse.explore.packing import Packer
+from px4fuse.explore.packing import ArrayEncoder
 from px4fuse.html.safe import (
     clean_values,
     compute_csp_hash,
@@ -26,16 +26,16 @@ from px4fuse.report.card_html import (
 # Maximum length (characters) of a text from a log on the web page
 MAX_LOG_TEXT_LENGTH = 2000
 SCRIPT_NAMES = ("card", "step", "times")
-PACKAGE = "px4fuse.explore"
+ASSET_PACKAGE = "px4fuse.explore"
 
 
-def html_text(analysis: Analysis) -> str:
-    packer = Packer()
-    data, card = make_flight_data(analysis, packer), make_diagnosis_card(analysis)
+def make_analysis_page(analysis: Analysis) -> str:
+    encoder = ArrayEncoder()
+    data, card = make_flight_data(analysis, encoder), make_diagnosis_card(analysis)
     identity = card.identity
     return make_page_html(
         data,
-        data_scripts=make_data_elements(data, analysis, packer),
+        data_scripts=make_data_elements(data, analysis, encoder),
         command="explore",
         title=data["log"],
         about=f"{identity.source}, {identity.firmware}, {identity.duration_s:.1f} s",
@@ -44,17 +44,21 @@ def html_text(analysis: Analysis) -> str:
     )
 
 
-def make_data_elements(data: PageData, analysis: Analysis, packer: Packer, suffix: str = "") -> str:
+def make_data_elements(
+    data: PageData, analysis: Analysis, encoder: ArrayEncoder, suffix: str = ""
+) -> str:
     """Return HTML elements with the data of one flight; ``suffix`` makes their ids unique."""
     bokeh_document, name_by_plot_id = make_document_json(data)
     content = {
         "flight": data,
         "ranges": make_page_constants(),
-        "packed": packer.array_specs,
+        "packed": encoder.array_specs,
         "places": name_by_plot_id,
     }
-    figures = f'<template id="figures{suffix}">{make_sigma_ratio_figures(analysis)}</template>\n'
-    return figures + "\n".join(
+    figures_html = (
+        f'<template id="figures{suffix}">{make_sigma_ratio_figures(analysis)}</template>\n'
+    )
+    return figures_html + "\n".join(
         f'<script type="{kind}" id="{name}{suffix}">{text}</script>'
         for name, kind, text in (
             (
@@ -63,7 +67,7 @@ def make_data_elements(data: PageData, analysis: Analysis, packer: Packer, suffi
                 encode_safe_json(clean_values(content, MAX_LOG_TEXT_LENGTH)),
             ),
             ("document", "application/json", encode_safe_json(bokeh_document)),
-            ("arrays", "text/plain", packer.text()),
+            ("arrays", "text/plain", encoder.text()),
         )
     )
 
@@ -91,20 +95,23 @@ def make_page_html(
     fields
         Further fields of the template ``page.html``.
     """
-    practice = "practice" if choices else "no_practice"
+    practice_script = "practice" if choices else "no_practice"
     scripts_by_name = {
-        # BokehJS without widgets, tables and formulas; the second script only sets the log level
+        # BokehJS without widgets, tables and formulas; js_raw[1] only sets the log level
         "bokeh": Resources(mode="inline", components=["bokeh"]).js_raw[0],
-        "engine": read_asset("engine.js", PACKAGE),
+        "engine": read_asset("engine.js", ASSET_PACKAGE),
         "script": read_asset("dom.js")
-        + "".join(read_asset(f"{name}.js", PACKAGE) for name in (*SCRIPT_NAMES, practice, "page")),
+        + "".join(
+            read_asset(f"{name}.js", ASSET_PACKAGE)
+            for name in (*SCRIPT_NAMES, practice_script, "page")
+        ),
     }
     return load_template("explore/page.html").render(
         {f"{name}_hash": compute_csp_hash(text) for name, text in scripts_by_name.items()},
         **scripts_by_name,
         style="".join(map(read_asset, ("colours.css", "base.css")))
         + read_card_css()
-        + read_asset("page.css", PACKAGE),
+        + read_asset("page.css", ASSET_PACKAGE),
         command=command,
         made_from=f"px4fuse {command} {sha256}".rstrip(),
         made_with=f"px4fuse {version('px4fuse')}",

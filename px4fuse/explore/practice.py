@@ -20,7 +20,7 @@ from px4fuse.core.record import Record, read_toml
 from px4fuse.core.text import capitalise_first
 from px4fuse.diagnose import diagnose
 from px4fuse.explore.data import make_flight_data
-from px4fuse.explore.packing import Packer
+from px4fuse.explore.packing import ArrayEncoder
 from px4fuse.explore.page import make_data_elements, make_page_html
 from px4fuse.findings import Finding
 from px4fuse.report.card_html import make_card_html
@@ -41,7 +41,7 @@ MAX_SEED = 2**32 - 1
 SIGMA_A_M_S2, SIGMA_Z_M = 0.10, 0.10
 # Settings of the simulated flights: less than a minute, with two turns. IMU errors are small,
 # because large errors resemble a time offset or a misaligned position frame
-SCENARIO_VALUES: dict[str, Any] = {
+SCENARIO_SETTINGS: dict[str, Any] = {
     "passes": 3,
     "speed_m_s": 1.5,
     "sigma_a_m_s2": 0.05,
@@ -111,7 +111,7 @@ class QuizFlight:
         return sorted({fault.choice for fault in self.faults}) or ["nothing"]
 
 
-def draw_flights(seed: int, level: int, count: int) -> tuple[QuizFlight, ...]:
+def choose_random_flights(seed: int, level: int, count: int) -> tuple[QuizFlight, ...]:
     """Choose the faults of all simulated flights at random; all faults are equally frequent.
 
     Parameters
@@ -131,27 +131,29 @@ def draw_flights(seed: int, level: int, count: int) -> tuple[QuizFlight, ...]:
 
 
 def _draw_flight(rng: np.random.Generator, right_answer: str, level: int) -> QuizFlight:
-    def draw_one(candidates: list[QuizFault]) -> list[QuizFault]:
+    def draw_one_fault(candidates: list[QuizFault]) -> list[QuizFault]:
         return [candidates[rng.integers(len(candidates))]] if candidates else []
 
-    faults = draw_one([fault for fault in QUIZ_FAULTS if fault.choice == right_answer])
+    faults = draw_one_fault([fault for fault in QUIZ_FAULTS if fault.choice == right_answer])
     if level == MAX_QUIZ_LEVEL and faults and rng.random() < 0.5:
-        candidates = ((fault, {fault.choice, right_answer}) for fault in QUIZ_FAULTS)
-        faults += draw_one([fault for fault, pair in candidates if pair in COMBINABLE_ANSWERS])
-    sizes, sigma_uwb_m = [], SIGMA_Z_M
+        faults_and_answers = ((fault, {fault.choice, right_answer}) for fault in QUIZ_FAULTS)
+        faults += draw_one_fault(
+            [fault for fault, pair in faults_and_answers if pair in COMBINABLE_ANSWERS]
+        )
+    fault_sizes, sigma_uwb_m = [], SIGMA_Z_M
     for fault in faults:
         sign = "-" if fault.has_either_sign and rng.random() < 0.5 else ""
-        sizes.append(f"{sign}{fault.sizes[level - 1]}")
+        fault_sizes.append(f"{sign}{fault.sizes[level - 1]}")
         if fault.name == NOISY_UWB_FAULT:
-            sigma_uwb_m = float(sizes[-1])
+            sigma_uwb_m = float(fault_sizes[-1])
     scenario = Scenario(
-        **SCENARIO_VALUES,
+        **SCENARIO_SETTINGS,
         length_m=round(float(rng.uniform(*AISLE_LENGTH_RANGE_M)), 1),
         heading_deg=round(float(rng.uniform(0.0, 359.0)), 0),
         sigma_uwb_m=sigma_uwb_m,
         seed=int(rng.integers(MAX_SEED)),
     )
-    return QuizFlight(scenario, tuple(faults), tuple(sizes))
+    return QuizFlight(scenario, tuple(faults), tuple(fault_sizes))
 
 
 def make_practice_page(
@@ -164,15 +166,15 @@ def make_practice_page(
 
     ``progress`` is called with a text, the number of finished flights, and the number of flights.
     """
-    flight_elements = []
+    html_by_flight = []
     data: dict[str, Any] = {}
-    for flight_index, practice_flight in enumerate(draw_flights(seed, level, count)):
+    for flight_index, practice_flight in enumerate(choose_random_flights(seed, level, count)):
         progress(f"flight {flight_index + 1}", flight_index, count)
-        data, elements = _simulate_flight_data(practice_flight, flight_index)
-        flight_elements.append(elements)
+        data, flight_html = _simulate_flight_data(practice_flight, flight_index)
+        html_by_flight.append(flight_html)
     return make_page_html(
         data,
-        data_scripts="\n".join(flight_elements),
+        data_scripts="\n".join(html_by_flight),
         command="practice",
         title="simulated flights with known faults",
         about=f"seed {seed}, level {level}",
@@ -185,26 +187,32 @@ def _simulate_flight_data(
     practice_flight: QuizFlight, flight_index: int
 ) -> tuple[dict[str, Any], str]:
     faults_and_sizes = [*zip(practice_flight.faults, practice_flight.sizes, strict=True)]
-    options = [
+    fault_options = [
         f"{fault.name}={size}" for fault, size in faults_and_sizes if fault.name != NOISY_UWB_FAULT
     ]
-    simulation = flights.simulate(practice_flight.scenario, parse_faults(options))
+    simulation = flights.simulate(practice_flight.scenario, parse_faults(fault_options))
     flight = flights.to_flight(simulation, f"flight {flight_index + 1}")
     request = ComparisonRequest(log=flight.log.name, sigma_a_m_s2=SIGMA_A_M_S2, sigma_z_m=SIGMA_Z_M)
-    # keep_as_sent: the automatic correction of axes and timestamps would hide the injected fault
-    analysis, packer = diagnose(request, flight=flight, keep_as_sent=True), Packer()
-    data, card = make_flight_data(analysis, packer), build_card(analysis, request)
-    descriptions = [_describe_fault(*pair, analysis.findings) for pair in faults_and_sizes]
+    # without the automatic correction of axes and timestamps, which would hide the injected fault
+    analysis, encoder = (
+        diagnose(request, flight=flight, keep_positions_as_sent=True),
+        ArrayEncoder(),
+    )
+    data, card = make_flight_data(analysis, encoder), build_card(analysis, request)
+    fault_descriptions = [_describe_fault(*pair, analysis.findings) for pair in faults_and_sizes]
     answer_key = {
         "right": practice_flight.correct_answers,
-        "mistakes": descriptions,
-        "card": make_card_html(_with_fault_headline(card, descriptions), has_apply_buttons=True),
+        "mistakes": fault_descriptions,
+        "card": make_card_html(
+            _with_fault_headline(card, fault_descriptions), has_apply_buttons=True
+        ),
     }
     compressed_key = base64.b64encode(zlib.compress(json.dumps(answer_key).encode())).decode()
-    elements = make_data_elements(data, analysis, packer, f"-{flight_index}")
+    flight_html = make_data_elements(data, analysis, encoder, f"-{flight_index}")
     return (
         data,
-        f'{elements}\n<script type="text/plain" id="key-{flight_index}">{compressed_key}</script>',
+        f'{flight_html}\n<script type="text/plain" id="key-{flight_index}">'
+        f"{compressed_key}</script>",
     )
 
 
@@ -231,10 +239,10 @@ def split_size(size: str) -> list[str]:
     return [re.sub(r"(?<=\d)(?=[^\d.])", " ", part).replace("deg", "°") for part in size.split(",")]
 
 
-def _with_fault_headline(card: Card, descriptions: Sequence[Mapping[str, Any]]) -> Card:
-    if card.causes or not descriptions:
+def _with_fault_headline(card: Card, fault_descriptions: Sequence[Mapping[str, Any]]) -> Card:
+    if card.causes or not fault_descriptions:
         return card
-    fault_text = "; ".join(f"{fault['fault']}: {fault['size']}" for fault in descriptions)
+    fault_text = "; ".join(f"{fault['fault']}: {fault['size']}" for fault in fault_descriptions)
     return structs.replace(
         card,
         severity="warning",

@@ -22,7 +22,7 @@ from px4fuse.core.record import (
     Share,
     Unavailable,
 )
-from px4fuse.core.text import count_noun
+from px4fuse.core.text import format_count
 
 # Result of a consistency test: "underconfident" if the reported σ is too large, "overconfident" if
 # it is too small
@@ -184,7 +184,7 @@ def assess_innovations(
     if innovation_count < MIN_INNOVATIONS:
         return Unavailable(
             "consistency test",
-            f"the filter has only {count_noun(innovation_count, 'innovation')} "
+            f"the filter has only {format_count(innovation_count, 'innovation')} "
             f"(at least {MIN_INNOVATIONS} are needed)",
             "Analyse a longer segment, or log the source at a higher rate.",
         )

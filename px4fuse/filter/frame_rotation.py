@@ -17,7 +17,7 @@ import pandas as pd
 from msgspec import structs
 from scipy.special import chdtrc
 
-from px4fuse.core.arrays import Array, median_interval
+from px4fuse.core.arrays import Array, compute_median_interval_s
 from px4fuse.core.record import NotNegative, Record, Share
 from px4fuse.filter.fitting import NoiseParameters, fit_constant_errors, maximise_likelihood
 from px4fuse.filter.imu_motion import (
@@ -280,7 +280,7 @@ def _fit_heading_to_positions(
     """
     time_s = position_samples.index.to_numpy()
     fit_duration_s = max(
-        HEADING_FIT_DURATION_S, 2 * MIN_SEGMENT_MEASUREMENTS * median_interval(time_s)
+        HEADING_FIT_DURATION_S, 2 * MIN_SEGMENT_MEASUREMENTS * compute_median_interval_s(time_s)
     )
     motion_cache = MotionCache()
     misalignment_rad = 0.0

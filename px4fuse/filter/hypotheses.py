@@ -24,7 +24,7 @@ from scipy.linalg import cho_factor, cho_solve
 from scipy.spatial.transform import Rotation
 from scipy.special import chdtri
 
-from px4fuse.core.arrays import Array, ArrayPair, BoolArray, IntArray, cumulative_integral
+from px4fuse.core.arrays import Array, ArrayPair, BoolArray, IntArray, integrate_cumulatively
 from px4fuse.filter.likelihood import (
     PreintegratedMotion,
     fit_parabola_vertex,
@@ -672,7 +672,7 @@ def make_design_matrix(
     )
     increment_pairs += [
         _integrate_between_measurements(
-            cumulative_integral(weights, weight_time_s), weight_time_s, timeline
+            integrate_cumulatively(weights, weight_time_s), weight_time_s, timeline
         )
         for weights in knot_weights
     ]
@@ -727,7 +727,10 @@ def _integrate_unit_errors(attitude: pd.DataFrame, acceleration: Acceleration) -
     body_to_ned = Rotation.from_quat(quaternions, scalar_first=True)
     attitude_time_s = attitude.index.to_numpy()
     bias_integrals = [
-        (attitude_time_s, cumulative_integral(body_to_ned.apply(np.eye(3)[axis]), attitude_time_s))
+        (
+            attitude_time_s,
+            integrate_cumulatively(body_to_ned.apply(np.eye(3)[axis]), attitude_time_s),
+        )
         for axis in (FORWARD_COLUMN, RIGHT_COLUMN)
     ]
     north, east, _ = acceleration.acceleration_integral_m_s

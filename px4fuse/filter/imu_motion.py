@@ -23,7 +23,7 @@ import pandas as pd
 from scipy import constants
 from scipy.spatial.transform import Rotation, Slerp
 
-from px4fuse.core.arrays import Array, IntArray, cumulative_integral
+from px4fuse.core.arrays import Array, IntArray, integrate_cumulatively
 from px4fuse.core.record import Span
 from px4fuse.filter.fitting import NoiseParameters, fit_with_sigma_ratios
 from px4fuse.filter.marginal_likelihood import PositionsAndIncrements, subtract_smooth_path
@@ -387,7 +387,7 @@ def make_segment_motion(
     imu_samples = imu.iloc[first_row:end_row]
     imu_time_s = imu_time_s[first_row:end_row]
     columns = [*Columns.SPECIFIC_FORCE, *Columns.ANGULAR_RATE]
-    imu_integral = cumulative_integral(imu_samples[columns].to_numpy(), imu_time_s)
+    imu_integral = integrate_cumulatively(imu_samples[columns].to_numpy(), imu_time_s)
     step_times_s = np.arange(imu_time_s[0], imu_time_s[-1], INTEGRATION_STEP_S)
     integrals_at_steps = np.column_stack(
         [np.interp(step_times_s, imu_time_s, column) for column in imu_integral.T]

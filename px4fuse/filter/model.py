@@ -16,7 +16,7 @@ than arrays of one element. A covariance is a tuple of its elements 00, 01, 11.
 from typing import TypeVar
 
 from px4fuse.core.arrays import Array
-from px4fuse.trajectory.rotation import from_elements
+from px4fuse.trajectory.rotation import build_matrix
 
 STATE_COLUMNS = ["position_m", "velocity_m_s"]
 COVARIANCE_COLUMNS = ["position_variance_m2", "covariance_m2_s", "velocity_variance_m2_s2"]
@@ -33,12 +33,12 @@ SymmetricElements = tuple[T, T, T]
 def make_symmetric_matrix(covariance: SymmetricElements[float] | SymmetricElements[Array]) -> Array:
     """Return a symmetric 2 × 2 matrix from its elements 00, 01, 11."""
     p00, p01, p11 = covariance
-    return from_elements((p00, p01), (p01, p11))
+    return build_matrix((p00, p01), (p01, p11))
 
 
 def make_transition_matrix(dt_s: float | Array) -> Array:
     """Return KF's transition matrix F, shape (2, 2)."""
-    return from_elements((1.0, dt_s), (0.0, 1.0))
+    return build_matrix((1.0, dt_s), (0.0, 1.0))
 
 
 def compute_unit_process_noise(dt_s: T) -> SymmetricElements[T]:

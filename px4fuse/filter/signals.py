@@ -15,7 +15,7 @@ from numpy.typing import ArrayLike
 from scipy import constants
 from scipy.spatial.transform import Rotation, Slerp
 
-from px4fuse.core.arrays import Array, BoolArray, cumulative_integral, row_blocks
+from px4fuse.core.arrays import Array, BoolArray, integrate_cumulatively, row_blocks
 from px4fuse.core.record import Span, one_line_repr
 from px4fuse.errors import MissingDataError, SettingsError
 from px4fuse.flight.model import (
@@ -339,7 +339,10 @@ def project_acceleration(
     return Acceleration(
         time_s=time_s,
         acceleration_integral_m_s=np.array(
-            [cumulative_integral(values.to_numpy(), time_s) for _, values in acceleration.items()]
+            [
+                integrate_cumulatively(values.to_numpy(), time_s)
+                for _, values in acceleration.items()
+            ]
         ),
         acceleration_products_m2_s4=segment_acceleration_m_s2.T
         @ segment_acceleration_m_s2

@@ -103,13 +103,13 @@
   };
 
   const nameColumn = Math.max(columns.findIndex(([, kind]) => kind === "name"), 0);
-  const classes = (kind, visibleFrom, group) =>
-    `${{ number: "n", line: "line", full: "full", ratio: "ratio" }[kind] ?? ""} ${visibleFrom} ${group && `g-${group}`}`;
+  const classes = (kind, minScreenSize, group) =>
+    `${{ number: "n", line: "line", full: "full", ratio: "ratio" }[kind] ?? ""} ${minScreenSize} ${group && `g-${group}`}`;
   const cell = ([text, value, below, style], column) => {
-    const [, kind, group, visibleFrom] = columns[column];
+    const [, kind, group, minScreenSize] = columns[column];
     const hasStyle = style === "flags" || ["ratio", "full"].includes(kind);
     const node = make(column === nameColumn ? "th" : "td", "",
-      `${classes(kind, visibleFrom, group)} ${hasStyle ? style : ""}`);
+      `${classes(kind, minScreenSize, group)} ${hasStyle ? style : ""}`);
     if (style === "flags") node.append(list(text ? text.split("\n") : []));
     else if (text) {
       node.append(...kind === "ratio" ? [ratioMark(value, style.split(" ")[1]), make("span", text)]
@@ -151,10 +151,10 @@
 
   const listTable = make("table", "", "list"), headRow = listTable.createTHead().insertRow();
   const body = listTable.createTBody();
-  const heads = columns.map(([title, kind, group, visibleFrom], column) => {
+  const heads = columns.map(([title, kind, group, minScreenSize], column) => {
     const button = make("button", title);
     button.addEventListener("click", () => sort(column));
-    return fill(make("th", "", { className: classes(kind, visibleFrom, group), scope: "col", ariaSort: "none" }), [button]);
+    return fill(make("th", "", { className: classes(kind, minScreenSize, group), scope: "col", ariaSort: "none" }), [button]);
   });
   headRow.append(...heads);
 

@@ -26,14 +26,14 @@ class Column(NamedTuple):
         "rank": text that is sorted by a number; "ratio": number that is drawn on an axis.
     group : str
         Check box with which users show or hide the column; "" for a column that is always shown.
-    visible_from : str
+    min_screen_size : str
         Smallest screen size on which the column is shown.
     """
 
     title: str
     kind: Literal["text", "name", "full", "line", "number", "rank", "ratio"] = "text"
     group: str = ""
-    visible_from: Literal["always", "tablet", "desk"] = "always"
+    min_screen_size: Literal["always", "tablet", "desk"] = "always"
 
 
 class Cell(NamedTuple):
@@ -56,7 +56,7 @@ def make_number_cell(
     return Cell(format_value(value), value, second_line)
 
 
-# Section of an unfolded row, for frame.js: kind, title and contents
+# Section of the details that open below a table row, for frame.js: [kind, title, contents, ...]
 RowSection = list[Any]
 
 
@@ -155,7 +155,7 @@ def page(
     ratio_axis : mapping, optional
         Axis of the ratio columns: ``ends`` (range), ``bands`` (shaded) and ``marks`` (SVG paths).
     """
-    style = "".join(map(read_asset, ("colours.css", "base.css", "frame.css")))
+    css_text = "".join(map(read_asset, ("colours.css", "base.css", "frame.css")))
     script = "".join(map(read_asset, ("dom.js", "frame.js")))
     page_data = {
         "columns": columns,
@@ -175,9 +175,9 @@ def page(
         "axis": ratio_axis or {},
     }
     return load_template("html/frame.html").render(
-        style_hash=compute_csp_hash(style),
+        style_hash=compute_csp_hash(css_text),
         script_hash=compute_csp_hash(script),
-        style=style,
+        style=css_text,
         script=script,
         title=title,
         subtitle=subtitle,

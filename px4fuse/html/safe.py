@@ -33,12 +33,12 @@ def clean_text(text: str, max_length: int = MAX_TEXT_LENGTH) -> str:
 
 
 def clean_values(value: Any, max_length: int = MAX_TEXT_LENGTH) -> Any:
-    def clean(element: Any) -> Any:
+    def clean_element(element: Any) -> Any:
         if isinstance(element, str):
             return clean_text(element, max_length)
         return element.item() if hasattr(element, "item") else element
 
-    return convert_nested(value, clean)
+    return convert_nested(value, clean_element)
 
 
 def encode_safe_json(value: object) -> str:

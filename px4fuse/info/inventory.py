@@ -34,7 +34,7 @@ from px4fuse.flight.model import (
     sample_rate,
 )
 from px4fuse.info.tables import NO_POSITION, list_missing_data
-from px4fuse.request import ComparisonRequest, with_options
+from px4fuse.request import ComparisonRequest, replace_argument_names
 
 SCHEMA_NAME = "px4fuse-info"
 SCHEMA_VERSION = "1.0"
@@ -52,8 +52,8 @@ DATA_LABELS = {
     "truth": "ground truth",
     "airborne": "land detector",
 }
-# Type of samples that an analysis of px4fuse compare requires
-SAMPLES_BY_ANALYSIS = {
+# Samples that each analysis of px4fuse compare requires, as text after their number
+SAMPLE_TEXT_BY_ANALYSIS = {
     "EKF2 states": "samples of EKF2's position and velocity",
     "EKF2 variances": "samples of EKF2's variances",
     "EKF2 consistency": "EKF2 innovations",
@@ -65,7 +65,10 @@ TimeSpans = tuple[tuple[float, float], ...]
 
 @dataclass(frozen=True)
 class AnalysisOption:
-    """Analysis of a log; ``reason``: the data that it uses, or why it is not possible."""
+    """Analysis that may be possible with a log.
+
+    ``reason``: the data that the analysis uses, or why it is not possible.
+    """
 
     name: str
     possible: bool
@@ -74,7 +77,7 @@ class AnalysisOption:
 
 @dataclass(frozen=True)
 class LoggingAdvice:
-    """Change before the next flight (``remedy``), and data or analyses that it makes possible."""
+    """Logging advice: change for the next flight (``remedy``), and data or analyses it adds."""
 
     remedy: str
     improves: tuple[str, ...]
@@ -144,7 +147,7 @@ class Inventory:
     segment : Segment or None
         Time span that ``px4fuse compare`` analyses by default.
     abilities : tuple of AnalysisOption
-        Analyses, with the reason if one is not possible.
+        All analyses of px4fuse; each states whether the log is sufficient.
     advice : tuple of LoggingAdvice
         Changes for the next flight.
     """
@@ -164,12 +167,12 @@ def take_inventory(flight: Flight) -> Inventory:
     comparison, reason, position_remedy = None, "", ""
     try:
         comparison = prepare_comparison_inputs(
-            flight, ComparisonRequest(log=flight.log.name), keep_as_sent=True
+            flight, ComparisonRequest(log=flight.log.name), keep_positions_as_sent=True
         )
         reason = comparison.source_reason
     except Px4FuseError as error:
-        reason = with_options(error.reason).removeprefix(f"{flight.log.name}: ")
-        position_remedy = with_options(error.remedy)
+        reason = replace_argument_names(error.reason).removeprefix(f"{flight.log.name}: ")
+        position_remedy = replace_argument_names(error.remedy)
         if not isinstance(error, MissingDataError):
             position_remedy = (
                 "Set SDLOG_MODE to 0 (logging from arming) to record the whole flight."
@@ -216,7 +219,7 @@ def _collect_data_by_stream(flight: Flight) -> dict[str, pd.DataFrame | TimeSpan
     if isinstance(ekf2, Unavailable):
         data_by_stream["ekf2_state"] = ekf2
     else:
-        # from the axis with most innovations, because other axes may be missing
+        # the innovations along the axis with most of them, because other axes may be missing
         innovations = max(
             ekf2.innovations.values(),
             key=lambda samples: len(samples) if isinstance(samples, pd.DataFrame) else -1,
@@ -296,11 +299,11 @@ def _list_analyses(
     else:
         source, segment = comparison.source, comparison.segment
         sample_count = len(cut_to_segment(source.samples, segment))
-        description = (
+        used_data_text = (
             f"KF with {sample_count} samples of position source {source.name} from "
             f"{segment.start_s:.1f} s to {segment.end_s:.1f} s"
         )
-        yield AnalysisOption("compare", True, description)
+        yield AnalysisOption("compare", True, used_data_text)
     low_rate_findings = () if flight.log.is_assessed else imu.detect_low_rates(flight)
     imu_fault_text = " ".join(finding.message for finding in low_rate_findings)
     if isinstance(missing_data := imu_and_attitude(flight), Unavailable):
@@ -308,7 +311,7 @@ def _list_analyses(
     acceleration_text = "IMU acceleration rotated into NED by the attitude, without gravity"
     yield AnalysisOption("acceleration", not imu_fault_text, imu_fault_text or acceleration_text)
     yield from _list_ekf2_and_truth_analyses(flight, comparison)
-    results_by_aid, ekf2, description = evaluate_aids(flight), flight.ekf2, ""
+    results_by_aid, ekf2, rates_text = evaluate_aids(flight), flight.ekf2, ""
     if isinstance(results_by_aid, dict) and isinstance(ekf2, Ekf2):
         rate_texts = (
             f"{aid.label} {sample_rate(samples):.2g} Hz"
@@ -316,28 +319,28 @@ def _list_analyses(
             else f"{aid.label} 1 sample"
             for name, aid in results_by_aid.items()
         )
-        description = ", ".join(rate_texts)
-    yield _make_analysis_option("aids", results_by_aid, description)
-    replay_inputs, description = prepare_inputs(flight), ""
+        rates_text = ", ".join(rate_texts)
+    yield _make_analysis_option("aids", results_by_aid, rates_text)
+    replay_inputs, replay_text = prepare_inputs(flight), ""
     if not isinstance(replay_inputs, Unavailable):
         replayed_duration_s = sum(
             float(np.ptp(segment.time_s)) for segment in replay_inputs.segments
         )
-        description = f"EKF2 replay of {replayed_duration_s:.0f} s with {replay_inputs.aid.label}"
-    yield _make_analysis_option("what-if", replay_inputs, description)
+        replay_text = f"EKF2 replay of {replayed_duration_s:.0f} s with {replay_inputs.aid.label}"
+    yield _make_analysis_option("what-if", replay_inputs, replay_text)
 
 
-def _make_analysis_option(name: str, data: object, description: str) -> AnalysisOption:
+def _make_analysis_option(name: str, data: object, used_data_text: str) -> AnalysisOption:
     if isinstance(data, Unavailable):
         return AnalysisOption(name, False, data.reason)
-    return AnalysisOption(name, True, description)
+    return AnalysisOption(name, True, used_data_text)
 
 
 def _list_ekf2_and_truth_analyses(
     flight: Flight, comparison: PreparedComparison | None
 ) -> Iterator[AnalysisOption]:
     """Yield the analyses that need EKF2 data or ground truth."""
-    data_by_analysis: dict[str, object] = dict.fromkeys(SAMPLES_BY_ANALYSIS, flight.ekf2)
+    data_by_analysis: dict[str, object] = dict.fromkeys(SAMPLE_TEXT_BY_ANALYSIS, flight.ekf2)
     data_by_analysis["error"] = flight.truth
     if comparison is not None:
         main_axis, segment, ekf2 = comparison.input_axes[0], comparison.segment, flight.ekf2
@@ -355,7 +358,7 @@ def _list_ekf2_and_truth_analyses(
     for name, data in data_by_analysis.items():
         has_data = not isinstance(data, Unavailable)
         count_text = (
-            f"{len(data)} {SAMPLES_BY_ANALYSIS[name]}" if isinstance(data, pd.DataFrame) else ""
+            f"{len(data)} {SAMPLE_TEXT_BY_ANALYSIS[name]}" if isinstance(data, pd.DataFrame) else ""
         )
         yield _make_analysis_option(
             name, NO_COMPARISON if comparison is None and has_data else data, count_text
@@ -384,12 +387,12 @@ def _collect_logging_advice(
         (finding.remedy, finding_title(finding.id)) for finding in findings if finding.remedy
     ]
     # data that a MAVLink recording can contain, in addition to positions
-    possible_mavlink_data = (flight.imu, flight.attitude, flight.ekf2, flight.airborne)
+    data_in_mavlink_logs = (flight.imu, flight.attitude, flight.ekf2, flight.airborne)
     actions_and_purposes += [
         (missing_data.remedy, missing_data.what)
         for missing_data in list_missing_data(flight)
         if missing_data is not NO_POSITION
-        and (flight.log.writes_ulog or any(missing_data is data for data in possible_mavlink_data))
+        and (flight.log.writes_ulog or any(missing_data is data for data in data_in_mavlink_logs))
     ]
     purposes_by_action: dict[str, dict[str, None]] = {}
     for action, purpose in actions_and_purposes:

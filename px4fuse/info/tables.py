@@ -21,7 +21,7 @@ from px4fuse.flight.model import Ekf2, Flight, PositionTrack, Truth, Unavailable
 SCHEMA_NAME = "px4fuse-flight"
 SCHEMA_VERSION = "1.0"
 # Names that replace a placeholder in columns.csv: one row of the file gives one row for each name
-PLACEHOLDER_NAMES = {
+NAMES_BY_PLACEHOLDER = {
     "{axis}": ("north", "east", "down"),
     "{body_axis}": ("forward", "right", "down"),
     "{element}": ("w", "x", "y", "z"),
@@ -47,7 +47,7 @@ class DescribedTable:
     column_descriptions: pd.DataFrame
 
 
-def with_source_innovations(flight: Flight) -> Flight:
+def add_source_innovations(flight: Flight) -> Flight:
     """Add the EKF2 innovations of the default position source to a flight."""
     try:
         return select_source_innovations(flight, choose_source(flight)[0])
@@ -91,7 +91,7 @@ def list_missing_data(flight: Flight) -> tuple[Unavailable, ...]:
     return tuple(dict.fromkeys(missing_data))
 
 
-def description(flight: Flight) -> dict[str, Any]:
+def describe_flight(flight: Flight) -> dict[str, Any]:
     """Describe log, topics, clocks and missing data of a flight, for flight.json."""
     ekf2 = flight.ekf2
     description_fields: dict[str, Any] = {
@@ -115,7 +115,7 @@ def description(flight: Flight) -> dict[str, Any]:
 def _read_column_descriptions() -> pd.DataFrame:
     """Read the descriptions of all columns (columns.csv), indexed by table name."""
     csv_lines = Path(__file__).with_name("columns.csv").read_text("utf-8").splitlines()
-    for placeholder, names in PLACEHOLDER_NAMES.items():
+    for placeholder, names in NAMES_BY_PLACEHOLDER.items():
         csv_lines = [
             line.replace(placeholder, name)
             for line in csv_lines
@@ -148,9 +148,9 @@ def _describe_table(
         .loc[tables_in_csv]
         .map(lambda cell: cell.format(**placeholder_values))
     )
-    topics, clock = topics_and_clock
+    topics, clock_name = topics_and_clock
     column_descriptions = column_descriptions.assign(
-        table=name, source_topic=" ".join(topics), clock=clock
+        table=name, source_topic=" ".join(topics), clock=clock_name
     )
     described_data = data.reindex(columns=[*column_descriptions["column"]])
     return DescribedTable(name, described_data, column_descriptions)
@@ -176,12 +176,12 @@ def _make_described_tables(flight: Flight) -> Iterator[DescribedTable]:
     acceleration = compute_ned_acceleration(flight)
     if isinstance(acceleration, pd.DataFrame):
         acceleration = acceleration.set_axis(["north_m_s2", "east_m_s2", "down_m_s2"], axis=1)
-        imu_topics, clock = _find_topics_and_clock(flight, "imu")
+        imu_topics, imu_clock_name = _find_topics_and_clock(flight, "imu")
         attitude_topics, _ = _find_topics_and_clock(flight, "attitude")
         yield _describe_table(
             "acceleration_ned",
             _with_time_column(acceleration),
-            ((*imu_topics, *attitude_topics), clock),
+            ((*imu_topics, *attitude_topics), imu_clock_name),
         )
     for name, track in _name_tracks(flight):
         placeholder_values = {"frame": track.frame, "description": track.description}
@@ -263,7 +263,7 @@ def _make_ekf2_tables(flight: Flight, ekf2: Ekf2) -> Iterator[DescribedTable]:
 
 
 def _name_tracks(flight: Flight) -> Iterator[tuple[str, PositionTrack]]:
-    """Yield each position track with a table name, which is also unique in lower case."""
+    """Yield each position track with a table name, unique for file systems that ignore case."""
     used_names: set[str] = set()
     for track in flight.positions:
         # a name with this prefix is never reserved on Windows (con, aux, ...)

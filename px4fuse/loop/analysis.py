@@ -287,7 +287,7 @@ def analyse_flight_loop(
             "Send visual-inertial odometry to PX4 as MAVLink message ODOMETRY.",
         )
     segment, _ = loop_segment.choose_loop_segment(flight, trajectory, None, None)
-    segment_position_m = trajectory.between(segment.start_s, segment.end_s).position_m
+    segment_position_m = trajectory.cut_to_span(segment.start_s, segment.end_s).position_m
     extent_m = end_distance_m = 0.0
     if len(segment_position_m):
         extent_m = float(np.linalg.norm(np.ptp(segment_position_m, axis=0)))

@@ -10,10 +10,10 @@ from scipy.spatial.transform import Rotation
 
 from px4fuse.core.arrays import Array, IntArray, cumulative_sums
 from px4fuse.trajectory.graph import lie
-from px4fuse.trajectory.model import NED_COMPONENTS, Frame, Trajectory, cumulative_distance
+from px4fuse.trajectory.model import NED_COMPONENTS_BY_FRAME, Frame, Trajectory, cumulative_distance
 
 DOWN_DIRECTION = np.array([0.0, 0.0, 1.0])
-# Conversion of each frame to z down: key of NED_COMPONENTS, new frame, and note to the user
+# Conversion of each frame to z down: key of NED_COMPONENTS_BY_FRAME, new frame, note to the user
 _Z_DOWN_CONVERSIONS: dict[Frame, tuple[str, Frame, str]] = {
     "ENU": ("enu", "NED", "the axes were converted from east, north, up to north, east, down"),
     "camera": (
@@ -39,7 +39,7 @@ def to_z_down(trajectory: Trajectory) -> Trajectory:
     if trajectory.frame not in _Z_DOWN_CONVERSIONS:
         return trajectory
     axes, z_down_frame, note = _Z_DOWN_CONVERSIONS[trajectory.frame]
-    axis_order, _ = NED_COMPONENTS[axes]
+    axis_order, _ = NED_COMPONENTS_BY_FRAME[axes]
     position_variance_m2 = trajectory.position_variance_m2
     return replace(
         _rotate(trajectory, _matrix_to_ned(axes), z_down_frame),
@@ -59,7 +59,7 @@ def from_z_down(trajectory: Trajectory, frame: Frame) -> Trajectory:
 
 
 def _matrix_to_ned(axes: str) -> Array:
-    axis_order, axis_signs = NED_COMPONENTS[axes]
+    axis_order, axis_signs = NED_COMPONENTS_BY_FRAME[axes]
     return np.asarray(np.diag(axis_signs) @ np.eye(3)[axis_order])
 
 

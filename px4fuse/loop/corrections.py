@@ -29,7 +29,7 @@ from px4fuse.trajectory.evaluation import Evaluation, evaluate
 from px4fuse.trajectory.graph import lie
 from px4fuse.trajectory.graph.covariance import gate_edges
 from px4fuse.trajectory.graph.model import PoseGraph
-from px4fuse.trajectory.graph.solver import ROBUST_KEY, SOLUTIONS, Solution, solve
+from px4fuse.trajectory.graph.solver import ROBUST_SOLUTION_KEY, SOLUTION_LABELS, Solution, solve
 from px4fuse.trajectory.model import Trajectory, cumulative_distance
 
 # The variances that the odometry reports are used instead of the default drift if the variance at
@@ -220,7 +220,7 @@ CORRECTION_LABELS: Mapping[str, str] = {
     "uncorrected": UNCORRECTED_LABEL,
     "by_distance_plain": POSITIONS_CORRECTED_LABEL,
     "by_distance": HEADINGS_CORRECTED_LABEL,
-    **{f"pose_graph_{name}": label for name, label in SOLUTIONS.items()},
+    **{f"pose_graph_{name}": label for name, label in SOLUTION_LABELS.items()},
 }
 # Corrected path and solution of its pose graph (None without a pose graph), or the reason why the
 # corrected path is missing
@@ -313,15 +313,15 @@ def solve_pose_graphs(
             "Give two times at one place with --closure.",
         )
     if isinstance(graph, Unavailable):
-        corrections = {f"pose_graph_{solution_name}": graph for solution_name in SOLUTIONS}
+        corrections = {f"pose_graph_{solution_name}": graph for solution_name in SOLUTION_LABELS}
         return corrections, ()
     edge_indices = np.arange(len(graph.first_nodes))
     is_closure = edge_indices >= len(edge_indices) - len(closures)
     is_rejected = np.zeros(len(edge_indices), bool)
     is_rejected[is_closure] = [not closure.accepted for closure in closures]
-    for solution_name, label in SOLUTIONS.items():
+    for solution_name, label in SOLUTION_LABELS.items():
         name = f"pose_graph_{solution_name}"
-        is_robust = solution_name == ROBUST_KEY
+        is_robust = solution_name == ROBUST_SOLUTION_KEY
         is_gated = solution_name == "gated"
         progress(f"optimising: {label}")
         if is_robust and len(closures) < 2:

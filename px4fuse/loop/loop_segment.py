@@ -35,7 +35,7 @@ def cut_trajectory(
         The segment contains fewer than three poses.
     """
     time_s = trajectory.time_s
-    segment_track = trajectory.between(segment.start_s, segment.end_s)
+    segment_track = trajectory.cut_to_span(segment.start_s, segment.end_s)
     if len(segment_track) < MIN_POSES:
         raise TrajectoryError(
             f"{trajectory.name} ({time_s[0]:.2f} s to {time_s[-1]:.2f} s) has {len(segment_track)} "
@@ -47,7 +47,7 @@ def cut_trajectory(
     position_m = segment_track.position_m.copy()
     quaternions = None if segment_track.rotation is None else segment_track.rotation.as_quat()
     for index, rest_start_s in ((0, segment.start_s - REST_DURATION_S), (-1, segment.end_s)):
-        poses_at_rest = trajectory.between(rest_start_s, rest_start_s + REST_DURATION_S)
+        poses_at_rest = trajectory.cut_to_span(rest_start_s, rest_start_s + REST_DURATION_S)
         # If the vehicle moves, keep the single pose at this end of the segment instead of the mean
         if (
             not len(poses_at_rest)

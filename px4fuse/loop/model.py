@@ -23,7 +23,7 @@ from px4fuse.trajectory.graph.model import PoseGraph
 from px4fuse.trajectory.graph.solver import Solution
 from px4fuse.trajectory.model import AxisComponents, Frame, Trajectory, TrajectoryKind
 
-# Name of a correction of the path; "pose_graph_KEY" contains a KEY of SOLUTIONS (solver.py)
+# Name of a correction of the path; "pose_graph_" is followed by a key of solver.SOLUTION_LABELS
 CorrectionName = Literal[
     "uncorrected",
     "by_distance_plain",

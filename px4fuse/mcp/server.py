@@ -18,7 +18,7 @@ from mcp.server.mcpserver.prompts import Prompt
 from mcp.server.mcpserver.resources import FunctionResource
 from mcp.types import CallToolResult, TextContent, Tool
 
-from px4fuse.core.reading import files_by_sha256
+from px4fuse.core.reading import hash_files
 from px4fuse.core.record import read_toml
 from px4fuse.core.text import one_line
 from px4fuse.core.workers import JobFailure, poll_with_limits
@@ -157,9 +157,13 @@ class Server(MCPServer[Any]):
                 del self._cache[next(iter(self._cache))]
         return result
 
-    def _add_resource(self, name: str, title: str, mime_type: str, read: Callable[[], Any]) -> None:
+    def _add_resource(
+        self, name: str, title: str, mime_type: str, read_content: Callable[[], Any]
+    ) -> None:
         uri = f"px4fuse://{name}"
-        self.add_resource(FunctionResource(uri=uri, name=title, mime_type=mime_type, fn=read))
+        self.add_resource(
+            FunctionResource(uri=uri, name=title, mime_type=mime_type, fn=read_content)
+        )
 
     async def _explain(self, finding_id: str) -> str:
         return self._run_command(None, ["explain", finding_id])[0]
@@ -183,4 +187,4 @@ async def _make_cache_key(
     """Return the command line and the SHA-256 of the input files; None if an input is a folder."""
     if any(file.is_dir() for file in files):
         return None
-    return (*command_words, *await anyio.to_thread.run_sync(files_by_sha256, files))
+    return (*command_words, *await anyio.to_thread.run_sync(hash_files, files))

@@ -11,7 +11,7 @@ from px4fuse.errors import TrajectoryError
 from px4fuse.readers.text_table import TextTableRows, decode_text, make_line_error, quote
 from px4fuse.readers.trajectory import MAX_COORDINATE_M, UNIT_NORM_TOLERANCE
 from px4fuse.trajectory.graph.initialisation import initialise
-from px4fuse.trajectory.graph.model import POSES_FROM_FILE, PoseGraph
+from px4fuse.trajectory.graph.model import INITIAL_POSES_FROM_FILE, PoseGraph
 
 MAX_FILE_BYTES = 500_000_000
 # Number of vertex ids, and number of values after the ids, by the tag that begins a line
@@ -108,7 +108,7 @@ def parse_g2o(text: str, name: str) -> PoseGraph:
         information=_make_information_matrices(
             edges, edge_values[:, pose_width:], 3 if dimension == 2 else 6
         ),
-        initialised=POSES_FROM_FILE,
+        initialised=INITIAL_POSES_FROM_FILE,
     )
     try:
         return graph if vertices.lines else initialise(graph)

@@ -15,7 +15,7 @@ from typing import Literal
 import numpy as np
 import pandas as pd
 
-from px4fuse.core.arrays import Array, IntArray, median_interval
+from px4fuse.core.arrays import Array, IntArray, compute_median_interval_s
 from px4fuse.core.reading import read_bytes_limited, split_path_and_part
 from px4fuse.errors import LogError, SettingsError
 from px4fuse.flight.model import NO_INVALID_ROWS, time_index
@@ -202,7 +202,7 @@ def read_position_file(
             f"{COLUMNS_OPTION}.",
         )
     numbers = numbers.iloc[kept_rows].set_index(time_index(times_s[kept_rows]))
-    median_interval_s = median_interval(numbers.index)
+    median_interval_s = compute_median_interval_s(numbers.index)
     if not interval_range_s[0] <= median_interval_s <= interval_range_s[1]:
         notes.append(
             f"a median interval of {median_interval_s:.3g} s is unusual: check the unit of time "
@@ -275,7 +275,7 @@ def _open_table(
     if is_bag(path):
         return read_bag(path, body_name)
     content = read_bytes_limited(
-        path, LogError, MAX_FILE_BYTES, empty_remedy="Copy the position file again."
+        path, LogError, MAX_FILE_BYTES, remedy_if_empty="Copy the position file again."
     )
     refuse_foreign_format(path, content, LogError)
     table = find_table(path, content, columns, body_name)

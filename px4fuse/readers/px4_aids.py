@@ -194,4 +194,6 @@ def _make_aid_log(
     innovation_columns = [f"innovation_{axis}" for axis in aid.axes]
     parameters = aid.logged_parameters(topics.ekf2_parameters)
     samples = samples.assign(**-samples[innovation_columns])
-    return AidLog(used_topics, aid.axes, samples, enabled_changes, parameters, excluded_sample_count)
+    return AidLog(
+        used_topics, aid.axes, samples, enabled_changes, parameters, excluded_sample_count
+    )

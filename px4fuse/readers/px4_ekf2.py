@@ -10,7 +10,7 @@ import numpy as np
 import pandas as pd
 from numpy.typing import ArrayLike
 
-from px4fuse.core.arrays import Array, IntArray, median_interval
+from px4fuse.core.arrays import Array, IntArray, compute_median_interval_s
 from px4fuse.flight.ekf2_parameters import AIDS, EV_POS, FLOW, STATUS_FLAGS, fill_with_defaults
 from px4fuse.flight.model import (
     BIAS_NOT_LOGGED,
@@ -213,7 +213,10 @@ def _estimate_step_s(topics: Topics) -> float:
     """Return EKF2's prediction interval (s), a multiple of the IMU interval (ImuDownSampler)."""
     configured_interval_s = configured_step_s(topics)
     imu_time_s = topics.read(Layout(px4.IMU_LAYOUT.topic, {"time": "timestamp"})).index.to_numpy()
-    if len(imu_time_s) < 2 or (interval_s := median_interval(imu_time_s)) >= configured_interval_s:
+    if (
+        len(imu_time_s) < 2
+        or (interval_s := compute_median_interval_s(imu_time_s)) >= configured_interval_s
+    ):
         return configured_interval_s
     layout = Layout(_find_state_vector(topics)[0], {"states[0]": "states[0]"})
     prediction_end_rows = find_rows_of_timestamps(imu_time_s, topics.primary_samples(layout).index)

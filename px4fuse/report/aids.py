@@ -12,7 +12,7 @@ from px4fuse.ekf2.aids import AidResult, find_flight_span
 from px4fuse.flight.model import AidLog, Flight, Unavailable, sample_step_function
 from px4fuse.report import style
 from px4fuse.report.event_marks import ON_GROUND_BAND_STYLE
-from px4fuse.report.page import Cell, Page, appendix_title
+from px4fuse.report.page import Cell, Page, make_appendix_title
 from px4fuse.report.panels import draw_dots
 from px4fuse.report.phrases import format_sigma_verdict
 
@@ -23,7 +23,8 @@ LEAD_TEXT = (
 )
 AID_PANEL_HEIGHT = 21.0  # height (points) of the plot of one aiding source
 MAX_DRAWN_SIGMAS = 4.0  # larger |ν/√S| are drawn as triangles at the edge of the plot
-# Aiding sources of outdoor flights: a report has a page on all aiding sources if EKF2 fused one
+# Aiding sources of outdoor flights: if EKF2 fused one of these or more, a report has a page on all
+# aiding sources
 OUTDOOR_AIDS = ("gnss_pos", "gnss_vel", "optical_flow", "aux_global_position")
 
 
@@ -32,7 +33,7 @@ def draw_pages(analysis: Analysis | AidsOnlyAnalysis, _: object) -> Iterator[Pag
     is_comparison = isinstance(analysis, Analysis)
     aids = select_aids_if_outdoor(analysis) if isinstance(analysis, Analysis) else analysis.aids
     if aids:
-        page = Page(appendix_title(TITLE) if is_comparison else TITLE, LEAD_TEXT)
+        page = Page(make_appendix_title(TITLE) if is_comparison else TITLE, LEAD_TEXT)
         write_aids(page, aids)
         _draw_aid_panels(page, analysis.flight, aids)
         yield page
@@ -41,8 +42,8 @@ def draw_pages(analysis: Analysis | AidsOnlyAnalysis, _: object) -> Iterator[Pag
 def select_aids_if_outdoor(analysis: Analysis) -> Mapping[str, AidResult]:
     """Return all aiding sources if EKF2 fused GNSS or optical flow (outdoor flight), else {}."""
     aids = {} if isinstance(analysis.aids, Unavailable) else analysis.aids
-    enabled_names = {name for name, aid in aids.items() if aid.verdict != "disabled"}
-    return {} if enabled_names.isdisjoint(OUTDOOR_AIDS) else aids
+    enabled_aid_names = {name for name, aid in aids.items() if aid.verdict != "disabled"}
+    return {} if enabled_aid_names.isdisjoint(OUTDOOR_AIDS) else aids
 
 
 def write_aids(page: Page, aids: Mapping[str, AidResult]) -> None:
@@ -51,7 +52,9 @@ def write_aids(page: Page, aids: Mapping[str, AidResult]) -> None:
     for aid in aids.values():
         if aid.verdict == "disabled":
             continue
-        enabled_text = "" if aid.enabled_fraction is None else f"{aid.enabled_fraction:.0%}"
+        enabled_fraction_text = (
+            "" if aid.enabled_fraction is None else f"{aid.enabled_fraction:.0%}"
+        )
         noise_text = "" if aid.noise is None else f"{format_number(aid.noise)} {aid.unit}"
         verdict_colour = style.GOOD_COLOUR if aid.verdict == "consistent" else style.MUTED_COLOUR
         if aid.is_faulty:
@@ -59,7 +62,7 @@ def write_aids(page: Page, aids: Mapping[str, AidResult]) -> None:
         aid_cells: list[Cell] = [
             aid.label,
             (format_aid_verdict(aid), verdict_colour),
-            enabled_text,
+            enabled_fraction_text,
             f"{aid.rejected_fraction:.1%}",
             f"{aid.longest_gap_duration_s:.1f}",
             noise_text,
@@ -79,9 +82,9 @@ def write_aids(page: Page, aids: Mapping[str, AidResult]) -> None:
             aid_cells = [""] * 6
     column_heads = ["aiding source", "verdict", "enabled", "rejec-\nted", "longest\ngap (s)", "√R"]
     column_heads += ["axis", "n", "mean\nNIS", "95 %\nband", "mean\nν/√S"]
-    page.table(column_heads, rows, right_aligned_columns=(2, 3, 4, 5, 7, 8, 10))
+    page.add_table(column_heads, rows, right_aligned_columns=(2, 3, 4, 5, 7, 8, 10))
     if disabled_labels := [aid.label for aid in aids.values() if aid.verdict == "disabled"]:
-        page.write_small(
+        page.write_small_text(
             f"Aiding sources that are logged but never fused: {', '.join(disabled_labels)}."
         )
 
@@ -96,17 +99,17 @@ def _draw_aid_panels(page: Page, flight: Flight, aids: Mapping[str, AidResult]) 
     flight_span_s = find_flight_span(flight)
     if isinstance(flight.ekf2, Unavailable) or isinstance(flight_span_s, Unavailable):
         return
-    enabled_names = [name for name, aid in aids.items() if aid.verdict != "disabled"]
-    page.heading("Normalised innovations of each aiding source")
-    page.write_small(
+    enabled_aid_names = [name for name, aid in aids.items() if aid.verdict != "disabled"]
+    page.write_heading("Normalised innovations of each aiding source")
+    page.write_small_text(
         "95 % of the normalised innovations ν/√S are expected within ±2 (lines). Hollow samples "
         "were not fused. Grey: fusion was disabled. Triangles: values beyond "
         f"±{MAX_DRAWN_SIGMAS:g}."
     )
-    for name in enabled_names:
-        axes = page.panel(aids[name].label, AID_PANEL_HEIGHT, gap_above=1.0)
+    for name in enabled_aid_names:
+        axes = page.add_panel(aids[name].label, AID_PANEL_HEIGHT, gap_above=1.0)
         _draw_innovations(axes, flight.ekf2.aids[name], flight_span_s)
-        style.label_time_axis(axes, name == enabled_names[-1])
+        style.label_time_axis(axes, name == enabled_aid_names[-1])
 
 
 def _draw_innovations(axes: style.Axes, aid_log: AidLog, span_s: Span) -> None:

@@ -11,16 +11,16 @@ from px4fuse.core.text import format_ratio
 from px4fuse.errors import SettingsError
 from px4fuse.html.safe import load_template, read_asset
 from px4fuse.report.card_text import (
-    LABELLED_TICKS,
+    LABELLED_RATIO_TICKS,
     QUANTITY_LABELS,
     SEVERITY_SIGNS,
     format_consistent_ratios,
+    format_rerun_note,
     format_spans,
     format_target,
     label_alternatives,
     locate_sigma_ratio,
     rerun_columns,
-    rerun_note,
     with_typed_path,
 )
 
@@ -71,7 +71,7 @@ def make_card_html(card: Card, *, is_open: bool = False, has_apply_buttons: bool
         signs=SEVERITY_SIGNS,
         target=format_target,
         format_spans=format_spans,
-        rerun_note=rerun_note,
+        format_rerun_note=format_rerun_note,
     )
 
 
@@ -89,7 +89,7 @@ def make_sigma_ratio_html(verdicts: Sequence[Verdict], axis: str, name: str = ""
         percent=_format_axis_percent,
         alternative=make_alternative_text(verdicts),
         ticks=[
-            (_format_axis_percent(map_ratio_to_axis(tick)), label, tick not in LABELLED_TICKS)
+            (_format_axis_percent(map_ratio_to_axis(tick)), label, tick not in LABELLED_RATIO_TICKS)
             for tick, label in RATIO_AXIS_TICKS.items()
         ],
         limits=format_consistent_ratios(),
@@ -131,8 +131,10 @@ def make_alternative_text(verdicts: Sequence[Verdict]) -> str:
         if verdict.ratio is not None:
             explained_suffix = ", explained" if verdict.is_explained else ""
             verdict_text = f"{format_ratio(verdict.ratio)}, {verdict.word}{explained_suffix}"
-        quantity = f"{FILTER_NAMES[verdict.filter]}, {SCREEN_READER_QUANTITIES[verdict.against]}"
-        sentences.append(f"{quantity}: {verdict_text}.")
+        filter_and_quantity = (
+            f"{FILTER_NAMES[verdict.filter]}, {SCREEN_READER_QUANTITIES[verdict.against]}"
+        )
+        sentences.append(f"{filter_and_quantity}: {verdict_text}.")
     return " ".join(sentences)
 
 

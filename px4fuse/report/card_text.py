@@ -33,9 +33,9 @@ AXIS_INDENT = 58  # number of characters left of the axis of σ ratios
 TEXT_INDENT = 11  # number of characters of a label with the blanks around it
 # Maximum length (characters) of a command beside its label; longer commands get their own line
 MAX_COMMAND_LENGTH = 74
-# Labelled ticks of the axis of σ ratios
-LABELLED_TICKS = (0.1, 0.5, 1.0, 2.0, 10.0)
-REFERENCE_MARKS = {"source": "●", "truth": "◆"}
+# Ticks of the axis of σ ratios that have labels
+LABELLED_RATIO_TICKS = (0.1, 0.5, 1.0, 2.0, 10.0)
+SYMBOL_BY_REFERENCE = {"source": "●", "truth": "◆"}
 QUANTITY_LABELS = {"source": "● source: innovation ÷ √S", "truth": "◆ ground truth: error ÷ σ"}
 SEVERITY_SIGNS = {
     "error": "■ ERROR",
@@ -90,37 +90,37 @@ class Paragraph(NamedTuple):
         )
 
 
-def card_lines(card: Card) -> Iterator[Paragraph]:
+def format_card_lines(card: Card) -> Iterator[Paragraph]:
     if card.severity == "refused":
         yield Paragraph(f"error[{card.id}]: {card.headline}", SEVERITY_STYLES["error"])
         for label, text in card.facts.items():
-            yield from _labelled_lines(label, text)
+            yield from _format_labelled_lines(label, text)
         yield Paragraph("No file was written. Exit code 2.")
         return
-    yield from _identity_lines(card)
-    yield from headline_lines(card)
-    yield from _labelled_lines("effect", card.effect_text)
+    yield from _format_identity_lines(card)
+    yield from format_headline_lines(card)
+    yield from _format_labelled_lines("effect", card.effect_text)
     for label, text in zip(("do this", "", ""), card.do_this, strict=False):
-        yield from _labelled_lines(label, text)
+        yield from _format_labelled_lines(label, text)
     for number, cause in enumerate(card.causes, start=1):
         if number > 1:
             title = f"{cause.severity}[{cause.id}]: {cause.title}"
             yield Paragraph(title, SEVERITY_STYLES[cause.severity])
         label = f"cause {number}" if len(card.causes) > 1 else "cause"
-        yield from _labelled_lines(label, cause.why)
-        yield from _cause_lines(cause)
+        yield from _format_labelled_lines(label, cause.why)
+        yield from _format_cause_lines(cause)
     if card.more_causes:
         yield Paragraph(f"{card.more_causes} more causes are listed with -v")
     for label, text in card.facts.items():
-        yield from _labelled_lines(label, text)
-    yield from _verdict_axis_lines(card)
-    yield from _aid_axis_lines(card.aids)
+        yield from _format_labelled_lines(label, text)
+    yield from _format_verdict_lines(card)
+    yield from _format_aid_lines(card.aids)
     for text in (card.reconcile, card.difference):
-        yield from _wrapped_lines(text, "  ", "  ")
+        yield from _wrap_lines(text, "  ", "  ")
     if card.notes:
         yield Paragraph("")
     for text in note_texts(card, "with -v"):
-        yield from _wrapped_lines(text, "", "  ")
+        yield from _wrap_lines(text, "", "  ")
 
 
 def note_texts(card: Card, other_notes_place: str) -> list[str]:
@@ -133,7 +133,7 @@ def note_texts(card: Card, other_notes_place: str) -> list[str]:
     return texts
 
 
-def closing_lines(card: Card) -> Iterator[Paragraph]:
+def format_closing_lines(card: Card) -> Iterator[Paragraph]:
     """Yield the last lines of a diagnosis card: commands that print details."""
     actions = [action for cause in card.causes for _, action in label_alternatives(cause)]
     text = "More: -v."
@@ -141,7 +141,7 @@ def closing_lines(card: Card) -> Iterator[Paragraph]:
         text += " Console means the MAVLink Console of QGroundControl."
     if card.id:
         text += f" Meaning: px4fuse explain {card.id}"
-    yield from _wrapped_lines(text, "", "")
+    yield from _wrap_lines(text, "", "")
 
 
 def with_typed_path(card: Card, path: str | None) -> Card:
@@ -174,13 +174,13 @@ def to_ascii(text: str) -> str:
 
 
 def format_consistent_ratios() -> str:
-    """Format the σ ratios of a consistent filter, against position source and ground truth.
+    """Format the σ ratios of a consistent filter: ● position source, ◆ ground truth.
 
     >>> format_consistent_ratios()
     '● 0.8 to 1.25, ◆ 0.67 to 1.5'
     """
     return ", ".join(
-        f"{REFERENCE_MARKS[name]} {low:g} to {high:g}"
+        f"{SYMBOL_BY_REFERENCE[name]} {low:g} to {high:g}"
         for name, (low, high) in CONSISTENT_SIGMA_RATIOS.items()
     )
 
@@ -193,11 +193,18 @@ def draw_sigma_ratio(ratio: float | None, reference: Reference) -> str:
     >>> draw_sigma_ratio(128.0, "truth")
     '───────────────░░░░░░░──────────────▶'
     """
-    low, high = (_find_axis_column(end) for end in CONSISTENT_SIGMA_RATIOS[reference])
-    characters = ["░" if low <= column <= high else "─" for column in range(AXIS_WIDTH)]
+    first_band_column, last_band_column = (
+        _find_axis_column(end) for end in CONSISTENT_SIGMA_RATIOS[reference]
+    )
+    characters = [
+        "░" if first_band_column <= column <= last_band_column else "─"
+        for column in range(AXIS_WIDTH)
+    ]
     if ratio is not None:
         column, last_column = _find_axis_column(ratio), AXIS_WIDTH - 1
-        symbol = "◀" if column < 0 else "▶" if column > last_column else REFERENCE_MARKS[reference]
+        symbol = (
+            "◀" if column < 0 else "▶" if column > last_column else SYMBOL_BY_REFERENCE[reference]
+        )
         characters[min(max(column, 0), last_column)] = symbol
     return "".join(characters)
 
@@ -225,35 +232,35 @@ def _find_axis_column(ratio: float) -> int:
     return round(map_ratio_to_axis(ratio) * (AXIS_WIDTH - 1))
 
 
-def _identity_lines(card: Card) -> Iterator[Paragraph]:
+def _format_identity_lines(card: Card) -> Iterator[Paragraph]:
     identity = card.identity
     flight_text = f"{identity.firmware}, {identity.duration_s:.1f} s, {identity.source}"
     student_text = ", ".join(filter(None, (identity.student, identity.student_id)))
     yield Paragraph("  ".join(filter(None, (identity.file, flight_text, student_text))))
     if identity.settings:
-        yield from _wrapped_lines(f"KF: {identity.settings}", "  ", "      ")
+        yield from _wrap_lines(f"KF: {identity.settings}", "  ", "      ")
     changed_options = (*identity.changed, *identity.parameters)
     if changed_options:
-        yield from _wrapped_lines(f"changed: {'; '.join(changed_options)}", "  ", "           ")
+        yield from _wrap_lines(f"changed: {'; '.join(changed_options)}", "  ", "           ")
     yield Paragraph("")
 
 
-def headline_lines(card: Card) -> Iterator[Paragraph]:
+def format_headline_lines(card: Card) -> Iterator[Paragraph]:
     """Yield the first line of a diagnosis card: severity, id and title of the worst fault."""
     label = "ok" if card.severity == "clean" else card.severity
     severity_and_id = f"{label}[{card.id}]" if card.id else label
     yield Paragraph(f"{severity_and_id}: {card.headline}", SEVERITY_STYLES[card.severity])
 
 
-def _cause_lines(cause: Cause) -> Iterator[Paragraph]:
-    yield from _labelled_lines("when", format_spans(cause))
+def _format_cause_lines(cause: Cause) -> Iterator[Paragraph]:
+    yield from _format_labelled_lines("when", format_spans(cause))
     actions = label_alternatives(cause)
     labels = [f"{prefix}{format_target(action)}" for prefix, action in actions]
     label_width = max(map(len, labels), default=0) + 2
     for label, (_, action) in zip(labels, actions, strict=True):
-        yield from _action_lines(label, label_width, action)
-    yield from _rerun_table_lines(cause.reruns)
-    yield from _wrapped_lines(cause.after, "  ", "  ")
+        yield from _format_action_lines(label, label_width, action)
+    yield from _format_rerun_table(cause.reruns)
+    yield from _wrap_lines(cause.after, "  ", "  ")
 
 
 def label_alternatives(cause: Cause) -> list[tuple[str, Action]]:
@@ -270,11 +277,11 @@ def format_target(action: Action) -> str:
     return f"{action.target} ({action.where})" if action.where else action.target
 
 
-def _action_lines(label: str, label_width: int, action: Action) -> Iterator[Paragraph]:
+def _format_action_lines(label: str, label_width: int, action: Action) -> Iterator[Paragraph]:
     indent = " " * (2 + label_width)
     label_text = f"  {label:{label_width}}"
     if action.sentence:
-        yield from _wrapped_lines(action.sentence, label_text, indent)
+        yield from _wrap_lines(action.sentence, label_text, indent)
         label_text = indent
     if any(len(command) > MAX_COMMAND_LENGTH for command in action.commands):
         if label_text.strip():
@@ -285,13 +292,13 @@ def _action_lines(label: str, label_width: int, action: Action) -> Iterator[Para
         label_text = indent
 
 
-def _rerun_table_lines(reruns: Sequence[Rerun]) -> Iterator[Paragraph]:
+def _format_rerun_table(reruns: Sequence[Rerun]) -> Iterator[Paragraph]:
     columns = rerun_columns(reruns)
     widths = [max(map(len, column)) for column in columns]
     for row in zip(*columns, strict=True):
         cells = (f"{cell:{width}}" for cell, width in zip(row, widths, strict=True))
         yield Paragraph(f"  {'  '.join(cells)}".rstrip())
-    if note := rerun_note(reruns):
+    if note := format_rerun_note(reruns):
         yield Paragraph(f"  {note}")
 
 
@@ -313,15 +320,15 @@ def rerun_columns(reruns: Sequence[Rerun]) -> list[tuple[str, ...]]:
     return [column for column in columns if any(column[1:])]
 
 
-def rerun_note(reruns: Sequence[Rerun]) -> str:
+def format_rerun_note(reruns: Sequence[Rerun]) -> str:
     starts_s = [
         rerun.from_s for rerun in reruns if rerun.is_prediction and rerun.from_s is not None
     ]
     if not starts_s:
         return ""
     return (
-        "EKF2 (replay) is a prediction by px4fuse's model of EKF2. Its values before and after "
-        f"the change exclude gaps and the time before {min(starts_s):.0f} s."
+        "EKF2 (replay) is a prediction by px4fuse's model of EKF2. Its statistics exclude gaps and "
+        f"the time before {min(starts_s):.0f} s."
     )
 
 
@@ -337,53 +344,53 @@ def _format_percent(fraction: float) -> str:
     return f"{100.0 * fraction:.0f}"
 
 
-def _verdict_axis_lines(card: Card) -> Iterator[Paragraph]:
+def _format_verdict_lines(card: Card) -> Iterator[Paragraph]:
     if not card.verdicts:
         return
     direction_text = "" if card.effect is None else f", {card.effect.axis}"
     yield Paragraph("")
-    heading = "Reported uncertainty: RMS of actual error ÷ reported σ"
-    yield from _wrapped_lines(f"{heading}{direction_text}", "", "  ")
+    heading = "Consistency: RMS of actual error ÷ reported σ (1: consistent)"
+    yield from _wrap_lines(f"{heading}{direction_text}", "", "  ")
     legend, left_label = f"  ░ consistent ({format_consistent_ratios()})", "σ too large"
     directions = f"{left_label}{'σ too small':>{AXIS_WIDTH - len(left_label)}}"
     yield Paragraph(f"{'':{AXIS_INDENT}}", plot=directions)
-    yield Paragraph(f"{legend:{AXIS_INDENT}}", plot=_ticks_line())
+    yield Paragraph(f"{legend:{AXIS_INDENT}}", plot=_format_tick_labels())
     if any(verdict.is_explained for verdict in card.verdicts):
         yield Paragraph(
-            "  Verdicts in brackets: effects of the causes above, not faults of the filter."
+            "  A verdict in brackets is an effect of the causes above, not a fault of the filter."
         )
-    yield from map(_verdict_line, card.verdicts)
+    yield from map(_format_verdict_line, card.verdicts)
 
 
-def _verdict_line(verdict: Verdict) -> Paragraph:
+def _format_verdict_line(verdict: Verdict) -> Paragraph:
     filter_label = FILTER_NAMES[verdict.filter] if verdict.against == "source" else ""
     label_text = f"  {filter_label:4} {QUANTITY_LABELS[verdict.against]:25}"
     if verdict.ratio is None:
-        text = f"{'–':>7}  not evaluated: {verdict.reason}"
-        return Paragraph(text, "", label_text, " " * 41, wraps=True)
-    word = f"({verdict.word})" if verdict.is_explained else verdict.word
-    text = f"{label_text}{format_ratio(verdict.ratio):>7}  {word}"
+        verdict_text = f"{'–':>7}  not evaluated: {verdict.reason}"
+        return Paragraph(verdict_text, "", label_text, " " * 41, wraps=True)
+    verdict_word = f"({verdict.word})" if verdict.is_explained else verdict.word
+    verdict_text = f"{label_text}{format_ratio(verdict.ratio):>7}  {verdict_word}"
     style = "bold" if verdict.is_fault else ""
     sigma_ratio_plot = draw_sigma_ratio(verdict.ratio, verdict.against)
-    return Paragraph(f"{text:{AXIS_INDENT}}", style, plot=sigma_ratio_plot)
+    return Paragraph(f"{verdict_text:{AXIS_INDENT}}", style, plot=sigma_ratio_plot)
 
 
-def _ticks_line() -> str:
+def _format_tick_labels() -> str:
     characters = [" "] * AXIS_WIDTH
-    for tick in LABELLED_TICKS:
+    for tick in LABELLED_RATIO_TICKS:
         label = RATIO_AXIS_TICKS[tick]
         start = min(max(_find_axis_column(tick) - len(label) // 2, 0), AXIS_WIDTH - len(label))
         characters[start : start + len(label)] = label
     return "".join(characters)
 
 
-def _aid_axis_lines(aid_rows: Sequence[AidRow]) -> Iterator[Paragraph]:
+def _format_aid_lines(aid_rows: Sequence[AidRow]) -> Iterator[Paragraph]:
     if not aid_rows:
         return
     yield Paragraph("")
-    yield from _wrapped_lines(AIDS_CAPTION, "", "  ")
+    yield from _wrap_lines(AIDS_CAPTION, "", "  ")
     indent = 31
-    yield Paragraph(f"{'':{indent}}", plot=_ticks_line())
+    yield Paragraph(f"{'':{indent}}", plot=_format_tick_labels())
     for row, previous_row in zip(aid_rows, (None, *aid_rows), strict=False):
         label = "" if previous_row and row.label == previous_row.label else row.label
         ratio_text = "–" if row.ratio is None else format_ratio(row.ratio)
@@ -395,15 +402,19 @@ def format_spans(cause: Cause) -> str:
     """Format the time from the first to the last occurrence of a fault."""
     if not cause.spans_s:
         return ""
-    first_s, last_s = cause.spans_s[0][0], cause.spans_s[-1][1]
-    return f"{first_s:.1f} s" if last_s - first_s < 0.05 else f"{first_s:.1f} to {last_s:.1f} s"
+    first_start_s, last_end_s = cause.spans_s[0][0], cause.spans_s[-1][1]
+    return (
+        f"{first_start_s:.1f} s"
+        if last_end_s - first_start_s < 0.05
+        else f"{first_start_s:.1f} to {last_end_s:.1f} s"
+    )
 
 
-def _labelled_lines(label: str, text: str) -> Iterator[Paragraph]:
+def _format_labelled_lines(label: str, text: str) -> Iterator[Paragraph]:
     indent = " " * TEXT_INDENT
-    yield from _wrapped_lines(text, f"  {label:{TEXT_INDENT - 2}}", indent)
+    yield from _wrap_lines(text, f"  {label:{TEXT_INDENT - 2}}", indent)
 
 
-def _wrapped_lines(text: str, first_indent: str, indent: str) -> Iterator[Paragraph]:
+def _wrap_lines(text: str, first_indent: str, indent: str) -> Iterator[Paragraph]:
     if text:
         yield Paragraph(text, "", first_indent, indent, wraps=True)

@@ -30,7 +30,7 @@ TIME_OFFSET_FINDINGS = ("source_time_offset_changes", "source_time_offset", "ekf
 def summarise_offset(analysis: Analysis, findings: Iterable[Finding]) -> str:
     """Summarise the time offset of the position source in one line."""
     if has_time_offset_page(analysis, findings):
-        return "The appendix on the time offset contains the estimate."
+        return "See the appendix on the time offset for the estimated time offset."
     advice_by_label = make_time_offset_advice(analysis, analysis.clock)
     return " ".join(
         advice_by_label[label] for label in ("Result", "Offset") if label in advice_by_label
@@ -59,12 +59,12 @@ def make_time_offset_advice(
             "Offset": f"The time offset cannot be estimated: {time_offset.reason}.",
             "Action": "Fly passes of 5 m or more, and stop after each pass.",
         }
-    offset_s, (low_s, high_s) = time_offset.offset_s, time_offset.interval_s
+    offset_s, (low_offset_s, high_offset_s) = time_offset.offset_s, time_offset.interval_s
     advice_by_label = {
         "Result": "The position source has no significant time offset.",
         "Offset": (
-            f"Add {offset_s:+.3f} s (95 % {low_s:+.3f} to {high_s:+.3f} s) to the timestamps of "
-            "the position source."
+            f"Add {offset_s:+.3f} s (95 % {low_offset_s:+.3f} to {high_offset_s:+.3f} s) to the "
+            "timestamps of the position source."
         ),
     }
     if time_offset.is_significant(offset_s):
@@ -75,7 +75,7 @@ def make_time_offset_advice(
         suggested_offset_s = compute_clock_offset_option_s(comparison, time_offset)
         advice_by_label["Re-run"] = f"px4fuse compare LOG --clock-offset {suggested_offset_s:.3f}"
     if (logged_delay_ms := find_logged_delay_ms(comparison)) is not None:
-        advice_by_label["PX4"] = _delay_advice(comparison, time_offset, logged_delay_ms)
+        advice_by_label["PX4"] = _format_delay_advice(comparison, time_offset, logged_delay_ms)
     if time_offset.has_changed():
         offset_texts = ", ".join(
             f"{part.offset_s:+.2f} s from {part.start_s:.0f} s" for part in time_offset.parts
@@ -102,23 +102,23 @@ def make_time_offset_advice(
     return advice_by_label
 
 
-def _delay_advice(
+def _format_delay_advice(
     comparison: PreparedComparison, time_offset: ClockOffset, logged_delay_ms: float
 ) -> str:
-    name, fitted_delay_ms = (
+    delay_parameter, fitted_delay_ms = (
         find_aid(comparison).delay,
         estimate_delay_if_wrong_ms(comparison, time_offset, logged_delay_ms),
     )
     if fitted_delay_ms is None:
-        return f"{name} {logged_delay_ms:g} ms agrees with the estimated time offset."
-    if limit_text := describe_delay_limit(name, fitted_delay_ms, logged_delay_ms):
+        return f"{delay_parameter} {logged_delay_ms:g} ms agrees with the estimated time offset."
+    if limit_text := describe_delay_limit(delay_parameter, fitted_delay_ms, logged_delay_ms):
         return (
-            f"The maximum-likelihood {name} is {fitted_delay_ms:.0f} ms, but {name} cannot "
-            f"{limit_text}. Correct the sender's clock."
+            f"The maximum-likelihood {delay_parameter} is {fitted_delay_ms:.0f} ms, but "
+            f"{delay_parameter} cannot {limit_text}. Correct the sender's clock."
         )
     return (
-        f"Set {name} to {max(fitted_delay_ms, 0.0):.0f} ms (now {logged_delay_ms:g} ms), or "
-        "correct the sender's clock."
+        f"Set {delay_parameter} to {max(fitted_delay_ms, 0.0):.0f} ms (now {logged_delay_ms:g} "
+        "ms), or correct the sender's clock."
     )
 
 
@@ -135,15 +135,15 @@ def draw_pages(analysis: Analysis, results: ComparisonResults) -> Iterator[Page]
         "is from the gyros, because the same positions have corrected EKF2's attitude.",
     )
     page.write_labelled_texts(make_time_offset_advice(analysis, time_offset))
-    (low, high), estimate_s = time_offset.interval_s, time_offset.offset_s
+    (low_offset_s, high_offset_s), estimate_s = time_offset.interval_s, time_offset.offset_s
     curve_sentence = (
         f"The log-likelihood of {time_offset.count} measurements has its maximum at "
-        f"{estimate_s:+.3f} s; 95 % interval {low:+.3f} to {high:+.3f} s. The interval also "
-        "includes the IMU noise, so it is wider than the curve shows."
+        f"{estimate_s:+.3f} s; 95 % interval {low_offset_s:+.3f} to {high_offset_s:+.3f} s. The "
+        "curve does not include the IMU noise, but the interval does, so the interval is wider."
     )
     title = "Decrease of the log-likelihood from its maximum (nats)"
     draw_offset_likelihood(
-        page.panel(title, CURVE_HEIGHT, caption=curve_sentence, gap_above=14.0), time_offset
+        page.add_panel(title, CURVE_HEIGHT, caption=curve_sentence, gap_above=14.0), time_offset
     )
     yield page
 

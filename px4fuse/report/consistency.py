@@ -29,14 +29,14 @@ from px4fuse.filter.tuning import AxisTuning
 from px4fuse.findings.cause_text import format_change, format_explained_fraction
 from px4fuse.flight.model import Unavailable
 from px4fuse.report import event_marks
-from px4fuse.report.page import Page, draw_legend_above, two_columns
+from px4fuse.report.page import Page, draw_legend_above, make_two_columns
 from px4fuse.report.panels import normalised_innovations
 from px4fuse.report.phrases import (
     VERDICT_TABLE_HEAD,
     format_noise_estimate,
     format_settings,
+    get_statistics_by_filter,
     make_verdict_row,
-    statistics_by_filter,
 )
 from px4fuse.report.style import (
     INNOVATION_STYLES,
@@ -55,7 +55,7 @@ HISTOGRAM_EDGES = np.linspace(-MAX_DRAWN_SIGMAS, MAX_DRAWN_SIGMAS, 33)
 # Upper limit of the density axis; a higher one would make the normal density (up to 0.4) flat
 MAX_DENSITY_AXIS_LIMIT = 1.6
 # Below this p value of the Ljung-Box test, innovations are called "not white"
-MIN_WHITE_P_VALUE = 0.01
+MIN_WHITENESS_P_VALUE = 0.01
 RUNNING_NIS_HEIGHT = 140.0  # height (points) of the axes of the running mean NIS
 DISTRIBUTION_HEIGHT = 150.0  # height (points) of the axes of distribution and autocorrelation
 LEGEND_HEIGHT = 14.0  # height (points) of a legend above the axes
@@ -80,19 +80,19 @@ def draw_pages(analysis: Analysis, _: object) -> Iterator[Page]:
         "are normally distributed with mean 0, and are white. The plots show KF and EKF2 "
         f"along {axis_text}; the table lists all axes.",
     )
-    if innovations := _tested_innovations(result):
+    if innovations := _select_tested_innovations(result):
         title = "Running mean NIS (log scale)"
         axes = event_marks.add_panel(
             page, analysis, title, RUNNING_NIS_HEIGHT, gap_above=LEGEND_HEIGHT
         )
-        left_column, right_column = two_columns()
-        histogram_axes = left_column.panel(
+        left_column, right_column = make_two_columns()
+        histogram_axes = left_column.add_panel(
             "Distribution of ν/√S", DISTRIBUTION_HEIGHT, gap_above=LEGEND_HEIGHT, left=4.0
         )
-        autocorrelation_axes = right_column.panel(
+        autocorrelation_axes = right_column.add_panel(
             "Autocorrelation",
             DISTRIBUTION_HEIGHT,
-            caption=_whiteness_sentence(result, innovations),
+            caption=_describe_whiteness(result, innovations),
             gap_above=LEGEND_HEIGHT,
         )
         _draw_running_nis(axes, innovations)
@@ -104,22 +104,22 @@ def draw_pages(analysis: Analysis, _: object) -> Iterator[Page]:
     else:
         reason = getattr(result.filters["kf"], "reason", "too few innovations")
         page.write(f"The consistency along {axis_text} is not tested: {reason}.")
-    page.heading("All axes")
+    page.write_heading("All axes")
     column_heads = [*VERDICT_TABLE_HEAD, "n", "beyond\n2√S", "t of\nmean", "lag 1", "Ljung-\nBox"]
     rows = [
         [*make_verdict_row(axis_result, name), *_statistic_cells(consistency)]
         for axis_result in analysis.axes.values()
-        for name, consistency in statistics_by_filter(axis_result).items()
+        for name, consistency in get_statistics_by_filter(axis_result).items()
     ]
-    page.table(column_heads, rows, right_aligned_columns=(2, 5, 6, 7, 8))
+    page.add_table(column_heads, rows, right_aligned_columns=(2, 5, 6, 7, 8))
     noise_rows = [
         [name, *map(format_noise_estimate, (tuning.sigma_a_two_state, tuning.sigma_z))]
         for name, tuning in analysis.tuning.items()
         if isinstance(tuning, AxisTuning)
     ]
     if noise_rows:
-        page.heading("Maximum-likelihood noises of KF, with 95 % intervals")
-        page.table(NOISE_TABLE_HEAD, noise_rows, right_aligned_columns=(1, 2))
+        page.write_heading("Maximum-likelihood noises of KF, with 95 % intervals")
+        page.add_table(NOISE_TABLE_HEAD, noise_rows, right_aligned_columns=(1, 2))
         page.write(f"This report uses {format_settings(analysis.settings)}.")
     _write_causes(page, analysis)
     yield page
@@ -137,24 +137,26 @@ def _write_causes(page: Page, analysis: Analysis) -> None:
     rows = []
     for trial, statistic in reruns_and_statistics:
         label, exponent = STATISTIC_LABELS_AND_POWERS[statistic]
-        values = [outcome.value(statistic) or 0.0 for outcome in (trial.before, trial.after)]
+        statistic_values = [
+            outcome.value(statistic) or 0.0 for outcome in (trial.before, trial.after)
+        ]
         cells = [FILTER_NAMES[trial.filter], format_change(analysis, trial), label]
-        cells += [format_number(value**exponent, 2) for value in values]
+        cells += [format_number(value**exponent, 2) for value in statistic_values]
         rows.append([*cells, format_explained_fraction(trial, statistic)])
     if not rows:
         return
-    page.heading(f"Tested causes along {axis.label}")
+    page.write_heading(f"Tested causes of inconsistent filters along {axis.label}")
     column_heads = ["filter", "change", "quantity", "as flown", "with change", "explains"]
-    page.table(column_heads, rows, right_aligned_columns=(3, 4))
-    page.write_small(
-        "Each row is a re-run with one changed setting. 'explains' is the reduction of "
-        "ln(quantity), relative to its value as flown (of KF - EKF2: of the mean square). 'all': "
-        "the re-run is consistent. A change that explains 50 % or more is a cause."
+    page.add_table(column_heads, rows, right_aligned_columns=(3, 4))
+    page.write_small_text(
+        "Each row is a re-run with one changed setting. 'explains' is the fraction by which the "
+        "change reduces ln(quantity), or for KF - EKF2 the mean square. 'all': the re-run is "
+        "consistent. A change that explains 50 % or more is a cause."
     )
 
 
-def _tested_innovations(result: AxisComparison) -> InnovationsByFilter:
-    consistency_by_name = statistics_by_filter(result)
+def _select_tested_innovations(result: AxisComparison) -> InnovationsByFilter:
+    consistency_by_name = get_statistics_by_filter(result)
     return {
         name: values
         for name, values in normalised_innovations(result).items()
@@ -210,9 +212,9 @@ def _draw_autocorrelation(axes: Axes, innovations: InnovationsByFilter) -> None:
         fill_colour = KF_COLOUR if name == "KF" else "white"
         dots = INNOVATION_STYLES[name] | {"ms": 3.0, "mew": 0.6, "mfc": fill_colour}
         axes.plot(lag_positions, correlations, **dots, label=name)
-        whiteness_half_band = _whiteness_half_band(values)
-        axes.axhline(-whiteness_half_band, **_thin_line_style(name))
-        axes.axhline(whiteness_half_band, **_thin_line_style(name), label=f"95 % band {name}")
+        whiteness_limit = _compute_whiteness_limit(values)
+        axes.axhline(-whiteness_limit, **_thin_line_style(name))
+        axes.axhline(whiteness_limit, **_thin_line_style(name), label=f"95 % band {name}")
     draw_zero_line(axes)
     low, high = axes.get_ylim()
     axes.set_ylim(max(min(low, -0.3), -1.05), min(max(high, 0.3), 1.05))
@@ -220,19 +222,21 @@ def _draw_autocorrelation(axes: Axes, innovations: InnovationsByFilter) -> None:
     axes.set_xlabel("lag (measurements)")
 
 
-def _whiteness_half_band(values: pd.Series[float]) -> float:
-    """Return the half width of the 95 % band of the autocorrelation of white noise."""
+def _compute_whiteness_limit(values: pd.Series[float]) -> float:
+    """Return the limit (±) of 95 % of the autocorrelations of white noise."""
     return float(1.96 / np.sqrt(len(values)))
 
 
-def _whiteness_sentence(result: AxisComparison, innovations: InnovationsByFilter) -> str:
+def _describe_whiteness(result: AxisComparison, innovations: InnovationsByFilter) -> str:
     sentences = []
     for name, values in innovations.items():
-        consistency = statistics_by_filter(result)[name]
+        consistency = get_statistics_by_filter(result)[name]
         assert isinstance(consistency, Consistency)
         lag1_correlation, p_value = consistency.lag1_autocorrelation, consistency.ljung_box_p
-        interpretation = "white" if p_value >= MIN_WHITE_P_VALUE else "not white"
-        if p_value < MIN_WHITE_P_VALUE and abs(lag1_correlation) > _whiteness_half_band(values):
+        interpretation = "white" if p_value >= MIN_WHITENESS_P_VALUE else "not white"
+        if p_value < MIN_WHITENESS_P_VALUE and abs(lag1_correlation) > _compute_whiteness_limit(
+            values
+        ):
             interpretation = (
                 f"{name} {'lags' if lag1_correlation > 0.0 else 'follows measurement noise'}"
             )

@@ -24,15 +24,15 @@ from px4fuse.report.card_text import (
     QUANTITY_LABELS,
     SEVERITY_SIGNS,
     format_consistent_ratios,
+    format_rerun_note,
     format_spans,
     label_alternatives,
     locate_sigma_ratio,
     note_texts,
     rerun_columns,
-    rerun_note,
 )
 from px4fuse.report.cover_panels import write_panels
-from px4fuse.report.page import Block, Page, to_typst_data
+from px4fuse.report.page import Page, PageBlock, to_typst_data
 from px4fuse.report.style import SEVERITY_COLOURS
 from px4fuse.report.typesetting import measure_free_height
 from px4fuse.results.contract import AidsResults, ComparisonResults
@@ -61,7 +61,7 @@ def draw_pages(analysis: Analysis | AidsOnlyAnalysis, results: FlightResults) ->
     yield page
 
 
-def add_card(page: Page, card: Card) -> Block:
+def add_card(page: Page, card: Card) -> PageBlock:
     """Add a summary of faults, causes and actions to a page."""
     identity, duration_text = card.identity, f"{card.identity.duration_s:.1f} s"
     flight_texts = identity.firmware, identity.hardware, duration_text, identity.source
@@ -99,7 +99,9 @@ def add_card(page: Page, card: Card) -> Block:
 
 
 def find_free_height(page: Page) -> float:
-    return measure_free_height(to_typst_data(page.blocks, ""), fonts.font_names(str(page.blocks)))
+    return measure_free_height(
+        to_typst_data(page.blocks, ""), fonts.find_font_names(str(page.blocks))
+    )
 
 
 def _shorten_middle(name: str) -> str:
@@ -116,15 +118,15 @@ def _shorten_middle(name: str) -> str:
 
 def _make_ratio_axis(card: Card) -> dict[str, Any]:
     interval_legend = "" if card.aids else " · ├─┤ 95 % interval"
-    ends_text = " to ".join(RATIO_AXIS_TICKS[end] for end in RATIO_AXIS_ENDS)
+    axis_range_text = " to ".join(RATIO_AXIS_TICKS[end] for end in RATIO_AXIS_ENDS)
     direction_text = f", {card.effect.axis}" if card.effect else ""
     axis_text = f"RMS of actual error ÷ reported σ{direction_text}"
     return {
-        "axis_title": "Is the reported uncertainty right?",
+        "axis_title": "Is the σ reported by the filters right?",
         "axis_text": AIDS_CAPTION if card.aids else axis_text,
         "axis_legend": (
             f"grey: consistent ({format_consistent_ratios()}){interval_legend} · "
-            f"◀ ▶ ratio outside {ends_text}"
+            f"◀ ▶ ratio outside {axis_range_text}"
         ),
         "ticks": [
             {"fraction": map_ratio_to_axis(tick), "label": label}
@@ -170,9 +172,15 @@ def _make_ratio_fields(
 
 
 def _format_causes_legend(causes: Sequence[Cause]) -> str:
-    places = {action.where for cause in causes for _, action in label_alternatives(cause)}
-    texts = [f"{place}: {text}" for place, text in COMMAND_LOCATIONS.items() if place in places]
-    return " · ".join([*texts, "[id]: `px4fuse explain ID` explains the finding"])
+    command_locations = {
+        action.where for cause in causes for _, action in label_alternatives(cause)
+    }
+    legend_texts = [
+        f"{location}: {text}"
+        for location, text in COMMAND_LOCATIONS.items()
+        if location in command_locations
+    ]
+    return " · ".join([*legend_texts, "[id]: `px4fuse explain ID` explains the finding"])
 
 
 def _make_cause_fields(number: int, cause: Cause) -> dict[str, Any]:
@@ -187,7 +195,7 @@ def _make_cause_fields(number: int, cause: Cause) -> dict[str, Any]:
             _make_action_fields(prefix, action) for prefix, action in label_alternatives(cause)
         ],
         "reruns": {"head": head, "rows": rows},
-        "after": " ".join(filter(None, (rerun_note(cause.reruns), cause.after))),
+        "after": " ".join(filter(None, (format_rerun_note(cause.reruns), cause.after))),
         "id": cause.id,
     }
 

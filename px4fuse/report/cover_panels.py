@@ -30,11 +30,11 @@ from px4fuse.report.page import (
     AXIS_LABEL_HEIGHT,
     TICKS_HEIGHT,
     UNLABELLED_HEIGHT,
-    Block,
     Page,
-    line_count,
-    text_width,
-    two_columns,
+    PageBlock,
+    count_wrapped_lines,
+    make_two_columns,
+    measure_text_width,
 )
 from px4fuse.report.panels import add_legend, draw_dots, normalised_innovations
 from px4fuse.report.style import TRACK_STYLES, Axes, draw_curve
@@ -49,34 +49,35 @@ MIN_PLOTS_HEIGHT = 38.0 * POINTS_PER_MM
 # Minimum free height (points) on the first page for a plot of the innovations
 MIN_INNOVATIONS_HEIGHT = 50.0 * POINTS_PER_MM
 # Minimum and maximum height (points) of the innovation plot, with title and labels
-INNOVATION_HEIGHT_RANGE = 27.0 * POINTS_PER_MM, 38.0 * POINTS_PER_MM
+INNOVATION_PLOT_HEIGHT_RANGE = 27.0 * POINTS_PER_MM, 38.0 * POINTS_PER_MM
 # Minimum height (points) of each plot of a position error
 MIN_ERROR_PLOT_HEIGHT = 17.0 * POINTS_PER_MM
 # Total height (points) of the plots if they are on the next page
 NEXT_PAGE_PLOTS_HEIGHT = 160.0 * POINTS_PER_MM
 TITLE_HEIGHT = 16.5  # height (points) of a title of one line, with its gaps
 TITLE_LINE_HEIGHT = 10.5  # height (points) of each further line of a title
-# Unused height (points): gap above the legend, and gap below the last plot
-UNUSED_HEIGHT = 15.0
+# Unused height (points) of the page: gap above the legend, and gap below the last plot
+UNUSED_PAGE_HEIGHT = 15.0
 # Minimum height (points) of an innovation plot whose axis has ticks at ±2
-MIN_HEIGHT_WITH_TICKS_AT_2 = 48.0
+MIN_HEIGHT_FOR_TICKS_AT_2 = 48.0
 # Minimum width (points) of a plot with six ticks on the time axis
 MIN_WIDE_PLOT_WIDTH = 200.0
 LEFT_MARGIN = 38.0  # width (points) for tick and axis labels left of the axes
-# Fraction of the height of all plots that the innovation plot fills
+# Height of the innovation plot, as fraction of the height of all plots
 INNOVATION_HEIGHT_FRACTION = 0.22
-# Fraction of the height of all plots that the map fills
+# Height of the map, as fraction of the height of all plots
 MAP_HEIGHT_FRACTION = 0.25
 # Maximum innovation ÷ √S in the innovation plot; larger values are triangles at the edge
 MAX_DRAWN_SIGMAS = 4.0
 # Height (points) below a plot, without and with labels of the time axis
-HEIGHT_BELOW_AXES = UNLABELLED_HEIGHT, TICKS_HEIGHT + AXIS_LABEL_HEIGHT
+HEIGHTS_BELOW_AXES = UNLABELLED_HEIGHT, TICKS_HEIGHT + AXIS_LABEL_HEIGHT
 # Ratio of the extent of the map to the extent of the tracks
 MAP_MARGIN_FACTOR = 1.08
 # Maximum margin of the map around the positions, as a fraction of their extent
 MAX_MAP_MARGIN_FRACTION = 0.25
 MIN_MAP_EXTENT_M = 0.5
-# Maximum ratio of largest to smallest σ for which the title of a plot states only the median
+# If the ratio of largest to smallest σ is below this limit, plot titles state the median of σ,
+# otherwise its range
 MAX_CONSTANT_SIGMA_RATIO = 1.5
 # Time (s) after the start of a filter that is excluded from σ in plot titles
 SIGMA_SETTLING_S = 2.0
@@ -101,58 +102,65 @@ class FlightMap(NamedTuple):
     y_label: str
 
 
-def write_panels(block: Block, analysis: Analysis, card: Card, free_height: float) -> None:
+def write_panels(block: PageBlock, analysis: Analysis, card: Card, free_height: float) -> None:
     """Draw legend, map and plots over time on the first page; ``free_height`` is in points."""
     page = Page()
     block["blocks"] = page.blocks
     legend = add_legend(page, analysis)
-    errors, innovations = (
+    error_plots, innovation_plot = (
         _make_error_plots(analysis, card),
         _make_innovation_plot(analysis.main),
     )
     flight_map = _make_flight_map(analysis, card)
-    plots_height = free_height - legend["height"] - UNUSED_HEIGHT
+    plots_height = free_height - legend["height"] - UNUSED_PAGE_HEIGHT
     if plots_height < MIN_PLOTS_HEIGHT:
         plots_height = NEXT_PAGE_PLOTS_HEIGHT
         page.blocks.insert(0, {"kind": "break"})
     min_wide_map_height = (
-        MAP_HEIGHT_RANGE[0] + INNOVATION_HEIGHT_RANGE[0] + len(errors) * MIN_ERROR_PLOT_HEIGHT
+        MAP_HEIGHT_RANGE[0]
+        + INNOVATION_PLOT_HEIGHT_RANGE[0]
+        + len(error_plots) * MIN_ERROR_PLOT_HEIGHT
     )
-    innovation_height = float(
-        np.clip(INNOVATION_HEIGHT_FRACTION * plots_height, *INNOVATION_HEIGHT_RANGE)
+    innovation_plot_height = float(
+        np.clip(INNOVATION_HEIGHT_FRACTION * plots_height, *INNOVATION_PLOT_HEIGHT_RANGE)
     )
     length_m, width_m = np.ptp(flight_map.tracks["positions"], axis=1)
     is_elongated = length_m >= MIN_ELONGATED_TRACK_RATIO * max(width_m, 1e-6)
     if is_elongated and plots_height >= min_wide_map_height:
         map_height = float(np.clip(MAP_HEIGHT_FRACTION * plots_height, *MAP_HEIGHT_RANGE))
         _draw_map(page, analysis, flight_map, map_height)
-        error_heights = _compute_plot_heights(
-            page, errors, plots_height - map_height - innovation_height
+        error_plot_heights = _compute_plot_heights(
+            page, error_plots, plots_height - map_height - innovation_plot_height
         )
-        _draw_plots(page, analysis, [*errors, innovations], [*error_heights, innovation_height])
+        _draw_plots(
+            page,
+            analysis,
+            [*error_plots, innovation_plot],
+            [*error_plot_heights, innovation_plot_height],
+        )
         return
-    columns, map_height = two_columns(), plots_height
-    if not errors:
-        errors = [innovations]
+    columns, map_height = make_two_columns(), plots_height
+    if not error_plots:
+        error_plots = [innovation_plot]
     elif plots_height >= MIN_INNOVATIONS_HEIGHT:
-        map_height -= innovation_height
+        map_height -= innovation_plot_height
     _draw_map(columns[0], analysis, flight_map, map_height)
     if map_height < plots_height:
-        _draw_plots(columns[0], analysis, [innovations], [innovation_height])
-    label_height = HEIGHT_BELOW_AXES[True] - HEIGHT_BELOW_AXES[False]
-    heights = _compute_plot_heights(columns[1], errors, plots_height - label_height)
-    heights[-1] += label_height
-    _draw_plots(columns[1], analysis, errors, heights)
+        _draw_plots(columns[0], analysis, [innovation_plot], [innovation_plot_height])
+    label_height = HEIGHTS_BELOW_AXES[True] - HEIGHTS_BELOW_AXES[False]
+    plot_heights = _compute_plot_heights(columns[1], error_plots, plots_height - label_height)
+    plot_heights[-1] += label_height
+    _draw_plots(columns[1], analysis, error_plots, plot_heights)
     page.add_columns(*columns, gap_above=0.0)
 
 
 def _draw_plots(
-    page: Page, analysis: Analysis, plots: Sequence[TimePlot], heights: Sequence[float]
+    page: Page, analysis: Analysis, plots: Sequence[TimePlot], plot_heights: Sequence[float]
 ) -> None:
     """Draw plots over time; their heights (points) include titles and labels."""
-    for plot, height in zip(plots, heights, strict=True):
+    for plot, height in zip(plots, plot_heights, strict=True):
         is_last = plot is plots[-1]
-        axes_height = height - _find_title_height(page, plot.title) - HEIGHT_BELOW_AXES[is_last]
+        axes_height = height - _find_title_height(page, plot.title) - HEIGHTS_BELOW_AXES[is_last]
         axes = _add_panel(page, plot.title, axes_height)
         event_marks.draw_event_markers(axes, analysis)
         plot.draw(axes)
@@ -160,7 +168,7 @@ def _draw_plots(
 
 
 def _add_panel(page: Page, title: str, axes_height: float) -> Axes:
-    axes = page.panel(title, axes_height, left=LEFT_MARGIN, is_compact=True)
+    axes = page.add_panel(title, axes_height, left=LEFT_MARGIN, is_compact=True)
     axes.locator_params(axis="x", nbins=6 if page.width > MIN_WIDE_PLOT_WIDTH else 4)
     return axes
 
@@ -175,7 +183,7 @@ def _compute_plot_heights(
 
 
 def _find_title_height(page: Page, title: str) -> float:
-    return TITLE_HEIGHT + TITLE_LINE_HEIGHT * (line_count(title, page.width) - 1)
+    return TITLE_HEIGHT + TITLE_LINE_HEIGHT * (count_wrapped_lines(title, page.width) - 1)
 
 
 def _make_error_plots(analysis: Analysis, card: Card) -> list[TimePlot]:
@@ -211,8 +219,8 @@ def _make_error_plots(analysis: Analysis, card: Card) -> list[TimePlot]:
         name: pd.Series(interpolate_sigma(time_s, frame, "position_variance_m2"), time_s)
         for name, frame in (("KF", variance), ("EKF2", result.ekf2_variance))
     }
-    limits_m = [2.2 * sigma.median() for sigma in sigmas_m.values() if sigma.notna().any()]
-    half_range_m = 1.1 * max(float(difference_m.abs().max()), *limits_m)
+    sigma_limits_m = [2.2 * sigma.median() for sigma in sigmas_m.values() if sigma.notna().any()]
+    half_range_m = 1.1 * max(float(difference_m.abs().max()), *sigma_limits_m)
     label_and_rms = ("RMS", effect.difference_rms_m if effect else None)
     return [_make_error_plot("KF − EKF2 (m)", label_and_rms, difference_m, sigmas_m, half_range_m)]
 
@@ -250,18 +258,23 @@ def _make_error_plot(
 
 
 def _compute_error_limit_m(errors: pd.DataFrame) -> float:
-    largest_error, sigma = float(errors["error_m"].abs().max()), errors["sigma_m"].median()
+    largest_error_m, median_sigma_m = (
+        float(errors["error_m"].abs().max()),
+        errors["sigma_m"].median(),
+    )
     return max(
-        largest_error, 1e-3, min(2.2 * sigma, 3.0 * largest_error) if np.isfinite(sigma) else 0.0
+        largest_error_m,
+        1e-3,
+        min(2.2 * median_sigma_m, 3.0 * largest_error_m) if np.isfinite(median_sigma_m) else 0.0,
     )
 
 
 def _format_sigma(sigma: pd.Series[float]) -> str:
     settled_sigma = sigma[sigma.index >= min(sigma.index[0] + SIGMA_SETTLING_S, sigma.index[-1])]
-    low, high = float(settled_sigma.min()), float(settled_sigma.max())
-    if high < MAX_CONSTANT_SIGMA_RATIO * low:
+    min_sigma_m, max_sigma_m = float(settled_sigma.min()), float(settled_sigma.max())
+    if max_sigma_m < MAX_CONSTANT_SIGMA_RATIO * min_sigma_m:
         return format_metres(float(settled_sigma.median()))
-    return f"{format_metres(low)} to {format_metres(high)}"
+    return f"{format_metres(min_sigma_m)} to {format_metres(max_sigma_m)}"
 
 
 def _make_innovation_plot(result: AxisComparison) -> TimePlot:
@@ -279,7 +292,7 @@ def _make_innovation_plot(result: AxisComparison) -> TimePlot:
     def draw(axes: Axes) -> None:
         axes.set_ylim(-1.12 * MAX_DRAWN_SIGMAS, 1.12 * MAX_DRAWN_SIGMAS)
         height = axes.bbox.height * 72.0 / axes.figure.dpi
-        axes.set_yticks(np.arange(-4.0, 4.1, 2.0 if height >= MIN_HEIGHT_WITH_TICKS_AT_2 else 4.0))
+        axes.set_yticks(np.arange(-4.0, 4.1, 2.0 if height >= MIN_HEIGHT_FOR_TICKS_AT_2 else 4.0))
         axes.axhspan(-2.0, 2.0, color=style.CONSISTENT_BAND_COLOUR, lw=0, zorder=0.05)
         style.draw_zero_line(axes)
         for name in reversed(innovations):
@@ -336,7 +349,7 @@ def _make_flight_map(analysis: Analysis, card: Card) -> FlightMap:
 
 def _draw_map(page: Page, analysis: Analysis, flight_map: FlightMap, height: float) -> None:
     tracks, width = flight_map.tracks, page.width - LEFT_MARGIN - AXES_RIGHT_MARGIN
-    title, axes_height = "Map", height - TITLE_HEIGHT - HEIGHT_BELOW_AXES[True]
+    title, axes_height = "Map", height - TITLE_HEIGHT - HEIGHTS_BELOW_AXES[True]
     limits = _compute_map_limits(tracks, width / axes_height)
     distance_texts = []
     for name, coordinates in tracks.items():
@@ -346,11 +359,11 @@ def _draw_map(page: Page, analysis: Analysis, flight_map: FlightMap, height: flo
             distance_texts.append(f"{name} {format_metres(distance_m)} m")
     if distance_texts:
         title = f"Map; largest distance of tracks from the map: {', '.join(distance_texts)}"
-        axes_height = height - _find_title_height(page, title) - HEIGHT_BELOW_AXES[True]
+        axes_height = height - _find_title_height(page, title) - HEIGHTS_BELOW_AXES[True]
         limits = _compute_map_limits(tracks, width / axes_height)
     axes = _add_panel(page, title, axes_height)
     x_label = next(
-        text for text in flight_map.x_labels if text_width(text) < page.width - LEFT_MARGIN
+        text for text in flight_map.x_labels if measure_text_width(text) < page.width - LEFT_MARGIN
     )
     (left, bottom), (right, top) = limits
     axes.set(xlim=(left, right), ylim=(bottom, top), xlabel=x_label, ylabel=flight_map.y_label)
@@ -360,7 +373,7 @@ def _draw_map(page: Page, analysis: Analysis, flight_map: FlightMap, height: flo
         if name == "positions":
             axes.plot(map_x_m, map_y_m, **style.MEASUREMENT_STYLE | {"ms": 2.4})
         else:
-            stride = max(1, len(map_x_m) // style.MAX_WIDE_POINTS)
+            stride = max(1, len(map_x_m) // style.MAX_WIDE_AXES_POINTS)
             axes.plot(map_x_m[::stride], map_y_m[::stride], **TRACK_STYLES[name])
     position_times = cut_to_segment(analysis.source.samples, analysis.segment.flight).index
     map_x_m, map_y_m = tracks["positions"]
@@ -369,32 +382,32 @@ def _draw_map(page: Page, analysis: Analysis, flight_map: FlightMap, height: flo
         (analysis.events.landing_times_s, event_marks.LANDING_MARKER_STYLE),
     ):
         position_rows = position_times.get_indexer(pd.Index(times, dtype=float), method="nearest")
-        large_style = marker_style | {"ms": 9.0, "mec": "white", "mew": 0.8}
-        axes.plot(map_x_m[position_rows], map_y_m[position_rows], **large_style)
+        large_marker_style = marker_style | {"ms": 9.0, "mec": "white", "mew": 0.8}
+        axes.plot(map_x_m[position_rows], map_y_m[position_rows], **large_marker_style)
 
 
 def _compute_map_limits(
     tracks: Mapping[str, Coordinates], aspect_ratio: float
 ) -> tuple[Array, Array]:
     """Return the lower left and the upper right corner of the map (m)."""
-    # large errors of a filter are outside of the map, because they would reduce its scale
-    middles_m, sizes_m = [], []
+    # clip the tracks: the large errors of a diverged filter would make the flight tiny on the map
+    centres_m, sizes_m = [], []
     for axis_index in (0, 1):
         range_ends_m = [np.percentile(tracks["positions"][axis_index], (1.0, 99.0))]
         if "ground truth" in tracks:
             range_ends_m.append(_compute_range(tracks["ground truth"][axis_index]))
-        low_m, high_m = _compute_range(range_ends_m)
-        margin_m = MAX_MAP_MARGIN_FRACTION * (high_m - low_m)
-        limits_m = low_m - margin_m, high_m + margin_m
+        range_low_m, range_high_m = _compute_range(range_ends_m)
+        margin_m = MAX_MAP_MARGIN_FRACTION * (range_high_m - range_low_m)
+        limits_m = range_low_m - margin_m, range_high_m + margin_m
         range_ends_m += [
             np.clip(_compute_range(track[axis_index]), *limits_m) for track in tracks.values()
         ]
-        low_m, high_m = _compute_range(range_ends_m)
-        middles_m.append(0.5 * (low_m + high_m))
-        sizes_m.append(max(MAP_MARGIN_FACTOR * (high_m - low_m), MIN_MAP_EXTENT_M))
+        range_low_m, range_high_m = _compute_range(range_ends_m)
+        centres_m.append(0.5 * (range_low_m + range_high_m))
+        sizes_m.append(max(MAP_MARGIN_FACTOR * (range_high_m - range_low_m), MIN_MAP_EXTENT_M))
     map_length_m = max(sizes_m[0], sizes_m[1] * aspect_ratio)
     half_size_m = 0.5 * np.array([map_length_m, map_length_m / aspect_ratio])
-    return np.array(middles_m) - half_size_m, np.array(middles_m) + half_size_m
+    return np.array(centres_m) - half_size_m, np.array(centres_m) + half_size_m
 
 
 def _compute_range(values: ArrayLike) -> Array:

@@ -14,7 +14,7 @@ from px4fuse.filter.signals import AISLE
 from px4fuse.flight.ekf2_parameters import AIDS
 from px4fuse.flight.model import Unavailable
 from px4fuse.report import event_marks
-from px4fuse.report.page import Page, two_columns
+from px4fuse.report.page import Page, make_two_columns
 from px4fuse.report.style import (
     EKF2_BAND_COLOUR,
     EKF2_COLOUR,
@@ -31,14 +31,14 @@ BAR_ROW_HEIGHT = 12.0  # height (points) of a bar with its gap
 LABEL_WIDTH = 140.0  # width (points) of the labels of bars
 LEFT_COLUMN_FRACTION = 0.62  # fraction of the page width for the column with the labels of bars
 TIME_PLOT_HEIGHT = 105.0  # height (points) of the axes of the difference over time
-# Style of the bar of a replaced setting that increases the difference KF - EKF2
+# Bar style of a setting: KF with this setting of EKF2 differs more from EKF2 than without it
 INCREASE_BAR_STYLE: dict[str, Any] = {"color": "white", "hatch": "////"}
 
 
 def draw_pages(analysis: Analysis, _: object) -> Iterator[Page]:
     """Draw the contribution of each EKF2 setting to the mean square difference KF - EKF2."""
-    explanations = _explanations_by_axis(analysis)
-    if not _has_explanation(explanations):
+    explanation_by_axis = _select_explanations(analysis)
+    if not _has_explanation(explanation_by_axis):
         return
     page = Page(
         TITLE,
@@ -46,24 +46,28 @@ def draw_pages(analysis: Analysis, _: object) -> Iterator[Page]:
         "a time (px4fuse's model of EKF2). Each bar is the resulting reduction of the mean "
         "square difference KF - EKF2; a hatched bar is an increase. The bars add up to 100 %.",
     )
-    for name, explanation in explanations.items():
+    for name, explanation in explanation_by_axis.items():
         if isinstance(explanation, DifferenceExplanation):
             _draw_axis_explanation(page, name, explanation, analysis)
     replay = analysis.ekf2_replay
     assert isinstance(replay, Ekf2Replay)
     assert replay.agreement is not None
-    page.write_small(f"EKF2 replay: {format_agreement(replay.agreement)}.")
+    page.write_small_text(f"EKF2 replay: {format_agreement(replay.agreement)}.")
     yield page
 
 
-def _explanations_by_axis(analysis: Analysis) -> Mapping[str, DifferenceExplanation | Unavailable]:
+def _select_explanations(analysis: Analysis) -> Mapping[str, DifferenceExplanation | Unavailable]:
     """Return explanations of the difference KF - EKF2, only of the aisle axis if available."""
-    explanations = analysis.difference_steps
-    return {AISLE: explanations[AISLE]} if AISLE in explanations else explanations
+    explanation_by_axis = analysis.difference_steps
+    return (
+        {AISLE: explanation_by_axis[AISLE]} if AISLE in explanation_by_axis else explanation_by_axis
+    )
 
 
-def _has_explanation(explanations: Mapping[str, DifferenceExplanation | Unavailable]) -> bool:
-    return any(isinstance(entry, DifferenceExplanation) for entry in explanations.values())
+def _has_explanation(
+    explanation_by_axis: Mapping[str, DifferenceExplanation | Unavailable],
+) -> bool:
+    return any(isinstance(entry, DifferenceExplanation) for entry in explanation_by_axis.values())
 
 
 def write_explanation(page: Page, explanation: DifferenceExplanation | Unavailable) -> None:
@@ -79,12 +83,12 @@ def write_explanation(page: Page, explanation: DifferenceExplanation | Unavailab
 
 def describe_missing_explanation(analysis: Analysis) -> str:
     """Return the reason why the difference KF - EKF2 is not explained; "" if it is explained."""
-    explanations = _explanations_by_axis(analysis)
-    if isinstance(analysis.flight.ekf2, Unavailable) or _has_explanation(explanations):
+    explanation_by_axis = _select_explanations(analysis)
+    if isinstance(analysis.flight.ekf2, Unavailable) or _has_explanation(explanation_by_axis):
         return ""
     reasons = {
         f"{explanation.reason}. {explanation.remedy}": None
-        for explanation in explanations.values()
+        for explanation in explanation_by_axis.values()
         if isinstance(explanation, Unavailable)
     }
     return (
@@ -104,9 +108,10 @@ def format_agreement(agreement: Agreement) -> str:
     )
     sentences = [
         f"{'agrees' if agreement.good else 'does not agree'} with the log ({agreement.reason}). "
-        f"Correlation of {agreement.samples} innovations {correlation_text}; S of the replay ÷ S "
-        f"of the log {ratio_text}; rejected {agreement.rejected_fraction_replayed:.1%} (log "
-        f"{agreement.rejected_fraction_logged:.1%})",
+        f"Correlation of {agreement.samples} replayed with logged innovations {correlation_text}; "
+        f"innovation variance S, replay ÷ log {ratio_text}; rejected "
+        f"{agreement.rejected_fraction_replayed:.1%} "
+        f"(log {agreement.rejected_fraction_logged:.1%})",
         *(
             f"The replay of {AIDS[name].label} does not agree with the log and is not used: "
             f"{reason}"
@@ -120,11 +125,11 @@ def _draw_axis_explanation(
     page: Page, name: str, explanation: DifferenceExplanation, analysis: Analysis
 ) -> None:
     spans_text = ", ".join(f"{start:.0f} to {end:.0f} s" for start, end in explanation.spans_s)
-    page.heading(f"{name}, {spans_text}")
+    page.write_heading(f"{name}, {spans_text}")
     for sentence in explanation.sentences:
         page.write(sentence, size=8.5, gap_above=1.0)
     setting_names = [step.name for step in explanation.steps]
-    columns = two_columns(LEFT_COLUMN_FRACTION)
+    columns = make_two_columns(LEFT_COLUMN_FRACTION)
     quantities = (
         ("position", "m", "m2", explanation.unexplained_mean_square_m2),
         ("velocity", "m/s", "m2_s2", explanation.unexplained_velocity_mean_square_m2_s2),
@@ -139,12 +144,12 @@ def _draw_axis_explanation(
         )
         title = f"{quantity} difference, {np.sqrt(total_mean_square):.3f} {unit} RMS"
         height = BAR_ROW_HEIGHT * (len(setting_names) + 2)
-        axes = column.panel(title, height, left=left_edge)
-        percents = (
+        axes = column.add_panel(title, height, left=left_edge)
+        contributions_percent = (
             100.0 * mean_square_reductions / total_mean_square,
             100.0 * unexplained / total_mean_square,
         )
-        _draw_waterfall(axes, setting_names, *percents)
+        _draw_waterfall(axes, setting_names, *contributions_percent)
     axes.set_yticklabels([])
     page.add_columns(*columns)
     axes = event_marks.add_panel(
@@ -183,10 +188,10 @@ def _draw_waterfall(
     for row, percent in enumerate((100.0, *reductions_percent, unexplained_percent)):
         digits = 1 if 0.05 <= abs(percent) < 9.95 else 0
         axes.text(1.03 * right_end, row, f"{percent:z.{digits}f} %", va="center", size=8.0)
-    axes.set_yticks(range(row_count), ["KF - EKF2, total", *setting_names, "unexplained"])
+    axes.set_yticks(range(row_count), ["total difference", *setting_names, "unexplained"])
     axes.set_ylim(row_count - 0.4, -0.6)
     axes.set_xlim(min(0.0, float(bar_ends.min())), 1.2 * right_end)
-    axes.set_xlabel("% of the mean square difference")
+    axes.set_xlabel("% of the mean square difference KF - EKF2")
     axes.grid(visible=False)
 
 
@@ -195,6 +200,6 @@ def _describe_largest_difference(explanation: DifferenceExplanation) -> str:
     row = int(np.argmax(differences_m))
     return (
         f"Largest difference KF - EKF2: {differences_m[row]:.2g} m at "
-        f"{explanation.times_s[row]:.1f} s; unexplained RMS "
+        f"{explanation.times_s[row]:.1f} s; RMS of the unexplained part "
         f"{np.sqrt(np.mean(explanation.unexplained_m**2)):.2g} m."
     )

@@ -10,7 +10,7 @@ from px4fuse.core.text import format_metres
 from px4fuse.flight.model import Unavailable
 from px4fuse.loop.analysis import MIN_UNIX_TIME_S
 from px4fuse.report import style
-from px4fuse.report.page import Page, two_columns
+from px4fuse.report.page import Page, make_two_columns
 from px4fuse.report.style import EKF2_COLOUR, KF_COLOUR, MUTED_COLOUR, TRUTH_COLOUR, Artist, Axes
 from px4fuse.trajectory.evaluation import AbsoluteError, Evaluation
 from px4fuse.trajectory.model import AXES_OF_FRAME, Trajectory
@@ -26,7 +26,7 @@ PANEL_HEIGHT = 76.0  # height (points) of the axes of APE and RPE
 MAP_HEIGHT = 128.0  # height (points) of the axes of a map
 LABEL_MARGIN = 34.0  # width (points) of the labels of the vertical axis of a map
 COLOUR_BAR_MARGIN = 40.0  # width (points) of the colour bar with its labels
-REFERENCE_LINE = style.line_style(TRUTH_COLOUR, 0.8, (0, (4, 2)))
+REFERENCE_LINE_STYLE = style.line_style(TRUTH_COLOUR, 0.8, (0, (4, 2)))
 STATISTIC_LINES = (
     ("max", "max", style.line_style(MUTED_COLOUR, 0.8, (0, (1, 1.5)))),
     ("rmse", "RMSE", style.line_style(EKF2_COLOUR, 1.4)),
@@ -40,7 +40,7 @@ def draw_pages(evaluation: Evaluation, _: object) -> Iterator[Page]:
         "APE: distance of one pose from the reference (its RMSE over all poses is "
         "the ATE). RPE: error of the relative motion over a fixed distance or time.",
     )
-    page.write(ate_sentence(evaluation), size=9.0, bold=True)
+    page.write(summarise_ate(evaluation), size=9.0, bold=True)
     write_evaluation(page, evaluation)
     _draw_maps(page, evaluation)
     _draw_ape_and_rpe(page, evaluation)
@@ -52,30 +52,30 @@ def _draw_maps(page: Page, evaluation: Evaluation) -> None:
     frame, is_aligned = evaluation.reference_track.frame, evaluation.alignment != "none"
     axis_indices = list(MAP_AXIS_INDICES.get(frame, (0, 1)))
     names = [AXES_OF_FRAME[frame][index] for index in axis_indices]
-    left_column, right_column = two_columns()
-    unaligned_handles: dict[str, Artist] = {}
+    left_column, right_column = make_two_columns()
+    unaligned_legend_handles: dict[str, Artist] = {}
     if is_aligned:
-        axes = left_column.panel("Before alignment", MAP_HEIGHT, left=LABEL_MARGIN)
+        axes = left_column.add_panel("Before alignment", MAP_HEIGHT, left=LABEL_MARGIN)
         for position_m, line_style, label in (
-            (evaluation.reference_m, REFERENCE_LINE, "reference"),
+            (evaluation.reference_m, REFERENCE_LINE_STYLE, "reference"),
             (evaluation.unaligned_m, {"color": KF_COLOUR, "lw": 1.2}, "estimate"),
         ):
             drawn_position_m = position_m[:, axis_indices]
             plot_path(axes, drawn_position_m, evaluation.time_s, label=label, **line_style)
         style.set_map_axes(axes, *names)
-        unaligned_handles = _legend_handles(axes)
-        left_column.write_small(unaligned_sentence(evaluation))
+        unaligned_legend_handles = _get_legend_handles(axes)
+        left_column.write_small_text(describe_unaligned_rmse(evaluation))
     title = f"{'Aligned path' if is_aligned else 'Path'} coloured by error"
-    axes = right_column.panel(title, MAP_HEIGHT, left=LABEL_MARGIN, right=COLOUR_BAR_MARGIN)
+    axes = right_column.add_panel(title, MAP_HEIGHT, left=LABEL_MARGIN, right=COLOUR_BAR_MARGIN)
     _draw_path(axes, evaluation, axis_indices)
     style.set_map_axes(axes, *names)
-    right_column.write_small("Darker poses have a larger error; × marks the largest one.")
+    right_column.write_small_text("Darker poses have a larger error; × marks the largest one.")
     # one legend for both maps lists the reference once
-    page.legend([*(_legend_handles(axes) | unaligned_handles).values()])
+    page.add_legend([*(_get_legend_handles(axes) | unaligned_legend_handles).values()])
     page.add_columns(*[left_column] * is_aligned, right_column)
 
 
-def _legend_handles(axes: Axes) -> dict[str, Artist]:
+def _get_legend_handles(axes: Axes) -> dict[str, Artist]:
     handles, labels = axes.get_legend_handles_labels()
     return dict(zip(labels, handles, strict=True))
 
@@ -94,7 +94,7 @@ def _draw_path(axes: Axes, evaluation: Evaluation, axis_indices: list[int]) -> N
         vmax=max(float(error_m.max()), MIN_ERROR_RANGE_M),
     )
     reference_m = evaluation.reference_m[:, axis_indices]
-    plot_path(axes, reference_m, evaluation.time_s, label="reference", **REFERENCE_LINE)
+    plot_path(axes, reference_m, evaluation.time_s, label="reference", **REFERENCE_LINE_STYLE)
     axes.plot(*path_m[0], "o", color="white", mec="black", ms=5, mew=1.0, label="start", zorder=5)
     worst_point = path_m[np.argmax(error_m)]
     axes.plot(*worst_point, "x", color="black", ms=7, mew=1.6, label="largest error", zorder=5)
@@ -104,29 +104,30 @@ def _draw_path(axes: Axes, evaluation: Evaluation, axis_indices: list[int]) -> N
 
 
 def _draw_ape_and_rpe(page: Page, evaluation: Evaluation) -> None:
-    left_column, right_column = two_columns()
-    axes = left_column.panel("APE over time (m)", PANEL_HEIGHT)
-    origin_s = time_origin_s(evaluation)
-    label = "time from the first pose (s)" if origin_s else "time (s)"
-    draw_ape(axes, evaluation, evaluation.time_s - origin_s, label)
-    page.legend(axes.get_legend_handles_labels()[0])
-    axes = right_column.panel("APE over distance (m)", PANEL_HEIGHT)
+    left_column, right_column = make_two_columns()
+    axes = left_column.add_panel("APE over time (m)", PANEL_HEIGHT)
+    time_origin_s = compute_time_origin_s(evaluation)
+    label = "time from the first pose (s)" if time_origin_s else "time (s)"
+    draw_ape(axes, evaluation, evaluation.time_s - time_origin_s, label)
+    page.add_legend(axes.get_legend_handles_labels()[0])
+    axes = right_column.add_panel("APE over distance (m)", PANEL_HEIGHT)
     draw_ape(axes, evaluation, evaluation.distance_m, "distance along the reference (m)")
     page.add_columns(left_column, right_column)
-    if _rpe_statistics(evaluation):
-        left_column, right_column = two_columns()
+    if _collect_rpe_statistics(evaluation):
+        left_column, right_column = make_two_columns()
         _draw_rpe(
-            left_column.panel("RPE (m) over intervals of length delta", PANEL_HEIGHT), evaluation
+            left_column.add_panel("RPE (m) of pose pairs at distance delta", PANEL_HEIGHT),
+            evaluation,
         )
-        right_column.write(rpe_growth_sentence(evaluation.rpe), colour=MUTED_COLOUR, gap_above=24.0)
+        right_column.write(describe_rpe_growth(evaluation.rpe), colour=MUTED_COLOUR, gap_above=24.0)
         page.add_columns(left_column, right_column)
 
 
 def draw_ape(axes: Axes, evaluation: Evaluation, x_values: Array, label: str) -> None:
     """Draw the APE with its RMSE and maximum as horizontal lines."""
     error_m, x_start, x_end = evaluation.position_error_m, float(x_values[0]), float(x_values[-1])
-    drawn_x, drawn_errors_m = style.decimate_series(x_values, error_m, style.MAX_NARROW_POINTS)
-    gap_indices = np.searchsorted(drawn_x, x_values[_gap_indices(evaluation.time_s)])
+    drawn_x, drawn_errors_m = style.decimate_series(x_values, error_m, style.MAX_NARROW_AXES_POINTS)
+    gap_indices = np.searchsorted(drawn_x, x_values[_find_gap_indices(evaluation.time_s)])
     curve_with_gaps = np.insert([drawn_x, drawn_errors_m], gap_indices, np.nan, axis=1)
     axes.plot(*curve_with_gaps, color=KF_COLOUR, lw=0.8)
     for name, title, line_style in STATISTIC_LINES:
@@ -138,7 +139,9 @@ def draw_ape(axes: Axes, evaluation: Evaluation, x_values: Array, label: str) ->
 
 
 def _draw_rpe(axes: Axes, evaluation: Evaluation) -> None:
-    for index, (error, statistics) in enumerate(rpe_statistics := _rpe_statistics(evaluation)):
+    for index, (error, statistics) in enumerate(
+        rpe_statistics := _collect_rpe_statistics(evaluation)
+    ):
         if isinstance(error.interval_m, RmseInterval):
             interval = error.interval_m.low, error.interval_m.high
             axes.plot([index] * 2, interval, color=KF_COLOUR, lw=1.6, solid_capstyle="butt")
@@ -147,14 +150,14 @@ def _draw_rpe(axes: Axes, evaluation: Evaluation) -> None:
     axes.set_xticks(range(len(delta_texts)), delta_texts)
     axes.set_ylim(0.0, max(1.05 * axes.get_ylim()[1], MIN_ERROR_RANGE_M))
     axes.margins(x=0.1)
-    axes.set_xlabel("delta: distance, time or number of frames")
+    axes.set_xlabel("delta: distance, time or frames between the poses of a pair")
 
 
-def _rpe_statistics(evaluation: Evaluation) -> list[tuple[RelativeError, Statistics]]:
+def _collect_rpe_statistics(evaluation: Evaluation) -> list[tuple[RelativeError, Statistics]]:
     return [(e, e.translation_m) for e in evaluation.rpe if isinstance(e.translation_m, Statistics)]
 
 
-def _gap_indices(time_s: Array) -> IntArray:
+def _find_gap_indices(time_s: Array) -> IntArray:
     intervals_s = np.diff(time_s)
     is_gap = intervals_s > MIN_GAP_INTERVAL_RATIO * np.median(intervals_s)
     return np.asarray(np.flatnonzero(is_gap) + 1)
@@ -162,24 +165,27 @@ def _gap_indices(time_s: Array) -> IntArray:
 
 def plot_path(axes: Axes, positions_m: Array, time_s: Array, **style: Any) -> None:
     """Draw a path, shape (n, 2), with gaps where the time has gaps."""
-    gap_indices, count = _gap_indices(time_s), len(positions_m)
+    gap_indices, count = _find_gap_indices(time_s), len(positions_m)
     evenly_spaced_indices = np.linspace(0, count - 1, min(count, MAX_PATH_POINTS)).astype(np.intp)
     drawn_indices = np.unique(np.concatenate([evenly_spaced_indices, gap_indices]))
     gap_rows = np.searchsorted(drawn_indices, gap_indices)
     axes.plot(*np.insert(positions_m[drawn_indices], gap_rows, np.nan, axis=0).T, **style)
 
 
-def time_origin_s(evaluation: Evaluation) -> float:
+def compute_time_origin_s(evaluation: Evaluation) -> float:
     """Return the time of the first pose (s) if timestamps are UNIX time, else 0."""
     start_s = float(evaluation.time_s[0])
     return start_s if start_s > MIN_UNIX_TIME_S else 0.0
 
 
-def ate_sentence(evaluation: Evaluation) -> str:
+def summarise_ate(evaluation: Evaluation) -> str:
     """Summarise ATE and largest position error in one line."""
     worst_index = int(np.argmax(evaluation.position_error_m))
     preposition = "without" if evaluation.alignment == "none" else "after"
-    error, time_s = evaluation.ate.translation_m, evaluation.time_s - time_origin_s(evaluation)
+    error, time_s = (
+        evaluation.ate.translation_m,
+        evaluation.time_s - compute_time_origin_s(evaluation),
+    )
     return (
         f"ATE {format_metres(error.rmse)} m (RMSE {preposition} alignment). Largest error "
         f"{format_metres(error.max)} m at {time_s[worst_index]:.1f} s, after a path of "
@@ -194,8 +200,8 @@ def write_evaluation(page: Page, evaluation: Evaluation) -> None:
     for text in evaluation.warnings:
         page.write(text, bold=True, colour=style.SEVERITY_COLOURS["warning"])
     head = ["error", "RMSE", "95 %", "mean", "median", "std", "max", "n", "rotation\nRMSE (°)"]
-    page.table(head, make_error_rows(evaluation), right_aligned_columns=range(1, len(head)))
-    page.write_small(" ".join([*missing_reasons(evaluation), *evaluation.notes]))
+    page.add_table(head, make_error_rows(evaluation), right_aligned_columns=range(1, len(head)))
+    page.write_small_text(" ".join([*list_missing_reasons(evaluation), *evaluation.notes]))
 
 
 def make_error_rows(evaluation: Evaluation) -> list[list[str]]:
@@ -214,7 +220,7 @@ def make_error_rows(evaluation: Evaluation) -> list[list[str]]:
     return rows
 
 
-def missing_reasons(evaluation: Evaluation) -> list[str]:
+def list_missing_reasons(evaluation: Evaluation) -> list[str]:
     ate, rpe_translations = evaluation.ate, (error.translation_m for error in evaluation.rpe)
     reasons = {
         f"No {quantity.what}: {quantity.reason}.": None
@@ -224,7 +230,7 @@ def missing_reasons(evaluation: Evaluation) -> list[str]:
     return list(reasons)
 
 
-def unaligned_sentence(evaluation: Evaluation) -> str:
+def describe_unaligned_rmse(evaluation: Evaluation) -> str:
     estimate_m, reference_m = evaluation.unaligned_m, evaluation.reference_m
     rmse_m = float(np.sqrt(((estimate_m - reference_m) ** 2).sum(axis=1).mean()))
     alignment = evaluation.transform
@@ -239,7 +245,7 @@ def unaligned_sentence(evaluation: Evaluation) -> str:
     )
 
 
-def rpe_growth_sentence(rpe: tuple[RelativeError, ...]) -> str:
+def describe_rpe_growth(rpe: tuple[RelativeError, ...]) -> str:
     """Return the caption of the RPE plot: growth of the RPE with distance or time."""
     interval_note = "RMSE with its 95 % interval."
     rmse_by_unit_and_delta: dict[tuple[str, float], float] = {
@@ -278,10 +284,10 @@ def describe_track(track: Trajectory) -> str:
 
 def describe_method(evaluation: Evaluation) -> str:
     association, offset_s = evaluation.association, evaluation.time_offset.offset_s
-    texts = [
+    method_texts = [
         f"alignment {evaluation.alignment} ({evaluation.alignment_reason.rstrip('.')})",
         f"{association.poses} pose pairs, which cover {association.coverage_estimate:.0%} of the "
         f"time of the estimate and {association.coverage_reference:.0%} of the time of the "
         "reference",
     ]
-    return "; ".join(texts + [f"time offset {offset_s:+.3f} s"] * bool(offset_s))
+    return "; ".join(method_texts + [f"time offset {offset_s:+.3f} s"] * bool(offset_s))

@@ -1,4 +1,4 @@
-"""Events drawn on all time axes: gaps, resets, rejections, outliers."""
+"""Drawing of events on the time axes of plots: gaps, resets, rejections, outliers."""
 
 from collections.abc import Sequence
 from typing import Any, NamedTuple
@@ -21,7 +21,7 @@ from px4fuse.report.style import (
 _BAND_STYLE: dict[str, Any] = {"edgecolor": "none", "lw": 0.0}
 ON_GROUND_BAND_STYLE = _BAND_STYLE | {"facecolor": "#e4e4e4"}
 DROPOUT_BAND_STYLE = _BAND_STYLE | {"facecolor": "#a8a8a8"}
-GAP_BAND = _BAND_STYLE | {"facecolor": "#fbfbfb", "edgecolor": "#9a9a9a", "hatch": "/////"}
+GAP_BAND_STYLE = _BAND_STYLE | {"facecolor": "#fbfbfb", "edgecolor": "#9a9a9a", "hatch": "/////"}
 RESET_MARKER_STYLE = dot_style("#8a4508", 2, 6.0, 1.2)
 OUTLIER_MARKER_STYLE = dot_style("black", "x", 3.0, 0.7)
 TAKE_OFF_MARKER_STYLE, LANDING_MARKER_STYLE = (
@@ -50,10 +50,10 @@ def _make_event_markers(
     events = analysis.events
     return (
         EventMarkers("on the ground", events.ground_spans_s, ON_GROUND_BAND_STYLE),
-        EventMarkers("gap in position source", events.gaps, GAP_BAND),
+        EventMarkers("gap in position source", events.gaps, GAP_BAND_STYLE),
         EventMarkers("log dropout", events.dropouts, DROPOUT_BAND_STYLE),
         EventMarkers("EKF2 rejected", rejection_times_s, REJECTED_STYLE, 0.025),
-        EventMarkers("outlier", outlier_times(analysis), OUTLIER_MARKER_STYLE, 0.075),
+        EventMarkers("outlier", find_outlier_times(analysis), OUTLIER_MARKER_STYLE, 0.075),
         EventMarkers("EKF2 reset", events.reset_times_s, RESET_MARKER_STYLE, 0.92),
         EventMarkers("take-off", events.take_off_times_s, TAKE_OFF_MARKER_STYLE, 0.0),
         EventMarkers("landing", events.landing_times_s, LANDING_MARKER_STYLE, 0.0),
@@ -70,8 +70,10 @@ def draw_event_markers(axes: Axes, analysis: Analysis, *, axis: str | None = Non
 
     segment, x_transform = analysis.segment.flight, axes.get_xaxis_transform()
     axes.set_xlim(segment.start_s, segment.end_s)
-    name = analysis.main.axis.name if axis is None else axis
-    event_markers = _make_event_markers(analysis, analysis.events.rejection_times_s.get(name, ()))
+    axis_name = analysis.main.axis.name if axis is None else axis
+    event_markers = _make_event_markers(
+        analysis, analysis.events.rejection_times_s.get(axis_name, ())
+    )
     for order, (_, spans_or_times, style, height) in enumerate(event_markers, start=1):
         if not len(spans_or_times):
             continue
@@ -107,13 +109,13 @@ def add_panel(
     **options: Any,
 ) -> Axes:
     """Add a plot over time that also shows gaps, resets, rejections and outliers."""
-    axes = page.panel(title, height, **options)
+    axes = page.add_panel(title, height, **options)
     draw_event_markers(axes, analysis, axis=axis)
     label_time_axis(axes, with_time_label)
     return axes
 
 
-def outlier_times(analysis: Analysis) -> Array:
+def find_outlier_times(analysis: Analysis) -> Array:
     """Return the times (s) of the outliers found by noise estimation."""
     tunings = map(analysis.tuning.get, (HORIZONTAL, analysis.main.axis.name))
     times_s = [tuning.outlier_time_s for tuning in tunings if isinstance(tuning, AxisTuning)]
@@ -121,7 +123,7 @@ def outlier_times(analysis: Analysis) -> Array:
     return outlier_times_s
 
 
-def legend_entries(analysis: Analysis) -> list[Artist]:
+def make_legend_entries(analysis: Analysis) -> list[Artist]:
     """Return a legend entry for each type of event in this flight."""
     from matplotlib.lines import Line2D  # noqa: PLC0415
     from matplotlib.patches import Patch  # noqa: PLC0415
@@ -139,5 +141,7 @@ def legend_entries(analysis: Analysis) -> list[Artist]:
 def select_marker_times(times: Any, min_interval_s: float) -> Array:
     """Keep one time (s) per interval, so that drawn markers do not overlap."""
     times_s = np.asarray(times, dtype=np.float64)
-    visible_s: Array = times_s[np.unique(np.floor(times_s / min_interval_s), return_index=True)[1]]
-    return visible_s
+    kept_times_s: Array = times_s[
+        np.unique(np.floor(times_s / min_interval_s), return_index=True)[1]
+    ]
+    return kept_times_s

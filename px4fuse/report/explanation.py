@@ -11,13 +11,13 @@ def make_findings_list() -> Page:
     """List the ids and titles of all findings (detectable faults), by group."""
     page = Page()
     for group in FINDING_GROUPS:
-        page.heading(capitalise_first(group))
+        page.write_heading(capitalise_first(group))
         rows = [
             (name, finding.title)
             for name, finding in FINDING_CATALOGUE.items()
             if finding.group == group
         ]
-        page.table(("id", "finding"), rows)
+        page.add_table(("id", "finding"), rows)
     return page
 
 
@@ -43,10 +43,12 @@ def make_finding_page(finding_id: str) -> Page:
     if example.message:
         page.write_labelled("Example", example.message)
         page.write_labelled("Action", example.remedy)
-    for label, names in {"Causes": causes, "Effects": effect_ids(name)}.items():
-        if names:
-            page.write_labelled(label, ", ".join(names))
-    rate_sentences = ["False alarms and detection are not measured for this finding."]
+    for label, finding_ids in {"Causes": causes, "Effects": effect_ids(name)}.items():
+        if finding_ids:
+            page.write_labelled(label, ", ".join(finding_ids))
+    rate_sentences = [
+        "The rates of false alarms and of detection have not been measured for this finding."
+    ]
     if example.clean_flights:
         rate_texts = [f"{name}: {100.0 * rate:.0f} %" for name, rate in example.detection.items()]
         rate_sentences = [

@@ -13,7 +13,7 @@ from px4fuse.flight.model import Unavailable
 from px4fuse.report import panels, style
 from px4fuse.report.difference_page import describe_missing_explanation
 from px4fuse.report.page import COLUMN_GAP, PAGE_WIDTH, Page
-from px4fuse.report.phrases import list_verdict_warnings, statistics_by_filter
+from px4fuse.report.phrases import get_statistics_by_filter, list_verdict_warnings
 from px4fuse.report.style import EKF2_COLOUR, KF_COLOUR, Axes
 
 ZOOM_UPDATE_COUNT = 15  # number of updates in the enlarged plot of σ_p
@@ -45,7 +45,7 @@ def draw_innovations(analysis: Analysis, _: object) -> Iterator[Page]:
         panel.draw_on_page(page, analysis, result, with_time_label=is_last)
     _draw_zoom(page, analysis)
     for note in list_verdict_warnings(analysis):
-        page.write_small(note)
+        page.write_small_text(note)
     yield page
 
 
@@ -54,8 +54,8 @@ def _draw_zoom(page: Page, analysis: Analysis) -> None:
     result = analysis.main
     start_s, end_s = zoom_span_s = find_zoom_span(result, analysis.segment)
     title = f"σ of position (m), {end_s - start_s:.1f} s of the flight"
-    axes = page.panel(title, ZOOM_HEIGHT, caption=describe_sigma_at_updates(result))
-    _draw_sawtooth(axes, result, zoom_span_s)
+    axes = page.add_panel(title, ZOOM_HEIGHT, caption=describe_sigma_at_updates(result))
+    _draw_sigma_at_updates(axes, result, zoom_span_s)
     update_times_s = result.replay.updates.loc[start_s:end_s].index
     axes.vlines(
         update_times_s,
@@ -69,7 +69,7 @@ def _draw_zoom(page: Page, analysis: Analysis) -> None:
     ekf2_legend = ""
     if not isinstance(result.ekf2_state, Unavailable):
         ekf2_legend = " EKF2: ▵ before and ▾ after an update, □ logged σ."
-    page.write_small(f"The line is σ of KF; grey ticks mark measurements.{ekf2_legend}")
+    page.write_small_text(f"The line is σ of KF; grey ticks mark measurements.{ekf2_legend}")
 
 
 def find_zoom_span(result: AxisComparison, segment: Segment) -> Span:
@@ -89,7 +89,7 @@ def find_zoom_span(result: AxisComparison, segment: Segment) -> Span:
     return float(update_times_s[nearest_row]), float(update_times_s[nearest_row + update_count])
 
 
-def _draw_sawtooth(axes: Axes, result: AxisComparison, zoom_span_s: Span) -> None:
+def _draw_sigma_at_updates(axes: Axes, result: AxisComparison, zoom_span_s: Span) -> None:
     updates, steps = result.replay.updates, result.replay.steps
     variances_m2 = pd.concat([updates["prior_position_variance_m2"], steps["position_variance_m2"]])
     # a stable sort keeps the prior variance before the posterior variance of the same update
@@ -100,12 +100,12 @@ def _draw_sawtooth(axes: Axes, result: AxisComparison, zoom_span_s: Span) -> Non
         ekf2_updates = result.ekf2_innovations.loc[slice(*zoom_span_s)].dropna(
             subset=["prior_variance_m2"]
         )
-        sigma_before, sigma_after = (
+        prior_sigma_m, posterior_sigma_m = (
             np.sqrt(ekf2_updates[f"{side}_variance_m2"]) for side in ("prior", "posterior")
         )
-        axes.vlines(ekf2_updates.index, sigma_after, sigma_before, color=EKF2_COLOUR, lw=1.0)
-        axes.plot(sigma_before, **style.dot_style(EKF2_COLOUR, "^", 3.6, 0.7), mfc="none")
-        axes.plot(sigma_after, **style.dot_style(EKF2_COLOUR, "v", 3.6))
+        axes.vlines(ekf2_updates.index, posterior_sigma_m, prior_sigma_m, color=EKF2_COLOUR, lw=1.0)
+        axes.plot(prior_sigma_m, **style.dot_style(EKF2_COLOUR, "^", 3.6, 0.7), mfc="none")
+        axes.plot(posterior_sigma_m, **style.dot_style(EKF2_COLOUR, "v", 3.6))
     if isinstance(result.ekf2_variance, pd.DataFrame):
         variance_m2 = result.ekf2_variance["position_variance_m2"]
         logged_sigma = np.sqrt(variance_m2.loc[slice(*zoom_span_s)])
@@ -115,7 +115,7 @@ def _draw_sawtooth(axes: Axes, result: AxisComparison, zoom_span_s: Span) -> Non
 
 def describe_sigma_at_updates(result: AxisComparison) -> str:
     filter_texts = []
-    for name, filter_summary in statistics_by_filter(result).items():
+    for name, filter_summary in get_statistics_by_filter(result).items():
         prior_sigma_m = filter_summary.sigma_p_before_update_m
         posterior_sigma_m = filter_summary.sigma_p_after_update_m
         if prior_sigma_m is None or posterior_sigma_m is None:
@@ -124,16 +124,16 @@ def describe_sigma_at_updates(result: AxisComparison) -> str:
                     "σ of EKF2 before and after an update is unknown: S or R is not logged"
                 )
             continue
-        text = (
+        sigma_text = (
             f"{name}: σ from {prior_sigma_m:.3f} to {posterior_sigma_m:.3f} m by an update, "
             f"{1.0 - posterior_sigma_m**2 / prior_sigma_m**2:.0%} less variance"
         )
         if name == "KF":
-            text = (
+            sigma_text = (
                 f"σ grows in each prediction (SIGMA_A {result.replay.settings.sigma_a_m_s2:g} "
-                f"m/s²) and decreases with each measurement ({text})"
+                f"m/s²) and decreases with each measurement ({sigma_text})"
             )
-        filter_texts.append(text)
+        filter_texts.append(sigma_text)
     return f"{'; '.join(filter_texts)}." if filter_texts else ""
 
 
@@ -156,7 +156,7 @@ def draw_other_axes(analysis: Analysis, _: object) -> Iterator[Page]:
         columns = [Page(width=width) for _ in secondary_axes]
         for column, result in zip(columns, secondary_axes, strict=True):
             if panel is panels.POSITION_PANEL:
-                column.heading(result.axis.name)
+                column.write_heading(result.axis.name)
             panel.draw_on_page(
                 column,
                 analysis,

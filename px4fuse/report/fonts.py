@@ -13,27 +13,36 @@ from px4fuse.report.style import FONT
 
 # Words in the names of fonts that draw a box for every character
 PLACEHOLDER_FONT_WORDS = ("lastresort", "last resort", "blank", "notdef")
-NO_GLYPH = "\N{WHITE SQUARE}"
+MISSING_GLYPH_SYMBOL = "\N{WHITE SQUARE}"
 MAX_LISTED_CHARACTERS = 12
 
 
 @cache
 def find_font(character: str) -> str | None:
     """Return the name of an installed font with a character, preferably DejaVu Sans, or None."""
-    if ord(character) in _font_characters(font_manager.findfont(FONT)):
+    if ord(character) in _read_font_characters(font_manager.findfont(FONT)):
         return FONT
     return next(
-        (name for name, path in _other_fonts() if ord(character) in _font_characters(path)), None
+        (
+            name
+            for name, path in _list_fonts_except_dejavu()
+            if ord(character) in _read_font_characters(path)
+        ),
+        None,
     )
 
 
-def font_names(text: str) -> list[str]:
+def find_font_names(text: str) -> list[str]:
     """Return the names of the fonts for a text, DejaVu Sans first."""
     return list(dict.fromkeys([FONT, *filter(None, map(find_font, _find_non_ascii(text)))]))
 
 
 def find_font_folders(names: tuple[str, ...]) -> list[str]:
-    paths = {name: path for name, path in _other_fonts() if name in names} if len(names) > 1 else {}
+    paths = (
+        {name: path for name, path in _list_fonts_except_dejavu() if name in names}
+        if len(names) > 1
+        else {}
+    )
     font_files = [font_manager.findfont(FONT), *paths.values()]
     return list(dict.fromkeys(str(Path(str(path)).parent) for path in font_files))
 
@@ -48,9 +57,9 @@ def format_font_advice(characters: str) -> str:
         "…" if len(characters) > MAX_LISTED_CHARACTERS else ""
     )
     return (
-        f"No installed font has the characters {listed_characters}; the report shows {NO_GLYPH} "
-        "instead. Install a font with them, for example Noto Sans of their script "
-        "(fonts.google.com/noto)."
+        f"No installed font has the characters {listed_characters}; the report shows "
+        f"{MISSING_GLYPH_SYMBOL} instead. Install a font with them, for example Noto Sans of "
+        "their script (fonts.google.com/noto)."
     )
 
 
@@ -59,7 +68,7 @@ def _find_non_ascii(text: str) -> list[str]:
 
 
 @cache
-def _other_fonts() -> tuple[tuple[str, FontPath], ...]:
+def _list_fonts_except_dejavu() -> tuple[tuple[str, FontPath], ...]:
     """Return names and paths of installed fonts except DejaVu Sans, in order of preference."""
     manager = font_manager.fontManager
     known_paths = {str(entry.fname) for entry in manager.ttflist}
@@ -100,5 +109,5 @@ def _font_sort_key(entry: FontEntry) -> tuple[object, ...]:
 
 
 @cache
-def _font_characters(path: FontPath) -> frozenset[int]:
+def _read_font_characters(path: FontPath) -> frozenset[int]:
     return frozenset(font_manager.get_font(path).get_charmap())

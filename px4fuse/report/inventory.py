@@ -20,18 +20,20 @@ def make_log_page(inventory: Inventory, request: ComparisonRequest) -> Page:
     for label, text in _describe_log(inventory):
         page.write_labelled(label, text)
     if inventory.flight.log.senders:
-        page.table(
+        page.add_table(
             ("sender", "type", "messages", "lost"),
-            _sender_rows(inventory),
+            _make_sender_rows(inventory),
             right_aligned_columns=(2, 3),
         )
-    page.table(SOURCES_HEAD, list(_source_rows(inventory)), right_aligned_columns=(2, 3, 4, 5))
-    possible_cells = {True: ("yes", GOOD_COLOUR), False: ("no", SEVERITY_COLOURS["warning"])}
+    page.add_table(
+        SOURCES_HEAD, list(_make_source_rows(inventory)), right_aligned_columns=(2, 3, 4, 5)
+    )
+    cell_by_possibility = {True: ("yes", GOOD_COLOUR), False: ("no", SEVERITY_COLOURS["warning"])}
     rows = [
-        (possible_cells[option.possible], option.name, option.reason)
+        (cell_by_possibility[option.possible], option.name, option.reason)
         for option in inventory.abilities
     ]
-    page.table(("possible", "analysis", ""), rows)
+    page.add_table(("possible", "analysis", ""), rows)
     if inventory.abilities[0].possible:  # comparison of KF and EKF2
         command = command_line(request, "compare", for_shell=True)
         page.add("command", text=command, label="Run")
@@ -39,7 +41,7 @@ def make_log_page(inventory: Inventory, request: ComparisonRequest) -> Page:
         "Action": [
             f"{advice.remedy} ({'; '.join(advice.improves)})" for advice in inventory.advice
         ],
-        "Clocks": _clock_lines(inventory),
+        "Clocks": _format_clock_lines(inventory),
         "Not used": [
             f"{topic.name}, {topic.count} messages: {topic.reason}"
             for topic in inventory.flight.unused
@@ -63,17 +65,18 @@ def _describe_log(inventory: Inventory) -> list[tuple[str, str]]:
     labelled_texts = [
         ("Log", f"{log.format}, {size_text}, SHA-256 {log.sha256[:12]}"),
         ("Vehicle", f"{firmware_text}{git_text}, {hardware_text}"),
-        ("Data", f"{_duration_text(log.duration_s)}, {_start_text(inventory)}"),
-        ("Airborne", _airborne_text(inventory)),
+        ("Data", f"{_format_duration(log.duration_s)}, {_format_start(inventory)}"),
+        ("Airborne", _format_airborne_spans(inventory)),
     ]
     if log.dropouts:
-        lost_s = sum(dropout.duration_s for dropout in log.dropouts)
-        longest_s = max(dropout.duration_s for dropout in log.dropouts)
+        dropout_total_s = sum(dropout.duration_s for dropout in log.dropouts)
+        longest_dropout_s = max(dropout.duration_s for dropout in log.dropouts)
         dropout_count = len(log.dropouts)
-        text = (
-            f"{dropout_count} logger dropouts of {lost_s:.2f} s in total, at most {longest_s:.2f} s"
+        dropouts_text = (
+            f"{dropout_count} logger dropouts of {dropout_total_s:.2f} s in total, at most "
+            f"{longest_dropout_s:.2f} s"
         )
-        labelled_texts.append(("Dropouts", text))
+        labelled_texts.append(("Dropouts", dropouts_text))
     labelled_texts += [
         (file.role.capitalize(), f"{file.name}, SHA-256 {file.sha256[:12]}")
         for file in inventory.flight.inputs
@@ -81,20 +84,20 @@ def _describe_log(inventory: Inventory) -> list[tuple[str, str]]:
     return labelled_texts
 
 
-def _duration_text(seconds: float) -> str:
+def _format_duration(seconds: float) -> str:
     if not seconds:
         return "all samples have the same timestamp"
     return f"{seconds:.{1 if seconds >= 1 else 3}f} s"
 
 
-def _start_text(inventory: Inventory) -> str:
+def _format_start(inventory: Inventory) -> str:
     if inventory.start_utc is None:
         boot_time_s = inventory.flight.log.boot_time_s
         return f"the data start {boot_time_s:.1f} s after boot (the log contains no UTC)"
     return f"the data start at {inventory.start_utc[:19].replace('T', ' ')} UTC"
 
 
-def _airborne_text(inventory: Inventory) -> str:
+def _format_airborne_spans(inventory: Inventory) -> str:
     airborne_spans = inventory.flight.airborne
     if isinstance(airborne_spans, Unavailable):
         return "unknown (the log contains no land detector)"
@@ -104,7 +107,7 @@ def _airborne_text(inventory: Inventory) -> str:
     return join_first(span_texts, 3)
 
 
-def _sender_rows(inventory: Inventory) -> list[tuple[str, ...]]:
+def _make_sender_rows(inventory: Inventory) -> list[tuple[str, ...]]:
     return [
         (
             f"{sender.system}/{sender.component}",
@@ -116,11 +119,11 @@ def _sender_rows(inventory: Inventory) -> list[tuple[str, ...]]:
     ]
 
 
-def _source_rows(inventory: Inventory) -> Iterator[tuple[Cell, ...]]:
-    previous_part = ""
+def _make_source_rows(inventory: Inventory) -> Iterator[tuple[Cell, ...]]:
+    previous_data_type = ""
     for source in inventory.sources:
-        data_type = source.part if source.part != previous_part else ""
-        previous_part = source.part
+        data_type = source.part if source.part != previous_data_type else ""
+        previous_data_type = source.part
         if source.unavailable:
             # another table contains the reason for the missing data
             yield (data_type, ("none", MUTED_COLOUR), *("" for _ in SOURCES_HEAD[2:]))
@@ -129,33 +132,33 @@ def _source_rows(inventory: Inventory) -> Iterator[tuple[Cell, ...]]:
             f"{data_type:8} (used)" if source.chosen else data_type,
             source.name,
             "" if source.samples is None else f"{source.samples}",
-            "" if source.rate_hz is None else _format_narrow(source.rate_hz),
-            _gaps_text(source),
-            _span_text(source),
+            "" if source.rate_hz is None else _format_for_narrow_column(source.rate_hz),
+            _format_gaps(source),
+            _format_time_span(source),
         )
 
 
-def _gaps_text(source: LoggedData) -> str:
+def _format_gaps(source: LoggedData) -> str:
     if source.gaps is None:
         return ""
     if not source.gaps.count:
         return "0"
-    return f"{source.gaps.count} ({_format_narrow(source.gaps.longest_s)} s)"
+    return f"{source.gaps.count} ({_format_for_narrow_column(source.gaps.longest_s)} s)"
 
 
-def _format_narrow(value: float) -> str:
+def _format_for_narrow_column(value: float) -> str:
     """Format a rate (Hz) or time (s) with two or more digits, for a narrow column."""
     return f"{value:.{2 if value < 1 else 1 if value < 10 else 0}f}"
 
 
-def _span_text(source: LoggedData) -> str:
+def _format_time_span(source: LoggedData) -> str:
     if source.start_s is None or source.end_s is None:
         return ""
     digits = 1 if source.end_s < 10 else 0
     return f"{source.start_s:z.{digits}f} to {source.end_s:z.{digits}f}"
 
 
-def _clock_lines(inventory: Inventory) -> list[str]:
+def _format_clock_lines(inventory: Inventory) -> list[str]:
     names_by_clock: dict[str, dict[str, None]] = {}
     for source in inventory.sources:
         if source.clock:

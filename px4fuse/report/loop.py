@@ -12,7 +12,7 @@ from px4fuse.loop import corrections
 from px4fuse.loop.analysis import MIN_UNIX_TIME_S
 from px4fuse.loop.model import LANDING_CLOSURE_SOURCE, Closure, Loop
 from px4fuse.report.evaluation import describe_method, format_interval, plot_path
-from px4fuse.report.page import Cell, Page, appendix_title
+from px4fuse.report.page import Cell, Page, make_appendix_title
 from px4fuse.report.phrases import format_student, write_findings
 from px4fuse.report.style import (
     EKF2_COLOUR,
@@ -26,7 +26,7 @@ from px4fuse.report.style import (
 from px4fuse.results.contract import LoopResults
 from px4fuse.trajectory.evaluation import Evaluation
 from px4fuse.trajectory.graph.covariance import GATE_ALPHA
-from px4fuse.trajectory.graph.solver import MAX_GNC_CLOSURES, SOLUTIONS, Graph
+from px4fuse.trajectory.graph.solver import MAX_GNC_CLOSURES, SOLUTION_LABELS, Graph
 from px4fuse.trajectory.model import AXES_OF_FRAME, format_vector
 from px4fuse.trajectory.scores import RmseInterval, Statistics
 
@@ -41,10 +41,10 @@ PATH_STYLES = {
     corrections.UNCORRECTED_LABEL: TRACK_STYLES["EKF2"],
     corrections.POSITIONS_CORRECTED_LABEL: line_style("#79b294", 1.3, (0, (1.2, 1.2))),
     corrections.HEADINGS_CORRECTED_LABEL: line_style("#3a7d5c", 1.0, (0, (6, 1.2, 1, 1.2))),
-    SOLUTIONS["gated"]: line_style(KF_COLOUR, 1.2),
-    SOLUTIONS["all"]: line_style("#8d6a9f", 0.9, (0, (2, 1))),
+    SOLUTION_LABELS["gated"]: line_style(KF_COLOUR, 1.2),
+    SOLUTION_LABELS["all"]: line_style("#8d6a9f", 0.9, (0, (2, 1))),
 }
-TRACK_KINDS = {
+TRACK_TEXT_BY_KIND = {
     "vio": "odometry (external vision)",
     "ekf2": "EKF2 track",
     "kf": "KF track",
@@ -59,7 +59,7 @@ MAP_HEIGHT = 290.0  # height (points) of the axes of the map
 def draw_pages(analysis: Analysis, _: object) -> Iterator[Page]:
     """Draw the appendix on loop closure if the flight contains a loop."""
     if isinstance(analysis.loop, Loop):
-        page = Page(appendix_title(TITLE), LEAD_TEXT)
+        page = Page(make_appendix_title(TITLE), LEAD_TEXT)
         _write_page(page, analysis.loop)
         yield page
 
@@ -77,11 +77,11 @@ def draw_report(loop: Loop, results: LoopResults) -> Iterator[Page]:
 
 def _write_page(page: Page, loop: Loop) -> None:
     write_loop(page, loop)
-    axes = page.panel("Map in the frame of the odometry", MAP_HEIGHT, left=36.0)
+    axes = page.add_panel("Map in the frame of the odometry", MAP_HEIGHT, left=36.0)
     draw_map(axes, loop)
-    page.legend(axes.get_legend_handles_labels()[0])
-    page.heading("Loop closures and RPE")
-    page.write_small(
+    page.add_legend(axes.get_legend_handles_labels()[0])
+    page.write_heading("Loop closures and RPE")
+    page.write_small_text(
         "d²: squared Mahalanobis distance of the closure error, from drift and closure "
         "noise. p: probability of a larger d² for a true closure. GNC weight: "
         "1 if the closure is used, 0 if it is excluded."
@@ -128,7 +128,7 @@ def _draw_reference(axes: Axes, loop: Loop) -> None:
             plot_path(axes, reference_m, evaluation.time_s, label=reference.name, zorder=4, **line)
 
 
-def loop_page(loop: Loop, findings: tuple[Finding, ...]) -> Page:
+def make_loop_page(loop: Loop, findings: tuple[Finding, ...]) -> Page:
     """Make the terminal output on a loop: closure error, corrected paths and detected faults."""
     page = Page()
     write_loop(page, loop)
@@ -141,23 +141,23 @@ def write_loop(page: Page, loop: Loop) -> None:
     """Write the closure error, the test of the closure, and the ATE of each corrected path."""
     odometry = loop.odometry.trajectory
     true_end = loop.true_end
-    texts = {
-        "Track": f"{odometry.name}: {TRACK_KINDS[odometry.kind]}, {len(odometry)} poses, "
+    text_by_label = {
+        "Track": f"{odometry.name}: {TRACK_TEXT_BY_KIND[odometry.kind]}, {len(odometry)} poses, "
         f"{loop.key_frames} key frames, spacing {loop.key_frame_spacing_m:.2g} m",
         "Segment": f"{_format_span(loop)}, {loop.part_reason}",
         "Closure": describe_closure_error(loop),
         "True end": "not used" if isinstance(true_end, Unavailable) else true_end.source,
     }
     for closure in loop.closures[:1]:
-        texts["Gate"] = describe_gate(closure)
-    page.write_labelled_texts(texts)
-    for note in (correction_by_distance_sentence(loop), *list_missing_corrections(loop)):
-        page.write_small(note)
-    names = [reference.name for reference in loop.references]
+        text_by_label["Gate"] = describe_gate(closure)
+    page.write_labelled_texts(text_by_label)
+    for note in (explain_distance_correction(loop), *list_missing_corrections(loop)):
+        page.write_small_text(note)
+    reference_names = [reference.name for reference in loop.references]
     head = [
         "path",
         "position correction\nRMS / max (m)",
-        *(f"ATE against\n{name} (m)" for name in names),
+        *(f"ATE against\n{reference_name} (m)" for reference_name in reference_names),
     ]
     rows = []
     for path in loop.select_reported_paths():
@@ -166,16 +166,16 @@ def write_loop(page: Page, loop: Loop) -> None:
             correction_text = f"{path.correction_rms_m:.2f} / {path.correction_max_m:.2f}"
         ate_texts = [
             _format_error(evaluation.ate.translation_m, evaluation.ate.interval_m)
-            if isinstance(evaluation := path.scores[name], Evaluation)
+            if isinstance(evaluation := path.scores[reference_name], Evaluation)
             else "–"
-            for name in names
+            for reference_name in reference_names
         ]
         rows.append([path.name, correction_text, *ate_texts])
-    page.table(head, rows)
-    page.write_small(
+    page.add_table(head, rows)
+    page.write_small_text(
         "ATE: position RMSE after alignment, with its 95 % interval (block bootstrap) if the "
         "flight is long enough."
-        if names
+        if reference_names
         else "The error of the path is unknown without ground truth or reference trajectory. Add a "
         "reference trajectory with --reference FILE."
     )
@@ -198,9 +198,9 @@ def write_closures_and_rpe(page: Page, loop: Loop) -> None:
         rows.append([(cell, colour) for cell in cells])
     if rows:
         head = ["closure", "distance\n(m)", "d²", "degrees of\nfreedom", "p", "gate", "GNC\nweight"]
-        page.table(head, rows, right_aligned_columns=(1, 2, 3, 4, 6))
+        page.add_table(head, rows, right_aligned_columns=(1, 2, 3, 4, 6))
     for reference in loop.references:
-        page.heading(f"RPE against {reference.name}")
+        page.write_heading(f"RPE against {reference.name}")
         evaluations, reasons = dict[str, Evaluation](), dict[str, None]()
         for path in loop.select_reported_paths():
             evaluation = path.scores[reference.name]
@@ -220,9 +220,9 @@ def write_closures_and_rpe(page: Page, loop: Loop) -> None:
         ]
         for evaluation in [*evaluations.values()][:1]:
             delta_headings = [f"{error.delta_text} (m)" for error in evaluation.rpe]
-            page.table(["path", *delta_headings, "rotation (°)"], rows)
+            page.add_table(["path", *delta_headings, "rotation (°)"], rows)
             for text in (describe_method(evaluation), *evaluation.notes, *evaluation.warnings):
-                page.write_small(capitalise_first(text))
+                page.write_small_text(capitalise_first(text))
 
 
 def _format_span(loop: Loop) -> str:
@@ -239,15 +239,17 @@ def describe_closure_error(loop: Loop) -> str:
             return (
                 f"error hidden, because the flight is an assignment; path length {length_m:.1f} m"
             )
-        return f"none: with --open, the path of {length_m:.1f} m does not return to its start"
-    text = (
+        return (
+            f"not computed, because --open states that the path ({length_m:.1f} m) has an open end"
+        )
+    error_text = (
         f"{error_m:.2f} m after {length_m:.1f} m ({error_m / length_m:.2%}): "
         f"{format_vector(error_components_m)}"
     )
-    heading_deg = loop.heading_error_deg
-    if isinstance(heading_deg, Unavailable):
-        return f"{text}; heading error unknown: {heading_deg.reason}"
-    return f"{text}; heading error {heading_deg:+.1f}°"
+    heading_error_deg = loop.heading_error_deg
+    if isinstance(heading_error_deg, Unavailable):
+        return f"{error_text}; the heading error is unknown: {heading_error_deg.reason}"
+    return f"{error_text}; heading error {heading_error_deg:+.1f}°"
 
 
 def describe_gate(closure: Closure) -> str:
@@ -268,16 +270,16 @@ def format_closure_times(closure: Closure, loop: Loop) -> str:
     return f"{closure.time_1_s - time_origin_s:.2f} s and {closure.time_2_s - time_origin_s:.2f} s"
 
 
-def correction_by_distance_sentence(loop: Loop) -> str:
+def explain_distance_correction(loop: Loop) -> str:
     """Explain the correction of the path in proportion to distance; "" if it was not made."""
     if "by_distance_plain" not in loop.find_paths():
         return ""
-    heading_deg = loop.heading_error_deg
+    heading_error_deg = loop.heading_error_deg
     heading_sentence = (
         "The correction with headings also distributes the heading error along the path."
     )
-    if isinstance(heading_deg, Unavailable):
-        heading_sentence = f"The headings are not corrected: {heading_deg.reason}."
+    if isinstance(heading_error_deg, Unavailable):
+        heading_sentence = f"The headings are not corrected: {heading_error_deg.reason}."
     return (
         "The correction by distance shifts each position by a part of the closure error that is "
         "proportional to its distance from the start (lesson UAT 366, module 2, Example 2). "
@@ -303,7 +305,7 @@ def _format_rmse(statistics: Statistics | Unavailable, digits: int = 3) -> str:
     return f"{statistics.rmse:.{digits}f}" if isinstance(statistics, Statistics) else "–"
 
 
-def pose_graph_page(solved_graph: Graph) -> Page:
+def make_pose_graph_page(solved_graph: Graph) -> Page:
     """Make the terminal output on a pose graph: tested closures, solver and costs."""
     page, gates = Page(), solved_graph.gates
     page.write_labelled(
@@ -311,11 +313,11 @@ def pose_graph_page(solved_graph: Graph) -> Page:
         f"{solved_graph.name}: {solved_graph.dimension}-D, {solved_graph.poses} poses, "
         f"{solved_graph.edges} edges; initial poses: {solved_graph.initialised}",
     )
-    low, high = solved_graph.reduced_chi2_interval
-    if high > 0.0:
+    expected_low, expected_high = solved_graph.reduced_chi2_interval
+    if expected_high > 0.0:
         fit_text = (
             f"χ² per degree of freedom {format_number(solved_graph.reduced_chi2)} (95 % "
-            f"{format_number(low)} to {format_number(high)} expected)"
+            f"{format_number(expected_low)} to {format_number(expected_high)} expected)"
         )
         if (factor := solved_graph.information_factor) > 1.0:
             fit_text += (
@@ -323,10 +325,12 @@ def pose_graph_page(solved_graph: Graph) -> Page:
                 f"{format_number(factor, 2)} times too large. Gate and robust optimisation use "
                 "the information divided by this factor."
             )
-        elif solved_graph.reduced_chi2 > high:
-            fit_text += ". Possible causes: false closures, or too large information matrices."
-        elif solved_graph.reduced_chi2 < low:
-            fit_text += ": the information matrices are too small, so the gate is too wide."
+        elif solved_graph.reduced_chi2 > expected_high:
+            fit_text += (
+                ": too large. Possible causes: false closures, or too large information matrices."
+            )
+        elif solved_graph.reduced_chi2 < expected_low:
+            fit_text += ": too small information matrices, so the gate may accept false closures."
         page.write_labelled("Fit", fit_text)
     if isinstance(gates, Unavailable):
         page.write_labelled("Gate", f"not applied: {gates.reason}")
@@ -349,15 +353,17 @@ def pose_graph_page(solved_graph: Graph) -> Page:
     unconverged_solutions, rows = [], []
     for key, solution in solved_graph.solutions.items():
         if not solution.converged:
-            unconverged_solutions.append(SOLUTIONS[key])
+            unconverged_solutions.append(SOLUTION_LABELS[key])
         cost_texts = [f"{cost:.6g}" for cost in (solution.cost_initial, solution.cost)]
         dropped_count_text = "" if key == "all" else f"{solution.dropped}"
-        rows.append([SOLUTIONS[key], *cost_texts, f"{solution.iterations}", dropped_count_text])
+        rows.append(
+            [SOLUTION_LABELS[key], *cost_texts, f"{solution.iterations}", dropped_count_text]
+        )
     if unconverged_solutions:
         page.write_labelled(
             "Solver",
             f"not converged: {', '.join(unconverged_solutions)}. The cost is not at its minimum.",
         )
     head = ("path", "initial cost", "final cost", "iterations", "dropped closures")
-    page.table(head, rows, right_aligned_columns=(1, 2, 3, 4))
+    page.add_table(head, rows, right_aligned_columns=(1, 2, 3, 4))
     return page

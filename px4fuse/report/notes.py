@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING
 from px4fuse.analysis import Analysis
 from px4fuse.errors import SettingsError
 from px4fuse.report.cover import FlightResults
-from px4fuse.report.page import Page, appendix_title
+from px4fuse.report.page import Page, make_appendix_title
 from px4fuse.report.style import MUTED_COLOUR
 from px4fuse.results.answer_form import Answers, form_rows
 from px4fuse.results.contract import LoopResults
@@ -22,7 +22,7 @@ if TYPE_CHECKING:
     from markdown_it.token import Token
     from markdown_it.tree import SyntaxTreeNode
 
-HEADING_SIZES = {"h1": 12.0, "h2": 10.8, "h3": 9.6}
+HEADING_FONT_SIZES = {"h1": 12.0, "h2": 10.8, "h3": 9.6}
 INDENT = 12.0  # indent (points) of each list level
 MAX_INDENTS = 8  # maximum number of drawn list levels; deeper levels are not indented further
 # Maximum depth of nested Markdown: each level needs three levels of Python's stack of 1000
@@ -30,14 +30,14 @@ MAX_NESTING_DEPTH = 100
 TAG_PATTERN = re.compile(r"<!--.*?-->|<[^>]*>", re.DOTALL)
 
 
-def draw_pages(subject: object, results: FlightResults | LoopResults) -> Iterator[Page]:
-    """Draw the student's answers to an assignment and the student's notes, if there are any."""
+def draw_pages(analysed_item: object, results: FlightResults | LoopResults) -> Iterator[Page]:
+    """Yield a page with the student's answers and notes, or nothing if there are none."""
     title, answers = "Student notes", results.student.answers
-    page = Page(appendix_title(title) if isinstance(subject, Analysis) else title)
+    page = Page(make_appendix_title(title) if isinstance(analysed_item, Analysis) else title)
     if isinstance(answers, Answers):
-        page.heading("Answer form")
+        page.write_heading("Answer form")
         rows = [list(row) for row in form_rows(answers)]
-        page.table(("Question", "Answer"), rows, column_widths=[3.0, 4.0])
+        page.add_table(("Question", "Answer"), rows, column_widths=[3.0, 4.0])
     write_markdown(page, results.student.notes)
     if len(page.blocks) > 1:
         yield page
@@ -67,8 +67,8 @@ def parse_markdown(notes: str, name: str = "the notes") -> list[Token]:
     # imported here, because reports without notes do not need it (20 ms)
     from markdown_it import MarkdownIt  # noqa: PLC0415
 
-    markdown = MarkdownIt("commonmark", {"html": True}).enable(["table", "strikethrough"])
-    tokens = markdown.parse(notes)
+    markdown_parser = MarkdownIt("commonmark", {"html": True}).enable(["table", "strikethrough"])
+    tokens = markdown_parser.parse(notes)
     all_tokens = (
         nested_token for token in tokens for nested_token in (token, *(token.children or ()))
     )
@@ -91,7 +91,7 @@ def _write_blocks(page: Page, node: SyntaxTreeNode, indent_level: int, marker: s
     for child in children:
         match child.type:
             case "heading":
-                size = HEADING_SIZES.get(child.tag, 8.0)
+                size = HEADING_FONT_SIZES.get(child.tag, 8.0)
                 page.write(_inline_text(child), size=size, bold=True, indent=indent, gap_above=6.0)
             case "bullet_list" | "ordered_list":
                 first_number = int(child.attrs.get("start", 1))
@@ -106,7 +106,7 @@ def _write_blocks(page: Page, node: SyntaxTreeNode, indent_level: int, marker: s
             case "table":
                 rows = [row.children for section in child.children for row in section.children]
                 head, *body_rows = ([_inline_text(cell) for cell in row] for row in rows)
-                page.table(head, body_rows, column_widths=[1.0] * len(head))
+                page.add_table(head, body_rows, column_widths=[1.0] * len(head))
             case "html_block":
                 page.write(TAG_PATTERN.sub("", child.content).strip(), indent=indent)
             case _:  # paragraph; a horizontal rule, which has no text, is omitted

@@ -23,25 +23,25 @@ LEGEND_LINE_HEIGHT = 12.0  # height (points) of one line of a legend
 LEGEND_HANDLE_WIDTH = 30.0  # width (points) of the line sample and the gaps of a legend entry
 TICKS_HEIGHT = 12.0  # height (points) of the tick labels below the axes
 AXIS_LABEL_HEIGHT = 12.5  # height (points) of the axis label below the tick labels
-UNLABELLED_HEIGHT = 3.0  # height (points) below axes without tick labels
+UNLABELLED_HEIGHT = 3.0  # free height (points) below axes without tick labels
 # Characters that are printed although str.isprintable is False for them
-ALLOWED_CHARACTERS = "\n\N{NO-BREAK SPACE}"
+PRINTED_SPECIAL_CHARACTERS = "\n\N{NO-BREAK SPACE}"
 # Words of at least 500 characters are split, because PDF/A limits strings to 32,767 characters
-LONG_WORD = re.compile(r"[^ \n]{100}(?=[^ \n]{400})")
-Block = dict[str, Any]
+LONG_WORD_PATTERN = re.compile(r"[^ \n]{100}(?=[^ \n]{400})")
+PageBlock = dict[str, Any]
 Cell = str | tuple[str, str]
 
 
 class Page:
-    """Blocks of a section of a report, which may need several sheets, or of one column."""
+    """Blocks (texts, plots, tables) of a section or of a column of a report."""
 
-    def __init__(self, title: str = "", lead: str = "", *, width: float = PAGE_WIDTH) -> None:
-        self.blocks: list[Block] = []
+    def __init__(self, title: str = "", lead_text: str = "", *, width: float = PAGE_WIDTH) -> None:
+        self.blocks: list[PageBlock] = []
         self.width = width
         if title:
-            self.add("title", text=title, lead=lead)
+            self.add("title", text=title, lead=lead_text)
 
-    def add(self, kind: str, **fields: Any) -> Block:
+    def add(self, kind: str, **fields: Any) -> PageBlock:
         """Add a block of a kind that ``report.typ`` defines, and return it."""
         self.blocks.append({"kind": kind, **fields})
         return self.blocks[-1]
@@ -62,30 +62,36 @@ class Page:
             block = styled_text(text, size, colour, bold)
             self.add("text", above=gap_above, indent=indent, mark=marker, **block)
 
-    def heading(self, text: str) -> None:
+    def write_heading(self, text: str) -> None:
         self.add("heading", **styled_text(text, 9.5, bold=True))
 
-    def write_small(self, text: str) -> None:
+    def write_small_text(self, text: str) -> None:
         self.write(text, colour=MUTED_COLOUR, gap_above=-1.0)
 
     def write_labelled(
         self,
         label: str,
-        *texts: str | Block,
-        width: float = LABEL_WIDTH,
+        *texts: str | PageBlock,
+        label_width: float = LABEL_WIDTH,
         gap_above: float = 0.0,
         colour: str = "black",
         bold: bool = True,
     ) -> None:
         styled_texts = [styled_text(text) if isinstance(text, str) else text for text in texts]
         styled_label = styled_text(label, 8.0, colour, bold)
-        self.add("labelled", label=styled_label, texts=styled_texts, width=width, above=gap_above)
+        self.add(
+            "labelled",
+            label=styled_label,
+            texts=styled_texts,
+            width=label_width,
+            above=gap_above,
+        )
 
     def write_labelled_texts(self, texts: Mapping[str, str]) -> None:
         for label, text in texts.items():
             self.write_labelled(label, text)
 
-    def table(
+    def add_table(
         self,
         head: Sequence[str],
         rows: Sequence[Sequence[Cell]],
@@ -107,7 +113,7 @@ class Page:
         right, widths = right_aligned_columns, column_widths
         self.add("table", head=head, rows=rows, column_widths=widths, right=right)
 
-    def panel(
+    def add_panel(
         self,
         title: str,
         height: float,
@@ -143,13 +149,13 @@ class Page:
         _place_axes(block)
         return axes
 
-    def legend(self, entries: Iterable[Artist]) -> Block:
+    def add_legend(self, entries: Iterable[Artist]) -> PageBlock:
         from matplotlib.figure import Figure  # noqa: PLC0415
 
         rows: list[list[Artist]] = [[]]
         used_width = 0.0
         for entry in entries:
-            width = text_width(str(entry.get_label())) + LEGEND_HANDLE_WIDTH
+            width = measure_text_width(str(entry.get_label())) + LEGEND_HANDLE_WIDTH
             if rows[-1] and used_width + width > self.width:
                 rows.append([])
                 used_width = 0.0
@@ -179,20 +185,22 @@ class Page:
         self.add("columns", columns=blocks, widths=widths, gap=COLUMN_GAP, above=gap_above)
 
 
-def two_columns(left_fraction: float = 0.5) -> tuple[Page, Page]:
+def make_two_columns(left_fraction: float = 0.5) -> tuple[Page, Page]:
     """Return a left and a right column that fill the page."""
     free_width = PAGE_WIDTH - COLUMN_GAP
     return Page(width=left_fraction * free_width), Page(width=(1.0 - left_fraction) * free_width)
 
 
-def styled_text(text: str, size: float = 8.0, colour: str = "black", bold: bool = False) -> Block:
+def styled_text(
+    text: str, size: float = 8.0, colour: str = "black", bold: bool = False
+) -> PageBlock:
     """Return a text with its size (points), colour and weight."""
     return {"text": text, "size": size, "colour": colour, "weight": "bold" if bold else "regular"}
 
 
-def text_width(text: str) -> float:
+def measure_text_width(text: str) -> float:
     """Return the width (points) of a text in DejaVu Sans of 8 points."""
-    from matplotlib import font_manager  # noqa: PLC0415 - as in :meth:`Page.panel`
+    from matplotlib import font_manager  # noqa: PLC0415 - as in :meth:`Page.add_panel`
 
     font = font_manager.get_font(font_manager.findfont(FONT))
     # measured at a large font size, because widths are rounded to whole points
@@ -201,21 +209,21 @@ def text_width(text: str) -> float:
     return float(font.get_width_height()[0]) / 64.0 * 0.08
 
 
-def line_count(text: str, width: float) -> int:
+def count_wrapped_lines(text: str, width: float) -> int:
     """Return the number of lines of a text that wraps at a width (points)."""
     lines, used_width = 1, 0.0
     for word in text.split(" "):
-        word_width = text_width(f"{word} ")
-        if used_width and used_width + text_width(word) > width:
+        word_width = measure_text_width(f"{word} ")
+        if used_width and used_width + measure_text_width(word) > width:
             lines, used_width = lines + 1, 0.0
         used_width += word_width
     return lines
 
 
-def appendix_title(title: str) -> str:
+def make_appendix_title(title: str) -> str:
     """Return the title of an appendix page.
 
-    >>> appendix_title("Notes by the student")
+    >>> make_appendix_title("Notes by the student")
     'Appendix: notes by the student'
     """
     return f"Appendix: {title[0].lower()}{title[1:]}"
@@ -235,14 +243,14 @@ def draw_legend_above(axes: Axes) -> None:
 
 def replace_unprintable(text: str) -> str:
     """Remove control characters, split long words, and replace characters without a font by □."""
-    from px4fuse.report import fonts  # noqa: PLC0415 - as in :meth:`Page.panel`
+    from px4fuse.report import fonts  # noqa: PLC0415 - as in :meth:`Page.add_panel`
 
     return "".join(
         character
-        if character in ALLOWED_CHARACTERS or fonts.find_font(character)
-        else fonts.NO_GLYPH
-        for character in LONG_WORD.sub(r"\g<0>\n", text.expandtabs(4))
-        if character in ALLOWED_CHARACTERS or character.isprintable()
+        if character in PRINTED_SPECIAL_CHARACTERS or fonts.find_font(character)
+        else fonts.MISSING_GLYPH_SYMBOL
+        for character in LONG_WORD_PATTERN.sub(r"\g<0>\n", text.expandtabs(4))
+        if character in PRINTED_SPECIAL_CHARACTERS or character.isprintable()
     )
 
 
@@ -256,16 +264,16 @@ def to_typst_data(block: Any, log: str) -> Any:
             for name, value in block.items()
             if name not in ("figure", "axes")
         }
-        return fields | ({"svg": _figure_svg(block)} if "figure" in block else {})
+        return fields | ({"svg": _render_figure_svg(block)} if "figure" in block else {})
     if isinstance(block, Sequence):
         return [to_typst_data(item, log) for item in block]
     return block
 
 
-def _figure_svg(block: Mapping[str, Any]) -> str:
+def _render_figure_svg(block: Mapping[str, Any]) -> str:
     if "axes" in block:
         _place_axes(block)
-        replace_ticks(block["axes"], text_width)
+        replace_ticks(block["axes"], measure_text_width)
     buffer = io.StringIO()
     block["figure"].savefig(buffer, format="svg", metadata={"Date": None, "Creator": None})
     return buffer.getvalue()

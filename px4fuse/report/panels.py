@@ -14,8 +14,8 @@ from px4fuse.comparison.model import AxisComparison, Difference
 from px4fuse.filter.consistency import Consistency
 from px4fuse.flight.model import Unavailable
 from px4fuse.report import event_marks, style
-from px4fuse.report.page import Block, Page
-from px4fuse.report.phrases import format_verdict, statistics_by_filter
+from px4fuse.report.page import Page, PageBlock
+from px4fuse.report.phrases import format_verdict, get_statistics_by_filter
 from px4fuse.report.style import (
     INNOVATION_STYLES,
     TRACK_STYLES,
@@ -26,14 +26,14 @@ from px4fuse.report.style import (
     set_log_scale,
 )
 
-NARROW_HEIGHT = 72.0  # height (points) of the axes in narrow columns
+NARROW_AXES_HEIGHT = 72.0  # height (points) of the axes in narrow columns
 # Ratio of the axis limit to the largest innovation in a plot of innovations
 INNOVATION_AXIS_MARGIN_FACTOR = 1.3
 # The axis of an innovation plot grows to show innovations up to this multiple of the median √S
 MAX_INNOVATION_LIMIT_SIGMAS = 5.0
 
 
-class Quantity(NamedTuple):
+class QuantityColumns(NamedTuple):
     """Position or velocity: unit, and names of its table columns and statistics."""
 
     unit: str
@@ -43,10 +43,10 @@ class Quantity(NamedTuple):
     median_sigma_field: str
 
 
-POSITION_QUANTITY = Quantity(
+POSITION_QUANTITY = QuantityColumns(
     "m", "position_m", "position_variance_m2", "position_rmse_m", "sigma_p_median_m"
 )
-VELOCITY_QUANTITY = Quantity(
+VELOCITY_QUANTITY = QuantityColumns(
     "m/s", "velocity_m_s", "velocity_variance_m2_s2", "velocity_rmse_m_s", "sigma_v_median_m_s"
 )
 
@@ -70,7 +70,7 @@ class Panel(NamedTuple):
         is_narrow: bool = False,
     ) -> None:
         """Draw the plot on a page; a narrow plot has no caption."""
-        title, caption, height = self.title, "", NARROW_HEIGHT
+        title, caption, height = self.title, "", NARROW_AXES_HEIGHT
         statistics_text = self.make_statistics_text(result)
         if not is_narrow:
             caption, height = self.make_caption(analysis, result), self.height
@@ -81,17 +81,17 @@ class Panel(NamedTuple):
             title,
             height,
             caption=caption,
-            # axis "": no event markers of rejections, because rejected innovations are hollow dots
+            # axis "" omits the markers of rejections: here, rejected innovations are hollow dots
             axis="" if self is INNOVATIONS_PANEL else result.axis.name,
             with_time_label=with_time_label,
         )
         if is_narrow:
             axes.locator_params(axis="x", nbins=4)
         self.draw(axes, result.with_flight_tracks())
-        page.write_small(statistics_text)
+        page.write_small_text(statistics_text)
 
 
-def add_legend(page: Page, analysis: Analysis) -> Block:
+def add_legend(page: Page, analysis: Analysis) -> PageBlock:
     from matplotlib.lines import Line2D  # noqa: PLC0415
     from matplotlib.patches import Patch  # noqa: PLC0415
 
@@ -101,21 +101,21 @@ def add_legend(page: Page, analysis: Analysis) -> Block:
         Patch(facecolor=style.KF_BAND_COLOUR, lw=0, label="±2σ reported"),
         *(
             Line2D([], [], **TRACK_STYLES[name], label=name)
-            for name in _other_tracks(analysis.main)
+            for name in _list_ekf2_and_truth_tracks(analysis.main)
         ),
     ]
-    return page.legend([*lines, *event_marks.legend_entries(analysis)])
+    return page.add_legend([*lines, *event_marks.make_legend_entries(analysis)])
 
 
-def available_tables(**tables: object) -> dict[str, pd.DataFrame]:
+def select_available_tables(**tables: object) -> dict[str, pd.DataFrame]:
     return {name: table for name, table in tables.items() if isinstance(table, pd.DataFrame)}
 
 
-def _other_tracks(result: AxisComparison) -> dict[str, pd.DataFrame]:
-    return available_tables(**{"EKF2": result.ekf2_state, "ground truth": result.truth})
+def _list_ekf2_and_truth_tracks(result: AxisComparison) -> dict[str, pd.DataFrame]:
+    return select_available_tables(**{"EKF2": result.ekf2_state, "ground truth": result.truth})
 
 
-def draw_tracks(axes: Axes, result: AxisComparison, quantity: Quantity) -> None:
+def draw_tracks(axes: Axes, result: AxisComparison, quantity: QuantityColumns) -> None:
     """Draw position or velocity: measurements, KF with ±2σ, EKF2 and ground truth."""
     if quantity is POSITION_QUANTITY:
         measurements = pd.Series(result.axis.measurement_m, result.axis.measurement_time_s)
@@ -123,7 +123,7 @@ def draw_tracks(axes: Axes, result: AxisComparison, quantity: Quantity) -> None:
     kf_values = result.replay.steps[quantity.column]
     draw_sigma_band(axes, kf_values, np.sqrt(result.replay.steps[quantity.variance_column]))
     drawn_series = [kf_values]
-    for name, track in _other_tracks(result).items():
+    for name, track in _list_ekf2_and_truth_tracks(result).items():
         values = track[quantity.column]
         if values.notna().any():
             draw_curve(axes, values, **TRACK_STYLES[name], zorder=2.5)
@@ -140,54 +140,58 @@ def _describe_measurements(_: Analysis, result: AxisComparison) -> str:
     return f"{len(result.replay.updates)} measurements over {extent_m:.3g} m."
 
 
-def _format_rmse(result: AxisComparison, quantity: Quantity) -> list[str]:
+def _format_rmse(result: AxisComparison, quantity: QuantityColumns) -> list[str]:
     rmse_texts = [
         f"{name} {rmse:.3f} {quantity.unit}"
-        for name, filter_summary in statistics_by_filter(result).items()
+        for name, filter_summary in get_statistics_by_filter(result).items()
         if (rmse := getattr(filter_summary.truth, quantity.rmse_field, None)) is not None
     ]
     return [f"RMSE against ground truth {', '.join(rmse_texts)}"] if rmse_texts else []
 
 
 def _describe_position_difference(result: AxisComparison) -> str:
-    difference, texts = result.difference, _format_rmse(result, POSITION_QUANTITY)
+    difference, difference_texts = result.difference, _format_rmse(result, POSITION_QUANTITY)
     if isinstance(difference, Unavailable):
-        texts.append(f"{difference.what}: {difference.reason}")
+        difference_texts.append(f"{difference.what}: {difference.reason}")
     else:
-        texts.append(
+        difference_texts.append(
             f"position KF - EKF2 RMS {difference.position_rms_m:.3f} m, mean "
             f"{difference.position_mean_m:+.3f} m, maximum {difference.position_maximum_m:.2f} m"
         )
-    return "; ".join(texts)
+    return "; ".join(difference_texts)
 
 
 def _describe_velocity_difference(result: AxisComparison) -> str:
-    texts = _format_rmse(result, VELOCITY_QUANTITY)
+    difference_texts = _format_rmse(result, VELOCITY_QUANTITY)
     if isinstance(result.difference, Difference):
-        texts.append(f"velocity KF - EKF2 RMS {result.difference.velocity_rms_m_s:.3f} m/s")
-    return "; ".join(texts)
+        difference_texts.append(
+            f"velocity KF - EKF2 RMS {result.difference.velocity_rms_m_s:.3f} m/s"
+        )
+    return "; ".join(difference_texts)
 
 
 def _find_innovation_limit_m(result: AxisComparison) -> float:
     limits_m = []
-    for innovations in _innovation_tables(result).values():
+    for innovations in _collect_innovation_tables(result).values():
         median_sqrt_s_m = float(np.sqrt(innovations["innovation_variance_m2"].median()))
         # a quantile, so that outliers do not enlarge the axis
-        quantile_m = float(np.quantile(innovations["innovation_m"].abs(), 0.99))
-        shown_innovation_m = min(quantile_m, MAX_INNOVATION_LIMIT_SIGMAS * median_sqrt_s_m)
+        innovation_quantile_m = float(np.quantile(innovations["innovation_m"].abs(), 0.99))
+        shown_innovation_m = min(
+            innovation_quantile_m, MAX_INNOVATION_LIMIT_SIGMAS * median_sqrt_s_m
+        )
         limits_m.append(max(2.0 * median_sqrt_s_m, shown_innovation_m))
     return INNOVATION_AXIS_MARGIN_FACTOR * max(limits_m)
 
 
-def _innovation_tables(result: AxisComparison) -> dict[str, pd.DataFrame]:
-    return available_tables(KF=result.replay.updates, EKF2=result.ekf2_innovations)
+def _collect_innovation_tables(result: AxisComparison) -> dict[str, pd.DataFrame]:
+    return select_available_tables(KF=result.replay.updates, EKF2=result.ekf2_innovations)
 
 
 def normalised_innovations(result: AxisComparison) -> dict[str, pd.Series[float]]:
     """Return ν/√S of KF and, if logged, of EKF2, by filter name."""
     return {
         name: (table["innovation_m"] / np.sqrt(table["innovation_variance_m2"])).dropna()
-        for name, table in _innovation_tables(result).items()
+        for name, table in _collect_innovation_tables(result).items()
     }
 
 
@@ -197,15 +201,15 @@ def draw_dots(
     """Draw dots between -limit and limit; values outside are triangles at the limits."""
     draw_curve(axes, values[values.abs() <= axis_limit], **marker_style)
     for sign, marker in ((1.0, "^"), (-1.0, "v")):
-        outside = values[sign * values > axis_limit]
+        values_beyond_limit = values[sign * values > axis_limit]
         triangle_style = {**marker_style, "marker": marker, "ms": 3.2, "clip_on": False}
-        if len(outside):
-            draw_curve(axes, 0.0 * outside + sign * axis_limit, **triangle_style)
+        if len(values_beyond_limit):
+            draw_curve(axes, 0.0 * values_beyond_limit + sign * axis_limit, **triangle_style)
 
 
 def draw_innovations(axes: Axes, result: AxisComparison) -> None:
     """Draw the innovations of KF and EKF2 with ±2√S; rejected innovations are hollow."""
-    axis_limit_m, ekf2_innovations = _find_innovation_limit_m(result), result.ekf2_innovations
+    plot_limit_m, ekf2_innovations = _find_innovation_limit_m(result), result.ekf2_innovations
     updates, kf_innovations = result.replay.updates, result.replay.updates["innovation_m"]
     draw_sigma_band(axes, 0.0 * kf_innovations, np.sqrt(updates["innovation_variance_m2"]))
     style.draw_zero_line(axes)
@@ -222,19 +226,19 @@ def draw_innovations(axes: Axes, result: AxisComparison) -> None:
             *innovations_and_styles,
         ]
     for values, marker_style in innovations_and_styles:
-        draw_dots(axes, values, axis_limit_m, marker_style)
-    axes.set_ylim(-1.04 * axis_limit_m, 1.04 * axis_limit_m)
+        draw_dots(axes, values, plot_limit_m, marker_style)
+    axes.set_ylim(-1.04 * plot_limit_m, 1.04 * plot_limit_m)
 
 
 def describe_innovations(_: Analysis, result: AxisComparison) -> str:
     """Return the caption of the innovation plot."""
-    axis_limit_m, sentences = _find_innovation_limit_m(result), []
-    innovation_tables = _innovation_tables(result)
-    for name, consistency in statistics_by_filter(result).items():
+    plot_limit_m, sentences = _find_innovation_limit_m(result), []
+    innovation_tables = _collect_innovation_tables(result)
+    for name, consistency in get_statistics_by_filter(result).items():
         if isinstance(consistency, Unavailable):
             sentences.append(f"{name}: {consistency.reason}.")
             continue
-        outside_count = int((innovation_tables[name]["innovation_m"].abs() > axis_limit_m).sum())
+        outside_count = int((innovation_tables[name]["innovation_m"].abs() > plot_limit_m).sum())
         outside_text = f"; outside the plot (triangles): {outside_count}" if outside_count else ""
         sentences.append(
             f"{name}: {consistency.count} innovations, {format_verdict(consistency)}; mean "
@@ -252,22 +256,22 @@ def describe_innovations(_: Analysis, result: AxisComparison) -> str:
 
 
 def _format_fraction_outside(result: AxisComparison) -> str:
-    fractions = ", ".join(
+    fractions_text = ", ".join(
         f"{name} {consistency.fraction_outside_two_sigma:.1%}"
-        for name, consistency in statistics_by_filter(result).items()
+        for name, consistency in get_statistics_by_filter(result).items()
         if isinstance(consistency, Consistency)
     )
-    return f"{fractions} outside ±2√S (expected 5 %)" if fractions else ""
+    return f"{fractions_text} outside ±2√S (expected 5 %)" if fractions_text else ""
 
 
-def _draw_sigma(axes: Axes, result: AxisComparison, quantity: Quantity) -> None:
-    for name, variance in _variance_tables(result).items():
+def _draw_sigma(axes: Axes, result: AxisComparison, quantity: QuantityColumns) -> None:
+    for name, variance in _collect_variance_tables(result).items():
         draw_curve(axes, np.sqrt(variance[quantity.variance_column]), **TRACK_STYLES[name])
     set_log_scale(axes)
 
 
-def _variance_tables(result: AxisComparison) -> dict[str, pd.DataFrame]:
-    return available_tables(KF=result.replay.steps, EKF2=result.ekf2_variance)
+def _collect_variance_tables(result: AxisComparison) -> dict[str, pd.DataFrame]:
+    return select_available_tables(KF=result.replay.steps, EKF2=result.ekf2_variance)
 
 
 def describe_sigma_growth(analysis: Analysis, result: AxisComparison) -> str:
@@ -276,7 +280,7 @@ def describe_sigma_growth(analysis: Analysis, result: AxisComparison) -> str:
         return ""
     start_s, end_s = max(analysis.events.gaps, key=lambda gap: gap[1] - gap[0])
     sigma_texts = []
-    for name, table in _variance_tables(result.with_flight_tracks()).items():
+    for name, table in _collect_variance_tables(result.with_flight_tracks()).items():
         variance_m2 = table.loc[start_s:end_s, "position_variance_m2"]
         if len(variance_m2) > 1 and np.isfinite(variance_m2.max()):
             sigma_texts.append(f"{np.sqrt(variance_m2.max()):.2g} m ({name})")
@@ -288,13 +292,13 @@ def describe_sigma_growth(analysis: Analysis, result: AxisComparison) -> str:
     )
 
 
-def _format_median_sigma(result: AxisComparison, quantity: Quantity) -> str:
-    texts = []
-    for name, filter_summary in statistics_by_filter(result).items():
-        median = getattr(filter_summary, quantity.median_sigma_field)
-        text = "not logged" if median is None else f"{median:.3f} {quantity.unit}"
-        texts.append(f"{name} {text}")
-    return f"median: {', '.join(texts)}"
+def _format_median_sigma(result: AxisComparison, quantity: QuantityColumns) -> str:
+    sigma_texts = []
+    for name, filter_summary in get_statistics_by_filter(result).items():
+        median_sigma = getattr(filter_summary, quantity.median_sigma_field)
+        sigma_text = "not logged" if median_sigma is None else f"{median_sigma:.3f} {quantity.unit}"
+        sigma_texts.append(f"{name} {sigma_text}")
+    return f"median: {', '.join(sigma_texts)}"
 
 
 POSITION_PANEL = Panel(

@@ -21,7 +21,7 @@ from px4fuse.report import (
 )
 from px4fuse.report.page import Page, replace_unprintable, to_typst_data
 from px4fuse.report.phrases import format_student
-from px4fuse.report.style import report_style
+from px4fuse.report.style import apply_report_style
 from px4fuse.report.typesetting import compile_pdf
 from px4fuse.results import contract
 from px4fuse.results.model import NO_STUDENT
@@ -48,7 +48,7 @@ PAGES: Mapping[type, tuple[Callable[[Any, Any], Iterator[Page]], ...]] = {
         notes.draw_pages,
         provenance.draw_pages,
     ),
-    contract.LoopResults: (loop.draw_report, notes.draw_pages, provenance.draw_loop),
+    contract.LoopResults: (loop.draw_report, notes.draw_pages, provenance.draw_loop_provenance),
     contract.EvaluationResults: (evaluation.draw_pages,),
 }
 
@@ -82,17 +82,17 @@ def render_pdf(content: Any, results: Any, results_json: str) -> bytes:
         Identical for the same input and versions: no dates, no random identifiers.
     """
     title, name, sha256 = _describe_document(results)
-    blocks, written_text = list[Any](), ""
-    with report_style():
+    blocks, report_text = list[Any](), ""
+    with apply_report_style():
         # each page is converted immediately, because the figures of all pages need much memory
         for page in (page for draw in PAGES[type(results)] for page in draw(content, results)):
-            written_text += json.dumps(page.blocks, ensure_ascii=False, default=repr)
+            report_text += json.dumps(page.blocks, ensure_ascii=False, default=repr)
             blocks += to_typst_data(page.blocks, name)
     producer = f"px4fuse {metadata.version('px4fuse')}"
     student = format_student(getattr(results, "student", NO_STUDENT), " · ")
     release_free_memory()  # free the memory of the figures before Typst starts
     # fonts for other scripts are not needed in figures: figures contain no names and no notes
-    all_text = title + name + student + written_text
+    all_text = title + name + student + report_text
     return compile_pdf(
         {
             "title": title,
@@ -100,7 +100,7 @@ def render_pdf(content: Any, results: Any, results_json: str) -> bytes:
             "head": _shorten(f"px4fuse · {name} · SHA-256 {sha256[:12]}", 90),
             "student": _shorten(student, 40),
             "foot": producer,
-            "fonts": fonts.font_names(all_text),
+            "fonts": fonts.find_font_names(all_text),
             "blocks": blocks,
             "results": results_json,
         }

@@ -38,7 +38,7 @@ if TYPE_CHECKING:
 
 # Minimum p value of the Ljung-Box test for white innovations: with eight tests per flight, less
 # than 1 % of the flights have a false alarm
-MIN_WHITE_P_VALUE = 0.001
+MIN_WHITENESS_P_VALUE = 0.001
 # Error of the reported σ, by verdict on the filter
 SIGMA_ERROR_TEXTS = {"underconfident": "too large", "overconfident": "too small"}
 DIFFERENCE_FIELDS = ("position_rms_m", "velocity_rms_m_s")
@@ -74,7 +74,7 @@ def format_sigma_verdict(verdict: str, factor: float) -> str:
     return f"{verdict}, σ {format_factor(factor)}× {SIGMA_ERROR_TEXTS[verdict]}"
 
 
-def statistics_by_filter(result: AxisComparison) -> dict[str, FilterSummary | UntestedFilter]:
+def get_statistics_by_filter(result: AxisComparison) -> dict[str, FilterSummary | UntestedFilter]:
     """Return the statistics of each filter, without EKF2 if it is not logged, by label."""
     is_ekf2_missing = isinstance(result.ekf2_state, Unavailable)
     return {
@@ -89,7 +89,7 @@ VERDICT_TABLE_HEAD = ("axis", "filter", "mean\nNIS", "95 %\nband", "verdict")
 
 def make_verdict_row(result: AxisComparison, name: str) -> list[Cell]:
     """Return the table row on the consistency of a filter (KF or EKF2) along an axis."""
-    consistency = statistics_by_filter(result)[name]
+    consistency = get_statistics_by_filter(result)[name]
     label = result.axis.label.removeprefix("the ") if name == "KF" else ""
     if isinstance(consistency, Unavailable):
         return [label, name, "", "", (format_verdict(consistency), MUTED_COLOUR)]
@@ -108,14 +108,14 @@ def write_error_table(page: Page, analysis: Analysis) -> None:
 
     rows = []
     for result in axes:
-        for name, consistency in statistics_by_filter(result).items():
+        for name, consistency in get_statistics_by_filter(result).items():
             difference = result.difference if name == "KF" else None
             cells = [_format_rms(difference, field) for field in DIFFERENCE_FIELDS if has_ekf2]
             cells += [_format_rms(consistency.truth, field) for field in RMSE_FIELDS if has_truth]
             rows.append([*make_verdict_row(result, name), *cells])
     head = [*VERDICT_TABLE_HEAD, *(["KF-EKF2\n(m)", "RMS\n(m/s)"] if has_ekf2 else [])]
     head += ["RMSE\n(m)", "\n(m/s)"] if has_truth else []
-    page.table(head, rows, right_aligned_columns=(2, 3, 5, 6, 7, 8))
+    page.add_table(head, rows, right_aligned_columns=(2, 3, 5, 6, 7, 8))
 
 
 def _format_rms(statistic: object, field: str) -> str:
@@ -128,7 +128,7 @@ def list_verdict_warnings(comparison: Comparison) -> list[str]:
     consistency_rows = [
         (result.axis.label, filter_name, consistency)
         for result in comparison.axes.values()
-        for filter_name, consistency in statistics_by_filter(result).items()
+        for filter_name, consistency in get_statistics_by_filter(result).items()
         if isinstance(consistency, Consistency)
     ]
     notes = []
@@ -140,12 +140,12 @@ def list_verdict_warnings(comparison: Comparison) -> list[str]:
     correlated_filter_texts = [
         f"{filter_name} along {axis}, lag-1 autocorrelation {consistency.lag1_autocorrelation:+.2f}"
         for axis, filter_name, consistency in consistency_rows
-        if consistency.verdict == "consistent" and consistency.ljung_box_p < MIN_WHITE_P_VALUE
+        if consistency.verdict == "consistent" and consistency.ljung_box_p < MIN_WHITENESS_P_VALUE
     ]
     if correlated_filter_texts:
         notes.append(
             "Innovations are not white, although their variance is consistent (Ljung-Box test, p "
-            f"< {MIN_WHITE_P_VALUE:g}): {'; '.join(correlated_filter_texts)}. If the "
+            f"< {MIN_WHITENESS_P_VALUE:g}): {'; '.join(correlated_filter_texts)}. If the "
             "autocorrelation is positive, the filter lags and SIGMA_A may be too small. If it is "
             "negative, the filter follows the measurement noise and SIGMA_A may be too large."
         )
@@ -166,9 +166,9 @@ def describe_alignment(alignment: Alignment) -> dict[str, str]:
     """Describe the alignment of a position file with the flight, by label."""
     north_m, east_m, down_m = alignment.origin_m
     yaw_sigma_text = "" if alignment.yaw_sigma_deg is None else f" ± {alignment.yaw_sigma_deg:.2f}°"
-    clock_sigma_s, residual_rms_m = alignment.clock_offset_sigma_s, alignment.residual_rms_m
-    clock_sigma_text = "" if clock_sigma_s is None else f" ± {clock_sigma_s:.3f} s"
-    texts = {
+    clock_offset_sigma_s, residual_rms_m = alignment.clock_offset_sigma_s, alignment.residual_rms_m
+    clock_sigma_text = "" if clock_offset_sigma_s is None else f" ± {clock_offset_sigma_s:.3f} s"
+    text_by_label = {
         "frame": f"{alignment.frame} ({alignment.frame_reason})",
         "yaw": f"{alignment.yaw_deg:.2f}°{yaw_sigma_text} ({alignment.yaw_reason})",
         "origin": f"north {north_m:.3f} m, east {east_m:.3f} m, down {down_m:.3f} m",
@@ -178,8 +178,8 @@ def describe_alignment(alignment: Alignment) -> dict[str, str]:
     if alignment.correlation is not None:
         residual_text = "" if residual_rms_m is None else f", {residual_rms_m:.3f} m RMS per axis"
         correlation_text = f"correlation {alignment.correlation:.4f} with {alignment.reference}"
-        texts["match"] = correlation_text + residual_text
-    return texts
+        text_by_label["match"] = correlation_text + residual_text
+    return text_by_label
 
 
 def make_tuning_advice(
@@ -293,8 +293,8 @@ def format_noise_estimate(noise: NoiseEstimate) -> str:
     """Format a maximum-likelihood noise with its 95 % interval."""
     if noise.value is None:
         bounds = (("at most", noise.high), ("at least", noise.low))
-        texts = (f"{prefix} {bound:.2g}" for prefix, bound in bounds if bound is not None)
-        return next(texts, "not identifiable")
-    low = "0" if noise.low is None else f"{noise.low:.2g}"
-    high = "?" if noise.high is None else f"{noise.high:.2g}"
-    return f"{noise.value:.3g} ({low}-{high})"
+        bound_texts = (f"{prefix} {bound:.2g}" for prefix, bound in bounds if bound is not None)
+        return next(bound_texts, "not identifiable")
+    low_text = "0" if noise.low is None else f"{noise.low:.2g}"
+    high_text = "?" if noise.high is None else f"{noise.high:.2g}"
+    return f"{noise.value:.3g} ({low_text}-{high_text})"

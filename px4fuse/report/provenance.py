@@ -11,7 +11,7 @@ from px4fuse.report.cover import ALL_FINDINGS_TITLE, FlightResults
 from px4fuse.report.page import Page
 from px4fuse.report.phrases import describe_alignment, format_clock_map, write_findings
 from px4fuse.report.style import MUTED_COLOUR
-from px4fuse.request import with_options
+from px4fuse.request import replace_argument_names
 from px4fuse.results.contract import LoopResults
 
 LABEL_WIDTH = 168.0  # width (points) of the labels
@@ -25,26 +25,28 @@ def draw_pages(analysis: Analysis | AidsOnlyAnalysis, results: FlightResults) ->
     yield page
     if isinstance(analysis, Analysis):
         page, source = Page("Appendix: provenance"), analysis.source
-        clocks = map(format_clock_map, analysis.flight.clocks)
-        _write_section(page, "Clocks, mapped to the autopilot's boot clock", clocks)
+        clock_texts = map(format_clock_map, analysis.flight.clocks)
+        _write_section(
+            page, "Offset and drift of other clocks to the autopilot's boot clock", clock_texts
+        )
         offset_text = clock.summarise_offset(analysis, results.findings)
         _write_section(page, f"Time offset between {source.name} and the IMU", [offset_text])
         if source.alignment is not None:
             alignment_texts = describe_alignment(source.alignment).items()
             _write_section(page, f"Alignment of {source.name}", alignment_texts)
         _write_section(page, "Automatic choices", analysis.notes or ["none"])
-        _write_missing(page, analysis.missing)
+        _write_missing_data(page, analysis.missing)
         _write_methods(page, "methods.md")
     else:
         page, source = Page("Provenance"), None
         _write_section(page, "Automatic choices", analysis.flight.log.notes or ["none"])
-        _write_missing(page, (analysis.missing_data, *analysis.flight.missing))
+        _write_missing_data(page, (analysis.missing_data, *analysis.flight.missing))
     _write_versions(page, results)
-    _write_log(page, analysis.flight, source)
+    _write_log_section(page, analysis.flight, source)
     yield page
 
 
-def _write_log(page: Page, flight: Flight, source: PositionTrack | None) -> None:
+def _write_log_section(page: Page, flight: Flight, source: PositionTrack | None) -> None:
     log = flight.log
     other_source_texts = (
         f"{track.name} ({track.compute_rate_hz():.1f} Hz)"
@@ -72,18 +74,18 @@ def _write_log(page: Page, flight: Flight, source: PositionTrack | None) -> None
     page.add_columns(section)  # as a column, because Typst does not split columns between pages
 
 
-def _write_missing(page: Page, unavailable_parts: Iterable[Unavailable]) -> None:
+def _write_missing_data(page: Page, unavailable_parts: Iterable[Unavailable]) -> None:
     missing_data_texts = [
-        (part.source or part.what, f"{part.reason}. {with_options(part.remedy)}")
+        (part.source or part.what, f"{part.reason}. {replace_argument_names(part.remedy)}")
         for part in unavailable_parts
     ]
     _write_section(page, "Missing data", missing_data_texts or ["none"])
 
 
-def draw_loop(loop: Loop, results: LoopResults) -> Iterator[Page]:
-    """Draw the provenance page of ``px4fuse loop``: choices, methods, versions and files."""
+def draw_loop_provenance(loop: Loop, results: LoopResults) -> Iterator[Page]:
+    """Draw the provenance page of a loop: choices, methods, versions and files."""
     page, odometry = Page("Provenance"), loop.odometry.trajectory
-    file_facts = [
+    file_descriptions = [
         (
             "track" if track is odometry else "reference",
             f"{track.name}, {track.size_bytes} bytes, SHA-256 {track.sha256}. "
@@ -94,7 +96,7 @@ def draw_loop(loop: Loop, results: LoopResults) -> Iterator[Page]:
     _write_section(page, "Automatic choices", loop.notes or ["none"])
     _write_methods(page, "methods_loop.md")
     _write_versions(page, results)
-    _write_section(page, "Files", file_facts)
+    _write_section(page, "Files", file_descriptions)
     yield page
 
 
@@ -115,12 +117,12 @@ def _write_section(page: Page, title: str, texts: Iterable[str | tuple[str, str]
     """Write texts, or pairs of label and text, below a title if there are any."""
     for index, text in enumerate(texts):
         if index == 0:
-            page.heading(title)
+            page.write_heading(title)
         if isinstance(text, str):
             page.write(text)
         else:
             page.write_labelled(
-                *text, width=LABEL_WIDTH, gap_above=-1.0, colour=MUTED_COLOUR, bold=False
+                *text, label_width=LABEL_WIDTH, gap_above=-1.0, colour=MUTED_COLOUR, bold=False
             )
 
 

@@ -13,23 +13,27 @@ from px4fuse.card.model import Card
 from px4fuse.report.card_text import (
     CARD_WIDTH,
     Paragraph,
-    card_lines,
-    closing_lines,
-    headline_lines,
+    format_card_lines,
+    format_closing_lines,
+    format_headline_lines,
     to_ascii,
     with_typed_path,
 )
-from px4fuse.report.page import Block, Cell
+from px4fuse.report.page import Cell, PageBlock
 from px4fuse.report.style import GOOD_COLOUR, MUTED_COLOUR, SEVERITY_COLOURS
 from px4fuse.request import ComparisonRequest, Request, command_line
 
 # Terminal encodings that contain all characters of a diagnosis card
 UNICODE_ENCODINGS = ("utf-8", "utf8", "utf-16")
 # Function that yields the lines of a diagnosis card, by kind of block
-CARD_LINE_FUNCTIONS = {"card": card_lines, "closing": closing_lines, "headline": headline_lines}
+CARD_LINE_FUNCTIONS = {
+    "card": format_card_lines,
+    "closing": format_closing_lines,
+    "headline": format_headline_lines,
+}
 LABEL_CHARACTERS = 9  # width (characters) of a label on the terminal
 MIN_TABLE_WIDTH = 50  # minimum width (characters) of a terminal for tables
-POINTS_PER_COLUMN = 6.0  # indent (points) in the PDF that is one character on the terminal
+POINTS_PER_COLUMN = 6.0  # indent (points) in the PDF per character of indent on the terminal
 # Terminal styles of text colours; the other colours belong to plots
 STYLES_BY_COLOUR = {
     MUTED_COLOUR: "dim",
@@ -42,7 +46,9 @@ STYLES_BY_COLOUR = {
 _COMMAND_PATTERN = re.compile(r"px4fuse (\w+) LOG(?![\w.])((?: --[a-z-]+ [-\w]+(?:\.\d+)?)*)")
 
 
-def print_blocks(console: Console, blocks: Iterable[Block], request: Request | None = None) -> None:
+def print_blocks(
+    console: Console, blocks: Iterable[PageBlock], request: Request | None = None
+) -> None:
     """Print the blocks of a page (texts, tables, diagnosis card) on the terminal.
 
     With ``request``, commands in texts contain the log and the options of the user.
@@ -85,7 +91,7 @@ def _show_card(
             )
 
 
-def _show_labelled(console: Console, block: Block, request: Request | None) -> None:
+def _show_labelled(console: Console, block: PageBlock, request: Request | None) -> None:
     label_lines = block["label"]["text"].split("\n")
     labels = [line for line in label_lines if len(line) < LABEL_CHARACTERS]
     long_label_text = "".join(f" ({line})" for line in label_lines if len(line) >= LABEL_CHARACTERS)
@@ -118,7 +124,7 @@ def extract_commands(text: str, request: Request) -> tuple[str, list[str]]:
     return short_text, list(dict.fromkeys(commands))
 
 
-def _make_rich_text(block: Block) -> Text:
+def _make_rich_text(block: PageBlock) -> Text:
     style = STYLES_BY_COLOUR.get(block["colour"], "")
     return Text(block["text"], f"{style} bold" if block["weight"] == "bold" else style)
 

@@ -44,8 +44,8 @@ SEVERITY_COLOURS = {
 CONSISTENT_BAND_COLOUR = "#d5dfd8"
 
 
-def line_style(colour: str, width: float, dashes: object = "-") -> dict[str, Any]:
-    return {"color": colour, "lw": width, "ls": dashes}
+def line_style(colour: str, width: float, line_pattern: object = "-") -> dict[str, Any]:
+    return {"color": colour, "lw": width, "ls": line_pattern}
 
 
 def dot_style(
@@ -72,13 +72,13 @@ MEASUREMENT_STYLE = dot_style(MEASUREMENT_COLOUR, ".", 1.8)
 # Colour of the ±2σ band of each filter
 SIGMA_BAND_COLOURS = {"KF": KF_BAND_COLOUR, "EKF2": EKF2_BAND_COLOUR}
 
-MAX_WIDE_POINTS = 1500  # maximum number of drawn points of a curve in wide axes
-MAX_NARROW_POINTS = 500  # maximum number of drawn points of a curve in narrow axes
-MIN_WIDE_AXES_INCHES = 3.0  # minimum width (inches) of wide axes
+MAX_WIDE_AXES_POINTS = 1500  # maximum number of drawn points of a curve in wide axes
+MAX_NARROW_AXES_POINTS = 500  # maximum number of drawn points of a curve in narrow axes
+MIN_WIDE_AXES_INCHES = 3.0  # wider axes get MAX_WIDE_AXES_POINTS points per curve
 
 
 @contextmanager
-def report_style() -> Iterator[None]:
+def apply_report_style() -> Iterator[None]:
     """Apply the matplotlib settings of the report within a with block."""
     import matplotlib as mpl  # noqa: PLC0415 - slow import
 
@@ -104,16 +104,16 @@ def draw_sigma_band(
 ) -> None:
     """Draw the ±2σ band about a series."""
     time_s = centre.index.to_numpy()
-    drawn_time_s, upper = decimate_series(
+    drawn_time_s, upper_limit = decimate_series(
         time_s, np.asarray(centre + 2.0 * sigma, np.float64), _choose_max_points(axes)
     )
-    lower = np.interp(drawn_time_s, time_s, (centre - 2.0 * sigma).to_numpy())
-    axes.fill_between(drawn_time_s, lower, upper, color=colour, lw=0)
+    lower_limit = np.interp(drawn_time_s, time_s, (centre - 2.0 * sigma).to_numpy())
+    axes.fill_between(drawn_time_s, lower_limit, upper_limit, color=colour, lw=0)
 
 
 def _choose_max_points(axes: Axes) -> int:
     is_wide = axes.bbox.width / axes.figure.dpi > MIN_WIDE_AXES_INCHES
-    return MAX_WIDE_POINTS if is_wide else MAX_NARROW_POINTS
+    return MAX_WIDE_AXES_POINTS if is_wide else MAX_NARROW_AXES_POINTS
 
 
 def set_log_scale(axes: Axes) -> None:

@@ -24,7 +24,7 @@ ERROR_LEGEND = (
 )
 
 
-def comparison_page(
+def make_comparison_page(
     analysis: Analysis | AidsOnlyAnalysis,
     results: Any,
     *,
@@ -40,7 +40,7 @@ def comparison_page(
         return page
     if isinstance(analysis, AidsOnlyAnalysis):
         write_aids(page, analysis.aids)
-        page.heading("Findings")
+        page.write_heading("Findings")
         write_findings(page, results.findings)
         page.write("" if results.findings else "None.")
     else:
@@ -53,7 +53,7 @@ def _write_details(page: Page, analysis: Analysis, results: Any) -> None:
     page.write_labelled_texts(_describe_setup(analysis))
     write_error_table(page, analysis)
     for note in (ERROR_LEGEND, *list_verdict_warnings(analysis)):
-        page.write_small(note)
+        page.write_small_text(note)
     explanation = analysis.difference_steps.get(analysis.main.axis.name)
     if isinstance(explanation, DifferenceExplanation):
         write_explanation(page, explanation)

@@ -1,6 +1,6 @@
-"""Ticks, grid and labels of plots as few artists.
+"""Ticks, grid and labels of plots, drawn with few artists of matplotlib.
 
-A matplotlib axis makes seven artists per tick, which takes a tenth of the time of a report.
+An axis of matplotlib makes seven artists per tick, which takes a tenth of the time of a report.
 """
 
 from __future__ import annotations
@@ -13,22 +13,24 @@ import numpy as np
 
 from px4fuse.report.style import Axes
 
-ZORDER = 0.5  # below the curves, as with axes.axisbelow
+TICKS_ZORDER = 0.5  # below the curves, as with axes.axisbelow
 LINE_HEIGHT = 8.0  # height (points) of a tick label of 8 points
 
 
-def replace_ticks(axes: Axes, text_width: Callable[[str], float]) -> None:
+def replace_ticks(axes: Axes, measure_text_width: Callable[[str], float]) -> None:
     """Draw ticks, grid and labels as few artists, and hide the axis artists of matplotlib.
 
-    Data and limits of the axes are final; ``text_width`` returns the width (points) of a text.
+    Data and limits of the axes are final. ``measure_text_width`` returns a width in points.
     """
-    axes.apply_aspect()  # sets the limits of maps
+    axes.apply_aspect()  # final limits of axes with equal scales (maps)
     for is_x, axis in ((True, axes.xaxis), (False, axes.yaxis)):
         if axes.axison and axis.get_visible():
-            _replace_axis(axes, text_width, is_x=is_x)
+            _draw_axis_as_artists(axes, measure_text_width, is_x=is_x)
 
 
-def _replace_axis(axes: Axes, text_width: Callable[[str], float], *, is_x: bool) -> None:
+def _draw_axis_as_artists(
+    axes: Axes, measure_text_width: Callable[[str], float], *, is_x: bool
+) -> None:
     from matplotlib import rcParams  # noqa: PLC0415 - slow import
     from matplotlib.lines import Line2D  # noqa: PLC0415
     from matplotlib.markers import TICKDOWN, TICKLEFT  # noqa: PLC0415
@@ -38,9 +40,9 @@ def _replace_axis(axes: Axes, text_width: Callable[[str], float], *, is_x: bool)
     options, (low, high) = axis.get_tick_params(), sorted(axis.get_view_interval())
     size, pad = rcParams["xtick.major.size"], rcParams["xtick.major.pad"]
 
-    def points(along: Any, across: Any) -> tuple[Any, Any]:
-        """Return x and y of points along the axis, at a distance from the axis."""
-        return (along, across) if is_x else (across, along)
+    def order_xy(along_axis: Any, from_axis: Any) -> tuple[Any, Any]:
+        """Return (x, y) from the coordinates along this axis and perpendicular to it."""
+        return (along_axis, from_axis) if is_x else (from_axis, along_axis)
 
     all_locations, formatter = np.asarray(axis.get_majorticklocs()), axis.get_major_formatter()
     is_visible = np.abs(all_locations - (low + high) / 2.0) <= (0.5 + 1e-9) * (high - low)
@@ -48,28 +50,28 @@ def _replace_axis(axes: Axes, text_width: Callable[[str], float], *, is_x: bool)
     labels = [*compress(formatter.format_ticks(all_locations.tolist()), is_visible)]
     if options["gridOn"]:
         ends = np.tile([0.0, 1.0, np.nan], len(locations))  # nan separates the grid lines
-        grid = Line2D(*points(np.repeat(locations, 3), ends), transform=transform("grid"))
-        grid.set(color=rcParams["grid.color"], lw=rcParams["grid.linewidth"], zorder=ZORDER)
+        grid = Line2D(*order_xy(np.repeat(locations, 3), ends), transform=transform("grid"))
+        grid.set(color=rcParams["grid.color"], lw=rcParams["grid.linewidth"], zorder=TICKS_ZORDER)
         axes.add_artist(grid)
-    ticks = Line2D(*points(locations, 0.0 * locations), transform=transform("tick1"), ls="none")
+    ticks = Line2D(*order_xy(locations, 0.0 * locations), transform=transform("tick1"), ls="none")
     ticks.set(marker=TICKDOWN if is_x else TICKLEFT, ms=size, color="black")
-    ticks.set(mew=rcParams["xtick.major.width"], clip_on=False, zorder=ZORDER)
+    ticks.set(mew=rcParams["xtick.major.width"], clip_on=False, zorder=TICKS_ZORDER)
     axes.add_artist(ticks)
     distance = size + pad  # extent (points) of ticks and tick labels beside the axis
     if options["labelbottom" if is_x else "labelleft"] and labels:
         text1_transform = axes.get_xaxis_text1_transform if is_x else axes.get_yaxis_text1_transform
-        label_transform, vertical, horizontal = text1_transform(distance)
+        label_transform, vertical_alignment, horizontal_alignment = text1_transform(distance)
         for location, label in zip(locations, labels, strict=True):
-            text = axes.text(*points(location, 0.0), label, transform=label_transform)
-            text.set(va=vertical, ha=horizontal, zorder=ZORDER)
-        distance += LINE_HEIGHT if is_x else max(map(text_width, labels))
-    # the formatter moves a common summand or factor of the tick labels to the end of the axis
+            text = axes.text(*order_xy(location, 0.0), label, transform=label_transform)
+            text.set(va=vertical_alignment, ha=horizontal_alignment, zorder=TICKS_ZORDER)
+        distance += LINE_HEIGHT if is_x else max(map(measure_text_width, labels))
+    # label of the axis, and offset text of matplotlib (such as 1e-3 for all tick labels) at its end
     for label, position in ((axis.get_label_text(), 0.5), (formatter.get_offset(), 1.0)):
         is_axis_label = position == 0.5
         text = axes.annotate(
             label,
-            points(position, 0.0),
-            points(0.0, -distance - rcParams["axes.labelpad"]),
+            order_xy(position, 0.0),
+            order_xy(0.0, -distance - rcParams["axes.labelpad"]),
             xycoords="axes fraction",
             textcoords="offset points",
         )

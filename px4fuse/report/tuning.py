@@ -10,19 +10,18 @@ TUNING_HEAD = (
     "axis",
     "SIGMA_A (m/s²)\nestimate (95 %)",
     "SIGMA_Z (m)\nestimate (95 %)",
-    "log-likelihood\ngain (nats)",
-    "gain on\n2nd half",
-    "autocorrelation\nbefore, after",
+    "log-likelihood\ngain (nats per\nmeasurement)",
+    "log-likelihood\ngain on\n2nd half",
+    "lag-1 auto-\ncorrelation\nbefore, after",
 )
 TUNING_NOTE = (
-    "The log-likelihood gain is the increase per measurement from the chosen settings to the "
-    "estimates. For the gain on the 2nd half of the data, the noises are estimated on the first "
-    "half. The autocorrelation of the innovations is at lag 1, with the chosen settings (before) "
-    "and with the estimates (after)."
+    "Log-likelihood gain: with the estimates instead of the chosen settings. Gain on the 2nd half: "
+    "of the data, with the noises estimated on the first half. Lag-1 autocorrelation of the "
+    "innovations: before, with the chosen settings; after, with the estimates."
 )
 
 
-def tuning_page(
+def make_tuning_page(
     comparison: PreparedComparison, tunings: dict[str, AxisTuning | Unavailable]
 ) -> Page:
     """Format the estimates of SIGMA_A and SIGMA_Z along each axis."""
@@ -31,30 +30,30 @@ def tuning_page(
         if isinstance(tuning, Unavailable):
             sentences.append(f"{name}: {tuning.reason}. {tuning.remedy}")
             continue
-        held_out_gain = correlation_text = ""
+        held_out_gain_text = correlation_text = ""
         if not isinstance(tuning.held_out, Unavailable):
-            held_out_gain = f"{tuning.held_out.log_likelihood_gain_per_measurement:+.3f}"
+            held_out_gain_text = f"{tuning.held_out.log_likelihood_gain_per_measurement:+.3f}"
         if not isinstance(tuning.before, Unavailable) and not isinstance(tuning.after, Unavailable):
-            correlation_before, correlation_after = (
+            lag1_before, lag1_after = (
                 tuning.before.lag1_autocorrelation,
                 tuning.after.lag1_autocorrelation,
             )
-            correlation_text = f"{correlation_before:+.2f} {correlation_after:+.2f}"
+            correlation_text = f"{lag1_before:+.2f} {lag1_after:+.2f}"
         rows.append(
             [
                 name,
                 format_noise_estimate(tuning.sigma_a_two_state),
                 format_noise_estimate(tuning.sigma_z),
                 f"{tuning.log_likelihood_gain_per_measurement:.3f}",
-                held_out_gain,
+                held_out_gain_text,
                 correlation_text,
             ]
         )
     page.write_labelled("Chosen", format_settings(comparison.settings))
     if rows:
-        page.table(TUNING_HEAD, rows, right_aligned_columns=(1, 2, 3, 4, 5))
+        page.add_table(TUNING_HEAD, rows, right_aligned_columns=(1, 2, 3, 4, 5))
         sentences.append(TUNING_NOTE)
     for text in sentences:
-        page.write_small(text)
+        page.write_small_text(text)
     page.write_labelled_texts(make_tuning_advice(comparison, tunings))
     return page

@@ -18,7 +18,7 @@ TEMPLATES = ("cover.typ", "report.typ")
 def compile_pdf(report: Mapping[str, Any], template: str | None = None) -> bytes:
     """Typeset data as PDF, by default with the templates of the report."""
     with TemporaryDirectory() as empty_folder:
-        document = _compiler(report, template, empty_folder).compile(
+        document = _make_compiler(report, template, empty_folder).compile(
             format="pdf", pdf_standards=PDF_STANDARDS
         )
     assert isinstance(document, bytes)
@@ -30,11 +30,15 @@ def measure_free_height(blocks: Any, font_names: Sequence[str]) -> float:
     report = dict.fromkeys(("title", "author", "head", "student", "foot"), "")
     data = {**report, "fonts": font_names, "blocks": blocks, "results": None}
     with TemporaryDirectory() as empty_folder:
-        query_result = _compiler(data, None, empty_folder).query("<free>", field="value", one=True)
+        query_result = _make_compiler(data, None, empty_folder).query(
+            "<free>", field="value", one=True
+        )
     return float(json.loads(query_result))
 
 
-def _compiler(report: Mapping[str, Any], template: str | None, empty_folder: str) -> typst.Compiler:
+def _make_compiler(
+    report: Mapping[str, Any], template: str | None, empty_folder: str
+) -> typst.Compiler:
     if template is None:
         folder = Path(__file__).parent
         template = "\n".join((folder / name).read_text(encoding="utf-8") for name in TEMPLATES)

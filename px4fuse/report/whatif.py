@@ -29,11 +29,11 @@ def make_column_headings(analysis: WhatIfAnalysis) -> list[str]:
     change_texts += [
         f"without {name} from {start_s:g} s" for name, start_s in analysis.without.items()
     ]
-    heads = ["logged", "replayed"]
+    headings = ["logged", "replayed"]
     if change_texts:
         estimate_note = " (maximum-likelihood estimate)" if analysis.uses_estimates else ""
-        heads.append(f"replayed with {', '.join(change_texts)}{estimate_note}")
-    return heads
+        headings.append(f"replayed with {', '.join(change_texts)}{estimate_note}")
+    return headings
 
 
 def make_statistic_rows(analysis: WhatIfAnalysis) -> list[list[str]]:
@@ -93,9 +93,9 @@ def _format_fusion_statistics(summary: Summary) -> dict[str, str]:
 
 def make_sweep_table(analysis: WhatIfAnalysis) -> tuple[list[str], list[list[str]]]:
     """Return the headings, and a row of statistics for each value of the swept parameter."""
-    name, rows = find_swept_parameter(analysis), []
-    unit = PARAMETERS[name].unit
-    for summary in select_sweep(analysis):
+    parameter_name, rows = find_swept_parameter(analysis), []
+    unit = PARAMETERS[parameter_name].unit
+    for summary in select_sweep_summaries(analysis):
         axes = summary.axes.values()
         cells = [
             "/".join(format_number(axis.nis_mean) for axis in axes),
@@ -105,9 +105,9 @@ def make_sweep_table(analysis: WhatIfAnalysis) -> tuple[list[str], list[list[str
         ]
         if not summary.is_predictable:
             cells = [NOT_PREDICTABLE_TEXT, *[""] * 5]
-        rows.append([format_number(summary.changed[name]), *cells])
+        rows.append([format_number(summary.changed[parameter_name]), *cells])
     head = [
-        f"{name} ({unit})" if unit else name,
+        f"{parameter_name} ({unit})" if unit else parameter_name,
         "mean NIS N/E",
         "rejected",
         "longest gap (s)",
@@ -118,42 +118,46 @@ def make_sweep_table(analysis: WhatIfAnalysis) -> tuple[list[str], list[list[str
     return head, rows
 
 
-def select_sweep(analysis: WhatIfAnalysis) -> tuple[Summary, ...]:
+def select_sweep_summaries(analysis: WhatIfAnalysis) -> tuple[Summary, ...]:
     return analysis.whatif.whatif[analysis.sweep_start_index :]
 
 
 def find_swept_parameter(analysis: WhatIfAnalysis) -> str:
-    (name,) = select_sweep(analysis)[0].changed.keys() - analysis.changes.keys()
+    (name,) = select_sweep_summaries(analysis)[0].changed.keys() - analysis.changes.keys()
     return name
 
 
 def describe_sweep(analysis: WhatIfAnalysis) -> list[str]:
     """Return sentences on the best value of the swept parameter."""
     sentences = []
-    if summaries := [summary for summary in select_sweep(analysis) if summary.is_predictable]:
-        name = find_swept_parameter(analysis)
+    if summaries := [
+        summary for summary in select_sweep_summaries(analysis) if summary.is_predictable
+    ]:
+        parameter_name = find_swept_parameter(analysis)
         best_summary = min(summaries, key=lambda s: abs(math.log(s.nis_mean)))
         sentences.append(
-            f"The mean NIS is closest to 1 at {name} {format_number(best_summary.changed[name])} "
+            f"The mean NIS is closest to 1 at {parameter_name} "
+            f"{format_number(best_summary.changed[parameter_name])} "
             f"({format_number(best_summary.nis_mean)})."
         )
         value_by_rmse_m = {
-            rmse_m: summary.changed[name]
+            rmse_m: summary.changed[parameter_name]
             for summary in summaries
             if isinstance(rmse_m := summary.position_rmse_to_truth_m, float)
         }
         if value_by_rmse_m:
             min_rmse_m = min(value_by_rmse_m)
             sentences.append(
-                f"The horizontal position RMSE against ground truth is smallest at {name} "
-                f"{format_number(value_by_rmse_m[min_rmse_m])} ({min_rmse_m:.3f} m)."
+                "The horizontal position RMSE against ground truth is smallest at "
+                f"{parameter_name} {format_number(value_by_rmse_m[min_rmse_m])} "
+                f"({min_rmse_m:.3f} m)."
             )
     if not all(summary.is_predictable for summary in analysis.whatif.whatif):
         sentences.append(
             "A replay is not predictable in three cases: EKF2 rejects more than "
-            f"{MAX_REJECTED_FRACTION:.0%} of the samples, "
-            f"{1000.0 * ADDED_POSITION_SIGMA_M:.0f} mm of added position noise change its "
-            f"statistics, or EKF2 fuses no height for {HEIGHT_TIMEOUT_S:g} s."
+            f"{MAX_REJECTED_FRACTION:.0%} of the samples, the statistics change much with "
+            f"{1000.0 * ADDED_POSITION_SIGMA_M:.0f} mm of added position noise, or EKF2 fuses no "
+            f"height for {HEIGHT_TIMEOUT_S:g} s."
         )
     return [*sentences, *(f"{note}." for note in analysis.whatif.notes)]
 
@@ -162,7 +166,7 @@ def _format_number(value: float | Unavailable, digits: int = 3) -> str:
     return "n/a" if isinstance(value, Unavailable) else f"{value:.{digits}f}"
 
 
-def whatif_page(analysis: WhatIfAnalysis) -> Page:
+def make_whatif_page(analysis: WhatIfAnalysis) -> Page:
     page = Page()
     if AISLE in analysis.difference_steps:
         write_explanation(page, analysis.difference_steps[AISLE])
@@ -180,9 +184,9 @@ def whatif_page(analysis: WhatIfAnalysis) -> Page:
         )
         page.write_labelled("Change", no_change_text)
     head = ["", *make_column_headings(analysis)]
-    page.table(head, make_statistic_rows(analysis), right_aligned_columns=range(1, len(head)))
-    if select_sweep(analysis):
-        page.table(*make_sweep_table(analysis), right_aligned_columns=range(1, 7))
+    page.add_table(head, make_statistic_rows(analysis), right_aligned_columns=range(1, len(head)))
+    if select_sweep_summaries(analysis):
+        page.add_table(*make_sweep_table(analysis), right_aligned_columns=range(1, 7))
     for line in describe_sweep(analysis):
         page.write(line)
     page.write("Replays use px4fuse's model of EKF2, not PX4's code.")

@@ -253,7 +253,10 @@ def _make_barometer_topics(
 
 
 def _make_magnetometer_topics(
-    model_inputs: ReplayInputs, model_run: SegmentRun, ekf2_output: Ekf2Output, attitude_rate_hz: float
+    model_inputs: ReplayInputs,
+    model_run: SegmentRun,
+    ekf2_output: Ekf2Output,
+    attitude_rate_hz: float,
 ) -> list[Topic]:
     """Return the topics that need a magnetometer, or nothing without magnetometer."""
     field, settings = model_run.segment.field, model_inputs.settings

@@ -2,7 +2,7 @@
 
 from pathlib import Path
 
-from px4fuse.core.text import count_noun
+from px4fuse.core.text import format_count
 from px4fuse.errors import to_one_line
 from px4fuse.report.page import Page
 from px4fuse.simulation.faults import FAULT_TYPES, format_fault, injected_fault_names
@@ -14,7 +14,7 @@ POSITION_SOURCE_BY_KIND = {"aisle": "UWB", "loop": "VIO", "outdoor": "GNSS"}
 def summary(simulation: Simulation, answer: Path | None) -> Page:
     """Format the simulated flight with its injected faults."""
     scenario, page = simulation.scenario, Page()
-    path = f"{count_noun(scenario.passes, 'lap')} of a square of {scenario.length_m:g} m"
+    path = f"{format_count(scenario.passes, 'lap')} of a square of {scenario.length_m:g} m"
     if scenario.kind == "aisle":
         plural_suffix = "es" * (scenario.passes > 1)
         path = f"{scenario.passes} pass{plural_suffix} of {scenario.length_m:g} m"

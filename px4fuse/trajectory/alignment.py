@@ -17,7 +17,8 @@ from px4fuse.trajectory.model import MIN_POSES
 
 AlignmentKind = Literal["none", "yaw", "se3", "sim3"]
 
-# Minimum extent of a path for an estimate of the rotation, as fraction of its largest extent
+# Minimum extent of a path along its second principal axis for an estimate of the rotation, as
+# fraction of the largest extent
 MIN_RELATIVE_EXTENT = 1e-6
 # Minimum extent (m, RMS) of a path for an estimate of the rotation
 MIN_EXTENT_M = 1e-6
@@ -25,7 +26,8 @@ MIN_EXTENT_M = 1e-6
 # unrelated noise tracks of equal variance have the ratio √2
 MAX_YAW_RESIDUAL_RATIO = 1.0
 # The full rotation is estimated if the residual (RMS) is at most this many times the motion (RMS)
-# along the second principal axis: unrelated noise tracks of equal variance have the ratio √6
+# along the second principal axis, otherwise it is an error: two independent noise tracks of equal
+# variance have the ratio √6
 MAX_ROTATION_RESIDUAL_RATIO = 2.0
 
 
@@ -55,13 +57,15 @@ class Transform(Record):
 
     def apply(self, position_m: Array) -> Array:
         """Transform positions to the frame of the reference, shape (n, 3) or (3,)."""
-        rotated: Array = self.to_rotation().apply(self.scale * position_m)
-        return rotated + self.translation_m
+        rotated_position_m: Array = self.to_rotation().apply(self.scale * position_m)
+        return rotated_position_m + self.translation_m
 
     def apply_inverse(self, position_m: Array) -> Array:
         """Transform positions to the frame of the estimate, shape (n, 3) or (3,)."""
-        rotated: Array = self.to_rotation().inv().apply(position_m - np.array(self.translation_m))
-        return rotated / self.scale
+        rotated_position_m: Array = (
+            self.to_rotation().inv().apply(position_m - np.array(self.translation_m))
+        )
+        return rotated_position_m / self.scale
 
 
 def fit_alignment(
@@ -160,7 +164,7 @@ def _require_sufficient_motion(
     transform: Transform, estimate_m: Array, reference_m: Array, kind: str
 ) -> None:
     """Raise TrajectoryError if the motion is too small to estimate the rotation."""
-    estimate_extents, reference_extents = map(
+    estimate_extents_m, reference_extents_m = map(
         _compute_principal_extents_m, (estimate_m, reference_m)
     )
     residuals_m = reference_m - transform.apply(estimate_m)
@@ -170,14 +174,14 @@ def _require_sufficient_motion(
             for m in (estimate_m, reference_m)
         )
         residuals_m = residuals_m[:, :2]
-        max_extent_m = float(np.linalg.norm(reference_extents))
+        max_extent_m = float(np.linalg.norm(reference_extents_m))
         max_residual_ratio = MAX_YAW_RESIDUAL_RATIO
         motion_text = "horizontal motion"
         remedy = "Use `alignment` none."
     else:
         # motion along a line does not determine the rotation around the line
         max_extent_m, extent_m, _ = np.minimum(
-            transform.scale * estimate_extents, reference_extents
+            transform.scale * estimate_extents_m, reference_extents_m
         )
         max_residual_ratio = MAX_ROTATION_RESIDUAL_RATIO
         motion_text = "motion perpendicular to the main direction of flight"

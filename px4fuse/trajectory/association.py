@@ -6,7 +6,7 @@ from typing import Literal
 import numpy as np
 from scipy.spatial.transform import Slerp
 
-from px4fuse.core.arrays import Array, BoolArray, IntArray, median_interval
+from px4fuse.core.arrays import Array, BoolArray, IntArray, compute_median_interval_s
 from px4fuse.core.record import Count, NotNegative, Record
 from px4fuse.errors import TrajectoryError
 from px4fuse.trajectory.model import MIN_POSES, Trajectory
@@ -18,7 +18,7 @@ MAX_GAP_INTERVALS = 3.0
 # Minimum pose interval (s) of a sparse reference, which is not interpolated: its poses are paired
 # with the nearest poses of the estimate
 MIN_SPARSE_POSE_INTERVAL_S = 2.0
-# Lower limit (s) of the default maximum gap over which poses are interpolated
+# By default, poses are interpolated over gaps of at least this time (s), at any pose rate
 MIN_GAP_LIMIT_S = 0.1
 # Default maximum time difference (s) of a pair of poses, as in the evo package
 MAX_NEAREST_DIFFERENCE_S = 0.01
@@ -65,7 +65,7 @@ def associate(
         "interpolate": interpolate the reference at the times of the estimate. "nearest": pair each
         pose of the trajectory with fewer poses with the nearest pose in time, as evo does.
     max_gap_s : float, optional
-        See :class:`Association`; default: :func:`gap_limit`, or 0.01 s for "nearest".
+        See :class:`Association`; default: :func:`choose_gap_limit_s`, or 0.01 s for "nearest".
     time_offset_s : float
         Time offset added to the timestamps of the estimate.
 
@@ -75,9 +75,9 @@ def associate(
         Fewer than three poses match.
     """
     # interpolation over seconds would invent the path of a sparse reference
-    estimate_interval_s = median_interval(estimate.time_s)
+    estimate_interval_s = compute_median_interval_s(estimate.time_s)
     if method == "interpolate" and max_gap_s is None:
-        reference_interval_s = median_interval(reference.time_s)
+        reference_interval_s = compute_median_interval_s(reference.time_s)
         if reference_interval_s > max(MIN_SPARSE_POSE_INTERVAL_S, 2.0 * estimate_interval_s):
             method, max_gap_s = "nearest", estimate_interval_s
     time_s = estimate.time_s + time_offset_s
@@ -89,7 +89,7 @@ def associate(
         )
         matched_reference = reference[reference_indices]
     else:
-        gap_limit_s = gap_limit(reference.time_s) if max_gap_s is None else max_gap_s
+        gap_limit_s = choose_gap_limit_s(reference.time_s) if max_gap_s is None else max_gap_s
         end_tolerance_s = 0.0
         pose_indices = np.flatnonzero(is_bracketed(time_s, reference.time_s, gap_limit_s))
         matched_reference = _interpolate_poses(reference, time_s[pose_indices])
@@ -106,17 +106,17 @@ def associate(
     is_outside = (time_s < reference_start_s - end_tolerance_s) | (
         time_s > reference_end_s + end_tolerance_s
     )
-    outside_count = int(is_outside.sum())
+    outside_pose_count = int(is_outside.sum())
     used_intervals_s = np.diff(time_s[pose_indices])
     used_intervals_s = used_intervals_s[used_intervals_s <= max(5.0 * estimate_interval_s, 0.5)]
-    used_count, pose_count = len(np.unique(pose_indices)), len(estimate)
+    used_pose_count, pose_count = len(np.unique(pose_indices)), len(estimate)
     association = Association(
         method=method,
         poses=len(pose_indices),
         max_gap_s=gap_limit_s,
-        outside=outside_count,
-        in_gaps=pose_count - outside_count - used_count,
-        coverage_estimate=used_count / pose_count,
+        outside=outside_pose_count,
+        in_gaps=pose_count - outside_pose_count - used_pose_count,
+        coverage_estimate=used_pose_count / pose_count,
         coverage_reference=min(
             float(used_intervals_s.sum() / (reference_end_s - reference_start_s)), 1.0
         ),
@@ -124,21 +124,25 @@ def associate(
     return estimate[pose_indices], matched_reference, association
 
 
-def gap_limit(time_s: Array, min_limit_s: float = MIN_GAP_LIMIT_S) -> float:
+def choose_gap_limit_s(time_s: Array, min_gap_limit_s: float = MIN_GAP_LIMIT_S) -> float:
     """Return the default maximum gap (s) between timestamps over which poses are interpolated."""
-    return max(MAX_GAP_INTERVALS * median_interval(time_s), min_limit_s)
+    return max(MAX_GAP_INTERVALS * compute_median_interval_s(time_s), min_gap_limit_s)
 
 
-def is_bracketed(time_s: Array, reference_s: Array, gap_limit_s: float) -> BoolArray:
+def is_bracketed(time_s: Array, reference_time_s: Array, gap_limit_s: float) -> BoolArray:
     """Return a mask of times between two reference times with a gap of at most ``gap_limit_s``.
 
     Times that equal a reference time are included.
     """
-    next_indices = np.clip(np.searchsorted(reference_s, time_s), 1, len(reference_s) - 1)
-    previous_s = reference_s[next_indices - 1]
-    next_s = reference_s[next_indices]
-    is_between = (previous_s <= time_s) & (time_s <= next_s) & (next_s - previous_s <= gap_limit_s)
-    return np.asarray(is_between | (previous_s == time_s) | (next_s == time_s))
+    next_indices = np.clip(np.searchsorted(reference_time_s, time_s), 1, len(reference_time_s) - 1)
+    previous_reference_s = reference_time_s[next_indices - 1]
+    next_reference_s = reference_time_s[next_indices]
+    is_between = (
+        (previous_reference_s <= time_s)
+        & (time_s <= next_reference_s)
+        & (next_reference_s - previous_reference_s <= gap_limit_s)
+    )
+    return np.asarray(is_between | (previous_reference_s == time_s) | (next_reference_s == time_s))
 
 
 def _interpolate_poses(trajectory: Trajectory, time_s: Array) -> Trajectory:
@@ -146,44 +150,44 @@ def _interpolate_poses(trajectory: Trajectory, time_s: Array) -> Trajectory:
     rotation = trajectory.rotation
     if rotation is not None and len(time_s):
         rotation = Slerp(trajectory.time_s, rotation)(time_s)
-    poses = trajectory.with_positions(positions_at(trajectory, time_s))
+    poses = trajectory.with_positions(interpolate_positions(trajectory, time_s))
     return replace(poses, rotation=rotation, time_s=time_s)
 
 
-def positions_at(trajectory: Trajectory, time_s: Array) -> Array:
+def interpolate_positions(trajectory: Trajectory, time_s: Array) -> Array:
     """Interpolate the positions at times within the trajectory, shape (n, 3)."""
     columns = trajectory.position_m.T
     return np.stack([np.interp(time_s, trajectory.time_s, column) for column in columns], axis=-1)
 
 
 def _pair_nearest(
-    estimate_s: Array, reference_s: Array, max_difference_s: float, offset_s: float
+    estimate_time_s: Array, reference_time_s: Array, max_difference_s: float, offset_s: float
 ) -> tuple[IntArray, IntArray]:
     """Pair each pose of the shorter trajectory with the nearest pose (in time) of the longer one.
 
     Return the pose indices of both, without pairs that differ by more than ``max_difference_s``.
     """
     # The offset is added to the longer series as in the evo package, for equal rounding errors
-    is_estimate_longer = len(estimate_s) > len(reference_s)
-    shorter_time_s = reference_s if is_estimate_longer else estimate_s
-    longer_time_s = estimate_s + offset_s if is_estimate_longer else reference_s - offset_s
+    is_estimate_denser = len(estimate_time_s) > len(reference_time_s)
+    sparse_time_s = reference_time_s if is_estimate_denser else estimate_time_s
+    dense_time_s = estimate_time_s + offset_s if is_estimate_denser else reference_time_s - offset_s
     next_indices = np.minimum(
-        np.searchsorted(longer_time_s, shorter_time_s, side="right"),
-        len(longer_time_s) - 1,
+        np.searchsorted(dense_time_s, sparse_time_s, side="right"),
+        len(dense_time_s) - 1,
     )
     previous_indices = np.maximum(next_indices - 1, 0)
     nearest_indices = np.where(
-        np.abs(longer_time_s[next_indices] - shorter_time_s)
-        < np.abs(shorter_time_s - longer_time_s[previous_indices]),
+        np.abs(dense_time_s[next_indices] - sparse_time_s)
+        < np.abs(sparse_time_s - dense_time_s[previous_indices]),
         next_indices,
         previous_indices,
     )
     paired_indices = np.flatnonzero(
-        np.abs(longer_time_s[nearest_indices] - shorter_time_s) <= max_difference_s
+        np.abs(dense_time_s[nearest_indices] - sparse_time_s) <= max_difference_s
     )
     nearest_indices = nearest_indices[paired_indices]
     return (
         (nearest_indices, paired_indices)
-        if is_estimate_longer
+        if is_estimate_denser
         else (paired_indices, nearest_indices)
     )

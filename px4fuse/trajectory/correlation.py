@@ -24,20 +24,20 @@ class Moments:
         Number of common samples.
     covariance : ndarray, complex for complex series
         Σ conj(a - ā)(b - b̄).
-    energy_a, energy_b : ndarray
+    square_sum_a, square_sum_b : ndarray
         Σ |a - ā|² and Σ |b - b̄|².
     """
 
     count: Array
     covariance: ComplexArray
-    energy_a: Array
-    energy_b: Array
+    square_sum_a: Array
+    square_sum_b: Array
 
 
 def compute_moments(
     a: RealOrComplex, b: RealOrComplex, is_known_a: BoolArray, is_known_b: BoolArray
 ) -> Moments:
-    """Compute :class:`Moments` of two series on one time grid (Padfield 2012, eqs. 3 to 9).
+    """Compute the sums at each lag for a normalised correlation (Padfield 2012, eqs. 3 to 9).
 
     Parameters
     ----------
@@ -54,13 +54,13 @@ def compute_moments(
     )
     mask_a = is_known_a.astype(float)
     mask_b = is_known_b.astype(float)
-    common_count = np.rint(_correlate(mask_b, mask_a).real)
-    inverse_count = 1.0 / np.maximum(common_count, 1.0)
+    common_sample_count = np.rint(_correlate(mask_b, mask_a).real)
+    inverse_count = 1.0 / np.maximum(common_sample_count, 1.0)
     sum_a, sum_b = _correlate(mask_b, a), _correlate(b, mask_a)  # conjugate of Σ a
     covariance = _correlate(b, a) - sum_a * sum_b * inverse_count
-    energy_a = _correlate(mask_b, np.abs(a) ** 2).real - np.abs(sum_a) ** 2 * inverse_count
-    energy_b = _correlate(np.abs(b) ** 2, mask_a).real - np.abs(sum_b) ** 2 * inverse_count
-    return Moments(common_count, covariance, energy_a, energy_b)
+    square_sum_a = _correlate(mask_b, np.abs(a) ** 2).real - np.abs(sum_a) ** 2 * inverse_count
+    square_sum_b = _correlate(np.abs(b) ** 2, mask_a).real - np.abs(sum_b) ** 2 * inverse_count
+    return Moments(common_sample_count, covariance, square_sum_a, square_sum_b)
 
 
 def autocovariance(values: Array | ComplexArray) -> Array:

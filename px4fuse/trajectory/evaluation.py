@@ -14,7 +14,7 @@ from typing import Literal
 import numpy as np
 from msgspec import structs
 
-from px4fuse.core.arrays import Array, BoolArray, median_interval
+from px4fuse.core.arrays import Array, BoolArray, compute_median_interval_s
 from px4fuse.core.record import NOT_WRITTEN, NotWritten, OrUnavailable, Record
 from px4fuse.core.text import capitalise_first, format_metres
 from px4fuse.errors import TrajectoryError
@@ -31,12 +31,12 @@ from px4fuse.trajectory.time_offset import TimeOffset, compute_clock_offset_s, e
 MAX_CONSTANT_ROTATION_RAD = 1e-6
 # Minimum number of poses and minimum motion (m) for the conclusion that a constant orientation was
 # not measured
-MIN_CONSTANT_POSES, MIN_CONSTANT_MOTION_M = 10, 1.0
+MIN_CONSTANT_POSE_COUNT, MIN_CONSTANT_MOTION_M = 10, 1.0
 # Minimum duration (s) of a repeated position for a warning, and minimum motion (m) of the reference
 # during the repetition
 MIN_FROZEN_DURATION_S, MIN_FROZEN_MOTION_M = 2.0, 0.5
-# At a jump, the step of the estimate from one pose to the next exceeds that of the reference: by at
-# least this distance (m), and by this multiple of the median difference of the steps
+# A step is the distance of successive poses. At a jump, the step of the estimate minus that of the
+# reference is at least this distance (m), and this multiple of the median of the difference
 MIN_JUMP_M, MIN_JUMP_TO_MEDIAN_RATIO = 0.5, 20.0
 # A jump is a map restart if it ends within this distance (m) of the first position or the origin
 MAX_MAP_RESTART_DISTANCE_M = 0.5
@@ -45,7 +45,8 @@ MAX_STATED_JUMPS = 5
 # Minimum mean rotation (rad) between the orientations of estimate and reference for the conclusion
 # that their body axes differ
 MIN_BODY_ROTATION_RAD = np.radians(30.0)
-# Maximum RMS deviation (rad) from the mean rotation for the conclusion that body axes differ
+# Maximum RMS deviation (rad) of the rotations from estimate to reference from their mean, for the
+# conclusion that the body axes differ
 MAX_BODY_DEVIATION_RAD = np.radians(5.0)
 # Number of alternating estimates of alignment and lever arm
 LEVER_ARM_ITERATIONS = 5
@@ -56,7 +57,7 @@ def drop_constant_orientation(trajectory: Trajectory) -> tuple[Trajectory, tuple
     rotation, extent_m = trajectory.rotation, np.ptp(trajectory.position_m, axis=0).max()
     if (
         rotation is None
-        or len(trajectory) < MIN_CONSTANT_POSES
+        or len(trajectory) < MIN_CONSTANT_POSE_COUNT
         or extent_m < MIN_CONSTANT_MOTION_M
         or (rotation[0].inv() * rotation).magnitude().max() > MAX_CONSTANT_ROTATION_RAD
     ):
@@ -78,7 +79,7 @@ def find_frozen_poses(
         start_s, end_s = estimate.time_s[[start_index, end_index - 1]].tolist()
         if end_s - start_s < MIN_FROZEN_DURATION_S:
             continue
-        reference_position_m = reference.between(
+        reference_position_m = reference.cut_to_span(
             start_s + time_offset_s, end_s + time_offset_s
         ).position_m
         if (
@@ -96,15 +97,15 @@ def find_frozen_poses(
     return is_frozen, tuple(warnings)
 
 
-def find_jumps(estimate: Trajectory, reference: Trajectory) -> tuple[str, ...]:
+def find_jump_warnings(estimate: Trajectory, reference: Trajectory) -> tuple[str, ...]:
     """Return a warning if matched poses of the estimate jump and those of the reference do not."""
-    estimate_steps_m, reference_steps_m = (
+    steps_of_estimate_m, steps_of_reference_m = (
         np.linalg.norm(np.diff(trajectory.position_m, axis=0), axis=1)
         for trajectory in (estimate, reference)
     )
-    differences_m = np.abs(estimate_steps_m - reference_steps_m)
-    min_jump_m = max(MIN_JUMP_M, MIN_JUMP_TO_MEDIAN_RATIO * np.median(differences_m))
-    jump_indices = np.flatnonzero(estimate_steps_m - reference_steps_m > min_jump_m)
+    step_differences_m = np.abs(steps_of_estimate_m - steps_of_reference_m)
+    min_jump_m = max(MIN_JUMP_M, MIN_JUMP_TO_MEDIAN_RATIO * np.median(step_differences_m))
+    jump_indices = np.flatnonzero(steps_of_estimate_m - steps_of_reference_m > min_jump_m)
     if not len(jump_indices):
         return ()
     times_s = estimate.time_s[jump_indices + 1] - estimate.time_s[0]
@@ -117,9 +118,10 @@ def find_jumps(estimate: Trajectory, reference: Trajectory) -> tuple[str, ...]:
     if np.min(distances_m) < MAX_MAP_RESTART_DISTANCE_M:
         cause_text = "Probable cause: restart of the map, because the jump ends near the origin."
     return (
-        f"{estimate.name} jumps by up to {differences_m[jump_indices].max():.1f} m, {times_text} s "
-        f"after its start. {cause_text} ATE and RPE contain the jumps. One alignment does not fit "
-        "the poses before and after a jump: evaluate them as separate files.",
+        f"{estimate.name} jumps by up to {step_differences_m[jump_indices].max():.1f} m, "
+        f"{times_text} s after its start. {cause_text} ATE and RPE contain the jumps. One "
+        "alignment does not fit the poses before and after a jump: evaluate them as separate "
+        "files.",
     )
 
 
@@ -140,10 +142,10 @@ def has_other_body_axes(aligned_estimate: Trajectory, reference: Trajectory) -> 
 MAX_SCALE_ERROR = 0.1
 # A warning appears if a smaller fraction of the poses of the estimate is used, or if these poses
 # cover a smaller fraction of the time of the reference
-MIN_COVERED_FRACTION = 0.5
+MIN_MATCHED_FRACTION = 0.5
 # Minimum estimated time offset (s) for a warning that the clocks differ: a smaller time offset may
 # be the delay of a filter
-MIN_REPORTED_OFFSET_S = 0.1
+MIN_REPORTED_TIME_OFFSET_S = 0.1
 # An estimate counts as mirrored if one reversed axis reduces the ATE to at most this fraction
 MAX_MIRRORED_ATE_RATIO = 0.3
 # The mirror test requires an ATE of at least this fraction of the extent of the reference
@@ -268,14 +270,14 @@ def evaluate(
         max_gap_s=max_gap_s,
         time_offset_s=added_offset_s,
     )
-    alignment_reason, is_requested = "The user chose the alignment.", alignment is not None
+    alignment_reason, is_alignment_given = "The user chose the alignment.", alignment is not None
     if alignment is None:
         alignment, alignment_reason = choose_alignment(matched_estimate, matched_reference)
-    transform, line_motion_warnings = _fit_or_approximate(
-        matched_estimate, matched_reference, alignment, is_requested=is_requested
+    transform, line_motion_warnings = _fit_alignment_with_warning(
+        matched_estimate, matched_reference, alignment, is_alignment_given=is_alignment_given
     )
-    jump_warnings = find_jumps(matched_estimate, matched_reference)
-    aligned_estimate, notes = _with_reference_body_axes(
+    jump_warnings = find_jump_warnings(matched_estimate, matched_reference)
+    aligned_estimate, notes = _rotate_to_reference_body(
         _apply_transform(transform, matched_estimate), matched_reference
     )
     if not notes and has_other_body_axes(aligned_estimate, matched_reference):
@@ -421,30 +423,30 @@ def _choose_time_offset(
 
     Also return warnings, and another offset (s) with which the motions match better, if any.
     """
-    is_given = given_offset_s not in (None, "auto")
+    is_offset_given = given_offset_s not in (None, "auto")
     clock_offset_s = compute_clock_offset_s(estimate, reference)
     if isinstance(given_offset_s, float | int):
         clock_offset_s = given_offset_s
     clock_text = "the UNIX time of both files" if clock_offset_s else "unchanged timestamps"
     added_offset_s = clock_offset_s or 0.0
-    default_offset = TimeOffset(
+    unestimated_offset = TimeOffset(
         offset_s=added_offset_s,
         is_determinable=True,
         reason="The user chose the time offset."
-        if is_given
+        if is_offset_given
         else f"Poses are matched by {clock_text}.",
     )
     start_s, end_s = estimate.time_s[[0, -1]] + added_offset_s
     is_disjoint = start_s > reference.time_s[-1] or end_s < reference.time_s[0]
     is_estimated = given_offset_s == "auto" or is_disjoint
-    if is_given:
-        return default_offset, [], None
+    if is_offset_given:
+        return unestimated_offset, [], None
     estimated_offset = estimate_time_offset(estimate, reference)
     if is_estimated:
         if estimated_offset.is_determinable:
             return estimated_offset, [], None
         fallback_offset = structs.replace(
-            default_offset, is_determinable=False, reason=estimated_offset.reason
+            unestimated_offset, is_determinable=False, reason=estimated_offset.reason
         )
         return (
             fallback_offset,
@@ -455,9 +457,9 @@ def _choose_time_offset(
     best_offset_s = estimated_offset.offset_s or added_offset_s
     is_other_offset = (
         not low_s <= added_offset_s <= high_s
-        and abs(best_offset_s - added_offset_s) >= MIN_REPORTED_OFFSET_S
+        and abs(best_offset_s - added_offset_s) >= MIN_REPORTED_TIME_OFFSET_S
     )
-    return default_offset, [], best_offset_s if is_other_offset else None
+    return unestimated_offset, [], best_offset_s if is_other_offset else None
 
 
 def _find_offset_warnings(
@@ -501,8 +503,8 @@ def _find_mirror_warnings(
 def _find_swap_warnings(estimate: Trajectory, reference: Trajectory) -> Iterator[str]:
     if reference.kind == "truth" != estimate.kind:
         return
-    estimate_interval_s = median_interval(estimate.time_s)
-    reference_interval_s = median_interval(reference.time_s)
+    estimate_interval_s = compute_median_interval_s(estimate.time_s)
+    reference_interval_s = compute_median_interval_s(reference.time_s)
     action = "Check the order of the arguments: first the estimate, then the reference."
     if estimate.kind == "truth" != reference.kind:
         yield f"{estimate.name} is ground truth, but {reference.name} is not. {action}"
@@ -521,12 +523,12 @@ def _find_comparison_warnings(
     *,
     has_jumps: bool,
 ) -> Iterator[str]:
-    if association.coverage_estimate < MIN_COVERED_FRACTION:
+    if association.coverage_estimate < MIN_MATCHED_FRACTION:
         yield (
             f"Only {association.coverage_estimate:.0%} of the poses of the estimate are evaluated; "
             "the reference has no poses at the other times."
         )
-    if association.coverage_reference < MIN_COVERED_FRACTION:
+    if association.coverage_reference < MIN_MATCHED_FRACTION:
         yield (
             f"The estimate covers only {association.coverage_reference:.0%} of the time of the "
             "reference."
@@ -543,8 +545,12 @@ def _find_comparison_warnings(
         )
 
 
-def _fit_or_approximate(
-    estimate: Trajectory, reference: Trajectory, alignment: AlignmentKind, *, is_requested: bool
+def _fit_alignment_with_warning(
+    estimate: Trajectory,
+    reference: Trajectory,
+    alignment: AlignmentKind,
+    *,
+    is_alignment_given: bool,
 ) -> tuple[Transform, tuple[str, ...]]:
     """Fit the alignment. If the motion does not determine it, return a best fit and a warning.
 
@@ -557,7 +563,7 @@ def _fit_or_approximate(
     try:
         return fit_alignment(estimate.position_m, reference.position_m, alignment), ()
     except TrajectoryError as error:
-        if is_requested or len(estimate) < MIN_POSES:
+        if is_alignment_given or len(estimate) < MIN_POSES:
             raise
         transform = fit_alignment(
             estimate.position_m, reference.position_m, alignment, requires_motion=False
@@ -578,8 +584,10 @@ def _move_to_reference_body(
     """
     assert estimate.rotation is not None
     assert reference.rotation is not None
-    reference_axes = reference.rotation.as_matrix()
-    centred_axes = (reference_axes - reference_axes.mean(axis=0)).reshape(-1, 3)
+    reference_rotation_matrices = reference.rotation.as_matrix()
+    centred_rotation_matrices = (
+        reference_rotation_matrices - reference_rotation_matrices.mean(axis=0)
+    ).reshape(-1, 3)
     corrected_estimate = estimate
     for _ in range(LEVER_ARM_ITERATIONS):
         transform = fit_alignment(corrected_estimate.position_m, reference.position_m, alignment)
@@ -589,7 +597,7 @@ def _move_to_reference_body(
         ).mean()
         error_m = transform.apply(estimate.position_m) - reference.position_m
         centred_error_m = (error_m - error_m.mean(axis=0)).ravel()
-        lever_arm_m = np.linalg.lstsq(centred_axes, centred_error_m, rcond=None)[0]
+        lever_arm_m = np.linalg.lstsq(centred_rotation_matrices, centred_error_m, rcond=None)[0]
         rotation = estimate.rotation * body_rotation
         position_m = estimate.position_m - rotation.apply(lever_arm_m) / transform.scale
         corrected_estimate = replace(estimate, position_m=position_m, rotation=rotation)
@@ -604,7 +612,7 @@ def _move_to_reference_body(
     )
 
 
-def _with_reference_body_axes(
+def _rotate_to_reference_body(
     aligned_estimate: Trajectory, reference: Trajectory
 ) -> tuple[Trajectory, tuple[str, ...]]:
     """Remove the constant rotation between camera and vehicle axes; also return a note."""

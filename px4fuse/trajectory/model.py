@@ -19,7 +19,7 @@ TrajectoryKind = Literal["vio", "ekf2", "kf", "truth", "slam", "unknown"]
 Frame = Literal["NED", "FRD", "ENU", "camera", "unknown"]
 MIN_POSES = 3
 # Indices of north, east and down in (x, y, z), and the signs of these components, by frame
-NED_COMPONENTS = {
+NED_COMPONENTS_BY_FRAME = {
     "ned": ([0, 1, 2], [1.0, 1.0, 1.0]),
     "enu": ([1, 0, 2], [1.0, 1.0, -1.0]),
     "nwu": ([0, 1, 2], [1.0, -1.0, -1.0]),
@@ -138,14 +138,14 @@ class Trajectory:
 
     def __getitem__(self, selection: slice | BoolArray | IntArray) -> Trajectory:
         """Select poses by a slice, boolean array (n,) or integer array."""
-        selected: dict[str, Any] = {
+        selected_arrays: dict[str, Any] = {
             name: values[selection]
             for name, values in vars(self).items()
             if isinstance(values, np.ndarray | Rotation)
         }
-        return replace(self, **selected)
+        return replace(self, **selected_arrays)
 
-    def between(self, start_s: float, end_s: float) -> Trajectory:
+    def cut_to_span(self, start_s: float, end_s: float) -> Trajectory:
         """Return the poses from ``start_s`` to ``end_s``, possibly none."""
         return self[(self.time_s >= start_s) & (self.time_s <= end_s)]
 

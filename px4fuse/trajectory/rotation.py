@@ -43,7 +43,7 @@ def to_vector(q: Array) -> Array:
     )
 
 
-def from_elements(*rows: tuple[Array | float, ...]) -> Array:
+def build_matrix(*rows: tuple[Array | float, ...]) -> Array:
     """Build matrices from their elements, row by row: numbers, or arrays of the same shape."""
     shape = np.broadcast_shapes(*(np.shape(element) for row in rows for element in row))
     matrices = np.empty((*shape, len(rows), len(rows[0])))
@@ -56,7 +56,7 @@ def from_elements(*rows: tuple[Array | float, ...]) -> Array:
 def to_matrix(q: Array) -> Array:
     """Convert quaternions to rotation matrices, shape (..., 3, 3)."""
     w, x, y, z = _split_components(q)
-    return from_elements(
+    return build_matrix(
         (1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)),
         (2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)),
         (2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)),
@@ -71,7 +71,7 @@ def rotate(matrices: Array, vectors: Array) -> Array:
 def skew(v: Array) -> Array:
     """Return the cross-product matrices [v]× with [v]× u = v × u, shape (..., 3, 3)."""
     x, y, z = _split_components(v)
-    return from_elements((0.0, -z, y), (z, 0.0, -x), (-y, x, 0.0))
+    return build_matrix((0.0, -z, y), (z, 0.0, -x), (-y, x, 0.0))
 
 
 def cumulative_product(quaternions: Array) -> Array:
@@ -85,7 +85,7 @@ def cumulative_product(quaternions: Array) -> Array:
     rows = -(-n // width)
     identity = np.array([1.0, 0.0, 0.0, 0.0])
     padded_quaternions = np.concatenate([quaternions, np.tile(identity, (rows * width - n, 1))])
-    # Row r contains the quaternions r·width to (r+1)·width
+    # Products within each row first; then each row is multiplied by the product of all earlier rows
     row_products = padded_quaternions.reshape(rows, width, 4).copy()
     for column in range(1, width):
         row_products[:, column] = multiply(row_products[:, column - 1], row_products[:, column])

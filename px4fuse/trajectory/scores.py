@@ -11,7 +11,7 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 from scipy.special import ndtr, stdtrit
 
-from px4fuse.core.arrays import Array, IntArray, median_interval
+from px4fuse.core.arrays import Array, IntArray, compute_median_interval_s
 from px4fuse.core.record import Count, NotNegative, OrUnavailable, Record
 from px4fuse.errors import SettingsError
 from px4fuse.flight.model import Unavailable
@@ -25,21 +25,21 @@ DeltaUnit = Literal["frames", "m", "s"]
 RELATIVE_DELTA_TOLERANCE = 0.1
 DEFAULT_RPE_DISTANCES_M = (0.1, 0.5, 1.0, 5.0, 10.0, 50.0, 100.0, 500.0, 1000.0)
 DEFAULT_RPE_TIMES_S = (1.0, 10.0, 60.0)
-# Maximum number of default distances and of default times of RPE pairs
+# By default, the RPE is computed for at most this many distances and this many times
 MAX_DISTANCE_DELTAS = 3
 MAX_TIME_DELTAS = 2
-# Limits of a default distance as fraction of the path length; the maximum is also that of a default
-# time, as fraction of the duration
-MIN_DELTA_FRACTION = 1 / 200
-MAX_DELTA_FRACTION = 1 / 5
+# Minimum default distance of the RPE as fraction of the path length, and maximum default distance
+# or time of the RPE as fraction of path length or duration
+MIN_RPE_DISTANCE_FRACTION = 1 / 200
+MAX_RPE_DELTA_FRACTION = 1 / 5
 BOOTSTRAP_RESAMPLES = 2000
 BOOTSTRAP_SEED = 20120101
 # Probability of the bootstrap interval
 CONFIDENCE_LEVEL = 0.95
 # Length of a bootstrap block, in integrated autocorrelation times of the squared errors
-BLOCK_PER_CORRELATION_TIME = 3.0
+BLOCK_LENGTH_CORRELATION_TIMES = 3.0
 # Number of lags in the sum of autocorrelations, in integrated autocorrelation times (Sokal 1997)
-WINDOW_PER_CORRELATION_TIME = 5.0
+AUTOCORRELATION_WINDOW_TIMES = 5.0
 # Minimum number of bootstrap blocks for a 95 % interval
 MIN_BOOTSTRAP_BLOCKS = 5.0
 
@@ -140,23 +140,32 @@ def compute_rotation_statistics(a: Rotation, b: Rotation) -> Statistics:
 def choose_default_deltas(distance_m: Array, time_s: Array) -> tuple[Delta, ...]:
     """Choose distances and times for the RPE that fit path length and duration of the flight."""
 
-    def choose_values(
-        distance_or_time: Array, values: Sequence[float], min_fraction: float
+    def choose_delta_values(
+        distance_or_time: Array, values: Sequence[float], min_delta_fraction: float
     ) -> list[float]:
-        total = float(np.ptp(distance_or_time))
+        total_distance_or_time = float(np.ptp(distance_or_time))
         # The minimum distance or time of a pair is two median intervals between poses
-        minimum = max(min_fraction * total, 2.0 * median_interval(distance_or_time))
-        return [value for value in values if minimum <= value <= MAX_DELTA_FRACTION * total]
+        minimum = max(
+            min_delta_fraction * total_distance_or_time,
+            2.0 * compute_median_interval_s(distance_or_time),
+        )
+        return [
+            value
+            for value in values
+            if minimum <= value <= MAX_RPE_DELTA_FRACTION * total_distance_or_time
+        ]
 
-    distances_m = choose_values(distance_m, DEFAULT_RPE_DISTANCES_M, MIN_DELTA_FRACTION)
-    times_s = choose_values(time_s, DEFAULT_RPE_TIMES_S, 0.0)
+    distances_m = choose_delta_values(
+        distance_m, DEFAULT_RPE_DISTANCES_M, MIN_RPE_DISTANCE_FRACTION
+    )
+    times_s = choose_delta_values(time_s, DEFAULT_RPE_TIMES_S, 0.0)
     return (
         *(Delta(value, "m") for value in distances_m[-MAX_DISTANCE_DELTAS:]),
         *(Delta(value, "s") for value in times_s[-MAX_TIME_DELTAS:]),
     )
 
 
-def find_pairs(
+def find_pose_pairs(
     position_m: Array, time_s: Array, delta: Delta, *, all_pairs: bool = True
 ) -> tuple[IntArray, IntArray]:
     """Find pairs of poses with a distance of ``delta``.
@@ -213,7 +222,7 @@ def find_pairs(
 
 
 def _find_consecutive_pairs(steps: Array, delta: float) -> tuple[IntArray, IntArray]:
-    # Distances are summed from the start of each pair as in the evo package, for equal rounding
+    # Sum from the start of each pair, as the evo package does: rounding then selects equal pairs
     pair_ends = [0]
     distance_or_time = 0.0
     for index, step in enumerate(steps.tolist(), 1):
@@ -236,43 +245,54 @@ def compute_relative_error(
         P and Q, with the same number of poses at the same times. Only the scale of an alignment
         affects the RPE.
     delta, all_pairs
-        See :func:`find_pairs`; distances are measured along the reference.
+        See :func:`find_pose_pairs`; distances are measured along the reference.
     """
-    start_indices, end_indices = find_pairs(
+    start_indices, end_indices = find_pose_pairs(
         reference.position_m, reference.time_s, delta, all_pairs=all_pairs
     )
     analysis_name = f"RPE over {delta}"
     if not len(start_indices):
-        no_pair = Unavailable(
+        missing_pairs = Unavailable(
             analysis_name,
             f"the reference has no pair of poses with a distance of {delta}",
             "Use another distance of RPE pairs (delta).",
         )
         return RelativeError(
-            delta.value, delta.unit, all_pairs, "reference", no_pair, no_pair, no_pair
+            delta.value,
+            delta.unit,
+            all_pairs,
+            "reference",
+            missing_pairs,
+            missing_pairs,
+            missing_pairs,
         )
-    motions = [
+    displacements_m = [
         track.position_m[end_indices] - track.position_m[start_indices]
         for track in (aligned_estimate, reference)
     ]
     rotations = get_rotations(aligned_estimate, reference, analysis_name)
     rotation_deg: OrUnavailable[Statistics]
     if isinstance(rotations, Unavailable):
-        # without orientations, the motions are compared in the frame of the reference
+        # without orientations, displacements are compared in the frame of the reference
         rotation_deg = rotations
     else:
-        # with orientations, each motion is compared in the axes of its first pose
-        inverses = [rotation[start_indices].inv() for rotation in rotations]
-        motions = [inverse.apply(motion) for inverse, motion in zip(inverses, motions, strict=True)]
+        # with orientations, each displacement is expressed in the axes of its first pose
+        start_rotation_inverses = [rotation[start_indices].inv() for rotation in rotations]
+        displacements_m = [
+            inverse.apply(displacement_m)
+            for inverse, displacement_m in zip(
+                start_rotation_inverses, displacements_m, strict=True
+            )
+        ]
         estimated_rotation, reference_rotation = (
             inverse * rotation[end_indices]
-            for inverse, rotation in zip(inverses, rotations, strict=True)
+            for inverse, rotation in zip(start_rotation_inverses, rotations, strict=True)
         )
         rotation_deg = compute_rotation_statistics(reference_rotation, estimated_rotation)
-    # The translation of E is also rotated by Q_j⁻¹ Q_i, which does not change its length
-    translation_m = np.linalg.norm(motions[0] - motions[1], axis=1)
+    # Length of the translation of E; its rotation by Q_j⁻¹ Q_i does not change the length
+    translation_m = np.linalg.norm(displacements_m[0] - displacements_m[1], axis=1)
     overlapping_pair_count = int(np.median(end_indices - start_indices)) if all_pairs else 1
-    interval_m = estimate_rmse_interval(
+    rmse_interval_m = estimate_rmse_interval(
         translation_m, analysis_name, min_block_length=overlapping_pair_count
     )
     return RelativeError(
@@ -281,7 +301,7 @@ def compute_relative_error(
         all_pairs,
         "reference",
         compute_statistics(translation_m),
-        interval_m,
+        rmse_interval_m,
         rotation_deg,
     )
 
@@ -289,7 +309,7 @@ def compute_relative_error(
 def get_rotations(
     aligned_estimate: Trajectory, reference: Trajectory, analysis_name: str
 ) -> tuple[Rotation, Rotation] | Unavailable:
-    """Return the orientations of both, or the reason why ``analysis_name`` is not possible."""
+    """Return the orientations of estimate and reference, or the reason if one has none."""
     if aligned_estimate.rotation is not None and reference.rotation is not None:
         return aligned_estimate.rotation, reference.rotation
     role = "reference" if aligned_estimate.rotation else "estimate"
@@ -312,7 +332,7 @@ def estimate_rmse_interval(
     squared_errors = errors**2
     error_count = len(squared_errors)
     block_length = max(
-        int(np.ceil(BLOCK_PER_CORRELATION_TIME * autocorrelation_time(squared_errors))),
+        int(np.ceil(BLOCK_LENGTH_CORRELATION_TIMES * compute_autocorrelation_time(squared_errors))),
         min_block_length,
         1,
     )
@@ -342,7 +362,7 @@ def estimate_rmse_interval(
     return RmseInterval(float(low), float(high), block_length, block_count)
 
 
-def autocorrelation_time(values: Array) -> float:
+def compute_autocorrelation_time(values: Array) -> float:
     """Compute the integrated autocorrelation time (samples) of a series: 1 + 2 Σ ρ, at least 1.
 
     The sum ends at a lag of five autocorrelation times (Sokal 1997, section 3).
@@ -354,7 +374,7 @@ def autocorrelation_time(values: Array) -> float:
     covariance_by_lag = autocovariance(centred_values)
     correlation_times = 2.0 * np.cumsum(covariance_by_lag / covariance_by_lag[0]) - 1.0
     sufficient_window_lengths = np.flatnonzero(
-        np.arange(sample_count) >= WINDOW_PER_CORRELATION_TIME * correlation_times
+        np.arange(sample_count) >= AUTOCORRELATION_WINDOW_TIMES * correlation_times
     )
     return max(
         1.0,

@@ -13,10 +13,10 @@ from scipy.optimize import minimize_scalar
 from scipy.spatial.transform import Slerp
 from scipy.special import stdtrit
 
-from px4fuse.core.arrays import Array, BoolArray, median_interval
+from px4fuse.core.arrays import Array, BoolArray, compute_median_interval_s
 from px4fuse.core.record import Record, Span
 from px4fuse.trajectory.alignment import Transform, compute_rms_length_m, umeyama
-from px4fuse.trajectory.association import gap_limit, is_bracketed, positions_at
+from px4fuse.trajectory.association import choose_gap_limit_s, interpolate_positions, is_bracketed
 from px4fuse.trajectory.correlation import autocovariance, compute_moments
 from px4fuse.trajectory.model import MIN_POSES, Trajectory
 
@@ -32,7 +32,7 @@ MIN_OVERLAP_FRACTION = 0.5
 # Minimum number of overlapping poses, as fraction of their number at complete overlap
 MIN_USED_POSES_FRACTION = 0.3
 # Maximum number of candidate time offsets (correlation peaks) for which the ATE is computed
-MAX_CANDIDATES = 12
+MAX_CANDIDATE_OFFSETS = 12
 # Half-width (s) of the least-squares search around a correlation peak
 SEARCH_HALF_WIDTH_S = 0.5
 # Half-width (s) of the second least-squares search, around the result of the first search
@@ -46,19 +46,20 @@ MIN_CORRELATION = 0.3
 MIN_SECOND_PEAK_RATIO = 1.2
 # Maximum number of poses in the least-squares fit of the time offset
 MAX_FITTED_POSES = 2000
-# Maximum misfit (residual over extent of the motion) for accepting a fit of the time offset
-MAX_MISFIT = 0.5
-# Lower limit of the misfit: two fits with a smaller misfit are equally good
-MIN_MISFIT = 1e-3
-# Minimum RMS of the residual velocity, as fraction of the speed: only the velocity that no shift,
-# rotation or scale of the path explains makes a time offset observable
+# Maximum misfit (RMS residual over RMS extent of the motion) of an accepted fit of the time offset
+MAX_RELATIVE_MISFIT = 0.5
+# Lower limit of the misfit (RMS residual over RMS extent): better fits count as equally good
+MIN_RELATIVE_MISFIT = 1e-3
+# Minimum RMS of the residual velocity, as fraction of the RMS speed. The residual velocity is the
+# part that no shift, rotation or scale of the path explains: without it, no offset is observable
 MIN_RESIDUAL_SPEED_FRACTION = 0.05
 # Minimum correlation of the residual velocities of both trajectories: noise is not correlated
 MIN_RESIDUAL_CORRELATION = 0.5
-# Maximum lag of the autocovariances in the variance of a sum of residuals, in correlation lengths
+# Maximum lag of the autocovariances in the variance of the score (Newey & West 1987), in its
+# correlation lengths
 MAX_LAG_CORRELATION_LENGTHS = 4
 # Maximum half-width (s) of the 95 % interval of an accepted time offset
-MAX_HALF_INTERVAL_S = 0.5
+MAX_INTERVAL_HALF_WIDTH_S = 0.5
 CONFIDENCE_LEVEL = 0.95
 
 
@@ -100,7 +101,7 @@ def estimate_time_offset(estimate: Trajectory, reference: Trajectory) -> TimeOff
     another position or rotation.
     """
     # The trajectory with the shorter pose intervals is interpolated
-    if median_interval(estimate.time_s) >= median_interval(reference.time_s):
+    if compute_median_interval_s(estimate.time_s) >= compute_median_interval_s(reference.time_s):
         return _search_offset(estimate, reference)
     swapped_offset = _search_offset(reference, estimate)
     if swapped_offset.offset_s is None or swapped_offset.interval_s is None:
@@ -114,25 +115,30 @@ def estimate_time_offset(estimate: Trajectory, reference: Trajectory) -> TimeOff
 def _search_offset(sparse_track: Trajectory, dense_track: Trajectory) -> TimeOffset:
     """Estimate the offset to add to the timestamps of the trajectory with fewer poses (sparse)."""
     clock_offset_s = compute_clock_offset_s(sparse_track, dense_track)
-    candidates = _find_candidates(sparse_track, dense_track)
+    candidate_offsets_s = _find_candidate_offsets_s(sparse_track, dense_track)
     if clock_offset_s is not None:
-        candidates.insert(0, clock_offset_s)
-    if not candidates:
+        candidate_offsets_s.insert(0, clock_offset_s)
+    if not candidate_offsets_s:
         return _make_unknown_offset(
             "the speeds of both trajectories are not correlated at any time offset (no motion, "
             "constant speed, or different flights)"
         )
     offset_fits = (
-        _refine_offset(sparse_track, dense_track, lag, SEARCH_HALF_WIDTH_S) for lag in candidates
+        _refine_offset(sparse_track, dense_track, lag, SEARCH_HALF_WIDTH_S)
+        for lag in candidate_offsets_s
     )
     accepted_fits = sorted(
-        (fit for fit in offset_fits if fit is not None and fit.compute_misfit() <= MAX_MISFIT),
+        (
+            fit
+            for fit in offset_fits
+            if fit is not None and fit.compute_misfit() <= MAX_RELATIVE_MISFIT
+        ),
         key=_OffsetFit.compute_misfit,
     )
     if not accepted_fits:
         return _make_unknown_offset(
-            "at the time offsets with correlated speeds of both trajectories, the positions do not "
-            "match, or too few poses overlap"
+            "the speeds of both trajectories correlate at some time offsets, but there the "
+            "positions do not match, or too few poses overlap"
         )
     best_fit = accepted_fits[0]
     similar_fits = [
@@ -144,11 +150,11 @@ def _search_offset(sparse_track: Trajectory, dense_track: Trajectory) -> TimeOff
         # Of several offsets that fit equally well, the nearest to the UNIX time is used
         best_fit = min(similar_fits, key=lambda fit: abs(fit.offset_s - clock_offset_s))
     for fit in similar_fits if clock_offset_s is None else []:
-        difference_s = abs(fit.offset_s - best_fit.offset_s)
-        if difference_s > MIN_PEAK_DISTANCE_S:
+        offset_difference_s = abs(fit.offset_s - best_fit.offset_s)
+        if offset_difference_s > MIN_PEAK_DISTANCE_S:
             return _make_unknown_offset(
-                f"the motion is periodic: with a time offset that differs by {difference_s:.1f} s "
-                f"the ATE is {fit.compute_rms_m():.3g} m instead of "
+                "the motion is periodic: with a time offset that differs by "
+                f"{offset_difference_s:.1f} s the ATE is {fit.compute_rms_m():.3g} m instead of "
                 f"{best_fit.compute_rms_m():.3g} m"
             )
     # The fit is repeated with a narrower window of offsets, within which more poses overlap in time
@@ -156,16 +162,21 @@ def _search_offset(sparse_track: Trajectory, dense_track: Trajectory) -> TimeOff
         _refine_offset(sparse_track, dense_track, best_fit.offset_s, FINE_SEARCH_HALF_WIDTH_S)
         or best_fit
     )
-    half_interval_s = _compute_half_interval_s(sparse_track, dense_track, best_fit)
-    if not half_interval_s <= MAX_HALF_INTERVAL_S:
-        interval_text = f" (95 %: ±{half_interval_s:.2g} s)" if np.isfinite(half_interval_s) else ""
+    interval_half_width_s = _compute_interval_half_width_s(sparse_track, dense_track, best_fit)
+    if not interval_half_width_s <= MAX_INTERVAL_HALF_WIDTH_S:
+        interval_text = (
+            f" (95 %: ±{interval_half_width_s:.2g} s)" if np.isfinite(interval_half_width_s) else ""
+        )
         return _make_unknown_offset(
             "the speed is nearly constant, so a time offset cannot be distinguished from a "
             f"position offset{interval_text}"
         )
     return TimeOffset(
         offset_s=best_fit.offset_s,
-        interval_s=(best_fit.offset_s - half_interval_s, best_fit.offset_s + half_interval_s),
+        interval_s=(
+            best_fit.offset_s - interval_half_width_s,
+            best_fit.offset_s + interval_half_width_s,
+        ),
         is_determinable=True,
         reason="The time offset has the maximum speed correlation and the minimum ATE "
         f"({best_fit.compute_rms_m():.3g} m, {len(best_fit.time_s)} poses).",
@@ -179,18 +190,22 @@ def _make_unknown_offset(reason: str) -> TimeOffset:
 
 
 def _compute_grid_velocity(trajectory: Trajectory, step_s: float) -> tuple[Array, Array]:
-    """Compute smoothed velocities (m/s) on a regular time grid."""
+    """Return regular grid times (s), and the smoothed velocities (m/s) at these times."""
     time_s = trajectory.time_s
     grid_s = time_s[0] + step_s * np.arange(int(np.ptp(time_s) / step_s) + 1)
-    return grid_s, _smooth(
-        positions_at(trajectory, grid_s), time_s, step_s, derivative_order=1
+    return grid_s, _smooth_values(
+        interpolate_positions(trajectory, grid_s), time_s, step_s, derivative_order=1
     ) / step_s
 
 
-def _smooth(grid_values: Array, time_s: Array, step_s: float, derivative_order: int = 0) -> Array:
+def _smooth_values(
+    grid_values: Array, time_s: Array, step_s: float, derivative_order: int = 0
+) -> Array:
     """Smooth values on a time grid, or return their smoothed derivative per grid step (order 1)."""
-    sigma_samples = max(SMOOTHING_SIGMA_S, median_interval(time_s)) / step_s
-    return np.asarray(gaussian_filter1d(grid_values, sigma_samples, axis=0, order=derivative_order))
+    smoothing_sigma_samples = max(SMOOTHING_SIGMA_S, compute_median_interval_s(time_s)) / step_s
+    return np.asarray(
+        gaussian_filter1d(grid_values, smoothing_sigma_samples, axis=0, order=derivative_order)
+    )
 
 
 def _compute_velocity(trajectory: Trajectory, time_s: Array) -> Array:
@@ -208,24 +223,26 @@ def _compute_speeds(trajectory: Trajectory, step_s: float) -> tuple[list[Array],
     time_s = trajectory.time_s
     grid_s, velocity_m_s = _compute_grid_velocity(trajectory, step_s)
     # Speeds are interpolated between key frames, but not across gaps with lost tracking
-    is_known = is_bracketed(grid_s, time_s, max(10.0 * median_interval(time_s), 0.5))
-    speeds = [np.linalg.norm(velocity_m_s, axis=1)]
+    is_known = is_bracketed(grid_s, time_s, max(10.0 * compute_median_interval_s(time_s), 0.5))
+    linear_and_angular_speeds = [np.linalg.norm(velocity_m_s, axis=1)]
     if trajectory.rotation is not None:
         rotations = Slerp(time_s, trajectory.rotation)(grid_s)
         rates_rad_s = (rotations[:-1].inv() * rotations[1:]).as_rotvec() / step_s
         rates_rad_s = np.concatenate((rates_rad_s, rates_rad_s[-1:]))
-        speeds.append(np.linalg.norm(_smooth(rates_rad_s, time_s, step_s), axis=1))
-    return speeds, is_known
+        linear_and_angular_speeds.append(
+            np.linalg.norm(_smooth_values(rates_rad_s, time_s, step_s), axis=1)
+        )
+    return linear_and_angular_speeds, is_known
 
 
-def _find_candidates(sparse_track: Trajectory, dense_track: Trajectory) -> list[float]:
+def _find_candidate_offsets_s(sparse_track: Trajectory, dense_track: Trajectory) -> list[float]:
     """Find the time offsets with correlated speeds, best first (Padfield 2012, eqs. 3 to 9)."""
     durations_s = [float(np.ptp(track.time_s)) for track in (sparse_track, dense_track)]
     step_s = max(GRID_STEP_S, max(durations_s) / MAX_GRID_SAMPLES)
     shorter_duration_s = min(durations_s)
     if shorter_duration_s < 10 * step_s:
         return []
-    (sparse_speeds, is_sparse_known), (dense_speeds, is_dense_known) = (
+    (sparse_speeds, is_sparse_speed_known), (dense_speeds, is_dense_speed_known) = (
         _compute_speeds(track, step_s) for track in (sparse_track, dense_track)
     )
     min_count = MIN_OVERLAP_FRACTION * shorter_duration_s / step_s
@@ -233,26 +250,30 @@ def _find_candidates(sparse_track: Trajectory, dense_track: Trajectory) -> list[
     # angular speeds are only compared if both trajectories have orientations
     for sparse_values, dense_values in zip(sparse_speeds, dense_speeds, strict=False):
         speed_moments = compute_moments(
-            sparse_values, dense_values, is_sparse_known, is_dense_known
+            sparse_values, dense_values, is_sparse_speed_known, is_dense_speed_known
         )
         # Exclude lags at which a trajectory is at rest: its speed variance is a rounding error
         is_usable = speed_moments.count >= min_count
         for values, is_known, energy in (
-            (sparse_values, is_sparse_known, speed_moments.energy_a),
-            (dense_values, is_dense_known, speed_moments.energy_b),
+            (sparse_values, is_sparse_speed_known, speed_moments.square_sum_a),
+            (dense_values, is_dense_speed_known, speed_moments.square_sum_b),
         ):
             total_energy = float(np.var(values[is_known])) * np.count_nonzero(is_known)
             is_usable &= energy > 1e-3 * total_energy / len(values) * speed_moments.count
-        scale = np.sqrt(np.where(is_usable, speed_moments.energy_a * speed_moments.energy_b, 1.0))
+        scale = np.sqrt(
+            np.where(is_usable, speed_moments.square_sum_a * speed_moments.square_sum_b, 1.0)
+        )
         correlations.append(np.where(is_usable, speed_moments.covariance.real / scale, 0.0))
     mean_correlation = np.mean(correlations, axis=0)
-    local_maximum = maximum_filter1d(mean_correlation, round(2 * MIN_PEAK_DISTANCE_S / step_s) + 1)
-    peak_indices = np.flatnonzero(
-        (mean_correlation == local_maximum) & (mean_correlation > MIN_CORRELATION)
+    sliding_maximum = maximum_filter1d(
+        mean_correlation, round(2 * MIN_PEAK_DISTANCE_S / step_s) + 1
     )
-    peak_indices = peak_indices[np.argsort(-mean_correlation[peak_indices])][:MAX_CANDIDATES]
+    peak_indices = np.flatnonzero(
+        (mean_correlation == sliding_maximum) & (mean_correlation > MIN_CORRELATION)
+    )
+    peak_indices = peak_indices[np.argsort(-mean_correlation[peak_indices])][:MAX_CANDIDATE_OFFSETS]
     # At index k of the correlation, the first sparse sample coincides with dense sample k - (n - 1)
-    dense_start_indices = peak_indices - (len(is_sparse_known) - 1)
+    dense_start_indices = peak_indices - (len(is_sparse_speed_known) - 1)
     lags_s = dense_start_indices * step_s + dense_track.time_s[0] - sparse_track.time_s[0]
     return list(lags_s.tolist())
 
@@ -261,28 +282,32 @@ def _find_candidates(sparse_track: Trajectory, dense_track: Trajectory) -> list[
 class _OffsetFit:
     """Fit of the trajectory with fewer poses (sparse) to that with more poses (dense).
 
-    ``time_s`` and ``aligned_m`` are times and aligned positions (m) of the sparse trajectory,
-    ``target_m`` the positions (m) of the dense trajectory at these times.
+    ``time_s`` and ``aligned_position_m`` are times and aligned positions of the sparse trajectory,
+    ``target_position_m`` the positions of the dense trajectory at these times.
     """
 
     offset_s: float
     transform: Transform
     time_s: Array
-    aligned_m: Array
-    target_m: Array
+    aligned_position_m: Array
+    target_position_m: Array
 
     def compute_rms_m(self) -> float:
         """Return the RMS (m) of the position residuals."""
-        return compute_rms_length_m(self.target_m - self.aligned_m)
+        return compute_rms_length_m(self.target_position_m - self.aligned_position_m)
 
     def compute_misfit(self) -> float:
-        """Return the ratio of RMS residual to RMS extent of the motion; the least is best."""
-        # Extent of the dense trajectory: a bad fit can shrink the sparse trajectory to a point
-        extent_m = float(np.sqrt(self.target_m.var(axis=0).sum()))
-        return max(self.compute_rms_m() / extent_m, MIN_MISFIT) if extent_m > 0.0 else float("inf")
+        """Return RMS position residual over RMS extent of the dense trajectory (0: perfect)."""
+        # not the extent of the sparse trajectory, which a bad fit can scale to a point
+        extent_m = float(np.sqrt(self.target_position_m.var(axis=0).sum()))
+        return (
+            max(self.compute_rms_m() / extent_m, MIN_RELATIVE_MISFIT)
+            if extent_m > 0.0
+            else float("inf")
+        )
 
 
-def _compute_half_interval_s(
+def _compute_interval_half_width_s(
     sparse_track: Trajectory, dense_track: Trajectory, fit: _OffsetFit
 ) -> float:
     """Compute the half-width (s) of the 95 % interval of the time offset.
@@ -291,16 +316,19 @@ def _compute_half_interval_s(
     same effect as a time offset.
     """
     pose_count = len(fit.time_s)
-    centred_m = fit.aligned_m - fit.aligned_m.mean(axis=0)
-    dense_velocity = _compute_velocity(dense_track, fit.time_s + fit.offset_s)
-    sparse_velocity = fit.transform.to_rotation().apply(
+    centred_m = fit.aligned_position_m - fit.aligned_position_m.mean(axis=0)
+    dense_velocity_m_s = _compute_velocity(dense_track, fit.time_s + fit.offset_s)
+    sparse_velocity_m_s = fit.transform.to_rotation().apply(
         fit.transform.scale * _compute_velocity(sparse_track, fit.time_s)
     )
-    # Remove the velocity that a translation, a small rotation or a scale factor can explain
+    # Remove the velocity that is equivalent to a translation, a small rotation or a scale factor,
+    # because the alignment is estimated too
     columns = [np.tile(axis, (pose_count, 1)) for axis in np.eye(3)]
     columns += [np.cross(axis, centred_m) for axis in np.eye(3)]
     similarity_columns = np.stack([*columns, centred_m], axis=-1).reshape(3 * pose_count, 7)
-    velocities = np.stack((dense_velocity, sparse_velocity), axis=-1).reshape(3 * pose_count, 2)
+    velocities = np.stack((dense_velocity_m_s, sparse_velocity_m_s), axis=-1).reshape(
+        3 * pose_count, 2
+    )
     velocities = (
         velocities
         - similarity_columns @ np.linalg.lstsq(similarity_columns, velocities, rcond=None)[0]
@@ -309,15 +337,15 @@ def _compute_half_interval_s(
         velocities.T @ velocities
     ).tolist()
     if (
-        dense_information <= MIN_RESIDUAL_SPEED_FRACTION**2 * float((dense_velocity**2).sum())
+        dense_information <= MIN_RESIDUAL_SPEED_FRACTION**2 * float((dense_velocity_m_s**2).sum())
         or cross_information
         <= MIN_RESIDUAL_CORRELATION * (dense_information * sparse_information) ** 0.5
     ):
         return float("inf")
     likelihood_score = (
-        velocities[:, 0].reshape(pose_count, 3) * (fit.target_m - fit.aligned_m)
+        velocities[:, 0].reshape(pose_count, 3) * (fit.target_position_m - fit.aligned_position_m)
     ).sum(axis=1)
-    # The weights must cover more lags than the correlation length of the scores
+    # The Newey-West weights must extend beyond the correlation length of the score
     lag_count = min(
         max(1, MAX_LAG_CORRELATION_LENGTHS * _compute_correlation_length(likelihood_score)),
         pose_count // 4,
@@ -330,8 +358,10 @@ def _compute_half_interval_s(
     score_variance = max(
         uncorrelated_variance + 2.0 * float(lag_weights @ lagged_products), uncorrelated_variance
     )
-    quantile = float(stdtrit(max(pose_count / lag_count - 1.0, 1.0), 0.5 + CONFIDENCE_LEVEL / 2.0))
-    return float(quantile * np.sqrt(score_variance) / dense_information)
+    student_t_quantile = float(
+        stdtrit(max(pose_count / lag_count - 1.0, 1.0), 0.5 + CONFIDENCE_LEVEL / 2.0)
+    )
+    return float(student_t_quantile * np.sqrt(score_variance) / dense_information)
 
 
 def _compute_correlation_length(values: Array) -> int:
@@ -349,16 +379,18 @@ def _refine_offset(
     Return None if too few poses overlap.
     """
     sparse_time_s = sparse_track.time_s
-    gap_limit_s = max(gap_limit(dense_track.time_s), 0.5 * gap_limit(sparse_time_s))
+    gap_limit_s = max(
+        choose_gap_limit_s(dense_track.time_s), 0.5 * choose_gap_limit_s(sparse_time_s)
+    )
     # The same poses are used at every offset, so that the objective is continuous
     is_known = [
         is_bracketed(sparse_time_s + (lag_s + shift), dense_track.time_s, gap_limit_s)
         for shift in (-half_width_s, 0.0, half_width_s)
     ]
     pose_indices = np.flatnonzero(np.all(is_known, axis=0))
-    time_fraction = min(1.0, float(np.ptp(dense_track.time_s) / np.ptp(sparse_time_s)))
+    duration_ratio = min(1.0, float(np.ptp(dense_track.time_s) / np.ptp(sparse_time_s)))
     min_pose_count = max(
-        2 * MIN_POSES, MIN_USED_POSES_FRACTION * time_fraction * len(sparse_time_s)
+        2 * MIN_POSES, MIN_USED_POSES_FRACTION * duration_ratio * len(sparse_time_s)
     )
     if len(pose_indices) < min_pose_count:
         return None
@@ -367,21 +399,21 @@ def _refine_offset(
     sparse_position_m = sparse_track.position_m[pose_indices]
 
     def make_fit(shift_s: float) -> _OffsetFit:
-        target_m = positions_at(dense_track, sparse_time_s + (lag_s + shift_s))
-        # The transform is applied to the sparse trajectory, because a transform of the target could
-        # shrink the target to a point
-        transform = umeyama(sparse_position_m, target_m, with_scale=True)
+        target_position_m = interpolate_positions(dense_track, sparse_time_s + (lag_s + shift_s))
+        # Transform the sparse trajectory, not the target: a fitted scale could shrink the target to
+        # a point
+        transform = umeyama(sparse_position_m, target_position_m, with_scale=True)
         return _OffsetFit(
             lag_s + shift_s,
             transform,
             sparse_time_s,
             transform.apply(sparse_position_m),
-            target_m,
+            target_position_m,
         )
 
     def compute_cost(shift_s: float) -> float:
         fit = make_fit(shift_s)
-        return float(((fit.target_m - fit.aligned_m) ** 2).sum())
+        return float(((fit.target_position_m - fit.aligned_position_m) ** 2).sum())
 
     # The shift from lag_s is optimised: the offset may be 1e9 s (UNIX time minus boot time), so the
     # relative tolerance of the optimiser would be seconds

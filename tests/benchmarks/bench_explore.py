@@ -42,7 +42,7 @@ def main() -> None:
     from explore_tools import ask, show
 
     from px4fuse.diagnose import diagnose
-    from px4fuse.explore.page import html_text
+    from px4fuse.explore.page import make_analysis_page
     from px4fuse.request import ComparisonRequest
 
     program = next(filter(None, map(shutil.which, BROWSERS)), None)
@@ -53,7 +53,7 @@ def main() -> None:
         try:
             analysis = diagnose(ComparisonRequest(log=str(LOG)))
             file = Path(folder, "page.html")
-            file.write_bytes(html_text(analysis).encode())
+            file.write_bytes(make_analysis_page(analysis).encode())
             show(browser, file)
             print(f"page: {file.stat().st_size / 1e6:.2f} MB")
             for knob in ("sigma-a", "sigma-z", "dt", "clock-offset"):

@@ -182,7 +182,9 @@ def follow(analysis: Analysis, request: ComparisonRequest) -> list[Fix]:
         try:
             sent = compare_with_kf(
                 prepare_comparison(
-                    read_flight(request) if request.position else flight, request, keep_as_sent=True
+                    read_flight(request) if request.position else flight,
+                    request,
+                    keep_positions_as_sent=True,
                 )
             )
             fixes.append(

@@ -125,8 +125,8 @@ VALUES: dict[str, Draw] = {
     "roster": one_of("roster.csv"), "worksheet": one_of("sheet.csv"), "column": one_of("grade"),
     "due": one_of("2026-11-20 23:59", "2026-11-20 23:59+01:00", "2020-02-29 00:00 Europe/Berlin"),
     "late": one_of("10%/day", "10%/day up to 50%", "100%/day"),
-    "json_path": one_of("{out}/r.json", "-"), "tum": one_of("{out}/p.tum"),
-    "g2o": one_of("{out}/p.g2o"), "answer": one_of("{out}/a.json"),
+    "json_path": one_of("{out}/r.json", "-"), "tum_path": one_of("{out}/p.tum"),
+    "g2o_path": one_of("{out}/p.g2o"), "answer_key_path": one_of("{out}/a.json"),
     "write_rubric": one_of("{out}/w.toml"),
 }  # fmt: skip
 # Options that need another option, by name of the parameter
@@ -201,9 +201,9 @@ def drawn_words(name: str, command: click.Command, rng: random.Random, out: Path
     chosen = set(rng.sample(sorted(options), min(rng.randrange(6), len(options))))
     chosen |= {NEEDS[one] for one in chosen if one in NEEDS}
     if "assignment" in chosen:
-        chosen &= {"assignment", "secret_file", "mistakes", "no_truth", "answer"}
+        chosen &= {"assignment", "secret_file", "mistakes", "no_truth", "answer_key_path"}
     if arguments == "g.g2o":
-        chosen &= {"g2o", "json_path", "robust"}
+        chosen &= {"g2o_path", "json_path", "robust"}
     if arguments not in ("", "aisle.ulg"):  # the position file is of this flight
         chosen -= {"position", *(one for one in NEEDS if NEEDS[one] == "position")}
     for pair in EXCLUDED:

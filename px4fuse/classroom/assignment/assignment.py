@@ -24,9 +24,9 @@ from px4fuse.classroom.assignment.random_assignment import (
 )
 from px4fuse.classroom.assignment.roster import Person, normalise_text
 from px4fuse.classroom.assignment.truth import compute_form_answers
-from px4fuse.core.input_files import inputs_not_registered
+from px4fuse.core.input_files import suspend_input_registration
 from px4fuse.core.text import to_json_types
-from px4fuse.core.writing import write_all
+from px4fuse.core.writing import write_output_files
 from px4fuse.errors import OutputError
 from px4fuse.results.answer_form import form_name, format_answer_form
 from px4fuse.simulation import flights
@@ -132,7 +132,7 @@ def write_assignment(
     OutputError
         A file exists with other content, or cannot be written.
     """
-    with inputs_not_registered():
+    with suspend_input_registration():
         key = read_answer_key(key_file) if key_file.exists() else AnswerKey(kind, ())
     answers = {normalise_text(answer.student_id): answer for answer in key.answers}
     # an answer key without any of these students was written for another class
@@ -172,9 +172,9 @@ def write_assignment(
             missing_content_by_path[figures_file] = draw_figures(draw_number)
         key = AnswerKey(kind, tuple(answers.values()), stored_secret)
         # the secret must be stored before the log: a restart after an interruption needs it
-        write_all({key_file: format_answer_key(key).encode()})
+        write_output_files({key_file: format_answer_key(key).encode()})
         key_file.chmod(0o600)  # only the instructor can read the answer key
-        write_all(missing_content_by_path)
+        write_output_files(missing_content_by_path)
         written_count += folder / student.log_file_name in missing_content_by_path
         progress(finished_count, len(students))
     return key, written_count

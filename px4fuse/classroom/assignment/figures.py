@@ -106,7 +106,7 @@ def _plot_figures(comparisons: Mapping[str, Comparison]) -> bytes:
     from matplotlib.figure import Figure  # noqa: PLC0415 - slow import
 
     png_buffer = BytesIO()
-    with style.report_style():
+    with style.apply_report_style():
         figure = Figure(figsize=(17.0, 3.6 * len(comparisons)), layout="constrained")
         rows = figure.subplots(len(comparisons), 4, squeeze=False)
         for (title, comparison), axes in zip(comparisons.items(), rows, strict=True):

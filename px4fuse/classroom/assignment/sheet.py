@@ -76,7 +76,7 @@ def read_sheet(path: Path) -> Sheet:
         SettingsError,
         MAX_TABLE_BYTES,
         name=str(path),
-        size_remedy="Give a CSV table with the students of one class only.",
+        remedy_if_too_large="Give a CSV table with the students of one class only.",
     )
     if content.startswith((b"PK\x03\x04", b"\xd0\xcf\x11\xe0")):
         raise SettingsError(f"{path} is a spreadsheet, not a CSV file.", "Save the table as CSV.")

@@ -138,7 +138,8 @@ def compare_simulation(simulation: flights.Simulation) -> Comparison:
     prepared_comparison = prepare_comparison_inputs(
         flight,
         ComparisonRequest(log=flight.log.name, sigma_z_m=SIGMA_Z_M),
-        keep_as_sent=True,  # do not correct frame and clock: the student has to find these faults
+        # do not correct frame and clock: the student has to find these faults
+        keep_positions_as_sent=True,
     )
     return compare(prepared_comparison, run_kf(prepared_comparison))
 

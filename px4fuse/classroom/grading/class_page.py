@@ -16,7 +16,7 @@ from px4fuse.classroom.grading.model import (
     counted_reports,
     list_titles,
 )
-from px4fuse.core.text import count_noun, format_number
+from px4fuse.core.text import format_count, format_number
 from px4fuse.html import frame
 from px4fuse.html.frame import Cell, Column, Row, RowSection
 from px4fuse.html.safe import load_template, make_relative_url
@@ -48,16 +48,16 @@ def format_class_page(grades: Sequence[Grade], title: str, version_text: str) ->
     options = [(tag, f"{tag} ({count_by_tag[tag]})") for tag in tags if count_by_tag[tag]]
     return frame.page(
         title=title,
-        subtitle=f"{count_noun(len(grades), 'student')}, graded with {version_text}",
+        subtitle=f"{format_count(len(grades), 'student')}, graded with {version_text}",
         html_above=_format_statistics(grades, count_by_tag),
         row_nouns=("student", "students"),
         columns=(
             Column("Student"),
-            Column("Id", "line", visible_from="tablet"),
+            Column("Id", "line", min_screen_size="tablet"),
             Column("Status", "rank"),
             Column("Points", "number"),
-            Column("Handed in", "line", visible_from="desk"),
-            Column("Flags", "rank", visible_from="desk"),
+            Column("Handed in", "line", min_screen_size="desk"),
+            Column("Flags", "rank", min_screen_size="desk"),
             *(Column(title, "number", "items") for title in item_titles),
             *(Column(title, "number", "numbers") for title in number_titles),
         ),
@@ -118,7 +118,7 @@ def _make_grade_row(grade: Grade, item_titles: Sequence[str], number_titles: Seq
     status = report.status if report else NO_SUBMISSION_STATUS
     css_class, symbol = STATUS_STYLES[status]
     flag_count = len(grade.flags)
-    flag_count_text = count_noun(flag_count, "flag") if flag_count else ""
+    flag_count_text = format_count(flag_count, "flag") if flag_count else ""
     late_text = f"{math.ceil(grade.lateness_s / 60.0)} min late" if grade.lateness_s else ""
     points_by_title = {item.title: item.points for item in report.items} if report else {}
     number_values = report.numbers if report else {}

@@ -14,7 +14,7 @@ from px4fuse.classroom.grading.model import Grade, GradedReport, Submission
 from px4fuse.classroom.grading.outputs import find_grade_column, write_grading_files
 from px4fuse.classroom.grading.records import RECORDS_FOLDER, load_or_verify
 from px4fuse.classroom.grading.rubric import Rubric, grade_unreadable_file, score_report
-from px4fuse.core.reading import files_by_sha256, max_log_bytes
+from px4fuse.core.reading import hash_files, max_log_bytes
 from px4fuse.core.text import one_line
 from px4fuse.core.workers import JobFailure, run_with_limits
 from px4fuse.errors import ResultsError
@@ -93,7 +93,7 @@ def grade(
             "" if student_index is None else course.class_list.people[student_index].student_id
         )
         jobs.append((submission, submitter_id))
-    rubric_and_key, log_by_sha256 = (course.rubric, course.key), files_by_sha256(course.logs)
+    rubric_and_key, log_by_sha256 = (course.rubric, course.key), hash_files(course.logs)
     records_folder = output / RECORDS_FOLDER
     grade_job = partial(
         grade_submission, *rubric_and_key, log_by_sha256, records_folder, max_log_bytes.get()
@@ -101,7 +101,7 @@ def grade(
     report_by_index: dict[int, GradedReport] = {}
     reused_count = 0
     progress(0, len(found_submissions))
-    with closing(run_with_limits(grade_job, jobs, processes=processes)) as results:
+    with closing(run_with_limits(grade_job, jobs, process_count=processes)) as results:
         for index, result in results:
             if isinstance(result, JobFailure):
                 reason = f"the grading of this file failed: {result.reason}"

@@ -51,10 +51,10 @@ from px4fuse.classroom.grading.records import (
     RECORDS_FOLDER,
     REDRAWN_REPORT_SUFFIX,
 )
-from px4fuse.core.input_files import inputs_not_registered
+from px4fuse.core.input_files import suspend_input_registration
 from px4fuse.core.spreadsheet import neutralise_formulas
 from px4fuse.core.text import join_first, one_line
-from px4fuse.core.writing import write_all
+from px4fuse.core.writing import write_output_files
 from px4fuse.errors import SettingsError
 from px4fuse.html.safe import load_template
 
@@ -157,7 +157,7 @@ def write_grading_files(
         )
         contents[f"{GRADES_FOLDER}/{name}"] = filled_sheet.content()
         notes += sheet_notes
-    write_all({output / name: content for name, content in contents.items()})
+    write_output_files({output / name: content for name, content in contents.items()})
     output_names = dict.fromkeys([*(name.partition("/")[0] for name in contents), OVERRIDES_NAME])
     if has_redrawn_reports:
         output_names[REPORTS_FOLDER] = None
@@ -181,11 +181,11 @@ def _copy_redrawn_report(grade: Grade, stem: str, output: Path) -> Grade:
         record_path.with_suffix, (REDRAWN_REPORT_SUFFIX, DIAGNOSIS_SUFFIX)
     )
     if diagnosis_file.exists():
-        write_all({output / FEEDBACK_FOLDER / f"{stem}.pdf": diagnosis_file.read_bytes()})
+        write_output_files({output / FEEDBACK_FOLDER / f"{stem}.pdf": diagnosis_file.read_bytes()})
     if not redrawn_file.exists():
         return grade
     name = f"{REPORTS_FOLDER}/{stem}.pdf"
-    write_all({output / name: redrawn_file.read_bytes()})
+    write_output_files({output / name: redrawn_file.read_bytes()})
     return replace(grade, counted_report=replace(report, redrawn_report_path=name))
 
 
@@ -197,7 +197,7 @@ def _anonymise_grades(grades: Sequence[Grade], path: Path) -> tuple[list[Grade],
     """
     name_pair_by_identity: dict[str, tuple[str, str]] = {}
     if path.exists():
-        with inputs_not_registered():
+        with suspend_input_registration():
             sheet = read_sheet(path)
         for row in sheet.rows:
             pseudonym, identity, student = (

@@ -12,7 +12,7 @@ from pathlib import Path
 import msgspec
 from msgspec import structs
 
-from px4fuse.core.writing import write_all
+from px4fuse.core.writing import write_output_files
 from px4fuse.errors import ResultsError
 from px4fuse.readers.ulog_topics import ignores_assessed_mark
 from px4fuse.results.contract import ReportedResults, find_file_hashes, to_json
@@ -95,12 +95,14 @@ def load_or_verify(
     stored_verification = replace(verification, redrawn_pdf=b"")
     record = VerificationRecord(dependencies, to_json(results), stored_verification)
     for old_file in records_folder.glob(f"{sha256}.*"):
-        # keep the JSON file until write_all replaces it: another process may read it now, if two
-        # students handed in the same PDF
+        # keep the JSON file until write_output_files replaces it: another process may read it now,
+        # if two students handed in the same PDF
         if old_file.suffix != ".json":
             old_file.unlink(missing_ok=True)
     files[".json"] = msgspec.json.encode(record)
-    write_all({records_folder / f"{sha256}{suffix}": content for suffix, content in files.items()})
+    write_output_files(
+        {records_folder / f"{sha256}{suffix}": content for suffix, content in files.items()}
+    )
     return results, stored_verification, False
 
 

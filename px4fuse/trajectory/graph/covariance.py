@@ -54,12 +54,12 @@ def gate_edges(graph: model.PoseGraph, edge_indices: Sequence[int] | IntArray) -
         Odometry does not connect the vertices of a closure, or an information matrix is singular
         (odometry) or zero (closure).
     """
-    tested_edges = np.asarray(edge_indices, dtype=np.intp)
-    if not len(tested_edges):
+    tested_edge_indices = np.asarray(edge_indices, dtype=np.intp)
+    if not len(tested_edge_indices):
         return []
-    odometry_edges = model.find_odometry_edges(graph, tested_edges)
-    first_nodes = graph.first_nodes[tested_edges]
-    second_nodes = graph.second_nodes[tested_edges]
+    odometry_edges = model.find_odometry_edges(graph, tested_edge_indices)
+    first_nodes = graph.first_nodes[tested_edge_indices]
+    second_nodes = graph.second_nodes[tested_edge_indices]
     first_pose_index = int(min(first_nodes.min(), second_nodes.min()))
     connecting_edges = odometry_edges[
         first_pose_index : int(max(first_nodes.max(), second_nodes.max()))
@@ -73,7 +73,7 @@ def gate_edges(graph: model.PoseGraph, edge_indices: Sequence[int] | IntArray) -
             "Add an odometry edge between these vertices.",
         )
     poses = lie.chain(model.get_odometry_steps(graph, connecting_edges))
-    # all in the axes of the first pose of the odometry chain, so that they can be summed
+    # the covariances of all steps in the axes of the first pose of the chain, to sum them
     step_covariances = _propagate_covariances(
         lie.adjoint(poses[1:]), _compute_covariances(graph, connecting_edges)
     )
@@ -89,9 +89,9 @@ def gate_edges(graph: model.PoseGraph, edge_indices: Sequence[int] | IntArray) -
     relative_poses = lie.between(
         poses[first_nodes - first_pose_index], poses[second_nodes - first_pose_index]
     )
-    residuals = lie.log(lie.between(graph.measurements[tested_edges], relative_poses))
+    residuals = lie.log(lie.between(graph.measurements[tested_edge_indices], relative_poses))
     covariance = _propagate_covariances(lie.right_jacobian_inverse(residuals), covariance)
-    edge_tests = zip(tested_edges.tolist(), residuals, covariance, strict=True)
+    edge_tests = zip(tested_edge_indices.tolist(), residuals, covariance, strict=True)
     return [
         _test_edge(graph, edge_index, edge_residual, edge_covariance)
         for edge_index, edge_residual, edge_covariance in edge_tests
@@ -109,7 +109,7 @@ def _test_edge(
         int(graph.ids[graph.first_nodes[edge_index]]),
         int(graph.ids[graph.second_nodes[edge_index]]),
     )
-    directions, closure_variance = model.information_eigenvectors(graph.information[edge_index])
+    directions, closure_variance = model.compute_observed_directions(graph.information[edge_index])
     degrees_of_freedom = len(closure_variance)
     projected_residual = directions.T @ residual
     residual_covariance = directions.T @ covariance @ directions + np.diag(closure_variance)

@@ -36,11 +36,11 @@ def _initialise_chordal(graph: PoseGraph) -> PoseGraph:
     """Fit rotation matrices and then translations, both by linear least squares."""
     dimension = graph.dimension
     rotation_information = np.trace(graph.information[:, dimension:, dimension:], axis1=1, axis2=2)
-    model.require_connected(graph, rotation_information > 0.0, "edges that measure rotation")
+    model.require_connected(graph, rotation_information > 0.0, "edges with rotation information")
     measured_rotation = lie.rotation_matrix(graph.measurements)
     eye = np.broadcast_to(np.eye(dimension), measured_rotation.shape)
-    # Minimise the sum of weight |Z' R_i' - R_j'|^2 over matrices R, not only rotations; Z is the
-    # measured rotation of the edge from pose i to pose j
+    # Minimise the sum of weight |Z' R_i' - R_j'|^2 (': transpose) over all matrices R, a linear
+    # problem; the nearest rotations follow below. Z: measured rotation from pose i to pose j
     relaxed_rotation = _solve_positions(
         graph,
         measured_rotation.transpose(0, 2, 1),
@@ -50,8 +50,8 @@ def _initialise_chordal(graph: PoseGraph) -> PoseGraph:
         lie.rotation_matrix(graph.poses[0]).T,
     )
     rotation = _find_nearest_rotations(relaxed_rotation.transpose(0, 2, 1))
-    # Residual of an edge in the axes of its measured pose (rotation Z, translation z):
-    # (R_i Z)' (t_j - t_i - R_i z), for poses with rotation R and position t
+    # An edge measures rotation Z and translation z. Its residual translation in the measured axes
+    # of pose j is (R_i Z)' (t_j - t_i - R_i z), for poses with rotation R and position t
     first_rotation = rotation[graph.first_nodes]
     measured_pose_rotation = first_rotation @ measured_rotation
     information = (
@@ -68,26 +68,31 @@ def _initialise_chordal(graph: PoseGraph) -> PoseGraph:
     else:
         poses = np.column_stack([position, Rotation.from_matrix(rotation).as_quat()])
     poses[0] = graph.poses[0]
-    return replace(graph, poses=poses, initialised=model.POSES_FROM_CHORDAL)
+    return replace(graph, poses=poses, initialised=model.INITIAL_POSES_FROM_CHORDAL)
 
 
 def _solve_positions(
     graph: PoseGraph,
-    first_coefficient: Array,
-    second_coefficient: Array,
+    first_pose_coefficient: Array,
+    second_pose_coefficient: Array,
     information: Array,
-    edge_constant: Array,
+    edge_rhs: Array,
     first_pose: Array,
 ) -> Array:
-    """Solve the :class:`NormalEquations` for a known first pose; the result has shape (n, d, k)."""
+    """Solve the :class:`NormalEquations` with the first pose, shape (d, k), fixed.
+
+    Arguments are those of :meth:`NormalEquations.assemble`; the result has shape (n, d, k).
+    """
     edges = np.stack([graph.first_nodes, graph.second_nodes])
     equations = NormalEquations(edges, *first_pose.shape)
     known_poses = np.zeros((len(graph), *first_pose.shape))
     known_poses[0] = first_pose
-    for coefficient, nodes in zip((first_coefficient, second_coefficient), edges, strict=True):
-        edge_constant = edge_constant - coefficient @ known_poses[nodes]
+    for coefficient, nodes in zip(
+        (first_pose_coefficient, second_pose_coefficient), edges, strict=True
+    ):
+        edge_rhs = edge_rhs - coefficient @ known_poses[nodes]
     equation_values, _ = equations.assemble(
-        first_coefficient, second_coefficient, information, edge_constant
+        first_pose_coefficient, second_pose_coefficient, information, edge_rhs
     )
     solution = equations.solve(equation_values)
     if solution is None:

@@ -13,14 +13,14 @@ from numpy.polynomial.polynomial import polyval
 from scipy.spatial.transform import Rotation
 
 from px4fuse.core.arrays import Array
-from px4fuse.trajectory.rotation import from_elements, skew
+from px4fuse.trajectory.rotation import build_matrix, skew
 
 # Maximum angle (rad) for power series instead of quotients, which lose precision at small angles:
 # five terms of the series are accurate to 1e-14
 SMALL_ANGLE_RAD = 0.3
 # Coefficients of the power series in theta^2 of _compute_cot_term and _compute_cot_term_slope
-_COT_TERM_SERIES = (1 / 12, 1 / 720, 1 / 30240, 1 / 1209600, 1 / 47900160)
-_COT_TERM_SLOPE_SERIES = (1 / 360, 1 / 7560, 1 / 201600, 1 / 5987520, 691 / 130767436800)
+_COT_TERM_COEFFICIENTS = (1 / 12, 1 / 720, 1 / 30240, 1 / 1209600, 1 / 47900160)
+_COT_TERM_SLOPE_COEFFICIENTS = (1 / 360, 1 / 7560, 1 / 201600, 1 / 5987520, 691 / 130767436800)
 
 
 def wrap(angle: Array) -> Array:
@@ -38,7 +38,7 @@ def rotation_matrix(pose: Array) -> Array:
     if pose.shape[-1] == 3:
         c = np.cos(pose[..., 2])
         s = np.sin(pose[..., 2])
-        return from_elements((c, -s), (s, c))
+        return build_matrix((c, -s), (s, c))
     return _rotation_of(pose).as_matrix()
 
 
@@ -149,8 +149,8 @@ def right_jacobian_inverse(tangent: Array) -> Array:
     theta = np.linalg.norm(tangent[..., _get_dimension(tangent) :], axis=-1)[..., None, None]
     cot_term = _compute_cot_term(theta)
     half_cot_term_slope = 0.5 * _compute_cot_term_slope(theta)
-    # Power series of x / (1 - exp(-x)) for the matrix x = ad; powers above 4 are replaced with
-    # ad^5 = -2 theta^2 ad^3 - theta^4 ad
+    # Power series of x / (1 - exp(-x)), with the commutator matrix ad for x. Powers above 4 are
+    # eliminated by ad^5 = -2 theta^2 ad^3 - theta^4 ad
     jacobian: Array = (
         np.eye(commutator.shape[-1])
         + 0.5 * commutator
@@ -163,7 +163,7 @@ def _compute_commutator(tangent: Array) -> Array:
     """Return the Lie bracket matrices ad(xi) of tangents xi (Barfoot 2017, 7.33)."""
     if tangent.shape[-1] == 3:
         x, y, theta = np.moveaxis(tangent, -1, 0)
-        return from_elements((0.0, -theta, y), (theta, 0.0, -x), (0.0, 0.0, 0.0))
+        return build_matrix((0.0, -theta, y), (theta, 0.0, -x), (0.0, 0.0, 0.0))
     commutator = np.zeros((*tangent.shape, 6))
     commutator[..., :3, :3] = commutator[..., 3:, 3:] = skew(tangent[..., 3:])
     commutator[..., :3, 3:] = skew(tangent[..., :3])
@@ -182,10 +182,10 @@ def chain(steps: Array) -> Array:
     ndarray, shape (n + 1, 3) or (n + 1, 7)
     """
     poses = np.vstack([identity(steps.shape[-1]), steps])
-    length = 1
-    while length < len(poses):
-        poses[length:] = compose(poses[:-length], poses[length:])
-        length *= 2
+    chained_count = 1
+    while chained_count < len(poses):
+        poses[chained_count:] = compose(poses[:-chained_count], poses[chained_count:])
+        chained_count *= 2
     return poses
 
 
@@ -204,7 +204,7 @@ def _multiply_vectors(matrix: Array, vector: Array) -> Array:
 def _left_jacobian_inverse(phi: Array) -> Array:
     """Return the inverse left Jacobians of SO(2) or SO(3) (Barfoot 2017, 7.37)."""
     if phi.shape[-1] == 1:
-        skew_matrix = from_elements((0.0, -phi[..., 0]), (phi[..., 0], 0.0))
+        skew_matrix = build_matrix((0.0, -phi[..., 0]), (phi[..., 0], 0.0))
     else:
         skew_matrix = skew(phi)
     return (
@@ -219,14 +219,16 @@ def _compute_cot_term(theta: Array) -> Array:
     """Return (1 - theta/2 cot(theta/2)) / theta^2."""
     t = np.where(theta < SMALL_ANGLE_RAD, 1.0, theta)
     exact_value = (1.0 - 0.5 * t / np.tan(0.5 * t)) / t**2
-    return np.where(theta < SMALL_ANGLE_RAD, polyval(theta * theta, _COT_TERM_SERIES), exact_value)
+    return np.where(
+        theta < SMALL_ANGLE_RAD, polyval(theta * theta, _COT_TERM_COEFFICIENTS), exact_value
+    )
 
 
 def _compute_cot_term_slope(theta: Array) -> Array:
-    """Return the derivative of :func:`_compute_cot_term` by theta, divided by theta."""
+    """Return f'(theta) / theta for f = :func:`_compute_cot_term`."""
     t = np.where(theta < SMALL_ANGLE_RAD, 1.0, theta)
     half_cot_derivative = 0.5 / np.tan(0.5 * t) - 0.25 * t / np.sin(0.5 * t) ** 2
     exact_value = -(half_cot_derivative + 2.0 * (1.0 - 0.5 * t / np.tan(0.5 * t)) / t) / t**3
     return np.where(
-        theta < SMALL_ANGLE_RAD, polyval(theta * theta, _COT_TERM_SLOPE_SERIES), exact_value
+        theta < SMALL_ANGLE_RAD, polyval(theta * theta, _COT_TERM_SLOPE_COEFFICIENTS), exact_value
     )

@@ -18,10 +18,10 @@ from px4fuse.trajectory.graph.normal_equations import NormalEquations
 # A measurement does not observe a direction if the eigenvalue of its information matrix (scaled to
 # unit diagonal) is below this limit
 MIN_OBSERVED_EIGENVALUE = 1e-9
-# Sources of the initial poses of a pose graph
-POSES_FROM_FILE = "the file's vertices"
-POSES_FROM_ODOMETRY = "composed odometry edges"
-POSES_FROM_CHORDAL = "chordal initialisation"
+# Texts on the origin of the initial poses of a pose graph
+INITIAL_POSES_FROM_FILE = "the file's vertices"
+INITIAL_POSES_FROM_ODOMETRY = "composition of the odometry edges"
+INITIAL_POSES_FROM_CHORDAL = "chordal initialisation"
 
 
 @dataclass(frozen=True)
@@ -41,8 +41,8 @@ class PoseGraph:
     # Inverse covariance of each measurement, translation before rotation, in the axes of the
     # measured pose; zero in directions that are not measured
     information: Array
-    # Source of the initial poses
-    initialised: str = POSES_FROM_FILE
+    # Origin of the initial poses, as a text such as INITIAL_POSES_FROM_FILE
+    initialised: str = INITIAL_POSES_FROM_FILE
 
     __repr__ = one_line_repr
 
@@ -65,7 +65,7 @@ class PoseGraph:
         edges = np.stack([self.first_nodes, self.second_nodes])
         return NormalEquations(edges, self.degrees_of_freedom)
 
-    def find_successive(self) -> BoolArray:
+    def find_successive_edges(self) -> BoolArray:
         """Return the mask of the edges between successive poses, which are odometry by default."""
         return np.asarray(np.abs(self.first_nodes - self.second_nodes) == 1)
 
@@ -104,11 +104,11 @@ def cost(graph: PoseGraph) -> float:
     return 0.5 * float(np.sum(residuals(graph, graph.poses).chi2))
 
 
-def information_eigenvectors(information: Array) -> tuple[Array, Array]:
-    """Return the directions (columns) that a measurement observes, and the variances along them.
+def compute_observed_directions(information: Array) -> tuple[Array, Array]:
+    """Factorise an information matrix into observed directions (columns) and variances.
 
-    ``information == directions @ diag(1 / variance) @ directions.T``. The matrix is scaled to unit
-    diagonal first, because translation and rotation have different units.
+    ``information == directions @ diag(1 / variance) @ directions.T``. Eigenvectors are those of the
+    matrix scaled to unit diagonal, because translation and rotation have different units.
     """
     scale, scaled_information = scale_to_unit_diagonal(information)
     eigenvalues, eigenvectors = np.linalg.eigh(scaled_information)
@@ -159,7 +159,7 @@ def compose_odometry(graph: PoseGraph) -> PoseGraph:
     poses = lie.compose(
         graph.poses[:1], lie.chain(get_odometry_steps(graph, find_odometry_edges(graph)))
     )
-    return replace(graph, poses=poses, initialised=POSES_FROM_ODOMETRY)
+    return replace(graph, poses=poses, initialised=INITIAL_POSES_FROM_ODOMETRY)
 
 
 def find_odometry_edges(graph: PoseGraph, excluded_edges: IntArray | None = None) -> IntArray:
@@ -167,16 +167,16 @@ def find_odometry_edges(graph: PoseGraph, excluded_edges: IntArray | None = None
 
     Of several edges between two poses the first is used.
     """
-    odometry_edges = np.flatnonzero(graph.find_successive())
+    odometry_edges = np.flatnonzero(graph.find_successive_edges())
     if excluded_edges is not None:
         odometry_edges = np.setdiff1d(odometry_edges, excluded_edges)
-    next_edge = np.full(len(graph) - 1, -1, dtype=np.intp)
-    # Assigned in reverse order: of several edges between two poses, the first remains
+    next_edge_indices = np.full(len(graph) - 1, -1, dtype=np.intp)
+    # NumPy keeps the last of several assignments to one index: in reverse order, the first edge
     odometry_edges = odometry_edges[::-1]
-    next_edge[np.minimum(graph.first_nodes[odometry_edges], graph.second_nodes[odometry_edges])] = (
-        odometry_edges
-    )
-    return next_edge
+    next_edge_indices[
+        np.minimum(graph.first_nodes[odometry_edges], graph.second_nodes[odometry_edges])
+    ] = odometry_edges
+    return next_edge_indices
 
 
 def get_odometry_steps(graph: PoseGraph, edge_indices: IntArray) -> Array:

@@ -18,12 +18,12 @@ from px4fuse.trajectory.graph.model import PoseGraph, Residuals
 # takes minutes
 MAX_GNC_CLOSURES = 1000
 # Key in results.json of the solution by robust optimisation (graduated non-convexity)
-ROBUST_KEY = "gnc"
+ROBUST_SOLUTION_KEY = "gnc"
 # Labels of the pose graph solutions, by the key in results.json
-SOLUTIONS: Mapping[str, str] = {
+SOLUTION_LABELS: Mapping[str, str] = {
     "all": "pose graph, all closures",
     "gated": "pose graph, gated closures",
-    ROBUST_KEY: "pose graph, robust (GNC)",
+    ROBUST_SOLUTION_KEY: "pose graph, robust (GNC)",
 }
 
 
@@ -43,21 +43,23 @@ _FLOAT_EPSILON = float(np.finfo(float).eps)
 _GNC_STAGE_TOLERANCE = 1e-6
 _MAX_GNC_STAGE_ITERATIONS = 20
 
-# Probability that graduated non-convexity does not truncate the residual of a true closure
+# Probability that graduated non-convexity gives a true closure its full weight: sets the bound of
+# its χ²
 GNC_INLIER_PROBABILITY = 0.99
-# Probability that the χ² of a true closure is below the cost of dropping it, so the closure is kept
-KEEP_PROBABILITY = 0.999
+# Probability that a true closure is kept: the cost of dropping it is the χ² quantile at this
+# probability
+KEPT_CLOSURE_PROBABILITY = 0.999
 # Factor on the control parameter of graduated non-convexity per stage (Yang 2020, section V)
 _GNC_CONTROL_FACTOR = 1.4
 _MAX_GNC_STAGES = 100
 # Maximum number of dropped closures that are tested again, each by an optimisation
 _MAX_RETRIED_CLOSURES = 20
 _MAX_TRUNCATION_ROUNDS = 20
-# Information matrices are corrected if they are too large by at least this factor: if 40 % of the
-# closures are false, the factor is estimated as 2.1 although the matrices are correct
+# Information matrices are divided by their estimated scale factor if it is at least this value:
+# false closures alone can cause smaller factors (2.1 if 40 % of the closures are false)
 MIN_INFORMATION_FACTOR = 2.5
-# Minimum number of closures for estimating the factor of the information matrices
-MIN_CLOSURES_FOR_FACTOR = 10
+# Minimum number of closures for estimating the scale factor of the information matrices from d²
+MIN_CLOSURES_FOR_SCALING = 10
 
 
 class Solution(Record, kw_only=True):
@@ -67,7 +69,7 @@ class Solution(Record, kw_only=True):
     cost_initial: NotNegative
     # Half of the weighted sum of the squared Mahalanobis distances at the solution
     cost: NotNegative
-    # Number of accepted steps, over all starts and stages
+    # Number of accepted Levenberg-Marquardt steps in all starts and stages of the solver
     iterations: Count
     # True if the last step changed the cost by less than the tolerance
     converged: bool
@@ -108,24 +110,25 @@ def solve(
         optimisation drops all edges to some poses.
     """
     model.require_connected(graph, np.ones(len(graph.first_nodes), bool), "the edges")
-    may_be_false = ~graph.find_successive() if is_closure is None else is_closure
+    is_possibly_false = ~graph.find_successive_edges() if is_closure is None else is_closure
     start_residuals = model.residuals(graph, graph.poses)
     cost_initial = 0.5 * float(np.sum(start_residuals.chi2))
     if not np.isfinite(cost_initial):
         raise TrajectoryError(
-            "The pose graph contains a pose or measurement that is not finite or too large",
-            "Correct the number, or remove the vertex or edge.",
+            "The cost of the pose graph is not finite: a pose or a measurement is not finite or "
+            "too large",
+            "Correct the number, or remove its VERTEX or EDGE line.",
         )
-    weights = np.ones(len(may_be_false))
-    minimum = _minimise(graph, start_residuals, weights)
-    if robust and np.any(may_be_false):
-        minimum, weights = _solve_gnc(graph, start_residuals, minimum, may_be_false)
+    weights = np.ones(len(is_possibly_false))
+    optimum = _minimise(graph, start_residuals, weights)
+    if robust and np.any(is_possibly_false):
+        optimum, weights = _solve_gnc(graph, start_residuals, optimum, is_possibly_false)
     return Solution(
-        poses=minimum.residuals.poses,
-        cost=0.5 * float(np.sum(weights * minimum.residuals.chi2)),
+        poses=optimum.residuals.poses,
+        cost=0.5 * float(np.sum(weights * optimum.residuals.chi2)),
         cost_initial=cost_initial,
-        iterations=minimum.iterations,
-        converged=minimum.converged,
+        iterations=optimum.iterations,
+        converged=optimum.converged,
         dropped=int(np.count_nonzero(weights < 0.5)),
         weights=weights,
     )
@@ -135,7 +138,7 @@ def _minimise(
     graph: PoseGraph,
     residuals: Residuals,
     weights: Array,
-    tolerance: float = _COST_TOLERANCE,
+    relative_cost_tolerance: float = _COST_TOLERANCE,
     max_iterations: int = MAX_ITERATIONS,
 ) -> _Optimum:
     """Minimise the cost, starting at ``residuals``, like GTSAM's LevenbergMarquardtOptimizer."""
@@ -145,11 +148,13 @@ def _minimise(
     while iterations < max_iterations and cost > _COST_TOLERANCE:
         # Derivatives of the residual: J with respect to x_j, -J A with respect to x_i (J: inverse
         # right Jacobian, A: adjoint of the pose x_i relative to x_j)
-        jacobian = lie.right_jacobian_inverse(residuals.residual)
-        first_jacobian = jacobian @ lie.adjoint(lie.inverse(residuals.relative_poses))
-        values, gradient = graph.normal_equations.assemble(
-            -first_jacobian,
-            jacobian,
+        second_pose_jacobian = lie.right_jacobian_inverse(residuals.residual)
+        first_pose_jacobian = second_pose_jacobian @ lie.adjoint(
+            lie.inverse(residuals.relative_poses)
+        )
+        matrix_values, gradient = graph.normal_equations.assemble(
+            -first_pose_jacobian,
+            second_pose_jacobian,
             weights[:, None, None] * graph.information,
             -residuals.residual[..., None],
         )
@@ -157,14 +162,14 @@ def _minimise(
             cost_decrease = 0.0
             predicted_decrease = 0.0
             is_converged = False
-            step = graph.normal_equations.solve(values, damping)
+            step = graph.normal_equations.solve(matrix_values, damping)
             if step is not None:
                 predicted_decrease = 0.5 * float(np.sum(step * (damping * step + gradient)))
                 trial_residuals = model.residuals(
                     graph, lie.compose(residuals.poses, lie.exp(step[..., 0]))
                 )
                 cost_decrease = cost - float(np.sum(0.5 * weights * trial_residuals.chi2))
-                is_converged = abs(cost_decrease) < tolerance * cost
+                is_converged = abs(cost_decrease) < relative_cost_tolerance * cost
             is_accepted = (
                 predicted_decrease > _FLOAT_EPSILON * cost
                 and cost_decrease > _MIN_GAIN_RATIO * predicted_decrease
@@ -179,60 +184,62 @@ def _minimise(
         cost = cost - cost_decrease
         iterations += 1
         damping /= _DAMPING_FACTOR
-        if cost_decrease <= max(tolerance * cost_before, _COST_TOLERANCE):
+        if cost_decrease <= max(relative_cost_tolerance * cost_before, _COST_TOLERANCE):
             return _Optimum(residuals, iterations, True)
     return _Optimum(residuals, iterations, cost <= _COST_TOLERANCE)
 
 
 def _solve_gnc(
     graph: PoseGraph,
-    start: Residuals,
-    unweighted_minimum: _Optimum,
-    may_be_false: BoolArray,
+    start_residuals: Residuals,
+    unweighted_optimum: _Optimum,
+    is_possibly_false: BoolArray,
 ) -> tuple[_Optimum, Array]:
     """Drop false closures by graduated non-convexity from two starts; use the lower minimum.
 
     A dropped closure is restored if this lowers the truncated least-squares cost.
     """
     degrees_of_freedom = model.count_observed_directions(graph.information)
-    chi2_bound = np.full(len(may_be_false), np.inf)
-    drop_cost = np.zeros(len(may_be_false))
-    is_testable = may_be_false & (degrees_of_freedom > 0)
+    chi2_bound = np.full(len(is_possibly_false), np.inf)
+    drop_cost = np.zeros(len(is_possibly_false))
+    is_testable = is_possibly_false & (degrees_of_freedom > 0)
     half_degrees_of_freedom = degrees_of_freedom[is_testable] / 2.0
     chi2_bound[is_testable] = 2.0 * gammaincinv(half_degrees_of_freedom, GNC_INLIER_PROBABILITY)
-    drop_cost[is_testable] = 2.0 * gammaincinv(half_degrees_of_freedom, KEEP_PROBABILITY)
+    drop_cost[is_testable] = 2.0 * gammaincinv(half_degrees_of_freedom, KEPT_CLOSURE_PROBABILITY)
 
     def compute_truncated_cost(residuals: Residuals, edge_weights: Array) -> float:
         return 0.5 * float(np.sum(np.where(edge_weights > 0.0, residuals.chi2, drop_cost)))
 
-    iteration_count = unweighted_minimum.iterations
+    iteration_count = unweighted_optimum.iterations
     solutions = []
-    for start_residuals in (unweighted_minimum.residuals, start):
-        minimum, weights = _run_gnc(graph, start_residuals, chi2_bound)
-        iteration_count += minimum.iterations
-        solutions.append((compute_truncated_cost(minimum.residuals, weights), minimum, weights))
-    lowest_cost, minimum, weights = min(solutions, key=lambda solution: solution[0])
+    for initial_residuals in (unweighted_optimum.residuals, start_residuals):
+        optimum, weights = _run_gnc(graph, initial_residuals, chi2_bound)
+        iteration_count += optimum.iterations
+        solutions.append((compute_truncated_cost(optimum.residuals, weights), optimum, weights))
+    lowest_cost, optimum, weights = min(solutions, key=lambda solution: solution[0])
     dropped_edges = np.flatnonzero(weights == 0.0)
-    for edge_index in dropped_edges[np.argsort(minimum.residuals.chi2[dropped_edges])][
+    for edge_index in dropped_edges[np.argsort(optimum.residuals.chi2[dropped_edges])][
         :_MAX_RETRIED_CLOSURES
     ]:
         trial_weights = weights.copy()
         trial_weights[edge_index] = 1.0
-        retried_minimum = _minimise(graph, minimum.residuals, trial_weights)
-        iteration_count += retried_minimum.iterations
-        if (cost := compute_truncated_cost(retried_minimum.residuals, trial_weights)) < lowest_cost:
+        retried_optimum = _minimise(graph, optimum.residuals, trial_weights)
+        iteration_count += retried_optimum.iterations
+        if (cost := compute_truncated_cost(retried_optimum.residuals, trial_weights)) < lowest_cost:
             lowest_cost = cost
-            minimum = retried_minimum
+            optimum = retried_optimum
             weights = trial_weights
     model.require_connected(graph, weights > 0.0, "the edges that robust optimisation did not drop")
-    return _Optimum(minimum.residuals, iteration_count, minimum.converged), weights
+    return _Optimum(optimum.residuals, iteration_count, optimum.converged), weights
 
 
-def _run_gnc(graph: PoseGraph, start: Residuals, chi2_bound: Array) -> tuple[_Optimum, Array]:
+def _run_gnc(
+    graph: PoseGraph, start_residuals: Residuals, chi2_bound: Array
+) -> tuple[_Optimum, Array]:
     """Run graduated non-convexity from one start (Yang 2020, algorithm 1, eq. 13 and 14)."""
-    residuals = start
+    residuals = start_residuals
     iteration_count = 0
-    # -1, the minimum, for edges that cannot be false, because their bound is infinite
+    # relative excess of 2 χ² over its bound: -1 (never false) for edges with an infinite bound
     chi2_excess = 2.0 * residuals.chi2 / chi2_bound - 1.0
     if np.max(chi2_excess) > 0.0:
         gnc_control = 1.0 / float(np.max(chi2_excess))
@@ -242,25 +249,25 @@ def _run_gnc(graph: PoseGraph, start: Residuals, chi2_bound: Array) -> tuple[_Op
             weights = np.clip(
                 np.sqrt(gnc_control * (gnc_control + 1.0) / chi2_ratio) - gnc_control, 0.0, 1.0
             )
-            stage_minimum = _minimise(
+            stage_optimum = _minimise(
                 graph, residuals, weights, _GNC_STAGE_TOLERANCE, _MAX_GNC_STAGE_ITERATIONS
             )
-            residuals = stage_minimum.residuals
-            iteration_count = iteration_count + stage_minimum.iterations
+            residuals = stage_optimum.residuals
+            iteration_count = iteration_count + stage_optimum.iterations
             if np.all((weights < 1e-6) | (weights > 1.0 - 1e-6)):
                 break
             gnc_control *= _GNC_CONTROL_FACTOR
     weights = (residuals.chi2 <= chi2_bound).astype(float)
     for _ in range(_MAX_TRUNCATION_ROUNDS):
-        truncated_minimum = _minimise(graph, residuals, weights)
-        residuals = truncated_minimum.residuals
-        iteration_count = iteration_count + truncated_minimum.iterations
+        truncated_optimum = _minimise(graph, residuals, weights)
+        residuals = truncated_optimum.residuals
+        iteration_count = iteration_count + truncated_optimum.iterations
         # the iteration ends, because each round decreases the truncated cost
         new_weights = (residuals.chi2 <= chi2_bound).astype(float)
         if np.array_equal(new_weights, weights):
             break
         weights = new_weights
-    return _Optimum(residuals, iteration_count, truncated_minimum.converged), weights
+    return _Optimum(residuals, iteration_count, truncated_optimum.converged), weights
 
 
 class Graph(Record, kw_only=True):
@@ -281,7 +288,7 @@ class Graph(Record, kw_only=True):
         MIN_INFORMATION_FACTOR. Gate and robust optimisation use the matrices divided by it.
     gates : tuple of GateResult, or Unavailable
         Tests of all edges that are not odometry.
-    solutions : mapping from key of :data:`SOLUTIONS` to Solution
+    solutions : mapping from key of :data:`SOLUTION_LABELS` to Solution
     """
 
     name: str
@@ -314,8 +321,8 @@ def analyse_graph(
     TrajectoryError
         The graph is not connected.
     """
-    is_closure = ~graph.find_successive()
-    progress(f"optimising: {SOLUTIONS['all']}")
+    is_closure = ~graph.find_successive_edges()
+    progress(f"optimising: {SOLUTION_LABELS['all']}")
     solutions = {"all": solve(graph)}
     degrees_of_freedom = int(model.count_observed_directions(graph.information).sum())
     degrees_of_freedom -= (len(graph) - 1) * graph.information.shape[-1]
@@ -329,7 +336,10 @@ def analyse_graph(
     gate_results: tuple[GateResult, ...] | Unavailable
     try:
         gate_results = tuple(gate_edges(graph, np.flatnonzero(is_closure)))
-        if reduced_chi2 > reduced_chi2_interval[1] and len(gate_results) >= MIN_CLOSURES_FOR_FACTOR:
+        if (
+            reduced_chi2 > reduced_chi2_interval[1]
+            and len(gate_results) >= MIN_CLOSURES_FOR_SCALING
+        ):
             factor = min(reduced_chi2, _estimate_information_factor(gate_results))
             if factor >= MIN_INFORMATION_FACTOR:
                 information_factor = factor
@@ -343,8 +353,8 @@ def analyse_graph(
     if closure_count > 1 and (
         closure_count <= MAX_GNC_CLOSURES if run_robust is None else run_robust
     ):
-        progress(f"optimising: {SOLUTIONS[ROBUST_KEY]}")
-        solutions[ROBUST_KEY] = solve(scaled_graph, robust=True, is_closure=is_closure)
+        progress(f"optimising: {SOLUTION_LABELS[ROBUST_SOLUTION_KEY]}")
+        solutions[ROBUST_SOLUTION_KEY] = solve(scaled_graph, robust=True, is_closure=is_closure)
     results = Graph(
         name=name,
         dimension=graph.dimension,
@@ -361,8 +371,9 @@ def analyse_graph(
 
 
 def _estimate_information_factor(gate_results: tuple[GateResult, ...]) -> float:
-    """Estimate a common factor of all information matrices from the d² of the closures.
+    """Estimate the factor by which all information matrices are too large.
 
+    The factor is the median ratio of the d² of a closure to the expected median of its d².
     The median is robust against false closures if they are a minority.
     """
     chi2_medians = chdtri([gate.degrees_of_freedom for gate in gate_results], 0.5)
