@@ -47,7 +47,7 @@ def test_diagnosis_text_has_at_most_40_lines() -> None:
 def test_diagnosis_text_below_95_columns_has_ratios_without_plot() -> None:
     card = replace(SMALL_SIGMA_A, causes=())
     wide, narrow = (
-        [text for line in card_text.card_lines(card) for text in line.wrap(width)]
+        [text for line in card_text.format_card_lines(card) for text in line.wrap(width)]
         for width in (95, 80)
     )
     assert any("─░" in text for text in wide)

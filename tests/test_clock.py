@@ -318,7 +318,9 @@ def test_time_offset_maximises_joint_likelihood_of_flight_parts(monkeypatch, off
         make_position_batches=lambda grid: grid,
         measurement_weights=None,
     )
-    parts, p = time_offset._estimate_part_offsets(moved, offset_s, NoiseParameters(0.1, 0.1), 1.0)
+    parts, p = time_offset._estimate_flight_part_offsets(
+        moved, offset_s, NoiseParameters(0.1, 0.1), 1.0
+    )
     # the last part has a σ above the limit
     assert [(part.start_s, part.end_s) for part in parts] == [(0.0, 1.0), (2.0, 3.0), (4.0, 5.0)]
     assert [part.offset_s for part in parts] == pytest.approx(offset_s + shift[:3])

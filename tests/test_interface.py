@@ -211,6 +211,6 @@ def test_python_write_report_to_wrong_suffix_is_rejected(
         with pytest.raises(px4fuse.Px4FuseError, match="Give a name ending in"):
             function(analysis, tmp_path / name)
     bare = dataclasses.replace(analysis, request=None)
-    with pytest.raises(px4fuse.Px4FuseError, match="did not make the analysis"):
+    with pytest.raises(px4fuse.Px4FuseError, match="needs the settings of the analysis"):
         px4fuse.write_report(bare, tmp_path / "x.pdf")
     assert list(tmp_path.iterdir()) == []

@@ -94,7 +94,7 @@ def test_file_search_by_sha256_ignores_special_and_huge_files(desk, monkeypatch,
 
     def verify_nothing(work, reports, **_):
         (report,) = reports
-        found.append(work.keywords["logs"][log_sha256(report)])
+        found.append(work.keywords["path_by_sha256"][log_sha256(report)])
         yield 0, Verification("verified", (), with_log=True, page_status="same")
 
     monkeypatch.setattr(workers, "run_with_limits", verify_nothing)

@@ -32,6 +32,7 @@ from px4fuse.report import event_marks
 from px4fuse.report.page import Page, draw_legend_above, make_two_columns
 from px4fuse.report.panels import normalised_innovations
 from px4fuse.report.phrases import (
+    MIN_WHITENESS_P_VALUE,
     VERDICT_TABLE_HEAD,
     format_noise_estimate,
     format_settings,
@@ -54,8 +55,6 @@ MAX_DRAWN_SIGMAS = 4.0
 HISTOGRAM_EDGES = np.linspace(-MAX_DRAWN_SIGMAS, MAX_DRAWN_SIGMAS, 33)
 # Upper limit of the density axis; a higher one would make the normal density (up to 0.4) flat
 MAX_DENSITY_AXIS_LIMIT = 1.6
-# Below this p value of the Ljung-Box test, innovations are called "not white"
-MIN_WHITENESS_P_VALUE = 0.01
 RUNNING_NIS_HEIGHT = 140.0  # height (points) of the axes of the running mean NIS
 DISTRIBUTION_HEIGHT = 150.0  # height (points) of the axes of distribution and autocorrelation
 LEGEND_HEIGHT = 14.0  # height (points) of a legend above the axes
