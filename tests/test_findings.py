@@ -601,7 +601,7 @@ def test_explain_command_prints_meaning_and_example_of_fault(typed, monkeypatch,
 
 def test_explain_command_states_if_detection_rate_is_unknown(monkeypatch, capsys) -> None:
     _, out, _ = run_main(monkeypatch, capsys, "explain", "not_px4")
-    assert "detection are not measured" in out
+    assert "detection have not been measured" in out
 
 
 def test_explain_command_without_argument_lists_all_faults(monkeypatch, capsys) -> None:
