@@ -306,7 +306,7 @@ class TestAssign:
             1,
         )
 
-    def test_assign_flights_can_be_repeated_if_key_was_not_written(self, tmp_path):
+    def test_assignment_can_be_repeated_if_answer_key_is_missing(self, tmp_path):
         folder, key_file = tmp_path / "flights", tmp_path / "key.json"
         key_file.mkdir()
         with pytest.raises(SettingsError):

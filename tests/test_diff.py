@@ -210,7 +210,7 @@ def test_diff_of_aiding_sources_excludes_the_position_source(clean):
     assert "ev_pos" in {path.split(".")[1] for path in found}
 
 
-def test_diff_of_axis_in_only_one_input_lists_its_numbers(clean):
+def test_diff_lists_numbers_of_axis_that_only_one_input_has(clean):
     part = as_input(replace(clean.results, axes={"north": clean.results.axes["north"]}))
     found = by_path(list_changes(clean, part))
     assert found["axes.down.filters.kf.nis_mean"][1] is None

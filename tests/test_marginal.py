@@ -348,7 +348,7 @@ def with_gap() -> Axis:
 
 
 @pytest.mark.parametrize("interval", [0.1, 0.2, 0.5, None])
-def test_banded_likelihood_equals_likelihood_of_kf_innovations(interval: float | None) -> None:
+def test_likelihood_by_banded_matrix_equals_kf_likelihood(interval: float | None) -> None:
     """Intervals of one step (singular Q), of several steps, and with an IMU gap."""
     axis, chosen = with_gap(), Settings()
     if interval is not None:

@@ -1,4 +1,4 @@
-"""Tracks of a position file and of its references (EKF2 or IMU), in north, east, down."""
+"""Tracks to align: that of a position file, and that of EKF2 or the IMU, in north, east, down."""
 
 from dataclasses import dataclass, replace
 

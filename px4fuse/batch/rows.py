@@ -99,7 +99,7 @@ def collect_finding_values(findings: Iterable[Finding], aids: Mapping[str, AidRe
 
 
 def collect_card_values(card: Card) -> Row:
-    """Return the values of the table columns about the diagnosis of a flight."""
+    """Return headline, cause, action and σ ratios of a flight for the table of batch."""
     rmse_values_m = card.effect.position_rmse_m.values() if card.effect else ()
     return {
         "severity": card.severity,

@@ -46,8 +46,8 @@ JITTER_RATIO_LIMITS = 0.6, 1.5
 MIN_JITTER_FRACTION = 0.4
 # Minimum ratio of an estimate to its σ, to report jitter or noise that increases with speed
 MIN_SIGNIFICANCE_SIGMAS = 6.0
-# Noise must correlate with speed also inside the parts of a flight: number of parts, and minimum
-# median of correlation / σ
+# Noise grows with speed only if both also correlate within parts of the flight: number of parts,
+# and minimum of the median over the parts of correlation / σ of the correlation
 FLIGHT_PART_COUNT, MIN_PART_CORRELATION_SIGMAS = 5, 1.2
 # Quantiles of the speed: below the first, the vehicle is slow; above the second, it is fast
 SLOW_SPEED_QUANTILE, FAST_SPEED_QUANTILE = 0.3, 0.7

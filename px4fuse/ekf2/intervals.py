@@ -34,8 +34,8 @@ from px4fuse.ekf2.replay_segments import (
 )
 from px4fuse.trajectory.rotation import rotate, skew
 
-# EKF2 fuses no sample with fusion horizon - measurement time > this time (s): pop_first_older_than
-# (RingBuffer.h)
+# EKF2 discards a sample that was measured more than this time (s) before the fusion horizon:
+# pop_first_older_than (RingBuffer.h)
 MAX_LATENESS_S = 0.1
 # A sample is late if fusion horizon - measurement time > this time (s), which is an error of 3 cm
 # at 1 m/s

@@ -55,7 +55,8 @@ COARSE_MEASUREMENT_COUNT = 1000
 # Minimum log-likelihood gain of time-correlated over white noise in the coarse search. Below it, no
 # full fit is run
 MIN_COARSE_LIKELIHOOD_GAIN_NATS = 0.5
-# An estimated SIGMA_Z below this limit (m) suggests that the source low-pass filters its positions
+# If the estimated position noise (SIGMA_Z) is below this limit (m), the source probably low-pass
+# filters its positions
 MAX_LOW_PASS_SIGMA_Z_M = 0.01
 # Minimum log-likelihood gain of time-correlated over white noise to report time-correlated noise
 MIN_LIKELIHOOD_GAIN_NATS = 2.0

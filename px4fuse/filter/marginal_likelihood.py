@@ -505,7 +505,9 @@ class BandedSystem:
         return whitened_increments, (state_projection.T / diagonal).reshape(*dp.shape[:-1], -1)
 
     def solve(self, measured_m: Array, dp: Array, dv: Array) -> Array:
-        """Estimate the states from measured positions, Δp and Δv; shape (..., m, states).
+        """Estimate the states; shape (..., number of measurements, number of states).
+
+        ``dp`` and ``dv`` are the increments of position and velocity from the IMU.
 
         The states are position (m), velocity (m/s) and time-correlated noise (m), if any.
         """

@@ -42,7 +42,7 @@ def make_transition_matrix(dt_s: float | Array) -> Array:
 
 
 def compute_unit_process_noise(dt_s: T) -> SymmetricElements[T]:
-    """Return Q / (SIGMA_A² · DT) of a prediction step of ``dt_s``: elements 00, 01, 11."""
+    """Return elements 00, 01, 11 of Q / (SIGMA_A² · DT) for a prediction over ``dt_s`` (s)."""
     return dt_s**3 / 4.0, dt_s**2 / 2.0, dt_s
 
 

@@ -46,7 +46,7 @@ _MICROSECOND_S = 1e-6
 # not boot time: GPS topics before v1.16 contain receiver time, ground truth in v1.13 contains 0
 MAX_PUBLICATION_LAG_S = 10.0
 # Samples more than this time (s) before or after the IMU data are invalid
-MAX_TIME_OUTSIDE_S = 2.0
+MAX_TIME_OUTSIDE_IMU_S = 2.0
 # ULog info message with a note from the author of the log to its users
 NOTE_KEY = "px4fuse_note"
 # ULog info message which states that the log is an assignment for a student
@@ -244,8 +244,10 @@ class Topics:
                 row[~(np.abs(row) < MAX_FIELD_VALUE)] = np.nan  # damaged values
         index = time_index((time_us[kept_rows] - self.time_origin_us) * _MICROSECOND_S)
         samples = pd.DataFrame(values.T, index, list(fields), copy=False)
-        end_s = self.log.duration_s + MAX_TIME_OUTSIDE_S
-        return samples if is_step_function else rows_between(samples, -MAX_TIME_OUTSIDE_S, end_s)
+        end_s = self.log.duration_s + MAX_TIME_OUTSIDE_IMU_S
+        return (
+            samples if is_step_function else rows_between(samples, -MAX_TIME_OUTSIDE_IMU_S, end_s)
+        )
 
     def read(self, *layouts: Layout, is_step_function: bool = False) -> pd.DataFrame:
         """Read the first layout whose required fields are in the log; empty without them."""

@@ -135,7 +135,7 @@ def list_verdict_warnings(comparison: Comparison) -> list[str]:
     if comparison.source.origin.may_drift:
         notes.append(
             "The position source may drift. The verdicts compare each filter with the source, "
-            "not with the true position. Check the error with ground truth or a loop."
+            "not with the true position. Check the error with ground truth or a loop closure."
         )
     correlated_filter_texts = [
         f"{filter_name} along {axis}, lag-1 autocorrelation {consistency.lag1_autocorrelation:+.2f}"

@@ -26,8 +26,8 @@ from px4fuse.trajectory.model import MIN_POSES, Trajectory, cumulative_distance
 from px4fuse.trajectory.scores import Delta, RelativeError, RmseInterval, Statistics
 from px4fuse.trajectory.time_offset import TimeOffset, compute_clock_offset_s, estimate_time_offset
 
-# Maximum rotation (rad) from the first orientation of a trajectory with constant orientation: files
-# contain rounded numbers
+# An orientation is constant if no pose is rotated from the first one by more than this angle (rad),
+# which is above 0, because files contain rounded numbers
 MAX_CONSTANT_ROTATION_RAD = 1e-6
 # Minimum number of poses and minimum motion (m) for the conclusion that a constant orientation was
 # not measured

@@ -247,6 +247,6 @@ def derive_seed_from_secret(text: str, source_name: str) -> bytes:
 
 
 def derive_hmac_key(secret: str) -> bytes:
-    """Derive the HMAC key of the random numbers by scrypt (RFC 7914), so that guessing is slow."""
+    """Derive the key of the random generator from the secret; scrypt (RFC 7914) slows guessing."""
     text = secret.encode(errors="replace")
     return hashlib.scrypt(text, salt=HMAC_LABEL.encode(), n=2**14, r=8, p=1, dklen=32)

@@ -15,7 +15,7 @@ QuestionAndAnswer = tuple[str, str]
 
 
 def format_questions(grades: Sequence[Grade], key: AnswerKey, count: int) -> str:
-    """Format ``count`` questions with expected answers for each student with answers."""
+    """Format ``count`` questions and their right answers for each student with an answer form."""
     lines = [f"Questions for an oral check: {count} per student, with the expected answers."]
     for grade in grades:
         report = grade.counted_report
