@@ -166,7 +166,7 @@ def make_cause(
         alternatives=alternative_groups,
         actions=actions,
         reruns=tuple(_make_rerun(trial, trials) for trial in trials if can_show_effect(trial)),
-        after=_format_closing_sentence(analysis, useful_trials, alternative_groups),
+        after=_format_closing_sentence(analysis, useful_trials, alternative_groups, actions),
     )
 
 
@@ -374,12 +374,17 @@ def _format_closing_sentence(
     analysis: Analysis,
     useful_trials: Sequence[Trial],
     alternative_groups: Sequence[tuple[Action, ...]],
+    actions: Sequence[Action],
 ) -> str:
     if alternative_groups:
+        needs_delay_max = any("EKF2_DELAY_MAX" in action.sentence for action in actions)
         return (
-            "Shift the timestamps or change the delay parameter, not both: each corrects the same "
-            "time offset. Take all other actions, too. If timestamps are 0.2 s late, the delay "
-            "parameter is 200 ms and --clock-offset is -0.2 s."
+            "Correct the sender or the delay parameter, not both: each corrects the same time "
+            "offset of the next flights. "
+            + "Both need the larger EKF2_DELAY_MAX. "
+            * needs_delay_max
+            + "--clock-offset corrects only this analysis. Late timestamps need a positive delay "
+            "parameter and a negative --clock-offset."
         )
     if any(trial.kinds == ("defaults",) for trial in useful_trials):
         return "KF is consistent with the default noises as well as with the estimated noises."

@@ -299,7 +299,7 @@ def _format_rerun_table(reruns: Sequence[Rerun]) -> Iterator[Paragraph]:
         cells = (f"{cell:{width}}" for cell, width in zip(row, widths, strict=True))
         yield Paragraph(f"  {'  '.join(cells)}".rstrip())
     if note := format_rerun_note(reruns):
-        yield Paragraph(f"  {note}")
+        yield from _wrap_lines(note, "  ", "  ")
 
 
 def rerun_columns(reruns: Sequence[Rerun]) -> list[tuple[str, ...]]:
@@ -328,7 +328,7 @@ def format_rerun_note(reruns: Sequence[Rerun]) -> str:
         return ""
     return (
         "EKF2 (replay) is a prediction by px4fuse's model of EKF2. Its statistics exclude gaps and "
-        f"the time before {min(starts_s):.0f} s."
+        f"the time before {min(starts_s):.0f} s, so they differ from those of the flight."
     )
 
 

@@ -358,7 +358,7 @@ def _draw_map(page: Page, analysis: Analysis, flight_map: FlightMap, height: flo
         if distance_m > 0.0:
             distance_texts.append(f"{name} {format_metres(distance_m)} m")
     if distance_texts:
-        title = f"Map; largest distance of tracks from the map: {', '.join(distance_texts)}"
+        title = f"Map; largest distance outside the map: {', '.join(distance_texts)}"
         axes_height = height - _find_title_height(page, title) - HEIGHTS_BELOW_AXES[True]
         limits = _compute_map_limits(tracks, width / axes_height)
     axes = _add_panel(page, title, axes_height)
