@@ -19,7 +19,7 @@ pytestmark = pytest.mark.reallogs
 
 NOT_CARRIED = {
     "v1.16.1_aisle_2hz_stock": "never fused the horizontal position",
-    "v1.16.1_aisle_hwlog": "estimator_aid_src_ev_pos has a sample interval",
+    "v1.16.1_aisle_hwlog": "estimator_aid_src_ev_pos is logged every",
 }
 # the reasons are in test_gnss.py
 GNSS_NOT_CARRIED = ("v1.13.3_gps_profile1", "v1.14.4_gps_magdist")

@@ -230,9 +230,9 @@ def test_outlier_burst_is_not_reported_as_position_jump() -> None:
 
 def test_time_offset_is_not_reported_as_low_pass_filter() -> None:
     late = flown("clock-offset=250ms", passes=6)
-    assert late.source_low_pass.likelihood_gain_nats == 0.0
+    assert late.source_low_pass.gain_nats == 0.0
     _, low_pass, _ = _fit_source_errors(late, late.tuning, unavailable("clock offset"))
-    assert low_pass.likelihood_gain_nats > 3.0
+    assert low_pass.gain_nats > 3.0
 
 
 # ------------------------------------------------------------------ arrival times

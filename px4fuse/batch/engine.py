@@ -100,7 +100,7 @@ def run_jobs(
         The connection to the scheduler was lost.
     """
     if client is None:
-        for index, result in run_job_list(jobs, processes=processes):
+        for index, result in run_job_list(jobs, process_count=processes):
             yield jobs[index], result
         return
     from distributed import as_completed  # noqa: PLC0415
@@ -136,5 +136,5 @@ def _run_task(
     """Run the jobs of one Dask task in sequence, in a child process of the Dask worker."""
     # a Dask worker is a daemon process by default, which Python does not allow to start processes
     multiprocessing.current_process().daemon = False
-    results_by_index = dict(run_job_list(jobs, processes=1))
+    results_by_index = dict(run_job_list(jobs, process_count=1))
     return [results_by_index[index] for index in range(len(jobs))]

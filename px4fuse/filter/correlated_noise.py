@@ -96,7 +96,7 @@ class SourceLowPass:
         Correlation of the noise of successive positions; 0 without a low-pass filter.
     lag_s : float
         Lag of the positions at constant velocity.
-    likelihood_gain_nats : float
+    gain_nats : float
         Gain of log-likelihood over the model with white noise.
     sigma_z_m : float
         Standard deviation of the white position noise before the low-pass filter.
@@ -104,7 +104,7 @@ class SourceLowPass:
 
     correlation: float
     lag_s: float
-    likelihood_gain_nats: float
+    gain_nats: float
     sigma_z_m: float
 
 
@@ -118,9 +118,9 @@ class TimeCorrelatedNoise:
         Correlation time with its 95 % interval; ``high_s`` is infinite without ground truth.
     slow_m, white_m : float
         Standard deviations of time-correlated and white noise, per axis.
-    likelihood_gain_nats : float
+    gain_nats : float
         Gain of log-likelihood over white noise alone.
-    low_pass_likelihood_gain_nats : float
+    low_pass_gain_nats : float
         Log-likelihood of the model with a low-pass filter minus that with time-correlated noise.
     """
 
@@ -129,8 +129,8 @@ class TimeCorrelatedNoise:
     high_s: float
     slow_m: float
     white_m: float
-    likelihood_gain_nats: float
-    low_pass_likelihood_gain_nats: float
+    gain_nats: float
+    low_pass_gain_nats: float
 
 
 def fit_time_correlation(  # noqa: PLR0915 (two models with common data)
@@ -315,10 +315,10 @@ def fit_time_correlation_to_truth(
     white noise is larger.
     """
     min_likelihood_gain_nats = MIN_TRUTH_LIKELIHOOD_GAIN_NATS
-    low_pass_likelihood_gain_nats = low_pass.likelihood_gain_nats
+    low_pass_gain_nats = low_pass.gain_nats
     if isinstance(imu_fit, TimeCorrelatedNoise):
-        min_likelihood_gain_nats = max(MIN_TRUTH_LIKELIHOOD_GAIN_NATS, imu_fit.likelihood_gain_nats)
-        low_pass_likelihood_gain_nats = imu_fit.low_pass_likelihood_gain_nats
+        min_likelihood_gain_nats = max(MIN_TRUTH_LIKELIHOOD_GAIN_NATS, imu_fit.gain_nats)
+        low_pass_gain_nats = imu_fit.low_pass_gain_nats
     true_track = pd.concat([truth["position_m"] for truth in truths], axis=1).dropna()
     measurement_time_s = np.setdiff1d(axes[0].measurement_time_s, outlier_time_s)
     measurement_time_s = measurement_time_s[
@@ -402,7 +402,7 @@ def fit_time_correlation_to_truth(
         )
     )
     return TimeCorrelatedNoise(
-        *np.r_[tau_s, sigmas_m, likelihood_gains_nats.max(), low_pass_likelihood_gain_nats].tolist()
+        *np.r_[tau_s, sigmas_m, likelihood_gains_nats.max(), low_pass_gain_nats].tolist()
     )
 
 

@@ -286,13 +286,13 @@ def tune_axes(
     final_parameters = NoiseParameters(
         kf_sigma_a.value or kf_sigma_a.high or kf_fit.noise_parameters.sigma_a_m_s2, final_sigma_z_m
     )
-    likelihood_gain_nats = kf_fit.score(current_parameters) - kf_fit.score(final_parameters)
+    gain_nats = kf_fit.score(current_parameters) - kf_fit.score(final_parameters)
     return AxisTuning(
         name=name,
         **sigma_a.as_fields("sigma_a_m_s2"),
         **sigma_z.as_fields("sigma_z_m"),
         **kf_sigma_a.as_fields("sigma_a_two_state_m_s2"),
-        log_likelihood_gain_per_measurement=likelihood_gain_nats / measurement_count,
+        log_likelihood_gain_per_measurement=gain_nats / measurement_count,
         before=_assess_kf_consistency(preintegrated_motions[0], current_parameters, is_outlier),
         after=_assess_kf_consistency(preintegrated_motions[0], final_parameters, is_outlier),
         outlier_time_s=all_measurement_time_s[is_outlier],

@@ -59,10 +59,10 @@ def detect_time_correlated_noise(analysis: Analysis) -> Findings:
     noise = analysis.time_correlated_noise
     if (
         not isinstance(noise, TimeCorrelatedNoise)
-        or noise.likelihood_gain_nats < MIN_CORRELATED_LIKELIHOOD_NATS
+        or noise.gain_nats < MIN_CORRELATED_LIKELIHOOD_NATS
         or noise.slow_m < MIN_CORRELATED_SIGMA_M
         # a low-pass filtered source has its own finding
-        or noise.low_pass_likelihood_gain_nats >= MIN_LAG_LIKELIHOOD_NATS
+        or noise.low_pass_gain_nats >= MIN_LAG_LIKELIHOOD_NATS
     ):
         return
     tau_low_text, tau_high_text = (format_number(end, 1) for end in (noise.low_s, noise.high_s))

@@ -154,7 +154,7 @@ def find_low_pass(analysis: Analysis) -> SourceLowPass | None:
         or source.origin.reconstructed
         or not _has_valid_time_offset(analysis)
         or not isinstance(low_pass, SourceLowPass)
-        or low_pass.likelihood_gain_nats < MIN_LOW_PASS_LIKELIHOOD_NATS
+        or low_pass.gain_nats < MIN_LOW_PASS_LIKELIHOOD_NATS
         or low_pass.lag_s < MIN_LAG_S
     ):
         return None
@@ -171,7 +171,7 @@ def find_low_pass(analysis: Analysis) -> SourceLowPass | None:
     # A low-pass filter delays positions: correlated errors without lag have another cause
     if (
         isinstance(correlated_noise, TimeCorrelatedNoise)
-        and correlated_noise.low_pass_likelihood_gain_nats < MIN_LAG_LIKELIHOOD_NATS
+        and correlated_noise.low_pass_gain_nats < MIN_LAG_LIKELIHOOD_NATS
     ):
         return None
     return low_pass

@@ -92,7 +92,7 @@ def flown_errors_m(before: FlownFlight, after: FlownFlight, found: WhatIf) -> tu
     assert isinstance(ekf2, Ekf2)
     lift_off_s = [flown.flight.airborne[0][0] for flown in (before, after)]  # type: ignore[index]
     shift_s = lift_off_s[1] - lift_off_s[0]
-    spans = [(begin + shift_s, end + shift_s) for begin, end in found.find_evaluated_spans()]
+    spans = [(begin + shift_s, end + shift_s) for begin, end in found.evaluated_s]
     times = ekf2.state.index[is_inside_spans(ekf2.state.index, tuple(spans))].to_numpy()
     north, east, down = (
         compute_rmse_to_truth(

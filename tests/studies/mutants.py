@@ -306,7 +306,7 @@ def main() -> None:
         verdicts = []
         for mutant, verdict in zip(drawn, pool.map(judge, drawn), strict=True):
             verdicts.append((mutant.path.split("/")[1], verdict))
-            print(f"{verdict:9} {mutant.told()}", flush=True)
+            print(f"{verdict:9} {mutant.describe()}", flush=True)
     rooms, kinds = zip(*verdicts, strict=True)
     print(pd.crosstab(pd.Series(rooms, name="room"), pd.Series(kinds, name=""), margins=True))
 
