@@ -85,7 +85,7 @@ LEFT_OUT = f"not ({' or '.join((*MARKED_FILES, 'reallogs'))})"
 
 
 @pytest.hookimpl(tryfirst=True)
-def pytest_collection_modifyitems(items: list[pytest.ItemScore]) -> None:
+def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
     """Mark the tests of each file in ``MARKED_FILES``."""
     markers = {
         f"test_{name}.py": mark for mark, names in MARKED_FILES.items() for name in names.split()
@@ -114,7 +114,7 @@ def pytest_collection_finish() -> None:
     gc.freeze()
 
 
-def pytest_runtest_teardown(item: pytest.ItemScore, nextitem: pytest.ItemScore | None) -> None:
+def pytest_runtest_teardown(item: pytest.Item, nextitem: pytest.Item | None) -> None:
     """Clear the caches of a test file after its last test, because analyses are large.
 
     Commands change the garbage collection of their process, which is that of the tests here.

@@ -541,9 +541,3 @@ def assert_killed_scheduler_prints_one_line(address, tmp_path):
     assert said.startswith("px4fuse: the connection to the Dask scheduler was lost")
     assert said.endswith("Results of finished logs are kept. Run the same command to continue.\n")
     assert said.count("\n") == 1
-
-
-def test_run_jobs_in_worker_process_yields_each_job_with_result() -> None:
-    """Other tests replace the worker processes, so they do not see wrong arguments of them."""
-    run_in_processes = partial(run_with_limits, abs, timeout_s=60.0)
-    assert sorted(run_jobs(None, run_in_processes, [-1, 2], 1)) == [(-1, 1), (2, 2)]
