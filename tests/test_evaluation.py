@@ -472,6 +472,17 @@ def test_evaluate_with_implausible_arguments_gives_warnings() -> None:
         assert said in evaluate(estimate, reference, **how).warnings[0]
 
 
+def test_evaluate_late_estimate_along_a_line_has_ate_and_warnings() -> None:
+    reference = flight()
+    line_m = np.cumsum(1.0 + np.sin(0.3 * (reference.time_s - reference.time_s[0])) ** 2)
+    line_m = line_m[:, None] * np.array([0.02, 0.0, 0.0])
+    reference = replace(reference, position_m=line_m)
+    late = replace(reference, time_s=reference.time_s + 0.5, kind="slam", frame="camera")
+    got = evaluate(late, reference)
+    assert any("With -0.5" in warning for warning in got.warnings)
+    assert any("The best fit is used" in warning for warning in got.warnings)
+
+
 # -- clocks ----------------------------------------------------------------------------------------
 
 

@@ -76,7 +76,7 @@ HEIGHT_NEUTRAL_PREFIXES = (
     "EKF2_GPS_P_GATE",
     "EKF2_GPS_DELAY",
 )
-# Initial σ (m/s²) of the accelerometer bias, which EKF2 has already estimated on the ground
+# Initial σ (m/s²) of the accelerometer bias: small, because EKF2 estimated the bias on the ground
 INITIAL_BIAS_SIGMA_M_S2 = 0.01
 # Factors on the GNSS velocity variance, NED: EKF2 multiplies the vertical σ by 1.5
 # (gps_control.cpp)

@@ -581,8 +581,8 @@ def _read_logged_decisions(
         return rejected_flags, is_reset
     delay_s = fill_with_defaults(fusion_record.parameters, aid)[aid.delay] * 1e-3
     measurement_times_s = timestamp_s - delay_s - 0.5 * ekf2.step_s
-    # EKF2 fuses a sample when the fusion horizon reaches its measurement time, or when it arrives
-    # if that is later
+    # EKF2 fuses a sample when the fusion horizon reaches the measurement time of the sample. If the
+    # sample arrives later than that, EKF2 fuses it on arrival
     fusion_due_s = np.maximum.accumulate(np.maximum(measurement_times_s, arrival_s - horizon_s))
     aid_rows = ekf2.aids[aid.name].samples
     # Each row contains the time of EKF2's last fusion or reset (last_fused_s). EKF2 rejected all

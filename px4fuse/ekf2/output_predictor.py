@@ -72,7 +72,8 @@ def compute_published_state(
     imu_increments *= 0.5
     imu_increments += velocity_m_s[:-1]
     imu_increments *= step_s
-    # without resets: a reset shifts all buffered outputs, so the predictor has no error to correct
+    # Resets are removed from the state: EKF2 also shifts all buffered outputs by a reset, so the
+    # output predictor does not have to correct it
     position_without_resets = state[:, POSITION] - reset_m
     position_m = _predict_output(
         position_without_resets, imu_increments, lag_steps, mean_step_s, settings["EKF2_TAU_POS"]

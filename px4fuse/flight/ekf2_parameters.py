@@ -132,7 +132,7 @@ PARAMETERS, _LOGGED_PARAMETERS = (
 # Parameters of the EKF2 model, and other logged parameters that px4fuse needs
 KNOWN_PARAMETERS = PARAMETERS | _LOGGED_PARAMETERS
 MAGNETIC_FIELD_NOISE_PARAMETERS = ("EKF2_MAG_E_NOISE", "EKF2_MAG_B_NOISE")
-# Value of EKF2_MAG_TYPE for flights without magnetometer
+# Value of EKF2_MAG_TYPE with which EKF2 does not use the magnetometer ("None")
 MAG_TYPE_NONE = 5
 # Bit mask of EKF2_EV_CTRL: EKF2 fuses the yaw of external vision
 EV_CTRL_YAW_MASK = 8

@@ -68,6 +68,8 @@ def _draw_axis_as_artists(
         distance += LINE_HEIGHT if is_x else max(map(measure_text_width, labels))
     # label of the axis, and offset text of matplotlib (such as 1e-3 for all tick labels) at its end
     for label, position in ((axis.get_label_text(), 0.5), (formatter.get_offset(), 1.0)):
+        if not label:
+            continue
         is_axis_label = position == 0.5
         text = axes.annotate(
             label,

@@ -6,8 +6,9 @@ accumulate in it.
 """
 
 import re
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import replace
+from functools import partial
 from itertools import pairwise
 from typing import Literal
 
@@ -20,7 +21,13 @@ from px4fuse.core.text import capitalise_first, format_metres
 from px4fuse.errors import TrajectoryError
 from px4fuse.flight.model import Unavailable
 from px4fuse.trajectory import scores
-from px4fuse.trajectory.alignment import AlignmentKind, Transform, fit_alignment, umeyama
+from px4fuse.trajectory.alignment import (
+    AlignmentKind,
+    Transform,
+    compute_rms_length_m,
+    fit_alignment,
+    umeyama,
+)
 from px4fuse.trajectory.association import Association, AssociationMethod, associate
 from px4fuse.trajectory.model import MIN_POSES, Trajectory, cumulative_distance
 from px4fuse.trajectory.scores import Delta, RelativeError, RmseInterval, Statistics
@@ -294,17 +301,17 @@ def evaluate(
     )
     position_statistics = scores.compute_statistics(position_error_m)
     if other_offset_s is not None:
-        other_statistics = evaluate(
+        evaluate_with_offset = partial(
+            evaluate,
             estimate,
             reference,
-            alignment=alignment,
+            alignment=alignment if is_alignment_given else None,
             association=association,
             max_gap_s=max_gap_s,
-            time_offset_s=other_offset_s,
             rpe_deltas=(),
-        ).ate.translation_m
+        )
         offset_warnings += _find_offset_warnings(
-            position_statistics, other_statistics, other_offset_s
+            position_statistics, evaluate_with_offset, other_offset_s
         )
     rotations = scores.get_rotations(aligned_estimate, matched_reference, "ATE of the orientation")
     if rpe_deltas is None:
@@ -463,9 +470,14 @@ def _choose_time_offset(
 
 
 def _find_offset_warnings(
-    statistics: Statistics, other_statistics: Statistics, other_offset_s: float
+    statistics: Statistics, evaluate_with_offset: Callable[..., Evaluation], other_offset_s: float
 ) -> list[str]:
     """Warn if the ATE with another time offset is smaller for nearly the same number of poses."""
+    try:
+        other_evaluation = evaluate_with_offset(time_offset_s=other_offset_s)
+    except TrajectoryError:  # with this offset, too few poses match or have motion for an alignment
+        return []
+    other_statistics = other_evaluation.ate.translation_m
     if (
         other_statistics.rmse > MAX_OFFSET_ATE_RATIO * statistics.rmse
         or other_statistics.count < MIN_OFFSET_POSES_RATIO * statistics.count
@@ -485,12 +497,11 @@ def _find_mirror_warnings(
     if ate_m < MIN_MIRRORED_ATE_FRACTION * np.ptp(reference.position_m, axis=0).max():
         return
     for axis, signs in (("y", (1.0, -1.0, 1.0)), ("z", (1.0, 1.0, -1.0))):
-        mirrored = replace(estimate, position_m=estimate.position_m * signs)
+        mirrored_m = estimate.position_m * signs
         transform = fit_alignment(
-            mirrored.position_m, reference.position_m, alignment, requires_motion=False
+            mirrored_m, reference.position_m, alignment, requires_motion=False
         )
-        error_m = _apply_transform(transform, mirrored).position_m - reference.position_m
-        mirrored_ate_m = float(np.sqrt(np.mean(np.sum(error_m**2, axis=1))))
+        mirrored_ate_m = compute_rms_length_m(transform.apply(mirrored_m) - reference.position_m)
         if mirrored_ate_m < MAX_MIRRORED_ATE_RATIO * ate_m:
             yield (
                 f"The estimate is mirrored: with the sign of {axis} reversed, the ATE decreases "
