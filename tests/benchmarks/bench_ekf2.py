@@ -123,20 +123,24 @@ def waterfalls(models: dict[str, Ekf2Model]) -> dict[str, float]:
 def agreement_page(models: dict[str, Ekf2Model], left: dict[str, float]) -> str:
     """Return the table of agreement for the documentation."""
     lines = [
-        "| flight | innovations | correlation | S replayed / logged | rejected | "
-        "position difference (m) | KF - EKF2 unexplained | height: correlation, RMS (m) |",
+        "| flight | innovations in the log | correlation of innovations | S replayed ÷ S logged | "
+        "rejected samples | position difference replay - log | difference KF - EKF2 | height |",
         "|---|---|---|---|---|---|---|---|",
     ]
     for name, model in models.items():
-        a, axes = model.agreement, model.agreement.axes.values()
+        a, axes = model.agreement, model.agreement.axes.items()
+        statistics = [statistic for _, statistic in axes]
         cells = (
-            name, a.samples, " / ".join(f"{axis.innovation_correlation:.4f}" for axis in axes),
-            f"{min(x.s_ratio_p5 for x in axes):.3f} to {max(x.s_ratio_p95 for x in axes):.3f}",
-            f"{a.rejected_fraction_replayed:.1%} / {a.rejected_fraction_logged:.1%}",
-            " / ".join(f"{axis.position_rms_difference_m:.3f}" for axis in axes),
-            f"{left[name]:.1%}", height_cell(a),
+            name, f"{a.samples} innovations",
+            ", ".join(f"{x.innovation_correlation:.4f} {axis}" for axis, x in axes),
+            f"S ratio {min(x.s_ratio_p5 for x in statistics):.3f} to "
+            f"{max(x.s_ratio_p95 for x in statistics):.3f}",
+            f"replay {100.0 * a.rejected_fraction_replayed:.1f} %, "
+            f"log {100.0 * a.rejected_fraction_logged:.1f} %",
+            ", ".join(f"{x.position_rms_difference_m:.3f} m {axis}" for axis, x in axes),
+            f"{100.0 * left[name]:.1f} % unexplained", height_cell(a),
         )  # fmt: skip
-        lines.append(f"| {' | '.join(map(str, cells))} |")
+        lines.append(f"| {' | '.join(cells)} |")
     return "\n".join(lines)
 
 
@@ -144,9 +148,12 @@ def height_cell(agreement: Agreement) -> str:
     """Return the table cell of a flight with replayed heights."""
     heights = [*agreement.gnss_hgt.values(), *agreement.baro_hgt.values()]
     if not heights or agreement.doubtful:
-        return "logged"
-    both = " / ".join(f"{axis.innovation_correlation:.4f}" for axis in heights)
-    return f"{both}, {heights[0].position_rms_difference_m:.3f}"
+        return "taken from the log"
+    gnss, barometer = (axis.innovation_correlation for axis in heights)
+    return (
+        f"correlation {gnss:.4f} (GNSS), {barometer:.4f} (barometer); "
+        f"difference {heights[0].position_rms_difference_m:.3f} m RMS"
+    )
 
 
 def in_page() -> str:
