@@ -160,7 +160,7 @@ def test_aiding_source_report_names_its_noise_parameter(
     assert evaluate(aid_log(own=False, **parameters), name).noise_from == ""
 
 
-def test_gap_limit_of_aiding_source_increases_at_low_log_rate() -> None:
+def test_aid_gap_limit_is_longer_if_log_rate_is_low() -> None:
     """Rows of zeros are samples that EKF2 logged between two measurements."""
     log = aid_log(own=False, enabled=steps((0.0, 1.0)))
     decimated = replace(log, samples=log.samples.iloc[::10])
@@ -347,7 +347,7 @@ def test_gnss_without_fix_is_reported() -> None:
     assert "none with a 3D fix" in finding.message
 
 
-def test_action_disables_yaw_fusion_if_orientation_is_missing() -> None:
+def test_alignment_action_names_ev_yaw_bit_without_orientation() -> None:
     flight = aids_only(states={"yaw_align": pd.Series([0.0], [0.0])})
     flight.log = log(parameters={"EKF2_EV_CTRL": 9, "EKF2_MAG_TYPE": 5})
     (finding,) = ekf2_state.detect_missing_alignment(flight, SEGMENT, source())

@@ -209,7 +209,7 @@ def test_align_position_file_recovers_clock_frame_and_yaw(
     assert alignment.misplaced == alignment.warnings == ()
 
 
-def test_align_position_file_sigma_equals_rms_of_true_errors() -> None:
+def test_position_file_offset_and_yaw_errors_agree_with_sigma() -> None:
     clock, yaw = [], []
     for seed in range(24):
         flight = flight_along(seed=seed, duration_s=60.0)

@@ -169,7 +169,7 @@ class TestDraw:
         }
         assert {name for name, positive in signs if not positive} == both
 
-    def test_minimum_fault_size_equals_smallest_detected_size(self):
+    def test_smallest_assigned_fault_size_is_detected_in_95_percent(self):
         """From the limit on, 95 % of the flights of tests/studies/rates.csv have the finding."""
         table = rates()
         table = table[~table.condition.str.contains("outdoor")]

@@ -128,7 +128,7 @@ def test_diagnosis_without_ground_truth_still_lists_time_offset() -> None:
     assert rank_causes(analysis(trial("noises", outcome(0.98), outcome(1.0))), [NOISE]) == []
 
 
-def test_filter_rerun_with_smaller_error_recommends_parameter() -> None:
+def test_cause_action_sets_parameter_of_rerun_with_better_sigma() -> None:
     vibration = Finding("ekf2_overconfident", "error", "EKF2 is overconfident.", "Check.", {})
     helps = trial("process noise", CORRECTED, owner="ekf2")
     for trials, commands in (((helps,), ("param set EKF2_ACC_NOISE 0.7",)), ((), ())):

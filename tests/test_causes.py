@@ -27,7 +27,7 @@ def test_fault_table_contains_only_existing_fault_names() -> None:
     assert listed | set(EFFECTS_BY_CAUSE) <= set(FINDING_TITLES)
 
 
-def test_fault_table_order_puts_consequence_before_cause() -> None:
+def test_consequences_toml_lists_effect_before_its_cause() -> None:
     outer = list(EFFECTS_BY_CAUSE)
     for at, cause in enumerate(outer):
         assert set(effect_ids(cause)) & set(outer) <= set(outer[:at]), cause

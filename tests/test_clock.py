@@ -303,7 +303,7 @@ def test_time_offset_sigma_equals_width_of_likelihood_parabola() -> None:
 
 
 @pytest.mark.parametrize("offset_s", [0.0, -0.2, -0.21, 0.333])
-def test_time_offset_maximises_joint_likelihood_of_flight_parts(monkeypatch, offset_s) -> None:
+def test_time_offset_maximises_likelihood_sum_of_flight_parts(monkeypatch, offset_s) -> None:
     """Use parabolas as profiles of the parts."""
     shift, sigma = np.array([-0.05, 0.025, 0.0, 0.0]), np.array([0.03, 0.02, 0.03, 0.5])
 

@@ -90,7 +90,7 @@ class TestSample:
                 reported = np.interp(error.index, column.index, column, np.nan, np.nan)
                 assert nees == pytest.approx(np.nanmean(error**2 / reported))
 
-    def test_ekf2_state_at_fusion_horizon_is_state_before_update(
+    def test_ekf2_fusion_horizon_position_is_position_before_update(
         self, sample, sample_flight, sample_log
     ):
         """Published positions include the output predictor's lag, which no variance contains."""
@@ -254,7 +254,7 @@ class TestMissingParts:
             truth.position_rmse_m**2 / np.interp(40.5, variance.index, variance), rel=0.1
         )
 
-    def test_horizontal_nis_uses_only_updates_common_to_both_axes(self) -> None:
+    def test_horizontal_nis_uses_only_updates_with_north_and_east(self) -> None:
         flight = aisle_flight(ekf2=Estimator(nis=0.5))
         innovations = flight.ekf2.innovations
         north, east = innovations["north"], innovations["east"].iloc[100:]

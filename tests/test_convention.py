@@ -151,7 +151,7 @@ def test_frame_detection_finds_yaw_rotation_of_positions(rotation_deg):
     assert (total - rotation_deg + 180.0) % 360.0 - 180.0 == pytest.approx(0.0, abs=4.0)
 
 
-def test_yaw_rotation_refers_to_gnss_if_ekf2_heading_is_wrong():
+def test_source_rotation_is_relative_to_gnss_if_heading_is_wrong():
     attitude = flown().attitude.copy()
     attitude[Columns.QUATERNION] = multiply(yaw(-14.0), attitude[Columns.QUATERNION].to_numpy())
     gnss = replace(sent(flown(), late_s=0.2, sigma_m=0.3, seed=2), origin=GNSS_ORIGIN)
@@ -330,7 +330,7 @@ def fused(flight: Flight) -> Flight:
     ),
     (("west", "north", "down"), -32.0, ConventionFaults()),
 ])  # fmt: skip
-def test_vision_that_defines_heading_of_ekf2_has_no_yaw_fault(axes, rotation_deg, expected):
+def test_no_rotation_fault_if_vision_yaw_defines_ekf2_heading(axes, rotation_deg, expected):
     convention = Convention(
         verdict="determined", **dict(zip("xyz", axes, strict=True)), rotation_deg=rotation_deg,
         heading_from="gyroscopes", orientation=OrientationConvention(verdict="determined",
@@ -374,7 +374,7 @@ def test_low_pass_filtered_positions_are_not_reported_as_late(time_constant_s: f
     assert delayed.late_s == pytest.approx(time_constant_s, abs=0.1)
 
 
-def test_clock_offset_auto_note_contains_already_applied_delay():
+def test_clock_offset_auto_note_states_total_time_offset():
     late = replace(flown(), positions=(sent(flown(), late_s=0.7),))
     request = ComparisonRequest(log="made", clock_offset_s="auto", axes=("north", "east"))
     prepared = prepare_comparison(late, request)
@@ -440,7 +440,7 @@ def test_frame_detection_on_recorded_logs_finds_known_frame(name):
     assert_found(check_convention(flight, track), **expected)
 
 
-def test_frame_check_without_heights_keeps_all_x_and_y() -> None:
+def test_convention_check_without_heights_keeps_horizontal_data() -> None:
     flight = simulate_flight(Scenario(seed=5), parse_faults(["no-vvo"]))
     prepared = prepare(flight)
     assert prepared.source.samples[Columns.POSITION[:2]].notna().all(axis=None)

@@ -41,7 +41,7 @@ def test_simulated_fault_is_top_finding_on_95_percent_of_logs(finding) -> None:
     assert rows["rate" if finding in CONSEQUENCES else "first"].max() >= 0.95
 
 
-def test_undetectable_faults_are_found_in_below_10_percent() -> None:
+def test_rate_of_faults_listed_as_undetectable_is_at_most_0_1() -> None:
     for finding, condition in NOT_DETECTABLE:
         (row,) = TABLE[
             (TABLE["finding"] == finding) & (TABLE["condition"] == condition)
@@ -55,7 +55,7 @@ def test_clock_jump_is_detected_despite_likelihood_rounding() -> None:
     assert found(FAULTY_SEED + 2, jump)[0] == "source_time_offset_changes"
 
 
-def test_faults_always_detected_in_study_are_still_detected() -> None:
+def test_faults_with_detection_rate_1_are_found_in_new_flights() -> None:
     certain = {(row.finding, row.condition) for row in TABLE.itertuples() if row.rate == 1.0}
     assert found(5) == ()
     for condition in (
@@ -68,7 +68,7 @@ def test_faults_always_detected_in_study_are_still_detected() -> None:
         assert condition.finding in found(20_000, condition)
 
 
-def test_rate_table_counts_findings_at_any_and_at_first_rank() -> None:
+def test_rate_table_counts_all_findings_and_first_findings() -> None:
     usual, yaw = clean(DEFAULT), Condition("source_frame_misaligned", "--mistake yaw=30")
     flown = [Job(0, (usual,)), Job(1, (usual,)), Job(FAULTY_SEED, (yaw,))]
     made = pd.DataFrame(

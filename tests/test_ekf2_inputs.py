@@ -344,7 +344,7 @@ def turning(states: np.ndarray) -> tuple[pd.DataFrame, pd.DataFrame, Ekf2, Fusio
     return imu, attitude, made(Ekf2, state=state), record
 
 
-def test_ekf2_replay_inputs_of_turning_vehicle_equal_true_motion():
+def test_ekf2_replay_inputs_equal_true_motion_in_turn():
     flown = turning(10.0 + 0.1 * np.arange(21))
     found = _make_segment(*flown, 5, 11.5)
     steps = 10.5 + 0.01 * np.arange(101)

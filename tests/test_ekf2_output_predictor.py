@@ -70,7 +70,7 @@ def test_ekf2_output_predictor_equals_step_by_step_simulation(lag: int) -> None:
         assert found == pytest.approx(known, abs=1e-9)
 
 
-def test_output_predictor_attitude_equals_stepwise_recursion() -> None:
+def test_output_predictor_attitude_sum_equals_loop_over_steps() -> None:
     lag, horizon_s = 19, 0.2
     error = np.zeros((600, 3))
     error[100:] = 0.01, 0.0, -0.02

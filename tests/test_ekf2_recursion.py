@@ -129,7 +129,7 @@ def deciding(
     ({"follows_log": True}, (True, False, False, 9.5, False, 5)),
     ({"logged": 0.0}, (True, False, False, 9.5, False, 5)),
 ])  # fmt: skip
-def test_replay_rejects_stops_and_resets_at_ekf2_timeouts(case, expected):
+def test_ekf2_model_stops_fusion_and_resets_after_ekf2_timeouts(case, expected):
     assert deciding(**case) == expected
 
 
@@ -141,7 +141,7 @@ def test_replay_rejects_stops_and_resets_at_ekf2_timeouts(case, expected):
     ({"EKF2_EV_DELAY": 50.0}, True, FusionDelays(0.05, 0.12)),
     ({"EKF2_EV_DELAY": 200.0}, True, FusionDelays(0.2, 0.19)),
 ])  # fmt: skip
-def test_fusion_horizon_equals_length_of_ekf2_buffer(settings, by_delay, timing):
+def test_fusion_horizon_delay_equals_duration_of_ekf2_buffer(settings, by_delay, timing):
     usual = {"EKF2_EV_DELAY": 0.0, "EKF2_DELAY_MAX": 200.0}
     rules = replace(RULES, uses_delay_as_horizon=by_delay)
     inputs = made(
@@ -189,7 +189,7 @@ def test_ekf2_without_fusion_resets_to_gnss_after_7_or_14_s(
     assert (taken, reset) == (False, resets)
 
 
-def test_second_axis_update_uses_innovation_before_first_update():
+def test_north_and_east_innovations_precede_both_updates():
     """The second gain uses the new covariance and the old S, as in EKF2; it is not optimal."""
     rng = np.random.default_rng(6)
     root = rng.normal(size=(2, 15, 15))
@@ -240,7 +240,7 @@ def test_ekf2_replay_rejects_gnss_velocity_outside_gate(speed_m_s, moves):
     assert abs(wider.state[11, 0, 3]) > 1e-3
 
 
-def test_initial_state_correlation_at_rest_equals_reference():
+def test_initial_correlations_at_rest_equal_kalman_filter():
     """Reference: a plain Kalman filter of a vehicle at rest for one minute, facing east."""
     turn = Rotation.from_euler("z", 110.0, degrees=True).as_matrix()
     count = 6000
@@ -483,7 +483,7 @@ def events(
     return _make_events(inputs, stretch_of(100), FusionDelays(delay_s, horizon_s))
 
 
-def test_ekf2_replay_interval_ends_at_step_that_fuses_a_sample():
+def test_ekf2_replay_fuses_each_sample_at_end_of_an_interval():
     """Half a step and the delay before its timestamp; additional events in gaps of vision."""
     found = events([10.2, 10.305, 10.9])
     has_sample = found.sample >= 0
@@ -507,7 +507,7 @@ def test_ekf2_replay_interval_ends_at_step_that_fuses_a_sample():
 @pytest.mark.parametrize(("age_s", "late", "lost"), [
     (0.22, False, False), (0.24, True, False), (0.28, True, False), (0.31, False, True),
 ])  # fmt: skip
-def test_vision_sample_is_late_or_lost_if_it_arrives_too_old(age_s, late, lost):
+def test_vision_sample_that_arrives_late_is_marked_late_or_lost(age_s, late, lost):
     """Due 0.2 s after its timestamp: late by more than 0.03 s, lost from 0.1 s on."""
     found = events([10.2, 10.4], age_s=age_s, horizon_s=0.2)
     assert (bool(found.late[0]), bool(found.lost[0])) == (late, lost)

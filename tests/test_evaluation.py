@@ -203,7 +203,7 @@ def test_pose_association_interpolates_motion_but_not_gaps() -> None:
     assert lost.coverage_reference == pytest.approx(0.75, abs=0.01)
 
 
-def test_sparse_reference_is_paired_and_not_interpolated() -> None:
+def test_associate_with_sparse_reference_uses_nearest_poses() -> None:
     reference, estimate = flight(80.0, 0.1), flight(80.0, 5.0)
     estimate_poses, reference_poses, got = associate(estimate, reference)
     assert (got.method, got.poses) == ("nearest", len(reference))
@@ -411,7 +411,7 @@ def test_constant_reference_orientation_gives_no_rotation_error() -> None:
     assert got.rpe[-1].translation_m.rmse < 1e-6
 
 
-def test_evaluation_of_frozen_estimate_ends_at_the_freeze() -> None:
+def test_evaluation_excludes_poses_after_estimate_stops_changing() -> None:
     reference = flight()
     middle, position_m = len(reference) // 2, reference.position_m.copy()
     position_m[middle:] = position_m[middle]
@@ -472,7 +472,7 @@ def test_evaluate_with_implausible_arguments_gives_warnings() -> None:
         assert said in evaluate(estimate, reference, **how).warnings[0]
 
 
-def test_evaluate_late_estimate_along_a_line_has_ate_and_warnings() -> None:
+def test_evaluate_late_straight_trajectory_warns_of_time_offset() -> None:
     reference = flight()
     line_m = np.cumsum(1.0 + np.sin(0.3 * (reference.time_s - reference.time_s[0])) ** 2)
     line_m = line_m[:, None] * np.array([0.02, 0.0, 0.0])

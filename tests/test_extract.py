@@ -240,7 +240,7 @@ def test_extract_to_parquet_writes_the_same_tables(tmp_path, sample_log, sample_
 # ---- the lesson by hand -----------------------------------------------------------------------
 
 
-def test_kf_code_in_documentation_gives_states_of_compare(
+def test_kf_example_in_python_guide_equals_kf_of_compare(
     tmp_path, monkeypatch, capsys, sample_log, sample_flight
 ):
     """The example is KF, except that it rounds the time of each measurement to the DT grid."""

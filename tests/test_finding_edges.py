@@ -109,7 +109,7 @@ def test_fault_report_lists_times_of_occurrence(spans: Any, expected: str) -> No
     assert replace(make_finding("x"), spans_s=spans).spans_text == expected
 
 
-def test_status_flag_before_first_sample_has_first_value() -> None:
+def test_status_flag_has_first_logged_value_at_earlier_times() -> None:
     flag, whole = pd.Series([1.0, 0.0, 1.0], index=[20.0, 30.0, 80.0]), Segment(10.0, 110.0, "")
     assert compute_flag_fraction(flag, whole) == 0.5
     assert compute_flag_fraction(flag, Segment(25.0, 35.0, "")) == 0.5
@@ -118,7 +118,7 @@ def test_status_flag_before_first_sample_has_first_value() -> None:
     assert find_spans_with_value(0.0, flag, Segment(40.0, 50.0, "")) == ((40.0, 50.0),)
 
 
-def test_fault_report_lists_consequences_below_root_cause() -> None:
+def test_split_cause_groups_puts_effect_into_group_of_its_cause() -> None:
     first, other = make_finding("kf_underconfident"), make_finding("no_motion", "note")
     follows = make_finding("kf_underconfident", caused_by="kf_underconfident")
     assert split_cause_groups([first, follows, other]) == [[first, follows], [other]]
@@ -266,7 +266,7 @@ def rejected(count: int, of: int) -> pd.DataFrame:
     ("count", "of", "expected"),
     [(1, 100, "warning"), (1, 101, None), (20, 100, "error"), (19, 100, "warning")],
 )
-def test_ekf2_rejections_warn_from_1_and_are_error_from_20_pct(
+def test_severity_of_rejections_depends_on_rejected_percentage(
     count: int, of: int, expected: str | None
 ) -> None:
     """EKF2 rejects the horizontal vector, so the main axis is used."""
@@ -285,7 +285,7 @@ def test_ekf2_rejections_warn_from_1_and_are_error_from_20_pct(
             assert finding.remedy.endswith(remedy)
 
 
-def test_action_is_recommended_only_if_it_halves_ekf2_rejections() -> None:
+def test_rejection_action_requires_rerun_with_half_of_rejections() -> None:
     frame = rejected(20, 100)
     for after, improves, action in (
         (0.09, True, "Set EKF2_EVP_NOISE to 0.1 m."), (0.1, True, CHECK_FIRST),
@@ -310,7 +310,7 @@ CHECK_FIRST = (
 # ---------------------------------------------------------------- errors and truth
 
 
-def test_finding_of_error_above_sigma_names_axis_and_action() -> None:
+def test_error_above_sigma_finding_prefers_the_main_axis() -> None:
     ekf2 = axis("east", ekf2=statement(0.49), ekf2_truth=against_truth(25.0, 1.0))
     finding = only(hidden_errors.detect, analysis(axes=(axis(), hiding(name="down"), ekf2)))
     assert finding.title == (
@@ -424,7 +424,7 @@ def test_imu_rate_below_98_percent_of_required_is_reported(imu_hz, attitude_hz, 
         assert all(action.format(hz) in f.remedy for f, hz in zip(found, expected, strict=True))
 
 
-def test_missing_log_of_received_positions_is_reported() -> None:
+def test_finding_states_why_received_positions_are_not_logged() -> None:
     lacks = (
         Unavailable("another", "no", "Do."),
         Unavailable("it", "it was disabled", "Do.", source="vehicle_visual_odometry"),
@@ -463,7 +463,7 @@ def test_position_gap_above_1_s_and_five_intervals_is_reported(
         ] * there
 
 
-def test_motion_range_ignores_5_percent_of_positions_at_each_end() -> None:
+def test_motion_range_omits_extreme_5_percent_of_positions() -> None:
     moving = positions(10.0 + np.arange(100))
     moving["east_m"] = np.repeat([-9.0, -1.0, -0.5, 0.0, 0.5, 1.0, 9.0], [3, 4, 3, 80, 3, 4, 3])
     outside = positions([5.0, 111.0], 99.0)
@@ -484,7 +484,9 @@ def test_wrong_frame_of_position_file_is_reported_as_error() -> None:
 
 
 @pytest.mark.parametrize(("until_s", "expected"), [(60.0, "warning"), (60.1, "note")])
-def test_frd_positions_with_fused_yaw_give_only_a_note(until_s: float, expected: str) -> None:
+def test_frd_frame_finding_is_a_note_if_ekf2_fuses_source_yaw(
+    until_s: float, expected: str
+) -> None:
     frd = source(frame="FRD")
     one = analysis(source=frd, ekf2=with_fusion((0.0, 1.0), (until_s, 0.0), column="yaw"))
     finding = only(source_frame.detect, one)
@@ -922,7 +924,7 @@ def test_position_jump_report_contains_count_and_largest_jump() -> None:
     assert finding.spans_s == ((30.0, 30.0), (60.0, 60.0))
 
 
-def test_scale_and_variance_findings_state_too_large_or_small() -> None:
+def test_scale_and_variance_titles_state_direction_of_the_error() -> None:
     for signed, word in ((0.2, "long"), (-0.2, "short")):
         finding = only(source_positions.detect_scale_error, scaled(signed))
         assert finding.title == f"UWB distances are 20 % too {word}"
@@ -979,7 +981,7 @@ def test_position_outlier_size_is_distance_to_ground_truth() -> None:
         assert f"distance to {reference} is {north_m:.2f} m" in finding.message
 
 
-def test_position_outlier_finding_states_how_many_ekf2_rejected() -> None:
+def test_outlier_finding_counts_outliers_that_ekf2_rejected() -> None:
     innovations = pd.DataFrame({"rejected": np.zeros(120)}, index=np.arange(0.05, 120.0))
     innovations.iloc[[20, 40, 50], 0] = 1.0
     outliers = tuned(outlier_time_s=np.array([20.0, 30.0, 40.0]), count=120)

@@ -515,7 +515,7 @@ def test_simulated_fault_is_the_only_reported_error(at: int, fault: Fault) -> No
 @pytest.mark.parametrize(
     ("gate", "expected"), [(1.0, 0.5340), (1.5, 0.2494), (2.0, 0.0889), (2.8, 0.0102), (3.0, None)]
 )
-def test_narrow_gate_is_reported_before_its_rejections(gate, expected) -> None:
+def test_narrow_gate_is_listed_above_the_rejections_it_causes(gate, expected) -> None:
     """Expected shares: tables of the normal distribution, two axes."""
     flown = with_ekf2(gate=gate)(aisle_flight(**ekf2(rejected_fraction=0.3)))
     first, *others = found(compare(flown))
@@ -534,7 +534,7 @@ def test_narrow_gate_is_reported_before_its_rejections(gate, expected) -> None:
 @pytest.mark.parametrize(
     ("absent", "flight", "present"), MISSING_FIELD, ids=lambda value: str(value)[:40]
 )
-def test_fault_that_requires_an_unlogged_field_is_not_reported(
+def test_finding_is_absent_if_the_log_lacks_the_needed_data(
     absent: str, flight: Any, present: str | None
 ) -> None:
     found_ids = ids(found(compare(aisle_flight(duration_s=60.0, **flight))))

@@ -107,7 +107,7 @@ def test_mean_flow_per_update_is_recovered_from_filtered_flow(tmp_path):
 
 
 @pytest.mark.parametrize("every", [1, 10])
-def test_mean_flow_velocity_equals_velocity_at_update_time(every):
+def test_flow_velocity_averaged_for_update_equals_true_velocity(every):
     """The motion since a sample is known from the IMU, so corners cause no innovations."""
     (segment,) = model().inputs.segments
     with_flow = add_flow_samples(segment, flow_of(every=every), 3.0)

@@ -117,7 +117,7 @@ def unfused(**parts: Any) -> Any:
     return analysis(ekf2=ekf2, source=source(**parts.pop("source", {})), **parts)
 
 
-def test_constant_positions_not_fused_by_ekf2_are_not_reported() -> None:
+def test_not_fusing_is_absent_if_unfused_positions_are_constant() -> None:
     still = unfused(source={"samples": positions(np.arange(0.0, 120.0, 0.1), 2.0)},
                     ekf2={"parameters": {"EKF2_EV_CTRL": 2.0}})  # fmt: skip
     assert named(ekf2_not_fusing.detect, still) == {}
@@ -176,7 +176,7 @@ def test_unmet_ekf2_fusion_condition_is_found_in_real_log(
         assert text in f"{found[0].message} {found[0].remedy}"
 
 
-def test_gnss_fusion_without_flags_is_read_from_xy_global() -> None:
+def test_gnss_is_fused_if_flags_are_missing_and_xy_global_is_set() -> None:
     ekf2 = made(Ekf2, aids={}, states={"xy_global": on(1.0)})
     assert has_fused_aid(ekf2)
     assert not has_fused_aid(ekf2, "baro_hgt")

@@ -102,7 +102,7 @@ def test_grade_report_that_exceeds_time_limit_is_not_verified(tmp_path, monkeypa
 
 
 @pytest.mark.usefixtures("jobs_in_process", "cached_pages")
-def test_grade_with_log_verifies_only_the_unchanged_report(tmp_path) -> None:
+def test_grade_verifies_original_report_and_rejects_forgeries(tmp_path) -> None:
     folder = tmp_path / "in"
     folder.mkdir()
     shutil.copy(REPORT, folder / "a.pdf")
@@ -185,7 +185,7 @@ def test_grade_with_changed_logs_does_not_reuse_verification(tmp_path) -> None:
 
 
 @pytest.mark.usefixtures("jobs_in_process")
-def test_grade_report_without_its_log_makes_points_pending(tmp_path) -> None:
+def test_points_of_report_are_pending_if_its_log_is_not_given(tmp_path) -> None:
     (tmp_path / "in").mkdir()
     shutil.copy(REPORT, tmp_path / "in")
     (tmp_path / "logs").mkdir()

@@ -63,7 +63,7 @@ def test_constant_heading_misalignment_is_recovered(misalignment_deg):
     assert found.sigma_deg < 3.0
 
 
-def test_gyro_bias_that_ekf2_removes_is_no_misalignment():
+def test_gyro_bias_does_not_change_estimated_heading_error():
     flight = simulated()
     imu = flight.imu.copy()
     imu[Columns.ANGULAR_RATE[2]] += 0.1
@@ -95,7 +95,7 @@ def test_drifting_heading_error_is_estimated_per_flight_part(by):
     assert first.heading_error_deg > last.heading_error_deg
 
 
-def test_heading_error_of_scaled_positions_has_the_same_range():
+def test_heading_error_range_is_unchanged_by_position_scale():
     flight, _ = with_heading_drift(simulated(passes=6))
     scale = 1.3
     scaled = tuple(
@@ -158,7 +158,7 @@ def test_heading_error_from_positions_equals_that_of_orientation(
 # ---- parts and drift ----------------------------------------------------------------------------
 
 
-def test_long_flight_has_over_100_heading_error_estimates() -> None:
+def test_heading_error_is_estimated_for_all_parts_of_long_flight() -> None:
     """1,000 measurements in 25 minutes: fewer than three per part of ``FLIGHT_PART_DURATION_S``."""
     time = np.linspace(0.0, 1500.0, 1000)
     parts = frame_rotation._average_flight_parts(

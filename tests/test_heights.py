@@ -115,7 +115,7 @@ def test_barometer_bias_matches_scalar_kalman_filter() -> None:
     np.testing.assert_allclose(found["innovation_down_m"], innovations, atol=1e-9)
 
 
-def test_barometer_bias_is_constant_after_reference_ends() -> None:
+def test_barometer_bias_is_constant_after_height_reference_stops() -> None:
     steps = list(range(10, 400, 10))
     _, found = standing(sampled(steps, [-1.0] * len(steps)), reference_until=1.005)
     after = found["innovation_down_m"].loc[1.15:]
@@ -172,7 +172,7 @@ def test_height_sample_with_weight_2_equals_two_samples() -> None:
 @pytest.mark.parametrize(
     ("innovation", "expected"), [(-0.5, -0.5), (0.5, 0.0), (3.9, 0.0), (4.5, 0.5)]
 )
-def test_barometer_innovation_in_ground_effect_dead_zone_is_zero(innovation, expected) -> None:
+def test_barometer_innovation_inside_dead_zone_is_set_to_zero(innovation, expected) -> None:
     """Dead zone EKF2_GND_EFF_DZ of baro_height_control.cpp."""
     _, found = standing(of_baro([10], [innovation], dead_zone_m=4.0))
     assert found["innovation_down_m"].item() == pytest.approx(expected)
@@ -202,7 +202,7 @@ def opened_once() -> Ekf2Model:
     return opened(outdoors())
 
 
-def test_what_if_barometer_noise_gives_nis_of_flight_with_it() -> None:
+def test_what_if_baro_noise_equals_flight_with_same_baro_noise() -> None:
     model = opened_once()
     assert model.agreement.baro_hgt["down"].innovation_correlation > 0.999
     assert model.agreement.baro_hgt["down"].position_rms_difference_m < 0.02
@@ -302,7 +302,7 @@ def test_ekf2_replay_of_heights_without_data_gives_reason() -> None:
     assert "before PX4 v1.14" in add_heights(flight, ekf2, log, segments)
 
 
-def test_ekf2_noise_of_clipped_acceleration_is_4_9_m_s2() -> None:
+def test_ekf2_model_sets_clipped_acceleration_noise_to_4_9_m_s2() -> None:
     """The noise is BADACC_BIAS_PNOISE of covariance.cpp."""
     inputs = opened_once().inputs
     (segment,) = inputs.segments
@@ -322,7 +322,7 @@ def test_ekf2_noise_of_clipped_acceleration_is_4_9_m_s2() -> None:
     np.testing.assert_allclose(ran(clipped).variance, expected, rtol=1e-9)
 
 
-def test_bad_acceleration_fraction_equals_clipped_imu_fraction() -> None:
+def test_clipped_fraction_of_step_is_mean_of_clipped_imu_axes() -> None:
     flight = outdoors()
     (plain,) = opened_once().inputs.segments
     clipped = pd.Series(0, flight.imu.index)

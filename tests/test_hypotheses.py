@@ -95,7 +95,7 @@ def test_innovations_after_position_step_equal_kf_replay() -> None:
     np.testing.assert_allclose([nu[:, 0], s], expected, atol=1e-9)
 
 
-def test_bias_regression_over_imu_gap_reproduces_kf_innovations() -> None:
+def test_bias_regression_residuals_equal_kf_innovations() -> None:
     analysis = flown()
     axes = tuple(analysis.axes[name].axis for name in ("north", "east"))
     model = make_design_matrix(analysis.flight, axes, RIGHT, 0.10, 0.0)
@@ -116,7 +116,7 @@ def test_bias_regression_over_imu_gap_reproduces_kf_innovations() -> None:
             np.testing.assert_allclose(fits.residual[fits.axis == at], residual, atol=1e-9)
 
 
-def test_bias_regression_equals_least_squares_with_prior() -> None:
+def test_bias_regression_equals_lstsq_with_prior_as_data_row() -> None:
     rng = np.random.default_rng(1)
     columns, data = rng.normal(size=(2, 25, 2)), rng.normal(size=(2, 25))
     skip = np.arange(25) % 5 == 0
@@ -273,7 +273,7 @@ def without_variances(flight: Flight) -> Flight:
         ("r-scale=0.25", without_variances),
     ],
 )
-def test_causes_without_needed_imu_or_variance_are_not_reported(mistake, change) -> None:
+def test_hypothesis_findings_require_imu_or_reported_variance(mistake, change) -> None:
     named = set(found(analysed(change(flight(mistake))), OF_CAUSES))
     assert named <= {"source_outliers"}
 

@@ -115,7 +115,7 @@ def test_python_compare_with_invalid_arguments_is_rejected(analysis, arguments, 
 # -- errors ----------------------------------------------------------------------------------------
 
 
-def test_settings_errors_name_python_argument_or_command_option(sample_log):
+def test_out_of_range_error_names_argument_or_command_option(sample_log):
     with pytest.raises(px4fuse.Px4FuseError, match=r"^`clock_offset_s` 99 is out of range"):
         px4fuse.Settings(clock_offset_s=99.0)
     said = error_line("tune", sample_log, "--clock-offset", 99.0)

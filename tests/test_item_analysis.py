@@ -35,7 +35,7 @@ FORM = Answers(
 )
 
 
-def test_item_discrimination_equals_correlation_with_other_items() -> None:
+def test_discrimination_is_correlation_with_other_points() -> None:
     for index, item in enumerate(analyse_items(REPORTS)):
         others = POINTS.sum(axis=1) - POINTS[:, index]
         expected = np.corrcoef(POINTS[:, index], others)[0, 1]

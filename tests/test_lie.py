@@ -57,7 +57,7 @@ class TestTangents:
             quotient = (up - down) / (2.0 * step)
             np.testing.assert_allclose(jacobian[:, :, k], quotient, atol=1e-7, rtol=0)
 
-    def test_lie_adjoint_converts_right_to_left_perturbation(
+    def test_lie_adjoint_maps_right_to_equal_left_perturbation(
         self, dimension: int, angle: float
     ) -> None:
         x, xi = lie.exp(tangents(dimension, angle)), tangents(dimension, 0.7)

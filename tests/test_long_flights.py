@@ -48,7 +48,7 @@ def test_memory_of_varying_offset_fit_grows_linearly_with_time():
     assert peaks[1] < 10.0 * peaks[0]
 
 
-def test_varying_time_offset_fit_equals_dense_least_squares():
+def test_time_offset_per_flight_part_equals_numpy_least_squares():
     fit = fit_of(600, varying_offset)
     found = find_offset_variation(fit)
     parts = np.floor(fit.time_s / 4.0).astype(int)

@@ -160,7 +160,7 @@ def test_read_magnetometer_prefers_topic_with_more_samples(tmp_path: Path) -> No
     assert field.index[0] - stamped_s == pytest.approx(0.02 + 0.5 * 0.01, abs=1e-6)
 
 
-def test_slowly_logged_magnetometer_is_replaced_by_ekf2_samples(tmp_path: Path) -> None:
+def test_magnetic_field_is_from_ekf2_topic_if_sensor_log_is_slow(tmp_path: Path) -> None:
     """EKF2's copy at a low rate is used, except if the sensor topic contains all samples."""
     log = magnetic()
     remaining = log["estimator_aid_src_mag"]
@@ -181,7 +181,7 @@ def test_slowly_logged_magnetometer_is_replaced_by_ekf2_samples(tmp_path: Path) 
     assert list(field) == ["forward_gauss", "right_gauss", "down_gauss", "fused_3d"]
 
 
-def test_mean_magnetometer_sample_is_recovered_from_low_pass() -> None:
+def test_mean_field_is_restored_from_filtered_mag_innovations() -> None:
     """The vehicle rotates, EKF2's attitude differs from the published one, the sensor is noisy."""
     count, every, rows = 12, 7, 30
     interval_s, dt = 0.5 / every, 0.008

@@ -103,7 +103,7 @@ def test_banded_solver_equals_dense_normal_equations(seed: int) -> None:
     np.testing.assert_allclose(system.position_variance(), variance, rtol=1e-6)
 
 
-def test_log_determinant_with_singular_q_grows_with_noise() -> None:
+def test_log_determinant_of_s_grows_with_large_process_noise() -> None:
     """Q of a single step has rank one, so the term that makes it invertible is below rounding."""
     step, joined = np.full(19, 0.09755900000000004), np.ones(19, dtype=bool)
     unit = 0.1 * step * np.stack([step**2 / 4.0, step / 2.0, np.ones(19)])
@@ -253,7 +253,7 @@ def test_likelihood_with_imu_biases_equals_multivariate_normal() -> None:
 
 
 @pytest.mark.parametrize("start_known", [True, False])
-def test_segment_with_one_position_does_not_change_likelihood(start_known: bool) -> None:
+def test_likelihood_ignores_segment_with_a_single_position(start_known: bool) -> None:
     part = with_constants()
     if not start_known:
         part = replace(part, prior_precision=np.zeros((COUNT, 2)))
@@ -298,7 +298,7 @@ def test_fitted_imu_biases_equal_dense_least_squares() -> None:
         np.testing.assert_array_equal(count, np.isfinite(part.measurement_m).sum(axis=1))
 
 
-def test_likelihood_is_unchanged_if_imu_motion_is_subtracted() -> None:
+def test_likelihood_is_equal_with_imu_motion_subtracted_first() -> None:
     part = with_constants()
     given = [arguments(each, SOME_NOISES[0], WEIGHT) for each in (part, subtract_smooth_path(part))]
     plain, found_values = (fit_positions(*each).compute_scores()[0] for each in given)
@@ -463,7 +463,7 @@ def test_maximum_likelihood_fit_finds_simulated_outliers(clean, share, size_m, l
 
 
 @pytest.mark.parametrize(("axes", "share", "width"), [(1, 0.15, 4.0), (2, 0.1, 5.0), (2, 0.3, 3.0)])
-def test_noise_sigma_is_inverse_root_of_likelihood_curvature(axes, share, width):
+def test_sigma_of_noise_estimate_follows_likelihood_curvature(axes, share, width):
     """Without motion the likelihood has a closed form."""
     rng = np.random.default_rng(axes)
     wrong = rng.random(4000) < share
@@ -496,7 +496,7 @@ def test_noise_sigma_is_inverse_root_of_likelihood_curvature(axes, share, width)
     assert widening == pytest.approx(curved * 2.0 * axes * 4000, rel=0.01)
 
 
-def test_noise_fit_without_outlier_model_keeps_given_weights() -> None:
+def test_noise_fit_without_outliers_uses_measurement_weights() -> None:
     weight = np.random.default_rng(1).uniform(0.2, 1.0, MANY)
     parts = [convert_to_positions(preintegrate(pair(1)[0], TRUE))]
     found = maximise_likelihood(parts, NoiseParameters(0.5, 0.1), weight, fits_outliers=False)

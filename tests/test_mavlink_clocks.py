@@ -414,7 +414,7 @@ def map_unix_timestamps(received, *exchanges):
     return stamps, map_clock("x", stamps, received, line, *exchanges, None, has_receive_times=True)
 
 
-def test_timesync_that_contradicts_receive_time_is_ignored():
+def test_timesync_one_hour_after_receive_times_is_ignored():
     """This TIMESYNC would place messages one hour before their receipt."""
     received = np.arange(0.0, 60.0, 0.1) + 0.01
     wrong = (received, UNIX_S + 3600.0 + received), NO_EXCHANGES[1]

@@ -81,7 +81,7 @@ def trial(
         (0.101, NoiseEstimate(0.033, 0.032, 0.034), ("warning", 3.06)),
     ],
 )  # fmt: skip
-def test_noise_setting_wrong_by_factor_4_is_error_else_warning(
+def test_severity_of_noise_setting_depends_on_error_factor(
     chosen: float, estimate: NoiseEstimate, expected: Any
 ) -> None:
     off = noises.find_setting_deviation("sigma_z_m", chosen, estimate)
@@ -110,7 +110,7 @@ SIGMA_A_TO_0_1, BOTH = {"sigma_a_m_s2": 0.1}, {"sigma_a_m_s2": 0.1, "sigma_z_m":
           ("sigma_a_too_large", "note", noises.NO_IMPROVEMENT_ACTION)]),
     ],
 )  # fmt: skip
-def test_wrong_noise_action_states_noise_of_improving_rerun(trials: Any, expected: Any) -> None:
+def test_action_for_wrong_noise_uses_values_of_best_rerun(trials: Any, expected: Any) -> None:
     fitted = tuned(NoiseEstimate(0.5, 0.45, 0.55), NoiseEstimate(0.1, 0.09, 0.11))
     cause, other = noises.detect_wrong_settings(
         analysis(source=MOVING, tuning=fitted, trials=trials)
@@ -127,7 +127,7 @@ def test_wrong_noise_action_states_noise_of_improving_rerun(trials: Any, expecte
         (0.5, None, ("note", noises.NO_IMPROVEMENT_ACTION)),
     ],
 )
-def test_noise_finding_keeps_severity_error_if_kf_is_consistent(
+def test_noise_finding_severity_depends_on_rerun_improvement(
     nis_mean: float, rmse_m: float | None, expected: tuple[str, str]
 ) -> None:
     """A re-run shows no improvement if σ is consistent before and the position error unknown."""
@@ -307,7 +307,7 @@ def fused(noise_m: float, nis: float = 5.0, name: str = "north", **parts: Any) -
     [({}, 0.1, True), ({"EKF2_EVP_NOISE": 0.1}, 0.1, True), ({"EKF2_EVP_NOISE": 0.11}, 0.1, False),
      ({}, 0.124, True), ({}, 0.126, False), ({}, 0.081, True), ({}, 0.079, False)],
 )  # fmt: skip
-def test_ekf2_noise_counts_as_default_within_25_percent(flown, used_m, default):
+def test_ekf2_noise_within_25_percent_of_default_is_default(flown, used_m, default):
     assert (
         _has_default_noises(analysis(log=log(parameters=flown)), "ekf2", fused(used_m)) is default
     )
@@ -337,7 +337,7 @@ def test_ekf2_noise_counts_as_default_within_25_percent(flown, used_m, default):
         ("ekf2", {"EKF2_ACC_NOISE": 0.35}, "process noise", "Set EKF2_ACC_NOISE to 0.35 m/s²."),
     ],
 )  # fmt: skip
-def test_inconsistent_filter_action_corrects_the_found_cause(owner, change, kind, action) -> None:
+def test_action_for_inconsistent_filter_corrects_its_cause(owner, change, kind, action) -> None:
     # changes that explain less than 0.5 or more than 1.5 are not causes
     causes = (tried(owner, {"sigma_z_m": 7.0}, explained_fraction=0.4), tried(owner, change),
               tried(owner, {"sigma_z_m": 7.0}, explained_fraction=1.6))  # fmt: skip
@@ -431,7 +431,7 @@ def test_overconfident_ekf2_without_replay_gets_noise_advice(
           "positions")),
     ],
 )  # fmt: skip
-def test_wrong_ekf2_noise_title_names_sensor_if_value_is_default(
+def test_title_of_wrong_default_noise_names_the_position_sensor(
     flown_m: float, kind: str, rejected: float, expected: tuple[str, str, str]
 ) -> None:
     aid = GNSS_POS if kind == "gnss" else EV_POS
@@ -541,7 +541,9 @@ END = TrueEnd(displacement_m={"forward": 0.0, "right": 0.0, "down": 0.0}, sigma_
         (NONE, None),
     ],
 )  # fmt: skip
-def test_drift_report_contains_closure_error_at_known_landing(loop: Any, size: str | None) -> None:
+def test_source_drift_title_states_closure_error_if_it_is_known(
+    loop: Any, size: str | None
+) -> None:
     one = analysis(axes=(hiding(nees=25.0),), source=ODOMETRY, loop=loop)
     finding = only(hidden_errors.detect, one)
     assert (finding.id, finding.severity) == ("source_drift", "error")

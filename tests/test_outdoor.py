@@ -248,7 +248,7 @@ def test_magnetometer_disturbance_is_cause_of_missing_fusion() -> None:
     assert changed.evidence["time_s"] == pytest.approx(67.0, abs=10.0)
 
 
-def test_simulated_ekf2_noise_below_receiver_sigma_raises_error() -> None:
+def test_simulate_gnss_rejects_ekf2_noise_below_receiver_sigma() -> None:
     with pytest.raises(SettingsError, match=r"the larger of EKF2_GPS_P_NOISE .*0\.4 m"):
         simulate(OUTDOOR, parse_faults(["ekf2-noise=0.05"]))
     parameters = simulate(OUTDOOR, parse_faults(["ekf2-noise=0.8"])).parameters
@@ -269,7 +269,7 @@ def test_simulated_correlated_error_has_requested_sigma_and_tau() -> None:
     assert np.std(first) == pytest.approx(0.5, rel=0.1)
 
 
-def test_simulated_heading_error_builds_up_with_a_lag() -> None:
+def test_simulated_heading_error_grows_exponentially_to_its_size() -> None:
     time_s = np.array([0.0, 39.9, 43.0, 100.0])
     clean = sensors.simulate_attitude_error(OUTDOOR, FaultSizes(), time_s).as_rotvec()
     wrong = sensors.simulate_attitude_error(

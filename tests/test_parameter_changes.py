@@ -19,7 +19,7 @@ def found(flight: Flight) -> Finding:
     return finding
 
 
-def test_fusion_switched_off_in_flight_explains_missing_fusion() -> None:
+def test_parameter_that_disables_fusion_causes_fusion_finding() -> None:
     flight = aisle_flight(ekf2=Estimator(fusing=((0.0, 1.0), (60.0, 0.0))))
     first, *others = find(unexplained(compare(with_change(flight, "EKF2_EV_CTRL", 1.0, 0.0))))
     assert (first.id, first.severity) == ("parameter_changed", "warning")
@@ -31,7 +31,7 @@ def test_parameter_change_in_flight_without_effect_gives_a_note() -> None:
     assert found(with_change(aisle_flight(), "EKF2_EVP_NOISE", 0.1, 0.11)).severity == "note"
 
 
-def test_parameter_change_before_larger_error_is_warning() -> None:
+def test_parameter_change_with_larger_later_error_is_a_warning() -> None:
     flight = aisle_flight()
     state = flight.ekf2.state.copy()
     state.loc[60.0:, ["north_m", "east_m"]] += 0.5

@@ -326,7 +326,7 @@ def test_gnc_pose_graph_keeps_weight_1_of_true_loop_closures() -> None:
         assert robust.cost == pytest.approx(solve(graph).cost, rel=1e-8)
 
 
-def test_robust_pose_graph_reweights_only_loop_closures() -> None:
+def test_robust_pose_graph_gives_low_weight_to_false_closures() -> None:
     graph, _, true = laps(0)
     plain = solve(graph).cost
     sure = solve(graph, robust=True, is_closure=np.zeros(len(true), dtype=bool))

@@ -74,7 +74,7 @@ def test_innovations_on_rotated_axis_combine_north_and_east() -> None:
 
 
 @pytest.mark.parametrize("axis", ["north", "east", "aisle"])
-def test_projected_variances_follow_scalar_kalman_update(axis: str) -> None:
+def test_position_variances_follow_from_s_and_r_of_innovations(axis: str) -> None:
     """P⁻ = S - R and 1/P⁺ = 1/P⁻ + 1/R; a rejected sample leaves P⁻ unchanged."""
     got = innovations(with_innovations(flight(), north=NORTH, east=EAST), axis)
     s, r = got["innovation_variance_m2"], got["observation_variance_m2"]
@@ -86,7 +86,7 @@ def test_projected_variances_follow_scalar_kalman_update(axis: str) -> None:
     np.testing.assert_allclose(got["posterior_variance_m2"], expected)
 
 
-def test_innovation_variance_below_r_gives_nan_prior_variance() -> None:
+def test_position_variance_is_nan_if_s_is_not_larger_than_r() -> None:
     """S equal to R or smaller gives NaN instead of P⁻ ≤ 0."""
     north = NORTH.assign(innovation_variance_m2=[0.05, 0.02, 0.005, 0.08])
     got = innovations(with_innovations(flight(), north=north), "north")

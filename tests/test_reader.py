@@ -290,7 +290,7 @@ def test_ekf2_samples_are_taken_from_primary_instance(read, generation, switches
     ]
 
 
-def test_ekf2_primary_instance_ignores_unset_selector(read):
+def test_selector_value_255_is_not_used_as_primary_instance(read):
     ekf2 = read(with_two_instances("v1.16", [(0.0, 255), (3.05, 1)])).ekf2
     assert ekf2.instances == ((-np.inf, 1),)
     assert ekf2.variance["north_m2"].iloc[-1] == pytest.approx(3.0 * 0.07, rel=1e-6)
@@ -456,7 +456,7 @@ def test_unfused_gnss_is_used_as_source_only_on_request(read):
 
 
 @pytest.mark.parametrize("delay_ms", [0.0, 175.0])
-def test_times_of_estimator_aid_src_ev_pos_exclude_ekf2_delay(read, delay_ms):
+def test_reader_adds_ev_delay_to_times_of_ekf2_vision_samples(read, delay_ms):
     """EKF2 subtracts EKF2_EV_DELAY and half its prediction interval from the timestamp."""
     log = make_log("v1.16").drop("vehicle_visual_odometry")
     log.parameters["EKF2_EV_DELAY"] = delay_ms

@@ -65,7 +65,7 @@ def largest_errors(
 
 @pytest.mark.reallogs
 @pytest.mark.parametrize("name", SHARED_FILES)
-def test_read_position_file_of_recorded_cases_equals_original(name: str) -> None:
+def test_read_position_file_equals_true_positions_of_example(name: str) -> None:
     folder = shared("cases/position_files")
     expected = json.loads((folder / "EXPECTED.json").read_text())["files"][name]
     options = expected["options"]

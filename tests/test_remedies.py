@@ -127,7 +127,7 @@ def trial(after: RunStatistics, change: str = "sigma_z_m", kind: str = "noises")
         (13.3, 9.0, 0.5, "nothing", False),
     ],
 )
-def test_filter_rerun_with_smaller_nis_or_rmse_is_improvement(
+def test_improvement_of_rerun_depends_on_nis_nees_and_rmse(
     nis, nees, rmse_m, expected, has
 ) -> None:
     one = trial(RunStatistics(nis_mean=nis, nees_mean=nees, position_rmse_m=rmse_m))
@@ -226,7 +226,7 @@ def test_ekf2_delay_with_worse_replay_is_not_recommended(sample: Analysis) -> No
     assert found == ["ekf2_ev_delay_wrong"]
 
 
-def test_height_noise_unlike_position_noise_is_in_advice(sample: Analysis) -> None:
+def test_advice_states_height_noise_if_it_differs_from_setting(sample: Analysis) -> None:
     """The sample fuses the horizontal position only."""
     down = sample.tuning["down"]
     assert isinstance(down, AxisTuning)

@@ -114,7 +114,7 @@ def test_filter_rerun_for_vibration_increases_ekf2_acc_noise() -> None:
     assert not any("EKF2_ACC_NOISE" in row.change for row in flown("nlos=7%").trials)
 
 
-def test_time_offset_applied_to_kf_is_also_tested_for_ekf2() -> None:
+def test_ekf2_is_rerun_with_time_offset_that_kf_already_uses() -> None:
     bare = flown("clock-offset=-0.19")
     offset_s = cause(bare, "kf", "nees").change[CLOCK_OFFSET_KEY]
     analysis = find_faults(compare(bare.flight, replace(RIGHT, clock_offset_s=offset_s)))
@@ -187,7 +187,7 @@ def test_rerun_gives_kf_ekf2_difference_with_and_without_change() -> None:
     )
 
 
-def test_rerun_with_time_offset_excludes_outliers_at_moved_times() -> None:
+def test_rerun_with_time_offset_shifts_times_of_outliers() -> None:
     analysis = flown("clock-offset=-0.19", "nlos=7%")
     count = cause(analysis, "ekf2").change[OUTLIERS_KEY]
     rows = [one for one in analysis.trials if one.filter == "ekf2" and one.axis == "aisle"]
@@ -205,7 +205,7 @@ def test_rerun_with_time_offset_excludes_outliers_at_moved_times() -> None:
         assert nis.mean() < 1.3
 
 
-def test_ekf2_is_rerun_with_default_of_each_changed_parameter() -> None:
+def test_ekf2_is_rerun_with_px4_default_of_each_changed_noise() -> None:
     analysis = flown("ekf2-noise=0.03")
     settings = {**analysis.ekf2_model.inputs.settings, "EKF2_ACC_NOISE": 0.5, "EKF2_GYR_NOISE": 0.1}
     inputs = replace(analysis.ekf2_model.inputs, settings=settings)
@@ -215,7 +215,7 @@ def test_ekf2_is_rerun_with_default_of_each_changed_parameter() -> None:
     assert tried[1:] == [{"EKF2_ACC_NOISE": 0.35}, {"EKF2_GYR_NOISE": 0.015}]
 
 
-def test_cause_must_explain_50_to_150_percent_of_nis_deviation() -> None:
+def test_cause_explains_50_to_150_percent_of_log_mean_nis() -> None:
     def one(change: Any, explains: float, *, into: bool = False) -> Trial:
         after = RunStatistics(innovations=10 if into else 10**6, nis_mean=9.0 ** (1.0 - explains))
         return Trial(

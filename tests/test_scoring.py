@@ -170,7 +170,7 @@ def key(*mistakes, sha256=SHA, **values):
 
 
 class TestForm:
-    def test_answer_form_earns_points_only_for_answers_in_key(self):
+    def test_answer_form_earns_points_only_for_injected_faults(self):
         found = with_form(["dropout"], student__id="S01 ")
         points, comment = check_points("answers", found, key=key())
         assert points == 0.3

@@ -147,7 +147,7 @@ def test_acceleration_mean_per_step_of_linear_signal_is_exact(gaps_ms, data):
         (np.r_[0.0 : 20.0 : 1 / 8.6], np.arange(0.0, 19.0, 0.1), np.zeros(189)),
     ],
 )  # fmt: skip
-def test_imu_gap_fraction_is_part_of_step_without_imu_data(time, edges, gaps):
+def test_imu_gap_fraction_is_fraction_of_step_without_imu_data(time, edges, gaps):
     """In a gap between equal values the mean is that value; outside the data it is zero."""
     mean, gap = compute_mean_step_acceleration(acceleration_of(time, np.ones(len(time))), edges)
     np.testing.assert_allclose(gap, gaps, atol=1e-9)
@@ -321,7 +321,7 @@ def test_ekf2_position_jump_at_origin_shift_is_removed(at, good):
 
 
 @pytest.mark.parametrize("reset_s", [4.0, 10.0, 15.0])
-def test_ekf2_reset_that_corrects_an_error_is_kept(reset_s):
+def test_ekf2_reset_that_corrects_drift_remains_in_ekf2_state(reset_s):
     """EKF2 drifts by 2 m and a reset moves it back to the source."""
     drift = np.where(reset_s > STATE_TIME, 2.0 * STATE_TIME / reset_s, 0.0)
     resets = [Reset(reset_s, kind, (-2.0, 0.0, 0.0)) for kind in ("position", "velocity")]
@@ -346,7 +346,7 @@ def test_ekf2_height_reset_is_kept_if_position_reset_is_removed():
     assert "height" in statement.split("not removed")[1]
 
 
-def test_ekf2_reset_on_axis_without_source_data_is_not_removed():
+def test_height_reset_is_kept_if_source_has_no_height():
     """A source without height contains no information on a change of the frame."""
     track = noisy_track()
     blind = replace(track, samples=track.samples.assign(down_m=np.nan))
@@ -373,7 +373,7 @@ def test_ekf2_resets_outside_evaluated_segment_are_not_removed(reset_s, said):
     assert bool(said) == bool(statement)
 
 
-def test_aisle_axis_of_wide_track_is_labelled_main_axis() -> None:
+def test_label_of_aisle_axis_is_main_axis_for_wide_track() -> None:
     flight = aisle_flight()
     labels = {axis.name: axis.label for axis in make_axes(flight, flight.positions[0], ALL)}
     assert (labels["north"], labels["aisle"]) == ("north", "the main axis")

@@ -215,7 +215,7 @@ class TestMistakes:
         assert np.array_equal(*arrivals)
         assert make_answer_key(late)["truth"]["clock_offset_to_add_s"] == -offset_s
 
-    def test_simulated_clock_jump_ends_at_timesync_convergence(self):
+    def test_simulated_timestamps_are_late_until_timesync_converges(self):
         jumping = simulate(Scenario(seed=4), parse_faults(["clock-jump=0.25"]))
         fields, time = jumping.positions.topic.fields, jumping.positions.measurement_times_s
         before = time < 50.0

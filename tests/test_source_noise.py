@@ -257,7 +257,7 @@ def test_time_correlation_fit_without_imu_is_unavailable() -> None:
     )
 
 
-def test_time_correlation_fit_searches_with_and_without_offset(
+def test_time_correlation_fit_tries_zero_and_given_time_offset(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     analysis, tried = analysed(MIXED), []
@@ -311,7 +311,7 @@ def test_position_jump_among_outliers_is_reported_once(seed: int) -> None:
     assert evidence["at_s"] == pytest.approx(kept["at_s"], abs=0.2)
 
 
-def test_copy_of_ground_truth_has_no_time_correlated_noise():
+def test_positions_equal_to_truth_have_no_correlated_noise():
     axes = [compare(simulate_flight(Scenario(passes=2))).axes[name] for name in ("north", "east")]
     copies = [
         dataclasses.replace(

@@ -75,7 +75,7 @@ def test_randomly_repeated_positions_give_no_lost_tracking():
     assert invalid(pd.DataFrame(positions, time_s, ["x", "y", "z"])) == {}
 
 
-def test_zero_position_near_the_origin_is_valid():
+def test_position_0_0_0_is_valid_if_track_passes_the_origin():
     samples = track() - 8.0
     assert samples.iloc[30].abs().max() < 1e-9
     samples.iloc[30] = 0.0
@@ -100,7 +100,7 @@ def test_rounding_step_of_float32_positions_is_found(origin, step):
     assert estimate_rounding_step(values) < 0.01
 
 
-def test_position_resolution_of_subnormal_difference_is_zero():
+def test_rounding_step_is_zero_for_difference_below_float_range():
     assert estimate_rounding_step(np.array([0.0, 5e-324, 1e10])) == 0.0
 
 
@@ -274,7 +274,7 @@ def test_two_position_senders_report_contains_their_distance(lost):
 
 
 @pytest.mark.parametrize("is_fused", [0.0, 1.0])
-def test_report_on_positions_copied_from_ekf2_reports_delay(is_fused):
+def test_finding_on_copied_ekf2_positions_states_copy_delay(is_fused):
     flight = aisle_flight(ekf2=Estimator(fusing=((0.0, is_fused),)))
     first, *_ = detected(copied(flight))
     assert first.evidence["delay_s"] == pytest.approx(0.03, abs=0.01)
@@ -313,7 +313,7 @@ def test_unfused_vision_report_shows_quality_below_ekf2_ev_qmin(quality, words):
     assert words in one.remedy
 
 
-def test_findings_from_two_senders_are_removed_or_made_effects():
+def test_two_senders_remove_or_explain_other_findings():
     analysis = unexplained(compare(aisle_flight()))
     findings = [
         finding("error", name, "m.", "r.")
@@ -363,7 +363,7 @@ def test_source_without_lever_arm_has_no_lever_arm_report():
 
 @pytest.mark.reallogs
 @pytest.mark.parametrize("name", CASES)
-def test_faults_found_in_recorded_logs_equal_expected_faults(name):
+def test_findings_on_example_logs_equal_expected_findings(name):
     folder = shared("cases")
     case = json.loads((folder / "EXPECTED.json").read_text())["cases"][name]
     result, first, harmful = judge(case, run(case["command"], folder))

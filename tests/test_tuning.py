@@ -62,7 +62,7 @@ def test_tune_finds_no_outliers_in_clean_data() -> None:
     assert sum(len(found.outlier_time_s) for found in many()) <= 0.001 * SEEDS * COUNT
 
 
-def test_two_stage_fit_of_long_flight_equals_single_fit(
+def test_noise_fit_started_from_first_part_equals_single_fit(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     """The fit that starts at the first measurements has the same result, also with outliers."""
@@ -82,7 +82,7 @@ def test_two_stage_fit_of_long_flight_equals_single_fit(
     assert set(axis.measurement_time_s[outliers]) <= set(found.outlier_time_s)
 
 
-def test_outliers_between_downsampled_positions_are_found() -> None:
+def test_tune_finds_outliers_among_positions_it_does_not_fit() -> None:
     """Only every fourth position is used for the noises at 100 Hz."""
     axis = modelled(4, 2000)
     fast = replace(axis, measurement_time_s=0.01 * np.arange(2001.0))
@@ -233,7 +233,7 @@ def test_tune_separates_imu_bias_and_tilt_from_noise() -> None:
     assert found.noises.random_walk_m == 0.0
 
 
-def test_tuned_sigma_a_at_weak_motion_is_unbiased() -> None:
+def test_sigma_a_estimate_is_unbiased_if_vehicle_moves_little() -> None:
     """A scale signal that contains the noise would explain part of it (errors in variables)."""
     ratios = [
         horizontal(made_flight(seed, moving=0.1, sigma_a=0.5)[0]).noises.sigma_a_m_s2 / 0.5

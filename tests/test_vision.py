@@ -251,7 +251,7 @@ def test_ekf2_replay_of_vision_and_gnss_equals_reference(
     assert found["fused"].all()
 
 
-def test_vision_noise_during_gnss_fusion_is_at_least_gnss_noise() -> None:
+def test_vision_noise_is_at_least_gnss_noise_while_gnss_is_fused() -> None:
     """R is the largest of EKF2_EVP_NOISE, EKF2_GPS_P_NOISE and the reported variance."""
     inputs = flying(sent(), EKF2_GPS_P_NOISE=0.5)
     noises = ({**inputs.settings, "EKF2_EVP_NOISE": noise_m} for noise_m in (0.01, 0.5, 0.7))
@@ -376,7 +376,7 @@ def off_by(received: ReceivedPositions, north_m: float) -> ReceivedPositions:
     return replace(received, position_m=received.position_m + far)
 
 
-def test_rejection_of_gnss_and_vision_resets_position_to_vision() -> None:
+def test_position_resets_to_vision_if_gnss_and_vision_rejected() -> None:
     inputs = flying(off_by(sent(sigma_m=0.05), 20.0), seconds=20.0)
     done = ran(replace(inputs, received=off_by(inputs.received, 40.0)))
     found = update_records(done)
@@ -487,7 +487,7 @@ def test_ekf2_model_of_gnss_and_vision_agrees_with_log() -> None:
     assert model().inputs.settings["EKF2_EVP_NOISE"] == pytest.approx(0.1)
 
 
-def test_what_if_vision_noise_gives_nis_of_flight_with_it() -> None:
+def test_what_if_vision_noise_equals_flight_with_same_noise() -> None:
     other = opened(flown(EKF2_EVP_NOISE=1.0))
     for one, value, then in ((model(), 1.0, other), (other, 0.1, model())):
         found, true = what_if(one, [{"EKF2_EVP_NOISE": value}]), what_if(then, [])
@@ -574,7 +574,7 @@ def test_ekf2_model_with_incomplete_vision_is_unavailable() -> None:
     assert "changes of the vision position" in refused.reason
 
 
-def test_gnss_flight_difference_steps_include_vision_fusion() -> None:
+def test_difference_steps_of_gnss_flight_include_vision_step() -> None:
     found = steps.explain_by_steps(model())
     for why in found.values():
         names = [step.name for step in why.steps]

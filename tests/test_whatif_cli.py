@@ -89,7 +89,7 @@ def test_what_if_with_unknown_aiding_source_raises_error(estimated: WhatIfAnalys
             what_if(model, [], without)
 
 
-def test_what_if_without_set_option_keeps_consistent_parameters(estimated: WhatIfAnalysis) -> None:
+def test_what_if_without_set_changes_no_correct_parameter(estimated: WhatIfAnalysis) -> None:
     """The UWB noise is 0.10 m, as EKF2 assumes, and its timestamps are right."""
     assert estimated.uses_estimates
     assert not estimated.changes

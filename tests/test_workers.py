@@ -94,7 +94,7 @@ def test_worker_process_is_replaced_after_maximum_job_count(monkeypatch):
     assert results[0] == results[1] != results[2]
 
 
-def test_worker_that_cannot_import_the_function_fails_each_job(monkeypatch):
+def test_all_jobs_fail_if_worker_cannot_import_the_function(monkeypatch):
     monkeypatch.setattr(run_job, "__module__", "test_workers_is_not_here")
     monkeypatch.setitem(sys.modules, "test_workers_is_not_here", sys.modules[__name__])
     results, _ = run([("square", 1), ("square", 2)])

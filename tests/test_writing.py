@@ -74,7 +74,7 @@ def test_output_to_named_pipe_keeps_the_pipe(desk) -> None:
 
 
 @posix
-def test_output_to_device_does_not_replace_it_by_a_file(desk) -> None:
+def test_writing_to_a_device_does_not_replace_the_device(desk) -> None:
     """Use a link, so that a failure replaces the link and not the device."""
     link = desk / "null"
     link.symlink_to(os.devnull)
