@@ -4,6 +4,7 @@ Each detector runs on a flight without a fault, with the fault, without required
 short flight.
 """
 
+import re
 from functools import cache
 from typing import Any
 
@@ -16,7 +17,13 @@ from flights import aisle_flight, unavailable, unexplained
 
 from px4fuse.analysis import Analysis
 from px4fuse.comparison.estimates import _fit_source_errors, estimate
-from px4fuse.filter.hypotheses import DesignMatrix, fit_systematic_errors, make_design_matrix
+from px4fuse.core.arrays import integrate_cumulatively
+from px4fuse.filter.hypotheses import (
+    DesignMatrix,
+    estimate_mean_acceleration_error,
+    fit_systematic_errors,
+    make_design_matrix,
+)
 from px4fuse.filter.kalman import replay
 from px4fuse.filter.likelihood import innovations, preintegrate
 from px4fuse.filter.settings import Settings
@@ -252,6 +259,44 @@ def test_clock_jump_of_50_ms_is_warning_and_of_300_ms_is_error(jump, severity):
     assert finding.evidence["until_s"] == pytest.approx(50.0, abs=0.5)
     assert finding.evidence["latency_s"] == pytest.approx(float(jump[:-2]) / 1e3, abs=0.005)
     assert "--start 50" in finding.remedy
+
+
+@pytest.mark.parametrize("scale", [0.96, 1.04])
+def test_accelerometer_scale_error_is_reported_as_vertical_bias(scale) -> None:
+    scaled = flight()
+    imu_samples = scaled.imu.copy()
+    imu_samples[Columns.SPECIFIC_FORCE] *= scale
+    scaled = replace(scaled, imu=imu_samples)
+    axes = ("north", "east", "down")
+    comparison = compare(scaled, RIGHT, axes=axes)
+    analysis = replace(unexplained(comparison), **vars(estimate(comparison)))
+    (finding,) = imu.detect_accelerometer_bias(analysis)
+    assert finding.evidence["bias_m_s2"] == pytest.approx(9.81 * 0.04, abs=0.12)
+    scale_text = re.search(r"scale factor of (\S+) has", finding.message)[1]
+    assert float(scale_text) == pytest.approx(scale, abs=0.012)  # the IMU has a bias, too
+    # without the height, the bias is unknown
+    assert found(analysed(scaled), (imu.detect_accelerometer_bias,)) == {}
+
+
+@pytest.mark.parametrize("error_m_s2", [-0.5, 0.3])
+def test_mean_acceleration_error_of_noise_free_axis_is_exact(error_m_s2) -> None:
+    down = compare(aisle_flight(duration_s=30.0), RIGHT, axes=("down",))["down"].axis
+    acceleration = down.acceleration
+    time_s = acceleration.time_s
+    biased = acceleration.acceleration_integral_m_s + error_m_s2 * (time_s - time_s[0])
+    at_rest = replace(
+        down,
+        measurement_m=np.interp(
+            down.measurement_time_s,
+            time_s,
+            integrate_cumulatively(acceleration.compute_integral_m_s(), time_s),
+        ),
+        acceleration=replace(acceleration, acceleration_integral_m_s=biased),
+    )
+    assert estimate_mean_acceleration_error(at_rest) == pytest.approx(error_m_s2, abs=1e-3)
+    gap = replace(at_rest.acceleration, cumulative_gap_s=np.array([0.0, 1.0]))
+    assert estimate_mean_acceleration_error(replace(at_rest, acceleration=gap)) is None
+    assert estimate_mean_acceleration_error(at_rest.keep_rows(slice(0, 20))) is None
 
 
 # ------------------------------------------------------------------ missing data

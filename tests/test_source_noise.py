@@ -1,6 +1,7 @@
 """Position noise that is correlated, repeated, unequal or varying: kind and size are found."""
 
 import dataclasses
+import re
 from functools import cache, partial
 from typing import Any
 
@@ -70,6 +71,14 @@ def root_findings(analysis: Analysis) -> dict[str, Finding]:
     }  # fmt: skip
 
 
+def diagonal_noise(rng: errors.Rng, time: errors.Values, true: errors.Values) -> errors.Made:
+    """Noise of 0.2 m along 135° from north, and of 0.05 m along 45° and down."""
+    along, across, down = rng.normal(size=(3, len(time))) * np.array([[0.2], [0.05], [0.05]])
+    return np.column_stack([across - along, across + along, np.sqrt(2.0) * down]) / np.sqrt(
+        2.0
+    ), 0.0
+
+
 UNEQUAL = partial(errors.white, sigma=np.array([0.05, 0.2, 0.1]))
 LOUD = partial(errors.two_levels, factor=3.0)
 SLOW = partial(errors.coloured, tau_s=0.5, share=1.0)
@@ -110,6 +119,15 @@ def test_simulated_position_noise_is_found_with_type_and_size(
     assert found[name].severity == severity
     for key, (value, within) in evidence.items():
         assert found[name].evidence[key] == pytest.approx(value, abs=within)
+
+
+@pytest.mark.parametrize("rate_hz", [5.0, 20.0])
+def test_noise_along_diagonal_is_found_with_its_direction(rate_hz) -> None:
+    found = root_findings(analysed(diagonal_noise, rate_hz, passes=5))["source_noise_unequal_axes"]
+    heading_deg = float(re.search(r"along (\d+)° from north and", found.message)[1])
+    assert heading_deg == pytest.approx(135.0, abs=6.0)
+    assert found.evidence["larger_noise_sigma_z_m"] == pytest.approx(0.2, abs=0.03)
+    assert found.evidence["smaller_noise_sigma_z_m"] == pytest.approx(0.05, abs=0.02)
 
 
 def test_noise_variation_report_names_noisy_third_of_flight() -> None:

@@ -1,18 +1,24 @@
-"""Position noise that differs between north and east, or between parts of the flight."""
+"""Position noise that differs between horizontal directions, or between parts of the flight."""
 
+from collections.abc import Sequence
 from itertools import pairwise
 from typing import NamedTuple
 
 import numpy as np
+import pandas as pd
 
-from px4fuse.comparison.model import Comparison, select_north_and_east
+from px4fuse.comparison.model import AxisComparison, Comparison, select_north_and_east
 from px4fuse.core.arrays import Array, BoolArray
 from px4fuse.filter.likelihood import innovations, preintegrate
+from px4fuse.filter.signals import Axis, make_horizontal_axis
 from px4fuse.filter.tuning import AxisTuning, tune
 from px4fuse.flight.model import Unavailable
 
 # Noises are estimated separately along north and east if their mean NIS differ by this factor
 MIN_AXIS_NIS_RATIO = 1.7
+# Noises are estimated along the directions of the largest and the smallest noise if the correlation
+# of the noise along north and east is this number of σ: 1 of 3 million flights without correlation
+MIN_CORRELATION_SIGMAS = 5.0
 # Maximum number of flight parts of equal length whose innovations are compared
 MAX_FLIGHT_PART_COUNT = 12
 # Minimum number of measurements in each compared flight part
@@ -29,18 +35,47 @@ class NoisyPart(NamedTuple):
 
 
 def tune_by_axis(comparison: Comparison) -> tuple[AxisTuning, ...]:
-    """Estimate separate noises along north and along east, if their mean NIS differs."""
-    axes = select_north_and_east(comparison)
-    summaries = [axis.filters["kf"] for axis in axes]
+    """Estimate separate noises along two perpendicular axes, if the noises seem to differ.
+
+    The axes are north and east. If the noise along north and east is correlated, they are the axes
+    of the largest and the smallest noise.
+    """
+    compared_axes = select_north_and_east(comparison)
+    summaries = [axis.filters["kf"] for axis in compared_axes]
     nis_means = [summary.nis_mean for summary in summaries if not isinstance(summary, Unavailable)]
-    if len(nis_means) < 2 or max(nis_means) < MIN_AXIS_NIS_RATIO * min(nis_means):
+    if len(nis_means) < 2:
+        return ()
+    axes: Sequence[Axis] = [compared.axis for compared in compared_axes]
+    if (heading_deg := _find_heading_of_largest_noise(compared_axes)) is not None:
+        axes = [make_horizontal_axis(axes, heading_deg + turn_deg) for turn_deg in (0.0, 90.0)]
+    elif max(nis_means) < MIN_AXIS_NIS_RATIO * min(nis_means):
         return ()
     return tuple(
         axis_tuning
         for axis in axes
-        for axis_tuning in tune((axis.axis,), comparison.settings, (axis.axis.name,)).values()
+        for axis_tuning in tune((axis,), comparison.settings, (axis.name,)).values()
         if isinstance(axis_tuning, AxisTuning)
     )
+
+
+def _find_heading_of_largest_noise(north_and_east: Sequence[AxisComparison]) -> float | None:
+    """Return the heading (°, 0 to 180) of the largest noise, if north and east are correlated.
+
+    The function compares the changes of KF's innovation between two samples, because slow errors
+    (time offset, scale, misalignment) cancel in them. Median and signs are robust to outliers: the
+    correlation is sin(π/2 · mean(sign(north) · sign(east))) (Blomqvist 1950).
+    """
+    innovations_m = [axis.replay.updates["innovation_m"] for axis in north_and_east]
+    changes_m = pd.concat(innovations_m, axis="columns", join="inner").diff().dropna().to_numpy()
+    changes_m = changes_m[::2]  # neighbouring changes share an innovation
+    if len(changes_m) < MIN_PART_MEASUREMENTS:
+        return None
+    correlation = np.sin(0.5 * np.pi * np.sign(changes_m).prod(axis=1).mean())
+    if abs(correlation) * np.sqrt(len(changes_m)) < MIN_CORRELATION_SIGMAS:
+        return None
+    north_m, east_m = np.median(np.abs(changes_m), axis=0)
+    double_angle_rad = np.arctan2(2.0 * correlation * north_m * east_m, north_m**2 - east_m**2)
+    return float(np.degrees(0.5 * double_angle_rad)) % 180.0
 
 
 def find_noisy_part(

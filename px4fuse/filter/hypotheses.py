@@ -134,6 +134,26 @@ class SystematicErrors:
         return bias.value >= max(MIN_BIAS_M_S2, MIN_BIAS_TO_SIGMA_RATIO * bias.sigma)
 
 
+def estimate_mean_acceleration_error(axis: Axis) -> float | None:
+    """Fit a constant error of the acceleration (m/s²) along an axis to its positions.
+
+    Start position, start velocity and the error are fitted to the measurements minus the doubly
+    integrated acceleration. None without IMU, with a gap in the IMU, or with few measurements.
+    """
+    acceleration, time_s = axis.acceleration, axis.measurement_time_s
+    if (
+        isinstance(acceleration, Unavailable)
+        or acceleration.cumulative_gap_s[-1] > 0.0
+        or len(time_s) < MIN_MEASUREMENTS
+    ):
+        return None
+    velocity_m_s = acceleration.compute_integral_m_s()
+    path_m = integrate_cumulatively(velocity_m_s, acceleration.time_s)
+    residuals_m = axis.measurement_m - np.interp(time_s, acceleration.time_s, path_m)
+    # the doubly integrated acceleration is too large by error · t² / 2
+    return -2.0 * float(np.polynomial.Polynomial.fit(time_s, residuals_m, 2).convert().coef[2])
+
+
 def fit_systematic_errors(
     flight: Flight,
     axes: tuple[Axis, ...],

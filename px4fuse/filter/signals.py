@@ -6,7 +6,7 @@ force + [0, 0, g] (Groves 2013, eq. 5.52 without earth rate).
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -270,6 +270,25 @@ def make_axes(
     if not axes:
         raise MissingDataError(f"{source_label} has no finite position in the analysed segment.")
     return tuple(axes)
+
+
+def make_horizontal_axis(north_and_east: Sequence[Axis], heading_deg: float) -> Axis:
+    """Combine the axes north and east, with equal measurement times, to one of another heading."""
+    north, east = north_and_east
+    angle_rad = np.radians(heading_deg)
+    direction = np.cos(angle_rad) * north.direction + np.sin(angle_rad) * east.direction
+    acceleration = north.acceleration
+    return replace(
+        north,
+        name=f"{heading_deg % 180.0:.0f}° from north",
+        direction=direction,
+        heading_deg=heading_deg,
+        measurement_m=np.cos(angle_rad) * north.measurement_m
+        + np.sin(angle_rad) * east.measurement_m,
+        acceleration=acceleration
+        if isinstance(acceleration, Unavailable)
+        else replace(acceleration, direction=direction),
+    )
 
 
 def make_downsampling_slice(time_s: Array) -> slice:

@@ -2,12 +2,17 @@
 
 import numpy as np
 import pandas as pd
+from scipy import constants
 
 from px4fuse.analysis import Analysis
 from px4fuse.core.arrays import select_intervals
 from px4fuse.core.record import Span
 from px4fuse.ekf2.inputs import MAX_MISSING_IMU_FRACTION, compute_lost_imu_fraction
-from px4fuse.filter.hypotheses import MIN_BIAS_M_S2, SystematicErrors
+from px4fuse.filter.hypotheses import (
+    MIN_BIAS_M_S2,
+    SystematicErrors,
+    estimate_mean_acceleration_error,
+)
 from px4fuse.filter.signals import Segment, cut_to_segment, find_imu_gaps
 from px4fuse.finding import MIN_SPAN_S
 from px4fuse.findings.missing import DEFAULT_SDLOG_PROFILE, VISION_PROFILE_MASK
@@ -119,6 +124,19 @@ def detect_accelerometer_bias(analysis: Analysis) -> Findings:
                 "Calibrate the accelerometers at the temperature of the flight.",
                 {"bias_m_s2": bias_m_s2},
             )
+    elif (down := analysis.axes.get("down")) is not None:
+        error_m_s2 = estimate_mean_acceleration_error(down.axis)
+        if error_m_s2 is None or abs(error_m_s2) < MIN_BIAS_M_S2:
+            return
+        yield finding(
+            "error" if abs(error_m_s2) >= MIN_BIAS_FOR_ERROR_M_S2 else "warning",
+            "accelerometer_bias",
+            f"The accelerometer is biased by {error_m_s2:+.2f} m/s² down, compared with the heights"
+            f" of the source. A scale factor of {1.0 - error_m_s2 / constants.g:.3f} has the same "
+            "effect. KF does not estimate biases.",
+            "Calibrate the accelerometers at the temperature of the flight.",
+            {"bias_m_s2": abs(error_m_s2)},
+        )
 
 
 def _find_ekf2_accelerometer_bias(analysis: Analysis) -> list[float] | None:

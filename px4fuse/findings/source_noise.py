@@ -136,7 +136,7 @@ def detect_repeated_positions(analysis: Analysis) -> Findings:
 
 
 def detect_unequal_noise(analysis: Analysis) -> Findings:
-    """Detect that the position noise differs between north and east."""
+    """Detect that the position noise differs between two horizontal directions."""
     if analysis.source.origin.is_gnss:
         return  # the estimate of SIGMA_Z lacks the time-correlated noise, which dominates in GNSS
     axis_noise_estimates = sorted(
@@ -155,17 +155,21 @@ def detect_unequal_noise(analysis: Analysis) -> Findings:
         or larger_noise_lower_bound_m <= smaller_noise_upper_bound_m
     ):
         return
+    action = f"Check {find_source_texts(analysis.source).errors}."
+    keys = ("smaller_noise_sigma_z_m", "larger_noise_sigma_z_m")
+    if larger_noise_axis in analysis.axes:
+        action += (
+            " Analyse each axis separately "
+            f"(--axis {larger_noise_axis} --sigma-z {larger_noise_m:.2g})."
+        )
+        keys = (f"{smaller_noise_axis}_sigma_z_m", f"{larger_noise_axis}_sigma_z_m")
     yield warning(
         "source_noise_unequal_axes",
         f"{source_name(analysis.source)} noise is {larger_noise_m:.2g} m along "
         f"{larger_noise_axis} and {smaller_noise_m:.2g} m along {smaller_noise_axis}. One SIGMA_Z, "
         "or one EKF2 measurement noise, does not fit both axes.",
-        f"Check {find_source_texts(analysis.source).errors}. Analyse each axis separately "
-        f"(--axis {larger_noise_axis} --sigma-z {larger_noise_m:.2g}).",
-        {
-            f"{smaller_noise_axis}_sigma_z_m": smaller_noise_m,
-            f"{larger_noise_axis}_sigma_z_m": larger_noise_m,
-        },
+        action,
+        dict(zip(keys, (smaller_noise_m, larger_noise_m), strict=True)),
     )
 
 
