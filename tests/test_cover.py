@@ -15,7 +15,7 @@ from msgspec.structs import replace
 from page_tools import axes_of, every, pdf_of, set_by_typst, smallest_type
 
 from px4fuse.analysis import Analysis
-from px4fuse.card.model import Action, AidRow, Card, Cause, Note
+from px4fuse.card.model import Action, AidConsistency, Card, Cause, Note
 from px4fuse.flight.model import Reset
 from px4fuse.report import cover, cover_panels
 from px4fuse.report.page import Page
@@ -135,8 +135,8 @@ def test_report_cover_contains_reason_of_missing_verdict() -> None:
 
 def test_report_cover_lists_sigma_ratios_of_aiding_sources() -> None:
     aids = (
-        AidRow(label="barometer", component="height", ratio=0.57, is_usual=True),
-        AidRow(label="magnetometer", component="x", ratio=None),
+        AidConsistency(label="barometer", component="height", ratio=0.57, is_usual=True),
+        AidConsistency(label="magnetometer", component="x", ratio=None),
     )
     card = replace(SMALL_SIGMA_A, verdicts=(), causes=(), effect=None, aids=aids)
     text = text_of(card)

@@ -11,13 +11,13 @@ TUNING_HEAD = (
     "SIGMA_A (m/s²)\nestimate (95 %)",
     "SIGMA_Z (m)\nestimate (95 %)",
     "log-likelihood\ngain (nats per\nmeasurement)",
-    "log-likelihood\ngain on\n2nd half",
+    "log-likelihood\ngain, 2nd half\nof the data",
     "lag-1 auto-\ncorrelation\nbefore, after",
 )
 TUNING_NOTE = (
-    "Log-likelihood gain: with the estimates instead of the chosen settings. Gain on the 2nd half: "
-    "of the data, with the noises estimated on the first half. Lag-1 autocorrelation of the "
-    "innovations: before, with the chosen settings; after, with the estimates."
+    "The log-likelihood gain compares the estimates with the chosen settings. The gain on the 2nd "
+    "half of the data uses noises that are estimated on the first half. The innovations have the "
+    "lag-1 autocorrelation 'before' with the chosen settings, and 'after' with the estimates."
 )
 
 
