@@ -294,7 +294,7 @@ def test_html_file_of_user_is_not_overwritten_by_default(desk, command, mine) ->
     page.parent.mkdir()
     page.write_bytes(mine)
     message = error_line(*command.split())
-    assert f"{page} exists and was not overwritten, because it is not the output of" in message
+    assert f"{page} exists and was not overwritten, because the file is not recognised" in message
     assert page.read_bytes() == mine
     run_checked(*command.split(), "-o", page)
     assert page.read_bytes() != mine

@@ -17,9 +17,9 @@ from px4fuse.comparison.trials import (
     Trial,
     becomes_consistent,
     classify_improvement,
+    compare_sigma_ratios,
     compute_log_ratio_reduction,
     compute_preference_key,
-    compute_sigma_ratios,
     halves_discrepancy,
     has_effect,
     remains_overconfident,
@@ -338,23 +338,14 @@ def make_parameter_action(analysis: Analysis, change: Mapping[str, float]) -> Ac
 
 
 def _make_rerun(trial: Trial, trials: Sequence[Trial]) -> Rerun:
-    statistics_before_and_after = trial.before, trial.after
-    rejected_fractions = [
-        statistics.rejected_fraction for statistics in statistics_before_and_after
-    ]
+    rejected_fractions = trial.before.rejected_fraction, trial.after.rejected_fraction
     values_before_and_after: dict[str, Any] = {
-        "position_rmse_m": [
-            statistics.position_rmse_m for statistics in statistics_before_and_after
-        ],
-        "source_ratio": [
-            compute_sigma_ratios(statistics).get("source")
-            for statistics in statistics_before_and_after
-        ],
-        "truth_ratio": [
-            compute_sigma_ratios(statistics).get("truth")
-            for statistics in statistics_before_and_after
-        ],
+        f"{reference}_ratio": tuple(ratios) for reference, *ratios in compare_sigma_ratios(trial)
     }
+    values_before_and_after["position_rmse_m"] = (
+        trial.before.position_rmse_m,
+        trial.after.position_rmse_m,
+    )
     if max(fraction or 0.0 for fraction in rejected_fractions) >= MIN_REJECTED_FRACTION_TO_SHOW:
         values_before_and_after["rejected_fraction"] = rejected_fractions
     return Rerun(
@@ -362,7 +353,7 @@ def _make_rerun(trial: Trial, trials: Sequence[Trial]) -> Rerun:
         is_prediction=trial.filter == "ekf2",
         from_s=trial.from_s,
         improves=classify_improvement(trial),
-        **{name: tuple(pair) for name, pair in values_before_and_after.items() if None not in pair},
+        **{name: pair for name, pair in values_before_and_after.items() if None not in pair},
     )
 
 

@@ -93,9 +93,7 @@ def undo_time_offset(comparison: Comparison) -> PositionTrack:
 def _make_offset_slider(request: ComparisonRequest, analysis: Analysis) -> PageData:
     """Return range and estimate of the time offset, or the reason why it cannot be changed."""
     if request.position is not None:
-        return {
-            "why": "You cannot change this offset: it aligns the position file with the log."
-        }
+        return {"why": "You cannot change this offset: it aligns the position file with the log."}
     applied_offset_s, clock_offset = analysis.settings.clock_offset_s, analysis.clock
     estimated_offset_s = None
     if isinstance(clock_offset, ClockOffset) and clock_offset.is_determinable:

@@ -87,8 +87,8 @@ def make_time_offset_advice(
     if clock_drift := faults.clock_drift:
         advice_by_label["Drift"] = (
             f"The clock of the timestamps is {abs(100.0 * clock_drift):.1f} % "
-            f"{'fast' if clock_drift > 0.0 else 'slow'}, so the time offset changes. Offset is its "
-            "value in the middle of the data."
+            f"{'fast' if clock_drift > 0.0 else 'slow'}, so the time offset changes. 'Offset' is "
+            "the time offset in the middle of the data."
         )
     elif time_offset.drift_ppm is not None and time_offset.drift_sigma_ppm is not None:
         half_width_ppm = 1.96 * time_offset.drift_sigma_ppm

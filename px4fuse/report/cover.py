@@ -63,8 +63,13 @@ def draw_pages(analysis: Analysis | AidsOnlyAnalysis, results: FlightResults) ->
 
 def add_card(page: Page, card: Card) -> PageBlock:
     """Add a summary of faults, causes and actions to a page."""
-    identity, duration_text = card.identity, f"{card.identity.duration_s:.1f} s"
-    flight_texts = identity.firmware, identity.hardware, duration_text, identity.source
+    identity = card.identity
+    flight_texts = (
+        identity.firmware,
+        identity.hardware,
+        f"{identity.duration_s:.1f} s",
+        identity.source,
+    )
     more_causes_text = f"{card.more_causes} more causes are listed in {ALL_FINDINGS_TITLE}"
     return page.add(
         "cover",

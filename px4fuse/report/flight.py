@@ -41,8 +41,9 @@ def draw_innovations(analysis: Analysis, _: object) -> Iterator[Page]:
         panels.POSITION_SIGMA_PANEL,
         panels.VELOCITY_SIGMA_PANEL,
     ):
-        is_last = panel is panels.VELOCITY_SIGMA_PANEL
-        panel.draw_on_page(page, analysis, result, with_time_label=is_last)
+        panel.draw_on_page(
+            page, analysis, result, with_time_label=panel is panels.VELOCITY_SIGMA_PANEL
+        )
     _draw_enlarged_sigma_plot(page, analysis)
     for note in list_verdict_warnings(analysis):
         page.write_small_text(note)

@@ -99,12 +99,10 @@ def _font_sort_key(entry: FontEntry) -> tuple[object, ...]:
     PostScript fonts are last: they are embedded as TrueType, which some PDF viewers do not display.
     """
     weight = entry.weight if isinstance(entry.weight, int) else 400
-    is_postscript = str(entry.fname).lower().endswith(".otf")
-    is_noto, is_sans = entry.name.startswith("Noto Sans"), "Sans" in entry.name
     return (
-        is_postscript,
-        not is_noto,
-        not is_sans,
+        str(entry.fname).lower().endswith(".otf"),
+        not entry.name.startswith("Noto Sans"),
+        "Sans" not in entry.name,
         abs(weight - 400),
         entry.name,
         str(entry.fname),

@@ -110,12 +110,11 @@ def _write_blocks(page: Page, node: SyntaxTreeNode, indent_level: int, marker: s
             case "html_block":
                 page.write(TAG_PATTERN.sub("", child.content).strip(), indent=indent)
             case _:  # paragraph; a horizontal rule, which has no text, is omitted
-                gap_above = 0.0 if marker else 2.0
                 page.write(
                     _inline_text(child),
                     indent=indent,
                     marker=marker,
-                    gap_above=gap_above,
+                    gap_above=0.0 if marker else 2.0,
                 )
         marker = ""
 

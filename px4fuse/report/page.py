@@ -110,8 +110,13 @@ class Page:
         right_aligned_columns : sequence of int
             Indices of the columns with numbers.
         """
-        right, widths = right_aligned_columns, column_widths
-        self.add("table", head=head, rows=rows, column_widths=widths, right=right)
+        self.add(
+            "table",
+            head=head,
+            rows=rows,
+            column_widths=column_widths,
+            right=right_aligned_columns,
+        )
 
     def add_panel(
         self,

@@ -39,7 +39,7 @@ def _draw_axis_as_artists(
     axis = axes.xaxis if is_x else axes.yaxis
     transform: Any = axes.get_xaxis_transform if is_x else axes.get_yaxis_transform
     options, (low, high) = axis.get_tick_params(), sorted(axis.get_view_interval())
-    size, label_gap = rcParams["xtick.major.size"], rcParams["xtick.major.label_gap"]
+    size, label_gap = rcParams["xtick.major.size"], rcParams["xtick.major.pad"]
 
     def order_xy(coordinate_along_axis: Any, coordinate_across_axis: Any) -> tuple[Any, Any]:
         """Return (x, y) from the coordinates along this axis and perpendicular to it."""

@@ -34,11 +34,7 @@ def make_tuning_page(
         if not isinstance(tuning.held_out, Unavailable):
             held_out_gain_text = f"{tuning.held_out.log_likelihood_gain_per_measurement:+.3f}"
         if not isinstance(tuning.before, Unavailable) and not isinstance(tuning.after, Unavailable):
-            lag1_before, lag1_after = (
-                tuning.before.lag1_autocorrelation,
-                tuning.after.lag1_autocorrelation,
-            )
-            correlation_text = f"{lag1_before:+.2f} {lag1_after:+.2f}"
+            correlation_text = f"{tuning.before.lag1_autocorrelation:+.2f} {tuning.after.lag1_autocorrelation:+.2f}"
         rows.append(
             [
                 name,
