@@ -4,7 +4,7 @@ from px4fuse.card.model import (
     Action,
     AnalysisDescription,
     Card,
-    Cause,
+    DiagnosedCause,
     FlightErrors,
     Note,
     Rerun,
@@ -45,7 +45,7 @@ SMALL_SIGMA_A = Card(
     ),
     difference="Position difference KF − EKF2: 2.11 m RMS; 0.069 m after the fix.",
     causes=(
-        Cause(
+        DiagnosedCause(
             id="process_noise_near_zero",
             severity="error",
             title="SIGMA_A is 360 times too small: KF ignores new positions",

@@ -25,7 +25,7 @@ from px4fuse.card.model import (
     AnalysisDescription,
     Card,
     CardSeverity,
-    Cause,
+    DiagnosedCause,
     FlightErrors,
     Note,
     Verdict,
@@ -220,7 +220,7 @@ def build_unusable_log_card(error: LogError | MissingDataError, path: Path) -> C
     )
 
 
-def _make_headline(causes: Sequence[Cause], sigma_verdicts: Sequence[Verdict]) -> str:
+def _make_headline(causes: Sequence[DiagnosedCause], sigma_verdicts: Sequence[Verdict]) -> str:
     if causes:
         main_cause, *further_causes = causes
         for further_cause in further_causes:
@@ -374,7 +374,7 @@ def _format_lengths(length_by_filter_m: Mapping[FilterName, float]) -> str:
     )
 
 
-def _format_actions(causes: Sequence[Cause]) -> tuple[str, ...]:
+def _format_actions(causes: Sequence[DiagnosedCause]) -> tuple[str, ...]:
     if not causes:
         return ("Change nothing.",)
     numbered_sentences: list[str] = []
@@ -407,7 +407,7 @@ def _format_action(action: Action) -> str:
 
 
 def _mark_explained_verdicts(
-    sigma_verdicts: Sequence[Verdict], causes: Sequence[Cause], *, may_drift: bool
+    sigma_verdicts: Sequence[Verdict], causes: Sequence[DiagnosedCause], *, may_drift: bool
 ) -> tuple[Verdict, ...]:
     """Set ``is_explained`` of each inconsistent verdict that requires no change of filter settings.
 
@@ -442,7 +442,7 @@ def _mark_explained_verdicts(
 
 
 def _explain_verdict_differences(
-    analysis: Analysis, sigma_verdicts: tuple[Verdict, ...], causes: Sequence[Cause]
+    analysis: Analysis, sigma_verdicts: tuple[Verdict, ...], causes: Sequence[DiagnosedCause]
 ) -> tuple[tuple[Verdict, ...], str]:
     """Return the verdicts with ``is_explained`` set, and an explanation of differing verdicts.
 
@@ -475,7 +475,7 @@ def _explain_verdict_differences(
 
 
 def _explain_differing_verdicts(
-    analysis: Analysis, sigma_verdicts: Sequence[Verdict], causes: Sequence[Cause]
+    analysis: Analysis, sigma_verdicts: Sequence[Verdict], causes: Sequence[DiagnosedCause]
 ) -> str:
     corrected_filters = {
         "ekf2" if rerun.is_prediction else "kf"

@@ -7,7 +7,7 @@ from typing import Any, NamedTuple
 from msgspec import structs
 
 from px4fuse.analysis import Analysis
-from px4fuse.card.model import Action, ActionTarget, Cause, Rerun, Verdict
+from px4fuse.card.model import Action, ActionTarget, DiagnosedCause, Rerun, Verdict
 from px4fuse.comparison.changes import SIGMA_A, SIGMA_Z
 from px4fuse.comparison.model import FILTER_NAMES, FilterName
 from px4fuse.comparison.remedy import select_changed_settings
@@ -157,7 +157,7 @@ def make_cause(
     ranked_cause: RankedCause,
     sigma_verdicts: Sequence[Verdict],
     request: ComparisonRequest,
-) -> Cause:
+) -> DiagnosedCause:
     """Describe a fault, with actions for position source, KF and EKF2."""
     finding, trials = ranked_cause.finding, ranked_cause.trials
     useful_trials = [trial for trial in trials if may_improve_filter(trial)]
@@ -173,9 +173,9 @@ def make_cause(
     )
 
 
-def make_cause_without_reruns(finding: Finding) -> Cause:
+def make_cause_without_reruns(finding: Finding) -> DiagnosedCause:
     """Make a cause from the texts of a finding alone, without results of filter re-runs."""
-    return Cause(
+    return DiagnosedCause(
         id=finding.id,
         severity="error" if finding.severity == "error" else "warning",
         title=finding.title,

@@ -143,7 +143,7 @@ class Rerun(Record, kw_only=True):
     improves: Improvement
 
 
-class Cause(Record, kw_only=True):
+class DiagnosedCause(Record, kw_only=True):
     """Fault in a flight, with its effect, recommended actions and re-runs.
 
     Attributes
@@ -256,7 +256,7 @@ class Card(Record, kw_only=True):
     verdicts: tuple[Verdict, ...] = ()
     reconcile: str = ""
     difference: str = ""
-    causes: tuple[Cause, ...] = ()
+    causes: tuple[DiagnosedCause, ...] = ()
     more_causes: Count = 0
     notes: tuple[Note, ...] = ()
     aids: tuple[AidConsistency, ...] = ()

@@ -61,11 +61,11 @@ class Plot(Record):
 
     Attributes
     ----------
-    lines : tuple of (str, str, str, str)
+    line_definitions : tuple of (str, str, str, str)
         Data source, column, key of :data:`LINE_STYLES`, and label in the tooltip of each line.
     """
 
-    lines: tuple[tuple[str, str, str, str], ...]
+    line_definitions: tuple[tuple[str, str, str, str], ...]
     scale: Literal["linear", "log"] = "linear"
     unit: str = ""
 
@@ -135,7 +135,7 @@ def _make_plots(data: PageData, shared_time_range: Range1d) -> dict[str, Any]:
                 "t", "minus", "plus", source=get_source("error"), fill_alpha=0.25, name="kf_band"
             )
         line_renderers: list[Any] = []
-        for source_name, column, style_name, hover_name in plot.lines:
+        for source_name, column, style_name, hover_name in plot.line_definitions:
             if style_name in missing_tracks:
                 continue
             line_renderer = plot_figure.line(

@@ -131,10 +131,10 @@ def make_alternative_text(verdicts: Sequence[Verdict]) -> str:
         if verdict.ratio is not None:
             explained_note = ", explained" if verdict.is_explained else ""
             verdict_text = f"{format_ratio(verdict.ratio)}, {verdict.word}{explained_note}"
-        filter_and_quantity = (
-            f"{FILTER_NAMES[verdict.filter]}, {SCREEN_READER_QUANTITIES[verdict.against]}"
+        sentences.append(
+            f"{FILTER_NAMES[verdict.filter]}, {SCREEN_READER_QUANTITIES[verdict.against]}: "
+            f"{verdict_text}."
         )
-        sentences.append(f"{filter_and_quantity}: {verdict_text}.")
     return " ".join(sentences)
 
 

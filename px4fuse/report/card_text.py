@@ -17,7 +17,7 @@ from px4fuse.card.model import (
     Action,
     AidConsistency,
     Card,
-    Cause,
+    DiagnosedCause,
     Rerun,
     Verdict,
     map_ratio_to_axis,
@@ -149,7 +149,7 @@ def with_typed_path(card: Card, path: str | None) -> Card:
 
     >>> from px4fuse.card.model import AnalysisDescription
     >>> action = Action("KF", commands=("px4fuse compare a.ulg --sigma-z 1",), where="shell")
-    >>> cause = Cause(id="x", severity="error", title="", why="", actions=(action,))
+    >>> cause = DiagnosedCause(id="x", severity="error", title="", why="", actions=(action,))
     >>> log = AnalysisDescription(file="a.ulg")
     >>> card = Card(severity="error", headline="", causes=(cause,), identity=log)
     >>> with_typed_path(card, "my logs/a.ulg").causes[0].actions[0].commands
@@ -253,7 +253,7 @@ def format_headline_lines(card: Card) -> Iterator[Paragraph]:
     yield Paragraph(f"{severity_and_id}: {card.headline}", SEVERITY_STYLES[card.severity])
 
 
-def _format_cause_lines(cause: Cause) -> Iterator[Paragraph]:
+def _format_cause_lines(cause: DiagnosedCause) -> Iterator[Paragraph]:
     yield from _format_labelled_lines("when", format_spans(cause))
     actions = label_alternatives(cause)
     labels = [f"{prefix}{format_target(action)}" for prefix, action in actions]
@@ -264,7 +264,7 @@ def _format_cause_lines(cause: Cause) -> Iterator[Paragraph]:
     yield from _wrap_lines(cause.after, "  ", "  ")
 
 
-def label_alternatives(cause: Cause) -> list[tuple[str, Action]]:
+def label_alternatives(cause: DiagnosedCause) -> list[tuple[str, Action]]:
     """Return the actions of a cause; alternative actions begin with "EITHER " or "OR "."""
     alternatives = [
         ("OR " if place else "EITHER ", action)
@@ -399,7 +399,7 @@ def _format_aid_lines(aid_rows: Sequence[AidConsistency]) -> Iterator[Paragraph]
         yield Paragraph(f"{label_text:{indent}}", plot=draw_sigma_ratio(row.ratio, "source"))
 
 
-def format_spans(cause: Cause) -> str:
+def format_spans(cause: DiagnosedCause) -> str:
     """Format the time from the first to the last occurrence of a fault."""
     if not cause.spans_s:
         return ""
@@ -412,8 +412,7 @@ def format_spans(cause: Cause) -> str:
 
 
 def _format_labelled_lines(label: str, text: str) -> Iterator[Paragraph]:
-    indent = " " * TEXT_INDENT
-    yield from _wrap_lines(text, f"  {label:{TEXT_INDENT - 2}}", indent)
+    yield from _wrap_lines(text, f"  {label:{TEXT_INDENT - 2}}", " " * TEXT_INDENT)
 
 
 def _wrap_lines(text: str, first_indent: str, indent: str) -> Iterator[Paragraph]:

@@ -10,7 +10,7 @@ from px4fuse.card.model import (
     Action,
     AidConsistency,
     Card,
-    Cause,
+    DiagnosedCause,
     Verdict,
     map_ratio_to_axis,
 )
@@ -70,7 +70,6 @@ def add_card(page: Page, card: Card) -> PageBlock:
         f"{identity.duration_s:.1f} s",
         identity.source,
     )
-    more_causes_text = f"{card.more_causes} more causes are listed in {ALL_FINDINGS_TITLE}"
     return page.add(
         "cover",
         sign=SEVERITY_SIGNS[card.severity],
@@ -92,7 +91,9 @@ def add_card(page: Page, card: Card) -> PageBlock:
         causes=[
             _make_cause_fields(number, cause) for number, cause in enumerate(card.causes, start=1)
         ],
-        more_causes=more_causes_text if card.more_causes else "",
+        more_causes=f"{card.more_causes} more causes are listed in {ALL_FINDINGS_TITLE}"
+        if card.more_causes
+        else "",
         difference=card.difference,
         notes=note_texts(card, f"in {ALL_FINDINGS_TITLE}"),
         terms=AIDS_TERMS_NOTE if card.aids else TERMS_NOTE,
@@ -125,10 +126,11 @@ def _make_sigma_ratio_axis(card: Card) -> dict[str, Any]:
     interval_legend = "" if card.aids else " · ├─┤ 95 % interval"
     axis_range_text = " to ".join(RATIO_AXIS_TICKS[end] for end in RATIO_AXIS_ENDS)
     direction_text = f", {card.effect.axis}" if card.effect else ""
-    axis_text = f"RMS of actual error ÷ reported σ{direction_text}"
     return {
         "axis_title": "Is the σ reported by the filters right?",
-        "axis_text": AIDS_CAPTION if card.aids else axis_text,
+        "axis_text": AIDS_CAPTION
+        if card.aids
+        else f"RMS of actual error ÷ reported σ{direction_text}",
         "axis_legend": (
             f"grey: ratio of a consistent filter ({format_consistent_ratios()}){interval_legend} · "
             f"◀ ▶: ratio outside {axis_range_text}"
@@ -176,7 +178,7 @@ def _make_sigma_ratio_fields(
     return {"ratio": format_ratio(ratio), **locate_sigma_ratio(ratio, reference, interval)}
 
 
-def _format_causes_legend(causes: Sequence[Cause]) -> str:
+def _format_causes_legend(causes: Sequence[DiagnosedCause]) -> str:
     programs_with_commands = {
         action.where for cause in causes for _, action in label_alternatives(cause)
     }
@@ -188,7 +190,7 @@ def _format_causes_legend(causes: Sequence[Cause]) -> str:
     return " · ".join([*legend_texts, "[id]: `px4fuse explain ID` explains the finding"])
 
 
-def _make_cause_fields(number: int, cause: Cause) -> dict[str, Any]:
+def _make_cause_fields(number: int, cause: DiagnosedCause) -> dict[str, Any]:
     columns = make_rerun_columns(cause.reruns)
     head, *rows = zip(*columns, strict=True) if columns else ((),)
     return {

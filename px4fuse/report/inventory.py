@@ -71,9 +71,8 @@ def _describe_log(inventory: Inventory) -> list[tuple[str, str]]:
     if log.dropouts:
         dropout_total_s = sum(dropout.duration_s for dropout in log.dropouts)
         longest_dropout_s = max(dropout.duration_s for dropout in log.dropouts)
-        dropout_count = len(log.dropouts)
         dropouts_text = (
-            f"{dropout_count} logger dropouts of {dropout_total_s:.2f} s in total, at most "
+            f"{len(log.dropouts)} logger dropouts of {dropout_total_s:.2f} s in total, at most "
             f"{longest_dropout_s:.2f} s"
         )
         labelled_texts.append(("Dropouts", dropouts_text))

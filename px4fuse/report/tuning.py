@@ -34,7 +34,8 @@ def make_tuning_page(
         if not isinstance(tuning.held_out, Unavailable):
             held_out_gain_text = f"{tuning.held_out.log_likelihood_gain_per_measurement:+.3f}"
         if not isinstance(tuning.before, Unavailable) and not isinstance(tuning.after, Unavailable):
-            correlation_text = f"{tuning.before.lag1_autocorrelation:+.2f} {tuning.after.lag1_autocorrelation:+.2f}"
+            before, after = tuning.before.lag1_autocorrelation, tuning.after.lag1_autocorrelation
+            correlation_text = f"{before:+.2f} {after:+.2f}"
         rows.append(
             [
                 name,
