@@ -79,8 +79,8 @@ _loop_option = partial(options.request_option, LoopRequest)
     type=parse_closure,
     metavar="T1,T2[,SIGMA]",
     multiple=True,
-    help="Loop closure: the vehicle was at the same place at the times T1 and T2 (s). SIGMA is the "
-    "σ (m) of the distance of both places. Repeatable.  [default SIGMA: 0.1 m]",
+    help="Loop closure: the vehicle was at the same place at the times T1 and T2 (s). SIGMA (m): "
+    "σ of the distance of both places. Repeatable.  [default SIGMA: 0.1 m]",
 )
 @options.flag_option(
     "--robust",

@@ -217,8 +217,8 @@ def _check_options(assignment: Path | None) -> None:
     for parameter in list_given_parameters():
         if assignment is not None and parameter.name not in ASSIGNMENT_OPTIONS:
             raise SettingsError(
-                f"{parameter.opts[0]} is not available with --assignment, because px4fuse draws "
-                "those flights at random",
+                f"{parameter.opts[0]} is not available with --assignment, because "
+                "those flights are random",
                 f"Omit {parameter.opts[0]}.",
             )
         if assignment is None and parameter.name in ASSIGNMENT_ONLY_OPTIONS:

@@ -353,12 +353,14 @@ def _format_verdict_lines(card: Card) -> Iterator[Paragraph]:
     heading = "Consistency: RMS of actual error ÷ reported σ (1: consistent)"
     yield from _wrap_lines(f"{heading}{direction_text}", "", "  ")
     legend, too_large_label = f"  ░ consistent ({format_consistent_ratios()})", "σ too large"
-    directions = f"{too_large_label}{'σ too small':>{AXIS_WIDTH - len(too_large_label)}}"
-    yield Paragraph(f"{'':{AXIS_INDENT}}", plot=directions)
+    yield Paragraph(
+        f"{'':{AXIS_INDENT}}",
+        plot=f"{too_large_label}{'σ too small':>{AXIS_WIDTH - len(too_large_label)}}",
+    )
     yield Paragraph(f"{legend:{AXIS_INDENT}}", plot=_format_tick_labels())
     if any(verdict.is_explained for verdict in card.verdicts):
         yield Paragraph(
-            "  A verdict in brackets is no fault of the filter: its settings need no change."
+            "  A verdict in brackets is not a fault of the filter: its settings need no change."
         )
     yield from map(_format_verdict_line, card.verdicts)
 

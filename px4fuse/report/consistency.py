@@ -210,8 +210,11 @@ def _draw_autocorrelation(axes: Axes, innovations: InnovationsByFilter) -> None:
         correlations = compute_autocorrelation(np.asarray(values, np.float64), lag_count)
         bar_lags = np.arange(1, lag_count + 1) + shift
         axes.vlines(bar_lags, 0.0, correlations, color=TRACK_STYLES[name]["color"], lw=1.2)
-        fill_colour = KF_COLOUR if name == "KF" else "white"
-        marker_style = INNOVATION_STYLES[name] | {"ms": 3.0, "mew": 0.6, "mfc": fill_colour}
+        marker_style = INNOVATION_STYLES[name] | {
+            "ms": 3.0,
+            "mew": 0.6,
+            "mfc": KF_COLOUR if name == "KF" else "white",
+        }
         axes.plot(bar_lags, correlations, **marker_style, label=name)
         whiteness_limit = _compute_whiteness_limit(values)
         axes.axhline(-whiteness_limit, **_thin_line_style(name))

@@ -163,8 +163,7 @@ def _format_clock_lines(inventory: Inventory) -> list[str]:
         if source.clock:
             name = source.name if source.part == "position" else source.part
             source_names_by_clock.setdefault(source.clock, {})[name] = None
-    lines = [
-        f"{clock}: {', '.join(names_on_clock)}"
-        for clock, names_on_clock in source_names_by_clock.items()
+    return [
+        *(f"{clock}: {', '.join(names)}" for clock, names in source_names_by_clock.items()),
+        *map(format_clock_map, inventory.flight.clocks),
     ]
-    return lines + [format_clock_map(clock) for clock in inventory.flight.clocks]
