@@ -117,7 +117,7 @@ def compare(
         raise SettingsError(
             "the arguments position and system are not possible with a Flight, because "
             "they determine how a log is read.",
-            "Give the path of the log instead of the Flight.",
+            "Pass the path of the log, not a Flight object.",
         )
     if isinstance(clock_offset_s, str) and clock_offset_s != request.AUTO:
         raise SettingsError(
@@ -301,17 +301,15 @@ def _display_card(analysis: Analysis) -> str | None:
 def _require_suffix(path: Pathlike, suffix: str) -> Path:
     output_path = Path(path)
     if output_path.suffix.lower() != suffix:
-        raise OutputError(
-            f"{output_path}: the name does not end in {suffix}. Give a name ending in {suffix}."
-        )
+        raise OutputError(f"{output_path}: the name of the file must end in {suffix}.")
     return output_path
 
 
 def _require_request(analysis: Analysis) -> request.ComparisonRequest:
     if analysis.request is None:
         raise SettingsError(
-            "A report or web page needs the settings of the analysis, but this analysis contains "
-            "none.",
+            "A report or web page needs the settings of the analysis. This analysis contains no "
+            "settings.",
             "Pass an analysis from px4fuse.compare.",
         )
     return analysis.request

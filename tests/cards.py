@@ -1,6 +1,15 @@
 """Diagnosis cards of typical flights, for the tests of what prints them."""
 
-from px4fuse.card.model import Action, Card, Cause, Effect, Identity, Note, Rerun, Verdict
+from px4fuse.card.model import (
+    Action,
+    AnalysisDescription,
+    Card,
+    DiagnosedCause,
+    FlightErrors,
+    Note,
+    Rerun,
+    Verdict,
+)
 
 
 def _verdict(owner, against, ratio, word, **fields):
@@ -17,7 +26,7 @@ SMALL_SIGMA_A = Card(
     severity="error",
     id="process_noise_near_zero",
     headline="SIGMA_A is 360 times too small: KF ignores new positions",
-    effect=Effect(
+    effect=FlightErrors(
         axis="along the aisle, 30° from north",
         position_rmse_m={"kf": 2.11, "ekf2": 0.063},
         horizontal_rmse_m={"kf": 7.0, "ekf2": 0.09},
@@ -36,7 +45,7 @@ SMALL_SIGMA_A = Card(
     ),
     difference="Position difference KF − EKF2: 2.11 m RMS; 0.069 m after the fix.",
     causes=(
-        Cause(
+        DiagnosedCause(
             id="process_noise_near_zero",
             severity="error",
             title="SIGMA_A is 360 times too small: KF ignores new positions",
@@ -75,7 +84,7 @@ SMALL_SIGMA_A = Card(
             "Send 10 Hz.",
         ),
     ),
-    identity=Identity(
+    identity=AnalysisDescription(
         file="aisle_uwb.ulg",
         firmware="PX4 v1.16.1",
         duration_s=129.7,

@@ -82,7 +82,7 @@ def test_diagnosis_lists_sensor_fault_before_wrong_parameter() -> None:
         ("source_time_offset", 1), ("sigma_z_too_small", 1),
     ]  # fmt: skip
     # the setting reduces the error more, but a source fault comes first
-    assert ranked[1].log_ratio_reduction > ranked[0].log_ratio_reduction
+    assert ranked[1].log_sigma_ratio_reduction > ranked[0].log_sigma_ratio_reduction
 
 
 @pytest.mark.parametrize(
@@ -160,7 +160,7 @@ def test_diagnosis_without_ground_truth_is_reported_as_untested() -> None:
         (ratios, "no change: the reported σ is consistent"),
         (
             untested,
-            "no change: only ground truth shows this fault, and the log has none",
+            "no change: only ground truth shows this fault, and the log has no ground truth",
         ),
     ):
         cause = make_cause(analysis(), ranked, evaluated, REQUEST)
@@ -200,6 +200,6 @@ def test_diagnosis_explains_differing_nis_and_nees_verdicts() -> None:
         "position and σ",
     )
     assert card.reconcile == (
-        "The innovations of EKF2 show little of the first fault on this card; the errors against "
-        "ground truth show it. The re-run without this fault reduces the position error."
+        "The first fault on this card hardly changes the innovations of EKF2, but it increases "
+        "the errors against ground truth. The re-run without this fault reduces the position error."
     )

@@ -15,7 +15,7 @@ from msgspec.structs import replace
 from page_tools import axes_of, every, pdf_of, set_by_typst, smallest_type
 
 from px4fuse.analysis import Analysis
-from px4fuse.card.model import Action, AidRow, Card, Cause, Note
+from px4fuse.card.model import Action, AidConsistency, Card, DiagnosedCause, Note
 from px4fuse.flight.model import Reset
 from px4fuse.report import cover, cover_panels
 from px4fuse.report.page import Page
@@ -71,7 +71,7 @@ def test_report_cover_prints_texts_of_the_diagnosis() -> None:
 def test_report_cover_joins_alternative_actions_by_either_or() -> None:
     sender = Action("sender", "subtract 0.264 s")
     console = Action("EKF2", commands=("param set EKF2_EV_DELAY 264", "reboot"), where="console")
-    cause = Cause(
+    cause = DiagnosedCause(
         id="source_time_offset", severity="error", title="Late", why="",
         alternatives=((sender,), (console,)), actions=(Action("KF", "no change"),),
     )  # fmt: skip
@@ -135,14 +135,14 @@ def test_report_cover_contains_reason_of_missing_verdict() -> None:
 
 def test_report_cover_lists_sigma_ratios_of_aiding_sources() -> None:
     aids = (
-        AidRow(label="barometer", component="height", ratio=0.57, is_usual=True),
-        AidRow(label="magnetometer", component="x", ratio=None),
+        AidConsistency(label="barometer", component="height", ratio=0.57, is_usual=True),
+        AidConsistency(label="magnetometer", component="x", ratio=None),
     )
     card = replace(SMALL_SIGMA_A, verdicts=(), causes=(), effect=None, aids=aids)
     text = text_of(card)
     assert "barometer height 0.57" in text
     assert "magnetometer x not evaluated" in text
-    assert "this is usual and not a fault" in text
+    assert "such a value is usual and not a fault" in text
 
 
 def test_report_cover_prints_right_to_left_name_before_id() -> None:
@@ -200,7 +200,7 @@ def test_cover_map_title_states_farthest_distance_outside_map() -> None:
     analysis = unexplained(compare(flight))
     titles = panels_by_title(drawn(analysis))
     (title,) = (title for title in titles if title.startswith("Map"))
-    assert title.startswith("Map; largest distance outside the map: EKF2 3")
+    assert title.startswith("Map; largest distance of points outside the map: EKF2 3")
 
 
 def test_innovations_beyond_plot_scale_are_drawn_as_triangles(eventful: Analysis) -> None:

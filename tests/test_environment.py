@@ -77,7 +77,7 @@ def test_command_under_small_memory_limit_reports_the_limit(tmp_path) -> None:
     for command in (f"compare {LOG} -o r.pdf", f"explore {LOG} -o r.html", f"info {LOG}"):
         code, out, err = started(command, before="ulimit -v 400000;", folder=tmp_path)
         assert (code, out) == (2, "")
-        assert err.startswith("px4fuse: the memory limit is 410 MB; px4fuse needs at least 800 MB")
+        assert err.startswith("px4fuse: px4fuse needs 800 MB of address space; the limit is 410 MB")
         assert len(err.splitlines()) == 1
     assert started("--help", before="ulimit -v 400000;", folder=tmp_path)[0] == 0
     assert contents(tmp_path) == {}

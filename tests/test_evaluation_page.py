@@ -97,7 +97,7 @@ def test_unaligned_rmse_in_evaluation_report_equals_evo() -> None:
     centre = true.position_m.mean(axis=0) - estimate.position_m.mean(axis=0)
     assert f"translation {format_metres(np.linalg.norm(centre))} m" in sentence
     half = transformed(true, Rotation.identity(), np.zeros(3), 0.5, kind="slam")
-    assert ", scale 2 (" in describe_unaligned_rmse(evaluate(half, true, alignment="sim3"))
+    assert ", scale 2." in describe_unaligned_rmse(evaluate(half, true, alignment="sim3"))
 
 
 @pytest.mark.parametrize(("kind", "times"), [("noise", 1.0), ("walk", 10**0.5), ("scale", 10.0)])
@@ -110,10 +110,10 @@ def test_rpe_growth_distinguishes_noise_from_drift(kind: str, times: float) -> N
         "scale": 0.05 * line(n).position_m,
     }[kind]
     sentence = describe_rpe_growth(evaluate_with_error(error).rpe)
-    growth = re.search(r"From 1 to 10 m the RMSE grows ([\d.]+) times", sentence)
+    growth = re.search(r"From 1 to 10 m, the RMSE grows ([\d.]+) times", sentence)
     assert float(growth[1]) == pytest.approx(times, rel=0.1)
     assert "1 for independent noise, 3.2 for a random walk, 10 for a scale" in sentence
-    assert "Give a second distance" in describe_rpe_growth(evaluate_with_error(error).rpe[:1])
+    assert "Add a distance" in describe_rpe_growth(evaluate_with_error(error).rpe[:1])
 
 
 # -- panels ----------------------------------------------------------------------------------------

@@ -179,9 +179,7 @@ def test_explore_page_apply_button_takes_recommended_values(
     value = browser.ask("document.getElementById('sigma-a-value').value")
     assert f"--sigma-a {value}" in command
     assert "KF is consistent with these settings" in text(browser, "card")
-    assert "Diagnosis with the original settings (before your changes): ■ ERROR" in text(
-        browser, "card"
-    )
+    assert "Diagnosis before your changes of the settings: ■ ERROR" in text(browser, "card")
     assert browser.complaints() == []
 
 

@@ -24,7 +24,7 @@ from px4fuse.ekf2.whatif import HEIGHT_LOGGED_NOTE, HEIGHT_REPLAYED_NOTE, what_i
 from px4fuse.errors import SettingsError
 from px4fuse.flight.model import AidLog, Ekf2, Flight, FusionRecord
 from px4fuse.readers import read_log
-from px4fuse.report.difference_page import format_agreement
+from px4fuse.report.difference_page import format_replay_agreement
 from px4fuse.report.whatif import make_statistic_rows
 from px4fuse.request import WhatIfRequest
 from px4fuse.results.build import make_whatif_results
@@ -256,7 +256,7 @@ def test_what_if_excludes_height_sensor_that_disagrees_with_log() -> None:
     assert set(agreement.doubtful) == {"baro_hgt"}
     assert "a correlation of" in agreement.doubtful["baro_hgt"]
     assert agreement.baro_hgt["down"].innovation_correlation < 0.95
-    assert "barometer" in format_agreement(agreement)
+    assert "barometer" in format_replay_agreement(agreement)
     assert model.baseline_replay.other_aid_updates.keys() == {"gnss_vel"}
     own = np.interp(
         model.baseline_replay.delayed.index, flight.ekf2.state.index, flight.ekf2.state["down_m"]

@@ -53,9 +53,9 @@ def test_practice_flights_contain_each_fault_equally_often(
         assert set(one.correct_answers) <= set(QUIZ_ANSWERS)
         assert len(one.correct_answers) == max(len(one.faults), 1)
         assert len(one.faults) <= (2 if level == 3 else 1)
-        for mistake, size in zip(one.faults, one.sizes, strict=True):
+        for mistake, size in zip(one.faults, one.fault_sizes, strict=True):
             assert size.removeprefix("-") == mistake.sizes[level - 1]
-            assert mistake.has_either_sign or not size.startswith("-")
+            assert mistake.has_random_sign or not size.startswith("-")
 
 
 def test_practice_level_3_has_some_flights_with_two_faults() -> None:

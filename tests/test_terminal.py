@@ -24,7 +24,7 @@ from px4fuse.errors import OutputError
 from px4fuse.report import card_text, screen
 from px4fuse.report.card_text import format_card_lines, with_typed_path
 from px4fuse.report.page import Page
-from px4fuse.report.screen import extract_commands, print_paragraph
+from px4fuse.report.screen import print_paragraph, shorten_commands
 from px4fuse.report.terminal import make_comparison_page
 from px4fuse.request import ComparisonRequest, PositionFile, command_line, format_settings_suffix
 from px4fuse.results.build import results
@@ -132,7 +132,7 @@ def test_printed_commands_contain_typed_files_and_options() -> None:
         log="my flights/a'b.ulg", position=PositionFile(path="u w/b.csv"),
         start_s=12.5, sigma_z_m=0.3,
     )  # fmt: skip
-    text, (command, loops) = extract_commands(
+    text, (command, loops) = shorten_commands(
         "Try px4fuse compare LOG --sigma-z 0.2 --clock-offset -0.125: better. Or (px4fuse loop "
         "LOG). Not px4fuse sync LOG.ulg.",
         request,
@@ -294,7 +294,7 @@ def test_html_file_of_user_is_not_overwritten_by_default(desk, command, mine) ->
     page.parent.mkdir()
     page.write_bytes(mine)
     message = error_line(*command.split())
-    assert f"{page} exists and was not overwritten, because it is not the output of" in message
+    assert f"{page} exists and was not overwritten, because the file is not recognised" in message
     assert page.read_bytes() == mine
     run_checked(*command.split(), "-o", page)
     assert page.read_bytes() != mine

@@ -43,7 +43,7 @@ from px4fuse.flight.model import (
     PositionTrack,
     Unavailable,
 )
-from px4fuse.report.difference_page import format_agreement
+from px4fuse.report.difference_page import format_replay_agreement
 from px4fuse.report.whatif import make_statistic_rows
 from px4fuse.request import WhatIfRequest
 from px4fuse.results.build import make_whatif_results
@@ -540,7 +540,7 @@ def test_what_if_without_gnss_uses_vision() -> None:
 @pytest.mark.parametrize("wrong", [{"wrong_m": 1.0}, {"flipped": True}])
 def test_ekf2_model_excludes_vision_that_disagrees_with_log(wrong: dict[str, Any]) -> None:
     found = opened(flown(**wrong))
-    assert "external vision" in format_agreement(found.agreement)
+    assert "external vision" in format_replay_agreement(found.agreement)
     assert "ev_pos" in found.agreement.doubtful
     assert found.agreement.ev_pos["north"].innovation_correlation < 0.5
     # a replay with GNSS only differs from EKF2

@@ -14,19 +14,19 @@ from px4fuse.card.causes import (
     RankedCause,
     can_show_effect,
     make_cause,
-    make_plain_cause,
+    make_cause_without_reruns,
     rank_causes,
 )
 from px4fuse.card.model import (
-    MAX_CAUSES,
+    MAX_CAUSES_ON_CARD,
     MAX_HEADLINE_LENGTH,
     Action,
-    AidRow,
+    AidConsistency,
+    AnalysisDescription,
     Card,
     CardSeverity,
-    Cause,
-    Effect,
-    Identity,
+    DiagnosedCause,
+    FlightErrors,
     Note,
     Verdict,
 )
@@ -69,33 +69,34 @@ from px4fuse.request import (
 )
 
 MAX_ACTIONS = 3
-# Minimum fraction of positions rejected by EKF2 for a sentence about rejections
+# The card states the fraction of positions that EKF2 rejected if it reaches this limit
 MIN_REPORTED_REJECTED_FRACTION = 0.01
 # Aiding sources whose √S is usually too large with PX4's default noises, which is not a fault
 USUALLY_UNDERCONFIDENT_AIDS = frozenset({"baro_hgt", "mag", "gravity"})
-DRIFT_EXPLANATION = (
+SMALL_INNOVATIONS_EXPLANATION = (
     "The innovations are smaller than expected. This is not a fault here: the source may drift, "
     "and innovations do not show drift. Do not reduce noise settings."
 )
-PRINTED_BYTE_COUNT = 4  # number of bytes printed from the start of an unreadable log
+PRINTED_FIRST_BYTES = 4  # number of bytes printed from the start of an unreadable log
 ULOG_FIRST_BYTES = "55 4C 6F 67"  # first bytes of each ULog file (hexadecimal)
 HEADING_ERROR_EXPLANATION = (
-    "KF and EKF2 rotate the measured acceleration by the wrong heading. Each measurement corrects "
-    "the position, so innovations show little of the position error."
+    "KF and EKF2 rotate the measured acceleration by a wrong heading. The innovations stay small, "
+    "because each measured position corrects the predicted position."
 )
 OUTLIER_EXPLANATION = (
-    "The mean NIS of EKF2 includes the outliers that EKF2's gate rejects. They do not affect the "
-    "position."
+    "The mean NIS of EKF2 includes the outliers that EKF2's gate rejects. Rejected outliers do not "
+    "affect EKF2's position."
 )
 UNEXPLAINED_DIFFERENCE_TEXT = (
-    "The ratio of actual to reported σ of KF or EKF2 is different for innovations and for errors "
-    "against ground truth. No re-run explains the difference."
+    "For KF or EKF2, innovations and errors against ground truth result in different ratios of "
+    "actual to reported σ. No re-run explains the difference."
 )
-# Reasons why innovations are consistent but errors against ground truth are not, by finding ids
-SOURCE_FAULTS_AND_SENTENCES = (
+# Finding ids, and why these faults hardly change innovations but increase errors against ground
+# truth
+SOURCE_FAULT_EXPLANATIONS = (
     (
         {"source_axes_wrong", "source_orientation_wrong", "source_unit_wrong"},
-        "KF uses the corrected positions of the source. EKF2 used the uncorrected positions.",
+        "KF uses positions that px4fuse corrected. EKF2 used the uncorrected positions.",
     ),
     (
         {
@@ -123,7 +124,7 @@ def build_card(
         Name and id.
     """
     source, segment = analysis.source, analysis.segment
-    analysis_identity = _make_identity(
+    analysis_description = _describe_analysis(
         analysis.flight.log,
         request,
         student,
@@ -135,13 +136,13 @@ def build_card(
     )
     if analysis.flight.log.is_assessed:
         headline = "Assignment: the student makes the diagnosis, so px4fuse prints none"
-        return Card(severity="note", headline=headline, identity=analysis_identity)
-    root_findings = [group[0] for group in split_cause_groups(analysis.findings)]
+        return Card(severity="note", headline=headline, identity=analysis_description)
+    cause_findings = [group[0] for group in split_cause_groups(analysis.findings)]
     sigma_verdicts = make_sigma_verdicts(analysis.main)
-    ranked_causes = rank_causes(analysis, root_findings)
+    ranked_causes = rank_causes(analysis, cause_findings)
     causes = tuple(
         make_cause(analysis, ranked_finding, sigma_verdicts, request)
-        for ranked_finding in ranked_causes[:MAX_CAUSES]
+        for ranked_finding in ranked_causes[:MAX_CAUSES_ON_CARD]
     )
     sigma_verdicts, explanation = _explain_verdict_differences(analysis, sigma_verdicts, causes)
     effect = _summarise_errors(analysis)
@@ -158,9 +159,9 @@ def build_card(
         reconcile=explanation,
         difference=_describe_difference(effect, ranked_causes),
         causes=causes,
-        more_causes=max(len(ranked_causes) - MAX_CAUSES, 0),
-        notes=_make_notes(root_findings, request.log),
-        identity=analysis_identity,
+        more_causes=max(len(ranked_causes) - MAX_CAUSES_ON_CARD, 0),
+        notes=_make_notes(cause_findings, request.log),
+        identity=analysis_description,
     )
 
 
@@ -168,9 +169,9 @@ def build_aids_card(
     analysis: AidsOnlyAnalysis, request: ComparisonRequest, student: tuple[str, str]
 ) -> Card:
     """Build the diagnosis card of a flight without positions, about the aiding sources of EKF2."""
-    root_findings = [group[0] for group in split_cause_groups(analysis.findings)]
-    faults = [finding for finding in root_findings if finding.severity != "note"]
-    causes = tuple(make_plain_cause(finding) for finding in faults[:MAX_CAUSES])
+    cause_findings = [group[0] for group in split_cause_groups(analysis.findings)]
+    faults = [finding for finding in cause_findings if finding.severity != "note"]
+    causes = tuple(make_cause_without_reruns(finding) for finding in faults[:MAX_CAUSES_ON_CARD])
     missing_data = analysis.missing_data
     return Card(
         severity=causes[0].severity if causes else "clean",
@@ -178,10 +179,10 @@ def build_aids_card(
         headline=causes[0].title if causes else "No fault found in EKF2's aiding sources",
         do_this=_format_actions(causes),
         causes=causes,
-        more_causes=max(len(faults) - MAX_CAUSES, 0),
-        notes=_make_notes(root_findings, request.log),
+        more_causes=max(len(faults) - MAX_CAUSES_ON_CARD, 0),
+        notes=_make_notes(cause_findings, request.log),
         aids=tuple(
-            AidRow(
+            AidConsistency(
                 label=aid.label,
                 component=name,
                 ratio=math.sqrt(axis.nis_mean) if axis.nis_mean else None,
@@ -193,7 +194,9 @@ def build_aids_card(
         facts={
             "KF": f"not run: {missing_data.reason}. {replace_argument_names(missing_data.remedy)}"
         },
-        identity=_make_identity(analysis.flight.log, request, student, source="no position source"),
+        identity=_describe_analysis(
+            analysis.flight.log, request, student, source="no position source"
+        ),
     )
 
 
@@ -201,7 +204,7 @@ def build_unusable_log_card(error: LogError | MissingDataError, path: Path) -> C
     """Build the diagnosis card of a log that cannot be analysed, with reason and action."""
     text_by_label = {}
     with suppress(LogError):  # the headline already contains the reason of an unreadable file
-        first_bytes = read_head(path, PRINTED_BYTE_COUNT, LogError).hex(" ").upper()
+        first_bytes = read_head(path, PRINTED_FIRST_BYTES, LogError).hex(" ").upper()
         size_bytes = file_size(path, LogError)
         text_by_label["read"] = (
             f"{size_bytes:,} bytes; first bytes {first_bytes} (of a ULog: {ULOG_FIRST_BYTES})"
@@ -213,11 +216,11 @@ def build_unusable_log_card(error: LogError | MissingDataError, path: Path) -> C
         id=error.id,
         headline=replace_argument_names(error.reason),
         facts=text_by_label,
-        identity=Identity(file=display_name(path)),
+        identity=AnalysisDescription(file=display_name(path)),
     )
 
 
-def _make_headline(causes: Sequence[Cause], sigma_verdicts: Sequence[Verdict]) -> str:
+def _make_headline(causes: Sequence[DiagnosedCause], sigma_verdicts: Sequence[Verdict]) -> str:
     if causes:
         main_cause, *further_causes = causes
         for further_cause in further_causes:
@@ -244,7 +247,7 @@ def _make_headline(causes: Sequence[Cause], sigma_verdicts: Sequence[Verdict]) -
     return f"No fault found: {FILTER_NAMES[consistent_filters.pop()]} is consistent"
 
 
-def _summarise_errors(analysis: Analysis) -> Effect:
+def _summarise_errors(analysis: Analysis) -> FlightErrors:
     comparison, segment, reset_count = analysis.main, analysis.segment.flight, None
     difference = comparison.difference
     if isinstance(analysis.flight.ekf2, Ekf2):
@@ -252,7 +255,7 @@ def _summarise_errors(analysis: Analysis) -> Effect:
         reset_count = int(
             ((segment.start_s < reset_times_s) & (reset_times_s <= segment.end_s)).sum()
         )
-    return Effect(
+    return FlightErrors(
         axis=describe_axis(analysis, comparison),
         position_rmse_m=_find_rmse_by_filter_m(comparison),
         horizontal_rmse_m=_compute_horizontal_rmse_m(analysis),
@@ -288,7 +291,9 @@ def _compute_horizontal_rmse_m(analysis: Analysis) -> dict[FilterName, float]:
     }
 
 
-def _describe_effect(analysis: Analysis, effect: Effect, sigma_verdicts: Sequence[Verdict]) -> str:
+def _describe_effect(
+    analysis: Analysis, effect: FlightErrors, sigma_verdicts: Sequence[Verdict]
+) -> str:
     sentences, segment, flight = [], analysis.segment, analysis.segment.flight
     if analysis.flight.airborne == () and has_little_motion(analysis):
         return "The vehicle stayed on the ground, so the errors of KF and EKF2 are not evaluated."
@@ -338,16 +343,16 @@ def _describe_effect(analysis: Analysis, effect: Effect, sigma_verdicts: Sequenc
 
 def _describe_worst_axis(analysis: Analysis) -> list[str]:
     results = (analysis.main, *analysis.select_secondary_axes())
-    nees_result_and_rmse = [
+    nees_axis_rmse_tuples = [
         (truth.nees_position_mean, result, truth.position_rmse_m)
         for result in results
         if isinstance(truth := result.filters["ekf2"].truth, ErrorsAgainstTruth)
         and truth.nees_position_mean
         and not (truth.has_only_lag_errors and result is not analysis.main)
     ]
-    if not nees_result_and_rmse:
+    if not nees_axis_rmse_tuples:
         return []
-    nees, worst_result, rmse_m = max(nees_result_and_rmse, key=lambda item: item[0])
+    nees, worst_result, rmse_m = max(nees_axis_rmse_tuples, key=lambda item: item[0])
     ratio = math.sqrt(nees)
     is_overconfident = classify_sigma_ratio(ratio, "truth") == "overconfident"
     if worst_result is analysis.main or not is_overconfident:
@@ -369,7 +374,7 @@ def _format_lengths(length_by_filter_m: Mapping[FilterName, float]) -> str:
     )
 
 
-def _format_actions(causes: Sequence[Cause]) -> tuple[str, ...]:
+def _format_actions(causes: Sequence[DiagnosedCause]) -> tuple[str, ...]:
     if not causes:
         return ("Change nothing.",)
     numbered_sentences: list[str] = []
@@ -402,12 +407,13 @@ def _format_action(action: Action) -> str:
 
 
 def _mark_explained_verdicts(
-    sigma_verdicts: Sequence[Verdict], causes: Sequence[Cause], *, may_drift: bool
+    sigma_verdicts: Sequence[Verdict], causes: Sequence[DiagnosedCause], *, may_drift: bool
 ) -> tuple[Verdict, ...]:
-    """Set ``is_explained`` of inconsistent verdicts that require no change of filter settings.
+    """Set ``is_explained`` of each inconsistent verdict that requires no change of filter settings.
 
-    Reasons: a cause recommends no change, the errors against ground truth are consistent, or
-    innovations are small and the source may drift.
+    A verdict is explained in three cases. A cause recommends no change of the filter, the errors
+    of the filter against ground truth are consistent, or the innovations are small and the source
+    may drift.
     """
     filters_to_keep_unchanged = {
         name
@@ -427,7 +433,7 @@ def _mark_explained_verdicts(
         and (
             FILTER_NAMES[verdict.filter] in filters_to_keep_unchanged
             or verdict.filter in filters_consistent_with_truth
-            # small innovations do not prove a too large σ: they do not contain drift
+            # innovations do not contain drift, so small innovations do not prove a too large σ
             or (may_drift and (verdict.against, verdict.word) == ("source", "underconfident"))
         )
         else verdict
@@ -436,39 +442,40 @@ def _mark_explained_verdicts(
 
 
 def _explain_verdict_differences(
-    analysis: Analysis, sigma_verdicts: tuple[Verdict, ...], causes: Sequence[Cause]
+    analysis: Analysis, sigma_verdicts: tuple[Verdict, ...], causes: Sequence[DiagnosedCause]
 ) -> tuple[tuple[Verdict, ...], str]:
-    """Return verdicts with ``is_explained``, and why innovations and errors disagree.
+    """Return the verdicts with ``is_explained`` set, and an explanation of differing verdicts.
 
-    They disagree if only one of both is consistent with the σ that a filter reports.
+    The explanation states why the verdict from innovations differs from the verdict from errors
+    against ground truth.
     """
     may_drift, ekf2_errors = analysis.source.origin.may_drift, analysis.main.filters["ekf2"].truth
     sigma_verdicts = _mark_explained_verdicts(sigma_verdicts, causes, may_drift=may_drift)
-    *other_verdicts, ekf2_verdict = sigma_verdicts
-    horizon_sigma_ratio = math.inf
+    *previous_verdicts, ekf2_verdict = sigma_verdicts
+    fusion_horizon_sigma_ratio = math.inf
     if (
         not causes
         and ekf2_verdict.word == "overconfident"
         and isinstance(ekf2_errors, ErrorsAgainstTruth)
         and ekf2_errors.nees_position_horizon_mean
     ):
-        horizon_sigma_ratio = math.sqrt(ekf2_errors.nees_position_horizon_mean)
-    if classify_sigma_ratio(horizon_sigma_ratio, "truth") == "consistent":
-        return (*other_verdicts, replace(ekf2_verdict, is_explained=True)), (
-            "EKF2's σ belongs to its delayed position at the fusion horizon. The error of this "
-            f"position is {format_ratio(horizon_sigma_ratio)} times σ, so EKF2 is consistent. The "
-            "error of the published position also contains the lag of the output predictor."
+        fusion_horizon_sigma_ratio = math.sqrt(ekf2_errors.nees_position_horizon_mean)
+    if classify_sigma_ratio(fusion_horizon_sigma_ratio, "truth") == "consistent":
+        return (*previous_verdicts, replace(ekf2_verdict, is_explained=True)), (
+            "EKF2 reports σ for its delayed position at the fusion horizon. The error of the "
+            f"delayed position is {format_ratio(fusion_horizon_sigma_ratio)} times σ, so EKF2 is "
+            "consistent. The output predictor adds a lag error to the published position."
         )
     explanation = _explain_differing_verdicts(analysis, sigma_verdicts, causes)
     if explanation == UNEXPLAINED_DIFFERENCE_TEXT:
         sigma_verdicts = tuple(replace(verdict, is_explained=False) for verdict in sigma_verdicts)
     elif not explanation and may_drift and any(verdict.is_explained for verdict in sigma_verdicts):
-        explanation = DRIFT_EXPLANATION
+        explanation = SMALL_INNOVATIONS_EXPLANATION
     return sigma_verdicts, explanation
 
 
 def _explain_differing_verdicts(
-    analysis: Analysis, sigma_verdicts: Sequence[Verdict], causes: Sequence[Cause]
+    analysis: Analysis, sigma_verdicts: Sequence[Verdict], causes: Sequence[DiagnosedCause]
 ) -> str:
     corrected_filters = {
         "ekf2" if rerun.is_prediction else "kf"
@@ -476,7 +483,7 @@ def _explain_differing_verdicts(
         for rerun in cause.reruns
         if rerun.improves == "position and σ"
     }
-    differing_filters = [
+    filters_with_differing_ratios = [
         filter_name
         for filter_name in FILTER_NAMES
         for source, truth in [
@@ -489,18 +496,20 @@ def _explain_differing_verdicts(
             or (truth.ratio > 2.0 * source.ratio and filter_name not in corrected_filters)
         )
     ]
-    if not differing_filters:
+    if not filters_with_differing_ratios:
         return ""
     finding_ids = {finding.id for finding in analysis.findings}
-    for fault_ids, sentence in SOURCE_FAULTS_AND_SENTENCES:
+    for fault_ids, sentence in SOURCE_FAULT_EXPLANATIONS:
         if not finding_ids.isdisjoint(fault_ids):
             return sentence
-    if corrected_filters.issuperset(differing_filters):
-        filter_labels = " and ".join(FILTER_NAMES[filter_name] for filter_name in differing_filters)
+    if corrected_filters.issuperset(filters_with_differing_ratios):
+        filter_labels = " and ".join(
+            FILTER_NAMES[filter_name] for filter_name in filters_with_differing_ratios
+        )
         return (
-            f"The innovations of {filter_labels} show little of the first fault on this card; the "
-            "errors against ground truth show it. The re-run without this fault reduces the "
-            "position error."
+            f"The first fault on this card hardly changes the innovations of {filter_labels}, but "
+            "it increases the errors against ground truth. The re-run without this fault reduces "
+            "the position error."
         )
     horizontal_tuning = analysis.tuning.get(HORIZONTAL)
     if analysis.source.origin.may_drift:
@@ -518,11 +527,13 @@ def _explain_differing_verdicts(
         )
     has_heading_error = "ekf2_heading_error" in finding_ids
     explanation = HEADING_ERROR_EXPLANATION if has_heading_error else UNEXPLAINED_DIFFERENCE_TEXT
-    has_rejected_outliers = "source_outliers" in finding_ids and "ekf2" in differing_filters
+    has_rejected_outliers = (
+        "source_outliers" in finding_ids and "ekf2" in filters_with_differing_ratios
+    )
     return OUTLIER_EXPLANATION if has_rejected_outliers else explanation
 
 
-def _describe_difference(effect: Effect, ranked_causes: Sequence[RankedCause]) -> str:
+def _describe_difference(effect: FlightErrors, ranked_causes: Sequence[RankedCause]) -> str:
     if effect.difference_rms_m is None or not ranked_causes:
         return ""
     difference_text = _format_difference(effect.difference_rms_m)
@@ -534,8 +545,8 @@ def _describe_difference(effect: Effect, ranked_causes: Sequence[RankedCause]) -
     }
     if len(corrected_filters) == 2:
         return (
-            f"{difference_text}. The fault affects both KF and EKF2, so the position difference "
-            "hardly shows the fault."
+            f"{difference_text}. The first fault on this card affects both KF and EKF2, so their "
+            "difference hardly shows the fault."
         )
     rerun_difference_by_filter_m = {
         trial.filter: trial.after.difference_rms_m for trial in reversed(trials)
@@ -551,18 +562,18 @@ def _describe_difference(effect: Effect, ranked_causes: Sequence[RankedCause]) -
     return f"{difference_text}; {rerun_text}."
 
 
-def _make_notes(root_findings: Sequence[Finding], log_name: str) -> tuple[Note, ...]:
+def _make_notes(cause_findings: Sequence[Finding], log_name: str) -> tuple[Note, ...]:
     return tuple(
         Note(finding.id, f"{finding.title}.", with_log_name(finding.remedy, log_name))
-        for finding in root_findings
+        for finding in cause_findings
         if finding.severity == "note"
     )
 
 
-def _make_identity(
+def _describe_analysis(
     log: LogInfo, request: ComparisonRequest, student: tuple[str, str], **texts: Any
-) -> Identity:
-    return Identity(
+) -> AnalysisDescription:
+    return AnalysisDescription(
         file=log.name,
         firmware=log.firmware,
         hardware=log.hardware,

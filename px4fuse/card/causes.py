@@ -7,7 +7,7 @@ from typing import Any, NamedTuple
 from msgspec import structs
 
 from px4fuse.analysis import Analysis
-from px4fuse.card.model import Action, ActionTarget, Cause, Rerun, Verdict
+from px4fuse.card.model import Action, ActionTarget, DiagnosedCause, Rerun, Verdict
 from px4fuse.comparison.changes import SIGMA_A, SIGMA_Z
 from px4fuse.comparison.model import FILTER_NAMES, FilterName
 from px4fuse.comparison.remedy import select_changed_settings
@@ -17,9 +17,9 @@ from px4fuse.comparison.trials import (
     Trial,
     becomes_consistent,
     classify_improvement,
+    compare_sigma_ratios,
     compute_log_ratio_reduction,
     compute_preference_key,
-    compute_sigma_ratios,
     halves_discrepancy,
     has_effect,
     remains_overconfident,
@@ -38,11 +38,11 @@ from px4fuse.request import COMPARISON_OPTIONS, ComparisonRequest, command_line
 SETTING_CHANGE_KINDS = frozenset({"noises", "noise", "gate", "process noise"})
 # Kinds of change that shift the measured positions. The estimates of KF and EKF2 shift, too, so
 # only ground truth shows the effect
-TRUTH_ONLY_CHANGE_KINDS = frozenset({"time offset", "delay", "rotation"})
+CHANGE_KINDS_VISIBLE_ONLY_IN_TRUTH = frozenset({"time offset", "delay", "rotation"})
 # Name endings of PX4 parameters that require a reboot (reboot_required)
 REBOOT_PARAMETER_SUFFIXES = ("_DELAY", "_DELAY_MAX", "_PREDICT_US")
 # Minimum fraction of rejected positions that the table of re-runs shows
-MIN_SHOWN_REJECTED_FRACTION = 0.005
+MIN_REJECTED_FRACTION_TO_SHOW = 0.005
 # Devices or filters to be changed, by group of the finding
 ACTION_TARGET_BY_GROUP: Mapping[str, ActionTarget] = {
     "position source": "sender",
@@ -53,8 +53,8 @@ ACTION_TARGET_BY_GROUP: Mapping[str, ActionTarget] = {
     "loops": "source",
     "logging": "logging",
 }
-# Exceptions from ACTION_TARGET_BY_GROUP
-ACTION_TARGET_BY_ID: Mapping[str, ActionTarget] = {
+# Device or filter to be changed, for findings whose target is not the target of their group
+ACTION_TARGET_BY_FINDING_ID: Mapping[str, ActionTarget] = {
     "source_drift": "source",
     "source_lever_arm": "EKF2",
     "source_coordinate_constant": "EKF2",
@@ -66,20 +66,20 @@ ACTION_TARGET_BY_ID: Mapping[str, ActionTarget] = {
 class RankedCause(NamedTuple):
     """Possible cause of a fault, its rank (0 first), and the re-runs of KF and EKF2 that test it.
 
-    Causes of equal rank are sorted by ``log_ratio_reduction``, largest first: the decrease of
-    |ln(actual / reported σ)| in the re-runs.
+    ``log_sigma_ratio_reduction`` is the decrease of |ln(actual / reported σ)| in the re-runs. Among
+    causes of equal rank, the cause with the largest decrease is the first.
     """
 
     finding: Finding
     rank: int
-    log_ratio_reduction: float
+    log_sigma_ratio_reduction: float
     trials: tuple[Trial, ...]
 
 
-def rank_causes(analysis: Analysis, root_findings: Sequence[Finding]) -> list[RankedCause]:
-    """Sort errors and warnings by importance; omit those whose re-runs show no effect."""
+def rank_causes(analysis: Analysis, cause_findings: Sequence[Finding]) -> list[RankedCause]:
+    """Sort errors and warnings by importance; omit findings whose re-runs have no effect."""
     ranked_causes = []
-    for finding in root_findings:
+    for finding in cause_findings:
         if finding.severity == "note":
             continue
         trials = find_trials_of_finding(analysis.select_main_trials(), finding)
@@ -89,9 +89,9 @@ def rank_causes(analysis: Analysis, root_findings: Sequence[Finding]) -> list[Ra
             has_effect(trial) or not can_show_effect(trial) for trial in trials
         ):
             continue
-        log_ratio_reduction = sum(map(compute_log_ratio_reduction, trials))
+        log_sigma_ratio_reduction = sum(map(compute_log_ratio_reduction, trials))
         rank = _find_cause_rank(finding, trials)
-        ranked_causes.append(RankedCause(finding, rank, log_ratio_reduction, trials))
+        ranked_causes.append(RankedCause(finding, rank, log_sigma_ratio_reduction, trials))
     fault_causes = [
         cause
         for cause in ranked_causes
@@ -101,9 +101,9 @@ def rank_causes(analysis: Analysis, root_findings: Sequence[Finding]) -> list[Ra
         fault_causes or ranked_causes,
         key=lambda cause: (
             cause.rank,
-            # source faults (False) precede settings (True): a changed setting may only hide a fault
+            # settings (True) after faults of the source, which a changed setting may merely hide
             cause.rank in (1, 2, 3) and _is_setting_fault(cause.finding),
-            -cause.log_ratio_reduction,
+            -cause.log_sigma_ratio_reduction,
         ),
     )
 
@@ -126,26 +126,29 @@ def _find_cause_rank(finding: Finding, trials: Iterable[Trial]) -> int:
 
 
 def find_trials_of_finding(trials: Iterable[Trial], finding: Finding) -> tuple[Trial, ...]:
-    """Return the best re-run of KF and of EKF2 for each kind of change that tests a finding."""
-    tested_kinds = FINDING_CATALOGUE[finding.id].reruns
-    tested_kinds |= {"defaults"} if "noises" in tested_kinds else set()
-    best_trial_by_change: dict[tuple[FilterName, str], Trial] = {}
+    """Return the re-runs that test a finding: the best of each filter and kind of change."""
+    tested_change_kinds = FINDING_CATALOGUE[finding.id].reruns
+    tested_change_kinds |= {"defaults"} if "noises" in tested_change_kinds else set()
+    best_trial_by_filter_and_kind: dict[tuple[FilterName, str], Trial] = {}
     for trial in trials:
-        if len(trial.kinds) == 1 and trial.kinds[0] in tested_kinds:
+        if len(trial.kinds) == 1 and trial.kinds[0] in tested_change_kinds:
             key = trial.filter, trial.kinds[0]
-            best_trial_by_change[key] = min(
-                trial, best_trial_by_change.get(key, trial), key=compute_preference_key
+            best_trial_by_filter_and_kind[key] = min(
+                trial, best_trial_by_filter_and_kind.get(key, trial), key=compute_preference_key
             )
-    return tuple(best_trial_by_change.values())
+    return tuple(best_trial_by_filter_and_kind.values())
 
 
 def can_show_effect(trial: Trial) -> bool:
-    """Return True unless only ground truth, which is not logged, shows the effect of a re-run."""
+    """Return False if only ground truth could show the effect of a re-run, but is not logged."""
     has_truth = trial.before.position_rmse_m is not None
-    return has_truth or TRUTH_ONLY_CHANGE_KINDS.isdisjoint(trial.kinds) or has_effect(trial)
+    return (
+        has_truth or CHANGE_KINDS_VISIBLE_ONLY_IN_TRUTH.isdisjoint(trial.kinds) or has_effect(trial)
+    )
 
 
 def may_improve_filter(trial: Trial) -> bool:
+    """Return True if a re-run improves the filter, or if the log cannot show its effect."""
     return classify_improvement(trial) != "nothing" or not can_show_effect(trial)
 
 
@@ -154,25 +157,25 @@ def make_cause(
     ranked_cause: RankedCause,
     sigma_verdicts: Sequence[Verdict],
     request: ComparisonRequest,
-) -> Cause:
+) -> DiagnosedCause:
     """Describe a fault, with actions for position source, KF and EKF2."""
     finding, trials = ranked_cause.finding, ranked_cause.trials
     useful_trials = [trial for trial in trials if may_improve_filter(trial)]
-    alternative_groups, actions = _make_actions(
+    alternative_action_groups, actions = _make_actions(
         analysis, ranked_cause, useful_trials, sigma_verdicts, request
     )
     return structs.replace(
-        make_plain_cause(finding),
-        alternatives=alternative_groups,
+        make_cause_without_reruns(finding),
+        alternatives=alternative_action_groups,
         actions=actions,
         reruns=tuple(_make_rerun(trial, trials) for trial in trials if can_show_effect(trial)),
-        after=_format_closing_sentence(analysis, useful_trials, alternative_groups, actions),
+        after=_format_closing_sentence(analysis, useful_trials, alternative_action_groups, actions),
     )
 
 
-def make_plain_cause(finding: Finding) -> Cause:
+def make_cause_without_reruns(finding: Finding) -> DiagnosedCause:
     """Make a cause from the texts of a finding alone, without results of filter re-runs."""
-    return Cause(
+    return DiagnosedCause(
         id=finding.id,
         severity="error" if finding.severity == "error" else "warning",
         title=finding.title,
@@ -189,50 +192,55 @@ def _make_actions(
     sigma_verdicts: Sequence[Verdict],
     request: ComparisonRequest,
 ) -> tuple[tuple[tuple[Action, ...], ...], tuple[Action, ...]]:
-    """Return (alternative_groups, actions): the user takes one group, and all actions."""
+    """Return groups of alternative actions, and further actions.
+
+    The user takes all actions of one group, and all further actions.
+    """
     finding = ranked_cause.finding
-    trial_by_change = {(trial.filter, trial.kinds[0]): trial for trial in useful_trials}
+    trial_by_filter_and_kind = {(trial.filter, trial.kinds[0]): trial for trial in useful_trials}
     sender_actions: list[Action] = []
     if finding.remedy:
         remedy = with_log_name(finding.remedy, request.log)
         sender_actions.append(Action(_find_action_target(finding, analysis.source), remedy))
-    delay_trial = trial_by_change.get(("ekf2", "delay"))
-    offset_trial = trial_by_change.get(("ekf2", "time offset")) or trial_by_change.get(
-        ("kf", "time offset")
-    )
+    delay_trial = trial_by_filter_and_kind.get(("ekf2", "delay"))
+    offset_trial = trial_by_filter_and_kind.get(
+        ("ekf2", "time offset")
+    ) or trial_by_filter_and_kind.get(("kf", "time offset"))
     delay_actions = []
     if delay_trial:
-        # If both a new delay and shifted timestamps need EKF2_DELAY_MAX, it is a separate action
+        # parameters that the shift of timestamps also changes (EKF2_DELAY_MAX) are separate actions
         offset_setting_names = offset_trial.change.keys() if offset_trial else ()
-        delay_change = {
+        delay_parameter_values = {
             name: value
             for name, value in delay_trial.change.items()
             if name not in offset_setting_names
         }
-        delay_actions = [make_parameter_action(analysis, delay_change)]
+        delay_actions = [make_parameter_action(analysis, delay_parameter_values)]
     # users cannot shift the timestamps of a GNSS receiver
     if offset_trial and not (analysis.source.origin.is_gnss and sender_actions):
         shift_s = offset_trial.change[CLOCK_OFFSET_KEY]
         if offset_trial.filter == "kf":
             shift_s -= analysis.settings.clock_offset_s
-        shift_instruction = lower_first(format_shift(shift_s))
-        sender_actions = [Action("sender", f"{shift_instruction} the timestamp of each position")]
-    alternative_groups: tuple[tuple[Action, ...], ...] = ()
+        instruction = f"{lower_first(format_shift(shift_s))} the timestamp of each position"
+        sender_actions = [Action("sender", instruction)]
+    alternative_action_groups: tuple[tuple[Action, ...], ...] = ()
     actions = delay_actions or sender_actions
     if offset_trial and delay_trial:
-        actions, alternative_groups = [], (tuple(sender_actions), tuple(delay_actions))
+        actions, alternative_action_groups = [], (tuple(sender_actions), tuple(delay_actions))
     elif (
         not offset_trial and not delay_trial and _is_setting_fault(finding) and ranked_cause.trials
     ):
         actions = []
-    for (filter_name, kind), trial in trial_by_change.items():
+    for (filter_name, kind), trial in trial_by_filter_and_kind.items():
         if (
             filter_name == "kf"
             and kind != "defaults"
             and trial.change.keys() <= COMPARISON_OPTIONS.keys()
         ):
-            default_trial = trial_by_change.get(("kf", "defaults")) if kind == "noises" else None
-            default_settings = default_trial.change if default_trial else {}
+            default_noises_trial = (
+                trial_by_filter_and_kind.get(("kf", "defaults")) if kind == "noises" else None
+            )
+            default_settings = default_noises_trial.change if default_noises_trial else {}
             change, alignment = trial.change, analysis.source.alignment
             # --clock-offset replaces the alignment's time offset, so it must include that offset
             if CLOCK_OFFSET_KEY in change and alignment:
@@ -244,20 +252,22 @@ def _make_actions(
             actions += [make_parameter_action(analysis, changes)] if changes else []
     # actions on KF are last: first correct the vehicle
     actions.sort(key=lambda action: action.target == "KF")
-    targets = {action.target for group in (actions, *alternative_groups) for action in group}
+    action_targets = {
+        action.target for group in (actions, *alternative_action_groups) for action in group
+    }
     reason_by_filter: dict[ActionTarget, str] = {
         name: reason
         for filter_name, name in FILTER_NAMES.items()
-        if name not in targets
-        and (reason := _explain_no_change(finding, filter_name, sigma_verdicts))
+        if name not in action_targets
+        and (reason := _explain_missing_action(finding, filter_name, sigma_verdicts))
     }
     if len(reason_by_filter) == 2 and len(set(reason_by_filter.values())) == 1:
         reason_by_filter = {"KF, EKF2": reason_by_filter["KF"]}
     actions += [Action(target, reason) for target, reason in reason_by_filter.items()]
-    return alternative_groups, tuple(actions)
+    return alternative_action_groups, tuple(actions)
 
 
-def _explain_no_change(
+def _explain_missing_action(
     finding: Finding, filter_name: FilterName, sigma_verdicts: Sequence[Verdict]
 ) -> str:
     verdict_by_reference = {
@@ -268,25 +278,27 @@ def _explain_no_change(
     if not verdict_by_reference:
         return ""
     if set(verdict_by_reference.values()) == {"consistent"}:
-        needs_ground_truth = FINDING_CATALOGUE[finding.id].reruns & TRUTH_ONLY_CHANGE_KINDS
+        needs_ground_truth = (
+            FINDING_CATALOGUE[finding.id].reruns & CHANGE_KINDS_VISIBLE_ONLY_IN_TRUTH
+        )
         if needs_ground_truth and "truth" not in verdict_by_reference:
-            return "no change: only ground truth shows this fault, and the log has none"
+            return "no change: only ground truth shows this fault, and the log has no ground truth"
         return "no change: the reported σ is consistent"
     if finding.id == "source_outliers":
         if filter_name == "kf":
             return (
-                "no KF option rejects outliers; a larger SIGMA_Z (--sigma-z) only reduces the mean "
-                "NIS"
+                "no option makes KF reject outliers; a larger SIGMA_Z (--sigma-z) only reduces the "
+                "mean NIS"
             )
         if verdict_by_reference.get("truth", "consistent") == "consistent":
-            return "no change: EKF2's gate rejects these outliers, and the reported σ is consistent"
+            return "no change: EKF2's gate rejects these outliers, and EKF2's σ is consistent"
     fault_text = "drift of the position source" if finding.id == "source_drift" else "this fault"
     return f"no filter setting corrects {fault_text}"
 
 
 def _find_action_target(finding: Finding, source: PositionTrack | None = None) -> ActionTarget:
     group = FINDING_CATALOGUE[finding.id].group
-    target = ACTION_TARGET_BY_ID.get(finding.id) or ACTION_TARGET_BY_GROUP[group]
+    target = ACTION_TARGET_BY_FINDING_ID.get(finding.id) or ACTION_TARGET_BY_GROUP[group]
     is_gnss_receiver = target == "sender" and source is not None and source.origin.is_gnss
     return "receiver" if is_gnss_receiver else target
 
@@ -296,7 +308,8 @@ def make_rerun_action(
 ) -> Action:
     """Return the command that runs KF with changed settings.
 
-    If KF also improves with its default noises (``default_settings``), the action offers both.
+    ``default_settings`` are the default noises if KF improves with them, too. The action then
+    offers the choice between the default noises and the changed settings.
     """
     command = command_line(structs.replace(request, **change))
     default_options_text = " and ".join(
@@ -313,11 +326,11 @@ def make_rerun_action(
 
 def make_parameter_action(analysis: Analysis, change: Mapping[str, float]) -> Action:
     model = analysis.ekf2_model
-    flown_settings = {} if isinstance(model, Unavailable) else model.inputs.settings
+    logged_parameters = {} if isinstance(model, Unavailable) else model.inputs.settings
     change_texts, commands = [], []
-    change = select_changed_settings(change, flown_settings)
+    change = select_changed_settings(change, logged_parameters)
     for name, value in change.items():
-        change_text = f"{name} {flown_settings.get(name, math.nan):g} → {value:g}"
+        change_text = f"{name} {logged_parameters.get(name, math.nan):g} → {value:g}"
         change_texts.append(f"{change_text} {PARAMETERS[name].printed_unit}".rstrip())
         commands.append(f"param set {name} {value:g}")
     commands += ["reboot"] * any(name.endswith(REBOOT_PARAMETER_SUFFIXES) for name in change)
@@ -325,31 +338,22 @@ def make_parameter_action(analysis: Analysis, change: Mapping[str, float]) -> Ac
 
 
 def _make_rerun(trial: Trial, trials: Sequence[Trial]) -> Rerun:
-    statistics_before_and_after = trial.before, trial.after
-    rejected_fractions = [
-        statistics.rejected_fraction for statistics in statistics_before_and_after
-    ]
+    rejected_fractions = trial.before.rejected_fraction, trial.after.rejected_fraction
     values_before_and_after: dict[str, Any] = {
-        "position_rmse_m": [
-            statistics.position_rmse_m for statistics in statistics_before_and_after
-        ],
-        "source_ratio": [
-            compute_sigma_ratios(statistics).get("source")
-            for statistics in statistics_before_and_after
-        ],
-        "truth_ratio": [
-            compute_sigma_ratios(statistics).get("truth")
-            for statistics in statistics_before_and_after
-        ],
+        f"{reference}_ratio": tuple(ratios) for reference, *ratios in compare_sigma_ratios(trial)
     }
-    if max(fraction or 0.0 for fraction in rejected_fractions) >= MIN_SHOWN_REJECTED_FRACTION:
+    values_before_and_after["position_rmse_m"] = (
+        trial.before.position_rmse_m,
+        trial.after.position_rmse_m,
+    )
+    if max(fraction or 0.0 for fraction in rejected_fractions) >= MIN_REJECTED_FRACTION_TO_SHOW:
         values_before_and_after["rejected_fraction"] = rejected_fractions
     return Rerun(
         label=_format_trial_label(trial, trials),
         is_prediction=trial.filter == "ekf2",
         from_s=trial.from_s,
         improves=classify_improvement(trial),
-        **{name: tuple(pair) for name, pair in values_before_and_after.items() if None not in pair},
+        **{name: pair for name, pair in values_before_and_after.items() if None not in pair},
     )
 
 
@@ -373,18 +377,16 @@ def _format_trial_label(trial: Trial, trials: Sequence[Trial]) -> str:
 def _format_closing_sentence(
     analysis: Analysis,
     useful_trials: Sequence[Trial],
-    alternative_groups: Sequence[tuple[Action, ...]],
+    alternative_action_groups: Sequence[tuple[Action, ...]],
     actions: Sequence[Action],
 ) -> str:
-    if alternative_groups:
-        needs_delay_max = any("EKF2_DELAY_MAX" in action.sentence for action in actions)
+    if alternative_action_groups:
+        changes_delay_max = any("EKF2_DELAY_MAX" in action.sentence for action in actions)
         return (
-            "Correct the sender or the delay parameter, not both: each corrects the same time "
-            "offset of the next flights. "
-            + "Both need the larger EKF2_DELAY_MAX. "
-            * needs_delay_max
-            + "--clock-offset corrects only this analysis. Late timestamps need a positive delay "
-            "parameter and a negative --clock-offset."
+            "For the next flights, correct either the sender or the delay parameter, not both. "
+            + "Either correction needs a larger EKF2_DELAY_MAX. " * changes_delay_max
+            + "--clock-offset corrects only this analysis. If timestamps are late, the delay "
+            "parameter is positive, but --clock-offset is negative."
         )
     if any(trial.kinds == ("defaults",) for trial in useful_trials):
         return "KF is consistent with the default noises as well as with the estimated noises."
@@ -397,15 +399,15 @@ def _format_closing_sentence(
                     f"PX4's default of {default_noise_m:g} m is inside the 95 % interval of the "
                     "estimate, so the default is as good as the estimate."
                 )
-    truth_sigma_ratios = [
+    sigma_ratios_against_truth = [
         math.sqrt(trial.after.nees_mean) for trial in useful_trials if trial.after.nees_mean
     ]
     if (
-        truth_sigma_ratios
-        and classify_sigma_ratio(min(truth_sigma_ratios), "truth") == "overconfident"
+        sigma_ratios_against_truth
+        and classify_sigma_ratio(min(sigma_ratios_against_truth), "truth") == "overconfident"
     ):
         return (
-            "After this fix, the reported σ is still too small against ground truth: another "
-            "error remains."
+            "After this correction, the reported σ is still too small against ground truth: "
+            "another error remains."
         )
     return ""

@@ -21,7 +21,7 @@ ActionTarget = Literal[
 RATIO_AXIS_ENDS = (0.1, 10.0)
 RATIO_AXIS_TICKS = {0.1: "1/10", 0.2: "1/5", 0.5: "1/2", 1.0: "1", 2.0: "2", 5.0: "5", 10.0: "10"}
 # Maximum number of causes on a diagnosis card
-MAX_CAUSES = 3
+MAX_CAUSES_ON_CARD = 3
 # Maximum number of notes on a diagnosis card
 MAX_NOTES = 3
 MAX_HEADLINE_LENGTH = 84
@@ -69,7 +69,7 @@ class Verdict(Record, kw_only=True):
         return self.word in ("overconfident", "underconfident") and not self.is_explained
 
 
-class Effect(Record, kw_only=True):
+class FlightErrors(Record, kw_only=True):
     """Errors in a flight: position RMSE of KF and EKF2, rejections and resets of EKF2.
 
     Attributes
@@ -143,7 +143,7 @@ class Rerun(Record, kw_only=True):
     improves: Improvement
 
 
-class Cause(Record, kw_only=True):
+class DiagnosedCause(Record, kw_only=True):
     """Fault in a flight, with its effect, recommended actions and re-runs.
 
     Attributes
@@ -181,8 +181,8 @@ class Note(Record):
     action: str = ""
 
 
-class Identity(Record, kw_only=True):
-    """Log, software versions and settings of an analysis.
+class AnalysisDescription(Record, kw_only=True):
+    """Log, firmware, settings and student of an analysis, and the px4fuse version.
 
     Attributes
     ----------
@@ -213,11 +213,11 @@ class Identity(Record, kw_only=True):
     version: str = ""
 
 
-class AidRow(Record, kw_only=True):
+class AidConsistency(Record, kw_only=True):
     """Consistency of one ``component`` (for example "north") of an EKF2 aiding source.
 
-    ``ratio`` is the RMS of innovation ÷ √S. ``is_usual`` is True if a small ratio is not a fault,
-    because PX4's default noise is larger than the noise of usual sensors.
+    ``ratio`` is the RMS of innovation ÷ √S. ``is_usual`` is True for barometer, magnetometer and
+    gravity: their usual ratio is below 1, because PX4's default noise exceeds the sensor noise.
     """
 
     label: str
@@ -241,7 +241,7 @@ class Card(Record, kw_only=True):
     difference : str
         Position difference KF - EKF2, before and after the first cause is corrected.
     more_causes : int
-        Number of causes that are not in ``causes``, which contains at most :data:`MAX_CAUSES`.
+        Number of causes omitted from ``causes`` (limit: :data:`MAX_CAUSES_ON_CARD`).
     facts : mapping from label to str
         Further rows of the card: "KF" (why KF was not run); for a log that cannot be analysed,
         "read" (size and first bytes) and "fix" (action).
@@ -250,15 +250,15 @@ class Card(Record, kw_only=True):
     severity: CardSeverity
     id: str = ""
     headline: str
-    effect: Effect | None = None
+    effect: FlightErrors | None = None
     effect_text: str = ""
     do_this: tuple[str, ...] = ()
     verdicts: tuple[Verdict, ...] = ()
     reconcile: str = ""
     difference: str = ""
-    causes: tuple[Cause, ...] = ()
+    causes: tuple[DiagnosedCause, ...] = ()
     more_causes: Count = 0
     notes: tuple[Note, ...] = ()
-    aids: tuple[AidRow, ...] = ()
+    aids: tuple[AidConsistency, ...] = ()
     facts: Mapping[str, str] = {}
-    identity: Identity
+    identity: AnalysisDescription

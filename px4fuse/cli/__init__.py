@@ -58,11 +58,11 @@ IGNORED_ENVIRONMENT_VARIABLES = ("MPLBACKEND", "SOURCE_DATE_EPOCH")
 # Minimum address space (bytes) for a run: the report of the sample log needs 0.7 GB
 MIN_ADDRESS_SPACE_BYTES = 800_000_000
 
-# Commands that need pyarrow; without its import, other commands need 70 MB less memory
-PARQUET_COMMANDS = ("batch", "extract")
+# Commands that need pyarrow; other commands do not import it, which saves 70 MB of memory
+COMMANDS_WITH_PARQUET = ("batch", "extract")
 
 
-class LazyGroup(click.Group):
+class LazyCommandGroup(click.Group):
     """Commands of px4fuse; the module of a command is imported when the command runs."""
 
     def list_commands(self, ctx: click.Context) -> list[str]:
@@ -95,7 +95,7 @@ class LazyGroup(click.Group):
         except BrokenPipeError as error:
             # without errno, because click handles EPIPE with exit code 1
             raise BrokenPipeError from error
-        except KeyboardInterrupt as interrupt:  # click would print an empty line
+        except KeyboardInterrupt as interrupt:  # click's own handler prints an empty line
             raise Interrupted(interrupt, describe_written_files(ctx)) from None
         except (MemoryError, OSError) as error:
             raise _make_system_error(error, describe_written_files(ctx)) from error
@@ -116,7 +116,7 @@ def help_text(name: str) -> str:
 
 
 @click.group(
-    cls=LazyGroup, context_settings={"help_option_names": HELP_OPTIONS, "show_default": True}
+    cls=LazyCommandGroup, context_settings={"help_option_names": HELP_OPTIONS, "show_default": True}
 )
 @click.version_option(package_name="px4fuse")
 def cli() -> None:
@@ -155,8 +155,8 @@ def _check_memory() -> None:
     limit_bytes = resource.getrlimit(resource.RLIMIT_AS)[0]
     if limit_bytes != resource.RLIM_INFINITY and limit_bytes < MIN_ADDRESS_SPACE_BYTES:
         raise SettingsError(
-            f"the memory limit is {limit_bytes / 1e6:.0f} MB; px4fuse needs at least "
-            f"{MIN_ADDRESS_SPACE_BYTES / 1e6:.0f} MB of address space",
+            f"px4fuse needs {MIN_ADDRESS_SPACE_BYTES / 1e6:.0f} MB of address space; the limit is "
+            f"{limit_bytes / 1e6:.0f} MB",
             "Raise the memory limit, for example with ulimit -v unlimited.",
         )
 
@@ -206,7 +206,7 @@ def _configure_libraries() -> None:
         os.environ.pop(name, None)
     # matplotlib warns if the home folder is read-only, which has no effect on px4fuse
     logging.getLogger("matplotlib").setLevel(logging.ERROR)
-    if not set(PARQUET_COMMANDS) & set(sys.argv[1:2]):
+    if not set(COMMANDS_WITH_PARQUET) & set(sys.argv[1:2]):
         # pandas then does not import pyarrow, which needs 70 MB
         sys.modules.setdefault("pyarrow", None)  # type: ignore[arg-type]
 
@@ -257,11 +257,11 @@ def _raise_interrupt(signal_number: int, _: object) -> None:
 
 
 def _raise_signal_again(unraisable: "sys.UnraisableHookArgs") -> None:
-    """Send a signal again if it arrived in a finaliser, because Python ignores exceptions there."""
+    """Send a signal again if Python ignored its exception, because a finaliser was running."""
     error = unraisable.exc_value
     if isinstance(error, KeyboardInterrupt):
         signal_number = error.args[0] if error.args else signal.SIGINT
-        # a delay of 0.1 s, so that the finaliser that received the signal has ended
+        # wait 0.1 s, so that the finaliser has ended
         threading.Timer(
             0.1, signal.pthread_kill, [threading.main_thread().ident, signal_number]
         ).start()

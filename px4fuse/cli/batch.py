@@ -10,7 +10,7 @@ from px4fuse.cli import options, outputs
 from px4fuse.errors import SettingsError
 from px4fuse.finding import SEVERITIES, Severity
 
-FAIL_LEVELS = ("failed", *SEVERITIES)
+FAIL_ON_LEVELS = ("failed", *SEVERITIES)
 
 
 @click.command()
@@ -35,7 +35,7 @@ FAIL_LEVELS = ("failed", *SEVERITIES)
 )
 @options.settings_options
 @options.make_fail_on_option(
-    FAIL_LEVELS, "Exit with code 1 if a log failed or has a finding of at least this severity."
+    FAIL_ON_LEVELS, "Exit with code 1 if a log failed or has a finding of at least this severity."
 )
 @options.open_option
 def batch(
@@ -66,11 +66,13 @@ def batch(
     except KeyboardInterrupt as interrupt:
         message = "no log was finished, and nothing was written."
         if (output / "rows").is_dir():
-            message = f"results of finished logs are in {output}. Run the same command to continue."
+            message = (
+                f"results of finished logs are in {output}. Run the same command for the others."
+            )
         raise outputs.Interrupted(interrupt, message) from None
     outputs.write_and_print_results(
         {}, format_summary(batch_result), written_files=batch_result.written_paths
     )
-    options.exit_for_severity(
-        fail_on, FAIL_LEVELS, {*batch_result.severities, *batch_result.table["status"]}
+    options.exit_if_severity_reached(
+        fail_on, FAIL_ON_LEVELS, {*batch_result.severities, *batch_result.table["status"]}
     )

@@ -18,7 +18,7 @@ from px4fuse.request import format_settings_suffix
 @options.analysis_options
 @options.student_options
 @options.report_options(
-    "Report to write (PDF).  [default: reports/LOG.pdf; the name contains changed settings]"
+    "Report to write (PDF).  [default: reports/LOG.pdf; changed settings are added to the name]"
 )
 @options.make_fail_on_option(SEVERITIES, "Exit with code 1 on a finding of at least this severity.")
 @options.flag_option(
@@ -90,6 +90,6 @@ def compare(
     if failed_verdicts:
         sys.exit(1)
     independent_findings = [finding for finding in results.findings if finding.caused_by is None]
-    options.exit_for_severity(
+    options.exit_if_severity_reached(
         fail_on, SEVERITIES, {finding.severity for finding in independent_findings}
     )

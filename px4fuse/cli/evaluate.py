@@ -55,7 +55,7 @@ _evaluation_option = partial(options.request_option, EvaluationRequest)
 )
 @_evaluation_option(
     "association",
-    "Reference pose that an estimated pose is compared with: interpolated at the same time, or the "
+    "Reference pose for each estimated pose: interpolated to the time of the estimate, or the "
     "nearest in time (as in evo).",
 )
 @_evaluation_option(

@@ -80,7 +80,7 @@ def _require_same_flight(folder: Path, sha256: str) -> None:
             text = read_text(folder / "flight.json", OutputError, MAX_DESCRIPTION_BYTES)
         earlier_log = json.loads(text)["log"]
         earlier_name, earlier_sha256 = earlier_log["name"], earlier_log["sha256"]
-    # without a valid flight.json, the folder contains no tables of another log
+    # without a valid flight.json, assume that the folder contains no tables of another log
     except (OutputError, ValueError, KeyError, TypeError):
         return
     if earlier_sha256 != sha256:

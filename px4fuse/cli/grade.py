@@ -54,12 +54,14 @@ from px4fuse.errors import OutputError, SettingsError
 )
 @click.option(
     "--due",
+    "due_time_text",
     metavar="TIME",
     help="Due time of the reports: '2026-11-20 23:59' in this computer's time zone, or followed by "
     "'+01:00' or 'Europe/Berlin'. Submission times without a zone are in the same zone.",
 )
 @click.option(
     "--late",
+    "late_rule_text",
     metavar="RULE",
     help="Deduction for a late submission: '10%/day' or '10%/day up to 50%' of all points, for "
     "each started day.  [default: no deduction]",
@@ -121,8 +123,8 @@ def grade(
     key: Path | None,
     output: Path | None,
     roster: Path | None,
-    due: str | None,
-    late: str | None,
+    due_time_text: str | None,
+    late_rule_text: str | None,
     write_rubric: Path | None,
     **option_values: Any,
 ) -> None:
@@ -144,7 +146,7 @@ def grade(
     if write_rubric is not None:
         write_new(write_rubric, rubric_text().encode())
         return
-    if late and due is None:
+    if late_rule_text and due_time_text is None:
         raise SettingsError("--late requires --due TIME.")
     question_count, process_count = option_values.pop("questions") or 0, option_values.pop("jobs")
     if question_count and key is None:
@@ -162,8 +164,8 @@ def grade(
         roster=None if roster is None else read_people(read_sheet(roster)),
         worksheets=tuple(map(read_sheet, option_values.pop("worksheet"))),
         column=option_values.pop("column") or "",
-        due=parse_due_time(due) if due else None,
-        late_rule=parse_late_rule(late) if late else None,
+        due=parse_due_time(due_time_text) if due_time_text else None,
+        late_rule=parse_late_rule(late_rule_text) if late_rule_text else None,
         grace_s=60.0 * option_values.pop("grace"),
         question_count=question_count,
         **option_values,
@@ -179,7 +181,7 @@ def grade(
             )
     except KeyboardInterrupt as interrupt:
         interruption_note = (
-            f"results of verified reports are in {output}. Run the same command to continue."
+            f"results of verified reports are in {output}. Run the same command for the others."
         )
         raise Interrupted(interrupt, interruption_note) from None
     write_and_print_results({}, grading_page(outcome), written_files=outcome.written_paths)

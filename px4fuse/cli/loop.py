@@ -41,7 +41,7 @@ def parse_landing(text: str) -> Landing:
     return Landing(
         *_parse_numbers(
             text,
-            "FORWARD,RIGHT (m from take-off) or FORWARD,RIGHT,DEG (rotation in °)",
+            "FORWARD,RIGHT (distances in m) or FORWARD,RIGHT,DEG (and rotation in °)",
             MAX_LANDING_DISTANCE_M,
         )
     )
@@ -79,8 +79,8 @@ _loop_option = partial(options.request_option, LoopRequest)
     type=parse_closure,
     metavar="T1,T2[,SIGMA]",
     multiple=True,
-    help="Loop closure: the vehicle was at the same place at the times T1 and T2 (s), within SIGMA "
-    "(m, 1 σ); repeatable.  [default SIGMA: 0.1 m]",
+    help="Loop closure: the vehicle was at the same place at the times T1 and T2 (s). SIGMA (m): "
+    "σ of the distance of both places. Repeatable.  [default SIGMA: 0.1 m]",
 )
 @options.flag_option(
     "--robust",
@@ -108,11 +108,13 @@ _loop_option = partial(options.request_option, LoopRequest)
 )
 @_loop_option(
     "position_drift_m",
-    "Position drift (m, 1 σ) of the odometry after 100 m; a weight in the pose graph.",
+    "Position drift (m, 1 σ) of the odometry after 100 m. More drift reduces the weight of the "
+    "odometry.",
 )
 @_loop_option(
     "heading_drift_deg",
-    "Heading drift (°, 1 σ) of the odometry after 100 m; a weight in the pose graph.",
+    "Heading drift (°, 1 σ) of the odometry after 100 m. More drift reduces the weight of the "
+    "odometry.",
 )
 @_loop_option(
     "key_frames_m",

@@ -32,7 +32,7 @@ TOOL_ARGUMENT_BY_PARAMETER = {
     "source": "log",
 }
 # Command parameters that the tools of the server do not offer: outputs, exit codes, student data
-OMITTED_COMMAND_PARAMETERS = {
+PARAMETERS_WITHOUT_TOOL_ARGUMENT = {
     *("output", "json_path", "tum_path", "g2o_path", "fail_on", "checks"),
     *("student", "student_id", "notes", "answers"),
 }
@@ -74,7 +74,7 @@ def mcp(
 
     gc.enable()  # main() disables it for short commands, but the server runs for a long time
     for signal_number in TERMINATION_SIGNALS:
-        # an exception would not end the thread that reads standard input
+        # end the process; an exception would not end the thread that reads standard input
         signal.signal(signal_number, lambda number, _: os._exit(128 + number))
     folders = tuple(root.resolve() for root in roots)
     if report_folder is not None:
@@ -175,12 +175,12 @@ def make_tools(folders: tuple[Path, ...]) -> list[tuple[Any, Any]]:
 
 
 def _list_parameters(command_name: str) -> dict[str, click.Parameter]:
-    """Return the parameters of a command, by the name of the tool argument."""
+    """Return the parameters of a command, by the name of the argument of the MCP tool."""
     return {
         TOOL_ARGUMENT_BY_PARAMETER.get(name, name): parameter
         for parameter in find_command(command_name).params
         if parameter.expose_value
-        and (name := str(parameter.name)) not in OMITTED_COMMAND_PARAMETERS
+        and (name := str(parameter.name)) not in PARAMETERS_WITHOUT_TOOL_ARGUMENT
     }
 
 
@@ -200,7 +200,7 @@ def _make_schema(parameter: click.Parameter) -> dict[str, Any]:
     value_type, schema = parameter.type, dict[str, Any](type="string", pattern=r"^[^\x00]+$")
     if isinstance(value_type, click.Choice):
         schema = {"enum": [*value_type.choices]}
-    elif isinstance(value_type, options.TypedQuantity):
+    elif isinstance(value_type, options.NumberWithUnit):
         schema = {"anyOf": [{"type": "number"}, {"const": "auto"}][: 1 + value_type.accepts_auto]}
     elif isinstance(value_type, click.IntRange):
         schema = {"type": "integer"}

@@ -69,7 +69,7 @@ class InputPath(NonEmptyPath):
         return path
 
 
-class TypedQuantity(click.ParamType["float | str"]):
+class NumberWithUnit(click.ParamType["float | str"]):
     """Number in a fixed unit, as type of a command-line option.
 
     ``example`` is a valid value for the error message. If ``accepts_auto``, the text "auto" is also
@@ -143,13 +143,13 @@ max_size_option = click.option(
 )
 
 
-def _json_option(more_text: str = "") -> OptionDecorator:
+def _json_option(extra_help_text: str = "") -> OptionDecorator:
     return click.option(
         "--json",
         "json_path",
         type=NonEmptyPath(),
         metavar="FILE",
-        help=f"Results to write (JSON); - prints them to standard output.{more_text}",
+        help=f"Results to write (JSON); - prints them to standard output.{extra_help_text}",
     )
 
 
@@ -177,9 +177,7 @@ def output_option(metavar: str, help_text: str, **details: Any) -> OptionDecorat
 
 def report_options(help_text: str) -> OptionDecorator:
     """Make the option -o for the PDF report, and the option --json for the results."""
-    json_text = (
-        " Without -o, no report is then written.  [default: FILE.json for the report FILE.pdf]"
-    )
+    json_text = " --json without -o writes no report.  [default: FILE.json for the report FILE.pdf]"
     return _combine_options(output_option("FILE.pdf", help_text), _json_option(json_text))
 
 
@@ -187,11 +185,11 @@ def make_fail_on_option(levels: tuple[str, ...], help_text: str) -> OptionDecora
     return click.option("--fail-on", type=Choice(levels), help=help_text)
 
 
-def exit_for_severity(
-    fail_on: str | None, levels: Sequence[str], reached_levels: Iterable[str]
+def exit_if_severity_reached(
+    fail_on: str | None, levels: Sequence[str], found_levels: Iterable[str]
 ) -> None:
-    """Exit with code 1 if ``reached_levels`` contains the level --fail-on or a higher level."""
-    if fail_on is not None and {*reached_levels} & {*levels[: levels.index(fail_on) + 1]}:
+    """Exit with code 1 if a level in ``found_levels`` is at least as severe as --fail-on."""
+    if fail_on is not None and {*found_levels} & {*levels[: levels.index(fail_on) + 1]}:
         sys.exit(1)
 
 
@@ -206,7 +204,7 @@ def _make_open_option(*names: str) -> OptionDecorator:
 
 #: Option --open of commands that write a report or a page
 open_option = _make_open_option("--open", "--show", "opened")
-#: Option --show of px4fuse loop, where --open means that the path is open (not a loop)
+#: Option --show of px4fuse loop, whose --open states that the path does not return to its start
 show_option = _make_open_option("--show", "shown")
 #: Options for the student's name and id, notes and answer form
 student_options = _combine_options(
@@ -214,7 +212,7 @@ student_options = _combine_options(
     click.option(
         "--id", "student_id", metavar="ID", help="Id of the student, printed on the report."
     ),
-    input_option("--notes", "FILE.md", "Text of the student (Markdown), printed in the report."),
+    input_option("--notes", "FILE.md", "Notes of the student (Markdown), printed in the report."),
     input_option(
         "--answers",
         "FILE.toml",
@@ -242,7 +240,7 @@ def request_option(
     literal_types = [each for each in types if get_origin(each) is Literal]
     if float in types:
         unit = next(unit for suffix, unit in UNIT_BY_SUFFIX.items() if name.endswith(suffix))
-        details["type"] = TypedQuantity(
+        details["type"] = NumberWithUnit(
             unit, field.default or example, accepts_auto=bool(literal_types)
         )
     elif literal_types:
@@ -338,7 +336,7 @@ filter_options = _combine_options(
     _comparison_option(
         "position_source",
         "Position source for KF, for example vehicle_gps_position; px4fuse info lists all "
-        "sources.  [default: the logged source closest to the raw measurement]",
+        "sources.  [default: the least processed of the logged sources]",
         metavar="NAME",
     ),
     _comparison_option(
@@ -348,7 +346,7 @@ filter_options = _combine_options(
     ),
     _comparison_option(
         "height",
-        "Height source of the axis down on a flight with GNSS.  [default: the source that EKF2 "
+        "Height source for the down axis of a flight with GNSS.  [default: the source that EKF2 "
         "fused, GNSS first]",
     ),
 )

@@ -29,22 +29,22 @@ if TYPE_CHECKING:
 
 # Maximum length (bytes) of a default report name (file systems allow 255), and length to which a
 # longer name is cut
-MAX_NAME_BYTES, CUT_STEM_BYTES = 200, 180
+MAX_NAME_BYTES, SHORTENED_NAME_BYTES = 200, 180
 # Empty name and id, for a report without a student
 NO_STUDENT_NAME = ("", "")
 # Line width (characters) in a pipe: longer than any paragraph
-UNWRAPPED_WIDTH = 10_000
+PIPE_LINE_WIDTH = 10_000
 # Key in the click context: paths of the files that the command has written
 WRITTEN_FILES_KEY = "px4fuse.written"
 # Key in the click context: True to open the output in its default program
 OPENS_OUTPUT_KEY = "px4fuse.opens_output"
 # Key in the click context: function that sends progress messages to px4fuse mcp
 SEND_PROGRESS_KEY = "px4fuse.send"
-# Key in the click context: list to which a command of px4fuse mcp adds its results (JSON text)
+# Key in the click context: list to which a command adds its results (JSON text) for px4fuse mcp
 RESULTS_KEY = "px4fuse.results"
 # Suffixes of files that --open can open, in order of preference
 OPENABLE_SUFFIXES = (".html", ".htm", ".pdf", ".png")
-# HTML element with the command that made a web page, and the SHA-256 of its log
+# HTML element of a web page: the command that made the page, and the SHA-256 of the log
 GENERATOR_PATTERN = re.compile('<meta name="generator" content="([^"]*)">')
 
 
@@ -118,14 +118,12 @@ def choose_default_report_path(report_stem: str, results: Results) -> Path:
     from px4fuse.verification.pdf_input import read_attached_results
 
     if len(os.fsencode(report_stem)) > MAX_NAME_BYTES:
-        short_stem = os.fsencode(report_stem)[:CUT_STEM_BYTES].decode(errors="ignore")
+        short_stem = os.fsencode(report_stem)[:SHORTENED_NAME_BYTES].decode(errors="ignore")
         report_stem = f"{short_stem}_{hashlib.sha256(os.fsencode(report_stem)).hexdigest()[:8]}"
     path = Path("reports", f"{report_stem}.pdf")
-    mismatch_reason = (
-        "it is not a report of this px4fuse version on the same input files and student"
-    )
+    mismatch_reason = "the file is not recognised as a report on the same input files and student"
     for target, read in (path, read_attached_results), (path.with_suffix(".json"), read_results):
-        _require_replaceable(target, mismatch_reason, partial(_is_same_report, results, read))
+        _require_replaceable_file(target, mismatch_reason, partial(_is_same_report, results, read))
     return path
 
 
@@ -135,21 +133,21 @@ def check_default_page(path: Path, page: str) -> None:
     Raises
     ------
     OutputError
-        A file with this path exists, and is not a web page of this command and log.
+        A file with this path exists, and is not a web page of the same command and log.
     """
     generator_tags = GENERATOR_PATTERN.findall(page)
-    _require_replaceable(
+    _require_replaceable_file(
         path,
-        "it is not the output of this px4fuse version for the same command and log",
+        "the file is not recognised as a web page of the same command and log",
         lambda content: GENERATOR_PATTERN.findall(content.decode()) == generator_tags,
     )
 
 
-def _require_replaceable(
-    path: Path, mismatch_reason: str, is_replaceable: Callable[[bytes], bool]
+def _require_replaceable_file(
+    path: Path, mismatch_reason: str, can_replace: Callable[[bytes], bool]
 ) -> None:
     try:
-        may_replace = not path.exists() or is_replaceable(path.read_bytes())
+        may_replace = not path.exists() or can_replace(path.read_bytes())
     except (OSError, UnicodeDecodeError, ResultsError):
         may_replace = False
     if not may_replace:
@@ -162,7 +160,7 @@ def _require_replaceable(
 def _is_same_report(
     new_results: Results, read: Callable[[bytes, str], Results], existing_content: bytes
 ) -> bool:
-    """Return True if the existing report has the same input files and the same or no student."""
+    """Return True for a report on the same input files, with the same student or without one."""
     from px4fuse.results.contract import find_file_hashes, to_json
 
     existing_results = read(existing_content, "report")
@@ -197,7 +195,7 @@ def choose_web_page_path(output: Path | None, default: Path) -> Path:
 def choose_report_paths(output: Path | None, json_path: Path | None) -> list[Path]:
     """Return the paths of a report (PDF) and its results (JSON), from the values of -o and --json.
 
-    Without -o, the path of the report is missing: it depends on the analysis.
+    Without -o, only the path of the results is returned: the report name depends on the analysis.
 
     Raises
     ------
@@ -362,7 +360,7 @@ def make_console(*, uses_stderr: bool = False) -> Console:
     console = PipeConsole(highlight=False, stderr=uses_stderr)
     columns_text = os.environ.get("COLUMNS", "")
     if not console.is_terminal and not (columns_text.isdecimal() and int(columns_text)):
-        console.width = UNWRAPPED_WIDTH
+        console.width = PIPE_LINE_WIDTH
     elif console.width < 1:  # COLUMNS=0: rich would print nothing
         console.width = shutil.get_terminal_size().columns
     return console

@@ -37,7 +37,7 @@ from px4fuse.cli.outputs import (
     "--open/--no-open",
     "opens_browser",
     default=None,
-    help="Open the page in the browser.  [default: --open on a terminal]",
+    help="Open the page in the browser.  [default: yes on a terminal]",
 )
 @click.pass_context
 def practice(

@@ -10,7 +10,7 @@ import click
 from px4fuse.cli.options import (
     Choice,
     NonEmptyPath,
-    TypedQuantity,
+    NumberWithUnit,
     flag_option,
     input_option,
     list_given_parameters,
@@ -33,7 +33,7 @@ from px4fuse.simulation.scenario import (
 _DEFAULT_SCENARIO = Scenario()
 MIXED_KIND = "mixed"
 OUTDOOR_KIND: ScenarioKind = "outdoor"
-ASSIGNMENT_ONLY_OPTIONS = ("secret_file", "mistakes")
+ASSIGNMENT_ONLY_OPTIONS = ("secret_file", "fault_count")
 # Options that can be combined with --assignment
 ASSIGNMENT_OPTIONS = (
     "output",
@@ -57,7 +57,7 @@ def _add_scenario_options(command: Callable[..., None]) -> Callable[..., None]:
             f"; outdoors {outdoor_default:g}" if outdoor_default else ""
         )
         help_text = f"{quantity.meaning}  [default: {default_text}]"
-        option_type = TypedQuantity(quantity.unit, default)
+        option_type = NumberWithUnit(quantity.unit, default)
         command = click.option(quantity.cli_name, field, type=option_type, help=help_text)(command)
     return command
 
@@ -66,7 +66,9 @@ class CommandWithFaultTable(click.Command):
     """Command whose help ends with a table of the faults that can be injected."""
 
     def format_epilog(self, ctx: click.Context, formatter: click.HelpFormatter) -> None:
-        with formatter.section("Injected faults for --mistake [the default VALUE is in brackets]"):
+        with formatter.section(
+            "Injected faults for --mistake [brackets contain the default VALUE]"
+        ):
             formatter.write_dl(
                 [
                     (
@@ -88,7 +90,7 @@ class CommandWithFaultTable(click.Command):
     "--assignment",
     "ROSTER.csv",
     "Class list (student id, name): writes one flight per student, with individual noises and "
-    "injected faults, and the answer key beside the folder.",
+    "injected faults, and the answer key next to DIR.",
 )
 @input_option(
     "--secret-file",
@@ -98,6 +100,7 @@ class CommandWithFaultTable(click.Command):
 )
 @click.option(
     "--mistakes",
+    "fault_count",
     type=int,
     metavar="N",
     help="Number of injected faults in each flight of --assignment.  [default: random, 0 to 2]",
@@ -119,6 +122,7 @@ class CommandWithFaultTable(click.Command):
 )
 @click.option(
     "--mistake",
+    "fault_texts",
     metavar="NAME[=VALUE]",
     multiple=True,
     help="Injected fault, from the table below; repeatable.  [default: none]",
@@ -152,8 +156,8 @@ def simulate(
     *,
     assignment: Path | None,
     secret_file: Path | None,
-    mistakes: int | None,
-    mistake: tuple[str, ...],
+    fault_count: int | None,
+    fault_texts: tuple[str, ...],
     answer_key_path: Path | None,
     no_truth: bool,
     no_ekf2: bool,
@@ -174,14 +178,16 @@ def simulate(
     _check_options(assignment)
     if assignment is not None:
         secret = _read_secret(secret_file)
-        _write_assignment(assignment, output, answer_key_path, secret, kind, mistakes, not no_truth)
+        _write_assignment(
+            assignment, output, answer_key_path, secret, kind, fault_count, not no_truth
+        )
         return
     if kind == MIXED_KIND:
         raise SettingsError(f"--kind {MIXED_KIND} requires --assignment ROSTER.csv.")
     if output.suffix.lower() != ".ulg":
         raise OutputError(f"{output}: the output is a ULog. Give a name ending in .ulg (-o).")
     check_output_paths([output, answer_key_path])
-    fault_sizes = parse_faults(mistake)
+    fault_sizes = parse_faults(fault_texts)
     scenario = make_scenario(
         kind,
         truth=not no_truth,
@@ -211,8 +217,8 @@ def _check_options(assignment: Path | None) -> None:
     for parameter in list_given_parameters():
         if assignment is not None and parameter.name not in ASSIGNMENT_OPTIONS:
             raise SettingsError(
-                f"{parameter.opts[0]} is not available with --assignment, which draws flights "
-                "at random",
+                f"{parameter.opts[0]} is not available with --assignment, because "
+                "those flights are random",
                 f"Omit {parameter.opts[0]}.",
             )
         if assignment is None and parameter.name in ASSIGNMENT_ONLY_OPTIONS:

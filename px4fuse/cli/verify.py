@@ -45,7 +45,7 @@ def verify(
     from px4fuse.verification.verification import verify as verify_report
 
     content = read_bytes_limited(
-        report, LogError, MAX_PDF_BYTES, remedy_if_too_large="Give a report (PDF) of px4fuse."
+        report, LogError, MAX_PDF_BYTES, remedy_if_too_large="Give a PDF report that px4fuse wrote."
     )
     recorded_results = read_report(content, display_name(report))
     with progress(json_path) as show_progress:
@@ -53,7 +53,9 @@ def verify(
         file_by_sha256 = hash_files(logs)
         check_output_paths([json_path, output])
         if logs and not file_by_sha256:
-            raise LogError("The folders LOG contain no files. Give the flight log or its folder.")
+            raise LogError(
+                "The folders given as LOG contain no files. Give the flight log or its folder."
+            )
         show_progress("repeating the analysis")
         verification = run_one_with_limits(
             partial(verify_report, pdf=content, path_by_sha256=file_by_sha256),

@@ -37,9 +37,9 @@ from px4fuse.request import Sweep, WhatIfRequest
 @click.option(
     "--from",
     "start_s",
-    type=options.TypedQuantity("s", 60.0),
+    type=options.NumberWithUnit("s", 60.0),
     metavar="SECONDS",
-    help="Time after the first data (s) from which EKF2 does not fuse the aiding sources of "
+    help="Time (s after the first data) at which EKF2 stops fusing the aiding sources of "
     "--without.  [default: 0]",
 )
 @options.system_option

@@ -71,7 +71,7 @@ const Card = (() => {
       recorded.hidden = !isChanged;
       // its advice is for the analysed settings
       query("#card .do")?.toggleAttribute("hidden", isChanged);
-      recorded.textContent = `Diagnosis with the original settings (before your changes): ${analysed.sign} ${analysed.headline}`;
+      recorded.textContent = `Diagnosis before your changes of the settings: ${analysed.sign} ${analysed.headline}`;
     }
     return { showRatios, showTexts, verdicts };
   }

@@ -15,7 +15,7 @@ from px4fuse.card.verdicts import make_sigma_verdicts
 from px4fuse.comparison.model import AxisComparison, Comparison, ErrorsAgainstTruth
 from px4fuse.comparison.preparation import shift_clock
 from px4fuse.comparison.remedy import find_aid
-from px4fuse.explore.packing import COARSE_STEPS_PER_UNIT, ArrayEncoder
+from px4fuse.explore.packing import DRAWN_VALUE_STEPS_PER_UNIT, ArrayEncoder
 from px4fuse.filter.consistency import CONFIDENCE_LEVEL, CONSISTENT_SIGMA_RATIOS
 from px4fuse.filter.model import INITIAL_COVARIANCE
 from px4fuse.filter.settings import KF_NUMERIC_SETTINGS, SETTING_RANGES, Settings
@@ -34,7 +34,7 @@ OFFSET_SLIDER_HALF_RANGE_S = 0.6
 
 
 def make_flight_data(analysis: Analysis, encoder: ArrayEncoder) -> PageData:
-    """Return the data of one flight for JSON; its arrays are encoded by the packer."""
+    """Return the data of one flight for JSON; ``encoder`` encodes the arrays."""
     inputs = make_kf_inputs(analysis, encoder)
     events, request = analysis.events, analysis.request
     assert request is not None
@@ -75,7 +75,7 @@ def make_kf_inputs(comparison: Comparison, encoder: ArrayEncoder) -> PageData:
 
 
 def make_page_constants() -> PageData:
-    """Return the range and default of each KF setting, and constants for drawing σ ratios."""
+    """Return ranges and defaults of the KF settings, and the constants of σ ratio plots."""
     return {
         "settings": {name: (low, high) for name, (low, high, *_) in SETTING_RANGES.items()},
         "lesson": asdict(Settings()),
@@ -93,7 +93,7 @@ def undo_time_offset(comparison: Comparison) -> PositionTrack:
 def _make_offset_slider(request: ComparisonRequest, analysis: Analysis) -> PageData:
     """Return range and estimate of the time offset, or the reason why it cannot be changed."""
     if request.position is not None:
-        return {"why": "Not adjustable: this offset aligns the position file with the log."}
+        return {"why": "You cannot change this offset: it aligns the position file with the log."}
     applied_offset_s, clock_offset = analysis.settings.clock_offset_s, analysis.clock
     estimated_offset_s = None
     if isinstance(clock_offset, ClockOffset) and clock_offset.is_determinable:
@@ -113,13 +113,13 @@ def _make_imu_data(comparison: Comparison, encoder: ArrayEncoder) -> PageData | 
     time_s = acceleration.time_s
     gap_start_indices = np.flatnonzero(find_imu_gaps(time_s))
     gap_bounds_s = np.stack([time_s[gap_start_indices], time_s[gap_start_indices + 1]], 1)
-    gap_sum_s = np.cumsum(np.diff(gap_bounds_s, prepend=gap_bounds_s[:, :1]))
+    cumulative_gap_duration_s = np.cumsum(np.diff(gap_bounds_s, prepend=gap_bounds_s[:, :1]))
     return {
         "time": encoder.add_times(time_s[_find_segment_slice(comparison, acceleration)]),
         "span": [time_s[0], time_s[-1]],
         "gapEdges": gap_bounds_s.ravel().tolist(),
-        # for each start and end of a gap: total duration (s) of the gaps until then
-        "gapSum": gap_sum_s.tolist(),
+        # total duration (s) of all gaps up to each start and each end of a gap
+        "gapSum": cumulative_gap_duration_s.tolist(),
     }
 
 
@@ -134,10 +134,10 @@ def _find_segment_slice(comparison: Comparison, acceleration: Acceleration) -> s
 def _make_axis_inputs(
     comparison: Comparison, axis: Axis, source_track: PositionTrack, encoder: ArrayEncoder
 ) -> PageData:
-    """Return position measurements (m) and integrated acceleration (m/s) along an axis.
+    """Return position measurements (m) and the time integral of acceleration (m/s) along an axis.
 
-    Measurements shortly before and after the analysed time span are included, because a changed
-    time offset can move them into the time span.
+    Measurements shortly outside the analysed time span are included, because another time offset
+    can move these measurements into the time span.
     """
     segment = comparison.segment
     time_s = source_track.samples.index.to_numpy()
@@ -179,12 +179,12 @@ def _make_axis_data(analysis: Analysis, result: AxisComparison, encoder: ArrayEn
 def _pack_nis_bands(innovation_count: int, encoder: ArrayEncoder) -> list[dict[str, int]]:
     """Return lower and upper limits of the 95 % band of the mean NIS, encoded for the page.
 
-    Row n - 1 is the limit for n innovations. There are twice ``innovation_count`` rows, because
-    another time offset can increase the number of innovations.
+    Row n - 1 contains the limits for n innovations. There are twice ``innovation_count`` rows,
+    because the user can change the time offset, and more measurements are then in the time span.
     """
     innovation_counts = np.arange(1, 2 * innovation_count + 1)
     bounds = stats.chi2.interval(CONFIDENCE_LEVEL, innovation_counts)
-    return [encoder.add(bound / innovation_counts, COARSE_STEPS_PER_UNIT) for bound in bounds]
+    return [encoder.add(bound / innovation_counts, DRAWN_VALUE_STEPS_PER_UNIT) for bound in bounds]
 
 
 def _make_ekf2_data(
@@ -195,7 +195,7 @@ def _make_ekf2_data(
     state = result.ekf2_state.dropna()
     summary = result.filters["ekf2"]
     ekf2_data: PageData = {
-        "state": _pack_frame(state, ["position_m", "velocity_m_s"], encoder),
+        "state": _pack_table(state, ["position_m", "velocity_m_s"], encoder),
         "variance": [],
         "innovations": [],
         "summary": {"why": summary.reason}
@@ -215,7 +215,7 @@ def _make_ekf2_data(
         }
     if isinstance(result.ekf2_variance, pd.DataFrame):
         sigma = result.ekf2_variance.dropna().pow(0.5)
-        ekf2_data["variance"] = _pack_frame(
+        ekf2_data["variance"] = _pack_table(
             sigma, ["position_variance_m2", "velocity_variance_m2_s2"], encoder
         )
     if isinstance(result.ekf2_innovations, pd.DataFrame):
@@ -223,12 +223,12 @@ def _make_ekf2_data(
         valid_rows = innovations[
             np.isfinite(innovations["innovation_m"]) & (innovations["innovation_variance_m2"] > 0)
         ]
-        packed_rows = valid_rows.assign(
+        drawn_innovations = valid_rows.assign(
             rejected=(valid_rows["rejected"] > 0).astype(float),
             sigma=np.sqrt(valid_rows["innovation_variance_m2"]),
         )
-        ekf2_data["innovations"] = _pack_frame(
-            packed_rows, ["innovation_m", "sigma", "rejected"], encoder
+        ekf2_data["innovations"] = _pack_table(
+            drawn_innovations, ["innovation_m", "sigma", "rejected"], encoder
         )
         variance_m2 = innovations["observation_variance_m2"].dropna()
         ekf2_data["r"] = float(np.sqrt(variance_m2.median())) if len(variance_m2) else None
@@ -241,15 +241,17 @@ def _make_truth_data(result: AxisComparison, encoder: ArrayEncoder) -> PageData 
     position = result.truth[["position_m"]].dropna()
     velocity = result.truth[["velocity_m_s"]].dropna()
     return {
-        "p": _pack_frame(position, ["position_m"], encoder),
-        "v": _pack_frame(velocity, ["velocity_m_s"], encoder) if len(velocity) else None,
+        "p": _pack_table(position, ["position_m"], encoder),
+        "v": _pack_table(velocity, ["velocity_m_s"], encoder) if len(velocity) else None,
     }
 
 
-def _pack_frame(
+def _pack_table(
     table: pd.DataFrame, columns: list[str], encoder: ArrayEncoder
 ) -> list[dict[str, int]]:
-    values = [encoder.add(table[column].to_numpy(), COARSE_STEPS_PER_UNIT) for column in columns]
+    values = [
+        encoder.add(table[column].to_numpy(), DRAWN_VALUE_STEPS_PER_UNIT) for column in columns
+    ]
     return [encoder.add_times(table.index.to_numpy()), *values]
 
 
@@ -274,8 +276,8 @@ def _format_ekf2_settings(analysis: Analysis) -> dict[str, str]:
 def _make_commands(request: ComparisonRequest, analysis: Analysis) -> PageData:
     """Return the ``px4fuse compare`` command of this analysis in two forms.
 
-    "base" lets px4fuse choose time span and main axis. "fixed" contains both, because the choice
-    depends on the time offset, which the user can change.
+    In "base", px4fuse chooses time span and main axis. In "fixed", time span and main axis are
+    those of this analysis: px4fuse could choose others with another time offset.
     """
     offset_s = None if request.position is None else request.clock_offset_s
     defaults = ComparisonRequest(log=request.log)
@@ -284,7 +286,7 @@ def _make_commands(request: ComparisonRequest, analysis: Analysis) -> PageData:
     heading_deg = request.heading_deg
     if heading_deg is None and AISLE in analysis.axes:
         heading_deg = analysis[AISLE].heading_deg
-    explicit_request = msgspec.structs.replace(
+    fixed_request = msgspec.structs.replace(
         base_request,
         start_s=analysis.segment.start_s,
         end_s=analysis.segment.end_s,
@@ -292,7 +294,7 @@ def _make_commands(request: ComparisonRequest, analysis: Analysis) -> PageData:
     )
     return {
         "base": command_line(base_request, for_shell=True),
-        "fixed": command_line(explicit_request, for_shell=True),
+        "fixed": command_line(fixed_request, for_shell=True),
         "input": request.input,
         "default_input": "zero"
         if isinstance(analysis.main.axis.acceleration, Unavailable)

@@ -15,10 +15,10 @@ from px4fuse.explore.data import PageData
 # Keyword arguments of Bokeh's drawing functions
 BokehStyle = dict[str, Any]
 # Columns of the Bokeh data sources, which JavaScript fills
-SOURCE_COLUMNS = (
+BOKEH_SOURCE_COLUMNS = (
     "t p v sp sv "  # t: time (s); p: position (m), v: velocity (m/s); sp, sv: their σ
     "k0 k1 "  # KF gain: k0 of position, k1 of velocity (1/s)
-    "e minus plus "  # e: position error (m); minus, plus: -2σ and +2σ
+    "e minus plus "  # e: position error (m); minus, plus: limits (m) of its 2σ band
     "x y "  # x: innovation ÷ √S; y: ± plot limit, where an arrow head marks a larger |x|
     "z turn "  # z: measured position (m); turn: angle (rad) of an arrow head
     "row left right"  # row of the event plot; left, right: start and end (s) of the event
@@ -41,9 +41,9 @@ GAP_BAND_STYLE: BokehStyle = {
     "hatch_alpha": 0.6,
 }
 # Limit (±) of innovation ÷ √S for 95 % of the innovations of a consistent filter
-CONSISTENT_LIMIT_SIGMAS = 2.0
+CONSISTENCY_LIMIT_IN_SQRT_S = 2.0
 # Limit (±) of the plot axis of innovation ÷ √S
-PLOT_LIMIT_SIGMAS = 4.6
+PLOT_LIMIT_IN_SQRT_S = 4.6
 # Left margin (pixels) of a plot
 LEFT_MARGIN_PIXELS = 50
 # Left margin (pixels) of the event plot, which has long labels, and of the plot above
@@ -61,11 +61,11 @@ class Plot(Record):
 
     Attributes
     ----------
-    lines : tuple of (str, str, str, str)
+    line_definitions : tuple of (str, str, str, str)
         Data source, column, key of :data:`LINE_STYLES`, and label in the tooltip of each line.
     """
 
-    lines: tuple[tuple[str, str, str, str], ...]
+    line_definitions: tuple[tuple[str, str, str, str], ...]
     scale: Literal["linear", "log"] = "linear"
     unit: str = ""
 
@@ -81,27 +81,27 @@ class PageLayout(Record):
     """Tabs and plots of the web page (``figures.toml``)."""
 
     event_rows: list[str]
-    views: dict[str, PageTab]
+    tabs: dict[str, PageTab]
     plots: dict[str, Plot]
 
 
-FIGURES = read_toml(__file__, PageLayout)
+PAGE_LAYOUT = read_toml(__file__, PageLayout)
 
 
 def make_document_json(data: PageData) -> tuple[Any, dict[str, str]]:
     """Return a Bokeh document with all plots as JSON, and the name of each plot by its id."""
     document = Document()
-    time_range = _make_range("time")
-    plots = _make_plots(data, time_range)
-    plots |= {"strip": _make_event_plot(data, time_range), "step": _make_phase_plot()}
+    shared_time_range = _make_axis_range("time")
+    plots = _make_plots(data, shared_time_range)
+    plots |= {"strip": _make_event_plot(data, shared_time_range), "step": _make_phase_plot()}
     with document.models.freeze():  # Bokeh collects all models once, which is faster
         for plot in plots.values():
             document.add_root(plot)
     return document.to_json(deferred=False), {plot.id: name for name, plot in plots.items()}
 
 
-def has_reference(data: PageData) -> bool:
-    """Return True if ground truth or EKF2's state is logged for at least one axis."""
+def has_truth_or_ekf2(data: PageData) -> bool:
+    """Return True if ground truth or EKF2's state is logged along at least one axis."""
     return _has_track(data, "truth") or _has_track(data, "ekf2")
 
 
@@ -109,17 +109,17 @@ def _has_track(data: PageData, kind: str) -> bool:
     return any(isinstance(axis[kind], dict) for axis in data["axes"])
 
 
-def _make_plots(data: PageData, time_range: Range1d) -> dict[str, Any]:
+def _make_plots(data: PageData, shared_time_range: Range1d) -> dict[str, Any]:
     missing_tracks = {kind for kind in ("ekf2", "truth") if not _has_track(data, kind)}
     plots: dict[str, Any] = {}
-    for name, plot in FIGURES.plots.items():
-        if name == "error" and not has_reference(data):
+    for name, plot in PAGE_LAYOUT.plots.items():
+        if name == "error" and not has_truth_or_ekf2(data):
             continue
         get_source = cache(lambda source, plot=name: _make_data_source(f"{plot}:{source}"))
         plot_figure = plots[name] = _make_figure(
             name,
             215,
-            x_range=time_range,
+            x_range=shared_time_range,
             y_axis_type=plot.scale,
             tools="xbox_zoom,xpan,tap",
             active_drag="xbox_zoom",
@@ -135,7 +135,7 @@ def _make_plots(data: PageData, time_range: Range1d) -> dict[str, Any]:
                 "t", "minus", "plus", source=get_source("error"), fill_alpha=0.25, name="kf_band"
             )
         line_renderers: list[Any] = []
-        for source_name, column, style_name, hover_name in plot.lines:
+        for source_name, column, style_name, hover_name in plot.line_definitions:
             if style_name in missing_tracks:
                 continue
             line_renderer = plot_figure.line(
@@ -157,10 +157,12 @@ def _make_plots(data: PageData, time_range: Range1d) -> dict[str, Any]:
 def _draw_innovations(
     plot_figure: Any, get_source: Callable[[str], ColumnDataSource], *, with_ekf2: bool
 ) -> None:
-    plot_figure.y_range = Range1d(start=-PLOT_LIMIT_SIGMAS, end=PLOT_LIMIT_SIGMAS)
+    plot_figure.y_range = Range1d(start=-PLOT_LIMIT_IN_SQRT_S, end=PLOT_LIMIT_IN_SQRT_S)
     plot_figure.add_layout(
         BoxAnnotation(
-            bottom=-CONSISTENT_LIMIT_SIGMAS, top=CONSISTENT_LIMIT_SIGMAS, **CONSISTENT_BAND_STYLE
+            bottom=-CONSISTENCY_LIMIT_IN_SQRT_S,
+            top=CONSISTENCY_LIMIT_IN_SQRT_S,
+            **CONSISTENT_BAND_STYLE,
         )
     )
     kf_renderer = _draw_dots(plot_figure, get_source("updates"), "t x", 4, name="kf")
@@ -180,9 +182,11 @@ def _draw_innovations(
 def _add_hover(plot_figure: Any, renderer: Any, label: str, value: str) -> None:
     tooltip_rows = [("time", "@t{0.00} s"), (label, value)]
     # place tooltips on different sides, so that they do not overlap
-    side: Any = {"EKF2": "right", "ground truth": "above"}.get(label, "left")
+    tooltip_side: Any = {"EKF2": "right", "ground truth": "above"}.get(label, "left")
     plot_figure.add_tools(
-        HoverTool(renderers=[renderer], tooltips=tooltip_rows, mode="vline", attachment=side)
+        HoverTool(
+            renderers=[renderer], tooltips=tooltip_rows, mode="vline", attachment=tooltip_side
+        )
     )
 
 
@@ -199,23 +203,23 @@ def _add_cursor(plot_figure: Any, name: str = "cursor", **style: Any) -> None:
     )
 
 
-def _make_range(name: str | None = None) -> Range1d:
+def _make_axis_range(name: str | None = None) -> Range1d:
     return Range1d(start=0.1, end=1.0, name=name)
 
 
 def _make_data_source(name: str) -> ColumnDataSource:
     return ColumnDataSource(
-        {column: [] for column in SOURCE_COLUMNS.split()}, name=f"{name}-source"
+        {column: [] for column in BOKEH_SOURCE_COLUMNS.split()}, name=f"{name}-source"
     )
 
 
-def _make_event_plot(data: PageData, time_range: Range1d) -> Any:
+def _make_event_plot(data: PageData, shared_time_range: Range1d) -> Any:
     data_source = _make_data_source("strip")
-    rows = FIGURES.event_rows if _has_track(data, "ekf2") else FIGURES.event_rows[2:]
+    rows = PAGE_LAYOUT.event_rows if _has_track(data, "ekf2") else PAGE_LAYOUT.event_rows[2:]
     plot_figure = _make_figure(
         "strip",
         28 * len(rows) + 24,
-        x_range=time_range,
+        x_range=shared_time_range,
         y_range=FactorRange(factors=rows),
         tools="xbox_zoom,xpan",
         active_drag="xbox_zoom",
@@ -246,8 +250,8 @@ def _make_phase_plot() -> Any:
     plot_figure = _make_figure(
         "step",
         330,
-        x_range=_make_range(),
-        y_range=_make_range(),
+        x_range=_make_axis_range(),
+        y_range=_make_axis_range(),
         tools="",
         x_axis_label="position (m)",
         y_axis_label="velocity (m/s)",

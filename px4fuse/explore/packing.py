@@ -1,7 +1,8 @@
 """Compact encoding of arrays for the web page.
 
-Numbers are scaled and rounded to integers. The bytes of their differences are sorted by
-significance, compressed by deflate and encoded as base64.
+Numbers are scaled and rounded to integers. The differences of successive integers are split into
+bytes: first the lowest byte of each difference, then the next byte. This order compresses well
+(deflate). The result is encoded as base64.
 """
 
 import base64
@@ -12,11 +13,11 @@ import numpy as np
 
 from px4fuse.core.arrays import Array
 
-# Inputs of KF are rounded to this many steps per m, m/s or s, because integers are smaller when
-# compressed. The rounding error is 1 % of the tolerance between KF in JavaScript and KF in Python
-FINE_STEPS_PER_UNIT = 2.0**36
+# Rounding steps per m, m/s or s for the inputs of KF, because integers compress well. The rounding
+# error is 1 % of the tolerated difference between KF in JavaScript and KF in Python
+KF_INPUT_STEPS_PER_UNIT = 2.0**36
 # Rounding steps per unit for values that are only drawn or averaged
-COARSE_STEPS_PER_UNIT = 1e6
+DRAWN_VALUE_STEPS_PER_UNIT = 1e6
 # Limit of the rounded values: half of the largest integer that JavaScript represents exactly
 MAX_EXACT_INTEGER = 2.0**52
 
@@ -28,7 +29,7 @@ class ArrayEncoder:
     array_specs: list[tuple[int, int, float]] = field(default_factory=list)
     _encoded_arrays: list[bytes] = field(default_factory=list)
 
-    def add(self, values: Array, scale: float = FINE_STEPS_PER_UNIT) -> dict[str, int]:
+    def add(self, values: Array, scale: float = KF_INPUT_STEPS_PER_UNIT) -> dict[str, int]:
         """Add an array, rounded to ``scale`` steps per unit.
 
         Return ``{"array": index}``, which replaces the array in the JSON data.
@@ -50,7 +51,7 @@ class ArrayEncoder:
 
     def add_times(self, time_s: Array) -> dict[str, int]:
         has_whole_microseconds = bool(np.all(np.abs(np.rint(time_s * 1e6) / 1e6 - time_s) < 1e-10))
-        return self.add(time_s, 1e6 if has_whole_microseconds else FINE_STEPS_PER_UNIT)
+        return self.add(time_s, 1e6 if has_whole_microseconds else KF_INPUT_STEPS_PER_UNIT)
 
     def text(self) -> str:
         """Return all arrays, compressed, as one base64 text."""

@@ -371,16 +371,16 @@ const Explore = (async () => {
       const text = values && format(values);
       return text ? `${name} ${text}` : [];
     }).join(", ");
-    title("innovation", `innovations outside ±2 (expected 5 %): ${both((x) => percent(x, 0))}`);
+    title("innovation", `innovations outside ±2√S (expected 5 %): ${both((x) => percent(x, 0))}`);
     title("gain", "KF: position gain (solid), velocity gain (dotted, 1/s)");
     if (kf === null) return;
-    const gaps = flight.events.gap.length ? "; hatched: gap in the position source" : "";
-    const shaded = `shaded: ±2σ reported by KF${gaps}`;
+    const legend = flight.events.gap.length
+      ? "shaded: ±2σ reported by KF · hatched: gap in the position source" : "shaded: ±2σ reported by KF";
     if (!isText(axis.truth)) {
-      title("error", `position RMSE ${both(({ truthP }) => truthP && Card.formatMetres(truthP))} · ${shaded}`);
+      title("error", `position RMSE ${both(({ truthP }) => truthP && Card.formatMetres(truthP))} · ${legend}`);
     } else if (kf.ekf2P) {
       $("error").parentElement.querySelector("b").textContent = "KF − EKF2 position difference (m)";
-      title("error", `RMS ${Card.formatMetres(kf.ekf2P)} · ${shaded}`);
+      title("error", `RMS ${Card.formatMetres(kf.ekf2P)} · ${legend}`);
     }
   }
 

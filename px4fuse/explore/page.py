@@ -7,7 +7,7 @@ from bokeh.resources import Resources
 
 from px4fuse.analysis import Analysis
 from px4fuse.explore.data import PageData, make_flight_data, make_page_constants
-from px4fuse.explore.figures import FIGURES, has_reference, make_document_json
+from px4fuse.explore.figures import PAGE_LAYOUT, has_truth_or_ekf2, make_document_json
 from px4fuse.explore.packing import ArrayEncoder
 from px4fuse.html.safe import (
     clean_values,
@@ -95,7 +95,7 @@ def make_page_html(
     fields
         Further fields of the template ``page.html``.
     """
-    practice_script = "practice" if choices else "no_practice"
+    practice_script_name = "practice" if choices else "no_practice"
     scripts_by_name = {
         # BokehJS without widgets, tables and formulas; js_raw[1] only sets the log level
         "bokeh": Resources(mode="inline", components=["bokeh"]).js_raw[0],
@@ -103,7 +103,7 @@ def make_page_html(
         "script": read_asset("dom.js")
         + "".join(
             read_asset(f"{name}.js", ASSET_PACKAGE)
-            for name in (*SCRIPT_NAMES, practice_script, "page")
+            for name in (*SCRIPT_NAMES, practice_script_name, "page")
         ),
     }
     return load_template("explore/page.html").render(
@@ -116,7 +116,7 @@ def make_page_html(
         made_from=f"px4fuse {command} {sha256}".rstrip(),
         made_with=f"px4fuse {version('px4fuse')}",
         choices=choices,
-        views=FIGURES.views,
-        has_reference=has_reference(data),
+        tabs=PAGE_LAYOUT.tabs,
+        has_truth_or_ekf2=has_truth_or_ekf2(data),
         **fields,
     )

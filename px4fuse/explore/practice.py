@@ -29,8 +29,8 @@ from px4fuse.simulation import flights
 from px4fuse.simulation.faults import parse_faults
 from px4fuse.simulation.scenario import Scenario
 
-# Pairs of faults (as answers of the quiz) that do not hide each other in one flight
-COMBINABLE_ANSWERS = (
+# Pairs of quiz answers whose faults do not hide each other in one flight
+COMBINABLE_ANSWER_PAIRS = (
     {"clock", "source"},
     {"clock", "gate"},
     {"frame", "source"},
@@ -84,7 +84,7 @@ class QuizFault(Record):
     symptom: str
     size_text: str = "{0}"
     view: str = "errors"
-    has_either_sign: bool = False
+    has_random_sign: bool = False
 
 
 class QuizTable(Record):
@@ -104,7 +104,7 @@ class QuizFlight:
 
     scenario: Scenario
     faults: tuple[QuizFault, ...]
-    sizes: tuple[str, ...]
+    fault_sizes: tuple[str, ...]
 
     @property
     def correct_answers(self) -> list[str]:
@@ -138,11 +138,11 @@ def _draw_flight(rng: np.random.Generator, right_answer: str, level: int) -> Qui
     if level == MAX_QUIZ_LEVEL and faults and rng.random() < 0.5:
         faults_and_answers = ((fault, {fault.choice, right_answer}) for fault in QUIZ_FAULTS)
         faults += draw_one_fault(
-            [fault for fault, pair in faults_and_answers if pair in COMBINABLE_ANSWERS]
+            [fault for fault, pair in faults_and_answers if pair in COMBINABLE_ANSWER_PAIRS]
         )
     fault_sizes, sigma_uwb_m = [], SIGMA_Z_M
     for fault in faults:
-        sign = "-" if fault.has_either_sign and rng.random() < 0.5 else ""
+        sign = "-" if fault.has_random_sign and rng.random() < 0.5 else ""
         fault_sizes.append(f"{sign}{fault.sizes[level - 1]}")
         if fault.name == NOISY_UWB_FAULT:
             sigma_uwb_m = float(fault_sizes[-1])
@@ -186,7 +186,7 @@ def make_practice_page(
 def _simulate_flight_data(
     practice_flight: QuizFlight, flight_index: int
 ) -> tuple[dict[str, Any], str]:
-    faults_and_sizes = [*zip(practice_flight.faults, practice_flight.sizes, strict=True)]
+    faults_and_sizes = [*zip(practice_flight.faults, practice_flight.fault_sizes, strict=True)]
     fault_options = [
         f"{fault.name}={size}" for fault, size in faults_and_sizes if fault.name != NOISY_UWB_FAULT
     ]
@@ -222,7 +222,7 @@ def _describe_fault(fault: QuizFault, size: str, findings: tuple[Finding, ...]) 
     time_text = f"{spans[0][0]:.1f} to {spans[-1][1]:.1f} s" if spans else "whole flight"
     return {
         "fault": fault.description,
-        "size": fault.size_text.format(*split_size(size)),
+        "size": fault.size_text.format(*split_fault_size(size)),
         "time": time_text,
         "symptom": fault.symptom,
         "view": fault.view,
@@ -230,10 +230,10 @@ def _describe_fault(fault: QuizFault, size: str, findings: tuple[Finding, ...]) 
     }
 
 
-def split_size(size: str) -> list[str]:
+def split_fault_size(size: str) -> list[str]:
     """Split the size of an injected fault at commas, and separate numbers and units by blanks.
 
-    >>> split_size("5%,2m"), split_size("-400ms"), split_size("0.3")
+    >>> split_fault_size("5%,2m"), split_fault_size("-400ms"), split_fault_size("0.3")
     (['5 %', '2 m'], ['-400 ms'], ['0.3'])
     """
     return [re.sub(r"(?<=\d)(?=[^\d.])", " ", part).replace("deg", "°") for part in size.split(",")]

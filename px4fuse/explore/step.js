@@ -135,7 +135,7 @@ const Step = (() => {
       slider.value = selected.measurement;
       slider.ariaValueText = `Measurement ${selected.measurement + 1} of ${count}`;
       $("now").textContent = now.u >= 0 ? `Measurement ${now.u + 1} of ${count}, at ${t.toFixed(3)} s`
-        + (now.updated ? "" : ", after the prediction of KF, before its update") : `KF has predicted to ${t.toFixed(3)} s`;
+        + (now.updated ? ": after the update of KF" : ": before the update of KF") : `KF's prediction has reached ${t.toFixed(3)} s`;
       if (!isVisible("step")) return;
       drawPlane(run, now);
       if (now.i === 0) return $("numbers").replaceChildren(make("p", "Initial state of KF: the first measured position, velocity 0."));

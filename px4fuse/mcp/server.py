@@ -140,12 +140,14 @@ class Server(MCPServer[Any]):
         job_results = poll_with_limits(
             partial(self._run_command, sender), [command_words], 1, *self._limits, max_wait_s=0.0
         )
-        progress_numbers = count(1)
+        progress_message_numbers = count(1)
         # closing() ends the worker process, also if the client cancels the call
         with receiver, sender, closing(job_results):
             while (outcome := next(job_results)) is None:
                 while receiver.poll():
-                    await context.report_progress(next(progress_numbers), message=receiver.recv())
+                    await context.report_progress(
+                        next(progress_message_numbers), message=receiver.recv()
+                    )
                 await anyio.sleep(POLL_INTERVAL_S)
         _, result = outcome
         if isinstance(result, JobFailure):

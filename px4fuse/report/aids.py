@@ -19,7 +19,7 @@ from px4fuse.report.phrases import format_sigma_verdict
 TITLE = "Aiding sources of EKF2"
 LEAD_TEXT = (
     "Each aiding source is tested with its innovations in flight: a mean NIS of 1 is expected. "
-    "Time-correlated errors, wrong delays and wrong headings hardly change the NIS."
+    "The NIS hardly shows time-correlated errors, wrong delays and wrong headings."
 )
 AID_PANEL_HEIGHT = 21.0  # height (points) of the plot of one aiding source
 MAX_DRAWN_SIGMAS = 4.0  # larger |ν/√S| are drawn as triangles at the edge of the plot
@@ -31,7 +31,9 @@ OUTDOOR_AIDS = ("gnss_pos", "gnss_vel", "optical_flow", "aux_global_position")
 def draw_pages(analysis: Analysis | AidsOnlyAnalysis, _: object) -> Iterator[Page]:
     """Draw the page on aiding sources; in a comparison of KF and EKF2 only for outdoor flights."""
     is_comparison = isinstance(analysis, Analysis)
-    aids = select_aids_if_outdoor(analysis) if isinstance(analysis, Analysis) else analysis.aids
+    aids = (
+        select_aids_of_outdoor_flight(analysis) if isinstance(analysis, Analysis) else analysis.aids
+    )
     if aids:
         page = Page(make_appendix_title(TITLE) if is_comparison else TITLE, LEAD_TEXT)
         write_aids(page, aids)
@@ -39,7 +41,7 @@ def draw_pages(analysis: Analysis | AidsOnlyAnalysis, _: object) -> Iterator[Pag
         yield page
 
 
-def select_aids_if_outdoor(analysis: Analysis) -> Mapping[str, AidResult]:
+def select_aids_of_outdoor_flight(analysis: Analysis) -> Mapping[str, AidResult]:
     """Return all aiding sources if EKF2 fused GNSS or optical flow (outdoor flight), else {}."""
     aids = {} if isinstance(analysis.aids, Unavailable) else analysis.aids
     enabled_aid_names = {name for name, aid in aids.items() if aid.verdict != "disabled"}

@@ -20,7 +20,7 @@ from px4fuse.report.card_text import (
     format_target,
     label_alternatives,
     locate_sigma_ratio,
-    rerun_columns,
+    make_rerun_columns,
     with_typed_path,
 )
 
@@ -42,7 +42,7 @@ def make_diagnosis_card(analysis: Analysis) -> Card:
     """Return the summary of faults, causes and actions of an analysis."""
     if analysis.request is None:
         raise SettingsError(
-            "The command that repeats this analysis is known only for results of px4fuse.compare.",
+            "A diagnosis card needs the settings of the analysis. This analysis contains none.",
             "Create the analysis with px4fuse.compare.",
         )
     card = build_card(analysis, analysis.request)
@@ -67,7 +67,7 @@ def make_card_html(card: Card, *, is_open: bool = False, has_apply_buttons: bool
         if card.verdicts and card.effect is not None
         else "",
         label_alternatives=label_alternatives,
-        rerun_rows=lambda reruns: zip(*rerun_columns(reruns), strict=True),
+        rerun_rows=lambda reruns: zip(*make_rerun_columns(reruns), strict=True),
         signs=SEVERITY_SIGNS,
         target=format_target,
         format_spans=format_spans,
@@ -86,10 +86,10 @@ def make_sigma_ratio_html(verdicts: Sequence[Verdict], axis: str, name: str = ""
         name=name,
         marks=locate_sigma_ratio,
         paths=MARKER_SVG_PATHS,
-        percent=_format_axis_percent,
+        percent=_format_svg_position,
         alternative=make_alternative_text(verdicts),
         ticks=[
-            (_format_axis_percent(map_ratio_to_axis(tick)), label, tick not in LABELLED_RATIO_TICKS)
+            (_format_svg_position(map_ratio_to_axis(tick)), label, tick not in LABELLED_RATIO_TICKS)
             for tick, label in RATIO_AXIS_TICKS.items()
         ],
         limits=format_consistent_ratios(),
@@ -129,16 +129,16 @@ def make_alternative_text(verdicts: Sequence[Verdict]) -> str:
     for verdict in verdicts:
         verdict_text = f"not evaluated, {verdict.reason}"
         if verdict.ratio is not None:
-            explained_suffix = ", explained" if verdict.is_explained else ""
-            verdict_text = f"{format_ratio(verdict.ratio)}, {verdict.word}{explained_suffix}"
-        filter_and_quantity = (
-            f"{FILTER_NAMES[verdict.filter]}, {SCREEN_READER_QUANTITIES[verdict.against]}"
+            explained_note = ", explained" if verdict.is_explained else ""
+            verdict_text = f"{format_ratio(verdict.ratio)}, {verdict.word}{explained_note}"
+        sentences.append(
+            f"{FILTER_NAMES[verdict.filter]}, {SCREEN_READER_QUANTITIES[verdict.against]}: "
+            f"{verdict_text}."
         )
-        sentences.append(f"{filter_and_quantity}: {verdict_text}.")
     return " ".join(sentences)
 
 
-def _format_axis_percent(fraction: float) -> str:
+def _format_svg_position(fraction: float) -> str:
     # SVG positions are percentages, so the axis fits any width without style attributes, which the
     # security policy of the pages forbids
     return f"{100.0 * min(max(fraction, 0.0), 1.0):.2f}%"

@@ -15,9 +15,9 @@ from px4fuse.card.model import (
     RATIO_AXIS_ENDS,
     RATIO_AXIS_TICKS,
     Action,
-    AidRow,
+    AidConsistency,
     Card,
-    Cause,
+    DiagnosedCause,
     Rerun,
     Verdict,
     map_ratio_to_axis,
@@ -56,7 +56,7 @@ ASCII_REPLACEMENTS = str.maketrans("░●◆◀▶─÷−–²³×", ":ox<>-/-
 )
 AIDS_CAPTION = (
     "RMS of innovation ÷ √S of each aiding source that EKF2 fused. A value below 1 means that √S "
-    "is too large. For barometer, magnetometer and gravity this is usual and not a fault."
+    "is too large. For barometer, magnetometer and gravity, such a value is usual and not a fault."
 )
 
 
@@ -147,10 +147,11 @@ def format_closing_lines(card: Card) -> Iterator[Paragraph]:
 def with_typed_path(card: Card, path: str | None) -> Card:
     """Replace the file name of the log in all commands of a card by the path that the user typed.
 
-    >>> from px4fuse.card.model import Identity
+    >>> from px4fuse.card.model import AnalysisDescription
     >>> action = Action("KF", commands=("px4fuse compare a.ulg --sigma-z 1",), where="shell")
-    >>> cause = Cause(id="x", severity="error", title="", why="", actions=(action,))
-    >>> card = Card(severity="error", headline="", causes=(cause,), identity=Identity(file="a.ulg"))
+    >>> cause = DiagnosedCause(id="x", severity="error", title="", why="", actions=(action,))
+    >>> log = AnalysisDescription(file="a.ulg")
+    >>> card = Card(severity="error", headline="", causes=(cause,), identity=log)
     >>> with_typed_path(card, "my logs/a.ulg").causes[0].actions[0].commands
     ("px4fuse compare 'my logs/a.ulg' --sigma-z 1",)
     """
@@ -194,14 +195,14 @@ def draw_sigma_ratio(ratio: float | None, reference: Reference) -> str:
     '───────────────░░░░░░░──────────────▶'
     """
     first_band_column, last_band_column = (
-        _find_axis_column(end) for end in CONSISTENT_SIGMA_RATIOS[reference]
+        _compute_axis_column(end) for end in CONSISTENT_SIGMA_RATIOS[reference]
     )
     characters = [
         "░" if first_band_column <= column <= last_band_column else "─"
         for column in range(AXIS_WIDTH)
     ]
     if ratio is not None:
-        column, last_column = _find_axis_column(ratio), AXIS_WIDTH - 1
+        column, last_column = _compute_axis_column(ratio), AXIS_WIDTH - 1
         symbol = (
             "◀" if column < 0 else "▶" if column > last_column else SYMBOL_BY_REFERENCE[reference]
         )
@@ -228,7 +229,7 @@ def locate_sigma_ratio(
     }
 
 
-def _find_axis_column(ratio: float) -> int:
+def _compute_axis_column(ratio: float) -> int:
     return round(map_ratio_to_axis(ratio) * (AXIS_WIDTH - 1))
 
 
@@ -252,7 +253,7 @@ def format_headline_lines(card: Card) -> Iterator[Paragraph]:
     yield Paragraph(f"{severity_and_id}: {card.headline}", SEVERITY_STYLES[card.severity])
 
 
-def _format_cause_lines(cause: Cause) -> Iterator[Paragraph]:
+def _format_cause_lines(cause: DiagnosedCause) -> Iterator[Paragraph]:
     yield from _format_labelled_lines("when", format_spans(cause))
     actions = label_alternatives(cause)
     labels = [f"{prefix}{format_target(action)}" for prefix, action in actions]
@@ -263,7 +264,7 @@ def _format_cause_lines(cause: Cause) -> Iterator[Paragraph]:
     yield from _wrap_lines(cause.after, "  ", "  ")
 
 
-def label_alternatives(cause: Cause) -> list[tuple[str, Action]]:
+def label_alternatives(cause: DiagnosedCause) -> list[tuple[str, Action]]:
     """Return the actions of a cause; alternative actions begin with "EITHER " or "OR "."""
     alternatives = [
         ("OR " if place else "EITHER ", action)
@@ -293,7 +294,7 @@ def _format_action_lines(label: str, label_width: int, action: Action) -> Iterat
 
 
 def _format_rerun_table(reruns: Sequence[Rerun]) -> Iterator[Paragraph]:
-    columns = rerun_columns(reruns)
+    columns = make_rerun_columns(reruns)
     widths = [max(map(len, column)) for column in columns]
     for row in zip(*columns, strict=True):
         cells = (f"{cell:{width}}" for cell, width in zip(row, widths, strict=True))
@@ -302,11 +303,11 @@ def _format_rerun_table(reruns: Sequence[Rerun]) -> Iterator[Paragraph]:
         yield from _wrap_lines(note, "  ", "  ")
 
 
-def rerun_columns(reruns: Sequence[Rerun]) -> list[tuple[str, ...]]:
+def make_rerun_columns(reruns: Sequence[Rerun]) -> list[tuple[str, ...]]:
     """Return the columns (heading, cells) of the table of re-runs with changed settings."""
     rows = [
         {
-            "re-run of this log": rerun.label,
+            "re-run (filter, change)": rerun.label,
             "position RMSE": _format_before_after(rerun.position_rmse_m, format_metres, " m"),
             "● innovation ÷ √S": _format_before_after(rerun.source_ratio, format_ratio),
             "◆ error ÷ σ": _format_before_after(rerun.truth_ratio, format_ratio),
@@ -321,14 +322,14 @@ def rerun_columns(reruns: Sequence[Rerun]) -> list[tuple[str, ...]]:
 
 
 def format_rerun_note(reruns: Sequence[Rerun]) -> str:
-    starts_s = [
+    replay_starts_s = [
         rerun.from_s for rerun in reruns if rerun.is_prediction and rerun.from_s is not None
     ]
-    if not starts_s:
+    if not replay_starts_s:
         return ""
     return (
         "EKF2 (replay) is a prediction by px4fuse's model of EKF2. Its statistics exclude gaps and "
-        f"the time before {min(starts_s):.0f} s, so they differ from those of the flight."
+        f"the time before {min(replay_starts_s):.0f} s, so they differ from those of the flight."
     )
 
 
@@ -351,13 +352,15 @@ def _format_verdict_lines(card: Card) -> Iterator[Paragraph]:
     yield Paragraph("")
     heading = "Consistency: RMS of actual error ÷ reported σ (1: consistent)"
     yield from _wrap_lines(f"{heading}{direction_text}", "", "  ")
-    legend, left_label = f"  ░ consistent ({format_consistent_ratios()})", "σ too large"
-    directions = f"{left_label}{'σ too small':>{AXIS_WIDTH - len(left_label)}}"
-    yield Paragraph(f"{'':{AXIS_INDENT}}", plot=directions)
+    legend, too_large_label = f"  ░ consistent ({format_consistent_ratios()})", "σ too large"
+    yield Paragraph(
+        f"{'':{AXIS_INDENT}}",
+        plot=f"{too_large_label}{'σ too small':>{AXIS_WIDTH - len(too_large_label)}}",
+    )
     yield Paragraph(f"{legend:{AXIS_INDENT}}", plot=_format_tick_labels())
     if any(verdict.is_explained for verdict in card.verdicts):
         yield Paragraph(
-            "  A verdict in brackets is an effect of the causes above, not a fault of the filter."
+            "  A verdict in brackets is not a fault of the filter: its settings need no change."
         )
     yield from map(_format_verdict_line, card.verdicts)
 
@@ -379,12 +382,12 @@ def _format_tick_labels() -> str:
     characters = [" "] * AXIS_WIDTH
     for tick in LABELLED_RATIO_TICKS:
         label = RATIO_AXIS_TICKS[tick]
-        start = min(max(_find_axis_column(tick) - len(label) // 2, 0), AXIS_WIDTH - len(label))
+        start = min(max(_compute_axis_column(tick) - len(label) // 2, 0), AXIS_WIDTH - len(label))
         characters[start : start + len(label)] = label
     return "".join(characters)
 
 
-def _format_aid_lines(aid_rows: Sequence[AidRow]) -> Iterator[Paragraph]:
+def _format_aid_lines(aid_rows: Sequence[AidConsistency]) -> Iterator[Paragraph]:
     if not aid_rows:
         return
     yield Paragraph("")
@@ -398,7 +401,7 @@ def _format_aid_lines(aid_rows: Sequence[AidRow]) -> Iterator[Paragraph]:
         yield Paragraph(f"{label_text:{indent}}", plot=draw_sigma_ratio(row.ratio, "source"))
 
 
-def format_spans(cause: Cause) -> str:
+def format_spans(cause: DiagnosedCause) -> str:
     """Format the time from the first to the last occurrence of a fault."""
     if not cause.spans_s:
         return ""
@@ -411,8 +414,7 @@ def format_spans(cause: Cause) -> str:
 
 
 def _format_labelled_lines(label: str, text: str) -> Iterator[Paragraph]:
-    indent = " " * TEXT_INDENT
-    yield from _wrap_lines(text, f"  {label:{TEXT_INDENT - 2}}", indent)
+    yield from _wrap_lines(text, f"  {label:{TEXT_INDENT - 2}}", " " * TEXT_INDENT)
 
 
 def _wrap_lines(text: str, first_indent: str, indent: str) -> Iterator[Paragraph]:

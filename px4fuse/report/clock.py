@@ -87,8 +87,8 @@ def make_time_offset_advice(
     if clock_drift := faults.clock_drift:
         advice_by_label["Drift"] = (
             f"The clock of the timestamps is {abs(100.0 * clock_drift):.1f} % "
-            f"{'fast' if clock_drift > 0.0 else 'slow'}. The offset applies to the middle of the "
-            "data."
+            f"{'fast' if clock_drift > 0.0 else 'slow'}, so the time offset changes. 'Offset' is "
+            "the time offset in the middle of the data."
         )
     elif time_offset.drift_ppm is not None and time_offset.drift_sigma_ppm is not None:
         half_width_ppm = 1.96 * time_offset.drift_sigma_ppm
@@ -132,16 +132,16 @@ def draw_pages(analysis: Analysis, results: ComparisonResults) -> Iterator[Page]
         "Late or early timestamps hardly change the innovations, because the filter "
         "follows the positions. px4fuse maximises the likelihood of the positions over the "
         "time offset, together with sensor biases, attitude errors and noises. The attitude "
-        "is from the gyros, because the same positions have corrected EKF2's attitude.",
+        "is from the gyros, not from EKF2, because EKF2 fused the same positions.",
     )
     page.write_labelled_texts(make_time_offset_advice(analysis, time_offset))
     (low_offset_s, high_offset_s), estimate_s = time_offset.interval_s, time_offset.offset_s
     curve_sentence = (
         f"The log-likelihood of {time_offset.count} measurements has its maximum at "
         f"{estimate_s:+.3f} s; 95 % interval {low_offset_s:+.3f} to {high_offset_s:+.3f} s. The "
-        "curve does not include the IMU noise, but the interval does, so the interval is wider."
+        "interval includes the IMU noise; the curve does not, so the curve is narrower."
     )
-    title = "Decrease of the log-likelihood from its maximum (nats)"
+    title = "Log-likelihood of the positions: decrease below its maximum (nats)"
     draw_offset_likelihood(
         page.add_panel(title, CURVE_HEIGHT, caption=curve_sentence, gap_above=14.0), time_offset
     )

@@ -59,7 +59,7 @@ RUNNING_NIS_HEIGHT = 140.0  # height (points) of the axes of the running mean NI
 DISTRIBUTION_HEIGHT = 150.0  # height (points) of the axes of distribution and autocorrelation
 LEGEND_HEIGHT = 14.0  # height (points) of a legend above the axes
 # Label of each statistic, and exponent that is applied before printing (0.5: square root)
-STATISTIC_LABELS_AND_POWERS: Mapping[Statistic, tuple[str, float]] = {
+STATISTIC_LABELS_AND_EXPONENTS: Mapping[Statistic, tuple[str, float]] = {
     "nis": ("mean NIS", 1.0),
     "nees": ("√NEES", 0.5),
     "difference": ("KF - EKF2 (m)", 1.0),
@@ -86,7 +86,7 @@ def draw_pages(analysis: Analysis, _: object) -> Iterator[Page]:
         )
         left_column, right_column = make_two_columns()
         histogram_axes = left_column.add_panel(
-            "Distribution of ν/√S", DISTRIBUTION_HEIGHT, gap_above=LEGEND_HEIGHT, left=4.0
+            "Distribution of ν/√S", DISTRIBUTION_HEIGHT, gap_above=LEGEND_HEIGHT, left_margin=4.0
         )
         autocorrelation_axes = right_column.add_panel(
             "Autocorrelation",
@@ -126,16 +126,16 @@ def draw_pages(analysis: Analysis, _: object) -> Iterator[Page]:
 
 def _write_causes(page: Page, analysis: Analysis) -> None:
     axis = analysis.main.axis
-    reruns_and_statistics: list[tuple[Trial, Statistic]] = []
+    trial_statistic_pairs: list[tuple[Trial, Statistic]] = []
     for filter_name, statistic in product(FILTER_NAMES, DISCREPANCY_STATISTICS):
         trials = find_trials(analysis.trials, filter_name, axis.name, statistic)
-        reruns_and_statistics += [(trial, statistic) for trial in trials]
+        trial_statistic_pairs += [(trial, statistic) for trial in trials]
         cause = find_cause_trial(trials, filter_name, axis.name, statistic)
         if cause and cause.before.difference_rms_m and cause.after.difference_rms_m:
-            reruns_and_statistics.append((cause, "difference"))
+            trial_statistic_pairs.append((cause, "difference"))
     rows = []
-    for trial, statistic in reruns_and_statistics:
-        label, exponent = STATISTIC_LABELS_AND_POWERS[statistic]
+    for trial, statistic in trial_statistic_pairs:
+        label, exponent = STATISTIC_LABELS_AND_EXPONENTS[statistic]
         statistic_values = [
             outcome.value(statistic) or 0.0 for outcome in (trial.before, trial.after)
         ]
@@ -148,9 +148,9 @@ def _write_causes(page: Page, analysis: Analysis) -> None:
     column_heads = ["filter", "change", "quantity", "as flown", "with change", "explains"]
     page.add_table(column_heads, rows, right_aligned_columns=(3, 4))
     page.write_small_text(
-        "Each row is a re-run with one changed setting. 'explains' is the fraction by which the "
-        "change reduces ln(quantity), or for KF - EKF2 the mean square. 'all': the re-run is "
-        "consistent. A change that explains 50 % or more is a cause."
+        "Each row is a re-run with one changed setting. 'explains' is the fraction of ln(mean NIS) "
+        "or ln(mean NEES) that the change removes; for KF - EKF2, of the mean square. 'all': the "
+        "filter becomes consistent. A change that explains 50 % or more is a cause."
     )
 
 
@@ -173,14 +173,16 @@ def _draw_running_nis(axes: Axes, innovations: InnovationsByFilter) -> None:
         innovation_counts = np.arange(1, len(values) + 1)
         running_nis = (values**2).cumsum() / innovation_counts
         draw_curve(axes, running_nis.iloc[2:], **TRACK_STYLES[name], label=name)
-        drawn_counts = np.unique(np.geomspace(3, len(innovation_counts), 60).astype(int))
-        band_low, band_high = np.array([compute_nis_band(int(count)) for count in drawn_counts]).T
-        drawn_times_s = values.index[drawn_counts - 1]
+        band_innovation_counts = np.unique(np.geomspace(3, len(innovation_counts), 60).astype(int))
+        band_low, band_high = np.array(
+            [compute_nis_band(int(count)) for count in band_innovation_counts]
+        ).T
+        drawn_times_s = values.index[band_innovation_counts - 1]
         axes.plot(drawn_times_s, band_low, **_thin_line_style(name))
         axes.plot(drawn_times_s, band_high, **_thin_line_style(name), label=f"95 % band {name}")
-        settled_nis = running_nis.iloc[len(running_nis) // 4 :]
-        min_drawn_nis = min(min_drawn_nis, 0.7 * settled_nis.min())
-        max_drawn_nis = max(max_drawn_nis, 1.4 * settled_nis.max())
+        nis_after_first_quarter = running_nis.iloc[len(running_nis) // 4 :]
+        min_drawn_nis = min(min_drawn_nis, 0.7 * nis_after_first_quarter.min())
+        max_drawn_nis = max(max_drawn_nis, 1.4 * nis_after_first_quarter.max())
     axes.axhline(1.0, color="black", lw=0.5)
     axes.set(yscale="log", ylim=(min_drawn_nis, max_drawn_nis))
     set_plain_ticks(axes)
@@ -190,14 +192,14 @@ def _draw_histogram(axes: Axes, innovations: InnovationsByFilter) -> None:
     innovation_grid = np.linspace(-MAX_DRAWN_SIGMAS, MAX_DRAWN_SIGMAS, 81)
     normal_density = np.exp(-0.5 * innovation_grid**2) / np.sqrt(2.0 * np.pi)
     axes.fill_between(innovation_grid, normal_density, color="#dcdcdc", lw=0, label="normal")
-    density_limit = 0.4
+    max_density = 0.4
     for name, values in innovations.items():
         drawn_values = values.clip(-MAX_DRAWN_SIGMAS, MAX_DRAWN_SIGMAS)
         density, _ = np.histogram(drawn_values, HISTOGRAM_EDGES, density=True)
         axes.stairs(density, HISTOGRAM_EDGES, **TRACK_STYLES[name], label=name)
-        density_limit = max(density_limit, float(density.max()))
+        max_density = max(max_density, float(density.max()))
     axes.set_xlim(-MAX_DRAWN_SIGMAS, MAX_DRAWN_SIGMAS)
-    axes.set_ylim(0.0, min(1.15 * density_limit, MAX_DENSITY_AXIS_LIMIT))
+    axes.set_ylim(0.0, min(1.15 * max_density, MAX_DENSITY_AXIS_LIMIT))
     axes.set_yticks([])
     axes.set_xlabel("ν / √S")
 
@@ -206,11 +208,14 @@ def _draw_autocorrelation(axes: Axes, innovations: InnovationsByFilter) -> None:
     for shift, (name, values) in zip((-0.18, 0.18), innovations.items(), strict=False):
         lag_count = min(MAX_AUTOCORRELATION_LAG, len(values) // 3)
         correlations = compute_autocorrelation(np.asarray(values, np.float64), lag_count)
-        lag_positions = np.arange(1, lag_count + 1) + shift
-        axes.vlines(lag_positions, 0.0, correlations, color=TRACK_STYLES[name]["color"], lw=1.2)
-        fill_colour = KF_COLOUR if name == "KF" else "white"
-        dots = INNOVATION_STYLES[name] | {"ms": 3.0, "mew": 0.6, "mfc": fill_colour}
-        axes.plot(lag_positions, correlations, **dots, label=name)
+        bar_lags = np.arange(1, lag_count + 1) + shift
+        axes.vlines(bar_lags, 0.0, correlations, color=TRACK_STYLES[name]["color"], lw=1.2)
+        marker_style = INNOVATION_STYLES[name] | {
+            "ms": 3.0,
+            "mew": 0.6,
+            "mfc": KF_COLOUR if name == "KF" else "white",
+        }
+        axes.plot(bar_lags, correlations, **marker_style, label=name)
         whiteness_limit = _compute_whiteness_limit(values)
         axes.axhline(-whiteness_limit, **_thin_line_style(name))
         axes.axhline(whiteness_limit, **_thin_line_style(name), label=f"95 % band {name}")
@@ -222,7 +227,7 @@ def _draw_autocorrelation(axes: Axes, innovations: InnovationsByFilter) -> None:
 
 
 def _compute_whiteness_limit(values: pd.Series[float]) -> float:
-    """Return the limit (±) of 95 % of the autocorrelations of white noise."""
+    """Return the limit of |autocorrelation| that white noise exceeds at 5 % of the lags."""
     return float(1.96 / np.sqrt(len(values)))
 
 

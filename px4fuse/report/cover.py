@@ -8,9 +8,9 @@ from px4fuse.card.model import (
     RATIO_AXIS_ENDS,
     RATIO_AXIS_TICKS,
     Action,
-    AidRow,
+    AidConsistency,
     Card,
-    Cause,
+    DiagnosedCause,
     Verdict,
     map_ratio_to_axis,
 )
@@ -28,8 +28,8 @@ from px4fuse.report.card_text import (
     format_spans,
     label_alternatives,
     locate_sigma_ratio,
+    make_rerun_columns,
     note_texts,
-    rerun_columns,
 )
 from px4fuse.report.cover_panels import write_panels
 from px4fuse.report.page import Page, PageBlock, to_typst_data
@@ -46,7 +46,7 @@ TERMS_NOTE = (
     "acceleration as input, no gate. Replay: px4fuse's model of EKF2, run on this log."
 )
 AIDS_TERMS_NOTE = (
-    "√S: standard deviation of an innovation as EKF2 reports it. Source: an aiding sensor."
+    "√S: standard deviation of an innovation as EKF2 reports it. Source: a sensor that aids EKF2."
 )
 COMMAND_LOCATIONS = {"shell": "your computer", "console": "MAVLink Console of QGroundControl"}
 ALL_FINDINGS_TITLE = "All findings"
@@ -63,9 +63,13 @@ def draw_pages(analysis: Analysis | AidsOnlyAnalysis, results: FlightResults) ->
 
 def add_card(page: Page, card: Card) -> PageBlock:
     """Add a summary of faults, causes and actions to a page."""
-    identity, duration_text = card.identity, f"{card.identity.duration_s:.1f} s"
-    flight_texts = identity.firmware, identity.hardware, duration_text, identity.source
-    more_causes_text = f"{card.more_causes} more causes are listed in {ALL_FINDINGS_TITLE}"
+    identity = card.identity
+    flight_texts = (
+        identity.firmware,
+        identity.hardware,
+        f"{identity.duration_s:.1f} s",
+        identity.source,
+    )
     return page.add(
         "cover",
         sign=SEVERITY_SIGNS[card.severity],
@@ -79,7 +83,7 @@ def add_card(page: Page, card: Card) -> PageBlock:
         headline=card.headline,
         effect=card.effect_text,
         do_this=card.do_this,
-        **_make_ratio_axis(card),
+        **_make_sigma_ratio_axis(card),
         facts=list(card.facts.items()),
         reconcile=card.reconcile,
         causes_title="Cause and fix" if len(card.causes) == 1 else "Causes and fixes",
@@ -87,7 +91,9 @@ def add_card(page: Page, card: Card) -> PageBlock:
         causes=[
             _make_cause_fields(number, cause) for number, cause in enumerate(card.causes, start=1)
         ],
-        more_causes=more_causes_text if card.more_causes else "",
+        more_causes=f"{card.more_causes} more causes are listed in {ALL_FINDINGS_TITLE}"
+        if card.more_causes
+        else "",
         difference=card.difference,
         notes=note_texts(card, f"in {ALL_FINDINGS_TITLE}"),
         terms=AIDS_TERMS_NOTE if card.aids else TERMS_NOTE,
@@ -116,17 +122,18 @@ def _shorten_middle(name: str) -> str:
     return f"{name[: half_length - 1]}…{name[-half_length:]}"
 
 
-def _make_ratio_axis(card: Card) -> dict[str, Any]:
+def _make_sigma_ratio_axis(card: Card) -> dict[str, Any]:
     interval_legend = "" if card.aids else " · ├─┤ 95 % interval"
     axis_range_text = " to ".join(RATIO_AXIS_TICKS[end] for end in RATIO_AXIS_ENDS)
     direction_text = f", {card.effect.axis}" if card.effect else ""
-    axis_text = f"RMS of actual error ÷ reported σ{direction_text}"
     return {
         "axis_title": "Is the σ reported by the filters right?",
-        "axis_text": AIDS_CAPTION if card.aids else axis_text,
+        "axis_text": AIDS_CAPTION
+        if card.aids
+        else f"RMS of actual error ÷ reported σ{direction_text}",
         "axis_legend": (
-            f"grey: consistent ({format_consistent_ratios()}){interval_legend} · "
-            f"◀ ▶ ratio outside {axis_range_text}"
+            f"grey: ratio of a consistent filter ({format_consistent_ratios()}){interval_legend} · "
+            f"◀ ▶: ratio outside {axis_range_text}"
         ),
         "ticks": [
             {"fraction": map_ratio_to_axis(tick), "label": label}
@@ -147,23 +154,23 @@ def _make_verdict_row(verdict: Verdict) -> dict[str, Any]:
         "word": verdict_text,
         "quiet": verdict.is_explained,
         "loud": verdict.is_fault,
-        **_make_ratio_fields(verdict.ratio, verdict.against, verdict.interval),
+        **_make_sigma_ratio_fields(verdict.ratio, verdict.against, verdict.interval),
     }
 
 
-def _make_aid_row(row: AidRow) -> dict[str, Any]:
+def _make_aid_row(aid: AidConsistency) -> dict[str, Any]:
     return {
         "filter": "ekf2",
         "label": "",
-        "quantity": f"{row.label} {row.component}".strip(),
-        "word": "not evaluated" if row.ratio is None else "",
-        "quiet": row.is_usual,
+        "quantity": f"{aid.label} {aid.component}".strip(),
+        "word": "not evaluated" if aid.ratio is None else "",
+        "quiet": aid.is_usual,
         "loud": False,
-        **_make_ratio_fields(row.ratio, "source", None),
+        **_make_sigma_ratio_fields(aid.ratio, "source", None),
     }
 
 
-def _make_ratio_fields(
+def _make_sigma_ratio_fields(
     ratio: float | None, reference: Reference, interval: tuple[float, float] | None
 ) -> dict[str, Any]:
     if ratio is None:
@@ -171,20 +178,20 @@ def _make_ratio_fields(
     return {"ratio": format_ratio(ratio), **locate_sigma_ratio(ratio, reference, interval)}
 
 
-def _format_causes_legend(causes: Sequence[Cause]) -> str:
-    command_locations = {
+def _format_causes_legend(causes: Sequence[DiagnosedCause]) -> str:
+    programs_with_commands = {
         action.where for cause in causes for _, action in label_alternatives(cause)
     }
     legend_texts = [
         f"{location}: {text}"
         for location, text in COMMAND_LOCATIONS.items()
-        if location in command_locations
+        if location in programs_with_commands
     ]
     return " · ".join([*legend_texts, "[id]: `px4fuse explain ID` explains the finding"])
 
 
-def _make_cause_fields(number: int, cause: Cause) -> dict[str, Any]:
-    columns = rerun_columns(cause.reruns)
+def _make_cause_fields(number: int, cause: DiagnosedCause) -> dict[str, Any]:
+    columns = make_rerun_columns(cause.reruns)
     head, *rows = zip(*columns, strict=True) if columns else ((),)
     return {
         "number": str(number),

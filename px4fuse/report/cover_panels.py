@@ -47,7 +47,7 @@ MAP_HEIGHT_RANGE = 40.0 * POINTS_PER_MM, 53.0 * POINTS_PER_MM
 # Minimum free height (points) on the first page for plots; otherwise they are on the next page
 MIN_PLOTS_HEIGHT = 38.0 * POINTS_PER_MM
 # Minimum free height (points) on the first page for a plot of the innovations
-MIN_INNOVATIONS_HEIGHT = 50.0 * POINTS_PER_MM
+MIN_HEIGHT_FOR_INNOVATION_PLOT = 50.0 * POINTS_PER_MM
 # Minimum and maximum height (points) of the innovation plot, with title and labels
 INNOVATION_PLOT_HEIGHT_RANGE = 27.0 * POINTS_PER_MM, 38.0 * POINTS_PER_MM
 # Minimum height (points) of each plot of a position error
@@ -59,7 +59,7 @@ TITLE_LINE_HEIGHT = 10.5  # height (points) of each further line of a title
 # Unused height (points) of the page: gap above the legend, and gap below the last plot
 UNUSED_PAGE_HEIGHT = 15.0
 # Minimum height (points) of an innovation plot whose axis has ticks at ±2
-MIN_HEIGHT_FOR_TICKS_AT_2 = 48.0
+MIN_HEIGHT_FOR_TICKS_AT_2_SIGMA = 48.0
 # Minimum width (points) of a plot with six ticks on the time axis
 MIN_WIDE_PLOT_WIDTH = 200.0
 LEFT_MARGIN = 38.0  # width (points) for tick and axis labels left of the axes
@@ -69,8 +69,7 @@ INNOVATION_HEIGHT_FRACTION = 0.22
 MAP_HEIGHT_FRACTION = 0.25
 # Maximum innovation ÷ √S in the innovation plot; larger values are triangles at the edge
 MAX_DRAWN_SIGMAS = 4.0
-# Height (points) below a plot, without and with labels of the time axis
-HEIGHTS_BELOW_AXES = UNLABELLED_HEIGHT, TICKS_HEIGHT + AXIS_LABEL_HEIGHT
+LABELLED_HEIGHT = TICKS_HEIGHT + AXIS_LABEL_HEIGHT  # height (points) of labels below a plot
 # Ratio of the extent of the map to the extent of the tracks
 MAP_MARGIN_FACTOR = 1.08
 # Maximum margin of the map around the positions, as a fraction of their extent
@@ -78,9 +77,9 @@ MAX_MAP_MARGIN_FRACTION = 0.25
 MIN_MAP_EXTENT_M = 0.5
 # If the ratio of largest to smallest σ is below this limit, plot titles state the median of σ,
 # otherwise its range
-MAX_CONSTANT_SIGMA_RATIO = 1.5
+MAX_SIGMA_RATIO_SHOWN_AS_MEDIAN = 1.5
 # Time (s) after the start of a filter that is excluded from σ in plot titles
-SIGMA_SETTLING_S = 2.0
+SIGMA_SETTLING_DURATION_S = 2.0
 Coordinates = tuple[Array, Array]
 
 
@@ -94,7 +93,7 @@ class TimePlot(NamedTuple):
 class FlightMap(NamedTuple):
     """Tracks seen from above: coordinates (m) to the right and upwards.
 
-    ``x_labels`` are possible labels of the horizontal axis, the longest first.
+    ``x_labels`` are labels of the horizontal axis, the longest first; the first that fits is drawn.
     """
 
     tracks: Mapping[str, Coordinates]
@@ -125,8 +124,8 @@ def write_panels(block: PageBlock, analysis: Analysis, card: Card, free_height: 
         np.clip(INNOVATION_HEIGHT_FRACTION * plots_height, *INNOVATION_PLOT_HEIGHT_RANGE)
     )
     length_m, width_m = np.ptp(flight_map.tracks["positions"], axis=1)
-    is_elongated = length_m >= MIN_ELONGATED_TRACK_RATIO * max(width_m, 1e-6)
-    if is_elongated and plots_height >= min_wide_map_height:
+    is_track_elongated = length_m >= MIN_ELONGATED_TRACK_RATIO * max(width_m, 1e-6)
+    if is_track_elongated and plots_height >= min_wide_map_height:
         map_height = float(np.clip(MAP_HEIGHT_FRACTION * plots_height, *MAP_HEIGHT_RANGE))
         _draw_map(page, analysis, flight_map, map_height)
         error_plot_heights = _compute_plot_heights(
@@ -142,12 +141,12 @@ def write_panels(block: PageBlock, analysis: Analysis, card: Card, free_height: 
     columns, map_height = make_two_columns(), plots_height
     if not error_plots:
         error_plots = [innovation_plot]
-    elif plots_height >= MIN_INNOVATIONS_HEIGHT:
+    elif plots_height >= MIN_HEIGHT_FOR_INNOVATION_PLOT:
         map_height -= innovation_plot_height
     _draw_map(columns[0], analysis, flight_map, map_height)
     if map_height < plots_height:
         _draw_plots(columns[0], analysis, [innovation_plot], [innovation_plot_height])
-    label_height = HEIGHTS_BELOW_AXES[True] - HEIGHTS_BELOW_AXES[False]
+    label_height = LABELLED_HEIGHT - UNLABELLED_HEIGHT
     plot_heights = _compute_plot_heights(columns[1], error_plots, plots_height - label_height)
     plot_heights[-1] += label_height
     _draw_plots(columns[1], analysis, error_plots, plot_heights)
@@ -160,7 +159,8 @@ def _draw_plots(
     """Draw plots over time; their heights (points) include titles and labels."""
     for plot, height in zip(plots, plot_heights, strict=True):
         is_last = plot is plots[-1]
-        axes_height = height - _find_title_height(page, plot.title) - HEIGHTS_BELOW_AXES[is_last]
+        height_below_axes = LABELLED_HEIGHT if is_last else UNLABELLED_HEIGHT
+        axes_height = height - _find_title_height(page, plot.title) - height_below_axes
         axes = _add_panel(page, plot.title, axes_height)
         event_marks.draw_event_markers(axes, analysis)
         plot.draw(axes)
@@ -168,7 +168,7 @@ def _draw_plots(
 
 
 def _add_panel(page: Page, title: str, axes_height: float) -> Axes:
-    axes = page.add_panel(title, axes_height, left=LEFT_MARGIN, is_compact=True)
+    axes = page.add_panel(title, axes_height, left_margin=LEFT_MARGIN, is_compact=True)
     axes.locator_params(axis="x", nbins=6 if page.width > MIN_WIDE_PLOT_WIDTH else 4)
     return axes
 
@@ -176,7 +176,7 @@ def _add_panel(page: Page, title: str, axes_height: float) -> Axes:
 def _compute_plot_heights(
     page: Page, plots: Sequence[TimePlot], total_height: float
 ) -> list[float]:
-    """Return heights (points) of plots with equally high axes and titles of one or more lines."""
+    """Return heights (points) of plots whose axes are equally high below titles of any length."""
     title_heights = [_find_title_height(page, plot.title) for plot in plots]
     axes_height = (total_height - sum(title_heights)) / max(len(plots), 1)
     return [axes_height + title_height for title_height in title_heights]
@@ -196,7 +196,7 @@ def _make_error_plots(analysis: Analysis, card: Card) -> list[TimePlot]:
         and errors["error_m"].notna().any()
     }
     if errors_by_filter:
-        half_range_m = 1.1 * max(map(_compute_error_limit_m, errors_by_filter.values()))
+        half_range_m = 1.1 * max(map(_compute_error_axis_limit_m, errors_by_filter.values()))
         rmse_by_filter_m = effect.position_rmse_m if effect else {}
         return [
             _make_error_plot(
@@ -257,7 +257,7 @@ def _make_error_plot(
     return TimePlot(f"{label}: {', '.join(statistic_texts)}", draw)
 
 
-def _compute_error_limit_m(errors: pd.DataFrame) -> float:
+def _compute_error_axis_limit_m(errors: pd.DataFrame) -> float:
     largest_error_m, median_sigma_m = (
         float(errors["error_m"].abs().max()),
         errors["sigma_m"].median(),
@@ -270,10 +270,12 @@ def _compute_error_limit_m(errors: pd.DataFrame) -> float:
 
 
 def _format_sigma(sigma: pd.Series[float]) -> str:
-    settled_sigma = sigma[sigma.index >= min(sigma.index[0] + SIGMA_SETTLING_S, sigma.index[-1])]
-    min_sigma_m, max_sigma_m = float(settled_sigma.min()), float(settled_sigma.max())
-    if max_sigma_m < MAX_CONSTANT_SIGMA_RATIO * min_sigma_m:
-        return format_metres(float(settled_sigma.median()))
+    sigma_after_settling = sigma[
+        sigma.index >= min(sigma.index[0] + SIGMA_SETTLING_DURATION_S, sigma.index[-1])
+    ]
+    min_sigma_m, max_sigma_m = float(sigma_after_settling.min()), float(sigma_after_settling.max())
+    if max_sigma_m < MAX_SIGMA_RATIO_SHOWN_AS_MEDIAN * min_sigma_m:
+        return format_metres(float(sigma_after_settling.median()))
     return f"{format_metres(min_sigma_m)} to {format_metres(max_sigma_m)}"
 
 
@@ -292,7 +294,9 @@ def _make_innovation_plot(result: AxisComparison) -> TimePlot:
     def draw(axes: Axes) -> None:
         axes.set_ylim(-1.12 * MAX_DRAWN_SIGMAS, 1.12 * MAX_DRAWN_SIGMAS)
         height = axes.bbox.height * 72.0 / axes.figure.dpi
-        axes.set_yticks(np.arange(-4.0, 4.1, 2.0 if height >= MIN_HEIGHT_FOR_TICKS_AT_2 else 4.0))
+        axes.set_yticks(
+            np.arange(-4.0, 4.1, 2.0 if height >= MIN_HEIGHT_FOR_TICKS_AT_2_SIGMA else 4.0)
+        )
         axes.axhspan(-2.0, 2.0, color=style.CONSISTENT_BAND_COLOUR, lw=0, zorder=0.05)
         style.draw_zero_line(axes)
         for name in reversed(innovations):
@@ -349,7 +353,7 @@ def _make_flight_map(analysis: Analysis, card: Card) -> FlightMap:
 
 def _draw_map(page: Page, analysis: Analysis, flight_map: FlightMap, height: float) -> None:
     tracks, width = flight_map.tracks, page.width - LEFT_MARGIN - AXES_RIGHT_MARGIN
-    title, axes_height = "Map", height - TITLE_HEIGHT - HEIGHTS_BELOW_AXES[True]
+    title, axes_height = "Map", height - TITLE_HEIGHT - LABELLED_HEIGHT
     limits = _compute_map_limits(tracks, width / axes_height)
     distance_texts = []
     for name, coordinates in tracks.items():
@@ -358,8 +362,8 @@ def _draw_map(page: Page, analysis: Analysis, flight_map: FlightMap, height: flo
         if distance_m > 0.0:
             distance_texts.append(f"{name} {format_metres(distance_m)} m")
     if distance_texts:
-        title = f"Map; largest distance outside the map: {', '.join(distance_texts)}"
-        axes_height = height - _find_title_height(page, title) - HEIGHTS_BELOW_AXES[True]
+        title = f"Map; largest distance of points outside the map: {', '.join(distance_texts)}"
+        axes_height = height - _find_title_height(page, title) - LABELLED_HEIGHT
         limits = _compute_map_limits(tracks, width / axes_height)
     axes = _add_panel(page, title, axes_height)
     x_label = next(
@@ -395,14 +399,14 @@ def _compute_map_limits(
     for axis_index in (0, 1):
         range_ends_m = [np.percentile(tracks["positions"][axis_index], (1.0, 99.0))]
         if "ground truth" in tracks:
-            range_ends_m.append(_compute_range(tracks["ground truth"][axis_index]))
-        range_low_m, range_high_m = _compute_range(range_ends_m)
+            range_ends_m.append(_compute_min_and_max(tracks["ground truth"][axis_index]))
+        range_low_m, range_high_m = _compute_min_and_max(range_ends_m)
         margin_m = MAX_MAP_MARGIN_FRACTION * (range_high_m - range_low_m)
         limits_m = range_low_m - margin_m, range_high_m + margin_m
         range_ends_m += [
-            np.clip(_compute_range(track[axis_index]), *limits_m) for track in tracks.values()
+            np.clip(_compute_min_and_max(track[axis_index]), *limits_m) for track in tracks.values()
         ]
-        range_low_m, range_high_m = _compute_range(range_ends_m)
+        range_low_m, range_high_m = _compute_min_and_max(range_ends_m)
         centres_m.append(0.5 * (range_low_m + range_high_m))
         sizes_m.append(max(MAP_MARGIN_FACTOR * (range_high_m - range_low_m), MIN_MAP_EXTENT_M))
     map_length_m = max(sizes_m[0], sizes_m[1] * aspect_ratio)
@@ -410,5 +414,5 @@ def _compute_map_limits(
     return np.array(centres_m) - half_size_m, np.array(centres_m) + half_size_m
 
 
-def _compute_range(values: ArrayLike) -> Array:
+def _compute_min_and_max(values: ArrayLike) -> Array:
     return np.array([np.nanmin(values), np.nanmax(values)])

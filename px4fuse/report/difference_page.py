@@ -31,20 +31,20 @@ BAR_ROW_HEIGHT = 12.0  # height (points) of a bar with its gap
 LABEL_WIDTH = 140.0  # width (points) of the labels of bars
 LEFT_COLUMN_FRACTION = 0.62  # fraction of the page width for the column with the labels of bars
 TIME_PLOT_HEIGHT = 105.0  # height (points) of the axes of the difference over time
-# Bar style of a setting: KF with this setting of EKF2 differs more from EKF2 than without it
+# Bar style of an EKF2 setting that increases the difference KF - EKF2 when KF uses the setting
 INCREASE_BAR_STYLE: dict[str, Any] = {"color": "white", "hatch": "////"}
 
 
 def draw_pages(analysis: Analysis, _: object) -> Iterator[Page]:
     """Draw the contribution of each EKF2 setting to the mean square difference KF - EKF2."""
-    explanation_by_axis = _select_explanations(analysis)
+    explanation_by_axis = _select_difference_explanations(analysis)
     if not _has_explanation(explanation_by_axis):
         return
     page = Page(
         TITLE,
-        "KF is replayed with its settings and equations replaced by those of EKF2, one at "
-        "a time (px4fuse's model of EKF2). Each bar is the resulting reduction of the mean "
-        "square difference KF - EKF2; a hatched bar is an increase. The bars add up to 100 %.",
+        "px4fuse replays KF and replaces its settings and equations by those of EKF2, one after "
+        "another. Each bar is the reduction of the mean square difference KF - EKF2 by one "
+        "replacement; a hatched bar is an increase. The bars add up to 100 %.",
     )
     for name, explanation in explanation_by_axis.items():
         if isinstance(explanation, DifferenceExplanation):
@@ -52,12 +52,17 @@ def draw_pages(analysis: Analysis, _: object) -> Iterator[Page]:
     replay = analysis.ekf2_replay
     assert isinstance(replay, Ekf2Replay)
     assert replay.agreement is not None
-    page.write_small_text(f"EKF2 replay: {format_agreement(replay.agreement)}.")
+    page.write_small_text(f"EKF2 replay: {format_replay_agreement(replay.agreement)}.")
     yield page
 
 
-def _select_explanations(analysis: Analysis) -> Mapping[str, DifferenceExplanation | Unavailable]:
-    """Return explanations of the difference KF - EKF2, only of the aisle axis if available."""
+def _select_difference_explanations(
+    analysis: Analysis,
+) -> Mapping[str, DifferenceExplanation | Unavailable]:
+    """Return explanations of the difference KF - EKF2 by axis.
+
+    If the aisle axis is analysed, only its explanation is returned.
+    """
     explanation_by_axis = analysis.difference_steps
     return (
         {AISLE: explanation_by_axis[AISLE]} if AISLE in explanation_by_axis else explanation_by_axis
@@ -83,7 +88,7 @@ def write_explanation(page: Page, explanation: DifferenceExplanation | Unavailab
 
 def describe_missing_explanation(analysis: Analysis) -> str:
     """Return the reason why the difference KF - EKF2 is not explained; "" if it is explained."""
-    explanation_by_axis = _select_explanations(analysis)
+    explanation_by_axis = _select_difference_explanations(analysis)
     if isinstance(analysis.flight.ekf2, Unavailable) or _has_explanation(explanation_by_axis):
         return ""
     reasons = {
@@ -98,7 +103,7 @@ def describe_missing_explanation(analysis: Analysis) -> str:
     )
 
 
-def format_agreement(agreement: Agreement) -> str:
+def format_replay_agreement(agreement: Agreement) -> str:
     correlation_text = ", ".join(
         f"{axis.innovation_correlation:.4f} ({name})" for name, axis in agreement.axes.items()
     )
@@ -107,11 +112,11 @@ def format_agreement(agreement: Agreement) -> str:
         for axis in agreement.axes.values()
     )
     sentences = [
-        f"{'agrees' if agreement.good else 'does not agree'} with the log ({agreement.reason}). "
-        f"Correlation of {agreement.samples} replayed with logged innovations {correlation_text}; "
-        f"innovation variance S, replay ÷ log {ratio_text}; rejected "
-        f"{agreement.rejected_fraction_replayed:.1%} "
-        f"(log {agreement.rejected_fraction_logged:.1%})",
+        f"{'agrees' if agreement.good else 'does not agree'} with the log ({agreement.reason})",
+        f"Correlation of {agreement.samples} replayed with logged innovations: {correlation_text}",
+        f"Replayed ÷ logged innovation variance S: {ratio_text}",
+        f"Rejected samples: {agreement.rejected_fraction_replayed:.1%} in the replay, "
+        f"{agreement.rejected_fraction_logged:.1%} in the log",
         *(
             f"The replay of {AIDS[name].label} does not agree with the log and is not used: "
             f"{reason}"
@@ -134,17 +139,17 @@ def _draw_axis_explanation(
         ("position", "m", "m2", explanation.unexplained_mean_square_m2),
         ("velocity", "m/s", "m2_s2", explanation.unexplained_velocity_mean_square_m2_s2),
     )
-    for column, left_edge, (quantity, unit, squared_unit, unexplained) in zip(
+    for column, left_margin, (quantity, unit, squared_unit, unexplained) in zip(
         columns, (LABEL_WIDTH, 4.0), quantities, strict=True
     ):
-        mean_square_field = f"{quantity}_mean_square_{squared_unit}"
-        total_mean_square = getattr(explanation, mean_square_field)
+        mean_square_field_name = f"{quantity}_mean_square_{squared_unit}"
+        total_mean_square = getattr(explanation, mean_square_field_name)
         mean_square_reductions = np.array(
-            [getattr(step, mean_square_field) for step in explanation.steps]
+            [getattr(step, mean_square_field_name) for step in explanation.steps]
         )
         title = f"{quantity} difference, {np.sqrt(total_mean_square):.3f} {unit} RMS"
         height = BAR_ROW_HEIGHT * (len(setting_names) + 2)
-        axes = column.add_panel(title, height, left=left_edge)
+        axes = column.add_panel(title, height, left_margin=left_margin)
         contributions_percent = (
             100.0 * mean_square_reductions / total_mean_square,
             100.0 * unexplained / total_mean_square,
@@ -155,7 +160,7 @@ def _draw_axis_explanation(
     axes = event_marks.add_panel(
         page,
         analysis,
-        "Position difference KF - EKF2 (m, dark) and unexplained difference (light)",
+        "Position difference KF - EKF2 (m): total (dark) and unexplained part (light)",
         TIME_PLOT_HEIGHT,
         caption=_describe_largest_difference(explanation),
         axis=name,
@@ -200,6 +205,6 @@ def _describe_largest_difference(explanation: DifferenceExplanation) -> str:
     row = int(np.argmax(differences_m))
     return (
         f"Largest difference KF - EKF2: {differences_m[row]:.2g} m at "
-        f"{explanation.times_s[row]:.1f} s; RMS of the unexplained part "
+        f"{explanation.times_s[row]:.1f} s; RMS of the part that no setting explains: "
         f"{np.sqrt(np.mean(explanation.unexplained_m**2)):.2g} m."
     )

@@ -22,7 +22,7 @@ MAP_AXIS_INDICES = {"NED": (1, 0), "FRD": (1, 0), "camera": (0, 2)}
 MIN_GAP_INTERVAL_RATIO = 10.0
 MAX_PATH_POINTS = 1200  # maximum number of drawn points of a path
 MIN_ERROR_RANGE_M = 1e-3  # minimum range (m) of an error axis, so that rounding errors look small
-PANEL_HEIGHT = 76.0  # height (points) of the axes of APE and RPE
+ERROR_PLOT_HEIGHT = 76.0  # height (points) of the axes of APE and RPE
 MAP_HEIGHT = 128.0  # height (points) of the axes of a map
 LABEL_MARGIN = 34.0  # width (points) of the labels of the vertical axis of a map
 COLOUR_BAR_MARGIN = 40.0  # width (points) of the colour bar with its labels
@@ -55,7 +55,7 @@ def _draw_maps(page: Page, evaluation: Evaluation) -> None:
     left_column, right_column = make_two_columns()
     unaligned_legend_handles: dict[str, Artist] = {}
     if is_aligned:
-        axes = left_column.add_panel("Before alignment", MAP_HEIGHT, left=LABEL_MARGIN)
+        axes = left_column.add_panel("Before alignment", MAP_HEIGHT, left_margin=LABEL_MARGIN)
         for position_m, line_style, label in (
             (evaluation.reference_m, REFERENCE_LINE_STYLE, "reference"),
             (evaluation.unaligned_m, {"color": KF_COLOUR, "lw": 1.2}, "estimate"),
@@ -66,11 +66,13 @@ def _draw_maps(page: Page, evaluation: Evaluation) -> None:
         unaligned_legend_handles = _get_legend_handles(axes)
         left_column.write_small_text(describe_unaligned_rmse(evaluation))
     title = f"{'Aligned path' if is_aligned else 'Path'} coloured by error"
-    axes = right_column.add_panel(title, MAP_HEIGHT, left=LABEL_MARGIN, right=COLOUR_BAR_MARGIN)
+    axes = right_column.add_panel(
+        title, MAP_HEIGHT, left_margin=LABEL_MARGIN, right_margin=COLOUR_BAR_MARGIN
+    )
     _draw_path(axes, evaluation, axis_indices)
     style.set_map_axes(axes, *names)
     right_column.write_small_text("Darker poses have a larger error; × marks the largest one.")
-    # one legend for both maps lists the reference once
+    # one legend for both maps, so that the reference has one entry
     page.add_legend([*(_get_legend_handles(axes) | unaligned_legend_handles).values()])
     page.add_columns(*[left_column] * is_aligned, right_column)
 
@@ -105,18 +107,18 @@ def _draw_path(axes: Axes, evaluation: Evaluation, axis_indices: list[int]) -> N
 
 def _draw_ape_and_rpe(page: Page, evaluation: Evaluation) -> None:
     left_column, right_column = make_two_columns()
-    axes = left_column.add_panel("APE over time (m)", PANEL_HEIGHT)
+    axes = left_column.add_panel("APE over time (m)", ERROR_PLOT_HEIGHT)
     time_origin_s = compute_time_origin_s(evaluation)
     label = "time from the first pose (s)" if time_origin_s else "time (s)"
     draw_ape(axes, evaluation, evaluation.time_s - time_origin_s, label)
     page.add_legend(axes.get_legend_handles_labels()[0])
-    axes = right_column.add_panel("APE over distance (m)", PANEL_HEIGHT)
+    axes = right_column.add_panel("APE over distance (m)", ERROR_PLOT_HEIGHT)
     draw_ape(axes, evaluation, evaluation.distance_m, "distance along the reference (m)")
     page.add_columns(left_column, right_column)
     if _collect_rpe_statistics(evaluation):
         left_column, right_column = make_two_columns()
         _draw_rpe(
-            left_column.add_panel("RPE (m) of pose pairs at distance delta", PANEL_HEIGHT),
+            left_column.add_panel("RPE (m) of pose pairs at distance delta", ERROR_PLOT_HEIGHT),
             evaluation,
         )
         right_column.write(describe_rpe_growth(evaluation.rpe), colour=MUTED_COLOUR, gap_above=24.0)
@@ -150,7 +152,7 @@ def _draw_rpe(axes: Axes, evaluation: Evaluation) -> None:
     axes.set_xticks(range(len(delta_texts)), delta_texts)
     axes.set_ylim(0.0, max(1.05 * axes.get_ylim()[1], MIN_ERROR_RANGE_M))
     axes.margins(x=0.1)
-    axes.set_xlabel("delta: distance, time or frames between the poses of a pair")
+    axes.set_xlabel("delta: distance, time or frames between two compared poses")
 
 
 def _collect_rpe_statistics(evaluation: Evaluation) -> list[tuple[RelativeError, Statistics]]:
@@ -238,10 +240,9 @@ def describe_unaligned_rmse(evaluation: Evaluation) -> str:
     centre_m = estimate_m.mean(axis=0)
     shift_m = float(np.linalg.norm(alignment.apply(centre_m) - centre_m))
     return (
-        f"RMSE before alignment {format_metres(rmse_m)} m. Alignment: rotation "
-        f"{np.degrees(alignment.to_rotation().magnitude()):.1f}°, translation "
-        f"{format_metres(shift_m)} m"
-        f"{scale_text} (difference of the frames, not an error)."
+        f"RMSE before alignment {format_metres(rmse_m)} m. The alignment corrects the frame, not "
+        f"errors: rotation {np.degrees(alignment.to_rotation().magnitude()):.1f}°, translation "
+        f"{format_metres(shift_m)} m{scale_text}."
     )
 
 
@@ -258,16 +259,17 @@ def describe_rpe_growth(rpe: tuple[RelativeError, ...]) -> str:
     unit = max(units, key=units.count, default="")
     deltas = sorted(delta for delta_unit, delta in rmse_by_unit_and_delta if delta_unit == unit)
     if len(deltas) < 2:
-        return f"{interval_note} Give a second distance (--rpe) to distinguish noise from drift."
+        return f"{interval_note} Add a distance (--rpe): drift grows with distance, noise does not."
     smallest_delta, *_, largest_delta = deltas
     delta_ratio = largest_delta / smallest_delta
-    rmse_ratio = (
+    rmse_growth_factor = (
         rmse_by_unit_and_delta[unit, largest_delta] / rmse_by_unit_and_delta[unit, smallest_delta]
     )
     return (
-        f"{interval_note} From {smallest_delta:g} to {largest_delta:g} {unit} the RMSE grows "
-        f"{rmse_ratio:.2g} times. Expected: 1 for independent noise, {np.sqrt(delta_ratio):.2g} "
-        f"for a random walk, {delta_ratio:.3g} for a scale or heading error."
+        f"{interval_note} From {smallest_delta:g} to {largest_delta:g} {unit}, the RMSE grows "
+        f"{rmse_growth_factor:.2g} times. Expected factor: 1 for independent noise, "
+        f"{np.sqrt(delta_ratio):.2g} for a random walk, {delta_ratio:.3g} for a scale or heading "
+        "error."
     )
 
 

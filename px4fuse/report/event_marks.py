@@ -28,7 +28,7 @@ TAKE_OFF_MARKER_STYLE, LANDING_MARKER_STYLE = (
     dot_style("black", "*", 6.0),
     dot_style("black", "P", 5.0),
 )
-# Minimum time between two drawn event markers, as a fraction of the analysed time span
+# At most one marker is drawn for events within this fraction of the analysed time span
 MIN_MARKER_INTERVAL_FRACTION = 1.0 / 300.0
 
 
@@ -39,7 +39,7 @@ class EventMarkers(NamedTuple):
     """
 
     label: str
-    spans_or_times: Sequence[Any] | Array
+    event_times_or_spans_s: Sequence[Any] | Array
     style: dict[str, Any]
     height: float | None = None
 
@@ -74,19 +74,19 @@ def draw_event_markers(axes: Axes, analysis: Analysis, *, axis: str | None = Non
     event_markers = _make_event_markers(
         analysis, analysis.events.rejection_times_s.get(axis_name, ())
     )
-    for order, (_, spans_or_times, style, height) in enumerate(event_markers, start=1):
-        if not len(spans_or_times):
+    for order, (_, event_times_or_spans_s, style, height) in enumerate(event_markers, start=1):
+        if not len(event_times_or_spans_s):
             continue
         if height is None:
             corners = [
                 [(start_s, 0.0), (start_s, 1.0), (end_s, 1.0), (end_s, 0.0)]
-                for start_s, end_s in spans_or_times
+                for start_s, end_s in event_times_or_spans_s
             ]
             bands = PolyCollection(corners, transform=x_transform, zorder=0.1 * order, **style)
             axes.add_collection(bands, autolim=False)
         else:
             min_interval_s = MIN_MARKER_INTERVAL_FRACTION * (segment.end_s - segment.start_s)
-            times_s = select_marker_times(spans_or_times, min_interval_s)
+            times_s = select_marker_times(event_times_or_spans_s, min_interval_s)
             markers = Line2D(
                 times_s,
                 np.full(len(times_s), height),
@@ -133,8 +133,10 @@ def make_legend_entries(analysis: Analysis) -> list[Artist]:
     ]
     return [
         Patch(**style, label=label) if height is None else Line2D([], [], **style, label=label)
-        for label, spans_or_times, style, height in _make_event_markers(analysis, rejection_times_s)
-        if len(spans_or_times)
+        for label, event_times_or_spans_s, style, height in _make_event_markers(
+            analysis, rejection_times_s
+        )
+        if len(event_times_or_spans_s)
     ]
 
 

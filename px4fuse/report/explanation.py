@@ -50,12 +50,14 @@ def make_finding_page(finding_id: str) -> Page:
         "The rates of false alarms and of detection have not been measured for this finding."
     ]
     if example.clean_flights:
-        rate_texts = [f"{name}: {100.0 * rate:.0f} %" for name, rate in example.detection.items()]
+        detection_rate_texts = [
+            f"{name}: {100.0 * rate:.0f} %" for name, rate in example.detection.items()
+        ]
         rate_sentences = [
             f"False alarms occurred on {example.false_alarms} of {example.clean_flights} simulated "
             "flights without an injected fault.",
-            "Fraction of simulated flights on which the injected fault is detected: "
-            f"{'; '.join(rate_texts)}.",
+            "Detected fraction of the simulated flights with the injected fault: "
+            f"{'; '.join(detection_rate_texts)}.",
         ]
     page.write_labelled("Rates", *rate_sentences)
     return page

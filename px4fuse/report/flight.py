@@ -18,7 +18,7 @@ from px4fuse.report.style import EKF2_COLOUR, KF_COLOUR, Axes
 
 ZOOM_UPDATE_COUNT = 15  # number of updates in the enlarged plot of σ_p
 MIN_ZOOM_S = 1.0  # minimum duration (s) of the enlarged plot of σ_p
-ZOOM_HEIGHT = 125.0  # height (points) of the axes of the enlarged plot of σ_p
+ENLARGED_PLOT_HEIGHT = 125.0  # height (points) of the axes of the enlarged plot of σ_p
 
 
 def draw_pages(analysis: Analysis, _: object) -> Iterator[Page]:
@@ -41,20 +41,21 @@ def draw_innovations(analysis: Analysis, _: object) -> Iterator[Page]:
         panels.POSITION_SIGMA_PANEL,
         panels.VELOCITY_SIGMA_PANEL,
     ):
-        is_last = panel is panels.VELOCITY_SIGMA_PANEL
-        panel.draw_on_page(page, analysis, result, with_time_label=is_last)
-    _draw_zoom(page, analysis)
+        panel.draw_on_page(
+            page, analysis, result, with_time_label=panel is panels.VELOCITY_SIGMA_PANEL
+        )
+    _draw_enlarged_sigma_plot(page, analysis)
     for note in list_verdict_warnings(analysis):
         page.write_small_text(note)
     yield page
 
 
-def _draw_zoom(page: Page, analysis: Analysis) -> None:
+def _draw_enlarged_sigma_plot(page: Page, analysis: Analysis) -> None:
     """Draw the growth of σ_p by predictions and its reduction by updates over a few seconds."""
     result = analysis.main
     start_s, end_s = zoom_span_s = find_zoom_span(result, analysis.segment)
     title = f"σ of position (m), {end_s - start_s:.1f} s of the flight"
-    axes = page.add_panel(title, ZOOM_HEIGHT, caption=describe_sigma_at_updates(result))
+    axes = page.add_panel(title, ENLARGED_PLOT_HEIGHT, caption=describe_sigma_at_updates(result))
     _draw_sigma_at_updates(axes, result, zoom_span_s)
     update_times_s = result.replay.updates.loc[start_s:end_s].index
     axes.vlines(
@@ -125,13 +126,13 @@ def describe_sigma_at_updates(result: AxisComparison) -> str:
                 )
             continue
         sigma_text = (
-            f"{name}: σ from {prior_sigma_m:.3f} to {posterior_sigma_m:.3f} m by an update, "
-            f"{1.0 - posterior_sigma_m**2 / prior_sigma_m**2:.0%} less variance"
+            f"{name}: an update reduces σ from {prior_sigma_m:.3f} to {posterior_sigma_m:.3f} m "
+            f"(variance by {1.0 - posterior_sigma_m**2 / prior_sigma_m**2:.0%})"
         )
         if name == "KF":
             sigma_text = (
                 f"σ grows in each prediction (SIGMA_A {result.replay.settings.sigma_a_m_s2:g} "
-                f"m/s²) and decreases with each measurement ({sigma_text})"
+                f"m/s²) and decreases with each measurement; {sigma_text}"
             )
         filter_texts.append(sigma_text)
     return f"{'; '.join(filter_texts)}." if filter_texts else ""

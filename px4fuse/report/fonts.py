@@ -11,7 +11,7 @@ from matplotlib.font_manager import FontEntry, FontPath
 
 from px4fuse.report.style import FONT
 
-# Words in the names of fonts that draw a box for every character
+# Words in the names of placeholder fonts, which draw each character as a box
 PLACEHOLDER_FONT_WORDS = ("lastresort", "last resort", "blank", "notdef")
 MISSING_GLYPH_SYMBOL = "\N{WHITE SQUARE}"
 MAX_LISTED_CHARACTERS = 12
@@ -34,7 +34,9 @@ def find_font(character: str) -> str | None:
 
 def find_font_names(text: str) -> list[str]:
     """Return the names of the fonts for a text, DejaVu Sans first."""
-    return list(dict.fromkeys([FONT, *filter(None, map(find_font, _find_non_ascii(text)))]))
+    return list(
+        dict.fromkeys([FONT, *filter(None, map(find_font, _find_non_ascii_characters(text)))])
+    )
 
 
 def find_font_folders(names: tuple[str, ...]) -> list[str]:
@@ -49,7 +51,9 @@ def find_font_folders(names: tuple[str, ...]) -> list[str]:
 
 def find_missing_characters(text: str) -> str:
     """Return each character of a text for which no font is installed."""
-    return "".join(character for character in _find_non_ascii(text) if find_font(character) is None)
+    return "".join(
+        character for character in _find_non_ascii_characters(text) if find_font(character) is None
+    )
 
 
 def format_font_advice(characters: str) -> str:
@@ -63,7 +67,7 @@ def format_font_advice(characters: str) -> str:
     )
 
 
-def _find_non_ascii(text: str) -> list[str]:
+def _find_non_ascii_characters(text: str) -> list[str]:
     return [c for c in dict.fromkeys(text) if not c.isascii() and c.isprintable()]
 
 
@@ -90,17 +94,15 @@ def _list_fonts_except_dejavu() -> tuple[tuple[str, FontPath], ...]:
 
 
 def _font_sort_key(entry: FontEntry) -> tuple[object, ...]:
-    """Return the sort key: Noto Sans first, then sans serif, then regular weight; PostScript last.
+    """Return a key that sorts Noto Sans first, then sans serif, then fonts of regular weight.
 
-    PostScript outlines are embedded as TrueType, which some PDF viewers do not display.
+    PostScript fonts are last: they are embedded as TrueType, which some PDF viewers do not display.
     """
     weight = entry.weight if isinstance(entry.weight, int) else 400
-    is_postscript = str(entry.fname).lower().endswith(".otf")
-    is_noto, is_sans = entry.name.startswith("Noto Sans"), "Sans" in entry.name
     return (
-        is_postscript,
-        not is_noto,
-        not is_sans,
+        str(entry.fname).lower().endswith(".otf"),
+        not entry.name.startswith("Noto Sans"),
+        "Sans" not in entry.name,
         abs(weight - 400),
         entry.name,
         str(entry.fname),

@@ -22,19 +22,19 @@ def make_log_page(inventory: Inventory, request: ComparisonRequest) -> Page:
     if inventory.flight.log.senders:
         page.add_table(
             ("sender", "type", "messages", "lost"),
-            _make_sender_rows(inventory),
+            _make_mavlink_sender_rows(inventory),
             right_aligned_columns=(2, 3),
         )
     page.add_table(
         SOURCES_HEAD, list(_make_source_rows(inventory)), right_aligned_columns=(2, 3, 4, 5)
     )
-    cell_by_possibility = {True: ("yes", GOOD_COLOUR), False: ("no", SEVERITY_COLOURS["warning"])}
+    cell_by_is_possible = {True: ("yes", GOOD_COLOUR), False: ("no", SEVERITY_COLOURS["warning"])}
     rows = [
-        (cell_by_possibility[option.possible], option.name, option.reason)
+        (cell_by_is_possible[option.possible], option.name, option.reason)
         for option in inventory.abilities
     ]
     page.add_table(("possible", "analysis", ""), rows)
-    if inventory.abilities[0].possible:  # comparison of KF and EKF2
+    if inventory.abilities[0].possible:  # the first analysis is the comparison of KF and EKF2
         command = command_line(request, "compare", for_shell=True)
         page.add("command", text=command, label="Run")
     texts_by_label = {
@@ -71,9 +71,8 @@ def _describe_log(inventory: Inventory) -> list[tuple[str, str]]:
     if log.dropouts:
         dropout_total_s = sum(dropout.duration_s for dropout in log.dropouts)
         longest_dropout_s = max(dropout.duration_s for dropout in log.dropouts)
-        dropout_count = len(log.dropouts)
         dropouts_text = (
-            f"{dropout_count} logger dropouts of {dropout_total_s:.2f} s in total, at most "
+            f"{len(log.dropouts)} logger dropouts of {dropout_total_s:.2f} s in total, at most "
             f"{longest_dropout_s:.2f} s"
         )
         labelled_texts.append(("Dropouts", dropouts_text))
@@ -107,7 +106,7 @@ def _format_airborne_spans(inventory: Inventory) -> str:
     return join_first(span_texts, 3)
 
 
-def _make_sender_rows(inventory: Inventory) -> list[tuple[str, ...]]:
+def _make_mavlink_sender_rows(inventory: Inventory) -> list[tuple[str, ...]]:
     return [
         (
             f"{sender.system}/{sender.component}",
@@ -159,12 +158,12 @@ def _format_time_span(source: LoggedData) -> str:
 
 
 def _format_clock_lines(inventory: Inventory) -> list[str]:
-    names_by_clock: dict[str, dict[str, None]] = {}
+    source_names_by_clock: dict[str, dict[str, None]] = {}
     for source in inventory.sources:
         if source.clock:
             name = source.name if source.part == "position" else source.part
-            names_by_clock.setdefault(source.clock, {})[name] = None
-    lines = [
-        f"{clock}: {', '.join(names_on_clock)}" for clock, names_on_clock in names_by_clock.items()
+            source_names_by_clock.setdefault(source.clock, {})[name] = None
+    return [
+        *(f"{clock}: {', '.join(names)}" for clock, names in source_names_by_clock.items()),
+        *map(format_clock_map, inventory.flight.clocks),
     ]
-    return lines + [format_clock_map(clock) for clock in inventory.flight.clocks]

@@ -31,9 +31,9 @@ from px4fuse.trajectory.model import AXES_OF_FRAME, format_vector
 from px4fuse.trajectory.scores import RmseInterval, Statistics
 
 LEAD_TEXT = (
-    "The closure error is the distance between the end of the odometry and the true end. Each "
-    "correction distributes it along the path: by distance, or by pose graph optimisation. Each "
-    "closure is tested first, because a false closure would deform the whole path."
+    "The closure error is the distance between the end of the odometry and the true end. It is "
+    "distributed along the path by distance, or by pose graph optimisation. px4fuse first tests "
+    "each closure, because a false closure would deform the whole path."
 )
 MAX_LISTED_CLOSURES = 10
 ERROR_COLOUR = SEVERITY_COLOURS["error"]
@@ -77,14 +77,14 @@ def draw_report(loop: Loop, results: LoopResults) -> Iterator[Page]:
 
 def _write_page(page: Page, loop: Loop) -> None:
     write_loop(page, loop)
-    axes = page.add_panel("Map in the frame of the odometry", MAP_HEIGHT, left=36.0)
+    axes = page.add_panel("Map in the frame of the odometry", MAP_HEIGHT, left_margin=36.0)
     draw_map(axes, loop)
     page.add_legend(axes.get_legend_handles_labels()[0])
     page.write_heading("Loop closures and RPE")
     page.write_small_text(
-        "d²: squared Mahalanobis distance of the closure error, from drift and closure "
-        "noise. p: probability of a larger d² for a true closure. GNC weight: "
-        "1 if the closure is used, 0 if it is excluded."
+        "d²: squared Mahalanobis distance of the closure error, given drift and closure noise. p: "
+        "probability that a true closure has a larger d². Weight of GNC (graduated non-convexity): "
+        "1 for a used closure, 0 for an excluded closure."
     )
     write_closures_and_rpe(page, loop)
 
@@ -97,14 +97,14 @@ def draw_map(axes: Axes, loop: Loop) -> None:
     for corrected_path in loop.select_reported_paths():
         track, name = corrected_path.trajectory, corrected_path.name
         if name in PATH_STYLES:
-            horizontal_m = track.position_m[:, (1, 0)]
-            plot_path(axes, horizontal_m, track.time_s, label=name, **PATH_STYLES[name])
+            map_xy_m = track.position_m[:, (1, 0)]
+            plot_path(axes, map_xy_m, track.time_s, label=name, **PATH_STYLES[name])
     start, end = odometry_path.position_m[[0, -1]][:, (1, 0)]
     axes.plot(*start, "o", color="black", ms=5, label="start", zorder=5)
-    end_label = "end of odometry"
+    end_label = "end of the odometry path"
     axes.plot(*end, "s", color=EKF2_COLOUR, mec="black", mew=0.6, ms=5, label=end_label, zorder=5)
     if loop.closure_error_axes_m is not None:
-        true_end = end - np.array(list(loop.closure_error_axes_m.values()))[[1, 0]]
+        true_end_xy_m = end - np.array(list(loop.closure_error_axes_m.values()))[[1, 0]]
         arrow_style = {
             "arrowstyle": "->",
             "color": ERROR_COLOUR,
@@ -112,10 +112,12 @@ def draw_map(axes: Axes, loop: Loop) -> None:
             "shrinkA": 3,
             "shrinkB": 0,
         }
-        axes.annotate("", xy=true_end, xytext=end, zorder=6, arrowprops=arrow_style)
+        axes.annotate("", xy=true_end_xy_m, xytext=end, zorder=6, arrowprops=arrow_style)
         label = f"closure error {loop.closure_error_m:.2f} m"
         axes.plot([], [], color=ERROR_COLOUR, lw=1.2, label=label)
-        axes.plot(*true_end, "x", color=ERROR_COLOUR, ms=5, mew=1.2, zorder=6, label="true end")
+        axes.plot(
+            *true_end_xy_m, "x", color=ERROR_COLOUR, ms=5, mew=1.2, zorder=6, label="true end"
+        )
     set_map_axes(axes, axis_names[1], axis_names[0])
 
 
@@ -197,7 +199,15 @@ def write_closures_and_rpe(page: Page, loop: Loop) -> None:
         colour = "black" if closure.accepted else ERROR_COLOUR
         rows.append([(cell, colour) for cell in cells])
     if rows:
-        head = ["closure", "distance\n(m)", "d²", "degrees of\nfreedom", "p", "gate", "GNC\nweight"]
+        head = [
+            "closure",
+            "distance\n(m)",
+            "d²",
+            "d² degrees\nof freedom",
+            "p",
+            "gate",
+            "GNC\nweight",
+        ]
         page.add_table(head, rows, right_aligned_columns=(1, 2, 3, 4, 6))
     for reference in loop.references:
         page.write_heading(f"RPE against {reference.name}")
@@ -219,8 +229,8 @@ def write_closures_and_rpe(page: Page, loop: Loop) -> None:
             for name, evaluation in evaluations.items()
         ]
         for evaluation in [*evaluations.values()][:1]:
-            delta_headings = [f"{error.delta_text} (m)" for error in evaluation.rpe]
-            page.add_table(["path", *delta_headings, "rotation (°)"], rows)
+            rpe_column_titles = [f"{error.delta_text} (m)" for error in evaluation.rpe]
+            page.add_table(["path", *rpe_column_titles, "rotation (°)"], rows)
             for text in (describe_method(evaluation), *evaluation.notes, *evaluation.warnings):
                 page.write_small_text(capitalise_first(text))
 
@@ -236,11 +246,10 @@ def describe_closure_error(loop: Loop) -> str:
     length_m = loop.path_length_m
     if error_m is None or error_components_m is None:
         if loop.is_assessed:
-            return (
-                f"error hidden, because the flight is an assignment; path length {length_m:.1f} m"
-            )
+            return f"error hidden in an assignment; path length {length_m:.1f} m"
         return (
-            f"not computed, because --open states that the path ({length_m:.1f} m) has an open end"
+            f"no closure error: --open states that the path ({length_m:.1f} m) does not return to "
+            "its start"
         )
     error_text = (
         f"{error_m:.2f} m after {length_m:.1f} m ({error_m / length_m:.2%}): "
@@ -248,17 +257,17 @@ def describe_closure_error(loop: Loop) -> str:
     )
     heading_error_deg = loop.heading_error_deg
     if isinstance(heading_error_deg, Unavailable):
-        return f"{error_text}; the heading error is unknown: {heading_error_deg.reason}"
+        return f"{error_text}; heading error unknown: {heading_error_deg.reason}"
     return f"{error_text}; heading error {heading_error_deg:+.1f}°"
 
 
 def describe_gate(closure: Closure) -> str:
     gate_decision = (
-        "accepted" if closure.accepted else "REJECTED, the closure error is too large for the drift"
+        "accepted" if closure.accepted else "REJECTED: the drift is too small for this error"
     )
     return (
-        f"d² {closure.d2:.1f} with {closure.degrees_of_freedom} degrees of freedom, "
-        f"p {closure.p:.2g} (rejected below {GATE_ALPHA:g}): {gate_decision}"
+        f"{gate_decision}. d² {closure.d2:.1f} with {closure.degrees_of_freedom} degrees of "
+        f"freedom, p {closure.p:.2g} (minimum {GATE_ALPHA:g})"
     )
 
 
@@ -279,10 +288,12 @@ def explain_distance_correction(loop: Loop) -> str:
         "The correction with headings also distributes the heading error along the path."
     )
     if isinstance(heading_error_deg, Unavailable):
-        heading_sentence = f"The headings are not corrected: {heading_error_deg.reason}."
+        heading_sentence = (
+            f"The headings of the path are not corrected: {heading_error_deg.reason}."
+        )
     return (
-        "The correction by distance shifts each position by a part of the closure error that is "
-        "proportional to its distance from the start (lesson UAT 366, module 2, Example 2). "
+        "The correction by distance shifts each position in proportion to its distance from the "
+        "start, and the end by the closure error (lesson UAT 366, module 2, Example 2). "
         f"{heading_sentence}"
     )
 
@@ -313,24 +324,27 @@ def make_pose_graph_page(solved_graph: Graph) -> Page:
         f"{solved_graph.name}: {solved_graph.dimension}-D, {solved_graph.poses} poses, "
         f"{solved_graph.edges} edges; initial poses: {solved_graph.initialised}",
     )
-    expected_low, expected_high = solved_graph.reduced_chi2_interval
-    if expected_high > 0.0:
+    expected_chi2_low, expected_chi2_high = solved_graph.reduced_chi2_interval
+    if expected_chi2_high > 0.0:
         fit_text = (
-            f"χ² per degree of freedom {format_number(solved_graph.reduced_chi2)} (95 % "
-            f"{format_number(expected_low)} to {format_number(expected_high)} expected)"
+            f"χ² per degree of freedom {format_number(solved_graph.reduced_chi2)} (expected "
+            f"{format_number(expected_chi2_low)} to {format_number(expected_chi2_high)}, 95 %)."
         )
         if (factor := solved_graph.information_factor) > 1.0:
             fit_text += (
-                ". Probable cause: all information matrices are about "
-                f"{format_number(factor, 2)} times too large. Gate and robust optimisation use "
-                "the information divided by this factor."
+                " Probable cause: all information matrices are about "
+                f"{format_number(factor, 2)} times too large. Gate and robust optimisation "
+                "therefore divide the information matrices by this factor."
             )
-        elif solved_graph.reduced_chi2 > expected_high:
+        elif solved_graph.reduced_chi2 > expected_chi2_high:
             fit_text += (
-                ": too large. Possible causes: false closures, or too large information matrices."
+                " χ² is too large. Possible causes: false closures, or too large information "
+                "matrices."
             )
-        elif solved_graph.reduced_chi2 < expected_low:
-            fit_text += ": too small information matrices, so the gate may accept false closures."
+        elif solved_graph.reduced_chi2 < expected_chi2_low:
+            fit_text += (
+                " The information matrices are too small, so the gate may accept false closures."
+            )
         page.write_labelled("Fit", fit_text)
     if isinstance(gates, Unavailable):
         page.write_labelled("Gate", f"not applied: {gates.reason}")
@@ -343,8 +357,8 @@ def make_pose_graph_page(solved_graph: Graph) -> Page:
             if not gate.accepted
         ]
         count_text = f"{len(gate_texts)} of {len(gates)} loop closures rejected"
-        listed_closures = join_first(gate_texts, MAX_LISTED_CLOSURES, "\n").split("\n")
-        page.write_labelled("Gate", count_text, *listed_closures)
+        rejected_closure_lines = join_first(gate_texts, MAX_LISTED_CLOSURES, "\n").split("\n")
+        page.write_labelled("Gate", count_text, *rejected_closure_lines)
         if len(gates) > MAX_GNC_CLOSURES and len(solved_graph.solutions) == 1:
             page.write_labelled(
                 "Robust",

@@ -30,10 +30,10 @@ MAX_NESTING_DEPTH = 100
 TAG_PATTERN = re.compile(r"<!--.*?-->|<[^>]*>", re.DOTALL)
 
 
-def draw_pages(analysed_item: object, results: FlightResults | LoopResults) -> Iterator[Page]:
+def draw_pages(analysis_or_loop: object, results: FlightResults | LoopResults) -> Iterator[Page]:
     """Yield a page with the student's answers and notes, or nothing if there are none."""
     title, answers = "Student notes", results.student.answers
-    page = Page(make_appendix_title(title) if isinstance(analysed_item, Analysis) else title)
+    page = Page(make_appendix_title(title) if isinstance(analysis_or_loop, Analysis) else title)
     if isinstance(answers, Answers):
         page.write_heading("Answer form")
         rows = [list(row) for row in form_rows(answers)]
@@ -72,10 +72,10 @@ def parse_markdown(notes: str, name: str = "the notes") -> list[Token]:
     all_tokens = (
         nested_token for token in tokens for nested_token in (token, *(token.children or ()))
     )
-    depth = max(accumulate(token.nesting for token in all_tokens), default=0)
-    if depth > MAX_NESTING_DEPTH:
+    nesting_depth = max(accumulate(token.nesting for token in all_tokens), default=0)
+    if nesting_depth > MAX_NESTING_DEPTH:
         raise SettingsError(
-            f"{name}: emphasis, lists and quotes are nested {depth} levels deep; at most "
+            f"{name}: emphasis, lists and quotes are nested {nesting_depth} levels deep; at most "
             f"{MAX_NESTING_DEPTH} levels are allowed",
             "Remove repeated * and _ from the text.",
         )
@@ -110,12 +110,11 @@ def _write_blocks(page: Page, node: SyntaxTreeNode, indent_level: int, marker: s
             case "html_block":
                 page.write(TAG_PATTERN.sub("", child.content).strip(), indent=indent)
             case _:  # paragraph; a horizontal rule, which has no text, is omitted
-                gap_above = 0.0 if marker else 2.0
                 page.write(
                     _inline_text(child),
                     indent=indent,
                     marker=marker,
-                    gap_above=gap_above,
+                    gap_above=0.0 if marker else 2.0,
                 )
         marker = ""
 

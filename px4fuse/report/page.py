@@ -110,8 +110,13 @@ class Page:
         right_aligned_columns : sequence of int
             Indices of the columns with numbers.
         """
-        right, widths = right_aligned_columns, column_widths
-        self.add("table", head=head, rows=rows, column_widths=widths, right=right)
+        self.add(
+            "table",
+            head=head,
+            rows=rows,
+            column_widths=column_widths,
+            right=right_aligned_columns,
+        )
 
     def add_panel(
         self,
@@ -120,13 +125,13 @@ class Page:
         *,
         caption: str = "",
         gap_above: float = 4.0,
-        left: float = AXES_LEFT_MARGIN,
-        right: float = AXES_RIGHT_MARGIN,
+        left_margin: float = AXES_LEFT_MARGIN,
+        right_margin: float = AXES_RIGHT_MARGIN,
         is_compact: bool = False,
     ) -> Axes:
         """Add axes below a title and a caption; return the axes.
 
-        ``height`` of the axes and margins ``gap_above``, ``left`` and ``right`` are in points.
+        The height of the axes, the gap above the title and the margins are in points.
         """
         # imported here, because text-only commands do not need matplotlib (0.3 s)
         from matplotlib.figure import Figure  # noqa: PLC0415
@@ -140,7 +145,7 @@ class Page:
             caption=caption,
             alt=": ".join(filter(None, (title, caption))),
             axes=axes,
-            margins=(left, right, gap_above),
+            margins=(left_margin, right_margin, gap_above),
             height=height,
             width=self.width,
             figure=axes.figure,
@@ -254,19 +259,19 @@ def replace_unprintable(text: str) -> str:
     )
 
 
-def to_typst_data(block: Any, log: str) -> Any:
+def to_typst_data(block: Any, log_name: str) -> Any:
     """Convert blocks to data for Typst: printable texts, and figures as SVG."""
     if isinstance(block, str):
-        return replace_unprintable(with_log_name(block, log))
+        return replace_unprintable(with_log_name(block, log_name))
     if isinstance(block, Mapping):
         fields = {
-            name: to_typst_data(value, log)
+            name: to_typst_data(value, log_name)
             for name, value in block.items()
             if name not in ("figure", "axes")
         }
         return fields | ({"svg": _render_figure_svg(block)} if "figure" in block else {})
     if isinstance(block, Sequence):
-        return [to_typst_data(item, log) for item in block]
+        return [to_typst_data(item, log_name) for item in block]
     return block
 
 
@@ -281,7 +286,7 @@ def _render_figure_svg(block: Mapping[str, Any]) -> str:
 
 def _place_axes(block: Mapping[str, Any]) -> None:
     axes, width, height = block["axes"], block["width"], block["height"]
-    left, right, top_margin = block["margins"]
+    left_margin, right_margin, top_margin = block["margins"]
     has_tick_labels = axes.axison and axes.xaxis.get_tick_params()["labelbottom"]
     bottom_margin = (TICKS_HEIGHT if has_tick_labels else UNLABELLED_HEIGHT) + (
         AXIS_LABEL_HEIGHT if axes.get_xlabel() else 0.0
@@ -290,9 +295,9 @@ def _place_axes(block: Mapping[str, Any]) -> None:
     block["figure"].set_size_inches(width / 72.0, total_height / 72.0)
     axes.set_position(
         (
-            left / width,
+            left_margin / width,
             bottom_margin / total_height,
-            (width - left - right) / width,
+            (width - left_margin - right_margin) / width,
             height / total_height,
         )
     )

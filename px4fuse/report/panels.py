@@ -30,7 +30,7 @@ NARROW_AXES_HEIGHT = 72.0  # height (points) of the axes in narrow columns
 # Ratio of the axis limit to the largest innovation in a plot of innovations
 INNOVATION_AXIS_MARGIN_FACTOR = 1.3
 # The axis of an innovation plot grows to show innovations up to this multiple of the median √S
-MAX_INNOVATION_LIMIT_SIGMAS = 5.0
+MAX_AXIS_LIMIT_IN_SQRT_S = 5.0
 
 
 class QuantityColumns(NamedTuple):
@@ -39,8 +39,8 @@ class QuantityColumns(NamedTuple):
     unit: str
     column: str
     variance_column: str
-    rmse_field: str
-    median_sigma_field: str
+    rmse_field_name: str
+    median_sigma_field_name: str
 
 
 POSITION_QUANTITY = QuantityColumns(
@@ -81,7 +81,7 @@ class Panel(NamedTuple):
             title,
             height,
             caption=caption,
-            # axis "" omits the markers of rejections: here, rejected innovations are hollow dots
+            # the innovation plot shows rejections as hollow dots, so axis "" omits their markers
             axis="" if self is INNOVATIONS_PANEL else result.axis.name,
             with_time_label=with_time_label,
         )
@@ -144,7 +144,7 @@ def _format_rmse(result: AxisComparison, quantity: QuantityColumns) -> list[str]
     rmse_texts = [
         f"{name} {rmse:.3f} {quantity.unit}"
         for name, filter_summary in get_statistics_by_filter(result).items()
-        if (rmse := getattr(filter_summary.truth, quantity.rmse_field, None)) is not None
+        if (rmse := getattr(filter_summary.truth, quantity.rmse_field_name, None)) is not None
     ]
     return [f"RMSE against ground truth {', '.join(rmse_texts)}"] if rmse_texts else []
 
@@ -176,9 +176,7 @@ def _find_innovation_limit_m(result: AxisComparison) -> float:
         median_sqrt_s_m = float(np.sqrt(innovations["innovation_variance_m2"].median()))
         # a quantile, so that outliers do not enlarge the axis
         innovation_quantile_m = float(np.quantile(innovations["innovation_m"].abs(), 0.99))
-        shown_innovation_m = min(
-            innovation_quantile_m, MAX_INNOVATION_LIMIT_SIGMAS * median_sqrt_s_m
-        )
+        shown_innovation_m = min(innovation_quantile_m, MAX_AXIS_LIMIT_IN_SQRT_S * median_sqrt_s_m)
         limits_m.append(max(2.0 * median_sqrt_s_m, shown_innovation_m))
     return INNOVATION_AXIS_MARGIN_FACTOR * max(limits_m)
 
@@ -239,12 +237,12 @@ def describe_innovations(_: Analysis, result: AxisComparison) -> str:
             sentences.append(f"{name}: {consistency.reason}.")
             continue
         outside_count = int((innovation_tables[name]["innovation_m"].abs() > plot_limit_m).sum())
-        outside_text = f"; outside the plot (triangles): {outside_count}" if outside_count else ""
+        outside_text = f" Outside the plot (triangles): {outside_count}." if outside_count else ""
         sentences.append(
             f"{name}: {consistency.count} innovations, {format_verdict(consistency)}; mean "
             f"{consistency.innovation_mean_m:+.3f} m, standard deviation "
             f"{consistency.innovation_std_m:.3f} m, median √S {consistency.sqrt_s_median_m:.3f} m"
-            f"{outside_text}."
+            f".{outside_text}"
         )
     if isinstance(result.ekf2_state, Unavailable):
         sentences.append(f"EKF2: {result.ekf2_state.reason}.")
@@ -287,7 +285,7 @@ def describe_sigma_growth(analysis: Analysis, result: AxisComparison) -> str:
     if not sigma_texts:
         return ""
     return (
-        f"In the gap of {end_s - start_s:.1f} s from {start_s:.0f} s, σ grew to "
+        f"In the gap of the position source from {start_s:.1f} to {end_s:.1f} s, σ grew to "
         f"{' and '.join(sigma_texts)}."
     )
 
@@ -295,7 +293,7 @@ def describe_sigma_growth(analysis: Analysis, result: AxisComparison) -> str:
 def _format_median_sigma(result: AxisComparison, quantity: QuantityColumns) -> str:
     sigma_texts = []
     for name, filter_summary in get_statistics_by_filter(result).items():
-        median_sigma = getattr(filter_summary, quantity.median_sigma_field)
+        median_sigma = getattr(filter_summary, quantity.median_sigma_field_name)
         sigma_text = "not logged" if median_sigma is None else f"{median_sigma:.3f} {quantity.unit}"
         sigma_texts.append(f"{name} {sigma_text}")
     return f"median: {', '.join(sigma_texts)}"

@@ -28,7 +28,7 @@ from px4fuse.results.model import NO_STUDENT
 
 RESULTS_NAME = "results.json"
 # Functions that draw the pages of a report, in their order, by type of results
-PAGES: Mapping[type, tuple[Callable[[Any, Any], Iterator[Page]], ...]] = {
+PAGE_FUNCTIONS_BY_RESULTS_TYPE: Mapping[type, tuple[Callable[[Any, Any], Iterator[Page]], ...]] = {
     contract.ComparisonResults: (
         cover.draw_pages,
         flight.draw_pages,
@@ -72,7 +72,7 @@ def render_pdf(content: Any, results: Any, results_json: str) -> bytes:
     content : Analysis, AidsOnlyAnalysis, Loop or Evaluation
         Source of the figures.
     results : Results
-        Results for the texts; their type selects the :data:`PAGES`.
+        Results for the texts; their type selects the :data:`PAGE_FUNCTIONS_BY_RESULTS_TYPE`.
     results_json : str
         Attached to the PDF as ``results.json``, so the PDF alone can be verified.
 
@@ -85,7 +85,11 @@ def render_pdf(content: Any, results: Any, results_json: str) -> bytes:
     blocks, report_text = list[Any](), ""
     with apply_report_style():
         # each page is converted immediately, because the figures of all pages need much memory
-        for page in (page for draw in PAGES[type(results)] for page in draw(content, results)):
+        for page in (
+            page
+            for draw in PAGE_FUNCTIONS_BY_RESULTS_TYPE[type(results)]
+            for page in draw(content, results)
+        ):
             report_text += json.dumps(page.blocks, ensure_ascii=False, default=repr)
             blocks += to_typst_data(page.blocks, name)
     producer = f"px4fuse {metadata.version('px4fuse')}"

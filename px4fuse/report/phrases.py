@@ -39,7 +39,7 @@ if TYPE_CHECKING:
 # Minimum p value of the Ljung-Box test for white innovations: with eight tests per flight, less
 # than 1 % of the flights have a false alarm
 MIN_WHITENESS_P_VALUE = 0.001
-# Error of the reported σ, by verdict on the filter
+# Error of the σ that an underconfident or an overconfident filter reports
 SIGMA_ERROR_TEXTS = {"underconfident": "too large", "overconfident": "too small"}
 DIFFERENCE_FIELDS = ("position_rms_m", "velocity_rms_m_s")
 RMSE_FIELDS = ("position_rmse_m", "velocity_rmse_m_s")
@@ -137,24 +137,26 @@ def list_verdict_warnings(comparison: Comparison) -> list[str]:
             "The position source may drift. The verdicts compare each filter with the source, "
             "not with the true position. Check the error with ground truth or a loop closure."
         )
-    correlated_filter_texts = [
+    autocorrelated_innovation_texts = [
         f"{filter_name} along {axis}, lag-1 autocorrelation {consistency.lag1_autocorrelation:+.2f}"
         for axis, filter_name, consistency in consistency_rows
         if consistency.verdict == "consistent" and consistency.ljung_box_p < MIN_WHITENESS_P_VALUE
     ]
-    if correlated_filter_texts:
+    if autocorrelated_innovation_texts:
         notes.append(
             "Innovations are not white, although their variance is consistent (Ljung-Box test, p "
-            f"< {MIN_WHITENESS_P_VALUE:g}): {'; '.join(correlated_filter_texts)}. If the "
-            "autocorrelation is positive, the filter lags and SIGMA_A may be too small. If it is "
-            "negative, the filter follows the measurement noise and SIGMA_A may be too large."
+            f"< {MIN_WHITENESS_P_VALUE:g}): {'; '.join(autocorrelated_innovation_texts)}. Positive "
+            "autocorrelation: the filter lags, so SIGMA_A may be too small. Negative "
+            "autocorrelation: the filter follows measurement noise, so SIGMA_A may be too large."
         )
     return notes
 
 
 def format_clock_map(clock: ClockMap) -> str:
-    is_note_sufficient = clock.method in ("boot clock", "arrival time") or "own speed" in clock.note
-    if is_note_sufficient or clock.distinct_stamps is not None:
+    is_described_by_note = (
+        clock.method in ("boot clock", "arrival time") or "own speed" in clock.note
+    )
+    if is_described_by_note or clock.distinct_stamps is not None:
         return f"{clock.clock}: {clock.note}"
     return (
         f"{clock.clock}, mapped by {clock.method}: offset {clock.offset_s:+.4f} s, drift "
@@ -176,7 +178,9 @@ def describe_alignment(alignment: Alignment) -> dict[str, str]:
         f"({alignment.clock_reason})",
     }
     if alignment.correlation is not None:
-        residual_text = "" if residual_rms_m is None else f", {residual_rms_m:.3f} m RMS per axis"
+        residual_text = (
+            "" if residual_rms_m is None else f", residual {residual_rms_m:.3f} m RMS per axis"
+        )
         correlation_text = f"correlation {alignment.correlation:.4f} with {alignment.reference}"
         text_by_label["match"] = correlation_text + residual_text
     return text_by_label
@@ -185,7 +189,7 @@ def describe_alignment(alignment: Alignment) -> dict[str, str]:
 def make_tuning_advice(
     comparison: PreparedComparison, tuning_by_axis: Mapping[str, AxisTuning | Unavailable]
 ) -> dict[str, str]:
-    """Return recommendations after noise estimation, by label such as "SIGMA_Z"."""
+    """Return recommendations from noise estimates, by their label (for example "SIGMA_Z")."""
     names = (HORIZONTAL, "aisle", *tuning_by_axis)
     axis_name = next(
         (name for name in names if isinstance(tuning_by_axis.get(name), AxisTuning)), ""
@@ -216,8 +220,8 @@ def make_tuning_advice(
     elif sigma_z.value is None:
         bound_text = "" if sigma_z.high is None else f" (at most {sigma_z.high:.2g} m)"
         advice_by_label["SIGMA_Z"] = (
-            f"SIGMA_Z cannot be estimated at this logging rate{bound_text}: it is masked by the "
-            "process noise between samples. Log the source at a higher rate."
+            f"SIGMA_Z{bound_text} cannot be estimated, because the process noise between two "
+            "logged positions is too large. Log the source at a higher rate."
         )
     elif log.autopilot == "PX4" and not may_drift and comparison.source.origin.is_vision:
         logged_noise_m, name = log.parameters.get(EV_POS.noise), EV_POS.noise
@@ -232,8 +236,8 @@ def make_tuning_advice(
         if EV_POS.noise_mode in changes and reported_sigma_m > (sigma_z.high or np.inf):
             changes = select_changed_settings(changes, log.parameters)
             advice_by_label["PX4"] = (
-                f"Set {format_parameters(changes)}: EKF2 now uses the σ reported by the source, "
-                f"{reported_sigma_m:.2g} m, which is larger than the estimate."
+                f"Set {format_parameters(changes)}. EKF2 now uses the σ that the source reports: "
+                f"{reported_sigma_m:.2g} m. The estimated noise is smaller."
             )
         elif is_logged_within_interval:
             advice_by_label["PX4"] = (
@@ -246,8 +250,8 @@ def make_tuning_advice(
         advice_by_label["SIGMA_A"] = (
             "SIGMA_A cannot be estimated: the flight has too little motion, or is too short."
             if sigma_a.low is None
-            else f"SIGMA_A is at least {sigma_a.low:.2g} m/s²: logged acceleration and positions "
-            "disagree."
+            else f"The estimate of SIGMA_A is at least {sigma_a.low:.2g} m/s²: logged acceleration "
+            "and positions disagree."
         )
     elif (
         tuning.biases_fitted
@@ -255,9 +259,9 @@ def make_tuning_advice(
     ):
         bound_text = "" if tuning.sigma_a.value is not None else "at most "
         advice_by_label["SIGMA_A"] = (
-            f"Accelerometer noise alone is {bound_text}{accelerometer_noise:.2g} m/s². KF has no "
-            "state for accelerometer bias and tilt error. To include both, SIGMA_A must be "
-            f"{sigma_a.value:.2g} m/s²."
+            f"Accelerometer noise alone is {bound_text}{accelerometer_noise:.2g} m/s². Set SIGMA_A "
+            f"to {sigma_a.value:.2g} m/s² to include accelerometer bias and tilt error, which are "
+            "not states of KF."
         )
     if len(tuning.outlier_time_s):
         advice_by_label["Outliers"] = (
@@ -295,6 +299,6 @@ def format_noise_estimate(noise: NoiseEstimate) -> str:
         bounds = (("at most", noise.high), ("at least", noise.low))
         bound_texts = (f"{prefix} {bound:.2g}" for prefix, bound in bounds if bound is not None)
         return next(bound_texts, "not identifiable")
-    low_text = "0" if noise.low is None else f"{noise.low:.2g}"
-    high_text = "?" if noise.high is None else f"{noise.high:.2g}"
-    return f"{noise.value:.3g} ({low_text}-{high_text})"
+    lower_limit_text = "0" if noise.low is None else f"{noise.low:.2g}"
+    upper_limit_text = "?" if noise.high is None else f"{noise.high:.2g}"
+    return f"{noise.value:.3g} ({lower_limit_text}-{upper_limit_text})"

@@ -18,7 +18,7 @@ LABEL_WIDTH = 168.0  # width (points) of the labels
 
 
 def draw_pages(analysis: Analysis | AidsOnlyAnalysis, results: FlightResults) -> Iterator[Page]:
-    """Draw the page with all detected faults (findings), and the provenance page of a flight."""
+    """Draw two pages of a flight: all detected faults (findings); versions, files and methods."""
     page = Page(ALL_FINDINGS_TITLE)
     write_findings(page, results.findings)
     page.write("" if results.findings else "None.")
@@ -71,7 +71,7 @@ def _write_log_section(page: Page, flight: Flight, source: PositionTrack | None)
     text_by_label["SHA-256"] = log.sha256
     section = Page()
     _write_section(section, "Log", text_by_label.items())
-    page.add_columns(section)  # as a column, because Typst does not split columns between pages
+    page.add_columns(section)  # Typst keeps a column, and so the section, on one page
 
 
 def _write_missing_data(page: Page, unavailable_parts: Iterable[Unavailable]) -> None:

@@ -42,7 +42,7 @@ STYLES_BY_COLOUR = {
     SEVERITY_COLOURS["note"]: "cyan",
     GOOD_COLOUR: "green",
 }
-# Commands in a text, without the full stop of the sentence
+# Commands of px4fuse in a text; a full stop after a command is not a part of the command
 _COMMAND_PATTERN = re.compile(r"px4fuse (\w+) LOG(?![\w.])((?: --[a-z-]+ [-\w]+(?:\.\d+)?)*)")
 
 
@@ -98,19 +98,19 @@ def _show_labelled(console: Console, block: PageBlock, request: Request | None) 
     for index, (label, text_block) in enumerate(zip_longest(labels, block["texts"])):
         text, commands = Text() if text_block is None else _make_rich_text(text_block), list[str]()
         if request is not None:
-            text.plain, commands = extract_commands(text.plain, request)
+            text.plain, commands = shorten_commands(text.plain, request)
         text.append("" if index else long_label_text)
-        rich_label = _make_rich_text({**block["label"], "text": label or ""})
-        print_paragraph(console, text, rich_label, indent=LABEL_CHARACTERS)
+        styled_label = _make_rich_text({**block["label"], "text": label or ""})
+        print_paragraph(console, text, styled_label, indent=LABEL_CHARACTERS)
         for command in commands:
             print_line(console, "", command)
 
 
-def extract_commands(text: str, request: Request) -> tuple[str, list[str]]:
-    """Replace each command in a text by its options; return the text and the complete commands.
+def shorten_commands(text: str, request: Request) -> tuple[str, list[str]]:
+    """Shorten each command in a text to its options; return the text and the complete commands.
 
     >>> request = ComparisonRequest(log="a b.ulg")
-    >>> extract_commands("px4fuse compare LOG --sigma-z 0.2: better.", request)
+    >>> shorten_commands("px4fuse compare LOG --sigma-z 0.2: better.", request)
     ('--sigma-z 0.2: better.', ["px4fuse compare 'a b.ulg' --sigma-z 0.2"])
     """
     log_path = str(getattr(request, "log", "") or getattr(request, "source", ""))

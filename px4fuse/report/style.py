@@ -129,10 +129,10 @@ def set_plain_ticks(axes: Axes) -> None:
     from matplotlib.ticker import LogLocator, NullLocator  # noqa: PLC0415
 
     axis, (low, high) = axes.yaxis, axes.get_ylim()
-    decade_ticks = (
+    tick_multiples = (
         (1.0, 2.0, 5.0) if high / low < 30.0 else (1.0, 3.0) if high / low < 300.0 else (1.0,)
     )
-    axis.set_major_locator(LogLocator(base=10.0, subs=decade_ticks))
+    axis.set_major_locator(LogLocator(base=10.0, subs=tick_multiples))
     axis.set_major_formatter(lambda value, _: f"{value:g}")
     axis.set_minor_locator(NullLocator())
 
@@ -161,7 +161,7 @@ def decimate_series(times: Array, values: Array, max_points: int) -> tuple[Array
     if len(times) <= max_points:
         return times, values
     intervals = np.array_split(np.arange(len(times)), max_points // 2)
-    minimum_rows = [rows[values[rows].argmin()] for rows in intervals]
-    maximum_rows = [rows[values[rows].argmax()] for rows in intervals]
-    selected_rows = np.unique(minimum_rows + maximum_rows)
+    rows_of_minima = [rows[values[rows].argmin()] for rows in intervals]
+    rows_of_maxima = [rows[values[rows].argmax()] for rows in intervals]
+    selected_rows = np.unique(rows_of_minima + rows_of_maxima)
     return times[selected_rows], values[selected_rows]

@@ -7,7 +7,7 @@ from px4fuse.card.model import Card
 from px4fuse.comparison.model import Comparison
 from px4fuse.core.text import capitalise_first
 from px4fuse.ekf2.steps import DifferenceExplanation
-from px4fuse.report.aids import select_aids_if_outdoor, write_aids
+from px4fuse.report.aids import select_aids_of_outdoor_flight, write_aids
 from px4fuse.report.difference_page import write_explanation
 from px4fuse.report.page import Page
 from px4fuse.report.phrases import (
@@ -57,15 +57,15 @@ def _write_details(page: Page, analysis: Analysis, results: Any) -> None:
     explanation = analysis.difference_steps.get(analysis.main.axis.name)
     if isinstance(explanation, DifferenceExplanation):
         write_explanation(page, explanation)
-    if aids := select_aids_if_outdoor(analysis):
+    if aids := select_aids_of_outdoor_flight(analysis):
         write_aids(page, aids)
     write_findings(page, results.findings)
 
 
-def make_card_page(block_kind: str, card: Card) -> Page:
-    """Make a page with a card, or only with its first ("headline") or last lines ("closing")."""
+def make_card_page(card_part: str, card: Card) -> Page:
+    """Make a page with one part of a card: "card" (all), "headline" or "closing" (last lines)."""
     page = Page()
-    page.add(block_kind, card=card)
+    page.add(card_part, card=card)
     return page
 
 

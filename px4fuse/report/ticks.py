@@ -39,11 +39,15 @@ def _draw_axis_as_artists(
     axis = axes.xaxis if is_x else axes.yaxis
     transform: Any = axes.get_xaxis_transform if is_x else axes.get_yaxis_transform
     options, (low, high) = axis.get_tick_params(), sorted(axis.get_view_interval())
-    size, pad = rcParams["xtick.major.size"], rcParams["xtick.major.pad"]
+    size, label_gap = rcParams["xtick.major.size"], rcParams["xtick.major.pad"]
 
-    def order_xy(along_axis: Any, from_axis: Any) -> tuple[Any, Any]:
+    def order_xy(coordinate_along_axis: Any, coordinate_across_axis: Any) -> tuple[Any, Any]:
         """Return (x, y) from the coordinates along this axis and perpendicular to it."""
-        return (along_axis, from_axis) if is_x else (from_axis, along_axis)
+        return (
+            (coordinate_along_axis, coordinate_across_axis)
+            if is_x
+            else (coordinate_across_axis, coordinate_along_axis)
+        )
 
     all_locations, formatter = np.asarray(axis.get_majorticklocs()), axis.get_major_formatter()
     is_visible = np.abs(all_locations - (low + high) / 2.0) <= (0.5 + 1e-9) * (high - low)
@@ -58,14 +62,16 @@ def _draw_axis_as_artists(
     ticks.set(marker=TICKDOWN if is_x else TICKLEFT, ms=size, color="black")
     ticks.set(mew=rcParams["xtick.major.width"], clip_on=False, zorder=TICKS_ZORDER)
     axes.add_artist(ticks)
-    distance = size + pad  # extent (points) of ticks and tick labels beside the axis
+    tick_extent = size + label_gap  # extent (points) of ticks and tick labels beside the axis
     if options["labelbottom" if is_x else "labelleft"] and labels:
-        text1_transform = axes.get_xaxis_text1_transform if is_x else axes.get_yaxis_text1_transform
-        label_transform, vertical_alignment, horizontal_alignment = text1_transform(distance)
+        get_label_transform = (
+            axes.get_xaxis_text1_transform if is_x else axes.get_yaxis_text1_transform
+        )
+        label_transform, vertical_alignment, horizontal_alignment = get_label_transform(tick_extent)
         for location, label in zip(locations, labels, strict=True):
             text = axes.text(*order_xy(location, 0.0), label, transform=label_transform)
             text.set(va=vertical_alignment, ha=horizontal_alignment, zorder=TICKS_ZORDER)
-        distance += LINE_HEIGHT if is_x else max(map(measure_text_width, labels))
+        tick_extent += LINE_HEIGHT if is_x else max(map(measure_text_width, labels))
     # label of the axis, and offset text of matplotlib (such as 1e-3 for all tick labels) at its end
     for label, position in ((axis.get_label_text(), 0.5), (formatter.get_offset(), 1.0)):
         if not label:
@@ -74,7 +80,7 @@ def _draw_axis_as_artists(
         text = axes.annotate(
             label,
             order_xy(position, 0.0),
-            order_xy(0.0, -distance - rcParams["axes.labelpad"]),
+            order_xy(0.0, -tick_extent - rcParams["axes.labelpad"]),
             xycoords="axes fraction",
             textcoords="offset points",
         )

@@ -11,13 +11,13 @@ TUNING_HEAD = (
     "SIGMA_A (m/s²)\nestimate (95 %)",
     "SIGMA_Z (m)\nestimate (95 %)",
     "log-likelihood\ngain (nats per\nmeasurement)",
-    "log-likelihood\ngain on\n2nd half",
+    "log-likelihood\ngain, 2nd half\nof the data",
     "lag-1 auto-\ncorrelation\nbefore, after",
 )
 TUNING_NOTE = (
-    "Log-likelihood gain: with the estimates instead of the chosen settings. Gain on the 2nd half: "
-    "of the data, with the noises estimated on the first half. Lag-1 autocorrelation of the "
-    "innovations: before, with the chosen settings; after, with the estimates."
+    "The log-likelihood gain compares the estimates with the chosen settings. The gain on the 2nd "
+    "half of the data uses noises that are estimated on the first half. The innovations have the "
+    "lag-1 autocorrelation 'before' with the chosen settings, and 'after' with the estimates."
 )
 
 
@@ -34,11 +34,8 @@ def make_tuning_page(
         if not isinstance(tuning.held_out, Unavailable):
             held_out_gain_text = f"{tuning.held_out.log_likelihood_gain_per_measurement:+.3f}"
         if not isinstance(tuning.before, Unavailable) and not isinstance(tuning.after, Unavailable):
-            lag1_before, lag1_after = (
-                tuning.before.lag1_autocorrelation,
-                tuning.after.lag1_autocorrelation,
-            )
-            correlation_text = f"{lag1_before:+.2f} {lag1_after:+.2f}"
+            before, after = tuning.before.lag1_autocorrelation, tuning.after.lag1_autocorrelation
+            correlation_text = f"{before:+.2f} {after:+.2f}"
         rows.append(
             [
                 name,

@@ -15,7 +15,7 @@ from px4fuse.ekf2.whatif import (
 from px4fuse.filter.signals import AISLE
 from px4fuse.flight.ekf2_parameters import AIDS, PARAMETERS
 from px4fuse.flight.model import Unavailable
-from px4fuse.report.difference_page import format_agreement, write_explanation
+from px4fuse.report.difference_page import format_replay_agreement, write_explanation
 from px4fuse.report.page import Page
 
 NOT_PREDICTABLE_TEXT = "not predictable"
@@ -53,7 +53,7 @@ def make_statistic_rows(analysis: WhatIfAnalysis) -> list[list[str]]:
     return [[label, *(column.get(label, "n/a") for column in columns)] for label in texts_by_label]
 
 
-def _format_statistics(summary: Summary, replayed: Summary) -> dict[str, str]:
+def _format_statistics(summary: Summary, replayed_summary: Summary) -> dict[str, str]:
     text_by_label = dict[str, str]()
     for name, axis in summary.axes.items():
         text_by_label |= _format_nis_statistics(name, axis) | {
@@ -63,9 +63,9 @@ def _format_statistics(summary: Summary, replayed: Summary) -> dict[str, str]:
     text_by_label |= {"samples": f"{summary.samples}", **_format_fusion_statistics(summary)}
     if summary.velocity_rejected_fraction is not None:
         text_by_label["GNSS velocities rejected"] = f"{summary.velocity_rejected_fraction:.1%}"
-    if isinstance(replayed.heading_error_mean_deg, float):
+    if isinstance(replayed_summary.heading_error_mean_deg, float):
         text_by_label["mean heading error (°)"] = _format_number(summary.heading_error_mean_deg, 1)
-    if replayed.heights:
+    if replayed_summary.heights:
         text_by_label["height RMSE (m)"] = _format_number(summary.height_rmse_to_truth_m)
     for name, aid in {**summary.heights, **summary.others}.items():
         label = AIDS[name].label
@@ -140,24 +140,24 @@ def describe_sweep(analysis: WhatIfAnalysis) -> list[str]:
             f"{format_number(best_summary.changed[parameter_name])} "
             f"({format_number(best_summary.nis_mean)})."
         )
-        value_by_rmse_m = {
+        parameter_value_by_rmse_m = {
             rmse_m: summary.changed[parameter_name]
             for summary in summaries
             if isinstance(rmse_m := summary.position_rmse_to_truth_m, float)
         }
-        if value_by_rmse_m:
-            min_rmse_m = min(value_by_rmse_m)
+        if parameter_value_by_rmse_m:
+            min_rmse_m = min(parameter_value_by_rmse_m)
             sentences.append(
                 "The horizontal position RMSE against ground truth is smallest at "
-                f"{parameter_name} {format_number(value_by_rmse_m[min_rmse_m])} "
+                f"{parameter_name} {format_number(parameter_value_by_rmse_m[min_rmse_m])} "
                 f"({min_rmse_m:.3f} m)."
             )
     if not all(summary.is_predictable for summary in analysis.whatif.whatif):
         sentences.append(
-            "A replay is not predictable in three cases: EKF2 rejects more than "
-            f"{MAX_REJECTED_FRACTION:.0%} of the samples, the statistics change much with "
-            f"{1000.0 * ADDED_POSITION_SIGMA_M:.0f} mm of added position noise, or EKF2 fuses no "
-            f"height for {HEIGHT_TIMEOUT_S:g} s."
+            "'not predictable' has three possible reasons: EKF2 rejects more than "
+            f"{MAX_REJECTED_FRACTION:.0%} of the samples, {1000.0 * ADDED_POSITION_SIGMA_M:.0f} mm "
+            "of added position noise changes the statistics much, or EKF2 fuses no height for "
+            f"{HEIGHT_TIMEOUT_S:g} s."
         )
     return [*sentences, *(f"{note}." for note in analysis.whatif.notes)]
 
@@ -176,10 +176,10 @@ def make_whatif_page(analysis: WhatIfAnalysis) -> Page:
         f"{start:.1f} to {end:.1f} s" for start, end in whatif_result.evaluated_s
     )
     page.write_labelled("Used", f"The statistics of all columns are for {spans_text}.")
-    page.write_labelled("Replay", format_agreement(whatif_result.agreement))
+    page.write_labelled("Replay", format_replay_agreement(whatif_result.agreement))
     if analysis.uses_estimates and not analysis.changes:
         no_change_text = (
-            "No other position noise or delay fits this log better, so no parameter is changed. "
+            "The logged position noise and delay fit this log best, so no parameter is changed. "
             "Test another value with --set NAME=VALUE."
         )
         page.write_labelled("Change", no_change_text)
