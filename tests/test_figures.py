@@ -8,7 +8,7 @@ import pytest
 
 from px4fuse.classroom.assignment import figures
 from px4fuse.classroom.assignment.figures import (
-    FIGURE_FAULTS,
+    FIGURE_ANSWERS_BY_FAULT,
     QUESTIONS,
     draw_figures,
     select_choices,
@@ -29,7 +29,9 @@ def test_right_answers_on_each_figure_describe_the_same_fault() -> None:
         for first in range(0, len(choices), len(QUESTIONS)):
             rows = zip(choices[first:], QUESTIONS, strict=False)
             right = [(choice.answer_text(letter), field) for (choice, letter), field in rows]
-            fault = next(each for each in FIGURE_FAULTS.values() if each.fault == right[0][0])
+            fault = next(
+                each for each in FIGURE_ANSWERS_BY_FAULT.values() if each.fault == right[0][0]
+            )
             assert all(getattr(fault, field) == text for text, field in right)
         form = format_answer_form("s.ulg", "0" * 64, [choice for choice, _ in choices])
         assert len(form.encode()) < MAX_FORM_BYTES
@@ -44,8 +46,8 @@ def test_right_multiple_choice_letters_are_equally_frequent() -> None:
 
 def test_answers_to_plot_questions_differ_between_faults() -> None:
     for field in QUESTIONS:
-        assert len({getattr(fault, field) for fault in FIGURE_FAULTS.values()}) == len(
-            FIGURE_FAULTS
+        assert len({getattr(fault, field) for fault in FIGURE_ANSWERS_BY_FAULT.values()}) == len(
+            FIGURE_ANSWERS_BY_FAULT
         )
 
 

@@ -15,7 +15,7 @@ from exchange import replace
 from form_guesses import SHA256, right
 from test_form_points import CLEAN, GAP, RIGHT, TRUTH
 
-from px4fuse.classroom.assignment.truth import InjectedFault, RightFormAnswers, RightVerdict
+from px4fuse.classroom.assignment.truth import CorrectFormAnswers, CorrectVerdict, InjectedFault
 from px4fuse.classroom.grading.flags import flag_equal_contents
 from px4fuse.classroom.grading.form_points import compute_form_points
 from px4fuse.errors import SettingsError
@@ -182,8 +182,8 @@ def test_two_students_with_equal_plot_answers_are_flagged() -> None:
 # ------------------------------------------------ students who analysed their flight
 
 OFF = InjectedFault("ekf2-off")
-OFF_TRUTH = RightFormAnswers(
-    (OFF,), 0.1, RightVerdict("consistent"), RightVerdict(""), ("never fused",),
+OFF_TRUTH = CorrectFormAnswers(
+    (OFF,), 0.1, CorrectVerdict("consistent"), CorrectVerdict(""), ("never fused",),
     ("followed wrong positions",), (0.5, 0.1, 0.2),
 )  # fmt: skip
 NLOS_TRUTH = replace(TRUTH, mistakes=(InjectedFault("nlos", 3.0, 2.5, 3.5, 10.0, 60.0), GAP))
@@ -191,14 +191,14 @@ COMPASS_TRUTH = replace(TRUTH, mistakes=(InjectedFault("heading", 20.0, 17.0, 23
 END_TRUTH = replace(TRUTH, mistakes=(InjectedFault("open-end", 5.0, 4.7, 5.3, 60.0),))
 
 
-def first_mistake(truth: RightFormAnswers, **values) -> Answers:
+def first_mistake(truth: CorrectFormAnswers, **values) -> Answers:
     """Return the right form with other values of its first fault."""
     form = right(truth)
     return replace(form, mistakes=(replace(form.mistakes[0], **values), *form.mistakes[1:]))
 
 
 # Right answers, form of a student who analysed the flight, and minimum points of 100
-HONEST_FORMS: dict[str, tuple[RightFormAnswers, Answers, float]] = {
+HONEST_FORMS: dict[str, tuple[CorrectFormAnswers, Answers, float]] = {
     "EKF2 never fused, verdict not available": (OFF_TRUTH, right(OFF_TRUTH), 100.0),
     "EKF2 never fused and followed": (
         OFF_TRUTH,

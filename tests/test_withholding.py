@@ -13,7 +13,10 @@ from form_guesses import right
 
 from px4fuse.classroom.assignment.assignment import simulate_assigned_flight
 from px4fuse.classroom.assignment.roster import Person
-from px4fuse.classroom.grading.form_points import FLIGHT_POINTS_FRACTION, compute_form_points
+from px4fuse.classroom.grading.form_points import (
+    FLIGHT_QUESTIONS_POINTS_FRACTION,
+    compute_form_points,
+)
 from px4fuse.classroom.grading.records import load_or_verify
 from px4fuse.classroom.grading.rubric import read_rubric, score_report
 from px4fuse.core.reading import hash_files
@@ -119,7 +122,7 @@ def test_form_without_answers_on_plots_earns_part_of_points() -> None:
     assert compute_form_points(complete, answer.form).fraction == pytest.approx(1.0)
     copied = replace(complete, choices=())
     assert compute_form_points(copied, answer.form).fraction == pytest.approx(
-        FLIGHT_POINTS_FRACTION
+        FLIGHT_QUESTIONS_POINTS_FRACTION
     )
     for letter in CHOICE_NAMES:
         guessed = replace(complete, choices=(letter,) * len(answer.form.choices))

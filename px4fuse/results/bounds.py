@@ -152,11 +152,7 @@ def _check_or_replace_value(value: Any, annotation: Any, path: str, reasons: lis
     except _OutOfBoundsError as error:
         for unavailable_type in list_types(annotation):
             if isinstance(unavailable_type, type) and issubclass(unavailable_type, Unavailable):
-                text_fields = {
-                    "what": path,
-                    "reason": str(error),
-                    "remedy": CHECK_LOG_REMEDY,
-                }
+                text_fields = {"what": path, "reason": str(error), "remedy": CHECK_LOG_REMEDY}
                 other_fields = {
                     field.name: _check_value(getattr(value, field.name), field.type, path, reasons)
                     for field in fields(unavailable_type)

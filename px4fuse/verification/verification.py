@@ -138,11 +138,7 @@ def recompute_report(
 
 
 def _link_file(
-    path_by_sha256: Mapping[str, Path],
-    folder: Path,
-    name: str,
-    sha256: str | None,
-    file_label: str,
+    path_by_sha256: Mapping[str, Path], folder: Path, name: str, sha256: str | None, file_label: str
 ) -> str:
     """Link the file with this SHA-256 into a temporary folder, and return the path of the link.
 

@@ -41,7 +41,7 @@ from conftest import blank_page  # noqa: E402
 
 from px4fuse.classroom.assignment.key import (  # noqa: E402
     AnswerKey,
-    RightAnswers,
+    CorrectAnswers,
     format_answer_key,
     read_answer_key,
 )
@@ -209,8 +209,8 @@ _OVERRIDES = "id,item,points,comment\ns1,total,80,good\ns2,,,see me\n"
 
 def _key() -> list[bytes]:
     people = (
-        RightAnswers("s1", "Ada", "s1.ulg", "0" * 64),
-        RightAnswers("s2", "山田", "s2.ulg", "1" * 64),
+        CorrectAnswers("s1", "Ada", "s1.ulg", "0" * 64),
+        CorrectAnswers("s2", "山田", "s2.ulg", "1" * 64),
     )
     return [format_answer_key(AnswerKey("aisle", people)).encode()]
 

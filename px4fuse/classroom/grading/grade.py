@@ -81,7 +81,7 @@ def grade(
     for worksheet in course.worksheets:
         find_grade_column(worksheet, course.column)
     unread_file_notes = [
-        f"{one_line(file.name, 80)} was not read; only {OVERRIDES_NAME} is read."
+        f"{one_line(file.name, 80)} was ignored: px4fuse reads only {OVERRIDES_NAME}."
         for file in sorted(output.glob("overrides*"))
         if file.name != OVERRIDES_NAME
     ]
