@@ -182,7 +182,7 @@ def test_grade_keeps_first_report_if_later_one_needs_review() -> None:
         (ada, _), _ = make_grades(files, packed=times)
         assert ada.total == 9.0
         assert [one.submission for one in ada.other_reports] == ["z.pdf"]
-        assert ada.flags == ("The file z.pdf does not count: its status is pending.",)
+        assert ada.flags == ("The file z.pdf does not count: it is pending.",)
     waiting = replace(
         files["a.pdf"].items[0], is_awaiting_points=True
     )  # waits for the points of the notes

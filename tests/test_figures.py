@@ -15,7 +15,7 @@ from px4fuse.classroom.assignment.figures import (
 )
 from px4fuse.classroom.assignment.random_assignment import draw_uniform
 from px4fuse.results.answer_form import (
-    CHOICE_NAMES,
+    CHOICE_LETTERS,
     MAX_CHOICES,
     MAX_FORM_BYTES,
     format_answer_form,
@@ -40,7 +40,7 @@ def test_right_answers_on_each_figure_describe_the_same_fault() -> None:
 def test_right_multiple_choice_letters_are_equally_frequent() -> None:
     draws = [partial(draw_uniform, b"secret", f"s{number}", "aisle") for number in range(200)]
     letters = [letter for random_number in draws for _, letter in select_choices(random_number)]
-    for name in CHOICE_NAMES:
+    for name in CHOICE_LETTERS:
         assert letters.count(name) / len(letters) == pytest.approx(0.2, abs=0.03)
 
 

@@ -31,9 +31,9 @@ from px4fuse.classroom.grading.form_points import (
 from px4fuse.cli.simulate import simulate
 from px4fuse.core.text import convert_nested
 from px4fuse.results.answer_form import (
-    CORRECTION_RULES,
     FAULT_KINDS,
-    PANELS,
+    REPORT_PANELS,
+    UNITS_BY_CORRECTION,
     Answers,
     Choice,
     NamedFault,
@@ -101,10 +101,10 @@ def parts(answers: Answers, truth: CorrectFormAnswers = TRUTH) -> list[float]:
 
 def test_answer_form_offers_correct_answers_for_each_fault() -> None:
     assert set(SIMULATED) == set(FAULT_KINDS) - {"none", "vio-drift"}
-    assert set(POINTS_CONFIG["shows"]) | {"cover"} == set(PANELS)
+    assert set(POINTS_CONFIG["shows"]) | {"cover"} == set(REPORT_PANELS)
     for name in SIMULATED:
         offered = find_accepted_corrections(InjectedFault(name, 1.0, 0.85, 1.15, 10.0, 20.0), TRUTH)
-        assert {cure for cure, _, _ in offered} <= set(CORRECTION_RULES)
+        assert {cure for cure, _, _ in offered} <= set(UNITS_BY_CORRECTION)
         assert max(share for _, _, share in offered) == 1.0
         assert set(find_panels_showing_fault(name)) > {"cover"}
 
@@ -244,8 +244,10 @@ def answers_of(form: dict[str, Any]) -> Answers:
     claims = []
     for one in form["mistakes"] or []:
         when = one["when"]
-        parameter = one["parameter"] if one["parameter"] in CORRECTION_RULES else ""
-        unit = one["value_unit"] if one["value_unit"] in CORRECTION_RULES.get(parameter, {}) else ""
+        parameter = one["parameter"] if one["parameter"] in UNITS_BY_CORRECTION else ""
+        unit = (
+            one["value_unit"] if one["value_unit"] in UNITS_BY_CORRECTION.get(parameter, {}) else ""
+        )
         claims.append(
             NamedFault(
                 one["kind"], one["size"],

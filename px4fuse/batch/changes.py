@@ -153,7 +153,7 @@ def _list_finding_changes(
     results_a: Results, results_b: Results
 ) -> Iterator[contract.UnsharedFinding]:
     """Yield the findings whose id and severity are only in A or only in B."""
-    comparisons: tuple[tuple[Results, Results, contract.DiffSide], ...] = (
+    comparisons: tuple[tuple[Results, Results, contract.DiffInputName], ...] = (
         (results_b, results_a, "B"),
         (results_a, results_b, "A"),
     )

@@ -65,8 +65,10 @@ def analyse(job: Job) -> LogOutcome:
                 return LogOutcome(sha256)
             outcome = _compare_log(job, path, sha256)
             if _compute_sha256(path) != sha256:
-                remedy = "Run the same command again when the file is complete."
-                raise LogError("the file changed while it was read", remedy)
+                raise LogError(
+                    "the file changed while it was read",
+                    "Run the same command again when the file is complete.",
+                )
             return outcome
     except Px4FuseError as error:
         return LogOutcome(

@@ -162,8 +162,9 @@ def collect_log_values(log: Log) -> Row:
 
 def make_table(rows: Iterable[Row]) -> pd.DataFrame:
     text_columns = dict.fromkeys((name for name, kind in COLUMN_TYPES.items() if kind == "str"), "")
-    rows_with_empty_texts = [text_columns | clean_row(row) for row in rows]
-    return pd.DataFrame(rows_with_empty_texts, columns=list(COLUMN_TYPES)).astype(COLUMN_TYPES)
+    return pd.DataFrame(
+        [text_columns | clean_row(row) for row in rows], columns=list(COLUMN_TYPES)
+    ).astype(COLUMN_TYPES)
 
 
 def clean_row(row: Row) -> Row:

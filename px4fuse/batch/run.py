@@ -322,11 +322,12 @@ def _write_table(state: _RunState, logs: Iterable[LogAddress]) -> BatchResult:
                 yield replace_name_by_path(row, log.path_for_table) | common_values
 
     table = make_table(make_complete_rows())
-    page = format_html(table, state.output.resolve().name, f"px4fuse {state.version}")
     contents = {
         state.output / "fleet.parquet": table.to_parquet(index=False),
         state.output / "fleet.csv": format_csv(table),
-        state.output / "fleet.html": page.encode(),
+        state.output / "fleet.html": (
+            format_html(table, state.output.resolve().name, f"px4fuse {state.version}")
+        ).encode(),
     }
     write_output_files(contents)
     return BatchResult(

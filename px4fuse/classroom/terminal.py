@@ -28,8 +28,8 @@ def assignment_page(key: AnswerKey, folder: Path, key_file: Path, written_count:
             f"{name} {number}" for name, number in sorted(flight_count_by_fault.items())
         ),
         "Level": f"difficulty {min(difficulties):.2f} to {max(difficulties):.2f} (easiest "
-        f"{EASIEST_DIFFICULTY:g}, hardest {MAX_FAULT_DIFFICULTY:g}). Difficulty: smallest size that "
-        "px4fuse detects in 19 of 20 flights, divided by the size in the flight.",
+        f"{EASIEST_DIFFICULTY:g}, hardest {MAX_FAULT_DIFFICULTY:g}). Difficulty: smallest size "
+        "that px4fuse detects in 19 of 20 flights, divided by the size in the flight.",
         "Flights": f"{folder_text} ({written_count} logs written, {flight_count - written_count} "
         "existed already)",
         "Answers": f"{key_file_text} (not for students: the file lists the injected faults)",

@@ -27,12 +27,12 @@ from px4fuse.classroom.grading.form_points import (
     find_panels_showing_fault,
 )
 from px4fuse.results.answer_form import (
-    CHOICE_NAMES,
-    CORRECTION_RULES,
+    CHOICE_LETTERS,
     EKF2_BEHAVIOURS,
     FAULT_KINDS,
     NOT_AVAILABLE,
-    PANELS,
+    REPORT_PANELS,
+    UNITS_BY_CORRECTION,
     VERDICTS,
     Answers,
     NamedFault,
@@ -58,7 +58,7 @@ def guess_choices(rng: np.random.Generator, one: CorrectFormAnswers) -> tuple[st
         guess = rng.choice(one.choices[first][0].options)
         fault = next(each for each in FIGURE_ANSWERS_BY_FAULT.values() if each.fault == guess)
         for (choice, _), field in zip(one.choices[first : first + count], QUESTIONS, strict=True):
-            letters.append(CHOICE_NAMES[choice.options.index(getattr(fault, field))])
+            letters.append(CHOICE_LETTERS[choice.options.index(getattr(fault, field))])
     return tuple(letters)
 
 
@@ -69,9 +69,9 @@ def at_random(rng: np.random.Generator, one: CorrectFormAnswers) -> Answers:
     claims = tuple(
         NamedFault(
             str(kind), float(rng.lognormal(-1.0, 1.5)), when="whole flight",
-            parameter=str(rng.choice(list(CORRECTION_RULES))),
+            parameter=str(rng.choice(list(UNITS_BY_CORRECTION))),
             value=float(rng.lognormal(-1.0, 1.5)),
-            panel=str(rng.choice(PANELS)),
+            panel=str(rng.choice(REPORT_PANELS)),
         )
         for kind in kinds
     )  # fmt: skip
@@ -82,7 +82,7 @@ def at_random(rng: np.random.Generator, one: CorrectFormAnswers) -> Answers:
         verdict_ekf2=str(rng.choice(VERDICTS)),  # type: ignore[arg-type]
         ekf2_did=(str(rng.choice(EKF2_BEHAVIOURS)),),
         quantities=tuple(rng.normal(0.0, 0.3, 3).tolist()),
-        choices=tuple(rng.choice(CHOICE_NAMES, len(one.choices)).tolist()),
+        choices=tuple(rng.choice(CHOICE_LETTERS, len(one.choices)).tolist()),
     )
 
 

@@ -61,8 +61,10 @@ def simulate_assigned_flight(
     log = flights.to_ulog(simulation, is_assessed=True)
     sha256 = hashlib.sha256(log).hexdigest()
     true_values = flights.make_answer_key(simulation)["truth"]
-    choices = select_choices(partial(draw_uniform, secret, student.student_id, kind))
-    form_answers = replace(compute_form_answers(simulation, sha256), choices=choices)
+    form_answers = replace(
+        compute_form_answers(simulation, sha256),
+        choices=select_choices(partial(draw_uniform, secret, student.student_id, kind)),
+    )
     return log, CorrectAnswers(
         student_id=student.student_id,
         name=student.name,
@@ -168,8 +170,9 @@ def write_assignment(
         }
         figures_file = folder / Path(student.log_file_name).with_suffix(".png")
         if not figures_file.exists():
-            draw_number = partial(draw_uniform, secret, student.student_id, kind)
-            missing_content_by_path[figures_file] = draw_figures(draw_number)
+            missing_content_by_path[figures_file] = draw_figures(
+                partial(draw_uniform, secret, student.student_id, kind)
+            )
         key = AnswerKey(kind, tuple(answers.values()), stored_secret)
         # the secret must be stored before the log: a restart after an interruption needs it
         write_output_files({key_file: format_answer_key(key).encode()})

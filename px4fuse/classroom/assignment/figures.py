@@ -15,7 +15,7 @@ from px4fuse.comparison.model import FILTER_NAMES, AxisComparison, Comparison, F
 from px4fuse.core.record import Record, read_toml
 from px4fuse.flight.model import Ekf2, Truth
 from px4fuse.report import panels, style
-from px4fuse.results.answer_form import CHOICE_NAMES, Choice, ChoiceName
+from px4fuse.results.answer_form import CHOICE_LETTERS, Choice, ChoiceLetter
 from px4fuse.simulation import flights
 from px4fuse.simulation.faults import parse_faults
 from px4fuse.simulation.scenario import make_scenario
@@ -77,7 +77,7 @@ def _select_fault_kinds(draw_number: Callable[[str], float]) -> dict[str, str]:
     return {f"Figure {number}": kind for number, kind in enumerate(fault_kinds, start=1)}
 
 
-def select_choices(draw_number: Callable[[str], float]) -> tuple[tuple[Choice, ChoiceName], ...]:
+def select_choices(draw_number: Callable[[str], float]) -> tuple[tuple[Choice, ChoiceLetter], ...]:
     """Make the multiple-choice questions about a student's figures, each with its right letter.
 
     ``draw_number`` converts a name, such as "figures fault", to a random number in [0, 1). Equal
@@ -88,14 +88,18 @@ def select_choices(draw_number: Callable[[str], float]) -> tuple[tuple[Choice, C
         other_fault_kinds = _shuffle(
             FIGURE_ANSWERS_BY_FAULT.keys() - {kind}, f"{title} other", draw_number
         )
-        fault_kinds = [kind, *other_fault_kinds[: len(CHOICE_NAMES) - 1]]
+        fault_kinds = [kind, *other_fault_kinds[: len(CHOICE_LETTERS) - 1]]
         for field, question in QUESTIONS.items():
             shuffled_kinds = _shuffle(fault_kinds, f"{title} {field}", draw_number)
             options = tuple(
                 getattr(FIGURE_ANSWERS_BY_FAULT[each], field) for each in shuffled_kinds
             )
-            right_letter = CHOICE_NAMES[shuffled_kinds.index(kind)]
-            choices.append((Choice(f"{title}: {question}", options), right_letter))
+            choices.append(
+                (
+                    Choice(f"{title}: {question}", options),
+                    (CHOICE_LETTERS[shuffled_kinds.index(kind)]),
+                )
+            )
     return tuple(choices)
 
 
@@ -111,10 +115,18 @@ def draw_figures(draw_number: Callable[[str], float]) -> bytes:
             return draw_number(f"{title} {number_name}")
 
         scenario_numbers = draw_scenario_numbers("aisle", draw_figure_number)
-        seed = int(2**53 * draw_figure_number("seed"))
-        scenario = make_scenario("aisle", passes=STRAIGHT_PASS_COUNT, seed=seed, **scenario_numbers)
-        faults = parse_faults(tuple(filter(None, [FIGURE_ANSWERS_BY_FAULT[kind].mistake_option])))
-        comparisons[title] = compare_simulation(flights.simulate(scenario, faults))
+        scenario = make_scenario(
+            "aisle",
+            passes=STRAIGHT_PASS_COUNT,
+            seed=int(2**53 * draw_figure_number("seed")),
+            **scenario_numbers,
+        )
+        comparisons[title] = compare_simulation(
+            flights.simulate(
+                scenario,
+                parse_faults(tuple(filter(None, [FIGURE_ANSWERS_BY_FAULT[kind].mistake_option]))),
+            )
+        )
     return _plot_figures(comparisons)
 
 

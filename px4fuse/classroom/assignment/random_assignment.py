@@ -224,8 +224,9 @@ def assign_random_flight(
         seed=derive_random_bits(secret, student_id, kind, "seed"),
         **draw_scenario_numbers(kind, draw_number),
     )
-    max_difficulty = max(difficulties, default=HARDEST_DIFFICULTY)
-    return AssignedFlight(scenario, tuple(mistake_options), round(max_difficulty, 2))
+    return AssignedFlight(
+        scenario, tuple(mistake_options), round(max(difficulties, default=HARDEST_DIFFICULTY), 2)
+    )
 
 
 def draw_scenario_numbers(

@@ -136,14 +136,13 @@ def read_student(sheet: Sheet, row: Sequence[str]) -> Person | None:
         numbers |= {"canvas": number} if (number := sheet.find_cell(row, ("id",))) else {}
         cells["student_id"] = one_line(sheet.find_cell(row, ("sisuserid",)), MAX_NAME_LENGTH)
     student_id = cells["student_id"] or cells["login"] or cells["email"]
-    submission_time = sheet.find_cell(row, ("lastmodifiedsubmission",))
     person = Person(
         student_id,
         name,
         cells["email"],
         cells["login"],
         numbers,
-        submission_time,
+        sheet.find_cell(row, ("lastmodifiedsubmission",)),
         cells["extended_due"],
     )
     return person if student_id or name or numbers else None
@@ -162,8 +161,9 @@ class ClassList:
                     name: getattr(student, name) or getattr(other_person, name)
                     for name in FIELDS_FROM_OTHER_TABLES
                 }
-                numbers = other_person.numbers | student.numbers
-                self.people[student_index] = replace(student, numbers=numbers, **fields)
+                self.people[student_index] = replace(
+                    student, numbers=other_person.numbers | student.numbers, **fields
+                )
 
     def find_student_index(self, searched_person: Person) -> int | None:
         """Return the index of a person in ``people``; None for an unknown person.

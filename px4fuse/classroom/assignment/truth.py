@@ -25,9 +25,9 @@ from px4fuse.loop.analysis import analyse
 from px4fuse.loop.tracks import LoopSource, trajectory_of
 from px4fuse.request import SIGMA_Z_M, ComparisonRequest
 from px4fuse.results.answer_form import (
-    FURTHER_GATE_UPDATE_COUNT,
+    GATE_QUESTION_FURTHER_UPDATES,
     Choice,
-    ChoiceName,
+    ChoiceLetter,
     FormQuestion,
     select_questions,
 )
@@ -112,7 +112,7 @@ class CorrectFormAnswers(Record):
     ekf2_did: tuple[str, ...]
     ekf2_did_also: tuple[str, ...]
     quantities: tuple[float | tuple[float, ...] | None, ...]
-    choices: tuple[tuple[Choice, ChoiceName], ...] = ()
+    choices: tuple[tuple[Choice, ChoiceLetter], ...] = ()
 
 
 def compute_form_answers(simulation: flights.Simulation, log_sha256: str) -> CorrectFormAnswers:
@@ -188,8 +188,7 @@ def _make_correct_verdict(comparison: Comparison, filter_name: FilterName) -> Co
     filter_summary = comparison.main.filters[filter_name]
     if not isinstance(filter_summary, FilterSummary):
         return CorrectVerdict("")
-    is_consistent = filter_summary.verdict == "consistent"
-    factor = None if is_consistent else filter_summary.sigma_error_factor
+    factor = None if filter_summary.verdict == "consistent" else filter_summary.sigma_error_factor
     return CorrectVerdict(filter_summary.verdict, factor)
 
 
@@ -250,14 +249,16 @@ def compute_numeric_answer(
     nis = updates["innovation_m"] ** 2 / updates["innovation_variance_m2"]
     match question.kind:
         case "gate":
-            is_outside = nis.iloc[: FURTHER_GATE_UPDATE_COUNT + 1] > question.duration_s_or_gate**2
+            is_outside = (
+                nis.iloc[: GATE_QUESTION_FURTHER_UPDATES + 1] > question.question_parameter**2
+            )
             rejected_update_numbers = np.flatnonzero(is_outside) + question.update_number
             return tuple(rejected_update_numbers.astype(float).tolist())
         case "prediction":
             p, f = make_symmetric_matrix(tuple(covariance)), make_transition_matrix(settings.dt_s)
             q = make_symmetric_matrix(compute_unit_process_noise(settings.dt_s))
             q *= settings.sigma_a_m_s2**2 * settings.dt_s
-            for _ in range(round(question.duration_s_or_gate / settings.dt_s)):
+            for _ in range(round(question.question_parameter / settings.dt_s)):
                 p = f @ p @ f.T + q
             return math.sqrt(p[0, 0])
         case "nis":

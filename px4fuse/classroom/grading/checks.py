@@ -230,8 +230,9 @@ class VerificationItem(RubricItem, frozen=True, tag="verified"):
     def score(self, scoring_input: ScoringInput) -> ScoreAndReason:
         verification = scoring_input.verification
         reason_text = format_reason("".join(verification.reasons[:1]))
-        is_verified = verification.status == "verified"
-        return float(is_verified), f"Verification: {verification.status}{reason_text}."
+        return float(
+            verification.status == "verified"
+        ), f"Verification: {verification.status}{reason_text}."
 
 
 class NumberItem(RubricItem, frozen=True, tag="number"):
@@ -395,8 +396,8 @@ class ConsistencyItem(
     """Check that KF is consistent, by the mean NIS of north and east together.
 
     The points decrease to zero if the reported σ is ``factor_at_zero_points`` times too small or
-    too large. A report with SIGMA_A and SIGMA_Z within the 95 % intervals of their estimates gets all
-    points.
+    too large. A report with SIGMA_A and SIGMA_Z within the 95 % intervals of their estimates gets
+    all points.
     """
 
     command: ClassVar[str] = "compare"

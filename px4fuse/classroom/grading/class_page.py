@@ -180,8 +180,11 @@ def _make_grade_details(grade: Grade) -> Iterator[RowSection]:
         f"{other_report.submission}: {other_report.status}" for other_report in grade.other_reports
     ]
     yield frame.make_list_section("Flags", grade.flags, is_warning=True)
-    actions = [report.instructor_action] if report.instructor_action else []
-    yield frame.make_list_section("Required decision of the instructor", actions, is_warning=True)
+    yield frame.make_list_section(
+        "Required decision of the instructor",
+        [report.instructor_action] if report.instructor_action else [],
+        is_warning=True,
+    )
     yield frame.make_list_section("Verification", verification.reasons)
     yield frame.make_table_section(
         "Numbers that differ in the new run", differences, ("Value", "Report", "New run")
@@ -212,8 +215,11 @@ def _make_points_cell(grade: Grade) -> Cell:
     notes += ["changed by instructor"] * any(
         override.points is not None for override in grade.overrides.values()
     )
-    text = f"{format_cell_number(grade.total)} / {format_cell_number(grade.max_points)}"
-    return Cell(text, grade.total, ", ".join(notes))
+    return Cell(
+        f"{format_cell_number(grade.total)} / {format_cell_number(grade.max_points)}",
+        grade.total,
+        ", ".join(notes),
+    )
 
 
 def _make_points_inputs(grade: Grade) -> RowSection:

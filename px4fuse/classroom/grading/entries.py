@@ -355,9 +355,9 @@ def _choose_counted_report(candidates: Sequence[CandidateReport], course: Course
             and sort_key >= chosen_sort_key
             and (report.instructor_action or not report.version)
         ):
-            status = "pending" if report.version else "no report"
+            status = "pending" if report.version else "not a report"
             flags.append(
-                f"The file {one_line(report.submission, 80)} does not count: its status is {status}."
+                f"The file {one_line(report.submission, 80)} does not count: it is {status}."
             )
     return replace(
         grade, counted_report=chosen_report, other_reports=other_reports, flags=tuple(flags)
@@ -428,8 +428,10 @@ def read_overrides(path: Path) -> OverridesByStudent:
         title for title in OVERRIDE_TITLES if sheet.find_column_index((title,)) is None
     ]
     if missing_titles:
-        remedy = f"Required columns: {', '.join(OVERRIDE_TITLES)}."
-        raise SettingsError(f"{path}: no column {', '.join(missing_titles)}.", remedy)
+        raise SettingsError(
+            f"{path}: no column {', '.join(missing_titles)}.",
+            f"Required columns: {', '.join(OVERRIDE_TITLES)}.",
+        )
     overrides: dict[str, dict[str, GradeOverride]] = defaultdict(dict)
     for row_number, row in enumerate(sheet.rows, start=2):
         if any(cell.strip() for cell in row[len(sheet.column_titles) :]):

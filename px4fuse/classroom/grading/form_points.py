@@ -18,13 +18,13 @@ from px4fuse.classroom.assignment.truth import CorrectFormAnswers, InjectedFault
 from px4fuse.classroom.grading.model import ItemScore
 from px4fuse.core.record import read_toml
 from px4fuse.results.answer_form import (
-    CHOICE_NAMES,
+    CHOICE_LETTERS,
     FAULT_KINDS,
     NO_FAULT_KIND,
     NOT_AVAILABLE,
     Answers,
     NamedFault,
-    QuantityAnswer,
+    NumericAnswer,
     select_questions,
 )
 
@@ -169,7 +169,8 @@ def _describe_fault_answers(
 ) -> Iterator[str]:
     """Yield feedback on each injected fault, and on named faults that the flight does not have."""
     if not matches:
-        yield f"your flight has no injected fault{', as your form states' * has_recognised_fault_free_flight}"
+        form_text = ", as your form states" * has_recognised_fault_free_flight
+        yield f"your flight has no injected fault{form_text}"
     for fault, named_fault, _ in matches:
         fault_text = f"{fault.kind} ({FAULT_KINDS[fault.kind].description})"
         right_answer = describe_right_answer(fault)
@@ -251,9 +252,8 @@ def _match_faults(
         if score and kind not in match_by_kind and named_fault in unmatched_faults:
             match_by_kind[kind] = named_fault, score
             unmatched_faults.remove(named_fault)
-    no_match = (None, 0.0)
     matches = [
-        (fault, *match_by_kind.get(fault.kind, no_match)) for fault in right_answers.mistakes
+        (fault, *match_by_kind.get(fault.kind, (None, 0.0))) for fault in right_answers.mistakes
     ]
     return matches, unmatched_faults
 
@@ -296,7 +296,7 @@ def score_fault_size(fault: InjectedFault, named_fault: NamedFault) -> float:
     - 1/3: only the sign is wrong, or the size is right but the student named another fault.
     - Faults in GUESSABLE_FAULT_KINDS: outside the tolerance, the score decreases to 0.
     """
-    stated_size = named_fault.convert_size_to_first_unit()
+    stated_size = named_fault.convert_size_to_standard_unit()
     if fault.size is None or fault.low is None or fault.high is None or stated_size is None:
         return 0.0
     if named_fault.kind != fault.kind:
@@ -333,15 +333,17 @@ def score_evidence(fault: InjectedFault, named_fault: NamedFault) -> float:
 
 
 def find_panels_showing_fault(fault_kind: str) -> list[str]:
-    fault_kinds_by_panel = POINTS_CONFIG["shows"].items()
-    return [*(panel for panel, kinds in fault_kinds_by_panel if fault_kind in kinds), "cover"]
+    return [
+        *(panel for panel, kinds in POINTS_CONFIG["shows"].items() if fault_kind in kinds),
+        "cover",
+    ]
 
 
 def score_correction(
     fault: InjectedFault, named_fault: NamedFault, right_answers: CorrectFormAnswers
 ) -> float:
     """Return the score for the parameter that corrects a fault, and for the parameter's value."""
-    stated_value = named_fault.convert_value_to_first_unit()
+    stated_value = named_fault.convert_value_to_standard_unit()
     scores = [
         score
         if (low, high) == NO_BOUNDS
@@ -356,7 +358,7 @@ def score_correction(
 def _score_number_in_range(
     value: float, low: float, high: float, score_outside_range: float
 ) -> float:
-    """Return 1 within the bounds, 1/3 if only the sign is wrong, and else ``score_outside_range``."""
+    """Return 1 within the range, 1/3 if only the sign is wrong, or ``score_outside_range``."""
     if low <= value <= high:
         return 1.0
     return 1.0 / 3.0 if low <= -value <= high else score_outside_range
@@ -422,11 +424,14 @@ def _score_ekf2_behaviour(answers: Answers, right_answers: CorrectFormAnswers) -
 
 def _score_choices(answers: Answers, right_answers: CorrectFormAnswers) -> float:
     """Return the mean score of the multiple-choice questions; random answers give 0 on average."""
-    wrong_choice_points = -1.0 / (len(CHOICE_NAMES) - 1)
-    right_letters = (right_letter for _, right_letter in right_answers.choices)
+    wrong_choice_points = -1.0 / (len(CHOICE_LETTERS) - 1)
     points = (
         1.0 if letter == right_letter else wrong_choice_points
-        for letter, right_letter in zip(answers.choices, right_letters, strict=False)
+        for letter, right_letter in zip(
+            answers.choices,
+            (right_letter for _, right_letter in right_answers.choices),
+            strict=False,
+        )
         if letter
     )
     return sum(points) / len(right_answers.choices)
@@ -436,13 +441,13 @@ def _score_numbers(answers: Answers, right_answers: CorrectFormAnswers) -> float
     """Return the mean score for the numbers that the student computed with KF."""
     # an empty list as right answer is not scored, because it could be guessed
     scored_number_count = sum(value not in (None, ()) for value in right_answers.quantities)
-    given_and_right_numbers = zip(answers.quantities, right_answers.quantities, strict=False)
-    return sum(_score_number(*pair) for pair in given_and_right_numbers) / max(
-        scored_number_count, 1
-    )
+    return sum(
+        _score_number(*pair)
+        for pair in zip(answers.quantities, right_answers.quantities, strict=False)
+    ) / max(scored_number_count, 1)
 
 
-def _score_number(answer: QuantityAnswer, right_answer: QuantityAnswer) -> float:
+def _score_number(answer: NumericAnswer, right_answer: NumericAnswer) -> float:
     if isinstance(right_answer, tuple) and answer is not None:
         answer = answer if isinstance(answer, tuple) else (answer,)
         difference_count = len(set(answer) ^ set(right_answer))

@@ -225,5 +225,6 @@ def list_titles(grades: Sequence[Grade]) -> tuple[tuple[str, ...], tuple[str, ..
     """Return the column titles of the rubric items, and of the numbers from the reports."""
     reports = counted_reports(grades)
     item_titles = dict.fromkeys(item.title for report in reports for item in report.items)
-    number_titles = dict.fromkeys(title for report in reports for title in report.numbers)
-    return tuple(item_titles), tuple(number_titles)
+    return tuple(item_titles), tuple(
+        dict.fromkeys(title for report in reports for title in report.numbers)
+    )

@@ -8,7 +8,7 @@ from px4fuse.classroom.assignment.truth import CorrectFormAnswers
 from px4fuse.classroom.grading.form_points import describe_right_answer, find_panels_showing_fault
 from px4fuse.classroom.grading.model import Grade
 from px4fuse.core.text import one_line
-from px4fuse.results.answer_form import FAULT_KINDS, NO_FAULT_KIND, PANELS, Answers
+from px4fuse.results.answer_form import FAULT_KINDS, NO_FAULT_KIND, REPORT_PANELS, Answers
 
 # Question to the student, and expected answer
 QuestionAndAnswer = tuple[str, str]
@@ -43,8 +43,8 @@ def ask_about_form(
         yield (
             f"You named {kind} ({FAULT_KINDS[kind].description}). Which plot would show this "
             "fault, and does this plot in your report show the fault?",
-            f"{kind} would be visible in {' or '.join(find_panels_showing_fault(kind))}. The plots do "
-            f"not show {kind}, because the injected fault of the flight is: {true_faults_text}.",
+            f"{kind} would be visible in {' or '.join(find_panels_showing_fault(kind))}. The plots "
+            f"do not show {kind}, because the injected fault of the flight is: {true_faults_text}.",
         )
     for fault in right_answers.mistakes:
         description = FAULT_KINDS[fault.kind].description
@@ -56,7 +56,7 @@ def ask_about_form(
             )
             continue
         other_panels = [
-            panel for panel in PANELS if panel not in find_panels_showing_fault(fault.kind)
+            panel for panel in REPORT_PANELS if panel not in find_panels_showing_fault(fault.kind)
         ]
         yield (
             f"You named {fault.kind} ({description}). Show this fault in a plot of your report. "

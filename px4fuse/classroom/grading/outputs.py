@@ -140,8 +140,9 @@ def write_grading_files(
     if course.anonymous:
         page_grades, pseudonym_csv = _anonymise_grades(page_grades, output / PSEUDONYMS_FILE)
         contents[PSEUDONYMS_FILE] = pseudonym_csv.encode()
-    version_text = f"px4fuse {metadata.version('px4fuse')}"
-    contents["class.html"] = format_class_page(page_grades, class_title, version_text).encode()
+    contents["class.html"] = format_class_page(
+        page_grades, class_title, f"px4fuse {metadata.version('px4fuse')}"
+    ).encode()
     if course.question_count and course.key is not None:
         text = format_questions(grades, course.key, course.question_count)
         contents[QUESTIONS_FILE] = text.encode()
@@ -226,8 +227,9 @@ def _anonymise_grades(grades: Sequence[Grade], path: Path) -> tuple[list[Grade],
         anonymise_grade(grade, pseudonym_and_name_by_identity[_identify_student(grade)][0])
         for grade in grades
     ]
-    pseudonym_csv = _format_csv(PSEUDONYM_TITLES, rows)
-    return sorted(anonymous_grades, key=lambda grade: grade.student), pseudonym_csv
+    return sorted(anonymous_grades, key=lambda grade: grade.student), (
+        _format_csv(PSEUDONYM_TITLES, rows)
+    )
 
 
 def anonymise_grade(grade: Grade, pseudonym: str) -> Grade:

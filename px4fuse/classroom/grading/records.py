@@ -158,8 +158,9 @@ def _load_record(
 ) -> tuple[ReportedResults, Verification] | None:
     """Load an earlier result; None without a result, or after a change of libraries or files."""
     try:
-        content = (records_folder / f"{sha256}.json").read_bytes()
-        record = msgspec.json.decode(content, type=VerificationRecord)
+        record = msgspec.json.decode(
+            (records_folder / f"{sha256}.json").read_bytes(), type=VerificationRecord
+        )
         if record.versions_and_files != _collect_versions_and_files(
             record.results, path_by_sha256, assigned_hashes
         ):

@@ -85,7 +85,7 @@ class Rubric(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=Tr
         for title, unique_title in zip(titles, make_unique(titles), strict=True):
             if title != unique_title:
                 raise ValueError(
-                    f"the title {title!r} is not unique or is reserved. Give each item its own title"
+                    f"the title {title!r} is not unique or is reserved. Give the item another title"
                 )
 
 

@@ -134,8 +134,9 @@ def find_submissions(paths: Sequence[Path]) -> tuple[tuple[Submission, ...], tup
                 ignored_names.append(_shorten_name(submission.name))
             else:
                 try:
-                    text = read_submission(submission).decode("utf-8", errors="replace")
-                    origin_by_submission_number |= read_gradescope_metadata(text)
+                    origin_by_submission_number |= read_gradescope_metadata(
+                        read_submission(submission).decode("utf-8", errors="replace")
+                    )
                 except ResultsError as error:
                     notes.append(str(error))
     if ignored_names:
@@ -168,10 +169,10 @@ def add_submitters(
 ) -> Iterator[Submission]:
     """Add student and learning platform, found in the file names, to submissions.
 
-    The platform of a zip file or folder is the platform whose pattern matches most file names. Files
-    with names of another platform are not assigned to a student, because a student may have chosen
-    these names. ``origin_by_submission_number`` contains students and times from the metadata of
-    Gradescope. They replace the students and times in file names.
+    The platform of a zip file or folder is the platform whose pattern matches most file names. A
+    file with a name of another platform is not assigned to a student, because a student may have
+    chosen this name. ``origin_by_submission_number`` contains students and times from the metadata
+    of Gradescope. They replace the students and times in file names.
     """
     export_names = [
         submission.file if submission.zip_entry else submission.name.partition("/")[0]
@@ -288,7 +289,7 @@ def _list_folder_submissions(path: Path, notes: list[str]) -> Iterator[Submissio
     if not path.is_dir():
         raise SettingsError(f"{one_line(str(path), MAX_NAME_LENGTH)} is not a file or folder.")
     root = path.resolve()
-    ignored_file_count = 0
+    ignored_count = 0
     for file in files_below(root):  # symbolic links to folders are not entered
         name = file.relative_to(root)
         if any(map(_is_hidden, name.parts)):
@@ -301,10 +302,10 @@ def _list_folder_submissions(path: Path, notes: list[str]) -> Iterator[Submissio
             is_inside = False
         if is_inside:
             yield Submission(resolved_path, "", name.as_posix())
-        ignored_file_count += not is_inside
-    if ignored_file_count:
+        ignored_count += not is_inside
+    if ignored_count:
         notes.append(
-            f"{one_line(path.name, MAX_NAME_LENGTH)}: {ignored_file_count} links out of the folder, "
+            f"{one_line(path.name, MAX_NAME_LENGTH)}: {ignored_count} links out of the folder, "
             "special files or unreadable folders were ignored."
         )
 
