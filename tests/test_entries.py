@@ -145,7 +145,7 @@ def test_grade_ignores_other_file_submitted_beside_a_report() -> None:
              blackboard("ada", "20-10-00-00"): essay}  # fmt: skip
     (ada, _), _ = make_grades(files)
     assert ada.total == 4.0
-    assert "status: no report" in ada.flags[0]
+    assert "it is not a report" in ada.flags[0]
     (ada, _), _ = make_grades({blackboard("ada", "20-10-00-00"): essay})
     assert ada.total == 0.0
 
