@@ -66,7 +66,7 @@ _compare_log = job._compare_log
 
 
 def _compare_cached(work: job.Job, path: Path, sha256: str) -> job.LogOutcome:
-    known = repr((path.name, sha256, work.request, work.with_report))
+    known = repr((path.name, sha256, work.request, work.writes_report))
     kept = Path(os.environ[MEMORY]) / hashlib.sha256(known.encode()).hexdigest()
     if not kept.is_file():
         outcome = _compare_log(work, path, sha256)

@@ -42,7 +42,9 @@ def skip_verification(monkeypatch) -> list[str]:
         return VERIFIED if log_sha256(results) in logs else verify(results, pdf, logs)
 
     monkeypatch.setattr(records, "verify", verify_by_log)
-    monkeypatch.setattr(records, "repeat_with_diagnosis", lambda results, _: (results, b""))
+    monkeypatch.setattr(
+        records, "repeat_analysis_with_diagnosis", lambda results, _: (results, b"")
+    )
     in_this_process(monkeypatch)
     return verified_ids
 

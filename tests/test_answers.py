@@ -51,11 +51,13 @@ def test_read_answer_form_returns_filled_in_values(tmp_path: Path) -> None:
     text = text.replace('unit = ""', 'unit = "rad"', 1).replace('q2 = ""', "q2 = [3, 7]")
     found = read(tmp_path, text.replace('verdict_kf = ""', 'verdict_kf = "underconfident"'))
     (claim,) = found.mistakes
-    assert claim.convert_size_to_first_unit() == pytest.approx(-21.03, abs=0.01)
+    assert claim.convert_size_to_standard_unit() == pytest.approx(-21.03, abs=0.01)
     assert found.quantities[1] == (3.0, 7.0)
     assert found.verdict_kf == "underconfident"
-    assert NamedFault("scale", 1.14, "factor").convert_size_to_first_unit() == pytest.approx(14.0)
-    assert NamedFault("clock-offset", 200.0, "ms").convert_size_to_first_unit() == pytest.approx(
+    assert NamedFault("scale", 1.14, "factor").convert_size_to_standard_unit() == pytest.approx(
+        14.0
+    )
+    assert NamedFault("clock-offset", 200.0, "ms").convert_size_to_standard_unit() == pytest.approx(
         0.2
     )
 
@@ -126,7 +128,7 @@ def test_right_answer_for_predicted_sigma_equals_closed_form() -> None:
     at = run.updates.index[quantity.update_number - 1]
     p0, p1, p2 = run.steps.loc[at, ["position_variance_m2", "covariance_m2_s",
                                     "velocity_variance_m2_s2"]]  # fmt: skip
-    dt, n = settings.dt_s, round(quantity.duration_s_or_gate / settings.dt_s)
+    dt, n = settings.dt_s, round(quantity.question_parameter / settings.dt_s)
     t = n * dt
     # the acceleration of a step moves the position by dt²/2, and by dt² in each later step
     lags = dt * (np.arange(n) + 0.5)

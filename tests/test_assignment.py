@@ -24,12 +24,12 @@ from px4fuse.classroom.assignment.assignment import (
 from px4fuse.classroom.assignment.key import AnswerKey, format_answer_key, read_answer_key
 from px4fuse.classroom.assignment.random_assignment import (
     EASIEST_DIFFICULTY,
-    FAULT_COUNT_FRACTIONS,
+    FLIGHT_RULES_BY_KIND,
+    HARD_FAULTS_PROBABILITY,
     HARDEST_DIFFICULTY,
-    LOOP_FLIGHT_FRACTION,
+    LOOP_PROBABILITY,
     MAX_FAULT_DIFFICULTY,
-    SAMPLING_RULES_BY_KIND,
-    UNDETECTABLE_FLIGHT_FRACTION,
+    PROBABILITY_BY_FAULT_COUNT,
     assign_random_flight,
     derive_hmac_key,
 )
@@ -55,9 +55,7 @@ FINDINGS = {
     "ekf2-gate": "ekf2_rejects_positions", "ekf2-delay": "ekf2_ev_delay_wrong",
     "ekf2-off": "ekf2_not_fusing", "open-end": "false_loop_closure",
 }  # fmt: skip
-CHOICE = {
-    choice.name: choice for rules in SAMPLING_RULES_BY_KIND.values() for choice in rules.faults
-}
+CHOICE = {choice.name: choice for rules in FLIGHT_RULES_BY_KIND.values() for choice in rules.faults}
 
 
 def choices_of(drawn):
@@ -125,16 +123,16 @@ class TestDraw:
     @pytest.mark.parametrize("kind", ["aisle", "loop"])
     def test_simulated_assignments_contain_configured_fault_count(self, kind):
         flights = [assign_random_flight(SECRET, f"s{n}", kind) for n in range(1000)]
-        for count, share in enumerate(FAULT_COUNT_FRACTIONS[kind]):
+        for count, share in enumerate(PROBABILITY_BY_FAULT_COUNT[kind]):
             found = sum(len(one.mistake_options) == count for one in flights) / 1000
             assert found == pytest.approx(share, abs=0.05)
         names = {choice.name for one in flights for choice in choices_of(one)}
-        assert names == {choice.name for choice in SAMPLING_RULES_BY_KIND[kind].faults}
+        assert names == {choice.name for choice in FLIGHT_RULES_BY_KIND[kind].faults}
 
     def test_mixed_assignment_contains_straight_and_loop_flights(self):
         mixed = [assign_random_flight(SECRET, f"s{n}", "mixed") for n in range(1000)]
         kinds = Counter(one.scenario.kind for one in mixed)
-        assert kinds["loop"] / 1000 == pytest.approx(LOOP_FLIGHT_FRACTION, abs=0.05)
+        assert kinds["loop"] / 1000 == pytest.approx(LOOP_PROBABILITY, abs=0.05)
         assert all(
             one == assign_random_flight(SECRET, f"s{n}", one.scenario.kind)
             for n, one in enumerate(mixed)
@@ -150,22 +148,20 @@ class TestDraw:
             parse_faults(drawn.mistake_options)
             ratios = [EASIEST_DIFFICULTY]
             for choice, text in zip(choices_of(drawn), drawn.mistake_options, strict=True):
-                if choice.detectable_size is None:
+                if choice.detection_limit is None:
                     assert text == choice.name
                     continue
                 size = float(re.search(r"=([-+]?[\d.]+)", text)[1])
                 signs[choice.name, size > 0] += 1
-                ratio = choice.detectable_size / abs(size)
-                ratios.append(1.0 / ratio if choice.is_smaller_easier else ratio)
-                if choice.start_range_s is not None:
+                ratio = choice.detection_limit / abs(size)
+                ratios.append(1.0 / ratio if choice.is_smaller_size_easier_to_detect else ratio)
+                if choice.fault_start_range_s is not None:
                     at = float(text.rpartition(",")[2].removesuffix("s"))
-                    assert choice.start_range_s[0] <= at <= choice.start_range_s[1]
+                    assert choice.fault_start_range_s[0] <= at <= choice.fault_start_range_s[1]
             assert drawn.difficulty == pytest.approx(max(ratios), abs=0.011)
             assert EASIEST_DIFFICULTY <= drawn.difficulty <= MAX_FAULT_DIFFICULTY
         both = {
-            choice.name
-            for choice in SAMPLING_RULES_BY_KIND["aisle"].faults
-            if choice.has_either_sign
+            choice.name for choice in FLIGHT_RULES_BY_KIND["aisle"].faults if choice.has_either_sign
         }
         assert {name for name, positive in signs if not positive} == both
 
@@ -174,30 +170,34 @@ class TestDraw:
         table = rates()
         table = table[~table.condition.str.contains("outdoor")]
         for choice in (
-            choice for rules in SAMPLING_RULES_BY_KIND.values() for choice in rules.faults
+            choice for rules in FLIGHT_RULES_BY_KIND.values() for choice in rules.faults
         ):
             plain = re.compile(rf"--mistake {choice.name}(=([\d.]+)\D*)?$")
             rows = table[(table.finding == FINDINGS[choice.name]) & (table.flights >= 10)]
             matches = ((plain.search(row.condition), row) for row in rows.itertuples())
             sizes = {float(match[2] or 0.0): row for match, row in matches if match}
             found = {size: row for size, row in sizes.items() if row.rate >= 0.95}
-            if choice.detectable_size is None:
+            if choice.detection_limit is None:
                 assert list(found) == [0.0]
                 continue
-            assert choice.detectable_size == (max if choice.is_smaller_easier else min)(found)
-            assert found[choice.detectable_size].flights >= 20
+            assert choice.detection_limit == (
+                max if choice.is_smaller_size_easier_to_detect else min
+            )(found)
+            assert found[choice.detection_limit].flights >= 20
             # each larger size is found, too
-            larger = [s for s in sizes if (s < choice.detectable_size) == choice.is_smaller_easier]
-            assert set(larger) <= {choice.detectable_size, *found}
+            larger = [
+                s
+                for s in sizes
+                if (s < choice.detection_limit) == choice.is_smaller_size_easier_to_detect
+            ]
+            assert set(larger) <= {choice.detection_limit, *found}
 
     def test_assignment_difficulties_cover_range_from_easy_to_hard(self):
         each = [assign_random_flight(SECRET, f"s{n}", "loop", 1).difficulty for n in range(500)]
         counts, _ = np.histogram(each, bins=4, range=(EASIEST_DIFFICULTY, HARDEST_DIFFICULTY))
         assert counts.min() > 65
         undetectable_count = sum(one > HARDEST_DIFFICULTY for one in each)
-        assert undetectable_count / len(each) == pytest.approx(
-            UNDETECTABLE_FLIGHT_FRACTION, abs=0.06
-        )
+        assert undetectable_count / len(each) == pytest.approx(HARD_FAULTS_PROBABILITY, abs=0.06)
 
     def test_assignment_flight_seeds_have_128_bits(self):
         seeds = [assign_random_flight(SECRET, f"s{n}", "aisle").scenario.seed for n in range(50)]

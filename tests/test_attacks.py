@@ -28,7 +28,7 @@ from forgery import (
 )
 from results_tools import LOOP, changed_results, decode_results
 
-from px4fuse.classroom.assignment.key import AnswerKey, RightAnswers
+from px4fuse.classroom.assignment.key import AnswerKey, CorrectAnswers
 from px4fuse.classroom.assignment.truth import compute_form_answers
 from px4fuse.classroom.grading.model import GradedReport
 from px4fuse.classroom.grading.rubric import (
@@ -131,10 +131,10 @@ def flight(tmp_path_factory: pytest.TempPathFactory) -> Flight:
     (sha256,) = honest.files
     truth = compute_form_answers(simulation, sha256)
     answers = (
-        RightAnswers(
+        CorrectAnswers(
             "s01", "Ada", "s01.ulg", sha256, {}, FAULT_TYPES, {"duration_s": 70.0}, None, truth
         ),
-        RightAnswers("s02", "Bob", "s02.ulg", "b" * 64),
+        CorrectAnswers("s02", "Bob", "s02.ulg", "b" * 64),
     )
     return Flight(honest, AnswerKey("aisle", answers))
 
@@ -342,7 +342,7 @@ def grade_loop(truth: Any, request: dict[str, Any], loop: dict[str, Any]) -> Gra
     values |= {f"loop__{name}": value for name, value in loop.items()}
     results = decode_results(changed_results(LOOP, student__id="s01", **values))
     key = truth and AnswerKey(
-        "loop", (RightAnswers("s01", "", "", LOOP["track"]["sha256"], *truth),)
+        "loop", (CorrectAnswers("s01", "", "", LOOP["track"]["sha256"], *truth),)
     )
     verdict = Verification("verified", (), True, page_status="same")
     made = score_report(results, verdict, read_rubric(None), key)

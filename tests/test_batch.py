@@ -404,7 +404,7 @@ def test_find_logs_accepts_folders_globs_and_urls(tmp_path, monkeypatch):
         path = tmp_path / name
         path.parent.mkdir(parents=True, exist_ok=True)
         path.write_bytes(b"12345")
-    assert [(log.name, log.table_path) for log in find_logs(["logs"])] == [
+    assert [(log.name, log.path_for_table) for log in find_logs(["logs"])] == [
         ("a.TLOG", "logs/deep/a.TLOG"), ("b.ulg", "logs/b.ulg"), ("d[1].ulg", "logs/d[1].ulg"),
         ("e.ULG.gz", "logs/e.ULG.gz"),
     ]  # fmt: skip
@@ -415,7 +415,7 @@ def test_find_logs_accepts_folders_globs_and_urls(tmp_path, monkeypatch):
     memory = fsspec.filesystem("memory")
     memory.pipe("/fleet/x.ulg", tiny_log(3))
     (log,) = find_logs(["memory://fleet"])
-    assert (log.name, log.table_path) == ("x.ulg", "memory:///fleet/x.ulg")
+    assert (log.name, log.path_for_table) == ("x.ulg", "memory:///fleet/x.ulg")
     found = analysed(log.address)
     assert {(row["name"], row["log_sha256"]) for row in found.rows} == {("x.ulg", found.sha256)}
     (small,) = analysed(log.address, max_bytes=10).rows

@@ -16,7 +16,7 @@ from golden_tools import assert_matches_golden, of_values
 from hypothesis import given
 from hypothesis import strategies as st
 
-from px4fuse.classroom.grading.class_page import count_by_bin, format_class_page
+from px4fuse.classroom.grading.class_page import compute_histogram, format_class_page
 from px4fuse.classroom.grading.model import Grade, GradedReport, GradeOverride, ItemScore
 from px4fuse.classroom.grading.outputs import anonymise_grade
 from px4fuse.html.safe import MAX_TEXT_LENGTH
@@ -68,7 +68,7 @@ CLASS = (
         id="1007",
         numbers={"mean NIS": 1.02},
         redrawn_report_path="reports/1007.pdf",
-        is_found_by_fault={"positions that jump": True},
+        did_student_name_fault={"positions that jump": True},
     ),
     row(
         "ada",
@@ -76,7 +76,7 @@ CLASS = (
         id="1001",
         status="numbers differ",
         flags=("The same log as Zoë.",),
-        is_found_by_fault={"positions that jump": False, "outliers": False},
+        did_student_name_fault={"positions that jump": False, "outliers": False},
         lateness_s=7200.0,
         deducted_points=1.0,
     ),
@@ -94,7 +94,7 @@ CLASS = (
         numbers={MARKUP: 1.0},
         instructor_action=MARKUP,
         form=FORM,
-        is_found_by_fault={MARKUP: False},
+        did_student_name_fault={MARKUP: False},
         redrawn_report_path="javascript:alert(1)",
         comment=BREAKOUT,
         items=(
@@ -133,7 +133,7 @@ def test_grades_page_escapes_html_in_student_text(text: str) -> None:
             word, 5.0, id=word, file=f"{word}.pdf", flags=(word,), reasons=(word,),
             notes=f"So: {word}",
             numbers={word: 1.0}, items=(ItemScore(word, 5.0, 20.0, word),),
-            is_found_by_fault={word: False},
+            did_student_name_fault={word: False},
             instructor_action=word, form=FORM, comment=word,
         )  # fmt: skip
         return format_class_page([one], word, word)
@@ -191,7 +191,7 @@ def anonymous_class() -> list[Grade]:
             instructor_action=said,
             notes=f"{name} ({student_id}): {SAYS} 王小明", form=FORM,
             numbers={"mean NIS": 1.0}, items=(ItemScore("Settings", 9.0, 20.0, said),),
-            is_found_by_fault={"positions that jump": False}, comment=said,
+            did_student_name_fault={"positions that jump": False}, comment=said,
             overrides={"Settings": GradeOverride(10.0, said)},
             other_reports=(graded(name, 3.0, file=f"old/{file}"),),
             redrawn_report_path=f"reports/{student_id}.pdf", sha256="ab" * 32,
@@ -215,7 +215,7 @@ def test_grades_page_in_anonymous_mode_contains_no_names() -> None:
     assert [
         "list",
         "Injected faults of this flight",
-        ["positions that jump: not named in the answer form"],
+        ["positions that jump: the student did not name this fault"],
         False,
     ] in parts
     # no text of students, no link to a PDF, no input boxes without an owner
@@ -302,7 +302,7 @@ def test_grades_page_links_report_redrawn_from_the_log() -> None:
 
 
 def test_points_histogram_has_counts_and_lower_bin_edges() -> None:
-    assert count_by_bin([0, 5, 5.5, 9, 99], 10) == [
+    assert compute_histogram([0, 5, 5.5, 9, 99], 10) == [
         (count, f"{edge}") for edge, count in enumerate((1, 0, 0, 0, 0, 2, 0, 0, 0, 2))
     ]
 

@@ -14,8 +14,8 @@ from hypothesis import strategies as st
 
 from px4fuse.classroom.grading.model import Grade, GradedReport, ItemScore
 from px4fuse.classroom.grading.outputs import (
-    FIRST_COLUMN_TITLES,
-    LAST_COLUMN_TITLES,
+    TITLES_AFTER_ITEMS,
+    TITLES_BEFORE_ITEMS,
     format_class_table,
 )
 from px4fuse.core.spreadsheet import MAX_CELL_LENGTH, neutralise_formulas
@@ -82,8 +82,8 @@ def test_grades_csv_escapes_cells_that_start_like_formulas(
     rows: list[tuple[str, dict[str, float]]],
 ) -> None:
     head, *rest = cells(format_class_table([graded(text, numbers) for text, numbers in rows]))
-    assert tuple(head[: len(FIRST_COLUMN_TITLES)]) == FIRST_COLUMN_TITLES
-    assert tuple(head[-len(LAST_COLUMN_TITLES) :]) == LAST_COLUMN_TITLES
+    assert tuple(head[: len(TITLES_BEFORE_ITEMS)]) == TITLES_BEFORE_ITEMS
+    assert tuple(head[-len(TITLES_AFTER_ITEMS) :]) == TITLES_AFTER_ITEMS
     assert len(rest) == len(rows)
     for (text, numbers), row in zip(rows, rest, strict=True):
         assert len(row) == len(head)
@@ -96,7 +96,7 @@ def test_grades_csv_escapes_cells_that_start_like_formulas(
             "",
             "1",
         ]
-        assert row[: len(FIRST_COLUMN_TITLES)] == said
+        assert row[: len(TITLES_BEFORE_ITEMS)] == said
         both = neutralise_formulas(f"{text} | {text}")
         said = [
             neutralise_formulas(text),
@@ -108,9 +108,9 @@ def test_grades_csv_escapes_cells_that_start_like_formulas(
             both,
             "ab" * 32,
         ]
-        assert row[-len(LAST_COLUMN_TITLES) :] == said
+        assert row[-len(TITLES_AFTER_ITEMS) :] == said
         found = sorted(
-            float(cell) for cell in row[len(FIRST_COLUMN_TITLES) : -len(LAST_COLUMN_TITLES)] if cell
+            float(cell) for cell in row[len(TITLES_BEFORE_ITEMS) : -len(TITLES_AFTER_ITEMS)] if cell
         )
         assert found == pytest.approx(sorted([*numbers.values(), 1.0]), rel=1e-9, abs=1e-300)
 
@@ -137,7 +137,7 @@ def test_grades_csv_begins_with_bom_and_has_crlf_line_ends() -> None:
     assert made.encode().startswith(b"\xef\xbb\xbffile,student,")
     assert made.count("\r\n") == made.count("\n") == 2
     (_, row) = cells(made)
-    assert row[len(FIRST_COLUMN_TITLES) : -len(LAST_COLUMN_TITLES)] == ["0.3", ""]
+    assert row[len(TITLES_BEFORE_ITEMS) : -len(TITLES_AFTER_ITEMS)] == ["0.3", ""]
 
 
 def test_grades_csv_lists_late_and_missing_students() -> None:

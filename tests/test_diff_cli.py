@@ -61,7 +61,10 @@ def test_diff_exit_code_is_1_if_verdict_is_worse(settings, changed):
     assert "Worse    Mean NIS of KF, aisle: " in said
     nothing = json.loads(run_checked("diff", settings[0], first, "--json", "-").stdout)
     assert [nothing[part] for part in ("settings", "numbers", "findings", "worse")] == [[]] * 4
-    assert "No verdict is worse in B than in A." in run_checked("diff", *settings[::-1]).stdout
+    assert (
+        "Compared with A, B has no new inconsistent filter and no new error."
+        in run_checked("diff", *settings[::-1]).stdout
+    )
 
 
 def test_diff_of_report_and_log_uses_settings_of_the_report(settings, tmp_path, monkeypatch):

@@ -145,7 +145,7 @@ def test_grade_ignores_other_file_submitted_beside_a_report() -> None:
              blackboard("ada", "20-10-00-00"): essay}  # fmt: skip
     (ada, _), _ = make_grades(files)
     assert ada.total == 4.0
-    assert "status: no report" in ada.flags[0]
+    assert "it is not a report" in ada.flags[0]
     (ada, _), _ = make_grades({blackboard("ada", "20-10-00-00"): essay})
     assert ada.total == 0.0
 
@@ -162,7 +162,7 @@ def test_grade_with_two_different_answer_forms_is_pending() -> None:
     assert ada.total is None
     assert (
         ada.counted_report.instructor_action
-        == "Ask the student which of 2 reports counts: the answer forms differ."
+        == "The answer forms of 2 reports differ. Ask the student which report counts."
     )
     assert len(ada.other_reports) == 1
     assert make_grades(files, Course(RUBRIC, attempt="best"))[0][0].total == 9.0
@@ -182,7 +182,7 @@ def test_grade_keeps_first_report_if_later_one_needs_review() -> None:
         (ada, _), _ = make_grades(files, packed=times)
         assert ada.total == 9.0
         assert [one.submission for one in ada.other_reports] == ["z.pdf"]
-        assert ada.flags == ("The file z.pdf does not count (status: pending).",)
+        assert ada.flags == ("The file z.pdf does not count: it is pending.",)
     waiting = replace(
         files["a.pdf"].items[0], is_awaiting_points=True
     )  # waits for the points of the notes
@@ -196,8 +196,8 @@ def test_submission_named_like_a_platform_export_is_flagged() -> None:
     (ada, _), _ = make_grades({name: graded_report("", 4.0)})
     assert ada.submission_time == "2026-11-20 10:00"
     assert ada.flags == (
-        "The student's part of the file name imitates a learning platform (platform of the "
-        "export: Blackboard). Check who handed in the file.",
+        "The student chose a file name that looks like the file names of a learning platform "
+        "(platform of the export: Blackboard). Check who handed in the file.",
     )
 
 
@@ -347,7 +347,7 @@ def test_instructor_overrides_csv_accepts_decimal_commas(tmp_path) -> None:
         ("1,A,-1,", "are not a number of 0 or more"),
         ("1,A,nan,", "are not a number of 0 or more"),
         ("1,A,1_5,", "are not a number of 0 or more"),
-        ("1,,5,", "the points 5 need a rubric title or 'total' as item"),
+        ("1,,5,", "the points 5 have no item: write a rubric title or 'total'"),
         ("1,A,5,\n1,A,6,", "student 1 has two rows for the item A"),
     ],
 )

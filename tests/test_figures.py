@@ -8,14 +8,14 @@ import pytest
 
 from px4fuse.classroom.assignment import figures
 from px4fuse.classroom.assignment.figures import (
-    FIGURE_FAULTS,
+    FIGURE_ANSWERS_BY_FAULT,
     QUESTIONS,
     draw_figures,
     select_choices,
 )
 from px4fuse.classroom.assignment.random_assignment import draw_uniform
 from px4fuse.results.answer_form import (
-    CHOICE_NAMES,
+    CHOICE_LETTERS,
     MAX_CHOICES,
     MAX_FORM_BYTES,
     format_answer_form,
@@ -29,7 +29,9 @@ def test_right_answers_on_each_figure_describe_the_same_fault() -> None:
         for first in range(0, len(choices), len(QUESTIONS)):
             rows = zip(choices[first:], QUESTIONS, strict=False)
             right = [(choice.answer_text(letter), field) for (choice, letter), field in rows]
-            fault = next(each for each in FIGURE_FAULTS.values() if each.fault == right[0][0])
+            fault = next(
+                each for each in FIGURE_ANSWERS_BY_FAULT.values() if each.fault == right[0][0]
+            )
             assert all(getattr(fault, field) == text for text, field in right)
         form = format_answer_form("s.ulg", "0" * 64, [choice for choice, _ in choices])
         assert len(form.encode()) < MAX_FORM_BYTES
@@ -38,14 +40,14 @@ def test_right_answers_on_each_figure_describe_the_same_fault() -> None:
 def test_right_multiple_choice_letters_are_equally_frequent() -> None:
     draws = [partial(draw_uniform, b"secret", f"s{number}", "aisle") for number in range(200)]
     letters = [letter for random_number in draws for _, letter in select_choices(random_number)]
-    for name in CHOICE_NAMES:
+    for name in CHOICE_LETTERS:
         assert letters.count(name) / len(letters) == pytest.approx(0.2, abs=0.03)
 
 
 def test_answers_to_plot_questions_differ_between_faults() -> None:
     for field in QUESTIONS:
-        assert len({getattr(fault, field) for fault in FIGURE_FAULTS.values()}) == len(
-            FIGURE_FAULTS
+        assert len({getattr(fault, field) for fault in FIGURE_ANSWERS_BY_FAULT.values()}) == len(
+            FIGURE_ANSWERS_BY_FAULT
         )
 
 

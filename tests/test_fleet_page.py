@@ -218,7 +218,7 @@ def test_batch_page_without_javascript_shows_a_note(browser: Browser, tmp_path: 
     shown(browser, tmp_path, artificial_logs(4), scripts=False)
     browser.call("Emulation.setScriptExecutionDisabled", value=False)
     text = browser.ask("document.body.innerText")
-    assert "Enable JavaScript to show the logs. The table fleet.csv contains all rows." in text
+    assert "Enable JavaScript to show the logs. fleet.csv contains the table of all logs." in text
 
 
 @pytest.mark.parametrize(("scheme", "width"), [("light", 360), ("dark", 1400)])

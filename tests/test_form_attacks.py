@@ -15,7 +15,7 @@ from exchange import replace
 from form_guesses import SHA256, right
 from test_form_points import CLEAN, GAP, RIGHT, TRUTH
 
-from px4fuse.classroom.assignment.truth import InjectedFault, RightFormAnswers, RightVerdict
+from px4fuse.classroom.assignment.truth import CorrectFormAnswers, CorrectVerdict, InjectedFault
 from px4fuse.classroom.grading.flags import flag_equal_contents
 from px4fuse.classroom.grading.form_points import compute_form_points
 from px4fuse.errors import SettingsError
@@ -120,7 +120,7 @@ ATTACKS: dict[str, tuple[str, str | float]] = {
     "N20 two verdicts": (changed('"overconfident"', '"consistent or overconfident"'), "verdict_kf"),
     "N20 list of verdicts": (changed('"overconfident"', '["consistent"]'), "verdict_kf"),
     "N21 two values": (changed("-0.2\npanel", '"0 or 5"\npanel'), NOT_A_NUMBER),
-    "N21 two corrections": (changed('"--start"', '["--start", "--end"]'), "short text in quotes"),
+    "N21 two corrections": (changed('"--start"', '["--start", "--end"]'), "text in quotes"),
     "N27 UTF-16": (HONEST.encode("utf-16").decode("latin-1"), "line 1"),
     "N27 NUL": (changed('"clock"', '"clo\x00ck"'), "line"),
     "N27 escaped NUL": (changed('"clock"', '"clock\\u0000"'), "is not one of"),
@@ -128,7 +128,7 @@ ATTACKS: dict[str, tuple[str, str | float]] = {
     "N28 HTML as panel": (changed('"clock"\n', '"<script>"\n'), "is not one of"),
     "N29 true as size": (number("true"), NOT_A_NUMBER),
     "N29 date as size": (number("2026-11-20"), NOT_A_NUMBER),
-    "N29 number as kind": (changed('"clock-offset"', "3"), "short text in quotes"),
+    "N29 number as kind": (changed('"clock-offset"', "3"), "text in quotes"),
     "N31 path in a field": ('file = "../flights_answers.json"\n' + HONEST, "unknown field `file`"),
     "N36 list of panels": (changed('"clock"\n', '"clock, map"\n'), "is not one of"),
     "N37 text to the grader": (changed('"clock"\n', '"judge: all right"\n'), "is not one of"),
@@ -182,8 +182,8 @@ def test_two_students_with_equal_plot_answers_are_flagged() -> None:
 # ------------------------------------------------ students who analysed their flight
 
 OFF = InjectedFault("ekf2-off")
-OFF_TRUTH = RightFormAnswers(
-    (OFF,), 0.1, RightVerdict("consistent"), RightVerdict(""), ("never fused",),
+OFF_TRUTH = CorrectFormAnswers(
+    (OFF,), 0.1, CorrectVerdict("consistent"), CorrectVerdict(""), ("never fused",),
     ("followed wrong positions",), (0.5, 0.1, 0.2),
 )  # fmt: skip
 NLOS_TRUTH = replace(TRUTH, mistakes=(InjectedFault("nlos", 3.0, 2.5, 3.5, 10.0, 60.0), GAP))
@@ -191,14 +191,14 @@ COMPASS_TRUTH = replace(TRUTH, mistakes=(InjectedFault("heading", 20.0, 17.0, 23
 END_TRUTH = replace(TRUTH, mistakes=(InjectedFault("open-end", 5.0, 4.7, 5.3, 60.0),))
 
 
-def first_mistake(truth: RightFormAnswers, **values) -> Answers:
+def first_mistake(truth: CorrectFormAnswers, **values) -> Answers:
     """Return the right form with other values of its first fault."""
     form = right(truth)
     return replace(form, mistakes=(replace(form.mistakes[0], **values), *form.mistakes[1:]))
 
 
 # Right answers, form of a student who analysed the flight, and minimum points of 100
-HONEST_FORMS: dict[str, tuple[RightFormAnswers, Answers, float]] = {
+HONEST_FORMS: dict[str, tuple[CorrectFormAnswers, Answers, float]] = {
     "EKF2 never fused, verdict not available": (OFF_TRUTH, right(OFF_TRUTH), 100.0),
     "EKF2 never fused and followed": (
         OFF_TRUTH,

@@ -16,23 +16,23 @@ from scipy.stats import spearmanr
 
 from px4fuse.classroom.assignment.random_assignment import assign_random_flight
 from px4fuse.classroom.assignment.truth import (
+    CorrectFormAnswers,
+    CorrectVerdict,
     InjectedFault,
-    RightFormAnswers,
-    RightVerdict,
     compute_form_answers,
 )
 from px4fuse.classroom.grading.form_points import (
     FORM_PART_NAMES,
-    POINTS_TABLE,
+    POINTS_CONFIG,
     compute_form_points,
     find_accepted_corrections,
-    find_panels,
+    find_panels_showing_fault,
 )
 from px4fuse.cli.simulate import simulate
 from px4fuse.core.text import convert_nested
 from px4fuse.results.answer_form import (
     FAULT_KINDS,
-    PANELS,
+    REPORT_PANELS,
     UNITS_BY_CORRECTION,
     Answers,
     Choice,
@@ -46,8 +46,8 @@ from px4fuse.simulation.scenario import Scenario, make_scenario
 SHA256 = "a" * 64
 LATE = InjectedFault("clock-offset", 0.2, 0.17, 0.23)
 GAP = InjectedFault("dropout", 3.0, 2.55, 3.45, 50.0, 53.0)
-TRUTH = RightFormAnswers(
-    (LATE, GAP), 0.1, RightVerdict("overconfident", 2.0), RightVerdict("underconfident", 1.3),
+TRUTH = CorrectFormAnswers(
+    (LATE, GAP), 0.1, CorrectVerdict("overconfident", 2.0), CorrectVerdict("underconfident", 1.3),
     ("followed wrong positions", "dead-reckoned, then reset"), ("fused at the wrong time",),
     (0.5, (3.0, 7.0), -0.2),
 )  # fmt: skip
@@ -73,8 +73,8 @@ RIGHT = Answers(
     ekf2_did=("followed wrong positions", "dead-reckoned, then reset"),
     quantities=(0.505, (3.0, 7.0), -0.2),
 )
-CLEAN = RightFormAnswers(
-    (), 0.1, RightVerdict("consistent"), RightVerdict("consistent"), ("normal",),
+CLEAN = CorrectFormAnswers(
+    (), 0.1, CorrectVerdict("consistent"), CorrectVerdict("consistent"), ("normal",),
     ("followed the positions",), (0.5, 0.1, 0.2),
 )  # fmt: skip
 
@@ -90,29 +90,29 @@ def with_false(*kinds: str) -> Answers:
     return replace(RIGHT, mistakes=(*RIGHT.mistakes, *map(NamedFault, kinds)))
 
 
-def points_by_part(answers: Answers, truth: RightFormAnswers = TRUTH) -> dict[str, float]:
+def points_by_form_part(answers: Answers, truth: CorrectFormAnswers = TRUTH) -> dict[str, float]:
     return {part.title: part.points for part in compute_form_points(answers, truth).parts}
 
 
-def parts(answers: Answers, truth: RightFormAnswers = TRUTH) -> list[float]:
-    found = points_by_part(answers, truth)
+def parts(answers: Answers, truth: CorrectFormAnswers = TRUTH) -> list[float]:
+    found = points_by_form_part(answers, truth)
     return [round(found.get(name, 0.0), 2) for name in FORM_PART_NAMES]
 
 
 def test_answer_form_offers_correct_answers_for_each_fault() -> None:
     assert set(SIMULATED) == set(FAULT_KINDS) - {"none", "vio-drift"}
-    assert set(POINTS_TABLE["shows"]) | {"cover"} == set(PANELS)
+    assert set(POINTS_CONFIG["shows"]) | {"cover"} == set(REPORT_PANELS)
     for name in SIMULATED:
         offered = find_accepted_corrections(InjectedFault(name, 1.0, 0.85, 1.15, 10.0, 20.0), TRUTH)
         assert {cure for cure, _, _ in offered} <= set(UNITS_BY_CORRECTION)
         assert max(share for _, _, share in offered) == 1.0
-        assert set(find_panels(name)) > {"cover"}
+        assert set(find_panels_showing_fault(name)) > {"cover"}
 
 
 def test_correct_answer_form_earns_all_and_empty_form_no_points() -> None:
-    assert points_by_part(RIGHT) == FULL
+    assert points_by_form_part(RIGHT) == FULL
     assert parts(Answers(log_sha256=SHA256)) == [0.0] * 6
-    assert compute_form_points(RIGHT, TRUTH).is_named_by_kind == {
+    assert compute_form_points(RIGHT, TRUTH).did_student_name_fault == {
         "clock-offset": True,
         "dropout": True,
     }
@@ -166,7 +166,7 @@ HALF_RIGHT: list[tuple[Answers, dict[str, float]]] = [
 def test_partly_correct_answer_form_has_partial_points(
     answers: Answers, less: dict[str, float]
 ) -> None:
-    assert points_by_part(answers) == pytest.approx({**FULL, **less}, abs=0.01)
+    assert points_by_form_part(answers) == pytest.approx({**FULL, **less}, abs=0.01)
 
 
 def test_answer_that_names_a_fault_of_clean_flight_has_no_points() -> None:
@@ -203,9 +203,9 @@ def test_guessed_answers_for_all_loop_flights_earn_few_points() -> None:
         sizes = [float(typed.partition("=")[2].rstrip("m")) for typed in drawn.mistake_options]
         measured = [size + rng.normal(0.0, 0.4) for size in sizes]
         wrong = [InjectedFault("open-end", size, size - 0.3, size + 0.3, 65.0) for size in measured]
-        verdicts = RightVerdict("underconfident", 7.0), RightVerdict("overconfident", 1.1)
+        verdicts = CorrectVerdict("underconfident", 7.0), CorrectVerdict("overconfident", 1.1)
         truths.append(
-            RightFormAnswers(tuple(wrong), 0.01, *verdicts, ("normal",), (), (0.5, 0.1, ()))
+            CorrectFormAnswers(tuple(wrong), 0.01, *verdicts, ("normal",), (), (0.5, 0.1, ()))
         )
     for kind in ("open-end", "none"):
         for each in constants(truths, kind):
@@ -300,13 +300,13 @@ VERDICT_WORDS = {
 }  # fmt: skip
 
 
-def verdicts_by_hand(flight: dict[str, Any]) -> tuple[RightVerdict, RightVerdict]:
+def verdicts_by_hand(flight: dict[str, Any]) -> tuple[CorrectVerdict, CorrectVerdict]:
     """Return the verdicts on KF and EKF2 with which the forms were judged.
 
     They are of the 95 % band of the mean NIS, without a band for the ratio.
     """
     words = (VERDICT_WORDS[flight[name]["verdict"]] for name in ("verdict_ours", "verdict_ekf2"))
-    kf, ekf2 = map(RightVerdict, words)
+    kf, ekf2 = map(CorrectVerdict, words)
     return kf, ekf2
 
 

@@ -17,7 +17,7 @@ from conftest import LOG, REPORT, REPORT_PAGES
 from forgery import forged, with_results
 from pypdf import PdfReader, PdfWriter
 
-from px4fuse.classroom.assignment.key import AnswerKey, RightAnswers
+from px4fuse.classroom.assignment.key import AnswerKey, CorrectAnswers
 from px4fuse.classroom.assignment.roster import make_file_names
 from px4fuse.classroom.grading.entries import Course, parse_late_rule
 from px4fuse.classroom.grading.grade import GradeOutcome, grade
@@ -164,7 +164,7 @@ def test_grade_second_run_processes_only_changed_files(submitted, tmp_path) -> N
     assert reused() == 2
     (output / "overrides (1).csv").write_text("id,item,points,comment\n")
     again = grade([submitted, tmp_path / "more.zip"], Course(read_rubric(None)), output)
-    assert "overrides (1).csv was not read; only overrides.csv is read." in again.notes
+    assert "overrides (1).csv was ignored: px4fuse reads only overrides.csv." in again.notes
 
 
 @pytest.mark.usefixtures("jobs_in_process", "cached_pages")
@@ -193,7 +193,7 @@ def test_points_of_report_are_pending_if_its_log_is_not_given(tmp_path) -> None:
     (sha256,) = hash_files([LOG])
     rubric, logs = read_rubric(None), [tmp_path / "logs"]
     for given, status in ((sha256, "cannot verify"), ("0" * 64, "other log")):
-        key = AnswerKey("aisle", (RightAnswers("1", "Ada", "1.ulg", given),))
+        key = AnswerKey("aisle", (CorrectAnswers("1", "Ada", "1.ulg", given),))
         outcome = grade([tmp_path / "in"], Course(rubric, key, logs), tmp_path / "out", processes=1)
         (one,) = outcome.reports
         assert one.verification.status == status

@@ -8,8 +8,8 @@ import numpy as np
 import pytest
 from class_tools import grade, graded_report
 
-from px4fuse.classroom.assignment.key import AnswerKey, RightAnswers
-from px4fuse.classroom.assignment.truth import InjectedFault, RightFormAnswers, RightVerdict
+from px4fuse.classroom.assignment.key import AnswerKey, CorrectAnswers
+from px4fuse.classroom.assignment.truth import CorrectFormAnswers, CorrectVerdict, InjectedFault
 from px4fuse.classroom.grading.item_analysis import analyse_items
 from px4fuse.classroom.grading.model import ItemScore
 from px4fuse.classroom.grading.oral_check import ask_about_form, format_questions
@@ -17,11 +17,11 @@ from px4fuse.results.answer_form import Answers, Choice, NamedFault
 
 POINTS = np.array([[9, 2, 1], [8, 4, 9], [5, 6, 3], [2, 8, 8], [1, 9, 2]], dtype=float)
 REPORTS = [graded_report(f"{n}.pdf", *row) for n, row in enumerate(POINTS.tolist())]
-TRUTH = RightFormAnswers(
+TRUTH = CorrectFormAnswers(
     (InjectedFault("nlos", 10.0, 8.5, 11.5), InjectedFault("yaw", 20.0, 17.0, 23.0)),
     0.1,
-    RightVerdict("overconfident", 2.0),
-    RightVerdict("consistent"),
+    CorrectVerdict("overconfident", 2.0),
+    CorrectVerdict("consistent"),
     ("normal",),
     (),
     (1.0, 2.0, 3.0),
@@ -52,7 +52,7 @@ def test_item_analysis_lists_answer_form_parts_and_faults() -> None:
         replace(
             each,
             form_part_scores=(ItemScore("sizes", n, 15.0, ""),),
-            is_found_by_fault={"nlos": n > 1},
+            did_student_name_fault={"nlos": n > 1},
         )
         for n, each in enumerate(REPORTS)
     ]
@@ -86,7 +86,7 @@ def test_oral_exam_asks_first_about_wrong_and_missed_faults() -> None:
 
 
 def test_oral_exam_page_lists_n_questions_per_student() -> None:
-    key = AnswerKey("aisle", (RightAnswers("s1", "Ada", "s1.ulg", "a" * 64, form=TRUTH),))
+    key = AnswerKey("aisle", (CorrectAnswers("s1", "Ada", "s1.ulg", "a" * 64, form=TRUTH),))
     report = graded_report("r.pdf", 5.0, form=FORM, log_sha256="a" * 64)
     rows = (replace(grade("s1", "Ada", 5.0), counted_report=report), grade("s2", "Max", None))
     text = format_questions(rows, key, 2)

@@ -50,7 +50,10 @@ from px4fuse.verification import pages
 from px4fuse.verification.model import PageDifference
 from px4fuse.verification.pages import COORDINATE_TOLERANCE_PT, compare_pages
 from px4fuse.verification.pdf_input import read_report
-from px4fuse.verification.verification import is_same_number_rounded, is_same_text_rounded
+from px4fuse.verification.verification import (
+    is_same_number_up_to_rounding,
+    is_same_text_up_to_rounding,
+)
 
 STRING = TextStringObject
 N = NumberObject
@@ -420,22 +423,22 @@ FORGERIES: dict[str, tuple[Forge, str, bool]] = {
     # resources
     "an image": (
         draw_on_page(b"q 300 0 0 90 50 690 cm /X Do Q", resource("/XObject", "/X", image())),
-        "an image or form object", True,
+        "an image or embedded drawing", True,
     ),
     "an image with alternates": (
         resource("/XObject", "/X", image(Alternates=array(dictionary(DefaultForPrinting=ON)))),
-        "an image or form object", True,
+        "an image or embedded drawing", True,
     ),
     "an image with a proxy": (
-        resource("/XObject", "/X", image(OPI=dictionary())), "an image or form object", True,
+        resource("/XObject", "/X", image(OPI=dictionary())), "an image or embedded drawing", True,
     ),
     "an image with a mask": (
-        resource("/XObject", "/X", image(SMask=image())), "an image or form object", True,
+        resource("/XObject", "/X", image(SMask=image())), "an image or embedded drawing", True,
     ),
     "a form XObject": (
         draw_on_page(b"/X Do", resource("/XObject", "/X", stream(WHITE, Subtype=name("Form"),
                                                           BBox=box(0, 0, 600, 850)))),
-        "an image or form object", True,
+        "an image or embedded drawing", True,
     ),
     "a soft mask": (
         draw_on_page(b"/g9 gs", resource("/ExtGState", "/g9", dictionary(SMask=name("None")))),
@@ -597,7 +600,7 @@ FILES: dict[str, tuple[Callable[[bytes], bytes], str]] = {
     "bytes behind the end": (lambda pdf: pdf + b"\n% Eve\n", "bytes after the end of the PDF"),
     "a table at the beginning": (linearised, "second cross-reference table"),
     "a hybrid table": (hybrid, "second cross-reference table"),
-    "a later generation": (later_generation, "/Contents was changed (object generation above 0)"),
+    "a later generation": (later_generation, "/Contents was replaced (object generation above 0)"),
     "a key twice": (
         lambda pdf: pdf.replace(b"/Tabs/S", b"/Tabs/S/Tabs/S", 1), "the PDF cannot be read",
     ),
@@ -734,8 +737,8 @@ def test_pdf_comparison_ignores_rounded_last_digit(pdf: bytes) -> None:
 
     assert compare(made, pdf, alike=alike) == ()
     ((theirs, ours),) = [pair for pair in asked if pair[0] != pair[1]]
-    assert is_same_text_rounded(theirs, ours, lambda *_: True)
-    assert not is_same_text_rounded(theirs, ours, partial(is_same_number_rounded, ()))
+    assert is_same_text_up_to_rounding(theirs, ours, lambda *_: True)
+    assert not is_same_text_up_to_rounding(theirs, ours, partial(is_same_number_up_to_rounding, ()))
     # the positions of the letters are unchanged
     digit = once(rb"(?<=\))(-?[\d.]+)(?=\()", b"-9000")
     assert compare(forged(made, on_page(1, digit)), made, alike=alike) != ()

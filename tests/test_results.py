@@ -212,5 +212,7 @@ def test_results_without_any_valid_axis_raise_error():
     wrong = replace(
         results.axes["aisle"], updates=replace(results.axes["aisle"].updates, input_gap_s=math.nan)
     )
-    with pytest.raises(ResultsError, match=r"axes.aisle.updates.input_gap_s is not a finite"):
+    with pytest.raises(
+        ResultsError, match=r"axes.aisle.updates.input_gap_s has a value that is not finite"
+    ):
         drop_invalid_numbers(replace(results, axes={"aisle": wrong}))

@@ -107,7 +107,7 @@ def test_read_class_list_accepts_any_table_format(tmp_path, content) -> None:
 
 
 BAD_ROSTERS = {
-    "no id column": ("a,b\n1,2\n", "no column identifies the student"), "empty": ("", "empty"),
+    "no id column": ("a,b\n1,2\n", "no column contains ids"), "empty": ("", "empty"),
     "header alone": ("id,name\n", "0 students"),
     "empty id": ("id,name\n1,A\n,B\n", "the id of 'B'"),
     "same id": ("id\n1\n2\n1\n", "rows 2 and 4 have the same id '1'"),

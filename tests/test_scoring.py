@@ -17,8 +17,8 @@ from results_tools import (
     finding,
 )
 
-from px4fuse.classroom.assignment.key import AnswerKey, RightAnswers
-from px4fuse.classroom.assignment.truth import InjectedFault, RightFormAnswers, RightVerdict
+from px4fuse.classroom.assignment.key import AnswerKey, CorrectAnswers
+from px4fuse.classroom.assignment.truth import CorrectFormAnswers, CorrectVerdict, InjectedFault
 from px4fuse.classroom.grading.flags import flag_equal_contents, flag_settings
 from px4fuse.classroom.grading.model import Grade, GradedReport
 from px4fuse.classroom.grading.outputs import feedback_text
@@ -123,8 +123,8 @@ CHECKED = [
     ("consistent", NORTH, {}, 0.0, "without --axis"),
     ("consistent", changed_results(**UNDERSTATED), {}, 0.0, "2.1 times too small"),
     ("consistent", changed_results(**UNDERSTATED, settings__sigma_a_m_s2=0.36), {}, 1.0,
-     "settings do not make KF consistent"),
-    ("clock", EXAMPLE, {}, 1.0, "interval of the estimate is -0.022 to 0.060 s"),
+     "would not make KF consistent"),
+    ("clock", EXAMPLE, {}, 1.0, "estimated time offset is -0.022 to 0.060 s"),
     ("clock", changed_results(clock__applied_s=0.25), {}, 0.0, "0.250 s"),
     ("clock", UNCLEAR, {}, 0.5, "no acceleration)."),
     ("clock", changed_results(clock=NONE), {}, 0.0, "too few of them"),
@@ -157,15 +157,15 @@ def test_report_with_undeterminable_time_offset_earns_points():
 # ------------------------------------------------------------------ faults
 
 
-TRUTH = RightFormAnswers(
-    (InjectedFault("dropout", 3.0, 2.55, 3.45, 50.0, 53.0),), 0.1, RightVerdict("consistent"),
-    RightVerdict("consistent"), ("dead-reckoned, then reset",), (), (0.5, 0.1, 0.2),
+TRUTH = CorrectFormAnswers(
+    (InjectedFault("dropout", 3.0, 2.55, 3.45, 50.0, 53.0),), 0.1, CorrectVerdict("consistent"),
+    CorrectVerdict("consistent"), ("dead-reckoned, then reset",), (), (0.5, 0.1, 0.2),
 )  # fmt: skip
 
 
 def key(*mistakes, sha256=SHA, **values):
-    answer = RightAnswers("s01", "Ann", "s01.ulg", sha256, {}, mistakes, form=TRUTH, **values)
-    other = RightAnswers("s02", "Bob", "s02.ulg", "b" * 64)
+    answer = CorrectAnswers("s01", "Ann", "s01.ulg", sha256, {}, mistakes, form=TRUTH, **values)
+    other = CorrectAnswers("s02", "Bob", "s02.ulg", "b" * 64)
     return AnswerKey("aisle", (answer, other))
 
 
@@ -436,7 +436,7 @@ class TestClassFlags:
         theirs = Answers(log_sha256=SHA, mistakes=other, quantities=(0.124, 0.7, None))
         made = flag_equal_contents([report(1, form=mine), report(2, form=theirs)])
         assert set(made) == {"1.pdf", "2.pdf"}
-        assert "The answer form contains the same numbers as the form of" in made["1.pdf"][0]
+        assert "The answer form contains the same numbers as the answer form of" in made["1.pdf"][0]
         # two equal numbers are not enough
         theirs = replace(theirs, quantities=(0.2, 0.7, 0.45))
         apart = replace(mine, quantities=(0.123, None, 0.3))

@@ -13,7 +13,7 @@ import pytest
 from class_tools import make_report, skip_verification, write_zip
 from golden_tools import assert_matches_golden
 
-from px4fuse.classroom.assignment.key import AnswerKey, RightAnswers
+from px4fuse.classroom.assignment.key import AnswerKey, CorrectAnswers
 from px4fuse.classroom.assignment.roster import read_people
 from px4fuse.classroom.assignment.sheet import read_sheet
 from px4fuse.classroom.grading.entries import Course, parse_due_time, parse_late_rule
@@ -77,7 +77,7 @@ class Lab:
         for number in STUDENTS:
             (self.logs / f"{number}.ulg").write_bytes(log(number))
         answers = (
-            RightAnswers(student_id(n), name(n), f"{n}.ulg", hashlib.sha256(log(n)).hexdigest(),
+            CorrectAnswers(student_id(n), name(n), f"{n}.ulg", hashlib.sha256(log(n)).hexdigest(),
                    mistakes=("nlos=5%",))
             for n in STUDENTS
         )  # fmt: skip

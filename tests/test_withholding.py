@@ -13,13 +13,16 @@ from form_guesses import right
 
 from px4fuse.classroom.assignment.assignment import simulate_assigned_flight
 from px4fuse.classroom.assignment.roster import Person
-from px4fuse.classroom.grading.form_points import FLIGHT_POINTS_FRACTION, compute_form_points
+from px4fuse.classroom.grading.form_points import (
+    FLIGHT_QUESTIONS_POINTS_FRACTION,
+    compute_form_points,
+)
 from px4fuse.classroom.grading.records import load_or_verify
 from px4fuse.classroom.grading.rubric import read_rubric, score_report
 from px4fuse.core.reading import hash_files
 from px4fuse.flight.model import DIAGNOSIS_WITHHELD
 from px4fuse.readers.ulog_topics import ASSESSED_MARK_KEY
-from px4fuse.results.answer_form import CHOICE_NAMES, format_answer_form
+from px4fuse.results.answer_form import CHOICE_LETTERS, format_answer_form
 from px4fuse.results.contract import ComparisonResults, to_json
 from px4fuse.results.reading import read_results
 from px4fuse.verification.model import Verification
@@ -119,9 +122,9 @@ def test_form_without_answers_on_plots_earns_part_of_points() -> None:
     assert compute_form_points(complete, answer.form).fraction == pytest.approx(1.0)
     copied = replace(complete, choices=())
     assert compute_form_points(copied, answer.form).fraction == pytest.approx(
-        FLIGHT_POINTS_FRACTION
+        FLIGHT_QUESTIONS_POINTS_FRACTION
     )
-    for letter in CHOICE_NAMES:
+    for letter in CHOICE_LETTERS:
         guessed = replace(complete, choices=(letter,) * len(answer.form.choices))
         assert compute_form_points(guessed, answer.form).fraction < 0.6
 

@@ -7,8 +7,8 @@ from pathlib import Path
 
 from px4fuse.batch.inputs import InputResults, ProgressCallback, Results, read_diff_inputs
 from px4fuse.batch.measures import (
-    ABSOLUTE_TOLERANCE,
-    RELATIVE_TOLERANCE,
+    MAX_OMITTED_DIFFERENCE,
+    MAX_OMITTED_RELATIVE_DIFFERENCE,
     ComparedNumber,
     collect_compared_numbers,
 )
@@ -62,22 +62,24 @@ def diff(
     return list_changes(*read_diff_inputs(Path(a), Path(b), progress))
 
 
-def list_changes(a: InputResults, b: InputResults) -> contract.ChangeResults:
+def list_changes(input_a: InputResults, input_b: InputResults) -> contract.ChangeResults:
     """List the settings, numbers and findings that differ between the results of A and B."""
-    findings = tuple(_list_finding_changes(a.results, b.results))
+    findings = tuple(_list_finding_changes(input_a.results, input_b.results))
     return contract.ChangeResults(
         schema=schema_of(contract.CHANGES_SCHEMA_NAME),
-        a=_describe_input(a),
-        b=_describe_input(b),
-        settings=tuple(_list_setting_changes(a.results, b.results)),
+        a=_describe_input(input_a),
+        b=_describe_input(input_b),
+        settings=tuple(_list_setting_changes(input_a.results, input_b.results)),
         numbers=tuple(
             compare_numbers(
-                collect_compared_numbers(a.results), collect_compared_numbers(b.results)
+                collect_compared_numbers(input_a.results), collect_compared_numbers(input_b.results)
             )
         ),
         findings=findings,
-        worse=tuple(_describe_worse_verdicts(a.results, b.results, findings)),
-        provenance=provenance(shlex.join(["px4fuse", "diff", a.file_name, b.file_name])),
+        worse=tuple(_describe_worse_verdicts(input_a.results, input_b.results, findings)),
+        provenance=provenance(
+            shlex.join(["px4fuse", "diff", input_a.file_name, input_b.file_name])
+        ),
     )
 
 
@@ -129,17 +131,17 @@ def compare_numbers(
             and math.isclose(
                 number_a.value,
                 number_b.value,
-                rel_tol=RELATIVE_TOLERANCE,
-                abs_tol=ABSOLUTE_TOLERANCE,
+                rel_tol=MAX_OMITTED_RELATIVE_DIFFERENCE,
+                abs_tol=MAX_OMITTED_DIFFERENCE,
             )
         ):
             continue
-        labelled_number = number_a or number_b
-        assert labelled_number is not None
+        existing_number = number_a or number_b
+        assert existing_number is not None
         yield contract.NumberChange(
             path=path,
-            label=labelled_number.label,
-            unit=labelled_number.unit,
+            label=existing_number.label,
+            unit=existing_number.unit,
             a=getattr(number_a, "value", None),
             b=getattr(number_b, "value", None),
             a_interval=getattr(number_a, "interval", None),
@@ -151,7 +153,7 @@ def _list_finding_changes(
     results_a: Results, results_b: Results
 ) -> Iterator[contract.UnsharedFinding]:
     """Yield the findings whose id and severity are only in A or only in B."""
-    comparisons: tuple[tuple[Results, Results, contract.DiffSide], ...] = (
+    comparisons: tuple[tuple[Results, Results, contract.DiffInputName], ...] = (
         (results_b, results_a, "B"),
         (results_a, results_b, "A"),
     )
@@ -169,7 +171,10 @@ def _list_finding_changes(
 def _describe_worse_verdicts(
     results_a: Results, results_b: Results, findings: Iterable[contract.UnsharedFinding]
 ) -> Iterator[str]:
-    """Yield sentences on filters that are consistent only in results A, and errors only in B."""
+    """Yield a sentence for each filter that is consistent in A but not in B, and each new error.
+
+    A new error is a finding of severity error that only B contains.
+    """
     nis_and_nees_a, nis_and_nees_b = map(_collect_nis_and_nees, (results_a, results_b))
     for label, (mean_a, was_consistent) in nis_and_nees_a.items():
         mean_b, is_consistent = nis_and_nees_b.get(label, (mean_a, True))
@@ -192,14 +197,18 @@ def _describe_worse_verdicts(
 
 def _collect_nis_and_nees(results: Results) -> dict[str, tuple[float, bool]]:
     """Return each mean NIS and mean NEES by label, with True for a consistent filter."""
-    mean_by_label: dict[str, tuple[float, bool]] = {}
+    mean_and_consistency_by_label: dict[str, tuple[float, bool]] = {}
     for axis, result in (find_value(results, "axes") or {}).items():
         for name, label in FILTER_NAMES.items():
             summary = result.filters[name]
             if isinstance(summary, FilterSummary):
-                is_consistent = not is_inconsistent(summary)
-                mean_by_label[f"Mean NIS of {label}, {axis}"] = summary.nis_mean, is_consistent
+                mean_and_consistency_by_label[f"Mean NIS of {label}, {axis}"] = (
+                    summary.nis_mean,
+                    not is_inconsistent(summary),
+                )
             if (nees := find_value(summary, "truth.nees_position_mean")) is not None:
-                is_consistent = MAX_SQRT_MEAN_NEES**-2 <= nees <= MAX_SQRT_MEAN_NEES**2
-                mean_by_label[f"Mean NEES of {label}, {axis}"] = nees, is_consistent
-    return mean_by_label
+                mean_and_consistency_by_label[f"Mean NEES of {label}, {axis}"] = (
+                    nees,
+                    MAX_SQRT_MEAN_NEES**-2 <= nees <= MAX_SQRT_MEAN_NEES**2,
+                )
+    return mean_and_consistency_by_label

@@ -23,8 +23,9 @@ if TYPE_CHECKING:
 
 # Maximum time (s) to connect to the Dask scheduler, and to wait for its first worker
 CONNECT_TIMEOUT_S = 15.0
-# Number of logs per Dask task: one process analyses all of them, because its start takes 2 s
-JOBS_PER_TASK = 4
+# Maximum number of logs per Dask task. One process analyses all logs of a task, because the start
+# of a process takes 2 s
+MAX_LOGS_PER_DASK_TASK = 4
 
 
 @contextmanager
@@ -106,9 +107,10 @@ def run_jobs(
     from distributed import as_completed  # noqa: PLC0415
 
     job_lists = [
-        jobs[start : start + JOBS_PER_TASK] for start in range(0, len(jobs), JOBS_PER_TASK)
+        jobs[start : start + MAX_LOGS_PER_DASK_TASK]
+        for start in range(0, len(jobs), MAX_LOGS_PER_DASK_TASK)
     ]
-    futures = dict(
+    jobs_by_future = dict(
         zip(
             client.map(partial(_run_task, run_job_list), job_lists, pure=False),
             job_lists,
@@ -116,25 +118,26 @@ def run_jobs(
         )
     )
     try:
-        for future in as_completed(list(futures)):
-            task_jobs = futures.pop(future)
+        for future in as_completed(list(jobs_by_future)):
+            jobs_of_task = jobs_by_future.pop(future)
             if future.status not in ("finished", "error"):
                 raise Px4FuseError("the connection to the Dask scheduler was lost.")
             # jobs catch their own errors, so an exception means that the worker process failed
             error = future.exception()
             failure = JobFailure(one_line(f"{type(error).__name__}: {error}", 300))
-            results = [failure] * len(task_jobs) if error else future.result()
-            yield from zip(task_jobs, results, strict=True)
+            results = [failure] * len(jobs_of_task) if error else future.result()
+            yield from zip(jobs_of_task, results, strict=True)
     finally:
-        if futures and client.status == "running":
-            client.cancel(list(futures))
+        if jobs_by_future and client.status == "running":
+            client.cancel(list(jobs_by_future))
 
 
 def _run_task(
     run_job_list: Callable[..., Iterator[tuple[int, Any]]], jobs: Sequence[Any]
 ) -> list[Any]:
     """Run the jobs of one Dask task in sequence, in a child process of the Dask worker."""
-    # a Dask worker is a daemon process by default, which Python does not allow to start processes
+    # Dask workers are daemon processes by default, and Python does not allow daemon processes to
+    # start processes
     multiprocessing.current_process().daemon = False
     results_by_index = dict(run_job_list(jobs, process_count=1))
     return [results_by_index[index] for index in range(len(jobs))]

@@ -12,7 +12,7 @@ from px4fuse.diagnose import diagnose_or_check_aids
 from px4fuse.errors import LogError, ResultsError
 from px4fuse.filter.settings import Settings
 from px4fuse.request import ComparisonRequest
-from px4fuse.results.build import make_outcome_results
+from px4fuse.results.build import make_compare_results
 from px4fuse.results.contract import AidsResults, ComparisonResults, to_json
 from px4fuse.results.reading import MAX_RESULTS_BYTES, read_results
 from px4fuse.verification.pdf_input import MAX_PDF_BYTES, read_attached_results
@@ -20,9 +20,10 @@ from px4fuse.verification.pdf_input import MAX_PDF_BYTES, read_attached_results
 InputKind = Literal["log", "report", "results"]
 ProgressCallback = Callable[[str], None]
 Results = ComparisonResults | AidsResults
-# Settings of the other input with which a log is analysed, if both inputs are about different logs
+# If A and B are about different logs, px4fuse diff analyses a log with these settings, copied from
+# the results of the other input
 _FILTER_SETTINGS = {*Settings.__dataclass_fields__, "axes"}
-# Options that are not copied from the other input if both are about the same log: input files
+# If A and B are about the same log, all settings except these input files are copied
 _INPUT_FILE_SETTINGS = {"log", "system", "position"}
 
 
@@ -38,7 +39,9 @@ class InputResults:
 def read_diff_inputs(
     a: Path, b: Path, progress: ProgressCallback = lambda _: None
 ) -> tuple[InputResults, InputResults]:
-    """Read two logs, reports or results; analyse a log with the settings of the other input.
+    """Read results from two logs, reports (PDF) or results files.
+
+    If only one input is a log, the log is analysed with the settings in the other input.
 
     Raises
     ------
@@ -75,21 +78,24 @@ def _read_given_results(path: Path) -> InputResults | None:
 
 
 def _analyse_log(
-    path: Path, other_input: InputResults | None, progress: ProgressCallback
+    path: Path, input_with_settings: InputResults | None, progress: ProgressCallback
 ) -> InputResults:
     request = ComparisonRequest(log=str(path))
-    if other_input is not None:
-        is_same_log = other_input.results.log.sha256 in hash_files([path])
+    if input_with_settings is not None:
+        is_same_log = input_with_settings.results.log.sha256 in hash_files([path])
         copied_setting_names = (
             {*request.__struct_fields__} - _INPUT_FILE_SETTINGS if is_same_log else _FILTER_SETTINGS
         )
         request = replace(
             request,
-            **{name: getattr(other_input.results.request, name) for name in copied_setting_names},
+            **{
+                name: getattr(input_with_settings.results.request, name)
+                for name in copied_setting_names
+            },
         )
     analysis = diagnose_or_check_aids(request, progress)
     # to_json rounds all numbers, as in the results of a report
-    results_json = to_json(make_outcome_results(request, analysis))
+    results_json = to_json(make_compare_results(request, analysis))
     results = read_results(results_json.encode())
     assert isinstance(results, Results)
     return InputResults(display_name(path), "log", results)

@@ -8,8 +8,8 @@ import msgspec
 
 from px4fuse.batch.logs import local_file
 from px4fuse.batch.rows import (
-    FAILED,
-    NOT_COMPARED,
+    STATUS_FAILED,
+    STATUS_NOT_COMPARED,
     Row,
     collect_finding_values,
     collect_log_values,
@@ -36,7 +36,7 @@ class Job:
 
     address: str
     request: ComparisonRequest
-    with_report: bool
+    writes_report: bool
     max_bytes: int
     finished_hashes: frozenset[str] = frozenset()
 
@@ -65,11 +65,15 @@ def analyse(job: Job) -> LogOutcome:
                 return LogOutcome(sha256)
             outcome = _compare_log(job, path, sha256)
             if _compute_sha256(path) != sha256:
-                remedy = "Run the same command again when the file is complete."
-                raise LogError("the file changed while it was read", remedy)
+                raise LogError(
+                    "the file changed while it was read",
+                    "Run the same command again when the file is complete.",
+                )
             return outcome
     except Px4FuseError as error:
-        return LogOutcome(sha256, (make_failure_row(error, FAILED) | {"log_sha256": sha256},))
+        return LogOutcome(
+            sha256, (make_failure_row(error, STATUS_FAILED) | {"log_sha256": sha256},)
+        )
 
 
 def make_failure_row(error: Px4FuseError, status: str, name: str = "") -> Row:
@@ -97,16 +101,16 @@ def _compare_log(job: Job, path: Path, sha256: str) -> LogOutcome:
                 analysis.missing_data.reason, analysis.missing_data.remedy
             )
             return LogOutcome(
-                sha256, (row | make_failure_row(missing_data, NOT_COMPARED, path.name),)
+                sha256, (row | make_failure_row(missing_data, STATUS_NOT_COMPARED, path.name),)
             )
         comparison_results = results(request, analysis)
         results_json, report_pdf = to_json(comparison_results), b""
-        if job.with_report:
+        if job.writes_report:
             from px4fuse.report.pdf import render_pdf  # noqa: PLC0415
 
             report_pdf = render_pdf(analysis, comparison_results, results_json)
     except Px4FuseError as error:
-        status = NOT_COMPARED if isinstance(error, MissingDataError) else FAILED
+        status = STATUS_NOT_COMPARED if isinstance(error, MissingDataError) else STATUS_FAILED
         return LogOutcome(sha256, (row | make_failure_row(error, status, path.name),))
     return LogOutcome(
         sha256, tuple(make_axis_rows(comparison_results)), results_json.encode(), report_pdf

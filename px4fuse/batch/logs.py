@@ -30,15 +30,15 @@ class LogAddress:
     ----------
     name : str
         File name.
-    table_path : str
-        Path or URL in the table, as the user gave it.
+    path_for_table : str
+        Path or URL for the table of px4fuse batch, relative if the user gave a relative path.
     address : str
         Absolute path or URL.
     size_bytes : int or None
     """
 
     name: str
-    table_path: str
+    path_for_table: str
     address: str
     size_bytes: int | None
 
@@ -63,6 +63,7 @@ def _find_pattern_logs(pattern: str) -> list[LogAddress]:
     if not pattern:
         raise SettingsError("the name of a log is empty", "Give files, folders, globs or URLs.")
     file_system, root_path = _open_file_system(pattern)
+    is_local = _is_local(file_system)
     suffixes: tuple[str, ...] = ("",)
     try:
         if file_system.isdir(root_path):
@@ -91,11 +92,13 @@ def _find_pattern_logs(pattern: str) -> list[LogAddress]:
         )
     found_logs = []
     for path, file_info in info_by_path.items():
-        address = path if _is_local(file_system) else file_system.unstrip_protocol(path)
-        is_relative = _is_local(file_system) and not Path(pattern).is_absolute()
-        table_path = os.path.relpath(path) if is_relative else address
-        found_logs.append(LogAddress(_file_name(path), table_path, address, file_info.get("size")))
-        if _is_local(file_system):
+        address = path if is_local else file_system.unstrip_protocol(path)
+        is_relative_path = is_local and not Path(pattern).is_absolute()
+        path_for_table = os.path.relpath(path) if is_relative_path else address
+        found_logs.append(
+            LogAddress(_file_name(path), path_for_table, address, file_info.get("size"))
+        )
+        if is_local:
             add_input(Path(path))
     return found_logs
 
@@ -152,5 +155,5 @@ def _is_local(file_system: AbstractFileSystem) -> bool:
 
 
 def _file_name(path: str) -> str:
-    """Return the file name in a path or URL, without the query of a URL."""
+    """Return the file name in a path or URL; the query of a URL (after "?") is omitted."""
     return PurePosixPath(path.partition("?")[0]).name or "log"

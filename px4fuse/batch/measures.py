@@ -1,8 +1,8 @@
 """Numbers that ``px4fuse diff`` compares, with 95 % intervals.
 
 ``measures.csv`` lists the path of each number in the results, such as
-``axes.*.rejected_fraction``. ``*`` stands for any key, and FILTER for KF and EKF2. The unit "share"
-is a fraction from 0 to 1.
+``axes.*.rejected_fraction``. ``*`` stands for any key, and KF_OR_EKF2 for each of the two filters.
+The unit "share" is a fraction from 0 to 1.
 """
 
 from collections.abc import Iterator
@@ -19,14 +19,18 @@ from px4fuse.results.contract import AidsResults, ComparisonResults, ConfidenceI
 # Rows of measures.csv; "interval" is the field in the results that contains the 95 % interval
 COMPARED_NUMBER_DEFINITIONS = [
     row
-    | {"path": row["path"].replace("FILTER", name), "label": row["label"].replace("FILTER", label)}
+    | {
+        "path": row["path"].replace("KF_OR_EKF2", name),
+        "label": row["label"].replace("KF_OR_EKF2", label),
+    }
     for row in read_rows("measures.csv")
-    for name, label in (FILTER_NAMES.items() if "FILTER" in row["path"] else [("", "")])
+    for name, label in (FILTER_NAMES.items() if "KF_OR_EKF2" in row["path"] else [("", "")])
 ]
-# px4fuse diff omits numbers of A and B that differ by at most this fraction
-RELATIVE_TOLERANCE = 0.01
-# px4fuse diff omits numbers of A and B that differ by at most this, in the unit of the numbers
-ABSOLUTE_TOLERANCE = 0.001
+# px4fuse diff does not list a number if the values in A and B differ by at most this fraction
+MAX_OMITTED_RELATIVE_DIFFERENCE = 0.01
+# px4fuse diff does not list a number if the values in A and B differ by at most this. The unit is
+# the unit of the number, for example m or s
+MAX_OMITTED_DIFFERENCE = 0.001
 
 
 @dataclass(frozen=True)
@@ -43,11 +47,11 @@ def collect_compared_numbers(results: ComparisonResults | AidsResults) -> dict[s
     """Return the numbers that ``px4fuse diff`` compares, by path (``clock.offset_s``)."""
     axes = {} if isinstance(results, AidsResults) else results.axes
     # EKF2 rejects north and east together, so their rejected fractions are equal: keep only one
-    horizontal_axis = next((name for name in ("north", "east", AISLE) if name in axes), "")
+    first_horizontal_axis = next((name for name in ("north", "east", AISLE) if name in axes), "")
     # omit the aiding source of the positions: the results of the axes contain its numbers
-    position_source_aids: tuple[str, ...] = ("ev_pos", "ev_hgt") if axes else ()
+    aids_of_position_source: tuple[str, ...] = ("ev_pos", "ev_hgt") if axes else ()
     if find_value(results, "source.kind") == "gnss":
-        position_source_aids = ("gnss_pos",)
+        aids_of_position_source = ("gnss_pos",)
     numbers_by_path: dict[str, ComparedNumber] = {}
     for definition in COMPARED_NUMBER_DEFINITIONS:
         pattern, interval_field = definition["path"], definition["interval"]
@@ -57,9 +61,9 @@ def collect_compared_numbers(results: ComparisonResults | AidsResults) -> dict[s
             value = getattr(record, field_name, None)
             is_undetermined = isinstance(record, ClockOffset) and not record.is_determinable
             is_undetermined |= isinstance(record, HeadingError) and record.drifts
-            is_duplicate = pattern.startswith("aids.") and first_key in position_source_aids
+            is_duplicate = pattern.startswith("aids.") and first_key in aids_of_position_source
             if pattern == "axes.*.rejected_fraction":
-                is_duplicate = first_key not in (horizontal_axis, "down")
+                is_duplicate = first_key not in (first_horizontal_axis, "down")
             if is_undetermined or is_duplicate or not isinstance(value, int | float):
                 continue
             labels = (AIDS[name].label if name in AIDS else name for name in keys)

@@ -8,7 +8,13 @@ from typing import Any
 
 import pandas as pd
 
-from px4fuse.batch.rows import DONE, FAILED, FINDING_SEPARATOR, NOT_COMPARED, RESULT_PATH_BY_COLUMN
+from px4fuse.batch.rows import (
+    FINDING_SEPARATOR,
+    RESULT_PATH_BY_COLUMN,
+    STATUS_DONE,
+    STATUS_FAILED,
+    STATUS_NOT_COMPARED,
+)
 from px4fuse.card.model import RATIO_AXIS_ENDS
 from px4fuse.core.text import format_count, format_metres, format_number, format_ratio, join_first
 from px4fuse.filter.consistency import CONSISTENT_SIGMA_RATIOS
@@ -19,7 +25,8 @@ from px4fuse.html.safe import clean_text, load_template, make_relative_url
 from px4fuse.report.card_html import MARKER_SVG_PATHS
 from px4fuse.report.card_text import SEVERITY_SIGNS, SYMBOL_BY_REFERENCE, format_consistent_ratios
 
-# Filter and reference of each σ ratio (source: innovations; truth: errors), as in Card.verdicts
+# Columns of σ ratios, as "<filter>_<reference>". A ratio is computed from innovations (reference
+# source) or from errors against ground truth (reference truth)
 SIGMA_RATIO_COLUMNS = ("kf_source", "kf_truth", "ekf2_source", "ekf2_truth")
 SEVERITIES = list(SEVERITY_SIGNS)
 FILE_LINKS = (("Report (PDF)", "report"), ("Results (JSON)", "results"))
@@ -28,7 +35,7 @@ AXIS_COLUMNS = [name for name, path in RESULT_PATH_BY_COLUMN.items() if "{" in p
 # Columns with one value per log; the page shows them after a click on a row
 LOG_COLUMNS = [
     name
-    for name, path in RESULT_PATH_BY_COLUMN.items()
+    for name in RESULT_PATH_BY_COLUMN
     if name
     not in (
         *AXIS_COLUMNS,
@@ -46,10 +53,11 @@ LOG_COLUMNS = [
         "report",
     )
 ]
-# Name of the group of columns that the page shows on request
-EXTRA_COLUMN_GROUP = "numbers"
-# Labels of the drop-down lists that filter logs; each key is the prefix of tags ("status:done")
-DROP_DOWN_LABELS = {
+# Group of columns that the page hides until the user clicks on "more columns"
+OPTIONAL_COLUMN_GROUP = "numbers"
+# Labels of the drop-down lists that filter logs. Each key is the first part of a tag of a log, for
+# example "status" in the tag "status:done"
+DROP_DOWN_LABEL_BY_TAG_PREFIX = {
     "severity": "Diagnosis",
     "status": "Status",
     "vehicle": "Vehicle",
@@ -57,10 +65,10 @@ DROP_DOWN_LABELS = {
     "finding": "Finding",
     "remedy": "Action",
 }
-# Axes whose numbers the row of a log shows: the first of these groups with results
-MAIN_AXES_BY_PREFERENCE = (("aisle",), ("north", "east"), ("down",))
+# The row of a log shows the numbers of the first of these groups of axes that has results
+MAIN_AXIS_GROUPS_BY_PREFERENCE = (("aisle",), ("north", "east"), ("down",))
 
-#: Values of one log by column name, with the columns that :func:`_summarise_log` adds
+#: Values of one log, by table column and by the further names in :func:`_summarise_log`
 LogSummary = Mapping[str, Any]
 
 
@@ -82,7 +90,7 @@ def format_html(table: pd.DataFrame, title: str, version_text: str) -> str:
             _make_log_cells(log),
             tuple(log["tags"]),
             _make_log_details(log),
-            _make_side_sections(log),
+            _make_file_and_flight_sections(log),
         )
         for log in logs
     ]
@@ -105,18 +113,18 @@ def format_html(table: pd.DataFrame, title: str, version_text: str) -> str:
             ),
             Column("KF − EKF2 (m)", "number", min_screen_size="tablet"),
             *(
-                Column(label, "line", EXTRA_COLUMN_GROUP)
+                Column(label, "line", OPTIONAL_COLUMN_GROUP)
                 for label in ("Date (UTC)", "Vehicle", "Firmware")
             ),
-            Column("SIGMA_Z estimate (m)", "number", EXTRA_COLUMN_GROUP),
-            Column("Time offset (s)", "number", EXTRA_COLUMN_GROUP),
-            Column("Findings", "rank", EXTRA_COLUMN_GROUP),
+            Column("SIGMA_Z estimate (m)", "number", OPTIONAL_COLUMN_GROUP),
+            Column("Time offset (s)", "number", OPTIONAL_COLUMN_GROUP),
+            Column("Findings", "rank", OPTIONAL_COLUMN_GROUP),
         ),
         rows=rows,
         filters=_make_drop_down_lists(logs),
-        column_groups=[(EXTRA_COLUMN_GROUP, "more columns")],
+        column_groups=[(OPTIONAL_COLUMN_GROUP, "more columns")],
         placeholder="search by name, vehicle, firmware or finding",
-        full_table_note="The table fleet.csv contains all rows.",
+        full_table_note="fleet.csv contains the table of all logs.",
         ratio_axis={
             "bands": CONSISTENT_SIGMA_RATIOS,
             "ends": RATIO_AXIS_ENDS,
@@ -144,7 +152,7 @@ def _make_log_cells(log: LogSummary) -> tuple[Cell, ...]:
         frame.make_number_cell(log.get("sigma_z_m"), format_number),
         frame.make_number_cell(log.get("clock_offset_s"), format_number),
         Cell()
-        if log["status"] == FAILED
+        if log["status"] == STATUS_FAILED
         else frame.make_number_cell(
             float(len(finding_titles)), second_line=join_first(finding_titles, 2)
         ),
@@ -155,9 +163,11 @@ def _make_ratio_cell(ratio: float | None, name: str, verdict: str) -> Cell:
     if ratio is None:
         return Cell()
     filter_name, _, reference_name = name.partition("_")
-    emphasis_class = " loud" if verdict in ("overconfident", "underconfident") else ""
+    emphasis_css_class = " loud" if verdict in ("overconfident", "underconfident") else ""
     return Cell(
-        format_ratio(ratio), ratio, style_class=f"{filter_name} {reference_name}{emphasis_class}"
+        format_ratio(ratio),
+        ratio,
+        style_class=f"{filter_name} {reference_name}{emphasis_css_class}",
     )
 
 
@@ -200,7 +210,7 @@ def _make_log_details(log: LogSummary) -> tuple[RowSection, ...]:
     )
 
 
-def _make_side_sections(log: LogSummary) -> tuple[RowSection, ...]:
+def _make_file_and_flight_sections(log: LogSummary) -> tuple[RowSection, ...]:
     return (
         frame.make_links_section(
             "Files", [(label, make_relative_url(log.get(name, ""))) for label, name in FILE_LINKS]
@@ -222,7 +232,7 @@ def _make_drop_down_lists(logs: Sequence[LogSummary]) -> list[tuple[str, list[tu
         tag: label for log in logs for tag, label in log["tags"].items()
     }
     drop_down_lists = []
-    for kind, label in DROP_DOWN_LABELS.items():
+    for kind, label in DROP_DOWN_LABEL_BY_TAG_PREFIX.items():
         options = [
             (tag, f"{clean_text(label_by_tag[tag], 60)} ({count})")
             for tag, count in count_by_tag.most_common()
@@ -247,12 +257,15 @@ def summarise_logs(table: pd.DataFrame) -> list[LogSummary]:
 
 
 def _summarise_log(rows: Sequence[Mapping[str, Any]]) -> LogSummary:
-    """Combine the rows of a log, one per axis; numbers are those of the main axis."""
+    """Return one summary of a log from its rows, one per axis; numbers are of the main axis.
+
+    The main axis is the first in MAIN_AXIS_GROUPS_BY_PREFERENCE.
+    """
     axis_rows = [row for row in rows if "axis" in row]
     main_axis_rows = next(
         (
             preferred_rows
-            for names in MAIN_AXES_BY_PREFERENCE
+            for names in MAIN_AXIS_GROUPS_BY_PREFERENCE
             if (preferred_rows := [row for row in axis_rows if row["axis"] in names])
         ),
         rows,
@@ -263,12 +276,14 @@ def _summarise_log(rows: Sequence[Mapping[str, Any]]) -> LogSummary:
     reasons_and_remedies = ((row.get("reason", ""), row.get("remedy", "")) for row in rows)
     log |= {
         "name": log.get("name") or PurePosixPath(log["log"]).name or "unnamed",
-        "status": DONE if any(row["status"] == DONE for row in rows) else rows[0]["status"],
+        "status": STATUS_DONE
+        if any(row["status"] == STATUS_DONE for row in rows)
+        else rows[0]["status"],
         "missing_results": tuple(dict.fromkeys(pair for pair in reasons_and_remedies if any(pair))),
         "axes": axis_rows,
         "findings": [id_ for id_ in log.get("findings", "").split(FINDING_SEPARATOR) if id_],
     }
-    status_text = log["status"] if log["status"] == NOT_COMPARED else "refused"
+    status_text = log["status"] if log["status"] == STATUS_NOT_COMPARED else "refused"
     log |= {
         "severity": log.get("severity", "refused"),
         "headline": log.get("headline", f"{status_text}: {log.get('reason', '')}"),

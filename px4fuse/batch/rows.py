@@ -18,10 +18,11 @@ from px4fuse.findings import Finding
 from px4fuse.request import quote_command
 from px4fuse.results.contract import ComparisonResults, Log
 
-DONE, NOT_COMPARED, FAILED = "done", "not compared", "failed"
+STATUS_DONE, STATUS_NOT_COMPARED, STATUS_FAILED = "done", "not compared", "failed"
 FINDING_SEPARATOR = ";"
-# Key in the results for the noise estimate of north and east; other axes have their own name as key
-_TUNING_KEY_BY_AXIS = {"north": "horizontal", "east": "horizontal"}
+# Key of the noise estimate in the results: "horizontal" for north and east, which have one estimate
+# together. For each other axis, the key is its name
+_NOISE_ESTIMATE_KEY_BY_AXIS = {"north": "horizontal", "east": "horizontal"}
 
 
 def read_rows(name: str) -> list[dict[str, str]]:
@@ -64,7 +65,9 @@ def make_axis_rows(results: ComparisonResults) -> list[Row]:
         )
         row = common_values | {
             "axis": name,
-            "status": NOT_COMPARED if isinstance(axis.filters["kf"], Unavailable) else DONE,
+            "status": STATUS_NOT_COMPARED
+            if isinstance(axis.filters["kf"], Unavailable)
+            else STATUS_DONE,
             "reason": f"{unavailable_filter.what}: {unavailable_filter.reason}"
             if unavailable_filter
             else "",
@@ -76,8 +79,8 @@ def make_axis_rows(results: ComparisonResults) -> list[Row]:
                 and path
                 and (is_offset_determinable or not path.startswith("clock."))
             ):
-                tuning_key = _TUNING_KEY_BY_AXIS.get(name, name)
-                row[column] = find_value(results, path.format(axis=name, tuned=tuning_key))
+                noise_estimate_key = _NOISE_ESTIMATE_KEY_BY_AXIS.get(name, name)
+                row[column] = find_value(results, path.format(axis=name, tuned=noise_estimate_key))
         rows.append(row)
     return rows
 
@@ -159,8 +162,9 @@ def collect_log_values(log: Log) -> Row:
 
 def make_table(rows: Iterable[Row]) -> pd.DataFrame:
     text_columns = dict.fromkeys((name for name, kind in COLUMN_TYPES.items() if kind == "str"), "")
-    filled_rows = [text_columns | clean_row(row) for row in rows]
-    return pd.DataFrame(filled_rows, columns=list(COLUMN_TYPES)).astype(COLUMN_TYPES)
+    return pd.DataFrame(
+        [text_columns | clean_row(row) for row in rows], columns=list(COLUMN_TYPES)
+    ).astype(COLUMN_TYPES)
 
 
 def clean_row(row: Row) -> Row:

@@ -14,14 +14,14 @@ from typing import Annotated, Any
 import msgspec
 import pandas as pd
 
-from px4fuse.batch import LOG_TIMEOUT_S
+from px4fuse.batch import LOG_ANALYSIS_TIMEOUT_S
 from px4fuse.batch.engine import connect_cluster, run_jobs
 from px4fuse.batch.job import Job, LogOutcome, analyse, make_failure_row, make_file_stem
 from px4fuse.batch.logs import LogAddress, find_logs
 from px4fuse.batch.page import format_html
 from px4fuse.batch.rows import (
-    FAILED,
-    NOT_COMPARED,
+    STATUS_FAILED,
+    STATUS_NOT_COMPARED,
     Row,
     clean_row,
     format_csv,
@@ -87,11 +87,11 @@ class _RunState:
     settings: str
     # SHA-256 of finished logs
     hash_by_address: dict[str, str] = field(default_factory=dict)
-    # of several identical logs, only the first has results in the table
+    # first of several identical logs; only this log has results in the table
     first_log_by_hash: dict[str, LogAddress] = field(default_factory=dict)
     failed_row_by_address: dict[str, Row] = field(default_factory=dict)
     # SHA-256 of logs that were finished in an earlier run
-    reused_log_hashes: set[str] = field(default_factory=set)
+    hashes_from_earlier_runs: set[str] = field(default_factory=set)
 
 
 def run_batch(
@@ -153,7 +153,7 @@ def run(
     output: Path,
     *,
     reports: bool = False,
-    timeout_s: float = LOG_TIMEOUT_S,
+    timeout_s: float = LOG_ANALYSIS_TIMEOUT_S,
     scheduler: str | None = None,
     workers: int | None = None,
     memory_gb: float = MAX_MEMORY_BYTES / 1e9,
@@ -184,7 +184,7 @@ def run(
         request = ComparisonRequest(log="LOG", **settings)
     except TypeError as error:
         raise SettingsError(
-            f"px4fuse.compare has no such setting ({error})", "Omit or correct the setting."
+            f"px4fuse.compare does not accept a setting ({error})", "Omit or correct the setting."
         ) from error
     if request.position is not None:
         raise SettingsError("A position file belongs to one flight. Omit `position` for many logs.")
@@ -229,13 +229,17 @@ def run(
 
 
 def _find_cached_hashes(state: _RunState, reports: bool) -> dict[int | None, set[str]]:
-    """Return the SHA-256 of the logs that earlier runs finished, by size of the log in bytes."""
+    """Return the SHA-256 of the logs that earlier runs finished, by size of the log in bytes.
+
+    With ``reports``, a log without a PDF report is not finished. The size is None for a log at a
+    URL without a known size.
+    """
     hashes_by_size: dict[int | None, set[str]] = defaultdict(set)
     for cached_rows in load_cached_rows(state):
         first_row = cached_rows.rows[0]
-        required_file_columns = OUTPUT_FILE_COLUMNS[: 1 + reports] if "axis" in first_row else ()
+        output_file_columns = OUTPUT_FILE_COLUMNS[: 1 + reports] if "axis" in first_row else ()
         if all(
-            (state.output / first_row.get(column, "")).is_file() for column in required_file_columns
+            (state.output / first_row.get(column, "")).is_file() for column in output_file_columns
         ):
             hashes_by_size[cached_rows.size_bytes].add(cached_rows.sha256)
     return hashes_by_size
@@ -257,14 +261,14 @@ def _cache_outcome(state: _RunState, log: LogAddress, outcome: LogOutcome | JobF
     if isinstance(outcome, JobFailure):
         remedy = "Increase --timeout or --memory, or run px4fuse compare on this log."
         outcome = LogOutcome(
-            "", (make_failure_row(LogError(outcome.reason.rstrip("."), remedy), FAILED),)
+            "", (make_failure_row(LogError(outcome.reason.rstrip("."), remedy), STATUS_FAILED),)
         )
-    if outcome.rows and outcome.rows[0]["status"] == FAILED:
+    if outcome.rows and outcome.rows[0]["status"] == STATUS_FAILED:
         state.failed_row_by_address[log.address] = outcome.rows[0]
         return
     first_log = min(log, state.first_log_by_hash.get(outcome.sha256, log))
     if not outcome.rows:
-        state.reused_log_hashes.add(outcome.sha256)
+        state.hashes_from_earlier_runs.add(outcome.sha256)
     elif first_log is log:
         _write_log(state, log, outcome)
     state.hash_by_address[log.address] = outcome.sha256
@@ -297,32 +301,35 @@ def _write_table(state: _RunState, logs: Iterable[LogAddress]) -> BatchResult:
     def find_rows(log: LogAddress) -> Iterable[Row]:
         if log.address in state.failed_row_by_address:
             return [state.failed_row_by_address[log.address]]
-        if log.address not in state.hash_by_address:  # the run ended before this log
+        if log.address not in state.hash_by_address:  # batch stopped before this log
             return []
         sha256 = state.hash_by_address[log.address]
         first_log = state.first_log_by_hash[sha256]
         if first_log is log and sha256 in rows_by_hash:
             return rows_by_hash[sha256]
-        status, reason = NOT_COMPARED, f"the log is identical to {first_log.table_path}"
+        status, reason = STATUS_NOT_COMPARED, f"the log is identical to {first_log.path_for_table}"
         if first_log is log:
-            status = FAILED
+            status = STATUS_FAILED
             reason = "another run of px4fuse batch changed the results of this log"
         return [{"status": status, "log_sha256": sha256, "reason": reason}]
 
     def make_complete_rows() -> Iterator[Row]:
         for log in logs:
-            common_values = {"log": log.table_path, "name": log.name}
+            common_values = {"log": log.path_for_table, "name": log.name}
             common_values |= {"px4fuse": state.version, "settings": state.settings}
             for row in find_rows(log):
                 severities.update(row.get("severities", ()))
-                yield replace_name_by_path(row, log.table_path) | common_values
+                yield replace_name_by_path(row, log.path_for_table) | common_values
 
     table = make_table(make_complete_rows())
-    page = format_html(table, state.output.resolve().name, f"px4fuse {state.version}")
     contents = {
         state.output / "fleet.parquet": table.to_parquet(index=False),
         state.output / "fleet.csv": format_csv(table),
-        state.output / "fleet.html": page.encode(),
+        state.output / "fleet.html": (
+            format_html(table, state.output.resolve().name, f"px4fuse {state.version}")
+        ).encode(),
     }
     write_output_files(contents)
-    return BatchResult(table, len(state.reused_log_hashes), frozenset(severities), tuple(contents))
+    return BatchResult(
+        table, len(state.hashes_from_earlier_runs), frozenset(severities), tuple(contents)
+    )

@@ -4,9 +4,9 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING
 
-from px4fuse.batch.measures import ABSOLUTE_TOLERANCE, RELATIVE_TOLERANCE
+from px4fuse.batch.measures import MAX_OMITTED_DIFFERENCE, MAX_OMITTED_RELATIVE_DIFFERENCE
 from px4fuse.batch.page import SIGMA_RATIO_COLUMNS, LogSummary, sort_logs, summarise_logs
-from px4fuse.batch.rows import FAILED
+from px4fuse.batch.rows import STATUS_FAILED
 from px4fuse.core.text import format_count, format_number, format_ratio
 from px4fuse.report.card_text import SEVERITY_SIGNS
 from px4fuse.report.page import Cell, Page, styled_text
@@ -26,16 +26,16 @@ NUMBER_TABLE_TITLES = ("number", "A", "95 %", "B", "95 %", "unit")
 def format_summary(batch_result: BatchResult) -> Page:
     """Format diagnoses and σ ratios (actual ÷ reported σ), and reasons for missing results."""
     page, logs = Page(), batch_result.table.drop_duplicates("log")
-    uncompared_logs = logs[logs["axis"] == ""].groupby(["status", "reason", "remedy"], sort=False)[
-        "log"
-    ]
-    reason_table = uncompared_logs.agg(["count", "first"]).reset_index()
+    logs_by_failure_reason = logs[logs["axis"] == ""].groupby(
+        ["status", "reason", "remedy"], sort=False
+    )["log"]
+    reason_table = logs_by_failure_reason.agg(["count", "first"]).reset_index()
     sorted_reasons = reason_table.sort_values("count", ascending=False, kind="stable")
     for reason in sorted_reasons.head(MAX_LISTED_REASONS).to_dict("records"):
         template = "{first}: {status}: {reason}. {remedy}"
         if reason["count"] > 1:
             template = f"{{count}} logs without results, for example {template}"
-        colour = ERROR_COLOUR if reason["status"] == FAILED else WARNING_COLOUR
+        colour = ERROR_COLOUR if reason["status"] == STATUS_FAILED else WARNING_COLOUR
         page.write(template.format_map(reason).rstrip(), colour=colour)
     if (unlisted_count := len(reason_table) - MAX_LISTED_REASONS) > 0:
         page.write(f"fleet.html lists {unlisted_count} more reasons for logs without a result.")
@@ -52,7 +52,7 @@ def format_summary(batch_result: BatchResult) -> Page:
         page.write(f"fleet.html lists {len(sorted_logs) - MAX_LISTED_LOGS} more logs.")
     counts = logs["status"].value_counts()
     counts_text = ", ".join(f"{count} {status}" for status, count in counts.items())
-    retry_note = " Run the same command to repeat failed logs." if FAILED in counts else ""
+    retry_note = " Run the same command to repeat failed logs." if STATUS_FAILED in counts else ""
     page.write(
         f"{len(logs)} logs: {counts_text}. Results from an earlier run: "
         f"{format_count(batch_result.reused_count, 'log')}.{retry_note}"
@@ -97,7 +97,7 @@ def format_differences(results: ChangeResults) -> Page:
         rows.append((number.label, *cells, unit))
     if rows:
         page.add_table(NUMBER_TABLE_TITLES, rows, right_aligned_columns=(1, 2, 3, 4))
-    tolerance_text = f"{100.0 * RELATIVE_TOLERANCE:g} % or {ABSOLUTE_TOLERANCE:g}"
+    tolerance_text = f"{100.0 * MAX_OMITTED_RELATIVE_DIFFERENCE:g} % or {MAX_OMITTED_DIFFERENCE:g}"
     page.write(
         f"Numbers that differ by less than {tolerance_text} are not listed.", colour=MUTED_COLOUR
     )
@@ -109,7 +109,7 @@ def format_differences(results: ChangeResults) -> Page:
     for text in results.worse:
         page.write_labelled("Worse", styled_text(text, 8.0, ERROR_COLOUR))
     if not results.worse:
-        page.write("No verdict is worse in B than in A.")
+        page.write("Compared with A, B has no new inconsistent filter and no new error.")
     return page
 
 

@@ -4,10 +4,7 @@ from collections import Counter
 from pathlib import Path
 
 from px4fuse.classroom.assignment.key import AnswerKey
-from px4fuse.classroom.assignment.random_assignment import (
-    EASIEST_DIFFICULTY,
-    MAX_FAULT_DIFFICULTY,
-)
+from px4fuse.classroom.assignment.random_assignment import EASIEST_DIFFICULTY, MAX_FAULT_DIFFICULTY
 from px4fuse.classroom.grading.grade import GradeOutcome
 from px4fuse.core.text import format_count, one_line
 from px4fuse.errors import to_one_line
@@ -30,9 +27,9 @@ def assignment_page(key: AnswerKey, folder: Path, key_file: Path, written_count:
         "Faults": ", ".join(
             f"{name} {number}" for name, number in sorted(flight_count_by_fault.items())
         ),
-        "Level": f"difficulty {min(difficulties):.2f} to {max(difficulties):.2f}, from the range "
-        f"{EASIEST_DIFFICULTY:g} to {MAX_FAULT_DIFFICULTY:g}. The difficulty is the smallest "
-        "size that px4fuse detects in 19 of 20 flights, divided by the size in the flight.",
+        "Level": f"difficulty {min(difficulties):.2f} to {max(difficulties):.2f} (easiest "
+        f"{EASIEST_DIFFICULTY:g}, hardest {MAX_FAULT_DIFFICULTY:g}). Difficulty: smallest size "
+        "that px4fuse detects in 19 of 20 flights, divided by the size in the flight.",
         "Flights": f"{folder_text} ({written_count} logs written, {flight_count - written_count} "
         "existed already)",
         "Answers": f"{key_file_text} (not for students: the file lists the injected faults)",

@@ -18,7 +18,7 @@ import click
 from click.core import ParameterSource
 from msgspec import Struct, structs
 
-from px4fuse.batch import LOG_TIMEOUT_S
+from px4fuse.batch import LOG_ANALYSIS_TIMEOUT_S
 from px4fuse.cli.outputs import OPENS_OUTPUT_KEY
 from px4fuse.core.input_files import add_input
 from px4fuse.core.reading import max_log_bytes, read_log_bytes, read_text
@@ -119,7 +119,7 @@ timeout_option = click.option(
     "timeout_s",
     type=click.FloatRange(1.0),
     metavar="SECONDS",
-    default=LOG_TIMEOUT_S,
+    default=LOG_ANALYSIS_TIMEOUT_S,
     help="Maximum time for one log (s); a log that takes longer fails.",
 )
 #: Option --memory of commands that analyse logs in worker processes

@@ -55,18 +55,18 @@ class AllowedAnswers(Record):
     """Allowed answers to the questions of the answer form (``form.toml``)."""
 
     behaviours: tuple[str, ...]
-    panels: tuple[str, ...]
+    report_panels: tuple[str, ...]
     units: dict[str, dict[str, float]]
-    mistakes: dict[str, FaultKind]
+    fault_kinds: dict[str, FaultKind]
     corrections: dict[str, str]
 
 
 _ALLOWED_ANSWERS = read_toml(__file__, AllowedAnswers, "form.toml")
 _UNITS_BY_QUANTITY: Mapping[str, Mapping[str, float]] = {"": {}, **_ALLOWED_ANSWERS.units}
-FAULT_KINDS, EKF2_BEHAVIOURS, PANELS = (
-    _ALLOWED_ANSWERS.mistakes,
+FAULT_KINDS, EKF2_BEHAVIOURS, REPORT_PANELS = (
+    _ALLOWED_ANSWERS.fault_kinds,
     _ALLOWED_ANSWERS.behaviours,
-    _ALLOWED_ANSWERS.panels,
+    _ALLOWED_ANSWERS.report_panels,
 )
 # Allowed units for the value of each correction of a fault, for example of a changed parameter
 UNITS_BY_CORRECTION = {
@@ -78,8 +78,9 @@ NOT_AVAILABLE = "not available"
 Number = Annotated[float, Meta(gt=-1e9, lt=1e9)]
 Unit = Annotated[str, Meta(max_length=10)]
 VerdictWord = Literal["", "consistent", "overconfident", "underconfident", "not available"]
+# Allowed verdicts on a filter, without the blank answer
 VERDICTS = get_args(VerdictWord)[1:]
-ChoiceName = Literal["", "a", "b", "c", "d", "e"]
+ChoiceLetter = Literal["", "a", "b", "c", "d", "e"]
 NUMBER_HELP = (
     "a number with a decimal point such as 0.2, without quotes or unit, or a list such as [61, 64]"
 )
@@ -87,19 +88,22 @@ NUMBER_HELP = (
 ACCEPTED_ANSWER_BY_FIELD = {
     **dict.fromkeys(("verdict_kf", "verdict_ekf2"), f"one of {', '.join(VERDICTS)}"),
     "when": '"whole flight", or "" with times in from_s and until_s',
-    "ekf2_did": "a list of behaviours of EKF2, each in quotes",
+    "ekf2_did": "a list of texts, each in quotes",
     "choices": "a letter from a to e in quotes",
     "log_sha256": "the SHA-256 of the log, which px4fuse answers LOG writes into an empty form",
-    **dict.fromkeys(("kind", "unit", "parameter", "value_unit", "panel"), "a short text in quotes"),
+    **dict.fromkeys(
+        ("kind", "unit", "parameter", "value_unit", "panel"),
+        "a text in quotes",
+    ),
 }
 # Answer to a question about KF: a number, a list of KF updates, or None if left blank
-QuantityAnswer = Number | Annotated[tuple[Number, ...], Meta(max_length=200)] | None
+NumericAnswer = Number | Annotated[tuple[Number, ...], Meta(max_length=200)] | None
 
 
 # Letters of the answers to a multiple-choice question
-CHOICE_NAMES: tuple[ChoiceName, ...] = get_args(ChoiceName)[1:]
+CHOICE_LETTERS: tuple[ChoiceLetter, ...] = get_args(ChoiceLetter)[1:]
 MAX_CHOICES = 20
-CHOICES_HEAD = """
+FIGURE_QUESTIONS_COMMENT = """
 # Figures: the picture of the same name (.png) shows other flights with other faults, analysed with
 # SIGMA_A 0.5 and SIGMA_Z 0.1. The background is grey while the vehicle flies in the direction of
 # the aisle, and white otherwise. Give the letter of the right answer. A wrong letter subtracts a
@@ -115,11 +119,11 @@ class Choice(Record):
     options: tuple[str, ...]
 
     def answer_text(self, letter: str) -> str:
-        return self.options[CHOICE_NAMES.index(letter)]
+        return self.options[CHOICE_LETTERS.index(letter)]
 
     @property
     def text(self) -> str:
-        options = map(": ".join, zip(CHOICE_NAMES, self.options, strict=True))
+        options = map(": ".join, zip(CHOICE_LETTERS, self.options, strict=True))
         return "\n#     ".join([self.question, *options])
 
 
@@ -149,8 +153,8 @@ class NamedFault(Record):
     value_unit: Unit = ""
     panel: str = ""
 
-    def convert_size_to_first_unit(self) -> float | None:
-        """Convert the fault's size to the first allowed unit, such as scale factor 1.05 to 5 %."""
+    def convert_size_to_standard_unit(self) -> float | None:
+        """Convert the size to the first unit of the fault in ``form.toml``, for example cm to m."""
         units = FAULT_KINDS[self.kind].units
         if self.size is None or not units:
             return None
@@ -158,8 +162,8 @@ class NamedFault(Record):
             return (self.size - 1.0) * 100.0
         return self.size * (units[self.unit] if self.unit else next(iter(units.values())))
 
-    def convert_value_to_first_unit(self) -> float | None:
-        """Convert ``value`` of ``parameter`` to the first allowed unit, for example cm to m."""
+    def convert_value_to_standard_unit(self) -> float | None:
+        """Convert the value to the first unit of the parameter in ``form.toml`` (cm to m)."""
         units = UNITS_BY_CORRECTION.get(self.parameter, {})
         if self.value is None or not units:
             return self.value
@@ -188,8 +192,8 @@ class Answers(Record, kw_only=True):
     verdict_kf: VerdictWord = ""
     verdict_ekf2: VerdictWord = ""
     ekf2_did: Annotated[tuple[str, ...], Meta(max_length=len(EKF2_BEHAVIOURS))] = ()
-    quantities: Annotated[tuple[QuantityAnswer, ...], Meta(max_length=10)] = ()
-    choices: Annotated[tuple[ChoiceName, ...], Meta(max_length=MAX_CHOICES)] = ()
+    quantities: Annotated[tuple[NumericAnswer, ...], Meta(max_length=10)] = ()
+    choices: Annotated[tuple[ChoiceLetter, ...], Meta(max_length=MAX_CHOICES)] = ()
 
     @property
     def states_no_fault(self) -> bool:
@@ -197,8 +201,8 @@ class Answers(Record, kw_only=True):
 
 
 QuestionKind = Literal["gain", "variance", "innovation", "nis", "prediction", "gate"]
-# Kinds of the three questions about KF: one kind of each pair is selected at random
-_QUESTION_PAIRS: tuple[tuple[QuestionKind, QuestionKind], ...] = (
+# KF has three questions. The kind of each question is selected at random from one of these pairs
+_QUESTION_KIND_PAIRS: tuple[tuple[QuestionKind, QuestionKind], ...] = (
     ("gain", "variance"),
     ("innovation", "nis"),
     ("prediction", "gate"),
@@ -210,54 +214,60 @@ class FormQuestion(Record):
 
     Attributes
     ----------
+    kind : str
+        Quantity that the student must compute.
     update_number : int
         Number of the KF update, from 1. The first measurement only sets the state.
-    duration_s_or_gate : float
-        Kind "prediction": duration without update (s). Kind "gate": innovation gate (in √S).
+    question_parameter : float
+        Duration without update (s) for the kind "prediction", innovation gate (in √S) for "gate".
     """
 
     kind: QuestionKind
     update_number: int
     sigma_a_m_s2: float
     sigma_z_m: float
-    duration_s_or_gate: float = 0.0
+    question_parameter: float = 0.0
 
     @property
     def text(self) -> str:
-        update, number_text = self.update_number, f"{self.duration_s_or_gate:g}"
+        update, number_text = self.update_number, f"{self.question_parameter:g}"
         quantity = {
             "gain": f"Kalman gain of the position in update {update}",
             "variance": f"position variance after update {update} (m²)",
-            "innovation": f"innovation of update {update} (m)",
-            "nis": f"NIS of update {update}",
-            "prediction": f"position sigma (m) of KF {number_text} s after update {update}, if no "
-            "update follows",
-            "gate": f"numbers of the updates {update} to {update + FURTHER_GATE_UPDATE_COUNT}"
-            f" whose innovation is outside ±{number_text} sqrt(S); KF rejects no measurement",
+            "innovation": f"innovation in update {update} (m)",
+            "nis": f"NIS in update {update}",
+            "prediction": f"position sigma of KF (m) {number_text} s after update {update}, "
+            "without further updates",
+            "gate": f"update numbers {update} to {update + GATE_QUESTION_FURTHER_UPDATES} with an "
+            f"innovation outside ±{number_text} sqrt(S); KF rejects no measurement",
         }[self.kind]
         return f"{quantity}; with SIGMA_A {self.sigma_a_m_s2:g} and SIGMA_Z {self.sigma_z_m:g}"
 
 
-# A question of kind "gate" asks which innovations are outside the gate, in one KF update and this
-# number of further updates
-FURTHER_GATE_UPDATE_COUNT = 20
+# Number of updates after the first update in a question of kind "gate", which asks for the updates
+# whose innovations are outside the gate
+GATE_QUESTION_FURTHER_UPDATES = 20
 
 
 def select_questions(log_sha256: str) -> tuple[FormQuestion, ...]:
     """Select three questions about KF at random, with the SHA-256 of the log as seed."""
     random_bytes = iter(hashlib.sha256(f"px4fuse answers {log_sha256}".encode()).digest())
 
-    def draw_between(low: float, high: float, decimals: int) -> float:
+    def draw_number_between(low: float, high: float, decimals: int) -> float:
         return round(low + (high - low) * next(random_bytes) / 255.0, decimals)
 
-    sigmas = (draw_between(0.2, 0.45, 2), draw_between(0.06, 0.14, 3))
-    first_kind, second_kind, third_kind = (pair[next(random_bytes) % 2] for pair in _QUESTION_PAIRS)
-    duration_or_gate_range = (1.0, 4.0) if third_kind == "prediction" else (0.8, 1.3)
-    duration_s_or_gate = draw_between(*duration_or_gate_range, 1)
+    sigmas = (draw_number_between(0.2, 0.45, 2), draw_number_between(0.06, 0.14, 3))
+    first_question_kind, second_question_kind, third_question_kind = (
+        pair[next(random_bytes) % 2] for pair in _QUESTION_KIND_PAIRS
+    )
+    parameter_range = (1.0, 4.0) if third_question_kind == "prediction" else (0.8, 1.3)
+    question_parameter = draw_number_between(*parameter_range, 1)
     return (
-        FormQuestion(first_kind, 2 + next(random_bytes) % 7, *sigmas),
-        FormQuestion(second_kind, 20 + next(random_bytes) % 130, *sigmas),
-        FormQuestion(third_kind, 20 + next(random_bytes) % 100, *sigmas, duration_s_or_gate),
+        FormQuestion(first_question_kind, 2 + next(random_bytes) % 7, *sigmas),
+        FormQuestion(second_question_kind, 20 + next(random_bytes) % 130, *sigmas),
+        FormQuestion(
+            third_question_kind, 20 + next(random_bytes) % 100, *sigmas, question_parameter
+        ),
     )
 
 
@@ -311,13 +321,13 @@ def _describe_error(error: Exception, form_toml: str, form_values: dict[str, Any
 
 
 def _convert_form(form: dict[str, Any]) -> dict[str, Any]:
-    filled_form = _remove_blanks(form)
+    filled_form = _remove_empty_values(form)
     mistakes = filled_form.pop("mistake", ())
     quantities, choices = (
         msgspec.convert(filled_form.pop(name, {}), dict[str, Any])
         for name in ("quantities", "choices")
     )
-    quantity_fields = [f"q{number}" for number in range(1, len(_QUESTION_PAIRS) + 1)]
+    quantity_fields = [f"q{number}" for number in range(1, len(_QUESTION_KIND_PAIRS) + 1)]
     choice_fields = [f"c{number}" for number in range(1, MAX_CHOICES + 1)]
     if unknown_fields := sorted(
         {*quantities, *({"mistakes"} & filled_form.keys())} - set(quantity_fields)
@@ -327,20 +337,22 @@ def _convert_form(form: dict[str, Any]) -> dict[str, Any]:
             f"the field {unknown_fields[0]} is unknown; known fields: mistake, "
             f"{', '.join(quantity_fields)}"
         )
-    answered_names = choice_fields if choices else ()
+    answered_choice_fields = choice_fields if choices else ()
     return {
         **filled_form,
         "mistakes": mistakes,
         "quantities": tuple(map(quantities.get, quantity_fields)),
-        "choices": tuple(choices.get(name, "") for name in answered_names),
+        "choices": tuple(choices.get(name, "") for name in answered_choice_fields),
     }
 
 
-def _remove_blanks(value: Any) -> Any:
+def _remove_empty_values(value: Any) -> Any:
     if isinstance(value, dict):
-        return {key: _remove_blanks(element) for key, element in value.items() if element != ""}
+        return {
+            key: _remove_empty_values(element) for key, element in value.items() if element != ""
+        }
     if isinstance(value, list):
-        return [element for element in map(_remove_blanks, value) if element not in ("", {})]
+        return [element for element in map(_remove_empty_values, value) if element not in ("", {})]
     return value
 
 
@@ -348,7 +360,7 @@ def check_answers(answers: Answers) -> None:
     """Raise ValueError for an answer that is not allowed, out of range, or repeated."""
     kinds = [named_fault.kind for named_fault in answers.mistakes]
     for kind in kinds:
-        _require_choice("kind", kind, FAULT_KINDS)
+        _require_allowed_answer("kind", kind, FAULT_KINDS)
         if kinds.count(kind) > 1:
             raise ValueError(
                 f"the form names the kind {kind!r} twice; name each kind of fault once"
@@ -356,20 +368,22 @@ def check_answers(answers: Answers) -> None:
     if NO_FAULT_KIND in kinds and len(kinds) > 1:
         raise ValueError('the form names "none" and a fault; name only one of them')
     for behaviour in answers.ekf2_did:
-        _require_choice("ekf2_did", behaviour, EKF2_BEHAVIOURS)
+        _require_allowed_answer("ekf2_did", behaviour, EKF2_BEHAVIOURS)
     for named_fault in answers.mistakes:
         fault_kind = FAULT_KINDS[named_fault.kind]
-        for field_name, choices in (
+        for field_name, allowed_answers in (
             ("parameter", UNITS_BY_CORRECTION),
-            ("panel", PANELS),
+            ("panel", REPORT_PANELS),
             ("unit", fault_kind.units),
             ("value_unit", UNITS_BY_CORRECTION.get(named_fault.parameter)),
         ):
             chosen_name = getattr(named_fault, field_name)
-            if chosen_name and choices is not None:
-                _require_choice(f"{named_fault.kind}: {field_name}", chosen_name, choices)
+            if chosen_name and allowed_answers is not None:
+                _require_allowed_answer(
+                    f"{named_fault.kind}: {field_name}", chosen_name, allowed_answers
+                )
         min_size, max_size = fault_kind.size_range
-        size = named_fault.convert_size_to_first_unit()
+        size = named_fault.convert_size_to_standard_unit()
         if size is not None and not min_size <= size <= max_size:
             unit = next(iter(fault_kind.units))
             raise ValueError(
@@ -378,11 +392,13 @@ def check_answers(answers: Answers) -> None:
             )
 
 
-def _require_choice(field_name: str, value: str, choices: Any) -> None:
-    if value not in choices:
-        choices_text = _join_quoted(choices)
-        fault = f"is not one of {choices_text}" if choices_text else "must be left empty"
-        raise ValueError(f"{field_name} {value!r} {fault}")
+def _require_allowed_answer(field_name: str, answer: str, allowed_answers: Any) -> None:
+    if answer not in allowed_answers:
+        choices_text = _join_quoted(allowed_answers)
+        fault = (
+            f"is not one of {choices_text}" if choices_text else "is not allowed: leave it empty"
+        )
+        raise ValueError(f"{field_name} {answer!r} {fault}")
 
 
 def form_name(log_name: str) -> str:
@@ -410,15 +426,15 @@ def format_answer_form(log_name: str, log_sha256: str, choices: Sequence[Choice]
         form=form_name(log_name),
         sha256=log_sha256,
         verdicts=_join_quoted(VERDICTS),
-        behaviours=_format_comment_lines(_join_in_threes(EKF2_BEHAVIOURS)),
+        behaviours=_format_comment_lines(_format_rows_of_three(EKF2_BEHAVIOURS)),
         kinds=_format_comment_lines(kind_lines),
         corrections=_format_comment_lines(
             name + _format_units(UNITS_BY_CORRECTION[name]) for name in UNITS_BY_CORRECTION
         ),
-        panels=_format_comment_lines(_join_in_threes(PANELS)),
+        panels=_format_comment_lines(_format_rows_of_three(REPORT_PANELS)),
         questions="\n".join(questions),
     ) + "".join(
-        f'{CHOICES_HEAD * (number == 1)}# {choice.text}\nc{number} = ""\n'
+        f'{FIGURE_QUESTIONS_COMMENT * (number == 1)}# {choice.text}\nc{number} = ""\n'
         for number, choice in enumerate(choices, start=1)
     )
 
@@ -471,5 +487,5 @@ def _join_quoted(names: Iterable[str]) -> str:
     return ", ".join(f'"{name}"' for name in names)
 
 
-def _join_in_threes(names: tuple[str, ...]) -> Iterator[str]:
+def _format_rows_of_three(names: tuple[str, ...]) -> Iterator[str]:
     return (_join_quoted(names[start : start + 3]) for start in range(0, len(names), 3))

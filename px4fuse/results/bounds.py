@@ -12,15 +12,15 @@ from msgspec.structs import fields, replace
 from px4fuse.core.record import Unavailable
 from px4fuse.errors import ResultsError
 
-# Maximum absolute values in results: length (m) and ratio
-MAX_LENGTH_M, MAX_RATIO = 1e9, 1e6
+# Maximum absolute values in results: lengths (m), and statistics such as NIS, ratios and factors
+MAX_ABSOLUTE_LENGTH_M, MAX_ABSOLUTE_RATIO = 1e9, 1e6
 # Valid range of a number, by pattern of its field name; the first match applies
 RANGE_BY_FIELD_PATTERN = {
-    r"(^|_)(nis|nees)($|_)": (0.0, MAX_RATIO),
+    r"(^|_)(nis|nees)($|_)": (0.0, MAX_ABSOLUTE_RATIO),
     r"(enabled|fused|lost|rejected)_fraction($|_)": (0.0, 1.0),
     r"(^|_)correlation$": (-1.0, 1.0),
-    r"(^|_)(ratio|factor)($|_)": (-MAX_RATIO, MAX_RATIO),
-    r"_m$": (-MAX_LENGTH_M, MAX_LENGTH_M),
+    r"(^|_)(ratio|factor)($|_)": (-MAX_ABSOLUTE_RATIO, MAX_ABSOLUTE_RATIO),
+    r"_m$": (-MAX_ABSOLUTE_LENGTH_M, MAX_ABSOLUTE_LENGTH_M),
 }
 CHECK_LOG_REMEDY = "Check the logged data from which this number is computed."
 T = TypeVar("T", bound=msgspec.Struct)
@@ -83,7 +83,7 @@ def _check_value(value: Any, annotation: Any, path: str, reasons: list[str]) -> 
     if isinstance(value, float):
         low, high = find_bounds(path.rpartition(".")[2])
         if not math.isfinite(value):
-            raise _OutOfBoundsError(f"{path} is not a finite number")
+            raise _OutOfBoundsError(f"{path} has a value that is not finite")
         if not low <= value <= high:
             raise _OutOfBoundsError(f"{path} is {value:.3g} (allowed: {low:g} to {high:g})")
         return value
@@ -152,11 +152,7 @@ def _check_or_replace_value(value: Any, annotation: Any, path: str, reasons: lis
     except _OutOfBoundsError as error:
         for unavailable_type in list_types(annotation):
             if isinstance(unavailable_type, type) and issubclass(unavailable_type, Unavailable):
-                text_fields = {
-                    "what": path,
-                    "reason": str(error),
-                    "remedy": CHECK_LOG_REMEDY,
-                }
+                text_fields = {"what": path, "reason": str(error), "remedy": CHECK_LOG_REMEDY}
                 other_fields = {
                     field.name: _check_value(getattr(value, field.name), field.type, path, reasons)
                     for field in fields(unavailable_type)

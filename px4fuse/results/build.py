@@ -57,7 +57,7 @@ def results(
     return drop_invalid_numbers(contract.ComparisonResults(**fields))
 
 
-def make_outcome_results(
+def make_compare_results(
     request: ComparisonRequest, outcome: Analysis | AidsOnlyAnalysis, student: Student = NO_STUDENT
 ) -> contract.ComparisonResults | contract.AidsResults:
     """Return the results of ``px4fuse compare`` for a flight with or without positions."""
@@ -65,7 +65,7 @@ def make_outcome_results(
         return results(request, outcome, student)
     return drop_invalid_numbers(
         contract.AidsResults(
-            **_make_common_fields(contract.AIDS_SCHEMA_NAME, request, outcome.flight),
+            **_make_common_fields(contract.AIDING_SOURCES_SCHEMA_NAME, request, outcome.flight),
             aids=dict(outcome.aids),
             card=build_aids_card(outcome, request.with_file_names(), (student.name, student.id)),
             findings=outcome.findings,
@@ -80,9 +80,11 @@ def make_tuning_results(
     comparison: PreparedComparison,
     tuning_by_axis: Mapping[str, AxisTuning | Unavailable],
 ) -> contract.TuningResults:
-    common_fields = _make_flight_fields("px4fuse-tuning", request, comparison, "tune")
     return drop_invalid_numbers(
-        contract.TuningResults(**common_fields, tuning=dict(tuning_by_axis))
+        contract.TuningResults(
+            **_make_flight_fields("px4fuse-tuning", request, comparison, "tune"),
+            tuning=dict(tuning_by_axis),
+        )
     )
 
 
@@ -91,8 +93,11 @@ def make_sync_results(
     comparison: PreparedComparison,
     time_offset: ClockOffset | Unavailable,
 ) -> contract.SyncResults:
-    common_fields = _make_flight_fields("px4fuse-sync", request, comparison, "sync")
-    return drop_invalid_numbers(contract.SyncResults(**common_fields, clock=time_offset))
+    return drop_invalid_numbers(
+        contract.SyncResults(
+            **_make_flight_fields("px4fuse-sync", request, comparison, "sync"), clock=time_offset
+        )
+    )
 
 
 def make_whatif_results(request: WhatIfRequest, analysis: WhatIfAnalysis) -> contract.WhatIfResults:

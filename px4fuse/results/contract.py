@@ -38,7 +38,7 @@ from px4fuse.trajectory.model import Track
 COMPARISON_SCHEMA_NAME = "px4fuse-results"
 LOOP_SCHEMA_NAME = "px4fuse-loop"
 WHATIF_SCHEMA_NAME = "px4fuse-whatif"
-AIDS_SCHEMA_NAME = "px4fuse-aids"
+AIDING_SOURCES_SCHEMA_NAME = "px4fuse-aids"
 CHANGES_SCHEMA_NAME = "px4fuse-changes"
 # Maximum number of significant digits of a number in the results
 SIGNIFICANT_DIGITS = 10
@@ -114,7 +114,7 @@ class ChosenSettings(Record, kw_only=True):
 ESTIMATE_FIELD_BY_SETTING = {"sigma_a_m_s2": "sigma_a_two_state_m_s2", "sigma_z_m": "sigma_z_m"}
 
 
-DiffSide = Literal["A", "B"]
+DiffInputName = Literal["A", "B"]
 # 95 % interval; the upper bound is None if the data do not limit it
 ConfidenceInterval = tuple[float, float | None]
 
@@ -167,7 +167,7 @@ class UnsharedFinding(Record):
     id: str
     severity: Literal["error", "warning", "note"]
     message: str
-    only_in: DiffSide
+    only_in: DiffInputName
 
 
 class _FlightResults(Record):
@@ -192,7 +192,8 @@ class ComparisonResults(_FlightResults):
     ekf2_replay : Ekf2Replay
         Replay of EKF2 from the log, and its agreement with the logged EKF2.
     difference_steps : mapping of axis name to DifferenceExplanation
-        Difference KF - EKF2 after each step that replaces one setting of KF by that of EKF2.
+        Explanation of the difference KF - EKF2: re-runs of KF, in which settings of KF are replaced
+        step by step by settings of EKF2.
     trials : tuple of Trial
         Re-runs of KF and EKF2, each with one change of a setting or of the data.
     card : Card
@@ -342,7 +343,7 @@ Results = (
 RESULTS_BY_SCHEMA: dict[str, type[Results]] = {
     COMPARISON_SCHEMA_NAME: ComparisonResults,
     LOOP_SCHEMA_NAME: LoopResults,
-    AIDS_SCHEMA_NAME: AidsResults,
+    AIDING_SOURCES_SCHEMA_NAME: AidsResults,
     "px4fuse-tuning": TuningResults,
     "px4fuse-sync": SyncResults,
     "px4fuse-graph": GraphResults,
@@ -378,7 +379,7 @@ def make_schemas_of_types(types: Collection[type]) -> tuple[list[dict[str, Any]]
     components: dict[str, Any] = {}
 
     def describe_union(union_type: Any) -> dict[str, Any]:
-        # an unset field is not written, so the schema allows no value
+        # msgspec does not write an unset field, so the schema of this field allows no value
         if union_type is msgspec.UnsetType:
             return {"not": {}}
         record_types.update(dict.fromkeys(union_type.union_members))
@@ -405,7 +406,7 @@ def to_json_dict(results: msgspec.Struct) -> dict[str, Any]:
 def round_number(value: float) -> float:
     """Round a number to ten significant digits, or to six decimals if that is more precise.
 
-    UNIX times (s) need the six decimals. Further digits depend on the processor.
+    UNIX times (s) need the six decimals. Further digits differ between processors.
 
     >>> round_number(0.1 + 0.2), round_number(1795251250.2020123)
     (0.3, 1795251250.202012)

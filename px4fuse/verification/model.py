@@ -22,8 +22,14 @@ PageStatus = Literal["same", "differ", "not compared"]
 class Mismatch:
     """Value in a report that differs from a new analysis of the log.
 
-    ``path`` is the field in the results, for example ``axes.north.filters.kf.nis_mean``. A missing
-    value is "absent". ``recorded`` is in the report, ``recomputed`` is of the new analysis.
+    Attributes
+    ----------
+    path : str
+        Field of the results, for example ``axes.north.filters.kf.nis_mean``.
+    recorded : str
+        Value in the report; "absent" for a missing value.
+    recomputed : str
+        Value in the results of the new analysis; "absent" for a missing value.
     """
 
     path: str
@@ -39,6 +45,8 @@ class PageDifference:
     ----------
     page : int
         Page number; 0 for the whole document.
+    what : str
+        Description of the difference.
     is_structural : bool
         True for added or missing PDF objects: another program wrote the file.
     """
@@ -82,6 +90,6 @@ class Verification:
 
     @property
     def outcome(self) -> str:
-        """Status, or "page differs" if the numbers are right but pages of the PDF were changed."""
+        """Result for users: ``status``, or "page differs" if only pages of the PDF were changed."""
         has_different_pages = self.status == "verified" and self.page_status == "differ"
         return "page differs" if has_different_pages else self.status

@@ -16,7 +16,8 @@ SCHEMA = {"name": "px4fuse-verification", "version": "3.0"}
 def make_verification_output(pdf: bytes, verification: Verification) -> dict[str, object]:
     """Return the JSON output of ``px4fuse verify``."""
     values = asdict(verification)
-    for name in ("redrawn_pdf", "remedy", "missing"):  # only px4fuse grade uses these fields
+    # the JSON output omits the fields that only px4fuse grade needs
+    for name in ("redrawn_pdf", "remedy", "missing"):
         del values[name]
     return {
         "schema": SCHEMA,
@@ -48,7 +49,7 @@ def verification_page(name: str, verification: Verification, output: Path | None
         page.write("No report was written with -o: the analysis could not be repeated.")
     elif output is None and verification.pages:
         page.write(
-            "Action: write the report again from the log with -o FILE.pdf, and read that report."
+            "Action: write a new report from the log with -o FILE.pdf, and read the new report."
         )
     page.write(VERIFICATION_SCOPE_NOTE, colour=MUTED_COLOUR)
     return page

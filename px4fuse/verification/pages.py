@@ -52,11 +52,11 @@ from px4fuse.verification.pdf_input import (
 COORDINATE_TOLERANCE_PT = 0.25
 # Relative and absolute tolerance of PDF numbers except coordinates: programs may save 32-bit floats
 PDF_NUMBER_TOLERANCE = 1e-5
-# Maximum kerning (1/1000 em) of a text with tolerated numbers, because a forger could change the
-# order of the digits by a larger kerning
+# Numbers in a text may differ by rounding only if the kerning (1/1000 em) of the text is below this
+# limit. By a larger kerning, a forger could change the order of the digits
 MAX_KERNING_PER_MILLE_EM = 200.0
-# Maximum ratio of the sizes of submitted to redrawn page content: an escaped character has four
-# bytes
+# Maximum size of the content of a submitted page, divided by the size of the redrawn page: a
+# program may write each character as an escape sequence of four bytes
 MAX_CONTENT_SIZE_RATIO = 4
 # Maximum time (s) for comparing two PDFs; the comparison of the largest report takes 3 s
 PDF_COMPARISON_TIMEOUT_S = 12.0
@@ -67,7 +67,7 @@ SECOND_XREF_TABLE_REASON = (
     "the PDF was changed after px4fuse wrote it (second cross-reference table)"
 )
 # PDF dictionary keys that are not compared, because programs that save a PDF change them
-_COMPRESSION_KEYS = frozenset(("/Length", "/Filter"))
+_COMPRESSION_AND_LENGTH_KEYS = frozenset(("/Length", "/Filter"))
 _WRITER_KEYS = frozenset(("/Producer", "/CreationDate", "/ModDate"))
 _XMP_WRITER_FIELDS = re.compile(
     r"<(pdf:Producer|xmp:(?:Create|Modify|Metadata)Date|xmpMM:(?:Document|Instance)ID"
@@ -86,8 +86,8 @@ _ENTRY_DESCRIPTIONS = {
     "/OpenAction": "a PDF action that runs automatically",
     "/Outlines": "bookmarks",
     "/Rotate": "a rotation",
-    "/UserUnit": "a page unit other than 1/72 inch",
-    "/XObject": "an image or form object",
+    "/UserUnit": "a length unit other than 1/72 inch",
+    "/XObject": "an image or embedded drawing",
 }
 # Tokens of PDF page content (ISO 32000-1, 7.2 and 7.3): strings, hexadecimal strings, and others
 _TOKEN_PATTERN = re.compile(
@@ -107,7 +107,7 @@ _ESCAPED_CHARACTERS = {
     "\r": "",
     "\r\n": "",
 }
-# PDF drawing operators with coordinates, and index of the first coordinate among their operands
+# PDF drawing operators with coordinates: index of the first operand that is a coordinate
 _FIRST_COORDINATE_INDEX = {"m": 0, "l": 0, "c": 0, "v": 0, "y": 0, "re": 0, "cm": 4, "Tm": 4}
 _TEXT_OPERATORS = frozenset(("Tj", "TJ"))
 # Entry of a font's ToUnicode map: glyph number and UTF-16 text, in hexadecimal digits
@@ -127,9 +127,11 @@ def compare_pages(
     ``is_same_text`` returns True if two texts are equal up to the rounding of numbers. At most
     MAX_LISTED_DIFFERENCES are returned, in page order.
     """
-    job = submitted_pdf, redrawn_pdf, is_same_text
     differences = run_one_with_limits(
-        _compare_pdfs, job, PDF_COMPARISON_TIMEOUT_S, MAX_MEMORY_BYTES
+        _compare_pdfs,
+        (submitted_pdf, redrawn_pdf, is_same_text),
+        PDF_COMPARISON_TIMEOUT_S,
+        MAX_MEMORY_BYTES,
     )
     if not isinstance(differences, JobFailure):
         return differences
@@ -161,8 +163,7 @@ def _compare_pdfs(job: tuple[bytes, bytes, TextComparison]) -> tuple[PageDiffere
                 differences.insert(0, PageDifference(0, description, True))
             return tuple(differences)
     except (LimitReachedError, RecursionError, SyntaxError, *BROKEN_PDF_ERRORS) as error:
-        reason = f"the PDF cannot be read ({type(error).__name__})"
-        return (PageDifference(0, reason, True),)
+        return (PageDifference(0, f"the PDF cannot be read ({type(error).__name__})", True),)
 
 
 @dataclass
@@ -173,8 +174,9 @@ class _PdfComparison:
     # pairs of objects that are not compared again: number and generation in the submitted PDF,
     # number in the redrawn PDF
     compared_objects: set[tuple[int, int, int]] = field(default_factory=set)
-    # pairs of "/Parent" entries of pages; compared last, because they refer to all other pages
-    page_parent_pairs: list[tuple[Any, Any, str]] = field(default_factory=list)
+    # pairs of submitted and redrawn "/Parent" entries of pages. They are compared after the pages,
+    # because they refer to all pages
+    parent_entry_pairs: list[tuple[Any, Any, str]] = field(default_factory=list)
     # fonts of the current page by name
     fonts: Mapping[str, Any] = field(default_factory=dict)
     # number of compared values, which is limited because a malicious PDF may contain millions
@@ -199,9 +201,10 @@ class _PdfComparison:
                 dict.get(reader.trailer, key) for reader in (submitted_pdf, redrawn_pdf)
             )
             yield from self._compare(submitted_value, redrawn_value, key, 0)
-        for values in self.page_parent_pairs:
+        for values in self.parent_entry_pairs:
             yield from self._compare(*values, 0)
-        # programs for PDF 1.4 use another cross-reference table, so they could display other pages
+        # Programs for PDF 1.4 ignore /XRefStm and use the first cross-reference table, so they
+        # could display other pages
         if "/XRefStm" in submitted_pdf.trailer:
             yield PageDifference(0, SECOND_XREF_TABLE_REASON, True)
 
@@ -209,16 +212,16 @@ class _PdfComparison:
         self, submitted_value: Any, redrawn_value: Any, key: str, page_number: int
     ) -> Iterator[PageDifference]:
         """Yield the differences of two values at one place in both PDFs, and of nested values."""
-        remaining_values = [(submitted_value, redrawn_value, key)]
-        while remaining_values:
-            submitted_value, redrawn_value, key = remaining_values.pop()
+        value_pairs_to_compare = [(submitted_value, redrawn_value, key)]
+        while value_pairs_to_compare:
+            submitted_value, redrawn_value, key = value_pairs_to_compare.pop()
             self.value_count += 1
             if self.value_count > MAX_PDF_VALUES:
                 raise LimitReachedError(f"the PDF contains more than {MAX_PDF_VALUES} values")
             if isinstance(submitted_value, IndirectObject):
                 if submitted_value.generation:
                     # programs that ignore generation numbers would display another object
-                    description = f"the PDF entry {key} was changed (object generation above 0)"
+                    description = f"the PDF entry {key} was replaced (object generation above 0)"
                     yield PageDifference(page_number, description, True)
                 if isinstance(redrawn_value, IndirectObject):
                     object_ids = (
@@ -235,12 +238,12 @@ class _PdfComparison:
             if _pdf_type_of(submitted_value) is not _pdf_type_of(redrawn_value):
                 yield PageDifference(
                     page_number,
-                    f"the PDF entry {key} has another type than in the report drawn from the log",
+                    f"the type of the PDF entry {key} differs from the report drawn from the log",
                     True,
                 )
             elif isinstance(redrawn_value, DictionaryObject):
                 yield from self._compare_dictionaries(
-                    submitted_value, redrawn_value, key, page_number, remaining_values
+                    submitted_value, redrawn_value, key, page_number, value_pairs_to_compare
                 )
             elif isinstance(redrawn_value, ArrayObject):
                 if len(submitted_value) != len(redrawn_value):
@@ -251,7 +254,7 @@ class _PdfComparison:
                     yield PageDifference(page_number, description, True)
                     continue
                 pairs = zip(*map(list.__iter__, (submitted_value, redrawn_value)), strict=True)
-                remaining_values += [(*pair, key) for pair in pairs][::-1]
+                value_pairs_to_compare += [(*pair, key) for pair in pairs][::-1]
             elif not self._is_same_value(submitted_value, redrawn_value):
                 texts = [one_line(str(value), 60) for value in (submitted_value, redrawn_value)]
                 description = (
@@ -265,9 +268,9 @@ class _PdfComparison:
         redrawn_dictionary: DictionaryObject,
         key: str,
         page_number: int,
-        remaining_values: list[tuple[Any, Any, str]],
+        value_pairs_to_compare: list[tuple[Any, Any, str]],
     ) -> Iterator[PageDifference]:
-        """Yield differences in keys and streams; append the values that are still to compare."""
+        """Yield differences in keys and streams; append value pairs of equal keys to the list."""
         submitted_keys = _select_compared_keys(submitted_dictionary, key)
         redrawn_keys = _select_compared_keys(redrawn_dictionary, key)
         for name in sorted(submitted_keys ^ redrawn_keys):
@@ -277,10 +280,11 @@ class _PdfComparison:
                 description = f"the PDF contains {entry_description}, which px4fuse does not write"
             yield PageDifference(page_number, description, True)
         for name in sorted(submitted_keys & redrawn_keys, reverse=True):
-            values = submitted_dictionary.raw_get(name), redrawn_dictionary.raw_get(name), name
             (
-                self.page_parent_pairs if page_number and name == "/Parent" else remaining_values
-            ).append(values)
+                self.parent_entry_pairs
+                if page_number and name == "/Parent"
+                else value_pairs_to_compare
+            ).append((submitted_dictionary.raw_get(name), redrawn_dictionary.raw_get(name), name))
         if isinstance(redrawn_dictionary, StreamObject):
             yield from self._compare_streams(
                 submitted_dictionary, redrawn_dictionary, key, page_number
@@ -326,8 +330,8 @@ class _PdfComparison:
             and _normalise_xmp_metadata(submitted_data) == _normalise_xmp_metadata(redrawn_data)
         ):
             return
-        is_drawing = key == "/Contents" or stream_type == "/Pattern"
-        if not is_drawing or len(submitted_data) > MAX_CONTENT_SIZE_RATIO * len(redrawn_data):
+        is_page_content = key == "/Contents" or stream_type == "/Pattern"
+        if not is_page_content or len(submitted_data) > MAX_CONTENT_SIZE_RATIO * len(redrawn_data):
             yield PageDifference(
                 page_number,
                 f"the content of the PDF entry {key} differs from the report drawn from the log",
@@ -390,10 +394,10 @@ def _find_ambiguities(pdf: bytes) -> Iterator[str]:
     if end_match is None:
         yield "the file has bytes after the end of the PDF"
     elif b"/Linearized" in pdf[:1024]:
-        # the file must end with the position of its first cross-reference table; a second table
-        # could replace pages
-        table_start = pdf.find(b"endobj") + len(b"endobj")
-        if pdf[table_start : int(end_match[1])].strip():
+        # The file must end with the position of its first cross-reference table, which follows the
+        # first object. A second table could replace pages
+        xref_table_start = pdf.find(b"endobj") + len(b"endobj")
+        if pdf[xref_table_start : int(end_match[1])].strip():
             yield SECOND_XREF_TABLE_REASON
 
 
@@ -417,10 +421,10 @@ def _select_compared_keys(value: DictionaryObject, key: str) -> set[str]:
     """Return the keys of a PDF dictionary to compare with the redrawn PDF, without null values."""
     compared_keys = {name for name in value if not isinstance(value.raw_get(name), NullObject)}
     if isinstance(value, StreamObject):
-        compared_keys -= _COMPRESSION_KEYS
+        compared_keys -= _COMPRESSION_AND_LENGTH_KEYS
     if key == "/Info":
         compared_keys -= _WRITER_KEYS
-    # /Params has only times and size of an attachment, whose content is compared
+    # The content of an attachment is compared, so /Params (dates and size) is ignored
     return compared_keys - {"/Params"} if value.get("/Type") == "/EmbeddedFile" else compared_keys
 
 

@@ -37,7 +37,7 @@ MAX_UNRESOLVED_REFERENCES = 100
 
 _DAMAGED_REASON = "the PDF is damaged. Hand in the file that px4fuse wrote."
 _ENCRYPTED_REASON = "the PDF is encrypted. Hand in the file that px4fuse wrote."
-_COSTLY_REASON = "the PDF needs more memory or time to read than a report of px4fuse."
+_TOO_COSTLY_REASON = "the PDF needs more memory or time to read than a report of px4fuse."
 
 # Exceptions that pypdf raises for damaged PDFs; AttributeError occurred in a test with 900 damaged
 # PDFs
@@ -49,7 +49,7 @@ _ACTIVE_CONTENT_KEY_PATTERN = re.compile(
     "/(JS|JavaScript|XFA|RichMediaContent|RichMediaSettings|Collection|RF)"
 )
 # Types of PDF actions that run programs or open other files and addresses
-_ACTIVE_ACTION_PATTERN = re.compile(
+_DANGEROUS_ACTION_PATTERN = re.compile(
     "/(JavaScript|Launch|SubmitForm|ImportData|GoToR|GoToE|Rendition|RichMediaExecute|Movie|Sound)"
 )
 
@@ -121,7 +121,7 @@ def read_attached_results(pdf: bytes, name: str) -> Results:
     except ResultsError as error:
         reason, remedy = f"{error.reason}.", error.remedy
     except (LimitReachedError, RecursionError, MemoryError):
-        reason = _COSTLY_REASON
+        reason = _TOO_COSTLY_REASON
     except DependencyError:  # pypdf cannot decrypt AES without another library
         reason = _ENCRYPTED_REASON
     except BROKEN_PDF_ERRORS:
@@ -131,8 +131,9 @@ def read_attached_results(pdf: bytes, name: str) -> Results:
 
 def open_strictly(pdf: bytes) -> pypdf.PdfReader:
     """Open a PDF without repair, because other programs may repair the PDF differently."""
-    max_entries = 10 * MAX_PDF_OBJECTS
-    return pypdf.PdfReader(io.BytesIO(pdf), strict=True, xref_stream_maximum_entries=max_entries)
+    return pypdf.PdfReader(
+        io.BytesIO(pdf), strict=True, xref_stream_maximum_entries=10 * MAX_PDF_OBJECTS
+    )
 
 
 def _check_file(pdf: bytes) -> None:
@@ -160,10 +161,10 @@ def _check_file(pdf: bytes) -> None:
 
 
 def _estimate_inflated_bytes(pdf: bytes, start: int, limit_bytes: int) -> int:
-    """Estimate the cost (bytes) of decompressing the zlib data at ``start``; 0 without zlib data.
+    """Return the size (bytes) of the decompressed zlib data at ``start``; 0 without zlib data.
 
-    The cost is the maximum of compressed size, decompressed size and 1000, but at most
-    ``limit_bytes`` + 1.
+    If the compressed data are larger, their size is returned. The result is at least 1000 and at
+    most ``limit_bytes`` + 1.
     """
     zlib_header = pdf[start : start + 2]
     if (
@@ -190,18 +191,19 @@ def _estimate_inflated_bytes(pdf: bytes, start: int, limit_bytes: int) -> int:
 
 
 def _walk_dictionaries(reader: pypdf.PdfReader) -> Iterator[tuple[DictionaryObject, bool]]:
-    """Yield each PDF dictionary, with True if it is reached by a click on a link or bookmark."""
+    """Yield each PDF dictionary, with True for an action that only runs after a click on a link."""
     visited_references: set[tuple[IndirectObject, bool]] = set()
     missing_count = value_count = 0
     remaining_values: list[tuple[Any, bool]] = [(reader.trailer, False)]
     while remaining_values:
-        value, is_reached_by_click = remaining_values.pop()
+        value, is_action_after_click = remaining_values.pop()
         value_count += 1
         if isinstance(value, IndirectObject):
-            if (value, is_reached_by_click) in visited_references:
+            if (value, is_action_after_click) in visited_references:
                 continue
-            visited_references.add((value, is_reached_by_click))
-            # count objects without cross-reference: pypdf would search the whole file for each
+            visited_references.add((value, is_action_after_click))
+            # count references to objects that the cross-reference table does not list: pypdf
+            # searches the whole file for each of them
             number, generation = value.idnum, value.generation
             is_in_object_stream = generation == 0 and number in reader.xref_objStm
             is_listed = is_in_object_stream or number in reader.xref.get(generation, {})
@@ -210,28 +212,28 @@ def _walk_dictionaries(reader: pypdf.PdfReader) -> Iterator[tuple[DictionaryObje
                 len(visited_references) > MAX_PDF_OBJECTS
                 or missing_count > MAX_UNRESOLVED_REFERENCES
             ):
-                raise ResultsError(_COSTLY_REASON)
+                raise ResultsError(_TOO_COSTLY_REASON)
             # a reference to a missing object is null (ISO 32000-1, 7.3.10)
             value = value.get_object() if is_listed else None
         if value_count > MAX_PDF_VALUES:
-            raise ResultsError(_COSTLY_REASON)
+            raise ResultsError(_TOO_COSTLY_REASON)
         if isinstance(value, DictionaryObject):
-            yield value, is_reached_by_click
+            yield value, is_action_after_click
             remaining_values.extend((value.raw_get(key), key == "/A") for key in value)
         elif isinstance(value, ArrayObject):
             remaining_values.extend((element, False) for element in list.__iter__(value))
 
 
-def _find_foreign_features(
-    dictionary: DictionaryObject, is_reached_by_click: bool
+def _find_unexpected_features(
+    dictionary: DictionaryObject, is_action_after_click: bool
 ) -> Iterator[str]:
-    """Yield features that reports of px4fuse do not have: active content, links to files, ..."""
+    """Yield names of features that px4fuse never writes, for example scripts or external files."""
     yield from (key[1:] for key in dictionary if _ACTIVE_CONTENT_KEY_PATTERN.fullmatch(key))
     action, dictionary_type = (_read_pdf_name(dictionary.get(key)) or "" for key in ("/S", "/Type"))
-    if _ACTIVE_ACTION_PATTERN.fullmatch(action):
+    if _DANGEROUS_ACTION_PATTERN.fullmatch(action):
         yield action[1:]
-    if action == "/URI" and not is_reached_by_click:
-        yield "an action that opens a URL"
+    if action == "/URI" and not is_action_after_click:
+        yield "an action that opens a URL without a click"
     is_stream = isinstance(dictionary, StreamObject)
     if ("/EF" not in dictionary and dictionary_type in {"/Filespec", "/F"}) or (
         is_stream and "/F" in dictionary
@@ -246,8 +248,8 @@ def _find_foreign_features(
         if not _ALLOWED_FILTERS.issuperset(all_filter_names) or len(set(all_filter_names)) != len(
             all_filter_names
         ):
-            filter_text = " ".join(name or "?" for name in all_filter_names[:3])
-            yield f"a stream with unsupported compression ({one_line(filter_text, 60)})"
+            compression_text = " ".join(name or "?" for name in all_filter_names[:3])
+            yield f"a stream with unsupported compression ({one_line(compression_text, 60)})"
 
 
 def resolve_reference(value: Any) -> Any:
@@ -264,22 +266,24 @@ def _read_attachment(reader: pypdf.PdfReader) -> bytes:
     """Return the content of the attached file RESULTS_NAME; other attachments are an error."""
     file_specifications: list[DictionaryObject] = []
     streams: dict[int, StreamObject] = {}
-    foreign_features: set[str] = set()
-    for dictionary, is_reached_by_click in _walk_dictionaries(reader):
-        foreign_features.update(_find_foreign_features(dictionary, is_reached_by_click))
+    unexpected_features: set[str] = set()
+    for dictionary, is_action_after_click in _walk_dictionaries(reader):
+        unexpected_features.update(_find_unexpected_features(dictionary, is_action_after_click))
         embedded_files: list[object] = (
             [dictionary] if _read_pdf_name(dictionary.get("/Type")) == "/EmbeddedFile" else []
         )
         if "/EF" in dictionary:
             file_specifications.append(dictionary)
-            file_versions = resolve_reference(dictionary.get("/EF"))
+            embedded_file_streams = resolve_reference(dictionary.get("/EF"))
             embedded_files += (
-                file_versions.values() if isinstance(file_versions, DictionaryObject) else ()
+                embedded_file_streams.values()
+                if isinstance(embedded_file_streams, DictionaryObject)
+                else ()
             )
         objects = map(resolve_reference, embedded_files)
         streams |= {id(each): each for each in objects if isinstance(each, StreamObject)}
-    if foreign_features:
-        feature_names = ", ".join(sorted(foreign_features))
+    if unexpected_features:
+        feature_names = ", ".join(sorted(unexpected_features))
         raise ResultsError(f"the PDF contains {feature_names}, which px4fuse never writes.")
     if not file_specifications and not streams:
         raise ResultsError(

@@ -38,7 +38,7 @@ from px4fuse.verification.pages import TextComparison, compare_pages
 ASK_AUTHOR_REMEDY = (
     "Ask the author how the report was made, and for its log and all other input files."
 )
-FOREIGN_REQUEST_REASON = "px4fuse cannot have written the command in the report"
+INVALID_COMMAND_REASON = "the command in the report is not a command of px4fuse"
 # Minimum KF prediction interval DT (s): 60,000 steps for a flight of ten minutes take half a minute
 MIN_DT_S = 0.01
 ORIGINAL_PDF_REMEDY = "Ask the author of the report for the PDF that px4fuse wrote."
@@ -49,12 +49,13 @@ NO_LOG_REASON = "no log was given, so the analysis could not be repeated"
 # Relative tolerance of numbers in a report: the results on four types of processors (OpenBLAS
 # kernels) differ by at most 3e-8 (six flights)
 RESULT_RELATIVE_TOLERANCE = 1e-6
-# Absolute tolerance of numbers in a report, compared with a new analysis
+# Absolute tolerance of numbers, for the comparison of a report with a new analysis
 RESULT_ABSOLUTE_TOLERANCE = 1e-9
 # Relative tolerance of maximum-likelihood estimates in a report. The cost is flat at its minimum: a
 # change in its 12th digit changes the 4th digit of the estimate. Reports print up to three digits
 ESTIMATE_RELATIVE_TOLERANCE = 1e-3
-# Absolute tolerance of maximum-likelihood estimates in a report, compared with a new analysis
+# Absolute tolerance of maximum-likelihood estimates, for the comparison of a report with a new
+# analysis
 ESTIMATE_ABSOLUTE_TOLERANCE = 1e-5
 # Fields of the results that contain maximum-likelihood estimates, or depend on them
 ESTIMATE_FIELDS = (
@@ -74,22 +75,22 @@ ESTIMATE_FIELDS = (
 ITERATIONS_FIELD = "iterations"
 # Maximum difference between a solver's iterations in a report and in a new analysis: the solver may
 # stop earlier on another processor
-MAX_ITERATION_DIFFERENCE = 2
+MAX_SOLVER_ITERATION_DIFFERENCE = 2
 # Fields of the results that are not compared, because they describe the computer
 MACHINE_DEPENDENT_FIELDS = ("provenance.python", "provenance.libraries")
 MAX_LISTED_DIFFERENCES = 20
 MAX_LISTED_PAGE_DIFFERENCES = 5
 MAX_TEXT_LENGTH = 120
 # Factors by which a result is multiplied before it is printed (per cent; mm or ms)
-PRINTED_SCALES = (1.0, 100.0, 1000.0)
+PRINTED_UNIT_FACTORS = (1.0, 100.0, 1000.0)
 # Maximum number of lines of a student's notes in a report; a page has 60 lines
 MAX_NOTES_LINES = 5_000
 _NUMBER_PATTERN = re.compile(r"(\d+(?:\.\d+)?(?:e[+-]?\d+)?)")
 
-# Results of the new analysis, and a function that draws its PDF when pages are compared
+# Results of the new analysis, and a function that draws the PDF of these results
 RecomputedReport = tuple[ReportedResults, Callable[[], bytes]]
 # Function that links an input file: file name, SHA-256, label for messages -> path of the link
-_FileLinker = Callable[[str, str | None, str], str]
+_LinkInputFile = Callable[[str, str | None, str], str]
 
 
 class NotRepeatableError(Exception):
@@ -120,14 +121,14 @@ def recompute_report(
                 "the results do not list the library versions of px4fuse", ASK_AUTHOR_REMEDY
             )
         with tempfile.TemporaryDirectory(prefix="px4fuse-") as folder:
-            file_linker = partial(_link_file, path_by_sha256, Path(folder))
+            link_input_file = partial(_link_input_file, path_by_sha256, Path(folder))
             if isinstance(results, LoopResults):
-                analysis, new_results = _repeat_loop_closure(results, file_linker)
+                analysis, new_results = _repeat_loop_closure(results, link_input_file)
             else:
-                analysis, new_results = _repeat_comparison(results, file_linker)
+                analysis, new_results = _repeat_comparison(results, link_input_file)
         return new_results, partial(_draw_report, analysis, new_results, results.provenance)
     except SettingsError as error:  # px4fuse cannot have made a report with invalid settings
-        return make_unverifiable_result(f"{FOREIGN_REQUEST_REASON}: {error}", ASK_AUTHOR_REMEDY)
+        return make_unverifiable_result(f"{INVALID_COMMAND_REASON}: {error}", ASK_AUTHOR_REMEDY)
     except NotRepeatableError as error:
         return make_unverifiable_result(*error.args)
     except Px4FuseError as error:
@@ -137,12 +138,8 @@ def recompute_report(
         return make_unverifiable_result(reason, ASK_AUTHOR_REMEDY)
 
 
-def _link_file(
-    path_by_sha256: Mapping[str, Path],
-    folder: Path,
-    name: str,
-    sha256: str | None,
-    file_label: str,
+def _link_input_file(
+    path_by_sha256: Mapping[str, Path], folder: Path, name: str, sha256: str | None, file_label: str
 ) -> str:
     """Link the file with this SHA-256 into a temporary folder, and return the path of the link.
 
@@ -155,7 +152,9 @@ def _link_file(
         reason = f"none of the given files has the SHA-256 of {file_label}"
         raise NotRepeatableError(reason, f"Add {missing_file_name} to --logs.", missing_file_name)
     if name != Path(name).name or name == ".." or "\\" in name or not name.isprintable():
-        reason = f"{FOREIGN_REQUEST_REASON}: its file name contains a folder or is not printable"
+        reason = (
+            f"{INVALID_COMMAND_REASON}: a file name contains a folder or unprintable characters"
+        )
         raise NotRepeatableError(reason, ASK_AUTHOR_REMEDY)
     # a separate folder for each link, because file names may be equal
     target = Path(tempfile.mkdtemp(dir=folder), name)
@@ -175,41 +174,42 @@ def split_track(source: str) -> tuple[str, str]:
 
 
 def _repeat_comparison(
-    submitted_results: ComparisonResults, file_linker: _FileLinker
+    submitted_results: ComparisonResults, link_input_file: _LinkInputFile
 ) -> tuple[object, ReportedResults]:
     from px4fuse.diagnose import diagnose  # noqa: PLC0415
     from px4fuse.results.build import results  # noqa: PLC0415
 
     recorded_request = submitted_results.request
     if recorded_request.dt_s < MIN_DT_S:
-        reason = f"DT is below {MIN_DT_S:g} s, so the analysis would take too long"
-        raise NotRepeatableError(reason, ASK_AUTHOR_REMEDY)
+        raise NotRepeatableError(
+            f"DT is below {MIN_DT_S:g} s, so the analysis would take too long", ASK_AUTHOR_REMEDY
+        )
     hash_by_role = {file.role: file.sha256 for file in submitted_results.log.joined}
     request = replace(
         recorded_request,
-        log=file_linker(recorded_request.log, submitted_results.log.sha256, "the log"),
+        log=link_input_file(recorded_request.log, submitted_results.log.sha256, "the log"),
     )
     if (position := recorded_request.position) is not None:
-        linked_path = file_linker(position.path, hash_by_role.get("position"), "--position")
-        request = replace(request, position=replace(position, path=linked_path))
+        link_path = link_input_file(position.path, hash_by_role.get("position"), "--position")
+        request = replace(request, position=replace(position, path=link_path))
     analysis = diagnose(request)
     return analysis, results(recorded_request, analysis, submitted_results.student)
 
 
 def _repeat_loop_closure(
-    submitted_results: LoopResults, file_linker: _FileLinker
+    submitted_results: LoopResults, link_input_file: _LinkInputFile
 ) -> tuple[object, ReportedResults]:
     from px4fuse.diagnose import analyse_loop_closure  # noqa: PLC0415
     from px4fuse.results.build import make_loop_results  # noqa: PLC0415
 
     recorded_request = submitted_results.request
     path, track = split_track(recorded_request.source)
-    linked_path = file_linker(path, submitted_results.track.sha256, "the log")
-    request = replace(recorded_request, source=linked_path + track)
+    link_path = link_input_file(path, submitted_results.track.sha256, "the log")
+    request = replace(recorded_request, source=link_path + track)
     if recorded_request.reference is not None:
         path, track = split_track(recorded_request.reference)
         sha256 = submitted_results.references[-1].sha256 if submitted_results.references else None
-        request = replace(request, reference=file_linker(path, sha256, "--reference") + track)
+        request = replace(request, reference=link_input_file(path, sha256, "--reference") + track)
     analysis = analyse_loop_closure(request)
     return analysis, make_loop_results(recorded_request, analysis, submitted_results.student)
 
@@ -258,7 +258,7 @@ def verify(
     if sha256 not in path_by_sha256:
         expected_hash = one_line(sha256, 64) or "none"
         reason = f"the given files do not contain the log (SHA-256 {expected_hash})"
-        remedy = f"If the log is yours, add {log_file_name} to --logs."
+        remedy = f"If you have the log, add {log_file_name} to --logs."
         return Verification("other log", (reason,), False, remedy=remedy, missing=log_file_name)
     if results.student.notes.count("\n") > MAX_NOTES_LINES:
         reason = f"the student's notes have more than {MAX_NOTES_LINES} lines"
@@ -266,18 +266,19 @@ def verify(
     recomputed_report = recompute_report(results, path_by_sha256)
     if isinstance(recomputed_report, Verification):
         return recomputed_report
-    return _verify_with_log(results, pdf, *recomputed_report)
+    return _compare_with_new_report(results, pdf, *recomputed_report)
 
 
 def make_unverifiable_result(
     reason: str, remedy: str = "", missing_input: str = ""
 ) -> Verification:
     """Return the status "cannot verify" with its reason."""
-    reasons = (one_line(reason, 400),)
-    return Verification("cannot verify", reasons, False, remedy=remedy, missing=missing_input)
+    return Verification(
+        "cannot verify", (one_line(reason, 400),), False, remedy=remedy, missing=missing_input
+    )
 
 
-def _verify_with_log(
+def _compare_with_new_report(
     submitted_results: ReportedResults,
     pdf: bytes,
     new_results: ReportedResults,
@@ -307,8 +308,9 @@ def _verify_with_log(
             f"{len(mismatches)} of {value_count} values differ from a new run on the log: "
             f"{paths_text}"
         ]
-    is_same_text = partial(is_same_text_rounded, is_same_number=is_same_number)
-    page_differences = compare_pages(pdf, redrawn_pdf, is_same_text)
+    page_differences = compare_pages(
+        pdf, redrawn_pdf, partial(is_same_text_up_to_rounding, is_same_number=is_same_number)
+    )
     is_from_other_program = any(difference.is_structural for difference in page_differences)
     installed_libraries = new_results.provenance.libraries.items()
     differing_libraries = (
@@ -327,7 +329,7 @@ def _verify_with_log(
     difference_sentences = [difference.sentence for difference in page_differences]
     listed_sentences = difference_sentences[:MAX_LISTED_PAGE_DIFFERENCES]
     if unlisted_count := len(difference_sentences) - len(listed_sentences):
-        listed_sentences.append(f"the PDF has {unlisted_count} more differences")
+        listed_sentences.append(f"{unlisted_count} further differences are not listed")
     # the decisive reason is first: some tables show only one reason
     if status == "cannot verify":
         reasons = listed_sentences + reasons
@@ -354,19 +356,19 @@ def _verify_with_log(
     )
 
 
-def is_same_number_rounded(
+def is_same_number_up_to_rounding(
     agreeing_pairs: Iterable[tuple[float, float]], submitted_number: str, redrawn_number: str
 ) -> bool:
-    """Return True if the two printed numbers are the rounded values of an agreeing pair.
+    """Return True if two printed numbers are the rounded values of the same result.
 
-    ``agreeing_pairs`` are results in the report and in the new analysis that differ by less than
-    the tolerance.
+    ``agreeing_pairs`` are values of results in the report and in the new analysis, if they differ
+    by less than the tolerance.
     """
     decimals = _count_decimals(submitted_number)
     printed_pair = float(submitted_number), float(redrawn_number)
     return decimals == _count_decimals(redrawn_number) and any(
         printed_pair == (round(abs(a) * scale, decimals), round(abs(b) * scale, decimals))
-        for scale in PRINTED_SCALES
+        for scale in PRINTED_UNIT_FACTORS
         for a, b in agreeing_pairs
     )
 
@@ -381,14 +383,16 @@ def compare_results(
     mismatches : tuple of Mismatch
         Values that differ by more than the tolerances.
     is_same_number : callable
-        Returns True if two printed numbers are the rounded values of a result that agrees.
+        Returns True if two printed numbers are the rounded values of one result, whose values in
+        the report and in the new analysis agree.
     value_count : int
         Number of compared values.
     """
     command = str(new_results["provenance"]["command"])
-    # With "auto" or --position, all numbers depend on an estimated time offset or frame alignment,
-    # so all have the tolerance of estimates
-    has_estimated_inputs = not {"auto", "--position"}.isdisjoint(command.split())
+    # With an option "auto" or --position, KF uses a time offset or an alignment that px4fuse
+    # estimates from the log. All numbers then depend on estimates, so the tolerance of estimates
+    # applies to all numbers
+    has_estimated_settings = not {"auto", "--position"}.isdisjoint(command.split())
     recorded_values, new_values = dict(flatten(recorded_results)), dict(flatten(new_results))
     value_pair_by_path = {
         path: (recorded_values.get(path, _ABSENT), new_values.get(path, _ABSENT))
@@ -397,7 +401,7 @@ def compare_results(
     }
     agreement_by_path = {
         path: _is_within_tolerance(
-            path, *value_pair, has_estimated_inputs or path.startswith(ESTIMATE_FIELDS)
+            path, *value_pair, has_estimated_settings or path.startswith(ESTIMATE_FIELDS)
         )
         for path, value_pair in value_pair_by_path.items()
         if all(map(is_number, value_pair))
@@ -406,7 +410,7 @@ def compare_results(
         value_pair_by_path[path] for path, agrees in agreement_by_path.items() if agrees
     )
     unequal_pairs = tuple((float(a), float(b)) for a, b in agreeing_pairs if a != b)
-    is_same_number = partial(is_same_number_rounded, unequal_pairs)
+    is_same_number = partial(is_same_number_up_to_rounding, unequal_pairs)
     mismatched_paths = [path for path, agrees in agreement_by_path.items() if not agrees]
     mismatched_paths += [
         path
@@ -449,7 +453,7 @@ def _is_within_tolerance(
     path: str, submitted_number: float, new_number: float, is_estimated: bool
 ) -> bool:
     if isinstance(new_number, int):
-        tolerance: float = MAX_ITERATION_DIFFERENCE * path.endswith(ITERATIONS_FIELD)
+        tolerance: float = MAX_SOLVER_ITERATION_DIFFERENCE * path.endswith(ITERATIONS_FIELD)
     elif is_estimated:
         tolerance = ESTIMATE_RELATIVE_TOLERANCE * abs(new_number) + ESTIMATE_ABSOLUTE_TOLERANCE
     else:
@@ -461,24 +465,28 @@ def _is_equal_after_rounding(
     submitted_value: Any, new_value: Any, is_same_number: TextComparison
 ) -> bool:
     if isinstance(submitted_value, str) and isinstance(new_value, str):
-        return is_same_text_rounded(submitted_value, clean_text(new_value), is_same_number)
+        return is_same_text_up_to_rounding(submitted_value, clean_text(new_value), is_same_number)
     return type(submitted_value) is type(new_value) and bool(submitted_value == new_value)
 
 
-def is_same_text_rounded(first_text: str, second_text: str, is_same_number: TextComparison) -> bool:
+def is_same_text_up_to_rounding(
+    first_text: str, second_text: str, is_same_number: TextComparison
+) -> bool:
     """Return True if texts are equal except for numbers, which ``is_same_number`` compares.
 
-    >>> is_same_text_rounded("0.15 m", "0.16 m", lambda one, other: True)
+    >>> is_same_text_up_to_rounding("0.15 m", "0.16 m", lambda one, other: True)
     True
-    >>> is_same_text_rounded("0.15 m", "0.15 s", lambda one, other: True)
+    >>> is_same_text_up_to_rounding("0.15 m", "0.15 s", lambda one, other: True)
     False
     """
     if first_text == second_text:
         return True
     # re.split with a group returns texts at even indices, and numbers at odd indices
-    first_parts, second_parts = map(_NUMBER_PATTERN.split, (first_text, second_text))
-    number_pairs = zip(first_parts[1::2], second_parts[1::2], strict=False)
-    return first_parts[::2] == second_parts[::2] and all(
+    first_texts_and_numbers, second_texts_and_numbers = map(
+        _NUMBER_PATTERN.split, (first_text, second_text)
+    )
+    number_pairs = zip(first_texts_and_numbers[1::2], second_texts_and_numbers[1::2], strict=False)
+    return first_texts_and_numbers[::2] == second_texts_and_numbers[::2] and all(
         a == b or is_same_number(a, b) for a, b in number_pairs
     )
 

@@ -33,9 +33,9 @@ from px4fuse.analysis import Analysis
 from px4fuse.classroom.assignment.assignment import simulate_assigned_flight
 from px4fuse.classroom.assignment.roster import Person
 from px4fuse.classroom.assignment.truth import (
+    CorrectFormAnswers,
+    CorrectVerdict,
     InjectedFault,
-    RightFormAnswers,
-    RightVerdict,
     _find_ekf2_behaviours,
     compute_numeric_answer,
 )
@@ -101,20 +101,20 @@ def sizes(analysis: Analysis) -> dict[str, InjectedFault]:
     return found
 
 
-def copied(analysis: Analysis, kinds: list[str], log_sha256: str) -> RightFormAnswers:
+def copied(analysis: Analysis, kinds: list[str], log_sha256: str) -> CorrectFormAnswers:
     """Return the answers that follow from the outputs, for these faults."""
     known = sizes(analysis)
     mistakes = tuple(known[kind] for kind in kinds if kind in known)
     filters = analysis.main.filters
-    kf = RightVerdict(getattr(filters["kf"], "verdict", ""))
-    ekf2 = RightVerdict(getattr(filters["ekf2"], "verdict", ""))
+    kf = CorrectVerdict(getattr(filters["kf"], "verdict", ""))
+    ekf2 = CorrectVerdict(getattr(filters["ekf2"], "verdict", ""))
     tuning = analysis.tuning.get(HORIZONTAL)
     sigma_z_m = (tuning.sigma_z.value if isinstance(tuning, AxisTuning) else None) or 0.1
     behaviour = _find_ekf2_behaviours(analysis, mistakes, sigma_z_m)
     numbers = tuple(
         compute_numeric_answer(analysis.main, question) for question in select_questions(log_sha256)
     )
-    return RightFormAnswers(mistakes, sigma_z_m, kf, ekf2, *behaviour, numbers)
+    return CorrectFormAnswers(mistakes, sigma_z_m, kf, ekf2, *behaviour, numbers)
 
 
 def rule_kinds(analysis: Analysis, loop: Loop | None) -> list[str]:
@@ -133,7 +133,7 @@ def rule_kinds(analysis: Analysis, loop: Loop | None) -> list[str]:
     return [kind for kind, applies in rules.items() if applies][:2]
 
 
-def forms_of(number: int) -> tuple[RightFormAnswers, dict[str, Answers]]:
+def forms_of(number: int) -> tuple[CorrectFormAnswers, dict[str, Answers]]:
     """Return the right answers for one student, and the form of each copying strategy."""
     content, answer = simulate_assigned_flight(SECRET, Person(f"s{number}"), "mixed")
     assert answer.form is not None

@@ -18,20 +18,20 @@ import numpy as np
 from msgspec.structs import replace
 
 from px4fuse.classroom.assignment.assignment import simulate_assigned_flight
-from px4fuse.classroom.assignment.figures import FIGURE_FAULTS, QUESTIONS
+from px4fuse.classroom.assignment.figures import FIGURE_ANSWERS_BY_FAULT, QUESTIONS
 from px4fuse.classroom.assignment.roster import Person
-from px4fuse.classroom.assignment.truth import InjectedFault, RightFormAnswers
+from px4fuse.classroom.assignment.truth import CorrectFormAnswers, InjectedFault
 from px4fuse.classroom.grading.form_points import (
     compute_form_points,
     find_accepted_corrections,
-    find_panels,
+    find_panels_showing_fault,
 )
 from px4fuse.results.answer_form import (
-    CHOICE_NAMES,
+    CHOICE_LETTERS,
     EKF2_BEHAVIOURS,
     FAULT_KINDS,
     NOT_AVAILABLE,
-    PANELS,
+    REPORT_PANELS,
     UNITS_BY_CORRECTION,
     VERDICTS,
     Answers,
@@ -43,7 +43,7 @@ SHA256 = "0" * 64
 GUESSES = 20
 
 
-def truth(number: int) -> RightFormAnswers:
+def truth(number: int) -> CorrectFormAnswers:
     """Return the correct answers for the flight of one student of a mixed class."""
     student = Person(f"s{number}")
     _, answer = simulate_assigned_flight(SECRET, student, "mixed")
@@ -51,18 +51,18 @@ def truth(number: int) -> RightFormAnswers:
     return answer.form
 
 
-def guess_choices(rng: np.random.Generator, one: RightFormAnswers) -> tuple[str, ...]:
+def guess_choices(rng: np.random.Generator, one: CorrectFormAnswers) -> tuple[str, ...]:
     """Guess the fault of each figure, and give the answers to all questions for this fault."""
     letters, count = [], len(QUESTIONS)
     for first in range(0, len(one.choices), count):
         guess = rng.choice(one.choices[first][0].options)
-        fault = next(each for each in FIGURE_FAULTS.values() if each.fault == guess)
+        fault = next(each for each in FIGURE_ANSWERS_BY_FAULT.values() if each.fault == guess)
         for (choice, _), field in zip(one.choices[first : first + count], QUESTIONS, strict=True):
-            letters.append(CHOICE_NAMES[choice.options.index(getattr(fault, field))])
+            letters.append(CHOICE_LETTERS[choice.options.index(getattr(fault, field))])
     return tuple(letters)
 
 
-def at_random(rng: np.random.Generator, one: RightFormAnswers) -> Answers:
+def at_random(rng: np.random.Generator, one: CorrectFormAnswers) -> Answers:
     """Return a form with random valid answers."""
     named = [name for name in FAULT_KINDS if name != "none"]
     kinds = rng.choice(named, int(rng.integers(1, 4)), replace=False)
@@ -71,7 +71,7 @@ def at_random(rng: np.random.Generator, one: RightFormAnswers) -> Answers:
             str(kind), float(rng.lognormal(-1.0, 1.5)), when="whole flight",
             parameter=str(rng.choice(list(UNITS_BY_CORRECTION))),
             value=float(rng.lognormal(-1.0, 1.5)),
-            panel=str(rng.choice(PANELS)),
+            panel=str(rng.choice(REPORT_PANELS)),
         )
         for kind in kinds
     )  # fmt: skip
@@ -82,11 +82,11 @@ def at_random(rng: np.random.Generator, one: RightFormAnswers) -> Answers:
         verdict_ekf2=str(rng.choice(VERDICTS)),  # type: ignore[arg-type]
         ekf2_did=(str(rng.choice(EKF2_BEHAVIOURS)),),
         quantities=tuple(rng.normal(0.0, 0.3, 3).tolist()),
-        choices=tuple(rng.choice(CHOICE_NAMES, len(one.choices)).tolist()),
+        choices=tuple(rng.choice(CHOICE_LETTERS, len(one.choices)).tolist()),
     )
 
 
-def constants(truths: Sequence[RightFormAnswers], kind: str) -> Iterator[Answers]:
+def constants(truths: Sequence[CorrectFormAnswers], kind: str) -> Iterator[Answers]:
     """Yield constant forms: one fault of several sizes, and the most frequent other answers."""
 
     def common(values: list[str]) -> str:
@@ -114,12 +114,12 @@ def constants(truths: Sequence[RightFormAnswers], kind: str) -> Iterator[Answers
         for from_s in (None, float(np.median(begins))):
             claim = NamedFault(
                 kind, float(size), when="whole flight" if from_s is None else "", from_s=from_s,
-                parameter=cure, panel=find_panels(kind)[0],
+                parameter=cure, panel=find_panels_showing_fault(kind)[0],
             )  # fmt: skip
             yield replace(blank, mistakes=(claim,))
 
 
-def right(one: RightFormAnswers) -> Answers:
+def right(one: CorrectFormAnswers) -> Answers:
     """Return the correct form."""
     claims = []
     for wrong in one.mistakes:
@@ -131,7 +131,7 @@ def right(one: RightFormAnswers) -> Answers:
             NamedFault(
                 wrong.kind, wrong.size, when="whole flight" if whole else "", parameter=parameter,
                 from_s=wrong.from_s, until_s=wrong.until_s, value=value,
-                panel=find_panels(wrong.kind)[0],
+                panel=find_panels_showing_fault(wrong.kind)[0],
             )
         )  # fmt: skip
     return Answers(

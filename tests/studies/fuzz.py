@@ -41,7 +41,7 @@ from conftest import blank_page  # noqa: E402
 
 from px4fuse.classroom.assignment.key import (  # noqa: E402
     AnswerKey,
-    RightAnswers,
+    CorrectAnswers,
     format_answer_key,
     read_answer_key,
 )
@@ -60,7 +60,7 @@ from px4fuse.readers.position_file import read_position_file  # noqa: E402
 from px4fuse.readers.trajectory import read_trajectory  # noqa: E402
 from px4fuse.request import ComparisonRequest  # noqa: E402
 from px4fuse.results import answer_form  # noqa: E402
-from px4fuse.results.build import make_outcome_results  # noqa: E402
+from px4fuse.results.build import make_compare_results  # noqa: E402
 from px4fuse.results.contract import to_json  # noqa: E402
 from px4fuse.results.reading import read_results  # noqa: E402
 from px4fuse.trajectory.graph.solver import analyse_graph  # noqa: E402
@@ -209,8 +209,8 @@ _OVERRIDES = "id,item,points,comment\ns1,total,80,good\ns2,,,see me\n"
 
 def _key() -> list[bytes]:
     people = (
-        RightAnswers("s1", "Ada", "s1.ulg", "0" * 64),
-        RightAnswers("s2", "山田", "s2.ulg", "1" * 64),
+        CorrectAnswers("s1", "Ada", "s1.ulg", "0" * 64),
+        CorrectAnswers("s2", "山田", "s2.ulg", "1" * 64),
     )
     return [format_answer_key(AnswerKey("aisle", people)).encode()]
 
@@ -281,7 +281,7 @@ def _flights() -> list[bytes]:
 def _compared(path: Path) -> object:
     """Run ``compare`` without drawing: findings and results of a log."""
     request = ComparisonRequest(log=str(path))
-    return to_json(make_outcome_results(request, diagnose_or_check_aids(request)))
+    return to_json(make_compare_results(request, diagnose_or_check_aids(request)))
 
 
 LOG = str(REPOSITORY / "sample_logs/aisle_uwb.ulg")

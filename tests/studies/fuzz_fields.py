@@ -64,7 +64,7 @@ from px4fuse.errors import Px4FuseError  # noqa: E402
 from px4fuse.flight.ekf2_parameters import KNOWN_PARAMETERS  # noqa: E402
 from px4fuse.readers import mavlink, read_log, ulog  # noqa: E402
 from px4fuse.report import pdf  # noqa: E402
-from px4fuse.results.bounds import MAX_LENGTH_M, MAX_RATIO  # noqa: E402
+from px4fuse.results.bounds import MAX_ABSOLUTE_LENGTH_M, MAX_ABSOLUTE_RATIO  # noqa: E402
 from px4fuse.simulation.ulog_writer import Topic  # noqa: E402
 
 REPOSITORY = TESTS.parent
@@ -450,9 +450,11 @@ def impossible(value: Any, path: str = "") -> Iterator[str]:
             and not -1e-9 <= value <= 1.0 + 1e-9
         ):
             yield f"{path} {value} is no share"
-        elif name.endswith("_m") and abs(value) > MAX_LENGTH_M:
+        elif name.endswith("_m") and abs(value) > MAX_ABSOLUTE_LENGTH_M:
             yield f"{path} {value} is no length"
-        elif ("ratio" in name or "nis" in name or "factor" in name) and abs(value) > MAX_RATIO:
+        elif ("ratio" in name or "nis" in name or "factor" in name) and abs(
+            value
+        ) > MAX_ABSOLUTE_RATIO:
             yield f"{path} {value} is no ratio"
 
 

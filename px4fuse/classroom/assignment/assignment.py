@@ -12,7 +12,7 @@ from msgspec.structs import replace
 from px4fuse.classroom.assignment.figures import draw_figures, select_choices
 from px4fuse.classroom.assignment.key import (
     AnswerKey,
-    RightAnswers,
+    CorrectAnswers,
     format_answer_key,
     read_answer_key,
 )
@@ -50,7 +50,7 @@ def simulate_assigned_flight(
     kind: FlightKind,
     fault_count: int | None = None,
     with_ground_truth: bool = True,
-) -> tuple[bytes, RightAnswers]:
+) -> tuple[bytes, CorrectAnswers]:
     """Simulate the flight of one student; return the log (ULog) and the right answers."""
     assigned_flight = assign_random_flight(
         secret, student.student_id, kind, fault_count, with_ground_truth
@@ -61,9 +61,11 @@ def simulate_assigned_flight(
     log = flights.to_ulog(simulation, is_assessed=True)
     sha256 = hashlib.sha256(log).hexdigest()
     true_values = flights.make_answer_key(simulation)["truth"]
-    choices = select_choices(partial(draw_uniform, secret, student.student_id, kind))
-    form_answers = replace(compute_form_answers(simulation, sha256), choices=choices)
-    return log, RightAnswers(
+    form_answers = replace(
+        compute_form_answers(simulation, sha256),
+        choices=select_choices(partial(draw_uniform, secret, student.student_id, kind)),
+    )
+    return log, CorrectAnswers(
         student_id=student.student_id,
         name=student.name,
         file=student.log_file_name,
@@ -136,10 +138,10 @@ def write_assignment(
         key = read_answer_key(key_file) if key_file.exists() else AnswerKey(kind, ())
     answers = {normalise_text(answer.student_id): answer for answer in key.answers}
     # an answer key without any of these students was written for another class
-    is_same_class = not answers or not answers.keys().isdisjoint(
+    is_key_of_this_class = not answers or not answers.keys().isdisjoint(
         normalise_text(student.student_id) for student in students
     )
-    _require_same_flights(key_file, key.kind == kind and is_same_class)
+    _require_key_of_same_flights(key_file, key.kind == kind and is_key_of_this_class)
     stored_secret = key.secret
     if secret is None:
         stored_secret = stored_secret or secrets.token_urlsafe(24)
@@ -152,7 +154,7 @@ def write_assignment(
             secret, student, kind, fault_count, with_ground_truth
         )
         stored_answer = answers.setdefault(normalise_text(student.student_id), answer)
-        _require_same_flights(key_file, stored_answer.sha256 == answer.sha256)
+        _require_key_of_same_flights(key_file, stored_answer.sha256 == answer.sha256)
         choices = stored_answer.form.choices if stored_answer.form else ()
         empty_form = format_answer_form(
             student.log_file_name, answer.sha256, [choice for choice, _ in choices]
@@ -164,12 +166,13 @@ def write_assignment(
         missing_content_by_path = {
             path: content
             for path, content in content_by_path.items()
-            if not _is_written(path, content)
+            if not _exists_with_same_content(path, content)
         }
         figures_file = folder / Path(student.log_file_name).with_suffix(".png")
         if not figures_file.exists():
-            draw_number = partial(draw_uniform, secret, student.student_id, kind)
-            missing_content_by_path[figures_file] = draw_figures(draw_number)
+            missing_content_by_path[figures_file] = draw_figures(
+                partial(draw_uniform, secret, student.student_id, kind)
+            )
         key = AnswerKey(kind, tuple(answers.values()), stored_secret)
         # the secret must be stored before the log: a restart after an interruption needs it
         write_output_files({key_file: format_answer_key(key).encode()})
@@ -180,8 +183,14 @@ def write_assignment(
     return key, written_count
 
 
-def _is_written(path: Path, content: bytes) -> bool:
-    """Return True if the file exists; raise OutputError if its content differs."""
+def _exists_with_same_content(path: Path, content: bytes) -> bool:
+    """Return True if the file exists with this content, and False if the file does not exist.
+
+    Raises
+    ------
+    OutputError
+        The file exists with other content.
+    """
     if not path.exists() and not path.is_symlink():
         return False
     if path.is_file() and path.stat().st_size == len(content) and path.read_bytes() == content:
@@ -192,10 +201,10 @@ def _is_written(path: Path, content: bytes) -> bool:
     )
 
 
-def _require_same_flights(key_file: Path, has_same_flights: bool) -> None:
+def _require_key_of_same_flights(key_file: Path, has_same_flights: bool) -> None:
     if not has_same_flights:
         raise OutputError(
-            f"{key_file} is the answer key of other flights and was not overwritten. Use the "
-            "secret, options and students of the existing key (you can add students), or another "
-            "file (--answer)."
+            f"{key_file} is the answer key of other flights and was not overwritten. Choose "
+            "another file with --answer. To add students to this key, repeat its secret, options "
+            "and students."
         )

@@ -15,31 +15,43 @@ from px4fuse.comparison.model import FILTER_NAMES, AxisComparison, Comparison, F
 from px4fuse.core.record import Record, read_toml
 from px4fuse.flight.model import Ekf2, Truth
 from px4fuse.report import panels, style
-from px4fuse.results.answer_form import CHOICE_NAMES, Choice, ChoiceName
+from px4fuse.results.answer_form import CHOICE_LETTERS, Choice, ChoiceLetter
 from px4fuse.simulation import flights
 from px4fuse.simulation.faults import parse_faults
 from px4fuse.simulation.scenario import make_scenario
 
 FIGURE_COUNT = 3
-AISLE_PASS_COUNT = 4
-# Grey background of the figures: velocity (m/s) along the positive aisle direction above this value
-MIN_SHADED_SPEED_M_S = 0.2
-# Questions about each figure, by the field of FigureFault that contains the right answer
+# Number of straight passes along the aisle in each simulated flight
+STRAIGHT_PASS_COUNT = 4
+# The background is grey while the velocity along the positive aisle direction is above this value
+MIN_SPEED_FOR_GREY_BACKGROUND_M_S = 0.2
+# Questions about each figure, by the field of FigureAnswers that contains the right answer
 QUESTIONS = {
-    "fault": "injected fault",
-    "evidence": "evidence in the plots, and plots without evidence",
+    "fault": "injected fault of the flight",
+    "evidence": "plots that show the fault, and plots that do not show the fault",
     "change": "smallest change that makes KF and EKF2 consistent",
-    "prediction": "effect if SIGMA_Z and EKF2_EVP_NOISE were three times as large",
-    "useless": "change that does not correct the fault, and the reason",
+    "prediction": "effect on KF and EKF2 if SIGMA_Z and EKF2_EVP_NOISE are multiplied by 3",
+    "useless": "change that does not correct the fault, with the reason",
 }
 
 
-class FigureFault(Record):
-    """Injected fault of a simulated flight, and right answers to the questions about its figure.
+class FigureAnswers(Record):
+    """Right answers to the questions about the figure of a simulated flight with one fault.
 
-    The texts are the right answers to QUESTIONS. ``prediction`` is the effect of position noises
-    that are three times as large; ``useless`` is a change that does not correct the fault, with the
-    reason. ``option`` is the value of ``px4fuse simulate --mistake``; "" without a fault.
+    Attributes
+    ----------
+    fault : str
+        Name of the injected fault.
+    evidence : str
+        Plots that show the fault.
+    change : str
+        Smallest change that makes KF and EKF2 consistent.
+    prediction : str
+        Effect on KF and EKF2 if SIGMA_Z and EKF2_EVP_NOISE are multiplied by 3.
+    useless : str
+        Change that does not correct the fault, with the reason.
+    mistake_option : str
+        Value of ``px4fuse simulate --mistake`` for this fault; "" for a flight without a fault.
     """
 
     fault: str
@@ -47,38 +59,47 @@ class FigureFault(Record):
     change: str
     prediction: str
     useless: str
-    option: str = ""
+    mistake_option: str = ""
 
 
-FIGURE_FAULTS = read_toml(__file__, dict[str, FigureFault])
+FIGURE_ANSWERS_BY_FAULT = read_toml(__file__, dict[str, FigureAnswers])
 
 
-def _shuffle(names: Iterable[str], prefix: str, draw_number: Callable[[str], float]) -> list[str]:
-    return sorted(names, key=lambda name: draw_number(f"{prefix} {name}"))
+def _shuffle(
+    names: Iterable[str], seed_prefix: str, draw_number: Callable[[str], float]
+) -> list[str]:
+    return sorted(names, key=lambda name: draw_number(f"{seed_prefix} {name}"))
 
 
 def _select_fault_kinds(draw_number: Callable[[str], float]) -> dict[str, str]:
     """Select the injected fault of each figure at random; return the fault by figure title."""
-    fault_kinds = _shuffle(FIGURE_FAULTS, "figures", draw_number)[:FIGURE_COUNT]
+    fault_kinds = _shuffle(FIGURE_ANSWERS_BY_FAULT, "figures", draw_number)[:FIGURE_COUNT]
     return {f"Figure {number}": kind for number, kind in enumerate(fault_kinds, start=1)}
 
 
-def select_choices(
-    draw_number: Callable[[str], float],
-) -> tuple[tuple[Choice, ChoiceName], ...]:
-    """Make multiple-choice questions about the figures; return each with its right letter.
+def select_choices(draw_number: Callable[[str], float]) -> tuple[tuple[Choice, ChoiceLetter], ...]:
+    """Make the multiple-choice questions about a student's figures, each with its right letter.
 
-    ``draw_number`` returns a random number in [0, 1) that depends only on its argument.
+    ``draw_number`` converts a name, such as "figures fault", to a random number in [0, 1). Equal
+    names give equal numbers.
     """
     choices = []
     for title, kind in _select_fault_kinds(draw_number).items():
-        other_fault_kinds = _shuffle(FIGURE_FAULTS.keys() - {kind}, f"{title} other", draw_number)
-        fault_kinds = [kind, *other_fault_kinds[: len(CHOICE_NAMES) - 1]]
+        other_fault_kinds = _shuffle(
+            FIGURE_ANSWERS_BY_FAULT.keys() - {kind}, f"{title} other", draw_number
+        )
+        fault_kinds = [kind, *other_fault_kinds[: len(CHOICE_LETTERS) - 1]]
         for field, question in QUESTIONS.items():
             shuffled_kinds = _shuffle(fault_kinds, f"{title} {field}", draw_number)
-            options = tuple(getattr(FIGURE_FAULTS[each], field) for each in shuffled_kinds)
-            right_letter = CHOICE_NAMES[shuffled_kinds.index(kind)]
-            choices.append((Choice(f"{title}: {question}", options), right_letter))
+            options = tuple(
+                getattr(FIGURE_ANSWERS_BY_FAULT[each], field) for each in shuffled_kinds
+            )
+            choices.append(
+                (
+                    Choice(f"{title}: {question}", options),
+                    (CHOICE_LETTERS[shuffled_kinds.index(kind)]),
+                )
+            )
     return tuple(choices)
 
 
@@ -90,14 +111,22 @@ def draw_figures(draw_number: Callable[[str], float]) -> bytes:
     comparisons = {}
     for title, kind in _select_fault_kinds(draw_number).items():
 
-        def draw_figure_number(quantity: str, title: str = title) -> float:
-            return draw_number(f"{title} {quantity}")
+        def draw_figure_number(number_name: str, title: str = title) -> float:
+            return draw_number(f"{title} {number_name}")
 
-        numbers = draw_scenario_numbers("aisle", draw_figure_number)
-        seed = int(2**53 * draw_figure_number("seed"))
-        scenario = make_scenario("aisle", passes=AISLE_PASS_COUNT, seed=seed, **numbers)
-        faults = parse_faults(tuple(filter(None, [FIGURE_FAULTS[kind].option])))
-        comparisons[title] = compare_simulation(flights.simulate(scenario, faults))
+        scenario_numbers = draw_scenario_numbers("aisle", draw_figure_number)
+        scenario = make_scenario(
+            "aisle",
+            passes=STRAIGHT_PASS_COUNT,
+            seed=int(2**53 * draw_figure_number("seed")),
+            **scenario_numbers,
+        )
+        comparisons[title] = compare_simulation(
+            flights.simulate(
+                scenario,
+                parse_faults(tuple(filter(None, [FIGURE_ANSWERS_BY_FAULT[kind].mistake_option]))),
+            )
+        )
     return _plot_figures(comparisons)
 
 
@@ -123,7 +152,10 @@ def _plot_figures(comparisons: Mapping[str, Comparison]) -> bytes:
 
 
 def _draw_errors(axes: style.Axes, result: AxisComparison, filter_name: FilterName) -> None:
-    """Plot the position error of a filter and ±2σ; grey: flight in the positive direction."""
+    """Plot the position error of a filter and ±2σ.
+
+    The background is grey while the vehicle flies in the positive aisle direction.
+    """
     name, truth = FILTER_NAMES[filter_name], result.truth
     errors = compute_position_errors(result, filter_name)
     axes.set_title(f"{name}: error along the aisle and ±2σ (m)")
@@ -136,7 +168,7 @@ def _draw_errors(axes: style.Axes, result: AxisComparison, filter_name: FilterNa
         truth.index,
         0.0,
         1.0,
-        where=truth["velocity_m_s"] > MIN_SHADED_SPEED_M_S,
+        where=truth["velocity_m_s"] > MIN_SPEED_FOR_GREY_BACKGROUND_M_S,
         transform=axes.get_xaxis_transform(),
         color="0.9",
         zorder=0,
@@ -144,7 +176,7 @@ def _draw_errors(axes: style.Axes, result: AxisComparison, filter_name: FilterNa
 
 
 def _draw_map(axes: style.Axes, comparison: Comparison) -> None:
-    axes.set_title("Map: positions (dots), EKF2, ground truth (dotted)")
+    axes.set_title("Map: positions (dots), EKF2 (line), ground truth (dotted line)")
     ekf2, truth = comparison.flight.ekf2, comparison.flight.truth
     assert isinstance(ekf2, Ekf2)
     assert isinstance(truth, Truth)

@@ -7,7 +7,7 @@ import msgspec
 from msgspec import Meta
 
 from px4fuse.classroom.assignment.roster import MAX_STUDENTS, ClassList, Person, normalise_text
-from px4fuse.classroom.assignment.truth import RightFormAnswers
+from px4fuse.classroom.assignment.truth import CorrectFormAnswers
 from px4fuse.core.reading import read_text
 from px4fuse.errors import SettingsError
 
@@ -24,7 +24,7 @@ _ShortTexts = Annotated[
 ]
 
 
-class RightAnswers(
+class CorrectAnswers(
     msgspec.Struct, frozen=True, rename={"student_id": "id", "true_values": "truth"}
 ):
     """Simulated flight of one student, with its injected faults and the right answers.
@@ -40,7 +40,8 @@ class RightAnswers(
     true_values : dict
         Parameters of the simulation that the log does not contain, for example ``sigma_z_m``.
     difficulty : float or None
-        Smallest size that px4fuse detects, divided by the size of the injected fault.
+        Smallest size that px4fuse detects, divided by the size of the injected fault. A fault with
+        a larger difficulty is harder to detect.
     """
 
     student_id: Annotated[str, Meta(max_length=1000, pattern=r"\S")]
@@ -51,7 +52,7 @@ class RightAnswers(
     mistakes: _ShortTexts = ()
     true_values: dict[str, _Number] = {}
     difficulty: _Number | None = None
-    form: RightFormAnswers | None = None
+    form: CorrectFormAnswers | None = None
 
 
 class _AnswerKeySchema(msgspec.Struct, frozen=True):
@@ -67,7 +68,7 @@ class AnswerKey(msgspec.Struct, frozen=True):
     """
 
     kind: _Text
-    answers: Annotated[tuple[RightAnswers, ...], Meta(min_length=1, max_length=MAX_STUDENTS)] = (
+    answers: Annotated[tuple[CorrectAnswers, ...], Meta(min_length=1, max_length=MAX_STUDENTS)] = (
         msgspec.field(name="students")
     )
     secret: _Text = ""
@@ -77,13 +78,13 @@ class AnswerKey(msgspec.Struct, frozen=True):
     def __repr__(self) -> str:  # an error message must not show the secret
         return f"AnswerKey({self.kind!r}, {len(self.answers)} students)"
 
-    def find_student_answers(self, student_id: str) -> RightAnswers | None:
+    def find_student_answers(self, student_id: str) -> CorrectAnswers | None:
         """Return the right answers for a student, or None; the id may lack leading zeros."""
         class_list = ClassList(Person(answer.student_id) for answer in self.answers)
         student_index = class_list.find_student_index(Person(student_id))
         return None if student_index is None else self.answers[student_index]
 
-    def find_log_answers(self, sha256: str) -> RightAnswers | None:
+    def find_answers_by_log_sha256(self, sha256: str) -> CorrectAnswers | None:
         return next((answer for answer in self.answers if answer.sha256 == sha256), None)
 
 
@@ -106,7 +107,7 @@ def read_answer_key(path: Path) -> AnswerKey:
             raise ValueError("two students have the same id")
     except (msgspec.MsgspecError, RecursionError, ValueError) as error:
         raise SettingsError(
-            f"{path} is not an answer key of this px4fuse version ({error}).",
+            f"{path} is not an answer key, or is from another px4fuse version ({error}).",
             "Give the file that px4fuse simulate --assignment wrote.",
         ) from error
     return key

@@ -26,22 +26,25 @@ FlightKind = Literal["aisle", "loop", "mixed"]
 
 # Minimum length (characters) of the instructor's secret: a shorter secret can be guessed
 MIN_SECRET_LENGTH = 16
-# First part of each HMAC message. Another label would change the flights of existing answer keys
+# First part of each HMAC message, from which the flight of a student is computed. Do not change the
+# label: the flights would no longer agree with existing answer keys
 HMAC_LABEL = "px4fuse assignment 2"
-# Fractions of the flights that have 0, 1 and 2 injected faults. The only fault of a loop is
-# "open-end" (landing far from the start); 40 % have no fault, so that students cannot guess it
-FAULT_COUNT_FRACTIONS: dict[ScenarioKind, tuple[float, ...]] = {
+# Probabilities of 0, 1 and 2 injected faults in a flight. A loop has at most one fault, "open-end"
+# (landing far from the start). 40 % of the loops have no fault: otherwise students could guess the
+# fault
+PROBABILITY_BY_FAULT_COUNT: dict[ScenarioKind, tuple[float, ...]] = {
     "aisle": (0.1, 0.5, 0.4),
     "loop": (0.4, 0.6),
 }
-# Fraction of loops if the kind of flight is "mixed"; the other flights are along an aisle
-LOOP_FLIGHT_FRACTION = 1 / 3
-# Range of the difficulty of an injected fault. Difficulty: smallest size that px4fuse detects,
-# divided by the size in the flight
+# Probability of a loop if the kind of flight is "mixed"; the other flights are along an aisle
+LOOP_PROBABILITY = 1 / 3
+# Range of the difficulty of an injected fault. The difficulty is the smallest size that px4fuse
+# detects, divided by the size in the flight. It is the inverse of this ratio if a fault with a
+# smaller size is easier to detect
 EASIEST_DIFFICULTY, HARDEST_DIFFICULTY = 0.6, 1.0
-# Fraction of the flights with faults that px4fuse may not detect (difficulty above 1), and maximum
-# difficulty of these faults: students must analyse them without the findings of px4fuse
-UNDETECTABLE_FLIGHT_FRACTION, MAX_FAULT_DIFFICULTY = 0.25, 1.5
+# Probability of faults with a difficulty above 1, and maximum difficulty of these faults. px4fuse
+# may not detect such faults, so students must find them without the findings of px4fuse
+HARD_FAULTS_PROBABILITY, MAX_FAULT_DIFFICULTY = 0.25, 1.5
 
 
 class AssignableFault(Record):
@@ -52,56 +55,63 @@ class AssignableFault(Record):
     name : str
         Name of the fault in ``px4fuse simulate --mistake``.
     group : str
-        Faults with equal groups hide each other, so a flight has at most one of them.
-    detectable_size : float or None
+        Name of a group of faults. Faults of one group mask each other, so a flight has at most one
+        fault of each group.
+    detection_limit : float or None
         Size (in ``unit``) that px4fuse detects in 19 of 20 flights (tests/studies/rates.csv); None
         for a fault without a size.
-    is_smaller_easier : bool
+    is_smaller_size_easier_to_detect : bool
         True if a fault with a smaller size is easier to detect.
     has_either_sign : bool
         True if the sign of the size is random.
-    start_range_s : (float, float) or None
-        Earliest and latest start (s); None for a fault of the whole flight.
-    hidden_groups : tuple of str
-        Groups of faults that this fault hides.
+    fault_start_range_s : (float, float) or None
+        Earliest and latest start (s) of the fault; None for a fault of the whole flight.
+    masked_fault_groups : tuple of str
+        Groups of faults that px4fuse cannot detect in a flight with this fault.
     """
 
     name: str
     group: str
-    detectable_size: float | None = None
+    detection_limit: float | None = None
     unit: str = ""
-    is_smaller_easier: bool = False
+    is_smaller_size_easier_to_detect: bool = False
     has_either_sign: bool = False
-    start_range_s: tuple[float, float] | None = None
-    hidden_groups: tuple[str, ...] = ()
+    fault_start_range_s: tuple[float, float] | None = None
+    masked_fault_groups: tuple[str, ...] = ()
 
     def is_detectable_with(self, other_fault: AssignableFault) -> bool:
-        """Return True if both injected faults can be detected in the same flight."""
-        is_hidden = other_fault.group in (self.group, *self.hidden_groups)
-        return not is_hidden and self.group not in other_fault.hidden_groups
+        """Return True if neither of two faults masks the other in the same flight."""
+        is_masked = other_fault.group in (self.group, *self.masked_fault_groups)
+        return not is_masked and self.group not in other_fault.masked_fault_groups
 
     def format_option(
-        self, difficulty: float, sign: float = 1.0, start_fraction: float = 0.5
+        self, difficulty: float, sign: float = 1.0, fault_start_fraction: float = 0.5
     ) -> str:
         """Return the value of the option ``px4fuse simulate --mistake`` for this fault.
 
-        ``difficulty`` is the smallest size that px4fuse detects, divided by the size in the flight.
-        ``start_fraction`` is 0 for the earliest start and 1 for the latest start.
+        Parameters
+        ----------
+        difficulty : float
+            Smallest size that px4fuse detects, divided by the size of the fault in the flight.
+        sign : float
+            Sign of the size, 1 or -1.
+        fault_start_fraction : float
+            Start of the fault: 0 for the earliest start, 1 for the latest start.
         """
-        if self.detectable_size is None:
+        if self.detection_limit is None:
             return self.name
-        size = self.detectable_size / difficulty
-        if self.is_smaller_easier:
-            size = self.detectable_size * difficulty
+        size = self.detection_limit / difficulty
+        if self.is_smaller_size_easier_to_detect:
+            size = self.detection_limit * difficulty
         option_value = f"{self.name}={math.copysign(float(f'{size:.3g}'), sign):g}{self.unit}"
-        if self.start_range_s is None:
+        if self.fault_start_range_s is None:
             return option_value
-        earliest_start_s, latest_start_s = self.start_range_s
-        start_s = earliest_start_s + start_fraction * (latest_start_s - earliest_start_s)
+        earliest_start_s, latest_start_s = self.fault_start_range_s
+        start_s = earliest_start_s + fault_start_fraction * (latest_start_s - earliest_start_s)
         return f"{option_value},{start_s:.0f}s"
 
 
-class SamplingRules(Record):
+class FlightRules(Record):
     """Possible faults and random parameters of one kind of simulated flight.
 
     ``numbers`` gives (minimum, maximum, number of decimals) of each random field of the scenario.
@@ -111,7 +121,7 @@ class SamplingRules(Record):
     numbers: dict[str, tuple[float, float, int]]
 
 
-SAMPLING_RULES_BY_KIND = read_toml(__file__, dict[ScenarioKind, SamplingRules], "drawn.toml")
+FLIGHT_RULES_BY_KIND = read_toml(__file__, dict[ScenarioKind, FlightRules], "drawn.toml")
 
 
 @dataclass(frozen=True)
@@ -132,7 +142,7 @@ class AssignedFlight:
     difficulty: float
 
 
-def draw_bits(secret: bytes, student_id: str, kind: FlightKind, quantity: str) -> int:
+def derive_random_bits(secret: bytes, student_id: str, kind: FlightKind, quantity: str) -> int:
     """Return a random integer (128 bits) for a quantity of a student's flight, such as "seed".
 
     Equal arguments always give the same number.
@@ -144,7 +154,7 @@ def draw_bits(secret: bytes, student_id: str, kind: FlightKind, quantity: str) -
 
 def draw_uniform(secret: bytes, student_id: str, kind: FlightKind, quantity: str) -> float:
     """Return a uniform random number in [0, 1) for a quantity of a student's flight."""
-    return (draw_bits(secret, student_id, kind, quantity) >> 75) / 2**53
+    return (derive_random_bits(secret, student_id, kind, quantity) >> 75) / 2**53
 
 
 def assign_random_flight(
@@ -171,9 +181,9 @@ def assign_random_flight(
     SettingsError
         A flight cannot have ``fault_count`` injected faults.
     """
-    possible_kinds = FAULT_COUNT_FRACTIONS if kind == "mixed" else (kind,)
+    possible_kinds = PROBABILITY_BY_FAULT_COUNT if kind == "mixed" else (kind,)
     max_fault_count = (
-        min(len(FAULT_COUNT_FRACTIONS[scenario_kind]) for scenario_kind in possible_kinds) - 1
+        min(len(PROBABILITY_BY_FAULT_COUNT[scenario_kind]) for scenario_kind in possible_kinds) - 1
     )
     if fault_count is not None and not 0 <= fault_count <= max_fault_count:
         raise SettingsError(
@@ -182,40 +192,41 @@ def assign_random_flight(
         )
     if kind == "mixed":
         kind = (
-            "loop"
-            if draw_uniform(secret, student_id, kind, "kind") < LOOP_FLIGHT_FRACTION
-            else "aisle"
+            "loop" if draw_uniform(secret, student_id, kind, "kind") < LOOP_PROBABILITY else "aisle"
         )
     draw_number = partial(draw_uniform, secret, student_id, kind)
     if fault_count is None:
         fault_count = bisect(
-            list(accumulate(FAULT_COUNT_FRACTIONS[kind][:-1])), draw_number("count")
+            list(accumulate(PROBABILITY_BY_FAULT_COUNT[kind][:-1])), draw_number("count")
         )
     faults: list[AssignableFault] = []
-    rules = SAMPLING_RULES_BY_KIND[kind]
-    for fault in sorted(rules.faults, key=lambda each: draw_number(f"order {each.name}")):
+    flight_rules = FLIGHT_RULES_BY_KIND[kind]
+    for fault in sorted(flight_rules.faults, key=lambda each: draw_number(f"order {each.name}")):
         if len(faults) < fault_count and all(map(fault.is_detectable_with, faults)):
             faults.append(fault)
     difficulty_range = EASIEST_DIFFICULTY, HARDEST_DIFFICULTY
-    if draw_number("undetectable") < UNDETECTABLE_FLIGHT_FRACTION:
+    if draw_number("undetectable") < HARD_FAULTS_PROBABILITY:
         difficulty_range = HARDEST_DIFFICULTY, MAX_FAULT_DIFFICULTY
     difficulties, mistake_options = [], []
     for fault in faults:
-        name, difficulty = fault.name, EASIEST_DIFFICULTY
-        if fault.detectable_size is not None:
+        name, fault_difficulty = fault.name, EASIEST_DIFFICULTY
+        if fault.detection_limit is not None:
             low, high = difficulty_range
-            difficulty = low + (high - low) * draw_number(f"size {name}")
+            fault_difficulty = low + (high - low) * draw_number(f"size {name}")
         sign = -1.0 if fault.has_either_sign and draw_number(f"sign {name}") < 0.5 else 1.0
-        difficulties.append(difficulty)
-        mistake_options.append(fault.format_option(difficulty, sign, draw_number(f"at {name}")))
+        difficulties.append(fault_difficulty)
+        mistake_options.append(
+            fault.format_option(fault_difficulty, sign, draw_number(f"at {name}"))
+        )
     scenario = make_scenario(
         kind,
         truth=with_ground_truth and kind == "aisle",
-        seed=draw_bits(secret, student_id, kind, "seed"),
+        seed=derive_random_bits(secret, student_id, kind, "seed"),
         **draw_scenario_numbers(kind, draw_number),
     )
-    max_difficulty = max(difficulties, default=HARDEST_DIFFICULTY)
-    return AssignedFlight(scenario, tuple(mistake_options), round(max_difficulty, 2))
+    return AssignedFlight(
+        scenario, tuple(mistake_options), round(max(difficulties, default=HARDEST_DIFFICULTY), 2)
+    )
 
 
 def draw_scenario_numbers(
@@ -224,7 +235,7 @@ def draw_scenario_numbers(
     """Return random values for the numeric fields of :class:`Scenario`."""
     return {
         name: round(low + (high - low) * draw_number(name), decimals)
-        for name, (low, high, decimals) in SAMPLING_RULES_BY_KIND[kind].numbers.items()
+        for name, (low, high, decimals) in FLIGHT_RULES_BY_KIND[kind].numbers.items()
     }
 
 

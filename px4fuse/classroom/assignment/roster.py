@@ -27,23 +27,23 @@ TITLES_BY_FIELD = read_toml(__file__, dict[str, tuple[str, ...]], "columns.toml"
 # Fields of a student that are copied from other tables if they are missing in the class list
 FIELDS_FROM_OTHER_TABLES = ("name", "email", "login", "submission_time", "extended_due")
 # Names in Canvas gradebooks that are not students ("Points Possible", "Student, Test")
-NOT_STUDENT_NAMES = ("pointspossible", "studenttest")
+NON_STUDENT_ROW_NAMES = ("pointspossible", "studenttest")
 
 
 @dataclass(frozen=True)
 class Person:
-    """Student of the class.
+    """Student of the class, as in a table of a learning platform.
 
     Attributes
     ----------
     login : str
         Login on Blackboard or ILIAS.
     numbers : dict
-        Number of the student on each learning platform, by name of the platform.
+        Number that a learning platform uses for the student, by name of the platform.
     submission_time : str
-        Submission time in Moodle's worksheet.
+        Submission time, as text, if the table is a grading worksheet of Moodle.
     extended_due : str
-        Due time of this student, as text, if the instructor extended it.
+        Later due time, as text, that the instructor granted to this student; "" without it.
     """
 
     student_id: str
@@ -73,7 +73,7 @@ def read_people(sheet: Sheet) -> tuple[Person, ...]:
     """
     if all(sheet.find_column_index(titles) is None for titles in TITLES_BY_FIELD.values()):
         raise SettingsError(
-            f"{sheet.path}: no column identifies the student.",
+            f"{sheet.path}: no column contains ids, emails or names of students.",
             "Give one column the title id, email or name.",
         )
     row_number_by_id: dict[str, int] = {}
@@ -127,7 +127,7 @@ def read_student(sheet: Sheet, row: Sequence[str]) -> Person | None:
         for field_name, titles in TITLES_BY_FIELD.items()
     }
     name = cells["name"] or f"{cells['first']} {cells['last']}".strip()
-    if re.sub(r"\W", "", name.casefold()) in NOT_STUDENT_NAMES:
+    if re.sub(r"\W", "", name.casefold()) in NON_STUDENT_ROW_NAMES:
         return None
     numbers = {}
     if participant := re.search(r"\d+$", sheet.find_cell(row, ("identifier",))):
@@ -136,21 +136,20 @@ def read_student(sheet: Sheet, row: Sequence[str]) -> Person | None:
         numbers |= {"canvas": number} if (number := sheet.find_cell(row, ("id",))) else {}
         cells["student_id"] = one_line(sheet.find_cell(row, ("sisuserid",)), MAX_NAME_LENGTH)
     student_id = cells["student_id"] or cells["login"] or cells["email"]
-    submission_time = sheet.find_cell(row, ("lastmodifiedsubmission",))
     person = Person(
         student_id,
         name,
         cells["email"],
         cells["login"],
         numbers,
-        submission_time,
+        sheet.find_cell(row, ("lastmodifiedsubmission",)),
         cells["extended_due"],
     )
     return person if student_id or name or numbers else None
 
 
 class ClassList:
-    """Students of a class; missing fields are copied from the tables ``other_lists``."""
+    """Students of a class. Their missing fields are copied from the tables ``other_lists``."""
 
     def __init__(self, people: Iterable[Person] = (), *other_lists: Iterable[Person]) -> None:
         self.people = list(people)
@@ -162,8 +161,9 @@ class ClassList:
                     name: getattr(student, name) or getattr(other_person, name)
                     for name in FIELDS_FROM_OTHER_TABLES
                 }
-                numbers = other_person.numbers | student.numbers
-                self.people[student_index] = replace(student, numbers=numbers, **fields)
+                self.people[student_index] = replace(
+                    student, numbers=other_person.numbers | student.numbers, **fields
+                )
 
     def find_student_index(self, searched_person: Person) -> int | None:
         """Return the index of a person in ``people``; None for an unknown person.
@@ -232,8 +232,10 @@ def is_same_name(name: str, other_name: str) -> bool:
     joined_names = (
         "".join(longer_words[start:] + longer_words[:start]) for start in range(len(longer_words))
     )
-    is_joined = len(shorter_words) == 1 < len(longer_words) and shorter_words[0] in joined_names
-    return bool(shorter_words) and (sorted(words) == sorted(other_words) or is_joined)
+    is_joined_name = (
+        len(shorter_words) == 1 < len(longer_words) and shorter_words[0] in joined_names
+    )
+    return bool(shorter_words) and (sorted(words) == sorted(other_words) or is_joined_name)
 
 
 def make_file_stem(student_id: str) -> str | None:

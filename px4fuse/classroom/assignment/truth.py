@@ -25,9 +25,9 @@ from px4fuse.loop.analysis import analyse
 from px4fuse.loop.tracks import LoopSource, trajectory_of
 from px4fuse.request import SIGMA_Z_M, ComparisonRequest
 from px4fuse.results.answer_form import (
-    FURTHER_GATE_UPDATE_COUNT,
+    GATE_QUESTION_FURTHER_UPDATES,
     Choice,
-    ChoiceName,
+    ChoiceLetter,
     FormQuestion,
     select_questions,
 )
@@ -43,12 +43,12 @@ CLOSURE_TOLERANCE_M = 0.3
 MIN_REJECTED_FRACTION = 0.005
 # Minimum size (m) of an EKF2 position reset that the student must report
 MIN_RESET_M = 0.2
-# Duration (s) at the start of the flight in which position resets are ignored: EKF2 resets to the
-# first position
-RESET_IGNORE_DURATION_S = 5.0
+# Position resets in this time (s) after the start of the flight are ignored, because EKF2 then
+# resets to the first position
+INITIAL_TIME_WITHOUT_RESETS_S = 5.0
 # For each behaviour of EKF2 in the answer form, such as "never fused": faults for which the student
 # must ("required") or may ("allowed") report this behaviour
-BEHAVIOUR_RULES = read_toml(__file__, dict[str, dict[str, set[str]]], "did.toml")
+EKF2_BEHAVIOUR_RULES = read_toml(__file__, dict[str, dict[str, set[str]]], "did.toml")
 
 
 class InjectedFault(Record):
@@ -72,18 +72,23 @@ class InjectedFault(Record):
     until_s: float | None = None
 
 
-class RightVerdict(Record):
-    """Consistency of a filter, and the factor by which its reported σ is too small or too large.
+class CorrectVerdict(Record):
+    """Correct answer to the question if a filter is consistent.
 
-    ``verdict`` is "consistent", "overconfident" or "underconfident", or "" with too few data.
+    Attributes
+    ----------
+    verdict : str
+        "consistent", "overconfident" or "underconfident"; "" with too few data.
+    factor : float or None
+        Factor by which the reported σ is too small or too large.
     """
 
     verdict: str
     factor: float | None = None
 
 
-class RightFormAnswers(Record):
-    """Right answers to the questions about one simulated flight.
+class CorrectFormAnswers(Record):
+    """Correct answers to the questions about one simulated flight.
 
     Attributes
     ----------
@@ -93,7 +98,7 @@ class RightFormAnswers(Record):
     ekf2_did : tuple of str
         Behaviours of EKF2 that the student must report, for example "never fused".
     ekf2_did_also : tuple of str
-        Behaviours of EKF2 that the student may report.
+        Further behaviours of EKF2 that the student may report without losing points.
     quantities : tuple
         Numeric answers; None if the flight is too short for a question.
     choices : tuple
@@ -102,15 +107,15 @@ class RightFormAnswers(Record):
 
     mistakes: tuple[InjectedFault, ...]
     sigma_z_m: float
-    kf: RightVerdict
-    ekf2: RightVerdict
+    kf: CorrectVerdict
+    ekf2: CorrectVerdict
     ekf2_did: tuple[str, ...]
     ekf2_did_also: tuple[str, ...]
     quantities: tuple[float | tuple[float, ...] | None, ...]
-    choices: tuple[tuple[Choice, ChoiceName], ...] = ()
+    choices: tuple[tuple[Choice, ChoiceLetter], ...] = ()
 
 
-def compute_form_answers(simulation: flights.Simulation, log_sha256: str) -> RightFormAnswers:
+def compute_form_answers(simulation: flights.Simulation, log_sha256: str) -> CorrectFormAnswers:
     """Compute the right answers from the simulated flight and its analysis by px4fuse."""
     answer_key = flights.make_answer_key(simulation)
     comparison = compare_simulation(simulation)
@@ -119,11 +124,11 @@ def compute_form_answers(simulation: flights.Simulation, log_sha256: str) -> Rig
         for name, values in answer_key["mistakes"].items()
     )
     sigma_z_m = answer_key["truth"]["sigma_z_m"]
-    return RightFormAnswers(
+    return CorrectFormAnswers(
         faults,
         sigma_z_m,
-        _make_right_verdict(comparison, "kf"),
-        _make_right_verdict(comparison, "ekf2"),
+        _make_correct_verdict(comparison, "kf"),
+        _make_correct_verdict(comparison, "ekf2"),
         *_find_ekf2_behaviours(comparison, faults, sigma_z_m),
         tuple(
             compute_numeric_answer(comparison.main, question)
@@ -147,10 +152,10 @@ def compare_simulation(simulation: flights.Simulation) -> Comparison:
 def _make_injected_fault(
     name: str, values: Mapping[str, Any], truth: Mapping[str, Any], comparison: Comparison
 ) -> InjectedFault:
-    size_fields = SIMULATED_MISTAKES[name].size_fields
-    if not size_fields:
+    fault_size_fields = SIMULATED_MISTAKES[name].size_fields
+    if not fault_size_fields:
         return InjectedFault(name)
-    size = values[size_fields[0]]
+    size = values[fault_size_fields[0]]
     tolerance = FAULT_SIZE_TOLERANCE_FRACTION * abs(size)
     if name == "open-end":
         # the student can only measure the closure error, which includes the odometry drift
@@ -160,7 +165,8 @@ def _make_injected_fault(
         tolerance = CLOSURE_TOLERANCE_M
     low, high = size - tolerance, size + tolerance
     if name == "clock-offset":
-        # the estimate is the correction, the negative offset: accept also its 95 % interval
+        # px4fuse estimates the correction, which has the opposite sign of the offset. Offsets in
+        # the 95 % interval of the estimate are also right
         _, time_offset = estimate_noises_and_clock(comparison)
         if isinstance(time_offset, ClockOffset) and time_offset.is_determinable:
             low, high = min(low, -time_offset.interval_s[1]), max(high, -time_offset.interval_s[0])
@@ -173,49 +179,49 @@ def _make_injected_fault(
         case "nlos" if truth["outlier_time_s"]:
             fault_start_s, *_, fault_end_s = truth["outlier_time_s"] * 2
         case "dropout" | "imu-dropout" | "jump" | "heading" | "mag":
-            fault_start_s = values[size_fields[1]]
+            fault_start_s = values[fault_size_fields[1]]
             fault_end_s = fault_start_s + abs(size) if name.endswith("dropout") else None
     return InjectedFault(name, size, low, high, fault_start_s, fault_end_s)
 
 
-def _make_right_verdict(comparison: Comparison, filter_name: FilterName) -> RightVerdict:
+def _make_correct_verdict(comparison: Comparison, filter_name: FilterName) -> CorrectVerdict:
     filter_summary = comparison.main.filters[filter_name]
     if not isinstance(filter_summary, FilterSummary):
-        return RightVerdict("")
-    is_consistent = filter_summary.verdict == "consistent"
-    factor = None if is_consistent else filter_summary.sigma_error_factor
-    return RightVerdict(filter_summary.verdict, factor)
+        return CorrectVerdict("")
+    factor = None if filter_summary.verdict == "consistent" else filter_summary.sigma_error_factor
+    return CorrectVerdict(filter_summary.verdict, factor)
 
 
 def _find_ekf2_behaviours(
     comparison: Comparison, faults: tuple[InjectedFault, ...], sigma_z_m: float
 ) -> tuple[tuple[str, ...], tuple[str, ...]]:
-    """Return the behaviours of EKF2 that the student must report, and those that are accepted."""
-    size_by_kind = {fault.kind: fault.size or 0.0 for fault in faults}
+    """Return the behaviours of EKF2 that the student must report, and further allowed ones."""
+    fault_size_by_kind = {fault.kind: fault.size or 0.0 for fault in faults}
     required_behaviours, allowed_behaviours = (
         [
             behaviour
-            for behaviour, kinds in BEHAVIOUR_RULES[rule].items()
-            if kinds & size_by_kind.keys()
+            for behaviour, kinds in EKF2_BEHAVIOUR_RULES[rule].items()
+            if kinds & fault_size_by_kind.keys()
         ]
         for rule in ("required", "allowed")
     )
-    if size_by_kind.get("ekf2-noise", 0.0) > sigma_z_m:
+    if fault_size_by_kind.get("ekf2-noise", 0.0) > sigma_z_m:
         required_behaviours.append("weighted the positions too little")
     innovations = comparison.main.ekf2_innovations
     if not isinstance(innovations, Unavailable):
-        has_bad_samples = "nlos" in size_by_kind or "jump" in size_by_kind
+        has_bad_samples = "nlos" in fault_size_by_kind or "jump" in fault_size_by_kind
         if (innovations["rejected"] > 0).mean() > MIN_REJECTED_FRACTION:
             required_behaviours.append(
                 "rejected outliers" if has_bad_samples else "rejected good samples"
             )
     ekf2 = comparison.flight.ekf2
-    counted_resets_start_s = comparison.segment.start_s + RESET_IGNORE_DURATION_S
+    resets_count_from_s = comparison.segment.start_s + INITIAL_TIME_WITHOUT_RESETS_S
     for reset in ekf2.resets if isinstance(ekf2, Ekf2) else ():
-        is_large = reset.quantity == "position" and math.hypot(*reset.delta[:2]) > MIN_RESET_M
-        if is_large and reset.time_s > counted_resets_start_s:
+        is_large_reset = reset.quantity == "position" and math.hypot(*reset.delta[:2]) > MIN_RESET_M
+        if is_large_reset and reset.time_s > resets_count_from_s:
             required_behaviours.append("dead-reckoned, then reset")
-    if "never fused" in required_behaviours:  # EKF2 cannot follow positions that it does not fuse
+    # EKF2 cannot follow positions that it never fuses, so the other behaviours are only allowed
+    if "never fused" in required_behaviours:
         allowed_behaviours = [*required_behaviours, *allowed_behaviours]
         required_behaviours = ["never fused"]
     if not required_behaviours:
@@ -243,14 +249,16 @@ def compute_numeric_answer(
     nis = updates["innovation_m"] ** 2 / updates["innovation_variance_m2"]
     match question.kind:
         case "gate":
-            is_outside = nis.iloc[: FURTHER_GATE_UPDATE_COUNT + 1] > question.duration_s_or_gate**2
+            is_outside = (
+                nis.iloc[: GATE_QUESTION_FURTHER_UPDATES + 1] > question.question_parameter**2
+            )
             rejected_update_numbers = np.flatnonzero(is_outside) + question.update_number
             return tuple(rejected_update_numbers.astype(float).tolist())
         case "prediction":
             p, f = make_symmetric_matrix(tuple(covariance)), make_transition_matrix(settings.dt_s)
             q = make_symmetric_matrix(compute_unit_process_noise(settings.dt_s))
             q *= settings.sigma_a_m_s2**2 * settings.dt_s
-            for _ in range(round(question.duration_s_or_gate / settings.dt_s)):
+            for _ in range(round(question.question_parameter / settings.dt_s)):
                 p = f @ p @ f.T + q
             return math.sqrt(p[0, 0])
         case "nis":

@@ -15,7 +15,7 @@ from typing import Annotated, Any, ClassVar, Literal
 import msgspec
 from msgspec import Meta
 
-from px4fuse.classroom.assignment.key import AnswerKey, RightAnswers
+from px4fuse.classroom.assignment.key import AnswerKey, CorrectAnswers
 from px4fuse.classroom.grading.form_points import FormPoints, compute_form_points
 from px4fuse.comparison.model import ErrorsAgainstTruth
 from px4fuse.core.record import Share
@@ -48,7 +48,7 @@ Title = Annotated[
     ),
 ]
 Bound = Annotated[float, Meta(ge=-1e12, le=1e12)]
-ZeroPointsErrorFactor = Annotated[float, Meta(ge=1.0, le=1000.0)]
+ErrorFactorAtZeroPoints = Annotated[float, Meta(ge=1.0, le=1000.0)]
 # Fraction of the maximum points (0 to 1), and reason for the student
 ScoreAndReason = tuple[float, str]
 
@@ -63,9 +63,9 @@ class RubricItem(
     points : float
         Maximum points.
     report : {"any", "compare", "loop"}
-        Only reports of this px4fuse command are scored, as the instructor decided.
+        px4fuse command whose reports the instructor wants to score with this item.
     command : {"any", "compare", "loop"}
-        Only reports of this px4fuse command contain the data that the check needs.
+        px4fuse command whose reports contain the data for this type of check.
     needs_answer_key : bool
         True if the check requires an answer key.
     is_scored_by_instructor : bool
@@ -80,7 +80,7 @@ class RubricItem(
     points: Annotated[float, Meta(ge=0.0, le=1000.0)]
     report: Literal["any", "compare", "loop"] = "any"
 
-    def score(self, check_input: CheckInput) -> ScoreAndReason:
+    def score(self, scoring_input: ScoringInput) -> ScoreAndReason:
         """Return the fraction of the maximum points (0 to 1), and the reason as sentences."""
         raise NotImplementedError
 
@@ -90,23 +90,23 @@ class RubricItem(
         return has_required_key and {self.report, self.command} <= {"any", command_name}
 
 
-def score_deviation(deviation_factor: float, zero_points_factor: float) -> float:
+def compute_points_fraction(deviation_factor: float, factor_at_zero_points: float) -> float:
     """Return the fraction of the points for a value that is wrong by ``deviation_factor``.
 
-    The fraction is 1 - ln(deviation_factor) / ln(zero_points_factor), between 0 and 1.
+    The fraction is 1 - ln(deviation_factor) / ln(factor_at_zero_points), between 0 and 1.
 
-    >>> [round(score_deviation(deviation, 4.0), 2) for deviation in (1.0, 2.0, 4.0, 9.0)]
+    >>> [round(compute_points_fraction(deviation, 4.0), 2) for deviation in (1.0, 2.0, 4.0, 9.0)]
     [1.0, 0.5, 0.0, 0.0]
     """
     if deviation_factor <= 1.0:
         return 1.0
-    if deviation_factor >= zero_points_factor:
+    if deviation_factor >= factor_at_zero_points:
         return 0.0
-    return 1.0 - math.log(deviation_factor) / math.log(zero_points_factor)
+    return 1.0 - math.log(deviation_factor) / math.log(factor_at_zero_points)
 
 
 @dataclass(frozen=True)
-class CheckInput:
+class ScoringInput:
     """Input of the checks: results and verification of one report, and answer key.
 
     ``submitter_id`` is the student id on the learning platform.
@@ -128,12 +128,16 @@ class CheckInput:
         return dict(flatten(to_json_dict(self.results)))
 
     @cached_property
-    def right_answers(self) -> RightAnswers | None:
+    def right_answers(self) -> CorrectAnswers | None:
         """Right answers for the log of the report; None if the log is not in the answer key."""
-        return None if self.key is None else self.key.find_log_answers(log_sha256(self.results))
+        return (
+            None
+            if self.key is None
+            else self.key.find_answers_by_log_sha256(log_sha256(self.results))
+        )
 
     @cached_property
-    def assigned_answer(self) -> RightAnswers | None:
+    def assigned_log_answers(self) -> CorrectAnswers | None:
         """Right answers for the log that the instructor gave to the student."""
         if self.key is None:
             return None
@@ -145,7 +149,7 @@ class CheckInput:
     @cached_property
     def is_own_log(self) -> bool:
         """True if the report is about the log that the instructor gave to the student."""
-        assigned_sha256 = self.assigned_answer and self.assigned_answer.sha256
+        assigned_sha256 = self.assigned_log_answers and self.assigned_log_answers.sha256
         return self.key is None or assigned_sha256 == log_sha256(self.results)
 
     @cached_property
@@ -169,9 +173,9 @@ class CheckInput:
     @cached_property
     def form_points(self) -> FormPoints | str:
         """Points for the student's answers, or the reason for no points."""
-        assigned_answer = self.assigned_answer
-        if self.right_answers is None or (assigned_answer and not self.is_own_log):
-            file_text = format_reason(assigned_answer.file if assigned_answer else "")
+        assigned_log_answers = self.assigned_log_answers
+        if self.right_answers is None or (assigned_log_answers and not self.is_own_log):
+            file_text = format_reason(assigned_log_answers.file if assigned_log_answers else "")
             return (
                 f"this report is not about the log that you were given{file_text}. Make a "
                 "report of that log, with your --id"
@@ -220,14 +224,15 @@ def format_reason(reason: str) -> str:
 # ------------------------------------------------------------------ checks of any report
 
 
-class VerifiedItem(RubricItem, frozen=True, tag="verified"):
+class VerificationItem(RubricItem, frozen=True, tag="verified"):
     """Check that a re-run of the analysis on the log reproduces the numbers of the report."""
 
-    def score(self, check_input: CheckInput) -> ScoreAndReason:
-        verification = check_input.verification
+    def score(self, scoring_input: ScoringInput) -> ScoreAndReason:
+        verification = scoring_input.verification
         reason_text = format_reason("".join(verification.reasons[:1]))
-        is_verified = verification.status == "verified"
-        return float(is_verified), f"Verification: {verification.status}{reason_text}."
+        return float(
+            verification.status == "verified"
+        ), f"Verification: {verification.status}{reason_text}."
 
 
 class NumberItem(RubricItem, frozen=True, tag="number"):
@@ -247,8 +252,10 @@ class NumberItem(RubricItem, frozen=True, tag="number"):
 
     def __post_init__(self) -> None:
         is_bounded = math.isfinite(self.at_least) or math.isfinite(self.at_most)
-        is_zero_limit_outside = self.zero_at is None or self._compute_excess(self.zero_at) >= 0.0
-        if not is_bounded or self.at_least > self.at_most or not is_zero_limit_outside:
+        is_zero_at_outside_bounds = (
+            self.zero_at is None or self._compute_excess(self.zero_at) >= 0.0
+        )
+        if not is_bounded or self.at_least > self.at_most or not is_zero_at_outside_bounds:
             raise ValueError(
                 "give at_least, at_most or both (at_least <= at_most); zero_at must be outside"
             )
@@ -258,22 +265,24 @@ class NumberItem(RubricItem, frozen=True, tag="number"):
         return max(self.at_least - number, number - self.at_most)
 
     def _score_number(self, number: float) -> float:
-        excess = self._compute_excess(number)
-        if excess <= 0.0:
+        excess_over_bound = self._compute_excess(number)
+        if excess_over_bound <= 0.0:
             return 1.0
         excess_for_zero_points = 0.0 if self.zero_at is None else self._compute_excess(self.zero_at)
         return (
-            max(1.0 - excess / excess_for_zero_points, 0.0) if excess_for_zero_points > 0.0 else 0.0
+            max(1.0 - excess_over_bound / excess_for_zero_points, 0.0)
+            if excess_for_zero_points > 0.0
+            else 0.0
         )
 
-    def score(self, check_input: CheckInput) -> ScoreAndReason:
-        values = find_values(check_input.values, self.path)
+    def score(self, scoring_input: ScoringInput) -> ScoreAndReason:
+        values = find_values(scoring_input.values, self.path)
         numbers = [
             (self._score_number(value), value, path) for path, value in values if is_number(value)
         ]
         if not numbers:
             label = self.name or f"the number {self.path}"
-            reason_text = check_input.find_missing_reason(self.path)
+            reason_text = scoring_input.find_missing_reason(self.path)
             return 0.0, f"Your report does not contain {label}{reason_text}."
         points_fraction, number, path = min(numbers, key=lambda each: each[0])
         label = self.name or f"the number {shorten_text(path)}"
@@ -289,8 +298,8 @@ class AnswersItem(RubricItem, frozen=True, tag="answers"):
 
     needs_answer_key: ClassVar[bool] = True
 
-    def score(self, check_input: CheckInput) -> ScoreAndReason:
-        points_or_reason = check_input.form_points
+    def score(self, scoring_input: ScoringInput) -> ScoreAndReason:
+        points_or_reason = scoring_input.form_points
         if isinstance(points_or_reason, str):
             return 0.0, f"{capitalise_first(points_or_reason)}."
         points_text = ", ".join(
@@ -307,8 +316,8 @@ class TextItem(RubricItem, frozen=True, tag="text"):
     needs_answer_key: ClassVar[bool] = True
     is_scored_by_instructor: ClassVar[bool] = True
 
-    def score(self, check_input: CheckInput) -> ScoreAndReason:
-        if not check_input.results.student.notes.strip():
+    def score(self, scoring_input: ScoringInput) -> ScoreAndReason:
+        if not scoring_input.results.student.notes.strip():
             return 0.0, "Your report has no text. Write a text and add it with --notes."
         return 0.0, "Your instructor reads your text and gives points for it."
 
@@ -326,20 +335,20 @@ NOISE_SETTINGS: dict[NoiseSettingName, tuple[str, str, str]] = {
 }
 
 
-class TuningItem(RubricItem, frozen=True, tag="tuning", rename={"zero_points_factor": "factor"}):
+class TuningItem(RubricItem, frozen=True, tag="tuning", rename={"factor_at_zero_points": "factor"}):
     """Check that SIGMA_A or SIGMA_Z is within the 95 % interval of its estimate.
 
-    Outside the interval, the points decrease to zero at ``zero_points_factor`` times the upper
+    Outside the interval, the points decrease to zero at ``factor_at_zero_points`` times the upper
     bound, and at the lower bound divided by this factor.
     """
 
     command: ClassVar[str] = "compare"
 
     setting: NoiseSettingName
-    zero_points_factor: ZeroPointsErrorFactor = 2.0
+    factor_at_zero_points: ErrorFactorAtZeroPoints = 2.0
 
-    def score(self, check_input: CheckInput) -> ScoreAndReason:
-        comparison = check_input.comparison
+    def score(self, scoring_input: ScoringInput) -> ScoreAndReason:
+        comparison = scoring_input.comparison
         label, unit, option = NOISE_SETTINGS[self.setting]
         chosen_value: float = getattr(comparison.settings, self.setting)
         horizontal_tuning = comparison.tuning.get(HORIZONTAL)
@@ -347,31 +356,34 @@ class TuningItem(RubricItem, frozen=True, tag="tuning", rename={"zero_points_fac
             horizontal_tuning, f"{ESTIMATE_FIELD_BY_SETTING[self.setting]}_interval", None
         )
         if interval is None or interval[1] is None:
-            reason_text = check_input.find_missing_reason(f"tuning.{HORIZONTAL}")
+            reason_text = scoring_input.find_missing_reason(f"tuning.{HORIZONTAL}")
             return 0.0, f"Your report has no 95 % interval for {label}{reason_text}."
-        low, high = interval
-        if label == "SIGMA_Z" and check_input.has_finding("source_may_drift", "source_drift"):
-            # innovations, and so the estimate of SIGMA_Z, do not contain the drift of the source
-            high = max(high, _find_largest_error_m(comparison))
+        lower_bound, upper_bound = interval
+        if label == "SIGMA_Z" and scoring_input.has_finding("source_may_drift", "source_drift"):
+            # SIGMA_Z is estimated from innovations, which do not contain the drift of the source.
+            # Larger values, up to the position error, are also right
+            upper_bound = max(upper_bound, _find_max_position_error_m(comparison))
         deviation_factor = max(
-            chosen_value / high if high > 0.0 else math.inf, low / chosen_value, 1.0
+            chosen_value / upper_bound if upper_bound > 0.0 else math.inf,
+            lower_bound / chosen_value,
+            1.0,
         )
-        relation, advice = "within", ""
+        position_text, advice = "within", ""
         if deviation_factor > 1.0:
-            side = "above" if chosen_value > high else "below"
-            relation = f"a factor of {format_factor(deviation_factor)} {side}"
+            side = "above" if chosen_value > upper_bound else "below"
+            position_text = f"a factor of {format_factor(deviation_factor)} {side}"
             advice = f" Set {option} to a value in this interval."
-        return score_deviation(deviation_factor, self.zero_points_factor), (
-            f"Your {label} {chosen_value:.3g} {unit} is {relation} the 95 % interval of the "
-            f"maximum-likelihood estimate ({low:.3g} to {high:.3g} {unit}).{advice}"
+        return compute_points_fraction(deviation_factor, self.factor_at_zero_points), (
+            f"Your {label} {chosen_value:.3g} {unit} is {position_text} the 95 % interval of the "
+            f"maximum-likelihood estimate ({lower_bound:.3g} to {upper_bound:.3g} {unit}).{advice}"
         )
 
 
-def _find_largest_error_m(comparison: ComparisonResults) -> float:
+def _find_max_position_error_m(comparison: ComparisonResults) -> float:
     """Return the position RMSE of KF or the loop closure error (m), whichever is larger."""
-    truth_errors = [axis.filters["kf"].truth for axis in comparison.axes.values()]
+    kf_errors = [axis.filters["kf"].truth for axis in comparison.axes.values()]
     errors_m = [
-        errors.position_rmse_m for errors in truth_errors if isinstance(errors, ErrorsAgainstTruth)
+        errors.position_rmse_m for errors in kf_errors if isinstance(errors, ErrorsAgainstTruth)
     ]
     if isinstance(comparison.loop, Loop):
         errors_m.append(comparison.loop.closure_error_m or 0.0)
@@ -379,39 +391,39 @@ def _find_largest_error_m(comparison: ComparisonResults) -> float:
 
 
 class ConsistencyItem(
-    RubricItem, frozen=True, tag="consistent", rename={"zero_points_factor": "factor"}
+    RubricItem, frozen=True, tag="consistent", rename={"factor_at_zero_points": "factor"}
 ):
     """Check that KF is consistent, by the mean NIS of north and east together.
 
-    The points decrease to zero if the reported σ is ``zero_points_factor`` times too small or too
-    large. A report with SIGMA_A and SIGMA_Z within the 95 % intervals of their estimates gets all
-    points.
+    The points decrease to zero if the reported σ is ``factor_at_zero_points`` times too small or
+    too large. A report with SIGMA_A and SIGMA_Z within the 95 % intervals of their estimates gets
+    all points.
     """
 
     command: ClassVar[str] = "compare"
 
-    zero_points_factor: ZeroPointsErrorFactor = 2.0
+    factor_at_zero_points: ErrorFactorAtZeroPoints = 2.0
 
-    def score(self, check_input: CheckInput) -> ScoreAndReason:
-        nis_result = check_input.comparison.horizontal.get("kf")
+    def score(self, scoring_input: ScoringInput) -> ScoreAndReason:
+        nis_result = scoring_input.comparison.horizontal.get("kf")
         if not isinstance(nis_result, HorizontalNis):
-            reason_text = check_input.find_missing_reason(f"{HORIZONTAL}.kf")
+            reason_text = scoring_input.find_missing_reason(f"{HORIZONTAL}.kf")
             return 0.0, f"Your report has no result on the consistency of KF{reason_text}."
         if nis_result.verdict == "consistent":
             return 1.0, "KF is consistent."
         direction = "small" if nis_result.nis_mean > 1.0 else "large"
         sigma_factor = nis_result.sigma_error_factor
-        points_fraction = score_deviation(sigma_factor, self.zero_points_factor)
+        points_fraction = compute_points_fraction(sigma_factor, self.factor_at_zero_points)
         advice = (
             "Compare SIGMA_A and SIGMA_Z with the maximum-likelihood estimates, and look for "
             "errors that are not white noise."
         )
         tuning_items = [TuningItem(title="", points=0.0, setting=name) for name in NOISE_SETTINGS]
-        if all(item.score(check_input)[0] == 1.0 for item in tuning_items):
+        if all(item.score(scoring_input)[0] == 1.0 for item in tuning_items):
             points_fraction = 1.0
             advice = (
-                "SIGMA_A and SIGMA_Z are within the 95 % intervals of their estimates, so other "
-                "settings do not make KF consistent."
+                "SIGMA_A and SIGMA_Z agree with their estimates (95 % intervals). Other values "
+                "would not make KF consistent."
             )
         return points_fraction, (
             f"The reported σ of KF is {format_factor(sigma_factor)} times too {direction}. {advice}"
@@ -426,7 +438,7 @@ class TimeOffsetItem(RubricItem, frozen=True, tag="clock"):
     margin_s : float
         Maximum distance (s) of the applied time offset from the 95 % interval of the estimate.
     undeterminable : float
-        Fraction of the points if the time offset cannot be estimated from the flight.
+        Fraction of the points if the time offset cannot be estimated, or changes in flight.
     """
 
     command: ClassVar[str] = "compare"
@@ -434,23 +446,24 @@ class TimeOffsetItem(RubricItem, frozen=True, tag="clock"):
     margin_s: Annotated[float, Meta(ge=0.0, le=10.0)] = 0.03
     undeterminable: Share = 0.5
 
-    def score(self, check_input: CheckInput) -> ScoreAndReason:
-        clock = check_input.comparison.clock
+    def score(self, scoring_input: ScoringInput) -> ScoreAndReason:
+        clock = scoring_input.comparison.clock
         if not isinstance(clock, ClockOffset) or not clock.is_determinable:
-            points_fraction = self.undeterminable if isinstance(clock, ClockOffset) else 0.0
             reason_text = format_reason(clock.reason or "")
             statement = f"The time offset cannot be estimated from your flight{reason_text}."
-            # all points for an assigned log: the student cannot change its motion
-            return 1.0 if check_input.right_answers is not None else points_fraction, statement
-        (low, high), applied_s = clock.interval_s, clock.applied_s
+            # a student cannot change the motion in an assigned log
+            if scoring_input.right_answers is not None:
+                return 1.0, statement
+            return self.undeterminable if isinstance(clock, ClockOffset) else 0.0, statement
+        (low, high), applied_offset_s = clock.interval_s, clock.applied_s
         statement = (
-            f"You applied a time offset of {applied_s:.3f} s. The 95 % interval of the estimate is "
-            f"{low:.3f} to {high:.3f} s."
+            f"Your time offset is {applied_offset_s:.3f} s. The estimated time offset is {low:.3f} "
+            f"to {high:.3f} s (95 % interval)."
         )
-        if low - self.margin_s <= applied_s <= high + self.margin_s:
+        if low - self.margin_s <= applied_offset_s <= high + self.margin_s:
             return 1.0, statement
-        if check_input.has_finding(*CHANGING_CLOCK_FINDINGS):
-            faults = check_input.form.mistakes if isinstance(check_input.form, Answers) else ()
+        if scoring_input.has_finding(*CHANGING_CLOCK_FINDINGS):
+            faults = scoring_input.form.mistakes if isinstance(scoring_input.form, Answers) else ()
             if any(fault.kind in ("clock-jump", "clock-drift") for fault in faults):
                 return 1.0, "The time offset changes during your flight, as your form states."
             return self.undeterminable, (
@@ -463,9 +476,9 @@ class TimeOffsetItem(RubricItem, frozen=True, tag="clock"):
 # ------------------------------------------------------------------ check of a loop
 
 
-# Maximum distance (m) between take-off and landing position of a closed loop
+# Maximum distance (m) between take-off and landing position for which a loop closure is right
 MAX_LANDING_DISTANCE_M = 0.5
-UNITS_BY_CORRECTION: tuple[CorrectionName, ...] = (
+CORRECTED_PATH_NAMES: tuple[CorrectionName, ...] = (
     "by_distance_plain",
     "by_distance",
     "pose_graph_gated",
@@ -480,11 +493,11 @@ class LoopItem(RubricItem, frozen=True, tag="loop"):
     accepted loop closure.
     """
 
-    def score(self, check_input: CheckInput) -> ScoreAndReason:
-        loop = check_input.results.loop
+    def score(self, scoring_input: ScoringInput) -> ScoreAndReason:
+        loop = scoring_input.results.loop
         closures = loop.closures if isinstance(loop, Loop) else ()
         is_accepted = any(closure.accepted for closure in closures)
-        right_answers = check_input.right_answers
+        right_answers = scoring_input.right_answers
         true_values = right_answers.true_values if right_answers else {}
         landing_distance_m = true_values.get("closure_error_m", 0.0)
         if landing_distance_m > MAX_LANDING_DISTANCE_M and not is_accepted:
@@ -502,7 +515,7 @@ class LoopItem(RubricItem, frozen=True, tag="loop"):
             )
         points_fraction, comment = 0.25, "No loop closure was accepted."
         if is_accepted:
-            corrected_paths = map(loop.corrections.get, UNITS_BY_CORRECTION)
+            corrected_paths = map(loop.corrections.get, CORRECTED_PATH_NAMES)
             is_corrected = any(isinstance(path, CorrectedPath) for path in corrected_paths)
             points_fraction = 1.0 if is_corrected else 0.5
             comment = (
@@ -511,5 +524,5 @@ class LoopItem(RubricItem, frozen=True, tag="loop"):
             )
         error_text, path_text = map(format_length, (loop.closure_error_m, loop.path_length_m))
         return points_fraction, (
-            f"You measured a loop closure error of {error_text} after {path_text}. {comment}"
+            f"Your loop closure error is {error_text} after a path of {path_text}. {comment}"
         )

@@ -65,7 +65,7 @@ def format_class_page(grades: Sequence[Grade], title: str, version_text: str) ->
         filters=[("Status", [("", f"Everyone ({len(grades)})"), *options])],
         column_groups=(("items", "Points of each rubric item"), ("numbers", "Numbers")),
         placeholder="search for name, id, file or flag",
-        full_table_note="The table class.csv contains all rows.",
+        full_table_note="class.csv contains the table of all students.",
     )
 
 
@@ -80,19 +80,21 @@ def _format_statistics(grades: Sequence[Grade], count_by_tag: Mapping[str, int])
         averages=(statistics.fmean(total_points), statistics.median(total_points))
         if total_points
         else (),
-        totals=count_by_bin(total_points, max_points) if total_points else (),
+        totals=compute_histogram(total_points, max_points) if total_points else (),
         max_points_text=format_cell_number(max_points),
         max_points_edge=format_number(max_points),
         pending_points=[report.points for report in reports if report.instructor_action],
         number=format_cell_number,
-        items=[(each, count_by_bin(each.point_fractions, 1.0)) for each in analyse_items(reports)],
+        items=[
+            (each, compute_histogram(each.point_fractions, 1.0)) for each in analyse_items(reports)
+        ],
     )
 
 
-def count_by_bin(values: Sequence[float], maximum: float) -> list[tuple[int, str]]:
+def compute_histogram(values: Sequence[float], maximum: float) -> list[tuple[int, str]]:
     """Compute a histogram of ten bins from 0 to ``maximum``; return (count, lower edge) per bin.
 
-    >>> count_by_bin([0.0, 5.0, 5.5, 9.0], 10.0)[5]
+    >>> compute_histogram([0.0, 5.0, 5.5, 9.0], 10.0)[5]
     (2, '5')
     """
     counts, edges = np.histogram(np.clip(values, 0.0, maximum), HISTOGRAM_BIN_COUNT, (0.0, maximum))
@@ -108,7 +110,9 @@ def _make_grade_tags(grade: Grade) -> list[str]:
         tags += ["pending"] * bool(report.instructor_action)
         tags += ["to read"] * report.is_awaiting_points
         tags += [
-            f"missed: {kind}" for kind, is_named in report.is_found_by_fault.items() if not is_named
+            f"missed: {kind}"
+            for kind, is_named in report.did_student_name_fault.items()
+            if not is_named
         ]
     return tags + ["changed by instructor"] * bool(grade.overrides or grade.comment)
 
@@ -121,7 +125,7 @@ def _make_grade_row(grade: Grade, item_titles: Sequence[str], number_titles: Seq
     flag_count_text = format_count(flag_count, "flag") if flag_count else ""
     late_text = f"{math.ceil(grade.lateness_s / 60.0)} min late" if grade.lateness_s else ""
     points_by_title = {item.title: item.points for item in report.items} if report else {}
-    number_values = report.numbers if report else {}
+    report_numbers = report.numbers if report else {}
     cells = (
         Cell(grade.display_name, second_line=grade.file_name),
         Cell(grade.student_id),
@@ -130,7 +134,7 @@ def _make_grade_row(grade: Grade, item_titles: Sequence[str], number_titles: Seq
         Cell(grade.submission_time, second_line=late_text),
         Cell("\n".join(grade.flags), float(flag_count), "", "flags"),
         *(frame.make_number_cell(points_by_title.get(title)) for title in item_titles),
-        *(frame.make_number_cell(number_values.get(title)) for title in number_titles),
+        *(frame.make_number_cell(report_numbers.get(title)) for title in number_titles),
     )
     # the points of an anonymous student cannot be entered: overrides.csv needs the id or the file
     points_inputs = (_make_points_inputs(grade),) if grade.student_id or grade.file_name else ()
@@ -169,15 +173,18 @@ def _make_grade_details(grade: Grade) -> Iterator[RowSection]:
         for item in report.items
     ]
     fault_texts = [
-        f"{kind}: {'named' if is_named else 'not named'} in the answer form"
-        for kind, is_named in report.is_found_by_fault.items()
+        f"{kind}: the student {'named' if is_named else 'did not name'} this fault"
+        for kind, is_named in report.did_student_name_fault.items()
     ]
     other_report_texts = [
         f"{other_report.submission}: {other_report.status}" for other_report in grade.other_reports
     ]
     yield frame.make_list_section("Flags", grade.flags, is_warning=True)
-    actions = [report.instructor_action] if report.instructor_action else []
-    yield frame.make_list_section("Required decision of the instructor", actions, is_warning=True)
+    yield frame.make_list_section(
+        "Required decision of the instructor",
+        [report.instructor_action] if report.instructor_action else [],
+        is_warning=True,
+    )
     yield frame.make_list_section("Verification", verification.reasons)
     yield frame.make_table_section(
         "Numbers that differ in the new run", differences, ("Value", "Report", "New run")
@@ -208,8 +215,11 @@ def _make_points_cell(grade: Grade) -> Cell:
     notes += ["changed by instructor"] * any(
         override.points is not None for override in grade.overrides.values()
     )
-    text = f"{format_cell_number(grade.total)} / {format_cell_number(grade.max_points)}"
-    return Cell(text, grade.total, ", ".join(notes))
+    return Cell(
+        f"{format_cell_number(grade.total)} / {format_cell_number(grade.max_points)}",
+        grade.total,
+        ", ".join(notes),
+    )
 
 
 def _make_points_inputs(grade: Grade) -> RowSection:

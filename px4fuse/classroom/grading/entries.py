@@ -56,12 +56,12 @@ GERMAN_MONTHS = ("jan", "feb", "mär", "apr", "mai", "jun", "jul", "aug", "sep",
 class LateRule:
     """Deduction of points for late submissions.
 
-    For each started day or hour (``unit_s``), the fraction ``deduction_per_unit`` of the maximum
-    points is deducted, but at most ``max_deduction_fraction``.
+    For each started day or hour (``lateness_unit_s``), the fraction ``deduction_per_unit`` of the
+    maximum points is deducted, but at most ``max_deduction_fraction``.
     """
 
     deduction_per_unit: float
-    unit_s: float
+    lateness_unit_s: float
     max_deduction_fraction: float
 
     def compute_deduction(self, lateness_s: float, max_points: float) -> float:
@@ -72,7 +72,7 @@ class LateRule:
         >>> parse_late_rule("10%/day up to 30%").compute_deduction(1e9, 50.0)
         15.0
         """
-        late_unit_count = math.ceil(max(lateness_s, 0.0) / self.unit_s)
+        late_unit_count = math.ceil(max(lateness_s, 0.0) / self.lateness_unit_s)
         return round(
             max_points
             * min(late_unit_count * self.deduction_per_unit, self.max_deduction_fraction),
@@ -136,9 +136,9 @@ class Course:
         return ClassList(people, *people_by_sheet)
 
 
-# Sort key (UNIX times of submission and zip entry) of a report, the report, and the grade of the
-# student if only this report counts
-RankedAttempt = tuple[tuple[float, float], GradedReport, Grade]
+# Report that may count for the grade of a student: UNIX times of submission and zip entry (for
+# sorting), the report, and the grade of the student if this report counts
+CandidateReport = tuple[tuple[float, float], GradedReport, Grade]
 
 
 def build_grades(
@@ -166,18 +166,18 @@ def build_grades(
     """
     has_class_list = bool(course.class_list.people)
     class_list = course.class_list if has_class_list else _collect_students(reports, submissions)
-    attempts_by_index: dict[int | None, list[RankedAttempt]] = defaultdict(list)
+    candidates_by_student_index: dict[int | None, list[CandidateReport]] = defaultdict(list)
     for report, submission in zip(reports, submissions, strict=True):
         student_index = class_list.find_student_index(submission.origin.person)
         if student_index is None:
             student_index = class_list.find_student_index(Person(report.student_id, report.student))
-        attempts_by_index[student_index].append(
-            _make_attempt(report, submission, course, student_index, class_list)
+        candidates_by_student_index[student_index].append(
+            _make_candidate(report, submission, course, student_index, class_list)
         )
     max_points = max((report.max_points for report in reports), default=0.0)
     grades = [
-        _choose_attempt(attempts_by_index[student_index], course)
-        if attempts_by_index[student_index]
+        _choose_counted_report(candidates_by_student_index[student_index], course)
+        if candidates_by_student_index[student_index]
         else Grade(person.name, person.student_id, None, max_points=max_points)
         for student_index, person in enumerate(class_list.people)
     ]
@@ -186,9 +186,9 @@ def build_grades(
         unknown_student_flag = "The student is not in the class list."
     grades += [
         replace(grade, flags=(unknown_student_flag, *grade.flags))
-        for *_, grade in attempts_by_index[None]
+        for *_, grade in candidates_by_student_index[None]
     ]
-    overrides_of_grades, notes = match_overrides(overrides, grades)
+    overrides_per_grade, notes = match_overrides(overrides, grades)
     flags_by_submission = flag_equal_contents(counted_reports(grades))
     grades_with_report = [grade for grade in grades if grade.counted_report]
     unknown_time_count = sum(grade.lateness_s is None for grade in grades_with_report)
@@ -199,7 +199,7 @@ def build_grades(
         )
     final_grades = (
         _apply_overrides(*grade_and_overrides, flags_by_submission, course)
-        for grade_and_overrides in zip(grades, overrides_of_grades, strict=True)
+        for grade_and_overrides in zip(grades, overrides_per_grade, strict=True)
     )
     return tuple(final_grades), notes
 
@@ -216,8 +216,8 @@ def _collect_students(
             if class_list.find_student_index(person) is not None:
                 continue
             # ignore the id in the report if another student already has this id
-            unassigned_id = report.student_id if reported_student_index is None else ""
-            student_id = person.student_id or unassigned_id
+            unused_reported_id = report.student_id if reported_student_index is None else ""
+            student_id = person.student_id or unused_reported_id
             name = one_line(report.student if student_id else person.name, 200) or person.name
             student_id = next(filter(None, (student_id, person.login, *person.numbers.values())))
             class_list.people.append(replace(person, student_id=student_id, name=name))
@@ -226,14 +226,14 @@ def _collect_students(
     return class_list
 
 
-def _make_attempt(
+def _make_candidate(
     report: GradedReport,
     submission: Submission,
     course: Course,
     student_index: int | None,
     class_list: ClassList,
-) -> RankedAttempt:
-    """Return a report with its sort key, and the grade of the student if this report is chosen."""
+) -> CandidateReport:
+    """Return a report, its times, and the grade of the student if this report counts."""
     origin, platform = submission.origin, submission.origin.platform.capitalize()
     person = (
         Person(report.student_id) if student_index is None else class_list.people[student_index]
@@ -243,10 +243,10 @@ def _make_attempt(
         due_time = parse_due_time(
             person.extended_due, f"extension of {one_line(person.student_id, 40)}:", due_time.tzinfo
         )
-    stated_time = origin.time or parse_moodle_time(person.submission_time)
+    platform_time = origin.time or parse_moodle_time(person.submission_time)
     submission_time, zip_time = (
         submission_time and add_time_zone(submission_time, due_time)
-        for submission_time in (stated_time, submission.time)
+        for submission_time in (platform_time, submission.time)
     )
     lateness_s, flags = None, []
     if due_time is not None and submission_time is not None:
@@ -262,10 +262,10 @@ def _make_attempt(
             f"The time in the zip file ({zip_time:{TIME_FORMAT}}) is after the due time. It may be "
             "the time of the download, so no points were deducted."
         )
-    if origin.has_imitated_platform_name:
+    if origin.has_forged_platform_name:
         flags.append(
-            "The student's part of the file name imitates a learning platform (platform of the "
-            f"export: {platform or 'none'}). Check who handed in the file."
+            "The student chose a file name that looks like the file names of a learning platform "
+            f"(platform of the export: {platform or 'none'}). Check who handed in the file."
         )
     reported_student_index = (
         class_list.find_student_index(Person(report.student_id)) if platform else None
@@ -296,56 +296,68 @@ def _make_attempt(
     return sort_key, report, grade
 
 
-def _deduct_points(attempt: RankedAttempt) -> float:
-    _, report, grade = attempt
+def _compute_points_after_deduction(candidate: CandidateReport) -> float:
+    _, report, grade = candidate
     return max(report.points - grade.deducted_points, 0.0)
 
 
-def _choose_attempt(attempts: Sequence[RankedAttempt], course: Course) -> Grade:
+def _choose_counted_report(candidates: Sequence[CandidateReport], course: Course) -> Grade:
     """Choose the report of a student that counts; add flags if the choice is ambiguous."""
-    # sort by time; reports with equal times by points
-    sorted_attempts = sorted(
-        attempts,
-        key=lambda attempt: (attempt[0], _deduct_points(attempt), attempt[1].submission),
+    # sort by time, and reports with the same time by points
+    sorted_candidates = sorted(
+        candidates,
+        key=lambda candidate: (
+            candidate[0],
+            _compute_points_after_deduction(candidate),
+            candidate[1].submission,
+        ),
     )
-    # prefer reports that need no decision of the instructor, then readable reports
-    attempts_with_report = [attempt for attempt in sorted_attempts if attempt[1].version]
-    attempts_without_decision = [
-        attempt for attempt in attempts_with_report if not attempt[1].instructor_action
+    # prefer reports whose points need no decision of the instructor, then readable reports
+    readable_candidates = [candidate for candidate in sorted_candidates if candidate[1].version]
+    final_candidates = [
+        candidate for candidate in readable_candidates if not candidate[1].instructor_action
     ]
-    eligible_attempts = attempts_without_decision or attempts_with_report or sorted_attempts
+    eligible_candidates = final_candidates or readable_candidates or sorted_candidates
     chosen_sort_key, chosen_report, grade = {
-        "latest": eligible_attempts[-1],
-        # of several reports with the earliest time, the last one has the most points (sort order)
+        "latest": eligible_candidates[-1],
+        # last of the reports with the earliest time, because the last has the most points
         "first": [
-            attempt for attempt in eligible_attempts if attempt[0] == eligible_attempts[0][0]
+            candidate
+            for candidate in eligible_candidates
+            if candidate[0] == eligible_candidates[0][0]
         ][-1],
-        "best": max(reversed(eligible_attempts), key=_deduct_points),
+        "best": max(reversed(eligible_candidates), key=_compute_points_after_deduction),
     }[course.attempt]
     flags = list(grade.flags)
-    other_reports = tuple(report for _, report, _ in sorted_attempts if report is not chosen_report)
+    other_reports = tuple(
+        report for _, report, _ in sorted_candidates if report is not chosen_report
+    )
     forms = [
-        report.form for sort_key, report, _ in eligible_attempts if sort_key == chosen_sort_key
+        report.form for sort_key, report, _ in eligible_candidates if sort_key == chosen_sort_key
     ]
     # without this rule, students could hand in several answer forms with different guesses
     if course.attempt != "best" and len(set(forms)) > 1:
-        action = f"Ask the student which of {len(forms)} reports counts: the answer forms differ."
+        action = (
+            f"The answer forms of {len(forms)} reports differ. Ask the student which report counts."
+        )
         chosen_report = replace(chosen_report, instructor_action=action)
     elif (
-        course.attempt == "best" and len({report.form for _, report, _ in attempts_with_report}) > 1
+        course.attempt == "best" and len({report.form for _, report, _ in readable_candidates}) > 1
     ):
-        flags.append(f"The student handed in {len(attempts)} reports with different answer forms.")
+        flags.append(
+            f"The student handed in {len(candidates)} reports with different answer forms."
+        )
     elif len(forms) > 1 and any(chosen_sort_key):
         flags.append(f"{len(forms)} reports have the same time; the one with most points counts.")
-    for sort_key, report, _ in sorted_attempts:
+    for sort_key, report, _ in sorted_candidates:
         if (
             report in other_reports
             and sort_key >= chosen_sort_key
             and (report.instructor_action or not report.version)
         ):
-            status = "pending" if report.version else "no report"
+            status = "pending" if report.version else "not a report"
             flags.append(
-                f"The file {one_line(report.submission, 80)} does not count (status: {status})."
+                f"The file {one_line(report.submission, 80)} does not count: it is {status}."
             )
     return replace(
         grade, counted_report=chosen_report, other_reports=other_reports, flags=tuple(flags)
@@ -361,7 +373,9 @@ def _apply_overrides(
     """Apply the instructor's points and comments, and compute the total points."""
     report, total_points, flags = grade.counted_report, None, grade.flags
     if report is not None:
-        items = (_override_item(item, override_by_title.get(item.title)) for item in report.items)
+        items = (
+            _apply_item_override(item, override_by_title.get(item.title)) for item in report.items
+        )
         report = replace(report, items=tuple(items))
         flags = (*flags, *report.flags, *flags_by_submission.get(report.submission, ()))
         if report.counted_points is not None or course.include_pending:
@@ -379,8 +393,8 @@ def _apply_overrides(
     )
 
 
-def _override_item(item: ItemScore, override: GradeOverride | None) -> ItemScore:
-    """Replace the points of a rubric item by the instructor's points, and append the comment."""
+def _apply_item_override(item: ItemScore, override: GradeOverride | None) -> ItemScore:
+    """Replace points by the instructor's points, and append the instructor's comment."""
     if override is None:
         return item
     comment = item.comment
@@ -414,8 +428,10 @@ def read_overrides(path: Path) -> OverridesByStudent:
         title for title in OVERRIDE_TITLES if sheet.find_column_index((title,)) is None
     ]
     if missing_titles:
-        remedy = f"Required columns: {', '.join(OVERRIDE_TITLES)}."
-        raise SettingsError(f"{path}: no column {', '.join(missing_titles)}.", remedy)
+        raise SettingsError(
+            f"{path}: no column {', '.join(missing_titles)}.",
+            f"Required columns: {', '.join(OVERRIDE_TITLES)}.",
+        )
     overrides: dict[str, dict[str, GradeOverride]] = defaultdict(dict)
     for row_number, row in enumerate(sheet.rows, start=2):
         if any(cell.strip() for cell in row[len(sheet.column_titles) :]):
@@ -434,7 +450,9 @@ def read_overrides(path: Path) -> OverridesByStudent:
         elif points and (parsed_points is None or parsed_points < 0.0):
             problem = f"the points {one_line(points, 20)!r} are not a number of 0 or more"
         elif points and not item_title:
-            problem = f"the points {one_line(points, 20)} need a rubric title or 'total' as item"
+            problem = (
+                f"the points {one_line(points, 20)} have no item: write a rubric title or 'total'"
+            )
         if problem:
             raise SettingsError(f"{path}: row {row_number}: {problem}.")
         overrides[student][item_title] = GradeOverride(

@@ -19,17 +19,17 @@ from px4fuse.results.contract import LoopResults, ReportedResults
 from px4fuse.simulation import flights
 from px4fuse.verification.model import Verification
 
-# Minimum number of equal numbers in the answers of two students that is suspicious
-MIN_SAME_NUMBERS = 3
+# Minimum number of equal numbers in the reports of two students for a suspicion of a copy
+MIN_EQUAL_NUMBERS_OF_A_COPY = 3
 # Minimum number of answered multiple-choice questions for comparing two students
 MIN_ANSWERED_CHOICES = 6
 # Maximum relative difference of numbers that count as equal: a copy may have small changes
 SAME_NUMBER_RELATIVE_TOLERANCE = 0.02
 # Minimum fraction of the log that a report must analyse (--start, --end): else it is flagged
 MIN_ANALYSED_LOG_FRACTION = 0.5
-# Maximum factor by which --drift or --heading-drift may be above or below its default: else the
-# report is flagged
-MAX_DRIFT_OPTION_FACTOR = 4.0
+# A report is flagged if --drift or --heading-drift is above the default times this ratio, or below
+# the default divided by this ratio
+MAX_DRIFT_TO_DEFAULT_RATIO = 4.0
 MAX_LISTED_REPORTS = 4
 # Pairs of reports with equal contents
 ReportPairs = Iterator[tuple[GradedReport, GradedReport]]
@@ -69,11 +69,13 @@ def flag_settings(results: ReportedResults, has_key: bool = False) -> Iterator[s
     if settings.input == "zero" and not has_no_imu:
         yield "KF did not use the IMU (--input zero)."
     source = results.source
-    received_tracks = [track.name for track in source.available if track.path == "as received"]
-    if received_tracks and source.path != "as received":
+    names_of_received_tracks = [
+        track.name for track in source.available if track.path == "as received"
+    ]
+    if names_of_received_tracks and source.path != "as received":
         yield (
-            f"The position source is {source.name} ({source.path}), not "
-            f"{received_tracks[0]}, the positions as received by PX4."
+            f"The position source is {source.name} ({source.path}). The positions as received by "
+            f"PX4 are also in the log: {names_of_received_tracks[0]}."
         )
     if results.log.hardware == flights.SIMULATION_HARDWARE and not has_key:
         yield "The log is simulated (px4fuse simulate), not a real flight."
@@ -86,7 +88,11 @@ def _flag_drift(request: LoopRequest) -> Iterator[str]:
         ("--drift", "m", request.position_drift_m, defaults.position_drift_m),
         ("--heading-drift", "°", request.heading_drift_deg, defaults.heading_drift_deg),
     ):
-        if not default / MAX_DRIFT_OPTION_FACTOR <= drift <= default * MAX_DRIFT_OPTION_FACTOR:
+        if (
+            not default / MAX_DRIFT_TO_DEFAULT_RATIO
+            <= drift
+            <= default * MAX_DRIFT_TO_DEFAULT_RATIO
+        ):
             yield (
                 f"{option} is {drift:g} {unit} per 100 m (default {default:g} {unit}). The test of "
                 "the loop closure depends on this value. Ask the student for the reason."
@@ -113,10 +119,10 @@ def _collect_form_numbers(report: GradedReport) -> dict[tuple[str, str], float]:
 
 
 def _count_same_numbers(numbers: Mapping[Any, float], other_numbers: Mapping[Any, float]) -> int:
-    """Count the equal numbers of two students, except numbers with one digit (equal by chance).
+    """Count the equal numbers of two students. Numbers with one digit may be equal by chance.
 
-    Numbers with the field name "value" (lists, values of corrections) must be exactly equal, others
-    within SAME_NUMBER_RELATIVE_TOLERANCE.
+    Numbers are equal within SAME_NUMBER_RELATIVE_TOLERANCE. Values of corrections, and lists, must
+    be exactly equal. Numbers with one digit are not counted.
     """
     return sum(
         _count_digits(number) > 1
@@ -132,7 +138,8 @@ def _identify_student(report: GradedReport) -> str:
 
 
 # Checks for equal contents of two reports: sentence for the instructor, function that returns the
-# compared content, and function that returns an owner. Reports of one owner are not compared
+# compared content, and function whose results must differ for the two reports (for example, two
+# reports of one student are not compared)
 EQUAL_CONTENT_CHECKS: tuple[
     tuple[str, Callable[[GradedReport], object], Callable[[GradedReport], str]], ...
 ] = (
@@ -148,17 +155,17 @@ EQUAL_CONTENT_CHECKS: tuple[
         _identify_student,
     ),
     (
-        "The numbers are those in the report of {}, but the SHA-256 of the log differs: this is a "
-        "copy.",
+        "The numbers equal those in the report of {}, but the SHA-256 of the log differs: the "
+        "report is a copy.",
         lambda report: (
             report.verification.status == "verified"
-            and len(report.numbers) >= MIN_SAME_NUMBERS
+            and len(report.numbers) >= MIN_EQUAL_NUMBERS_OF_A_COPY
             and tuple(report.numbers.values())
         ),
         attrgetter("log_sha256"),
     ),
     (
-        "The answers about the figures are those in the report of {}, although the figures differ.",
+        "The answers about the figures equal those of {}, whose figures were different.",
         lambda report: (
             report.form
             and sum(map(bool, report.form.choices)) >= MIN_ANSWERED_CHOICES
@@ -174,11 +181,11 @@ def flag_equal_contents(reports: Sequence[GradedReport]) -> Mapping[str, Sequenc
     flags_by_submission: dict[str, list[str]] = defaultdict(list)
     for flag_text, pairs in (
         *(
-            (flag_text, _find_equal_reports(reports, get_content, get_owner))
-            for flag_text, get_content, get_owner in EQUAL_CONTENT_CHECKS
+            (flag_text, _find_equal_reports(reports, get_compared_content, get_required_difference))
+            for flag_text, get_compared_content, get_required_difference in EQUAL_CONTENT_CHECKS
         ),
         (
-            "The answer form contains the same numbers as the form of {}. It may be a copy.",
+            "The answer form contains the same numbers as the answer form of {}. It may be a copy.",
             _find_copied_forms(reports),
         ),
     ):
@@ -197,15 +204,15 @@ def flag_equal_contents(reports: Sequence[GradedReport]) -> Mapping[str, Sequenc
 
 def _find_equal_reports(
     reports: Sequence[GradedReport],
-    get_content: Callable[[GradedReport], object],
-    get_owner: Callable[[GradedReport], str],
+    get_compared_content: Callable[[GradedReport], object],
+    get_required_difference: Callable[[GradedReport], str],
 ) -> ReportPairs:
     reports_by_content: dict[object, list[GradedReport]] = defaultdict(list)
     for report in reports:
-        reports_by_content[get_content(report)].append(report)
+        reports_by_content[get_compared_content(report)].append(report)
     for content, equal_reports in reports_by_content.items():
         for report, other_report in combinations(equal_reports if content else (), 2):
-            if get_owner(report) != get_owner(other_report):
+            if get_required_difference(report) != get_required_difference(other_report):
                 yield report, other_report
 
 
@@ -213,7 +220,7 @@ def _find_copied_forms(reports: Sequence[GradedReport]) -> ReportPairs:
     """Yield pairs of reports of different students whose answers have equal numbers."""
     reports_and_numbers = [(report, _collect_form_numbers(report)) for report in reports]
     for (report, numbers), (other_report, other_numbers) in combinations(reports_and_numbers, 2):
-        is_copied = _count_same_numbers(numbers, other_numbers) >= MIN_SAME_NUMBERS
+        is_copied = _count_same_numbers(numbers, other_numbers) >= MIN_EQUAL_NUMBERS_OF_A_COPY
         if is_copied and _identify_student(report) != _identify_student(other_report):
             yield report, other_report
 

@@ -14,39 +14,41 @@ from typing import NamedTuple
 
 import msgspec
 
-from px4fuse.classroom.assignment.truth import InjectedFault, RightFormAnswers
+from px4fuse.classroom.assignment.truth import CorrectFormAnswers, InjectedFault
 from px4fuse.classroom.grading.model import ItemScore
 from px4fuse.core.record import read_toml
 from px4fuse.results.answer_form import (
-    CHOICE_NAMES,
+    CHOICE_LETTERS,
     FAULT_KINDS,
     NO_FAULT_KIND,
     NOT_AVAILABLE,
     Answers,
     NamedFault,
-    QuantityAnswer,
+    NumericAnswer,
     select_questions,
 )
 
 # Fraction of the points for questions about the flight; the rest is for questions about figures.
 # Small, because px4fuse itself can answer the questions about the flight
-FLIGHT_POINTS_FRACTION = 0.2
+FLIGHT_QUESTIONS_POINTS_FRACTION = 0.2
 # Points deducted for each false fault
 FALSE_FAULT_DEDUCTION = 10.0
-# With this number of false faults or more, named faults give no points: the student guessed
-FALSE_FAULTS_FOR_ZERO_POINTS = 3
-# Score for naming a fault that is similar to the injected fault
-SIMILAR_FAULT_SCORE = 0.4
-# Score for naming ekf2-noise (wrong EKF2_EVP_NOISE) instead of r-scale (wrong reported variance),
-# because both make R of EKF2 wrong
-EKF2_NOISE_FOR_R_SCALE_SCORE = 2.0 / 3.0
-# Score for naming a consequence of the injected fault instead of the fault
-FAULT_CONSEQUENCE_SCORE = 0.15
+# From this number of false faults, the named faults give no points, because the student guessed
+ZERO_POINTS_FALSE_FAULT_COUNT = 3
+# Score for the answer that names a fault similar to the injected fault
+SCORE_FOR_SIMILAR_FAULT = 0.4
+# Score for the answer ekf2-noise (wrong EKF2_EVP_NOISE) if the injected fault is r-scale (wrong
+# reported variance). Both faults make R of EKF2 wrong
+SCORE_FOR_WRONG_NOISE_PARAMETER = 2.0 / 3.0
+# Score for the answer that names a consequence of the injected fault, for example outliers after a
+# jump
+SCORE_FOR_NAMED_CONSEQUENCE = 0.15
 # Kinds of injected faults that can be guessed without a measurement
 GUESSABLE_FAULT_KINDS = frozenset(("open-end",))
-# Size of a guessable fault: the points decrease to zero while the relative error increases from the
-# tolerance by this fraction. Small, because the sizes in the students' flights differ little
-ZERO_POINTS_EXCESS_FRACTION = 0.08
+# The size of a guessable fault gives no points if its relative error exceeds the tolerance by this
+# fraction; within this fraction, the points decrease linearly. The fraction is small, because the
+# sizes in the flights of different students are similar
+EXCESS_SIZE_ERROR_AT_ZERO_POINTS = 0.08
 NO_BOUNDS = (-math.inf, math.inf)
 # Minimum tolerance (s) of the start and the end of an injected fault
 FAULT_TIME_TOLERANCE_S = 2.0
@@ -57,7 +59,7 @@ FAULT_TIME_TOLERANCE_FRACTION = 0.05
 MAX_NUMBER_ERROR_FULL_POINTS = 0.02
 # Maximum relative error of a number that the student computed, for half of the points
 MAX_NUMBER_ERROR_HALF_POINTS = 0.10
-# Maximum relative error of the size of an injected fault for half of the points
+# Maximum relative error of the size of an injected fault that gives half of the points
 MAX_SIZE_ERROR_HALF_POINTS = 0.4
 
 
@@ -66,36 +68,41 @@ class _CorrectionRule(NamedTuple):
 
     Attributes
     ----------
-    score_by_kind : mapping
-        Score for naming the parameter, by kind of fault.
+    score_by_fault_kind : mapping
+        Score of an answer that names the parameter as correction, by kind of injected fault.
     right_value_range : (float, float) or str
-        Smallest and largest right value, or the name of a rule in
-        :func:`find_accepted_corrections`.
+        Smallest and largest right value of the parameter, or the name of a range that
+        :func:`find_accepted_corrections` computes from the injected fault.
     """
 
     parameter: str
-    score_by_kind: Mapping[str, float]
+    score_by_fault_kind: Mapping[str, float]
     right_value_range: tuple[float, float] | str = NO_BOUNDS
 
 
-POINTS_TABLE = read_toml(__file__, dict)
-UNITS_BY_CORRECTION = msgspec.convert(POINTS_TABLE["corrections"], tuple[_CorrectionRule, ...])
+POINTS_CONFIG = read_toml(__file__, dict)
+CORRECTION_RULES = msgspec.convert(POINTS_CONFIG["corrections"], tuple[_CorrectionRule, ...])
 SIMILAR_FAULT_GROUPS = msgspec.convert(
-    [*POINTS_TABLE["neighbours"].values()], tuple[frozenset[str], ...]
+    [*POINTS_CONFIG["neighbours"].values()], tuple[frozenset[str], ...]
 )
-FORM_PART_NAMES = tuple(POINTS_TABLE["weights"])
+FORM_PART_NAMES = tuple(POINTS_CONFIG["weights"])
 
 
 @dataclass(frozen=True)
 class FormPoints:
-    """Points for the parts of a student's answers ("mistakes", "sizes", ...), and feedback.
+    """Points and feedback for a student's answer form.
 
-    ``is_named_by_kind`` states for each kind of injected fault whether the student named it.
+    Attributes
+    ----------
+    parts : tuple of ItemScore
+        Points for each part of the form, for example "mistakes" (names of the faults).
+    did_student_name_fault : mapping of str to bool
+        For each kind of injected fault: True if the student named this fault.
     """
 
     parts: tuple[ItemScore, ...] = ()
     feedback: tuple[str, ...] = ()
-    is_named_by_kind: Mapping[str, bool] = field(default_factory=dict)
+    did_student_name_fault: Mapping[str, bool] = field(default_factory=dict)
 
     @property
     def fraction(self) -> float:
@@ -103,47 +110,52 @@ class FormPoints:
         return max(points, 0.0) / sum(part.max_points for part in self.parts)
 
 
-def compute_form_points(answers: Answers, right_answers: RightFormAnswers) -> FormPoints:
+def compute_form_points(answers: Answers, right_answers: CorrectFormAnswers) -> FormPoints:
     """Compare a student's answers with the right answers, and compute the points."""
-    is_no_fault_recognised = not right_answers.mistakes and answers.states_no_fault
-    weights = POINTS_TABLE["weights_clean" if is_no_fault_recognised else "weights"]
+    has_recognised_fault_free_flight = not right_answers.mistakes and answers.states_no_fault
+    weights = POINTS_CONFIG["weights_clean" if has_recognised_fault_free_flight else "weights"]
     scores = dict.fromkeys(FORM_PART_NAMES, 0.0)
     matches, false_faults = _match_faults(answers, right_answers)
-    if right_answers.mistakes and len(false_faults) < FALSE_FAULTS_FOR_ZERO_POINTS:
+    if right_answers.mistakes and len(false_faults) < ZERO_POINTS_FALSE_FAULT_COUNT:
         scores |= _score_faults(matches, right_answers)
     scores["numbers"] = numbers_score = _score_numbers(answers, right_answers)
     # the verdicts can be guessed: without a right number, they give only half of their points
-    is_guess_possible = not numbers_score and not is_no_fault_recognised
+    can_verdicts_be_guessed = not numbers_score and not has_recognised_fault_free_flight
     scores["verdicts"] = _score_verdicts(answers, right_answers) * (
-        0.5 if is_guess_possible else 1.0
+        0.5 if can_verdicts_be_guessed else 1.0
     )
-    points_by_part = {name: weights[name] * score for name, score in scores.items()}
-    if is_no_fault_recognised:
-        points_by_part["mistakes"] = weights["mistakes"]
+    points_by_form_part = {name: weights[name] * score for name, score in scores.items()}
+    if has_recognised_fault_free_flight:
+        points_by_form_part["mistakes"] = weights["mistakes"]
     elif right_answers.mistakes and all(fault.size is None for fault in right_answers.mistakes):
-        # no injected fault has a size: add the points for sizes to those for naming the faults
-        points_by_part["mistakes"] += weights["sizes"] * scores["mistakes"]
-    points_by_part["mistakes"] -= FALSE_FAULT_DEDUCTION * len(false_faults)
-    points_by_part["mistakes"] = max(points_by_part["mistakes"], 0.0)
+        # If no injected fault has a size, naming the faults also gives the points for sizes
+        points_by_form_part["mistakes"] += weights["sizes"] * scores["mistakes"]
+    points_by_form_part["mistakes"] -= FALSE_FAULT_DEDUCTION * len(false_faults)
+    points_by_form_part["mistakes"] = max(points_by_form_part["mistakes"], 0.0)
     if right_answers.choices:
-        weights = {name: FLIGHT_POINTS_FRACTION * points for name, points in weights.items()}
-        weights["figures"] = 100.0 * (1.0 - FLIGHT_POINTS_FRACTION)
-        points_by_part = {
-            name: FLIGHT_POINTS_FRACTION * points for name, points in points_by_part.items()
+        weights = {
+            name: FLIGHT_QUESTIONS_POINTS_FRACTION * points for name, points in weights.items()
         }
-        points_by_part["figures"] = weights["figures"] * _score_choices(answers, right_answers)
+        weights["figures"] = 100.0 * (1.0 - FLIGHT_QUESTIONS_POINTS_FRACTION)
+        points_by_form_part = {
+            name: FLIGHT_QUESTIONS_POINTS_FRACTION * points
+            for name, points in points_by_form_part.items()
+        }
+        points_by_form_part["figures"] = weights["figures"] * _score_choices(answers, right_answers)
     named_kinds = [named_fault.kind for named_fault in answers.mistakes]
-    is_named_by_kind = {fault.kind: fault.kind in named_kinds for fault in right_answers.mistakes}
+    did_student_name_fault = {
+        fault.kind: fault.kind in named_kinds for fault in right_answers.mistakes
+    }
     feedback = (
-        *_describe_fault_answers(matches, false_faults, is_no_fault_recognised),
+        *_describe_fault_answers(matches, false_faults, has_recognised_fault_free_flight),
         *_describe_wrong_answers(answers, right_answers),
     )
     parts = tuple(
-        ItemScore(name, points_by_part[name], max_points, "")
+        ItemScore(name, points_by_form_part[name], max_points, "")
         for name, max_points in weights.items()
         if max_points
     )
-    return FormPoints(parts, feedback, is_named_by_kind)
+    return FormPoints(parts, feedback, did_student_name_fault)
 
 
 # Injected fault, fault that the student named for it (or None), and score
@@ -151,11 +163,14 @@ FaultMatch = tuple[InjectedFault, NamedFault | None, float]
 
 
 def _describe_fault_answers(
-    matches: list[FaultMatch], false_faults: list[NamedFault], is_no_fault_recognised: bool
+    matches: list[FaultMatch],
+    false_faults: list[NamedFault],
+    has_recognised_fault_free_flight: bool,
 ) -> Iterator[str]:
     """Yield feedback on each injected fault, and on named faults that the flight does not have."""
     if not matches:
-        yield f"your flight has no injected fault{', as your form states' * is_no_fault_recognised}"
+        form_text = ", as your form states" * has_recognised_fault_free_flight
+        yield f"your flight has no injected fault{form_text}"
     for fault, named_fault, _ in matches:
         fault_text = f"{fault.kind} ({FAULT_KINDS[fault.kind].description})"
         right_answer = describe_right_answer(fault)
@@ -179,22 +194,14 @@ def describe_right_answer(fault: InjectedFault) -> str:
     start_text = "" if fault.from_s is None else f"from {fault.from_s:.0f} s "
     end_text = "" if fault.until_s is None else f"until {fault.until_s:.0f} s"
     texts.append(f"{start_text}{end_text}".strip() or "whole flight")
-    return ", ".join([*texts, f"shown in {' or '.join(find_panels(fault.kind))}"])
+    return ", ".join([*texts, f"shown in {' or '.join(find_panels_showing_fault(fault.kind))}"])
 
 
-def _describe_wrong_answers(answers: Answers, right_answers: RightFormAnswers) -> Iterator[str]:
+def _describe_wrong_answers(answers: Answers, right_answers: CorrectFormAnswers) -> Iterator[str]:
     """Yield feedback on wrong answers about consistency, EKF2, numbers and figures."""
     rows: list[tuple[str, object, object]] = [
-        (
-            "consistency of KF",
-            answers.verdict_kf,
-            right_answers.kf.verdict or NOT_AVAILABLE,
-        ),
-        (
-            "consistency of EKF2",
-            answers.verdict_ekf2,
-            right_answers.ekf2.verdict or NOT_AVAILABLE,
-        ),
+        ("consistency of KF", answers.verdict_kf, right_answers.kf.verdict or NOT_AVAILABLE),
+        ("consistency of EKF2", answers.verdict_ekf2, right_answers.ekf2.verdict or NOT_AVAILABLE),
     ]
     if _score_ekf2_behaviour(answers, right_answers) < 1.0:
         rows.append(("behaviour of EKF2", answers.ekf2_did, right_answers.ekf2_did))
@@ -226,7 +233,7 @@ def _format_answer(answer: object) -> str:
 
 
 def _match_faults(
-    answers: Answers, right_answers: RightFormAnswers
+    answers: Answers, right_answers: CorrectFormAnswers
 ) -> tuple[list[FaultMatch], list[NamedFault]]:
     """Match each injected fault with the named fault that gives the most points.
 
@@ -237,7 +244,7 @@ def _match_faults(
     ]
     match_by_kind: dict[str, tuple[NamedFault, float]] = {}
     candidates = [
-        (score_named_kind(fault.kind, named_fault.kind), fault.kind, named_fault)
+        (score_fault_kind(fault.kind, named_fault.kind), fault.kind, named_fault)
         for fault in right_answers.mistakes
         for named_fault in unmatched_faults
     ]
@@ -245,25 +252,26 @@ def _match_faults(
         if score and kind not in match_by_kind and named_fault in unmatched_faults:
             match_by_kind[kind] = named_fault, score
             unmatched_faults.remove(named_fault)
-    no_match = (None, 0.0)
     matches = [
-        (fault, *match_by_kind.get(fault.kind, no_match)) for fault in right_answers.mistakes
+        (fault, *match_by_kind.get(fault.kind, (None, 0.0))) for fault in right_answers.mistakes
     ]
     return matches, unmatched_faults
 
 
-def score_named_kind(kind: str, named_kind: str) -> float:
-    """Return the score for naming ``named_kind`` if the fault is ``kind``."""
+def score_fault_kind(kind: str, named_kind: str) -> float:
+    """Return the score (0 to 1) of the answer ``named_kind`` if the injected fault is ``kind``."""
     if kind == named_kind:
         return 1.0
     if (kind, named_kind) == ("r-scale", "ekf2-noise"):
-        return EKF2_NOISE_FOR_R_SCALE_SCORE
+        return SCORE_FOR_WRONG_NOISE_PARAMETER
     if any({kind, named_kind} <= group for group in SIMILAR_FAULT_GROUPS):
-        return SIMILAR_FAULT_SCORE
-    return FAULT_CONSEQUENCE_SCORE if named_kind in POINTS_TABLE["effects"].get(kind, ()) else 0.0
+        return SCORE_FOR_SIMILAR_FAULT
+    return (
+        SCORE_FOR_NAMED_CONSEQUENCE if named_kind in POINTS_CONFIG["effects"].get(kind, ()) else 0.0
+    )
 
 
-def _score_faults(matches: list[FaultMatch], right_answers: RightFormAnswers) -> dict[str, float]:
+def _score_faults(matches: list[FaultMatch], right_answers: CorrectFormAnswers) -> dict[str, float]:
     """Return the mean score of all injected faults, by part of the answer form."""
     sized_fault_count = sum(fault.size is not None for fault, _, _ in matches)
     scores = dict.fromkeys(("mistakes", "sizes", "time and panel", "correction"), 0.0)
@@ -271,11 +279,11 @@ def _score_faults(matches: list[FaultMatch], right_answers: RightFormAnswers) ->
         if named_fault is None:
             continue
         size_score = score_fault_size(fault, named_fault)
-        weight = (size_score if fault.kind in GUESSABLE_FAULT_KINDS else 1.0) / len(matches)
-        evidence_weight = weight if named_fault.kind == fault.kind else 0.5 * weight
+        fault_weight = (size_score if fault.kind in GUESSABLE_FAULT_KINDS else 1.0) / len(matches)
+        evidence_weight = fault_weight if named_fault.kind == fault.kind else 0.5 * fault_weight
         scores["mistakes"] += score / len(matches)
         scores["time and panel"] += score_evidence(fault, named_fault) * evidence_weight
-        scores["correction"] += score_correction(fault, named_fault, right_answers) * weight
+        scores["correction"] += score_correction(fault, named_fault, right_answers) * fault_weight
         scores["sizes"] += size_score / max(sized_fault_count, 1)
     return scores
 
@@ -283,23 +291,26 @@ def _score_faults(matches: list[FaultMatch], right_answers: RightFormAnswers) ->
 def score_fault_size(fault: InjectedFault, named_fault: NamedFault) -> float:
     """Return the score for the size that the student states for a fault.
 
-    1: within the tolerance. 1/2: relative error up to MAX_SIZE_ERROR_HALF_POINTS. 1/3: wrong sign,
-    or correct size of a wrong fault. For GUESSABLE_FAULT_KINDS, the score outside the tolerance
-    decreases from 1 to 0 within ZERO_POINTS_EXCESS_FRACTION.
+    - 1: the size is within the tolerance.
+    - 1/2: the relative error is at most MAX_SIZE_ERROR_HALF_POINTS.
+    - 1/3: only the sign is wrong, or the size is right but the student named another fault.
+    - Faults in GUESSABLE_FAULT_KINDS: outside the tolerance, the score decreases to 0.
     """
-    stated_size = named_fault.convert_size_to_first_unit()
+    stated_size = named_fault.convert_size_to_standard_unit()
     if fault.size is None or fault.low is None or fault.high is None or stated_size is None:
         return 0.0
     if named_fault.kind != fault.kind:
         units = [[*FAULT_KINDS[kind].units][:1] for kind in (named_fault.kind, fault.kind)]
-        is_right = fault.low <= stated_size <= fault.high and units[0] == units[1]
-        return is_right / 3.0
-    deviation = abs(stated_size - fault.size) / abs(fault.size)
-    score_outside = 0.5 * (deviation <= MAX_SIZE_ERROR_HALF_POINTS)
+        is_size_right = fault.low <= stated_size <= fault.high and units[0] == units[1]
+        return is_size_right / 3.0
+    relative_error = abs(stated_size - fault.size) / abs(fault.size)
+    score_outside_range = 0.5 * (relative_error <= MAX_SIZE_ERROR_HALF_POINTS)
     if fault.kind in GUESSABLE_FAULT_KINDS:
-        tolerance = (fault.high - fault.low) / (2.0 * abs(fault.size))
-        score_outside = max(1.0 - (deviation - tolerance) / ZERO_POINTS_EXCESS_FRACTION, 0.0)
-    return _score_value(stated_size, fault.low, fault.high, score_outside)
+        relative_tolerance = (fault.high - fault.low) / (2.0 * abs(fault.size))
+        score_outside_range = max(
+            1.0 - (relative_error - relative_tolerance) / EXCESS_SIZE_ERROR_AT_ZERO_POINTS, 0.0
+        )
+    return _score_number_in_range(stated_size, fault.low, fault.high, score_outside_range)
 
 
 def score_evidence(fault: InjectedFault, named_fault: NamedFault) -> float:
@@ -318,34 +329,39 @@ def score_evidence(fault: InjectedFault, named_fault: NamedFault) -> float:
             for true_s, named_s in true_and_named_times_s
             if true_s is not None
         )
-    return 0.5 * is_time_right + 0.5 * (named_fault.panel in find_panels(fault.kind))
+    return 0.5 * is_time_right + 0.5 * (named_fault.panel in find_panels_showing_fault(fault.kind))
 
 
-def find_panels(fault_kind: str) -> list[str]:
-    kinds_by_panel = POINTS_TABLE["shows"].items()
-    return [*(panel for panel, kinds in kinds_by_panel if fault_kind in kinds), "cover"]
+def find_panels_showing_fault(fault_kind: str) -> list[str]:
+    return [
+        *(panel for panel, kinds in POINTS_CONFIG["shows"].items() if fault_kind in kinds),
+        "cover",
+    ]
 
 
 def score_correction(
-    fault: InjectedFault, named_fault: NamedFault, right_answers: RightFormAnswers
+    fault: InjectedFault, named_fault: NamedFault, right_answers: CorrectFormAnswers
 ) -> float:
-    """Return the score for the parameter that corrects a fault, and for the value of it."""
-    stated_value = named_fault.convert_value_to_first_unit()
+    """Return the score for the parameter that corrects a fault, and for the parameter's value."""
+    stated_value = named_fault.convert_value_to_standard_unit()
     scores = [
         score
         if (low, high) == NO_BOUNDS
-        else score * (0.5 if stated_value is None else _score_value(stated_value, low, high, 0.5))
+        else score
+        * (0.5 if stated_value is None else _score_number_in_range(stated_value, low, high, 0.5))
         for parameter, (low, high), score in find_accepted_corrections(fault, right_answers)
         if parameter == named_fault.parameter
     ]
     return max(scores, default=0.0)
 
 
-def _score_value(value: float, low: float, high: float, score_outside: float) -> float:
-    """Return 1 within the bounds, 1/3 if only the sign is wrong, and else ``score_outside``."""
+def _score_number_in_range(
+    value: float, low: float, high: float, score_outside_range: float
+) -> float:
+    """Return 1 within the range, 1/3 if only the sign is wrong, or ``score_outside_range``."""
     if low <= value <= high:
         return 1.0
-    return 1.0 / 3.0 if low <= -value <= high else score_outside
+    return 1.0 / 3.0 if low <= -value <= high else score_outside_range
 
 
 # Parameter that corrects an injected fault, range of right values, and score
@@ -353,47 +369,47 @@ AcceptedCorrection = tuple[str, tuple[float, float], float]
 
 
 def find_accepted_corrections(
-    fault: InjectedFault, right_answers: RightFormAnswers
+    fault: InjectedFault, right_answers: CorrectFormAnswers
 ) -> tuple[AcceptedCorrection, ...]:
     size, lower_bound, upper_bound = (value or 0.0 for value in (fault.size, fault.low, fault.high))
-    from_s = fault.from_s or 0.0
-    until_s = from_s if fault.until_s is None else fault.until_s
-    bounds_by_name = {
+    fault_start_s = fault.from_s or 0.0
+    fault_end_s = fault_start_s if fault.until_s is None else fault.until_s
+    range_by_name = {
         "negated": (-upper_bound, -lower_bound),
         "size": (lower_bound, upper_bound),
         "late milliseconds": (1e3 * lower_bound, 1e3 * upper_bound),
         "twice": (2.0 * size, 1e4),
         "factors": (100.0 / (100.0 + upper_bound), 100.0 / (100.0 + lower_bound)),
         "noise": (0.8 * right_answers.sigma_z_m, 1.25 * right_answers.sigma_z_m),
-        "after": (until_s - 1.0, until_s + 15.0),
-        "before": (from_s - 15.0, from_s + 1.0),
+        "after": (fault_end_s - 1.0, fault_end_s + 15.0),
+        "before": (fault_start_s - 15.0, fault_start_s + 1.0),
     }
     return tuple(
         (
             rule.parameter,
-            bounds_by_name[values] if isinstance(values := rule.right_value_range, str) else values,
-            rule.score_by_kind[fault.kind],
+            range_by_name[values] if isinstance(values := rule.right_value_range, str) else values,
+            rule.score_by_fault_kind[fault.kind],
         )
-        for rule in UNITS_BY_CORRECTION
-        if fault.kind in rule.score_by_kind
-        # EKF2_EV_DELAY cannot be negative
+        for rule in CORRECTION_RULES
+        if fault.kind in rule.score_by_fault_kind
+        # EKF2_EV_DELAY cannot be negative, so it does not correct timestamps that are too early
         and (size > 0.0 or rule.right_value_range != "late milliseconds")
     )
 
 
-def _score_verdicts(answers: Answers, right_answers: RightFormAnswers) -> float:
+def _score_verdicts(answers: Answers, right_answers: CorrectFormAnswers) -> float:
     """Return the mean of three scores (0 to 1): verdict on KF, on EKF2, and behaviour of EKF2."""
-    given_and_right_verdicts = (
+    answered_and_right_verdicts = (
         (answers.verdict_kf, right_answers.kf.verdict),
         (answers.verdict_ekf2, right_answers.ekf2.verdict),
     )
     right_verdict_count = sum(
-        answer == (right or NOT_AVAILABLE) for answer, right in given_and_right_verdicts
+        answer == (right or NOT_AVAILABLE) for answer, right in answered_and_right_verdicts
     )
     return (right_verdict_count + _score_ekf2_behaviour(answers, right_answers)) / 3.0
 
 
-def _score_ekf2_behaviour(answers: Answers, right_answers: RightFormAnswers) -> float:
+def _score_ekf2_behaviour(answers: Answers, right_answers: CorrectFormAnswers) -> float:
     """Return 1 if the reported behaviour of EKF2 is right, 1/2 with one error, otherwise 0."""
     stated_behaviours, required_behaviours = set(answers.ekf2_did), set(right_answers.ekf2_did)
     allowed_behaviours = set(right_answers.ekf2_did_also)
@@ -406,29 +422,32 @@ def _score_ekf2_behaviour(answers: Answers, right_answers: RightFormAnswers) -> 
     return 1.0 if is_complete and not false_behaviour_count else 0.5
 
 
-def _score_choices(answers: Answers, right_answers: RightFormAnswers) -> float:
+def _score_choices(answers: Answers, right_answers: CorrectFormAnswers) -> float:
     """Return the mean score of the multiple-choice questions; random answers give 0 on average."""
-    wrong_choice_points = -1.0 / (len(CHOICE_NAMES) - 1)
-    right_letters = (right_letter for _, right_letter in right_answers.choices)
+    wrong_choice_points = -1.0 / (len(CHOICE_LETTERS) - 1)
     points = (
         1.0 if letter == right_letter else wrong_choice_points
-        for letter, right_letter in zip(answers.choices, right_letters, strict=False)
+        for letter, right_letter in zip(
+            answers.choices,
+            (right_letter for _, right_letter in right_answers.choices),
+            strict=False,
+        )
         if letter
     )
     return sum(points) / len(right_answers.choices)
 
 
-def _score_numbers(answers: Answers, right_answers: RightFormAnswers) -> float:
+def _score_numbers(answers: Answers, right_answers: CorrectFormAnswers) -> float:
     """Return the mean score for the numbers that the student computed with KF."""
     # an empty list as right answer is not scored, because it could be guessed
     scored_number_count = sum(value not in (None, ()) for value in right_answers.quantities)
-    given_and_right_numbers = zip(answers.quantities, right_answers.quantities, strict=False)
-    return sum(_score_number(*pair) for pair in given_and_right_numbers) / max(
-        scored_number_count, 1
-    )
+    return sum(
+        _score_number(*pair)
+        for pair in zip(answers.quantities, right_answers.quantities, strict=False)
+    ) / max(scored_number_count, 1)
 
 
-def _score_number(answer: QuantityAnswer, right_answer: QuantityAnswer) -> float:
+def _score_number(answer: NumericAnswer, right_answer: NumericAnswer) -> float:
     if isinstance(right_answer, tuple) and answer is not None:
         answer = answer if isinstance(answer, tuple) else (answer,)
         difference_count = len(set(answer) ^ set(right_answer))

@@ -81,7 +81,7 @@ def grade(
     for worksheet in course.worksheets:
         find_grade_column(worksheet, course.column)
     unread_file_notes = [
-        f"{one_line(file.name, 80)} was not read; only {OVERRIDES_NAME} is read."
+        f"{one_line(file.name, 80)} was ignored: px4fuse reads only {OVERRIDES_NAME}."
         for file in sorted(output.glob("overrides*"))
         if file.name != OVERRIDES_NAME
     ]
@@ -94,9 +94,12 @@ def grade(
         )
         jobs.append((submission, submitter_id))
     rubric_and_key, log_by_sha256 = (course.rubric, course.key), hash_files(course.logs)
-    records_folder = output / RECORDS_FOLDER
     grade_job = partial(
-        grade_submission, *rubric_and_key, log_by_sha256, records_folder, max_log_bytes.get()
+        grade_submission,
+        *rubric_and_key,
+        log_by_sha256,
+        output / RECORDS_FOLDER,
+        max_log_bytes.get(),
     )
     report_by_index: dict[int, GradedReport] = {}
     reused_count = 0
@@ -115,8 +118,12 @@ def grade(
             report_by_index[index] = replace(report, submission=submission.name, student=student)
             reused_count += is_loaded
             progress(len(report_by_index), len(found_submissions))
-    graded_reports = [report_by_index[index] for index in range(len(found_submissions))]
-    grades, override_notes = build_grades(graded_reports, found_submissions, course, overrides)
+    grades, override_notes = build_grades(
+        [report_by_index[index] for index in range(len(found_submissions))],
+        found_submissions,
+        course,
+        overrides,
+    )
     written_paths, class_notes = write_grading_files(grades, course, output)
     all_notes = *notes, *unread_file_notes, *override_notes, *class_notes
     return GradeOutcome(grades, all_notes, reused_count, written_paths)

@@ -62,18 +62,18 @@ def analyse_items(reports: Sequence[GradedReport]) -> list[ItemStatistics]:
                     continue
                 score = item.points, item.max_points, total_points - item.points
                 scores_by_item[group_index, f"{prefix}{item.title}"].append(score)
-        for kind, is_named in report.is_found_by_fault.items():
+        for kind, is_named in report.did_student_name_fault.items():
             scores_by_item[2, f"Fault: {kind}"].append((float(is_named), 1.0, report.points))
     statistics = []
     for (_, title), scores in sorted(scores_by_item.items(), key=lambda item: item[0][0]):
-        item_points, max_points, other_points = np.transpose(scores)
+        item_points, max_points, points_of_other_items = np.transpose(scores)
         discrimination = None
         if (
             len(scores) >= MIN_REPORTS_FOR_CORRELATION
             and np.ptp(item_points)
-            and np.ptp(other_points)
+            and np.ptp(points_of_other_items)
         ):
-            discrimination = round(float(np.corrcoef(item_points, other_points)[0, 1]), 2)
+            discrimination = round(float(np.corrcoef(item_points, points_of_other_items)[0, 1]), 2)
         point_fractions = item_points / np.where(max_points > 0.0, max_points, 1.0)
         statistics.append(
             ItemStatistics(

@@ -30,18 +30,19 @@ class ExportOrigin:
         Submission time; without time zone if the platform omits it.
     is_late : bool
         True if the platform marks the file as late.
-    has_imitated_platform_name : bool
-        True if the student's part of the file name imitates a platform.
+    has_forged_platform_name : bool
+        True if the part of the file name that the student chose looks like the name of a file
+        from a platform.
     """
 
     platform: str = ""
     person: Person = UNKNOWN_PERSON
     time: datetime | None = None
     is_late: bool = False
-    has_imitated_platform_name: bool = False
+    has_forged_platform_name: bool = False
 
 
-UNKNOWN_SUBMITTER = ExportOrigin()
+UNKNOWN_ORIGIN = ExportOrigin()
 
 
 @dataclass(frozen=True)
@@ -64,7 +65,7 @@ class Submission:
     zip_entry: str
     name: str
     time: datetime | None = None
-    origin: ExportOrigin = UNKNOWN_SUBMITTER
+    origin: ExportOrigin = UNKNOWN_ORIGIN
 
 
 @dataclass(frozen=True)
@@ -102,8 +103,8 @@ class GradedReport:
         Numbers of the report for the table of the class, by column title.
     version : str
         Version of px4fuse that wrote the report.
-    is_found_by_fault : mapping
-        For each injected fault of the student's flight: True if the student found the fault.
+    did_student_name_fault : mapping
+        For each injected fault of the student's flight: True if the student named the fault.
     form_part_scores : tuple of ItemScore
         Points for each part of ``form``, 100 points in total.
     redrawn_report_path : str
@@ -123,7 +124,7 @@ class GradedReport:
     log_sha256: str = ""
     version: str = ""
     notes: str = field(default="", repr=False)
-    is_found_by_fault: Mapping[str, bool] = field(default_factory=dict)
+    did_student_name_fault: Mapping[str, bool] = field(default_factory=dict)
     form_part_scores: tuple[ItemScore, ...] = ()
     redrawn_report_path: str = ""
 
@@ -208,7 +209,7 @@ class Grade:
 
     @property
     def file_name(self) -> str:
-        """Name of the report that counts; "" without a submission."""
+        """Name of the submitted file that is graded; "" without a submission."""
         return self.counted_report.submission if self.counted_report else ""
 
     @property
@@ -224,5 +225,6 @@ def list_titles(grades: Sequence[Grade]) -> tuple[tuple[str, ...], tuple[str, ..
     """Return the column titles of the rubric items, and of the numbers from the reports."""
     reports = counted_reports(grades)
     item_titles = dict.fromkeys(item.title for report in reports for item in report.items)
-    number_titles = dict.fromkeys(title for report in reports for title in report.numbers)
-    return tuple(item_titles), tuple(number_titles)
+    return tuple(item_titles), tuple(
+        dict.fromkeys(title for report in reports for title in report.numbers)
+    )

@@ -4,11 +4,11 @@ import textwrap
 from collections.abc import Iterator, Sequence
 
 from px4fuse.classroom.assignment.key import AnswerKey
-from px4fuse.classroom.assignment.truth import RightFormAnswers
-from px4fuse.classroom.grading.form_points import describe_right_answer, find_panels
+from px4fuse.classroom.assignment.truth import CorrectFormAnswers
+from px4fuse.classroom.grading.form_points import describe_right_answer, find_panels_showing_fault
 from px4fuse.classroom.grading.model import Grade
 from px4fuse.core.text import one_line
-from px4fuse.results.answer_form import FAULT_KINDS, NO_FAULT_KIND, PANELS, Answers
+from px4fuse.results.answer_form import FAULT_KINDS, NO_FAULT_KIND, REPORT_PANELS, Answers
 
 # Question to the student, and expected answer
 QuestionAndAnswer = tuple[str, str]
@@ -19,7 +19,7 @@ def format_questions(grades: Sequence[Grade], key: AnswerKey, count: int) -> str
     lines = [f"Questions for an oral check: {count} per student, with the expected answers."]
     for grade in grades:
         report = grade.counted_report
-        answer = key.find_log_answers(report.log_sha256) if report else None
+        answer = key.find_answers_by_log_sha256(report.log_sha256) if report else None
         if report is None or report.form is None or answer is None or answer.form is None:
             continue
         lines += ["", one_line(f"{grade.display_name} {grade.student_id}", 100)]
@@ -31,7 +31,7 @@ def format_questions(grades: Sequence[Grade], key: AnswerKey, count: int) -> str
 
 
 def ask_about_form(
-    answers: Answers, right_answers: RightFormAnswers
+    answers: Answers, right_answers: CorrectFormAnswers
 ) -> Iterator[QuestionAndAnswer]:
     """Yield questions about the faults and figures in a student's answers, wrong answers first."""
     named_kinds = [fault.kind for fault in answers.mistakes]
@@ -43,8 +43,8 @@ def ask_about_form(
         yield (
             f"You named {kind} ({FAULT_KINDS[kind].description}). Which plot would show this "
             "fault, and does this plot in your report show the fault?",
-            f"{' or '.join(find_panels(kind))} would show {kind}. This plot does not show {kind}, "
-            f"because the injected fault of the flight is: {true_faults_text}.",
+            f"{kind} would be visible in {' or '.join(find_panels_showing_fault(kind))}. The plots "
+            f"do not show {kind}, because the injected fault of the flight is: {true_faults_text}.",
         )
     for fault in right_answers.mistakes:
         description = FAULT_KINDS[fault.kind].description
@@ -55,7 +55,9 @@ def ask_about_form(
                 f"{describe_right_answer(fault)}.",
             )
             continue
-        other_panels = [panel for panel in PANELS if panel not in find_panels(fault.kind)]
+        other_panels = [
+            panel for panel in REPORT_PANELS if panel not in find_panels_showing_fault(fault.kind)
+        ]
         yield (
             f"You named {fault.kind} ({description}). Show this fault in a plot of your report. "
             "Name a plot that cannot show this fault, with the reason.",

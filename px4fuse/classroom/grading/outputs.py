@@ -66,7 +66,7 @@ PSEUDONYMS_FILE = "names.csv"
 QUESTIONS_FILE = "questions.txt"
 PSEUDONYM_TITLES = ("pseudonym", "id", "name")
 # Columns of class.csv before and after the columns of rubric items and numbers
-FIRST_COLUMN_TITLES = (
+TITLES_BEFORE_ITEMS = (
     "file",
     "student",
     "id",
@@ -77,7 +77,7 @@ FIRST_COLUMN_TITLES = (
     "deducted",
     "total",
 )
-LAST_COLUMN_TITLES = (
+TITLES_AFTER_ITEMS = (
     "handed in",
     "hours late",
     "pending",
@@ -140,8 +140,9 @@ def write_grading_files(
     if course.anonymous:
         page_grades, pseudonym_csv = _anonymise_grades(page_grades, output / PSEUDONYMS_FILE)
         contents[PSEUDONYMS_FILE] = pseudonym_csv.encode()
-    version_text = f"px4fuse {metadata.version('px4fuse')}"
-    contents["class.html"] = format_class_page(page_grades, class_title, version_text).encode()
+    contents["class.html"] = format_class_page(
+        page_grades, class_title, f"px4fuse {metadata.version('px4fuse')}"
+    ).encode()
     if course.question_count and course.key is not None:
         text = format_questions(grades, course.key, course.question_count)
         contents[QUESTIONS_FILE] = text.encode()
@@ -195,7 +196,7 @@ def _anonymise_grades(grades: Sequence[Grade], path: Path) -> tuple[list[Grade],
     Return the anonymous grades and a CSV table of the pseudonyms. Pseudonyms in an existing table
     at ``path`` are kept.
     """
-    name_pair_by_identity: dict[str, tuple[str, str]] = {}
+    pseudonym_and_name_by_identity: dict[str, tuple[str, str]] = {}
     if path.exists():
         with suspend_input_registration():
             sheet = read_sheet(path)
@@ -203,29 +204,32 @@ def _anonymise_grades(grades: Sequence[Grade], path: Path) -> tuple[list[Grade],
             pseudonym, identity, student = (
                 sheet.find_cell(row, (title,)).removeprefix("'") for title in PSEUDONYM_TITLES
             )
-            name_pair_by_identity[identity] = pseudonym, student
-    used_pseudonyms = {pseudonym for pseudonym, _ in name_pair_by_identity.values()}
+            pseudonym_and_name_by_identity[identity] = pseudonym, student
+    used_pseudonyms = {pseudonym for pseudonym, _ in pseudonym_and_name_by_identity.values()}
     numbered_pseudonyms = (f"Student {number:03}" for number in itertools.count(1))
     free_pseudonyms = (
         pseudonym for pseudonym in numbered_pseudonyms if pseudonym not in used_pseudonyms
     )
     students = {_identify_student(grade): grade.student for grade in grades}
-    new_identities = [identity for identity in students if identity not in name_pair_by_identity]
+    new_identities = [
+        identity for identity in students if identity not in pseudonym_and_name_by_identity
+    ]
     random.SystemRandom().shuffle(new_identities)
     for identity in new_identities:
-        name_pair_by_identity[identity] = next(free_pseudonyms), students[identity]
+        pseudonym_and_name_by_identity[identity] = next(free_pseudonyms), students[identity]
     rows = (
         (pseudonym, identity, student)
         for identity, (pseudonym, student) in sorted(
-            name_pair_by_identity.items(), key=itemgetter(1)
+            pseudonym_and_name_by_identity.items(), key=itemgetter(1)
         )
     )
     anonymous_grades = [
-        anonymise_grade(grade, name_pair_by_identity[_identify_student(grade)][0])
+        anonymise_grade(grade, pseudonym_and_name_by_identity[_identify_student(grade)][0])
         for grade in grades
     ]
-    pseudonym_csv = _format_csv(PSEUDONYM_TITLES, rows)
-    return sorted(anonymous_grades, key=lambda grade: grade.student), pseudonym_csv
+    return sorted(anonymous_grades, key=lambda grade: grade.student), (
+        _format_csv(PSEUDONYM_TITLES, rows)
+    )
 
 
 def anonymise_grade(grade: Grade, pseudonym: str) -> Grade:
@@ -242,7 +246,7 @@ def anonymise_grade(grade: Grade, pseudonym: str) -> Grade:
             and "The points are not final: the instructor has to decide.",
             form=report.form,
             numbers=report.numbers,
-            is_found_by_fault=report.is_found_by_fault,
+            did_student_name_fault=report.did_student_name_fault,
             form_part_scores=report.form_part_scores,
         )
     return Grade(
@@ -264,7 +268,7 @@ def anonymise_grade(grade: Grade, pseudonym: str) -> Grade:
 def format_class_table(grades: Sequence[Grade]) -> str:
     """Format a table with one row per student as CSV for Excel and LibreOffice."""
     item_titles, number_titles = list_titles(grades)
-    titles = (*FIRST_COLUMN_TITLES, *item_titles, *number_titles, *LAST_COLUMN_TITLES)
+    titles = (*TITLES_BEFORE_ITEMS, *item_titles, *number_titles, *TITLES_AFTER_ITEMS)
     rows = []
     for grade in grades:
         report = grade.counted_report
@@ -369,8 +373,8 @@ def find_grade_column(sheet: Sheet, column_title: str) -> int:
         if normalise_text(column_title) in map(normalise_text, (title, short_title_by_index[index]))
     ]
     candidate_indices = assignment_indices if grade_column_index is None else [grade_column_index]
-    # a Moodle table has one grade column: if --column does not match it, the option is for another
-    # table
+    # A Moodle table has only one grade column. If --column is not the title of this column, the
+    # user gave --column for another table
     if column_title and (matching_indices or sheet.find_column_index(("identifier",)) is None):
         candidate_indices = matching_indices
     if len(candidate_indices) == 1:
@@ -415,10 +419,8 @@ def fill_grades(
     SettingsError
         No grade column was found, or several.
     """
-    grade_column_index, feedback_column_index = (
-        find_grade_column(sheet, grade_column_title),
-        sheet.find_column_index(COMMENT_COLUMN_TITLES),
-    )
+    grade_column_index = find_grade_column(sheet, grade_column_title)
+    feedback_column_index = sheet.find_column_index(COMMENT_COLUMN_TITLES)
     format_feedback = (
         neutralise_formulas
         if sheet.find_column_index(HTML_COMMENT_COLUMN_TITLES) is None

@@ -36,14 +36,14 @@ class VerificationRecord:
 
     Attributes
     ----------
-    dependencies : dict
+    versions_and_files : dict
         Versions of libraries, and availability of input files by SHA-256. The result is valid while
         they are unchanged.
     results : str
         Results (JSON) that are attached to the PDF.
     """
 
-    dependencies: dict[str, str]
+    versions_and_files: dict[str, str]
     results: str
     verification: Verification
 
@@ -85,15 +85,18 @@ def load_or_verify(
     if loaded := _load_record(records_folder, sha256, path_by_sha256, assigned_hashes):
         return *loaded, True
     results = read_report(pdf, "The file")
-    dependencies = _collect_dependencies(to_json(results), path_by_sha256, assigned_hashes)
-    # the log is in the answer key but not available: the status must be "cannot verify"
-    is_log_missing = dependencies.get(log_sha256(results)) == "assigned"
+    versions_and_files = _collect_versions_and_files(
+        to_json(results), path_by_sha256, assigned_hashes
+    )
+    # The log was assigned to a student, but is missing in --logs. Verification without any log
+    # gives the status "cannot verify" instead of "other log"
+    is_log_missing = versions_and_files.get(log_sha256(results)) == "assigned"
     verification = verify(results, pdf, {} if is_log_missing else path_by_sha256)
     files = {REDRAWN_REPORT_SUFFIX: verification.redrawn_pdf} if verification.redrawn_pdf else {}
     if verification.status == "verified" and log_sha256(results) in assigned_hashes:
-        results, files[DIAGNOSIS_SUFFIX] = repeat_with_diagnosis(results, path_by_sha256)
+        results, files[DIAGNOSIS_SUFFIX] = repeat_analysis_with_diagnosis(results, path_by_sha256)
     stored_verification = replace(verification, redrawn_pdf=b"")
-    record = VerificationRecord(dependencies, to_json(results), stored_verification)
+    record = VerificationRecord(versions_and_files, to_json(results), stored_verification)
     for old_file in records_folder.glob(f"{sha256}.*"):
         # keep the JSON file until write_output_files replaces it: another process may read it now,
         # if two students handed in the same PDF
@@ -106,7 +109,7 @@ def load_or_verify(
     return results, stored_verification, False
 
 
-def repeat_with_diagnosis(
+def repeat_analysis_with_diagnosis(
     results: ReportedResults, path_by_sha256: Mapping[str, Path]
 ) -> tuple[ReportedResults, bytes]:
     """Repeat the analysis and include the faults that were hidden from the student.
@@ -124,10 +127,13 @@ def repeat_with_diagnosis(
     return structs.replace(diagnosed_results, provenance=results.provenance), draw()
 
 
-def _collect_dependencies(
+def _collect_versions_and_files(
     results: str, path_by_sha256: Mapping[str, Path], assigned_hashes: frozenset[str]
 ) -> dict[str, str]:
-    """Return the dependencies of a result: library versions, and availability of input files."""
+    """Return the versions of libraries, and for each input file of the results, if it is available.
+
+    A cached verification is valid while these values do not change.
+    """
     return _read_versions() | {
         sha256: "available"
         if sha256 in path_by_sha256
@@ -150,11 +156,12 @@ def _load_record(
     path_by_sha256: Mapping[str, Path],
     assigned_hashes: frozenset[str],
 ) -> tuple[ReportedResults, Verification] | None:
-    """Load an earlier result; None if there is none or its dependencies have changed."""
+    """Load an earlier result; None without a result, or after a change of libraries or files."""
     try:
-        content = (records_folder / f"{sha256}.json").read_bytes()
-        record = msgspec.json.decode(content, type=VerificationRecord)
-        if record.dependencies != _collect_dependencies(
+        record = msgspec.json.decode(
+            (records_folder / f"{sha256}.json").read_bytes(), type=VerificationRecord
+        )
+        if record.versions_and_files != _collect_versions_and_files(
             record.results, path_by_sha256, assigned_hashes
         ):
             return None

@@ -14,8 +14,8 @@ from px4fuse.classroom.assignment.key import AnswerKey
 from px4fuse.classroom.assignment.roster import make_unique
 from px4fuse.classroom.grading.checks import (
     FORM_MISMATCH_REASON,
-    CheckInput,
     RubricItem,
+    ScoringInput,
     Text,
     format_reason,
     shorten_text,
@@ -64,11 +64,12 @@ class Rubric(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=Tr
     Attributes
     ----------
     unverified : {"pending", "zero"}
-        Rule for a report that could not be verified.
+        Points of a report that could not be verified: they wait for a decision of the instructor
+        ("pending"), or the report gets no points ("zero").
     others_log : {"pending", "zero", "count"}
-        Rule for a report on the log of another student.
+        Points of a report on the log of another student; with "count", they count.
     pages : {"count", "pending", "zero"}
-        Rule for a report whose numbers are verified, but whose pages were changed.
+        Points of a report whose numbers are verified, but whose pages were changed.
     """
 
     title: Text = ""
@@ -84,7 +85,7 @@ class Rubric(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=Tr
         for title, unique_title in zip(titles, make_unique(titles), strict=True):
             if title != unique_title:
                 raise ValueError(
-                    f"the title {title!r} is not unique or is reserved. Give items other titles"
+                    f"the title {title!r} is not unique or is reserved. Give the item another title"
                 )
 
 
@@ -115,8 +116,8 @@ def parse_rubric(text: str, source_name: str) -> Rubric:
 
 
 def _format_item_and_field(path: re.Match[str]) -> str:
-    """Convert the path in an error of msgspec to item number and field."""
-    return f"item {int(path[1]) + 1}{f', {path[2]}' * bool(path[2])}"
+    """Convert a path of msgspec, such as ``$.item[3].points``, to "item 4, field points"."""
+    return f"item {int(path[1]) + 1}{f', field {path[2]}' * bool(path[2])}"
 
 
 # ------------------------------------------------------------------ points
@@ -138,16 +139,16 @@ def score_report(
     ``submitter_id`` is the student id on the learning platform, which is used instead of the id in
     the report.
     """
-    check_input = CheckInput(results, verification, key, submitter_id)
-    points_rule, reason_or_action = _decide_points_rule(check_input, rubric)
+    scoring_input = ScoringInput(results, verification, key, submitter_id)
+    points_rule, zero_points_reason, instructor_action = _decide_points_rule(scoring_input, rubric)
     student, command = results.student, "loop" if isinstance(results, LoopResults) else "compare"
     graded_items = []
     for item in rubric.items:
         if not item.is_applicable(command, key):
             continue
-        fraction, comment = 0.0, f"No points: {reason_or_action}."
+        fraction, comment = 0.0, f"No points: {zero_points_reason}."
         if points_rule != "zero":
-            fraction, comment = item.score(check_input)
+            fraction, comment = item.score(scoring_input)
         is_awaiting_points = (
             item.is_scored_by_instructor and bool(student.notes.strip()) and points_rule != "zero"
         )
@@ -162,8 +163,8 @@ def score_report(
                 is_awaiting_points,
             )
         )
-    form_result, values = check_input.form_points, check_input.values
-    if isinstance(form_result, str) or not check_input.is_own_log:
+    form_result, values = scoring_input.form_points, scoring_input.values
+    if isinstance(form_result, str) or not scoring_input.is_own_log:
         form_result = FormPoints()
     return GradedReport(
         "",
@@ -174,13 +175,13 @@ def score_report(
         flags=(
             *flag_page_differences(verification),
             *flag_settings(results, key is not None),
-            *([] if check_input.is_own_log else [_make_foreign_log_advice(check_input)]),
-            *([FORM_MISMATCH_ADVICE] if check_input.has_form_of_other_log else []),
+            *([] if scoring_input.is_own_log else [_make_other_students_log_advice(scoring_input)]),
+            *([FORM_MISMATCH_ADVICE] if scoring_input.has_form_of_other_log else []),
         ),
-        instructor_action=reason_or_action if points_rule == "pending" else "",
-        is_found_by_fault=form_result.is_named_by_kind,
+        instructor_action=instructor_action,
+        did_student_name_fault=form_result.did_student_name_fault,
         form_part_scores=form_result.parts,
-        form=check_input.form if isinstance(check_input.form, Answers) else None,
+        form=scoring_input.form if isinstance(scoring_input.form, Answers) else None,
         numbers={
             title: float(values[path]) for title, path in CLASS_TABLE_NUMBERS if path in values
         },
@@ -190,15 +191,15 @@ def score_report(
     )
 
 
-def _decide_points_rule(check_input: CheckInput, rubric: Rubric) -> tuple[PointsRule, str]:
+def _decide_points_rule(scoring_input: ScoringInput, rubric: Rubric) -> tuple[PointsRule, str, str]:
     """Decide if the points of a report count.
 
-    Return the decision, and the reason for zero points or the required action of the instructor.
+    Return the decision, the reason for zero points, and the required action of the instructor.
     """
-    verification = check_input.verification
+    verification = scoring_input.verification
     first_reason = format_reason("".join(verification.reasons[:1]))
     if verification.status == "numbers differ":
-        return "zero", f"the numbers of your report differ from those of its log{first_reason}"
+        return "zero", f"the numbers of your report differ from those of its log{first_reason}", ""
     # each problem has a rule, a reason for the student, and an action of the instructor
     problems: list[tuple[PointsRule, str, str]] = []
     if verification.status != "verified":
@@ -217,12 +218,14 @@ def _decide_points_rule(check_input: CheckInput, rubric: Rubric) -> tuple[Points
                 "Compare the pages with the report that px4fuse drew from the log.",
             )
         )
-    if not check_input.is_own_log:
+    if not scoring_input.is_own_log:
         reason_text = "your report is not about the log that you were given"
-        problems.append((rubric.others_log, reason_text, _make_foreign_log_advice(check_input)))
-    if check_input.has_form_of_other_log:
+        problems.append(
+            (rubric.others_log, reason_text, _make_other_students_log_advice(scoring_input))
+        )
+    if scoring_input.has_form_of_other_log:
         problems.append(("pending", FORM_MISMATCH_REASON, FORM_MISMATCH_ADVICE))
-    if check_input.key is not None and getattr(check_input.results.request, "position", None):
+    if scoring_input.key is not None and getattr(scoring_input.results.request, "position", None):
         action = (
             "Ask where the position file (--position) is from: the assignment contains no position "
             "files."
@@ -230,23 +233,26 @@ def _decide_points_rule(check_input: CheckInput, rubric: Rubric) -> tuple[Points
         problems.append(("pending", "", action))
     for rule, reason_text, _ in problems:
         if rule == "zero":
-            return "zero", reason_text
+            return "zero", reason_text, ""
     action = " ".join(action for rule, _, action in problems if rule == "pending")
-    return ("pending", action) if action else ("count", "")
+    return "pending" if action else "count", "", action
 
 
-def _make_foreign_log_advice(check_input: CheckInput) -> str:
+def _make_other_students_log_advice(scoring_input: ScoringInput) -> str:
     """Return the action of the instructor for a report on the log of another student."""
-    student_id = shorten_text(check_input.results.student.id)
+    student_id = shorten_text(scoring_input.results.student.id)
     id_text = f"the id in the report is {student_id}" if student_id else "the report has no id"
-    if check_input.submitter_id:
-        id_text += f", and {shorten_text(check_input.submitter_id)} submitted the report"
-    if check_input.right_answers is None:
-        return "The log of the report is not in the answer key. Ask for a report on the given log."
-    assigned_id = shorten_text(check_input.right_answers.student_id)
-    return (
+    if scoring_input.right_answers is None:
+        return (
+            "The log of the report is not in the answer key. Ask for a report on the assigned log."
+        )
+    assigned_id = shorten_text(scoring_input.right_answers.student_id)
+    advice = (
         f"Ask who wrote the report: its log was assigned to student {assigned_id}, but {id_text}."
     )
+    if scoring_input.submitter_id:
+        advice += f" Student {shorten_text(scoring_input.submitter_id)} submitted the report."
+    return advice
 
 
 def grade_unreadable_file(
@@ -254,10 +260,11 @@ def grade_unreadable_file(
 ) -> GradedReport:
     """Return zero points for a file that is not a report."""
     comment = f"No points: the file is not a px4fuse report ({shorten_text(reason).rstrip('.')})."
-    verification, items = make_unverifiable_result(reason, remedy), rubric.items
     graded_items = tuple(
         ItemScore(item.title, 0.0, item.points, comment)
-        for item in items
+        for item in rubric.items
         if item.is_applicable("compare", key)
     )
-    return GradedReport("", "", "", verification, graded_items, instructor_action=remedy)
+    return GradedReport(
+        "", "", "", make_unverifiable_result(reason, remedy), graded_items, instructor_action=remedy
+    )

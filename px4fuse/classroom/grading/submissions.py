@@ -33,7 +33,7 @@ from pathlib import Path
 from typing import IO
 
 from px4fuse.classroom.assignment.roster import Person, make_unique
-from px4fuse.classroom.grading.model import UNKNOWN_SUBMITTER, ExportOrigin, Submission
+from px4fuse.classroom.grading.model import UNKNOWN_ORIGIN, ExportOrigin, Submission
 from px4fuse.core.input_files import add_input
 from px4fuse.core.reading import files_below
 from px4fuse.core.record import read_toml
@@ -68,9 +68,9 @@ PATH_PATTERN_BY_PLATFORM = {
     name: re.compile(pattern)
     for name, pattern in read_toml(__file__, dict[str, str], "platforms.toml").items()
 }
-# Parts of a path that only a learning platform writes; a path with more of them than the platform
-# writes contains an imitation by the student
-_PLATFORM_NAME_PATTERN = re.compile(r"_attempt_\d{4}-|_\d+_assignsubmission_")
+# Text that Blackboard or Moodle adds to a path. A path that contains this text more often than the
+# platform adds it was forged by the student
+_PLATFORM_TEXT_PATTERN = re.compile(r"_attempt_\d{4}-|_\d+_assignsubmission_")
 BLACKBOARD_TIME_FORMAT = "%Y-%m-%d-%H-%M-%S"
 _SUBMISSION_PATTERN = re.compile(
     r"^(?:submission_)?(\d+)(?:\.pdf)?:\s*\n((?:[ -].*\n?)*)", re.MULTILINE
@@ -83,7 +83,8 @@ class _EntryError(Exception):
 
 
 _BROKEN_ZIP_ERRORS = (zipfile.BadZipFile, zlib.error, struct.error, EOFError, MemoryError)
-# zipfile raises NotImplementedError for unknown methods: a RuntimeError, as in BAD_VALUE_ERRORS
+# BAD_VALUE_ERRORS contains RuntimeError, and so NotImplementedError, which zipfile raises for
+# unknown compression methods
 _UNREADABLE_FILE_ERRORS = (_EntryError, *_BROKEN_ZIP_ERRORS, *BAD_VALUE_ERRORS)
 
 
@@ -133,8 +134,9 @@ def find_submissions(paths: Sequence[Path]) -> tuple[tuple[Submission, ...], tup
                 ignored_names.append(_shorten_name(submission.name))
             else:
                 try:
-                    text = read_submission(submission).decode("utf-8", errors="replace")
-                    origin_by_submission_number |= read_gradescope_metadata(text)
+                    origin_by_submission_number |= read_gradescope_metadata(
+                        read_submission(submission).decode("utf-8", errors="replace")
+                    )
                 except ResultsError as error:
                     notes.append(str(error))
     if ignored_names:
@@ -167,21 +169,24 @@ def add_submitters(
 ) -> Iterator[Submission]:
     """Add student and learning platform, found in the file names, to submissions.
 
-    All files of a zip file or folder have one platform, whose pattern matches most file names. So a
-    student cannot imitate the file names of another platform. ``origin_by_submission_number``
-    contains students and times from the metadata of Gradescope, which replace those in file names.
+    The platform of a zip file or folder is the platform whose pattern matches most file names. A
+    file with a name of another platform is not assigned to a student, because a student may have
+    chosen this name. ``origin_by_submission_number`` contains students and times from the metadata
+    of Gradescope. They replace the students and times in file names.
     """
     export_names = [
         submission.file if submission.zip_entry else submission.name.partition("/")[0]
         for submission in submissions
     ]
-    platform_counts: dict[object, Counter[str]] = defaultdict(Counter)
+    platform_counts_by_export: dict[object, Counter[str]] = defaultdict(Counter)
     for export_name, submission in zip(export_names, submissions, strict=True):
-        platform_counts[export_name].update(
+        platform_counts_by_export[export_name].update(
             filter(None, [parse_submission_path(submission.name).platform])
         )
     for export_name, submission in zip(export_names, submissions, strict=True):
-        platforms = [platform for platform, _ in platform_counts[export_name].most_common(1)]
+        platforms = [
+            platform for platform, _ in platform_counts_by_export[export_name].most_common(1)
+        ]
         origin = parse_submission_path(submission.name, platforms)
         if origin.platform in ("gradescope", ""):
             # Gradescope exports PDFs as SUBMISSION_NUMBER.pdf
@@ -284,7 +289,7 @@ def _list_folder_submissions(path: Path, notes: list[str]) -> Iterator[Submissio
     if not path.is_dir():
         raise SettingsError(f"{one_line(str(path), MAX_NAME_LENGTH)} is not a file or folder.")
     root = path.resolve()
-    outside_count = 0
+    ignored_count = 0
     for file in files_below(root):  # symbolic links to folders are not entered
         name = file.relative_to(root)
         if any(map(_is_hidden, name.parts)):
@@ -297,10 +302,10 @@ def _list_folder_submissions(path: Path, notes: list[str]) -> Iterator[Submissio
             is_inside = False
         if is_inside:
             yield Submission(resolved_path, "", name.as_posix())
-        outside_count += not is_inside
-    if outside_count:
+        ignored_count += not is_inside
+    if ignored_count:
         notes.append(
-            f"{one_line(path.name, MAX_NAME_LENGTH)}: {outside_count} links out of the folder, "
+            f"{one_line(path.name, MAX_NAME_LENGTH)}: {ignored_count} links out of the folder, "
             "special files or unreadable folders were ignored."
         )
 
@@ -386,25 +391,25 @@ def parse_submission_path(
             match = PATH_PATTERN_BY_PLATFORM[platform].match(remaining_path)
             if match is None:
                 continue
-            name_parts = {key: value or "" for key, value in match.groupdict().items()}
-            time_text = name_parts.get("time", "")
+            matched_fields = {key: value or "" for key, value in match.groupdict().items()}
+            time_text = matched_fields.get("time", "")
             try:
                 time = datetime.strptime(time_text, BLACKBOARD_TIME_FORMAT) if time_text else None
-            except ValueError:  # not written by a platform, which writes valid times only
+            except ValueError:  # platforms write only valid times: the student chose this name
                 continue
-            person_names = (name_parts.get(key) for key in ("name", "first", "last"))
-            numbers = {platform: name_parts["number"]} if "number" in name_parts else {}
-            full_name, login = " ".join(filter(None, person_names)), name_parts.get("login", "")
+            person_names = (matched_fields.get(key) for key in ("name", "first", "last"))
+            numbers = {platform: matched_fields["number"]} if "number" in matched_fields else {}
+            full_name, login = " ".join(filter(None, person_names)), matched_fields.get("login", "")
             person = Person("", full_name, "", login, numbers)
-            max_platform_name_count = platform in ("moodle", "blackboard")
-            has_imitated_platform_name = (
-                len(_PLATFORM_NAME_PATTERN.findall(name)) > max_platform_name_count
+            # Moodle and Blackboard add this text once to each path
+            has_forged_platform_name = len(_PLATFORM_TEXT_PATTERN.findall(name)) > (
+                platform in ("moodle", "blackboard")
             )
             return ExportOrigin(
-                platform, person, time, bool(name_parts.get("late")), has_imitated_platform_name
+                platform, person, time, bool(matched_fields.get("late")), has_forged_platform_name
             )
         remaining_path = remaining_path.partition("/")[2]
-    return UNKNOWN_SUBMITTER
+    return UNKNOWN_ORIGIN
 
 
 def read_gradescope_metadata(text: str) -> dict[str, ExportOrigin]:
