@@ -10,7 +10,7 @@ from msgspec.structs import asdict
 from pyulog import ULog
 
 from px4fuse.comparison.model import AxisComparison, Comparison, Difference, UntestedFilter
-from px4fuse.comparison.projection import project_horizon_position
+from px4fuse.comparison.projection import project_fusion_horizon_position
 from px4fuse.core.arrays import Array
 from px4fuse.errors import SettingsError
 from px4fuse.filter.settings import Settings
@@ -104,7 +104,7 @@ class TestSample:
                               "observation_variance")
             )  # fmt: skip
             axis = sample[name].axis
-            horizon = project_horizon_position(sample_flight.ekf2, axis, sample.segment)
+            horizon = project_fusion_horizon_position(sample_flight.ekf2, axis, sample.segment)
             np.testing.assert_allclose(horizon["position_m"], observed + state_minus, atol=1e-9)
             np.testing.assert_allclose(horizon["position_variance_m2"], s - r, rtol=1e-9)
 

@@ -15,7 +15,7 @@ from exchange import replace
 from flights import given_placement
 
 from px4fuse.comparison.model import Comparison
-from px4fuse.convention.axes import AXIS_ASSIGNMENTS, CLOCKWISE_DIRECTIONS, METRES_PER_UNIT
+from px4fuse.convention.axes import CLOCKWISE_DIRECTIONS, METRES_PER_UNIT, SIGNED_AXIS_PERMUTATIONS
 from px4fuse.convention.check import check_convention
 from px4fuse.convention.correction import ConventionFaults, find_convention_faults
 from px4fuse.convention.model import AxisDirections, Convention, OrientationConvention
@@ -45,7 +45,9 @@ UNIT_VECTORS = {
     "down": (0, 0, 1), "up": (0, 0, -1),
 }  # fmt: skip
 ALL_AXES = [
-    assignment.find_directions(quarter) for assignment in AXIS_ASSIGNMENTS for quarter in range(4)
+    assignment.compute_axis_directions(quarter)
+    for assignment in SIGNED_AXIS_PERMUTATIONS
+    for quarter in range(4)
 ]
 ENU, NWU = ("east", "north", "up"), ("north", "west", "up")
 # Rotations of NED to ENU and NWU, and of FRD to FLU

@@ -355,9 +355,7 @@ def test_ekf2_reset_on_axis_without_source_data_is_not_removed():
     assert "removed" in remove_origin_resets(ekf2, track, WHOLE)[1]
     state, statement = remove_origin_resets(ekf2, blind, WHOLE)
     pd.testing.assert_frame_equal(state, ekf2.state)
-    assert (
-        statement == "EKF2 resets not removed, because they correct an error of EKF2: 1 of height"
-    )
+    assert statement == "EKF2 resets that correct an error of EKF2 were kept: 1 of height"
 
 
 @pytest.mark.parametrize(("reset_s", "said"), [

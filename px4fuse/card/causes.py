@@ -17,8 +17,8 @@ from px4fuse.comparison.trials import (
     Trial,
     becomes_consistent,
     classify_improvement,
-    compute_log_ratio_reduction,
     compute_preference_key,
+    compute_sigma_ratio_improvement,
     compute_sigma_ratios,
     halves_discrepancy,
     has_effect,
@@ -89,7 +89,7 @@ def rank_causes(analysis: Analysis, root_findings: Sequence[Finding]) -> list[Ra
             has_effect(trial) or not can_show_effect(trial) for trial in trials
         ):
             continue
-        log_ratio_reduction = sum(map(compute_log_ratio_reduction, trials))
+        log_ratio_reduction = sum(map(compute_sigma_ratio_improvement, trials))
         rank = _find_cause_rank(finding, trials)
         ranked_causes.append(RankedCause(finding, rank, log_ratio_reduction, trials))
     fault_causes = [

@@ -238,7 +238,7 @@ def read_source(
             f"{display_name(path)} is a pose graph, not a trajectory.",
             f"Optimise the pose graph with px4fuse loop {display_name(path)}.",
         )
-    if decode_text(file_head) is not None:  # flight logs are binary
+    if decode_text(file_head) is not None:  # A text file is a trajectory: flight logs are binary
         trajectory = read_trajectory(path, track_name)
         return LoopSource(trajectory if frame is None else replace(trajectory, frame=frame), None)
     if frame is not None:
