@@ -271,12 +271,13 @@ def prepare_comparison(
             limit_s - clock_offset.applied_s for limit_s in clock_offset.interval_s
         )
         notes = [
+            *prepared_comparison.notes,
             f"--clock-offset auto: the time offset {clock_offset.remaining_s:+.3f} s (95 % "
-            f"{low_offset_s:+.3f} to {high_offset_s:+.3f} s) is not significant and was not applied"
+            f"{low_offset_s:+.3f} to {high_offset_s:+.3f} s) is not significant and not applied",
         ]
         if clock_offset.applied_s:
-            notes.append(f"the position timestamps were shifted by {clock_offset.applied_s:+.3f} s")
-        return replace(prepared_comparison, notes=(*prepared_comparison.notes, *notes))
+            notes.append(f"the timestamps were shifted by {clock_offset.applied_s:+.3f} s")
+        return replace(prepared_comparison, notes=tuple(notes))
     request = structs.replace(request, clock_offset_s=clock_offset.offset_s)
     return prepare_comparison_inputs(flight, request, keep_positions_as_sent=keep_positions_as_sent)
 

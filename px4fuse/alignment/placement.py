@@ -160,14 +160,14 @@ def align_position_file(
             f"{recording.name}: {error.reason}; {spans_text}", f"{error.remedy}."
         ) from None
     if frame:
-        frame_reason = "the user gave the frame with --position-frame"
+        frame_reason = "the frame was given with --position-frame"
     elif recording.format:
         frame_reason = f"the format {recording.format} defines the frame"
     else:
         frame_reason = "the column names of the position file contain the axis directions"
-    yaw_reason = "the user gave the yaw with --position-yaw"
+    yaw_reason = "the yaw was given with --position-yaw"
     if yaw_deg is None:
-        yaw_reason = "without --position-yaw, the yaw of the file's frame relative to EKF2 is 0°"
+        yaw_reason = "without --position-yaw, px4fuse assumes a yaw of 0° to EKF2's frame"
     alignment, aligned_samples = _apply_alignment(
         flight, recording, problem, match, frame_reason, yaw_reason, clock_offset_s
     )
@@ -242,7 +242,7 @@ def _apply_alignment(
     yaw_sigma_deg = time_offset_sigma_s = reference_correlation = residual_rms_m = None
     origin_m = np.zeros(3)
     reference_name = ""
-    time_offset_reason = "the user gave the offset with --clock-offset"
+    time_offset_reason = "the offset was given with --clock-offset"
     if match:
         frame = match.frame
         reference_name = match.reference.name

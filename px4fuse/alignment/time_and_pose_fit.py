@@ -44,9 +44,9 @@ class CorrelationPeak:
     """
 
     lag_s: float
-    concordance: float = float("nan")
-    second_peak_lag_difference_s: float = float("nan")
-    second_to_best_residual_ratio: float = float("inf")
+    concordance: float = np.nan
+    second_peak_lag_difference_s: float = np.nan
+    second_to_best_residual_ratio: float = np.inf
 
 
 @dataclass(frozen=True, kw_only=True)

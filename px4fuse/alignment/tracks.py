@@ -139,10 +139,13 @@ def _smooth_ekf2_track(state: pd.DataFrame) -> SampledTrack:
         )
     position_m = finite_state[Columns.POSITION].to_numpy()
     grid_track = resample_to_grid(_make_gapless_track(finite_state.index.to_numpy(), position_m))
-    smoothed_position_m = gaussian_filter1d(
-        grid_track.position_m, SMOOTHING_SIGMA_S / GRID_STEP_S, axis=0, mode="nearest"
+    return replace(
+        grid_track,
+        position_m=gaussian_filter1d(
+            grid_track.position_m, SMOOTHING_SIGMA_S / GRID_STEP_S, axis=0, mode="nearest"
+        ),
+        name=EKF2_REFERENCE,
     )
-    return replace(grid_track, position_m=smoothed_position_m, name=EKF2_REFERENCE)
 
 
 def make_ekf2_references(flight: Flight) -> list[SampledTrack]:

@@ -167,10 +167,8 @@ def _summarise_filter(
         )
     }
     if not isinstance(innovations, Unavailable):
-        innovation_m, innovation_variance_m2 = (
-            innovations["innovation_m"],
-            innovations["innovation_variance_m2"],
-        )
+        innovation_m = innovations["innovation_m"]
+        innovation_variance_m2 = innovations["innovation_variance_m2"]
         consistency = assess_innovations(
             innovation_m.to_numpy(), innovation_variance_m2.to_numpy(), gate
         )

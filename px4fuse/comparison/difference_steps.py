@@ -320,10 +320,8 @@ def _describe_property_differences(
 
 
 def _describe_unexplained_fractions(explanation: DifferenceExplanation) -> str:
-    position_mean_square_m2, velocity_mean_square_m2_s2 = (
-        explanation.position_mean_square_m2,
-        explanation.velocity_mean_square_m2_s2,
-    )
+    position_mean_square_m2 = explanation.position_mean_square_m2
+    velocity_mean_square_m2_s2 = explanation.velocity_mean_square_m2_s2
     unexplained_position_text, unexplained_velocity_text = (
         f"{100 * min(fraction, 1.0):.1f} %"
         for fraction in (
@@ -353,10 +351,7 @@ def _describe_rmse(explanation: DifferenceExplanation) -> list[str]:
         kf_rmse_m,
         *(step.position_rmse_to_truth_m or 0.0 for step in explanation.steps),
     ]
-    mean_square_changes, step_names = (
-        np.diff(np.square(rmse_by_step)),
-        [step.name for step in explanation.steps],
-    )
+    mean_square_changes = np.diff(np.square(rmse_by_step))
     largest_change_index = int(
         np.argmin(mean_square_changes)
         if ekf2_rmse_m < kf_rmse_m
@@ -365,6 +360,6 @@ def _describe_rmse(explanation: DifferenceExplanation) -> list[str]:
     rmse_before_m, rmse_after_m = rmse_by_step[largest_change_index : largest_change_index + 2]
     return [
         f"Position RMSE: EKF2 {ekf2_rmse_m:.3f} m, KF {kf_rmse_m:.3f} m. Largest contribution to "
-        f"the difference: EKF2's {step_names[largest_change_index]} changes KF's RMSE from "
-        f"{rmse_before_m:.3f} m to {rmse_after_m:.3f} m."
+        f"the difference: EKF2's {explanation.steps[largest_change_index].name} changes KF's RMSE "
+        f"from {rmse_before_m:.3f} m to {rmse_after_m:.3f} m."
     ]

@@ -229,10 +229,8 @@ def compute_local_residuals(comparison: Comparison) -> LocalResiduals | None:
         timestamp_deviation_s, TIMESTAMP_MEDIAN_FILTER_LENGTH, mode="nearest"
     )
     half_window_rows = max(2, round(VELOCITY_HALF_WINDOW_S / interval_s))
-    window_first_rows, window_last_rows = (
-        np.clip(rows - half_window_rows, 0, None),
-        np.clip(rows + half_window_rows, None, len(time_s) - 1),
-    )
+    window_first_rows = np.clip(rows - half_window_rows, 0, None)
+    window_last_rows = np.clip(rows + half_window_rows, None, len(time_s) - 1)
     displacement_m = position_m[window_last_rows] - position_m[window_first_rows]
     velocity_m_s = displacement_m / (time_s[window_last_rows] - time_s[window_first_rows])[:, None]
     has_small_interpolation_noise = residual_to_position_sigma_ratio < MAX_RESIDUAL_SIGMA_RATIO
@@ -497,10 +495,8 @@ def find_offset_variation(fit: ErrorFit) -> OffsetVariation | None:
 def find_attitude_delay(imu: pd.DataFrame, attitude: pd.DataFrame) -> float | None:
     """Return the time (s) by which the logged attitude is late, if it is not zero."""
     imu_time_s, attitude_time_s = imu.index.to_numpy(), attitude.index.to_numpy()
-    start_s, end_s = (
-        max(imu_time_s[0], attitude_time_s[0]),
-        min(imu_time_s[-1], attitude_time_s[-1]),
-    )
+    start_s = max(imu_time_s[0], attitude_time_s[0])
+    end_s = min(imu_time_s[-1], attitude_time_s[-1])
     time_s = np.arange(
         start_s + MAX_ATTITUDE_DELAY_S, end_s - MAX_ATTITUDE_DELAY_S, ROTATION_INTERVAL_S
     )

@@ -150,10 +150,8 @@ def select_source_innovations(flight: Flight, track: PositionTrack) -> Flight:
     if isinstance(flight.ekf2, Unavailable) or not track.origin.fused_as_gnss:
         return flight
     # GNSS innovations replace those of vision, so missing vision innovations are not reported
-    missing_vision_innovations, streams = (
-        _find_missing_innovations(flight.ekf2),
-        dict(flight.streams),
-    )
+    missing_vision_innovations = _find_missing_innovations(flight.ekf2)
+    streams = dict(flight.streams)
     ekf2 = with_gnss_innovations(
         flight.ekf2, GNSS if track.barometer is None else GNSS_AND_BAROMETER
     )

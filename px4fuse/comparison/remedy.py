@@ -62,10 +62,8 @@ def estimate_gnss_delay_ms(model: Ekf2Model) -> tuple[float, float] | None:
     quadratic_coefficient, linear_coefficient, _ = np.polyfit(GNSS_DELAYS_MS, nis_sums, 2)
     if quadratic_coefficient <= 0.0:
         return None
-    gnss_delay_ms, delay_sigma_ms = (
-        -0.5 * linear_coefficient / quadratic_coefficient,
-        quadratic_coefficient**-0.5,
-    )
+    gnss_delay_ms = -0.5 * linear_coefficient / quadratic_coefficient
+    delay_sigma_ms = quadratic_coefficient**-0.5
     min_delay_error_ms = max(1e3 * MIN_TIME_OFFSET_S, MIN_OFFSET_SIGMAS * delay_sigma_ms)
     delay_error_ms = abs(gnss_delay_ms - model.inputs.settings[GNSS_POS.delay])
     return (

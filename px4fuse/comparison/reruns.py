@@ -348,10 +348,8 @@ def _rerun_kf(
         name: change[name] for name in change if name in vars(Settings())
     }
     changed_settings = replace(comparison.settings, **kf_settings)
-    truth, rotates_gnss_positions = (
-        axis_result.truth,
-        ROTATION_KEY in change and source.origin.is_gnss,
-    )
+    truth = axis_result.truth
+    rotates_gnss_positions = ROTATION_KEY in change and source.origin.is_gnss
     if ROTATION_KEY in change:
         rotated_direction = _rotate_direction(axis.direction, change[ROTATION_KEY])
         measured_m = weighted_sum(

@@ -137,11 +137,9 @@ def makes_overconfident(trial: Trial, statistic: Statistic) -> bool:
 
     The filter is underconfident against the source, then overconfident against ground truth.
     """
-    nees_before, nis_before, nees_after = (
-        trial.before.nees_mean,
-        trial.before.nis_mean,
-        trial.after.nees_mean,
-    )
+    nees_before = trial.before.nees_mean
+    nis_before = trial.before.nis_mean
+    nees_after = trial.after.nees_mean
     if statistic != "nis" or nis_before is None or nis_before >= 1.0 or nees_after is None:
         return False
     return nees_after >= (
@@ -211,14 +209,7 @@ def compute_sigma_ratio_deviation(statistics: RunStatistics) -> float:
 
     The sum is 0 for a consistent filter.
     """
-    squared_sigma_ratios = [
-        squared_sigma_ratio
-        for squared_sigma_ratio in (statistics.nis_mean, statistics.nees_mean)
-        if squared_sigma_ratio
-    ]
-    return sum(
-        0.5 * abs(math.log(squared_sigma_ratio)) for squared_sigma_ratio in squared_sigma_ratios
-    )
+    return sum(abs(math.log(ratio)) for ratio in compute_sigma_ratios(statistics).values())
 
 
 def compute_preference_key(trial: Trial) -> tuple[bool, int, float]:
@@ -256,10 +247,8 @@ def compare_sigma_ratios(trial: Trial) -> list[tuple[Reference, float, float]]:
 
     The reference is "source" (ratio from innovations) or "truth" (from errors).
     """
-    sigma_ratios_before, sigma_ratios_after = (
-        compute_sigma_ratios(trial.before),
-        compute_sigma_ratios(trial.after),
-    )
+    sigma_ratios_before = compute_sigma_ratios(trial.before)
+    sigma_ratios_after = compute_sigma_ratios(trial.after)
     return [
         (reference, sigma_ratios_before[reference], sigma_ratios_after[reference])
         for reference in sigma_ratios_before.keys() & sigma_ratios_after.keys()

@@ -214,12 +214,9 @@ class Hypothesis:
 
     def is_similar_to(self, other: "Hypothesis", max_difference_rad: float = np.pi / 4.0) -> bool:
         heading_difference_rad = np.angle(np.exp(1j * (self.parameters[1] - other.parameters[1])))
-        is_similar = (
+        return bool(
             abs(self.delay_s - other.delay_s) < 0.5
             and abs(heading_difference_rad) < max_difference_rad
-        )
-        return bool(
-            is_similar
             and (self.axis_permutation, self.unit) == (other.axis_permutation, other.unit)
         )
 
@@ -339,10 +336,8 @@ def find_convention_candidates(
         for (permutation_index, unit_index), offset_index in np.ndenumerate(
             np.argmax(scores_at_quarter_turn, axis=0)
         ):
-            unit_name, axis_permutation = (
-                [*METRES_PER_UNIT][unit_index],
-                SIGNED_AXIS_PERMUTATIONS[permutation_index],
-            )
+            unit_name = [*METRES_PER_UNIT][unit_index]
+            axis_permutation = SIGNED_AXIS_PERMUTATIONS[permutation_index]
             # If z is constant, the source measures no height. Then z is the vertical axis
             if (
                 axis_permutation.vertical_axis != 2
@@ -377,10 +372,8 @@ def refine_hypothesis(
     """Refine delay, rotation and drifts of a hypothesis by robust least squares (Gauss-Newton)."""
     rows = np.flatnonzero(source_motion.is_valid)
     rows = rows[:: max(1, len(rows) // MAX_REFINEMENT_ROWS)]
-    best_hypothesis, parameters = (
-        replace(initial_hypothesis, score=-np.inf),
-        initial_hypothesis.parameters,
-    )
+    best_hypothesis = replace(initial_hypothesis, score=-np.inf)
+    parameters = initial_hypothesis.parameters
     for _ in range(REFINEMENT_ITERATIONS):
         hypothesis, parameter_step = _evaluate_hypothesis(
             replace(initial_hypothesis, parameters=parameters), rows, source_motion, imu_motion

@@ -81,10 +81,8 @@ def _fit_lever_arm_to_truth(flight: Flight, truth: Truth, track: PositionTrack) 
     offset_columns = np.broadcast_to(np.eye(2), rotation.shape)
     design = np.concatenate([rotation, offset_columns, velocity_m_s[:, :, None]], axis=2)
     is_known = np.isfinite(velocity_m_s).all(axis=1)
-    design_rows, valid_position_errors_m = (
-        design[is_known].reshape(-1, 5),
-        error_m[is_known].ravel(),
-    )
+    design_rows = design[is_known].reshape(-1, 5)
+    valid_position_errors_m = error_m[is_known].ravel()
     if len(design_rows) < MIN_COORDINATE_COUNT:
         return None
     fitted_parameters, _, rank, _ = np.linalg.lstsq(

@@ -124,9 +124,8 @@ def check_orientation(
         if candidate.order_and_heading_free_frames != best_candidate.order_and_heading_free_frames
     )
     orientation_convention = best_candidate.convention
-    tilt_difference_deg = orientation_convention.tilt_difference_deg
     if (
-        tilt_difference_deg > MAX_TILT_DIFFERENCE_DEG
+        orientation_convention.tilt_difference_deg > MAX_TILT_DIFFERENCE_DEG
         or best_candidate.heading_difference_deg > MAX_HEADING_DIFFERENCE_DEG
     ):
         orientation_convention = replace(orientation_convention, verdict="unrelated")

@@ -70,9 +70,9 @@ def analyse(
     def convert_to_trajectory_time_s(time_s: float) -> float:
         return time_s + time_origin_s if abs(time_s) < MIN_UNIX_TIME_S else time_s
 
-    request_times = (request.start_s, request.end_s)
     start_s, end_s = (
-        None if time_s is None else convert_to_trajectory_time_s(time_s) for time_s in request_times
+        None if time_s is None else convert_to_trajectory_time_s(time_s)
+        for time_s in (request.start_s, request.end_s)
     )
     segment, is_at_rest_at_both_ends = loop_segment.choose_loop_segment(
         flight, trajectory, start_s, end_s
@@ -104,11 +104,8 @@ def analyse(
             0, (GivenClosure(segment.start_s, segment.end_s, true_end.sigma_m), true_end)
         )
     key_frame_spacing_m = request.key_frames_m
-    key_frame_spacing_m = (
-        compute_default_spacing_m(path.position_m)
-        if key_frame_spacing_m is None
-        else key_frame_spacing_m
-    )
+    if key_frame_spacing_m is None:
+        key_frame_spacing_m = compute_default_spacing_m(path.position_m)
     key_frame_indices, distance_m = _choose_key_frames(path, key_frame_spacing_m)
     graph, node_indices, variance_note = build_pose_graph(
         path, key_frame_indices, closures_and_final_poses, noise

@@ -70,9 +70,9 @@ def compute_odometry_variances(
         noise.position_m**2 / 100.0 * step_length_m
         + noise.position_m_per_root_s**2 * step_duration_s
     )
-    heading_variance_rad2 = np.radians(noise.heading_deg) ** 2 / 100.0 * step_length_m
     heading_variance_rad2 = (
-        heading_variance_rad2 + np.radians(noise.heading_deg_per_root_s) ** 2 * step_duration_s
+        np.radians(noise.heading_deg) ** 2 / 100.0 * step_length_m
+        + np.radians(noise.heading_deg_per_root_s) ** 2 * step_duration_s
     )
     tilt_variance_rad2 = noise.tilt_share**2 * heading_variance_rad2
     rotation_variance_rad2 = np.column_stack(
@@ -269,7 +269,7 @@ def _explain_gate_rejection(correction_name: str, closure: Closure) -> Unavailab
         correction_name,
         f"the χ² gate rejects {closure} (squared Mahalanobis distance {closure.d2:.1f}, "
         f"p {closure.p:.1g})",
-        "Measure the landing place (--landed-at). Or assume a larger odometry drift (--drift). Or "
+        "Measure the landing place (--landed-at), assume a larger odometry drift (--drift), or "
         "give --open if the path does not return to its start.",
     )
 

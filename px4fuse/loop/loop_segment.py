@@ -90,10 +90,8 @@ def choose_loop_segment(
         reason = "the whole trajectory, because the log contains no detected take-off"
     else:
         take_off_s, landing_s = flight.airborne[0][0], flight.airborne[-1][1]
-        segment_start_s, segment_end_s = (
-            max(segment_start_s, take_off_s),
-            min(segment_end_s, landing_s),
-        )
+        segment_start_s = max(segment_start_s, take_off_s)
+        segment_end_s = min(segment_end_s, landing_s)
         reason = "from take-off to landing, by the land detector"
         if len(flight.airborne) > 1:
             reason = f"from the first take-off to the last of {len(flight.airborne)} landings"
