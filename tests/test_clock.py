@@ -487,5 +487,5 @@ def test_time_offset_with_too_wide_interval_is_undetermined() -> None:
     assert step.change_p_value < 1e-3
     wide = widen_for_drift(replace(stated(-0.4, 0.4, -0.3, 0.3), interval_s=(-0.05, 0.05)))
     assert not wide.is_determinable
-    assert "probably because the source drifts" in wide.reason
+    assert "probably because the positions drift" in wide.reason
     assert widen_for_drift(stated(0.0, 0.3)).change_p_value is None  # two parts give no scatter

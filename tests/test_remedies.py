@@ -236,5 +236,6 @@ def test_height_noise_unlike_position_noise_is_in_advice(sample: Analysis) -> No
     ekf2 = replace(sample.flight.ekf2, fusion_flags=flags)
     fused = replace(sample, flight=replace(sample.flight, ekf2=ekf2))
     advice = remedies.make_height_noise_advice(fused, tuning, 0.1)
-    assert "height noise of the source is 0.6 m. Report a variance of 0.36 m² for z" in advice
+    assert "height noise of the source is 0.6 m. " in advice
+    assert "send each position with a variance of 0.36 m² for z." in advice
     assert remedies.make_height_noise_advice(fused, tuning, 0.4) == ""
