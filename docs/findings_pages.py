@@ -40,7 +40,7 @@ from test_source_values import examples as value_examples  # noqa: E402
 
 import px4fuse  # noqa: E402
 from px4fuse.analysis import Analysis  # noqa: E402
-from px4fuse.diagnose import find_faults  # noqa: E402
+from px4fuse.diagnose import analyse_comparison  # noqa: E402
 from px4fuse.ekf2.aids import evaluate_aids  # noqa: E402
 from px4fuse.filter.frame_rotation import HeadingPart, combine_heading_parts  # noqa: E402
 from px4fuse.filter.settings import Settings  # noqa: E402
@@ -138,7 +138,7 @@ def collect_examples() -> dict[str, FindingExample]:
 
     for name, (faults, settings) in FAULTS_AND_SETTINGS_BY_ID.items():
         flight = simulate_flight(Scenario(passes=4, seed=2), parse_faults(faults))
-        analysis = find_faults(compare(flight, Settings(**settings)))
+        analysis = analyse_comparison(compare(flight, Settings(**settings)))
         command = " ".join(["px4fuse simulate", *(f"--mistake {fault}" for fault in faults)])
         options = [f"--{key[:7].replace('_', '-')} {value:g}" for key, value in settings.items()]
         settings_text = f", analysed with `compare {' '.join(options)}`" if options else ""
@@ -153,7 +153,7 @@ def collect_examples() -> dict[str, FindingExample]:
         flight = simulate_flight(Scenario(passes=4, seed=2, ekf2=False))
         truth = flight.truth.samples[Columns.POSITION].dropna()
         true_position_m = CubicSpline(truth.index.to_numpy(), truth.to_numpy())
-        analysis = find_faults(
+        analysis = analyse_comparison(
             compare(laid_over(flight, true_position_m, model, 10.0, 2), Settings())
         )
         findings = [finding for finding in find(analysis) if finding.id.startswith("source_")]
@@ -356,7 +356,7 @@ def save_picture(name: str, example: FindingExample, folder: Path) -> str:
     figure, axes_list = pyplot.subplots(3, sharex=True, figsize=(8, 7), layout="constrained")
     drawn_panels = (POSITION_PANEL, INNOVATIONS_PANEL, POSITION_SIGMA_PANEL)
     for axes, panel in zip(axes_list, drawn_panels, strict=True):
-        panel.draw(axes, axis_analysis.with_flight_tracks())
+        panel.draw(axes, axis_analysis.with_whole_flight_tracks())
         axes.set_ylabel(fill(panel.title, LABEL_LENGTH))
     axes_list[0].set_title(axis_analysis.axis.name)
     axes_list[-1].set_xlabel("time (s)")

@@ -53,7 +53,7 @@ class Analysis(Comparison, Estimates, Reruns):
         return model if isinstance(model, Unavailable) else model.baseline_replay
 
     def select_main_trials(self) -> list[Trial]:
-        """Return the re-runs along the main axis whose results before the change are logged."""
+        """Return the re-runs along the main axis for which the log contains the results before."""
         main_axis = self.main.axis.name
         return [trial for trial in self.trials if trial.axis == main_axis and trial.is_logged]
 
@@ -63,7 +63,7 @@ class Analysis(Comparison, Estimates, Reruns):
 
 
 @dataclass(frozen=True)
-class AidsOnlyAnalysis:
+class AidingSourceAnalysis:
     """Evaluation of EKF2's aiding sources, for a flight without positions for KF.
 
     Attributes
@@ -91,12 +91,11 @@ class WhatIfAnalysis:
     Attributes
     ----------
     changes : mapping from PX4 name to value
-        Changed parameters of EKF2; empty if only a range of values of one parameter is replayed.
+        Changed parameters of EKF2; empty if the replays only test values of one parameter.
     uses_estimates : bool
         True if ``changes`` are maximum-likelihood estimates.
     difference_steps : mapping from axis name to DifferenceExplanation or Unavailable
-        Causes of the difference between KF (default settings) and EKF2 (logged), which existed
-        before the change of parameters.
+        Causes of the difference between KF (default settings) and EKF2 as logged.
     without : mapping from PX4's name of an aiding source to float
         Time (s) from which EKF2 does not fuse the aiding source in the replays.
     """
@@ -112,11 +111,11 @@ class WhatIfAnalysis:
 
     @property
     def sweep_start_index(self) -> int:
-        """Index in ``whatif.whatif`` of the first replay of a parameter sweep, if there is one."""
+        """Index of the first replay of the parameter sweep in the tuple ``whatif.whatif``."""
         return int(bool(self.changes or self.without))
 
 
-def find_failed_checks(analysis: Analysis | AidsOnlyAnalysis) -> dict[str, str]:
+def find_failed_checks(analysis: Analysis | AidingSourceAnalysis) -> dict[str, str]:
     """Return the axes and aiding sources for which EKF2 is not consistent, with the reason.
 
     Reasons are: overconfident, or (only aiding sources) biased or not fused for a long time.

@@ -19,12 +19,12 @@ from typing import TypeVar
 
 from msgspec import structs
 
-from px4fuse.analysis import AidsOnlyAnalysis, Analysis, WhatIfAnalysis
+from px4fuse.analysis import AidingSourceAnalysis, Analysis, WhatIfAnalysis
 from px4fuse.comparison.comparison import compare, run_kf
 from px4fuse.comparison.difference_steps import (
-    estimate_wrong_settings,
     explain_ekf2_difference,
-    list_step_configurations,
+    find_corrected_noise_settings,
+    list_explanation_configurations,
 )
 from px4fuse.comparison.estimates import (
     Estimates,
@@ -108,14 +108,14 @@ def _diagnose_flight(
     progress("running KF")
     kf_runs = run_kf(prepared_comparison)
     comparison = compare(prepared_comparison, kf_runs)
-    return replace(find_faults(comparison, progress), request=request)
+    return replace(analyse_comparison(comparison, progress), request=request)
 
 
 def _refine_clock_offset(flight: Flight, analysis: Analysis) -> Flight | None:
-    """Return the flight with the clock offset of a position file as estimated with the IMU.
+    """Return the flight with the clock offset of the position file as estimated with the IMU.
 
-    The offset from reading the file is relative to EKF2's positions, which may be late. Return None
-    if there is no such offset, or if it agrees with the IMU.
+    :func:`read_flight` estimates the offset with EKF2's positions, which may be late. Return None
+    if the offset was not estimated with EKF2, or if the IMU gives the same offset.
     """
     alignment, clock_offset = analysis.source.alignment, analysis.clock
     if (
@@ -134,18 +134,19 @@ def _refine_clock_offset(flight: Flight, analysis: Analysis) -> Flight | None:
         alignment,
         clock_offset_s=alignment.clock_offset_s + clock_offset.offset_s,
         clock_offset_sigma_s=clock_offset.sigma_s,
-        clock_reason=f"the offset was estimated with the IMU, because EKF2's position is "
-        f"{delay_text} relative to the IMU",
+        clock_reason=f"the offset was estimated with the IMU; EKF2's position is {delay_text} "
+        "compared with the IMU",
     )
     file_track, *other_tracks = flight.positions
     shifted_track = replace(shift_clock(file_track, clock_offset.offset_s), alignment=alignment)
     return replace(flight, positions=(shifted_track, *other_tracks))
 
 
-def find_faults(comparison: Comparison, progress: Progress = ignore_progress) -> Analysis:
-    """Estimate errors, re-run KF and EKF2, and find faults and their causes (steps 5 to 8 of 8).
+def analyse_comparison(comparison: Comparison, progress: Progress = ignore_progress) -> Analysis:
+    """Estimate errors, re-run KF and EKF2, and find faults and their causes.
 
-    If students must find the faults of the flight, only the comparison is returned.
+    These are the steps 5 to 8 of this module. If students must find the faults of the flight, only
+    the comparison is returned.
     """
     if comparison.flight.log.is_assessed:
         return Analysis(
@@ -184,10 +185,10 @@ def find_faults(comparison: Comparison, progress: Progress = ignore_progress) ->
 
 
 def refine_delay(comparison: Comparison, clock_offset: ClockOffset | Unavailable) -> Comparison:
-    """Replace the detected delay of the position timestamps by the more precise ``clock_offset``.
+    """Replace the reported delay of the position timestamps by the more precise ``clock_offset``.
 
-    Only the reported delay changes. KF is not run again: :func:`prepare_comparison_inputs` has
-    already corrected the detected delay, and re-runs test the rest, ``clock_offset.remaining_s``.
+    KF is not run again: :func:`prepare_comparison_inputs` has already corrected the first estimate
+    of the delay. Re-runs test the difference, ``clock_offset.remaining_s``.
     """
     if (
         comparison.convention is None
@@ -195,15 +196,15 @@ def refine_delay(comparison: Comparison, clock_offset: ClockOffset | Unavailable
         or not clock_offset.is_determinable
     ):
         return comparison
-    # a time offset is negative for late timestamps
+    # The delay is the negative time offset
     refined_convention = structs.replace(comparison.convention, late_s=-clock_offset.offset_s)
-    # If the refined delay is too small to be a fault, report the detected delay, because the
-    # positions were corrected by it
-    is_fault = all(
+    # If the refined delay is too small to be a fault, the first estimate is reported, because the
+    # positions were corrected by the first estimate
+    is_delay_a_fault = all(
         find_convention_faults(convention, comparison.flight, comparison.source.frame).late_s != 0.0
         for convention in (comparison.convention, refined_convention)
     )
-    return replace(comparison, convention=refined_convention) if is_fault else comparison
+    return replace(comparison, convention=refined_convention) if is_delay_a_fault else comparison
 
 
 def read_flight(request: ComparisonRequest, progress: Progress = ignore_progress) -> Flight:
@@ -269,13 +270,14 @@ def prepare_comparison(
         low_offset_s, high_offset_s = (
             limit_s - clock_offset.applied_s for limit_s in clock_offset.interval_s
         )
-        note = (
+        notes = [
+            *prepared_comparison.notes,
             f"--clock-offset auto: the time offset {clock_offset.remaining_s:+.3f} s (95 % "
-            f"{low_offset_s:+.3f} to {high_offset_s:+.3f} s) is not significant and was not applied"
-        )
+            f"{low_offset_s:+.3f} to {high_offset_s:+.3f} s) is not significant and not applied",
+        ]
         if clock_offset.applied_s:
-            note += f". The timestamps were already corrected by {clock_offset.applied_s:+.3f} s"
-        return replace(prepared_comparison, notes=(*prepared_comparison.notes, note))
+            notes.append(f"the timestamps were shifted by {clock_offset.applied_s:+.3f} s")
+        return replace(prepared_comparison, notes=tuple(notes))
     request = structs.replace(request, clock_offset_s=clock_offset.offset_s)
     return prepare_comparison_inputs(flight, request, keep_positions_as_sent=keep_positions_as_sent)
 
@@ -285,12 +287,12 @@ def rerun(
 ) -> Reruns:
     """Replay EKF2, explain the difference KF - EKF2, and re-run both with one error corrected."""
     progress("replaying EKF2")
-    estimated_settings = estimate_wrong_settings(comparison, estimates.tuning)
+    estimated_settings = find_corrected_noise_settings(comparison, estimates.tuning)
     # Replay all parameter sets that the next two functions need at once, which is faster
     ekf2_model = prepare_ekf2_model(
         comparison.flight,
         lambda inputs: [
-            *list_step_configurations(comparison, inputs, estimated_settings),
+            *list_explanation_configurations(comparison, inputs, estimated_settings),
             *list_rerun_configurations(comparison, estimates, inputs),
         ],
     )
@@ -306,13 +308,13 @@ def rerun(
 
 def diagnose_or_check_aids(
     request: ComparisonRequest, progress: Progress = ignore_progress, flight: Flight | None = None
-) -> Analysis | AidsOnlyAnalysis:
+) -> Analysis | AidingSourceAnalysis:
     """Run :func:`diagnose`; for a flight without positions, check only EKF2's aiding sources.
 
     Raises
     ------
     LogError, MissingDataError, SettingsError
-        See :func:`diagnose`. MissingDataError also if EKF2's innovations are missing.
+        As in :func:`diagnose`, or the log contains neither positions nor EKF2's innovations.
     """
     flight = flight or read_flight(request, progress)
     if request.position_source or any(track.origin.is_auto_candidate for track in flight.positions):
@@ -329,7 +331,7 @@ def diagnose_or_check_aids(
             f"checked: {aids.reason}",
             missing_data.remedy,
         )
-    return AidsOnlyAnalysis(flight, aids, missing_data, find_aid_findings(aids, flight))
+    return AidingSourceAnalysis(flight, aids, missing_data, find_aid_findings(aids, flight))
 
 
 def run_what_if(
@@ -351,12 +353,12 @@ def run_what_if(
         if sweep.parameter in changes:
             raise SettingsError(
                 f"{sweep.parameter} has both a new value and a sweep.",
-                f"Give a value or a sweep of {sweep.parameter}.",
+                f"Give either a new value or a sweep for {sweep.parameter}.",
             )
     comparison_request = ComparisonRequest(log=request.log, system=request.system)
     flight = flight or read_flight(comparison_request, progress)
-    is_default_change = not changes and sweep is None and not request.without
-    if flight.log.is_assessed and is_default_change:
+    has_no_user_change = not changes and sweep is None and not request.without
+    if flight.log.is_assessed and has_no_user_change:
         raise MissingDataError(
             f"{flight.log.name}: {DIAGNOSIS_WITHHELD.reason}",
             "State the change to replay with --set or --sweep.",
@@ -370,23 +372,23 @@ def run_what_if(
             comparison_request = structs.replace(comparison_request, axes=("north", "east", AISLE))
             prepared_comparison = prepare_comparison_inputs(flight, comparison_request)
             comparison = compare(prepared_comparison, run_kf(prepared_comparison))
-    except MissingDataError:  # without a comparison, only changes of the user can be replayed
-        if is_default_change:
+    except MissingDataError:  # Without KF, only parameter changes from the user can be replayed
+        if has_no_user_change:
             raise
     if comparison is not None:
         tuning, clock_offset = estimate_noises_and_clock(comparison, progress)
-        estimated_settings = estimate_wrong_settings(comparison, tuning)
+        estimated_settings = find_corrected_noise_settings(comparison, tuning)
         explanation_by_axis = explain_ekf2_difference(
             comparison, ekf2_model, clock_offset, estimated_settings
         )
-        if is_default_change:
+        if has_no_user_change:
             changes = estimate_ekf2_parameters(comparison, ekf2_model, tuning, clock_offset)
     parameter_sets = [changes] if changes or request.without else []
     parameter_sets += [changes | values for values in swept_settings]
     progress("replaying EKF2 with other parameters")
     what_if_result = require_available(what_if(ekf2_model, parameter_sets, request.without), flight)
     return WhatIfAnalysis(
-        flight, what_if_result, changes, is_default_change, explanation_by_axis, request.without
+        flight, what_if_result, changes, has_no_user_change, explanation_by_axis, request.without
     )
 
 

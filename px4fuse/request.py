@@ -30,7 +30,7 @@ HeightName = Literal["gnss", "barometer"]
 FrameName = Literal["NED", "FRD", "ENU", "camera"]
 SystemId = Annotated[int, msgspec.Meta(ge=0, le=255)]
 
-
+# Names of all request fields that contain a path
 _PATH_FIELDS = ("log", "path", "source", "estimate", "reference")
 
 

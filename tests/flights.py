@@ -18,7 +18,10 @@ from px4fuse.analysis import Analysis
 from px4fuse.comparison.estimates import Estimates, TuningByAxis
 from px4fuse.comparison.flight_events import collect_events
 from px4fuse.comparison.model import Comparison
-from px4fuse.comparison.noise_differences import find_noisy_part, tune_by_axis
+from px4fuse.comparison.noise_differences import (
+    find_noisy_flight_part,
+    tune_perpendicular_axes,
+)
 from px4fuse.comparison.reruns import rerun_filters
 from px4fuse.core.arrays import Array
 from px4fuse.ekf2.aids import evaluate_aids
@@ -347,8 +350,8 @@ def unexplained(comparison: Comparison, tuning: TuningByAxis | None = None) -> A
     estimates = Estimates(
         tuning=tuning or {}, clock=missing, heading=missing, systematic_errors=missing,
         source_low_pass=missing, time_correlated_noise=missing,
-        axis_tunings=tune_by_axis(comparison),
-        noisy_part=find_noisy_part(comparison, (tuning or {}).get(HORIZONTAL)),
+        axis_tunings=tune_perpendicular_axes(comparison),
+        noisy_part=find_noisy_flight_part(comparison, (tuning or {}).get(HORIZONTAL)),
     )  # fmt: skip
     trials = rerun_filters(comparison, estimates, missing)
     return Analysis(

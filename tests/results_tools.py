@@ -6,7 +6,7 @@ from pathlib import Path
 from typing import Any
 
 from px4fuse.core.record import Unavailable
-from px4fuse.loop.model import Closure, CorrectedPath, Loop, OdometryNoise, TrueEnd
+from px4fuse.loop.model import Closure, Loop, OdometryNoise, PathResult, TrueFinalPose
 from px4fuse.request import LoopRequest
 from px4fuse.results.contract import LoopResults, Results, to_json_dict
 from px4fuse.results.model import Student, provenance, schema_of
@@ -24,7 +24,7 @@ SHA256 = EXAMPLE["log"]["sha256"]
 NONE = Unavailable("it", "nobody asked", "Ask.")
 
 
-def correction(rmse: float, moved_m: float) -> CorrectedPath:
+def correction(rmse: float, moved_m: float) -> PathResult:
     """Return a correction with one score."""
     statistics = Statistics(9, rmse, rmse, rmse, 0.0, rmse, rmse)
     score = Evaluation(
@@ -38,7 +38,7 @@ def correction(rmse: float, moved_m: float) -> CorrectedPath:
         notes=(),
         warnings=(),
     )
-    return CorrectedPath(
+    return PathResult(
         correction_max_m=moved_m, correction_rms_m=moved_m, scores={"slam.tum": score, "ekf2": NONE}
     )
 
@@ -61,7 +61,7 @@ LOOP = to_json_dict(
             key_frame_spacing_m=0.5,
             path_length_m=87.7,
             end_from_start_m={"north": 1.42, "east": 0.0, "down": 0.0},
-            true_end=TrueEnd(
+            true_end=TrueFinalPose(
                 displacement_m={"north": 0.0, "east": 0.0, "down": 0.0},
                 sigma_m=0.1,
                 source="landing",

@@ -14,7 +14,7 @@ from flights import aisle_flight
 from pypdf import PdfReader
 from ulog_tools import gnss_log, seconds_of, stamps
 
-from px4fuse.analysis import AidsOnlyAnalysis, find_failed_checks
+from px4fuse.analysis import AidingSourceAnalysis, find_failed_checks
 from px4fuse.ekf2.aids import AidResult, evaluate_aids
 from px4fuse.errors import MissingDataError
 from px4fuse.findings import aids as aids_detector
@@ -292,7 +292,9 @@ def test_compare_with_checks_option_exits_with_1_on_sensor_fault(
 @pytest.mark.parametrize(("sigma", "bad"), [(0.5, False), (0.25, False), (1.5, True)])
 def test_checks_option_accepts_underconfident_aiding_source(sigma: float, bad: bool) -> None:
     made = with_aids(gnss_pos=aid_log(sigma=sigma))
-    alone = AidsOnlyAnalysis(made, evaluate_aids(made), Unavailable("it", "not there", "Log it."))
+    alone = AidingSourceAnalysis(
+        made, evaluate_aids(made), Unavailable("it", "not there", "Log it.")
+    )
     assert find_failed_checks(alone) == ({"GNSS position": "overconfident"} if bad else {})
 
 

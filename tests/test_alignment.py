@@ -227,7 +227,7 @@ def test_align_position_file_takes_frame_from_column_names(flight: Flight, frame
     alignment, track = align(flight, file)
     assert alignment.frame == frame
     assert alignment.frame_reason.startswith(
-        f"of all tried frames, {frame} has the smallest residual against the EKF2 position "
+        f"{frame} is the tested frame with the smallest residual against the EKF2 position "
         f"({frame} 0.1"
     )
     assert_same_track(track, flight.positions[0], 1e-9)
@@ -296,7 +296,7 @@ def test_align_position_file_with_rotated_frame_gives_warning(flight, yaw_deg, o
     assert alignment.yaw_deg == 0.0
     assert clock_error_s(alignment) < 0.03
     (warning,) = alignment.misplaced
-    seen = re.search(r"(rotated by [-0-9.]+° against .*)?its origin ([0-9.]+) m from", warning)
+    seen = re.search(r"(rotated by [-0-9.]+° relative to .*)?its origin ([0-9.]+) m from", warning)
     assert seen
     turned = float(seen[1].split()[2].rstrip("°")) if yaw_deg else 0.0
     shifted = float(seen[2])
@@ -309,7 +309,7 @@ def test_align_position_file_with_rotated_frame_gives_warning(flight, yaw_deg, o
 
 @pytest.mark.parametrize(("unit_m", "message", "remedy"), [
     (0.01, "in centimetres, not in metres", "Run again with --position-unit cm."),
-    (0.3048, "in feet, not in metres", "Multiply x, y and z by 0.3048 in the file."),
+    (0.3048, "in feet, not in metres", "Multiply x, y and z in the file by 0.3048."),
 ])  # fmt: skip
 def test_align_position_file_in_wrong_unit_reports_the_unit(
     sample_flight: Flight, unit_m: float, message: str, remedy: str

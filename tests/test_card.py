@@ -15,7 +15,7 @@ from px4fuse.card.build import build_card, build_unusable_log_card
 from px4fuse.card.causes import make_cause, rank_causes
 from px4fuse.card.model import Action
 from px4fuse.comparison.trials import RunStatistics, Trial, classify_improvement
-from px4fuse.diagnose import find_faults
+from px4fuse.diagnose import analyse_comparison
 from px4fuse.errors import LogError
 from px4fuse.filter.settings import Settings
 from px4fuse.findings import Finding
@@ -193,7 +193,7 @@ def test_diagnosis_of_clean_flight_advises_no_change(sample: Analysis) -> None:
 
 def test_diagnosis_explains_differing_nis_and_nees_verdicts() -> None:
     flight = simulate_flight(Scenario(seed=8), parse_faults(("ekf2-delay=0.25",)))
-    explained = find_faults(compare(flight, Settings()))
+    explained = analyse_comparison(compare(flight, Settings()))
     card = build_card(explained, REQUEST)
     assert (card.id, card.causes[0].reruns[0].improves) == (
         "ekf2_ev_delay_wrong",

@@ -29,7 +29,7 @@ from scipy.stats import binom, chi2, ttest_ind
 
 from px4fuse.comparison import estimates
 from px4fuse.comparison.estimates import (
-    MIN_OFFSETS_PER_SIDE,
+    MIN_ESTIMATES_BEFORE_AND_AFTER_CHANGE,
     estimate_noises_and_clock,
     widen_for_drift,
 )
@@ -414,7 +414,10 @@ def test_time_offset_jump_p_value_equals_bonferroni_t_test() -> None:
     """Compare with scipy's two-sample t for equal weights and a scatter above the stated σ."""
     offset = np.array([0.0, 0.03, -0.02, 0.01, 0.2, 0.24, 0.19, 0.22, 0.2])
     weight = np.full(len(offset), 1e6)
-    places = range(MIN_OFFSETS_PER_SIDE, len(offset) - MIN_OFFSETS_PER_SIDE + 1)
+    places = range(
+        MIN_ESTIMATES_BEFORE_AND_AFTER_CHANGE,
+        len(offset) - MIN_ESTIMATES_BEFORE_AND_AFTER_CHANGE + 1,
+    )
     smallest_p = min(ttest_ind(offset[:at], offset[at:]).pvalue for at in places)
     assert estimates._compute_change_p_value(offset, weight) == pytest.approx(
         smallest_p * len(places), rel=1e-9
@@ -487,5 +490,5 @@ def test_time_offset_with_too_wide_interval_is_undetermined() -> None:
     assert step.change_p_value < 1e-3
     wide = widen_for_drift(replace(stated(-0.4, 0.4, -0.3, 0.3), interval_s=(-0.05, 0.05)))
     assert not wide.is_determinable
-    assert "probably because the source drifts" in wide.reason
+    assert "probably because the positions drift" in wide.reason
     assert widen_for_drift(stated(0.0, 0.3)).change_p_value is None  # two parts give no scatter

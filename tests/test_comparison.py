@@ -10,7 +10,7 @@ from msgspec.structs import asdict
 from pyulog import ULog
 
 from px4fuse.comparison.model import AxisComparison, Comparison, Difference, UntestedFilter
-from px4fuse.comparison.projection import project_horizon_position
+from px4fuse.comparison.projection import project_fusion_horizon_position
 from px4fuse.core.arrays import Array
 from px4fuse.errors import SettingsError
 from px4fuse.filter.settings import Settings
@@ -104,7 +104,7 @@ class TestSample:
                               "observation_variance")
             )  # fmt: skip
             axis = sample[name].axis
-            horizon = project_horizon_position(sample_flight.ekf2, axis, sample.segment)
+            horizon = project_fusion_horizon_position(sample_flight.ekf2, axis, sample.segment)
             np.testing.assert_allclose(horizon["position_m"], observed + state_minus, atol=1e-9)
             np.testing.assert_allclose(horizon["position_variance_m2"], s - r, rtol=1e-9)
 
@@ -270,7 +270,9 @@ class TestRobustness:
     def test_compare_removes_ekf2_frame_reset_and_adds_note(self, made: Comparison) -> None:
         reset = Reset(60.0, "position", (5.0, -3.0, 0.0))
         comparison = compare(aisle_flight(ekf2=Estimator(resets=(reset,))))
-        assert any("EKF2's frame: 1 of horizontal position" in note for note in comparison.notes)
+        assert any(
+            "frame were removed: 1 of horizontal position" in note for note in comparison.notes
+        )
         for result, same in zip(comparison.axes.values(), made.axes.values(), strict=True):
             assert asdict(result.difference) == pytest.approx(asdict(same.difference))
 

@@ -15,7 +15,7 @@ from exchange import replace
 from flights import given_placement
 
 from px4fuse.comparison.model import Comparison
-from px4fuse.convention.axes import AXIS_ASSIGNMENTS, CLOCKWISE_DIRECTIONS, METRES_PER_UNIT
+from px4fuse.convention.axes import CLOCKWISE_DIRECTIONS, METRES_PER_UNIT, SIGNED_AXIS_PERMUTATIONS
 from px4fuse.convention.check import check_convention
 from px4fuse.convention.correction import ConventionFaults, find_convention_faults
 from px4fuse.convention.model import AxisDirections, Convention, OrientationConvention
@@ -45,7 +45,9 @@ UNIT_VECTORS = {
     "down": (0, 0, 1), "up": (0, 0, -1),
 }  # fmt: skip
 ALL_AXES = [
-    assignment.find_directions(quarter) for assignment in AXIS_ASSIGNMENTS for quarter in range(4)
+    assignment.compute_axis_directions(quarter)
+    for assignment in SIGNED_AXIS_PERMUTATIONS
+    for quarter in range(4)
 ]
 ENU, NWU = ("east", "north", "up"), ("north", "west", "up")
 # Rotations of NED to ENU and NWU, and of FRD to FLU
@@ -379,8 +381,8 @@ def test_clock_offset_auto_note_states_total_time_offset():
     request = ComparisonRequest(log="made", clock_offset_s="auto", axes=("north", "east"))
     prepared = prepare_comparison(late, request)
     assert prepared.settings.clock_offset_s == pytest.approx(-0.7, abs=0.02)
-    (note,) = (note for note in prepared.notes if note.startswith("--clock-offset auto: "))
-    remaining_s, applied_s = map(float, re.findall(r"([+-]\d\.\d+) s(?: \(95|$)", note))
+    notes = " ".join(prepared.notes[-2:])
+    remaining_s, applied_s = map(float, re.findall(r"([+-]\d\.\d+) s(?: \(95|$)", notes))
     assert abs(remaining_s) < 0.1
     assert applied_s == pytest.approx(prepared.settings.clock_offset_s, abs=0.001)
 
@@ -392,7 +394,8 @@ def test_ambiguous_position_axes_report_lists_possible_axes():
 
 
 @pytest.mark.parametrize(("axes", "message", "remedy"), [
-    (("north", "east", "up"), "x and y are exchanged: x is east, y north, z down", "(y, x, z)"),
+    (("north", "east", "up"), "x and y are exchanged: x is east, y north, z down",
+     "north = y, east = x, down = z"),
     (("west", "north", "down"), "NWU read as ENU: x is north, y west, z up", "frame nwu."),
 ])  # fmt: skip
 def test_position_file_in_wrong_frame_report_names_true_frame(axes, message, remedy):

@@ -15,7 +15,7 @@ from px4fuse.batch.measures import (
     ComparedNumber,
     collect_compared_numbers,
 )
-from px4fuse.diagnose import find_faults
+from px4fuse.diagnose import analyse_comparison
 from px4fuse.ekf2.aids import AidAxis, AidResult
 from px4fuse.request import ComparisonRequest
 from px4fuse.results.build import results
@@ -61,7 +61,7 @@ def flown(seed: int, *mistakes: str, **scenario) -> InputResults:
     request = ComparisonRequest(
         log="f.ulg", sigma_a_m_s2=RIGHT.sigma_a_m_s2, sigma_z_m=RIGHT.sigma_z_m
     )
-    found = results(request, find_faults(compare(flight, RIGHT)))
+    found = results(request, analyse_comparison(compare(flight, RIGHT)))
     return as_input(read_results(to_json(found).encode()))
 
 

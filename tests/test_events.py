@@ -52,7 +52,7 @@ def test_time_without_positions_is_plotted_but_not_evaluated() -> None:
     assert collect_events(covered).gaps == ()
     for result, other in zip(whole.axes.values(), covered.axes.values(), strict=True):
         assert (result.filters, result.difference) == (other.filters, other.difference)
-        shown = result.with_flight_tracks()
+        shown = result.with_whole_flight_tracks()
         for name in ("ekf2_state", "ekf2_variance", "truth"):
             assert getattr(result, name).index[-1] <= 80.0
             assert getattr(shown, name).index[-1] > 119.0

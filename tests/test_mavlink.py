@@ -47,7 +47,7 @@ from pandas.testing import assert_frame_equal
 from scipy.spatial.transform import Rotation
 from time_limit import time_limit
 
-from px4fuse.diagnose import find_faults
+from px4fuse.diagnose import analyse_comparison
 from px4fuse.errors import LogError, MissingDataError
 from px4fuse.flight.model import (
     MOTION_CAPTURE_ORIGIN,
@@ -441,7 +441,7 @@ def test_ardupilot_messages_contain_no_px4_advice(read, missing_messages):
     if flight.positions:
         texts += [
             f"{f.message} {f.remedy}"
-            for f in find_faults(compare(flight)).findings
+            for f in analyse_comparison(compare(flight)).findings
             if f.id != "not_px4"
         ]
     else:

@@ -38,7 +38,7 @@ from px4fuse.findings.cause_grouping import group_by_cause
 from px4fuse.findings.noises import _has_default_noises
 from px4fuse.flight.ekf2_parameters import EV_POS, GNSS_POS, PARAMETERS
 from px4fuse.flight.model import GNSS_ORIGIN, RECEIVED_ORIGIN
-from px4fuse.loop.model import Closure, Loop, TrueEnd
+from px4fuse.loop.model import Closure, Loop, TrueFinalPose
 
 MOVING = source(samples=positions(np.arange(0.0, 120.0), np.arange(120.0)))
 HOVERING = source(samples=positions(np.arange(0.0, 120.0)))
@@ -526,7 +526,7 @@ def test_possible_drift_finding_states_loop_closure_error() -> None:
     assert "closure error" not in unclosed.message
 
 
-END = TrueEnd(displacement_m={"forward": 0.0, "right": 0.0, "down": 0.0}, sigma_m=0.1,
+END = TrueFinalPose(displacement_m={"forward": 0.0, "right": 0.0, "down": 0.0}, sigma_m=0.1,
               source="given", assumed=False)  # fmt: skip
 
 

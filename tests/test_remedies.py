@@ -19,7 +19,7 @@ from px4fuse.comparison.trials import (
     find_trial,
     has_effect,
 )
-from px4fuse.diagnose import find_faults
+from px4fuse.diagnose import analyse_comparison
 from px4fuse.ekf2.whatif import what_if
 from px4fuse.filter.settings import Settings
 from px4fuse.filter.tuning import AxisTuning, NoiseEstimate
@@ -37,7 +37,7 @@ LOOP = Scenario(kind="loop", passes=1, length_m=8.0, vio_rate_hz=10.0)
 
 @cache
 def flown(scenario: Scenario, settings: Settings, *mistakes: str) -> Analysis:
-    return find_faults(
+    return analyse_comparison(
         compare(simulate_flight(scenario, parse_faults(mistakes)), settings, axes=AXES)
     )
 
@@ -236,5 +236,6 @@ def test_advice_states_height_noise_if_it_differs_from_setting(sample: Analysis)
     ekf2 = replace(sample.flight.ekf2, fusion_flags=flags)
     fused = replace(sample, flight=replace(sample.flight, ekf2=ekf2))
     advice = remedies.make_height_noise_advice(fused, tuning, 0.1)
-    assert "height noise of the source is 0.6 m. Report a variance of 0.36 m² for z" in advice
+    assert "height noise of the source is 0.6 m. " in advice
+    assert "send each position with a variance of 0.36 m² for z." in advice
     assert remedies.make_height_noise_advice(fused, tuning, 0.4) == ""

@@ -11,8 +11,8 @@ from flights import unexplained
 from px4fuse.analysis import Analysis
 from px4fuse.comparison.difference_steps import (
     add_cause_sentences,
-    estimate_wrong_settings,
     explain_ekf2_difference,
+    find_corrected_noise_settings,
 )
 from px4fuse.ekf2.steps import (
     MEASUREMENT_NOISE_STEP,
@@ -137,7 +137,7 @@ def test_kf_ekf2_difference_text_names_largest_contribution(sample, share, text)
 
 def test_kf_ekf2_difference_text_begins_with_wrong_kf_setting(sample: Analysis) -> None:
     comparison = compare(sample.flight, Settings(sigma_a_m_s2=0.001), axes=("aisle",))
-    corrected = estimate_wrong_settings(comparison, sample.tuning)
+    corrected = find_corrected_noise_settings(comparison, sample.tuning)
     assert corrected == {"sigma_a_m_s2": pytest.approx(0.363, abs=0.01)}
     explained = explain_ekf2_difference(comparison, sample.ekf2_model, sample.clock, corrected)[
         "aisle"
@@ -145,4 +145,4 @@ def test_kf_ekf2_difference_text_begins_with_wrong_kf_setting(sample: Analysis) 
     assert explained.corrected == corrected
     assert explained.position_mean_square_m2 < 0.01
     assert "--sigma-a 0.363" in explained.sentences[0]
-    assert estimate_wrong_settings(sample, sample.tuning) == {}
+    assert find_corrected_noise_settings(sample, sample.tuning) == {}

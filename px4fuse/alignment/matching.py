@@ -8,8 +8,8 @@ import pandas as pd
 
 from px4fuse.alignment import time_and_pose_fit, tracks
 from px4fuse.alignment.time_and_pose_fit import (
-    INTERPOLATION_RESIDUAL_M,
-    MIN_CONCORDANCE,
+    INTERPOLATION_ERROR_M,
+    MIN_CONCORDANCE_TO_ACCEPT_MATCH,
     CorrelationPeak,
     TrackFit,
 )
@@ -17,26 +17,26 @@ from px4fuse.alignment.tracks import EKF2_REFERENCE, IMU_REFERENCE, NoMatchError
 from px4fuse.flight.model import Flight, Unavailable
 from px4fuse.trajectory.time_offset import GRID_STEP_S, MIN_SECOND_PEAK_RATIO
 
-# Frames to try if the yaw is estimated; without nwu, which is enu rotated by 90°
-ESTIMATED_YAW_FRAMES = ("ned", "enu")
-# Frames to try if the user gives the yaw; without eus and edn (y up or down), because a level
-# flight along one axis cannot distinguish them from frames with z up
-FIXED_YAW_FRAMES = ("ned", "enu", "nwu")
+# Frames to try if the yaw is estimated. nwu is omitted, because it is enu with another yaw
+FRAMES_FOR_ESTIMATED_YAW = ("ned", "enu")
+# Frames to try if the user gives the yaw. eus and edn (y vertical) are omitted, because in a level
+# flight along one axis they fit as well as frames with z vertical
+FRAMES_FOR_GIVEN_YAW = ("ned", "enu", "nwu")
 # Maximum time span (s) of a position file, which limits the computing time to five seconds
 MAX_FILE_DURATION_S = 86400.0
-# Minimum concordance correlation coefficient (Lin 1989) of a position file with EKF2's position or
-# the IMU, for a match that is reported without a warning
-MIN_RELIABLE_CONCORDANCE = {EKF2_REFERENCE: 0.9, IMU_REFERENCE: 0.7}
+# Minimum concordance correlation coefficient (Lin 1989) between position file and reference: a
+# match with a smaller coefficient is reported with a warning
+MIN_CONCORDANCE_WITHOUT_WARNING = {EKF2_REFERENCE: 0.9, IMU_REFERENCE: 0.7}
 # Maximum standard deviation (s) of an accepted time offset
 MAX_TIME_OFFSET_SIGMA_S = 0.5
-# Minimum ratio of the residuals in the second best and the best frame; with a smaller ratio, the
-# frame is ambiguous
-MIN_FRAME_RESIDUAL_RATIO = 1.3
+# Minimum ratio of the residual in the second best frame to the residual in the best frame. With a
+# smaller ratio, the frame is ambiguous
+MIN_SECOND_TO_BEST_FRAME_RESIDUAL_RATIO = 1.3
 # A misaligned frame is reported only if the position residual with the given yaw (default 0) is
 # more than this many times the residual with estimated yaw
-MIN_MISALIGNED_RESIDUAL_RATIO = 2.0
+MIN_GIVEN_TO_ESTIMATED_YAW_RESIDUAL_RATIO = 2.0
 # Minimum position residual (m, RMS) with the given yaw, to report a misaligned frame
-MIN_MISALIGNED_RESIDUAL_M = 0.3
+MIN_RESIDUAL_OF_MISALIGNED_FRAME_M = 0.3
 
 
 @dataclass(frozen=True)
@@ -73,24 +73,24 @@ class Match:
     rms_m_by_frame : dict from frame to float
         RMS position residual in each tried frame, best first.
     fit : TrackFit
-        Fit with the yaw from the user; equal to ``free_yaw_fit`` if the user gave no yaw.
-    free_yaw_fit : TrackFit
+        Fit with the user's yaw; equal to ``estimated_yaw_fit`` if the user gave no yaw.
+    estimated_yaw_fit : TrackFit
         Fit with estimated yaw.
     is_rotated : bool
-        True if the yaw from the user is wrong: ``free_yaw_fit`` is much better than ``fit``.
+        True if the yaw from the user is wrong: ``estimated_yaw_fit`` is much better than ``fit``.
     """
 
     reference: SampledTrack
     frame: str
     rms_m_by_frame: dict[str, float]
     fit: TrackFit
-    free_yaw_fit: TrackFit
+    estimated_yaw_fit: TrackFit
     is_rotated: bool
 
     @property
     def time_offset_fit(self) -> TrackFit:
-        """Fit for the time offset: with estimated yaw if the user's yaw is wrong."""
-        return self.free_yaw_fit if self.is_rotated else self.fit
+        """Fit that gives the time offset. It estimates the yaw if the user's yaw is wrong."""
+        return self.estimated_yaw_fit if self.is_rotated else self.fit
 
     @property
     def residuals_text(self) -> str:
@@ -110,23 +110,23 @@ def find_match(flight: Flight, problem: AlignmentProblem) -> Match | None:
     NoMatchError
         Both fail, so an option that the user did not give cannot be estimated.
     """
-    value_by_option = {
+    user_value_by_option = {
         "clock_offset_s": problem.lag_s,
         "frame": problem.frames[0] if len(problem.frames) == 1 else None,
         "yaw_deg": problem.yaw_rad,
     }
-    missing_options = [f"`{name}`" for name, value in value_by_option.items() if value is None]
+    missing_options = [f"`{name}`" for name, value in user_value_by_option.items() if value is None]
     reasons = []
-    make_reference_functions = [tracks.make_ekf2_references]
+    reference_factories = [tracks.make_ekf2_references]
     # The IMU is used only to estimate missing options: its band-pass filtered motion is not
     # accurate enough for checking given options
     if missing_options:
-        make_reference_functions.append(tracks.make_imu_references)
-    for make_references in make_reference_functions:
+        reference_factories.append(tracks.make_imu_references)
+    for make_references in reference_factories:
         try:
             match = _find_best_match(make_references(flight), problem)
             _require_unique_match(match)
-            return _refit_with_corrected_resets(flight, match, problem)
+            return _refit_without_origin_resets(flight, match, problem)
         except NoMatchError as error:
             if error.remedy and missing_options:
                 raise
@@ -145,7 +145,9 @@ def _find_best_match(references: list[SampledTrack], problem: AlignmentProblem) 
         raise NoMatchError(
             "the position file covers more than one day; shorten the file to the flight"
         )
-    frames = problem.frames or (ESTIMATED_YAW_FRAMES if yaw_rad is None else FIXED_YAW_FRAMES)
+    frames = problem.frames or (
+        FRAMES_FOR_ESTIMATED_YAW if yaw_rad is None else FRAMES_FOR_GIVEN_YAW
+    )
     if (
         tracks.compute_horizontal_range_m(tracks.convert_to_ned(samples, frames[0]))
         < tracks.MIN_MOTION_M
@@ -157,50 +159,55 @@ def _find_best_match(references: list[SampledTrack], problem: AlignmentProblem) 
     matches = []
     for reference in references:
         reference_name = reference.name
-        fit_frame = partial(_fit_in_frame, problem, reference)
-        frames_and_fits = [(frame, fit_frame(frame, yaw_rad)) for frame in frames]
+        fit_file_in_frame = partial(_fit_file_in_frame, problem, reference)
+        frames_and_fits = [(frame, fit_file_in_frame(frame, yaw_rad)) for frame in frames]
         frames_and_fits.sort(key=lambda frame_and_fit: frame_and_fit[1].residual_rms_m)
         best_frame, fit = frames_and_fits[0]
-        free_yaw_fit = fit if yaw_rad is None else fit_frame(best_frame, None)
-        is_rotated = is_reliable_fit(free_yaw_fit, reference_name) and (
-            fit.concordance < MIN_CONCORDANCE[reference_name]
-            or needs_rotation(fit.horizontal_rms_m, free_yaw_fit, reference_name)
+        estimated_yaw_fit = fit if yaw_rad is None else fit_file_in_frame(best_frame, None)
+        is_rotated = is_reliable_fit(estimated_yaw_fit, reference_name) and (
+            fit.concordance < MIN_CONCORDANCE_TO_ACCEPT_MATCH[reference_name]
+            or needs_rotation(fit.horizontal_rms_m, estimated_yaw_fit, reference_name)
         )
         rms_m_by_frame = {frame: fit.residual_rms_m for frame, fit in frames_and_fits}
-        matches.append(Match(reference, best_frame, rms_m_by_frame, fit, free_yaw_fit, is_rotated))
+        matches.append(
+            Match(reference, best_frame, rms_m_by_frame, fit, estimated_yaw_fit, is_rotated)
+        )
     return min(matches, key=lambda match: match.time_offset_fit.residual_rms_m)
 
 
-def needs_rotation(horizontal_rms_m: float, free_yaw_fit: TrackFit, reference: str) -> bool:
+def needs_rotation(horizontal_rms_m: float, estimated_yaw_fit: TrackFit, reference: str) -> bool:
     """Return True if the fit with estimated yaw has a residual far below ``horizontal_rms_m``.
 
-    The residual must be below ``horizontal_rms_m`` / MIN_MISALIGNED_RESIDUAL_RATIO.
+    The residual must be below ``horizontal_rms_m`` / MIN_GIVEN_TO_ESTIMATED_YAW_RESIDUAL_RATIO.
     """
-    return horizontal_rms_m > MIN_MISALIGNED_RESIDUAL_RATIO * free_yaw_fit.horizontal_rms_m and (
-        horizontal_rms_m > MIN_MISALIGNED_RESIDUAL_M or reference == IMU_REFERENCE
+    return (
+        horizontal_rms_m
+        > MIN_GIVEN_TO_ESTIMATED_YAW_RESIDUAL_RATIO * estimated_yaw_fit.horizontal_rms_m
+        and (horizontal_rms_m > MIN_RESIDUAL_OF_MISALIGNED_FRAME_M or reference == IMU_REFERENCE)
     )
 
 
 def is_reliable_fit(fit: TrackFit, reference: str) -> bool:
     return (
-        fit.concordance >= MIN_RELIABLE_CONCORDANCE[reference]
-        and fit.second_peak_ratio >= MIN_SECOND_PEAK_RATIO
+        fit.concordance >= MIN_CONCORDANCE_WITHOUT_WARNING[reference]
+        and fit.second_to_best_residual_ratio >= MIN_SECOND_PEAK_RATIO
     )
 
 
 def _require_unique_match(match: Match) -> None:
     reference_name = match.reference.name
     fit = match.time_offset_fit
-    if fit.concordance < MIN_CONCORDANCE[reference_name]:
+    if fit.concordance < MIN_CONCORDANCE_TO_ACCEPT_MATCH[reference_name]:
         raise NoMatchError(
             f"the position file does not match the {reference_name}: Lin's concordance correlation "
-            f"coefficient is {fit.concordance:.2f} (at least {MIN_CONCORDANCE[reference_name]:g} "
-            "is needed)"
+            f"coefficient is {fit.concordance:.2f} (at least "
+            f"{MIN_CONCORDANCE_TO_ACCEPT_MATCH[reference_name]:g} is needed)"
         )
     ambiguity_text = ""
-    if fit.second_peak_ratio < MIN_SECOND_PEAK_RATIO:
+    if fit.second_to_best_residual_ratio < MIN_SECOND_PEAK_RATIO:
         ambiguity_text = (
-            f"two time offsets that differ by {abs(fit.second_peak_lag_s):.1f} s fit equally well"
+            f"two time offsets that differ by {abs(fit.second_peak_lag_difference_s):.1f} s fit "
+            "equally well"
         )
     elif fit.lag_sigma_s is not None and fit.lag_sigma_s > MAX_TIME_OFFSET_SIGMA_S:
         ambiguity_text = (
@@ -214,9 +221,9 @@ def _require_unique_match(match: Match) -> None:
         )
     if len(match.rms_m_by_frame) > 1:
         best_residual_m, second_best_residual_m = (
-            np.hypot(m, INTERPOLATION_RESIDUAL_M) for m in [*match.rms_m_by_frame.values()][:2]
+            np.hypot(m, INTERPOLATION_ERROR_M) for m in [*match.rms_m_by_frame.values()][:2]
         )
-        if second_best_residual_m < MIN_FRAME_RESIDUAL_RATIO * best_residual_m:
+        if second_best_residual_m < MIN_SECOND_TO_BEST_FRAME_RESIDUAL_RATIO * best_residual_m:
             raise NoMatchError(
                 "the frame of the position file cannot be estimated, because several frames have "
                 f"similar residuals against the {reference_name} ({match.residuals_text})",
@@ -224,7 +231,7 @@ def _require_unique_match(match: Match) -> None:
             )
 
 
-def _refit_with_corrected_resets(flight: Flight, match: Match, problem: AlignmentProblem) -> Match:
+def _refit_without_origin_resets(flight: Flight, match: Match, problem: AlignmentProblem) -> Match:
     ekf2 = flight.ekf2
     fit = match.time_offset_fit
     if match.reference.name == IMU_REFERENCE or isinstance(ekf2, Unavailable) or not ekf2.resets:
@@ -239,12 +246,12 @@ def _refit_with_corrected_resets(flight: Flight, match: Match, problem: Alignmen
         ekf2_track,
         is_lag_estimated=problem.lag_s is None,
     )
-    free_yaw_fit = refit(match.free_yaw_fit, None)
-    fit = free_yaw_fit if problem.yaw_rad is None else refit(match.fit, problem.yaw_rad)
-    return replace(match, reference=ekf2_track, fit=fit, free_yaw_fit=free_yaw_fit)
+    estimated_yaw_fit = refit(match.estimated_yaw_fit, None)
+    fit = estimated_yaw_fit if problem.yaw_rad is None else refit(match.fit, problem.yaw_rad)
+    return replace(match, reference=ekf2_track, fit=fit, estimated_yaw_fit=estimated_yaw_fit)
 
 
-def _fit_in_frame(
+def _fit_file_in_frame(
     problem: AlignmentProblem, reference: SampledTrack, frame: str, yaw_rad: float | None
 ) -> TrackFit:
     file_track = tracks.convert_to_ned(problem.samples, frame)

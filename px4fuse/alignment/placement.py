@@ -1,11 +1,12 @@
 """Alignment of an external position file with a flight: time offset, frame, yaw and origin.
 
-The computer of a UWB system has a separate clock and frame. The track of the file is matched with
-EKF2's position or, if this is not suitable, with the acceleration integrated twice. The time offset
-is found by cross-correlation at all lags, and refined by robust least squares. It is relative to
-the reference: if EKF2 fused late positions, it includes their delay.
+A UWB system has its own clock and its own coordinate frame. Its track is matched with EKF2's
+position. If EKF2's position is not suitable, the acceleration integrated twice is used.
 
-Horizontal positions are complex numbers, north + i·east: a rotation in yaw is a factor e^{i·yaw}.
+The time offset is found by cross-correlation at all lags and refined by robust least squares. If
+EKF2 fused late positions, the estimated time offset contains the delay of these positions.
+
+Horizontal positions are complex numbers, north + i·east. A yaw rotation is a factor e^{i·yaw}.
 """
 
 from collections.abc import Iterator
@@ -18,7 +19,10 @@ from msgspec import structs
 
 from px4fuse.alignment import matching, tracks
 from px4fuse.alignment.matching import AlignmentProblem, Match
-from px4fuse.alignment.time_and_pose_fit import MIN_CONCORDANCE, compute_clipped_rms_m
+from px4fuse.alignment.time_and_pose_fit import (
+    MIN_CONCORDANCE_TO_ACCEPT_MATCH,
+    compute_clipped_rms_m,
+)
 from px4fuse.alignment.tracks import EKF2_REFERENCE, IMU_REFERENCE, NoMatchError
 from px4fuse.convention.axes import METRES_PER_UNIT
 from px4fuse.convention.check import check_convention
@@ -49,7 +53,7 @@ MAX_CONVENTION_CHECK_SPAN_S = 7200.0
 def _explain_mismatch(
     flight: Flight, problem: AlignmentProblem, metres_per_unit: float
 ) -> tuple[str, str] | None:
-    """Return error message and advice if the IMU contradicts axes or unit of the file."""
+    """Return error message and advice if the IMU shows that axes or unit of the file are wrong."""
     samples = problem.samples
     span_s = max(float(samples.index[-1] - samples.index[0]), flight.log.duration_s)
     if span_s > MAX_CONVENTION_CHECK_SPAN_S:
@@ -60,8 +64,8 @@ def _explain_mismatch(
         positions.to_numpy(), time_index(time_s.to_numpy()), Columns.POSITION
     )
     track = PositionTrack("", POSITION_FILE_ORIGIN, "", position_samples, "unknown", "", ())
-    search_limits = {} if problem.lag_s is not None else {"max_time_offset_s": span_s}
-    convention = check_convention(flight, track, **search_limits)
+    time_offset_limits = {} if problem.lag_s is not None else {"max_time_offset_s": span_s}
+    convention = check_convention(flight, track, **time_offset_limits)
     if convention is None or convention.verdict != "determined":
         return None
     axes, faults = convention.axes, []
@@ -82,9 +86,9 @@ def _explain_mismatch(
     return "; ".join(fault_texts), " ".join(actions)
 
 
-# A time offset is ambiguous if the position residual at the second best time offset is less than
-# this many times the residual at the best one. Correct matches with the noisy IMU: 1.4 to 1.7
-MAX_SIMILAR_RESIDUAL_RATIO = {EKF2_REFERENCE: 2.0, IMU_REFERENCE: 1.4}
+# Minimum ratio of the position residual at the second best time offset to the residual at the best
+# time offset. A smaller ratio gives a warning. Correct matches with the noisy IMU: 1.4 to 1.7
+MIN_RESIDUAL_RATIO_WITHOUT_WARNING = {EKF2_REFERENCE: 2.0, IMU_REFERENCE: 1.4}
 # Maximum difference (s) between the UNIX clocks of computers in a lab: a larger difference
 # indicates another flight
 MAX_UNIX_CLOCK_DIFFERENCE_S = 60.0
@@ -120,14 +124,14 @@ def align_position_file(
     SettingsError
         An option is invalid.
     MissingDataError
-        An option cannot be estimated, or file and log do not overlap in time.
+        An omitted option cannot be estimated, or file and log do not overlap in time.
     """
     _check_options(frame, yaw_deg, clock_offset_s)
     samples = select_valid_rows(recording.samples, ["x_m", "y_m"])
-    if len(samples) < tracks.MIN_SAMPLES:
+    if len(samples) < tracks.MIN_MATCHED_SAMPLES:
         raise MissingDataError(
             f"{recording.name} contains {len(samples)} positions; at least "
-            f"{tracks.MIN_SAMPLES} are needed",
+            f"{tracks.MIN_MATCHED_SAMPLES} are needed",
             "Check that the position file contains the whole flight.",
         )
     start_s, end_s = samples.index[[0, -1]].tolist()
@@ -163,7 +167,7 @@ def align_position_file(
         frame_reason = "the column names of the position file contain the axis directions"
     yaw_reason = "the yaw was given with --position-yaw"
     if yaw_deg is None:
-        yaw_reason = "the position file is assumed not to be rotated against EKF2's frame"
+        yaw_reason = "without --position-yaw, px4fuse assumes a yaw of 0° to EKF2's frame"
     alignment, aligned_samples = _apply_alignment(
         flight, recording, problem, match, frame_reason, yaw_reason, clock_offset_s
     )
@@ -244,11 +248,11 @@ def _apply_alignment(
         reference_name = match.reference.name
         if len(problem.frames) != 1:
             frame_reason = (
-                f"of all tried frames, {frame} has the smallest residual against the "
+                f"{frame} is the tested frame with the smallest residual against the "
                 f"{reference_name} ({match.residuals_text})"
             )
             if is_yaw_estimated and frame == "enu":
-                frame_reason += " (nwu was not tried, because nwu is enu rotated by 90°)"
+                frame_reason += "; nwu was not tested, because it is enu with another yaw"
         if is_yaw_estimated:
             yaw_rad = match.fit.yaw_rad
             yaw_sigma_deg = float(np.degrees(match.fit.yaw_sigma_rad or 0.0))
@@ -259,8 +263,8 @@ def _apply_alignment(
             time_offset_sigma_s = match.time_offset_fit.lag_sigma_s
             clock_offset_s = lag_s + (flight.log.boot_time_s - float(samples.index[0]))
             time_offset_reason = (
-                f"the offset was estimated with the {reference_name}; if the {reference_name} is "
-                "late, the offset contains this delay"
+                f"the position file was matched with the {reference_name}; a delay of the "
+                f"{reference_name} is part of the offset"
             )
         reference_correlation = float(
             (np.exp(-1j * yaw_rad) * match.time_offset_fit.coherence).real
@@ -281,7 +285,7 @@ def _apply_alignment(
         ekf2_comparison
         and not (is_yaw_estimated or frame_conflict)
         and reference_correlation is not None
-        and reference_correlation < MIN_CONCORDANCE[EKF2_REFERENCE]
+        and reference_correlation < MIN_CONCORDANCE_TO_ACCEPT_MATCH[EKF2_REFERENCE]
     ):
         warnings.append(
             "The position file does not match the EKF2 position (correlation "
@@ -289,11 +293,11 @@ def _apply_alignment(
         )
     unix_start_s = flight.log.start_unix_s
     if recording.clock_kind == "UNIX" and unix_start_s is not None and clock_offset_s is not None:
-        difference_s = abs(flight.log.boot_time_s - clock_offset_s - unix_start_s)
-        if difference_s >= MAX_UNIX_CLOCK_DIFFERENCE_S:
+        unix_time_difference_s = abs(flight.log.boot_time_s - clock_offset_s - unix_start_s)
+        if unix_time_difference_s >= MAX_UNIX_CLOCK_DIFFERENCE_S:
             warnings.append(
-                f"The UNIX times of position file and log differ by {difference_s:.0f} s. Check "
-                "that both files are of the same flight."
+                f"The UNIX times of position file and log differ by {unix_time_difference_s:.0f} "
+                "s. Check that both files are of the same flight."
             )
     alignment = Alignment(
         frame=frame,
@@ -325,7 +329,7 @@ def _compare_with_ekf2(
     except NoMatchError:
         return None
     ekf2_position_m, is_known = ekf2_track.at(aligned_samples.index.to_numpy())
-    if np.count_nonzero(is_known) < tracks.MIN_SAMPLES:
+    if np.count_nonzero(is_known) < tracks.MIN_MATCHED_SAMPLES:
         return None
     file_position_m = aligned_samples[Columns.POSITION[:2]].to_numpy()[is_known]
     ekf2_position_m = ekf2_position_m[is_known, :2]
@@ -340,7 +344,7 @@ def _compare_with_ekf2(
 
 def _describe_frame_conflict(match: Match, distance_to_ekf2_m: Array | None, yaw_rad: float) -> str:
     reference_name = match.reference.name
-    fit = match.free_yaw_fit
+    fit = match.estimated_yaw_fit
     is_rotated = match.is_rotated
     shift_text, shift_m = "", 0.0
     if distance_to_ekf2_m is not None:
@@ -357,7 +361,7 @@ def _describe_frame_conflict(match: Match, distance_to_ekf2_m: Array | None, yaw
     if shift_text and abs(yaw_deg) < MIN_REPORTED_YAW_DEG and shift_m < MIN_REPORTED_SHIFT_M:
         return ""
     return (
-        f"The frame of the position file is rotated by {yaw_deg:.1f}° against the "
+        f"The frame of the position file is rotated by {yaw_deg:.1f}° relative to the "
         f"{reference_name}. {shift_text}Give --position-yaw auto to estimate yaw and origin."
     )
 
@@ -365,19 +369,19 @@ def _describe_frame_conflict(match: Match, distance_to_ekf2_m: Array | None, yaw
 def _find_warnings(match: Match, is_yaw_estimated: bool) -> Iterator[str]:
     reference_name = match.reference.name
     fit = match.time_offset_fit
-    if fit.concordance < matching.MIN_RELIABLE_CONCORDANCE[reference_name]:
+    if fit.concordance < matching.MIN_CONCORDANCE_WITHOUT_WARNING[reference_name]:
         yield (
             f"The match of the position file with the {reference_name} is poor: Lin's concordance "
             f"correlation coefficient is {fit.concordance:.2f}."
         )
-    if fit.second_peak_ratio < MAX_SIMILAR_RESIDUAL_RATIO[reference_name]:
+    if fit.second_to_best_residual_ratio < MIN_RESIDUAL_RATIO_WITHOUT_WARNING[reference_name]:
         yield (
-            f"A time offset that differs by {fit.second_peak_lag_s:+.1f} s fits nearly as well: "
-            f"the residual is {fit.second_peak_ratio:.1f} times larger. Check the time offset, or "
-            "set the time offset with --clock-offset."
+            f"A time offset that differs by {fit.second_peak_lag_difference_s:+.1f} s fits nearly "
+            f"as well: the residual is {fit.second_to_best_residual_ratio:.1f} times larger. Check "
+            "the time offset, or set the time offset with --clock-offset."
         )
     if is_yaw_estimated and reference_name == IMU_REFERENCE:
         yield (
-            "The yaw estimated against the IMU has an error of 1° to 6°. The origin of the file's "
-            "frame is unknown and set to 0."
+            "The yaw was estimated with the IMU, with an error of 1° to 6°. The origin of the "
+            "file's frame is unknown and set to 0."
         )

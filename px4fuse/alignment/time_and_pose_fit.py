@@ -1,4 +1,4 @@
-"""Fit of positions to a reference: lag by cross-correlation, then lag, yaw and origin together."""
+"""Fit of a position file to a reference: time offset (lag), yaw and origin."""
 
 from dataclasses import dataclass, replace
 
@@ -12,19 +12,19 @@ from px4fuse.trajectory.correlation import autocovariance, compute_moments
 from px4fuse.trajectory.time_offset import GRID_STEP_S
 
 # Maximum difference (s) between the lag fitted by least squares and the lag of the correlation peak
-MAX_LAG_FROM_PEAK_S = 1.0
-# Minimum concordance correlation coefficient (Lin 1989) of a position file with EKF2's position or
-# the IMU, to accept the match
-MIN_CONCORDANCE = {EKF2_REFERENCE: 0.7, IMU_REFERENCE: 0.5}
-# Lower limit of 1 - concordance in the log-likelihood gain -N·ln(1 - concordance). Without it, few
-# samples with a concordance near 1 would have a larger gain than a match of many samples
-MIN_ONE_MINUS_CONCORDANCE = 1e-4
+MAX_LAG_CORRECTION_S = 1.0
+# Minimum concordance correlation coefficient (Lin 1989) between position file and reference. With a
+# smaller coefficient, the match is rejected
+MIN_CONCORDANCE_TO_ACCEPT_MATCH = {EKF2_REFERENCE: 0.7, IMU_REFERENCE: 0.5}
+# Lower limit of 1 - concordance. Without this limit, a lag with few, nearly equal samples would be
+# preferred to a match of many samples
+MIN_CONCORDANCE_DEFICIT = 1e-4
 # Minimum distance (s) between the lags of two separate correlation peaks
 MIN_PEAK_DISTANCE_S = 3.0
-# Residual (m) of identical tracks, which is caused by interpolation on the time grid
-INTERPOLATION_RESIDUAL_M = 0.05
-# Limit (m) to which position residuals are clipped in an RMS, because they may be outliers
-MAX_RESIDUAL_M = 1.0
+# Error (m) of the interpolation of positions to the time grid
+INTERPOLATION_ERROR_M = 0.05
+# Larger position residuals (m) are set to this value before an RMS, because they may be outliers
+RESIDUAL_CLIP_LIMIT_M = 1.0
 
 
 @dataclass(frozen=True)
@@ -37,16 +37,16 @@ class CorrelationPeak:
         Time to add to the times of the file, which start at 0.
     concordance : float
         Lin's concordance correlation coefficient, 1 for equal tracks; NaN if the user gave the lag.
-    second_peak_lag_s : float
+    second_peak_lag_difference_s : float
         Second best lag minus best lag; NaN without a second peak.
-    second_peak_ratio : float
+    second_to_best_residual_ratio : float
         Residual (RMS) at the second best lag over the residual at the best lag.
     """
 
     lag_s: float
-    concordance: float = float("nan")
-    second_peak_lag_s: float = float("nan")
-    second_peak_ratio: float = float("inf")
+    concordance: float = np.nan
+    second_peak_lag_difference_s: float = np.nan
+    second_to_best_residual_ratio: float = np.inf
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -64,7 +64,8 @@ class TrackFit(CorrelationPeak):
     coherence : complex
         Correlation of file and reference; its phase is the yaw.
     horizontal_rms_m, residual_rms_m : float
-        RMS residual per horizontal axis, and of the vector (with height, if available).
+        RMS position residual per horizontal axis, and RMS length of the residual vector. The
+        vector contains the height if available.
     """
 
     lag_sigma_s: float | None
@@ -79,10 +80,10 @@ class TrackFit(CorrelationPeak):
 def find_correlation_peak(
     file_track: SampledTrack, reference: SampledTrack, yaw_rad: float | None
 ) -> CorrelationPeak:
-    """Find the lag at which a position file matches a reference best.
+    """Return the lag at which a position file matches a reference best.
 
-    The lag maximises -N·ln(1 - concordance), with N common samples and Lin's concordance
-    correlation coefficient. This is the log-likelihood gain over two unrelated tracks.
+    The score of a lag is -N·ln(1 - c): N is the number of common samples, c is Lin's concordance
+    correlation coefficient. The best lag has the largest score.
 
     Raises
     ------
@@ -93,65 +94,67 @@ def find_correlation_peak(
         np.count_nonzero(file_track.is_valid), np.count_nonzero(reference.is_valid)
     )
     min_sample_count = max(
-        tracks.MIN_SAMPLES, min(tracks.MIN_OVERLAP_S / GRID_STEP_S, shorter_sample_count / 2)
+        tracks.MIN_MATCHED_SAMPLES,
+        min(tracks.MIN_OVERLAP_S / GRID_STEP_S, shorter_sample_count / 2),
     )
     if shorter_sample_count < min_sample_count:
         raise NoMatchError("position file and reference have too few common samples for a match")
-    track_moments = compute_moments(
+    moments_by_lag = compute_moments(
         file_track.to_complex_m(), reference.to_complex_m(), file_track.is_valid, reference.is_valid
     )
-    common_count = track_moments.count
-    covariance = track_moments.covariance
-    energy_sum = track_moments.square_sum_a + track_moments.square_sum_b
-    has_overlap = common_count >= min_sample_count
+    common_sample_counts = moments_by_lag.count
+    covariance = moments_by_lag.covariance
+    square_sum_m2 = moments_by_lag.square_sum_a + moments_by_lag.square_sum_b
+    has_overlap = common_sample_counts >= min_sample_count
     # Exclude lags at which both tracks are at rest: their variance is a rounding error
-    has_overlap &= energy_sum > 1e-9 * np.max(energy_sum)
-    real_covariance = (
+    has_overlap &= square_sum_m2 > 1e-9 * np.max(square_sum_m2)
+    rotated_covariance = (
         np.abs(covariance) if yaw_rad is None else (np.exp(-1j * yaw_rad) * covariance).real
     )
-    concordance = np.zeros_like(energy_sum)
-    concordance[has_overlap] = 2.0 * real_covariance[has_overlap] / energy_sum[has_overlap]
-    log_likelihood_gain = -common_count * np.log(
-        np.maximum(1.0 - concordance, MIN_ONE_MINUS_CONCORDANCE)
+    concordance = np.zeros_like(square_sum_m2)
+    concordance[has_overlap] = 2.0 * rotated_covariance[has_overlap] / square_sum_m2[has_overlap]
+    log_likelihood_gain = -common_sample_counts * np.log(
+        np.maximum(1.0 - concordance, MIN_CONCORDANCE_DEFICIT)
     )
     best_index = int(np.argmax(np.where(has_overlap, log_likelihood_gain, -np.inf)))
 
     def compute_lag_s(index: int) -> float:
         return float(reference.time_s[0]) + (index - len(file_track.is_valid) + 1) * GRID_STEP_S
 
-    # Lags next to the best lag are no second peak: lags up to the first one with less than half of
-    # the best concordance, but at most MIN_PEAK_DISTANCE_S from the best lag
+    # Lags near the best lag belong to the same peak and are not a second peak. The peak ends where
+    # the concordance falls below half of its maximum, or at MIN_PEAK_DISTANCE_S from the best lag
     low_concordance_indices = np.flatnonzero(concordance < 0.5 * concordance[best_index])
     peak_start_index = np.max(
         low_concordance_indices[low_concordance_indices < best_index], initial=-1
     )
     peak_end_index = np.min(
-        low_concordance_indices[low_concordance_indices > best_index], initial=len(common_count)
+        low_concordance_indices[low_concordance_indices > best_index],
+        initial=len(common_sample_counts),
     )
-    is_other_peak = (
+    can_be_second_peak = (
         has_overlap
-        & (common_count >= 0.5 * common_count[best_index])
-        & (energy_sum >= 0.25 * energy_sum[best_index])
-        & (concordance >= MIN_CONCORDANCE[reference.name])
+        & (common_sample_counts >= 0.5 * common_sample_counts[best_index])
+        & (square_sum_m2 >= 0.25 * square_sum_m2[best_index])
+        & (concordance >= MIN_CONCORDANCE_TO_ACCEPT_MATCH[reference.name])
     )
     min_peak_distance_steps = round(MIN_PEAK_DISTANCE_S / GRID_STEP_S)
     best_peak_start_index = max(peak_start_index + 1, best_index - min_peak_distance_steps)
-    is_other_peak[
+    can_be_second_peak[
         best_peak_start_index : min(peak_end_index, best_index + min_peak_distance_steps + 1)
     ] = False
     peak = CorrelationPeak(compute_lag_s(best_index), float(concordance[best_index]))
-    if not is_other_peak.any():
+    if not can_be_second_peak.any():
         return peak
     # RMS residual (m) per axis at each lag, plus the interpolation error of the time grid
-    mean_square_m2 = np.maximum(energy_sum - 2.0 * real_covariance, 0.0) / (
-        2.0 * np.maximum(common_count, 1.0)
+    mean_square_residual_m2 = np.maximum(square_sum_m2 - 2.0 * rotated_covariance, 0.0) / (
+        2.0 * np.maximum(common_sample_counts, 1.0)
     )
-    residual_m = np.sqrt(mean_square_m2 + INTERPOLATION_RESIDUAL_M**2)
-    second_peak_index = int(np.argmin(np.where(is_other_peak, residual_m, np.inf)))
+    residual_m = np.sqrt(mean_square_residual_m2 + INTERPOLATION_ERROR_M**2)
+    second_peak_index = int(np.argmin(np.where(can_be_second_peak, residual_m, np.inf)))
     return replace(
         peak,
-        second_peak_lag_s=compute_lag_s(second_peak_index) - compute_lag_s(best_index),
-        second_peak_ratio=float(residual_m[second_peak_index] / residual_m[best_index]),
+        second_peak_lag_difference_s=compute_lag_s(second_peak_index) - compute_lag_s(best_index),
+        second_to_best_residual_ratio=float(residual_m[second_peak_index] / residual_m[best_index]),
     )
 
 
@@ -175,16 +178,16 @@ def fit_by_least_squares(
     """
     reference_m, is_known = reference.at(file_track.time_s + peak.lag_s)
     is_used = is_known & file_track.is_valid
-    if np.count_nonzero(is_used) < tracks.MIN_SAMPLES:
+    if np.count_nonzero(is_used) < tracks.MIN_MATCHED_SAMPLES:
         raise NoMatchError(
             f"only {np.count_nonzero(is_used)} positions of the file overlap the "
-            f"{reference.name} in time; at least {tracks.MIN_SAMPLES} are needed"
+            f"{reference.name} in time; at least {tracks.MIN_MATCHED_SAMPLES} are needed"
         )
     reference_time_s = file_track.time_s[is_used] + peak.lag_s
     file_position_m = file_track.to_complex_m()[is_used]
     reference_position_m = (reference_m[:, 0] + 1j * reference_m[:, 1])[is_used]
     centre_m = np.mean(file_position_m)
-    # with a centred track, the errors of yaw and origin are uncorrelated
+    # The track is centred, because the errors of yaw and origin are then uncorrelated
     file_position_m = file_position_m - centre_m
     sigma_product_m2 = float(np.sqrt(np.var(file_position_m) * np.var(reference_position_m)))
     coherence = (
@@ -194,13 +197,13 @@ def fit_by_least_squares(
         if sigma_product_m2 > 0
         else 0j
     )
-    mean_variance_m2 = float(np.var(file_position_m) + np.var(reference_position_m)) / 2.0
+    mean_of_variances_m2 = float(np.var(file_position_m) + np.var(reference_position_m)) / 2.0
     reference_horizontal_position_m = reference.to_complex_m()
 
     # Parameters: origin north and east (m), fitted lag minus lag of the peak (s), yaw (rad)
     reference_mean_m = reference_position_m.mean()
     parameters = np.array([reference_mean_m.real, reference_mean_m.imag, 0.0, np.angle(coherence)])
-    bounds = np.array([np.inf, np.inf, MAX_LAG_FROM_PEAK_S, np.inf])
+    bounds = np.array([np.inf, np.inf, MAX_LAG_CORRECTION_S, np.inf])
     is_fitted = np.array([True, True, is_lag_estimated, yaw_rad is None])
     if yaw_rad is not None:
         parameters[3] = yaw_rad
@@ -208,14 +211,14 @@ def fit_by_least_squares(
     def compute_residuals_m(fitted_parameters: Array) -> Array:
         all_parameters = parameters.copy()
         all_parameters[is_fitted] = fitted_parameters
-        origin_north_m, origin_east_m, lag_from_peak_s, fitted_yaw_rad = all_parameters
-        target_m = np.interp(
-            reference_time_s + lag_from_peak_s, reference.time_s, reference_horizontal_position_m
+        origin_north_m, origin_east_m, lag_correction_s, fitted_yaw_rad = all_parameters
+        reference_at_lag_m = np.interp(
+            reference_time_s + lag_correction_s, reference.time_s, reference_horizontal_position_m
         )
         residuals = (
             np.exp(1j * fitted_yaw_rad) * file_position_m
             + complex(origin_north_m, origin_east_m)
-            - target_m
+            - reference_at_lag_m
         )
         return np.concatenate([residuals.real, residuals.imag])
 
@@ -228,7 +231,7 @@ def fit_by_least_squares(
     )
     residuals = compute_residuals_m(solution.x)
     parameters[is_fitted] = solution.x
-    origin_north_m, origin_east_m, lag_from_peak_s, fitted_yaw_rad = parameters.tolist()
+    origin_north_m, origin_east_m, lag_correction_s, fitted_yaw_rad = parameters.tolist()
     complex_residuals = residuals[: len(file_position_m)] + 1j * residuals[len(file_position_m) :]
     jacobian = np.asarray(solution.jac)
     information = jacobian.T @ jacobian
@@ -240,8 +243,8 @@ def fit_by_least_squares(
         * _compute_autocorrelation_factor(complex_residuals)
     )
     parameter_sigma = np.sqrt(np.maximum(parameter_variance, 0.0))
-    is_lag_at_limit = is_lag_estimated and abs(lag_from_peak_s) > 0.99 * MAX_LAG_FROM_PEAK_S
-    reference_ned_m, _ = reference.at(reference_time_s + lag_from_peak_s)
+    is_lag_at_limit = is_lag_estimated and abs(lag_correction_s) > 0.99 * MAX_LAG_CORRECTION_S
+    reference_ned_m, _ = reference.at(reference_time_s + lag_correction_s)
     down_difference_m = reference_ned_m[:, 2] - file_track.position_m[is_used, 2]
     down_difference_m = down_difference_m[np.isfinite(down_difference_m)]
     origin_down_m = float(np.median(down_difference_m)) if len(down_difference_m) else 0.0
@@ -251,24 +254,26 @@ def fit_by_least_squares(
     )
     concordance = peak.concordance
     if np.isnan(concordance):
-        rotated_coherence = float((np.exp(-1j * fitted_yaw_rad) * coherence).real)
+        correlation_after_rotation = float((np.exp(-1j * fitted_yaw_rad) * coherence).real)
         concordance = (
-            rotated_coherence * sigma_product_m2 / mean_variance_m2 if sigma_product_m2 > 0 else 0.0
+            correlation_after_rotation * sigma_product_m2 / mean_of_variances_m2
+            if sigma_product_m2 > 0
+            else 0.0
         )
-    horizontal_origin_m = (
+    complex_origin_m = (
         complex(origin_north_m, origin_east_m) - np.exp(1j * fitted_yaw_rad) * centre_m
     )
     return TrackFit(
-        lag_s=peak.lag_s + lag_from_peak_s,
+        lag_s=peak.lag_s + lag_correction_s,
         lag_sigma_s=(np.inf if is_lag_at_limit else float(parameter_sigma[2]))
         if is_lag_estimated
         else None,
         concordance=concordance,
-        second_peak_lag_s=peak.second_peak_lag_s,
-        second_peak_ratio=peak.second_peak_ratio,
+        second_peak_lag_difference_s=peak.second_peak_lag_difference_s,
+        second_to_best_residual_ratio=peak.second_to_best_residual_ratio,
         yaw_rad=fitted_yaw_rad,
         yaw_sigma_rad=float(parameter_sigma[-1]) if yaw_rad is None else None,
-        origin_m=np.array([horizontal_origin_m.real, horizontal_origin_m.imag, origin_down_m]),
+        origin_m=np.array([complex_origin_m.real, complex_origin_m.imag, origin_down_m]),
         coherence=coherence,
         horizontal_rms_m=float(horizontal_rms_m),
         residual_rms_m=float(np.sqrt(2.0 * horizontal_rms_m**2 + vertical_rms_m**2)),
@@ -295,5 +300,5 @@ def _compute_autocorrelation_factor(residual: ComplexArray) -> float:
 
 
 def compute_clipped_rms_m(residual_m: Array) -> float:
-    """Return the RMS (m) of residuals that are clipped to MAX_RESIDUAL_M."""
-    return float(np.sqrt(np.mean(np.minimum(np.abs(residual_m), MAX_RESIDUAL_M) ** 2)))
+    """Return the RMS (m) of residuals that are clipped to RESIDUAL_CLIP_LIMIT_M."""
+    return float(np.sqrt(np.mean(np.minimum(np.abs(residual_m), RESIDUAL_CLIP_LIMIT_M) ** 2)))

@@ -1,4 +1,4 @@
-"""Tracks to align: that of a position file, and that of EKF2 or the IMU, in north, east, down."""
+"""Tracks for the alignment (north, east, down): the position file, and EKF2 or IMU as reference."""
 
 from dataclasses import dataclass, replace
 
@@ -28,21 +28,22 @@ from px4fuse.trajectory.time_offset import GRID_STEP_S
 
 EKF2_REFERENCE, IMU_REFERENCE = "EKF2 position", "IMU"
 
-# An interval between two samples is a gap if it is longer than this time (s), and longer than three
-# median intervals
-MIN_GAP_LIMIT_S = 0.5
-# Minimum horizontal motion (m) of a track, to match the track with another track
+# Minimum length (s) of a gap between two samples. A gap is also longer than three median intervals
+MIN_GAP_S = 0.5
+# Minimum horizontal motion (m) of a track that is matched with another track
 MIN_MOTION_M = 0.5
-# Minimum number of positions of a track, to match the track with another track
-MIN_SAMPLES = 10
+# Minimum number of positions of a track that is matched with another track
+MIN_MATCHED_SAMPLES = 10
 # Minimum overlap (s) of two matched tracks, or half of the shorter track if that is less
 MIN_OVERLAP_S = 10.0
 # σ (s) of the Gaussian filter that smooths the steps of EKF2's position at updates
 SMOOTHING_SIGMA_S = 0.2
-# Frequency band in which acceleration integrated twice equals position; at lower frequencies the
-# integral drifts
+# Frequency band (Hz) in which acceleration integrated twice equals position. At lower frequencies,
+# the integral drifts
 BAND_PASS_HZ = (0.1, 1.0)
-BAND_PASS_TRANSIENT_S = 2.0
+# Time (s) near ends and gaps in which the output of the band-pass filter is not used
+BAND_PASS_SETTLING_TIME_S = 2.0
+# Maximum length (s) by which a track is extended at both ends before the band-pass filter
 BAND_PASS_PADDING_S = 10.0
 
 
@@ -96,7 +97,7 @@ def _make_gapless_track(time_s: Array, position_m: Array) -> SampledTrack:
 def resample_to_grid(track: SampledTrack) -> SampledTrack:
     """Resample a track to a regular time grid, and mark samples inside gaps as invalid."""
     grid_s = np.arange(track.time_s[0], track.time_s[-1], GRID_STEP_S)
-    is_known = is_bracketed(grid_s, track.time_s, choose_gap_limit_s(track.time_s, MIN_GAP_LIMIT_S))
+    is_known = is_bracketed(grid_s, track.time_s, choose_gap_limit_s(track.time_s, MIN_GAP_S))
     return SampledTrack(grid_s, track.at(grid_s)[0], is_known)
 
 
@@ -107,9 +108,9 @@ def remove_spikes(track: SampledTrack, window_size: int = 3) -> SampledTrack:
 
 def apply_band_pass(position_m: Array) -> Array:
     """Filter positions on the time grid to the band BAND_PASS_HZ, without delay."""
-    filter_sections = butter(2, BAND_PASS_HZ, "bandpass", fs=1.0 / GRID_STEP_S, output="sos")
+    second_order_sections = butter(2, BAND_PASS_HZ, "bandpass", fs=1.0 / GRID_STEP_S, output="sos")
     return sosfiltfilt(
-        filter_sections,
+        second_order_sections,
         position_m,
         axis=0,
         padlen=min(round(BAND_PASS_PADDING_S / GRID_STEP_S), len(position_m) - 1),
@@ -118,7 +119,7 @@ def apply_band_pass(position_m: Array) -> Array:
 
 def mark_transients(track: SampledTrack) -> SampledTrack:
     """Set ``is_valid`` to False near ends and gaps, where the band-pass filter has transients."""
-    transient_sample_count = round(BAND_PASS_TRANSIENT_S / GRID_STEP_S)
+    transient_sample_count = round(BAND_PASS_SETTLING_TIME_S / GRID_STEP_S)
     return replace(
         track,
         is_valid=binary_erosion(track.is_valid, np.ones(2 * transient_sample_count + 1, bool)),
@@ -132,14 +133,19 @@ def compute_horizontal_range_m(track: SampledTrack) -> float:
 
 def _smooth_ekf2_track(state: pd.DataFrame) -> SampledTrack:
     finite_state = select_valid_rows(state, Columns.POSITION[:2])
-    if len(finite_state) < MIN_SAMPLES:
-        raise NoMatchError(f"the log has fewer than {MIN_SAMPLES} horizontal EKF2 positions")
+    if len(finite_state) < MIN_MATCHED_SAMPLES:
+        raise NoMatchError(
+            f"the log has fewer than {MIN_MATCHED_SAMPLES} horizontal EKF2 positions"
+        )
     position_m = finite_state[Columns.POSITION].to_numpy()
     grid_track = resample_to_grid(_make_gapless_track(finite_state.index.to_numpy(), position_m))
-    smoothed_position_m = gaussian_filter1d(
-        grid_track.position_m, SMOOTHING_SIGMA_S / GRID_STEP_S, axis=0, mode="nearest"
+    return replace(
+        grid_track,
+        position_m=gaussian_filter1d(
+            grid_track.position_m, SMOOTHING_SIGMA_S / GRID_STEP_S, axis=0, mode="nearest"
+        ),
+        name=EKF2_REFERENCE,
     )
-    return replace(grid_track, position_m=smoothed_position_m, name=EKF2_REFERENCE)
 
 
 def make_ekf2_references(flight: Flight) -> list[SampledTrack]:
@@ -165,7 +171,10 @@ def make_ekf2_references(flight: Flight) -> list[SampledTrack]:
 
 
 def make_imu_references(flight: Flight) -> list[SampledTrack]:
-    """Return the IMU acceleration integrated twice, band-pass filtered after each integration."""
+    """Return the IMU's motion as reference: acceleration integrated twice.
+
+    A band-pass filter after each integration removes drift.
+    """
     acceleration = compute_ned_acceleration(flight)
     if isinstance(acceleration, Unavailable):
         raise NoMatchError(f"the log has no acceleration in NED ({acceleration.reason})")
@@ -196,7 +205,8 @@ def align_samples(
     position_m = track.position_m
     axis_order, _ = NED_COMPONENTS_BY_FRAME[frame]
     variance_m2 = samples[["sigma_x_m", "sigma_y_m", "sigma_z_m"]].to_numpy()[:, axis_order] ** 2
-    if yaw_rad:  # mixes north and east: both variances are NaN if σ of one axis is missing
+    # The rotation combines north and east, so both variances are NaN if one σ is missing
+    if yaw_rad:
         c, s = np.cos(yaw_rad), np.sin(yaw_rad)
         yaw_rotation = np.array([[c, -s], [s, c]])
         position_m[:, :2] = position_m[:, :2] @ yaw_rotation.T
@@ -209,7 +219,7 @@ def align_samples(
 
 
 def make_continuous_ekf2_track(ekf2: Ekf2, aligned_samples: pd.DataFrame) -> SampledTrack:
-    """Return EKF2's track without position resets that only move the origin of EKF2's frame."""
+    """Return EKF2's track after removal of resets that only moved the origin of EKF2's frame."""
     track = PositionTrack("", POSITION_FILE_ORIGIN, "", aligned_samples, "NED", "", ())
     segment = Segment(float(aligned_samples.index[0]), float(aligned_samples.index[-1]), "")
     return _smooth_ekf2_track(remove_origin_resets(ekf2, track, segment)[0])

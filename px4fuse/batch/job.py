@@ -84,7 +84,7 @@ def make_failure_row(error: Px4FuseError, status: str, name: str = "") -> Row:
 
 def _compare_log(job: Job, path: Path, sha256: str) -> LogOutcome:
     # slow imports, which only the worker processes need
-    from px4fuse.analysis import AidsOnlyAnalysis  # noqa: PLC0415
+    from px4fuse.analysis import AidingSourceAnalysis  # noqa: PLC0415
     from px4fuse.diagnose import diagnose_or_check_aids, read_flight  # noqa: PLC0415
     from px4fuse.results.build import make_log_record, results  # noqa: PLC0415
     from px4fuse.results.contract import to_json  # noqa: PLC0415
@@ -95,7 +95,7 @@ def _compare_log(job: Job, path: Path, sha256: str) -> LogOutcome:
         flight = read_flight(request)
         row |= collect_log_values(make_log_record(flight))
         analysis = diagnose_or_check_aids(request, flight=flight)
-        if isinstance(analysis, AidsOnlyAnalysis):
+        if isinstance(analysis, AidingSourceAnalysis):
             row |= collect_finding_values(analysis.findings, analysis.aids)
             missing_data = MissingDataError(
                 analysis.missing_data.reason, analysis.missing_data.remedy

@@ -9,7 +9,7 @@ from typing import Any
 
 from msgspec.structs import replace
 
-from px4fuse.analysis import AidsOnlyAnalysis, Analysis
+from px4fuse.analysis import AidingSourceAnalysis, Analysis
 from px4fuse.card.causes import (
     RankedCause,
     can_show_effect,
@@ -166,7 +166,7 @@ def build_card(
 
 
 def build_aids_card(
-    analysis: AidsOnlyAnalysis, request: ComparisonRequest, student: tuple[str, str]
+    analysis: AidingSourceAnalysis, request: ComparisonRequest, student: tuple[str, str]
 ) -> Card:
     """Build the diagnosis card of a flight without positions, about the aiding sources of EKF2."""
     cause_findings = [group[0] for group in split_cause_groups(analysis.findings)]

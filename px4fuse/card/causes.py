@@ -18,8 +18,8 @@ from px4fuse.comparison.trials import (
     becomes_consistent,
     classify_improvement,
     compare_sigma_ratios,
-    compute_log_ratio_reduction,
     compute_preference_key,
+    compute_sigma_ratio_improvement,
     halves_discrepancy,
     has_effect,
     remains_overconfident,
@@ -89,7 +89,7 @@ def rank_causes(analysis: Analysis, cause_findings: Sequence[Finding]) -> list[R
             has_effect(trial) or not can_show_effect(trial) for trial in trials
         ):
             continue
-        log_sigma_ratio_reduction = sum(map(compute_log_ratio_reduction, trials))
+        log_sigma_ratio_reduction = sum(map(compute_sigma_ratio_improvement, trials))
         rank = _find_cause_rank(finding, trials)
         ranked_causes.append(RankedCause(finding, rank, log_sigma_ratio_reduction, trials))
     fault_causes = [

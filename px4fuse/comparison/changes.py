@@ -17,7 +17,7 @@ from px4fuse.comparison.remedy import (
 )
 from px4fuse.comparison.trials import (
     CLOCK_OFFSET_KEY,
-    DISCREPANCY_STATISTICS,
+    CONSISTENCY_STATISTICS,
     FORWARD_BIAS_KEY,
     OUTLIERS_KEY,
     RIGHT_BIAS_KEY,
@@ -33,12 +33,12 @@ from px4fuse.filter.tuning import HORIZONTAL, AxisTuning
 from px4fuse.flight.ekf2_parameters import GNSS_VEL, PARAMETERS
 from px4fuse.flight.model import LogInfo, Unavailable
 
-# Minimum SIGMA_Z (m) in a re-run of KF: noise of motion capture, the most accurate position source
+# Minimum SIGMA_Z (m) in a re-run of KF. Motion capture, the most accurate source, has this noise
 MIN_RERUN_SIGMA_Z_M = 0.005
 # Names of KF's noise settings
 SIGMA_A, SIGMA_Z = "sigma_a_m_s2", "sigma_z_m"
-# Kind of change in :attr:`Trial.kinds`, for each KF setting and each correction of the data
-KIND_BY_KF_CHANGE = {
+# Kind of a change (:attr:`Trial.kinds`) for each changed KF setting and each correction of the data
+KIND_BY_CHANGE_NAME = {
     SIGMA_A: "noises",
     SIGMA_Z: "noises",
     OUTLIERS_KEY: "outliers",
@@ -47,13 +47,12 @@ KIND_BY_KF_CHANGE = {
     FORWARD_BIAS_KEY: "bias",
     RIGHT_BIAS_KEY: "bias",
 }
-# KF settings that re-runs change. All other changes in re-runs of KF correct the data, for example
-# outliers
-CHANGED_KF_SETTINGS = frozenset((SIGMA_A, SIGMA_Z))
+# KF settings that a re-run may change. Other re-runs of KF correct the data, for example outliers
+KF_NOISE_SETTINGS = frozenset((SIGMA_A, SIGMA_Z))
 ACC_NOISE = "EKF2_ACC_NOISE"
-# EKF2 is re-run with a larger EKF2_ACC_NOISE if the estimated SIGMA_A exceeds it by this factor. A
-# smaller factor may be due to tilt errors and biases, which SIGMA_A includes
-MIN_VIBRATION_RATIO = 3.0
+# Minimum ratio of estimated acceleration noise to EKF2_ACC_NOISE for a re-run with more noise. A
+# smaller ratio may be due to tilt errors and biases, because the estimate includes them
+MIN_ESTIMATED_TO_LOGGED_ACC_NOISE_RATIO = 3.0
 # EKF2 parameters that a re-run sets to PX4's default
 PARAMETERS_SET_TO_DEFAULT = (
     ACC_NOISE,
@@ -83,8 +82,8 @@ def find_candidate_changes(
     # Innovations do not show the slow errors of GNSS and odometry, so small innovations do not
     # justify a smaller noise
     origin = comparison.source.origin
-    may_have_slow_errors = origin.may_drift or origin.is_gnss
-    if axis_tuning is not None and not (is_underconfident and may_have_slow_errors):
+    may_have_correlated_errors = origin.may_drift or origin.is_gnss
+    if axis_tuning is not None and not (is_underconfident and may_have_correlated_errors):
         changes += (
             _find_kf_noise_changes(comparison.settings, axis_tuning, is_underconfident)
             if ekf2_inputs is None
@@ -92,14 +91,12 @@ def find_candidate_changes(
         )
     if axis_tuning is not None and not is_underconfident and len(axis_tuning.outlier_time_s):
         changes.append({OUTLIERS_KEY: float(len(axis_tuning.outlier_time_s))})
-    delay_parameters = (
+    delay_change = (
         {}
         if ekf2_inputs is None
         else make_estimated_delay_change(comparison, ekf2_inputs, estimates.clock)
     )
-    changes += (
-        [delay_parameters] if delay_parameters else _find_offset_changes(estimates, ekf2_inputs)
-    )
+    changes += [delay_change] if delay_change else _find_offset_changes(estimates, ekf2_inputs)
     if axis_result.axis.name == "down":
         return changes
     if isinstance(heading := estimates.heading, HeadingError):
@@ -118,12 +115,13 @@ def find_main_axis_changes(
 ) -> list[Change]:
     """Return the changes of settings or data for re-runs along the main axis.
 
-    Added to :func:`find_candidate_changes` are, for KF, a change of both noises and the default
-    noises; for EKF2 with a wrong delay parameter, shifted timestamps.
+    The list contains the changes of :func:`find_candidate_changes`. For KF, one more re-run
+    changes both noises, and one sets the default noises. For EKF2 with a wrong delay parameter,
+    one more re-run shifts the timestamps.
     """
     changes = remove_repeated_changes(
         change
-        for statistic in DISCREPANCY_STATISTICS[::-1]
+        for statistic in CONSISTENCY_STATISTICS[::-1]
         for change in find_candidate_changes(
             comparison, estimates, ekf2_inputs, comparison.main, statistic
         )
@@ -132,7 +130,7 @@ def find_main_axis_changes(
         has_delay_change = any(ekf2_inputs.aid.delay in change for change in changes)
         offset_changes = _find_offset_changes(estimates, ekf2_inputs) if has_delay_change else []
         return remove_repeated_changes([*changes, *offset_changes])
-    noise_changes = [change for change in changes if change.keys() <= CHANGED_KF_SETTINGS]
+    noise_changes = [change for change in changes if change.keys() <= KF_NOISE_SETTINGS]
     if len(noise_changes) > 1:
         changes.append({name: value for change in noise_changes for name, value in change.items()})
     default_settings = find_default_settings(comparison)
@@ -146,7 +144,7 @@ def remove_repeated_changes(changes: Iterable[Change]) -> list[Change]:
 def classify_change(
     comparison: Comparison, ekf2_inputs: ReplayInputs | None, change: Change
 ) -> tuple[str, ...]:
-    """Return the kinds of a change, for example ("noise",) or ("delay", "outliers")."""
+    """Return the kind of each changed value, for example ("noise",) or ("delay", "outliers")."""
     if ekf2_inputs is None and change == find_default_settings(comparison):
         return ("defaults",)
     kind_by_parameter: dict[str, str] = {}
@@ -156,14 +154,14 @@ def classify_change(
     changed_names = [name for name in change if name not in SECONDARY_CHANGE_KEYS]
     return tuple(
         dict.fromkeys(
-            KIND_BY_KF_CHANGE.get(name) or kind_by_parameter.get(name, "process noise")
+            KIND_BY_CHANGE_NAME.get(name) or kind_by_parameter.get(name, "process noise")
             for name in changed_names
         )
     )
 
 
 def find_default_settings(comparison: Comparison) -> Change:
-    """Return the default of each KF noise for which the user chose another value."""
+    """Return the change to KF's default noises, for each noise that the user set differently."""
     user_settings, default_settings = comparison.settings, Settings()
     setting_names = (SIGMA_A,) if comparison.source.origin.is_gnss else (SIGMA_A, SIGMA_Z)
     return {
@@ -179,7 +177,7 @@ def find_axis_tuning(tuning: TuningByAxis, axis: str) -> AxisTuning | None:
 
 
 def _find_offset_changes(estimates: Estimates, ekf2_inputs: ReplayInputs | None) -> list[Change]:
-    """Return the estimated time offset, if a significant part of it is not corrected yet.
+    """Return the change that corrects the time offset; empty without a significant time offset.
 
     For EKF2, EKF2_DELAY_MAX is increased if the shifted positions are too old to be fused.
     """
@@ -200,21 +198,24 @@ def _find_offset_changes(estimates: Estimates, ekf2_inputs: ReplayInputs | None)
 def _find_kf_noise_changes(
     settings: Settings, axis_tuning: AxisTuning, is_underconfident: bool
 ) -> list[Change]:
-    """Return changes of SIGMA_A and SIGMA_Z to their estimates, if outside the 95 % intervals.
+    """Return changes of SIGMA_A and SIGMA_Z to their estimates.
 
-    The noises of an underconfident KF are only reduced, otherwise they are only increased.
+    A noise is changed only if KF's value is outside the 95 % interval of the estimate. The noises
+    of an underconfident KF are only reduced, and the noises of any other KF are only increased.
     """
     changes = list[Change]()
     for name, noise in ((SIGMA_A, axis_tuning.sigma_a_two_state), (SIGMA_Z, axis_tuning.sigma_z)):
         current_sigma = getattr(settings, name)
         estimated_sigma = noise.value or (noise.high if is_underconfident else None) or 0.0
-        noise_bound = noise.high if is_underconfident else noise.low
+        interval_end = noise.high if is_underconfident else noise.low
         if noise.value is None and name == SIGMA_Z:
             estimated_sigma = max(estimated_sigma, MIN_RERUN_SIGMA_Z_M)
         if (
             estimated_sigma
-            and noise_bound is not None
-            and (current_sigma > noise_bound if is_underconfident else current_sigma < noise_bound)
+            and interval_end is not None
+            and (
+                current_sigma > interval_end if is_underconfident else current_sigma < interval_end
+            )
         ):
             changes.append({name: float(f"{estimated_sigma:.3g}")})
     return changes
@@ -234,18 +235,18 @@ def _find_bias_changes(estimates: Estimates) -> list[Change]:
 def _find_ekf2_noise_changes(
     ekf2_inputs: ReplayInputs, summary: FilterSummary, axis_tuning: AxisTuning
 ) -> list[Change]:
-    """Return EKF2 parameters for the estimated noise, if EKF2's is outside the 95 % interval."""
+    """Return the change to the estimated noise if EKF2's noise is outside the 95 % interval."""
     noise_m = axis_tuning.sigma_z.value
-    if noise_m is None:  # the RMS innovation is an upper bound of the noise
+    if noise_m is None:  # The RMS innovation replaces a missing estimate: the noise is not larger
         noise_m = float(np.hypot(summary.innovation_std_m, summary.innovation_mean_m))
     change = make_estimated_noise_change(ekf2_inputs, axis_tuning.sigma_z, noise_m)
     return [change] if change else []
 
 
 def _find_default_changes(log: LogInfo, ekf2_inputs: ReplayInputs) -> list[Change]:
-    """Return changes to PX4's default, for each EKF2 noise with another value in the log.
+    """Return one change to PX4's default for each EKF2 noise that differs from the default.
 
-    The gate is included if the logged gate is below PX4's default.
+    The gate is also set to its default if the logged gate is below PX4's default.
     """
     gate_parameter, logged_parameters = ekf2_inputs.aid.gate, ekf2_inputs.settings
     default_by_parameter = {
@@ -263,16 +264,16 @@ def _find_default_changes(log: LogInfo, ekf2_inputs: ReplayInputs) -> list[Chang
 def _find_acc_noise_changes(
     settings: Settings, ekf2_inputs: ReplayInputs, axis_tuning: AxisTuning
 ) -> list[Change]:
-    """Return the EKF2_ACC_NOISE for the estimated SIGMA_A, if it is much larger than logged.
+    """Return the change of EKF2_ACC_NOISE to the estimated SIGMA_A if the estimate is much larger.
 
-    In each prediction, EKF2 adds (EKF2_ACC_NOISE · step)² to the velocity variance, and KF adds
-    SIGMA_A² · DT².
+    Each prediction adds (EKF2_ACC_NOISE · step)² to the velocity variance of EKF2, and
+    SIGMA_A² · DT² to the velocity variance of KF.
     """
     ekf2_steps_per_dt = settings.dt_s / ekf2_inputs.mean_step_s
     logged_acc_noise, max_acc_noise = ekf2_inputs.settings[ACC_NOISE], PARAMETERS[ACC_NOISE].maximum
     if (
         axis_tuning.sigma_a_two_state.low or 0.0
-    ) * ekf2_steps_per_dt**0.5 <= MIN_VIBRATION_RATIO * logged_acc_noise:
+    ) * ekf2_steps_per_dt**0.5 <= MIN_ESTIMATED_TO_LOGGED_ACC_NOISE_RATIO * logged_acc_noise:
         return []
     estimated_acc_noise = min(
         (axis_tuning.sigma_a_two_state.value or 0.0) * ekf2_steps_per_dt**0.5, max_acc_noise

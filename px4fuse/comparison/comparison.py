@@ -1,4 +1,4 @@
-"""Comparison of KF with EKF2, and of both with ground truth, axis by axis."""
+"""Run of KF, and comparison of KF and EKF2 with each other and with ground truth on each axis."""
 
 from collections.abc import Mapping
 from dataclasses import replace
@@ -18,7 +18,7 @@ from px4fuse.comparison.model import (
     FilterSummary,
     PreparedComparison,
     UntestedFilter,
-    Updates,
+    UpdateStatistics,
 )
 from px4fuse.core.arrays import Array
 from px4fuse.filter.consistency import (
@@ -60,7 +60,7 @@ def compare(prepared_comparison: PreparedComparison, kf_runs: Mapping[str, Repla
         notes += [note] if note else []
         notes += ekf2.notes
         if not state.equals(ekf2.state):
-            # The states at the fusion horizon contain the resets that ``state`` no longer has
+            # EKF2's logged states at the fusion horizon contain the removed resets: not used
             ekf2 = replace(ekf2, state=state, aids={}, record=RECORD_NOT_LOGGED)
     axes = {
         name: _compare_axis(prepared_comparison, ekf2, kf_run) for name, kf_run in kf_runs.items()
@@ -94,8 +94,8 @@ def _compare_axis(
         gate = ekf2.gate
     ekf2_errors = compute_error_statistics(ekf2_state, ekf2_variance, truth)
     if isinstance(ekf2_errors, ErrorsAgainstTruth) and isinstance(ekf2, Ekf2):
-        fusion_horizon_nees = _compute_horizon_nees(
-            projection.project_horizon_position(ekf2, axis, segment), truth
+        fusion_horizon_nees = _compute_nees_at_fusion_horizon(
+            projection.project_fusion_horizon_position(ekf2, axis, segment), truth
         )
         ekf2_errors = structs.replace(ekf2_errors, nees_position_horizon_mean=fusion_horizon_nees)
     updates = kf_run.updates.assign(
@@ -108,7 +108,7 @@ def _compare_axis(
         heading_deg=axis.heading_deg,
         direction=(north_component, east_component, down_component),
         note=axis.note,
-        updates=Updates(
+        updates=UpdateStatistics(
             count=len(updates),
             first_s=float(updates.index[0]),
             last_s=float(updates.index[-1]),
@@ -130,7 +130,7 @@ def _compare_axis(
         replay=kf_run,
         ekf2_innovations=innovations,
         **tracks,
-        flight_tracks=tracks
+        whole_flight_tracks=tracks
         if segment.flight_span_s in (None, (segment.start_s, segment.end_s))
         else project_tracks(ekf2, flight.truth, axis, segment.flight),
     )
@@ -167,10 +167,8 @@ def _summarise_filter(
         )
     }
     if not isinstance(innovations, Unavailable):
-        innovation_m, innovation_variance_m2 = (
-            innovations["innovation_m"],
-            innovations["innovation_variance_m2"],
-        )
+        innovation_m = innovations["innovation_m"]
+        innovation_variance_m2 = innovations["innovation_variance_m2"]
         consistency = assess_innovations(
             innovation_m.to_numpy(), innovation_variance_m2.to_numpy(), gate
         )
@@ -277,13 +275,15 @@ def compute_error_statistics(
     )
 
 
-def _compute_horizon_nees(
-    horizon_state: pd.DataFrame | None, truth: TableOrUnavailable
+def _compute_nees_at_fusion_horizon(
+    fusion_horizon_state: pd.DataFrame | None, truth: TableOrUnavailable
 ) -> float | None:
-    if horizon_state is None or isinstance(truth, Unavailable):
+    if fusion_horizon_state is None or isinstance(truth, Unavailable):
         return None
-    errors_m = _compute_errors(horizon_state, truth, "position_m")
-    return _compute_mean_nees(errors_m / np.sqrt(horizon_state["position_variance_m2"].to_numpy()))
+    errors_m = _compute_errors(fusion_horizon_state, truth, "position_m")
+    return _compute_mean_nees(
+        errors_m / np.sqrt(fusion_horizon_state["position_variance_m2"].to_numpy())
+    )
 
 
 def _compute_errors(state: pd.DataFrame, truth: pd.DataFrame, column: str) -> Array:
@@ -346,7 +346,7 @@ def compute_normalised_errors(
         return Unavailable(
             "error against ground truth",
             "no analysed sample has both a reported σ and ground truth",
-            "Choose a time span with a reported σ and ground truth.",
+            "Choose a time span in which the log contains reported σ and ground truth.",
         )
     return normalised_errors.index.to_numpy(), normalised_errors.to_numpy()
 
@@ -363,5 +363,9 @@ def _assess_horizontal_innovations(
     if len(tables) < 2:
         return None
     # Only updates with innovations along both axes (equal timestamps) are used
-    north_nu, north_s, east_nu, east_s = pd.concat(tables, axis=1, join="inner").to_numpy().T
-    return assess_horizontal_nis((north_nu, north_s), (east_nu, east_s))
+    north_innovation_m, north_variance_m2, east_innovation_m, east_variance_m2 = (
+        pd.concat(tables, axis=1, join="inner").to_numpy().T
+    )
+    return assess_horizontal_nis(
+        (north_innovation_m, north_variance_m2), (east_innovation_m, east_variance_m2)
+    )

@@ -32,20 +32,19 @@ from px4fuse.request import COMPARISON_OPTIONS
 
 # Maximum relative difference of the position RMSEs of KF and EKF2 to report them as equal
 MAX_RELATIVE_RMSE_DIFFERENCE = 0.05
-# The property of EKF2 with the second largest contribution is reported if it explains at least this
-# fraction of the mean square difference KF - EKF2
+# Minimum fraction of the mean square difference KF - EKF2 that a property of EKF2 explains, to
+# report the property as second cause
 MIN_CONTRIBUTION_FRACTION = 0.05
-# A noise setting of KF that differs from its estimate by at least this factor dominates the
-# difference KF - EKF2. The explanation then uses KF with the estimate
-MIN_SETTING_ERROR_RATIO = 4.0
-# A step replaces one property of KF by that of EKF2. The report omits steps that change KF's
-# position by less than this distance (m)
-MIN_STEP_EFFECT_M = 1e-6
-# Position differences KF - EKF2 outside the replayed times are reported above this value (m)
+# Minimum ratio of a KF noise setting to its estimate (or the inverse) that dominates the difference
+# KF - EKF2. The difference is then explained for KF with the estimate instead of the setting
+MIN_SETTING_TO_ESTIMATE_RATIO = 4.0
+# A property of EKF2 that changes KF's position by less than this distance (m) is not reported
+MIN_POSITION_CHANGE_M = 1e-6
+# Minimum position difference KF - EKF2 (m) that is reported at times without a replay of EKF2
 MIN_DIFFERENCE_OUTSIDE_REPLAY_M = 0.5
-# Position differences KF - EKF2 outside the replayed times are reported if they exceed the
-# differences inside by this factor
-UNREPLAYED_DIFFERENCE_RATIO = 3.0
+# Minimum ratio of the position difference KF - EKF2 at times without a replay to the difference at
+# replayed times, to report the difference at times without a replay
+MIN_OUTSIDE_TO_INSIDE_REPLAY_RATIO = 3.0
 
 
 def explain_ekf2_difference(
@@ -56,7 +55,7 @@ def explain_ekf2_difference(
 ) -> dict[str, DifferenceExplanation | Unavailable]:
     """Explain the difference KF - EKF2 along each horizontal axis of a comparison.
 
-    ``estimate_by_setting`` is from :func:`estimate_wrong_settings`. If only the down axis is
+    ``estimate_by_setting`` is from :func:`find_corrected_noise_settings`. If only the down axis is
     analysed, return the reason why its difference is not explained.
     """
     axis_results = {
@@ -77,16 +76,18 @@ def explain_ekf2_difference(
     explanations = steps.explain_by_steps(model, kf_settings, kf_runs)
     if isinstance(explanations, Unavailable):
         return dict.fromkeys(axis_results, explanations)
-    reasons = _explain_steps(replace(comparison, settings=changed_settings), model, clock_offset)
+    reasons = _describe_property_differences(
+        replace(comparison, settings=changed_settings), model, clock_offset
+    )
     explanation_by_axis: dict[str, DifferenceExplanation | Unavailable] = {}
     for name, by_steps in explanations.items():
         explanation = structs.replace(
             by_steps,
             corrected=dict(estimate_by_setting),
             steps=tuple(
-                step for step in by_steps.steps if step.position_moved_m > MIN_STEP_EFFECT_M
+                step for step in by_steps.steps if step.position_moved_m > MIN_POSITION_CHANGE_M
             ),
-            outside=_compare_unreplayed_times(axis_results[name], kf_runs[name], by_steps.spans_s),
+            outside=_compare_outside_replay(axis_results[name], kf_runs[name], by_steps.spans_s),
         )
         explanation_by_axis[name] = add_cause_sentences(
             explanation, axis_results[name].axis.label, reasons
@@ -94,11 +95,11 @@ def explain_ekf2_difference(
     return explanation_by_axis
 
 
-def estimate_wrong_settings(comparison: Comparison, tuning: TuningByAxis) -> dict[str, float]:
-    """Return noise estimates for those KF settings that are wrong by a large factor.
+def find_corrected_noise_settings(comparison: Comparison, tuning: TuningByAxis) -> dict[str, float]:
+    """Return the estimate of each KF noise setting that is wrong by a large factor.
 
-    They replace the settings before the difference KF - EKF2 is explained. Otherwise each property
-    of EKF2 would remove most of the difference, and the contributions could not be separated.
+    The difference KF - EKF2 is explained for KF with these estimates. With a wrong noise, each
+    property of EKF2 alone would remove most of the difference.
     """
     axis_tuning = find_first_tuning(tuning, HORIZONTAL, AISLE, "north", "east")
     if axis_tuning is None or comparison.source.origin.is_gnss:
@@ -111,15 +112,18 @@ def estimate_wrong_settings(comparison: Comparison, tuning: TuningByAxis) -> dic
         current_value = getattr(comparison.settings, name)
         if noise.value is None or current_value == getattr(Settings(), name):
             continue
-        if max(current_value / noise.value, noise.value / current_value) >= MIN_SETTING_ERROR_RATIO:
+        if (
+            max(current_value / noise.value, noise.value / current_value)
+            >= MIN_SETTING_TO_ESTIMATE_RATIO
+        ):
             estimate_by_setting[name] = float(f"{noise.value:.3g}")
     return estimate_by_setting
 
 
-def list_step_configurations(
+def list_explanation_configurations(
     comparison: Comparison, ekf2_inputs: ReplayInputs, estimate_by_setting: Mapping[str, Any]
 ) -> list[FilterConfiguration]:
-    """Return the EKF2 configurations that :func:`explain_ekf2_difference` replays."""
+    """Return the EKF2 configurations that are replayed to explain the difference KF - EKF2."""
     return list(
         steps.make_step_configurations(
             ekf2_inputs, _make_comparable_settings(comparison, ekf2_inputs, estimate_by_setting)
@@ -135,23 +139,24 @@ def _make_comparable_settings(
     return settings if is_same_source else replace(settings, clock_offset_s=0.0)
 
 
-def _compare_unreplayed_times(
+def _compare_outside_replay(
     axis_result: AxisComparison, kf_run: Replay, spans_s: Spans
 ) -> UnreplayedDifference | None:
     if not isinstance(axis_result.ekf2_state, pd.DataFrame):
         return None
-    unreplayed_state = axis_result.ekf2_state[
+    state_outside_replay = axis_result.ekf2_state[
         ~is_inside_spans(axis_result.ekf2_state.index, spans_s)
     ]
-    unreplayed_times_s = unreplayed_state.index.to_numpy()
+    times_outside_replay_s = state_outside_replay.index.to_numpy()
     difference_m = np.abs(
-        predict_state(kf_run, unreplayed_times_s)[0] - unreplayed_state["position_m"].to_numpy()
+        predict_state(kf_run, times_outside_replay_s)[0]
+        - state_outside_replay["position_m"].to_numpy()
     )
     if not np.isfinite(difference_m).any():
         return None
     largest_index = int(np.nanargmax(difference_m))
     return UnreplayedDifference(
-        float(difference_m[largest_index]), float(unreplayed_times_s[largest_index])
+        float(difference_m[largest_index]), float(times_outside_replay_s[largest_index])
     )
 
 
@@ -166,20 +171,21 @@ def add_cause_sentences(
     axis_label : str
         Name of the axis, for example "the main axis".
     step_reasons : mapping from step name to str
-        Difference between KF and EKF2 in the property that the step replaces, such as the
-        measurement noise.
+        Text on the difference between KF and EKF2 in one property, such as the measurement noise.
+        A step gives KF this property of EKF2.
     """
     step_reasons = {
         **step_reasons,
-        steps.REJECTION_STEP: step_reasons[steps.REJECTION_STEP]
-        + _describe_rejections(explanation),
+        steps.REJECTION_STEP: ". ".join(
+            [step_reasons[steps.REJECTION_STEP], *_describe_rejections(explanation)]
+        ),
     }
-    largest_step, second_largest_step, *_ = sorted(
+    largest_contribution, second_contribution, *_ = sorted(
         explanation.steps, key=lambda step: -step.position_mean_square_m2
     )
     cause_text = (
         f"Largest contribution to the difference KF - EKF2 along {axis_label}: "
-        f"{largest_step.name}. {step_reasons[largest_step.name]}."
+        f"{largest_contribution.name}. {step_reasons[largest_contribution.name]}."
     )
     sentences = []
     if explanation.corrected:
@@ -187,23 +193,23 @@ def add_cause_sentences(
             f"{COMPARISON_OPTIONS[name]} {value:g}" for name, value in explanation.corrected.items()
         )
         sentences.append(
-            f"KF is first run again with the estimated noise ({settings_text}). The following "
-            "sentences explain the remaining difference KF - EKF2."
+            f"KF was run again with the estimated noise ({settings_text}). The following sentences "
+            "explain the difference between this run and EKF2."
         )
-    sentences.append(f"{cause_text} {_describe_step_effect(largest_step, explanation)}")
+    sentences.append(f"{cause_text} {_describe_step_effect(largest_contribution, explanation)}")
     if (
-        second_largest_step.position_mean_square_m2
+        second_contribution.position_mean_square_m2
         >= MIN_CONTRIBUTION_FRACTION * explanation.position_mean_square_m2
     ):
         sentences.append(
-            f"Second largest contribution: {second_largest_step.name}. "
-            f"{step_reasons[second_largest_step.name]}. "
-            f"{_describe_step_effect(second_largest_step, explanation)}"
+            f"Second largest contribution: {second_contribution.name}. "
+            f"{step_reasons[second_contribution.name]}. "
+            f"{_describe_step_effect(second_contribution, explanation)}"
         )
     sentences += [_describe_unexplained_fractions(explanation), *_describe_rmse(explanation)]
     min_reported_difference_m = max(
         MIN_DIFFERENCE_OUTSIDE_REPLAY_M,
-        UNREPLAYED_DIFFERENCE_RATIO * float(np.max(np.abs(explanation.kf_minus_ekf2_m))),
+        MIN_OUTSIDE_TO_INSIDE_REPLAY_RATIO * float(np.max(np.abs(explanation.kf_minus_ekf2_m))),
     )
     if (
         explanation.outside is not None
@@ -219,8 +225,8 @@ def add_cause_sentences(
 
 def _describe_step_effect(step: Step, explanation: DifferenceExplanation) -> str:
     explained_fraction = step.position_mean_square_m2 / explanation.position_mean_square_m2
-    # The fractions explained by all steps add up to 1. If one is above 1, others are negative
-    increase_text = (
+    # The fractions of all properties add up to 1: with a fraction above 1, others are negative
+    opposite_effect_text = (
         " Other properties of EKF2 increase the difference KF - EKF2."
         if explained_fraction > 1.0
         else ""
@@ -228,23 +234,23 @@ def _describe_step_effect(step: Step, explanation: DifferenceExplanation) -> str
     return (
         f"If KF uses EKF2's {step.name}, KF's position changes by up to "
         f"{step.position_moved_m:.2f} m (at {step.moved_at_s:.1f} s), and the mean square "
-        f"difference KF - EKF2 decreases by {100 * explained_fraction:.0f} %.{increase_text}"
+        f"difference KF - EKF2 decreases by {100 * explained_fraction:.0f} %.{opposite_effect_text}"
     )
 
 
-def _describe_rejections(explanation: DifferenceExplanation) -> str:
+def _describe_rejections(explanation: DifferenceExplanation) -> list[str]:
     rejection_run = explanation.longest_rejection
     if rejection_run is None:
-        return ""
+        return []
     count_text = f"{rejection_run.samples} position{'s' if rejection_run.samples > 1 else ''}"
-    return (
-        f". From {rejection_run.start_s:.0f} s on, EKF2 rejected {count_text} in a row for "
-        f"{rejection_run.duration_s:.1f} s. This changes EKF2's position by up to "
-        f"{rejection_run.distance_m:.2g} m (replay with and without gate)"
-    )
+    return [
+        f"EKF2 rejected {count_text} in sequence, from {rejection_run.start_s:.0f} s on for "
+        f"{rejection_run.duration_s:.1f} s. Replays with and without gate differ by up to "
+        f"{rejection_run.distance_m:.2g} m in EKF2's position"
+    ]
 
 
-def _explain_steps(
+def _describe_property_differences(
     comparison: Comparison, model: Ekf2Model, clock_offset: ClockOffset | Unavailable
 ) -> dict[str, str]:
     kf_settings, ekf2_inputs, source = comparison.settings, model.inputs, comparison.source
@@ -265,18 +271,20 @@ def _explain_steps(
         f"assumes {position_age_ms:.0f} ms"
     )
     if isinstance(clock_offset, ClockOffset) and clock_offset.is_determinable:
-        offset_and_limits_s = (clock_offset.offset_s, *clock_offset.interval_s[::-1])
-        estimated_delay_ms, low_ms, high_ms = (
-            1e3 * (source.assumed_delay_s - offset_s) for offset_s in offset_and_limits_s
+        offset_high_low_s = (clock_offset.offset_s, *clock_offset.interval_s[::-1])
+        estimated_delay_ms, delay_low_ms, delay_high_ms = (
+            1e3 * (source.assumed_delay_s - offset_s) for offset_s in offset_high_low_s
         )
         delay_text = (
-            f"{delay_text}. The maximum-likelihood estimate of this age is "
-            f"{estimated_delay_ms:.0f} ms (95 % {low_ms:.0f} to {high_ms:.0f} ms)"
+            f"{delay_text}. The maximum-likelihood estimate of the age of positions is "
+            f"{estimated_delay_ms:.0f} ms (95 % {delay_low_ms:.0f} to {delay_high_ms:.0f} ms)"
         )
-    equivalent_sigma_a = ekf2_parameters["EKF2_ACC_NOISE"] * np.sqrt(
+    acc_noise_as_sigma_a = ekf2_parameters["EKF2_ACC_NOISE"] * np.sqrt(
         ekf2_inputs.mean_step_s / kf_settings.dt_s
     )
-    trusted_input = "IMU" if equivalent_sigma_a < kf_settings.sigma_a_m_s2 else "positions"
+    higher_weighted_input = (
+        "IMU" if acc_noise_as_sigma_a < kf_settings.sigma_a_m_s2 else "positions"
+    )
     return {
         steps.SAMPLE_TIMES_STEP: prediction_text,
         steps.TIMESTAMPS_STEP: delay_text,
@@ -286,9 +294,9 @@ def _explain_steps(
         ),
         steps.BIASES_STEP: "EKF2 estimates the accelerometer bias; KF does not",
         steps.PROCESS_NOISE_STEP: (
-            f"EKF2_ACC_NOISE {ekf2_parameters['EKF2_ACC_NOISE']:g} corresponds to SIGMA_A "
-            f"{equivalent_sigma_a:.2g} m/s²; KF uses {kf_settings.sigma_a_m_s2:.2g} m/s². "
-            f"EKF2 gives the {trusted_input} more weight than KF"
+            f"EKF2_ACC_NOISE {ekf2_parameters['EKF2_ACC_NOISE']:g} has the same effect as SIGMA_A "
+            f"{acc_noise_as_sigma_a:.2g} m/s²; KF has SIGMA_A {kf_settings.sigma_a_m_s2:.2g} m/s². "
+            f"EKF2 gives the {higher_weighted_input} more weight than KF"
         ),
         steps.ATTITUDE_STEP: (
             "EKF2 corrects its attitude with the positions; KF uses EKF2's logged attitude"
@@ -304,18 +312,16 @@ def _explain_steps(
             "positions; KF has no innovation gate and uses all positions"
         ),
         steps.OUTPUT_PREDICTOR_STEP: (
-            f"EKF2 fuses positions {1e3 * ekf2_inputs.horizon_s:.0f} ms late, and its output "
-            f"predictor (EKF2_TAU_POS {ekf2_parameters['EKF2_TAU_POS']:g} s) predicts the present "
-            "state; KF has no delay"
+            f"EKF2 fuses positions with a delay of {1e3 * ekf2_inputs.horizon_s:.0f} ms. EKF2's "
+            f"output predictor (EKF2_TAU_POS {ekf2_parameters['EKF2_TAU_POS']:g} s) extrapolates "
+            "to the present. KF has no delay"
         ),
     }
 
 
 def _describe_unexplained_fractions(explanation: DifferenceExplanation) -> str:
-    position_mean_square_m2, velocity_mean_square_m2_s2 = (
-        explanation.position_mean_square_m2,
-        explanation.velocity_mean_square_m2_s2,
-    )
+    position_mean_square_m2 = explanation.position_mean_square_m2
+    velocity_mean_square_m2_s2 = explanation.velocity_mean_square_m2_s2
     unexplained_position_text, unexplained_velocity_text = (
         f"{100 * min(fraction, 1.0):.1f} %"
         for fraction in (
@@ -345,17 +351,15 @@ def _describe_rmse(explanation: DifferenceExplanation) -> list[str]:
         kf_rmse_m,
         *(step.position_rmse_to_truth_m or 0.0 for step in explanation.steps),
     ]
-    mean_square_changes, step_names = (
-        np.diff(np.square(rmse_by_step)),
-        [step.name for step in explanation.steps],
-    )
-    step_index = int(
+    mean_square_changes = np.diff(np.square(rmse_by_step))
+    largest_change_index = int(
         np.argmin(mean_square_changes)
         if ekf2_rmse_m < kf_rmse_m
         else np.argmax(mean_square_changes)
     )
-    rmse_before_m, rmse_after_m = rmse_by_step[step_index : step_index + 2]
+    rmse_before_m, rmse_after_m = rmse_by_step[largest_change_index : largest_change_index + 2]
     return [
-        f"Position RMSE: EKF2 {ekf2_rmse_m:.3f} m, KF {kf_rmse_m:.3f} m. KF's RMSE changes most "
-        f"with EKF2's {step_names[step_index]} ({rmse_before_m:.3f} → {rmse_after_m:.3f} m)."
+        f"Position RMSE: EKF2 {ekf2_rmse_m:.3f} m, KF {kf_rmse_m:.3f} m. Largest contribution to "
+        f"the difference: EKF2's {explanation.steps[largest_change_index].name} changes KF's RMSE "
+        f"from {rmse_before_m:.3f} m to {rmse_after_m:.3f} m."
     ]

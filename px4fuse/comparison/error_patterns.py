@@ -22,95 +22,105 @@ from px4fuse.trajectory.scores import compute_autocorrelation_time
 
 # Minimum number of positions to search for jitter and other error patterns
 MIN_POSITIONS = 100
-# Rows of the neighbours of a position, relative to its row
+# Row offsets of the four neighbours from which a position is interpolated
 NEIGHBOUR_ROW_OFFSETS = np.array([-2, -1, 1, 2])
 # Maximum time from the first to the last neighbour of a position, in median intervals: cubic
 # interpolation across a gap is inaccurate
-MAX_NEIGHBOUR_SPAN_INTERVALS = 8.0
+MAX_NEIGHBOUR_SPAN_IN_INTERVALS = 8.0
 # Maximum σ of a residual (position minus interpolation of its neighbours), in units of the
 # position's σ. Residuals with a larger σ are not used, because their interpolation is inaccurate
 MAX_RESIDUAL_SIGMA_RATIO = 4.0
-# Number of timestamps in a running median, which follows steps due to missing positions, but not
-# jitter
-TIMESTAMP_MEDIAN_SAMPLES = 9
+# Number of timestamps in a running median. The median follows missing positions, but not jitter
+TIMESTAMP_MEDIAN_FILTER_LENGTH = 9
 # Half of the time (s) over which a velocity is averaged
 VELOCITY_HALF_WINDOW_S = 0.3
-# Number of residuals per independent residual: successive residuals have common neighbours
-RESIDUALS_PER_INDEPENDENT = 3
+# Number of residuals that count as one independent residual, because they have common neighbours
+RESIDUAL_CORRELATION_LENGTH = 3
 # Minimum reported timestamp jitter (s, 1 σ): a position error of 8 mm at 1 m/s
 MIN_JITTER_S = 0.008
-# Jitter alone causes position residuals of timestamp residual · velocity. It is confirmed if the
-# ratio of both is in this range
+# Jitter causes position residuals of timestamp residual · velocity. Jitter is confirmed if the
+# ratio of measured to expected position residuals is in this range
 JITTER_RATIO_LIMITS = 0.6, 1.5
 # Jitter is reported if it causes at least this fraction of the RMS position residual
-MIN_JITTER_FRACTION = 0.4
+MIN_JITTER_PART_OF_RESIDUAL = 0.4
 # Minimum ratio of an estimate to its σ, to report jitter or noise that increases with speed
 MIN_SIGNIFICANCE_SIGMAS = 6.0
-# Noise grows with speed only if both also correlate within parts of the flight: number of parts,
-# and minimum of the median over the parts of correlation / σ of the correlation
-FLIGHT_PART_COUNT, MIN_PART_CORRELATION_SIGMAS = 5, 1.2
+# Number of flight parts in which the correlation of noise with speed is tested
+FLIGHT_PART_COUNT = 5
+# Minimum ratio of this correlation to its σ (median over the flight parts)
+MIN_NOISE_SPEED_CORRELATION_SIGMAS = 1.2
 # Quantiles of the speed: below the first, the vehicle is slow; above the second, it is fast
 SLOW_SPEED_QUANTILE, FAST_SPEED_QUANTILE = 0.3, 0.7
 # Minimum ratio of the noise at high speed to the noise at low speed, both along and across the
 # motion, to report noise that increases with speed
 MIN_FAST_TO_SLOW_NOISE_RATIO = 1.6
 # Minimum extent (m, RMS distance from its mean) of a path to fit scale factor and rotation
-MIN_PATH_EXTENT_RMS_M = 0.5
+MIN_RMS_DISTANCE_FROM_PATH_MEAN_M = 0.5
 # Length (s) of the running mean that is removed from the errors of odometry, which drifts
 DRIFT_WINDOW_S = 12.0
 # Length (s) of the flight parts with separate time offsets
-OFFSET_PART_LENGTH_S = 4.0
+OFFSET_PART_DURATION_S = 4.0
 # Minimum RMS speed (m/s) of a flight part whose time offset is estimated
 MIN_SPEED_FOR_OFFSET_M_S = 0.3
 # Minimum range (s) of a varying time offset to report it: a position error of 8 cm at 1 m/s
 MIN_OFFSET_RANGE_S = 0.08
-# Varying time offsets are reported only if the mean square of the slow errors is at least this
-# multiple of the white-noise variance: the offsets of many flight parts can also fit noise
+# Minimum ratio of the mean square of the slow errors to the white-noise variance, to report varying
+# time offsets. With smaller errors, the time offsets of the flight parts may only fit noise
 MIN_SLOW_TO_WHITE_NOISE_RATIO = 0.25
-# Varying time offsets are reported only if at most this fraction of the mean square of the slow
-# errors remains after their correction
-MAX_REMAINING_SLOW_ERROR = 0.2
+# Varying time offsets are reported only if their correction reduces the mean square of the slow
+# errors to at most this fraction
+MAX_REMAINING_SLOW_ERROR_FRACTION = 0.2
 # A sinusoidal error is reported if it explains at least this fraction of the mean square of the
 # slow errors
 MIN_PERIODIC_ERROR_FRACTION = 0.88
 # Minimum ratio of the amplitude of a sinusoidal error to the σ of white noise
-MIN_AMPLITUDE_SIGMAS = 1.0
+MIN_AMPLITUDE_TO_WHITE_NOISE_RATIO = 1.0
 # Minimum number of periods of a sinusoidal error in the flight
 MIN_PERIOD_COUNT = 5.0
 # Maximum tested frequency (Hz) of a sinusoidal error
 MAX_FREQUENCY_HZ = 2.0
 # Spacing of the tested frequencies, in periods per flight duration
-PERIODS_PER_FREQUENCY_STEP = 0.2
-# Minimum number of time bins per period: an amplitude is then too small by at most 0.2 %
+FREQUENCY_STEP_IN_PERIODS_PER_FLIGHT = 0.2
+# Minimum number of time bins per period of a sinusoidal error. The estimated amplitude is then too
+# small by at most 0.2 %
 MIN_BINS_PER_PERIOD = 30
-# A sinusoidal error is not reported if more than this fraction of the mean square of the vehicle's
-# motion has the same frequency: the error may then be due to the motion
-MAX_PERIODIC_MOTION_FRACTION = 0.1
-# Sampling interval (s) of the compared rotations. The tested delays of the logged attitude are
-# multiples of two intervals, up to the second value (s)
-ROTATION_INTERVAL_S, MAX_ATTITUDE_DELAY_S = 0.01, 0.5
+# Maximum fraction of the vehicle's motion (mean square) at the frequency of a reported sinusoidal
+# error. With a larger fraction, the motion may cause the error
+MAX_MOTION_FRACTION_AT_ERROR_FREQUENCY = 0.1
+# Sampling interval (s) of the compared rotations; delays are tested in steps of two intervals
+ROTATION_INTERVAL_S = 0.01
+# Maximum tested delay (s) of the logged attitude
+MAX_ATTITUDE_DELAY_S = 0.5
 # Smaller delays (s) of the logged attitude are not reported
 MIN_ATTITUDE_DELAY_S = 0.04
 # Maximum number of rotations from attitude and gyroscopes that are compared, to limit the computing
 # time
 MAX_ROTATION_COUNT = 20_000
 # Time (s) over which a rotation from attitude is compared with the rotation from gyroscopes
-ROTATION_STEP_S = 0.1
+ROTATION_COMPARISON_TIME_S = 0.1
 # Larger differences (rad) between rotations from attitude and from gyroscopes are limited to this
 # value, because resets of the attitude cause them
 MAX_ROTATION_DIFFERENCE_RAD = 0.2
 # A delay of the attitude is reported if its correction reduces the mean square difference between
 # rotations from attitude and from gyroscopes to less than this fraction
-MAX_CORRECTED_DIFFERENCE_RATIO = 0.5
+MAX_REMAINING_ROTATION_DIFFERENCE_RATIO = 0.5
 # Minimum speed (m/s) of the fast part of a flight, and minimum noise (m) at this speed, to report
 # noise that increases with speed
-MIN_FAST_SPEED_M_S, MIN_FAST_NOISE_M = 0.3, 0.02
+MIN_HIGH_SPEED_M_S, MIN_NOISE_AT_HIGH_SPEED_M = 0.3, 0.02
 # Ratio of the standard deviation to the median absolute value of normal noise
-SIGMA_PER_MEDIAN_ABSOLUTE = 1.4826
+SIGMA_PER_MEDIAN_ABSOLUTE_VALUE = 1.4826
 
 
 class SpeedDependentNoise(NamedTuple):
-    """Position noise ``slow_m``, ``fast_m`` (1 σ) at the speeds ``slow_m_s``, ``fast_m_s``."""
+    """Position noise at low and at high speed.
+
+    Attributes
+    ----------
+    slow_m, fast_m : float
+        Position noise (m, 1 σ) at low and at high speed.
+    slow_m_s, fast_m_s : float
+        Low and high speed (m/s).
+    """
 
     slow_m: float
     fast_m: float
@@ -121,14 +131,19 @@ class SpeedDependentNoise(NamedTuple):
 class LocalResiduals(NamedTuple):
     """Deviations of positions and timestamps from a cubic polynomial through their four neighbours.
 
-    ``residual_m``, shape (n, 2), is the deviation of the horizontal position. Before the fit, the
-    time at a constant rate is subtracted from the timestamps. Both residuals are scaled to the σ of
-    a single position or timestamp. ``ekf2_speed_m_s`` is EKF2's horizontal speed.
+    Attributes
+    ----------
+    residual_m : ndarray, shape (n, 2)
+        Deviation of the horizontal position, scaled so that its σ is the position noise.
+    timestamp_jitter_s : ndarray, shape (n,)
+        Deviation of the timestamp from a constant rate, scaled in the same way.
+    ekf2_speed_m_s : ndarray, shape (n,), or None
+        EKF2's horizontal speed.
     """
 
     residual_m: Array
     velocity_m_s: Array
-    timestamp_residual_s: Array
+    timestamp_jitter_s: Array
     ekf2_speed_m_s: Array | None
 
 
@@ -149,12 +164,12 @@ class ErrorFit(NamedTuple):
     scale_sigma: float
 
     def compute_slow_mean_square_m2(self) -> float:
-        """Return the mean square (m²) of the slow errors: residuals minus white noise."""
+        """Return the mean square (m²) of the residuals minus the variance of white noise."""
         return float(np.mean(self.residual_m**2, axis=0).sum()) - 2.0 * self.white_noise_sigma_m**2
 
 
 class PeriodicError(NamedTuple):
-    """Sinusoidal position error; ``fraction``: its part of the mean square of the slow errors."""
+    """Sinusoidal position error. ``fraction`` of the slow errors (mean square) is sinusoidal."""
 
     period_s: float
     amplitude_m: float
@@ -162,7 +177,15 @@ class PeriodicError(NamedTuple):
 
 
 class OffsetVariation(NamedTuple):
-    """Smallest (``least_s``) and largest time offset in flight, and the times of both."""
+    """Range of the time offset of the positions in flight.
+
+    Attributes
+    ----------
+    least_s, most_s : float
+        Smallest and largest time offset (s), relative to the mean time offset.
+    least_at_s, most_at_s : float
+        Flight times (s) of the smallest and of the largest time offset.
+    """
 
     least_s: float
     most_s: float
@@ -190,84 +213,87 @@ def compute_local_residuals(comparison: Comparison) -> LocalResiduals | None:
     neighbour_rows = rows[:, None] + NEIGHBOUR_ROW_OFFSETS
     elapsed_s = time_s[neighbour_rows] - time_s[rows, None]
     interval_s = float(np.median(np.diff(time_s)))
-    is_complete = np.ptp(elapsed_s, axis=1) < MAX_NEIGHBOUR_SPAN_INTERVALS * interval_s
+    has_close_neighbours = np.ptp(elapsed_s, axis=1) < MAX_NEIGHBOUR_SPAN_IN_INTERVALS * interval_s
     rows, neighbour_rows, elapsed_s = (
-        array[is_complete] for array in (rows, neighbour_rows, elapsed_s)
+        array[has_close_neighbours] for array in (rows, neighbour_rows, elapsed_s)
     )
-    weights = np.ones_like(elapsed_s)  # for Lagrange's interpolation at the time of the position
+    # Weights of the neighbours in Lagrange's interpolation at the time of the position
+    weights = np.ones_like(elapsed_s)
     for neighbour in range(len(NEIGHBOUR_ROW_OFFSETS)):
         for other_neighbour in set(range(len(NEIGHBOUR_ROW_OFFSETS))) - {neighbour}:
             other_elapsed_s = elapsed_s[:, other_neighbour]
             weights[:, neighbour] *= other_elapsed_s / (other_elapsed_s - elapsed_s[:, neighbour])
-    residual_sigma_ratio = np.sqrt(1.0 + np.sum(weights**2, axis=1))
+    residual_to_position_sigma_ratio = np.sqrt(1.0 + np.sum(weights**2, axis=1))
     timestamp_deviation_s = time_s - interval_s * np.arange(len(time_s))
     timestamp_delay_s = timestamp_deviation_s - median_filter(
-        timestamp_deviation_s, TIMESTAMP_MEDIAN_SAMPLES, mode="nearest"
+        timestamp_deviation_s, TIMESTAMP_MEDIAN_FILTER_LENGTH, mode="nearest"
     )
     half_window_rows = max(2, round(VELOCITY_HALF_WINDOW_S / interval_s))
-    window_first_rows, window_last_rows = (
-        np.clip(rows - half_window_rows, 0, None),
-        np.clip(rows + half_window_rows, None, len(time_s) - 1),
-    )
+    window_first_rows = np.clip(rows - half_window_rows, 0, None)
+    window_last_rows = np.clip(rows + half_window_rows, None, len(time_s) - 1)
     displacement_m = position_m[window_last_rows] - position_m[window_first_rows]
     velocity_m_s = displacement_m / (time_s[window_last_rows] - time_s[window_first_rows])[:, None]
-    is_accurate = residual_sigma_ratio < MAX_RESIDUAL_SIGMA_RATIO
+    has_small_interpolation_noise = residual_to_position_sigma_ratio < MAX_RESIDUAL_SIGMA_RATIO
 
     def compute_residual(values: Array) -> Array:
         interpolated_values = np.einsum("nk,nk...->n...", weights, values[neighbour_rows])
-        scaled_residuals = ((values[rows] - interpolated_values).T / residual_sigma_ratio).T
-        return np.asarray(scaled_residuals[is_accurate])
+        scaled_residuals = (
+            (values[rows] - interpolated_values).T / residual_to_position_sigma_ratio
+        ).T
+        return np.asarray(scaled_residuals[has_small_interpolation_noise])
 
     ekf2 = comparison.flight.ekf2
     ekf2_speed_m_s = None
     if isinstance(ekf2, Ekf2):
         logged_speed_m_s = np.linalg.norm(ekf2.state[Columns.VELOCITY[:2]].to_numpy(), axis=1)
         ekf2_speed_m_s = np.interp(
-            time_s[rows[is_accurate]], ekf2.state.index.to_numpy(), logged_speed_m_s
+            time_s[rows[has_small_interpolation_noise]],
+            ekf2.state.index.to_numpy(),
+            logged_speed_m_s,
         )
     return LocalResiduals(
         compute_residual(position_m),
-        velocity_m_s[is_accurate],
+        velocity_m_s[has_small_interpolation_noise],
         compute_residual(timestamp_delay_s),
         ekf2_speed_m_s,
     )
 
 
 def find_timestamp_jitter(errors: LocalResiduals) -> float | None:
-    """Return the jitter (s, 1 σ) of the timestamps if the position errors confirm it.
+    """Return the jitter (s, 1 σ) of the timestamps if position errors confirm the jitter.
 
-    If a position has a late timestamp, it is behind the interpolated position by delay · velocity.
+    A late timestamp causes a position error of -delay · velocity.
     """
-    expected_residual_m = -errors.velocity_m_s * errors.timestamp_residual_s[:, None]
+    expected_residual_m = -errors.velocity_m_s * errors.timestamp_jitter_s[:, None]
     expected_square_sum_m2 = float(np.sum(expected_residual_m**2))
-    jitter_s = float(np.std(errors.timestamp_residual_s))
+    jitter_s = float(np.std(errors.timestamp_jitter_s))
     if jitter_s < MIN_JITTER_S or not expected_square_sum_m2:
         return None
-    ratio = float(np.sum(errors.residual_m * expected_residual_m)) / expected_square_sum_m2
-    unexplained_residual_m = errors.residual_m - ratio * expected_residual_m
-    ratio_sigma = np.sqrt(
-        RESIDUALS_PER_INDEPENDENT * np.mean(unexplained_residual_m**2) / expected_square_sum_m2
+    residual_ratio = float(np.sum(errors.residual_m * expected_residual_m)) / expected_square_sum_m2
+    unexplained_residual_m = errors.residual_m - residual_ratio * expected_residual_m
+    residual_ratio_sigma = np.sqrt(
+        RESIDUAL_CORRELATION_LENGTH * np.mean(unexplained_residual_m**2) / expected_square_sum_m2
     )
     jitter_fraction = np.sqrt(expected_square_sum_m2 / np.sum(errors.residual_m**2))
     is_jitter = (
-        JITTER_RATIO_LIMITS[0] < ratio < JITTER_RATIO_LIMITS[1]
-        and ratio > MIN_SIGNIFICANCE_SIGMAS * ratio_sigma
-        and jitter_fraction > MIN_JITTER_FRACTION
+        JITTER_RATIO_LIMITS[0] < residual_ratio < JITTER_RATIO_LIMITS[1]
+        and residual_ratio > MIN_SIGNIFICANCE_SIGMAS * residual_ratio_sigma
+        and jitter_fraction > MIN_JITTER_PART_OF_RESIDUAL
     )
     return jitter_s if is_jitter else None
 
 
-def find_speed_noise(errors: LocalResiduals) -> SpeedDependentNoise | None:
+def find_speed_dependent_noise(errors: LocalResiduals) -> SpeedDependentNoise | None:
     """Return the noise at low and high speed if it increases with speed in all directions."""
     # The speed is from EKF2, because a speed from the positions would contain their noise
     speed_m_s = errors.ekf2_speed_m_s
     if speed_m_s is None:
         return None
     residual_norms_m = np.linalg.norm(errors.residual_m, axis=1)
-    # Each part of the flight is tested, too: larger noise in only one part may correlate with speed
+    # Each flight part is tested, because larger noise in one part may look like noise due to speed
     correlation_z_scores = [
         rank_correlation(residual_norms_m[part], speed_m_s[part])
-        * np.sqrt(len(part) / RESIDUALS_PER_INDEPENDENT)
+        * np.sqrt(len(part) / RESIDUAL_CORRELATION_LENGTH)
         for part in (
             np.arange(len(residual_norms_m)),
             *np.array_split(np.arange(len(residual_norms_m)), FLIGHT_PART_COUNT),
@@ -277,7 +303,7 @@ def find_speed_noise(errors: LocalResiduals) -> SpeedDependentNoise | None:
     if (
         len(correlation_z_scores) <= FLIGHT_PART_COUNT
         or correlation_z_scores[0] < MIN_SIGNIFICANCE_SIGMAS
-        or np.median(correlation_z_scores[1:]) < MIN_PART_CORRELATION_SIGMAS
+        or np.median(correlation_z_scores[1:]) < MIN_NOISE_SPEED_CORRELATION_SIGMAS
     ):
         return None
     speed_limits_m_s = np.quantile(speed_m_s, [SLOW_SPEED_QUANTILE, FAST_SPEED_QUANTILE])
@@ -286,22 +312,23 @@ def find_speed_noise(errors: LocalResiduals) -> SpeedDependentNoise | None:
     direction = errors.velocity_m_s / np.maximum(source_speed_m_s, 1e-6)
     along_track_residual_m = np.abs(np.sum(errors.residual_m * direction, axis=1))
     cross_track_residual_m = np.abs(np.sum(errors.residual_m * _rotate_90(direction), axis=1))
-    # Noise must increase along and across the track: timestamp jitter causes noise along it
+    # Noise must increase in both directions, because jitter causes noise only along the track
     if any(
         np.median(noise_m[is_fast]) < MIN_FAST_TO_SLOW_NOISE_RATIO * np.median(noise_m[is_slow])
         for noise_m in (along_track_residual_m, cross_track_residual_m)
     ):
         return None
     slow_and_fast_noise_m = (
-        SIGMA_PER_MEDIAN_ABSOLUTE * float(np.median(np.abs(errors.residual_m[rows])))
+        SIGMA_PER_MEDIAN_ABSOLUTE_VALUE * float(np.median(np.abs(errors.residual_m[rows])))
         for rows in (is_slow, is_fast)
     )
     slow_and_fast_speed_m_s = (float(np.median(speed_m_s[rows])) for rows in (is_slow, is_fast))
-    speed_noise = SpeedDependentNoise(*slow_and_fast_noise_m, *slow_and_fast_speed_m_s)
+    speed_dependent_noise = SpeedDependentNoise(*slow_and_fast_noise_m, *slow_and_fast_speed_m_s)
     is_relevant = (
-        speed_noise.fast_m_s >= MIN_FAST_SPEED_M_S and speed_noise.fast_m >= MIN_FAST_NOISE_M
+        speed_dependent_noise.fast_m_s >= MIN_HIGH_SPEED_M_S
+        and speed_dependent_noise.fast_m >= MIN_NOISE_AT_HIGH_SPEED_M
     )
-    return speed_noise if is_relevant else None
+    return speed_dependent_noise if is_relevant else None
 
 
 def fit_errors(comparison: Comparison, local_residuals: LocalResiduals) -> ErrorFit | None:
@@ -319,7 +346,7 @@ def fit_errors(comparison: Comparison, local_residuals: LocalResiduals) -> Error
     path_m, velocity_m_s = true_spline(time_s), true_spline(time_s, 1)
     path_m = path_m - path_m.mean(axis=0)
     path_mean_square_m2 = float(np.mean(np.sum(path_m**2, axis=1)))
-    if path_mean_square_m2 < MIN_PATH_EXTENT_RMS_M**2:
+    if path_mean_square_m2 < MIN_RMS_DISTANCE_FROM_PATH_MEAN_M**2:
         return None
     columns = np.stack(
         [
@@ -332,20 +359,22 @@ def fit_errors(comparison: Comparison, local_residuals: LocalResiduals) -> Error
     )
     error_m = position_m - true_spline(time_s)
     parameters, residual_m = _fit_least_squares(columns, error_m)
-    # The σ of the scale factor depends on the independent errors; successive errors are correlated
+    # The σ of the scale factor depends on the number of independent errors
     interval_s = float(np.median(np.diff(time_s)))
     independent_error_count = len(time_s) / max(
         *map(compute_autocorrelation_time, residual_m.T), 1.0
     )
     scale_sigma = np.sqrt(np.mean(residual_m**2) / (path_mean_square_m2 * independent_error_count))
     if comparison.source.origin.may_drift:
-        window_rows = max(1, round(DRIFT_WINDOW_S / interval_s))
+        window_length = max(1, round(DRIFT_WINDOW_S / interval_s))
 
-        def high_pass(values: Array) -> Array:
-            return values - uniform_filter1d(values, window_rows, axis=0)
+        def remove_running_mean(values: Array) -> Array:
+            return values - uniform_filter1d(values, window_length, axis=0)
 
-        _, residual_m = _fit_least_squares(high_pass(columns)[..., 2:], high_pass(error_m))
-    white_noise_sigma_m = SIGMA_PER_MEDIAN_ABSOLUTE * float(
+        _, residual_m = _fit_least_squares(
+            remove_running_mean(columns)[..., 2:], remove_running_mean(error_m)
+        )
+    white_noise_sigma_m = SIGMA_PER_MEDIAN_ABSOLUTE_VALUE * float(
         np.median(np.abs(local_residuals.residual_m))
     )
     return ErrorFit(
@@ -370,13 +399,13 @@ def _fit_least_squares(columns: Array, values: Array) -> tuple[Array, Array]:
 def find_periodic_error(fit: ErrorFit) -> PeriodicError | None:
     """Find a sinusoidal error that explains most of the slow errors.
 
-    Return None without such an error, or if the motion contains its frequency.
+    Return None without such an error, or if the vehicle itself moves at this frequency.
     """
     duration_s = fit.time_s[-1] - fit.time_s[0]
     max_frequency_hz = min(MAX_FREQUENCY_HZ, 0.25 / float(np.median(np.diff(fit.time_s))))
-    frequency_step_hz = PERIODS_PER_FREQUENCY_STEP / duration_s
+    frequency_step_hz = FREQUENCY_STEP_IN_PERIODS_PER_FLIGHT / duration_s
     rows = slice(
-        round(MIN_PERIOD_COUNT / PERIODS_PER_FREQUENCY_STEP),
+        round(MIN_PERIOD_COUNT / FREQUENCY_STEP_IN_PERIODS_PER_FLIGHT),
         int(np.ceil(max_frequency_hz / frequency_step_hz)),
     )
     if rows.stop <= rows.start or fit.compute_slow_mean_square_m2() <= 0.0:
@@ -397,15 +426,15 @@ def find_periodic_error(fit: ErrorFit) -> PeriodicError | None:
         return 2.0 * float(np.sum(np.abs(complex_sinusoid @ values / len(values)) ** 2))
 
     periodic_mean_square_m2 = compute_mean_square_m2(fit.residual_m, frequency_hz)
-    motion_fraction = compute_mean_square_m2(fit.path_m, frequency_hz) / np.mean(
+    motion_fraction_at_frequency = compute_mean_square_m2(fit.path_m, frequency_hz) / np.mean(
         np.sum(fit.path_m**2, axis=1)
     )
     amplitude_m = float(np.sqrt(2.0 * periodic_mean_square_m2))
     explained_fraction = periodic_mean_square_m2 / fit.compute_slow_mean_square_m2()
     if (
         explained_fraction < MIN_PERIODIC_ERROR_FRACTION
-        or amplitude_m < MIN_AMPLITUDE_SIGMAS * fit.white_noise_sigma_m
-        or motion_fraction > MAX_PERIODIC_MOTION_FRACTION
+        or amplitude_m < MIN_AMPLITUDE_TO_WHITE_NOISE_RATIO * fit.white_noise_sigma_m
+        or motion_fraction_at_frequency > MAX_MOTION_FRACTION_AT_ERROR_FREQUENCY
     ):
         return None
     return PeriodicError(1.0 / frequency_hz, amplitude_m, explained_fraction)
@@ -417,41 +446,48 @@ def find_offset_variation(fit: ErrorFit) -> OffsetVariation | None:
     The time offsets of all flight parts and the parameters of :class:`ErrorFit` are fitted
     together. A time offset causes no error at rest, so it does not explain a jump or drift.
     """
-    part_indices = np.floor((fit.time_s - fit.time_s[0]) / OFFSET_PART_LENGTH_S).astype(int)
-    square_speed_sums = np.bincount(part_indices, np.sum(fit.velocity_m_s**2, axis=1))
-    mean_square_speeds = square_speed_sums / np.maximum(np.bincount(part_indices), 1)
+    flight_part_indices = np.floor((fit.time_s - fit.time_s[0]) / OFFSET_PART_DURATION_S).astype(
+        int
+    )
+    square_speed_sums = np.bincount(flight_part_indices, np.sum(fit.velocity_m_s**2, axis=1))
+    mean_square_speeds = square_speed_sums / np.maximum(np.bincount(flight_part_indices), 1)
     moving_part_indices = np.flatnonzero(mean_square_speeds > MIN_SPEED_FOR_OFFSET_M_S**2)
     if len(moving_part_indices) < 2:
         return None
-    # Each flight part has its own time offset. Its effect is first removed from all columns, then
+    # First, the best time offset of each flight part is removed from all columns of the fit. Then
     # the parameters that are constant in flight are fitted
-    error_per_offset_m_s = -fit.velocity_m_s
-    inverse_square_sums = np.zeros_like(square_speed_sums)
-    inverse_square_sums[moving_part_indices] = 1.0 / square_speed_sums[moving_part_indices]
+    error_per_time_offset_m_s = -fit.velocity_m_s
+    inverse_square_speed_sums = np.zeros_like(square_speed_sums)
+    inverse_square_speed_sums[moving_part_indices] = 1.0 / square_speed_sums[moving_part_indices]
 
-    def fit_offsets(values: Array) -> Array:
-        sums = np.zeros((len(inverse_square_sums), values.shape[-1]))
-        np.add.at(sums, part_indices, np.einsum("na,nak->nk", error_per_offset_m_s, values))
-        return sums * inverse_square_sums[:, None]
+    def fit_time_offsets_by_part(values: Array) -> Array:
+        velocity_weighted_sums = np.zeros((len(inverse_square_speed_sums), values.shape[-1]))
+        np.add.at(
+            velocity_weighted_sums,
+            flight_part_indices,
+            np.einsum("na,nak->nk", error_per_time_offset_m_s, values),
+        )
+        return velocity_weighted_sums * inverse_square_speed_sums[:, None]
 
-    # Effects of the constant parameters, and the errors. The offsets of the flight parts replace
-    # the constant time offset
+    # The columns are the effects of the constant parameters without time offset, and the errors
     columns = np.concatenate([fit.columns[..., :-1], fit.residual_m[..., None]], axis=-1)
-    offsets_by_column_s = fit_offsets(columns)
-    columns -= error_per_offset_m_s[:, :, None] * offsets_by_column_s[part_indices, None]
+    time_offsets_by_column_s = fit_time_offsets_by_part(columns)
+    columns -= (
+        error_per_time_offset_m_s[:, :, None] * time_offsets_by_column_s[flight_part_indices, None]
+    )
     parameters, residual_m = _fit_least_squares(columns[..., :-1], columns[..., -1])
-    offsets_s = (offsets_by_column_s @ np.append(-parameters, 1.0))[moving_part_indices]
+    offsets_s = (time_offsets_by_column_s @ np.append(-parameters, 1.0))[moving_part_indices]
     slow_mean_square_m2 = fit.compute_slow_mean_square_m2()
-    remaining_mean_square_m2 = (
+    unexplained_mean_square_m2 = (
         float(np.mean(residual_m**2, axis=0).sum()) - 2.0 * fit.white_noise_sigma_m**2
     )
     if (
         np.ptp(offsets_s) < MIN_OFFSET_RANGE_S
         or slow_mean_square_m2 < MIN_SLOW_TO_WHITE_NOISE_RATIO * 2.0 * fit.white_noise_sigma_m**2
-        or remaining_mean_square_m2 > MAX_REMAINING_SLOW_ERROR * slow_mean_square_m2
+        or unexplained_mean_square_m2 > MAX_REMAINING_SLOW_ERROR_FRACTION * slow_mean_square_m2
     ):
         return None
-    times_s = fit.time_s[0] + OFFSET_PART_LENGTH_S * (moving_part_indices + 0.5)
+    times_s = fit.time_s[0] + OFFSET_PART_DURATION_S * (moving_part_indices + 0.5)
     extreme_indices = [int(np.argmin(offsets_s)), int(np.argmax(offsets_s))]
     return OffsetVariation(*offsets_s[extreme_indices].tolist(), *times_s[extreme_indices].tolist())
 
@@ -459,15 +495,13 @@ def find_offset_variation(fit: ErrorFit) -> OffsetVariation | None:
 def find_attitude_delay(imu: pd.DataFrame, attitude: pd.DataFrame) -> float | None:
     """Return the time (s) by which the logged attitude is late, if it is not zero."""
     imu_time_s, attitude_time_s = imu.index.to_numpy(), attitude.index.to_numpy()
-    start_s, end_s = (
-        max(imu_time_s[0], attitude_time_s[0]),
-        min(imu_time_s[-1], attitude_time_s[-1]),
-    )
+    start_s = max(imu_time_s[0], attitude_time_s[0])
+    end_s = min(imu_time_s[-1], attitude_time_s[-1])
     time_s = np.arange(
         start_s + MAX_ATTITUDE_DELAY_S, end_s - MAX_ATTITUDE_DELAY_S, ROTATION_INTERVAL_S
     )
     time_s = time_s[:MAX_ROTATION_COUNT]
-    rows_per_rotation = round(ROTATION_STEP_S / ROTATION_INTERVAL_S)
+    samples_per_rotation = round(ROTATION_COMPARISON_TIME_S / ROTATION_INTERVAL_S)
     if len(time_s) < MIN_POSITIONS:
         return None
     imu = rows_between(
@@ -476,7 +510,7 @@ def find_attitude_delay(imu: pd.DataFrame, attitude: pd.DataFrame) -> float | No
     imu_time_s = imu.index.to_numpy()
     quaternions = interpolate(time_s, attitude_time_s, attitude[Columns.QUATERNION].to_numpy())
     rotation_rad = to_vector(
-        multiply(conjugate(quaternions[:-rows_per_rotation]), quaternions[rows_per_rotation:])
+        multiply(conjugate(quaternions[:-samples_per_rotation]), quaternions[samples_per_rotation:])
     )
     angle_rad = integrate_cumulatively(imu[Columns.ANGULAR_RATE].to_numpy(), imu_time_s)
 
@@ -484,20 +518,24 @@ def find_attitude_delay(imu: pd.DataFrame, attitude: pd.DataFrame) -> float | No
         delayed_angle_rad = np.array(
             [np.interp(time_s - delay_s, imu_time_s, column) for column in angle_rad.T]
         )
-        differences_rad = (
+        rotation_differences_rad = (
             rotation_rad
             - (
-                delayed_angle_rad[:, rows_per_rotation:] - delayed_angle_rad[:, :-rows_per_rotation]
+                delayed_angle_rad[:, samples_per_rotation:]
+                - delayed_angle_rad[:, :-samples_per_rotation]
             ).T
         )
-        differences_rad -= np.median(differences_rad, axis=0)  # due to the gyroscope bias
+        # The median difference is due to the gyroscope bias
+        rotation_differences_rad -= np.median(rotation_differences_rad, axis=0)
         # Each difference is limited, because resets of the attitude cause large differences
-        norms_rad = np.minimum(np.linalg.norm(differences_rad, axis=1), MAX_ROTATION_DIFFERENCE_RAD)
-        return float(np.mean(norms_rad**2))
+        limited_angles_rad = np.minimum(
+            np.linalg.norm(rotation_differences_rad, axis=1), MAX_ROTATION_DIFFERENCE_RAD
+        )
+        return float(np.mean(limited_angles_rad**2))
 
     delays_s = np.arange(-MAX_ATTITUDE_DELAY_S, MAX_ATTITUDE_DELAY_S, 2.0 * ROTATION_INTERVAL_S)
     delay_s = float(min(delays_s, key=compute_mean_square_rad2))
-    is_late = abs(delay_s) >= MIN_ATTITUDE_DELAY_S and compute_mean_square_rad2(
+    is_delay_significant = abs(delay_s) >= MIN_ATTITUDE_DELAY_S and compute_mean_square_rad2(
         delay_s
-    ) < MAX_CORRECTED_DIFFERENCE_RATIO * compute_mean_square_rad2(0.0)
-    return delay_s if is_late else None
+    ) < MAX_REMAINING_ROTATION_DIFFERENCE_RATIO * compute_mean_square_rad2(0.0)
+    return delay_s if is_delay_significant else None

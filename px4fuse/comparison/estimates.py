@@ -12,7 +12,11 @@ from msgspec import structs
 from scipy.special import stdtr
 
 from px4fuse.comparison.model import Comparison, PreparedComparison
-from px4fuse.comparison.noise_differences import NoisyPart, find_noisy_part, tune_by_axis
+from px4fuse.comparison.noise_differences import (
+    NoisyPart,
+    find_noisy_flight_part,
+    tune_perpendicular_axes,
+)
 from px4fuse.core.arrays import Array
 from px4fuse.filter.correlated_noise import (
     SourceLowPass,
@@ -47,8 +51,8 @@ MIN_TELEMETRY_IMU_HZ = 200.0
 MIN_IMU_RATE_RATIO = 0.98
 TELEMETRY_IMU_MESSAGES = ("HIGHRES_IMU", "SCALED_IMU", "SCALED_IMU2", "SCALED_IMU3")
 
-# Minimum number of time offset estimates before a tested change of the offset in flight, and after
-MIN_OFFSETS_PER_SIDE = 2
+# Minimum number of time offset estimates before, and also after, a tested change of the time offset
+MIN_ESTIMATES_BEFORE_AND_AFTER_CHANGE = 2
 
 # Axes with a noise estimate in the report; north and east have a common estimate
 REPORTED_AXES = (HORIZONTAL, "down")
@@ -122,8 +126,12 @@ def estimate(comparison: Comparison, progress: Progress = ignore_progress) -> Es
         systematic_errors=systematic_errors,
         source_low_pass=source_low_pass,
         time_correlated_noise=correlated_noise,
-        axis_tunings=() if is_odometry or source.origin.is_gnss else tune_by_axis(comparison),
-        noisy_part=None if is_odometry else find_noisy_part(comparison, tuning.get(HORIZONTAL)),
+        axis_tunings=()
+        if is_odometry or source.origin.is_gnss
+        else tune_perpendicular_axes(comparison),
+        noisy_part=None
+        if is_odometry
+        else find_noisy_flight_part(comparison, tuning.get(HORIZONTAL)),
     )
 
 
@@ -263,10 +271,16 @@ def _fit_source_errors(
         return systematic_errors, time_correlation_fit, time_correlation_fit
     source_low_pass, correlated_noise = time_correlation_fit
     truths = [comparison.axes[axis.name].truth for axis in axes]
-    known_truths = [truth for truth in truths if not isinstance(truth, Unavailable)]
-    if len(known_truths) == len(axes):
+    available_truths = [truth for truth in truths if not isinstance(truth, Unavailable)]
+    if len(available_truths) == len(axes):
         correlated_noise = fit_time_correlation_to_truth(
-            axes, known_truths, excluded_times_s, offset_s, jumps, correlated_noise, source_low_pass
+            axes,
+            available_truths,
+            excluded_times_s,
+            offset_s,
+            jumps,
+            correlated_noise,
+            source_low_pass,
         )
     return systematic_errors, source_low_pass, correlated_noise
 
@@ -274,7 +288,7 @@ def _fit_source_errors(
 def _select_horizontal_axes(
     comparison: Comparison, tuning: TuningByAxis
 ) -> tuple[tuple[Axis, ...], AxisTuning] | Unavailable:
-    """Return the horizontal axes that have a noise estimate, with the estimate."""
+    """Return the horizontal axes that have a common noise estimate, and this estimate."""
     for name, axis_names in ((HORIZONTAL, ("north", "east")), (AISLE, (AISLE,))):
         axis_tuning = tuning.get(name)
         if isinstance(axis_tuning, AxisTuning) and comparison.axes.keys() >= set(axis_names):
@@ -318,32 +332,33 @@ def explain_low_imu_rate(flight: Flight) -> Unavailable | None:
 def widen_for_drift(clock_offset: ClockOffset) -> ClockOffset:
     """Widen the 95 % interval of the time offset of a source that may drift (odometry).
 
-    Drift increases the scatter of the estimates from different flight parts. The interval is
-    widened by the ratio of this scatter to the σ of the estimates.
+    Drift increases the scatter of the time offsets of different flight parts. The interval is
+    widened by the ratio of the scatter to the reported σ of these time offsets.
     """
     offsets_s = np.array([part.offset_s for part in clock_offset.parts])
     weights = np.array([part.sigma_s**-2.0 for part in clock_offset.parts])
-    if len(offsets_s) <= MIN_OFFSETS_PER_SIDE:
+    if len(offsets_s) <= MIN_ESTIMATES_BEFORE_AND_AFTER_CHANGE:
         return structs.replace(
             clock_offset, change_p_value=None, drift_ppm=None, drift_sigma_ppm=None
         )
-    sigma_factor = np.sqrt(
+    sigma_widening_factor = np.sqrt(
         max(1.0, _compute_weighted_square_sum(offsets_s, weights) / (len(offsets_s) - 1))
     )
-    low_s, high_s = (
-        clock_offset.offset_s + sigma_factor * (limit_s - clock_offset.offset_s)
+    interval_low_s, interval_high_s = (
+        clock_offset.offset_s + sigma_widening_factor * (limit_s - clock_offset.offset_s)
         for limit_s in clock_offset.interval_s
     )
     drift_reason = clock_offset.reason
-    if not drift_reason and (high_s - low_s) / 2.0 > MAX_OFFSET_HALF_INTERVAL_S:
+    if not drift_reason and (interval_high_s - interval_low_s) / 2.0 > MAX_OFFSET_HALF_INTERVAL_S:
         drift_reason = (
-            "the time offset differs between parts of the flight, probably because the source "
-            f"drifts (95 % interval of the offset: {low_s:+.2f} s to {high_s:+.2f} s)"
+            "the time offset differs between parts of the flight, probably because the positions "
+            f"drift (95 % interval of the offset: {interval_low_s:+.2f} s to "
+            f"{interval_high_s:+.2f} s)"
         )
     return structs.replace(
         clock_offset,
-        interval_s=(float(low_s), float(high_s)),
-        sigma_s=float(clock_offset.sigma_s * sigma_factor),
+        interval_s=(float(interval_low_s), float(interval_high_s)),
+        sigma_s=float(clock_offset.sigma_s * sigma_widening_factor),
         is_determinable=not drift_reason,
         reason=drift_reason,
         drift_ppm=None,
@@ -363,35 +378,38 @@ def _compute_change_p_value(offsets_s: Array, weights: Array) -> float | None:
     correction. Changes below ``MIN_TIME_OFFSET_CHANGE_S`` are ignored.
     """
     part_count = len(offsets_s)
-    split_rows = range(MIN_OFFSETS_PER_SIDE, part_count - MIN_OFFSETS_PER_SIDE + 1)
-    smallest_p = 1.0
+    split_rows = range(
+        MIN_ESTIMATES_BEFORE_AND_AFTER_CHANGE,
+        part_count - MIN_ESTIMATES_BEFORE_AND_AFTER_CHANGE + 1,
+    )
+    smallest_p_value = 1.0
     for split_row in split_rows:
-        before_and_after = [
+        parts_before_and_after = [
             (offsets_s[rows], weights[rows])
             for rows in (slice(None, split_row), slice(split_row, None))
         ]
-        step_s = float(
+        offset_change_s = float(
             np.diff(
                 [
                     np.average(side_offsets_s, weights=side_weights)
-                    for side_offsets_s, side_weights in before_and_after
+                    for side_offsets_s, side_weights in parts_before_and_after
                 ]
             )[0]
         )
-        if abs(step_s) < MIN_TIME_OFFSET_CHANGE_S:
+        if abs(offset_change_s) < MIN_TIME_OFFSET_CHANGE_S:
             continue
         variance_factor = max(
             1.0,
             sum(
                 _compute_weighted_square_sum(side_offsets_s, side_weights)
-                for side_offsets_s, side_weights in before_and_after
+                for side_offsets_s, side_weights in parts_before_and_after
             )
             / (part_count - 2),
         )
-        step_sigma_s = np.sqrt(
+        offset_change_sigma_s = np.sqrt(
             variance_factor
-            * sum(1.0 / np.sum(side_weights) for _, side_weights in before_and_after)
+            * sum(1.0 / np.sum(side_weights) for _, side_weights in parts_before_and_after)
         )
-        p_value = 2.0 * float(stdtr(part_count - 2, -abs(step_s) / step_sigma_s))
-        smallest_p = min(smallest_p, p_value * len(split_rows))
-    return smallest_p if split_rows else None
+        p_value = 2.0 * float(stdtr(part_count - 2, -abs(offset_change_s) / offset_change_sigma_s))
+        smallest_p_value = min(smallest_p_value, p_value * len(split_rows))
+    return smallest_p_value if split_rows else None

@@ -48,7 +48,10 @@ class ErrorsAgainstTruth(Record, kw_only=True):
 
     @property
     def has_only_lag_errors(self) -> bool:
-        """True if EKF2's errors exceed σ only because its output predictor lags."""
+        """True if EKF2 is not overconfident at the fusion horizon.
+
+        Only the lag of EKF2's output predictor then makes the errors larger than σ.
+        """
         nees = self.nees_position_horizon_mean
         return nees is not None and classify_sigma_ratio(nees**0.5, "truth") != "overconfident"
 
@@ -73,7 +76,7 @@ class FilterSummary(Consistency, kw_only=True):
 
 
 class UntestedFilter(Unavailable, kw_only=True):
-    """Filter that could not be tested for consistency: the reason, its reported σ and errors."""
+    """Reported σ and errors of a filter, and the reason why its consistency was not tested."""
 
     sigma_p_median_m: Positive | None = None
     sigma_v_median_m_s: Positive | None = None
@@ -94,10 +97,10 @@ class Difference(Record, kw_only=True):
     velocity_maximum_m_s: NotNegative
 
 
-class Updates(Record, kw_only=True):
-    """Number and times of KF's updates along one axis.
+class UpdateStatistics(Record, kw_only=True):
+    """Number of KF's updates along one axis, and times (s) of the first and the last update.
 
-    ``input_gap_s`` is the time without IMU data.
+    ``input_gap_s`` is the total time (s) without IMU data.
     """
 
     count: Count
@@ -125,15 +128,15 @@ class AxisComparison(Record, kw_only=True):
     ekf2_innovations : DataFrame or Unavailable
         :attr:`Ekf2.innovations` along the axis, with the position variance before (P⁻ = S - R) and
         after (P⁺ = P⁻R/S) each update.
-    flight_tracks : mapping from attribute name to DataFrame or Unavailable
-        ``ekf2_state``, ``ekf2_variance`` and ``truth`` over the whole flight. The attributes with
-        these names contain only the analysed segment.
+    whole_flight_tracks : mapping from attribute name to DataFrame or Unavailable
+        ``ekf2_state``, ``ekf2_variance`` and ``truth`` over the whole flight, not only over the
+        analysed segment.
     """
 
     heading_deg: float | None = None
     direction: Vector
     note: str
-    updates: Updates
+    updates: UpdateStatistics
     filters: Mapping[FilterName, RecordOrUnavailable[FilterSummary, UntestedFilter]]
     difference: OrUnavailable[Difference]
     rejected_fraction: Share | None = None
@@ -143,11 +146,11 @@ class AxisComparison(Record, kw_only=True):
     ekf2_variance: NotWritten[TableOrUnavailable] = NOT_WRITTEN
     ekf2_innovations: NotWritten[TableOrUnavailable] = NOT_WRITTEN
     truth: NotWritten[TableOrUnavailable] = NOT_WRITTEN
-    flight_tracks: NotWritten[Mapping[str, TableOrUnavailable]] = NOT_WRITTEN
+    whole_flight_tracks: NotWritten[Mapping[str, TableOrUnavailable]] = NOT_WRITTEN
 
-    def with_flight_tracks(self) -> "AxisComparison":
-        """Return the result with tracks of the whole flight instead of the segment, for plots."""
-        return structs.replace(self, **self.flight_tracks)
+    def with_whole_flight_tracks(self) -> "AxisComparison":
+        """Return a copy with EKF2 and ground truth over the whole flight, for plots."""
+        return structs.replace(self, **self.whole_flight_tracks)
 
 
 @dataclass(frozen=True)
@@ -210,7 +213,7 @@ class Comparison(PreparedComparison):
 
     @property
     def main(self) -> AxisComparison:
-        """Result along the main axis (direction of largest motion), else along the first axis."""
+        """Result along the main axis (direction of largest motion), or along the first axis."""
         return self.axes.get(AISLE) or next(iter(self.axes.values()))
 
 

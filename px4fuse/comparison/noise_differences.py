@@ -34,7 +34,7 @@ class NoisyPart(NamedTuple):
     sigma_ratio_without_outliers: float
 
 
-def tune_by_axis(comparison: Comparison) -> tuple[AxisTuning, ...]:
+def tune_perpendicular_axes(comparison: Comparison) -> tuple[AxisTuning, ...]:
     """Estimate separate noises along two perpendicular axes, if the noises seem to differ.
 
     The axes are north and east. If the noise along north and east is correlated, they are the axes
@@ -78,17 +78,17 @@ def _find_heading_of_largest_noise(north_and_east: Sequence[AxisComparison]) -> 
     return float(np.degrees(0.5 * double_angle_rad)) % 180.0
 
 
-def find_noisy_part(
+def find_noisy_flight_part(
     comparison: Comparison, axis_tuning: AxisTuning | Unavailable | None
 ) -> NoisyPart | None:
     """Find a time span with larger innovations than in the rest of the flight.
 
-    ``axis_tuning`` contains the estimated noises of north and east.
+    ``axis_tuning`` contains the noises of north and east for a run of KF.
     """
     settings = comparison.settings
     if axis_tuning is None:
         return None
-    # KF's settings replace missing estimates: many noisy measurements may prevent the estimation
+    # Without an estimate, KF's settings are used: noisy measurements may prevent the estimation
     sigma_a: float | None = settings.sigma_a_m_s2
     sigma_z: float | None = settings.sigma_z_m
     outlier_time_s = np.zeros(0)
@@ -105,18 +105,18 @@ def find_noisy_part(
     part_count = min(MAX_FLIGHT_PART_COUNT, len(time_s) // MIN_PART_MEASUREMENTS)
     part_edges = np.linspace(0, len(time_s), part_count + 1).astype(int)
 
-    def compute_relative_magnitudes(is_excluded: BoolArray | None) -> Array:
+    def compute_scaled_innovations(is_excluded: BoolArray | None) -> Array:
         axis_innovations = [
             innovations(axis_motion, sigma_a, sigma_z, is_excluded) for axis_motion in axis_motions
         ]
         magnitudes = np.abs([nu / np.sqrt(s) for nu, s in axis_innovations])
-        # Wrong noise settings scale all innovations, so they are divided by their median
+        # A wrong noise scales all innovations by one factor. Division by the median removes it
         return np.asarray(magnitudes / np.median(magnitudes, axis=1, keepdims=True))
 
-    relative_magnitudes = compute_relative_magnitudes(None)
+    scaled_innovations = compute_scaled_innovations(None)
     median_magnitude_by_part = np.array(
         [
-            np.median(relative_magnitudes[:, first_row:end_row])
+            np.median(scaled_innovations[:, first_row:end_row])
             for first_row, end_row in pairwise(part_edges)
         ]
     )
@@ -141,8 +141,8 @@ def find_noisy_part(
             / np.median(magnitudes[:, is_outside_noisy_part])
         )
         for magnitudes in (
-            relative_magnitudes,
-            compute_relative_magnitudes(np.isin(time_s, outlier_time_s)),
+            scaled_innovations,
+            compute_scaled_innovations(np.isin(time_s, outlier_time_s)),
         )
     )
     start_s, end_s = time_s[

@@ -9,7 +9,7 @@ from msgspec import structs
 from px4fuse.comparison.model import PreparedComparison
 from px4fuse.comparison.projection import find_observation_variance
 from px4fuse.convention.check import check_convention
-from px4fuse.convention.correction import correct_convention, find_convention_faults
+from px4fuse.convention.correction import convert_to_px4_convention, find_convention_faults
 from px4fuse.core.text import capitalise_first
 from px4fuse.ekf2.fusion_conditions import constant_coordinates
 from px4fuse.errors import MissingDataError, SettingsError, suggest_name
@@ -86,12 +86,14 @@ def prepare_comparison_inputs(
     # A time offset from the user replaces the detected one
     if convention is not None and settings.clock_offset_s:
         convention = structs.replace(convention, late_s=0.0)
-    late_s = find_convention_faults(convention, flight, source_track.frame).late_s
+    timestamp_delay_s = find_convention_faults(convention, flight, source_track.frame).late_s
     # A time offset outside the valid range is set to the limit of the range
-    limits_s = SETTING_RANGES["clock_offset_s"][:2]
-    clock_offset_s = float(np.clip(settings.clock_offset_s - late_s, *limits_s))
+    clock_offset_limits_s = SETTING_RANGES["clock_offset_s"][:2]
+    clock_offset_s = float(
+        np.clip(settings.clock_offset_s - timestamp_delay_s, *clock_offset_limits_s)
+    )
     settings = replace(settings, clock_offset_s=clock_offset_s)
-    flight, source_track = correct_convention(flight, source_track, convention)
+    flight, source_track = convert_to_px4_convention(flight, source_track, convention)
     source_track = _subtract_lever_arm(source_track, flight)
     source_track = _shift_vision_to_ekf2_origin(source_track, flight)
     source_track = _use_barometer_height(source_track, flight, request.height)
@@ -122,7 +124,7 @@ def prepare_comparison_inputs(
     if settings.input == "imu" and isinstance(acceleration, Unavailable):
         if request.input == "imu":
             raise SettingsError(
-                f"{flight.log.name}: `input` imu needs acceleration, which is missing: "
+                f"{flight.log.name}: `input` imu needs acceleration, but the log contains none: "
                 f"{acceleration}"
             )
         settings = replace(settings, input="zero")
@@ -144,14 +146,12 @@ def prepare_comparison_inputs(
 
 
 def select_source_innovations(flight: Flight, track: PositionTrack) -> Flight:
-    """Return the flight with EKF2's GNSS innovations for a GNSS source, else those of vision."""
+    """Return a copy of the flight with EKF2's GNSS innovations if the position source is GNSS."""
     if isinstance(flight.ekf2, Unavailable) or not track.origin.fused_as_gnss:
         return flight
-    # Missing innovations of external vision are not reported, because KF and EKF2 use GNSS
-    missing_vision_innovations, streams = (
-        _find_missing_innovations(flight.ekf2),
-        dict(flight.streams),
-    )
+    # GNSS innovations replace those of vision, so missing vision innovations are not reported
+    missing_vision_innovations = _find_missing_innovations(flight.ekf2)
+    streams = dict(flight.streams)
     ekf2 = with_gnss_innovations(
         flight.ekf2, GNSS if track.barometer is None else GNSS_AND_BAROMETER
     )
@@ -227,13 +227,13 @@ def _subtract_lever_arm(track: PositionTrack, flight: Flight) -> PositionTrack:
 def _shift_vision_to_ekf2_origin(track: PositionTrack, flight: Flight) -> PositionTrack:
     """Shift vision positions to EKF2's origin if EKF2 also fused GNSS.
 
-    EKF2 then estimates the constant offset of vision, so it is not an error for KF either.
+    EKF2 then estimates the constant offset of vision. The same offset is removed for KF.
     """
     ekf2 = flight.ekf2
     if not (track.origin.is_vision and isinstance(ekf2, Ekf2) and has_fused_aid(ekf2)):
         return track
     samples = track.samples.copy()
-    offset_m = [
+    median_offset_m = [
         float(
             np.nanmedian(
                 samples[column] - np.interp(samples.index, ekf2.state.index, ekf2.state[column])
@@ -241,13 +241,13 @@ def _shift_vision_to_ekf2_origin(track: PositionTrack, flight: Flight) -> Positi
         )
         for column in Columns.POSITION
     ]
-    if track.frame != "NED" or not np.isfinite(offset_m).all():
+    if track.frame != "NED" or not np.isfinite(median_offset_m).all():
         return track
-    samples[Columns.POSITION] -= offset_m
-    north_m, east_m, down_m = offset_m
+    samples[Columns.POSITION] -= median_offset_m
+    north_m, east_m, down_m = median_offset_m
     origin_note = (
-        f"the median offset of {track.name} from EKF2 ({north_m:.1f} m north, {east_m:.1f} m east, "
-        f"{down_m:.1f} m down) is removed: EKF2 estimates this offset while it fuses GNSS"
+        f"positions of {track.name} were shifted to EKF2's origin: their median offset from EKF2 "
+        f"({north_m:.1f} m north, {east_m:.1f} m east, {down_m:.1f} m down) was subtracted"
     )
     return replace(track, samples=samples, notes=(*track.notes, origin_note))
 
@@ -264,11 +264,11 @@ def _use_barometer_height(
         raise SettingsError(
             f"{log_name}: `height` needs GNSS as position source, not {track.name}."
         )
-    is_fused_by_ekf2 = has_fused_aid(ekf2, BAROMETER.name) and not has_fused_aid(
+    is_barometer_ekf2_height = has_fused_aid(ekf2, BAROMETER.name) and not has_fused_aid(
         ekf2, GNSS.vertical
     )
     uses_barometer = height_sensor == "barometer" or (
-        height_sensor is None and track.origin.fused_as_gnss and is_fused_by_ekf2
+        height_sensor is None and track.origin.fused_as_gnss and is_barometer_ekf2_height
     )
     if not uses_barometer or barometer_heights is None:
         if height_sensor == "barometer":
@@ -276,19 +276,18 @@ def _use_barometer_height(
                 f"{log_name}: the log contains no barometer height.", GNSS.to_log
             )
         return track
-    zero_height_down_m = barometer_heights["down_m"].iloc[0]
-    height_origin_text = "the first barometer height"
+    barometer_offset_down_m = barometer_heights["down_m"].iloc[0]
+    height_note = "heights are barometer heights relative to the first barometer sample"
     if isinstance(ekf2, Ekf2):
         ekf2_down_m = np.interp(
             barometer_heights.index, ekf2.state.index, ekf2.state["down_m"], np.nan, np.nan
         )
         if np.isfinite(ekf2_down_m).any():
-            zero_height_down_m = float(np.nanmedian(barometer_heights["down_m"] - ekf2_down_m))
-        height_origin_text = "EKF2's height 0 (median difference to EKF2's height removed)"
-    height_note = f"heights are from the barometer; height 0 is {height_origin_text}"
+            barometer_offset_down_m = float(np.nanmedian(barometer_heights["down_m"] - ekf2_down_m))
+        height_note = "heights are barometer heights minus their median difference to EKF2's height"
     return replace(
         track,
-        barometer=barometer_heights - zero_height_down_m,
+        barometer=barometer_heights - barometer_offset_down_m,
         description=f"{track.description}, barometer height",
         notes=(*track.notes, height_note),
     )
@@ -296,16 +295,16 @@ def _use_barometer_height(
 
 def explain_missing_source(flight: Flight) -> Unavailable:
     """Return the reason why the log has no position source, and the action for the user."""
-    topics = f"{', '.join(SOURCE_TRACKS)} or EKF2 innovations of external vision"
+    topics = f"{', '.join(SOURCE_TRACKS)}, and EKF2 innovations of external vision"
     remedy = (
         "set SDLOG_PROFILE to 129 and send the UWB position to PX4 as VISION_POSITION_ESTIMATE, or "
         "give the position file with --position."
     )
     if flight.log.format.startswith("MAVLink"):
-        topics = " or ".join(dict.fromkeys(source.message for source in POSITION_MESSAGE_TYPES))
+        topics = ", ".join(dict.fromkeys(source.message for source in POSITION_MESSAGE_TYPES))
         remedy = "give the position file of the positioning system as argument `position`"
         remedy = (
-            f"{remedy}, or read the ULog of this flight."
+            f"{remedy}, or analyse the ULog of this flight."
             if flight.log.writes_ulog
             else f"{remedy}."
         )
@@ -315,7 +314,7 @@ def explain_missing_source(flight: Flight) -> Unavailable:
             f"use {track_name}, which EKF2 did not fuse (--position-source {track_name}), "
             f"or {remedy}"
         )
-    reason = f"no external position in this log (no {topics})"
+    reason = f"no external position in this log (possible sources: {topics})"
     height_only_reason = next(
         (item for item in flight.missing if item.reason == HEIGHT_ONLY_REASON), None
     )
@@ -334,10 +333,10 @@ def explain_missing_source(flight: Flight) -> Unavailable:
 
 def _explain_choice(flight: Flight, track: PositionTrack) -> str:
     if track.origin == POSITION_FILE_ORIGIN:
-        return "position file given with --position"
+        return "the user gave this position file with --position"
     if track.origin.fused_as_gnss:
         return "the only position source in the log, fused by EKF2"
-    origin_text = f" (from {track.log})" if track.log and track.log != flight.log.name else ""
+    log_text = f" (from {track.log})" if track.log and track.log != flight.log.name else ""
     unusable_sources = [
         missing.source
         for missing in flight.missing
@@ -346,9 +345,9 @@ def _explain_choice(flight: Flight, track: PositionTrack) -> str:
         < track.origin.find_preference_rank()
     ]
     if not unusable_sources:
-        return f"chosen automatically: positions as received by PX4{origin_text}"
+        return f"chosen automatically: positions as received by PX4{log_text}"
     sources_text = ", ".join(unusable_sources)
-    return f"chosen automatically{origin_text}; preferred sources are not usable: {sources_text}"
+    return f"chosen automatically{log_text}; preferred sources are not usable: {sources_text}"
 
 
 def shift_clock(track: PositionTrack, clock_offset_s: float) -> PositionTrack:
@@ -380,9 +379,9 @@ def choose_segment(
     available_end_s = min(source_span_s[1], flight.log.duration_s)
     chosen_start_s, chosen_end_s = available_start_s, available_end_s
     if isinstance(flight.airborne, Unavailable):
-        reason = "whole duration of the position source (no land detector in the log)"
+        reason = "the whole time span with positions, because the log contains no land detector"
     elif not flight.airborne:
-        reason = "whole duration of the position source (the vehicle stayed on the ground)"
+        reason = "the whole time span with positions, because the vehicle stayed on the ground"
     else:
         flight_spans_s = join_flights(flight.airborne)
         chosen_start_s, chosen_end_s = max(
@@ -403,7 +402,7 @@ def choose_segment(
         if not max(chosen_start_s, available_start_s) < min(chosen_end_s, available_end_s):
             chosen_start_s = min(chosen_start_s, available_start_s)
             chosen_end_s = max(chosen_end_s, available_end_s)
-            reason = "whole duration of the position source (no positions in flight)"
+            reason = "the whole time span with positions, because there are no positions in flight"
     if start_s is not None or end_s is not None:
         chosen_start_s = chosen_start_s if start_s is None else start_s
         chosen_end_s = chosen_end_s if end_s is None else end_s
@@ -416,7 +415,7 @@ def choose_segment(
             and clipped_span_s[0] < clipped_span_s[1]
         ):
             chosen_start_s, chosen_end_s = clipped_span_s
-            reason += ", limited to the logged time"
+            reason += "; the log covers only part of the chosen time"
     if not chosen_start_s < chosen_end_s:
         raise SettingsError(
             f"{flight.log.name}: no positions between {chosen_start_s:.6g} s and "

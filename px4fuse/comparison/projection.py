@@ -33,9 +33,9 @@ PROJECTED_COLUMNS: Mapping[str, tuple[list[str], int]] = {
     "position_variance_m2": (Columns.POSITION_VARIANCE, 2),
     "velocity_variance_m2_s2": (Columns.VELOCITY_VARIANCE, 2),
 }
-# EKF2's resets are removed if EKF2's median squared distance from the positions then decreases to
-# less than this fraction
-MAX_SQUARED_DISTANCE_RATIO = 0.95
+# Maximum ratio of EKF2's median squared distance from the positions without resets to the distance
+# with resets, to remove the resets
+MAX_DISTANCE_RATIO_WITHOUT_RESETS = 0.95
 
 
 def remove_origin_resets(
@@ -43,8 +43,8 @@ def remove_origin_resets(
 ) -> tuple[pd.DataFrame, str]:
     """Remove the resets of EKF2's position that only move the origin of its frame.
 
-    Resets are removed if this reduces the median distance of EKF2 from the measured positions. All
-    other resets correct an error of EKF2 and are not removed.
+    A reset moves only the origin if EKF2 without the reset is closer to the measured positions. All
+    other resets correct an error of EKF2 and are kept.
 
     Returns
     -------
@@ -53,10 +53,10 @@ def remove_origin_resets(
     statement : str
         Text for the user with the numbers of removed and other resets; empty without a reset.
     """
-    resets_inside = [
+    resets_in_segment = [
         reset for reset in ekf2.resets if segment.start_s < reset.time_s <= segment.end_s
     ]
-    state = ekf2.state.copy() if resets_inside else ekf2.state
+    state = ekf2.state.copy() if resets_in_segment else ekf2.state
     removed_reset_texts, kept_reset_texts = list[str](), list[str]()
     for label, quantity, columns in (
         ("horizontal position", "position", Columns.POSITION[:2]),
@@ -67,7 +67,7 @@ def remove_origin_resets(
         axes = [Columns.STATE.index(column) % 3 for column in columns]
         resets = [
             reset
-            for reset in resets_inside
+            for reset in resets_in_segment
             if reset.quantity == quantity and any(reset.delta[axis] for axis in axes)
         ]
         if not resets:
@@ -77,20 +77,20 @@ def remove_origin_resets(
             samples = cut_to_segment(track.samples, segment)[columns].dropna()
             compute_squared_distance_m2 = partial(_compute_squared_distance_m2, samples)
             candidates = _make_states_without_resets(ekf2.state[columns], resets, axes)
-            best_state = min(candidates, key=compute_squared_distance_m2)
+            closest_state = min(candidates, key=compute_squared_distance_m2)
             if compute_squared_distance_m2(
-                best_state
-            ) < MAX_SQUARED_DISTANCE_RATIO * compute_squared_distance_m2(ekf2.state):
-                state[columns], group = best_state, removed_reset_texts
+                closest_state
+            ) < MAX_DISTANCE_RATIO_WITHOUT_RESETS * compute_squared_distance_m2(ekf2.state):
+                state[columns], group = closest_state, removed_reset_texts
         group.append(f"{len(resets)} of {label}")
     reset_statements = (
         f"{treatment}: {', '.join(reset_texts)}"
         for treatment, reset_texts in (
             (
-                "EKF2 resets removed, because they only move the origin of EKF2's frame",
+                "EKF2 resets that only move the origin of EKF2's frame were removed",
                 removed_reset_texts,
             ),
-            ("EKF2 resets not removed, because they correct an error of EKF2", kept_reset_texts),
+            ("EKF2 resets that correct an error of EKF2 were kept", kept_reset_texts),
         )
         if reset_texts
     )
@@ -98,19 +98,21 @@ def remove_origin_resets(
 
 
 def _make_states_without_resets(
-    published: pd.DataFrame, resets: list[Reset], axes: list[int]
+    published_state: pd.DataFrame, resets: list[Reset], axes: list[int]
 ) -> Iterator[pd.DataFrame]:
-    """Yield EKF2's position without resets, in the frame of each interval between resets."""
+    """Yield EKF2's positions without resets, one table for each interval between resets.
+
+    In each table, all positions are in EKF2's frame of one interval.
+    """
     reset_m = np.array([reset.delta for reset in resets])[:, axes]
-    is_after_reset = np.array([published.index >= reset.time_s for reset in resets]).T
+    is_after_reset = np.array([published_state.index >= reset.time_s for reset in resets]).T
     for earlier_count in range(len(resets) + 1):
-        # All positions are converted to the frame between the resets earlier_count and
-        # earlier_count + 1: earlier resets are added to the positions before them, later resets are
-        # subtracted from the positions after them
-        shift_m = (~is_after_reset[:, :earlier_count]) @ reset_m[:earlier_count] - is_after_reset[
-            :, earlier_count:
-        ] @ reset_m[earlier_count:]
-        yield published + shift_m
+        # The frame is that after the first earlier_count resets. These resets are added to the
+        # positions before them; all later resets are subtracted from the positions after them
+        frame_shift_m = (~is_after_reset[:, :earlier_count]) @ reset_m[
+            :earlier_count
+        ] - is_after_reset[:, earlier_count:] @ reset_m[earlier_count:]
+        yield published_state + frame_shift_m
 
 
 def _compute_squared_distance_m2(samples: pd.DataFrame, state: pd.DataFrame) -> float:
@@ -137,7 +139,7 @@ def project(table: pd.DataFrame, axis: Axis, segment: Segment) -> pd.DataFrame:
     return pd.DataFrame(projected_columns, index=rows.index)
 
 
-def _report_no_samples(quantity_name: str) -> Unavailable:
+def _make_no_samples_result(quantity_name: str) -> Unavailable:
     reason = f"the log contains no {quantity_name} in the analysed time span"
     return Unavailable(quantity_name, reason, "Analyse a longer time span.")
 
@@ -148,20 +150,22 @@ def project_variance(ekf2: Ekf2, axis: Axis, segment: Segment) -> pd.DataFrame |
         return ekf2.variance
     projected_variance = project(ekf2.variance, axis, segment)
     if projected_variance.empty:
-        return _report_no_samples("EKF2 variances")
+        return _make_no_samples_result("EKF2 variances")
     return projected_variance
 
 
-def project_horizon_position(ekf2: Ekf2, axis: Axis, segment: Segment) -> pd.DataFrame | None:
+def project_fusion_horizon_position(
+    ekf2: Ekf2, axis: Axis, segment: Segment
+) -> pd.DataFrame | None:
     """Return EKF2's position (m) and its variance (m²) at the fusion horizon, if logged.
 
-    EKF2's variance belongs to this position. The published position is extrapolated to the present
-    by the output predictor. Covariances between axes are neglected, because they are not logged.
+    EKF2's variance belongs to this position. The output predictor extrapolates the published
+    position to the present. Covariances between axes are neglected, because they are not logged.
     """
     weights = dict(zip(AXIS_NAMES, axis.direction.tolist(), strict=True))
     aid = ekf2.aids.get("ev_hgt" if axis.name == "down" else "ev_pos")
     if aid is not None and f"observation_{aid.axes[0]}" in aid.samples:
-        # State before an update: position = observation - innovation, P⁻ = S - R
+        # Before an update, the position is observation - innovation, and the variance P⁻ is S - R
         samples = cut_to_segment(aid.samples, segment)
         position, variance = (
             sum(
@@ -176,14 +180,16 @@ def project_horizon_position(ekf2: Ekf2, axis: Axis, segment: Segment) -> pd.Dat
         )
         if axis.name == "down":
             position = position + _find_altitude_offset_m(ekf2, position)
-        horizon_positions = pd.DataFrame({"position_m": position, "position_variance_m2": variance})
-        return horizon_positions[horizon_positions["position_variance_m2"] > 0.0]
+        fusion_horizon_positions = pd.DataFrame(
+            {"position_m": position, "position_variance_m2": variance}
+        )
+        return fusion_horizon_positions[fusion_horizon_positions["position_variance_m2"] > 0.0]
     if isinstance(ekf2.record, Unavailable):
         return None
     # Logs of PX4 before v1.16 contain the state at the fusion horizon
-    horizon_state = project(ekf2.record.delayed, axis, segment)
-    horizon_positions = horizon_state[["position_m", "position_variance_m2"]].dropna()
-    return horizon_positions if len(horizon_positions) else None
+    fusion_horizon_state = project(ekf2.record.delayed, axis, segment)
+    fusion_horizon_positions = fusion_horizon_state[["position_m", "position_variance_m2"]].dropna()
+    return fusion_horizon_positions if len(fusion_horizon_positions) else None
 
 
 def _find_altitude_offset_m(ekf2: Ekf2, down_m: pd.Series) -> float:
@@ -203,12 +209,12 @@ def project_innovations(
     """Project EKF2's innovations onto an axis, and add EKF2's position variance at each update.
 
     The added columns are ``prior_variance_m2`` (P⁻ = S - R) and ``posterior_variance_m2``
-    (P⁺ = P⁻R/S; P⁻ if rejected); NaN if R is unknown.
+    (P⁺ = P⁻R/S if fused, P⁻ if rejected). Both are NaN if R is unknown.
     """
     if track.aid(axis.name) is None:
         return Unavailable(
             "EKF2 innovations",
-            f"EKF2 never fuses {track.name}, so its logged innovations are of another source",
+            f"EKF2 never fuses {track.name}; the logged innovations belong to another source",
             "Choose the source that EKF2 fused (--position-source).",
         )
     axis_innovations = []
@@ -220,7 +226,7 @@ def project_innovations(
     if axis.name == AISLE:
         rows = _combine_north_and_east(rows, axis_innovations[1], axis.direction)
     if rows.empty:
-        return _report_no_samples("EKF2 innovations")
+        return _make_no_samples_result("EKF2 innovations")
     noise_variance = rows["observation_variance_m2"].fillna(
         find_observation_variance(flight, track, axis, segment)
     )
@@ -243,13 +249,15 @@ def _combine_north_and_east(
     common_times = north_innovations.index.intersection(east_innovations.index)
     north, east = north_innovations.loc[common_times], east_innovations.loc[common_times]
     cosine, sine = float(direction[0]), float(direction[1])
-    # cos² and sin² are the weights of variances; columns of other quantities are replaced below
-    combined = cosine * cosine * north + sine * sine * east
-    combined["innovation_m"] = cosine * north["innovation_m"] + sine * east["innovation_m"]
+    # cos² and sin² are the weights of variances. All columns without variances are set below
+    combined_innovations = cosine * cosine * north + sine * sine * east
+    combined_innovations["innovation_m"] = (
+        cosine * north["innovation_m"] + sine * east["innovation_m"]
+    )
     for column in ("test_ratio", "fused", "rejected"):
         # EKF2 fuses or rejects both axes together, so the larger value is used
-        combined[column] = np.fmax(north[column], east[column])
-    return combined
+        combined_innovations[column] = np.fmax(north[column], east[column])
+    return combined_innovations
 
 
 def find_observation_variance(
@@ -289,5 +297,5 @@ def project_truth(
         return truth
     projected_truth = project(truth.samples, axis, segment)
     if len(projected_truth) < MIN_COMMON_SAMPLES:
-        return _report_no_samples("ground truth")
+        return _make_no_samples_result("ground truth")
     return projected_truth

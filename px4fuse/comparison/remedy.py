@@ -22,12 +22,12 @@ GNSS_DELAYS_MS = (0.0, 150.0, 300.0)
 # Transmission time (ms) of a position message: EKF2_DELAY_MAX includes it
 TRANSMISSION_DELAY_MS = 30.0
 # EKF2_DELAY_MAX is rounded up to a multiple of this value (ms)
-DELAY_MAX_ROUNDING_MS = 50.0
+EKF2_DELAY_MAX_STEP_MS = 50.0
 # A height noise that differs from the horizontal noise is reported only if EKF2 fuses heights of
 # the source for at least this fraction of the time
-MIN_HEIGHT_FUSED_FRACTION = 0.5
-# Minimum height noise / horizontal noise for which one noise parameter does not fit both
-MIN_HEIGHT_TO_HORIZONTAL_NOISE = 2.0
+MIN_FUSED_FRACTION_OF_HEIGHTS = 0.5
+# Minimum ratio of height noise to horizontal noise, to report that one parameter sets both noises
+MIN_HEIGHT_TO_HORIZONTAL_NOISE_RATIO = 2.0
 
 
 def estimate_gnss_delay_ms(model: Ekf2Model) -> tuple[float, float] | None:
@@ -36,8 +36,12 @@ def estimate_gnss_delay_ms(model: Ekf2Model) -> tuple[float, float] | None:
     The delay minimises the NIS of GNSS in re-runs of EKF2 with several values of EKF2_GPS_DELAY.
     Return None if it does not differ significantly from the logged delay.
     """
-    received = model.inputs.received
-    if model.inputs.vision is None or received.velocity_m_s is None or received.uses_sender_times:
+    received_positions = model.inputs.received
+    if (
+        model.inputs.vision is None
+        or received_positions.velocity_m_s is None
+        or received_positions.uses_sender_times
+    ):
         return None
     nis_sums = []
     for replay in replay_with_settings(
@@ -52,16 +56,14 @@ def estimate_gnss_delay_ms(model: Ekf2Model) -> tuple[float, float] | None:
             for axis in ("north", "east")
             for updates in update_tables
         ]
-        # Sum of NIS for an equal number of samples in all re-runs: the true number depends on the
-        # delay
-        nis_sums.append(float(np.mean(nis)) * len(nis) * len(received.timestamp_s))
+        # The mean is scaled to the same number of samples in all re-runs, because the number of
+        # fused samples depends on the delay
+        nis_sums.append(float(np.mean(nis)) * len(nis) * len(received_positions.timestamp_s))
     quadratic_coefficient, linear_coefficient, _ = np.polyfit(GNSS_DELAYS_MS, nis_sums, 2)
     if quadratic_coefficient <= 0.0:
         return None
-    gnss_delay_ms, delay_sigma_ms = (
-        -0.5 * linear_coefficient / quadratic_coefficient,
-        quadratic_coefficient**-0.5,
-    )
+    gnss_delay_ms = -0.5 * linear_coefficient / quadratic_coefficient
+    delay_sigma_ms = quadratic_coefficient**-0.5
     min_delay_error_ms = max(1e3 * MIN_TIME_OFFSET_S, MIN_OFFSET_SIGMAS * delay_sigma_ms)
     delay_error_ms = abs(gnss_delay_ms - model.inputs.settings[GNSS_POS.delay])
     return (
@@ -93,10 +95,12 @@ def estimate_ekf2_parameters(
     if not is_source_fused(comparison, ekf2_inputs):
         return {}
     axis_tuning = find_first_tuning(tuning, HORIZONTAL, AISLE, "north", "east")
-    may_have_slow_errors = comparison.source.origin.may_drift or comparison.source.origin.is_gnss
+    may_have_correlated_errors = (
+        comparison.source.origin.may_drift or comparison.source.origin.is_gnss
+    )
     noise_m = None if axis_tuning is None else axis_tuning.sigma_z.value
     used_noise_m = find_used_noise_m(ekf2_inputs)
-    min_noise_m = used_noise_m if may_have_slow_errors else 0.0
+    min_noise_m = used_noise_m if may_have_correlated_errors else 0.0
     if (
         axis_tuning
         and noise_m
@@ -118,13 +122,13 @@ def make_estimated_delay_change(
 ) -> dict[str, float]:
     if isinstance(clock_offset, Unavailable) or not clock_offset.is_determinable:
         return {}
-    estimated_delay_ms = estimate_delay_if_wrong_ms(
+    estimated_delay_ms = estimate_differing_delay_ms(
         comparison, clock_offset, ekf2_inputs.settings[ekf2_inputs.aid.delay]
     )
     return {} if estimated_delay_ms is None else make_delay_change(ekf2_inputs, estimated_delay_ms)
 
 
-def estimate_delay_if_wrong_ms(
+def estimate_differing_delay_ms(
     comparison: PreparedComparison, clock_offset: ClockOffset, logged_delay_ms: float
 ) -> float | None:
     """Return the estimated delay (ms) of the positions if it differs from the logged delay.
@@ -142,7 +146,10 @@ def estimate_delay_if_wrong_ms(
 def describe_delay_limit(
     parameter_name: str, estimated_delay_ms: float, logged_delay_ms: float
 ) -> str:
-    """Return "exceed 300 ms" or "be negative" for a delay that PX4 does not permit, else ""."""
+    """Return the reason why PX4 does not permit a delay, as text after "cannot".
+
+    The text is "exceed 300 ms" or "be negative", and "" for a permitted delay.
+    """
     if estimated_delay_ms > (maximum_ms := PARAMETERS[parameter_name].maximum):
         return f"exceed {maximum_ms:g} ms"
     return "be negative" if round(estimated_delay_ms) <= 0.0 == logged_delay_ms else ""
@@ -225,8 +232,8 @@ def make_delay_max_change(
     if required_delay_max_ms <= settings.get("EKF2_DELAY_MAX", math.inf):
         return {}
     return {
-        "EKF2_DELAY_MAX": DELAY_MAX_ROUNDING_MS
-        * math.ceil(required_delay_max_ms / DELAY_MAX_ROUNDING_MS)
+        "EKF2_DELAY_MAX": EKF2_DELAY_MAX_STEP_MS
+        * math.ceil(required_delay_max_ms / EKF2_DELAY_MAX_STEP_MS)
     }
 
 
@@ -257,13 +264,13 @@ def make_height_noise_advice(
     if not isinstance(down_tuning, AxisTuning) or not comparison.source.origin.is_vision:
         return ""
     height_noise_m = down_tuning.sigma_z.value or 0.0
-    is_fused = ekf2.fusion_flags["vertical"].mean() > MIN_HEIGHT_FUSED_FRACTION
-    if not is_fused or height_noise_m < MIN_HEIGHT_TO_HORIZONTAL_NOISE * noise_m:
+    is_fused = ekf2.fusion_flags["vertical"].mean() > MIN_FUSED_FRACTION_OF_HEIGHTS
+    if not is_fused or height_noise_m < MIN_HEIGHT_TO_HORIZONTAL_NOISE_RATIO * noise_m:
         return ""
     return (
-        f" {EV_POS.noise} also sets EKF2's height noise, but the height noise of the source is "
-        f"{height_noise_m:.2g} m. Report a variance of {height_noise_m**2:.2g} m² for z, and set "
-        f"{EV_POS.noise_mode} to 0."
+        f" {EV_POS.noise} is also the noise of heights, but the height noise of the source is "
+        f"{height_noise_m:.2g} m. Set {EV_POS.noise_mode} to 0, and send each position with a "
+        f"variance of {height_noise_m**2:.2g} m² for z."
     )
 
 

@@ -40,7 +40,7 @@ from px4fuse.comparison.projection import project, project_truth
 from px4fuse.comparison.remedy import is_source_fused
 from px4fuse.comparison.trials import (
     CLOCK_OFFSET_KEY,
-    DISCREPANCY_STATISTICS,
+    CONSISTENCY_STATISTICS,
     FORWARD_BIAS_KEY,
     MIN_REPORTED_NEES,
     OUTLIERS_KEY,
@@ -50,7 +50,7 @@ from px4fuse.comparison.trials import (
     RunStatistics,
     Statistic,
     Trial,
-    find_helpful_trials,
+    find_partial_corrections,
 )
 from px4fuse.core.arrays import Array
 from px4fuse.ekf2.filter_recursion import FilterConfiguration
@@ -79,16 +79,16 @@ POSITION_VARIANCE_COLUMNS = [f"position_variance_{axis}_m2" for axis in HORIZONT
 OBSERVATION_VARIANCE_COLUMNS = [f"observation_variance_{axis}_m2" for axis in HORIZONTAL_AXES]
 DIFFERENCE_UNAVAILABLE = Unavailable(
     "difference KF - EKF2",
-    "this re-run rotates KF's frame but not EKF2's, so their positions are not comparable",
+    "this re-run rotates only KF's frame, so positions of KF and EKF2 are not comparable",
     "",
 )
-# Re-runs of EKF2 are compared with the log if position RMSE and σ ratios of the replay agree with
-# the log within this factor. Otherwise they are compared with the replay
-MAX_REPLAY_TO_LOG_RATIO = 1.10
+# Re-runs of EKF2 are compared with the log if replay and log agree within this factor in position
+# RMSE and σ ratios. Otherwise, they are compared with the replay
+MAX_REPLAYED_TO_LOGGED_RATIO = 1.10
 
 
 class ErrorAboveSigma(NamedTuple):
-    """Position error of a filter against ground truth that exceeds its reported σ."""
+    """Position error of a filter against ground truth that exceeds the filter's reported σ."""
 
     nees: float
     rmse_m: float
@@ -97,16 +97,16 @@ class ErrorAboveSigma(NamedTuple):
 
 
 def find_error_above_sigma(summary: FilterSummary | UntestedFilter) -> ErrorAboveSigma | None:
-    """Return the position error of a filter if it exceeds the reported σ, but mean NIS is normal.
+    """Return the position error if it exceeds the reported σ although the mean NIS is normal.
 
-    Without innovations along the axis, the mean NIS counts as normal.
+    A missing mean NIS counts as normal.
     """
     truth = summary.truth
     if isinstance(truth, Unavailable):
         return None
     nis_mean = None if isinstance(summary, Unavailable) else summary.nis_mean
     nees, rmse_m = truth.nees_position_mean or 0.0, truth.position_rmse_m
-    # Lag of the output predictor is no such error: NEES at the fusion horizon does not contain it
+    # The NEES at the fusion horizon does not contain errors due to the lag of the output predictor
     fusion_horizon_nees = truth.nees_position_horizon_mean or nees
     if min(nees, fusion_horizon_nees) < MIN_REPORTED_NEES or (nis_mean or 0.0) >= MAX_NORMAL_NIS:
         return None
@@ -204,7 +204,7 @@ def _find_changes_to_test(
     ekf2_inputs: ReplayInputs | None,
     axis_result: AxisComparison,
 ) -> list[tuple[Change, tuple[Statistic, ...]]]:
-    """Return the changes for re-runs along an axis, each with the statistics it may correct."""
+    """Return the changes for re-runs along an axis, and the statistics that each may correct."""
     summary = axis_result.filters["kf" if ekf2_inputs is None else "ekf2"]
     if not isinstance(summary, FilterSummary) or (
         ekf2_inputs is not None and axis_result.axis.name == "down"
@@ -218,7 +218,7 @@ def _find_changes_to_test(
         statistic: find_candidate_changes(
             comparison, estimates, ekf2_inputs, axis_result, statistic
         )
-        for statistic in DISCREPANCY_STATISTICS
+        for statistic in CONSISTENCY_STATISTICS
         if has_discrepancy[statistic]
     }
     changes = remove_repeated_changes(chain.from_iterable(candidates.values()))
@@ -239,7 +239,7 @@ def _rerun_with_changes(
     changes = _find_changes_to_test(comparison, estimates, tested_filter.ekf2_inputs, axis_result)
     if not changes:
         return []
-    original_statistics, is_logged = _find_original_statistics(tested_filter, axis_result)
+    original_statistics, is_logged = _find_statistics_without_change(tested_filter, axis_result)
 
     def make_trial(change: Change, discrepancies: Iterable[Statistic]) -> Trial:
         changed_statistics = tested_filter.rerun(axis_result, change)
@@ -262,8 +262,8 @@ def _rerun_with_changes(
         )
 
     trials = [make_trial(change, discrepancies) for change, discrepancies in changes]
-    for statistic in DISCREPANCY_STATISTICS:
-        helpful_trials = find_helpful_trials(trials, statistic)
+    for statistic in CONSISTENCY_STATISTICS:
+        helpful_trials = find_partial_corrections(trials, statistic)
         trials += [
             make_trial({**helpful_trials[0].change, **other_trial.change}, (statistic,))
             for other_trial in helpful_trials[1:]
@@ -271,10 +271,10 @@ def _rerun_with_changes(
     return trials
 
 
-def _find_original_statistics(
+def _find_statistics_without_change(
     tested_filter: _Filter, axis_result: AxisComparison
 ) -> tuple[RunStatistics, bool]:
-    """Return the statistics with unchanged settings, and True if they are from the log."""
+    """Return the statistics without a change, and True if they are from the log, not a replay."""
     replayed_statistics, logged_state = tested_filter.rerun(axis_result, {}), axis_result.ekf2_state
     if tested_filter.ekf2_model is None:
         return replayed_statistics, True
@@ -296,13 +296,13 @@ def _find_original_statistics(
         (
             logged_statistics.position_rmse_m,
             replayed_statistics.position_rmse_m,
-            MAX_REPLAY_TO_LOG_RATIO,
+            MAX_REPLAYED_TO_LOGGED_RATIO,
         ),
-        (logged_statistics.nis_mean, replayed_statistics.nis_mean, MAX_REPLAY_TO_LOG_RATIO**2),
+        (logged_statistics.nis_mean, replayed_statistics.nis_mean, MAX_REPLAYED_TO_LOGGED_RATIO**2),
         (
             logged_statistics.nees_mean,
             replayed_statistics.nees_mean,
-            MAX_REPLAY_TO_LOG_RATIO**2,
+            MAX_REPLAYED_TO_LOGGED_RATIO**2,
         ),
     )
     is_replay_similar = all(
@@ -320,15 +320,15 @@ def _summarise_run(
     kf_minus_ekf2: Difference | Unavailable,
     rejected_fraction: float | None = None,
 ) -> RunStatistics:
-    truth = errors if isinstance(errors, ErrorsAgainstTruth) else None
+    known_errors = errors if isinstance(errors, ErrorsAgainstTruth) else None
     has_innovations = len(innovation_m) > 0
     return RunStatistics(
         innovations=len(innovation_m),
         nis_mean=float(np.mean(innovation_m**2 / innovation_variance_m2))
         if has_innovations
         else None,
-        position_rmse_m=None if truth is None else truth.position_rmse_m,
-        nees_mean=None if truth is None else truth.nees_position_mean,
+        position_rmse_m=None if known_errors is None else known_errors.position_rmse_m,
+        nees_mean=None if known_errors is None else known_errors.nees_position_mean,
         difference_rms_m=None
         if isinstance(kf_minus_ekf2, Unavailable)
         else kf_minus_ekf2.position_rms_m,
@@ -348,10 +348,8 @@ def _rerun_kf(
         name: change[name] for name in change if name in vars(Settings())
     }
     changed_settings = replace(comparison.settings, **kf_settings)
-    truth, rotates_gnss_positions = (
-        axis_result.truth,
-        ROTATION_KEY in change and source.origin.is_gnss,
-    )
+    truth = axis_result.truth
+    rotates_gnss_positions = ROTATION_KEY in change and source.origin.is_gnss
     if ROTATION_KEY in change:
         rotated_direction = _rotate_direction(axis.direction, change[ROTATION_KEY])
         measured_m = weighted_sum(
@@ -359,8 +357,8 @@ def _rerun_kf(
         )
         axis = replace(axis, measurement_m=measured_m[np.isfinite(measured_m)])
         if rotates_gnss_positions:
-            # The acceleration has the wrong heading. Rotating GNSS positions and ground truth
-            # instead is equivalent
+            # The heading of the acceleration is wrong. Rotating GNSS positions and ground truth
+            # has the same effect as correcting this heading
             rotated_axis = replace(axis, direction=rotated_direction)
             truth = project_truth(comparison.flight.truth, rotated_axis, segment)
     if FORWARD_BIAS_KEY in change:
@@ -406,7 +404,7 @@ def _replay_ekf2(
     if not change:
         return model.baseline_replay
     changed_parameters = {name: value for name, value in change.items() if name in PARAMETERS}
-    misaligned_model = misalign_positions(
+    model_with_moved_positions = misalign_positions(
         model, change.get(ROTATION_KEY, 0.0), change.get(CLOCK_OFFSET_KEY, 0.0)
     )
     excluded_times_s, axis_tuning = None, find_axis_tuning(tuning, HORIZONTAL)
@@ -415,7 +413,9 @@ def _replay_ekf2(
         if comparison.source.origin.fused_as_gnss:
             excluded_times_s += 1e-3 * model.inputs.settings[model.inputs.aid.delay]
         excluded_times_s += change.get(CLOCK_OFFSET_KEY, 0.0)
-    (replay,) = replay_with_settings(misaligned_model, [changed_parameters], excluded_times_s)
+    (replay,) = replay_with_settings(
+        model_with_moved_positions, [changed_parameters], excluded_times_s
+    )
     return replay
 
 
@@ -433,15 +433,19 @@ def _summarise_replay(
     """
     evaluated_spans_s, axis = model.baseline_replay.find_evaluated_spans(), axis_result.axis
     if ROTATION_KEY in change and comparison.source.origin.is_gnss:
-        # EKF2's frame rotates with the GNSS positions, so the axis is rotated by the same angle
+        # The rotated GNSS positions rotate EKF2's frame. The axis is rotated by the same angle
         axis = replace(axis, direction=_rotate_direction(axis.direction, -change[ROTATION_KEY]))
-    cosines, ekf2_updates = axis.direction[:2], ekf2_replay.updates
+    direction_cosines, ekf2_updates = axis.direction[:2], ekf2_replay.updates
     ekf2_updates = rows_inside(ekf2_updates, evaluated_spans_s)
-    innovation_variance_m2 = weighted_sum(ekf2_updates, INNOVATION_VARIANCE_COLUMNS, cosines**2)
-    prior_variance_m2 = innovation_variance_m2 - weighted_sum(
-        ekf2_updates, OBSERVATION_VARIANCE_COLUMNS, cosines**2
+    innovation_variance_m2 = weighted_sum(
+        ekf2_updates, INNOVATION_VARIANCE_COLUMNS, direction_cosines**2
     )
-    posterior_variance_m2 = weighted_sum(ekf2_updates, POSITION_VARIANCE_COLUMNS, cosines**2)
+    prior_variance_m2 = innovation_variance_m2 - weighted_sum(
+        ekf2_updates, OBSERVATION_VARIANCE_COLUMNS, direction_cosines**2
+    )
+    posterior_variance_m2 = weighted_sum(
+        ekf2_updates, POSITION_VARIANCE_COLUMNS, direction_cosines**2
+    )
     variance_by_time = pd.DataFrame(
         {
             "position_variance_m2": 0.5 * (prior_variance_m2 + posterior_variance_m2),
@@ -451,14 +455,14 @@ def _summarise_replay(
     )
     published_track = project(ekf2_replay.published, axis, comparison.segment)
     published_track = rows_inside(published_track, evaluated_spans_s)
-    logged_state, compared_track = axis_result.ekf2_state, published_track
+    logged_state, track_compared_with_kf = axis_result.ekf2_state, published_track
     # Without a change, KF is compared with the logged EKF2 (as in the report), else with the replay
     if not change and not isinstance(logged_state, Unavailable):
-        compared_track = rows_inside(logged_state, evaluated_spans_s)
+        track_compared_with_kf = rows_inside(logged_state, evaluated_spans_s)
     return _summarise_run(
-        weighted_sum(ekf2_updates, INNOVATION_COLUMNS, cosines),
+        weighted_sum(ekf2_updates, INNOVATION_COLUMNS, direction_cosines),
         innovation_variance_m2,
         compute_error_statistics(published_track, variance_by_time, axis_result.truth),
-        compute_difference_statistics(axis_result.replay, compared_track),
+        compute_difference_statistics(axis_result.replay, track_compared_with_kf),
         float((ekf2_updates["rejected"] > 0.0).mean()) if len(ekf2_updates) else None,
     )

@@ -1,4 +1,4 @@
-"""Re-runs of KF or EKF2 with changed settings or data, and their effect along one axis."""
+"""Re-runs of KF or EKF2 with changed settings or data, and the effect of each change."""
 
 import math
 from collections.abc import Iterable, Mapping
@@ -12,39 +12,41 @@ from px4fuse.filter.consistency import Reference, classify_sigma_ratio, compute_
 from px4fuse.flight.ekf2_parameters import EV_POS
 
 Statistic = Literal["nis", "nees", "difference"]
-# Statistics that show if a change makes a filter consistent
-DISCREPANCY_STATISTICS: tuple[Statistic, Statistic] = ("nees", "nis")
+# Statistics that show whether a filter is consistent
+CONSISTENCY_STATISTICS: tuple[Statistic, Statistic] = ("nees", "nis")
 # Values of KF settings, EKF2 parameters and corrections of the data, by name
 Change = Mapping[str, float]
-# Keys of Trial.change for corrections of the data, not of parameters
+# Names of corrections of the data in a change: shift of the timestamps (s), clockwise rotation of
+# the positions (°), number of omitted outliers, and removed accelerometer bias (m/s²)
 CLOCK_OFFSET_KEY, ROTATION_KEY, OUTLIERS_KEY = "clock_offset_s", "turned_deg", "outliers_left_out"
 FORWARD_BIAS_KEY, RIGHT_BIAS_KEY = "bias_forward_m_s2", "bias_right_m_s2"
 Improvement = Literal["position and σ", "position", "σ only", "nothing"]
 # Position errors are reported if the mean NEES exceeds this limit (2 reported σ): flights without a
 # fault have a mean NEES below 3
 MIN_REPORTED_NEES = 4.0
-# A smaller noise makes a filter overconfident if the mean NEES was above 1 and reaches this limit
-MAX_NEES_AFTER_CHANGE = 2.0
-# A change may be the cause if it removes a fraction of 1 ± this tolerance of ln(mean NIS) or
-# ln(mean NEES), which are 0 for a consistent filter
-CAUSE_FRACTION_TOLERANCE = 0.5
-# A corrected sensor fault is the only cause if it removes a fraction of 1 ± this tolerance
-SENSOR_CAUSE_TOLERANCE = 0.25
-# Changes are combined in one re-run if each alone removes a fraction of 1 ± this tolerance
-COMBINATION_TOLERANCE = 0.9
-# Keys of Trial.change that correct faulty sensor data; other keys change settings of a filter
-SENSOR_CHANGE_KEYS = frozenset((OUTLIERS_KEY, CLOCK_OFFSET_KEY, ROTATION_KEY, FORWARD_BIAS_KEY))
-# Keys of Trial.change that have an effect only together with another change
+# A re-run with smaller noise makes a filter overconfident if the mean NEES was above 1 before and
+# is at least this value after the re-run
+MIN_OVERCONFIDENT_NEES_AFTER_CHANGE = 2.0
+# A change is a possible cause if it removes 50 % to 150 % of ln(mean NIS) or ln(mean NEES). These
+# logarithms are 0 for a consistent filter
+POSSIBLE_CAUSE_FRACTION_TOLERANCE = 0.5
+# A sensor fault is the only cause if its correction removes 75 % to 125 % of ln(mean NIS or NEES)
+ONLY_CAUSE_FRACTION_TOLERANCE = 0.25
+# Two changes are combined in a re-run if each change removes 10 % to 190 % of ln(mean NIS or NEES)
+COMBINED_CHANGE_FRACTION_TOLERANCE = 0.9
+# Names of changes that correct faulty sensor data. Other changes are settings of a filter
+SENSOR_CORRECTION_KEYS = frozenset((OUTLIERS_KEY, CLOCK_OFFSET_KEY, ROTATION_KEY, FORWARD_BIAS_KEY))
+# Names of changes that have an effect only together with another change
 SECONDARY_CHANGE_KEYS = frozenset(("EKF2_DELAY_MAX", EV_POS.noise_mode, RIGHT_BIAS_KEY))
 # A re-run has an effect if it changes a ratio of actual to reported σ by at least this factor
-MIN_SIGMA_RATIO_FACTOR = 1.10
+MIN_SIGMA_RATIO_CHANGE_FACTOR = 1.10
 # A re-run has an effect if it changes the position RMSE by more than this fraction
 MIN_RMSE_CHANGE_FRACTION = 0.05
 # A re-run improves the position if it reduces the position RMSE by at least this fraction
 MIN_RMSE_REDUCTION = 0.20
-# A re-run leaves a filter overconfident if more than this fraction of ln(actual / reported σ)
-# against ground truth remains
-MAX_REMAINING_ERROR_FRACTION = 0.75
+# A filter remains overconfident if more than this fraction of ln(actual σ / reported σ) against
+# ground truth remains after a re-run
+MAX_REMAINING_OVERCONFIDENCE_FRACTION = 0.75
 
 
 class RunStatistics(Record, kw_only=True):
@@ -66,21 +68,22 @@ class RunStatistics(Record, kw_only=True):
 
 
 class Trial(Record, kw_only=True):
-    """Re-run of one filter along one axis with a change, and its effect.
+    """Re-run of one filter with changed settings or data, and the effect along one axis.
 
     Attributes
     ----------
     kinds : tuple of str
         Kinds of change, for example "noise", "delay", "outliers" or "rotation".
     change : mapping from name to value
-        KF settings, EKF2 parameters, or a correction of the data: ``turned_deg`` (clockwise
-        rotation of the positions), ``outliers_left_out`` (number), or a removed accelerometer bias.
+        New values of KF settings or EKF2 parameters. A correction of the data is ``turned_deg``
+        (clockwise rotation of the positions), ``outliers_left_out`` (number of outliers),
+        ``clock_offset_s`` (shift of the timestamps), or a removed accelerometer bias.
     discrepancies : tuple of {"nis", "nees"}
-        Statistics outside their limits that the change may correct.
+        Statistics that are outside their limits and that the change may bring inside.
     before, after : RunStatistics
-        Statistics without and with the change, over equal times.
+        Statistics without and with the change, over the same time span.
     is_logged : bool
-        True if ``before`` is from the log, False if from a replay of EKF2.
+        True if ``before`` is from the log (EKF2) or the first run (KF), False if from a replay.
     from_s : float or None
         Start of the evaluated time; None for the whole segment.
     """
@@ -98,14 +101,14 @@ class Trial(Record, kw_only=True):
     @property
     def corrects_sensor(self) -> bool:
         """True if the change corrects faulty sensor data, False if it only changes settings."""
-        return not SENSOR_CHANGE_KEYS.isdisjoint(self.change)
+        return not SENSOR_CORRECTION_KEYS.isdisjoint(self.change)
 
 
 def compute_explained_fraction(trial: Trial, statistic: Statistic) -> float:
     """Return the fraction of ln(mean NIS) or ln(mean NEES) that a change removes.
 
-    For the statistic "difference", it is the fraction of the mean square difference KF - EKF2.
-    Above 1, the change is too large. The fraction is 0 if it is unknown.
+    For the statistic "difference", return the removed fraction of the mean square difference
+    KF - EKF2. A fraction above 1 means that the change is too large. Return 0 for missing values.
     """
     value_before, value_after = trial.before.value(statistic), trial.after.value(statistic)
     if not value_before or not value_after:
@@ -115,7 +118,7 @@ def compute_explained_fraction(trial: Trial, statistic: Statistic) -> float:
     return 1.0 - float(np.log(value_after) / np.log(value_before))
 
 
-def _compute_explanation_error(trial: Trial, statistic: Statistic) -> float:
+def _compute_explained_fraction_error(trial: Trial, statistic: Statistic) -> float:
     return abs(compute_explained_fraction(trial, statistic) - 1.0)
 
 
@@ -130,23 +133,26 @@ def brings_inside_limits(trial: Trial, statistic: Statistic) -> bool:
 
 
 def makes_overconfident(trial: Trial, statistic: Statistic) -> bool:
-    """Return True if the change reduces the reported σ below the errors against ground truth."""
-    nees_before, nis_before, nees_after = (
-        trial.before.nees_mean,
-        trial.before.nis_mean,
-        trial.after.nees_mean,
-    )
+    """Return True if the change makes an underconfident filter overconfident.
+
+    The filter is underconfident against the source, then overconfident against ground truth.
+    """
+    nees_before = trial.before.nees_mean
+    nis_before = trial.before.nis_mean
+    nees_after = trial.after.nees_mean
     if statistic != "nis" or nis_before is None or nis_before >= 1.0 or nees_after is None:
         return False
     return nees_after >= (
-        MAX_NEES_AFTER_CHANGE if nees_before and nees_before > 1.0 else MIN_REPORTED_NEES
+        MIN_OVERCONFIDENT_NEES_AFTER_CHANGE
+        if nees_before and nees_before > 1.0
+        else MIN_REPORTED_NEES
     )
 
 
 def find_trials(
     trials: Iterable[Trial], filter_name: FilterName, axis: str, statistic: Statistic = "nis"
 ) -> list[Trial]:
-    """Return the re-runs of a filter and axis with changes that may correct ``statistic``."""
+    """Return a filter's re-runs along an axis that may bring ``statistic`` inside its limits."""
     return [
         trial
         for trial in trials
@@ -157,53 +163,53 @@ def find_trials(
 def find_cause_trial(
     trials: Iterable[Trial], filter_name: FilterName, axis: str, statistic: Statistic = "nis"
 ) -> Trial | None:
-    """Return the re-run that best corrects a mean NIS or mean NEES outside its limits.
+    """Return the re-run that best brings the mean NIS or mean NEES inside its limits.
 
-    A single change is preferred to two, and a corrected sensor fault to a changed setting.
+    One change is preferred to two changes, and a corrected sensor fault to a changed setting.
     """
 
     def rank(trial: Trial) -> tuple[bool, int, bool, float]:
-        explanation_error = _compute_explanation_error(trial, statistic)
-        is_complete = trial.corrects_sensor and explanation_error <= SENSOR_CAUSE_TOLERANCE
+        explained_fraction_error = _compute_explained_fraction_error(trial, statistic)
+        is_complete = (
+            trial.corrects_sensor and explained_fraction_error <= ONLY_CAUSE_FRACTION_TOLERANCE
+        )
         return (
             not (is_complete or brings_inside_limits(trial, statistic)),
             len(trial.change.keys() - SECONDARY_CHANGE_KEYS),
             not trial.corrects_sensor,
-            explanation_error,
+            explained_fraction_error,
         )
 
     causes = (
         trial
         for trial in find_trials(trials, filter_name, axis, statistic)
-        if _compute_explanation_error(trial, statistic) <= CAUSE_FRACTION_TOLERANCE
+        if _compute_explained_fraction_error(trial, statistic) <= POSSIBLE_CAUSE_FRACTION_TOLERANCE
         and not makes_overconfident(trial, statistic)
     )
     return min(causes, key=rank, default=None)
 
 
-def find_helpful_trials(trials: Iterable[Trial], statistic: Statistic) -> list[Trial]:
-    """Return the re-runs that correct a statistic only partly, best first.
+def find_partial_corrections(trials: Iterable[Trial], statistic: Statistic) -> list[Trial]:
+    """Return the re-runs that bring a statistic closer to its limits, best first.
 
-    The list is empty if one re-run brings the statistic inside its limits.
+    If one re-run brings the statistic inside its limits, return an empty list.
     """
     candidates = [
         trial
         for trial in trials
         if statistic in trial.discrepancies
-        and _compute_explanation_error(trial, statistic) < COMBINATION_TOLERANCE
+        and _compute_explained_fraction_error(trial, statistic) < COMBINED_CHANGE_FRACTION_TOLERANCE
     ]
-    candidates.sort(key=lambda trial: _compute_explanation_error(trial, statistic))
+    candidates.sort(key=lambda trial: _compute_explained_fraction_error(trial, statistic))
     return [] if any(brings_inside_limits(trial, statistic) for trial in candidates) else candidates
 
 
-def compute_log_ratio_sum(statistics: RunStatistics) -> float:
-    """Return |ln(actual / reported σ)| from innovations plus that from errors; 0 is consistent."""
-    squared_ratios = [
-        squared_ratio
-        for squared_ratio in (statistics.nis_mean, statistics.nees_mean)
-        if squared_ratio
-    ]
-    return sum(0.5 * abs(math.log(squared_ratio)) for squared_ratio in squared_ratios)
+def compute_sigma_ratio_deviation(statistics: RunStatistics) -> float:
+    """Return the sum of |ln(actual σ / reported σ)| against source and ground truth.
+
+    The sum is 0 for a consistent filter.
+    """
+    return sum(abs(math.log(ratio)) for ratio in compute_sigma_ratios(statistics).values())
 
 
 def compute_preference_key(trial: Trial) -> tuple[bool, int, float]:
@@ -215,25 +221,25 @@ def compute_preference_key(trial: Trial) -> tuple[bool, int, float]:
     return (
         not is_made_consistent,
         len(trial.change) if is_made_consistent else 0,
-        compute_log_ratio_sum(trial.after),
+        compute_sigma_ratio_deviation(trial.after),
     )
 
 
 def compute_sigma_ratios(statistics: RunStatistics) -> dict[Reference, float]:
     """Return the ratios of actual to reported σ against position source and ground truth."""
-    squared_ratios: dict[Reference, float | None] = {
+    squared_sigma_ratios: dict[Reference, float | None] = {
         "source": statistics.nis_mean,
         "truth": statistics.nees_mean,
     }
     return {
-        reference: math.sqrt(squared_ratio)
-        for reference, squared_ratio in squared_ratios.items()
-        if squared_ratio
+        reference: math.sqrt(squared_sigma_ratio)
+        for reference, squared_sigma_ratio in squared_sigma_ratios.items()
+        if squared_sigma_ratio
     }
 
 
-def compute_log_ratio_reduction(trial: Trial) -> float:
-    return compute_log_ratio_sum(trial.before) - compute_log_ratio_sum(trial.after)
+def compute_sigma_ratio_improvement(trial: Trial) -> float:
+    return compute_sigma_ratio_deviation(trial.before) - compute_sigma_ratio_deviation(trial.after)
 
 
 def compare_sigma_ratios(trial: Trial) -> list[tuple[Reference, float, float]]:
@@ -241,10 +247,8 @@ def compare_sigma_ratios(trial: Trial) -> list[tuple[Reference, float, float]]:
 
     The reference is "source" (ratio from innovations) or "truth" (from errors).
     """
-    sigma_ratios_before, sigma_ratios_after = (
-        compute_sigma_ratios(trial.before),
-        compute_sigma_ratios(trial.after),
-    )
+    sigma_ratios_before = compute_sigma_ratios(trial.before)
+    sigma_ratios_after = compute_sigma_ratios(trial.after)
     return [
         (reference, sigma_ratios_before[reference], sigma_ratios_after[reference])
         for reference in sigma_ratios_before.keys() & sigma_ratios_after.keys()
@@ -261,7 +265,7 @@ def becomes_consistent(trial: Trial) -> bool:
 
 
 def halves_discrepancy(trial: Trial) -> bool:
-    """Return True if a re-run halves |ln(actual / reported σ)| of an inconsistent filter."""
+    """Return True if a re-run halves |ln(actual σ / reported σ)| of an inconsistent filter."""
     return any(
         classify_sigma_ratio(ratio_before, reference) != "consistent"
         and abs(math.log(ratio_after)) <= 0.5 * abs(math.log(ratio_before))
@@ -272,14 +276,14 @@ def halves_discrepancy(trial: Trial) -> bool:
 def remains_overconfident(trial: Trial) -> bool:
     """Return True if a filter is overconfident against ground truth before and after a re-run.
 
-    More than 75 % of ln(actual / reported σ) must remain.
+    More than 75 % of ln(actual σ / reported σ) must remain after the re-run.
     """
     return any(
         reference == "truth"
         and classify_sigma_ratio(ratio_before, reference)
         == classify_sigma_ratio(ratio_after, reference)
         == "overconfident"
-        and math.log(ratio_after) > MAX_REMAINING_ERROR_FRACTION * math.log(ratio_before)
+        and math.log(ratio_after) > MAX_REMAINING_OVERCONFIDENCE_FRACTION * math.log(ratio_before)
         for reference, ratio_before, ratio_after in compare_sigma_ratios(trial)
     )
 
@@ -287,9 +291,10 @@ def remains_overconfident(trial: Trial) -> bool:
 def find_trial(
     trials: Iterable[Trial], filter_name: FilterName, kind: str, name: str = ""
 ) -> Trial | None:
-    """Return the best re-run of a filter with one kind of change; None without an improvement.
+    """Return the re-run that improves a filter most, among re-runs with one kind of change.
 
-    ``name`` limits the search to changes of one setting or EKF2 parameter.
+    ``name`` limits the search to changes of one setting or EKF2 parameter. Return None without an
+    improvement.
     """
     return min(
         (
@@ -308,7 +313,9 @@ def find_trial(
 def has_effect(trial: Trial) -> bool:
     """Return True if a re-run changes a σ ratio by 10 % or the position RMSE by 5 %."""
     if any(
-        not 1.0 / MIN_SIGMA_RATIO_FACTOR <= ratio_after / ratio_before <= MIN_SIGMA_RATIO_FACTOR
+        not 1.0 / MIN_SIGMA_RATIO_CHANGE_FACTOR
+        <= ratio_after / ratio_before
+        <= MIN_SIGMA_RATIO_CHANGE_FACTOR
         for _, ratio_before, ratio_after in compare_sigma_ratios(trial)
     ):
         return True
@@ -321,7 +328,7 @@ def has_effect(trial: Trial) -> bool:
 
 
 def can_show_improvement(trial: Trial) -> bool:
-    """Return True if a re-run could show an improvement.
+    """Return True if an improvement would be visible in the statistics.
 
     This requires ground truth, or a filter that is inconsistent before the change.
     """
@@ -334,8 +341,9 @@ def can_show_improvement(trial: Trial) -> bool:
 def classify_improvement(trial: Trial) -> Improvement:
     """Return the quantities that a re-run improves: position, σ, both or nothing.
 
-    Position: the RMSE decreases by at least 20 %. σ: actual / reported σ from innovations or from
-    errors becomes consistent, or its |ln| is halved, and neither ratio becomes worse.
+    The position is improved if the RMSE decreases by at least 20 %. σ is improved if a ratio of
+    actual to reported σ becomes consistent, or if the re-run halves |ln(ratio)|, and no ratio
+    becomes worse.
     """
     rmse_before_m, rmse_after_m = trial.before.position_rmse_m, trial.after.position_rmse_m
     is_position_better = bool(

@@ -5,8 +5,8 @@
 2. Least squares: refine the best hypotheses, together with an accelerometer bias and, if the
    heading is integrated from the gyroscopes, its drift.
 
-Residuals (m) have a Student distribution. The log likelihood is relative to positions that are
-unrelated to the motion.
+Residuals (m) have a Student distribution. The log likelihood is that of a hypothesis minus that of
+positions that do not depend on the motion.
 """
 
 from collections.abc import Mapping
@@ -42,25 +42,25 @@ METRES_PER_UNIT: Final[dict[Unit, float]] = {"m": 1.0, "cm": 0.01, "mm": 0.001, 
 SMALL_ROTATION_RAD = np.radians(8.0)
 # Hypotheses with a time offset of at most this time (s) are equally probable a priori
 SMALL_TIME_OFFSET_S = 0.3
-# Log prior odds, against an unrotated frame, of a frame rotated by more than SMALL_ROTATION_RAD
-ROTATION_LOG_ODDS = -1.0
-# Log prior odds, against an unrotated frame, of a frame rotated by up to SMALL_ROTATION_RAD
-SMALL_ROTATION_LOG_ODDS = -0.5
-# Log prior odds, against a smaller one, of a time offset above SMALL_TIME_OFFSET_S
-TIME_OFFSET_LOG_ODDS = -2.0
-# Log prior odds, against metres, of another unit
-UNIT_LOG_ODDS = -2.0
+# Logarithm of the prior odds: frame rotated by more than SMALL_ROTATION_RAD to unrotated frame
+LARGE_ROTATION_LOG_PRIOR_ODDS = -1.0
+# Logarithm of the prior odds: frame rotated by at most SMALL_ROTATION_RAD to unrotated frame
+SMALL_ROTATION_LOG_PRIOR_ODDS = -0.5
+# Logarithm of the prior odds: time offset above SMALL_TIME_OFFSET_S to smaller time offset
+LARGE_TIME_OFFSET_LOG_PRIOR_ODDS = -2.0
+# Logarithm of the prior odds: another unit to metres
+OTHER_UNIT_LOG_PRIOR_ODDS = -2.0
 # σ (m) of barometer heights in the comparison with the heights of the source
 BAROMETER_SIGMA_M = 0.5
 # Assumed number of independent height errors in a flight, for the likelihood of the heights
-INDEPENDENT_HEIGHT_COUNT = 6.0
+INDEPENDENT_HEIGHT_ERROR_COUNT = 6.0
 # Limit (m) to which height errors are clipped, to limit the effect of outliers
 MAX_HEIGHT_ERROR_M = 20.0 * BAROMETER_SIGMA_M
 # Maximum number of hypotheses of the grid search that are refined
 MAX_REFINED_HYPOTHESES = 8
 # A hypothesis on axes, unit and delay is refined if its score (log likelihood plus log prior odds)
 # is at most this much (nats) below the best score
-MAX_REFINED_SCORE_DEFICIT = 60.0
+MAX_SCORE_BELOW_BEST_TO_REFINE = 60.0
 # Maximum number of second differences in one least-squares fit, to limit the computing time
 MAX_REFINEMENT_ROWS = 1200
 # Number of Gauss-Newton iterations in the refinement of a hypothesis on axes, unit and delay
@@ -72,9 +72,9 @@ MAX_TIME_OFFSET_STEP_S = 0.15
 PARAMETER_PRIOR_PRECISION = np.array([0.0, 0.0, np.radians(0.05) ** -2, 0.0, *[0.3**-2] * 3])
 # Horizontal directions, clockwise from above
 CLOCKWISE_DIRECTIONS: tuple[Direction, ...] = ("north", "east", "south", "west")
-# Log prior odds of common directions of x, y, z; compute_log_odds returns those of all others
-AXES_LOG_ODDS: Final[dict[AxisDirections, float]] = {
-    ("north", "east", "down"): 1.0,  # as PX4 expects
+# Logarithm of the prior odds of common directions of x, y, z
+LOG_PRIOR_ODDS_BY_AXES: Final[dict[AxisDirections, float]] = {
+    ("north", "east", "down"): 1.0,  # NED, the convention of PX4
     ("east", "north", "up"): -0.5,
     ("north", "west", "up"): -1.0,
     ("north", "east", "up"): -2.5,  # NED, but z inverted
@@ -83,44 +83,53 @@ AXES_LOG_ODDS: Final[dict[AxisDirections, float]] = {
 }
 
 
-class AxisAssignment(NamedTuple):
-    """Vertical axis and pair of horizontal axes among x, y, z, without the rotation of the pair.
+class SignedAxisPermutation(NamedTuple):
+    """Choice of the vertical axis and of two horizontal axes among x, y and z.
+
+    The heading of the horizontal axes is not part of the choice.
 
     Attributes
     ----------
-    vertical_axis, first_axis, second_axis : int
+    vertical_axis, first_horizontal_axis, second_horizontal_axis : int
         Indices (0: x, 1: y, 2: z) of the vertical axis and of the horizontal axes.
     vertical_sign : {1, -1}
         1 if the vertical axis points down.
     handedness : {1, -1}
-        1 if ``second_axis`` is 90° clockwise from ``first_axis``.
+        1 if ``second_horizontal_axis`` is 90° clockwise from ``first_horizontal_axis``.
     """
 
     vertical_axis: int
     vertical_sign: int
-    first_axis: int
-    second_axis: int
+    first_horizontal_axis: int
+    second_horizontal_axis: int
     handedness: int
 
     @property
     def is_mirrored(self) -> bool:
         return (self.vertical_sign * self.handedness < 0) != (self.vertical_axis == 1)
 
-    def find_directions(self, quarter_turns: int) -> AxisDirections:
-        """Return the directions of x, y, z; ``first_axis`` is n quarter turns east of north."""
+    def compute_axis_directions(self, quarter_turns: int) -> AxisDirections:
+        """Return the directions of x, y, z.
+
+        The first horizontal axis points ``quarter_turns`` · 90° clockwise from north.
+        """
         directions: list[Direction] = ["down" if self.vertical_sign > 0 else "up"] * 3
-        directions[self.first_axis] = CLOCKWISE_DIRECTIONS[quarter_turns % 4]
-        directions[self.second_axis] = CLOCKWISE_DIRECTIONS[(quarter_turns + self.handedness) % 4]
+        directions[self.first_horizontal_axis] = CLOCKWISE_DIRECTIONS[quarter_turns % 4]
+        directions[self.second_horizontal_axis] = CLOCKWISE_DIRECTIONS[
+            (quarter_turns + self.handedness) % 4
+        ]
         return directions[0], directions[1], directions[2]
 
-    def compute_log_odds(self, quarter_turns: int) -> float:
-        axes = self.find_directions(quarter_turns)
-        other_axes_log_odds = -2.0 if self.vertical_axis == 2 or axes[1] == "up" else -4.0
-        return AXES_LOG_ODDS.get(axes, -5.0 if self.is_mirrored else other_axes_log_odds)
+    def compute_log_prior_odds(self, quarter_turns: int) -> float:
+        axes = self.compute_axis_directions(quarter_turns)
+        uncommon_axes_log_odds = -2.0 if self.vertical_axis == 2 or axes[1] == "up" else -4.0
+        return LOG_PRIOR_ODDS_BY_AXES.get(
+            axes, -5.0 if self.is_mirrored else uncommon_axes_log_odds
+        )
 
 
-AXIS_ASSIGNMENTS = tuple(
-    AxisAssignment(vertical, sign, 0 if vertical else 1, 1 if vertical == 2 else 2, hand)
+SIGNED_AXIS_PERMUTATIONS = tuple(
+    SignedAxisPermutation(vertical, sign, 0 if vertical else 1, 1 if vertical == 2 else 2, hand)
     for vertical, sign, hand in product(range(3), (1, -1), (1, -1))
 )
 
@@ -132,13 +141,16 @@ class SentPositions:
     time_s: Array
     position_m: Array
     max_time_offset_s: float
-    barometer: tuple[Array, Array] | None = None
+    barometer_times_and_heights: tuple[Array, Array] | None = None
 
     def remove_clock_drift(self, clock_drift: float) -> "SentPositions":
         return replace(self, time_s=correct_clock_drift(self.time_s, clock_drift))
 
     def compute_second_differences(self, imu: ImuSecondDifferences) -> SourceSecondDifferences:
-        """Return the second differences from ``max_time_offset_s`` before ``imu`` to after it."""
+        """Return second differences of the positions over the time span of ``imu``.
+
+        The time span is extended by ``max_time_offset_s`` at both ends.
+        """
         margin_steps = round(self.max_time_offset_s / GRID_INTERVAL_S)
         grid_s = imu.time_s[0] + GRID_INTERVAL_S * np.arange(
             -margin_steps, len(imu.time_s) + margin_steps
@@ -153,29 +165,29 @@ class Hypothesis:
     Attributes
     ----------
     parameters : ndarray, shape (7,)
-        Delay of the timestamps (s), heading of ``first_axis``, the first horizontal axis (rad,
-        clockwise from north), heading drift of the gyroscopes (rad/s), drift of the source's clock
-        (s/s), accelerometer bias in FRD (m/s²).
+        Delay of the timestamps (s), heading of the first horizontal axis (rad, clockwise from
+        north), heading drift of the gyroscopes (rad/s), drift of the source's clock (s/s),
+        accelerometer bias in FRD (m/s², 3 values).
     score : float
         Log likelihood plus log prior odds (nats).
     has_rotation : bool
         False if the rotation is fixed to a multiple of 90°.
-    min_displacement_ratio, max_displacement_ratio : float
-        Bounds of the ratio of the source's displacements to those from the IMU.
+    min_source_to_imu_displacement_ratio, max_source_to_imu_displacement_ratio : float
+        Bounds of the ratio between displacements from the source and displacements from the IMU.
     residual_sigma_m : float
         Scale (m) of the Student distribution of the horizontal residuals.
     independent_residual_count : float
         Number of independent residuals: duration of the data over SECOND_DIFFERENCE_WINDOW_S.
     """
 
-    assignment: AxisAssignment
+    axis_permutation: SignedAxisPermutation
     unit: Unit
     parameters: Array
     score: float
     has_rotation: bool = True
     has_clock_drift: bool = False
-    min_displacement_ratio: float = 1.0
-    max_displacement_ratio: float = 1.0
+    min_source_to_imu_displacement_ratio: float = 1.0
+    max_source_to_imu_displacement_ratio: float = 1.0
     residual_sigma_m: float = 0.0
     independent_residual_count: float = 0.0
     heading_from: HeadingSource = "EKF2"
@@ -187,26 +199,26 @@ class Hypothesis:
 
     @property
     def quarter_turns(self) -> int:
-        """Heading of ``first_axis`` in units of 90° clockwise from north, rounded (1: east)."""
+        """Heading of the first horizontal axis, rounded to multiples of 90° (0: north, 1: east)."""
         return round(float(self.parameters[1]) / (np.pi / 2.0))
 
     @property
     def axes(self) -> AxisDirections:
         """Directions of x, y, z of the positions, rounded to multiples of 90°."""
-        return self.assignment.find_directions(self.quarter_turns)
+        return self.axis_permutation.compute_axis_directions(self.quarter_turns)
 
     @property
-    def heading_remainder_rad(self) -> float:
-        """Heading (rad) of ``first_axis`` minus the nearest multiple of 90°."""
+    def heading_minus_quarter_turns_rad(self) -> float:
+        """Heading (rad) of ``first_horizontal_axis`` minus the nearest multiple of 90°."""
         return float(self.parameters[1] - self.quarter_turns * np.pi / 2.0)
 
     def is_similar_to(self, other: "Hypothesis", max_difference_rad: float = np.pi / 4.0) -> bool:
         heading_difference_rad = np.angle(np.exp(1j * (self.parameters[1] - other.parameters[1])))
-        is_similar = (
+        return bool(
             abs(self.delay_s - other.delay_s) < 0.5
             and abs(heading_difference_rad) < max_difference_rad
+            and (self.axis_permutation, self.unit) == (other.axis_permutation, other.unit)
         )
-        return bool(is_similar and (self.assignment, self.unit) == (other.assignment, other.unit))
 
 
 def correct_clock_drift(time_s: Array, clock_drift: float) -> Array:
@@ -216,20 +228,21 @@ def correct_clock_drift(time_s: Array, clock_drift: float) -> Array:
 
 
 def search_hypotheses(
-    positions: SentPositions, imu_motion_by_heading: Mapping[HeadingSource, ImuSecondDifferences]
+    positions: SentPositions,
+    imu_motion_by_heading_source: Mapping[HeadingSource, ImuSecondDifferences],
 ) -> list[Hypothesis]:
     """Return the likely hypotheses on axes, unit and delay of the positions, best first.
 
     The list is empty without motion, or with an overlap of less than ``MIN_OVERLAP_S``.
     """
     hypotheses = []
-    for heading_from, imu_motion in imu_motion_by_heading.items():
+    for heading_from, imu_motion in imu_motion_by_heading_source.items():
         source_motion = positions.compute_second_differences(imu_motion)
-        for candidate in find_candidates(source_motion, imu_motion):
+        for candidate in find_convention_candidates(source_motion, imu_motion):
             start_hypotheses = [replace(candidate, heading_from=heading_from)]
-            if abs(candidate.heading_remainder_rad) < 3.0 * SMALL_ROTATION_RAD:
+            if abs(candidate.heading_minus_quarter_turns_rad) < 3.0 * SMALL_ROTATION_RAD:
                 parameters = candidate.parameters.copy()
-                parameters[1] -= candidate.heading_remainder_rad
+                parameters[1] -= candidate.heading_minus_quarter_turns_rad
                 start_hypotheses.append(
                     replace(start_hypotheses[0], parameters=parameters, has_rotation=False)
                 )
@@ -243,52 +256,57 @@ def search_hypotheses(
     )
 
 
-def find_candidates(
+def find_convention_candidates(
     source_motion: SourceSecondDifferences, imu_motion: ImuSecondDifferences
 ) -> list[Hypothesis]:
     """Return the likely combinations of axes, unit and time offset, most likely first."""
-    source_moment_columns = np.column_stack(
+    source_moment_terms = np.column_stack(
         [
             source_motion.second_differences,
             source_motion.second_differences**2,
             source_motion.is_valid,
         ]
     )
-    imu_moment_columns = np.column_stack(
+    imu_moment_terms = np.column_stack(
         [imu_motion.table[..., 0], imu_motion.table[..., 0] ** 2, imu_motion.is_valid]
     )
-    offset_steps = np.arange(len(source_moment_columns) - len(imu_moment_columns) + 1)
-    moments = np.stack(
+    offset_steps = np.arange(len(source_moment_terms) - len(imu_moment_terms) + 1)
+    cross_moments = np.stack(
         [
-            source_moment_columns[step : step + len(imu_moment_columns)].T @ imu_moment_columns
+            source_moment_terms[step : step + len(imu_moment_terms)].T @ imu_moment_terms
             for step in offset_steps
         ]
     )
-    # column 6 is 1 for valid samples: moments[:, 6, 6] counts samples valid in source and IMU
-    has_overlap = moments[:, 6, 6] * GRID_INTERVAL_S >= MIN_OVERLAP_S
+    # Column 6 is 1 for valid samples, so cross_moments[:, 6, 6] is the number of common samples
+    has_overlap = cross_moments[:, 6, 6] * GRID_INTERVAL_S >= MIN_OVERLAP_S
     if not has_overlap.any():
         return []
     delay_s = (offset_steps[has_overlap] - offset_steps[-1] / 2.0) * GRID_INTERVAL_S
-    moments = moments[has_overlap]
-    independent_residual_count = moments[:, 6, 6, None, None] * (
+    cross_moments = cross_moments[has_overlap]
+    independent_residual_count = cross_moments[:, 6, 6, None, None] * (
         GRID_INTERVAL_S / SECOND_DIFFERENCE_WINDOW_S
     )
-    moments /= moments[:, 6:, 6:]
-    vertical_axis, vertical_sign, first_axis, second_axis, handedness = np.array(AXIS_ASSIGNMENTS).T
-    correlation = (
-        moments[:, first_axis, 0]
-        + handedness * moments[:, second_axis, 1]
-        + 1j * moments[:, first_axis, 1]
+    cross_moments /= cross_moments[:, 6:, 6:]
+    vertical_axis, vertical_sign, first_horizontal_axis, second_horizontal_axis, handedness = (
+        np.array(SIGNED_AXIS_PERMUTATIONS).T
     )
-    correlation -= 1j * handedness * moments[:, second_axis, 0]
-    source_mean_square = np.maximum(moments[:, 3:6, 6, None], 1e-12)
+    correlation = (
+        cross_moments[:, first_horizontal_axis, 0]
+        + handedness * cross_moments[:, second_horizontal_axis, 1]
+        + 1j * cross_moments[:, first_horizontal_axis, 1]
+    )
+    correlation -= 1j * handedness * cross_moments[:, second_horizontal_axis, 0]
+    source_mean_square = np.maximum(cross_moments[:, 3:6, 6, None], 1e-12)
     metres_per_unit = np.array([*METRES_PER_UNIT.values()])
     north_mean_square_m2, east_mean_square_m2, down_mean_square_m2 = np.moveaxis(
-        moments[:, 6, 3:6, None, None], 1, 0
+        cross_moments[:, 6, 3:6, None, None], 1, 0
     )
     horizontal_residual_m2 = (
         metres_per_unit**2
-        * (source_mean_square[:, first_axis] + source_mean_square[:, second_axis])
+        * (
+            source_mean_square[:, first_horizontal_axis]
+            + source_mean_square[:, second_horizontal_axis]
+        )
         + north_mean_square_m2
         + east_mean_square_m2
     )
@@ -299,7 +317,7 @@ def find_candidates(
         metres_per_unit**2 * source_mean_square[:, vertical_axis] + down_mean_square_m2
     )
     down_residual_m2 -= (
-        2.0 * metres_per_unit * (vertical_sign * moments[:, vertical_axis, 2])[..., None]
+        2.0 * metres_per_unit * (vertical_sign * cross_moments[:, vertical_axis, 2])[..., None]
     )
     score = np.sum(np.log(source_mean_square), axis=1)[:, None] + 6.0 * np.log(metres_per_unit)
     score = score - 2.0 * np.log(np.maximum(horizontal_residual_m2, MIN_HORIZONTAL_SIGMA_M**2))
@@ -312,33 +330,36 @@ def find_candidates(
     nearest_quarter_turns = np.round(rotation_rad / (np.pi / 2.0)).astype(int) % 4
     hypotheses = []
     for quarter_turns in range(4):
-        quarter_turn_scores = np.where(
+        scores_at_quarter_turn = np.where(
             (nearest_quarter_turns == quarter_turns)[..., None], score, -np.inf
         )
-        for (assignment_index, unit_index), offset_index in np.ndenumerate(
-            np.argmax(quarter_turn_scores, axis=0)
+        for (permutation_index, unit_index), offset_index in np.ndenumerate(
+            np.argmax(scores_at_quarter_turn, axis=0)
         ):
-            unit_name, assignment = (
-                [*METRES_PER_UNIT][unit_index],
-                AXIS_ASSIGNMENTS[assignment_index],
-            )
-            # a constant third coordinate: the source measures no height, so z is vertical
-            if assignment.vertical_axis != 2 and not source_motion.second_differences[:, 2].any():
+            unit_name = [*METRES_PER_UNIT][unit_index]
+            axis_permutation = SIGNED_AXIS_PERMUTATIONS[permutation_index]
+            # If z is constant, the source measures no height. Then z is the vertical axis
+            if (
+                axis_permutation.vertical_axis != 2
+                and not source_motion.second_differences[:, 2].any()
+            ):
                 continue
             total_score = (
-                quarter_turn_scores[offset_index, assignment_index, unit_index]
-                + assignment.compute_log_odds(quarter_turns)
-                + UNIT_LOG_ODDS * (unit_name != "m")
+                scores_at_quarter_turn[offset_index, permutation_index, unit_index]
+                + axis_permutation.compute_log_prior_odds(quarter_turns)
+                + OTHER_UNIT_LOG_PRIOR_ODDS * (unit_name != "m")
             )
             parameters = np.array(
-                [delay_s[offset_index], rotation_rad[offset_index, assignment_index], *[0.0] * 5]
+                [delay_s[offset_index], rotation_rad[offset_index, permutation_index], *[0.0] * 5]
             )
-            hypotheses.append(Hypothesis(assignment, unit_name, parameters, float(total_score)))
+            hypotheses.append(
+                Hypothesis(axis_permutation, unit_name, parameters, float(total_score))
+            )
     hypotheses.sort(key=lambda hypothesis: -hypothesis.score)
     return [
         hypothesis
         for hypothesis in hypotheses[:MAX_REFINED_HYPOTHESES]
-        if hypothesis.score > hypotheses[0].score - MAX_REFINED_SCORE_DEFICIT
+        if hypothesis.score > hypotheses[0].score - MAX_SCORE_BELOW_BEST_TO_REFINE
     ]
 
 
@@ -351,10 +372,8 @@ def refine_hypothesis(
     """Refine delay, rotation and drifts of a hypothesis by robust least squares (Gauss-Newton)."""
     rows = np.flatnonzero(source_motion.is_valid)
     rows = rows[:: max(1, len(rows) // MAX_REFINEMENT_ROWS)]
-    best_hypothesis, parameters = (
-        replace(initial_hypothesis, score=-np.inf),
-        initial_hypothesis.parameters,
-    )
+    best_hypothesis = replace(initial_hypothesis, score=-np.inf)
+    parameters = initial_hypothesis.parameters
     for _ in range(REFINEMENT_ITERATIONS):
         hypothesis, parameter_step = _evaluate_hypothesis(
             replace(initial_hypothesis, parameters=parameters), rows, source_motion, imu_motion
@@ -363,7 +382,8 @@ def refine_hypothesis(
             best_hypothesis = hypothesis
         parameters = parameters + parameter_step
     return replace(
-        best_hypothesis, score=best_hypothesis.score + _compute_log_odds(best_hypothesis, positions)
+        best_hypothesis,
+        score=best_hypothesis.score + _compute_total_log_odds(best_hypothesis, positions),
     )
 
 
@@ -373,7 +393,7 @@ def _evaluate_hypothesis(
     source_motion: SourceSecondDifferences,
     imu_motion: ImuSecondDifferences,
 ) -> tuple[Hypothesis, Array]:
-    """Return the hypothesis with its log likelihood, and a Gauss-Newton step of its parameters."""
+    """Return the hypothesis with updated score, and the Gauss-Newton step of its parameters."""
     delay_s, rotation_rad, heading_drift_rad_s, clock_drift, *_ = hypothesis.parameters
     time_s = source_motion.time_s[rows]
     row_interval_s = GRID_INTERVAL_S * float(np.median(np.diff(rows)))
@@ -398,21 +418,23 @@ def _evaluate_hypothesis(
     imu_table_rows = (1.0 - grid_fraction) * imu_motion.table[
         grid_index
     ] + grid_fraction * imu_motion.table[grid_index + 1]
-    sent_second_differences = source_motion.second_differences[rows[is_used]]
-    vertical_axis, vertical_sign, first_axis, second_axis, handedness = hypothesis.assignment
+    unconverted_second_differences = source_motion.second_differences[rows[is_used]]
+    vertical_axis, vertical_sign, first_horizontal_axis, second_horizontal_axis, handedness = (
+        hypothesis.axis_permutation
+    )
     metres_per_unit = METRES_PER_UNIT[hypothesis.unit]
     complex_rotation = metres_per_unit * np.exp(
         1j * (rotation_rad + heading_drift_rad_s * elapsed_s)
     )
-    horizontal_difference_m = complex_rotation * (
-        sent_second_differences[:, first_axis]
-        + 1j * handedness * sent_second_differences[:, second_axis]
+    complex_second_difference_m = complex_rotation * (
+        unconverted_second_differences[:, first_horizontal_axis]
+        + 1j * handedness * unconverted_second_differences[:, second_horizontal_axis]
     )
     source_second_difference_m = np.column_stack(
         [
-            horizontal_difference_m.real,
-            horizontal_difference_m.imag,
-            metres_per_unit * vertical_sign * sent_second_differences[:, vertical_axis],
+            complex_second_difference_m.real,
+            complex_second_difference_m.imag,
+            metres_per_unit * vertical_sign * unconverted_second_differences[:, vertical_axis],
         ]
     )
     imu_second_difference_m = (
@@ -426,20 +448,20 @@ def _evaluate_hypothesis(
     vertical_log_likelihood, sigma_down_m = fit_student_distribution(
         residual_squares[1], 1, MIN_VERTICAL_SIGMA_M
     )
-    # a constant axis (missing heights) must not change the likelihood
-    is_axis_known = sent_second_differences.any(axis=0)
+    # A constant axis (for example without heights) is omitted from the likelihood
+    is_axis_known = unconverted_second_differences.any(axis=0)
     log_likelihood_gain += vertical_log_likelihood * is_axis_known[vertical_axis] + np.log(
         metres_per_unit
     ) * np.count_nonzero(is_axis_known)
     log_likelihood_gain -= sum(
         fit_student_distribution(column**2, 1, 1e-6)[0]
-        for column in sent_second_differences.T[is_axis_known]
+        for column in unconverted_second_differences.T[is_axis_known]
     )
     weight = 1.0 / (
         np.array([[sigma_m**2], [sigma_down_m**2]]) + residual_squares / STUDENT_DEGREES_OF_FREEDOM
     )
     weight *= row_interval_s / SECOND_DIFFERENCE_WINDOW_S
-    source_square_sum, product_sum, imu_square_sum = (
+    source_square_sum, source_imu_product_sum, imu_square_sum = (
         float(np.sum(weight[0] @ (first * second)[:, :2]))
         for first, second in (
             (source_second_difference_m, source_second_difference_m),
@@ -447,31 +469,33 @@ def _evaluate_hypothesis(
             (imu_second_difference_m, imu_second_difference_m),
         )
     )
-    # without motion the convention is unknown
-    if 0.0 in (source_square_sum, product_sum, imu_square_sum):
+    # Without motion, axes and unit cannot be determined
+    if 0.0 in (source_square_sum, source_imu_product_sum, imu_square_sum):
         return rejected_result
     jacobian = np.zeros((len(grid_index), 3, len(PARAMETER_PRIOR_PRECISION)))
-    jacobian[..., 0] = imu_motion.second_difference_rate_m_s[grid_index]
+    jacobian[..., 0] = imu_motion.second_difference_derivative_m_s[grid_index]
     jacobian[:, 0, 1], jacobian[:, 1, 1] = (
-        -horizontal_difference_m.imag,
-        horizontal_difference_m.real,
+        -complex_second_difference_m.imag,
+        complex_second_difference_m.real,
     )
     jacobian[..., 2] = jacobian[..., 1] * elapsed_s[:, None]
     jacobian[..., 3] = jacobian[..., 0] * (time_s - mean_time_s)[:, None]
     jacobian[..., 4:] = imu_table_rows[..., 1:]
     uses_gyro_heading = hypothesis.heading_from != "EKF2"
-    is_free = np.array(
+    is_parameter_estimated = np.array(
         [True, hypothesis.has_rotation, uses_gyro_heading, hypothesis.has_clock_drift, *[True] * 3]
     )
-    columns = jacobian[..., is_free].reshape(-1, is_free.sum())
-    weighted_columns = columns.T * weight[[0, 0, 1]].T.ravel()
-    normal_matrix = weighted_columns @ columns + np.diag(PARAMETER_PRIOR_PRECISION[is_free] + 1e-9)
+    columns = jacobian[..., is_parameter_estimated].reshape(-1, is_parameter_estimated.sum())
+    weighted_design_columns = columns.T * weight[[0, 0, 1]].T.ravel()
+    normal_matrix = weighted_design_columns @ columns + np.diag(
+        PARAMETER_PRIOR_PRECISION[is_parameter_estimated] + 1e-9
+    )
     gradient = (
-        weighted_columns @ residual.ravel()
-        + (PARAMETER_PRIOR_PRECISION * hypothesis.parameters)[is_free]
+        weighted_design_columns @ residual.ravel()
+        + (PARAMETER_PRIOR_PRECISION * hypothesis.parameters)[is_parameter_estimated]
     )
     parameter_step = np.zeros(len(PARAMETER_PRIOR_PRECISION))
-    parameter_step[is_free] = -np.linalg.solve(normal_matrix, gradient)
+    parameter_step[is_parameter_estimated] = -np.linalg.solve(normal_matrix, gradient)
     parameter_step[0] = np.clip(parameter_step[0], -MAX_TIME_OFFSET_STEP_S, MAX_TIME_OFFSET_STEP_S)
     scored_hypothesis = replace(
         hypothesis,
@@ -479,8 +503,8 @@ def _evaluate_hypothesis(
             independent_residual_count * log_likelihood_gain
             - 0.5 * PARAMETER_PRIOR_PRECISION @ hypothesis.parameters**2
         ),
-        min_displacement_ratio=product_sum / imu_square_sum,
-        max_displacement_ratio=source_square_sum / product_sum,
+        min_source_to_imu_displacement_ratio=source_imu_product_sum / imu_square_sum,
+        max_source_to_imu_displacement_ratio=source_square_sum / source_imu_product_sum,
         residual_sigma_m=sigma_m,
         independent_residual_count=independent_residual_count,
     )
@@ -507,30 +531,34 @@ def fit_student_distribution(
     return float(score), float(np.sqrt(variance))
 
 
-def _compute_log_odds(hypothesis: Hypothesis, positions: SentPositions) -> float:
-    """Return the log prior odds of a hypothesis, plus the log likelihood ratio of its heights."""
-    log_odds = hypothesis.assignment.compute_log_odds(hypothesis.quarter_turns)
-    log_odds += UNIT_LOG_ODDS * (hypothesis.unit != "m")
-    log_odds += TIME_OFFSET_LOG_ODDS * (abs(hypothesis.delay_s) > SMALL_TIME_OFFSET_S)
+def _compute_total_log_odds(hypothesis: Hypothesis, positions: SentPositions) -> float:
+    """Return the log prior odds of a hypothesis plus the log likelihood ratio of the heights."""
+    log_odds = hypothesis.axis_permutation.compute_log_prior_odds(hypothesis.quarter_turns)
+    log_odds += OTHER_UNIT_LOG_PRIOR_ODDS * (hypothesis.unit != "m")
+    log_odds += LARGE_TIME_OFFSET_LOG_PRIOR_ODDS * (abs(hypothesis.delay_s) > SMALL_TIME_OFFSET_S)
     if hypothesis.has_rotation:
         # Bayesian information criterion: one more estimated parameter costs ½ ln n
         log_odds -= 0.5 * float(np.log(max(hypothesis.independent_residual_count, 2.0)))
-        is_large_rotation = abs(hypothesis.heading_remainder_rad) > SMALL_ROTATION_RAD
-        log_odds += ROTATION_LOG_ODDS if is_large_rotation else SMALL_ROTATION_LOG_ODDS
-    if positions.barometer is not None:
-        log_odds += _compute_height_log_ratio(hypothesis, positions, *positions.barometer)
+        is_large_rotation = abs(hypothesis.heading_minus_quarter_turns_rad) > SMALL_ROTATION_RAD
+        log_odds += (
+            LARGE_ROTATION_LOG_PRIOR_ODDS if is_large_rotation else SMALL_ROTATION_LOG_PRIOR_ODDS
+        )
+    if positions.barometer_times_and_heights is not None:
+        log_odds += _compute_height_log_likelihood_ratio(
+            hypothesis, positions, *positions.barometer_times_and_heights
+        )
     return log_odds
 
 
-def _compute_height_log_ratio(
+def _compute_height_log_likelihood_ratio(
     hypothesis: Hypothesis, positions: SentPositions, time_s: Array, barometer_height_m: Array
 ) -> float:
-    """Return ln p(heights | they follow the barometer) - ln p(heights | constant height)."""
+    """Return the log likelihood of heights that follow the barometer minus that of a constant."""
     height_m = np.interp(positions.time_s - hypothesis.delay_s, time_s, barometer_height_m)
     down_m = (
         METRES_PER_UNIT[hypothesis.unit]
-        * hypothesis.assignment.vertical_sign
-        * positions.position_m[:, hypothesis.assignment.vertical_axis]
+        * hypothesis.axis_permutation.vertical_sign
+        * positions.position_m[:, hypothesis.axis_permutation.vertical_axis]
     )
     # height is positive upwards, so down + height is constant for a correct hypothesis
     error_m = down_m - np.median(down_m) + height_m - np.median(height_m)
@@ -539,4 +567,4 @@ def _compute_height_log_ratio(
     variance_ratio = max(float(np.var(height_m)), min_variance_m2) / max(
         mean_square_error_m2, min_variance_m2
     )
-    return 0.5 * INDEPENDENT_HEIGHT_COUNT * float(np.log(variance_ratio))
+    return 0.5 * INDEPENDENT_HEIGHT_ERROR_COUNT * float(np.log(variance_ratio))

@@ -12,7 +12,7 @@ from px4fuse.convention.axes import (
     SMALL_ROTATION_RAD,
     Hypothesis,
     SentPositions,
-    find_candidates,
+    find_convention_candidates,
     refine_hypothesis,
     search_hypotheses,
 )
@@ -23,7 +23,7 @@ from px4fuse.convention.model import (
     OrientationConvention,
 )
 from px4fuse.convention.motion import (
-    MIN_GAP_S,
+    MIN_POSITION_GAP_S,
     SECOND_DIFFERENCE_WINDOW_S,
     ImuSecondDifferences,
     InertialData,
@@ -41,39 +41,39 @@ from px4fuse.trajectory.rotation import heading
 # Minimum lead (nats) in score of the best convention over the second best, for the verdict
 # "determined"
 MIN_CONVENTION_LOG_ODDS = 4.0
-# Minimum log-likelihood gain (nats) of the best convention over positions that are unrelated to the
-# motion
-MIN_LIKELIHOOD_GAIN = 8.0
-# Minimum log-likelihood gain (nats) per independent sample, over positions that are unrelated to
-# the motion: if one convention fits, and if several fit
-MIN_LIKELIHOOD_GAIN_PER_SAMPLE = (0.15, 0.4)
+# Minimum log-likelihood gain (nats) of the best convention, compared with positions that do not
+# depend on the motion
+MIN_LOG_LIKELIHOOD_GAIN = 8.0
+# Minimum value of this gain per independent sample. First value: only one convention fits; second
+# value: several conventions fit
+MIN_LOG_LIKELIHOOD_GAIN_PER_SAMPLE = (0.15, 0.4)
 # Accepted ratio of the source's displacements to those from the IMU
-MIN_SOURCE_TO_IMU_RATIO, MAX_SOURCE_TO_IMU_RATIO = 0.88, 1.12
+MIN_SOURCE_TO_IMU_DISPLACEMENT_RATIO, MAX_SOURCE_TO_IMU_DISPLACEMENT_RATIO = 0.88, 1.12
 # A convention is doubtful if σ of its residuals is above this multiple of the expected noise
 MAX_RESIDUAL_TO_NOISE_RATIO = 2.4
 # σ (m) of the second differences of the position integrated from the IMU
 IMU_SECOND_DIFFERENCE_SIGMA_M = 0.05
-# EKF2's heading (relative to north) is used, unless the heading from the gyroscopes fits better by
-# more than this (nats)
-MAX_EKF2_HEADING_SCORE_LOSS = 20.0
+# Maximum loss in log likelihood (nats) by the use of EKF2's heading instead of the heading from the
+# gyroscopes. EKF2's heading is preferred, because it is relative to north
+MAX_LIKELIHOOD_LOSS_WITH_EKF2_HEADING = 20.0
 # Minimum number of GNSS positions for a fit of the heading of the source's frame
 MIN_GNSS_POSITIONS = 30
 # The heading fitted to GNSS is used if the RMS residual is at most this fraction of the RMS extent
 # of the GNSS positions; 0.1 is a heading error of about 0.1 rad
 MAX_GNSS_RESIDUAL_RATIO = 0.1
-# Minimum log-likelihood gain from a clock drift; a drift with a smaller gain is not corrected
-MIN_DRIFT_SCORE_GAIN = 15.0
+# Minimum log-likelihood gain (nats) of a hypothesis with clock drift, to correct the drift
+MIN_LIKELIHOOD_GAIN_FROM_CLOCK_DRIFT = 15.0
 # Tested clock drifts (rate of the clock minus 1)
 TESTED_CLOCK_DRIFTS = np.linspace(-0.05, 0.05, 21)
 # Minimum log-likelihood gain from a low-pass filter instead of a delay. In simulated flights it
 # is above 13 with a low-pass filter, and below 3 with a delay
-MIN_LOW_PASS_SCORE_GAIN = 8.0
+MIN_LIKELIHOOD_GAIN_FROM_LOW_PASS = 8.0
 # Delays (s) between these limits can be the effect of a low-pass filter in the source
 MIN_LOW_PASS_DELAY_S, MAX_LOW_PASS_DELAY_S = 0.2, 5.0
 # Repeated positions are removed if they are less than this fraction of all positions
 MAX_REPEATED_POSITION_FRACTION = 0.5
 # Heights are used if at least this fraction of the positions has a height
-MIN_HEIGHT_FRACTION = 0.5
+MIN_FRACTION_OF_POSITIONS_WITH_HEIGHT = 0.5
 # Variance of third differences of white noise with variance 1
 THIRD_DIFFERENCE_VARIANCE = 20.0
 # Variance of second differences of white noise with variance 1
@@ -101,29 +101,30 @@ def check_convention(
     if inertial_data is None:
         return None
     positions = _read_positions(flight, track, max_time_offset_s)
-    imu_motion_by_heading = {
+    imu_motion_by_heading_source = {
         name: integrate_imu_motion(inertial_data, attitude)
         for name, attitude in inertial_data.compute_attitudes().items()
     }
-    hypotheses = _rank_convention_hypotheses(positions, imu_motion_by_heading)
+    hypotheses = _rank_convention_hypotheses(positions, imu_motion_by_heading_source)
     if not hypotheses:
         return None
     if clock_drift := _estimate_clock_drift(
-        positions, imu_motion_by_heading[hypotheses[0].heading_from], hypotheses[0]
+        positions, imu_motion_by_heading_source[hypotheses[0].heading_from], hypotheses[0]
     ):
         positions_without_drift = positions.remove_clock_drift(clock_drift)
         hypotheses_without_drift = _rank_convention_hypotheses(
-            positions_without_drift, imu_motion_by_heading
+            positions_without_drift, imu_motion_by_heading_source
         )
         if (
             hypotheses_without_drift
-            and hypotheses_without_drift[0].score > hypotheses[0].score + MIN_DRIFT_SCORE_GAIN
+            and hypotheses_without_drift[0].score
+            > hypotheses[0].score + MIN_LIKELIHOOD_GAIN_FROM_CLOCK_DRIFT
         ):
             hypotheses, positions = hypotheses_without_drift, positions_without_drift
         else:
             clock_drift = 0.0
-    hypotheses[0] = _replace_delay_by_low_pass(
-        hypotheses[0], positions, imu_motion_by_heading[hypotheses[0].heading_from]
+    hypotheses[0] = _replace_delay_by_low_pass_filter(
+        hypotheses[0], positions, imu_motion_by_heading_source[hypotheses[0].heading_from]
     )
     if not is_source_fused(flight):
         hypotheses[0] = _rotate_to_gnss(hypotheses[0], positions, flight, track)
@@ -141,7 +142,7 @@ def _read_positions(
 ) -> SentPositions:
     """Return the positions without repetitions; heights are 0 if the source has none."""
     samples, barometer = track.samples[Columns.POSITION], flight.barometer
-    if samples["down_m"].notna().mean() < MIN_HEIGHT_FRACTION:
+    if samples["down_m"].notna().mean() < MIN_FRACTION_OF_POSITIONS_WITH_HEIGHT:
         samples = samples.assign(down_m=0.0)
     samples = samples.dropna()
     is_repeated = (samples.diff() == 0.0).all(axis=1)
@@ -156,18 +157,19 @@ def _read_positions(
 
 
 def _rank_convention_hypotheses(
-    positions: SentPositions, imu_motion_by_heading: dict[HeadingSource, ImuSecondDifferences]
+    positions: SentPositions,
+    imu_motion_by_heading_source: dict[HeadingSource, ImuSecondDifferences],
 ) -> list[Hypothesis]:
     """Return the likely hypotheses on axes, unit and delay, best first.
 
-    A hypothesis with EKF2's heading is before a similar one with the heading from the gyroscopes,
-    unless its score is lower by more than MAX_EKF2_HEADING_SCORE_LOSS.
+    If the best hypothesis has a similar hypothesis with EKF2's heading, the latter is moved to the
+    first place. Its score may be lower by MAX_LIKELIHOOD_LOSS_WITH_EKF2_HEADING.
     """
-    hypotheses = search_hypotheses(positions, imu_motion_by_heading)
+    hypotheses = search_hypotheses(positions, imu_motion_by_heading_source)
     for hypothesis in hypotheses:
         if (
             hypothesis.heading_from == "EKF2"
-            and hypothesis.score > hypotheses[0].score - MAX_EKF2_HEADING_SCORE_LOSS
+            and hypothesis.score > hypotheses[0].score - MAX_LIKELIHOOD_LOSS_WITH_EKF2_HEADING
             and hypothesis.is_similar_to(hypotheses[0], SMALL_ROTATION_RAD)
         ):
             other_hypotheses = [other for other in hypotheses if other is not hypothesis]
@@ -175,7 +177,7 @@ def _rank_convention_hypotheses(
     return hypotheses
 
 
-def _replace_delay_by_low_pass(
+def _replace_delay_by_low_pass_filter(
     hypothesis: Hypothesis, positions: SentPositions, imu_motion: ImuSecondDifferences
 ) -> Hypothesis:
     """Return the hypothesis without its delay, if a low-pass filter explains the delay better.
@@ -194,8 +196,12 @@ def _replace_delay_by_low_pass(
         positions.compute_second_differences(filtered_motion),
         filtered_motion,
     )
-    score_gain = low_pass_hypothesis.score - hypothesis.score
-    return low_pass_hypothesis if score_gain > MIN_LOW_PASS_SCORE_GAIN else hypothesis
+    log_likelihood_gain_nats = low_pass_hypothesis.score - hypothesis.score
+    return (
+        low_pass_hypothesis
+        if log_likelihood_gain_nats > MIN_LIKELIHOOD_GAIN_FROM_LOW_PASS
+        else hypothesis
+    )
 
 
 def is_source_fused(flight: Flight) -> bool:
@@ -207,48 +213,54 @@ def is_source_fused(flight: Flight) -> bool:
 def _rotate_to_gnss(
     hypothesis: Hypothesis, positions: SentPositions, flight: Flight, track: PositionTrack
 ) -> Hypothesis:
-    """Fit the rotation of a hypothesis to GNSS positions, because EKF2's heading may be wrong."""
+    """Fit the rotation of the frame to GNSS positions, because EKF2's heading may be wrong."""
     gnss_tracks = [other for other in flight.positions if other.origin.is_gnss]
     if not gnss_tracks or track.origin.is_gnss or not hypothesis.has_rotation:
         return hypothesis
     gnss_positions = gnss_tracks[0].samples[Columns.POSITION[:2]].dropna()
     time_s = gnss_positions.index.to_numpy() + hypothesis.delay_s
     source_time_s = positions.time_s
-    has_near_source_samples = is_bracketed(
-        time_s, source_time_s, choose_gap_limit_s(source_time_s, MIN_GAP_S)
+    is_between_source_samples = is_bracketed(
+        time_s, source_time_s, choose_gap_limit_s(source_time_s, MIN_POSITION_GAP_S)
     )
-    if np.count_nonzero(has_near_source_samples) < MIN_GNSS_POSITIONS:
+    if np.count_nonzero(is_between_source_samples) < MIN_GNSS_POSITIONS:
         return hypothesis
     sent_position_m = METRES_PER_UNIT[hypothesis.unit] * positions.position_m
-    axis_assignment = hypothesis.assignment
+    axis_permutation = hypothesis.axis_permutation
     source_position_m = (
-        sent_position_m[:, axis_assignment.first_axis]
-        + 1j * axis_assignment.handedness * sent_position_m[:, axis_assignment.second_axis]
+        sent_position_m[:, axis_permutation.first_horizontal_axis]
+        + 1j
+        * axis_permutation.handedness
+        * sent_position_m[:, axis_permutation.second_horizontal_axis]
     )
     velocity_m_s = np.interp(time_s, source_time_s, np.gradient(source_position_m, source_time_s))
     columns = np.column_stack([np.interp(time_s, source_time_s, source_position_m), velocity_m_s])[
-        has_near_source_samples
+        is_between_source_samples
     ]
     columns -= columns.mean(axis=0)
-    north_east_m = (gnss_positions.to_numpy() @ [1.0, 1j])[has_near_source_samples]
+    north_east_m = (gnss_positions.to_numpy() @ [1.0, 1j])[is_between_source_samples]
     north_east_m -= north_east_m.mean()
-    factors, residual_square_sum_m2, *_ = np.linalg.lstsq(columns, north_east_m)
+    fitted_coefficients, residual_square_sum_m2, *_ = np.linalg.lstsq(columns, north_east_m)
     if not residual_square_sum_m2 < (MAX_GNSS_RESIDUAL_RATIO * np.linalg.norm(north_east_m)) ** 2:
         return hypothesis
     parameters = hypothesis.parameters.copy()
-    parameters[1] = np.angle(factors[0])
+    parameters[1] = np.angle(fitted_coefficients[0])
     return replace(hypothesis, parameters=parameters, heading_from="GNSS")
 
 
 def _choose_convention(
     hypotheses: list[Hypothesis], positions: SentPositions, clock_drift: float
 ) -> Convention:
-    """Return the best convention, with a verdict from its lead and its residuals."""
+    """Return the best convention and its verdict.
+
+    The verdict depends on the lead over the second best convention and on the residuals.
+    """
     best_hypothesis = hypotheses[0]
     other_conventions = [
         hypothesis for hypothesis in hypotheses if not hypothesis.is_similar_to(best_hypothesis)
     ]
-    if not positions.position_m[:, 2].any():  # without heights, up and down fit equally well
+    # Without heights, z up and z down fit equally well
+    if not positions.position_m[:, 2].any():
         other_conventions = [
             hypothesis
             for hypothesis in other_conventions
@@ -257,13 +269,16 @@ def _choose_convention(
     log_odds = best_hypothesis.score - other_conventions[0].score if other_conventions else None
     is_ambiguous = log_odds is not None and log_odds < MIN_CONVENTION_LOG_ODDS
     verdict: ConventionVerdict = "ambiguous" if is_ambiguous else "determined"
-    if best_hypothesis.score < MIN_LIKELIHOOD_GAIN:
+    if best_hypothesis.score < MIN_LOG_LIKELIHOOD_GAIN:
         verdict = "not determinable"
     elif (
         best_hypothesis.score
-        < MIN_LIKELIHOOD_GAIN_PER_SAMPLE[is_ambiguous] * best_hypothesis.independent_residual_count
-        or best_hypothesis.min_displacement_ratio > MAX_SOURCE_TO_IMU_RATIO
-        or best_hypothesis.max_displacement_ratio < MIN_SOURCE_TO_IMU_RATIO
+        < MIN_LOG_LIKELIHOOD_GAIN_PER_SAMPLE[is_ambiguous]
+        * best_hypothesis.independent_residual_count
+        or best_hypothesis.min_source_to_imu_displacement_ratio
+        > MAX_SOURCE_TO_IMU_DISPLACEMENT_RATIO
+        or best_hypothesis.max_source_to_imu_displacement_ratio
+        < MIN_SOURCE_TO_IMU_DISPLACEMENT_RATIO
         or compute_residual_ratio(best_hypothesis, positions) > MAX_RESIDUAL_TO_NOISE_RATIO
     ):
         verdict = "doubtful"
@@ -280,12 +295,12 @@ def _choose_convention(
         z=z,
         unit=best_hypothesis.unit,
         heading_from=best_hypothesis.heading_from,
-        is_mirrored=best_hypothesis.assignment.is_mirrored,
-        rotation_deg=-float(np.degrees(best_hypothesis.heading_remainder_rad))
+        is_mirrored=best_hypothesis.axis_permutation.is_mirrored,
+        rotation_deg=-float(np.degrees(best_hypothesis.heading_minus_quarter_turns_rad))
         * best_hypothesis.has_rotation,
         late_s=best_hypothesis.delay_s,
         clock_drift=clock_drift,
-        scale=best_hypothesis.min_displacement_ratio,
+        scale=best_hypothesis.min_source_to_imu_displacement_ratio,
         log_odds=log_odds,
         log_likelihood_gain=best_hypothesis.score,
         alternatives=tuple(dict.fromkeys(likely_conventions)),
@@ -295,7 +310,9 @@ def _choose_convention(
 def _describe_hypothesis(hypothesis: Hypothesis) -> str:
     properties = [format_axes(hypothesis.axes, hypothesis.unit)]
     if hypothesis.has_rotation:
-        properties.append(f"rotated by {-np.degrees(hypothesis.heading_remainder_rad):+.0f}°")
+        properties.append(
+            f"rotated by {-np.degrees(hypothesis.heading_minus_quarter_turns_rad):+.0f}°"
+        )
     properties.append(f"timestamps {hypothesis.delay_s:+.1f} s late")
     return ", ".join(properties)
 
@@ -323,18 +340,18 @@ def _estimate_clock_drift(
 ) -> float:
     """Return the rate error (s/s) of the source's clock relative to the autopilot's boot clock.
 
-    0 if it is not significant.
+    Return 0 if the drift is not significant.
     """
     initial_clock_drift = 0.0
     if (
-        best_hypothesis.score < MIN_LIKELIHOOD_GAIN
+        best_hypothesis.score < MIN_LOG_LIKELIHOOD_GAIN
         or compute_residual_ratio(best_hypothesis, positions) > MAX_RESIDUAL_TO_NOISE_RATIO
     ):
         hypotheses = [
             (candidates[0], clock_drift)
             for clock_drift in TESTED_CLOCK_DRIFTS.tolist()
             if (
-                candidates := find_candidates(
+                candidates := find_convention_candidates(
                     positions.remove_clock_drift(clock_drift).compute_second_differences(
                         imu_motion
                     ),
@@ -354,7 +371,8 @@ def _estimate_clock_drift(
     clock_drift = (1.0 + initial_clock_drift) / (1.0 - float(hypothesis.parameters[3])) - 1.0
     return (
         clock_drift
-        if initial_clock_drift or hypothesis.score > best_hypothesis.score + MIN_DRIFT_SCORE_GAIN
+        if initial_clock_drift
+        or hypothesis.score > best_hypothesis.score + MIN_LIKELIHOOD_GAIN_FROM_CLOCK_DRIFT
         else 0.0
     )
 
@@ -366,9 +384,9 @@ def _check_orientation(
     best_hypothesis: Hypothesis,
     verdict: ConventionVerdict,
 ) -> OrientationConvention | None:
-    """Return the convention of the source's orientation, with its heading error if determinable.
+    """Return the convention of the source's orientation, and the heading error if determinable.
 
-    None with too few orientations in flight.
+    Return None with too few orientations in flight.
     """
     assert track.orientation is not None
     quaternions = track.orientation[Columns.QUATERNION].to_numpy()
@@ -381,8 +399,8 @@ def _check_orientation(
     if (
         verdict != "determined"
         or convention.verdict not in ("determined", "ambiguous")
-        or best_hypothesis.assignment.vertical_axis != 2
-        or best_hypothesis.assignment.is_mirrored
+        or best_hypothesis.axis_permutation.vertical_axis != 2
+        or best_hypothesis.axis_permutation.is_mirrored
     ):
         return convention
     source_heading_rad = np.interp(inertial_data.time_s, time_s, heading(attitude))
@@ -397,11 +415,11 @@ def _check_orientation(
     correct_headings_deg = {"FLU to ENU": [90.0], "FLU to NWU": [0.0]}.get(
         convention.frames, [0.0, 90.0]
     )
-    if best_hypothesis.assignment.vertical_sign > 0:
+    if best_hypothesis.axis_permutation.vertical_sign > 0:
         correct_headings_deg = [0.0]
     for hypothesis in search_hypotheses(positions, {"EKF2": imu_motion}):
-        if (hypothesis.assignment, hypothesis.unit, hypothesis.has_rotation) == (
-            best_hypothesis.assignment,
+        if (hypothesis.axis_permutation, hypothesis.unit, hypothesis.has_rotation) == (
+            best_hypothesis.axis_permutation,
             best_hypothesis.unit,
             True,
         ):

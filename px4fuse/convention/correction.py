@@ -29,12 +29,13 @@ MIN_RESIDUAL_ROTATION_DEG = 8.0
 # Minimum rotation (°) that is corrected in a frame with correct axes; smaller rotations are
 # reported as a heading error
 MIN_FRAME_ROTATION_DEG = 15.0
-# Minimum delay (s) that is corrected together with axes and unit; smaller delays are left to the
-# estimate of the time offset
-MIN_CORRECTED_DELAY_S = 0.5
+# Minimum delay (s) that is corrected together with axes and unit. The estimate of the time offset
+# finds smaller delays
+MIN_DELAY_TO_CORRECT_S = 0.5
 # Minimum heading difference (°) between the source's orientation and its positions that is reported
 MIN_HEADING_ERROR_DEG = 10.0
-# Fault of the source's orientation; empty without a fault
+# Fault of the source's orientation: copy of EKF2's attitude, wrong quaternion order, wrong body or
+# world frame, heading error, or no fault
 OrientationFault = Literal["", "copied", "order", "frames", "heading"]
 
 
@@ -106,7 +107,7 @@ def find_convention_faults(
     if convention.verdict != "determined":
         return ConventionFaults(orientation=orientation_fault)
     is_fused = is_source_fused(flight)
-    has_wrong_axes, rotation_deg = _check_axes_and_rotation(convention)
+    has_wrong_axes, rotation_deg = _find_axis_fault_and_rotation(convention)
     has_wrong_heading = orientation_fault in ("order", "heading")
     uses_gyro_heading = convention.heading_from == "gyroscopes"
     # EKF2 fused the yaw of the source, so no heading in the log is independent of the source
@@ -116,19 +117,14 @@ def find_convention_faults(
         and convention.orientation is not None
         and orientation_fault != "copied"
     )
-    is_unfused_with_gyro_heading = uses_gyro_heading and not is_fused and not has_wrong_axes
-    if (
-        has_wrong_heading
-        or is_heading_from_source
-        or is_unfused_with_gyro_heading
-        or frame == "FRD"
-    ):
+    has_no_heading_reference = uses_gyro_heading and not is_fused and not has_wrong_axes
+    if has_wrong_heading or is_heading_from_source or has_no_heading_reference or frame == "FRD":
         rotation_deg = 0.0
     faults = ConventionFaults(
         has_wrong_axes=has_wrong_axes,
         rotation_deg=rotation_deg,
         has_wrong_unit=convention.unit != "m",
-        late_s=convention.late_s if abs(convention.late_s) >= MIN_CORRECTED_DELAY_S else 0.0,
+        late_s=convention.late_s if abs(convention.late_s) >= MIN_DELAY_TO_CORRECT_S else 0.0,
         clock_drift=convention.clock_drift,
         orientation=orientation_fault,
         is_north_unknown=has_wrong_axes and is_heading_from_source,
@@ -138,11 +134,11 @@ def find_convention_faults(
     )
 
 
-def _check_axes_and_rotation(convention: Convention) -> tuple[bool, float]:
-    """Return (True if the axes are not NED, clockwise rotation of the positions in °)."""
+def _find_axis_fault_and_rotation(convention: Convention) -> tuple[bool, float]:
+    """Return True if the axes are not NED, and the clockwise rotation (°) of the positions."""
     rotation_deg, is_z_up = convention.rotation_deg, convention.z == "up"
-    is_known_frame = convention.axes in (FRAME_AXES["ENU"], FRAME_AXES["NWU"])
-    if convention.is_mirrored or is_known_frame or convention.z not in ("up", "down"):
+    is_enu_or_nwu = convention.axes in (FRAME_AXES["ENU"], FRAME_AXES["NWU"])
+    if convention.is_mirrored or is_enu_or_nwu or convention.z not in ("up", "down"):
         return True, rotation_deg * (abs(rotation_deg) > MIN_RESIDUAL_ROTATION_DEG)
     total_rotation_deg = (
         rotation_deg - 90.0 * CLOCKWISE_DIRECTIONS.index(convention.x) + 90.0 * is_z_up
@@ -159,16 +155,16 @@ def _find_orientation_fault(convention: Convention) -> OrientationFault:
         return "copied"
     if orientation.order != "w x y z":
         return "order"
-    is_z_known_down = convention.verdict == "determined" and convention.z == "down"
+    is_z_known_to_be_down = convention.verdict == "determined" and convention.z == "down"
     expected_frames = (
-        {"FRD to NED"} if is_z_known_down else {"FRD to NED", "FLU to ENU", "FLU to NWU"}
+        {"FRD to NED"} if is_z_known_to_be_down else {"FRD to NED", "FLU to ENU", "FLU to NWU"}
     )
     if orientation.frames not in expected_frames:
         return "frames"
     return "heading" if abs(orientation.heading_error_deg or 0.0) > MIN_HEADING_ERROR_DEG else ""
 
 
-def correct_convention(
+def convert_to_px4_convention(
     flight: Flight, track: PositionTrack, convention: Convention | None
 ) -> tuple[Flight, PositionTrack]:
     """Convert a position source to PX4's axes (NED), unit (m) and boot clock.
@@ -203,7 +199,7 @@ def correct_convention(
     if inertial_data is None:
         return flight, track
     attitude = inertial_data.compute_attitudes()[convention.heading_from]
-    # if the positions keep their axes, rotate the attitude instead: to the north of the positions
+    # Positions with correct axes are not rotated. The attitude is rotated to their north instead
     if not faults.has_wrong_axes and not faults.rotation_deg:
         heading_change_deg = convention.rotation_deg - 90.0 * CLOCKWISE_DIRECTIONS.index(
             convention.x
@@ -229,7 +225,7 @@ def _make_matrix_to_ned_metres(convention: Convention, faults: ConventionFaults)
 
 
 def _multiply_known_values(values: Array, matrix: Array) -> Array:
-    """Multiply each row by a matrix; NaN only where an unknown value contributes."""
+    """Multiply each row by a matrix. NaN values with weight 0 do not make a result NaN."""
     is_unknown = np.isnan(values).astype(float) @ (matrix != 0.0).T > 0.0
     return np.where(is_unknown, np.nan, np.nan_to_num(values) @ matrix.T)
 

@@ -18,11 +18,11 @@ from px4fuse.trajectory.scores import compute_autocorrelation_time
 
 # Minimum lever arm (m) that is reported: twice the noise of good UWB (0.1 m)
 MIN_LEVER_ARM_M = 0.2
-# Minimum lever arm, in σ of its estimate, that is reported: 1.5 σ occur without a lever arm
+# Minimum ratio of a reported lever arm to its σ. Without a lever arm, the ratio reaches 1.5
 MIN_LEVER_ARM_SIGMAS = 2.5
 # Minimum lever arm (m) that is reported if it is estimated from ground truth
 MIN_LEVER_ARM_WITH_TRUTH_M = 0.05
-# Minimum lever arm, in σ, that is reported if it is estimated from ground truth
+# Minimum ratio of a reported lever arm to its σ if it is estimated from ground truth
 MIN_LEVER_ARM_SIGMAS_WITH_TRUTH = 5.0
 # Maximum lever arm (m) that is reported: a larger one is a frame error of the position source
 MAX_LEVER_ARM_M = 5.0
@@ -60,7 +60,7 @@ def estimate_lever_arm(flight: Flight, track: PositionTrack) -> LeverArm | None:
 
 
 def _fit_lever_arm_to_truth(flight: Flight, truth: Truth, track: PositionTrack) -> LeverArm | None:
-    """Fit a constant, a lever arm and a delay to the position errors against ground truth."""
+    """Fit a constant offset, a lever arm and a delay to the errors against ground truth."""
     attitude, columns = flight.attitude, Columns.POSITION[:2]
     airborne_spans_s = () if isinstance(flight.airborne, Unavailable) else flight.airborne
     position_samples = track.samples[columns].dropna()
@@ -68,9 +68,9 @@ def _fit_lever_arm_to_truth(flight: Flight, truth: Truth, track: PositionTrack) 
         position_samples = position_samples.loc[airborne_spans_s[0][0] : airborne_spans_s[-1][1]]
     if isinstance(attitude, Unavailable) or len(position_samples) < 2:
         return None
-    time_s, true_samples = position_samples.index.to_numpy(), truth.samples
+    time_s, truth_samples = position_samples.index.to_numpy(), truth.samples
     true_positions_m = [
-        np.interp(time_s, true_samples.index, true_samples[name], np.nan, np.nan)
+        np.interp(time_s, truth_samples.index, truth_samples[name], np.nan, np.nan)
         for name in columns
     ]
     error_m = position_samples.to_numpy() - np.transpose(true_positions_m)
@@ -78,18 +78,19 @@ def _fit_lever_arm_to_truth(flight: Flight, truth: Truth, track: PositionTrack) 
     velocity_m_s = np.gradient(np.transpose(true_positions_m), time_s, axis=0)
     quaternions = attitude[Columns.QUATERNION].to_numpy()
     rotation = to_matrix(interpolate(time_s, attitude.index.to_numpy(), quaternions))[:, :2, :2]
-    identity_columns = np.broadcast_to(np.eye(2), rotation.shape)
-    design = np.concatenate([rotation, identity_columns, velocity_m_s[:, :, None]], axis=2)
+    offset_columns = np.broadcast_to(np.eye(2), rotation.shape)
+    design = np.concatenate([rotation, offset_columns, velocity_m_s[:, :, None]], axis=2)
     is_known = np.isfinite(velocity_m_s).all(axis=1)
-    design_rows, known_errors_m = design[is_known].reshape(-1, 5), error_m[is_known].ravel()
+    design_rows = design[is_known].reshape(-1, 5)
+    valid_position_errors_m = error_m[is_known].ravel()
     if len(design_rows) < MIN_COORDINATE_COUNT:
         return None
     fitted_parameters, _, rank, _ = np.linalg.lstsq(
-        design_rows, known_errors_m, rcond=MIN_SINGULAR_VALUE_RATIO
+        design_rows, valid_position_errors_m, rcond=MIN_SINGULAR_VALUE_RATIO
     )
     if rank < design_rows.shape[1]:  # with a constant heading, a lever arm is a constant offset
         return None
-    residual_m = (known_errors_m - design_rows @ fitted_parameters).reshape(-1, 2)
+    residual_m = (valid_position_errors_m - design_rows @ fitted_parameters).reshape(-1, 2)
     # successive errors of a source may be correlated
     variance_factor = max(map(compute_autocorrelation_time, residual_m.T))
     covariance = (
@@ -117,7 +118,7 @@ def _fit_lever_arm_to_imu(flight: Flight, track: PositionTrack) -> LeverArm | No
     design = np.concatenate(
         [
             rotation_second_differences,
-            imu_motion.second_difference_rate_m_s[:, :2, None],
+            imu_motion.second_difference_derivative_m_s[:, :2, None],
             imu_motion.table[:, :2, 1:],
         ],
         axis=2,
@@ -130,14 +131,18 @@ def _fit_lever_arm_to_imu(flight: Flight, track: PositionTrack) -> LeverArm | No
         is_used = is_used & source_motion.is_valid
         second_difference_error_m = source_motion.second_differences - imu_motion.table[:, :2, 0]
         design_rows = design[is_used].reshape(-1, design.shape[2])
-        used_differences_m = second_difference_error_m[is_used].ravel()
-        # second differences closer than two windows share positions: one per two windows counts
+        valid_second_difference_errors_m = second_difference_error_m[is_used].ravel()
+        # Second differences within two windows have common positions and are not independent
         independent_difference_count = (
-            len(used_differences_m) * GRID_INTERVAL_S / (2.0 * SECOND_DIFFERENCE_WINDOW_S)
+            len(valid_second_difference_errors_m)
+            * GRID_INTERVAL_S
+            / (2.0 * SECOND_DIFFERENCE_WINDOW_S)
         )
         if independent_difference_count < 2 * design_rows.shape[1]:
             return None
-        fitted_parameters = np.linalg.lstsq(design_rows, used_differences_m, rcond=None)[0]
+        fitted_parameters = np.linalg.lstsq(
+            design_rows, valid_second_difference_errors_m, rcond=None
+        )[0]
         residual_m: Array = np.linalg.norm(
             second_difference_error_m - design @ fitted_parameters, axis=1
         )
@@ -145,7 +150,7 @@ def _fit_lever_arm_to_imu(flight: Flight, track: PositionTrack) -> LeverArm | No
         covariance = (
             np.linalg.pinv(design_rows.T @ design_rows)
             * sigma_m**2
-            * len(used_differences_m)
+            * len(valid_second_difference_errors_m)
             / independent_difference_count
         )
         lever_arm_sigma_m = float(np.sqrt(np.trace(covariance[:2, :2])))

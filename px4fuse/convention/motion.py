@@ -5,7 +5,7 @@ position and velocity:
 
 p(t + T) - 2 p(t) + p(t - T) = ∫ (T - |s|) a(t + s) ds, s from -T to T
 
-Subtracting its running mean removes constant acceleration errors (tilt, bias).
+The running mean is subtracted, because this removes constant acceleration errors (tilt, bias).
 """
 
 from dataclasses import dataclass, replace
@@ -44,8 +44,8 @@ HIGH_PASS_WINDOW_S = 12.0
 LEVELLING_WINDOW_S = 40.0
 # Length (s) of the windows for the estimate of the gyro bias
 GYRO_BIAS_WINDOW_S = 1.0
-# Shorter intervals (s) between two positions are no gap
-MIN_GAP_S = 0.35
+# Minimum interval (s) between two positions that counts as a gap
+MIN_POSITION_GAP_S = 0.35
 
 
 @dataclass(frozen=True)
@@ -91,13 +91,13 @@ class SourceSecondDifferences:
     def from_positions(
         cls, time_s: Array, position: Array, grid_s: Array
     ) -> "SourceSecondDifferences":
-        """Compute the second differences of positions at the times ``grid_s``; invalid in gaps."""
+        """Compute second differences of positions at ``grid_s``. They are invalid in gaps."""
         window_steps = round(SECOND_DIFFERENCE_WINDOW_S / GRID_INTERVAL_S)
         position_times_s = grid_s[0] + GRID_INTERVAL_S * np.arange(
             -window_steps, len(grid_s) + window_steps
         )
         has_near_samples = is_bracketed(
-            position_times_s, time_s, choose_gap_limit_s(time_s, MIN_GAP_S)
+            position_times_s, time_s, choose_gap_limit_s(time_s, MIN_POSITION_GAP_S)
         )
         interpolated_positions = np.column_stack(
             [np.interp(position_times_s, time_s, column) for column in position.T]
@@ -116,25 +116,25 @@ class SourceSecondDifferences:
 
 @dataclass(frozen=True)
 class ImuSecondDifferences:
-    """Second differences p(t + T) - 2 p(t) + p(t - T) (m, NED) of the position, from the IMU.
+    """Second differences of the vehicle's position (m, NED), integrated from the IMU.
 
-    T is SECOND_DIFFERENCE_WINDOW_S.
+    A second difference is p(t + T) - 2 p(t) + p(t - T), with T = SECOND_DIFFERENCE_WINDOW_S.
 
     Attributes
     ----------
     time_s : ndarray, shape (n,)
     is_valid : ndarray of bool, shape (n,)
     table : ndarray, shape (n, 3, 4)
-        Column 0: second difference. Columns 1 to 3: its derivatives with respect to the
+        Column 0 is the second difference. Columns 1 to 3 are its derivatives with respect to the
         accelerometer bias (FRD, m/s²).
-    second_difference_rate_m_s : ndarray, shape (n, 3)
+    second_difference_derivative_m_s : ndarray, shape (n, 3)
         Derivative of the second difference with respect to time.
     """
 
     time_s: Array
     is_valid: BoolArray
     table: Array
-    second_difference_rate_m_s: Array
+    second_difference_derivative_m_s: Array
 
 
 def integrate_inertial_data(flight: Flight) -> InertialData | None:
@@ -155,24 +155,24 @@ def integrate_inertial_data(flight: Flight) -> InertialData | None:
         return None
     columns = [*Columns.SPECIFIC_FORCE, *Columns.ANGULAR_RATE]
     imu_integrals = (integrate_cumulatively(imu[name].to_numpy(), imu_times_s) for name in columns)
-    integral_increments = np.diff(
+    imu_increments = np.diff(
         [np.interp(time_s, imu_times_s, integral) for integral in imu_integrals]
     ).T
-    specific_force_m_s2 = integral_increments[:, :3] / INTEGRATION_STEP_S
+    specific_force_m_s2 = imu_increments[:, :3] / INTEGRATION_STEP_S
     logged_attitude = interpolate(time_s, attitude_times_s, attitude[Columns.QUATERNION].to_numpy())
     gyro_attitude = _level_attitude(
-        _integrate_gyros(integral_increments[:, 3:], logged_attitude), specific_force_m_s2
+        _integrate_gyros(imu_increments[:, 3:], logged_attitude), specific_force_m_s2
     )
     airborne_spans_s = flight.airborne
     if isinstance(airborne_spans_s, Unavailable):
         airborne_spans_s = ((float(time_s[0]), float(time_s[-1])),)
     gap_rows = np.flatnonzero(find_imu_gaps(imu_times_s))
-    recorded_spans_s = zip(
+    gap_free_spans_s = zip(
         [-np.inf, *imu_times_s[gap_rows + 1]], [*imu_times_s[gap_rows], np.inf], strict=True
     )
     valid_spans_s = (
         (max(flight_start_s, recorded_from_s), min(flight_end_s, recorded_until_s))
-        for recorded_from_s, recorded_until_s in recorded_spans_s
+        for recorded_from_s, recorded_until_s in gap_free_spans_s
         for flight_start_s, flight_end_s in airborne_spans_s
     )
     return InertialData(
@@ -206,15 +206,15 @@ def _integrate_gyros(rotation_rad: Array, logged_attitude: Array) -> Array:
 
 def _level_attitude(attitude: Array, specific_force_m_s2: Array) -> Array:
     """Correct the tilt of an attitude, so that the mean specific force is vertical."""
-    mean_force_m_s2 = rotate(to_matrix(attitude[:-1]), specific_force_m_s2)
+    mean_specific_force_m_s2 = rotate(to_matrix(attitude[:-1]), specific_force_m_s2)
     for _ in range(2):
-        mean_force_m_s2 = running_mean(
-            mean_force_m_s2,
-            np.ones(len(mean_force_m_s2), dtype=bool),
+        mean_specific_force_m_s2 = running_mean(
+            mean_specific_force_m_s2,
+            np.ones(len(mean_specific_force_m_s2), dtype=bool),
             round(LEVELLING_WINDOW_S / INTEGRATION_STEP_S),
         )
-    vertical = mean_force_m_s2 / np.maximum(
-        np.linalg.norm(mean_force_m_s2, axis=1, keepdims=True), 1.0
+    vertical = mean_specific_force_m_s2 / np.maximum(
+        np.linalg.norm(mean_specific_force_m_s2, axis=1, keepdims=True), 1.0
     )
     levelling_rotation = from_vector(np.cross(vertical, [0.0, 0.0, -1.0]))
     return multiply(np.concatenate([levelling_rotation, levelling_rotation[-1:]]), attitude)
@@ -234,9 +234,11 @@ def running_mean(values: Array, is_valid: BoolArray, width: int) -> Array:
 
 
 def high_pass(values: Array, is_valid: BoolArray) -> Array:
-    filtered = values - running_mean(values, is_valid, round(HIGH_PASS_WINDOW_S / GRID_INTERVAL_S))
-    filtered[~is_valid] = 0.0
-    return filtered
+    high_pass_filtered = values - running_mean(
+        values, is_valid, round(HIGH_PASS_WINDOW_S / GRID_INTERVAL_S)
+    )
+    high_pass_filtered[~is_valid] = 0.0
+    return high_pass_filtered
 
 
 def compute_second_differences(position: Array, window: int) -> Array:
@@ -275,9 +277,12 @@ def integrate_imu_motion(inertial_data: InertialData, attitude: Array) -> ImuSec
         is_valid &= (time_s < end - SECOND_DIFFERENCE_WINDOW_S) | (
             time_s > start + SECOND_DIFFERENCE_WINDOW_S
         )
-    filtered = high_pass(second_differences, is_valid)
+    high_pass_filtered = high_pass(second_differences, is_valid)
     return ImuSecondDifferences(
-        time_s, is_valid, filtered, np.gradient(filtered[..., 0], GRID_INTERVAL_S, axis=0)
+        time_s,
+        is_valid,
+        high_pass_filtered,
+        np.gradient(high_pass_filtered[..., 0], GRID_INTERVAL_S, axis=0),
     )
 
 
@@ -285,12 +290,14 @@ def filter_imu_motion(
     imu_motion: ImuSecondDifferences, time_constant_s: float
 ) -> ImuSecondDifferences:
     """Apply a first-order low-pass filter to second differences from the IMU."""
-    previous_weight = np.exp(-GRID_INTERVAL_S / time_constant_s)
+    previous_output_weight = np.exp(-GRID_INTERVAL_S / time_constant_s)
     table = imu_motion.table.copy()
     for row in range(1, len(table)):
-        table[row] += previous_weight * (table[row - 1] - table[row])
-    rate_m_s = np.gradient(table[..., 0], GRID_INTERVAL_S, axis=0)
-    return replace(imu_motion, table=table, second_difference_rate_m_s=rate_m_s)
+        table[row] += previous_output_weight * (table[row - 1] - table[row])
+    second_difference_derivative_m_s = np.gradient(table[..., 0], GRID_INTERVAL_S, axis=0)
+    return replace(
+        imu_motion, table=table, second_difference_derivative_m_s=second_difference_derivative_m_s
+    )
 
 
 def replace_heading(attitude: Array, heading_rad: Array) -> Array:

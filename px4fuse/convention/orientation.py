@@ -33,21 +33,20 @@ QUATERNIONS_BY_FRAMES: Final[dict[BodyAndWorldFrame, tuple[Array, Array]]] = {
 QUATERNION_ORDERS: tuple[QuaternionOrder, QuaternionOrder] = ("w x y z", "x y z w")
 # An orientation is a copy of EKF2's attitude if their median difference is at most this (°): copies
 # differ by 0.03°, fused motion capture by more than 0.2°
-MAX_COPY_DIFFERENCE_DEG = 0.15
+MAX_DIFFERENCE_OF_ATTITUDE_COPY_DEG = 0.15
 # Tested delays (s) of a copy of EKF2's attitude
 COPY_DELAYS_S = np.arange(0.0, 0.205, 0.01)
-# Maximum median difference (°) of the converted tilt from the gyroscopes' tilt, for a correct
+# Maximum median difference (°) between converted tilt and the gyroscopes' tilt, for a correct
 # convention
 MAX_TILT_DIFFERENCE_DEG = 6.0
-# Maximum median difference (°) between converted heading and the gyroscopes' heading for a correct
-# convention, after their mean difference is removed
+# Maximum median difference (°) between converted heading and the gyroscopes' heading, for a correct
+# convention. A constant difference is subtracted first
 MAX_HEADING_DIFFERENCE_DEG = 12.0
-# Lower limit (°) of tilt and heading differences in the score of a convention: smaller differences
-# are noise
-MIN_SCORED_ANGLE_DEG = 0.7
-# Factor k of the score of a convention: log prior odds - k · duration (s) · ln(tilt difference (°)
-# · heading difference (°)), with the differences from the gyroscopes' attitude
-SCORE_FACTOR_PER_S = 0.5
+# Smaller tilt and heading differences (°) are noise and count as this value in the score
+MIN_ANGLE_DIFFERENCE_IN_SCORE_DEG = 0.7
+# Weight w in the score of a convention: log prior odds - w · duration (s) · ln(tilt difference (°)
+# · heading difference (°)). The differences are those from the gyroscopes' attitude
+SCORE_WEIGHT_PER_S = 0.5
 # Minimum lead (nats) in score of the best convention over the second best, for the verdict
 # "determined"
 MIN_CONVENTION_SCORE_LEAD = 4.0
@@ -65,8 +64,11 @@ class OrientationCandidate(NamedTuple):
     score: float
 
     @property
-    def order_and_frames(self) -> tuple[str, str]:
-        """Quaternion order and frames, with ENU as NWU: a heading offset does not distinguish."""
+    def order_and_heading_free_frames(self) -> tuple[str, str]:
+        """Quaternion order, body frame and world frame; ENU counts as NWU.
+
+        ENU and NWU differ only in heading, and the constant heading difference is not compared.
+        """
         return self.convention.order, self.convention.frames.replace("ENU", "NWU")
 
 
@@ -78,13 +80,13 @@ def check_orientation(
     Returns
     -------
     convention : OrientationConvention
-        Without ``heading_error_deg``.
+        Convention without ``heading_error_deg``.
     time_s : ndarray, shape (m,)
-        Times in flight, at most MAX_ORIENTATION_COUNT.
+        Times (s) of the compared orientations, at most MAX_ORIENTATION_COUNT.
     attitude : ndarray, shape (m, 4)
-        FRD to NED.
+        Orientations converted to quaternions (w, x, y, z; FRD to NED).
 
-    The result is None for fewer than MIN_ORIENTATION_COUNT orientations.
+    Return None for fewer than MIN_ORIENTATION_COUNT orientations.
     """
     flight_rows = np.flatnonzero(is_inside_spans(time_s, inertial_data.valid_spans_s))
     if len(flight_rows) < MIN_ORIENTATION_COUNT:
@@ -99,7 +101,9 @@ def check_orientation(
         cos_half_angle = np.clip(
             np.abs(np.sum(sent_quaternions * logged_attitude, axis=1)), 0.0, 1.0
         )
-        if np.median(2.0 * np.arccos(cos_half_angle)) < np.radians(MAX_COPY_DIFFERENCE_DEG):
+        if np.median(2.0 * np.arccos(cos_half_angle)) < np.radians(
+            MAX_DIFFERENCE_OF_ATTITUDE_COPY_DEG
+        ):
             return OrientationConvention(verdict="copied"), sample_times_s, sent_quaternions
     reference_attitude = interpolate(
         sample_times_s, inertial_data.time_s, inertial_data.gyro_attitude
@@ -117,18 +121,21 @@ def check_orientation(
     second_best_candidate = next(
         candidate
         for candidate in candidates
-        if candidate.order_and_frames != best_candidate.order_and_frames
+        if candidate.order_and_heading_free_frames != best_candidate.order_and_heading_free_frames
     )
-    convention = best_candidate.convention
-    tilt_difference_deg = convention.tilt_difference_deg
+    orientation_convention = best_candidate.convention
     if (
-        tilt_difference_deg > MAX_TILT_DIFFERENCE_DEG
+        orientation_convention.tilt_difference_deg > MAX_TILT_DIFFERENCE_DEG
         or best_candidate.heading_difference_deg > MAX_HEADING_DIFFERENCE_DEG
     ):
-        convention = replace(convention, verdict="unrelated")
+        orientation_convention = replace(orientation_convention, verdict="unrelated")
     elif best_candidate.score - second_best_candidate.score < MIN_CONVENTION_SCORE_LEAD:
-        convention = replace(convention, verdict="ambiguous")
-    return convention, sample_times_s, convert_to_attitude(sent_quaternions, convention)
+        orientation_convention = replace(orientation_convention, verdict="ambiguous")
+    return (
+        orientation_convention,
+        sample_times_s,
+        convert_to_attitude(sent_quaternions, orientation_convention),
+    )
 
 
 def convert_to_attitude(sent_quaternions: Array, convention: OrientationConvention) -> Array:
@@ -150,9 +157,9 @@ def _score_convention(
 ) -> OrientationCandidate:
     """Score one convention of the quaternions by their distance from the reference attitude.
 
-    The score decreases with the median differences of tilt and heading; the mean heading difference
-    is removed first. The prior prefers quaternion order w x y z, FRD to NED, no rotation of the
-    body, and a mean heading difference of at most 8°.
+    The score decreases with the median differences of tilt and heading. The mean heading difference
+    is subtracted first. The prior prefers quaternion order w x y z, FRD to NED, a mean heading
+    difference of at most 8°, and a body frame that is not rotated by ``body_quarter_turns`` · 90°.
     """
     convention = OrientationConvention(verdict="determined", order=order, frames=frames)
     body_rotation = from_vector(np.array([0.0, 0.0, body_quarter_turns * np.pi / 2.0]))
@@ -168,9 +175,9 @@ def _score_convention(
         np.median([tilt_difference_rad, heading_difference_rad], axis=1)
     ).tolist()
     log_angle_differences = np.log(
-        np.maximum([tilt_difference_deg, heading_difference_deg], MIN_SCORED_ANGLE_DEG)
+        np.maximum([tilt_difference_deg, heading_difference_deg], MIN_ANGLE_DIFFERENCE_IN_SCORE_DEG)
     )
-    score = -SCORE_FACTOR_PER_S * (time_s[-1] - time_s[0]) * float(np.sum(log_angle_differences))
+    score = -SCORE_WEIGHT_PER_S * (time_s[-1] - time_s[0]) * float(np.sum(log_angle_differences))
     score -= 4.0 * (order != "w x y z") + 2.0 * (frames != "FRD to NED")
     score -= 2.0 * (body_quarter_turns != 0) + 1.0 * (
         abs(mean_heading_difference_rad) > np.radians(8.0)

@@ -29,9 +29,9 @@ def append_opposites(axes: AxisDirections) -> list[Direction]:
 
 
 def find_axes_in_file(axes: AxisDirections, frame: str) -> AxisDirections:
-    """Return the true directions of x, y, z in a file that was read as ``frame``.
+    """Return the true directions of x, y, z in a file that was read with a wrong ``frame``.
 
-    ``axes`` are the true directions of the components that were read as north, east, down.
+    ``axes`` are the true directions of the north, east and down components after reading.
     """
     true_directions = dict(zip(DIRECTIONS, append_opposites(axes), strict=True))
     x, y, z = (true_directions[name] for name in FRAME_AXES[frame])
@@ -65,10 +65,9 @@ def describe_axes(
     source_axis_by_direction = dict(
         zip(append_opposites(axes), ("x", "y", "z", "-z", "-y", "-x"), strict=True)
     )
-    ned_axes_text = ", ".join(
-        source_axis_by_direction[direction] for direction in FRAME_AXES["NED"]
+    ned_text = ", ".join(
+        f"{direction} = {source_axis_by_direction[direction]}" for direction in FRAME_AXES["NED"]
     )
-    ned_text = f"(north, east, down) = ({ned_axes_text})"
     if is_file and frame_name:
         return fault, f"Run again with --position-frame {frame_name.lower()}."
     if is_file:
@@ -92,8 +91,9 @@ def describe_unit(
     fault = f"{positions} are in {UNIT_NAMES[unit]}, not in {stated_unit}"
     if is_file and unit != "feet":
         return fault, f"Run again with --position-unit {unit}."
-    correction_place = "in the file" if is_file else "before sending"
-    return fault, f"Multiply x, y and z by {METRES_PER_UNIT[unit]:g} {correction_place}."
+    if is_file:
+        return fault, f"Multiply x, y and z in the file by {METRES_PER_UNIT[unit]:g}."
+    return fault, f"Multiply x, y and z by {METRES_PER_UNIT[unit]:g} before sending."
 
 
 def describe_quaternion_conversion(frames: str) -> str:
@@ -102,9 +102,11 @@ def describe_quaternion_conversion(frames: str) -> str:
     >>> describe_quaternion_conversion("FLU to NWU")
     'Convert the orientation: q_NED = (0, 1, 0, 0) ⊗ q ⊗ (0, 1, 0, 0), in the order w, x, y, z.'
     """
-    left_factor_text = {"ENU": "(0, √½, √½, 0) ⊗ ", "NWU": "(0, 1, 0, 0) ⊗ "}.get(frames[-3:], "")
-    right_factor_text = " ⊗ (0, 1, 0, 0)" if frames.startswith("FLU") else ""
+    left_quaternion_text = {"ENU": "(0, √½, √½, 0) ⊗ ", "NWU": "(0, 1, 0, 0) ⊗ "}.get(
+        frames[-3:], ""
+    )
+    right_quaternion_text = " ⊗ (0, 1, 0, 0)" if frames.startswith("FLU") else ""
     return (
-        f"Convert the orientation: q_NED = {left_factor_text}q{right_factor_text}, in the order w, "
-        "x, y, z."
+        f"Convert the orientation: q_NED = {left_quaternion_text}q{right_quaternion_text}, in the "
+        "order w, x, y, z."
     )

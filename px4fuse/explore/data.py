@@ -171,8 +171,8 @@ def _make_axis_data(analysis: Analysis, result: AxisComparison, encoder: ArrayEn
         "bands": _pack_nis_bands(len(result.axis.measurement_time_s), encoder),
         # key of the noise estimate: north and east may have a common estimate
         "noises": HORIZONTAL if name != "down" and HORIZONTAL in analysis.tuning else name,
-        "ekf2": _make_ekf2_data(analysis, result.with_flight_tracks(), encoder),
-        "truth": _make_truth_data(result.with_flight_tracks(), encoder),
+        "ekf2": _make_ekf2_data(analysis, result.with_whole_flight_tracks(), encoder),
+        "truth": _make_truth_data(result.with_whole_flight_tracks(), encoder),
     }
 
 

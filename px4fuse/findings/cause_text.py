@@ -98,7 +98,7 @@ def format_action(analysis: Analysis, change: Mapping[str, float]) -> str:
         )
     if (offset_s := change.pop(trials.CLOCK_OFFSET_KEY, None)) is not None:
         actions.append(f"{format_shift(offset_s)} the position timestamps before sending.")
-    settings = {name: change.pop(name) for name in changes.CHANGED_KF_SETTINGS & change.keys()}
+    settings = {name: change.pop(name) for name in changes.KF_NOISE_SETTINGS & change.keys()}
     if change:
         change = select_changed_settings(change, _find_used_settings(analysis))
         actions.append(f"Set {format_settings(change)}.")

@@ -151,7 +151,7 @@ def detect_wrong_delay(analysis: Analysis, time_offset: ClockOffset) -> Findings
     estimated_delay_ms = -1e3 * time_offset.offset_s
     if (
         delay_ms is None
-        or remedy.estimate_delay_if_wrong_ms(analysis, time_offset, delay_ms) is None
+        or remedy.estimate_differing_delay_ms(analysis, time_offset, delay_ms) is None
     ):
         return
     delay_low_ms, delay_high_ms = (-1e3 * end_s for end_s in reversed(time_offset.interval_s))

@@ -161,7 +161,7 @@ def _find_ekf2_errors_at_end(analysis: Analysis, span_s: Span) -> dict[str, floa
     axes = [analysis.axes[name] for name in ("north", "east") if name in analysis.axes]
     squared_errors_m2 = []
     for result in axes if len(axes) == 2 else [analysis.main]:
-        tracks = result.with_flight_tracks()
+        tracks = result.with_whole_flight_tracks()
         if isinstance(tracks.ekf2_state, Unavailable):
             return {}
         position_m = tracks.ekf2_state["position_m"].loc[slice(*span_s)]

@@ -14,7 +14,7 @@ from px4fuse.comparison.error_patterns import (
     find_attitude_delay,
     find_offset_variation,
     find_periodic_error,
-    find_speed_noise,
+    find_speed_dependent_noise,
     find_timestamp_jitter,
     fit_errors,
 )
@@ -75,7 +75,7 @@ def detect_jitter_and_speed_noise(analysis: Analysis, local_residuals: LocalResi
             "processed, sent or received.",
             {"jitter_s": jitter_s},
         )
-    speed_noise = find_speed_noise(local_residuals)
+    speed_noise = find_speed_dependent_noise(local_residuals)
     if speed_noise is not None:
         yield error(
             "source_noise_grows_with_speed",

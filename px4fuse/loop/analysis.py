@@ -11,20 +11,20 @@ from px4fuse.flight.model import DIAGNOSIS_WITHHELD, Flight, Unavailable
 from px4fuse.loop import loop_segment
 from px4fuse.loop.closure import choose_key_frames, compute_default_spacing_m, to_z_down
 from px4fuse.loop.corrections import (
-    ClosureAndLanding,
+    ClosureAndFinalPose,
     build_pose_graph,
-    correct_paths_by_distance,
+    distribute_closure_error_by_distance,
     gate_closures,
     score_paths,
     solve_pose_graphs,
 )
-from px4fuse.loop.model import LANDING_CLOSURE_SOURCE, Loop, OdometryNoise, TrueEnd
+from px4fuse.loop.model import LANDING_CLOSURE_SOURCE, Loop, OdometryNoise, TrueFinalPose
 from px4fuse.loop.tracks import LoopSource, find_odometry, trajectory_of
 from px4fuse.request import GivenClosure, LoopRequest
 from px4fuse.trajectory.graph import lie
 from px4fuse.trajectory.model import Trajectory, components_by_axis, cumulative_distance
 
-# A time (s) in an option is UNIX time above this limit, else time from the first pose
+# Larger times (s) in options are UNIX times, smaller times count from the first pose
 MIN_UNIX_TIME_S = 1e6
 # Minimum path length (m) of a loop
 MIN_PATH_LENGTH_M = 2.0
@@ -32,7 +32,7 @@ MIN_PATH_LENGTH_M = 2.0
 MIN_FLIGHT_LOOP_PATH_M = 10.0
 # Maximum distance between both ends of the path for a loop analysis in ``px4fuse compare``, as
 # fraction of the path length
-MAX_END_TO_START_FRACTION = 0.10
+MAX_END_TO_START_DISTANCE_FRACTION = 0.10
 # Maximum value (m or °) of the options for drift, key frame spacing and σ
 MAX_LOOP_OPTION_VALUE = 100.0
 
@@ -67,67 +67,74 @@ def analyse(
     is_assessed = flight is not None and bool(flight.log.is_assessed)
     time_origin_s = float(trajectory.time_s[0]) if trajectory.unix_offset_s == 0.0 else 0.0
 
-    def to_track_time(time_s: float) -> float:
+    def convert_to_trajectory_time_s(time_s: float) -> float:
         return time_s + time_origin_s if abs(time_s) < MIN_UNIX_TIME_S else time_s
 
-    request_times = (request.start_s, request.end_s)
-    start_s, end_s = (None if time_s is None else to_track_time(time_s) for time_s in request_times)
-    segment, rests_at_ends = loop_segment.choose_loop_segment(flight, trajectory, start_s, end_s)
+    start_s, end_s = (
+        None if time_s is None else convert_to_trajectory_time_s(time_s)
+        for time_s in (request.start_s, request.end_s)
+    )
+    segment, is_at_rest_at_both_ends = loop_segment.choose_loop_segment(
+        flight, trajectory, start_s, end_s
+    )
     truth = None if flight is None or trajectory.kind == "truth" else find_truth_trajectory(flight)
     z_down_trajectory = to_z_down(trajectory)
-    path = loop_segment.cut_trajectory(z_down_trajectory, segment, rests_at_ends)
-    end_from_truth = None
+    path = loop_segment.cut_trajectory(z_down_trajectory, segment, is_at_rest_at_both_ends)
+    final_pose_in_truth = None
     if truth and request.closed_loop and request.landed_at is None:
-        end_from_truth = loop_segment.read_end_from_truth(path, truth, segment, rests_at_ends)
-    true_end = _find_true_end(path, request, end_from_truth, segment, is_assessed=is_assessed)
+        final_pose_in_truth = loop_segment.find_final_pose_in_truth(
+            path, truth, segment, is_at_rest_at_both_ends
+        )
+    true_end = _find_true_end(path, request, final_pose_in_truth, segment, is_assessed=is_assessed)
     given_closures = [
         GivenClosure(
-            to_track_time(closure.time_1_s), to_track_time(closure.time_2_s), closure.sigma_m
+            convert_to_trajectory_time_s(closure.time_1_s),
+            convert_to_trajectory_time_s(closure.time_2_s),
+            closure.sigma_m,
         )
         for closure in request.closures
     ]
     for closure in given_closures:
         _require_valid_closure(closure, path)
-    closures_and_landings: list[ClosureAndLanding] = [(closure, None) for closure in given_closures]
+    closures_and_final_poses: list[ClosureAndFinalPose] = [
+        (closure, None) for closure in given_closures
+    ]
     if not isinstance(true_end, Unavailable):
-        closures_and_landings.insert(
+        closures_and_final_poses.insert(
             0, (GivenClosure(segment.start_s, segment.end_s, true_end.sigma_m), true_end)
         )
     key_frame_spacing_m = request.key_frames_m
-    key_frame_spacing_m = (
-        compute_default_spacing_m(path.position_m)
-        if key_frame_spacing_m is None
-        else key_frame_spacing_m
-    )
+    if key_frame_spacing_m is None:
+        key_frame_spacing_m = compute_default_spacing_m(path.position_m)
     key_frame_indices, distance_m = _choose_key_frames(path, key_frame_spacing_m)
     graph, node_indices, variance_note = build_pose_graph(
-        path, key_frame_indices, closures_and_landings, noise
+        path, key_frame_indices, closures_and_final_poses, noise
     )
     notes = [*z_down_trajectory.notes, variance_note]
-    if isinstance(end_from_truth, str):
-        notes.append(f"the ground truth does not contain the landing place: {end_from_truth}")
-    gated_closures = gate_closures(graph, closures_and_landings)
-    graph_corrections, gated_closures = solve_pose_graphs(
-        path, node_indices, graph, gated_closures, progress
+    if isinstance(final_pose_in_truth, str):
+        notes.append(f"the ground truth does not contain the landing place: {final_pose_in_truth}")
+    tested_closures = gate_closures(graph, closures_and_final_poses)
+    pose_graph_corrections, tested_closures = solve_pose_graphs(
+        path, node_indices, graph, tested_closures, progress
     )
-    end_from_start_m = path.position_m[-1] - path.position_m[0]
+    displacement_m = path.position_m[-1] - path.position_m[0]
     odometry_heading_change_deg = loop_segment.compute_heading_change_deg(path)
-    misclosure_m = (
+    closure_error_vector_m = (
         true_end
         if isinstance(true_end, Unavailable)
-        else end_from_start_m - true_end.displacement_vector_m
+        else displacement_m - true_end.displacement_vector_m
     )
     heading_error_deg = _compute_heading_error(true_end, odometry_heading_change_deg)
-    landing_closure = next((c for c in gated_closures if c.source == LANDING_CLOSURE_SOURCE), None)
-    paths_corrected_by_distance = correct_paths_by_distance(
-        path, distance_m, misclosure_m, heading_error_deg, landing_closure
+    landing_closure = next((c for c in tested_closures if c.source == LANDING_CLOSURE_SOURCE), None)
+    paths_corrected_by_distance = distribute_closure_error_by_distance(
+        path, distance_m, closure_error_vector_m, heading_error_deg, landing_closure
     )
     references = tuple(track for track in (truth, reference) if track is not None)
     closure_error_m = closure_percent = closure_error_axes_m = None
-    if not isinstance(misclosure_m, Unavailable):
-        closure_error_m = float(np.linalg.norm(misclosure_m))
+    if not isinstance(closure_error_vector_m, Unavailable):
+        closure_error_m = float(np.linalg.norm(closure_error_vector_m))
         closure_percent = 100.0 * closure_error_m / float(distance_m[-1])
-        closure_error_axes_m = components_by_axis(path.frame, misclosure_m)
+        closure_error_axes_m = components_by_axis(path.frame, closure_error_vector_m)
     return Loop(
         track=path.name,
         kind=path.kind,
@@ -139,7 +146,7 @@ def analyse(
         key_frames=len(key_frame_indices),
         key_frame_spacing_m=key_frame_spacing_m,
         path_length_m=float(distance_m[-1]),
-        end_from_start_m=components_by_axis(path.frame, end_from_start_m),
+        end_from_start_m=components_by_axis(path.frame, displacement_m),
         heading_change_deg=odometry_heading_change_deg,
         true_end=true_end,
         closure_error_m=closure_error_m,
@@ -148,8 +155,10 @@ def analyse(
         heading_error_deg=heading_error_deg,
         is_absolute_track=flight is not None and _is_drift_free(trajectory, flight),
         odometry_noise=noise,
-        closures=gated_closures,
-        corrections=score_paths(path, paths_corrected_by_distance | graph_corrections, references),
+        closures=tested_closures,
+        corrections=score_paths(
+            path, paths_corrected_by_distance | pose_graph_corrections, references
+        ),
         notes=tuple(note for note in notes if note),
         distance_m=distance_m,
         graph=graph,
@@ -162,11 +171,11 @@ def analyse(
 def _find_true_end(
     path: Trajectory,
     request: LoopRequest,
-    end_from_truth: TrueEnd | str | None,
+    final_pose_in_truth: TrueFinalPose | str | None,
     segment: Segment,
     *,
     is_assessed: bool,
-) -> TrueEnd | Unavailable:
+) -> TrueFinalPose | Unavailable:
     """Return the true final pose: measured, from ground truth, or equal to the initial pose."""
     if request.landed_at is not None:
         if not request.closed_loop:
@@ -174,15 +183,15 @@ def _find_true_end(
                 "`landed_at` and `closed_loop` exclude each other.",
                 "Omit `landed_at` or `closed_loop`.",
             )
-        return loop_segment.convert_measured_end(path, request.landed_at)
+        return loop_segment.convert_measured_final_pose(path, request.landed_at)
     if not request.closed_loop:
         return Unavailable(
             "loop closure error",
             "the path does not return to its start (stated with --open)",
             "Omit --open.",
         )
-    if isinstance(end_from_truth, TrueEnd):
-        return end_from_truth
+    if isinstance(final_pose_in_truth, TrueFinalPose):
+        return final_pose_in_truth
     if is_assessed:
         return DIAGNOSIS_WITHHELD
     flight = segment.flight
@@ -196,18 +205,18 @@ def _find_true_end(
             "not of the whole flight",
             "Choose the time span of a loop with --from and --to.",
         )
-    return loop_segment.assume_end_at_takeoff(path)
+    return loop_segment.assume_landing_at_takeoff(path)
 
 
 def _is_drift_free(trajectory: Trajectory, flight: Flight) -> bool:
-    """Return True if the trajectory is from KF or EKF2, aided by positions without drift."""
+    """Return True if the trajectory is from a filter that used positions without drift."""
     has_vision = any(track.origin.is_vision for track in flight.positions)
     has_no_odometry = isinstance(find_odometry(flight), Unavailable)
     return trajectory.kind in ("ekf2", "kf") and has_vision and has_no_odometry
 
 
 def _choose_key_frames(path: Trajectory, key_frame_spacing_m: float) -> tuple[IntArray, Array]:
-    """Return the key frame indices, and the path length (m) via key frames up to each pose."""
+    """Return the key frame indices, and the path length (m) along key frames up to each pose."""
     _require_in_range("key_frames_m", key_frame_spacing_m, 1e-3)
     key_frame_indices = choose_key_frames(path.position_m, key_frame_spacing_m)
     distance_m = cumulative_distance(path.position_m[key_frame_indices])
@@ -242,7 +251,7 @@ def _require_valid_closure(closure: GivenClosure, path: Trajectory) -> None:
 
 
 def _compute_heading_error(
-    true_end: TrueEnd | Unavailable, heading_change_deg: float | None
+    true_end: TrueFinalPose | Unavailable, heading_change_deg: float | None
 ) -> float | Unavailable:
     quantity = "heading error at the end of the loop"
     if isinstance(true_end, Unavailable):
@@ -288,18 +297,20 @@ def analyse_flight_loop(
         )
     segment, _ = loop_segment.choose_loop_segment(flight, trajectory, None, None)
     segment_position_m = trajectory.cut_to_span(segment.start_s, segment.end_s).position_m
-    extent_m = end_distance_m = 0.0
+    extent_m = end_to_start_distance_m = 0.0
     if len(segment_position_m):
         extent_m = float(np.linalg.norm(np.ptp(segment_position_m, axis=0)))
-        end_distance_m = float(np.linalg.norm(segment_position_m[-1] - segment_position_m[0]))
+        end_to_start_distance_m = float(
+            np.linalg.norm(segment_position_m[-1] - segment_position_m[0])
+        )
     if (
         2.0 * extent_m < MIN_FLIGHT_LOOP_PATH_M
-        or end_distance_m > MAX_END_TO_START_FRACTION * 2.0 * extent_m
+        or end_to_start_distance_m > MAX_END_TO_START_DISTANCE_FRACTION * 2.0 * extent_m
     ):
         return Unavailable(
             "loop closure",
-            f"the odometry has an extent of {extent_m:.1f} m and ends {end_distance_m:.1f} m from "
-            "its start, so it is not a loop",
+            f"the odometry has an extent of {extent_m:.1f} m and ends "
+            f"{end_to_start_distance_m:.1f} m from its start, so it is not a loop",
             "Fly back to the take-off place, or give two times at one place with px4fuse loop "
             "--closure.",
         )

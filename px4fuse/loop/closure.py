@@ -65,13 +65,13 @@ def _matrix_to_ned(axes: str) -> Array:
 
 def _rotate(trajectory: Trajectory, matrix: Array, frame: Frame) -> Trajectory:
     """Rotate a trajectory to another frame, and convert camera axes to body axes or the reverse."""
-    axes_rotation = Rotation.from_matrix(matrix)
+    frame_rotation = Rotation.from_matrix(matrix)
     rotated = replace(
-        trajectory.with_positions(trajectory.position_m @ matrix.T, axes_rotation), frame=frame
+        trajectory.with_positions(trajectory.position_m @ matrix.T, frame_rotation), frame=frame
     )
     if rotated.rotation is None or "camera" not in (trajectory.frame, frame):
         return rotated
-    return replace(rotated, rotation=rotated.rotation * axes_rotation.inv())
+    return replace(rotated, rotation=rotated.rotation * frame_rotation.inv())
 
 
 def compute_default_spacing_m(position_m: Array) -> float:
@@ -101,23 +101,23 @@ def choose_key_frames(position_m: Array, spacing_m: float) -> IntArray:
         len(key_frame_indices) > 1
         and np.linalg.norm(position_m[-1] - last_key_frame_position_m) < spacing_m / 2.0
     ):
-        # The last two key frames would be so near that their distance is mostly noise
+        # If the last key frame is near the final pose, their distance is mostly noise
         key_frame_indices.pop()
     return np.array([*key_frame_indices, len(position_m) - 1])
 
 
 def distribute_by_distance(
-    position_m: Array, misclosure_m: Array, cumulative_distance_m: Array | None = None
+    position_m: Array, closure_error_vector_m: Array, cumulative_distance_m: Array | None = None
 ) -> Array:
     """Subtract a part of the loop closure error from each position, in proportion to path length.
 
-    ``misclosure_m`` is the final position minus the true final position. The method is the compass
-    rule of surveying (Bowditch 1808; UAT 366 module 2, Example 2).
+    ``closure_error_vector_m`` is the final position minus the true final position. The method is
+    the compass rule of surveying (Bowditch 1808; UAT 366 module 2, Example 2).
     """
     distance_m = (
         cumulative_distance(position_m) if cumulative_distance_m is None else cumulative_distance_m
     )
-    return np.asarray(position_m - (distance_m / distance_m[-1])[:, None] * misclosure_m)
+    return np.asarray(position_m - (distance_m / distance_m[-1])[:, None] * closure_error_vector_m)
 
 
 def compute_heading_change_rad(rotation: Rotation) -> float:
@@ -132,8 +132,8 @@ def compute_heading_change_rad(rotation: Rotation) -> float:
 def correct_by_distance(
     trajectory: Trajectory,
     cumulative_distance_m: Array,
-    misclosure_m: Array,
-    misclosure_heading_rad: float,
+    closure_error_vector_m: Array,
+    heading_closure_error_rad: float,
 ) -> Trajectory:
     """Distribute the loop closure errors of position and heading in proportion to the distance.
 
@@ -143,16 +143,16 @@ def correct_by_distance(
     position_m = trajectory.position_m
     distance_fraction = cumulative_distance_m / cumulative_distance_m[-1]
     correction_rotation = Rotation.from_rotvec(
-        np.outer(-distance_fraction * misclosure_heading_rad, DOWN_DIRECTION)
+        np.outer(-distance_fraction * heading_closure_error_rad, DOWN_DIRECTION)
     )
-    middle_fraction = (distance_fraction[1:] + distance_fraction[:-1]) / 2.0
-    middle_rotation = Rotation.from_rotvec(
-        np.outer(-middle_fraction * misclosure_heading_rad, DOWN_DIRECTION)
+    step_middle_distance_fraction = (distance_fraction[1:] + distance_fraction[:-1]) / 2.0
+    rotation_at_step_middle = Rotation.from_rotvec(
+        np.outer(-step_middle_distance_fraction * heading_closure_error_rad, DOWN_DIRECTION)
     )
     rotated_position_m = position_m[0] + cumulative_sums(
-        middle_rotation.apply(np.diff(position_m, axis=0))
+        rotation_at_step_middle.apply(np.diff(position_m, axis=0))
     )
-    remaining_error_m = rotated_position_m[-1] - (position_m[-1] - misclosure_m)
+    remaining_error_m = rotated_position_m[-1] - (position_m[-1] - closure_error_vector_m)
     return trajectory.with_positions(
         distribute_by_distance(rotated_position_m, remaining_error_m, cumulative_distance_m),
         correction_rotation,

@@ -19,10 +19,10 @@ from px4fuse.loop.closure import (
 from px4fuse.loop.model import (
     LANDING_CLOSURE_SOURCE,
     Closure,
-    CorrectedPath,
     CorrectionName,
     OdometryNoise,
-    TrueEnd,
+    PathResult,
+    TrueFinalPose,
 )
 from px4fuse.request import GivenClosure
 from px4fuse.trajectory.evaluation import Evaluation, evaluate
@@ -32,15 +32,15 @@ from px4fuse.trajectory.graph.model import PoseGraph
 from px4fuse.trajectory.graph.solver import ROBUST_SOLUTION_KEY, SOLUTION_LABELS, Solution, solve
 from px4fuse.trajectory.model import Trajectory, cumulative_distance
 
-# The variances that the odometry reports are used instead of the default drift if the variance at
-# the end of the path is more than this factor larger than at the start
-MIN_VARIANCE_GROWTH = 2.0
-# Minimum variance of an odometry edge, as fraction of the default variance: avoids a division by 0
-MIN_ODOMETRY_VARIANCE_FRACTION = 1e-2
-# The variance at the start or end of the path is the median over this fraction of the poses
-END_POSES_FRACTION = 0.1
-# Loop closure, and the true final pose if the closure connects take-off and landing (else None)
-ClosureAndLanding = tuple[GivenClosure, TrueEnd | None]
+# Minimum ratio of the variance reported at the end of the path to the variance at the start. With a
+# larger ratio, the reported variances replace the default drift of the odometry
+MIN_VARIANCE_GROWTH_RATIO = 2.0
+# Minimum ratio of a reported variance to the default variance, to avoid a division by 0
+MIN_REPORTED_TO_DEFAULT_VARIANCE_RATIO = 1e-2
+# Fraction of the poses whose median variance is the variance at the start or end of the path
+FRACTION_OF_POSES_AT_EACH_END = 0.1
+# Loop closure, and the true final pose; None if the closure is not that of take-off and landing
+ClosureAndFinalPose = tuple[GivenClosure, TrueFinalPose | None]
 
 
 def compute_odometry_variances(
@@ -70,54 +70,59 @@ def compute_odometry_variances(
         noise.position_m**2 / 100.0 * step_length_m
         + noise.position_m_per_root_s**2 * step_duration_s
     )
-    heading_variance_rad2 = np.radians(noise.heading_deg) ** 2 / 100.0 * step_length_m
     heading_variance_rad2 = (
-        heading_variance_rad2 + np.radians(noise.heading_deg_per_root_s) ** 2 * step_duration_s
+        np.radians(noise.heading_deg) ** 2 / 100.0 * step_length_m
+        + np.radians(noise.heading_deg_per_root_s) ** 2 * step_duration_s
     )
     tilt_variance_rad2 = noise.tilt_share**2 * heading_variance_rad2
     rotation_variance_rad2 = np.column_stack(
         [tilt_variance_rad2, tilt_variance_rad2, heading_variance_rad2]
     )
-    drift_source = "default" if noise == OdometryNoise() else "from options"
+    drift_origin_text = "default" if noise == OdometryNoise() else "from options"
     variance_texts = [
         f"the odometry drift after 100 m is {noise.position_m:g} m in position and "
-        f"{noise.heading_deg:g}° in heading (1 σ, {drift_source})"
+        f"{noise.heading_deg:g}° in heading (1 σ, {drift_origin_text})"
     ]
-    position_variance_growth = _compute_variance_growth(path.position_variance_m2, node_indices)
-    if position_variance_growth is not None:
+    position_variance_increments_m2 = _compute_variance_increments(
+        path.position_variance_m2, node_indices
+    )
+    if position_variance_increments_m2 is not None:
         translation_variance_m2 = np.maximum(
-            position_variance_growth.mean(axis=1),
-            MIN_ODOMETRY_VARIANCE_FRACTION * translation_variance_m2,
+            position_variance_increments_m2.mean(axis=1),
+            MIN_REPORTED_TO_DEFAULT_VARIANCE_RATIO * translation_variance_m2,
         )
         variance_texts.append(
-            "the translation variance between two nodes is the increase of the logged position "
-            "variance"
+            "the odometry's position variance between two graph nodes is the increase of the "
+            "logged position variance"
         )
     elif path.position_variance_m2 is not None:
         variance_texts.append("the logged position variances do not grow, so they are not used")
-    rotation_variance_growth = _compute_variance_growth(path.rotation_variance_rad2, node_indices)
-    if rotation_variance_growth is not None:
+    rotation_variance_increments_rad2 = _compute_variance_increments(
+        path.rotation_variance_rad2, node_indices
+    )
+    if rotation_variance_increments_rad2 is not None:
         rotation_variance_rad2 = np.maximum(
-            rotation_variance_growth, MIN_ODOMETRY_VARIANCE_FRACTION * rotation_variance_rad2
+            rotation_variance_increments_rad2,
+            MIN_REPORTED_TO_DEFAULT_VARIANCE_RATIO * rotation_variance_rad2,
         )
         variance_texts.append(
-            "the rotation variance between two nodes is the increase of the logged orientation "
-            "variance"
+            "the odometry's orientation variance between two graph nodes is the increase of the "
+            "logged orientation variance"
         )
     return translation_variance_m2, rotation_variance_rad2, "; ".join(variance_texts)
 
 
-def _compute_variance_growth(variance: Array | None, node_indices: IntArray) -> Array | None:
-    """Compute the growth of reported variances between graph nodes, shape (k - 1, 3).
+def _compute_variance_increments(variance: Array | None, node_indices: IntArray) -> Array | None:
+    """Return the increases of reported variances between graph nodes, shape (k - 1, 3).
 
-    Return None if the variances do not grow by MIN_VARIANCE_GROWTH along the path.
+    Return None if the variances do not grow by MIN_VARIANCE_GROWTH_RATIO along the path.
     """
     if variance is None:
         return None
-    end_sample_count = max(1, int(END_POSES_FRACTION * len(variance)))
-    start_variance_sum = float(np.median(variance[:end_sample_count].sum(axis=1)))
-    end_variance_sum = float(np.median(variance[-end_sample_count:].sum(axis=1)))
-    if not end_variance_sum > MIN_VARIANCE_GROWTH * start_variance_sum:
+    end_sample_count = max(1, int(FRACTION_OF_POSES_AT_EACH_END * len(variance)))
+    total_variance_at_start = float(np.median(variance[:end_sample_count].sum(axis=1)))
+    total_variance_at_end = float(np.median(variance[-end_sample_count:].sum(axis=1)))
+    if not total_variance_at_end > MIN_VARIANCE_GROWTH_RATIO * total_variance_at_start:
         return None
     return np.maximum(np.diff(variance[node_indices], axis=0), 0.0)
 
@@ -125,7 +130,7 @@ def _compute_variance_growth(variance: Array | None, node_indices: IntArray) -> 
 def build_pose_graph(
     path: Trajectory,
     key_frame_indices: IntArray,
-    closures_and_landings: Sequence[ClosureAndLanding],
+    closures_and_final_poses: Sequence[ClosureAndFinalPose],
     noise: OdometryNoise,
 ) -> tuple[PoseGraph | Unavailable, IntArray, str]:
     """Build the pose graph of a path with z down; its last edges are the loop closures.
@@ -149,7 +154,7 @@ def build_pose_graph(
             "",
         )
     closure_times_s = np.array(
-        [(closure.time_1_s, closure.time_2_s) for closure, _ in closures_and_landings]
+        [(closure.time_1_s, closure.time_2_s) for closure, _ in closures_and_final_poses]
     ).reshape(-1, 2)
     pose_indices = np.abs(path.time_s - closure_times_s[..., None]).argmin(axis=-1)
     node_indices = np.union1d(key_frame_indices, pose_indices).astype(np.intp)
@@ -168,12 +173,12 @@ def build_pose_graph(
     )
     information[step_indices[:, None], range(6), range(6)] = information_diagonal
     first_rotation_inverse = node_rotation[first_nodes].inv()
-    second_rotation = node_rotation[second_nodes]
+    second_node_rotation = node_rotation[second_nodes]
     measured_translation_m = first_rotation_inverse.apply(
         node_position_m[second_nodes] - node_position_m[first_nodes]
     )
     for edge_index, (closure, true_end) in enumerate(
-        closures_and_landings, start=len(step_indices)
+        closures_and_final_poses, start=len(step_indices)
     ):
         measured_translation_m[edge_index] = (
             0.0
@@ -183,16 +188,16 @@ def build_pose_graph(
         information[edge_index, range(3), range(3)] = closure.sigma_m**-2
         if true_end is not None and true_end.heading_change_deg is not None:
             odometry_heading_change_rad = compute_heading_change_rad(
-                second_rotation[edge_index] * node_rotation[first_nodes[edge_index]].inv()
+                second_node_rotation[edge_index] * node_rotation[first_nodes[edge_index]].inv()
             )
             heading_correction_rad = float(
                 lie.wrap(np.radians(true_end.heading_change_deg) - odometry_heading_change_rad)
             )
-            second_rotation[edge_index] = (
+            second_node_rotation[edge_index] = (
                 Rotation.from_rotvec(heading_correction_rad * DOWN_DIRECTION)
-                * second_rotation[edge_index]
+                * second_node_rotation[edge_index]
             )
-            vertical_direction = second_rotation[edge_index].inv().apply(DOWN_DIRECTION)
+            vertical_direction = second_node_rotation[edge_index].inv().apply(DOWN_DIRECTION)
             heading_sigma_rad = np.radians(true_end.sigma_heading_deg or 0.0)
             information[edge_index, 3:, 3:] = (
                 np.outer(vertical_direction, vertical_direction) / heading_sigma_rad**2
@@ -204,7 +209,7 @@ def build_pose_graph(
         first_nodes=first_nodes,
         second_nodes=second_nodes,
         measurements=np.column_stack(
-            [measured_translation_m, (first_rotation_inverse * second_rotation).as_quat()]
+            [measured_translation_m, (first_rotation_inverse * second_node_rotation).as_quat()]
         ),
         information=information,
         initialised="odometry",
@@ -213,8 +218,8 @@ def build_pose_graph(
 
 
 UNCORRECTED_LABEL = "uncorrected"
-POSITIONS_CORRECTED_LABEL = "closure error distributed over positions"
-HEADINGS_CORRECTED_LABEL = "closure error distributed over positions and headings"
+POSITIONS_CORRECTED_LABEL = "positions corrected in proportion to distance"
+HEADINGS_CORRECTED_LABEL = "positions and headings corrected in proportion to distance"
 # Labels of the path corrections, by the key in results.json
 CORRECTION_LABELS: Mapping[str, str] = {
     "uncorrected": UNCORRECTED_LABEL,
@@ -227,56 +232,60 @@ CORRECTION_LABELS: Mapping[str, str] = {
 CorrectionOutcome = tuple[Trajectory, Solution | None] | Unavailable
 
 
-def correct_paths_by_distance(
+def distribute_closure_error_by_distance(
     path: Trajectory,
     distance_m: Array,
-    misclosure_m: Array | Unavailable,
+    closure_error_vector_m: Array | Unavailable,
     heading_error_deg: float | Unavailable,
     landing_closure: Closure | None,
 ) -> dict[CorrectionName, CorrectionOutcome]:
-    """Distribute the closure error by path length: over positions, and over positions and headings.
+    """Distribute the closure error along the path, in proportion to the distance flown.
 
-    Return both corrected paths.
+    Return a path with corrected positions, and a path with corrected positions and headings.
     """
     if landing_closure is not None and not landing_closure.accepted:
-        misclosure_m = _make_gate_rejection(
+        closure_error_vector_m = _explain_gate_rejection(
             "distribution of the closure error along the path", landing_closure
         )
-    if isinstance(misclosure_m, Unavailable):
-        return {"by_distance_plain": misclosure_m, "by_distance": misclosure_m}
-    corrected_position_m = distribute_by_distance(path.position_m, misclosure_m, distance_m)
+    if isinstance(closure_error_vector_m, Unavailable):
+        return {"by_distance_plain": closure_error_vector_m, "by_distance": closure_error_vector_m}
+    corrected_position_m = distribute_by_distance(
+        path.position_m, closure_error_vector_m, distance_m
+    )
     heading_error_rad = (
         0.0 if isinstance(heading_error_deg, Unavailable) else float(np.radians(heading_error_deg))
     )
-    corrected_path = correct_by_distance(path, distance_m, misclosure_m, heading_error_rad)
+    corrected_path = correct_by_distance(
+        path, distance_m, closure_error_vector_m, heading_error_rad
+    )
     return {
         "by_distance_plain": (path.with_positions(corrected_position_m), None),
         "by_distance": (corrected_path, None),
     }
 
 
-def _make_gate_rejection(correction_name: str, closure: Closure) -> Unavailable:
+def _explain_gate_rejection(correction_name: str, closure: Closure) -> Unavailable:
     return Unavailable(
         correction_name,
         f"the χ² gate rejects {closure} (squared Mahalanobis distance {closure.d2:.1f}, "
         f"p {closure.p:.1g})",
-        "Measure the landing place (--landed-at), increase the odometry drift (--drift), or give "
-        "--open if the path does not return to its start.",
+        "Measure the landing place (--landed-at), assume a larger odometry drift (--drift), or "
+        "give --open if the path does not return to its start.",
     )
 
 
 def gate_closures(
-    graph: PoseGraph | Unavailable, closures_and_landings: Sequence[ClosureAndLanding]
+    graph: PoseGraph | Unavailable, closures_and_final_poses: Sequence[ClosureAndFinalPose]
 ) -> tuple[Closure, ...]:
     """Test the loop closures (the last edges of the graph) against odometry with a χ² gate."""
     if isinstance(graph, Unavailable):
         return ()
     closure_edges = np.arange(
-        len(graph.first_nodes) - len(closures_and_landings), len(graph.first_nodes)
+        len(graph.first_nodes) - len(closures_and_final_poses), len(graph.first_nodes)
     )
     closures = []
     for gate_result, (closure, true_end) in zip(
-        gate_edges(graph, closure_edges), closures_and_landings, strict=True
+        gate_edges(graph, closure_edges), closures_and_final_poses, strict=True
     ):
         odometry_displacement_m = (
             graph.poses[gate_result.second, :3] - graph.poses[gate_result.first, :3]
@@ -327,13 +336,12 @@ def solve_pose_graphs(
         if is_robust and len(closures) < 2:
             corrections[name] = Unavailable(
                 label,
-                "Robust optimisation rejects loop closures that contradict other loop closures, "
-                "but the path has only one loop closure. The gate also tests a single loop "
-                "closure.",
+                "Robust optimisation compares loop closures with each other, but the path has only "
+                "one loop closure. Only the χ² gate can test this loop closure.",
                 "Give more loop closures with --closure.",
             )
         elif is_gated and is_rejected[is_closure].all():
-            corrections[name] = _make_gate_rejection("pose graph", closures[0])
+            corrections[name] = _explain_gate_rejection("pose graph", closures[0])
         elif is_gated and not is_rejected.any():
             corrections[name] = corrections["pose_graph_all"]
         else:
@@ -370,7 +378,7 @@ def _interpolate_corrections(
         time_s[node_indices[previous_node_indices + 1]]
         - time_s[node_indices[previous_node_indices]]
     )
-    position_by_previous_node_m, position_by_next_node_m = (
+    position_corrected_by_previous_node_m, position_corrected_by_next_node_m = (
         solved_poses[node, :3]
         + node_corrections[node].apply(path.position_m - graph_poses[node, :3])
         for node in (previous_node_indices, previous_node_indices + 1)
@@ -378,7 +386,7 @@ def _interpolate_corrections(
     next_node_weight = np.clip(next_node_fraction, 0.0, 1.0)[:, None]
     position_m = (
         1.0 - next_node_weight
-    ) * position_by_previous_node_m + next_node_weight * position_by_next_node_m
+    ) * position_corrected_by_previous_node_m + next_node_weight * position_corrected_by_next_node_m
     return path.with_positions(position_m, Slerp(time_s[node_indices], node_corrections)(time_s))
 
 
@@ -386,13 +394,13 @@ def score_paths(
     odometry: Trajectory,
     corrected_paths: Mapping[CorrectionName, CorrectionOutcome],
     references: tuple[Trajectory, ...],
-) -> dict[CorrectionName, CorrectedPath | Unavailable]:
+) -> dict[CorrectionName, PathResult | Unavailable]:
     """Compute ATE and RPE of odometry and corrected paths, all with the odometry's time offset."""
-    offset_by_reference: dict[str, float] = {}
+    time_offset_by_reference_s: dict[str, float] = {}
 
     def evaluate_path(path: Trajectory, reference: Trajectory) -> Evaluation | Unavailable:
         default_offset_s = 0.0 if reference.sha256 == path.sha256 else None
-        offset_s = offset_by_reference.get(reference.name, default_offset_s)
+        offset_s = time_offset_by_reference_s.get(reference.name, default_offset_s)
         try:
             return evaluate(path, reference, time_offset_s=offset_s)
         except Px4FuseError as error:
@@ -402,15 +410,13 @@ def score_paths(
                 "Give another reference trajectory with --reference.",
             )
 
-    def score_path(
-        name: CorrectionName, path: Trajectory, solution: Solution | None
-    ) -> CorrectedPath:
+    def score_path(name: CorrectionName, path: Trajectory, solution: Solution | None) -> PathResult:
         displacement_m: Array = np.linalg.norm(path.position_m - odometry.position_m, axis=1)
         solution_fields = {
             field_name: getattr(solution, field_name, None)
             for field_name in ("cost_initial", "cost", "iterations", "converged")
         }
-        return CorrectedPath(
+        return PathResult(
             name=CORRECTION_LABELS[name],
             trajectory=path,
             correction_max_m=float(displacement_m.max()),
@@ -423,16 +429,16 @@ def score_paths(
     uncorrected_path = score_path("uncorrected", odometry, None)
     for name, evaluation in uncorrected_path.scores.items():
         if isinstance(evaluation, Evaluation) and evaluation.time_offset.offset_s is not None:
-            offset_by_reference[name] = evaluation.time_offset.offset_s
-    scored_paths: dict[CorrectionName, CorrectedPath | Unavailable] = {
-        "uncorrected": uncorrected_path
-    }
+            time_offset_by_reference_s[name] = evaluation.time_offset.offset_s
+    scored_paths: dict[CorrectionName, PathResult | Unavailable] = {"uncorrected": uncorrected_path}
     for name, corrected_path in corrected_paths.items():
         if isinstance(corrected_path, Unavailable):
             scored_paths[name] = corrected_path
         elif name == "pose_graph_gated" and corrected_path is corrected_paths["pose_graph_all"]:
-            all_closures_path = scored_paths["pose_graph_all"]
-            scored_paths[name] = structs.replace(all_closures_path, name=CORRECTION_LABELS[name])
+            path_with_all_closures = scored_paths["pose_graph_all"]
+            scored_paths[name] = structs.replace(
+                path_with_all_closures, name=CORRECTION_LABELS[name]
+            )
         else:
             scored_paths[name] = score_path(name, *corrected_path)
     return scored_paths

@@ -10,7 +10,7 @@ from px4fuse.errors import SettingsError, TrajectoryError
 from px4fuse.filter.signals import Segment
 from px4fuse.flight.model import Flight, Unavailable
 from px4fuse.loop.closure import DOWN_DIRECTION, compute_heading_change_rad
-from px4fuse.loop.model import TrueEnd
+from px4fuse.loop.model import TrueFinalPose
 from px4fuse.request import Landing
 from px4fuse.trajectory.model import MIN_POSES, Trajectory, components_by_axis, format_vector
 
@@ -19,15 +19,16 @@ REST_DURATION_S = 1.0
 # Maximum extent (m) of the positions of a vehicle at rest
 MAX_POSITION_EXTENT_AT_REST_M = 0.15
 # Maximum heading change (°) of the odometry for which the true heading change is assumed to be zero
-MAX_SMALL_HEADING_CHANGE_DEG = 15.0
+MAX_HEADING_CHANGE_ASSUMED_ZERO_DEG = 15.0
 
 
 def cut_trajectory(
-    trajectory: Trajectory, segment: Segment, rests_at_ends: bool = False
+    trajectory: Trajectory, segment: Segment, is_at_rest_at_both_ends: bool = False
 ) -> Trajectory:
     """Return the part of a trajectory in a time segment.
 
-    If ``rests_at_ends``, the first and last pose are averages over REST_DURATION_S on the ground.
+    If ``is_at_rest_at_both_ends``, the first and the last pose are averages over REST_DURATION_S on
+    the ground.
 
     Raises
     ------
@@ -42,7 +43,7 @@ def cut_trajectory(
             f"poses between {segment.start_s:.2f} s and {segment.end_s:.2f} s; at least "
             f"{MIN_POSES} are needed"
         )
-    if not rests_at_ends:
+    if not is_at_rest_at_both_ends:
         return segment_track
     position_m = segment_track.position_m.copy()
     quaternions = None if segment_track.rotation is None else segment_track.rotation.as_quat()
@@ -82,22 +83,20 @@ def choose_loop_segment(
     segment_start_s, segment_end_s = track_start_s, track_end_s = trajectory.time_s[
         [0, -1]
     ].tolist()
-    rests_at_ends, flight_span_s = False, None
+    is_at_rest_at_both_ends, flight_span_s = False, None
     if flight is None:
         reason = "the whole trajectory"
     elif isinstance(flight.airborne, Unavailable) or not flight.airborne:
-        reason = "the whole track, because the log has no land detector"
+        reason = "the whole trajectory, because the log contains no detected take-off"
     else:
         take_off_s, landing_s = flight.airborne[0][0], flight.airborne[-1][1]
-        segment_start_s, segment_end_s = (
-            max(segment_start_s, take_off_s),
-            min(segment_end_s, landing_s),
-        )
+        segment_start_s = max(segment_start_s, take_off_s)
+        segment_end_s = min(segment_end_s, landing_s)
         reason = "from take-off to landing, by the land detector"
         if len(flight.airborne) > 1:
             reason = f"from the first take-off to the last of {len(flight.airborne)} landings"
         if start_s is None and end_s is None:
-            rests_at_ends, flight_span_s = True, (take_off_s, landing_s)
+            is_at_rest_at_both_ends, flight_span_s = True, (take_off_s, landing_s)
     if start_s is not None or end_s is not None:
         segment_start_s = segment_start_s if start_s is None else start_s
         segment_end_s = segment_end_s if end_s is None else end_s
@@ -110,8 +109,8 @@ def choose_loop_segment(
             "Change --from or --to.",
         )
     if limited_span_s != (segment_start_s, segment_end_s):
-        reason = f"{reason}, shortened to the times of the poses"
-    return Segment(*limited_span_s, reason, flight_span_s), rests_at_ends
+        reason = f"{reason}; times without poses are omitted"
+    return Segment(*limited_span_s, reason, flight_span_s), is_at_rest_at_both_ends
 
 
 def compute_heading_change_deg(path: Trajectory) -> float | None:
@@ -121,21 +120,21 @@ def compute_heading_change_deg(path: Trajectory) -> float | None:
     return float(np.degrees(compute_heading_change_rad(path.rotation[-1] * path.rotation[0].inv())))
 
 
-def assume_end_at_takeoff(path: Trajectory) -> TrueEnd:
+def assume_landing_at_takeoff(path: Trajectory) -> TrueFinalPose:
     """Assume that the vehicle landed at the take-off place.
 
-    If the odometry's heading change is small, the final heading is assumed equal to the initial
-    heading, else it is unknown.
+    The final heading is assumed equal to the initial heading if the odometry's heading changed by
+    at most MAX_HEADING_CHANGE_ASSUMED_ZERO_DEG. Otherwise, the final heading is unknown.
     """
     odometry_heading_change_deg = compute_heading_change_deg(path)
     is_same_heading = (
         odometry_heading_change_deg is not None
-        and abs(odometry_heading_change_deg) <= MAX_SMALL_HEADING_CHANGE_DEG
+        and abs(odometry_heading_change_deg) <= MAX_HEADING_CHANGE_ASSUMED_ZERO_DEG
     )
-    source = "assumed: landing at the take-off place, final heading unknown"
+    source = "assumption: the vehicle landed at the take-off place with an unknown heading"
     if is_same_heading:
-        source = "assumed: landing at the take-off place with the initial heading"
-    return TrueEnd(
+        source = "assumption: the vehicle landed at the take-off place with the initial heading"
+    return TrueFinalPose(
         displacement_m=components_by_axis(path.frame, np.zeros(3)),
         heading_change_deg=0.0 if is_same_heading else None,
         sigma_m=0.10,
@@ -145,7 +144,7 @@ def assume_end_at_takeoff(path: Trajectory) -> TrueEnd:
     )
 
 
-def convert_measured_end(path: Trajectory, landing: Landing) -> TrueEnd:
+def convert_measured_final_pose(path: Trajectory, landing: Landing) -> TrueFinalPose:
     """Convert the landing place from ``--landed-at`` to the frame of the trajectory."""
     forward_m, right_m, heading_change_deg = structs.astuple(landing)
     heading_rad = 0.0
@@ -155,23 +154,23 @@ def convert_measured_end(path: Trajectory, landing: Landing) -> TrueEnd:
     displacement_m = Rotation.from_rotvec(heading_rad * DOWN_DIRECTION).apply(
         [forward_m, right_m, 0.0]
     )
-    return TrueEnd(
+    return TrueFinalPose(
         displacement_m=components_by_axis(path.frame, displacement_m),
         heading_change_deg=heading_change_deg,
         sigma_m=0.05,
         sigma_heading_deg=None if heading_change_deg is None else 2.0,
-        source=f"measured: landing {format_vector({'forward': forward_m, 'right': right_m})} of "
-        "the take-off place (--landed-at)",
+        source="landing place relative to take-off, measured by the user: "
+        f"{format_vector({'forward': forward_m, 'right': right_m})} (--landed-at)",
         assumed=False,
     )
 
 
-def read_end_from_truth(
-    path: Trajectory, truth: Trajectory, segment: Segment, rests_at_ends: bool
-) -> TrueEnd | str:
+def find_final_pose_in_truth(
+    path: Trajectory, truth: Trajectory, segment: Segment, is_at_rest_at_both_ends: bool
+) -> TrueFinalPose | str:
     """Return the true final pose in the odometry frame, or the reason why it is unknown."""
     try:
-        true_path = cut_trajectory(truth, segment, rests_at_ends)
+        true_path = cut_trajectory(truth, segment, is_at_rest_at_both_ends)
     except TrajectoryError as error:
         return str(error)
     displacement_m = true_path.position_m[-1] - true_path.position_m[0]
@@ -190,7 +189,7 @@ def read_end_from_truth(
             "the ground truth cannot be rotated to the odometry frame, because the odometry or the "
             "ground truth has no orientation"
         )
-    return TrueEnd(
+    return TrueFinalPose(
         displacement_m=components_by_axis(path.frame, displacement_m),
         heading_change_deg=true_heading_change_deg,
         sigma_m=0.02,

@@ -23,7 +23,8 @@ from px4fuse.trajectory.graph.model import PoseGraph
 from px4fuse.trajectory.graph.solver import Solution
 from px4fuse.trajectory.model import AxisComponents, Frame, Trajectory, TrajectoryKind
 
-# Name of a correction of the path; "pose_graph_" is followed by a key of solver.SOLUTION_LABELS
+# Name of a correction of the path. The rest of a name after "pose_graph_" is a key of
+# solver.SOLUTION_LABELS
 CorrectionName = Literal[
     "uncorrected",
     "by_distance_plain",
@@ -36,7 +37,7 @@ CorrectionName = Literal[
 LANDING_CLOSURE_SOURCE = "landing"
 
 
-class TrueEnd(Record, kw_only=True):
+class TrueFinalPose(Record, kw_only=True):
     """True final pose of a path relative to its initial pose.
 
     Attributes
@@ -77,15 +78,15 @@ class OdometryNoise(Record, omit_defaults=False):
     position_m: NotNegative = 1.0
     # σ of the heading after 100 m
     heading_deg: NotNegative = 3.0
-    # Random walk over time (m/√s, °/√s), also while hovering
+    # Drift of position (m/√s) and heading (°/√s) over time, for example while hovering
     position_m_per_root_s: NotNegative = 0.01
     heading_deg_per_root_s: NotNegative = 0.03
-    # Ratio of the drifts of tilt and heading; small, because gravity corrects the tilt
+    # Tilt drift divided by heading drift; small, because gravity corrects the tilt
     tilt_share: NotNegative = 0.1
 
 
 class Closure(Record, kw_only=True):
-    """Loop closure (two times at one place), with the results of gate and robust optimisation."""
+    """Loop closure (two times at one place), and its results in gate and robust optimisation."""
 
     # Two times at which the vehicle was at the same place, on the clock of the trajectory
     time_1_s: float
@@ -101,7 +102,7 @@ class Closure(Record, kw_only=True):
     degrees_of_freedom: Count
     p: Share
     accepted: bool
-    # Weight of robust optimisation, 0 to 1; None with a single closure (no redundancy)
+    # Weight of this closure in robust optimisation, 0 to 1; None if it is the only closure
     weight_gnc: float | None = None
 
     def __str__(self) -> str:
@@ -110,13 +111,14 @@ class Closure(Record, kw_only=True):
         return f"the loop closure between {self.time_1_s:.12g} s and {self.time_2_s:.12g} s"
 
 
-class CorrectedPath(Record, kw_only=True):
+class PathResult(Record, kw_only=True):
     """Corrected path, or uncorrected odometry, with ATE and RPE against each reference."""
 
     # Maximum and RMS distance between corrected and uncorrected positions
     correction_max_m: NotNegative
     correction_rms_m: NotNegative
-    # Cost (initial, final), iterations and convergence of the pose graph; None without pose graph
+    # Cost before and after optimisation of the pose graph, number of iterations, and True if the
+    # optimisation converged; None without a pose graph
     cost_initial: NotNegative | None = None
     cost: NotNegative | None = None
     iterations: Count | None = None
@@ -156,7 +158,7 @@ class Loop(Record, kw_only=True):
     path_length_m: NotNegative
     end_from_start_m: AxisComponents
     heading_change_deg: float | None = None
-    true_end: OrUnavailable[TrueEnd]
+    true_end: OrUnavailable[TrueFinalPose]
     closure_error_m: NotNegative | None = None
     closure_percent: NotNegative | None = None
     closure_error_axes_m: AxisComponents | None = None
@@ -164,7 +166,7 @@ class Loop(Record, kw_only=True):
     is_absolute_track: bool
     odometry_noise: OdometryNoise
     closures: tuple[Closure, ...]
-    corrections: Mapping[CorrectionName, OrUnavailable[CorrectedPath]]
+    corrections: Mapping[CorrectionName, OrUnavailable[PathResult]]
     notes: tuple[str, ...]
     distance_m: NotWritten[Array] = NOT_WRITTEN
     graph: NotWritten[PoseGraph | Unavailable] = NOT_WRITTEN
@@ -173,28 +175,30 @@ class Loop(Record, kw_only=True):
     is_assessed: NotWritten[bool] = False
 
     @property
-    def odometry(self) -> CorrectedPath:
+    def odometry(self) -> PathResult:
         """Odometry from take-off to landing, without correction, in a frame with z down."""
         return self.find_paths()["uncorrected"]
 
-    def find_paths(self) -> dict[CorrectionName, CorrectedPath]:
-        """Return the odometry and the corrected paths that could be computed, by name."""
+    def find_paths(self) -> dict[CorrectionName, PathResult]:
+        """Return uncorrected odometry and all available corrected paths, by name."""
         return {
-            name: path for name, path in self.corrections.items() if isinstance(path, CorrectedPath)
+            name: path for name, path in self.corrections.items() if isinstance(path, PathResult)
         }
 
-    def select_reported_paths(self) -> tuple[CorrectedPath, ...]:
-        """Return the available paths, without those that equal another path by definition."""
+    def select_reported_paths(self) -> tuple[PathResult, ...]:
+        """Return the available paths without duplicates."""
         duplicate_names: set[CorrectionName] = set()
         if all(closure.accepted for closure in self.closures):
-            duplicate_names.add("pose_graph_all")  # without a rejection, equals "pose_graph_gated"
+            # If the gate rejects no closure, this path is equal to "pose_graph_gated"
+            duplicate_names.add("pose_graph_all")
         if isinstance(self.heading_error_deg, Unavailable):
-            duplicate_names.add("by_distance")  # no heading to correct: equals "by_distance_plain"
+            # Without a heading error, this path is equal to "by_distance_plain"
+            duplicate_names.add("by_distance")
         return tuple(
             path for name, path in self.find_paths().items() if name not in duplicate_names
         )
 
-    def choose_best_path(self) -> CorrectedPath:
+    def choose_best_path(self) -> PathResult:
         """Return the most reliable path.
 
         It is the pose graph with closures accepted by the χ² gate, else the path corrected by
@@ -207,7 +211,7 @@ class Loop(Record, kw_only=True):
     @property
     def is_end_assumed(self) -> bool:
         """True if the closure error assumes landing at the take-off place."""
-        return isinstance(self.true_end, TrueEnd) and self.true_end.assumed
+        return isinstance(self.true_end, TrueFinalPose) and self.true_end.assumed
 
     def solved_graph(self) -> PoseGraph:
         """Return the pose graph with all closures and the poses of the best solution.

@@ -125,8 +125,7 @@ def _make_trajectory(
 ) -> Trajectory:
     """Make a trajectory at the times of the positions, with interpolated orientations (slerp)."""
     position_samples = select_valid_rows(position_samples, Columns.POSITION)
-    rotation = None
-    rotation_variance = None
+    rotation = rotation_variance = None
     if isinstance(orientation, pd.DataFrame):
         orientation_times_s = orientation.index.to_numpy()
         covered_samples = position_samples[
@@ -141,11 +140,12 @@ def _make_trajectory(
             rotation = Slerp(orientation_times_s, rotations)(position_samples.index.to_numpy())
             reported_variance = _read_reported_variances(orientation, Columns.ROTATION_VARIANCE)
             if reported_variance is not None:
-                variance_columns = [
-                    np.interp(position_samples.index, orientation_times_s, column)
-                    for column in reported_variance.T
-                ]
-                rotation_variance = np.column_stack(variance_columns)
+                rotation_variance = np.column_stack(
+                    [
+                        np.interp(position_samples.index, orientation_times_s, column)
+                        for column in reported_variance.T
+                    ]
+                )
     if len(position_samples) < MIN_POSES:
         raise MissingDataError(
             f"{flight.log.name}:{track_name} has {len(position_samples)} poses; {MIN_POSES} are "
@@ -238,7 +238,7 @@ def read_source(
             f"{display_name(path)} is a pose graph, not a trajectory.",
             f"Optimise the pose graph with px4fuse loop {display_name(path)}.",
         )
-    if decode_text(file_head) is not None:  # flight logs are binary
+    if decode_text(file_head) is not None:  # A text file is a trajectory: flight logs are binary
         trajectory = read_trajectory(path, track_name)
         return LoopSource(trajectory if frame is None else replace(trajectory, frame=frame), None)
     if frame is not None:

@@ -5,7 +5,7 @@ from collections.abc import Iterator, Mapping
 import numpy as np
 import pandas as pd
 
-from px4fuse.analysis import AidsOnlyAnalysis, Analysis
+from px4fuse.analysis import AidingSourceAnalysis, Analysis
 from px4fuse.core.record import Span
 from px4fuse.core.text import format_number
 from px4fuse.ekf2.aids import AidResult, find_flight_span
@@ -28,7 +28,7 @@ MAX_DRAWN_SIGMAS = 4.0  # larger |ν/√S| are drawn as triangles at the edge of
 OUTDOOR_AIDS = ("gnss_pos", "gnss_vel", "optical_flow", "aux_global_position")
 
 
-def draw_pages(analysis: Analysis | AidsOnlyAnalysis, _: object) -> Iterator[Page]:
+def draw_pages(analysis: Analysis | AidingSourceAnalysis, _: object) -> Iterator[Page]:
     """Draw the page on aiding sources; in a comparison of KF and EKF2 only for outdoor flights."""
     is_comparison = isinstance(analysis, Analysis)
     aids = (

@@ -6,7 +6,7 @@ from px4fuse.analysis import Analysis
 from px4fuse.comparison.model import PreparedComparison
 from px4fuse.comparison.remedy import (
     describe_delay_limit,
-    estimate_delay_if_wrong_ms,
+    estimate_differing_delay_ms,
     find_aid,
     find_logged_delay_ms,
 )
@@ -107,7 +107,7 @@ def _format_delay_advice(
 ) -> str:
     delay_parameter, fitted_delay_ms = (
         find_aid(comparison).delay,
-        estimate_delay_if_wrong_ms(comparison, time_offset, logged_delay_ms),
+        estimate_differing_delay_ms(comparison, time_offset, logged_delay_ms),
     )
     if fitted_delay_ms is None:
         return f"{delay_parameter} {logged_delay_ms:g} ms agrees with the estimated time offset."

@@ -12,7 +12,7 @@ import pandas as pd
 from px4fuse.analysis import Analysis
 from px4fuse.comparison.model import FILTER_NAMES, AxisComparison
 from px4fuse.comparison.trials import (
-    DISCREPANCY_STATISTICS,
+    CONSISTENCY_STATISTICS,
     Statistic,
     Trial,
     find_cause_trial,
@@ -127,7 +127,7 @@ def draw_pages(analysis: Analysis, _: object) -> Iterator[Page]:
 def _write_causes(page: Page, analysis: Analysis) -> None:
     axis = analysis.main.axis
     trial_statistic_pairs: list[tuple[Trial, Statistic]] = []
-    for filter_name, statistic in product(FILTER_NAMES, DISCREPANCY_STATISTICS):
+    for filter_name, statistic in product(FILTER_NAMES, CONSISTENCY_STATISTICS):
         trials = find_trials(analysis.trials, filter_name, axis.name, statistic)
         trial_statistic_pairs += [(trial, statistic) for trial in trials]
         cause = find_cause_trial(trials, filter_name, axis.name, statistic)

@@ -3,7 +3,7 @@
 from collections.abc import Iterator, Sequence
 from typing import Any
 
-from px4fuse.analysis import AidsOnlyAnalysis, Analysis
+from px4fuse.analysis import AidingSourceAnalysis, Analysis
 from px4fuse.card.model import (
     RATIO_AXIS_ENDS,
     RATIO_AXIS_TICKS,
@@ -52,7 +52,7 @@ COMMAND_LOCATIONS = {"shell": "your computer", "console": "MAVLink Console of QG
 ALL_FINDINGS_TITLE = "All findings"
 
 
-def draw_pages(analysis: Analysis | AidsOnlyAnalysis, results: FlightResults) -> Iterator[Page]:
+def draw_pages(analysis: Analysis | AidingSourceAnalysis, results: FlightResults) -> Iterator[Page]:
     """Draw the first page: the diagnosis card, and plots in the space below the card."""
     page = Page()
     block = add_card(page, results.card)

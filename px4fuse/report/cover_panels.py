@@ -188,7 +188,7 @@ def _find_title_height(page: Page, title: str) -> float:
 
 def _make_error_plots(analysis: Analysis, card: Card) -> list[TimePlot]:
     """Return plots of the position errors of KF and EKF2, or of KF - EKF2 without ground truth."""
-    result, effect = analysis.main.with_flight_tracks(), card.effect
+    result, effect = analysis.main.with_whole_flight_tracks(), card.effect
     errors_by_filter = {
         filter_name: errors
         for filter_name in FILTER_NAMES

@@ -87,7 +87,7 @@ class Panel(NamedTuple):
         )
         if is_narrow:
             axes.locator_params(axis="x", nbins=4)
-        self.draw(axes, result.with_flight_tracks())
+        self.draw(axes, result.with_whole_flight_tracks())
         page.write_small_text(statistics_text)
 
 
@@ -278,7 +278,7 @@ def describe_sigma_growth(analysis: Analysis, result: AxisComparison) -> str:
         return ""
     start_s, end_s = max(analysis.events.gaps, key=lambda gap: gap[1] - gap[0])
     sigma_texts = []
-    for name, table in _collect_variance_tables(result.with_flight_tracks()).items():
+    for name, table in _collect_variance_tables(result.with_whole_flight_tracks()).items():
         variance_m2 = table.loc[start_s:end_s, "position_variance_m2"]
         if len(variance_m2) > 1 and np.isfinite(variance_m2.max()):
             sigma_texts.append(f"{np.sqrt(variance_m2.max()):.2g} m ({name})")

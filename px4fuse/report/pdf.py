@@ -69,7 +69,7 @@ def render_pdf(content: Any, results: Any, results_json: str) -> bytes:
 
     Parameters
     ----------
-    content : Analysis, AidsOnlyAnalysis, Loop or Evaluation
+    content : Analysis, AidingSourceAnalysis, Loop or Evaluation
         Source of the figures.
     results : Results
         Results for the texts; their type selects the :data:`PAGE_FUNCTIONS_BY_RESULTS_TYPE`.

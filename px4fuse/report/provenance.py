@@ -3,7 +3,7 @@
 from collections.abc import Iterable, Iterator
 from pathlib import Path
 
-from px4fuse.analysis import AidsOnlyAnalysis, Analysis
+from px4fuse.analysis import AidingSourceAnalysis, Analysis
 from px4fuse.flight.model import Flight, PositionTrack, Unavailable
 from px4fuse.loop.model import Loop
 from px4fuse.report import clock
@@ -17,7 +17,7 @@ from px4fuse.results.contract import LoopResults
 LABEL_WIDTH = 168.0  # width (points) of the labels
 
 
-def draw_pages(analysis: Analysis | AidsOnlyAnalysis, results: FlightResults) -> Iterator[Page]:
+def draw_pages(analysis: Analysis | AidingSourceAnalysis, results: FlightResults) -> Iterator[Page]:
     """Draw two pages of a flight: all detected faults (findings); versions, files and methods."""
     page = Page(ALL_FINDINGS_TITLE)
     write_findings(page, results.findings)

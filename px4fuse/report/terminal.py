@@ -2,7 +2,7 @@
 
 from typing import Any
 
-from px4fuse.analysis import AidsOnlyAnalysis, Analysis
+from px4fuse.analysis import AidingSourceAnalysis, Analysis
 from px4fuse.card.model import Card
 from px4fuse.comparison.model import Comparison
 from px4fuse.core.text import capitalise_first
@@ -25,7 +25,7 @@ ERROR_LEGEND = (
 
 
 def make_comparison_page(
-    analysis: Analysis | AidsOnlyAnalysis,
+    analysis: Analysis | AidingSourceAnalysis,
     results: Any,
     *,
     verbose: bool = False,
@@ -38,7 +38,7 @@ def make_comparison_page(
     page = make_card_page("headline" if quiet else "card", results.card)
     if not verbose:
         return page
-    if isinstance(analysis, AidsOnlyAnalysis):
+    if isinstance(analysis, AidingSourceAnalysis):
         write_aids(page, analysis.aids)
         page.write_heading("Findings")
         write_findings(page, results.findings)

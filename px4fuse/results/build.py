@@ -6,7 +6,7 @@ from typing import Any
 
 import msgspec
 
-from px4fuse.analysis import AidsOnlyAnalysis, Analysis, WhatIfAnalysis
+from px4fuse.analysis import AidingSourceAnalysis, Analysis, WhatIfAnalysis
 from px4fuse.card.build import build_aids_card, build_card
 from px4fuse.comparison.model import PreparedComparison
 from px4fuse.filter.time_offset import ClockOffset
@@ -58,7 +58,9 @@ def results(
 
 
 def make_compare_results(
-    request: ComparisonRequest, outcome: Analysis | AidsOnlyAnalysis, student: Student = NO_STUDENT
+    request: ComparisonRequest,
+    outcome: Analysis | AidingSourceAnalysis,
+    student: Student = NO_STUDENT,
 ) -> contract.ComparisonResults | contract.AidsResults:
     """Return the results of ``px4fuse compare`` for a flight with or without positions."""
     if isinstance(outcome, Analysis):

@@ -139,7 +139,7 @@ def _plot_figures(comparisons: Mapping[str, Comparison]) -> bytes:
         figure = Figure(figsize=(17.0, 3.6 * len(comparisons)), layout="constrained")
         rows = figure.subplots(len(comparisons), 4, squeeze=False)
         for (title, comparison), axes in zip(comparisons.items(), rows, strict=True):
-            result = comparison.main.with_flight_tracks()
+            result = comparison.main.with_whole_flight_tracks()
             axes[0].set_title(f"{title}: innovations along the aisle and ±2√S (m)")
             panels.draw_innovations(axes[0], result)
             for axis, filter_name in zip(axes[1:3], FILTER_NAMES, strict=True):

@@ -23,7 +23,7 @@ from px4fuse.core.text import capitalise_first, format_factor, format_length, on
 from px4fuse.filter.consistency import HorizontalNis
 from px4fuse.filter.time_offset import ClockOffset
 from px4fuse.filter.tuning import HORIZONTAL
-from px4fuse.loop.model import CorrectedPath, CorrectionName, Loop
+from px4fuse.loop.model import CorrectionName, Loop, PathResult
 from px4fuse.results.answer_form import Answers, check_answers
 from px4fuse.results.contract import (
     ESTIMATE_FIELD_BY_SETTING,
@@ -516,7 +516,7 @@ class LoopItem(RubricItem, frozen=True, tag="loop"):
         points_fraction, comment = 0.25, "No loop closure was accepted."
         if is_accepted:
             corrected_paths = map(loop.corrections.get, CORRECTED_PATH_NAMES)
-            is_corrected = any(isinstance(path, CorrectedPath) for path in corrected_paths)
+            is_corrected = any(isinstance(path, PathResult) for path in corrected_paths)
             points_fraction = 1.0 if is_corrected else 0.5
             comment = (
                 "A loop closure was accepted, and the drift of the path was "
