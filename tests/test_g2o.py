@@ -112,18 +112,18 @@ INVALID_TEXTS = {
         "line 2: the line contains a number that",
     ),
     "long": (SPACE.replace("0 0 0 1\nE", "0 0 0 1.7e308\nE"), "line 2: the quaternion does not"),
-    "two FIX": (PLANE + "FIX 0\nFIX 1", "line 5: FIX names a second vertex"),
+    "two FIX": (PLANE + "FIX 0\nFIX 1", "line 5: the file fixes a second vertex"),
     "parts": (
         f"{EDGE}\n{EDGE.replace('0 1', '5 6', 1)}",
         "2 disconnected parts: vertex 5 is not connected",
     ),
     "too small": (
         PLANE.replace(UNIT_2, "1e-51 0 0 1 0 1"),
-        "line 3: the absolute value of an information matrix element",
+        "line 3: an element of the information matrix",
     ),
     "smallest": (
         PLANE.replace(UNIT_2, "1 0 0 5e-324 0 1"),
-        "line 3: the absolute value of an information matrix element",
+        "line 3: an element of the information matrix",
     ),
     "far vertex": (
         PLANE.replace("1 1 0 0\n", "1 1e30 0 0\n"),
@@ -135,7 +135,7 @@ INVALID_TEXTS = {
     ),
     "too large": (
         PLANE.replace(UNIT_2, "1 0 0 1 0 1e51"),
-        "line 3: the absolute value of an information matrix element",
+        "line 3: an element of the information matrix",
     ),
 }
 

@@ -17,7 +17,7 @@ from px4fuse.errors import Px4FuseError, TrajectoryError
 
 _TEXT_FORMATS = read_toml(__file__, dict[str, list[dict[str, Any]]], "formats.toml")
 # Text formats of UWB systems: name, and regular expressions of a position and of the ranges
-STREAM_FORMATS = _TEXT_FORMATS["streams"]
+UWB_TEXT_FORMATS = _TEXT_FORMATS["streams"]
 
 
 def refuse_foreign_format(path: Path, first_bytes: bytes, error_type: type[Px4FuseError]) -> None:
