@@ -37,7 +37,7 @@ def test_parse_g2o_reads_information_as_upper_triangle_by_rows(whole: str, unit:
     expected = np.zeros((size, size))
     expected[upper] = np.arange(len(upper[0])) + 100.0 * (upper[0] == upper[1])
     graph = parse_g2o(whole.replace(unit, " ".join(map(str, expected[upper]))), "a.g2o")
-    assert (graph.dimension, graph.initialised) == (size // 3 + 1, INITIAL_POSES_FROM_FILE)
+    assert (graph.dimension, graph.initial_pose_origin) == (size // 3 + 1, INITIAL_POSES_FROM_FILE)
     np.testing.assert_array_equal(np.triu(graph.information[0]), expected)
     np.testing.assert_array_equal(graph.information[0], graph.information[0].T)
 
@@ -62,7 +62,10 @@ def test_parse_g2o_without_vertices_initialises_poses_from_edges() -> None:
     graph = parse_g2o(f"EDGE_SE2 7 9 1 0 0 {UNIT_2}\nEDGE_SE2 9 12 1 0 1 {UNIT_2}", "a.g2o")
     assert graph.ids.tolist() == [7, 9, 12]
     np.testing.assert_allclose(graph.poses, [[0, 0, 0], [1, 0, 0], [2, 0, 1]], atol=1e-12)
-    assert graph.initialised in {"composition of the odometry edges", "chordal initialisation"}
+    assert graph.initial_pose_origin in {
+        "composition of the odometry edges",
+        "chordal initialisation",
+    }
 
 
 EDGE = f"EDGE_SE2 0 1 1 0 0 {UNIT_2}"
@@ -230,9 +233,9 @@ def test_loop_command_on_g2o_reports_missing_convergence(tmp_path, monkeypatch, 
     path.write_text(far + SQUARE.format(*[UNIT_2] * 4) + f"EDGE_SE2 0 4 0.1 0.1 6.2 {UNIT_2}\n")
     assert "Solver" not in run_main(monkeypatch, capsys, "loop", path)[1]
     monkeypatch.setattr(solver, "_MAX_DAMPING", 0.0)
-    monkeypatch.setattr(solver, "_MIN_GAIN_RATIO", 1e9)
+    monkeypatch.setattr(solver, "_MIN_COST_DECREASE_RATIO", 1e9)
     code, out, _ = run_main(monkeypatch, capsys, "loop", path, "--json", tmp_path / "g.json")
     assert code == 0
-    assert "not converged: pose graph, all closures" in out
+    assert "not converged: pose graph with all loop closures" in out
     solutions = json.loads((tmp_path / "g.json").read_text())["graph"]["solutions"]
     assert not solutions["all"]["converged"]

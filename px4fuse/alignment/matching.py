@@ -15,7 +15,7 @@ from px4fuse.alignment.time_and_pose_fit import (
 )
 from px4fuse.alignment.tracks import EKF2_REFERENCE, IMU_REFERENCE, NoMatchError, SampledTrack
 from px4fuse.flight.model import Flight, Unavailable
-from px4fuse.trajectory.time_offset import GRID_STEP_S, MIN_SECOND_PEAK_RATIO
+from px4fuse.trajectory.time_offset import GRID_STEP_S, MIN_SECOND_BEST_RESIDUAL_RATIO
 
 # Frames to try if the yaw is estimated; without nwu, which is enu rotated by 90°
 ESTIMATED_YAW_FRAMES = ("ned", "enu")
@@ -184,7 +184,7 @@ def needs_rotation(horizontal_rms_m: float, free_yaw_fit: TrackFit, reference: s
 def is_reliable_fit(fit: TrackFit, reference: str) -> bool:
     return (
         fit.concordance >= MIN_RELIABLE_CONCORDANCE[reference]
-        and fit.second_peak_ratio >= MIN_SECOND_PEAK_RATIO
+        and fit.second_peak_ratio >= MIN_SECOND_BEST_RESIDUAL_RATIO
     )
 
 
@@ -198,7 +198,7 @@ def _require_unique_match(match: Match) -> None:
             "is needed)"
         )
     ambiguity_text = ""
-    if fit.second_peak_ratio < MIN_SECOND_PEAK_RATIO:
+    if fit.second_peak_ratio < MIN_SECOND_BEST_RESIDUAL_RATIO:
         ambiguity_text = (
             f"two time offsets that differ by {abs(fit.second_peak_lag_s):.1f} s fit equally well"
         )

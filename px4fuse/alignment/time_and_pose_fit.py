@@ -102,7 +102,7 @@ def find_correlation_peak(
     )
     common_count = track_moments.count
     covariance = track_moments.covariance
-    energy_sum = track_moments.square_sum_a + track_moments.square_sum_b
+    energy_sum = track_moments.sum_of_squares_a + track_moments.sum_of_squares_b
     has_overlap = common_count >= min_sample_count
     # Exclude lags at which both tracks are at rest: their variance is a rounding error
     has_overlap &= energy_sum > 1e-9 * np.max(energy_sum)

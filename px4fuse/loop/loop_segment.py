@@ -12,7 +12,7 @@ from px4fuse.flight.model import Flight, Unavailable
 from px4fuse.loop.closure import DOWN_DIRECTION, compute_heading_change_rad
 from px4fuse.loop.model import TrueEnd
 from px4fuse.request import Landing
-from px4fuse.trajectory.model import MIN_POSES, Trajectory, components_by_axis, format_vector
+from px4fuse.trajectory.model import MIN_POSES, Trajectory, format_vector, split_by_axis
 
 # Time (s) over which poses on the ground are averaged
 REST_DURATION_S = 1.0
@@ -136,7 +136,7 @@ def assume_end_at_takeoff(path: Trajectory) -> TrueEnd:
     if is_same_heading:
         source = "assumed: landing at the take-off place with the initial heading"
     return TrueEnd(
-        displacement_m=components_by_axis(path.frame, np.zeros(3)),
+        displacement_m=split_by_axis(path.frame, np.zeros(3)),
         heading_change_deg=0.0 if is_same_heading else None,
         sigma_m=0.10,
         sigma_heading_deg=5.0 if is_same_heading else None,
@@ -156,7 +156,7 @@ def convert_measured_end(path: Trajectory, landing: Landing) -> TrueEnd:
         [forward_m, right_m, 0.0]
     )
     return TrueEnd(
-        displacement_m=components_by_axis(path.frame, displacement_m),
+        displacement_m=split_by_axis(path.frame, displacement_m),
         heading_change_deg=heading_change_deg,
         sigma_m=0.05,
         sigma_heading_deg=None if heading_change_deg is None else 2.0,
@@ -191,7 +191,7 @@ def read_end_from_truth(
             "ground truth has no orientation"
         )
     return TrueEnd(
-        displacement_m=components_by_axis(path.frame, displacement_m),
+        displacement_m=split_by_axis(path.frame, displacement_m),
         heading_change_deg=true_heading_change_deg,
         sigma_m=0.02,
         sigma_heading_deg=None if true_heading_change_deg is None else 0.5,

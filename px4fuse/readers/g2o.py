@@ -10,7 +10,7 @@ from px4fuse.core.reading import display_name, read_bytes_limited
 from px4fuse.errors import TrajectoryError
 from px4fuse.readers.text_table import TextTableRows, decode_text, make_line_error, quote
 from px4fuse.readers.trajectory import MAX_COORDINATE_M, UNIT_NORM_TOLERANCE
-from px4fuse.trajectory.graph.initialisation import initialise
+from px4fuse.trajectory.graph.initialisation import compute_initial_poses
 from px4fuse.trajectory.graph.model import INITIAL_POSES_FROM_FILE, PoseGraph
 
 MAX_FILE_BYTES = 500_000_000
@@ -108,10 +108,10 @@ def parse_g2o(text: str, name: str) -> PoseGraph:
         information=_make_information_matrices(
             edges, edge_values[:, values_per_pose:], 3 if dimension == 2 else 6
         ),
-        initialised=INITIAL_POSES_FROM_FILE,
+        initial_pose_origin=INITIAL_POSES_FROM_FILE,
     )
     try:
-        return graph if vertices.lines else initialise(graph)
+        return graph if vertices.lines else compute_initial_poses(graph)
     except TrajectoryError as error:
         raise TrajectoryError(f"{name}: {error}") from None
 
