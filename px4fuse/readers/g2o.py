@@ -65,8 +65,11 @@ def parse_g2o(text: str, name: str) -> PoseGraph:
     dimension, pose_type, values_per_pose = (2, "SE2", 3) if is_2d else (3, "SE3:QUAT", 7)
     for tag, rows in rows_by_tag.items():
         if rows.lines and not tag.endswith(pose_type):
-            fault = "the file contains 2D entries (SE2) and 3D entries (SE3)"
-            raise rows.make_row_error(0, fault, "Keep only the 2D or only the 3D entries.")
+            raise rows.make_row_error(
+                0,
+                "the file contains 2D entries (SE2) and 3D entries (SE3)",
+                "Keep only the 2D or only the 3D entries.",
+            )
     vertices = rows_by_tag[f"VERTEX_{pose_type}"]
     edges = rows_by_tag[f"EDGE_{pose_type}"]
     if not edges.lines:
@@ -218,8 +221,7 @@ def _make_information_matrices(edges: TextTableRows, numbers: Array, dimension: 
     edges.raise_where(
         is_too_small | (magnitudes > _MAX_INFORMATION_ELEMENT),
         "an element of the information matrix of this edge is too large or too close to 0",
-        "Give 0, or an element with an absolute value from "
-        f"{_MIN_INFORMATION_ELEMENT:g} to {_MAX_INFORMATION_ELEMENT:g}.",
+        f"Give 0, or ±{_MIN_INFORMATION_ELEMENT:g} to ±{_MAX_INFORMATION_ELEMENT:g}.",
     )
     eigenvalues = np.linalg.eigvalsh(matrices)
     edges.raise_where(

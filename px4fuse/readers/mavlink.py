@@ -164,8 +164,11 @@ def _read_ekf2(
     samples = recording.read(layout)
     state = samples[Columns.STATE].dropna()
     if len(state) < 2:
-        reason = f"{message_name} contains no finite EKF2 state"
-        return Unavailable("EKF2", reason, "Start the recording after EKF2 has started.")
+        return Unavailable(
+            "EKF2",
+            f"{message_name} contains no finite EKF2 state",
+            "Start the recording after EKF2 has started.",
+        )
     recording.record_stream("ekf2_state", message_name)
     notes = [f"the EKF2 state is from the autopilot's {message_name} messages"]
     if autopilot != "PX4":

@@ -224,8 +224,7 @@ def read_truth(
         samples = samples.dropna(subset=Columns.GEODETIC[:2])
         if not samples["latitude_deg"].any():
             continue
-        columns = Columns.GEODETIC + Columns.VELOCITY + Columns.QUATERNION
-        samples = samples.reindex(columns=columns)
+        samples = samples.reindex(columns=Columns.GEODETIC + Columns.VELOCITY + Columns.QUATERNION)
         if not samples[Columns.VELOCITY].to_numpy().any():
             # Velocities that are zero in all samples were not sent
             samples[Columns.VELOCITY] = np.nan

@@ -84,16 +84,14 @@ def choose_autopilot(frames: MavlinkFrames, system_id: int | None) -> tuple[Mavl
         [address for address in vehicle_addresses if address in message_count_by_autopilot]
         or [address for address in message_count_by_autopilot if address not in vehicle_types]
         or vehicle_addresses
+        or [
+            address
+            for address in frame_count_by_address
+            if address[1] == messages.AUTOPILOT_COMPONENT_ID
+        ]
+        # If no message is from an autopilot, assume that each system has one that sent nothing
+        or [(address[0], messages.AUTOPILOT_COMPONENT_ID) for address in frame_count_by_address]
     )
-    candidates = candidates or [
-        address
-        for address in frame_count_by_address
-        if address[1] == messages.AUTOPILOT_COMPONENT_ID
-    ]
-    # If no message is from an autopilot, assume that each system has one that sent nothing
-    candidates = candidates or [
-        (address[0], messages.AUTOPILOT_COMPONENT_ID) for address in frame_count_by_address
-    ]
     if system_id is not None:
         candidates = [
             address for address in {*vehicle_addresses, *candidates} if address[0] == system_id
@@ -234,7 +232,7 @@ def describe_clock_conversions(
 def describe_senders(recording: Recording) -> tuple[Sender, ...]:
     """Describe the senders in the recording, most messages first."""
     frames = recording.frames
-    vehicle_types = _read_vehicle_types(recording.frames)
+    vehicle_types = _read_vehicle_types(frames)
     sender_descriptions = []
     for address, count in _count_frames(frames)[:MAX_SENDERS]:
         description = "component that sent no HEARTBEAT"

@@ -91,10 +91,9 @@ def read_column_name(name: str) -> ColumnMeaning:
         and word_set <= _TIME_WORDS
         and unit not in METRES_BY_LENGTH_UNIT
     ):
-        time_kind = TIME_KINDS[2 if word_set & _WORDS_BY_ROLE["recorded"] else 1]
-        if word_set & _WORDS_BY_ROLE["measured"]:
-            time_kind = TIME_KINDS[0]
-        return ColumnMeaning("time", unit=unit, time_kind=time_kind)
+        rank = 2 if word_set & _WORDS_BY_ROLE["recorded"] else 1
+        rank = 0 if word_set & _WORDS_BY_ROLE["measured"] else rank
+        return ColumnMeaning("time", unit=unit, time_kind=TIME_KINDS[rank])
     if word_set and word_set <= _WORDS_BY_ROLE["tag"]:
         return ColumnMeaning("tag")
     sigma_and_context_words = _WORDS_BY_ROLE["sigma"] | _WORDS_BY_ROLE["context"]

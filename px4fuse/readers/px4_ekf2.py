@@ -117,8 +117,7 @@ def read_ekf2(topics: Topics) -> Ekf2 | Unavailable:
         for log in (aids[name] for name in ("ev_pos", "ev_hgt") if name in aids)
         if log.excluded_sample_count
     ]
-    status_flags = dict(enabled_aids)
-    status_flags |= {
+    status_flags = enabled_aids | {
         name: local_position[name] for name in VALIDITY_FLAGS if name in local_position
     }
     failed_gnss_checks = topics.primary_samples(
@@ -466,12 +465,9 @@ def _read_optical_flow(topics: Topics, enabled_aids: StepFunctions) -> pd.DataFr
         / (1.0 - previous_output_weight)
     ).T
     flow_velocity = flow_velocity.iloc[used_rows]
-    newest_velocity_columns, rate_columns = (
-        ["newest_forward_m_s", "newest_right_m_s"],
-        ["x_rad_s", "y_rad_s"],
-    )
-    squared_ground_distance_m2 = (flow_velocity[newest_velocity_columns] ** 2).sum(axis=1) / (
-        flow_velocity[rate_columns] ** 2
+    newest_velocity = flow_velocity[["newest_forward_m_s", "newest_right_m_s"]]
+    squared_ground_distance_m2 = (newest_velocity**2).sum(axis=1) / (
+        flow_velocity[["x_rad_s", "y_rad_s"]] ** 2
     ).sum(axis=1)
     flow = pd.DataFrame(
         {

@@ -48,8 +48,8 @@ def read_unlogged_fixes(
         return pd.DataFrame()
     position, velocity = map(topics.primary_samples, position_and_velocity_layouts)
     # Rows of EKF2's GNSS topic that are neither fused nor rejected contain no new fix
-    is_fix = position[["fused", "rejected"]].any(axis=1)
-    position = position.loc[is_fix].drop(columns=["fused", "rejected"])
+    position = position[position[["fused", "rejected"]].any(axis=1)]
+    position = position.drop(columns=["fused", "rejected"])
     fixes = position.join(velocity, how="inner").dropna()
     # Use the height of EKF2's topic only if GNSS is the height reference. Otherwise, the height
     # contains EKF2's estimate of the GNSS height bias

@@ -212,8 +212,7 @@ def _read_logged_track(topics: Topics, name: str) -> PositionTrack | Unavailable
     orientation = read_orientation(samples)
     instance_count = len(topics.instances(layout.topic))
     note = (
-        f"{instance_count} programs publish {layout.topic}. px4fuse and EKF2 use only the first "
-        "program (instance 0)."
+        f"{instance_count} programs publish {layout.topic}. px4fuse and EKF2 use only instance 0."
     )
     return _make_ulog_track(
         topics,
@@ -559,10 +558,8 @@ def read_truth(
     truth is shifted from the origin of the simulation to EKF2's origin.
     """
     attitude = read_attitude(topics.read(px4.TOPIC_LAYOUTS["truth_attitude"]))
-    local_layout, global_layout = (
-        px4.TOPIC_LAYOUTS["truth_local"],
-        px4.TOPIC_LAYOUTS["truth_global"],
-    )
+    local_layout = px4.TOPIC_LAYOUTS["truth_local"]
+    global_layout = px4.TOPIC_LAYOUTS["truth_global"]
     logged_local_samples = topics.read(local_layout)
     local_samples = select_valid_rows(logged_local_samples, logged_local_samples.columns.tolist())
     global_positions = select_valid_rows(topics.read(global_layout), Columns.GEODETIC[:2])

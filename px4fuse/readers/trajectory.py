@@ -102,7 +102,6 @@ def read_trajectory(path: str | Path, body: str | None = None) -> Trajectory:
     frame, frame_note = _detect_frame(kind, position_m)
     time_s = samples.index.to_numpy()
     notes = (*recording.format_detection_notes, *recording.notes)
-    more_notes = (kind_note, frame_note, _describe_gaps(time_s))
     return Trajectory(
         name=name,
         kind=kind,
@@ -115,7 +114,7 @@ def read_trajectory(path: str | Path, body: str | None = None) -> Trajectory:
         size_bytes=recording.size_bytes,
         notes=(
             *(f"{note[0].upper()}{note[1:]}." for note in notes),
-            *(note for note in more_notes if note),
+            *filter(None, (kind_note, frame_note, _describe_gaps(time_s))),
         ),
     )
 

@@ -162,8 +162,9 @@ def _interpolate_poses(trajectory: Trajectory, time_s: Array) -> Trajectory:
 
 def interpolate_positions(trajectory: Trajectory, time_s: Array) -> Array:
     """Interpolate the positions at times within the trajectory, shape (n, 3)."""
-    columns = trajectory.position_m.T
-    return np.stack([np.interp(time_s, trajectory.time_s, column) for column in columns], axis=-1)
+    return np.stack(
+        [np.interp(time_s, trajectory.time_s, column) for column in trajectory.position_m.T], -1
+    )
 
 
 def _pair_nearest(

@@ -49,10 +49,9 @@ def compute_moments(
         Mask of known samples, at least one per series.
     """
     # The means are subtracted first, which improves the numerical precision
-    masked_series = (a, is_known_a), (b, is_known_b)
     a, b = (
         np.where(is_known, values - np.mean(values[is_known]), 0.0)
-        for values, is_known in masked_series
+        for values, is_known in ((a, is_known_a), (b, is_known_b))
     )
     mask_a = is_known_a.astype(float)
     mask_b = is_known_b.astype(float)

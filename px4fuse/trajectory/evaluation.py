@@ -476,10 +476,9 @@ def _find_better_offset_warnings(
 ) -> list[str]:
     """Warn if a better time offset reduces the ATE for nearly the same number of poses."""
     try:
-        better_evaluation = evaluate_with_offset(time_offset_s=better_offset_s)
+        better_statistics = evaluate_with_offset(time_offset_s=better_offset_s).ate.translation_m
     except TrajectoryError:  # with this offset, too few poses match or have motion for an alignment
         return []
-    better_statistics = better_evaluation.ate.translation_m
     if (
         better_statistics.rmse > MAX_ATE_RATIO_OF_BETTER_OFFSET * statistics.rmse
         or better_statistics.count < MIN_POSE_COUNT_RATIO_OF_BETTER_OFFSET * statistics.count

@@ -275,8 +275,8 @@ def _find_elimination_order(
     first_pose_anchor_matrix = sparse.csc_array(([1.0], ([0], [0])), shape=(pose_count, pose_count))
     lu_factors = splu(
         (incidence_matrix.T @ incidence_matrix + first_pose_anchor_matrix).tocsc(),
-        # With this order, the factor has 1.1 to 1.9 times fewer nonzeros than with the default COLAMD,
-        # on public benchmark graphs
+        # With this order, the factor has 1.1 to 1.9 times fewer nonzeros than with the default
+        # COLAMD, on public benchmark graphs
         permc_spec="MMD_AT_PLUS_A",
         diag_pivot_thresh=0.0,
         # SuperLU does not merge columns, because the merged columns would store zeros
@@ -289,11 +289,10 @@ def _find_elimination_order(
     # elimination changes: the row of the first nonzero below the diagonal
     parent = sparsity_pattern.indices[sparsity_pattern.indptr[:-2] + 1]
     last_pose = pose_count - 1
-    elimination_tree_entries = (
-        nonzero_counts[:-1],
-        (last_pose - parent, last_pose - np.arange(last_pose)),
+    tree = sparse.csr_array(
+        (nonzero_counts[:-1], (last_pose - parent, last_pose - np.arange(last_pose))),
+        shape=first_pose_anchor_matrix.shape,
     )
-    tree = sparse.csr_array(elimination_tree_entries, shape=first_pose_anchor_matrix.shape)
     elimination_order = last_pose - depth_first_order(tree, 0, return_predecessors=False)[::-1]
     position = np.argsort(elimination_order)
     nonzero_counts = nonzero_counts[elimination_order]
