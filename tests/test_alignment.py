@@ -91,7 +91,7 @@ def position_file(
     return PositionRecording(
         name="uwb.csv", sha256="f" * 64, size_bytes=1234, clock_kind="UNIX",
         frames=(frame,) if frame else (),
-        samples=table(time_s, values, SAMPLE_COLUMNS), detection_notes=("time: column 1",),
+        samples=table(time_s, values, SAMPLE_COLUMNS), format_detection_notes=("time: column 1",),
         notes=("two rows dropped",),
     )  # fmt: skip
 

@@ -38,7 +38,7 @@ from px4fuse.request import ComparisonRequest
 from px4fuse.simulation.faults import parse_faults
 from px4fuse.simulation.flights import simulate_flight
 from px4fuse.simulation.scenario import Scenario
-from px4fuse.trajectory.rotation import from_vector, interpolate, multiply
+from px4fuse.trajectory.rotation import from_rotation_vector, interpolate, multiply
 
 UNIT_VECTORS = {
     "north": (1, 0, 0), "south": (-1, 0, 0), "east": (0, 1, 0), "west": (0, -1, 0),
@@ -115,12 +115,12 @@ def oriented(flight: Flight, seed: int = 1) -> tuple[np.ndarray, np.ndarray]:
     """Return times and attitudes, FRD to NED, with noise of 0.3°."""
     attitude = flight.attitude[Columns.QUATERNION].iloc[::5]
     rng = np.random.default_rng(seed)
-    noise = from_vector(np.radians(rng.normal(0.0, 0.3, (len(attitude), 3))))
+    noise = from_rotation_vector(np.radians(rng.normal(0.0, 0.3, (len(attitude), 3))))
     return attitude.index.to_numpy(), multiply(attitude.to_numpy(), noise)
 
 
 def yaw(degrees: float) -> np.ndarray:
-    return from_vector(np.array([0.0, 0.0, np.radians(degrees)]))
+    return from_rotation_vector(np.array([0.0, 0.0, np.radians(degrees)]))
 
 
 def assert_found(convention: Convention, **expected: object) -> None:

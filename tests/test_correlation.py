@@ -5,7 +5,7 @@ import pytest
 from scipy.stats import f
 
 from px4fuse.trajectory.correlation import autocovariance, compute_moments
-from px4fuse.trajectory.time_offset import MIN_SECOND_PEAK_RATIO
+from px4fuse.trajectory.time_offset import MIN_SECOND_BEST_RESIDUAL_RATIO
 
 
 @pytest.mark.parametrize("is_complex", [False, True])
@@ -25,8 +25,8 @@ def test_cross_correlation_equals_direct_sum_at_each_lag(is_complex: bool) -> No
         x, y = a[both], b[[i + lag for i in both]]
         x, y = (v - v.mean() if len(v) else v for v in (x, y))
         np.testing.assert_allclose(found.covariance[k], np.sum(x.conj() * y), atol=1e-10)
-        np.testing.assert_allclose(found.square_sum_a[k], np.sum(np.abs(x) ** 2), atol=1e-10)
-        np.testing.assert_allclose(found.square_sum_b[k], np.sum(np.abs(y) ** 2), atol=1e-10)
+        np.testing.assert_allclose(found.sum_of_squares_a[k], np.sum(np.abs(x) ** 2), atol=1e-10)
+        np.testing.assert_allclose(found.sum_of_squares_b[k], np.sum(np.abs(y) ** 2), atol=1e-10)
 
 
 def test_autocovariance_equals_sum_of_products() -> None:
@@ -36,4 +36,4 @@ def test_autocovariance_equals_sum_of_products() -> None:
 
 
 def test_min_second_peak_ratio_equals_95_percent_f_quantile() -> None:
-    assert pytest.approx(0.05, abs=0.005) == f.sf(MIN_SECOND_PEAK_RATIO**2, 80, 80)
+    assert pytest.approx(0.05, abs=0.005) == f.sf(MIN_SECOND_BEST_RESIDUAL_RATIO**2, 80, 80)

@@ -24,10 +24,10 @@ from px4fuse.report.page import Page
 from px4fuse.report.style import apply_report_style
 from px4fuse.trajectory.evaluation import Evaluation, evaluate
 from px4fuse.trajectory.model import Trajectory
-from px4fuse.trajectory.scores import Delta
+from px4fuse.trajectory.scores import RpePairDistance
 
 LOOP = REPOSITORY / "sample_logs" / "loop_vio.ulg"
-DELTAS = (Delta(1.0, "m"), Delta(10.0, "m"))
+DELTAS = (RpePairDistance(1.0, "m"), RpePairDistance(10.0, "m"))
 
 
 @cache

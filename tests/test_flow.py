@@ -17,7 +17,7 @@ from px4fuse.ekf2.replay_segments import VELOCITY
 from px4fuse.ekf2.whatif import what_if
 from px4fuse.flight.model import Columns, Flight, Reset
 from px4fuse.readers import read_log
-from px4fuse.readers.px4_innovations import with_gnss_innovations
+from px4fuse.readers.px4_innovations import replace_vision_by_gnss_innovations
 from px4fuse.simulation.faults import parse_faults
 from px4fuse.simulation.flights import simulate_flight
 from px4fuse.simulation.scenario import make_scenario
@@ -192,9 +192,13 @@ def test_read_gnss_omits_fixes_while_fusion_is_disabled():
     ekf2 = flight.ekf2
     enabled = pd.Series([1.0, 0.0, 1.0], index=[0.0, 50.0, 60.0])
     aids = {**ekf2.aids, "gnss_pos": replace(ekf2.aids["gnss_pos"], enabled=enabled)}
-    found = read_gnss(flight, with_gnss_innovations(replace(ekf2, aids=aids)), ekf2.record)
+    found = read_gnss(
+        flight, replace_vision_by_gnss_innovations(replace(ekf2, aids=aids)), ekf2.record
+    )
     aids["gnss_pos"] = replace(ekf2.aids["gnss_pos"], enabled=None)
-    every = read_gnss(flight, with_gnss_innovations(replace(ekf2, aids=aids)), ekf2.record)
+    every = read_gnss(
+        flight, replace_vision_by_gnss_innovations(replace(ekf2, aids=aids)), ekf2.record
+    )
     delay_s = ekf2.record.parameters["EKF2_GPS_DELAY"] * 1e-3
     measured_s = every.timestamp_s - delay_s  # type: ignore[union-attr]
     remaining = (measured_s < 50.0) | (measured_s >= 60.0)

@@ -37,7 +37,7 @@ def test_parse_g2o_reads_information_as_upper_triangle_by_rows(whole: str, unit:
     expected = np.zeros((size, size))
     expected[upper] = np.arange(len(upper[0])) + 100.0 * (upper[0] == upper[1])
     graph = parse_g2o(whole.replace(unit, " ".join(map(str, expected[upper]))), "a.g2o")
-    assert (graph.dimension, graph.initialised) == (size // 3 + 1, INITIAL_POSES_FROM_FILE)
+    assert (graph.dimension, graph.initial_pose_origin) == (size // 3 + 1, INITIAL_POSES_FROM_FILE)
     np.testing.assert_array_equal(np.triu(graph.information[0]), expected)
     np.testing.assert_array_equal(graph.information[0], graph.information[0].T)
 
@@ -62,7 +62,10 @@ def test_parse_g2o_without_vertices_initialises_poses_from_edges() -> None:
     graph = parse_g2o(f"EDGE_SE2 7 9 1 0 0 {UNIT_2}\nEDGE_SE2 9 12 1 0 1 {UNIT_2}", "a.g2o")
     assert graph.ids.tolist() == [7, 9, 12]
     np.testing.assert_allclose(graph.poses, [[0, 0, 0], [1, 0, 0], [2, 0, 1]], atol=1e-12)
-    assert graph.initialised in {"composition of the odometry edges", "chordal initialisation"}
+    assert graph.initial_pose_origin in {
+        "composition of the odometry edges",
+        "chordal initialisation",
+    }
 
 
 EDGE = f"EDGE_SE2 0 1 1 0 0 {UNIT_2}"
@@ -112,18 +115,18 @@ INVALID_TEXTS = {
         "line 2: the line contains a number that",
     ),
     "long": (SPACE.replace("0 0 0 1\nE", "0 0 0 1.7e308\nE"), "line 2: the quaternion does not"),
-    "two FIX": (PLANE + "FIX 0\nFIX 1", "line 5: FIX names a second vertex"),
+    "two FIX": (PLANE + "FIX 0\nFIX 1", "line 5: the file fixes a second vertex"),
     "parts": (
         f"{EDGE}\n{EDGE.replace('0 1', '5 6', 1)}",
         "2 disconnected parts: vertex 5 is not connected",
     ),
     "too small": (
         PLANE.replace(UNIT_2, "1e-51 0 0 1 0 1"),
-        "line 3: the absolute value of an information matrix element",
+        "line 3: an element of the information matrix",
     ),
     "smallest": (
         PLANE.replace(UNIT_2, "1 0 0 5e-324 0 1"),
-        "line 3: the absolute value of an information matrix element",
+        "line 3: an element of the information matrix",
     ),
     "far vertex": (
         PLANE.replace("1 1 0 0\n", "1 1e30 0 0\n"),
@@ -135,7 +138,7 @@ INVALID_TEXTS = {
     ),
     "too large": (
         PLANE.replace(UNIT_2, "1 0 0 1 0 1e51"),
-        "line 3: the absolute value of an information matrix element",
+        "line 3: an element of the information matrix",
     ),
 }
 
@@ -230,9 +233,9 @@ def test_loop_command_on_g2o_reports_missing_convergence(tmp_path, monkeypatch, 
     path.write_text(far + SQUARE.format(*[UNIT_2] * 4) + f"EDGE_SE2 0 4 0.1 0.1 6.2 {UNIT_2}\n")
     assert "Solver" not in run_main(monkeypatch, capsys, "loop", path)[1]
     monkeypatch.setattr(solver, "_MAX_DAMPING", 0.0)
-    monkeypatch.setattr(solver, "_MIN_GAIN_RATIO", 1e9)
+    monkeypatch.setattr(solver, "_MIN_COST_DECREASE_RATIO", 1e9)
     code, out, _ = run_main(monkeypatch, capsys, "loop", path, "--json", tmp_path / "g.json")
     assert code == 0
-    assert "not converged: pose graph, all closures" in out
+    assert "not converged: pose graph with all loop closures" in out
     solutions = json.loads((tmp_path / "g.json").read_text())["graph"]["solutions"]
     assert not solutions["all"]["converged"]

@@ -63,7 +63,7 @@ class TestTangents:
         x, xi = lie.exp(tangents(dimension, angle)), tangents(dimension, 0.7)
         moved = (lie.adjoint(x) @ xi[..., None])[..., 0]
         left, right = lie.compose(x, lie.exp(xi)), lie.compose(lie.exp(moved), x)
-        np.testing.assert_allclose(lie.log(lie.between(left, right)), 0.0, atol=1e-12)
+        np.testing.assert_allclose(lie.log(lie.relative_pose(left, right)), 0.0, atol=1e-12)
 
 
 def test_lie_group_log_of_half_turn_has_angle_pi() -> None:
@@ -78,7 +78,7 @@ def test_lie_group_log_of_half_turn_has_angle_pi() -> None:
 @pytest.mark.parametrize("count", [0, 1, 2, 7, 64, 65])
 def test_chained_poses_equal_running_matrix_product(dimension: int, count: int) -> None:
     steps = lie.exp(tangents(dimension, 0.4, count))
-    made = lie.chain(steps)
+    made = lie.accumulate_poses(steps)
     expected = np.eye(dimension + 1)
     assert len(made) == count + 1
     np.testing.assert_array_equal(homogeneous(made[0]), expected)
@@ -102,5 +102,5 @@ def test_pose_composition_and_inverse_satisfy_group_axioms(
     np.testing.assert_allclose(homogeneous(left), homogeneous(right), atol=1e-11)
     none = homogeneous(lie.compose(a, lie.inverse(a)))
     np.testing.assert_allclose(none, np.eye(dimension + 1), atol=1e-11)
-    between, composed = lie.between(a, b), lie.compose(lie.inverse(a), b)
+    between, composed = lie.relative_pose(a, b), lie.compose(lie.inverse(a), b)
     np.testing.assert_allclose(homogeneous(between), homogeneous(composed), atol=1e-11)

@@ -30,7 +30,7 @@ from mavlink_tools import (
 from px4fuse.errors import SettingsError
 from px4fuse.flight.model import Flight, sample_rate
 from px4fuse.readers import read_log
-from px4fuse.readers.mavlink_clocks import ClockLine, fit_clock_line, map_clock
+from px4fuse.readers.mavlink_clocks import ClockLine, fit_clock_line, map_clock_to_boot
 
 EMPTY = np.zeros(0)
 NO_EXCHANGES = (EMPTY, EMPTY), (EMPTY, EMPTY)
@@ -69,7 +69,7 @@ def test_mavlink_clock_fit_with_random_delay_recovers_offset(offset, drift_ppm, 
 def test_mavlink_clock_fit_of_messages_without_delay_is_exact(span, slope):
     x = np.linspace(0.0, span, 500)
     line = fit_clock_line(x, 7.0 + 1.00005 * x)
-    assert (line.pair_count, line.slope) == (500, pytest.approx(slope, abs=1e-12))
+    assert (line.reading_pair_count, line.slope) == (500, pytest.approx(slope, abs=1e-12))
     np.testing.assert_allclose(line.at(x), 7.0 + 1.00005 * x, atol=1e-9 if span > 30 else 1e-3)
     np.testing.assert_allclose(line.inverse().at(line.at(x)), x, atol=1e-9)
     assert line.jitter_s < 1e-3
@@ -135,7 +135,10 @@ METHODS = {
         (Aisle(clock=lambda boot: boot + 2 * HOUR_S, replies=False), "receive time", "clock of",
          (-1.5 * WAY_S, 1.5 * WAY_S)),
 }  # fmt: skip
-NOTES = {"SYSTEM_TIME": "UNIX clocks of sender and autopilot", "receive time": "minimum link delay"}
+NOTES = {
+    "SYSTEM_TIME": "UNIX clocks of sender and autopilot",
+    "receive time": "minimum delay of the link",
+}
 
 
 @pytest.mark.parametrize("case", METHODS)
@@ -411,7 +414,9 @@ def map_unix_timestamps(received, *exchanges):
     """Return UNIX timestamps at 10 Hz and their clock map for given receive times."""
     stamps = UNIX_S + 0.1 * np.arange(len(received))
     line = ClockLine(0.0, 0.0, 1.0, 0.0, 9)
-    return stamps, map_clock("x", stamps, received, line, *exchanges, None, has_receive_times=True)
+    return stamps, map_clock_to_boot(
+        "x", stamps, received, line, *exchanges, None, has_receive_times=True
+    )
 
 
 def test_timesync_one_hour_after_receive_times_is_ignored():

@@ -245,7 +245,7 @@ def test_read_mavlink_counts_unknown_frames_and_bad_bytes(
     frames = read(stamped(*parts) if with_stamps else b"".join(parts))
     assert frames.sequence_numbers.tolist() == [*good]
     assert frames.unknown_frame_count == unknown_frame_count
-    assert frames.bad_byte_count == bad * (len(BEATS[4]) + 8 * with_stamps)
+    assert frames.byte_count_outside_frames == bad * (len(BEATS[4]) + 8 * with_stamps)
 
 
 @pytest.mark.parametrize(("share", "is_stated"), [(0.002, False), (0.005, True)])
@@ -276,7 +276,7 @@ def test_truncated_mavlink_recording_is_reported_as_damage(tmp_path, stamped: bo
 @pytest.mark.parametrize("rest", [b"\x00" * 50, raw_frame(40_000, b"abcdefg", seed=7)])
 def test_complete_mavlink_recording_is_not_reported_truncated(read, rest: bytes):
     """Invalid bytes and a complete frame of an unknown dialect are not a truncated frame."""
-    assert not read(b"".join(beats(6)) + rest).ends_in_frame
+    assert not read(b"".join(beats(6)) + rest).is_last_frame_incomplete
 
 
 @pytest.mark.parametrize("junk", JUNK.values(), ids=JUNK)
@@ -284,7 +284,7 @@ def test_invalid_bytes_between_mavlink_frames_are_skipped(read, junk):
     parts = beats(6)
     frames = read(b"".join(parts[:3]) + junk + b"".join(parts[3:]))
     assert frames.sequence_numbers.tolist() == list(range(6))
-    assert frames.bad_byte_count == len(junk)
+    assert frames.byte_count_outside_frames == len(junk)
 
 
 def test_tlog_receive_time_is_not_read_as_start_of_a_frame(read):
@@ -298,7 +298,7 @@ def test_tlog_receive_time_is_not_read_as_start_of_a_frame(read):
     parts[3] = stamp(START_US)[:3] + b"\xfe" + body[:4] + true
     frames = read(b"".join(parts))
     assert names(frames) == ["HEARTBEAT"] * 3 + ["ATTITUDE"] + ["HEARTBEAT"] * 2
-    assert frames.bad_byte_count == 0
+    assert frames.byte_count_outside_frames == 0
 
 
 @pytest.mark.parametrize("with_stamps", [True, False])
@@ -311,7 +311,7 @@ def test_mavlink_frame_inside_payload_is_ignored(read, with_stamps):
     parts = [*beats(2), frame(outer), *beats(2), frame(filled), *beats(2)]
     frames = read(stamped(*parts) if with_stamps else b"".join(parts))
     assert Counter(names(frames)) == {"HEARTBEAT": 6, "TUNNEL": 2}
-    assert frames.bad_byte_count == 0
+    assert frames.byte_count_outside_frames == 0
     carried = decoded(frames, "TUNNEL")["payload"][0]
     assert bytes(carried[: len(inner)]) == inner
 
@@ -322,7 +322,7 @@ def test_incomplete_first_and_last_mavlink_frame_are_dropped(read):
     for cut in (1, 5, len(parts[0]) - 1):
         frames = read(whole[cut : len(whole) - cut])
         assert frames.sequence_numbers.tolist() == [1, 2, 3]
-        assert frames.bad_byte_count == 2 * (len(parts[0]) - cut)
+        assert frames.byte_count_outside_frames == 2 * (len(parts[0]) - cut)
     tlog = stamped(*parts)
     for cut in (3, 8, 12):
         frames = read(tlog[cut : len(tlog) - cut])
@@ -348,7 +348,7 @@ def test_mavlink_file_of_a_single_message_is_read(read, with_stamps):
     frames = read(stamped(content) if with_stamps else content)
     assert len(frames) == 1
     assert (frames.receive_times_us is not None) == with_stamps
-    assert frames.bad_byte_count == 0
+    assert frames.byte_count_outside_frames == 0
 
 
 @given(st.lists(st.sampled_from(["v1", "v2", "signed", "unknown", "bad", "junk"]), min_size=1))

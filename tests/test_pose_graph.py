@@ -16,7 +16,7 @@ from px4fuse.errors import TrajectoryError
 from px4fuse.readers.g2o import parse_g2o, read_g2o
 from px4fuse.trajectory.graph import lie
 from px4fuse.trajectory.graph.covariance import gate_edges
-from px4fuse.trajectory.graph.initialisation import _initialise_chordal, initialise
+from px4fuse.trajectory.graph.initialisation import _compute_chordal_poses, compute_initial_poses
 from px4fuse.trajectory.graph.model import (
     INITIAL_POSES_FROM_CHORDAL,
     INITIAL_POSES_FROM_ODOMETRY,
@@ -56,10 +56,10 @@ def noisy_graph(dimension: int, seed: int, poses: int = 30, sigma: float = 0.05)
     """Make a random walk with closures and measurement noise; poses from odometry."""
     rng = np.random.default_rng(seed)
     free = TANGENT[dimension]
-    truth = lie.chain(lie.exp(rng.normal(size=(poses - 1, free)) * 0.7))
+    truth = lie.accumulate_poses(lie.exp(rng.normal(size=(poses - 1, free)) * 0.7))
     first = np.concatenate([np.arange(poses - 1), rng.integers(0, poses - 5, 15)])
     second = np.concatenate([np.arange(1, poses), first[poses - 1 :] + rng.integers(2, 6, 15)])
-    exact = lie.between(truth[first], truth[second])
+    exact = lie.relative_pose(truth[first], truth[second])
     measured = lie.compose(exact, lie.exp(rng.normal(size=(len(first), free)) * sigma))
     information = np.tile(np.eye(free) / sigma**2, (len(first), 1, 1))
     made = PoseGraph(dimension, np.arange(poses), truth, first, second, measured, information)
@@ -110,8 +110,8 @@ def test_chordal_initialisation_equals_dense_least_squares(dimension: int, seed:
     values = [r @ rotation[i] @ pose[:d] for r, (i, _, pose, *_) in zip(roots, edges, strict=True)]
     weights = [(-root, root) for root in roots]
     position = least_squares(weights, values, graph.poses[0, :d]).reshape(n - 1, d)
-    made = _initialise_chordal(graph)
-    assert made.initialised == INITIAL_POSES_FROM_CHORDAL
+    made = _compute_chordal_poses(graph)
+    assert made.initial_pose_origin == INITIAL_POSES_FROM_CHORDAL
     np.testing.assert_array_equal(made.poses[0], graph.poses[0])
     np.testing.assert_allclose(lie.rotation_matrix(made.poses), rotation, atol=1e-7)
     np.testing.assert_allclose(made.poses[1:, :d], position, rtol=1e-6, atol=1e-6)
@@ -148,7 +148,7 @@ def test_pose_graph_minimum_cost_equals_gtsam(name: str) -> None:
 @pytest.mark.parametrize("name", ["SE-Sync_manhattan", "SE-Sync_CSAIL", "SE-Sync_kitti_00"])
 def test_g2o_without_vertices_starts_from_chordal_solution(name: str) -> None:
     graph = read_g2o(shared("pose_graphs") / f"{name}.g2o")
-    assert graph.initialised == INITIAL_POSES_FROM_CHORDAL
+    assert graph.initial_pose_origin == INITIAL_POSES_FROM_CHORDAL
     assert cost(graph) < 1e-3 * cost(compose_odometry(graph))
     assert solve(graph).cost < 0.9 * cost(graph) or name == "SE-Sync_CSAIL"
 
@@ -168,7 +168,7 @@ def test_square_loop_closure_error_is_spread_by_distance(dimension: int) -> None
     rng = np.random.default_rng(3)
     step[:, :dimension] += rng.normal(size=(4 * side, dimension)) * 0.05
     measured = lie.compose(lie.exp(step), lie.exp(turns))
-    odometry = lie.chain(measured)
+    odometry = lie.accumulate_poses(measured)
     information = np.zeros((4 * side + 1, free, free))
     information[:, range(dimension), range(dimension)] = 1.0
     information[:-1] /= length[:, None, None]
@@ -247,7 +247,9 @@ def test_star_shaped_pose_graph_is_initialised_exactly() -> None:
     assert cost(graph) == pytest.approx(0.0, abs=1e-20)
     # relative to the first pose
     away = lie.compose(np.array([[5.0, -2.0, 0.7]]), graph.poses)
-    np.testing.assert_allclose(initialise(replace(graph, poses=away)).poses, away, atol=1e-9)
+    np.testing.assert_allclose(
+        compute_initial_poses(replace(graph, poses=away)).poses, away, atol=1e-9
+    )
 
 
 # --- false closures -------------------------------------------------------------------------------
@@ -269,14 +271,14 @@ def laps(seed: int, false: int = 1) -> tuple[PoseGraph, np.ndarray, np.ndarray]:
     ])  # fmt: skip
     spread = np.array([0.03] * 3 + [0.02] * 3)  # m and rad per step
     odometry = noisy_odometry(truth, spread, rng)
-    steps = lie.between(odometry[:-1], odometry[1:])
+    steps = lie.relative_pose(odometry[:-1], odometry[1:])
     pairs = [(0, lap * per_lap) for lap in range(1, count + 1)]
     while len(pairs) < count + false:
         a, b = np.sort(rng.integers(0, n, 2)).tolist()
         if b - a > 10 and np.linalg.norm(truth[a, :3] - truth[b, :3]) > 5.0:
             pairs.append((a, b))
     i, j = np.array(pairs).T
-    closures = lie.between(odometry[i], odometry[j])
+    closures = lie.relative_pose(odometry[i], odometry[j])
     closures[:, :3] = rng.normal(size=(len(i), 3)) * sigma
     information = np.zeros((n - 1 + len(i), 6, 6))
     information[: n - 1] = np.diag(spread**-2.0)
@@ -345,14 +347,14 @@ def odometry_graph(dimension: int, sigma: float, poses: int = 40) -> PoseGraph:
     rng = np.random.default_rng(11)
     free = TANGENT[dimension]
     steps = lie.exp(rng.normal(size=(poses - 1, free)) * 0.3)
-    truth = lie.chain(steps)
+    truth = lie.accumulate_poses(steps)
     first, second = np.arange(poses - 1), np.arange(1, poses)
     back = np.arange(poses - 1) % 3 == 1
     first[back], second[back] = second[back], first[back]
     first, second = np.append(first, poses - 3), np.append(second, 4)
     root = rng.normal(size=(poses, free, free)) * 0.3 + np.eye(free)
     information = root @ root.transpose(0, 2, 1) / sigma**2
-    measured = lie.between(truth[first], truth[second])
+    measured = lie.relative_pose(truth[first], truth[second])
     return PoseGraph(dimension, np.arange(poses), truth, first, second, measured, information)
 
 
@@ -400,7 +402,7 @@ def test_loop_closure_gate_distance_equals_gtsam(dimension: int, is_back: bool) 
     order = GTSAM_ORDER if dimension == 3 else [0, 1, 2]
     marginal = gtsam.Marginals(factors, values).marginalCovariance(len(graph) - 1)
     covariance = marginal[np.ix_(order, order)]
-    pose = lie.between(graph.poses[0], compose_odometry(chain).poses[-1])
+    pose = lie.relative_pose(graph.poses[0], compose_odometry(chain).poses[-1])
     for off in np.random.default_rng(5).normal(size=(4, free)) * 1e-6:
         measured = lie.compose(pose, lie.exp(-off))
         closure = replace(
@@ -441,7 +443,9 @@ def test_scaling_all_information_matrices_keeps_gate_results() -> None:
         graph,
         first_nodes=np.append(graph.first_nodes, ends),
         second_nodes=np.append(graph.second_nodes, ends - 4),
-        measurements=np.vstack([graph.measurements, lie.between(truth[ends], truth[ends - 4])]),
+        measurements=np.vstack(
+            [graph.measurements, lie.relative_pose(truth[ends], truth[ends - 4])]
+        ),
         information=np.concatenate([graph.information, information]),
     ), 3)  # fmt: skip
     correct, _ = analyse_graph("g", graph)

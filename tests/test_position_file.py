@@ -107,7 +107,7 @@ def assert_track(
 
 def assert_stated(file: PositionRecording, *words: str) -> None:
     """Check that one of the sentences contains all of these words."""
-    sentences = (*file.detection_notes, *file.notes)
+    sentences = (*file.format_detection_notes, *file.notes)
     assert any(all(word in sentence for word in words) for sentence in sentences), sentences
 
 
@@ -395,9 +395,9 @@ def test_read_position_file_drops_backward_timestamps(read, shifts_us, dropped):
 @pytest.mark.parametrize("name", ["tag_id", "tagid", "node"])
 def test_read_position_file_with_two_tags_requires_body(read, name):
     text = table({name: ["A1", "B2"] * (ROWS // 2), **PLAIN})
-    assert "contains the rigid bodies or tags A1, B2. Choose one" in error_message(read, text)
+    assert "It contains A1, B2. Choose one" in error_message(read, text)
     assert_track(read(text, body="B2"), rows=slice(1, None, 2))
-    assert "contains the rigid bodies or tags A1, B2" in error_message(read, text, body="C3")
+    assert "It contains A1, B2" in error_message(read, text, body="C3")
     assert "only one body, which has no name" in error_message(read, table(PLAIN), body="C3")
 
 
@@ -429,9 +429,9 @@ def test_columns_option_overrides_detected_column_names(read, given, columns, fr
 @pytest.mark.parametrize(("options", "words"), [
     ({"time_unit": "min"}, "`time_unit`: 'min' is not one of s, ms, us, ns."),
     ({"length_unit": "ft"}, "`length_unit`: 'ft' is not one of m, cm, mm."),
-    ({"columns": ("time", "x")}, "must name four or five different columns"),
-    ({"columns": ("time", "x", "x", "z")}, "must name four or five different columns"),
-    ({"columns": ("time", "x", "y", "")}, "must name four or five different columns"),
+    ({"columns": ("time", "x")}, "four or five different columns"),
+    ({"columns": ("time", "x", "x", "z")}, "four or five different columns"),
+    ({"columns": ("time", "x", "y", "")}, "four or five different columns"),
     ({"columns": ("1", "2", "3", "9")},
      "no column '9'; the columns are 'time', 'x', 'y', 'z'. Name the columns with"),
     ({"columns": ("1", "2", "3", "9" * 5000)}, "no column '9999"),
@@ -497,7 +497,7 @@ def check_any(read, content: bytes) -> None:
     assert np.isfinite(samples.index).all()
     assert np.isfinite(samples[["x_m", "y_m"]].to_numpy()).all()
     assert not np.isinf(samples.to_numpy()).any()
-    assert all(len(line.splitlines()) == 1 for line in (*file.detection_notes, *file.notes))
+    assert all(len(line.splitlines()) == 1 for line in (*file.format_detection_notes, *file.notes))
 
 
 @pytest.mark.parametrize(

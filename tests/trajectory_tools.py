@@ -66,9 +66,9 @@ def square(per_leg: int, side_m: float, laps: int = 1) -> tuple[np.ndarray, Rota
 
 def noisy_odometry(poses: np.ndarray, sigma: np.ndarray, rng: np.random.Generator) -> np.ndarray:
     """Return poses (n, 7) of odometry with noise per step, sigma (6,) in m, then rad."""
-    steps = lie.between(poses[:-1], poses[1:])
+    steps = lie.relative_pose(poses[:-1], poses[1:])
     noise = lie.exp(rng.normal(size=(len(steps), 6)) * sigma)
-    return lie.compose(poses[:1], lie.chain(lie.compose(steps, noise)))
+    return lie.compose(poses[:1], lie.accumulate_poses(lie.compose(steps, noise)))
 
 
 SHIFT = np.array([100.0, -20.0, 3.0])

@@ -15,7 +15,7 @@ from px4fuse.alignment.time_and_pose_fit import (
 )
 from px4fuse.alignment.tracks import EKF2_REFERENCE, IMU_REFERENCE, NoMatchError, SampledTrack
 from px4fuse.flight.model import Flight, Unavailable
-from px4fuse.trajectory.time_offset import GRID_STEP_S, MIN_SECOND_PEAK_RATIO
+from px4fuse.trajectory.time_offset import GRID_STEP_S, MIN_SECOND_BEST_RESIDUAL_RATIO
 
 # Frames to try if the yaw is estimated. nwu is omitted, because it is enu with another yaw
 FRAMES_FOR_ESTIMATED_YAW = ("ned", "enu")
@@ -190,7 +190,7 @@ def needs_rotation(horizontal_rms_m: float, estimated_yaw_fit: TrackFit, referen
 def is_reliable_fit(fit: TrackFit, reference: str) -> bool:
     return (
         fit.concordance >= MIN_CONCORDANCE_WITHOUT_WARNING[reference]
-        and fit.second_to_best_residual_ratio >= MIN_SECOND_PEAK_RATIO
+        and fit.second_to_best_residual_ratio >= MIN_SECOND_BEST_RESIDUAL_RATIO
     )
 
 
@@ -204,7 +204,7 @@ def _require_unique_match(match: Match) -> None:
             f"{MIN_CONCORDANCE_TO_ACCEPT_MATCH[reference_name]:g} is needed)"
         )
     ambiguity_text = ""
-    if fit.second_to_best_residual_ratio < MIN_SECOND_PEAK_RATIO:
+    if fit.second_to_best_residual_ratio < MIN_SECOND_BEST_RESIDUAL_RATIO:
         ambiguity_text = (
             f"two time offsets that differ by {abs(fit.second_peak_lag_difference_s):.1f} s fit "
             "equally well"

@@ -195,7 +195,10 @@ def align_position_file(
         ),
         step_m=recording.rounding_step_m,
     )
-    notes = [f"{recording.name}: {text}" for text in (*recording.detection_notes, *recording.notes)]
+    notes = [
+        f"{recording.name}: {text}"
+        for text in (*recording.format_detection_notes, *recording.notes)
+    ]
     dropped_counts = (
         {recording.name: recording.dropped_row_count}
         if recording.dropped_row_count and not clock_map

@@ -104,7 +104,7 @@ def find_correlation_peak(
     )
     common_sample_counts = moments_by_lag.count
     covariance = moments_by_lag.covariance
-    square_sum_m2 = moments_by_lag.square_sum_a + moments_by_lag.square_sum_b
+    square_sum_m2 = moments_by_lag.sum_of_squares_a + moments_by_lag.sum_of_squares_b
     has_overlap = common_sample_counts >= min_sample_count
     # Exclude lags at which both tracks are at rest: their variance is a rounding error
     has_overlap &= square_sum_m2 > 1e-9 * np.max(square_sum_m2)

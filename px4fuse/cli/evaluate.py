@@ -14,16 +14,16 @@ from px4fuse.errors import SettingsError
 from px4fuse.request import EvaluationRequest, format_settings_suffix
 
 if TYPE_CHECKING:
-    from px4fuse.trajectory.scores import Delta
+    from px4fuse.trajectory.scores import RpePairDistance
 
 # Maximum RPE delta (m, s or frames)
 MAX_RPE_DELTA = 1e6
 _DELTA_PATTERN = re.compile(r"(\d+\.?\d*|\.\d+) ?(m|s|frames|f)")
 
 
-def parse_delta(text: str) -> Delta:
+def parse_delta(text: str) -> RpePairDistance:
     """Parse the delta of the RPE: a distance (``5m``), time (``10s``) or frame count (``1f``)."""
-    from px4fuse.trajectory.scores import Delta
+    from px4fuse.trajectory.scores import RpePairDistance
 
     match = _DELTA_PATTERN.fullmatch(text.strip())
     if match is None or not 0.0 < float(match[1]) <= MAX_RPE_DELTA:
@@ -31,7 +31,7 @@ def parse_delta(text: str) -> Delta:
             f"The delta {text!r} is not a distance (5m), a time (10s) or a number of frames (1f)."
         )
     unit = {"m": "m", "s": "s"}.get(match[2], "frames")
-    return Delta(float(match[1]), unit)  # type: ignore[arg-type]
+    return RpePairDistance(float(match[1]), unit)  # type: ignore[arg-type]
 
 
 _evaluation_option = partial(options.request_option, EvaluationRequest)

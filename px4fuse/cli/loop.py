@@ -241,7 +241,7 @@ def _solve_graph(
     with outputs.progress(json_path, g2o_path) as show_progress:
         show_progress(f"reading {display_name(source)}")
         results, solved_graph = analyse_graph(
-            display_name(source), read_g2o(path), show_progress, run_robust=robust
+            display_name(source), read_g2o(path), show_progress, use_robust_optimisation=robust
         )
     command = command_line(LoopRequest(source=str(source))) + (" --robust" if robust else "")
     contents = {} if g2o_path is None else {g2o_path: format_g2o(solved_graph).encode()}

@@ -17,7 +17,7 @@ from px4fuse.comparison.model import Comparison
 from px4fuse.core.arrays import Array, integrate_cumulatively, rank_correlation
 from px4fuse.filter.signals import cut_to_segment
 from px4fuse.flight.model import Columns, Ekf2, Unavailable, rows_between
-from px4fuse.trajectory.rotation import conjugate, interpolate, multiply, to_vector
+from px4fuse.trajectory.rotation import conjugate, interpolate, multiply, to_rotation_vector
 from px4fuse.trajectory.scores import compute_autocorrelation_time
 
 # Minimum number of positions to search for jitter and other error patterns
@@ -509,7 +509,7 @@ def find_attitude_delay(imu: pd.DataFrame, attitude: pd.DataFrame) -> float | No
     )
     imu_time_s = imu.index.to_numpy()
     quaternions = interpolate(time_s, attitude_time_s, attitude[Columns.QUATERNION].to_numpy())
-    rotation_rad = to_vector(
+    rotation_rad = to_rotation_vector(
         multiply(conjugate(quaternions[:-samples_per_rotation]), quaternions[samples_per_rotation:])
     )
     angle_rad = integrate_cumulatively(imu[Columns.ANGULAR_RATE].to_numpy(), imu_time_s)

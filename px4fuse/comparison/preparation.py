@@ -31,9 +31,9 @@ from px4fuse.flight.model import (
 from px4fuse.readers.mavlink_messages import POSITION_MESSAGE_TYPES
 from px4fuse.readers.px4_innovations import (
     GNSS,
-    GNSS_AND_BAROMETER,
+    GNSS_WITH_BAROMETER_HEIGHT,
     has_fused_aid,
-    with_gnss_innovations,
+    replace_vision_by_gnss_innovations,
 )
 from px4fuse.readers.px4_positions import NO_FIX_ACTION
 from px4fuse.readers.px4_topics import ORIGIN_BY_TRACK_NAME, SOURCE_TRACKS
@@ -152,8 +152,8 @@ def select_source_innovations(flight: Flight, track: PositionTrack) -> Flight:
     # GNSS innovations replace those of vision, so missing vision innovations are not reported
     missing_vision_innovations = _find_missing_innovations(flight.ekf2)
     streams = dict(flight.streams)
-    ekf2 = with_gnss_innovations(
-        flight.ekf2, GNSS if track.barometer is None else GNSS_AND_BAROMETER
+    ekf2 = replace_vision_by_gnss_innovations(
+        flight.ekf2, GNSS if track.barometer is None else GNSS_WITH_BAROMETER_HEIGHT
     )
     other_missing_data = tuple(
         item
@@ -265,7 +265,7 @@ def _use_barometer_height(
             f"{log_name}: `height` needs GNSS as position source, not {track.name}."
         )
     is_barometer_ekf2_height = has_fused_aid(ekf2, BAROMETER.name) and not has_fused_aid(
-        ekf2, GNSS.vertical
+        ekf2, GNSS.vertical_aid
     )
     uses_barometer = height_sensor == "barometer" or (
         height_sensor is None and track.origin.fused_as_gnss and is_barometer_ekf2_height
@@ -273,7 +273,7 @@ def _use_barometer_height(
     if not uses_barometer or barometer_heights is None:
         if height_sensor == "barometer":
             raise MissingDataError(
-                f"{log_name}: the log contains no barometer height.", GNSS.to_log
+                f"{log_name}: the log contains no barometer height.", GNSS.logging_remedy
             )
         return track
     barometer_offset_down_m = barometer_heights["down_m"].iloc[0]

@@ -23,13 +23,13 @@ from px4fuse.trajectory.association import choose_gap_limit_s, is_bracketed
 from px4fuse.trajectory.rotation import (
     conjugate,
     cumulative_product,
-    from_vector,
+    from_rotation_vector,
     heading,
     interpolate,
     multiply,
     rotate,
     to_matrix,
-    to_vector,
+    to_rotation_vector,
 )
 
 # Time T (s) between successive positions of a second difference p(t + T) - 2 p(t) + p(t - T)
@@ -190,7 +190,7 @@ def _integrate_gyros(rotation_rad: Array, logged_attitude: Array) -> Array:
     The bias is the median rotation rate relative to the logged attitude, so heading resets have no
     effect.
     """
-    gyro_error_rad = rotation_rad - to_vector(
+    gyro_error_rad = rotation_rad - to_rotation_vector(
         multiply(conjugate(logged_attitude[:-1]), logged_attitude[1:])
     )
     gyro_error_sum_rad = np.cumsum(gyro_error_rad, axis=0)
@@ -200,7 +200,9 @@ def _integrate_gyros(rotation_rad: Array, logged_attitude: Array) -> Array:
         / window_steps
     )
     return cumulative_product(
-        np.concatenate([logged_attitude[:1], from_vector(rotation_rad - gyro_bias_rad_per_step)])
+        np.concatenate(
+            [logged_attitude[:1], from_rotation_vector(rotation_rad - gyro_bias_rad_per_step)]
+        )
     )
 
 
@@ -216,7 +218,7 @@ def _level_attitude(attitude: Array, specific_force_m_s2: Array) -> Array:
     vertical = mean_specific_force_m_s2 / np.maximum(
         np.linalg.norm(mean_specific_force_m_s2, axis=1, keepdims=True), 1.0
     )
-    levelling_rotation = from_vector(np.cross(vertical, [0.0, 0.0, -1.0]))
+    levelling_rotation = from_rotation_vector(np.cross(vertical, [0.0, 0.0, -1.0]))
     return multiply(np.concatenate([levelling_rotation, levelling_rotation[-1:]]), attitude)
 
 

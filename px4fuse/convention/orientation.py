@@ -14,7 +14,13 @@ from px4fuse.convention.model import BodyAndWorldFrame, OrientationConvention, Q
 from px4fuse.convention.motion import InertialData
 from px4fuse.core.arrays import Array
 from px4fuse.ekf2.replay import is_inside_spans
-from px4fuse.trajectory.rotation import from_vector, heading, interpolate, multiply, to_matrix
+from px4fuse.trajectory.rotation import (
+    from_rotation_vector,
+    heading,
+    interpolate,
+    multiply,
+    to_matrix,
+)
 
 IDENTITY_QUATERNION = np.array([1.0, 0.0, 0.0, 0.0])
 # Quaternion (w, x, y, z) of half a turn about x, from FLU to FRD
@@ -162,7 +168,7 @@ def _score_convention(
     difference of at most 8°, and a body frame that is not rotated by ``body_quarter_turns`` · 90°.
     """
     convention = OrientationConvention(verdict="determined", order=order, frames=frames)
-    body_rotation = from_vector(np.array([0.0, 0.0, body_quarter_turns * np.pi / 2.0]))
+    body_rotation = from_rotation_vector(np.array([0.0, 0.0, body_quarter_turns * np.pi / 2.0]))
     attitude = multiply(convert_to_attitude(sent_quaternions, convention), body_rotation)
     heading_difference_phasor = np.exp(1j * (heading(attitude) - heading(reference_attitude)))
     mean_heading_difference_rad = np.angle(np.mean(heading_difference_phasor))

@@ -49,7 +49,7 @@ from px4fuse.flight.model import (
     sample_step_function,
 )
 from px4fuse.readers.common import find_flight_spans
-from px4fuse.readers.px4_innovations import has_fused_aid, with_gnss_innovations
+from px4fuse.readers.px4_innovations import has_fused_aid, replace_vision_by_gnss_innovations
 from px4fuse.readers.px4_positions import MAX_DOWNSAMPLED_HZ
 from px4fuse.readers.px4_topics import DEFAULT_PROFILE_REMEDY
 from px4fuse.trajectory.rotation import conjugate, interpolate, multiply, rotate, to_matrix
@@ -244,7 +244,7 @@ def prepare_inputs(  # noqa: PLR0911, PLR0912 (one return per reason)
     is_gnss = aid == GNSS_POS
     logged_ekf2 = ekf2
     if is_gnss:
-        ekf2 = with_gnss_innovations(ekf2)
+        ekf2 = replace_vision_by_gnss_innovations(ekf2)
     fusion_record = ekf2.record
     horizon_s = ekf2.horizon_s
     if isinstance(fusion_record, Unavailable):

@@ -66,7 +66,7 @@ from px4fuse.flight.ekf2_parameters import (
     check_parameters,
 )
 from px4fuse.flight.model import AXIS_NAMES, Columns, Ekf2, Flight, NedAxis, Unavailable, time_index
-from px4fuse.readers.px4_innovations import with_gnss_innovations
+from px4fuse.readers.px4_innovations import replace_vision_by_gnss_innovations
 from px4fuse.trajectory.rotation import rotate
 
 # Maximum delay (s) of the fusion horizon: PX4's maximum of EKF2_DELAY_MAX
@@ -140,7 +140,7 @@ def _prepare_without_aids(
     if isinstance(inputs, Unavailable):
         return structs.replace(inputs, what=ANALYSIS_NAME)
     if inputs.aid == GNSS_POS and isinstance(flight.ekf2, Ekf2):
-        flight = replace(flight, ekf2=with_gnss_innovations(flight.ekf2))
+        flight = replace(flight, ekf2=replace_vision_by_gnss_innovations(flight.ekf2))
     baseline_configuration = FilterConfiguration(inputs.settings)
     delays = baseline_configuration.compute_delays(inputs)
     intervals = tuple(make_intervals(inputs, segment, delays) for segment in inputs.segments)

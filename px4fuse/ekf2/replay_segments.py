@@ -40,12 +40,12 @@ from px4fuse.readers.px4_ekf2 import compute_samples_per_step, find_rows_of_time
 from px4fuse.trajectory.rotation import (
     conjugate,
     cumulative_product,
-    from_vector,
+    from_rotation_vector,
     interpolate,
     multiply,
     rotate,
     to_matrix,
-    to_vector,
+    to_rotation_vector,
 )
 
 # After a longer gap (s) in the position source, the replay restarts from the logged state. In gaps
@@ -524,7 +524,7 @@ def _make_segment(
     step_times_s = imu_times_s[np.append(0, step_end_indices)]
     step_s = np.diff(step_times_s)
     gyro_attitude = cumulative_product(
-        np.concatenate([[[1.0, 0.0, 0.0, 0.0]], from_vector(rotation_vectors)])
+        np.concatenate([[[1.0, 0.0, 0.0, 0.0]], from_rotation_vector(rotation_vectors)])
     )
 
     def compute_relative_attitude(
@@ -545,7 +545,7 @@ def _make_segment(
     state_times_s, error_quaternions = compute_relative_attitude(
         fusion_record.delayed, 1e-4, nominal_attitude
     )
-    attitude_error_rad = to_vector(error_quaternions)
+    attitude_error_rad = to_rotation_vector(error_quaternions)
     published_position_m = _interpolate(ekf2.state[Columns.POSITION], step_times_s[:1])[0]
     position_m = initial_row[Columns.POSITION].to_numpy()
     position_m = np.where(np.isfinite(position_m), position_m, published_position_m)
@@ -557,7 +557,7 @@ def _make_segment(
         step_s=step_s,
         # float32 (as in PX4) saves memory: these arrays are the largest
         body_to_ned=to_matrix(nominal_attitude).astype(np.float32),
-        correction_rad=to_vector(
+        correction_rad=to_rotation_vector(
             multiply(gyro_to_published_rotation[1:], conjugate(gyro_to_published_rotation[:-1]))
         ).astype(np.float32),
         force_m_s2=velocity_increments / step_s[:, None],

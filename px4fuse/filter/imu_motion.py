@@ -33,11 +33,11 @@ from px4fuse.flight.model import Columns, Flight, Unavailable, rows_between
 from px4fuse.trajectory.rotation import (
     conjugate,
     cumulative_product,
-    from_vector,
+    from_rotation_vector,
     multiply,
     rotate,
     to_matrix,
-    to_vector,
+    to_rotation_vector,
 )
 
 # Prior σ (rad) of the errors of tilt and heading at the start of a segment
@@ -401,7 +401,9 @@ def make_segment_motion(
     # The mean specific force of each step is rotated by the attitude in the middle of the step
     mean_specific_force_m_s2 = np.diff(specific_force_integral_m_s, axis=0) / INTEGRATION_STEP_S
     body_to_ned = to_matrix(
-        multiply(attitude_quaternion[:-1], from_vector(np.diff(gyro_integral_rad, axis=0) / 2.0))
+        multiply(
+            attitude_quaternion[:-1], from_rotation_vector(np.diff(gyro_integral_rad, axis=0) / 2.0)
+        )
     )
     specific_force_ned_m_s2 = rotate(body_to_ned, mean_specific_force_m_s2)
     table = np.zeros((len(mean_specific_force_m_s2), 2, 3, len(SEGMENT_CONSTANT_PRIOR_SIGMAS)))
@@ -448,7 +450,7 @@ def _estimate_large_gyro_bias(
     gyro_angle_rad = np.column_stack(
         [np.interp(attitude_time_s, step_times_s, column) for column in gyro_integral_rad.T]
     )
-    drift_rad = np.diff(gyro_angle_rad, axis=0) - to_vector(
+    drift_rad = np.diff(gyro_angle_rad, axis=0) - to_rotation_vector(
         multiply(conjugate(quaternions[:-1]), quaternions[1:])
     )
     bias_rad_s = np.asarray(np.median(drift_rad / np.diff(attitude_time_s)[:, None], axis=0))
@@ -479,5 +481,7 @@ def _integrate_gyros(
     start_s = np.clip(step_times_s[0], nearby_attitude_time_s[0], nearby_attitude_time_s[-1])
     slerp = Slerp(nearby_attitude_time_s, Rotation.from_quat(logged_quaternions, scalar_first=True))
     start_quaternion = slerp(start_s).as_quat(scalar_first=True)
-    rotation_since_start = cumulative_product(from_vector(np.diff(gyro_integral_rad, axis=0)))
+    rotation_since_start = cumulative_product(
+        from_rotation_vector(np.diff(gyro_integral_rad, axis=0))
+    )
     return np.vstack([start_quaternion, multiply(start_quaternion, rotation_since_start)])

@@ -22,7 +22,7 @@ from px4fuse.loop.model import LANDING_CLOSURE_SOURCE, Loop, OdometryNoise, True
 from px4fuse.loop.tracks import LoopSource, find_odometry, trajectory_of
 from px4fuse.request import GivenClosure, LoopRequest
 from px4fuse.trajectory.graph import lie
-from px4fuse.trajectory.model import Trajectory, components_by_axis, cumulative_distance
+from px4fuse.trajectory.model import Trajectory, cumulative_distance, split_by_axis
 
 # Larger times (s) in options are UNIX times, smaller times count from the first pose
 MIN_UNIX_TIME_S = 1e6
@@ -134,7 +134,7 @@ def analyse(
     if not isinstance(closure_error_vector_m, Unavailable):
         closure_error_m = float(np.linalg.norm(closure_error_vector_m))
         closure_percent = 100.0 * closure_error_m / float(distance_m[-1])
-        closure_error_axes_m = components_by_axis(path.frame, closure_error_vector_m)
+        closure_error_axes_m = split_by_axis(path.frame, closure_error_vector_m)
     return Loop(
         track=path.name,
         kind=path.kind,
@@ -146,7 +146,7 @@ def analyse(
         key_frames=len(key_frame_indices),
         key_frame_spacing_m=key_frame_spacing_m,
         path_length_m=float(distance_m[-1]),
-        end_from_start_m=components_by_axis(path.frame, displacement_m),
+        end_from_start_m=split_by_axis(path.frame, displacement_m),
         heading_change_deg=odometry_heading_change_deg,
         true_end=true_end,
         closure_error_m=closure_error_m,

@@ -67,7 +67,7 @@ def _rotate(trajectory: Trajectory, matrix: Array, frame: Frame) -> Trajectory:
     """Rotate a trajectory to another frame, and convert camera axes to body axes or the reverse."""
     frame_rotation = Rotation.from_matrix(matrix)
     rotated = replace(
-        trajectory.with_positions(trajectory.position_m @ matrix.T, frame_rotation), frame=frame
+        trajectory.replace_positions(trajectory.position_m @ matrix.T, frame_rotation), frame=frame
     )
     if rotated.rotation is None or "camera" not in (trajectory.frame, frame):
         return rotated
@@ -153,7 +153,7 @@ def correct_by_distance(
         rotation_at_step_middle.apply(np.diff(position_m, axis=0))
     )
     remaining_error_m = rotated_position_m[-1] - (position_m[-1] - closure_error_vector_m)
-    return trajectory.with_positions(
+    return trajectory.replace_positions(
         distribute_by_distance(rotated_position_m, remaining_error_m, cumulative_distance_m),
         correction_rotation,
     )

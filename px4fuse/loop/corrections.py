@@ -212,7 +212,7 @@ def build_pose_graph(
             [measured_translation_m, (first_rotation_inverse * second_node_rotation).as_quat()]
         ),
         information=information,
-        initialised="odometry",
+        initial_pose_origin="odometry",
     )
     return graph, node_indices, variance_note
 
@@ -259,7 +259,7 @@ def distribute_closure_error_by_distance(
         path, distance_m, closure_error_vector_m, heading_error_rad
     )
     return {
-        "by_distance_plain": (path.with_positions(corrected_position_m), None),
+        "by_distance_plain": (path.replace_positions(corrected_position_m), None),
         "by_distance": (corrected_path, None),
     }
 
@@ -387,7 +387,7 @@ def _interpolate_corrections(
     position_m = (
         1.0 - next_node_weight
     ) * position_corrected_by_previous_node_m + next_node_weight * position_corrected_by_next_node_m
-    return path.with_positions(position_m, Slerp(time_s[node_indices], node_corrections)(time_s))
+    return path.replace_positions(position_m, Slerp(time_s[node_indices], node_corrections)(time_s))
 
 
 def score_paths(

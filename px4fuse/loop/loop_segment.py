@@ -12,7 +12,7 @@ from px4fuse.flight.model import Flight, Unavailable
 from px4fuse.loop.closure import DOWN_DIRECTION, compute_heading_change_rad
 from px4fuse.loop.model import TrueFinalPose
 from px4fuse.request import Landing
-from px4fuse.trajectory.model import MIN_POSES, Trajectory, components_by_axis, format_vector
+from px4fuse.trajectory.model import MIN_POSES, Trajectory, format_vector, split_by_axis
 
 # Time (s) over which poses on the ground are averaged
 REST_DURATION_S = 1.0
@@ -135,7 +135,7 @@ def assume_landing_at_takeoff(path: Trajectory) -> TrueFinalPose:
     if is_same_heading:
         source = "assumption: the vehicle landed at the take-off place with the initial heading"
     return TrueFinalPose(
-        displacement_m=components_by_axis(path.frame, np.zeros(3)),
+        displacement_m=split_by_axis(path.frame, np.zeros(3)),
         heading_change_deg=0.0 if is_same_heading else None,
         sigma_m=0.10,
         sigma_heading_deg=5.0 if is_same_heading else None,
@@ -155,7 +155,7 @@ def convert_measured_final_pose(path: Trajectory, landing: Landing) -> TrueFinal
         [forward_m, right_m, 0.0]
     )
     return TrueFinalPose(
-        displacement_m=components_by_axis(path.frame, displacement_m),
+        displacement_m=split_by_axis(path.frame, displacement_m),
         heading_change_deg=heading_change_deg,
         sigma_m=0.05,
         sigma_heading_deg=None if heading_change_deg is None else 2.0,
@@ -190,7 +190,7 @@ def find_final_pose_in_truth(
             "ground truth has no orientation"
         )
     return TrueFinalPose(
-        displacement_m=components_by_axis(path.frame, displacement_m),
+        displacement_m=split_by_axis(path.frame, displacement_m),
         heading_change_deg=true_heading_change_deg,
         sigma_m=0.02,
         sigma_heading_deg=None if true_heading_change_deg is None else 0.5,

@@ -17,20 +17,21 @@ MAX_IMU_READING = 1e4
 MIN_INVALID_ZERO_DISTANCE_M = 0.3
 # Minimum distance (m) of a damaged position from the median position
 MIN_DAMAGED_DISTANCE_M = 1e4
-# Minimum distance of a damaged position from the median position, relative to the median distance
-MIN_DAMAGED_TO_MEDIAN_RATIO = 100.0
+# Minimum distance of a damaged position from the median position, as a multiple of the median of
+# these distances
+MIN_DAMAGED_TO_MEDIAN_DISTANCE_RATIO = 100.0
 # Minimum duration (s) of equal positions that are rejected as frozen: some sources repeat each
 # position for a shorter time
 MIN_FROZEN_S = 1.0
 # Minimum number of successive equal positions that are rejected as frozen
-MIN_FROZEN_COUNT = 5
+MIN_FROZEN_POSITION_COUNT = 5
 # Maximum fraction of frozen positions. With more, none is rejected: the vehicle may be at rest
 MAX_FROZEN_FRACTION = 0.5
 # Maximum probability that positions repeated at random are rejected as frozen
-MAX_RANDOM_RUN_PROBABILITY = 0.01
-# Values are multiples of a rounding step if difference / step is at most this far from whole
-# numbers
-MAX_STEP_MULTIPLE_ERROR = 0.01
+MAX_FALSE_FROZEN_PROBABILITY = 0.01
+# Values are rounded to a step if each quotient difference / step differs by less than this from a
+# whole number
+MAX_DIFFERENCE_FROM_INTEGER = 0.01
 # Minimum norm of a valid quaternion: senders without attitude send zeros
 MIN_QUATERNION_NORM = 0.5
 
@@ -75,7 +76,7 @@ def select_valid_rows(
 
 
 def classify_invalid_positions(samples: pd.DataFrame, columns: list[str]) -> "pd.Series[str]":
-    """Return for each position the reason why it is not a measurement, or "" if it is.
+    """Return for each position the reason why it is not a measurement; "" for a measurement.
 
     "NaN": a coordinate is not finite. "zero": the source sent 0, 0, 0 instead of a position. "far":
     the position is damaged. "held": the source sent its last position again.
@@ -97,22 +98,25 @@ def classify_invalid_positions(samples: pd.DataFrame, columns: list[str]) -> "pd
     if len(valid_rows):
         offset_from_median_m = values[valid_rows] - np.median(values[valid_rows], axis=0)
         distance_m = np.linalg.norm(offset_from_median_m, axis=1)
-        is_far = distance_m > max(
-            MIN_DAMAGED_DISTANCE_M, MIN_DAMAGED_TO_MEDIAN_RATIO * float(np.median(distance_m))
+        is_far_from_median = distance_m > max(
+            MIN_DAMAGED_DISTANCE_M,
+            MIN_DAMAGED_TO_MEDIAN_DISTANCE_RATIO * float(np.median(distance_m)),
         )
-        reason_by_row.iloc[valid_rows[is_far]] = "far"
-        valid_rows = valid_rows[~is_far]
+        reason_by_row.iloc[valid_rows[is_far_from_median]] = "far"
+        valid_rows = valid_rows[~is_far_from_median]
     is_repeated = np.all(np.diff(values[valid_rows], axis=0) == 0.0, axis=1)
     run_starts = np.flatnonzero(np.append(True, ~is_repeated))
     # Longest run of equal positions that is likely if the source repeats positions at random
-    repeated_fraction = np.clip(np.mean(is_repeated), 1e-6, 1.0 - 1e-6) if len(is_repeated) else 0.5
-    max_random_run_length = np.log(max(len(valid_rows), 1) / MAX_RANDOM_RUN_PROBABILITY) / -np.log(
-        repeated_fraction
+    repeated_position_fraction = (
+        np.clip(np.mean(is_repeated), 1e-6, 1.0 - 1e-6) if len(is_repeated) else 0.5
     )
+    max_random_run_length = np.log(
+        max(len(valid_rows), 1) / MAX_FALSE_FROZEN_PROBABILITY
+    ) / -np.log(repeated_position_fraction)
     frozen_rows = [
         valid_rows[run_start + 1 : run_end]
         for run_start, run_end in zip(run_starts, [*run_starts[1:], len(valid_rows)], strict=True)
-        if run_end - run_start >= max(MIN_FROZEN_COUNT, max_random_run_length)
+        if run_end - run_start >= max(MIN_FROZEN_POSITION_COUNT, max_random_run_length)
         and np.ptp(time_s[valid_rows[run_start:run_end]]) >= MIN_FROZEN_S
     ]
     if frozen_rows and len(rows := np.concatenate(frozen_rows)) < MAX_FROZEN_FRACTION * len(
@@ -127,11 +131,14 @@ def estimate_rounding_step(values: Array) -> float:
     differences = np.diff(np.unique(values[np.isfinite(values)]))
     if not len(differences):
         return 0.0
-    # a tiny minimum makes the counts infinite: is_multiple is then False
+    # If the smallest difference is almost 0, the quotients overflow to infinity or NaN, and the
+    # result is 0
     with np.errstate(over="ignore", invalid="ignore"):
         step_counts = differences / differences.min()
-        is_multiple = np.abs(step_counts - np.rint(step_counts)) < MAX_STEP_MULTIPLE_ERROR
-    return float(differences.min()) if is_multiple.all() else 0.0
+        is_multiple_of_step = (
+            np.abs(step_counts - np.rint(step_counts)) < MAX_DIFFERENCE_FROM_INTEGER
+        )
+    return float(differences.min()) if is_multiple_of_step.all() else 0.0
 
 
 def interpolate_inside(time_s: pd.Index | Array, values: "pd.Series[float]") -> Array:

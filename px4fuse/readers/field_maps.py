@@ -26,7 +26,7 @@ class Layout:
     # Required field of each column; ``name[i]`` is an array element
     columns: Mapping[str, str] = field(default_factory=dict)
     # Field of each column that only some PX4 releases log; empty for MAVLink
-    optional: Mapping[str, str] = field(default_factory=dict)
+    optional_columns: Mapping[str, str] = field(default_factory=dict)
     # Factor of each column, by which the field is multiplied; 1 if absent
     scale: Mapping[str, float] = field(default_factory=dict)
 
@@ -36,29 +36,30 @@ def expand_layouts(toml_tables: Mapping[str, Any]) -> dict[str, Layout]:
     return {
         name: replace(
             layout,
-            columns=expand_columns(layout.columns),
-            optional=expand_columns(layout.optional),
-            scale=expand_columns(layout.scale),
+            columns=assign_fields_to_columns(layout.columns),
+            optional_columns=assign_fields_to_columns(layout.optional_columns),
+            scale=assign_fields_to_columns(layout.scale),
         )
         for name, layout in msgspec.convert(toml_tables, dict[str, Layout]).items()
     }
 
 
-def expand_columns(fields: Mapping[str, Any]) -> dict[str, Any]:
-    """Assign a message field, or a number, to each DataFrame column.
+def assign_fields_to_columns(fields: Mapping[str, Any]) -> dict[str, Any]:
+    """Return the message field (or the number) of each DataFrame column.
 
-    A key of ``fields`` contains column names, or the name of a list in :class:`Columns`. A value
-    contains field names, an array ``q[]``, array elements ``covariance[0 6]``, or one number.
+    A key of ``fields`` lists column names, or is the name of a list in :class:`Columns`. Its value
+    lists one field per column. The value ``q[]`` stands for the elements of an array field,
+    ``covariance[0 6]`` for its elements 0 and 6. A number applies to all columns of the key.
 
     Examples
     --------
-    >>> expand_columns({"POSITION": "x y z"})
+    >>> assign_fields_to_columns({"POSITION": "x y z"})
     {'north_m': 'x', 'east_m': 'y', 'down_m': 'z'}
-    >>> expand_columns({"north_m east_m": "position[]"})
+    >>> assign_fields_to_columns({"north_m east_m": "position[]"})
     {'north_m': 'position[0]', 'east_m': 'position[1]'}
-    >>> expand_columns({"north_m2 east_m2": "covariance[0 6]", "w x": 1.0})
+    >>> assign_fields_to_columns({"north_m2 east_m2": "covariance[0 6]", "w x": 1.0})
     {'north_m2': 'covariance[0]', 'east_m2': 'covariance[6]', 'w': 1.0, 'x': 1.0}
-    >>> expand_columns({"a b": "hpos[0] vpos"})
+    >>> assign_fields_to_columns({"a b": "hpos[0] vpos"})
     {'a': 'hpos[0]', 'b': 'vpos'}
     """
     columns: dict[str, Any] = {}

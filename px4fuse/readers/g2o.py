@@ -10,12 +10,12 @@ from px4fuse.core.reading import display_name, read_bytes_limited
 from px4fuse.errors import TrajectoryError
 from px4fuse.readers.text_table import TextTableRows, decode_text, make_line_error, quote
 from px4fuse.readers.trajectory import MAX_COORDINATE_M, UNIT_NORM_TOLERANCE
-from px4fuse.trajectory.graph.initialisation import initialise
+from px4fuse.trajectory.graph.initialisation import compute_initial_poses
 from px4fuse.trajectory.graph.model import INITIAL_POSES_FROM_FILE, PoseGraph
 
 MAX_FILE_BYTES = 500_000_000
-# Number of vertex ids, and number of values after the ids, by the tag that begins a line
-_ID_AND_VALUE_COUNTS = {
+# Number of vertex ids, and number of values after the ids, in a g2o line with each tag (first word)
+_ID_AND_VALUE_COUNTS_BY_TAG = {
     "VERTEX_SE2": (1, 3),
     "VERTEX_SE3:QUAT": (1, 7),
     "EDGE_SE2": (2, 3 + 6),
@@ -35,7 +35,7 @@ _MAX_VERTEX_ID = 2**63 - 1
 _EIGENVALUE_TOLERANCE = 1e-9
 # Minimum and maximum valid element (1/m², 1/rad²) of an information matrix: the product of two
 # elements neither overflows nor becomes zero
-_MIN_INFORMATION, _MAX_INFORMATION = 1e-50, 1e50
+_MIN_INFORMATION_ELEMENT, _MAX_INFORMATION_ELEMENT = 1e-50, 1e50
 
 
 def read_g2o(path: str | Path) -> PoseGraph:
@@ -61,27 +61,30 @@ def read_g2o(path: str | Path) -> PoseGraph:
 def parse_g2o(text: str, name: str) -> PoseGraph:
     """Parse the text of a g2o file. ``name`` is the file name, for error messages."""
     rows_by_tag = _group_rows_by_tag(text, name)
-    is_in_plane = any(rows.lines for tag, rows in rows_by_tag.items() if tag.endswith("SE2"))
-    dimension, pose_type, pose_width = (2, "SE2", 3) if is_in_plane else (3, "SE3:QUAT", 7)
+    is_2d = any(rows.lines for tag, rows in rows_by_tag.items() if tag.endswith("SE2"))
+    dimension, pose_type, values_per_pose = (2, "SE2", 3) if is_2d else (3, "SE3:QUAT", 7)
     for tag, rows in rows_by_tag.items():
         if rows.lines and not tag.endswith(pose_type):
-            fault = "the file contains 2D entries (SE2) and 3D entries (SE3)"
-            raise rows.make_row_error(0, fault, "Keep only the 2D or only the 3D entries.")
+            raise rows.make_row_error(
+                0,
+                "the file contains 2D entries (SE2) and 3D entries (SE3)",
+                "Keep only the 2D or only the 3D entries.",
+            )
     vertices = rows_by_tag[f"VERTEX_{pose_type}"]
     edges = rows_by_tag[f"EDGE_{pose_type}"]
     if not edges.lines:
         raise TrajectoryError(f"{name} contains no edges", _FORMAT_REMEDY)
     edge_vertex_ids, edge_values = _parse_rows(edges, f"EDGE_{pose_type}")
     ids = np.unique(edge_vertex_ids)
-    poses = np.zeros((len(ids), pose_width))
+    poses = np.zeros((len(ids), values_per_pose))
     poses[:, 6:] = 1.0  # the identity rotation has w = 1
     if vertices.lines:
         vertex_ids, poses = _parse_rows(vertices, f"VERTEX_{pose_type}")
-        id_order = np.argsort(vertex_ids[:, 0], kind="stable")
-        ids = vertex_ids[id_order, 0]
-        poses = _normalise_quaternions(vertices, poses)[id_order]
+        order_by_vertex_id = np.argsort(vertex_ids[:, 0], kind="stable")
+        ids = vertex_ids[order_by_vertex_id, 0]
+        poses = _normalise_quaternions(vertices, poses)[order_by_vertex_id]
         is_repeated = np.zeros(len(ids), bool)
-        is_repeated[id_order[1:]] = ids[1:] == ids[:-1]
+        is_repeated[order_by_vertex_id[1:]] = ids[1:] == ids[:-1]
         vertices.raise_where(
             is_repeated,
             "another line defines the vertex with this id",
@@ -104,14 +107,14 @@ def parse_g2o(text: str, name: str) -> PoseGraph:
         poses=poses,
         first_nodes=vertex_indices[:, 0],
         second_nodes=vertex_indices[:, 1],
-        measurements=_normalise_quaternions(edges, edge_values[:, :pose_width]),
+        measurements=_normalise_quaternions(edges, edge_values[:, :values_per_pose]),
         information=_make_information_matrices(
-            edges, edge_values[:, pose_width:], 3 if dimension == 2 else 6
+            edges, edge_values[:, values_per_pose:], 3 if dimension == 2 else 6
         ),
-        initialised=INITIAL_POSES_FROM_FILE,
+        initial_pose_origin=INITIAL_POSES_FROM_FILE,
     )
     try:
-        return graph if vertices.lines else initialise(graph)
+        return graph if vertices.lines else compute_initial_poses(graph)
     except TrajectoryError as error:
         raise TrajectoryError(f"{name}: {error}") from None
 
@@ -142,7 +145,7 @@ def format_g2o(graph: PoseGraph) -> str:
 
 
 def _group_rows_by_tag(text: str, name: str) -> dict[str, TextTableRows]:
-    rows_by_tag = {tag: TextTableRows(name) for tag in _ID_AND_VALUE_COUNTS}
+    rows_by_tag = {tag: TextTableRows(name) for tag in _ID_AND_VALUE_COUNTS_BY_TAG}
     fixed_ids: set[str] = set()
     for line_number, raw_line in enumerate(text.split("\n"), start=1):
         line = raw_line.partition("#")[0].strip()
@@ -157,7 +160,7 @@ def _group_rows_by_tag(text: str, name: str) -> dict[str, TextTableRows]:
                 raise make_line_error(
                     name,
                     line_number,
-                    "FIX names a second vertex, but px4fuse fixes only one",
+                    "the file fixes a second vertex (tag FIX), but only one can be fixed",
                     "Remove this line. To keep the relative pose of both vertices, add an edge.",
                 )
         elif not tag.startswith(_SKIPPED_TAGS):
@@ -168,7 +171,7 @@ def _group_rows_by_tag(text: str, name: str) -> dict[str, TextTableRows]:
 
 def _parse_rows(rows: TextTableRows, tag: str) -> tuple[IntArray, Array]:
     """Return the vertex ids, shape (n, 1 or 2), and the other numbers of all lines with a tag."""
-    vertex_count, value_count = _ID_AND_VALUE_COUNTS[tag]
+    vertex_count, value_count = _ID_AND_VALUE_COUNTS_BY_TAG[tag]
     cells, numbers = rows.parse(1 + vertex_count, value_count)
     is_invalid_id = [
         _VERTEX_ID_PATTERN.fullmatch(id_text) is None or abs(int(id_text)) > _MAX_VERTEX_ID
@@ -214,11 +217,11 @@ def _make_information_matrices(edges: TextTableRows, numbers: Array, dimension: 
     matrices = np.empty((len(numbers), dimension, dimension))
     matrices[:, row, column] = matrices[:, column, row] = numbers
     magnitudes = np.abs(numbers)
-    is_too_small = (row == column) & (magnitudes > 0.0) & (magnitudes < _MIN_INFORMATION)
+    is_too_small = (row == column) & (magnitudes > 0.0) & (magnitudes < _MIN_INFORMATION_ELEMENT)
     edges.raise_where(
-        is_too_small | (magnitudes > _MAX_INFORMATION),
-        "the absolute value of an information matrix element is too small or too large",
-        f"Give 0, or an absolute value from {_MIN_INFORMATION:g} to {_MAX_INFORMATION:g}.",
+        is_too_small | (magnitudes > _MAX_INFORMATION_ELEMENT),
+        "an element of the information matrix of this edge is too large or too close to 0",
+        f"Give 0, or ±{_MIN_INFORMATION_ELEMENT:g} to ±{_MAX_INFORMATION_ELEMENT:g}.",
     )
     eigenvalues = np.linalg.eigvalsh(matrices)
     edges.raise_where(

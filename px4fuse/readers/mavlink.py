@@ -44,7 +44,7 @@ from px4fuse.readers.mavlink_recording import (
     read_recording,
 )
 from px4fuse.readers.px4_positions import barometer
-from px4fuse.readers.ulog_topics import SINGLE_INSTANCE, describe_dropped_samples
+from px4fuse.readers.ulog_topics import NO_INSTANCE_SWITCHES, describe_dropped_samples
 
 VARIANCE_COLUMNS = Columns.POSITION_VARIANCE + Columns.VELOCITY_VARIANCE
 # MAV_PARAM_TYPE_REAL32; types with smaller numbers are integers
@@ -69,7 +69,7 @@ def read_mavlink(name: str, content: bytes, system_id: int | None = None) -> Fli
     frames = read_frames(name, content)
     address, autopilot = senders.choose_autopilot(frames, system_id)
     recording = read_recording(frames, address)
-    clock_mappings = senders.map_senders(recording)
+    clock_mappings = senders.map_sender_clocks(recording)
     parameters, replaced_parameter_notes = replace_invalid_parameters(
         _read_parameters(recording, autopilot)
     )
@@ -98,7 +98,7 @@ def read_mavlink(name: str, content: bytes, system_id: int | None = None) -> Fli
         airborne=airborne_spans_s,
         barometer=barometer(compute_pressure_altitude_m(pressure_hpa)),
         missing=(*common.collect_unavailable(imu, attitude, ekf2, truth), *unavailable_positions),
-        streams=recording.streams,
+        streams=recording.data_source_by_kind,
         clocks=senders.describe_clock_conversions(recording, clock_mappings),
         unused=tuple(
             UnusedData(name, count, reason)
@@ -164,39 +164,42 @@ def _read_ekf2(
     samples = recording.read(layout)
     state = samples[Columns.STATE].dropna()
     if len(state) < 2:
-        reason = f"{message_name} contains no finite EKF2 state"
-        return Unavailable("EKF2", reason, "Start the recording after EKF2 has started.")
+        return Unavailable(
+            "EKF2",
+            f"{message_name} contains no finite EKF2 state",
+            "Start the recording after EKF2 has started.",
+        )
     recording.record_stream("ekf2_state", message_name)
     notes = [f"the EKF2 state is from the autopilot's {message_name} messages"]
     if autopilot != "PX4":
-        notes.append(f"in this analysis, EKF2 means the estimator of {autopilot}")
+        notes.append(f"the results call the estimator of {autopilot} EKF2")
     if "reset_counter" in samples and (
         reset_count := np.count_nonzero(samples["reset_counter"].diff()[1:])
     ):
         notes.append(
-            f"EKF2 reset its state {reset_count} times; the resets were not removed, because "
-            "ODOMETRY does not contain the size of a reset"
+            f"EKF2 reset its state {reset_count} times. The state still contains these steps, "
+            "because ODOMETRY does not contain their size"
         )
     variance = samples.reindex(columns=VARIANCE_COLUMNS)
     variance = variance[(variance > 0.0).all(axis=1)]
     if variance.empty:
         message_name = messages.MESSAGE_LAYOUTS["accuracy"].topic
-        variance = _compute_accuracy_variance(recording)
+        variance = _compute_variance_from_accuracy(recording)
         if len(variance):
             notes.append(
-                "the EKF2 position variances are from ESTIMATOR_STATUS (variance of each "
-                "horizontal axis = pos_horiz_accuracy² / 2); velocity variances are not sent"
+                "EKF2's position variances are from ESTIMATOR_STATUS: pos_horiz_accuracy² / 2 "
+                "along each horizontal axis. Velocity variances are not sent"
             )
     if len(variance):
         recording.record_stream("ekf2_variance", message_name)
-    missing_variance = Unavailable(
+    unavailable_variance = Unavailable(
         "EKF2 variances",
         "the recording has no ODOMETRY with covariance and no ESTIMATOR_STATUS",
         remedies["variance"],
     )
     return Ekf2(
         state=state,
-        variance=variance if len(variance) else missing_variance,
+        variance=variance if len(variance) else unavailable_variance,
         innovations={
             axis: Unavailable(
                 f"EKF2 innovations, {axis}",
@@ -212,14 +215,14 @@ def _read_ekf2(
             remedies["innovations"],
         ),
         resets=(),
-        instances=SINGLE_INSTANCE,
+        instances=NO_INSTANCE_SWITCHES,
         gate=fill_with_defaults(parameters)[EV_POS.gate],
         notes=tuple(notes),
         record=replay_unavailable,
     )
 
 
-def _compute_accuracy_variance(recording: Recording) -> pd.DataFrame:
+def _compute_variance_from_accuracy(recording: Recording) -> pd.DataFrame:
     """Compute position variances (m²) from the accuracies (1 σ, m) in ESTIMATOR_STATUS.
 
     PX4's horizontal accuracy is the square root of the sum of both axes' variances
@@ -274,7 +277,7 @@ def _describe_log(
 ) -> LogInfo:
     frames = recording.frames
     damage_notes = []
-    if frames.ends_in_frame:
+    if frames.is_last_frame_incomplete:
         damage_notes.append(common.format_truncation("frame", recording.duration_s, is_in_flight))
     firmware = f"{autopilot}, unknown version"
     firmware_hash = "unknown"
@@ -317,7 +320,7 @@ def _describe_log(
         vehicle=vehicle_id,
         damage=(*damage_notes, *recording.damage_notes),
         ends_in_flight=is_in_flight,
-        bytes_read=len(frames.content) - frames.bad_byte_count,
+        bytes_read=len(frames.content) - frames.byte_count_outside_frames,
     )
 
 
@@ -333,7 +336,7 @@ def _estimate_start_unix_s(recording: Recording) -> float | None:
     if boot_to_unix_fit is not None:
         return float(boot_to_unix_fit.at(recording.time_origin_s))
     receive_times_us = recording.frames.receive_times_us
-    if receive_times_us is None or not recording.receipt_to_boot_fit.pair_count:
+    if receive_times_us is None or not recording.receipt_to_boot_fit.reading_pair_count:
         return None
     return float(
         receive_times_us[0] * 1e-6

@@ -16,25 +16,26 @@ from scipy.stats import theilslopes
 from px4fuse.core.arrays import Array
 from px4fuse.flight.model import ClockMap
 
-# Timestamps whose median difference (s) from their receive times is larger are not of the boot
-# clock
+# Maximum median difference (s) between boot times and the receive times on the boot clock. With a
+# larger difference, the timestamps are from another clock
 MAX_BOOT_TIME_DIFFERENCE_S = 10.0
-# If TIMESYNC reduces the difference between timestamps and receive times by at least this time (s),
-# the sender has its own clock, not the autopilot's boot clock
-MIN_TIMESYNC_IMPROVEMENT_S = 0.1
+# Minimum reduction (s) by TIMESYNC of the difference between timestamps and receive times. With a
+# smaller reduction, the timestamps are already boot times
+MIN_REDUCTION_BY_TIMESYNC_S = 0.1
 # Minimum UNIX time (s), 2001-09-09: smaller times are times since boot
 MIN_UNIX_TIME_S = 1e9
-# The clock fit uses one message per interval of this length (s): the one with the least delay
-ENVELOPE_INTERVAL_S = 2.0
-MAX_ENVELOPE_INTERVALS = 200
+# The clock fit uses one message per interval of this length (s): the message with the least delay
+CLOCK_FIT_INTERVAL_S = 2.0
+MAX_CLOCK_FIT_INTERVALS = 200
 # Minimum time span (s) to estimate a clock drift; for a shorter span, the drift is assumed to be 0
 MIN_DRIFT_SPAN_S = 30.0
 # Maximum relative difference between the rates of two clocks. If the difference is larger, the
 # recording was replayed faster or slower than real time
-MAX_RELATIVE_RATE_DIFFERENCE = 0.01
-# Maximum valid ratio of the rates of two clocks: above 1e9, that of a wrong unit (s for ns)
-MAX_CLOCK_RATE_RATIO = 1e12
-MIN_TIMESYNC_PAIRS = 3
+MAX_RELATIVE_CLOCK_RATE_DIFFERENCE = 0.01
+# Maximum valid ratio of the rates of two clocks. It is above 1e9, the ratio of a clock in ns that
+# was read as s, because the fit corrects this error
+MAX_RATIO_OF_CLOCK_RATES = 1e12
+MIN_TIMESYNC_REPLIES = 3
 # Minimum fraction of distinct timestamps of a running clock
 MIN_DISTINCT_TIME_FRACTION = 0.1
 # Maximum regular interval (s) between positions: a longer interval is a gap
@@ -47,15 +48,16 @@ class ClockLine:
 
     y = y0 + slope · (x - x0).
 
-    ``pair_count`` is the number of pairs x, y to which the line is fitted. ``jitter_s`` (unit of y)
-    is their robust standard deviation from the line, 1.4826 · median absolute deviation.
+    ``reading_pair_count`` is the number of pairs x, y to which the line is fitted. ``jitter_s``
+    (unit of y) is their robust standard deviation from the line, 1.4826 · median absolute
+    deviation.
     """
 
     x0: float
     y0: float
     slope: float
     jitter_s: float
-    pair_count: int
+    reading_pair_count: int
 
     def at(self, x: Array | float) -> Array:
         """Return the readings y of the target clock at readings x of the source clock."""
@@ -64,7 +66,7 @@ class ClockLine:
     def inverse(self) -> ClockLine:
         """Return the inverse map, from y to x."""
         return ClockLine(
-            self.y0, self.x0, 1.0 / self.slope, self.jitter_s / self.slope, self.pair_count
+            self.y0, self.x0, 1.0 / self.slope, self.jitter_s / self.slope, self.reading_pair_count
         )
 
 
@@ -79,33 +81,40 @@ def fit_clock_line(x: Array, y: Array) -> ClockLine:
     y = y[time_order]
     x0 = float(x[len(x) // 2])
     span_s = float(x[-1] - x[0])
-    interval_count = int(np.clip(span_s / ENVELOPE_INTERVAL_S, 1, MAX_ENVELOPE_INTERVALS))
+    interval_count = int(np.clip(span_s / CLOCK_FIT_INTERVAL_S, 1, MAX_CLOCK_FIT_INTERVALS))
     interval_starts = np.searchsorted(x, np.linspace(x[0], x[-1], interval_count + 1)[1:-1])
-    interval_rows = [rows for rows in np.split(np.arange(len(x)), interval_starts) if len(rows)]
+    rows_by_interval = [rows for rows in np.split(np.arange(len(x)), interval_starts) if len(rows)]
     slope = 1.0
-    middle_rows = [rows[len(rows) // 2] for rows in interval_rows]
+    middle_rows = [rows[len(rows) // 2] for rows in rows_by_interval]
     if len(middle_rows) > 1 and x[middle_rows[-1]] > x[middle_rows[0]]:
         initial_slope = _compute_median_slope(x[middle_rows], y[middle_rows])
-        if abs(initial_slope - 1.0) > MAX_RELATIVE_RATE_DIFFERENCE and _is_plausible_rate_ratio(
-            initial_slope
-        ):
+        if abs(
+            initial_slope - 1.0
+        ) > MAX_RELATIVE_CLOCK_RATE_DIFFERENCE and _is_plausible_rate_ratio(initial_slope):
             slope = initial_slope
 
-    def find_envelope(slope: float) -> tuple[Array, list[int]]:
-        residual_s = y - slope * (x - x0)
-        return residual_s, [rows[np.argmin(residual_s[rows])] for rows in interval_rows]
+    def find_least_delays(slope: float) -> tuple[Array, list[int]]:
+        relative_delay_s = y - slope * (x - x0)
+        return relative_delay_s, [
+            rows[np.argmin(relative_delay_s[rows])] for rows in rows_by_interval
+        ]
 
-    residual_s, envelope_rows = find_envelope(slope)
-    if span_s >= MIN_DRIFT_SPAN_S and len(envelope_rows) > 1:
-        # Two iterations, because the slope determines which messages have the smallest delay
+    relative_delay_s, least_delay_rows = find_least_delays(slope)
+    if span_s >= MIN_DRIFT_SPAN_S and len(least_delay_rows) > 1:
+        # The slope is fitted twice, because a corrected slope changes which messages have the least
+        # delay
         for _ in range(2):
             corrected_slope = slope + _compute_median_slope(
-                x[envelope_rows], residual_s[envelope_rows]
+                x[least_delay_rows], relative_delay_s[least_delay_rows]
             )
             slope = corrected_slope if _is_plausible_rate_ratio(corrected_slope) else 1.0
-            residual_s, envelope_rows = find_envelope(slope)
+            relative_delay_s, least_delay_rows = find_least_delays(slope)
     return ClockLine(
-        x0, float(np.median(residual_s[envelope_rows])), slope, robust_std(residual_s), len(x)
+        x0,
+        float(np.median(relative_delay_s[least_delay_rows])),
+        slope,
+        robust_std(relative_delay_s),
+        len(x),
     )
 
 
@@ -116,7 +125,7 @@ def _compute_median_slope(x: Array, y: Array) -> float:
 
 
 def _is_plausible_rate_ratio(slope: float) -> bool:
-    return 1.0 / MAX_CLOCK_RATE_RATIO < slope < MAX_CLOCK_RATE_RATIO
+    return 1.0 / MAX_RATIO_OF_CLOCK_RATES < slope < MAX_RATIO_OF_CLOCK_RATES
 
 
 def is_running_clock(timestamps_s: Array) -> bool:
@@ -133,14 +142,15 @@ def robust_std(values: Array) -> float:
 class ClockMapping:
     """Conversion of a sender's timestamps to the autopilot's boot clock, with its description.
 
-    ``sender_to_boot_fit`` is None if most timestamps are equal: receive times then replace them.
+    ``sender_to_boot_fit`` is None if most timestamps are equal. Receive times then replace the
+    timestamps.
     """
 
     sender_to_boot_fit: ClockLine | None
     description: ClockMap
 
 
-def map_clock(
+def map_clock_to_boot(
     name: str,
     timestamps_s: Array,
     receive_times_s: Array,
@@ -160,9 +170,11 @@ def map_clock(
     receipt_to_boot_fit : ClockLine
         Conversion of receive times to the boot clock.
     sender_replies : tuple of ndarray
-        Times (s) of the autopilot's TIMESYNC requests, and of the sender's replies.
+        Replies of the sender to TIMESYNC requests: request times (s) on the boot clock, and reply
+        times (s) on the sender's clock.
     autopilot_replies : tuple of ndarray
-        Times (s) of the sender's TIMESYNC requests, and of the autopilot's replies.
+        Replies of the autopilot to TIMESYNC requests: request times (s) on the sender's clock, and
+        reply times (s) on the boot clock.
     boot_to_unix_fit : ClockLine or None
         Conversion of the boot clock to UNIX time, from the autopilot's SYSTEM_TIME.
     has_receive_times : bool
@@ -185,21 +197,21 @@ def map_clock(
         )
         return ClockMapping(None, description)
 
-    def compute_receipt_difference_s(boot_time_s: Array) -> float:
+    def compute_difference_from_receipt_s(boot_time_s: Array) -> float:
         return abs(float(np.median(boot_time_at_receipt_s - boot_time_s)))
 
     timesync_fit = _fit_timesync(sender_replies, autopilot_replies)
-    receipt_difference_s = compute_receipt_difference_s(timestamps_s)
+    difference_from_receipt_s = compute_difference_from_receipt_s(timestamps_s)
     # A clock that started seconds after the boot clock looks like the boot clock, unless TIMESYNC
     # reduces the difference from the receive times
-    receipt_difference_reduction_s = 0.0
+    reduction_by_timesync_s = 0.0
     if timesync_fit is not None:
-        receipt_difference_reduction_s = receipt_difference_s - compute_receipt_difference_s(
+        reduction_by_timesync_s = difference_from_receipt_s - compute_difference_from_receipt_s(
             timesync_fit.at(timestamps_s)
         )
     if (
-        receipt_difference_s <= MAX_BOOT_TIME_DIFFERENCE_S
-        and receipt_difference_reduction_s < MIN_TIMESYNC_IMPROVEMENT_S
+        difference_from_receipt_s <= MAX_BOOT_TIME_DIFFERENCE_S
+        and reduction_by_timesync_s < MIN_REDUCTION_BY_TIMESYNC_S
     ):
         sender_to_boot_fit = ClockLine(
             float(timestamps_s[0]), float(timestamps_s[0]), 1.0, 0.0, len(timestamps_s)
@@ -215,10 +227,10 @@ def map_clock(
         unix_note = "assumption: the UNIX clocks of sender and autopilot are synchronised"
         candidate_fits.append(("SYSTEM_TIME", boot_to_unix_fit.inverse(), unix_note))
     for method, sender_to_boot_fit, note in candidate_fits:
-        # If the converted timestamps disagree with the receive times, the conversion is of another
-        # clock than the timestamps
+        # If the converted timestamps disagree with the receive times, the conversion belongs to
+        # another clock
         if (
-            compute_receipt_difference_s(sender_to_boot_fit.at(timestamps_s))
+            compute_difference_from_receipt_s(sender_to_boot_fit.at(timestamps_s))
             <= MAX_BOOT_TIME_DIFFERENCE_S
         ):
             return _make_clock_mapping(clock_name, method, sender_to_boot_fit, timestamps_s, note)
@@ -227,8 +239,8 @@ def map_clock(
     y0 = float(receipt_to_boot_fit.at(sender_to_boot_fit.y0))
     sender_to_boot_fit = replace(sender_to_boot_fit, y0=y0, slope=slope)
     note = (
-        "the recording has no usable TIMESYNC or SYSTEM_TIME: all sample times are too late by the "
-        "minimum link delay, which is unknown"
+        "the recording has no usable TIMESYNC or SYSTEM_TIME. All sample times are too late by the "
+        "minimum delay of the link, which is unknown"
     )
     return _make_clock_mapping(clock_name, time_source, sender_to_boot_fit, timestamps_s, note)
 
@@ -237,26 +249,28 @@ def _fit_timesync(
     sender_replies: tuple[Array, Array], autopilot_replies: tuple[Array, Array]
 ) -> ClockLine | None:
     """Fit the relation of sender clock to boot clock by TIMESYNC, averaged over both directions."""
-    clock_lines = []
-    if len(sender_replies[0]) >= MIN_TIMESYNC_PAIRS:
+    clock_fits = []
+    if len(sender_replies[0]) >= MIN_TIMESYNC_REPLIES:
         # The autopilot's request (boot time) is before the sender's reply, so the fit converts boot
         # to sender time
-        clock_lines.append(fit_clock_line(*sender_replies).inverse())
-    if len(autopilot_replies[0]) >= MIN_TIMESYNC_PAIRS:
-        clock_lines.append(fit_clock_line(*autopilot_replies))
-    if not clock_lines:
+        clock_fits.append(fit_clock_line(*sender_replies).inverse())
+    if len(autopilot_replies[0]) >= MIN_TIMESYNC_REPLIES:
+        clock_fits.append(fit_clock_line(*autopilot_replies))
+    if not clock_fits:
         return None
-    x0 = clock_lines[0].x0
-    line_parameters = [(float(line.at(x0)), line.slope, line.jitter_s) for line in clock_lines]
+    x0 = clock_fits[0].x0
+    line_parameters = [(float(line.at(x0)), line.slope, line.jitter_s) for line in clock_fits]
     y0, slope, jitter_s = np.mean(line_parameters, axis=0).tolist()
-    return ClockLine(x0, y0, slope, jitter_s, sum(line.pair_count for line in clock_lines))
+    return ClockLine(x0, y0, slope, jitter_s, sum(line.reading_pair_count for line in clock_fits))
 
 
 def _make_clock_mapping(
     clock: str, method: str, line: ClockLine, timestamps_s: Array, note: str
 ) -> ClockMapping:
-    middle_s = float(0.5 * (timestamps_s.min() + timestamps_s.max()))
-    offset_s = float(line.at(middle_s)) - middle_s
+    middle_timestamp_s = float(0.5 * (timestamps_s.min() + timestamps_s.max()))
+    offset_s = float(line.at(middle_timestamp_s)) - middle_timestamp_s
     drift_ppm = (line.slope - 1.0) * 1e6
-    description = ClockMap(clock, method, line.pair_count, offset_s, drift_ppm, line.jitter_s, note)
+    description = ClockMap(
+        clock, method, line.reading_pair_count, offset_s, drift_ppm, line.jitter_s, note
+    )
     return ClockMapping(line, description)

@@ -81,9 +81,9 @@ class MavlinkFrames:
     # Number of complete frames with messages that are not in the dialect
     unknown_frame_count: int
     # Number of bytes that are not part of a frame
-    bad_byte_count: int
+    byte_count_outside_frames: int
     # True if the file ends within a frame
-    ends_in_frame: bool
+    is_last_frame_incomplete: bool
     # Number of damaged receive times
     damaged_receive_time_count: int
 
@@ -116,14 +116,16 @@ class MavlinkFrames:
         for length in np.unique(payload_lengths).tolist():
             byte_count = min(length, layout.itemsize)
             if byte_count:
-                rows_of_length = np.flatnonzero(payload_lengths == length)
-                payload_windows = np.lib.stride_tricks.sliding_window_view(
+                rows_with_length = np.flatnonzero(payload_lengths == length)
+                bytes_by_start_offset = np.lib.stride_tricks.sliding_window_view(
                     content_bytes, byte_count
                 )
                 # Indexing copies the payloads, so frames are decoded in batches
-                for batch_start in range(0, len(rows_of_length), DECODE_BATCH_SIZE):
-                    batch_rows = rows_of_length[batch_start : batch_start + DECODE_BATCH_SIZE]
-                    payload[batch_rows, :byte_count] = payload_windows[payload_starts[batch_rows]]
+                for batch_start in range(0, len(rows_with_length), DECODE_BATCH_SIZE):
+                    batch_rows = rows_with_length[batch_start : batch_start + DECODE_BATCH_SIZE]
+                    payload[batch_rows, :byte_count] = bytes_by_start_offset[
+                        payload_starts[batch_rows]
+                    ]
         return payload.view(layout)[:, 0]
 
 
@@ -175,8 +177,10 @@ def read_frames(name: str, content: bytes) -> MavlinkFrames:
     is_version_2 = content_bytes[start_offsets] == MAGIC_BYTE_V2
     # Sequence, system and component are consecutive bytes of the header
     sequence_offsets = start_offsets + np.where(is_version_2, 4, 2)
-    unknown_frame_count, bad_byte_count, ends_in_frame = _count_other_bytes(
-        content, start_offsets - receive_time_bytes, end_offsets, receive_time_bytes
+    unknown_frame_count, byte_count_outside_frames, is_last_frame_incomplete = (
+        _count_bytes_outside_frames(
+            content, start_offsets - receive_time_bytes, end_offsets, receive_time_bytes
+        )
     )
     receive_times_us, damaged_receive_time_count = (
         _read_receive_times(content_bytes, start_offsets, end_offsets)
@@ -196,8 +200,8 @@ def read_frames(name: str, content: bytes) -> MavlinkFrames:
         payload_lengths=content_bytes[start_offsets + 1],
         receive_times_us=receive_times_us,
         unknown_frame_count=unknown_frame_count,
-        bad_byte_count=bad_byte_count,
-        ends_in_frame=ends_in_frame,
+        byte_count_outside_frames=byte_count_outside_frames,
+        is_last_frame_incomplete=is_last_frame_incomplete,
         damaged_receive_time_count=damaged_receive_time_count,
     )
 
@@ -225,9 +229,9 @@ def _find_valid_frames(content: bytes) -> Int64Array:
 def _remove_nested_frames(frames: Int64Array) -> Int64Array:
     """Remove frames that overlap with another frame.
 
-    The payload of TUNNEL may contain a frame, and a receive time may look like a frame header. Of
-    two overlapping frames, the one that begins where the previous frame or its receive time ends is
-    kept.
+    Frames overlap if a payload contains a frame (message TUNNEL), or if a receive time looks like a
+    frame header. The kept frame begins directly after the previous frame, or after the receive time
+    that follows the previous frame.
     """
     if not np.any(frames[1:, 0] < frames[:-1, 1]):
         return frames
@@ -235,11 +239,12 @@ def _remove_nested_frames(frames: Int64Array) -> Int64Array:
     end_offsets = frames[:, 1].tolist()
     kept_rows = []
     previous_end = 0
-    known_starts = {*start_offsets}
+    all_frame_starts = {*start_offsets}
     for row, frame_start in enumerate(start_offsets):
-        expected_starts = previous_end, previous_end + RECEIVE_TIME_BYTES
+        expected_frame_starts = previous_end, previous_end + RECEIVE_TIME_BYTES
         if frame_start >= previous_end and (
-            frame_start in expected_starts or known_starts.isdisjoint(expected_starts)
+            frame_start in expected_frame_starts
+            or all_frame_starts.isdisjoint(expected_frame_starts)
         ):
             kept_rows.append(row)
             previous_end = end_offsets[row]
@@ -249,10 +254,10 @@ def _remove_nested_frames(frames: Int64Array) -> Int64Array:
 def _find_possible_frames(
     content_bytes: ByteArray, block_start: int
 ) -> tuple[Int64Array, Int64Array]:
-    """Find frames whose checksum is not tested yet.
+    """Find the frames that begin in one block of the file, before their checksum is tested.
 
-    Return first byte, end and message id of each frame, shape (n, 3), and the offset of each
-    checksum, shape (n,). Only the block of BLOCK_BYTES from ``block_start`` is searched.
+    The block has BLOCK_BYTES and begins at ``block_start``. Return first byte, end and message id
+    of each possible frame, shape (n, 3), and the offset of its checksum, shape (n,).
     """
     block = content_bytes[block_start : block_start + BLOCK_BYTES]
     start_offsets = block_start + np.flatnonzero(
@@ -288,15 +293,15 @@ def _find_possible_frames(
 
 def _has_receive_times(start_offsets: Int64Array, end_offsets: Int64Array) -> bool:
     """Return True if a receive time of eight bytes precedes most frames, as in a ``.tlog``."""
-    gap_bytes = start_offsets[1:] - end_offsets[:-1]
-    timed_frame_count = int(np.count_nonzero(gap_bytes == RECEIVE_TIME_BYTES))
-    untimed_frame_count = int(np.count_nonzero(gap_bytes == 0))
-    if timed_frame_count + untimed_frame_count:
-        return timed_frame_count > untimed_frame_count
+    gap_sizes_bytes = start_offsets[1:] - end_offsets[:-1]
+    frame_count_with_receive_time = int(np.count_nonzero(gap_sizes_bytes == RECEIVE_TIME_BYTES))
+    frame_count_without_receive_time = int(np.count_nonzero(gap_sizes_bytes == 0))
+    if frame_count_with_receive_time + frame_count_without_receive_time:
+        return frame_count_with_receive_time > frame_count_without_receive_time
     return bool(start_offsets[0] == RECEIVE_TIME_BYTES)
 
 
-def _count_other_bytes(
+def _count_bytes_outside_frames(
     content: bytes, start_offsets: Int64Array, end_offsets: Int64Array, receive_time_bytes: int
 ) -> tuple[int, int, bool]:
     """Count the frames of unknown messages, and all other bytes that are not in valid frames.
@@ -305,25 +310,27 @@ def _count_other_bytes(
     the receive time before each frame: 8, or 0 without receive times.
     """
     unknown_frame_count = 0
-    bad_byte_count = 0
-    last_bytes = b""
-    gap_starts = np.append(0, end_offsets)
-    gap_ends = np.append(start_offsets, len(content))
-    for gap_start, gap_end in np.column_stack([gap_starts, gap_ends])[
-        gap_starts < gap_ends
+    byte_count_outside_frames = 0
+    bytes_after_last_frame = b""
+    gap_start_offsets = np.append(0, end_offsets)
+    gap_end_offsets = np.append(start_offsets, len(content))
+    for gap_start, gap_end in np.column_stack([gap_start_offsets, gap_end_offsets])[
+        gap_start_offsets < gap_end_offsets
     ].tolist():
         offset = gap_start
         for frame_bytes in _measure_unknown_frames(content, gap_start, gap_end, receive_time_bytes):
             unknown_frame_count += 1
             offset += frame_bytes
-        bad_byte_count += gap_end - offset
-        last_bytes = content[offset:gap_end] if gap_end == len(content) else b""
-    begins_frame = {*last_bytes[receive_time_bytes : receive_time_bytes + 1]} <= {
+        byte_count_outside_frames += gap_end - offset
+        bytes_after_last_frame = content[offset:gap_end] if gap_end == len(content) else b""
+    begins_frame = {*bytes_after_last_frame[receive_time_bytes : receive_time_bytes + 1]} <= {
         MAGIC_BYTE_V1,
         MAGIC_BYTE_V2,
     }
-    ends_in_frame = 0 < len(last_bytes) < receive_time_bytes + MAX_FRAME_BYTES and begins_frame
-    return unknown_frame_count, bad_byte_count, ends_in_frame
+    is_last_frame_incomplete = (
+        0 < len(bytes_after_last_frame) < receive_time_bytes + MAX_FRAME_BYTES and begins_frame
+    )
+    return unknown_frame_count, byte_count_outside_frames, is_last_frame_incomplete
 
 
 def _measure_unknown_frames(
@@ -361,7 +368,7 @@ def _read_receive_times(
     is_usable = start_offsets >= RECEIVE_TIME_BYTES
     is_usable[1:] &= start_offsets[1:] - end_offsets[:-1] >= RECEIVE_TIME_BYTES
     eight_byte_windows = np.lib.stride_tricks.sliding_window_view(content_bytes, RECEIVE_TIME_BYTES)
-    # The file may begin without the receive time of the first frame
+    # If the first frame has no receive time, other bytes are read here, but not marked as usable
     unchecked_receive_times_us = np.ascontiguousarray(
         eight_byte_windows[np.maximum(start_offsets - RECEIVE_TIME_BYTES, 0)]
     ).view(">u8")[:, 0]

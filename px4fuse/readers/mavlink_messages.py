@@ -14,7 +14,7 @@ from px4fuse.flight.model import RECORD_NOT_LOGGED, SourceOrigin, Unavailable, f
 from px4fuse.readers.field_maps import Layout, expand_layouts
 
 AUTOPILOT_COMPONENT_ID = 1  # MAV_COMP_ID_AUTOPILOT1
-INVALID_AUTOPILOT = 8  # MAV_AUTOPILOT_INVALID: sent by ground stations, cameras, companions
+NO_AUTOPILOT = 8  # MAV_AUTOPILOT_INVALID: sent by ground stations, cameras, companions
 GROUND_STATION_TYPE = 6  # MAV_TYPE_GCS
 ON_GROUND_STATE = 1  # MAV_LANDED_STATE_ON_GROUND
 ARDUPILOT_REPLAY_UNAVAILABLE = Unavailable(
@@ -43,8 +43,8 @@ AUTOPILOT_MESSAGES = (
 class PositionMessageType:
     """Message type that carries an external position to the autopilot: fields, frame, clock."""
 
-    # Key of the message's fields in MESSAGE_LAYOUTS
-    row: str
+    # Key in MESSAGE_LAYOUTS of the fields that are read from this message
+    layout_name: str
     description: str
     # Name of the position source for the option --position-source
     track_name: str = ""
@@ -54,13 +54,13 @@ class PositionMessageType:
     # Field with the sender's timestamp (µs)
     timestamp_field: str = "time_usec"
     # Required MAV_ESTIMATOR_TYPE, if any
-    estimator: int | None = None
+    estimator_type: int | None = None
     # True if PX4 ignores the covariance: MAV_ESTIMATOR_TYPE_NAIVE (mavlink_receiver.cpp)
     drops_covariance: bool = False
 
     @property
     def layout(self) -> Layout:
-        return MESSAGE_LAYOUTS[self.row]
+        return MESSAGE_LAYOUTS[self.layout_name]
 
     @property
     def origin(self) -> SourceOrigin:
@@ -72,23 +72,23 @@ class PositionMessageType:
 
 
 @dataclass(frozen=True)
-class FrameOfReference:
+class FrameConversion:
     """Conversion of vectors in a MAV_FRAME to NED or FRD: order and signs of the components."""
 
     name: str
-    order: tuple[int, int, int] = (0, 1, 2)
-    signs: tuple[float, float, float] = (1.0, 1.0, 1.0)
-    body: bool = False
+    axis_order: tuple[int, int, int] = (0, 1, 2)
+    axis_signs: tuple[float, float, float] = (1.0, 1.0, 1.0)
+    is_body_frame: bool = False
 
 
 _MESSAGE_TABLES = read_toml(__file__, dict[str, dict[str, Any]])
 MESSAGE_LAYOUTS = expand_layouts(_MESSAGE_TABLES["layouts"])
-assert not any(layout.optional for layout in MESSAGE_LAYOUTS.values()), (
+assert not any(layout.optional_columns for layout in MESSAGE_LAYOUTS.values()), (
     "mavlink_messages.toml has optional fields, which the MAVLink reader ignores"
 )
 _TYPE_BY_TRACK_NAME = msgspec.convert(_MESSAGE_TABLES["positions"], dict[str, PositionMessageType])
-FRAMES_OF_REFERENCE = msgspec.convert(
-    _MESSAGE_TABLES["frames"], dict[int, FrameOfReference], strict=False
+CONVERSION_BY_MAV_FRAME = msgspec.convert(
+    _MESSAGE_TABLES["frames"], dict[int, FrameConversion], strict=False
 )
 AUTOPILOT_NAME_BY_ID = msgspec.convert(_MESSAGE_TABLES["autopilots"], dict[int, str], strict=False)
 REASON_BY_UNUSED_MESSAGE: Mapping[str, str] = _MESSAGE_TABLES["unused"]
@@ -113,7 +113,10 @@ GNSS_LAYOUTS = (MESSAGE_LAYOUTS["gnss"], replace(MESSAGE_LAYOUTS["gnss"], topic=
 
 
 def remedies_of_autopilot(autopilot: str) -> tuple[Mapping[str, str], Unavailable]:
-    """Return advice on recording each missing kind of data, and why EKF2 cannot be replayed."""
+    """Return advice for missing data, and the reason why the estimator cannot be replayed.
+
+    The advice is a sentence for each kind of data, such as "imu", with the message to record.
+    """
     if autopilot == "ArduPilot":
         return _MESSAGE_TABLES["remedies"][autopilot], ARDUPILOT_REPLAY_UNAVAILABLE
     return _MESSAGE_TABLES["remedies"]["PX4"], RECORD_NOT_LOGGED

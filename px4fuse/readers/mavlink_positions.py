@@ -85,8 +85,8 @@ def _read_track(
     """Read the positions in one message type from one sender; None if it sent no such message."""
     rows = recording.rows(source.message, sender)
     table = recording.frames.table(source.message, rows)
-    if source.estimator is not None:
-        is_of_estimator = table["estimator_type"] == source.estimator
+    if source.estimator_type is not None:
+        is_of_estimator = table["estimator_type"] == source.estimator_type
         rows = rows[is_of_estimator]
         table = table[is_of_estimator]
     if not len(rows):
@@ -102,8 +102,8 @@ def _read_track(
     frame = source.frame
     if "frame_id" in samples and len(samples):
         # A track has one coordinate frame: the frame of the last sample, as in PX4
-        reference_frame = messages.FRAMES_OF_REFERENCE.get(int(samples["frame_id"].iloc[-1]))
-        frame = "unknown" if reference_frame is None else reference_frame.name
+        frame_conversion = messages.CONVERSION_BY_MAV_FRAME.get(int(samples["frame_id"].iloc[-1]))
+        frame = "unknown" if frame_conversion is None else frame_conversion.name
     if source.drops_covariance:
         samples[Columns.POSITION_VARIANCE + Columns.ROTATION_VARIANCE] = np.nan
     orientation = read_orientation(samples)
@@ -137,15 +137,15 @@ def _read_gnss(
         return None
     message_count = len(rows)
     rows = rows[np.diff(recording.frames.table(layout.topic, rows)["time_usec"], prepend=0) > 0]
-    fix_boot_time_s = recording.frames.table(layout.topic, rows)["time_usec"] * 1e-6
+    gnss_boot_time_s = recording.frames.table(layout.topic, rows)["time_usec"] * 1e-6
     receipt_boot_times_s = recording.compute_receipt_boot_times_s(rows)
     if (
         len(rows)
-        and np.median(np.abs(receipt_boot_times_s - fix_boot_time_s)) > MAX_BOOT_TIME_DIFFERENCE_S
+        and np.median(np.abs(receipt_boot_times_s - gnss_boot_time_s)) > MAX_BOOT_TIME_DIFFERENCE_S
     ):
         # The timestamps are not boot times, for example UNIX times: use the receive times
-        fix_boot_time_s = receipt_boot_times_s
-    fixes = recording.read(layout, rows, fix_boot_time_s - delay_s)
+        gnss_boot_time_s = receipt_boot_times_s
+    fixes = recording.read(layout, rows, gnss_boot_time_s - delay_s)
     fixes = fixes[fixes["fix_type"] >= px4_positions.FIX_TYPE_3D]
     if len(fixes) < px4_positions.MIN_TRACK_SAMPLES:
         fix_count_text = "none" if fixes.empty else f"only {len(fixes)}"
@@ -165,7 +165,7 @@ def _read_gnss(
         structs.replace(GNSS_ORIGIN, is_auto_candidate=is_auto_candidate),
         description="GNSS position",
         frame="NED",
-        clock=f"{BOOT_CLOCK_TEXT} minus {1e3 * delay_s:g} ms",
+        clock=f"{BOOT_CLOCK_TEXT}: timestamp minus {1e3 * delay_s:g} ms",
         topics=(layout.topic,),
         log=recording.frames.name,
         assumed_delay_s=delay_s,
@@ -224,8 +224,7 @@ def read_truth(
         samples = samples.dropna(subset=Columns.GEODETIC[:2])
         if not samples["latitude_deg"].any():
             continue
-        columns = Columns.GEODETIC + Columns.VELOCITY + Columns.QUATERNION
-        samples = samples.reindex(columns=columns)
+        samples = samples.reindex(columns=Columns.GEODETIC + Columns.VELOCITY + Columns.QUATERNION)
         if not samples[Columns.VELOCITY].to_numpy().any():
             # Velocities that are zero in all samples were not sent
             samples[Columns.VELOCITY] = np.nan

@@ -25,14 +25,14 @@ from px4fuse.readers.mavlink_frames import (
     message_name,
     wire_layout,
 )
-from px4fuse.readers.mavlink_messages import BOOT_CLOCK_MESSAGES, FRAMES_OF_REFERENCE
+from px4fuse.readers.mavlink_messages import BOOT_CLOCK_MESSAGES, CONVERSION_BY_MAV_FRAME
 from px4fuse.readers.ulog_topics import longest_increasing_run
 from px4fuse.trajectory.rotation import rotate
 
 BOOT_CLOCK_TEXT = "autopilot boot clock"
 RECEIPT_CLOCK_TEXT = "autopilot boot clock, estimated from receive times"
 # Minimum backward step (s) of the boot clock at a restart; a smaller step is a late packet
-MIN_RESTART_STEP_S = 5.0
+MIN_BACKWARD_STEP_AT_RESTART_S = 5.0
 # Number of messages before and after a backward step of the boot clock that have to confirm a
 # restart
 RESTART_CHECK_MESSAGES = 20
@@ -43,8 +43,8 @@ MIN_TIMESTAMP_GROUP_FRACTION = 0.01
 MAX_TIME_OUTSIDE_FLIGHT_S = 60.0
 # A file is damaged if a larger fraction of its bytes is outside of MAVLink frames
 MAX_STRAY_BYTE_FRACTION = 0.002
-# Minimum number of timestamps for the conclusion from mostly equal values that the clock stands
-MIN_CONSTANT_TIMESTAMPS = 10
+# Minimum number of timestamps to detect a stopped clock, most of whose timestamps are equal
+MIN_STOPPED_CLOCK_TIMESTAMPS = 10
 
 
 @dataclass(eq=False)  # not frozen: the readers add streams and counts
@@ -55,13 +55,13 @@ class Recording:
     # Address of the autopilot of this flight
     address: MavlinkAddress
     # Analysed frames: the longest part of the recording between two restarts of the autopilot
-    session_frames: slice
+    analysed_frame_slice: slice
     # Receive time of each frame (s since the first frame). If the file contains no receive times,
     # the boot time of the last autopilot message before the frame replaces them
     receive_times_s: Array
     # Conversion of receive times to the boot clock
     receipt_to_boot_fit: ClockLine
-    # Boot time (s) at flight time zero: the start of the session
+    # Boot time (s) at flight time zero: the start of the analysed frames
     time_origin_s: float
     duration_s: float
     notes: list[str]
@@ -71,14 +71,16 @@ class Recording:
     receive_time_reversal_count: int | None = None
     # Number of samples with an invalid timestamp, by message
     dropped_count_by_message: dict[str, int] = field(default_factory=dict)
-    # Messages and clock of each kind of data in the flight
-    streams: dict[str, DataSource] = field(default_factory=dict)
+    # Messages that contain each kind of data, such as "imu", and the clock of their timestamps
+    data_source_by_kind: dict[str, DataSource] = field(default_factory=dict)
 
     def rows_of_all_senders(self, message: str) -> IntArray:
-        """Return the indices of the frames of one message type in the session, from all senders."""
+        """Return the indices of the analysed frames with one message type, from all senders."""
         rows = self.frames.rows(message)
         return np.asarray(
-            rows[(rows >= self.session_frames.start) & (rows < self.session_frames.stop)]
+            rows[
+                (rows >= self.analysed_frame_slice.start) & (rows < self.analysed_frame_slice.stop)
+            ]
         )
 
     def rows(self, message: str, address: MavlinkAddress | None = None) -> IntArray:
@@ -117,7 +119,7 @@ class Recording:
         boot_times_s = (
             self.compute_boot_times_s(table, rows) if boot_times_s is None else boot_times_s
         )
-        selected_rows = self._select_rows(name or layout.topic, boot_times_s)
+        selected_rows = self._find_rows_with_valid_time(name or layout.topic, boot_times_s)
         if len(selected_rows) < len(table):
             table = table[selected_rows]
         # One hour of IMU data has hundreds of megabytes, so fields are copied only once
@@ -139,7 +141,7 @@ class Recording:
             samples[Columns.QUATERNION] = attitude.as_quat(scalar_first=True)
         return _to_ned(samples) if "frame_id" in samples else samples
 
-    def _select_rows(self, name: str, boot_times_s: Array) -> IntArray:
+    def _find_rows_with_valid_time(self, name: str, boot_times_s: Array) -> IntArray:
         """Return the indices of valid and increasing boot times; count all others as dropped."""
         time_s = boot_times_s - self.time_origin_s
         is_inside = (time_s >= -MAX_TIME_OUTSIDE_FLIGHT_S) & (
@@ -148,24 +150,28 @@ class Recording:
         rows = np.flatnonzero(is_inside & (boot_times_s > 0.0))
         time_us = np.rint(boot_times_s[rows] * 1e6).astype(np.int64)
         # A message that is received twice, over two links, is one sample
-        first_copy_rows = np.sort(np.unique(time_us, return_index=True)[1])
-        increasing_time_rows = longest_increasing_run(time_us[first_copy_rows])
+        first_row_of_each_time = np.sort(np.unique(time_us, return_index=True)[1])
+        increasing_time_rows = longest_increasing_run(time_us[first_row_of_each_time])
         if (
             dropped_count := len(boot_times_s)
             - len(rows)
-            + len(first_copy_rows)
+            + len(first_row_of_each_time)
             - len(increasing_time_rows)
         ):
             self.dropped_count_by_message[name] = dropped_count
-        return np.asarray(rows[first_copy_rows[increasing_time_rows]])
+        return np.asarray(rows[first_row_of_each_time[increasing_time_rows]])
 
     def compute_receipt_boot_times_s(self, rows: IntArray) -> Array:
-        """Return receive times on the boot clock (s), minus the unknown minimum link delay."""
+        """Return receive times of frames, converted to the boot clock (s).
+
+        The minimum delay of the link is removed, because the conversion is fitted to the messages
+        with the least delay.
+        """
         return self.receipt_to_boot_fit.at(self.receive_times_s[rows])
 
     def compute_boot_times_s(self, table: NDArray[Any], rows: IntArray) -> Array:
         """Return the time since boot (s) of each message, or its receive time if it has none."""
-        if not self.receipt_to_boot_fit.pair_count:  # no message contains the boot clock
+        if not self.receipt_to_boot_fit.reading_pair_count:  # no message contains the boot clock
             return self.compute_receipt_boot_times_s(rows)
         if "time_boot_ms" in (table.dtype.names or ()):
             return np.asarray(table["time_boot_ms"] * 1e-3)
@@ -177,7 +183,7 @@ class Recording:
 
     def record_stream(self, data_kind: str, *messages: str, clock: str = BOOT_CLOCK_TEXT) -> None:
         """Store for the report which messages and clock supply data such as "imu"."""
-        self.streams[data_kind] = DataSource(messages, clock, self.frames.name)
+        self.data_source_by_kind[data_kind] = DataSource(messages, clock, self.frames.name)
 
 
 def _to_ned(samples: pd.DataFrame) -> pd.DataFrame:
@@ -190,55 +196,57 @@ def _to_ned(samples: pd.DataFrame) -> pd.DataFrame:
     quaternions = samples[Columns.QUATERNION].to_numpy(copy=True)
     has_quaternion = np.linalg.norm(quaternions, axis=1) > MIN_QUATERNION_NORM
     orientation = Columns.QUATERNION + Columns.ROTATION_VARIANCE
-    ned_samples = samples.copy()
-    ned_samples[Columns.STATE + Columns.POSITION_VARIANCE] = np.nan
-    ned_samples[Columns.VELOCITY_VARIANCE + orientation] = np.nan
-    for frame_number, frame in FRAMES_OF_REFERENCE.items():
-        is_body_frame = frame.body
+    converted_samples = samples.copy()
+    converted_samples[Columns.STATE + Columns.POSITION_VARIANCE] = np.nan
+    converted_samples[Columns.VELOCITY_VARIANCE + orientation] = np.nan
+    for frame_number, frame in CONVERSION_BY_MAV_FRAME.items():
+        is_body_frame = frame.is_body_frame
         is_in_frame = (samples["frame_id"] == frame_number) & (not is_body_frame)
         is_in_child_frame = (samples["child_frame_id"] == frame_number) & (
             has_quaternion | (not is_body_frame)
         )
-        if min(frame.signs) > 0.0:
-            ned_samples.loc[is_in_frame, orientation] = samples.loc[is_in_frame, orientation]
+        if min(frame.axis_signs) > 0.0:
+            converted_samples.loc[is_in_frame, orientation] = samples.loc[is_in_frame, orientation]
         for rows, vector_columns, variance_columns in (
             (is_in_frame, Columns.POSITION, Columns.POSITION_VARIANCE),
             (is_in_child_frame, Columns.VELOCITY, Columns.VELOCITY_VARIANCE),
         ):
-            vectors = samples.loc[rows, vector_columns].to_numpy()[:, frame.order] * frame.signs
-            variances = samples.loc[rows, variance_columns].to_numpy()[:, frame.order]
+            vectors = (
+                samples.loc[rows, vector_columns].to_numpy()[:, frame.axis_order] * frame.axis_signs
+            )
+            variances = samples.loc[rows, variance_columns].to_numpy()[:, frame.axis_order]
             if is_body_frame and rows.any():
                 rotation = Rotation.from_quat(quaternions[rows], scalar_first=True).as_matrix()
                 vectors = rotate(rotation, vectors)
-                # The variances in NED are the diagonal of R diag(σ²) Rᵀ
+                # Diagonal of R diag(σ²) Rᵀ, the covariance matrix in NED
                 variances = rotate(rotation**2, variances)
-            ned_samples.loc[rows, vector_columns] = vectors
-            ned_samples.loc[rows, variance_columns] = variances
-    return ned_samples
+            converted_samples.loc[rows, vector_columns] = vectors
+            converted_samples.loc[rows, variance_columns] = variances
+    return converted_samples
 
 
 def _read_boot_times(frames: MavlinkFrames, address: MavlinkAddress) -> tuple[IntArray, Array]:
     """Return the indices of the autopilot's frames with a time since boot, and these times (s)."""
     is_from_autopilot = frames.is_sent_by(address)
-    all_rows = [np.zeros(0, dtype=np.intp)]
-    all_times_s = [np.zeros(0)]
+    rows_by_message = [np.zeros(0, dtype=np.intp)]
+    times_by_message_s = [np.zeros(0)]
     for message_id in np.unique(frames.message_ids[is_from_autopilot]).tolist():
         name = message_name(message_id)
         if "time_boot_ms" in (wire_layout(message_id).names or ()):
-            field_name, unit_s = "time_boot_ms", 1e-3
+            field_name, seconds_per_unit = "time_boot_ms", 1e-3
         elif name in BOOT_CLOCK_MESSAGES:
-            field_name, unit_s = "time_usec", 1e-6
+            field_name, seconds_per_unit = "time_usec", 1e-6
         else:
             continue
         rows = frames.rows(name)
         rows = rows[is_from_autopilot[rows]]
-        all_rows.append(rows)
-        all_times_s.append(frames.table(name, rows)[field_name] * unit_s)
-    rows = np.concatenate(all_rows)
-    times_s = np.concatenate(all_times_s)
+        rows_by_message.append(rows)
+        times_by_message_s.append(frames.table(name, rows)[field_name] * seconds_per_unit)
+    rows = np.concatenate(rows_by_message)
+    times_s = np.concatenate(times_by_message_s)
     is_boot_time = (times_s > 0.0) & (times_s < MIN_UNIX_TIME_S)
     is_usable = is_boot_time if np.any(is_boot_time) else (times_s >= MIN_UNIX_TIME_S)
-    if is_usable.sum() >= MIN_CONSTANT_TIMESTAMPS and not is_running_clock(times_s[is_usable]):
+    if is_usable.sum() >= MIN_STOPPED_CLOCK_TIMESTAMPS and not is_running_clock(times_s[is_usable]):
         is_usable &= False
     usable_indices = np.flatnonzero(is_usable)
     usable_indices = usable_indices[np.argsort(rows[usable_indices])]
@@ -246,14 +254,14 @@ def _read_boot_times(frames: MavlinkFrames, address: MavlinkAddress) -> tuple[In
 
 
 def read_recording(frames: MavlinkFrames, address: MavlinkAddress) -> Recording:
-    """Return the longest part of a recording between restarts of the autopilot.
+    """Return the longest part of a recording without a restart of the autopilot.
 
     Receive times are converted to the boot clock.
     """
     notes: list[str] = []
     rows, boot_times_s = _read_boot_times(frames, address)
-    session_frames = slice(0, len(frames))
-    restart_rows = np.flatnonzero(np.diff(boot_times_s) < -MIN_RESTART_STEP_S) + 1
+    analysed_frame_slice = slice(0, len(frames))
+    restart_rows = np.flatnonzero(np.diff(boot_times_s) < -MIN_BACKWARD_STEP_AT_RESTART_S) + 1
     # A single late or early packet is not a restart: the packets before and after have to agree
     boot_time_before_restart_s = boot_times_s[
         np.maximum(restart_rows - 1 - RESTART_CHECK_MESSAGES, 0)
@@ -264,22 +272,22 @@ def read_recording(frames: MavlinkFrames, address: MavlinkAddress) -> Recording:
     restart_rows = restart_rows[
         boot_time_after_restart_s
         < np.minimum(boot_time_before_restart_s, boot_times_s[restart_rows - 1])
-        - MIN_RESTART_STEP_S
+        - MIN_BACKWARD_STEP_AT_RESTART_S
     ]
     if len(restart_rows):
-        row_limits = [0, *restart_rows.tolist(), len(rows)]
-        session_index = int(np.argmax(np.diff(row_limits)))
-        session_rows = slice(*row_limits[session_index : session_index + 2])
-        session_fraction = len(rows[session_rows]) / len(rows)
-        rows, boot_times_s = rows[session_rows], boot_times_s[session_rows]
-        session_frames = slice(
-            int(rows[0]) if session_index else 0,
-            int(rows[-1]) + 1 if session_index < len(restart_rows) else len(frames),
+        part_boundaries = [0, *restart_rows.tolist(), len(rows)]
+        longest_part_index = int(np.argmax(np.diff(part_boundaries)))
+        longest_part_rows = slice(*part_boundaries[longest_part_index : longest_part_index + 2])
+        longest_part_fraction = len(rows[longest_part_rows]) / len(rows)
+        rows, boot_times_s = rows[longest_part_rows], boot_times_s[longest_part_rows]
+        analysed_frame_slice = slice(
+            int(rows[0]) if longest_part_index else 0,
+            int(rows[-1]) + 1 if longest_part_index < len(restart_rows) else len(frames),
         )
         notes.append(
             f"number of restarts of the boot clock: {len(restart_rows)}. Only the longest part "
             f"between two restarts is analysed: {boot_times_s[0]:.1f} s to {boot_times_s[-1]:.1f} "
-            f"s after boot ({session_fraction:.0%} of the data)"
+            f"s after boot ({longest_part_fraction:.0%} of the data)"
         )
     increasing_time_rows = _remove_stray_timestamps(
         boot_times_s, longest_increasing_run(np.rint(boot_times_s * 1e6).astype(np.int64))
@@ -308,16 +316,16 @@ def read_recording(frames: MavlinkFrames, address: MavlinkAddress) -> Recording:
     ):
         if count:
             notes.append(f"{quantity}: {count}")
-    bad_byte_count, byte_count = frames.bad_byte_count, len(frames.content)
+    byte_count_outside_frames, byte_count = frames.byte_count_outside_frames, len(frames.content)
     stray_bytes_note = (
-        f"{bad_byte_count:,} bytes ({bad_byte_count / byte_count:.2%}) are not part of a complete "
-        "MAVLink frame"
+        f"{byte_count_outside_frames:,} bytes ({byte_count_outside_frames / byte_count:.2%}) are "
+        "not part of a complete MAVLink frame"
     )
     damage_notes: tuple[str, ...] = ()
     # Incomplete frames at the beginning and end of the file do not count as damage
-    if bad_byte_count - 2 * MAX_FRAME_BYTES > MAX_STRAY_BYTE_FRACTION * byte_count:
+    if byte_count_outside_frames - 2 * MAX_FRAME_BYTES > MAX_STRAY_BYTE_FRACTION * byte_count:
         damage_notes = (f"the file is damaged: {stray_bytes_note}",)
-    elif bad_byte_count:
+    elif byte_count_outside_frames:
         notes.append(stray_bytes_note)
     # Without boot times, the time axis is the receive time
     time_origin_s, end_s = (
@@ -326,7 +334,7 @@ def read_recording(frames: MavlinkFrames, address: MavlinkAddress) -> Recording:
     return Recording(
         frames,
         address,
-        session_frames,
+        analysed_frame_slice,
         receive_times_s,
         receipt_to_boot_fit,
         time_origin_s,

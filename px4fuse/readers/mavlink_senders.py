@@ -10,14 +10,18 @@ from px4fuse.errors import SettingsError
 from px4fuse.flight.model import ClockMap, Sender
 from px4fuse.readers import mavlink_messages as messages
 from px4fuse.readers.mavlink_clocks import (
-    MAX_RELATIVE_RATE_DIFFERENCE,
+    MAX_RELATIVE_CLOCK_RATE_DIFFERENCE,
     ClockLine,
     ClockMapping,
     is_running_clock,
-    map_clock,
+    map_clock_to_boot,
 )
 from px4fuse.readers.mavlink_frames import VEHICLE_TYPES, Int64Array, MavlinkAddress, MavlinkFrames
-from px4fuse.readers.mavlink_recording import MIN_RESTART_STEP_S, Recording, map_boot_to_unix
+from px4fuse.readers.mavlink_recording import (
+    MIN_BACKWARD_STEP_AT_RESTART_S,
+    Recording,
+    map_boot_to_unix,
+)
 
 # Maximum number of senders that are read; senders with more messages are preferred
 MAX_SENDERS = 32
@@ -28,7 +32,7 @@ MAX_LOST_MESSAGE_FRACTION = 0.9
 MAX_LATE_MESSAGES = 16
 # Maximum difference (s) of TIMESYNC timestamps from a sender's position timestamps: a larger
 # difference shows another clock
-MAX_SAME_CLOCK_DIFFERENCE_S = 1e5
+MAX_TIMESYNC_TO_POSITION_TIME_DIFFERENCE_S = 1e5
 
 
 def _read_vehicle_types(frames: MavlinkFrames) -> dict[MavlinkAddress, tuple[int, int]]:
@@ -51,7 +55,7 @@ def _count_frames(
 
 
 def _is_vehicle(vehicle_type: int, autopilot: int) -> bool:
-    return autopilot != messages.INVALID_AUTOPILOT and vehicle_type != messages.GROUND_STATION_TYPE
+    return autopilot != messages.NO_AUTOPILOT and vehicle_type != messages.GROUND_STATION_TYPE
 
 
 def choose_autopilot(frames: MavlinkFrames, system_id: int | None) -> tuple[MavlinkAddress, str]:
@@ -80,16 +84,14 @@ def choose_autopilot(frames: MavlinkFrames, system_id: int | None) -> tuple[Mavl
         [address for address in vehicle_addresses if address in message_count_by_autopilot]
         or [address for address in message_count_by_autopilot if address not in vehicle_types]
         or vehicle_addresses
+        or [
+            address
+            for address in frame_count_by_address
+            if address[1] == messages.AUTOPILOT_COMPONENT_ID
+        ]
+        # If no message is from an autopilot, assume that each system has one that sent nothing
+        or [(address[0], messages.AUTOPILOT_COMPONENT_ID) for address in frame_count_by_address]
     )
-    candidates = candidates or [
-        address
-        for address in frame_count_by_address
-        if address[1] == messages.AUTOPILOT_COMPONENT_ID
-    ]
-    # If no message is from an autopilot, assume that each system has one that sent nothing
-    candidates = candidates or [
-        (address[0], messages.AUTOPILOT_COMPONENT_ID) for address in frame_count_by_address
-    ]
     if system_id is not None:
         candidates = [
             address for address in {*vehicle_addresses, *candidates} if address[0] == system_id
@@ -124,7 +126,7 @@ def find_senders(recording: Recording, message: str) -> list[MavlinkAddress]:
     ][:MAX_SENDERS]
 
 
-def map_senders(recording: Recording) -> dict[MavlinkAddress, ClockMapping]:
+def map_sender_clocks(recording: Recording) -> dict[MavlinkAddress, ClockMapping]:
     """Return the relation of each position sender's clock to the autopilot's boot clock."""
     message_names = {source.message for source in messages.POSITION_MESSAGE_TYPES}
     senders = {address for message in message_names for address in find_senders(recording, message)}
@@ -149,35 +151,40 @@ def _map_sender_clock(
     rows = recording.rows("TIMESYNC", sender)
     timesync = frames.table("TIMESYNC", rows)
     sender_reply_times_s = timesync["tc1"] * 1e-9
-    request_times_s = timesync["ts1"] * 1e-9
-    # A TIMESYNC reply repeats the requester's time in ts1, which is boot time only if the autopilot
-    # sent the request
+    timesync_request_times_s = timesync["ts1"] * 1e-9
+    # A TIMESYNC reply repeats the time of the request in ts1. Only requests of the autopilot have
+    # boot time
     is_sender_reply = (sender_reply_times_s != 0.0) & (
-        np.abs(request_times_s - recording.compute_receipt_boot_times_s(rows)) <= MIN_RESTART_STEP_S
+        np.abs(timesync_request_times_s - recording.compute_receipt_boot_times_s(rows))
+        <= MIN_BACKWARD_STEP_AT_RESTART_S
     )
     # The sender reads its clock just before it sends a TIMESYNC request: the delay is smallest
-    is_request = (
+    is_timesync_request = (
         has_running_clock
         & (sender_reply_times_s == 0.0)
-        & (np.abs(request_times_s - median_timestamp_s) < MAX_SAME_CLOCK_DIFFERENCE_S)
+        & (
+            np.abs(timesync_request_times_s - median_timestamp_s)
+            < MAX_TIMESYNC_TO_POSITION_TIME_DIFFERENCE_S
+        )
     )
-    timestamps_s.append(request_times_s[is_request])
-    receive_times_s.append(recording.receive_times_s[rows][is_request])
+    timestamps_s.append(timesync_request_times_s[is_timesync_request])
+    receive_times_s.append(recording.receive_times_s[rows][is_timesync_request])
     autopilot_timesync = frames.table("TIMESYNC", recording.rows("TIMESYNC"))
     autopilot_reply_times_s = autopilot_timesync["tc1"] * 1e-9
     sender_request_times_s = autopilot_timesync["ts1"] * 1e-9
     is_autopilot_reply = (autopilot_reply_times_s != 0.0) & (
-        np.abs(sender_request_times_s - median_timestamp_s) < MAX_SAME_CLOCK_DIFFERENCE_S
+        np.abs(sender_request_times_s - median_timestamp_s)
+        < MAX_TIMESYNC_TO_POSITION_TIME_DIFFERENCE_S
     )
     is_autopilot_reply &= ~np.isin(
         autopilot_timesync["ts1"], _read_other_request_times(recording, sender)
     )
-    return map_clock(
+    return map_clock_to_boot(
         f"system {sender[0]}, component {sender[1]}",
         np.concatenate(timestamps_s),
         np.concatenate(receive_times_s),
         recording.receipt_to_boot_fit,
-        (request_times_s[is_sender_reply], sender_reply_times_s[is_sender_reply]),
+        (timesync_request_times_s[is_sender_reply], sender_reply_times_s[is_sender_reply]),
         (sender_request_times_s[is_autopilot_reply], autopilot_reply_times_s[is_autopilot_reply]),
         boot_to_unix_fit,
         has_receive_times=frames.receive_times_us is not None,
@@ -199,18 +206,18 @@ def describe_clock_conversions(
     clock_descriptions = [mapping.description for mapping in clock_mappings.values()]
     receive_times_us = recording.frames.receive_times_us
     receipt_to_boot_fit = recording.receipt_to_boot_fit
-    if receive_times_us is not None and receipt_to_boot_fit.pair_count:
-        note = "the recorded link was replayed faster or slower than real time"
-        if abs(receipt_to_boot_fit.slope - 1.0) < MAX_RELATIVE_RATE_DIFFERENCE:
+    if receive_times_us is not None and receipt_to_boot_fit.reading_pair_count:
+        note = "the messages were recorded during a replay that was faster or slower than real time"
+        if abs(receipt_to_boot_fit.slope - 1.0) < MAX_RELATIVE_CLOCK_RATE_DIFFERENCE:
             note = (
-                "receive times are converted to the boot clock with the messages that have the "
-                "least link delay; they serve only to order messages and to convert other clocks"
+                "the conversion of receive times is fitted to the messages with the least delay. "
+                "Receive times replace missing timestamps and convert other clocks"
             )
         clock_descriptions.append(
             ClockMap(
                 clock="receive time (UNIX time of the recording computer)",
                 method="receive time",
-                pairs=receipt_to_boot_fit.pair_count,
+                pairs=receipt_to_boot_fit.reading_pair_count,
                 offset_s=receipt_to_boot_fit.y0
                 - receipt_to_boot_fit.x0
                 - float(receive_times_us[0]) * 1e-6,
@@ -225,14 +232,14 @@ def describe_clock_conversions(
 def describe_senders(recording: Recording) -> tuple[Sender, ...]:
     """Describe the senders in the recording, most messages first."""
     frames = recording.frames
-    vehicle_types = _read_vehicle_types(recording.frames)
+    vehicle_types = _read_vehicle_types(frames)
     sender_descriptions = []
     for address, count in _count_frames(frames)[:MAX_SENDERS]:
-        description = "sender without heartbeat"
+        description = "component that sent no HEARTBEAT"
         if address in vehicle_types:
             vehicle_type, autopilot = vehicle_types[address]
             description = VEHICLE_TYPES.get(vehicle_type, f"vehicle of MAV_TYPE {vehicle_type}")
-            if autopilot != messages.INVALID_AUTOPILOT:
+            if autopilot != messages.NO_AUTOPILOT:
                 description = (
                     f"{messages.AUTOPILOT_NAME_BY_ID.get(autopilot, 'autopilot')} {description}"
                 )

@@ -30,8 +30,8 @@ from px4fuse.readers.position_names import (
 )
 from px4fuse.readers.recording_table import (
     COLUMNS_OPTION,
+    HEADERLESS_TABLE_FORMAT,
     MAX_FILE_BYTES,
-    NO_HEADER,
     SEPARATORS,
     PositionTable,
     choose_body,
@@ -50,24 +50,24 @@ SIGMA_COLUMNS = ["sigma_x_m", "sigma_y_m", "sigma_z_m"]
 SAMPLE_COLUMNS = ["x_m", "y_m", "z_m", *SIGMA_COLUMNS]
 
 # Maximum number of UWB tags in a column; a column with more different values is a counter
-MAX_TAGS = 100
+MAX_TAGS_IN_FILE = 100
 MIN_USABLE_ROWS = 3
-# Minimum fraction of rows that fit an assumption: increasing times in a file without header, or
-# whole seconds if another column contains the nanoseconds
-MIN_FITTING_ROW_FRACTION = 0.9
+# Minimum fraction of rows with increasing times in a file without header, and of rows with whole
+# seconds in a file with another column for nanoseconds
+MIN_MATCHING_ROW_FRACTION = 0.9
 # Minimum plausible median interval (s): UWB systems send at most 200 positions per second, ±10 %
 MIN_INTERVAL_S = 0.9 / 200
 # Maximum plausible median interval (s): UWB systems send a position every 5 s or more often, ±10 %
 MAX_INTERVAL_S = 1.1 / 0.2
 # Plausible units of timestamps in trajectories, and plausible median intervals (s)
 TRAJECTORY_TIME_UNITS, TRAJECTORY_INTERVAL_RANGE_S = ("s", "ns"), (1e-3, 1e3)
-# Maximum median interval (s) of UNIX times: timestamps with a longer interval in this unit are
-# boot times in a smaller unit
+# Maximum median interval (s) of timestamps that are read as UNIX times. Timestamps with a longer
+# interval are boot times, and their unit is smaller
 MAX_UNIX_TIME_INTERVAL_S = 60.0
 # Maximum extent (m) of an indoor flight. Positions with a larger extent are probably in mm
 MAX_INDOOR_EXTENT_M = 200.0
 # Maximum absolute coordinate in the unit of the file: larger values are timestamps or damaged text
-MAX_RAW_COORDINATE = 1e9
+MAX_COORDINATE_IN_FILE_UNIT = 1e9
 
 
 @dataclass(frozen=True)
@@ -85,7 +85,7 @@ class PositionRecording:
     # Coordinate frames that column names and format allow; empty if all are possible
     frames: tuple[str, ...]
     # Sentences about the detected format, such as unit or frame
-    detection_notes: tuple[str, ...]
+    format_detection_notes: tuple[str, ...]
     # Warnings, and sentences about dropped rows
     notes: tuple[str, ...]
     # Number of rows with an invalid timestamp
@@ -145,20 +145,22 @@ def read_position_file(
     path, body_in_path = split_path_and_part(str(path))
     table, sha256, size_bytes = _open_table(path, columns, body or body_in_path)
     notes = [*table.notes]
-    meanings = [read_column_name(name) for name in table.column_names]
+    column_meanings = [read_column_name(name) for name in table.column_names]
     given_columns = _find_column_indices(table, columns or ())
     quaternion_columns = find_quaternion_columns(table.column_names)
     numbers, has_time_zone = _read_numbers(
-        table, meanings, given_columns, quaternion_columns, body or body_in_path
+        table, column_meanings, given_columns, quaternion_columns, body or body_in_path
     )
     row_count = len(numbers)
     time_column, axis_columns, sigma_columns, frame, time_text = _choose_columns(
-        table, meanings, given_columns, numbers
+        table, column_meanings, given_columns, numbers
     )
     position_columns = [index for index in axis_columns if index is not None]
     # pandas reads numbers such as 1e999 as infinite
     has_time = np.isfinite(numbers[time_column])
-    is_usable = has_time & (numbers[position_columns].abs() < MAX_RAW_COORDINATE).all(axis=1)
+    is_usable = has_time & (numbers[position_columns].abs() < MAX_COORDINATE_IN_FILE_UNIT).all(
+        axis=1
+    )
     if unusable_count := int(np.count_nonzero(~is_usable)):
         notes.append(
             f"number of dropped rows without valid time or position: {unusable_count}"
@@ -167,13 +169,17 @@ def read_position_file(
     times_without_position = numbers.loc[has_time & ~is_usable, time_column].to_numpy()
     numbers = numbers[is_usable]
     file_times = numbers[time_column].to_numpy()
-    units, interval_range_s = (
+    time_units, plausible_interval_range_s = (
         (TRAJECTORY_TIME_UNITS, TRAJECTORY_INTERVAL_RANGE_S)
         if is_trajectory
         else (tuple(SECONDS_BY_TIME_UNIT), (MIN_INTERVAL_S, MAX_INTERVAL_S))
     )
     unit, unit_text = _choose_time_unit(
-        file_times, meanings[time_column].unit, time_unit, units, interval_range_s
+        file_times,
+        column_meanings[time_column].unit,
+        time_unit,
+        time_units,
+        plausible_interval_range_s,
     )
     units_per_second: float = round(1.0 / SECONDS_BY_TIME_UNIT[unit])
     if table.rate_hz is not None:
@@ -187,7 +193,8 @@ def read_position_file(
             f"{dropped_count}"
         )
     has_no_times = (
-        table.format == NO_HEADER and len(kept_rows) < MIN_FITTING_ROW_FRACTION * row_count
+        table.format == HEADERLESS_TABLE_FORMAT
+        and len(kept_rows) < MIN_MATCHING_ROW_FRACTION * row_count
     )
     if has_no_times or len(kept_rows) < MIN_USABLE_ROWS:
         raise LogError(
@@ -203,7 +210,7 @@ def read_position_file(
         )
     numbers = numbers.iloc[kept_rows].set_index(time_index(times_s[kept_rows]))
     median_interval_s = compute_median_interval_s(numbers.index)
-    if not interval_range_s[0] <= median_interval_s <= interval_range_s[1]:
+    if not plausible_interval_range_s[0] <= median_interval_s <= plausible_interval_range_s[1]:
         notes.append(
             f"a median interval of {median_interval_s:.3g} s is unusual: check the unit of time "
             "(--position-time-unit)"
@@ -211,7 +218,7 @@ def read_position_file(
     scale_by_column, length_unit_text = _choose_length_units(
         numbers,
         position_columns,
-        meanings,
+        column_meanings,
         length_unit,
         np.inf if is_trajectory else MAX_INDOOR_EXTENT_M,
     )
@@ -223,7 +230,7 @@ def read_position_file(
     invalid_reasons = classify_invalid_positions(samples, SAMPLE_COLUMNS[: len(position_columns)])
     if is_trajectory:
         invalid_reasons[:] = ""
-    invalid_reason_series = (
+    reasons_of_invalid_rows = (
         invalid_reasons[invalid_reasons != ""],
         pd.Series("NaN", times_without_position / units_per_second),
     )
@@ -246,7 +253,7 @@ def read_position_file(
         clock_kind=clock_kind,
         frames=(frame,) if frame else table.frames,
         dropped_row_count=dropped_count,
-        detection_notes=(
+        format_detection_notes=(
             f"the file format is {table.format}"
             if table.format
             else f"the separator is {SEPARATORS[table.separator]}, the header is line "
@@ -258,7 +265,7 @@ def read_position_file(
         ),
         notes=tuple(notes),
         metres_per_unit=scale_by_column[position_columns[0]],
-        reason_by_invalid_row=pd.concat(invalid_reason_series).sort_index(),
+        reason_by_invalid_row=pd.concat(reasons_of_invalid_rows).sort_index(),
         format=table.format,
         row_count=row_count,
         quaternions=quaternions if quaternion_columns else None,
@@ -286,8 +293,8 @@ def _find_increasing_rows(times_s: Array) -> IntArray:
     """Return the indices of the rows with strictly increasing times before 2100."""
     usable_rows = np.flatnonzero(np.abs(times_s) < MAX_VALID_UNIX_TIME_S)
     # Ranks are used instead of times, because longest_increasing_run requires positive values
-    ranks = np.unique(times_s[usable_rows], return_inverse=True)[1].astype(np.int64)
-    return usable_rows[longest_increasing_run(ranks + 1)]
+    time_ranks = np.unique(times_s[usable_rows], return_inverse=True)[1].astype(np.int64)
+    return usable_rows[longest_increasing_run(time_ranks + 1)]
 
 
 def _check_options(
@@ -303,36 +310,38 @@ def _check_options(
     names = columns or ("1", "2", "3")
     if "" in names or not 3 <= len({*names}) == len(names) <= 5:
         raise SettingsError(
-            f"{COLUMNS_OPTION}[,SIGMA]: {','.join(names)!r} must name four or five different "
-            "columns (three without height)."
+            f"{COLUMNS_OPTION}[,SIGMA]: {','.join(names)!r} must name three (without height), "
+            "four or five different columns."
         )
 
 
 def _read_numbers(
     table: PositionTable,
-    meanings: list[ColumnMeaning],
+    column_meanings: list[ColumnMeaning],
     given_columns: list[int],
     quaternion_columns: list[int],
     body_name: str | None,
 ) -> tuple[pd.DataFrame, bool]:
     """Convert the text of the needed columns to numbers.
 
-    Dates in ISO 8601 become UNIX times, and their unit in ``meanings`` becomes "s". The second
-    value is False for dates without time zone, otherwise True.
+    Dates in ISO 8601 become UNIX times, and their unit in ``column_meanings`` becomes "s". The
+    second value is False for dates without time zone, otherwise True.
     """
-    known_columns = [index for index, meaning in enumerate(meanings) if meaning.kind]
+    known_columns = [index for index, meaning in enumerate(column_meanings) if meaning.kind]
     texts = table.read_cells([*given_columns, *quaternion_columns, *known_columns])
-    texts = _select_body(table, texts, meanings, body_name)
+    texts = _select_body(table, texts, column_meanings, body_name)
     may_have_decimal_comma = table.separator != ","
-    # apply on an empty table returns the dtype object
+    # DataFrame.apply returns dtype object for an empty table, so the dtype is set here
     numbers = texts.apply(_to_numbers, may_have_decimal_comma=may_have_decimal_comma).astype(
         np.float64
     )
     has_time_zone = True
-    for index in given_columns[:1] or [i for i in known_columns if meanings[i].kind == "time"]:
+    for index in given_columns[:1] or [
+        i for i in known_columns if column_meanings[i].kind == "time"
+    ]:
         if numbers[index].isna().mean() > 0.5 and texts[index].notna().any():
             numbers[index], has_time_zone = _read_dates(texts[index])
-            meanings[index] = replace(meanings[index], unit="s")
+            column_meanings[index] = replace(column_meanings[index], unit="s")
     return numbers, has_time_zone
 
 
@@ -366,14 +375,14 @@ def _read_dates(texts: "pd.Series[str]") -> tuple["pd.Series[float]", bool]:
 def _select_body(
     table: PositionTable,
     texts: pd.DataFrame,
-    meanings: Sequence[ColumnMeaning],
+    column_meanings: Sequence[ColumnMeaning],
     body_name: str | None,
 ) -> pd.DataFrame:
     """Return the rows of one rigid body or UWB tag, if a column contains their names."""
-    for index, meaning in enumerate(meanings):
+    for index, meaning in enumerate(column_meanings):
         if meaning.kind == "tag":
             tags = texts[index].dropna().unique().tolist()
-            if 1 < len(tags) <= MAX_TAGS or (tags and body_name is not None):
+            if 1 < len(tags) <= MAX_TAGS_IN_FILE or (tags and body_name is not None):
                 return texts[texts[index] == choose_body(table.file_name, tags, body_name)]
     if body_name is not None and not table.has_only_chosen_body:
         raise LogError(
@@ -385,7 +394,7 @@ def _select_body(
 
 def _find_column_indices(table: PositionTable, wanted_columns: tuple[str, ...]) -> list[int]:
     names = [name.casefold() for name in table.column_names]
-    # A number is the name of a column, or else its position in the header
+    # A number selects the column with this name, or else the column at this position in the header
     names += [str(index + 1) for index in range(len(names))]
     indices = []
     for column in wanted_columns:
@@ -406,7 +415,7 @@ def _find_column_indices(table: PositionTable, wanted_columns: tuple[str, ...]) 
 
 def _choose_columns(
     table: PositionTable,
-    meanings: Sequence[ColumnMeaning],
+    column_meanings: Sequence[ColumnMeaning],
     given_columns: list[int],
     numbers: pd.DataFrame,
 ) -> tuple[int, _ColumnIndices, _ColumnIndices, str | None, str]:
@@ -420,51 +429,56 @@ def _choose_columns(
         frame = None
         axis_columns: _ColumnIndices = (*given_columns[1:4], None)[:3]
         # Only the names of the given columns may define the frame and so the order of the axes
-        given_meanings = [
+        meanings_of_given_columns = [
             meaning if index in axis_columns else ColumnMeaning()
-            for index, meaning in enumerate(meanings)
+            for index, meaning in enumerate(column_meanings)
         ]
-        named_axis_columns = position_names.find_position_columns(given_meanings)
-        if named_axis_columns and {*named_axis_columns[1]} == {*axis_columns}:
-            frame, axis_columns = named_axis_columns
+        frame_and_axis_columns = position_names.find_position_columns(meanings_of_given_columns)
+        if frame_and_axis_columns and {*frame_and_axis_columns[1]} == {*axis_columns}:
+            frame, axis_columns = frame_and_axis_columns
     else:
-        time_columns = [index for index, column in enumerate(meanings) if column.kind == "time"]
+        time_columns = [
+            index for index, column in enumerate(column_meanings) if column.kind == "time"
+        ]
         is_mostly_empty = numbers[time_columns].fillna(0.0).eq(0.0).mean() >= 0.5
-        rank_time_kind = position_names.TIME_KINDS.index
         time_column, *other_time_columns = sorted(
             time_columns,
             key=lambda index: (
                 is_mostly_empty[index],
-                rank_time_kind(meanings[index].axis_or_time_kind),
-                meanings[index].unit == "ns",
+                position_names.TIME_KINDS.index(column_meanings[index].time_kind),
+                column_meanings[index].unit == "ns",
             ),
         )
         time_text = table.format_labels(time_column)
         for index in [*other_time_columns]:
             has_whole_seconds = (
                 numbers[time_column] % 1.0 == 0.0
-            ).mean() > MIN_FITTING_ROW_FRACTION
-            if has_whole_seconds and meanings[index].unit == "ns" and numbers[index].max() < 1e9:
+            ).mean() > MIN_MATCHING_ROW_FRACTION
+            if (
+                has_whole_seconds
+                and column_meanings[index].unit == "ns"
+                and numbers[index].max() < 1e9
+            ):
                 numbers[time_column] += numbers[index] * 1e-9
                 other_time_columns.remove(index)
                 time_text += f" plus {table.format_labels(index)}"
         if other_time_columns:
             unused_labels = table.format_labels(*other_time_columns)
-            time_text += f" ({meanings[time_column].axis_or_time_kind}; not used: {unused_labels})"
-        frame, axis_columns = position_names.find_position_columns(meanings) or (None, ())
+            time_text += f" ({column_meanings[time_column].time_kind}; not used: {unused_labels})"
+        frame, axis_columns = position_names.find_position_columns(column_meanings) or (None, ())
     if axis_columns[2] is not None and numbers[axis_columns[2]].isna().all():
         axis_columns = (*axis_columns[:2], None)
     sigma_columns = (
         (given_columns[4],) * 3
         if len(given_columns) > 4
-        else position_names.find_sigma_columns(meanings, frame)
+        else position_names.find_sigma_columns(column_meanings, frame)
     )
     return time_column, axis_columns, sigma_columns, frame, time_text
 
 
 def _choose_time_unit(
     times: Array,
-    column_name_unit: str,
+    unit_in_column_name: str,
     given_unit: str | None,
     units: Container[str],
     interval_range_s: tuple[float, float],
@@ -478,10 +492,10 @@ def _choose_time_unit(
         return given_unit, "the unit was given with --position-time-unit"
     median_time = float(np.median(times)) if len(times) else 0.0
     if (
-        abs(median_time) * SECONDS_BY_TIME_UNIT.get(column_name_unit, np.inf)
+        abs(median_time) * SECONDS_BY_TIME_UNIT.get(unit_in_column_name, np.inf)
         < MAX_VALID_UNIX_TIME_S
     ):
-        return column_name_unit, "from the column name"
+        return unit_in_column_name, "from the column name"
     time_steps = np.diff(times)
     median_step = float(np.median(time_steps[time_steps > 0])) if (time_steps > 0).any() else 0.0
     plausible_units = []
@@ -508,18 +522,18 @@ def _choose_time_unit(
 def _choose_length_units(
     numbers: pd.DataFrame,
     position_columns: list[int],
-    meanings: Sequence[ColumnMeaning],
+    column_meanings: Sequence[ColumnMeaning],
     given_unit: str | None,
     max_extent_m: float,
 ) -> tuple[dict[int, float], str]:
-    """Return the length in metres of each column's unit, and a text on the unit of the positions.
+    """Return the factor from each column's unit to metres, and a text on the unit of the positions.
 
     Without a unit from the user or in the column names, positions are in mm if their extent in
     metres exceeds ``max_extent_m``.
     """
     column_name_units = {
         index: meaning.unit
-        for index, meaning in enumerate(meanings)
+        for index, meaning in enumerate(column_meanings)
         if meaning.unit in METRES_BY_LENGTH_UNIT
     }
     # The extent is the range from 5 % to 95 %, so that outliers do not determine the unit
@@ -544,8 +558,8 @@ def _choose_length_units(
         )
     elif max_extent > max_extent_m:
         reason = (
-            "px4fuse assumes metres, because the extent is too large for an indoor flight in any "
-            "unit; set another unit with --position-unit"
+            "px4fuse assumes metres, because in each unit the extent is too large for an indoor "
+            "flight; set another unit with --position-unit"
         )
     unit_by_column = {
         index: column_name_units.get(index, unit) for index in map(int, numbers.columns)

@@ -33,7 +33,9 @@ _TIME_WORDS = (
 # Kinds of time columns, in order of preference
 TIME_KINDS = ["time of measurement", "time", "time of recording"]
 # Column names of two words without separator, such as "px" (position, x) and "xstd" (x, sigma)
-_JOINED_NAME_PATTERN = re.compile(r"(pos|p|t|sigma|std|s)([xyzneud])|([xyz])(pos|std|sigma)")
+_NAME_WITHOUT_SEPARATOR_PATTERN = re.compile(
+    r"(pos|p|t|sigma|std|s)([xyzneud])|([xyz])(pos|std|sigma)"
+)
 # Quaternion components, such as "qx", "q_RS_w []" and "pose.orientation.x"
 _QUATERNION_NAME_PATTERN = re.compile(r"(?:\bq|orientation|rotation|quat)(?:\w*_|[ .])?([wxyz])\b")
 # Axis names by coordinate frame. The frame of a file is the first of which both horizontal axes are
@@ -55,27 +57,32 @@ class ColumnMeaning:
     ----------
     kind : str
         "time", "position", "sigma" or "tag" (number of a UWB tag).
-    axis_or_time_kind : str
-        Axis of a position or sigma, or element of :data:`TIME_KINDS` for a time.
+    axis : str
+        Axis of a position or sigma, such as "x" or "north".
     unit : str
     group : str
-        Column name without axis and unit. The columns x, y and z of one position have one group.
+        Column name without axis and unit: equal for the columns x, y and z of one position.
+    time_kind : str
+        For a time, one of :data:`TIME_KINDS`.
     """
 
     kind: str = ""
-    axis_or_time_kind: str = ""
+    axis: str = ""
     unit: str = ""
     group: str = ""
+    time_kind: str = ""
 
 
 def read_column_name(name: str) -> ColumnMeaning:
     """Find quantity, axis and unit in a column name."""
-    plain_name = unicodedata.normalize("NFKC", name).replace("μ", "u")
-    plain_name = re.sub(r"(?<=[a-z0-9])(?=[A-Z])", "_", plain_name).lower()
-    column_words = re.findall(r"[^\W_]+", plain_name)
+    snake_case_name = unicodedata.normalize("NFKC", name).replace("μ", "u")
+    snake_case_name = re.sub(r"(?<=[a-z0-9])(?=[A-Z])", "_", snake_case_name).lower()
+    column_words = re.findall(r"[^\W_]+", snake_case_name)
     unit = _UNIT_BY_WORD.get(column_words[-1], "") if column_words else ""
     if len(column_words) == 1 and unit in SECONDS_BY_TIME_UNIT and len(column_words[0]) > 2:
-        return ColumnMeaning("time", "time", unit)  # a unit alone, such as "sec", is a time
+        return ColumnMeaning(
+            "time", unit=unit, time_kind="time"
+        )  # a unit alone, such as "sec", is a time
     unit = unit if len(column_words) > 1 else ""
     column_words = column_words[:-1] if unit else column_words
     word_set = {*column_words}
@@ -84,18 +91,19 @@ def read_column_name(name: str) -> ColumnMeaning:
         and word_set <= _TIME_WORDS
         and unit not in METRES_BY_LENGTH_UNIT
     ):
-        matches_time_kind = [
-            bool(word_set & _WORDS_BY_ROLE["measured"]),
-            not word_set & _WORDS_BY_ROLE["recorded"],
-            True,
-        ]
-        return ColumnMeaning("time", TIME_KINDS[matches_time_kind.index(True)], unit)
+        rank = 2 if word_set & _WORDS_BY_ROLE["recorded"] else 1
+        rank = 0 if word_set & _WORDS_BY_ROLE["measured"] else rank
+        return ColumnMeaning("time", unit=unit, time_kind=TIME_KINDS[rank])
     if word_set and word_set <= _WORDS_BY_ROLE["tag"]:
         return ColumnMeaning("tag")
     sigma_and_context_words = _WORDS_BY_ROLE["sigma"] | _WORDS_BY_ROLE["context"]
     split_words: list[str] = []
     for word in column_words:
-        match = None if word in sigma_and_context_words else _JOINED_NAME_PATTERN.fullmatch(word)
+        match = (
+            None
+            if word in sigma_and_context_words
+            else _NAME_WITHOUT_SEPARATOR_PATTERN.fullmatch(word)
+        )
         split_words += [group for group in match.groups() if group] if match else [word]
     axes = [_AXIS_BY_WORD[word] for word in split_words if word in _AXIS_BY_WORD]
     other_words = [word for word in split_words if word not in _AXIS_BY_WORD]
@@ -122,9 +130,7 @@ def find_position_columns(
     columns_by_group: dict[str, dict[str, int]] = {}
     for index, column in enumerate(column_meanings):
         if column.kind == "position":
-            columns_by_group.setdefault(column.group, {}).setdefault(
-                column.axis_or_time_kind, index
-            )
+            columns_by_group.setdefault(column.group, {}).setdefault(column.axis, index)
     for axis_count in (3, 2):
         for axes in columns_by_group.values():
             # x, y, z, w is a quaternion
@@ -141,7 +147,7 @@ def find_sigma_columns(
     sigma_columns: dict[str, int] = {}
     for index, meaning in enumerate(column_meanings):
         if meaning.kind == "sigma":
-            sigma_columns.setdefault(meaning.axis_or_time_kind, index)
+            sigma_columns.setdefault(meaning.axis, index)
     axes = next(axes for name, axes in _AXIS_NAMES_BY_FRAME if name == frame)
     return tuple(
         sigma_columns.get(axis, sigma_columns.get(letter, sigma_columns.get("")))

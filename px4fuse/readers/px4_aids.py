@@ -16,7 +16,7 @@ from px4fuse.flight.ekf2_parameters import AIDS, STATUS_FLAGS, Aid
 from px4fuse.flight.model import AidLog, StepFunctions, sample_step_function
 from px4fuse.readers import px4_topics as px4
 from px4fuse.readers.common import join_nearest
-from px4fuse.readers.field_maps import Layout, expand_columns
+from px4fuse.readers.field_maps import Layout, assign_fields_to_columns
 from px4fuse.readers.ulog_topics import Topics
 
 # Maximum time difference (s) between a logged innovation and its logged variance S. By default, PX4
@@ -40,14 +40,14 @@ def read_aids(topics: Topics, enabled_aids: StepFunctions) -> dict[str, AidLog]:
     """
     log_by_aid = {}
     for name, aid in AIDS.items():
-        enabled_changes = enabled_aids.get(name)
-        aid_log = _read_aid_topic(topics, aid, enabled_changes)
+        enabled_flag = enabled_aids.get(name)
+        aid_log = _read_aid_topic(topics, aid, enabled_flag)
         # While the fusion of a source is disabled, the topics that are common to all sources
         # contain old values, or values of other sources
         if aid_log is None and (
-            name.startswith("ev_") if enabled_changes is None else enabled_changes.any()
+            name.startswith("ev_") if enabled_flag is None else enabled_flag.any()
         ):
-            aid_log = _read_common_topics(topics, aid, enabled_changes)
+            aid_log = _read_common_topics(topics, aid, enabled_flag)
         if aid_log is not None:
             log_by_aid[name] = aid_log
     return log_by_aid
@@ -86,7 +86,7 @@ def read_enabled_aids(topics: Topics) -> dict[str, pd.Series[float]]:
 
 
 def _read_aid_topic(
-    topics: Topics, aid: Aid, enabled_changes: pd.Series[float] | None
+    topics: Topics, aid: Aid, enabled_flag: pd.Series[float] | None
 ) -> AidLog | None:
     field_by_quantity = {
         "innovation": "innovation",
@@ -94,47 +94,51 @@ def _read_aid_topic(
         "noise": "observation_variance",
         "ratio": "test_ratio",
     }
-    if aid.name in px4.AIDS_WITH_LOCAL_OBSERVATION:
+    if aid.name in px4.AIDS_WITH_LOCAL_POSITION_OBSERVATION:
         field_by_quantity["observation"] = "observation"
     columns = {"fused": "fused", "rejected": "innovation_rejected"}
     for name, field in field_by_quantity.items():
-        columns |= _expand_columns_by_axis(name, aid, field + "[]" * (len(aid.axes) > 1))
+        columns |= _assign_fields_by_axis(name, aid, field + "[]" * (len(aid.axes) > 1))
     layout = Layout(f"estimator_aid_src_{aid.name}", columns, OPTIONAL_FIELDS.get(aid.name, {}))
     if topics.find_layout(layout) is None:  # return early: reading an empty table takes time
         return None
     samples = topics.primary_samples(layout).dropna()
     if "last_fused_us" in samples:
         samples["last_fused_s"] = (samples.pop("last_fused_us") - topics.time_origin_us) * 1e-6
-    if enabled_changes is not None and aid.name in px4.AIDS_ALWAYS_FUSED:
-        samples["fused"] = sample_step_function(enabled_changes, samples.index)
-    return _make_aid_log(topics, (layout.topic,), aid, samples, enabled_changes)
+    if enabled_flag is not None and aid.name in px4.AIDS_ALWAYS_FUSED:
+        samples["fused"] = sample_step_function(enabled_flag, samples.index)
+    return _make_aid_log(topics, (layout.topic,), aid, samples, enabled_flag)
 
 
 def _read_common_topics(
-    topics: Topics, aid: Aid, enabled_changes: pd.Series[float] | None
+    topics: Topics, aid: Aid, enabled_flag: pd.Series[float] | None
 ) -> AidLog | None:
-    """Read innovations from ``estimator_innovations`` or ``ekf2_innovations``, with all sources."""
+    """Read the innovations of an aiding source from a topic that contains all aiding sources.
+
+    The topic is ``estimator_innovations`` or, in older logs, ``ekf2_innovations``.
+    """
     is_in_gauss = aid.name == "mag_heading" and any(
         "cs_mag" in table for table in topics.tables_of(px4.STATUS_FLAGS)
     )
     layouts = []
     if aid.fields and not is_in_gauss:
-        topics_and_quantities = zip(px4.INNOVATION_TOPICS, ("innovation", "variance"), strict=True)
         layouts.append(
             [
-                Layout(topic, _expand_columns_by_axis(name, aid, aid.fields))
-                for topic, name in topics_and_quantities
+                Layout(topic, _assign_fields_by_axis(name, aid, aid.fields))
+                for topic, name in zip(
+                    px4.INNOVATION_TOPICS, ("innovation", "variance"), strict=True
+                )
             ]
         )
     if aid.old_fields:
-        fields = _expand_columns_by_axis("innovation", aid, aid.old_fields)
+        field_by_column = _assign_fields_by_axis("innovation", aid, aid.old_fields)
         variance_fields = aid.old_fields.replace("innov", "innov_var")
-        fields |= _expand_columns_by_axis("variance", aid, variance_fields)
-        layouts.append([Layout(px4.OLD_INNOVATION_TOPIC, fields)] * 2)
+        field_by_column |= _assign_fields_by_axis("variance", aid, variance_fields)
+        layouts.append([Layout(px4.OLD_INNOVATION_TOPIC, field_by_column)] * 2)
     for value_layout, variance_layout in layouts:
         innovations = topics.primary_samples(value_layout)
-        samples = topics.primary_samples(value_layout, select=_drop_repeats_and_zeros)
-        unknown_fusion_times_s = _find_unknown_fusion_times(
+        samples = topics.primary_samples(value_layout, select_rows=_drop_repeats_and_zeros)
+        unknown_fusion_times_s = _find_times_with_unknown_fusion(
             innovations[f"innovation_{aid.axes[0]}"],
             topics.primary_samples(variance_layout)[f"variance_{aid.axes[0]}"],
         )
@@ -144,11 +148,11 @@ def _read_common_topics(
             variance_samples = topics.primary_samples(variance_layout).dropna()
             samples = join_nearest(samples, variance_samples, MAX_VARIANCE_TIME_DIFFERENCE_S)
         excluded_sample_count = len(samples) - len(samples := samples.dropna())
-        if enabled_changes is not None:
-            samples = samples[sample_step_function(enabled_changes, samples.index) > 0.0]
+        if enabled_flag is not None:
+            samples = samples[sample_step_function(enabled_flag, samples.index) > 0.0]
         used_topics = tuple(dict.fromkeys((value_layout.topic, variance_layout.topic)))
         aid_log = _make_aid_log(
-            topics, used_topics, aid, samples, enabled_changes, excluded_sample_count
+            topics, used_topics, aid, samples, enabled_flag, excluded_sample_count
         )
         if aid_log is not None:
             return replace(aid_log, unknown_fusion_times_s=unknown_fusion_times_s)
@@ -162,18 +166,18 @@ def _drop_repeats_and_zeros(samples: pd.DataFrame) -> pd.DataFrame:
     return finite_samples[first_column.ne(first_column.shift()) & (first_column != 0.0)]
 
 
-def _find_unknown_fusion_times(innovation: pd.Series, variance: pd.Series) -> Array:
-    """Return the times (s) at which the log does not show if EKF2 fused a sample, and which.
+def _find_times_with_unknown_fusion(innovation: pd.Series, variance: pd.Series) -> Array:
+    """Return the times (s) at which EKF2 may have fused a sample that is not logged.
 
-    Without a sample, EKF2 logs the innovation 0. A new variance S shows that EKF2 fused a sample,
-    even if the logged innovation belongs to an older sample.
+    At these times, the innovation is 0 (EKF2 has no sample) or the variance S is new. A new S shows
+    that EKF2 fused a sample, but the logged innovation may belong to an older sample.
     """
-    is_changed = (variance > 0.0) & variance.ne(variance.shift())
-    return np.union1d(innovation.index[innovation == 0.0], variance.index[is_changed])
+    is_new_variance = (variance > 0.0) & variance.ne(variance.shift())
+    return np.union1d(innovation.index[innovation == 0.0], variance.index[is_new_variance])
 
 
-def _expand_columns_by_axis(name: str, aid: Aid, fields: str) -> dict[str, str]:
-    return expand_columns({" ".join(f"{name}_{axis}" for axis in aid.axes): fields})
+def _assign_fields_by_axis(name: str, aid: Aid, fields: str) -> dict[str, str]:
+    return assign_fields_to_columns({" ".join(f"{name}_{axis}" for axis in aid.axes): fields})
 
 
 def _make_aid_log(
@@ -181,7 +185,7 @@ def _make_aid_log(
     used_topics: tuple[str, ...],
     aid: Aid,
     samples: pd.DataFrame,
-    enabled_changes: pd.Series[float] | None,
+    enabled_flag: pd.Series[float] | None,
     excluded_sample_count: int = 0,
 ) -> AidLog | None:
     """Return the innovations of an aiding source; None without a positive innovation variance.
@@ -194,6 +198,4 @@ def _make_aid_log(
     innovation_columns = [f"innovation_{axis}" for axis in aid.axes]
     parameters = aid.logged_parameters(topics.ekf2_parameters)
     samples = samples.assign(**-samples[innovation_columns])
-    return AidLog(
-        used_topics, aid.axes, samples, enabled_changes, parameters, excluded_sample_count
-    )
+    return AidLog(used_topics, aid.axes, samples, enabled_flag, parameters, excluded_sample_count)

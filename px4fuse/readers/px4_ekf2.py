@@ -41,13 +41,13 @@ VALIDITY_FLAGS = ("xy_valid", "xy_global")
 # Wind and terrain are not read
 STATE_COUNT = 22
 # Bit of filter_control_status_u (common.h) that is set while EKF2 fuses the 3D magnetic field
-MAG_3D_BIT = 5
+MAG_3D_FUSION_BIT = 5
 # Minimum logged rate (Hz) of magnetometer samples to assume that no sample is missing: EKF2 uses 14
 # samples per second
 MIN_MAGNETOMETER_HZ = 10.0
 # EKF2 rounds the ratio of prediction interval to IMU interval to a whole number. If the ratio is
 # closer to n + 0.5 than this limit, both whole numbers are possible
-MAX_HALF_INTEGER_DISTANCE = 0.05
+MAX_DISTANCE_FROM_HALF_INTEGER = 0.05
 # EKF2 logs low-pass filtered optical flow. The filter is inverted only between two samples of at
 # most this interval (s)
 MAX_FLOW_INTERVAL_S = 0.5
@@ -105,8 +105,8 @@ def read_ekf2(topics: Topics) -> Ekf2 | Unavailable:
     if innovation_topics:
         topics.record_stream("ekf2_innovations", *innovation_topics)
     notes = [
-        f"the times of EKF2 innovations are publication times, up to 0.2 s late, because {topic} "
-        "has no measurement time"
+        f"{topic} has no measurement times, so the times of EKF2 innovations are publication times "
+        "(up to 0.2 s late)"
         for topic in innovation_topics[:1]
         if not any("timestamp_sample" in table for table in topics.tables_of(topic))
     ]
@@ -117,19 +117,18 @@ def read_ekf2(topics: Topics) -> Ekf2 | Unavailable:
         for log in (aids[name] for name in ("ev_pos", "ev_hgt") if name in aids)
         if log.excluded_sample_count
     ]
-    status_flags = dict(enabled_aids)
-    status_flags |= {
+    status_flags = enabled_aids | {
         name: local_position[name] for name in VALIDITY_FLAGS if name in local_position
     }
-    failed_checks = topics.primary_samples(px4.TOPIC_LAYOUTS["gnss_checks"], is_step_function=True)[
-        "failed"
-    ].dropna()
-    if len(failed_checks):
-        status_flags["failed_checks"] = failed_checks
+    failed_gnss_checks = topics.primary_samples(
+        px4.TOPIC_LAYOUTS["gnss_checks"], is_step_function=True
+    )["failed"].dropna()
+    if len(failed_gnss_checks):
+        status_flags["failed_checks"] = failed_gnss_checks
     step_s = _estimate_step_s(topics)
-    delayed_state = variance = _read_delayed_state(topics, step_s)
-    if isinstance(delayed_state, pd.DataFrame):
-        variance = delayed_state[Columns.POSITION_VARIANCE + Columns.VELOCITY_VARIANCE]
+    horizon_state = variance = _read_horizon_state(topics, step_s)
+    if isinstance(horizon_state, pd.DataFrame):
+        variance = horizon_state[Columns.POSITION_VARIANCE + Columns.VELOCITY_VARIANCE]
         variance = variance[(variance > 0.0).all(axis=1)]
         if variance.empty:
             variance = VARIANCES_NOT_LOGGED
@@ -145,10 +144,10 @@ def read_ekf2(topics: Topics) -> Ekf2 | Unavailable:
         instances=topics.primary_instances,
         gate=vision_gate,
         notes=tuple(notes),
-        accelerometer_bias=_read_accelerometer_bias(topics, delayed_state),
+        accelerometer_bias=_read_accelerometer_bias(topics, horizon_state),
         step_s=step_s,
         horizon_s=_compute_horizon_delay_s(topics, step_s),
-        record=_read_fusion_record(topics, delayed_state, local_position, enabled_aids, step_s),
+        record=_read_fusion_record(topics, horizon_state, local_position, enabled_aids, step_s),
         aids=aids,
         states=status_flags,
         parameters=topics.ekf2_parameters,
@@ -166,11 +165,13 @@ def _find_state_vector(topics: Topics) -> tuple[str, int]:
             state_count = sum(name.startswith("states[") for name in table)
             variance_count = sum(name.startswith("covariances[") for name in table)
             if variance_count:
-                return topic, px4.ATTITUDE_VARIANCE_COUNTS.get((state_count, variance_count), 0)
+                return topic, px4.ATTITUDE_VARIANCE_COUNT_BY_ARRAY_LENGTHS.get(
+                    (state_count, variance_count), 0
+                )
     return "", 0
 
 
-def _read_delayed_state(topics: Topics, step_s: float) -> TableOrUnavailable:
+def _read_horizon_state(topics: Topics, step_s: float) -> TableOrUnavailable:
     """Read EKF2's state and variances at the fusion horizon.
 
     The columns are equal for all PX4 releases. Older releases log the IMU biases as increments per
@@ -219,11 +220,16 @@ def _estimate_step_s(topics: Topics) -> float:
     ):
         return configured_interval_s
     layout = Layout(_find_state_vector(topics)[0], {"states[0]": "states[0]"})
-    prediction_end_rows = find_rows_of_timestamps(imu_time_s, topics.primary_samples(layout).index)
-    # time differences are used instead of row numbers, because IMU samples may be missing
-    end_sample_counts = np.rint((imu_time_s[prediction_end_rows] - imu_time_s[0]) / interval_s)
+    imu_rows_at_prediction_ends = find_rows_of_timestamps(
+        imu_time_s, topics.primary_samples(layout).index
+    )
+    # Sample indices are computed from times, because IMU samples may be missing in the log
+    prediction_end_indices = np.rint(
+        (imu_time_s[imu_rows_at_prediction_ends] - imu_time_s[0]) / interval_s
+    )
     return (
-        compute_samples_per_step(configured_interval_s, interval_s, end_sample_counts) * interval_s
+        compute_samples_per_step(configured_interval_s, interval_s, prediction_end_indices)
+        * interval_s
     )
 
 
@@ -243,39 +249,39 @@ def compute_samples_per_step(
 ) -> int:
     """Return the number of IMU samples in one EKF2 prediction.
 
-    This is the ratio of both intervals, rounded. A ratio near n + 0.5 is rounded down if only n
-    agrees with ``step_ends``, the indices of the IMU samples at which logged predictions end.
+    This is the ratio of both intervals, rounded. A ratio near n + 0.5 is rounded to n if only n
+    fits the logged predictions. ``step_ends``: indices of the IMU samples at which they end.
 
     >>> compute_samples_per_step(0.010, 0.00375), compute_samples_per_step(0.010, 0.004)
     (3, 3)
     >>> compute_samples_per_step(0.010, 0.004, [0, 4, 6, 14])
     2
     """
-    samples_per_step_plus_half = configured_step_s / imu_interval_s + 0.5
-    # The added 1e-6 makes the result independent of the rounding of timestamps to µs
-    sample_count = max(int(samples_per_step_plus_half + 1e-6), 1)
-    samples_between_ends = np.diff(np.asarray(step_ends, dtype=float))
+    interval_ratio = configured_step_s / imu_interval_s
+    # n + 0.5 is rounded up; 1e-6 is added, because the IMU interval may contain rounding errors
+    sample_count = max(int(interval_ratio + 0.5 + 1e-6), 1)
+    samples_between_logged_ends = np.diff(np.asarray(step_ends, dtype=float))
     if (
         sample_count > 1
-        and abs(samples_per_step_plus_half - sample_count) < MAX_HALF_INTEGER_DISTANCE
-        and len(samples_between_ends)
+        and abs(interval_ratio + 0.5 - sample_count) < MAX_DISTANCE_FROM_HALF_INTEGER
+        and len(samples_between_logged_ends)
     ):
-        is_multiple_of_larger, is_multiple_of_smaller = (
-            np.mean(samples_between_ends % step_sample_count == 0.0) > 0.9
+        is_multiple_of_larger_count, is_multiple_of_smaller_count = (
+            np.mean(samples_between_logged_ends % step_sample_count == 0.0) > 0.9
             for step_sample_count in (sample_count, sample_count - 1)
         )
-        return sample_count - int(is_multiple_of_smaller and not is_multiple_of_larger)
+        return sample_count - int(is_multiple_of_smaller_count and not is_multiple_of_larger_count)
     return sample_count
 
 
 def _read_accelerometer_bias(
-    topics: Topics, delayed_state: TableOrUnavailable
+    topics: Topics, horizon_state: TableOrUnavailable
 ) -> TableOrUnavailable:
     if len(bias := topics.primary_samples(px4.TOPIC_LAYOUTS["sensor_bias"]).dropna()):
         return bias
-    if isinstance(delayed_state, Unavailable) or delayed_state.empty:
+    if isinstance(horizon_state, Unavailable) or horizon_state.empty:
         return BIAS_NOT_LOGGED
-    return delayed_state[Columns.ACCELEROMETER_BIAS].set_axis(Columns.SPECIFIC_FORCE, axis=1)
+    return horizon_state[Columns.ACCELEROMETER_BIAS].set_axis(Columns.SPECIFIC_FORCE, axis=1)
 
 
 def _compute_horizon_delay_s(topics: Topics, step_s: float) -> float | Unavailable:
@@ -284,13 +290,13 @@ def _compute_horizon_delay_s(topics: Topics, step_s: float) -> float | Unavailab
     The delay is not available before v1.13, where timestamp_sample is the time of the newest IMU
     sample instead of the fusion horizon.
     """
-    age_s = _compute_publication_age_s(topics, _find_state_vector(topics)[0])
-    if len(age_s) and (median_age_s := float(age_s.median())) > step_s:
-        return median_age_s
+    delay_s = _compute_publication_delay_s(topics, _find_state_vector(topics)[0])
+    if len(delay_s) and (median_delay_s := float(delay_s.median())) > step_s:
+        return median_delay_s
     return HORIZON_NOT_LOGGED
 
 
-def _compute_publication_age_s(topics: Topics, topic: str) -> pd.Series:
+def _compute_publication_delay_s(topics: Topics, topic: str) -> pd.Series:
     """Return the delay (s) from measurement to publication of each sample of a topic.
 
     The index is the measurement time (s).
@@ -299,21 +305,23 @@ def _compute_publication_age_s(topics: Topics, topic: str) -> pd.Series:
         if "timestamp_sample" in table:
             sample_times_us = measurement_time_us(table)
             sample_time_index = time_index((sample_times_us - topics.time_origin_us) * 1e-6)
-            age_us = table["timestamp"].astype(np.int64) - sample_times_us
-            return pd.Series(age_us * 1e-6, index=sample_time_index)
+            delay_us = table["timestamp"].astype(np.int64) - sample_times_us
+            return pd.Series(delay_us * 1e-6, index=sample_time_index)
     return pd.Series(dtype=np.float64)
 
 
 def _read_fusion_flags(topics: Topics, enabled_aids: StepFunctions) -> TableOrUnavailable:
     """Read EKF2's fusion flags of external vision: horizontal position, height and yaw."""
-    aid_by_group = {"horizontal": "ev_pos", "vertical": "ev_hgt", "yaw": "ev_yaw"}
-    if not {*aid_by_group.values()} <= enabled_aids.keys():
+    aid_name_by_flag = {"horizontal": "ev_pos", "vertical": "ev_hgt", "yaw": "ev_yaw"}
+    if not {*aid_name_by_flag.values()} <= enabled_aids.keys():
         return Unavailable(
             "EKF2 fusion flags",
             "estimator_status_flags and estimator_status are not logged",
             px4.DEFAULT_PROFILE_REMEDY,
         )
-    flags = pd.DataFrame({group: enabled_aids[aid] for group, aid in aid_by_group.items()}).dropna()
+    flags = pd.DataFrame(
+        {flag: enabled_aids[aid_name] for flag, aid_name in aid_name_by_flag.items()}
+    ).dropna()
     topic = px4.STATUS_FLAGS if topics.instances(px4.STATUS_FLAGS) else px4.STATUS_TOPIC
     if flags.empty:
         return Unavailable(
@@ -347,7 +355,7 @@ def read_resets(local_samples: pd.DataFrame) -> tuple[Reset, ...]:
 
 def _read_fusion_record(
     topics: Topics,
-    delayed_state: TableOrUnavailable,
+    horizon_state: TableOrUnavailable,
     local_samples: pd.DataFrame,
     enabled_aids: StepFunctions,
     step_s: float,
@@ -357,10 +365,10 @@ def _read_fusion_record(
     ``local_samples`` contains ``vehicle_local_position``, EKF2's published position.
     """
     topic, attitude_variance_count = _find_state_vector(topics)
-    if topic != px4.STATE_VECTOR_TOPICS[0] or isinstance(delayed_state, Unavailable):
+    if topic != px4.STATE_VECTOR_TOPICS[0] or isinstance(horizon_state, Unavailable):
         return RECORD_NOT_LOGGED
-    quaternion_norm = np.linalg.norm(delayed_state[Columns.QUATERNION], axis=1)
-    usable_state = delayed_state[np.abs(quaternion_norm - 1.0) < 0.01].copy()
+    quaternion_norm = np.linalg.norm(horizon_state[Columns.QUATERNION], axis=1)
+    usable_state = horizon_state[np.abs(quaternion_norm - 1.0) < 0.01].copy()
     if usable_state.empty:
         return RECORD_NOT_LOGGED
     horizontal_columns = Columns.POSITION[:2]
@@ -371,7 +379,7 @@ def _read_fusion_record(
         usable_state[horizontal_columns] = np.nan
         altitude_m = _last_finite_value(local_samples, "ref_alt", 0.0)
         usable_state["down_m"] += altitude_m
-    age_s = _compute_publication_age_s(topics, VISION_TOPIC).sort_index()
+    vision_delay_s = _compute_publication_delay_s(topics, VISION_TOPIC).sort_index()
     return FusionRecord(
         parameters=topics.ekf2_parameters,
         delayed=usable_state,
@@ -381,7 +389,7 @@ def _read_fusion_record(
             for name in OTHER_HORIZONTAL_AIDS
             if name in enabled_aids and enabled_aids[name].any()
         ),
-        vision_age_s=age_s[~age_s.index.duplicated()],
+        vision_age_s=vision_delay_s[~vision_delay_s.index.duplicated()],
         magnetic_field_gauss=_read_magnetic_field(topics, step_s),
         flow=_read_optical_flow(topics, enabled_aids),
         latitude_deg=_last_finite_value(local_samples, "ref_lat", np.nan),
@@ -389,7 +397,7 @@ def _read_fusion_record(
         states={name: enabled_aids[name] for name in STATUS_FLAGS if name in enabled_aids},
         height_bias_updates={
             name: topics.primary_samples(layout).dropna()
-            for name, layout in px4.HEIGHT_BIAS_LAYOUTS.items()
+            for name, layout in px4.HEIGHT_BIAS_LAYOUT_BY_AID.items()
             if topics.find_layout(layout) is not None
         },
     )
@@ -429,7 +437,7 @@ def _read_magnetic_field(topics: Topics, step_s: float) -> pd.DataFrame:
     if field.empty or control_bits.empty:
         return pd.DataFrame()
     flags = sample_step_function(control_bits, field.index).astype(np.int64)
-    return field.assign(fused_3d=(flags >> MAG_3D_BIT & 1).astype(float))
+    return field.assign(fused_3d=(flags >> MAG_3D_FUSION_BIT & 1).astype(float))
 
 
 def _read_optical_flow(topics: Topics, enabled_aids: StepFunctions) -> pd.DataFrame:
@@ -457,12 +465,9 @@ def _read_optical_flow(topics: Topics, enabled_aids: StepFunctions) -> pd.DataFr
         / (1.0 - previous_output_weight)
     ).T
     flow_velocity = flow_velocity.iloc[used_rows]
-    newest_velocity_columns, rate_columns = (
-        ["newest_forward_m_s", "newest_right_m_s"],
-        ["x_rad_s", "y_rad_s"],
-    )
-    squared_range = (flow_velocity[newest_velocity_columns] ** 2).sum(axis=1) / (
-        flow_velocity[rate_columns] ** 2
+    newest_velocity = flow_velocity[["newest_forward_m_s", "newest_right_m_s"]]
+    squared_ground_distance_m2 = (newest_velocity**2).sum(axis=1) / (
+        flow_velocity[["x_rad_s", "y_rad_s"]] ** 2
     ).sum(axis=1)
     flow = pd.DataFrame(
         {
@@ -470,7 +475,7 @@ def _read_optical_flow(topics: Topics, enabled_aids: StepFunctions) -> pd.DataFr
             "right_m_s": right_velocity_m_s,
             "samples": sample_count,
             "interval_s": interval_s,
-            "noise_m2_s2": squared_range
+            "noise_m2_s2": squared_ground_distance_m2
             * np.interp(times_s[used_rows], flow_noise.index, flow_noise["noise"]),
         },
         index=flow_velocity.index,

@@ -7,15 +7,15 @@ from px4fuse.core.arrays import Array
 from px4fuse.flight.model import Columns, Ekf2, Unavailable, time_index
 from px4fuse.readers import px4_topics as px4
 from px4fuse.readers.common import interpolate_inside
-from px4fuse.readers.px4_innovations import with_gnss_innovations
+from px4fuse.readers.px4_innovations import replace_vision_by_gnss_innovations
 from px4fuse.readers.ulog_topics import Topics
 
 # A logged fix and an EKF2 observation are from one GNSS measurement if their times differ by less
 # than this limit (s): receivers send at most 20 fixes per second
-MAX_SAME_FIX_TIME_DIFFERENCE_S = 0.01
+MAX_TIME_DIFFERENCE_OF_SAME_FIX_S = 0.01
 # EKF2's observation is a latitude (°) if it differs by less than this limit from the logged
 # latitude, otherwise a local position (m)
-MAX_LATITUDE_DISTANCE_DEG = 1.0
+MAX_DIFFERENCE_FROM_LOGGED_LATITUDE_DEG = 1.0
 # Possible intervals (s) between the fixes of a GNSS receiver: 4 to 20 fixes per second
 CANDIDATE_FIX_INTERVALS_S = np.arange(0.05, 0.26, 0.0005)
 # Maximum deviation (s) of the interval between two logged fixes from a whole multiple of the
@@ -23,12 +23,12 @@ CANDIDATE_FIX_INTERVALS_S = np.arange(0.05, 0.26, 0.0005)
 MAX_DEVIATION_FROM_MULTIPLE_S = 0.006
 # Minimum number of fixes that are both logged and reconstructed, to measure the error
 MIN_LOGGED_FIXES = 10
-# The receiver interval is known if logged intervals of both n and n + 1 receiver intervals occur at
-# least this often
-MIN_EQUAL_INTERVAL_COUNT = 3
+# The receiver interval is known if some logged intervals are n times as long, others n + 1 times.
+# Minimum number of logged intervals with each of these multiples
+MIN_LOGGED_INTERVALS_PER_MULTIPLE = 3
 # Maximum RMS error (m) of reconstructed fixes, measured at fixes that are both logged and
 # reconstructed
-MAX_RECONSTRUCTION_ERROR_M = 0.1
+MAX_FIX_RECONSTRUCTION_ERROR_M = 0.1
 
 
 def read_unlogged_fixes(
@@ -38,16 +38,21 @@ def read_unlogged_fixes(
 
     The logger writes at most 10 fixes per second.
     """
-    layouts = px4.TOPIC_LAYOUTS["fused_position"], px4.TOPIC_LAYOUTS["fused_velocity"]
-    if isinstance(ekf2, Unavailable) or not all(map(topics.find_layout, layouts)):
+    position_and_velocity_layouts = (
+        px4.TOPIC_LAYOUTS["fused_position"],
+        px4.TOPIC_LAYOUTS["fused_velocity"],
+    )
+    if isinstance(ekf2, Unavailable) or not all(
+        map(topics.find_layout, position_and_velocity_layouts)
+    ):
         return pd.DataFrame()
-    position, velocity = map(topics.primary_samples, layouts)
+    position, velocity = map(topics.primary_samples, position_and_velocity_layouts)
     # Rows of EKF2's GNSS topic that are neither fused nor rejected contain no new fix
-    is_fix = position[["fused", "rejected"]].any(axis=1)
-    position = position.loc[is_fix].drop(columns=["fused", "rejected"])
+    position = position[position[["fused", "rejected"]].any(axis=1)]
+    position = position.drop(columns=["fused", "rejected"])
     fixes = position.join(velocity, how="inner").dropna()
-    # Use the height of EKF2's topic only if GNSS is the height reference: otherwise it contains
-    # EKF2's estimate of the GNSS height bias
+    # Use the height of EKF2's topic only if GNSS is the height reference. Otherwise, the height
+    # contains EKF2's estimate of the GNSS height bias
     height_layout = px4.TOPIC_LAYOUTS["fused_height"]
     if topics.find_layout(height_layout) and topics.ekf2_parameters.get("EKF2_HGT_REF", 1.0) == 1.0:
         fixes = fixes.join(topics.primary_samples(height_layout))
@@ -63,12 +68,12 @@ def read_unlogged_fixes(
     is_between_fixes = (fixes.index > logged_fixes.index[0]) & (
         fixes.index < logged_fixes.index[-1]
     )
-    matched_fixes = fixes[distance_s <= MAX_SAME_FIX_TIME_DIFFERENCE_S]
-    unlogged_fixes = fixes[(distance_s > MAX_SAME_FIX_TIME_DIFFERENCE_S) & is_between_fixes]
+    matched_fixes = fixes[distance_s <= MAX_TIME_DIFFERENCE_OF_SAME_FIX_S]
+    unlogged_fixes = fixes[(distance_s > MAX_TIME_DIFFERENCE_OF_SAME_FIX_S) & is_between_fixes]
     # Before v1.16 the topic contains a local position (m) instead of latitude and longitude
     is_in_degrees = (
         matched_fixes["latitude_deg"].sub(logged_fixes["latitude_deg"].median()).abs().median()
-        < MAX_LATITUDE_DISTANCE_DEG
+        < MAX_DIFFERENCE_FROM_LOGGED_LATITUDE_DEG
     )
     return unlogged_fixes if is_in_degrees else pd.DataFrame()
 
@@ -76,10 +81,10 @@ def read_unlogged_fixes(
 def reconstruct_fixes(
     fixes: pd.DataFrame, ekf2: Ekf2 | Unavailable, delay_s: float
 ) -> tuple[pd.DataFrame, str]:
-    """Compute unlogged GNSS fixes: sum of EKF2 position and innovation (PX4 up to v1.15).
+    """Reconstruct GNSS fixes that are not logged, as EKF2 position plus innovation (up to v1.15).
 
     Return the fixes, with interpolated heights, and a note for the user. Both are empty if the
-    error of reconstructed fixes exceeds MAX_RECONSTRUCTION_ERROR_M.
+    error of reconstructed fixes exceeds MAX_FIX_RECONSTRUCTION_ERROR_M.
 
     Parameters
     ----------
@@ -91,7 +96,7 @@ def reconstruct_fixes(
     empty_result = pd.DataFrame(columns=fixes.columns), ""
     if isinstance(ekf2, Unavailable) or isinstance(ekf2.horizon_s, Unavailable) or len(fixes) < 3:
         return empty_result
-    gnss_innovations = with_gnss_innovations(ekf2).innovations
+    gnss_innovations = replace_vision_by_gnss_innovations(ekf2).innovations
     north_innovations, east_innovations = gnss_innovations["north"], gnss_innovations["east"]
     logged_fix_times_s = fixes.index.to_numpy()
     receiver_interval_s = _estimate_receiver_interval(logged_fix_times_s)
@@ -104,37 +109,37 @@ def reconstruct_fixes(
     # If a fix is older than the fusion horizon, EKF2 fuses it at the horizon (RingBuffer.h)
     delay_beyond_horizon_s = max(0.0, delay_s - ekf2.horizon_s)
     fusion_times_s = north_innovations.index.to_numpy() - delay_beyond_horizon_s
-    # An innovation belongs to the last fix before it. Count the receiver intervals from the last
-    # logged fix to that fix: 0 if that fix is logged
+    # Each innovation belongs to the latest fix before it. This fix is logged if less than one
+    # receiver interval has elapsed since the latest logged fix
     previous_fix_index = np.searchsorted(logged_fix_times_s, fusion_times_s) - 1
-    elapsed_interval_count = (
+    intervals_since_logged_fix = (
         fusion_times_s - logged_fix_times_s[previous_fix_index]
     ) / receiver_interval_s
     is_between_fixes = (previous_fix_index >= 0) & (
         previous_fix_index < len(logged_fix_times_s) - 1
     )
-    # Skip innovations within one EKF2 step after a fix: they may also belong to the fix before
-    is_unambiguous = is_between_fixes & (
-        elapsed_interval_count % 1.0 > ekf2.step_s / receiver_interval_s
+    # Skip innovations within one EKF2 step after a fix, which may belong to the previous fix
+    has_unique_fix = is_between_fixes & (
+        intervals_since_logged_fix % 1.0 > ekf2.step_s / receiver_interval_s
     )
-    previous_fix_index = previous_fix_index[is_unambiguous]
-    elapsed_interval_count = np.floor(elapsed_interval_count[is_unambiguous])
+    previous_fix_index = previous_fix_index[has_unique_fix]
+    intervals_since_logged_fix = np.floor(intervals_since_logged_fix[has_unique_fix])
     reconstructed_fix_times_s = (
-        logged_fix_times_s[previous_fix_index] + elapsed_interval_count * receiver_interval_s
+        logged_fix_times_s[previous_fix_index] + intervals_since_logged_fix * receiver_interval_s
     )
     reconstructed_fixes = pd.DataFrame(
         {
             column: interpolate_inside(
                 reconstructed_fix_times_s + delay_beyond_horizon_s, ekf2.state[column]
             )
-            + innovations["innovation_m"].to_numpy()[is_unambiguous]
+            + innovations["innovation_m"].to_numpy()[has_unique_fix]
             for column, innovations in zip(
                 Columns.POSITION, (north_innovations, east_innovations), strict=False
             )
         },
         index=time_index(reconstructed_fix_times_s),
     )
-    is_logged = elapsed_interval_count == 0.0
+    is_logged = intervals_since_logged_fix == 0.0
     position_error = (
         reconstructed_fixes - fixes[reconstructed_fixes.columns].to_numpy()[previous_fix_index]
     )
@@ -144,7 +149,7 @@ def reconstruct_fixes(
     if len(position_error) < MIN_LOGGED_FIXES or reconstructed_fixes.empty:
         return empty_result
     rms_error_m = float(np.sqrt(np.mean(position_error.to_numpy() ** 2)))
-    if rms_error_m > MAX_RECONSTRUCTION_ERROR_M:
+    if rms_error_m > MAX_FIX_RECONSTRUCTION_ERROR_M:
         return empty_result
     for column in (Columns.POSITION[2], *Columns.POSITION_VARIANCE):
         if column in fixes:
@@ -152,8 +157,8 @@ def reconstruct_fixes(
                 reconstructed_fixes.index, logged_fix_times_s, fixes[column]
             )
     return reconstructed_fixes, (
-        f"{len(reconstructed_fixes)} unlogged GNSS fixes are reconstructed as EKF2 position plus "
-        f"innovation (RMS error {rms_error_m:.2f} m per axis at {len(position_error)} logged fixes)"
+        f"{len(reconstructed_fixes)} GNSS fixes are not logged. They are computed as EKF2 position "
+        f"plus innovation, with an RMS error of {rms_error_m:.2f} m along each axis"
     )
 
 
@@ -165,22 +170,26 @@ def _estimate_receiver_interval(fix_times_s: Array) -> float | None:
     """
     logged_intervals_s = np.diff(fix_times_s)[:, None]
     multiples = logged_intervals_s / CANDIDATE_FIX_INTERVALS_S
-    multiple_deviation_s = np.abs(multiples - np.round(multiples)) * CANDIDATE_FIX_INTERVALS_S
-    deviation_percentile_98_s = np.percentile(multiple_deviation_s, 98, axis=0)
-    possible_indices = np.flatnonzero(deviation_percentile_98_s <= MAX_DEVIATION_FROM_MULTIPLE_S)
+    deviation_from_multiple_s = np.abs(multiples - np.round(multiples)) * CANDIDATE_FIX_INTERVALS_S
+    percentile_98_of_deviation_s = np.percentile(deviation_from_multiple_s, 98, axis=0)
+    possible_indices = np.flatnonzero(percentile_98_of_deviation_s <= MAX_DEVIATION_FROM_MULTIPLE_S)
     if not len(possible_indices):
         return None
     longest_interval_s = CANDIDATE_FIX_INTERVALS_S[possible_indices[-1]]
-    # Of the candidates within 10 % of the longest possible interval, use the one from whose
-    # multiples the logged intervals deviate least
-    near_longest_indices = np.flatnonzero(
+    # Of the candidates within 10 % of the longest possible interval, use the best fit to the logged
+    # intervals
+    candidate_indices_near_longest = np.flatnonzero(
         np.abs(CANDIDATE_FIX_INTERVALS_S - longest_interval_s) < 0.1 * longest_interval_s
     )
     best_interval_s = CANDIDATE_FIX_INTERVALS_S[
-        near_longest_indices[np.argmin(deviation_percentile_98_s[near_longest_indices])]
+        candidate_indices_near_longest[
+            np.argmin(percentile_98_of_deviation_s[candidate_indices_near_longest])
+        ]
     ]
     interval_multiples = np.round(logged_intervals_s[:, 0] / best_interval_s)
-    is_frequent = np.bincount(interval_multiples.astype(int)) >= MIN_EQUAL_INTERVAL_COUNT
-    if not np.any(is_frequent[1:] & is_frequent[:-1]):
+    is_frequent_multiple = (
+        np.bincount(interval_multiples.astype(int)) >= MIN_LOGGED_INTERVALS_PER_MULTIPLE
+    )
+    if not np.any(is_frequent_multiple[1:] & is_frequent_multiple[:-1]):
         return None
     return float(np.median(logged_intervals_s[:, 0] / interval_multiples))

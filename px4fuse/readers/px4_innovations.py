@@ -14,28 +14,29 @@ Innovations = dict[NedAxis, TableOrUnavailable]
 
 
 @dataclass(frozen=True)
-class Ekf2Source:
-    """External vision or GNSS as position source, and the EKF2 aiding sources that belong to it."""
+class Ekf2PositionSource:
+    """Position source (external vision or GNSS), and the EKF2 aiding sources that use it."""
 
     name: str
     # PX4's names of the aiding sources for horizontal position and height
-    horizontal: str
-    vertical: str
+    horizontal_aid: str
+    vertical_aid: str
     # Advice to enable the fusion, by "horizontal" and "vertical" (height)
     remedies: Mapping[str, str]
     # Advice to the user if the innovations are not logged
-    to_log: str
+    logging_remedy: str
     # Name of the height sensor, if it is not the position source itself
-    height: str = ""
+    height_sensor: str = ""
 
 
 VISION, GNSS = (
-    msgspec.convert(PARAMETER_TABLES["sources"][name], Ekf2Source) for name in ("vision", "gnss")
+    msgspec.convert(PARAMETER_TABLES["sources"][name], Ekf2PositionSource)
+    for name in ("vision", "gnss")
 )
-GNSS_AND_BAROMETER = replace(
+GNSS_WITH_BAROMETER_HEIGHT = replace(
     GNSS,
-    vertical=BAROMETER.name,
-    height="the barometer",
+    vertical_aid=BAROMETER.name,
+    height_sensor="the barometer",
     remedies={
         **GNSS.remedies,
         "vertical": "Set EKF2_BARO_CTRL to 1 (EKF2_HGT_MODE to 0 before v1.14) to fuse the "
@@ -62,15 +63,20 @@ def has_fused_aid(ekf2: Ekf2 | Unavailable, aid: str = GNSS_POS.name) -> bool:
     return bool(ekf2.states["xy_global"].any())
 
 
-def with_gnss_innovations(ekf2: Ekf2, source: Ekf2Source = GNSS) -> Ekf2:
+def replace_vision_by_gnss_innovations(ekf2: Ekf2, source: Ekf2PositionSource = GNSS) -> Ekf2:
     """Return the EKF2 data with the innovations of ``source`` instead of external vision."""
     enabled_flags = {
         group: ekf2.states[name]
-        for group, name in (("horizontal", source.horizontal), ("vertical", source.vertical))
+        for group, name in (
+            ("horizontal", source.horizontal_aid),
+            ("vertical", source.vertical_aid),
+        )
         if name in ekf2.states
     }
     fusion_flags: TableOrUnavailable = Unavailable(
-        "EKF2 fusion flags", "the log does not contain the fusion flags of GNSS", GNSS.to_log
+        "EKF2 fusion flags",
+        "the log does not contain the fusion flags of GNSS",
+        GNSS.logging_remedy,
     )
     if enabled_flags:
         columns = ["horizontal", "vertical", "yaw"]
@@ -92,7 +98,7 @@ def collect_innovations_by_axis(
     aids: Mapping[str, AidLog],
     fusion_flags: TableOrUnavailable,
     gate: float,
-    source: Ekf2Source = VISION,
+    source: Ekf2PositionSource = VISION,
 ) -> tuple[Innovations, tuple[str, ...]]:
     """Return the innovations along each axis, and the topics from which they are read.
 
@@ -103,26 +109,27 @@ def collect_innovations_by_axis(
         Fusion flags, see :class:`~px4fuse.flight.model.Ekf2`.
     gate : float
         Innovation gate (√S), used to compute rejections if they are not logged.
-    source : Ekf2Source
+    source : Ekf2PositionSource
     """
     innovations: Innovations = {}
     used_topics: dict[str, None] = {}
     for axis in AXIS_NAMES:
-        group = "vertical" if axis == "down" else "horizontal"
-        sensor_name = (axis == "down" and source.height) or source.name
-        aid_log = aids.get(source.vertical if axis == "down" else source.horizontal)
+        axis_group = "vertical" if axis == "down" else "horizontal"
+        sensor_name = (axis == "down" and source.height_sensor) or source.name
+        aid_log = aids.get(source.vertical_aid if axis == "down" else source.horizontal_aid)
         axis_innovations = None if aid_log is None else select_axis_innovations(aid_log, axis, gate)
-        if isinstance(fusion_flags, pd.DataFrame) and not fusion_flags[group].any():
+        if isinstance(fusion_flags, pd.DataFrame) and not fusion_flags[axis_group].any():
             quantity = "height" if axis == "down" else "horizontal position"
             reason = f"EKF2 never fused the {quantity} from {sensor_name} in this log"
-            remedy = source.remedies[group]
+            remedy = source.remedies[axis_group]
         elif aid_log is None or axis_innovations is None or axis_innovations.empty:
             reason = (
-                f"while {sensor_name} was fused, the log has no usable sample of "
-                f"estimator_aid_src_{source.horizontal}, estimator_aid_src_{source.vertical}, "
-                "estimator_innovations or ekf2_innovations"
+                f"the log has no usable innovation of {sensor_name} in "
+                f"estimator_aid_src_{source.horizontal_aid}, "
+                f"estimator_aid_src_{source.vertical_aid}, estimator_innovations or "
+                "ekf2_innovations"
             )
-            remedy = source.to_log
+            remedy = source.logging_remedy
         else:
             innovations[axis] = axis_innovations
             used_topics |= dict.fromkeys(aid_log.topics)

@@ -49,15 +49,16 @@ EARTH_RADIUS_M = 6_371_000.0  # PX4's CONSTANTS_RADIUS_OF_EARTH, src/lib/geo/geo
 FIX_TYPE_3D = 3
 NO_FIX_ACTION = "Give the antenna a free view of the sky and wait for a fix."
 # Maximum delay (µs) from timestamp to publication if PX4 set the timestamp at the arrival
-MAX_ARRIVAL_DELAY_US = 100
+MAX_ARRIVAL_TO_PUBLICATION_DELAY_US = 100
 # If at least this fraction of the timestamps are arrival times, the log has no measurement times
 MIN_ARRIVAL_TIME_FRACTION = 0.9
 # Maximum time difference (s) between a height and the horizontal position to which it is joined:
 # at a climb rate of 0.5 m/s, the height error is 2.5 cm
 MAX_HEIGHT_TIME_DIFFERENCE_S = 0.05
-# Below this logged GNSS rate (Hz), the logger dropped fixes: receivers send 5 to 20 Hz
+# Maximum logged rate (Hz) of GNSS fixes which shows that the logger dropped fixes: receivers send 5
+# to 20 Hz
 MAX_DOWNSAMPLED_HZ = 4.0
-STATUS_COLUMNS = ["reset_counter", "quality", "age_s"]
+POSITION_STATUS_COLUMNS = ["reset_counter", "quality", "age_s"]
 # Length (µs) of each possible unit of timestamps
 MICROSECONDS_BY_UNIT = {
     "microseconds": 1.0,
@@ -65,9 +66,9 @@ MICROSECONDS_BY_UNIT = {
     "seconds": 1e6,
     "nanoseconds": 1e-3,
 }
-# Timestamps are in a unit in which their rate differs from that of the boot clock by at most this
-# fraction
-MAX_RELATIVE_RATE_ERROR = 0.05
+# Maximum relative difference between the rate of timestamps in their unit and the rate of the boot
+# clock
+MAX_CLOCK_RATE_ERROR_FRACTION = 0.05
 AUTOPILOT_CLOCK_TEXT = "autopilot boot clock (PX4 converted the sender's timestamps)"
 # Latitude and longitude in degrees, optionally altitude in m
 GeodeticPosition = tuple[float, ...]
@@ -78,8 +79,8 @@ def read_positions(
 ) -> tuple[tuple[PositionTrack, ...], tuple[Unavailable, ...]]:
     """Read the positions of all sources in the log, best first, and the missing sources."""
     fusion_flags = ekf2.fusion_flags if isinstance(ekf2, Ekf2) else ekf2
-    # EKF2's position observations contain no orientation: only fused yaw shows that the source is
-    # odometry
+    # EKF2's position observations contain no orientation. If EKF2 fused the yaw of the source, the
+    # source is odometry
     is_odometry = isinstance(fusion_flags, pd.DataFrame) and bool((fusion_flags["yaw"] > 0).any())
     return split_tracks(
         [
@@ -132,14 +133,16 @@ def make_track(
     track_fields
         Other fields of :class:`~px4fuse.flight.model.PositionTrack`.
     """
-    source_status = samples[[name for name in STATUS_COLUMNS if name in samples]]
+    status_samples = samples[[name for name in POSITION_STATUS_COLUMNS if name in samples]]
     samples = samples.reindex(columns=Columns.POSITION + Columns.POSITION_VARIANCE)
     is_nan = samples[Columns.POSITION].isna().to_numpy()
     is_height_only = bool(is_nan[:, :2].all() and not is_nan[:, 2].all())
     rounding_step_m = max(
         estimate_rounding_step(samples[name].to_numpy()) for name in needed_columns[:2]
     )
-    if origin.is_gnss:  # repetitions are valid: a receiver at rest may repeat its position
+    if (
+        origin.is_gnss
+    ):  # a receiver at rest may repeat its position, so repeated positions are valid
         samples, invalid_rows = select_valid_rows(samples, needed_columns), NO_INVALID_ROWS
     else:
         invalid_reasons = classify_invalid_positions(samples, needed_columns)
@@ -160,7 +163,7 @@ def make_track(
         samples=samples.assign(**variance.where(variance > 0)),
         origin=origin,
         invalid=invalid_rows,
-        status=source_status,
+        status=status_samples,
         step_m=rounding_step_m,
         **track_fields,
     )
@@ -209,8 +212,7 @@ def _read_logged_track(topics: Topics, name: str) -> PositionTrack | Unavailable
     orientation = read_orientation(samples)
     instance_count = len(topics.instances(layout.topic))
     note = (
-        f"{instance_count} programs publish {layout.topic}, each as one instance. px4fuse and EKF2 "
-        "use instance 0."
+        f"{instance_count} programs publish {layout.topic}. px4fuse and EKF2 use only instance 0."
     )
     return _make_ulog_track(
         topics,
@@ -220,16 +222,16 @@ def _read_logged_track(topics: Topics, name: str) -> PositionTrack | Unavailable
         notes=(note,) if instance_count > 1 and not is_ekf2 else (),
         is_odometry=orientation is not None,
         frame=frame,
-        clock_map=_describe_arrival_clock(topics, layout.topic),
+        clock_map=_describe_clock_of_arrival_times(topics, layout.topic),
         orientation=orientation,
     )
 
 
-def _describe_arrival_clock(topics: Topics, topic: str) -> ClockMap | None:
-    """Describe the clock of a topic with arrival times or repeated times; else return None.
+def _describe_clock_of_arrival_times(topics: Topics, topic: str) -> ClockMap | None:
+    """Describe the clock of a topic with arrival times or repeated timestamps; else return None.
 
-    PX4 replaces timestamps by arrival times until it has received 500 TIMESYNC replies
-    (``Timesync.cpp``). px4fuse replaces a ``timestamp_sample`` that is not boot time in µs.
+    PX4 logs arrival times as timestamps until it has received 500 TIMESYNC replies
+    (``Timesync.cpp``). px4fuse uses arrival times if ``timestamp_sample`` is not boot time in µs.
     """
     table = topics.tables_of(topic)[0]
     if "timestamp_sample" not in table or len(table["timestamp"]) < MIN_TRACK_SAMPLES:
@@ -237,12 +239,12 @@ def _describe_arrival_clock(topics: Topics, topic: str) -> ClockMap | None:
     published_us = table["timestamp"].astype(np.int64)
     sample_timestamps_us = table["timestamp_sample"].astype(np.int64)
     age_us = published_us - sample_timestamps_us
-    if np.mean(np.abs(age_us) <= MAX_ARRIVAL_DELAY_US) >= MIN_ARRIVAL_TIME_FRACTION:
+    if np.mean(np.abs(age_us) <= MAX_ARRIVAL_TO_PUBLICATION_DELAY_US) >= MIN_ARRIVAL_TIME_FRACTION:
         clock_name = SENDER_CLOCK
         note = "PX4 replaced timestamps by arrival times, because the clocks were not synchronised"
     elif abs(np.median(age_us)) > MAX_PUBLICATION_LAG_S * 1e6:
         clock_name = _describe_timestamp_clock(published_us, sample_timestamps_us)
-        note = "timestamp_sample does not contain boot times in microseconds"
+        note = "timestamp_sample is not boot time in µs, so px4fuse uses arrival times"
     else:
         return describe_repeated_timestamps(
             SENDER_CLOCK, len(sample_timestamps_us), len(np.unique(sample_timestamps_us))
@@ -251,12 +253,12 @@ def _describe_arrival_clock(topics: Topics, topic: str) -> ClockMap | None:
 
 
 def _describe_timestamp_clock(published_us: IntArray, sample_timestamps_us: IntArray) -> str:
-    """Describe timestamps that are not boot time in µs, for example "UNIX time in milliseconds"."""
+    """Return clock and unit of timestamps that are not boot time in µs: "UNIX time in seconds"."""
     if not sample_timestamps_us.any():
         return "0"
     rate_ratio = float(np.ptp(published_us)) / max(float(np.ptp(sample_timestamps_us)), 1.0)
     for unit, unit_us in MICROSECONDS_BY_UNIT.items():
-        if abs(rate_ratio / unit_us - 1.0) < MAX_RELATIVE_RATE_ERROR:
+        if abs(rate_ratio / unit_us - 1.0) < MAX_CLOCK_RATE_ERROR_FRACTION:
             if (
                 MIN_VALID_UNIX_TIME_S
                 <= float(np.median(sample_timestamps_us)) * unit_us * 1e-6
@@ -268,16 +270,19 @@ def _describe_timestamp_clock(published_us: IntArray, sample_timestamps_us: IntA
 
 
 def _read_fused_observation(topics: Topics, is_odometry: bool) -> PositionTrack | Unavailable:
-    horizontal, vertical = px4.TOPIC_LAYOUTS["kept_horizontal"], px4.TOPIC_LAYOUTS["kept_vertical"]
-    if topics.find_layout(horizontal) is None:
-        return unavailable_source(px4.FUSED_OBSERVATION_TRACK)
-    has_height = topics.find_layout(vertical) is not None
-    return _make_derived_track(
+    horizontal_layout, vertical_layout = (
+        px4.TOPIC_LAYOUTS["kept_horizontal"],
+        px4.TOPIC_LAYOUTS["kept_vertical"],
+    )
+    if topics.find_layout(horizontal_layout) is None:
+        return unavailable_source(px4.FUSED_OBSERVATION_TRACK_NAME)
+    has_height = topics.find_layout(vertical_layout) is not None
+    return _make_track_from_ekf2_topics(
         topics,
-        px4.FUSED_OBSERVATION_TRACK,
-        topics.primary_samples(horizontal),
-        topics.primary_samples(vertical) if has_height else None,
-        (horizontal.topic, vertical.topic)[: 1 + has_height],
+        px4.FUSED_OBSERVATION_TRACK_NAME,
+        topics.primary_samples(horizontal_layout),
+        topics.primary_samples(vertical_layout) if has_height else None,
+        (horizontal_layout.topic, vertical_layout.topic)[: 1 + has_height],
         # EKF2 subtracts half its prediction interval from measurement times
         # (estimator_interface.cpp)
         shift_s=0.5 * configured_step_s(topics),
@@ -285,7 +290,7 @@ def _read_fused_observation(topics: Topics, is_odometry: bool) -> PositionTrack 
     )
 
 
-def _make_derived_track(
+def _make_track_from_ekf2_topics(
     topics: Topics,
     name: str,
     samples: pd.DataFrame,
@@ -298,7 +303,7 @@ def _make_derived_track(
     """Make a position track from horizontal positions and heights in EKF2's topics.
 
     The logger downsamples both topics separately, so the height that is nearest in time is used.
-    EKF2_EV_DELAY is added to the times, because EKF2 subtracts it from the sender's timestamps.
+    EKF2 subtracted EKF2_EV_DELAY from the sender's timestamps; the delay is added again.
     """
     notes: tuple[str, ...] = ()
     if height_samples is not None:
@@ -331,10 +336,10 @@ def _reconstruct_track(
 ) -> PositionTrack | Unavailable:
     """Reconstruct external vision positions that are not logged: EKF2 position plus innovation.
 
-    The times of the innovations are used. They are late by up to one interval of the source.
+    The times are those of the innovations, up to one interval of the source after the measurement.
     """
     if isinstance(ekf2, Unavailable):
-        return unavailable_source(px4.RECONSTRUCTED_TRACK, "the log contains no EKF2 state")
+        return unavailable_source(px4.RECONSTRUCTED_TRACK_NAME, "the log contains no EKF2 state")
     positions = {
         column: innovations["innovation_m"]
         + interpolate_inside(innovations.index, ekf2.state[column])
@@ -343,17 +348,17 @@ def _reconstruct_track(
     }
     if not {"north_m", "east_m"} <= positions.keys():
         return unavailable_source(
-            px4.RECONSTRUCTED_TRACK, "EKF2 fused no horizontal external vision position"
+            px4.RECONSTRUCTED_TRACK_NAME, "EKF2 fused no horizontal external vision position"
         )
     down_m = positions.pop("down_m", None)
-    return _make_derived_track(
+    return _make_track_from_ekf2_topics(
         topics,
-        px4.RECONSTRUCTED_TRACK,
+        px4.RECONSTRUCTED_TRACK_NAME,
         pd.DataFrame(positions),
         None if down_m is None else down_m.to_frame("down_m"),
         ("vehicle_local_position", *ekf2.innovation_topics),
         is_odometry=is_odometry,
-        clock=f"fusion times plus {EV_POS.delay}, late by up to one interval of the source",
+        clock=f"autopilot boot clock: fusion time plus {EV_POS.delay}, up to one interval late",
     )
 
 
@@ -375,14 +380,14 @@ def project(
             sin_origin * sin_latitude + cos_origin * cos_latitude * cos_longitude_step, -1.0, 1.0
         )
     )
-    arc_over_chord = np.where(
+    arc_over_sine = np.where(
         arc_rad > 0, arc_rad / np.where(arc_rad > 0, np.sin(arc_rad), 1.0), 1.0
     )
-    north_rad = arc_over_chord * (
+    north_arc_rad = arc_over_sine * (
         cos_origin * sin_latitude - sin_origin * cos_latitude * cos_longitude_step
     )
-    east_rad = arc_over_chord * cos_latitude * np.sin(longitude_step_rad)
-    return north_rad * EARTH_RADIUS_M, east_rad * EARTH_RADIUS_M
+    east_arc_rad = arc_over_sine * cos_latitude * np.sin(longitude_step_rad)
+    return north_arc_rad * EARTH_RADIUS_M, east_arc_rad * EARTH_RADIUS_M
 
 
 def unproject(north_m: Array, east_m: Array, origin: GeodeticPosition) -> tuple[Array, Array]:
@@ -390,15 +395,16 @@ def unproject(north_m: Array, east_m: Array, origin: GeodeticPosition) -> tuple[
 
     Source: PX4 ``MapProjection::reproject``, src/lib/geo/geo.cpp (Snyder 1987, equation 20-14).
     """
-    north_rad, east_rad = north_m / EARTH_RADIUS_M, east_m / EARTH_RADIUS_M
+    north_arc_rad, east_arc_rad = north_m / EARTH_RADIUS_M, east_m / EARTH_RADIUS_M
     origin_latitude_rad, origin_longitude_rad = np.radians(origin[:2])
     sin_origin, cos_origin = np.sin(origin_latitude_rad), np.cos(origin_latitude_rad)
-    arc_rad = np.hypot(north_rad, east_rad)
+    arc_rad = np.hypot(north_arc_rad, east_arc_rad)
     # sin(arc)/arc, 1 at the origin
     sinc_arc = np.sinc(arc_rad / np.pi)
-    latitude_rad = np.arcsin(np.cos(arc_rad) * sin_origin + north_rad * sinc_arc * cos_origin)
+    latitude_rad = np.arcsin(np.cos(arc_rad) * sin_origin + north_arc_rad * sinc_arc * cos_origin)
     longitude_rad = origin_longitude_rad + np.arctan2(
-        east_rad * sinc_arc, cos_origin * np.cos(arc_rad) - north_rad * sin_origin * sinc_arc
+        east_arc_rad * sinc_arc,
+        cos_origin * np.cos(arc_rad) - north_arc_rad * sin_origin * sinc_arc,
     )
     return np.degrees(latitude_rad), np.degrees(longitude_rad)
 
@@ -455,14 +461,16 @@ def _read_gnss_track(topics: Topics, ekf2: Ekf2 | Unavailable) -> PositionTrack 
         )
     parameters = topics.ekf2_parameters
     published_s = (fixes["published_us"].to_numpy() - topics.time_origin_us) * 1e-6
-    has_driver_times = GNSS_MODE_PARAMETER in parameters and bool(
-        np.any(published_s - fixes.index > MAX_ARRIVAL_DELAY_US * 1e-6)
+    has_gnss_driver_times = GNSS_MODE_PARAMETER in parameters and bool(
+        np.any(published_s - fixes.index > MAX_ARRIVAL_TO_PUBLICATION_DELAY_US * 1e-6)
     )
-    delay_ms = 0.0 if has_driver_times else fill_with_defaults(parameters, GNSS_POS)[GNSS_POS.delay]
+    delay_ms = (
+        0.0 if has_gnss_driver_times else fill_with_defaults(parameters, GNSS_POS)[GNSS_POS.delay]
+    )
     clock = "autopilot boot clock, measurement times from the GNSS driver"
-    if not has_driver_times:
+    if not has_gnss_driver_times:
         fixes = fixes.set_axis(time_index(published_s - delay_ms * 1e-3))
-        clock = f"autopilot boot clock minus {delay_ms:g} ms ({GNSS_POS.delay})"
+        clock = f"autopilot boot clock: timestamp minus {GNSS_POS.delay} ({delay_ms:g} ms)"
     unlogged_fixes = read_unlogged_fixes(topics, fixes, ekf2)
     if len(unlogged_fixes):
         fixes = pd.concat([fixes, unlogged_fixes]).sort_index()
@@ -550,10 +558,8 @@ def read_truth(
     truth is shifted from the origin of the simulation to EKF2's origin.
     """
     attitude = read_attitude(topics.read(px4.TOPIC_LAYOUTS["truth_attitude"]))
-    local_layout, global_layout = (
-        px4.TOPIC_LAYOUTS["truth_local"],
-        px4.TOPIC_LAYOUTS["truth_global"],
-    )
+    local_layout = px4.TOPIC_LAYOUTS["truth_local"]
+    global_layout = px4.TOPIC_LAYOUTS["truth_global"]
     logged_local_samples = topics.read(local_layout)
     local_samples = select_valid_rows(logged_local_samples, logged_local_samples.columns.tolist())
     global_positions = select_valid_rows(topics.read(global_layout), Columns.GEODETIC[:2])
@@ -565,10 +571,8 @@ def read_truth(
         if has_fused_aid(ekf2):
             local_samples = local_samples.copy()
             for column in Columns.POSITION:  # both frames differ by a constant
-                interpolated_m = interpolate_inside(
-                    projected_positions.index, local_samples[column]
-                )
-                shift_m = (projected_positions[column] - interpolated_m).median()
+                local_truth_m = interpolate_inside(projected_positions.index, local_samples[column])
+                shift_m = (projected_positions[column] - local_truth_m).median()
                 local_samples[column] += np.nan_to_num(shift_m)
     if len(local_samples):
         return Truth(local_layout.topic, local_samples, attitude)

@@ -1,8 +1,8 @@
 """PX4 topic and field names of all supported PX4 releases.
 
 ``px4_topics.toml`` contains one or more layouts of each quantity: topic, fields and DataFrame
-columns. The first layout is read of which the log contains the topic and all required fields. The
-names are from PX4-Autopilot's ``msg/*.msg`` at the releases in the comments of ``px4_topics.toml``.
+columns. The reader uses the first layout whose topic and required fields are in the log. The names
+are from PX4-Autopilot's ``msg/*.msg`` at the releases in the comments of ``px4_topics.toml``.
 The names of EKF2's aiding sources are in ``ekf2_parameters.toml``.
 """
 
@@ -34,7 +34,7 @@ class TrackSource:
     # Coordinate frame of the positions. If "unknown", a field of the topic may contain it, see
     # FRAME_BY_FIELD_VALUE
     frame: str = "unknown"
-    # Keys in TOPIC_LAYOUTS of the formats of this topic, preferred format first; empty for
+    # Possible layouts of this topic (keys in TOPIC_LAYOUTS), preferred layout first. Empty for
     # positions that are computed from several topics
     layouts: tuple[str, ...] = ()
 
@@ -52,7 +52,9 @@ FRAME_BY_FIELD_VALUE = msgspec.convert(
 )
 UNUSED_TOPICS: Mapping[str, str] = _TOPIC_TABLES["unused"]
 IMU_LAYOUT, LOCAL_POSITION_LAYOUT = TOPIC_LAYOUTS["imu"], TOPIC_LAYOUTS["local_position"]
-HEIGHT_BIAS_LAYOUTS = {name: TOPIC_LAYOUTS[f"bias_of_{name}"] for name in ("baro_hgt", "gnss_hgt")}
+HEIGHT_BIAS_LAYOUT_BY_AID = {
+    name: TOPIC_LAYOUTS[f"bias_of_{name}"] for name in ("baro_hgt", "gnss_hgt")
+}
 # Advice to the user if a topic of the default logging profile is not logged
 DEFAULT_PROFILE_REMEDY = "Record with SDLOG_PROFILE bit 0 (default)."
 # Topics with EKF2's state vector and variances, in order of preference
@@ -60,20 +62,20 @@ STATE_VECTOR_TOPICS = ("estimator_states", "estimator_status")  # since v1.12, v
 # Layouts of the measured magnetic field: magnetometer topic, and observation in EKF2's aiding
 # source topic (since v1.14)
 MAGNETIC_FIELD_LAYOUTS = TOPIC_LAYOUTS["magnetometer"], TOPIC_LAYOUTS["observed_field"]
-# (number of logged states, number of logged variances): number of attitude variances, which are 4
-# of the quaternion or 3 of the rotation error (generated/state.h, v1.15.4 and v1.16)
-ATTITUDE_VARIANCE_COUNTS: Mapping[tuple[int, int], int] = {
+# Number of attitude variances by the numbers of logged states and of logged variances. 4 variances
+# are of the quaternion, 3 of the rotation error (generated/state.h, v1.15.4 and v1.16)
+ATTITUDE_VARIANCE_COUNT_BY_ARRAY_LENGTHS: Mapping[tuple[int, int], int] = {
     (24, 24): 4,
     (24, 23): 3,
     (25, 24): 3,
-    (32, 28): 4,  # before v1.9: 24 states, then unused elements
+    (32, 28): 4,  # before v1.9: only the first 24 states are used
 }
 QUATERNION_VARIANCE_COUNT = 4
 ANTENNA_COLUMNS = ["antenna_forward_m", "antenna_right_m", "antenna_down_m"]
 # Values of the option --position-source: positions that EKF2 fused, positions reconstructed as EKF2
 # position plus innovation, GNSS positions
-FUSED_OBSERVATION_TRACK = "estimator_aid_src_ev_pos"
-RECONSTRUCTED_TRACK = "ekf2_state_plus_innovation"
+FUSED_OBSERVATION_TRACK_NAME = "estimator_aid_src_ev_pos"
+RECONSTRUCTED_TRACK_NAME = "ekf2_state_plus_innovation"
 GPS_POSITION = "vehicle_gps_position"
 # Position sources, other than GNSS, with a topic that contains the positions
 SOURCE_TRACKS = [
@@ -83,7 +85,7 @@ ORIGIN_BY_TRACK_NAME = {name: track.origin for name, track in TRACK_SOURCES.item
 # Aiding sources whose flag "fused" is always set in v1.15 and v1.16. The flag is not used
 AIDS_ALWAYS_FUSED = ("gravity", "drag")
 # Aiding sources whose logged observation is a local position; that of GNSS is a latitude
-AIDS_WITH_LOCAL_OBSERVATION = ("ev_pos", "ev_hgt")
+AIDS_WITH_LOCAL_POSITION_OBSERVATION = ("ev_pos", "ev_hgt")
 STATUS_FLAGS, STATUS_TOPIC = "estimator_status_flags", "estimator_status"
 # Topics with the innovations and the innovation variances of all aiding sources (since v1.12)
 INNOVATION_TOPICS = "estimator_innovations", "estimator_innovation_variances"
@@ -93,7 +95,7 @@ OLD_INNOVATION_TOPIC = "ekf2_innovations"
 def find_track_layouts(source_name: str) -> list[Layout]:
     """Return the possible topics and fields of a position source, best first.
 
-    If a layout contains no topic, the topic has the name of the position source.
+    In a layout without topic, the name of the position source becomes the topic.
     """
     layouts = [TOPIC_LAYOUTS[name] for name in TRACK_SOURCES[source_name].layouts]
     return [replace(layout, topic=layout.topic or source_name) for layout in layouts]

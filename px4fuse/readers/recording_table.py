@@ -20,7 +20,7 @@ from px4fuse.core.reading import display_name, read_text
 from px4fuse.errors import LogError
 from px4fuse.readers import position_names
 from px4fuse.readers.position_names import read_column_name
-from px4fuse.readers.text_table import STREAM_FORMATS, decode_text, is_number, quote
+from px4fuse.readers.text_table import UWB_TEXT_FORMATS, decode_text, is_number, quote
 
 # Maximum size (bytes) of a position file: several days of UWB positions
 MAX_FILE_BYTES = 500_000_000
@@ -31,7 +31,7 @@ MAX_HEADER_CHARS = 200_000
 MAX_COLUMNS = 200
 COLUMNS_OPTION = "`columns` TIME,X,Y,Z"
 SEPARATORS = {";": "semicolon", "\t": "tab", ",": "comma", " ": "space"}
-NO_HEADER = "table without header"
+HEADERLESS_TABLE_FORMAT = "table without header"
 _ISO_DATE = re.compile(r"\d{4}-\d\d-\d\d")
 
 
@@ -44,7 +44,7 @@ class PositionTable:
     format: str
     column_names: list[str]
     # Text of the rows, without the header
-    data_text: str
+    rows_text: str
     separator: str = ","
     # Line number of the header, 0 without a header. None if rows of the table are not lines of the
     # file, as in JSON
@@ -77,7 +77,7 @@ class PositionTable:
         column_indices = sorted({*columns})
         try:
             texts = pd.read_csv(
-                io.StringIO(self.data_text),
+                io.StringIO(self.rows_text),
                 sep=r"\s+" if self.separator == " " else self.separator,
                 header=None,
                 index_col=False,
@@ -112,7 +112,7 @@ def choose_body(file_name: str, body_names: Iterable[str], wanted_body: str | No
     if len(matches) == 1:
         return matches[0]
     raise LogError(
-        f"{file_name} contains the rigid bodies or tags {', '.join(names[:12])}",
+        f"no rigid body or tag of {file_name} is selected. It contains {', '.join(names[:12])}",
         "Choose one with --body NAME.",
     )
 
@@ -168,7 +168,7 @@ def find_table(
             f"{column_list}. The first line is {quote(lines[0])}.",
             f"Add the header time,x,y,z. Alternatively, name the columns with {COLUMNS_OPTION}.",
         )
-    first_row = table.data_text[:MAX_HEADER_CHARS].lstrip("\n").partition("\n")[0]
+    first_row = table.rows_text[:MAX_HEADER_CHARS].lstrip("\n").partition("\n")[0]
     row_width = len(_split_line(first_row.rstrip(f"{table.separator} "), table.separator))
     if row_width > len(table.column_names):
         raise LogError(
@@ -205,8 +205,8 @@ def _find_header_table(
         for separator in SEPARATORS:
             column_names = _split_line(line.strip("#% "), separator)
             if len(column_names) <= MAX_COLUMNS and _is_header(column_names, wanted_names):
-                data_text = _remove_comments(text.split("\n", index + 1)[index + 1])
-                return PositionTable(file_name, "", column_names, data_text, separator, index + 1)
+                rows_text = _remove_comments(text.split("\n", index + 1)[index + 1])
+                return PositionTable(file_name, "", column_names, rows_text, separator, index + 1)
     return None
 
 
@@ -227,7 +227,7 @@ def _find_body_table(
     is_motive = header_index >= 3 and rows[0][0] == "Format Version"
     if header_index < 3 or not (is_motive or is_number(rows[1][0])):
         return None
-    axes, data_text = rows[header_index], text.split("\n", header_index + 1)[header_index + 1]
+    axes, rows_text = rows[header_index], text.split("\n", header_index + 1)[header_index + 1]
     rows = [row + [""] * (len(axes) - len(row)) for row in rows]
     if is_motive:
         unit = dict(zip(rows[0][::2], rows[0][1::2], strict=False)).get("Length Units", "")
@@ -247,7 +247,7 @@ def _find_body_table(
             f"{axis.removeprefix('T')}_{unit}" if axis.removeprefix("T") in {*"XYZ"} else ""
             for axis, unit in zip(axes, rows[header_index + 1], strict=False)
         ]
-        data_text = re.split(r"\n[, ]*\n", data_text.partition("\n")[2], maxsplit=1)[0] + "\n"
+        rows_text = re.split(r"\n[, ]*\n", rows_text.partition("\n")[2], maxsplit=1)[0] + "\n"
     bodies_with_position = (
         body_name for body_name, name in zip(body_names, column_names, strict=False) if name
     )
@@ -261,7 +261,7 @@ def _find_body_table(
         file_name,
         "OptiTrack Motive CSV export" if is_motive else "Vicon Nexus CSV export",
         column_names,
-        data_text,
+        rows_text,
         header_line=header_index + 1,
         # Motive exports y up by default, and z up by an option that the file does not contain
         frames=("eus", "enu") if is_motive else (),
@@ -273,13 +273,13 @@ def _find_body_table(
 
 def _find_stream_table(file_name: str, text: str, lines: Sequence[str]) -> PositionTable | None:
     """Find the positions in a text format of ``formats.toml``, such as the output of a UWB tag."""
-    for stream_format in STREAM_FORMATS:
+    for stream_format in UWB_TEXT_FORMATS:
         pattern = re.compile(stream_format["row"], re.MULTILINE)
         first_row = next((line for line in lines if pattern.match(line)), None)
         if first_row is not None:
             rows = pattern.findall(text)
-            range_count = len(re.findall(stream_format["ranges"], first_row))
-            notes = [f"px4fuse does not use the {range_count} UWB ranges in each line"]
+            uwb_range_count = len(re.findall(stream_format["ranges"], first_row))
+            notes = [f"px4fuse does not use the {uwb_range_count} UWB ranges in each line"]
             if lost_count := text.count("\n") - len(rows):
                 notes.append(f"lines without a position: {lost_count}")
             csv_text = "".join(f"{','.join(row)}\n" for row in rows)
@@ -320,7 +320,7 @@ def _find_json_table(file_name: str, text: str) -> PositionTable | None:
 
 
 def _find_headerless_table(path: Path, text: str, lines: Sequence[str]) -> PositionTable | None:
-    """Read a table without header: columns time, x, y, z, or 3x4 matrices in KITTI files."""
+    """Find a table without header: columns time, x, y, z, or the 3x4 matrices of KITTI poses."""
     plain_lines = (line.partition("#")[0] for line in lines)
     first_row = next((line for line in plain_lines if line.strip(" \t%")), "")
     for separator in SEPARATORS:
@@ -331,7 +331,7 @@ def _find_headerless_table(path: Path, text: str, lines: Sequence[str]) -> Posit
         if separator == " " and len(fields) == 12:
             return _read_kitti_table(path, text)
         if is_number(decimal_fields[0]) or _ISO_DATE.match(fields[0]):
-            name, quaternion_order = NO_HEADER, ""
+            name, quaternion_order = HEADERLESS_TABLE_FORMAT, ""
             if separator in " \t" and len(fields) == 8:
                 name, quaternion_order = "TUM trajectory", "xyzw"
             elif separator == "," and len(fields) in (8, 17) and len(fields[0]) == 19:
@@ -339,9 +339,9 @@ def _find_headerless_table(path: Path, text: str, lines: Sequence[str]) -> Posit
             column_names = ["time", "x", "y", "z", *(f"q{axis}" for axis in quaternion_order)]
             column_names += [""] * (len(fields) - len(column_names))
             note = "the file has no header: columns 1 to 4 are read as time, x, y, z"
-            data_text = _remove_comments(text)
+            rows_text = _remove_comments(text)
             return PositionTable(
-                display_name(path), name, column_names, data_text, separator, 0, notes=(note,)
+                display_name(path), name, column_names, rows_text, separator, 0, notes=(note,)
             )
     return None
 

@@ -17,7 +17,7 @@ from px4fuse.errors import Px4FuseError, TrajectoryError
 
 _TEXT_FORMATS = read_toml(__file__, dict[str, list[dict[str, Any]]], "formats.toml")
 # Text formats of UWB systems: name, and regular expressions of a position and of the ranges
-STREAM_FORMATS = _TEXT_FORMATS["streams"]
+UWB_TEXT_FORMATS = _TEXT_FORMATS["streams"]
 
 
 def refuse_foreign_format(path: Path, first_bytes: bytes, error_type: type[Px4FuseError]) -> None:
@@ -134,17 +134,16 @@ class TextTableRows:
         try:
             table = np.loadtxt(lines, dtype=columns, ndmin=1)
         except ValueError as error:
-            row_fields = (text.split() for text in lines)
-            is_valid = (
-                len(fields) == text_column_count + number_column_count
-                and all(is_number(field_text.strip()) for field_text in fields[text_column_count:])
-                for fields in row_fields
+            column_count = text_column_count + number_column_count
+            invalid_rows = (
+                row
+                for row, cells in enumerate(map(str.split, lines))
+                if len(cells) != column_count or not all(map(is_number, cells[text_column_count:]))
             )
-            row = next((row for row, is_row_valid in enumerate(is_valid) if not is_row_valid), 0)
+            row = next(invalid_rows, 0)
             raise self.make_row_error(
                 row,
-                f"{quote(lines[row])} does not have {text_column_count + number_column_count} "
-                "columns with numbers",
+                f"{quote(lines[row])} does not have {column_count} columns with numbers",
                 "Correct or remove this line.",
             ) from error
         return table["texts"], np.ascontiguousarray(table["numbers"])

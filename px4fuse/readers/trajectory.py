@@ -15,7 +15,7 @@ from px4fuse.core.arrays import Array, BoolArray
 from px4fuse.core.reading import read_head
 from px4fuse.errors import LogError, TrajectoryError
 from px4fuse.readers.position_file import PositionRecording, read_position_file
-from px4fuse.readers.recording_table import COLUMNS_OPTION, NO_HEADER
+from px4fuse.readers.recording_table import COLUMNS_OPTION, HEADERLESS_TABLE_FORMAT
 from px4fuse.readers.ros_bag import is_bag
 from px4fuse.trajectory.model import Frame, Trajectory, TrajectoryKind
 
@@ -30,12 +30,12 @@ UNIT_NORM_TOLERANCE = 1e-15
 MAX_DROPPED_ROW_FRACTION = 0.01
 # The first pose is the identity, as in SLAM, if its coordinates (m) and rotation angle (rad) are
 # below this limit
-MAX_IDENTITY_DEVIATION = 1e-6
+MAX_DEVIATION_FROM_IDENTITY = 1e-6
 # Maximum ratio smallest / second RMS extent along the principal axes, for a motion in a plane
-MAX_PLANE_THICKNESS_RATIO = 1 / 3
+MAX_SMALLEST_TO_SECOND_EXTENT_RATIO = 1 / 3
 # Minimum ratio second / largest RMS extent along the principal axes, for a motion in a plane: a
 # straight motion has no unique plane
-MIN_PLANE_WIDTH_RATIO = 0.1
+MIN_SECOND_TO_LARGEST_EXTENT_RATIO = 0.1
 # Maximum angle (rad) between the normal of the plane of motion and the y axis of a camera frame
 MAX_TILT_RAD = math.radians(20.0)
 # Minimum fraction of pose intervals that are near the median interval, for a regular frame rate
@@ -43,7 +43,7 @@ MIN_REGULAR_INTERVAL_FRACTION = 0.9
 # A pose interval is near the median interval if it differs by at most this fraction
 MAX_MEDIAN_INTERVAL_DEVIATION = 0.5
 # Minimum interval between two poses that counts as a gap, in median intervals
-MIN_GAP_INTERVALS = 2.5
+MIN_GAP_IN_MEDIAN_INTERVALS = 2.5
 # Minimum interval (s) between two poses that counts as a gap
 MIN_POSE_GAP_S = 0.3
 
@@ -53,8 +53,13 @@ _TRUTH_NAME_PATTERN = re.compile(
     r"truth|vicon|leica|mocap|(?<![a-z])gt(?![a-z])|b_w_RS_S", re.IGNORECASE
 )
 # Number of bytes at the start of a file in which comments are searched
-_HEAD_BYTES = 4096
-_FRAMES: dict[tuple[str, ...], Frame] = {("ned",): "NED", ("enu",): "ENU", ("edn",): "camera"}
+_COMMENT_SEARCH_BYTES = 4096
+# Frame of a trajectory, by the possible frames of the position file
+_FRAME_BY_RECORDING_FRAMES: dict[tuple[str, ...], Frame] = {
+    ("ned",): "NED",
+    ("enu",): "ENU",
+    ("edn",): "camera",
+}
 
 
 def read_trajectory(path: str | Path, body: str | None = None) -> Trajectory:
@@ -71,13 +76,13 @@ def read_trajectory(path: str | Path, body: str | None = None) -> Trajectory:
     try:
         recording = read_position_file(path, body=body, is_trajectory=True)
     except LogError as error:
-        # Remove the advice to use an option that evaluate and loop do not have
+        # The commands for trajectories have no option for columns: remove this advice
         remedy = re.sub(f" [^.]*{COLUMNS_OPTION}.", "", error.remedy)
         raise TrajectoryError(error.reason, remedy) from error
     name, samples = recording.name, recording.samples
     position_m = samples[["x_m", "y_m", "z_m"]].to_numpy()
     dropped_count = recording.row_count - len(samples)
-    if recording.format == NO_HEADER:
+    if recording.format == HEADERLESS_TABLE_FORMAT:
         raise TrajectoryError(
             f"{name} has no header that names its columns",
             "Add a header such as '# time x y z qx qy qz qw'.",
@@ -91,26 +96,25 @@ def read_trajectory(path: str | Path, body: str | None = None) -> Trajectory:
     if np.isnan(position_m).any():
         raise TrajectoryError(f"{name} contains no height", "Export x, y and z.")
     rotation = _read_rotation(recording)
-    first_bytes = b"" if is_bag(path) else read_head(path, _HEAD_BYTES, TrajectoryError)
+    first_bytes = b"" if is_bag(path) else read_head(path, _COMMENT_SEARCH_BYTES, TrajectoryError)
     comment_text = "\n".join(re.findall(r"(?m)^\s*#.*", first_bytes.decode(errors="replace")))
-    kind, kind_note = _detect_kind(path, comment_text, position_m, rotation)
+    kind, kind_note = _detect_trajectory_kind(path, comment_text, position_m, rotation)
     frame, frame_note = _detect_frame(kind, position_m)
     time_s = samples.index.to_numpy()
-    notes = (*recording.detection_notes, *recording.notes)
-    more_notes = (kind_note, frame_note, _describe_gaps(time_s))
+    notes = (*recording.format_detection_notes, *recording.notes)
     return Trajectory(
         name=name,
         kind=kind,
         time_s=time_s,
         position_m=position_m,
         rotation=rotation,
-        frame=_FRAMES.get(recording.frames, frame),
+        frame=_FRAME_BY_RECORDING_FRAMES.get(recording.frames, frame),
         unix_offset_s=0.0 if recording.clock_kind == "UNIX" else None,
         sha256=recording.sha256,
         size_bytes=recording.size_bytes,
         notes=(
             *(f"{note[0].upper()}{note[1:]}." for note in notes),
-            *(note for note in more_notes if note),
+            *filter(None, (kind_note, frame_note, _describe_gaps(time_s))),
         ),
     )
 
@@ -152,24 +156,24 @@ def _read_rotation(recording: PositionRecording) -> Rotation | None:
     return Rotation(quaternions / norms[:, None], normalize=False)
 
 
-def _detect_kind(
+def _detect_trajectory_kind(
     path: Path, comment_text: str, position_m: Array, rotation: Rotation | None
 ) -> tuple[TrajectoryKind, str]:
     # EuRoC files are always called data.csv; their folder name indicates the kind
     folder = path.absolute().parent.name if path.name == "data.csv" else ""
-    text_by_note = {
+    searched_text_by_note = {
         "A comment in the file states that the trajectory is ground truth.": comment_text,
         "The file name states that the trajectory is ground truth.": path.name,
         "The folder name states that the trajectory is ground truth.": folder,
     }
-    for note, text in text_by_note.items():
+    for note, text in searched_text_by_note.items():
         if _TRUTH_NAME_PATTERN.search(text):
             return "truth", note
     if (
         rotation is not None
-        and max(np.abs(position_m[0]).max(), rotation[0].magnitude()) < MAX_IDENTITY_DEVIATION
+        and max(np.abs(position_m[0]).max(), rotation[0].magnitude()) < MAX_DEVIATION_FROM_IDENTITY
     ):
-        return "slam", "The trajectory is from SLAM, because the first pose is the identity."
+        return "slam", "px4fuse assumes SLAM, because the first pose is the identity."
     return "unknown", ""
 
 
@@ -178,13 +182,13 @@ def _detect_frame(kind: TrajectoryKind, position_m: Array) -> tuple[Frame, str]:
         return "unknown", ""
     centred_m = position_m - position_m.mean(axis=0)
     eigenvalues, axes = np.linalg.eigh(centred_m.T @ centred_m)  # eigenvalues in ascending order
-    thickness_rms_m, width_rms_m, length_rms_m = np.sqrt(
+    smallest_extent_m, second_extent_m, largest_extent_m = np.sqrt(
         np.maximum(eigenvalues, 0.0) / len(position_m)
     )
     tilt_rad = math.acos(min(1.0, abs(float(axes[1, 0]))))
     is_planar = (
-        width_rms_m > MIN_PLANE_WIDTH_RATIO * length_rms_m
-        and thickness_rms_m < MAX_PLANE_THICKNESS_RATIO * width_rms_m
+        second_extent_m > MIN_SECOND_TO_LARGEST_EXTENT_RATIO * largest_extent_m
+        and smallest_extent_m < MAX_SMALLEST_TO_SECOND_EXTENT_RATIO * second_extent_m
     )
     if not is_planar or tilt_rad > MAX_TILT_RAD:
         return "unknown", ""
@@ -203,17 +207,17 @@ def _describe_gaps(time_s: Array) -> str:
     )
     if is_regular.mean() < MIN_REGULAR_INTERVAL_FRACTION:
         return (
-            "The poses are key frames, or many poses are missing: the pose intervals are irregular "
-            f"(median {median_interval_s:.3g} s, maximum {intervals_s.max():.3g} s)."
+            f"The pose intervals are irregular (median {median_interval_s:.3g} s, maximum "
+            f"{intervals_s.max():.3g} s): the poses are key frames, or many poses are missing."
         )
     gap_indices = np.flatnonzero(
-        intervals_s > max(MIN_GAP_INTERVALS * median_interval_s, MIN_POSE_GAP_S)
+        intervals_s > max(MIN_GAP_IN_MEDIAN_INTERVALS * median_interval_s, MIN_POSE_GAP_S)
     )
     if not len(gap_indices):
         return ""
-    lost_s = intervals_s[gap_indices] - median_interval_s
-    longest_gap_start_s = time_s[gap_indices[np.argmax(lost_s)]] - time_s[0]
+    missing_time_s = intervals_s[gap_indices] - median_interval_s
+    longest_gap_start_s = time_s[gap_indices[np.argmax(missing_time_s)]] - time_s[0]
     return (
-        f"Poses are missing for {lost_s.sum():.1f} s in {len(gap_indices)} gaps. The longest gap "
-        f"begins {longest_gap_start_s:.1f} s after the first pose."
+        f"Poses are missing for {missing_time_s.sum():.1f} s in {len(gap_indices)} gaps. The "
+        f"longest gap begins {longest_gap_start_s:.1f} s after the first pose."
     )

@@ -27,7 +27,7 @@ from px4fuse.readers.ulog_topics import (
     read_topics,
 )
 
-ACCELEROMETER_OFFSET_INVALID_US = 0x7FFFFFFF
+INVALID_ACCELEROMETER_OFFSET_US = 0x7FFFFFFF
 # IMU samples are missing in an interval longer than this (s); 4 ms is normal
 MIN_IMU_GAP_S = 0.2
 # Minimum and maximum valid UTC (UNIX time, s) of a GNSS receiver: GPS_EPOCH_SECS of PX4
@@ -58,12 +58,12 @@ def read_ulog(name: str, content: bytes) -> Flight:
         topics.record_stream("truth", truth.name)
     airborne_spans_s = _read_airborne_spans(topics)
     altitude_m = topics.read(px4.TOPIC_LAYOUTS["barometer"])["altitude_m"]
-    delay_s = topics.ekf2_parameters.get(BAROMETER.delay, 0.0) * 1e-3
+    barometer_delay_s = topics.ekf2_parameters.get(BAROMETER.delay, 0.0) * 1e-3
     is_in_flight = common.ends_in_flight(airborne_spans_s, topics.log.duration_s)
     dropped_message_counts = [
         (topic, count) for (topic, _), count in sorted(topics.dropped.items())
     ]
-    tilt_failures = topics.read(px4.TOPIC_LAYOUTS["failure"], is_step_function=True)[
+    tilt_failure_flags = topics.read(px4.TOPIC_LAYOUTS["failure"], is_step_function=True)[
         ["roll", "pitch"]
     ]
     return Flight(
@@ -82,11 +82,11 @@ def read_ulog(name: str, content: bytes) -> Flight:
         truth=truth,
         airborne=airborne_spans_s,
         tumble_spans=common.find_flight_spans(
-            tilt_failures.max(axis=1) == 0.0, topics.log.duration_s
+            tilt_failure_flags.max(axis=1) == 0.0, topics.log.duration_s
         ),
-        barometer=barometer(altitude_m, delay_s),
+        barometer=barometer(altitude_m, barometer_delay_s),
         missing=(*common.collect_unavailable(imu, attitude, ekf2, truth), *unavailable_positions),
-        streams=topics.streams,
+        streams=topics.data_source_by_kind,
         unused=tuple(
             UnusedData(name, len(table["timestamp"]), reason)
             for name, reason in px4.UNUSED_TOPICS.items()
@@ -145,7 +145,7 @@ def _read_imu(topics: Topics) -> pd.DataFrame:
     columns = {name: values.to_numpy() for name, values in imu.items()}
     time_s, rows = imu.index.to_numpy(), np.arange(len(imu))
     if (offset_us := columns.pop("accelerometer_offset_us", None)) is not None:
-        rows = np.flatnonzero(offset_us != ACCELEROMETER_OFFSET_INVALID_US)
+        rows = np.flatnonzero(offset_us != INVALID_ACCELEROMETER_OFFSET_US)
         time_us = np.rint(time_s[rows] * 1e6 + offset_us[rows])
         kept_rows = longest_increasing_run(time_us.astype(np.int64) + topics.time_origin_us)
         time_s, rows = time_us[kept_rows] * 1e-6, rows[kept_rows]

@@ -46,14 +46,14 @@ _MICROSECOND_S = 1e-6
 # not boot time: GPS topics before v1.16 contain receiver time, ground truth in v1.13 contains 0
 MAX_PUBLICATION_LAG_S = 10.0
 # Samples more than this time (s) before or after the IMU data are invalid
-MAX_TIME_OUTSIDE_IMU_S = 2.0
+MAX_TIME_OUTSIDE_IMU_DATA_S = 2.0
 # ULog info message with a note from the author of the log to its users
 NOTE_KEY = "px4fuse_note"
 # ULog info message which states that the log is an assignment for a student
-ASSESSED_MARK_KEY = "px4fuse_assessed"
-# True while an instructor's command reads logs: the mark ASSESSED_MARK_KEY, which hides the
-# diagnosis of an assignment, is then ignored
-ignores_assessed_mark = ContextVar("ignores_assessed_mark", default=False)
+ASSIGNMENT_FLAG_KEY = "px4fuse_assessed"
+# True while an instructor's command reads logs. The message ASSIGNMENT_FLAG_KEY then does not hide
+# the diagnosis of the assignment
+ignores_assignment_flag = ContextVar("ignores_assignment_flag", default=False)
 # Maximum interval (s) between IMU timestamps of one flight: after a longer interval, the autopilot
 # was restarted
 MAX_DATA_GAP_S = 600.0
@@ -68,8 +68,8 @@ TopicArrays = dict[str, NDArray[Any]]
 Tables = dict[tuple[str, int], TopicArrays]
 # For each change of the primary EKF2 instance: time (s) and number of the new primary instance
 InstanceSwitches = tuple[tuple[float, int], ...]
-# Without the selector topic there is one EKF2 instance
-SINGLE_INSTANCE: InstanceSwitches = ((-np.inf, 0),)
+# Without the selector topic, EKF2 instance 0 is primary at all times
+NO_INSTANCE_SWITCHES: InstanceSwitches = ((-np.inf, 0),)
 
 
 class _SkippedByteCounter(io.BytesIO):
@@ -80,20 +80,20 @@ class _SkippedByteCounter(io.BytesIO):
     """
 
     skipped_bytes = 0
-    header_start = read_end = position = 0  # byte offsets in the file
+    header_start_offset = read_end_offset = position = 0  # byte offsets in the file
 
     def read(self, size: int, /) -> bytes:  # type: ignore[override]  # pyulog gives a size
         start = self.position
         if size == HEADER_BYTES:
-            if start != self.read_end:
-                self.skipped_bytes += start - self.header_start
-            self.header_start = start
-        self.read_end = self.position = start + size
+            if start != self.read_end_offset:
+                self.skipped_bytes += start - self.header_start_offset
+            self.header_start_offset = start
+        self.read_end_offset = self.position = start + size
         return io.BytesIO.read(self, size)
 
     def seek(self, offset: int, whence: int = io.SEEK_SET, /) -> int:
-        # pyulog seeks back by the length that it requested, even if it got fewer bytes. A position
-        # after the end of the file prevents an endless loop
+        # pyulog seeks back by the length that it requested, even if the file has fewer bytes. The
+        # position counts requested bytes, or pyulog would read the end of the file endlessly
         if whence == io.SEEK_CUR:
             offset += self.position
         self.position = super().seek(offset)
@@ -173,8 +173,8 @@ class Topics:
     is_truncated: bool
     # True if pyulog skipped invalid bytes or messages
     is_damaged: bool
-    # Topics and clock of each kind of data in the flight
-    streams: dict[str, DataSource] = field(default_factory=dict)
+    # Topics that contain each kind of data, such as "imu", and the clock of their timestamps
+    data_source_by_kind: dict[str, DataSource] = field(default_factory=dict)
     # Changes of EKF2_ parameters after take-off
     parameter_changes: tuple[ParameterChange, ...] = ()
 
@@ -188,13 +188,13 @@ class Topics:
 
     @cached_property
     def primary_instances(self) -> InstanceSwitches:
-        """Start time (s) and number of each primary EKF2 instance (``EKF2Selector.cpp``)."""
+        """Time (s) at which an EKF2 instance becomes primary, and its number (``EKF2Selector``)."""
         instances = self.read(TOPIC_LAYOUTS["selector"], is_step_function=True)["instance"]
         instances = instances[instances < 255]  # 255 means that no instance is selected yet
-        primary_changes = instances[instances.ne(instances.shift())]
-        switch_times_s = [-np.inf, *primary_changes.index[1:]]
-        numbers = primary_changes.astype(int).tolist()
-        return tuple(zip(switch_times_s, numbers, strict=False)) or SINGLE_INSTANCE
+        primary_instance_changes = instances[instances.ne(instances.shift())]
+        switch_times_s = [-np.inf, *primary_instance_changes.index[1:]]
+        numbers = primary_instance_changes.astype(int).tolist()
+        return tuple(zip(switch_times_s, numbers, strict=False)) or NO_INSTANCE_SWITCHES
 
     def find_layout(self, *layouts: Layout) -> Layout | None:
         """Return the first layout whose required fields are in the log, or None."""
@@ -225,11 +225,11 @@ class Topics:
             Strictly increasing in time; may be empty.
         """
         instance_numbers = self.instances(layout.topic)
-        number = instance if instance in instance_numbers else instance_numbers[0]
-        table = self.tables[layout.topic, number]
+        instance_number = instance if instance in instance_numbers else instance_numbers[0]
+        table = self.tables[layout.topic, instance_number]
         fields = {
             column: field_name
-            for column, field_name in {**layout.columns, **layout.optional}.items()
+            for column, field_name in {**layout.columns, **layout.optional_columns}.items()
             if field_name in table
         }
         time_us = measurement_time_us(table)
@@ -244,9 +244,11 @@ class Topics:
                 row[~(np.abs(row) < MAX_FIELD_VALUE)] = np.nan  # damaged values
         index = time_index((time_us[kept_rows] - self.time_origin_us) * _MICROSECOND_S)
         samples = pd.DataFrame(values.T, index, list(fields), copy=False)
-        end_s = self.log.duration_s + MAX_TIME_OUTSIDE_IMU_S
+        end_s = self.log.duration_s + MAX_TIME_OUTSIDE_IMU_DATA_S
         return (
-            samples if is_step_function else rows_between(samples, -MAX_TIME_OUTSIDE_IMU_S, end_s)
+            samples
+            if is_step_function
+            else rows_between(samples, -MAX_TIME_OUTSIDE_IMU_DATA_S, end_s)
         )
 
     def read(self, *layouts: Layout, is_step_function: bool = False) -> pd.DataFrame:
@@ -263,7 +265,7 @@ class Topics:
         layout: Layout,
         *,
         is_step_function: bool = False,
-        select: Callable[[pd.DataFrame], pd.DataFrame] | None = None,
+        select_rows: Callable[[pd.DataFrame], pd.DataFrame] | None = None,
     ) -> pd.DataFrame:
         """Read an EKF2 topic from the EKF2 instance that was primary at each time.
 
@@ -273,24 +275,27 @@ class Topics:
         ----------
         layout, is_step_function
             See :meth:`read_instance`.
-        select : callable, optional
+        select_rows : callable, optional
             Function that selects rows from the samples of each instance.
         """
         if self.find_layout(layout) is None:
             return _empty_frame(layout)
         instance_numbers = self.instances(layout.topic)
-        has_single_instance = self.primary_instances == SINGLE_INSTANCE
+        has_single_instance = self.primary_instances == NO_INSTANCE_SWITCHES
         switch_times_s, primary_instance_numbers = (
             np.array(values) for values in zip(*self.primary_instances, strict=True)
         )
         instance_tables: list[pd.DataFrame] = []
         for number in instance_numbers[:1] if has_single_instance else instance_numbers:
             samples = self.read_instance(layout, number, is_step_function=is_step_function)
-            samples = samples if select is None else select(samples)
-            last_switch_indices = np.searchsorted(switch_times_s, samples.index, side="right") - 1
+            samples = samples if select_rows is None else select_rows(samples)
+            previous_switch_indices = (
+                np.searchsorted(switch_times_s, samples.index, side="right") - 1
+            )
             instance_tables.append(
                 samples[
-                    has_single_instance | (primary_instance_numbers[last_switch_indices] == number)
+                    has_single_instance
+                    | (primary_instance_numbers[previous_switch_indices] == number)
                 ]
             )
         joined_tables = pd.concat(instance_tables).sort_index()
@@ -303,9 +308,9 @@ class Topics:
             np.any(measurement_time_us(table) != table["timestamp"].astype(np.int64))
             for table in self.tables_of(topics[0])
         )
-        event = "measurement" if has_measurement_time else "publication"
-        clock = f"autopilot boot clock ({event} time)"
-        self.streams[data_kind] = DataSource(topics, clock, self.log.name)
+        timestamp_kind = "measurement" if has_measurement_time else "publication"
+        clock = f"autopilot boot clock ({timestamp_kind} time)"
+        self.data_source_by_kind[data_kind] = DataSource(topics, clock, self.log.name)
 
 
 def _empty_frame(layout: Layout) -> pd.DataFrame:
@@ -326,7 +331,7 @@ def measurement_time_us(table: TopicArrays) -> NDArray[np.int64]:
         return published_us
     sample_timestamps_us = sample_timestamps_us.astype(np.int64)
     lag_s = np.abs(published_us - sample_timestamps_us) * _MICROSECOND_S
-    # Single invalid measurement times, as in the first message, are replaced by publication times
+    # Isolated invalid measurement times, such as the first, are replaced by publication times
     is_plausible = (sample_timestamps_us > 0) & (lag_s <= MAX_PUBLICATION_LAG_S)
     if np.count_nonzero(is_plausible) * 2 < len(is_plausible):
         return published_us
@@ -343,22 +348,22 @@ def longest_increasing_run(time_us: NDArray[np.int64]) -> IntArray:
     positive_times = time_us[positive_time_indices]
     if len(positive_times) < 2 or np.all(np.diff(positive_times) > 0):
         return positive_time_indices
-    # Element k: smallest last timestamp, and its index, of all increasing subsequences with k + 1
-    # timestamps
-    last_times: list[int] = []
-    last_indices: list[int] = []
+    # At index k: smallest timestamp at which an increasing subsequence of k + 1 timestamps ends,
+    # and the index of this timestamp
+    smallest_end_times: list[int] = []
+    end_indices: list[int] = []
     previous_index = np.empty(len(positive_times), dtype=np.intp)
     for index, time in enumerate(positive_times.tolist()):
-        length = bisect_left(last_times, time)
-        previous_index[index] = last_indices[length - 1] if length else -1
-        last_times[length : length + 1] = [time]
-        last_indices[length : length + 1] = [index]
-    run_indices = []
-    index = last_indices[-1]
+        length = bisect_left(smallest_end_times, time)
+        previous_index[index] = end_indices[length - 1] if length else -1
+        smallest_end_times[length : length + 1] = [time]
+        end_indices[length : length + 1] = [index]
+    reversed_run_indices = []
+    index = end_indices[-1]
     while index >= 0:
-        run_indices.append(index)
+        reversed_run_indices.append(index)
         index = int(previous_index[index])
-    return positive_time_indices[np.array(run_indices[::-1], dtype=np.intp)]
+    return positive_time_indices[np.array(reversed_run_indices[::-1], dtype=np.intp)]
 
 
 def describe_dropped_samples(dropped_counts: Iterable[tuple[str, int]]) -> tuple[str, ...]:
@@ -383,7 +388,7 @@ def read_topics(name: str, content: bytes) -> Topics:
             ulog = _TolerantULogParser(content_reader, message_name_filter_list=list_topics())
             tables = _read_tables(ulog)
             # If px4fuse uses no topic of the log, the other topics give the duration of the log
-            time_span_tables = tables or _read_tables(
+            tables_for_time_span = tables or _read_tables(
                 _TolerantULogParser(_SkippedByteCounter(content))
             )
     except Exception as error:  # pyulog raises many types for damaged bytes
@@ -392,19 +397,19 @@ def read_topics(name: str, content: bytes) -> Topics:
             "Copy the .ulg from the vehicle again.",
         ) from error
     notes: tuple[str, ...] = ()
-    if not time_span_tables:
+    if not tables_for_time_span:
         raise LogError(
             f"{name}: the ULog contains no samples",
             "Copy the file again, or set SDLOG_PROFILE to 129 (default and vision topics).",
         )
     if not tables:
-        names = sorted({topic for topic, _ in time_span_tables})
+        names = sorted({topic for topic, _ in tables_for_time_span})
         notes += (
             f"the log contains only topics that px4fuse does not use ({join_first(names, 5)})",
         )
     if NOTE_KEY in ulog.msg_info_dict:
         notes += (_read_printable_text(ulog.msg_info_dict, NOTE_KEY, ""),)
-    time_origin_us, data_end_us = _find_data_span_us(time_span_tables, name)
+    time_origin_us, data_end_us = _find_data_span_us(tables_for_time_span, name)
     logged_values, parameter_changes = _read_parameters(ulog, tables, time_origin_us)
     parameter_values, parameter_faults = replace_invalid_parameters(logged_values)
     log = LogInfo(
@@ -430,11 +435,11 @@ def read_topics(name: str, content: bytes) -> Topics:
             if name in PARAMETERS
         },
         notes=(*notes, *parameter_faults),
-        bytes_read=content_reader.header_start - content_reader.skipped_bytes,
+        bytes_read=content_reader.header_start_offset - content_reader.skipped_bytes,
         autopilot=_read_printable_text(ulog.msg_info_dict, "sys_name", "PX4"),
         vehicle=_read_printable_text(ulog.msg_info_dict, "sys_uuid", ""),
         is_assessed=True
-        if ASSESSED_MARK_KEY in ulog.msg_info_dict and not ignores_assessed_mark.get()
+        if ASSIGNMENT_FLAG_KEY in ulog.msg_info_dict and not ignores_assignment_flag.get()
         else UNSET,
     )
     return Topics(
@@ -443,7 +448,7 @@ def read_topics(name: str, content: bytes) -> Topics:
         time_origin_us,
         {},
         {name: value for name, value in parameter_values.items() if name.startswith("EKF2_")},
-        content_reader.header_start < len(content) < content_reader.read_end,
+        content_reader.header_start_offset < len(content) < content_reader.read_end_offset,
         ulog.file_corruption,
         parameter_changes=parameter_changes,
     )
@@ -481,7 +486,8 @@ def _read_parameters(
 def _read_tables(ulog: ULog) -> Tables:
     """Return the samples of each topic instance.
 
-    Two subscriptions to one instance are merged; only the fields that both have are kept.
+    If the log contains two subscriptions to one instance, their samples are merged, and only the
+    common fields are kept.
     """
     tables: Tables = {}
     for subscription in ulog.data_list:
@@ -509,12 +515,12 @@ def _find_data_span_us(tables: Tables, name: str) -> tuple[int, int]:
         time_us = tables[key]["timestamp"].astype(np.int64)
         increasing_times_us = time_us[longest_increasing_run(time_us)]
         if len(increasing_times_us):
-            # Only the longest run without a gap is used: timestamps hours away are invalid
+            # Invalid timestamps may be hours away, so only the longest run without a gap is used
             gap_rows = (
                 np.flatnonzero(np.diff(increasing_times_us) > MAX_DATA_GAP_S / _MICROSECOND_S) + 1
             )
-            longest_run_times_us = max(np.split(increasing_times_us, gap_rows), key=len)
-            return int(longest_run_times_us[0]), int(longest_run_times_us[-1])
+            times_without_gap_us = max(np.split(increasing_times_us, gap_rows), key=len)
+            return int(times_without_gap_us[0]), int(times_without_gap_us[-1])
     raise LogError(f"{name}: all timestamps are zero", "Record the flight again.")
 
 

@@ -57,8 +57,8 @@ def _draw_maps(page: Page, evaluation: Evaluation) -> None:
     if is_aligned:
         axes = left_column.add_panel("Before alignment", MAP_HEIGHT, left_margin=LABEL_MARGIN)
         for position_m, line_style, label in (
-            (evaluation.reference_m, REFERENCE_LINE_STYLE, "reference"),
-            (evaluation.unaligned_m, {"color": KF_COLOUR, "lw": 1.2}, "estimate"),
+            (evaluation.reference_position_m, REFERENCE_LINE_STYLE, "reference"),
+            (evaluation.unaligned_position_m, {"color": KF_COLOUR, "lw": 1.2}, "estimate"),
         ):
             drawn_position_m = position_m[:, axis_indices]
             plot_path(axes, drawn_position_m, evaluation.time_s, label=label, **line_style)
@@ -83,7 +83,7 @@ def _get_legend_handles(axes: Axes) -> dict[str, Artist]:
 
 
 def _draw_path(axes: Axes, evaluation: Evaluation, axis_indices: list[int]) -> None:
-    error_m, path_m = evaluation.position_error_m, evaluation.estimate_m[:, axis_indices]
+    error_m, path_m = evaluation.position_error_m, evaluation.aligned_position_m[:, axis_indices]
     stride = max(1, len(error_m) // MAX_PATH_POINTS)
     dots = axes.scatter(
         path_m[::stride, 0],
@@ -95,7 +95,7 @@ def _draw_path(axes: Axes, evaluation: Evaluation, axis_indices: list[int]) -> N
         vmin=0.0,
         vmax=max(float(error_m.max()), MIN_ERROR_RANGE_M),
     )
-    reference_m = evaluation.reference_m[:, axis_indices]
+    reference_m = evaluation.reference_position_m[:, axis_indices]
     plot_path(axes, reference_m, evaluation.time_s, label="reference", **REFERENCE_LINE_STYLE)
     axes.plot(*path_m[0], "o", color="white", mec="black", ms=5, mew=1.0, label="start", zorder=5)
     worst_point = path_m[np.argmax(error_m)]
@@ -233,7 +233,7 @@ def list_missing_reasons(evaluation: Evaluation) -> list[str]:
 
 
 def describe_unaligned_rmse(evaluation: Evaluation) -> str:
-    estimate_m, reference_m = evaluation.unaligned_m, evaluation.reference_m
+    estimate_m, reference_m = evaluation.unaligned_position_m, evaluation.reference_position_m
     rmse_m = float(np.sqrt(((estimate_m - reference_m) ** 2).sum(axis=1).mean()))
     alignment = evaluation.transform
     scale_text = f", scale {alignment.scale:.3g}" if alignment.degrees_of_freedom == 7 else ""

@@ -125,7 +125,9 @@ def _draw_reference(axes: Axes, loop: Loop) -> None:
     for reference in loop.references[:1]:
         evaluation = loop.choose_best_path().scores.get(reference.name)
         if isinstance(evaluation, Evaluation):
-            reference_m = evaluation.transform.apply_inverse(evaluation.reference_m)[:, (1, 0)]
+            reference_m = evaluation.transform.apply_inverse(evaluation.reference_position_m)[
+                :, (1, 0)
+            ]
             line = TRACK_STYLES["ground truth"]
             plot_path(axes, reference_m, evaluation.time_s, label=reference.name, zorder=4, **line)
 

@@ -124,8 +124,8 @@ def make_loop_results(request: LoopRequest, loop: Loop, student: Student) -> con
         contract.LoopResults(
             schema=schema_of(contract.LOOP_SCHEMA_NAME),
             request=request.with_file_names(),
-            track=loop.odometry.trajectory.track(),
-            references=tuple(reference.track() for reference in loop.references),
+            track=loop.odometry.trajectory.describe_track(),
+            references=tuple(reference.describe_track() for reference in loop.references),
             loop=loop,
             findings=find_loop_findings(loop),
             student=student,
@@ -140,8 +140,8 @@ def make_evaluation_results(
     return drop_invalid_numbers(
         contract.EvaluationResults(
             schema=schema_of("px4fuse-evaluation"),
-            estimate=evaluation.estimate_track.track(),
-            reference=evaluation.reference_track.track(),
+            estimate=evaluation.estimate_track.describe_track(),
+            reference=evaluation.reference_track.describe_track(),
             provenance=provenance(command_line(request)),
             **msgspec.structs.asdict(evaluation),
         )

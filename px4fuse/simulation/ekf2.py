@@ -63,11 +63,11 @@ from px4fuse.simulation.ulog_writer import Topic
 from px4fuse.trajectory.rotation import (
     conjugate,
     cumulative_product,
-    from_vector,
+    from_rotation_vector,
     multiply,
     rotate,
     skew,
-    to_vector,
+    to_rotation_vector,
 )
 
 # EKF2's prediction step (µs): EKF2_PREDICT_US
@@ -219,7 +219,7 @@ def _make_segment(
     body_to_ned = compute_attitude(motion.at(time_s)).body_to_ned
     true_quaternions = sensors.to_quaternions(body_to_ned)
     integrated_attitude = cumulative_product(
-        np.concatenate([true_quaternions[:1], from_vector(rotation_rad)])
+        np.concatenate([true_quaternions[:1], from_rotation_vector(rotation_rad)])
     )
     attitude_difference = multiply(true_quaternions, conjugate(integrated_attitude))
     attitude_error_rad = np.zeros((len(time_s), 3))
@@ -244,7 +244,7 @@ def _make_segment(
             time_s=time_s,
             step_s=np.diff(time_s),
             body_to_ned=body_to_ned,
-            correction_rad=to_vector(
+            correction_rad=to_rotation_vector(
                 multiply(attitude_difference[1:], conjugate(attitude_difference[:-1]))
             ),
             force_m_s2=velocity_increment_m_s / np.diff(time_s)[:, None],
@@ -348,11 +348,11 @@ def _compute_output(
     return Ekf2Output(
         time_us=time_us,
         lag_steps=lag_steps,
-        delayed_attitude=multiply(from_vector(state[:, THETA]), true_quaternions),
+        delayed_attitude=multiply(from_rotation_vector(state[:, THETA]), true_quaternions),
         delayed_states=state[:, 3:],
         velocity_m_s=velocity_m_s,
         position_m=position_m,
-        attitude=multiply(from_vector(attitude_error_rad), true_quaternions),
+        attitude=multiply(from_rotation_vector(attitude_error_rad), true_quaternions),
         resets=tuple((step + lag_steps, reset_m) for step, reset_m in resets),
         is_step_aided=is_step_aided,
     )

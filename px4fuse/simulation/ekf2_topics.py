@@ -11,7 +11,7 @@ from px4fuse.ekf2.filter_recursion import HORIZONTAL_POSITION, POSITION_COLUMNS,
 from px4fuse.ekf2.inputs import ReplayInputs
 from px4fuse.ekf2.replay_segments import POSITION
 from px4fuse.flight.ekf2_parameters import BAROMETER, GNSS_POS, GNSS_VEL, MAG, Aid
-from px4fuse.readers.px4_ekf2 import MAG_3D_BIT
+from px4fuse.readers.px4_ekf2 import MAG_3D_FUSION_BIT
 from px4fuse.readers.px4_positions import unproject
 from px4fuse.simulation import sensors
 from px4fuse.simulation.ulog_writer import Topic, make_topic
@@ -298,7 +298,8 @@ def _make_magnetometer_topics(
         ),
         make_topic(
             "estimator_status",
-            ekf2_output.make_timestamps(status_steps) | {"control_mode_flags": 1 << MAG_3D_BIT},
+            ekf2_output.make_timestamps(status_steps)
+            | {"control_mode_flags": 1 << MAG_3D_FUSION_BIT},
         ),
     ]
 

@@ -12,7 +12,7 @@ from px4fuse.errors import SettingsError
 from px4fuse.flight.ekf2_parameters import EV_POS, GNSS_POS
 from px4fuse.flight.model import Flight
 from px4fuse.readers.ulog import read_ulog
-from px4fuse.readers.ulog_topics import ASSESSED_MARK_KEY, NOTE_KEY
+from px4fuse.readers.ulog_topics import ASSIGNMENT_FLAG_KEY, NOTE_KEY
 from px4fuse.simulation import ekf2, sensors
 from px4fuse.simulation.ekf2_topics import MAGNETOMETER_LOG_RATE_HZ
 from px4fuse.simulation.faults import FAULT_TYPES, FaultSizes, format_fault, injected_fault_names
@@ -118,7 +118,7 @@ def to_ulog(simulation: Simulation, *, is_assessed: bool = False) -> bytes:
         "ver_hw": SIMULATION_HARDWARE,
         "ver_sw_release": PX4_RELEASE,
         **({NOTE_KEY: SIMULATED_EKF2_NOTE} if simulation.scenario.ekf2 else {}),
-        **({ASSESSED_MARK_KEY: 1} if is_assessed else {}),
+        **({ASSIGNMENT_FLAG_KEY: 1} if is_assessed else {}),
     }
     return encode_ulog(simulation.topics, simulation.parameters, info, sensors.FIRST_TIMESTAMP_US)
 

@@ -19,16 +19,15 @@ AlignmentKind = Literal["none", "yaw", "se3", "sim3"]
 
 # Minimum extent of a path along its second principal axis for an estimate of the rotation, as
 # fraction of the largest extent
-MIN_RELATIVE_EXTENT = 1e-6
+MIN_EXTENT_RATIO_FOR_ROTATION = 1e-6
 # Minimum extent (m, RMS) of a path for an estimate of the rotation
 MIN_EXTENT_M = 1e-6
-# The yaw is estimated if the residual (RMS) is at most this many times the horizontal motion (RMS):
+# Maximum ratio of the residual (RMS) to the horizontal motion (RMS) for an estimate of the yaw. Two
 # unrelated noise tracks of equal variance have the ratio √2
-MAX_YAW_RESIDUAL_RATIO = 1.0
-# The full rotation is estimated if the residual (RMS) is at most this many times the motion (RMS)
-# along the second principal axis, otherwise it is an error: two independent noise tracks of equal
-# variance have the ratio √6
-MAX_ROTATION_RESIDUAL_RATIO = 2.0
+MAX_RESIDUAL_RATIO_FOR_YAW = 1.0
+# Maximum ratio of the residual (RMS) to the motion (RMS) along the second principal axis, for an
+# estimate of the full rotation. Two unrelated noise tracks of equal variance have the ratio √6
+MAX_RESIDUAL_RATIO_FOR_ROTATION = 2.0
 
 
 class Transform(Record):
@@ -175,7 +174,7 @@ def _require_sufficient_motion(
         )
         residuals_m = residuals_m[:, :2]
         max_extent_m = float(np.linalg.norm(reference_extents_m))
-        max_residual_ratio = MAX_YAW_RESIDUAL_RATIO
+        max_residual_ratio = MAX_RESIDUAL_RATIO_FOR_YAW
         motion_text = "horizontal motion"
         remedy = "Use `alignment` none."
     else:
@@ -183,16 +182,16 @@ def _require_sufficient_motion(
         max_extent_m, extent_m, _ = np.minimum(
             transform.scale * estimate_extents_m, reference_extents_m
         )
-        max_residual_ratio = MAX_ROTATION_RESIDUAL_RATIO
+        max_residual_ratio = MAX_RESIDUAL_RATIO_FOR_ROTATION
         motion_text = "motion perpendicular to the main direction of flight"
         remedy = "Use `alignment` yaw or none."
     residual_m = compute_rms_length_m(residuals_m)
     if (
-        extent_m < max(MIN_EXTENT_M, MIN_RELATIVE_EXTENT * max_extent_m)
+        extent_m < max(MIN_EXTENT_M, MIN_EXTENT_RATIO_FOR_ROTATION * max_extent_m)
         or residual_m > max_residual_ratio * extent_m
     ):
         raise TrajectoryError(
-            f"the alignment {kind} cannot be estimated: the {motion_text} is {extent_m:.2g} m "
-            f"(RMS), and the residual after alignment is {residual_m:.2g} m",
+            f"the alignment {kind} cannot be estimated: the {motion_text} is too small ("
+            f"{extent_m:.2g} m RMS, residual after alignment {residual_m:.2g} m RMS)",
             remedy,
         )

@@ -18,10 +18,10 @@ MAX_GAP_INTERVALS = 3.0
 # Minimum pose interval (s) of a sparse reference, which is not interpolated: its poses are paired
 # with the nearest poses of the estimate
 MIN_SPARSE_POSE_INTERVAL_S = 2.0
-# By default, poses are interpolated over gaps of at least this time (s), at any pose rate
+# Minimum default limit (s) of the gaps over which poses are interpolated, for high pose rates
 MIN_GAP_LIMIT_S = 0.1
 # Default maximum time difference (s) of a pair of poses, as in the evo package
-MAX_NEAREST_DIFFERENCE_S = 0.01
+MAX_PAIR_TIME_DIFFERENCE_S = 0.01
 
 
 class Association(Record):
@@ -74,7 +74,7 @@ def associate(
     TrajectoryError
         Fewer than three poses match.
     """
-    # interpolation over seconds would invent the path of a sparse reference
+    # A sparse reference is not interpolated, because its path between two poses is unknown
     estimate_interval_s = compute_median_interval_s(estimate.time_s)
     if method == "interpolate" and max_gap_s is None:
         reference_interval_s = compute_median_interval_s(reference.time_s)
@@ -83,14 +83,16 @@ def associate(
     time_s = estimate.time_s + time_offset_s
     reference_start_s, reference_end_s = reference.time_s[[0, -1]]
     if method == "nearest":
-        gap_limit_s = end_tolerance_s = MAX_NEAREST_DIFFERENCE_S if max_gap_s is None else max_gap_s
+        gap_limit_s = max_time_outside_reference_s = (
+            MAX_PAIR_TIME_DIFFERENCE_S if max_gap_s is None else max_gap_s
+        )
         pose_indices, reference_indices = _pair_nearest(
             estimate.time_s, reference.time_s, gap_limit_s, time_offset_s
         )
         matched_reference = reference[reference_indices]
     else:
         gap_limit_s = choose_gap_limit_s(reference.time_s) if max_gap_s is None else max_gap_s
-        end_tolerance_s = 0.0
+        max_time_outside_reference_s = 0.0
         pose_indices = np.flatnonzero(is_bracketed(time_s, reference.time_s, gap_limit_s))
         matched_reference = _interpolate_poses(reference, time_s[pose_indices])
     if len(pose_indices) < MIN_POSES:
@@ -103,22 +105,24 @@ def associate(
             "Check that both trajectories are of the same flight. If clocks differ, give "
             "`time_offset_s` auto.",
         )
-    is_outside = (time_s < reference_start_s - end_tolerance_s) | (
-        time_s > reference_end_s + end_tolerance_s
+    is_outside = (time_s < reference_start_s - max_time_outside_reference_s) | (
+        time_s > reference_end_s + max_time_outside_reference_s
     )
-    outside_pose_count = int(is_outside.sum())
-    used_intervals_s = np.diff(time_s[pose_indices])
-    used_intervals_s = used_intervals_s[used_intervals_s <= max(5.0 * estimate_interval_s, 0.5)]
+    pose_count_outside_reference = int(is_outside.sum())
+    intervals_of_used_poses_s = np.diff(time_s[pose_indices])
+    intervals_of_used_poses_s = intervals_of_used_poses_s[
+        intervals_of_used_poses_s <= max(5.0 * estimate_interval_s, 0.5)
+    ]
     used_pose_count, pose_count = len(np.unique(pose_indices)), len(estimate)
     association = Association(
         method=method,
         poses=len(pose_indices),
         max_gap_s=gap_limit_s,
-        outside=outside_pose_count,
-        in_gaps=pose_count - outside_pose_count - used_pose_count,
+        outside=pose_count_outside_reference,
+        in_gaps=pose_count - pose_count_outside_reference - used_pose_count,
         coverage_estimate=used_pose_count / pose_count,
         coverage_reference=min(
-            float(used_intervals_s.sum() / (reference_end_s - reference_start_s)), 1.0
+            float(intervals_of_used_poses_s.sum() / (reference_end_s - reference_start_s)), 1.0
         ),
     )
     return estimate[pose_indices], matched_reference, association
@@ -135,14 +139,16 @@ def is_bracketed(time_s: Array, reference_time_s: Array, gap_limit_s: float) -> 
     Times that equal a reference time are included.
     """
     next_indices = np.clip(np.searchsorted(reference_time_s, time_s), 1, len(reference_time_s) - 1)
-    previous_reference_s = reference_time_s[next_indices - 1]
-    next_reference_s = reference_time_s[next_indices]
+    previous_reference_time_s = reference_time_s[next_indices - 1]
+    next_reference_time_s = reference_time_s[next_indices]
     is_between = (
-        (previous_reference_s <= time_s)
-        & (time_s <= next_reference_s)
-        & (next_reference_s - previous_reference_s <= gap_limit_s)
+        (previous_reference_time_s <= time_s)
+        & (time_s <= next_reference_time_s)
+        & (next_reference_time_s - previous_reference_time_s <= gap_limit_s)
     )
-    return np.asarray(is_between | (previous_reference_s == time_s) | (next_reference_s == time_s))
+    return np.asarray(
+        is_between | (previous_reference_time_s == time_s) | (next_reference_time_s == time_s)
+    )
 
 
 def _interpolate_poses(trajectory: Trajectory, time_s: Array) -> Trajectory:
@@ -150,14 +156,15 @@ def _interpolate_poses(trajectory: Trajectory, time_s: Array) -> Trajectory:
     rotation = trajectory.rotation
     if rotation is not None and len(time_s):
         rotation = Slerp(trajectory.time_s, rotation)(time_s)
-    poses = trajectory.with_positions(interpolate_positions(trajectory, time_s))
+    poses = trajectory.replace_positions(interpolate_positions(trajectory, time_s))
     return replace(poses, rotation=rotation, time_s=time_s)
 
 
 def interpolate_positions(trajectory: Trajectory, time_s: Array) -> Array:
     """Interpolate the positions at times within the trajectory, shape (n, 3)."""
-    columns = trajectory.position_m.T
-    return np.stack([np.interp(time_s, trajectory.time_s, column) for column in columns], axis=-1)
+    return np.stack(
+        [np.interp(time_s, trajectory.time_s, column) for column in trajectory.position_m.T], -1
+    )
 
 
 def _pair_nearest(
@@ -167,7 +174,7 @@ def _pair_nearest(
 
     Return the pose indices of both, without pairs that differ by more than ``max_difference_s``.
     """
-    # The offset is added to the longer series as in the evo package, for equal rounding errors
+    # The offset is added to the longer series, so that rounding errors are those of the evo package
     is_estimate_denser = len(estimate_time_s) > len(reference_time_s)
     sparse_time_s = reference_time_s if is_estimate_denser else estimate_time_s
     dense_time_s = estimate_time_s + offset_s if is_estimate_denser else reference_time_s - offset_s

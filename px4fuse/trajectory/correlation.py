@@ -15,8 +15,8 @@ RealOrComplex = TypeVar("RealOrComplex", Array, ComplexArray)
 class Moments:
     """Second moments of two series a and b over their common samples, at each lag.
 
-    Arrays have shape (n + m - 1,). At index k, a[0] coincides with b[k - (n - 1)]. Sums, and the
-    means ā and b̄, are over the common samples.
+    Arrays have shape (n + m - 1,). At index k, a[0] and b[k - (n - 1)] are at the same time. Sums,
+    and the means ā and b̄, are over the common samples.
 
     Attributes
     ----------
@@ -24,20 +24,22 @@ class Moments:
         Number of common samples.
     covariance : ndarray, complex for complex series
         Σ conj(a - ā)(b - b̄).
-    square_sum_a, square_sum_b : ndarray
+    sum_of_squares_a, sum_of_squares_b : ndarray
         Σ |a - ā|² and Σ |b - b̄|².
     """
 
     count: Array
     covariance: ComplexArray
-    square_sum_a: Array
-    square_sum_b: Array
+    sum_of_squares_a: Array
+    sum_of_squares_b: Array
 
 
 def compute_moments(
     a: RealOrComplex, b: RealOrComplex, is_known_a: BoolArray, is_known_b: BoolArray
 ) -> Moments:
-    """Compute the sums at each lag for a normalised correlation (Padfield 2012, eqs. 3 to 9).
+    """Compute second moments of two series at each lag, for a normalised correlation.
+
+    The equations are those of Padfield (2012), 3 to 9.
 
     Parameters
     ----------
@@ -47,20 +49,23 @@ def compute_moments(
         Mask of known samples, at least one per series.
     """
     # The means are subtracted first, which improves the numerical precision
-    masked_series = (a, is_known_a), (b, is_known_b)
     a, b = (
         np.where(is_known, values - np.mean(values[is_known]), 0.0)
-        for values, is_known in masked_series
+        for values, is_known in ((a, is_known_a), (b, is_known_b))
     )
     mask_a = is_known_a.astype(float)
     mask_b = is_known_b.astype(float)
     common_sample_count = np.rint(_correlate(mask_b, mask_a).real)
-    inverse_count = 1.0 / np.maximum(common_sample_count, 1.0)
-    sum_a, sum_b = _correlate(mask_b, a), _correlate(b, mask_a)  # conjugate of Σ a
-    covariance = _correlate(b, a) - sum_a * sum_b * inverse_count
-    square_sum_a = _correlate(mask_b, np.abs(a) ** 2).real - np.abs(sum_a) ** 2 * inverse_count
-    square_sum_b = _correlate(np.abs(b) ** 2, mask_a).real - np.abs(sum_b) ** 2 * inverse_count
-    return Moments(common_sample_count, covariance, square_sum_a, square_sum_b)
+    reciprocal_count = 1.0 / np.maximum(common_sample_count, 1.0)
+    conjugate_sum_a, sum_b = _correlate(mask_b, a), _correlate(b, mask_a)
+    covariance = _correlate(b, a) - conjugate_sum_a * sum_b * reciprocal_count
+    sum_of_squares_a = (
+        _correlate(mask_b, np.abs(a) ** 2).real - np.abs(conjugate_sum_a) ** 2 * reciprocal_count
+    )
+    sum_of_squares_b = (
+        _correlate(np.abs(b) ** 2, mask_a).real - np.abs(sum_b) ** 2 * reciprocal_count
+    )
+    return Moments(common_sample_count, covariance, sum_of_squares_a, sum_of_squares_b)
 
 
 def autocovariance(values: Array | ComplexArray) -> Array:

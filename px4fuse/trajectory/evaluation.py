@@ -30,31 +30,32 @@ from px4fuse.trajectory.alignment import (
 )
 from px4fuse.trajectory.association import Association, AssociationMethod, associate
 from px4fuse.trajectory.model import MIN_POSES, Trajectory, cumulative_distance
-from px4fuse.trajectory.scores import Delta, RelativeError, RmseInterval, Statistics
+from px4fuse.trajectory.scores import RelativeError, RmseInterval, RpePairDistance, Statistics
 from px4fuse.trajectory.time_offset import TimeOffset, compute_clock_offset_s, estimate_time_offset
 
 # An orientation is constant if no pose is rotated from the first one by more than this angle (rad),
 # which is above 0, because files contain rounded numbers
-MAX_CONSTANT_ROTATION_RAD = 1e-6
-# Minimum number of poses and minimum motion (m) for the conclusion that a constant orientation was
-# not measured
-MIN_CONSTANT_POSE_COUNT, MIN_CONSTANT_MOTION_M = 10, 1.0
+MAX_ROTATION_OF_CONSTANT_ORIENTATION_RAD = 1e-6
+# A constant orientation is a placeholder if the trajectory has at least this number of poses and
+# this extent (m)
+MIN_POSE_COUNT_FOR_PLACEHOLDER, MIN_EXTENT_FOR_PLACEHOLDER_M = 10, 1.0
 # Minimum duration (s) of a repeated position for a warning, and minimum motion (m) of the reference
 # during the repetition
-MIN_FROZEN_DURATION_S, MIN_FROZEN_MOTION_M = 2.0, 0.5
-# A step is the distance of successive poses. At a jump, the step of the estimate minus that of the
-# reference is at least this distance (m), and this multiple of the median of the difference
+MIN_FREEZE_DURATION_S, MIN_REFERENCE_MOTION_DURING_FREEZE_M = 2.0, 0.5
+# At a jump, the distance of successive poses is longer in the estimate than in the reference.
+# Minimum difference (m) of both distances, and its minimum ratio to the median difference
 MIN_JUMP_M, MIN_JUMP_TO_MEDIAN_RATIO = 0.5, 20.0
-# A jump is a map restart if it ends within this distance (m) of the first position or the origin
-MAX_MAP_RESTART_DISTANCE_M = 0.5
+# After a restart of its map, SLAM continues near the first position or the origin. Maximum distance
+# (m) from one of them
+MAX_DISTANCE_FROM_START_AFTER_RESTART_M = 0.5
 # Maximum number of jump times in the warning about jumps
 MAX_STATED_JUMPS = 5
 # Minimum mean rotation (rad) between the orientations of estimate and reference for the conclusion
 # that their body axes differ
-MIN_BODY_ROTATION_RAD = np.radians(30.0)
-# Maximum RMS deviation (rad) of the rotations from estimate to reference from their mean, for the
-# conclusion that the body axes differ
-MAX_BODY_DEVIATION_RAD = np.radians(5.0)
+MIN_ROTATION_BETWEEN_BODY_AXES_RAD = np.radians(30.0)
+# Maximum RMS deviation (rad) of this rotation from its mean, because a rotation between body axes
+# is constant
+MAX_DEVIATION_FROM_MEAN_ROTATION_RAD = np.radians(5.0)
 # Number of alternating estimates of alignment and lever arm
 LEVER_ARM_ITERATIONS = 5
 
@@ -64,9 +65,10 @@ def drop_constant_orientation(trajectory: Trajectory) -> tuple[Trajectory, tuple
     rotation, extent_m = trajectory.rotation, np.ptp(trajectory.position_m, axis=0).max()
     if (
         rotation is None
-        or len(trajectory) < MIN_CONSTANT_POSE_COUNT
-        or extent_m < MIN_CONSTANT_MOTION_M
-        or (rotation[0].inv() * rotation).magnitude().max() > MAX_CONSTANT_ROTATION_RAD
+        or len(trajectory) < MIN_POSE_COUNT_FOR_PLACEHOLDER
+        or extent_m < MIN_EXTENT_FOR_PLACEHOLDER_M
+        or (rotation[0].inv() * rotation).magnitude().max()
+        > MAX_ROTATION_OF_CONSTANT_ORIENTATION_RAD
     ):
         return trajectory, ()
     return replace(trajectory, rotation=None), (
@@ -84,7 +86,7 @@ def find_frozen_poses(
         [*np.flatnonzero(is_new_position).tolist(), len(estimate)]
     ):
         start_s, end_s = estimate.time_s[[start_index, end_index - 1]].tolist()
-        if end_s - start_s < MIN_FROZEN_DURATION_S:
+        if end_s - start_s < MIN_FREEZE_DURATION_S:
             continue
         reference_position_m = reference.cut_to_span(
             start_s + time_offset_s, end_s + time_offset_s
@@ -92,14 +94,14 @@ def find_frozen_poses(
         if (
             len(reference_position_m)
             and (motion_m := np.linalg.norm(np.ptp(reference_position_m, axis=0)))
-            > MIN_FROZEN_MOTION_M
+            > MIN_REFERENCE_MOTION_DURING_FREEZE_M
         ):
             is_frozen[start_index + 1 : end_index] = True
             warnings.append(
                 f"The position of {estimate.name} does not change from "
                 f"{start_s - estimate.time_s[0]:.1f} s to {end_s - estimate.time_s[0]:.1f} s after "
-                f"its start ({(end_index - start_index) / len(estimate):.0%} of the estimate), "
-                f"while the reference moves {motion_m:.1f} m. ATE and RPE exclude these poses."
+                f"its start, while the reference moves {motion_m:.1f} m. ATE and RPE exclude these "
+                f"poses ({(end_index - start_index) / len(estimate):.0%} of the estimate)."
             )
     return is_frozen, tuple(warnings)
 
@@ -122,13 +124,15 @@ def find_jump_warnings(estimate: Trajectory, reference: Trajectory) -> tuple[str
         for origin_m in (estimate.position_m[0], 0.0)
     ]
     cause_text = "The SLAM system probably lost track or relocalised."
-    if np.min(distances_m) < MAX_MAP_RESTART_DISTANCE_M:
-        cause_text = "Probable cause: restart of the map, because the jump ends near the origin."
+    if np.min(distances_m) < MAX_DISTANCE_FROM_START_AFTER_RESTART_M:
+        cause_text = (
+            "The SLAM system probably restarted its map, because a jump ends near the start."
+        )
     return (
         f"{estimate.name} jumps by up to {step_differences_m[jump_indices].max():.1f} m, "
-        f"{times_text} s after its start. {cause_text} ATE and RPE contain the jumps. One "
-        "alignment does not fit the poses before and after a jump: evaluate them as separate "
-        "files.",
+        f"{times_text} s after its start. {cause_text} ATE and RPE contain the jumps. "
+        "Evaluate the poses before and after a jump as separate files, because one alignment does "
+        "not fit both.",
     )
 
 
@@ -140,8 +144,8 @@ def has_other_body_axes(aligned_estimate: Trajectory, reference: Trajectory) -> 
     mean_rotation = rotation_difference.mean()
     deviation_rad = (mean_rotation.inv() * rotation_difference).magnitude()
     return bool(
-        mean_rotation.magnitude() > MIN_BODY_ROTATION_RAD
-        and np.sqrt(np.mean(deviation_rad**2)) < MAX_BODY_DEVIATION_RAD
+        mean_rotation.magnitude() > MIN_ROTATION_BETWEEN_BODY_AXES_RAD
+        and np.sqrt(np.mean(deviation_rad**2)) < MAX_DEVIATION_FROM_MEAN_ROTATION_RAD
     )
 
 
@@ -149,18 +153,18 @@ def has_other_body_axes(aligned_estimate: Trajectory, reference: Trajectory) -> 
 MAX_SCALE_ERROR = 0.1
 # A warning appears if a smaller fraction of the poses of the estimate is used, or if these poses
 # cover a smaller fraction of the time of the reference
-MIN_MATCHED_FRACTION = 0.5
-# Minimum estimated time offset (s) for a warning that the clocks differ: a smaller time offset may
-# be the delay of a filter
+MIN_EVALUATED_FRACTION = 0.5
+# Minimum estimated time offset (s) for a warning that the clocks differ. A smaller offset may be
+# the delay of an estimator
 MIN_REPORTED_TIME_OFFSET_S = 0.1
 # An estimate counts as mirrored if one reversed axis reduces the ATE to at most this fraction
 MAX_MIRRORED_ATE_RATIO = 0.3
 # The mirror test requires an ATE of at least this fraction of the extent of the reference
-MIN_MIRRORED_ATE_FRACTION = 0.03
-# Another time offset is reported if it reduces the ATE to at most this fraction
-MAX_OFFSET_ATE_RATIO = 0.8
-# Minimum ratio of the numbers of evaluated poses with and without the other time offset
-MIN_OFFSET_POSES_RATIO = 0.8
+MIN_ATE_TO_EXTENT_RATIO_FOR_MIRROR_TEST = 0.03
+# A better time offset is reported if it reduces the ATE to at most this fraction
+MAX_ATE_RATIO_OF_BETTER_OFFSET = 0.8
+# Minimum number of evaluated poses with the better time offset, relative to that with the used one
+MIN_POSE_COUNT_RATIO_OF_BETTER_OFFSET = 0.8
 # Maximum ratio of the pose interval of the reference to that of the estimate; above it, the user
 # probably interchanged reference and estimate
 MAX_POSE_INTERVAL_RATIO = 5.0
@@ -168,7 +172,7 @@ MAX_POSE_INTERVAL_RATIO = 5.0
 _Z_DOWN_FRAMES = ("NED", "FRD")
 _Z_UP_FRAMES = ("ENU",)
 # Kinds of trajectories in a frame with unknown vertical direction
-_KINDS_WITHOUT_VERTICAL = ("slam", "unknown")
+_KINDS_WITHOUT_KNOWN_VERTICAL = ("slam", "unknown")
 # File names of monocular SLAM, of which the scale is unknown
 _MONOCULAR_PATTERN = re.compile(r"(?<![a-z])mono(?![a-z])|monocular", re.IGNORECASE)
 
@@ -204,7 +208,7 @@ class Evaluation(Record, kw_only=True):
         Times of the compared poses, on the clock of the estimate.
     distance_m : ndarray, shape (n,)
         Distance along the reference, from the first compared pose.
-    unaligned_m, estimate_m, reference_m : ndarray, shape (n, 3)
+    unaligned_position_m, aligned_position_m, reference_position_m : ndarray, shape (n, 3)
         Positions of the estimate before and after alignment, and of the reference.
     position_error_m : ndarray, shape (n,)
     """
@@ -222,9 +226,9 @@ class Evaluation(Record, kw_only=True):
     reference_track: NotWritten[Trajectory] = NOT_WRITTEN
     time_s: NotWritten[Array] = NOT_WRITTEN
     distance_m: NotWritten[Array] = NOT_WRITTEN
-    unaligned_m: NotWritten[Array] = NOT_WRITTEN
-    estimate_m: NotWritten[Array] = NOT_WRITTEN
-    reference_m: NotWritten[Array] = NOT_WRITTEN
+    unaligned_position_m: NotWritten[Array] = NOT_WRITTEN
+    aligned_position_m: NotWritten[Array] = NOT_WRITTEN
+    reference_position_m: NotWritten[Array] = NOT_WRITTEN
     position_error_m: NotWritten[Array] = NOT_WRITTEN
 
 
@@ -236,7 +240,7 @@ def evaluate(
     association: AssociationMethod = "interpolate",
     max_gap_s: float | None = None,
     time_offset_s: float | Literal["auto"] | None = None,
-    rpe_deltas: Sequence[Delta] | None = None,
+    rpe_deltas: Sequence[RpePairDistance] | None = None,
     all_pairs: bool = True,
 ) -> Evaluation:
     """Compute ATE and RPE of an estimate against a reference.
@@ -252,7 +256,7 @@ def evaluate(
         Time offset added to the timestamps of the estimate. "auto" estimates the offset from the
         motion. None uses UNIX time if both trajectories have it, else 0. If the trajectories then
         do not overlap, the offset is estimated.
-    rpe_deltas : sequence of Delta, optional
+    rpe_deltas : sequence of RpePairDistance, optional
         Distances and times of the RPE; by default adapted to length and duration of the flight.
 
     Raises
@@ -265,7 +269,7 @@ def evaluate(
     (estimate, reference), constant_orientation_notes = zip(
         *map(drop_constant_orientation, (estimate, reference)), strict=True
     )
-    time_offset, offset_warnings, other_offset_s = _choose_time_offset(
+    time_offset, offset_warnings, better_offset_s = _choose_time_offset(
         estimate, reference, time_offset_s
     )
     added_offset_s = time_offset.offset_s or 0.0
@@ -300,7 +304,7 @@ def evaluate(
         aligned_estimate.position_m - matched_reference.position_m, axis=1
     )
     position_statistics = scores.compute_statistics(position_error_m)
-    if other_offset_s is not None:
+    if better_offset_s is not None:
         evaluate_with_offset = partial(
             evaluate,
             estimate,
@@ -310,8 +314,8 @@ def evaluate(
             max_gap_s=max_gap_s,
             rpe_deltas=(),
         )
-        offset_warnings += _find_offset_warnings(
-            position_statistics, evaluate_with_offset, other_offset_s
+        offset_warnings += _find_better_offset_warnings(
+            position_statistics, evaluate_with_offset, better_offset_s
         )
     rotations = scores.get_rotations(aligned_estimate, matched_reference, "ATE of the orientation")
     if rpe_deltas is None:
@@ -339,16 +343,16 @@ def evaluate(
         ),
         time_s=matched_estimate.time_s,
         distance_m=distance_m,
-        unaligned_m=matched_estimate.position_m,
-        estimate_m=aligned_estimate.position_m,
-        reference_m=matched_reference.position_m,
+        unaligned_position_m=matched_estimate.position_m,
+        aligned_position_m=aligned_estimate.position_m,
+        reference_position_m=matched_reference.position_m,
         position_error_m=position_error_m,
         notes=(*constant_orientation_notes[0], *constant_orientation_notes[1], *notes),
         warnings=(
             *frozen_warnings,
             *jump_warnings,
             *line_motion_warnings,
-            *_find_swap_warnings(estimate, reference),
+            *_find_argument_order_warnings(estimate, reference),
             *_find_mirror_warnings(
                 matched_estimate, matched_reference, alignment, position_statistics.rmse
             ),
@@ -365,7 +369,7 @@ def evaluate(
 
 
 def _apply_transform(transform: Transform, estimate: Trajectory) -> Trajectory:
-    return estimate.with_positions(transform.apply(estimate.position_m), transform.to_rotation())
+    return estimate.replace_positions(transform.apply(estimate.position_m), transform.to_rotation())
 
 
 def choose_alignment(estimate: Trajectory, reference: Trajectory) -> tuple[AlignmentKind, str]:
@@ -377,13 +381,13 @@ def choose_alignment(estimate: Trajectory, reference: Trajectory) -> tuple[Align
     """
     has_same_frame = estimate.frame == reference.frame != "unknown"
     if estimate.kind == "truth" and (has_same_frame or reference.kind == "truth"):
-        return "none", "The estimate is not aligned, because it is itself ground truth."
+        return "none", "No alignment is applied, because the estimate is ground truth."
     frames_text = f"{estimate.frame} and {reference.frame}"
     has_common_vertical = any(
         {estimate.frame, reference.frame} <= set(vertical_frames)
         for vertical_frames in (_Z_DOWN_FRAMES, _Z_UP_FRAMES)
     )
-    if has_common_vertical and estimate.kind not in _KINDS_WITHOUT_VERTICAL:
+    if has_common_vertical and estimate.kind not in _KINDS_WITHOUT_KNOWN_VERTICAL:
         return "yaw", (
             "Yaw and position are aligned (4 degrees of freedom): z is vertical in both frames "
             f"({frames_text}), so a tilt counts as an error."
@@ -394,8 +398,8 @@ def choose_alignment(estimate: Trajectory, reference: Trajectory) -> tuple[Align
     except TrajectoryError:
         if has_common_vertical:
             return "yaw", (
-                "Yaw and position are aligned (4 degrees of freedom): the motion is along a line, "
-                f"and z is vertical in both frames ({frames_text})."
+                "Yaw and position are aligned (4 degrees of freedom): motion along a line does "
+                f"not determine all angles, but z is vertical in both frames ({frames_text})."
             )
     if abs(scale - 1.0) > MAX_SCALE_ERROR:
         scale_reason = (
@@ -405,13 +409,11 @@ def choose_alignment(estimate: Trajectory, reference: Trajectory) -> tuple[Align
         if _MONOCULAR_PATTERN.search(track.name):
             scale_reason = f"the file name {track.name} indicates monocular SLAM"
     for track in (estimate, reference):
-        if track.kind in _KINDS_WITHOUT_VERTICAL:
-            frame_cause = "the source of this trajectory is unknown"
+        if track.kind in _KINDS_WITHOUT_KNOWN_VERTICAL:
+            cause = "the source of this trajectory is unknown"
             if track.kind == "slam":
-                frame_cause = "SLAM uses the frame of the first key frame"
-            frame_reason = (
-                f"the vertical direction of {track.name} is unknown, because {frame_cause}"
-            )
+                cause = "SLAM uses the frame of the first key frame"
+            frame_reason = f"the vertical direction of {track.name} is unknown, because {cause}"
             if scale_reason:
                 return "sim3", (
                     "Rotation, position and scale are aligned (7 degrees of freedom): "
@@ -428,64 +430,63 @@ def _choose_time_offset(
 ) -> tuple[TimeOffset, list[str], float | None]:
     """Choose the offset to add to the timestamps of the estimate.
 
-    Also return warnings, and another offset (s) with which the motions match better, if any.
+    Also return warnings, and a better offset (s) that is estimated from the motion, if any.
     """
     is_offset_given = given_offset_s not in (None, "auto")
     clock_offset_s = compute_clock_offset_s(estimate, reference)
     if isinstance(given_offset_s, float | int):
         clock_offset_s = given_offset_s
-    clock_text = "the UNIX time of both files" if clock_offset_s else "unchanged timestamps"
+    match_text = (
+        f"Poses are matched by {'UNIX time' if clock_offset_s else 'unchanged timestamps'}."
+    )
     added_offset_s = clock_offset_s or 0.0
-    unestimated_offset = TimeOffset(
+    offset_without_estimate = TimeOffset(
         offset_s=added_offset_s,
         is_determinable=True,
-        reason="The user chose the time offset."
-        if is_offset_given
-        else f"Poses are matched by {clock_text}.",
+        reason="The user chose the time offset." if is_offset_given else match_text,
     )
     start_s, end_s = estimate.time_s[[0, -1]] + added_offset_s
     is_disjoint = start_s > reference.time_s[-1] or end_s < reference.time_s[0]
     is_estimated = given_offset_s == "auto" or is_disjoint
     if is_offset_given:
-        return unestimated_offset, [], None
+        return offset_without_estimate, [], None
     estimated_offset = estimate_time_offset(estimate, reference)
     if is_estimated:
         if estimated_offset.is_determinable:
             return estimated_offset, [], None
         fallback_offset = structs.replace(
-            unestimated_offset, is_determinable=False, reason=estimated_offset.reason
+            offset_without_estimate, is_determinable=False, reason=estimated_offset.reason
         )
         return (
             fallback_offset,
-            [f"{estimated_offset.reason} Instead, poses are matched by {clock_text}."],
+            [f"{estimated_offset.reason} {match_text}"],
             None,
         )
     low_s, high_s = estimated_offset.interval_s or (added_offset_s, added_offset_s)
     best_offset_s = estimated_offset.offset_s or added_offset_s
-    is_other_offset = (
+    has_better_offset = (
         not low_s <= added_offset_s <= high_s
         and abs(best_offset_s - added_offset_s) >= MIN_REPORTED_TIME_OFFSET_S
     )
-    return unestimated_offset, [], best_offset_s if is_other_offset else None
+    return offset_without_estimate, [], best_offset_s if has_better_offset else None
 
 
-def _find_offset_warnings(
-    statistics: Statistics, evaluate_with_offset: Callable[..., Evaluation], other_offset_s: float
+def _find_better_offset_warnings(
+    statistics: Statistics, evaluate_with_offset: Callable[..., Evaluation], better_offset_s: float
 ) -> list[str]:
-    """Warn if the ATE with another time offset is smaller for nearly the same number of poses."""
+    """Warn if a better time offset reduces the ATE for nearly the same number of poses."""
     try:
-        other_evaluation = evaluate_with_offset(time_offset_s=other_offset_s)
+        better_statistics = evaluate_with_offset(time_offset_s=better_offset_s).ate.translation_m
     except TrajectoryError:  # with this offset, too few poses match or have motion for an alignment
         return []
-    other_statistics = other_evaluation.ate.translation_m
     if (
-        other_statistics.rmse > MAX_OFFSET_ATE_RATIO * statistics.rmse
-        or other_statistics.count < MIN_OFFSET_POSES_RATIO * statistics.count
+        better_statistics.rmse > MAX_ATE_RATIO_OF_BETTER_OFFSET * statistics.rmse
+        or better_statistics.count < MIN_POSE_COUNT_RATIO_OF_BETTER_OFFSET * statistics.count
     ):
         return []
     return [
-        f"With {other_offset_s:+.3f} s added to the timestamps of the estimate, the ATE decreases "
-        f"from {format_metres(statistics.rmse)} to {format_metres(other_statistics.rmse)} m. If "
+        f"With {better_offset_s:+.3f} s added to the timestamps of the estimate, the ATE decreases "
+        f"from {format_metres(statistics.rmse)} to {format_metres(better_statistics.rmse)} m. If "
         "the clocks differ, give --time-offset auto."
     ]
 
@@ -494,7 +495,7 @@ def _find_mirror_warnings(
     estimate: Trajectory, reference: Trajectory, alignment: AlignmentKind, ate_m: float
 ) -> Iterator[str]:
     """Warn if the estimate fits much better with one reversed axis (left-handed frame)."""
-    if ate_m < MIN_MIRRORED_ATE_FRACTION * np.ptp(reference.position_m, axis=0).max():
+    if ate_m < MIN_ATE_TO_EXTENT_RATIO_FOR_MIRROR_TEST * np.ptp(reference.position_m, axis=0).max():
         return
     for axis, signs in (("y", (1.0, -1.0, 1.0)), ("z", (1.0, 1.0, -1.0))):
         mirrored_m = estimate.position_m * signs
@@ -511,7 +512,7 @@ def _find_mirror_warnings(
             return
 
 
-def _find_swap_warnings(estimate: Trajectory, reference: Trajectory) -> Iterator[str]:
+def _find_argument_order_warnings(estimate: Trajectory, reference: Trajectory) -> Iterator[str]:
     if reference.kind == "truth" != estimate.kind:
         return
     estimate_interval_s = compute_median_interval_s(estimate.time_s)
@@ -534,12 +535,12 @@ def _find_comparison_warnings(
     *,
     has_jumps: bool,
 ) -> Iterator[str]:
-    if association.coverage_estimate < MIN_MATCHED_FRACTION:
+    if association.coverage_estimate < MIN_EVALUATED_FRACTION:
         yield (
             f"Only {association.coverage_estimate:.0%} of the poses of the estimate are evaluated; "
             "the reference has no poses at the other times."
         )
-    if association.coverage_reference < MIN_MATCHED_FRACTION:
+    if association.coverage_reference < MIN_EVALUATED_FRACTION:
         yield (
             f"The estimate covers only {association.coverage_reference:.0%} of the time of the "
             "reference."
@@ -580,8 +581,8 @@ def _fit_alignment_with_warning(
             estimate.position_m, reference.position_m, alignment, requires_motion=False
         )
         return transform, (
-            f"{capitalise_first(error.reason)}. The best fit is used, so the ATE is a lower limit, "
-            "and rotation errors may be wrong.",
+            f"{capitalise_first(error.reason)}. The ATE may be too small, and rotation errors may "
+            "be wrong.",
         )
 
 
@@ -590,7 +591,7 @@ def _move_to_reference_body(
 ) -> tuple[Trajectory, tuple[str, ...]]:
     """Convert the poses of the estimate to the body axes and body origin of the reference.
 
-    The constant rotation and lever arm between the bodies are fitted alternately with the
+    The constant rotation and the lever arm between both bodies are fitted in turn with the
     alignment.
     """
     assert estimate.rotation is not None
@@ -628,14 +629,14 @@ def _rotate_to_reference_body(
 ) -> tuple[Trajectory, tuple[str, ...]]:
     """Remove the constant rotation between camera and vehicle axes; also return a note."""
     vehicle_frames = (*_Z_DOWN_FRAMES, *_Z_UP_FRAMES)
-    axes_differ = (aligned_estimate.frame == "camera") != (reference.frame == "camera") or any(
+    body_axes_differ = (aligned_estimate.frame == "camera") != (reference.frame == "camera") or any(
         track.kind == "slam"
         and other_track.frame in vehicle_frames
         and track.frame not in vehicle_frames
         for track, other_track in ((aligned_estimate, reference), (reference, aligned_estimate))
     )
     rotation_of_estimate = aligned_estimate.rotation
-    if rotation_of_estimate is None or reference.rotation is None or not axes_differ:
+    if rotation_of_estimate is None or reference.rotation is None or not body_axes_differ:
         return aligned_estimate, ()
     # chordal mean of the rotation differences (Hartley 2013, section 5.3)
     rotation = (rotation_of_estimate.inv() * reference.rotation).mean()

@@ -64,8 +64,8 @@ def format_vector(vector_m: Mapping[str, float]) -> str:
     )
 
 
-def components_by_axis(frame: Frame, vector_m: Array) -> dict[str, float]:
-    """Return the components of a vector, by the names of the axes of its frame."""
+def split_by_axis(frame: Frame, vector_m: Array) -> dict[str, float]:
+    """Return the component of a vector along each axis of its frame, by axis name."""
     return dict(zip(AXES_OF_FRAME[frame], vector_m.tolist(), strict=True))
 
 
@@ -149,7 +149,7 @@ class Trajectory:
         """Return the poses from ``start_s`` to ``end_s``, possibly none."""
         return self[(self.time_s >= start_s) & (self.time_s <= end_s)]
 
-    def with_positions(
+    def replace_positions(
         self, position_m: Array, world_rotation: Rotation | None = None
     ) -> Trajectory:
         """Return the trajectory with new positions, and without reported variances.
@@ -167,7 +167,7 @@ class Trajectory:
             rotation_variance_rad2=None,
         )
 
-    def track(self) -> Track:
+    def describe_track(self) -> Track:
         """Return the description of the trajectory for results.json."""
         track_fields = ("name", "sha256", "size_bytes", "kind", "frame", "notes")
         return Track(

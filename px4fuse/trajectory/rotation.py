@@ -23,17 +23,17 @@ def _split_components(vectors: Array) -> list[Array]:
 
 
 def conjugate(q: Array) -> Array:
-    """Return the inverse of unit quaternions."""
+    """Return the conjugates of quaternions, which are the inverses of unit quaternions."""
     return np.asarray(q * np.array([1.0, -1.0, -1.0, -1.0]))
 
 
-def from_vector(rotation: Array) -> Array:
+def from_rotation_vector(rotation: Array) -> Array:
     """Convert rotation vectors (rad) to quaternions."""
     angle = np.linalg.norm(rotation, axis=-1, keepdims=True)
     return np.concatenate([np.cos(angle / 2), 0.5 * np.sinc(angle / (2 * np.pi)) * rotation], -1)
 
 
-def to_vector(q: Array) -> Array:
+def to_rotation_vector(q: Array) -> Array:
     """Convert quaternions to rotation vectors (rad) of at most π."""
     q = q * np.where(q[..., :1] < 0.0, -1.0, 1.0)
     imaginary_norm = np.linalg.norm(q[..., 1:], axis=-1, keepdims=True)
@@ -89,20 +89,22 @@ def cumulative_product(quaternions: Array) -> Array:
     row_products = padded_quaternions.reshape(rows, width, 4).copy()
     for column in range(1, width):
         row_products[:, column] = multiply(row_products[:, column - 1], row_products[:, column])
-    previous_products = np.tile(identity, (rows, 1))
+    products_of_previous_rows = np.tile(identity, (rows, 1))
     for row in range(1, rows):
-        previous_products[row] = multiply(previous_products[row - 1], row_products[row - 1, -1])
-    product = multiply(previous_products[:, None, :], row_products).reshape(-1, 4)[:n]
+        products_of_previous_rows[row] = multiply(
+            products_of_previous_rows[row - 1], row_products[row - 1, -1]
+        )
+    product = multiply(products_of_previous_rows[:, None, :], row_products).reshape(-1, 4)[:n]
     return np.asarray(product / np.linalg.norm(product, axis=1, keepdims=True))
 
 
 def interpolate(times: Array, known_times: Array, quaternions: Array) -> Array:
     """Interpolate quaternions linearly and normalise them, for small angles between them."""
     relative_signs = np.sign(np.sum(quaternions[1:] * quaternions[:-1], axis=1))
-    signs = np.concatenate(
+    continuity_signs = np.concatenate(
         [[1.0], np.cumprod(np.where(relative_signs == 0.0, 1.0, relative_signs))]
     )
-    continuous_quaternions = quaternions * signs[:, None]
+    continuous_quaternions = quaternions * continuity_signs[:, None]
     q = np.stack(
         [np.interp(times, known_times, component) for component in continuous_quaternions.T],
         axis=-1,

@@ -18,38 +18,38 @@ from px4fuse.flight.model import Unavailable
 from px4fuse.trajectory.correlation import autocovariance
 from px4fuse.trajectory.model import Trajectory, cumulative_distance
 
-DeltaUnit = Literal["frames", "m", "s"]
+PairDistanceUnit = Literal["frames", "m", "s"]
 
-# Maximum relative error of the distance of an RPE pair, if all pairs are used: default of the evo
-# package
-RELATIVE_DELTA_TOLERANCE = 0.1
+# Maximum relative error of the distance of a pair of poses, if all pairs are used. This is the
+# default of the evo package
+MAX_RELATIVE_PAIR_DISTANCE_ERROR = 0.1
 DEFAULT_RPE_DISTANCES_M = (0.1, 0.5, 1.0, 5.0, 10.0, 50.0, 100.0, 500.0, 1000.0)
 DEFAULT_RPE_TIMES_S = (1.0, 10.0, 60.0)
 # By default, the RPE is computed for at most this many distances and this many times
-MAX_DISTANCE_DELTAS = 3
-MAX_TIME_DELTAS = 2
-# Minimum default distance of the RPE as fraction of the path length, and maximum default distance
-# or time of the RPE as fraction of path length or duration
-MIN_RPE_DISTANCE_FRACTION = 1 / 200
-MAX_RPE_DELTA_FRACTION = 1 / 5
+MAX_DEFAULT_RPE_DISTANCES = 3
+MAX_DEFAULT_RPE_TIMES = 2
+# Minimum default distance of pose pairs, as fraction of the path length
+MIN_PAIR_DISTANCE_FRACTION_OF_PATH = 1 / 200
+# Maximum default distance (time) of pose pairs, as fraction of the path length (duration)
+MAX_PAIR_DISTANCE_FRACTION = 1 / 5
 BOOTSTRAP_RESAMPLES = 2000
 BOOTSTRAP_SEED = 20120101
 # Probability of the bootstrap interval
 CONFIDENCE_LEVEL = 0.95
 # Length of a bootstrap block, in integrated autocorrelation times of the squared errors
-BLOCK_LENGTH_CORRELATION_TIMES = 3.0
+BLOCK_LENGTH_IN_CORRELATION_TIMES = 3.0
 # Number of lags in the sum of autocorrelations, in integrated autocorrelation times (Sokal 1997)
-AUTOCORRELATION_WINDOW_TIMES = 5.0
+WINDOW_LENGTH_IN_CORRELATION_TIMES = 5.0
 # Minimum number of bootstrap blocks for a 95 % interval
 MIN_BOOTSTRAP_BLOCKS = 5.0
 
 
 @dataclass(frozen=True)
-class Delta:
+class RpePairDistance:
     """Distance between the two poses of an RPE pair in frames, metres or seconds."""
 
     value: float
-    unit: DeltaUnit
+    unit: PairDistanceUnit
 
     def __str__(self) -> str:
         return f"{self.value:g} {self.unit}"
@@ -106,7 +106,7 @@ class RelativeError(Record):
     """
 
     delta: float
-    unit: DeltaUnit
+    unit: PairDistanceUnit
     all_pairs: bool
     pairs_from: Literal["reference"]
     translation_m: OrUnavailable[Statistics]
@@ -116,7 +116,7 @@ class RelativeError(Record):
     @property
     def delta_text(self) -> str:
         """Distance between the two poses of a pair, with unit."""
-        return str(Delta(self.delta, self.unit))
+        return str(RpePairDistance(self.delta, self.unit))
 
 
 def compute_statistics(errors: Array) -> Statistics:
@@ -137,36 +137,36 @@ def compute_rotation_statistics(a: Rotation, b: Rotation) -> Statistics:
     return compute_statistics(np.degrees((a.inv() * b).magnitude()))
 
 
-def choose_default_deltas(distance_m: Array, time_s: Array) -> tuple[Delta, ...]:
+def choose_default_deltas(distance_m: Array, time_s: Array) -> tuple[RpePairDistance, ...]:
     """Choose distances and times for the RPE that fit path length and duration of the flight."""
 
     def choose_delta_values(
-        distance_or_time: Array, values: Sequence[float], min_delta_fraction: float
+        distance_or_time: Array, values: Sequence[float], min_fraction: float
     ) -> list[float]:
         total_distance_or_time = float(np.ptp(distance_or_time))
         # The minimum distance or time of a pair is two median intervals between poses
         minimum = max(
-            min_delta_fraction * total_distance_or_time,
+            min_fraction * total_distance_or_time,
             2.0 * compute_median_interval_s(distance_or_time),
         )
         return [
             value
             for value in values
-            if minimum <= value <= MAX_RPE_DELTA_FRACTION * total_distance_or_time
+            if minimum <= value <= MAX_PAIR_DISTANCE_FRACTION * total_distance_or_time
         ]
 
     distances_m = choose_delta_values(
-        distance_m, DEFAULT_RPE_DISTANCES_M, MIN_RPE_DISTANCE_FRACTION
+        distance_m, DEFAULT_RPE_DISTANCES_M, MIN_PAIR_DISTANCE_FRACTION_OF_PATH
     )
     times_s = choose_delta_values(time_s, DEFAULT_RPE_TIMES_S, 0.0)
     return (
-        *(Delta(value, "m") for value in distances_m[-MAX_DISTANCE_DELTAS:]),
-        *(Delta(value, "s") for value in times_s[-MAX_TIME_DELTAS:]),
+        *(RpePairDistance(value, "m") for value in distances_m[-MAX_DEFAULT_RPE_DISTANCES:]),
+        *(RpePairDistance(value, "s") for value in times_s[-MAX_DEFAULT_RPE_TIMES:]),
     )
 
 
 def find_pose_pairs(
-    position_m: Array, time_s: Array, delta: Delta, *, all_pairs: bool = True
+    position_m: Array, time_s: Array, delta: RpePairDistance, *, all_pairs: bool = True
 ) -> tuple[IntArray, IntArray]:
     """Find pairs of poses with a distance of ``delta``.
 
@@ -174,7 +174,7 @@ def find_pose_pairs(
     ----------
     position_m : ndarray, shape (n, 3)
     time_s : ndarray, shape (n,)
-    delta : Delta
+    delta : RpePairDistance
         Distance of a pair; in m it is measured along the path.
     all_pairs : bool
         True: pairs start at every pose and end at the pose nearest to delta. False: pairs start at
@@ -204,25 +204,30 @@ def find_pose_pairs(
     if not all_pairs:
         return _find_consecutive_pairs(np.diff(distance_or_time), delta.value)
     start_indices = np.arange(pose_count - 1)
-    # Neighbours of the nearest pose are tested, too, because of rounding errors
+    # Neighbours are tested too, because rounding errors may change the nearest pose
     nearest_indices = np.searchsorted(distance_or_time, distance_or_time + delta.value)[:-1]
     candidate_indices = np.clip(
         nearest_indices[:, None] + np.arange(-2, 2), start_indices[:, None] + 1, pose_count - 1
     )
-    distance_error = np.abs(
+    pair_distance_error = np.abs(
         distance_or_time[candidate_indices] - distance_or_time[start_indices, None] - delta.value
     )
-    best_columns = np.argmin(distance_error, axis=1)
+    best_candidate_columns = np.argmin(pair_distance_error, axis=1)
     # If several poses have an equal distance (at rest), the first is used
-    first_equal_indices = np.searchsorted(
-        distance_or_time, distance_or_time[candidate_indices[start_indices, best_columns]]
+    first_indices_at_same_distance = np.searchsorted(
+        distance_or_time, distance_or_time[candidate_indices[start_indices, best_candidate_columns]]
     )
-    is_near = distance_error[start_indices, best_columns] <= RELATIVE_DELTA_TOLERANCE * delta.value
-    return start_indices[is_near], np.maximum(first_equal_indices, start_indices + 1)[is_near]
+    is_near = (
+        pair_distance_error[start_indices, best_candidate_columns]
+        <= MAX_RELATIVE_PAIR_DISTANCE_ERROR * delta.value
+    )
+    return start_indices[is_near], np.maximum(first_indices_at_same_distance, start_indices + 1)[
+        is_near
+    ]
 
 
 def _find_consecutive_pairs(steps: Array, delta: float) -> tuple[IntArray, IntArray]:
-    # Sum from the start of each pair, as the evo package does: rounding then selects equal pairs
+    # The sum restarts with each pair, so that rounding errors are those of the evo package
     pair_ends = [0]
     distance_or_time = 0.0
     for index, step in enumerate(steps.tolist(), 1):
@@ -235,9 +240,15 @@ def _find_consecutive_pairs(steps: Array, delta: float) -> tuple[IntArray, IntAr
 
 
 def compute_relative_error(
-    aligned_estimate: Trajectory, reference: Trajectory, delta: Delta, *, all_pairs: bool = True
+    aligned_estimate: Trajectory,
+    reference: Trajectory,
+    delta: RpePairDistance,
+    *,
+    all_pairs: bool = True,
 ) -> RelativeError:
-    """Compute the RPE over one delta: E = (Q_i⁻¹ Q_j)⁻¹ (P_i⁻¹ P_j), Sturm (2012), eq. 1.
+    """Compute the RPE of the pairs of poses with a distance of ``delta``.
+
+    The error of a pair is E = (Q_i⁻¹ Q_j)⁻¹ (P_i⁻¹ P_j), Sturm (2012), eq. 1.
 
     Parameters
     ----------
@@ -252,7 +263,7 @@ def compute_relative_error(
     )
     analysis_name = f"RPE over {delta}"
     if not len(start_indices):
-        missing_pairs = Unavailable(
+        no_pairs_result = Unavailable(
             analysis_name,
             f"the reference has no pair of poses with a distance of {delta}",
             "Use another distance of RPE pairs (delta).",
@@ -262,9 +273,9 @@ def compute_relative_error(
             delta.unit,
             all_pairs,
             "reference",
-            missing_pairs,
-            missing_pairs,
-            missing_pairs,
+            no_pairs_result,
+            no_pairs_result,
+            no_pairs_result,
         )
     displacements_m = [
         track.position_m[end_indices] - track.position_m[start_indices]
@@ -289,7 +300,7 @@ def compute_relative_error(
             for inverse, rotation in zip(start_rotation_inverses, rotations, strict=True)
         )
         rotation_deg = compute_rotation_statistics(reference_rotation, estimated_rotation)
-    # Length of the translation of E; its rotation by Q_j⁻¹ Q_i does not change the length
+    # The difference is the translation of E in other axes, so it has the same length
     translation_m = np.linalg.norm(displacements_m[0] - displacements_m[1], axis=1)
     overlapping_pair_count = int(np.median(end_indices - start_indices)) if all_pairs else 1
     rmse_interval_m = estimate_rmse_interval(
@@ -332,7 +343,11 @@ def estimate_rmse_interval(
     squared_errors = errors**2
     error_count = len(squared_errors)
     block_length = max(
-        int(np.ceil(BLOCK_LENGTH_CORRELATION_TIMES * compute_autocorrelation_time(squared_errors))),
+        int(
+            np.ceil(
+                BLOCK_LENGTH_IN_CORRELATION_TIMES * compute_autocorrelation_time(squared_errors)
+            )
+        ),
         min_block_length,
         1,
     )
@@ -354,8 +369,8 @@ def estimate_rmse_interval(
         0, error_count, (BOOTSTRAP_RESAMPLES, round(block_count))
     )
     resampled_means = block_means[block_starts].mean(axis=1)
-    quantile = float(stdtrit(block_count - 1.0, 0.5 + CONFIDENCE_LEVEL / 2.0))
-    tail_probability = float(ndtr(-quantile * np.sqrt(block_count / (block_count - 1.0))))
+    student_t_quantile = float(stdtrit(block_count - 1.0, 0.5 + CONFIDENCE_LEVEL / 2.0))
+    tail_probability = float(ndtr(-student_t_quantile * np.sqrt(block_count / (block_count - 1.0))))
     low, high = np.sqrt(
         np.maximum(np.quantile(resampled_means, [tail_probability, 1.0 - tail_probability]), 0.0)
     )
@@ -373,14 +388,14 @@ def compute_autocorrelation_time(values: Array) -> float:
     sample_count = len(centred_values)
     covariance_by_lag = autocovariance(centred_values)
     correlation_times = 2.0 * np.cumsum(covariance_by_lag / covariance_by_lag[0]) - 1.0
-    sufficient_window_lengths = np.flatnonzero(
-        np.arange(sample_count) >= AUTOCORRELATION_WINDOW_TIMES * correlation_times
+    possible_window_lengths = np.flatnonzero(
+        np.arange(sample_count) >= WINDOW_LENGTH_IN_CORRELATION_TIMES * correlation_times
     )
     return max(
         1.0,
         float(
-            correlation_times[sufficient_window_lengths[0]]
-            if len(sufficient_window_lengths)
+            correlation_times[possible_window_lengths[0]]
+            if len(possible_window_lengths)
             else sample_count
         ),
     )

@@ -38,26 +38,26 @@ SEARCH_HALF_WIDTH_S = 0.5
 # Half-width (s) of the second least-squares search, around the result of the first search
 FINE_SEARCH_HALF_WIDTH_S = 0.1
 # Minimum distance (s) between two peaks of the speed correlation
-MIN_PEAK_DISTANCE_S = 1.0
+MIN_CORRELATION_PEAK_DISTANCE_S = 1.0
 # Minimum correlation of the speeds of both trajectories at a candidate time offset
-MIN_CORRELATION = 0.3
+MIN_SPEED_CORRELATION = 0.3
 # Minimum ratio of the residuals (RMS) at the second best and the best time offset, for an
 # unambiguous result: 95 % limit of an F-test with 80 independent residuals (30 s of flight)
-MIN_SECOND_PEAK_RATIO = 1.2
+MIN_SECOND_BEST_RESIDUAL_RATIO = 1.2
 # Maximum number of poses in the least-squares fit of the time offset
 MAX_FITTED_POSES = 2000
 # Maximum misfit (RMS residual over RMS extent of the motion) of an accepted fit of the time offset
 MAX_RELATIVE_MISFIT = 0.5
 # Lower limit of the misfit (RMS residual over RMS extent): better fits count as equally good
-MIN_RELATIVE_MISFIT = 1e-3
-# Minimum RMS of the residual velocity, as fraction of the RMS speed. The residual velocity is the
-# part that no shift, rotation or scale of the path explains: without it, no offset is observable
-MIN_RESIDUAL_SPEED_FRACTION = 0.05
+MISFIT_FLOOR = 1e-3
+# Minimum RMS of the residual velocity for an estimate of the time offset, as fraction of the RMS
+# speed. The residual velocity is the part that no shift, rotation or scale of the path explains
+MIN_RESIDUAL_VELOCITY_FRACTION = 0.05
 # Minimum correlation of the residual velocities of both trajectories: noise is not correlated
-MIN_RESIDUAL_CORRELATION = 0.5
-# Maximum lag of the autocovariances in the variance of the score (Newey & West 1987), in its
-# correlation lengths
-MAX_LAG_CORRELATION_LENGTHS = 4
+MIN_RESIDUAL_VELOCITY_CORRELATION = 0.5
+# Maximum lag of the autocovariances that give the variance of the score (Newey & West 1987), in
+# correlation lengths of the score
+MAX_LAG_IN_CORRELATION_LENGTHS = 4
 # Maximum half-width (s) of the 95 % interval of an accepted time offset
 MAX_INTERVAL_HALF_WIDTH_S = 0.5
 CONFIDENCE_LEVEL = 0.95
@@ -103,12 +103,14 @@ def estimate_time_offset(estimate: Trajectory, reference: Trajectory) -> TimeOff
     # The trajectory with the shorter pose intervals is interpolated
     if compute_median_interval_s(estimate.time_s) >= compute_median_interval_s(reference.time_s):
         return _search_offset(estimate, reference)
-    swapped_offset = _search_offset(reference, estimate)
-    if swapped_offset.offset_s is None or swapped_offset.interval_s is None:
-        return swapped_offset
-    low_s, high_s = swapped_offset.interval_s
+    offset_of_swapped_tracks = _search_offset(reference, estimate)
+    if offset_of_swapped_tracks.offset_s is None or offset_of_swapped_tracks.interval_s is None:
+        return offset_of_swapped_tracks
+    low_s, high_s = offset_of_swapped_tracks.interval_s
     return structs.replace(
-        swapped_offset, offset_s=-swapped_offset.offset_s, interval_s=(-high_s, -low_s)
+        offset_of_swapped_tracks,
+        offset_s=-offset_of_swapped_tracks.offset_s,
+        interval_s=(-high_s, -low_s),
     )
 
 
@@ -137,25 +139,26 @@ def _search_offset(sparse_track: Trajectory, dense_track: Trajectory) -> TimeOff
     )
     if not accepted_fits:
         return _make_unknown_offset(
-            "the speeds of both trajectories correlate at some time offsets, but there the "
-            "positions do not match, or too few poses overlap"
+            "at all time offsets with correlated speeds, the positions do not match or too few "
+            "poses overlap"
         )
     best_fit = accepted_fits[0]
-    similar_fits = [
+    fits_similar_to_best = [
         fit
         for fit in accepted_fits
-        if fit.compute_misfit() <= MIN_SECOND_PEAK_RATIO * best_fit.compute_misfit()
+        if fit.compute_misfit() <= MIN_SECOND_BEST_RESIDUAL_RATIO * best_fit.compute_misfit()
     ]
     if clock_offset_s is not None:
         # Of several offsets that fit equally well, the nearest to the UNIX time is used
-        best_fit = min(similar_fits, key=lambda fit: abs(fit.offset_s - clock_offset_s))
-    for fit in similar_fits if clock_offset_s is None else []:
+        best_fit = min(fits_similar_to_best, key=lambda fit: abs(fit.offset_s - clock_offset_s))
+    for fit in fits_similar_to_best if clock_offset_s is None else []:
         offset_difference_s = abs(fit.offset_s - best_fit.offset_s)
-        if offset_difference_s > MIN_PEAK_DISTANCE_S:
+        if offset_difference_s > MIN_CORRELATION_PEAK_DISTANCE_S:
             return _make_unknown_offset(
-                "the motion is periodic: with a time offset that differs by "
-                f"{offset_difference_s:.1f} s the ATE is {fit.compute_rms_m():.3g} m instead of "
-                f"{best_fit.compute_rms_m():.3g} m"
+                "the motion is periodic: two time offsets that differ by "
+                f"{offset_difference_s:.1f} s give an ATE of "
+                f"{best_fit.compute_residual_rms_m():.3g} m and "
+                f"{fit.compute_residual_rms_m():.3g} m"
             )
     # The fit is repeated with a narrower window of offsets, within which more poses overlap in time
     best_fit = (
@@ -178,8 +181,8 @@ def _search_offset(sparse_track: Trajectory, dense_track: Trajectory) -> TimeOff
             best_fit.offset_s + interval_half_width_s,
         ),
         is_determinable=True,
-        reason="The time offset has the maximum speed correlation and the minimum ATE "
-        f"({best_fit.compute_rms_m():.3g} m, {len(best_fit.time_s)} poses).",
+        reason="The time offset is estimated from correlated speeds, and minimises the ATE "
+        f"({best_fit.compute_residual_rms_m():.3g} m, {len(best_fit.time_s)} poses).",
     )
 
 
@@ -254,25 +257,28 @@ def _find_candidate_offsets_s(sparse_track: Trajectory, dense_track: Trajectory)
         )
         # Exclude lags at which a trajectory is at rest: its speed variance is a rounding error
         is_usable = speed_moments.count >= min_count
-        for values, is_known, energy in (
-            (sparse_values, is_sparse_speed_known, speed_moments.square_sum_a),
-            (dense_values, is_dense_speed_known, speed_moments.square_sum_b),
+        for values, is_known, square_sum in (
+            (sparse_values, is_sparse_speed_known, speed_moments.sum_of_squares_a),
+            (dense_values, is_dense_speed_known, speed_moments.sum_of_squares_b),
         ):
-            total_energy = float(np.var(values[is_known])) * np.count_nonzero(is_known)
-            is_usable &= energy > 1e-3 * total_energy / len(values) * speed_moments.count
+            total_square_sum = float(np.var(values[is_known])) * np.count_nonzero(is_known)
+            is_usable &= square_sum > 1e-3 * total_square_sum / len(values) * speed_moments.count
         scale = np.sqrt(
-            np.where(is_usable, speed_moments.square_sum_a * speed_moments.square_sum_b, 1.0)
+            np.where(
+                is_usable, speed_moments.sum_of_squares_a * speed_moments.sum_of_squares_b, 1.0
+            )
         )
         correlations.append(np.where(is_usable, speed_moments.covariance.real / scale, 0.0))
     mean_correlation = np.mean(correlations, axis=0)
     sliding_maximum = maximum_filter1d(
-        mean_correlation, round(2 * MIN_PEAK_DISTANCE_S / step_s) + 1
+        mean_correlation, round(2 * MIN_CORRELATION_PEAK_DISTANCE_S / step_s) + 1
     )
     peak_indices = np.flatnonzero(
-        (mean_correlation == sliding_maximum) & (mean_correlation > MIN_CORRELATION)
+        (mean_correlation == sliding_maximum) & (mean_correlation > MIN_SPEED_CORRELATION)
     )
     peak_indices = peak_indices[np.argsort(-mean_correlation[peak_indices])][:MAX_CANDIDATE_OFFSETS]
-    # At index k of the correlation, the first sparse sample coincides with dense sample k - (n - 1)
+    # Correlation index k aligns the first sparse sample with dense sample k - (n - 1), for n sparse
+    # samples
     dense_start_indices = peak_indices - (len(is_sparse_speed_known) - 1)
     lags_s = dense_start_indices * step_s + dense_track.time_s[0] - sparse_track.time_s[0]
     return list(lags_s.tolist())
@@ -283,25 +289,25 @@ class _OffsetFit:
     """Fit of the trajectory with fewer poses (sparse) to that with more poses (dense).
 
     ``time_s`` and ``aligned_position_m`` are times and aligned positions of the sparse trajectory,
-    ``target_position_m`` the positions of the dense trajectory at these times.
+    ``dense_track_position_m`` the positions of the dense trajectory at these times.
     """
 
     offset_s: float
     transform: Transform
     time_s: Array
     aligned_position_m: Array
-    target_position_m: Array
+    dense_track_position_m: Array
 
-    def compute_rms_m(self) -> float:
+    def compute_residual_rms_m(self) -> float:
         """Return the RMS (m) of the position residuals."""
-        return compute_rms_length_m(self.target_position_m - self.aligned_position_m)
+        return compute_rms_length_m(self.dense_track_position_m - self.aligned_position_m)
 
     def compute_misfit(self) -> float:
         """Return RMS position residual over RMS extent of the dense trajectory (0: perfect)."""
-        # not the extent of the sparse trajectory, which a bad fit can scale to a point
-        extent_m = float(np.sqrt(self.target_position_m.var(axis=0).sum()))
+        # The dense trajectory gives the extent, because a bad fit can shrink the sparse trajectory
+        extent_m = float(np.sqrt(self.dense_track_position_m.var(axis=0).sum()))
         return (
-            max(self.compute_rms_m() / extent_m, MIN_RELATIVE_MISFIT)
+            max(self.compute_residual_rms_m() / extent_m, MISFIT_FLOOR)
             if extent_m > 0.0
             else float("inf")
         )
@@ -317,51 +323,54 @@ def _compute_interval_half_width_s(
     """
     pose_count = len(fit.time_s)
     centred_m = fit.aligned_position_m - fit.aligned_position_m.mean(axis=0)
-    dense_velocity_m_s = _compute_velocity(dense_track, fit.time_s + fit.offset_s)
-    sparse_velocity_m_s = fit.transform.to_rotation().apply(
+    dense_track_velocity_m_s = _compute_velocity(dense_track, fit.time_s + fit.offset_s)
+    sparse_track_velocity_m_s = fit.transform.to_rotation().apply(
         fit.transform.scale * _compute_velocity(sparse_track, fit.time_s)
     )
     # Remove the velocity that is equivalent to a translation, a small rotation or a scale factor,
     # because the alignment is estimated too
     columns = [np.tile(axis, (pose_count, 1)) for axis in np.eye(3)]
     columns += [np.cross(axis, centred_m) for axis in np.eye(3)]
-    similarity_columns = np.stack([*columns, centred_m], axis=-1).reshape(3 * pose_count, 7)
-    velocities = np.stack((dense_velocity_m_s, sparse_velocity_m_s), axis=-1).reshape(
+    similarity_jacobian = np.stack([*columns, centred_m], axis=-1).reshape(3 * pose_count, 7)
+    velocities = np.stack((dense_track_velocity_m_s, sparse_track_velocity_m_s), axis=-1).reshape(
         3 * pose_count, 2
     )
-    velocities = (
+    residual_velocities = (
         velocities
-        - similarity_columns @ np.linalg.lstsq(similarity_columns, velocities, rcond=None)[0]
+        - similarity_jacobian @ np.linalg.lstsq(similarity_jacobian, velocities, rcond=None)[0]
     )
-    (dense_information, cross_information), (_, sparse_information) = (
-        velocities.T @ velocities
+    (dense_square_sum, cross_product_sum), (_, sparse_square_sum) = (
+        residual_velocities.T @ residual_velocities
     ).tolist()
     if (
-        dense_information <= MIN_RESIDUAL_SPEED_FRACTION**2 * float((dense_velocity_m_s**2).sum())
-        or cross_information
-        <= MIN_RESIDUAL_CORRELATION * (dense_information * sparse_information) ** 0.5
+        dense_square_sum
+        <= MIN_RESIDUAL_VELOCITY_FRACTION**2 * float((dense_track_velocity_m_s**2).sum())
+        or cross_product_sum
+        <= MIN_RESIDUAL_VELOCITY_CORRELATION * (dense_square_sum * sparse_square_sum) ** 0.5
     ):
         return float("inf")
     likelihood_score = (
-        velocities[:, 0].reshape(pose_count, 3) * (fit.target_position_m - fit.aligned_position_m)
+        residual_velocities[:, 0].reshape(pose_count, 3)
+        * (fit.dense_track_position_m - fit.aligned_position_m)
     ).sum(axis=1)
     # The Newey-West weights must extend beyond the correlation length of the score
     lag_count = min(
-        max(1, MAX_LAG_CORRELATION_LENGTHS * _compute_correlation_length(likelihood_score)),
+        max(1, MAX_LAG_IN_CORRELATION_LENGTHS * _compute_correlation_length(likelihood_score)),
         pose_count // 4,
     )
     lag_weights = 1.0 - np.arange(1, lag_count + 1) / (lag_count + 1.0)
     lagged_products = [
         float(likelihood_score[k:] @ likelihood_score[:-k]) for k in range(1, lag_count + 1)
     ]
-    uncorrelated_variance = float(likelihood_score @ likelihood_score)
+    variance_if_uncorrelated = float(likelihood_score @ likelihood_score)
     score_variance = max(
-        uncorrelated_variance + 2.0 * float(lag_weights @ lagged_products), uncorrelated_variance
+        variance_if_uncorrelated + 2.0 * float(lag_weights @ lagged_products),
+        variance_if_uncorrelated,
     )
     student_t_quantile = float(
         stdtrit(max(pose_count / lag_count - 1.0, 1.0), 0.5 + CONFIDENCE_LEVEL / 2.0)
     )
-    return float(student_t_quantile * np.sqrt(score_variance) / dense_information)
+    return float(student_t_quantile * np.sqrt(score_variance) / dense_square_sum)
 
 
 def _compute_correlation_length(values: Array) -> int:
@@ -399,25 +408,30 @@ def _refine_offset(
     sparse_position_m = sparse_track.position_m[pose_indices]
 
     def make_fit(shift_s: float) -> _OffsetFit:
-        target_position_m = interpolate_positions(dense_track, sparse_time_s + (lag_s + shift_s))
-        # Transform the sparse trajectory, not the target: a fitted scale could shrink the target to
-        # a point
-        transform = umeyama(sparse_position_m, target_position_m, with_scale=True)
+        dense_track_position_m = interpolate_positions(
+            dense_track, sparse_time_s + (lag_s + shift_s)
+        )
+        # The sparse trajectory is transformed, because a fitted scale could shrink the dense
+        # trajectory to a point
+        transform = umeyama(sparse_position_m, dense_track_position_m, with_scale=True)
         return _OffsetFit(
             lag_s + shift_s,
             transform,
             sparse_time_s,
             transform.apply(sparse_position_m),
-            target_position_m,
+            dense_track_position_m,
         )
 
     def compute_cost(shift_s: float) -> float:
         fit = make_fit(shift_s)
-        return float(((fit.target_position_m - fit.aligned_position_m) ** 2).sum())
+        return float(((fit.dense_track_position_m - fit.aligned_position_m) ** 2).sum())
 
-    # The shift from lag_s is optimised: the offset may be 1e9 s (UNIX time minus boot time), so the
-    # relative tolerance of the optimiser would be seconds
-    shifts_s = half_width_s * np.linspace(-1.0, 1.0, 21)
-    best_index = int(np.argmin([compute_cost(shift) for shift in shifts_s]))
-    bounds_s = (shifts_s[max(best_index - 1, 0)], shifts_s[min(best_index + 1, len(shifts_s) - 1)])
-    return make_fit(float(minimize_scalar(compute_cost, bounds=bounds_s, method="bounded").x))
+    # The shift from lag_s is optimised, not the offset of up to 1e9 s (UNIX time minus boot time):
+    # its relative tolerance in the optimiser would be seconds
+    candidate_shifts_s = half_width_s * np.linspace(-1.0, 1.0, 21)
+    best_index = int(np.argmin([compute_cost(shift) for shift in candidate_shifts_s]))
+    shift_bounds_s = (
+        candidate_shifts_s[max(best_index - 1, 0)],
+        candidate_shifts_s[min(best_index + 1, len(candidate_shifts_s) - 1)],
+    )
+    return make_fit(float(minimize_scalar(compute_cost, bounds=shift_bounds_s, method="bounded").x))

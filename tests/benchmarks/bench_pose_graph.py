@@ -35,12 +35,12 @@ def chain(poses: int):
 
     rng = np.random.default_rng(0)
     step = np.array([1.0, 0.0, 0.02, 0.0, 0.01, 2.0 * np.pi / 50])
-    truth = lie.chain(lie.exp(np.tile(step, (poses - 1, 1))))
+    truth = lie.accumulate_poses(lie.exp(np.tile(step, (poses - 1, 1))))
     first, last = np.arange(poses - 1), np.arange(0, poses - 50, 10)
     i, j = np.concatenate([first, last]), np.concatenate([first + 1, last + 50])
     spread = np.repeat([0.02, 0.002], 3)
     noise = lie.exp(rng.normal(size=(len(i), 6)) * spread)
-    measured = lie.compose(lie.between(truth[i], truth[j]), noise)
+    measured = lie.compose(lie.relative_pose(truth[i], truth[j]), noise)
     information = np.tile(np.diag(spread**-2.0), (len(i), 1, 1))
     return compose_odometry(PoseGraph(3, np.arange(poses), truth, i, j, measured, information))
 
@@ -66,7 +66,7 @@ def main() -> None:
         found, other = solve(graph), factors.error(optimiser.values())
         print(
             f"{name}: {len(graph)} poses, {len(graph.first_nodes)} edges, "
-            f"{graph.initialised}, read in "
+            f"{graph.initial_pose_origin}, read in "
             f"{reading:.2f} s; {np.median(ours / theirs):.2f} x GTSAM "
             f"({np.median(ours):.3f} s / {np.median(theirs):.3f} s, {runs} pairs); "
             f"steps {found.iterations} / {optimiser.iterations()}; cost {cost(graph):.6g} -> "

@@ -14,7 +14,7 @@ from msgspec import structs
 
 from px4fuse.core.writing import write_output_files
 from px4fuse.errors import ResultsError
-from px4fuse.readers.ulog_topics import ignores_assessed_mark
+from px4fuse.readers.ulog_topics import ignores_assignment_flag
 from px4fuse.results.contract import ReportedResults, find_file_hashes, to_json
 from px4fuse.results.model import provenance
 from px4fuse.results.reading import read_results
@@ -116,11 +116,11 @@ def repeat_analysis_with_diagnosis(
 
     Return results and report (PDF).
     """
-    token = ignores_assessed_mark.set(True)
+    token = ignores_assignment_flag.set(True)
     try:
         outcome = recompute_report(results, path_by_sha256)
     finally:
-        ignores_assessed_mark.reset(token)
+        ignores_assignment_flag.reset(token)
     if isinstance(outcome, Verification):
         raise ResultsError(f"No diagnosis report for the student: {'; '.join(outcome.reasons)}.")
     diagnosed_results, draw = outcome

@@ -12,8 +12,9 @@ from px4fuse.trajectory.graph import lie, model
 
 # Probability that the gate rejects a true closure
 GATE_ALPHA = 0.001
-# Eigenvalues of a covariance matrix (scaled to unit diagonal) below this limit are rounding errors
-_MIN_EIGENVALUE = 1e-13
+# Minimum eigenvalue of a covariance matrix (scaled to unit diagonal). A smaller eigenvalue is a
+# rounding error
+_MIN_COVARIANCE_EIGENVALUE = 1e-13
 
 
 class GateResult(Record):
@@ -45,14 +46,15 @@ def gate_edges(graph: model.PoseGraph, edge_indices: Sequence[int] | IntArray) -
     """Test closures against odometry alone, before the optimisation uses them.
 
     The test statistic is the squared Mahalanobis distance between a closure and the relative pose
-    from odometry, whose covariance is propagated by the adjoint (Barfoot 2017, 8.96 and the first
-    order of 8.108). All edges between successive poses are odometry, except the tested edges.
+    from odometry. The adjoint propagates the covariance of odometry (Barfoot 2017, eq. 8.96, and
+    eq. 8.108 to first order). All edges between successive poses are odometry, except the tested
+    edges.
 
     Raises
     ------
     TrajectoryError
-        Odometry does not connect the vertices of a closure, or an information matrix is singular
-        (odometry) or zero (closure).
+        Odometry does not connect the vertices of a closure, the information matrix of an odometry
+        edge is singular, or the information matrix of a closure is zero.
     """
     tested_edge_indices = np.asarray(edge_indices, dtype=np.intp)
     if not len(tested_edge_indices):
@@ -72,24 +74,27 @@ def gate_edges(graph: model.PoseGraph, edge_indices: Sequence[int] | IntArray) -
             f"{graph.ids[pose_index]} and {graph.ids[pose_index + 1]}",
             "Add an odometry edge between these vertices.",
         )
-    poses = lie.chain(model.get_odometry_steps(graph, connecting_edges))
+    poses = lie.accumulate_poses(model.get_odometry_steps(graph, connecting_edges))
     # the covariances of all steps in the axes of the first pose of the chain, to sum them
-    step_covariances = _propagate_covariances(
+    odometry_step_covariances = _propagate_covariances(
         lie.adjoint(poses[1:]), _compute_covariances(graph, connecting_edges)
     )
     cumulative_covariance = np.concatenate(
-        [np.zeros((1, *step_covariances.shape[1:])), np.cumsum(step_covariances, axis=0)]
+        [
+            np.zeros((1, *odometry_step_covariances.shape[1:])),
+            np.cumsum(odometry_step_covariances, axis=0),
+        ]
     )
-    chain_covariance = (
+    odometry_chain_covariance = (
         cumulative_covariance[np.maximum(first_nodes, second_nodes) - first_pose_index]
         - cumulative_covariance[np.minimum(first_nodes, second_nodes) - first_pose_index]
     )
-    end_adjoint = lie.adjoint(lie.inverse(poses[second_nodes - first_pose_index]))
-    covariance = _propagate_covariances(end_adjoint, chain_covariance)
-    relative_poses = lie.between(
+    inverse_second_pose_adjoint = lie.adjoint(lie.inverse(poses[second_nodes - first_pose_index]))
+    covariance = _propagate_covariances(inverse_second_pose_adjoint, odometry_chain_covariance)
+    relative_poses = lie.relative_pose(
         poses[first_nodes - first_pose_index], poses[second_nodes - first_pose_index]
     )
-    residuals = lie.log(lie.between(graph.measurements[tested_edge_indices], relative_poses))
+    residuals = lie.log(lie.relative_pose(graph.measurements[tested_edge_indices], relative_poses))
     covariance = _propagate_covariances(lie.right_jacobian_inverse(residuals), covariance)
     edge_tests = zip(tested_edge_indices.tolist(), residuals, covariance, strict=True)
     return [
@@ -117,11 +122,11 @@ def _test_edge(
     if (
         not is_testable
         or np.linalg.eigvalsh(model.scale_to_unit_diagonal(residual_covariance)[1])[0]
-        <= _MIN_EIGENVALUE
+        <= _MIN_COVARIANCE_EIGENVALUE
     ):
         raise TrajectoryError(
             f"The closure from vertex {vertices[0]} to {vertices[1]} cannot be tested: its "
-            "information matrix is zero, or far larger or smaller than that of the odometry",
+            "information matrix is zero, or differs by many orders of magnitude from the odometry",
             "Give information matrices of similar magnitude.",
         )
     d2 = float(projected_residual @ np.linalg.solve(residual_covariance, projected_residual))
@@ -130,7 +135,7 @@ def _test_edge(
 
 
 def _compute_covariances(graph: model.PoseGraph, odometry_edges: IntArray) -> Array:
-    """Compute the covariances of odometry edges, in the axes of the later pose."""
+    """Compute the covariance of each odometry edge, in the axes of its later pose."""
     scale, scaled_information = model.scale_to_unit_diagonal(graph.information[odometry_edges])
     is_full_rank = np.linalg.eigvalsh(scaled_information)[:, 0] > 1e-12
     if not np.all(is_full_rank):
@@ -142,7 +147,10 @@ def _compute_covariances(graph: model.PoseGraph, odometry_edges: IntArray) -> Ar
         )
     covariance = np.linalg.inv(scaled_information) / (scale[:, :, None] * scale[:, None, :])
     is_backward = graph.first_nodes[odometry_edges] > graph.second_nodes[odometry_edges]
-    # An edge from a later to an earlier pose is inverted: (Z exp(r))^-1 = Z^-1 exp(-Ad(Z) r)
-    measured_adjoint = lie.adjoint(graph.measurements[odometry_edges[is_backward]])
-    covariance[is_backward] = _propagate_covariances(measured_adjoint, covariance[is_backward])
+    # An edge from a later to an earlier pose is inverted: (Z exp(r))^-1 = Z^-1 exp(-Ad(Z) r), with
+    # the measured pose Z, its adjoint Ad(Z) and the residual r
+    adjoint_of_measurement = lie.adjoint(graph.measurements[odometry_edges[is_backward]])
+    covariance[is_backward] = _propagate_covariances(
+        adjoint_of_measurement, covariance[is_backward]
+    )
     return covariance

@@ -12,11 +12,11 @@ from px4fuse.trajectory.graph.model import PoseGraph
 from px4fuse.trajectory.graph.normal_equations import NormalEquations
 
 
-def initialise(graph: PoseGraph) -> PoseGraph:
-    """Compute initial poses from the edges; the first pose is unchanged.
+def compute_initial_poses(graph: PoseGraph) -> PoseGraph:
+    """Return the graph with initial poses from its edges; the first pose is unchanged.
 
     The method is chordal initialisation (Carlone et al. 2015, Initialization techniques for 3D
-    SLAM, section IV-C), or the composition of the odometry edges if its cost is lower.
+    SLAM, section IV-C). If composed odometry edges have a lower cost, their poses are used.
 
     Raises
     ------
@@ -24,24 +24,24 @@ def initialise(graph: PoseGraph) -> PoseGraph:
         The graph is not connected, or its edges do not determine its poses.
     """
     if np.any(model.find_odometry_edges(graph) < 0):
-        return _initialise_chordal(graph)
+        return _compute_chordal_poses(graph)
     composed_graph = model.compose_odometry(graph)
     try:
-        return min(composed_graph, _initialise_chordal(graph), key=model.cost)
+        return min(composed_graph, _compute_chordal_poses(graph), key=model.cost)
     except TrajectoryError:  # some edges have no rotation, so only the composed poses are possible
         return composed_graph
 
 
-def _initialise_chordal(graph: PoseGraph) -> PoseGraph:
-    """Fit rotation matrices and then translations, both by linear least squares."""
+def _compute_chordal_poses(graph: PoseGraph) -> PoseGraph:
+    """Compute initial poses by linear least squares: first rotations, then positions."""
     dimension = graph.dimension
     rotation_information = np.trace(graph.information[:, dimension:, dimension:], axis1=1, axis2=2)
     model.require_connected(graph, rotation_information > 0.0, "edges with rotation information")
     measured_rotation = lie.rotation_matrix(graph.measurements)
     eye = np.broadcast_to(np.eye(dimension), measured_rotation.shape)
-    # Minimise the sum of weight |Z' R_i' - R_j'|^2 (': transpose) over all matrices R, a linear
-    # problem; the nearest rotations follow below. Z: measured rotation from pose i to pose j
-    relaxed_rotation = _solve_positions(
+    # Minimise the sum of weight |Zᵀ R_iᵀ - R_jᵀ|² over all matrices R, which is a linear problem. Z
+    # is the measured rotation from pose i to j. Each R is then replaced by the nearest rotation
+    unconstrained_matrices = _solve_positions(
         graph,
         measured_rotation.transpose(0, 2, 1),
         -eye,
@@ -49,15 +49,15 @@ def _initialise_chordal(graph: PoseGraph) -> PoseGraph:
         0.0 * measured_rotation,
         lie.rotation_matrix(graph.poses[0]).T,
     )
-    rotation = _find_nearest_rotations(relaxed_rotation.transpose(0, 2, 1))
-    # An edge measures rotation Z and translation z. Its residual translation in the measured axes
-    # of pose j is (R_i Z)' (t_j - t_i - R_i z), for poses with rotation R and position t
+    rotation = _find_nearest_rotations(unconstrained_matrices.transpose(0, 2, 1))
+    # An edge measures rotation Z and translation z of pose j relative to pose i. With rotations R
+    # and positions t of the poses, the residual is (R_i Z)ᵀ (t_j - t_i - R_i z)
     first_rotation = rotation[graph.first_nodes]
-    measured_pose_rotation = first_rotation @ measured_rotation
+    predicted_second_rotation = first_rotation @ measured_rotation
     information = (
-        measured_pose_rotation
+        predicted_second_rotation
         @ graph.information[:, :dimension, :dimension]
-        @ measured_pose_rotation.transpose(0, 2, 1)
+        @ predicted_second_rotation.transpose(0, 2, 1)
     )
     translation = first_rotation @ graph.measurements[:, :dimension, None]
     position = _solve_positions(
@@ -68,38 +68,43 @@ def _initialise_chordal(graph: PoseGraph) -> PoseGraph:
     else:
         poses = np.column_stack([position, Rotation.from_matrix(rotation).as_quat()])
     poses[0] = graph.poses[0]
-    return replace(graph, poses=poses, initialised=model.INITIAL_POSES_FROM_CHORDAL)
+    return replace(graph, poses=poses, initial_pose_origin=model.INITIAL_POSES_FROM_CHORDAL)
 
 
 def _solve_positions(
     graph: PoseGraph,
-    first_pose_coefficient: Array,
-    second_pose_coefficient: Array,
+    first_pose_matrix: Array,
+    second_pose_matrix: Array,
     information: Array,
-    edge_rhs: Array,
+    right_hand_side: Array,
     first_pose: Array,
 ) -> Array:
-    """Solve the :class:`NormalEquations` with the first pose, shape (d, k), fixed.
+    """Solve ``A x_i + B x_j = c`` over all edges (i, j) for x, shape (n, d, k), with given x_0.
 
-    Arguments are those of :meth:`NormalEquations.assemble`; the result has shape (n, d, k).
+    Parameters
+    ----------
+    first_pose_matrix, second_pose_matrix, information : ndarray, shape (m, d, d)
+        A, B, and the weight of each edge.
+    right_hand_side : ndarray, shape (m, d, k)
+        c of each edge.
+    first_pose : ndarray, shape (d, k)
+        x_0.
     """
     edges = np.stack([graph.first_nodes, graph.second_nodes])
     equations = NormalEquations(edges, *first_pose.shape)
-    known_poses = np.zeros((len(graph), *first_pose.shape))
-    known_poses[0] = first_pose
-    for coefficient, nodes in zip(
-        (first_pose_coefficient, second_pose_coefficient), edges, strict=True
-    ):
-        edge_rhs = edge_rhs - coefficient @ known_poses[nodes]
-    equation_values, _ = equations.assemble(
-        first_pose_coefficient, second_pose_coefficient, information, edge_rhs
+    fixed_first_pose = np.zeros((len(graph), *first_pose.shape))
+    fixed_first_pose[0] = first_pose
+    for pose_matrix, nodes in zip((first_pose_matrix, second_pose_matrix), edges, strict=True):
+        right_hand_side = right_hand_side - pose_matrix @ fixed_first_pose[nodes]
+    matrix_values, _ = equations.assemble(
+        first_pose_matrix, second_pose_matrix, information, right_hand_side
     )
-    solution = equations.solve(equation_values)
+    solution = equations.solve(matrix_values)
     if solution is None:
         raise TrajectoryError(
-            "The edges do not determine the initial poses", "Give VERTEX lines with initial poses."
+            "The edges do not determine all initial poses", "Give VERTEX lines with initial poses."
         )
-    return known_poses + solution
+    return fixed_first_pose + solution
 
 
 def _find_nearest_rotations(matrices: Array) -> Array:

@@ -18,9 +18,10 @@ from px4fuse.trajectory.rotation import build_matrix, skew
 # Maximum angle (rad) for power series instead of quotients, which lose precision at small angles:
 # five terms of the series are accurate to 1e-14
 SMALL_ANGLE_RAD = 0.3
-# Coefficients of the power series in theta^2 of _compute_cot_term and _compute_cot_term_slope
-_COT_TERM_COEFFICIENTS = (1 / 12, 1 / 720, 1 / 30240, 1 / 1209600, 1 / 47900160)
-_COT_TERM_SLOPE_COEFFICIENTS = (1 / 360, 1 / 7560, 1 / 201600, 1 / 5987520, 691 / 130767436800)
+# Coefficients of the power series in theta^2 of f(theta) = (1 - theta/2 cot(theta/2)) / theta^2 and
+# of f'(theta) / theta. f is the factor of the squared matrix in an inverse Jacobian
+_SQUARE_FACTOR_SERIES = (1 / 12, 1 / 720, 1 / 30240, 1 / 1209600, 1 / 47900160)
+_SQUARE_FACTOR_SLOPE_SERIES = (1 / 360, 1 / 7560, 1 / 201600, 1 / 5987520, 691 / 130767436800)
 
 
 def wrap(angle: Array) -> Array:
@@ -66,10 +67,10 @@ def compose(a: Array, b: Array) -> Array:
 
 def inverse(pose: Array) -> Array:
     """Return the inverses of poses."""
-    return between(pose, identity(pose.shape[-1]))
+    return relative_pose(pose, identity(pose.shape[-1]))
 
 
-def between(a: Array, b: Array) -> Array:
+def relative_pose(a: Array, b: Array) -> Array:
     """Return the poses b relative to a: the inverse of a, times b."""
     d = _get_dimension(a)
     inverse_rotation = np.swapaxes(rotation_matrix(a), -1, -2)
@@ -98,7 +99,7 @@ def exp(tangent: Array) -> Array:
 
 
 def log(pose: Array) -> Array:
-    """Return the tangents of poses, the inverse of :func:`exp`, with rotations up to pi.
+    """Return the tangents of poses (logarithm, inverse of :func:`exp`), with rotations up to pi.
 
     Parameters
     ----------
@@ -133,7 +134,9 @@ def adjoint(pose: Array) -> Array:
 
 
 def right_jacobian_inverse(tangent: Array) -> Array:
-    """Return the inverse right Jacobians, the derivatives of log(X exp(xi)) by xi at 0.
+    """Return the inverse right Jacobians: derivatives of log(X exp(xi)) by xi at xi = 0.
+
+    X is the pose of the tangent.
 
     Parameters
     ----------
@@ -147,16 +150,16 @@ def right_jacobian_inverse(tangent: Array) -> Array:
     commutator = _compute_commutator(tangent)
     commutator_squared = commutator @ commutator
     theta = np.linalg.norm(tangent[..., _get_dimension(tangent) :], axis=-1)[..., None, None]
-    cot_term = _compute_cot_term(theta)
-    half_cot_term_slope = 0.5 * _compute_cot_term_slope(theta)
-    # Power series of x / (1 - exp(-x)), with the commutator matrix ad for x. Powers above 4 are
-    # eliminated by ad^5 = -2 theta^2 ad^3 - theta^4 ad
+    square_factor = _compute_square_factor(theta)
+    half_square_factor_slope = 0.5 * _compute_square_factor_slope(theta)
+    # The Jacobian is the power series of x / (1 - exp(-x)), where x is the commutator matrix ad.
+    # Powers above 4 follow from ad^5 = -2 theta^2 ad^3 - theta^4 ad
     jacobian: Array = (
         np.eye(commutator.shape[-1])
         + 0.5 * commutator
-        + (cot_term - theta * theta * half_cot_term_slope) * commutator_squared
+        + (square_factor - theta * theta * half_square_factor_slope) * commutator_squared
     )
-    return jacobian - half_cot_term_slope * (commutator_squared @ commutator_squared)
+    return jacobian - half_square_factor_slope * (commutator_squared @ commutator_squared)
 
 
 def _compute_commutator(tangent: Array) -> Array:
@@ -170,7 +173,7 @@ def _compute_commutator(tangent: Array) -> Array:
     return commutator
 
 
-def chain(steps: Array) -> Array:
+def accumulate_poses(steps: Array) -> Array:
     """Compose n relative motions to n + 1 poses, of which the first is the identity.
 
     Parameters
@@ -182,10 +185,10 @@ def chain(steps: Array) -> Array:
     ndarray, shape (n + 1, 3) or (n + 1, 7)
     """
     poses = np.vstack([identity(steps.shape[-1]), steps])
-    chained_count = 1
-    while chained_count < len(poses):
-        poses[chained_count:] = compose(poses[:-chained_count], poses[chained_count:])
-        chained_count *= 2
+    composed_count = 1
+    while composed_count < len(poses):
+        poses[composed_count:] = compose(poses[:-composed_count], poses[composed_count:])
+        composed_count *= 2
     return poses
 
 
@@ -210,25 +213,27 @@ def _left_jacobian_inverse(phi: Array) -> Array:
     return (
         np.eye(skew_matrix.shape[-1])
         - 0.5 * skew_matrix
-        + _compute_cot_term(np.linalg.norm(phi, axis=-1)[..., None, None])
+        + _compute_square_factor(np.linalg.norm(phi, axis=-1)[..., None, None])
         * (skew_matrix @ skew_matrix)
     )
 
 
-def _compute_cot_term(theta: Array) -> Array:
-    """Return (1 - theta/2 cot(theta/2)) / theta^2."""
+def _compute_square_factor(theta: Array) -> Array:
+    """Return f(theta) = (1 - theta/2 cot(theta/2)) / theta^2, the factor of ad^2 or [phi]×^2."""
     t = np.where(theta < SMALL_ANGLE_RAD, 1.0, theta)
-    exact_value = (1.0 - 0.5 * t / np.tan(0.5 * t)) / t**2
+    closed_form_value = (1.0 - 0.5 * t / np.tan(0.5 * t)) / t**2
     return np.where(
-        theta < SMALL_ANGLE_RAD, polyval(theta * theta, _COT_TERM_COEFFICIENTS), exact_value
+        theta < SMALL_ANGLE_RAD, polyval(theta * theta, _SQUARE_FACTOR_SERIES), closed_form_value
     )
 
 
-def _compute_cot_term_slope(theta: Array) -> Array:
-    """Return f'(theta) / theta for f = :func:`_compute_cot_term`."""
+def _compute_square_factor_slope(theta: Array) -> Array:
+    """Return f'(theta) / theta, for f(theta) = (1 - theta/2 cot(theta/2)) / theta^2."""
     t = np.where(theta < SMALL_ANGLE_RAD, 1.0, theta)
     half_cot_derivative = 0.5 / np.tan(0.5 * t) - 0.25 * t / np.sin(0.5 * t) ** 2
-    exact_value = -(half_cot_derivative + 2.0 * (1.0 - 0.5 * t / np.tan(0.5 * t)) / t) / t**3
+    closed_form_value = -(half_cot_derivative + 2.0 * (1.0 - 0.5 * t / np.tan(0.5 * t)) / t) / t**3
     return np.where(
-        theta < SMALL_ANGLE_RAD, polyval(theta * theta, _COT_TERM_SLOPE_COEFFICIENTS), exact_value
+        theta < SMALL_ANGLE_RAD,
+        polyval(theta * theta, _SQUARE_FACTOR_SLOPE_SERIES),
+        closed_form_value,
     )

@@ -17,9 +17,9 @@ from px4fuse.trajectory.graph.normal_equations import NormalEquations
 
 # A measurement does not observe a direction if the eigenvalue of its information matrix (scaled to
 # unit diagonal) is below this limit
-MIN_OBSERVED_EIGENVALUE = 1e-9
+MIN_EIGENVALUE_OF_OBSERVED_DIRECTION = 1e-9
 # Texts on the origin of the initial poses of a pose graph
-INITIAL_POSES_FROM_FILE = "the file's vertices"
+INITIAL_POSES_FROM_FILE = "vertices in the g2o file"
 INITIAL_POSES_FROM_ODOMETRY = "composition of the odometry edges"
 INITIAL_POSES_FROM_CHORDAL = "chordal initialisation"
 
@@ -41,8 +41,8 @@ class PoseGraph:
     # Inverse covariance of each measurement, translation before rotation, in the axes of the
     # measured pose; zero in directions that are not measured
     information: Array
-    # Origin of the initial poses, as a text such as INITIAL_POSES_FROM_FILE
-    initialised: str = INITIAL_POSES_FROM_FILE
+    # Method or file that gave the initial poses, a text such as INITIAL_POSES_FROM_FILE
+    initial_pose_origin: str = INITIAL_POSES_FROM_FILE
 
     __repr__ = one_line_repr
 
@@ -93,8 +93,8 @@ class Residuals:
 
 def residuals(graph: PoseGraph, poses: Array) -> Residuals:
     """Compute the residuals of all edges at the poses, shape (n, 3) or (n, 7)."""
-    relative_poses = lie.between(poses[graph.first_nodes], poses[graph.second_nodes])
-    residual = lie.log(lie.between(graph.measurements, relative_poses))
+    relative_poses = lie.relative_pose(poses[graph.first_nodes], poses[graph.second_nodes])
+    residual = lie.log(lie.relative_pose(graph.measurements, relative_poses))
     weighted_residual = (graph.information @ residual[..., None])[..., 0]
     return Residuals(poses, relative_poses, residual, np.sum(residual * weighted_residual, axis=-1))
 
@@ -112,7 +112,7 @@ def compute_observed_directions(information: Array) -> tuple[Array, Array]:
     """
     scale, scaled_information = scale_to_unit_diagonal(information)
     eigenvalues, eigenvectors = np.linalg.eigh(scaled_information)
-    is_observed = eigenvalues > MIN_OBSERVED_EIGENVALUE
+    is_observed = eigenvalues > MIN_EIGENVALUE_OF_OBSERVED_DIRECTION
     return scale[:, None] * eigenvectors[:, is_observed], 1.0 / eigenvalues[is_observed]
 
 
@@ -120,7 +120,7 @@ def count_observed_directions(information: Array) -> IntArray:
     """Return the number of directions that each measurement observes (rank of information)."""
     _, scaled_information = scale_to_unit_diagonal(information)
     eigenvalues = np.linalg.eigvalsh(scaled_information)
-    counts: IntArray = np.count_nonzero(eigenvalues > MIN_OBSERVED_EIGENVALUE, axis=1)
+    counts: IntArray = np.count_nonzero(eigenvalues > MIN_EIGENVALUE_OF_OBSERVED_DIRECTION, axis=1)
     return counts
 
 
@@ -132,9 +132,10 @@ def scale_to_unit_diagonal(matrices: Array) -> tuple[Array, Array]:
 
 
 def require_connected(graph: PoseGraph, is_used: BoolArray, edges_name: str) -> None:
-    """Raise TrajectoryError if the used edges with information do not connect all poses.
+    """Raise TrajectoryError if the used edges do not connect all poses.
 
-    ``edges_name`` names the edges in the error message.
+    Edges with the information matrix 0 do not count. ``edges_name``: the used edges, for the error
+    message.
     """
     if not len(graph.first_nodes):
         raise TrajectoryError("The pose graph has no edges", "Give a g2o file with EDGE lines.")
@@ -157,9 +158,9 @@ def require_connected(graph: PoseGraph, is_used: BoolArray, edges_name: str) -> 
 def compose_odometry(graph: PoseGraph) -> PoseGraph:
     """Return the graph with poses composed from odometry. Odometry must connect all poses."""
     poses = lie.compose(
-        graph.poses[:1], lie.chain(get_odometry_steps(graph, find_odometry_edges(graph)))
+        graph.poses[:1], lie.accumulate_poses(get_odometry_steps(graph, find_odometry_edges(graph)))
     )
-    return replace(graph, poses=poses, initialised=INITIAL_POSES_FROM_ODOMETRY)
+    return replace(graph, poses=poses, initial_pose_origin=INITIAL_POSES_FROM_ODOMETRY)
 
 
 def find_odometry_edges(graph: PoseGraph, excluded_edges: IntArray | None = None) -> IntArray:
@@ -171,7 +172,7 @@ def find_odometry_edges(graph: PoseGraph, excluded_edges: IntArray | None = None
     if excluded_edges is not None:
         odometry_edges = np.setdiff1d(odometry_edges, excluded_edges)
     next_edge_indices = np.full(len(graph) - 1, -1, dtype=np.intp)
-    # NumPy keeps the last of several assignments to one index: in reverse order, the first edge
+    # Reverse the edges, because NumPy keeps the last assignment to an index: the first edge is kept
     odometry_edges = odometry_edges[::-1]
     next_edge_indices[
         np.minimum(graph.first_nodes[odometry_edges], graph.second_nodes[odometry_edges])

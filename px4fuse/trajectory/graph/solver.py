@@ -21,8 +21,8 @@ MAX_GNC_CLOSURES = 1000
 ROBUST_SOLUTION_KEY = "gnc"
 # Labels of the pose graph solutions, by the key in results.json
 SOLUTION_LABELS: Mapping[str, str] = {
-    "all": "pose graph, all closures",
-    "gated": "pose graph, gated closures",
+    "all": "pose graph with all loop closures",
+    "gated": "pose graph with loop closures that pass the gate",
     ROBUST_SOLUTION_KEY: "pose graph, robust (GNC)",
 }
 
@@ -35,7 +35,7 @@ _DAMPING_FACTOR = 10.0
 # Maximum damping of Levenberg-Marquardt, as in GTSAM
 _MAX_DAMPING = 1e5
 # Minimum ratio of actual to predicted cost decrease for accepting a step, as in GTSAM
-_MIN_GAIN_RATIO = 1e-3
+_MIN_COST_DECREASE_RATIO = 1e-3
 # Relative and absolute tolerance of the cost of a pose graph
 _COST_TOLERANCE = 1e-10
 _FLOAT_EPSILON = float(np.finfo(float).eps)
@@ -43,23 +43,25 @@ _FLOAT_EPSILON = float(np.finfo(float).eps)
 _GNC_STAGE_TOLERANCE = 1e-6
 _MAX_GNC_STAGE_ITERATIONS = 20
 
-# Probability that graduated non-convexity gives a true closure its full weight: sets the bound of
-# its χ²
+# Probability that a true closure has full weight in graduated non-convexity. The bound of its χ² is
+# the quantile at this probability
 GNC_INLIER_PROBABILITY = 0.99
-# Probability that a true closure is kept: the cost of dropping it is the χ² quantile at this
-# probability
+# Probability that a true closure is kept. A dropped closure adds the χ² quantile at this
+# probability to the cost, instead of its χ²
 KEPT_CLOSURE_PROBABILITY = 0.999
 # Factor on the control parameter of graduated non-convexity per stage (Yang 2020, section V)
 _GNC_CONTROL_FACTOR = 1.4
 _MAX_GNC_STAGES = 100
-# Maximum number of dropped closures that are tested again, each by an optimisation
-_MAX_RETRIED_CLOSURES = 20
-_MAX_TRUNCATION_ROUNDS = 20
-# Information matrices are divided by their estimated scale factor if it is at least this value:
-# false closures alone can cause smaller factors (2.1 if 40 % of the closures are false)
-MIN_INFORMATION_FACTOR = 2.5
-# Minimum number of closures for estimating the scale factor of the information matrices from d²
-MIN_CLOSURES_FOR_SCALING = 10
+# Maximum number of dropped closures that are restored on trial, each with an optimisation
+_MAX_RESTORE_ATTEMPTS = 20
+# Maximum number of rounds with weights 0 and 1 after graduated non-convexity
+_MAX_REWEIGHTING_ROUNDS = 20
+# Minimum estimated scale factor by which information matrices are divided. False closures alone can
+# cause smaller factors, such as 2.1 if 40 % of the closures are false
+MIN_INFORMATION_SCALE_FACTOR = 2.5
+# Minimum number of closures for estimating the scale factor of the information matrices from the
+# squared Mahalanobis distances d² of the closures
+MIN_CLOSURES_FOR_SCALE_FACTOR = 10
 
 
 class Solution(Record, kw_only=True):
@@ -110,7 +112,7 @@ def solve(
         optimisation drops all edges to some poses.
     """
     model.require_connected(graph, np.ones(len(graph.first_nodes), bool), "the edges")
-    is_possibly_false = ~graph.find_successive_edges() if is_closure is None else is_closure
+    can_be_false = ~graph.find_successive_edges() if is_closure is None else is_closure
     start_residuals = model.residuals(graph, graph.poses)
     cost_initial = 0.5 * float(np.sum(start_residuals.chi2))
     if not np.isfinite(cost_initial):
@@ -119,10 +121,10 @@ def solve(
             "too large",
             "Correct the number, or remove its VERTEX or EDGE line.",
         )
-    weights = np.ones(len(is_possibly_false))
+    weights = np.ones(len(can_be_false))
     optimum = _minimise(graph, start_residuals, weights)
-    if robust and np.any(is_possibly_false):
-        optimum, weights = _solve_gnc(graph, start_residuals, optimum, is_possibly_false)
+    if robust and np.any(can_be_false):
+        optimum, weights = _solve_gnc(graph, start_residuals, optimum, can_be_false)
     return Solution(
         poses=optimum.residuals.poses,
         cost=0.5 * float(np.sum(weights * optimum.residuals.chi2)),
@@ -172,7 +174,7 @@ def _minimise(
                 is_converged = abs(cost_decrease) < relative_cost_tolerance * cost
             is_accepted = (
                 predicted_decrease > _FLOAT_EPSILON * cost
-                and cost_decrease > _MIN_GAIN_RATIO * predicted_decrease
+                and cost_decrease > _MIN_COST_DECREASE_RATIO * predicted_decrease
             )
             if is_accepted or is_converged or damping >= _MAX_DAMPING:
                 break
@@ -193,22 +195,25 @@ def _solve_gnc(
     graph: PoseGraph,
     start_residuals: Residuals,
     unweighted_optimum: _Optimum,
-    is_possibly_false: BoolArray,
+    can_be_false: BoolArray,
 ) -> tuple[_Optimum, Array]:
-    """Drop false closures by graduated non-convexity from two starts; use the lower minimum.
+    """Drop false closures by graduated non-convexity, and return the optimum and the edge weights.
 
-    A dropped closure is restored if this lowers the truncated least-squares cost.
+    Of the results from two starts, the result with the lower cost is used. A dropped closure is
+    restored if this lowers the truncated cost, in which each dropped closure has a fixed cost.
     """
     degrees_of_freedom = model.count_observed_directions(graph.information)
-    chi2_bound = np.full(len(is_possibly_false), np.inf)
-    drop_cost = np.zeros(len(is_possibly_false))
-    is_testable = is_possibly_false & (degrees_of_freedom > 0)
+    chi2_bound = np.full(len(can_be_false), np.inf)
+    cost_if_dropped = np.zeros(len(can_be_false))
+    is_testable = can_be_false & (degrees_of_freedom > 0)
     half_degrees_of_freedom = degrees_of_freedom[is_testable] / 2.0
     chi2_bound[is_testable] = 2.0 * gammaincinv(half_degrees_of_freedom, GNC_INLIER_PROBABILITY)
-    drop_cost[is_testable] = 2.0 * gammaincinv(half_degrees_of_freedom, KEPT_CLOSURE_PROBABILITY)
+    cost_if_dropped[is_testable] = 2.0 * gammaincinv(
+        half_degrees_of_freedom, KEPT_CLOSURE_PROBABILITY
+    )
 
     def compute_truncated_cost(residuals: Residuals, edge_weights: Array) -> float:
-        return 0.5 * float(np.sum(np.where(edge_weights > 0.0, residuals.chi2, drop_cost)))
+        return 0.5 * float(np.sum(np.where(edge_weights > 0.0, residuals.chi2, cost_if_dropped)))
 
     iteration_count = unweighted_optimum.iterations
     solutions = []
@@ -219,17 +224,19 @@ def _solve_gnc(
     lowest_cost, optimum, weights = min(solutions, key=lambda solution: solution[0])
     dropped_edges = np.flatnonzero(weights == 0.0)
     for edge_index in dropped_edges[np.argsort(optimum.residuals.chi2[dropped_edges])][
-        :_MAX_RETRIED_CLOSURES
+        :_MAX_RESTORE_ATTEMPTS
     ]:
         trial_weights = weights.copy()
         trial_weights[edge_index] = 1.0
-        retried_optimum = _minimise(graph, optimum.residuals, trial_weights)
-        iteration_count += retried_optimum.iterations
-        if (cost := compute_truncated_cost(retried_optimum.residuals, trial_weights)) < lowest_cost:
+        optimum_with_closure = _minimise(graph, optimum.residuals, trial_weights)
+        iteration_count += optimum_with_closure.iterations
+        if (
+            cost := compute_truncated_cost(optimum_with_closure.residuals, trial_weights)
+        ) < lowest_cost:
             lowest_cost = cost
-            optimum = retried_optimum
+            optimum = optimum_with_closure
             weights = trial_weights
-    model.require_connected(graph, weights > 0.0, "the edges that robust optimisation did not drop")
+    model.require_connected(graph, weights > 0.0, "the edges that remain after robust optimisation")
     return _Optimum(optimum.residuals, iteration_count, optimum.converged), weights
 
 
@@ -239,15 +246,19 @@ def _run_gnc(
     """Run graduated non-convexity from one start (Yang 2020, algorithm 1, eq. 13 and 14)."""
     residuals = start_residuals
     iteration_count = 0
-    # relative excess of 2 χ² over its bound: -1 (never false) for edges with an infinite bound
-    chi2_excess = 2.0 * residuals.chi2 / chi2_bound - 1.0
-    if np.max(chi2_excess) > 0.0:
-        gnc_control = 1.0 / float(np.max(chi2_excess))
+    # The initial control parameter is 1 / max(2 χ² / bound - 1) (Yang 2020, section V). If the
+    # maximum is not positive, all edges keep full weight
+    inverse_control_by_edge = 2.0 * residuals.chi2 / chi2_bound - 1.0
+    if np.max(inverse_control_by_edge) > 0.0:
+        control_parameter = 1.0 / float(np.max(inverse_control_by_edge))
         for _ in range(_MAX_GNC_STAGES):
             # the limit avoids a division by zero and does not change the weight, which is 1
             chi2_ratio = np.maximum(residuals.chi2 / chi2_bound, 1e-200)
             weights = np.clip(
-                np.sqrt(gnc_control * (gnc_control + 1.0) / chi2_ratio) - gnc_control, 0.0, 1.0
+                np.sqrt(control_parameter * (control_parameter + 1.0) / chi2_ratio)
+                - control_parameter,
+                0.0,
+                1.0,
             )
             stage_optimum = _minimise(
                 graph, residuals, weights, _GNC_STAGE_TOLERANCE, _MAX_GNC_STAGE_ITERATIONS
@@ -256,18 +267,18 @@ def _run_gnc(
             iteration_count = iteration_count + stage_optimum.iterations
             if np.all((weights < 1e-6) | (weights > 1.0 - 1e-6)):
                 break
-            gnc_control *= _GNC_CONTROL_FACTOR
+            control_parameter *= _GNC_CONTROL_FACTOR
     weights = (residuals.chi2 <= chi2_bound).astype(float)
-    for _ in range(_MAX_TRUNCATION_ROUNDS):
-        truncated_optimum = _minimise(graph, residuals, weights)
-        residuals = truncated_optimum.residuals
-        iteration_count = iteration_count + truncated_optimum.iterations
+    for _ in range(_MAX_REWEIGHTING_ROUNDS):
+        reweighted_optimum = _minimise(graph, residuals, weights)
+        residuals = reweighted_optimum.residuals
+        iteration_count = iteration_count + reweighted_optimum.iterations
         # the iteration ends, because each round decreases the truncated cost
         new_weights = (residuals.chi2 <= chi2_bound).astype(float)
         if np.array_equal(new_weights, weights):
             break
         weights = new_weights
-    return _Optimum(residuals, iteration_count, truncated_optimum.converged), weights
+    return _Optimum(residuals, iteration_count, reweighted_optimum.converged), weights
 
 
 class Graph(Record, kw_only=True):
@@ -284,8 +295,9 @@ class Graph(Record, kw_only=True):
     reduced_chi2_interval : tuple of float
         95 % interval of ``reduced_chi2`` for correct information matrices and closures.
     information_factor : float
-        Estimated factor by which all information matrices are too large; 1 if it is below
-        MIN_INFORMATION_FACTOR. Gate and robust optimisation use the matrices divided by it.
+        Estimated factor by which all information matrices are too large, or 1 if the estimate is
+        below MIN_INFORMATION_SCALE_FACTOR. Gate and robust optimisation use the matrices divided by
+        this factor.
     gates : tuple of GateResult, or Unavailable
         Tests of all edges that are not odometry.
     solutions : mapping from key of :data:`SOLUTION_LABELS` to Solution
@@ -308,7 +320,7 @@ def analyse_graph(
     graph: PoseGraph,
     progress: Callable[[str], None] = lambda _: None,
     *,
-    run_robust: bool | None = None,
+    use_robust_optimisation: bool | None = None,
 ) -> tuple[Graph, PoseGraph]:
     """Test the loop closures of a pose graph, and optimise the graph by least squares and robustly.
 
@@ -333,25 +345,27 @@ def analyse_graph(
             (chdtri(degrees_of_freedom, [0.975, 0.025]) / degrees_of_freedom).tolist()
         )
     scaled_graph, information_factor = graph, 1.0
-    gate_results: tuple[GateResult, ...] | Unavailable
+    closure_tests: tuple[GateResult, ...] | Unavailable
     try:
-        gate_results = tuple(gate_edges(graph, np.flatnonzero(is_closure)))
+        closure_tests = tuple(gate_edges(graph, np.flatnonzero(is_closure)))
         if (
             reduced_chi2 > reduced_chi2_interval[1]
-            and len(gate_results) >= MIN_CLOSURES_FOR_SCALING
+            and len(closure_tests) >= MIN_CLOSURES_FOR_SCALE_FACTOR
         ):
-            factor = min(reduced_chi2, _estimate_information_factor(gate_results))
-            if factor >= MIN_INFORMATION_FACTOR:
+            factor = min(reduced_chi2, _estimate_information_factor(closure_tests))
+            if factor >= MIN_INFORMATION_SCALE_FACTOR:
                 information_factor = factor
                 scaled_graph = replace(graph, information=graph.information / factor)
-                gate_results = tuple(gate_edges(scaled_graph, np.flatnonzero(is_closure)))
+                closure_tests = tuple(gate_edges(scaled_graph, np.flatnonzero(is_closure)))
     except TrajectoryError as error:
-        gate_results = Unavailable(
+        closure_tests = Unavailable(
             "gate", str(error), "Give an odometry edge between all successive vertices."
         )
     closure_count = int(np.count_nonzero(is_closure))
     if closure_count > 1 and (
-        closure_count <= MAX_GNC_CLOSURES if run_robust is None else run_robust
+        closure_count <= MAX_GNC_CLOSURES
+        if use_robust_optimisation is None
+        else use_robust_optimisation
     ):
         progress(f"optimising: {SOLUTION_LABELS[ROBUST_SOLUTION_KEY]}")
         solutions[ROBUST_SOLUTION_KEY] = solve(scaled_graph, robust=True, is_closure=is_closure)
@@ -360,21 +374,21 @@ def analyse_graph(
         dimension=graph.dimension,
         poses=len(graph),
         edges=len(graph.first_nodes),
-        initialised=graph.initialised,
+        initialised=graph.initial_pose_origin,
         reduced_chi2=reduced_chi2,
         reduced_chi2_interval=reduced_chi2_interval,
         information_factor=information_factor,
-        gates=gate_results,
+        gates=closure_tests,
         solutions=solutions,
     )
     return results, replace(graph, poses=solutions["all"].poses)
 
 
-def _estimate_information_factor(gate_results: tuple[GateResult, ...]) -> float:
+def _estimate_information_factor(closure_tests: tuple[GateResult, ...]) -> float:
     """Estimate the factor by which all information matrices are too large.
 
     The factor is the median ratio of the d² of a closure to the expected median of its d².
     The median is robust against false closures if they are a minority.
     """
-    chi2_medians = chdtri([gate.degrees_of_freedom for gate in gate_results], 0.5)
-    return float(np.median(np.divide([gate.d2 for gate in gate_results], chi2_medians)))
+    expected_d2_medians = chdtri([gate.degrees_of_freedom for gate in closure_tests], 0.5)
+    return float(np.median(np.divide([gate.d2 for gate in closure_tests], expected_d2_medians)))
