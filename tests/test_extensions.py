@@ -167,7 +167,7 @@ def test_extension_guide_names_only_existing_files() -> None:
         "cli/options.py": [],
         "filter/settings.py": ["class Settings", "SETTING_RANGES"],
         "results/contract.py": ["class ChosenSettings"],
-        "flight/model.py": ["ORIGINS"],
+        "flight/model.py": ["SOURCE_ORIGINS"],
         "report/pdf.py": ["PAGES"],
         "cli/__init__.py": ["COMMANDS"],
     }.items():

@@ -37,7 +37,7 @@ from px4fuse.findings import cause_text, ekf2_noise, hidden_errors, loops, noise
 from px4fuse.findings.cause_grouping import group_by_cause
 from px4fuse.findings.noises import _has_default_noises
 from px4fuse.flight.ekf2_parameters import EV_POS, GNSS_POS, PARAMETERS
-from px4fuse.flight.model import GNSS_ORIGIN, RECEIVED_ORIGIN
+from px4fuse.flight.model import AS_RECEIVED_ORIGIN, GNSS_ORIGIN
 from px4fuse.loop.model import Closure, Loop, TrueEnd
 
 MOVING = source(samples=positions(np.arange(0.0, 120.0), np.arange(120.0)))
@@ -275,14 +275,14 @@ def test_smaller_noise_on_odometry_is_not_recommended() -> None:
         finding = only(
             noises.detect_inconsistent_variances, analysis(axes=(kf(nis),), source=ODOMETRY)
         )
-        assert (finding.remedy == noises.KEEP_NOISE_ACTION_DRIFT) is is_kept
+        assert (finding.remedy == noises.KEEP_NOISE_BECAUSE_OF_DRIFT_ACTION) is is_kept
         assert finding.severity == level
     for owner, there in (("kf", True), ("ekf2", False)):
         worse = {owner: statement(), f"{owner}_truth": against_truth(9.0)}
         finding = only(
             noises.detect_inconsistent_variances, analysis(axes=(kf(0.2), axis("east", **worse)))
         )
-        assert (finding.remedy == noises.KEEP_NOISE_ACTION_TRUTH) is there
+        assert (finding.remedy == noises.KEEP_NOISE_BECAUSE_OF_TRUTH_ACTION) is there
         assert finding.evidence["cause"] == "elsewhere"
 
 
@@ -376,7 +376,7 @@ def test_smaller_noise_that_contradicts_ground_truth_is_rejected() -> None:
     contradicted = replace(contradicted, after=replace(contradicted.after, nees_mean=4.0))
     one = analysis(axes=(kf(0.2),), trials=(contradicted,))
     finding = only(noises.detect_inconsistent_variances, one)
-    assert (finding.remedy, finding.severity) == (noises.KEEP_NOISE_ACTION_TRUTH, "note")
+    assert (finding.remedy, finding.severity) == (noises.KEEP_NOISE_BECAUSE_OF_TRUTH_ACTION, "note")
     assert finding.evidence["cause"] == "elsewhere"
 
 
@@ -445,7 +445,7 @@ def test_wrong_ekf2_noise_title_names_sensor_if_value_is_default(
     inputs = SimpleNamespace(aid=aid, settings=settings, received=received)
     model = SimpleNamespace(inputs=inputs)
     result = axis("north", rejected_fraction=rejected)
-    origin = GNSS_ORIGIN if kind == "gnss" else RECEIVED_ORIGIN
+    origin = GNSS_ORIGIN if kind == "gnss" else AS_RECEIVED_ORIGIN
     one = analysis(
         axes=(result,), trials=(rerun,), ekf2_model=model, source=source(origin=origin),
         settings=Settings(1.0, flown_m),

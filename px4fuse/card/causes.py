@@ -28,8 +28,8 @@ from px4fuse.core.text import lower_first, with_log_name
 from px4fuse.filter.consistency import classify_sigma_ratio
 from px4fuse.filter.tuning import HORIZONTAL, AxisTuning
 from px4fuse.finding import Finding
-from px4fuse.findings.cause_grouping import CONVENTION_KEY
-from px4fuse.findings.cause_text import format_shift
+from px4fuse.findings.cause_grouping import WRONG_CONVENTION_KEY
+from px4fuse.findings.cause_text import format_timestamp_action
 from px4fuse.findings.model import FINDING_CATALOGUE
 from px4fuse.flight.ekf2_parameters import PARAMETERS
 from px4fuse.flight.model import PositionTrack, Unavailable
@@ -109,12 +109,15 @@ def rank_causes(analysis: Analysis, root_findings: Sequence[Finding]) -> list[Ra
 
 
 def _is_setting_fault(finding: Finding) -> bool:
-    rerun_kinds = FINDING_CATALOGUE[finding.id].reruns
+    rerun_kinds = FINDING_CATALOGUE[finding.id].rerun_kinds
     return bool(rerun_kinds) and rerun_kinds <= SETTING_CHANGE_KINDS
 
 
 def _find_cause_rank(finding: Finding, trials: Iterable[Trial]) -> int:
-    if FINDING_CATALOGUE[finding.id].verdict == "meaningless" or CONVENTION_KEY in finding.evidence:
+    if (
+        FINDING_CATALOGUE[finding.id].verdict == "meaningless"
+        or WRONG_CONVENTION_KEY in finding.evidence
+    ):
         return 0
     if _is_setting_fault(finding) and any(map(remains_overconfident, trials)):
         return 3
@@ -127,7 +130,7 @@ def _find_cause_rank(finding: Finding, trials: Iterable[Trial]) -> int:
 
 def find_trials_of_finding(trials: Iterable[Trial], finding: Finding) -> tuple[Trial, ...]:
     """Return the best re-run of KF and of EKF2 for each kind of change that tests a finding."""
-    tested_kinds = FINDING_CATALOGUE[finding.id].reruns
+    tested_kinds = FINDING_CATALOGUE[finding.id].rerun_kinds
     tested_kinds |= {"defaults"} if "noises" in tested_kinds else set()
     best_trial_by_change: dict[tuple[FilterName, str], Trial] = {}
     for trial in trials:
@@ -215,7 +218,7 @@ def _make_actions(
         shift_s = offset_trial.change[CLOCK_OFFSET_KEY]
         if offset_trial.filter == "kf":
             shift_s -= analysis.settings.clock_offset_s
-        shift_instruction = lower_first(format_shift(shift_s))
+        shift_instruction = lower_first(format_timestamp_action(shift_s))
         sender_actions = [Action("sender", f"{shift_instruction} the timestamp of each position")]
     alternative_groups: tuple[tuple[Action, ...], ...] = ()
     actions = delay_actions or sender_actions
@@ -268,7 +271,7 @@ def _explain_no_change(
     if not verdict_by_reference:
         return ""
     if set(verdict_by_reference.values()) == {"consistent"}:
-        needs_ground_truth = FINDING_CATALOGUE[finding.id].reruns & TRUTH_ONLY_CHANGE_KINDS
+        needs_ground_truth = FINDING_CATALOGUE[finding.id].rerun_kinds & TRUTH_ONLY_CHANGE_KINDS
         if needs_ground_truth and "truth" not in verdict_by_reference:
             return "no change: only ground truth shows this fault, and the log has none"
         return "no change: the reported σ is consistent"
@@ -391,7 +394,7 @@ def _format_closing_sentence(
     tuning = analysis.tuning.get(HORIZONTAL)
     for trial in useful_trials:
         if trial.kinds == ("noise",) and isinstance(tuning, AxisTuning):
-            default_noise_m = analysis.flight.log.default_of(next(iter(trial.change)))
+            default_noise_m = analysis.flight.log.find_default_value(next(iter(trial.change)))
             if (tuning.sigma_z.low or 0.0) <= default_noise_m <= (tuning.sigma_z.high or 0.0):
                 return (
                     f"PX4's default of {default_noise_m:g} m is inside the 95 % interval of the "

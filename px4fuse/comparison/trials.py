@@ -35,7 +35,7 @@ COMBINATION_TOLERANCE = 0.9
 # Keys of Trial.change that correct faulty sensor data; other keys change settings of a filter
 SENSOR_CHANGE_KEYS = frozenset((OUTLIERS_KEY, CLOCK_OFFSET_KEY, ROTATION_KEY, FORWARD_BIAS_KEY))
 # Keys of Trial.change that have an effect only together with another change
-SECONDARY_CHANGE_KEYS = frozenset(("EKF2_DELAY_MAX", EV_POS.noise_mode, RIGHT_BIAS_KEY))
+SECONDARY_CHANGE_KEYS = frozenset(("EKF2_DELAY_MAX", EV_POS.noise_mode_parameter, RIGHT_BIAS_KEY))
 # A re-run has an effect if it changes a ratio of actual to reported σ by at least this factor
 MIN_SIGMA_RATIO_FACTOR = 1.10
 # A re-run has an effect if it changes the position RMSE by more than this fraction

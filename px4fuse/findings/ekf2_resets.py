@@ -7,7 +7,7 @@ from px4fuse.analysis import Analysis
 from px4fuse.comparison.flight_events import find_airborne_spans
 from px4fuse.comparison.projection import remove_origin_resets
 from px4fuse.core.record import Span
-from px4fuse.findings.cause_grouping import CAUSE_KEY, GAP_CAUSE, UNKNOWN_CAUSE
+from px4fuse.findings.cause_grouping import CAUSE_KEY, SOURCE_GAP_CAUSE, UNKNOWN_CAUSE
 from px4fuse.findings.model import Findings, finding, format_count, make_zero_length_spans, warning
 from px4fuse.flight.model import Ekf2, Reset
 
@@ -17,18 +17,19 @@ TAKE_OFF_DURATION_S = 10.0
 MAX_RESET_DELAY_S = 5.0
 # EKF2 starts fusion by a reset to the first position. This normal reset can be up to this time (s)
 # after the logged start of fusion, because fusion flags are logged at 1 Hz
-MAX_START_RESET_DELAY_S = 1.0
+MAX_FUSION_START_TO_RESET_S = 1.0
 
 
 def detect(analysis: Analysis) -> Findings:
     ekf2, segment = analysis.flight.ekf2, analysis.segment.flight
     if not isinstance(ekf2, Ekf2):
         return
-    # Earlier resets are normal. NaN if EKF2 fuses no position: the comparison below is then False
+    # Resets up to the start of fusion are normal and not reported. If EKF2 fuses no position, the
+    # start is NaN and all resets are reported
     fusion_start_s = -np.inf
     if isinstance(ekf2.fusion_flags, pd.DataFrame):
         is_fused = ekf2.fusion_flags["horizontal"] > 0.0
-        fusion_start_s = is_fused.index[is_fused].min() + MAX_START_RESET_DELAY_S
+        fusion_start_s = is_fused.index[is_fused].min() + MAX_FUSION_START_TO_RESET_S
     position_resets = [
         reset
         for reset in ekf2.resets
@@ -65,7 +66,7 @@ def detect(analysis: Analysis) -> Findings:
                 "count": len(sizes_m),
                 "largest_m": max(sizes_m),
                 "at_s": largest_reset_time_s,
-                CAUSE_KEY: GAP_CAUSE if follows_gap else UNKNOWN_CAUSE,
+                CAUSE_KEY: SOURCE_GAP_CAUSE if follows_gap else UNKNOWN_CAUSE,
             },
             make_zero_length_spans(reset.time_s for reset in reported_resets),
         )
@@ -74,7 +75,7 @@ def detect(analysis: Analysis) -> Findings:
 
 def detect_instance_switches(ekf2: Ekf2, span_s: Span) -> Findings:
     """Detect changes of the primary EKF2 instance in a time span (s)."""
-    switch_times_s = [time for time, _ in ekf2.instances if span_s[0] < time <= span_s[1]]
+    switch_times_s = [time for time, _ in ekf2.primary_instances if span_s[0] < time <= span_s[1]]
     if switch_times_s:
         yield warning(
             "ekf2_instance_switch",

@@ -23,38 +23,40 @@ def detect(analysis: Analysis) -> Findings:
 def detect_loop_faults(loop: Loop) -> Findings:
     """Detect false loop closures and wrong assumptions about a loop."""
     yield from detect_inconsistent_closures(loop)
-    yield from detect_wrong_assumptions(loop)
+    yield from detect_wrong_loop_assumptions(loop)
 
 
 def detect_inconsistent_closures(loop: Loop) -> Findings:
     """Detect loop closures that contradict the odometry drift or other loop closures."""
-    gnc_weights = [
+    robust_weights = [
         1.0 if closure.weight_gnc is None else closure.weight_gnc for closure in loop.closures
     ]
-    rejected_count = sum(gnc_weight < MIN_GNC_WEIGHT for gnc_weight in gnc_weights)
-    rejects_most_closures = rejected_count > MAX_REJECTED_CLOSURE_FRACTION * len(gnc_weights)
-    if rejects_most_closures:
+    rejected_count = sum(robust_weight < MIN_GNC_WEIGHT for robust_weight in robust_weights)
+    are_most_closures_rejected = rejected_count > MAX_REJECTED_CLOSURE_FRACTION * len(
+        robust_weights
+    )
+    if are_most_closures_rejected:
         yield warning(
             "loop_drift_too_small",
-            f"Robust optimisation rejects {rejected_count} of {len(gnc_weights)} loop closures. "
+            f"Robust optimisation rejects {rejected_count} of {len(robust_weights)} loop closures. "
             "The stated odometry drift is probably too small.",
             "Increase the stated drift (--drift or --heading-drift).",
-            {"dropped": rejected_count, "closures": len(gnc_weights)},
+            {"dropped": rejected_count, "closures": len(robust_weights)},
         )
-    for closure, gnc_weight in zip(loop.closures, gnc_weights, strict=True):
+    for closure, robust_weight in zip(loop.closures, robust_weights, strict=True):
         if not closure.accepted:
             yield _make_false_closure_finding(closure, loop.is_end_assumed)
-        elif gnc_weight < MIN_GNC_WEIGHT and not rejects_most_closures:
+        elif robust_weight < MIN_GNC_WEIGHT and not are_most_closures_rejected:
             yield warning(
                 "loop_closure_inconsistent",
-                f"{closure!s} contradicts the other loop closures. Robust "
-                "optimisation rejects it, although drift could explain its closure error.",
+                f"{closure!s} contradicts the other loop closures, so robust optimisation rejects "
+                "it. Odometry drift alone could explain the closure error.",
                 "Remove this loop closure, or use the path of the robust optimisation (GNC).",
-                _make_closure_evidence(closure) | {"gnc_weight": gnc_weight},
+                _make_closure_evidence(closure) | {"gnc_weight": robust_weight},
             )
 
 
-def detect_wrong_assumptions(loop: Loop) -> Findings:
+def detect_wrong_loop_assumptions(loop: Loop) -> Findings:
     closure_error_m = loop.closure_error_m
     evidence = {} if closure_error_m is None else {"closure_error_m": closure_error_m}
     if loop.is_absolute_track:
@@ -89,10 +91,10 @@ def _make_false_closure_finding(closure: Closure, is_end_assumed: bool) -> Findi
         )
     return error(
         "false_loop_closure",
-        f"False loop closure (closure error {closure.distance_m:.2f} m): {closure_text}. The "
-        "stated drift of the odometry does not explain the closure error (squared "
-        f"Mahalanobis distance {closure.d2:.0f}, {closure.degrees_of_freedom} degrees of freedom, "
-        f"p {closure.p:.1g}). A path that contains this closure would be deformed.",
+        f"False loop closure: {closure_text}. The closure error of {closure.distance_m:.2f} m is "
+        "larger than the stated odometry drift explains (squared Mahalanobis distance "
+        f"{closure.d2:.0f}, {closure.degrees_of_freedom} degrees of freedom, p {closure.p:.1g}). "
+        "This closure would deform the path.",
         f"{action} If the odometry has more drift than stated, increase --drift and "
         "--heading-drift.",
         _make_closure_evidence(closure),

@@ -4,7 +4,7 @@ from px4fuse.analysis import Analysis
 from px4fuse.comparison.model import PreparedComparison
 from px4fuse.core.text import capitalise_first
 from px4fuse.findings.model import Findings, warning
-from px4fuse.flight.model import RECEIVED_ORIGIN, Unavailable, positions_phrase
+from px4fuse.flight.model import AS_RECEIVED_ORIGIN, Unavailable, positions_phrase
 
 VISION_TOPIC = "vehicle_visual_odometry"
 # SDLOG_PROFILE: default value, and mask of bit 7 for external vision (logged_topics.cpp)
@@ -44,12 +44,12 @@ def detect_unavailable_data(analysis: Analysis) -> Findings:
 
 def detect_source_not_logged(analysis: PreparedComparison) -> Findings:
     """Detect that the log lacks the positions which PX4 received."""
-    source, received_origin_rank = analysis.source, RECEIVED_ORIGIN.find_preference_rank()
-    has_received_positions = any(
-        track.origin.find_preference_rank() == received_origin_rank
+    source, rank_as_received = analysis.source, AS_RECEIVED_ORIGIN.find_preference_rank()
+    has_positions_as_received = any(
+        track.origin.find_preference_rank() == rank_as_received
         for track in analysis.flight.positions
     )
-    if source.origin.has_all_samples or has_received_positions:
+    if source.origin.has_all_samples or has_positions_as_received:
         return
     rate_hz, parameters = source.compute_rate_hz(), analysis.flight.log.parameters
     sdlog_profile = int(parameters.get("SDLOG_PROFILE", DEFAULT_SDLOG_PROFILE))

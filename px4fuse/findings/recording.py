@@ -28,11 +28,12 @@ def detect_dropouts(analysis: PreparedComparison) -> Findings:
     ]
     if dropouts:
         total_s = sum(dropout.duration_s for dropout in dropouts)
-        longest_s = max(dropout.duration_s for dropout in dropouts)
+        longest_dropout_s = max(dropout.duration_s for dropout in dropouts)
         yield warning(
             "logger_dropouts",
             f"The logger lost {total_s:.2f} s of data in {len(dropouts)} "
-            f"dropout{'s' if len(dropouts) > 1 else ''}. The longest lasted {longest_s:.2f} s.",
+            f"dropout{'s' if len(dropouts) > 1 else ''}. The longest lasted "
+            f"{longest_dropout_s:.2f} s.",
             "Use a faster SD card, or log fewer topics (SDLOG_PROFILE).",
             {"count": len(dropouts), "total_s": total_s},
             tuple((dropout.start_s, dropout.start_s + dropout.duration_s) for dropout in dropouts),
@@ -86,7 +87,7 @@ def detect_lost_data(flight: Flight) -> Findings:
 
 
 def detect_decreasing_clocks(flight: Flight) -> Findings:
-    """Detect a decreasing boot clock (restart of the autopilot) and decreasing receive times."""
+    """Detect a boot clock that jumps back (restart of the autopilot), or receive times that do."""
     log = flight.log
     if log.restarts:
         yield warning(
@@ -115,7 +116,7 @@ def detect_other_estimators(analysis: Analysis) -> Findings:
             "ekf2_simulated",
             "This log is simulated: px4fuse's own model of EKF2 computed the EKF2 estimates, not "
             "PX4's code.",
-            "Use a real flight to assess PX4's EKF2.",
+            "To assess PX4's EKF2, analyse a real flight.",
         )
     if not isinstance(ekf2, Ekf2):
         return

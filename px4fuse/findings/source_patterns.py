@@ -29,8 +29,8 @@ from px4fuse.findings.model import (
     warning,
 )
 from px4fuse.findings.source_positions import (
-    MIN_SCALE_ERROR_FOR_ERROR,
-    MIN_SCALE_ERROR_SIGMAS,
+    MIN_SCALE_ERROR_FOR_SEVERITY_ERROR,
+    MIN_SCALE_ERROR_TO_SIGMA_RATIO,
 )
 from px4fuse.findings.source_stamps import detect_bursts
 from px4fuse.flight.model import positions_phrase, source_name
@@ -57,7 +57,7 @@ def detect(analysis: Analysis) -> Findings:
     yield from detect_jitter_and_speed_noise(analysis, local_residuals)
     error_fit = fit_errors(analysis, local_residuals)
     if error_fit is not None:
-        yield from detect_slow_errors(analysis, error_fit)
+        yield from detect_periodic_errors_and_offset_changes(analysis, error_fit)
         if not analysis.source.origin.is_gnss:  # GNSS has no scale factor error
             yield from detect_scale_error(analysis, error_fit)
 
@@ -90,7 +90,7 @@ def detect_jitter_and_speed_noise(analysis: Analysis, local_residuals: LocalResi
         )
 
 
-def detect_slow_errors(analysis: Analysis, error_fit: ErrorFit) -> Findings:
+def detect_periodic_errors_and_offset_changes(analysis: Analysis, error_fit: ErrorFit) -> Findings:
     periodic_error = find_periodic_error(error_fit)
     positions_text = positions_phrase(analysis.source)
     if periodic_error is not None:
@@ -101,7 +101,7 @@ def detect_slow_errors(analysis: Analysis, error_fit: ErrorFit) -> Findings:
             f"s. This sinusoid explains {format_percent(min(periodic_error.fraction, 1.0))} of the "
             "slow errors against ground truth. KF and EKF2 follow this error, so innovations "
             "hardly show it.",
-            f"Check {find_source_texts(analysis.source).errors}. Look for a process with this "
+            f"{find_source_texts(analysis.source).slow_error_check}. Look for a process with this "
             "period, such as a rotating part or a control loop. No noise setting corrects this "
             "error.",
             periodic_error._asdict(),
@@ -109,16 +109,16 @@ def detect_slow_errors(analysis: Analysis, error_fit: ErrorFit) -> Findings:
         return
     clock, offset_change = analysis.clock, find_offset_variation(error_fit)
     if isinstance(clock, ClockOffset) and clock.has_changed():
-        return  # source_clock.py reports this change
+        return  # source_clock.py reports a change of the time offset
     if offset_change is not None:
         yield error(
             "source_time_offset_changes",
             f"The time offset of the {positions_text} varies in flight by "
             f"{offset_change.most_s - offset_change.least_s:.2f} s. Its deviation from the "
             f"mean is {offset_change.least_s:+.2f} s at {offset_change.least_at_s:.0f} s and "
-            f"{offset_change.most_s:+.2f} s at {offset_change.most_at_s:.0f} s, estimated "
-            "from the errors along the motion against ground truth. No single --clock-offset "
-            "corrects the whole flight.",
+            f"{offset_change.most_s:+.2f} s at {offset_change.most_at_s:.0f} s. The estimate is "
+            "from position errors against ground truth. No single --clock-offset corrects the "
+            "whole flight.",
             "Synchronise the clocks during the whole flight. Send the time of measurement, not the "
             "time at which a position was sent or received.",
             offset_change._asdict(),
@@ -127,16 +127,16 @@ def detect_slow_errors(analysis: Analysis, error_fit: ErrorFit) -> Findings:
 
 def detect_scale_error(analysis: Analysis, error_fit: ErrorFit) -> Findings:
     if abs(error_fit.scale) >= max(
-        MIN_SCALE_ERROR_AGAINST_TRUTH, MIN_SCALE_ERROR_SIGMAS * error_fit.scale_sigma
+        MIN_SCALE_ERROR_AGAINST_TRUTH, MIN_SCALE_ERROR_TO_SIGMA_RATIO * error_fit.scale_sigma
     ):
         yield finding(
-            "error" if abs(error_fit.scale) >= MIN_SCALE_ERROR_FOR_ERROR else "warning",
+            "error" if abs(error_fit.scale) >= MIN_SCALE_ERROR_FOR_SEVERITY_ERROR else "warning",
             "source_scale_error",
             f"{source_name(analysis.source)} distances are {format_percent(abs(error_fit.scale))} "
             f"too {'long' if error_fit.scale > 0.0 else 'short'}. The comparison with ground truth "
             f"is accurate to ± {format_percent(1.96 * error_fit.scale_sigma, 1)} (95 %). "
             "Innovations do not show a scale factor error.",
-            f"Check {find_source_texts(analysis.source).scale}.",
+            f"{find_source_texts(analysis.source).scale_check}.",
             {"scale": 1.0 + error_fit.scale, "sigma": error_fit.scale_sigma},
         )
 

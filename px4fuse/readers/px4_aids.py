@@ -126,15 +126,15 @@ def _read_common_topics(
                 for topic, name in topics_and_quantities
             ]
         )
-    if aid.old_fields:
-        fields = _expand_columns_by_axis("innovation", aid, aid.old_fields)
-        variance_fields = aid.old_fields.replace("innov", "innov_var")
+    if aid.ekf2_innovations_fields:
+        fields = _expand_columns_by_axis("innovation", aid, aid.ekf2_innovations_fields)
+        variance_fields = aid.ekf2_innovations_fields.replace("innov", "innov_var")
         fields |= _expand_columns_by_axis("variance", aid, variance_fields)
         layouts.append([Layout(px4.OLD_INNOVATION_TOPIC, fields)] * 2)
     for value_layout, variance_layout in layouts:
         innovations = topics.primary_samples(value_layout)
         samples = topics.primary_samples(value_layout, select=_drop_repeats_and_zeros)
-        unknown_fusion_times_s = _find_unknown_fusion_times(
+        times_with_unknown_fusion_s = _find_unknown_fusion_times(
             innovations[f"innovation_{aid.axes[0]}"],
             topics.primary_samples(variance_layout)[f"variance_{aid.axes[0]}"],
         )
@@ -151,7 +151,7 @@ def _read_common_topics(
             topics, used_topics, aid, samples, enabled_changes, excluded_sample_count
         )
         if aid_log is not None:
-            return replace(aid_log, unknown_fusion_times_s=unknown_fusion_times_s)
+            return replace(aid_log, times_with_unknown_fusion_s=times_with_unknown_fusion_s)
     return None
 
 
