@@ -92,7 +92,7 @@ def source(**parts: Any) -> Any:
         "frame": "NED",
         "clock_map": None, "alignment": None, "rate_hz": 5.0, "assumed_delay_s": 0.0,
         "samples": moving(parts.get("rate_hz", 5.0)), "status": pd.DataFrame(), "velocity": None,
-        "invalid": NO_INVALID_ROWS,
+        "invalid_reasons": NO_INVALID_ROWS,
     }  # fmt: skip
     made = {**usual, **parts}
     rate_hz = made.pop("rate_hz")

@@ -304,7 +304,7 @@ def test_action_is_recommended_only_if_it_halves_ekf2_rejections() -> None:
 
 CHECK_FIRST = (
     "Check the data link and the line of sight to the anchors. Then check EKF2_EV_DELAY and "
-    "EKF2_EVP_NOISE. Increase EKF2_EVP_GATE last."
+    "EKF2_EVP_NOISE. Increase EKF2_EVP_GATE only if no fault is found."
 )
 
 
@@ -315,8 +315,8 @@ def test_finding_of_error_above_sigma_names_axis_and_action() -> None:
     ekf2 = axis("east", ekf2=statement(0.49), ekf2_truth=against_truth(25.0, 1.0))
     finding = only(hidden_errors.detect, analysis(axes=(axis(), hiding(name="down"), ekf2)))
     assert finding.title == (
-        "Position errors that innovations do not show: KF 2.0 times the reported σ, "
-        "EKF2 5.0 times the reported σ"
+        "Position errors that innovations do not show: KF error 2.0 times the reported σ, "
+        "EKF2 error 5.0 times the reported σ"
     )
     assert finding.evidence["filter"] == "ekf2"
     # the main axis is preferred
@@ -892,7 +892,7 @@ def test_positions_too_late_for_ekf2_buffer_are_reported(late_share, is_reported
     one = analysis(ekf2={"record": record, "horizon_s": 0.2})
     findings = list(source_stamps.detect_varying_latency(one))
     assert [finding.severity for finding in findings] == ["error"] * is_reported
-    assert all("later than 0.30 s (here 5 %)" in finding.message for finding in findings)
+    assert all("0.30 s after their timestamp: 5 % in this flight" in finding.message for finding in findings)
 
 
 def test_position_sample_interval_is_found_despite_jitter() -> None:
@@ -931,7 +931,7 @@ def test_scale_and_variance_findings_state_too_large_or_small() -> None:
     for reported, word in ((2.0, "large"), (0.5, "small")):
         finding = only(source_positions.detect_wrong_variance, stating(reported, 1.0))
         assert finding.title == f"The variance that UWB reports is 4 times too {word}"
-        assert ("may include time-correlated errors" in finding.message) is (word == "large")
+        assert ("do not show time-correlated errors" in finding.message) is (word == "large")
 
 
 @pytest.mark.parametrize(("error_m", "expected"), [(1.41, "error"), (1.42, None)])

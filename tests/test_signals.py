@@ -218,7 +218,7 @@ def test_clock_shift_changes_only_timestamps():
     moved = shift_clock(track, -0.1)
     np.testing.assert_allclose(moved.samples.index, track.samples.index - 0.1, atol=1e-12)
     np.testing.assert_array_equal(moved.samples, track.samples)
-    kept = {name: getattr(track, name) for name in ("samples", "invalid", "status")}
+    kept = {name: getattr(track, name) for name in ("samples", "invalid_reasons", "status")}
     assert replace(moved, **kept) == track
 
 

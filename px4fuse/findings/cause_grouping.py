@@ -21,7 +21,7 @@ ACCELEROMETER_CAUSE = "accelerometer"
 # No tested change of a setting corrects the filter
 UNKNOWN_CAUSE = "elsewhere"
 # Key in Finding.evidence: σ of the white position noise ÷ smallest measurement noise of KF and
-# EKF2. The evidence contains the ratio only if the white noise is a fault of its own
+# EKF2. The evidence contains the ratio only if the white noise is a separate fault
 WHITE_TO_ASSUMED_NOISE_RATIO_KEY = "white_over_assumed"
 # Cause of a fault of an aiding source: the sensor of this aiding source also gives KF's positions
 SOURCE_SENSOR_CAUSE = "the source's sensor"
