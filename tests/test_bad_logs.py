@@ -343,14 +343,14 @@ def test_read_log_with_non_finite_parameter_keeps_times_finite(tmp_path, paramet
     ("parameter", "value", "note"),
     [
         ("EKF2_GYR_NOISE", 1e30, "1e+30 rad/s is outside PX4's range 0.0001 to 0.1. "
-         "px4fuse uses the parameter's default 0.015."),
+         "px4fuse uses the parameter default 0.015."),
         ("EKF2_PREDICT_US", -1.0, "-1 µs is outside PX4's range 1000 to 20000. "
-         "px4fuse uses the parameter's default 10000."),
+         "px4fuse uses the parameter default 10000."),
         ("EKF2_EVV_GATE", 0.0, "0 SD is outside PX4's range 1 to 1000. "
-         "px4fuse uses the parameter's default 3."),
+         "px4fuse uses the parameter default 3."),
         ("EKF2_EV_POS_X", 1e30, "1e+30 m is outside PX4's range -100 to 100. "
-         "px4fuse uses the parameter's default 0."),
-        ("EKF2_ACC_NOISE", np.nan, "is not a finite number. px4fuse uses the parameter's default 0.35."),
+         "px4fuse uses the parameter default 0."),
+        ("EKF2_ACC_NOISE", np.nan, "is not a finite number. px4fuse uses the parameter default 0.35."),
         ("SDLOG_PROFILE", np.inf, "is not a finite number. px4fuse ignores SDLOG_PROFILE."),
     ],
 )  # fmt: skip

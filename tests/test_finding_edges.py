@@ -892,7 +892,10 @@ def test_positions_too_late_for_ekf2_buffer_are_reported(late_share, is_reported
     one = analysis(ekf2={"record": record, "horizon_s": 0.2})
     findings = list(source_stamps.detect_varying_latency(one))
     assert [finding.severity for finding in findings] == ["error"] * is_reported
-    assert all("0.30 s after their timestamp: 5 % in this flight" in finding.message for finding in findings)
+    assert all(
+        "0.30 s after their timestamp: 5 % in this flight" in finding.message
+        for finding in findings
+    )
 
 
 def test_position_sample_interval_is_found_despite_jitter() -> None:

@@ -71,9 +71,11 @@ def detect(analysis: Analysis) -> Findings:
 
 def measure_imu_at_rest(flight: Flight) -> pd.Series | None:
     """Return the median angular rate and specific force at rest before take-off, if known."""
-    if not isinstance(flight.imu, pd.DataFrame) or not flight.airborne:
-        return None
-    if isinstance(flight.airborne, Unavailable):
+    if (
+        not isinstance(flight.imu, pd.DataFrame)
+        or isinstance(flight.airborne, Unavailable)
+        or not flight.airborne
+    ):
         return None
     end_s = flight.airborne[0][0] - MOTOR_RUN_UP_DURATION_S
     imu = rows_between(flight.imu, -np.inf, end_s).astype(np.float64)

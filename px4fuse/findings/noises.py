@@ -89,7 +89,7 @@ KEEP_NOISE_BECAUSE_OF_TRUTH_ACTION = (
 # Effect of a noise setting that is too small or too large on KF, and the reason
 EFFECT_AND_REASON_BY_WRONG_SETTING = {
     (SIGMA_Z, "small"): (
-        "KF's estimate follows the noise of the positions",
+        "KF follows the noise of single positions",
         "KF's gain is too large.",
     ),
     (SIGMA_Z, "large"): ("KF follows the positions slowly", "KF's gain is too small."),
@@ -98,7 +98,7 @@ EFFECT_AND_REASON_BY_WRONG_SETTING = {
         "KF's covariance P grows too little between updates, so KF's gain is too small.",
     ),
     (SIGMA_A, "large"): (
-        "KF's estimate follows the noise of the positions",
+        "KF follows the noise of single positions",
         "KF's covariance P grows too much between updates, so KF's gain is too large.",
     ),
 }
@@ -184,9 +184,7 @@ def _make_setting_finding(
             "chosen": setting,
             "most_likely": estimated_noise,
             "factor": setting / estimated_noise,
-            "lag1_autocorrelation": getattr(
-                axis_tuning.before, "lag1_autocorrelation", float("nan")
-            ),
+            "lag1_autocorrelation": getattr(axis_tuning.before, "lag1_autocorrelation", np.nan),
         },
     )
 
@@ -361,7 +359,7 @@ def _make_wrong_sigma_finding(
 
 def _format_action_for_excessive_noise(analysis: Analysis) -> str:
     name = find_aid(analysis).noise
-    parameter_noise_m = analysis.flight.log.parameters.get(name, float("nan"))
+    parameter_noise_m = analysis.flight.log.parameters.get(name, np.nan)
     reported_variance = cut_to_segment(analysis.source.samples, analysis.segment)[
         Columns.POSITION_VARIANCE[0]
     ]
@@ -474,5 +472,5 @@ def find_ekf2_noise_m(result: AxisComparison) -> float:
     """Return EKF2's median measurement noise √R (m) along an axis; NaN if unknown."""
     innovations = result.ekf2_innovations
     if isinstance(innovations, Unavailable):
-        return float("nan")
+        return np.nan
     return float(np.sqrt(innovations["observation_variance_m2"].median()))

@@ -31,9 +31,8 @@ def detect_dropouts(analysis: PreparedComparison) -> Findings:
         longest_dropout_s = max(dropout.duration_s for dropout in dropouts)
         yield warning(
             "logger_dropouts",
-            f"The logger lost {total_s:.2f} s of data in {len(dropouts)} "
-            f"dropout{'s' if len(dropouts) > 1 else ''}. The longest lasted "
-            f"{longest_dropout_s:.2f} s.",
+            f"The logger lost {total_s:.2f} s of data. Number of dropouts: {len(dropouts)}, longest "
+            f"dropout: {longest_dropout_s:.2f} s.",
             "Use a faster SD card, or log fewer topics (SDLOG_PROFILE).",
             {"count": len(dropouts), "total_s": total_s},
             tuple((dropout.start_s, dropout.start_s + dropout.duration_s) for dropout in dropouts),
@@ -70,9 +69,8 @@ def detect_lost_data(flight: Flight) -> Findings:
         )
     for topic, count in list(log.dropped.items())[:1]:
         other_topic_count = len(log.dropped) - 1
-        topics = "topic" if other_topic_count == 1 else "topics"
         other_topics_sentence = (
-            f" {other_topic_count} other {topics} also contain wrong timestamps."
+            f" Other topics with wrong timestamps: {other_topic_count}."
             if other_topic_count
             else ""
         )

@@ -194,11 +194,9 @@ def _make_heading_drift_finding(analysis: Analysis, heading_error: HeadingError)
         magnetometer_advice(analysis.flight),
         analysis.source.orientation is not None,
     )
-    possible_causes = [
-        "a magnetometer indoors" if calibration_advice else "a gyroscope bias",
-        *(["heading drift of the odometry"] if has_yaw else []),
-    ]
-    possible_cause, action = ", or ".join(possible_causes), ""
+    possible_cause = "a magnetometer indoors" if calibration_advice else "a gyroscope bias"
+    possible_cause += ", or heading drift of the odometry" * has_yaw
+    action = ""
     is_yaw_fused = int(analysis.flight.log.parameters.get(EV_POS.switch, 0.0)) & EV_CTRL_YAW_MASK
     if has_yaw and not is_yaw_fused:
         action = "Let EKF2 fuse the yaw of the source (EKF2_EV_CTRL bit 3)."

@@ -320,6 +320,6 @@ def _compute_median_distance_m(position_m: Array, time_s: Array, ekf2_state: pd.
     )
     is_inside = (time_s > state_times_s[0]) & (time_s < state_times_s[-1]) & is_moving
     if np.count_nonzero(is_inside) < WINDOW_SAMPLES:
-        return float("nan")
+        return np.nan
     distance_m = np.linalg.norm(position_m - ekf2_position_spline(time_s), axis=1)
     return float(np.median(distance_m[is_inside]))

@@ -209,7 +209,7 @@ def replace_invalid_parameters(
             notes.append(f"{fault}. px4fuse ignores {name}.")
         else:
             valid_values[name] = defaults[name]
-            notes.append(f"{fault}. px4fuse uses the parameter's default {valid_values[name]:g}.")
+            notes.append(f"{fault}. px4fuse uses the parameter default {valid_values[name]:g}.")
     return valid_values, tuple(notes)
 
 

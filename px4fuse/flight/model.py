@@ -552,7 +552,7 @@ BIAS_NOT_LOGGED = Unavailable(
     "Record a ULog with SDLOG_PROFILE bit 0 (default).",
 )
 HORIZON_NOT_LOGGED = Unavailable(
-    "time of EKF2's fusion horizon",
+    "time of the fusion horizon",
     "the log contains only publication times of the EKF2 state, no fusion times",
     "Record a ULog with PX4 v1.13 or newer.",
 )
@@ -613,9 +613,9 @@ class FusionRecord:
         """Return True if EKF2 stores the position as latitude and longitude (since v1.16)."""
         return not np.isfinite(self.delayed["north_m"]).any()
 
-    def was_flag_set(self, state: str, times_s: Array) -> BoolArray:
+    def was_flag_set(self, flag: str, times_s: Array) -> BoolArray:
         """Return a mask of the times at which a status flag of EKF2 (key of ``states``) was set."""
-        step_function = self.states.get(state)
+        step_function = self.states.get(flag)
         return (
             np.zeros(len(times_s), bool)
             if step_function is None
@@ -813,7 +813,7 @@ def sample_rate(samples: pd.DataFrame) -> float:
     result is NaN for fewer than two samples.
     """
     if len(samples) < 2:
-        return float("nan")
+        return np.nan
     intervals_s = samples.index.to_series().diff().dropna()
     regular_intervals_s = intervals_s[intervals_s <= 3.0 * intervals_s.median()]
     if len(regular_intervals_s) < MIN_REGULAR_INTERVAL_FRACTION * len(intervals_s):
