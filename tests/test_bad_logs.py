@@ -350,7 +350,8 @@ def test_read_log_with_non_finite_parameter_keeps_times_finite(tmp_path, paramet
          "px4fuse uses the parameter default 3."),
         ("EKF2_EV_POS_X", 1e30, "1e+30 m is outside PX4's range -100 to 100. "
          "px4fuse uses the parameter default 0."),
-        ("EKF2_ACC_NOISE", np.nan, "is not a finite number. px4fuse uses the parameter default 0.35."),
+        ("EKF2_ACC_NOISE", np.nan, "is not a finite number. "
+         "px4fuse uses the parameter default 0.35."),
         ("SDLOG_PROFILE", np.inf, "is not a finite number. px4fuse ignores SDLOG_PROFILE."),
     ],
 )  # fmt: skip

@@ -27,11 +27,11 @@ TABLES = [
 # A finding, a page and a command as short as the lists allow
 NEW_FILES = {
     "findings/wind.py": """
-from px4fuse.findings.model import note
+from px4fuse.findings.model import make_note
 
 
 def detect(analysis):
-    yield note("wind", "There was wind.", "Fly indoors.")
+    yield make_note("wind", "There was wind.", "Fly indoors.")
 """,
     "report/wind.py": """
 from px4fuse.report.page import Page

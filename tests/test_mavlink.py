@@ -416,8 +416,10 @@ def test_mavlink_parameter_out_of_range_is_replaced_by_default(read):
     flight = read(recorder)
     notes = [note for note in flight.log.notes if "EKF2_" in note]
     assert notes == [
-        "EKF2_EVP_GATE 0 SD is outside PX4's range 1 to 1000. px4fuse uses the parameter default 5.",
-        "EKF2_EVP_NOISE 1e+30 m is outside PX4's range 0.01 to 1000. px4fuse uses the parameter default 0.1.",
+        "EKF2_EVP_GATE 0 SD is outside PX4's range 1 to 1000. px4fuse uses the parameter default "
+        "5.",
+        "EKF2_EVP_NOISE 1e+30 m is outside PX4's range 0.01 to 1000. px4fuse uses the parameter "
+        "default 0.1.",
     ]
     assert flight.ekf2.gate == 5.0
     assert flight.log.parameters["EKF2_EV_DELAY"] == 300.0

@@ -145,7 +145,8 @@ def test_wrong_noise_report_contains_factor_and_estimated_noise() -> None:
     worse, _ = noises.detect_wrong_settings(analysis(source=MOVING, tuning=fitted))
     assert worse.evidence["factor"] == pytest.approx(10.0)
     assert worse.message == (
-        "SIGMA_A is 10 times too large: KF follows the noise of single positions. SIGMA_A is 1 m/s²; "
+        "SIGMA_A is 10 times too large: KF follows the noise of single positions. SIGMA_A is 1 "
+        "m/s²; "
         "its maximum-likelihood estimate is 0.1 m/s² (95 % 0.09 to 0.11 m/s²). KF's covariance P "
         "grows too much between updates, so KF's gain is too large."
     )

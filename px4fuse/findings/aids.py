@@ -12,7 +12,7 @@ from px4fuse.core.text import format_number, format_ratio
 from px4fuse.ekf2.aids import CHANGE_WINDOW_S, AidResult
 from px4fuse.finding import Finding
 from px4fuse.findings.cause_grouping import CAUSE_KEY, INNOVATION_CHANGE_CAUSE, SOURCE_SENSOR_CAUSE
-from px4fuse.findings.model import Findings, finding, format_percent, note, warning
+from px4fuse.findings.model import Findings, finding, format_percent, make_note, make_warning
 from px4fuse.flight.ekf2_parameters import AIDS, BAROMETER, MAG
 from px4fuse.flight.model import BAD_ACCELERATION_FLAG, Unavailable
 
@@ -163,7 +163,7 @@ def _make_innovation_change_finding(name: str, aid: AidResult) -> Finding:
         innovation_change_by_axis.items(), key=lambda item: abs(item[1][1])
     )
     innovation_sigma = aid.axes[axis].s_sqrt_median
-    return warning(
+    return make_warning(
         "aid_innovation_shift",
         f"{_format_aid_label(aid)}: the mean {axis} innovation shifts by "
         f"{format_number(abs(mean_change) * innovation_sigma, 2)} {aid.unit} at {time_s:.0f} s. "
@@ -184,7 +184,7 @@ def _make_overconfident_finding(name: str, aid: AidResult, sensor_cause: str) ->
     noise_text = ""
     if aid.noise is not None:
         noise_text = f" ({format_number(aid.noise)} {aid.unit}, from {aid.noise_from})"
-    return warning(
+    return make_warning(
         "aid_overconfident",
         f"EKF2 is overconfident about {_format_aid_label(aid)}: σ is "
         f"{format_ratio(aid.nis_mean**0.5)} times too small. The mean NIS is "
@@ -206,7 +206,7 @@ def _make_innovation_bias_finding(name: str, aid: AidResult) -> Finding:
     axis, worst_axis = max(
         aid.axes.items(), key=lambda item: abs(item[1].mean_normalised_innovation)
     )
-    return note(
+    return make_note(
         "aid_innovation_bias",
         f"{_format_aid_label(aid)}: the mean {axis} innovation is "
         f"{format_number(worst_axis.innovation_mean)} {aid.unit}, expected 0 (√S "

@@ -19,8 +19,8 @@ from px4fuse.findings.model import (
     find_spans_with_value,
     finding,
     format_percent,
-    note,
-    warning,
+    make_note,
+    make_warning,
 )
 from px4fuse.flight.model import (
     POSITION_FILE_ORIGIN,
@@ -68,7 +68,7 @@ def detect_unfused_positions(analysis: PreparedComparison) -> Findings:
     }
     if aid is None:
         if source.name == MOTION_CAPTURE_TOPIC and not fused_fraction:
-            yield warning(
+            yield make_warning(
                 "ekf2_not_fusing",
                 f"EKF2 never fused the {positions_text}: EKF2 does not read {source.name}. This "
                 "topic contains ground truth: ATT_POS_MOCAP, or ODOMETRY of estimator type MOCAP.",
@@ -104,7 +104,7 @@ def detect_unfused_positions(analysis: PreparedComparison) -> Findings:
             spans if fused_fraction else (),
         )
     else:
-        yield warning(
+        yield make_warning(
             "ekf2_fusion_interrupted",
             f"{message} For up to {longest_span_s[1] - longest_span_s[0]:.1f} s EKF2 relied on the "
             "IMU and other aiding sources.",
@@ -194,7 +194,7 @@ def _detect_slow_restart(
             restart_delay_spans.append((float(unfused_times_s[0]), end_s))
     if restart_delay_spans:
         longest_delay_s = max(end - start for start, end in restart_delay_spans)
-        yield note(
+        yield make_note(
             "source_rate_at_limit",
             f"After a gap EKF2 resumed fusion {longest_delay_s:.1f} s late: "
             f"{positions_phrase(source)} come at only {rate_hz:.1f} Hz. EKF2 (v1.14 and later) "

@@ -8,7 +8,13 @@ from px4fuse.comparison.flight_events import find_airborne_spans
 from px4fuse.comparison.projection import remove_origin_resets
 from px4fuse.core.record import Span
 from px4fuse.findings.cause_grouping import CAUSE_KEY, SOURCE_GAP_CAUSE, UNKNOWN_CAUSE
-from px4fuse.findings.model import Findings, finding, format_count, make_zero_length_spans, warning
+from px4fuse.findings.model import (
+    Findings,
+    finding,
+    format_count,
+    make_warning,
+    make_zero_length_spans,
+)
 from px4fuse.flight.model import Ekf2, Reset
 
 # Time (s) after take-off in which a height reset of EKF2 is normal
@@ -53,7 +59,7 @@ def detect(analysis: Analysis) -> Findings:
         largest_reset_time_s = reported_resets[int(np.argmax(sizes_m))].time_s
         _, reset_statement = remove_origin_resets(ekf2, analysis.source, analysis.segment)
         if reset_statement:
-            reset_statement = f" In the comparison of KF with EKF2: {reset_statement}."
+            reset_statement = f" Treatment in the comparison: {reset_statement}."
         yield finding(
             "warning" if horizontal_resets else "note",
             "ekf2_resets",
@@ -77,7 +83,7 @@ def detect_instance_switches(ekf2: Ekf2, span_s: Span) -> Findings:
     """Detect changes of the primary EKF2 instance in a time span (s)."""
     switch_times_s = [time for time, _ in ekf2.primary_instances if span_s[0] < time <= span_s[1]]
     if switch_times_s:
-        yield warning(
+        yield make_warning(
             "ekf2_instance_switch",
             f"The primary EKF2 instance changed {format_count(len(switch_times_s))}, first at "
             f"{switch_times_s[0]:.1f} s. The comparison uses the primary instance at each time.",

@@ -12,10 +12,10 @@ from px4fuse.filter.signals import Segment, cut_to_segment
 from px4fuse.findings.model import (
     Findings,
     compute_flag_fraction,
-    error,
     find_spans_with_value,
     format_percent,
     magnetometer_advice,
+    make_error,
 )
 from px4fuse.flight.ekf2_parameters import BAROMETER, EV_CTRL_YAW_MASK, EV_POS, MAG
 from px4fuse.flight.model import (
@@ -122,7 +122,7 @@ def _detect_bias_at_limit(
                     f"instead of {constants.g:.2f}. Its bias along the down axis is "
                     f"{constants.g - force_m_s2:+.2f} m/s²."
                 )
-        yield error(
+        yield make_error(
             "ekf2_bias_at_limit",
             message + (_describe_height_error(analysis, ekf2) if axis_index == 2 else ""),
             f"Calibrate the {sensor}s at the temperature of the flight.",
@@ -155,7 +155,7 @@ def _detect_gyro_bias(bias_states: pd.DataFrame, median_imu_at_rest: pd.Series |
     if differences_rad_s[axis_index] < MIN_GYRO_BIAS_RAD_S:
         return
     direction = ("forward", "right", "down (vertical)")[axis_index]
-    yield error(
+    yield make_error(
         "gyroscope_bias",
         f"The gyroscope measures {measured_biases_rad_s[axis_index]:+.2f} rad/s about {direction} "
         f"at rest. EKF2 estimates only {estimated_biases_rad_s[axis_index]:+.3f} rad/s of this "
@@ -203,7 +203,7 @@ def detect_missing_alignment(
             until_text = (
                 f" until {alignment_end_s:.1f} s" if alignment_end_s < segment.end_s else ""
             )
-            yield error(
+            yield make_error(
                 "ekf2_not_aligned",
                 f"EKF2 has not aligned its {quantity}{until_text}. cs_{flag} is 0 for "
                 f"{format_percent(unaligned_fraction)} of the flight. EKF2 fuses no position "

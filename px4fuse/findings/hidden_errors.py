@@ -26,7 +26,14 @@ from px4fuse.filter.tuning import HORIZONTAL, AxisTuning
 from px4fuse.finding import Finding
 from px4fuse.findings.cause_grouping import CAUSE_KEY
 from px4fuse.findings.cause_text import classify_cause, format_action, rerun_refutes_cause
-from px4fuse.findings.model import Findings, error, find_source_texts, finding, format_percent, note
+from px4fuse.findings.model import (
+    Findings,
+    find_source_texts,
+    finding,
+    format_percent,
+    make_error,
+    make_note,
+)
 from px4fuse.flight.model import Unavailable, source_name
 from px4fuse.loop.model import Loop
 from px4fuse.trajectory.alignment import fit_alignment
@@ -211,7 +218,7 @@ def _make_drift_finding(
         )
     noise_parameter = "" if analysis.source.origin.aid is None else analysis.source.origin.aid.noise
     noise_setting_names = " or ".join(filter(None, ("SIGMA_Z", noise_parameter)))
-    return error(
+    return make_error(
         "source_drift",
         f"{sensor_name} drifts: {drift_text}. {rmse_sentence}The innovations of "
         f"{' and '.join(filter_labels)} do not show the drift, because the estimates follow "
@@ -288,4 +295,4 @@ def make_possible_drift_finding(analysis: Analysis) -> Finding:
         "Measure the drift from the loop closure error (px4fuse loop LOG) or with ground truth "
         "(ATT_POS_MOCAP). If the source is motion capture, run again with --source-kind mocap."
     )
-    return note("source_may_drift", message, action, evidence)
+    return make_note("source_may_drift", message, action, evidence)

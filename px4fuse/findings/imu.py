@@ -11,7 +11,7 @@ from px4fuse.filter.hypotheses import MIN_BIAS_M_S2, SystematicErrors
 from px4fuse.filter.signals import Segment, cut_to_segment, find_imu_gaps
 from px4fuse.finding import MIN_SPAN_S
 from px4fuse.findings.missing import DEFAULT_SDLOG_PROFILE, VISION_PROFILE_MASK
-from px4fuse.findings.model import Findings, error, finding, format_percent, warning
+from px4fuse.findings.model import Findings, finding, format_percent, make_error, make_warning
 from px4fuse.flight.model import Columns, Ekf2, Flight, sample_rate
 
 # Maximum specific force (m/s²) of real sensors: 35 g, because the largest range is 32 g
@@ -58,7 +58,7 @@ def detect_impossible_acceleration(analysis: Analysis) -> Findings:
     time_s = samples.index[force_m_s2 > MAX_PLAUSIBLE_SPECIFIC_FORCE_M_S2].to_numpy()
     if len(time_s) < MIN_IMPLAUSIBLE_FORCE_SAMPLES:
         return
-    yield error(
+    yield make_error(
         "imu_values_impossible",
         f"The accelerometer values are impossible: up to {np.nanmax(force_m_s2):,.0f} m/s², "
         f"first at {time_s[0]:.1f} s. Sensors of autopilots measure at most 32 g (314 m/s²). The "
@@ -112,7 +112,7 @@ def detect_accelerometer_bias(analysis: Analysis) -> Findings:
             )
         )
         if bias_m_s2 >= MIN_BIAS_M_S2:
-            yield warning(
+            yield make_warning(
                 "accelerometer_bias",
                 f"EKF2 estimates an accelerometer bias of {bias_m_s2:.2f} m/s². Its components are "
                 f"{ekf2_bias_m_s2[0]:+.2f} forward, {ekf2_bias_m_s2[1]:+.2f} right and "
@@ -135,10 +135,10 @@ def detect_tumbling(analysis: Analysis) -> Findings:
     """Detect roll or pitch beyond the limits of PX4's failure detector."""
     if spans := analysis.segment.cut(analysis.flight.excessive_tilt_spans_s):
         end_s = max(spans[0][0] - 1.0, 0.0)
-        yield error(
+        yield make_error(
             "attitude_failure",
-            f"Roll or pitch exceeded PX4's failure-detector limits at {spans[0][0]:.1f} s. Later "
-            "data do not represent normal flight. The limits are FD_FAIL_R and FD_FAIL_P.",
+            f"Roll or pitch exceeded PX4's failure-detector limits (FD_FAIL_R, FD_FAIL_P) at "
+            f"{spans[0][0]:.1f} s. Later data do not represent normal flight.",
             f"Analyse only the time before the attitude failure (--end {end_s:.1f}).",
             {"total_s": sum(end - start for start, end in spans)},
             spans,
@@ -157,7 +157,7 @@ def detect_clipping(analysis: Analysis) -> Findings:
         clipping_times_by_burst_s = np.split(
             time_s, np.flatnonzero(np.diff(time_s) > MIN_TIME_BETWEEN_CLIPPINGS_S) + 1
         )
-        yield warning(
+        yield make_warning(
             "accelerometer_clipping",
             f"The accelerometer was clipped for {clipped_duration_s:.2f} s ({len(time_s)} "
             "samples). The log lacks motion beyond the sensor range. Height and vertical velocity "
@@ -182,7 +182,7 @@ def detect_imu_gaps(analysis: Analysis) -> Findings:
             action = "Record on a link without message loss. "
         elif log.dropouts:
             action = "Use a faster SD card. "
-        yield warning(
+        yield make_warning(
             "imu_gap",
             f"{missing_data} samples are missing for {gap_s:.2f} s. In this gap KF increases "
             "SIGMA_A to the standard deviation of the measured acceleration.",
@@ -208,7 +208,7 @@ def detect_missing_imu_samples(analysis: Analysis) -> Findings:
             "Use a faster SD card, or log fewer topics: set SDLOG_PROFILE to "
             f"{sdlog_profile ^ other_topics}."
         )
-    yield warning(
+    yield make_warning(
         "imu_samples_missing",
         f"{format_percent(lost_fraction)} of the IMU samples are missing from the log. KF "
         "increases Q in these gaps. EKF2 cannot be replayed, so the effect of changed parameters "
@@ -256,7 +256,7 @@ def detect_low_rates(flight: Flight) -> Findings:
                     "(MAV_CMD_SET_MESSAGE_INTERVAL)"
                     f"{', or give the ULog of the flight' if log.writes_ulog else ''}."
                 )
-            yield warning(
+            yield make_warning(
                 "imu_rate_too_low",
                 f"The {label} was logged at {rate_hz:.1f} Hz, but {required_rate_hz:g} Hz are "
                 "needed. Motion between samples is lost, and vibration is aliased.",

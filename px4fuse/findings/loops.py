@@ -2,7 +2,7 @@
 
 from px4fuse.analysis import Analysis
 from px4fuse.finding import Finding
-from px4fuse.findings.model import Findings, error, note, warning
+from px4fuse.findings.model import Findings, make_error, make_note, make_warning
 from px4fuse.loop.model import LANDING_CLOSURE_SOURCE, Closure, Loop
 from px4fuse.trajectory.graph.covariance import GATE_ALPHA
 
@@ -36,7 +36,7 @@ def detect_inconsistent_closures(loop: Loop) -> Findings:
         robust_weights
     )
     if are_most_closures_rejected:
-        yield warning(
+        yield make_warning(
             "loop_drift_too_small",
             f"Robust optimisation rejects {rejected_count} of {len(robust_weights)} loop closures. "
             "The stated odometry drift is probably too small.",
@@ -47,7 +47,7 @@ def detect_inconsistent_closures(loop: Loop) -> Findings:
         if not closure.accepted:
             yield _make_false_closure_finding(closure, loop.is_end_assumed)
         elif robust_weight < MIN_GNC_WEIGHT and not are_most_closures_rejected:
-            yield warning(
+            yield make_warning(
                 "loop_closure_inconsistent",
                 f"{closure!s} contradicts the other loop closures, so robust optimisation rejects "
                 "it. Odometry drift alone could explain the closure error.",
@@ -60,7 +60,7 @@ def detect_wrong_loop_assumptions(loop: Loop) -> Findings:
     closure_error_m = loop.closure_error_m
     evidence = {} if closure_error_m is None else {"closure_error_m": closure_error_m}
     if loop.is_absolute_track:
-        yield warning(
+        yield make_warning(
             "loop_on_absolute_positions",
             "This track consists of absolute positions, which do not drift. The loop closure error "
             "is only position noise, so a correction makes the path worse.",
@@ -68,7 +68,7 @@ def detect_wrong_loop_assumptions(loop: Loop) -> Findings:
             evidence,
         )
     if evidence and loop.is_end_assumed:
-        yield note(
+        yield make_note(
             "loop_landing_assumed",
             "The landing place is unknown, so px4fuse assumes the take-off place. If the vehicle "
             "landed elsewhere, the loop closure error contains the distance between both places.",
@@ -89,7 +89,7 @@ def _make_false_closure_finding(closure: Closure, is_end_assumed: bool) -> Findi
             "If the vehicle landed elsewhere, state the place (--landed-at FORWARD,RIGHT) or "
             "ignore the landing (--open)."
         )
-    return error(
+    return make_error(
         "false_loop_closure",
         f"False loop closure: {closure_text}. The closure error of {closure.distance_m:.2f} m is "
         "larger than the stated odometry drift explains (squared Mahalanobis distance "

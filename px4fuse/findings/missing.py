@@ -3,7 +3,7 @@
 from px4fuse.analysis import Analysis
 from px4fuse.comparison.model import PreparedComparison
 from px4fuse.core.text import capitalise_first
-from px4fuse.findings.model import Findings, warning
+from px4fuse.findings.model import Findings, make_warning
 from px4fuse.flight.model import AS_RECEIVED_ORIGIN, Unavailable, positions_phrase
 
 VISION_TOPIC = "vehicle_visual_odometry"
@@ -22,9 +22,9 @@ def detect_unavailable_data(analysis: Analysis) -> Findings:
     if isinstance(ekf2, Unavailable):
         reason = capitalise_first(ekf2.reason)
         message = f"The log contains no EKF2 state. {reason}. The report contains KF only."
-        yield warning("ekf2_not_logged", message, ekf2.remedy)
+        yield make_warning("ekf2_not_logged", message, ekf2.remedy)
     if isinstance(acceleration, Unavailable):
-        yield warning(
+        yield make_warning(
             "acceleration_not_logged",
             "The acceleration is missing, so KF assumes constant velocity. Missing "
             f"{acceleration.what}: {acceleration.reason}.",
@@ -33,7 +33,7 @@ def detect_unavailable_data(analysis: Analysis) -> Findings:
     for result in analysis.axes.values():
         kf_summary = result.filters["kf"]
         if isinstance(kf_summary, Unavailable):
-            yield warning(
+            yield make_warning(
                 "too_few_innovations",
                 f"The consistency of KF is not tested: {kf_summary.reason}.",
                 kf_summary.remedy,
@@ -58,7 +58,7 @@ def detect_source_not_logged(analysis: PreparedComparison) -> Findings:
         for missing_data in analysis.missing
         if missing_data.source == VISION_TOPIC
     )
-    yield warning(
+    yield make_warning(
         "source_not_logged",
         f"The log lacks the {positions_phrase(source)} as PX4 received them. Reason: "
         f"{next(reasons, f'{VISION_TOPIC} is not in this log')}. px4fuse uses {source.name} "

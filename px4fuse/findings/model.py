@@ -132,7 +132,7 @@ def finding(
     return Finding(name, severity, message, remedy, evidence, title, spans_s=spans_s)
 
 
-error, warning, note = (partial(finding, severity) for severity in SEVERITIES)
+make_error, make_warning, make_note = (partial(finding, severity) for severity in SEVERITIES)
 
 
 def split_cause_groups(findings: Iterable[Finding]) -> list[list[Finding]]:

@@ -37,7 +37,7 @@ from px4fuse.findings.cause_text import (
     rerun_refutes_cause,
 )
 from px4fuse.findings.hidden_errors import find_hidden_errors
-from px4fuse.findings.model import Findings, error, finding, lower_severity
+from px4fuse.findings.model import Findings, finding, lower_severity, make_error
 from px4fuse.findings.source_positions import has_little_motion
 from px4fuse.flight.ekf2_parameters import BAROMETER, EV_POS, GNSS_POS, PARAMETERS
 from px4fuse.flight.model import Columns, Unavailable, sample_rate
@@ -257,7 +257,7 @@ def detect_process_noise_near_zero(analysis: Analysis) -> Findings:
                 f"{format_estimate(SIGMA_A, sigma_a_m_s2, axis_tuning.sigma_a_two_state)}. "
             )
             action = format_setting_action(analysis, SIGMA_A, estimated_sigma_a)
-        yield error(
+        yield make_error(
             "process_noise_near_zero",
             f"{title}: KF ignores new positions. {estimate_text}KF's position gain decreases to "
             f"{steady_position_gain:.2g}, so KF needs {time_constant_s:.0f} s to follow a position "

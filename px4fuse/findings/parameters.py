@@ -10,7 +10,7 @@ from px4fuse.comparison.comparison import compute_position_errors
 from px4fuse.comparison.remedy import find_aid
 from px4fuse.core.text import format_metres, format_ratio
 from px4fuse.filter.consistency import assess_innovations
-from px4fuse.findings.model import Findings, note, warning
+from px4fuse.findings.model import Findings, make_note, make_warning
 from px4fuse.flight.ekf2_parameters import AID_MASK_PARAMETER, PARAMETERS
 from px4fuse.flight.model import Ekf2, Unavailable
 
@@ -40,7 +40,7 @@ def detect(analysis: Analysis) -> Findings:
         and segment.start_s < change.time_s < segment.end_s
     ]
     span_edges_s = [segment.start_s, *(change.time_s for change in changes), segment.end_s]
-    for change_index, (time_s, name, before, after) in enumerate(changes):
+    for change_index, (time_s, name, value_before, value_after) in enumerate(changes):
         consistency_before, consistency_after = (
             _compute_span_consistency(analysis, *span_edges_s[span_index : span_index + 2])
             for span_index in (change_index, change_index + 1)
@@ -73,12 +73,12 @@ def detect(analysis: Analysis) -> Findings:
         )
         if name in fusion_parameters:
             action = f"Do not change {name} in flight. {action}"
-        yield (warning if has_effect else note)(
+        yield (make_warning if has_effect else make_note)(
             "parameter_changed",
-            f"{name} changed from {before:g} to {after:g}{unit} at {time_s:.1f} "
+            f"{name} changed from {value_before:g} to {value_after:g}{unit} at {time_s:.1f} "
             f"s.{effect_sentences}",
             action,
-            {"parameter": name, "before": before, "after": after, "at_s": time_s},
+            {"parameter": name, "before": value_before, "after": value_after, "at_s": time_s},
             ((time_s, time_s),),
         )
 

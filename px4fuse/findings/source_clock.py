@@ -8,7 +8,7 @@ from px4fuse.comparison.model import FilterName, PreparedComparison
 from px4fuse.comparison.trials import Trial
 from px4fuse.filter.time_offset import ClockOffset
 from px4fuse.findings.cause_text import format_timestamp_action
-from px4fuse.findings.model import Findings, error, finding, warning
+from px4fuse.findings.model import Findings, finding, make_error, make_warning
 from px4fuse.findings.source_positions import find_low_pass
 from px4fuse.findings.source_stamps import find_timesync_convergence
 from px4fuse.flight.ekf2_parameters import GNSS_POS, RECEIVER_DELAY_PARAMETERS
@@ -45,7 +45,7 @@ def detect_time_offset(analysis: Analysis, time_offset: ClockOffset) -> Findings
     }
     if time_offset.has_changed() and time_offset.change_p_value is not None:
         start_offset_s, end_offset_s = time_offset.parts[0].offset_s, time_offset.parts[-1].offset_s
-        yield error(
+        yield make_error(
             "source_time_offset_changes",
             f"The time offset of the positions changes in flight from {start_offset_s:+.2f} s to "
             f"{end_offset_s:+.2f} s (significance test: p {time_offset.change_p_value:.1g}). No "
@@ -171,7 +171,7 @@ def detect_wrong_delay(analysis: Analysis, time_offset: ClockOffset) -> Findings
     else:
         delay_text = f"the positions are {abs_delay_ms} ms late"
     limit_text = remedy.describe_delay_limit("EKF2_EV_DELAY", estimated_delay_ms, delay_ms)
-    yield warning(
+    yield make_warning(
         "ekf2_ev_delay_wrong",
         f"EKF2_EV_DELAY is {delay_ms:g} ms, but {delay_text}. The 95 % interval is "
         f"{interval_low_ms} to {interval_high_ms} ms. EKF2 fuses each position at the wrong time, "
@@ -192,7 +192,7 @@ def detect_wrong_gnss_delay(analysis: Analysis) -> Findings:
     if estimate is None:
         return
     delay_ms, (estimated_delay_ms, sigma_ms) = ekf2_model.inputs.settings[GNSS_POS.delay], estimate
-    yield warning(
+    yield make_warning(
         "ekf2_gps_delay_wrong",
         f"{GNSS_POS.delay} is {delay_ms:g} ms, but GNSS positions and velocities are "
         f"{estimated_delay_ms:.0f} ms late (± {1.96 * sigma_ms:.0f} ms, 95 %, compared with "

@@ -25,7 +25,7 @@ from px4fuse.convention.texts import (
 )
 from px4fuse.finding import Finding
 from px4fuse.findings.cause_grouping import RESET_TIME_KEY, WRONG_CONVENTION_KEY
-from px4fuse.findings.model import FINDING_CATALOGUE, Findings, error, warning
+from px4fuse.findings.model import FINDING_CATALOGUE, Findings, make_error, make_warning
 from px4fuse.flight.model import PositionTrack, positions_phrase, source_name
 
 # Groups of findings that are valid even if all positions are wrong
@@ -51,7 +51,7 @@ def detect(analysis: Comparison) -> Findings:
         }
         if kind == "rotation":
             evidence["misalignment_deg"] = faults.rotation_deg
-        make_finding = warning if kind in ("copied", "ambiguous") else error
+        make_finding = make_warning if kind in ("copied", "ambiguous") else make_error
         yield make_finding(name, message, action, evidence)
 
 

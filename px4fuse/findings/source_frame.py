@@ -16,8 +16,8 @@ from px4fuse.findings.model import (
     compute_flag_fraction,
     finding,
     magnetometer_advice,
-    note,
-    warning,
+    make_note,
+    make_warning,
 )
 from px4fuse.flight.ekf2_parameters import EV_CTRL_YAW_MASK, EV_POS
 from px4fuse.flight.model import (
@@ -78,8 +78,8 @@ def make_frd_positions_finding(analysis: Analysis) -> Finding:
         )
     has_yaw = analysis.source.orientation is not None
     if fusion_sentence:
-        return note("source_frame_frd", f"{fault} {fusion_sentence}", action)
-    return warning(
+        return make_note("source_frame_frd", f"{fault} {fusion_sentence}", action)
+    return make_warning(
         "source_frame_frd",
         f"{fault} EKF2 did not fuse the yaw of {sensor_name}, so EKF2's axes are NED. The axes of "
         "positions and EKF2 may differ.",

@@ -19,8 +19,8 @@ from px4fuse.findings.model import (
     find_source_texts,
     finding,
     format_percent,
-    note,
-    warning,
+    make_note,
+    make_warning,
 )
 from px4fuse.flight.ekf2_parameters import AIDS, EV_POS, Aid
 from px4fuse.flight.model import (
@@ -80,7 +80,7 @@ def detect_source_gaps(analysis: Analysis) -> Findings:
     positions_text = positions_phrase(source)
     if gap_spans_only_in_log:
         start_s, end_s, gap_count_text = _find_longest_gap(gap_spans_only_in_log)
-        yield warning(
+        yield make_warning(
             "source_gap_in_log",
             f"{positions_text} are missing in the log for {end_s - start_s:.1f} s{gap_count_text}, "
             "but EKF2 fused them. The source did not stop; KF has no measurement in this time.",
@@ -90,7 +90,7 @@ def detect_source_gaps(analysis: Analysis) -> Findings:
         )
     if gap_spans:
         start_s, end_s, gap_count_text = _find_longest_gap(gap_spans)
-        yield warning(
+        yield make_warning(
             "source_gap",
             f"No position for {end_s - start_s:.1f} s{gap_count_text}. "
             f"{describe_errors_after_gap(analysis, (start_s, end_s))}",
@@ -256,7 +256,7 @@ def detect_lost_samples(analysis: Analysis) -> Findings:
         action = "Record on the companion computer or on a link without message loss."
         if analysis.flight.log.writes_ulog:
             action += " Or set SDLOG_PROFILE to 129: the ULog then contains the received positions."
-        yield note(
+        yield make_note(
             "source_samples_lost",
             f"The recording lacks {format_percent(lost_count / sent_count)} of the "
             f"{positions_phrase(source)}. {lost_count} of {sent_count} positions are missing (one "

@@ -15,7 +15,14 @@ from px4fuse.filter.consistency import CONSISTENT_SIGMA_RATIOS
 from px4fuse.filter.correlated_noise import TimeCorrelatedNoise
 from px4fuse.filter.signals import cut_to_segment
 from px4fuse.findings.cause_grouping import WHITE_TO_ASSUMED_NOISE_RATIO_KEY
-from px4fuse.findings.model import Findings, error, find_source_texts, format_percent, note, warning
+from px4fuse.findings.model import (
+    Findings,
+    find_source_texts,
+    format_percent,
+    make_error,
+    make_note,
+    make_warning,
+)
 from px4fuse.findings.noises import MAX_RATIO_OF_EQUAL_NOISES, find_ekf2_noise_m
 from px4fuse.findings.source_positions import (
     MIN_LOW_PASS_TO_CORRELATED_NOISE_NATS,
@@ -89,7 +96,9 @@ def detect_time_correlated_noise(analysis: Analysis) -> Findings:
     ):
         evidence[WHITE_TO_ASSUMED_NOISE_RATIO_KEY] = white_noise_to_setting_ratio
     # Time-correlated errors are normal for GNSS: if they are within the reported σ, they are a note
-    make_finding = note if is_gnss and not _has_error_above_reported_sigma(analysis) else warning
+    make_finding = (
+        make_note if is_gnss and not _has_error_above_reported_sigma(analysis) else make_warning
+    )
     yield make_finding(
         "source_noise_time_correlated",
         f"Time-correlated {name} error of {noise.slow_m:.2g} m, correlation time "
@@ -128,7 +137,9 @@ def detect_repeated_positions(analysis: Analysis) -> Findings:
     )
     if repeated_count < MIN_REPEATED_POSITION_COUNT or repeated_fraction < MIN_REPEATED_FRACTION:
         return
-    make_finding = error if repeated_fraction >= MIN_REPEATED_FRACTION_FOR_ERROR else warning
+    make_finding = (
+        make_error if repeated_fraction >= MIN_REPEATED_FRACTION_FOR_ERROR else make_warning
+    )
     yield make_finding(
         "source_samples_repeated",
         f"{repeated_count} of {len(is_repeated)} {positions_phrase(analysis.source)} repeat the "
@@ -159,7 +170,7 @@ def detect_unequal_noise(analysis: Analysis) -> Findings:
         or larger_noise_lower_bound_m <= smaller_noise_upper_bound_m
     ):
         return
-    yield warning(
+    yield make_warning(
         "source_noise_unequal_axes",
         f"{source_name(analysis.source)} noise is {larger_noise_m:.2g} m along "
         f"{larger_noise_axis} and {smaller_noise_m:.2g} m along {smaller_noise_axis}. One SIGMA_Z, "
@@ -184,7 +195,7 @@ def detect_noise_variation(analysis: Analysis) -> Findings:
     ):
         return
     noise_ratio, start_s, end_s = noisy_part.sigma_ratio, noisy_part.start_s, noisy_part.end_s
-    yield (error if noise_ratio >= MIN_NOISY_PART_SIGMA_RATIO_FOR_ERROR else warning)(
+    yield (make_error if noise_ratio >= MIN_NOISY_PART_SIGMA_RATIO_FOR_ERROR else make_warning)(
         "source_noise_varies",
         f"{source_name(analysis.source)} noise is {noise_ratio:.1f} times larger from "
         f"{start_s:.0f} to {end_s:.0f} s. Most samples in this time are noisier, so single "

@@ -22,11 +22,11 @@ from px4fuse.core.text import format_metres, format_ratio
 from px4fuse.filter.time_offset import ClockOffset
 from px4fuse.findings.model import (
     Findings,
-    error,
     find_source_texts,
     finding,
     format_percent,
-    warning,
+    make_error,
+    make_warning,
 )
 from px4fuse.findings.source_positions import (
     MIN_SCALE_ERROR_FOR_SEVERITY_ERROR,
@@ -65,7 +65,7 @@ def detect(analysis: Analysis) -> Findings:
 def detect_jitter_and_speed_noise(analysis: Analysis, local_residuals: LocalResiduals) -> Findings:
     jitter_s, clock_map = find_timestamp_jitter(local_residuals), analysis.source.clock_map
     if jitter_s is not None and (clock_map is None or clock_map.distinct_stamps is None):
-        yield (error if jitter_s >= MIN_JITTER_FOR_ERROR_S else warning)(
+        yield (make_error if jitter_s >= MIN_JITTER_FOR_ERROR_S else make_warning)(
             "source_timestamp_jitter",
             f"The timestamps of the {positions_phrase(analysis.source)} jitter by "
             f"{1e3 * jitter_s:.0f} ms (1 σ). The positions are measured at a constant interval, "
@@ -77,7 +77,7 @@ def detect_jitter_and_speed_noise(analysis: Analysis, local_residuals: LocalResi
         )
     speed_noise = find_speed_noise(local_residuals)
     if speed_noise is not None:
-        yield error(
+        yield make_error(
             "source_noise_grows_with_speed",
             f"{source_name(analysis.source)} noise grows with speed: "
             f"{format_metres(speed_noise.slow_m)} m at {speed_noise.slow_m_s:.1f} m/s and "
@@ -94,7 +94,9 @@ def detect_periodic_errors_and_offset_changes(analysis: Analysis, error_fit: Err
     periodic_error = find_periodic_error(error_fit)
     positions_text = positions_phrase(analysis.source)
     if periodic_error is not None:
-        yield (error if periodic_error.amplitude_m >= MIN_AMPLITUDE_FOR_ERROR_M else warning)(
+        yield (
+            make_error if periodic_error.amplitude_m >= MIN_AMPLITUDE_FOR_ERROR_M else make_warning
+        )(
             "source_error_periodic",
             f"The error of the {positions_text} is periodic: amplitude "
             f"{format_metres(periodic_error.amplitude_m)} m, period {periodic_error.period_s:.1f} "
@@ -102,8 +104,7 @@ def detect_periodic_errors_and_offset_changes(analysis: Analysis, error_fit: Err
             "slow errors against ground truth. KF and EKF2 follow this error, so innovations "
             "hardly show it.",
             f"{find_source_texts(analysis.source).slow_error_check}. Look for a process with this "
-            "period, such as a rotating part or a control loop. No noise setting corrects this "
-            "error.",
+            "period, such as a rotating part or a control loop.",
             periodic_error._asdict(),
         )
         return
@@ -111,7 +112,7 @@ def detect_periodic_errors_and_offset_changes(analysis: Analysis, error_fit: Err
     if isinstance(clock, ClockOffset) and clock.has_changed():
         return  # source_clock.py reports a change of the time offset
     if offset_change is not None:
-        yield error(
+        yield make_error(
             "source_time_offset_changes",
             f"The time offset of the {positions_text} varies in flight by "
             f"{offset_change.most_s - offset_change.least_s:.2f} s. Its deviation from the "
@@ -147,7 +148,7 @@ def detect_attitude_delay(analysis: Analysis) -> Findings:
         return
     delay_s = find_attitude_delay(imu, attitude)
     if delay_s is not None:
-        yield warning(
+        yield make_warning(
             "attitude_late",
             f"The logged attitude is {abs(delay_s):.2f} s {'late' if delay_s > 0.0 else 'early'} "
             "relative to the gyroscopes. KF rotates the acceleration by this attitude, so the "

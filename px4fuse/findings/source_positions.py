@@ -33,14 +33,14 @@ from px4fuse.findings.cause_grouping import (
 from px4fuse.findings.imu import MIN_IMU_RATE_HZ, is_rate_too_low
 from px4fuse.findings.model import (
     Findings,
-    error,
     find_source_texts,
     finding,
     format_count,
     format_percent,
+    make_error,
+    make_note,
+    make_warning,
     make_zero_length_spans,
-    note,
-    warning,
 )
 from px4fuse.findings.source_stamps import detect_arrival_timestamps
 from px4fuse.flight.ekf2_parameters import EV_POS
@@ -184,7 +184,7 @@ def _has_valid_time_offset(analysis: Analysis) -> bool:
 def detect_low_pass(analysis: Analysis) -> Findings:
     low_pass = find_low_pass(analysis)
     if low_pass is not None:
-        make_finding = error if low_pass.lag_s >= MIN_LAG_FOR_ERROR_S else warning
+        make_finding = make_error if low_pass.lag_s >= MIN_LAG_FOR_ERROR_S else make_warning
         yield make_finding(
             "source_low_pass_filtered",
             f"{positions_phrase(analysis.source)} are low-pass filtered and lag by "
@@ -270,18 +270,18 @@ def detect_constant_coordinates(analysis: Analysis) -> Findings:
     finding_id, mask_of_constant, make_finding = (
         "source_coordinate_constant",
         EV_CTRL_HORIZONTAL_MASK,
-        error,
+        make_error,
     )
     consequence = "px4fuse estimates nothing from these positions."
     if coordinates == ["z"]:
         finding_id, mask_of_constant, make_finding = (
             "source_height_constant",
             EV_CTRL_HEIGHT_MASK,
-            warning,
+            make_warning,
         )
         consequence = "The height is not a measurement, so it is not evaluated."
     elif coordinates == ["x", "y"]:
-        make_finding = warning
+        make_finding = make_warning
         consequence = "Only the height is a measurement. The horizontal position is not evaluated."
     action, coordinates_text = "", " and ".join(coordinates)
     if fusion_parameter in analysis.flight.log.parameters:
@@ -292,7 +292,7 @@ def detect_constant_coordinates(analysis: Analysis) -> Findings:
             new_value = fusion_parameter_value & ~mask_of_constant | mask_of_measured
             setting_action = f"Set {fusion_parameter} to {new_value}"
         elif coordinates == ["z"]:
-            make_finding = note
+            make_finding = make_note
         action = f"{setting_action}, so that EKF2 does not fuse {coordinates_text}. "
     values_text = ", ".join(f"{values_m[each]:g}" for each in coordinates)
     yield make_finding(
@@ -351,7 +351,7 @@ def detect_repeated_jumps(analysis: Analysis) -> Findings:
             f"{np.median(jump_sizes_m):.2f} m apart."
         )
         action = "Send the position of the same point of the vehicle, for example of one tag."
-    yield error(
+    yield make_error(
         "source_relocalises",
         f"The source jumps {len(jumps)} times, by up to {jump_sizes_m.max():.2f} m. The "
         f"jumps are at {jump_times_text} s, about every {np.median(np.diff(times_s)):.0f} s. "
@@ -641,7 +641,7 @@ def detect_little_motion(analysis: Analysis) -> Findings:
     """Detect too little motion to estimate velocity, heading and time offset."""
     extent_m = compute_motion_range_m(analysis)
     if has_little_motion(analysis):
-        yield warning(
+        yield make_warning(
             "no_motion",
             f"The vehicle moved only {extent_m:.2f} m horizontally. This is the range of the "
             "positions (5th to 95th percentile). Velocity, heading and time offset cannot be "

@@ -14,10 +14,10 @@ from px4fuse.ekf2.intervals import MAX_LATENESS_S
 from px4fuse.findings.model import (
     Findings,
     compute_flag_fraction,
-    error,
     format_percent,
-    note,
-    warning,
+    make_error,
+    make_note,
+    make_warning,
 )
 from px4fuse.flight.ekf2_parameters import EV_POS
 from px4fuse.flight.model import (
@@ -80,7 +80,7 @@ def detect(analysis: Analysis) -> Findings:
             kf_times_sentence = (
                 "KF uses arrival times like EKF2. Both tracks lag by the latency of the positions."
             )
-        yield warning(
+        yield make_warning(
             "companion_not_synchronised",
             f"The source of the {positions_text} never synchronised its clock (TIMESYNC). EKF2 "
             f"used arrival times as times of measurement. {kf_times_sentence}",
@@ -102,7 +102,7 @@ def detect_bursts(analysis: Analysis) -> Findings:
         or burst_duration_s > MAX_BURST_TO_PAUSE_DURATION_RATIO * pause_s
     ):
         return
-    yield error(
+    yield make_error(
         "source_timestamp_jitter",
         f"The timestamps of the {positions_phrase(analysis.source)} come in bursts of "
         f"{burst_size:.0f}, every {pause_s:.2g} s "
@@ -120,7 +120,7 @@ def detect_repeated_timestamps(
 ) -> Findings:
     resolution_s = float(np.median(np.diff(analysis.source.samples.index)))
     rate_hz = sample_count / (distinct_count * resolution_s)
-    yield error(
+    yield make_error(
         "source_timestamps_shared",
         f"The timestamps of the {positions_phrase(analysis.source)} have a resolution of "
         f"{resolution_s:.3g} s. The {sample_count} samples ({rate_hz:.2g} Hz) have only "
@@ -144,7 +144,7 @@ def detect_timestamp_unit(analysis: Analysis, clock_name: str) -> Findings:
             "EKF2 never fused the positions: with these timestamps, the positions are "
             f"{AGE_TEXT_BY_WRONG_TIMESTAMP[clock_name]} for EKF2. "
         )
-    yield error(
+    yield make_error(
         "source_timestamp_unit",
         f"The timestamps of the {positions_phrase(analysis.source)} are "
         f"{'0 in every message' if clock_name == '0' else f'in {clock_name}'}. PX4 expects "
@@ -158,7 +158,7 @@ def detect_timestamp_unit(analysis: Analysis, clock_name: str) -> Findings:
 def detect_constant_timestamps(
     positions_text: str, clock_map: ClockMap, distinct_count: int
 ) -> Findings:
-    yield error(
+    yield make_error(
         "source_timestamps_constant",
         f"Distinct timestamps of {clock_map.pairs} {positions_text}: only {distinct_count}. The "
         "time of measurement is unknown; px4fuse uses the receive time instead.",
@@ -167,7 +167,7 @@ def detect_constant_timestamps(
         {"stamps": clock_map.pairs, "distinct": distinct_count},
     )
     if (jitter_s := clock_map.jitter_s) > MAX_RECEIPT_JITTER_S:
-        yield warning(
+        yield make_warning(
             "source_timestamp_jitter",
             f"The receive times of the {positions_text} jitter by {jitter_s * 1e3:.0f} ms (1 σ). "
             "px4fuse uses them as timestamps. At 1 m/s this is a position error of "
@@ -190,12 +190,12 @@ def detect_arrival_timestamps(analysis: Analysis) -> Findings:
     timesync_convergence = find_timesync_convergence(analysis)
     if timesync_convergence is not None:
         convergence_time_s, latency_s = timesync_convergence
-        make_finding = error if latency_s >= MIN_LATENCY_FOR_ERROR_S else warning
+        make_finding = make_error if latency_s >= MIN_LATENCY_FOR_ERROR_S else make_warning
         airborne = analysis.flight.airborne
         if not isinstance(airborne, Unavailable) and all(
             start >= convergence_time_s for start, _ in airborne
         ):
-            make_finding = note
+            make_finding = make_note
         yield make_finding(
             "source_timestamps_are_arrival_times",
             f"Position timestamps are arrival times until {convergence_time_s:.1f} s, when "
@@ -211,7 +211,7 @@ def detect_arrival_timestamps(analysis: Analysis) -> Findings:
         np.mean(position_age_s.abs() < MAX_ARRIVAL_TO_PUBLICATION_DELAY_S)
         >= MIN_FRACTION_OF_TIMESTAMP_KIND
     ):
-        yield warning(
+        yield make_warning(
             "source_timestamps_are_arrival_times",
             "Position timestamps are arrival times in the whole flight. The source was never "
             "synchronised with the autopilot (TIMESYNC), so every position is late by its latency.",
@@ -255,7 +255,7 @@ def detect_varying_latency(analysis: Analysis) -> Findings:
             return
         change_verb = "varies"
         start_s, end_s = position_age_s.quantile([0.05, 0.95]).tolist()
-    yield (error if dropped_fraction > MIN_DROPPED_POSITION_FRACTION else warning)(
+    yield (make_error if dropped_fraction > MIN_DROPPED_POSITION_FRACTION else make_warning)(
         "source_latency_varies",
         f"The latency of the {positions_phrase(analysis.source)} {change_verb} in flight from "
         f"{start_s:.2f} s to {end_s:.2f} s (time from measurement to arrival).{late_drop_sentence}",

@@ -16,7 +16,7 @@ from px4fuse.core.text import format_metres
 from px4fuse.ekf2.model import replay_with_settings
 from px4fuse.ekf2.replay import rows_inside
 from px4fuse.filter.signals import cut_to_segment
-from px4fuse.findings.model import Findings, error, find_source_texts, note, warning
+from px4fuse.findings.model import Findings, find_source_texts, make_error, make_note, make_warning
 from px4fuse.findings.source_intervals import describe_errors_after_gap
 from px4fuse.flight.model import Columns, Ekf2, Truth, Unavailable, positions_phrase, source_name
 from px4fuse.readers.px4_positions import NO_FIX_ACTION
@@ -113,9 +113,9 @@ def detect_invalid_rows(analysis: Analysis) -> Findings:
         times_text = f"{len(spans)} time spans between {spans[0][0]:.1f} s and {spans[-1][1]:.1f} s"
         if len(spans) <= 3:
             times_text = " and ".join(f"{start:.1f} s to {end:.1f} s" for start, end in spans)
-        error_text, make_finding = "", note if reason == "NaN" else warning
+        error_text, make_finding = "", make_note if reason == "NaN" else make_warning
         if duration_s > compute_max_interval_s(1.0 / source.compute_rate_hz()):
-            make_finding = warning
+            make_finding = make_warning
             valid_times_s = _find_valid_times_around(analysis, longest_span_s)
             error_text = f" {describe_errors_after_gap(analysis, valid_times_s)}"
         yield make_finding(
@@ -152,7 +152,7 @@ def detect_rounding(analysis: Analysis) -> Findings:
             " At the sender, subtract a local origin in double precision (64 bit) before the "
             "conversion to 32-bit float."
         )
-    yield warning(
+    yield make_warning(
         "source_positions_rounded",
         f"{positions_phrase(source)} are rounded to steps of {step_m:.3g} m.{cause_text} The "
         "rounding "
@@ -187,7 +187,7 @@ def detect_lever_arm(analysis: Analysis) -> Findings:
     if source.alignment is not None:  # no EKF2 parameter corrects positions of a file
         sensor_text = "sensor"
         action = "Subtract this lever arm, rotated to NED by the attitude, from the positions."
-    yield warning(
+    yield make_warning(
         "source_lever_arm",
         f"The {sensor_text} is mounted {np.hypot(lever_arm_forward_m, lever_arm_right_m):.2f} m "
         "from the "
@@ -256,7 +256,7 @@ def detect_two_senders(analysis: Analysis) -> Findings:
         f"{abs(part):.2f} m {name.partition('_')[0]}"
         for part, name in zip(median_deviation_m, samples.columns, strict=True)
     )
-    yield error(
+    yield make_error(
         "source_two_senders",
         f"Two systems alternately send positions that differ by {distance_m:.2f} m. Without the "
         f"motion of the vehicle, successive {positions_phrase(analysis.source)} ({rate_hz:.3g} Hz "
@@ -294,7 +294,7 @@ def detect_copied_estimate(analysis: Analysis) -> Findings:
     orientation = convention.orientation if convention else None
     is_copied = orientation and orientation.verdict == "copied"
     copied_quantity = "position and attitude" if is_copied else "position"
-    yield error(
+    yield make_error(
         "source_is_ekf2_estimate",
         f"{source_name(source)} sends EKF2's own {copied_quantity} back. The positions equal those "
         f"that EKF2 estimated {1e3 * TESTED_COPY_DELAYS_S[best_index]:.0f} ms before (median "

@@ -657,8 +657,8 @@ class ParameterChange(NamedTuple):
 
     time_s: float
     name: str
-    before: float
-    after: float
+    value_before: float
+    value_after: float
 
 
 @dataclass(frozen=True)
