@@ -449,7 +449,8 @@ def test_positions_missing_for_part_of_flight_are_reported_first(
     first, *_ = found(compare_prepared(prepare_comparison(read_flight(request), request)))
     # EKF2 fused its own source besides the file
     assert (first.id, first.severity) == (finding, "warning" if file else "error")
-    assert f"in flight at {at_s} s: EKF2's position error is " in first.title
+    assert f"in flight at {at_s} s, " in first.title
+    assert "position error at the end of this time is " in first.message
     assert first.evidence["error_m"] == pytest.approx(error_m, rel=0.05)
     assert ("dead reckoning" in first.message) == (file is None)
 
