@@ -52,7 +52,7 @@ from px4fuse.findings import (  # noqa: E402
     find_loop_findings,
     source_frame,
 )
-from px4fuse.findings.cause_grouping import EFFECTS_BY_CAUSE, effect_ids  # noqa: E402
+from px4fuse.findings.cause_grouping import EFFECTS_BY_CAUSE, find_effect_ids  # noqa: E402
 from px4fuse.findings.model import FINDING_CATALOGUE, FINDING_GROUPS, load_examples  # noqa: E402
 from px4fuse.flight.model import Columns  # noqa: E402
 from px4fuse.report.panels import INNOVATIONS_PANEL, POSITION_PANEL, POSITION_SIGMA_PANEL  # noqa: E402
@@ -80,8 +80,9 @@ IDS_WITH_RECORDED_EXAMPLE = {
     "source_height_constant",
     "source_relocalises",
 }
-LABEL_LENGTH = 26  # characters per line of an axis label
-# By finding id: --mistake options and KF settings with which a simulated flight shows the finding
+MAX_LABEL_LINE_LENGTH = 26  # maximum number of characters in a line of an axis label
+# For each finding id: faults (option --mistake of px4fuse simulate) and KF settings that cause the
+# finding
 FAULTS_AND_SETTINGS_BY_ID: Mapping[str, tuple[tuple[str, ...], Mapping[str, float]]] = {
     "accelerometer_bias": (("accel-bias",), {}),
     "ekf2_ev_delay_wrong": (("ekf2-delay=250ms",), {}),
@@ -106,8 +107,8 @@ FAULTS_AND_SETTINGS_BY_ID: Mapping[str, tuple[tuple[str, ...], Mapping[str, floa
 
 
 @dataclass(frozen=True)
-class FindingExample:
-    """Example of a finding: the finding, a description of the flight, and the analysis to plot."""
+class ExampleFlight:
+    """Flight with a finding: finding, description of the flight, and its analysis for plots."""
 
     finding: Finding
     flight: str
@@ -115,7 +116,10 @@ class FindingExample:
 
 
 def simulate_late_timestamps() -> list[Finding]:
-    """Simulate a late attitude and a growing latency of the positions; return their findings."""
+    """Simulate attitude timestamps that are 0.2 s late, and positions that arrive later and later.
+
+    Return the findings on both faults.
+    """
     flight = simulate_flight(Scenario(passes=4, seed=2))
     age_s = pd.Series(np.linspace(0.03, 0.2, 100), index=np.linspace(5.0, 60.0, 100))
     record = replace(flight.ekf2.record, vision_age_s=age_s)
@@ -128,13 +132,13 @@ def simulate_late_timestamps() -> list[Finding]:
     return [finding for finding in find(unexplained(compare(flight))) if finding.id in faults]
 
 
-def collect_examples() -> dict[str, FindingExample]:
+def collect_examples() -> dict[str, ExampleFlight]:
     """Return an example of each finding, by finding id."""
-    example_by_id: dict[str, FindingExample] = {}
+    example_by_id: dict[str, ExampleFlight] = {}
 
     def add_examples(findings: Any, flight: str, analysis: Analysis | None = None) -> None:
         for finding in findings:
-            example_by_id.setdefault(finding.id, FindingExample(finding, flight, analysis))
+            example_by_id.setdefault(finding.id, ExampleFlight(finding, flight, analysis))
 
     for name, (faults, settings) in FAULTS_AND_SETTINGS_BY_ID.items():
         flight = simulate_flight(Scenario(passes=4, seed=2), parse_faults(faults))
@@ -195,10 +199,10 @@ def collect_examples() -> dict[str, FindingExample]:
     flight = aisle_flight(duration_s=60.0)
     log_with_outage = aid_log(enabled=steps((0.0, 1.0)))
     log_with_outage = replace(log_with_outage, samples=outage_free(log_with_outage, 20.0, 41.0))
-    changed_log = aid_log()
-    changed_log.samples.loc[35.0:, "innovation_east"] -= 0.7
+    log_with_innovation_change = aid_log()
+    log_with_innovation_change.samples.loc[35.0:, "innovation_east"] -= 0.7
     aids = {"gnss_pos": log_with_outage, "baro_hgt": aid_log(sigma=1.5), "mag": aid_log(mean=-0.4),
-            "mag_heading": changed_log}  # fmt: skip
+            "mag_heading": log_with_innovation_change}  # fmt: skip
     aid_results = evaluate_aids(replace(flight, ekf2=replace(flight.ekf2, aids=aids)))
     add_examples(find_aid_findings(aid_results), "simulated innovations of the aiding sources")
     add_examples(simulate_late_timestamps(), "a simulated flight with changed timestamps")
@@ -222,8 +226,8 @@ def find_detector_modules() -> dict[str, str]:
         for node in ast.walk(tree):
             if isinstance(node, ast.Constant) and node.value in FINDING_TITLES:
                 module_by_id.setdefault(str(node.value), path.stem)
-    # These modules form finding ids from a filter or parameter name and a suffix
-    module_by_generated_id = {
+    # Modules whose finding ids are no literals, because they are composed of a name and a suffix
+    module_by_composed_id = {
         name: stem
         for name in FINDING_TITLES
         for stem, prefixes in {
@@ -232,7 +236,7 @@ def find_detector_modules() -> dict[str, str]:
         }.items()
         if name.startswith(prefixes)
     }
-    return module_by_id | module_by_generated_id
+    return module_by_id | module_by_composed_id
 
 
 def is_numeric_literal(expression: ast.expr) -> bool:
@@ -277,18 +281,18 @@ def format_rate_rows(name: str) -> Iterator[str]:
         )
 
 
-def format_page(name: str, example: FindingExample | None, folder: Path) -> Iterator[str]:
+def format_page(name: str, example: ExampleFlight | None, folder: Path) -> Iterator[str]:
     """Yield the Markdown paragraphs of the page on a finding."""
     entry = FINDING_CATALOGUE[name]
     yield f"# {entry.title}\n\n`{name}` ({entry.group})\n"
     yield f"## What it means\n\n{entry.meaning}\n"
-    causes = [cause for cause in EFFECTS_BY_CAUSE if name in effect_ids(cause)]
-    effects = effect_ids(name)
+    causes = [cause for cause in EFFECTS_BY_CAUSE if name in find_effect_ids(cause)]
+    effects = find_effect_ids(name)
     if causes:
         yield "The finding can be a consequence of: " + format_finding_links(causes) + ".\n"
     if effects:
         yield "Possible consequences of the finding: " + format_finding_links(effects) + ".\n"
-    if entry.role == "recording":
+    if entry.report_class == "recording":
         yield "This finding is about the recording. It is listed before findings about noises.\n"
     if example is not None:
         finding = example.finding
@@ -298,14 +302,14 @@ def format_page(name: str, example: FindingExample | None, folder: Path) -> Iter
             file = save_picture(name, example, folder)
             yield f"![Position, innovations and σ of the example flight]({file})\n"
         yield f"## What to do\n\n> {finding.remedy}\n"
-    rate_rows = list(format_rate_rows(name))
-    if rate_rows:
+    error_rate_rows = list(format_rate_rows(name))
+    if error_rate_rows:
         yield "## False alarms and detection\n"
         yield "The rates were measured on simulated flights. In flights with the fault `none`,"
         yield "each finding is a false alarm.\n"
         yield "| fault | kind of flight | number of flights | rate of the finding | 95 % interval |"
         yield "|---|---|---|---|---|"
-        yield "\n".join(rate_rows) + "\n"
+        yield "\n".join(error_rate_rows) + "\n"
     module_name = find_detector_modules()[name]
     rows = list(format_threshold_rows(module_name))
     if rows:
@@ -321,21 +325,30 @@ def format_finding_links(names: Iterable[str]) -> str:
     return ", ".join(f"[{FINDING_TITLES[name]}]({name}.md)" for name in dict.fromkeys(names))
 
 
-def collect_examples_and_rates(simulated_by_id: Mapping[str, FindingExample]) -> dict[str, Any]:
-    """Return message, action and error rates of each finding, which ``px4fuse explain`` prints."""
-    table, recorded_by_id, contents = read_detection_rates(), load_examples(), {}
+def collect_finding_examples_and_rates(
+    simulated_example_by_id: Mapping[str, ExampleFlight],
+) -> dict[str, Any]:
+    """Return an example message, its action, and the error rates of each finding.
+
+    ``px4fuse explain`` prints them. Error rates: false alarms, and detection of each fault.
+    """
+    table, recorded_example_by_id, contents = read_detection_rates(), load_examples(), {}
     for name in FINDING_TITLES:
         rows = table[table["finding"] == name]
         fault_free_rows = rows[rows["condition"] == "none"]
-        example = simulated_by_id[name].finding if name in simulated_by_id else recorded_by_id[name]
+        example = (
+            simulated_example_by_id[name].finding
+            if name in simulated_example_by_id
+            else recorded_example_by_id[name]
+        )
         contents[name] = {
             "message": example.message,
             "remedy": example.remedy,
-            "clean_flights": int(fault_free_rows["flights"].sum()),
-            "false_alarms": round(
+            "fault_free_flight_count": int(fault_free_rows["flights"].sum()),
+            "false_alarm_count": round(
                 float((fault_free_rows["flights"] * fault_free_rows["rate"]).sum())
             ),
-            "detection": {
+            "detection_rate_by_fault": {
                 row.condition: row.rate for row in rows[rows["condition"] != "none"].itertuples()
             },
         }
@@ -344,12 +357,14 @@ def collect_examples_and_rates(simulated_by_id: Mapping[str, FindingExample]) ->
 
 def write_examples() -> None:
     """Write the examples for ``px4fuse explain`` to ``examples.json``."""
-    text = json.dumps(collect_examples_and_rates(collect_examples()), ensure_ascii=False, indent=1)
+    text = json.dumps(
+        collect_finding_examples_and_rates(collect_examples()), ensure_ascii=False, indent=1
+    )
     EXAMPLES_PATH.write_text(f"{text}\n", encoding="utf-8")
 
 
-def save_picture(name: str, example: FindingExample, folder: Path) -> str:
-    """Plot position, innovations and σ along the axis of an example; return the file name."""
+def save_picture(name: str, example: ExampleFlight, folder: Path) -> str:
+    """Plot position, innovations and σ of an example along one axis; return the file name."""
     axis = example.finding.evidence.get("axis")
     assert example.analysis is not None
     axis_analysis = example.analysis.axes.get(str(axis)) or example.analysis.main
@@ -357,7 +372,7 @@ def save_picture(name: str, example: FindingExample, folder: Path) -> str:
     drawn_panels = (POSITION_PANEL, INNOVATIONS_PANEL, POSITION_SIGMA_PANEL)
     for axes, panel in zip(axes_list, drawn_panels, strict=True):
         panel.draw(axes, axis_analysis.with_whole_flight_tracks())
-        axes.set_ylabel(fill(panel.title, LABEL_LENGTH))
+        axes.set_ylabel(fill(panel.title, MAX_LABEL_LINE_LENGTH))
     axes_list[0].set_title(axis_analysis.axis.name)
     axes_list[-1].set_xlabel("time (s)")
     figure.savefig(folder / f"{name}.png", dpi=70)

@@ -54,7 +54,7 @@ from px4fuse.filter.signals import AISLE
 from px4fuse.filter.time_offset import ClockOffset
 from px4fuse.filter.tuning import HORIZONTAL
 from px4fuse.findings import find, find_aid_findings
-from px4fuse.findings.cause_grouping import CONVENTION_KEY
+from px4fuse.findings.cause_grouping import WRONG_CONVENTION_KEY
 from px4fuse.flight.ekf2_parameters import check_parameters
 from px4fuse.flight.model import DIAGNOSIS_WITHHELD, Flight, Unavailable
 from px4fuse.loop.model import Loop
@@ -124,7 +124,7 @@ def _refine_clock_offset(flight: Flight, analysis: Analysis) -> Flight | None:
         or alignment.reference != "EKF2 position"
         or not isinstance(clock_offset, ClockOffset)
         or all(finding.id != "source_time_offset" for finding in analysis.findings)
-        or any(CONVENTION_KEY in finding.evidence for finding in analysis.findings)
+        or any(WRONG_CONVENTION_KEY in finding.evidence for finding in analysis.findings)
     ):
         return None
     delay_text = (

@@ -22,8 +22,8 @@ from px4fuse.filter.tuning import HORIZONTAL, AxisTuning, NoiseEstimate
 from px4fuse.findings import Finding
 from px4fuse.flight.ekf2_parameters import PARAMETERS
 from px4fuse.flight.model import (
+    AS_RECEIVED_ORIGIN,
     NO_INVALID_ROWS,
-    RECEIVED_ORIGIN,
     Columns,
     Ekf2,
     FusionRecord,
@@ -34,7 +34,7 @@ T = TypeVar("T")
 
 NONE = Unavailable("it", "no topic for it", "Log it.")
 SEGMENT = Segment(10.0, 110.0, "")
-DRIFTING = replace(RECEIVED_ORIGIN, kind="vio")
+DRIFTING = replace(AS_RECEIVED_ORIGIN, kind="vio")
 # Settings that differ from the defaults
 CHOSEN = Settings(sigma_a_m_s2=1.0, sigma_z_m=1.0)
 
@@ -72,7 +72,7 @@ class StandIn:
 def log(**parts: Any) -> Any:
     usual = {
         "parameters": {}, "notes": (), "format": "ULog", "writes_ulog": True, "autopilot": "PX4",
-        "default_of": lambda name: PARAMETERS[name].default,
+        "find_default_value": lambda name: PARAMETERS[name].default,
         "dropouts": (), "damage": (), "ends_in_flight": False, "duration_s": 60.0, "bytes": 0,
         "bytes_read": 0, "restarts": None, "receive_time_reversals": None, "dropped": {},
     }  # fmt: skip
@@ -88,11 +88,11 @@ def moving(rate_hz: float) -> pd.DataFrame:
 
 def source(**parts: Any) -> Any:
     usual = {
-        "name": "uwb", "description": "UWB", "origin": RECEIVED_ORIGIN, "orientation": None,
+        "name": "uwb", "description": "UWB", "origin": AS_RECEIVED_ORIGIN, "orientation": None,
         "frame": "NED",
         "clock_map": None, "alignment": None, "rate_hz": 5.0, "assumed_delay_s": 0.0,
         "samples": moving(parts.get("rate_hz", 5.0)), "status": pd.DataFrame(), "velocity": None,
-        "invalid": NO_INVALID_ROWS,
+        "invalid_reasons": NO_INVALID_ROWS,
     }  # fmt: skip
     made = {**usual, **parts}
     rate_hz = made.pop("rate_hz")

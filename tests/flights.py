@@ -28,8 +28,8 @@ from px4fuse.ekf2.aids import evaluate_aids
 from px4fuse.filter.signals import Axis, Segment, project_acceleration
 from px4fuse.filter.tuning import HORIZONTAL, tune
 from px4fuse.flight.model import (
+    AS_RECEIVED_ORIGIN,
     AXIS_NAMES,
-    RECEIVED_ORIGIN,
     Alignment,
     Columns,
     Dropout,
@@ -72,7 +72,7 @@ class Uwb:
     outlier_share: float = 0.0
     outlier_m: float = 3.0
     name: str = "vehicle_visual_odometry"
-    origin: SourceOrigin = RECEIVED_ORIGIN
+    origin: SourceOrigin = AS_RECEIVED_ORIGIN
     frame: str = "NED"
 
 
@@ -94,7 +94,7 @@ class Estimator:
     fusing: tuple[tuple[float, float], ...] | None = ((0.0, 1.0),)
     fusing_yaw: float = 1.0
     resets: tuple[Reset, ...] = ()
-    instances: tuple[tuple[float, int], ...] = ((-np.inf, 0),)
+    primary_instances: tuple[tuple[float, int], ...] = ((-np.inf, 0),)
     variance_logged: bool = True
     innovations_logged: bool = True
     noise_logged: bool = True
@@ -119,7 +119,7 @@ def aisle_flight(
     dropouts: tuple[Dropout, ...] = (),
     notes: tuple[str, ...] = (),
     damage: tuple[str, ...] = (),
-    tumble_spans: tuple[Span, ...] = (),
+    excessive_tilt_spans_s: tuple[Span, ...] = (),
 ) -> Flight:
     """Simulate a flight along the aisle; None omits a part of the log."""
     rng = np.random.default_rng(seed)
@@ -180,7 +180,7 @@ def aisle_flight(
         if truth
         else unavailable("ground truth"),
         airborne=((0.0, duration_s),),
-        tumble_spans=tumble_spans,
+        excessive_tilt_spans_s=excessive_tilt_spans_s,
     )
 
 
@@ -271,7 +271,7 @@ def _ekf2(
             ["horizontal", "vertical", "yaw"],
         ),
         resets=made.resets,
-        instances=made.instances,
+        primary_instances=made.primary_instances,
         gate=5.0,
     )
 

@@ -20,7 +20,7 @@ from px4fuse.errors import MissingDataError
 from px4fuse.findings import aids as aids_detector
 from px4fuse.findings import ekf2_state, find_aid_findings
 from px4fuse.findings.aids import detect_aid_faults
-from px4fuse.findings.cause_grouping import CAUSE_KEY, INNOVATION_SHIFT_CAUSE, SOURCE_SENSOR_CAUSE
+from px4fuse.findings.cause_grouping import CAUSE_KEY, INNOVATION_CHANGE_CAUSE, SOURCE_SENSOR_CAUSE
 from px4fuse.flight.ekf2_parameters import AIDS
 from px4fuse.flight.model import AidLog, Ekf2, Flight, Unavailable
 from px4fuse.readers import read_log
@@ -249,7 +249,7 @@ def test_shift_of_mean_innovation_is_reported_with_its_time() -> None:
     assert starved.evidence[CAUSE_KEY] == SOURCE_SENSOR_CAUSE
     assert (
         next(detect_aid_faults({"mag": rejected}, "gnss_pos")).evidence[CAUSE_KEY]
-        == INNOVATION_SHIFT_CAUSE
+        == INNOVATION_CHANGE_CAUSE
     )
     little = log.samples.copy()
     little.loc[35.0:, "innovation_east"] -= 0.2
@@ -320,14 +320,16 @@ def test_compare_of_log_without_take_off_raises_an_error(tmp_path: Path) -> None
 
 def aids_only(**ekf2: Any) -> Any:
     """Make a flight without positions."""
-    usual = {"instances": ((0.5, 0),), "states": {}, "fusion_flags": NONE}
+    usual = {"primary_instances": ((0.5, 0),), "states": {}, "fusion_flags": NONE}
     return SimpleNamespace(
         ekf2=made(Ekf2, **{**usual, **ekf2}), airborne=((5.0, 50.0),), log=log(), missing=()
     )
 
 
 def test_aiding_source_report_lists_ekf2_instance_changes() -> None:
-    (finding,) = find_aid_findings({}, aids_only(instances=((0.5, 0), (12.0, 1), (13.5, 0))))
+    (finding,) = find_aid_findings(
+        {}, aids_only(primary_instances=((0.5, 0), (12.0, 1), (13.5, 0)))
+    )
     assert (finding.id, finding.evidence["count"]) == ("ekf2_instance_switch", 2)
     assert not find_aid_findings({}, aids_only())
 

@@ -23,7 +23,7 @@ from px4fuse.diagnose import diagnose_or_check_aids
 from px4fuse.errors import LogError, Px4FuseError
 from px4fuse.filter.signals import make_axes
 from px4fuse.flight.model import Flight, Unavailable
-from px4fuse.info.inventory import take_inventory
+from px4fuse.info.inventory import list_log_contents
 from px4fuse.readers import ULOG_MAGIC, read_log
 from px4fuse.request import ComparisonRequest
 from px4fuse.results.build import make_compare_results
@@ -135,7 +135,7 @@ def test_read_log_without_known_topics_reports_no_data(tmp_path):
     assert flight.streams == {}
     assert flight.log.duration_s == pytest.approx(1.9)
     assert any("battery_status" in note for note in flight.log.notes)
-    inventory = take_inventory(flight)
+    inventory = list_log_contents(flight)
     assert all(row.unavailable for row in inventory.sources)
     assert not any(ability.possible for ability in inventory.abilities)
     with pytest.raises(Px4FuseError, match=r"no external position .* SDLOG_PROFILE to 129"):
@@ -343,15 +343,16 @@ def test_read_log_with_non_finite_parameter_keeps_times_finite(tmp_path, paramet
     ("parameter", "value", "note"),
     [
         ("EKF2_GYR_NOISE", 1e30, "1e+30 rad/s is outside PX4's range 0.0001 to 0.1. "
-         "px4fuse uses the default 0.015."),
+         "px4fuse uses the parameter default 0.015."),
         ("EKF2_PREDICT_US", -1.0, "-1 µs is outside PX4's range 1000 to 20000. "
-         "px4fuse uses the default 10000."),
+         "px4fuse uses the parameter default 10000."),
         ("EKF2_EVV_GATE", 0.0, "0 SD is outside PX4's range 1 to 1000. "
-         "px4fuse uses the default 3."),
+         "px4fuse uses the parameter default 3."),
         ("EKF2_EV_POS_X", 1e30, "1e+30 m is outside PX4's range -100 to 100. "
-         "px4fuse uses the default 0."),
-        ("EKF2_ACC_NOISE", np.nan, "is not a finite number. px4fuse uses the default 0.35."),
-        ("SDLOG_PROFILE", np.inf, "is not a finite number. px4fuse ignores this parameter."),
+         "px4fuse uses the parameter default 0."),
+        ("EKF2_ACC_NOISE", np.nan, "is not a finite number. "
+         "px4fuse uses the parameter default 0.35."),
+        ("SDLOG_PROFILE", np.inf, "is not a finite number. px4fuse ignores SDLOG_PROFILE."),
     ],
 )  # fmt: skip
 def test_px4_parameter_out_of_range_is_replaced_by_default(tmp_path, parameter, value, note):
@@ -442,7 +443,7 @@ def test_info_command_shows_no_rate_for_a_single_sample(tmp_path):
     name = "estimator_aid_src_ev_hgt"
     log.topics = [take(one, [50]) if one.name == name else one for one in log.topics]
     flight = write_and_read(log, tmp_path)
-    aids = next(one for one in take_inventory(flight).abilities if one.name == "aids")
+    aids = next(one for one in list_log_contents(flight).abilities if one.name == "aids")
     assert "external vision, height 1 sample" in aids.reason
     assert "nan" not in aids.reason
 

@@ -19,7 +19,7 @@ from px4fuse.diagnose import analyse_comparison
 from px4fuse.errors import LogError
 from px4fuse.filter.settings import Settings
 from px4fuse.findings import Finding
-from px4fuse.flight.model import RECEIVED_ORIGIN
+from px4fuse.flight.model import AS_RECEIVED_ORIGIN
 from px4fuse.readers import read_log
 from px4fuse.report.card_text import format_card_lines
 from px4fuse.request import ComparisonRequest
@@ -60,7 +60,7 @@ def trial(
 
 
 def analysis(*trials: Trial) -> Any:
-    source = SimpleNamespace(origin=RECEIVED_ORIGIN, alignment=None)
+    source = SimpleNamespace(origin=AS_RECEIVED_ORIGIN, alignment=None)
     model = SimpleNamespace(inputs=SimpleNamespace(settings={"EKF2_ACC_NOISE": 0.35}))
     return SimpleNamespace(
         select_main_trials=lambda: trials,

@@ -9,9 +9,9 @@ from px4fuse.analysis import Analysis
 from px4fuse.findings import FINDING_TITLES, Finding
 from px4fuse.findings.cause_grouping import (
     EFFECTS_BY_CAUSE,
-    GAP_CAUSE,
+    SOURCE_GAP_CAUSE,
     UNKNOWN_CAUSE,
-    effect_ids,
+    find_effect_ids,
     group_by_cause,
 )
 from px4fuse.flight.model import Unavailable
@@ -23,14 +23,14 @@ def one(name: str, severity: str = "warning", **evidence: str) -> Finding:
 
 
 def test_fault_table_contains_only_existing_fault_names() -> None:
-    listed = {name for cause in EFFECTS_BY_CAUSE for name in effect_ids(cause)}
+    listed = {name for cause in EFFECTS_BY_CAUSE for name in find_effect_ids(cause)}
     assert listed | set(EFFECTS_BY_CAUSE) <= set(FINDING_TITLES)
 
 
 def test_consequences_toml_lists_effect_before_its_cause() -> None:
     outer = list(EFFECTS_BY_CAUSE)
     for at, cause in enumerate(outer):
-        assert set(effect_ids(cause)) & set(outer) <= set(outer[:at]), cause
+        assert set(find_effect_ids(cause)) & set(outer) <= set(outer[:at]), cause
 
 
 UNDERSTATED, REJECTING = "ekf2_overconfident", "ekf2_rejects_positions"
@@ -61,7 +61,7 @@ UNDERSTATED, REJECTING = "ekf2_overconfident", "ekf2_rejects_positions"
           ("source_scale_error", "warning", "source_noise_varies")]),
         # resets follow the gap if all of them are at its end, else the rejections
         ([one("source_outliers", "error"), one(REJECTING), one("source_gap"),
-          one("ekf2_resets", cause=GAP_CAUSE)],
+          one("ekf2_resets", cause=SOURCE_GAP_CAUSE)],
          [("source_outliers", "error", None), (REJECTING, "warning", "source_outliers"),
           ("source_gap", "warning", None), ("ekf2_resets", "warning", "source_gap")]),
         ([one("source_outliers", "error"), one(REJECTING), one("ekf2_resets", cause=UNKNOWN_CAUSE)],

@@ -48,7 +48,7 @@ from px4fuse.filter.likelihood import compute_profile_interval
 from px4fuse.filter.signals import Segment
 from px4fuse.filter.time_offset import MAX_CHANGE_P_VALUE, ClockOffset, PartOffset
 from px4fuse.flight.model import (
-    ALIGNED_ORIGIN,
+    ALIGNED_BY_EKF2_ORIGIN,
     GNSS_ORIGIN,
     KEPT_BY_EKF2_ORIGIN,
     MOTION_CAPTURE_ORIGIN,
@@ -459,7 +459,7 @@ def stated(
         (POSITION_FILE_ORIGIN, False),
         (MOTION_CAPTURE_ORIGIN, False),
         (GNSS_ORIGIN, False),
-        (ALIGNED_ORIGIN, True),
+        (ALIGNED_BY_EKF2_ORIGIN, True),
         (KEPT_BY_EKF2_ORIGIN, True),
     ],
 )

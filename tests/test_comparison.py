@@ -133,7 +133,7 @@ def test_position_source_of_kind_vio_is_treated_as_drifting(sample_flight: Fligh
         assert (origin.kind, origin.may_drift, origin.is_gnss) == (kind, drifts, slow)
         # EKF2 still fused it as external vision, with the same numbers
         assert origin.is_vision
-        assert not origin.fused_as_gnss
+        assert not origin.is_fused_as_gnss
         assert said.horizontal == plain.horizontal
 
 

@@ -23,11 +23,11 @@ from px4fuse.diagnose import prepare_comparison, refine_delay
 from px4fuse.filter.time_offset import ClockOffset
 from px4fuse.finding import Finding
 from px4fuse.findings import source_convention
-from px4fuse.findings.cause_grouping import CONVENTION_KEY
+from px4fuse.findings.cause_grouping import WRONG_CONVENTION_KEY
 from px4fuse.findings.model import finding
 from px4fuse.flight.model import (
+    AS_RECEIVED_ORIGIN,
     GNSS_ORIGIN,
-    RECEIVED_ORIGIN,
     Columns,
     Flight,
     PositionTrack,
@@ -103,7 +103,7 @@ def sent(
     stamps = time + late_s + clock_drift * (time - time.mean())
     samples = pd.DataFrame(position, pd.Index(stamps, name="time_s"), Columns.POSITION)
     samples = samples.reindex(columns=Columns.POSITION + Columns.POSITION_VARIANCE)
-    return PositionTrack("made", RECEIVED_ORIGIN, "", samples, "NED", "", ())
+    return PositionTrack("made", AS_RECEIVED_ORIGIN, "", samples, "NED", "", ())
 
 
 def reclassify_as_vio(track: PositionTrack, quaternion: np.ndarray, time: np.ndarray):
@@ -282,7 +282,7 @@ AMBIGUOUS = Convention(
 @pytest.mark.parametrize(("name", "kind"), CONVENTION_FAULTS)
 def test_wrong_axes_unit_or_clock_is_the_only_reported_fault(name, kind):
     found = list(source_convention.detect(compared(CONVENTION_FAULTS[name, kind](flown()))))
-    assert [(one.id, one.evidence[CONVENTION_KEY]) for one in found] == [(name, kind)]
+    assert [(one.id, one.evidence[WRONG_CONVENTION_KEY]) for one in found] == [(name, kind)]
 
 
 @pytest.mark.parametrize(
@@ -315,7 +315,7 @@ def test_enu_orientation_report_contains_conversion_to_ned():
     (found,) = source_convention.detect(
         compared(reclassify_as_vio(sent(flown()), quaternion, time))
     )
-    assert found.evidence[CONVENTION_KEY] == "frames"
+    assert found.evidence[WRONG_CONVENTION_KEY] == "frames"
     assert "q_NED = (0, √½, √½, 0) ⊗ q ⊗ (0, 1, 0, 0)" in found.remedy
 
 

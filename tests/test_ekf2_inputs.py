@@ -45,13 +45,13 @@ from px4fuse.flight.ekf2_parameters import (
     uses_aid_mask,
 )
 from px4fuse.flight.model import (
-    ALIGNED_ORIGIN,
+    ALIGNED_BY_EKF2_ORIGIN,
+    AS_RECEIVED_ORIGIN,
     DEAD_RECKONING_FLAG,
     GNSS_ORIGIN,
     KEPT_BY_EKF2_ORIGIN,
     MOTION_CAPTURE_ORIGIN,
     POSITION_FILE_ORIGIN,
-    RECEIVED_ORIGIN,
     AidLog,
     Columns,
     Ekf2,
@@ -179,13 +179,13 @@ def track(name: str, origin: SourceOrigin, interval_s: float = 0.1, **parts: Any
 
 
 @pytest.mark.parametrize(("tracks", "expected"), [
-    ([track("file", POSITION_FILE_ORIGIN), track("vehicle_visual_odometry", RECEIVED_ORIGIN)],
+    ([track("file", POSITION_FILE_ORIGIN), track("vehicle_visual_odometry", AS_RECEIVED_ORIGIN)],
      "vehicle_visual_odometry"),
     ([track("file", POSITION_FILE_ORIGIN), track("gps", GNSS_ORIGIN)], "file"),
     ([track("mocap", MOTION_CAPTURE_ORIGIN)], None),
     # complete copies: interval below 0.9 times the logger's, and at least 4 Hz
-    ([track(ALIGNED_TOPIC, ALIGNED_ORIGIN, 0.179)], ALIGNED_TOPIC),
-    ([track(ALIGNED_TOPIC, ALIGNED_ORIGIN, 0.181)], None),
+    ([track(ALIGNED_TOPIC, ALIGNED_BY_EKF2_ORIGIN, 0.179)], ALIGNED_TOPIC),
+    ([track(ALIGNED_TOPIC, ALIGNED_BY_EKF2_ORIGIN, 0.181)], None),
     ([track("estimator_aid_src_ev_pos", KEPT_BY_EKF2_ORIGIN, 0.25)], "estimator_aid_src_ev_pos"),
     ([track("estimator_aid_src_ev_pos", KEPT_BY_EKF2_ORIGIN, 0.26)], None),
 ])  # fmt: skip
@@ -202,7 +202,7 @@ def test_vision_positions_in_frd_are_rotated_with_variance():
         q = Rotation.from_euler("z", heading, degrees=True).as_quat(scalar_first=True)
         return pd.DataFrame([q] * 30, index=time, columns=Columns.QUATERNION)
 
-    own = track("vehicle_visual_odometry", RECEIVED_ORIGIN, frame="FRD", orientation=facing(0.0))
+    own = track("vehicle_visual_odometry", AS_RECEIVED_ORIGIN, frame="FRD", orientation=facing(0.0))
     own.samples[Columns.POSITION] = [2.0, 0.5, -1.0]
     own.samples[Columns.POSITION_VARIANCE] = [0.04, np.nan, 0.09]
     for parameters, yaw, turned in (
@@ -336,7 +336,7 @@ def turning(states: np.ndarray) -> tuple[pd.DataFrame, pd.DataFrame, Ekf2, Fusio
     delayed = delayed.assign(**dict.fromkeys(Columns.VELOCITY, 2.0), **{
         **dict.fromkeys(Columns.POSITION, np.nan), **dict.fromkeys(Columns.GYRO_BIAS, 0.0),
         **dict.fromkeys(Columns.ACCELEROMETER_BIAS, 0.2), Columns.GYRO_BIAS[2]: 0.01,
-        **{name: 1.0 + n for n, name in enumerate(Columns.DELAYED_VARIANCE)},
+        **{name: 1.0 + n for n, name in enumerate(Columns.FUSION_HORIZON_VARIANCE)},
     })  # fmt: skip
     delayed["attitude_down_rad2"] = states
     state = pd.DataFrame(7.0, index=time, columns=Columns.STATE).assign(down_m=time)
@@ -359,7 +359,7 @@ def test_ekf2_replay_inputs_equal_true_motion_in_turn():
     assert_allclose(found.state[3:9], [2.0, 2.0, 2.0, 7.0, 7.0, 10.5])
     assert_allclose(found.state[9:], 0.0)
     expected = np.arange(1.0, 16.0)
-    expected[Columns.DELAYED_VARIANCE.index("attitude_down_rad2")] = 10.5
+    expected[Columns.FUSION_HORIZON_VARIANCE.index("attitude_down_rad2")] = 10.5
     assert_allclose(found.variance, expected)
     assert_allclose(found.attitude_variance_rad2[:, 2], steps)
     assert_allclose(found.down_m, steps)
@@ -375,7 +375,7 @@ def segments(monkeypatch, **parts: Any) -> list[tuple[float, float]]:
     tenths = np.arange(0.0, 60.0, 0.1)
     usual = {
         "imu": np.arange(0.0, 60.0, 0.01), "vision": tenths, "fused": tenths, "airborne": NONE,
-        "delayed": tenths[::5], "instances": ((-np.inf, 0),),
+        "delayed": tenths[::5], "primary_instances": ((-np.inf, 0),),
     }  # fmt: skip
     given = SimpleNamespace(**{**usual, **parts})
 
@@ -389,7 +389,7 @@ def segments(monkeypatch, **parts: Any) -> list[tuple[float, float]]:
     imu, fused, delayed = (
         pd.DataFrame(index=each) for each in (given.imu, given.fused, given.delayed)
     )
-    ekf2 = made(Ekf2, innovations={"north": fused}, instances=given.instances)
+    ekf2 = made(Ekf2, innovations={"north": fused}, primary_instances=given.primary_instances)
     record = made(FusionRecord, delayed=delayed)
     find_replay_segments(
         made(Flight, airborne=given.airborne), imu, imu, ekf2, record, given.vision
@@ -419,7 +419,7 @@ def test_ekf2_replay_segments_end_at_vision_and_imu_gaps(monkeypatch):
     parted = segments(monkeypatch, imu=without(imu, 30.0, 30.07))
     assert [start for start, _ in parted] == [1.0, 31.5]
     # another EKF2 instance has different states and splits the flight
-    parted = segments(monkeypatch, instances=((-np.inf, 0), (30.2, 1)))
+    parted = segments(monkeypatch, primary_instances=((-np.inf, 0), (30.2, 1)))
     assert parted == [(1.0, 30.2), (31.5, 59.99)]
     # a segment has at least 10 s and ends 1 s after the last vision sample
     assert segments(monkeypatch, fused=np.arange(48.0, 60.0, 0.1))[0][0] == 49.0

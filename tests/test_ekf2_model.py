@@ -19,7 +19,7 @@ from px4fuse.ekf2.model import (
     run_configurations,
 )
 from px4fuse.ekf2.replay import HORIZONTAL_AXES
-from px4fuse.flight.model import RECEIVED_ORIGIN, Flight, Unavailable
+from px4fuse.flight.model import AS_RECEIVED_ORIGIN, Flight, Unavailable
 from px4fuse.readers import read_log
 
 
@@ -167,7 +167,7 @@ def test_ekf2_replay_counts_late_and_lost_vision_samples(model: Ekf2Model) -> No
 
 def with_copies(flight: Flight) -> Flight:
     """Return the flight with EKF2's copies of the positions only."""
-    copies = tuple(track for track in flight.positions if track.origin != RECEIVED_ORIGIN)
+    copies = tuple(track for track in flight.positions if track.origin != AS_RECEIVED_ORIGIN)
     return replace(flight, positions=copies)
 
 

@@ -28,7 +28,7 @@ def made_log(generation, position=True):
 def test_read_ekf2_states_layout_is_equal_for_each_px4_release(read, generation):
     ekf2 = read(made_log(generation, position=generation != "v1.16")).ekf2
     record = ekf2.record
-    assert list(record.delayed) == Columns.DELAYED_STATE + Columns.DELAYED_VARIANCE
+    assert list(record.delayed) == Columns.FUSION_HORIZON_STATE + Columns.FUSION_HORIZON_VARIANCE
     row = record.delayed.iloc[3]
     assert row[Columns.QUATERNION].to_numpy() == pytest.approx(QUATERNION)
     assert row["north_m_s"] == pytest.approx(0.5)
@@ -42,20 +42,22 @@ def test_read_ekf2_states_layout_is_equal_for_each_px4_release(read, generation)
     known = [np.nan] * 2 if generation == "v1.16" else [3.0, 4.0]
     assert row[["north_m", "east_m"]].to_numpy() == pytest.approx(known, nan_ok=True)
     logged = covariances(16)[4 if old else 3 :]
-    assert row[Columns.DELAYED_VARIANCE[3:9]].to_numpy() == pytest.approx(logged[:6])
-    assert row[Columns.DELAYED_VARIANCE[9:15]].to_numpy() == pytest.approx(logged[6:12] / per**2)
+    assert row[Columns.FUSION_HORIZON_VARIANCE[3:9]].to_numpy() == pytest.approx(logged[:6])
+    assert row[Columns.FUSION_HORIZON_VARIANCE[9:15]].to_numpy() == pytest.approx(
+        logged[6:12] / per**2
+    )
     # magnetic fields
-    fields = [*Columns.EARTH_FIELD, *Columns.BODY_FIELD]
+    fields = [*Columns.EARTH_MAGNETIC_FIELD, *Columns.BODY_MAGNETIC_FIELD]
     assert row[fields].to_numpy() == pytest.approx(STATES[16:])
     of_fields = covariances(22 if old else 21)[-6:]
-    assert row[Columns.DELAYED_VARIANCE[15:]].to_numpy() == pytest.approx(of_fields)
+    assert row[Columns.FUSION_HORIZON_VARIANCE[15:]].to_numpy() == pytest.approx(of_fields)
 
 
 def test_attitude_variance_equals_variance_of_sampled_angles(read):
     log = made_log("v1.14")
     variance = np.array([1e-5, 4e-5, 2e-5, 3e-5])
     log["estimator_states"]["covariances"][:, :4] = variance
-    found = read(log).ekf2.record.delayed.iloc[0][Columns.DELAYED_VARIANCE[:3]].to_numpy()
+    found = read(log).ekf2.record.delayed.iloc[0][Columns.FUSION_HORIZON_VARIANCE[:3]].to_numpy()
     rng = np.random.default_rng(7)
     drawn = QUATERNION + rng.normal(0.0, np.sqrt(variance), (200_000, 4))
     truth = Rotation.from_quat(QUATERNION, scalar_first=True)

@@ -27,11 +27,11 @@ TABLES = [
 # A finding, a page and a command as short as the lists allow
 NEW_FILES = {
     "findings/wind.py": """
-from px4fuse.findings.model import note
+from px4fuse.findings.model import make_note
 
 
 def detect(analysis):
-    yield note("wind", "There was wind.", "Fly indoors.")
+    yield make_note("wind", "There was wind.", "Fly indoors.")
 """,
     "report/wind.py": """
 from px4fuse.report.page import Page
@@ -167,7 +167,7 @@ def test_extension_guide_names_only_existing_files() -> None:
         "cli/options.py": [],
         "filter/settings.py": ["class Settings", "SETTING_RANGES"],
         "results/contract.py": ["class ChosenSettings"],
-        "flight/model.py": ["ORIGINS"],
+        "flight/model.py": ["SOURCE_ORIGINS"],
         "report/pdf.py": ["PAGES"],
         "cli/__init__.py": ["COMMANDS"],
     }.items():

@@ -52,7 +52,7 @@ def read(path: Path) -> pd.DataFrame:
 def rich_flight() -> Flight:
     """Make a flight with all parts for which a table exists."""
     resets = Reset(5.0, "position", (0.5, 0.0, -1.0)), Reset(6.0, "velocity", (0, 1, 0))
-    ekf2 = Estimator(resets=resets, instances=((-np.inf, 0), (9.0, 1)))
+    ekf2 = Estimator(resets=resets, primary_instances=((-np.inf, 0), (9.0, 1)))
     flight = aisle_flight(duration_s=20.0, ekf2=ekf2, dropouts=(Dropout(3.0, 0.2),))
     clock = ClockMap('UNIX time, "quoted"', "TIMESYNC", 512, -1.7e9 / 3, 2.5, 0.001, "a, note")
     file = InputFile("uwb.csv", "00" * 32, 10, "position")

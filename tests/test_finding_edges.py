@@ -62,7 +62,7 @@ from px4fuse.findings import (
     source_stamps,
     split_cause_groups,
 )
-from px4fuse.findings.cause_grouping import GAP_CAUSE, UNKNOWN_CAUSE
+from px4fuse.findings.cause_grouping import SOURCE_GAP_CAUSE, UNKNOWN_CAUSE
 from px4fuse.findings.model import (
     SOURCE_TEXTS,
     compute_flag_fraction,
@@ -70,12 +70,12 @@ from px4fuse.findings.model import (
     make_zero_length_spans,
 )
 from px4fuse.flight.model import (
-    ALIGNED_ORIGIN,
+    ALIGNED_BY_EKF2_ORIGIN,
+    AS_RECEIVED_ORIGIN,
     GNSS_ORIGIN,
     KEPT_BY_EKF2_ORIGIN,
     MOTION_CAPTURE_ORIGIN,
-    REBUILT_ORIGIN,
-    RECEIVED_ORIGIN,
+    REBUILT_FROM_INNOVATIONS_ORIGIN,
     ClockMap,
     Columns,
     Dropout,
@@ -140,7 +140,7 @@ def test_ekf2_resets_outside_evaluated_segment_are_ignored(
         Reset(40.0, "velocity", (9.0, 0.0, 0.0)), Reset(50.0, "position", (0.0, 0.0, 0.0)),
         Reset(110.0, "position", (0.0, 0.0, 1.0)), Reset(110.1, "position", (9.0, 0.0, 0.0)),
     )  # fmt: skip
-    one = analysis(ekf2={"instances": switches, "resets": resets}, events=NO_GAP)
+    one = analysis(ekf2={"primary_instances": switches, "resets": resets}, events=NO_GAP)
     reset, switch = ekf2_resets.detect(one)
     assert switch.evidence == {"count": 2, "at_s": 10.5}
     # the reset of the height alone is not counted
@@ -156,7 +156,7 @@ def test_ekf2_resets_outside_evaluated_segment_are_ignored(
         (Reset(19.9, "position", (0.0, 0.0, 1.0)), (), ("note", UNKNOWN_CAUSE)),
         (Reset(30.0, "position", (1.0, 0.0, 1.0)), (), ("warning", UNKNOWN_CAUSE)),
         # up to 5 s after a gap in the source
-        (Reset(65.0, "position", (1.0, 0.0, 0.0)), ((50.0, 60.0),), ("warning", GAP_CAUSE)),
+        (Reset(65.0, "position", (1.0, 0.0, 0.0)), ((50.0, 60.0),), ("warning", SOURCE_GAP_CAUSE)),
         (Reset(65.1, "position", (1.0, 0.0, 0.0)), ((50.0, 60.0),), ("warning", UNKNOWN_CAUSE)),
     ],
 )
@@ -164,7 +164,8 @@ def test_ekf2_height_reset_at_take_off_is_not_reported(
     reset: Reset, gaps: Any, expected: Any, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(ekf2_resets, "remove_origin_resets", lambda *_: (None, "resets kept"))
-    one = analysis(ekf2={"instances": (), "resets": (reset,)}, flight={"airborne": ((20.0, 90.0),)},
+    one = analysis(ekf2={"primary_instances": (), "resets": (reset,)},
+                   flight={"airborne": ((20.0, 90.0),)},
                    events=SimpleNamespace(gaps=gaps))  # fmt: skip
     found = [(each.severity, each.evidence["cause"]) for each in ekf2_resets.detect(one)]
     assert found == ([] if expected is None else [expected])
@@ -303,7 +304,7 @@ def test_rejection_action_requires_rerun_with_half_of_rejections() -> None:
 
 CHECK_FIRST = (
     "Check the data link and the line of sight to the anchors. Then check EKF2_EV_DELAY and "
-    "EKF2_EVP_NOISE. Increase EKF2_EVP_GATE last."
+    "EKF2_EVP_NOISE. Increase EKF2_EVP_GATE only if no fault is found."
 )
 
 
@@ -314,8 +315,8 @@ def test_error_above_sigma_finding_prefers_the_main_axis() -> None:
     ekf2 = axis("east", ekf2=statement(0.49), ekf2_truth=against_truth(25.0, 1.0))
     finding = only(hidden_errors.detect, analysis(axes=(axis(), hiding(name="down"), ekf2)))
     assert finding.title == (
-        "Position errors that innovations do not show: KF 2.0 times the reported σ, "
-        "EKF2 5.0 times the reported σ"
+        "Position errors that innovations do not show: KF error 2.0 times the reported σ, "
+        "EKF2 error 5.0 times the reported σ"
     )
     assert finding.evidence["filter"] == "ekf2"
     # the main axis is preferred
@@ -324,7 +325,7 @@ def test_error_above_sigma_finding_prefers_the_main_axis() -> None:
     assert finding.evidence["ekf2_sigma_p_m"] == pytest.approx(0.2)
     assert finding.remedy == (
         "Check the time offset of the positions (px4fuse sync LOG). "
-        f"Then check {SOURCE_TEXTS['uwb'].errors}."
+        f"{SOURCE_TEXTS['uwb'].slow_error_check}."
     )
     # the error is EKF2's own only if the RMSE of KF is below 0.7 of it
     for kf_rmse_m, remedy in (
@@ -333,14 +334,14 @@ def test_error_above_sigma_finding_prefers_the_main_axis() -> None:
             0.28,
             (
                 "Check the time offset of the positions (px4fuse sync LOG). "
-                f"Then check {SOURCE_TEXTS['uwb'].errors}."
+                f"{SOURCE_TEXTS['uwb'].slow_error_check}."
             ),
         ),
         (
             0.4,
             (
                 "Check the time offset of the positions (px4fuse sync LOG). "
-                f"Then check {SOURCE_TEXTS['uwb'].errors}."
+                f"{SOURCE_TEXTS['uwb'].slow_error_check}."
             ),
         ),
     ):
@@ -371,7 +372,7 @@ def test_frame_is_misaligned_if_alignment_halves_position_rmse(
              ekf2_state=pd.DataFrame({"position_m": estimate[:, at]}, index=time))
         for at, name in enumerate(("north", "east"))
     ]  # fmt: skip
-    track = source(origin=DRIFTING if drifts else RECEIVED_ORIGIN)
+    track = source(origin=DRIFTING if drifts else AS_RECEIVED_ORIGIN)
     finding = only(hidden_errors.detect, analysis(axes=tuple(axes), source=track))
     assert finding.evidence["position_rmse_horizontal_m"] == pytest.approx(1.0, rel=0.01)
     assert finding.evidence["position_rmse_aligned_m"] == pytest.approx(left, rel=0.01)
@@ -430,7 +431,7 @@ def test_finding_states_why_received_positions_are_not_logged() -> None:
         Unavailable("it", "it was disabled", "Do.", source="vehicle_visual_odometry"),
     )
     profile = log(parameters={"SDLOG_PROFILE": 2.0})
-    for origin in (ALIGNED_ORIGIN, KEPT_BY_EKF2_ORIGIN, REBUILT_ORIGIN):
+    for origin in (ALIGNED_BY_EKF2_ORIGIN, KEPT_BY_EKF2_ORIGIN, REBUILT_FROM_INNOVATIONS_ORIGIN):
         of = source(origin=origin)
         found = only(
             missing.detect_source_not_logged, analysis(source=of, missing=lacks, log=profile)
@@ -439,8 +440,8 @@ def test_finding_states_why_received_positions_are_not_logged() -> None:
         assert "Reason: it was disabled." in found.message
         assert "SDLOG_PROFILE to 130 " in found.remedy
     for origin, tracks in (
-        (RECEIVED_ORIGIN, ()), (MOTION_CAPTURE_ORIGIN, ()), (GNSS_ORIGIN, ()),
-        (ALIGNED_ORIGIN, (SimpleNamespace(origin=RECEIVED_ORIGIN),)),
+        (AS_RECEIVED_ORIGIN, ()), (MOTION_CAPTURE_ORIGIN, ()), (GNSS_ORIGIN, ()),
+        (ALIGNED_BY_EKF2_ORIGIN, (SimpleNamespace(origin=AS_RECEIVED_ORIGIN),)),
     ):  # fmt: skip
         one = analysis(source=source(origin=origin), flight={"positions": tracks})
         assert named(missing.detect_source_not_logged, one) == {}
@@ -745,7 +746,7 @@ SOURCE_EDGES = [
         ([1] * 50 + [2] * 35 + [4] * 15, "error"), ([1] * 50 + [2] * 34 + [4] * 16, None))),
     # mapped timestamps and topics rebuilt by EKF2 show nothing
     (DOWNSAMPLED, at_multiples([1, 2] * 30, clock_map=clock_map()), None),
-    (DOWNSAMPLED, at_multiples([1, 2] * 30, origin=ALIGNED_ORIGIN), None),
+    (DOWNSAMPLED, at_multiples([1, 2] * 30, origin=ALIGNED_BY_EKF2_ORIGIN), None),
     (DOWNSAMPLED, at_multiples([1, 2] * 30, origin=MOTION_CAPTURE_ORIGIN), "warning"),
     # two samples lost in one interval
     *((source_intervals.detect_lost_samples, at_multiples([1] * singles + [3], 0.25, **parts),
@@ -893,7 +894,10 @@ def test_positions_too_late_for_ekf2_buffer_are_reported(late_share, is_reported
     one = analysis(ekf2={"record": record, "horizon_s": 0.2})
     findings = list(source_stamps.detect_varying_latency(one))
     assert [finding.severity for finding in findings] == ["error"] * is_reported
-    assert all("later than 0.30 s (here 5 %)" in finding.message for finding in findings)
+    assert all(
+        "0.30 s after their timestamp: 5 % in this flight" in finding.message
+        for finding in findings
+    )
 
 
 def test_position_sample_interval_is_found_despite_jitter() -> None:
@@ -932,7 +936,7 @@ def test_scale_and_variance_titles_state_direction_of_the_error() -> None:
     for reported, word in ((2.0, "large"), (0.5, "small")):
         finding = only(source_positions.detect_wrong_variance, stating(reported, 1.0))
         assert finding.title == f"The variance that UWB reports is 4 times too {word}"
-        assert ("may include time-correlated errors" in finding.message) is (word == "large")
+        assert ("do not show time-correlated errors" in finding.message) is (word == "large")
 
 
 @pytest.mark.parametrize(("error_m", "expected"), [(1.41, "error"), (1.42, None)])

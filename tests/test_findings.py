@@ -24,7 +24,7 @@ from px4fuse.filter.settings import Settings
 from px4fuse.findings import FINDING_TITLES, Finding, find, split_cause_groups
 from px4fuse.findings.model import FINDING_CATALOGUE, FINDING_GROUPS, load_examples
 from px4fuse.flight.model import (
-    ALIGNED_ORIGIN,
+    ALIGNED_BY_EKF2_ORIGIN,
     AXIS_NAMES,
     AidLog,
     ClockMap,
@@ -233,12 +233,12 @@ FAULTS = [
     Fault("ekf2_resets", "note", {"largest_m": about(0.4, 1e-9), "at_s": 60.0},
           ekf2(resets=(STEP_UP,))),
     Fault("ekf2_instance_switch", "warning", {"count": 2, "at_s": 30.0},
-          ekf2(instances=((-math.inf, 0), (30.0, 1), (80.0, 0)))),
+          ekf2(primary_instances=((-math.inf, 0), (30.0, 1), (80.0, 0)))),
     Fault("ekf2_simulated", "note", change=with_log(notes=(SIMULATED_EKF2_NOTE,))),
     Fault("ekf2_not_logged", "warning", flight={"ekf2": None}),
     # the position source
     Fault("source_not_logged", "warning", {"rate_hz": about(4.0), "sdlog_profile": 1},
-          {"uwb": Uwb(name=ALIGNED_TOPIC, origin=ALIGNED_ORIGIN, rate_hz=4.0),
+          {"uwb": Uwb(name=ALIGNED_TOPIC, origin=ALIGNED_BY_EKF2_ORIGIN, rate_hz=4.0),
            "parameters": NO_VISION}),
     Fault("source_rate_at_limit", "note", {"rate_hz": about(4.0), "longest_s": about(1.0, 1e-6)},
           {"uwb": Uwb(rate_hz=4.0, gap_s=(40.0, 48.0)),
@@ -272,7 +272,8 @@ FAULTS = [
     Fault("imu_gap", "warning", {"total_s": about(2.0, 1e-6)}, {"imu": Imu(gap_s=(40.0, 42.0))}),
     Fault("imu_values_impossible", "error", {"count": 1000},
           change=lambda f: replace(f, imu=f.imu * (1.0 + 199.0 * (f.imu.index > 110.0))[:, None])),
-    Fault("attitude_failure", "error", {"total_s": 4.0}, {"tumble_spans": ((100.0, 104.0),)}),
+    Fault("attitude_failure", "error", {"total_s": 4.0},
+          {"excessive_tilt_spans_s": ((100.0, 104.0),)}),
     Fault("accelerometer_clipping", "warning", {"count": 30, "total_s": about(0.3, 0.01)},
           {"imu": Imu(clipped_s=(50.0, 50.295))}),
     Fault("logger_dropouts", "warning", {"count": 2, "total_s": about(0.5, 1e-9)},
@@ -448,7 +449,8 @@ def test_positions_missing_for_part_of_flight_are_reported_first(
     first, *_ = found(compare_prepared(prepare_comparison(read_flight(request), request)))
     # EKF2 fused its own source besides the file
     assert (first.id, first.severity) == (finding, "warning" if file else "error")
-    assert f"in flight at {at_s} s: EKF2's position error is " in first.title
+    assert f"in flight at {at_s} s, " in first.title
+    assert "position error at the end of this time is " in first.message
     assert first.evidence["error_m"] == pytest.approx(error_m, rel=0.05)
     assert ("dead reckoning" in first.message) == (file is None)
 
@@ -571,10 +573,12 @@ def test_explain_command_examples_show_measured_detection_rates() -> None:
     rows = pd.read_csv(Path(__file__).parent / "studies" / "rates.csv")
     for name, example in examples.items():
         clean = rows[(rows["finding"] == name) & (rows["condition"] == "none")]
-        assert example.clean_flights == clean["flights"].sum()
-        assert example.false_alarms == pytest.approx((clean["flights"] * clean["rate"]).sum())
+        assert example.fault_free_flight_count == clean["flights"].sum()
+        assert example.false_alarm_count == pytest.approx((clean["flights"] * clean["rate"]).sum())
         faulty = rows[(rows["finding"] == name) & (rows["condition"] != "none")]
-        assert example.detection == dict(zip(faulty["condition"], faulty["rate"], strict=True))
+        assert example.detection_rate_by_fault == dict(
+            zip(faulty["condition"], faulty["rate"], strict=True)
+        )
 
 
 @pytest.mark.parametrize(

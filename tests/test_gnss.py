@@ -101,8 +101,8 @@ def test_gnss_positions_without_fix_are_invalid(tmp_path: Path) -> None:
     log = outdoors("v1.16")
     log["vehicle_gps_position"]["fix_type"][10:20] = 1
     (track,) = (one for one in flight_of(log, tmp_path).positions if one.origin.is_gnss)
-    assert track.invalid.tolist() == ["no fix"] * 10
-    assert not track.invalid.index.isin(track.samples.index).any()
+    assert track.invalid_reasons.tolist() == ["no fix"] * 10
+    assert not track.invalid_reasons.index.isin(track.samples.index).any()
 
 
 def track_of(flight: Flight) -> PositionTrack:
@@ -255,9 +255,9 @@ def test_down_axis_of_gnss_flight_uses_fused_barometer(tmp_path):
     assert prepared.settings.sigma_z_m == pytest.approx(0.4)  # EKF2_BARO_NOISE
     innovations = prepared.flight.ekf2.innovations["down"]  # type: ignore[union-attr]
     np.testing.assert_allclose(innovations["innovation_m"], -0.2, rtol=1e-6)
-    fused_as_gnss = prepare_comparison(flight, replace(request, height="gnss"))
-    assert not np.isin(fused_as_gnss.input_axes[0].measurement_time_s, at).any()
-    assert isinstance(fused_as_gnss.flight.ekf2.innovations["down"], Unavailable)  # type: ignore[union-attr]
+    is_fused_as_gnss = prepare_comparison(flight, replace(request, height="gnss"))
+    assert not np.isin(is_fused_as_gnss.input_axes[0].measurement_time_s, at).any()
+    assert isinstance(is_fused_as_gnss.flight.ekf2.innovations["down"], Unavailable)  # type: ignore[union-attr]
 
 
 def test_down_axis_uses_unfused_barometer_only_on_request(tmp_path):
@@ -351,7 +351,7 @@ FLIGHTS: dict[str, tuple[str | None, dict[str, str], str]] = {
         (None, {"gnss_pos": "underconfident", "rng_hgt": "underconfident"}, ""),
 }  # fmt: skip
 # Minimum number of fixes reconstructed from innovations in flights logged at 2 Hz
-REBUILT_ORIGIN = {"v1.13.3_gps_profile1": 100, "v1.14.4_gps_magdist": 200}
+REBUILT_FROM_INNOVATIONS_ORIGIN = {"v1.13.3_gps_profile1": 100, "v1.14.4_gps_magdist": 200}
 STAMP_S = 0.016  # s, simulation steps of 8 ms from a fix to its timestamp and to the filter
 OF_OTHERS = ("EKF2_EV", "vision", "anchor", "UWB", "line of sight", " tag ")
 
@@ -384,12 +384,12 @@ def test_compare_of_real_gnss_flights_equals_reference_numbers(name, shared_logs
     assert not reason or re.search(reason, analysis.ekf2_model.reason)
     assert verdicts == {aid: analysis.aids[aid].verdict for aid in verdicts}
     assert as_in_the_log(analysis.aids, truth) >= 2
-    if name in REBUILT_ORIGIN:
+    if name in REBUILT_FROM_INNOVATIONS_ORIGIN:
         track = track_of(analysis.flight)
         assert "2.0" in track.notes[0]
         pattern = r"^(\d+) GNSS fixes are not logged.*RMS error of ([\d.]+) m"
         count, exact_m = re.findall(pattern, track.notes[1])[0]
-        assert int(count) > REBUILT_ORIGIN[name]
+        assert int(count) > REBUILT_FROM_INNOVATIONS_ORIGIN[name]
         assert float(exact_m) < 0.1
         assert track.compute_rate_hz() > 2.9
 

@@ -22,7 +22,7 @@ from px4fuse.info.inventory import (
     AnalysisOption,
     Inventory,
     LoggedData,
-    take_inventory,
+    list_log_contents,
     to_json_dict,
 )
 from px4fuse.readers import read_log
@@ -49,7 +49,7 @@ def widest(text: str) -> int:
 
 
 def inventory_of(log: Log, tmp_path: Path) -> Inventory:
-    return take_inventory(read_log(log.write(tmp_path / "made.ulg")))
+    return list_log_contents(read_log(log.write(tmp_path / "made.ulg")))
 
 
 def source(inventory: Inventory, part: str) -> LoggedData:
@@ -68,7 +68,7 @@ def remedies(inventory: Inventory) -> list[str]:
 
 
 def test_info_output_matches_contents_of_log(sample_flight):
-    inventory, ekf2 = take_inventory(sample_flight), sample_flight.ekf2
+    inventory, ekf2 = list_log_contents(sample_flight), sample_flight.ekf2
     frames = {
         "IMU": sample_flight.imu, "attitude": sample_flight.attitude, "EKF2 state": ekf2.state,
         "EKF2 variance": ekf2.variance, "innovations": ekf2.innovations["north"],
@@ -89,7 +89,7 @@ def test_info_output_matches_contents_of_log(sample_flight):
 
 
 def test_info_sample_counts_match_those_of_compare(sample_flight):
-    inventory = take_inventory(sample_flight)
+    inventory = list_log_contents(sample_flight)
     comparison = compare(sample_flight)
     assert all(ability.possible for ability in inventory.abilities)
     assert inventory.segment == comparison.segment
@@ -170,7 +170,7 @@ def test_info_on_slow_imu_states_that_analysis_is_impossible(tmp_path, imu_hz, s
     if said is not None:
         assert said in found.reason
         assert "50 Hz are needed" in found.reason
-    both = (take_inventory(aisle_flight(attitude_hz=rate_hz)) for rate_hz in (5.0, 9.97))
+    both = (list_log_contents(aisle_flight(attitude_hz=rate_hz)) for rate_hz in (5.0, 9.97))
     slow, fast = (ability(one, "acceleration") for one in both)
     assert (slow.possible, fast.possible) == (False, True)
     assert "attitude was logged at 5.0 Hz, but 10 Hz are needed" in slow.reason
@@ -180,7 +180,7 @@ def test_info_on_damaged_log_reports_the_damage_first(tmp_path, sample_log):
     path = tmp_path / "damaged.tlog"
     content = Aisle(seconds=10.0).record().tlog()
     path.write_bytes(content[: len(content) // 2] + bytes(5000) + content[len(content) // 2 :])
-    inventory = take_inventory(read_log(path))
+    inventory = list_log_contents(read_log(path))
     assert any("damaged" in note for note in inventory.notes)
     assert "link" in remedies(inventory)[0]
     (named,) = [
@@ -190,7 +190,7 @@ def test_info_on_damaged_log_reports_the_damage_first(tmp_path, sample_log):
     ulog = bytearray(sample_log.read_bytes())
     ulog[1_500_000:1_504_096] = bytes(4096)
     path.with_suffix(".ulg").write_bytes(ulog)
-    assert "Copy the log" in remedies(take_inventory(read_log(path.with_suffix(".ulg"))))[0]
+    assert "Copy the log" in remedies(list_log_contents(read_log(path.with_suffix(".ulg"))))[0]
 
 
 def test_info_on_log_without_take_off_reports_never_airborne(tmp_path):
@@ -209,7 +209,7 @@ def test_info_does_not_use_position_source_as_ground_truth(tmp_path):
     log = make_log().add(odometry("vehicle_mocap_odometry", 10.0, 16))
     assert ability(inventory_of(log, tmp_path), "error").possible
     flight = read_log(log.drop("vehicle_visual_odometry").write(tmp_path / "made.ulg"))
-    inventory = take_inventory(flight)
+    inventory = list_log_contents(flight)
     assert source(inventory, "position").name == "vehicle_mocap_odometry"
     assert not ability(inventory, "error").possible
 
@@ -253,7 +253,7 @@ def test_info_reports_count_and_duration_of_gaps(tmp_path):
 ])  # fmt: skip
 def test_info_lists_exactly_the_analyses_that_compare_performs(flight: Flight):
     """The flights have no streams; an analysis is possible exactly if compare performs it."""
-    inventory = take_inventory(flight)
+    inventory = list_log_contents(flight)
     strict(json.dumps(to_json_dict(inventory)))
     try:
         comparison = compare(flight)
@@ -280,7 +280,7 @@ def test_info_prints_log_dropouts_and_advice(monkeypatch, tmp_path, sample_fligh
                   start_unix_s=1e18)  # fmt: skip
     flight = replace(sample_flight, log=log)
     monkeypatch.setattr("px4fuse.diagnose.read_log", lambda _, **__: flight)
-    assert take_inventory(flight).start_utc is None
+    assert list_log_contents(flight).start_utc is None
     text = info(tmp_path / "any.tlog")
     assert widest(text) <= WIDTH
     for words in ("unknown", "2 logger dropouts", "faster SD card"):
@@ -298,10 +298,10 @@ def test_info_ends_without_traceback_on_each_test_log(shared_logs, monkeypatch, 
     taken = []
 
     def take(flight: Flight) -> Inventory:
-        taken.append(take_inventory(flight))
+        taken.append(list_log_contents(flight))
         return taken[-1]
 
-    monkeypatch.setattr("px4fuse.info.inventory.take_inventory", take)
+    monkeypatch.setattr("px4fuse.info.inventory.list_log_contents", take)
     for path in paths:
         code, out, err = run_main(monkeypatch, capsys, "info", path)
         assert code in ((0,) if path.suffix == ".ulg" else (0, 2)), path.name

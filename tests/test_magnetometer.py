@@ -171,7 +171,7 @@ def test_magnetic_field_is_from_ekf2_topic_if_sensor_log_is_slow(tmp_path: Path)
     assert len(field) == remaining["timestamp"].size
     np.testing.assert_allclose(field.iloc[:, :3], np.tile(2.0 * EARTH, (len(field), 1)), rtol=1e-6)
     np.testing.assert_allclose(
-        field[Columns.FIELD_INNOVATION], remaining["innovation_filtered"], 1e-6
+        field[Columns.MAGNETIC_FIELD_INNOVATION], remaining["innovation_filtered"], 1e-6
     )
     at = stamps(20.0, 12.0)
     log.drop("vehicle_magnetometer")
@@ -204,7 +204,7 @@ def test_mean_field_is_restored_from_filtered_mag_innovations() -> None:
     remaining = np.delete(
         remaining, [count, *range(20, 26)]
     )  # the logger missed one row, then three seconds
-    fields = [*Columns.EARTH_FIELD, *Columns.BODY_FIELD]
+    fields = [*Columns.EARTH_MAGNETIC_FIELD, *Columns.BODY_MAGNETIC_FIELD]
     delayed = pd.DataFrame(dict(zip(fields, [*EARTH, *body], strict=True)), [99.0, 200.0])
     matrices = rotation.as_matrix()
     segment = made(ReplaySegment, time_s=time_s, body_to_ned=matrices, attitude_error_rad=error)

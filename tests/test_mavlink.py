@@ -50,15 +50,15 @@ from time_limit import time_limit
 from px4fuse.diagnose import analyse_comparison
 from px4fuse.errors import LogError, MissingDataError
 from px4fuse.flight.model import (
+    AS_RECEIVED_ORIGIN,
     MOTION_CAPTURE_ORIGIN,
-    RECEIVED_ORIGIN,
     Columns,
     Ekf2,
     Flight,
     Truth,
     Unavailable,
 )
-from px4fuse.info.inventory import take_inventory
+from px4fuse.info.inventory import list_log_contents
 from px4fuse.readers import read_log
 from px4fuse.readers.mavlink_frames import wire_layout
 from px4fuse.readers.mavlink_positions import compute_pressure_altitude_m
@@ -113,7 +113,7 @@ def test_read_mavlink_returns_the_simulated_motion_and_imu(read):
     assert flight.streams["ekf2_state"].topics == ("ODOMETRY",)
     [track] = flight.positions
     assert track.name == "VISION_POSITION_ESTIMATE"
-    assert (track.origin.path, track.frame) == (RECEIVED_ORIGIN.path, "NED")
+    assert (track.origin.path, track.frame) == (AS_RECEIVED_ORIGIN.path, "NED")
     variance = track.samples[Columns.POSITION_VARIANCE]
     assert_allclose(variance, np.tile(POSE_VARIANCE, (200, 1)), rtol=1e-6)
 
@@ -255,8 +255,8 @@ def test_mavlink_odometry_velocity_is_rotated_to_ned(read, child):
 
 
 @pytest.mark.parametrize(("estimator", "name", "origin"), [
-    (0, "ODOMETRY", RECEIVED_ORIGIN), (1, "ODOMETRY_NAIVE", RECEIVED_ORIGIN),
-    (2, "ODOMETRY_VISION", RECEIVED_ORIGIN), (3, "ODOMETRY_VIO", RECEIVED_ORIGIN),
+    (0, "ODOMETRY", AS_RECEIVED_ORIGIN), (1, "ODOMETRY_NAIVE", AS_RECEIVED_ORIGIN),
+    (2, "ODOMETRY_VISION", AS_RECEIVED_ORIGIN), (3, "ODOMETRY_VIO", AS_RECEIVED_ORIGIN),
     (6, "ODOMETRY_MOCAP", MOTION_CAPTURE_ORIGIN), (4, "", None), (8, "", None),
 ])  # fmt: skip
 def test_mavlink_odometry_estimator_type_selects_source_name(read, estimator, name, origin):
@@ -416,8 +416,10 @@ def test_mavlink_parameter_out_of_range_is_replaced_by_default(read):
     flight = read(recorder)
     notes = [note for note in flight.log.notes if "EKF2_" in note]
     assert notes == [
-        "EKF2_EVP_GATE 0 SD is outside PX4's range 1 to 1000. px4fuse uses the default 5.",
-        "EKF2_EVP_NOISE 1e+30 m is outside PX4's range 0.01 to 1000. px4fuse uses the default 0.1.",
+        "EKF2_EVP_GATE 0 SD is outside PX4's range 1 to 1000. px4fuse uses the parameter default "
+        "5.",
+        "EKF2_EVP_NOISE 1e+30 m is outside PX4's range 0.01 to 1000. px4fuse uses the parameter "
+        "default 0.1.",
     ]
     assert flight.ekf2.gate == 5.0
     assert flight.log.parameters["EKF2_EV_DELAY"] == 300.0
@@ -436,7 +438,7 @@ def test_ardupilot_messages_contain_no_px4_advice(read, missing_messages):
             recorder.sent[at] = received, sender, heartbeat(2, 3), link
     flight = read(recorder)
     assert flight.log.autopilot == "ArduPilot"
-    texts = [str(part) for part in take_inventory(flight).advice]
+    texts = [str(part) for part in list_log_contents(flight).advice]
     texts += [str(part) for part in flight.missing]
     if flight.positions:
         texts += [
@@ -512,7 +514,7 @@ def test_mavlink_gnss_position_is_relative_to_autopilot_origin(read, origin, clo
     """The receiver's timestamps may be boot time or UNIX time."""
     flight = read(outdoors(origin=origin, clock=clock))
     (track,) = flight.positions
-    assert (track.name, track.origin.fused_as_gnss, track.origin.is_auto_candidate) == (
+    assert (track.name, track.origin.is_fused_as_gnss, track.origin.is_auto_candidate) == (
         "GPS_RAW_INT",
         True,
         True,

@@ -37,7 +37,7 @@ from px4fuse.findings import cause_text, ekf2_noise, hidden_errors, loops, noise
 from px4fuse.findings.cause_grouping import group_by_cause
 from px4fuse.findings.noises import _has_default_noises
 from px4fuse.flight.ekf2_parameters import EV_POS, GNSS_POS, PARAMETERS
-from px4fuse.flight.model import GNSS_ORIGIN, RECEIVED_ORIGIN
+from px4fuse.flight.model import AS_RECEIVED_ORIGIN, GNSS_ORIGIN
 from px4fuse.loop.model import Closure, Loop, TrueFinalPose
 
 MOVING = source(samples=positions(np.arange(0.0, 120.0), np.arange(120.0)))
@@ -145,7 +145,8 @@ def test_wrong_noise_report_contains_factor_and_estimated_noise() -> None:
     worse, _ = noises.detect_wrong_settings(analysis(source=MOVING, tuning=fitted))
     assert worse.evidence["factor"] == pytest.approx(10.0)
     assert worse.message == (
-        "SIGMA_A is 10 times too large: KF follows the measurement noise. SIGMA_A is 1 m/s²; "
+        "SIGMA_A is 10 times too large: KF follows the noise of single positions. SIGMA_A is 1 "
+        "m/s²; "
         "its maximum-likelihood estimate is 0.1 m/s² (95 % 0.09 to 0.11 m/s²). KF's covariance P "
         "grows too much between updates, so KF's gain is too large."
     )
@@ -275,14 +276,14 @@ def test_smaller_noise_on_odometry_is_not_recommended() -> None:
         finding = only(
             noises.detect_inconsistent_variances, analysis(axes=(kf(nis),), source=ODOMETRY)
         )
-        assert (finding.remedy == noises.KEEP_NOISE_ACTION_DRIFT) is is_kept
+        assert (finding.remedy == noises.KEEP_NOISE_BECAUSE_OF_DRIFT_ACTION) is is_kept
         assert finding.severity == level
     for owner, there in (("kf", True), ("ekf2", False)):
         worse = {owner: statement(), f"{owner}_truth": against_truth(9.0)}
         finding = only(
             noises.detect_inconsistent_variances, analysis(axes=(kf(0.2), axis("east", **worse)))
         )
-        assert (finding.remedy == noises.KEEP_NOISE_ACTION_TRUTH) is there
+        assert (finding.remedy == noises.KEEP_NOISE_BECAUSE_OF_TRUTH_ACTION) is there
         assert finding.evidence["cause"] == "elsewhere"
 
 
@@ -324,9 +325,9 @@ def test_ekf2_noise_within_25_percent_of_default_is_default(flown, used_m, defau
         ("kf", {"outliers_left_out": 9.0, "sigma_z_m": 2.0}, "outliers",
          "before sending. Set SIGMA_Z to 2 m (--sigma-z 2)."),
         ("kf", {"clock_offset_s": -0.25}, "clock",
-         "Subtract 0.250 s from the position timestamps before sending."),
+         "Subtract 0.250 s from the timestamp of each position before sending."),
         ("kf", {"clock_offset_s": 0.25}, "clock",
-         "Add 0.250 s to the position timestamps before sending."),
+         "Add 0.250 s to the timestamp of each position before sending."),
         ("kf", {"turned_deg": -20.0}, "frame",
          "Rotate the positions by -20° before they are sent."),
         ("kf", {"bias_forward_m_s2": 0.5, "bias_right_m_s2": 0.1}, "accelerometer",
@@ -376,7 +377,7 @@ def test_smaller_noise_that_contradicts_ground_truth_is_rejected() -> None:
     contradicted = replace(contradicted, after=replace(contradicted.after, nees_mean=4.0))
     one = analysis(axes=(kf(0.2),), trials=(contradicted,))
     finding = only(noises.detect_inconsistent_variances, one)
-    assert (finding.remedy, finding.severity) == (noises.KEEP_NOISE_ACTION_TRUTH, "note")
+    assert (finding.remedy, finding.severity) == (noises.KEEP_NOISE_BECAUSE_OF_TRUTH_ACTION, "note")
     assert finding.evidence["cause"] == "elsewhere"
 
 
@@ -384,21 +385,21 @@ def test_smaller_noise_that_contradicts_ground_truth_is_rejected() -> None:
     ("one", "estimate", "parameters", "text"),
     [
         (fused(0.1), NoiseEstimate(0.3, 0.2, 0.4), {},
-         "Set EKF2_EVP_NOISE to 0.3 m (EKF2 uses 0.1 m)."),
+         "Set EKF2_EVP_NOISE to 0.3 m. EKF2 used a measurement noise of 0.1 m."),
         (fused(0.1), NoiseEstimate(0.124, 0.12, 0.13), {},
          "EKF2's measurement noise (0.1 m) equals the estimated position"),
         (fused(0.1, 0.2), NoiseEstimate(0.081, 0.08, 0.09), {},
          "EKF2's measurement noise (0.1 m) equals"),
         # a smaller noise than the sender reports: its variances must not be used
         (fused(0.3, 0.2), NoiseEstimate(0.1, 0.09, 0.11), {"EKF2_EVP_NOISE": 0.1},
-         "Set EKF2_EV_NOISE_MD to 1 (EKF2"),
+         "Set EKF2_EV_NOISE_MD to 1. EKF2"),
         (fused(0.3, 0.2), NoiseEstimate(0.1, 0.09, 0.11), {"EKF2_EVP_NOISE": 0.25},
-         "Set EKF2_EVP_NOISE to 0.1 m (EKF2"),
+         "Set EKF2_EVP_NOISE to 0.1 m. EKF2"),
         # PX4's minimum, and a bound
         (fused(0.3, 0.2), NoiseEstimate(0.002, 0.001, 0.003), {},
-         "Set EKF2_EVP_NOISE to 0.01 m (EKF2"),
+         "Set EKF2_EVP_NOISE to 0.01 m. EKF2"),
         (fused(0.1), NoiseEstimate(None, None, 0.2), {},
-         "Set EKF2_EVP_NOISE to 0.2 m (EKF2 uses 0.1 m)."),
+         "Set EKF2_EVP_NOISE to 0.2 m. EKF2 used a measurement noise of 0.1 m."),
     ],
 )  # fmt: skip
 def test_overconfident_ekf2_without_replay_gets_noise_advice(
@@ -445,7 +446,7 @@ def test_title_of_wrong_default_noise_names_the_position_sensor(
     inputs = SimpleNamespace(aid=aid, settings=settings, received=received)
     model = SimpleNamespace(inputs=inputs)
     result = axis("north", rejected_fraction=rejected)
-    origin = GNSS_ORIGIN if kind == "gnss" else RECEIVED_ORIGIN
+    origin = GNSS_ORIGIN if kind == "gnss" else AS_RECEIVED_ORIGIN
     one = analysis(
         axes=(result,), trials=(rerun,), ekf2_model=model, source=source(origin=origin),
         settings=Settings(1.0, flown_m),

@@ -12,7 +12,7 @@ from exchange import replace
 from px4fuse.comparison.comparison import compare, run_kf
 from px4fuse.diagnose import prepare_comparison, read_flight
 from px4fuse.errors import Px4FuseError
-from px4fuse.flight.model import ORIGINS, Flight, find_source_origin
+from px4fuse.flight.model import SOURCE_ORIGINS, Flight, find_source_origin
 from px4fuse.request import ComparisonRequest, PositionFile
 from px4fuse.simulation.flights import simulate_flight
 from px4fuse.simulation.scenario import make_scenario
@@ -76,7 +76,7 @@ def test_each_option_of_compare_changes_the_results(name: str) -> None:
 
 
 def test_unknown_kind_of_position_source_raises_an_error() -> None:
-    for origin in ORIGINS:
+    for origin in SOURCE_ORIGINS:
         assert find_source_origin(origin.kind, origin.path) is origin
     with pytest.raises(ValueError, match="no position source has the kind"):
         find_source_origin("lidar", "as received")

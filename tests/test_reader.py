@@ -30,12 +30,12 @@ from ulog_tools import (
 from px4fuse.comparison.preparation import choose_source
 from px4fuse.errors import MissingDataError
 from px4fuse.flight.model import (
-    ALIGNED_ORIGIN,
+    ALIGNED_BY_EKF2_ORIGIN,
+    AS_RECEIVED_ORIGIN,
     GNSS_ORIGIN,
     KEPT_BY_EKF2_ORIGIN,
     MOTION_CAPTURE_ORIGIN,
-    REBUILT_ORIGIN,
-    RECEIVED_ORIGIN,
+    REBUILT_FROM_INNOVATIONS_ORIGIN,
     Columns,
     Reset,
     Unavailable,
@@ -82,7 +82,7 @@ def delay_boot(log, by_us):
 @pytest.mark.parametrize("generation", GENERATIONS)
 def test_read_ulog_of_each_px4_release_reads_external_vision(read, generation):
     (track, *_) = read(make_log(generation)).positions
-    assert (track.name, track.origin.path) == ("vehicle_visual_odometry", RECEIVED_ORIGIN.path)
+    assert (track.name, track.origin.path) == ("vehicle_visual_odometry", AS_RECEIVED_ORIGIN.path)
     assert_equals_external_vision(track)
     assert track.frame == ("unknown" if generation == "v1.9" else "NED")
     assert track.compute_rate_hz() == pytest.approx(5.0)
@@ -213,7 +213,7 @@ def test_imu_times_include_accelerometer_timestamp_offset(read):
 
 def test_read_ulog_reads_imu_clipping_and_failure_detector(read):
     log = make_log("v1.16")
-    assert (plain := read(log)).tumble_spans == ()
+    assert (plain := read(log)).excessive_tilt_spans_s == ()
     assert "clipped" not in plain.imu
     bits = np.zeros(len(log["sensor_combined"]["timestamp"]), np.uint8)
     bits[300:304] = 4  # bit of the third axis
@@ -225,7 +225,7 @@ def test_read_ulog_reads_imu_clipping_and_failure_detector(read):
     log.add(topic("failure_detector_status", at, failing))
     flight = read(log)
     np.testing.assert_array_equal(np.flatnonzero(flight.imu["clipped"]), range(300, 304))
-    assert flight.tumble_spans == ((pytest.approx(3.0), pytest.approx(5.5)),)
+    assert flight.excessive_tilt_spans_s == ((pytest.approx(3.0), pytest.approx(5.5)),)
 
 
 @pytest.mark.parametrize(("name", "at", "jump_us"), [
@@ -285,14 +285,14 @@ def test_ekf2_samples_are_taken_from_primary_instance(read, generation, switches
     at = times(frame)
     np.testing.assert_allclose(at, seconds_of(ev_stamps(10.0)), atol=1e-9)
     np.testing.assert_allclose(frame["innovation_m"], ev_error(at)[:, 1] * scale(at), **FLOAT32)
-    assert [number for _, number in ekf2.instances] == [
+    assert [number for _, number in ekf2.primary_instances] == [
         number for at, number in enumerate(numbers) if at == 0 or number != numbers[at - 1]
     ]
 
 
 def test_selector_value_255_is_not_used_as_primary_instance(read):
     ekf2 = read(with_two_instances("v1.16", [(0.0, 255), (3.05, 1)])).ekf2
-    assert ekf2.instances == ((-np.inf, 1),)
+    assert ekf2.primary_instances == ((-np.inf, 1),)
     assert ekf2.variance["north_m2"].iloc[-1] == pytest.approx(3.0 * 0.07, rel=1e-6)
 
 
@@ -409,11 +409,11 @@ def gps_topic():
 
 
 PREFERRED = [
-    ("vehicle_visual_odometry", RECEIVED_ORIGIN),
+    ("vehicle_visual_odometry", AS_RECEIVED_ORIGIN),
     ("vehicle_mocap_odometry", MOTION_CAPTURE_ORIGIN),
-    ("estimator_visual_odometry_aligned", ALIGNED_ORIGIN),
+    ("estimator_visual_odometry_aligned", ALIGNED_BY_EKF2_ORIGIN),
     ("estimator_aid_src_ev_pos", KEPT_BY_EKF2_ORIGIN),
-    ("ekf2_state_plus_innovation", REBUILT_ORIGIN),
+    ("ekf2_state_plus_innovation", REBUILT_FROM_INNOVATIONS_ORIGIN),
     ("vehicle_gps_position", GNSS_ORIGIN),
 ]
 
@@ -495,7 +495,7 @@ def test_position_reconstructed_from_innovation_equals_measured(read, generation
     track, _ = choose_source(read(log))
     assert (track.name, track.origin.path) == (
         "ekf2_state_plus_innovation",
-        REBUILT_ORIGIN.path,
+        REBUILT_FROM_INNOVATIONS_ORIGIN.path,
     )
     expected = position(times(track.samples)) + ev_error(times(track.samples))
     np.testing.assert_allclose(track.samples[Columns.POSITION], expected, atol=1e-5)
@@ -620,7 +620,7 @@ def test_read_log_of_simulation_returns_simulated_uwb_samples(shared_logs, name)
     else:
         assert np.median(late) == pytest.approx(config["latency_ms"] * 1e-3, abs=0.02)
     inside = (sent_s > sent_s[match[0]]) & (sent_s < sent_s[match[-1]])
-    if track.origin.path == RECEIVED_ORIGIN.path and not config["dropouts"]:
+    if track.origin.path == AS_RECEIVED_ORIGIN.path and not config["dropouts"]:
         assert len(read_s) >= 0.98 * np.count_nonzero(inside)
 
 

@@ -35,7 +35,7 @@ def test_position_jumps_without_reset_counter_are_reported(shift_m, count, words
     (found,) = source_positions.detect_repeated_jumps(shifted(shift_m))
     assert found.evidence["count"] == pytest.approx(count, abs=2)
     assert words in found.message
-    assert "without a change of its reset_counter" in found.message
+    assert "does not change reset_counter" in found.message
 
 
 def test_single_outliers_are_not_reported_as_jumps() -> None:

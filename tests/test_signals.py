@@ -25,8 +25,8 @@ from px4fuse.filter.signals import (
     project_acceleration,
 )
 from px4fuse.flight.model import (
+    AS_RECEIVED_ORIGIN,
     AXIS_NAMES,
-    RECEIVED_ORIGIN,
     Columns,
     Ekf2,
     Flight,
@@ -46,7 +46,7 @@ def still_imu(time, force=(0.0, 0.0, -GRAVITY)):
     return imu_table(time, np.broadcast_to(force, (len(time), 3)), np.zeros((len(time), 3)))
 
 
-def track_of(time, positions, name="vehicle_visual_odometry", origin=RECEIVED_ORIGIN):
+def track_of(time, positions, name="vehicle_visual_odometry", origin=AS_RECEIVED_ORIGIN):
     values = np.hstack([positions, np.full((len(time), 3), np.nan)])
     samples = table(time, values, Columns.POSITION + Columns.POSITION_VARIANCE)
     return PositionTrack(name, origin, "", samples, "NED", "", (name,))
@@ -218,7 +218,7 @@ def test_clock_shift_changes_only_timestamps():
     moved = shift_clock(track, -0.1)
     np.testing.assert_allclose(moved.samples.index, track.samples.index - 0.1, atol=1e-12)
     np.testing.assert_array_equal(moved.samples, track.samples)
-    kept = {name: getattr(track, name) for name in ("samples", "invalid", "status")}
+    kept = {name: getattr(track, name) for name in ("samples", "invalid_reasons", "status")}
     assert replace(moved, **kept) == track
 
 

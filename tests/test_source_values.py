@@ -115,7 +115,7 @@ def test_constant_coordinate_is_reported_and_not_fused(column, name, severity, c
     comparison = compare(replace(flight, positions=(source,)))
     (found,) = source_positions.detect_constant_coordinates(comparison)
     assert (found.id, found.severity) == (name, severity)
-    assert "constant (1.25 m)" in found.message
+    assert "the value is always 1.25 m" in found.message
     assert f"EKF2_EV_CTRL {'to' if control == 2 else 'at'} {control}" in found.remedy
     assert ("down" in comparison.axes) is (column != "down_m")
 
@@ -178,7 +178,7 @@ def test_invalid_position_report_contains_times_and_effect():
     flight = aisle_flight(uwb=Uwb(gap_s=(40.0, 46.0)))
     at = pd.Index([*np.arange(40.2, 46.0, 0.2), 80.1, 80.2])
     reasons = pd.Series(["held"] * (len(at) - 2) + ["zero"] * 2, at)
-    findings = {one.id: one for one in detected(with_track(flight, invalid=reasons))}
+    findings = {one.id: one for one in detected(with_track(flight, invalid_reasons=reasons))}
     assert set(findings) == {"source_zero_positions", "source_position_held"}
     assert findings["source_zero_positions"].evidence["count"] == 2
     held = findings["source_position_held"]
@@ -190,13 +190,13 @@ def test_invalid_position_report_contains_times_and_effect():
 
 def test_single_sample_without_position_gives_only_a_note():
     invalid_rows = pd.Series(["NaN"], pd.Index([60.05]))
-    (one,) = detected(with_track(aisle_flight(), invalid=invalid_rows))
+    (one,) = detected(with_track(aisle_flight(), invalid_reasons=invalid_rows))
     assert (one.id, one.severity) == ("source_without_position", "note")
 
 
 @pytest.mark.parametrize(("step_m", "words"), [(0.5, "double precision"), (0.1, "more digits")])
 def test_rounded_positions_report_recommends_more_digits(step_m, words):
-    (one,) = detected(with_track(aisle_flight(), step_m=step_m))
+    (one,) = detected(with_track(aisle_flight(), rounding_step_m=step_m))
     assert words in one.remedy
 
 
@@ -225,7 +225,7 @@ def without_rows(flight: Flight, reason: str) -> Flight:
     return with_track(
         flight,
         samples=samples[~is_invalid],
-        invalid=pd.Series(reason, samples.index[is_invalid]),
+        invalid_reasons=pd.Series(reason, samples.index[is_invalid]),
     )
 
 
@@ -237,7 +237,7 @@ def with_clock(flight: Flight, name: str, note: str = "", distinct: int | None =
 VALUE_FAULTS = {
     "source_is_ekf2_estimate": copied,
     "source_two_senders": alternating,
-    "source_positions_rounded": lambda flight: with_track(flight, step_m=0.5),
+    "source_positions_rounded": lambda flight: with_track(flight, rounding_step_m=0.5),
     "source_timestamp_unit": lambda flight: with_clock(flight, "milliseconds"),
     "source_timestamps_shared": lambda flight: with_clock(
         flight, "local", REPEATED_TIMESTAMPS_NOTE, 120

@@ -144,4 +144,7 @@ def test_logged_parameter_default_replaces_default_of_px4_table() -> None:
     end = 19 + struct.unpack("<H", content[16:18])[0]  # of the first message after the file header
     log = read_topics("a.ulg", content[:end] + message + content[end:]).log
     assert log.parameter_defaults == {"EKF2_EV_DELAY": 175.0}
-    assert (log.default_of("EKF2_EV_DELAY"), log.default_of("EKF2_EVP_NOISE")) == (175.0, 0.1)
+    assert (log.find_default_value("EKF2_EV_DELAY"), log.find_default_value("EKF2_EVP_NOISE")) == (
+        175.0,
+        0.1,
+    )

@@ -36,7 +36,7 @@ from px4fuse.errors import SettingsError
 from px4fuse.filter.settings import Settings
 from px4fuse.findings import find
 from px4fuse.flight.model import (
-    RECEIVED_ORIGIN,
+    AS_RECEIVED_ORIGIN,
     AidLog,
     Columns,
     Flight,
@@ -463,7 +463,7 @@ def flown(
     rows = pd.DataFrame(np.hstack([vision.position_m, vision.variance_m2]), vision.timestamp_s,
                         [*Columns.POSITION, *Columns.POSITION_VARIANCE])  # fmt: skip
     track = PositionTrack(
-        vision.source, RECEIVED_ORIGIN, "external vision", rows, "NED", "boot", (vision.source,)
+        vision.source, AS_RECEIVED_ORIGIN, "external vision", rows, "NED", "boot", (vision.source,)
     )
     ekf2 = replace(flight.ekf2, aids={**flight.ekf2.aids, "ev_pos": log})
     return replace(flight, positions=(track, *flight.positions), ekf2=ekf2)

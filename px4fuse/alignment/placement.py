@@ -190,10 +190,10 @@ def align_position_file(
         log=recording.name,
         alignment=alignment,
         clock_map=clock_map,
-        invalid=invalid_reasons.set_axis(
+        invalid_reasons=invalid_reasons.set_axis(
             invalid_reasons.index + (aligned_samples.index[0] - start_s)
         ),
-        step_m=recording.rounding_step_m,
+        rounding_step_m=recording.rounding_step_m,
     )
     notes = [
         f"{recording.name}: {text}"

@@ -619,5 +619,5 @@ def _format_changed_parameters(analysis: Analysis) -> tuple[str, ...]:
         for name in (aid.noise, aid.delay, aid.gate)
         if name in PARAMETERS
         and (value := log.parameters.get(name)) is not None
-        and not math.isclose(value, default := log.default_of(name), rel_tol=1e-3)
+        and not math.isclose(value, default := log.find_default_value(name), rel_tol=1e-3)
     )

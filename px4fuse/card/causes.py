@@ -28,8 +28,8 @@ from px4fuse.core.text import lower_first, with_log_name
 from px4fuse.filter.consistency import classify_sigma_ratio
 from px4fuse.filter.tuning import HORIZONTAL, AxisTuning
 from px4fuse.finding import Finding
-from px4fuse.findings.cause_grouping import CONVENTION_KEY
-from px4fuse.findings.cause_text import format_shift
+from px4fuse.findings.cause_grouping import WRONG_CONVENTION_KEY
+from px4fuse.findings.cause_text import format_timestamp_action
 from px4fuse.findings.model import FINDING_CATALOGUE
 from px4fuse.flight.ekf2_parameters import PARAMETERS
 from px4fuse.flight.model import PositionTrack, Unavailable
@@ -109,12 +109,15 @@ def rank_causes(analysis: Analysis, cause_findings: Sequence[Finding]) -> list[R
 
 
 def _is_setting_fault(finding: Finding) -> bool:
-    rerun_kinds = FINDING_CATALOGUE[finding.id].reruns
+    rerun_kinds = FINDING_CATALOGUE[finding.id].rerun_kinds
     return bool(rerun_kinds) and rerun_kinds <= SETTING_CHANGE_KINDS
 
 
 def _find_cause_rank(finding: Finding, trials: Iterable[Trial]) -> int:
-    if FINDING_CATALOGUE[finding.id].verdict == "meaningless" or CONVENTION_KEY in finding.evidence:
+    if (
+        FINDING_CATALOGUE[finding.id].verdict == "meaningless"
+        or WRONG_CONVENTION_KEY in finding.evidence
+    ):
         return 0
     if _is_setting_fault(finding) and any(map(remains_overconfident, trials)):
         return 3
@@ -127,7 +130,7 @@ def _find_cause_rank(finding: Finding, trials: Iterable[Trial]) -> int:
 
 def find_trials_of_finding(trials: Iterable[Trial], finding: Finding) -> tuple[Trial, ...]:
     """Return the re-runs that test a finding: the best of each filter and kind of change."""
-    tested_change_kinds = FINDING_CATALOGUE[finding.id].reruns
+    tested_change_kinds = FINDING_CATALOGUE[finding.id].rerun_kinds
     tested_change_kinds |= {"defaults"} if "noises" in tested_change_kinds else set()
     best_trial_by_filter_and_kind: dict[tuple[FilterName, str], Trial] = {}
     for trial in trials:
@@ -221,7 +224,7 @@ def _make_actions(
         shift_s = offset_trial.change[CLOCK_OFFSET_KEY]
         if offset_trial.filter == "kf":
             shift_s -= analysis.settings.clock_offset_s
-        instruction = f"{lower_first(format_shift(shift_s))} the timestamp of each position"
+        instruction = f"{lower_first(format_timestamp_action(shift_s))} the timestamp of each position"
         sender_actions = [Action("sender", instruction)]
     alternative_action_groups: tuple[tuple[Action, ...], ...] = ()
     actions = delay_actions or sender_actions
@@ -279,7 +282,7 @@ def _explain_missing_action(
         return ""
     if set(verdict_by_reference.values()) == {"consistent"}:
         needs_ground_truth = (
-            FINDING_CATALOGUE[finding.id].reruns & CHANGE_KINDS_VISIBLE_ONLY_IN_TRUTH
+            FINDING_CATALOGUE[finding.id].rerun_kinds & CHANGE_KINDS_VISIBLE_ONLY_IN_TRUTH
         )
         if needs_ground_truth and "truth" not in verdict_by_reference:
             return "no change: only ground truth shows this fault, and the log has no ground truth"
@@ -393,7 +396,7 @@ def _format_closing_sentence(
     tuning = analysis.tuning.get(HORIZONTAL)
     for trial in useful_trials:
         if trial.kinds == ("noise",) and isinstance(tuning, AxisTuning):
-            default_noise_m = analysis.flight.log.default_of(next(iter(trial.change)))
+            default_noise_m = analysis.flight.log.find_default_value(next(iter(trial.change)))
             if (tuning.sigma_z.low or 0.0) <= default_noise_m <= (tuning.sigma_z.high or 0.0):
                 return (
                     f"PX4's default of {default_noise_m:g} m is inside the 95 % interval of the "

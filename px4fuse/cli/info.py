@@ -49,13 +49,13 @@ def info(log: Path, json_path: Path | None, **option_values: Any) -> None:
     not possible, and settings to log the missing data on the next flight.
     """
     from px4fuse.diagnose import read_flight
-    from px4fuse.info.inventory import take_inventory, to_json_dict
+    from px4fuse.info.inventory import list_log_contents, to_json_dict
     from px4fuse.report.inventory import make_log_page
 
     request = comparison_request(log, option_values)
     with progress(json_path) as show_progress:
         flight = read_flight(request, show_progress)
         show_progress("reading the contents of the log")
-        inventory = take_inventory(flight)
+        inventory = list_log_contents(flight)
     contents = make_result_files(to_json_dict(inventory), json_path)
     write_and_print_results(contents, make_log_page(inventory, request))

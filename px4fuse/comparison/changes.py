@@ -250,7 +250,7 @@ def _find_default_changes(log: LogInfo, ekf2_inputs: ReplayInputs) -> list[Chang
     """
     gate_parameter, logged_parameters = ekf2_inputs.aid.gate, ekf2_inputs.settings
     default_by_parameter = {
-        name: log.default_of(name) for name in (gate_parameter, *PARAMETERS_SET_TO_DEFAULT)
+        name: log.find_default_value(name) for name in (gate_parameter, *PARAMETERS_SET_TO_DEFAULT)
     }
     return [
         {name: value}

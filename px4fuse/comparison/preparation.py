@@ -17,7 +17,7 @@ from px4fuse.filter.settings import SETTING_RANGES, requested_settings
 from px4fuse.filter.signals import AISLE, MIN_MEASUREMENTS, Segment, cut_to_segment, make_axes
 from px4fuse.flight.ekf2_parameters import BAROMETER, GNSS_POS, PARAMETERS
 from px4fuse.flight.model import (
-    ALIGNED_ORIGIN,
+    ALIGNED_BY_EKF2_ORIGIN,
     HEIGHT_ONLY_REASON,
     POSITION_FILE_ORIGIN,
     Columns,
@@ -80,7 +80,9 @@ def prepare_comparison_inputs(
             source_track, origin=structs.replace(source_track.origin, kind=source_kind)
         )
     source_track = shift_clock(source_track, settings.clock_offset_s)
-    is_in_ned = source_track.origin.is_gnss or source_track.origin.path == ALIGNED_ORIGIN.path
+    is_in_ned = (
+        source_track.origin.is_gnss or source_track.origin.path == ALIGNED_BY_EKF2_ORIGIN.path
+    )
     skips_convention_check = keep_positions_as_sent or is_in_ned or flight.log.is_assessed
     convention = None if skips_convention_check else check_convention(flight, source_track)
     # A time offset from the user replaces the detected one
@@ -100,7 +102,7 @@ def prepare_comparison_inputs(
     flight = select_source_innovations(flight, source_track)
     missing_data = flight.missing
     segment = choose_segment(flight, source_track, request.start_s, request.end_s)
-    has_height = not source_track.origin.fused_as_gnss and "z" not in constant_coordinates(
+    has_height = not source_track.origin.is_fused_as_gnss and "z" not in constant_coordinates(
         source_track
     )
     axis_names = request.axes or (None if has_height else HORIZONTAL_AXES)
@@ -110,7 +112,7 @@ def prepare_comparison_inputs(
     if isinstance(flight.truth, Truth) and flight.truth.name == source_track.name:
         flight = replace(flight, truth=NO_SEPARATE_TRUTH)
     notes = (*flight.log.notes, *source_track.notes)
-    if source_track.origin.fused_as_gnss and request.sigma_z_m is None:
+    if source_track.origin.is_fused_as_gnss and request.sigma_z_m is None:
         default_noise_m = PARAMETERS[GNSS_POS.noise].default
         sigma_z_m = (
             find_observation_variance(
@@ -147,7 +149,7 @@ def prepare_comparison_inputs(
 
 def select_source_innovations(flight: Flight, track: PositionTrack) -> Flight:
     """Return a copy of the flight with EKF2's GNSS innovations if the position source is GNSS."""
-    if isinstance(flight.ekf2, Unavailable) or not track.origin.fused_as_gnss:
+    if isinstance(flight.ekf2, Unavailable) or not track.origin.is_fused_as_gnss:
         return flight
     # GNSS innovations replace those of vision, so missing vision innovations are not reported
     missing_vision_innovations = _find_missing_innovations(flight.ekf2)
@@ -260,7 +262,7 @@ def _use_barometer_height(
     The zero of a barometer is arbitrary, so its median difference to EKF2's height is removed.
     """
     ekf2, barometer_heights, log_name = flight.ekf2, flight.barometer, flight.log.name
-    if height_sensor and not track.origin.fused_as_gnss:
+    if height_sensor and not track.origin.is_fused_as_gnss:
         raise SettingsError(
             f"{log_name}: `height` needs GNSS as position source, not {track.name}."
         )
@@ -268,7 +270,7 @@ def _use_barometer_height(
         ekf2, GNSS.vertical_aid
     )
     uses_barometer = height_sensor == "barometer" or (
-        height_sensor is None and track.origin.fused_as_gnss and is_barometer_ekf2_height
+        height_sensor is None and track.origin.is_fused_as_gnss and is_barometer_ekf2_height
     )
     if not uses_barometer or barometer_heights is None:
         if height_sensor == "barometer":
@@ -334,7 +336,7 @@ def explain_missing_source(flight: Flight) -> Unavailable:
 def _explain_choice(flight: Flight, track: PositionTrack) -> str:
     if track.origin == POSITION_FILE_ORIGIN:
         return "the user gave this position file with --position"
-    if track.origin.fused_as_gnss:
+    if track.origin.is_fused_as_gnss:
         return "the only position source in the log, fused by EKF2"
     log_text = f" (from {track.log})" if track.log and track.log != flight.log.name else ""
     unusable_sources = [

@@ -283,7 +283,7 @@ def find_observation_variance(
     configured_variance_m2 = max(noise_factor * noise_m, EKF2_MIN_NOISE_M) ** 2
     # For a position file or barometer, EKF2 receives no variance: only the parameter sets R
     ignores_reported_variance = track.alignment is not None or aid == BAROMETER
-    if ignores_reported_variance or parameters.get(aid.noise_mode) == 1.0:
+    if ignores_reported_variance or parameters.get(aid.noise_mode_parameter) == 1.0:
         return configured_variance_m2
     median_variance_m2 = cut_to_segment(track.samples, segment)[Columns.POSITION_VARIANCE].median()
     reported_variance_m2 = float(np.nansum(median_variance_m2.to_numpy() * axis.direction**2))

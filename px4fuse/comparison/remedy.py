@@ -171,7 +171,7 @@ def find_logged_delay_ms(comparison: PreparedComparison) -> float | None:
     logged_delay_ms = comparison.flight.log.parameters.get(source.origin.aid.delay)
     return (
         None
-        if source.origin.fused_as_gnss and source.assumed_delay_s == 0.0 != logged_delay_ms
+        if source.origin.is_fused_as_gnss and source.assumed_delay_s == 0.0 != logged_delay_ms
         else logged_delay_ms
     )
 
@@ -202,8 +202,12 @@ def make_noise_change(
     If the sender reports a larger noise (``reported_noise_m``), a parameter makes EKF2 ignore it.
     """
     changes = {aid.noise: max(float(f"{noise_m:.2g}"), PARAMETERS[aid.noise].minimum)}
-    if aid.noise_mode and settings.get(aid.noise_mode, 0.0) == 0.0 and noise_m < reported_noise_m:
-        changes[aid.noise_mode] = 1.0
+    if (
+        aid.noise_mode_parameter
+        and settings.get(aid.noise_mode_parameter, 0.0) == 0.0
+        and noise_m < reported_noise_m
+    ):
+        changes[aid.noise_mode_parameter] = 1.0
     return changes
 
 
@@ -240,7 +244,9 @@ def make_delay_max_change(
 def find_used_noise_m(ekf2_inputs: ReplayInputs) -> float:
     """Return the median √R (m) that EKF2 used for the positions."""
     aid, logged_parameters = ekf2_inputs.aid, ekf2_inputs.settings
-    ignores_reported_noise = aid.noise_mode and logged_parameters[aid.noise_mode] == 1.0
+    ignores_reported_noise = (
+        aid.noise_mode_parameter and logged_parameters[aid.noise_mode_parameter] == 1.0
+    )
     return max(
         logged_parameters[aid.noise],
         0.0 if ignores_reported_noise else _compute_reported_noise_m(ekf2_inputs),
@@ -269,7 +275,7 @@ def make_height_noise_advice(
         return ""
     return (
         f" {EV_POS.noise} is also the noise of heights, but the height noise of the source is "
-        f"{height_noise_m:.2g} m. Set {EV_POS.noise_mode} to 0, and send each position with a "
+        f"{height_noise_m:.2g} m. Set {EV_POS.noise_mode_parameter} to 0, and send each position with a "
         f"variance of {height_noise_m**2:.2g} m² for z."
     )
 

@@ -410,7 +410,7 @@ def _replay_ekf2(
     excluded_times_s, axis_tuning = None, find_axis_tuning(tuning, HORIZONTAL)
     if OUTLIERS_KEY in change and axis_tuning is not None:
         excluded_times_s = axis_tuning.outlier_time_s - comparison.settings.clock_offset_s
-        if comparison.source.origin.fused_as_gnss:
+        if comparison.source.origin.is_fused_as_gnss:
             excluded_times_s += 1e-3 * model.inputs.settings[model.inputs.aid.delay]
         excluded_times_s += change.get(CLOCK_OFFSET_KEY, 0.0)
     (replay,) = replay_with_settings(

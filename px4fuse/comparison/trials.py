@@ -37,7 +37,7 @@ COMBINED_CHANGE_FRACTION_TOLERANCE = 0.9
 # Names of changes that correct faulty sensor data. Other changes are settings of a filter
 SENSOR_CORRECTION_KEYS = frozenset((OUTLIERS_KEY, CLOCK_OFFSET_KEY, ROTATION_KEY, FORWARD_BIAS_KEY))
 # Names of changes that have an effect only together with another change
-SECONDARY_CHANGE_KEYS = frozenset(("EKF2_DELAY_MAX", EV_POS.noise_mode, RIGHT_BIAS_KEY))
+SECONDARY_CHANGE_KEYS = frozenset(("EKF2_DELAY_MAX", EV_POS.noise_mode_parameter, RIGHT_BIAS_KEY))
 # A re-run has an effect if it changes a ratio of actual to reported σ by at least this factor
 MIN_SIGMA_RATIO_CHANGE_FACTOR = 1.10
 # A re-run has an effect if it changes the position RMSE by more than this fraction

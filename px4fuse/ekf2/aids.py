@@ -318,7 +318,7 @@ def _find_noise_parameter(aid: Aid, aid_log: AidLog, noise_sigma: float | None) 
     """Return the parameter that determines R, or another origin, such as "reported accuracy"."""
     parameter_value = aid_log.parameters.get(aid.noise)
     if noise_sigma is None or parameter_value is None:
-        return "" if noise_sigma is None else aid.noise_origin
+        return "" if noise_sigma is None else aid.noise_source_text
     for expected_noise in (
         parameter_value,
         GNSS_HEIGHT_NOISE_FACTOR * parameter_value,
@@ -326,17 +326,18 @@ def _find_noise_parameter(aid: Aid, aid_log: AidLog, noise_sigma: float | None) 
     ):
         if abs(noise_sigma - expected_noise) <= NOISE_RELATIVE_TOLERANCE * expected_noise:
             return aid.noise
-    return aid.noise_origin or aid.noise
+    return aid.noise_source_text or aid.noise
 
 
 def _find_longest_gap(
     sample_times_s: Array, is_fused: BoolArray, aid_log: AidLog, start_s: float, end_s: float
 ) -> Span:
-    is_inside = (aid_log.unknown_fusion_times_s > start_s) & (
-        aid_log.unknown_fusion_times_s < end_s
+    is_inside = (aid_log.times_with_unknown_fusion_s > start_s) & (
+        aid_log.times_with_unknown_fusion_s < end_s
     )
     gap_ends_s = np.union1d(
-        np.r_[start_s, sample_times_s[is_fused], end_s], aid_log.unknown_fusion_times_s[is_inside]
+        np.r_[start_s, sample_times_s[is_fused], end_s],
+        aid_log.times_with_unknown_fusion_s[is_inside],
     )
     gap_starts_s = gap_ends_s[:-1]
     is_enabled = np.ones(len(gap_starts_s), bool)

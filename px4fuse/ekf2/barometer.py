@@ -110,7 +110,7 @@ def _combine_barometer_samples(
     fused_bias_m = np.column_stack([previous_bias_m, bias_updates["bias_m"]]).ravel()
     # Innovations in ground effect are not used: EKF2 subtracts a dead zone from them
     rows_outside_ground_effect = logged_rows[
-        ~fusion_record.was_in_state(GROUND_EFFECT_FLAG, row_times_s)
+        ~fusion_record.was_flag_set(GROUND_EFFECT_FLAG, row_times_s)
     ]
     prediction_offset_m = (
         rows_outside_ground_effect["observation_down"]

@@ -897,8 +897,8 @@ def _collect_measurements(
     measured_values[..., 3:] = (
         received_positions.position_m[sample_indices][:, None] - lever_arm_ned_m
     )
-    if aid.noise_mode:
-        uses_reported_noise = uses_reported_noise & (parameters[aid.noise_mode] != 1.0)
+    if aid.noise_mode_parameter:
+        uses_reported_noise = uses_reported_noise & (parameters[aid.noise_mode_parameter] != 1.0)
     reported_variance = np.where(
         uses_reported_noise[:, None], received_positions.variance_m2[sample_indices][:, None], 0.0
     )

@@ -20,7 +20,7 @@ from px4fuse.ekf2.replay_segments import (
     SensorSamples,
     compute_low_pass_weights,
 )
-from px4fuse.flight.model import FLOW_FILTER_WEIGHT
+from px4fuse.flight.model import FLOW_FILTER_NEW_SAMPLE_WEIGHT
 
 
 def add_flow_samples(segment: ReplaySegment, flow: pd.DataFrame, gate: float) -> ReplaySegment:
@@ -33,7 +33,7 @@ def add_flow_samples(segment: ReplaySegment, flow: pd.DataFrame, gate: float) ->
     sample_count = flow["samples"].to_numpy()
     interval_s = flow["interval_s"].to_numpy()
     step_index, weight = compute_low_pass_weights(
-        segment, flow.index.to_numpy(), sample_count, interval_s, FLOW_FILTER_WEIGHT
+        segment, flow.index.to_numpy(), sample_count, interval_s, FLOW_FILTER_NEW_SAMPLE_WEIGHT
     )
     rotation_to_body = segment.body_to_ned[step_index].swapaxes(2, 3)[:, :, :2]
     imu_velocity_m_s = np.einsum(

@@ -90,7 +90,7 @@ def add_heights(
         sample_weight = barometer_samples["weight"].to_numpy()
     ground_effect_dead_zone_m = parameters.get("EKF2_GND_EFF_DZ", DEFAULT_DEAD_ZONE_M)
     dead_zone_m = np.where(
-        fusion_record.was_in_state(GROUND_EFFECT_FLAG, measurement_times_s),
+        fusion_record.was_flag_set(GROUND_EFFECT_FLAG, measurement_times_s),
         ground_effect_dead_zone_m,
         0.0,
     )

@@ -365,7 +365,7 @@ def find_replay_segments(
     magnetic_field_span_s = _find_field_fusion_span(fusion_record) if is_gnss else None
     cut_times_s += magnetic_field_span_s[1:] if magnetic_field_span_s else ()
     # The replay restarts when another EKF2 instance becomes primary, because its state differs
-    cut_times_s += [time_s for time_s, _ in ekf2.instances[1:]]
+    cut_times_s += [time_s for time_s, _ in ekf2.primary_instances[1:]]
     parameter_changes = [change for change in ekf2.parameter_changes if change.name in PARAMETERS]
     cut_times_s += [change.time_s for change in parameter_changes]
 
@@ -565,10 +565,10 @@ def _make_segment(
         state=np.concatenate(
             [attitude_error_rad[0], initial_row[Columns.VELOCITY], position_m, np.zeros(6)]
         ),
-        variance=np.asarray(initial_row[Columns.DELAYED_VARIANCE[:15]]),
+        variance=np.asarray(initial_row[Columns.FUSION_HORIZON_VARIANCE[:15]]),
         down_m=_interpolate(ekf2.state[["down_m"]], step_times_s)[:, 0],
         attitude_variance_rad2=_interpolate(
-            fusion_record.delayed[Columns.DELAYED_VARIANCE[:3]], step_times_s
+            fusion_record.delayed[Columns.FUSION_HORIZON_VARIANCE[:3]], step_times_s
         ).astype(np.float32),
         down_variance_m2=_interpolate(fusion_record.delayed[["down_m2"]], step_times_s)[:, 0],
         attitude_error_rad=_interpolate(
@@ -576,7 +576,7 @@ def _make_segment(
         ).astype(np.float32),
         state_correlation=np.eye(15),
         is_acceleration_bad=(
-            fusion_record.was_in_state(BAD_ACCELERATION_FLAG, step_times_s)
+            fusion_record.was_flag_set(BAD_ACCELERATION_FLAG, step_times_s)
             if BAD_ACCELERATION_FLAG in fusion_record.states
             else None
         ),
@@ -617,12 +617,12 @@ def _add_magnetic_field(
         measurement_times_s,
         field_gauss.iloc[:, :3].to_numpy(),
         fused_samples_per_row,
-        np.asarray(initial_row[[*Columns.EARTH_FIELD, *Columns.BODY_FIELD]]),
-        np.asarray(initial_row[Columns.DELAYED_VARIANCE[-6:]]),
+        np.asarray(initial_row[[*Columns.EARTH_MAGNETIC_FIELD, *Columns.BODY_MAGNETIC_FIELD]]),
+        np.asarray(initial_row[Columns.FUSION_HORIZON_VARIANCE[-6:]]),
     )
-    if Columns.FIELD_INNOVATION[0] not in field_gauss:
+    if Columns.MAGNETIC_FIELD_INNOVATION[0] not in field_gauss:
         return extended_segment
-    filtered_nu_gauss = field_gauss[Columns.FIELD_INNOVATION].to_numpy()
+    filtered_nu_gauss = field_gauss[Columns.MAGNETIC_FIELD_INNOVATION].to_numpy()
     return replace(
         extended_segment,
         field=_compute_mean_field(
@@ -670,7 +670,7 @@ def _compute_mean_field(
     rotation_to_body = segment.body_to_ned[step_indices].swapaxes(2, 3)
     earth_field_gauss, body_field_gauss = (
         _interpolate(delayed_state[names], measurement_times_s)
-        for names in (Columns.EARTH_FIELD, Columns.BODY_FIELD)
+        for names in (Columns.EARTH_MAGNETIC_FIELD, Columns.BODY_MAGNETIC_FIELD)
     )
     rotated_earth_field = earth_field_gauss[:, None] - np.cross(
         segment.attitude_error_rad[step_indices], earth_field_gauss[:, None]

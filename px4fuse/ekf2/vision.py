@@ -128,7 +128,7 @@ class VisionFilter:
         self.is_gnss_off = ~is_enabled_by_aid[GNSS_POS.name]
         self.gate_squared = np.maximum(parameters[EV_POS.gate], MIN_INNOVATION_GATE)[:, None] ** 2
         reported_variance = samples[5:7] * (
-            uses_reported_noise & (parameters[EV_POS.noise_mode] != 1.0)
+            uses_reported_noise & (parameters[EV_POS.noise_mode_parameter] != 1.0)
         )
         min_variance = np.maximum(parameters[EV_POS.noise], MIN_NOISE_SIGMA) ** 2
         gnss_variance = np.where(self.is_gnss_off, 0.0, parameters[GNSS_POS.noise] ** 2)

@@ -36,7 +36,7 @@ from px4fuse.findings import (
     source_values,
 )
 from px4fuse.findings.cause_grouping import group_by_cause
-from px4fuse.findings.model import FINDING_TITLES, split_cause_groups, warning
+from px4fuse.findings.model import FINDING_TITLES, make_warning, split_cause_groups
 from px4fuse.flight.model import Ekf2, Flight
 from px4fuse.loop.model import Loop
 from px4fuse.readers.px4_positions import NO_FIX_ACTION
@@ -97,7 +97,7 @@ def find_aid_findings(
     for item in flight.missing if flight is not None else ():
         if item.remedy == NO_FIX_ACTION:
             message = f"The GNSS receiver had no position: {item.reason}."
-            findings.append(warning("source_without_position", message, item.remedy))
+            findings.append(make_warning("source_without_position", message, item.remedy))
     if flight is not None and isinstance(flight.ekf2, Ekf2):
         spans_s = find_airborne_spans(flight) or ((0.0, flight.log.duration_s),)
         segment = Segment(spans_s[0][0], spans_s[-1][1], "")

@@ -11,23 +11,23 @@ from px4fuse.core.record import Span
 from px4fuse.core.text import format_number, format_ratio
 from px4fuse.ekf2.aids import CHANGE_WINDOW_S, AidResult
 from px4fuse.finding import Finding
-from px4fuse.findings.cause_grouping import CAUSE_KEY, INNOVATION_SHIFT_CAUSE, SOURCE_SENSOR_CAUSE
-from px4fuse.findings.model import Findings, finding, format_percent, note, warning
+from px4fuse.findings.cause_grouping import CAUSE_KEY, INNOVATION_CHANGE_CAUSE, SOURCE_SENSOR_CAUSE
+from px4fuse.findings.model import Findings, finding, format_percent, make_note, make_warning
 from px4fuse.flight.ekf2_parameters import AIDS, BAROMETER, MAG
 from px4fuse.flight.model import BAD_ACCELERATION_FLAG, Unavailable
 
-# Aiding sources of external vision, which other modules test by replays of EKF2
-AIDS_OF_OTHER_DETECTORS = ("ev_pos", "ev_hgt")
+# Aiding sources of external vision; the other detectors test them in replays of EKF2
+AIDS_TESTED_BY_REPLAY = ("ev_pos", "ev_hgt")
 # A barometer gap that begins within this time (s) after take-off is normal: ground effect
 GROUND_EFFECT_DURATION_S = 10.0
-# Minimum ratio of EKF2's largest height error in a barometer gap to the height RMSE outside the
-# gap; only above this ratio, a finding states the error
-MIN_GAP_HEIGHT_ERROR_RATIO = 3.0
-# Aiding sources whose vertical innovations can set EKF2's flag for a bad vertical acceleration
-VERTICAL_AIDS = ("gnss_vel", "gnss_hgt", "baro_hgt")
+# The finding on a barometer gap states EKF2's largest height error in the gap if this error exceeds
+# the height RMSE outside the gap by this factor
+MIN_GAP_ERROR_TO_HEIGHT_RMSE_RATIO = 3.0
+# Aiding sources whose vertical innovations EKF2 tests to flag a bad vertical acceleration
+AIDS_OF_VERTICAL_ACCELERATION_TEST = ("gnss_vel", "gnss_hgt", "baro_hgt")
 # The finding is a note if EKF2 flags its vertical acceleration as bad for at most this fraction of
 # the time, otherwise a warning
-MAX_FLAGGED_FRACTION_FOR_NOTE = 0.3
+MAX_BAD_ACCELERATION_FRACTION_FOR_NOTE = 0.3
 # Action if EKF2 does not fuse a sensor, by the PX4 parameter that enables the fusion of the sensor
 ACTION_BY_SWITCH = {
     "EKF2_BARO_CTRL": "Shield the barometer from propeller wash and light.",
@@ -65,24 +65,24 @@ def detect_bad_acceleration(analysis: Analysis, aids: Mapping[str, AidResult]) -
     state_times_s = state_times_s[
         (state_times_s >= analysis.segment.start_s) & (state_times_s <= analysis.segment.end_s)
     ]
-    is_flagged_bad = ekf2.record.was_in_state(BAD_ACCELERATION_FLAG, state_times_s)
+    is_flagged_bad = ekf2.record.was_flag_set(BAD_ACCELERATION_FLAG, state_times_s)
     if not is_flagged_bad.any():
         return
     too_small_noises = {
         AIDS[name].noise
-        for name in VERTICAL_AIDS
+        for name in AIDS_OF_VERTICAL_ACCELERATION_TEST
         if name in aids and aids[name].verdict == "overconfident"
     }
-    cause = "Normal measurement noise can set the flag fs_bad_acc_vertical for some seconds."
-    remedy = "If EKF2 sets the flag for longer, check the IMU for vibration and clipping."
+    cause = "Normal measurement noise can set EKF2's flag fs_bad_acc_vertical for some seconds."
+    remedy = "If fs_bad_acc_vertical stays set, check the IMU for vibration and clipping."
     if too_small_noises:
         parameters_text = " and ".join(sorted(too_small_noises))
-        cause = f"The noise of EKF2 is set too small: {parameters_text}."
+        cause = f"EKF2's measurement noise is set too small: {parameters_text}."
         remedy = f"Increase {parameters_text} to the true noise of the sensor."
     flagged_fraction = float(is_flagged_bad.mean())
     start_s = float(state_times_s[is_flagged_bad.argmax()])
     yield finding(
-        "warning" if flagged_fraction > MAX_FLAGGED_FRACTION_FOR_NOTE else "note",
+        "warning" if flagged_fraction > MAX_BAD_ACCELERATION_FRACTION_FOR_NOTE else "note",
         "ekf2_acceleration_bad",
         f"EKF2 flags its vertical acceleration as bad for {format_percent(flagged_fraction)} of "
         f"the time, first at {start_s:.0f} s. Barometer and GNSS both measure a larger height than "
@@ -103,9 +103,9 @@ def detect_aid_faults(
     ``source_aid`` is the aiding source whose positions KF uses, ``height_error_m`` is EKF2's height
     error in a barometer gap, if large.
     """
-    tested_aids = {name: aid for name, aid in aids.items() if name not in AIDS_OF_OTHER_DETECTORS}
+    aids_to_test = {name: aid for name, aid in aids.items() if name not in AIDS_TESTED_BY_REPLAY}
     unfused_aids_by_switch: dict[str, list[AidResult]] = {}
-    for name, aid in tested_aids.items():
+    for name, aid in aids_to_test.items():
         is_take_off_gap = name == BAROMETER.name and any(
             start <= aid.longest_gap_s[0] <= start + GROUND_EFFECT_DURATION_S
             for start in take_off_times_s
@@ -114,10 +114,10 @@ def detect_aid_faults(
             unfused_aids_by_switch.setdefault(AIDS[name].switch or name, []).append(aid)
     for fusion_parameter, aids_of_sensor in unfused_aids_by_switch.items():
         yield _make_not_fused_finding(fusion_parameter, aids_of_sensor, source_aid, height_error_m)
-    for name, aid in tested_aids.items():
-        sensor_cause = _find_sensor_cause(AIDS[name].switch, source_aid)
+    for name, aid in aids_to_test.items():
+        sensor_cause = _find_source_sensor_cause(AIDS[name].switch, source_aid)
         if not sensor_cause and any(result.change for result in aid.axes.values()):
-            yield _make_innovation_shift_finding(name, aid)
+            yield _make_innovation_change_finding(name, aid)
         elif aid.verdict == "overconfident" and name != source_aid:
             yield _make_overconfident_finding(name, aid, sensor_cause)
         elif aid.verdict == "biased":
@@ -130,7 +130,7 @@ def _make_not_fused_finding(
     source_aid: str,
     height_error_m: float | None,
 ) -> Finding:
-    longest_gap_aid = max(aids_of_sensor, key=lambda aid: aid.longest_gap_duration_s)
+    aid_with_longest_gap = max(aids_of_sensor, key=lambda aid: aid.longest_gap_duration_s)
     aid_labels_text = ", ".join(_format_aid_label(aid) for aid in aids_of_sensor)
     has_innovation_shift = any(axis.change for aid in aids_of_sensor for axis in aid.axes.values())
     is_barometer, height_error_text = fusion_parameter == BAROMETER.switch, ""
@@ -140,26 +140,30 @@ def _make_not_fused_finding(
         "note" if is_barometer and not height_error_text else "warning",
         "aid_not_fused",
         f"EKF2 fused no sample of {aid_labels_text} for "
-        f"{longest_gap_aid.longest_gap_duration_s:.0f} s{height_error_text}. EKF2 rejected "
-        f"{format_percent(longest_gap_aid.rejected_fraction)} of the samples, and relied on "
+        f"{aid_with_longest_gap.longest_gap_duration_s:.0f} s{height_error_text}. EKF2 rejected "
+        f"{format_percent(aid_with_longest_gap.rejected_fraction)} of the samples, and relied on "
         "the IMU and other aiding sources.",
         ACTION_BY_SWITCH.get(fusion_parameter, DEFAULT_ACTION),
         {
             "aid": aid_labels_text,
-            "longest_gap_s": longest_gap_aid.longest_gap_duration_s,
-            "rejected_fraction": longest_gap_aid.rejected_fraction,
-            CAUSE_KEY: _find_sensor_cause(fusion_parameter, source_aid)
-            or (INNOVATION_SHIFT_CAUSE if has_innovation_shift else ""),
+            "longest_gap_s": aid_with_longest_gap.longest_gap_duration_s,
+            "rejected_fraction": aid_with_longest_gap.rejected_fraction,
+            CAUSE_KEY: _find_source_sensor_cause(fusion_parameter, source_aid)
+            or (INNOVATION_CHANGE_CAUSE if has_innovation_shift else ""),
         },
-        (longest_gap_aid.longest_gap_s,),
+        (aid_with_longest_gap.longest_gap_s,),
     )
 
 
-def _make_innovation_shift_finding(name: str, aid: AidResult) -> Finding:
-    shifts_by_axis = {axis: result.change for axis, result in aid.axes.items() if result.change}
-    axis, (time_s, mean_change) = max(shifts_by_axis.items(), key=lambda item: abs(item[1][1]))
+def _make_innovation_change_finding(name: str, aid: AidResult) -> Finding:
+    innovation_change_by_axis = {
+        axis: result.change for axis, result in aid.axes.items() if result.change
+    }
+    axis, (time_s, mean_change) = max(
+        innovation_change_by_axis.items(), key=lambda item: abs(item[1][1])
+    )
     innovation_sigma = aid.axes[axis].s_sqrt_median
-    return warning(
+    return make_warning(
         "aid_innovation_shift",
         f"{_format_aid_label(aid)}: the mean {axis} innovation shifts by "
         f"{format_number(abs(mean_change) * innovation_sigma, 2)} {aid.unit} at {time_s:.0f} s. "
@@ -180,7 +184,7 @@ def _make_overconfident_finding(name: str, aid: AidResult, sensor_cause: str) ->
     noise_text = ""
     if aid.noise is not None:
         noise_text = f" ({format_number(aid.noise)} {aid.unit}, from {aid.noise_from})"
-    return warning(
+    return make_warning(
         "aid_overconfident",
         f"EKF2 is overconfident about {_format_aid_label(aid)}: σ is "
         f"{format_ratio(aid.nis_mean**0.5)} times too small. The mean NIS is "
@@ -202,12 +206,12 @@ def _make_innovation_bias_finding(name: str, aid: AidResult) -> Finding:
     axis, worst_axis = max(
         aid.axes.items(), key=lambda item: abs(item[1].mean_normalised_innovation)
     )
-    return note(
+    return make_note(
         "aid_innovation_bias",
-        f"{_format_aid_label(aid)}: the {axis} innovation has a mean of "
-        f"{format_number(worst_axis.innovation_mean)} {aid.unit} (√S "
-        f"{format_number(worst_axis.s_sqrt_median)} {aid.unit}). This aiding source "
-        "contradicts another one.",
+        f"{_format_aid_label(aid)}: the mean {axis} innovation is "
+        f"{format_number(worst_axis.innovation_mean)} {aid.unit}, expected 0 (√S "
+        f"{format_number(worst_axis.s_sqrt_median)} {aid.unit}). The sensor "
+        "contradicts another sensor.",
         "Calibrate the sensor. Changed noise settings do not correct a bias.",
         {
             "aid": name,
@@ -229,7 +233,7 @@ def _find_large_height_error_m(analysis: Analysis, span_s: Span) -> float | None
     largest_error_m = float(error_m[is_in_span].max())
     return (
         largest_error_m
-        if largest_error_m > MIN_GAP_HEIGHT_ERROR_RATIO * rmse_outside_gap_m
+        if largest_error_m > MIN_GAP_ERROR_TO_HEIGHT_RMSE_RATIO * rmse_outside_gap_m
         else None
     )
 
@@ -238,5 +242,6 @@ def _format_aid_label(aid: AidResult) -> str:
     return f"the {aid.label}" if aid.label in (BAROMETER.label, MAG.label) else aid.label
 
 
-def _find_sensor_cause(fusion_parameter: str, source_aid: str) -> str:
+def _find_source_sensor_cause(fusion_parameter: str, source_aid: str) -> str:
+    """Return SOURCE_SENSOR_CAUSE if the parameter enables the sensor of KF's positions, else ""."""
     return SOURCE_SENSOR_CAUSE if source_aid and AIDS[source_aid].switch == fusion_parameter else ""

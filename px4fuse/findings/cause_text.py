@@ -33,11 +33,11 @@ def classify_cause(analysis: Analysis, cause: Trial | None) -> str:
         trials.OUTLIERS_KEY: kinds.OUTLIER_CAUSE,
         trials.CLOCK_OFFSET_KEY: kinds.CLOCK_CAUSE,
         aid.delay: kinds.CLOCK_CAUSE,
-        trials.ROTATION_KEY: kinds.FRAME_CAUSE,
+        trials.ROTATION_KEY: kinds.MISALIGNED_FRAME_CAUSE,
         trials.FORWARD_BIAS_KEY: kinds.ACCELEROMETER_CAUSE,
         changes.SIGMA_Z: kinds.MEASUREMENT_NOISE_CAUSE,
         aid.noise: kinds.MEASUREMENT_NOISE_CAUSE,
-        aid.gate: kinds.GATE_CAUSE,
+        aid.gate: kinds.WRONG_GATE_CAUSE,
     }
     return next(
         (kind for name, kind in kind_by_change.items() if name in cause.change),
@@ -45,8 +45,8 @@ def classify_cause(analysis: Analysis, cause: Trial | None) -> str:
     )
 
 
-def is_refuted(analysis: Analysis, filter_name: FilterName, cause: Trial) -> bool:
-    """Return True if the change corrects neither σ nor RMSE in a re-run along the main axis."""
+def rerun_refutes_cause(analysis: Analysis, filter_name: FilterName, cause: Trial) -> bool:
+    """Return True if a change improves neither σ nor RMSE in a re-run along the main axis."""
     return any(
         (trial.filter, trial.change) == (filter_name, cause.change)
         and can_show_improvement(trial)
@@ -69,10 +69,10 @@ def _find_used_settings(analysis: Analysis) -> Mapping[str, float]:
     return {} if isinstance(ekf2_model, Unavailable) else ekf2_model.inputs.settings
 
 
-def format_explained_fraction(cause: Trial, statistic: Statistic) -> str:
-    """Format by how much a change moves ln(mean NIS) or ln(mean NEES) towards 0, its ideal."""
+def describe_explained_part(cause: Trial, statistic: Statistic) -> str:
+    """Describe the part of a wrong mean NIS, mean NEES or difference that a change explains."""
     if makes_overconfident(cause, statistic):
-        return "contradicts ground truth"
+        return "σ too small against ground truth"
     if statistic != "difference" and brings_inside_limits(cause, statistic):
         return "all"
     fraction = compute_explained_fraction(cause, statistic)
@@ -85,7 +85,7 @@ def format_action(analysis: Analysis, change: Mapping[str, float]) -> str:
     actions, change = [], dict(change)
     is_gnss = analysis.source.origin.is_gnss
     if change.pop(trials.OUTLIERS_KEY, None):
-        actions.append(find_source_texts(analysis.source).outliers_action)
+        actions.append(find_source_texts(analysis.source).outlier_action)
     if change.pop(trials.FORWARD_BIAS_KEY, None) is not None:
         actions.append("Calibrate the accelerometer and the level horizon.")
         change.pop(trials.RIGHT_BIAS_KEY)
@@ -97,7 +97,7 @@ def format_action(analysis: Analysis, change: Mapping[str, float]) -> str:
             else f"Rotate the positions by {rotation_deg:+.0f}° before they are sent."
         )
     if (offset_s := change.pop(trials.CLOCK_OFFSET_KEY, None)) is not None:
-        actions.append(f"{format_shift(offset_s)} the position timestamps before sending.")
+        actions.append(f"{format_timestamp_action(offset_s)} before sending.")
     settings = {name: change.pop(name) for name in changes.KF_NOISE_SETTINGS & change.keys()}
     if change:
         change = select_changed_settings(change, _find_used_settings(analysis))
@@ -107,8 +107,10 @@ def format_action(analysis: Analysis, change: Mapping[str, float]) -> str:
     return " ".join(actions)
 
 
-def format_shift(shift_s: float) -> str:
-    return f"Subtract {-shift_s:.3f} s from" if shift_s < 0 else f"Add {shift_s:.3f} s to"
+def format_timestamp_action(shift_s: float) -> str:
+    """Format the action for a time offset: "Add 0.1 s to the timestamp of each position"."""
+    shift_text = f"Subtract {-shift_s:.3f} s from" if shift_s < 0 else f"Add {shift_s:.3f} s to"
+    return f"{shift_text} the timestamp of each position"
 
 
 def format_kf_settings(settings: Mapping[str, float]) -> str:

@@ -15,7 +15,7 @@ from px4fuse.core.text import format_factor
 from px4fuse.filter.consistency import classify_sigma_ratio
 from px4fuse.filter.tuning import HORIZONTAL, AxisTuning
 from px4fuse.finding import Severity
-from px4fuse.findings.cause_grouping import CAUSE_KEY, REPORTED_VARIANCE_CAUSE
+from px4fuse.findings.cause_grouping import CAUSE_KEY, REPORTED_VARIANCE_USED_BY_EKF2_CAUSE
 from px4fuse.findings.model import Findings, finding, format_percent
 from px4fuse.flight.model import Unavailable, source_name
 
@@ -23,11 +23,11 @@ from px4fuse.flight.model import Unavailable, source_name
 # smaller factors hardly change EKF2's position error
 MIN_NOISE_FACTOR_FOR_ERROR = 2.0
 # The first sentence of the message states the fraction of rejected positions from this value on
-MIN_STATED_REJECTED_FRACTION = 0.05
+MIN_REJECTED_FRACTION_IN_MESSAGE = 0.05
 
 
 def detect(analysis: Analysis) -> Findings:
-    """Detect a wrong EKF2 measurement noise: EKF2 is consistent in a replay with the estimate."""
+    """Detect a wrong noise parameter: a replay with the estimated noise makes EKF2 consistent."""
     trial, aid = find_confirmed_noise_trial(analysis), find_aid(analysis)
     if trial is None:
         return
@@ -35,15 +35,15 @@ def detect(analysis: Analysis) -> Findings:
     inputs = analysis.ekf2_model.inputs
     used_noise_m, estimated_noise_m = find_used_noise_m(inputs), trial.change[aid.noise]
     # EKF2 uses the larger one: the σ that the source reports, or the noise parameter
-    is_noise_from_source = used_noise_m > inputs.settings[aid.noise]
+    uses_reported_sigma = used_noise_m > inputs.settings[aid.noise]
     ratio, is_set_too_small = estimated_noise_m / used_noise_m, estimated_noise_m > used_noise_m
     factor, size_word = max(ratio, 1.0 / ratio), "small" if is_set_too_small else "large"
     sensor_name = source_name(analysis.source)
-    is_kf_noise_equal = analysis.source.origin.is_gnss and math.isclose(
+    is_kf_noise_equal_to_ekf2 = analysis.source.origin.is_gnss and math.isclose(
         analysis.settings.sigma_z_m, used_noise_m, rel_tol=1e-2
     )
     rejected_fraction = analysis.main.rejected_fraction or 0.0
-    if rejected_fraction >= MIN_STATED_REJECTED_FRACTION:
+    if rejected_fraction >= MIN_REJECTED_FRACTION_IN_MESSAGE:
         effect_text = f": EKF2 rejects {format_percent(rejected_fraction)} of the positions"
         reason = f"EKF2 rejects normal {sensor_name} noise as outliers and relies on the IMU."
     else:
@@ -52,23 +52,25 @@ def detect(analysis: Analysis) -> Findings:
             f"With a noise of {used_noise_m:.3g} m, EKF2's gain is too {gain_size_word}, and its "
             f"reported σ is too {size_word}."
         )
-    name = "EKF2's position noise" if is_noise_from_source else aid.noise
+    name = "EKF2's position noise" if uses_reported_sigma else aid.noise
     title = f"{name} is {format_factor(factor)} times too {size_word}{effect_text}"
-    is_default_noise = used_noise_m == analysis.flight.log.default_of(aid.noise)
-    # PX4's default suits usual sensors: if it is too small, the sensor is noisier than usual
+    is_default_noise = used_noise_m == analysis.flight.log.find_default_value(aid.noise)
+    # PX4's default suits usual sensors. If the default is too small, this sensor is noisier than
+    # usual
     if is_set_too_small and is_default_noise:
-        filter_names = "KF and EKF2" if is_kf_noise_equal else "EKF2"
+        filter_names = "KF and EKF2" if is_kf_noise_equal_to_ekf2 else "EKF2"
         title = (
             f"{sensor_name} noise is {format_factor(factor)} times the noise setting of "
             f"{filter_names}{effect_text}"
         )
     source_sentence = ""
     variance_action = ""
-    if is_noise_from_source:
+    if uses_reported_sigma:
         variance_action = (
-            f", or report a variance of {estimated_noise_m**2:.2g} m² with each position"
+            f" Alternatively, report a variance of {estimated_noise_m**2:.2g} m² with each "
+            "position."
         )
-        mode_text = f" ({aid.noise_mode} 0)" if aid.noise_mode else ""
+        mode_text = f" ({aid.noise_mode_parameter} 0)" if aid.noise_mode_parameter else ""
         source_sentence = (
             f"EKF2 uses the σ that {sensor_name} reports{mode_text}, because this σ is larger than "
             f"{aid.noise} ({inputs.settings[aid.noise]:g} m). "
@@ -89,15 +91,15 @@ def detect(analysis: Analysis) -> Findings:
         f"{title}. {name} is {used_noise_m:.3g} m; the maximum-likelihood estimate is "
         f"{estimated_noise_m:.3g} m{interval_text}. "
         f"{source_sentence}{reason}"
-        f"{f' KF takes SIGMA_Z from {aid.noise}.' if is_kf_noise_equal else ''}",
-        f"Set {format_settings(select_changed_settings(trial.change, inputs.settings))}"
-        f"{variance_action}."
+        f"{f' KF takes SIGMA_Z from {aid.noise}.' if is_kf_noise_equal_to_ekf2 else ''}",
+        f"Set {format_settings(select_changed_settings(trial.change, inputs.settings))}."
+        f"{variance_action}"
         f"{make_height_noise_advice(analysis, analysis.tuning, estimated_noise_m)}",
         {
             "flown_m": used_noise_m,
             "estimate_m": estimated_noise_m,
             "factor": ratio,
-            CAUSE_KEY: REPORTED_VARIANCE_CAUSE if is_noise_from_source else "",
+            CAUSE_KEY: REPORTED_VARIANCE_USED_BY_EKF2_CAUSE if uses_reported_sigma else "",
         },
     )
 

@@ -1,4 +1,4 @@
-"""Positions that EKF2 fuses never, with interruptions or late; an invalid EKF2 position."""
+"""Detect positions that EKF2 does not fuse or fuses late, and an invalid EKF2 position."""
 
 import numpy as np
 import pandas as pd
@@ -19,8 +19,8 @@ from px4fuse.findings.model import (
     find_spans_with_value,
     finding,
     format_percent,
-    note,
-    warning,
+    make_note,
+    make_warning,
 )
 from px4fuse.flight.model import (
     POSITION_FILE_ORIGIN,
@@ -35,9 +35,9 @@ from px4fuse.flight.model import (
 FUSED_FRACTION_FOR_ERROR = 0.5
 # Missing fusion is reported if EKF2 fuses the positions for less than this fraction of the time
 FUSED_FRACTION_FOR_WARNING = 0.98
-# Minimum mean interval (s) between positions to test for a late start of fusion: due to jitter,
-# single intervals then exceed EV_START_INTERVAL_S
-MIN_LATE_START_INTERVAL_S = 0.18
+# A late start of fusion is possible if the mean interval between positions is at least this (s).
+# Jitter then makes single intervals longer than EV_START_INTERVAL_S
+MIN_INTERVAL_FOR_LATE_START_S = 0.18
 MOTION_CAPTURE_TOPIC = "vehicle_mocap_odometry"
 # An invalid EKF2 position is reported from this distance (m) to ground truth or source on
 MIN_INVALID_POSITION_ERROR_M = 1.0
@@ -48,10 +48,10 @@ def detect(analysis: Comparison) -> Findings:
         return
     if isinstance(analysis.flight.ekf2, Ekf2):
         yield from _detect_invalid_position(analysis, analysis.flight.ekf2)
-    yield from detect_missing_fusion(analysis)
+    yield from detect_unfused_positions(analysis)
 
 
-def detect_missing_fusion(analysis: PreparedComparison) -> Findings:
+def detect_unfused_positions(analysis: PreparedComparison) -> Findings:
     ekf2, source = analysis.flight.ekf2, _find_received_source(analysis)
     if not isinstance(ekf2, Ekf2) or isinstance(ekf2.fusion_flags, Unavailable):
         return
@@ -68,11 +68,10 @@ def detect_missing_fusion(analysis: PreparedComparison) -> Findings:
     }
     if aid is None:
         if source.name == MOTION_CAPTURE_TOPIC and not fused_fraction:
-            yield warning(
+            yield make_warning(
                 "ekf2_not_fusing",
-                f"EKF2 never fused the {positions_text}: EKF2 does not read {source.name}. PX4 "
-                "writes ATT_POS_MOCAP, and ODOMETRY of estimator type MOCAP, to this topic as "
-                "ground truth.",
+                f"EKF2 never fused the {positions_text}: EKF2 does not read {source.name}. This "
+                "topic contains ground truth: ATT_POS_MOCAP, or ODOMETRY of estimator type MOCAP.",
                 "To fuse these positions, send VISION_POSITION_ESTIMATE, or ODOMETRY of "
                 "estimator type VISION.",
                 evidence,
@@ -95,7 +94,7 @@ def detect_missing_fusion(analysis: PreparedComparison) -> Findings:
         f"{title}{unmet_condition.fault and ': '}{unmet_condition.fault}. {unmet_condition.reason}"
     )
     if fused_fraction < FUSED_FRACTION_FOR_ERROR:
-        is_disabled_gnss = source.origin.fused_as_gnss and unmet_condition.condition == "switch"
+        is_disabled_gnss = source.origin.is_fused_as_gnss and unmet_condition.condition == "switch"
         yield finding(
             "note" if is_disabled_gnss else "error",
             "ekf2_not_fusing",
@@ -105,10 +104,10 @@ def detect_missing_fusion(analysis: PreparedComparison) -> Findings:
             spans if fused_fraction else (),
         )
     else:
-        yield warning(
+        yield make_warning(
             "ekf2_fusion_interrupted",
             f"{message} For up to {longest_span_s[1] - longest_span_s[0]:.1f} s EKF2 relied on the "
-            "IMU and its other aiding sources.",
+            "IMU and other aiding sources.",
             action,
             evidence,
             spans,
@@ -134,9 +133,9 @@ def _detect_invalid_position(analysis: Comparison, ekf2: Ekf2) -> Findings:
     distance_m = _find_largest_distance_m(analysis, ekf2, spans)
     if distance_m < MIN_INVALID_POSITION_ERROR_M:
         return
-    reference = "ground truth" if isinstance(analysis.flight.truth, Truth) else "source"
+    reference = "ground truth" if isinstance(analysis.flight.truth, Truth) else "position source"
     distance_sentence = (
-        f" During that time EKF2 is up to {format_metres(distance_m)} m from the {reference}."
+        f" The invalid position is up to {format_metres(distance_m)} m from the {reference}."
     )
     if not np.isfinite(distance_m):
         distance_sentence = ""
@@ -145,8 +144,8 @@ def _detect_invalid_position(analysis: Comparison, ekf2: Ekf2) -> Findings:
         "ekf2_position_invalid",
         f"EKF2's horizontal position is invalid {format_percent(invalid_fraction)} of the time "
         f"(xy_valid 0), and PX4 does not use this position.{distance_sentence}",
-        "Restore the fusion of positions first. While EKF2's position is invalid, its errors do "
-        "not depend on noise settings.",
+        "First restore the fusion of positions. The error of an invalid EKF2 position does not "
+        "depend on noise settings.",
         {"invalid_fraction": invalid_fraction, "distance_m": distance_m},
         spans,
     )
@@ -157,12 +156,12 @@ def _find_largest_distance_m(analysis: Comparison, ekf2: Ekf2, spans: tuple[Span
     truth, columns = analysis.flight.truth, ["north_m", "east_m"]
     reference = truth.samples if isinstance(truth, Truth) else analysis.source.samples
     ekf2_position_m = pd.concat([ekf2.state[columns].loc[start:end] for start, end in spans])
-    distances_m = [
+    differences_m = [
         ekf2_position_m[axis]
         - np.interp(ekf2_position_m.index, reference.index, reference[axis], np.nan, np.nan)
         for axis in columns
     ]
-    return float(np.hypot(*distances_m).max())
+    return float(np.hypot(*differences_m).max())
 
 
 def _detect_slow_restart(
@@ -175,19 +174,19 @@ def _detect_slow_restart(
         or not source.origin.is_vision
         or not source.origin.has_all_samples
         or source.alignment
-        or 1.0 / rate_hz < MIN_LATE_START_INTERVAL_S
+        or 1.0 / rate_hz < MIN_INTERVAL_FOR_LATE_START_S
     ):
         return
     time_s = source.samples.index.to_numpy()
     gap_ends_s = time_s[1:][np.diff(time_s) > EV_STOP_INTERVAL_S]
     restart_delay_spans = []
     for start_s, end_s in find_spans_with_value(0.0, fusion_flag, analysis.segment):
-        gap_ends_without_fusion_s = gap_ends_s[
+        gap_ends_while_not_fusing_s = gap_ends_s[
             (gap_ends_s > start_s - EV_STOP_INTERVAL_S) & (gap_ends_s < end_s)
         ]
-        if not len(gap_ends_without_fusion_s):
+        if not len(gap_ends_while_not_fusing_s):
             continue
-        unfused_times_s = time_s[(time_s >= gap_ends_without_fusion_s[-1]) & (time_s < end_s)]
+        unfused_times_s = time_s[(time_s >= gap_ends_while_not_fusing_s[-1]) & (time_s < end_s)]
         if (
             len(unfused_times_s) > 2
             and unfused_times_s[1] - unfused_times_s[0] >= EV_START_INTERVAL_S
@@ -195,7 +194,7 @@ def _detect_slow_restart(
             restart_delay_spans.append((float(unfused_times_s[0]), end_s))
     if restart_delay_spans:
         longest_delay_s = max(end - start for start, end in restart_delay_spans)
-        yield note(
+        yield make_note(
             "source_rate_at_limit",
             f"After a gap EKF2 resumed fusion {longest_delay_s:.1f} s late: "
             f"{positions_phrase(source)} come at only {rate_hz:.1f} Hz. EKF2 (v1.14 and later) "

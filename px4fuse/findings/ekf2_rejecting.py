@@ -1,4 +1,4 @@
-"""Rejections: EKF2's innovation gate rejects positions, for example because it is too small."""
+"""Detect positions that EKF2's innovation gate rejects, and a gate that is too small."""
 
 import math
 
@@ -23,7 +23,7 @@ REJECTED_FRACTION_FOR_WARNING = 0.01
 # Minimum fraction of rejected positions, for severity "error"
 REJECTED_FRACTION_FOR_ERROR = 0.20
 # A change prevents rejections if the rejected fraction after it ÷ before it is below this ratio
-MAX_REJECTED_FRACTION_RATIO = 0.5
+MAX_REJECTED_AFTER_TO_BEFORE_RATIO = 0.5
 
 
 def detect(analysis: Analysis) -> Findings:
@@ -55,8 +55,8 @@ def _detect_small_gate(analysis: Analysis, rejection_findings: tuple[Finding, ..
 
 def _detect_rejections(analysis: Analysis) -> Findings:
     ekf2, down_comparison = analysis.flight.ekf2, analysis.axes.get("down")
-    # EKF2 rejects north and east of a position together, so the main axis contains all rejections
-    # of horizontal positions
+    # EKF2 accepts or rejects the horizontal position as a whole, so one horizontal axis shows all
+    # rejected positions
     for result in (
         analysis.main,
         *([down_comparison] if down_comparison and down_comparison is not analysis.main else []),
@@ -92,8 +92,8 @@ def _find_rejection_remedy(analysis: Analysis, result: AxisComparison) -> str:
     if helpful_trials and result is analysis.main:
         return format_action(analysis, min(helpful_trials, key=compute_preference_key).change)
     return (
-        f"Check {find_source_texts(analysis.source).reception}. Then check {aid.delay} and "
-        f"{aid.noise}. Increase {aid.gate} last."
+        f"{find_source_texts(analysis.source).data_link_check}. Then check {aid.delay} and "
+        f"{aid.noise}. Increase {aid.gate} only if no fault is found."
     )
 
 
@@ -105,4 +105,7 @@ def _prevents_rejections(trial: Trial) -> bool:
         or classify_improvement(trial) == "nothing"
     ):
         return False
-    return len(trial.kinds) == 1 and rejected_after < MAX_REJECTED_FRACTION_RATIO * rejected_before
+    return (
+        len(trial.kinds) == 1
+        and rejected_after < MAX_REJECTED_AFTER_TO_BEFORE_RATIO * rejected_before
+    )

@@ -7,8 +7,14 @@ from px4fuse.analysis import Analysis
 from px4fuse.comparison.flight_events import find_airborne_spans
 from px4fuse.comparison.projection import remove_origin_resets
 from px4fuse.core.record import Span
-from px4fuse.findings.cause_grouping import CAUSE_KEY, GAP_CAUSE, UNKNOWN_CAUSE
-from px4fuse.findings.model import Findings, finding, format_count, make_zero_length_spans, warning
+from px4fuse.findings.cause_grouping import CAUSE_KEY, SOURCE_GAP_CAUSE, UNKNOWN_CAUSE
+from px4fuse.findings.model import (
+    Findings,
+    finding,
+    format_count,
+    make_warning,
+    make_zero_length_spans,
+)
 from px4fuse.flight.model import Ekf2, Reset
 
 # Time (s) after take-off in which a height reset of EKF2 is normal
@@ -17,18 +23,19 @@ TAKE_OFF_DURATION_S = 10.0
 MAX_RESET_DELAY_S = 5.0
 # EKF2 starts fusion by a reset to the first position. This normal reset can be up to this time (s)
 # after the logged start of fusion, because fusion flags are logged at 1 Hz
-MAX_START_RESET_DELAY_S = 1.0
+MAX_FUSION_START_TO_RESET_S = 1.0
 
 
 def detect(analysis: Analysis) -> Findings:
     ekf2, segment = analysis.flight.ekf2, analysis.segment.flight
     if not isinstance(ekf2, Ekf2):
         return
-    # Earlier resets are normal. NaN if EKF2 fuses no position: the comparison below is then False
+    # Resets up to the start of fusion are normal and not reported. If EKF2 fuses no position, the
+    # start is NaN and all resets are reported
     fusion_start_s = -np.inf
     if isinstance(ekf2.fusion_flags, pd.DataFrame):
         is_fused = ekf2.fusion_flags["horizontal"] > 0.0
-        fusion_start_s = is_fused.index[is_fused].min() + MAX_START_RESET_DELAY_S
+        fusion_start_s = is_fused.index[is_fused].min() + MAX_FUSION_START_TO_RESET_S
     position_resets = [
         reset
         for reset in ekf2.resets
@@ -52,7 +59,7 @@ def detect(analysis: Analysis) -> Findings:
         largest_reset_time_s = reported_resets[int(np.argmax(sizes_m))].time_s
         _, reset_statement = remove_origin_resets(ekf2, analysis.source, analysis.segment)
         if reset_statement:
-            reset_statement = f" In the comparison of KF with EKF2: {reset_statement}."
+            reset_statement = f" Treatment in the comparison: {reset_statement}."
         yield finding(
             "warning" if horizontal_resets else "note",
             "ekf2_resets",
@@ -65,7 +72,7 @@ def detect(analysis: Analysis) -> Findings:
                 "count": len(sizes_m),
                 "largest_m": max(sizes_m),
                 "at_s": largest_reset_time_s,
-                CAUSE_KEY: GAP_CAUSE if follows_gap else UNKNOWN_CAUSE,
+                CAUSE_KEY: SOURCE_GAP_CAUSE if follows_gap else UNKNOWN_CAUSE,
             },
             make_zero_length_spans(reset.time_s for reset in reported_resets),
         )
@@ -74,9 +81,9 @@ def detect(analysis: Analysis) -> Findings:
 
 def detect_instance_switches(ekf2: Ekf2, span_s: Span) -> Findings:
     """Detect changes of the primary EKF2 instance in a time span (s)."""
-    switch_times_s = [time for time, _ in ekf2.instances if span_s[0] < time <= span_s[1]]
+    switch_times_s = [time for time, _ in ekf2.primary_instances if span_s[0] < time <= span_s[1]]
     if switch_times_s:
-        yield warning(
+        yield make_warning(
             "ekf2_instance_switch",
             f"The primary EKF2 instance changed {format_count(len(switch_times_s))}, first at "
             f"{switch_times_s[0]:.1f} s. The comparison uses the primary instance at each time.",

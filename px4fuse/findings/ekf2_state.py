@@ -12,10 +12,10 @@ from px4fuse.filter.signals import Segment, cut_to_segment
 from px4fuse.findings.model import (
     Findings,
     compute_flag_fraction,
-    error,
     find_spans_with_value,
     format_percent,
     magnetometer_advice,
+    make_error,
 )
 from px4fuse.flight.ekf2_parameters import BAROMETER, EV_CTRL_YAW_MASK, EV_POS, MAG
 from px4fuse.flight.model import (
@@ -34,7 +34,7 @@ BIAS_LIMIT_PARAMETERS = (
     ("EKF2_GYR_B_LIM", "rad/s", "gyroscope", Columns.GYRO_BIAS),
 )
 # EKF2's estimate of a bias is at its limit if |bias| / limit parameter is at least this value
-MIN_BIAS_LIMIT_RATIO = 0.98
+MIN_BIAS_TO_LIMIT_RATIO = 0.98
 # Minimum fraction of the flight with EKF2's estimate of a bias at its limit, for a finding
 MIN_TIME_AT_LIMIT_FRACTION = 0.5
 # Length (s) of the windows in which px4fuse tests if the vehicle is at rest
@@ -42,7 +42,7 @@ REST_WINDOW_S = 1.0
 # Time (s) before take-off in which the motors run, so that the IMU is not at rest
 MOTOR_RUN_UP_DURATION_S = 0.5
 # Maximum standard deviation of angular rate (rad/s) and specific force (m/s²) at rest
-MAX_IMU_STDS_AT_REST = (0.04, 1.5)
+MAX_RATE_AND_FORCE_STD_AT_REST = (0.04, 1.5)
 # Maximum change (rad/s) of the mean angular rate between windows at rest
 MAX_RATE_CHANGE_AT_REST_RAD_S = 0.01
 # Minimum gyroscope bias (rad/s) for a finding: the heading turns by 90° in 30 s
@@ -64,16 +64,18 @@ def detect(analysis: Analysis) -> Findings:
     if not isinstance(ekf2.record, Unavailable):
         bias_states = cut_to_segment(ekf2.record.delayed, analysis.segment)
         if len(bias_states):
-            yield from _detect_limited_bias(analysis, ekf2, bias_states, median_imu_at_rest)
+            yield from _detect_bias_at_limit(analysis, ekf2, bias_states, median_imu_at_rest)
             yield from _detect_gyro_bias(bias_states, median_imu_at_rest)
     yield from detect_missing_alignment(analysis.flight, analysis.segment, analysis.source)
 
 
 def measure_imu_at_rest(flight: Flight) -> pd.Series | None:
     """Return the median angular rate and specific force at rest before take-off, if known."""
-    if not isinstance(flight.imu, pd.DataFrame) or not flight.airborne:
-        return None
-    if isinstance(flight.airborne, Unavailable):
+    if (
+        not isinstance(flight.imu, pd.DataFrame)
+        or isinstance(flight.airborne, Unavailable)
+        or not flight.airborne
+    ):
         return None
     end_s = flight.airborne[0][0] - MOTOR_RUN_UP_DURATION_S
     imu = rows_between(flight.imu, -np.inf, end_s).astype(np.float64)
@@ -81,7 +83,7 @@ def measure_imu_at_rest(flight: Flight) -> pd.Series | None:
     window_means, window_stds = windows.mean(), windows.std()
     is_at_rest = np.ones(len(window_means), bool)
     for columns, limit in zip(
-        (Columns.ANGULAR_RATE, Columns.SPECIFIC_FORCE), MAX_IMU_STDS_AT_REST, strict=True
+        (Columns.ANGULAR_RATE, Columns.SPECIFIC_FORCE), MAX_RATE_AND_FORCE_STD_AT_REST, strict=True
     ):
         is_at_rest &= np.linalg.norm(window_stds[columns], axis=1) < limit
     window_means = window_means[is_at_rest]
@@ -93,14 +95,16 @@ def measure_imu_at_rest(flight: Flight) -> pd.Series | None:
     return window_means.median()
 
 
-def _detect_limited_bias(
+def _detect_bias_at_limit(
     analysis: Analysis, ekf2: Ekf2, bias_states: pd.DataFrame, median_imu_at_rest: pd.Series | None
 ) -> Findings:
     for parameter, unit, sensor, columns in BIAS_LIMIT_PARAMETERS:
         limit = ekf2.parameters.get(parameter, 0.0)
-        fractions = (bias_states[columns].abs() >= MIN_BIAS_LIMIT_RATIO * limit).mean().to_numpy()
-        axis_index = int(np.argmax(fractions))
-        time_at_limit_fraction = float(fractions[axis_index])
+        time_at_limit_fractions = (
+            (bias_states[columns].abs() >= MIN_BIAS_TO_LIMIT_RATIO * limit).mean().to_numpy()
+        )
+        axis_index = int(np.argmax(time_at_limit_fractions))
+        time_at_limit_fraction = float(time_at_limit_fractions[axis_index])
         if limit <= 0.0 or time_at_limit_fraction < MIN_TIME_AT_LIMIT_FRACTION:
             continue
         median_bias = float(bias_states[columns[axis_index]].median())
@@ -118,7 +122,7 @@ def _detect_limited_bias(
                     f"instead of {constants.g:.2f}. Its bias along the down axis is "
                     f"{constants.g - force_m_s2:+.2f} m/s²."
                 )
-        yield error(
+        yield make_error(
             "ekf2_bias_at_limit",
             message + (_describe_height_error(analysis, ekf2) if axis_index == 2 else ""),
             f"Calibrate the {sensor}s at the temperature of the flight.",
@@ -151,7 +155,7 @@ def _detect_gyro_bias(bias_states: pd.DataFrame, median_imu_at_rest: pd.Series |
     if differences_rad_s[axis_index] < MIN_GYRO_BIAS_RAD_S:
         return
     direction = ("forward", "right", "down (vertical)")[axis_index]
-    yield error(
+    yield make_error(
         "gyroscope_bias",
         f"The gyroscope measures {measured_biases_rad_s[axis_index]:+.2f} rad/s about {direction} "
         f"at rest. EKF2 estimates only {estimated_biases_rad_s[axis_index]:+.3f} rad/s of this "
@@ -199,7 +203,7 @@ def detect_missing_alignment(
             until_text = (
                 f" until {alignment_end_s:.1f} s" if alignment_end_s < segment.end_s else ""
             )
-            yield error(
+            yield make_error(
                 "ekf2_not_aligned",
                 f"EKF2 has not aligned its {quantity}{until_text}. cs_{flag} is 0 for "
                 f"{format_percent(unaligned_fraction)} of the flight. EKF2 fuses no position "
@@ -214,12 +218,12 @@ def _find_heading_action(flight: Flight, source: PositionTrack | None) -> str:
     """Return the action for a missing heading alignment; it depends on the heading sensors."""
     action = magnetometer_advice(flight) or f"Enable the magnetometer ({MAG.switch} 0)."
     if source is not None and source.origin.is_vision:
-        alternative_action = "let EKF2 fuse the yaw of the source"
+        alternative_action = "let EKF2 fuse the yaw of the source (EKF2_EV_CTRL bit 3)"
         if source.orientation is None:
-            alternative_action = f"send the orientation of the source, and {alternative_action}"
+            alternative_action = "send the orientation of the source and set EKF2_EV_CTRL bit 3"
             if int(flight.log.parameters.get(EV_POS.switch, 0)) & EV_CTRL_YAW_MASK:
                 alternative_action = (
-                    f"send the orientation of the source: {EV_POS.switch} bit 3 is set, but the "
+                    "send the orientation of the source: EKF2_EV_CTRL bit 3 is set, but the "
                     "orientation is missing or constant"
                 )
         action += f" Alternatively, {alternative_action}."

@@ -1,7 +1,7 @@
-"""Position errors that innovations do not show: errors against ground truth, drift of the source.
+"""Detect position errors that innovations do not show, and drift of the position source.
 
-Innovations compare a filter with its position source. They do not show errors of the source that
-the filter follows.
+Innovations compare a filter with its position source. If the filter follows an error of the source,
+the innovations stay small. Only ground truth or a loop closure shows such an error.
 """
 
 from collections.abc import Mapping
@@ -25,8 +25,15 @@ from px4fuse.errors import TrajectoryError
 from px4fuse.filter.tuning import HORIZONTAL, AxisTuning
 from px4fuse.finding import Finding
 from px4fuse.findings.cause_grouping import CAUSE_KEY
-from px4fuse.findings.cause_text import classify_cause, format_action, is_refuted
-from px4fuse.findings.model import Findings, error, find_source_texts, finding, format_percent, note
+from px4fuse.findings.cause_text import classify_cause, format_action, rerun_refutes_cause
+from px4fuse.findings.model import (
+    Findings,
+    find_source_texts,
+    finding,
+    format_percent,
+    make_error,
+    make_note,
+)
 from px4fuse.flight.model import Unavailable, source_name
 from px4fuse.loop.model import Loop
 from px4fuse.trajectory.alignment import fit_alignment
@@ -35,25 +42,25 @@ from px4fuse.trajectory.alignment import fit_alignment
 MIN_NEES_FOR_ERROR = 16.0
 # EKF2 has a fault that KF does not have if KF's position RMSE ÷ EKF2's is below this ratio
 MAX_KF_TO_EKF2_RMSE_RATIO = 0.7
-# Maximum ratio of position RMSE after alignment to RMSE before it, for a misaligned position frame
+# The position frame is misaligned if alignment reduces the position RMSE to less than this fraction
 MAX_ALIGNED_RMSE_RATIO = 0.5
 DRIFT_REMEDY = (
-    "Send an absolute position (GNSS, UWB) as well in the next flight. A loop closure (px4fuse "
-    "loop LOG) corrects the path of this flight, not the filters."
+    "In the next flight, send an absolute position (GNSS, UWB) as well. To correct the path of "
+    "this flight by a loop closure, run px4fuse loop LOG."
 )
 FRAME_REMEDY = "Rotate and shift the positions into the frame of the ground truth."
 EKF2_REMEDY = (
     "Check delay, heading and other aiding sources of EKF2: KF has a smaller error with the "
     "same positions."
 )
-HEIGHT_REMEDY = (
+EKF2_HEIGHT_REMEDY = (
     "Check the height sensors that EKF2 fuses (EKF2_HGT_REF) and the accelerometer: KF has a "
     "smaller height error."
 )
 
 
 class AlignmentRmse(NamedTuple):
-    """Horizontal position RMSE (m) against ground truth, before and after the best alignment."""
+    """Horizontal position RMSE (m) against ground truth, before and after alignment of a track."""
 
     rmse_before_m: float
     rmse_after_m: float
@@ -70,16 +77,16 @@ class AlignmentRmse(NamedTuple):
 
 
 def find_hidden_errors(comparison: Comparison) -> list[tuple[FilterName, str, ErrorAboveSigma]]:
-    """Find position errors that exceed the reported σ, but that innovations do not show.
+    """Find position errors that exceed the reported σ although the innovations are consistent.
 
     Return (filter, axis, error) for each error, largest mean NEES first.
     """
     alignment, frame_residual_rms_m = comparison.source.alignment, 0.0
-    # A frame fitted to EKF2's track contains EKF2's errors. KF's height errors, and KF errors below
-    # the residual of the fit, may thus be errors of the frame
+    # The frame of a position file that was fitted to EKF2's track contains EKF2's errors. Then KF's
+    # height errors, and KF's errors below the residual of the fit, are not reported
     if is_frame_fitted := alignment is not None and alignment.yaw_sigma_deg is not None:
         frame_residual_rms_m = alignment.residual_rms_m or 0.0
-    hidden_errors = [
+    errors_not_in_innovations = [
         (filter_name, name, error)
         for name, result in comparison.axes.items()
         for filter_name, summary in result.filters.items()
@@ -89,29 +96,31 @@ def find_hidden_errors(comparison: Comparison) -> list[tuple[FilterName, str, Er
             or (error.rmse_m > frame_residual_rms_m and not (is_frame_fitted and name == "down"))
         )
     ]
-    return sorted(hidden_errors, key=lambda entry: -entry[2].nees)
+    return sorted(errors_not_in_innovations, key=lambda entry: -entry[2].nees)
 
 
 def detect(analysis: Analysis) -> Findings:
-    if hidden_errors := find_hidden_errors(analysis):
-        yield make_hidden_error_finding(analysis, hidden_errors)
+    if errors_not_in_innovations := find_hidden_errors(analysis):
+        yield make_hidden_error_finding(analysis, errors_not_in_innovations)
     elif analysis.source.origin.may_drift:
         yield make_possible_drift_finding(analysis)
 
 
 def make_hidden_error_finding(
-    analysis: Analysis, hidden_errors: list[tuple[FilterName, str, ErrorAboveSigma]]
+    analysis: Analysis, errors_not_in_innovations: list[tuple[FilterName, str, ErrorAboveSigma]]
 ) -> Finding:
-    hidden_errors = sorted(hidden_errors, key=lambda entry: entry[1] != analysis.main.axis.name)
-    worst_filter, main_axis, worst_error = hidden_errors[0]
+    errors_not_in_innovations = sorted(
+        errors_not_in_innovations, key=lambda entry: entry[1] != analysis.main.axis.name
+    )
+    worst_filter, main_axis, worst_error = errors_not_in_innovations[0]
     evidence: dict[str, float | str] = {"axis": main_axis, "filter": worst_filter}
     sigma_ratio_by_filter, sentences = dict[str, float](), list[str]()
     trial_by_filter = dict[FilterName, Trial]()
     for filter_name in FILTER_NAMES:
         label = FILTER_NAMES[filter_name]
-        for _, axis, hidden_error in [entry for entry in hidden_errors if entry[0] == filter_name][
-            :1
-        ]:
+        for _, axis, hidden_error in [
+            entry for entry in errors_not_in_innovations if entry[0] == filter_name
+        ][:1]:
             if hidden_error.nis_mean is not None:
                 evidence[f"{filter_name}_nis_mean"] = hidden_error.nis_mean
             evidence |= {
@@ -120,7 +129,7 @@ def make_hidden_error_finding(
                 f"{filter_name}_sigma_p_m": hidden_error.reported_sigma_m,
             }
             cause = find_cause_trial(analysis.trials, filter_name, axis, "nees")
-            if cause is not None and not is_refuted(analysis, filter_name, cause):
+            if cause is not None and not rerun_refutes_cause(analysis, filter_name, cause):
                 trial_by_filter[filter_name] = cause
             sigma_ratio_by_filter[label] = hidden_error.nees**0.5
             sentences.append(
@@ -149,20 +158,20 @@ def make_hidden_error_finding(
         and kf_errors.position_rmse_m < MAX_KF_TO_EKF2_RMSE_RATIO * worst_error.rmse_m
     )
     is_fault_of_ekf2_only = is_kf_better and all(
-        filter_name == "ekf2" for filter_name, *_ in hidden_errors
+        filter_name == "ekf2" for filter_name, *_ in errors_not_in_innovations
     )
     remedy = (
         "Check the time offset of the positions (px4fuse sync LOG). "
-        f"Then check {find_source_texts(analysis.source).errors}."
+        f"{find_source_texts(analysis.source).slow_error_check}."
     )
     if cause is not None:
         remedy = format_action(analysis, cause.change)
     elif is_misaligned:
         remedy = FRAME_REMEDY
     elif is_fault_of_ekf2_only:
-        remedy = HEIGHT_REMEDY if main_axis == "down" else EKF2_REMEDY
+        remedy = EKF2_HEIGHT_REMEDY if main_axis == "down" else EKF2_REMEDY
     ratio_texts = (
-        f"{label} {format_ratio(ratio)} times the reported σ"
+        f"{label} error {format_ratio(ratio)} times the reported σ"
         for label, ratio in sigma_ratio_by_filter.items()
     )
     title = f"Position errors that innovations do not show: {', '.join(ratio_texts)}"
@@ -182,9 +191,9 @@ def _make_drift_finding(
     evidence: Mapping[str, float | str],
     filter_labels: tuple[str, ...],
 ) -> Finding:
-    """Make the finding that the position source drifts.
+    """Make the finding that the source drifts although the innovations are consistent.
 
-    The innovations of the filters ``filter_labels`` do not show the drift.
+    ``filter_labels`` are the filters whose position error exceeds their reported σ.
     """
     sensor_name, loop = source_name(analysis.source), analysis.loop
     drift_text = f"position RMSE {format_metres(worst_error.rmse_m)} m against ground truth"
@@ -209,7 +218,7 @@ def _make_drift_finding(
         )
     noise_parameter = "" if analysis.source.origin.aid is None else analysis.source.origin.aid.noise
     noise_setting_names = " or ".join(filter(None, ("SIGMA_Z", noise_parameter)))
-    return error(
+    return make_error(
         "source_drift",
         f"{sensor_name} drifts: {drift_text}. {rmse_sentence}The innovations of "
         f"{' and '.join(filter_labels)} do not show the drift, because the estimates follow "
@@ -241,18 +250,23 @@ def _compute_alignment_rmse(
         true_positions_m.append(np.interp(errors.index, truth.index, truth["position_m"]))
     if len(axis_errors_m) < 2:
         return None
-    zero_height, is_known = np.zeros(len(axis_errors_m[0])), np.isfinite(axis_errors_m).all(axis=0)
-    error_m, true_m = (
-        np.column_stack([*columns, zero_height])[is_known]
+    zero_down_column, is_known = (
+        np.zeros(len(axis_errors_m[0])),
+        np.isfinite(axis_errors_m).all(axis=0),
+    )
+    error_m, true_position_m = (
+        np.column_stack([*columns, zero_down_column])[is_known]
         for columns in (axis_errors_m, true_positions_m)
     )
     try:
-        aligned_m = fit_alignment(true_m + error_m, true_m, "yaw").apply(true_m + error_m)
+        aligned_position_m = fit_alignment(true_position_m + error_m, true_position_m, "yaw").apply(
+            true_position_m + error_m
+        )
     except TrajectoryError:  # the track is too short to determine a rotation
         return None
     rmse_m, aligned_rmse_m = (
-        float(np.linalg.norm(errors)) / len(true_m) ** 0.5
-        for errors in (error_m, aligned_m - true_m)
+        float(np.linalg.norm(errors)) / len(true_position_m) ** 0.5
+        for errors in (error_m, aligned_position_m - true_position_m)
     )
     return AlignmentRmse(rmse_m, aligned_rmse_m)
 
@@ -281,4 +295,4 @@ def make_possible_drift_finding(analysis: Analysis) -> Finding:
         "Measure the drift from the loop closure error (px4fuse loop LOG) or with ground truth "
         "(ATT_POS_MOCAP). If the source is motion capture, run again with --source-kind mocap."
     )
-    return note("source_may_drift", message, action, evidence)
+    return make_note("source_may_drift", message, action, evidence)

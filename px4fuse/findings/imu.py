@@ -16,13 +16,13 @@ from px4fuse.filter.hypotheses import (
 from px4fuse.filter.signals import Segment, cut_to_segment, find_imu_gaps
 from px4fuse.finding import MIN_SPAN_S
 from px4fuse.findings.missing import DEFAULT_SDLOG_PROFILE, VISION_PROFILE_MASK
-from px4fuse.findings.model import Findings, error, finding, format_percent, warning
+from px4fuse.findings.model import Findings, finding, format_percent, make_error, make_warning
 from px4fuse.flight.model import Columns, Ekf2, Flight, sample_rate
 
 # Maximum specific force (m/s²) of real sensors: 35 g, because the largest range is 32 g
-MAX_SPECIFIC_FORCE_M_S2 = 343.0
-# Minimum number of samples above MAX_SPECIFIC_FORCE_M_S2 for a finding
-MIN_OUT_OF_RANGE_SAMPLES = 3
+MAX_PLAUSIBLE_SPECIFIC_FORCE_M_S2 = 343.0
+# Minimum number of samples above MAX_PLAUSIBLE_SPECIFIC_FORCE_M_S2 for a finding
+MIN_IMPLAUSIBLE_FORCE_SAMPLES = 3
 # Minimum accelerometer bias (m/s²), for severity "error": a position error of 0.15 m after 1 s
 MIN_BIAS_FOR_ERROR_M_S2 = 0.3
 # Tilt error (°) that has the same effect as an accelerometer bias of 1 m/s²
@@ -36,11 +36,11 @@ MIN_ATTITUDE_RATE_HZ = 10.0
 # Clipping is reported if it lasts longer than this time (s): a touch-down clips one or two samples
 MAX_CLIPPING_DURATION_S = 0.1
 # Minimum time (s) without clipped samples between two reported time spans of clipping
-MIN_CLIPPING_PAUSE_S = 2.0
+MIN_TIME_BETWEEN_CLIPPINGS_S = 2.0
 # Mask of SDLOG_PROFILE, bit 4: full IMU rate (logged_topics.cpp)
-HIGH_RATE_MASK = 16
+SDLOG_HIGH_RATE_MASK = 16
 # Minimum ratio of measured to required sample rate: sensors are up to 2 % slower than nominal
-MIN_REQUIRED_RATE_FRACTION = 0.98
+MIN_MEASURED_TO_REQUIRED_RATE_RATIO = 0.98
 
 
 def detect(analysis: Analysis) -> Findings:
@@ -60,10 +60,10 @@ def detect_impossible_acceleration(analysis: Analysis) -> Findings:
         return
     samples = cut_to_segment(imu, analysis.segment)[Columns.SPECIFIC_FORCE]
     force_m_s2 = np.linalg.norm(samples.to_numpy(), axis=1)
-    time_s = samples.index[force_m_s2 > MAX_SPECIFIC_FORCE_M_S2].to_numpy()
-    if len(time_s) < MIN_OUT_OF_RANGE_SAMPLES:
+    time_s = samples.index[force_m_s2 > MAX_PLAUSIBLE_SPECIFIC_FORCE_M_S2].to_numpy()
+    if len(time_s) < MIN_IMPLAUSIBLE_FORCE_SAMPLES:
         return
-    yield error(
+    yield make_error(
         "imu_values_impossible",
         f"The accelerometer values are impossible: up to {np.nanmax(force_m_s2):,.0f} m/s², "
         f"first at {time_s[0]:.1f} s. Sensors of autopilots measure at most 32 g (314 m/s²). The "
@@ -107,7 +107,8 @@ def detect_accelerometer_bias(analysis: Analysis) -> Findings:
             },
         )
     elif ekf2_bias_m_s2 is not None:
-        # The positions show no significant horizontal bias, so only EKF2's vertical bias counts
+        # If the positions show that the horizontal bias is not significant, only the vertical
+        # component of EKF2's bias is tested
         bias_m_s2 = float(
             np.linalg.norm(
                 ekf2_bias_m_s2[2:]
@@ -116,7 +117,7 @@ def detect_accelerometer_bias(analysis: Analysis) -> Findings:
             )
         )
         if bias_m_s2 >= MIN_BIAS_M_S2:
-            yield warning(
+            yield make_warning(
                 "accelerometer_bias",
                 f"EKF2 estimates an accelerometer bias of {bias_m_s2:.2f} m/s². Its components are "
                 f"{ekf2_bias_m_s2[0]:+.2f} forward, {ekf2_bias_m_s2[1]:+.2f} right and "
@@ -150,13 +151,13 @@ def _find_ekf2_accelerometer_bias(analysis: Analysis) -> list[float] | None:
 
 def detect_tumbling(analysis: Analysis) -> Findings:
     """Detect roll or pitch beyond the limits of PX4's failure detector."""
-    if spans := analysis.segment.cut(analysis.flight.tumble_spans):
+    if spans := analysis.segment.cut(analysis.flight.excessive_tilt_spans_s):
         end_s = max(spans[0][0] - 1.0, 0.0)
-        yield error(
+        yield make_error(
             "attitude_failure",
-            f"Roll or pitch exceeded PX4's failure-detector limits at {spans[0][0]:.1f} s. Later "
-            "data do not represent normal flight. The limits are FD_FAIL_R and FD_FAIL_P.",
-            f"Analyse only the time before this failure (--end {end_s:.1f}).",
+            f"Roll or pitch exceeded PX4's failure-detector limits (FD_FAIL_R, FD_FAIL_P) at "
+            f"{spans[0][0]:.1f} s. Later data do not represent normal flight.",
+            f"Analyse only the time before the attitude failure (--end {end_s:.1f}).",
             {"total_s": sum(end - start for start, end in spans)},
             spans,
         )
@@ -172,9 +173,9 @@ def detect_clipping(analysis: Analysis) -> Findings:
     clipped_duration_s = len(time_s) / sample_rate(imu)
     if clipped_duration_s > MAX_CLIPPING_DURATION_S:
         clipping_times_by_burst_s = np.split(
-            time_s, np.flatnonzero(np.diff(time_s) > MIN_CLIPPING_PAUSE_S) + 1
+            time_s, np.flatnonzero(np.diff(time_s) > MIN_TIME_BETWEEN_CLIPPINGS_S) + 1
         )
-        yield warning(
+        yield make_warning(
             "accelerometer_clipping",
             f"The accelerometer was clipped for {clipped_duration_s:.2f} s ({len(time_s)} "
             "samples). The log lacks motion beyond the sensor range. Height and vertical velocity "
@@ -199,7 +200,7 @@ def detect_imu_gaps(analysis: Analysis) -> Findings:
             action = "Record on a link without message loss. "
         elif log.dropouts:
             action = "Use a faster SD card. "
-        yield warning(
+        yield make_warning(
             "imu_gap",
             f"{missing_data} samples are missing for {gap_s:.2f} s. In this gap KF increases "
             "SIGMA_A to the standard deviation of the measured acceleration.",
@@ -225,7 +226,7 @@ def detect_missing_imu_samples(analysis: Analysis) -> Findings:
             "Use a faster SD card, or log fewer topics: set SDLOG_PROFILE to "
             f"{sdlog_profile ^ other_topics}."
         )
-    yield warning(
+    yield make_warning(
         "imu_samples_missing",
         f"{format_percent(lost_fraction)} of the IMU samples are missing from the log. KF "
         "increases Q in these gaps. EKF2 cannot be replayed, so the effect of changed parameters "
@@ -239,14 +240,17 @@ def _find_gap_spans(imu: pd.DataFrame, segment: Segment) -> tuple[Span, ...]:
     """Return start and end (s) of each IMU gap in a segment, also at both ends of the segment."""
     time_s = imu.index.to_numpy()
     gaps = select_intervals(time_s, find_imu_gaps(time_s))
-    end_spans = ((segment.start_s, float(time_s[0])), (float(time_s[-1]), segment.end_s))
-    gaps += [(start, end) for start, end in end_spans if end - start > MIN_SPAN_S]
+    spans_at_segment_ends = (
+        (segment.start_s, float(time_s[0])),
+        (float(time_s[-1]), segment.end_s),
+    )
+    gaps += [(start, end) for start, end in spans_at_segment_ends if end - start > MIN_SPAN_S]
     gaps_inside = (span for span in gaps if span[1] > segment.start_s and span[0] < segment.end_s)
     return tuple(sorted(gaps_inside))
 
 
 def is_rate_too_low(samples: pd.DataFrame, required_rate_hz: float) -> bool:
-    return sample_rate(samples) < MIN_REQUIRED_RATE_FRACTION * required_rate_hz
+    return sample_rate(samples) < MIN_MEASURED_TO_REQUIRED_RATE_RATIO * required_rate_hz
 
 
 def detect_low_rates(flight: Flight) -> Findings:
@@ -260,7 +264,8 @@ def detect_low_rates(flight: Flight) -> Findings:
         if isinstance(samples, pd.DataFrame) and is_rate_too_low(samples, required_rate_hz):
             rate_hz, requested_rate_hz = sample_rate(samples), 2.0 * required_rate_hz
             sdlog_profile = (
-                int(log.parameters.get("SDLOG_PROFILE", DEFAULT_SDLOG_PROFILE)) | HIGH_RATE_MASK
+                int(log.parameters.get("SDLOG_PROFILE", DEFAULT_SDLOG_PROFILE))
+                | SDLOG_HIGH_RATE_MASK
             )
             action = f"Set SDLOG_PROFILE to {sdlog_profile} (bit 4 logs {topic} at full rate)."
             if log.format.startswith("MAVLink"):
@@ -269,7 +274,7 @@ def detect_low_rates(flight: Flight) -> Findings:
                     "(MAV_CMD_SET_MESSAGE_INTERVAL)"
                     f"{', or give the ULog of the flight' if log.writes_ulog else ''}."
                 )
-            yield warning(
+            yield make_warning(
                 "imu_rate_too_low",
                 f"The {label} was logged at {rate_hz:.1f} Hz, but {required_rate_hz:g} Hz are "
                 "needed. Motion between samples is lost, and vibration is aliased.",

@@ -2,7 +2,7 @@
 
 from px4fuse.analysis import Analysis
 from px4fuse.finding import Finding
-from px4fuse.findings.model import Findings, error, note, warning
+from px4fuse.findings.model import Findings, make_error, make_note, make_warning
 from px4fuse.loop.model import LANDING_CLOSURE_SOURCE, Closure, Loop
 from px4fuse.trajectory.graph.covariance import GATE_ALPHA
 
@@ -23,42 +23,44 @@ def detect(analysis: Analysis) -> Findings:
 def detect_loop_faults(loop: Loop) -> Findings:
     """Detect false loop closures and wrong assumptions about a loop."""
     yield from detect_inconsistent_closures(loop)
-    yield from detect_wrong_assumptions(loop)
+    yield from detect_wrong_loop_assumptions(loop)
 
 
 def detect_inconsistent_closures(loop: Loop) -> Findings:
     """Detect loop closures that contradict the odometry drift or other loop closures."""
-    gnc_weights = [
+    robust_weights = [
         1.0 if closure.weight_gnc is None else closure.weight_gnc for closure in loop.closures
     ]
-    rejected_count = sum(gnc_weight < MIN_GNC_WEIGHT for gnc_weight in gnc_weights)
-    rejects_most_closures = rejected_count > MAX_REJECTED_CLOSURE_FRACTION * len(gnc_weights)
-    if rejects_most_closures:
-        yield warning(
+    rejected_count = sum(robust_weight < MIN_GNC_WEIGHT for robust_weight in robust_weights)
+    are_most_closures_rejected = rejected_count > MAX_REJECTED_CLOSURE_FRACTION * len(
+        robust_weights
+    )
+    if are_most_closures_rejected:
+        yield make_warning(
             "loop_drift_too_small",
-            f"Robust optimisation rejects {rejected_count} of {len(gnc_weights)} loop closures. "
+            f"Robust optimisation rejects {rejected_count} of {len(robust_weights)} loop closures. "
             "The stated odometry drift is probably too small.",
             "Increase the stated drift (--drift or --heading-drift).",
-            {"dropped": rejected_count, "closures": len(gnc_weights)},
+            {"dropped": rejected_count, "closures": len(robust_weights)},
         )
-    for closure, gnc_weight in zip(loop.closures, gnc_weights, strict=True):
+    for closure, robust_weight in zip(loop.closures, robust_weights, strict=True):
         if not closure.accepted:
             yield _make_false_closure_finding(closure, loop.is_end_assumed)
-        elif gnc_weight < MIN_GNC_WEIGHT and not rejects_most_closures:
-            yield warning(
+        elif robust_weight < MIN_GNC_WEIGHT and not are_most_closures_rejected:
+            yield make_warning(
                 "loop_closure_inconsistent",
-                f"{closure!s} contradicts the other loop closures. Robust "
-                "optimisation rejects it, although drift could explain its closure error.",
+                f"{closure!s} contradicts the other loop closures, so robust optimisation rejects "
+                "it. Odometry drift alone could explain the closure error.",
                 "Remove this loop closure, or use the path of the robust optimisation (GNC).",
-                _make_closure_evidence(closure) | {"gnc_weight": gnc_weight},
+                _make_closure_evidence(closure) | {"gnc_weight": robust_weight},
             )
 
 
-def detect_wrong_assumptions(loop: Loop) -> Findings:
+def detect_wrong_loop_assumptions(loop: Loop) -> Findings:
     closure_error_m = loop.closure_error_m
     evidence = {} if closure_error_m is None else {"closure_error_m": closure_error_m}
     if loop.is_absolute_track:
-        yield warning(
+        yield make_warning(
             "loop_on_absolute_positions",
             "This track consists of absolute positions, which do not drift. The loop closure error "
             "is only position noise, so a correction makes the path worse.",
@@ -66,7 +68,7 @@ def detect_wrong_assumptions(loop: Loop) -> Findings:
             evidence,
         )
     if evidence and loop.is_end_assumed:
-        yield note(
+        yield make_note(
             "loop_landing_assumed",
             "The landing place is unknown, so px4fuse assumes the take-off place. If the vehicle "
             "landed elsewhere, the loop closure error contains the distance between both places.",
@@ -87,12 +89,12 @@ def _make_false_closure_finding(closure: Closure, is_end_assumed: bool) -> Findi
             "If the vehicle landed elsewhere, state the place (--landed-at FORWARD,RIGHT) or "
             "ignore the landing (--open)."
         )
-    return error(
+    return make_error(
         "false_loop_closure",
-        f"False loop closure (closure error {closure.distance_m:.2f} m): {closure_text}. The "
-        "stated drift of the odometry does not explain the closure error (squared "
-        f"Mahalanobis distance {closure.d2:.0f}, {closure.degrees_of_freedom} degrees of freedom, "
-        f"p {closure.p:.1g}). A path that contains this closure would be deformed.",
+        f"False loop closure: {closure_text}. The closure error of {closure.distance_m:.2f} m is "
+        "larger than the stated odometry drift explains (squared Mahalanobis distance "
+        f"{closure.d2:.0f}, {closure.degrees_of_freedom} degrees of freedom, p {closure.p:.1g}). "
+        "This closure would deform the path.",
         f"{action} If the odometry has more drift than stated, increase --drift and "
         "--heading-drift.",
         _make_closure_evidence(closure),

@@ -3,8 +3,8 @@
 from px4fuse.analysis import Analysis
 from px4fuse.comparison.model import PreparedComparison
 from px4fuse.core.text import capitalise_first
-from px4fuse.findings.model import Findings, warning
-from px4fuse.flight.model import RECEIVED_ORIGIN, Unavailable, positions_phrase
+from px4fuse.findings.model import Findings, make_warning
+from px4fuse.flight.model import AS_RECEIVED_ORIGIN, Unavailable, positions_phrase
 
 VISION_TOPIC = "vehicle_visual_odometry"
 # SDLOG_PROFILE: default value, and mask of bit 7 for external vision (logged_topics.cpp)
@@ -22,9 +22,9 @@ def detect_unavailable_data(analysis: Analysis) -> Findings:
     if isinstance(ekf2, Unavailable):
         reason = capitalise_first(ekf2.reason)
         message = f"The log contains no EKF2 state. {reason}. The report contains KF only."
-        yield warning("ekf2_not_logged", message, ekf2.remedy)
+        yield make_warning("ekf2_not_logged", message, ekf2.remedy)
     if isinstance(acceleration, Unavailable):
-        yield warning(
+        yield make_warning(
             "acceleration_not_logged",
             "The acceleration is missing, so KF assumes constant velocity. Missing "
             f"{acceleration.what}: {acceleration.reason}.",
@@ -33,7 +33,7 @@ def detect_unavailable_data(analysis: Analysis) -> Findings:
     for result in analysis.axes.values():
         kf_summary = result.filters["kf"]
         if isinstance(kf_summary, Unavailable):
-            yield warning(
+            yield make_warning(
                 "too_few_innovations",
                 f"The consistency of KF is not tested: {kf_summary.reason}.",
                 kf_summary.remedy,
@@ -44,12 +44,12 @@ def detect_unavailable_data(analysis: Analysis) -> Findings:
 
 def detect_source_not_logged(analysis: PreparedComparison) -> Findings:
     """Detect that the log lacks the positions which PX4 received."""
-    source, received_origin_rank = analysis.source, RECEIVED_ORIGIN.find_preference_rank()
-    has_received_positions = any(
-        track.origin.find_preference_rank() == received_origin_rank
+    source, rank_as_received = analysis.source, AS_RECEIVED_ORIGIN.find_preference_rank()
+    has_positions_as_received = any(
+        track.origin.find_preference_rank() == rank_as_received
         for track in analysis.flight.positions
     )
-    if source.origin.has_all_samples or has_received_positions:
+    if source.origin.has_all_samples or has_positions_as_received:
         return
     rate_hz, parameters = source.compute_rate_hz(), analysis.flight.log.parameters
     sdlog_profile = int(parameters.get("SDLOG_PROFILE", DEFAULT_SDLOG_PROFILE))
@@ -58,7 +58,7 @@ def detect_source_not_logged(analysis: PreparedComparison) -> Findings:
         for missing_data in analysis.missing
         if missing_data.source == VISION_TOPIC
     )
-    yield warning(
+    yield make_warning(
         "source_not_logged",
         f"The log lacks the {positions_phrase(source)} as PX4 received them. Reason: "
         f"{next(reasons, f'{VISION_TOPIC} is not in this log')}. px4fuse uses {source.name} "

@@ -24,28 +24,27 @@ class CatalogueEntry(Record):
     ----------
     group : str
         One of :data:`FINDING_GROUPS`.
-    role : str
-        Effect on the estimates, which determines the place in the list of findings. Listed first:
-        "unusable" (all positions are wrong), "misleading" (some positions are wrong) and "first"
-        (other important causes). "noise" is listed after other errors, "recording" before other
-        warnings.
+    report_class : str
+        Class that determines the place in the list of findings. Listed first: "unusable" (all
+        positions are wrong), "misleading" (some positions are wrong) and "first" (other important
+        causes). "noise" is listed after other errors, "recording" before other warnings.
     verdict : str
-        Relation to the verdicts on KF and EKF2 (consistent, over- or underconfident).
-        "meaningless": the finding makes them invalid. "repeated": the finding repeats a verdict.
-    reruns : frozenset of str
-        Kinds of re-runs (``Trial.kinds``) that test the finding.
-    after_wrong_convention : str
-        What becomes of the finding if axes, unit or clock of the positions are wrong. "effect":
-        listed as an effect of the wrong convention. "withdrawn": removed. Empty: unchanged.
+        "meaningless": the verdicts on KF and EKF2 (consistent, over- or underconfident) are not
+        valid in a flight with this finding. "repeated": the finding itself states a verdict.
+    rerun_kinds : frozenset of str
+        Kinds of changes (``Trial.kinds``) that px4fuse tests in re-runs to confirm the finding.
+    status_if_convention_wrong : str
+        Treatment of the finding if axes, unit or clock of the positions are wrong. "effect": listed
+        as an effect of the wrong convention. "withdrawn": removed. Empty: unchanged.
     """
 
     title: str
     meaning: str
     group: str = "position source"
-    role: Literal["", "unusable", "misleading", "first", "noise", "recording"] = ""
+    report_class: Literal["", "unusable", "misleading", "first", "noise", "recording"] = ""
     verdict: Literal["", "meaningless", "repeated"] = ""
-    reruns: frozenset[str] = frozenset()
-    after_wrong_convention: Literal["", "effect", "withdrawn"] = ""
+    rerun_kinds: frozenset[str] = frozenset()
+    status_if_convention_wrong: Literal["", "effect", "withdrawn"] = ""
 
 
 # All possible findings by id; findings of equal severity are listed in this order
@@ -57,23 +56,23 @@ FINDING_TITLES: Mapping[str, str] = {name: entry.title for name, entry in FINDIN
 
 
 class FindingExample(Record):
-    """Example of a finding, with its rates of false alarm and detection (tests/studies/rates.csv).
+    """Example of a finding, and its rates on simulated flights (tests/studies/rates.csv).
 
     Attributes
     ----------
-    clean_flights : int
+    fault_free_flight_count : int
         Number of simulated flights without an injected fault.
-    false_alarms : int
-        Number of clean flights with the finding.
-    detection : dict
-        Fraction of the flights with an injected fault that have the finding, by name of the fault.
+    false_alarm_count : int
+        Number of these flights in which px4fuse reports the finding.
+    detection_rate_by_fault : dict
+        Fraction of the flights with an injected fault in which px4fuse reports the finding.
     """
 
     message: str
     remedy: str
-    clean_flights: int
-    false_alarms: int
-    detection: Mapping[str, float]
+    fault_free_flight_count: int
+    false_alarm_count: int
+    detection_rate_by_fault: Mapping[str, float]
 
 
 def load_examples() -> Mapping[str, FindingExample]:
@@ -83,16 +82,16 @@ def load_examples() -> Mapping[str, FindingExample]:
 
 
 class SourceTexts(Record):
-    """Texts on causes and actions for one kind of source; source_words.toml explains the keys."""
+    """Sentences on causes and actions for one kind of position source (source_words.toml)."""
 
-    smoothing_action: str
-    jump: str
+    low_pass_action: str
+    jump_causes: str
     jump_action: str
-    outliers: str
-    outliers_action: str
-    reception: str
-    scale: str
-    errors: str
+    outlier_causes: str
+    outlier_action: str
+    data_link_check: str
+    scale_check: str
+    slow_error_check: str
 
 
 _TEXTS_BY_KIND = read_toml(__file__, dict[PositionKind, dict[str, str]], "source_words.toml")
@@ -126,17 +125,18 @@ def finding(
     spans_s: tuple[Span, ...] = (),
 ) -> Finding:
     """Make a finding; its title is the first sentence of the message."""
-    if message[1:2] != " ":  # a message such as "x and y are exchanged" begins with an axis
+    # Axis names stay lower case at the beginning of a message: "x and y are exchanged"
+    if message[1:2] != " ":
         message = capitalise_first(message)
     title = message.partition(". ")[0].removesuffix(".")
     return Finding(name, severity, message, remedy, evidence, title, spans_s=spans_s)
 
 
-error, warning, note = (partial(finding, severity) for severity in SEVERITIES)
+make_error, make_warning, make_note = (partial(finding, severity) for severity in SEVERITIES)
 
 
 def split_cause_groups(findings: Iterable[Finding]) -> list[list[Finding]]:
-    """Group findings: each group is a cause, followed by its effects."""
+    """Split findings into groups: a cause, followed by the findings that it causes."""
     groups: list[list[Finding]] = []
     for entry in findings:
         if entry.caused_by is None:

@@ -34,10 +34,10 @@ from px4fuse.findings.cause_text import (
     classify_cause,
     format_action,
     format_kf_settings,
-    is_refuted,
+    rerun_refutes_cause,
 )
 from px4fuse.findings.hidden_errors import find_hidden_errors
-from px4fuse.findings.model import Findings, error, finding, lower_severity
+from px4fuse.findings.model import Findings, finding, lower_severity, make_error
 from px4fuse.findings.source_positions import has_little_motion
 from px4fuse.flight.ekf2_parameters import BAROMETER, EV_POS, GNSS_POS, PARAMETERS
 from px4fuse.flight.model import Columns, Unavailable, sample_rate
@@ -46,13 +46,13 @@ from px4fuse.request import COMPARISON_OPTIONS
 
 # Minimum factor between a noise setting and its estimate, for a warning: smaller factors hardly
 # change the track
-MIN_NOISE_FACTOR = 1.5
+MIN_SETTING_TO_ESTIMATE_FACTOR = 1.5
 # Minimum factor between a noise setting and its estimate, for severity "error"
 MIN_NOISE_FACTOR_FOR_ERROR = 4.0
-# KF ignores new positions if its time constant exceeds this value (s): vehicles turn in less time
-MIN_TIME_CONSTANT_S = 2.5
-# Factor on the 95 % interval of ln(noise estimate): 0.3 % of correct settings are outside the
-# widened interval
+# KF ignores new positions if KF's time constant exceeds this value (s): vehicles turn in less time
+MIN_KF_TIME_CONSTANT_S = 2.5
+# Factor that widens the 95 % interval of ln(noise estimate), so that only 0.3 % of the correct
+# noise settings are outside
 INTERVAL_WIDENING_FACTOR = 1.5
 # KF lags if the lag-1 autocorrelation of its innovations exceeds this value; white innovations
 # reach 0.2
@@ -61,9 +61,9 @@ MIN_LAG1_AUTOCORRELATION = 0.3
 # Minimum factor between actual and reported σ, for severity "error"
 MIN_SIGMA_FACTOR_FOR_ERROR = 2.0
 # Two noise σ count as equal up to this ratio: the median of 100 values has a standard error of 12 %
-NOISE_RATIO_TOLERANCE = 1.25
+MAX_RATIO_OF_EQUAL_NOISES = 1.25
 # If EKF2's √R is larger than EKF2_EVP_NOISE times this factor, R is the variance in the messages
-MIN_USED_TO_SET_NOISE_RATIO = 1.25
+MIN_USED_TO_PARAMETER_NOISE_RATIO = 1.25
 # Action if no change in a re-run corrects the wrong σ
 UNEXPLAINED_SIGMA_ACTION = (
     "No tested change of noise, time offset, frame or outliers explains the wrong σ. Check the "
@@ -71,31 +71,34 @@ UNEXPLAINED_SIGMA_ACTION = (
 )
 UNKNOWN_NOISE_ACTION = "The noise could not be estimated; px4fuse tune LOG states the reason."
 NO_IMPROVEMENT_ACTION = (
-    "No change: a re-run with the estimated noise improves neither position nor σ."
+    "Change nothing: a re-run with the estimated noise improves neither KF's position nor its σ."
 )
 
 
 AXIS_GROUPS = {"horizontal": ("north", "east", "aisle"), "vertical": ("down",)}
-KEEP_NOISE_ACTION_DRIFT = (
+KEEP_NOISE_BECAUSE_OF_DRIFT_ACTION = (
     "Do not reduce noise settings: innovations do not show the drift of the source."
 )
-KEEP_NOISE_ACTION_CORRELATED = (
-    "Do not reduce noise settings: R has to include the time-correlated error of {sensor}, which "
-    "innovations do not show."
+KEEP_NOISE_BECAUSE_OF_CORRELATION_ACTION = (
+    "Do not reduce noise settings. Innovations do not show the time-correlated error of {sensor}, "
+    "but R has to include this error."
 )
-KEEP_NOISE_ACTION_TRUTH = (
+KEEP_NOISE_BECAUSE_OF_TRUTH_ACTION = (
     "Do not reduce noise settings: ground truth shows that a smaller σ would be too small."
 )
 # Effect of a noise setting that is too small or too large on KF, and the reason
-SETTING_EFFECTS = {
-    (SIGMA_Z, "small"): ("KF follows the measurement noise", "KF's gain is too large."),
+EFFECT_AND_REASON_BY_WRONG_SETTING = {
+    (SIGMA_Z, "small"): (
+        "KF follows the noise of single positions",
+        "KF's gain is too large.",
+    ),
     (SIGMA_Z, "large"): ("KF follows the positions slowly", "KF's gain is too small."),
     (SIGMA_A, "small"): (
         "KF lags behind the motion",
         "KF's covariance P grows too little between updates, so KF's gain is too small.",
     ),
     (SIGMA_A, "large"): (
-        "KF follows the measurement noise",
+        "KF follows the noise of single positions",
         "KF's covariance P grows too much between updates, so KF's gain is too large.",
     ),
 }
@@ -106,8 +109,8 @@ AxisWithSummary = tuple[AxisComparison, FilterSummary]
 class SettingDeviation(NamedTuple):
     """Deviation of a noise setting from its estimate.
 
-    ``estimate`` is the upper bound of the estimate if only the bound is known. ``factor`` is the
-    larger of setting / estimate and estimate / setting.
+    ``estimate`` is the estimated noise, or its upper bound if the data give only a bound.
+    ``factor`` is the larger of setting / estimate and estimate / setting.
     """
 
     estimate: float
@@ -169,7 +172,7 @@ def _make_setting_finding(
     noise = axis_tuning.sigma_z if name == SIGMA_Z else axis_tuning.sigma_a_two_state
     label, size_word = SETTING_RANGES[name].label, "small" if setting < estimated_noise else "large"
     is_upper_bound = noise.value is None
-    effect, reason = SETTING_EFFECTS[name, size_word]
+    effect, reason = EFFECT_AND_REASON_BY_WRONG_SETTING[name, size_word]
     action = format_setting_action(analysis, name, estimated_noise)
     return finding(
         "note" if action == NO_IMPROVEMENT_ACTION else severity,
@@ -181,9 +184,7 @@ def _make_setting_finding(
             "chosen": setting,
             "most_likely": estimated_noise,
             "factor": setting / estimated_noise,
-            "lag1_autocorrelation": getattr(
-                axis_tuning.before, "lag1_autocorrelation", float("nan")
-            ),
+            "lag1_autocorrelation": getattr(axis_tuning.before, "lag1_autocorrelation", np.nan),
         },
     )
 
@@ -222,10 +223,10 @@ def find_setting_deviation(
     )
     low, high = (estimate * (end / estimate) ** INTERVAL_WIDENING_FACTOR for end in (low, high))
     factor = max(setting / estimate, estimate / setting)
-    if low <= setting <= high or factor < MIN_NOISE_FACTOR:
+    if low <= setting <= high or factor < MIN_SETTING_TO_ESTIMATE_FACTOR:
         return None
     severity: Severity = "error" if factor >= MIN_NOISE_FACTOR_FOR_ERROR else "warning"
-    if setting == getattr(Settings(), name):  # the user did not choose the wrong value
+    if setting == getattr(Settings(), name):  # px4fuse's default, not chosen by the user
         severity = lower_severity(severity)
     return SettingDeviation(estimate, factor, severity)
 
@@ -234,7 +235,8 @@ def detect_process_noise_near_zero(analysis: Analysis) -> Findings:
     """Detect a SIGMA_A so small that KF ignores new positions."""
     for result in sorted(analysis.axes.values(), key=lambda result: result is not analysis.main):
         updates, summary = result.replay.updates, result.filters["kf"]
-        # Without motion, a small SIGMA_A is correct: the innovations are then consistent or white
+        # Without motion, a small SIGMA_A is correct. KF is then not overconfident, or its
+        # innovations are white
         if (
             isinstance(summary, Unavailable)
             or summary.verdict != "overconfident"
@@ -243,17 +245,19 @@ def detect_process_noise_near_zero(analysis: Analysis) -> Findings:
             continue
         steady_position_gain = float(updates["gain_position"].iloc[len(updates) // 2 :].median())
         time_constant_s = 1.0 / (sample_rate(updates) * steady_position_gain)
-        if time_constant_s < MIN_TIME_CONSTANT_S:
+        if time_constant_s < MIN_KF_TIME_CONSTANT_S:
             continue
-        sigma_a = analysis.settings.sigma_a_m_s2
+        sigma_a_m_s2 = analysis.settings.sigma_a_m_s2
         axis_tuning = find_axis_tuning(analysis.tuning, result.axis.name)
-        title, estimate_text = f"Process noise SIGMA_A is almost zero ({sigma_a:g} m/s²)", ""
+        title, estimate_text = f"Process noise SIGMA_A is almost zero ({sigma_a_m_s2:g} m/s²)", ""
         action = "Increase SIGMA_A (--sigma-a)."
         if axis_tuning is not None and (estimated_sigma_a := axis_tuning.sigma_a_two_state.value):
-            title = f"SIGMA_A is {format_factor(estimated_sigma_a / sigma_a)} times too small"
-            estimate_text = f"{format_estimate(SIGMA_A, sigma_a, axis_tuning.sigma_a_two_state)}. "
+            title = f"SIGMA_A is {format_factor(estimated_sigma_a / sigma_a_m_s2)} times too small"
+            estimate_text = (
+                f"{format_estimate(SIGMA_A, sigma_a_m_s2, axis_tuning.sigma_a_two_state)}. "
+            )
             action = format_setting_action(analysis, SIGMA_A, estimated_sigma_a)
-        yield error(
+        yield make_error(
             "process_noise_near_zero",
             f"{title}: KF ignores new positions. {estimate_text}KF's position gain decreases to "
             f"{steady_position_gain:.2g}, so KF needs {time_constant_s:.0f} s to follow a position "
@@ -277,14 +281,14 @@ def detect_inconsistent_variances(analysis: Analysis) -> Findings:
                     and (summary.sigma_ratio < 1.0) == is_underconfident
                 ]
                 if inconsistent_axes:
-                    variance_finding = _make_variance_finding(
+                    sigma_finding = _make_wrong_sigma_finding(
                         analysis, filter_name, axis_group, inconsistent_axes
                     )
-                    yield structs.replace(variance_finding, caused_by=first_finding_id)
-                    first_finding_id = variance_finding.id
+                    yield structs.replace(sigma_finding, caused_by=first_finding_id)
+                    first_finding_id = sigma_finding.id
 
 
-def _make_variance_finding(
+def _make_wrong_sigma_finding(
     analysis: Analysis,
     filter_name: FilterName,
     axis_group: str,
@@ -301,19 +305,21 @@ def _make_variance_finding(
     axis_tuning = find_axis_tuning(analysis.tuning, worst_axis.axis.name)
     verdict = "underconfident" if is_underconfident else "overconfident"
     if is_underconfident and analysis.source.origin.may_drift:
-        severity, remedy_text, cause = "note", KEEP_NOISE_ACTION_DRIFT, UNKNOWN_CAUSE
+        severity, remedy_text, cause = "note", KEEP_NOISE_BECAUSE_OF_DRIFT_ACTION, UNKNOWN_CAUSE
     elif is_underconfident and analysis.source.origin.is_gnss:
         is_barometer = analysis.source.aid(worst_axis.axis.name) == BAROMETER
         remedy_text = (
-            _format_excessive_noise(analysis) if filter_name == "ekf2" and not is_barometer else ""
+            _format_action_for_excessive_noise(analysis)
+            if filter_name == "ekf2" and not is_barometer
+            else ""
         )
         cause = MEASUREMENT_NOISE_CAUSE if remedy_text else UNKNOWN_CAUSE
-        keep_noise_action = KEEP_NOISE_ACTION_CORRELATED.format(
+        action_to_keep_noise = KEEP_NOISE_BECAUSE_OF_CORRELATION_ACTION.format(
             sensor="a barometer" if is_barometer else "GNSS"
         )
         severity, remedy_text = (
             severity if remedy_text else "note",
-            remedy_text or keep_noise_action,
+            remedy_text or action_to_keep_noise,
         )
     elif (
         is_underconfident
@@ -324,12 +330,14 @@ def _make_variance_finding(
     elif is_underconfident and any(
         filter_with_error == filter_name for filter_with_error, *_ in find_hidden_errors(analysis)
     ):
-        remedy_text, cause = KEEP_NOISE_ACTION_TRUTH, UNKNOWN_CAUSE
+        remedy_text, cause = KEEP_NOISE_BECAUSE_OF_TRUTH_ACTION, UNKNOWN_CAUSE
     else:
         rerun = find_cause_trial(analysis.trials, filter_name, worst_axis.axis.name)
         cause = classify_cause(analysis, rerun)
-        remedy_text = _find_variance_remedy(analysis, filter_name, worst_axis, axis_tuning, rerun)
-        severity = "note" if remedy_text == KEEP_NOISE_ACTION_TRUTH else severity
+        remedy_text = _find_action_for_wrong_sigma(
+            analysis, filter_name, worst_axis, axis_tuning, rerun
+        )
+        severity = "note" if remedy_text == KEEP_NOISE_BECAUSE_OF_TRUTH_ACTION else severity
     low, high = summary.nis_band
     return finding(
         severity,
@@ -349,9 +357,9 @@ def _make_variance_finding(
     )
 
 
-def _format_excessive_noise(analysis: Analysis) -> str:
+def _format_action_for_excessive_noise(analysis: Analysis) -> str:
     name = find_aid(analysis).noise
-    parameter_noise_m = analysis.flight.log.parameters.get(name, float("nan"))
+    parameter_noise_m = analysis.flight.log.parameters.get(name, np.nan)
     reported_variance = cut_to_segment(analysis.source.samples, analysis.segment)[
         Columns.POSITION_VARIANCE[0]
     ]
@@ -360,7 +368,9 @@ def _format_excessive_noise(analysis: Analysis) -> str:
     noise_m = max(
         reported_noise_m, (horizontal_tuning.sigma_z.value if horizontal_tuning else None) or 0.0
     )
-    if not parameter_noise_m > NOISE_RATIO_TOLERANCE * noise_m:  # the comparison is False for NaN
+    if (
+        not parameter_noise_m > MAX_RATIO_OF_EQUAL_NOISES * noise_m
+    ):  # the comparison is False for NaN
         return ""
     noise_label = (
         "noise that the receiver reports" if noise_m == reported_noise_m else "estimated noise"
@@ -378,7 +388,7 @@ def _format_noise_minimum(analysis: Analysis) -> str:
     if not is_fused_with_gnss or parameters.get(EV_POS.noise, 0.0) > gnss_noise_m:
         return ""
     return (
-        "No change: while EKF2 fuses GNSS as well, PX4 limits the noise of vision positions to at "
+        "Change nothing: while EKF2 also fuses GNSS, the noise of vision positions in PX4 is at "
         f"least {GNSS_POS.noise} ({gnss_noise_m:g} m)."
     )
 
@@ -394,34 +404,35 @@ def _has_default_noises(
         )
     noise_parameter = find_aid(analysis, result.axis.name).noise
     log = analysis.flight.log
-    default_noise = log.default_of(noise_parameter)
+    default_noise = log.find_default_value(noise_parameter)
     is_parameter_default = log.parameters.get(noise_parameter, default_noise) == default_noise
-    # If R differs from the parameter, EKF2 uses the variance that the source reports, not a default
+    # EKF2 uses the default, unless R is the variance that the source reports. Unknown R (NaN) is
+    # treated as the default
     return is_parameter_default and not abs(
         np.log(find_ekf2_noise_m(result) / default_noise)
-    ) > np.log(NOISE_RATIO_TOLERANCE)
+    ) > np.log(MAX_RATIO_OF_EQUAL_NOISES)
 
 
-def _find_variance_remedy(
+def _find_action_for_wrong_sigma(
     analysis: Analysis,
     filter_name: FilterName,
     result: AxisComparison,
     axis_tuning: AxisTuning | None,
     cause: Trial | None,
 ) -> str:
-    if cause is not None and not is_refuted(analysis, filter_name, cause):
+    if cause is not None and not rerun_refutes_cause(analysis, filter_name, cause):
         return format_action(analysis, cause.change)
     reruns = find_trials(analysis.trials, filter_name, result.axis.name)
     if any(makes_overconfident(rerun, "nis") for rerun in reruns):
-        return KEEP_NOISE_ACTION_TRUTH
+        return KEEP_NOISE_BECAUSE_OF_TRUTH_ACTION
     if axis_tuning is None:
         return UNKNOWN_NOISE_ACTION
     if filter_name == "ekf2" and not reruns:
-        return _find_remedy_without_replay(analysis, result, axis_tuning)
+        return _find_sigma_action_without_replay(analysis, result, axis_tuning)
     return UNEXPLAINED_SIGMA_ACTION
 
 
-def _find_remedy_without_replay(
+def _find_sigma_action_without_replay(
     analysis: Analysis, result: AxisComparison, axis_tuning: AxisTuning
 ) -> str:
     aid, noise = find_aid(analysis, result.axis.name), axis_tuning.sigma_z
@@ -431,9 +442,9 @@ def _find_remedy_without_replay(
         return UNEXPLAINED_SIGMA_ACTION
     noise_m, used_noise_m = max(estimated_noise_m, EKF2_MIN_NOISE_M), find_ekf2_noise_m(result)
     ratio = used_noise_m / noise_m if ekf2_summary.sigma_ratio < 1.0 else noise_m / used_noise_m
-    if ratio > NOISE_RATIO_TOLERANCE:
+    if ratio > MAX_RATIO_OF_EQUAL_NOISES:
         parameters = analysis.flight.log.parameters
-        uses_reported_noise = used_noise_m > MIN_USED_TO_SET_NOISE_RATIO * parameters.get(
+        uses_reported_noise = used_noise_m > MIN_USED_TO_PARAMETER_NOISE_RATIO * parameters.get(
             aid.noise, np.inf
         )
         changes = {
@@ -446,12 +457,13 @@ def _find_remedy_without_replay(
         if not changes:
             return UNEXPLAINED_SIGMA_ACTION
         return (
-            f"Set {format_settings(changes)} (EKF2 uses {used_noise_m:.2g} m). No replay confirms "
-            "this change: fly again and compare."
+            f"Set {format_settings(changes)}. EKF2 used a measurement noise of {used_noise_m:.2g} "
+            "m. "
+            "Fly again to test the change, because EKF2 cannot be replayed."
         )
     return (
-        f"EKF2's measurement noise ({used_noise_m:.2g} m) equals the estimated position noise, so "
-        "EKF2's wrong σ has another cause. Check the time offset (px4fuse sync LOG) and the IMU "
+        f"EKF2's measurement noise ({used_noise_m:.2g} m) equals the estimated position noise. "
+        "The wrong σ has another cause: check the time offset (px4fuse sync LOG) and the IMU "
         "(gaps, vibration)."
     )
 
@@ -460,5 +472,5 @@ def find_ekf2_noise_m(result: AxisComparison) -> float:
     """Return EKF2's median measurement noise √R (m) along an axis; NaN if unknown."""
     innovations = result.ekf2_innovations
     if isinstance(innovations, Unavailable):
-        return float("nan")
+        return np.nan
     return float(np.sqrt(innovations["observation_variance_m2"].median()))

@@ -10,12 +10,12 @@ from px4fuse.comparison.comparison import compute_position_errors
 from px4fuse.comparison.remedy import find_aid
 from px4fuse.core.text import format_metres, format_ratio
 from px4fuse.filter.consistency import assess_innovations
-from px4fuse.findings.model import Findings, note, warning
+from px4fuse.findings.model import Findings, make_note, make_warning
 from px4fuse.flight.ekf2_parameters import AID_MASK_PARAMETER, PARAMETERS
 from px4fuse.flight.model import Ekf2, Unavailable
 
 # A parameter change has an effect if σ ratio or position RMSE change by at least this factor
-MIN_EFFECTIVE_CHANGE_FACTOR = 1.5
+MIN_SIGMA_RATIO_OR_RMSE_CHANGE_FACTOR = 1.5
 
 
 class SpanConsistency(NamedTuple):
@@ -40,9 +40,9 @@ def detect(analysis: Analysis) -> Findings:
         and segment.start_s < change.time_s < segment.end_s
     ]
     span_edges_s = [segment.start_s, *(change.time_s for change in changes), segment.end_s]
-    for change_index, (time_s, name, before, after) in enumerate(changes):
+    for change_index, (time_s, name, value_before, value_after) in enumerate(changes):
         consistency_before, consistency_after = (
-            _assess_span(analysis, *span_edges_s[span_index : span_index + 2])
+            _compute_span_consistency(analysis, *span_edges_s[span_index : span_index + 2])
             for span_index in (change_index, change_index + 1)
         )
         unit = "" if name in fusion_parameters else f" {PARAMETERS[name].printed_unit}".rstrip()
@@ -53,14 +53,14 @@ def detect(analysis: Analysis) -> Findings:
                 for span in (consistency_before, consistency_after)
             }
             has_effect |= len(verdicts) > 1
-            has_effect |= _differ_significantly(
+            has_effect |= _differ_by_min_factor(
                 consistency_before.sigma_ratio, consistency_after.sigma_ratio
             )
             effect_sentences = (
                 f" EKF2 is {consistency_before.verdict_text} before the change and "
                 f"{consistency_after.verdict_text} after it (innovations along the main axis)."
             )
-        if _differ_significantly(consistency_before.rmse_m, consistency_after.rmse_m):
+        if _differ_by_min_factor(consistency_before.rmse_m, consistency_after.rmse_m):
             has_effect = True
             effect_sentences += (
                 " EKF2's position RMSE along the main axis is "
@@ -68,31 +68,31 @@ def detect(analysis: Analysis) -> Findings:
                 f"{format_metres(consistency_after.rmse_m)} m after it."
             )
         action = (
-            "Analyse the flight before and after the change separately "
-            f"(--end {time_s:.1f}, --start {time_s:.1f})."
+            f"Analyse the flight before (--end {time_s:.1f}) and after the change "
+            f"(--start {time_s:.1f}) separately."
         )
         if name in fusion_parameters:
             action = f"Do not change {name} in flight. {action}"
-        yield (warning if has_effect else note)(
+        yield (make_warning if has_effect else make_note)(
             "parameter_changed",
-            f"{name} changed from {before:g} to {after:g}{unit} at {time_s:.1f} "
+            f"{name} changed from {value_before:g} to {value_after:g}{unit} at {time_s:.1f} "
             f"s.{effect_sentences}",
             action,
-            {"parameter": name, "before": before, "after": after, "at_s": time_s},
+            {"parameter": name, "before": value_before, "after": value_after, "at_s": time_s},
             ((time_s, time_s),),
         )
 
 
-def _differ_significantly(before: float, after: float) -> bool:
-    """Return True if both values are known and the change is large enough for an effect."""
+def _differ_by_min_factor(before: float, after: float) -> bool:
+    """Return True if both values are known and differ by more than the minimum factor."""
     return (
         before > 0.0
         and after > 0.0
-        and abs(math.log(after / before)) > math.log(MIN_EFFECTIVE_CHANGE_FACTOR)
+        and abs(math.log(after / before)) > math.log(MIN_SIGMA_RATIO_OR_RMSE_CHANGE_FACTOR)
     )
 
 
-def _assess_span(analysis: Analysis, start_s: float, end_s: float) -> SpanConsistency:
+def _compute_span_consistency(analysis: Analysis, start_s: float, end_s: float) -> SpanConsistency:
     rmse_m = math.nan
     errors = compute_position_errors(analysis.main, "ekf2")
     if not isinstance(errors, Unavailable):

@@ -6,7 +6,7 @@ from px4fuse.analysis import Analysis
 from px4fuse.comparison.model import PreparedComparison
 from px4fuse.core.text import capitalise_first, format_number
 from px4fuse.ekf2.inputs import SIMULATED_EKF2_NOTE
-from px4fuse.findings.model import Findings, finding, format_count, note, warning
+from px4fuse.findings.model import Findings, finding, format_count, make_note, make_warning
 from px4fuse.flight.model import Ekf2, Flight
 
 
@@ -28,11 +28,12 @@ def detect_dropouts(analysis: PreparedComparison) -> Findings:
     ]
     if dropouts:
         total_s = sum(dropout.duration_s for dropout in dropouts)
-        longest_s = max(dropout.duration_s for dropout in dropouts)
-        yield warning(
+        longest_dropout_s = max(dropout.duration_s for dropout in dropouts)
+        yield make_warning(
             "logger_dropouts",
-            f"The logger lost {total_s:.2f} s of data in {len(dropouts)} "
-            f"dropout{'s' if len(dropouts) > 1 else ''}. The longest lasted {longest_s:.2f} s.",
+            f"The logger lost {total_s:.2f} s of data. Number of dropouts: {len(dropouts)}, "
+            "longest "
+            f"dropout: {longest_dropout_s:.2f} s.",
             "Use a faster SD card, or log fewer topics (SDLOG_PROFILE).",
             {"count": len(dropouts), "total_s": total_s},
             tuple((dropout.start_s, dropout.start_s + dropout.duration_s) for dropout in dropouts),
@@ -69,13 +70,12 @@ def detect_lost_data(flight: Flight) -> Findings:
         )
     for topic, count in list(log.dropped.items())[:1]:
         other_topic_count = len(log.dropped) - 1
-        topics = "topic" if other_topic_count == 1 else "topics"
         other_topics_sentence = (
-            f" {other_topic_count} other {topics} also contain wrong timestamps."
+            f" Other topics with wrong timestamps: {other_topic_count}."
             if other_topic_count
             else ""
         )
-        yield note(
+        yield make_note(
             "samples_out_of_order",
             f"{count} samples of {topic} have wrong timestamps: zero, or earlier than the sample "
             f"before. px4fuse ignores these samples.{other_topics_sentence} Possible cause: a "
@@ -86,10 +86,10 @@ def detect_lost_data(flight: Flight) -> Findings:
 
 
 def detect_decreasing_clocks(flight: Flight) -> Findings:
-    """Detect a decreasing boot clock (restart of the autopilot) and decreasing receive times."""
+    """Detect a boot clock that jumps back (restart of the autopilot), or receive times that do."""
     log = flight.log
     if log.restarts:
-        yield warning(
+        yield make_warning(
             "autopilot_restarted",
             f"The autopilot's boot clock restarted {format_count(log.restarts)}. px4fuse reads "
             "only the longest recording between restarts.",
@@ -97,7 +97,7 @@ def detect_decreasing_clocks(flight: Flight) -> Findings:
             {"count": log.restarts},
         )
     if reversals := log.receive_time_reversals:
-        yield note(
+        yield make_note(
             "receive_time_went_back",
             f"The recorded receive time decreased {format_count(reversals)}. Possible cause: the "
             "clock of the recording computer was set back, or the file consists of several "
@@ -111,16 +111,16 @@ def detect_other_estimators(analysis: Analysis) -> Findings:
     """Detect estimates that are not from PX4's EKF2, and MAVLink logs, which lack innovations."""
     log, ekf2 = analysis.flight.log, analysis.flight.ekf2
     if SIMULATED_EKF2_NOTE in log.notes:
-        yield note(
+        yield make_note(
             "ekf2_simulated",
             "This log is simulated: px4fuse's own model of EKF2 computed the EKF2 estimates, not "
             "PX4's code.",
-            "Use a real flight to assess PX4's EKF2.",
+            "To assess PX4's EKF2, analyse a real flight.",
         )
     if not isinstance(ekf2, Ekf2):
         return
     if log.autopilot != "PX4":
-        yield note(
+        yield make_note(
             "not_px4",
             f"This log is from {log.autopilot}, not PX4. {log.autopilot} does not have the PX4 "
             "parameters that the report names.",
@@ -129,7 +129,7 @@ def detect_other_estimators(analysis: Analysis) -> Findings:
         )
     if log.format.startswith("MAVLink"):
         contents = "states and variances" if isinstance(ekf2.variance, pd.DataFrame) else "states"
-        yield note(
+        yield make_note(
             "innovations_need_ulog",
             f"A MAVLink recording contains the {contents} of EKF2, but no innovations. The "
             "consistency of EKF2 cannot be tested.",

@@ -7,8 +7,8 @@ from px4fuse.comparison import remedy
 from px4fuse.comparison.model import FilterName, PreparedComparison
 from px4fuse.comparison.trials import Trial
 from px4fuse.filter.time_offset import ClockOffset
-from px4fuse.findings.cause_text import format_shift
-from px4fuse.findings.model import Findings, error, finding, warning
+from px4fuse.findings.cause_text import format_timestamp_action
+from px4fuse.findings.model import Findings, finding, make_error, make_warning
 from px4fuse.findings.source_positions import find_low_pass
 from px4fuse.findings.source_stamps import find_timesync_convergence
 from px4fuse.flight.ekf2_parameters import GNSS_POS, RECEIVER_DELAY_PARAMETERS
@@ -16,8 +16,9 @@ from px4fuse.flight.model import Unavailable
 
 # Minimum time offset (s), for severity "error": a position error of 0.1 m at 1 m/s
 MIN_OFFSET_FOR_ERROR_S = 0.10
-# A time offset is not reported if its correction increases KF's position RMSE by a larger ratio
-MAX_RMSE_RATIO = 1.005
+# A time offset is reported only if KF's position RMSE with corrected timestamps ÷ RMSE without
+# correction is at most this ratio
+MAX_RMSE_RATIO_AFTER_CORRECTION = 1.005
 CORRECT_AT_SENDER_ACTION = "Correct the position timestamps before sending."
 
 
@@ -44,7 +45,7 @@ def detect_time_offset(analysis: Analysis, time_offset: ClockOffset) -> Findings
     }
     if time_offset.has_changed() and time_offset.change_p_value is not None:
         start_offset_s, end_offset_s = time_offset.parts[0].offset_s, time_offset.parts[-1].offset_s
-        yield error(
+        yield make_error(
             "source_time_offset_changes",
             f"The time offset of the positions changes in flight from {start_offset_s:+.2f} s to "
             f"{end_offset_s:+.2f} s (significance test: p {time_offset.change_p_value:.1g}). No "
@@ -60,22 +61,25 @@ def detect_time_offset(analysis: Analysis, time_offset: ClockOffset) -> Findings
     if (
         not time_offset.is_significant(time_offset.remaining_s)
         or find_timesync_convergence(analysis) is not None
-        or _compute_rmse_ratio(_find_trial(analysis, "kf", "time offset")) > MAX_RMSE_RATIO
+        or _compute_rmse_ratio(_find_trial(analysis, "kf", "time offset"))
+        > MAX_RMSE_RATIO_AFTER_CORRECTION
     ):
         return
     interval_s, has_late_timestamps = (
         (interval_low_s - time_offset.applied_s, interval_high_s - time_offset.applied_s),
         time_offset.remaining_s < 0,
     )
-    offset_low_s, offset_high_s = (
+    abs_offset_low_s, abs_offset_high_s = (
         (-interval_s[1], -interval_s[0]) if has_late_timestamps else interval_s
     )
     yield finding(
         "error" if abs_offset_s > MIN_OFFSET_FOR_ERROR_S else "warning",
         "source_time_offset",
         f"Position timestamps are {abs_offset_s:.2f} s {'late' if has_late_timestamps else 'early'}"
-        f". The estimate from IMU and positions is {abs_offset_s:.3f} s (95 % {offset_low_s:.3f} "
-        f"to {offset_high_s:.3f} s). At 1 m/s this is a position error of {abs_offset_s:.2f} m in "
+        f". The estimate from IMU and positions is {abs_offset_s:.3f} s (95 % "
+        f"{abs_offset_low_s:.3f} "
+        f"to {abs_offset_high_s:.3f} s). At 1 m/s this is a position error of {abs_offset_s:.2f} m "
+        "in "
         "KF and EKF2. Innovations hardly show this "
         f"error.{_format_assumed_delay(analysis, time_offset)}",
         _find_offset_remedy(analysis, time_offset),
@@ -104,7 +108,7 @@ def _compute_rmse_ratio(trial: Trial | None) -> float:
 def _find_receiver_delay_parameter(analysis: Analysis) -> str | None:
     parameters = analysis.flight.log.parameters
     names = (name for name in (*RECEIVER_DELAY_PARAMETERS, GNSS_POS.delay) if name in parameters)
-    return next(names, None) if analysis.source.origin.fused_as_gnss else None
+    return next(names, None) if analysis.source.origin.is_fused_as_gnss else None
 
 
 def _format_assumed_delay(analysis: Analysis, time_offset: ClockOffset) -> str:
@@ -123,22 +127,17 @@ def _find_offset_remedy(analysis: Analysis, time_offset: ClockOffset) -> str:
     if delay_parameter := _find_receiver_delay_parameter(analysis):
         return f"Check the delay of the GNSS receiver ({delay_parameter})."
     if analysis.source.alignment is not None:
-        total_offset_s = compute_clock_offset_option_s(analysis, time_offset)
+        total_offset_s = compute_offset_for_option_s(analysis, time_offset)
         return f"Run again with --clock-offset {total_offset_s:.3f}."
     position_age_ms = (remedy.find_logged_delay_ms(analysis) or 0.0) - 1e3 * time_offset.remaining_s
-    horizon_parameters = remedy.make_delay_max_change(
-        analysis.flight.log.parameters, position_age_ms
-    )
+    delay_max_change = remedy.make_delay_max_change(analysis.flight.log.parameters, position_age_ms)
     delay_action = (
-        f", and set {remedy.format_settings(horizon_parameters)}" if horizon_parameters else ""
+        f", and set {remedy.format_settings(delay_max_change)}" if delay_max_change else ""
     )
-    shift_action = format_shift(time_offset.remaining_s)
-    return f"{shift_action} the timestamp of each position{delay_action}."
+    return f"{format_timestamp_action(time_offset.remaining_s)}{delay_action}."
 
 
-def compute_clock_offset_option_s(
-    comparison: PreparedComparison, time_offset: ClockOffset
-) -> float:
+def compute_offset_for_option_s(comparison: PreparedComparison, time_offset: ClockOffset) -> float:
     """Return the value (s) of ``--clock-offset`` that corrects a time offset."""
     # --clock-offset replaces the offset that the alignment of a position file found and applied
     alignment = comparison.source.alignment
@@ -146,7 +145,8 @@ def compute_clock_offset_option_s(
 
 
 def detect_wrong_delay(analysis: Analysis, time_offset: ClockOffset) -> Findings:
-    # For GNSS, the time offset already includes an error of EKF2_GPS_DELAY
+    # Only vision is tested: a wrong EKF2_GPS_DELAY is part of the time offset of GNSS positions,
+    # which detect_time_offset reports
     delay_ms = remedy.find_logged_delay_ms(analysis) if analysis.source.origin.is_vision else None
     estimated_delay_ms = -1e3 * time_offset.offset_s
     if (
@@ -171,12 +171,13 @@ def detect_wrong_delay(analysis: Analysis, time_offset: ClockOffset) -> Findings
     else:
         delay_text = f"the positions are {abs_delay_ms} ms late"
     limit_text = remedy.describe_delay_limit("EKF2_EV_DELAY", estimated_delay_ms, delay_ms)
-    yield warning(
+    yield make_warning(
         "ekf2_ev_delay_wrong",
         f"EKF2_EV_DELAY is {delay_ms:g} ms, but {delay_text}. The 95 % interval is "
         f"{interval_low_ms} to {interval_high_ms} ms. EKF2 fuses each position at the wrong time, "
         "so its track leads or "
-        f"lags.{f' The parameter EKF2_EV_DELAY cannot {limit_text}.' if limit_text else ''}",
+        "lags the "
+        f"motion.{f' The parameter EKF2_EV_DELAY cannot {limit_text}.' if limit_text else ''}",
         CORRECT_AT_SENDER_ACTION if limit_text else _find_delay_remedy(analysis),
         {"ekf2_ev_delay_ms": delay_ms, "asked_ms": estimated_delay_ms},
     )
@@ -191,11 +192,12 @@ def detect_wrong_gnss_delay(analysis: Analysis) -> Findings:
     if estimate is None:
         return
     delay_ms, (estimated_delay_ms, sigma_ms) = ekf2_model.inputs.settings[GNSS_POS.delay], estimate
-    yield warning(
+    yield make_warning(
         "ekf2_gps_delay_wrong",
         f"{GNSS_POS.delay} is {delay_ms:g} ms, but GNSS positions and velocities are "
         f"{estimated_delay_ms:.0f} ms late (± {1.96 * sigma_ms:.0f} ms, 95 %, compared with "
-        "vision). EKF2 fuses each GNSS sample at the wrong time, so its track leads or lags.",
+        "vision). EKF2 fuses each GNSS sample at the wrong time, so its track leads or lags the "
+        "motion.",
         f"Set {remedy.format_settings({GNSS_POS.delay: round(estimated_delay_ms)})}.",
         {"ekf2_gps_delay_ms": delay_ms, "estimate_ms": estimated_delay_ms, "sigma_ms": sigma_ms},
     )
@@ -205,11 +207,11 @@ def _find_delay_remedy(analysis: Analysis) -> str:
     trial = _find_trial(analysis, "ekf2", "delay")
     if trial is None:
         return "Check EKF2_EV_DELAY."
-    rmse_or_nis_ratio = _compute_rmse_ratio(trial)
-    if math.isnan(rmse_or_nis_ratio) and trial.before.nis_mean and trial.after.nis_mean:
-        rmse_or_nis_ratio = trial.after.nis_mean / trial.before.nis_mean
+    after_to_before_ratio = _compute_rmse_ratio(trial)
+    if math.isnan(after_to_before_ratio) and trial.before.nis_mean and trial.after.nis_mean:
+        after_to_before_ratio = trial.after.nis_mean / trial.before.nis_mean
     return (
         f"Set {remedy.format_settings(trial.change)}."
-        if rmse_or_nis_ratio < 1.0
+        if after_to_before_ratio < 1.0
         else CORRECT_AT_SENDER_ACTION
     )

@@ -1,4 +1,4 @@
-"""Positions with another convention than PX4's: wrong axes, unit, clock or orientation.
+"""Detect positions that do not follow PX4's convention: wrong axes, unit, clock or orientation.
 
 Sources: MAVROS ``vision_pose`` (``transform_frame_enu_ned``), PX4 ``VehicleOdometry.msg``, REP 103.
 """
@@ -24,16 +24,16 @@ from px4fuse.convention.texts import (
     format_axes,
 )
 from px4fuse.finding import Finding
-from px4fuse.findings.cause_grouping import CONVENTION_KEY, RESET_TIME_KEY
-from px4fuse.findings.model import FINDING_CATALOGUE, Findings, error, warning
+from px4fuse.findings.cause_grouping import RESET_TIME_KEY, WRONG_CONVENTION_KEY
+from px4fuse.findings.model import FINDING_CATALOGUE, Findings, make_error, make_warning
 from px4fuse.flight.model import PositionTrack, positions_phrase, source_name
 
 # Groups of findings that are valid even if all positions are wrong
-POSITION_INDEPENDENT_GROUPS = ("logging", "IMU")
+POSITION_INDEPENDENT_FINDING_GROUPS = ("logging", "IMU")
 
 
-# Wrong axes, unit, clock or orientation: (id of the finding, kind of the fault, which is the value
-# of CONVENTION_KEY in the evidence, message, action)
+# Content of a finding on wrong axes, unit, clock or orientation: finding id, kind of fault (value
+# of the evidence WRONG_CONVENTION_KEY), message, action
 ConventionFaultTexts = tuple[str, str, str, str]
 
 
@@ -46,12 +46,12 @@ def detect(analysis: Comparison) -> Findings:
         *_find_position_faults(convention, faults, analysis.source),
     ):
         evidence: dict[str, float | str] = {
-            CONVENTION_KEY: kind,
+            WRONG_CONVENTION_KEY: kind,
             "log_likelihood": round(convention.log_likelihood_gain, 1),
         }
         if kind == "rotation":
             evidence["misalignment_deg"] = faults.rotation_deg
-        make_finding = warning if kind in ("copied", "ambiguous") else error
+        make_finding = make_warning if kind in ("copied", "ambiguous") else make_error
         yield make_finding(name, message, action, evidence)
 
 
@@ -61,17 +61,19 @@ def remove_convention_effects(analysis: Comparison, findings: Sequence[Finding])
     Findings on EKF2 are kept and marked as effects, because EKF2 used the wrong positions.
     """
     faults = _find_convention_faults(analysis)
-    cause_findings = [item for item in findings if CONVENTION_KEY in item.evidence]
-    unusable_findings = [item for item in findings if FINDING_CATALOGUE[item.id].role == "unusable"]
+    cause_findings = [item for item in findings if WRONG_CONVENTION_KEY in item.evidence]
+    unusable_findings = [
+        item for item in findings if FINDING_CATALOGUE[item.id].report_class == "unusable"
+    ]
     if unusable_findings:
         cause_findings = unusable_findings
         findings = [
             item
             for item in findings
             if item in unusable_findings
-            or _is_convention_effect(item)
+            or _is_effect_of_wrong_convention(item)
             or (
-                FINDING_CATALOGUE[item.id].group in POSITION_INDEPENDENT_GROUPS
+                FINDING_CATALOGUE[item.id].group in POSITION_INDEPENDENT_FINDING_GROUPS
                 and item.id != "accelerometer_bias"
             )
         ]
@@ -80,7 +82,8 @@ def remove_convention_effects(analysis: Comparison, findings: Sequence[Finding])
     cause_findings += [
         item
         for item in findings
-        if FINDING_CATALOGUE[item.id].role == "misleading" or RESET_TIME_KEY in item.evidence
+        if FINDING_CATALOGUE[item.id].report_class == "misleading"
+        or RESET_TIME_KEY in item.evidence
     ]
     if not cause_findings:
         return [*findings]
@@ -88,7 +91,7 @@ def remove_convention_effects(analysis: Comparison, findings: Sequence[Finding])
         item
         for item in findings
         if item not in cause_findings
-        and FINDING_CATALOGUE[item.id].after_wrong_convention != "withdrawn"
+        and FINDING_CATALOGUE[item.id].status_if_convention_wrong != "withdrawn"
         # a drifting clock has no constant time offset
         and not (faults.clock_drift and item.id == "source_time_offset")
     ]
@@ -98,24 +101,24 @@ def remove_convention_effects(analysis: Comparison, findings: Sequence[Finding])
             *(
                 item
                 for item in other_findings
-                if _is_convention_effect(item) or item.severity == "note"
+                if _is_effect_of_wrong_convention(item) or item.severity == "note"
             ),
         ]
-    effect_findings = [
+    findings_caused_by_convention = [
         replace(item, message=f"{item.title}.", caused_by=cause_findings[0].id)
         for item in other_findings
-        if _is_convention_effect(item) and item.caused_by is None
+        if _is_effect_of_wrong_convention(item) and item.caused_by is None
     ]
     return [
         cause_findings[0],
-        *effect_findings,
+        *findings_caused_by_convention,
         *cause_findings[1:],
-        *(item for item in other_findings if not _is_convention_effect(item)),
+        *(item for item in other_findings if not _is_effect_of_wrong_convention(item)),
     ]
 
 
-def _is_convention_effect(item: Finding) -> bool:
-    return FINDING_CATALOGUE[item.id].after_wrong_convention == "effect"
+def _is_effect_of_wrong_convention(item: Finding) -> bool:
+    return FINDING_CATALOGUE[item.id].status_if_convention_wrong == "effect"
 
 
 def _find_convention_faults(analysis: Comparison) -> ConventionFaults:
@@ -134,11 +137,11 @@ def _find_position_faults(
     )
     stated_frame = alignment.frame.upper() if alignment else "NED"
     axes, rotation_deg = find_axes_in_file(convention.axes, stated_frame), faults.rotation_deg
-    is_rotation_of_file_frame = (
+    has_hardly_rotated_file = (
         is_position_file and abs(convention.rotation_deg) <= MIN_RESIDUAL_ROTATION_DEG
     )
     if faults.has_wrong_axes or (
-        rotation_deg and is_rotation_of_file_frame and axes in FRAME_AXES.values()
+        rotation_deg and has_hardly_rotated_file and axes in FRAME_AXES.values()
     ):
         orientation = convention.orientation
         frame_sentence = "The analysis uses the positions converted to NED."
@@ -151,7 +154,9 @@ def _find_position_faults(
             axes, stated_frame, is_mirrored=convention.is_mirrored, is_file=is_position_file
         )
         if faults.has_wrong_axes and rotation_deg:
-            fault_text += f", and rotated by {rotation_deg:+.0f}° (clockwise from above)"
+            fault_text += (
+                f". The frame is also rotated by {rotation_deg:+.0f}° clockwise from above"
+            )
         if orientation and orientation.frames.startswith("FLU"):
             action += f" {describe_quaternion_conversion(orientation.frames)}"
         message = f"{fault_text}. {evidence_sentence} {frame_sentence}"
@@ -162,13 +167,15 @@ def _find_position_faults(
             "gyroscopes": "the heading at take-off",
             "GNSS": "the GNSS positions",
         }[convention.heading_from]
-        other_cause = (
-            "." if convention.heading_from == "GNSS" else f", or {reference_text} is wrong."
+        cause_sentence = (
+            "The x axis of the source does not point north."
+            if convention.heading_from == "GNSS"
+            else f"The x axis of the source does not point north, or {reference_text} is wrong."
         )
         message = (
             f"{positions_text} are rotated by {rotation_deg:+.0f}° (clockwise from above) "
-            f"relative to {reference_text}. The x axis of the source does not point north"
-            f"{other_cause} {evidence_sentence} The analysis uses the positions rotated to NED."
+            f"relative to {reference_text}. {cause_sentence} {evidence_sentence} "
+            "The analysis rotates the positions to NED."
         )
         action = (
             "Align the frame of the positioning system with north, or rotate positions and "
@@ -215,9 +222,9 @@ def _find_position_faults(
     if faults.is_ambiguous:
         axes_text = format_axes(convention.axes, convention.unit)
         message = (
-            f"The axes of the {positions_text} are not NED, and the motion does not show which "
-            f"they are: {'; or '.join((axes_text, *convention.alternatives[:3]))}. px4fuse "
-            "estimates nothing from the positions."
+            f"The axes of the {positions_text} are not NED. The motion fits several conventions: "
+            f"{'; or '.join((axes_text, *convention.alternatives[:3]))}. px4fuse estimates nothing "
+            "from the positions."
         )
         action = "Fly a square with climb and descent, or state the frame (--position-frame)."
         yield "source_convention_ambiguous", "ambiguous", message, action
@@ -252,8 +259,8 @@ def _find_orientation_faults(
             "geometry_msgs have the order x, y, z, w.",
         ),
         "frames": (
-            f"The orientation of {source} is the rotation {orientation.frames}, but PX4 expects "
-            f"FRD to NED. With converted frames, {agreement_text}",
+            f"The orientation of {source} rotates {orientation.frames}, but PX4 expects "
+            f"FRD to NED. After a conversion of the frames, {agreement_text}",
             describe_quaternion_conversion(orientation.frames),
         ),
         "heading": (

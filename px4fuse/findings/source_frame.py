@@ -16,8 +16,8 @@ from px4fuse.findings.model import (
     compute_flag_fraction,
     finding,
     magnetometer_advice,
-    note,
-    warning,
+    make_note,
+    make_warning,
 )
 from px4fuse.flight.ekf2_parameters import EV_CTRL_YAW_MASK, EV_POS
 from px4fuse.flight.model import (
@@ -38,9 +38,9 @@ MIN_MISALIGNMENT_SIGMAS = 4.0
 MIN_HEADING_ERROR_DEG = 5.0
 # Minimum yaw misalignment (°), for severity "error": 26 % of the motion appears on the other axis
 MIN_SEVERE_HEADING_ERROR_DEG = 15.0
-# If EKF2's heading drifts relative to the positions, but its drift relative to ground truth is less
-# than this fraction of that drift, the frame of the positions drifts, not EKF2's heading
-MIN_TRUE_DRIFT_RATIO = 0.5
+# EKF2's heading drifts if its drift against ground truth is at least this fraction of its drift
+# against the positions. Otherwise the frame of the positions drifts
+MIN_TRUE_TO_RELATIVE_HEADING_DRIFT_RATIO = 0.5
 # Topic of the positions that EKF2 rotated into the frame of its state (EKF2.cpp)
 ALIGNED_VISION_TOPIC = "estimator_visual_odometry_aligned"
 CHECK_GNSS_DELAY_ACTION = "Check EKF2_GPS_DELAY: a wrong delay also causes a heading error."
@@ -48,14 +48,14 @@ CHECK_GNSS_DELAY_ACTION = "Check EKF2_GPS_DELAY: a wrong delay also causes a hea
 
 def detect(analysis: Analysis) -> Findings:
     if analysis.source.frame == "FRD":
-        yield make_frame_finding(analysis)
+        yield make_frd_positions_finding(analysis)
     heading_error = analysis.heading
     if isinstance(heading_error, HeadingError) and not analysis.source.origin.reconstructed:
         yield from detect_misalignment(analysis, heading_error)
     yield from detect_uncertain_alignment(analysis)
 
 
-def make_frame_finding(analysis: Analysis) -> Finding:
+def make_frd_positions_finding(analysis: Analysis) -> Finding:
     """Make the finding that positions are in FRD, so that their x axis is not north."""
     ekf2, log = analysis.flight.ekf2, analysis.flight.log
     fusion_flags = ekf2.fusion_flags if isinstance(ekf2, Ekf2) else None
@@ -78,13 +78,13 @@ def make_frame_finding(analysis: Analysis) -> Finding:
         )
     has_yaw = analysis.source.orientation is not None
     if fusion_sentence:
-        return note("source_frame_frd", f"{fault} {fusion_sentence}", action)
-    return warning(
+        return make_note("source_frame_frd", f"{fault} {fusion_sentence}", action)
+    return make_warning(
         "source_frame_frd",
         f"{fault} EKF2 did not fuse the yaw of {sensor_name}, so EKF2's axes are NED. The axes of "
         "positions and EKF2 may differ.",
-        "Send the position in NED"
-        + (", or let EKF2 fuse the yaw (EKF2_EV_CTRL bit 3)." if has_yaw else "."),
+        "Send the position in NED."
+        + " Alternatively, let EKF2 fuse the yaw of the source (EKF2_EV_CTRL bit 3)." * has_yaw,
     )
 
 
@@ -95,7 +95,7 @@ def detect_misalignment(analysis: Analysis, heading_error: HeadingError) -> Find
         heading_error.sigma_deg,
     )
     if heading_error.drifts:
-        if not _is_drift_refuted(analysis.flight, heading_error):
+        if not _truth_contradicts_heading_drift(analysis.flight, heading_error):
             yield _make_heading_drift_finding(analysis, heading_error)
         return
     systematic_errors = analysis.systematic_errors
@@ -112,14 +112,13 @@ def detect_misalignment(analysis: Analysis, heading_error: HeadingError) -> Find
     positions_text = positions_phrase(analysis.source)
     finding_id, reference = "ekf2_heading_error", "EKF2's heading"
     if analysis.source.origin.is_gnss:
-        reason = (
-            "GNSS positions refer to true north, so the rotation is an error of EKF2's heading."
-        )
+        reason = "GNSS positions refer to true north, so EKF2's heading is wrong by this rotation."
         _, action = _explain_gnss_heading_error(analysis)
     elif analysis.source.name == ALIGNED_VISION_TOPIC:
         reason = (
-            "EKF2 had rotated these positions into its own frame, but the IMU measures the motion "
-            "in another direction."
+            "EKF2 rotated these positions into its own frame. The IMU nevertheless measures "
+            "another "
+            "direction of the motion."
         )
         action = "Align the positioning frame with north."
     else:
@@ -158,7 +157,7 @@ def _explain_gnss_heading_error(analysis: Analysis) -> tuple[str, str]:
     return cause, f"{advice} {CHECK_GNSS_DELAY_ACTION}".lstrip()
 
 
-def _is_drift_refuted(flight: Flight, heading_error: HeadingError) -> bool:
+def _truth_contradicts_heading_drift(flight: Flight, heading_error: HeadingError) -> bool:
     truth, attitude = flight.truth, flight.attitude
     if (
         isinstance(truth, Unavailable)
@@ -178,7 +177,7 @@ def _is_drift_refuted(flight: Flight, heading_error: HeadingError) -> bool:
     heading_change_deg = abs(last_part.heading_error_deg - first_part.heading_error_deg)
     return (
         abs(heading_errors_deg[1] - heading_errors_deg[0])
-        < MIN_TRUE_DRIFT_RATIO * heading_change_deg
+        < MIN_TRUE_TO_RELATIVE_HEADING_DRIFT_RATIO * heading_change_deg
     )
 
 
@@ -188,27 +187,24 @@ def _make_heading_drift_finding(analysis: Analysis, heading_error: HeadingError)
         math.remainder(part.heading_error_deg, 360.0) for part in (first_part, last_part)
     ]
     heading_change_deg = last_part.heading_error_deg - first_part.heading_error_deg
-    estimation_basis = "positions and IMU"
+    estimation_data_text = "positions and IMU"
     if heading_error.by == "orientation":
-        estimation_basis = f"the orientation of {source_name(analysis.source)}"
+        estimation_data_text = f"the orientation of {source_name(analysis.source)}"
     calibration_advice, has_yaw = (
         magnetometer_advice(analysis.flight),
         analysis.source.orientation is not None,
     )
-    possible_causes = [
-        "a magnetometer indoors" if calibration_advice else "a gyroscope bias",
-        *(["odometry whose heading drifts"] if has_yaw else []),
-    ]
-    possible_cause, action = ", or ".join(possible_causes), ""
+    possible_cause = "a magnetometer indoors" if calibration_advice else "a gyroscope bias"
+    possible_cause += ", or heading drift of the odometry" * has_yaw
+    action = ""
     is_yaw_fused = int(analysis.flight.log.parameters.get(EV_POS.switch, 0.0)) & EV_CTRL_YAW_MASK
-    sentence_start = "Alternatively, let" if calibration_advice else "Let"
     if has_yaw and not is_yaw_fused:
-        action = f"{sentence_start} EKF2 fuse the yaw of the source (EKF2_EV_CTRL bit 3)."
+        action = "Let EKF2 fuse the yaw of the source (EKF2_EV_CTRL bit 3)."
     if analysis.source.origin.is_gnss:
         calibration_advice = ""
         possible_cause, action = _explain_gnss_heading_error(analysis)
     elif action and not analysis.flight.log.writes_ulog:
-        action = f"{sentence_start} the autopilot fuse the yaw of the source."
+        action = "Let the autopilot fuse the yaw of the source."
     return finding(
         "error" if abs(heading_change_deg) >= MIN_SEVERE_HEADING_ERROR_DEG else "warning",
         "ekf2_heading_error",
@@ -216,9 +212,11 @@ def _make_heading_drift_finding(analysis: Analysis, heading_error: HeadingError)
         f"{positions_phrase(analysis.source)}. Its error is {heading_errors_deg[0]:+.0f}° from "
         f"{first_part.start_s:.0f} to {first_part.end_s:.0f} s and {heading_errors_deg[1]:+.0f}° "
         f"from {last_part.start_s:.0f} to {last_part.end_s:.0f} s (clockwise from above, estimated "
-        f"from {estimation_basis}). A constant rotation of the positions cannot correct the drift. "
+        f"from {estimation_data_text}). A constant rotation of the positions cannot correct the "
+        "drift. "
         f"Possible cause: {possible_cause}.",
-        f"{calibration_advice} {action}".strip() or "Check the heading source of EKF2.",
+        " Alternatively: ".join(filter(None, (calibration_advice, action)))
+        or "Check the heading source of EKF2.",
         {
             "from_deg": first_part.heading_error_deg,
             "to_deg": last_part.heading_error_deg,
@@ -242,6 +240,6 @@ def detect_uncertain_alignment(analysis: Analysis) -> Findings:
             severity,
             "position_file_alignment",
             f"{sentence.rstrip('.')}.",
-            "State time offset, frame and yaw of the file if known (--clock-offset, "
-            "--position-frame, --position-yaw).",
+            "If time offset, frame and yaw of the file are known, run again with --clock-offset, "
+            "--position-frame and --position-yaw.",
         )

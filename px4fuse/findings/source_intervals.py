@@ -1,4 +1,4 @@
-"""Gaps in the position source, lost positions, and a downsampled source."""
+"""Detect gaps in the position source, positions lost in the recording, and downsampling."""
 
 import numpy as np
 import pandas as pd
@@ -19,12 +19,12 @@ from px4fuse.findings.model import (
     find_source_texts,
     finding,
     format_percent,
-    note,
-    warning,
+    make_note,
+    make_warning,
 )
 from px4fuse.flight.ekf2_parameters import AIDS, EV_POS, Aid
 from px4fuse.flight.model import (
-    ALIGNED_ORIGIN,
+    ALIGNED_BY_EKF2_ORIGIN,
     Ekf2,
     Unavailable,
     positions_phrase,
@@ -37,20 +37,20 @@ MIN_LOST_POSITION_FRACTION = 0.02
 # Minimum number of intervals between positions to detect downsampling
 MIN_INTERVAL_COUNT = 50
 # Minimum fraction of missing positions to report downsampling: a radio link loses fewer
-MIN_DOWNSAMPLED_FRACTION = 0.25
-# Each interval of downsampled positions is n or n + 1 periods of the source: 1 or 2 if positions at
-# 30 Hz are downsampled to 20 Hz. Minimum fraction of intervals with one of these two lengths
-MIN_INTERVAL_PAIR_FRACTION = 0.85
-# Minimum fraction of intervals with the rarer one of these two lengths
-MIN_RARER_LENGTH_FRACTION = 0.1
+MIN_MISSING_FRACTION_FOR_DOWNSAMPLING = 0.25
+# Downsampled positions have intervals of two lengths, n and n + 1 source periods (30 Hz to 20 Hz: 1
+# and 2). Minimum fraction of intervals with one of the two lengths
+MIN_FRACTION_OF_BOTH_INTERVAL_LENGTHS = 0.85
+# Downsampled positions have intervals of two lengths. Minimum fraction of the rarer length
+MIN_FRACTION_OF_RARER_INTERVAL_LENGTH = 0.1
 # Intervals are multiples of a period if the RMS of (interval / period - nearest integer) is at most
 # this value: jitter causes 0.03, random intervals cause 0.29
 MAX_ROUNDING_RMS_ERROR = 0.06
-# The tested periods of the source are median interval / n, with n from 1 to this number
+# Tested values of the source period: median interval / n, with n from 1 to this number
 MAX_PERIODS_IN_MEDIAN_INTERVAL = 4
 # Minimum length (s) of a gap at the start or end of the flight for a finding: shorter gaps may be
 # errors of take-off and landing times, because the land detector is seconds late
-MIN_END_GAP_S = 3.0
+MIN_GAP_AT_START_OR_END_S = 3.0
 # KF's predicted state is read this time (s) before the position that updates it
 TIME_BEFORE_UPDATE_S = 1e-6
 
@@ -64,37 +64,37 @@ def detect(analysis: Analysis) -> Findings:
 def detect_source_gaps(analysis: Analysis) -> Findings:
     """Detect gaps in the position source."""
     flight, source, ekf2 = analysis.segment.flight, analysis.source, analysis.flight.ekf2
-    gap_spans, fused_gap_spans = list[Span](), list[Span]()
-    invalid_times_s = analysis.source.invalid.index
+    gap_spans, gap_spans_only_in_log = list[Span](), list[Span]()
+    invalid_times_s = analysis.source.invalid_reasons.index
     for gap in analysis.events.gaps:
         if np.any((invalid_times_s > gap[0]) & (invalid_times_s < gap[1])):
             continue  # source_values.py reports these invalid positions
         aids = _find_fused_aids(ekf2, gap)
         if source.origin.aid in aids and source.alignment is None:
-            fused_gap_spans.append(gap)
+            gap_spans_only_in_log.append(gap)
         elif gap[0] == flight.start_s or gap[1] == flight.end_s:
-            if gap[1] - gap[0] > MIN_END_GAP_S:
-                yield _make_partial_source_finding(analysis, gap, aids)
+            if gap[1] - gap[0] > MIN_GAP_AT_START_OR_END_S:
+                yield _make_stop_or_begin_finding(analysis, gap, aids)
         else:
             gap_spans.append(gap)
     positions_text = positions_phrase(source)
-    if fused_gap_spans:
-        start_s, end_s, gap_count_text = _find_longest_gap(fused_gap_spans)
-        yield warning(
+    if gap_spans_only_in_log:
+        start_s, end_s, gap_count_text = _find_longest_gap(gap_spans_only_in_log)
+        yield make_warning(
             "source_gap_in_log",
             f"{positions_text} are missing in the log for {end_s - start_s:.1f} s{gap_count_text}, "
             "but EKF2 fused them. The source did not stop; KF has no measurement in this time.",
-            _find_unlogged_remedy(analysis, start_s, end_s),
-            {"count": len(fused_gap_spans), "longest_s": end_s - start_s, "at_s": start_s},
-            tuple(fused_gap_spans),
+            _find_remedy_for_unlogged_positions(analysis, start_s, end_s),
+            {"count": len(gap_spans_only_in_log), "longest_s": end_s - start_s, "at_s": start_s},
+            tuple(gap_spans_only_in_log),
         )
     if gap_spans:
         start_s, end_s, gap_count_text = _find_longest_gap(gap_spans)
-        yield warning(
+        yield make_warning(
             "source_gap",
             f"No position for {end_s - start_s:.1f} s{gap_count_text}. "
             f"{describe_errors_after_gap(analysis, (start_s, end_s))}",
-            f"Check {find_source_texts(source).reception} at {start_s:.1f} s.",
+            f"{find_source_texts(source).data_link_check} at {start_s:.1f} s.",
             {"count": len(gap_spans), "longest_s": end_s - start_s, "at_s": start_s},
             tuple(gap_spans),
         )
@@ -105,7 +105,7 @@ def _find_longest_gap(gaps: list[Span]) -> tuple[float, float, str]:
     return start_s, end_s, "" if len(gaps) == 1 else f", the longest of {len(gaps)} gaps"
 
 
-def _find_unlogged_remedy(analysis: Analysis, start_s: float, end_s: float) -> str:
+def _find_remedy_for_unlogged_positions(analysis: Analysis, start_s: float, end_s: float) -> str:
     for track in analysis.flight.positions:
         if track.origin.aid == analysis.source.origin.aid and len(track.samples[start_s:end_s]) > 2:
             return f"Run again with --position-source {track.name}, which contains these positions."
@@ -114,9 +114,7 @@ def _find_unlogged_remedy(analysis: Analysis, start_s: float, end_s: float) -> s
     return "Log fewer topics (SDLOG_PROFILE)."
 
 
-def _make_partial_source_finding(
-    analysis: Analysis, span_s: Span, fused_aids: list[Aid]
-) -> Finding:
+def _make_stop_or_begin_finding(analysis: Analysis, span_s: Span, fused_aids: list[Aid]) -> Finding:
     (start_s, end_s), source = span_s, analysis.source
     is_source_stop = end_s == analysis.segment.flight.end_s
     event_verb, start_or_stop_s, before_or_after = (
@@ -124,17 +122,15 @@ def _make_partial_source_finding(
     )
     action = "" if is_source_stop or source.alignment else " Take off only when positions arrive."
     ekf2_errors_at_end, duration_s = _find_ekf2_errors_at_end(analysis, span_s), end_s - start_s
-    time_text = f"after {duration_s:.1f} s" if is_source_stop else "just before the first position"
-    effect_text = (
-        f", {duration_s:.1f} s {'before the end' if is_source_stop else 'after the start'}"
-    )
+    time_text = f"{duration_s:.1f} s {'before the end' if is_source_stop else 'after the start'}"
+    effect_sentence = ""
     if "error_m" in ekf2_errors_at_end:
         error_text = format_metres(ekf2_errors_at_end["error_m"])
-        effect_text = f": EKF2's position error is {error_text} m {time_text}"
+        effect_sentence = f"EKF2's position error at the end of this time is {error_text} m. "
     elif "sigma_m" in ekf2_errors_at_end:
         sigma_text = format_metres(ekf2_errors_at_end["sigma_m"])
-        effect_text = f": EKF2's reported σ is {sigma_text} m {time_text}"
-    has_aids, aiding_sentence = _has_aids(analysis.flight.ekf2), ""
+        effect_sentence = f"EKF2's reported σ at the end of this time is {sigma_text} m. "
+    has_aids, aiding_sentence = _has_aiding_sources(analysis.flight.ekf2), ""
     if has_aids:
         labels = [aid.label for aid in fused_aids] or ["the IMU alone (dead reckoning)"]
         aiding_sentence = f"For {duration_s:.1f} s EKF2 relied on {' and '.join(labels)}. "
@@ -144,9 +140,10 @@ def _make_partial_source_finding(
         else "warning",
         "source_stops" if is_source_stop else "source_begins",
         f"{positions_phrase(source)} {event_verb} in flight at {start_or_stop_s:.1f} "
-        f"s{effect_text}. {aiding_sentence}px4fuse evaluates KF and EKF2 only while positions "
+        f"s, {time_text}. {aiding_sentence}{effect_sentence}px4fuse evaluates KF and EKF2 only "
+        "while positions "
         "arrive.",
-        f"Check {find_source_texts(source).reception} {before_or_after} {start_or_stop_s:.1f} "
+        f"{find_source_texts(source).data_link_check} {before_or_after} {start_or_stop_s:.1f} "
         f"s.{action}",
         {"at_s": start_or_stop_s, "duration_s": duration_s, **ekf2_errors_at_end},
         (span_s,),
@@ -173,17 +170,19 @@ def _find_ekf2_errors_at_end(analysis: Analysis, span_s: Span) -> dict[str, floa
             )
         sigma_m = interpolate_sigma(time_s, tracks.ekf2_variance, "position_variance_m2")
         squared_errors_m2.append([(position_m - true_position_m) ** 2, sigma_m**2])
-    named_square_sums = zip(("error_m", "sigma_m"), np.sum(squared_errors_m2, axis=0), strict=True)
+    quantities_and_square_sums = zip(
+        ("error_m", "sigma_m"), np.sum(squared_errors_m2, axis=0), strict=True
+    )
     return {
         name: float(np.sqrt(values[np.isfinite(values)][-1]))
-        for name, values in named_square_sums
+        for name, values in quantities_and_square_sums
         if np.isfinite(values).any()
     }
 
 
-def describe_errors_after_gap(analysis: Analysis, gap_s: Span) -> str:
+def describe_errors_after_gap(analysis: Analysis, gap_span_s: Span) -> str:
     """Describe the position errors of KF and EKF2 at the end of a gap."""
-    result, (start_s, end_s) = analysis.main, gap_s
+    result, (start_s, end_s) = analysis.main, gap_span_s
     start_and_end_times_s = np.array([start_s, end_s - TIME_BEFORE_UPDATE_S])
     axis, ekf2_state = result.axis, result.ekf2_state
     reference_m = float(axis.measurement_m[np.searchsorted(axis.measurement_time_s, end_s)])
@@ -199,12 +198,12 @@ def describe_errors_after_gap(analysis: Analysis, gap_s: Span) -> str:
     if isinstance(ekf2_state, pd.DataFrame) and len(
         positions_before := ekf2_state["position_m"].loc[:end_s]
     ):
-        if _has_aids(analysis.flight.ekf2):
+        if _has_aiding_sources(analysis.flight.ekf2):
             aiding_sentence = "In the gap KF and EKF2 rely on the IMU alone."
-        if other_aids := _find_fused_aids(analysis.flight.ekf2, gap_s):
+        if other_aids := _find_fused_aids(analysis.flight.ekf2, gap_span_s):
             aid_labels_text = " and ".join(aid.label for aid in other_aids)
             aiding_sentence = (
-                f"In the gap KF relies on the IMU alone, EKF2 also on {aid_labels_text}."
+                f"In the gap KF relies on the IMU alone. EKF2 also relies on {aid_labels_text}."
             )
         variance, state_time_s = result.ekf2_variance, float(positions_before.index[-1])
         sigma_text = ""
@@ -219,7 +218,7 @@ def describe_errors_after_gap(analysis: Analysis, gap_s: Span) -> str:
     return f"{aiding_sentence} {quantity} along {axis.label}: {', '.join(error_texts)}."
 
 
-def _has_aids(ekf2: Ekf2 | Unavailable) -> bool:
+def _has_aiding_sources(ekf2: Ekf2 | Unavailable) -> bool:
     return isinstance(ekf2, Ekf2) and bool(ekf2.aids)
 
 
@@ -257,7 +256,7 @@ def detect_lost_samples(analysis: Analysis) -> Findings:
         action = "Record on the companion computer or on a link without message loss."
         if analysis.flight.log.writes_ulog:
             action += " Or set SDLOG_PROFILE to 129: the ULog then contains the received positions."
-        yield note(
+        yield make_note(
             "source_samples_lost",
             f"The recording lacks {format_percent(lost_count / sent_count)} of the "
             f"{positions_phrase(source)}. {lost_count} of {sent_count} positions are missing (one "
@@ -270,30 +269,35 @@ def detect_lost_samples(analysis: Analysis) -> Findings:
 def detect_downsampling(analysis: Analysis) -> Findings:
     """Detect positions that were downsampled before PX4 received them."""
     source = analysis.source
-    # Timestamps do not show the intervals at which PX4 received the positions if px4fuse converted
-    # the timestamps, or if PX4 logged positions only after EKF2 had used them (ALIGNED_ORIGIN)
+    # The timestamps must show the intervals at which PX4 received the positions. This is not so if
+    # px4fuse converted the timestamps, or if EKF2 processed the positions before PX4 logged them
     if (
         source.clock_map is not None
-        or source.origin.find_preference_rank() >= ALIGNED_ORIGIN.find_preference_rank()
+        or source.origin.find_preference_rank() >= ALIGNED_BY_EKF2_ORIGIN.find_preference_rank()
     ):
         return
     intervals_s, _ = _compute_intervals_s(analysis)
-    period_and_counts = (
-        _find_period(intervals_s) if len(intervals_s) >= MIN_INTERVAL_COUNT else None
-    )
-    if period_and_counts is None:
+    if (
+        len(intervals_s) < MIN_INTERVAL_COUNT
+        or (period_and_multiples := _find_period(intervals_s)) is None
+    ):
         return
-    period_s, period_counts = period_and_counts
-    lost_fraction = 1.0 - 1.0 / float(np.mean(period_counts))
-    fraction_by_period_count = np.bincount(period_counts.astype(np.intp)) / len(period_counts)
-    adjacent_pair_fractions = fraction_by_period_count[:-1] + fraction_by_period_count[1:]
-    shorter_period_count = int(np.argmax(adjacent_pair_fractions))
-    has_two_interval_lengths = (
-        adjacent_pair_fractions[shorter_period_count] >= MIN_INTERVAL_PAIR_FRACTION
-        and fraction_by_period_count[shorter_period_count : shorter_period_count + 2].min()
-        >= MIN_RARER_LENGTH_FRACTION
+    period_s, periods_in_intervals = period_and_multiples
+    lost_fraction = 1.0 - 1.0 / float(np.mean(periods_in_intervals))
+    fraction_by_interval_length = np.bincount(periods_in_intervals.astype(np.intp)) / len(
+        periods_in_intervals
     )
-    if lost_fraction < MIN_DOWNSAMPLED_FRACTION or not has_two_interval_lengths:
+    fraction_by_pair_of_lengths = fraction_by_interval_length[:-1] + fraction_by_interval_length[1:]
+    periods_in_shorter_interval = int(np.argmax(fraction_by_pair_of_lengths))
+    has_two_interval_lengths = (
+        fraction_by_pair_of_lengths[periods_in_shorter_interval]
+        >= MIN_FRACTION_OF_BOTH_INTERVAL_LENGTHS
+        and fraction_by_interval_length[
+            periods_in_shorter_interval : periods_in_shorter_interval + 2
+        ].min()
+        >= MIN_FRACTION_OF_RARER_INTERVAL_LENGTH
+    )
+    if lost_fraction < MIN_MISSING_FRACTION_FOR_DOWNSAMPLING or not has_two_interval_lengths:
         return
     mean_interval_s = float(np.mean(intervals_s))
     is_too_slow = mean_interval_s > EV_START_INTERVAL_S
@@ -331,17 +335,17 @@ def _compute_intervals_s(analysis: Analysis) -> tuple[Array, float]:
 
 def _find_period(intervals_s: Array) -> tuple[float, Array] | None:
     """Return the period (s) of the source, and the number of periods in each interval."""
-    # The upper median is one of the intervals. The mean of two intervals may be no multiple of the
-    # period
+    # The upper median is one of the intervals, and thus a multiple of the period. numpy.median may
+    # be the mean of two intervals
     median_interval_s = float(np.sort(intervals_s)[len(intervals_s) // 2])
     for median_count in range(1, MAX_PERIODS_IN_MEDIAN_INTERVAL + 1):
-        period_counts = np.rint(intervals_s * median_count / median_interval_s)
-        if np.any(period_counts < 1.0):
+        periods_in_intervals = np.rint(intervals_s * median_count / median_interval_s)
+        if np.any(periods_in_intervals < 1.0):
             continue
-        period_s = float(np.sum(intervals_s) / np.sum(period_counts))
+        period_s = float(np.sum(intervals_s) / np.sum(periods_in_intervals))
         if (
-            float(np.sqrt(np.mean((intervals_s / period_s - period_counts) ** 2)))
+            float(np.sqrt(np.mean((intervals_s / period_s - periods_in_intervals) ** 2)))
             <= MAX_ROUNDING_RMS_ERROR
         ):
-            return period_s, period_counts
+            return period_s, periods_in_intervals
     return None

@@ -1,6 +1,7 @@
-"""Position noise that is time-correlated, unequal between axes or varying; repeated positions.
+"""Detect position noise that R does not describe, and repeated positions.
 
-Neither KF nor EKF2 can model this noise, because R describes white noise with constant σ.
+R describes white noise with constant σ. The detected noise is time-correlated, unequal
+between axes, or varies in flight.
 """
 
 from dataclasses import asdict
@@ -13,20 +14,30 @@ from px4fuse.core.text import format_number
 from px4fuse.filter.consistency import CONSISTENT_SIGMA_RATIOS
 from px4fuse.filter.correlated_noise import TimeCorrelatedNoise
 from px4fuse.filter.signals import cut_to_segment
-from px4fuse.findings.cause_grouping import WHITE_NOISE_RATIO_KEY
-from px4fuse.findings.model import Findings, error, find_source_texts, format_percent, note, warning
-from px4fuse.findings.noises import NOISE_RATIO_TOLERANCE, find_ekf2_noise_m
-from px4fuse.findings.source_positions import MIN_LAG_LIKELIHOOD_NATS, has_little_motion
+from px4fuse.findings.cause_grouping import WHITE_TO_ASSUMED_NOISE_RATIO_KEY
+from px4fuse.findings.model import (
+    Findings,
+    find_source_texts,
+    format_percent,
+    make_error,
+    make_note,
+    make_warning,
+)
+from px4fuse.findings.noises import MAX_RATIO_OF_EQUAL_NOISES, find_ekf2_noise_m
+from px4fuse.findings.source_positions import (
+    MIN_LOW_PASS_TO_CORRELATED_NOISE_NATS,
+    has_little_motion,
+)
 from px4fuse.flight.model import Columns, positions_phrase, source_name
 
 # White noise is a separate fault if its σ ÷ σ of the time-correlated noise is above this ratio
-MIN_WHITE_TO_SLOW_SIGMA_RATIO = 0.3
+MIN_WHITE_TO_CORRELATED_SIGMA_RATIO = 0.3
 # Minimum log likelihood ratio (nats) of time-correlated to white noise: 1 of 400 flights without a
 # fault exceeds it
-MIN_CORRELATED_LIKELIHOOD_NATS = 5.0
+MIN_CORRELATED_NOISE_LOG_LIKELIHOOD_RATIO_NATS = 5.0
 # Minimum time-correlated error (m, 1 σ): timestamps in ms cause 2 mm at 4 m/s, and the motion from
 # IMU or ground truth also has errors of some mm
-MIN_CORRELATED_SIGMA_M = 0.005
+MIN_CORRELATED_NOISE_SIGMA_M = 0.005
 # Minimum fraction of repeated positions for a warning
 MIN_REPEATED_FRACTION = 0.05
 # Minimum fraction of repeated positions, for severity "error"
@@ -36,12 +47,12 @@ MIN_REPEATED_POSITION_COUNT = 10
 # Minimum ratio of the larger to the smaller position noise σ of north and east, for a finding
 MIN_AXIS_NOISE_RATIO = 1.5
 # Minimum ratio of the noise in one part of the flight to the noise in the rest, for a warning
-MIN_PART_NOISE_RATIO = 2.0
+MIN_NOISY_PART_SIGMA_RATIO = 2.0
 # Minimum ratio of the noise in one part of the flight to the noise in the rest, without outliers,
 # for a warning
-MIN_PART_NOISE_RATIO_WITHOUT_OUTLIERS = 1.5
+MIN_NOISY_PART_SIGMA_RATIO_WITHOUT_OUTLIERS = 1.5
 # Minimum ratio of the noise in one part of the flight to that in the rest, for severity "error"
-MIN_PART_NOISE_RATIO_FOR_ERROR = 4.0
+MIN_NOISY_PART_SIGMA_RATIO_FOR_ERROR = 4.0
 
 
 def detect(analysis: Analysis) -> Findings:
@@ -59,10 +70,10 @@ def detect_time_correlated_noise(analysis: Analysis) -> Findings:
     noise = analysis.time_correlated_noise
     if (
         not isinstance(noise, TimeCorrelatedNoise)
-        or noise.gain_nats < MIN_CORRELATED_LIKELIHOOD_NATS
-        or noise.slow_m < MIN_CORRELATED_SIGMA_M
-        # a low-pass filtered source has its own finding
-        or noise.low_pass_gain_nats >= MIN_LAG_LIKELIHOOD_NATS
+        or noise.gain_nats < MIN_CORRELATED_NOISE_LOG_LIKELIHOOD_RATIO_NATS
+        or noise.slow_m < MIN_CORRELATED_NOISE_SIGMA_M
+        # source_positions.py reports a low-pass filter
+        or noise.low_pass_gain_nats >= MIN_LOW_PASS_TO_CORRELATED_NOISE_NATS
     ):
         return
     tau_low_text, tau_high_text = (format_number(end, 1) for end in (noise.low_s, noise.high_s))
@@ -78,33 +89,35 @@ def detect_time_correlated_noise(analysis: Analysis) -> Findings:
         analysis.settings.sigma_z_m,
         *map(find_ekf2_noise_m, analysis.axes.values()),
     ]
-    white_to_assumed_noise_ratio = noise.white_m / float(np.nanmin(assumed_noises_m))
+    white_noise_to_setting_ratio = noise.white_m / float(np.nanmin(assumed_noises_m))
     if (
-        white_to_assumed_noise_ratio > NOISE_RATIO_TOLERANCE
-        and noise.white_m > MIN_WHITE_TO_SLOW_SIGMA_RATIO * noise.slow_m
+        white_noise_to_setting_ratio > MAX_RATIO_OF_EQUAL_NOISES
+        and noise.white_m > MIN_WHITE_TO_CORRELATED_SIGMA_RATIO * noise.slow_m
     ):
-        evidence[WHITE_NOISE_RATIO_KEY] = white_to_assumed_noise_ratio
+        evidence[WHITE_TO_ASSUMED_NOISE_RATIO_KEY] = white_noise_to_setting_ratio
     # Time-correlated errors are normal for GNSS: if they are within the reported σ, they are a note
-    make_finding = note if is_gnss and not _has_error_above_reported_sigma(analysis) else warning
+    make_finding = (
+        make_note if is_gnss and not _has_error_above_reported_sigma(analysis) else make_warning
+    )
     yield make_finding(
         "source_noise_time_correlated",
         f"Time-correlated {name} error of {noise.slow_m:.2g} m, correlation time "
         f"{correlation_time_text} ({interval_text}). The rest of the error is white noise of "
         f"{noise.white_m:.2g} m (1 σ). KF and EKF2 assume independent errors. Both follow the "
         "correlated error and report a σ that is too small. Innovations do not show this error.",
-        f"Check {find_source_texts(analysis.source).errors}.",
+        f"{find_source_texts(analysis.source).slow_error_check}.",
         evidence,
     )
 
 
 def _has_error_above_reported_sigma(analysis: Analysis) -> bool:
-    truths = [summary.truth for summary in analysis.main.filters.values()]
+    errors_against_truth = [summary.truth for summary in analysis.main.filters.values()]
     return any(
-        isinstance(truth, ErrorsAgainstTruth)
-        and not truth.has_only_lag_errors
-        and truth.nees_position_mean is not None
-        and truth.nees_position_mean > CONSISTENT_SIGMA_RATIOS["truth"][1] ** 2
-        for truth in truths
+        isinstance(errors, ErrorsAgainstTruth)
+        and not errors.has_only_lag_errors
+        and errors.nees_position_mean is not None
+        and errors.nees_position_mean > CONSISTENT_SIGMA_RATIOS["truth"][1] ** 2
+        for errors in errors_against_truth
     )
 
 
@@ -124,7 +137,9 @@ def detect_repeated_positions(analysis: Analysis) -> Findings:
     )
     if repeated_count < MIN_REPEATED_POSITION_COUNT or repeated_fraction < MIN_REPEATED_FRACTION:
         return
-    make_finding = error if repeated_fraction >= MIN_REPEATED_FRACTION_FOR_ERROR else warning
+    make_finding = (
+        make_error if repeated_fraction >= MIN_REPEATED_FRACTION_FOR_ERROR else make_warning
+    )
     yield make_finding(
         "source_samples_repeated",
         f"{repeated_count} of {len(is_repeated)} {positions_phrase(analysis.source)} repeat the "
@@ -155,7 +170,7 @@ def detect_unequal_noise(analysis: Analysis) -> Findings:
         or larger_noise_lower_bound_m <= smaller_noise_upper_bound_m
     ):
         return
-    action = f"Check {find_source_texts(analysis.source).errors}."
+    action = f"{find_source_texts(analysis.source).slow_error_check}."
     keys = ("smaller_noise_sigma_z_m", "larger_noise_sigma_z_m")
     if larger_noise_axis in analysis.axes:
         action += (
@@ -163,7 +178,7 @@ def detect_unequal_noise(analysis: Analysis) -> Findings:
             f"(--axis {larger_noise_axis} --sigma-z {larger_noise_m:.2g})."
         )
         keys = (f"{smaller_noise_axis}_sigma_z_m", f"{larger_noise_axis}_sigma_z_m")
-    yield warning(
+    yield make_warning(
         "source_noise_unequal_axes",
         f"{source_name(analysis.source)} noise is {larger_noise_m:.2g} m along "
         f"{larger_noise_axis} and {smaller_noise_m:.2g} m along {smaller_noise_axis}. One SIGMA_Z, "
@@ -177,19 +192,19 @@ def detect_noise_variation(analysis: Analysis) -> Findings:
     noisy_part = analysis.noisy_part
     if (
         noisy_part is None
-        or noisy_part.sigma_ratio < MIN_PART_NOISE_RATIO
-        # The noise must also be larger without the outliers of that part: a fused outlier increases
-        # the next innovations, too
-        or noisy_part.sigma_ratio_without_outliers < MIN_PART_NOISE_RATIO_WITHOUT_OUTLIERS
+        or noisy_part.sigma_ratio < MIN_NOISY_PART_SIGMA_RATIO
+        # An outlier that KF fuses also increases the next innovations. The noise of the part must
+        # therefore be larger even without the outliers
+        or noisy_part.sigma_ratio_without_outliers < MIN_NOISY_PART_SIGMA_RATIO_WITHOUT_OUTLIERS
     ):
         return
     noise_ratio, start_s, end_s = noisy_part.sigma_ratio, noisy_part.start_s, noisy_part.end_s
-    yield (error if noise_ratio >= MIN_PART_NOISE_RATIO_FOR_ERROR else warning)(
+    yield (make_error if noise_ratio >= MIN_NOISY_PART_SIGMA_RATIO_FOR_ERROR else make_warning)(
         "source_noise_varies",
         f"{source_name(analysis.source)} noise is {noise_ratio:.1f} times larger from "
-        f"{start_s:.0f} to {end_s:.0f} s. Most samples of that time are affected, not single "
-        "outliers. No single SIGMA_Z fits the whole flight.",
-        f"Check {find_source_texts(analysis.source).reception} in that time. Let the source send a "
+        f"{start_s:.0f} to {end_s:.0f} s. Most samples in this time are noisier, so single "
+        "outliers are not the cause. No single SIGMA_Z fits the whole flight.",
+        f"{find_source_texts(analysis.source).data_link_check} in that time. Let the source send a "
         "variance with each position, or analyse this time separately (--start, --end).",
         {"ratio": noise_ratio, "first_s": start_s, "until_s": end_s},
         ((start_s, end_s),),

@@ -22,15 +22,15 @@ from px4fuse.core.text import format_metres, format_ratio
 from px4fuse.filter.time_offset import ClockOffset
 from px4fuse.findings.model import (
     Findings,
-    error,
     find_source_texts,
     finding,
     format_percent,
-    warning,
+    make_error,
+    make_warning,
 )
 from px4fuse.findings.source_positions import (
-    MIN_SCALE_ERROR_FOR_ERROR,
-    MIN_SCALE_ERROR_SIGMAS,
+    MIN_SCALE_ERROR_FOR_SEVERITY_ERROR,
+    MIN_SCALE_ERROR_TO_SIGMA_RATIO,
 )
 from px4fuse.findings.source_stamps import detect_bursts
 from px4fuse.flight.model import positions_phrase, source_name
@@ -57,7 +57,7 @@ def detect(analysis: Analysis) -> Findings:
     yield from detect_jitter_and_speed_noise(analysis, local_residuals)
     error_fit = fit_errors(analysis, local_residuals)
     if error_fit is not None:
-        yield from detect_slow_errors(analysis, error_fit)
+        yield from detect_periodic_errors_and_offset_changes(analysis, error_fit)
         if not analysis.source.origin.is_gnss:  # GNSS has no scale factor error
             yield from detect_scale_error(analysis, error_fit)
 
@@ -65,7 +65,7 @@ def detect(analysis: Analysis) -> Findings:
 def detect_jitter_and_speed_noise(analysis: Analysis, local_residuals: LocalResiduals) -> Findings:
     jitter_s, clock_map = find_timestamp_jitter(local_residuals), analysis.source.clock_map
     if jitter_s is not None and (clock_map is None or clock_map.distinct_stamps is None):
-        yield (error if jitter_s >= MIN_JITTER_FOR_ERROR_S else warning)(
+        yield (make_error if jitter_s >= MIN_JITTER_FOR_ERROR_S else make_warning)(
             "source_timestamp_jitter",
             f"The timestamps of the {positions_phrase(analysis.source)} jitter by "
             f"{1e3 * jitter_s:.0f} ms (1 σ). The positions are measured at a constant interval, "
@@ -77,7 +77,7 @@ def detect_jitter_and_speed_noise(analysis: Analysis, local_residuals: LocalResi
         )
     speed_noise = find_speed_dependent_noise(local_residuals)
     if speed_noise is not None:
-        yield error(
+        yield make_error(
             "source_noise_grows_with_speed",
             f"{source_name(analysis.source)} noise grows with speed: "
             f"{format_metres(speed_noise.slow_m)} m at {speed_noise.slow_m_s:.1f} m/s and "
@@ -90,35 +90,36 @@ def detect_jitter_and_speed_noise(analysis: Analysis, local_residuals: LocalResi
         )
 
 
-def detect_slow_errors(analysis: Analysis, error_fit: ErrorFit) -> Findings:
+def detect_periodic_errors_and_offset_changes(analysis: Analysis, error_fit: ErrorFit) -> Findings:
     periodic_error = find_periodic_error(error_fit)
     positions_text = positions_phrase(analysis.source)
     if periodic_error is not None:
-        yield (error if periodic_error.amplitude_m >= MIN_AMPLITUDE_FOR_ERROR_M else warning)(
+        yield (
+            make_error if periodic_error.amplitude_m >= MIN_AMPLITUDE_FOR_ERROR_M else make_warning
+        )(
             "source_error_periodic",
             f"The error of the {positions_text} is periodic: amplitude "
             f"{format_metres(periodic_error.amplitude_m)} m, period {periodic_error.period_s:.1f} "
             f"s. This sinusoid explains {format_percent(min(periodic_error.fraction, 1.0))} of the "
             "slow errors against ground truth. KF and EKF2 follow this error, so innovations "
             "hardly show it.",
-            f"Check {find_source_texts(analysis.source).errors}. Look for a process with this "
-            "period, such as a rotating part or a control loop. No noise setting corrects this "
-            "error.",
+            f"{find_source_texts(analysis.source).slow_error_check}. Look for a process with this "
+            "period, such as a rotating part or a control loop.",
             periodic_error._asdict(),
         )
         return
     clock, offset_change = analysis.clock, find_offset_variation(error_fit)
     if isinstance(clock, ClockOffset) and clock.has_changed():
-        return  # source_clock.py reports this change
+        return  # source_clock.py reports a change of the time offset
     if offset_change is not None:
-        yield error(
+        yield make_error(
             "source_time_offset_changes",
             f"The time offset of the {positions_text} varies in flight by "
             f"{offset_change.most_s - offset_change.least_s:.2f} s. Its deviation from the "
             f"mean is {offset_change.least_s:+.2f} s at {offset_change.least_at_s:.0f} s and "
-            f"{offset_change.most_s:+.2f} s at {offset_change.most_at_s:.0f} s, estimated "
-            "from the errors along the motion against ground truth. No single --clock-offset "
-            "corrects the whole flight.",
+            f"{offset_change.most_s:+.2f} s at {offset_change.most_at_s:.0f} s. The estimate is "
+            "from position errors against ground truth. No single --clock-offset corrects the "
+            "whole flight.",
             "Synchronise the clocks during the whole flight. Send the time of measurement, not the "
             "time at which a position was sent or received.",
             offset_change._asdict(),
@@ -127,16 +128,16 @@ def detect_slow_errors(analysis: Analysis, error_fit: ErrorFit) -> Findings:
 
 def detect_scale_error(analysis: Analysis, error_fit: ErrorFit) -> Findings:
     if abs(error_fit.scale) >= max(
-        MIN_SCALE_ERROR_AGAINST_TRUTH, MIN_SCALE_ERROR_SIGMAS * error_fit.scale_sigma
+        MIN_SCALE_ERROR_AGAINST_TRUTH, MIN_SCALE_ERROR_TO_SIGMA_RATIO * error_fit.scale_sigma
     ):
         yield finding(
-            "error" if abs(error_fit.scale) >= MIN_SCALE_ERROR_FOR_ERROR else "warning",
+            "error" if abs(error_fit.scale) >= MIN_SCALE_ERROR_FOR_SEVERITY_ERROR else "warning",
             "source_scale_error",
             f"{source_name(analysis.source)} distances are {format_percent(abs(error_fit.scale))} "
             f"too {'long' if error_fit.scale > 0.0 else 'short'}. The comparison with ground truth "
             f"is accurate to ± {format_percent(1.96 * error_fit.scale_sigma, 1)} (95 %). "
             "Innovations do not show a scale factor error.",
-            f"Check {find_source_texts(analysis.source).scale}.",
+            f"{find_source_texts(analysis.source).scale_check}.",
             {"scale": 1.0 + error_fit.scale, "sigma": error_fit.scale_sigma},
         )
 
@@ -147,7 +148,7 @@ def detect_attitude_delay(analysis: Analysis) -> Findings:
         return
     delay_s = find_attitude_delay(imu, attitude)
     if delay_s is not None:
-        yield warning(
+        yield make_warning(
             "attitude_late",
             f"The logged attitude is {abs(delay_s):.2f} s {'late' if delay_s > 0.0 else 'early'} "
             "relative to the gyroscopes. KF rotates the acceleration by this attitude, so the "

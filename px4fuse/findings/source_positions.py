@@ -1,6 +1,6 @@
-"""Positions that are constant, low-pass filtered, jump or have outliers; wrong scale or variance.
+"""Detect positions that are constant, low-pass filtered, jump or contain outliers.
 
-Flights with too little motion are also reported.
+A wrong scale factor, a wrong reported variance and too little motion are also detected.
 """
 
 from collections.abc import Sequence
@@ -26,21 +26,21 @@ from px4fuse.filter.tuning import HORIZONTAL, AxisTuning
 from px4fuse.finding import Severity
 from px4fuse.findings.cause_grouping import (
     CAUSE_KEY,
-    NO_TAKE_OFF_CAUSE,
-    REPORTED_VARIANCE_CAUSE,
+    REPORTED_VARIANCE_USED_BY_EKF2_CAUSE,
     RESET_TIME_KEY,
+    VEHICLE_ON_GROUND_CAUSE,
 )
 from px4fuse.findings.imu import MIN_IMU_RATE_HZ, is_rate_too_low
 from px4fuse.findings.model import (
     Findings,
-    error,
     find_source_texts,
     finding,
     format_count,
     format_percent,
+    make_error,
+    make_note,
+    make_warning,
     make_zero_length_spans,
-    note,
-    warning,
 )
 from px4fuse.findings.source_stamps import detect_arrival_timestamps
 from px4fuse.flight.ekf2_parameters import EV_POS
@@ -57,18 +57,18 @@ from px4fuse.flight.model import (
 
 # The vehicle moves if the extent (m) of the positions is at least this (5th to 95th percentile)
 MIN_MOTION_RANGE_M = 0.5
-# The vehicle moves if this extent of the positions ÷ position noise σ is at least this ratio. White
-# noise at rest has the ratio 3.29; 25 % is margin
-MIN_MOTION_RANGE_SIGMAS = 1.25 * 3.29
+# The vehicle moves if the extent of the positions (5th to 95th percentile) ÷ position noise σ is at
+# least this ratio. At rest, white noise has an extent of 3.29 σ; 25 % is margin
+MIN_MOTION_RANGE_TO_NOISE_RATIO = 1.25 * 3.29
 # Minimum log likelihood ratio (nats) of low-pass filtered to white noise; for positions that are
 # not filtered it is 0 to 2
-MIN_LOW_PASS_LIKELIHOOD_NATS = 6.0
+MIN_LOW_PASS_LOG_LIKELIHOOD_RATIO_NATS = 6.0
 # Minimum log likelihood ratio (nats) of low-pass filtered to time-correlated noise, to report a
-# low-pass filter. Only the filter delays the positions
-MIN_LAG_LIKELIHOOD_NATS = 1.0
-# The lag of low-pass filtered positions is estimated from the noise correlation. If it exceeds the
-# upper 95 % limit of the delay by this factor, the delay (the time offset) is reported as the lag
-MAX_LAG_TO_DELAY_RATIO = 4.0
+# low-pass filter. A low-pass filter delays the positions, time-correlated noise does not
+MIN_LOW_PASS_TO_CORRELATED_NOISE_NATS = 1.0
+# The lag due to a low-pass filter is estimated from the noise correlation. If this lag exceeds the
+# upper 95 % limit of the measured delay by this factor, the measured delay is reported as the lag
+MAX_ESTIMATED_LAG_TO_DELAY_RATIO = 4.0
 # Minimum lag (s) due to a low-pass filter, for a warning: a position error of 5 cm at 1 m/s
 MIN_LAG_S = 0.05
 # Minimum lag (s) due to a low-pass filter, for severity "error": a position error of 10 cm at 1 m/s
@@ -78,46 +78,46 @@ MIN_JUMP_M = 0.2
 # Minimum ratio of a position jump to the σ of time-correlated noise, for a warning
 MIN_JUMP_SIGMAS = 5.0
 # Minimum number of jumps with a change of reset_counter to report repeated jumps
-MIN_ANNOUNCED_JUMPS = 2
+MIN_JUMPS_WITH_RESET_COUNTER = 2
 # Minimum number of jumps without a change of reset_counter to report repeated jumps
-MIN_UNANNOUNCED_JUMPS = 3
+MIN_JUMPS_WITHOUT_RESET_COUNTER = 3
 # Minimum size (m) of a jump without a change of reset_counter
-MIN_UNANNOUNCED_JUMP_M = 0.1
+MIN_JUMP_WITHOUT_RESET_COUNTER_M = 0.1
 # Minimum ratio of a jump without a change of reset_counter to the median of position changes
-MIN_UNANNOUNCED_JUMP_RATIO = 8.0
+MIN_JUMP_TO_MEDIAN_CHANGE_RATIO = 8.0
 # A jump is compared with the median of this number of position changes around it
-CHANGE_WINDOW_SAMPLES = 61
+JUMP_WINDOW_SAMPLES = 61
 # Minimum number of positions to detect jumps
 MIN_POSITIONS_FOR_JUMPS = 100
-# Minimum time (s) and number of positions after a jump without return: outliers return earlier
+# Minimum time (s) and number of positions that a jump lasts: outliers go back to the track earlier
 MIN_JUMP_DURATION_S, MIN_JUMP_DURATION_SAMPLES = 0.6, 9
-# A jump lasts if the shift of the median position, from before to after the jump, differs from the
-# jump by less than this fraction of the jump; otherwise the positions have returned
-MAX_SHIFT_TO_JUMP_DEVIATION = 0.5
+# A jump lasts if the medians of the positions after and before the jump differ by the size of the
+# jump, with a deviation below this fraction of the size
+MAX_MEDIAN_SHIFT_DEVIATION_FRACTION = 0.5
 # Maximum ratio of the interval before a jump to the median interval: a position change in a longer
 # interval may be motion
-MAX_JUMP_INTERVAL_RATIO = 1.5
+MAX_JUMP_TO_MEDIAN_INTERVAL_RATIO = 1.5
 # The positions alternate between two points if at least this fraction of the jumps is opposite to
 # the previous jump
-MIN_REVERSED_JUMP_FRACTION = 0.7
+MIN_OPPOSITE_JUMP_FRACTION = 0.7
 # Maximum time (s) from a position jump to the reset of EKF2 that the jump causes
 MAX_JUMP_TO_RESET_TIME_S = 5.0
 # Maximum number of jumps whose times are printed
 MAX_LISTED_JUMPS = 8
 # Maximum rounding difference (s) between the time of a position and that of its reset_counter
 RESET_TIME_TOLERANCE_S = 1e-4
-# Masks of EKF2_EV_CTRL: horizontal position (bit 0), and height (bit 1)
-HORIZONTAL_CONTROL_MASK, HEIGHT_CONTROL_MASK = 1, 2
+# Bit masks of EKF2_EV_CTRL: EKF2 fuses the horizontal position (bit 0) or the height (bit 1)
+EV_CTRL_HORIZONTAL_MASK, EV_CTRL_HEIGHT_MASK = 1, 2
 # Maximum time (s) between a jump and the increment of reset_counter: two intervals at 2 Hz
-MAX_JUMP_TO_COUNTER_TIME_S = 1.0
+MAX_JUMP_TO_RESET_COUNTER_TIME_S = 1.0
 # Minimum position jump (m), for severity "error": five times the noise of good UWB (0.1 m)
 MIN_JUMP_FOR_ERROR_M = 0.5
 # Minimum scale factor error (ratio minus 1) for a warning: flights without a fault reach 0.11
 MIN_SCALE_ERROR_FOR_WARNING = 0.12
 # Minimum scale factor error (ratio minus 1), for severity "error": 1 m in a distance of 7 m
-MIN_SCALE_ERROR_FOR_ERROR = 0.15
+MIN_SCALE_ERROR_FOR_SEVERITY_ERROR = 0.15
 # Minimum |scale factor error| / σ of its estimate, for a warning: 0.3 % of correct sources exceed 3
-MIN_SCALE_ERROR_SIGMAS = 3.0
+MIN_SCALE_ERROR_TO_SIGMA_RATIO = 3.0
 # Minimum fraction of outliers for a warning: normal noise has 0.02 % beyond 3.7 σ
 MIN_OUTLIER_FRACTION = 0.005
 # Minimum fraction of outliers, for severity "error": one outlier in 10 s at 5 Hz
@@ -127,9 +127,9 @@ MIN_OUTLIERS = 3
 # Minimum fraction of positions with logged innovations, to state the number of rejected outliers
 MIN_LOGGED_POSITION_FRACTION = 0.75
 # Minimum factor between reported and estimated position variance for a warning
-MIN_VARIANCE_RATIO = 2.0
+MIN_REPORTED_VARIANCE_FACTOR = 2.0
 # Minimum factor between reported and estimated position variance, for severity "error"
-MIN_VARIANCE_RATIO_FOR_ERROR = 3.0
+MIN_REPORTED_VARIANCE_FACTOR_FOR_ERROR = 3.0
 
 
 def detect(analysis: Analysis) -> Findings:
@@ -150,28 +150,28 @@ def find_low_pass(analysis: Analysis) -> SourceLowPass | None:
     """Return the low-pass filter of the position source; None if its positions are not filtered."""
     source, low_pass = analysis.source, analysis.source_low_pass
     if (
-        source.orientation is not None  # odometry: drift also correlates errors
+        source.orientation is not None  # odometry: its errors are correlated because of drift
         or source.origin.reconstructed
         or not _has_valid_time_offset(analysis)
         or not isinstance(low_pass, SourceLowPass)
-        or low_pass.gain_nats < MIN_LOW_PASS_LIKELIHOOD_NATS
+        or low_pass.gain_nats < MIN_LOW_PASS_LOG_LIKELIHOOD_RATIO_NATS
         or low_pass.lag_s < MIN_LAG_S
     ):
         return None
     time_offset, correlated_noise = analysis.clock, analysis.time_correlated_noise
-    # A much larger lag from the noise correlation is less accurate than the time offset (negative
-    # for a lag), for example at a high rate
+    # The lag from the noise correlation is inaccurate if it is much larger than the measured delay,
+    # for example at a high rate. The measured delay (-time offset) is then the lag
     lag_limit_s = (
-        -MAX_LAG_TO_DELAY_RATIO * time_offset.interval_s[0]
+        -MAX_ESTIMATED_LAG_TO_DELAY_RATIO * time_offset.interval_s[0]
         if isinstance(time_offset, ClockOffset)
         else 0.0
     )
     if isinstance(time_offset, ClockOffset) and low_pass.lag_s > lag_limit_s >= MIN_LAG_S:
         low_pass = replace(low_pass, lag_s=-time_offset.offset_s)
-    # A low-pass filter delays positions: correlated errors without lag have another cause
+    # A low-pass filter delays the positions. Correlated errors without delay have another cause
     if (
         isinstance(correlated_noise, TimeCorrelatedNoise)
-        and correlated_noise.low_pass_gain_nats < MIN_LAG_LIKELIHOOD_NATS
+        and correlated_noise.low_pass_gain_nats < MIN_LOW_PASS_TO_CORRELATED_NOISE_NATS
     ):
         return None
     return low_pass
@@ -184,15 +184,15 @@ def _has_valid_time_offset(analysis: Analysis) -> bool:
 def detect_low_pass(analysis: Analysis) -> Findings:
     low_pass = find_low_pass(analysis)
     if low_pass is not None:
-        make_finding = error if low_pass.lag_s >= MIN_LAG_FOR_ERROR_S else warning
+        make_finding = make_error if low_pass.lag_s >= MIN_LAG_FOR_ERROR_S else make_warning
         yield make_finding(
             "source_low_pass_filtered",
             f"{positions_phrase(analysis.source)} are low-pass filtered and lag by "
             f"{low_pass.lag_s:.2f} s. The correlation of successive errors is "
             f"{low_pass.correlation:.1f}; the noise before filtering is {low_pass.sigma_z_m:.2g} "
             "m. KF and EKF2 assume independent errors, so both are overconfident and lag.",
-            f"{find_source_texts(analysis.source).smoothing_action} Do not change the timestamps, "
-            "because the positions are late, not the timestamps.",
+            f"{find_source_texts(analysis.source).low_pass_action} Do not change the timestamps: "
+            "the positions lag behind the vehicle, but their timestamps are correct.",
             asdict(low_pass),
         )
 
@@ -200,8 +200,8 @@ def detect_low_pass(analysis: Analysis) -> Findings:
 def detect_jumps(analysis: Analysis) -> Findings:
     """Detect position jumps that the IMU does not measure."""
     systematic_errors = analysis.systematic_errors
-    # A change from arrival to measurement times shifts the positions of a moving vehicle, like a
-    # jump
+    # If the timestamps change from arrival to measurement times, the positions of a moving vehicle
+    # shift as in a jump
     if not isinstance(systematic_errors, SystematicErrors) or any(
         detect_arrival_timestamps(analysis)
     ):
@@ -222,14 +222,14 @@ def detect_jumps(analysis: Analysis) -> Findings:
         )
         positions_text = positions_phrase(analysis.source)
         source_texts = find_source_texts(analysis.source)
-        cause = f"Possible causes: {source_texts.jump}."
+        cause = source_texts.jump_causes
         evidence = {
             "count": len(large_jumps),
             "size_m": size_m,
             "at_s": jump_time_s,
             "sigma_m": sigma_m,
         }
-        if np.any(np.abs(counter_change_times_s - jump_time_s) < MAX_JUMP_TO_COUNTER_TIME_S):
+        if np.any(np.abs(counter_change_times_s - jump_time_s) < MAX_JUMP_TO_RESET_COUNTER_TIME_S):
             evidence[RESET_TIME_KEY] = float(
                 counter_change_times_s[np.argmin(np.abs(counter_change_times_s - jump_time_s))]
             )
@@ -237,9 +237,9 @@ def detect_jumps(analysis: Analysis) -> Findings:
                 "The source announced the jump (reset_counter): it relocalised or set a new origin."
             )
         jump_text = f"jump by {size_m:.2f} m"
-        jump_steps_m = np.array([[step.value for step in jump.step_m] for jump in large_jumps])
+        jump_vectors_m = np.array([[step.value for step in jump.step_m] for jump in large_jumps])
         after_jump_text = "stay there"
-        if np.linalg.norm(jump_steps_m.sum(axis=0)) < MIN_JUMP_M:
+        if np.linalg.norm(jump_vectors_m.sum(axis=0)) < MIN_JUMP_M:
             after_jump_text = "return afterwards"
         if len(large_jumps) > 1:
             jump_text = f"jump {format_count(len(large_jumps))}, by up to {size_m:.2f} m"
@@ -247,7 +247,8 @@ def detect_jumps(analysis: Analysis) -> Findings:
             "error" if size_m >= MIN_JUMP_FOR_ERROR_M else "warning",
             "source_position_jump",
             f"{positions_text} {jump_text} at {jump_time_s:.1f} s and {after_jump_text}. The IMU "
-            f"measures no such motion (± {1.96 * sigma_m:.2f} m, 95 %). {cause} KF and EKF2 follow "
+            f"does not measure this motion (± {1.96 * sigma_m:.2f} m, 95 %). {cause} KF and EKF2 "
+            "follow "
             "the jump, and their innovations stay consistent.",
             f"{source_texts.jump_action} Analyse only the time before or after the jump (--start, "
             "--end).",
@@ -258,40 +259,46 @@ def detect_jumps(analysis: Analysis) -> Findings:
 
 def detect_constant_coordinates(analysis: Analysis) -> Findings:
     """Detect coordinates that never change, so that the source does not measure them."""
-    source, fusion_switch = analysis.source, EV_POS.switch
+    source, fusion_parameter = analysis.source, EV_POS.switch
     coordinates = constant_coordinates(source)
     is_single_coordinate = len(coordinates) == 1
     if not (is_single_coordinate or is_height_only(source)) or (
-        is_single_coordinate and source.step_m > 0.0
+        is_single_coordinate and source.rounding_step_m > 0.0
     ):
         return  # coarsely rounded positions may be constant while the vehicle moves
     values_m = dict(zip("xyz", source.samples[Columns.POSITION].median().tolist(), strict=True))
-    finding_id, mask, make_finding = "source_coordinate_constant", HORIZONTAL_CONTROL_MASK, error
+    finding_id, mask_of_constant, make_finding = (
+        "source_coordinate_constant",
+        EV_CTRL_HORIZONTAL_MASK,
+        make_error,
+    )
     consequence = "px4fuse estimates nothing from these positions."
     if coordinates == ["z"]:
-        finding_id, mask, make_finding = "source_height_constant", HEIGHT_CONTROL_MASK, warning
+        finding_id, mask_of_constant, make_finding = (
+            "source_height_constant",
+            EV_CTRL_HEIGHT_MASK,
+            make_warning,
+        )
         consequence = "The height is not a measurement, so it is not evaluated."
     elif coordinates == ["x", "y"]:
-        make_finding = warning
+        make_finding = make_warning
         consequence = "Only the height is a measurement. The horizontal position is not evaluated."
     action, coordinates_text = "", " and ".join(coordinates)
-    if fusion_switch in analysis.flight.log.parameters:
-        control_value = int(analysis.flight.log.parameters[fusion_switch])
-        action = f"Leave {fusion_switch} at {control_value}"
-        if control_value & mask:
-            other_mask = HORIZONTAL_CONTROL_MASK + HEIGHT_CONTROL_MASK - mask
-            action = f"Set {fusion_switch} to {control_value & ~mask | other_mask}"
+    if fusion_parameter in analysis.flight.log.parameters:
+        fusion_parameter_value = int(analysis.flight.log.parameters[fusion_parameter])
+        setting_action = f"Leave {fusion_parameter} at {fusion_parameter_value}"
+        if fusion_parameter_value & mask_of_constant:
+            mask_of_measured = EV_CTRL_HORIZONTAL_MASK + EV_CTRL_HEIGHT_MASK - mask_of_constant
+            new_value = fusion_parameter_value & ~mask_of_constant | mask_of_measured
+            setting_action = f"Set {fusion_parameter} to {new_value}"
         elif coordinates == ["z"]:
-            make_finding = note
-        action += f", so that EKF2 does not fuse {coordinates_text}. "
-    fault_text = f"The coordinate {coordinates_text} of {source.name} is constant"
-    if not is_single_coordinate:
-        fault_text = f"The coordinates {coordinates_text} of {source.name} are constant"
+            make_finding = make_note
+        action = f"{setting_action}, so that EKF2 does not fuse {coordinates_text}. "
     values_text = ", ".join(f"{values_m[each]:g}" for each in coordinates)
     yield make_finding(
         finding_id,
-        f"{fault_text} ({values_text} m): the source does not measure "
-        f"{'it' if is_single_coordinate else 'them'}. {consequence}",
+        f"The source {source.name} does not measure {coordinates_text}: the value is always "
+        f"{values_text} m. {consequence}",
         f"{action}Send NaN for a coordinate that is not measured.",
         {f"{each}_m": value for each, value in values_m.items()},
     )
@@ -300,20 +307,20 @@ def detect_constant_coordinates(analysis: Analysis) -> Findings:
 def detect_repeated_jumps(analysis: Analysis) -> Findings:
     """Detect repeated jumps: a source corrects its drift, or alternates between two positions."""
     ekf2 = analysis.flight.ekf2
-    jumps, is_announced = _find_jumps(analysis)
-    if len(jumps) < MIN_UNANNOUNCED_JUMPS and not is_announced:
+    jumps, is_announced_by_source = _find_jumps(analysis)
+    if len(jumps) < MIN_JUMPS_WITHOUT_RESET_COUNTER and not is_announced_by_source:
         return
-    times_s, steps_m = (
+    times_s, jump_vectors_m = (
         np.array([time_s for time_s, _ in jumps]),
         np.array([step_m for _, step_m in jumps]),
     )
-    sizes_m = np.linalg.norm(steps_m, axis=1)
+    jump_sizes_m = np.linalg.norm(jump_vectors_m, axis=1)
     ekf2_reset_times_s = [
         reset.time_s
         for reset in (ekf2.resets if isinstance(ekf2, Ekf2) else ())
         if reset.quantity == "position" and any(reset.delta[:2])
     ]
-    reset_delays_s = [
+    reset_delays_after_jump_s = [
         min(delays_after_jump_s)
         for jump_time_s in times_s
         if (
@@ -325,32 +332,36 @@ def detect_repeated_jumps(analysis: Analysis) -> Findings:
         )
     ]
     reset_sentence = ""
-    if reset_delays_s:
+    if reset_delays_after_jump_s:
         reset_sentence = (
             " EKF2 rejects the positions after a jump and resets its position "
-            f"{np.median(reset_delays_s):.1f} s later."
+            f"{np.median(reset_delays_after_jump_s):.1f} s later."
         )
     jump_times_text = ", ".join(f"{at_s:.1f}" for at_s in times_s[:MAX_LISTED_JUMPS])
-    is_reversal = np.sum(steps_m[1:] * steps_m[:-1], axis=1) < 0.0
-    counter_text = "and its reset_counter increases at each jump"
+    is_reversal = np.sum(jump_vectors_m[1:] * jump_vectors_m[:-1], axis=1) < 0.0
+    counter_sentence = "The source increments reset_counter at each jump."
     cause_sentence = "The source (VIO or SLAM) drifts, and each jump corrects its drift."
-    if not is_announced:
-        counter_text = "without a change of its reset_counter"
-        cause_sentence = f"Possible causes: {find_source_texts(analysis.source).jump}."
+    if not is_announced_by_source:
+        counter_sentence = "The source does not change reset_counter at the jumps."
+        cause_sentence = find_source_texts(analysis.source).jump_causes
     action = "Improve the tracking of the source, or let it correct its drift in smaller steps."
-    if is_reversal.mean() >= MIN_REVERSED_JUMP_FRACTION:
+    if is_reversal.mean() >= MIN_OPPOSITE_JUMP_FRACTION:
         cause_sentence = (
-            "The source alternately sends the positions of two points, "
-            f"{np.median(sizes_m):.2f} m apart."
+            "The source alternately sends the positions of two points of the vehicle, "
+            f"{np.median(jump_sizes_m):.2f} m apart."
         )
         action = "Send the position of the same point of the vehicle, for example of one tag."
-    yield error(
+    yield make_error(
         "source_relocalises",
-        f"The source jumps {len(jumps)} times, by up to {sizes_m.max():.2f} m, {counter_text}. The "
+        f"The source jumps {len(jumps)} times, by up to {jump_sizes_m.max():.2f} m. The "
         f"jumps are at {jump_times_text} s, about every {np.median(np.diff(times_s)):.0f} s. "
-        f"{cause_sentence}{reset_sentence}",
+        f"{counter_sentence} {cause_sentence}{reset_sentence}",
         f"{action} Analyse the time between two jumps (--start, --end).",
-        {"count": len(jumps), "largest_m": float(sizes_m.max()), "announced": is_announced},
+        {
+            "count": len(jumps),
+            "largest_m": float(jump_sizes_m.max()),
+            "announced": is_announced_by_source,
+        },
         make_zero_length_spans(times_s.tolist()),
     )
 
@@ -359,33 +370,37 @@ def _find_jumps(analysis: Analysis) -> tuple[list[tuple[float, Array]], bool]:
     """Return time (s) and step (m) of each jump, and True if ``reset_counter`` announces the jumps.
 
     Jumps that are not announced must last for :data:`MIN_JUMP_DURATION_S`, and must be
-    :data:`MIN_UNANNOUNCED_JUMP_RATIO` times larger than other position changes.
+    :data:`MIN_JUMP_TO_MEDIAN_CHANGE_RATIO` times larger than other position changes.
     """
     position_m = cut_to_segment(analysis.source.samples, analysis.segment)[
         Columns.POSITION[:2]
     ].dropna()
-    # Drop repeated positions: the step after one contains the motion of two intervals, like a jump
+    # Drop repeated positions. The position change after a repetition contains the motion of two
+    # intervals and resembles a jump
     position_m = position_m[(position_m.diff() != 0.0).any(axis=1)]
-    time_s, steps_m = position_m.index.to_numpy(), np.diff(position_m.to_numpy(), axis=0)
-    if len(steps_m) < MIN_POSITIONS_FOR_JUMPS:
+    time_s, position_changes_m = position_m.index.to_numpy(), np.diff(position_m.to_numpy(), axis=0)
+    if len(position_changes_m) < MIN_POSITIONS_FOR_JUMPS:
         return [], False
-    jump_steps_m = steps_m[1:-1] - 0.5 * (steps_m[:-2] + steps_m[2:])
-    jump_sizes_m, intervals_s = np.linalg.norm(jump_steps_m, axis=1), np.diff(time_s)[1:-1]
+    jump_vectors_m = position_changes_m[1:-1] - 0.5 * (
+        position_changes_m[:-2] + position_changes_m[2:]
+    )
+    jump_sizes_m, intervals_s = np.linalg.norm(jump_vectors_m, axis=1), np.diff(time_s)[1:-1]
     reset_rows = (
         np.searchsorted(time_s, reset_times_s(analysis.source) - RESET_TIME_TOLERANCE_S) - 2
     )
     reset_rows = reset_rows[(reset_rows >= 0) & (reset_rows < len(jump_sizes_m))]
     reset_rows = reset_rows[jump_sizes_m[reset_rows] >= MIN_JUMP_M]
-    if len(reset_rows) >= MIN_ANNOUNCED_JUMPS:
-        return [(float(time_s[row + 2]), jump_steps_m[row]) for row in reset_rows], True
-    median_change_m = (
-        pd.Series(jump_sizes_m).rolling(CHANGE_WINDOW_SAMPLES, center=True, min_periods=1).median()
+    if len(reset_rows) >= MIN_JUMPS_WITH_RESET_COUNTER:
+        return [(float(time_s[row + 2]), jump_vectors_m[row]) for row in reset_rows], True
+    local_median_change_m = (
+        pd.Series(jump_sizes_m).rolling(JUMP_WINDOW_SAMPLES, center=True, min_periods=1).median()
     )
-    limit_m = np.maximum(
-        MIN_UNANNOUNCED_JUMP_M, MIN_UNANNOUNCED_JUMP_RATIO * median_change_m.to_numpy()
+    min_jump_sizes_m = np.maximum(
+        MIN_JUMP_WITHOUT_RESET_COUNTER_M,
+        MIN_JUMP_TO_MEDIAN_CHANGE_RATIO * local_median_change_m.to_numpy(),
     )
-    is_jump = (jump_sizes_m > limit_m) & (
-        intervals_s < MAX_JUMP_INTERVAL_RATIO * np.median(intervals_s)
+    is_jump = (jump_sizes_m > min_jump_sizes_m) & (
+        intervals_s < MAX_JUMP_TO_MEDIAN_INTERVAL_RATIO * np.median(intervals_s)
     )
     window_sample_count = max(
         MIN_JUMP_DURATION_SAMPLES, round(MIN_JUMP_DURATION_S / float(np.median(intervals_s)))
@@ -396,17 +411,19 @@ def _find_jumps(analysis: Analysis) -> tuple[list[tuple[float, Array]], bool]:
             position_m.iloc[max(row - window_sample_count, 0) : row],
             position_m.iloc[row:][:window_sample_count],
         )
-        nearby_steps_m = steps_m[max(row - window_sample_count, 0) : row + window_sample_count]
-        lasting_shift_m = (
+        nearby_changes_m = position_changes_m[
+            max(row - window_sample_count, 0) : row + window_sample_count
+        ]
+        median_shift_m = (
             positions_after_m.median()
             - positions_before_m.median()
-            - window_sample_count * np.median(nearby_steps_m, axis=0)
+            - window_sample_count * np.median(nearby_changes_m, axis=0)
         )
         if (
-            np.linalg.norm(lasting_shift_m - jump_steps_m[row - 2])
-            < MAX_SHIFT_TO_JUMP_DEVIATION * jump_sizes_m[row - 2]
+            np.linalg.norm(median_shift_m - jump_vectors_m[row - 2])
+            < MAX_MEDIAN_SHIFT_DEVIATION_FRACTION * jump_sizes_m[row - 2]
         ):
-            jumps.append((float(time_s[row]), jump_steps_m[row - 2]))
+            jumps.append((float(time_s[row]), jump_vectors_m[row - 2]))
     return jumps, False
 
 
@@ -417,7 +434,7 @@ def detect_scale_error(analysis: Analysis) -> Findings:
         return
     if (
         analysis.source.origin.is_gnss  # GNSS has no scale factor error
-        or isinstance(analysis.flight.truth, Truth)  # source_patterns.py is more exact
+        or isinstance(analysis.flight.truth, Truth)  # source_patterns.py uses it
         or not isinstance(systematic_errors, SystematicErrors)
         # the effect of a low-pass filter or of time-correlated noise may resemble a scale error
         or find_low_pass(analysis) is not None
@@ -426,16 +443,17 @@ def detect_scale_error(analysis: Analysis) -> Findings:
     ):
         return
     scale_error, sigma = systematic_errors.scale.value, systematic_errors.scale.sigma
-    if abs(scale_error) >= max(MIN_SCALE_ERROR_FOR_WARNING, MIN_SCALE_ERROR_SIGMAS * sigma):
+    if abs(scale_error) >= max(MIN_SCALE_ERROR_FOR_WARNING, MIN_SCALE_ERROR_TO_SIGMA_RATIO * sigma):
         yield finding(
-            "error" if abs(scale_error) >= MIN_SCALE_ERROR_FOR_ERROR else "warning",
+            "error" if abs(scale_error) >= MIN_SCALE_ERROR_FOR_SEVERITY_ERROR else "warning",
             "source_scale_error",
             f"{source_name(analysis.source)} distances are "
             f"{format_percent(abs(scale_error))} too {'long' if scale_error > 0 else 'short'}. The "
             f"comparison with the IMU is accurate to ± {format_percent(1.96 * sigma)} (95 %). "
             "Innovations do not show a scale factor error.",
-            "Measure a known distance with the source. Then check "
-            f"{find_source_texts(analysis.source).scale}. If the distance is right, calibrate the "
+            "Measure a known distance with the source. "
+            f"{find_source_texts(analysis.source).scale_check}. If the distance is right, "
+            "calibrate the "
             "accelerometers.",
             {"scale": 1.0 + scale_error, "sigma": sigma},
         )
@@ -473,10 +491,10 @@ def detect_outliers(analysis: Analysis) -> Findings:
         f"{outlier_count} of {axis_tuning.count} {positions_phrase(analysis.source)} "
         f"({format_percent(outlier_fraction, 1)}) are outliers of up to "
         f"{format_metres(float(outlier_sizes_m.max()))} m. Their median distance to {reference} is "
-        f"{format_metres(float(np.median(outlier_sizes_m)))} m. Possible cause: "
-        f"{source_texts.outliers}. KF rejects no outliers and follows each "
+        f"{format_metres(float(np.median(outlier_sizes_m)))} m. "
+        f"{source_texts.outlier_causes} KF rejects no outliers and follows each "
         f"outlier.{_format_rejected_outliers(analysis, outlier_times_s)}",
-        source_texts.outliers_action,
+        source_texts.outlier_action,
         {
             "count": outlier_count,
             "share": outlier_fraction,
@@ -528,10 +546,14 @@ def _format_rejected_outliers(analysis: Analysis, outlier_times_s: Sequence[floa
 def detect_wrong_variance(analysis: Analysis) -> Findings:
     """Detect a reported variance that differs from the estimated position noise."""
     source, axis_tuning = analysis.source, analysis.tuning.get(HORIZONTAL)
-    may_be_low_passed = (
+    may_be_low_pass_filtered = (
         isinstance(analysis.source_low_pass, Unavailable) or find_low_pass(analysis) is not None
     )
-    if may_be_low_passed or not isinstance(axis_tuning, AxisTuning) or not source.origin.is_vision:
+    if (
+        may_be_low_pass_filtered
+        or not isinstance(axis_tuning, AxisTuning)
+        or not source.origin.is_vision
+    ):
         return
     reported_variance_m2 = cut_to_segment(source.samples, analysis.segment)[
         Columns.POSITION_VARIANCE[:2]
@@ -543,19 +565,24 @@ def detect_wrong_variance(analysis: Analysis) -> Findings:
     reported_sigma_m = float(np.sqrt(reported_variance_m2.to_numpy().mean(axis=1)).mean())
     variance_ratio = (reported_sigma_m / noise_m) ** 2
     variance_error_factor = max(variance_ratio, 1.0 / variance_ratio)
-    # Do not report a variance that contains time-correlated errors: R has to include them, although
-    # innovations do not show them. With ground truth, the RMSE shows these errors
+    # A reported variance near the mean square error against ground truth is correct. It contains
+    # the time-correlated errors, which R has to include and which innovations do not show
     rmse_m = _compute_rmse_per_axis_m(analysis) if variance_ratio > 1.0 else None
-    if rmse_m is not None and reported_sigma_m**2 < MIN_VARIANCE_RATIO * rmse_m**2:
+    if rmse_m is not None and reported_sigma_m**2 < MIN_REPORTED_VARIANCE_FACTOR * rmse_m**2:
         return
-    if variance_error_factor >= MIN_VARIANCE_RATIO and not low <= reported_sigma_m <= high:
+    if (
+        variance_error_factor >= MIN_REPORTED_VARIANCE_FACTOR
+        and not low <= reported_sigma_m <= high
+    ):
         size_word, correlation_note = "small" if variance_ratio < 1.0 else "large", ""
         if size_word == "large" and rmse_m is None:
             correlation_note = (
-                " The reported σ may include time-correlated errors, which innovations do not show."
+                " The reported σ may be correct: innovations do not show time-correlated errors."
             )
         severity: Severity = (
-            "error" if variance_error_factor >= MIN_VARIANCE_RATIO_FOR_ERROR else "warning"
+            "error"
+            if variance_error_factor >= MIN_REPORTED_VARIANCE_FACTOR_FOR_ERROR
+            else "warning"
         )
         effect = (
             "EKF2 uses the larger of reported variance and EKF2_EVP_NOISE² (EKF2_EV_NOISE_MD 0)."
@@ -574,7 +601,7 @@ def detect_wrong_variance(analysis: Analysis) -> Findings:
                 "reported_sigma_m": reported_sigma_m,
                 "sigma_z_m": noise_m,
                 "variance_factor": variance_ratio,
-                CAUSE_KEY: REPORTED_VARIANCE_CAUSE if severity != "note" else "",
+                CAUSE_KEY: REPORTED_VARIANCE_USED_BY_EKF2_CAUSE if severity != "note" else "",
             },
         )
 
@@ -606,7 +633,7 @@ def has_little_motion(comparison: Comparison) -> bool:
     ].dropna()
     noise_m = estimate_white_noise_m(positions.to_numpy())
     return compute_motion_range_m(comparison) < max(
-        MIN_MOTION_RANGE_M, MIN_MOTION_RANGE_SIGMAS * noise_m
+        MIN_MOTION_RANGE_M, MIN_MOTION_RANGE_TO_NOISE_RATIO * noise_m
     )
 
 
@@ -614,12 +641,12 @@ def detect_little_motion(analysis: Analysis) -> Findings:
     """Detect too little motion to estimate velocity, heading and time offset."""
     extent_m = compute_motion_range_m(analysis)
     if has_little_motion(analysis):
-        yield warning(
+        yield make_warning(
             "no_motion",
             f"The vehicle moved only {extent_m:.2f} m horizontally. This is the range of the "
             "positions (5th to 95th percentile). Velocity, heading and time offset cannot be "
             "estimated from this flight.",
             "Fly several passes of 5 m or more, with clear starts and stops.",
             {"range_m": extent_m}
-            | ({CAUSE_KEY: NO_TAKE_OFF_CAUSE} if analysis.flight.airborne == () else {}),
+            | ({CAUSE_KEY: VEHICLE_ON_GROUND_CAUSE} if analysis.flight.airborne == () else {}),
         )

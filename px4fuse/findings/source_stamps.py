@@ -14,14 +14,14 @@ from px4fuse.ekf2.intervals import MAX_LATENESS_S
 from px4fuse.findings.model import (
     Findings,
     compute_flag_fraction,
-    error,
     format_percent,
-    note,
-    warning,
+    make_error,
+    make_note,
+    make_warning,
 )
 from px4fuse.flight.ekf2_parameters import EV_POS
 from px4fuse.flight.model import (
-    ARRIVAL_CLOCK_METHODS,
+    METHODS_WITHOUT_MEASUREMENT_TIMES,
     REPEATED_TIMESTAMPS_NOTE,
     ClockMap,
     Ekf2,
@@ -33,7 +33,7 @@ from px4fuse.flight.model import (
 # Jitter of receive times is reported above this value (s): a position error of 1 cm at 1 m/s
 MAX_RECEIPT_JITTER_S = 0.010
 # A timestamp is an arrival time if PX4 publishes the position within this time (s) after it
-MAX_ARRIVAL_TO_PUBLICATION_S = 0.001
+MAX_ARRIVAL_TO_PUBLICATION_DELAY_S = 0.001
 # Minimum latency (s) for a warning: a position error of 2 cm at 1 m/s
 MIN_LATENCY_S = 0.02
 # Minimum latency (s), for severity "error": a position error of 10 cm at 1 m/s
@@ -42,18 +42,18 @@ MIN_LATENCY_FOR_ERROR_S = 0.10
 MIN_LATENCY_CORRELATION = 0.8
 # Minimum fraction of positions that EKF2 drops because of their latency, for a finding
 MIN_DROPPED_POSITION_FRACTION = 0.02
-# Convergence of TIMESYNC in flight is detected with at least this number of positions before it and
-# after it
-MIN_TIMESYNC_POSITIONS = 10
-# TIMESYNC converged in flight if at least this fraction of earlier timestamps are arrival times and
-# at least this fraction of later timestamps are measurement times
-MIN_TIMESTAMP_KIND_FRACTION = 0.95
+# Minimum number of positions before and after the convergence of TIMESYNC, to detect the
+# convergence
+MIN_POSITIONS_BEFORE_AND_AFTER_TIMESYNC = 10
+# Minimum fraction of arrival times among the timestamps before the convergence of TIMESYNC, and of
+# measurement times among the timestamps after it
+MIN_FRACTION_OF_TIMESTAMP_KIND = 0.95
 # Minimum mean number of positions that arrive together (burst)
 MIN_BURST_POSITIONS = 2.5
 # Minimum number of bursts. With fewer bursts, the pauses are gaps in the position source
 MIN_BURST_COUNT = 20
 # Maximum ratio of the duration of a burst to the pause between bursts
-MAX_BURST_DURATION_RATIO = 0.3
+MAX_BURST_TO_PAUSE_DURATION_RATIO = 0.3
 ANSWER_TIMESYNC_ACTION = (
     "Let the companion computer answer TIMESYNC (MAVROS does by default; with pymavlink answer "
     "every request). Send positions only after 500 answers, which take 50 s at 10 Hz."
@@ -66,21 +66,21 @@ def detect(analysis: Analysis) -> Findings:
         yield from detect_arrival_timestamps(analysis)
         yield from detect_varying_latency(analysis)
     elif clock_map.note == REPEATED_TIMESTAMPS_NOTE and clock_map.distinct_stamps:
-        yield from detect_shared_timestamps(analysis, clock_map.pairs, clock_map.distinct_stamps)
+        yield from detect_repeated_timestamps(analysis, clock_map.pairs, clock_map.distinct_stamps)
     elif clock_map.clock in AGE_TEXT_BY_WRONG_TIMESTAMP:
         yield from detect_timestamp_unit(analysis, clock_map.clock)
     elif clock_map.distinct_stamps is not None:
         yield from detect_constant_timestamps(positions_text, clock_map, clock_map.distinct_stamps)
-    elif clock_map.method in ARRIVAL_CLOCK_METHODS:
+    elif clock_map.method in METHODS_WITHOUT_MEASUREMENT_TIMES:
         kf_times_sentence = (
-            "KF uses the timestamps of the messages, converted to the autopilot's boot clock by "
-            f"the {clock_map.method}."
+            "KF uses the timestamps of the messages. px4fuse converts them to boot time by the "
+            f"{clock_map.method}."
         )
         if clock_map.method == "arrival time":
             kf_times_sentence = (
-                "Like EKF2, KF uses arrival times, so the tracks are late by the position latency."
+                "KF uses arrival times like EKF2. Both tracks lag by the latency of the positions."
             )
-        yield warning(
+        yield make_warning(
             "companion_not_synchronised",
             f"The source of the {positions_text} never synchronised its clock (TIMESYNC). EKF2 "
             f"used arrival times as times of measurement. {kf_times_sentence}",
@@ -90,39 +90,42 @@ def detect(analysis: Analysis) -> Findings:
 
 
 def detect_bursts(analysis: Analysis) -> Findings:
-    """Detect positions that wait and arrive in bursts, and whose timestamps are arrival times."""
+    """Detect buffered positions that arrive in bursts and have arrival times as timestamps."""
     intervals_s = np.diff(analysis.source.samples.index.to_numpy())
     is_pause = intervals_s > intervals_s.mean()
     if np.count_nonzero(is_pause) < MIN_BURST_COUNT:
         return
     burst_size, pause_s = 1.0 / float(is_pause.mean()), float(np.median(intervals_s[is_pause]))
     burst_duration_s = burst_size * float(np.median(intervals_s[~is_pause]))
-    if burst_size < MIN_BURST_POSITIONS or burst_duration_s > MAX_BURST_DURATION_RATIO * pause_s:
+    if (
+        burst_size < MIN_BURST_POSITIONS
+        or burst_duration_s > MAX_BURST_TO_PAUSE_DURATION_RATIO * pause_s
+    ):
         return
-    yield error(
+    yield make_error(
         "source_timestamp_jitter",
         f"The timestamps of the {positions_phrase(analysis.source)} come in bursts of "
         f"{burst_size:.0f}, every {pause_s:.2g} s "
         f"({analysis.source.compute_rate_hz():.3g} Hz on average). "
-        "They are arrival times of positions that were "
-        f"measured earlier, by up to {pause_s:.2g} s. At 1 m/s this is a position error of up to "
+        "They are arrival times: the positions were "
+        f"measured up to {pause_s:.2g} s earlier. At 1 m/s this is a position error of up to "
         f"{format_metres(pause_s)} m along the motion.",
         "Send each position at once, with its time of measurement.",
         {"burst_size": burst_size, "interval_s": pause_s},
     )
 
 
-def detect_shared_timestamps(
+def detect_repeated_timestamps(
     analysis: Analysis, sample_count: int, distinct_count: int
 ) -> Findings:
     resolution_s = float(np.median(np.diff(analysis.source.samples.index)))
     rate_hz = sample_count / (distinct_count * resolution_s)
-    yield error(
+    yield make_error(
         "source_timestamps_shared",
         f"The timestamps of the {positions_phrase(analysis.source)} have a resolution of "
         f"{resolution_s:.3g} s. The {sample_count} samples ({rate_hz:.2g} Hz) have only "
         f"{distinct_count} different timestamps. px4fuse uses the first sample of each timestamp. "
-        "At 1 m/s the rounding is a position error of up to "
+        "At 1 m/s the position error due to this resolution is up to "
         f"{format_metres(resolution_s)} m.",
         "Send the time of measurement with a resolution of microseconds.",
         {"resolution_s": resolution_s, "samples": sample_count, "distinct": distinct_count},
@@ -138,15 +141,15 @@ def detect_timestamp_unit(analysis: Analysis, clock_name: str) -> Findings:
         fusion_flags["horizontal"], segment
     ):
         fusion_sentence = (
-            f"EKF2 never fused the positions, because it treats them as "
-            f"{AGE_TEXT_BY_WRONG_TIMESTAMP[clock_name]}. "
+            "EKF2 never fused the positions: with these timestamps, the positions are "
+            f"{AGE_TEXT_BY_WRONG_TIMESTAMP[clock_name]} for EKF2. "
         )
-    yield error(
+    yield make_error(
         "source_timestamp_unit",
         f"The timestamps of the {positions_phrase(analysis.source)} are "
         f"{'0 in every message' if clock_name == '0' else f'in {clock_name}'}. PX4 expects "
         f"timestamp_sample in microseconds since the autopilot's boot. {fusion_sentence}px4fuse "
-        "uses the arrival times, which are late by the latency.",
+        "uses the arrival times, which are later than the times of measurement.",
         find_timestamp_action(clock_name),
         {"clock": clock_name},
     )
@@ -155,17 +158,16 @@ def detect_timestamp_unit(analysis: Analysis, clock_name: str) -> Findings:
 def detect_constant_timestamps(
     positions_text: str, clock_map: ClockMap, distinct_count: int
 ) -> Findings:
-    yield error(
+    yield make_error(
         "source_timestamps_constant",
-        f"The timestamps of {clock_map.pairs} {positions_text} have only {distinct_count} distinct "
-        f"value{'s' if distinct_count > 1 else ''}. The time of measurement is unknown; px4fuse "
-        "uses the receive time instead.",
+        f"Distinct timestamps of {clock_map.pairs} {positions_text}: only {distinct_count}. The "
+        "time of measurement is unknown; px4fuse uses the receive time instead.",
         "Send the time of measurement in the message (usec, time_usec), in microseconds and as a "
         "64-bit integer.",
         {"stamps": clock_map.pairs, "distinct": distinct_count},
     )
     if (jitter_s := clock_map.jitter_s) > MAX_RECEIPT_JITTER_S:
-        yield warning(
+        yield make_warning(
             "source_timestamp_jitter",
             f"The receive times of the {positions_text} jitter by {jitter_s * 1e3:.0f} ms (1 σ). "
             "px4fuse uses them as timestamps. At 1 m/s this is a position error of "
@@ -187,26 +189,29 @@ def detect_arrival_timestamps(analysis: Analysis) -> Findings:
         return
     timesync_convergence = find_timesync_convergence(analysis)
     if timesync_convergence is not None:
-        until_s, latency_s = timesync_convergence
-        make_finding = error if latency_s >= MIN_LATENCY_FOR_ERROR_S else warning
+        convergence_time_s, latency_s = timesync_convergence
+        make_finding = make_error if latency_s >= MIN_LATENCY_FOR_ERROR_S else make_warning
         airborne = analysis.flight.airborne
-        if not isinstance(airborne, Unavailable) and all(start >= until_s for start, _ in airborne):
-            make_finding = note
+        if not isinstance(airborne, Unavailable) and all(
+            start >= convergence_time_s for start, _ in airborne
+        ):
+            make_finding = make_note
         yield make_finding(
             "source_timestamps_are_arrival_times",
-            f"Position timestamps are arrival times until {until_s:.1f} s. Until then TIMESYNC "
-            "had not converged (PX4 needs 500 answers). Later timestamps are times of "
-            f"measurement, {latency_s:.3f} s before arrival, so one time offset cannot correct "
-            "the whole flight.",
+            f"Position timestamps are arrival times until {convergence_time_s:.1f} s, when "
+            "TIMESYNC converged "
+            "(PX4 needs 500 answers). Later timestamps are times of measurement, "
+            f"{latency_s:.3f} s before arrival. One time offset cannot correct the whole flight.",
             "Let the clocks synchronise for one minute before take-off. Analyse only the later "
-            f"time (--start {until_s:.0f}).",
-            {"until_s": until_s, "latency_s": latency_s},
-            ((float(position_age_s.index[0]), until_s),),
+            f"time (--start {convergence_time_s:.0f}).",
+            {"until_s": convergence_time_s, "latency_s": latency_s},
+            ((float(position_age_s.index[0]), convergence_time_s),),
         )
     elif (
-        np.mean(position_age_s.abs() < MAX_ARRIVAL_TO_PUBLICATION_S) >= MIN_TIMESTAMP_KIND_FRACTION
+        np.mean(position_age_s.abs() < MAX_ARRIVAL_TO_PUBLICATION_DELAY_S)
+        >= MIN_FRACTION_OF_TIMESTAMP_KIND
     ):
-        yield warning(
+        yield make_warning(
             "source_timestamps_are_arrival_times",
             "Position timestamps are arrival times in the whole flight. The source was never "
             "synchronised with the autopilot (TIMESYNC), so every position is late by its latency.",
@@ -220,27 +225,27 @@ def detect_varying_latency(analysis: Analysis) -> Findings:
     position_age_s = _find_position_age_s(analysis)
     if position_age_s is None or find_timesync_convergence(analysis) is not None:
         return
-    sample_count = max(MIN_TIMESYNC_POSITIONS, len(position_age_s) // 10)
+    sample_count = max(MIN_POSITIONS_BEFORE_AND_AFTER_TIMESYNC, len(position_age_s) // 10)
     start_s, end_s = (
         float(age_s.median())
         for age_s in (position_age_s.iloc[:sample_count], position_age_s.iloc[-sample_count:])
     )
-    latency_change_text = "grows in flight"
-    age_time_rank_correlation = rank_correlation(
+    change_verb = "grows"
+    rank_correlation_of_age_with_time = rank_correlation(
         position_age_s.index.to_numpy(), position_age_s.to_numpy()
     )
-    ekf2, buffer_sentence, dropped_fraction = analysis.flight.ekf2, "", 0.0
+    ekf2, late_drop_sentence, dropped_fraction = analysis.flight.ekf2, "", 0.0
     if isinstance(ekf2, Ekf2) and isinstance(ekf2.horizon_s, float):
         delay_s = 1e-3 * analysis.flight.log.parameters.get(EV_POS.delay, 0.0)
         limit_s = ekf2.horizon_s + MAX_LATENESS_S - delay_s
         dropped_fraction = float((position_age_s > limit_s).mean())
-        buffer_sentence = (
-            f" EKF2 drops positions that arrive later than {limit_s:.2f} s (here "
-            f"{format_percent(dropped_fraction)})."
+        late_drop_sentence = (
+            f" EKF2 drops positions that arrive more than {limit_s:.2f} s after their timestamp: "
+            f"{format_percent(dropped_fraction)} in this flight."
         )
     if (
         end_s - start_s < MIN_LATENCY_FOR_ERROR_S
-        or age_time_rank_correlation < MIN_LATENCY_CORRELATION
+        or rank_correlation_of_age_with_time < MIN_LATENCY_CORRELATION
     ):
         if (
             not MIN_DROPPED_POSITION_FRACTION
@@ -248,12 +253,12 @@ def detect_varying_latency(analysis: Analysis) -> Findings:
             < 1.0 - MIN_DROPPED_POSITION_FRACTION
         ):
             return
-        latency_change_text = "varies"
+        change_verb = "varies"
         start_s, end_s = position_age_s.quantile([0.05, 0.95]).tolist()
-    yield (error if dropped_fraction > MIN_DROPPED_POSITION_FRACTION else warning)(
+    yield (make_error if dropped_fraction > MIN_DROPPED_POSITION_FRACTION else make_warning)(
         "source_latency_varies",
-        f"The latency of the {positions_phrase(analysis.source)} {latency_change_text} from "
-        f"{start_s:.2f} s to {end_s:.2f} s (time from measurement to arrival).{buffer_sentence}",
+        f"The latency of the {positions_phrase(analysis.source)} {change_verb} in flight from "
+        f"{start_s:.2f} s to {end_s:.2f} s (time from measurement to arrival).{late_drop_sentence}",
         "Find the queue that fills up: sender, bridge or link. Send fewer or smaller messages, and "
         "let the sender drop old positions.",
         {"start_s": start_s, "end_s": end_s, "dropped_fraction": dropped_fraction},
@@ -265,23 +270,27 @@ def find_timesync_convergence(analysis: Analysis) -> tuple[float, float] | None:
     position_age_s = _find_position_age_s(analysis)
     if position_age_s is None:
         return None
-    is_arrival_time = (position_age_s.abs() < MAX_ARRIVAL_TO_PUBLICATION_S).to_numpy()
-    # For each position, if TIMESYNC converged directly after it: number of timestamps of the wrong
-    # kind (measurement times before the convergence, arrival times after it)
-    wrong_timestamp_counts: Array = (
+    is_arrival_time = (position_age_s.abs() < MAX_ARRIVAL_TO_PUBLICATION_DELAY_S).to_numpy()
+    # TIMESYNC may have converged after each position. Number of timestamps that contradict each of
+    # these times: measurement times before the convergence, and arrival times after it
+    contradicting_timestamp_counts: Array = (
         np.cumsum(~is_arrival_time) + np.sum(is_arrival_time) - np.cumsum(is_arrival_time)
     )
-    converged_index = int(np.argmin(wrong_timestamp_counts)) + 1
+    converged_index = int(np.argmin(contradicting_timestamp_counts)) + 1
     if (
-        np.mean(is_arrival_time) >= MIN_TIMESTAMP_KIND_FRACTION
-        or min(converged_index, len(position_age_s) - converged_index) < MIN_TIMESYNC_POSITIONS
+        np.mean(is_arrival_time) >= MIN_FRACTION_OF_TIMESTAMP_KIND
+        or min(converged_index, len(position_age_s) - converged_index)
+        < MIN_POSITIONS_BEFORE_AND_AFTER_TIMESYNC
     ):
         return None
     latency_s = float(position_age_s.iloc[converged_index:].median())
-    correct_timestamp_fraction = min(
+    min_matching_timestamp_fraction = min(
         np.mean(is_arrival_time[:converged_index]), np.mean(~is_arrival_time[converged_index:])
     )
-    if correct_timestamp_fraction < MIN_TIMESTAMP_KIND_FRACTION or latency_s < MIN_LATENCY_S:
+    if (
+        min_matching_timestamp_fraction < MIN_FRACTION_OF_TIMESTAMP_KIND
+        or latency_s < MIN_LATENCY_S
+    ):
         return None
     return float(position_age_s.index[converged_index]), latency_s
 
@@ -300,4 +309,8 @@ def _find_position_age_s(analysis: Analysis) -> pd.Series | None:
     ):
         return None
     position_age_s = fusion_record.vision_age_s.loc[segment.start_s : segment.end_s]
-    return position_age_s if len(position_age_s) >= 2 * MIN_TIMESYNC_POSITIONS else None
+    return (
+        position_age_s
+        if len(position_age_s) >= 2 * MIN_POSITIONS_BEFORE_AND_AFTER_TIMESYNC
+        else None
+    )

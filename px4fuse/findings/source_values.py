@@ -16,12 +16,12 @@ from px4fuse.core.text import format_metres
 from px4fuse.ekf2.model import replay_with_settings
 from px4fuse.ekf2.replay import rows_inside
 from px4fuse.filter.signals import cut_to_segment
-from px4fuse.findings.model import Findings, error, find_source_texts, note, warning
+from px4fuse.findings.model import Findings, find_source_texts, make_error, make_note, make_warning
 from px4fuse.findings.source_intervals import describe_errors_after_gap
 from px4fuse.flight.model import Columns, Ekf2, Truth, Unavailable, positions_phrase, source_name
 from px4fuse.readers.px4_positions import NO_FIX_ACTION
 
-# Minimum rounding step (m) for a finding: the error of smaller steps is below the noise of UWB
+# Minimum reported rounding step (m): errors due to smaller steps are below the noise of UWB
 MIN_ROUNDING_STEP_M = 0.05
 # A lever arm is reported if a replay of EKF2 with the estimated lever arm reduces the position RMSE
 # at least to this fraction
@@ -29,21 +29,22 @@ MAX_LEVER_ARM_RMSE_RATIO = 0.7
 # Minimum distance (m) between the positions of two alternating senders, for a finding: smaller
 # distances may be the noise of good UWB
 MIN_SENDER_DISTANCE_M = 0.1
-# Minimum ratio of the distance between two senders to its scatter (1 σ): the noise of one sender
-# reaches a ratio of 2
+# Minimum distance between the positions of two senders ÷ scatter of the distance (1 σ). With one
+# sender, noise reaches the value 2
 MIN_SENDER_DISTANCE_SIGMAS = 4.0
-# Window length (samples) for the detection of two senders: one sends the odd samples, the other one
-# the even samples. Windows are short, because a lost sample exchanges odd and even
+# Window length (samples) for the detection of two senders: odd samples are from one sender, even
+# samples from another sender. After a lost sample, odd becomes even, so windows are short
 WINDOW_SAMPLES = 16
 # Minimum number of windows to detect two senders: in fewer windows, outliers of one sender resemble
 # a second sender
-MIN_WINDOWS = 10
+MIN_WINDOWS_FOR_TWO_SENDERS = 10
 # Positions are a copy of EKF2's position if their median distance is below this limit (m)
-MAX_COPY_DISTANCE_M = 0.01
-# Limit (m) for positions that EKF2 fuses: smaller, because EKF2 is near each source that it fuses
-MAX_FUSED_COPY_DISTANCE_M = 0.001
+MAX_DISTANCE_OF_COPY_M = 0.01
+# Fused positions are a copy of EKF2's position if their median distance is below this limit (m).
+# The limit is smaller, because EKF2's position is always near fused positions
+MAX_DISTANCE_OF_FUSED_COPY_M = 0.001
 # Positions are compared with EKF2's position above this speed (m/s): at rest, any source may agree
-MIN_COPY_SPEED_M_S = 0.2
+MIN_SPEED_FOR_COPY_TEST_M_S = 0.2
 # Tested delays (s) between EKF2's position and a source that sends it back
 TESTED_COPY_DELAYS_S = np.arange(0.0, 0.305, 0.005)
 NO_ESTIMATES_SENTENCE = "px4fuse estimates nothing from these positions."
@@ -61,12 +62,12 @@ INVALID_POSITION_TEXTS: Mapping[str, tuple[str, str, str]] = {
     ),
     "far": (
         "source_without_position",
-        "{positions} are more than 10 km from the other positions: another origin, or no fix",
+        "{positions} are more than 10 km from the other positions: wrong origin, or no fix",
         "",
     ),
     "no fix": (
         "source_without_position",
-        "{positions} have no 3D fix",
+        "{positions} were measured without a 3D fix",
         NO_FIX_ACTION,
     ),
     "NaN": (
@@ -86,9 +87,9 @@ def detect(analysis: Analysis) -> Findings:
 
 
 def _find_invalid_spans(time_s: Array, valid_times_s: Array) -> tuple[Span, ...]:
-    # Successive invalid samples have the same number of valid samples before them
-    valid_count_before = np.searchsorted(valid_times_s, time_s)
-    span_start_indices = np.flatnonzero(np.diff(valid_count_before, prepend=-1))
+    # Invalid samples form one span if no valid sample is between them
+    valid_counts_before_sample = np.searchsorted(valid_times_s, time_s)
+    span_start_indices = np.flatnonzero(np.diff(valid_counts_before_sample, prepend=-1))
     span_end_indices = np.append(span_start_indices[1:], len(time_s)) - 1
     return tuple(
         zip(time_s[span_start_indices].tolist(), time_s[span_end_indices].tolist(), strict=True)
@@ -97,9 +98,9 @@ def _find_invalid_spans(time_s: Array, valid_times_s: Array) -> tuple[Span, ...]
 
 def detect_invalid_rows(analysis: Analysis) -> Findings:
     source, segment = analysis.source, analysis.segment
-    invalid = source.invalid[segment.start_s : segment.end_s]
+    invalid_reasons = source.invalid_reasons[segment.start_s : segment.end_s]
     for reason, (name, fault_template, action) in INVALID_POSITION_TEXTS.items():
-        time_s = invalid[invalid == reason].index.to_numpy()
+        time_s = invalid_reasons[invalid_reasons == reason].index.to_numpy()
         if not (count := len(time_s)):
             continue
         spans = _find_invalid_spans(time_s, source.samples.index.to_numpy())
@@ -112,16 +113,16 @@ def detect_invalid_rows(analysis: Analysis) -> Findings:
         times_text = f"{len(spans)} time spans between {spans[0][0]:.1f} s and {spans[-1][1]:.1f} s"
         if len(spans) <= 3:
             times_text = " and ".join(f"{start:.1f} s to {end:.1f} s" for start, end in spans)
-        error_text, make_finding = "", note if reason == "NaN" else warning
+        error_text, make_finding = "", make_note if reason == "NaN" else make_warning
         if duration_s > compute_max_interval_s(1.0 / source.compute_rate_hz()):
-            make_finding = warning
+            make_finding = make_warning
             valid_times_s = _find_valid_times_around(analysis, longest_span_s)
             error_text = f" {describe_errors_after_gap(analysis, valid_times_s)}"
         yield make_finding(
             name,
             f"{fault_sentence}. Times of these positions: {times_text} ({total_s:.1f} s in total). "
             f"KF does not use them.{error_text}",
-            action or f"Check {find_source_texts(source).reception} at {longest_span_s[0]:.1f} s.",
+            action or f"{find_source_texts(source).data_link_check} at {longest_span_s[0]:.1f} s.",
             {
                 "count": count,
                 "longest_s": duration_s,
@@ -141,23 +142,22 @@ def _find_valid_times_around(analysis: Analysis, span_s: Span) -> Span:
 
 def detect_rounding(analysis: Analysis) -> Findings:
     """Detect positions that are rounded to coarse steps."""
-    source, step_m = analysis.source, analysis.source.step_m
+    source, step_m = analysis.source, analysis.source.rounding_step_m
     if step_m < MIN_ROUNDING_STEP_M:
         return
-    cause, action = "The source rounds the positions.", "Send the positions with more digits."
+    cause_text, action = "", "Send the positions with more digits."
     if np.log2(step_m) % 1.0 == 0.0:
-        cause = (
-            "Possible causes: the source rounds the positions, or stores large coordinates (such "
-            "as UTM) as 32-bit floats."
-        )
+        cause_text = " Possible cause: the source stores large coordinates (UTM) as 32-bit floats."
         action += (
-            " Subtract a local origin in double precision (64 bit) before the position becomes a "
-            "32-bit float."
+            " At the sender, subtract a local origin in double precision (64 bit) before the "
+            "conversion to 32-bit float."
         )
-    yield warning(
+    yield make_warning(
         "source_positions_rounded",
-        f"{positions_phrase(source)} move in steps of {step_m:.3g} m. {cause} The rounding error "
-        f"is {step_m / 12.0**0.5:.2g} m (1 σ) and correlated in time. {NO_ESTIMATES_SENTENCE}",
+        f"{positions_phrase(source)} are rounded to steps of {step_m:.3g} m.{cause_text} The "
+        "rounding "
+        f"error is {step_m / 12.0**0.5:.2g} m (1 σ) and correlated in time. "
+        f"{NO_ESTIMATES_SENTENCE}",
         action,
         {"step_m": step_m},
     )
@@ -173,34 +173,38 @@ def detect_lever_arm(analysis: Analysis) -> Findings:
     lever_arm = estimate_lever_arm(analysis.flight, source)
     if lever_arm is None:
         return
-    arm_forward_m, arm_right_m, sigma_m = lever_arm
+    lever_arm_forward_m, lever_arm_right_m, sigma_m = lever_arm
     # + 0.0 replaces -0.0 by 0.0
     lever_arm_m = np.add(source.lever_arm_m[:2], lever_arm[:2]).round(2) + 0.0
     change = dict(zip(find_aid(analysis).lever_arm, lever_arm_m.tolist(), strict=False))
     effect_sentence = _describe_replayed_effect(analysis, change)
     if effect_sentence is None:
         return
-    arm_forward_m, arm_right_m = (round(part, 2) + 0.0 for part in (arm_forward_m, arm_right_m))
+    lever_arm_forward_m, lever_arm_right_m = (
+        round(part, 2) + 0.0 for part in (lever_arm_forward_m, lever_arm_right_m)
+    )
     sensor_text, action = f"{source_name(source)} sensor", f"Set {format_settings(change)}."
     if source.alignment is not None:  # no EKF2 parameter corrects positions of a file
         sensor_text = "sensor"
         action = "Subtract this lever arm, rotated to NED by the attitude, from the positions."
-    yield warning(
+    yield make_warning(
         "source_lever_arm",
-        f"The {sensor_text} is mounted {np.hypot(arm_forward_m, arm_right_m):.2f} m from the "
-        f"mounting point that EKF2 assumes: {arm_forward_m:+.2f} m forward, {arm_right_m:+.2f} m "
+        f"The {sensor_text} is mounted {np.hypot(lever_arm_forward_m, lever_arm_right_m):.2f} m "
+        "from the "
+        f"mounting point that EKF2 assumes: {lever_arm_forward_m:+.2f} m forward, "
+        f"{lever_arm_right_m:+.2f} m "
         f"right (± {1.96 * sigma_m:.2f} m, 95 %). When the vehicle turns, the error of the "
         f"positions changes by up to twice this distance. {effect_sentence}{NO_ESTIMATES_SENTENCE}",
         f"{action} Measure the position of the sensor relative to the IMU.",
-        {"forward_m": arm_forward_m, "right_m": arm_right_m, "sigma_m": sigma_m},
+        {"forward_m": lever_arm_forward_m, "right_m": lever_arm_right_m, "sigma_m": sigma_m},
     )
 
 
 def _describe_replayed_effect(analysis: Analysis, change: Mapping[str, float]) -> str | None:
-    """Return a sentence on EKF2's position RMSE in replays without and with a change.
+    """Describe EKF2's position RMSE in replays without and with a change of parameters.
 
-    The sentence is "" if EKF2 cannot be replayed. Return None if the change hardly reduces the
-    RMSE: the position error then has another cause.
+    Return "" if EKF2 cannot be replayed. Return None if the change reduces the RMSE too little:
+    the position error then has another cause.
     """
     ekf2_model, truth = analysis.ekf2_model, analysis.flight.truth
     if isinstance(ekf2_model, Unavailable) or isinstance(truth, Unavailable):
@@ -218,8 +222,8 @@ def _describe_replayed_effect(analysis: Analysis, change: Mapping[str, float]) -
         rmses_m.append(float(np.sqrt(np.mean(np.square(np.hypot(*axis_errors_m))))))
     if rmses_m[1] > MAX_LEVER_ARM_RMSE_RATIO * rmses_m[0]:
         return None
-    before, after = map(format_metres, rmses_m)
-    return f"Replay of EKF2 with this lever arm: horizontal position RMSE {before} m → {after} m. "
+    rmse_text = " m → ".join(map(format_metres, rmses_m))
+    return f"Replay of EKF2 with this lever arm: horizontal position RMSE {rmse_text} m. "
 
 
 def detect_two_senders(analysis: Analysis) -> Findings:
@@ -227,32 +231,36 @@ def detect_two_senders(analysis: Analysis) -> Findings:
     samples = cut_to_segment(analysis.source.samples, analysis.segment)[Columns.POSITION]
     samples = samples.dropna(axis=1, how="all").dropna()
     window_count, rate_hz = (len(samples) - 2) // WINDOW_SAMPLES, analysis.source.compute_rate_hz()
-    if window_count < MIN_WINDOWS:
+    if window_count < MIN_WINDOWS_FOR_TWO_SENDERS:
         return
     time_s, position_m = samples.index.to_numpy(), samples.to_numpy()
     weight = ((time_s[1:-1] - time_s[:-2]) / (time_s[2:] - time_s[:-2]))[:, None]
     deviations_m = position_m[1:-1] - (1.0 - weight) * position_m[:-2] - weight * position_m[2:]
     deviations_m[::2] *= -1.0
-    window_offsets_m = np.median(
+    window_median_deviations_m = np.median(
         deviations_m[: window_count * WINDOW_SAMPLES].reshape(window_count, WINDOW_SAMPLES, -1),
         axis=1,
     )
-    largest_offset_m = window_offsets_m[np.argmax(np.linalg.norm(window_offsets_m, axis=1))]
-    window_offsets_m[window_offsets_m @ largest_offset_m < 0.0] *= -1.0
-    median_offset_m = np.median(window_offsets_m, axis=0)
-    scatter_m = 1.4826 * float(np.median(np.abs(window_offsets_m - median_offset_m), axis=0).max())
-    distance_m = float(np.linalg.norm(median_offset_m))
+    largest_deviation_m = window_median_deviations_m[
+        np.argmax(np.linalg.norm(window_median_deviations_m, axis=1))
+    ]
+    window_median_deviations_m[window_median_deviations_m @ largest_deviation_m < 0.0] *= -1.0
+    median_deviation_m = np.median(window_median_deviations_m, axis=0)
+    scatter_m = 1.4826 * float(
+        np.median(np.abs(window_median_deviations_m - median_deviation_m), axis=0).max()
+    )
+    distance_m = float(np.linalg.norm(median_deviation_m))
     if distance_m < max(MIN_SENDER_DISTANCE_M, MIN_SENDER_DISTANCE_SIGMAS * scatter_m):
         return
     distance_texts = ", ".join(
         f"{abs(part):.2f} m {name.partition('_')[0]}"
-        for part, name in zip(median_offset_m, samples.columns, strict=True)
+        for part, name in zip(median_deviation_m, samples.columns, strict=True)
     )
-    yield error(
+    yield make_error(
         "source_two_senders",
-        f"Two systems alternately send positions that differ by {distance_m:.2f} m. Successive "
-        f"{positions_phrase(analysis.source)} ({rate_hz:.3g} Hz in total) differ by "
-        f"{distance_texts} in addition to the motion of the vehicle. {NO_ESTIMATES_SENTENCE}",
+        f"Two systems alternately send positions that differ by {distance_m:.2f} m. Without the "
+        f"motion of the vehicle, successive {positions_phrase(analysis.source)} ({rate_hz:.3g} Hz "
+        f"in total) differ by {distance_texts}. {NO_ESTIMATES_SENTENCE}",
         "Send the positions of one system only, for example stop the second node, bridge or "
         "MAVROS plugin.",
         {"distance_m": distance_m, "rate_hz": rate_hz},
@@ -279,14 +287,14 @@ def detect_copied_estimate(analysis: Analysis) -> Findings:
         (fusion_flags["horizontal"][segment.start_s : segment.end_s] > 0.0).any()
     )
     if not distances_m[best_index] < (
-        MAX_FUSED_COPY_DISTANCE_M if is_fused else MAX_COPY_DISTANCE_M
+        MAX_DISTANCE_OF_FUSED_COPY_M if is_fused else MAX_DISTANCE_OF_COPY_M
     ):
         return
     convention = analysis.convention
     orientation = convention.orientation if convention else None
     is_copied = orientation and orientation.verdict == "copied"
     copied_quantity = "position and attitude" if is_copied else "position"
-    yield error(
+    yield make_error(
         "source_is_ekf2_estimate",
         f"{source_name(source)} sends EKF2's own {copied_quantity} back. The positions equal those "
         f"that EKF2 estimated {1e3 * TESTED_COPY_DELAYS_S[best_index]:.0f} ms before (median "
@@ -307,9 +315,11 @@ def _compute_median_distance_m(position_m: Array, time_s: Array, ekf2_state: pd.
     ekf2_position_spline = CubicHermiteSpline(
         state_times_s, ekf2_state[Columns.POSITION], ekf2_state[Columns.VELOCITY]
     )
-    is_moving = np.linalg.norm(ekf2_position_spline(time_s, 1), axis=1) > MIN_COPY_SPEED_M_S
+    is_moving = (
+        np.linalg.norm(ekf2_position_spline(time_s, 1), axis=1) > MIN_SPEED_FOR_COPY_TEST_M_S
+    )
     is_inside = (time_s > state_times_s[0]) & (time_s < state_times_s[-1]) & is_moving
     if np.count_nonzero(is_inside) < WINDOW_SAMPLES:
-        return float("nan")
+        return np.nan
     distance_m = np.linalg.norm(position_m - ekf2_position_spline(time_s), axis=1)
     return float(np.median(distance_m[is_inside]))

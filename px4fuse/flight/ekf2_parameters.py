@@ -17,7 +17,11 @@ from px4fuse.errors import SettingsError, suggest_name
 
 @dataclass(frozen=True)
 class Aid:
-    """Aiding source of EKF2: a kind of measurement that EKF2 can fuse, and its PX4 parameters."""
+    """Aiding source of EKF2: a kind of measurement that EKF2 can fuse, and its PX4 parameters.
+
+    The attributes ``switch``, ``noise``, ``gate``, ``delay`` and ``lever_arm`` contain names of
+    parameters, not values.
+    """
 
     # Name in PX4, as in ``estimator_aid_src_<name>``
     name: str
@@ -29,15 +33,16 @@ class Aid:
     # Parameter for the delay (ms) from measurement to timestamp
     delay: str = ""
     # Parameter that makes EKF2 ignore reported variances if it is 1
-    noise_mode: str = ""
+    noise_mode_parameter: str = ""
     # Parameters for the position of the sensor (m, FRD)
     lever_arm: tuple[str, ...] = ()
     # Name of the aiding source in reports
     label: str = ""
     # Unit of the innovations
     unit: str = "m"
-    # Data from which EKF2 computes R, if it is not the parameter ``noise`` alone; noun phrase
-    noise_origin: str = ""
+    # Text for users (noun phrase): data from which EKF2 computes R. "" if R is only ``noise``
+    # squared
+    noise_source_text: str = ""
     # Gate (√S) for logs without the parameter ``gate``
     default_gate: float = 5.0
     # Axes of the innovations, in the order of PX4
@@ -46,7 +51,7 @@ class Aid:
     # axis: ``ev_hpos[]`` stands for ``ev_hpos[0] ev_hpos[1]``
     fields: str = ""
     # Fields of ekf2_innovations (v1.8 to v1.10); ``_var`` is appended for the variance
-    old_fields: str = ""
+    ekf2_innovations_fields: str = ""
     # Flags of estimator_status_flags that are 1 while fusion of the aiding source is enabled. Each
     # element holds the flag of one PX4 release, or several flags separated by commas
     flags: tuple[str, ...] = ()
@@ -55,8 +60,8 @@ class Aid:
 
     @property
     def measurement_parameters(self) -> frozenset[str]:
-        """Names of the parameters for noise, gate and delay, without that which enables fusion."""
-        return frozenset((self.noise, self.gate, self.delay, self.noise_mode))
+        """Names of the parameters for noise, gate and delay, without the parameter ``switch``."""
+        return frozenset((self.noise, self.gate, self.delay, self.noise_mode_parameter))
 
     def logged_parameters(self, logged_values: Mapping[str, float]) -> dict[str, float]:
         """Return the logged parameters for noise, delay, gate and fusion of this aiding source."""
@@ -64,7 +69,7 @@ class Aid:
             self.noise,
             self.delay,
             self.gate,
-            self.noise_mode,
+            self.noise_mode_parameter,
             self.switch,
             AID_MASK_PARAMETER,
         )
@@ -137,9 +142,9 @@ MAG_TYPE_NONE = 5
 # Bit mask of EKF2_EV_CTRL: EKF2 fuses the yaw of external vision
 EV_CTRL_YAW_MASK = 8
 # Defaults of PX4 up to v1.13 that differ from the defaults of later releases (ekf2_params.c)
-OLD_DEFAULTS: Mapping[str, float] = {EV_POS.delay: 175.0}
+DEFAULTS_BEFORE_V1_14: Mapping[str, float] = {EV_POS.delay: 175.0}
 # Names of the logged parameters that the results contain
-REPORTED_PARAMETERS: tuple[str, ...] = tuple(PARAMETER_TABLES["reported"].split())
+PARAMETERS_IN_RESULTS: tuple[str, ...] = tuple(PARAMETER_TABLES["reported"].split())
 
 
 def fill_with_defaults(
@@ -168,7 +173,7 @@ def fill_with_defaults(
         if name not in excluded_names
     }
     if uses_aid_mask(logged_values) and aid == EV_POS:
-        defaults |= OLD_DEFAULTS
+        defaults |= DEFAULTS_BEFORE_V1_14
     return {name: float(logged_values.get(name, default)) for name, default in defaults.items()}
 
 
@@ -192,7 +197,7 @@ def replace_invalid_parameters(
     valid_values, notes = {}, []
     defaults = {name: parameter.default for name, parameter in KNOWN_PARAMETERS.items()}
     if uses_aid_mask(logged_values):
-        defaults |= OLD_DEFAULTS
+        defaults |= DEFAULTS_BEFORE_V1_14
     for name, value in logged_values.items():
         parameter_range = KNOWN_PARAMETERS.get(name)
         fault = "" if parameter_range is None else parameter_range.describe_range_error(name, value)
@@ -201,10 +206,10 @@ def replace_invalid_parameters(
         if not fault:
             valid_values[name] = value
         elif parameter_range is None:
-            notes.append(f"{fault}. px4fuse ignores this parameter.")
+            notes.append(f"{fault}. px4fuse ignores {name}.")
         else:
             valid_values[name] = defaults[name]
-            notes.append(f"{fault}. px4fuse uses the default {valid_values[name]:g}.")
+            notes.append(f"{fault}. px4fuse uses the parameter default {valid_values[name]:g}.")
     return valid_values, tuple(notes)
 
 
@@ -230,6 +235,6 @@ def check_parameters(changes: Mapping[str, float]) -> dict[str, float]:
             )
         if fault := parameter.describe_range_error(name, value):
             raise SettingsError(f"{fault} (default {parameter.default:g}).")
-        if name == EV_POS.noise_mode and value not in (0.0, 1.0):
+        if name == EV_POS.noise_mode_parameter and value not in (0.0, 1.0):
             raise SettingsError(f"{name} {value:g} is neither 0 nor 1.")
     return {name: float(value) for name, value in changes.items()}

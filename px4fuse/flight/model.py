@@ -5,8 +5,8 @@ Times are seconds on the autopilot's boot clock since the first sample of data, 
 (north, east, down) in m, m/s and m/s², or body FRD (forward, right, down) if stated. Time series
 are pandas frames with the index ``time_s``; column names contain the unit.
 
-Missing data are :class:`Unavailable`, which the report lists. They are never replaced by zero, an
-empty plot or a "pass".
+Missing data are :class:`Unavailable`, with a reason that the report prints. They are never
+replaced by zeros.
 """
 
 from __future__ import annotations
@@ -36,7 +36,7 @@ from px4fuse.core.record import Unavailable as Unavailable  # noqa: PLC0414 - pu
 from px4fuse.flight.ekf2_parameters import BAROMETER, EV_POS, GNSS_POS, PARAMETERS, Aid
 
 PositionKind = Literal["uwb", "vio", "mocap", "gnss", "unknown", "file"]
-DataRoute = Literal[
+PositionRoute = Literal[
     "given file",
     "as received",
     "aligned by EKF2",
@@ -51,8 +51,8 @@ class SourceOrigin(Record):
     # Kind of device, inferred from the data: "vio" sends a changing orientation, "uwb" only noisy
     # positions, "unknown" only precise positions
     kind: PositionKind
-    # Data that contain the positions: for example messages to the autopilot, or EKF2's innovations
-    path: DataRoute
+    # Data in the log from which the positions are read, for example "as received" by the autopilot
+    path: PositionRoute
     # Aiding source of EKF2 for these positions; None if EKF2 never fuses them
     aid: Aid | None
     # True if px4fuse may select the source without --position-source
@@ -82,44 +82,44 @@ class SourceOrigin(Record):
         return self.aid == EV_POS
 
     @property
-    def fused_as_gnss(self) -> bool:
+    def is_fused_as_gnss(self) -> bool:
         return self.aid == GNSS_POS
 
     @property
     def is_gnss(self) -> bool:
         """True for GNSS, whose errors (multipath, atmosphere) are correlated over minutes.
 
-        R must therefore be larger than the differences of consecutive positions indicate.
+        Differences of consecutive positions do not show these errors, but R has to include them.
         """
         return self.kind == "gnss"
 
     def find_preference_rank(self) -> int:
-        """Return the rank for the automatic choice of a position source; 0 is preferred."""
-        return [(origin.aid, origin.path) for origin in ORIGINS].index((self.aid, self.path))
+        """Return the index in SOURCE_ORIGINS. px4fuse chooses the source with the smallest rank."""
+        return [(origin.aid, origin.path) for origin in SOURCE_ORIGINS].index((self.aid, self.path))
 
 
-# Kinds of position sources, and the data of the log with their positions
+# Possible origins of positions: kind of the source, and data in the log that contain the positions
 POSITION_FILE_ORIGIN = SourceOrigin("file", "given file", EV_POS)
-RECEIVED_ORIGIN = SourceOrigin("uwb", "as received", EV_POS)
+AS_RECEIVED_ORIGIN = SourceOrigin("uwb", "as received", EV_POS)
 MOTION_CAPTURE_ORIGIN = SourceOrigin("mocap", "as received", None)
-ALIGNED_ORIGIN = SourceOrigin("uwb", "aligned by EKF2", EV_POS)
+ALIGNED_BY_EKF2_ORIGIN = SourceOrigin("uwb", "aligned by EKF2", EV_POS)
 KEPT_BY_EKF2_ORIGIN = SourceOrigin("uwb", "kept by EKF2", EV_POS)
-REBUILT_ORIGIN = SourceOrigin("uwb", "rebuilt from innovations", EV_POS)
+REBUILT_FROM_INNOVATIONS_ORIGIN = SourceOrigin("uwb", "rebuilt from innovations", EV_POS)
 GNSS_ORIGIN = SourceOrigin("gnss", "as received", GNSS_POS, is_auto_candidate=False)
-# In the order of preference for the analysis
-ORIGINS = (
+# All origins; a source with an earlier origin is preferred for the analysis
+SOURCE_ORIGINS = (
     POSITION_FILE_ORIGIN,
-    RECEIVED_ORIGIN,
+    AS_RECEIVED_ORIGIN,
     MOTION_CAPTURE_ORIGIN,
-    ALIGNED_ORIGIN,
+    ALIGNED_BY_EKF2_ORIGIN,
     KEPT_BY_EKF2_ORIGIN,
-    REBUILT_ORIGIN,
+    REBUILT_FROM_INNOVATIONS_ORIGIN,
     GNSS_ORIGIN,
 )
 
 
 def find_source_origin(kind: str, path: str) -> SourceOrigin:
-    for origin in ORIGINS:
+    for origin in SOURCE_ORIGINS:
         if (origin.kind, origin.path) == (kind, path):
             return origin
     raise ValueError(f"no position source has the kind {kind!r} and the path {path!r}")
@@ -135,7 +135,7 @@ def reclassify_as_vio(origin: SourceOrigin, *, has_changing_orientation: bool) -
 REPEATED_TIMESTAMPS_NOTE = (
     "most timestamps of the sender are repeated, so its clock is not converted"
 )
-# Clock of timestamps in a ULog that an external sender set and PX4 converted or replaced
+# Clock of timestamps that an external sender set. In a ULog, PX4 has converted or replaced them
 SENDER_CLOCK = "sender timestamps"
 # Replacement for results that would show a student the injected fault of an assignment
 DIAGNOSIS_WITHHELD = Unavailable(
@@ -199,7 +199,8 @@ class ClockMap(Record):
     jitter_s: NotNegative
     # Limitation of the conversion, if any
     note: str = ""
-    # Number of distinct timestamps, if too few for a conversion; otherwise None
+    # Number of distinct timestamps, if they are too few to convert them to boot time; otherwise
+    # None
     distinct_stamps: Count | None = None
 
 
@@ -292,7 +293,7 @@ class LogInfo(Record, omit_defaults=False):
 
     __repr__ = one_line_repr
 
-    def default_of(self, parameter: str) -> float:
+    def find_default_value(self, parameter: str) -> float:
         """Return the default of an EKF2 parameter: the logged default, else PX4's since v1.14."""
         return self.parameter_defaults.get(parameter, PARAMETERS[parameter].default)
 
@@ -304,7 +305,7 @@ class LogInfo(Record, omit_defaults=False):
 
 NedAxis = Literal["north", "east", "down"]
 TableOrUnavailable = pd.DataFrame | Unavailable
-# Step functions of flight time by name: values are valid until the next index
+# Step functions of flight time (s) by name: a value is valid until the time of the next value
 StepFunctions: TypeAlias = "Mapping[str, pd.Series[float]]"
 # Intervals (start, end) in s of flight time
 Spans = tuple[Span, ...]
@@ -312,7 +313,7 @@ Spans = tuple[Span, ...]
 # samples arrive in bursts
 MIN_REGULAR_INTERVAL_FRACTION = 0.8
 # Values of ClockMap.method for which the timestamps are not times of measurement
-ARRIVAL_CLOCK_METHODS = ("arrival time", "receive time", "message order")
+METHODS_WITHOUT_MEASUREMENT_TIMES = ("arrival time", "receive time", "message order")
 # Reason for missing positions if the source measures only the height
 HEIGHT_ONLY_REASON = "x and y are NaN in all messages, so the source measures only the height"
 # Ratio of the median absolute second difference to the σ of white noise
@@ -357,25 +358,25 @@ class Columns:
     # Columns of EKF2's state and variances at the fusion horizon, the same for all PX4 releases
     GYRO_BIAS: Final = [f"gyro_bias_{axis}_rad_s" for axis in BODY_AXES]
     ACCELEROMETER_BIAS: Final = [f"accelerometer_bias_{axis}_m_s2" for axis in BODY_AXES]
-    EARTH_FIELD: Final = [f"earth_field_{axis}_gauss" for axis in AXIS_NAMES]
-    BODY_FIELD: Final = [f"body_field_{axis}_gauss" for axis in BODY_AXES]
-    FIELD_INNOVATION: Final = [f"innovation_{axis}_gauss" for axis in BODY_AXES]
-    DELAYED_STATE: Final = [
+    EARTH_MAGNETIC_FIELD: Final = [f"earth_field_{axis}_gauss" for axis in AXIS_NAMES]
+    BODY_MAGNETIC_FIELD: Final = [f"body_field_{axis}_gauss" for axis in BODY_AXES]
+    MAGNETIC_FIELD_INNOVATION: Final = [f"innovation_{axis}_gauss" for axis in BODY_AXES]
+    FUSION_HORIZON_STATE: Final = [
         *QUATERNION,
         *VELOCITY,
         *POSITION,
         *GYRO_BIAS,
         *ACCELEROMETER_BIAS,
-        *EARTH_FIELD,
-        *BODY_FIELD,
+        *EARTH_MAGNETIC_FIELD,
+        *BODY_MAGNETIC_FIELD,
     ]
-    DELAYED_VARIANCE: Final = [
+    FUSION_HORIZON_VARIANCE: Final = [
         *(f"attitude_{axis}_rad2" for axis in AXIS_NAMES),
         *VELOCITY_VARIANCE,
         *POSITION_VARIANCE,
         *(f"{name.removesuffix('_rad_s')}_rad2_s2" for name in GYRO_BIAS),
         *(f"{name.removesuffix('_m_s2')}_m2_s4" for name in ACCELEROMETER_BIAS),
-        *(f"{name}2" for name in (*EARTH_FIELD, *BODY_FIELD)),
+        *(f"{name}2" for name in (*EARTH_MAGNETIC_FIELD, *BODY_MAGNETIC_FIELD)),
     ]
 
 
@@ -432,8 +433,8 @@ class PositionTrack:
     # Conversion of the sender's clock to the boot clock, if px4fuse made one
     clock_map: ClockMap | None = None
     alignment: Alignment | None = None
-    # Quaternion body FRD to ``frame``, and variances about the body axes (NaN if not sent). None
-    # if the orientation is constant, because the source is then not odometry
+    # Quaternion body FRD to ``frame``, and variances about the body axes (NaN if not sent). None if
+    # the source sends no orientation or a constant one
     orientation: pd.DataFrame | None = None
     # Velocity in NED and its variances, if the source measures velocity (GNSS)
     velocity: pd.DataFrame | None = None
@@ -448,11 +449,11 @@ class PositionTrack:
     notes: tuple[str, ...] = ()
     # Reason for each row that is not a measurement: "NaN", "zero" (0, 0, 0), "far"
     # (damaged) or "held" (the last position sent again)
-    invalid: pd.Series[str] = field(default_factory=lambda: NO_INVALID_ROWS)
+    invalid_reasons: pd.Series[str] = field(default_factory=lambda: NO_INVALID_ROWS)
     # ``reset_counter``, ``quality`` and ``age_s`` (arrival in PX4 minus timestamp), if logged
     status: pd.DataFrame = field(default_factory=pd.DataFrame)
     # Quantisation step of the horizontal position as sent; 0 if it is not quantised
-    step_m: float = 0.0
+    rounding_step_m: float = 0.0
 
     __repr__ = one_line_repr
 
@@ -551,7 +552,7 @@ BIAS_NOT_LOGGED = Unavailable(
     "Record a ULog with SDLOG_PROFILE bit 0 (default).",
 )
 HORIZON_NOT_LOGGED = Unavailable(
-    "EKF2 fusion horizon",
+    "time of the fusion horizon",
     "the log contains only publication times of the EKF2 state, no fusion times",
     "Record a ULog with PX4 v1.13 or newer.",
 )
@@ -568,31 +569,32 @@ RECORD_NOT_LOGGED = Unavailable(
 GROUND_EFFECT_FLAG, BAD_ACCELERATION_FLAG = "gnd_effect", "bad_acc_vertical"
 DEAD_RECKONING_FLAG = "inertial_dead_reckoning"
 # Weight of a new sample in EKF2's low-pass filter of optical flow (_flow_vel_body_lpf in ekf.h)
-FLOW_FILTER_WEIGHT = 0.1
+FLOW_FILTER_NEW_SAMPLE_WEIGHT = 0.1
 
 
 @dataclass(frozen=True)
 class FusionRecord:
-    """Logged states of EKF2 at its fusion horizon, and logged measurements, for the replay."""
+    """Logged data for the EKF2 replay: EKF2's states at the fusion horizon, and measurements."""
 
     # All EKF2_ parameters at the start of the log, by PX4 name, in PX4 units
     parameters: Mapping[str, float]
-    # State and variances at the fusion horizon, in the columns DELAYED_STATE and DELAYED_VARIANCE.
-    # The horizontal position is NaN if PX4 stores latitude and longitude
+    # State and variances at the fusion horizon, in the columns FUSION_HORIZON_STATE and
+    # FUSION_HORIZON_VARIANCE. The horizontal position is NaN if PX4 stores latitude and longitude
     delayed: pd.DataFrame
     # True if the PX4 release stores biases as increments per prediction (up to v1.14)
     stores_bias_increments: bool
-    # Names of the horizontal aiding sources that EKF2 fused, without external vision position
+    # Names of the fused aiding sources of horizontal position and velocity, except vision position
     other_horizontal_aids: tuple[str, ...]
     # Delay (s) from measurement to publication of each external vision sample
     vision_age_s: pd.Series
     # Measured magnetic field (body FRD). ``fused_3d`` is 1 while EKF2 fuses all components, 0 for
-    # heading only. Logs since v1.16 also fill the columns FIELD_INNOVATION: EKF2's low-pass
-    # filtered innovations (predicted minus measured)
+    # heading only. Logs since v1.16 also fill the columns MAGNETIC_FIELD_INNOVATION: EKF2's
+    # low-pass filtered innovations (predicted minus measured)
     magnetic_field_gauss: pd.DataFrame = field(default_factory=pd.DataFrame)
-    # Velocity from optical flow (body FRD): mean of the ``samples`` measurements since the previous
-    # row, at intervals of ``interval_s``. Their weights are those of EKF2's low-pass filter
-    # (FLOW_FILTER_WEIGHT), which is inverted. ``noise_m2_s2`` is the variance R of one measurement
+    # Velocity from optical flow (body FRD), computed from the logged low-pass filtered velocity.
+    # Each row is a weighted mean of the ``samples`` measurements since the previous row.
+    # ``interval_s`` is the interval of the measurements, ``noise_m2_s2`` the variance R of one
+    # measurement
     flow: pd.DataFrame = field(default_factory=pd.DataFrame)
     # Latitude of the origin
     latitude_deg: float = np.nan
@@ -611,9 +613,9 @@ class FusionRecord:
         """Return True if EKF2 stores the position as latitude and longitude (since v1.16)."""
         return not np.isfinite(self.delayed["north_m"]).any()
 
-    def was_in_state(self, state: str, times_s: Array) -> BoolArray:
-        """Return a mask of the times at which EKF2 reported a condition (key of ``states``)."""
-        step_function = self.states.get(state)
+    def was_flag_set(self, flag: str, times_s: Array) -> BoolArray:
+        """Return a mask of the times at which a status flag of EKF2 (key of ``states``) was set."""
+        step_function = self.states.get(flag)
         return (
             np.zeros(len(times_s), bool)
             if step_function is None
@@ -639,7 +641,7 @@ class AidLog:
     # Number of innovations that were dropped because no variance is near in time
     excluded_sample_count: int = 0
     # Times of innovations for which the log does not show whether EKF2 fused them
-    unknown_fusion_times_s: Array = field(default_factory=lambda: np.zeros(0))
+    times_with_unknown_fusion_s: Array = field(default_factory=lambda: np.zeros(0))
 
     __repr__ = one_line_repr
 
@@ -655,8 +657,8 @@ class ParameterChange(NamedTuple):
 
     time_s: float
     name: str
-    before: float
-    after: float
+    value_before: float
+    value_after: float
 
 
 @dataclass(frozen=True)
@@ -676,7 +678,7 @@ class Ekf2:
     fusion_flags: TableOrUnavailable
     resets: tuple[Reset, ...]
     # Start time (s) and number of each primary instance of EKF2
-    instances: tuple[tuple[float, int], ...]
+    primary_instances: tuple[tuple[float, int], ...]
     # Innovation gate (√S) of the position source, for example EKF2_EVP_GATE
     gate: float
     # Sentences on dropped samples and on the origin of the timestamps
@@ -685,8 +687,8 @@ class Ekf2:
     accelerometer_bias: TableOrUnavailable = BIAS_NOT_LOGGED
     # Prediction interval (s) of EKF2
     step_s: float = EKF2_STEP_S
-    # Delay of the fusion horizon: the state at t contains measurements up to t - horizon,
-    # propagated to t with the IMU
+    # Delay (s) of the fusion horizon. The state at time t contains measurements up to t minus this
+    # delay, and the IMU data up to t
     horizon_s: float | Unavailable = HORIZON_NOT_LOGGED
     record: FusionRecord | Unavailable = RECORD_NOT_LOGGED
     aids: Mapping[str, AidLog] = field(default_factory=dict)
@@ -765,8 +767,8 @@ class Flight:
     # Files read in addition to the log
     inputs: tuple[InputFile, ...] = ()
     # Intervals (s) in which PX4's failure detector reports roll or pitch beyond the limits
-    tumble_spans: Spans = ()
-    # Barometer height ``down_m`` with unknown zero
+    excessive_tilt_spans_s: Spans = ()
+    # Barometer height, negative: ``down_m`` is positive down. The zero level is unknown
     barometer: pd.DataFrame | None = None
 
     __repr__ = one_line_repr
@@ -811,7 +813,7 @@ def sample_rate(samples: pd.DataFrame) -> float:
     result is NaN for fewer than two samples.
     """
     if len(samples) < 2:
-        return float("nan")
+        return np.nan
     intervals_s = samples.index.to_series().diff().dropna()
     regular_intervals_s = intervals_s[intervals_s <= 3.0 * intervals_s.median()]
     if len(regular_intervals_s) < MIN_REGULAR_INTERVAL_FRACTION * len(intervals_s):

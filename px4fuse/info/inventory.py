@@ -39,7 +39,7 @@ from px4fuse.request import ComparisonRequest, replace_argument_names
 SCHEMA_NAME = "px4fuse-info"
 SCHEMA_VERSION = "1.0"
 # Fields of the class Flight that px4fuse info writes to JSON
-FLIGHT_FIELDS = ("log", "airborne", "clocks", "missing", "unused", "inputs")
+FLIGHT_FIELDS_IN_JSON = ("log", "airborne", "clocks", "missing", "unused", "inputs")
 # Label of each type of data in a log
 DATA_LABELS = {
     "imu": "IMU",
@@ -52,10 +52,10 @@ DATA_LABELS = {
     "truth": "ground truth",
     "airborne": "land detector",
 }
-# Samples that each analysis of px4fuse compare requires, as text after their number
-SAMPLE_TEXT_BY_ANALYSIS = {
+# Samples that each analysis of px4fuse compare requires. The text follows the number of samples
+REQUIRED_SAMPLES_BY_ANALYSIS = {
     "EKF2 states": "samples of EKF2's position and velocity",
-    "EKF2 variances": "samples of EKF2's variances",
+    "EKF2 variances": "samples of EKF2's position and velocity variances",
     "EKF2 consistency": "EKF2 innovations",
     "error": "samples of ground truth",
 }
@@ -77,7 +77,7 @@ class AnalysisOption:
 
 @dataclass(frozen=True)
 class LoggingAdvice:
-    """Logging advice: change for the next flight (``remedy``), and data or analyses it adds."""
+    """Change for the next flight (``remedy``), and data or analyses that it adds (``improves``)."""
 
     remedy: str
     improves: tuple[str, ...]
@@ -162,7 +162,7 @@ class Inventory:
     notes: tuple[str, ...]
 
 
-def take_inventory(flight: Flight) -> Inventory:
+def list_log_contents(flight: Flight) -> Inventory:
     """List the data in a log, the possible analyses, and changes for the next flight."""
     comparison, reason, position_remedy = None, "", ""
     try:
@@ -180,7 +180,7 @@ def take_inventory(flight: Flight) -> Inventory:
     if comparison is not None:
         flight = select_source_innovations(flight, comparison.source)
     log = flight.log
-    is_incomplete = log.ends_in_flight and not log.damage
+    is_landing_missing = log.ends_in_flight and not log.damage
     return Inventory(
         flight=flight,
         start_utc=format_utc_time(log.start_unix_s),
@@ -191,7 +191,7 @@ def take_inventory(flight: Flight) -> Inventory:
         advice=_collect_logging_advice(flight, comparison, position_remedy),
         notes=(
             *log.damage,
-            *["the log ends in flight and does not contain the landing"] * is_incomplete,
+            *["the log ends in flight and does not contain the landing"] * is_landing_missing,
             *log.notes,
             *(() if comparison is None else comparison.source.notes),
             *(flight.ekf2.notes if isinstance(flight.ekf2, Ekf2) else ()),
@@ -203,7 +203,7 @@ def to_json_dict(inventory: Inventory) -> dict[str, Any]:
     """Convert an inventory to dicts and lists for JSON; None and NaN are omitted."""
     inventory_fields = {**vars(inventory)}
     flight: Flight = inventory_fields.pop("flight")
-    flight_fields = {name: getattr(flight, name) for name in FLIGHT_FIELDS}
+    flight_fields = {name: getattr(flight, name) for name in FLIGHT_FIELDS_IN_JSON}
     if isinstance(flight.airborne, Unavailable):
         del flight_fields["airborne"]
     return {
@@ -219,7 +219,7 @@ def _collect_data_by_stream(flight: Flight) -> dict[str, pd.DataFrame | TimeSpan
     if isinstance(ekf2, Unavailable):
         data_by_stream["ekf2_state"] = ekf2
     else:
-        # the innovations along the axis with most of them, because other axes may be missing
+        # the axis with most innovations, because a log may lack the innovations of other axes
         innovations = max(
             ekf2.innovations.values(),
             key=lambda samples: len(samples) if isinstance(samples, pd.DataFrame) else -1,
@@ -251,13 +251,13 @@ def _list_logged_data(
 
 
 def _make_logged_data(
-    part: str,
+    data_label: str,
     data: pd.DataFrame | TimeSpans | Unavailable,
     stream: DataSource | PositionTrack | None,
     **data_fields: Any,
 ) -> LoggedData:
     if isinstance(data, Unavailable):
-        return LoggedData(part, unavailable=data.reason)
+        return LoggedData(data_label, unavailable=data.reason)
     if stream is not None:
         data_fields = {"name": stream.topics[0] if stream.topics else "", **data_fields}
         data_fields |= {"topics": stream.topics, "clock": stream.clock, "log": stream.log}
@@ -266,12 +266,12 @@ def _make_logged_data(
         times_s = data.index.tolist()
         if len(data) > 1:
             data_fields["rate_hz"] = sample_rate(data)
-            data_fields["gaps"] = _measure_gaps(data, is_imu=part == DATA_LABELS["imu"])
+            data_fields["gaps"] = _measure_gaps(data, is_imu=data_label == DATA_LABELS["imu"])
     else:
         times_s = [time_s for span in data for time_s in span]
     if times_s:
         data_fields |= {"start_s": times_s[0], "end_s": times_s[-1]}
-    return LoggedData(part, **data_fields)
+    return LoggedData(data_label, **data_fields)
 
 
 def _measure_gaps(samples: pd.DataFrame, *, is_imu: bool) -> GapStatistics:
@@ -340,8 +340,10 @@ def _list_ekf2_and_truth_analyses(
     flight: Flight, comparison: PreparedComparison | None
 ) -> Iterator[AnalysisOption]:
     """Yield the analyses that need EKF2 data or ground truth."""
-    data_by_analysis: dict[str, object] = dict.fromkeys(SAMPLE_TEXT_BY_ANALYSIS, flight.ekf2)
-    data_by_analysis["error"] = flight.truth
+    required_data_by_analysis: dict[str, object] = dict.fromkeys(
+        REQUIRED_SAMPLES_BY_ANALYSIS, flight.ekf2
+    )
+    required_data_by_analysis["error"] = flight.truth
     if comparison is not None:
         main_axis, segment, ekf2 = comparison.input_axes[0], comparison.segment, flight.ekf2
         ekf2_state, ekf2_variance, truth = project_tracks(
@@ -352,13 +354,19 @@ def _list_ekf2_and_truth_analyses(
             if isinstance(ekf2, Unavailable)
             else project_innovations(flight, ekf2, comparison.source, main_axis, segment)
         )
-        data_by_analysis = dict(
-            zip(data_by_analysis, (ekf2_state, ekf2_variance, innovations, truth), strict=True)
+        required_data_by_analysis = dict(
+            zip(
+                required_data_by_analysis,
+                (ekf2_state, ekf2_variance, innovations, truth),
+                strict=True,
+            )
         )
-    for name, data in data_by_analysis.items():
+    for name, data in required_data_by_analysis.items():
         has_data = not isinstance(data, Unavailable)
         count_text = (
-            f"{len(data)} {SAMPLE_TEXT_BY_ANALYSIS[name]}" if isinstance(data, pd.DataFrame) else ""
+            f"{len(data)} {REQUIRED_SAMPLES_BY_ANALYSIS[name]}"
+            if isinstance(data, pd.DataFrame)
+            else ""
         )
         yield _make_analysis_option(
             name, NO_COMPARISON if comparison is None and has_data else data, count_text
@@ -379,7 +387,7 @@ def _collect_logging_advice(
     if comparison is not None:
         findings += [
             *missing.detect_source_not_logged(comparison),
-            *ekf2_not_fusing.detect_missing_fusion(comparison),
+            *ekf2_not_fusing.detect_unfused_positions(comparison),
         ]
         findings += recording.detect_dropouts(comparison)
     findings += imu.detect_low_rates(flight)

@@ -26,7 +26,7 @@ NAMES_BY_PLACEHOLDER = {
     "{body_axis}": ("forward", "right", "down"),
     "{element}": ("w", "x", "y", "z"),
 }
-DICTIONARY_COLUMNS = ["table", "column", "unit", "frame", "meaning", "source_topic", "clock"]
+COLUMN_DESCRIPTION_FIELDS = ["table", "column", "unit", "frame", "meaning", "source_topic", "clock"]
 # Characters that are replaced in file names, because some systems do not allow them
 _UNSAFE_CHARACTERS = re.compile(r"[^A-Za-z0-9_-]+")
 # Maximum length (characters) of a table name, which is a file name
@@ -67,8 +67,8 @@ def data_dictionary(flight: Flight) -> pd.DataFrame:
     """Describe each column of all tables: unit, frame, meaning, topic and clock."""
     descriptions = [table.column_descriptions for table in _make_described_tables(flight)]
     if not descriptions:
-        return pd.DataFrame(columns=DICTIONARY_COLUMNS)
-    return pd.concat(descriptions, ignore_index=True)[DICTIONARY_COLUMNS]
+        return pd.DataFrame(columns=COLUMN_DESCRIPTION_FIELDS)
+    return pd.concat(descriptions, ignore_index=True)[COLUMN_DESCRIPTION_FIELDS]
 
 
 def to_bytes(table: pd.DataFrame, file_format: str) -> bytes:
@@ -99,7 +99,8 @@ def describe_flight(flight: Flight) -> dict[str, Any]:
         "log": flight.log,
         "streams": flight.streams,
         "positions": [
-            {"table": table, **track.description_fields()} for table, track in _name_tracks(flight)
+            {"table": table, **track.description_fields()}
+            for table, track in _list_tracks_with_table_names(flight)
         ],
         "ekf2": {"gate": ekf2.gate, "notes": ekf2.notes} if isinstance(ekf2, Ekf2) else None,
         "clocks": flight.clocks,
@@ -128,7 +129,7 @@ def _describe_table(
     name: str,
     data: pd.DataFrame,
     topics_and_clock: tuple[tuple[str, ...], str] = ((), ""),
-    name_in_csv: str = "",
+    name_in_columns_csv: str = "",
     **placeholder_values: str,
 ) -> DescribedTable:
     """Keep the columns that have a row in columns.csv, and add their descriptions.
@@ -137,15 +138,15 @@ def _describe_table(
     ----------
     topics_and_clock : tuple
         Source topics and clock of the table.
-    name_in_csv : str
+    name_in_columns_csv : str
         Name of the table in columns.csv; by default ``name``.
     placeholder_values : str
         Replacements for names in braces in columns.csv.
     """
-    tables_in_csv = ["any table"] * ("time_s" in data) + [name_in_csv or name]
+    csv_table_names = ["any table"] * ("time_s" in data) + [name_in_columns_csv or name]
     column_descriptions = (
         _read_column_descriptions()
-        .loc[tables_in_csv]
+        .loc[csv_table_names]
         .map(lambda cell: cell.format(**placeholder_values))
     )
     topics, clock_name = topics_and_clock
@@ -183,7 +184,7 @@ def _make_described_tables(flight: Flight) -> Iterator[DescribedTable]:
             _with_time_column(acceleration),
             ((*imu_topics, *attitude_topics), imu_clock_name),
         )
-    for name, track in _name_tracks(flight):
+    for name, track in _list_tracks_with_table_names(flight):
         placeholder_values = {"frame": track.frame, "description": track.description}
         topics_and_clock = (track.topics, track.clock)
         position_table = _with_time_column(track.samples)
@@ -253,16 +254,18 @@ def _make_ekf2_tables(flight: Flight, ekf2: Ekf2) -> Iterator[DescribedTable]:
     reset_table["time_s"] = np.array([reset.time_s for reset in ekf2.resets], np.float64)
     reset_table["quantity"] = np.array([reset.quantity for reset in ekf2.resets], object)
     yield _describe_table("resets", reset_table, topics_and_clock)
-    # the table needs a finite time, but the first EKF2 instance starts at minus infinity
+    # the first instance starts at minus infinity, but the table needs a finite time
     first_time_s = min(float(ekf2.state.index[0]), 0.0)
-    instance_rows = [(max(time_s, first_time_s), instance) for time_s, instance in ekf2.instances]
+    instance_rows = [
+        (max(time_s, first_time_s), instance) for time_s, instance in ekf2.primary_instances
+    ]
     instance_table = _make_numeric_table(["time_s", "instance"], instance_rows).astype(
         {"instance": np.int64}
     )
     yield _describe_table("instances", instance_table, topics_and_clock)
 
 
-def _name_tracks(flight: Flight) -> Iterator[tuple[str, PositionTrack]]:
+def _list_tracks_with_table_names(flight: Flight) -> Iterator[tuple[str, PositionTrack]]:
     """Yield each position track with a table name, unique for file systems that ignore case."""
     used_names: set[str] = set()
     for track in flight.positions:

@@ -12,7 +12,7 @@ import pandas as pd
 from px4fuse.flight.ekf2_parameters import (
     EV_POS,
     GNSS_POS,
-    REPORTED_PARAMETERS,
+    PARAMETERS_IN_RESULTS,
     fill_with_defaults,
     replace_invalid_parameters,
 )
@@ -215,7 +215,7 @@ def _read_ekf2(
             remedies["innovations"],
         ),
         resets=(),
-        instances=NO_INSTANCE_SWITCHES,
+        primary_instances=NO_INSTANCE_SWITCHES,
         gate=fill_with_defaults(parameters)[EV_POS.gate],
         notes=tuple(notes),
         record=replay_unavailable,
@@ -263,7 +263,7 @@ def _read_parameters(recording: Recording, autopilot: str) -> dict[str, float]:
     value_by_name: dict[str, float] = {}
     for raw_name, value in zip(table["param_id"].tolist(), values.tolist(), strict=True):
         name = raw_name.decode(errors="replace")
-        if name in REPORTED_PARAMETERS:
+        if name in PARAMETERS_IN_RESULTS:
             value_by_name.setdefault(name, float(value))
     return value_by_name
 

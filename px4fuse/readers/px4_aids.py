@@ -130,15 +130,15 @@ def _read_common_topics(
                 )
             ]
         )
-    if aid.old_fields:
-        field_by_column = _assign_fields_by_axis("innovation", aid, aid.old_fields)
-        variance_fields = aid.old_fields.replace("innov", "innov_var")
+    if aid.ekf2_innovations_fields:
+        field_by_column = _assign_fields_by_axis("innovation", aid, aid.ekf2_innovations_fields)
+        variance_fields = aid.ekf2_innovations_fields.replace("innov", "innov_var")
         field_by_column |= _assign_fields_by_axis("variance", aid, variance_fields)
         layouts.append([Layout(px4.OLD_INNOVATION_TOPIC, field_by_column)] * 2)
     for value_layout, variance_layout in layouts:
         innovations = topics.primary_samples(value_layout)
         samples = topics.primary_samples(value_layout, select_rows=_drop_repeats_and_zeros)
-        unknown_fusion_times_s = _find_times_with_unknown_fusion(
+        times_with_unknown_fusion_s = _find_times_with_unknown_fusion(
             innovations[f"innovation_{aid.axes[0]}"],
             topics.primary_samples(variance_layout)[f"variance_{aid.axes[0]}"],
         )
@@ -155,7 +155,7 @@ def _read_common_topics(
             topics, used_topics, aid, samples, enabled_flag, excluded_sample_count
         )
         if aid_log is not None:
-            return replace(aid_log, unknown_fusion_times_s=unknown_fusion_times_s)
+            return replace(aid_log, times_with_unknown_fusion_s=times_with_unknown_fusion_s)
     return None
 
 

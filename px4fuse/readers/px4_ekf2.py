@@ -15,7 +15,7 @@ from px4fuse.flight.ekf2_parameters import AIDS, EV_POS, FLOW, STATUS_FLAGS, fil
 from px4fuse.flight.model import (
     BIAS_NOT_LOGGED,
     EKF2_STEP_S,
-    FLOW_FILTER_WEIGHT,
+    FLOW_FILTER_NEW_SAMPLE_WEIGHT,
     HORIZON_NOT_LOGGED,
     RECORD_NOT_LOGGED,
     Columns,
@@ -141,7 +141,7 @@ def read_ekf2(topics: Topics) -> Ekf2 | Unavailable:
         innovation_topics=innovation_topics,
         fusion_flags=fusion_flags,
         resets=read_resets(local_position),
-        instances=topics.primary_instances,
+        primary_instances=topics.primary_instances,
         gate=vision_gate,
         notes=tuple(notes),
         accelerometer_bias=_read_accelerometer_bias(topics, horizon_state),
@@ -201,7 +201,7 @@ def _read_horizon_state(topics: Topics, step_s: float) -> TableOrUnavailable:
             [_convert_attitude_variance(state[:, :4], variance[:, :4]), variance[:, 4:]]
         )
         variance[:, 9:15] /= step_s**2
-    columns = Columns.DELAYED_STATE + Columns.DELAYED_VARIANCE
+    columns = Columns.FUSION_HORIZON_STATE + Columns.FUSION_HORIZON_VARIANCE
     return pd.DataFrame(np.hstack([state, variance]), index=samples.index, columns=columns)
 
 
@@ -428,7 +428,7 @@ def _read_magnetic_field(topics: Topics, step_s: float) -> pd.DataFrame:
         if len(field) > MIN_MAGNETOMETER_HZ * topics.log.duration_s
     ]
     tables_with_innovation = [
-        field for field in magnetic_field_tables if Columns.FIELD_INNOVATION[0] in field
+        field for field in magnetic_field_tables if Columns.MAGNETIC_FIELD_INNOVATION[0] in field
     ]
     field = max(complete_field_tables or tables_with_innovation or magnetic_field_tables, key=len)
     control_bits = topics.read(px4.TOPIC_LAYOUTS["control_bits"], is_step_function=True)[
@@ -458,7 +458,7 @@ def _read_optical_flow(topics: Topics, enabled_aids: StepFunctions) -> pd.DataFr
             sample_step_function(enabled_aids[FLOW.name], times_s[used_rows]) > 0.0
         ]
     sample_count = np.rint((times_s[used_rows] - times_s[used_rows - 1]) / interval_s)
-    previous_output_weight = ((1.0 - FLOW_FILTER_WEIGHT) ** sample_count)[:, None]
+    previous_output_weight = ((1.0 - FLOW_FILTER_NEW_SAMPLE_WEIGHT) ** sample_count)[:, None]
     filtered_velocity = flow_velocity[["forward_m_s", "right_m_s"]].to_numpy()
     forward_velocity_m_s, right_velocity_m_s = (
         (filtered_velocity[used_rows] - previous_output_weight * filtered_velocity[used_rows - 1])

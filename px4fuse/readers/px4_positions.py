@@ -162,9 +162,9 @@ def make_track(
         name=name,
         samples=samples.assign(**variance.where(variance > 0)),
         origin=origin,
-        invalid=invalid_rows,
+        invalid_reasons=invalid_rows,
         status=status_samples,
-        step_m=rounding_step_m,
+        rounding_step_m=rounding_step_m,
         **track_fields,
     )
 
@@ -517,7 +517,7 @@ def _read_gnss_track(topics: Topics, ekf2: Ekf2 | Unavailable) -> PositionTrack 
         samples_without_fix["published_us"].to_numpy() - topics.time_origin_us
     ) * 1e-6 - delay_ms * 1e-3
     return replace(
-        track, invalid=pd.Series("no fix", time_index(times_without_fix_s), dtype=object)
+        track, invalid_reasons=pd.Series("no fix", time_index(times_without_fix_s), dtype=object)
     )
 
 

@@ -81,7 +81,7 @@ def read_ulog(name: str, content: bytes) -> Flight:
         ekf2=ekf2,
         truth=truth,
         airborne=airborne_spans_s,
-        tumble_spans=common.find_flight_spans(
+        excessive_tilt_spans_s=common.find_flight_spans(
             tilt_failure_flags.max(axis=1) == 0.0, topics.log.duration_s
         ),
         barometer=barometer(altitude_m, barometer_delay_s),

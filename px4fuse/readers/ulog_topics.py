@@ -27,7 +27,7 @@ from px4fuse.core.text import join_first
 from px4fuse.errors import LogError
 from px4fuse.flight.ekf2_parameters import (
     PARAMETERS,
-    REPORTED_PARAMETERS,
+    PARAMETERS_IN_RESULTS,
     replace_invalid_parameters,
 )
 from px4fuse.flight.model import (
@@ -167,7 +167,7 @@ class Topics:
     time_origin_us: int
     # Number of samples with an invalid timestamp, by topic and instance
     dropped: dict[tuple[str, int], int]
-    # All EKF2_ parameters at take-off; ``log.parameters`` has only REPORTED_PARAMETERS
+    # All EKF2_ parameters at take-off; ``log.parameters`` has only PARAMETERS_IN_RESULTS
     ekf2_parameters: Mapping[str, float]
     # True if the file ends within a message
     is_truncated: bool
@@ -427,7 +427,9 @@ def read_topics(name: str, content: bytes) -> Topics:
             for dropout in ulog.dropouts
         ),
         parameters={
-            name: parameter_values[name] for name in REPORTED_PARAMETERS if name in parameter_values
+            name: parameter_values[name]
+            for name in PARAMETERS_IN_RESULTS
+            if name in parameter_values
         },
         parameter_defaults={
             name: value

@@ -13,7 +13,7 @@ from px4fuse.comparison.remedy import (
 from px4fuse.convention.correction import find_convention_faults
 from px4fuse.filter.time_offset import ClockOffset
 from px4fuse.findings import Finding
-from px4fuse.findings.source_clock import compute_clock_offset_option_s
+from px4fuse.findings.source_clock import compute_offset_for_option_s
 from px4fuse.flight.model import Unavailable
 from px4fuse.report.page import Page, draw_legend_above
 from px4fuse.report.style import KF_BAND_COLOUR, TRACK_STYLES, Axes
@@ -72,7 +72,7 @@ def make_time_offset_advice(
         advice_by_label["Result"] = (
             f"The position timestamps are {abs(offset_s):.3f} s {late_or_early}."
         )
-        suggested_offset_s = compute_clock_offset_option_s(comparison, time_offset)
+        suggested_offset_s = compute_offset_for_option_s(comparison, time_offset)
         advice_by_label["Re-run"] = f"px4fuse compare LOG --clock-offset {suggested_offset_s:.3f}"
     if (logged_delay_ms := find_logged_delay_ms(comparison)) is not None:
         advice_by_label["PX4"] = _format_delay_advice(comparison, time_offset, logged_delay_ms)

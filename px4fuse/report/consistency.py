@@ -26,7 +26,7 @@ from px4fuse.filter.consistency import (
     compute_nis_band,
 )
 from px4fuse.filter.tuning import AxisTuning
-from px4fuse.findings.cause_text import format_change, format_explained_fraction
+from px4fuse.findings.cause_text import describe_explained_part, format_change
 from px4fuse.flight.model import Unavailable
 from px4fuse.report import event_marks
 from px4fuse.report.page import Page, draw_legend_above, make_two_columns
@@ -141,7 +141,7 @@ def _write_causes(page: Page, analysis: Analysis) -> None:
         ]
         cells = [FILTER_NAMES[trial.filter], format_change(analysis, trial), label]
         cells += [format_number(value**exponent, 2) for value in statistic_values]
-        rows.append([*cells, format_explained_fraction(trial, statistic)])
+        rows.append([*cells, describe_explained_part(trial, statistic)])
     if not rows:
         return
     page.write_heading(f"Tested causes of inconsistent filters along {axis.label}")

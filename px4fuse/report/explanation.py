@@ -2,7 +2,7 @@
 
 from px4fuse.core.text import capitalise_first
 from px4fuse.errors import SettingsError, suggest_name
-from px4fuse.findings.cause_grouping import EFFECTS_BY_CAUSE, effect_ids
+from px4fuse.findings.cause_grouping import EFFECTS_BY_CAUSE, find_effect_ids
 from px4fuse.findings.model import FINDING_CATALOGUE, FINDING_GROUPS, load_examples
 from px4fuse.report.page import Page
 
@@ -36,25 +36,27 @@ def make_finding_page(finding_id: str) -> Page:
             f"{suggest_name(name, FINDING_CATALOGUE)}For a list of findings, run px4fuse explain.",
         )
     finding, example = FINDING_CATALOGUE[name], load_examples()[name]
-    causes = [cause for cause in EFFECTS_BY_CAUSE if name in effect_ids(cause)]
+    causes = [cause for cause in EFFECTS_BY_CAUSE if name in find_effect_ids(cause)]
     page = Page()
     page.write(f"{finding.title}  [{name}]", bold=True)
     page.write_labelled("Meaning", finding.meaning)
     if example.message:
         page.write_labelled("Example", example.message)
         page.write_labelled("Action", example.remedy)
-    for label, finding_ids in {"Causes": causes, "Effects": effect_ids(name)}.items():
+    for label, finding_ids in {"Causes": causes, "Effects": find_effect_ids(name)}.items():
         if finding_ids:
             page.write_labelled(label, ", ".join(finding_ids))
     rate_sentences = [
         "The rates of false alarms and of detection have not been measured for this finding."
     ]
-    if example.clean_flights:
+    if example.fault_free_flight_count:
         detection_rate_texts = [
-            f"{name}: {100.0 * rate:.0f} %" for name, rate in example.detection.items()
+            f"{name}: {100.0 * rate:.0f} %"
+            for name, rate in example.detection_rate_by_fault.items()
         ]
         rate_sentences = [
-            f"False alarms occurred on {example.false_alarms} of {example.clean_flights} simulated "
+            f"False alarms occurred on {example.false_alarm_count} of "
+            f"{example.fault_free_flight_count} simulated "
             "flights without an injected fault.",
             "Detected fraction of the simulated flights with the injected fault: "
             f"{'; '.join(detection_rate_texts)}.",

@@ -233,7 +233,7 @@ def make_tuning_advice(
         is_logged_within_interval = logged_noise_m is not None and (
             sigma_z.low or 0.0
         ) <= logged_noise_m <= (sigma_z.high or 0.0)
-        if EV_POS.noise_mode in changes and reported_sigma_m > (sigma_z.high or np.inf):
+        if EV_POS.noise_mode_parameter in changes and reported_sigma_m > (sigma_z.high or np.inf):
             changes = select_changed_settings(changes, log.parameters)
             advice_by_label["PX4"] = (
                 f"Set {format_parameters(changes)}. EKF2 now uses the σ that the source reports: "

@@ -27,7 +27,14 @@ from px4fuse.filter.frame_rotation import HeadingError
 from px4fuse.filter.time_offset import ClockOffset
 from px4fuse.filter.tuning import AxisTuning
 from px4fuse.findings import Finding
-from px4fuse.flight.model import Alignment, ClockMap, DataRoute, InputFile, LogInfo, PositionKind
+from px4fuse.flight.model import (
+    Alignment,
+    ClockMap,
+    InputFile,
+    LogInfo,
+    PositionKind,
+    PositionRoute,
+)
 from px4fuse.loop.model import Loop
 from px4fuse.request import AxisName, ComparisonRequest, KfInputName, LoopRequest, WhatIfRequest
 from px4fuse.results.model import SCHEMA_VERSION, Provenance, Schema, Student, Version
@@ -54,7 +61,7 @@ class Log(LogInfo, kw_only=True):
 class AvailableTrack(Record):
     name: str
     kind: PositionKind
-    path: DataRoute
+    path: PositionRoute
     samples: Count
     rate_hz: Positive | None = None
 
@@ -82,7 +89,7 @@ class PositionSource(Record, kw_only=True):
 
     name: str
     kind: PositionKind
-    path: DataRoute
+    path: PositionRoute
     ekf2_parameters: Mapping[str, float]
     description: str
     reason: str

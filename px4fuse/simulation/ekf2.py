@@ -104,7 +104,7 @@ def make_parameters(scenario: Scenario, faults: FaultSizes) -> dict[str, int | f
     is_gnss = aid == GNSS_POS
     defaults = fill_with_defaults({}, *_select_fused_aids(scenario))
     delay_ms = defaults[aid.delay] if faults.ekf2_delay_s is None else 1e3 * faults.ekf2_delay_s
-    aid_parameters: dict[str, float] = {aid.noise_mode: 1}
+    aid_parameters: dict[str, float] = {aid.noise_mode_parameter: 1}
     if is_gnss:
         # with EKF2_MAG_TYPE 1 EKF2 fuses the magnetic heading only, with 0 all axes
         mag_type = int(bool(faults.heading_deg))

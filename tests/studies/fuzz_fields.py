@@ -277,7 +277,7 @@ def two_changes(log: Log, rng: random.Random) -> str:
 
 KINDS: dict[str, Edit] = {
     "topic removed": without_topic,
-    "instances": permuted,
+    "primary_instances": permuted,
     "value of a field": changed_field,
     "times": changed_times,
     "parameters": changed_parameters,
