@@ -10,7 +10,13 @@ import pandas as pd
 
 from px4fuse.batch.rows import DONE, FAILED, FINDING_SEPARATOR, NOT_COMPARED, RESULT_PATH_BY_COLUMN
 from px4fuse.card.model import RATIO_AXIS_ENDS
-from px4fuse.core.text import format_count, format_metres, format_number, format_ratio, join_first
+from px4fuse.core.text import (
+    format_count,
+    format_metres,
+    format_number,
+    format_ratio,
+    join_first_names,
+)
 from px4fuse.filter.consistency import CONSISTENT_SIGMA_RATIOS
 from px4fuse.findings import finding_title
 from px4fuse.html import frame
@@ -89,7 +95,7 @@ def format_html(table: pd.DataFrame, title: str, version_text: str) -> str:
     return frame.page(
         title=title,
         subtitle=f"{format_count(len(logs), 'log')}. Compared by {version_text}.",
-        html_above=load_template("batch/axis.html").render(limits=format_consistent_ratios()),
+        html_above_table=load_template("batch/axis.html").render(limits=format_consistent_ratios()),
         row_nouns=("log", "logs"),
         columns=(
             Column("Sign", "rank"),
@@ -115,9 +121,9 @@ def format_html(table: pd.DataFrame, title: str, version_text: str) -> str:
         rows=rows,
         filters=_make_drop_down_lists(logs),
         column_groups=[(EXTRA_COLUMN_GROUP, "more columns")],
-        placeholder="search by name, vehicle, firmware or finding",
+        search_placeholder="search by name, vehicle, firmware or finding",
         full_table_note="The table fleet.csv contains all rows.",
-        ratio_axis={
+        sigma_ratio_axis={
             "bands": CONSISTENT_SIGMA_RATIOS,
             "ends": RATIO_AXIS_ENDS,
             "marks": MARKER_SVG_PATHS,
@@ -146,7 +152,7 @@ def _make_log_cells(log: LogSummary) -> tuple[Cell, ...]:
         Cell()
         if log["status"] == FAILED
         else frame.make_number_cell(
-            float(len(finding_titles)), second_line=join_first(finding_titles, 2)
+            float(len(finding_titles)), second_line=join_first_names(finding_titles, 2)
         ),
     )
 

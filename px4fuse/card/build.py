@@ -46,7 +46,7 @@ from px4fuse.core.text import (
     capitalise_first,
     format_metres,
     format_ratio,
-    lower_first,
+    lowercase_first_letter,
     with_log_name,
 )
 from px4fuse.ekf2.fusion_conditions import is_height_only
@@ -221,7 +221,7 @@ def _make_headline(causes: Sequence[Cause], sigma_verdicts: Sequence[Verdict]) -
     if causes:
         main_cause, *further_causes = causes
         for further_cause in further_causes:
-            joined_titles = f"{main_cause.title}; {lower_first(further_cause.title)}"
+            joined_titles = f"{main_cause.title}; {lowercase_first_letter(further_cause.title)}"
             if further_cause.severity == "error" and len(joined_titles) <= MAX_HEADLINE_LENGTH:
                 return joined_titles
         return main_cause.title
@@ -245,7 +245,7 @@ def _make_headline(causes: Sequence[Cause], sigma_verdicts: Sequence[Verdict]) -
 
 
 def _summarise_errors(analysis: Analysis) -> Effect:
-    comparison, segment, reset_count = analysis.main, analysis.segment.flight, None
+    comparison, segment, reset_count = analysis.main, analysis.segment.whole_flight, None
     difference = comparison.difference
     if isinstance(analysis.flight.ekf2, Ekf2):
         reset_times_s = find_horizontal_reset_times_s(analysis.flight.ekf2)
@@ -289,7 +289,7 @@ def _compute_horizontal_rmse_m(analysis: Analysis) -> dict[FilterName, float]:
 
 
 def _describe_effect(analysis: Analysis, effect: Effect, sigma_verdicts: Sequence[Verdict]) -> str:
-    sentences, segment, flight = [], analysis.segment, analysis.segment.flight
+    sentences, segment, flight = [], analysis.segment, analysis.segment.whole_flight
     if analysis.flight.airborne == () and has_little_motion(analysis):
         return "The vehicle stayed on the ground, so the errors of KF and EKF2 are not evaluated."
     if is_height_only(analysis.source):
@@ -397,7 +397,7 @@ def _format_action(action: Action) -> str:
     if action.where == "shell":
         options_text = action.commands[0].partition(" --")[2]
         return f"KF: {action.sentence or 'run again with'} --{options_text}"
-    text = lower_first(action.sentence.rstrip("."))
+    text = lowercase_first_letter(action.sentence.rstrip("."))
     return f"{capitalise_first(action.target)}: {text}"
 
 

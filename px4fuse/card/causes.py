@@ -24,7 +24,7 @@ from px4fuse.comparison.trials import (
     has_effect,
     remains_overconfident,
 )
-from px4fuse.core.text import lower_first, with_log_name
+from px4fuse.core.text import lowercase_first_letter, with_log_name
 from px4fuse.filter.consistency import classify_sigma_ratio
 from px4fuse.filter.tuning import HORIZONTAL, AxisTuning
 from px4fuse.finding import Finding
@@ -215,7 +215,7 @@ def _make_actions(
         shift_s = offset_trial.change[CLOCK_OFFSET_KEY]
         if offset_trial.filter == "kf":
             shift_s -= analysis.settings.clock_offset_s
-        shift_instruction = lower_first(format_shift(shift_s))
+        shift_instruction = lowercase_first_letter(format_shift(shift_s))
         sender_actions = [Action("sender", f"{shift_instruction} the timestamp of each position")]
     alternative_groups: tuple[tuple[Action, ...], ...] = ()
     actions = delay_actions or sender_actions

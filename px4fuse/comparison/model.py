@@ -13,7 +13,7 @@ from px4fuse.core.record import (
     NotNegative,
     NotWritten,
     OrUnavailable,
-    Positive,
+    PositiveFloat,
     Record,
     RecordOrUnavailable,
     Share,
@@ -65,20 +65,20 @@ class FilterSummary(Consistency, kw_only=True):
     truth : ErrorsAgainstTruth or Unavailable
     """
 
-    sigma_p_median_m: Positive | None = None
-    sigma_v_median_m_s: Positive | None = None
-    sigma_p_before_update_m: Positive | None = None
-    sigma_p_after_update_m: Positive | None = None
+    sigma_p_median_m: PositiveFloat | None = None
+    sigma_v_median_m_s: PositiveFloat | None = None
+    sigma_p_before_update_m: PositiveFloat | None = None
+    sigma_p_after_update_m: PositiveFloat | None = None
     truth: OrUnavailable[ErrorsAgainstTruth]
 
 
 class UntestedFilter(Unavailable, kw_only=True):
     """Filter that could not be tested for consistency: the reason, its reported σ and errors."""
 
-    sigma_p_median_m: Positive | None = None
-    sigma_v_median_m_s: Positive | None = None
-    sigma_p_before_update_m: Positive | None = None
-    sigma_p_after_update_m: Positive | None = None
+    sigma_p_median_m: PositiveFloat | None = None
+    sigma_v_median_m_s: PositiveFloat | None = None
+    sigma_p_before_update_m: PositiveFloat | None = None
+    sigma_p_after_update_m: PositiveFloat | None = None
     truth: OrUnavailable[ErrorsAgainstTruth]
 
 
@@ -103,7 +103,7 @@ class Updates(Record, kw_only=True):
     count: Count
     first_s: float
     last_s: float
-    rate_hz: Positive | None = None
+    rate_hz: PositiveFloat | None = None
     input_gap_s: NotNegative
 
 

@@ -21,7 +21,7 @@ MAX_START_RESET_DELAY_S = 1.0
 
 
 def detect(analysis: Analysis) -> Findings:
-    ekf2, segment = analysis.flight.ekf2, analysis.segment.flight
+    ekf2, segment = analysis.flight.ekf2, analysis.segment.whole_flight
     if not isinstance(ekf2, Ekf2):
         return
     # Earlier resets are normal. NaN if EKF2 fuses no position: the comparison below is then False

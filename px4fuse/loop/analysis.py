@@ -185,7 +185,7 @@ def _find_true_end(
         return end_from_truth
     if is_assessed:
         return DIAGNOSIS_WITHHELD
-    flight = segment.flight
+    flight = segment.whole_flight
     if (
         max(segment.start_s - flight.start_s, flight.end_s - segment.end_s)
         > loop_segment.REST_DURATION_S

@@ -49,7 +49,7 @@ def format_class_page(grades: Sequence[Grade], title: str, version_text: str) ->
     return frame.page(
         title=title,
         subtitle=f"{format_count(len(grades), 'student')}, graded with {version_text}",
-        html_above=_format_statistics(grades, count_by_tag),
+        html_above_table=_format_statistics(grades, count_by_tag),
         row_nouns=("student", "students"),
         columns=(
             Column("Student"),
@@ -64,7 +64,7 @@ def format_class_page(grades: Sequence[Grade], title: str, version_text: str) ->
         rows=[_make_grade_row(grade, item_titles, number_titles) for grade in grades],
         filters=[("Status", [("", f"Everyone ({len(grades)})"), *options])],
         column_groups=(("items", "Points of each rubric item"), ("numbers", "Numbers")),
-        placeholder="search for name, id, file or flag",
+        search_placeholder="search for name, id, file or flag",
         full_table_note="The table class.csv contains all rows.",
     )
 
