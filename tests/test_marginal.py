@@ -164,7 +164,7 @@ def arguments(
     """Return the arguments of :func:`fit_positions`."""
     if noises.correlated_sigma_m:
         positions = replace(positions, correlated_noise=(noises.correlated_sigma_m, noises.tau_s))
-    scaled, variance = positions.normalise_by_sigma_z(
+    scaled, variance = positions.divide_sigmas_by_sigma_z(
         1.0, noises.random_walk_m, weight / noises.sigma_z_m**2
     )
     return scaled, noises.sigma_a_m_s2, variance

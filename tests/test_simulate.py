@@ -368,7 +368,7 @@ def test_simulated_ulog_contains_no_names_of_faults():
     content = to_ulog(simulate(AISLE, parse_faults(texts)))
     for name in (
         *FAULT_TYPES,
-        *(field for mistake in FAULT_TYPES.values() for field in mistake.fields),
+        *(field for mistake in FAULT_TYPES.values() for field in mistake.field_names),
     ):
         # these names occur in the log for other reasons
         if name not in ("yaw", "scale", "jump", "heading", "mag"):

@@ -20,7 +20,7 @@ from px4fuse.core.text import (
 from px4fuse.filter.consistency import CONSISTENT_SIGMA_RATIOS
 from px4fuse.findings import finding_title
 from px4fuse.html import frame
-from px4fuse.html.frame import Cell, Column, Row, RowSection
+from px4fuse.html.frame import Cell, Column, Row, RowDetailsSection
 from px4fuse.html.safe import clean_text, load_template, make_relative_url
 from px4fuse.report.card_html import MARKER_SVG_PATHS
 from px4fuse.report.card_text import SEVERITY_SIGNS, SYMBOL_BY_REFERENCE, format_consistent_ratios
@@ -182,7 +182,7 @@ def sort_logs(logs: Iterable[LogSummary]) -> list[LogSummary]:
     return sorted(logs, key=compute_sort_key)
 
 
-def _make_log_details(log: LogSummary) -> tuple[RowSection, ...]:
+def _make_log_details(log: LogSummary) -> tuple[RowDetailsSection, ...]:
     value_rows = [
         [name, *(_format_value(axis.get(name, "")) for axis in log["axes"])]
         for name in AXIS_COLUMNS
@@ -206,7 +206,7 @@ def _make_log_details(log: LogSummary) -> tuple[RowSection, ...]:
     )
 
 
-def _make_side_sections(log: LogSummary) -> tuple[RowSection, ...]:
+def _make_side_sections(log: LogSummary) -> tuple[RowDetailsSection, ...]:
     return (
         frame.make_links_section(
             "Files", [(label, make_relative_url(log.get(name, ""))) for label, name in FILE_LINKS]

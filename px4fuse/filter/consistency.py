@@ -64,7 +64,7 @@ class NisVerdict(Record, kw_only=True):
 
     @property
     def sigma_error_factor(self) -> float:
-        """Factor between reported and actual σ, at least 1: the larger over the smaller."""
+        """Ratio of the larger to the smaller of reported and actual σ; at least 1."""
         return float(max(self.nis_mean, 1.0 / self.nis_mean) ** 0.5)
 
 

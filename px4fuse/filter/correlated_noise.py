@@ -210,7 +210,7 @@ def fit_time_correlation(  # noqa: PLR0915 (two models with common data)
         )
         if isinstance(motion_of_unfiltered_positions, Unavailable):
             return motion_of_unfiltered_positions, 0.0
-        # The first position of each IMU segment only initialises the state: p does not contain it
+        # The likelihood does not contain the first position of a segment, which sets the state
         is_used = np.isin(
             time_s,
             np.delete(
@@ -278,10 +278,9 @@ def fit_time_correlation(  # noqa: PLR0915 (two models with common data)
         )
         return noise_fit.compute_score() + minus_log_jacobian, noise_fit.noise_parameters
 
-    low_log_tau, high_log_tau = np.log(LOW_PASS_TAU_RANGE_S)
     log_tau = minimize_scalar(
         lambda log_tau: fit_low_pass(log_tau)[0],
-        bounds=(low_log_tau, high_log_tau),
+        bounds=np.log(LOW_PASS_TAU_RANGE_S),
         options={"xatol": LOG_TAU_TOLERANCE},
     ).x
     low_pass_score, low_pass_parameters = fit_low_pass(log_tau)
@@ -402,14 +401,10 @@ def fit_time_correlation_to_truth(
     tau_s = np.append(TESTED_TAUS_S, np.inf)[
         [tau_index, max(first_tau_index - 1, 0), last_tau_index + 1]
     ]
+    fraction = TESTED_CORRELATED_FRACTIONS[correlated_fraction_index]
     sigmas_m = np.sqrt(
         normalised_mean_squares[tau_index, correlated_fraction_index]
-        * np.array(
-            [
-                TESTED_CORRELATED_FRACTIONS[correlated_fraction_index],
-                1.0 - TESTED_CORRELATED_FRACTIONS[correlated_fraction_index],
-            ]
-        )
+        * np.array([fraction, 1.0 - fraction])
     )
     return TimeCorrelatedNoise(
         *np.r_[tau_s, sigmas_m, likelihood_gains_nats.max(), low_pass_likelihood_gain_nats].tolist()

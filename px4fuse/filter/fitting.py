@@ -229,7 +229,9 @@ def fit_with_sigma_ratios(
     ``random_walk_to_sigma_z_ratio`` (1/√s) is the random walk of the source, divided by SIGMA_Z.
     """
     batches_over_sigma_z = (
-        positions.normalise_by_sigma_z(sigma_z_m, random_walk_to_sigma_z_ratio, measurement_weights)
+        positions.divide_sigmas_by_sigma_z(
+            sigma_z_m, random_walk_to_sigma_z_ratio, measurement_weights
+        )
         for positions in position_batches
     )
     fits_by_batch = [
@@ -400,10 +402,8 @@ def maximise_likelihood(
             fits_outliers,
         )
         start_parameters = first_fit.noise_parameters
-        outlier_fraction, outlier_sigma_ratio = (
-            first_fit.outlier_fraction,
-            first_fit.outlier_sigma_ratio,
-        )
+        outlier_fraction = first_fit.outlier_fraction
+        outlier_sigma_ratio = first_fit.outlier_sigma_ratio
     noise_parameters = start_parameters
     for iteration in range(MAX_OUTLIER_ITERATIONS if fits_outliers else 0):
         likelihood = NegativeLogLikelihood(
@@ -526,7 +526,7 @@ def _estimate_squared_errors(
         constant_errors = fit_constant_errors(
             [positions], noise_parameters, measurement_weights
         ).estimate_segment_constants()[:, 0]
-        positions_with_random_walk, measurement_variance_m2 = positions.normalise_by_sigma_z(
+        positions_with_random_walk, measurement_variance_m2 = positions.divide_sigmas_by_sigma_z(
             1.0, noise_parameters.random_walk_m, measurement_weights / noise_parameters.sigma_z_m**2
         )
         squared_errors_and_axis_counts.append(

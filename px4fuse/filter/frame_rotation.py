@@ -348,15 +348,17 @@ def _estimate_heading_error_from_positions(
         heading_drift_variance_rad2 + heading_variance_rad2
     )
     misalignment_rad = float(np.angle(np.exp(1j * misalignment_rad)))
-    heading_part_fields = [
-        spans_s[is_part_long_enough],
-        np.degrees(misalignment_rad + weight_of_part_estimate * deviation_rad),
-        np.degrees(np.sqrt(1.0 / weight_sum + weight_of_part_estimate * heading_variance_rad2)),
-    ]
+    heading_part_fields = np.column_stack(
+        [
+            spans_s[is_part_long_enough],
+            np.degrees(misalignment_rad + weight_of_part_estimate * deviation_rad),
+            np.degrees(np.sqrt(1.0 / weight_sum + weight_of_part_estimate * heading_variance_rad2)),
+        ]
+    )
     chi_square = float(np.sum(deviation_rad**2 / heading_variance_rad2))
     is_drift_tested = len(heading_variance_rad2) > 1 and not has_constant_heading
     return combine_heading_parts(
-        tuple(HeadingPart(*row) for row in np.column_stack(heading_part_fields).tolist()),
+        tuple(HeadingPart(*row) for row in heading_part_fields.tolist()),
         float(chdtrc(len(heading_variance_rad2) - 1, chi_square)) if is_drift_tested else 1.0,
         "positions",
     )

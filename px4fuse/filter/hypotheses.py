@@ -339,10 +339,9 @@ def _find_significant_jump_times(
     min_chi_square = chdtri(
         design_matrix.axis_count, MAX_JUMP_FALSE_ALARM_P / len(design_matrix.time_s)
     )
-    descending_order = np.argsort(-chi_square)
     return [
         float(candidate_times_s[index])
-        for index in descending_order
+        for index in np.argsort(-chi_square)
         if chi_square[index] >= min_chi_square
     ]
 
@@ -425,8 +424,11 @@ def _locate_jump(
     is_skipped = outlier_mask_by_jump_time[best_jump_time_s]
     design_matrix_with_jump, jump_column_indices = design_matrix.add_jump(best_jump_time_s)
     regression = design_matrix_with_jump.fit(sigma_a, is_skipped)
-    step_m = tuple(regression.estimate(int(column)) for column in jump_column_indices)
-    return replace(jump, time_s=best_jump_time_s, step_m=step_m), is_skipped
+    return replace(
+        jump,
+        time_s=best_jump_time_s,
+        step_m=tuple(regression.estimate(int(column)) for column in jump_column_indices),
+    ), is_skipped
 
 
 def _test_jump(
@@ -445,11 +447,12 @@ def _test_jump(
     ):
         return None
     regression = design_matrix.fit(sigma_a, is_skipped)
-    normalised_jump_size = regression.coefficients[jump_column_indices]
     normalised_jump_size_covariance = regression.covariance[
         np.ix_(jump_column_indices, jump_column_indices)
     ]
-    normalised_jump_size = normalised_jump_size / regression.compute_residual_rms_by_axis()
+    normalised_jump_size = (
+        regression.coefficients[jump_column_indices] / regression.compute_residual_rms_by_axis()
+    )
     chi_square = float(
         normalised_jump_size
         @ np.linalg.solve(normalised_jump_size_covariance, normalised_jump_size)
@@ -648,11 +651,8 @@ class DesignMatrix:
         (axes, measurements, columns), contains the normalised innovations
         due to each error of size 1. The third result is Σ ln S.
         """
-        preintegrated_inputs, axis_count, jump_count = (
-            self.preintegrated_inputs,
-            self.axis_count,
-            self.jump_columns.shape[1],
-        )
+        preintegrated_inputs, axis_count = self.preintegrated_inputs, self.axis_count
+        jump_count = self.jump_columns.shape[1]
         column_count = len(self.prior_sigma)
         normalised_innovations = np.empty((axis_count, len(is_skipped)))
         columns = np.zeros((axis_count, len(is_skipped), column_count + axis_count * jump_count))
@@ -798,8 +798,9 @@ def _integrate_unit_errors(attitude: pd.DataFrame, acceleration: Acceleration) -
 
     Each of the three errors is a pair: times (s), and velocity errors (m/s) at these times.
     """
-    quaternions = attitude[Columns.QUATERNION].to_numpy(copy=True)
-    body_to_ned = Rotation.from_quat(quaternions, scalar_first=True)
+    body_to_ned = Rotation.from_quat(
+        attitude[Columns.QUATERNION].to_numpy(copy=True), scalar_first=True
+    )
     attitude_time_s = attitude.index.to_numpy()
     velocity_errors_by_unit_bias = [
         (
@@ -828,9 +829,11 @@ def _make_interpolation_weights(start_s: float, end_s: float) -> ArrayPair:
         + 1
     )
     interpolation_time_s = np.linspace(start_s, end_s, 20 * (knot_count - 1) + 1)
-    knot_times_s = np.linspace(start_s, end_s, knot_count)
     return interpolation_time_s, np.array(
-        [np.interp(interpolation_time_s, knot_times_s, weights) for weights in np.eye(knot_count)]
+        [
+            np.interp(interpolation_time_s, np.linspace(start_s, end_s, knot_count), weights)
+            for weights in np.eye(knot_count)
+        ]
     )
 
 

@@ -158,18 +158,15 @@ class PositionsAndImuMotion:
         if not has_enough_measurements.any():
             return self
         is_kept &= np.repeat(has_enough_measurements, np.diff(self.segment_edges))
-        kept_fields = {
-            name: getattr(self, name)[is_kept]
-            for name in ("time_s", "measurement_m", "measurement_weights")
-        }
-        segment_motions = tuple(
-            self.segment_motions[index] for index in np.flatnonzero(has_enough_measurements)
-        )
         return replace(
             self,
-            **kept_fields,
+            time_s=self.time_s[is_kept],
+            measurement_m=self.measurement_m[is_kept],
+            measurement_weights=self.measurement_weights[is_kept],
             segment_edges=np.cumsum([0, *kept_counts[has_enough_measurements]]),
-            segment_motions=segment_motions,
+            segment_motions=tuple(
+                self.segment_motions[index] for index in np.flatnonzero(has_enough_measurements)
+            ),
         )
 
     def make_positions_and_increments(self, time_offsets_s: Array) -> PositionsAndIncrements:
@@ -285,9 +282,9 @@ class PositionsAndImuMotion:
         factor_index, offset_index = np.unravel_index(
             np.argmin(minus_log_likelihood), minus_log_likelihood.shape
         )
-        sigma_a = noise_parameters.sigma_a_m_s2 * sigma_a_factors[int(factor_index)]
         return float(tested_offsets_s[offset_index]), replace(
-            noise_parameters, sigma_a_m_s2=sigma_a
+            noise_parameters,
+            sigma_a_m_s2=noise_parameters.sigma_a_m_s2 * sigma_a_factors[int(factor_index)],
         )
 
 
@@ -408,8 +405,9 @@ def make_segment_motion(
     )
     imu_samples = imu.iloc[first_row:end_row]
     imu_time_s = imu_time_s[first_row:end_row]
-    columns = [*Columns.SPECIFIC_FORCE, *Columns.ANGULAR_RATE]
-    imu_integral = integrate_cumulatively(imu_samples[columns].to_numpy(), imu_time_s)
+    imu_integral = integrate_cumulatively(
+        imu_samples[[*Columns.SPECIFIC_FORCE, *Columns.ANGULAR_RATE]].to_numpy(), imu_time_s
+    )
     step_times_s = np.arange(imu_time_s[0], imu_time_s[-1], INTEGRATION_STEP_S)
     imu_integrals_at_steps = np.column_stack(
         [np.interp(step_times_s, imu_time_s, column) for column in imu_integral.T]

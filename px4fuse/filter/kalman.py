@@ -108,8 +108,13 @@ def replay(
     steps = _make_table(states, step_times_s, model.STATE_COLUMNS + model.COVARIANCE_COLUMNS)
     steps["acceleration_m_s2"] = np.append(prediction_steps.acceleration_m_s2, 0.0)
     steps["input_variance_m2_s4"] = np.append(prediction_steps.input_variance_m2_s4, 0.0)
-    update_table = _make_table(updates, update_times_s, UPDATE_TABLE_COLUMNS)
-    return Replay(axis, settings, steps, update_table, prediction_steps.input_gap_s)
+    return Replay(
+        axis,
+        settings,
+        steps,
+        _make_table(updates, update_times_s, UPDATE_TABLE_COLUMNS),
+        prediction_steps.input_gap_s,
+    )
 
 
 def _make_table(rows: TableRows, index: "pd.Index[float]", columns: list[str]) -> pd.DataFrame:
@@ -238,8 +243,8 @@ def predict_variance(run: Replay, times_s: Array) -> Array:
         (p00, p01, p11), elapsed_s
     )
     q00, _, q11 = model.compute_process_noise_per_density(elapsed_s)
-    variances = (
-        position_variance_m2 + noise_density * q00,
-        velocity_variance_m2_s2 + noise_density * q11,
+    return np.where(
+        is_outside,
+        np.nan,
+        (position_variance_m2 + noise_density * q00, velocity_variance_m2_s2 + noise_density * q11),
     )
-    return np.where(is_outside, np.nan, variances)

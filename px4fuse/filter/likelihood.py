@@ -297,7 +297,7 @@ def find_profile_likelihood_interval(
 
         # √(decrease of the log-likelihood) is nearly linear in ln σ, so brentq needs few steps
         @cache
-        def compute_sqrt_log_likelihood_drop_minus_limit(log_sigma_change: float) -> float:
+        def compute_log_likelihood_drop_excess(log_sigma_change: float) -> float:
             nonlocal other_log_sigma
             if log_sigma_change == 0.0:
                 return -max_sqrt_log_likelihood_drop
@@ -319,12 +319,12 @@ def find_profile_likelihood_interval(
 
         max_log_sigma_change = direction * (float(np.log(search_limit)) - best_log_sigmas[0])
         tried_log_sigma_change = min(INITIAL_LOG_SIGMA_SEARCH_STEP, max_log_sigma_change)
-        while compute_sqrt_log_likelihood_drop_minus_limit(tried_log_sigma_change) < 0.0:
+        while compute_log_likelihood_drop_excess(tried_log_sigma_change) < 0.0:
             if tried_log_sigma_change == max_log_sigma_change:
                 return None
             tried_log_sigma_change = min(2.0 * tried_log_sigma_change, max_log_sigma_change)
         log_sigma_change = brentq(
-            compute_sqrt_log_likelihood_drop_minus_limit,
+            compute_log_likelihood_drop_excess,
             0.0,
             tried_log_sigma_change,
             xtol=1e-3 * tried_log_sigma_change,

@@ -122,7 +122,7 @@ class PositionsAndIncrements:
             },
         )
 
-    def normalise_by_sigma_z(
+    def divide_sigmas_by_sigma_z(
         self, sigma_z_m: float, random_walk_to_sigma_z_ratio: float, measurement_weights: Array
     ) -> tuple[PositionsAndIncrements, Array]:
         """Divide all σ by SIGMA_Z; return the result and the variance of each measurement.
@@ -233,13 +233,11 @@ class PositionFit:
 
     def scale_sigmas(self, factor: float) -> PositionFit:
         """Return the fit with the σ of all noises multiplied by ``factor``."""
-        covariance_log_determinant = (
-            self.covariance_log_determinant + 2.0 * self.degrees_of_freedom * math.log(factor)
-        )
         return replace(
             self,
             gram_matrix=self.gram_matrix / factor**2,
-            covariance_log_determinant=covariance_log_determinant,
+            covariance_log_determinant=self.covariance_log_determinant
+            + 2.0 * self.degrees_of_freedom * math.log(factor),
         )
 
     def compute_constants_information(self) -> Array:
@@ -408,10 +406,9 @@ def estimate_squared_errors(
     data_and_derivative_weights_by_interval = np.repeat(
         data_and_derivative_weights, np.diff([*positions.segment_starts, len(variance_m2)]), axis=0
     )[1:]
-    increments = positions.delta_position_m, positions.delta_velocity_m_s
     dp, dv = (
-        np.einsum("akn,nk->an", array[:, 0], data_and_derivative_weights_by_interval)
-        for array in increments
+        np.einsum("akn,nk->an", increments[:, 0], data_and_derivative_weights_by_interval)
+        for increments in (positions.delta_position_m, positions.delta_velocity_m_s)
     )
     expected_squared_error_m2 = np.zeros(len(variance_m2))
     for axes, system, _ in positions.factorise_equations(sigma_a_m_s2, variance_m2):
@@ -471,11 +468,11 @@ def compute_segment_inner_products(
         left_and_right_positions_m = np.concatenate(
             [left_positions_m[batch], right_positions_m[batch]], axis=1
         )[:, None]
-        positions_with_stacked_inputs = replace(
-            positions, delta_position_m=dp, delta_velocity_m_s=dv
-        )
         gram_matrix = fit_positions(
-            positions_with_stacked_inputs, sigma_a_m_s2, variance_m2, left_and_right_positions_m
+            replace(positions, delta_position_m=dp, delta_velocity_m_s=dv),
+            sigma_a_m_s2,
+            variance_m2,
+            left_and_right_positions_m,
         ).gram_matrix[:, 0]
         information = gram_matrix[:, constant_error_rows[:, None], constant_error_rows] + np.diag(
             positions.constant_prior_sigmas**-2.0
@@ -733,9 +730,8 @@ def factorise(
         raise np.linalg.LinAlgError(
             "the normal equations are singular (too few positions, or large rounding errors)"
         )
-    information_log_determinant = 2.0 * np.sum(np.log(cholesky_factor[0]))
     log_determinant = (
-        information_log_determinant
+        2.0 * np.sum(np.log(cholesky_factor[0]))
         + process_noise_log_determinant
         - np.sum(np.log(measurement_and_prior_precision[measurement_and_prior_precision > 0.0]))
     )

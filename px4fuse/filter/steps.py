@@ -70,7 +70,6 @@ def make_prediction_steps(
         time_s = np.append(start_s, time_s)
     measurement_index = np.full(len(time_s), -1, dtype=np.intp)
     measurement_index[np.searchsorted(time_s, measurement_time_s)] = np.flatnonzero(is_usable)
-    step_count = len(time_s) - 1
     if settings.input == "zero":
         return PredictionSteps(
             time_s, measurement_index, np.zeros(step_count), np.zeros(step_count), 0.0

@@ -281,9 +281,10 @@ def _compute_offset_likelihood_curve(
             _make_offset_grid(offset_s, half_width_s, offset_count)
             for offset_count in (FINE_GRID_OFFSET_COUNT, LIKELIHOOD_CURVE_POINT_COUNT)
         )
-        position_batches = motion.make_position_batches(computed_offsets_s)
         computed_scores = fit_constant_errors(
-            position_batches, noise_parameters, motion.measurement_weights
+            motion.make_position_batches(computed_offsets_s),
+            noise_parameters,
+            motion.measurement_weights,
         ).compute_scores()[0]
         profile_scores = CubicSpline(computed_offsets_s, computed_scores)(curve_time_offsets_s)
         interval_low_s, interval_high_s = compute_profile_likelihood_interval(
@@ -298,9 +299,10 @@ def _compute_offset_likelihood_curve(
 
 
 def _make_offset_grid(centre_s: float, half_width_s: float, offset_count: int) -> Array:
-    start_s = max(centre_s - half_width_s, -MAX_TESTED_TIME_OFFSET_S)
     return np.linspace(
-        start_s, min(centre_s + half_width_s, MAX_TESTED_TIME_OFFSET_S), offset_count
+        max(centre_s - half_width_s, -MAX_TESTED_TIME_OFFSET_S),
+        min(centre_s + half_width_s, MAX_TESTED_TIME_OFFSET_S),
+        offset_count,
     )
 
 
@@ -353,7 +355,7 @@ def _simulate_variance_increase_by_imu_noise(
             * np.sqrt(positions_at_offset.interval_s[is_within_segment])
             * draw_normal(interval_count_within_segments)
         )
-    positions_at_offset, measurement_variance_m2 = positions_at_offset.normalise_by_sigma_z(
+    positions_at_offset, measurement_variance_m2 = positions_at_offset.divide_sigmas_by_sigma_z(
         1.0,
         noise_parameters.random_walk_m,
         imu_motion.measurement_weights / noise_parameters.sigma_z_m**2,
@@ -365,10 +367,8 @@ def _simulate_variance_increase_by_imu_noise(
         (error_m, dp, dv),
         velocity_noise,
     )
-    variances = np.add.reduceat(residual_and_noise_inner_products, first_segment_of_each_group).var(
-        axis=1
-    )
-    return 1.0 + float(variances.sum()) / fisher_information
+    group_sums = np.add.reduceat(residual_and_noise_inner_products, first_segment_of_each_group)
+    return 1.0 + float(group_sums.var(axis=1).sum()) / fisher_information
 
 
 def _fit_minimum_and_sigma(grid: Array, scores: Array) -> tuple[float, float]:
@@ -405,15 +405,13 @@ def _estimate_flight_part_offsets(
     grid_offsets_s = np.linspace(
         coarse_offsets_s[0], coarse_offsets_s[-1], LIKELIHOOD_CURVE_POINT_COUNT
     )
-    segment_scores = CubicSpline(coarse_offsets_s, segment_scores_at_coarse_offsets, axis=1)(
-        grid_offsets_s
-    )
+    spline = CubicSpline(coarse_offsets_s, segment_scores_at_coarse_offsets, axis=1)
     part_offsets = []
     scores_above_minimum = []
     for begin, end, scores in zip(
         imu_motion.segment_edges,
         imu_motion.segment_edges[1:],
-        segment_scores,
+        spline(grid_offsets_s),
         strict=False,
     ):
         part_offset_s, sigma_s = _fit_minimum_and_sigma(grid_offsets_s, scores)
@@ -435,11 +433,9 @@ def _fit_clock_drift(part_offsets: tuple[PartOffset, ...]) -> tuple[float | None
     """
     if len(part_offsets) < 3:
         return None, None
-    times_offsets_and_sigmas = [
-        ((part_offset.start_s + part_offset.end_s) / 2.0, part_offset.offset_s, part_offset.sigma_s)
-        for part_offset in part_offsets
-    ]
-    time_s, offset_s, sigma_s = np.transpose(times_offsets_and_sigmas)
+    time_s, offset_s, sigma_s = np.transpose(
+        [((part.start_s + part.end_s) / 2.0, part.offset_s, part.sigma_s) for part in part_offsets]
+    )
     coefficients, covariance = np.polyfit(
         time_s - time_s.mean(), offset_s, 1, w=1.0 / sigma_s, cov="unscaled"
     )

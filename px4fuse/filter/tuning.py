@@ -341,9 +341,8 @@ def _estimate_kf_sigma_a(fit: NoiseFit, sigma_z_m: float) -> NoiseEstimate:
     def score(log_sigma_a: float, _: float = 0.0) -> float:
         return fit.score(NoiseParameters(float(np.exp(log_sigma_a)), sigma_z_m))
 
-    low_log_sigma, high_log_sigma = np.log(SIGMA_A_SEARCH_RANGE_M_S2)
     best_log_sigma_a = float(
-        minimize_scalar(score, bounds=(low_log_sigma, high_log_sigma), options={"xatol": 1e-3}).x
+        minimize_scalar(score, bounds=np.log(SIGMA_A_SEARCH_RANGE_M_S2), options={"xatol": 1e-3}).x
     )
     return _make_noise_estimate(score, (best_log_sigma_a, 0.0), SIGMA_A_SEARCH_RANGE_M_S2)
 

@@ -57,7 +57,7 @@ def make_number_cell(
 
 
 # Section of the details that open below a table row, as a list for frame.js: kind, title, contents
-RowSection = list[Any]
+RowDetailsSection = list[Any]
 
 
 @dataclass(frozen=True)
@@ -69,23 +69,25 @@ class Row:
 
     cells: tuple[Cell, ...]
     tags: tuple[str, ...] = ()
-    details: tuple[RowSection, ...] = ()
-    side_sections: tuple[RowSection, ...] = ()
+    details: tuple[RowDetailsSection, ...] = ()
+    side_sections: tuple[RowDetailsSection, ...] = ()
 
 
 # ------------------------------------------------------------------ sections of an unfolded row
 
 
-def make_list_section(title: str, texts: Sequence[str], is_warning: bool = False) -> RowSection:
+def make_list_section(
+    title: str, texts: Sequence[str], is_warning: bool = False
+) -> RowDetailsSection:
     return ["list", title, texts, is_warning]
 
 
-def make_prose_section(title: str, text: str) -> RowSection:
+def make_prose_section(title: str, text: str) -> RowDetailsSection:
     """Return a section with a text, whose line breaks are kept."""
     return ["prose", title, text]
 
 
-def make_name_value_section(title: str, rows: Sequence[tuple[str, str]]) -> RowSection:
+def make_name_value_section(title: str, rows: Sequence[tuple[str, str]]) -> RowDetailsSection:
     """Return a section with pairs (name, value); empty values are omitted."""
     return ["pairs", title, [row for row in rows if row[1]]]
 
@@ -95,11 +97,11 @@ def make_table_section(
     rows: Sequence[Sequence[str]],
     column_titles: Sequence[str],
     numeric_columns: Sequence[int] = (),
-) -> RowSection:
+) -> RowDetailsSection:
     return ["table", title, rows, column_titles, list(numeric_columns)]
 
 
-def make_links_section(title: str, rows: Sequence[tuple[str, str]]) -> RowSection:
+def make_links_section(title: str, rows: Sequence[tuple[str, str]]) -> RowDetailsSection:
     return ["links", title, [row for row in rows if row[1]]]
 
 
@@ -108,7 +110,7 @@ def make_input_boxes_section(
     student_id: str,
     rows: Sequence[tuple[str, float, float | None, str]],
     rows_without_boxes: Sequence[tuple[str, float | None, str]],
-) -> RowSection:
+) -> RowDetailsSection:
     """Return a section with input boxes, in which an instructor enters points and comments.
 
     Parameters

@@ -176,7 +176,6 @@ def simulate_ekf2(
             )
     settings = fill_with_defaults(logged_values, *fused_aids)
     rules = GNSS_RULES if aid == GNSS_POS else VISION_RULES
-    buffer_length = int(np.ceil(settings["EKF2_DELAY_MAX"] * 1e3 / PREDICTION_STEP_US))
     inputs = ReplayInputs(
         settings=settings,
         segments=(segment,),
@@ -187,7 +186,8 @@ def simulate_ekf2(
         if int(log_parameters[aid.switch]) & 1
         else replace(rules, start_interval_s=0.0),
         mean_step_s=step_s,
-        horizon_s=(buffer_length - 1) * step_s,
+        horizon_s=(int(np.ceil(settings["EKF2_DELAY_MAX"] * 1e3 / PREDICTION_STEP_US)) - 1)
+        * step_s,
         configured_step_s=PREDICTION_STEP_US * 1e-6,
         fuses_vision_height=False,
         imu_offset_m=np.zeros(3),
@@ -196,9 +196,12 @@ def simulate_ekf2(
     )
     model_run = run_configurations(inputs, [FilterConfiguration(settings)], {})[0]
     ekf2_output = _compute_output(inputs, model_run, time_us, true_quaternions)
-    aid_source_log_rate_hz = VEHICLE_AID_SOURCE_LOG_RATE_HZ if faults.no_vvo else 0.0
     return make_ekf2_topics(
-        inputs, model_run, ekf2_output, scenario.attitude_rate_hz, aid_source_log_rate_hz
+        inputs,
+        model_run,
+        ekf2_output,
+        scenario.attitude_rate_hz,
+        aid_source_log_rate_hz=VEHICLE_AID_SOURCE_LOG_RATE_HZ if faults.no_vvo else 0.0,
     )
 
 

@@ -149,11 +149,10 @@ def _make_states_topic(
         states[:, 9] -= sensors.HOME_POSITION[2]
     variances = np.zeros((len(logged_steps), 24), np.float32)
     variances[:, : model_run.variance.shape[2]] = model_run.variance[logged_indices + 1, 0]
-    fields = ekf2_output.make_timestamps(logged_steps) | {
-        "states": states,
-        "covariances": variances,
-    }
-    return make_topic("estimator_states", fields)
+    return make_topic(
+        "estimator_states",
+        ekf2_output.make_timestamps(logged_steps) | {"states": states, "covariances": variances},
+    )
 
 
 def _make_position_aid_topics(
@@ -320,14 +319,13 @@ def _make_aid_source_topic(
     ``rejected_and_fused_masks`` are masks of rejected and of fused samples.
     """
     innovation, innovation_variance, noise_variance = innovation_with_variances
-    test_ratio = innovation**2 / (max(settings[aid.gate], 1.0) ** 2 * innovation_variance)
     fields = {
         **timestamps,
         "observation": observation,
         "observation_variance": noise_variance,
         "innovation": -innovation,
         "innovation_variance": innovation_variance,
-        "test_ratio": test_ratio,
+        "test_ratio": innovation**2 / (max(settings[aid.gate], 1.0) ** 2 * innovation_variance),
         "innovation_rejected": rejected_and_fused_masks[0],
         "fused": rejected_and_fused_masks[1],
     }

@@ -35,34 +35,51 @@ class FaultSizes:
     clock_offset_s: float = make_bounded_field(0.0, -5.0, 5.0, "s", "SECONDS")
     clock_drift_ppm: float = make_bounded_field(0.0, -20_000.0, 20_000.0, "ppm", "PPM")
     clock_jump_s: float = make_bounded_field(0.0, 0.0, 5.0, "s", "SECONDS")
+    # Fraction of outliers, as without line of sight
     nlos_percent: float = make_bounded_field(0.0, 0.0, 50.0, "%", "PERCENT")
+    # Mean error of an outlier
     nlos_size_m: float = make_bounded_field(2.0, 0.0, 100.0, "m", "SIZE")
+    # Length of the gap of the position source
     dropout_s: float = make_bounded_field(0.0, 0.0, 600.0, "s", "SECONDS")
     dropout_at_s: float | None = _make_start_time_field()
+    # Length of the gap of the IMU
     imu_dropout_s: float = make_bounded_field(0.0, 0.0, 600.0, "s", "SECONDS")
     imu_dropout_at_s: float | None = _make_start_time_field()
+    # Reduced rate of the position source
     decimate_hz: float = make_bounded_field(0.0, 0.1, 100.0, "Hz", "HZ")
+    # Ratio of reported to true position variance
     r_scale: float = make_bounded_field(1.0, 1e-4, 1e4, "", "FACTOR")
+    # Rotation of the position frame about the vertical
     yaw_deg: float = make_bounded_field(0.0, -180.0, 180.0, "°", "DEG")
     scale_percent: float = make_bounded_field(0.0, -50.0, 50.0, "%", "PERCENT")
+    # Lasting jump of the positions
     jump_m: float = make_bounded_field(0.0, -100.0, 100.0, "m", "METRES")
     jump_at_s: float | None = _make_start_time_field()
+    # Time constant of the low-pass filter of the position source
     smoothed_s: float = make_bounded_field(0.0, 0.0, 10.0, "s", "SECONDS")
+    # The time-correlated position error has this σ
     slow_error_m: float = make_bounded_field(0.0, 0.0, 100.0, "m", "METRES")
+    # Correlation time of the time-correlated position error
     slow_error_s: float = make_bounded_field(30.0, 0.1, 1e4, "s", "TIME")
+    # Error of EKF2's heading
     heading_deg: float = make_bounded_field(0.0, -180.0, 180.0, "°", "DEG")
     heading_at_s: float | None = _make_start_time_field()
+    # Disturbance of the magnetic field
     mag_gauss: float = make_bounded_field(0.0, -1.0, 1.0, "gauss", "GAUSS")
     mag_at_s: float | None = _make_start_time_field()
     accel_bias_m_s2: float = make_bounded_field(0.0, -5.0, 5.0, "m/s²", "M/S2")
     vibration_m_s2: float = make_bounded_field(0.0, 0.0, 20.0, "m/s²", "M/S2")
     imu_rate_hz: float = make_bounded_field(0.0, 1.0, 1000.0, "Hz", "HZ")
+    # The vehicle only hovers
     no_motion: bool = False
+    # Distance from start to end of the path
     open_end_m: float = make_bounded_field(0.0, 0.0, 100.0, "m", "METRES")
+    # The topic vehicle_visual_odometry is not logged
     no_vvo: bool = False
     ekf2_noise_m: float = make_bounded_field(0.0, 0.01, 100.0, "m", "METRES")
     ekf2_delay_s: float | None = make_bounded_field(None, 0.0, 0.3, "s", "SECONDS")
     ekf2_gate: float = make_bounded_field(5.0, 1.0, 1000.0, "", "SD")
+    # EKF2 does not fuse the positions
     ekf2_off: bool = False
 
 

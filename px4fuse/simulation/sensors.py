@@ -163,10 +163,8 @@ def simulate_barometer(scenario: Scenario, motion: Motion) -> Topic:
 
 def simulate_height_error(scenario: Scenario, time_s: Array) -> Array:
     """Simulate the slow error (m, positive downward) of the barometer and of EKF2's height."""
-    rng, height_error_rms_m = (
-        make_random_generator(scenario, RandomStream.HEIGHT_ERROR),
-        np.array([HEIGHT_ERROR_RMS_M]),
-    )
+    rng = make_random_generator(scenario, RandomStream.HEIGHT_ERROR)
+    height_error_rms_m = np.array([HEIGHT_ERROR_RMS_M])
     return Sines.draw(rng, height_error_rms_m, SLOW_ERROR_PERIOD_RANGE_S).compute_values(time_s)[0][
         :, 0
     ]
@@ -181,13 +179,16 @@ def limit_rate(full_rate_topic: Topic, rate_hz: float, is_kept: BoolArray | bool
 
 def select_logged_imu(full_rate_topic: Topic, faults: FaultSizes, motion: Motion) -> Topic:
     """Return sensor_combined as logged, with the gap and the reduced rate of ``faults``."""
-    is_outside_gap = _is_outside_gap(
-        to_seconds(get_time_us(full_rate_topic)),
-        faults.imu_dropout_s,
-        faults.imu_dropout_at_s,
-        motion.duration_s,
+    return limit_rate(
+        full_rate_topic,
+        faults.imu_rate_hz,
+        _is_outside_gap(
+            to_seconds(get_time_us(full_rate_topic)),
+            faults.imu_dropout_s,
+            faults.imu_dropout_at_s,
+            motion.duration_s,
+        ),
     )
-    return limit_rate(full_rate_topic, faults.imu_rate_hz, is_outside_gap)
 
 
 def get_time_us(topic: Topic, field: str = "timestamp") -> IntArray:

@@ -18,7 +18,7 @@ from px4fuse.classroom.grading.model import (
 )
 from px4fuse.core.text import format_count, format_number
 from px4fuse.html import frame
-from px4fuse.html.frame import Cell, Column, Row, RowSection
+from px4fuse.html.frame import Cell, Column, Row, RowDetailsSection
 from px4fuse.html.safe import load_template, make_relative_url
 from px4fuse.results.answer_form import form_rows
 
@@ -147,7 +147,7 @@ def _make_grade_row(grade: Grade, item_titles: Sequence[str], number_titles: Seq
     )
 
 
-def _make_grade_details(grade: Grade) -> Iterator[RowSection]:
+def _make_grade_details(grade: Grade) -> Iterator[RowDetailsSection]:
     """Yield the details of a student, which the web page shows after a click on the row."""
     report, comment = grade.counted_report, frame.make_prose_section("Your comment", grade.comment)
     if report is None:
@@ -212,7 +212,7 @@ def _make_points_cell(grade: Grade) -> Cell:
     return Cell(text, grade.total, ", ".join(notes))
 
 
-def _make_points_inputs(grade: Grade) -> RowSection:
+def _make_points_inputs(grade: Grade) -> RowDetailsSection:
     """Make the input boxes for the points that the instructor can enter."""
     report = grade.counted_report
     max_points_by_title = {
