@@ -278,9 +278,10 @@ def fit_time_correlation(  # noqa: PLR0915 (two models with common data)
         )
         return noise_fit.compute_score() + minus_log_jacobian, noise_fit.noise_parameters
 
+    low_log_tau, high_log_tau = np.log(LOW_PASS_TAU_RANGE_S)
     log_tau = minimize_scalar(
         lambda log_tau: fit_low_pass(log_tau)[0],
-        bounds=np.log(LOW_PASS_TAU_RANGE_S),
+        bounds=(low_log_tau, high_log_tau),
         options={"xatol": LOG_TAU_TOLERANCE},
     ).x
     low_pass_score, low_pass_parameters = fit_low_pass(log_tau)
@@ -339,7 +340,8 @@ def fit_time_correlation_to_truth(
     measurement_time_s = measurement_time_s[
         :: max(1, -(-len(measurement_time_s) // MAX_TRUTH_MEASUREMENTS))
     ]
-    if len(measurement_time_s) < MIN_MEASUREMENTS:
+    position_count = len(measurement_time_s)
+    if position_count < MIN_MEASUREMENTS:
         return noise_from_imu
     measured_m = np.transpose(
         [axis.measurement_m[np.isin(axis.measurement_time_s, measurement_time_s)] for axis in axes]
@@ -349,10 +351,10 @@ def fit_time_correlation_to_truth(
         true_spline(measurement_time_s + clock_offset_s, order) for order in (0, 1)
     )
     is_in_flight_part = np.eye(FLIGHT_PART_COUNT)[
-        FLIGHT_PART_COUNT * np.arange(len(measurement_time_s)) // len(measurement_time_s)
+        FLIGHT_PART_COUNT * np.arange(position_count) // position_count
     ]
     time_offset_columns = np.einsum("tp,ta->tpa", is_in_flight_part, true_velocity_m_s).reshape(
-        len(measurement_time_s), -1
+        position_count, -1
     )
     jump_columns = make_unit_steps(measurement_time_s, [jump.time_s for jump in jumps])
     systematic_error_columns = np.column_stack(
@@ -392,10 +394,11 @@ def fit_time_correlation_to_truth(
     likelihood_gains_nats = half_axis_count_and_half_residual_count[1] * np.log(
         np.mean(residuals**2, axis=0)
     ).sum() - scores.min(axis=1)
-    if likelihood_gains_nats.max() < min_likelihood_gain_nats:
+    best_gain_nats = likelihood_gains_nats.max()
+    if best_gain_nats < min_likelihood_gain_nats:
         return noise_from_imu
     first_tau_index, last_tau_index = np.flatnonzero(
-        likelihood_gains_nats > likelihood_gains_nats.max() - MAX_LOG_LIKELIHOOD_DROP
+        likelihood_gains_nats > best_gain_nats - MAX_LOG_LIKELIHOOD_DROP
     )[[0, -1]]
     # Each end of the 95 % interval of τ is between two tested values: return the outer value
     tau_s = np.append(TESTED_TAUS_S, np.inf)[
@@ -407,7 +410,7 @@ def fit_time_correlation_to_truth(
         * np.array([fraction, 1.0 - fraction])
     )
     return TimeCorrelatedNoise(
-        *np.r_[tau_s, sigmas_m, likelihood_gains_nats.max(), low_pass_likelihood_gain_nats].tolist()
+        *np.r_[tau_s, sigmas_m, best_gain_nats, low_pass_likelihood_gain_nats].tolist()
     )
 
 

@@ -71,9 +71,8 @@ def make_prediction_steps(
     measurement_index = np.full(len(time_s), -1, dtype=np.intp)
     measurement_index[np.searchsorted(time_s, measurement_time_s)] = np.flatnonzero(is_usable)
     if settings.input == "zero":
-        return PredictionSteps(
-            time_s, measurement_index, np.zeros(step_count), np.zeros(step_count), 0.0
-        )
+        zeros = np.zeros(len(time_s) - 1)
+        return PredictionSteps(time_s, measurement_index, zeros, zeros, 0.0)
     if isinstance(axis.acceleration, Unavailable):
         raise SettingsError(
             f"The setting `input` is imu, but the axis {axis.name} has no IMU acceleration.",

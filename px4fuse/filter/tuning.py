@@ -219,6 +219,7 @@ def tune_axes(
 
     See :func:`tune` for the parameters.
     """
+    analysis_name = f"estimate of SIGMA_A and SIGMA_Z ({name})"
     preintegrated_motions = [preintegrate(axis, settings) for axis in axes]
     measurement_time_before_downsampling_s = axes[0].measurement_time_s[
         -len(preintegrated_motions[0].measurement_m) :
@@ -229,9 +230,7 @@ def tune_axes(
     ]
     measurement_count = len(axis_positions[0].measurement_m) - 1
     if measurement_count < MIN_MEASUREMENTS:
-        return report_too_few_measurements(
-            f"estimate of SIGMA_A and SIGMA_Z ({name})", measurement_count, MIN_MEASUREMENTS
-        )
+        return report_too_few_measurements(analysis_name, measurement_count, MIN_MEASUREMENTS)
     current_parameters = NoiseParameters(settings.sigma_a_m_s2, settings.sigma_z_m)
     kf_fit = maximise_likelihood(axis_positions, current_parameters, np.ones(measurement_count))
     # The estimate with biases, tilt and time offset needs IMU data
@@ -281,7 +280,7 @@ def tune_axes(
         )
     if np.mean(is_outlier) > MAX_OUTLIER_FRACTION:
         return Unavailable(
-            f"estimate of SIGMA_A and SIGMA_Z ({name})",
+            analysis_name,
             f"{100 * np.mean(is_outlier):.0f} % of the measurements are outliers, too many to "
             "estimate SIGMA_Z",
             "Reduce the outliers of the positioning system.",
@@ -341,8 +340,9 @@ def _estimate_kf_sigma_a(fit: NoiseFit, sigma_z_m: float) -> NoiseEstimate:
     def score(log_sigma_a: float, _: float = 0.0) -> float:
         return fit.score(NoiseParameters(float(np.exp(log_sigma_a)), sigma_z_m))
 
+    low_log_sigma, high_log_sigma = np.log(SIGMA_A_SEARCH_RANGE_M_S2)
     best_log_sigma_a = float(
-        minimize_scalar(score, bounds=np.log(SIGMA_A_SEARCH_RANGE_M_S2), options={"xatol": 1e-3}).x
+        minimize_scalar(score, bounds=(low_log_sigma, high_log_sigma), options={"xatol": 1e-3}).x
     )
     return _make_noise_estimate(score, (best_log_sigma_a, 0.0), SIGMA_A_SEARCH_RANGE_M_S2)
 
