@@ -170,7 +170,8 @@ def score_grid(
                 p_ij + q * unit + fixed
                 for p_ij, unit, fixed in zip(
                     propagate_covariance(covariance, axis.interval_s[k]),
-                    axis.unit_process_noise[k], axis.added_process_noise[k], strict=True,
+                    axis.process_noise_per_sigma_a_squared[k],
+                    axis.process_noise_independent_of_sigma_a[k], strict=True,
                 )
             )  # fmt: skip
             (nu, s, _, _), (p, v, covariance) = update_step(p, v, covariance, z, r / weight[k])

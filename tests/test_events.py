@@ -40,9 +40,9 @@ def test_time_without_positions_is_plotted_but_not_evaluated() -> None:
     resets = (Reset(100.0, "position", (1.0, 0.0, 0.0)),)
     flight = aisle_flight(uwb=Uwb(gap_s=(80.0, 130.0)), ekf2=Estimator(resets=resets))
     whole, covered = compare(flight), compare(flight, end_s=80.0)
-    assert (whole.segment.end_s, whole.segment.flight.end_s) == (80.0, 120.0)
+    assert (whole.segment.end_s, whole.segment.whole_flight.end_s) == (80.0, 120.0)
     chosen = compare(flight, end_s=100.0).segment
-    assert (chosen.end_s, chosen.flight.end_s) == (80.0, 100.0)
+    assert (chosen.end_s, chosen.whole_flight.end_s) == (80.0, 100.0)
     events = collect_events(whole)
     assert (events.gaps, events.reset_times_s, events.landing_times_s) == (
         ((80.0, 120.0),),

@@ -12,7 +12,7 @@ from flights import with_noises
 from px4fuse.card.build import build_card
 from px4fuse.comparison.model import FILTER_NAMES
 from px4fuse.diagnose import analyse_comparison
-from px4fuse.filter.time_offset import MAX_CHANGE_P_VALUE
+from px4fuse.filter.time_offset import MAX_P_VALUE_OF_CHANGED_OFFSET
 from px4fuse.findings import find
 from px4fuse.readers import read_log
 from px4fuse.report.clock import make_time_offset_advice
@@ -130,7 +130,7 @@ def test_recorded_flight_with_known_fault_reports_this_fault(shared_logs, name):
         assert clock.offset_s == pytest.approx(flown.offset_s, abs=0.05)
         low, high = clock.interval_s
         assert low <= flown.offset_s <= high
-        assert clock.change_p_value > MAX_CHANGE_P_VALUE
+        assert clock.change_p_value > MAX_P_VALUE_OF_CHANGED_OFFSET
         assert abs(clock.drift_ppm) < 4.0 * clock.drift_sigma_ppm
     if name.endswith("evdelay175"):
         assert not low <= -0.175 <= high

@@ -106,18 +106,24 @@ def test_bias_regression_residuals_equal_kf_innovations() -> None:
     analysis = flown()
     axes = tuple(analysis.axes[name].axis for name in ("north", "east"))
     model = make_design_matrix(analysis.flight, axes, RIGHT, 0.10, 0.0)
-    gap = np.zeros_like(model.preintegrated_columns.added_process_noise)
+    gap = np.zeros_like(model.preintegrated_inputs.process_noise_independent_of_sigma_a)
     gap[200] = 0.5, 0.5, 1.0
     with_gap = replace(
-        model, preintegrated_columns=replace(model.preintegrated_columns, added_process_noise=gap)
+        model,
+        preintegrated_inputs=replace(
+            model.preintegrated_inputs, process_noise_independent_of_sigma_a=gap
+        ),
     )
     skip = np.zeros(len(model.time_s), dtype=bool)
     for each in (model, with_gap):
-        fits, (data, columns, _) = each.fit(0.27, skip), each.whiten_design(0.27, skip)
+        fits, (data, columns, _) = (
+            each.fit(0.27, skip),
+            each.compute_innovations_and_design_matrix(0.27, skip),
+        )
         arrays = "measurement_m", "delta_position_m", "delta_velocity_m_s"
         for at, column in enumerate((0, 4)):
-            own = {name: getattr(each.preintegrated_columns, name)[:, column] for name in arrays}
-            nu, s = innovations(replace(each.preintegrated_columns, **own), 0.27, 0.10)
+            own = {name: getattr(each.preintegrated_inputs, name)[:, column] for name in arrays}
+            nu, s = innovations(replace(each.preintegrated_inputs, **own), 0.27, 0.10)
             np.testing.assert_allclose(data[at], nu / np.sqrt(s), atol=1e-9)
             residual = data[at] - columns[at] @ fits.coefficients
             np.testing.assert_allclose(fits.residual[fits.axis == at], residual, atol=1e-9)
@@ -128,7 +134,7 @@ def test_bias_regression_equals_lstsq_with_prior_as_data_row() -> None:
     columns, data = rng.normal(size=(2, 25, 2)), rng.normal(size=(2, 25))
     skip = np.arange(25) % 5 == 0
     model = part_of(DesignMatrix, prior_sigma=np.array([np.inf, 0.5]))
-    made = model.regress(data, columns, 0.0, skip)
+    made = model.fit_columns_to_innovations(data, columns, 0.0, skip)
     columns, data = columns[:, ~skip].reshape(40, 2), data[:, ~skip].ravel()
     assert made.axis.tolist() == [0] * 20 + [1] * 20
     rows = np.vstack([columns, [0.0, 1.0 / 0.5]])
@@ -136,7 +142,9 @@ def test_bias_regression_equals_lstsq_with_prior_as_data_row() -> None:
     np.testing.assert_allclose(made.coefficients, expected, rtol=1e-9)
     np.testing.assert_allclose(made.residual, data - columns @ expected)
     np.testing.assert_allclose(made.covariance, np.linalg.inv(rows.T @ rows), rtol=1e-9)
-    assert made.square_sum == pytest.approx(np.sum((np.append(data, 0.0) - rows @ expected) ** 2))
+    assert made.residual_and_prior_square_sum == pytest.approx(
+        np.sum((np.append(data, 0.0) - rows @ expected) ** 2)
+    )
     # σ is widened if the residual exceeds the assumed noise
     sigma = np.sqrt(made.covariance[0, 0])
     for spread, widened in ((3.0, 3.0), (0.5, 1.0)):

@@ -16,7 +16,7 @@ from hypothesis import strategies as st
 
 from px4fuse.errors import SettingsError
 from px4fuse.filter import model
-from px4fuse.filter.kalman import UPDATE_COLUMNS, predict_state, predict_variance, replay
+from px4fuse.filter.kalman import UPDATE_TABLE_COLUMNS, predict_state, predict_variance, replay
 from px4fuse.filter.model import COVARIANCE_COLUMNS, STATE_COLUMNS
 from px4fuse.filter.settings import InitialState, Settings
 from px4fuse.filter.signals import Axis
@@ -46,7 +46,7 @@ def plain_replay(axis: Axis, chosen: Settings) -> tuple[list[list[float]], list[
     z_at = dict(zip(measured, axis.measurement_m.tolist(), strict=True))
     steps = steps_of(measured, chosen.dt_s)
     if chosen.input == "imu":
-        imu = axis.acceleration.time_s, axis.acceleration.compute_integral_m_s()
+        imu = axis.acceleration.time_s, axis.acceleration.compute_velocity_change_m_s()
     q, r = chosen.sigma_a_m_s2**2 * chosen.dt_s, chosen.sigma_z_m**2
     x = [z_at[measured[0]], 0.0]
     P = [[0.5**2, 0.0], [0.0, 1.0**2]]
@@ -87,7 +87,7 @@ def test_kf_replay_of_any_axis_equals_textbook_recursion(axis: Axis, chosen: Set
     run = replay(axis, chosen)
     states, updates = plain_replay(axis, chosen)
     np.testing.assert_allclose(run.steps[STATE], states, rtol=1e-9, atol=1e-9)
-    np.testing.assert_allclose(run.updates[UPDATE_COLUMNS], updates, rtol=1e-9, atol=1e-9)
+    np.testing.assert_allclose(run.updates[UPDATE_TABLE_COLUMNS], updates, rtol=1e-9, atol=1e-9)
 
 
 @pytest.mark.parametrize("name", ["sigma_a_m_s2", "sigma_z_m", "dt_s", "clock_offset_s"])
@@ -98,7 +98,7 @@ def test_kf_settings_out_of_range_are_rejected(name: str) -> None:
 
 
 def test_kf_replay_with_imu_input_but_no_imu_is_rejected() -> None:
-    with pytest.raises(SettingsError, match="`input` is imu, but KF has no acceleration"):
+    with pytest.raises(SettingsError, match="`input` is imu, but the axis"):
         replay(line([0.0, 0.2, 0.4], [0.0, 0.0, 0.0]), Settings(input="imu"))
 
 
@@ -216,7 +216,9 @@ def test_kf_prediction_formulas_equal_matrix_products(dt: float) -> None:
     np.testing.assert_allclose(model.propagate_state(1.5, -2.0, 3.0, dt), moved[:, 0], rtol=1e-14)
     # Q = B Bᵀ / dt: the acceleration is constant over the step
     np.testing.assert_allclose(
-        model.make_symmetric_matrix(model.compute_unit_process_noise(dt)), b @ b.T / dt, rtol=1e-14
+        model.make_symmetric_matrix(model.compute_process_noise_per_density(dt)),
+        b @ b.T / dt,
+        rtol=1e-14,
     )
 
 
@@ -227,7 +229,9 @@ def test_kf_process_noise_sum_of_short_steps_equals_closed_form() -> None:
     for _ in range(count):
         propagate_covariance, added = (
             model.propagate_covariance(covariance, dt),
-            model.compute_unit_process_noise(dt),
+            model.compute_process_noise_per_density(dt),
         )
         covariance = tuple(a + b for a, b in zip(propagate_covariance, added, strict=True))
-    np.testing.assert_allclose(covariance, model.compute_unit_continuous_noise(total), rtol=1e-7)
+    np.testing.assert_allclose(
+        covariance, model.compute_continuous_process_noise_per_density(total), rtol=1e-7
+    )

@@ -17,21 +17,21 @@ from scipy.stats import norm
 
 from px4fuse.core.arrays import Array, IntArray
 from px4fuse.filter.fitting import (
-    START_OUTLIER_FRACTION,
-    START_OUTLIER_SIGMA_RATIO,
+    INITIAL_OUTLIER_FRACTION,
+    INITIAL_OUTLIER_SIGMA_RATIO,
     NegativeLogLikelihood,
     NoiseFit,
     NoiseParameters,
     _compute_outlier_probability,
-    compute_variance_inflation,
-    convert_to_positions,
+    compute_log_sigma_z_variance_factor,
+    convert_to_positions_and_increments,
     fit_constant_errors,
     maximise_likelihood,
     negative_log_likelihood,
 )
 from px4fuse.filter.likelihood import (
     MAX_LOG_LIKELIHOOD_DROP,
-    find_profile_interval,
+    find_profile_likelihood_interval,
     innovations,
     preintegrate,
 )
@@ -42,7 +42,7 @@ from px4fuse.filter.marginal_likelihood import (
     fit_positions,
     subtract_smooth_path,
 )
-from px4fuse.filter.model import compute_unit_continuous_noise
+from px4fuse.filter.model import compute_continuous_process_noise_per_density
 from px4fuse.filter.settings import Settings
 from px4fuse.filter.signals import Axis
 
@@ -65,7 +65,7 @@ def test_banded_solver_equals_dense_normal_equations(seed: int) -> None:
     second = int(rng.integers(3, count - 2))
     joined = np.arange(1, count) != second
     length = rng.uniform(0.05, 0.6, count - 1)
-    noise = rng.uniform(0.001, 0.4) * np.stack(compute_unit_continuous_noise(length))
+    noise = rng.uniform(0.001, 0.4) * np.stack(compute_continuous_process_noise_per_density(length))
     noise[[0, 2]] += rng.choice([0.0, 0.003], count - 1)
     precision = np.stack([rng.uniform(1.0, 100.0, count), np.zeros(count)], 1)
     precision[[0, second], 1] = 0.5, 2.0
@@ -147,8 +147,11 @@ def with_constants(offsets: int = 3) -> PositionsAndIncrements:
     initial[START] = WEAK
     return PositionsAndIncrements(
         measurement_m=measured, segment_starts=START, interval_s=length,
-        unit_process_noise=0.1 * np.stack(compute_unit_continuous_noise(length)),
-        added_process_noise=np.outer([0.3, 0.0, 0.2], rng.choice([0.0, 0.01], COUNT - 1)),
+        process_noise_per_sigma_a_squared=0.1
+        * np.stack(compute_continuous_process_noise_per_density(length)),
+        process_noise_independent_of_sigma_a=np.outer(
+            [0.3, 0.0, 0.2], rng.choice([0.0, 0.01], COUNT - 1)
+        ),
         prior_precision=initial, constant_prior_sigmas=np.array([0.3, 1.0, 0.1]),
         delta_position_m=rng.normal(0.0, 0.3, (3, offsets, 4, COUNT - 1)),
         delta_velocity_m_s=rng.normal(0.0, 0.3, (3, offsets, 4, COUNT - 1)),
@@ -161,7 +164,7 @@ def arguments(
     """Return the arguments of :func:`fit_positions`."""
     if noises.correlated_sigma_m:
         positions = replace(positions, correlated_noise=(noises.correlated_sigma_m, noises.tau_s))
-    scaled, variance = positions.normalise_by_sigma_z(
+    scaled, variance = positions.divide_sigmas_by_sigma_z(
         1.0, noises.random_walk_m, weight / noises.sigma_z_m**2
     )
     return scaled, noises.sigma_a_m_s2, variance
@@ -176,7 +179,10 @@ def stretch_normal(
     at: int = 0,
 ) -> tuple[IntArray, Array, Array]:
     """Return measured rows, their signals (data minus mean, constants) and their covariance."""
-    q = matrices(noises.sigma_a_m_s2**2 * part.unit_process_noise + part.added_process_noise)
+    q = matrices(
+        noises.sigma_a_m_s2**2 * part.process_noise_per_sigma_a_squared
+        + part.process_noise_independent_of_sigma_a
+    )
     rows = list(range(*(*START, COUNT)[stretch : stretch + 2]))
     # position and velocity for the signals of data and constants
     means = [np.zeros((2, 4))]
@@ -307,12 +313,12 @@ def test_likelihood_is_equal_with_imu_motion_subtracted_first() -> None:
     # the signal of the scale is the path of each offset
     scaled = fit_positions(
         *arguments(subtract_smooth_path(part, estimates_scale=True), SOME_NOISES[0], WEIGHT)
-    ).gram
+    ).gram_matrix
     way, speed = part.delta_position_m[:, 1:2], part.delta_velocity_m_s[:, 1:2]
     alone = replace(part, delta_position_m=way, delta_velocity_m_s=speed)
     one = fit_positions(
         *arguments(subtract_smooth_path(alone, estimates_scale=True), SOME_NOISES[0], WEIGHT)
-    ).gram
+    ).gram_matrix
     assert np.ptp(scaled[..., -1, -1]) > 1.0
     np.testing.assert_allclose(scaled[:, [1]], one, rtol=1e-7, atol=1e-7)
 
@@ -320,10 +326,19 @@ def test_likelihood_is_equal_with_imu_motion_subtracted_first() -> None:
 @pytest.mark.parametrize("which", ["filter", "constants"])
 def test_likelihood_between_grid_points_equals_exact_likelihood(which: str) -> None:
     """Equal over four decades of the ratio and of SIGMA_Z, except for a constant."""
-    parts = [convert_to_positions(preintegrate(modelled(seed, COUNT), TRUE)) for seed in (1, 2)]
+    parts = [
+        convert_to_positions_and_increments(preintegrate(modelled(seed, COUNT), TRUE))
+        for seed in (1, 2)
+    ]
     if which == "constants":
         part = with_constants(offsets=1)
-        parts = [replace(part, added_process_noise=0.0 * part.added_process_noise)]
+        parts = [
+            replace(
+                part,
+                process_noise_independent_of_sigma_a=0.0
+                * part.process_noise_independent_of_sigma_a,
+            )
+        ]
     some = np.exp(np.random.default_rng(4).uniform(-4.6, 1.0, (30, 2))).tolist()
     direct = [negative_log_likelihood(parts, NoiseParameters(*pair), WEIGHT) for pair in some]
     assert np.ptp(direct) > 100.0
@@ -363,7 +378,7 @@ def test_likelihood_by_banded_matrix_equals_kf_likelihood(interval: float | None
     weight = np.ones(len(legs.measurement_m))
     assert np.ptp(expected) > 50.0
     np.testing.assert_allclose(score_grid([legs], a, z, weight), expected, rtol=1e-9)
-    part = [convert_to_positions(legs)]
+    part = [convert_to_positions_and_increments(legs)]
     found_values = np.array(
         [negative_log_likelihood(part, NoiseParameters(*pair), weight) for pair in pairs]
     )
@@ -389,11 +404,13 @@ def test_profile_likelihood_interval_of_parabola_is_1_96_sigma(slope: float) -> 
         return 0.5 * along**2 + 0.5 * across**2
 
     reach = sigma * np.sqrt(2.0 * MAX_LOG_LIKELIHOOD_DROP)
-    ends = np.log(find_profile_interval(score, (1.0, 2.0), (np.exp(-4.0), np.exp(6.0))))
+    ends = np.log(find_profile_likelihood_interval(score, (1.0, 2.0), (np.exp(-4.0), np.exp(6.0))))
     assert ends == pytest.approx((1.0 - reach, 1.0 + reach), abs=0.01 * reach)
     bounds = np.exp(1.0 - 0.5 * reach), np.exp(1.0 + 0.5 * reach)
-    assert find_profile_interval(score, (1.0, 2.0), bounds) == (None, None)
-    wide = np.log(find_profile_interval(score, (1.0, 2.0), (np.exp(-4.0), np.exp(6.0)), 4.0))
+    assert find_profile_likelihood_interval(score, (1.0, 2.0), bounds) == (None, None)
+    wide = np.log(
+        find_profile_likelihood_interval(score, (1.0, 2.0), (np.exp(-4.0), np.exp(6.0)), 4.0)
+    )
     assert wide == pytest.approx((1.0 - 2.0 * reach, 1.0 + 2.0 * reach), abs=0.02 * reach)
 
 
@@ -423,7 +440,7 @@ def bursts(seed: int, share: float, length: int) -> Array:
 
 
 def noises_of(*axes: Axis) -> NoiseFit:
-    parts = [convert_to_positions(preintegrate(axis, TRUE)) for axis in axes]
+    parts = [convert_to_positions_and_increments(preintegrate(axis, TRUE)) for axis in axes]
     return maximise_likelihood(
         parts, NoiseParameters(TRUE.sigma_a_m_s2, TRUE.sigma_z_m), np.ones(MANY)
     )
@@ -491,14 +508,14 @@ def test_sigma_of_noise_estimate_follows_likelihood_curvature(axes, share, width
     found = _compute_outlier_probability(
         over, np.full(4000, axes), float(expit(best[2])), float(wide)
     )
-    widening = compute_variance_inflation(over, np.full(4000, axes), found, float(wide))
+    widening = compute_log_sigma_z_variance_factor(over, np.full(4000, axes), found, float(wide))
     assert widening > 1.1
     assert widening == pytest.approx(curved * 2.0 * axes * 4000, rel=0.01)
 
 
 def test_noise_fit_without_outliers_uses_measurement_weights() -> None:
     weight = np.random.default_rng(1).uniform(0.2, 1.0, MANY)
-    parts = [convert_to_positions(preintegrate(pair(1)[0], TRUE))]
+    parts = [convert_to_positions_and_increments(preintegrate(pair(1)[0], TRUE))]
     found = maximise_likelihood(parts, NoiseParameters(0.5, 0.1), weight, fits_outliers=False)
     np.testing.assert_array_equal(found.measurement_weights, weight)
     assert not found.outlier_probability.any()
@@ -514,16 +531,19 @@ def test_outlier_probability_follows_bayes_rule() -> None:
     """Bayes: ε N(e; 0, w²σ²) against (1 - ε) N(e; 0, σ²), over all axes."""
     error = np.linspace(0.0, 6.0, 25)
     for axes in (1, 2):
-        narrow = (1.0 - START_OUTLIER_FRACTION) * norm.pdf(error) ** axes
-        wide = START_OUTLIER_FRACTION * norm.pdf(error, scale=START_OUTLIER_SIGMA_RATIO) ** axes
+        narrow = (1.0 - INITIAL_OUTLIER_FRACTION) * norm.pdf(error) ** axes
+        wide = INITIAL_OUTLIER_FRACTION * norm.pdf(error, scale=INITIAL_OUTLIER_SIGMA_RATIO) ** axes
         got = _compute_outlier_probability(
-            axes * error**2, np.full(25, axes), START_OUTLIER_FRACTION, START_OUTLIER_SIGMA_RATIO
+            axes * error**2,
+            np.full(25, axes),
+            INITIAL_OUTLIER_FRACTION,
+            INITIAL_OUTLIER_SIGMA_RATIO,
         )
         np.testing.assert_allclose(got, wide / (wide + narrow), rtol=1e-9)
     # where the density underflows
     assert (
         _compute_outlier_probability(
-            np.array([1e200]), np.ones(1), START_OUTLIER_FRACTION, START_OUTLIER_SIGMA_RATIO
+            np.array([1e200]), np.ones(1), INITIAL_OUTLIER_FRACTION, INITIAL_OUTLIER_SIGMA_RATIO
         )
         == 1.0
     )

@@ -142,7 +142,7 @@ def test_text_file_in_utf8_or_utf16_is_read(tmp_path, encoding) -> None:
     path.write_bytes("σ = 1\n".encode(encoding))
     assert read_text(path, LogError, 100) == "σ = 1\n"
     path.write_bytes(b"ab\xff")
-    with pytest.raises(LogError, match=r"t is not a text file in UTF-8: byte 2"):
+    with pytest.raises(LogError, match=r"t is not a text file in UTF-8: the byte at position 2"):
         read_text(path, LogError, 100)
 
 

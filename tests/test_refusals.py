@@ -169,7 +169,7 @@ REFUSED = {
     "batch of a pattern": ("batch x*.ulg -o o", "no logs found"),
     "batch without logs": ("batch -o o", "no logs"),
     "batch to nowhere": ("batch a.ulg", "-o"),
-    "batch into a file": ("batch a.ulg -o n.md", "the output folder n.md is a file"),
+    "batch into a file": ("batch a.ulg -o n.md", "n.md is a file, but the output"),
     "batch of no noise": ("batch a.ulg -o o --sigma-z 0", "--sigma-z 0 is out of range"),
     "two kinds of workers": ("batch a.ulg -o o --scheduler tcp://h:1 --workers 2", "--workers"),
     "memory of words": ("batch a.ulg -o o --memory lots", "--memory"),

@@ -208,7 +208,9 @@ def test_positions_and_imu_are_projected_on_requested_heading():
     (axis,) = make_axes(flight, track, ALL, names=("aisle",), heading_deg=heading)
     expected = 0.6 * track.samples["north_m"] + 0.8 * track.samples["east_m"]
     np.testing.assert_allclose(axis.measurement_m, expected, atol=1e-12)
-    np.testing.assert_allclose(axis.acceleration.compute_integral_m_s(), 5.0 * time, atol=1e-11)
+    np.testing.assert_allclose(
+        axis.acceleration.compute_velocity_change_m_s(), 5.0 * time, atol=1e-11
+    )
     assert axis.heading_deg == heading
     assert "--heading" in axis.note
 

@@ -63,13 +63,18 @@ def test_each_simulated_fault_size_has_limits() -> None:
 
 def motion_of(scenario, mistakes=NO_FAULTS):
     return plan_flight(
-        scenario, mistakes, sensors.make_random_generator(scenario, sensors.RandomStream.WANDER)
+        scenario,
+        mistakes,
+        sensors.make_random_generator(scenario, sensors.RandomStream.PATH_DEVIATION),
     )
 
 
 def position_errors_m(simulation):
     positions = simulation.positions
-    return positions.position_m - simulation.motion.at(positions.measurement_times_s).position_m
+    return (
+        positions.position_m
+        - simulation.motion.compute_true_state(positions.measurement_times_s).position_m
+    )
 
 
 def stamps_s(simulation):
@@ -85,7 +90,7 @@ class TestMotion:
     def test_simulated_velocity_integrates_to_position(self, scenario):
         motion = motion_of(scenario)
         time = np.linspace(0.0, motion.duration_s, 40_001)
-        state = motion.at(time)
+        state = motion.compute_true_state(time)
         for value, derivative, tolerance in (
             (state.position_m, state.velocity_m_s, 1e-6),
             (state.velocity_m_s, state.acceleration_m_s2, 1e-6),
@@ -100,7 +105,7 @@ class TestMotion:
     def test_simulated_flight_starts_and_ends_at_rest_on_ground(self, scenario):
         motion = motion_of(scenario)
         time = np.array([0.0, motion.take_off_s, motion.touch_down_s + 1e-6, motion.duration_s])
-        state = motion.at(time)
+        state = motion.compute_true_state(time)
         assert np.allclose(state.velocity_m_s, 0.0, atol=1e-9)
         assert np.allclose(state.acceleration_m_s2, 0.0, atol=1e-9)
         assert np.allclose(state.position_m[:, 2], 0.0, atol=1e-9)
@@ -110,10 +115,12 @@ class TestMotion:
         # the jerk has small steps at the ends of the fade
         time = np.linspace(0.0, motion.duration_s, 20_001)
         step = 1e-4
-        before, here, after = (compute_attitude(motion.at(time + s)) for s in (-step, 0.0, step))
+        before, here, after = (
+            compute_attitude(motion.compute_true_state(time + s)) for s in (-step, 0.0, step)
+        )
         force = np.einsum("nij,nj->ni", here.body_to_ned, here.specific_force_m_s2)
         force[:, 2] += 9.80665
-        assert np.allclose(force, motion.at(time).acceleration_m_s2, atol=1e-9)
+        assert np.allclose(force, motion.compute_true_state(time).acceleration_m_s2, atol=1e-9)
         turn = np.swapaxes(before.body_to_ned, 1, 2) @ after.body_to_ned
         rate = Rotation.from_matrix(turn).as_rotvec() / (2 * step)
         error = np.abs(rate - here.angular_rate_rad_s)
@@ -125,7 +132,9 @@ class TestMotion:
 def test_simulated_open_loop_has_requested_closure_error(left_out, texts):
     scenario = replace(LOOP, passes=2)
     flown = simulate(scenario, parse_faults(texts))
-    first, last = flown.motion.at(np.array([0.0, flown.motion.duration_s])).position_m
+    first, last = flown.motion.compute_true_state(
+        np.array([0.0, flown.motion.duration_s])
+    ).position_m
     # the last side points back along heading + 270 degrees
     assert np.allclose(last - first, -left_out * compute_direction(30.0 + 270.0), atol=1e-9)
     error_m = make_answer_key(flown)["truth"]["closure_error_m"]
@@ -135,7 +144,7 @@ def test_simulated_open_loop_has_requested_closure_error(left_out, texts):
 @pytest.mark.parametrize("yaw", ["fixed", "follow"])
 def test_simulated_aisle_flight_has_requested_length_and_yaw(yaw):
     motion = motion_of(replace(AISLE, wander_m=0.0, yaw=yaw))
-    state = motion.at(np.linspace(0.0, motion.duration_s, 5001))
+    state = motion.compute_true_state(np.linspace(0.0, motion.duration_s, 5001))
     assert (state.position_m @ compute_direction(30.0)).max() == pytest.approx(12.0, abs=1e-9)
     assert np.abs(state.position_m @ compute_direction(120.0)).max() < 1e-9
     assert state.position_m[:, 2].min() == pytest.approx(-1.5, abs=1e-9)
@@ -156,10 +165,10 @@ def test_simulated_imu_noise_averaged_over_dt_equals_sigma_a(texts):
     simulation = simulate(scenario, parse_faults(texts))
     imu = to_flight(simulation).imu
     time = imu.index.to_numpy()
-    truth = compute_attitude(simulation.motion.at(time))
+    truth = compute_attitude(simulation.motion.compute_true_state(time))
     error = np.einsum("nij,nj->ni", truth.body_to_ned, imu.to_numpy()[:, :3])
     error[:, 2] += 9.80665
-    error -= simulation.motion.at(time).acceleration_m_s2
+    error -= simulation.motion.compute_true_state(time).acceleration_m_s2
     frame = pd.DataFrame(error, index=imu.index)
     for axis in np.eye(3):
         signal = project_acceleration(frame, axis, Segment(0.0, time[-1], ""))
@@ -171,13 +180,13 @@ def test_simulated_imu_noise_averaged_over_dt_equals_sigma_a(texts):
 def test_simulated_imu_biases_are_constant_with_requested_sigma():
     simulation = simulate(Scenario(seed=9))
     imu = to_flight(simulation).imu
-    truth = compute_attitude(simulation.motion.at(imu.index.to_numpy()))
+    truth = compute_attitude(simulation.motion.compute_true_state(imu.index.to_numpy()))
     truth_values = make_answer_key(simulation)["truth"]
     bias = imu.to_numpy()[:, :3].astype(float) - truth.specific_force_m_s2
     assert bias.mean(axis=0) == pytest.approx(truth_values["accelerometer_bias_m_s2"], abs=0.025)
     bias = imu[Columns.ANGULAR_RATE].to_numpy(float) - truth.angular_rate_rad_s
     assert bias.mean(axis=0) == pytest.approx(truth_values["gyro_bias_rad_s"], abs=3e-4)
-    drawn = [sensors.draw_biases(Scenario(seed=seed), NO_FAULTS) for seed in range(400)]
+    drawn = [sensors.draw_imu_biases(Scenario(seed=seed), NO_FAULTS) for seed in range(400)]
     assert np.std([b[0] for b in drawn]) == pytest.approx(0.03, rel=0.1)
     assert np.std([b[1] for b in drawn]) == pytest.approx(0.002, rel=0.1)
 
@@ -188,7 +197,9 @@ def test_simulated_vio_drift_has_requested_rate():
         scenario = Scenario(kind="loop", passes=1, length_m=8.0, seed=seed, sigma_vio_m=0.0)
         motion = motion_of(scenario)
         source = sensors.simulate_positions(scenario, NO_FAULTS, motion)
-        errors_m = source.position_m - motion.at(source.measurement_times_s).position_m
+        errors_m = (
+            source.position_m - motion.compute_true_state(source.measurement_times_s).position_m
+        )
         assert np.allclose(errors_m[-1], source.drift_m, atol=1e-9)
         ends.append(source.drift_m)
     # 1.5 % of 32 m plus the deviation, with a random walk of 0.01 m/√m
@@ -271,7 +282,7 @@ class TestMistakes:
     def test_simulated_low_pass_positions_lag_by_time_constant(self):
         scenario = Scenario(seed=4, sigma_uwb_m=0.0, uwb_rate_hz=50.0, wander_m=0.0)
         simulation = simulate(scenario, parse_faults(["smoothed=0.5s"]))
-        truth = simulation.motion.at(simulation.positions.measurement_times_s)
+        truth = simulation.motion.compute_true_state(simulation.positions.measurement_times_s)
         along = truth.velocity_m_s @ compute_direction(30.0)
         lag = -(position_errors_m(simulation) @ compute_direction(30.0))
         fast = np.abs(np.abs(along) - 1.0) < 1e-9
@@ -357,7 +368,7 @@ def test_simulated_ulog_contains_no_names_of_faults():
     content = to_ulog(simulate(AISLE, parse_faults(texts)))
     for name in (
         *FAULT_TYPES,
-        *(field for mistake in FAULT_TYPES.values() for field in mistake.fields),
+        *(field for mistake in FAULT_TYPES.values() for field in mistake.field_names),
     ):
         # these names occur in the log for other reasons
         if name not in ("yaw", "scale", "jump", "heading", "mag"):

@@ -114,7 +114,7 @@ def test_simulated_ekf2_is_consistent_at_its_fusion_horizon(clean):
     later = record.delayed[record.delayed.index > 15.0]
     error = later["north_m_s"] - np.interp(later.index, truth.index, truth["north_m_s"])
     assert 0.5 < np.mean(error**2 / later["north_m2_s2"]) < 2.5
-    bias, gyro_bias = sensors.draw_biases(AISLE, parse_faults([]))
+    bias, gyro_bias = sensors.draw_imu_biases(AISLE, parse_faults([]))
     last = later.iloc[-1]
     names = [f"gyro_bias_{axis}_rad_s" for axis in ("forward", "right")]
     assert last[names].to_numpy(float) == pytest.approx(gyro_bias[:2], abs=0.002)

@@ -16,11 +16,17 @@ from px4fuse.batch.rows import (
     STATUS_NOT_COMPARED,
 )
 from px4fuse.card.model import RATIO_AXIS_ENDS
-from px4fuse.core.text import format_count, format_metres, format_number, format_ratio, join_first
+from px4fuse.core.text import (
+    format_count,
+    format_metres,
+    format_number,
+    format_ratio,
+    join_first_names,
+)
 from px4fuse.filter.consistency import CONSISTENT_SIGMA_RATIOS
 from px4fuse.findings import finding_title
 from px4fuse.html import frame
-from px4fuse.html.frame import Cell, Column, Row, RowSection
+from px4fuse.html.frame import Cell, Column, Row, RowDetailsSection
 from px4fuse.html.safe import clean_text, load_template, make_relative_url
 from px4fuse.report.card_html import MARKER_SVG_PATHS
 from px4fuse.report.card_text import SEVERITY_SIGNS, SYMBOL_BY_REFERENCE, format_consistent_ratios
@@ -97,7 +103,7 @@ def format_html(table: pd.DataFrame, title: str, version_text: str) -> str:
     return frame.page(
         title=title,
         subtitle=f"{format_count(len(logs), 'log')}. Compared by {version_text}.",
-        html_above=load_template("batch/axis.html").render(limits=format_consistent_ratios()),
+        html_above_table=load_template("batch/axis.html").render(limits=format_consistent_ratios()),
         row_nouns=("log", "logs"),
         columns=(
             Column("Sign", "rank"),
@@ -123,9 +129,9 @@ def format_html(table: pd.DataFrame, title: str, version_text: str) -> str:
         rows=rows,
         filters=_make_drop_down_lists(logs),
         column_groups=[(OPTIONAL_COLUMN_GROUP, "more columns")],
-        placeholder="search by name, vehicle, firmware or finding",
+        search_placeholder="search by name, vehicle, firmware or finding",
         full_table_note="fleet.csv contains the table of all logs.",
-        ratio_axis={
+        sigma_ratio_axis={
             "bands": CONSISTENT_SIGMA_RATIOS,
             "ends": RATIO_AXIS_ENDS,
             "marks": MARKER_SVG_PATHS,
@@ -154,7 +160,7 @@ def _make_log_cells(log: LogSummary) -> tuple[Cell, ...]:
         Cell()
         if log["status"] == STATUS_FAILED
         else frame.make_number_cell(
-            float(len(finding_titles)), second_line=join_first(finding_titles, 2)
+            float(len(finding_titles)), second_line=join_first_names(finding_titles, 2)
         ),
     )
 
@@ -186,7 +192,7 @@ def sort_logs(logs: Iterable[LogSummary]) -> list[LogSummary]:
     return sorted(logs, key=compute_sort_key)
 
 
-def _make_log_details(log: LogSummary) -> tuple[RowSection, ...]:
+def _make_log_details(log: LogSummary) -> tuple[RowDetailsSection, ...]:
     value_rows = [
         [name, *(_format_value(axis.get(name, "")) for axis in log["axes"])]
         for name in AXIS_COLUMNS
@@ -210,7 +216,7 @@ def _make_log_details(log: LogSummary) -> tuple[RowSection, ...]:
     )
 
 
-def _make_file_and_flight_sections(log: LogSummary) -> tuple[RowSection, ...]:
+def _make_file_and_flight_sections(log: LogSummary) -> tuple[RowDetailsSection, ...]:
     return (
         frame.make_links_section(
             "Files", [(label, make_relative_url(log.get(name, ""))) for label, name in FILE_LINKS]

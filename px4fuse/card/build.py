@@ -46,7 +46,7 @@ from px4fuse.core.text import (
     capitalise_first,
     format_metres,
     format_ratio,
-    lower_first,
+    lowercase_first_letter,
     with_log_name,
 )
 from px4fuse.ekf2.fusion_conditions import is_height_only
@@ -224,7 +224,7 @@ def _make_headline(causes: Sequence[DiagnosedCause], sigma_verdicts: Sequence[Ve
     if causes:
         main_cause, *further_causes = causes
         for further_cause in further_causes:
-            joined_titles = f"{main_cause.title}; {lower_first(further_cause.title)}"
+            joined_titles = f"{main_cause.title}; {lowercase_first_letter(further_cause.title)}"
             if further_cause.severity == "error" and len(joined_titles) <= MAX_HEADLINE_LENGTH:
                 return joined_titles
         return main_cause.title
@@ -248,7 +248,7 @@ def _make_headline(causes: Sequence[DiagnosedCause], sigma_verdicts: Sequence[Ve
 
 
 def _summarise_errors(analysis: Analysis) -> FlightErrors:
-    comparison, segment, reset_count = analysis.main, analysis.segment.flight, None
+    comparison, segment, reset_count = analysis.main, analysis.segment.whole_flight, None
     difference = comparison.difference
     if isinstance(analysis.flight.ekf2, Ekf2):
         reset_times_s = find_horizontal_reset_times_s(analysis.flight.ekf2)
@@ -294,7 +294,7 @@ def _compute_horizontal_rmse_m(analysis: Analysis) -> dict[FilterName, float]:
 def _describe_effect(
     analysis: Analysis, effect: FlightErrors, sigma_verdicts: Sequence[Verdict]
 ) -> str:
-    sentences, segment, flight = [], analysis.segment, analysis.segment.flight
+    sentences, segment, flight = [], analysis.segment, analysis.segment.whole_flight
     if analysis.flight.airborne == () and has_little_motion(analysis):
         return "The vehicle stayed on the ground, so the errors of KF and EKF2 are not evaluated."
     if is_height_only(analysis.source):
@@ -402,7 +402,7 @@ def _format_action(action: Action) -> str:
     if action.where == "shell":
         options_text = action.commands[0].partition(" --")[2]
         return f"KF: {action.sentence or 'run again with'} --{options_text}"
-    text = lower_first(action.sentence.rstrip("."))
+    text = lowercase_first_letter(action.sentence.rstrip("."))
     return f"{capitalise_first(action.target)}: {text}"
 
 

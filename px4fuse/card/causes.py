@@ -24,7 +24,7 @@ from px4fuse.comparison.trials import (
     has_effect,
     remains_overconfident,
 )
-from px4fuse.core.text import lower_first, with_log_name
+from px4fuse.core.text import lowercase_first_letter, with_log_name
 from px4fuse.filter.consistency import classify_sigma_ratio
 from px4fuse.filter.tuning import HORIZONTAL, AxisTuning
 from px4fuse.finding import Finding
@@ -224,7 +224,7 @@ def _make_actions(
         shift_s = offset_trial.change[CLOCK_OFFSET_KEY]
         if offset_trial.filter == "kf":
             shift_s -= analysis.settings.clock_offset_s
-        instruction = f"{lower_first(format_timestamp_action(shift_s))} the timestamp of each position"
+        instruction = f"{lowercase_first_letter(format_timestamp_action(shift_s))} the timestamp of each position"
         sender_actions = [Action("sender", instruction)]
     alternative_action_groups: tuple[tuple[Action, ...], ...] = ()
     actions = delay_actions or sender_actions

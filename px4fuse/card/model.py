@@ -8,7 +8,7 @@ from msgspec import Meta
 
 from px4fuse.comparison.model import FilterName
 from px4fuse.comparison.trials import Improvement
-from px4fuse.core.record import Count, NotNegative, Positive, Record, Share, Span
+from px4fuse.core.record import Count, NotNegative, PositiveFloat, Record, Share, Span
 from px4fuse.filter.consistency import Reference
 
 CardSeverity = Literal["clean", "note", "warning", "error", "refused"]
@@ -57,7 +57,7 @@ class Verdict(Record, kw_only=True):
 
     filter: FilterName
     against: Reference
-    ratio: Positive | None = None
+    ratio: PositiveFloat | None = None
     interval: tuple[NotNegative, NotNegative] | None = None
     word: VerdictWord
     samples: Count = 0
@@ -222,7 +222,7 @@ class AidConsistency(Record, kw_only=True):
 
     label: str
     component: str
-    ratio: Positive | None = None
+    ratio: PositiveFloat | None = None
     is_usual: bool = False
 
 

@@ -19,7 +19,7 @@ from px4fuse.cli.options import (
 )
 from px4fuse.cli.outputs import Interrupted, progress, write_and_print_results, write_new
 from px4fuse.core.input_files import add_input, check_output_folder
-from px4fuse.core.reading import files_below
+from px4fuse.core.reading import list_files_recursively
 from px4fuse.errors import OutputError, SettingsError
 
 
@@ -198,6 +198,6 @@ def _require_output_outside(output: Path, input_paths: tuple[Path, ...]) -> None
                 f"-o {output} is inside the input {path}, so the next run would read this output. "
                 "Choose another output folder."
             )
-        for file in files_below(path):
+        for file in list_files_recursively(path):
             add_input(file)
     check_output_folder(output)

@@ -49,16 +49,18 @@ MAX_SECRET_BYTES = 10_000
 def _add_scenario_options(command: Callable[..., None]) -> Callable[..., None]:
     """Add a command-line option for each numeric field of Scenario."""
     for field, quantity in reversed(collect_field_bounds(Scenario).items()):
-        if not quantity.meaning:
+        if not quantity.help_text:
             continue
         default = getattr(_DEFAULT_SCENARIO, field)
         outdoor_default = DEFAULTS_BY_KIND[OUTDOOR_KIND].get(field)
         default_text = f"{default:g}" + (
             f"; outdoors {outdoor_default:g}" if outdoor_default else ""
         )
-        help_text = f"{quantity.meaning}  [default: {default_text}]"
+        help_text = f"{quantity.help_text}  [default: {default_text}]"
         option_type = NumberWithUnit(quantity.unit, default)
-        command = click.option(quantity.cli_name, field, type=option_type, help=help_text)(command)
+        command = click.option(
+            quantity.option_or_placeholder, field, type=option_type, help=help_text
+        )(command)
     return command
 
 
@@ -73,7 +75,8 @@ class CommandWithFaultTable(click.Command):
                 [
                     (
                         f"{name}{mistake.usage}",
-                        mistake.help + (f" [{mistake.default:g}]" if mistake.size_fields else ""),
+                        mistake.help
+                        + (f" [{mistake.default:g}]" if mistake.value_field_names else ""),
                     )
                     for name, mistake in FAULT_TYPES.items()
                 ]

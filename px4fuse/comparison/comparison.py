@@ -132,7 +132,7 @@ def _compare_axis(
         **tracks,
         whole_flight_tracks=tracks
         if segment.flight_span_s in (None, (segment.start_s, segment.end_s))
-        else project_tracks(ekf2, flight.truth, axis, segment.flight),
+        else project_tracks(ekf2, flight.truth, axis, segment.whole_flight),
     )
 
 

@@ -27,14 +27,14 @@ from px4fuse.filter.correlated_noise import (
 from px4fuse.filter.fitting import NoiseParameters
 from px4fuse.filter.frame_rotation import HeadingError, estimate_heading_error
 from px4fuse.filter.hypotheses import (
-    OUTLIER_RETEST_DURATION_S,
+    OUTLIER_RETEST_DURATION_AFTER_JUMP_S,
     SystematicErrors,
     fit_systematic_errors,
 )
 from px4fuse.filter.imu_motion import MAX_IMU_INTERVAL_S, MotionCache
 from px4fuse.filter.signals import AISLE, Axis
 from px4fuse.filter.time_offset import (
-    MAX_OFFSET_HALF_INTERVAL_S,
+    MAX_OFFSET_INTERVAL_HALF_WIDTH_S,
     MIN_TIME_OFFSET_CHANGE_S,
     ClockOffset,
     estimate_time_offset,
@@ -239,7 +239,7 @@ def _fit_source_errors(
     if (
         isinstance(clock_offset, ClockOffset)
         and clock_offset.is_determinable
-        and abs(clock_offset.remaining_s) > clock_offset.three_sigma_s
+        and abs(clock_offset.remaining_s) > clock_offset.significance_limit_s
     ):
         offset_s = clock_offset.remaining_s
     systematic_errors = fit_systematic_errors(
@@ -256,7 +256,9 @@ def _fit_source_errors(
     # The exact time of a jump is unknown, so the measurements directly after it are excluded
     time_s, excluded_times_s = axes[0].measurement_time_s, axis_tuning.outlier_time_s
     for jump in jumps:
-        is_after_jump = (time_s >= jump.time_s) & (time_s < jump.time_s + OUTLIER_RETEST_DURATION_S)
+        is_after_jump = (time_s >= jump.time_s) & (
+            time_s < jump.time_s + OUTLIER_RETEST_DURATION_AFTER_JUMP_S
+        )
         excluded_times_s = np.union1d(excluded_times_s, time_s[is_after_jump])
     time_correlation_fit = fit_time_correlation(
         flight,
@@ -349,7 +351,7 @@ def widen_for_drift(clock_offset: ClockOffset) -> ClockOffset:
         for limit_s in clock_offset.interval_s
     )
     drift_reason = clock_offset.reason
-    if not drift_reason and (interval_high_s - interval_low_s) / 2.0 > MAX_OFFSET_HALF_INTERVAL_S:
+    if not drift_reason and (interval_high_s - interval_low_s) / 2.0 > MAX_OFFSET_INTERVAL_HALF_WIDTH_S:
         drift_reason = (
             "the time offset differs between parts of the flight, probably because the positions "
             f"drift (95 % interval of the offset: {interval_low_s:+.2f} s to "

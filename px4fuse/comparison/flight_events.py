@@ -62,7 +62,7 @@ def find_airborne_spans(flight: Flight) -> tuple[Span, ...]:
 
 def collect_events(comparison: Comparison) -> Events:
     """Collect gaps, rejections, resets, take-offs and landings in the flight of the segment."""
-    flight, segment = comparison.flight, comparison.segment.flight
+    flight, segment = comparison.flight, comparison.segment.whole_flight
     start_s, end_s = segment.start_s, segment.end_s
     time_s = np.concatenate([[start_s], comparison.input_axes[0].measurement_time_s, [end_s]])
 

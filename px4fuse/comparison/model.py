@@ -13,7 +13,7 @@ from px4fuse.core.record import (
     NotNegative,
     NotWritten,
     OrUnavailable,
-    Positive,
+    PositiveFloat,
     Record,
     RecordOrUnavailable,
     Share,
@@ -68,20 +68,20 @@ class FilterSummary(Consistency, kw_only=True):
     truth : ErrorsAgainstTruth or Unavailable
     """
 
-    sigma_p_median_m: Positive | None = None
-    sigma_v_median_m_s: Positive | None = None
-    sigma_p_before_update_m: Positive | None = None
-    sigma_p_after_update_m: Positive | None = None
+    sigma_p_median_m: PositiveFloat | None = None
+    sigma_v_median_m_s: PositiveFloat | None = None
+    sigma_p_before_update_m: PositiveFloat | None = None
+    sigma_p_after_update_m: PositiveFloat | None = None
     truth: OrUnavailable[ErrorsAgainstTruth]
 
 
 class UntestedFilter(Unavailable, kw_only=True):
     """Reported σ and errors of a filter, and the reason why its consistency was not tested."""
 
-    sigma_p_median_m: Positive | None = None
-    sigma_v_median_m_s: Positive | None = None
-    sigma_p_before_update_m: Positive | None = None
-    sigma_p_after_update_m: Positive | None = None
+    sigma_p_median_m: PositiveFloat | None = None
+    sigma_v_median_m_s: PositiveFloat | None = None
+    sigma_p_before_update_m: PositiveFloat | None = None
+    sigma_p_after_update_m: PositiveFloat | None = None
     truth: OrUnavailable[ErrorsAgainstTruth]
 
 
@@ -106,7 +106,7 @@ class UpdateStatistics(Record, kw_only=True):
     count: Count
     first_s: float
     last_s: float
-    rate_hz: Positive | None = None
+    rate_hz: PositiveFloat | None = None
     input_gap_s: NotNegative
 
 

@@ -7,7 +7,7 @@ from typing import Literal
 import numpy as np
 
 from px4fuse.comparison.model import FilterName
-from px4fuse.core.record import Count, NotNegative, Positive, Record, Share
+from px4fuse.core.record import Count, NotNegative, PositiveFloat, Record, Share
 from px4fuse.filter.consistency import Reference, classify_sigma_ratio, compute_nis_band
 from px4fuse.flight.ekf2_parameters import EV_POS
 
@@ -53,7 +53,7 @@ class RunStatistics(Record, kw_only=True):
     """Statistics of one run of a filter along one axis; RMSE and NEES are against ground truth."""
 
     innovations: Count = 0
-    nis_mean: Positive | None = None
+    nis_mean: PositiveFloat | None = None
     position_rmse_m: NotNegative | None = None
     nees_mean: NotNegative | None = None
     difference_rms_m: NotNegative | None = None

@@ -2,7 +2,7 @@
 
 from typing import Literal
 
-from px4fuse.core.record import NotNegative, Positive, Record
+from px4fuse.core.record import NotNegative, PositiveFloat, Record
 
 ConventionVerdict = Literal["determined", "ambiguous", "doubtful", "not determinable"]
 Direction = Literal["north", "east", "south", "west", "up", "down"]
@@ -74,7 +74,7 @@ class Convention(Record, kw_only=True, omit_defaults=False):
     heading_from: HeadingSource = "EKF2"
     late_s: float = 0.0
     clock_drift: float = 0.0
-    scale: Positive = 1.0
+    scale: PositiveFloat = 1.0
     log_odds: float | None = None
     log_likelihood_gain: float = 0.0
     alternatives: tuple[str, ...] = ()

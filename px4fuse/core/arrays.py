@@ -13,11 +13,11 @@ ArrayPair = tuple[Array, Array]
 IntArray = NDArray[np.intp]
 BoolArray = NDArray[np.bool_]
 
-# Maximum number of rows in a slice from row_blocks
+# Maximum number of rows in a slice from iterate_row_blocks
 BLOCK_ROWS = 2**14
 
 
-def row_blocks(count: int) -> Iterator[slice]:
+def iterate_row_blocks(count: int) -> Iterator[slice]:
     """Yield slices of at most BLOCK_ROWS rows, so that temporary arrays need little memory."""
     return (slice(first, first + BLOCK_ROWS) for first in range(0, count, BLOCK_ROWS))
 

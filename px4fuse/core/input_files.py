@@ -1,7 +1,7 @@
 """Protection of the input files of a command from being overwritten by its outputs.
 
 Each file that is read is registered. Files are compared by device and inode, because different
-paths may lead to one file. Worker processes have no register: the main process adds their files.
+paths may lead to one file. A worker process registers no files: the main process registers them.
 """
 
 import os
@@ -22,7 +22,8 @@ class _InputRegister:
     """Input files and folders of the running command."""
 
     inputs: set[_FileIdentity] = field(default_factory=set)
-    input_by_folder: dict[_FileIdentity, Path] = field(default_factory=dict)
+    # input of each folder that contains inputs; if there are several, the first that was read
+    first_input_by_folder: dict[_FileIdentity, Path] = field(default_factory=dict)
     registered_folders: set[Path] = field(default_factory=set)
 
 
@@ -32,21 +33,21 @@ _input_register: ContextVar[_InputRegister | None] = ContextVar("register", defa
 @contextmanager
 def protect_inputs() -> Iterator[None]:
     """Register all files that are read inside this context; outputs cannot overwrite them."""
-    previous_register = _input_register.set(_InputRegister())
+    context_token = _input_register.set(_InputRegister())
     try:
         yield
     finally:
-        _input_register.reset(previous_register)
+        _input_register.reset(context_token)
 
 
 @contextmanager
 def suspend_input_registration() -> Iterator[None]:
     """Do not register files that are read inside this context, so outputs can overwrite them."""
-    previous_register = _input_register.set(None)
+    context_token = _input_register.set(None)
     try:
         yield
     finally:
-        _input_register.reset(previous_register)
+        _input_register.reset(context_token)
 
 
 def add_input(path: Path) -> None:
@@ -62,7 +63,7 @@ def add_input(path: Path) -> None:
         input_register.registered_folders.add(folder)
         for parent in map(_read_file_identity, (folder, *folder.parents)):
             if parent is not None:
-                input_register.input_by_folder.setdefault(parent, path)
+                input_register.first_input_by_folder.setdefault(parent, path)
 
 
 def check_outputs(output_paths: Iterable[Path]) -> None:
@@ -79,7 +80,9 @@ def check_outputs(output_paths: Iterable[Path]) -> None:
 def check_output_folder(folder: Path) -> None:
     """Raise an OutputError if the output folder is a file, or contains a registered input."""
     if folder.exists() and not folder.is_dir():
-        raise OutputError(f"the output folder {folder} is a file. Choose another name.")
+        raise OutputError(
+            f"{folder} is a file, but the output needs a folder. Choose another name."
+        )
     input_register = _input_register.get() or _InputRegister()
     folder_entries = _list_folder(folder)
     for path in (
@@ -92,7 +95,7 @@ def check_output_folder(folder: Path) -> None:
         input_path = (
             path
             if identity in input_register.inputs
-            else input_register.input_by_folder.get(identity)
+            else input_register.first_input_by_folder.get(identity)
         )
         if input_path is not None:
             raise OutputError(

@@ -6,6 +6,5 @@ import sys
 
 def release_free_memory() -> None:
     """Return freed memory, which the C library (glibc) keeps, to the operating system."""
-    trim = getattr(ctypes.CDLL(None), "malloc_trim", None) if sys.platform == "linux" else None
-    if trim is not None:
-        trim(0)
+    if sys.platform == "linux" and hasattr(c_library := ctypes.CDLL(None), "malloc_trim"):
+        c_library.malloc_trim(0)

@@ -44,10 +44,10 @@ def display_name(path: Path) -> str:
 
 
 def split_path_and_part(argument: str) -> tuple[Path, str | None]:
-    """Split ``FILE:PART`` (part: track, body in a motion-capture file, or ROS topic)."""
-    path, colon, part = argument.rpartition(":")
-    if colon and not Path(argument).exists() and (part.isidentifier() or Path(path).exists()):
-        return Path(path), part
+    """Split ``FILE:PART``. PART is a track, a body in a motion-capture file, or a ROS topic."""
+    path, colon, part_name = argument.rpartition(":")
+    if colon and not Path(argument).exists() and (part_name.isidentifier() or Path(path).exists()):
+        return Path(path), part_name
     return Path(argument), None
 
 
@@ -172,7 +172,7 @@ def read_text(
         return content.decode("utf-16" if is_utf16 else "utf-8-sig")
     except UnicodeDecodeError as error:
         raise error_type(
-            f"{name} is not a text file in UTF-8: byte {error.start} is invalid.",
+            f"{name} is not a text file in UTF-8: the byte at position {error.start} is invalid.",
             "Save the file as UTF-8.",
         ) from error
 
@@ -194,7 +194,7 @@ def hash_files(paths: Iterable[Path]) -> dict[str, Path]:
         if path.is_dir():
             files = [
                 folder_file
-                for folder_file in files_below(path)
+                for folder_file in list_files_recursively(path)
                 if folder_file.is_file() and file_size(folder_file, LogError) <= limit_bytes
             ]
         elif (size_bytes := file_size(path, LogError)) > limit_bytes:
@@ -213,7 +213,7 @@ def hash_files(paths: Iterable[Path]) -> dict[str, Path]:
     return file_by_hash
 
 
-def files_below(folder: Path) -> list[Path]:
+def list_files_recursively(folder: Path) -> list[Path]:
     """Return all files in a folder and its subfolders, sorted; links to folders are not followed.
 
     A folder that cannot be listed is returned like a file, so that the caller gets an error.
@@ -225,8 +225,8 @@ def files_below(folder: Path) -> list[Path]:
         try:
             with os.scandir(folder_path) as entries:
                 for entry in entries:
-                    destination = pending_folders if entry.is_dir(follow_symlinks=False) else files
-                    destination.append(Path(entry.path))
+                    target_paths = pending_folders if entry.is_dir(follow_symlinks=False) else files
+                    target_paths.append(Path(entry.path))
         except OSError:
             files.append(folder_path)
     return sorted(files)

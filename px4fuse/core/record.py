@@ -54,7 +54,7 @@ def _format_value(value: Any) -> str:
 
 
 NotNegative = Annotated[float, Meta(ge=0.0)]
-Positive = Annotated[float, Meta(gt=0.0)]
+PositiveFloat = Annotated[float, Meta(gt=0.0)]
 Share = Annotated[float, Meta(ge=0.0, le=1.0)]
 Correlation = Annotated[float, Meta(ge=-1.0, le=1.0)]
 Count = Annotated[int, Meta(ge=0)]
@@ -67,7 +67,7 @@ Vector = tuple[float, float, float]
 NOT_WRITTEN: Any = msgspec.UNSET
 
 
-# the decorator informs type checkers that subclasses are frozen, too
+# for type checkers: the fields of subclasses cannot be assigned
 @dataclass_transform(frozen_default=True)
 class Record(msgspec.Struct, frozen=True, forbid_unknown_fields=True, omit_defaults=True):
     """Immutable data class; fields that are None are not written to the JSON results.
@@ -111,7 +111,7 @@ if TYPE_CHECKING:
 else:
 
     class NotWritten:
-        """``NotWritten[T]``: type of a field (T, such as Array) that the JSON results omit."""
+        """``NotWritten[T]``: a field of type T (such as Array) that the JSON results omit."""
 
         def __class_getitem__(cls, kind: object) -> type:
             return msgspec.UnsetType
@@ -119,8 +119,8 @@ else:
     class RecordOrUnavailable:
         """``RecordOrUnavailable[T, A]``: a record T, or a subclass A of :class:`Unavailable`.
 
-        Decoded by :func:`decode_record_or_unavailable`, because msgspec requires a tag field for
-        unions.
+        msgspec decodes only unions with a tag field. This union has none, so
+        :func:`decode_record_or_unavailable` decodes it.
         """
 
         def __class_getitem__(cls, kinds: tuple[type, type]) -> type:

@@ -3,7 +3,7 @@
 import re
 import unicodedata
 
-FORMULA_STARTS = "=+-@"
+FORMULA_START_CHARACTERS = "=+-@"
 # Maximum length (characters) of a table cell: Excel truncates cells after 32,767
 MAX_CELL_LENGTH = 32_000
 
@@ -30,7 +30,7 @@ def _is_formula(text: str) -> bool:
         # Unicode categories Z (separators) and C (control characters) are not visible
         if character in "\"'" or unicodedata.category(character)[0] in "ZC":
             continue
-        return unicodedata.normalize("NFKC", character)[0] in FORMULA_STARTS
+        return unicodedata.normalize("NFKC", character)[0] in FORMULA_START_CHARACTERS
     return False
 
 

@@ -96,15 +96,15 @@ def capitalise_first(text: str) -> str:
     return text[:1].upper() + text[1:]
 
 
-def lower_first(text: str) -> str:
+def lowercase_first_letter(text: str) -> str:
     """Change the first letter to lower case, except in an acronym such as UWB."""
     return text if text[1:2].isupper() else text[:1].lower() + text[1:]
 
 
-def join_first(names: Sequence[str], max_count: int, separator: str = ", ") -> str:
+def join_first_names(names: Sequence[str], max_count: int, separator: str = ", ") -> str:
     """Join the first ``max_count`` names, and append the number of further names.
 
-    >>> join_first("abcd", 2), join_first("ab", 2)
+    >>> join_first_names("abcd", 2), join_first_names("ab", 2)
     ('a, b and 2 more', 'a, b')
     """
     suffix = f" and {len(names) - max_count} more" if len(names) > max_count else ""

@@ -25,9 +25,9 @@ def convert_to_unit(text: str, unit: str) -> float | None:
     """
     match = _NUMBER_WITH_UNIT.fullmatch(text.strip())
     unit = unit.lower()
-    typed_unit = match[2].lower() or unit if match else ""
+    unit_in_text = match[2].lower() or unit if match else ""
     for factors in ({unit: 1.0}, *_UNIT_FACTORS.values()):
-        if match and {typed_unit, unit} <= factors.keys():
+        if match and {unit_in_text, unit} <= factors.keys():
             with suppress(ValueError):  # float() rejects several decimal points
-                return float(match[1].replace(",", ".")) * (factors[typed_unit] / factors[unit])
+                return float(match[1].replace(",", ".")) * (factors[unit_in_text] / factors[unit])
     return None

@@ -32,7 +32,7 @@ MAX_JOBS_PER_WORKER = 80
 # Default limits of time (s) and memory (bytes) of a job; a report on 10 minutes takes 60 s
 JOB_TIMEOUT_S, MAX_MEMORY_BYTES = 120.0, 4_000_000_000
 # Maximum time (s) for the start of a process on a slow and busy computer
-START_TIMEOUT_S = 180.0
+WORKER_START_TIMEOUT_S = 180.0
 # Environment variables of worker processes. With PYTHONSAFEPATH, Python does not import files from
 # the current folder, which may contain files of a student
 _WORKER_ENVIRONMENT = {"PYTHONSAFEPATH": "1", **ONE_THREAD_ENVIRONMENT}
@@ -46,7 +46,7 @@ class JobFailure:
 
 
 class _Worker:
-    """Worker process with its current job, and the pipe for jobs and results."""
+    """Worker process, its current job, and the pipe that transfers jobs and results."""
 
     def __init__(
         self, function: Callable[[Any], Any], max_memory_bytes: int | None, job_index: int
@@ -69,9 +69,9 @@ class _Worker:
         self.is_ready = False
         self.job_index = job_index
         self.finished_count = 0
-        self.deadline = time.monotonic() + START_TIMEOUT_S
+        self.deadline = time.monotonic() + WORKER_START_TIMEOUT_S
 
-    def end(self) -> None:
+    def terminate(self) -> None:
         self.process.kill()
         self.process.join()
         self.process.close()
@@ -84,7 +84,8 @@ def _block_interrupts() -> Iterator[None]:
     if not hasattr(signal, "pthread_sigmask"):  # Windows
         yield
         return
-    resource_tracker.ensure_running()  # before Ctrl-C is blocked, because its start unblocks it
+    # The start of the resource tracker unblocks Ctrl-C, so it is started before Ctrl-C is blocked
+    resource_tracker.ensure_running()
     signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})
     try:
         yield
@@ -164,7 +165,7 @@ def poll_with_limits(
                             or worker.finished_count >= MAX_JOBS_PER_WORKER
                             or not waiting_indices
                         ):
-                            workers.pop(pipe).end()
+                            workers.pop(pipe).terminate()
                             continue
                         worker.job_index = waiting_indices.pop()
                     worker.deadline = time.monotonic() + timeout_s
@@ -172,15 +173,15 @@ def poll_with_limits(
                     with suppress(BrokenPipeError, ConnectionResetError):
                         pipe.send(jobs[worker.job_index])
                 elif time.monotonic() >= worker.deadline:
-                    time_limit_s = timeout_s if worker.is_ready else START_TIMEOUT_S
-                    workers.pop(pipe).end()
+                    time_limit_s = timeout_s if worker.is_ready else WORKER_START_TIMEOUT_S
+                    workers.pop(pipe).terminate()
                     yield (
                         worker.job_index,
                         JobFailure(f"the job exceeded the time limit of {time_limit_s:g} s."),
                     )
     finally:
         for worker in workers.values():
-            worker.end()
+            worker.terminate()
 
 
 def run_one_with_limits(

@@ -21,7 +21,7 @@ LOCKS_OPEN_FILES = sys.platform == "win32"
 # Advice to the user if an output cannot be written, by error number
 REMEDY_BY_ERRNO = {
     errno.ENOSPC: "Free disk space, or choose another disk.",
-    errno.EROFS: "Choose a folder that can be written.",
+    errno.EROFS: "Choose a folder with write permission.",
 }
 # Maximum number of paths in a message; a longer list is replaced by its length
 _MAX_LISTED_PATHS = 4

@@ -12,7 +12,7 @@ import numpy as np
 import pandas as pd
 
 from px4fuse.core.arrays import Array, BoolArray, compute_median_interval_s
-from px4fuse.core.record import Correlation, Count, NotNegative, Positive, Record, Share, Span
+from px4fuse.core.record import Correlation, Count, NotNegative, PositiveFloat, Record, Share, Span
 from px4fuse.ekf2.heights import GNSS_HEIGHT_NOISE_FACTOR
 from px4fuse.filter.consistency import assess_innovations, classify_mean_nis, compute_nis_band
 from px4fuse.flight.ekf2_parameters import AIDS, Aid
@@ -73,10 +73,10 @@ class AidAxis(Record, kw_only=True):
     samples: Count
     innovation_mean: float
     innovation_std: NotNegative
-    s_sqrt_median: Positive
-    nis_mean: Positive
+    s_sqrt_median: PositiveFloat
+    nis_mean: PositiveFloat
     nis_band: tuple[NotNegative, NotNegative]
-    sigma_ratio: Positive
+    sigma_ratio: PositiveFloat
     rejected_fraction: Share
     lag1_autocorrelation: Correlation
     ljung_box_p: Share
@@ -120,8 +120,8 @@ class AidResult(Record, kw_only=True):
     rejected_fraction: Share
     longest_gap_s: Span
     resets: Count
-    gate: Positive
-    noise: Positive | None = None
+    gate: PositiveFloat
+    noise: PositiveFloat | None = None
     noise_from: str
     verdict: AidVerdict
     axes: dict[str, AidAxis]

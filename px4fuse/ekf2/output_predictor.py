@@ -13,7 +13,7 @@ from collections.abc import Mapping
 import numpy as np
 from scipy.linalg import lapack
 
-from px4fuse.core.arrays import Array, row_blocks
+from px4fuse.core.arrays import Array, iterate_row_blocks
 from px4fuse.ekf2.replay_segments import (
     ACCELEROMETER_BIAS,
     GRAVITY_M_S2,
@@ -134,7 +134,7 @@ def _apply_recursive_filter(numerator: Array, denominator: Array, values: Array)
     filtered_values = np.zeros(values.shape)
     for delay in np.flatnonzero(numerator[:value_count]).tolist():
         filtered_values[delay:] += numerator[delay] * values[: value_count - delay]
-    for rows in row_blocks(value_count):
+    for rows in iterate_row_blocks(value_count):
         block = filtered_values[rows]
         if rows.start:
             for delay in (1 + np.flatnonzero(denominator[1:])).tolist():

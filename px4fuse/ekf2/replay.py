@@ -16,7 +16,7 @@ from px4fuse.core.record import (
     Count,
     NotNegative,
     NotWritten,
-    Positive,
+    PositiveFloat,
     Record,
     Share,
     Span,
@@ -99,9 +99,9 @@ class AxisAgreement(Record, kw_only=True):
 
     innovation_correlation: Correlation
     innovation_rms_difference: NotNegative
-    s_ratio_median: Positive
-    s_ratio_p5: Positive
-    s_ratio_p95: Positive
+    s_ratio_median: PositiveFloat
+    s_ratio_p5: PositiveFloat
+    s_ratio_p95: PositiveFloat
     nis_mean_logged: NotNegative
     nis_mean_replayed: NotNegative
     position_rms_difference_m: NotNegative

@@ -20,7 +20,7 @@ from px4fuse.core.arrays import (
     IntArray,
     compute_median_interval_s,
     cumulative_sums,
-    row_blocks,
+    iterate_row_blocks,
 )
 from px4fuse.core.record import Span
 from px4fuse.ekf2.earth_model import compute_earth_rate_rad_s, compute_position_scale
@@ -512,7 +512,7 @@ def _make_segment(
     accelerometer_bias = np.asarray(initial_row[Columns.ACCELEROMETER_BIAS])
     gyro_bias = np.asarray(initial_row[Columns.GYRO_BIAS])
     rotation_vectors, velocity_increments = np.zeros((2, len(step_end_indices), 3))
-    for steps in row_blocks(len(step_end_indices)):
+    for steps in iterate_row_blocks(len(step_end_indices)):
         first_row = step_end_indices[steps.start - 1] if steps.start else 0
         rows = slice(first_row, step_end_indices[steps][-1])
         samples, intervals_s = imu.iloc[rows.start + 1 : rows.stop + 1], imu_intervals_s[rows, None]
@@ -799,7 +799,8 @@ def find_step_ends(
     accumulated_count = accumulated_time_s = 0.0
     samples = np.stack([interval_s, sample_counts], axis=1)
     for sample, (interval, sample_count) in enumerate(
-        chain.from_iterable(samples[rows].tolist() for rows in row_blocks(len(samples))), start=1
+        chain.from_iterable(samples[rows].tolist() for rows in iterate_row_blocks(len(samples))),
+        start=1,
     ):
         accumulated_count = accumulated_count + sample_count
         accumulated_time_s = accumulated_time_s + interval

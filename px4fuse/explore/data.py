@@ -42,7 +42,7 @@ def make_flight_data(analysis: Analysis, encoder: ArrayEncoder) -> PageData:
         "log": analysis.flight.log.name,
         "settings": asdict(analysis.settings),
         "main": analysis.main.axis.name,
-        "shown": [analysis.segment.flight.start_s, analysis.segment.flight.end_s],
+        "shown": [analysis.segment.whole_flight.start_s, analysis.segment.whole_flight.end_s],
         **inputs,
         "axes": [
             axis_inputs | _make_axis_data(analysis, result, encoder)
@@ -151,7 +151,7 @@ def _make_axis_inputs(
         "z": encoder.add(position_m[is_near_segment]),
     }
     if isinstance(axis.acceleration, Acceleration):
-        acceleration_integral_m_s = axis.acceleration.compute_integral_m_s()[
+        acceleration_integral_m_s = axis.acceleration.compute_velocity_change_m_s()[
             _find_segment_slice(comparison, axis.acceleration)
         ]
         axis_data |= {

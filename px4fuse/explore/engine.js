@@ -48,7 +48,7 @@ const Engine = (() => {
     return { time, z };
   }
 
-  /* Time steps of KF: grid of DT and measurement times (steps.make_timeline) */
+  /* Time steps of KF: grid of DT and measurement times (steps.make_prediction_steps) */
   function timeline(flight, axis, settings) {
     const { time: all, z } = measured(axis, flight.segment, settings.clock_offset_s);
     if (all.length < MIN_MEASUREMENTS) return null;

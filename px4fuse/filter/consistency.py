@@ -17,7 +17,7 @@ from px4fuse.core.record import (
     Correlation,
     Count,
     NotNegative,
-    Positive,
+    PositiveFloat,
     Record,
     Share,
     Unavailable,
@@ -57,14 +57,14 @@ class NisVerdict(Record, kw_only=True):
     """
 
     count: Count
-    nis_mean: Positive
+    nis_mean: PositiveFloat
     nis_band: tuple[NotNegative, NotNegative]
-    sigma_ratio: Positive
+    sigma_ratio: PositiveFloat
     verdict: SigmaVerdict
 
     @property
     def sigma_error_factor(self) -> float:
-        """Factor between reported and actual σ, at least 1: the larger over the smaller."""
+        """Ratio of the larger to the smaller of reported and actual σ; at least 1."""
         return float(max(self.nis_mean, 1.0 / self.nis_mean) ** 0.5)
 
 
@@ -87,7 +87,7 @@ class Consistency(NisVerdict, kw_only=True):
 
     innovation_mean_m: float
     innovation_std_m: NotNegative
-    sqrt_s_median_m: Positive
+    sqrt_s_median_m: PositiveFloat
     fraction_outside_two_sigma: Share
     fraction_outside_gate: Share
     bias_t: float

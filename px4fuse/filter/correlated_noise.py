@@ -40,29 +40,29 @@ MIN_MEASUREMENTS = 100
 MAX_MEASUREMENTS = 2000
 # The noise of two successive positions is uncorrelated if the interval between them exceeds this
 # multiple of the median interval
-MAX_INTERVAL_TO_MEDIAN_RATIO = 3.0
+MAX_INTERVAL_TO_MEDIAN_INTERVAL_RATIO = 3.0
 # Time constants (s) in the coarse search for time-correlated noise
 COARSE_TAUS_S = (0.2, 0.6, 2.0, 6.0)
 # Tested fractions σ_c² / SIGMA_Z² in the coarse search. σ_c² is the time-correlated part of the
 # total variance SIGMA_Z²
-COARSE_VARIANCE_FRACTIONS = (0.12, 0.35, 0.8)
+COARSE_CORRELATED_VARIANCE_FRACTIONS = (0.12, 0.35, 0.8)
 # Tested multiples of SIGMA_A in the coarse search, for each fraction and time constant above
 COARSE_SIGMA_A_FACTORS = (0.4, 0.9)
 # Tested factors on all σ (SIGMA_A, SIGMA_Z, σ_c) in the coarse search, for each combination above
-COARSE_NOISE_FACTORS = np.geomspace(0.7, 1.6, 12)
+COARSE_SIGMA_FACTORS = np.geomspace(0.7, 1.6, 12)
 # Approximate number of position measurements in the coarse search for time-correlated noise
 COARSE_MEASUREMENT_COUNT = 1000
 # Minimum log-likelihood gain of time-correlated over white noise in the coarse search. Below it, no
 # full fit is run
-MIN_COARSE_LIKELIHOOD_GAIN_NATS = 0.5
+MIN_GAIN_FOR_FULL_FIT_NATS = 0.5
 # If the estimated position noise (SIGMA_Z) is below this limit (m), the source probably low-pass
 # filters its positions
-MAX_LOW_PASS_SIGMA_Z_M = 0.01
+MAX_SIGMA_Z_OF_LOW_PASS_SOURCE_M = 0.01
 # Minimum log-likelihood gain of time-correlated over white noise to report time-correlated noise
 MIN_LIKELIHOOD_GAIN_NATS = 2.0
-# Penalty (nats) on the score of time-correlated noise with shifted timestamps, in the comparison
-# with a low-pass filter: 1 per additional parameter (Akaike 1974)
-OFFSET_PENALTY_NATS = 2.0
+# Penalty (nats) on the score of time-correlated noise if its fit also shifts the timestamps. A
+# model with more parameters fits any data better (Akaike 1974)
+TIME_OFFSET_PENALTY_NATS = 2.0
 # Search range (s) of the time constant of a low pass
 LOW_PASS_TAU_RANGE_S = (0.02, 3.0)
 # Tolerance of ln τ in the search for the time constant τ of a low pass
@@ -72,9 +72,9 @@ MAX_TRUTH_MEASUREMENTS = 300
 # Minimum log-likelihood gain of time-correlated over white noise in the fit to the position errors
 # against ground truth
 MIN_TRUTH_LIKELIHOOD_GAIN_NATS = 5.0
-# If all position errors (m) against ground truth are smaller, ground truth is a copy of the
+# If no position error (m) against ground truth reaches this limit, ground truth is a copy of the
 # positions
-MIN_TRUTH_RESIDUAL_M = 1e-5
+MAX_RESIDUAL_OF_COPIED_TRUTH_M = 1e-5
 # Maximum time difference (s) between a position and the nearest ground truth sample. Interpolation
 # error: 1 cm at 2 m/s²
 MAX_TRUTH_TIME_DIFFERENCE_S = 0.1
@@ -82,13 +82,14 @@ MAX_TRUTH_TIME_DIFFERENCE_S = 0.1
 FLIGHT_PART_COUNT = 12
 # Tested time constants (s) of time-correlated noise in the noise fit to ground truth
 TESTED_TAUS_S = np.geomspace(0.3, 80.0, 17)
-# Tested time-correlated fractions of the error variance in the noise fit to ground truth
-CORRELATED_VARIANCE_FRACTIONS = np.linspace(0.05, 0.999, 20)
+# Tested values of σ_c² / (total error variance) in the noise fit to ground truth; σ_c² is the
+# variance of the time-correlated error
+TESTED_CORRELATED_FRACTIONS = np.linspace(0.05, 0.999, 20)
 
 
 @dataclass(frozen=True)
 class SourceLowPass:
-    """Low-pass filter that the position source applied to its positions, as estimated.
+    """Estimate of the low-pass filter that the source applied to its positions.
 
     Attributes
     ----------
@@ -97,7 +98,7 @@ class SourceLowPass:
     lag_s : float
         Lag of the positions at constant velocity.
     gain_nats : float
-        Gain of log-likelihood over the model with white noise.
+        Log-likelihood with the low-pass filter minus log-likelihood with white noise.
     sigma_z_m : float
         Standard deviation of the white position noise before the low-pass filter.
     """
@@ -115,11 +116,12 @@ class TimeCorrelatedNoise:
     Attributes
     ----------
     tau_s, low_s, high_s : float
-        Correlation time with its 95 % interval; ``high_s`` is infinite without ground truth.
+        Correlation time, and the limits of its 95 % interval. ``high_s`` is infinite without ground
+        truth.
     slow_m, white_m : float
-        Standard deviations of time-correlated and white noise, per axis.
+        Standard deviation of the time-correlated (slow) noise, and of the white noise, per axis.
     gain_nats : float
-        Gain of log-likelihood over white noise alone.
+        Log-likelihood with time-correlated noise minus log-likelihood with white noise.
     low_pass_gain_nats : float
         Log-likelihood of the model with a low-pass filter minus that with time-correlated noise.
     """
@@ -175,28 +177,30 @@ def fit_time_correlation(  # noqa: PLR0915 (two models with common data)
         )
     interval_s = np.diff(time_s, prepend=time_s[0])
     is_outlier = np.isin(time_s, outlier_time_s)
-    is_short_interval = (interval_s < MAX_INTERVAL_TO_MEDIAN_RATIO * np.median(interval_s[1:])) & (
-        interval_s > 0.0
-    )
+    is_interval_without_gap = (
+        interval_s < MAX_INTERVAL_TO_MEDIAN_INTERVAL_RATIO * np.median(interval_s[1:])
+    ) & (interval_s > 0.0)
     directions = np.array([axis.direction for axis in axes])
     motion_cache = MotionCache()
 
     def undo_low_pass(tau_s: float) -> tuple[PositionsAndImuMotion | Unavailable, float]:
-        """Invert a low-pass filter with time constant ``tau_s``.
+        """Undo a low-pass filter with time constant ``tau_s``.
 
-        Return the unfiltered positions u with their IMU motion, and -ln|du/dz|, to be added to
-        their -ln p. |du/dz| is Π 1/(1 - ρ) with ρ = exp(-Δt/τ).
+        Return the positions u before the filter with their IMU motion, and -ln|du/dz|. The
+        likelihood of the measured positions z is -ln p(z) = -ln p(u) - ln|du/dz|.
         """
         rho = np.zeros(len(time_s))
         if tau_s:
-            rho[is_short_interval] = np.exp(-interval_s[is_short_interval] / tau_s)
+            rho[is_interval_without_gap] = np.exp(-interval_s[is_interval_without_gap] / tau_s)
         previous_position_m = np.concatenate([measured_m[:1], measured_m[:-1]])
         unfiltered_position_m = (measured_m - rho[:, None] * previous_position_m) / (1.0 - rho)[
             :, None
         ]
-        # The inverse filter spreads an outlier to the next position, so both are excluded
-        is_used_position = ~(is_outlier | (is_short_interval & np.append(False, is_outlier[:-1])))
-        unfiltered_motion = compute_imu_motion(
+        # An outlier also changes the next unfiltered position, so both are excluded
+        is_used_position = ~(
+            is_outlier | (is_interval_without_gap & np.append(False, is_outlier[:-1]))
+        )
+        motion_of_unfiltered_positions = compute_imu_motion(
             flight,
             time_s[is_used_position],
             unfiltered_position_m[is_used_position],
@@ -204,21 +208,25 @@ def fit_time_correlation(  # noqa: PLR0915 (two models with common data)
             dt_s=settings.dt_s,
             motion_cache=motion_cache,
         )
-        if isinstance(unfiltered_motion, Unavailable):
-            return unfiltered_motion, 0.0
-        # The first position of each IMU segment determines only the initial state, not -ln p
+        if isinstance(motion_of_unfiltered_positions, Unavailable):
+            return motion_of_unfiltered_positions, 0.0
+        # The likelihood does not contain the first position of a segment, which sets the state
         is_used = np.isin(
-            time_s, np.delete(unfiltered_motion.time_s, unfiltered_motion.segment_edges[:-1])
+            time_s,
+            np.delete(
+                motion_of_unfiltered_positions.time_s,
+                motion_of_unfiltered_positions.segment_edges[:-1],
+            ),
         )
-        return unfiltered_motion, len(axes) * float(np.sum(np.log1p(-rho[is_used])))
+        return motion_of_unfiltered_positions, len(axes) * float(np.sum(np.log1p(-rho[is_used])))
 
     imu_motion, _ = undo_low_pass(0.0)
     if isinstance(imu_motion, Unavailable):
         return imu_motion
     tested_offsets_s = sorted({0.0, clock_offset_s})
     sigma_z_m = noise_parameters.sigma_z_m
-    coarse_motion = imu_motion.downsample(COARSE_MEASUREMENT_COUNT)
-    # Result without a low-pass filter, if none is found below
+    downsampled_motion = imu_motion.downsample(COARSE_MEASUREMENT_COUNT)
+    # Default result: the source has no low-pass filter
     source_low_pass = SourceLowPass(0.0, 0.0, 0.0, sigma_z_m)
     correlated_candidates = [
         replace(
@@ -227,23 +235,23 @@ def fit_time_correlation(  # noqa: PLR0915 (two models with common data)
             correlated_sigma_m=sigma_z_m * fraction**0.5,
             tau_s=tau,
         )
-        for fraction, tau in product(COARSE_VARIANCE_FRACTIONS, COARSE_TAUS_S)
+        for fraction, tau in product(COARSE_CORRELATED_VARIANCE_FRACTIONS, COARSE_TAUS_S)
     ]
     # Scores are -ln p of the positions: the lowest is the best
-    (coarse_white_score, _), (coarse_correlated_score, correlated_start_parameters) = (
-        _search_coarse_grid(coarse_motion, tested_offsets_s, candidate_parameters)
+    (coarse_white_noise_score, _), (coarse_correlated_noise_score, correlated_start_parameters) = (
+        _search_coarse_grid(downsampled_motion, tested_offsets_s, candidate_parameters)
         for candidate_parameters in ([noise_parameters], correlated_candidates)
     )
-    no_correlation = Unavailable(
+    no_correlation_found = Unavailable(
         "time-correlated noise of the positions", "the position errors are not time-correlated", ""
     )
-    is_sigma_z_small = sigma_z_m < MAX_LOW_PASS_SIGMA_Z_M
+    is_sigma_z_small = sigma_z_m < MAX_SIGMA_Z_OF_LOW_PASS_SOURCE_M
     if (
-        coarse_white_score - coarse_correlated_score < MIN_COARSE_LIKELIHOOD_GAIN_NATS
+        coarse_white_noise_score - coarse_correlated_noise_score < MIN_GAIN_FOR_FULL_FIT_NATS
         and not is_sigma_z_small
     ):
-        return source_low_pass, no_correlation
-    (white_fit, _), (correlated_fit, offset_s) = (
+        return source_low_pass, no_correlation_found
+    (white_noise_fit, _), (correlated_noise_fit, offset_s) = (
         min(
             (
                 (_fit_noises_at_offset(imu_motion, offset, start_parameters), offset)
@@ -253,20 +261,22 @@ def fit_time_correlation(  # noqa: PLR0915 (two models with common data)
         )
         for start_parameters in (noise_parameters, correlated_start_parameters)
     )
-    white_noise_score = white_fit.compute_score()
-    correlated_noise_score = correlated_fit.compute_score()
-    # A low-pass filter also looks like time-correlated noise. It is only fitted if time-correlated
-    # noise is significant, or if the positions are too smooth for white noise
+    white_noise_score = white_noise_fit.compute_score()
+    correlated_noise_score = correlated_noise_fit.compute_score()
+    # Low-pass filtered noise is also time-correlated or very small. In other cases, the low-pass
+    # filter is not fitted
     is_correlated = white_noise_score - correlated_noise_score >= MIN_LIKELIHOOD_GAIN_NATS
     if not (is_correlated or is_sigma_z_small):
-        return source_low_pass, no_correlation
+        return source_low_pass, no_correlation_found
 
     def fit_low_pass(log_tau: float) -> tuple[float, NoiseParameters]:
-        unfiltered_motion, negative_log_jacobian = undo_low_pass(float(np.exp(log_tau)))
-        # Availability depends only on the measurement times, which are the same as for τ = 0
-        assert not isinstance(unfiltered_motion, Unavailable)
-        noise_fit = _fit_noises_at_offset(unfiltered_motion, 0.0, white_fit.noise_parameters)
-        return noise_fit.compute_score() + negative_log_jacobian, noise_fit.noise_parameters
+        motion_of_unfiltered_positions, minus_log_jacobian = undo_low_pass(float(np.exp(log_tau)))
+        # The IMU motion is available: it was for τ = 0, which has the same measurement times
+        assert not isinstance(motion_of_unfiltered_positions, Unavailable)
+        noise_fit = _fit_noises_at_offset(
+            motion_of_unfiltered_positions, 0.0, white_noise_fit.noise_parameters
+        )
+        return noise_fit.compute_score() + minus_log_jacobian, noise_fit.noise_parameters
 
     low_log_tau, high_log_tau = np.log(LOW_PASS_TAU_RANGE_S)
     log_tau = minimize_scalar(
@@ -276,9 +286,9 @@ def fit_time_correlation(  # noqa: PLR0915 (two models with common data)
     ).x
     low_pass_score, low_pass_parameters = fit_low_pass(log_tau)
     if low_pass_score < white_noise_score:
-        median_s = float(np.median(np.diff(time_s)))
-        lag1_correlation = float(np.exp(-median_s / np.exp(log_tau)))
-        lag_s = median_s * lag1_correlation / (1.0 - lag1_correlation)
+        median_interval_s = float(np.median(np.diff(time_s)))
+        lag1_correlation = float(np.exp(-median_interval_s / np.exp(log_tau)))
+        lag_s = median_interval_s * lag1_correlation / (1.0 - lag1_correlation)
         source_low_pass = SourceLowPass(
             lag1_correlation,
             lag_s,
@@ -286,8 +296,8 @@ def fit_time_correlation(  # noqa: PLR0915 (two models with common data)
             low_pass_parameters.sigma_z_m,
         )
     if not is_correlated:
-        return source_low_pass, no_correlation
-    fitted_parameters = correlated_fit.noise_parameters
+        return source_low_pass, no_correlation_found
+    fitted_parameters = correlated_noise_fit.noise_parameters
     return source_low_pass, TimeCorrelatedNoise(
         fitted_parameters.tau_s,
         fitted_parameters.tau_s,
@@ -295,7 +305,7 @@ def fit_time_correlation(  # noqa: PLR0915 (two models with common data)
         fitted_parameters.correlated_sigma_m,
         fitted_parameters.sigma_z_m,
         white_noise_score - correlated_noise_score,
-        correlated_noise_score - low_pass_score + (OFFSET_PENALTY_NATS if offset_s else 0.0),
+        correlated_noise_score - low_pass_score + (TIME_OFFSET_PENALTY_NATS if offset_s else 0.0),
     )
 
 
@@ -305,20 +315,20 @@ def fit_time_correlation_to_truth(
     outlier_time_s: Array,
     clock_offset_s: float,
     jumps: Sequence[Jump],
-    imu_fit: TimeCorrelatedNoise | Unavailable,
+    noise_from_imu: TimeCorrelatedNoise | Unavailable,
     low_pass: SourceLowPass,
 ) -> TimeCorrelatedNoise | Unavailable:
     """Fit time-correlated noise to the position errors against ground truth.
 
-    Frame errors and time offsets are removed from the errors. ``imu_fit`` and ``low_pass`` are the
-    results of :func:`fit_time_correlation`. ``imu_fit`` is returned if its log-likelihood gain over
-    white noise is larger.
+    Frame errors and time offsets are removed from the errors. ``noise_from_imu`` and ``low_pass``
+    are the results of :func:`fit_time_correlation`. ``noise_from_imu`` is returned if its
+    log-likelihood gain over white noise is larger.
     """
     min_likelihood_gain_nats = MIN_TRUTH_LIKELIHOOD_GAIN_NATS
-    low_pass_gain_nats = low_pass.gain_nats
-    if isinstance(imu_fit, TimeCorrelatedNoise):
-        min_likelihood_gain_nats = max(MIN_TRUTH_LIKELIHOOD_GAIN_NATS, imu_fit.gain_nats)
-        low_pass_gain_nats = imu_fit.low_pass_gain_nats
+    low_pass_likelihood_gain_nats = low_pass.gain_nats
+    if isinstance(noise_from_imu, TimeCorrelatedNoise):
+        min_likelihood_gain_nats = max(MIN_TRUTH_LIKELIHOOD_GAIN_NATS, noise_from_imu.gain_nats)
+        low_pass_likelihood_gain_nats = noise_from_imu.low_pass_gain_nats
     true_track = pd.concat([truth["position_m"] for truth in truths], axis=1).dropna()
     measurement_time_s = np.setdiff1d(axes[0].measurement_time_s, outlier_time_s)
     measurement_time_s = measurement_time_s[
@@ -330,8 +340,9 @@ def fit_time_correlation_to_truth(
     measurement_time_s = measurement_time_s[
         :: max(1, -(-len(measurement_time_s) // MAX_TRUTH_MEASUREMENTS))
     ]
-    if len(measurement_time_s) < MIN_MEASUREMENTS:
-        return imu_fit
+    position_count = len(measurement_time_s)
+    if position_count < MIN_MEASUREMENTS:
+        return noise_from_imu
     measured_m = np.transpose(
         [axis.measurement_m[np.isin(axis.measurement_time_s, measurement_time_s)] for axis in axes]
     )
@@ -339,70 +350,67 @@ def fit_time_correlation_to_truth(
     true_m, true_velocity_m_s = (
         true_spline(measurement_time_s + clock_offset_s, order) for order in (0, 1)
     )
-    flight_part_indicators = np.eye(FLIGHT_PART_COUNT)[
-        FLIGHT_PART_COUNT * np.arange(len(measurement_time_s)) // len(measurement_time_s)
+    is_in_flight_part = np.eye(FLIGHT_PART_COUNT)[
+        FLIGHT_PART_COUNT * np.arange(position_count) // position_count
     ]
-    time_offset_columns = np.einsum(
-        "tp,ta->tpa", flight_part_indicators, true_velocity_m_s
-    ).reshape(len(measurement_time_s), -1)
+    time_offset_columns = np.einsum("tp,ta->tpa", is_in_flight_part, true_velocity_m_s).reshape(
+        position_count, -1
+    )
     jump_columns = make_unit_steps(measurement_time_s, [jump.time_s for jump in jumps])
-    nuisance_columns = np.column_stack(
+    systematic_error_columns = np.column_stack(
         [np.ones_like(measurement_time_s), true_m, time_offset_columns, jump_columns]
     )
-    residual_basis = np.linalg.qr(nuisance_columns, mode="complete")[0][
-        :, nuisance_columns.shape[1] :
+    basis_without_systematic_errors = np.linalg.qr(systematic_error_columns, mode="complete")[0][
+        :, systematic_error_columns.shape[1] :
     ]
-    residuals = residual_basis.T @ (measured_m - true_m)
-    if np.abs(residuals).max() < MIN_TRUTH_RESIDUAL_M:
-        return imu_fit
-    grid_scores = []
-    half_axis_and_residual_counts = 0.5 * np.array([len(axes), len(residuals)])
+    residuals = basis_without_systematic_errors.T @ (measured_m - true_m)
+    if np.abs(residuals).max() < MAX_RESIDUAL_OF_COPIED_TRUTH_M:
+        return noise_from_imu
+    scores_and_variances = []
+    half_axis_count_and_half_residual_count = 0.5 * np.array([len(axes), len(residuals)])
     for tested_tau_s in TESTED_TAUS_S:
         correlation_matrix = (
-            residual_basis.T
+            basis_without_systematic_errors.T
             @ np.exp(-np.abs(measurement_time_s[:, None] - measurement_time_s) / tested_tau_s)
-            @ residual_basis
+            @ basis_without_systematic_errors
         )
         eigenvalues, eigenvectors = np.linalg.eigh(correlation_matrix)
-        relative_variance = (
-            1.0
-            - CORRELATED_VARIANCE_FRACTIONS
-            + CORRELATED_VARIANCE_FRACTIONS * eigenvalues[:, None]
+        relative_noise_variance = (
+            1.0 - TESTED_CORRELATED_FRACTIONS + TESTED_CORRELATED_FRACTIONS * eigenvalues[:, None]
         )
-        mean_squares = (
-            ((eigenvectors.T @ residuals) ** 2).T @ (1.0 / relative_variance) / len(residuals)
+        normalised_mean_squares = (
+            ((eigenvectors.T @ residuals) ** 2).T @ (1.0 / relative_noise_variance) / len(residuals)
         )
-        scores = half_axis_and_residual_counts @ [
-            np.log(relative_variance).sum(axis=0),
-            np.log(mean_squares).sum(axis=0),
+        scores = half_axis_count_and_half_residual_count @ [
+            np.log(relative_noise_variance).sum(axis=0),
+            np.log(normalised_mean_squares).sum(axis=0),
         ]
-        grid_scores.append((scores, mean_squares.mean(axis=0)))
+        scores_and_variances.append((scores, normalised_mean_squares.mean(axis=0)))
     # Rows are time constants, columns time-correlated fractions of the variance
-    scores, mean_squares = np.transpose(grid_scores, (1, 0, 2))
-    tau_index, fraction_index = divmod(int(np.argmin(scores)), len(CORRELATED_VARIANCE_FRACTIONS))
-    likelihood_gains_nats = half_axis_and_residual_counts[1] * np.log(
+    scores, normalised_mean_squares = np.transpose(scores_and_variances, (1, 0, 2))
+    tau_index, correlated_fraction_index = divmod(
+        int(np.argmin(scores)), len(TESTED_CORRELATED_FRACTIONS)
+    )
+    likelihood_gains_nats = half_axis_count_and_half_residual_count[1] * np.log(
         np.mean(residuals**2, axis=0)
     ).sum() - scores.min(axis=1)
-    if likelihood_gains_nats.max() < min_likelihood_gain_nats:
-        return imu_fit
+    best_gain_nats = likelihood_gains_nats.max()
+    if best_gain_nats < min_likelihood_gain_nats:
+        return noise_from_imu
     first_tau_index, last_tau_index = np.flatnonzero(
-        likelihood_gains_nats > likelihood_gains_nats.max() - MAX_LOG_LIKELIHOOD_DROP
+        likelihood_gains_nats > best_gain_nats - MAX_LOG_LIKELIHOOD_DROP
     )[[0, -1]]
-    # Each end of the 95 % interval of τ is between two tested values: return the outer of them
+    # Each end of the 95 % interval of τ is between two tested values: return the outer value
     tau_s = np.append(TESTED_TAUS_S, np.inf)[
         [tau_index, max(first_tau_index - 1, 0), last_tau_index + 1]
     ]
+    fraction = TESTED_CORRELATED_FRACTIONS[correlated_fraction_index]
     sigmas_m = np.sqrt(
-        mean_squares[tau_index, fraction_index]
-        * np.array(
-            [
-                CORRELATED_VARIANCE_FRACTIONS[fraction_index],
-                1.0 - CORRELATED_VARIANCE_FRACTIONS[fraction_index],
-            ]
-        )
+        normalised_mean_squares[tau_index, correlated_fraction_index]
+        * np.array([fraction, 1.0 - fraction])
     )
     return TimeCorrelatedNoise(
-        *np.r_[tau_s, sigmas_m, likelihood_gains_nats.max(), low_pass_gain_nats].tolist()
+        *np.r_[tau_s, sigmas_m, best_gain_nats, low_pass_likelihood_gain_nats].tolist()
     )
 
 
@@ -434,11 +442,11 @@ def _search_coarse_grid(
             )
             total_scores = fit_constant_errors(
                 [positions], noise_parameters, imu_motion.measurement_weights
-            ).compute_scores(COARSE_NOISE_FACTORS)[:, 0]
+            ).compute_scores(COARSE_SIGMA_FACTORS)[:, 0]
             scored_parameters.append(
                 (
                     float(total_scores.min()),
-                    float(COARSE_NOISE_FACTORS[np.argmin(total_scores)]),
+                    float(COARSE_SIGMA_FACTORS[np.argmin(total_scores)]),
                     noise_parameters,
                 )
             )

@@ -17,7 +17,7 @@ class _LazyDistribution:
 
     def __getattr__(self, attribute: str) -> Any:
         stats = import_module("scipy.stats")
-        # filterpy calls logpdf while it is imported, before scipy.stats can be loaded
+        # filterpy calls logpdf already during its import, when scipy.stats cannot be loaded
         if stats.__spec__ is None:
             return lambda *_, **__: 0.0
         return getattr(getattr(stats, self._name), attribute)

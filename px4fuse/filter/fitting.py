@@ -41,30 +41,30 @@ MAX_COARSE_ITERATIONS = 3
 # Minimum ratio of the outliers' σ to SIGMA_Z: outliers with a smaller σ look like normal noise
 MIN_OUTLIER_SIGMA_RATIO = 3.0
 # Initial value of the fraction of outliers
-START_OUTLIER_FRACTION = 0.005
+INITIAL_OUTLIER_FRACTION = 0.005
 # Initial value of the ratio of the outliers' σ to SIGMA_Z
-START_OUTLIER_SIGMA_RATIO = 10.0
+INITIAL_OUTLIER_SIGMA_RATIO = 10.0
 # Upper limit of the estimated fraction of outliers
 MAX_OUTLIER_FRACTION = 0.4
-# Outliers are classified with at most this multiple of the SIGMA_Z from the median squared error,
-# because outliers increase the SIGMA_Z with the maximum likelihood
-MAX_SIGMA_Z_TO_ROBUST_RATIO = 1.2
+# Outliers increase the maximum-likelihood estimate of SIGMA_Z. To classify outliers, SIGMA_Z is
+# limited to this multiple of the value from the median squared error
+MAX_SIGMA_Z_TO_MEDIAN_BASED_SIGMA_Z_RATIO = 1.2
 # Expectation maximisation has converged if no outlier probability changes by more than this
 MAX_OUTLIER_PROBABILITY_CHANGE = 0.01
 # Value of -ln p per measurement if the likelihood cannot be computed: larger than any real value
 UNCOMPUTABLE_SCORE = 1e6
 # Step of ln σ for numerical derivatives of the log-likelihood
-DERIVATIVE_LOG_STEP = 1e-4
-# -ln p is interpolated on a grid over ln(SIGMA_A/SIGMA_Z) and ln SIGMA_Z: number of nodes in each
-# dimension, and their spacing
-NODE_COUNT_AND_LOG_STEP = 10, 0.25
-# Smaller grid for an approximate maximum of the likelihood, until the outlier probabilities have
-# converged
-COARSE_NODE_COUNT_AND_LOG_STEP = 6, 0.2
+LOG_STEP_FOR_DERIVATIVES = 1e-4
+# The negative log-likelihood is interpolated on a grid over ln(SIGMA_A/SIGMA_Z) and ln SIGMA_Z.
+# Number of grid nodes in each dimension, and distance between two nodes
+GRID_NODE_COUNT_AND_SPACING = 10, 0.25
+# Number and distance of the nodes of a smaller grid, which is less accurate. It is used until the
+# outlier probabilities have converged
+COARSE_GRID_NODE_COUNT_AND_SPACING = 6, 0.2
 # A noise fit to a long flight is initialised with a fit to this number of its first measurements
 INITIAL_FIT_MEASUREMENT_COUNT = 2000
 # Precision of a known initial position (1/m²) and velocity (s²/m²): σ of 1 µm and 1 µm/s
-KNOWN_START_PRECISION = 1e12
+KNOWN_INITIAL_STATE_PRECISION = 1e12
 
 
 @dataclass(frozen=True)
@@ -74,9 +74,9 @@ class NoiseParameters:
     Attributes
     ----------
     sigma_a_m_s2 : float
-        Noise of the acceleration over one DT.
+        Standard deviation of the acceleration error over one prediction step of length DT.
     sigma_z_m : float
-        White noise of a position.
+        Standard deviation of the white noise of a position.
     random_walk_m : float
         Random walk of the source (m/√s); 0 if the source does not drift.
     correlated_sigma_m, tau_s : float
@@ -91,7 +91,7 @@ class NoiseParameters:
 
 
 # Search range of each field of NoiseParameters, in the unit of the field
-SEARCH_RANGES = {
+NOISE_SEARCH_RANGES = {
     "sigma_a_m_s2": SIGMA_A_SEARCH_RANGE_M_S2,
     "sigma_z_m": SIGMA_Z_SEARCH_RANGE_M,
     "random_walk_m": (1e-4, 1.0),
@@ -103,8 +103,8 @@ SEARCH_RANGES = {
 class NegativeLogLikelihood:
     """Negative log-likelihood (-ln p) of the measurements as a function of the noise parameters.
 
-    Constant terms are omitted. For white noise, -ln p is computed at the nodes of a grid over
-    ln(SIGMA_A/SIGMA_Z) and ln SIGMA_Z, and interpolated by polynomials to the accuracy of rounding.
+    Constant terms are omitted. For white noise, -ln p is computed on a grid over
+    ln(SIGMA_A/SIGMA_Z) and ln SIGMA_Z. Between the grid nodes it is interpolated by polynomials.
 
     Parameters
     ----------
@@ -129,34 +129,38 @@ class NegativeLogLikelihood:
         self.measurement_weights = measurement_weights
         self.sigma_z_m = sigma_z_m
         self.is_interpolated = not any(
-            positions.added_process_noise.any() for positions in axis_positions
+            positions.process_noise_independent_of_sigma_a.any() for positions in axis_positions
         )
         self.node_count, self.node_spacing = node_count, node_spacing = (
-            COARSE_NODE_COUNT_AND_LOG_STEP if is_coarse else NODE_COUNT_AND_LOG_STEP
+            COARSE_GRID_NODE_COUNT_AND_SPACING if is_coarse else GRID_NODE_COUNT_AND_SPACING
         )
 
         @cache
-        def fit_axes_at_ratio(sigma_ratio_index: int) -> list[PositionFit]:
-            ratio = float(np.exp(node_spacing * sigma_ratio_index))
+        def fit_axes_with_sigma_ratio(log_sigma_ratio_node: int) -> list[PositionFit]:
+            sigma_a_to_sigma_z_ratio = float(np.exp(node_spacing * log_sigma_ratio_node))
             return [
-                fit_with_sigma_ratios([positions], [ratio], 0.0, measurement_weights, sigma_z_m)[0]
+                fit_with_sigma_ratios(
+                    [positions], [sigma_a_to_sigma_z_ratio], 0.0, measurement_weights, sigma_z_m
+                )[0]
                 for positions in axis_positions
             ]
 
         @cache
-        def compute_scores_at_ratio(sigma_ratio_index: int, sigma_z_index: int) -> Array:
-            sigma_factors = np.exp(node_spacing * (sigma_z_index + np.arange(node_count)))
-            axis_scores = [
+        def compute_scores_with_sigma_ratio(
+            log_sigma_ratio_node: int, log_sigma_z_node: int
+        ) -> Array:
+            sigma_factors = np.exp(node_spacing * (log_sigma_z_node + np.arange(node_count)))
+            scores_by_axis = [
                 axis_fit.compute_scores(sigma_factors)[:, 0]
-                for axis_fit in fit_axes_at_ratio(sigma_ratio_index)
+                for axis_fit in fit_axes_with_sigma_ratio(log_sigma_ratio_node)
             ]
-            return np.asarray(np.sum(axis_scores, axis=0))
+            return np.asarray(np.sum(scores_by_axis, axis=0))
 
         @cache
-        def compute_scores_at_nodes(sigma_ratio_index: int, sigma_z_index: int) -> Array:
+        def compute_scores_at_nodes(log_sigma_ratio_node: int, log_sigma_z_node: int) -> Array:
             return np.array(
                 [
-                    compute_scores_at_ratio(sigma_ratio_index + node, sigma_z_index)
+                    compute_scores_with_sigma_ratio(log_sigma_ratio_node + node, log_sigma_z_node)
                     for node in range(node_count)
                 ]
             )
@@ -164,7 +168,7 @@ class NegativeLogLikelihood:
         self._compute_scores_at_nodes = compute_scores_at_nodes
 
     def __call__(self, noise_parameters: NoiseParameters) -> float:
-        """Return -ln p of the measurements without its constant term, a multiple of ln 2π."""
+        """Return -ln p of the measurements, without the constant term that contains ln 2π."""
         if (
             noise_parameters.random_walk_m
             or noise_parameters.correlated_sigma_m
@@ -173,23 +177,23 @@ class NegativeLogLikelihood:
             return negative_log_likelihood(
                 self.axis_positions, noise_parameters, self.measurement_weights
             )
-        sigma_z_coordinate = log(noise_parameters.sigma_z_m) / self.node_spacing
-        sigma_ratio_coordinate = (
-            log(noise_parameters.sigma_a_m_s2) / self.node_spacing - sigma_z_coordinate
+        log_sigma_z_in_node_steps = log(noise_parameters.sigma_z_m) / self.node_spacing
+        log_sigma_ratio_in_node_steps = (
+            log(noise_parameters.sigma_a_m_s2) / self.node_spacing - log_sigma_z_in_node_steps
         )
-        node_offset = (self.node_count - 1) // 2
-        first_sigma_ratio_node = floor(sigma_ratio_coordinate) - node_offset
-        first_sigma_z_node = floor(sigma_z_coordinate) - node_offset
-        sigma_ratio_weights = _compute_interpolation_weights(
-            sigma_ratio_coordinate - first_sigma_ratio_node, self.node_count
+        grid_nodes_below_value = (self.node_count - 1) // 2
+        first_log_sigma_ratio_node = floor(log_sigma_ratio_in_node_steps) - grid_nodes_below_value
+        first_log_sigma_z_node = floor(log_sigma_z_in_node_steps) - grid_nodes_below_value
+        log_sigma_ratio_interpolation_weights = _compute_interpolation_weights(
+            log_sigma_ratio_in_node_steps - first_log_sigma_ratio_node, self.node_count
         )
-        sigma_z_weights = _compute_interpolation_weights(
-            sigma_z_coordinate - first_sigma_z_node, self.node_count
+        log_sigma_z_interpolation_weights = _compute_interpolation_weights(
+            log_sigma_z_in_node_steps - first_log_sigma_z_node, self.node_count
         )
         return float(
-            sigma_ratio_weights
-            @ self._compute_scores_at_nodes(first_sigma_ratio_node, first_sigma_z_node)
-            @ sigma_z_weights
+            log_sigma_ratio_interpolation_weights
+            @ self._compute_scores_at_nodes(first_log_sigma_ratio_node, first_log_sigma_z_node)
+            @ log_sigma_z_interpolation_weights
         )
 
 
@@ -199,12 +203,12 @@ def _compute_barycentric_weights(node_count: int) -> Array:
     return np.asarray((-1.0) ** nodes * comb(node_count - 1, nodes))
 
 
-def _compute_interpolation_weights(node_coordinate: float, node_count: int) -> Array:
-    """Return the weights of the values at nodes 0, 1, ... to interpolate at ``node_coordinate``.
+def _compute_interpolation_weights(position_in_node_steps: float, node_count: int) -> Array:
+    """Return the weights of the values at nodes 0, 1, ... for an interpolated value between nodes.
 
     Method: barycentric interpolation, Berrut and Trefethen (2004).
     """
-    node_distances = node_coordinate - np.arange(node_count)
+    node_distances = position_in_node_steps - np.arange(node_count)
     if not node_distances.all():
         return np.asarray(node_distances == 0.0, dtype=np.float64)
     weights = _compute_barycentric_weights(node_count) / node_distances
@@ -214,27 +218,33 @@ def _compute_interpolation_weights(node_coordinate: float, node_count: int) -> A
 def fit_with_sigma_ratios(
     position_batches: Iterable[PositionsAndIncrements],
     sigma_a_to_sigma_z_ratios: Sequence[float],
-    random_walk_to_sigma_z: float,
+    random_walk_to_sigma_z_ratio: float,
     measurement_weights: Array,
     sigma_z_m: float,
 ) -> list[PositionFit]:
-    """Fit the constant errors (biases, ...) with each ratio SIGMA_A / SIGMA_Z (1/s²).
+    """Fit constant errors (such as biases) to positions, for each ratio SIGMA_A / SIGMA_Z (1/s²).
 
-    All σ are divided by SIGMA_Z. ``position_batches`` contains the same positions for different
-    time offsets of the source; each returned fit contains all offsets.
-    ``random_walk_to_sigma_z`` (1/√s) is the random walk of the source, divided by SIGMA_Z.
+    All σ are divided by SIGMA_Z. The batches contain the same positions with different time offsets
+    of the source. Each returned fit (one per ratio) contains all time offsets.
+    ``random_walk_to_sigma_z_ratio`` (1/√s) is the random walk of the source, divided by SIGMA_Z.
     """
-    scaled_batches = (
-        positions.normalise_by_sigma_z(sigma_z_m, random_walk_to_sigma_z, measurement_weights)
+    batches_over_sigma_z = (
+        positions.divide_sigmas_by_sigma_z(
+            sigma_z_m, random_walk_to_sigma_z_ratio, measurement_weights
+        )
         for positions in position_batches
     )
     fits_by_batch = [
-        [fit_positions(scaled_positions, ratio, variance_m2) for ratio in sigma_a_to_sigma_z_ratios]
-        for scaled_positions, variance_m2 in scaled_batches
+        [
+            fit_positions(positions_over_sigma_z, ratio, variance_m2)
+            for ratio in sigma_a_to_sigma_z_ratios
+        ]
+        for positions_over_sigma_z, variance_m2 in batches_over_sigma_z
     ]
     return [
         replace(
-            batch_fits[0], gram=np.concatenate([batch_fit.gram for batch_fit in batch_fits], axis=1)
+            batch_fits[0],
+            gram_matrix=np.concatenate([batch_fit.gram_matrix for batch_fit in batch_fits], axis=1),
         )
         for batch_fits in zip(*fits_by_batch, strict=True)
     ]
@@ -245,9 +255,10 @@ def fit_constant_errors(
     noise_parameters: NoiseParameters,
     measurement_weights: Array,
 ) -> PositionFit:
-    """Fit the constant errors (biases, ...) with given noise parameters, for all time offsets.
+    """Fit constant errors (such as biases) to positions, with given noise parameters.
 
-    See :func:`fit_with_sigma_ratios`. The variance of a measurement is SIGMA_Z² / weight.
+    The batches contain the same positions with different time offsets of the source. The returned
+    fit contains all time offsets. The variance of a measurement is SIGMA_Z² / weight.
     """
     sigma_z_m = noise_parameters.sigma_z_m
     if noise_parameters.correlated_sigma_m:
@@ -273,7 +284,7 @@ def negative_log_likelihood(
     noise_parameters: NoiseParameters,
     measurement_weights: Array,
 ) -> float:
-    """Return -ln p of the measurements of all axes without its multiple of ln 2π."""
+    """Return -ln p of the measurements of all axes, without the constant term with ln 2π."""
     return float(
         sum(
             fit_constant_errors(
@@ -297,16 +308,16 @@ class NoiseFit:
         1 for a good measurement, 1/``outlier_sigma_ratio``² for an outlier.
     score : NegativeLogLikelihood
         -ln p as a function of the noise parameters.
-    sigma_z_variance_inflation : float
-        Factor (at least 1) by which the uncertain classification of measurements as outliers
-        increases the variance of ln SIGMA_Z.
+    log_sigma_z_variance_factor : float
+        Factor (at least 1) on the variance of ln SIGMA_Z, because the classification of outliers is
+        uncertain.
     """
 
     noise_parameters: NoiseParameters
     measurement_weights: Array
     outlier_probability: Array
     score: NegativeLogLikelihood
-    sigma_z_variance_inflation: float
+    log_sigma_z_variance_factor: float
     outlier_fraction: float
     outlier_sigma_ratio: float
 
@@ -315,14 +326,16 @@ class NoiseFit:
         return self.score(self.noise_parameters)
 
 
-def convert_to_positions(preintegrated_motion: PreintegratedMotion) -> PositionsAndIncrements:
-    """Convert KF's measurements and integrated acceleration to positions of one segment.
+def convert_to_positions_and_increments(
+    preintegrated_motion: PreintegratedMotion,
+) -> PositionsAndIncrements:
+    """Convert the inputs of KF to the inputs of :func:`fit_constant_errors`, as one segment.
 
-    The unknown constants of the segment are the errors of the initial position and velocity.
+    The constant errors of the segment are the errors of the initial position and velocity.
     """
     measurement_count = len(preintegrated_motion.measurement_m)
     prior_precision = np.zeros((measurement_count + 1, 2))
-    prior_precision[0] = KNOWN_START_PRECISION
+    prior_precision[0] = KNOWN_INITIAL_STATE_PRECISION
     measured_m = np.append(
         np.nan, preintegrated_motion.measurement_m - preintegrated_motion.initial_state.position_m
     )[:, None]
@@ -338,8 +351,8 @@ def convert_to_positions(preintegrated_motion: PreintegratedMotion) -> Positions
             measurement_m=measured_m,
             segment_starts=np.array([0]),
             interval_s=preintegrated_motion.interval_s,
-            unit_process_noise=preintegrated_motion.unit_process_noise.T,
-            added_process_noise=preintegrated_motion.added_process_noise.T,
+            process_noise_per_sigma_a_squared=preintegrated_motion.process_noise_per_sigma_a_squared.T,
+            process_noise_independent_of_sigma_a=preintegrated_motion.process_noise_independent_of_sigma_a.T,
             prior_precision=prior_precision,
             constant_prior_sigmas=np.sqrt([INITIAL_COVARIANCE[0], INITIAL_COVARIANCE[2]]),
             delta_position_m=dp,
@@ -371,10 +384,10 @@ def maximise_likelihood(
         True to estimate the outliers; False to keep the weights.
     """
     outlier_probability = np.zeros_like(measurement_weights)
-    outlier_fraction, outlier_sigma_ratio = START_OUTLIER_FRACTION, START_OUTLIER_SIGMA_RATIO
+    outlier_fraction, outlier_sigma_ratio = INITIAL_OUTLIER_FRACTION, INITIAL_OUTLIER_SIGMA_RATIO
     is_long = len(measurement_weights) > 2 * INITIAL_FIT_MEASUREMENT_COUNT
     if is_long:
-        first_positions = [
+        positions_of_first_fit = [
             positions.first(
                 len(positions.measurement_m)
                 - len(measurement_weights)
@@ -383,16 +396,14 @@ def maximise_likelihood(
             for positions in axis_positions
         ]
         first_fit = maximise_likelihood(
-            first_positions,
+            positions_of_first_fit,
             start_parameters,
             measurement_weights[:INITIAL_FIT_MEASUREMENT_COUNT],
             fits_outliers,
         )
         start_parameters = first_fit.noise_parameters
-        outlier_fraction, outlier_sigma_ratio = (
-            first_fit.outlier_fraction,
-            first_fit.outlier_sigma_ratio,
-        )
+        outlier_fraction = first_fit.outlier_fraction
+        outlier_sigma_ratio = first_fit.outlier_sigma_ratio
     noise_parameters = start_parameters
     for iteration in range(MAX_OUTLIER_ITERATIONS if fits_outliers else 0):
         likelihood = NegativeLogLikelihood(
@@ -416,10 +427,11 @@ def maximise_likelihood(
         # no measurement is an outlier
         if robust_variance_m2 > SIGMA_Z_SEARCH_RANGE_M[1] ** 2:
             break
-        limited_variance_m2 = min(
-            noise_parameters.sigma_z_m**2, MAX_SIGMA_Z_TO_ROBUST_RATIO**2 * robust_variance_m2
+        limited_sigma_z_variance_m2 = min(
+            noise_parameters.sigma_z_m**2,
+            MAX_SIGMA_Z_TO_MEDIAN_BASED_SIGMA_Z_RATIO**2 * robust_variance_m2,
         )
-        normalised_squares = expected_squared_errors_m2 / limited_variance_m2
+        normalised_squares = expected_squared_errors_m2 / limited_sigma_z_variance_m2
         previous_probability = outlier_probability
         for _ in range(MAX_OUTLIER_ITERATIONS if is_long else 1):
             outlier_probability = _compute_outlier_probability(
@@ -430,10 +442,12 @@ def maximise_likelihood(
                     outlier_probability.mean(), 0.5 / len(measurement_weights), MAX_OUTLIER_FRACTION
                 )
             )
-            outlier_mean_square = np.sum(outlier_probability * normalised_squares) / max(
+            outlier_mean_normalised_square = np.sum(outlier_probability * normalised_squares) / max(
                 np.sum(outlier_probability * measured_axis_counts), 1e-9
             )
-            outlier_sigma_ratio = max(MIN_OUTLIER_SIGMA_RATIO, float(np.sqrt(outlier_mean_square)))
+            outlier_sigma_ratio = max(
+                MIN_OUTLIER_SIGMA_RATIO, float(np.sqrt(outlier_mean_normalised_square))
+            )
         if (
             outlier_probability.sum() < 1.0
             and outlier_probability.max() < 0.5
@@ -447,17 +461,19 @@ def maximise_likelihood(
             < MAX_OUTLIER_PROBABILITY_CHANGE
         ):
             break
-        noise_parameters = replace(noise_parameters, sigma_z_m=float(np.sqrt(limited_variance_m2)))
+        noise_parameters = replace(
+            noise_parameters, sigma_z_m=float(np.sqrt(limited_sigma_z_variance_m2))
+        )
     likelihood = NegativeLogLikelihood(
         axis_positions, measurement_weights, start_parameters.sigma_z_m, is_coarse=is_long
     )
     noise_parameters = _maximise_by_gradient(likelihood, noise_parameters)
-    sigma_z_variance_inflation = 1.0
+    log_sigma_z_variance_factor = 1.0
     if outlier_probability.any():
         expected_squared_errors_m2, measured_axis_counts = _estimate_squared_errors(
             axis_positions, noise_parameters, measurement_weights
         )
-        sigma_z_variance_inflation = compute_variance_inflation(
+        log_sigma_z_variance_factor = compute_log_sigma_z_variance_factor(
             expected_squared_errors_m2 / noise_parameters.sigma_z_m**2,
             measured_axis_counts,
             outlier_probability,
@@ -468,7 +484,7 @@ def maximise_likelihood(
         measurement_weights,
         outlier_probability,
         likelihood,
-        sigma_z_variance_inflation,
+        log_sigma_z_variance_factor,
         outlier_fraction,
         outlier_sigma_ratio,
     )
@@ -501,21 +517,24 @@ def _estimate_squared_errors(
     noise_parameters: NoiseParameters,
     measurement_weights: Array,
 ) -> tuple[Array, Array]:
-    """Return for each measurement the expected squared error (m²) and the number of measured axes.
+    """Return the expected squared error (m²) of each measurement, and its number of axes.
 
-    The squared error is summed over the axes.
+    The squared error is summed over the measured axes.
     """
     squared_errors_and_axis_counts = []
     for positions in axis_positions:
-        constants = fit_constant_errors(
+        constant_errors = fit_constant_errors(
             [positions], noise_parameters, measurement_weights
         ).estimate_segment_constants()[:, 0]
-        scaled_positions, scaled_variance = positions.normalise_by_sigma_z(
+        positions_with_random_walk, measurement_variance_m2 = positions.divide_sigmas_by_sigma_z(
             1.0, noise_parameters.random_walk_m, measurement_weights / noise_parameters.sigma_z_m**2
         )
         squared_errors_and_axis_counts.append(
             estimate_squared_errors(
-                scaled_positions, noise_parameters.sigma_a_m_s2, scaled_variance, constants
+                positions_with_random_walk,
+                noise_parameters.sigma_a_m_s2,
+                measurement_variance_m2,
+                constant_errors,
             )
         )
     expected_squared_errors_m2, measured_axis_counts = np.sum(
@@ -538,41 +557,44 @@ def _compute_outlier_probability(
     )
 
 
-def compute_variance_inflation(
+def compute_log_sigma_z_variance_factor(
     normalised_squares: Array,
     measured_axis_counts: Array,
     outlier_probability: Array,
     outlier_sigma_ratio: float,
 ) -> float:
-    """Return the factor on the variance of ln SIGMA_Z due to the uncertain outlier classification.
+    """Return the variance of ln SIGMA_Z divided by its variance if all outliers were known.
 
-    The factor is relative to the variance with known outliers. Observed information is complete
-    minus missing information (Louis 1982). The parameters are ln SIGMA_Z,
-    ln ``outlier_sigma_ratio`` and the log odds of an outlier. ``normalised_squares`` is the squared
-    error of each measurement divided by SIGMA_Z², summed over its ``measured_axis_counts`` axes.
+    The information matrix is that of known outliers minus the missing information (Louis 1982).
+    Its parameters are ln SIGMA_Z, ln ``outlier_sigma_ratio`` and the log odds of an outlier.
+    ``normalised_squares`` is the squared error of each measurement, divided by SIGMA_Z² and summed
+    over its ``measured_axis_counts`` axes.
     """
     outlier_fraction = np.mean(outlier_probability)
-    sigma_information = 2.0 * float(np.sum(measured_axis_counts))
-    inverse_square_ratio = outlier_sigma_ratio**-2.0
-    complete_information = np.zeros((3, 3))
-    complete_information[:2, :2] = 2.0 * np.sum(measured_axis_counts * outlier_probability)
-    complete_information[0, 0] = sigma_information
-    complete_information[2, 2] = (
+    log_sigma_z_information = 2.0 * float(np.sum(measured_axis_counts))
+    inverse_outlier_variance_ratio = outlier_sigma_ratio**-2.0
+    information_with_known_outliers = np.zeros((3, 3))
+    information_with_known_outliers[:2, :2] = 2.0 * np.sum(
+        measured_axis_counts * outlier_probability
+    )
+    information_with_known_outliers[0, 0] = log_sigma_z_information
+    information_with_known_outliers[2, 2] = (
         len(normalised_squares) * outlier_fraction * (1.0 - outlier_fraction)
     )
     scores = np.stack(
         [
-            normalised_squares * (inverse_square_ratio - 1.0),
-            normalised_squares * inverse_square_ratio - measured_axis_counts,
+            normalised_squares * (inverse_outlier_variance_ratio - 1.0),
+            normalised_squares * inverse_outlier_variance_ratio - measured_axis_counts,
             np.ones_like(normalised_squares),
         ]
     )
     missing_information = (scores * (outlier_probability * (1.0 - outlier_probability))) @ scores.T
-    observed_information = complete_information - missing_information
-    # With very few outliers, the matrix is not positive definite, but their effect is negligible
+    observed_information = information_with_known_outliers - missing_information
+    # With very few outliers, the information matrix may not be positive definite. The outliers then
+    # hardly change the factor
     if np.linalg.eigvalsh(observed_information)[0] <= 0.0:
         return 1.0
-    return max(1.0, sigma_information * float(np.linalg.inv(observed_information)[0, 0]))
+    return max(1.0, log_sigma_z_information * float(np.linalg.inv(observed_information)[0, 0]))
 
 
 def _maximise_by_gradient(
@@ -581,14 +603,16 @@ def _maximise_by_gradient(
     max_steps: int = MAX_FINAL_ITERATIONS,
 ) -> NoiseParameters:
     nonzero_parameters = {name: value for name, value in vars(start_parameters).items() if value}
-    log_bounds = np.log([SEARCH_RANGES[name] for name in nonzero_parameters])
+    log_bounds = np.log([NOISE_SEARCH_RANGES[name] for name in nonzero_parameters])
     measurement_count = len(likelihood.measurement_weights)
 
     def score_per_measurement(log_parameters: Array) -> float:
-        # Per measurement, so that the gradient and the first step of L-BFGS-B have a size near 1
+        # The score is divided by the number of measurements. The gradient is then near 1, and
+        # L-BFGS-B begins with a step of suitable size
         try:
             return likelihood(to_noise_parameters(log_parameters)) / measurement_count
-        # Rounding errors made the equations singular. A large score shortens L-BFGS-B's step
+        # If the equations are singular because of rounding errors, a large score is returned.
+        # L-BFGS-B then tries a shorter step
         except np.linalg.LinAlgError:
             return UNCOMPUTABLE_SCORE
 
@@ -602,6 +626,11 @@ def _maximise_by_gradient(
         np.clip(np.log([*nonzero_parameters.values()]), *log_bounds.T),
         method="L-BFGS-B",
         bounds=log_bounds.tolist(),
-        options={"eps": DERIVATIVE_LOG_STEP, "ftol": 1e-10, "gtol": 1e-8, "maxiter": max_steps},
+        options={
+            "eps": LOG_STEP_FOR_DERIVATIVES,
+            "ftol": 1e-10,
+            "gtol": 1e-8,
+            "maxiter": max_steps,
+        },
     )
     return to_noise_parameters(search_result.x)

@@ -57,19 +57,19 @@ MIN_HEADING_SIGMA_DEG = 0.5
 # Maximum median interval (s) between logged attitudes for estimating the heading error
 MAX_ATTITUDE_INTERVAL_S = 0.11
 # Maximum number of iterations in the fit of the heading error
-MAX_LINEARISATIONS = 5
+MAX_HEADING_FIT_ITERATIONS = 5
 # The fit has converged if an iteration changes the heading error by less than this angle (rad)
-CONVERGED_HEADING_CHANGE_RAD = 0.01
+MAX_HEADING_CHANGE_AT_CONVERGENCE_RAD = 0.01
 # Prior σ (rad) of the heading error
 HEADING_SIGMA_RAD = 1.0
 # Minimum estimated scale factor of the positions, to avoid a division by zero
-MIN_POSITION_SCALE = 0.1
+MIN_FITTED_SCALE_FACTOR = 0.1
 # Index of the heading error in the vector of constants that are fitted to each flight part
 HEADING_ERROR_INDEX = 2
 
 
 class HeadingPart(Record):
-    """Yaw misalignment (°) between source frame and EKF2's heading in one part of the flight."""
+    """Heading error (°) in one part of the flight: yaw of the source frame relative to EKF2."""
 
     start_s: float
     end_s: float
@@ -83,16 +83,15 @@ class HeadingError(Record):
     Attributes
     ----------
     misalignment_deg, sigma_deg : float
-        Mean over the flight, and its σ.
+        Angle in yaw: mean over the flight, and σ of the mean.
     drifts : bool
-        True if the heading error drifts: the angle changes significantly and by at least
-        ``MIN_HEADING_DRIFT_DEG``.
+        True if the angle changes significantly in flight, by ``MIN_HEADING_DRIFT_DEG`` or more.
     parts : tuple of HeadingPart
         Angles in consecutive parts of the flight, clockwise from above.
     drift_p : float
-        p-value of a constant angle.
+        p-value of the test for a constant angle.
     by : {"orientation", "positions"}
-        Data of the position source from which the angle is estimated.
+        Data of the position source that give the angle.
     """
 
     misalignment_deg: float
@@ -183,7 +182,7 @@ def estimate_heading_error(  # noqa: PLR0911 (one return per missing input)
     noise_parameters = NoiseParameters(settings.sigma_a_m_s2, sigma_z_m)
     # The mounting angle of the source is unknown, so orientations do not give the misalignment.
     # They show only that it is constant
-    return _fit_heading_to_positions(
+    return _estimate_heading_error_from_positions(
         flight,
         position_samples,
         noise_parameters,
@@ -198,7 +197,7 @@ def _average_flight_parts(
     """Average yaw misalignment and σ (rad) over flight parts of equal duration.
 
     Parts with fewer than ``MIN_FLIGHT_PART_SAMPLES`` samples are omitted. The errors in one part
-    are correlated, so σ of the mean is the RMS of the samples' σ.
+    are correlated, so averaging does not reduce σ: it is the RMS of the samples' σ.
     """
     # At a low sample rate, parts are longer than FLIGHT_PART_DURATION_S, to contain enough samples
     part_count = max(
@@ -266,7 +265,7 @@ def _compare_orientations(
     )
 
 
-def _fit_heading_to_positions(
+def _estimate_heading_error_from_positions(
     flight: Flight,
     position_samples: pd.DataFrame,
     noise_parameters: NoiseParameters,
@@ -284,7 +283,7 @@ def _fit_heading_to_positions(
     )
     motion_cache = MotionCache()
     misalignment_rad = 0.0
-    for _ in range(MAX_LINEARISATIONS):
+    for _ in range(MAX_HEADING_FIT_ITERATIONS):
         cosine, sine = np.cos(misalignment_rad), np.sin(misalignment_rad)
         motion = compute_imu_motion(
             flight,
@@ -301,8 +300,8 @@ def _fit_heading_to_positions(
         spans_s = motion.time_s[
             np.column_stack([motion.segment_edges[:-1], motion.segment_edges[1:] - 1])
         ]
-        is_long = np.ptp(spans_s, axis=1) >= MIN_HEADING_FIT_DURATION_S
-        if not is_long.any():
+        is_part_long_enough = np.ptp(spans_s, axis=1) >= MIN_HEADING_FIT_DURATION_S
+        if not is_part_long_enough.any():
             return Unavailable(
                 "heading error",
                 "the longest part of the flight without an IMU gap is shorter than "
@@ -310,8 +309,8 @@ def _fit_heading_to_positions(
                 "Analyse a longer segment.",
             )
         positions = motion.make_positions_at_offset(0.0)
-        # Rotate the smoothed measured path, not the IMU motion, for the derivative with respect to
-        # the heading: noise in a regressor biases its coefficient towards zero
+        # The derivative with respect to the heading is the rotated smooth path. Noise of the IMU
+        # motion would bias the heading error towards zero
         for increments in (positions.delta_position_m, positions.delta_velocity_m_s):
             north_m, east_m = increments[:, :, -1]
             increments[:, :, HEADING_ERROR_INDEX] = -east_m, north_m
@@ -321,39 +320,45 @@ def _fit_heading_to_positions(
         position_fit = fit_constant_errors(
             [positions], noise_parameters, motion.measurement_weights
         )
-        fitted_constants = position_fit.estimate_segment_constants()[is_long, 0]
-        constants_covariance = np.linalg.inv(position_fit.compute_information())[is_long, 0]
+        constant_errors = position_fit.estimate_segment_constants()[is_part_long_enough, 0]
+        constant_errors_covariance = np.linalg.inv(position_fit.compute_constants_information())[
+            is_part_long_enough, 0
+        ]
         # This derivative contains the scale factor of the positions, so the fitted heading error is
         # divided by the factor
-        position_scale = np.maximum(1.0 + fitted_constants[:, -1], MIN_POSITION_SCALE)
-        error_rad = fitted_constants[:, HEADING_ERROR_INDEX] / position_scale
+        position_scale = np.maximum(1.0 + constant_errors[:, -1], MIN_FITTED_SCALE_FACTOR)
+        error_rad = constant_errors[:, HEADING_ERROR_INDEX] / position_scale
         heading_variance_rad2 = (
-            constants_covariance[:, HEADING_ERROR_INDEX, HEADING_ERROR_INDEX] / position_scale**2
+            constant_errors_covariance[:, HEADING_ERROR_INDEX, HEADING_ERROR_INDEX]
+            / position_scale**2
         )
         correction_rad, weight_sum = np.average(
             error_rad, weights=1.0 / heading_variance_rad2, returned=True
         )
         misalignment_rad += float(correction_rad)
-        if abs(correction_rad) < CONVERGED_HEADING_CHANGE_RAD:
+        if abs(correction_rad) < MAX_HEADING_CHANGE_AT_CONVERGENCE_RAD:
             break
     deviation_rad = error_rad - correction_rad
-    # Variance of the estimates = variance of the true heading errors + estimation variance
-    excess_variance_rad2 = max(float(np.mean(deviation_rad**2 - heading_variance_rad2)), 0.0)
-    heading_drift_variance_rad2 = 0.0 if has_constant_heading else excess_variance_rad2
-    # Shrinkage: the deviation of an uncertain flight part from the mean heading error is reduced
-    drift_variance_fraction = heading_drift_variance_rad2 / (
+    # The estimates vary because of noise and because of drift. Variance due to drift: variance of
+    # the estimates minus their noise variance
+    variance_above_noise_rad2 = max(float(np.mean(deviation_rad**2 - heading_variance_rad2)), 0.0)
+    heading_drift_variance_rad2 = 0.0 if has_constant_heading else variance_above_noise_rad2
+    # The more uncertain a flight part is, the nearer its result is to the mean heading error
+    weight_of_part_estimate = heading_drift_variance_rad2 / (
         heading_drift_variance_rad2 + heading_variance_rad2
     )
     misalignment_rad = float(np.angle(np.exp(1j * misalignment_rad)))
-    heading_part_columns = [
-        spans_s[is_long],
-        np.degrees(misalignment_rad + drift_variance_fraction * deviation_rad),
-        np.degrees(np.sqrt(1.0 / weight_sum + drift_variance_fraction * heading_variance_rad2)),
-    ]
+    heading_part_fields = np.column_stack(
+        [
+            spans_s[is_part_long_enough],
+            np.degrees(misalignment_rad + weight_of_part_estimate * deviation_rad),
+            np.degrees(np.sqrt(1.0 / weight_sum + weight_of_part_estimate * heading_variance_rad2)),
+        ]
+    )
     chi_square = float(np.sum(deviation_rad**2 / heading_variance_rad2))
     is_drift_tested = len(heading_variance_rad2) > 1 and not has_constant_heading
     return combine_heading_parts(
-        tuple(HeadingPart(*row) for row in np.column_stack(heading_part_columns).tolist()),
+        tuple(HeadingPart(*row) for row in heading_part_fields.tolist()),
         float(chdtrc(len(heading_variance_rad2) - 1, chi_square)) if is_drift_tested else 1.0,
         "positions",
     )

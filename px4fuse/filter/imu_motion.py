@@ -4,13 +4,14 @@ A segment is a part of the flight, at most 30 s long, without a gap in IMU or at
 is integrated from the gyroscopes, starting at EKF2's attitude. EKF2's later attitude is not used,
 because EKF2 corrected it with the positions to be tested.
 
-Unknown constants of each segment are errors of the initial attitude (rad, NED), gyro biases (rad/s,
-body), accelerometer biases (m/s², body) and the scale factor error of the positions. The motion is
-linear in small constants. Its derivatives are integrated once and interpolated for any time offset.
+Each segment has unknown constant errors: of the initial attitude (rad, NED), gyro biases (rad/s,
+body), accelerometer biases (m/s², body) and the scale factor error of the positions. For small
+errors, the motion is linear in them. The derivatives of the motion with respect to these errors are
+integrated once, and interpolated for any time offset.
 
-The derivative with respect to the scale is the smoothed measured path
-(:func:`px4fuse.filter.marginal_likelihood.subtract_smooth_path`), not the IMU motion, whose noise
-would bias the estimated scale (errors in variables, Fuller 1987).
+The derivative with respect to the scale factor error is a smooth path through the positions
+(:func:`px4fuse.filter.marginal_likelihood.subtract_smooth_path`). The IMU motion is not used for
+this derivative, because its noise would bias the scale (errors in variables, Fuller 1987).
 """
 
 from __future__ import annotations
@@ -27,7 +28,7 @@ from px4fuse.core.arrays import Array, IntArray, integrate_cumulatively
 from px4fuse.core.record import Span
 from px4fuse.filter.fitting import NoiseParameters, fit_with_sigma_ratios
 from px4fuse.filter.marginal_likelihood import PositionsAndIncrements, subtract_smooth_path
-from px4fuse.filter.model import compute_unit_continuous_noise
+from px4fuse.filter.model import compute_continuous_process_noise_per_density
 from px4fuse.filter.signals import find_imu_gaps
 from px4fuse.flight.model import Columns, Flight, Unavailable, rows_between
 from px4fuse.trajectory.rotation import (
@@ -44,7 +45,7 @@ from px4fuse.trajectory.rotation import (
 HEADING_SIGMA_RAD = 0.05
 # Prior σ of the unknown constants, wide for consumer sensors: initial tilt and heading (rad), gyro
 # bias (rad/s), accelerometer bias (m/s²), scale of the positions (1)
-SEGMENT_CONSTANT_PRIOR_SIGMAS = np.repeat([HEADING_SIGMA_RAD, 0.004, 0.3, 0.1], [3, 3, 3, 1])
+PRIOR_SIGMAS_OF_SEGMENT_CONSTANTS = np.repeat([HEADING_SIGMA_RAD, 0.004, 0.3, 0.1], [3, 3, 3, 1])
 # Maximum gyro bias (rad/s) that is fitted to the positions: 5 σ of its prior. A larger bias is
 # first estimated from EKF2's attitude and subtracted
 MAX_PRIOR_GYRO_BIAS_RAD_S = 0.02
@@ -54,7 +55,7 @@ MAX_REMOVED_GYRO_BIAS_RAD_S = 0.4
 # 0.12 rad. The linearised acceleration then has an error of 0.07 m/s²: g · 0.12² / 2
 MAX_SEGMENT_DURATION_S = 30.0
 # Maximum tested time offset (s) between position source and IMU
-MAX_OFFSET_S = 0.6
+MAX_TESTED_TIME_OFFSET_S = 0.6
 # Number of tested time offsets in the coarse search
 COARSE_OFFSET_COUNT = 25
 # Approximate number of position measurements in the coarse search for a time offset
@@ -62,7 +63,7 @@ COARSE_MEASUREMENT_COUNT = 600
 # Maximum number of array elements in a batch of time offsets, to limit the memory
 MAX_BATCH_ELEMENTS = 2**16
 # Minimum number of position measurements in all segments together
-MIN_MEASUREMENTS = 30
+MIN_TOTAL_MEASUREMENTS = 30
 # Minimum number of position measurements in a segment
 MIN_SEGMENT_MEASUREMENTS = 15
 # Minimum number of position measurements in a segment after downsampling
@@ -71,7 +72,7 @@ MIN_KEPT_MEASUREMENTS = 5
 INTEGRATION_STEP_S = 0.02
 # Prior precision of position (1/m²) and of velocity (s²/m²) at the start of a segment: so small
 # that it only prevents a singular matrix
-SEGMENT_START_PRIOR_PRECISION = 1e-6, 1e-4
+INITIAL_STATE_PRIOR_PRECISIONS = 1e-6, 1e-4
 # Maximum median interval (s) between IMU samples for an estimate of the motion
 MAX_IMU_INTERVAL_S = 0.025
 
@@ -80,22 +81,25 @@ MAX_IMU_INTERVAL_S = 0.025
 class SegmentMotion:
     """Motion of one segment from the IMU, and its derivatives with respect to the IMU's errors.
 
-    ``table`` has the shape (times, 2, 3, 1 + c): position and velocity, along NED. The last
-    dimension contains the motion without errors, then its derivative with respect to each of c = 9
-    constants: initial attitude error, gyro bias and accelerometer bias. The acceleration is
-    constant between successive times.
+    ``motion_and_derivatives``, shape (times, 2, 3, 1 + c), contains position and velocity along
+    NED. The last dimension contains the motion without errors, then its derivative with respect to
+    each of c = 9 constants: initial attitude error, gyro bias and accelerometer bias. The
+    acceleration is constant between successive times.
     """
 
     time_s: Array
-    table: Array
+    motion_and_derivatives: Array
 
     def interpolate(self, time_s: Array) -> tuple[Array, Array]:
-        """Interpolate position and velocity, each with its c derivatives, shape (..., 3, 1 + c)."""
+        """Return position and velocity at other times, each with the shape (..., 3, 1 + c).
+
+        The last dimension contains the motion, then its derivatives with respect to c constants.
+        """
         last_index = len(self.time_s) - 2
         row = np.clip(np.searchsorted(self.time_s, time_s, side="right") - 1, 0, last_index)
         elapsed_s = (time_s - self.time_s[row])[..., None, None]
-        position, velocity = np.moveaxis(self.table[row], -3, 0)
-        acceleration = (self.table[row + 1, 1] - velocity) / INTEGRATION_STEP_S
+        position, velocity = np.moveaxis(self.motion_and_derivatives[row], -3, 0)
+        acceleration = (self.motion_and_derivatives[row + 1, 1] - velocity) / INTEGRATION_STEP_S
         position += elapsed_s * (velocity + (0.5 * elapsed_s) * acceleration)
         velocity += elapsed_s * acceleration
         return position, velocity
@@ -154,30 +158,30 @@ class PositionsAndImuMotion:
         if not has_enough_measurements.any():
             return self
         is_kept &= np.repeat(has_enough_measurements, np.diff(self.segment_edges))
-        kept_fields = {
-            name: getattr(self, name)[is_kept]
-            for name in ("time_s", "measurement_m", "measurement_weights")
-        }
-        segment_motions = tuple(
-            self.segment_motions[index] for index in np.flatnonzero(has_enough_measurements)
-        )
         return replace(
             self,
-            **kept_fields,
+            time_s=self.time_s[is_kept],
+            measurement_m=self.measurement_m[is_kept],
+            measurement_weights=self.measurement_weights[is_kept],
             segment_edges=np.cumsum([0, *kept_counts[has_enough_measurements]]),
-            segment_motions=segment_motions,
+            segment_motions=tuple(
+                self.segment_motions[index] for index in np.flatnonzero(has_enough_measurements)
+            ),
         )
 
-    def make_positions(self, time_offsets_s: Array) -> PositionsAndIncrements:
-        """Return the positions, and the IMU increments between them for each time offset.
+    def make_positions_and_increments(self, time_offsets_s: Array) -> PositionsAndIncrements:
+        """Return the positions, and for each time offset the IMU increments between them.
 
-        The scale factor of the positions is not fitted.
+        The increments are the changes of position and velocity that the IMU measured. The result
+        contains no derivative for the scale factor of the positions.
         """
         interval_s = np.diff(self.time_s)
-        unit_process_noise = self.dt_s * np.stack(compute_unit_continuous_noise(interval_s))
+        process_noise_per_sigma_a_squared = self.dt_s * np.stack(
+            compute_continuous_process_noise_per_density(interval_s)
+        )
         prior_precision = np.zeros((len(self.time_s), 2))
-        prior_precision[self.segment_edges[:-1]] = SEGMENT_START_PRIOR_PRECISION
-        column_count = 1 + len(SEGMENT_CONSTANT_PRIOR_SIGMAS)
+        prior_precision[self.segment_edges[:-1]] = INITIAL_STATE_PRIOR_PRECISIONS
+        column_count = 1 + len(PRIOR_SIGMAS_OF_SEGMENT_CONSTANTS)
         dp, dv = np.zeros(
             (2, len(self.directions), len(time_offsets_s), column_count, len(interval_s))
         )
@@ -200,20 +204,23 @@ class PositionsAndImuMotion:
             measurement_m=self.measurement_m,
             segment_starts=self.segment_edges[:-1],
             interval_s=interval_s,
-            unit_process_noise=unit_process_noise,
-            added_process_noise=np.zeros_like(unit_process_noise),
+            process_noise_per_sigma_a_squared=process_noise_per_sigma_a_squared,
+            process_noise_independent_of_sigma_a=np.zeros_like(process_noise_per_sigma_a_squared),
             prior_precision=prior_precision,
             constant_prior_sigmas=np.r_[
-                SEGMENT_CONSTANT_PRIOR_SIGMAS[:2],
+                PRIOR_SIGMAS_OF_SEGMENT_CONSTANTS[:2],
                 self.heading_sigma_rad,
-                SEGMENT_CONSTANT_PRIOR_SIGMAS[3:],
+                PRIOR_SIGMAS_OF_SEGMENT_CONSTANTS[3:],
             ],
             delta_position_m=dp,
             delta_velocity_m_s=dv,
         )
 
     def make_positions_at_offset(self, offset_s: float) -> PositionsAndIncrements:
-        """Return positions and IMU increments for one time offset, to fit also a scale factor."""
+        """Return the positions, and the IMU increments between them with one time offset.
+
+        The result contains the derivative for the scale factor, so that a fit can estimate it.
+        """
         return next(self.make_position_batches(np.array([offset_s])))
 
     def make_position_batches(
@@ -224,11 +231,11 @@ class PositionsAndImuMotion:
         With ``estimates_scale``, the scale factor of the positions is a constant to be fitted.
         """
         values_per_offset = (
-            len(self.time_s) * len(self.directions) * (1 + len(SEGMENT_CONSTANT_PRIOR_SIGMAS))
+            len(self.time_s) * len(self.directions) * (1 + len(PRIOR_SIGMAS_OF_SEGMENT_CONSTANTS))
         )
         batch_size = max(1, MAX_BATCH_ELEMENTS // values_per_offset)
         for batch in np.split(time_offsets_s, range(batch_size, len(time_offsets_s), batch_size)):
-            positions = self.make_positions(batch)
+            positions = self.make_positions_and_increments(batch)
             yield (
                 subtract_smooth_path(positions, estimates_scale=True)
                 if estimates_scale
@@ -247,7 +254,9 @@ class PositionsAndImuMotion:
         ``sigma_a_factors`` are the tested multiples of SIGMA_A. With ``estimates_scale``, the
         scale factor of the positions is estimated.
         """
-        tested_offsets_s = np.linspace(-MAX_OFFSET_S, MAX_OFFSET_S, COARSE_OFFSET_COUNT)
+        tested_offsets_s = np.linspace(
+            -MAX_TESTED_TIME_OFFSET_S, MAX_TESTED_TIME_OFFSET_S, COARSE_OFFSET_COUNT
+        )
         sigma_z_m = noise_parameters.sigma_z_m
         sigma_a_to_sigma_z_ratios = [
             sigma_a_factor * noise_parameters.sigma_a_m_s2 / sigma_z_m
@@ -273,9 +282,9 @@ class PositionsAndImuMotion:
         factor_index, offset_index = np.unravel_index(
             np.argmin(minus_log_likelihood), minus_log_likelihood.shape
         )
-        sigma_a = noise_parameters.sigma_a_m_s2 * sigma_a_factors[int(factor_index)]
         return float(tested_offsets_s[offset_index]), replace(
-            noise_parameters, sigma_a_m_s2=sigma_a
+            noise_parameters,
+            sigma_a_m_s2=noise_parameters.sigma_a_m_s2 * sigma_a_factors[int(factor_index)],
         )
 
 
@@ -291,7 +300,7 @@ def compute_imu_motion(
     heading_sigma_rad: float = HEADING_SIGMA_RAD,
     max_segment_duration_s: float = MAX_SEGMENT_DURATION_S,
 ) -> PositionsAndImuMotion | Unavailable:
-    """Divide measurements into segments without IMU gap, and compute their motion from the IMU.
+    """Split positions into segments without an IMU gap, and integrate the IMU in each segment.
 
     Parameters
     ----------
@@ -317,32 +326,42 @@ def compute_imu_motion(
     attitude_time_s = attitude.index.to_numpy()
     rows_by_segment: list[IntArray] = []
     for begin_s, end_s in _find_covered_spans(imu_time_s, attitude_time_s):
-        covered_rows = np.flatnonzero(
-            (time_s >= begin_s + MAX_OFFSET_S) & (time_s <= end_s - MAX_OFFSET_S)
+        rows_with_imu_data = np.flatnonzero(
+            (time_s >= begin_s + MAX_TESTED_TIME_OFFSET_S)
+            & (time_s <= end_s - MAX_TESTED_TIME_OFFSET_S)
         )
-        if not len(covered_rows):
+        if not len(rows_with_imu_data):
             continue
-        covered_time_s = time_s[covered_rows]
+        times_with_imu_data_s = time_s[rows_with_imu_data]
         segment_count = max(
-            1, int(np.ceil((covered_time_s[-1] - covered_time_s[0]) / max_segment_duration_s))
+            1,
+            int(
+                np.ceil(
+                    (times_with_imu_data_s[-1] - times_with_imu_data_s[0]) / max_segment_duration_s
+                )
+            ),
         )
-        cut_times_s = np.linspace(covered_time_s[0], covered_time_s[-1], segment_count + 1)[1:-1]
-        for segment_rows in np.split(covered_rows, np.searchsorted(covered_time_s, cut_times_s)):
+        cut_times_s = np.linspace(
+            times_with_imu_data_s[0], times_with_imu_data_s[-1], segment_count + 1
+        )[1:-1]
+        for segment_rows in np.split(
+            rows_with_imu_data, np.searchsorted(times_with_imu_data_s, cut_times_s)
+        ):
             if len(segment_rows) >= MIN_SEGMENT_MEASUREMENTS:
                 rows_by_segment.append(segment_rows)
                 imu_span_s = (
-                    time_s[segment_rows[0]] - MAX_OFFSET_S,
-                    time_s[segment_rows[-1]] + MAX_OFFSET_S,
+                    time_s[segment_rows[0]] - MAX_TESTED_TIME_OFFSET_S,
+                    time_s[segment_rows[-1]] + MAX_TESTED_TIME_OFFSET_S,
                 )
                 if imu_span_s not in motion_cache:
                     motion_cache[imu_span_s] = make_segment_motion(imu, attitude, imu_span_s)
                 segment_motions.append(motion_cache[imu_span_s])
     used_rows = np.concatenate([np.zeros(0, dtype=np.intp), *rows_by_segment])
-    if len(used_rows) < MIN_MEASUREMENTS:
+    if len(used_rows) < MIN_TOTAL_MEASUREMENTS:
         return Unavailable(
             "time offset",
             f"only {len(used_rows)} positions have IMU and attitude data (at least "
-            f"{MIN_MEASUREMENTS} are needed)",
+            f"{MIN_TOTAL_MEASUREMENTS} are needed)",
             "Analyse a longer segment.",
         )
     segment_edges = np.cumsum([0, *map(len, rows_by_segment)])
@@ -386,14 +405,15 @@ def make_segment_motion(
     )
     imu_samples = imu.iloc[first_row:end_row]
     imu_time_s = imu_time_s[first_row:end_row]
-    columns = [*Columns.SPECIFIC_FORCE, *Columns.ANGULAR_RATE]
-    imu_integral = integrate_cumulatively(imu_samples[columns].to_numpy(), imu_time_s)
+    imu_integral = integrate_cumulatively(
+        imu_samples[[*Columns.SPECIFIC_FORCE, *Columns.ANGULAR_RATE]].to_numpy(), imu_time_s
+    )
     step_times_s = np.arange(imu_time_s[0], imu_time_s[-1], INTEGRATION_STEP_S)
-    integrals_at_steps = np.column_stack(
+    imu_integrals_at_steps = np.column_stack(
         [np.interp(step_times_s, imu_time_s, column) for column in imu_integral.T]
     )
-    specific_force_integral_m_s = integrals_at_steps[:, :3]
-    gyro_integral_rad = integrals_at_steps[:, 3:]
+    specific_force_integral_m_s = imu_integrals_at_steps[:, :3]
+    gyro_integral_rad = imu_integrals_at_steps[:, 3:]
     gyro_integral_rad -= np.outer(
         step_times_s, _estimate_large_gyro_bias(step_times_s, gyro_integral_rad, attitude)
     )
@@ -406,14 +426,16 @@ def make_segment_motion(
         )
     )
     specific_force_ned_m_s2 = rotate(body_to_ned, mean_specific_force_m_s2)
-    table = np.zeros((len(mean_specific_force_m_s2), 2, 3, len(SEGMENT_CONSTANT_PRIOR_SIGMAS)))
-    position, velocity = np.moveaxis(table, 1, 0)
+    motion_and_derivatives = np.zeros(
+        (len(mean_specific_force_m_s2), 2, 3, len(PRIOR_SIGMAS_OF_SEGMENT_CONSTANTS))
+    )
+    position, velocity = np.moveaxis(motion_and_derivatives, 1, 0)
     acceleration = np.zeros_like(velocity)
     acceleration[:, :, 0] = specific_force_ned_m_s2
     acceleration[:, 2, 0] += constants.g
     # A small attitude error θ adds θ × f to the acceleration. A gyro bias b causes the attitude
     # error θ = -∫ R b dt
-    attitude_error_per_gyro_bias = -INTEGRATION_STEP_S * (
+    attitude_error_by_unit_gyro_bias = -INTEGRATION_STEP_S * (
         np.cumsum(body_to_ned, axis=0) - body_to_ned / 2.0
     )
     for axis in range(3):
@@ -422,26 +444,28 @@ def make_segment_motion(
         acceleration[:, second_axis, 1 + axis] = -specific_force_ned_m_s2[:, third_axis]
         acceleration[:, third_axis, 1 + axis] = specific_force_ned_m_s2[:, second_axis]
         acceleration[:, axis, 4:7] = (
-            attitude_error_per_gyro_bias[:, second_axis] * specific_force_ned_m_s2[:, [third_axis]]
+            attitude_error_by_unit_gyro_bias[:, second_axis]
+            * specific_force_ned_m_s2[:, [third_axis]]
         )
         acceleration[:, axis, 4:7] -= (
-            attitude_error_per_gyro_bias[:, third_axis] * specific_force_ned_m_s2[:, [second_axis]]
+            attitude_error_by_unit_gyro_bias[:, third_axis]
+            * specific_force_ned_m_s2[:, [second_axis]]
         )
     acceleration[:, :, 7:10] = -body_to_ned
     np.cumsum(acceleration[:-1] * INTEGRATION_STEP_S, axis=0, out=velocity[1:])
-    mean_step_velocity = velocity[:-1] + acceleration[:-1] * (INTEGRATION_STEP_S / 2.0)
-    np.cumsum(mean_step_velocity * INTEGRATION_STEP_S, axis=0, out=position[1:])
-    return SegmentMotion(step_times_s[:-1], table)
+    mean_velocity_in_step = velocity[:-1] + acceleration[:-1] * (INTEGRATION_STEP_S / 2.0)
+    np.cumsum(mean_velocity_in_step * INTEGRATION_STEP_S, axis=0, out=position[1:])
+    return SegmentMotion(step_times_s[:-1], motion_and_derivatives)
 
 
 def _estimate_large_gyro_bias(
     step_times_s: Array, gyro_integral_rad: Array, attitude: pd.DataFrame
 ) -> Array:
-    """Estimate a large gyro bias (rad/s) from the logged attitude.
+    """Return a large gyro bias (rad/s): the difference of gyros and logged attitude.
 
-    A bias up to ``MAX_PRIOR_GYRO_BIAS_RAD_S`` is returned as zero, because it is fitted later. A
-    bias above ``MAX_REMOVED_GYRO_BIAS_RAD_S`` is also returned as zero: the logged attitude is then
-    wrong.
+    The result is zero if the bias is at most ``MAX_PRIOR_GYRO_BIAS_RAD_S``, because a later fit
+    estimates small biases. It is also zero above ``MAX_REMOVED_GYRO_BIAS_RAD_S``, because the
+    logged attitude is then wrong.
     """
     samples = rows_between(attitude, step_times_s[0], step_times_s[-1])[Columns.QUATERNION]
     if len(samples) < MIN_KEPT_MEASUREMENTS:
@@ -450,10 +474,12 @@ def _estimate_large_gyro_bias(
     gyro_angle_rad = np.column_stack(
         [np.interp(attitude_time_s, step_times_s, column) for column in gyro_integral_rad.T]
     )
-    drift_rad = np.diff(gyro_angle_rad, axis=0) - to_rotation_vector(
+    rotation_difference_rad = np.diff(gyro_angle_rad, axis=0) - to_rotation_vector(
         multiply(conjugate(quaternions[:-1]), quaternions[1:])
     )
-    bias_rad_s = np.asarray(np.median(drift_rad / np.diff(attitude_time_s)[:, None], axis=0))
+    bias_rad_s = np.asarray(
+        np.median(rotation_difference_rad / np.diff(attitude_time_s)[:, None], axis=0)
+    )
     is_bias_removed = (
         MAX_PRIOR_GYRO_BIAS_RAD_S < np.abs(bias_rad_s).max() <= MAX_REMOVED_GYRO_BIAS_RAD_S
     )

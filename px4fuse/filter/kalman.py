@@ -24,11 +24,11 @@ from px4fuse.core.record import one_line_repr
 from px4fuse.filter import model
 from px4fuse.filter.settings import InitialState, Settings
 from px4fuse.filter.signals import Axis
-from px4fuse.filter.steps import make_timeline
+from px4fuse.filter.steps import make_prediction_steps
 
-StepRows = list[tuple[float, ...]]
+TableRows = list[tuple[float, ...]]
 # Columns of ``Replay.updates``
-UPDATE_COLUMNS = [
+UPDATE_TABLE_COLUMNS = [
     "measurement_m",
     "innovation_m",
     "innovation_variance_m2",
@@ -82,32 +82,42 @@ def replay(
     SettingsError
         ``settings.input`` is "imu" and the axis has no acceleration.
     """
-    timeline = make_timeline(axis, settings, initial)
-    initial_state = initial or InitialState(timeline.time_s[0], axis.measurement_m[0])
+    prediction_steps = make_prediction_steps(axis, settings, initial)
+    initial_state = initial or InitialState(prediction_steps.time_s[0], axis.measurement_m[0])
     run_filter = _run_with_floats if fast else _run_with_filterpy
     states, updates = run_filter(
         initial_state,
         settings.sigma_z_m**2,
-        np.diff(timeline.time_s).tolist(),
-        timeline.acceleration_m_s2.tolist(),
-        ((settings.sigma_a_m_s2**2 + timeline.input_variance_m2_s4) * settings.dt_s).tolist(),
+        np.diff(prediction_steps.time_s).tolist(),
+        prediction_steps.acceleration_m_s2.tolist(),
+        (
+            (settings.sigma_a_m_s2**2 + prediction_steps.input_variance_m2_s4) * settings.dt_s
+        ).tolist(),
         [
             axis.measurement_m[index] if index >= 0 else None
-            for index in timeline.measurement_index[1:]
+            for index in prediction_steps.measurement_index[1:]
         ],
     )
     step_times_s, update_times_s = (
         pd.Index(times_s, name="time_s")
-        for times_s in (timeline.time_s, timeline.time_s[timeline.measurement_index >= 0])
+        for times_s in (
+            prediction_steps.time_s,
+            prediction_steps.time_s[prediction_steps.measurement_index >= 0],
+        )
     )
     steps = _make_table(states, step_times_s, model.STATE_COLUMNS + model.COVARIANCE_COLUMNS)
-    steps["acceleration_m_s2"] = np.append(timeline.acceleration_m_s2, 0.0)
-    steps["input_variance_m2_s4"] = np.append(timeline.input_variance_m2_s4, 0.0)
-    update_table = _make_table(updates, update_times_s, UPDATE_COLUMNS)
-    return Replay(axis, settings, steps, update_table, timeline.input_gap_s)
+    steps["acceleration_m_s2"] = np.append(prediction_steps.acceleration_m_s2, 0.0)
+    steps["input_variance_m2_s4"] = np.append(prediction_steps.input_variance_m2_s4, 0.0)
+    return Replay(
+        axis,
+        settings,
+        steps,
+        _make_table(updates, update_times_s, UPDATE_TABLE_COLUMNS),
+        prediction_steps.input_gap_s,
+    )
 
 
-def _make_table(rows: StepRows, index: "pd.Index[float]", columns: list[str]) -> pd.DataFrame:
+def _make_table(rows: TableRows, index: "pd.Index[float]", columns: list[str]) -> pd.DataFrame:
     # an array first, because pandas needs twice the time for a list of tuples
     values = np.fromiter(chain.from_iterable(rows), np.float64, len(rows) * len(columns))
     return pd.DataFrame(values.reshape(-1, len(columns)), index, columns)
@@ -115,11 +125,11 @@ def _make_table(rows: StepRows, index: "pd.Index[float]", columns: list[str]) ->
 
 def _run_with_filterpy(
     initial_state: InitialState, measurement_variance: float, *inputs: Sequence[Any]
-) -> tuple[StepRows, StepRows]:
+) -> tuple[TableRows, TableRows]:
     """Run KF with filterpy; return the rows of :attr:`Replay.steps` and :attr:`Replay.updates`.
 
-    ``inputs`` are four sequences, one value for each step: length (s), acceleration (m/s²), noise
-    density SIGMA_A² · DT (m²/s³), and measured position (m) or None.
+    ``inputs`` are four sequences with one value for each step: step length (s), acceleration
+    (m/s²), noise density SIGMA_A² · DT (m²/s³), and measured position (m) or None.
     """
     from px4fuse.filter.filterpy_import import KalmanFilter  # noqa: PLC0415 - takes 0.1 s
 
@@ -129,17 +139,17 @@ def _run_with_filterpy(
     kalman.H = np.array([[1.0, 0.0]])
     kalman.R = np.array([[measurement_variance]])
     kalman.inv = np.reciprocal  # S is 1 by 1
-    states: StepRows = [
+    states: TableRows = [
         (initial_state.position_m, initial_state.velocity_m_s, *model.INITIAL_COVARIANCE)
     ]
-    updates: StepRows = []
+    updates: TableRows = []
     dt_s, acceleration, noise_density = (np.array(values)[:, None, None] for values in inputs[:3])
     matrices = (
         acceleration,
         np.concatenate([dt_s**2 / 2.0, dt_s], axis=1),
         model.make_transition_matrix(dt_s[:, 0, 0]),
         noise_density
-        * model.make_symmetric_matrix(model.compute_unit_process_noise(dt_s[:, 0, 0])),
+        * model.make_symmetric_matrix(model.compute_process_noise_per_density(dt_s[:, 0, 0])),
     )
     for u, B, F, Q, measured_m in zip(*matrices, inputs[3], strict=True):
         kalman.predict(u=u, B=B, F=F, Q=Q)
@@ -166,25 +176,25 @@ def _run_with_filterpy(
 
 def _run_with_floats(
     initial_state: InitialState, measurement_variance: float, *inputs: Sequence[Any]
-) -> tuple[StepRows, StepRows]:
-    """Run KF with Python floats; arguments and results are those of :func:`_run_with_filterpy`."""
+) -> tuple[TableRows, TableRows]:
+    """Run KF with Python floats: a fast replacement of :func:`_run_with_filterpy`."""
     position, velocity, covariance = (
         initial_state.position_m,
         initial_state.velocity_m_s,
         model.INITIAL_COVARIANCE,
     )
-    states: StepRows = [(position, velocity, *covariance)]
-    updates: StepRows = []
+    states: TableRows = [(position, velocity, *covariance)]
+    updates: TableRows = []
     for dt_s, acceleration, noise_density, measured_m in zip(*inputs, strict=True):
         position, velocity, covariance = model.predict_step(
             position, velocity, covariance, acceleration, noise_density, dt_s
         )
         if measured_m is not None:
-            innovation_and_gains, updated_state = model.update_step(
+            innovation_variance_and_gains, updated_state = model.update_step(
                 position, velocity, covariance, measured_m, measurement_variance
             )
             updates.append(
-                (measured_m, *innovation_and_gains, position, covariance[0], covariance[2])
+                (measured_m, *innovation_variance_and_gains, position, covariance[0], covariance[2])
             )
             position, velocity, covariance = updated_state
         states.append((position, velocity, *covariance))
@@ -194,7 +204,8 @@ def _run_with_floats(
 def _find_previous_steps(run: Replay, times_s: Array) -> tuple[IntArray, Array, BoolArray]:
     """Find for each time the last step of KF before it.
 
-    Return its index, the time (s) since this step, and True for times outside the run of KF.
+    Return the index of this step, the time (s) since this step, and a mask: True for times before
+    the start or after the end of KF.
     """
     step_times_s = run.steps.index.to_numpy()
     step_index = np.clip(
@@ -210,7 +221,8 @@ def _find_previous_steps(run: Replay, times_s: Array) -> tuple[IntArray, Array, 
 def predict_state(run: Replay, times_s: Array) -> Array:
     """Predict position (m) and velocity (m/s) at each time from KF's last step before it.
 
-    Interpolation would use a measurement before its time. Times outside the run of KF give NaN.
+    The state is not interpolated, because the next step contains a later measurement. Times before
+    the start or after the end of KF give NaN.
     """
     step_index, elapsed_s, is_outside = _find_previous_steps(run, times_s)
     position, velocity, acceleration = (
@@ -225,9 +237,14 @@ def predict_variance(run: Replay, times_s: Array) -> Array:
     """Return the variances (m², m²/s²) of the results of :func:`predict_state`: FPFᵀ + Q."""
     step_index, elapsed_s, is_outside = _find_previous_steps(run, times_s)
     p00, p01, p11 = run.steps[model.COVARIANCE_COLUMNS].to_numpy()[step_index].T
-    input_variance_m2_s4 = run.steps["input_variance_m2_s4"].to_numpy()[step_index]
-    noise_density = (run.settings.sigma_a_m_s2**2 + input_variance_m2_s4) * run.settings.dt_s
-    p00, _, p11 = model.propagate_covariance((p00, p01, p11), elapsed_s)
-    q00, _, q11 = model.compute_unit_process_noise(elapsed_s)
-    variances = p00 + noise_density * q00, p11 + noise_density * q11
-    return np.where(is_outside, np.nan, variances)
+    imu_gap_variance_m2_s4 = run.steps["input_variance_m2_s4"].to_numpy()[step_index]
+    noise_density = (run.settings.sigma_a_m_s2**2 + imu_gap_variance_m2_s4) * run.settings.dt_s
+    position_variance_m2, _, velocity_variance_m2_s2 = model.propagate_covariance(
+        (p00, p01, p11), elapsed_s
+    )
+    q00, _, q11 = model.compute_process_noise_per_density(elapsed_s)
+    return np.where(
+        is_outside,
+        np.nan,
+        (position_variance_m2 + noise_density * q00, velocity_variance_m2_s2 + noise_density * q11),
+    )

@@ -41,16 +41,19 @@ def make_transition_matrix(dt_s: float | Array) -> Array:
     return build_matrix((1.0, dt_s), (0.0, 1.0))
 
 
-def compute_unit_process_noise(dt_s: T) -> SymmetricElements[T]:
-    """Return elements 00, 01, 11 of Q / (SIGMA_A² · DT) for a prediction over ``dt_s`` (s)."""
+def compute_process_noise_per_density(dt_s: T) -> SymmetricElements[T]:
+    """Return Q / noise density of one prediction step of length ``dt_s``: elements 00, 01, 11.
+
+    The noise density is SIGMA_A² · DT.
+    """
     return dt_s**3 / 4.0, dt_s**2 / 2.0, dt_s
 
 
-def compute_unit_continuous_noise(dt_s: T) -> SymmetricElements[T]:
-    """Return Q / (SIGMA_A² · DT) over ``dt_s`` for continuous white acceleration noise.
+def compute_continuous_process_noise_per_density(dt_s: T) -> SymmetricElements[T]:
+    """Return Q / noise density of continuous white acceleration noise over ``dt_s``.
 
-    DT is the interval for which SIGMA_A is defined. Element 00 is dt³/3. One prediction step, with
-    a constant acceleration error, has dt³/4; many short steps approach dt³/3.
+    The noise density is SIGMA_A² · DT. The result (elements 00, 01, 11) is the limit of many short
+    prediction steps.
     """
     return dt_s**3 / 3.0, dt_s**2 / 2.0, dt_s
 
@@ -75,12 +78,12 @@ def predict_step(
     noise_density: T,
     dt_s: T,
 ) -> tuple[T, T, SymmetricElements[T]]:
-    """Predict position, velocity and covariance: x = Fx + Ba, P = FPFᵀ + Q.
+    """Return the predicted position, velocity and covariance: Fx + Ba and FPFᵀ + Q.
 
-    ``noise_density`` (m²/s³) is the increase of the velocity variance per second, SIGMA_A² · DT.
+    ``noise_density`` (m²/s³) is SIGMA_A² · DT: the velocity variance increases by it each second.
     """
     p00, p01, p11 = propagate_covariance(covariance, dt_s)
-    q00, q01, q11 = compute_unit_process_noise(dt_s)
+    q00, q01, q11 = compute_process_noise_per_density(dt_s)
     predicted_covariance = (
         p00 + noise_density * q00,
         p01 + noise_density * q01,

@@ -15,7 +15,7 @@ from numpy.typing import ArrayLike
 from scipy import constants
 from scipy.spatial.transform import Rotation, Slerp
 
-from px4fuse.core.arrays import Array, BoolArray, integrate_cumulatively, row_blocks
+from px4fuse.core.arrays import Array, BoolArray, integrate_cumulatively, iterate_row_blocks
 from px4fuse.core.record import Span, one_line_repr
 from px4fuse.errors import MissingDataError, SettingsError
 from px4fuse.flight.model import (
@@ -53,7 +53,7 @@ class Segment:
     flight_span_s: Span | None = None
 
     @property
-    def flight(self) -> Segment:
+    def whole_flight(self) -> Segment:
         """Time span of the whole flight."""
         return Segment(*(self.flight_span_s or (self.start_s, self.end_s)), self.reason)
 
@@ -71,10 +71,10 @@ class Acceleration:
     ----------
     time_s : ndarray, shape (n,)
     acceleration_integral_m_s : ndarray, shape (3, n)
-        Integral of the acceleration in NED without gravity, from the first sample of the flight;
-        all axes share it.
+        Velocity change (NED) since the first IMU sample: integral of the acceleration without
+        gravity. This array is the same for all axes.
     acceleration_products_m2_s4 : ndarray, shape (3, 3)
-        Means, in the segment, of the products of two components (NED) of the acceleration.
+        Mean product of each two components (NED) of the acceleration in the segment.
     direction : ndarray, shape (3,)
         Unit vector of the axis in NED.
     gap_edge_time_s : ndarray, shape (k,)
@@ -92,7 +92,7 @@ class Acceleration:
 
     __repr__ = one_line_repr
 
-    def compute_integral_m_s(self) -> Array:
+    def compute_velocity_change_m_s(self) -> Array:
         """Return the velocity change (m/s) along the axis since the first sample, shape (n,)."""
         return np.asarray(self.direction @ self.acceleration_integral_m_s)
 
@@ -144,7 +144,7 @@ class Axis:
 
 
 def imu_and_attitude(flight: Flight) -> tuple[pd.DataFrame, pd.DataFrame] | Unavailable:
-    """Return the IMU samples in the time span of the attitude, and the attitude."""
+    """Return two tables: the IMU samples during the time span of the attitude, and the attitude."""
     imu, attitude = flight.imu, flight.attitude
     if isinstance(imu, Unavailable):
         return imu
@@ -153,7 +153,7 @@ def imu_and_attitude(flight: Flight) -> tuple[pd.DataFrame, pd.DataFrame] | Unav
     imu = rows_between(imu, attitude.index[0], attitude.index[-1])
     if len(imu) < 2:
         return Unavailable(
-            "acceleration in NED",
+            "acceleration in NED from IMU and attitude",
             "IMU and attitude data do not overlap in time",
             "Set SDLOG_MODE to 1 to log from boot.",
         )
@@ -172,11 +172,11 @@ def compute_ned_acceleration(flight: Flight) -> pd.DataFrame | Unavailable:
     quaternions = attitude[Columns.QUATERNION].to_numpy(copy=True)
     rotations = Rotation.from_quat(quaternions, scalar_first=True)
     body_to_ned = Slerp(attitude.index.to_numpy(), rotations)
-    force_m_s2 = imu[Columns.SPECIFIC_FORCE].to_numpy()
-    acceleration = np.empty(force_m_s2.shape)
-    for rows in row_blocks(len(imu)):
+    specific_force_m_s2 = imu[Columns.SPECIFIC_FORCE].to_numpy()
+    acceleration = np.empty(specific_force_m_s2.shape)
+    for rows in iterate_row_blocks(len(imu)):
         rotation = body_to_ned(imu.index.to_numpy()[rows])
-        acceleration[rows] = rotation.apply(force_m_s2[rows].astype(np.float64))
+        acceleration[rows] = rotation.apply(specific_force_m_s2[rows].astype(np.float64))
     acceleration[:, 2] += constants.g
     return pd.DataFrame(acceleration, imu.index, list(AXIS_NAMES), copy=False)
 
@@ -188,17 +188,17 @@ def estimate_aisle_heading(track: PositionTrack, segment: Segment) -> tuple[floa
     -------
     heading_deg : float
         0 to 180, because both directions along an aisle are equivalent.
-    elongation : float
+    length_to_width_ratio : float
         Ratio of the standard deviations of the positions along and across this direction.
     """
     position_m = cut_to_segment(track.samples, segment)[Columns.POSITION[:2]].dropna().to_numpy()
     centred_m = position_m - position_m.mean(axis=0)
     _, singular_values, directions = np.linalg.svd(centred_m, full_matrices=False)
     heading_deg = float(np.degrees(np.arctan2(directions[0, 1], directions[0, 0]))) % 180.0
-    elongation = (
+    length_to_width_ratio = (
         float(singular_values[0] / singular_values[1]) if singular_values[1] > 0 else float("inf")
     )
-    return heading_deg, elongation
+    return heading_deg, length_to_width_ratio
 
 
 def make_axes(

@@ -15,7 +15,7 @@ MAX_EQUAL_TIME_DIFFERENCE_S = 5e-7
 
 
 @dataclass(frozen=True)
-class Timeline:
+class PredictionSteps:
     """Prediction steps of KF, and the acceleration in each step.
 
     Attributes
@@ -39,9 +39,9 @@ class Timeline:
     input_gap_s: float
 
 
-def make_timeline(
+def make_prediction_steps(
     axis: Axis, settings: Settings, initial_state: InitialState | None = None
-) -> Timeline:
+) -> PredictionSteps:
     """Return the prediction steps of KF along an axis.
 
     Raises
@@ -70,25 +70,26 @@ def make_timeline(
         time_s = np.append(start_s, time_s)
     measurement_index = np.full(len(time_s), -1, dtype=np.intp)
     measurement_index[np.searchsorted(time_s, measurement_time_s)] = np.flatnonzero(is_usable)
-    step_count = len(time_s) - 1
     if settings.input == "zero":
-        return Timeline(time_s, measurement_index, np.zeros(step_count), np.zeros(step_count), 0.0)
+        zeros = np.zeros(len(time_s) - 1)
+        return PredictionSteps(time_s, measurement_index, zeros, zeros, 0.0)
     if isinstance(axis.acceleration, Unavailable):
         raise SettingsError(
-            f"The setting `input` is imu, but KF has no acceleration along {axis.name}.",
+            f"The setting `input` is imu, but the axis {axis.name} has no IMU acceleration.",
             f"{axis.acceleration}",
         )
     mean_acceleration_m_s2, gap_fraction = compute_mean_step_acceleration(axis.acceleration, time_s)
     gap_s = gap_fraction * np.diff(time_s)
-    # The unknown acceleration (rms) in an IMU gap of T seconds is assumed to be constant. It causes
-    # a velocity error of rms·T. White noise would cause rms·√(DT·T), so the variance is multiplied
-    # by T/DT
+    # In an IMU gap of T seconds, the unknown acceleration is assumed to be constant. The velocity
+    # error is then rms·T instead of rms·√(DT·T) with white noise: the variance is T/DT times larger
     interval_index = np.searchsorted(
         np.flatnonzero(measurement_index >= 0), np.arange(1, len(time_s))
     )
-    gap_in_interval_s = np.bincount(interval_index, weights=gap_s)[interval_index]
-    variance_scale = np.maximum(gap_in_interval_s / settings.dt_s, 1.0)
-    gap_variance_m2_s4 = gap_fraction * variance_scale * axis.acceleration.compute_rms_m_s2() ** 2
-    return Timeline(
+    gap_duration_in_interval_s = np.bincount(interval_index, weights=gap_s)[interval_index]
+    gap_variance_factor = np.maximum(gap_duration_in_interval_s / settings.dt_s, 1.0)
+    gap_variance_m2_s4 = (
+        gap_fraction * gap_variance_factor * axis.acceleration.compute_rms_m_s2() ** 2
+    )
+    return PredictionSteps(
         time_s, measurement_index, mean_acceleration_m_s2, gap_variance_m2_s4, float(np.sum(gap_s))
     )

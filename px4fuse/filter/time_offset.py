@@ -5,8 +5,9 @@ of positions with the acceleration shows it. The likelihood of the positions giv
 is maximised over τ and the noises. Constant errors with a similar effect are estimated too: biases,
 tilt and scale (:mod:`px4fuse.filter.imu_motion`).
 
-IMU noise makes the variance of τ larger than the curvature of the likelihood shows. The ratio of
-both variances is simulated, and widens the 95 % interval (sandwich estimate, White 1982).
+The curvature of the likelihood gives a variance of τ that is too small, because it does not contain
+all effects of the IMU noise. A simulation estimates the missing factor on the variance. The factor
+widens the 95 % interval (sandwich estimate, White 1982).
 """
 
 from collections.abc import Callable
@@ -23,14 +24,14 @@ from px4fuse.filter.imu_motion import (
     COARSE_MEASUREMENT_COUNT,
     COARSE_OFFSET_COUNT,
     HEADING_SIGMA_RAD,
-    MAX_OFFSET_S,
+    MAX_TESTED_TIME_OFFSET_S,
     MotionCache,
     PositionsAndImuMotion,
     compute_imu_motion,
 )
 from px4fuse.filter.likelihood import (
     MAX_LOG_LIKELIHOOD_DROP,
-    compute_profile_interval,
+    compute_profile_likelihood_interval,
     fit_parabola_vertex,
 )
 from px4fuse.filter.marginal_likelihood import compute_segment_inner_products
@@ -39,27 +40,27 @@ from px4fuse.filter.signals import Segment, cut_to_segment, make_downsampling_sl
 from px4fuse.flight.model import Columns, Flight, PositionTrack, Unavailable
 
 # Number of time offsets near the maximum at which the likelihood is computed
-FINE_OFFSET_COUNT = 11
+FINE_GRID_OFFSET_COUNT = 11
 # Number of time offsets to which the likelihood is interpolated (the curve in the report)
 LIKELIHOOD_CURVE_POINT_COUNT = 121
 # Prior σ (rad) of EKF2's heading with GNSS: large, because a wrong GNSS delay (0.2 s) rotates
 # EKF2's heading (5°)
 GNSS_HEADING_SIGMA_RAD = 0.2
 # Maximum half-width (s) of the 95 % interval of an accepted time offset
-MAX_OFFSET_HALF_INTERVAL_S = 0.15
+MAX_OFFSET_INTERVAL_HALF_WIDTH_S = 0.15
 # A segment whose time offset has a larger σ (s) is excluded from the test for a changed time offset
 MAX_SEGMENT_OFFSET_SIGMA_S = 0.15
 # The time offset changes in flight if the p-value of a constant offset is below this limit
-MAX_CHANGE_P_VALUE = 0.005
+MAX_P_VALUE_OF_CHANGED_OFFSET = 0.005
 # Minimum change (s) of the time offset in flight: a smaller change may be drift of the source
 MIN_TIME_OFFSET_CHANGE_S = 0.10
 # A time offset is significant if it exceeds this multiple of its σ: false alarm probability 0.3 %
 MIN_OFFSET_SIGMAS = 3.0
 # A time offset is significant if it exceeds this time (s): position error of 3 cm at 1 m/s
 MIN_TIME_OFFSET_S = 0.03
-# The variance of the time offset is simulated with about 96 samples. Each group of 12 flight
-# segments gives one sample per simulated series of IMU noise, so a longer flight needs fewer series
-SIMULATION_COUNT, SIMULATED_SEGMENT_COUNT = 96, 12
+# The variance of the time offset is simulated with IMU noise. Number of simulated groups of flight
+# segments, and number of segments in a group
+SIMULATED_GROUP_COUNT, SEGMENTS_PER_SIMULATED_GROUP = 96, 12
 
 
 class PartOffset(Record):
@@ -90,8 +91,8 @@ class ClockOffset(Record, kw_only=True):
         Drift of the source's clock; None with fewer than three parts.
     change_p_value : float or None
         p-value of a constant offset (likelihood ratio test); None with one part.
-    curve_s, curve_log_likelihood_drop : ndarray, shape (n,)
-        Time offsets (s), and the decrease of the log-likelihood from its maximum.
+    curve_time_offsets_s, curve_log_likelihood_drops : ndarray, shape (n,)
+        Tested time offsets (s), and the log-likelihood of each: its decrease from the maximum.
     """
 
     offset_s: float
@@ -105,8 +106,8 @@ class ClockOffset(Record, kw_only=True):
     change_p_value: Share | None = None
     parts: tuple[PartOffset, ...]
     count: Count
-    curve_s: NotWritten[Array] = NOT_WRITTEN
-    curve_log_likelihood_drop: NotWritten[Array] = NOT_WRITTEN
+    curve_time_offsets_s: NotWritten[Array] = NOT_WRITTEN
+    curve_log_likelihood_drops: NotWritten[Array] = NOT_WRITTEN
     sigma_a_m_s2: NotWritten[float] = NOT_WRITTEN
     sigma_z_m: NotWritten[float] = NOT_WRITTEN
 
@@ -116,17 +117,17 @@ class ClockOffset(Record, kw_only=True):
         return self.offset_s - self.applied_s
 
     @property
-    def three_sigma_s(self) -> float:
+    def significance_limit_s(self) -> float:
         return MIN_OFFSET_SIGMAS * self.sigma_s
 
     def has_changed(self) -> bool:
         """Return True if the offset changes significantly, by MIN_TIME_OFFSET_CHANGE_S or more."""
-        if self.change_p_value is None or self.change_p_value >= MAX_CHANGE_P_VALUE:
+        if self.change_p_value is None or self.change_p_value >= MAX_P_VALUE_OF_CHANGED_OFFSET:
             return False
         return abs(self.parts[-1].offset_s - self.parts[0].offset_s) >= MIN_TIME_OFFSET_CHANGE_S
 
     def is_significant(self, offset_s: float) -> bool:
-        return abs(offset_s) > max(MIN_TIME_OFFSET_S, self.three_sigma_s)
+        return abs(offset_s) > max(MIN_TIME_OFFSET_S, self.significance_limit_s)
 
 
 def estimate_time_offset(
@@ -180,7 +181,7 @@ def estimate_time_offset(
     coarse_motion = imu_motion.downsample(COARSE_MEASUREMENT_COUNT)
     offset_s, _ = imu_motion.search_offset(noise_parameters)
     offset_sigma_s = 0.0
-    half_width_s = 0.1
+    search_half_width_s = 0.1
     for motion in (coarse_motion, imu_motion):
         noise_parameters = maximise_likelihood(
             [motion.make_positions_at_offset(offset_s)],
@@ -188,7 +189,7 @@ def estimate_time_offset(
             motion.measurement_weights,
             fits_outliers=False,
         ).noise_parameters
-        tested_offsets_s = _make_offset_grid(offset_s, half_width_s, FINE_OFFSET_COUNT)
+        tested_offsets_s = _make_offset_grid(offset_s, search_half_width_s, FINE_GRID_OFFSET_COUNT)
         position_fit = fit_constant_errors(
             motion.make_position_batches(tested_offsets_s),
             noise_parameters,
@@ -197,40 +198,45 @@ def estimate_time_offset(
         offset_s, offset_sigma_s = _fit_minimum_and_sigma(
             tested_offsets_s, position_fit.compute_scores()[0]
         )
-        half_width_s = float(np.clip(3.5 * offset_sigma_s, 0.01, MAX_OFFSET_S))
-    offset_variance_factor = _simulate_offset_variance_factor(
+        search_half_width_s = float(np.clip(3.5 * offset_sigma_s, 0.01, MAX_TESTED_TIME_OFFSET_S))
+    offset_variance_factor = _simulate_variance_increase_by_imu_noise(
         imu_motion, offset_s, noise_parameters, offset_sigma_s**-2.0
     )
-    curve_offsets_s, profile_scores, interval_low_s, interval_high_s = _compute_offset_profile(
-        imu_motion,
-        noise_parameters,
-        offset_s,
-        half_width_s,
-        MAX_LOG_LIKELIHOOD_DROP * offset_variance_factor,
+    curve_time_offsets_s, profile_scores, interval_low_s, interval_high_s = (
+        _compute_offset_likelihood_curve(
+            imu_motion,
+            noise_parameters,
+            offset_s,
+            search_half_width_s,
+            MAX_LOG_LIKELIHOOD_DROP * offset_variance_factor,
+        )
     )
-    has_both_ends = interval_low_s is not None and interval_high_s is not None
-    offset_s = _fit_minimum_and_sigma(curve_offsets_s, profile_scores)[0]
-    # An IMU sample is the mean over one interval, and its timestamp may be any time in it. The
-    # error is half an interval (1 σ). 1.96 σ of it widen the 95 % interval on both sides
+    has_both_interval_ends = interval_low_s is not None and interval_high_s is not None
+    offset_s = _fit_minimum_and_sigma(curve_time_offsets_s, profile_scores)[0]
+    # The timestamp of an IMU sample may be any time in the interval that the sample averages. This
+    # timing error (σ of half an interval) widens both sides of the 95 % interval by 1.96 σ
     resolution_s = 0.5 * imu_motion.imu_interval_s
     interval_limits_s = (
-        curve_offsets_s[0] if interval_low_s is None else interval_low_s,
-        curve_offsets_s[-1] if interval_high_s is None else interval_high_s,
+        curve_time_offsets_s[0] if interval_low_s is None else interval_low_s,
+        curve_time_offsets_s[-1] if interval_high_s is None else interval_high_s,
     )
     interval_half_widths_s = np.hypot(np.array(interval_limits_s) - offset_s, 1.96 * resolution_s)
     interval_low_s = float(offset_s - interval_half_widths_s[0])
     interval_high_s = float(offset_s + interval_half_widths_s[1])
     rejection_reason = ""
-    if not has_both_ends or (interval_high_s - interval_low_s) / 2.0 > MAX_OFFSET_HALF_INTERVAL_S:
+    if (
+        not has_both_interval_ends
+        or (interval_high_s - interval_low_s) / 2.0 > MAX_OFFSET_INTERVAL_HALF_WIDTH_S
+    ):
         rejection_reason = (
-            f"time offsets from {interval_low_s:+.2f} s to {interval_high_s:+.2f} s have nearly "
-            "the same likelihood: the flight has too little acceleration, or the positions have "
-            "too much noise"
+            f"all time offsets from {interval_low_s:+.2f} s to {interval_high_s:+.2f} s fit the "
+            "data almost equally well. Possible causes: the flight has little acceleration, or the "
+            "positions are noisy"
         )
     parts: tuple[PartOffset, ...] = ()
     change_p_value = None
     if not rejection_reason:
-        progress("changes of the time offset in flight")
+        progress("change of the position source's time offset during the flight")
         parts, change_p_value = _estimate_flight_part_offsets(
             imu_motion, offset_s, noise_parameters, offset_variance_factor
         )
@@ -243,8 +249,8 @@ def estimate_time_offset(
         sigma_s=float(np.hypot(offset_sigma_s * np.sqrt(offset_variance_factor), resolution_s)),
         is_determinable=not rejection_reason,
         reason=rejection_reason,
-        curve_s=applied_offset_s + curve_offsets_s,
-        curve_log_likelihood_drop=profile_scores - profile_scores.min(),
+        curve_time_offsets_s=applied_offset_s + curve_time_offsets_s,
+        curve_log_likelihood_drops=profile_scores - profile_scores.min(),
         parts=tuple(
             structs.replace(part, offset_s=applied_offset_s + part.offset_s) for part in parts
         ),
@@ -257,73 +263,85 @@ def estimate_time_offset(
     )
 
 
-def _compute_offset_profile(
+def _compute_offset_likelihood_curve(
     motion: PositionsAndImuMotion,
     noise_parameters: NoiseParameters,
     offset_s: float,
     half_width_s: float,
-    score_rise: float,
+    max_score_increase: float,
 ) -> tuple[Array, Array, float | None, float | None]:
-    """Compute the profile of -ln p of the positions over the time offset.
+    """Compute the negative log-likelihood (-ln p) of the positions as a function of time offset.
 
-    Return time offsets (s), -ln p, and both ends (s) of the interval around the minimum. At the
-    ends, -ln p is its minimum plus ``score_rise``; None for an end outside the search range.
+    Return tested time offsets (s), -ln p of each, and both ends (s) of an interval around the
+    minimum. In this interval, -ln p is at most ``max_score_increase`` above its minimum. An end
+    outside the search range is None.
     """
     while True:
-        node_offsets_s, curve_offsets_s = (
+        computed_offsets_s, curve_time_offsets_s = (
             _make_offset_grid(offset_s, half_width_s, offset_count)
-            for offset_count in (FINE_OFFSET_COUNT, LIKELIHOOD_CURVE_POINT_COUNT)
+            for offset_count in (FINE_GRID_OFFSET_COUNT, LIKELIHOOD_CURVE_POINT_COUNT)
         )
-        position_batches = motion.make_position_batches(node_offsets_s)
-        node_scores = fit_constant_errors(
-            position_batches, noise_parameters, motion.measurement_weights
+        computed_scores = fit_constant_errors(
+            motion.make_position_batches(computed_offsets_s),
+            noise_parameters,
+            motion.measurement_weights,
         ).compute_scores()[0]
-        profile_scores = CubicSpline(node_offsets_s, node_scores)(curve_offsets_s)
-        interval_low_s, interval_high_s = compute_profile_interval(
-            curve_offsets_s, profile_scores, score_rise
+        profile_scores = CubicSpline(computed_offsets_s, computed_scores)(curve_time_offsets_s)
+        interval_low_s, interval_high_s = compute_profile_likelihood_interval(
+            curve_time_offsets_s, profile_scores, max_score_increase
         )
-        if None not in (interval_low_s, interval_high_s) or half_width_s >= 2.0 * MAX_OFFSET_S:
-            return curve_offsets_s, profile_scores, interval_low_s, interval_high_s
+        if (
+            None not in (interval_low_s, interval_high_s)
+            or half_width_s >= 2.0 * MAX_TESTED_TIME_OFFSET_S
+        ):
+            return curve_time_offsets_s, profile_scores, interval_low_s, interval_high_s
         half_width_s *= 2.0
 
 
 def _make_offset_grid(centre_s: float, half_width_s: float, offset_count: int) -> Array:
-    start_s = max(centre_s - half_width_s, -MAX_OFFSET_S)
-    return np.linspace(start_s, min(centre_s + half_width_s, MAX_OFFSET_S), offset_count)
+    return np.linspace(
+        max(centre_s - half_width_s, -MAX_TESTED_TIME_OFFSET_S),
+        min(centre_s + half_width_s, MAX_TESTED_TIME_OFFSET_S),
+        offset_count,
+    )
 
 
-def _simulate_offset_variance_factor(
+def _simulate_variance_increase_by_imu_noise(
     imu_motion: PositionsAndImuMotion,
     offset_s: float,
     noise_parameters: NoiseParameters,
     fisher_information: float,
 ) -> float:
-    """Simulate the factor on the variance of the estimated time offset due to IMU noise.
+    """Return the factor by which IMU noise increases the variance of the estimated time offset.
 
-    The factor is relative to 1 / ``fisher_information``; the latter is the curvature of -ln p. The
-    derivative of -ln p with respect to the time offset is eᵀM(v + n), with residuals e, inverse
-    covariance M, velocity v and velocity noise n of the IMU. The term eᵀMn increases the variance:
-    e also contains n.
+    Without this effect the variance is 1 / ``fisher_information``, the curvature of -ln p. The
+    derivative of -ln p with respect to the time offset is eᵀM(v + n), with residuals e of the
+    positions, inverse covariance M, velocity v, and noise n of the velocity from the IMU. Simulated
+    noise gives the variance of eᵀMn. It is not negligible, because e also contains n.
     """
     positions_at_offset = imu_motion.make_positions_at_offset(offset_s)
     is_within_segment = positions_at_offset.is_within_segment
     measurement_count = len(imu_motion.time_s)
     axis_count = len(imu_motion.directions)
-    interval_count = int(np.count_nonzero(is_within_segment))
+    interval_count_within_segments = int(np.count_nonzero(is_within_segment))
     rng = np.random.default_rng(measurement_count)
-    group_start_segments = np.arange(0, len(imu_motion.segment_motions), SIMULATED_SEGMENT_COUNT)
-    series_count = -(-SIMULATION_COUNT // len(group_start_segments))
+    first_segment_of_each_group = np.arange(
+        0, len(imu_motion.segment_motions), SEGMENTS_PER_SIMULATED_GROUP
+    )
+    noise_series_count = -(-SIMULATED_GROUP_COUNT // len(first_segment_of_each_group))
 
     def draw_normal(count: int) -> Array:
-        return rng.standard_normal((count, axis_count, series_count)).transpose(1, 2, 0)
+        return rng.standard_normal((count, axis_count, noise_series_count)).transpose(1, 2, 0)
 
     q00, q01, q11 = (
         noise_parameters.sigma_a_m_s2**2
-        * positions_at_offset.unit_process_noise[:, is_within_segment]
+        * positions_at_offset.process_noise_per_sigma_a_squared[:, is_within_segment]
     )
-    dp, dv = np.zeros((2, axis_count, series_count, measurement_count - 1))
-    dp[..., is_within_segment] = np.sqrt(q00) * draw_normal(interval_count)
-    dv[..., is_within_segment] = np.sqrt(q11 - q01**2 / q00) * draw_normal(interval_count)
+    dp, dv = np.zeros((2, axis_count, noise_series_count, measurement_count - 1))
+    dp[..., is_within_segment] = np.sqrt(q00) * draw_normal(interval_count_within_segments)
+    dv[..., is_within_segment] = np.sqrt(q11 - q01**2 / q00) * draw_normal(
+        interval_count_within_segments
+    )
     dv[..., is_within_segment] += q01 / q00 * dp[..., is_within_segment]
     error_m = noise_parameters.sigma_z_m * draw_normal(measurement_count)
     # The velocity noise of the IMU is the sum of the noise of Δv since the start of the segment
@@ -335,34 +353,34 @@ def _simulate_offset_variance_factor(
         dp[..., is_within_segment] += (
             noise_parameters.random_walk_m
             * np.sqrt(positions_at_offset.interval_s[is_within_segment])
-            * draw_normal(interval_count)
+            * draw_normal(interval_count_within_segments)
         )
-    positions_at_offset, scaled_variance = positions_at_offset.normalise_by_sigma_z(
+    positions_at_offset, measurement_variance_m2 = positions_at_offset.divide_sigmas_by_sigma_z(
         1.0,
         noise_parameters.random_walk_m,
         imu_motion.measurement_weights / noise_parameters.sigma_z_m**2,
     )
-    noise_inner_products = compute_segment_inner_products(
+    residual_and_noise_inner_products = compute_segment_inner_products(
         positions_at_offset,
         noise_parameters.sigma_a_m_s2,
-        scaled_variance,
+        measurement_variance_m2,
         (error_m, dp, dv),
         velocity_noise,
     )
-    variances = np.add.reduceat(noise_inner_products, group_start_segments).var(axis=1)
-    return 1.0 + float(variances.sum()) / fisher_information
+    group_sums = np.add.reduceat(residual_and_noise_inner_products, first_segment_of_each_group)
+    return 1.0 + float(group_sums.var(axis=1).sum()) / fisher_information
 
 
 def _fit_minimum_and_sigma(grid: Array, scores: Array) -> tuple[float, float]:
     """Fit a parabola to -ln p on a grid; return its minimiser, and σ from its curvature."""
     minimum_index = int(np.clip(np.argmin(scores), 1, len(grid) - 2))
     grid_step = grid[1] - grid[0]
-    vertex_shift, curvature = fit_parabola_vertex(scores, minimum_index)
+    parabola_vertex_shift, curvature = fit_parabola_vertex(scores, minimum_index)
     if curvature <= 0.0:
         return float(grid[int(np.argmin(scores))]), float(grid[-1] - grid[0])
-    return float(grid[minimum_index] + np.clip(vertex_shift, -1.0, 1.0) * grid_step), float(
-        grid_step / np.sqrt(curvature)
-    )
+    return float(
+        grid[minimum_index] + np.clip(parabola_vertex_shift, -1.0, 1.0) * grid_step
+    ), float(grid_step / np.sqrt(curvature))
 
 
 def _estimate_flight_part_offsets(
@@ -375,9 +393,11 @@ def _estimate_flight_part_offsets(
 
     The second value is the p-value of the test; None with fewer than two offsets.
     """
-    coarse_offsets_s = offset_s + np.linspace(-MAX_OFFSET_S, MAX_OFFSET_S, COARSE_OFFSET_COUNT)
-    coarse_offsets_s = coarse_offsets_s[np.abs(coarse_offsets_s) <= MAX_OFFSET_S]
-    coarse_segment_scores = fit_constant_errors(
+    coarse_offsets_s = offset_s + np.linspace(
+        -MAX_TESTED_TIME_OFFSET_S, MAX_TESTED_TIME_OFFSET_S, COARSE_OFFSET_COUNT
+    )
+    coarse_offsets_s = coarse_offsets_s[np.abs(coarse_offsets_s) <= MAX_TESTED_TIME_OFFSET_S]
+    segment_scores_at_coarse_offsets = fit_constant_errors(
         imu_motion.make_position_batches(coarse_offsets_s),
         noise_parameters,
         imu_motion.measurement_weights,
@@ -385,13 +405,13 @@ def _estimate_flight_part_offsets(
     grid_offsets_s = np.linspace(
         coarse_offsets_s[0], coarse_offsets_s[-1], LIKELIHOOD_CURVE_POINT_COUNT
     )
-    segment_scores = CubicSpline(coarse_offsets_s, coarse_segment_scores, axis=1)(grid_offsets_s)
+    spline = CubicSpline(coarse_offsets_s, segment_scores_at_coarse_offsets, axis=1)
     part_offsets = []
-    score_rises = []
+    scores_above_minimum = []
     for begin, end, scores in zip(
         imu_motion.segment_edges,
         imu_motion.segment_edges[1:],
-        segment_scores,
+        spline(grid_offsets_s),
         strict=False,
     ):
         part_offset_s, sigma_s = _fit_minimum_and_sigma(grid_offsets_s, scores)
@@ -399,10 +419,10 @@ def _estimate_flight_part_offsets(
         if sigma_s < MAX_SEGMENT_OFFSET_SIGMA_S:
             start_s, end_s = imu_motion.time_s[[begin, end - 1]].tolist()
             part_offsets.append(PartOffset(start_s, end_s, part_offset_s, sigma_s))
-            score_rises.append(scores - scores.min())
+            scores_above_minimum.append(scores - scores.min())
     if len(part_offsets) < 2:
         return tuple(part_offsets), None
-    chi_square = 2.0 * float(np.sum(score_rises, axis=0).min()) / offset_variance_factor
+    chi_square = 2.0 * float(np.sum(scores_above_minimum, axis=0).min()) / offset_variance_factor
     return tuple(part_offsets), float(chdtrc(len(part_offsets) - 1, chi_square))
 
 
@@ -413,11 +433,9 @@ def _fit_clock_drift(part_offsets: tuple[PartOffset, ...]) -> tuple[float | None
     """
     if len(part_offsets) < 3:
         return None, None
-    times_offsets_and_sigmas = [
-        ((part_offset.start_s + part_offset.end_s) / 2.0, part_offset.offset_s, part_offset.sigma_s)
-        for part_offset in part_offsets
-    ]
-    time_s, offset_s, sigma_s = np.transpose(times_offsets_and_sigmas)
+    time_s, offset_s, sigma_s = np.transpose(
+        [((part.start_s + part.end_s) / 2.0, part.offset_s, part.sigma_s) for part in part_offsets]
+    )
     coefficients, covariance = np.polyfit(
         time_s - time_s.mean(), offset_s, 1, w=1.0 / sigma_s, cov="unscaled"
     )

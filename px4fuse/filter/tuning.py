@@ -22,14 +22,14 @@ from px4fuse.filter.fitting import (
     SIGMA_Z_SEARCH_RANGE_M,
     NoiseFit,
     NoiseParameters,
-    convert_to_positions,
+    convert_to_positions_and_increments,
     estimate_outlier_probability,
     maximise_likelihood,
 )
 from px4fuse.filter.imu_motion import MotionCache, compute_imu_motion
 from px4fuse.filter.likelihood import (
     PreintegratedMotion,
-    find_profile_interval,
+    find_profile_likelihood_interval,
     innovations,
     preintegrate,
 )
@@ -47,8 +47,9 @@ MAX_OUTLIER_FRACTION = 0.3
 START_SIGMA_A_FACTORS = (0.1, 0.3, 1.0)
 # Initial value (m/√s) in the search for the random walk of a source that may drift
 START_RANDOM_WALK_M = 0.02
-# A noise estimate within this factor of an end of its search range is only a bound
-MAX_SEARCH_LIMIT_RATIO = 1.001
+# An estimate that differs from an end of its search range by less than this factor is not reported
+# as a value, but only as an upper or lower bound
+SEARCH_RANGE_END_TOLERANCE_FACTOR = 1.001
 
 
 class NoiseEstimate(Record):
@@ -69,7 +70,10 @@ class NoiseEstimate(Record):
         return cls(value, low or None, high)
 
     def as_fields(self, name: str) -> dict[str, Any]:
-        """Return the fields ``name`` and ``name_interval`` of :class:`AxisTuning`."""
+        """Return the estimate as two fields of :class:`AxisTuning`: value and 95 % interval.
+
+        The keys of the fields are ``name`` and ``name`` + "_interval".
+        """
         is_bounded = self.low is not None or self.high is not None
         interval = (self.low or 0.0, self.high) if is_bounded else None
         return {name: self.value, f"{name}_interval": interval}
@@ -211,25 +215,26 @@ def tune_axes(
     may_drift: bool = False,
     motion_cache: MotionCache | None = None,
 ) -> AxisTuning | Unavailable:
-    """Estimate the noises that several axes with equal measurement times have in common.
+    """Estimate noises that several axes with equal measurement times share.
 
     See :func:`tune` for the parameters.
     """
+    analysis_name = f"estimate of SIGMA_A and SIGMA_Z ({name})"
     preintegrated_motions = [preintegrate(axis, settings) for axis in axes]
-    all_measurement_time_s = axes[0].measurement_time_s[
+    measurement_time_before_downsampling_s = axes[0].measurement_time_s[
         -len(preintegrated_motions[0].measurement_m) :
     ]
     axes = tuple(axis.keep_rows(make_downsampling_slice(axis.measurement_time_s)) for axis in axes)
-    axis_positions = [convert_to_positions(preintegrate(axis, settings)) for axis in axes]
+    axis_positions = [
+        convert_to_positions_and_increments(preintegrate(axis, settings)) for axis in axes
+    ]
     measurement_count = len(axis_positions[0].measurement_m) - 1
     if measurement_count < MIN_MEASUREMENTS:
-        return report_too_few_measurements(
-            f"estimate of SIGMA_A and SIGMA_Z ({name})", measurement_count, MIN_MEASUREMENTS
-        )
+        return report_too_few_measurements(analysis_name, measurement_count, MIN_MEASUREMENTS)
     current_parameters = NoiseParameters(settings.sigma_a_m_s2, settings.sigma_z_m)
     kf_fit = maximise_likelihood(axis_positions, current_parameters, np.ones(measurement_count))
     # The estimate with biases, tilt and time offset needs IMU data
-    motion_fit = None
+    imu_motion_fit = None
     if flight is not None and settings.input == "imu":
         measured_m = np.column_stack([axis.measurement_m for axis in axes])
         # KF's fit has no weight for the first measurement, which is its initial state: use weight 1
@@ -253,54 +258,60 @@ def tune_axes(
             offset_s, start_parameters = imu_motion.search_offset(
                 start_parameters, START_SIGMA_A_FACTORS, estimates_scale=False
             )
-            motion_fit = maximise_likelihood(
+            imu_motion_fit = maximise_likelihood(
                 [imu_motion.make_positions_at_offset(offset_s)],
                 start_parameters,
                 imu_motion.measurement_weights,
             )
-    best_fit = kf_fit if motion_fit is None else motion_fit
+    best_fit = kf_fit if imu_motion_fit is None else imu_motion_fit
     is_outlier = kf_fit.outlier_probability > 0.5
-    if len(all_measurement_time_s) > measurement_count:
-        all_axis_positions = [
-            convert_to_positions(preintegrated_motion)
+    if len(measurement_time_before_downsampling_s) > measurement_count:
+        axis_positions_before_downsampling = [
+            convert_to_positions_and_increments(preintegrated_motion)
             for preintegrated_motion in preintegrated_motions
         ]
         is_outlier = (
-            estimate_outlier_probability(all_axis_positions, kf_fit, len(all_measurement_time_s))
+            estimate_outlier_probability(
+                axis_positions_before_downsampling,
+                kf_fit,
+                len(measurement_time_before_downsampling_s),
+            )
             > 0.5
         )
     if np.mean(is_outlier) > MAX_OUTLIER_FRACTION:
         return Unavailable(
-            f"estimate of SIGMA_A and SIGMA_Z ({name})",
+            analysis_name,
             f"{100 * np.mean(is_outlier):.0f} % of the measurements are outliers, too many to "
             "estimate SIGMA_Z",
             "Reduce the outliers of the positioning system.",
         )
     sigma_a, sigma_z = (_estimate_noise(best_fit, noise_index) for noise_index in (0, 1))
     final_sigma_z_m = sigma_z.value or sigma_z.high or best_fit.noise_parameters.sigma_z_m
-    kf_sigma_a = sigma_a if motion_fit is None else _estimate_kf_sigma_a(kf_fit, final_sigma_z_m)
-    if motion_fit is None and flight is not None and settings.input == "imu":
+    kf_sigma_a = (
+        sigma_a if imu_motion_fit is None else _estimate_kf_sigma_a(kf_fit, final_sigma_z_m)
+    )
+    if imu_motion_fit is None and flight is not None and settings.input == "imu":
         # Without estimates of biases and tilt, KF's SIGMA_A also covers them, and is only an upper
         # bound of the acceleration noise
         sigma_a = NoiseEstimate(None, None, kf_sigma_a.high)
     final_parameters = NoiseParameters(
         kf_sigma_a.value or kf_sigma_a.high or kf_fit.noise_parameters.sigma_a_m_s2, final_sigma_z_m
     )
-    gain_nats = kf_fit.score(current_parameters) - kf_fit.score(final_parameters)
+    log_likelihood_gain_nats = kf_fit.score(current_parameters) - kf_fit.score(final_parameters)
     return AxisTuning(
         name=name,
         **sigma_a.as_fields("sigma_a_m_s2"),
         **sigma_z.as_fields("sigma_z_m"),
         **kf_sigma_a.as_fields("sigma_a_two_state_m_s2"),
-        log_likelihood_gain_per_measurement=gain_nats / measurement_count,
+        log_likelihood_gain_per_measurement=log_likelihood_gain_nats / measurement_count,
         before=_assess_kf_consistency(preintegrated_motions[0], current_parameters, is_outlier),
         after=_assess_kf_consistency(preintegrated_motions[0], final_parameters, is_outlier),
-        outlier_time_s=all_measurement_time_s[is_outlier],
-        count=len(all_measurement_time_s),
+        outlier_time_s=measurement_time_before_downsampling_s[is_outlier],
+        count=len(measurement_time_before_downsampling_s),
         outliers=int(np.count_nonzero(is_outlier)),
-        held_out=_check_on_second_half(name, current_parameters, kf_fit),
+        held_out=_test_noises_on_second_half(name, current_parameters, kf_fit),
         noises=best_fit.noise_parameters,
-        biases_fitted=motion_fit is not None,
+        biases_fitted=imu_motion_fit is not None,
     )
 
 
@@ -316,7 +327,7 @@ def _estimate_noise(fit: NoiseFit, noise_index: int) -> NoiseEstimate:
         return fit.score(NoiseParameters(sigma_a, sigma_z, fit.noise_parameters.random_walk_m))
 
     search_range = (SIGMA_A_SEARCH_RANGE_M_S2, SIGMA_Z_SEARCH_RANGE_M)[noise_index]
-    variance_factor = (1.0, fit.sigma_z_variance_inflation)[noise_index]
+    variance_factor = (1.0, fit.log_sigma_z_variance_factor)[noise_index]
     return _make_noise_estimate(
         score,
         (np.log(best_parameters[noise_index]), np.log(best_parameters[1 - noise_index])),
@@ -343,13 +354,13 @@ def _make_noise_estimate(
     variance_factor: float = 1.0,
 ) -> NoiseEstimate:
     estimate = float(np.exp(best_log_sigmas[0]))
-    interval_low, interval_high = find_profile_interval(
+    interval_low, interval_high = find_profile_likelihood_interval(
         score, best_log_sigmas, search_range, variance_factor
     )
     is_inside = (
-        search_range[0] * MAX_SEARCH_LIMIT_RATIO
+        search_range[0] * SEARCH_RANGE_END_TOLERANCE_FACTOR
         < estimate
-        < search_range[1] / MAX_SEARCH_LIMIT_RATIO
+        < search_range[1] / SEARCH_RANGE_END_TOLERANCE_FACTOR
     )
     has_both_ends = interval_low is not None and interval_high is not None
     return NoiseEstimate(
@@ -368,13 +379,13 @@ def _assess_kf_consistency(
     return assess_innovations(nu[~is_outlier], s[~is_outlier])
 
 
-def _check_on_second_half(
+def _test_noises_on_second_half(
     name: str, current_parameters: NoiseParameters, fit: NoiseFit
 ) -> HeldOutCheck | Unavailable:
     first_half_count = len(fit.measurement_weights) // 2
     if first_half_count < MIN_MEASUREMENTS:
         return Unavailable(
-            f"test of SIGMA_A and SIGMA_Z on the second half ({name})",
+            f"test of SIGMA_A and SIGMA_Z on the second half of the flight ({name})",
             f"the first half of the segment contains only {first_half_count} measurements (at "
             f"least {MIN_MEASUREMENTS} are needed)",
             "Analyse a longer segment.",
@@ -383,23 +394,22 @@ def _check_on_second_half(
     first_half_positions = [
         positions.first(1 + first_half_count) for positions in fit.score.axis_positions
     ]
-    first_fit = maximise_likelihood(
+    first_half_fit = maximise_likelihood(
         first_half_positions,
         fit.noise_parameters,
         fit.measurement_weights[:first_half_count],
         fits_outliers=False,
     )
-    tuned_parameters = first_fit.noise_parameters
-    # Log-likelihoods add: the score of the second half is that of the whole flight minus that of
-    # the first half
-    current_score, tuned_score = (
-        fit.score(noise_parameters) - first_fit.score(noise_parameters)
-        for noise_parameters in (current_parameters, tuned_parameters)
+    first_half_parameters = first_half_fit.noise_parameters
+    # Score of the second half: score of the whole flight minus score of the first half
+    current_score, first_half_noise_score = (
+        fit.score(noise_parameters) - first_half_fit.score(noise_parameters)
+        for noise_parameters in (current_parameters, first_half_parameters)
     )
     second_half_count = len(fit.measurement_weights) - first_half_count
     return HeldOutCheck(
-        tuned_parameters.sigma_a_m_s2,
-        tuned_parameters.sigma_z_m,
+        first_half_parameters.sigma_a_m_s2,
+        first_half_parameters.sigma_z_m,
         second_half_count,
-        (current_score - tuned_score) / second_half_count,
+        (current_score - first_half_noise_score) / second_half_count,
     )

@@ -27,7 +27,7 @@ MAX_FUSION_START_TO_RESET_S = 1.0
 
 
 def detect(analysis: Analysis) -> Findings:
-    ekf2, segment = analysis.flight.ekf2, analysis.segment.flight
+    ekf2, segment = analysis.flight.ekf2, analysis.segment.whole_flight
     if not isinstance(ekf2, Ekf2):
         return
     # Resets up to the start of fusion are normal and not reported. If EKF2 fuses no position, the

@@ -6,7 +6,7 @@ import numpy as np
 
 from px4fuse.analysis import Analysis
 from px4fuse.comparison.remedy import find_aid, format_settings
-from px4fuse.core.text import lower_first
+from px4fuse.core.text import lowercase_first_letter
 from px4fuse.filter.frame_rotation import HeadingError
 from px4fuse.finding import Finding, Severity
 from px4fuse.findings.ekf2_noise import find_confirmed_noise_trial
@@ -132,7 +132,7 @@ def detect_misalignment(analysis: Analysis, heading_error: HeadingError) -> Find
     if not analysis.source.origin.is_gnss and (
         calibration_advice := magnetometer_advice(analysis.flight)
     ):
-        action += f" Alternatively: {lower_first(calibration_advice)}"
+        action += f" Alternatively: {lowercase_first_letter(calibration_advice)}"
     yield finding(
         "error" if abs(rotation_deg) >= MIN_SEVERE_HEADING_ERROR_DEG else "warning",
         finding_id,

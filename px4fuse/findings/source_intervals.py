@@ -63,7 +63,7 @@ def detect(analysis: Analysis) -> Findings:
 
 def detect_source_gaps(analysis: Analysis) -> Findings:
     """Detect gaps in the position source."""
-    flight, source, ekf2 = analysis.segment.flight, analysis.source, analysis.flight.ekf2
+    flight, source, ekf2 = analysis.segment.whole_flight, analysis.source, analysis.flight.ekf2
     gap_spans, gap_spans_only_in_log = list[Span](), list[Span]()
     invalid_times_s = analysis.source.invalid_reasons.index
     for gap in analysis.events.gaps:
@@ -116,7 +116,7 @@ def _find_remedy_for_unlogged_positions(analysis: Analysis, start_s: float, end_
 
 def _make_stop_or_begin_finding(analysis: Analysis, span_s: Span, fused_aids: list[Aid]) -> Finding:
     (start_s, end_s), source = span_s, analysis.source
-    is_source_stop = end_s == analysis.segment.flight.end_s
+    is_source_stop = end_s == analysis.segment.whole_flight.end_s
     event_verb, start_or_stop_s, before_or_after = (
         ("stop", start_s, "after") if is_source_stop else ("begin", end_s, "before")
     )

@@ -17,7 +17,7 @@ from px4fuse.ekf2.fusion_conditions import constant_coordinates, is_height_only
 from px4fuse.filter.correlated_noise import SourceLowPass, TimeCorrelatedNoise
 from px4fuse.filter.hypotheses import (
     OUTLIER_BURST_DURATION_S,
-    OUTLIER_RETEST_DURATION_S,
+    OUTLIER_RETEST_DURATION_AFTER_JUMP_S,
     SystematicErrors,
 )
 from px4fuse.filter.signals import cut_to_segment
@@ -476,7 +476,7 @@ def detect_outliers(analysis: Analysis) -> Findings:
         if not any(
             jump_time_s - OUTLIER_BURST_DURATION_S
             <= time_s
-            < jump_time_s + OUTLIER_RETEST_DURATION_S
+            < jump_time_s + OUTLIER_RETEST_DURATION_AFTER_JUMP_S
             for jump_time_s in jump_times_s
         )
     ]

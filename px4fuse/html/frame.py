@@ -56,8 +56,8 @@ def make_number_cell(
     return Cell(format_value(value), value, second_line)
 
 
-# Section of the details that open below a table row, for frame.js: [kind, title, contents, ...]
-RowSection = list[Any]
+# Section of the details that open below a table row, as a list for frame.js: kind, title, contents
+RowDetailsSection = list[Any]
 
 
 @dataclass(frozen=True)
@@ -69,23 +69,25 @@ class Row:
 
     cells: tuple[Cell, ...]
     tags: tuple[str, ...] = ()
-    details: tuple[RowSection, ...] = ()
-    side_sections: tuple[RowSection, ...] = ()
+    details: tuple[RowDetailsSection, ...] = ()
+    side_sections: tuple[RowDetailsSection, ...] = ()
 
 
 # ------------------------------------------------------------------ sections of an unfolded row
 
 
-def make_list_section(title: str, texts: Sequence[str], is_warning: bool = False) -> RowSection:
+def make_list_section(
+    title: str, texts: Sequence[str], is_warning: bool = False
+) -> RowDetailsSection:
     return ["list", title, texts, is_warning]
 
 
-def make_prose_section(title: str, text: str) -> RowSection:
+def make_prose_section(title: str, text: str) -> RowDetailsSection:
     """Return a section with a text, whose line breaks are kept."""
     return ["prose", title, text]
 
 
-def make_name_value_section(title: str, rows: Sequence[tuple[str, str]]) -> RowSection:
+def make_name_value_section(title: str, rows: Sequence[tuple[str, str]]) -> RowDetailsSection:
     """Return a section with pairs (name, value); empty values are omitted."""
     return ["pairs", title, [row for row in rows if row[1]]]
 
@@ -95,11 +97,11 @@ def make_table_section(
     rows: Sequence[Sequence[str]],
     column_titles: Sequence[str],
     numeric_columns: Sequence[int] = (),
-) -> RowSection:
+) -> RowDetailsSection:
     return ["table", title, rows, column_titles, list(numeric_columns)]
 
 
-def make_links_section(title: str, rows: Sequence[tuple[str, str]]) -> RowSection:
+def make_links_section(title: str, rows: Sequence[tuple[str, str]]) -> RowDetailsSection:
     return ["links", title, [row for row in rows if row[1]]]
 
 
@@ -108,7 +110,7 @@ def make_input_boxes_section(
     student_id: str,
     rows: Sequence[tuple[str, float, float | None, str]],
     rows_without_boxes: Sequence[tuple[str, float | None, str]],
-) -> RowSection:
+) -> RowDetailsSection:
     """Return a section with input boxes, in which an instructor enters points and comments.
 
     Parameters
@@ -116,7 +118,9 @@ def make_input_boxes_section(
     rows : sequence of (item, maximum, points, comment)
         Rows with input boxes.
     rows_without_boxes : sequence of (item, points, comment)
-        Rows without input boxes; the page writes all rows to a CSV file.
+        Rows without input boxes.
+
+    The page writes the rows of both kinds to one CSV file.
     """
     return ["boxes", title, student_id, rows, rows_without_boxes]
 
@@ -128,15 +132,15 @@ def page(
     *,
     title: str,
     subtitle: str,
-    html_above: str = "",
+    html_above_table: str = "",
     row_nouns: tuple[str, str],
     columns: Sequence[Column],
     rows: Sequence[Row],
     filters: Sequence[tuple[str, Sequence[tuple[str, str]]]],
     column_groups: Sequence[tuple[str, str]] = (),
-    placeholder: str,
+    search_placeholder: str,
     full_table_note: str,
-    ratio_axis: Mapping[str, Any] | None = None,
+    sigma_ratio_axis: Mapping[str, Any] | None = None,
 ) -> str:
     """Make a web page with a table that can be sorted, searched and filtered.
 
@@ -148,12 +152,13 @@ def page(
         Drop-down lists that filter rows by a tag.
     column_groups : sequence of (group, label)
         Check boxes that show or hide groups of columns.
-    placeholder : str
+    search_placeholder : str
         Hint in the search field.
     full_table_note : str
         Sentence about the file with all rows, for browsers without scripts.
-    ratio_axis : mapping, optional
-        Axis of the ratio columns: ``ends`` (range), ``bands`` (shaded) and ``marks`` (SVG paths).
+    sigma_ratio_axis : mapping, optional
+        Axis of the columns with σ ratios: ``ends`` (range), ``bands`` (shaded) and ``marks`` (SVG
+        paths).
     """
     css_text = "".join(map(read_asset, ("colours.css", "base.css", "frame.css")))
     script = "".join(map(read_asset, ("dom.js", "frame.js")))
@@ -172,7 +177,7 @@ def page(
         ],
         "size": MAX_PAGE_ROWS,
         "nouns": row_nouns,
-        "axis": ratio_axis or {},
+        "axis": sigma_ratio_axis or {},
     }
     return load_template("html/frame.html").render(
         style_hash=compute_csp_hash(css_text),
@@ -181,8 +186,8 @@ def page(
         script=script,
         title=title,
         subtitle=subtitle,
-        above=html_above,
-        placeholder=placeholder,
+        above=html_above_table,
+        placeholder=search_placeholder,
         filters=filters,
         groups=column_groups,
         row_nouns=row_nouns,

@@ -194,7 +194,7 @@ def _find_true_end(
         return final_pose_in_truth
     if is_assessed:
         return DIAGNOSIS_WITHHELD
-    flight = segment.flight
+    flight = segment.whole_flight
     if (
         max(segment.start_s - flight.start_s, flight.end_s - segment.end_s)
         > loop_segment.REST_DURATION_S

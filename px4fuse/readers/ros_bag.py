@@ -11,8 +11,8 @@ from px4fuse.core.reading import (
     LOG_SIZE_REMEDY,
     display_name,
     file_size,
-    files_below,
     format_size_limit,
+    list_files_recursively,
     max_log_bytes,
 )
 from px4fuse.errors import LogError
@@ -80,7 +80,7 @@ def read_bag(path: Path, topic: str | None) -> tuple[PositionTable, str, int]:
             f"{name} is a ROS bag, but the library rosbags, which reads it, is not installed",
             "Run pip install 'px4fuse[ros]'.",
         ) from None
-    files = files_below(path) if path.is_dir() else [path]
+    files = list_files_recursively(path) if path.is_dir() else [path]
     size_bytes = sum(file_size(file, LogError) for file in files)
     if size_bytes > max_log_bytes.get():
         raise LogError(format_size_limit(name, size_bytes, max_log_bytes.get()), LOG_SIZE_REMEDY)

@@ -23,7 +23,7 @@ from pyulog import ULog
 from pyulog.exceptions import ULogException
 
 from px4fuse.core.arrays import IntArray
-from px4fuse.core.text import join_first
+from px4fuse.core.text import join_first_names
 from px4fuse.errors import LogError
 from px4fuse.flight.ekf2_parameters import (
     PARAMETERS,
@@ -405,7 +405,8 @@ def read_topics(name: str, content: bytes) -> Topics:
     if not tables:
         names = sorted({topic for topic, _ in tables_for_time_span})
         notes += (
-            f"the log contains only topics that px4fuse does not use ({join_first(names, 5)})",
+            "the log contains only topics that px4fuse does not use "
+            f"({join_first_names(names, 5)})",
         )
     if NOTE_KEY in ulog.msg_info_dict:
         notes += (_read_printable_text(ulog.msg_info_dict, NOTE_KEY, ""),)

@@ -156,16 +156,27 @@ def draw_offset_likelihood(axes: Axes, time_offset: ClockOffset) -> None:
         time_offset.applied_s,
     )
     axes.axvspan(low_s, high_s, color=KF_BAND_COLOUR, lw=0, label="95 % interval")
-    axes.plot(time_offset.curve_s, time_offset.curve_log_likelihood_drop, **TRACK_STYLES["KF"])
+    axes.plot(
+        time_offset.curve_time_offsets_s,
+        time_offset.curve_log_likelihood_drops,
+        **TRACK_STYLES["KF"],
+    )
     axes.axvline(applied_offset_s, color="black", lw=0.8, ls="--", label="as analysed")
     axes.set_ylim(
-        min(MAX_DRAWN_DECREASE_NATS, float(time_offset.curve_log_likelihood_drop.max()) * 1.05), 0.0
+        min(MAX_DRAWN_DECREASE_NATS, float(time_offset.curve_log_likelihood_drops.max()) * 1.05),
+        0.0,
     )
     half_width_s = OFFSET_PLOT_WIDTH_RATIO * max(high_s - estimate_s, estimate_s - low_s)
     margin_s = 0.1 * half_width_s
     axes.set_xlim(
-        min(max(estimate_s - half_width_s, time_offset.curve_s[0]), applied_offset_s - margin_s),
-        max(min(estimate_s + half_width_s, time_offset.curve_s[-1]), applied_offset_s + margin_s),
+        min(
+            max(estimate_s - half_width_s, time_offset.curve_time_offsets_s[0]),
+            applied_offset_s - margin_s,
+        ),
+        max(
+            min(estimate_s + half_width_s, time_offset.curve_time_offsets_s[-1]),
+            applied_offset_s + margin_s,
+        ),
     )
     axes.set_xlabel("offset added to the source's timestamps (s)")
     draw_legend_above(axes)

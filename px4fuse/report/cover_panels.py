@@ -312,7 +312,7 @@ def _make_innovation_plot(result: AxisComparison) -> TimePlot:
 
 def _select_map_tracks(analysis: Analysis) -> dict[str, Coordinates]:
     """Return north and east (m) of positions, KF, EKF2 and ground truth."""
-    segment, flight = analysis.segment.flight, analysis.flight
+    segment, flight = analysis.segment.whole_flight, analysis.flight
 
     def cut_to_flight(track: pd.DataFrame) -> Coordinates:
         segment_track = cut_to_segment(track, segment)
@@ -379,7 +379,7 @@ def _draw_map(page: Page, analysis: Analysis, flight_map: FlightMap, height: flo
         else:
             stride = max(1, len(map_x_m) // style.MAX_WIDE_AXES_POINTS)
             axes.plot(map_x_m[::stride], map_y_m[::stride], **TRACK_STYLES[name])
-    position_times = cut_to_segment(analysis.source.samples, analysis.segment.flight).index
+    position_times = cut_to_segment(analysis.source.samples, analysis.segment.whole_flight).index
     map_x_m, map_y_m = tracks["positions"]
     for times, marker_style in (
         (analysis.events.take_off_times_s, event_marks.TAKE_OFF_MARKER_STYLE),

@@ -68,7 +68,7 @@ def draw_event_markers(axes: Axes, analysis: Analysis, *, axis: str | None = Non
     from matplotlib.collections import PolyCollection  # noqa: PLC0415
     from matplotlib.lines import Line2D  # noqa: PLC0415
 
-    segment, x_transform = analysis.segment.flight, axes.get_xaxis_transform()
+    segment, x_transform = analysis.segment.whole_flight, axes.get_xaxis_transform()
     axes.set_xlim(segment.start_s, segment.end_s)
     axis_name = analysis.main.axis.name if axis is None else axis
     event_markers = _make_event_markers(

@@ -2,7 +2,7 @@
 
 from collections.abc import Iterator
 
-from px4fuse.core.text import join_first
+from px4fuse.core.text import join_first_names
 from px4fuse.flight.model import Unavailable
 from px4fuse.info.inventory import Inventory, LoggedData
 from px4fuse.report.page import Cell, Page
@@ -103,7 +103,7 @@ def _format_airborne_spans(inventory: Inventory) -> str:
     if not airborne_spans:
         return "the land detector never reported a flight"
     span_texts = [f"{start:.1f} s to {end:.1f} s" for start, end in airborne_spans]
-    return join_first(span_texts, 3)
+    return join_first_names(span_texts, 3)
 
 
 def _make_mavlink_sender_rows(inventory: Inventory) -> list[tuple[str, ...]]:

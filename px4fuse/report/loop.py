@@ -5,7 +5,7 @@ from collections.abc import Iterator
 import numpy as np
 
 from px4fuse.analysis import Analysis
-from px4fuse.core.text import capitalise_first, format_number, format_p_value, join_first
+from px4fuse.core.text import capitalise_first, format_number, format_p_value, join_first_names
 from px4fuse.findings import Finding
 from px4fuse.flight.model import Unavailable
 from px4fuse.loop import corrections
@@ -359,7 +359,7 @@ def make_pose_graph_page(solved_graph: Graph) -> Page:
             if not gate.accepted
         ]
         count_text = f"{len(gate_texts)} of {len(gates)} loop closures rejected"
-        rejected_closure_lines = join_first(gate_texts, MAX_LISTED_CLOSURES, "\n").split("\n")
+        rejected_closure_lines = join_first_names(gate_texts, MAX_LISTED_CLOSURES, "\n").split("\n")
         page.write_labelled("Gate", count_text, *rejected_closure_lines)
         if len(gates) > MAX_GNC_CLOSURES and len(solved_graph.solutions) == 1:
             page.write_labelled(

@@ -16,7 +16,15 @@ from px4fuse.card.model import Card
 from px4fuse.comparison.model import AxisComparison, FilterName
 from px4fuse.comparison.trials import Trial
 from px4fuse.convention.model import Convention
-from px4fuse.core.record import Count, OrUnavailable, Positive, Record, Sha256, Span, Unavailable
+from px4fuse.core.record import (
+    Count,
+    OrUnavailable,
+    PositiveFloat,
+    Record,
+    Sha256,
+    Span,
+    Unavailable,
+)
 from px4fuse.core.text import convert_nested
 from px4fuse.ekf2.aids import AidResult
 from px4fuse.ekf2.replay import Agreement, Ekf2Replay
@@ -63,7 +71,7 @@ class AvailableTrack(Record):
     kind: PositionKind
     path: PositionRoute
     samples: Count
-    rate_hz: Positive | None = None
+    rate_hz: PositiveFloat | None = None
 
 
 class PositionSource(Record, kw_only=True):
@@ -93,7 +101,7 @@ class PositionSource(Record, kw_only=True):
     ekf2_parameters: Mapping[str, float]
     description: str
     reason: str
-    rate_hz: Positive
+    rate_hz: PositiveFloat
     frame: Literal["NED", "FRD", "unknown"]
     clock: str
     reconstructed: bool
@@ -107,9 +115,9 @@ class PositionSource(Record, kw_only=True):
 class ChosenSettings(Record, kw_only=True):
     """Settings of KF, analysed time span, and time offset added to the position timestamps."""
 
-    sigma_a_m_s2: Positive
-    sigma_z_m: Positive
-    dt_s: Positive
+    sigma_a_m_s2: PositiveFloat
+    sigma_z_m: PositiveFloat
+    dt_s: PositiveFloat
     input: KfInputName
     start_s: float
     end_s: float

@@ -3,9 +3,9 @@
 This model of EKF2 starts at rest with PX4's initial variances, and runs on the simulated
 IMU and positions. Its error states are linearised about the true attitude.
 
-Outdoors, EKF2 fuses magnetometer and barometer. Indoors, its heading and height have a simulated
-slow error. Indoors, vehicle_attitude does not come from the model, so that KF does not depend on
-EKF2 parameters.
+Outdoors, EKF2 fuses magnetometer and barometer. Indoors, EKF2's heading and height have a simulated
+slow error. Indoors, vehicle_attitude is simulated without the model: KF uses the attitude, and the
+results of KF must not change with EKF2 parameters.
 """
 
 from collections.abc import Mapping
@@ -70,7 +70,7 @@ from px4fuse.trajectory.rotation import (
     to_rotation_vector,
 )
 
-# EKF2's prediction step (µs): EKF2_PREDICT_US
+# Length (µs) of EKF2's prediction step: parameter EKF2_PREDICT_US
 PREDICTION_STEP_US = 10_000
 # σ (gauss) per axis of earth field and magnetometer bias at the start of the log
 MAGNETIC_FIELD_SIGMA_GAUSS = 0.03
@@ -85,11 +85,11 @@ REST_BEFORE_LOG_S = 10.0
 # σ of specific force (m/s²), angular rate (rad/s) and velocity (m/s) at rest. With these values the
 # model has the σ that EKF2 v1.16 reports on the ground: gyro bias 0.0005 rad/s, velocity 0.06 m/s,
 # horizontal accelerometer bias 0.17 m/s²
-REST_MEASUREMENT_SIGMA = np.repeat([0.05, 0.0005, 0.06], 3)
+MEASUREMENT_SIGMA_AT_REST = np.repeat([0.05, 0.0005, 0.06], 3)
 # σ of EKF2's heading (rad) as PX4 v1.16 logs it in flight
-HEADING_SIGMA_RAD = 0.03
+INDOOR_HEADING_SIGMA_RAD = 0.03
 # σ of EKF2's height (m) as PX4 v1.16 logs it in flight
-HEIGHT_SIGMA_M = 0.15
+INDOOR_HEIGHT_SIGMA_M = 0.15
 # Maximum time (s) between two events at which the model computes variances for estimator_states
 MAX_EVENT_INTERVAL_S = 0.1
 
@@ -107,8 +107,11 @@ def make_parameters(scenario: Scenario, faults: FaultSizes) -> dict[str, int | f
     aid_parameters: dict[str, float] = {aid.noise_mode_parameter: 1}
     if is_gnss:
         # with EKF2_MAG_TYPE 1 EKF2 fuses the magnetic heading only, with 0 all axes
-        mag_type = int(bool(faults.heading_deg))
-        aid_parameters = {GNSS_VEL.noise: scenario.sigma_gnss_m_s, MAG.switch: mag_type}
+        magnetometer_fusion_type = int(bool(faults.heading_deg))
+        aid_parameters = {
+            GNSS_VEL.noise: scenario.sigma_gnss_m_s,
+            MAG.switch: magnetometer_fusion_type,
+        }
         aid_parameters |= {BAROMETER.noise: sensors.SIGMA_BAROMETER_M}
     return (
         defaults
@@ -117,7 +120,8 @@ def make_parameters(scenario: Scenario, faults: FaultSizes) -> dict[str, int | f
             aid.noise: faults.ekf2_noise_m or sensors.compute_reported_sigma_m(scenario, faults),
             aid.gate: faults.ekf2_gate,
             aid.delay: delay_ms,
-            # EKF2 does not fuse older positions; with a clock jump, positions arrive late by it
+            # EKF2 discards positions with a delay above EKF2_DELAY_MAX (ms). With the fault
+            # clock-jump, positions arrive late by the size of the jump
             "EKF2_DELAY_MAX": max(defaults["EKF2_DELAY_MAX"], 100.0 + 1e3 * faults.clock_jump_s),
             "EKF2_PREDICT_US": PREDICTION_STEP_US,
         }
@@ -172,18 +176,18 @@ def simulate_ekf2(
             )
     settings = fill_with_defaults(logged_values, *fused_aids)
     rules = GNSS_RULES if aid == GNSS_POS else VISION_RULES
-    buffer_length = int(np.ceil(settings["EKF2_DELAY_MAX"] * 1e3 / PREDICTION_STEP_US))
     inputs = ReplayInputs(
         settings=settings,
         segments=(segment,),
         received=_select_positions(source),
-        # without bit 0 of EKF2_EV_CTRL, EKF2 tests the samples but never starts fusion
-        # (ev_pos_control.cpp): no two samples arrive within start_interval_s = 0
+        # If bit 0 of EKF2_EV_CTRL is not set, EKF2 tests the positions but never starts fusion
+        # (ev_pos_control.cpp). An interval of 0 has this effect: it never contains two positions
         rules=rules
         if int(log_parameters[aid.switch]) & 1
         else replace(rules, start_interval_s=0.0),
         mean_step_s=step_s,
-        horizon_s=(buffer_length - 1) * step_s,
+        horizon_s=(int(np.ceil(settings["EKF2_DELAY_MAX"] * 1e3 / PREDICTION_STEP_US)) - 1)
+        * step_s,
         configured_step_s=PREDICTION_STEP_US * 1e-6,
         fuses_vision_height=False,
         imu_offset_m=np.zeros(3),
@@ -192,9 +196,12 @@ def simulate_ekf2(
     )
     model_run = run_configurations(inputs, [FilterConfiguration(settings)], {})[0]
     ekf2_output = _compute_output(inputs, model_run, time_us, true_quaternions)
-    aid_source_log_rate_hz = VEHICLE_AID_SOURCE_LOG_RATE_HZ if faults.no_vvo else 0.0
     return make_ekf2_topics(
-        inputs, model_run, ekf2_output, scenario.attitude_rate_hz, aid_source_log_rate_hz
+        inputs,
+        model_run,
+        ekf2_output,
+        scenario.attitude_rate_hz,
+        aid_source_log_rate_hz=VEHICLE_AID_SOURCE_LOG_RATE_HZ if faults.no_vvo else 0.0,
     )
 
 
@@ -216,7 +223,7 @@ def _make_segment(
     )
     step_times_us = time_us[np.concatenate([[0], step_end_indices])]
     time_s = step_times_us * 1e-6
-    body_to_ned = compute_attitude(motion.at(time_s)).body_to_ned
+    body_to_ned = compute_attitude(motion.compute_true_state(time_s)).body_to_ned
     true_quaternions = sensors.to_quaternions(body_to_ned)
     integrated_attitude = cumulative_product(
         np.concatenate([true_quaternions[:1], from_rotation_vector(rotation_rad)])
@@ -231,7 +238,7 @@ def _make_segment(
         faults,
         motion,
         np.zeros(1),
-        sensors.RandomStream.REST,
+        sensors.RandomStream.IMU_NOISE_AT_REST,
         REST_BEFORE_LOG_S * scenario.imu_rate_hz,
     )
     state, covariance = _compute_state_at_rest(
@@ -251,13 +258,13 @@ def _make_segment(
             accelerometer_bias_m_s2=np.zeros(3),
             state=state,
             variance=variance,
-            down_m=motion.at(time_s).position_m[:, 2]
+            down_m=motion.compute_true_state(time_s).position_m[:, 2]
             + sensors.simulate_height_error(scenario, time_s),
             # The variance of tilt measurements is infinite, so only positions correct the tilt
             attitude_variance_rad2=np.tile(
-                [np.inf, np.inf, HEADING_SIGMA_RAD**2], (len(time_s), 1)
+                [np.inf, np.inf, INDOOR_HEADING_SIGMA_RAD**2], (len(time_s), 1)
             ),
-            down_variance_m2=np.full(len(time_s), HEIGHT_SIGMA_M**2),
+            down_variance_m2=np.full(len(time_s), INDOOR_HEIGHT_SIGMA_M**2),
             attitude_error_rad=attitude_error_rad,
             state_correlation=covariance / sigma[:, None] / sigma,
             is_fusing=False,
@@ -270,10 +277,10 @@ def _make_segment(
 def _compute_state_at_rest(
     rotation: Array, specific_force_m_s2: Array, rate_rad_s: Array, heading_error_rad: float
 ) -> tuple[Array, Array]:
-    """Compute EKF2's error state and covariance after REST_BEFORE_LOG_S at rest.
+    """Return EKF2's error state and covariance at the start of the log, after a time at rest.
 
-    PX4's initial covariance is corrected by one Kalman update with the known values at rest:
-    specific force -g, angular rate 0 and velocity 0.
+    They result from PX4's initial covariance and one Kalman update. The update uses the known
+    values at rest: specific force -g, angular rate 0 and velocity 0.
     """
     H = np.zeros((9, STATE_COUNT))
     H[0:3, THETA] = -skew(rotation @ specific_force_m_s2)
@@ -283,8 +290,8 @@ def _compute_state_at_rest(
     z = np.concatenate([-GRAVITY_M_S2 - rotation @ specific_force_m_s2, rate_rad_s, np.zeros(3)])
     P = np.diag(INITIAL_STATE_SIGMA**2)
     x = np.zeros(STATE_COUNT)
-    P[HEADING, HEADING], x[HEADING] = HEADING_SIGMA_RAD**2, heading_error_rad
-    K = P @ H.T @ np.linalg.inv(H @ P @ H.T + np.diag(REST_MEASUREMENT_SIGMA**2))
+    P[HEADING, HEADING], x[HEADING] = INDOOR_HEADING_SIGMA_RAD**2, heading_error_rad
+    K = P @ H.T @ np.linalg.inv(H @ P @ H.T + np.diag(MEASUREMENT_SIGMA_AT_REST**2))
     x += K @ (z - H @ x)
     x[HEADING] = heading_error_rad
     P -= K @ H @ P
@@ -302,25 +309,28 @@ def _select_positions(source: sensors.SimulatedPositions) -> ReceivedPositions:
         for name in ("timestamp_sample", "timestamp")
     )
     latest_timestamp_s = np.maximum.accumulate(np.concatenate([[-np.inf], timestamp_s[:-1]]))
-    is_newer = timestamp_s > latest_timestamp_s
+    is_newer_than_previous = timestamp_s > latest_timestamp_s
     velocity_m_s = source.velocity_m_s
     if velocity_m_s is not None:
         sigmas_m = np.stack([topic_fields["eph"], topic_fields["eph"], topic_fields["epv"]], axis=1)
-        position_variance = sigmas_m[is_newer] ** 2
+        position_variance = sigmas_m[is_newer_than_previous] ** 2
         velocity_variance = np.repeat(
-            topic_fields["s_variance_m_s"][is_newer, None] ** 2, 3, axis=1
+            topic_fields["s_variance_m_s"][is_newer_than_previous, None] ** 2, 3, axis=1
         )
     else:
-        position_variance, velocity_variance = topic_fields["position_variance"][is_newer], None
+        position_variance, velocity_variance = (
+            topic_fields["position_variance"][is_newer_than_previous],
+            None,
+        )
     return ReceivedPositions(
-        timestamp_s=timestamp_s[is_newer],
-        arrival_s=arrival_s[is_newer],
-        position_m=source.position_m[is_newer].astype(np.float32).astype(np.float64),
+        timestamp_s=timestamp_s[is_newer_than_previous],
+        arrival_s=arrival_s[is_newer_than_previous],
+        position_m=source.position_m[is_newer_than_previous].astype(np.float32).astype(np.float64),
         variance_m2=position_variance.astype(np.float64),
-        rejected=np.full(int(is_newer.sum()), np.nan),
-        reset=np.zeros(int(is_newer.sum()), dtype=bool),
+        rejected=np.full(int(is_newer_than_previous.sum()), np.nan),
+        reset=np.zeros(int(is_newer_than_previous.sum()), dtype=bool),
         source=source.topic.name,
-        velocity_m_s=None if velocity_m_s is None else velocity_m_s[is_newer],
+        velocity_m_s=None if velocity_m_s is None else velocity_m_s[is_newer_than_previous],
         velocity_variance_m2_s2=velocity_variance,
     )
 
@@ -331,11 +341,11 @@ def _compute_output(
     segment = model_run.segment
     lag_steps = round(inputs.horizon_s / inputs.mean_step_s)
     state, _ = compute_delayed_states(model_run, 0)
-    resets, is_step_aided = _hold_unaided_position(model_run, state)
+    resets, has_recent_position_aiding = _hold_position_without_aiding(model_run, state)
     reset_sum_m = np.zeros((len(state), 3))
-    for step, reset_m in resets:
-        reset_sum_m[step:, :2] += reset_m
-    # EKF2 corrects the newest IMU samples with the bias at the fusion horizon
+    for step, reset_size_m in resets:
+        reset_sum_m[step:, :2] += reset_size_m
+    # EKF2 corrects the newest IMU samples with an older gyro bias: that at the fusion horizon
     gyro_bias_rad_s = rotate(segment.body_to_ned[1:], delay_by(state[:, GYRO_BIAS], lag_steps)[1:])
     attitude_error_steps_rad = -segment.correction_rad - gyro_bias_rad_s * segment.step_s[:, None]
     gyro_attitude_error_rad = state[0, THETA] + cumulative_sums(attitude_error_steps_rad)
@@ -348,37 +358,46 @@ def _compute_output(
     return Ekf2Output(
         time_us=time_us,
         lag_steps=lag_steps,
-        delayed_attitude=multiply(from_rotation_vector(state[:, THETA]), true_quaternions),
-        delayed_states=state[:, 3:],
+        attitude_at_fusion_horizon=multiply(from_rotation_vector(state[:, THETA]), true_quaternions),
+        states_at_fusion_horizon=state[:, 3:],
         velocity_m_s=velocity_m_s,
         position_m=position_m,
         attitude=multiply(from_rotation_vector(attitude_error_rad), true_quaternions),
-        resets=tuple((step + lag_steps, reset_m) for step, reset_m in resets),
-        is_step_aided=is_step_aided,
+        resets=tuple((step + lag_steps, reset_size_m) for step, reset_size_m in resets),
+        has_recent_position_aiding=has_recent_position_aiding,
     )
 
 
-def _hold_unaided_position(
+def _hold_position_without_aiding(
     model_run: SegmentRun, state: Array
 ) -> tuple[list[tuple[int, Array]], BoolArray]:
-    """Hold the position in ``state`` constant without aiding, like PX4 (fake_pos_control.cpp).
+    """Keep the position in ``state`` constant during times without aiding (fake_pos_control.cpp).
 
-    Return the position resets (step, size in m), and a mask of the steps with aiding in the last
-    NO_AID_TIMEOUT_S.
+    Return the position resets (step, size in m), and a mask of steps: True if an aiding source was
+    fused in the last NO_AID_TIMEOUT_S.
     """
     events, time_s = model_run.events[0], model_run.segment.time_s
-    aid_events = np.flatnonzero(model_run.fused[:, 0] | model_run.reset[:, 0])
-    aiding_times_s = np.zeros(len(time_s))
-    aiding_times_s[events.end_step[aid_events]] = time_s[events.end_step[aid_events]]
-    is_step_aided = time_s - np.maximum.accumulate(aiding_times_s) <= NO_AID_TIMEOUT_S
-    last_aided_steps = np.maximum.accumulate(np.arange(len(time_s)) * is_step_aided)
-    state[:, HORIZONTAL_POSITION] = state[last_aided_steps, HORIZONTAL_POSITION]
-    state[~is_step_aided, VELOCITY.start : VELOCITY.start + 2] = 0.0
+    events_with_aiding = np.flatnonzero(model_run.fused[:, 0] | model_run.reset[:, 0])
+    time_of_aiding_s = np.zeros(len(time_s))
+    time_of_aiding_s[events.end_step[events_with_aiding]] = time_s[
+        events.end_step[events_with_aiding]
+    ]
+    has_recent_position_aiding = (
+        time_s - np.maximum.accumulate(time_of_aiding_s) <= NO_AID_TIMEOUT_S
+    )
+    last_step_with_aiding = np.maximum.accumulate(
+        np.arange(len(time_s)) * has_recent_position_aiding
+    )
+    state[:, HORIZONTAL_POSITION] = state[last_step_with_aiding, HORIZONTAL_POSITION]
+    state[~has_recent_position_aiding, VELOCITY.start : VELOCITY.start + 2] = 0.0
     resets = []
     for event in np.flatnonzero(model_run.reset[:, 0]):
-        step = int(events.end_step[event])
-        reset_m = model_run.innovation[event, 0, POSITION_COLUMNS]
-        if not is_step_aided[step - 1]:
-            reset_m = state[step, HORIZONTAL_POSITION] - state[step - 1, HORIZONTAL_POSITION]
-        resets.append((step, reset_m))
-    return resets, is_step_aided
+        step_at_reset = int(events.end_step[event])
+        reset_size_m = model_run.innovation[event, 0, POSITION_COLUMNS]
+        if not has_recent_position_aiding[step_at_reset - 1]:
+            reset_size_m = (
+                state[step_at_reset, HORIZONTAL_POSITION]
+                - state[step_at_reset - 1, HORIZONTAL_POSITION]
+            )
+        resets.append((step_at_reset, reset_size_m))
+    return resets, has_recent_position_aiding

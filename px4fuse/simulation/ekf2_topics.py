@@ -1,4 +1,4 @@
-"""EKF2 topics of a simulated flight in PX4 v1.16, from the results of px4fuse's EKF2 model."""
+"""Conversion of the results of px4fuse's EKF2 model to the EKF2 topics that PX4 v1.16 logs."""
 
 from collections.abc import Mapping
 from dataclasses import dataclass
@@ -40,25 +40,25 @@ class Ekf2Output:
         Times of the rows, µs from the first data.
     lag_steps : int
         Number of prediction steps from the fusion horizon (delayed time) to the publication.
-    delayed_attitude, delayed_states : ndarray
+    attitude_at_fusion_horizon, states_at_fusion_horizon : ndarray
         Quaternions, and velocity, position, gyro and accelerometer bias, at the fusion horizon.
     velocity_m_s, position_m, attitude : ndarray
         State that the output predictor publishes.
     resets : tuple of (int, ndarray)
         Step and size (m, north and east) of each reset of the published position.
-    is_step_aided : ndarray of bool
+    has_recent_position_aiding : ndarray of bool
         True if an aiding source was fused in the last NO_AID_TIMEOUT_S.
     """
 
     time_us: IntArray
     lag_steps: int
-    delayed_attitude: Array
-    delayed_states: Array
+    attitude_at_fusion_horizon: Array
+    states_at_fusion_horizon: Array
     velocity_m_s: Array
     position_m: Array
     attitude: Array
     resets: tuple[tuple[int, Array], ...]
-    is_step_aided: BoolArray
+    has_recent_position_aiding: BoolArray
 
     def make_timestamps(
         self, steps: IntArray, measurement_times_s: Array | None = None
@@ -79,9 +79,9 @@ class Ekf2Output:
     ) -> IntArray:
         """Return the indices of the messages that a logger writes with a rate limit (Hz)."""
         is_published = end_step < len(self.time_us) - self.lag_steps
-        events = np.flatnonzero(is_message_event & is_published)
-        times_s = sensors.to_seconds(self.time_us[end_step[events]])
-        return events[sensors.is_kept_at_rate(times_s, rate_hz)]
+        event_indices = np.flatnonzero(is_message_event & is_published)
+        times_s = sensors.to_seconds(self.time_us[end_step[event_indices]])
+        return event_indices[sensors.is_kept_at_rate(times_s, rate_hz)]
 
 
 def make_ekf2_topics(
@@ -118,9 +118,11 @@ def _make_local_position_topic(model_inputs: ReplayInputs, ekf2_output: Ekf2Outp
     fields |= sensors.split_vectors(
         {"": ekf2_output.position_m[logged_steps], "v": ekf2_output.velocity_m_s[logged_steps]}
     )
-    is_step_aided = ekf2_output.is_step_aided[np.maximum(logged_steps - ekf2_output.lag_steps, 0)]
+    has_recent_position_aiding = ekf2_output.has_recent_position_aiding[
+        np.maximum(logged_steps - ekf2_output.lag_steps, 0)
+    ]
     fields |= {"delta_xy": reset_sizes_m[reset_count], "xy_reset_counter": reset_count % 256}
-    fields |= dict.fromkeys(("xy_valid", "v_xy_valid"), is_step_aided)
+    fields |= dict.fromkeys(("xy_valid", "v_xy_valid"), has_recent_position_aiding)
     if model_inputs.aid == GNSS_POS:
         fields |= dict(zip(("ref_lat", "ref_lon", "ref_alt"), sensors.HOME_POSITION, strict=True))
     return make_topic("vehicle_local_position", fields)
@@ -136,10 +138,10 @@ def _make_states_topic(
     )
     logged_steps = end_step[logged_indices]
     states = np.zeros((len(logged_steps), 25), np.float32)
-    states[:, 0:4] = ekf2_output.delayed_attitude[logged_steps]
-    states[:, 4 : 4 + ekf2_output.delayed_states.shape[1]] = ekf2_output.delayed_states[
-        logged_steps
-    ]
+    states[:, 0:4] = ekf2_output.attitude_at_fusion_horizon[logged_steps]
+    states[:, 4 : 4 + ekf2_output.states_at_fusion_horizon.shape[1]] = (
+        ekf2_output.states_at_fusion_horizon[logged_steps]
+    )
     # v1.16 stores the horizontal position outside this vector, as latitude and longitude
     states[:, 7:9] = 0.0
     if model_inputs.aid == GNSS_POS:
@@ -147,11 +149,10 @@ def _make_states_topic(
         states[:, 9] -= sensors.HOME_POSITION[2]
     variances = np.zeros((len(logged_steps), 24), np.float32)
     variances[:, : model_run.variance.shape[2]] = model_run.variance[logged_indices + 1, 0]
-    fields = ekf2_output.make_timestamps(logged_steps) | {
-        "states": states,
-        "covariances": variances,
-    }
-    return make_topic("estimator_states", fields)
+    return make_topic(
+        "estimator_states",
+        ekf2_output.make_timestamps(logged_steps) | {"states": states, "covariances": variances},
+    )
 
 
 def _make_position_aid_topics(
@@ -161,27 +162,27 @@ def _make_position_aid_topics(
     events, received_positions = model_run.events[0], model_inputs.received
     velocity_m_s = received_positions.velocity_m_s
     logged_indices = ekf2_output.find_logged_messages(events.usable, events.end_step, rate_hz)
-    steps, sample_indices = events.end_step[logged_indices], events.sample[logged_indices]
-    timestamps = ekf2_output.make_timestamps(steps, events.time_s[logged_indices])
+    logged_steps, sample_indices = events.end_step[logged_indices], events.sample[logged_indices]
+    timestamps = ekf2_output.make_timestamps(logged_steps, events.time_s[logged_indices])
     measured_m = received_positions.position_m[sample_indices, :2]
     north, east = measured_m.T
     innovation_arrays = (model_run.innovation, model_run.innovation_variance, model_run.noise)
     innovation, innovation_variance, noise_variance = (
         values[logged_indices, 0, POSITION_COLUMNS] for values in innovation_arrays
     )
-    # The model gives no innovation (NaN) for positions that EKF2 does not test. EKF2 logs measured
-    # minus estimated position also for these
+    # If EKF2 does not test a position, the innovation of the model is NaN, but EKF2 logs an
+    # innovation: measured minus estimated position
     innovation, innovation_variance = np.where(
         np.isnan(innovation[:, :1]),
         (
-            measured_m - ekf2_output.delayed_states[steps][:, POSITION][:, :2],
+            measured_m - ekf2_output.states_at_fusion_horizon[logged_steps][:, POSITION][:, :2],
             model_run.variance[logged_indices + 1, 0, HORIZONTAL_POSITION] + noise_variance,
         ),
         (innovation, innovation_variance),
     )
     fusion_times_us = np.where(
         model_run.fused[logged_indices, 0] | model_run.reset[logged_indices, 0],
-        ekf2_output.time_us[steps],
+        ekf2_output.time_us[logged_steps],
         -1,
     )
     newest_fusion_us = np.maximum.accumulate(fusion_times_us)
@@ -231,8 +232,8 @@ def _make_barometer_topics(
         updates["fused_at_s"] < len(ekf2_output.time_us) - ekf2_output.lag_steps
     ].iloc[1:]
     updates = updates[sensors.is_kept_at_rate(updates.index.to_numpy(), OTHER_AIDS_LOG_RATE_HZ)]
-    innovation, innovation_variance, is_rejected, is_fused, update_steps = updates.to_numpy().T
-    measurement_times_s, steps = updates.index.to_numpy(), update_steps.astype(np.intp)
+    innovation, innovation_variance, is_rejected, is_fused, step_by_update = updates.to_numpy().T
+    measurement_times_s, steps = updates.index.to_numpy(), step_by_update.astype(np.intp)
     measured_m = (
         height_samples.down_m[
             np.searchsorted(height_samples.measurement_times_s, measurement_times_s)
@@ -274,7 +275,7 @@ def _make_magnetometer_topics(
     ]
     noise_variance = np.full(innovation.shape, settings[MAG.noise] ** 2)
     is_fused = fused_fraction[:, 0] > 0.0
-    attitude_steps, status_steps = (
+    logged_attitude_steps, logged_status_steps = (
         np.flatnonzero(sensors.is_kept_at_rate(sensors.to_seconds(time_us), rate_hz))
         for time_us, rate_hz in (
             (ekf2_output.time_us, attitude_rate_hz),
@@ -284,9 +285,9 @@ def _make_magnetometer_topics(
     return [
         sensors.make_attitude_topic(
             "vehicle_attitude",
-            ekf2_output.time_us[attitude_steps],
+            ekf2_output.time_us[logged_attitude_steps],
             PUBLICATION_DELAY_US,
-            ekf2_output.attitude[attitude_steps],
+            ekf2_output.attitude[logged_attitude_steps],
         ),
         _make_aid_source_topic(
             MAG,
@@ -298,7 +299,7 @@ def _make_magnetometer_topics(
         ),
         make_topic(
             "estimator_status",
-            ekf2_output.make_timestamps(status_steps)
+            ekf2_output.make_timestamps(logged_status_steps)
             | {"control_mode_flags": 1 << MAG_3D_FUSION_BIT},
         ),
     ]
@@ -309,25 +310,24 @@ def _make_aid_source_topic(
     settings: Mapping[str, float],
     timestamps: Mapping[str, Any],
     observation: Array,
-    innovation_and_variances: tuple[Array | Array32, ...],
-    rejected_and_fused: tuple[BoolArray, BoolArray],
+    innovation_with_variances: tuple[Array | Array32, ...],
+    rejected_and_fused_masks: tuple[BoolArray, BoolArray],
 ) -> Topic:
     """Return estimator_aid_src_* of an aiding source.
 
-    ``innovation_and_variances`` are innovation, its variance S, and the measurement variance R.
-    ``rejected_and_fused`` are masks of rejected and of fused samples.
+    ``innovation_with_variances`` are innovation, its variance S, and the measurement variance R.
+    ``rejected_and_fused_masks`` are masks of rejected and of fused samples.
     """
-    innovation, innovation_variance, noise_variance = innovation_and_variances
-    test_ratio = innovation**2 / (max(settings[aid.gate], 1.0) ** 2 * innovation_variance)
+    innovation, innovation_variance, noise_variance = innovation_with_variances
     fields = {
         **timestamps,
         "observation": observation,
         "observation_variance": noise_variance,
         "innovation": -innovation,
         "innovation_variance": innovation_variance,
-        "test_ratio": test_ratio,
-        "innovation_rejected": rejected_and_fused[0],
-        "fused": rejected_and_fused[1],
+        "test_ratio": innovation**2 / (max(settings[aid.gate], 1.0) ** 2 * innovation_variance),
+        "innovation_rejected": rejected_and_fused_masks[0],
+        "fused": rejected_and_fused_masks[1],
     }
     return make_topic(f"estimator_aid_src_{aid.name}", fields)
 
@@ -335,18 +335,20 @@ def _make_aid_source_topic(
 def _make_flags_topic(
     model_inputs: ReplayInputs, model_run: SegmentRun, ekf2_output: Ekf2Output
 ) -> Topic:
-    """Make estimator_status_flags: one message per second and per start or end of fusion."""
+    """Return estimator_status_flags: a message each second, and at each start or end of fusion."""
     events, time_s = model_run.events[0], model_run.segment.time_s
-    attempt_indices = np.flatnonzero(
+    fusion_attempt_indices = np.flatnonzero(
         model_run.fused[:, 0] | model_run.rejected[:, 0] | model_run.reset[:, 0]
     )
     is_fusing = np.zeros(len(time_s), np.bool_)
-    next_attempts_s = np.append(time_s[events.end_step[attempt_indices]], np.inf)[1:]
-    for step, next_attempt_s in zip(
-        events.end_step[attempt_indices].tolist(), next_attempts_s.tolist(), strict=True
+    next_fusion_attempts_s = np.append(time_s[events.end_step[fusion_attempt_indices]], np.inf)[1:]
+    for step, next_fusion_attempt_s in zip(
+        events.end_step[fusion_attempt_indices].tolist(),
+        next_fusion_attempts_s.tolist(),
+        strict=True,
     ):
         stop_s = time_s[step] + model_inputs.rules.stop_timeout_s
-        is_fusing[step : int(np.searchsorted(time_s, min(next_attempt_s, stop_s)))] = True
+        is_fusing[step : int(np.searchsorted(time_s, min(next_fusion_attempt_s, stop_s)))] = True
     has_changed = np.diff(is_fusing.astype(int), prepend=0) != 0
     is_logged = has_changed | sensors.is_kept_at_rate(time_s, FLAGS_LOG_RATE_HZ)
     logged_steps = np.flatnonzero(is_logged[: len(time_s) - ekf2_output.lag_steps])

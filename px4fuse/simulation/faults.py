@@ -27,41 +27,59 @@ def _make_start_time_field() -> Any:
 class FaultSizes:
     """Sizes of the faults to inject into a simulated flight; ``faults.toml`` explains each fault.
 
-    By default, no fault is injected. ``ekf2_noise_m`` 0 and ``ekf2_delay_s`` None stand for the
-    correct noise and delay of EKF2.
+    A field begins with the name of its fault in ``faults.toml``. Fields that end in ``_at_s`` are
+    start times. By default, no fault is injected. ``ekf2_noise_m`` 0 and ``ekf2_delay_s`` None are
+    the correct noise and delay of EKF2.
     """
 
     clock_offset_s: float = make_bounded_field(0.0, -5.0, 5.0, "s", "SECONDS")
     clock_drift_ppm: float = make_bounded_field(0.0, -20_000.0, 20_000.0, "ppm", "PPM")
     clock_jump_s: float = make_bounded_field(0.0, 0.0, 5.0, "s", "SECONDS")
+    # Fraction of outliers, as without line of sight
     nlos_percent: float = make_bounded_field(0.0, 0.0, 50.0, "%", "PERCENT")
+    # Mean error of an outlier
     nlos_size_m: float = make_bounded_field(2.0, 0.0, 100.0, "m", "SIZE")
+    # Length of the gap of the position source
     dropout_s: float = make_bounded_field(0.0, 0.0, 600.0, "s", "SECONDS")
     dropout_at_s: float | None = _make_start_time_field()
+    # Length of the gap of the IMU
     imu_dropout_s: float = make_bounded_field(0.0, 0.0, 600.0, "s", "SECONDS")
     imu_dropout_at_s: float | None = _make_start_time_field()
+    # Reduced rate of the position source
     decimate_hz: float = make_bounded_field(0.0, 0.1, 100.0, "Hz", "HZ")
+    # Ratio of reported to true position variance
     r_scale: float = make_bounded_field(1.0, 1e-4, 1e4, "", "FACTOR")
+    # Rotation of the position frame about the vertical
     yaw_deg: float = make_bounded_field(0.0, -180.0, 180.0, "°", "DEG")
     scale_percent: float = make_bounded_field(0.0, -50.0, 50.0, "%", "PERCENT")
+    # Lasting jump of the positions
     jump_m: float = make_bounded_field(0.0, -100.0, 100.0, "m", "METRES")
     jump_at_s: float | None = _make_start_time_field()
+    # Time constant of the low-pass filter of the position source
     smoothed_s: float = make_bounded_field(0.0, 0.0, 10.0, "s", "SECONDS")
+    # The time-correlated position error has this σ
     slow_error_m: float = make_bounded_field(0.0, 0.0, 100.0, "m", "METRES")
+    # Correlation time of the time-correlated position error
     slow_error_s: float = make_bounded_field(30.0, 0.1, 1e4, "s", "TIME")
+    # Error of EKF2's heading
     heading_deg: float = make_bounded_field(0.0, -180.0, 180.0, "°", "DEG")
     heading_at_s: float | None = _make_start_time_field()
+    # Disturbance of the magnetic field
     mag_gauss: float = make_bounded_field(0.0, -1.0, 1.0, "gauss", "GAUSS")
     mag_at_s: float | None = _make_start_time_field()
     accel_bias_m_s2: float = make_bounded_field(0.0, -5.0, 5.0, "m/s²", "M/S2")
     vibration_m_s2: float = make_bounded_field(0.0, 0.0, 20.0, "m/s²", "M/S2")
     imu_rate_hz: float = make_bounded_field(0.0, 1.0, 1000.0, "Hz", "HZ")
+    # The vehicle only hovers
     no_motion: bool = False
+    # Distance from start to end of the path
     open_end_m: float = make_bounded_field(0.0, 0.0, 100.0, "m", "METRES")
+    # The topic vehicle_visual_odometry is not logged
     no_vvo: bool = False
     ekf2_noise_m: float = make_bounded_field(0.0, 0.01, 100.0, "m", "METRES")
     ekf2_delay_s: float | None = make_bounded_field(None, 0.0, 0.3, "s", "SECONDS")
     ekf2_gate: float = make_bounded_field(5.0, 1.0, 1000.0, "", "SD")
+    # EKF2 does not fuse the positions
     ekf2_off: bool = False
 
 
@@ -82,7 +100,7 @@ class FaultType:
         Effect of the fault in the report, which a student is expected to find.
     changes_ekf2 : bool
         True if the fault changes EKF2 parameters.
-    fields : tuple of str
+    field_names : tuple of str
         Fields of :class:`FaultSizes` that the fault sets: the size, then optional values.
     """
 
@@ -91,18 +109,19 @@ class FaultType:
     finding: str
     kinds: tuple[ScenarioKind, ...] = SCENARIO_KINDS
     changes_ekf2: bool = False
-    fields: tuple[str, ...] = ()
+    field_names: tuple[str, ...] = ()
 
     @property
-    def size_fields(self) -> tuple[str, ...]:
-        """Names of the fields with the values of the fault; empty for a fault without a size."""
-        return () if self.default is True else self.fields
+    def value_field_names(self) -> tuple[str, ...]:
+        """Fields of FaultSizes that the user sets; empty for a fault without a size."""
+        return () if self.default is True else self.field_names
 
     @property
     def usage(self) -> str:
         """Syntax of the values after the name of the fault, such as ``=PERCENT[,SIZE]``."""
         required_placeholder, *optional_placeholders = [
-            f"={BOUNDS_BY_FIELD[field_name].cli_name}" for field_name in self.size_fields
+            f"={BOUNDS_BY_FIELD[field_name].option_or_placeholder}"
+            for field_name in self.value_field_names
         ] or [""]
         return required_placeholder + "".join(
             f"[,{placeholder[1:]}]" for placeholder in optional_placeholders
@@ -112,8 +131,8 @@ class FaultType:
 FAULT_TYPES: Mapping[str, FaultType] = {
     name: replace(
         fault_type,
-        # the names of the fields begin with the name of the fault
-        fields=tuple(
+        # the names of the fields of FaultSizes begin with the name of the fault
+        field_names=tuple(
             field for field in vars(FaultSizes()) if field.startswith(name.replace("-", "_"))
         ),
     )
@@ -147,13 +166,13 @@ def parse_faults(texts: Iterable[str]) -> FaultSizes:
             )
         fault_type = FAULT_TYPES[name]
         value_texts = values_text.split(",") if separator else []
-        if len(value_texts) > len(fault_type.size_fields):
+        if len(value_texts) > len(fault_type.value_field_names):
             raise SettingsError(
                 f"--mistake {option_text}: the fault has too many values. "
                 f"Use {name}{fault_type.usage}."
             )
-        value_by_field[fault_type.fields[0]] = fault_type.default
-        for field_name, value_text in zip(fault_type.size_fields, value_texts, strict=False):
+        value_by_field[fault_type.field_names[0]] = fault_type.default
+        for field_name, value_text in zip(fault_type.value_field_names, value_texts, strict=False):
             bounds = BOUNDS_BY_FIELD[field_name]
             size = convert_to_unit(value_text, bounds.unit)
             if size is None:
@@ -161,7 +180,7 @@ def parse_faults(texts: Iterable[str]) -> FaultSizes:
                     f"--mistake {option_text}: {value_text!r} is not a valid value: give "
                     f"{UNIT_NAMES[bounds.unit]}, as in {name}{fault_type.usage}."
                 )
-            bounds.check(size, f"--mistake {option_text}: {bounds.cli_name}")
+            bounds.check(size, f"--mistake {option_text}: {bounds.option_or_placeholder}")
             value_by_field[field_name] = size
     return FaultSizes(**value_by_field)  # type: ignore[arg-type]
 
@@ -172,7 +191,8 @@ def injected_fault_names(faults: FaultSizes) -> tuple[str, ...]:
     return tuple(
         name
         for name, fault_type in FAULT_TYPES.items()
-        if getattr(faults, fault_type.fields[0]) != getattr(defaults, fault_type.fields[0])
+        if getattr(faults, fault_type.field_names[0])
+        != getattr(defaults, fault_type.field_names[0])
     )
 
 
@@ -184,7 +204,7 @@ def format_fault(name: str, faults: FaultSizes) -> str:
     """
     value_texts = [
         f"{value:g}{_ASCII_UNITS.get(unit := BOUNDS_BY_FIELD[field_name].unit, unit)}"
-        for field_name in FAULT_TYPES[name].size_fields
+        for field_name in FAULT_TYPES[name].value_field_names
         if (value := getattr(faults, field_name)) is not None
     ]
     return f"{name}={','.join(value_texts)}" if value_texts else name

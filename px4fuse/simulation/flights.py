@@ -69,7 +69,9 @@ def simulate(scenario: Scenario, faults: FaultSizes = NO_FAULTS) -> Simulation:
             f"({reported_m:g} m). Use a larger value."
         )
     motion = plan_flight(
-        scenario, faults, sensors.make_random_generator(scenario, sensors.RandomStream.WANDER)
+        scenario,
+        faults,
+        sensors.make_random_generator(scenario, sensors.RandomStream.PATH_DEVIATION),
     )
     positions = sensors.simulate_positions(scenario, faults, motion)
     imu = sensors.simulate_imu(scenario, faults, motion)
@@ -146,8 +148,10 @@ def make_answer_key(simulation: Simulation) -> dict[str, Any]:
     """Return injected faults and true values of a flight for the instructor, as JSON types."""
     scenario, faults = simulation.scenario, simulation.faults
     motion, source = simulation.motion, simulation.positions
-    accelerometer_bias_m_s2, gyro_bias_rad_s = sensors.draw_biases(scenario, faults)
-    first_position_m, last_position_m = motion.at(np.array([0.0, motion.duration_s])).position_m
+    accelerometer_bias_m_s2, gyro_bias_rad_s = sensors.draw_imu_biases(scenario, faults)
+    first_position_m, last_position_m = motion.compute_true_state(
+        np.array([0.0, motion.duration_s])
+    ).position_m
     timestamps_us = sensors.get_time_us(source.topic, "timestamp_sample")
     outlier_indices = np.flatnonzero(source.is_outlier)
     answer_key: dict[str, Any] = to_json_types(
@@ -159,7 +163,10 @@ def make_answer_key(simulation: Simulation) -> dict[str, Any]:
                     "typed": format_fault(name, faults),
                     "help": FAULT_TYPES[name].help,
                     "finding": FAULT_TYPES[name].finding,
-                    **{field: getattr(faults, field) for field in FAULT_TYPES[name].size_fields},
+                    **{
+                        field: getattr(faults, field)
+                        for field in FAULT_TYPES[name].value_field_names
+                    },
                 }
                 for name in injected_fault_names(faults)
             },

@@ -30,15 +30,15 @@ CLIMB_RAMP_DURATION_S = 1.5
 MAX_FLIGHT_S = 3600.0
 # Time (s) in which the slow deviation from the path increases to its full size after take-off, and
 # decreases to zero before landing
-DEVIATION_RAMP_DURATION_S = 3.0
+PATH_DEVIATION_RAMP_DURATION_S = 3.0
 # Time (s) of a 180° turn at the end of the aisle with --yaw follow
 TURN_ROUND_DURATION_S = 4.0
 # Minimum distance (s) of the breakpoints of piecewise polynomials; nearer breakpoints are merged
-MIN_BREAKPOINT_DISTANCE_S = 1e-9
+MIN_POLYNOMIAL_BREAKPOINT_DISTANCE_S = 1e-9
 # Range of the periods (s) of the slow deviation from the path, a sum of sines
 DEVIATION_PERIOD_RANGE_S = (3.0, 20.0)
-# Number of sines in a slow deviation or sensor error
-SINE_COUNT = 4
+# A slow path deviation or sensor error is a sum of this number of sines
+SLOW_ERROR_SINE_COUNT = 4
 
 
 def _sum_ramps(ramps: Sequence[tuple[float, float, Array]]) -> PPoly:
@@ -52,14 +52,17 @@ def _sum_ramps(ramps: Sequence[tuple[float, float, Array]]) -> PPoly:
     end_s = start_s + duration_s
     times_s = np.r_[start_s[0] - 1.0, np.column_stack([start_s, end_s]).ravel(), end_s[-1] + 1.0]
     # If a ramp starts at the end of the previous ramp, keep only one of the two equal breakpoints
-    is_used = np.diff(times_s, prepend=-np.inf) > MIN_BREAKPOINT_DISTANCE_S
+    is_used = np.diff(times_s, prepend=-np.inf) > MIN_POLYNOMIAL_BREAKPOINT_DISTANCE_S
     values = np.repeat(value_after_ramp, 2, axis=0)[is_used]
     derivatives = np.stack([values, 0.0 * values, 0.0 * values], axis=1)
     return PPoly.from_bernstein_basis(BPoly.from_derivatives(times_s[is_used], derivatives))
 
 
 def _differentiate(ramp_function: PPoly, time_s: Array, orders: Sequence[int]) -> list[Array]:
-    """Return derivatives of a sum of ramps, shape (t, k), one per order; -1 is the integral."""
+    """Return the derivatives of a sum of ramps with the given orders, each of shape (t, k).
+
+    Order 0 is the function, and order -1 is its integral.
+    """
     clipped_times_s = np.clip(time_s, *ramp_function.x[[0, -1]])
     return [np.asarray(ramp_function.derivative(order)(clipped_times_s)) for order in orders]
 
@@ -74,16 +77,16 @@ class Sines:
 
     @classmethod
     def draw(
-        cls, rng: np.random.Generator, rms: Array, period_range_s: tuple[float, float]
+        cls, rng: np.random.Generator, rms_by_axis: Array, period_range_s: tuple[float, float]
     ) -> Sines:
-        """Draw SINE_COUNT sines with log-uniform periods, random phases, and an RMS per axis."""
+        """Draw random sines: log-uniform periods, random phases, and one RMS for each axis."""
         low, high = np.log(period_range_s)
-        angular_frequency = 2.0 * np.pi / np.exp(rng.uniform(low, high, SINE_COUNT))
-        phase = rng.uniform(0.0, 2.0 * np.pi, (SINE_COUNT, len(rms)))
-        amplitude = rms * np.sqrt(2.0 / SINE_COUNT)
+        angular_frequency = 2.0 * np.pi / np.exp(rng.uniform(low, high, SLOW_ERROR_SINE_COUNT))
+        phase = rng.uniform(0.0, 2.0 * np.pi, (SLOW_ERROR_SINE_COUNT, len(rms_by_axis)))
+        amplitude = rms_by_axis * np.sqrt(2.0 / SLOW_ERROR_SINE_COUNT)
         return cls(angular_frequency, amplitude * np.cos(phase), amplitude * np.sin(phase))
 
-    def at(self, time_s: Array, output_count: int = 1) -> list[Array]:
+    def compute_values(self, time_s: Array, output_count: int = 1) -> list[Array]:
         """Return ``output_count`` arrays (t, k): sum of the sines, then its time derivatives."""
         angle = np.outer(time_s, self.angular_frequency_rad_s)
         basis = np.concatenate([np.sin(angle), np.cos(angle)], axis=1)
@@ -122,26 +125,26 @@ class Motion:
     touch_down_s: float
     duration_s: float
 
-    def at(self, time_s: Array) -> TrueState:
+    def compute_true_state(self, time_s: Array) -> TrueState:
         """Return the true state at the times ``time_s``, which are seconds from the first data."""
         position, velocity, acceleration, jerk = _differentiate(
             self.velocity, time_s, (-1, 0, 1, 2)
         )
         yaw_rad, yaw_rate_rad_s = _differentiate(self.yaw, time_s, (0, 1))
-        # the deviation from the path is multiplied by 1 in the air and by 0 on the ground
-        deviation_factor = _sum_ramps(
+        # factor on the deviation from the path: 1 in the air and 0 on the ground
+        path_deviation_factor = _sum_ramps(
             [
-                (self.take_off_s, DEVIATION_RAMP_DURATION_S, np.array([1.0])),
+                (self.take_off_s, PATH_DEVIATION_RAMP_DURATION_S, np.array([1.0])),
                 (
-                    self.touch_down_s - DEVIATION_RAMP_DURATION_S,
-                    DEVIATION_RAMP_DURATION_S,
+                    self.touch_down_s - PATH_DEVIATION_RAMP_DURATION_S,
+                    PATH_DEVIATION_RAMP_DURATION_S,
                     np.array([-1.0]),
                 ),
             ]
         )
         # derivatives of the product factor · deviation (Leibniz rule)
-        f0, f1, f2, f3 = _differentiate(deviation_factor, time_s, range(4))
-        d0, d1, d2, d3 = self.path_deviation.at(time_s, 4)
+        f0, f1, f2, f3 = _differentiate(path_deviation_factor, time_s, range(4))
+        d0, d1, d2, d3 = self.path_deviation.compute_values(time_s, 4)
         return TrueState(
             position_m=position + f0 * d0,
             velocity_m_s=velocity + f0 * d1 + f1 * d0,
@@ -163,7 +166,7 @@ class AttitudeAndImu:
     angular_rate_rad_s : ndarray, shape (n, 3)
         Body FRD.
     specific_force_m_s2 : ndarray, shape (n, 3)
-        Body FRD; along the z axis only.
+        Body FRD. Only the z component is not zero, because a quadrotor has thrust along z only.
     """
 
     body_to_ned: Array
@@ -174,30 +177,32 @@ class AttitudeAndImu:
 def compute_attitude(state: TrueState) -> AttitudeAndImu:
     """Return attitude, angular rate and specific force of a quadrotor in the true motion."""
     gravity = np.array([0.0, 0.0, constants.g])
-    opposite_thrust_m_s2 = gravity - state.acceleration_m_s2
-    specific_thrust_m_s2 = np.sqrt(_dot(opposite_thrust_m_s2, opposite_thrust_m_s2))[:, None]
-    z = opposite_thrust_m_s2 / specific_thrust_m_s2
-    z_derivative_1_s = -state.jerk_m_s3 / specific_thrust_m_s2
-    z_derivative_1_s -= z * _dot(z, z_derivative_1_s)[:, None]
+    negative_thrust_acceleration_m_s2 = gravity - state.acceleration_m_s2
+    specific_thrust_m_s2 = np.sqrt(
+        _dot(negative_thrust_acceleration_m_s2, negative_thrust_acceleration_m_s2)
+    )[:, None]
+    z = negative_thrust_acceleration_m_s2 / specific_thrust_m_s2
+    z_derivative_per_s = -state.jerk_m_s3 / specific_thrust_m_s2
+    z_derivative_per_s -= z * _dot(z, z_derivative_per_s)[:, None]
     yaw_rad = state.yaw_rad
     forward_direction, right_direction = (
         np.stack([np.cos(angle), np.sin(angle), np.zeros_like(angle)], axis=1)
         for angle in (yaw_rad, yaw_rad + np.pi / 2.0)
     )
-    # n = z × forward_direction: direction of the body's y axis, but not of length 1
-    n = np.cross(z, forward_direction)
-    n_derivative_1_s = np.cross(z_derivative_1_s, forward_direction) + state.yaw_rate_rad_s[
-        :, None
-    ] * np.cross(z, right_direction)
-    n_norm = np.sqrt(_dot(n, n))
-    y = n / n_norm[:, None]
+    # unnormalised_y = z × forward_direction: direction of the body's y axis, but not of length 1
+    unnormalised_y = np.cross(z, forward_direction)
+    unnormalised_y_derivative_per_s = np.cross(
+        z_derivative_per_s, forward_direction
+    ) + state.yaw_rate_rad_s[:, None] * np.cross(z, right_direction)
+    unnormalised_y_length = np.sqrt(_dot(unnormalised_y, unnormalised_y))
+    y = unnormalised_y / unnormalised_y_length[:, None]
     x = np.cross(y, z)
     # angular rate ω in body axes, from dR/dt = R [ω]×
     rate_rad_s = np.stack(
         [
-            -_dot(z_derivative_1_s, y),
-            _dot(z_derivative_1_s, x),
-            -_dot(n_derivative_1_s, x) / n_norm,
+            -_dot(z_derivative_per_s, y),
+            _dot(z_derivative_per_s, x),
+            -_dot(unnormalised_y_derivative_per_s, x) / unnormalised_y_length,
         ],
         axis=1,
     )
@@ -220,7 +225,7 @@ def plan_flight(scenario: Scenario, faults: FaultSizes, rng: np.random.Generator
         The distance from start to end of the loop is longer than the last side, or the flight
         takes too long.
     """
-    flight_plan = _FlightPlan(TIME_ON_GROUND_S, scenario.heading_deg)
+    flight_plan = _FlightBuilder(TIME_ON_GROUND_S, scenario.heading_deg)
     climb_rate_m_s = min(MAX_CLIMB_RATE_M_S, scenario.altitude_m / 2.0)
     climb_time_s = scenario.altitude_m / climb_rate_m_s
     climb_velocity_m_s = np.array([0.0, 0.0, -climb_rate_m_s])
@@ -229,14 +234,14 @@ def plan_flight(scenario: Scenario, faults: FaultSizes, rng: np.random.Generator
         -climb_velocity_m_s, CLIMB_RAMP_DURATION_S, CLIMB_RAMP_DURATION_S / 2.0 + scenario.pause_s
     )
     if scenario.kind == "aisle":
-        _fly_aisle(flight_plan, scenario, 0.0 if faults.no_motion else scenario.speed_m_s)
+        _plan_aisle_passes(flight_plan, scenario, 0.0 if faults.no_motion else scenario.speed_m_s)
     else:
-        _fly_loop(flight_plan, scenario, faults)
+        _plan_square_laps(flight_plan, scenario, faults)
     flight_plan.add_velocity_change(-climb_velocity_m_s, CLIMB_RAMP_DURATION_S, climb_time_s)
     touch_down_s = flight_plan.ramp_centre_s + CLIMB_RAMP_DURATION_S / 2.0
     if touch_down_s > MAX_FLIGHT_S:
         raise SettingsError(
-            f"This flight would take {touch_down_s:.0f} s; the simulation is limited to "
+            f"This flight would take {touch_down_s:.0f} s, but the simulation is limited to "
             f"{MAX_FLIGHT_S:g} s. Reduce --passes or --length."
         )
     flight_plan.add_velocity_change(climb_velocity_m_s, CLIMB_RAMP_DURATION_S, 0.0)
@@ -250,11 +255,10 @@ def plan_flight(scenario: Scenario, faults: FaultSizes, rng: np.random.Generator
     )
 
 
-class _FlightPlan:
-    """Builder of a flight, which appends velocity and yaw ramps.
+class _FlightBuilder:
+    """Builder of a flight: a list of velocity ramps, and a list of yaw ramps.
 
-    ``ramp_centre_s`` is the time of the centre of the next velocity ramp. The distance flown
-    between two ramps is the speed times the time between their centres.
+    ``ramp_centre_s`` is the time of the centre of the velocity ramp that is added next.
     """
 
     def __init__(self, climb_start_s: float, heading_deg: float) -> None:
@@ -264,13 +268,16 @@ class _FlightPlan:
         self.yaw_ramps = [(-1.0, 1.0, np.radians([heading_deg]))]
 
     def add_velocity_change(
-        self, velocity_change_m_s: Array, duration_s: float, time_to_next_s: float
+        self, velocity_change_m_s: Array, duration_s: float, time_to_next_ramp_s: float
     ) -> None:
-        """Append a velocity ramp; ``time_to_next_s`` is the time from its centre to the next."""
+        """Append a velocity ramp.
+
+        ``time_to_next_ramp_s`` is the time from its centre to the centre of the next velocity ramp.
+        """
         self.velocity_ramps.append(
             (self.ramp_centre_s - duration_s / 2.0, duration_s, velocity_change_m_s)
         )
-        self.ramp_centre_s += time_to_next_s
+        self.ramp_centre_s += time_to_next_ramp_s
 
     def add_turn(self, angle_rad: float, start_s: float, duration_s: float) -> None:
         self.yaw_ramps.append((start_s, duration_s, np.array([angle_rad])))
@@ -282,11 +289,11 @@ def compute_direction(heading_deg: float) -> Array:
     return np.array([np.cos(heading_rad), np.sin(heading_rad), 0.0])
 
 
-def _fly_aisle(flight_plan: _FlightPlan, scenario: Scenario, speed_m_s: float) -> None:
+def _plan_aisle_passes(flight_plan: _FlightBuilder, scenario: Scenario, speed_m_s: float) -> None:
     velocity_m_s = speed_m_s * compute_direction(scenario.heading_deg)
-    nose_follows_path = scenario.nose_follows_path and speed_m_s > 0.0
+    heading_follows_path = scenario.nose_follows_path and speed_m_s > 0.0
     pause_s = (
-        max(scenario.pause_s, TURN_ROUND_DURATION_S) if nose_follows_path else scenario.pause_s
+        max(scenario.pause_s, TURN_ROUND_DURATION_S) if heading_follows_path else scenario.pause_s
     )
     flight_plan.ramp_centre_s += SPEED_RAMP_DURATION_S / 2.0
     for pass_index in range(scenario.passes):
@@ -298,11 +305,11 @@ def _fly_aisle(flight_plan: _FlightPlan, scenario: Scenario, speed_m_s: float) -
         flight_plan.add_velocity_change(
             -pass_velocity_m_s, SPEED_RAMP_DURATION_S, SPEED_RAMP_DURATION_S + pause_s
         )
-        if nose_follows_path and pass_index < scenario.passes - 1:
+        if heading_follows_path and pass_index < scenario.passes - 1:
             flight_plan.add_turn(np.pi, stop_s, TURN_ROUND_DURATION_S)
 
 
-def _fly_loop(flight_plan: _FlightPlan, scenario: Scenario, faults: FaultSizes) -> None:
+def _plan_square_laps(flight_plan: _FlightBuilder, scenario: Scenario, faults: FaultSizes) -> None:
     speed_m_s = 0.0 if faults.no_motion else scenario.speed_m_s
     last_side_length_m = scenario.length_m - faults.open_end_m
     if last_side_length_m < scenario.speed_m_s * CORNER_DURATION_S:

@@ -28,17 +28,17 @@ DEFAULTS_BY_KIND: Mapping[ScenarioKind, Mapping[str, float]] = {
 
 @dataclass(frozen=True)
 class Bounds:
-    """Limits of a numeric option, with its unit (:data:`px4fuse.core.units.UNIT_NAMES`).
+    """Limits and unit (:data:`px4fuse.core.units.UNIT_NAMES`) of a number on the command line.
 
-    ``cli_name`` is the option, such as --speed, or the placeholder for the size of a fault, such as
-    SECONDS. ``meaning`` is the help text of the option; empty for a field without option.
+    ``option_or_placeholder`` is the name of an option, such as --speed. For the size of a fault, it
+    is a placeholder such as SECONDS. ``help_text`` is the help of the option; empty for a fault.
     """
 
     low: float
     high: float
     unit: str = ""
-    cli_name: str = ""
-    meaning: str = ""
+    option_or_placeholder: str = ""
+    help_text: str = ""
 
     def check(self, value: float, name: str) -> None:
         """Raise SettingsError if a value is out of range; ``name`` is its name in the message."""
@@ -76,7 +76,7 @@ class Scenario:
     pause_s : float
         Time of hover at each end of the aisle.
     wander_m : float
-        RMS of the slow deviation from the path, on each axis.
+        RMS of the slow deviation from the planned path, on each axis.
     vio_walk_m : float
         Random walk of the VIO drift, m per √m flown, on each axis.
     tilt_error_deg, yaw_error_deg : float
@@ -96,7 +96,7 @@ class Scenario:
         1000.0,
         "m",
         "--length",
-        "Length of the aisle, or of one side of the square path.",
+        "Length of the aisle (or of each side of the square path).",
     )
     speed_m_s: float = make_bounded_field(
         1.0, 0.1, 10.0, "m/s", "--speed", "Speed on the straight segments of the path."
@@ -139,7 +139,7 @@ class Scenario:
         20.0,
         "m/s²",
         "--sigma-a",
-        "White accelerometer noise (1 σ of 0.1 s averages): the true process noise SIGMA_A.",
+        "True SIGMA_A: white accelerometer noise (1 σ), averaged over 0.1 s.",
     )
     accel_bias_sigma_m_s2: float = make_bounded_field(
         0.03,
@@ -166,7 +166,7 @@ class Scenario:
         if self.yaw is not None and self.yaw not in YAW_MODES:
             raise SettingsError(f"--yaw {self.yaw}: give {' or '.join(YAW_MODES)}.")
         for name, bounds in collect_field_bounds(Scenario).items():
-            bounds.check(getattr(self, name), bounds.cli_name)
+            bounds.check(getattr(self, name), bounds.option_or_placeholder)
         min_length_m = self.speed_m_s * (
             SPEED_RAMP_DURATION_S if self.kind == "aisle" else CORNER_DURATION_S
         )

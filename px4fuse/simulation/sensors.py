@@ -36,7 +36,7 @@ FIRST_POSITION_TIME_S = 0.1
 # 10 Hz (Timesync.cpp)
 TIMESYNC_CONVERGENCE_TIME_S = 50.0
 # Mean number of positions in a burst of outliers
-MEAN_OUTLIER_BURST_LENGTH = 3
+MEAN_OUTLIER_BURST_POSITION_COUNT = 3
 # Origin of the local frame outdoors: latitude, longitude (degrees) and altitude (m)
 HOME_POSITION = (47.397742, 8.545594, 488.0)
 # Time (s) from the measurement of a GNSS position to its timestamp
@@ -64,14 +64,15 @@ LAND_DETECTOR_INTERVAL_US = 1_000_000
 # therefore does not change the noise of the others
 RandomStream = IntEnum(
     "RandomStream",
-    "WANDER BIAS IMU ATTITUDE TIMING SOURCE DRIFT NLOS VIBRATION HEIGHT REST SLOW FIX_VELOCITY "
-    "FIELD BAROMETER",
+    "PATH_DEVIATION IMU_BIAS IMU_NOISE ATTITUDE_ERROR POSITION_TIMES POSITION_NOISE VIO_DRIFT "
+    "NLOS_OUTLIERS VIBRATION HEIGHT_ERROR IMU_NOISE_AT_REST SLOW_POSITION_ERROR "
+    "GNSS_VELOCITY_NOISE MAGNETOMETER_NOISE BAROMETER_NOISE",
     start=0,
 )
 
 
-def make_random_generator(scenario: Scenario, stream: RandomStream) -> np.random.Generator:
-    return np.random.default_rng([scenario.seed, stream])
+def make_random_generator(scenario: Scenario, random_stream: RandomStream) -> np.random.Generator:
+    return np.random.default_rng([scenario.seed, random_stream])
 
 
 @dataclass(frozen=True)
@@ -101,9 +102,9 @@ class SimulatedPositions:
     drift_m: Array
 
 
-def draw_biases(scenario: Scenario, faults: FaultSizes) -> tuple[Array, Array]:
+def draw_imu_biases(scenario: Scenario, faults: FaultSizes) -> tuple[Array, Array]:
     """Return accelerometer (m/s²) and gyro (rad/s) biases, body FRD, each of shape (3,)."""
-    rng = make_random_generator(scenario, RandomStream.BIAS)
+    rng = make_random_generator(scenario, RandomStream.IMU_BIAS)
     accelerometer_bias_m_s2 = rng.normal(0.0, scenario.accel_bias_sigma_m_s2, 3)
     accelerometer_bias_m_s2[0] += faults.accel_bias_m_s2
     return accelerometer_bias_m_s2, rng.normal(0.0, scenario.gyro_bias_sigma_rad_s, 3)
@@ -113,7 +114,7 @@ def simulate_imu(scenario: Scenario, faults: FaultSizes, motion: Motion) -> Topi
     """Simulate sensor_combined (accelerometer and gyro) at the full rate, without gaps."""
     time_us = _make_sample_times_us(motion, scenario.imu_rate_hz)
     specific_force_m_s2, rate_rad_s = measure_imu(
-        scenario, faults, motion, to_seconds(time_us), RandomStream.IMU
+        scenario, faults, motion, to_seconds(time_us), RandomStream.IMU_NOISE
     )
     if faults.vibration_m_s2:
         vibration_sigma_m_s2 = faults.vibration_m_s2 * np.sqrt(DT_S * scenario.imu_rate_hz)
@@ -132,7 +133,7 @@ def simulate_imu(scenario: Scenario, faults: FaultSizes, motion: Motion) -> Topi
 
 def simulate_magnetometer(scenario: Scenario, faults: FaultSizes, motion: Motion) -> Topic:
     time_us = _make_sample_times_us(motion, MAGNETOMETER_RATE_HZ)
-    body_to_ned = compute_attitude(motion.at(to_seconds(time_us))).body_to_ned
+    body_to_ned = compute_attitude(motion.compute_true_state(to_seconds(time_us))).body_to_ned
     # The measured field is rotated, which causes EKF2's heading error outdoors
     if faults.heading_deg:
         body_to_ned = (
@@ -140,7 +141,7 @@ def simulate_magnetometer(scenario: Scenario, faults: FaultSizes, motion: Motion
         )
     field_gauss = np.einsum("nji,j->ni", body_to_ned, EARTH_FIELD_GAUSS)
     field_gauss += SIGMA_MAGNETOMETER_GAUSS * make_random_generator(
-        scenario, RandomStream.FIELD
+        scenario, RandomStream.MAGNETOMETER_NOISE
     ).standard_normal(field_gauss.shape)
     disturbance_start_s = motion.duration_s / 2.0 if faults.mag_at_s is None else faults.mag_at_s
     field_gauss[to_seconds(time_us) >= disturbance_start_s, 1] += faults.mag_gauss
@@ -151,9 +152,9 @@ def simulate_magnetometer(scenario: Scenario, faults: FaultSizes, motion: Motion
 
 def simulate_barometer(scenario: Scenario, motion: Motion) -> Topic:
     time_us = _make_sample_times_us(motion, BAROMETER_RATE_HZ)
-    height_m = HOME_POSITION[2] - motion.at(to_seconds(time_us)).position_m[:, 2]
+    height_m = HOME_POSITION[2] - motion.compute_true_state(to_seconds(time_us)).position_m[:, 2]
     height_m -= simulate_height_error(scenario, to_seconds(time_us))
-    unit_noise = make_random_generator(scenario, RandomStream.BAROMETER).standard_normal(
+    unit_noise = make_random_generator(scenario, RandomStream.BAROMETER_NOISE).standard_normal(
         len(time_us)
     )
     height_m += SIGMA_BAROMETER_M * unit_noise
@@ -162,8 +163,11 @@ def simulate_barometer(scenario: Scenario, motion: Motion) -> Topic:
 
 def simulate_height_error(scenario: Scenario, time_s: Array) -> Array:
     """Simulate the slow error (m, positive downward) of the barometer and of EKF2's height."""
-    rng, rms = make_random_generator(scenario, RandomStream.HEIGHT), np.array([HEIGHT_ERROR_RMS_M])
-    return Sines.draw(rng, rms, SLOW_ERROR_PERIOD_RANGE_S).at(time_s)[0][:, 0]
+    rng = make_random_generator(scenario, RandomStream.HEIGHT_ERROR)
+    height_error_rms_m = np.array([HEIGHT_ERROR_RMS_M])
+    return Sines.draw(rng, height_error_rms_m, SLOW_ERROR_PERIOD_RANGE_S).compute_values(time_s)[0][
+        :, 0
+    ]
 
 
 def limit_rate(full_rate_topic: Topic, rate_hz: float, is_kept: BoolArray | bool = True) -> Topic:
@@ -175,17 +179,20 @@ def limit_rate(full_rate_topic: Topic, rate_hz: float, is_kept: BoolArray | bool
 
 def select_logged_imu(full_rate_topic: Topic, faults: FaultSizes, motion: Motion) -> Topic:
     """Return sensor_combined as logged, with the gap and the reduced rate of ``faults``."""
-    is_outside_gap = _is_outside_gap(
-        to_seconds(get_time_us(full_rate_topic)),
-        faults.imu_dropout_s,
-        faults.imu_dropout_at_s,
-        motion.duration_s,
+    return limit_rate(
+        full_rate_topic,
+        faults.imu_rate_hz,
+        _is_outside_gap(
+            to_seconds(get_time_us(full_rate_topic)),
+            faults.imu_dropout_s,
+            faults.imu_dropout_at_s,
+            motion.duration_s,
+        ),
     )
-    return limit_rate(full_rate_topic, faults.imu_rate_hz, is_outside_gap)
 
 
 def get_time_us(topic: Topic, field: str = "timestamp") -> IntArray:
-    """Return the publication time (or another time) of each message, µs from the first data."""
+    """Return a time in µs from the first data: the timestamp of each message, or another field."""
     return np.asarray(topic.fields[field].astype(np.int64) - FIRST_TIMESTAMP_US)
 
 
@@ -194,22 +201,22 @@ def measure_imu(
     faults: FaultSizes,
     motion: Motion,
     time_s: Array,
-    stream: RandomStream,
-    averaged_sample_count: float = 1.0,
+    random_stream: RandomStream,
+    samples_per_average: float = 1.0,
 ) -> ArrayPair:
     """Simulate specific force (m/s²) and angular rate (rad/s), with bias and white noise.
 
-    The noise is that of the mean of ``averaged_sample_count`` samples.
+    The noise is that of the mean of ``samples_per_average`` samples.
     """
-    truth = compute_attitude(motion.at(time_s))
-    rng, measurements = make_random_generator(scenario, stream), []
+    truth = compute_attitude(motion.compute_true_state(time_s))
+    rng, measurements = make_random_generator(scenario, random_stream), []
     for true_value, bias, sigma in zip(
         (truth.specific_force_m_s2, truth.angular_rate_rad_s),
-        draw_biases(scenario, faults),
+        draw_imu_biases(scenario, faults),
         (scenario.accelerometer_noise_m_s2, scenario.gyro_noise_rad_s),
         strict=True,
     ):
-        noise = 1.0 / np.sqrt(averaged_sample_count) * sigma * rng.standard_normal(true_value.shape)
+        noise = 1.0 / np.sqrt(samples_per_average) * sigma * rng.standard_normal(true_value.shape)
         measurements.append(true_value + bias + noise)
     specific_force_m_s2, rate_rad_s = measurements
     return specific_force_m_s2, rate_rad_s
@@ -218,7 +225,7 @@ def measure_imu(
 def simulate_logged_attitude(scenario: Scenario, faults: FaultSizes, motion: Motion) -> Topic:
     """Simulate vehicle_attitude without the EKF2 model: true attitude with a slow error."""
     time_us = _make_sample_times_us(motion, scenario.attitude_rate_hz)
-    true_rotation = compute_attitude(motion.at(to_seconds(time_us))).body_to_ned
+    true_rotation = compute_attitude(motion.compute_true_state(to_seconds(time_us))).body_to_ned
     error_rotation = simulate_attitude_error(scenario, faults, to_seconds(time_us)).as_matrix()
     logged_quaternions = to_quaternions(error_rotation @ true_rotation)
     return make_attitude_topic("vehicle_attitude", time_us, ATTITUDE_LATENCY_US, logged_quaternions)
@@ -226,7 +233,7 @@ def simulate_logged_attitude(scenario: Scenario, faults: FaultSizes, motion: Mot
 
 def simulate_true_attitude(scenario: Scenario, motion: Motion) -> Topic:
     time_us = _make_sample_times_us(motion, scenario.truth_rate_hz)
-    truth = compute_attitude(motion.at(to_seconds(time_us))).body_to_ned
+    truth = compute_attitude(motion.compute_true_state(to_seconds(time_us))).body_to_ned
     return make_attitude_topic("vehicle_attitude_groundtruth", time_us, 0, to_quaternions(truth))
 
 
@@ -243,8 +250,8 @@ def simulate_attitude_error(scenario: Scenario, faults: FaultSizes, time_s: Arra
     """Simulate the error of the logged attitude, a rotation in NED."""
     tilt_rms_deg = scenario.tilt_error_deg
     rms_rad = np.radians([tilt_rms_deg, tilt_rms_deg, scenario.yaw_error_deg])
-    rng = make_random_generator(scenario, RandomStream.ATTITUDE)
-    error_rad = Sines.draw(rng, rms_rad, SLOW_ERROR_PERIOD_RANGE_S).at(time_s)[0]
+    rng = make_random_generator(scenario, RandomStream.ATTITUDE_ERROR)
+    error_rad = Sines.draw(rng, rms_rad, SLOW_ERROR_PERIOD_RANGE_S).compute_values(time_s)[0]
     if faults.heading_deg:
         heading_error_rad = np.radians(faults.heading_deg)
         if faults.heading_at_s is not None:
@@ -272,7 +279,7 @@ def simulate_land_detector(motion: Motion) -> Topic:
 
 def simulate_ground_truth(scenario: Scenario, motion: Motion) -> Topic:
     time_us = _make_sample_times_us(motion, scenario.truth_rate_hz)
-    state = motion.at(to_seconds(time_us))
+    state = motion.compute_true_state(to_seconds(time_us))
     fields = make_timestamps(time_us) | split_vectors(
         {"": state.position_m, "v": state.velocity_m_s, "a": state.acceleration_m_s2}
     )
@@ -284,7 +291,7 @@ def simulate_positions(
     scenario: Scenario, faults: FaultSizes, motion: Motion
 ) -> SimulatedPositions:
     """Simulate UWB (aisle), VIO (loop) or GNSS (outdoor) positions with injected faults."""
-    timing_rng = make_random_generator(scenario, RandomStream.TIMING)
+    timing_rng = make_random_generator(scenario, RandomStream.POSITION_TIMES)
     interval_s = 1.0 / scenario.source_rate_hz
     position_count = int((motion.duration_s - FIRST_POSITION_TIME_S) / interval_s)
     nominal_times_s = FIRST_POSITION_TIME_S + interval_s * np.arange(position_count)
@@ -293,7 +300,7 @@ def simulate_positions(
         timing_rng.normal(0.0, INTERVAL_JITTER_FRACTION, position_count), -0.4, 0.4
     )
     time_s = np.maximum(nominal_times_s + jitter_fraction * interval_s, 0.0)
-    state = motion.at(time_s)
+    state = motion.compute_true_state(time_s)
     position_m = state.position_m.copy()
     speed_m_s = np.hypot(state.velocity_m_s[:, 0], state.velocity_m_s[:, 1])
     distance_m = cumulative_trapezoid(speed_m_s, time_s, initial=0)
@@ -303,9 +310,9 @@ def simulate_positions(
     position_m += drift_m
     is_outdoor = scenario.kind == "outdoor"
     sigma_m = scenario.source_sigma_m * (GNSS_SIGMA_FACTORS if is_outdoor else 1.0)
-    position_m += sigma_m * make_random_generator(scenario, RandomStream.SOURCE).standard_normal(
-        position_m.shape
-    )
+    position_m += sigma_m * make_random_generator(
+        scenario, RandomStream.POSITION_NOISE
+    ).standard_normal(position_m.shape)
     is_airborne = (time_s > motion.take_off_s) & (time_s < motion.touch_down_s)
     outlier_offset_m, is_outlier = simulate_outliers(scenario, faults, is_airborne)
     position_m += outlier_offset_m
@@ -329,7 +336,7 @@ def simulate_positions(
     velocity_m_s = None
     if is_outdoor:
         unit_velocity_noise = make_random_generator(
-            scenario, RandomStream.FIX_VELOCITY
+            scenario, RandomStream.GNSS_VELOCITY_NOISE
         ).standard_normal(position_m.shape)
         velocity_m_s = (
             state.velocity_m_s + scenario.sigma_gnss_m_s * GNSS_SIGMA_FACTORS * unit_velocity_noise
@@ -375,7 +382,9 @@ def simulate_correlated_noise(
 ) -> Array:
     """Simulate time-correlated noise (m), shape (n, 3): a first-order Gauss-Markov process."""
     noise_m = (
-        make_random_generator(scenario, RandomStream.SLOW).standard_normal((sample_count, 3))
+        make_random_generator(scenario, RandomStream.SLOW_POSITION_ERROR).standard_normal(
+            (sample_count, 3)
+        )
         * faults.slow_error_m
     )
     decay_factor = np.exp(-interval_s / faults.slow_error_s)
@@ -385,11 +394,15 @@ def simulate_correlated_noise(
 
 def simulate_vio_drift(scenario: Scenario, distance_m: Array) -> Array:
     """Simulate the VIO drift (m, NED), shape (n, 3): proportional to distance, and random walk."""
-    rng = make_random_generator(scenario, RandomStream.DRIFT)
+    rng = make_random_generator(scenario, RandomStream.VIO_DRIFT)
     drift_per_metre = scenario.vio_drift * compute_direction(rng.uniform(0.0, 360.0))
     sqrt_step_lengths = np.sqrt(np.diff(distance_m, prepend=0.0))[:, None]
-    random_walk = np.cumsum(sqrt_step_lengths * rng.standard_normal((len(distance_m), 3)), axis=0)
-    return np.asarray(distance_m[:, None] * drift_per_metre + scenario.vio_walk_m * random_walk)
+    unit_random_walk = np.cumsum(
+        sqrt_step_lengths * rng.standard_normal((len(distance_m), 3)), axis=0
+    )
+    return np.asarray(
+        distance_m[:, None] * drift_per_metre + scenario.vio_walk_m * unit_random_walk
+    )
 
 
 def simulate_outliers(
@@ -406,20 +419,21 @@ def simulate_outliers(
     outlier_count = round(len(airborne_indices) * faults.nlos_percent / 100.0)
     if outlier_count == 0:
         return outlier_error_m, is_outlier
-    rng = make_random_generator(scenario, RandomStream.NLOS)
-    burst_count = -(-outlier_count // MEAN_OUTLIER_BURST_LENGTH)
+    rng = make_random_generator(scenario, RandomStream.NLOS_OUTLIERS)
+    burst_count = -(-outlier_count // MEAN_OUTLIER_BURST_POSITION_COUNT)
     burst_lengths = 1 + rng.multinomial(
         outlier_count - burst_count, np.full(burst_count, 1.0 / burst_count)
     )
-    gap_lengths = rng.multinomial(
+    good_position_counts_between_bursts = rng.multinomial(
         len(airborne_indices) - outlier_count, np.full(burst_count + 1, 1.0 / (burst_count + 1))
     )
-    burst_index = np.repeat(np.arange(burst_count), burst_lengths)
-    # index of an outlier: number of earlier outliers, plus good positions in the gaps before it
+    burst_index_by_outlier = np.repeat(np.arange(burst_count), burst_lengths)
+    # The index of an outlier is the number of positions before it: outliers, and good positions
     outlier_indices = airborne_indices[
-        np.arange(outlier_count) + np.cumsum(gap_lengths)[burst_index]
+        np.arange(outlier_count)
+        + np.cumsum(good_position_counts_between_bursts)[burst_index_by_outlier]
     ]
-    angle_rad = rng.uniform(0.0, 2.0 * np.pi, burst_count)[burst_index]
+    angle_rad = rng.uniform(0.0, 2.0 * np.pi, burst_count)[burst_index_by_outlier]
     size_m = faults.nlos_size_m * rng.uniform(0.5, 1.5, outlier_count)
     outlier_error_m[outlier_indices, 0] = size_m * np.cos(angle_rad)
     outlier_error_m[outlier_indices, 1] = size_m * np.sin(angle_rad)
@@ -428,7 +442,7 @@ def simulate_outliers(
 
 
 def is_kept_at_rate(time_s: Array, rate_hz: float) -> BoolArray:
-    """Return a mask of the samples that a logger with a rate limit (Hz) writes; 0 is no limit."""
+    """Return a mask: True for samples that a logger with a rate limit (Hz) writes; 0: no limit."""
     if rate_hz <= 0.0:
         return np.ones(len(time_s), np.bool_)
     # the added 1e-6 prevents that rounding moves a sample into the previous logging interval
@@ -438,7 +452,7 @@ def is_kept_at_rate(time_s: Array, rate_hz: float) -> BoolArray:
 def _simulate_position_times_us(
     faults: FaultSizes, time_s: Array, rng: np.random.Generator
 ) -> tuple[IntArray, IntArray]:
-    """Simulate arrival time and timestamp of each position (µs from the first data)."""
+    """Return arrival time and timestamp of each position, both in µs from the first data."""
     mean_latency_s = faults.clock_jump_s or POSITION_LATENCY_S
     latency_s = np.maximum(
         rng.normal(mean_latency_s, POSITION_LATENCY_SIGMA_S, len(time_s)), MIN_POSITION_LATENCY_S

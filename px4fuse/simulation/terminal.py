@@ -40,6 +40,6 @@ def summary(simulation: Simulation, answer: Path | None) -> Page:
         else "EKF2 is not simulated (--no-ekf2)",
     }
     if answer is not None:
-        texts["Answer"] = f"{to_one_line(str(answer))}; do not give this file to students"
+        texts["Answer"] = f"{to_one_line(str(answer))} (do not give this answer file to students)"
     page.write_labelled_texts(texts)
     return page

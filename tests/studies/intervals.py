@@ -19,7 +19,7 @@ from comparisons import compare
 from detector_rates import DEFAULT, SCENARIOS, clean
 
 from px4fuse.comparison.estimates import estimate_noises_and_clock
-from px4fuse.filter.time_offset import MAX_CHANGE_P_VALUE, MIN_TIME_OFFSET_S, ClockOffset
+from px4fuse.filter.time_offset import MAX_P_VALUE_OF_CHANGED_OFFSET, MIN_TIME_OFFSET_S, ClockOffset
 from px4fuse.filter.tuning import HORIZONTAL, AxisTuning, NoiseEstimate
 from px4fuse.simulation.faults import parse_faults
 from px4fuse.simulation.flights import simulate_flight
@@ -45,13 +45,13 @@ def measured(job: Job) -> tuple[float, ...] | None:
     if not isinstance(tuned, AxisTuning) or not isinstance(clock, ClockOffset):
         return None
     low, high = clock.interval_s
-    false = abs(clock.offset_s) > max(clock.three_sigma_s, MIN_TIME_OFFSET_S)
+    false = abs(clock.offset_s) > max(clock.significance_limit_s, MIN_TIME_OFFSET_S)
     return (
         (tuned.sigma_z.value or np.nan) / flown.source_sigma_m - 1.0,
         covers(tuned.sigma_z, flown.source_sigma_m), covers(tuned.sigma_a, flown.sigma_a_m_s2),
         clock.offset_s, low <= 0.0 <= high, clock.offset_s / clock.sigma_s, clock.is_determinable,
         clock.is_determinable and false,
-        clock.change_p_value is not None and clock.change_p_value < MAX_CHANGE_P_VALUE,
+        clock.change_p_value is not None and clock.change_p_value < MAX_P_VALUE_OF_CHANGED_OFFSET,
     )  # fmt: skip
 
 

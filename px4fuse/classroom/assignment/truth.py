@@ -14,7 +14,7 @@ from px4fuse.core.record import Record, read_toml
 from px4fuse.filter.kalman import replay
 from px4fuse.filter.model import (
     COVARIANCE_COLUMNS,
-    compute_unit_process_noise,
+    compute_process_noise_per_density,
     make_symmetric_matrix,
     make_transition_matrix,
 )
@@ -152,10 +152,10 @@ def compare_simulation(simulation: flights.Simulation) -> Comparison:
 def _make_injected_fault(
     name: str, values: Mapping[str, Any], truth: Mapping[str, Any], comparison: Comparison
 ) -> InjectedFault:
-    fault_size_fields = SIMULATED_MISTAKES[name].size_fields
-    if not fault_size_fields:
+    value_field_names = SIMULATED_MISTAKES[name].value_field_names
+    if not value_field_names:
         return InjectedFault(name)
-    size = values[fault_size_fields[0]]
+    size = values[value_field_names[0]]
     tolerance = FAULT_SIZE_TOLERANCE_FRACTION * abs(size)
     if name == "open-end":
         # the student can only measure the closure error, which includes the odometry drift
@@ -179,7 +179,7 @@ def _make_injected_fault(
         case "nlos" if truth["outlier_time_s"]:
             fault_start_s, *_, fault_end_s = truth["outlier_time_s"] * 2
         case "dropout" | "imu-dropout" | "jump" | "heading" | "mag":
-            fault_start_s = values[fault_size_fields[1]]
+            fault_start_s = values[value_field_names[1]]
             fault_end_s = fault_start_s + abs(size) if name.endswith("dropout") else None
     return InjectedFault(name, size, low, high, fault_start_s, fault_end_s)
 
@@ -256,7 +256,7 @@ def compute_numeric_answer(
             return tuple(rejected_update_numbers.astype(float).tolist())
         case "prediction":
             p, f = make_symmetric_matrix(tuple(covariance)), make_transition_matrix(settings.dt_s)
-            q = make_symmetric_matrix(compute_unit_process_noise(settings.dt_s))
+            q = make_symmetric_matrix(compute_process_noise_per_density(settings.dt_s))
             q *= settings.sigma_a_m_s2**2 * settings.dt_s
             for _ in range(round(question.question_parameter / settings.dt_s)):
                 p = f @ p @ f.T + q

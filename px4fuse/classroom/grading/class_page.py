@@ -18,7 +18,7 @@ from px4fuse.classroom.grading.model import (
 )
 from px4fuse.core.text import format_count, format_number
 from px4fuse.html import frame
-from px4fuse.html.frame import Cell, Column, Row, RowSection
+from px4fuse.html.frame import Cell, Column, Row, RowDetailsSection
 from px4fuse.html.safe import load_template, make_relative_url
 from px4fuse.results.answer_form import form_rows
 
@@ -49,7 +49,7 @@ def format_class_page(grades: Sequence[Grade], title: str, version_text: str) ->
     return frame.page(
         title=title,
         subtitle=f"{format_count(len(grades), 'student')}, graded with {version_text}",
-        html_above=_format_statistics(grades, count_by_tag),
+        html_above_table=_format_statistics(grades, count_by_tag),
         row_nouns=("student", "students"),
         columns=(
             Column("Student"),
@@ -64,7 +64,7 @@ def format_class_page(grades: Sequence[Grade], title: str, version_text: str) ->
         rows=[_make_grade_row(grade, item_titles, number_titles) for grade in grades],
         filters=[("Status", [("", f"Everyone ({len(grades)})"), *options])],
         column_groups=(("items", "Points of each rubric item"), ("numbers", "Numbers")),
-        placeholder="search for name, id, file or flag",
+        search_placeholder="search for name, id, file or flag",
         full_table_note="class.csv contains the table of all students.",
     )
 
@@ -151,7 +151,7 @@ def _make_grade_row(grade: Grade, item_titles: Sequence[str], number_titles: Seq
     )
 
 
-def _make_grade_details(grade: Grade) -> Iterator[RowSection]:
+def _make_grade_details(grade: Grade) -> Iterator[RowDetailsSection]:
     """Yield the details of a student, which the web page shows after a click on the row."""
     report, comment = grade.counted_report, frame.make_prose_section("Your comment", grade.comment)
     if report is None:
@@ -222,7 +222,7 @@ def _make_points_cell(grade: Grade) -> Cell:
     )
 
 
-def _make_points_inputs(grade: Grade) -> RowSection:
+def _make_points_inputs(grade: Grade) -> RowDetailsSection:
     """Make the input boxes for the points that the instructor can enter."""
     report = grade.counted_report
     max_points_by_title = {

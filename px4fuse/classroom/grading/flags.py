@@ -13,7 +13,7 @@ from typing import Any
 
 from px4fuse.classroom.assignment.roster import normalise_text
 from px4fuse.classroom.grading.model import GradedReport
-from px4fuse.core.text import capitalise_first, join_first, one_line
+from px4fuse.core.text import capitalise_first, join_first_names, one_line
 from px4fuse.request import LoopRequest
 from px4fuse.results.contract import LoopResults, ReportedResults
 from px4fuse.simulation import flights
@@ -197,7 +197,7 @@ def flag_equal_contents(reports: Sequence[GradedReport]) -> Mapping[str, Sequenc
             )
         for submission_name, student_texts in students_by_submission.items():
             flags_by_submission[submission_name].append(
-                flag_text.format(join_first(student_texts, MAX_LISTED_REPORTS, "; "))
+                flag_text.format(join_first_names(student_texts, MAX_LISTED_REPORTS, "; "))
             )
     return flags_by_submission
 

@@ -53,7 +53,7 @@ from px4fuse.classroom.grading.records import (
 )
 from px4fuse.core.input_files import suspend_input_registration
 from px4fuse.core.spreadsheet import neutralise_formulas
-from px4fuse.core.text import join_first, one_line
+from px4fuse.core.text import join_first_names, one_line
 from px4fuse.core.writing import write_output_files
 from px4fuse.errors import SettingsError
 from px4fuse.html.safe import load_template
@@ -462,8 +462,8 @@ def fill_grades(
     ]
     if missing_names:
         notes.append(
-            f"{sheet.path.name} has no row for {join_first(missing_names, 4)}. These grades were "
-            "not entered."
+            f"{sheet.path.name} has no row for {join_first_names(missing_names, 4)}. These grades "
+            "were not entered."
         )
     return replace(sheet, rows=tuple(map(tuple, cells_by_row))), tuple(notes)
 

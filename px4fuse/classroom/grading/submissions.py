@@ -35,9 +35,9 @@ from typing import IO
 from px4fuse.classroom.assignment.roster import Person, make_unique
 from px4fuse.classroom.grading.model import UNKNOWN_ORIGIN, ExportOrigin, Submission
 from px4fuse.core.input_files import add_input
-from px4fuse.core.reading import files_below
+from px4fuse.core.reading import list_files_recursively
 from px4fuse.core.record import read_toml
-from px4fuse.core.text import clean_text, join_first, one_line
+from px4fuse.core.text import clean_text, join_first_names, one_line
 from px4fuse.errors import ResultsError, SettingsError
 from px4fuse.verification.model import BAD_VALUE_ERRORS
 from px4fuse.verification.pdf_input import MAX_PDF_BYTES
@@ -140,7 +140,7 @@ def find_submissions(paths: Sequence[Path]) -> tuple[tuple[Submission, ...], tup
                 except ResultsError as error:
                     notes.append(str(error))
     if ignored_names:
-        names_text = join_first(ignored_names, MAX_LISTED_FILES)
+        names_text = join_first_names(ignored_names, MAX_LISTED_FILES)
         notes.append(f"Ignored files (not PDF): {len(ignored_names)} ({names_text}).")
     if zip_count:
         notes.append(
@@ -290,7 +290,7 @@ def _list_folder_submissions(path: Path, notes: list[str]) -> Iterator[Submissio
         raise SettingsError(f"{one_line(str(path), MAX_NAME_LENGTH)} is not a file or folder.")
     root = path.resolve()
     ignored_count = 0
-    for file in files_below(root):  # symbolic links to folders are not entered
+    for file in list_files_recursively(root):  # symbolic links to folders are not entered
         name = file.relative_to(root)
         if any(map(_is_hidden, name.parts)):
             continue
