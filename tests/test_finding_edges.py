@@ -206,7 +206,7 @@ def never_fusing(rate_hz: float = 5.0, age_s: float | None = None, **parts: Any)
     return analysis(ekf2=ekf2, log=log(parameters=parameters), source=fed)
 
 
-UNKNOWN = "The log does not contain the reason"
+UNKNOWN = "The log does not show why EKF2 fused no position"
 
 
 @pytest.mark.parametrize(
