@@ -197,10 +197,7 @@ def _evaluate_aid(aid: Aid, aid_log: AidLog, start_s: float, end_s: float) -> Ai
     def select_axis_columns(name: str) -> Array:
         return samples[[f"{name}_{axis}" for axis in aid_log.axes]].to_numpy()
 
-    innovation, innovation_variance = (
-        select_axis_columns("innovation"),
-        select_axis_columns("variance"),
-    )
+    innovation, innovation_variance = map(select_axis_columns, ("innovation", "variance"))
     is_enabled = np.ones(len(samples), bool)
     enabled_fraction = None
     if aid_log.enabled is not None:

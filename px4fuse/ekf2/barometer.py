@@ -103,8 +103,7 @@ def _combine_barometer_samples(
     velocity_down_m_s = ekf2.state["down_m_s"]
     velocity_times_s = velocity_down_m_s.index.to_numpy()
     displacement_m = cumulative_trapezoid(velocity_down_m_s.to_numpy(), velocity_times_s, initial=0)
-    zero_bias_update = dict.fromkeys(("bias_m", "bias_m2"), 0.0)
-    zero_bias_update |= {"innovation_m": np.nan, "variance_m2": 1.0}
+    zero_bias_update = {"bias_m": 0.0, "bias_m2": 0.0, "innovation_m": np.nan, "variance_m2": 1.0}
     barometer_bias_updates = fusion_record.height_bias_updates.get(
         BAROMETER.name, pd.DataFrame(zero_bias_update, index=row_times_s[:1])
     )

@@ -13,6 +13,7 @@ and ``EKF/vel_pos_fusion.cpp`` (gate, fusion), ``ev_pos_control.cpp`` (noise, re
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
+from operator import attrgetter
 from typing import Any
 
 import numpy as np
@@ -247,14 +248,14 @@ def run_segment(  # noqa: PLR0912, PLR0915 (one recursion, read from top to bott
         fuses_velocity,
     ) = np.array(
         [
-            (
-                configuration.estimates_biases,
-                configuration.estimates_attitude,
-                configuration.has_gate,
-                configuration.uses_logged_decisions,
-                configuration.uses_reported_noise,
-                configuration.fuses_velocity,
-            )
+            attrgetter(
+                "estimates_biases",
+                "estimates_attitude",
+                "has_gate",
+                "uses_logged_decisions",
+                "uses_reported_noise",
+                "fuses_velocity",
+            )(configuration)
             for configuration in configurations
         ]
     ).T

@@ -44,24 +44,15 @@ CLOCK_SYNCHRONISATION_ACTION = (
     "Synchronise the clocks: UXRCE_DDS_SYNCT 1 with the uXRCE-DDS agent, or answer TIMESYNC of "
     "MAVLink. Send microseconds."
 )
-POSITIONS_IN_FUTURE_TEXT = "For EKF2, the positions are in the future."
-# Effect on EKF2 of timestamps of a wrong clock, by name of the clock
-EFFECT_BY_WRONG_CLOCK = {
-    **dict.fromkeys(
-        ("another clock", "an unknown clock", "UNIX time in seconds"),
-        "For EKF2, the positions are too old or in the future.",
-    ),
-    **{
-        f"UNIX time in {unit}seconds": POSITIONS_IN_FUTURE_TEXT
-        for unit in ("nano", "micro", "milli")
-    },
+# Clocks that must be synchronised with the autopilot's clock
+UNSYNCHRONISED_CLOCKS = {
+    "another clock",
+    "an unknown clock",
+    *(f"UNIX time in {unit}seconds" for unit in ("nano", "micro", "milli", "")),
 }
-# Effect on EKF2 of timestamps of a wrong clock or in a wrong unit, by name of clock or unit
-EFFECT_BY_WRONG_TIMESTAMP = {
-    **dict.fromkeys(("0", "milliseconds", "seconds"), "For EKF2, the positions are too old."),
-    **EFFECT_BY_WRONG_CLOCK,
-    "nanoseconds": POSITIONS_IN_FUTURE_TEXT,
-}
+# Clocks and units of timestamps that EKF2 cannot use. 0: all timestamps are 0
+UNUSABLE_TIMESTAMPS = {"0", "nanoseconds", "milliseconds", "seconds", *UNSYNCHRONISED_CLOCKS}
+UNUSABLE_TIMESTAMPS_EFFECT = "For EKF2, the positions are too old or in the future."
 # GNSS checks in the order of their bits in gps_check_fail_flags: name, parameter with the limit,
 # unit of the limit
 GNSS_CHECKS = (
@@ -118,10 +109,14 @@ class UnfusedPositions:
 
     @property
     def max_sample_age_s(self) -> float:
-        """Maximum age (s) of buffered samples: EKF2_DELAY_MAX, else MAX_HORIZON_DELAY_S."""
+        """Maximum age (s) of buffered samples: the delay of the fusion horizon.
+
+        If this delay is not logged: EKF2_DELAY_MAX, or MAX_HORIZON_DELAY_S.
+        """
         horizon_delay_s = self.ekf2.horizon_s
-        max_horizon_s = 1e-3 * self.parameters.get("EKF2_DELAY_MAX", 1e3 * MAX_HORIZON_DELAY_S)
-        return horizon_delay_s if isinstance(horizon_delay_s, float) else max_horizon_s
+        if isinstance(horizon_delay_s, float):
+            return horizon_delay_s
+        return 1e-3 * self.parameters.get("EKF2_DELAY_MAX", 1e3 * MAX_HORIZON_DELAY_S)
 
     @property
     def interval_s(self) -> float:
@@ -166,7 +161,7 @@ def _check_enabling_parameter(positions: UnfusedPositions) -> Iterator[UnmetCond
     action = f"Set {parameter_name} to {parameter_value | 1 << bit}."
     if is_height_only(positions.source):
         reason = f"The source contains no horizontal position: x and y are constant. {reason}"
-        action = f"Leave bit {bit} of {parameter_name} unset: the source measures only the height."
+        action = f"Leave bit {bit} of {parameter_name} unset."
     yield UnmetCondition("switch", f"{parameter_name} is {parameter_value}", reason, action)
 
 
@@ -216,18 +211,18 @@ def _check_position_gap(positions: UnfusedPositions) -> Iterator[UnmetCondition]
 
 def find_timestamp_action(clock_name: str) -> str:
     """Return the action for timestamps of a wrong clock or in a wrong unit."""
-    is_wrong_clock = clock_name in EFFECT_BY_WRONG_CLOCK
+    is_wrong_clock = clock_name in UNSYNCHRONISED_CLOCKS
     return CLOCK_SYNCHRONISATION_ACTION if is_wrong_clock else SET_TIMESTAMP_ACTION
 
 
 def _check_timestamps(positions: UnfusedPositions) -> Iterator[UnmetCondition]:
     clock_map, status = positions.source.clock_map, positions.source.status
-    if clock_map and (clock := clock_map.clock) in EFFECT_BY_WRONG_TIMESTAMP:
+    if clock_map and (clock := clock_map.clock) in UNUSABLE_TIMESTAMPS:
         yield UnmetCondition(
             "clock",
             "the timestamps are 0" if clock == "0" else f"the timestamps are in {clock}",
             "EKF2 expects timestamp_sample in microseconds since the autopilot's boot. "
-            f"{EFFECT_BY_WRONG_TIMESTAMP[clock]}",
+            f"{UNUSABLE_TIMESTAMPS_EFFECT}",
             find_timestamp_action(clock),
         )
     if "age_s" not in status:

@@ -88,10 +88,9 @@ def add_heights(
         measurement_times_s = barometer_samples.index.to_numpy()
         down_m = barometer_samples["down_m"].to_numpy() + fusion_record.altitude_m
         sample_weight = barometer_samples["weight"].to_numpy()
-    ground_effect_dead_zone_m = parameters.get("EKF2_GND_EFF_DZ", DEFAULT_GROUND_EFFECT_DEAD_ZONE_M)
     dead_zone_m = np.where(
         fusion_record.was_in_state(GROUND_EFFECT_FLAG, measurement_times_s),
-        ground_effect_dead_zone_m,
+        parameters.get("EKF2_GND_EFF_DZ", DEFAULT_GROUND_EFFECT_DEAD_ZONE_M),
         0.0,
     )
     segments_with_heights = []
@@ -297,9 +296,12 @@ class HeightFilter:
             if sensor == GNSS_HGT.name
             else slice(gnss_sample_index)
         )
-        update_records = self.update_records[:, sensor_sample_slice, :, configuration_index]
-        measurement_times_s = self.time_s[sensor_sample_slice, :, configuration_index].T
-        return make_update_table(update_records, measurement_times_s, end_s, ["down"])
+        return make_update_table(
+            self.update_records[:, sensor_sample_slice, :, configuration_index],
+            self.time_s[sensor_sample_slice, :, configuration_index].T,
+            end_s,
+            ["down"],
+        )
 
     def fuse_barometer(self, event: int, x: Array, P: Array) -> ArrayPair:
         for sample_index in range(len(self.down_m)):

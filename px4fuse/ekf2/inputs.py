@@ -456,8 +456,7 @@ def read_gnss(
         velocity_samples = velocity_samples[is_enabled]
     # The delay is already subtracted from the times of the GNSS samples. It is added again, because
     # the replay subtracts it from all timestamps
-    logged_settings = fill_with_defaults(parameters, GNSS_POS)
-    logged_delay_s = logged_settings[GNSS_POS.delay] * 1e-3
+    logged_delay_s = fill_with_defaults(parameters, GNSS_POS)[GNSS_POS.delay] * 1e-3
     timestamp_s = position_samples.index.to_numpy() + logged_delay_s
     # Maximum reported position noise (m) that EKF2 uses (gps_control.cpp)
     max_reported_noise_m = max(parameters.get("EKF2_NOAID_NOISE", 10.0), 1.0)

@@ -212,12 +212,11 @@ def _make_events(inputs: ReplayInputs, segment: ReplaySegment, delays: FusionDel
         & is_in_time
         & (earliest_fusion_times_s - measurement_times_s > MIN_DELAY_OF_LATE_SAMPLE_S)
     )
-    sample_indices = np.arange(first_row, end_row)
     is_too_late = is_inside & ~is_in_time
     events[event_row_by_sample] = np.rec.fromarrays(
         [
             sample_end_steps,
-            sample_indices,
+            np.arange(first_row, end_row),
             action,
             is_usable,
             can_start,

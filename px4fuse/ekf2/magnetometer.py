@@ -52,8 +52,8 @@ def average_by_event(
     Each mean is fused at the second of the two events.
     """
     event_index = np.searchsorted(event_end_steps, sensor_samples.step_indices)
-    is_inside = event_index < len(event_end_steps)
     event_count = len(event_end_steps)
+    is_inside = event_index < event_count
     event_index = event_index[is_inside]
     sample_counts = np.maximum(np.bincount(event_index, minlength=event_count), 1)
 

@@ -169,11 +169,9 @@ def _prepare_without_aids(
     model = Ekf2Model(
         flight, inputs, event_intervals_by_delays, baseline_replay, agreement, tuple(runs)
     )
-    rejected_fraction = max(
-        agreement.rejected_fraction_logged, agreement.rejected_fraction_replayed
-    )
     if (
-        rejected_fraction > MAX_REJECTED_FRACTION_FOR_COMPARISON
+        max(agreement.rejected_fraction_logged, agreement.rejected_fraction_replayed)
+        > MAX_REJECTED_FRACTION_FOR_COMPARISON
         and np.isfinite(inputs.received_positions.rejected_flags).any()
     ):
         agreement_with_rejections = compare_with_log(flight, replay_with_logged_rejections(model))

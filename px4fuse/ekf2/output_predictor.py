@@ -82,9 +82,8 @@ def compute_published_state(
     # EKF2 shifts all buffered outputs by a position reset, so a reset causes no error that the
     # output predictor corrects. Therefore the resets are subtracted from the state here, and added
     # at the end
-    position_without_resets = state[:, POSITION] - reset_m
     position_m = _predict_output(
-        position_without_resets,
+        state[:, POSITION] - reset_m,
         position_increments_m,
         lag_steps,
         mean_step_s,

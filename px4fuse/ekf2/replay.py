@@ -231,11 +231,9 @@ class _ComparedInnovations(NamedTuple):
     replayed: pd.DataFrame
     agreement_by_axis: dict[str, AxisAgreement]
 
-    def compute_rejected_fractions(self) -> tuple[float, float]:
-        logged_rejected_fraction, replayed_rejected_fraction = (
-            float(np.mean(innovations["rejected"] > 0.0)) for innovations in self[:2]
-        )
-        return logged_rejected_fraction, replayed_rejected_fraction
+    def compute_rejected_fractions(self) -> list[float]:
+        """Return the rejected fraction in the log, and the rejected fraction in the replay."""
+        return [float(np.mean(innovations["rejected"] > 0.0)) for innovations in self[:2]]
 
 
 def compare_with_log(flight: Flight, replay: Ekf2Replay) -> Agreement | Unavailable:
@@ -265,8 +263,9 @@ def compare_with_log(flight: Flight, replay: Ekf2Replay) -> Agreement | Unavaila
     rejected_fraction_logged, rejected_fraction_replayed = (
         position_comparison.compute_rejected_fractions()
     )
+    agreement_by_axis = position_comparison.agreement_by_axis
     is_in_agreement, reason = _judge_agreement(
-        position_comparison.agreement_by_axis, rejected_fraction_logged, rejected_fraction_replayed
+        agreement_by_axis, rejected_fraction_logged, rejected_fraction_replayed
     )
     agreement_by_aid, omitted_aids = _compare_other_aids(ekf2, replay)
     flow_position_difference_m = _compute_flow_position_difference_m(ekf2, replay)
@@ -277,25 +276,24 @@ def compare_with_log(flight: Flight, replay: Ekf2Replay) -> Agreement | Unavaila
         omitted_aids[FLOW.name] = (
             f"while {FLOW.label} was the only horizontal aiding source, replayed and logged "
             "positions differed by "
-            f"{_format_distinct_from_limit(flow_position_difference_m, MAX_FLOW_ONLY_DIFFERENCE_M)} "
-            f"m (limit {MAX_FLOW_ONLY_DIFFERENCE_M:g} m)"
+            f"{_format_unlike_limit(flow_position_difference_m, MAX_FLOW_ONLY_DIFFERENCE_M)} m "
+            f"(limit {MAX_FLOW_ONLY_DIFFERENCE_M:g} m)"
         )
     is_same_decision = (position_comparison.logged["rejected"] > 0.0).to_numpy() == (
         position_comparison.replayed["rejected"] > 0.0
     )
-    rms_differences_m = [
-        axis.position_rms_difference_m for axis in position_comparison.agreement_by_axis.values()
-    ]
     return Agreement(
-        north=position_comparison.agreement_by_axis["north"],
-        east=position_comparison.agreement_by_axis["east"],
-        **(agreement_by_aid | {aid.name: position_comparison.agreement_by_axis}),
+        north=agreement_by_axis["north"],
+        east=agreement_by_axis["east"],
+        **(agreement_by_aid | {aid.name: agreement_by_axis}),
         doubtful=omitted_aids,
         samples=len(position_comparison.logged),
         rejected_fraction_logged=rejected_fraction_logged,
         rejected_fraction_replayed=rejected_fraction_replayed,
         decisions_same=float(np.mean(is_same_decision)),
-        published_rms_difference_m=math.hypot(*rms_differences_m),
+        published_rms_difference_m=math.hypot(
+            *(axis.position_rms_difference_m for axis in agreement_by_axis.values())
+        ),
         good=is_in_agreement,
         reason=reason,
         heading_rms_difference_deg=_compute_heading_difference_deg(ekf2, replay),
@@ -577,7 +575,7 @@ def _judge_agreement(
         if difference_m > max_difference_m:
             return False, (
                 "the innovations agree with the log, but replayed and logged positions differ by "
-                f"{_format_distinct_from_limit(difference_m, max_difference_m)} m RMS "
+                f"{_format_unlike_limit(difference_m, max_difference_m)} m RMS "
                 f"(limit {max_difference_m:g} m): the log lacks data of EKF2's output predictor"
             )
         return True, correlation_text
@@ -610,7 +608,7 @@ def _judge_agreement(
     )
 
 
-def _format_distinct_from_limit(value: float, limit: float) -> str:
+def _format_unlike_limit(value: float, limit: float) -> str:
     """Format a value with enough decimals (at least 2) to differ from the limit."""
     return next(f"{value:.{n}f}" for n in range(2, 17) if round(value, n) > limit or n == 16)
 

@@ -595,13 +595,11 @@ def _find_magnetometer_3d_fusion_span(fusion_record: FusionRecord) -> Span | Non
 
     Return None if EKF2 did not fuse all three axes, or interrupted this fusion.
     """
-    magnetometer_3d_flag = (
-        fusion_record.magnetic_field_gauss["fused_3d"]
-        if len(fusion_record.magnetic_field_gauss)
-        else pd.Series(dtype=float)
-    )
-    flag_times_s = magnetometer_3d_flag.index.to_numpy()
-    is_fused = magnetometer_3d_flag.to_numpy() > 0.0
+    field_gauss = fusion_record.magnetic_field_gauss
+    if not len(field_gauss):
+        return None
+    flag_times_s = field_gauss.index.to_numpy()
+    is_fused = field_gauss["fused_3d"].to_numpy() > 0.0
     if not is_fused.any() or 1.0 / compute_median_interval_s(flag_times_s) < MIN_MAG_LOG_HZ:
         return None
     first_row, last_row = np.flatnonzero(is_fused)[[0, -1]]
@@ -629,11 +627,13 @@ def _add_magnetic_field(
     )
     if Columns.FIELD_INNOVATION[0] not in field_gauss:
         return segment_with_fields
-    filtered_field_innovation_gauss = field_gauss[Columns.FIELD_INNOVATION].to_numpy()
     return replace(
         segment_with_fields,
         magnetic_field=_compute_mean_magnetic_field(
-            segment, fusion_record.delayed, measurement_times_s, filtered_field_innovation_gauss
+            segment,
+            fusion_record.delayed,
+            measurement_times_s,
+            field_gauss[Columns.FIELD_INNOVATION].to_numpy(),
         ),
     )
 

@@ -48,7 +48,7 @@ NO_TRUTH_OVERLAP = Unavailable(
     "Record ground truth during the whole flight.",
 )
 # Names of the properties that differ between KF and EKF2
-SAMPLE_TIMES_PROPERTY = "sample times and length of prediction steps"
+SAMPLE_TIMES_PROPERTY = "sample times and prediction steps"
 TIMESTAMPS_PROPERTY = "timestamps and delay"
 MEASUREMENT_NOISE_PROPERTY = "measurement noise"
 ACCELEROMETER_BIAS_PROPERTY = "accelerometer bias estimated as a state"
@@ -294,7 +294,6 @@ def _explain_difference_along_axis(
     )
     initial_mean_squares, *_, unexplained_mean_squares = mean_square_differences.tolist()
     missing_truth_reason = NO_TRUTH_OVERLAP if isinstance(flight.truth, Truth) else flight.truth
-    rmse_by_filter = {"kf": rmse_by_track[0], "ekf2": rmse_by_track[-1]}
     return DifferenceExplanation(
         count=len(times_s),
         position_mean_square_m2=initial_mean_squares[0],
@@ -304,7 +303,7 @@ def _explain_difference_along_axis(
         unexplained_velocity_mean_square_m2_s2=unexplained_mean_squares[1],
         position_rmse_to_truth_m={
             name: missing_truth_reason if rmse_m is None else rmse_m
-            for name, rmse_m in rmse_by_filter.items()
+            for name, rmse_m in (("kf", rmse_by_track[0]), ("ekf2", rmse_by_track[-1]))
         },
         spans_s=spans_s,
         longest_rejection=longest_rejection,
@@ -395,9 +394,8 @@ def _find_longest_rejection(
     if not is_rejected.any():
         return None
     # A run of rejections lasts from the first rejected sample to the next fused sample
-    rejection_change = np.diff(is_rejected.astype(int), prepend=0, append=0)
-    run_starts = np.flatnonzero(rejection_change == 1)
-    run_ends = np.flatnonzero(rejection_change == -1)
+    change_rows = np.flatnonzero(np.diff(is_rejected, prepend=False, append=False))
+    run_starts, run_ends = change_rows.reshape(-1, 2).T
     longest_index = int(np.argmax(run_ends - run_starts))
     begin_s = fusion_times_s[run_starts[longest_index]]
     end_s = fusion_times_s[min(run_ends[longest_index], len(fusion_times_s) - 1)]

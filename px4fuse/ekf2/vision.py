@@ -150,10 +150,9 @@ class VisionFilter:
 
         ``end_s`` contains the time (s) of each event.
         """
-        measurement_times_s = self.measurement_times_s[..., configuration_index].T
         return make_update_table(
             self.update_records[..., configuration_index],
-            measurement_times_s,
+            self.measurement_times_s[..., configuration_index].T,
             end_s,
             ["north", "east"],
         )

@@ -597,11 +597,8 @@ def _describe_deviation(
         - model.baseline_replay.published_state[Columns.POSITION],
         spans_s,
     )
-    *horizontal_m, down_difference_m = np.abs(position_difference_m.to_numpy()).T
-    horizontal_distance_m, max_height_difference_m = (
-        np.hypot(*horizontal_m),
-        down_difference_m.max(),
-    )
+    *horizontal_m, height_difference_m = np.abs(position_difference_m.to_numpy()).T
+    horizontal_distance_m = np.hypot(*horizontal_m)
     aids_text = ", ".join(
         f"{aid} from {from_s:g} s on" for aid, from_s in disable_time_s_by_aid.items()
     )
@@ -615,7 +612,7 @@ def _describe_deviation(
         f"{horizontal_distance_m[-1]:.3g} m"
     )
     if height_aids & {*disable_time_s_by_aid}:
-        note = f"{note}. The published height differs by at most {max_height_difference_m:.3g} m"
+        note = f"{note}. The published height differs by at most {height_difference_m.max():.3g} m"
     if horizontal_aids <= disable_time_s_by_aid.keys():
         note = (
             f"{note}. The replay then uses only the IMU. EKF2 itself stops publishing a position "
@@ -640,8 +637,9 @@ def _describe_replay_limits(model: Ekf2Model, replay: Ekf2Replay) -> Iterator[st
             "would arrive late, after the fusion horizon. EKF2 would never fuse "
             f"{replay.lost} of them"
         )
-        has_delay_max_parameter = not model.inputs.rules.is_horizon_largest_delay
-        yield f"{note}. Increase EKF2_DELAY_MAX" if has_delay_max_parameter else note
+        # If the horizon is the largest delay, the PX4 release has no parameter EKF2_DELAY_MAX
+        is_horizon_largest_delay = model.inputs.rules.is_horizon_largest_delay
+        yield note if is_horizon_largest_delay else f"{note}. Increase EKF2_DELAY_MAX"
 
 
 def _format_changes(replay: Ekf2Replay) -> str:
