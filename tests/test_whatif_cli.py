@@ -73,7 +73,7 @@ def test_whatif_command_without_vision_predicts_position_drift(sample_log: Path)
     parts = [said["whatif"][axis]["position_rmse_to_truth_m"] for axis in ("north", "east")]
     assert np.hypot(*parts) > 1.0
     (note,) = [one for one in said["notes"] if one.startswith("Without ev_pos from 100 s on")]
-    assert "EKF2 itself stops publishing a position after EKF2_NOAID_TOUT (5 s)" in note
+    assert "EKF2 stops publishing a position after EKF2_NOAID_TOUT (5 s)" in note
 
 
 def test_what_if_with_unknown_aiding_source_raises_error(estimated: WhatIfAnalysis) -> None:

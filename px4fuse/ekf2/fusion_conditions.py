@@ -90,13 +90,13 @@ NO_UNMET_CONDITION_LOGGED = UnmetCondition(
 
 @dataclass(frozen=True)
 class UnfusedPositions:
-    """Positions that EKF2 received but did not fuse in the time span ``span_s``."""
+    """Positions that EKF2 received but did not fuse in the time span ``unfused_span_s``."""
 
     ekf2: Ekf2
     source: PositionTrack
     aid: Aid
     parameters: Mapping[str, float]
-    span_s: Span
+    unfused_span_s: Span
 
     @property
     def is_vision(self) -> bool:
@@ -123,15 +123,15 @@ class UnfusedPositions:
         return 1.0 / self.source.compute_rate_hz()
 
     def select_samples(self, samples: pd.DataFrame, lead_time_s: float = 0.0) -> pd.DataFrame:
-        """Return the samples inside ``span_s``, and the samples up to ``lead_time_s`` before it."""
-        return samples.loc[self.span_s[0] - lead_time_s : self.span_s[1]]
+        """Return the samples in ``unfused_span_s``, and in the ``lead_time_s`` before this span."""
+        return samples.loc[self.unfused_span_s[0] - lead_time_s : self.unfused_span_s[1]]
 
     def compute_status_bit_fraction(self, field_name: str, bit: int = 0) -> float:
-        """Return the fraction of ``span_s`` in which a status bit is set; NaN if not logged."""
+        """Return the fraction of ``unfused_span_s`` with a set status bit; NaN if not logged."""
         state_changes = self.ekf2.states.get(field_name)
         if state_changes is None:
             return float("nan")
-        state_values = sample_step_function(state_changes, np.linspace(*self.span_s, 200))
+        state_values = sample_step_function(state_changes, np.linspace(*self.unfused_span_s, 200))
         return float(np.mean(state_values.astype(np.int64) >> bit & 1))
 
 
@@ -196,7 +196,7 @@ def _check_position_gap(positions: UnfusedPositions) -> Iterator[UnmetCondition]
     uses_vision_stop_timeout = positions.is_vision and positions.has_enabling_parameter
     stop_timeout_s = EV_STOP_INTERVAL_S if uses_vision_stop_timeout else FUSION_STOP_TIMEOUT_S
     times_s = positions.source.samples.index.to_numpy()
-    start_s, end_s = positions.span_s
+    start_s, end_s = positions.unfused_span_s
     # EKF2 stops fusion if no position arrives for stop_timeout_s
     last_position_time_s = max(times_s[times_s < start_s], default=start_s)
     duration_s = np.min(times_s[times_s >= start_s], initial=end_s) - last_position_time_s

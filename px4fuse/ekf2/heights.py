@@ -179,7 +179,7 @@ def group_barometer_by_event(
 class HeightFilter:
     """Fuse heights as EKF2 does, in one segment and for several filter configurations at once.
 
-    The segment is divided by events (position fusions). At each event, the filter fuses up to k
+    An event is the end of an interval of the replay. At each event, the filter fuses up to k
     barometer samples since the previous event, and then the GNSS height.
 
     Parameters

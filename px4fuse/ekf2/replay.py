@@ -184,7 +184,7 @@ class Ekf2Replay(Record, kw_only=True, omit_defaults=False):
     late, lost : int
         Number of samples that were fused late, and number of samples too late to be fused.
     updates : DataFrame, one row per position sample, at EKF2's measurement time
-        See :func:`~px4fuse.ekf2.replay_segments.update_table`.
+        See :func:`~px4fuse.ekf2.replay_segments.make_update_table`.
     other_aid_updates : mapping from PX4's name to DataFrame
         Updates with GNSS velocity (m/s), GNSS height, barometer, and vision in addition to GNSS.
     optical_flow_only_spans_s : tuple of (float, float)

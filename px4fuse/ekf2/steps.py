@@ -385,7 +385,10 @@ def make_replacement_configurations(
 
 
 def _find_longest_rejection(
-    baseline_replay: Ekf2Replay, track_without_gate: pd.DataFrame, span: Span, spans_s: Spans
+    baseline_replay: Ekf2Replay,
+    horizon_track_without_gate: pd.DataFrame,
+    span: Span,
+    spans_s: Spans,
 ) -> RejectionRun | None:
     updates = rows_inside(baseline_replay.updates, spans_s)
     updates = updates[updates["fused_at_s"].between(*span)]
@@ -402,7 +405,11 @@ def _find_longest_rejection(
     horizon_track = baseline_replay.delayed_state.loc[begin_s:end_s]
     position_difference = [
         horizon_track[column]
-        - np.interp(horizon_track.index, track_without_gate.index, track_without_gate[column])
+        - np.interp(
+            horizon_track.index,
+            horizon_track_without_gate.index,
+            horizon_track_without_gate[column],
+        )
         for column in Columns.POSITION[:2]
     ]
     return RejectionRun(

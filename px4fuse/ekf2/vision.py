@@ -83,9 +83,10 @@ def group_vision_by_event(
 
 
 class VisionFilter:
-    """Fuse vision positions like EKF2 in one segment, for several filter configurations at once.
+    """Fuse vision positions as EKF2 does, in one segment and for several configurations at once.
 
-    Each event fuses the up to k samples since the previous event.
+    An event is the end of an interval of the replay. At each event, the filter fuses up to k
+    samples since the previous event.
 
     Parameters
     ----------

@@ -140,7 +140,8 @@ class Ekf2Statistics(Record, kw_only=True, omit_defaults=False):
     heading_error_mean_deg : float or Unavailable
         Mean of heading minus true heading, clockwise from above.
     heights, others : mapping from PX4's name to AidStatistics
-        Replayed height sensors, and vision that is fused in addition to GNSS.
+        ``heights``: statistics of each replayed height sensor. ``others``: statistics of vision, if
+        EKF2 fuses vision in addition to GNSS.
     late, lost : int
         Number of samples that were fused late, and number of samples that arrived too late.
     is_predictable : bool
@@ -615,7 +616,7 @@ def _describe_deviation(
         note = f"{note}. The published height differs by at most {height_difference_m.max():.3g} m"
     if horizontal_aids <= disable_time_s_by_aid.keys():
         note = (
-            f"{note}. The replay then uses only the IMU. EKF2 itself stops publishing a position "
+            f"{note}. The replay then uses only the IMU. EKF2 stops publishing a position "
             "after EKF2_NOAID_TOUT (5 s)"
         )
     return note
