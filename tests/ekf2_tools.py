@@ -25,7 +25,7 @@ def step_matrix(segment: ReplaySegment, k: int, *, trapezoid: bool = True) -> np
     dt, after = segment.step_s[k], segment.body_to_ned[k + 1]
     F = EYE.copy()
     F[0:3, 9:12] = -after * dt
-    F[3:6, 0:3] = -skew(after @ segment.force_m_s2[k]) * dt
+    F[3:6, 0:3] = -skew(after @ segment.specific_force_m_s2[k]) * dt
     F[3:6, 12:15] = -after * dt
     F[6:9, 3:6] = np.eye(3) * dt
     if trapezoid:  # mean of the velocities before and after
@@ -40,12 +40,12 @@ def step_noise(segment: ReplaySegment, k: int, gyro: float, force: float) -> np.
 def step_state(segment: ReplaySegment, k: int, x: np.ndarray) -> np.ndarray:
     """Predict the state by one step, directly from the equations."""
     dt, after = segment.step_s[k], segment.body_to_ned[k + 1]
-    force = after @ segment.force_m_s2[k]
+    force = after @ segment.specific_force_m_s2[k]
     x = x.copy()
     velocity = x[3:6].copy()
     x[3:6] += (force + GRAVITY_M_S2 - skew(force) @ x[0:3] - after @ x[12:15]) * dt
     x[6:9] += 0.5 * dt * (velocity + x[3:6])
-    x[0:3] += -after @ x[9:12] * dt - segment.correction_rad[k]
+    x[0:3] += -after @ x[9:12] * dt - segment.attitude_correction_rad[k]
     return x
 
 
@@ -62,7 +62,7 @@ def plain_replay(
     drift[9:12] = settings["EKF2_GYR_B_NOISE"] ** 2
     drift[12:15] = settings["EKF2_ACC_B_NOISE"] ** 2
     deviation = np.sqrt(segment.variance)
-    P = deviation[:, None] * segment.state_correlation * deviation
+    P = deviation[:, None] * segment.initial_state_correlation * deviation
     x, k = segment.state.copy(), 0
     R = settings["EKF2_EVP_NOISE"] ** 2
     innovations, variances = [], []
@@ -80,7 +80,7 @@ def plain_replay(
             P = F @ P @ F.T + step_noise(segment, k, gyro, force)
             P += np.diag(drift * inputs.mean_step_s**2)
             k += 1
-        position = inputs.received.position_m[sample]
+        position = inputs.received_positions.position_m[sample]
         if action:
             innovations.append(position[:2] - x[6:8])
             variances.append([P[6, 6] + R, P[7, 7] + R])

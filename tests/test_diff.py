@@ -16,7 +16,7 @@ from px4fuse.batch.measures import (
     collect_compared_numbers,
 )
 from px4fuse.diagnose import analyse_comparison
-from px4fuse.ekf2.aids import AidAxis, AidResult
+from px4fuse.ekf2.aids import AidAxisStatistics, AidResult
 from px4fuse.request import ComparisonRequest
 from px4fuse.results.build import results
 from px4fuse.results.contract import ChangeResults, ComparisonResults, to_json
@@ -174,7 +174,7 @@ def test_diff_compares_each_json_number_only_once(clean):
     }  # fmt: skip
 
 
-def aid(*axes: AidAxis, rejected_fraction: float = 0.0) -> AidResult:
+def aid(*axes: AidAxisStatistics, rejected_fraction: float = 0.0) -> AidResult:
     return AidResult(
         label="GNSS velocity", unit="m/s", topic="", fused_fraction=1.0, fused_logged=True,
         rejected_fraction=rejected_fraction, longest_gap_s=(0.0, 0.5), resets=0, gate=5.0,
@@ -183,8 +183,8 @@ def aid(*axes: AidAxis, rejected_fraction: float = 0.0) -> AidResult:
     )  # fmt: skip
 
 
-def aid_axis(nis_mean: float) -> AidAxis:
-    return AidAxis(
+def aid_axis(nis_mean: float) -> AidAxisStatistics:
+    return AidAxisStatistics(
         samples=200, innovation_mean=0.0, innovation_std=1.0, s_sqrt_median=1.0,
         nis_mean=nis_mean, nis_band=(0.8, 1.2), sigma_ratio=1.0, rejected_fraction=0.0,
         lag1_autocorrelation=0.0, ljung_box_p=0.5, bias_p=0.5,

@@ -23,9 +23,9 @@ from px4fuse.ekf2.replay import (
     _judge_agreement,
     compare_with_log,
     is_inside_spans,
+    judge_with_logged_rejections,
     logged_innovations,
     match_updates,
-    with_logged_rejections,
 )
 from px4fuse.flight.model import AidLog, Columns, Ekf2, FusionRecord, Unavailable
 
@@ -54,12 +54,14 @@ def test_ekf2_replay_updates_are_matched_by_measurement_time():
 
 
 def test_ekf2_replay_evaluation_excludes_first_5_s_of_segments():
-    replay = made(Ekf2Replay, stretches_s=((10.0, 30.0), (40.0, 60.0)), flow_only_spans_s=())
+    replay = made(
+        Ekf2Replay, stretches_s=((10.0, 30.0), (40.0, 60.0)), optical_flow_only_spans_s=()
+    )
     evaluated_spans = replay.find_evaluated_spans()
     assert evaluated_spans == ((15.0, 30.0), (45.0, 60.0))
     # times with flow as the only aiding source, and the seconds after them, are excluded
     carried = made(Ekf2Replay, stretches_s=replay.stretches_s,
-                   flow_only_spans_s=((20.0, 23.0), (52.0, 58.0)))  # fmt: skip
+                   optical_flow_only_spans_s=((20.0, 23.0), (52.0, 58.0)))  # fmt: skip
     assert carried.find_evaluated_spans() == ((15.0, 20.0), (28.0, 30.0), (45.0, 52.0))
     times = np.array([15.0, 15.1, 29.9, 30.0, 45.0, 50.0, 60.0])
     assert is_inside_spans(times, evaluated_spans).tolist() == [
@@ -89,13 +91,13 @@ def agreeing(
     (agreeing(s=0.949), 0.0, 0.0, False, "is 0.95 times"),
     (agreeing(0.95), 0.0, 0.0, True, "a correlation of 0.9500"),
     (agreeing(published_m=0.09), 0.0, 0.0, True, "have a correlation of 1.0000"),
-    (agreeing(published_m=0.11), 0.0, 0.0, False, "published positions differ by 0.11 m"),
+    (agreeing(published_m=0.11), 0.0, 0.0, False, "logged positions differ by 0.11 m"),
     # enough digits to show the excess
     (agreeing(published_m=0.1028), 0.0, 0.0, False, "differ by 0.103 m RMS (limit 0.1"),
     (agreeing(published_m=0.10004), 0.0, 0.0, False, "differ by 0.10004 m"),
     (agreeing(0.949), 0.0, 0.04, False, "a correlation of 0.9490, below"),
     # with many rejections, shares and NIS decide
-    (agreeing(0.5), 0.1, 0.06, True, "rejected 6.0% of the samples, EKF2 in the log 10.0%"),
+    (agreeing(0.5), 0.1, 0.06, True, "rejected 6.0% of the samples, EKF2 rejected 10.0%"),
     (agreeing(0.5), 0.06, 0.1, True, "single innovations are not compared"),
     (agreeing(0.5), 0.25, 0.19, False, "limits "),
     (agreeing(0.5), 0.125, 0.1875, False, "limits "),
@@ -125,15 +127,17 @@ def test_ekf2_replay_agreement_is_tested_with_logged_rejections(axis, good):
     )  # fmt: skip
     logged_gate = replace(own_gate, north=agreeing(), east=axis, decisions_same=1.0,
                        rejected_fraction_replayed=0.3)  # fmt: skip
-    found = with_logged_rejections(own_gate, logged_gate)
+    found = judge_with_logged_rejections(own_gate, logged_gate)
     assert found.good is good
-    assert found.reason.startswith("in a replay with EKF2's logged rejections, ")
+    assert found.reason.startswith("if the replay rejects the same samples as EKF2, ")
     assert (found.decisions_same, found.rejected_fraction_replayed) == (0.9, 0.2)
     assert found.axes == logged_gate.axes
     # above half of the positions the published position is not tested, but the correlation is
     mostly = replace(own_gate, rejected_fraction_logged=0.51)
-    assert with_logged_rejections(mostly, replace(logged_gate, east=agreeing(published_m=9.0))).good
-    refused = with_logged_rejections(mostly, replace(logged_gate, east=agreeing(0.98)))
+    assert judge_with_logged_rejections(
+        mostly, replace(logged_gate, east=agreeing(published_m=9.0))
+    ).good
+    refused = judge_with_logged_rejections(mostly, replace(logged_gate, east=agreeing(0.98)))
     assert not refused.good
     assert "0.9800" in refused.reason
     assert "rejected 51% of the positions and relied on the IMU" in refused.reason
@@ -148,7 +152,7 @@ def test_ekf2_replay_agreement_statistics_equal_their_formulas():
     index = pd.Index([16.0, 17.0, 99.0])
     still = pd.DataFrame(0.0, index=index, columns=Columns.STATE)
     off = still.assign(**{Columns.STATE[1]: [3.0, 4.0, 50.0], Columns.STATE[4]: 0.25})
-    replay = SimpleNamespace(published=off, find_evaluated_spans=lambda: ((15.0, 20.0),))
+    replay = SimpleNamespace(published_state=off, find_evaluated_spans=lambda: ((15.0, 20.0),))
     found = _compare_axis("east", pd.DataFrame(frame), model, made(Ekf2, state=still), replay)  # type: ignore[arg-type]
     assert found.innovation_correlation == pytest.approx(1.0)
     assert found.innovation_rms_difference == pytest.approx(0.5)
@@ -218,11 +222,11 @@ def compared(
     updates.loc[updates.index[-1], "rejected"] = 1.0
     replay = SimpleNamespace(
         updates=updates,
-        published=state,
+        published_state=state,
         find_evaluated_spans=lambda: ((14.5, 999.0),),
         settings={},
         other_aid_updates={},
-        flow_only_spans_s=(),
+        optical_flow_only_spans_s=(),
     )
     return compare_with_log(SimpleNamespace(ekf2=ekf2), replay)  # type: ignore[arg-type]
 

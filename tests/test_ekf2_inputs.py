@@ -119,7 +119,7 @@ def flown(monkeypatch: pytest.MonkeyPatch) -> Callable[..., Any]:
         "read_vision",
         lambda *_: ReceivedPositions(*np.zeros((6, 1)), source="vision"),
     )
-    segment = made(ReplaySegment, field=None)
+    segment = made(ReplaySegment, magnetic_field=None)
     monkeypatch.setattr(inputs_module, "find_replay_segments", lambda *_, **_more: (segment,))
 
     def prepared(
@@ -149,7 +149,7 @@ def test_ekf2_fusion_rules_are_those_of_logged_px4_release(flown):
     assert new.rules == FusionRules(0.2, 0.4, 1.0, 5, None, False)
     assert new.imu_offset_m.tolist() == [0.0, 0.25, 0.0]
     assert (new.mean_step_s, new.configured_step_s) == (0.01, 0.01)
-    assert (new.horizon_s, new.max_event_interval_s) == (0.1, 0.25)
+    assert (new.horizon_s, new.max_fusion_interval_in_gap_s) == (0.1, 0.25)
     old = flown(EKF2_AID_MASK=8.0, stores_bias_increments=True)
     assert old.rules == FusionRules(math.inf, 7.0, 7.0, 1_000_000, pytest.approx(5e-4), True)
     assert old.settings["EKF2_EV_DELAY"] == 175.0
@@ -352,9 +352,9 @@ def test_ekf2_replay_inputs_equal_true_motion_in_turn():
     assert_allclose(found.step_s, 0.01, atol=1e-9)
     turned = to_matrix(facing(steps))
     assert_allclose(found.body_to_ned, turned, atol=1e-6)
-    assert_allclose(found.correction_rad, 0.0, atol=1e-6)
+    assert_allclose(found.attitude_correction_rad, 0.0, atol=1e-6)
     # body frame at the end of the step, without bias
-    assert_allclose(found.force_m_s2, [[0.8, 0.0, -10.0]] * 100, atol=5e-3)
+    assert_allclose(found.specific_force_m_s2, [[0.8, 0.0, -10.0]] * 100, atol=5e-3)
     assert_allclose(found.state[:3], [0.0, 0.0, 0.05], atol=1e-6)
     assert_allclose(found.state[3:9], [2.0, 2.0, 2.0, 7.0, 7.0, 10.5])
     assert_allclose(found.state[9:], 0.0)
@@ -364,7 +364,7 @@ def test_ekf2_replay_inputs_equal_true_motion_in_turn():
     assert_allclose(found.attitude_variance_rad2[:, 2], steps)
     assert_allclose(found.down_m, steps)
     assert_allclose(found.attitude_error_rad[:, 2], 0.05 + 0.1 * (steps - 10.5), atol=1e-6)
-    assert found.is_fusing
+    assert found.starts_while_fusing
     flown[3].delayed[Columns.POSITION] = 3.0
     assert_allclose(_make_segment(*flown, 5, 11.5).state[6:9], [3.0, 3.0, 10.5])
 
@@ -385,7 +385,7 @@ def segments(monkeypatch, **parts: Any) -> list[tuple[float, float]]:
         return made(ReplaySegment, **dict.fromkeys(map(attrgetter("name"), fields(ReplaySegment))))
 
     monkeypatch.setattr("px4fuse.ekf2.replay_segments._make_segment", keep)
-    monkeypatch.setattr("px4fuse.ekf2.replay_segments.STATE_CORRELATION_HISTORY_S", 0.0)
+    monkeypatch.setattr("px4fuse.ekf2.replay_segments.CORRELATION_ESTIMATION_TIME_S", 0.0)
     imu, fused, delayed = (
         pd.DataFrame(index=each) for each in (given.imu, given.fused, given.delayed)
     )

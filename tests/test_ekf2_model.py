@@ -39,12 +39,16 @@ def vision_of(flight: Flight) -> pd.DataFrame:
 
 
 def test_ekf2_model_transition_equals_product_of_step_matrices(model: Ekf2Model) -> None:
-    segment, intervals = model.inputs.segments[0], next(iter(model.intervals.values()))[0]
+    segment, intervals = (
+        model.inputs.segments[0],
+        next(iter(model.event_intervals_by_delays.values()))[0],
+    )
     made, end = intervals.compute_transitions(slice(None)), intervals.events.end_step
     starts = np.concatenate([[0], end[:-1]])
     gyro, force = (model.inputs.settings[f"EKF2_{name}_NOISE"] for name in ("GYR", "ACC"))
     noise = np.zeros_like(made.transition)
-    noise[:, :9, :9] = gyro**2 * made.gyro_noise + force**2 * made.accelerometer_noise
+    noise[:, :9, :9] = gyro**2 * made.gyro_noise_covariance
+    noise[:, :9, :9] += force**2 * made.accelerometer_noise_covariance
     for at in (0, 1, 57, 300, len(end) - 1):
         F, Q = np.eye(15), np.zeros((15, 15))
         x = x0 = np.random.default_rng(at).normal(0.0, 0.01, 15)
@@ -54,7 +58,8 @@ def test_ekf2_model_transition_equals_product_of_step_matrices(model: Ekf2Model)
             Q = old @ Q @ old.T + step_noise(segment, k, gyro, force)
             x = step_state(segment, k, x)
         assert made.transition[at] == pytest.approx(F, abs=1e-12)
-        moved = made.transition[at] @ x0 + made.correction_input[at] + made.acceleration_input[at]
+        change = made.state_change_by_correction[at] + made.state_change_by_acceleration[at]
+        moved = made.transition[at] @ x0 + change
         assert moved == pytest.approx(x, abs=1e-12)
         # closed forms assume equal steps and a mean force; the real ones vary
         part = slice(0, 9)
@@ -68,12 +73,14 @@ def test_ekf2_model_state_between_updates_is_imu_prediction(
 ) -> None:
     """Without attitude as a state, the nominal attitude is not corrected."""
     configuration = FilterConfiguration(model.inputs.settings, estimates_attitude=attitude)
-    (part,) = run_configurations(model.inputs, [configuration], model.intervals)
+    (part,) = run_configurations(model.inputs, [configuration], model.event_intervals_by_delays)
     kept = np.random.default_rng(4).normal(0.0, 0.05, part.state.shape)
     state, _ = compute_delayed_states(replace(part, state=kept), 0)
     segment, ends = part.segment, part.events[0].end_step
     if not attitude:
-        segment = replace(segment, correction_rad=np.zeros_like(segment.correction_rad))
+        segment = replace(
+            segment, attitude_correction_rad=np.zeros_like(segment.attitude_correction_rad)
+        )
     np.testing.assert_array_equal(state[ends], kept[1:, 0])
     for at in (0, 1, 57, 300, len(ends)):  # after the last event follows one more interval
         x = kept[at, 0]
@@ -84,7 +91,7 @@ def test_ekf2_model_state_between_updates_is_imu_prediction(
 
 
 def test_ekf2_model_innovations_equal_reference_filter(model: Ekf2Model) -> None:
-    events = next(iter(model.intervals.values()))[0].events
+    events = next(iter(model.event_intervals_by_delays.values()))[0].events
     nu, S = plain_replay(model.inputs, model.inputs.segments[0], events[events.end_step < 3000])
     updates = model.baseline_replay.updates.iloc[: len(nu)]
     assert len(nu) > 100
@@ -133,23 +140,23 @@ def test_ekf2_replay_of_several_settings_equals_separate_runs(model: Ekf2Model) 
     together = list(replay_with_settings(model, settings))
     for change, found in zip(settings, together, strict=True):
         (alone,) = replay_with_settings(model, [change])
-        for part in ("updates", "delayed", "published"):
+        for part in ("updates", "delayed_state", "published_state"):
             joint, separate = getattr(found, part), getattr(alone, part)
             pd.testing.assert_frame_equal(joint, separate, rtol=0.0, atol=1e-9)
-        assert dict(found.changed) == change
+        assert dict(found.changed_parameters) == change
     pd.testing.assert_frame_equal(
-        together[3].published, model.baseline_replay.published, rtol=0.0, atol=1e-9
+        together[3].published_state, model.baseline_replay.published_state, rtol=0.0, atol=1e-9
     )
 
 
 def test_ekf2_replay_counts_late_and_lost_vision_samples(model: Ekf2Model) -> None:
-    vision = model.inputs.received
+    vision = model.inputs.received_positions
     assert (model.baseline_replay.late, model.baseline_replay.lost) == (0, 0)
     # the horizon is 214 ms, and samples may be 100 ms later
 
     def arriving(after_s: float, **settings: float) -> Any:
         slow = replace(vision, arrival_s=vision.timestamp_s + after_s)
-        made = replace(model, inputs=replace(model.inputs, received=slow))
+        made = replace(model, inputs=replace(model.inputs, received_positions=slow))
         return next(replay_with_settings(made, [{"EKF2_EV_DELAY": 1.0, **settings}]))
 
     in_time, late, lost = (arriving(after_s) for after_s in (0.20, 0.28, 0.36))
@@ -208,8 +215,10 @@ def test_ekf2_model_fuses_vision_height_if_enabled(model: Ekf2Model, sample_flig
     fused = replace(
         sample_flight, ekf2=replace(ekf2, fusion_flags=ekf2.fusion_flags.assign(vertical=1.0))
     )
-    low = opened(with_vision(fused, samples)).baseline_replay.delayed["down_m"].loc[40.0:100.0]
-    own = model.baseline_replay.delayed["down_m"].loc[40.0:100.0]
+    low = (
+        opened(with_vision(fused, samples)).baseline_replay.delayed_state["down_m"].loc[40.0:100.0]
+    )
+    own = model.baseline_replay.delayed_state["down_m"].loc[40.0:100.0]
     vision = samples["down_m"].loc[40.0:100.0]
     assert low.mean() == pytest.approx(vision.mean(), abs=0.03)
     assert abs(own.mean() - vision.mean()) > 0.4
@@ -221,5 +230,5 @@ def test_ekf2_model_with_constant_accelerometer_bias_is_finite(sample_flight: Fl
     fixed.loc[:, [name for name in fixed if str(name).endswith("m2_s4")]] = 0.0
     parameters = {**record.parameters, "EKF2_ACC_B_NOISE": 0.0}
     made = opened(with_record(sample_flight, delayed=fixed, parameters=parameters))
-    assert np.isfinite(made.baseline_replay.published.to_numpy()).all()
+    assert np.isfinite(made.baseline_replay.published_state.to_numpy()).all()
     assert np.isfinite(made.baseline_replay.updates.to_numpy()).all()

@@ -60,7 +60,9 @@ def test_ekf2_output_predictor_equals_step_by_step_simulation(lag: int) -> None:
     reset = np.zeros((n + 1, 3))
     reset[150:] = 0.7, -0.2, 0.0
     position += reset
-    segment = made_of(ReplaySegment, body_to_ned=turn, force_m_s2=force, step_s=np.full(n, STEP_S))
+    segment = made_of(
+        ReplaySegment, body_to_ned=turn, specific_force_m_s2=force, step_s=np.full(n, STEP_S)
+    )
     state = np.zeros((n + 1, 15))
     state[:, VELOCITY], state[:, POSITION], state[:, ACCELEROMETER_BIAS] = velocity, position, bias
     settings = {"EKF2_TAU_VEL": 0.25, "EKF2_TAU_POS": 0.4}

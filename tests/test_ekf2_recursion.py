@@ -17,7 +17,7 @@ from scipy.spatial.transform import Rotation
 from px4fuse.ekf2.filter_recursion import (
     FilterConfiguration,
     SegmentRun,
-    _compute_settled_correlation,
+    _compute_steady_state_correlation,
     _FusionDecisions,
     _limit_bias_variance,
     _update_sequentially,
@@ -31,9 +31,9 @@ from px4fuse.ekf2.intervals import (
     START_FUSION,
     FusionDelays,
     _compute_imu_process_noise,
-    _find_sample_actions,
+    _find_fusion_actions,
     _make_events,
-    make_intervals,
+    make_event_intervals,
 )
 from px4fuse.ekf2.model import Ekf2Model, replay_with_settings
 from px4fuse.ekf2.replay_segments import GRAVITY_M_S2, ReplaySegment, add_field_states
@@ -65,7 +65,7 @@ def test_vision_measurements_apply_lever_arm_and_noise_minimum():
         "EKF2_EV_POS_X": np.array([0.0, 0.3]), "EKF2_EV_POS_Y": np.zeros(2),
         "EKF2_EV_POS_Z": np.zeros(2),
     }  # fmt: skip
-    inputs = made(ReplayInputs, received=vision, imu_offset_m=np.zeros(3))
+    inputs = made(ReplayInputs, received_positions=vision, imu_offset_m=np.zeros(3))
     at = np.array([0]), np.array([[1]])
     position, noise = measurements(inputs, segment, *at, parameters, np.array([True, True]))
     # 0.3 m ahead of a body that faces east: the body is west of the sensor
@@ -94,11 +94,12 @@ def deciding(
 ) -> tuple[bool, bool, bool, float, bool, int]:
     """Return rejected, fused and reset at 10 s; then last fusion, stopped, remaining resets."""
     fusion = _FusionDecisions(
-        rules, 10.0 - gap_s, action=np.array([[action]]), can_start=np.array([[can_start]]),
+        rules, 10.0 - gap_s, sample_actions=np.array([[action]]),
+        can_start=np.array([[can_start]]),
         time_s=np.array([[10.0]]), has_gate=np.array([has_gate]),
         uses_logged_decisions=np.array([follows_log]),
-        logged_rejections=np.array([logged]), logged_resets=np.array([logged_reset]),
-        has_all_resets=False,
+        logged_rejected_flags=np.array([logged]), logged_resets=np.array([logged_reset]),
+        is_every_reset_logged=False,
     )  # fmt: skip
     fusion.last_velocity_s = np.array([10.0 - velocity_gap_s])
     fusion.is_stopped, fusion.remaining_resets = np.array([stopped]), np.array([left])
@@ -143,7 +144,7 @@ def test_ekf2_model_stops_fusion_and_resets_after_ekf2_timeouts(case, expected):
 ])  # fmt: skip
 def test_fusion_horizon_delay_equals_duration_of_ekf2_buffer(settings, by_delay, timing):
     usual = {"EKF2_EV_DELAY": 0.0, "EKF2_DELAY_MAX": 200.0}
-    rules = replace(RULES, uses_delay_as_horizon=by_delay)
+    rules = replace(RULES, is_horizon_largest_delay=by_delay)
     inputs = made(
         ReplayInputs,
         rules=rules,
@@ -159,14 +160,12 @@ def test_fusion_horizon_delay_equals_duration_of_ekf2_buffer(settings, by_delay,
 
 
 def test_what_if_with_ekf2_delay_max_on_px4_v1_14_raises_error():
-    rules = replace(RULES, uses_delay_as_horizon=True)
-    received = made(ReceivedPositions, uses_sender_times=False)
-    inputs = made(ReplayInputs, rules=rules, settings={}, aid=EV_POS, received=received)
+    rules = replace(RULES, is_horizon_largest_delay=True)
+    received = made(ReceivedPositions, uses_sender_timestamps=False)
+    inputs = made(ReplayInputs, rules=rules, settings={}, aid=EV_POS, received_positions=received)
     flight = SimpleNamespace(log=log(firmware="PX4 v1.14"))
     model = made(Ekf2Model, inputs=inputs, flight=flight)
-    with pytest.raises(
-        SettingsError, match=r"in PX4 v1\.14 the largest delay parameter is the delay"
-    ):
+    with pytest.raises(SettingsError, match=r"PX4 v1\.14 has no such parameter"):
         replay_with_settings(model, [{"EKF2_DELAY_MAX": 100.0}])
     assert not list(replay_with_settings(model, []))
 
@@ -246,7 +245,7 @@ def test_initial_correlations_at_rest_equal_kalman_filter():
     count = 6000
     segment = made(
         ReplaySegment, step_s=np.full(count, 0.01), body_to_ned=np.tile(turn, (count + 1, 1, 1)),
-        force_m_s2=np.zeros((count, 3)) - GRAVITY_M_S2, variance=np.empty(15),
+        specific_force_m_s2=np.zeros((count, 3)) - GRAVITY_M_S2, variance=np.empty(15),
     )  # fmt: skip
     P = np.diag(np.repeat([0.1, 0.3, 0.5, 1e-5, 0.2], 3) ** 2)
     for k in range(count):
@@ -258,7 +257,7 @@ def test_initial_correlations_at_rest_equal_kalman_filter():
     deviation = np.sqrt(np.diag(P))
     known = (P / deviation[:, None] / deviation)[:2, 12:14]
     segment.variance[:] = np.diag(P)
-    found = _compute_settled_correlation(segment)
+    found = _compute_steady_state_correlation(segment)
     np.testing.assert_allclose(found[:2, 12:14], known, atol=0.03)
     assert np.abs(known).max() > 0.9
     np.testing.assert_allclose(np.diag(found), 1.0)
@@ -334,13 +333,13 @@ def at_rest(
     flat = np.zeros((count, 3))
     segment = ReplaySegment(
         time_s=10.0 + 0.01 * np.arange(count + 1), step_s=np.full(count, 0.01),
-        body_to_ned=np.tile(np.eye(3), (count + 1, 1, 1)), correction_rad=flat,
-        force_m_s2=flat - GRAVITY_M_S2,
+        body_to_ned=np.tile(np.eye(3), (count + 1, 1, 1)), attitude_correction_rad=flat,
+        specific_force_m_s2=flat - GRAVITY_M_S2,
         accelerometer_bias_m_s2=np.zeros(3), state=np.zeros(15), variance=np.full(15, 1e-4),
         down_m=np.full(count + 1, down_m),
         attitude_variance_rad2=np.tile([tilt_rad2, tilt_rad2, 1e-4], (count + 1, 1)),
         down_variance_m2=np.full(count + 1, 4e-4), attitude_error_rad=np.zeros((count + 1, 3)),
-        state_correlation=np.eye(15),
+        initial_state_correlation=np.eye(15),
     )  # fmt: skip
     segment.state[2] = heading_rad
     if field_gauss is not None:
@@ -362,13 +361,14 @@ def at_rest(
         reset_times_s=reset_s,
     )
     inputs = ReplayInputs(
-        fill_with_defaults(settings, aid, *([MAG] if segment.field else [])), (segment,), vision,
+        fill_with_defaults(settings, aid, *([MAG] if segment.magnetic_field else [])),
+        (segment,), vision,
         rules, 0.01, 0.1, 0.01,
         fuses_vision_height=False, imu_offset_m=np.zeros(3), aid=aid,
     )  # fmt: skip
-    intervals = make_intervals(inputs, segment, FusionDelays(0.0, 0.1))
+    intervals = make_event_intervals(inputs, segment, FusionDelays(0.0, 0.1))
     configuration = FilterConfiguration(
-        inputs.settings, uses_logged_decisions=True, without=without or {}
+        inputs.settings, uses_logged_decisions=True, disable_time_s_by_aid=without or {}
     )
     return run_segment(inputs, segment, [configuration], [intervals])
 
@@ -442,7 +442,9 @@ def test_closed_form_process_noise_equals_sum_over_steps(n):
 
 
 def stretch_of(count: int, *, fusing: bool = True) -> ReplaySegment:
-    return made(ReplaySegment, time_s=10.0 + 0.01 * np.arange(count + 1), is_fusing=fusing)
+    return made(
+        ReplaySegment, time_s=10.0 + 0.01 * np.arange(count + 1), starts_while_fusing=fusing
+    )
 
 
 def vision_of(stamps: list[float], age_s: float = 0.0) -> ReceivedPositions:
@@ -455,7 +457,7 @@ def acting(stamps: list[float], *, fusing: bool = True, rules: FusionRules = RUL
     taken = np.array(stamps)
     end = np.searchsorted(segment.time_s, taken - 1e-9)
     inputs = made(ReplayInputs, rules=rules)
-    action, _ = _find_sample_actions(inputs, segment, taken, end, np.ones(len(taken), bool))
+    action, _ = _find_fusion_actions(inputs, segment, taken, end, np.ones(len(taken), bool))
     return action.tolist()
 
 
@@ -475,10 +477,10 @@ def events(
 ) -> Any:
     inputs = made(
         ReplayInputs,
-        received=vision_of(stamps, age_s),
+        received_positions=vision_of(stamps, age_s),
         mean_step_s=0.01,
         rules=RULES,
-        max_event_interval_s=0.25,
+        max_fusion_interval_in_gap_s=0.25,
     )
     return _make_events(inputs, stretch_of(100), FusionDelays(delay_s, horizon_s))
 

@@ -19,21 +19,21 @@ from px4fuse.ekf2.model import Ekf2Model
 from px4fuse.ekf2.replay import Ekf2Replay, compute_rmse_to_truth, interpolate_component
 from px4fuse.ekf2.replay_segments import ReplaySegment, SensorSamples
 from px4fuse.ekf2.steps import (
-    ATTITUDE_STEP,
-    FLOW_STEP,
-    GNSS_VELOCITY_STEP,
-    MAGNETOMETER_STEP,
-    OUTPUT_PREDICTOR_STEP,
-    REJECTION_STEP,
-    REPLACEMENT_STEPS,
+    ATTITUDE_PROPERTY,
+    FLOW_PROPERTY,
+    GNSS_VELOCITY_PROPERTY,
+    MAGNETOMETER_PROPERTY,
+    OUTPUT_PREDICTOR_PROPERTY,
+    REJECTION_PROPERTY,
+    REPLACED_PROPERTIES,
     DifferenceExplanation,
     _find_longest_rejection,
-    explain_by_steps,
-    make_step_configurations,
+    explain_difference_by_replacements,
+    make_replacement_configurations,
 )
 from px4fuse.ekf2.whatif import (
-    AxisSummary,
-    Summary,
+    AxisStatistics,
+    Ekf2Statistics,
     _describe_replay_limits,
     _find_longest_gap_s,
     what_if,
@@ -76,15 +76,18 @@ def test_what_if_result_contains_logged_and_replayed_values(model):
 
 def test_what_if_is_unavailable_if_replay_differs_from_log(model):
     doubtful = replace(model, agreement=replace(model.agreement, good=False, reason="no reason"))
-    for result in (what_if(doubtful, [{"EKF2_EVP_NOISE": 0.5}]), explain_by_steps(doubtful)):
+    for result in (
+        what_if(doubtful, [{"EKF2_EVP_NOISE": 0.5}]),
+        explain_difference_by_replacements(doubtful),
+    ):
         assert isinstance(result, Unavailable)
         assert "no reason" in result.reason
 
 
 def test_contributions_to_kf_ekf2_difference_add_up_to_total(model):
-    for axis in explain_by_steps(model).values():
+    for axis in explain_difference_by_replacements(model).values():
         assert axis.longest_rejection is None
-        assert tuple(step.name for step in axis.steps) == REPLACEMENT_STEPS
+        assert tuple(step.name for step in axis.steps) == REPLACED_PROPERTIES
         for quantity in ("position_mean_square_m2", "velocity_mean_square_m2_s2"):
             unexplained = getattr(axis, f"unexplained_{quantity.removeprefix('position_')}")
             total = sum(getattr(step, quantity) for step in axis.steps) + unexplained
@@ -95,14 +98,16 @@ def test_contributions_to_kf_ekf2_difference_add_up_to_total(model):
         assert by_name["measurement noise"].position_moved_m < 1e-6
         assert by_name["rejections and resets"].position_moved_m < 1e-6
         largest = sorted(axis.steps, key=lambda step: -step.position_mean_square_m2)[:2]
-        assert {step.name for step in largest} == {"process noise", OUTPUT_PREDICTOR_STEP}
+        assert {step.name for step in largest} == {"process noise", OUTPUT_PREDICTOR_PROPERTY}
         last = axis.steps[-1].position_rmse_to_truth_m
         assert last == pytest.approx(axis.position_rmse_to_truth_m["ekf2"], abs=0.003)
 
 
 def test_kf_ekf2_difference_without_common_time_is_unavailable(model):
     axis, steps = made(Axis, direction=np.eye(3)[0]), pd.DataFrame(index=[1e4, 1e4 + 1.0])
-    result = explain_by_steps(model, Settings(), {"north": made(Replay, axis=axis, steps=steps)})
+    result = explain_difference_by_replacements(
+        model, Settings(), {"north": made(Replay, axis=axis, steps=steps)}
+    )
     assert isinstance(result, Unavailable)
     assert "do not overlap" in result.reason
 
@@ -114,9 +119,11 @@ def test_each_step_replaces_one_more_kf_setting_by_ekf2_value():
     flown = {"EKF2_EVP_NOISE": 0.3, "EKF2_EV_NOISE_MD": 0.0, "EKF2_ACC_NOISE": 0.35}
     received = made(ReceivedPositions)
     plain = (made(ReplaySegment, flow=None, height_samples=None),)
-    flight = made(ReplayInputs, settings=flown, mean_step_s=0.01, received=received, segments=plain)
+    flight = made(
+        ReplayInputs, settings=flown, mean_step_s=0.01, received_positions=received, segments=plain
+    )
     kf_settings = Settings(0.5, 0.2, 0.16, clock_offset_s=-0.05)
-    found = list(make_step_configurations(flight, kf_settings).values())
+    found = list(make_replacement_configurations(flight, kf_settings).values())
     settings = [configuration.settings for configuration in found]
     assert [s["EKF2_ACC_NOISE"] for s in settings] == pytest.approx([2.0] * 4 + [0.35] * 3)
     assert [s["EKF2_EVP_NOISE"] for s in settings] == [0.2] * 2 + [0.3] * 5
@@ -133,11 +140,11 @@ def test_each_step_replaces_one_more_kf_setting_by_ekf2_value():
         ReplayInputs,
         aid=GNSS_POS,
         mean_step_s=0.01,
-        received=made(ReceivedPositions, velocity_m_s=np.zeros((1, 3))),
+        received_positions=made(ReceivedPositions, velocity_m_s=np.zeros((1, 3))),
         settings={"EKF2_ACC_NOISE": 0.35, "EKF2_GPS_P_NOISE": 0.5, "EKF2_GPS_DELAY": 110.0},
         segments=plain,
     )
-    found = list(make_step_configurations(gnss, kf_settings).values())
+    found = list(make_replacement_configurations(gnss, kf_settings).values())
     assert [configuration.fuses_velocity for configuration in found] == [False] * 6 + [True] * 2
     assert [configuration.has_gate for configuration in found] == [False] * 7 + [True]
     # the GNSS positions of KF already include the delay
@@ -147,20 +154,22 @@ def test_each_step_replaces_one_more_kf_setting_by_ekf2_value():
     ] * 6
     flow = (made(ReplaySegment, flow=made(SensorSamples), height_samples=None),)
     more = {"segments": flow, "settings": gnss.settings | {"EKF2_MAG_NOISE": 0.05}}
-    configurations = make_step_configurations(
+    configurations = make_replacement_configurations(
         made(ReplayInputs, **{**vars(gnss), **more}), kf_settings
     )
     assert list(configurations)[-5:] == [
-        ATTITUDE_STEP,
-        MAGNETOMETER_STEP,
-        GNSS_VELOCITY_STEP,
-        FLOW_STEP,
-        REJECTION_STEP,
+        ATTITUDE_PROPERTY,
+        MAGNETOMETER_PROPERTY,
+        GNSS_VELOCITY_PROPERTY,
+        FLOW_PROPERTY,
+        REJECTION_PROPERTY,
     ]
-    assert ["mag" in each.without for each in configurations.values()] == [True] * 6 + [False] * 4
-    assert ["optical_flow" in each.without for each in configurations.values()] == [True] * 8 + [
-        False
-    ] * 2
+    assert ["mag" in each.disable_time_s_by_aid for each in configurations.values()] == [
+        True
+    ] * 6 + [False] * 4
+    assert ["optical_flow" in each.disable_time_s_by_aid for each in configurations.values()] == [
+        True
+    ] * 8 + [False] * 2
     assert [each.fuses_velocity for each in configurations.values()] == [False] * 7 + [True] * 3
 
 
@@ -174,7 +183,7 @@ def test_longest_run_of_ekf2_rejections_has_start_and_duration():
     away = still.copy()
     away.iloc[:, 0] = np.where(time == 26.5, 3.0, 0.0)
     away.iloc[:, 1] = np.where(time == 26.5, -4.0, np.where(time < 24.0, 99.0, 0.0))
-    one = made(Ekf2Replay, updates=updates, delayed=away)
+    one = made(Ekf2Replay, updates=updates, delayed_state=away)
     found = _find_longest_rejection(one, still, (0.0, 99.0), ((0.0, 99.0),))
     assert (found.start_s, found.samples, found.duration_s) == (24.5, 3, 3.0)
     assert found.distance_m == pytest.approx(5.0)
@@ -205,8 +214,10 @@ def test_longest_time_without_fusion_includes_start_and_end():
 
 
 def test_what_if_summary_has_horizontal_nis_and_rmse() -> None:
-    north, east = (AxisSummary(nis, (0.9, 1.1), 0.1, 0.1, m) for nis, m in ((1.0, 0.3), (3.0, 0.4)))
-    one = Summary(changed={}, north=north, east=east, samples=9, rejected_fraction=0.0,
+    north, east = (
+        AxisStatistics(nis, (0.9, 1.1), 0.1, 0.1, m) for nis, m in ((1.0, 0.3), (3.0, 0.4))
+    )
+    one = Ekf2Statistics(changed={}, north=north, east=east, samples=9, rejected_fraction=0.0,
                   longest_without_fusion_s=0.1, resets=0)  # fmt: skip
     assert (one.nis_mean, one.position_rmse_to_truth_m) == pytest.approx((2.0, 0.5))
     blind = structs.replace(east, position_rmse_to_truth_m=NONE)
@@ -217,10 +228,14 @@ def test_what_if_summary_has_horizontal_nis_and_rmse() -> None:
 
 def test_what_if_with_late_samples_adds_a_note():
     for by_delay, remedy in ((False, ". Increase EKF2_DELAY_MAX"), (True, "")):
-        rules = replace(RULES, uses_delay_as_horizon=by_delay)
+        rules = replace(RULES, is_horizon_largest_delay=by_delay)
         model: Any = SimpleNamespace(inputs=SimpleNamespace(rules=rules))
         one: Any = SimpleNamespace(
-            late=3, lost=2, updates=range(8), changed={"EKF2_EV_DELAY": 90}, settings={}
+            late=3,
+            lost=2,
+            updates=range(8),
+            settings={},
+            changed_parameters={"EKF2_EV_DELAY": 90},
         )
         (note,) = _describe_replay_limits(model, one)
         assert note.startswith("EKF2_EV_DELAY=90: 5 of 10 samples")
@@ -265,7 +280,10 @@ def test_what_if_predicts_flight_with_corrected_ekf2_parameter(tmp_path, mistake
 def test_what_if_delay_that_prevents_fusion_raises_error(model, monkeypatch):
     changed = {"EKF2_EV_DELAY": 300.0}
     never = replace(
-        model.baseline_replay, updates=model.baseline_replay.updates[:0], lost=9, changed=changed
+        model.baseline_replay,
+        updates=model.baseline_replay.updates[:0],
+        lost=9,
+        changed_parameters=changed,
     )
     monkeypatch.setattr(whatif, "replay_with_settings", lambda *_, **_more: [never])
     with pytest.raises(SettingsError, match=r"EKF2_EV_DELAY=300: .* never be fused .* 9 samples"):
@@ -285,8 +303,8 @@ def test_what_if_above_35_percent_rejections_is_not_predictable(model):
 
 def test_what_if_sensitive_to_noise_is_marked_unpredictable(model, monkeypatch):
     """Vary NIS, rejections and RMSE just inside and just outside their limits."""
-    north = AxisSummary(1.0, (0.9, 1.1), 0.1, 0.1, 0.1)
-    base = Summary(
+    north = AxisStatistics(1.0, (0.9, 1.1), 0.1, 0.1, 0.1)
+    base = Ekf2Statistics(
         changed={"EKF2_EVP_GATE": 3.0}, north=north, east=north, samples=500, rejected_fraction=0.2,
         longest_without_fusion_s=1.0, resets=0,
     )  # fmt: skip
@@ -296,7 +314,7 @@ def test_what_if_sensitive_to_noise_is_marked_unpredictable(model, monkeypatch):
         runs.append((sigma_m, seed))
         return model
 
-    def is_predictable(changed: Summary) -> bool:
+    def is_predictable(changed: Ekf2Statistics) -> bool:
         monkeypatch.setattr(whatif, "add_position_noise", add_position_noise)
         monkeypatch.setattr(whatif, "replay_with_settings", lambda _, changes, **_more: changes)
         monkeypatch.setattr(whatif, "_summarise_replay", lambda *_: changed)

@@ -207,19 +207,27 @@ def never_fusing(rate_hz: float = 5.0, age_s: float | None = None, **parts: Any)
     return analysis(ekf2=ekf2, log=log(parameters=parameters), source=fed)
 
 
-UNKNOWN = "The log does not contain the reason"
+UNKNOWN = "The log does not show why EKF2 fused no position"
 
 
 @pytest.mark.parametrize(
     ("flight", "reason", "remedy"),
     [
-        (never_fusing(parameters={"EKF2_EV_CTRL": 14.0}), "EKF2_EV_CTRL is 14. Bit 0", "to 15."),
+        (
+            never_fusing(parameters={"EKF2_EV_CTRL": 14.0}),
+            "EKF2_EV_CTRL is 14. Fusion of horizontal position is disabled: bit 0",
+            "to 15.",
+        ),
         (
             never_fusing(parameters={"EKF2_EV_CTRL": 15.0, "EKF2_AID_MASK": 1.0}),
             UNKNOWN,
             "ekf2 status",
         ),
-        (never_fusing(parameters={"EKF2_AID_MASK": 1.0}), "EKF2_AID_MASK is 1. Bit 3", "to 9."),
+        (
+            never_fusing(parameters={"EKF2_AID_MASK": 1.0}),
+            "EKF2_AID_MASK is 1. Fusion of external vision position is disabled: bit 3",
+            "to 9.",
+        ),
         (never_fusing(parameters={"EKF2_AID_MASK": 9.0}), UNKNOWN, "ekf2 status"),
         (never_fusing(2.0), UNKNOWN, "ekf2 status"),  # releases before v1.14 have no limit
         (

@@ -11,7 +11,7 @@ from ulog_tools import gnss_log, seconds_of, stamps, topic
 
 from px4fuse.ekf2.flow import add_flow_samples
 from px4fuse.ekf2.inputs import read_gnss
-from px4fuse.ekf2.magnetometer import EventSamples, average_by_event, fuse_mean
+from px4fuse.ekf2.magnetometer import EventSamples, average_by_event, fuse_mean_sample
 from px4fuse.ekf2.model import Ekf2Model, replay_with_settings
 from px4fuse.ekf2.replay_segments import VELOCITY
 from px4fuse.ekf2.whatif import what_if
@@ -111,12 +111,12 @@ def test_flow_velocity_averaged_for_update_equals_true_velocity(every):
     """The motion since a sample is known from the IMU, so corners cause no innovations."""
     (segment,) = model().inputs.segments
     with_flow = add_flow_samples(segment, flow_of(every=every), 3.0)
-    end = next(iter(model().intervals.values()))[0].events.end_step
+    end = next(iter(model().event_intervals_by_delays.values()))[0].events.end_step
     found = average_by_event(segment, with_flow.flow, end)
     has_sample = found.sample_count > 0.0
     assert found.sample_count.sum() == pytest.approx(len(flow_of(every=every)) * every, abs=12.0)
     speed = true_velocity(segment.time_s[end[has_sample]])
-    expected = np.einsum("kab,kb->ka", found.rotation_to_body[has_sample], speed)
+    expected = np.einsum("kab,kb->ka", found.ned_to_body_rotation[has_sample], speed)
     off = found.value[has_sample] - expected
     assert np.sqrt(np.mean(off**2)) < 0.03
     assert np.ptp(expected, axis=0).min() > 0.7
@@ -128,17 +128,17 @@ def test_fused_optical_flow_mean_is_weighted_by_sample_count():
     P[0, 3:5, 3:5] = 0.25 * np.eye(2)
     samples = EventSamples(np.array([[1.0, -0.5]]), turn, np.array([10.0]), np.array([0.8]))
     gate = np.array([3.0])
-    after, left, _ = fuse_mean(x, P, samples, gate, VELOCITY)
+    after, left, _ = fuse_mean_sample(x, P, samples, gate, VELOCITY)
     # 1/P = 1/P₀ + n/R
     assert left[0, 3, 3] == pytest.approx(1.0 / (1.0 / 0.25 + 10.0 / 0.8), rel=1e-6)
     assert after[0, 3:5] == pytest.approx(np.array([1.0, -0.5]) * left[0, 3, 3] * 10.0 / 0.8)
     far = samples._replace(value=np.array([[3.1, 0.0]]))  # 3 σ of one sample are 3.07
-    np.testing.assert_array_equal(fuse_mean(x, P, far, gate, VELOCITY)[0], x)
-    assert fuse_mean(x, P, far, np.array([3.1]), VELOCITY)[0][0, 3] > 1.0
+    np.testing.assert_array_equal(fuse_mean_sample(x, P, far, gate, VELOCITY)[0], x)
+    assert fuse_mean_sample(x, P, far, np.array([3.1]), VELOCITY)[0][0, 3] > 1.0
     none = samples._replace(
-        sample_count=np.zeros(1), noise=np.zeros(1), rotation_to_body=np.zeros((1, 2, 3))
+        sample_count=np.zeros(1), noise=np.zeros(1), ned_to_body_rotation=np.zeros((1, 2, 3))
     )
-    np.testing.assert_array_equal(fuse_mean(x, P, none, gate, VELOCITY)[0], x)
+    np.testing.assert_array_equal(fuse_mean_sample(x, P, none, gate, VELOCITY)[0], x)
 
 
 def test_ekf2_replay_without_gnss_drifts_less_with_optical_flow():
@@ -146,17 +146,17 @@ def test_ekf2_replay_without_gnss_drifts_less_with_optical_flow():
     lost = dict.fromkeys(("gnss_pos", "gnss_vel"), 40.0)
     off = []
     for carried in (flying(), model()):
-        (replay,) = replay_with_settings(carried, [{}], without=lost)
+        (replay,) = replay_with_settings(carried, [{}], disable_time_s_by_aid=lost)
         difference = (
-            replay.delayed[["north_m", "east_m"]]
-            - model().baseline_replay.delayed[["north_m", "east_m"]]
+            replay.delayed_state[["north_m", "east_m"]]
+            - model().baseline_replay.delayed_state[["north_m", "east_m"]]
         )
         off.append(float(np.hypot(*difference.loc[100.0:101.0].to_numpy().T).max()))
     assert off[0] < 1.5
     assert off[1] > 10.0
-    (alone,) = replay_with_settings(flying(), [{}], without={"optical_flow": 0.0})
+    (alone,) = replay_with_settings(flying(), [{}], disable_time_s_by_aid={"optical_flow": 0.0})
     (flown,) = replay_with_settings(model(), [{}])
-    pd.testing.assert_frame_equal(alone.delayed, flown.delayed)
+    pd.testing.assert_frame_equal(alone.delayed_state, flown.delayed_state)
 
 
 def stretches_s(flight: Flight) -> list[tuple[float, float]]:
@@ -212,7 +212,7 @@ def test_ekf2_replay_start_covariance_uses_data_before_start():
     assert segment.preceding_segment is not None
     assert segment.preceding_segment.time_s[-1] == pytest.approx(segment.time_s[0], abs=1e-6)
     assert segment.preceding_segment.time_s[0] < 1.0
-    of_tilt = segment.state_correlation[:2, 12:15] @ segment.body_to_ned[0].T
+    of_tilt = segment.initial_state_correlation[:2, 12:15] @ segment.body_to_ned[0].T
     # θ × f = Rb with f = -g: the north bias couples with the east tilt, and vice versa
     np.testing.assert_allclose(of_tilt[:, :2], [[0.0, 0.98], [-0.98, 0.0]], atol=0.02)
 
@@ -234,13 +234,15 @@ def test_ekf2_model_of_optical_flow_flights_agrees_with_log(name, shared_logs, m
     if "outage" in name:
         assert agreement.carried_difference_m < 0.5
         assert agreement.doubtful == {}
-        ((lost_s, back_s),) = found.baseline_replay.flow_only_spans_s
+        ((lost_s, back_s),) = found.baseline_replay.optical_flow_only_spans_s
         assert lost_s == pytest.approx(42.1, abs=0.2)  # 35.2 s after take-off
         assert back_s == pytest.approx(72.6, abs=1.0)
     else:
         assert agreement.carried_difference_m is None
         notes = " ".join(
-            what_if(found, [{}], without=dict.fromkeys(("gnss_pos", "gnss_vel"), 60.0)).notes
+            what_if(
+                found, [{}], disable_time_s_by_aid=dict.fromkeys(("gnss_pos", "gnss_vel"), 60.0)
+            ).notes
         )  # type: ignore[union-attr]
         assert "Without gnss_pos from 60 s on" in notes
         assert "EKF2_NOAID_TOUT" not in notes

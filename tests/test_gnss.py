@@ -25,7 +25,7 @@ from px4fuse.ekf2.inputs import _make_fusion_rules, read_gnss
 from px4fuse.ekf2.inputs import prepare_inputs as prepare_replay
 from px4fuse.ekf2.model import Ekf2Model
 from px4fuse.ekf2.replay import is_inside_spans, rms
-from px4fuse.ekf2.whatif import Summary, what_if
+from px4fuse.ekf2.whatif import Ekf2Statistics, what_if
 from px4fuse.errors import MissingDataError, SettingsError
 from px4fuse.findings import find, noises
 from px4fuse.flight.model import (
@@ -486,12 +486,12 @@ def test_what_if_with_correct_gnss_delay_reduces_heading_error(models):
         return logged, after
 
     for model in models.values():
-        assert {segment.field is None for segment in model.inputs.segments} == {False}
+        assert {segment.magnetic_field is None for segment in model.inputs.segments} == {False}
         assert model.agreement.heading_rms_difference_deg < 0.5
         # height follows the logged EKF2 height
         state, replayed = (
             model.flight.ekf2.state["down_m"],
-            model.baseline_replay.published["down_m"],
+            model.baseline_replay.published_state["down_m"],
         )
         state = state[is_inside_spans(state.index, model.baseline_replay.find_evaluated_spans())]
         assert rms(np.interp(state.index, replayed.index, replayed) - state.to_numpy()) < 0.05
@@ -508,7 +508,7 @@ def test_what_if_with_correct_gnss_delay_reduces_heading_error(models):
 def test_what_if_without_aiding_source_predicts_position_error(models):
     """The error after 93 s agrees with the noise of the remaining aiding sources."""
 
-    def without(*names: str) -> tuple[Summary, float]:
+    def without(*names: str) -> tuple[Ekf2Statistics, float]:
         found = what_if(models["nominal"], [{}], dict.fromkeys(names, 60.0))
         assert found.evaluated_s[0][0] == 60.0
         (after,) = found.whatif
@@ -532,8 +532,10 @@ def test_what_if_without_aiding_source_predicts_position_error(models):
 def test_what_if_with_unused_parameter_raises_settings_error(models):
     with pytest.raises(SettingsError, match="EKF2 fused GNSS position, which this"):
         what_if(models["nominal"], [{"EKF2_EVP_NOISE": 0.2}])
-    own = replace(models["nominal"].inputs.received, uses_sender_times=True)
-    model = replace(models["nominal"], inputs=replace(models["nominal"].inputs, received=own))
+    own = replace(models["nominal"].inputs.received_positions, uses_sender_timestamps=True)
+    model = replace(
+        models["nominal"], inputs=replace(models["nominal"].inputs, received_positions=own)
+    )
     with pytest.raises(SettingsError, match="EKF2_GPS_DELAY has no effect in a replay of this log"):
         what_if(model, [{"EKF2_GPS_DELAY": 50.0}])
 
@@ -606,7 +608,7 @@ def test_gnss_noise_is_limited_by_the_same_bounds_as_in_ekf2(parameters, fused, 
     np.testing.assert_allclose(found.timestamp_s, samples.index + 0.11)
     np.testing.assert_allclose(found.arrival_s, found.timestamp_s)
     np.testing.assert_allclose(found.variance_m2[:, :2], 100.0)
-    assert not found.uses_sender_times
+    assert not found.uses_sender_timestamps
     assert (found.velocity_m_s is not None) is fused
     if found.velocity_m_s is not None and found.velocity_variance_m2_s2 is not None:
         np.testing.assert_allclose(found.velocity_m_s[0], [1.0, 2.0, 3.0])
@@ -623,14 +625,14 @@ def test_ekf2_model_without_fused_gnss_samples_is_unavailable(tmp_path):
     ]
     found = prepare_replay(flight_of(log, tmp_path))
     assert isinstance(found, Unavailable)
-    assert "no sample of GNSS position while EKF2 reports its fusion" in found.reason
+    assert "the log contains no sample of this source" in found.reason
 
 
 def test_gnss_driver_timestamp_replaces_delay_parameter(tmp_path):
     record = made(FusionRecord, parameters={"EKF2_GPS_DELAY": 110.0, "EKF2_GPS_MODE": 0.0})
     flight = flight_of(outdoors(own_s=0.09, EKF2_GPS_MODE=0.0), tmp_path)
     found = read_gnss(flight, flight.ekf2, record)
-    assert found.uses_sender_times
+    assert found.uses_sender_timestamps
     assert found.velocity_m_s is None
     # the timestamp is chosen so that the delay leads to the driver's time
     np.testing.assert_allclose(found.timestamp_s - 0.11, track_of(flight).samples.index)

@@ -44,8 +44,8 @@ def climbing(
     force = np.tile([0.0, 0.0, -9.80665 - up_m_s2], (count, 1))
     return made(
         ReplaySegment, time_s=STEP_S * np.arange(count + 1), step_s=np.full(count, STEP_S),
-        body_to_ned=np.tile(np.eye(3), (count + 1, 1, 1)), force_m_s2=force, height_samples=heights,
-        **more,
+        body_to_ned=np.tile(np.eye(3), (count + 1, 1, 1)), specific_force_m_s2=force,
+        height_samples=heights, **more,
     )  # fmt: skip
 
 
@@ -228,7 +228,7 @@ def test_what_if_without_height_sensor_reports_drift() -> None:
     (lost,) = found.whatif
     assert lost.heights == {}
     assert lost.height_rmse_to_truth_m > 2.0 * found.replayed.height_rmse_to_truth_m
-    assert ". The heights of the two replays differ by at most " in found.notes[-1]
+    assert ". The published height differs by at most " in found.notes[-1]
 
 
 def test_what_if_gives_no_result_after_long_height_rejection() -> None:
@@ -259,9 +259,11 @@ def test_what_if_excludes_height_sensor_that_disagrees_with_log() -> None:
     assert "barometer" in format_replay_agreement(agreement)
     assert model.baseline_replay.other_aid_updates.keys() == {"gnss_vel"}
     own = np.interp(
-        model.baseline_replay.delayed.index, flight.ekf2.state.index, flight.ekf2.state["down_m"]
+        model.baseline_replay.delayed_state.index,
+        flight.ekf2.state.index,
+        flight.ekf2.state["down_m"],
     )
-    assert np.abs(model.baseline_replay.delayed["down_m"] - own).max() < 0.5
+    assert np.abs(model.baseline_replay.delayed_state["down_m"] - own).max() < 0.5
     found = what_if(model, [{"EKF2_GPS_DELAY": 0.0}])
     assert HEIGHT_LOGGED_NOTE in found.notes
     with pytest.raises(SettingsError, match=r"EKF2_BARO_NOISE has no effect .*barometer: "):
@@ -345,7 +347,7 @@ def test_bad_acceleration_flag_is_set_by_two_large_innovations() -> None:
 
     def event(time_s: float, barometer: list[float], gnss: float) -> list[float]:
         """Return the fraction of the 0.1 s before an event with the flag, then fuse samples."""
-        share = flag.compute_flagged_fraction(np.array([time_s - 0.1]), np.array([time_s]))
+        share = flag.compute_bad_acceleration_fraction(np.array([time_s - 0.1]), np.array([time_s]))
         ratios.append(np.array([[one, one] for one in (*barometer, gnss)]))
         flag.update(np.array([time_s]), *ratios[-2:])
         return [0.0, 0.0] if share is None else share.tolist()
@@ -370,7 +372,7 @@ def test_ekf2_flag_for_bad_acceleration_is_read_from_log() -> None:
     segment = climbing(of_baro([10], [0.0]), is_acceleration_bad=is_bad)
     flag = BadAccelerationFlag(np.array([True]), 3.0, segment)
     shares = [
-        flag.compute_flagged_fraction(np.array([end_s - 0.2]), np.array([end_s]))
+        flag.compute_bad_acceleration_fraction(np.array([end_s - 0.2]), np.array([end_s]))
         for end_s in (0.9, 1.1, 1.3, 1.6, 1.8, 4.0)
     ]
     expected = [None, 0.5, 1.0, 0.5, None, 1.0]

@@ -9,14 +9,14 @@ from findings_tools import made
 from scipy.spatial.transform import Rotation
 from ulog_tools import Log, gnss_log, seconds_of, stamps, topic
 
-from px4fuse.ekf2.magnetometer import EventSamples, average_by_event, fuse_mean
+from px4fuse.ekf2.magnetometer import EventSamples, average_by_event, fuse_mean_sample
 from px4fuse.ekf2.replay_segments import (
-    BODY_FIELD,
-    EARTH_FIELD,
+    BODY_MAGNETIC_FIELD,
+    EARTH_MAGNETIC_FIELD,
     ReplaySegment,
     SensorSamples,
-    _compute_mean_field,
-    _find_field_fusion_span,
+    _compute_mean_magnetic_field,
+    _find_magnetometer_3d_fusion_span,
 )
 from px4fuse.flight.model import Columns, FusionRecord
 from px4fuse.readers import read_log
@@ -34,7 +34,9 @@ def field_samples(rotation: Rotation, body: np.ndarray, size: int = 1) -> EventS
 def fuse_field(
     x: np.ndarray, P: np.ndarray, seen: EventSamples, noise_gauss: np.ndarray, gate: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    return fuse_mean(x, P, seen._replace(noise=noise_gauss**2), gate, EARTH_FIELD, BODY_FIELD)
+    return fuse_mean_sample(
+        x, P, seen._replace(noise=noise_gauss**2), gate, EARTH_MAGNETIC_FIELD, BODY_MAGNETIC_FIELD
+    )
 
 
 def known_field_state(size: int = 1) -> tuple[np.ndarray, np.ndarray]:
@@ -118,8 +120,8 @@ def test_magnetometer_samples_are_averaged_until_next_update() -> None:
     np.testing.assert_allclose(found.noise, [0.0, 0.2, 0.2, 0.0, 0.0])
     assert found.sample_count.tolist() == [0.0, 4.0, 2.0, 0.0, 0.0]
     np.testing.assert_allclose(found.value[1], gauss[:2].mean(axis=0))
-    np.testing.assert_allclose(found.rotation_to_body[1], rotation[2:4].mean(axis=0).T)
-    np.testing.assert_allclose(found.rotation_to_body[2], rotation[6].T)
+    np.testing.assert_allclose(found.ned_to_body_rotation[1], rotation[2:4].mean(axis=0).T)
+    np.testing.assert_allclose(found.ned_to_body_rotation[2], rotation[6].T)
 
 
 # ---------------------------------------------------------------- reading
@@ -208,7 +210,9 @@ def test_mean_field_is_restored_from_filtered_mag_innovations() -> None:
     delayed = pd.DataFrame(dict(zip(fields, [*EARTH, *body], strict=True)), [99.0, 200.0])
     matrices = rotation.as_matrix()
     segment = made(ReplaySegment, time_s=time_s, body_to_ned=matrices, attitude_error_rad=error)
-    found = _compute_mean_field(segment, delayed, measured_at_s[remaining], filtered[remaining])
+    found = _compute_mean_magnetic_field(
+        segment, delayed, measured_at_s[remaining], filtered[remaining]
+    )
     near = np.flatnonzero(np.diff(remaining) < 20) + 1
     assert found.sample_count.tolist() == np.diff(remaining)[near - 1].tolist()
     assert sorted(set(found.sample_count)) == [7.0, 14.0]
@@ -217,7 +221,7 @@ def test_mean_field_is_restored_from_filtered_mag_innovations() -> None:
         remaining[near],
         found.sample_count.astype(int),
         found.value,
-        found.rotation_to_body,
+        found.ned_to_body_rotation,
         strict=True,
     ):
         of = row - np.arange(samples)
@@ -232,7 +236,7 @@ def settled(frame_hz: float, on: slice, count: int = 60) -> tuple[float, float] 
     fused = np.zeros(count)
     fused[on] = 1.0
     frame = pd.DataFrame({"fused_3d": fused}, index=np.arange(count) / frame_hz)
-    return _find_field_fusion_span(made(FusionRecord, magnetic_field_gauss=frame))
+    return _find_magnetometer_3d_fusion_span(made(FusionRecord, magnetic_field_gauss=frame))
 
 
 def test_magnetometer_replay_requires_continuous_3d_fusion() -> None:

@@ -443,7 +443,7 @@ def test_title_of_wrong_default_noise_names_the_position_sensor(
                   after=RunStatistics(nis_mean=1.0))  # fmt: skip
     settings = {aid.noise: flown_m, "EKF2_EV_NOISE_MD": 0.0}
     received = SimpleNamespace(variance_m2=np.zeros((9, 3)))
-    inputs = SimpleNamespace(aid=aid, settings=settings, received=received)
+    inputs = SimpleNamespace(aid=aid, settings=settings, received_positions=received)
     model = SimpleNamespace(inputs=inputs)
     result = axis("north", rejected_fraction=rejected)
     origin = GNSS_ORIGIN if kind == "gnss" else AS_RECEIVED_ORIGIN

@@ -194,7 +194,9 @@ def test_larger_ekf2_acc_noise_reduces_nees_under_vibration() -> None:
     assert after == pytest.approx(0.8 * before, rel=0.05)
     # at the fusion horizon σ covers the error with this noise
     (replayed,) = replay_with_settings(analysis.ekf2_model, [dict(tried.change)])
-    delayed = project_state(replayed.delayed, analysis.main.axis, analysis.segment)["position_m"]
+    delayed = project_state(replayed.delayed_state, analysis.main.axis, analysis.segment)[
+        "position_m"
+    ]
     truth = analysis.main.truth["position_m"]
     error_m = delayed - np.interp(delayed.index, truth.index, truth, np.nan, np.nan)
     variances = replayed.updates[POSITION_VARIANCE_COLUMNS].mean(axis=1).mean()
@@ -221,7 +223,7 @@ def test_what_if_uses_logged_heading_if_mag_is_not_replayed(tmp_path: Path) -> N
     assert result.notes[0] == HEADING_LOGGED_NOTE
     errors = [one.heading_error_mean_deg for one in (result.logged, *result.whatif)]
     assert errors[1] == pytest.approx(errors[0], abs=0.1)
-    with pytest.raises(SettingsError, match="the log lacks some fused magnetometer samples"):
+    with pytest.raises(SettingsError, match="the log does not contain all magnetometer samples"):
         what_if(model, [{"EKF2_MAG_NOISE": 0.1}])
 
 

@@ -21,7 +21,7 @@ from px4fuse.diagnose import analyse_comparison, run_what_if
 from px4fuse.ekf2 import steps
 from px4fuse.ekf2.filter_recursion import FilterConfiguration, SegmentRun, run_segment
 from px4fuse.ekf2.inputs import ReceivedPositions, ReplayInputs
-from px4fuse.ekf2.intervals import StepEvents, make_intervals
+from px4fuse.ekf2.intervals import StepEvents, make_event_intervals
 from px4fuse.ekf2.model import (
     Ekf2Model,
     list_modelled_aids,
@@ -121,7 +121,7 @@ def plain_both(  # noqa: PLR0915 (one filter, read from top to bottom)
     All axes are fused with the initial innovation and S (fuseDirectStateMeasurement). Returns a row
     per fix, and a row per vision sample.
     """
-    settings, received, vision = inputs.settings, inputs.received, inputs.vision
+    settings, received, vision = inputs.settings, inputs.received_positions, inputs.vision_positions
     assert vision is not None
     assert received.velocity_m_s is not None
     assert received.velocity_variance_m2_s2 is not None
@@ -130,7 +130,7 @@ def plain_both(  # noqa: PLR0915 (one filter, read from top to bottom)
     drift[12:15] = settings["EKF2_ACC_B_NOISE"] ** 2
     noises = settings["EKF2_GYR_NOISE"], settings["EKF2_ACC_NOISE"]
     deviation = np.sqrt(segment.variance)
-    x, P = segment.state.copy(), deviation[:, None] * segment.state_correlation * deviation
+    x, P = segment.state.copy(), deviation[:, None] * segment.initial_state_correlation * deviation
     measured_at_s = vision.timestamp_s - 1e-3 * settings["EKF2_EV_DELAY"] - 0.5 * inputs.mean_step_s
     steps = np.searchsorted(segment.time_s, measured_at_s - 1e-9).tolist()
     has_sample = {step: row for row, step in enumerate(steps) if step > 0}
@@ -198,22 +198,26 @@ def flying(
     unknown = np.full((count, 3), np.inf)
     segment = replace(
         whole, time_s=whole.time_s[:count], step_s=whole.step_s[: count - 1],
-        body_to_ned=whole.body_to_ned[:count], correction_rad=whole.correction_rad[: count - 1],
-        force_m_s2=whole.force_m_s2[: count - 1], down_m=whole.down_m[:count], field=None,
-        height_samples=None, state=whole.state[:15], variance=whole.variance[:15],
+        body_to_ned=whole.body_to_ned[:count],
+        attitude_correction_rad=whole.attitude_correction_rad[: count - 1],
+        specific_force_m_s2=whole.specific_force_m_s2[: count - 1], down_m=whole.down_m[:count],
+        magnetic_field=None, height_samples=None,
+        state=whole.state[:15], variance=whole.variance[:15],
         clipped_fraction=None, is_acceleration_bad=None,
-        state_correlation=np.eye(15), attitude_variance_rad2=unknown,
+        initial_state_correlation=np.eye(15), attitude_variance_rad2=unknown,
         down_variance_m2=unknown[:, 0],
         attitude_error_rad=whole.attitude_error_rad[:count],
     )  # fmt: skip
     known = {**inputs.settings, **SETTINGS, **settings}
-    return replace(inputs, segments=(segment,), vision=vision, settings=known)
+    return replace(inputs, segments=(segment,), vision_positions=vision, settings=known)
 
 
 def ran(inputs: ReplayInputs, *configurations: FilterConfiguration) -> SegmentRun:
     (segment,) = inputs.segments
     configurations = configurations or (FilterConfiguration(inputs.settings),)
-    made = [make_intervals(inputs, segment, one.compute_delays(inputs)) for one in configurations]
+    made = [
+        make_event_intervals(inputs, segment, one.compute_delays(inputs)) for one in configurations
+    ]
     return run_segment(inputs, segment, configurations, made)
 
 
@@ -229,7 +233,7 @@ def test_ekf2_replay_of_vision_and_gnss_equals_reference(
     rate_hz: float, late_s: float, settings: dict[str, float]
 ) -> None:
     inputs = flying(sent(rate_hz, late_s=late_s), **settings)
-    done, alone = ran(inputs), ran(replace(inputs, vision=None))
+    done, alone = ran(inputs), ran(replace(inputs, vision_positions=None))
     events = done.events[0]
     fixes, rows = plain_both(inputs, done.segment, events)
     used = events.action > 0
@@ -255,7 +259,7 @@ def test_vision_noise_is_at_least_gnss_noise_while_gnss_is_fused() -> None:
     """R is the largest of EKF2_EVP_NOISE, EKF2_GPS_P_NOISE and the reported variance."""
     inputs = flying(sent(), EKF2_GPS_P_NOISE=0.5)
     noises = ({**inputs.settings, "EKF2_EVP_NOISE": noise_m} for noise_m in (0.01, 0.5, 0.7))
-    alone = FilterConfiguration(inputs.settings, without={"gnss_pos": 0.0})
+    alone = FilterConfiguration(inputs.settings, disable_time_s_by_aid={"gnss_pos": 0.0})
     done = ran(inputs, *map(FilterConfiguration, noises), alone)
     assert done.vision_filter is not None
     noise = np.sqrt(
@@ -322,7 +326,7 @@ def test_vision_position_bias_restarts_after_a_gap() -> None:
     for gap_s, anew in ((0.9 * MAX_SAMPLE_GAP_S, False), (1.5 * MAX_SAMPLE_GAP_S, True)):
         remaining = (vision.timestamp_s < at_s) | (vision.timestamp_s > at_s + gap_s)
         moved = vision.position_m + 20.0 * (vision.timestamp_s > at_s)[:, None]
-        fields = ("timestamp_s", "arrival_s", "variance_m2", "rejected", "reset")
+        fields = ("timestamp_s", "arrival_s", "variance_m2", "rejected_flags", "is_reset_to_sample")
         parts = {name: getattr(vision, name)[remaining] for name in fields}
         found = update_records(ran(flying(replace(vision, position_m=moved[remaining], **parts))))
         after = found.loc[at_s + gap_s :]
@@ -337,7 +341,7 @@ def test_loss_of_gnss_resets_position_to_vision() -> None:
     done = ran(
         inputs,
         FilterConfiguration(inputs.settings),
-        FilterConfiguration(inputs.settings, without=lost),
+        FilterConfiguration(inputs.settings, disable_time_s_by_aid=lost),
     )
     found, flown = update_records(done, 1), update_records(done, 0)
     assert not flown["reset"].any()
@@ -360,7 +364,9 @@ def test_vision_position_bias_changes_with_gnss_position_reset() -> None:
     inputs = flying(sent(sigma_m=0.05))
     for resets_velocity in (False, True):
         rules = replace(inputs.rules, resets_velocity=resets_velocity)
-        done = ran(replace(inputs, rules=rules, received=off_by(inputs.received, 30.0)))
+        done = ran(
+            replace(inputs, rules=rules, received_positions=off_by(inputs.received_positions, 30.0))
+        )
         # up to v1.16 any fused position, also from vision, prevents a reset to GNSS
         assert int(done.reset.sum()) == (not resets_velocity)
         assert done.position_reset_m.sum() == pytest.approx(
@@ -378,7 +384,7 @@ def off_by(received: ReceivedPositions, north_m: float) -> ReceivedPositions:
 
 def test_position_resets_to_vision_if_gnss_and_vision_rejected() -> None:
     inputs = flying(off_by(sent(sigma_m=0.05), 20.0), seconds=20.0)
-    done = ran(replace(inputs, received=off_by(inputs.received, 40.0)))
+    done = ran(replace(inputs, received_positions=off_by(inputs.received_positions, 40.0)))
     found = update_records(done)
     (reset_s,) = found.index[found["reset"] > 0.0]
     assert reset_s == pytest.approx(float(done.segment.time_s[0]) + 16.0, abs=0.2)
@@ -402,7 +408,13 @@ def test_second_vision_sample_in_one_step_is_dropped() -> None:
     vision = sent(rate_hz=25.0)
     doubled = {
         name: np.repeat(getattr(vision, name), 2, axis=0)
-        for name in ("arrival_s", "position_m", "variance_m2", "rejected", "reset")
+        for name in (
+            "arrival_s",
+            "position_m",
+            "variance_m2",
+            "rejected_flags",
+            "is_reset_to_sample",
+        )
     }
     stamps = np.repeat(vision.timestamp_s, 2)
     stamps[::2] -= 0.0005
@@ -437,9 +449,13 @@ def flown(
         inputs: ReplayInputs, configurations: list[FilterConfiguration], known: Any
     ) -> list[SegmentRun]:
         settings = {**inputs.settings, **SETTINGS, **changed}
-        given = replace(inputs, vision=heard, settings=settings)
+        given = replace(inputs, vision_positions=heard, settings=settings)
         runs.extend(
-            usual_run(given, [FilterConfiguration(settings, without={"ev_pos": off_from_s})], known)
+            usual_run(
+                given,
+                [FilterConfiguration(settings, disable_time_s_by_aid={"ev_pos": off_from_s})],
+                known,
+            )
         )
         return runs
 
@@ -545,7 +561,7 @@ def test_ekf2_model_excludes_vision_that_disagrees_with_log(wrong: dict[str, Any
     assert found.agreement.ev_pos["north"].innovation_correlation < 0.5
     # a replay with GNSS only differs from EKF2
     assert not found.agreement.good
-    assert found.inputs.vision is None
+    assert found.inputs.vision_positions is None
     assert "ev_pos" not in list_modelled_aids(found.inputs)
     with pytest.raises(SettingsError, match="EKF2_EVP_NOISE has no effect in a replay of this log"):
         replay_with_settings(found, [{"EKF2_EVP_NOISE": 0.3}])
@@ -553,9 +569,11 @@ def test_ekf2_model_excludes_vision_that_disagrees_with_log(wrong: dict[str, Any
 
 def test_ekf2_model_does_not_fuse_vision_while_disabled() -> None:
     found = opened(flown(off_from_s=60.0))
-    assert found.inputs.vision is not None
-    update_records = np.isfinite(found.inputs.vision.position_m[:, 0])
-    assert found.inputs.vision.timestamp_s[update_records][-1] == pytest.approx(60.0, abs=0.1)
+    assert found.inputs.vision_positions is not None
+    update_records = np.isfinite(found.inputs.vision_positions.position_m[:, 0])
+    assert found.inputs.vision_positions.timestamp_s[update_records][-1] == pytest.approx(
+        60.0, abs=0.1
+    )
     assert found.agreement.good
     assert found.agreement.doubtful == {}
 
@@ -571,21 +589,21 @@ def test_ekf2_model_with_incomplete_vision_is_unavailable() -> None:
     older = replace(record, parameters={**remaining, "EKF2_AID_MASK": 9.0})
     refused = prepare_ekf2_model(replace(flight, ekf2=replace(flight.ekf2, record=older)))
     assert isinstance(refused, Unavailable)
-    assert "changes of the vision position" in refused.reason
+    assert "position increments of external vision" in refused.reason
 
 
 def test_difference_steps_of_gnss_flight_include_vision_step() -> None:
-    found = steps.explain_by_steps(model())
+    found = steps.explain_difference_by_replacements(model())
     for why in found.values():
         names = [step.name for step in why.steps]
         assert (
-            names.index(steps.GNSS_VELOCITY_STEP)
-            < names.index(steps.VISION_STEP)
-            < names.index(steps.REJECTION_STEP)
+            names.index(steps.GNSS_VELOCITY_PROPERTY)
+            < names.index(steps.VISION_PROPERTY)
+            < names.index(steps.REJECTION_PROPERTY)
         )
         assert why.unexplained_fraction < 0.05
         moved_m = {step.name: step.position_moved_m for step in why.steps}
-        assert min(moved_m[steps.GNSS_VELOCITY_STEP], moved_m[steps.VISION_STEP]) > 0.05
+        assert min(moved_m[steps.GNSS_VELOCITY_PROPERTY], moved_m[steps.VISION_PROPERTY]) > 0.05
     analysis = analyse_comparison(compare(flown(), Settings(0.27, 0.4)))
     # the noise of vision does not lead to a remedy for GNSS noise
     assert analysis.source.name == "vehicle_visual_odometry"

@@ -14,7 +14,7 @@ from cli_tools import run_checked
 from px4fuse.analysis import WhatIfAnalysis
 from px4fuse.diagnose import run_what_if
 from px4fuse.ekf2.model import prepare_ekf2_model
-from px4fuse.ekf2.whatif import Summary, what_if
+from px4fuse.ekf2.whatif import Ekf2Statistics, what_if
 from px4fuse.errors import MissingDataError, SettingsError
 from px4fuse.flight.model import Flight
 from px4fuse.report.whatif import (
@@ -160,7 +160,7 @@ class TestFlownFlights:
         (cured,) = found.whatif.whatif
         assert error(cured) < 0.7 * error(found.whatif.logged)
         with pytest.raises(
-            SettingsError, match="the largest delay parameter is the delay of the fusion horizon"
+            SettingsError, match="The largest EKF2 delay parameter sets the delay of"
         ):
             what_if(prepare_ekf2_model(found.flight), [{"EKF2_DELAY_MAX": 300.0}])
 
@@ -181,7 +181,7 @@ class TestFlownFlights:
             run_what_if(WhatIfRequest(log=str(shared_logs / f"{log}.ulg")))
 
 
-def error(summary: Summary) -> float:
+def error(summary: Ekf2Statistics) -> float:
     """Return the horizontal position RMSE against ground truth (m)."""
     parts = [axis.position_rmse_to_truth_m for axis in summary.axes.values()]
     assert all(isinstance(part, float) for part in parts)

@@ -15,10 +15,10 @@ from px4fuse.comparison.difference_steps import (
     find_corrected_noise_settings,
 )
 from px4fuse.ekf2.steps import (
-    MEASUREMENT_NOISE_STEP,
-    REPLACEMENT_STEPS,
-    SAMPLE_TIMES_STEP,
-    TIMESTAMPS_STEP,
+    MEASUREMENT_NOISE_PROPERTY,
+    REPLACED_PROPERTIES,
+    SAMPLE_TIMES_PROPERTY,
+    TIMESTAMPS_PROPERTY,
     DifferenceExplanation,
 )
 from px4fuse.filter.kalman import predict_state
@@ -48,7 +48,7 @@ def test_position_difference_on_report_page_is_kf_minus_ekf2(sample: Analysis) -
     assert explanation.position_mean_square_m2 == pytest.approx(np.mean(difference**2))
     v = speed - logged["velocity_m_s"].to_numpy()
     assert explanation.velocity_mean_square_m2_s2 == pytest.approx(np.mean(v**2))
-    assert np.mean(explanation.unexplained_m**2) == pytest.approx(
+    assert np.mean(explanation.unexplained_difference_m**2) == pytest.approx(
         explanation.unexplained_mean_square_m2
     )
 
@@ -56,17 +56,19 @@ def test_position_difference_on_report_page_is_kf_minus_ekf2(sample: Analysis) -
 def test_kf_setting_changes_difference_step_of_that_setting(sample: Analysis) -> None:
     plain = of(sample)
     zero = explain_again(sample, Settings(input="zero"))
-    assert zero.steps[0].name == SAMPLE_TIMES_STEP
+    assert zero.steps[0].name == SAMPLE_TIMES_PROPERTY
     assert zero.steps[0].position_mean_square_m2 > 10 * plain.steps[0].position_mean_square_m2
     assert "KF uses no acceleration (--input zero)" in " ".join(zero.sentences)
     small = explain_again(sample, Settings(sigma_z_m=0.02))
     assert (
-        next(step for step in small.steps if step.name == MEASUREMENT_NOISE_STEP).position_moved_m
+        next(
+            step for step in small.steps if step.name == MEASUREMENT_NOISE_PROPERTY
+        ).position_moved_m
         > 0.05
     )
-    assert MEASUREMENT_NOISE_STEP not in {step.name for step in plain.steps}  # equal settings
+    assert MEASUREMENT_NOISE_PROPERTY not in {step.name for step in plain.steps}  # equal settings
     late = explain_again(sample, Settings(clock_offset_s=-0.3))
-    assert TIMESTAMPS_STEP in late.sentences[0]
+    assert TIMESTAMPS_PROPERTY in late.sentences[0]
     assert "300 ms" in late.sentences[0]
     left = pytest.approx(plain.unexplained_mean_square_m2, rel=0.02)
     assert [o.unexplained_mean_square_m2 for o in (zero, small, late)] == [left] * 3
@@ -126,12 +128,12 @@ def test_kf_ekf2_difference_text_names_largest_contribution(sample, share, text)
     shares = [share, *[1e-3] * (len(explanation.steps) - 1)]
     steps = tuple(replace(one, position_mean_square_m2=of * whole)
                   for one, of in zip(explanation.steps, shares, strict=True))  # fmt: skip
-    reasons = {name: f"Reason of {name}" for name in REPLACEMENT_STEPS}
+    reasons = {name: f"Reason of {name}" for name in REPLACED_PROPERTIES}
     explained = add_cause_sentences(replace(explanation, steps=steps), "the aisle", reasons)
-    assert f"along the aisle: {first.name}." in explained.cause
+    assert f"along the aisle: {first.name}." in explained.cause_sentence
     assert text in explained.sentences[0]
-    assert explained.cause.endswith(f"Reason of {first.name}.")
-    assert explained.sentences[0].startswith(explained.cause)
+    assert explained.cause_sentence.endswith(f"Reason of {first.name}.")
+    assert explained.sentences[0].startswith(explained.cause_sentence)
     assert f" m (at {first.moved_at_s:.1f} s)" in explained.sentences[0]
 
 

@@ -21,7 +21,7 @@ from px4fuse.ekf2.filter_recursion import FilterConfiguration
 from px4fuse.ekf2.inputs import ReplayInputs
 from px4fuse.ekf2.model import Ekf2Model
 from px4fuse.ekf2.replay import Spans, is_inside_spans
-from px4fuse.ekf2.steps import DifferenceExplanation, Step, UnreplayedDifference
+from px4fuse.ekf2.steps import DifferenceExplanation, DifferenceOutsideReplay, PropertyReplacement
 from px4fuse.filter.kalman import Replay, predict_state, replay
 from px4fuse.filter.settings import Settings
 from px4fuse.filter.signals import AISLE
@@ -64,16 +64,19 @@ def explain_ekf2_difference(
     if not axis_results:
         reason = "EKF2 can be replayed for horizontal positions only"
         action = "Analyse a horizontal axis, too (for example --axis north)."
-        return {"down": Unavailable(steps.ANALYSIS_NAME, reason, action)}
+        return {"down": Unavailable(steps.DIFFERENCE_ANALYSIS_NAME, reason, action)}
     if isinstance(model, Unavailable):
-        return {name: structs.replace(model, what=steps.ANALYSIS_NAME) for name in axis_results}
+        return {
+            name: structs.replace(model, what=steps.DIFFERENCE_ANALYSIS_NAME)
+            for name in axis_results
+        }
     kf_settings = _make_comparable_settings(comparison, model.inputs, estimate_by_setting)
     changed_settings = replace(comparison.settings, **estimate_by_setting)
     kf_runs = {
         name: replay(axis.axis, changed_settings, fast=True) if estimate_by_setting else axis.replay
         for name, axis in axis_results.items()
     }
-    explanations = steps.explain_by_steps(model, kf_settings, kf_runs)
+    explanations = steps.explain_difference_by_replacements(model, kf_settings, kf_runs)
     if isinstance(explanations, Unavailable):
         return dict.fromkeys(axis_results, explanations)
     reasons = _describe_property_differences(
@@ -125,7 +128,7 @@ def list_explanation_configurations(
 ) -> list[FilterConfiguration]:
     """Return the EKF2 configurations that are replayed to explain the difference KF - EKF2."""
     return list(
-        steps.make_step_configurations(
+        steps.make_replacement_configurations(
             ekf2_inputs, _make_comparable_settings(comparison, ekf2_inputs, estimate_by_setting)
         ).values()
     )
@@ -135,13 +138,13 @@ def _make_comparable_settings(
     comparison: Comparison, ekf2_inputs: ReplayInputs, estimate_by_setting: Mapping[str, Any]
 ) -> Settings:
     settings = replace(comparison.settings, **estimate_by_setting)
-    is_same_source = comparison.source.name == ekf2_inputs.received.source
+    is_same_source = comparison.source.name == ekf2_inputs.received_positions.source
     return settings if is_same_source else replace(settings, clock_offset_s=0.0)
 
 
 def _compare_outside_replay(
     axis_result: AxisComparison, kf_run: Replay, spans_s: Spans
-) -> UnreplayedDifference | None:
+) -> DifferenceOutsideReplay | None:
     if not isinstance(axis_result.ekf2_state, pd.DataFrame):
         return None
     state_outside_replay = axis_result.ekf2_state[
@@ -155,7 +158,7 @@ def _compare_outside_replay(
     if not np.isfinite(difference_m).any():
         return None
     largest_index = int(np.nanargmax(difference_m))
-    return UnreplayedDifference(
+    return DifferenceOutsideReplay(
         float(difference_m[largest_index]), float(times_outside_replay_s[largest_index])
     )
 
@@ -176,8 +179,8 @@ def add_cause_sentences(
     """
     step_reasons = {
         **step_reasons,
-        steps.REJECTION_STEP: ". ".join(
-            [step_reasons[steps.REJECTION_STEP], *_describe_rejections(explanation)]
+        steps.REJECTION_PROPERTY: ". ".join(
+            [step_reasons[steps.REJECTION_PROPERTY], *_describe_rejections(explanation)]
         ),
     }
     largest_contribution, second_contribution, *_ = sorted(
@@ -220,10 +223,10 @@ def add_cause_sentences(
             f"positions of KF and EKF2 differ by up to {explanation.outside.maximum_m:.1f} m (at "
             f"{explanation.outside.at_s:.0f} s)."
         )
-    return structs.replace(explanation, sentences=tuple(sentences), cause=cause_text)
+    return structs.replace(explanation, sentences=tuple(sentences), cause_sentence=cause_text)
 
 
-def _describe_step_effect(step: Step, explanation: DifferenceExplanation) -> str:
+def _describe_step_effect(step: PropertyReplacement, explanation: DifferenceExplanation) -> str:
     explained_fraction = step.position_mean_square_m2 / explanation.position_mean_square_m2
     # The fractions of all properties add up to 1: with a fraction above 1, others are negative
     opposite_effect_text = (
@@ -261,9 +264,9 @@ def _describe_property_differences(
     )
     if kf_settings.input == "zero":
         prediction_text = "KF uses no acceleration (--input zero); EKF2 uses the IMU"
-    elif source.name != ekf2_inputs.received.source:
+    elif source.name != ekf2_inputs.received_positions.source:
         prediction_text = (
-            f"KF uses positions of {source.name}; EKF2 uses {ekf2_inputs.received.source}"
+            f"KF uses positions of {source.name}; EKF2 uses {ekf2_inputs.received_positions.source}"
         )
     position_age_ms = 1e3 * (source.assumed_delay_s - kf_settings.clock_offset_s)
     delay_text = (
@@ -286,32 +289,32 @@ def _describe_property_differences(
         "IMU" if acc_noise_as_sigma_a < kf_settings.sigma_a_m_s2 else "positions"
     )
     return {
-        steps.SAMPLE_TIMES_STEP: prediction_text,
-        steps.TIMESTAMPS_STEP: delay_text,
-        steps.MEASUREMENT_NOISE_STEP: (
+        steps.SAMPLE_TIMES_PROPERTY: prediction_text,
+        steps.TIMESTAMPS_PROPERTY: delay_text,
+        steps.MEASUREMENT_NOISE_PROPERTY: (
             f"EKF2 uses a measurement noise of {find_used_noise_m(model.inputs):.2g} m "
             f"({aid.noise}), KF uses {kf_settings.sigma_z_m:.2g} m"
         ),
-        steps.BIASES_STEP: "EKF2 estimates the accelerometer bias; KF does not",
-        steps.PROCESS_NOISE_STEP: (
+        steps.ACCELEROMETER_BIAS_PROPERTY: "EKF2 estimates the accelerometer bias; KF does not",
+        steps.PROCESS_NOISE_PROPERTY: (
             f"EKF2_ACC_NOISE {ekf2_parameters['EKF2_ACC_NOISE']:g} has the same effect as SIGMA_A "
             f"{acc_noise_as_sigma_a:.2g} m/s²; KF has SIGMA_A {kf_settings.sigma_a_m_s2:.2g} m/s². "
             f"EKF2 gives the {higher_weighted_input} more weight than KF"
         ),
-        steps.ATTITUDE_STEP: (
+        steps.ATTITUDE_PROPERTY: (
             "EKF2 corrects its attitude with the positions; KF uses EKF2's logged attitude"
         ),
-        steps.MAGNETOMETER_STEP: (
+        steps.MAGNETOMETER_PROPERTY: (
             "EKF2 estimates its heading with the magnetometer; KF uses EKF2's published heading"
         ),
-        steps.GNSS_VELOCITY_STEP: "EKF2 also fuses GNSS velocity; KF uses GNSS position only",
-        steps.FLOW_STEP: "EKF2 also fuses optical flow; KF uses positions only",
-        steps.VISION_STEP: "EKF2 fuses external vision and GNSS; KF uses one position source",
-        steps.REJECTION_STEP: (
+        steps.GNSS_VELOCITY_PROPERTY: "EKF2 also fuses GNSS velocity; KF uses GNSS position only",
+        steps.FLOW_PROPERTY: "EKF2 also fuses optical flow; KF uses positions only",
+        steps.VISION_PROPERTY: "EKF2 fuses external vision and GNSS; KF uses one position source",
+        steps.REJECTION_PROPERTY: (
             f"EKF2 rejects {100 * model.agreement.rejected_fraction_logged:.1f} % of the "
             "positions; KF has no innovation gate and uses all positions"
         ),
-        steps.OUTPUT_PREDICTOR_STEP: (
+        steps.OUTPUT_PREDICTOR_PROPERTY: (
             f"EKF2 fuses positions with a delay of {1e3 * ekf2_inputs.horizon_s:.0f} ms. EKF2's "
             f"output predictor (EKF2_TAU_POS {ekf2_parameters['EKF2_TAU_POS']:g} s) extrapolates "
             "to the present. KF has no delay"

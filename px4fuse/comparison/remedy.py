@@ -36,11 +36,11 @@ def estimate_gnss_delay_ms(model: Ekf2Model) -> tuple[float, float] | None:
     The delay minimises the NIS of GNSS in re-runs of EKF2 with several values of EKF2_GPS_DELAY.
     Return None if it does not differ significantly from the logged delay.
     """
-    received_positions = model.inputs.received
+    received_positions = model.inputs.received_positions
     if (
-        model.inputs.vision is None
+        model.inputs.vision_positions is None
         or received_positions.velocity_m_s is None
-        or received_positions.uses_sender_times
+        or received_positions.uses_sender_timestamps
     ):
         return None
     nis_sums = []
@@ -86,12 +86,17 @@ def estimate_ekf2_parameters(
     """
     changes: dict[str, float] = {}
     ekf2_inputs, min_vision_noise_m = model.inputs, 0.0
-    if ekf2_inputs.vision is not None and comparison.source.name == ekf2_inputs.vision.source:
+    if (
+        ekf2_inputs.vision_positions is not None
+        and comparison.source.name == ekf2_inputs.vision_positions.source
+    ):
         if (gnss_delay := estimate_gnss_delay_ms(model)) is not None:
             changes |= make_delay_change(ekf2_inputs, gnss_delay[0])
         # While EKF2 fuses GNSS, it increases the noise of vision at least to that of GNSS
         min_vision_noise_m = ekf2_inputs.settings[GNSS_POS.noise]
-        ekf2_inputs = replace(ekf2_inputs, aid=EV_POS, received=ekf2_inputs.vision)
+        ekf2_inputs = replace(
+            ekf2_inputs, aid=EV_POS, received_positions=ekf2_inputs.vision_positions
+        )
     if not is_source_fused(comparison, ekf2_inputs):
         return {}
     axis_tuning = find_first_tuning(tuning, HORIZONTAL, AISLE, "north", "east")
@@ -114,7 +119,7 @@ def estimate_ekf2_parameters(
 def is_source_fused(comparison: Comparison, ekf2_inputs: ReplayInputs) -> bool:
     """Return True if EKF2 fused the position source that KF uses."""
     source = comparison.source
-    return source.name == ekf2_inputs.received.source and source.alignment is None
+    return source.name == ekf2_inputs.received_positions.source and source.alignment is None
 
 
 def make_estimated_delay_change(
@@ -218,7 +223,7 @@ def make_delay_change(ekf2_inputs: ReplayInputs, delay_ms: float) -> dict[str, f
     """
     delay_name = ekf2_inputs.aid.delay
     parameter = PARAMETERS[delay_name]
-    if delay_ms > parameter.maximum or ekf2_inputs.received.uses_sender_times:
+    if delay_ms > parameter.maximum or ekf2_inputs.received_positions.uses_sender_timestamps:
         return {}
     changes = {delay_name: max(float(round(delay_ms)), parameter.minimum)}
     changes |= make_delay_max_change(ekf2_inputs.settings, changes[delay_name])
@@ -254,7 +259,7 @@ def find_used_noise_m(ekf2_inputs: ReplayInputs) -> float:
 
 
 def _compute_reported_noise_m(ekf2_inputs: ReplayInputs) -> float:
-    return float(np.sqrt(np.median(ekf2_inputs.received.variance_m2[:, :2])))
+    return float(np.sqrt(np.median(ekf2_inputs.received_positions.variance_m2[:, :2])))
 
 
 def make_height_noise_advice(

@@ -453,7 +453,7 @@ def _summarise_replay(
         },
         index=pd.Index(ekf2_updates["fused_at_s"].to_numpy()),
     )
-    published_track = project(ekf2_replay.published, axis, comparison.segment)
+    published_track = project(ekf2_replay.published_state, axis, comparison.segment)
     published_track = rows_inside(published_track, evaluated_spans_s)
     logged_state, track_compared_with_kf = axis_result.ekf2_state, published_track
     # Without a change, KF is compared with the logged EKF2 (as in the report), else with the replay

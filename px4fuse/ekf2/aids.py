@@ -31,23 +31,24 @@ AidVerdict = Literal[
 MIN_BIAS_TO_RMS_RATIO = 0.5
 # Minimum |mean innovation| / median √S of a biased aiding source
 MIN_BIAS_TO_SQRT_S_RATIO = 0.2
-# Length (s) of the windows in which normalised innovations ν/√S are averaged to detect a change
-CHANGE_WINDOW_S = 10.0
-# Minimum number of innovations in a window for a mean normalised innovation
-MIN_WINDOW_SAMPLES = 5
-# Minimum number of windows before a change of the mean normalised innovation
-MIN_WINDOWS_BEFORE_CHANGE = 2
-# Minimum change of the mean normalised innovation (√S) for a report
+# Length (s) of a window. The normalised innovations ν/√S are averaged in each window, to detect a
+# change of their mean
+INNOVATION_MEAN_WINDOW_S = 10.0
+# A window with fewer innovations is ignored
+MIN_INNOVATIONS_PER_WINDOW = 5
+# Minimum number of windows before a change of the mean innovation
+MIN_WINDOWS_BEFORE_MEAN_CHANGE = 2
+# A smaller change (√S) of the mean innovation is not significant
 MIN_MEAN_CHANGE_IN_SIGMA = 0.5
-# Minimum ratio of this change to the standard deviation of the window means before the change
-MIN_CHANGE_TO_SCATTER_RATIO = 6.0
+# Minimum ratio: change of the mean innovation / standard deviation of the window means before
+MIN_MEAN_CHANGE_TO_SCATTER_RATIO = 6.0
 # Maximum time (s) for which EKF2 fuses no sample of an enabled aiding source. After 7 s, EKF2
 # resets its state to the source (reset_timeout_max)
 MAX_TIME_WITHOUT_FUSION_S = 5.0
-# Maximum time without fusion in logging intervals: larger than the limit in s for a sparse log
-MAX_INTERVALS_WITHOUT_FUSION = 10.0
-# Maximum |√R / noise parameter - 1| if EKF2 computes R from this parameter
-NOISE_RELATIVE_TOLERANCE = 0.02
+# The same maximum time as a number of logging intervals. In a sparse log, this limit is longer
+MAX_LOG_INTERVALS_WITHOUT_FUSION = 10.0
+# EKF2 computes R from a noise parameter if √R differs from the parameter by at most this fraction
+MEASUREMENT_NOISE_RELATIVE_TOLERANCE = 0.02
 # Aiding sources are evaluated above this height (m): near the ground, rotor downwash disturbs the
 # barometer
 MIN_HEIGHT_M = 2.0
@@ -55,7 +56,7 @@ MIN_HEIGHT_M = 2.0
 HEIGHT_MEDIAN_FILTER_LENGTH = 11
 
 
-class AidAxis(Record, kw_only=True):
+class AidAxisStatistics(Record, kw_only=True):
     """Innovation statistics of one aiding source along one axis, in the unit of its measurements.
 
     Attributes
@@ -67,7 +68,7 @@ class AidAxis(Record, kw_only=True):
     rejected_fraction : float
         Fraction of samples outside the gate along this axis.
     change : (float, float) or None
-        Time (s) and size (√S) of the largest significant change of the mean innovation.
+        Largest significant change of the mean innovation: its time (s), and its size (√S).
     """
 
     samples: Count
@@ -124,7 +125,7 @@ class AidResult(Record, kw_only=True):
     noise: PositiveFloat | None = None
     noise_from: str
     verdict: AidVerdict
-    axes: dict[str, AidAxis]
+    axes: dict[str, AidAxisStatistics]
 
     @property
     def longest_gap_duration_s(self) -> float:
@@ -134,7 +135,8 @@ class AidResult(Record, kw_only=True):
     def is_faulty(self) -> bool:
         """True if the source is biased, overconfident, or enabled but not fused.
 
-        An underconfident source is not faulty: PX4's default noises are too large.
+        An underconfident source is not faulty. With PX4's default noises, which are too large, most
+        sources are underconfident.
         """
         return self.verdict in ("not_fused", "biased", "overconfident")
 
@@ -157,9 +159,11 @@ def find_flight_span(flight: Flight) -> Span | Unavailable:
             flight.barometer["down_m"].loc[start:end].rolling(HEIGHT_MEDIAN_FILTER_LENGTH).median()
         )
         height_m = (down_m.dropna().iloc[0] if down_m.notna().any() else 0.0) - down_m
-        flight_times_s = height_m.index[height_m > min(MIN_HEIGHT_M, height_m.max() / 2.0)]
-        if len(flight_times_s):
-            start, end = flight_times_s[[0, -1]].tolist()
+        times_above_min_height_s = height_m.index[
+            height_m > min(MIN_HEIGHT_M, height_m.max() / 2.0)
+        ]
+        if len(times_above_min_height_s):
+            start, end = times_above_min_height_s[[0, -1]].tolist()
     return start, end
 
 
@@ -188,15 +192,12 @@ def evaluate_aids(flight: Flight) -> dict[str, AidResult] | Unavailable:
 def _evaluate_aid(aid: Aid, aid_log: AidLog, start_s: float, end_s: float) -> AidResult:
     samples = aid_log.samples.loc[start_s:end_s]
     sample_times_s = samples.index.to_numpy()
-    gate = _find_effective_gate(aid, aid_log)
+    gate = _find_applied_gate(aid, aid_log)
 
     def select_axis_columns(name: str) -> Array:
         return samples[[f"{name}_{axis}" for axis in aid_log.axes]].to_numpy()
 
-    innovation, innovation_variance = (
-        select_axis_columns("innovation"),
-        select_axis_columns("variance"),
-    )
+    innovation, innovation_variance = map(select_axis_columns, ("innovation", "variance"))
     is_enabled = np.ones(len(samples), bool)
     enabled_fraction = None
     if aid_log.enabled is not None:
@@ -210,11 +211,13 @@ def _evaluate_aid(aid: Aid, aid_log: AidLog, start_s: float, end_s: float) -> Ai
     noise_sigma_median = None
     if is_fusion_logged:
         is_fused, is_rejected = samples[["fused", "rejected"]].to_numpy().T > 0.0
-        noise_sigma = select_axis_columns("noise")
+        noise_variance = select_axis_columns("noise")
         # If EKF2 resets its state to a sample, it logs innovation 0 and S = R for this sample
-        is_reset = ((innovation == 0.0) & np.isclose(innovation_variance, noise_sigma)).all(axis=1)
+        is_reset = ((innovation == 0.0) & np.isclose(innovation_variance, noise_variance)).all(
+            axis=1
+        )
         if is_fused.any():
-            noise_sigma_median = float(np.median(np.sqrt(noise_sigma[is_fused, 0])))
+            noise_sigma_median = float(np.median(np.sqrt(noise_variance[is_fused, 0])))
     else:
         is_rejected = np.max(innovation**2 / innovation_variance, axis=1, initial=0.0) > gate**2
         is_fused = ~is_rejected
@@ -230,7 +233,7 @@ def _evaluate_aid(aid: Aid, aid_log: AidLog, start_s: float, end_s: float) -> Ai
             gate,
         )
         if not isinstance(consistency, Unavailable):
-            axes[axis] = AidAxis(
+            axes[axis] = AidAxisStatistics(
                 samples=consistency.count,
                 innovation_mean=consistency.innovation_mean_m,
                 innovation_std=consistency.innovation_std_m,
@@ -260,7 +263,7 @@ def _evaluate_aid(aid: Aid, aid_log: AidLog, start_s: float, end_s: float) -> Ai
         resets=int(is_reset.sum()),
         gate=gate,
         noise=noise_sigma_median,
-        noise_from=_find_noise_parameter(aid, aid_log, noise_sigma_median),
+        noise_from=_find_noise_origin(aid, aid_log, noise_sigma_median),
         axes=axes,
         verdict=_classify_aid(
             axes, longest_gap_s, sample_times_s[is_fused & (not is_fusion_logged)]
@@ -271,51 +274,62 @@ def _evaluate_aid(aid: Aid, aid_log: AidLog, start_s: float, end_s: float) -> Ai
 
 
 def _find_largest_mean_change(time_s: Array, normalised_innovations: Array) -> Span | None:
-    """Return time (s) and size (√S) of the largest change of the mean; None if not significant.
+    """Return the largest significant change of the mean innovation: its time (s) and size (√S).
 
-    For each window of CHANGE_WINDOW_S: change = mean of the two windows after it - mean of all
-    windows before it. If the mean of the window itself has moved by more than a third of the
-    change, the change starts in the window, else after it.
+    Return None if no change is significant. Innovations are averaged in windows of
+    INNOVATION_MEAN_WINDOW_S. For each window, the mean of the next two windows is compared with the
+    mean of all earlier windows. The time of the change is the start of the first changed window.
     """
-    window_index = np.floor((time_s - time_s[0]) / CHANGE_WINDOW_S)
+    window_index = np.floor((time_s - time_s[0]) / INNOVATION_MEAN_WINDOW_S)
     windows = pd.Series(normalised_innovations).groupby(window_index).agg(["mean", "size"])
-    windows = windows[windows["size"] >= MIN_WINDOW_SAMPLES]
+    windows = windows[windows["size"] >= MIN_INNOVATIONS_PER_WINDOW]
     window_means = windows["mean"].to_numpy()
-    largest_change = None
+    largest_mean_change = None
     min_mean_change = MIN_MEAN_CHANGE_IN_SIGMA
-    for index in range(MIN_WINDOWS_BEFORE_CHANGE, len(window_means) - 2):
+    for index in range(MIN_WINDOWS_BEFORE_MEAN_CHANGE, len(window_means) - 2):
         mean_before_window = np.mean(window_means[:index])
         mean_change = float(np.mean(window_means[index + 1 : index + 3]) - mean_before_window)
         normalised_std = np.std(normalised_innovations[window_index < windows.index[index]])
         standard_error = normalised_std / math.sqrt(2.0 * windows["size"].iloc[:index].median())
-        mean_scatter = max(np.std(window_means[:index], ddof=1), standard_error)
-        if abs(mean_change) > max(min_mean_change, MIN_CHANGE_TO_SCATTER_RATIO * mean_scatter):
+        scatter_of_window_means = max(np.std(window_means[:index], ddof=1), standard_error)
+        if abs(mean_change) > max(
+            min_mean_change, MIN_MEAN_CHANGE_TO_SCATTER_RATIO * scatter_of_window_means
+        ):
             is_change_in_window = (
                 abs(window_means[index] - mean_before_window) > abs(mean_change) / 3.0
             )
-            first_changed_window = windows.index[index if is_change_in_window else index + 1]
-            largest_change = float(time_s[0] + CHANGE_WINDOW_S * first_changed_window), mean_change
+            first_changed_window_index = windows.index[index if is_change_in_window else index + 1]
+            largest_mean_change = (
+                float(time_s[0] + INNOVATION_MEAN_WINDOW_S * first_changed_window_index),
+                mean_change,
+            )
             min_mean_change = abs(mean_change)
-    return largest_change
+    return largest_mean_change
 
 
-def _compute_fraction(is_selected: BoolArray, is_counted: BoolArray) -> float:
-    return float((is_selected & is_counted).sum() / max(is_counted.sum(), 1))
+def _compute_fraction(is_in_numerator: BoolArray, is_in_denominator: BoolArray) -> float:
+    return float((is_in_numerator & is_in_denominator).sum() / max(is_in_denominator.sum(), 1))
 
 
-def _find_effective_gate(aid: Aid, aid_log: AidLog) -> float:
-    """Return EKF2's gate (√S) from logged test ratios ν²/(gate² S), or from its parameter."""
+def _find_applied_gate(aid: Aid, aid_log: AidLog) -> float:
+    """Return the gate (√S) that EKF2 applied.
+
+    The gate is computed from the logged test ratios ν²/(gate² S), or read from its parameter.
+    """
     axis = aid_log.axes[0]
     if f"ratio_{axis}" in aid_log.samples:
-        rows_with_ratio = aid_log.samples[aid_log.samples[f"ratio_{axis}"] > 0.0]
-        nis = rows_with_ratio[f"innovation_{axis}"] ** 2 / rows_with_ratio[f"variance_{axis}"]
-        if len(rows_with_ratio) and (nis > 0.0).any():
-            return float(np.sqrt(np.median(nis / rows_with_ratio[f"ratio_{axis}"])))
+        rows_with_test_ratio = aid_log.samples[aid_log.samples[f"ratio_{axis}"] > 0.0]
+        nis = (
+            rows_with_test_ratio[f"innovation_{axis}"] ** 2
+            / rows_with_test_ratio[f"variance_{axis}"]
+        )
+        if len(rows_with_test_ratio) and (nis > 0.0).any():
+            return float(np.sqrt(np.median(nis / rows_with_test_ratio[f"ratio_{axis}"])))
     return max(aid_log.parameters.get(aid.gate, aid.default_gate), 0.01)
 
 
-def _find_noise_parameter(aid: Aid, aid_log: AidLog, noise_sigma: float | None) -> str:
-    """Return the parameter that determines R, or another origin, such as "reported accuracy"."""
+def _find_noise_origin(aid: Aid, aid_log: AidLog, noise_sigma: float | None) -> str:
+    """Return the origin of R: the name of a parameter, or a text such as "reported accuracy"."""
     parameter_value = aid_log.parameters.get(aid.noise)
     if noise_sigma is None or parameter_value is None:
         return "" if noise_sigma is None else aid.noise_source_text
@@ -324,7 +338,10 @@ def _find_noise_parameter(aid: Aid, aid_log: AidLog, noise_sigma: float | None) 
         GNSS_HEIGHT_NOISE_FACTOR * parameter_value,
         np.sqrt(parameter_value),
     ):
-        if abs(noise_sigma - expected_noise) <= NOISE_RELATIVE_TOLERANCE * expected_noise:
+        if (
+            abs(noise_sigma - expected_noise)
+            <= MEASUREMENT_NOISE_RELATIVE_TOLERANCE * expected_noise
+        ):
             return aid.noise
     return aid.noise_source_text or aid.noise
 
@@ -335,27 +352,27 @@ def _find_longest_gap(
     is_inside = (aid_log.times_with_unknown_fusion_s > start_s) & (
         aid_log.times_with_unknown_fusion_s < end_s
     )
-    gap_ends_s = np.union1d(
+    gap_limits_s = np.union1d(
         np.r_[start_s, sample_times_s[is_fused], end_s],
         aid_log.times_with_unknown_fusion_s[is_inside],
     )
-    gap_starts_s = gap_ends_s[:-1]
+    gap_starts_s = gap_limits_s[:-1]
     is_enabled = np.ones(len(gap_starts_s), bool)
     if aid_log.enabled is not None:
         # EKF2 disables an aiding source up to 1 s after the last fused sample
         is_enabled = sample_step_function(aid_log.enabled, pd.Index(gap_starts_s + 1.0)) > 0.0
-    longest_index = int(np.argmax(np.diff(gap_ends_s) * is_enabled))
+    longest_index = int(np.argmax(np.diff(gap_limits_s) * is_enabled))
     if not is_enabled[longest_index]:
         return start_s, start_s
-    return float(gap_ends_s[longest_index]), float(gap_ends_s[longest_index + 1])
+    return float(gap_limits_s[longest_index]), float(gap_limits_s[longest_index + 1])
 
 
 def _classify_aid(
-    axes: dict[str, AidAxis], longest_gap_s: Span, fusion_times_s: Array
+    axes: dict[str, AidAxisStatistics], longest_gap_s: Span, fusion_times_s: Array
 ) -> AidVerdict:
     interval_s = compute_median_interval_s(fusion_times_s) if len(fusion_times_s) > 1 else 0.0
     if longest_gap_s[1] - longest_gap_s[0] > max(
-        MAX_TIME_WITHOUT_FUSION_S, MAX_INTERVALS_WITHOUT_FUSION * interval_s
+        MAX_TIME_WITHOUT_FUSION_S, MAX_LOG_INTERVALS_WITHOUT_FUSION * interval_s
     ):
         return "not_fused"
     if not axes:
@@ -371,5 +388,5 @@ def _classify_aid(
     )
 
 
-def _compute_mean_nis(axes: Mapping[str, AidAxis]) -> float:
+def _compute_mean_nis(axes: Mapping[str, AidAxisStatistics]) -> float:
     return float(np.mean([axis.nis_mean for axis in axes.values()] or [np.nan]))

@@ -14,11 +14,12 @@ import numpy as np
 from px4fuse.core.arrays import Array, BoolArray
 from px4fuse.ekf2.replay_segments import ReplaySegment
 
-# EKF2 flags a bad vertical acceleration if the normalised height innovations of barometer and GNSS
-# are large: minimum of the larger one (vert_innov_test_lim, common.h)
-MIN_LARGER_HEIGHT_INNOVATION = 3.0
-# Minimum of the smaller normalised height innovation for the same flag (vert_innov_test_min)
-MIN_SMALLER_HEIGHT_INNOVATION = 1.0
+# EKF2 flags a bad vertical acceleration only if the normalised height innovation of barometer or
+# GNSS exceeds this value (vert_innov_test_lim, common.h)
+MIN_HEIGHT_INNOVATION_OF_ONE_SENSOR = 3.0
+# EKF2 flags a bad vertical acceleration only if the normalised height innovations of barometer and
+# GNSS both exceed this value (vert_innov_test_min)
+MIN_HEIGHT_INNOVATION_OF_BOTH_SENSORS = 1.0
 
 
 class BadAccelerationFlag:
@@ -60,18 +61,21 @@ class BadAccelerationFlag:
             len(uses_logged_flag), time_s[0] + flag_duration_s * float(logged_flag[0])
         )
 
-    def compute_flagged_fraction(self, begin_s: Array, end_s: Array) -> Array | None:
-        """Return the fraction of an interval in which the flag is set, for each configuration.
+    def compute_bad_acceleration_fraction(self, begin_s: Array, end_s: Array) -> Array | None:
+        """Return the fraction of an interval with a bad acceleration, for each configuration.
 
-        Return None if the flag is not set for any configuration. Call the method for the
-        intervals in time order: it remembers the latest time span with the flag. If the flag is set
-        several times in one interval, only the last span counts.
+        Return None if no configuration has a bad acceleration in the interval. Intervals must be
+        given in time order. Only the last time span with the flag in an interval is counted.
         """
         if len(self.logged_since_s):
             last_row = np.searchsorted(self.logged_since_s, end_s) - 1
-            uses_logged_span = self.uses_logged_flag & (last_row >= 0)
-            self.since_s = np.where(uses_logged_span, self.logged_since_s[last_row], self.since_s)
-            self.until_s = np.where(uses_logged_span, self.logged_until_s[last_row], self.until_s)
+            uses_logged_flag_span = self.uses_logged_flag & (last_row >= 0)
+            self.since_s = np.where(
+                uses_logged_flag_span, self.logged_since_s[last_row], self.since_s
+            )
+            self.until_s = np.where(
+                uses_logged_flag_span, self.logged_until_s[last_row], self.until_s
+            )
         if not (self.until_s > begin_s).any():
             return None
         overlap_s = np.minimum(self.until_s, end_s) - np.maximum(self.since_s, begin_s)
@@ -90,28 +94,34 @@ class BadAccelerationFlag:
         """
         # EKF2's test uses the latest innovation of each height sensor, so each innovation is kept
         # until the next sample of the sensor
-        gnss_innovation = previous_innovations[-1]
-        barometer_innovation = np.full(len(gnss_innovation), np.nan)
+        gnss_height_innovation = previous_innovations[-1]
+        barometer_height_innovation = np.full(len(gnss_height_innovation), np.nan)
         for sample_innovation in previous_innovations[:-1]:
-            barometer_innovation = np.where(
-                np.isnan(sample_innovation), barometer_innovation, sample_innovation
+            barometer_height_innovation = np.where(
+                np.isnan(sample_innovation), barometer_height_innovation, sample_innovation
             )
-        is_acceleration_bad = _indicates_falling(barometer_innovation, gnss_innovation)
+        is_acceleration_bad = _indicates_falling(
+            barometer_height_innovation, gnss_height_innovation
+        )
         for sample_innovation in innovations[:-1]:
-            barometer_innovation = np.where(
-                np.isnan(sample_innovation), barometer_innovation, sample_innovation
+            barometer_height_innovation = np.where(
+                np.isnan(sample_innovation), barometer_height_innovation, sample_innovation
             )
-            is_acceleration_bad |= _indicates_falling(barometer_innovation, gnss_innovation)
-        is_acceleration_bad |= _indicates_falling(barometer_innovation, innovations[-1])
+            is_acceleration_bad |= _indicates_falling(
+                barometer_height_innovation, gnss_height_innovation
+            )
+        is_acceleration_bad |= _indicates_falling(barometer_height_innovation, innovations[-1])
         is_acceleration_bad &= ~self.uses_logged_flag
         self.since_s = np.where(is_acceleration_bad & (self.until_s < time_s), time_s, self.since_s)
         self.until_s = np.where(is_acceleration_bad, time_s + self.flag_duration_s, self.until_s)
 
 
-def _indicates_falling(barometer_innovation: Array, gnss_innovation: Array) -> BoolArray:
-    larger_innovation = np.maximum(barometer_innovation, gnss_innovation)
-    smaller_innovation = np.minimum(barometer_innovation, gnss_innovation)
+def _indicates_falling(
+    barometer_height_innovation: Array, gnss_height_innovation: Array
+) -> BoolArray:
+    larger_innovation = np.maximum(barometer_height_innovation, gnss_height_innovation)
+    smaller_innovation = np.minimum(barometer_height_innovation, gnss_height_innovation)
     return np.asarray(
-        (larger_innovation > MIN_LARGER_HEIGHT_INNOVATION)
-        & (smaller_innovation > MIN_SMALLER_HEIGHT_INNOVATION)
+        (larger_innovation > MIN_HEIGHT_INNOVATION_OF_ONE_SENSOR)
+        & (smaller_innovation > MIN_HEIGHT_INNOVATION_OF_BOTH_SENSORS)
     )

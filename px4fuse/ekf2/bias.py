@@ -10,26 +10,30 @@ import numpy as np
 
 from px4fuse.core.arrays import Array, BoolArray
 
-# Noise density (m/s/√Hz) of the random walk of a height or vision bias (bias_nsd, common.h)
-SENSOR_BIAS_NOISE_DENSITY = 0.13
+# Noise density (m/√s) of the random walk of a height or vision bias (bias_nsd, common.h)
+POSITION_BIAS_NOISE_M_PER_SQRT_S = 0.13
 # Minimum variance (m²) of the estimated height or vision bias
-MIN_BIAS_VARIANCE_M2 = 1e-8
+MIN_POSITION_BIAS_VARIANCE_M2 = 1e-8
 # EKF2 updates the height or vision bias only with innovations inside this gate (√S)
-BIAS_GATE = 3.0
+POSITION_BIAS_GATE = 3.0
 # EKF2 considers the bias wrong if |mean of (test ratio · sign of innovation)| exceeds this value
 # (isOffsetDetected, bias_estimator.cpp)
-MAX_MEAN_SIGNED_TEST_RATIO = 0.2
+MAX_MEAN_TEST_RATIO_OF_VALID_BIAS = 0.2
 # Factor by which EKF2 multiplies the random walk variance of a bias that it considers wrong
-WRONG_BIAS_VARIANCE_FACTOR = 1e3
+VARIANCE_FACTOR_FOR_WRONG_BIAS = 1e3
 # Time constant (s) of the low-pass filter of (test ratio · sign of innovation)
 TEST_RATIO_TIME_CONSTANT_S = 10.0
 
 
 class BiasEstimator:
-    """Estimated bias of one sensor, for several filter configurations at once.
+    """Kalman filter for the bias of one position or height sensor, for several EKF2 configurations.
 
-    ``bias_m`` (state minus measurement) is added to innovations. ``bias_m`` and ``variance_m2``
-    have the shape (filters,) or (filters, axes). ``steps_s``: lengths of EKF2's prediction steps.
+    Parameters
+    ----------
+    bias_m, variance_m2 : ndarray, shape (filters,) or (filters, axes)
+        Initial bias (state minus measurement), which is added to innovations, and its variance.
+    steps_s : ndarray
+        Lengths of EKF2's prediction steps.
     """
 
     def __init__(self, bias_m: Array, variance_m2: Array, steps_s: Array) -> None:
@@ -37,47 +41,50 @@ class BiasEstimator:
         self.bias_m = bias_m
         self.variance_m2 = variance_m2
         self.mean_signed_test_ratio = np.zeros_like(bias_m)
-        self.filter_weight = step_s / (TEST_RATIO_TIME_CONSTANT_S + step_s)
+        self.test_ratio_filter_weight = step_s / (TEST_RATIO_TIME_CONSTANT_S + step_s)
 
-    def remove_bias(
+    def remove_and_update_bias(
         self,
-        nu: Array,
+        innovation_m: Array,
         predicted_variance: Array,
         R_m2: Array,
         interval_s: Array,
-        updates_bias: BoolArray,
-        weight: Array | float = 1.0,
+        is_bias_updated: BoolArray,
+        represented_sample_count: Array | float = 1.0,
     ) -> tuple[Array, Array]:
-        """Correct innovation and R of a sample with the bias, then update the bias.
+        """Return innovation and R of a sample, corrected for the bias, and update the bias.
 
         Parameters
         ----------
-        nu, predicted_variance, R_m2 : ndarray
-            Uncorrected innovation (m), HPH' and R (m²).
+        innovation_m, predicted_variance, R_m2 : ndarray
+            Uncorrected innovation, HPH' and R.
         interval_s : ndarray
-            Time (s) since the previous sample; 0 if the bias is not updated.
-        updates_bias : ndarray of bool
-        weight : float or ndarray, shape (filters,)
-            Number of samples fused by EKF2 that this sample represents.
+            Time since the previous sample; 0 if the bias is not updated.
+        is_bias_updated : ndarray of bool
+        represented_sample_count : float or ndarray, shape (filters,)
+            Number of samples that EKF2 fused in place of this sample.
         """
-        has_offset = np.abs(self.mean_signed_test_ratio) > MAX_MEAN_SIGNED_TEST_RATIO
-        variance_rate = np.where(
-            has_offset,
-            WRONG_BIAS_VARIANCE_FACTOR * SENSOR_BIAS_NOISE_DENSITY**2,
-            SENSOR_BIAS_NOISE_DENSITY**2,
+        is_bias_wrong = np.abs(self.mean_signed_test_ratio) > MAX_MEAN_TEST_RATIO_OF_VALID_BIAS
+        bias_noise_m2_per_s = np.where(
+            is_bias_wrong,
+            VARIANCE_FACTOR_FOR_WRONG_BIAS * POSITION_BIAS_NOISE_M_PER_SQRT_S**2,
+            POSITION_BIAS_NOISE_M_PER_SQRT_S**2,
         )
-        bias_variance = np.minimum(self.variance_m2 + variance_rate * interval_s, R_m2)
-        nu = nu + self.bias_m
+        bias_variance = np.minimum(self.variance_m2 + bias_noise_m2_per_s * interval_s, R_m2)
+        innovation_m = innovation_m + self.bias_m
         R = R_m2 + bias_variance
-        S = bias_variance + (R_m2 + predicted_variance) / weight
-        test_ratio = nu * nu / (BIAS_GATE**2 * S)
-        K = bias_variance / S * (updates_bias & (test_ratio < 1.0))
-        self.bias_m = self.bias_m - K * nu
-        self.variance_m2 = np.maximum(bias_variance - K * bias_variance, MIN_BIAS_VARIANCE_M2)
-        signed_ratio_sum = (
-            np.copysign(np.minimum(test_ratio, 1.0), nu) + self.mean_signed_test_ratio
+        S = bias_variance + (R_m2 + predicted_variance) / represented_sample_count
+        test_ratio = innovation_m * innovation_m / (POSITION_BIAS_GATE**2 * S)
+        K = bias_variance / S * (is_bias_updated & (test_ratio < 1.0))
+        self.bias_m = self.bias_m - K * innovation_m
+        self.variance_m2 = np.maximum(
+            bias_variance - K * bias_variance, MIN_POSITION_BIAS_VARIANCE_M2
         )
-        self.mean_signed_test_ratio = self.mean_signed_test_ratio - (
-            self.filter_weight * weight * updates_bias * signed_ratio_sum
+        signed_test_ratio = np.copysign(np.minimum(test_ratio, 1.0), -innovation_m)
+        self.mean_signed_test_ratio = self.mean_signed_test_ratio + (
+            self.test_ratio_filter_weight
+            * represented_sample_count
+            * is_bias_updated
+            * (signed_test_ratio - self.mean_signed_test_ratio)
         )
-        return nu, R
+        return innovation_m, R

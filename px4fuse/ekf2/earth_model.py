@@ -25,8 +25,11 @@ def compute_earth_rate_rad_s(fusion_record: FusionRecord) -> Array:
     )
 
 
-def compute_position_scale(fusion_record: FusionRecord) -> tuple[float, float, float]:
-    """Return the ratio of EKF2's internal to its published position along north, east and down."""
+def compute_internal_to_published_ratio(fusion_record: FusionRecord) -> tuple[float, float, float]:
+    """Return the ratio of EKF2's internal to its published position along north, east and down.
+
+    The ratio is not 1 because EKF2 computes on an ellipsoid, but publishes positions on a sphere.
+    """
     if np.isnan(fusion_record.latitude_deg) or not fusion_record.stores_latitude():
         return 1.0, 1.0, 1.0
     eccentricity_squared = ECCENTRICITY**2
@@ -36,5 +39,5 @@ def compute_position_scale(fusion_record: FusionRecord) -> tuple[float, float, f
         EQUATORIAL_RADIUS_M * np.array([(1.0 - eccentricity_squared) / q**2.5, q**-0.5])
         + fusion_record.altitude_m
     )
-    north_radius_ratio, east_radius_ratio = (radii_m / EARTH_RADIUS_M).tolist()
-    return north_radius_ratio, east_radius_ratio, 1.0
+    north_to_sphere_radius_ratio, east_to_sphere_radius_ratio = (radii_m / EARTH_RADIUS_M).tolist()
+    return north_to_sphere_radius_ratio, east_to_sphere_radius_ratio, 1.0

@@ -1,6 +1,7 @@
-"""Recursion of the EKF2 model: several filter configurations run through one flight segment.
+"""Main loop of the EKF2 model: predict and fuse in one flight segment.
 
-The segment is divided into intervals. At the end of an interval (an "event"), the filter fuses a
+Several filter configurations (parameters, states, aiding sources) are computed at once. The segment
+is divided into intervals. The end of an interval is called an event. At an event, the model fuses a
 position or, in a gap of the position source, only height and heading.
 
 Symbols: x, P: state and covariance; R: measurement noise; S: innovation variance.
@@ -12,6 +13,7 @@ and ``EKF/vel_pos_fusion.cpp`` (gate, fusion), ``ev_pos_control.cpp`` (noise, re
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
+from operator import attrgetter
 from typing import Any
 
 import numpy as np
@@ -23,7 +25,7 @@ from px4fuse.ekf2.heights import (
     GNSS_HEIGHT_NOISE_FACTOR,
     HEIGHT_SENSORS,
     MIN_INNOVATION_GATE,
-    MIN_NOISE_SIGMA,
+    MIN_MEASUREMENT_NOISE_SIGMA,
     HeightFilter,
     group_barometer_by_event,
 )
@@ -35,21 +37,21 @@ from px4fuse.ekf2.intervals import (
     EventIntervals,
     FusionDelays,
     StepEvents,
-    make_intervals,
+    make_event_intervals,
 )
 from px4fuse.ekf2.magnetometer import (
     MIN_MAGNETOMETER_SIGMA_GAUSS,
     EventSamples,
     average_by_event,
-    fuse_mean,
+    fuse_mean_sample,
 )
 from px4fuse.ekf2.replay_segments import (
     ACCELEROMETER_BIAS,
     BIASES,
-    EARTH_FIELD,
+    EARTH_MAGNETIC_FIELD,
     GRAVITY_M_S2,
     GYRO_BIAS,
-    IMU_STATE_COUNT,
+    MOTION_STATE_COUNT,
     STATE_COUNT,
     THETA,
     VELOCITY,
@@ -68,7 +70,7 @@ VARIANCE_WITHOUT_EFFECT = 1e9
 # common.h; covariance.cpp)
 BAD_ACCELERATION_NOISE_M_S2 = 4.9
 # EKF2 parameters with these prefixes do not change the vertical innovations
-HEIGHT_NEUTRAL_PREFIXES = (
+PARAMETER_PREFIXES_WITHOUT_HEIGHT_EFFECT = (
     "EKF2_EV",
     "EKF2_MAG",
     "EKF2_OF",
@@ -80,27 +82,28 @@ HEIGHT_NEUTRAL_PREFIXES = (
 INITIAL_BIAS_SIGMA_M_S2 = 0.01
 # Factors on the GNSS velocity variance, NED: EKF2 multiplies the vertical σ by 1.5
 # (gps_control.cpp)
-VELOCITY_VARIANCE_FACTORS = np.array([1.0, 1.0, 2.25])
+GNSS_VELOCITY_VARIANCE_FACTORS = np.array([1.0, 1.0, 2.25])
 GRAVITY_MAGNITUDE_M_S2 = float(GRAVITY_M_S2[2])
 # Maximum σ (m/s²) of EKF2's accelerometer bias: 0.1 g (covariance.cpp)
 MAX_BIAS_SIGMA_M_S2 = 0.1 * GRAVITY_MAGNITUDE_M_S2
-# Minimum accelerometer bias variance of an axis / largest variance of the three axes
+# Minimum ratio: accelerometer bias variance of an axis / largest variance of the three axes
 # (covariance.cpp)
-MIN_BIAS_VARIANCE_RATIO = 0.01
+MIN_RATIO_TO_LARGEST_BIAS_VARIANCE = 0.01
 # State indices of heading error and position
 HEADING, POSITION_NORTH, POSITION_EAST, POSITION_DOWN = 2, 6, 7, 8
 # State indices of the accelerometer bias, rotated to NED
 ACCELEROMETER_BIAS_NORTH, ACCELEROMETER_BIAS_EAST, ACCELEROMETER_BIAS_DOWN = 12, 13, 14
-# State indices of the measurements that are fused together, in this order
-JOINTLY_MEASURED_STATES = np.array([HEADING, POSITION_DOWN, POSITION_NORTH, POSITION_EAST])
+# States whose measurements are fused in one joint update, in the order of the measurements
+STATES_FUSED_IN_ONE_UPDATE = np.array([HEADING, POSITION_DOWN, POSITION_NORTH, POSITION_EAST])
 # State indices of heading error and height (a slice, which does not copy the states)
 HEADING_AND_DOWN = slice(HEADING, POSITION_DOWN + 1, POSITION_DOWN - HEADING)
 HORIZONTAL_POSITION = slice(POSITION_NORTH, POSITION_EAST + 1)
-# State indices of velocity and position, which a GNSS sample measures
-MEASURED_STATES = slice(3, 9)
-# Columns of velocity, vertical velocity and horizontal position within MEASURED_STATES
+# State indices of velocity and position
+VELOCITY_AND_POSITION = slice(3, 9)
+# Columns of velocity, vertical velocity and horizontal position in measurements of velocity and
+# position (six columns, NED)
 VELOCITY_COLUMNS, DOWN_COLUMN = slice(0, 3), 2
-POSITION_COLUMNS = slice(3, 5)
+HORIZONTAL_POSITION_COLUMNS = slice(3, 5)
 
 
 @dataclass(frozen=True)
@@ -123,10 +126,10 @@ class FilterConfiguration:
         False to fuse every sample.
     uses_logged_decisions : bool
         True to use EKF2's logged rejections and resets instead of the gate.
-    without : mapping from PX4's name of an aiding source to float
+    disable_time_s_by_aid : mapping from PX4's name of an aiding source to float
         Time (s) from which the source is not fused.
     timestamp_offset_s : float or None
-        Time (s) to add to the timestamps of positions instead of EKF2's delay parameter.
+        Time (s) that is added to the timestamps of positions. EKF2's delay parameter is ignored.
     """
 
     settings: dict[str, float]
@@ -136,16 +139,20 @@ class FilterConfiguration:
     uses_reported_noise: bool = True
     has_gate: bool = True
     uses_logged_decisions: bool = False
-    without: Mapping[str, float] = field(default_factory=dict)
+    disable_time_s_by_aid: Mapping[str, float] = field(default_factory=dict)
     timestamp_offset_s: float | None = None
 
-    def keeps_logged_bad_acceleration(self, inputs: ReplayInputs) -> bool:
-        """Return True if EKF2's logged bad-acceleration flag is valid for the configuration."""
-        has_same_height_parameters = not self.without and all(
-            value == inputs.settings[name] or name.startswith(HEIGHT_NEUTRAL_PREFIXES)
+    def can_use_logged_bad_acceleration_flag(self, inputs: ReplayInputs) -> bool:
+        """Return True if the configuration can use EKF2's logged bad-acceleration flag.
+
+        The flag depends on the height innovations, and therefore on the height parameters.
+        """
+        has_logged_height_parameters = not self.disable_time_s_by_aid and all(
+            value == inputs.settings[name]
+            or name.startswith(PARAMETER_PREFIXES_WITHOUT_HEIGHT_EFFECT)
             for name, value in self.settings.items()
         )
-        return self.uses_logged_decisions or has_same_height_parameters
+        return self.uses_logged_decisions or has_logged_height_parameters
 
     def compute_delays(self, inputs: ReplayInputs) -> FusionDelays:
         """Return the delay of the position source, and the delay of the fusion horizon."""
@@ -153,7 +160,7 @@ class FilterConfiguration:
             return FusionDelays(-self.timestamp_offset_s - 0.5 * inputs.mean_step_s, np.inf)
         delay_s = self.settings[inputs.aid.delay] * 1e-3
         max_delay_ms = max(self.settings.get(aid.delay, 0.0) for aid in (GNSS_POS, EV_POS))
-        if inputs.rules.uses_delay_as_horizon:  # IMU buffer length = largest delay parameter
+        if inputs.rules.is_horizon_largest_delay:  # IMU buffer length = largest delay parameter
             buffer_length = math.ceil(max_delay_ms * 1e-3 / inputs.configured_step_s)
             return FusionDelays(
                 delay_s, max(inputs.horizon_s, (buffer_length - 1) * inputs.mean_step_s)
@@ -218,9 +225,9 @@ def run_segment(  # noqa: PLR0912, PLR0915 (one recursion, read from top to bott
     configurations: Sequence[FilterConfiguration],
     intervals: Sequence[EventIntervals],
 ) -> SegmentRun:
-    """Run several filter configurations through one flight segment.
+    """Return states and innovations of several filter configurations in one flight segment.
 
-    ``intervals`` contains, for each configuration, the intervals between events.
+    ``intervals`` contains one item per configuration: the intervals between its fusions.
     """
     configuration_count = len(configurations)
     event_count = len(intervals[0].events)
@@ -228,52 +235,53 @@ def run_segment(  # noqa: PLR0912, PLR0915 (one recursion, read from top to bott
         name: np.array([configuration.settings[name] for configuration in configurations])
         for name in configurations[0].settings
     }
-    # Changes in flight apply where the configuration has the logged value
+    # A parameter change in flight is applied only to configurations with the logged parameter value
     for name, value in segment.changed_parameters.items():
         is_unchanged = parameters[name] == inputs.settings[name]
         parameters[name] = np.where(is_unchanged, value, parameters[name])
     (
-        has_biases,
-        has_attitude,
+        estimates_biases,
+        estimates_attitude,
         has_gate,
         uses_logged_decisions,
         uses_reported_noise,
         fuses_velocity,
     ) = np.array(
         [
-            (
-                configuration.estimates_biases,
-                configuration.estimates_attitude,
-                configuration.has_gate,
-                configuration.uses_logged_decisions,
-                configuration.uses_reported_noise,
-                configuration.fuses_velocity,
-            )
+            attrgetter(
+                "estimates_biases",
+                "estimates_attitude",
+                "has_gate",
+                "uses_logged_decisions",
+                "uses_reported_noise",
+                "fuses_velocity",
+            )(configuration)
             for configuration in configurations
         ]
     ).T
-    distinct_intervals = list(dict.fromkeys(intervals))
-    interval_index_by_filter = (
-        list(map(distinct_intervals.index, intervals))
-        if len(distinct_intervals) > 1
-        else slice(None)
+    interval_sets = list(dict.fromkeys(intervals))
+    interval_set_index_by_configuration = (
+        list(map(interval_sets.index, intervals)) if len(interval_sets) > 1 else slice(None)
     )
 
-    def stack_configurations(interval_set_arrays: Sequence[Any]) -> Any:
-        return np.stack(interval_set_arrays, axis=1)[:, interval_index_by_filter]
+    def select_by_configuration(arrays_by_interval_set: Sequence[Any]) -> Any:
+        return np.stack(arrays_by_interval_set, axis=1)[:, interval_set_index_by_configuration]
 
-    event_table = stack_configurations(
-        [interval_arrays.events for interval_arrays in distinct_intervals]
+    event_table = select_by_configuration(
+        [interval_arrays.events for interval_arrays in interval_sets]
     )
     action = np.where(has_gate, event_table["action"], FUSE * event_table["usable"])
     event_steps = event_table["end_step"]
-    is_active = action > NO_ACTION
+    has_action = action > NO_ACTION
     event_time_s = segment.time_s[event_steps]
-    has_sample = np.any(is_active, axis=1).tolist()
+    has_sample = np.any(has_action, axis=1).tolist()
     is_enabled_by_aid = {
         aid.name: event_time_s
         < np.array(
-            [configuration.without.get(aid.name, np.inf) for configuration in configurations]
+            [
+                configuration.disable_time_s_by_aid.get(aid.name, np.inf)
+                for configuration in configurations
+            ]
         )
         for aid in (inputs.aid, GNSS_VEL, MAG, FLOW, EV_POS, *HEIGHT_SENSORS)
     }
@@ -282,7 +290,7 @@ def run_segment(  # noqa: PLR0912, PLR0915 (one recursion, read from top to bott
     measured_values, measurement_variance = _collect_measurements(
         inputs, segment, sample_indices, event_steps, parameters, uses_reported_noise
     )
-    has_velocity = inputs.received.velocity_m_s is not None
+    has_velocity = inputs.received_positions.velocity_m_s is not None
     gates = [
         parameters.get(GNSS_VEL.gate, np.ones(configuration_count)),
         parameters[inputs.aid.gate],
@@ -290,8 +298,8 @@ def run_segment(  # noqa: PLR0912, PLR0915 (one recursion, read from top to bott
     gate_squared = (
         np.maximum(np.repeat(np.stack(gates, axis=1), 3, axis=1), MIN_INNOVATION_GATE) ** 2
     )
-    # EKF2's logged height and heading replace height sensors and magnetometer if the replay does
-    # not contain them
+    # If the replay contains no height sensor or no magnetometer, it fuses EKF2's logged height or
+    # heading
     logged_heading_and_down = np.stack(
         [segment.attitude_error_rad[event_steps, HEADING], segment.down_m[event_steps]], axis=-1
     )
@@ -300,46 +308,53 @@ def run_segment(  # noqa: PLR0912, PLR0915 (one recursion, read from top to bott
         [attitude_variance[:, :, HEADING], segment.down_variance_m2[event_steps]], axis=-1
     )
     height_filter = vision_filter = None
-    has_magnetometer = segment.field is not None
-    event_step_arrays = [interval_arrays.events.end_step for interval_arrays in distinct_intervals]
+    has_magnetometer = segment.magnetic_field is not None
+    event_steps_by_interval_set = [
+        interval_arrays.events.end_step for interval_arrays in interval_sets
+    ]
     sensor_means = []
-    for aid, samples in ((MAG, segment.field), (FLOW, segment.flow)):
+    for aid, samples in ((MAG, segment.magnetic_field), (FLOW, segment.flow)):
         if samples is not None:
             sample_means_by_interval = [
-                average_by_event(segment, samples, end_steps) for end_steps in event_step_arrays
+                average_by_event(segment, samples, end_steps)
+                for end_steps in event_steps_by_interval_set
             ]
-            event_means = EventSamples(
-                *map(stack_configurations, zip(*sample_means_by_interval, strict=True))
+            mean_samples_by_event = EventSamples(
+                *map(select_by_configuration, zip(*sample_means_by_interval, strict=True))
             )
             if aid == MAG:
                 R = np.maximum(parameters[MAG.noise], MIN_MAGNETOMETER_SIGMA_GAUSS) ** 2
-                event_means = event_means._replace(noise=event_means.noise + R)
-            sample_count = event_means.sample_count * is_enabled_by_aid[aid.name]
+                mean_samples_by_event = mean_samples_by_event._replace(
+                    noise=mean_samples_by_event.noise + R
+                )
+            sample_count = mean_samples_by_event.sample_count * is_enabled_by_aid[aid.name]
             gate = parameters.get(aid.gate, np.full(configuration_count, samples.gate))
-            event_means = event_means._replace(sample_count=sample_count)
-            sensor_means.append((event_means, gate, samples.state_rows))
+            mean_samples_by_event = mean_samples_by_event._replace(sample_count=sample_count)
+            sensor_means.append((mean_samples_by_event, gate, samples.state_slices))
     uses_logged_flag = [
         segment.height_samples is None
         or segment.is_acceleration_bad is None
-        or configuration.keeps_logged_bad_acceleration(inputs)
+        or configuration.can_use_logged_bad_acceleration_flag(inputs)
         for configuration in configurations
     ]
     bad_acceleration_flag = BadAccelerationFlag(
-        np.array(uses_logged_flag), inputs.rules.bad_acceleration_duration_s, segment
+        np.array(uses_logged_flag), inputs.rules.bad_acceleration_flag_duration_s, segment
     )
     if segment.height_samples is not None:
-        barometer_by_event = np.stack(group_barometer_by_event(segment, event_step_arrays), axis=-1)
+        barometer_samples_by_event = np.stack(
+            group_barometer_by_event(segment, event_steps_by_interval_set), axis=-1
+        )
         height_filter = HeightFilter(
             segment,
-            barometer_by_event[..., interval_index_by_filter],
+            barometer_samples_by_event[..., interval_set_index_by_configuration],
             event_table["time_s"],
-            is_active,
+            has_action,
             is_enabled_by_aid,
             parameters,
             has_gate,
             bad_acceleration_flag,
         )
-    if inputs.vision is not None:
+    if inputs.vision_positions is not None:
         grouped_vision_samples = [
             group_vision_by_event(
                 inputs,
@@ -358,39 +373,41 @@ def run_segment(  # noqa: PLR0912, PLR0915 (one recursion, read from top to bott
             has_gate,
             uses_reported_noise,
         )
-    gyro_variance = np.where(has_attitude, parameters["EKF2_GYR_NOISE"] ** 2, 0.0)[:, None, None]
-    variance_increment, variance_limit = _compute_variance_growth(
-        inputs, segment, parameters, has_biases, has_attitude
+    gyro_variance = np.where(estimates_attitude, parameters["EKF2_GYR_NOISE"] ** 2, 0.0)[
+        :, None, None
+    ]
+    variance_growth_per_step, max_variance_for_growth = _compute_variance_growth(
+        inputs, segment, parameters, estimates_biases, estimates_attitude
     )
     step_counts = np.diff(event_steps, axis=0, prepend=0)[:, :, None]
     acceleration_variance = np.tile(
         parameters["EKF2_ACC_NOISE"][:, None, None] ** 2, (event_count, 1, 1, 1)
     )
     if (clipped_fraction := segment.clipped_fraction) is not None:
-        # In prediction steps with clipping, EKF2 uses BAD_ACCELERATION_NOISE_M_S2. The variance is
-        # the mean over the steps of an interval
-        clipped_fraction_sums = np.diff(
+        # While an accelerometer clips, EKF2 uses BAD_ACCELERATION_NOISE_M_S2. An interval has the
+        # mean noise variance of its prediction steps
+        clipped_fraction_sum_by_event = np.diff(
             np.cumsum(clipped_fraction)[event_steps], axis=0, prepend=clipped_fraction[0]
         )
         acceleration_variance += (
-            clipped_fraction_sums[:, :, None, None]
+            clipped_fraction_sum_by_event[:, :, None, None]
             / np.maximum(step_counts, 1)[..., None]
             * (BAD_ACCELERATION_NOISE_M_S2**2 - acceleration_variance)
         )
-    x, P = _make_start_state(segment, has_biases, has_attitude)
+    x, P = _make_start_state(segment, estimates_biases, estimates_attitude)
     if bad_acceleration_flag.until_s[0] > segment.time_s[0]:
         # The log contains no accelerometer bias while the bad-acceleration flag is set. The replay
         # starts with the segment's mean bias, computed from the change of the published velocity
         set_states(
             x,
             P,
-            ~bad_acceleration_flag.uses_logged_flag & has_biases,
+            ~bad_acceleration_flag.uses_logged_flag & estimates_biases,
             slice(ACCELEROMETER_BIAS_DOWN, ACCELEROMETER_BIAS_DOWN + 1),
             np.full((configuration_count, 1), segment.mean_bias_down_m_s2),
             np.full((configuration_count, 1), INITIAL_BIAS_SIGMA_M_S2**2),
         )
     is_aid_enabled = is_enabled_by_aid[inputs.aid.name]
-    decisions = _FusionDecisions(
+    fusion_decisions = _FusionDecisions(
         inputs.rules,
         segment.time_s[0],
         np.where(is_aid_enabled, action, NO_ACTION),
@@ -398,9 +415,9 @@ def run_segment(  # noqa: PLR0912, PLR0915 (one recursion, read from top to bott
         event_time_s,
         has_gate,
         uses_logged_decisions,
-        inputs.received.rejected[sample_indices],
-        inputs.received.reset[sample_indices],
-        inputs.received.has_all_resets,
+        inputs.received_positions.rejected_flags[sample_indices],
+        inputs.received_positions.is_reset_to_sample[sample_indices],
+        inputs.received_positions.is_every_reset_logged,
     )
     innovations = np.full((event_count, configuration_count, 6), np.nan)
     variances = innovations.astype(np.float32)
@@ -414,98 +431,121 @@ def run_segment(  # noqa: PLR0912, PLR0915 (one recursion, read from top to bott
     states[0] = x
     state_variances[0] = _get_state_variances(P)
     innovation, R = np.empty((2, configuration_count, 4))
-    measured_columns = slice(0 if has_velocity else POSITION_COLUMNS.start, POSITION_COLUMNS.stop)
-    is_component_fused = np.zeros((configuration_count, POSITION_COLUMNS.stop), bool)
+    measured_columns = slice(
+        0 if has_velocity else HORIZONTAL_POSITION_COLUMNS.start, HORIZONTAL_POSITION_COLUMNS.stop
+    )
+    is_component_fused = np.zeros((configuration_count, HORIZONTAL_POSITION_COLUMNS.stop), bool)
     start_s = np.full(configuration_count, segment.time_s[0])
-    state_resets = [(HORIZONTAL_POSITION, POSITION_COLUMNS, inputs.rules.reset_variance_factor)]
+    reset_rules = [
+        (HORIZONTAL_POSITION, HORIZONTAL_POSITION_COLUMNS, inputs.rules.reset_variance_factor)
+    ]
     if has_velocity and inputs.rules.resets_velocity:
-        state_resets.append((VELOCITY, VELOCITY_COLUMNS, 1.0))
+        reset_rules.append((VELOCITY, VELOCITY_COLUMNS, 1.0))
     for event in range(event_count):
-        batch_index = event % EVENT_BATCH_SIZE
-        if not batch_index:
+        index_in_batch = event % EVENT_BATCH_SIZE
+        if not index_in_batch:
             event_batch = slice(event, event + EVENT_BATCH_SIZE)
             transition_batches = [
                 interval_arrays.compute_transitions(event_batch)
-                for interval_arrays in distinct_intervals
+                for interval_arrays in interval_sets
             ]
-            (transition, correction_input, acceleration_input, gyro_noise, accelerometer_noise) = (
-                map(stack_configurations, zip(*transition_batches, strict=True))
+            (
+                transition,
+                state_change_by_correction,
+                state_change_by_acceleration,
+                gyro_noise_covariance,
+                accelerometer_noise_covariance,
+            ) = map(select_by_configuration, zip(*transition_batches, strict=True))
+            state_change = (
+                state_change_by_acceleration
+                + estimates_attitude[:, None] * state_change_by_correction
             )
-            state_input = acceleration_input + has_attitude[:, None] * correction_input
             process_noise = (
-                gyro_variance * gyro_noise
-                + acceleration_variance[event_batch] * accelerometer_noise
+                gyro_variance * gyro_noise_covariance
+                + acceleration_variance[event_batch] * accelerometer_noise_covariance
             )
-            variance_growth = variance_increment * step_counts[event_batch]
-        phi = transition[batch_index]
+            variance_growth = variance_growth_per_step * step_counts[event_batch]
+        phi = transition[index_in_batch]
         # x = Φx + u, P = ΦPΦ' + Q
-        x[:, :STATE_COUNT] = (phi @ x[:, :STATE_COUNT, None])[:, :, 0] + state_input[batch_index]
+        x[:, :STATE_COUNT] = (phi @ x[:, :STATE_COUNT, None])[:, :, 0] + state_change[
+            index_in_batch
+        ]
         P[:, :STATE_COUNT] = phi @ P[:, :STATE_COUNT]
         P[:, :, :STATE_COUNT] = P[:, :, :STATE_COUNT] @ np.swapaxes(phi, 1, 2)
-        P[:, :IMU_STATE_COUNT, :IMU_STATE_COUNT] += process_noise[batch_index]
+        P[:, :MOTION_STATE_COUNT, :MOTION_STATE_COUNT] += process_noise[index_in_batch]
         is_bias_constant = None
-        flagged_fraction = bad_acceleration_flag.compute_flagged_fraction(
+        flagged_fraction = bad_acceleration_flag.compute_bad_acceleration_fraction(
             event_time_s[event - 1] if event else start_s, event_time_s[event]
         )
         if flagged_fraction is not None:
             variance_increase = flagged_fraction * (
                 BAD_ACCELERATION_NOISE_M_S2**2 - acceleration_variance[event, :, 0, 0]
             )
-            P[:, :IMU_STATE_COUNT, :IMU_STATE_COUNT] += (
-                variance_increase[:, None, None] * accelerometer_noise[batch_index]
+            P[:, :MOTION_STATE_COUNT, :MOTION_STATE_COUNT] += (
+                variance_increase[:, None, None] * accelerometer_noise_covariance[index_in_batch]
             )
             is_bias_constant = bad_acceleration_flag.until_s > event_time_s[event]
             bias_before_fusion = x[:, ACCELEROMETER_BIAS].copy()
             bias_covariance = P[:, ACCELEROMETER_BIAS, ACCELEROMETER_BIAS].copy()
         bias_variance = _get_state_variances(P)[:, BIASES.start :]
-        bias_variance += (bias_variance < variance_limit) * variance_growth[batch_index]
-        if inputs.rules.min_bias_variance_m2_s4 is not None:
-            _limit_bias_variance(P, inputs.rules.min_bias_variance_m2_s4, has_biases)
+        bias_variance += (bias_variance < max_variance_for_growth) * variance_growth[index_in_batch]
+        if inputs.rules.min_accelerometer_bias_variance_m2_s4 is not None:
+            _limit_bias_variance(
+                P, inputs.rules.min_accelerometer_bias_variance_m2_s4, estimates_biases
+            )
         innovation[:, 2:] = 0.0
         R[:, 2:] = VARIANCE_WITHOUT_EFFECT
-        for event_means, gate, state_rows in sensor_means:
-            if event_means.sample_count[event].any():
-                event_mean = EventSamples(*(quantity[event] for quantity in event_means))
-                x, P, innovation_record = fuse_mean(x, P, event_mean, gate, *state_rows)
-                if EARTH_FIELD in state_rows:
-                    magnetometer_updates[event] = innovation_record
+        for mean_samples_by_event, gate, state_slices in sensor_means:
+            if mean_samples_by_event.sample_count[event].any():
+                mean_sample = EventSamples(*(quantity[event] for quantity in mean_samples_by_event))
+                x, P, innovation_variance_and_fused = fuse_mean_sample(
+                    x, P, mean_sample, gate, *state_slices
+                )
+                if EARTH_MAGNETIC_FIELD in state_slices:
+                    magnetometer_updates[event] = innovation_variance_and_fused
         if vision_filter is not None:
-            x, P = vision_filter.fuse(event, x, P, False, decisions.last_position_s)
+            x, P = vision_filter.fuse(event, x, P, False, fusion_decisions.last_position_s)
         if height_filter is not None:
             x, P = height_filter.fuse_barometer(event, x, P)
         if has_sample[event]:
-            nu = measured_values[event] - x[:, MEASURED_STATES]
-            S = _get_state_variances(P)[:, MEASURED_STATES] + measurement_variance[event]
+            nu = measured_values[event] - x[:, VELOCITY_AND_POSITION]
+            S = _get_state_variances(P)[:, VELOCITY_AND_POSITION] + measurement_variance[event]
             is_outside_gate = nu * nu > gate_squared * S
             if is_outside_gate[:, DOWN_COLUMN].any():
                 # With a bad vertical acceleration, EKF2 clips the vertical innovation to the gate
                 # if the horizontal velocity is inside the gate
-                is_clipped = has_gate & (bad_acceleration_flag.until_s > event_time_s[event])
-                is_clipped &= ~is_outside_gate[:, :DOWN_COLUMN].any(axis=1)
-                innovation_limit = np.sqrt(gate_squared * S)[is_clipped, DOWN_COLUMN]
-                nu[is_clipped, DOWN_COLUMN] = np.clip(
-                    nu[is_clipped, DOWN_COLUMN], -innovation_limit, innovation_limit
+                has_clipped_vertical_innovation = has_gate & (
+                    bad_acceleration_flag.until_s > event_time_s[event]
                 )
-                is_outside_gate[:, DOWN_COLUMN] &= ~is_clipped
+                has_clipped_vertical_innovation &= ~is_outside_gate[:, :DOWN_COLUMN].any(axis=1)
+                innovation_limit = np.sqrt(gate_squared * S)[
+                    has_clipped_vertical_innovation, DOWN_COLUMN
+                ]
+                nu[has_clipped_vertical_innovation, DOWN_COLUMN] = np.clip(
+                    nu[has_clipped_vertical_innovation, DOWN_COLUMN],
+                    -innovation_limit,
+                    innovation_limit,
+                )
+                is_outside_gate[:, DOWN_COLUMN] &= ~has_clipped_vertical_innovation
             innovations[event] = nu
             variances[event] = S
             is_velocity_fused = can_fuse_velocity[event] & ~(
                 is_outside_gate[:, VELOCITY_COLUMNS].any(axis=1) & has_gate
             )
-            is_outside_gate = is_outside_gate[:, POSITION_COLUMNS].any(axis=1)
+            is_outside_gate = is_outside_gate[:, HORIZONTAL_POSITION_COLUMNS].any(axis=1)
             is_rejected[event], is_fused[event], is_reset[event], is_velocity_fused = (
-                decisions.decide_fusion(event, is_outside_gate, is_velocity_fused)
+                fusion_decisions.decide_fusion(event, is_outside_gate, is_velocity_fused)
             )
             if inputs.aid == GNSS_POS:
                 if not has_magnetometer:
                     # Without logged magnetometer samples, the correction of the tilt is unknown.
                     # Only the tilt variance is set to its logged value
                     for tilt_row in range(HEADING):
-                        _, P = _reduce_variance_to(
+                        _, P = _compute_update_to_variance(
                             P, tilt_row, attitude_variance[event, :, tilt_row]
                         )
                 is_component_fused[:, VELOCITY_COLUMNS] = is_velocity_fused[:, None]
-                is_component_fused[:, POSITION_COLUMNS] = is_fused[event, :, None]
+                is_component_fused[:, HORIZONTAL_POSITION_COLUMNS] = is_fused[event, :, None]
                 x, P = _update_sequentially(
                     x,
                     P,
@@ -516,9 +556,9 @@ def run_segment(  # noqa: PLR0912, PLR0915 (one recursion, read from top to bott
                     is_component_fused[:, measured_columns],
                 )
             else:
-                innovation[:, 2:] = nu[:, POSITION_COLUMNS]
+                innovation[:, 2:] = nu[:, HORIZONTAL_POSITION_COLUMNS]
                 R[is_fused[event], 2:] = measurement_variance[
-                    event, is_fused[event], POSITION_COLUMNS
+                    event, is_fused[event], HORIZONTAL_POSITION_COLUMNS
                 ]
         if height_filter is not None:
             x, P = height_filter.fuse_gnss(
@@ -526,40 +566,47 @@ def run_segment(  # noqa: PLR0912, PLR0915 (one recursion, read from top to bott
             )
         # With a magnetometer, heading is estimated, so only height is set to its logged value
         elif has_magnetometer:
-            K, P = _reduce_variance_to(P, POSITION_DOWN, heading_and_down_variance[event, :, 1])
+            K, P = _compute_update_to_variance(
+                P, POSITION_DOWN, heading_and_down_variance[event, :, 1]
+            )
             x = x + K * (logged_heading_and_down[event, :, 1] - x[:, POSITION_DOWN])[:, None]
             x[:, POSITION_DOWN] = logged_heading_and_down[event, :, 1]
         if not has_magnetometer:
             np.subtract(
                 logged_heading_and_down[event], x[:, HEADING_AND_DOWN], out=innovation[:, :2]
             )
-            R[:, :2] = _compute_noise_for_variance(
+            R[:, :2] = _compute_noise_for_target_variance(
                 _get_state_variances(P)[:, HEADING_AND_DOWN], heading_and_down_variance[event]
             )
-            heading_error_rad = np.where(has_attitude, x[:, HEADING] + innovation[:, 0], 0.0)
+            heading_error_rad = np.where(estimates_attitude, x[:, HEADING] + innovation[:, 0], 0.0)
             if inputs.fuses_vision_height or height_filter is not None:
                 R[:, 1] = VARIANCE_WITHOUT_EFFECT
                 if has_sample[event] and height_filter is None:
                     innovation[:, 1] = nu[:, 5]
                     R[:, 1] = np.where(
-                        is_active[event], measurement_variance[event, :, 5], VARIANCE_WITHOUT_EFFECT
+                        has_action[event],
+                        measurement_variance[event, :, 5],
+                        VARIANCE_WITHOUT_EFFECT,
                     )
             x, P = _update_jointly(x, P, innovation, R)
             x[:, HEADING] = heading_error_rad
         if has_sample[event] and is_reset[event].any():
-            for rows, columns, variance_factor in state_resets:
+            for rows, columns, variance_factor in reset_rules:
                 reset_variance = variance_factor * measurement_variance[event, :, columns]
                 set_states(
                     x, P, is_reset[event], rows, measured_values[event, :, columns], reset_variance
                 )
-            position_reset_m[event, is_reset[event]] = nu[is_reset[event], POSITION_COLUMNS]
+            position_reset_m[event, is_reset[event]] = nu[
+                is_reset[event], HORIZONTAL_POSITION_COLUMNS
+            ]
         if vision_filter is not None:
             vision_filter.bias.bias_m = vision_filter.bias.bias_m + position_reset_m[event]
-            x, P = vision_filter.fuse(event, x, P, True, decisions.last_position_s)
-            # A fusion of vision also postpones the position reset after a time without GNSS fusion
+            x, P = vision_filter.fuse(event, x, P, True, fusion_decisions.last_position_s)
+            # EKF2 resets its position after a time without fusion. This time also restarts at a
+            # fusion of vision
             if inputs.rules.resets_velocity:
-                decisions.last_position_s = np.maximum(
-                    decisions.last_position_s, vision_filter.last_fusion_s
+                fusion_decisions.last_position_s = np.maximum(
+                    fusion_decisions.last_position_s, vision_filter.last_fusion_s
                 )
         if height_filter is not None and bad_acceleration_flag.models_flag:
             if has_sample[event] and has_velocity:
@@ -567,7 +614,7 @@ def run_segment(  # noqa: PLR0912, PLR0915 (one recursion, read from top to bott
                     can_fuse_velocity[event], nu[:, DOWN_COLUMN], np.nan
                 )
                 height_filter.update_records[event, -1, 1] = S[:, DOWN_COLUMN]
-            height_filter.update_bad_acceleration(event, event_time_s[event])
+            height_filter.update_bad_acceleration_flag(event, event_time_s[event])
         if is_bias_constant is not None:
             x[is_bias_constant, ACCELEROMETER_BIAS] = bias_before_fusion[is_bias_constant]
             P[is_bias_constant, ACCELEROMETER_BIAS, ACCELEROMETER_BIAS] = bias_covariance[
@@ -575,8 +622,8 @@ def run_segment(  # noqa: PLR0912, PLR0915 (one recursion, read from top to bott
             ]
         states[event + 1] = x
         state_variances[event + 1] = _get_state_variances(P)
-    innovations[~is_active] = np.nan
-    variances[~is_active] = np.nan
+    innovations[~has_action] = np.nan
+    variances[~has_action] = np.nan
     return SegmentRun(
         segment,
         tuple(configurations),
@@ -601,19 +648,22 @@ def run_segment(  # noqa: PLR0912, PLR0915 (one recursion, read from top to bott
 
 def _update_jointly(x: Array, P: Array, innovation: Array, R: Array) -> ArrayPair:
     """Fuse all measurements together: K = PH'(HPH' + R)⁻¹, x = x + Kν, P = P - KHP."""
-    HP = np.take(P, JOINTLY_MEASURED_STATES, axis=1)
-    S = np.take(HP, JOINTLY_MEASURED_STATES, axis=2)
-    S.reshape(len(x), -1)[:, :: len(JOINTLY_MEASURED_STATES) + 1] += R
+    HP = np.take(P, STATES_FUSED_IN_ONE_UPDATE, axis=1)
+    S = np.take(HP, STATES_FUSED_IN_ONE_UPDATE, axis=2)
+    S.reshape(len(x), -1)[:, :: len(STATES_FUSED_IN_ONE_UPDATE) + 1] += R
     K = np.swapaxes(HP, 1, 2) @ np.linalg.inv(S)
     x = x + (K @ innovation[:, :, None])[:, :, 0]
     P = P - K @ HP
     return x, 0.5 * (P + np.swapaxes(P, 1, 2))
 
 
-def _reduce_variance_to(P: Array, state_index: int, target_variance: Array) -> ArrayPair:
-    """Return gain and covariance of an update that reduces a state's variance to a target."""
+def _compute_update_to_variance(P: Array, state_index: int, target_variance: Array) -> ArrayPair:
+    """Return gain and covariance of an update after which a state has ``target_variance``.
+
+    Such updates give the replay a variance that EKF2 logged.
+    """
     state_variance = P[:, state_index, state_index]
-    R = _compute_noise_for_variance(state_variance, target_variance)
+    R = _compute_noise_for_target_variance(state_variance, target_variance)
     K = P[:, :, state_index] / (state_variance + R)[:, None]
     return K, P - K[:, :, None] * P[:, None, state_index]
 
@@ -623,78 +673,84 @@ def _update_sequentially(
 ) -> ArrayPair:
     """Fuse the components of a measurement one after the other, as EKF2 does; return x and P.
 
-    Innovations and innovation variances S of all components are computed before the first update
-    (fuseDirectStateMeasurement, ``ekf_helper.cpp``). With w = 1/S, c = PH' and K = wc, the Joseph
-    form is P - KHP - (KHP)' + K(HPH' + R)K' = P - bcc', b = w(2 - w(HPH' + R)).
+    Innovations ν and their variances S are computed before the first update
+    (fuseDirectStateMeasurement, ``ekf_helper.cpp``). Each update subtracts b c c' from P, where c =
+    PH' and b = w (2 - w (HPH' + R)) with w = 1/S. This is the Joseph form with the gain K = w c.
     """
     nu, S, R = (array[:, components] for array in (nu, S, R))
-    inverse_variance = is_fused / S
-    weight_squared = inverse_variance * inverse_variance
-    b = 2.0 * inverse_variance - weight_squared * R
-    rows = slice(MEASURED_STATES.start + components.start, MEASURED_STATES.start + components.stop)
+    fused_inverse_variance = is_fused / S
+    inverse_variance_squared = fused_inverse_variance * fused_inverse_variance
+    b = 2.0 * fused_inverse_variance - inverse_variance_squared * R
+    rows = slice(
+        VELOCITY_AND_POSITION.start + components.start,
+        VELOCITY_AND_POSITION.start + components.stop,
+    )
     columns = P[:, rows].copy()
     for j in range(nu.shape[1]):
         column = columns[:, j : j + 1]
-        cross_covariance = columns[:, j, rows]
-        b[:, j] -= weight_squared[:, j] * cross_covariance[:, j]
+        measurement_covariance = columns[:, j, rows]
+        b[:, j] -= inverse_variance_squared[:, j] * measurement_covariance[:, j]
         if j + 1 < nu.shape[1]:
-            factor = b[:, j, None] * cross_covariance[:, j + 1 :]
+            factor = b[:, j, None] * measurement_covariance[:, j + 1 :]
             columns[:, j + 1 :] -= factor[:, :, None] * column
-    x = x + ((inverse_variance * nu)[:, None] @ columns)[:, 0]
-    covariance_reduction_sqrt = np.sqrt(b)[:, :, None] * columns
-    return x, P - np.swapaxes(covariance_reduction_sqrt, 1, 2) @ covariance_reduction_sqrt
+    x = x + ((fused_inverse_variance * nu)[:, None] @ columns)[:, 0]
+    covariance_reduction_factor = np.sqrt(b)[:, :, None] * columns
+    return x, P - np.swapaxes(covariance_reduction_factor, 1, 2) @ covariance_reduction_factor
 
 
 @dataclass
 class _FusionDecisions:
     """Decisions on each position sample: rejected, fused, or used to reset the position.
 
-    After a time without fusion, the position is reset. After several successive resets, fusion
-    stops until EKF2 may start it with a sample (``can_start``). ``logged_rejections`` and
-    ``logged_resets`` are EKF2's logged decisions.
+    After a time without fusion, EKF2 resets the position. After several successive resets, EKF2
+    stops fusion until a sample may start it again (``can_start``). ``logged_rejected_flags`` and
+    ``logged_resets`` are EKF2's logged decisions. ``has_gate`` is False for configurations that
+    fuse every sample.
 
     Source: updateEvPosFusion, startEvPosFusion (``ev_pos_control.cpp``).
     """
 
-    rules: FusionRules
+    fusion_rules: FusionRules
     start_s: float
-    action: IntArray
+    sample_actions: IntArray
     can_start: BoolArray
     time_s: Array
     has_gate: BoolArray
     uses_logged_decisions: BoolArray
-    logged_rejections: Array
+    logged_rejected_flags: Array
     logged_resets: BoolArray
-    has_all_resets: bool
+    is_every_reset_logged: bool
 
     def __post_init__(self) -> None:
         configuration_count = len(self.has_gate)
 
         self.last_position_s, self.last_velocity_s = np.full((2, configuration_count), self.start_s)
         self.is_stopped = np.zeros(configuration_count, bool)
-        self.remaining_resets = np.full(configuration_count, self.rules.max_resets)
-        # True for events without a logged reset, start or rejection
+        self.remaining_resets = np.full(configuration_count, self.fusion_rules.max_resets)
+        # True for events at which the log contains no start, reset or rejection: then EKF2 fuses
+        # the sample if it is inside the gate
         self.only_gate_decides = (
-            (self.action == FUSE).all(axis=1)
+            (self.sample_actions == FUSE).all(axis=1)
             & ~self.logged_resets
-            & ~(self.logged_rejections > 0.0)
+            & ~(self.logged_rejected_flags > 0.0)
         )
 
     def decide_fusion(
         self, event: int, is_outside_gate: BoolArray, is_velocity_fused: BoolArray
     ) -> tuple[BoolArray, BoolArray, BoolArray, BoolArray]:
-        """Decide if filters reject the sample of an event, fuse it, or reset the position to it.
+        """Decide if each filter rejects or fuses a position sample, or resets its position to it.
 
         Return four masks: position rejected, position fused, position reset, velocity fused.
-        ``is_velocity_fused``: velocity inside its gate; it is not fused with a position reset.
+        ``is_velocity_fused`` is True if the velocity is inside its gate. A velocity is not fused if
+        the position is reset.
         """
-        fusion_rules = self.rules
+        fusion_rules = self.fusion_rules
         now_s = self.time_s[event]
-        action = self.action[event]
+        action = self.sample_actions[event]
         has_gate = self.has_gate
         uses_logged_decisions = self.uses_logged_decisions
         may_fuse = action == FUSE
-        is_decision_logged = math.isfinite(self.logged_rejections[event])
+        is_decision_logged = math.isfinite(self.logged_rejected_flags[event])
         self.last_velocity_s = np.where(is_velocity_fused, now_s, self.last_velocity_s)
         if self.only_gate_decides[event] and not (is_outside_gate.any() or self.is_stopped.any()):
             self.last_position_s = now_s
@@ -702,72 +758,88 @@ class _FusionDecisions:
         is_rejected = (
             np.where(
                 uses_logged_decisions & is_decision_logged,
-                self.logged_rejections[event] > 0.0,
+                self.logged_rejected_flags[event] > 0.0,
                 is_outside_gate,
             )
             & has_gate
             & may_fuse
         )
         time_since_fusion_s = now_s - self.last_position_s
-        if self.has_all_resets and not is_decision_logged:
-            # EKF2 resets its position after reset_timeout_s without fusion. If it logs no reset at
-            # the next event, which is after the timeout, it has fused this sample
+        if self.is_every_reset_logged and not is_decision_logged:
+            # Without a fusion, EKF2 resets its position after reset_timeout_s. If the next event is
+            # later and has no reset in the log, EKF2 must have fused the current sample
             next_event = min(event + 1, len(self.time_s) - 1)
-            is_last_before_timeout = (
+            is_last_event_before_reset_timeout = (
                 self.time_s[next_event] - self.last_position_s > fusion_rules.reset_timeout_s
             )
             is_rejected &= ~(
-                uses_logged_decisions & is_last_before_timeout & ~self.logged_resets[next_event]
+                uses_logged_decisions
+                & is_last_event_before_reset_timeout
+                & ~self.logged_resets[next_event]
             )
         is_fused = may_fuse & ~is_rejected & ~self.is_stopped
-        is_starting = has_gate & (
+        is_fusion_starting = has_gate & (
             (action == START_FUSION) | (self.is_stopped & self.can_start[event])
         )
-        is_failing = (
+        is_rejection_timed_out = (
             is_rejected & ~self.is_stopped & (time_since_fusion_s > fusion_rules.reset_timeout_s)
         )
         if fusion_rules.resets_velocity:
             is_velocity_timed_out = now_s - self.last_velocity_s > fusion_rules.reset_timeout_s
-            is_failing &= is_velocity_timed_out | (
+            is_rejection_timed_out &= is_velocity_timed_out | (
                 time_since_fusion_s > 2.0 * fusion_rules.reset_timeout_s
             )
-        is_restarted = is_starting | (is_failing & (self.remaining_resets > 0))
-        if is_decision_logged or self.logged_resets[event] or self.has_all_resets:
-            is_restart_logged = has_gate & (self.logged_resets[event] | (action == START_FUSION))
-            is_restarted = np.where(uses_logged_decisions, is_restart_logged, is_restarted)
-            is_fused &= ~is_restarted
-            is_failing &= ~uses_logged_decisions
-        self.last_position_s = np.where(is_fused | is_restarted, now_s, self.last_position_s)
-        self.last_velocity_s = np.where(is_restarted, now_s, self.last_velocity_s)
-        self.is_stopped = (self.is_stopped & ~is_starting) | (
-            is_failing & (self.remaining_resets == 0)
+        is_fusion_restarted = is_fusion_starting | (
+            is_rejection_timed_out & (self.remaining_resets > 0)
         )
-        remaining_resets = self.remaining_resets - (is_failing & (self.remaining_resets > 0))
-        self.remaining_resets = np.where(is_starting, fusion_rules.max_resets, remaining_resets)
-        return is_rejected, is_fused, is_restarted, is_velocity_fused & ~is_restarted
+        if is_decision_logged or self.logged_resets[event] or self.is_every_reset_logged:
+            is_fusion_restart_logged = has_gate & (
+                self.logged_resets[event] | (action == START_FUSION)
+            )
+            is_fusion_restarted = np.where(
+                uses_logged_decisions, is_fusion_restart_logged, is_fusion_restarted
+            )
+            is_fused &= ~is_fusion_restarted
+            is_rejection_timed_out &= ~uses_logged_decisions
+        self.last_position_s = np.where(is_fused | is_fusion_restarted, now_s, self.last_position_s)
+        self.last_velocity_s = np.where(is_fusion_restarted, now_s, self.last_velocity_s)
+        self.is_stopped = (self.is_stopped & ~is_fusion_starting) | (
+            is_rejection_timed_out & (self.remaining_resets == 0)
+        )
+        remaining_resets = self.remaining_resets - (
+            is_rejection_timed_out & (self.remaining_resets > 0)
+        )
+        self.remaining_resets = np.where(
+            is_fusion_starting, fusion_rules.max_resets, remaining_resets
+        )
+        return is_rejected, is_fused, is_fusion_restarted, is_velocity_fused & ~is_fusion_restarted
 
 
 def _compute_variance_growth(
     inputs: ReplayInputs,
     segment: ReplaySegment,
     parameters: dict[str, Array],
-    has_biases: BoolArray,
-    has_attitude: BoolArray,
+    estimates_biases: BoolArray,
+    estimates_attitude: BoolArray,
 ) -> ArrayPair:
-    """Return process noise per prediction step, and maximum variance, of biases and fields.
+    """Return process noise per prediction step, and maximum variance, of bias and field states.
 
-    EKF2 adds no process noise to a state with a larger variance.
+    The states are the biases of gyro and accelerometer and, if estimated, the magnetic fields. EKF2
+    adds no process noise to a state whose variance exceeds the maximum.
     """
-    limit_name_by_noise_name = {"GYR_B": "GYR", "ACC_B": "ACC"}
-    if segment.field is not None:
-        limit_name_by_noise_name |= {"MAG_E": "MAG", "MAG_B": "MAG"}
-    noise_density, variance_limit = (
+    limit_parameter_by_noise_parameter = {"GYR_B": "GYR", "ACC_B": "ACC"}
+    if segment.magnetic_field is not None:
+        limit_parameter_by_noise_parameter |= {"MAG_E": "MAG", "MAG_B": "MAG"}
+    noise_density, max_variance_for_growth = (
         np.stack([parameters[f"EKF2_{name}_NOISE"] for name in parameter_names], axis=-1)
-        for parameter_names in (limit_name_by_noise_name, limit_name_by_noise_name.values())
+        for parameter_names in (
+            limit_parameter_by_noise_parameter,
+            limit_parameter_by_noise_parameter.values(),
+        )
     )
-    noise_density[:, :2] *= np.stack([has_attitude, has_biases], axis=-1)
+    noise_density[:, :2] *= np.stack([estimates_attitude, estimates_biases], axis=-1)
     return np.repeat((noise_density * inputs.mean_step_s) ** 2, 3, axis=-1), np.repeat(
-        variance_limit**2, 3, axis=-1
+        max_variance_for_growth**2, 3, axis=-1
     )
 
 
@@ -777,26 +849,30 @@ def estimate_state_correlation(inputs: ReplayInputs, segment: ReplaySegment) -> 
     The log contains only the variances. Without correlations, the first updates would distribute
     corrections wrongly between tilt and accelerometer bias.
     """
-    state_correlation = _compute_settled_correlation(segment)
+    initial_state_correlation = _compute_steady_state_correlation(segment)
     if preceding_segment := segment.preceding_segment:
-        inputs = replace(inputs, vision=None)
+        inputs = replace(inputs, vision_positions=None)
         configuration = FilterConfiguration(inputs.settings)
         preceding_segment = replace(
-            preceding_segment, state_correlation=_compute_settled_correlation(preceding_segment)
+            preceding_segment,
+            initial_state_correlation=_compute_steady_state_correlation(preceding_segment),
         )
-        intervals = make_intervals(inputs, preceding_segment, configuration.compute_delays(inputs))
-        state_correlation = _compute_correlation(
+        intervals = make_event_intervals(
+            inputs, preceding_segment, configuration.compute_delays(inputs)
+        )
+        initial_state_correlation = _compute_correlation(
             run_segment(inputs, preceding_segment, [configuration], [intervals]).covariance[0]
         )
-    if segment.field is not None:
+    if segment.magnetic_field is not None:
         # EKF2 has just reset heading and magnetic fields, so they are uncorrelated with all states
-        state_correlation = block_diag(
-            state_correlation[:STATE_COUNT, :STATE_COUNT], np.eye(len(segment.state) - STATE_COUNT)
+        initial_state_correlation = block_diag(
+            initial_state_correlation[:STATE_COUNT, :STATE_COUNT],
+            np.eye(len(segment.state) - STATE_COUNT),
         )
-        state_correlation[HEADING] = 0.0
-        state_correlation[:, HEADING] = 0.0
-        state_correlation[HEADING, HEADING] = 1.0
-    return replace(segment, state_correlation=state_correlation)
+        initial_state_correlation[HEADING] = 0.0
+        initial_state_correlation[:, HEADING] = 0.0
+        initial_state_correlation[HEADING, HEADING] = 1.0
+    return replace(segment, initial_state_correlation=initial_state_correlation)
 
 
 def _compute_correlation(P: Array) -> Array:
@@ -805,11 +881,11 @@ def _compute_correlation(P: Array) -> Array:
     return np.asarray(P / sigma[:, None] / sigma)
 
 
-def _compute_settled_correlation(segment: ReplaySegment) -> Array:
-    """Return the steady-state correlation matrix of the states; tilt and bias are correlated.
+def _compute_steady_state_correlation(segment: ReplaySegment) -> Array:
+    """Return the correlation matrix of the states after a long fusion of velocity.
 
-    After long fusion of velocity, the acceleration errors of tilt error θ and accelerometer bias b
-    cancel each other: θ × f = R b, with specific force f and rotation R from body to NED.
+    Tilt error θ and accelerometer bias b are correlated, because their acceleration errors cancel
+    each other: θ × f = R b. f is the specific force, R the rotation from body to NED.
     """
     state_rotation_to_ned = np.eye(STATE_COUNT)
     state_rotation_to_ned[ACCELEROMETER_BIAS, ACCELEROMETER_BIAS] = segment.body_to_ned[0]
@@ -837,43 +913,50 @@ def _get_state_variances(P: Array) -> Array:
 
 
 def _make_start_state(
-    segment: ReplaySegment, has_biases: BoolArray, has_attitude: BoolArray
+    segment: ReplaySegment, estimates_biases: BoolArray, estimates_attitude: BoolArray
 ) -> ArrayPair:
-    x = np.tile(segment.state, (len(has_biases), 1))
+    x = np.tile(segment.state, (len(estimates_biases), 1))
     sigma = np.sqrt(segment.variance)
-    P = np.tile(sigma[:, None] * segment.state_correlation * sigma, (len(has_biases), 1, 1))
+    P = np.tile(
+        sigma[:, None] * segment.initial_state_correlation * sigma, (len(estimates_biases), 1, 1)
+    )
     for rows, is_estimated in (
-        (THETA, has_attitude),
-        (GYRO_BIAS, has_attitude),
-        (ACCELEROMETER_BIAS, has_biases),
+        (THETA, estimates_attitude),
+        (GYRO_BIAS, estimates_attitude),
+        (ACCELEROMETER_BIAS, estimates_biases),
     ):
         set_states(x, P, ~is_estimated, rows, *np.zeros((2, len(x), 3)))
-    x[~has_biases, ACCELEROMETER_BIAS] = -segment.accelerometer_bias_m_s2
+    x[~estimates_biases, ACCELEROMETER_BIAS] = -segment.accelerometer_bias_m_s2
     return x, P
 
 
-def _compute_noise_for_variance(variance: Array, target_variance: Array) -> Array:
-    """Return R for an update from ``variance`` to ``target_variance``: 1/R = 1/target - 1/variance.
+def _compute_noise_for_target_variance(variance: Array, target_variance: Array) -> Array:
+    """Return the R with which an update changes ``variance`` to ``target_variance``.
 
-    With this R, updates with EKF2's published height and heading give the logged variances.
+    1/R = 1/target_variance - 1/variance. The replay uses this R to fuse EKF2's logged height and
+    heading, so that the state variances after the update are the logged variances.
     """
     excess_variance = variance - target_variance
-    noise_variance = np.full(excess_variance.shape, VARIANCE_WITHOUT_EFFECT)
+    required_noise_variance = np.full(excess_variance.shape, VARIANCE_WITHOUT_EFFECT)
     np.divide(
-        variance * target_variance, excess_variance, out=noise_variance, where=excess_variance > 0.0
+        variance * target_variance,
+        excess_variance,
+        out=required_noise_variance,
+        where=excess_variance > 0.0,
     )
-    return noise_variance
+    return required_noise_variance
 
 
-def _limit_bias_variance(P: Array, lower_limit_m2_s4: float, has_biases: BoolArray) -> None:
+def _limit_bias_variance(P: Array, lower_limit_m2_s4: float, estimates_biases: BoolArray) -> None:
     """Limit the accelerometer bias variance like PX4 up to v1.14 (fixCovarianceErrors)."""
-    bias_variance = _get_state_variances(P)[:, ACCELEROMETER_BIAS]
+    accelerometer_bias_variance = _get_state_variances(P)[:, ACCELEROMETER_BIAS]
     min_variance = np.maximum(
-        MIN_BIAS_VARIANCE_RATIO * bias_variance.max(axis=1, keepdims=True), lower_limit_m2_s4
+        MIN_RATIO_TO_LARGEST_BIAS_VARIANCE * accelerometer_bias_variance.max(axis=1, keepdims=True),
+        lower_limit_m2_s4,
     )
-    bias_variance[has_biases] = np.clip(bias_variance, min_variance, MAX_BIAS_SIGMA_M_S2**2)[
-        has_biases
-    ]
+    accelerometer_bias_variance[estimates_biases] = np.clip(
+        accelerometer_bias_variance, min_variance, MAX_BIAS_SIGMA_M_S2**2
+    )[estimates_biases]
 
 
 def _collect_measurements(
@@ -885,7 +968,7 @@ def _collect_measurements(
     uses_reported_noise: BoolArray,
 ) -> ArrayPair:
     """Return measurements and variances, shape (events, filters, 6): velocity, position (NED)."""
-    received_positions = inputs.received
+    received_positions = inputs.received_positions
     aid = inputs.aid
     sensor_offset_m = (
         np.stack([parameters[name] for name in aid.lever_arm], -1) - inputs.imu_offset_m
@@ -903,25 +986,28 @@ def _collect_measurements(
         uses_reported_noise[:, None], received_positions.variance_m2[sample_indices][:, None], 0.0
     )
     measurement_variance[..., 3:] = np.maximum(
-        reported_variance, np.maximum(parameters[aid.noise], MIN_NOISE_SIGMA)[:, None] ** 2
+        reported_variance,
+        np.maximum(parameters[aid.noise], MIN_MEASUREMENT_NOISE_SIGMA)[:, None] ** 2,
     )
     if (
         received_positions.velocity_m_s is not None
         and received_positions.velocity_variance_m2_s2 is not None
     ):
-        # Velocity of the antenna relative to the IMU while the vehicle rotates
-        rotation_matrix_rate_per_s = (
+        # A rotating vehicle moves the antenna relative to the IMU: velocity = dR/dt · lever arm
+        rotation_matrix_derivative_per_s = (
             np.diff(segment.body_to_ned, axis=0)[event_steps - 1]
             / segment.step_s[event_steps - 1, None, None]
         )
-        lever_arm_velocity_m_s = (rotation_matrix_rate_per_s @ sensor_offset_m)[..., 0]
+        lever_arm_velocity_m_s = (rotation_matrix_derivative_per_s @ sensor_offset_m)[..., 0]
         measured_values[..., :3] = (
             received_positions.velocity_m_s[sample_indices][:, None] - lever_arm_velocity_m_s
         )
         reported_variance = received_positions.velocity_variance_m2_s2[sample_indices][:, None]
-        min_variance = np.maximum(parameters[GNSS_VEL.noise], MIN_NOISE_SIGMA)[:, None] ** 2
+        min_variance = (
+            np.maximum(parameters[GNSS_VEL.noise], MIN_MEASUREMENT_NOISE_SIGMA)[:, None] ** 2
+        )
         measurement_variance[..., :3] = (
-            np.maximum(reported_variance, min_variance) * VELOCITY_VARIANCE_FACTORS
+            np.maximum(reported_variance, min_variance) * GNSS_VELOCITY_VARIANCE_FACTORS
         )
     if aid == GNSS_POS:
         measurement_variance[..., 5] = np.maximum(

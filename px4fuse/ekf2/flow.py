@@ -35,14 +35,14 @@ def add_flow_samples(segment: ReplaySegment, flow: pd.DataFrame, gate: float) ->
     step_index, weight = compute_low_pass_weights(
         segment, flow.index.to_numpy(), sample_count, interval_s, FLOW_FILTER_NEW_SAMPLE_WEIGHT
     )
-    rotation_to_body = segment.body_to_ned[step_index].swapaxes(2, 3)[:, :, :2]
+    ned_to_body_rotation = segment.body_to_ned[step_index].swapaxes(2, 3)[:, :, :2]
     imu_velocity_m_s = np.einsum(
-        "ki,kiab,kib->ka", weight, rotation_to_body, segment.imu_velocity_change_m_s[step_index]
+        "ki,kiab,kib->ka", weight, ned_to_body_rotation, segment.imu_velocity_change_m_s[step_index]
     )
     sensor_samples = SensorSamples(
         step_index[:, 0],
         flow[["forward_m_s", "right_m_s"]].to_numpy() - imu_velocity_m_s,
-        np.einsum("ki,kiab->kab", weight, rotation_to_body),
+        np.einsum("ki,kiab->kab", weight, ned_to_body_rotation),
         sample_count,
         flow["noise_m2_s2"].to_numpy(),
         gate,

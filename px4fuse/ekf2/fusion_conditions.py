@@ -12,7 +12,7 @@ import numpy as np
 import pandas as pd
 
 from px4fuse.core.record import Span
-from px4fuse.ekf2.intervals import MAX_LATENESS_S
+from px4fuse.ekf2.intervals import MAX_DELAY_BEHIND_HORIZON_S
 from px4fuse.flight.ekf2_parameters import AID_MASK_PARAMETER, Aid
 from px4fuse.flight.model import Columns, Ekf2, PositionTrack, sample_step_function
 
@@ -28,35 +28,31 @@ FUSION_STOP_TIMEOUT_S = 7.0
 # Maximum delay (s) of EKF2's fusion horizon, if the log does not contain EKF2_DELAY_MAX
 MAX_HORIZON_DELAY_S = 1.0
 # Maximum number of position samples in EKF2's buffer
-MAX_BUFFERED_SAMPLES = 20
+MAX_BUFFERED_POSITIONS = 20
 # Tolerance (s) of a sample interval: half of the timestamp resolution of 1 µs
 INTERVAL_TOLERANCE_S = 5e-7
 # EKF2 stops fusion after it has rejected all samples for this time (s): no_aid_timeout_max
 MAX_REJECTION_DURATION_S = 1.0
 # A coordinate with a smaller range (m) in the log counts as not measured
-MIN_MEASURED_RANGE_M = 1e-3
+MIN_RANGE_OF_MEASURED_COORDINATE_M = 1e-3
 # A GNSS check explains missing GNSS fusion if it fails for at least this fraction of the time
-MIN_CHECK_FAILURE_FRACTION = 0.1
+MIN_GNSS_CHECK_FAILURE_FRACTION = 0.1
 SET_TIMESTAMP_ACTION = (
     "Set timestamp_sample to the time of measurement in microseconds since the autopilot's boot."
 )
-SYNCHRONISE_ACTION = (
+CLOCK_SYNCHRONISATION_ACTION = (
     "Synchronise the clocks: UXRCE_DDS_SYNCT 1 with the uXRCE-DDS agent, or answer TIMESYNC of "
     "MAVLink. Send microseconds."
 )
-# Age of positions for EKF2, by wrong clock of the timestamps
-AGE_TEXT_BY_WRONG_CLOCK = {
-    **dict.fromkeys(
-        ("another clock", "an unknown clock", "UNIX time in seconds"), "too old or in the future"
-    ),
-    **{f"UNIX time in {unit}seconds": "in the future" for unit in ("nano", "micro", "milli")},
+# Clocks that must be synchronised with the autopilot's clock
+UNSYNCHRONISED_CLOCKS = {
+    "another clock",
+    "an unknown clock",
+    *(f"UNIX time in {unit}seconds" for unit in ("nano", "micro", "milli", "")),
 }
-# Age of positions for EKF2, by wrong clock or wrong unit of the timestamps
-AGE_TEXT_BY_WRONG_TIMESTAMP = {
-    **dict.fromkeys(("0", "milliseconds", "seconds"), "too old"),
-    **AGE_TEXT_BY_WRONG_CLOCK,
-    "nanoseconds": "in the future",
-}
+# Clocks and units of timestamps that EKF2 cannot use. 0: all timestamps are 0
+UNUSABLE_TIMESTAMPS = {"0", "nanoseconds", "milliseconds", "seconds", *UNSYNCHRONISED_CLOCKS}
+UNUSABLE_TIMESTAMPS_EFFECT = "For EKF2, the positions are too old or in the future."
 # GNSS checks in the order of their bits in gps_check_fail_flags: name, parameter with the limit,
 # unit of the limit
 GNSS_CHECKS = (
@@ -68,7 +64,7 @@ GNSS_CHECKS = (
     ("speed accuracy", "EKF2_REQ_SACC", " m/s"),
     ("horizontal drift at rest", "EKF2_REQ_HDRIFT", " m/s"),
     ("vertical drift at rest", "EKF2_REQ_VDRIFT", " m/s"),
-    ("horizontal speed at rest", "EKF2_REQ_HDRIFT", " m/s"),
+    ("horizontal speed while the vehicle is at rest", "EKF2_REQ_HDRIFT", " m/s"),
     ("vertical speed", "EKF2_REQ_VDRIFT", " m/s"),
     ("spoofing", "", ""),
     ("jamming", "", ""),
@@ -84,23 +80,23 @@ class UnmetCondition(NamedTuple):
     action: str
 
 
-UNKNOWN_CONDITION = UnmetCondition(
+NO_UNMET_CONDITION_LOGGED = UnmetCondition(
     "",
     "",
-    "The log does not contain the reason: EKF2's logged conditions for fusion are met.",
+    "The log does not show why EKF2 fused no position: all logged conditions for fusion are met.",
     "Run `ekf2 status` in the console of PX4: it prints if attitude and position are valid.",
 )
 
 
 @dataclass(frozen=True)
 class UnfusedPositions:
-    """Positions that EKF2 received but did not fuse in the time span ``span_s``."""
+    """Positions that EKF2 received but did not fuse in the time span ``unfused_span_s``."""
 
     ekf2: Ekf2
     source: PositionTrack
     aid: Aid
     parameters: Mapping[str, float]
-    span_s: Span
+    unfused_span_s: Span
 
     @property
     def is_vision(self) -> bool:
@@ -113,58 +109,66 @@ class UnfusedPositions:
 
     @property
     def max_sample_age_s(self) -> float:
-        """Maximum age (s) of buffered samples: EKF2_DELAY_MAX, else MAX_HORIZON_DELAY_S."""
-        horizon_s = self.ekf2.horizon_s
-        max_horizon_s = 1e-3 * self.parameters.get("EKF2_DELAY_MAX", 1e3 * MAX_HORIZON_DELAY_S)
-        return horizon_s if isinstance(horizon_s, float) else max_horizon_s
+        """Maximum age (s) of buffered samples: the delay of the fusion horizon.
+
+        If this delay is not logged: EKF2_DELAY_MAX, or MAX_HORIZON_DELAY_S.
+        """
+        horizon_delay_s = self.ekf2.horizon_s
+        if isinstance(horizon_delay_s, float):
+            return horizon_delay_s
+        return 1e-3 * self.parameters.get("EKF2_DELAY_MAX", 1e3 * MAX_HORIZON_DELAY_S)
 
     @property
     def interval_s(self) -> float:
         return 1.0 / self.source.compute_rate_hz()
 
     def select_samples(self, samples: pd.DataFrame, lead_time_s: float = 0.0) -> pd.DataFrame:
-        """Return the samples from ``lead_time_s`` before ``span_s`` to the end of ``span_s``."""
-        return samples.loc[self.span_s[0] - lead_time_s : self.span_s[1]]
+        """Return the samples in ``unfused_span_s``, and in the ``lead_time_s`` before this span."""
+        return samples.loc[self.unfused_span_s[0] - lead_time_s : self.unfused_span_s[1]]
 
-    def compute_status_bit_fraction(self, state: str, bit: int = 0) -> float:
-        """Return the fraction of ``span_s`` in which a status bit is set; NaN if not logged."""
-        state_changes = self.ekf2.states.get(state)
+    def compute_status_bit_fraction(self, field_name: str, bit: int = 0) -> float:
+        """Return the fraction of ``unfused_span_s`` with a set status bit; NaN if not logged."""
+        state_changes = self.ekf2.states.get(field_name)
         if state_changes is None:
             return float("nan")
-        state_values = sample_step_function(state_changes, np.linspace(*self.span_s, 200))
+        state_values = sample_step_function(state_changes, np.linspace(*self.unfused_span_s, 200))
         return float(np.mean(state_values.astype(np.int64) >> bit & 1))
 
 
 def find_unmet_condition(positions: UnfusedPositions) -> UnmetCondition:
-    """Return the first condition for fusion that is not met; UNKNOWN_CONDITION if all are met."""
+    """Return the first condition for fusion that is not met, or NO_UNMET_CONDITION_LOGGED."""
     checks = VISION_FUSION_CHECKS if positions.is_vision else GNSS_FUSION_CHECKS
-    return next((unmet for check in checks for unmet in check(positions)), UNKNOWN_CONDITION)
+    return next(
+        (unmet for check in checks for unmet in check(positions)), NO_UNMET_CONDITION_LOGGED
+    )
 
 
-def _check_switch(positions: UnfusedPositions) -> Iterator[UnmetCondition]:
+def _check_enabling_parameter(positions: UnfusedPositions) -> Iterator[UnmetCondition]:
     parameter_name, bit = positions.aid.switch, 0
     if not positions.has_enabling_parameter:
         parameter_name, bit = AID_MASK_PARAMETER, 3 if positions.is_vision else 0
     parameter_value = int(positions.parameters.get(parameter_name, 1 << bit))
     if parameter_value >> bit & 1:
         return
-    fused_quantity = (
+    fused_quantity_name = (
         "horizontal position"
         if positions.has_enabling_parameter
         else positions.aid.label.replace(",", "")
     )
-    reason = f"Bit {bit} ({fused_quantity}) of {parameter_name} is not set."
+    reason = (
+        f"Fusion of {fused_quantity_name} is disabled: bit {bit} of {parameter_name} is not set."
+    )
     action = f"Set {parameter_name} to {parameter_value | 1 << bit}."
     if is_height_only(positions.source):
         reason = f"The source contains no horizontal position: x and y are constant. {reason}"
-        action = f"Do not set bit {bit} of {parameter_name}."
+        action = f"Leave bit {bit} of {parameter_name} unset."
     yield UnmetCondition("switch", f"{parameter_name} is {parameter_value}", reason, action)
 
 
 def constant_coordinates(source: PositionTrack) -> list[str]:
     """Return the coordinates (x, y, z) that a position source does not measure: constant values."""
     ranges_m = np.ptp(source.samples[Columns.POSITION].to_numpy(), axis=0)
-    is_constant = ranges_m < MIN_MEASURED_RANGE_M
+    is_constant = ranges_m < MIN_RANGE_OF_MEASURED_COORDINATE_M
     return [name for name, constant in zip("xyz", is_constant, strict=True) if constant]
 
 
@@ -173,7 +177,7 @@ def is_height_only(source: PositionTrack) -> bool:
     return {"x", "y"} <= {*constant_coordinates(source)}
 
 
-def _check_frame(positions: UnfusedPositions) -> Iterator[UnmetCondition]:
+def _check_position_frame(positions: UnfusedPositions) -> Iterator[UnmetCondition]:
     source = positions.source
     if positions.has_enabling_parameter and (source.frame, source.name) == (
         "unknown",
@@ -183,16 +187,16 @@ def _check_frame(positions: UnfusedPositions) -> Iterator[UnmetCondition]:
             "frame",
             "the pose_frame is unknown",
             "EKF2 (v1.14 and later) reads positions only in the frames NED (1) and FRD (2).",
-            "Send pose_frame 1 (x north, y east) or 2 (x forward at start); in MAVLink ODOMETRY "
-            "the frame_id MAV_FRAME_LOCAL_NED or MAV_FRAME_LOCAL_FRD.",
+            "Send pose_frame 1 (x north, y east) or 2 (x forward at start). In MAVLink ODOMETRY, "
+            "send frame_id MAV_FRAME_LOCAL_NED or MAV_FRAME_LOCAL_FRD.",
         )
 
 
 def _check_position_gap(positions: UnfusedPositions) -> Iterator[UnmetCondition]:
-    has_short_timeout = positions.is_vision and positions.has_enabling_parameter
-    stop_timeout_s = EV_STOP_INTERVAL_S if has_short_timeout else FUSION_STOP_TIMEOUT_S
+    uses_vision_stop_timeout = positions.is_vision and positions.has_enabling_parameter
+    stop_timeout_s = EV_STOP_INTERVAL_S if uses_vision_stop_timeout else FUSION_STOP_TIMEOUT_S
     times_s = positions.source.samples.index.to_numpy()
-    start_s, end_s = positions.span_s
+    start_s, end_s = positions.unfused_span_s
     # EKF2 stops fusion if no position arrives for stop_timeout_s
     last_position_time_s = max(times_s[times_s < start_s], default=start_s)
     duration_s = np.min(times_s[times_s >= start_s], initial=end_s) - last_position_time_s
@@ -207,18 +211,18 @@ def _check_position_gap(positions: UnfusedPositions) -> Iterator[UnmetCondition]
 
 def find_timestamp_action(clock_name: str) -> str:
     """Return the action for timestamps of a wrong clock or in a wrong unit."""
-    is_wrong_clock = clock_name in AGE_TEXT_BY_WRONG_CLOCK
-    return SYNCHRONISE_ACTION if is_wrong_clock else SET_TIMESTAMP_ACTION
+    is_wrong_clock = clock_name in UNSYNCHRONISED_CLOCKS
+    return CLOCK_SYNCHRONISATION_ACTION if is_wrong_clock else SET_TIMESTAMP_ACTION
 
 
 def _check_timestamps(positions: UnfusedPositions) -> Iterator[UnmetCondition]:
     clock_map, status = positions.source.clock_map, positions.source.status
-    if clock_map and (clock := clock_map.clock) in AGE_TEXT_BY_WRONG_TIMESTAMP:
+    if clock_map and (clock := clock_map.clock) in UNUSABLE_TIMESTAMPS:
         yield UnmetCondition(
             "clock",
-            "the timestamps are " + ("0" if clock == "0" else f"in {clock}"),
-            "EKF2 reads timestamp_sample in microseconds since the autopilot's boot, so for EKF2 "
-            f"these positions are {AGE_TEXT_BY_WRONG_TIMESTAMP[clock]}.",
+            "the timestamps are 0" if clock == "0" else f"the timestamps are in {clock}",
+            "EKF2 expects timestamp_sample in microseconds since the autopilot's boot. "
+            f"{UNUSABLE_TIMESTAMPS_EFFECT}",
             find_timestamp_action(clock),
         )
     if "age_s" not in status:
@@ -227,27 +231,27 @@ def _check_timestamps(positions: UnfusedPositions) -> Iterator[UnmetCondition]:
     # timestamp, so for EKF2 the age is larger by this delay
     delay_s = positions.parameters.get(positions.aid.delay, 0.0) * 1e-3
     age_s = float(positions.select_samples(status)["age_s"].median()) + delay_s
-    if -age_s > MAX_BUFFERED_SAMPLES * positions.interval_s:
+    if -age_s > MAX_BUFFERED_POSITIONS * positions.interval_s:
         yield UnmetCondition(
             "age",
             f"the timestamps are {-age_s:.2f} s in the future",
-            f"EKF2 fuses a position only at its timestamp, and buffers only {MAX_BUFFERED_SAMPLES} "
-            "positions.",
-            SYNCHRONISE_ACTION,
+            f"EKF2 buffers only {MAX_BUFFERED_POSITIONS} positions. New positions overwrite a "
+            "position before the time of its timestamp.",
+            CLOCK_SYNCHRONISATION_ACTION,
         )
-    if age_s > positions.max_sample_age_s + MAX_LATENESS_S:
-        action = SYNCHRONISE_ACTION
+    if age_s > positions.max_sample_age_s + MAX_DELAY_BEHIND_HORIZON_S:
+        action = CLOCK_SYNCHRONISATION_ACTION
         if age_s < MAX_HORIZON_DELAY_S:
-            max_delay_ms = 50.0 * np.ceil(20.0 * age_s)  # a round number, with margin
+            max_delay_ms = 50.0 * np.ceil(20.0 * age_s)  # next multiple of 50 ms
             action = (
-                "Check the clock of the positioning system. Then set EKF2_DELAY_MAX to "
-                f"{max_delay_ms:.0f} ms (v1.15 and later)."
+                "Correct the clock of the positioning system if it is wrong. If the positions are "
+                f"late, set EKF2_DELAY_MAX to {max_delay_ms:.0f} ms (v1.15 and later)."
             )
         yield UnmetCondition(
             "age",
             f"the positions are {age_s:.2f} s old at arrival",
             f"EKF2 fuses no position that is older than {positions.max_sample_age_s:.2f} s. "
-            "Timestamps that are too early also make positions too old.",
+            "Possible cause: the positions arrive late, or the clock of the timestamps is behind.",
             action,
         )
 
@@ -273,7 +277,9 @@ def _check_quality(positions: UnfusedPositions) -> Iterator[UnmetCondition]:
         f"{max(median_quality, 0.0):.0f} only if the positions are correct."
     )
     if not quality.any():
-        reason = f"{reason} MAVLink VISION_POSITION_ESTIMATE has no quality; EKF2 then uses 0."
+        reason = (
+            f"{reason} MAVLink VISION_POSITION_ESTIMATE contains no quality, so EKF2 assumes 0."
+        )
         action = "Send the quality field of MAVLink ODOMETRY, or set EKF2_EV_QMIN to 0."
     fault = f"the quality is {median_quality:.0f}, below EKF2_EV_QMIN {min_quality:.0f}"
     yield UnmetCondition("quality", fault, reason, action)
@@ -323,7 +329,7 @@ def _check_alignment(positions: UnfusedPositions) -> Iterator[UnmetCondition]:
 
 
 def _check_gnss(positions: UnfusedPositions) -> Iterator[UnmetCondition]:
-    if positions.compute_status_bit_fraction("gnss_fault") > MIN_CHECK_FAILURE_FRACTION:
+    if positions.compute_status_bit_fraction("gnss_fault") > MIN_GNSS_CHECK_FAILURE_FRACTION:
         yield UnmetCondition(
             "fault",
             "EKF2 declared GNSS faulty",
@@ -342,24 +348,24 @@ def _check_gnss(positions: UnfusedPositions) -> Iterator[UnmetCondition]:
     failed_bits = [
         bit
         for bit in failed_fraction_by_bit
-        if checked_mask >> bit & 1 and failed_fraction_by_bit[bit] > MIN_CHECK_FAILURE_FRACTION
+        if checked_mask >> bit & 1 and failed_fraction_by_bit[bit] > MIN_GNSS_CHECK_FAILURE_FRACTION
     ]
     if not failed_bits:
         return
     failed_bits.sort(key=lambda bit: -failed_fraction_by_bit[bit])
     samples = positions.select_samples(source.samples)
-    reported_variance_by_bit = {3: samples["north_m2"], 4: samples["down_m2"]}
+    reported_variance_by_check_bit = {3: samples["north_m2"], 4: samples["down_m2"]}
     if source.velocity is not None:
-        reported_variance_by_bit[5] = positions.select_samples(source.velocity)["north_m2_s2"]
+        reported_variance_by_check_bit[5] = positions.select_samples(source.velocity)["north_m2_s2"]
     check_texts = []
     for bit in failed_bits[:3]:
         name, parameter, unit = GNSS_CHECKS[bit]
         check_details = [f"failed {100.0 * failed_fraction_by_bit[bit]:.0f} % of the time"]
         if np.isfinite(limit := parameters.get(parameter, np.nan)):
-            # Positions without a fix are not in the samples, so the median of the samples may be
-            # within the limit
-            if bit in reported_variance_by_bit:
-                median_sigma = float(np.sqrt(reported_variance_by_bit[bit].median()))
+            # The samples contain only positions with a fix. Their median σ may be within the limit
+            # although the check fails
+            if bit in reported_variance_by_check_bit:
+                median_sigma = float(np.sqrt(reported_variance_by_check_bit[bit].median()))
                 if median_sigma > limit:
                     check_details.append(f"median {median_sigma:.2f}{unit}")
             check_details.append(f"limit {parameter} {limit:g}{unit}")
@@ -394,8 +400,8 @@ def _check_gate(positions: UnfusedPositions) -> Iterator[UnmetCondition]:
 
 # Checks for external vision, in EKF2's order
 VISION_FUSION_CHECKS = (
-    _check_switch,
-    _check_frame,
+    _check_enabling_parameter,
+    _check_position_frame,
     _check_position_gap,
     _check_timestamps,
     _check_quality,
@@ -406,7 +412,7 @@ VISION_FUSION_CHECKS = (
 # Checks for GNSS. _check_gnss is before _check_position_gap, because positions without a fix are
 # not logged and look like a gap
 GNSS_FUSION_CHECKS = (
-    _check_switch,
+    _check_enabling_parameter,
     _check_gnss,
     _check_position_gap,
     _check_alignment,

@@ -17,7 +17,7 @@ import numpy as np
 import pandas as pd
 
 from px4fuse.core.arrays import Array, ArrayPair, BoolArray, IntArray
-from px4fuse.ekf2.bad_acceleration import MIN_LARGER_HEIGHT_INNOVATION, BadAccelerationFlag
+from px4fuse.ekf2.bad_acceleration import MIN_HEIGHT_INNOVATION_OF_ONE_SENSOR, BadAccelerationFlag
 from px4fuse.ekf2.barometer import find_fused_barometer_samples
 from px4fuse.ekf2.bias import BiasEstimator
 from px4fuse.ekf2.replay_segments import (
@@ -42,7 +42,7 @@ VELOCITY_DOWN, POSITION_DOWN = 5, 8
 HEIGHT_SENSORS = (BAROMETER, GNSS_HGT)
 HEIGHT_AIDS = (*HEIGHT_SENSORS, AIDS["rng_hgt"], AIDS["ev_hgt"])
 # Default (m) of EKF2_GND_EFF_DZ, the barometer's dead zone near the ground
-DEFAULT_DEAD_ZONE_M = 4.0
+DEFAULT_GROUND_EFFECT_DEAD_ZONE_M = 4.0
 # PX4's name of the height reference, by value of EKF2_HGT_REF
 HEIGHT_AID_BY_REFERENCE = {0: BAROMETER.name, 1: GNSS_HGT.name}
 # Maximum time (s) from the start of the replay to the first logged height bias (logged at 2 Hz)
@@ -52,7 +52,7 @@ MIN_BAROMETER_LOG_HZ = 4.0
 # Minimum innovation gate (√S) that EKF2 uses
 MIN_INNOVATION_GATE = 1.0
 # Minimum σ of the measurement noise that EKF2 uses: position (m) or velocity (m/s)
-MIN_NOISE_SIGMA = 0.01
+MIN_MEASUREMENT_NOISE_SIGMA = 0.01
 # Factor on EKF2_GPS_P_NOISE for GNSS heights (gnss_height_control.cpp)
 GNSS_HEIGHT_NOISE_FACTOR = 1.5
 
@@ -88,10 +88,9 @@ def add_heights(
         measurement_times_s = barometer_samples.index.to_numpy()
         down_m = barometer_samples["down_m"].to_numpy() + fusion_record.altitude_m
         sample_weight = barometer_samples["weight"].to_numpy()
-    ground_effect_dead_zone_m = parameters.get("EKF2_GND_EFF_DZ", DEFAULT_DEAD_ZONE_M)
     dead_zone_m = np.where(
         fusion_record.was_flag_set(GROUND_EFFECT_FLAG, measurement_times_s),
-        ground_effect_dead_zone_m,
+        parameters.get("EKF2_GND_EFF_DZ", DEFAULT_GROUND_EFFECT_DEAD_ZONE_M),
         0.0,
     )
     segments_with_heights = []
@@ -134,22 +133,22 @@ def add_heights(
 def select_samples_in_segment(
     segment: ReplaySegment, measurement_times_s: Array, *quantities: Array
 ) -> tuple[Any, ...]:
-    """Return prediction step of the fusion, measurement time (s) and ``quantities`` of samples.
+    """Select the samples in a segment. Return their steps, measurement times and ``quantities``.
 
-    Samples outside of the segment are omitted.
+    The step of a sample is the index of the prediction step that fuses the sample.
     """
     step_indices, is_inside = find_sample_steps(segment, measurement_times_s)
     return step_indices, *(values[is_inside] for values in (measurement_times_s, *quantities))
 
 
 def group_barometer_by_event(
-    segment: ReplaySegment, event_step_arrays: Sequence[IntArray]
+    segment: ReplaySegment, event_steps_by_interval_set: Sequence[IntArray]
 ) -> list[Array]:
     """Group the barometer samples by event: each event fuses the samples since the previous one.
 
     Parameters
     ----------
-    event_step_arrays : sequence of ndarray of int
+    event_steps_by_interval_set : sequence of ndarray of int
         Prediction step of each event; one array for each set of filter events.
 
     Returns
@@ -172,28 +171,29 @@ def group_barometer_by_event(
                 height_samples.dead_zone_m,
                 height_samples.weight,
             )
-            for event_steps in event_step_arrays
+            for event_steps in event_steps_by_interval_set
         ]
     )
 
 
 class HeightFilter:
-    """Fuse heights like EKF2 in one segment, for several filter configurations at once.
+    """Fuse heights as EKF2 does, in one segment and for several filter configurations at once.
 
-    Each event fuses the samples since the previous event: up to k of the barometer, then GNSS.
+    An event is the end of an interval of the replay. At each event, the filter fuses up to k
+    barometer samples since the previous event, and then the GNSS height.
 
     Parameters
     ----------
     segment : ReplaySegment
-    barometer_by_event : ndarray, shape (6, k, events, filters) or (6, k, events, 1)
+    barometer_samples_by_event : ndarray, shape (6, k, events, filters) or (6, k, events, 1)
         Result of :func:`group_barometer_by_event`.
-    gnss_fix_times_s, has_fix : ndarray, shape (events, filters) or (events, 1)
+    gnss_fix_times_s, has_gnss_fix : ndarray, shape (events, filters) or (events, 1)
         Time of the GNSS fix of each event, and mask of the events with a fix.
     is_enabled_by_aid : mapping from PX4's name of a source to ndarray of bool, (events, filters)
     parameters : mapping from parameter name to ndarray, shape (filters,)
     has_gate : ndarray of bool, shape (filters,)
         False to fuse every sample.
-    bad_acceleration_flag : BadAcceleration
+    bad_acceleration_flag : BadAccelerationFlag
 
     Attributes
     ----------
@@ -205,9 +205,9 @@ class HeightFilter:
     def __init__(
         self,
         segment: ReplaySegment,
-        barometer_by_event: Array,
+        barometer_samples_by_event: Array,
         gnss_fix_times_s: Array,
-        has_fix: BoolArray,
+        has_gnss_fix: BoolArray,
         is_enabled_by_aid: Mapping[str, BoolArray],
         parameters: Mapping[str, Array],
         has_gate: BoolArray,
@@ -218,17 +218,25 @@ class HeightFilter:
         configuration_count = len(has_gate)
         assert height_samples is not None
         self.fused_sensors = height_samples.fused_sensors
-        self.down_m, self.age_s, measurement_times_s, self.dead_zone_m, weight, sample_flag = (
-            barometer_by_event
-        )
-        has_fix = (
-            has_fix
+        (
+            self.down_m,
+            self.age_s,
+            measurement_times_s,
+            self.dead_zone_m,
+            weight,
+            is_barometer_sample,
+        ) = barometer_samples_by_event
+        has_gnss_fix = (
+            has_gnss_fix
             & is_enabled_by_aid[GNSS_HGT.name]
             & (GNSS_HGT.name in height_samples.fused_sensors)
         )
-        has_barometer = (sample_flag > 0.0) & is_enabled_by_aid[BAROMETER.name]
+        has_barometer_sample = (is_barometer_sample > 0.0) & is_enabled_by_aid[BAROMETER.name]
         self.has_sample = np.concatenate(
-            [has_barometer, np.broadcast_to(has_fix, (1, *has_barometer.shape[1:]))]
+            [
+                has_barometer_sample,
+                np.broadcast_to(has_gnss_fix, (1, *has_barometer_sample.shape[1:])),
+            ]
         )
         self.any_sample = [np.any(mask, axis=1).tolist() for mask in self.has_sample]
         self.in_ground_effect = self.dead_zone_m.any(axis=2)
@@ -238,7 +246,11 @@ class HeightFilter:
         ]
         self.gate_squared = [np.where(has_gate, gate**2, np.inf) for gate in gates]
         self.R_m2 = (
-            np.maximum(parameters.get(BAROMETER.noise, MIN_NOISE_SIGMA), MIN_NOISE_SIGMA) ** 2
+            np.maximum(
+                parameters.get(BAROMETER.noise, MIN_MEASUREMENT_NOISE_SIGMA),
+                MIN_MEASUREMENT_NOISE_SIGMA,
+            )
+            ** 2
         )
         self.has_bias = [aid.name != height_samples.reference for aid in HEIGHT_SENSORS]
         self.weight = [*np.maximum(weight, 1.0), np.ones_like(gnss_fix_times_s)]
@@ -247,18 +259,18 @@ class HeightFilter:
         ).T
         start_s = segment.time_s[0]
         self.bias = BiasEstimator(bias_m, bias_variance_m2, segment.step_s)
-        self.updates_bias = self.has_sample & is_enabled_by_aid[height_samples.reference]
+        self.is_bias_updated = self.has_sample & is_enabled_by_aid[height_samples.reference]
         samples_with_bias = slice(0, -1) if self.has_bias[0] else slice(-1, None)
         self.interval_s = np.zeros(self.has_sample.shape)
         self.time_s = np.stack(
             np.broadcast_arrays(*measurement_times_s, gnss_fix_times_s, self.has_sample[0])[:-1]
         )
-        samples_per_event, event_count, _ = self.time_s.shape
+        max_samples_per_event, event_count, _ = self.time_s.shape
         self.update_records = np.full(
-            (event_count, samples_per_event + 1, 4, configuration_count), np.nan
+            (event_count, max_samples_per_event + 1, 4, configuration_count), np.nan
         )
-        # Interval between samples of the sensor whose bias is estimated, in the order of fusion.
-        # start_s stands for a missing sample: it does not change the latest sample time
+        # Times of all samples of the sensor whose bias is estimated, in the order of fusion. A
+        # missing sample has the time start_s, which is never later than the latest sample
         sample_times_s = np.where(self.has_sample, self.time_s, start_s)[
             samples_with_bias
         ].swapaxes(0, 1)
@@ -269,7 +281,7 @@ class HeightFilter:
             sample_times_s.shape
         )
         self.interval_s[samples_with_bias] = interval_s.swapaxes(0, 1)
-        self.interval_s *= self.updates_bias
+        self.interval_s *= self.is_bias_updated
 
     def make_update_table(
         self, sensor: str, configuration_index: int, end_s: Array
@@ -278,13 +290,18 @@ class HeightFilter:
 
         ``end_s`` contains the time (s) of each event.
         """
-        gnss_index = len(self.down_m)
-        sample_slice = (
-            slice(gnss_index, gnss_index + 1) if sensor == GNSS_HGT.name else slice(gnss_index)
+        gnss_sample_index = len(self.down_m)
+        sensor_sample_slice = (
+            slice(gnss_sample_index, gnss_sample_index + 1)
+            if sensor == GNSS_HGT.name
+            else slice(gnss_sample_index)
         )
-        update_records = self.update_records[:, sample_slice, :, configuration_index]
-        measurement_times_s = self.time_s[sample_slice, :, configuration_index].T
-        return make_update_table(update_records, measurement_times_s, end_s, ["down"])
+        return make_update_table(
+            self.update_records[:, sensor_sample_slice, :, configuration_index],
+            self.time_s[sensor_sample_slice, :, configuration_index].T,
+            end_s,
+            ["down"],
+        )
 
     def fuse_barometer(self, event: int, x: Array, P: Array) -> ArrayPair:
         for sample_index in range(len(self.down_m)):
@@ -307,10 +324,10 @@ class HeightFilter:
             event, len(self.down_m), x, P, gnss_down_m, np.zeros(1), gnss_variance_m2
         )
 
-    def update_bad_acceleration(self, event: int, time_s: Array) -> None:
+    def update_bad_acceleration_flag(self, event: int, time_s: Array) -> None:
         update_records = self.update_records[max(event - 1, 0) : event + 1]
         innovations = -update_records[:, :, 0] / np.sqrt(update_records[:, :, 1])
-        if (innovations > MIN_LARGER_HEIGHT_INNOVATION).any():
+        if (innovations > MIN_HEIGHT_INNOVATION_OF_ONE_SENSOR).any():
             innovations[:, -2] = np.fmax(innovations[:, -2], innovations[:, -1])
             self.bad_acceleration_flag.update(time_s, innovations[0, :-1], innovations[-1, :-1])
 
@@ -327,40 +344,47 @@ class HeightFilter:
         """Fuse a height (m, down), measured ``age_s`` (s) before the event."""
         if not self.any_sample[sample_index][event]:
             return x, P
-        sensor_index = int(sample_index == len(self.down_m))
-        # PH' and HPH', with H = 1 for the height and -age_s for the vertical velocity
-        state_height_covariance = P[:, :, POSITION_DOWN] - age_s[:, None] * P[:, :, VELOCITY_DOWN]
+        height_sensor_index = int(sample_index == len(self.down_m))
+        # The sample measured the height at an earlier time: height - age_s · vertical velocity. So
+        # H is 1 for the height and -age_s for the vertical velocity. The covariances are PH' and
+        # HPH'
+        covariance_with_measured_height = (
+            P[:, :, POSITION_DOWN] - age_s[:, None] * P[:, :, VELOCITY_DOWN]
+        )
         predicted_variance = (
-            state_height_covariance[:, POSITION_DOWN]
-            - age_s * state_height_covariance[:, VELOCITY_DOWN]
+            covariance_with_measured_height[:, POSITION_DOWN]
+            - age_s * covariance_with_measured_height[:, VELOCITY_DOWN]
         )
         nu = down_m - x[:, POSITION_DOWN] + age_s * x[:, VELOCITY_DOWN]
         sample_weight = self.weight[sample_index][event]
-        if self.has_bias[sensor_index]:
-            nu, R = self.bias.remove_bias(
+        if self.has_bias[height_sensor_index]:
+            nu, R = self.bias.remove_and_update_bias(
                 nu,
                 predicted_variance,
                 R,
                 self.interval_s[sample_index, event],
-                self.updates_bias[sample_index, event],
+                self.is_bias_updated[sample_index, event],
                 sample_weight,
             )
-        if sensor_index == 0 and self.in_ground_effect[sample_index, event]:
+        if height_sensor_index == 0 and self.in_ground_effect[sample_index, event]:
             nu = np.where(nu > 0.0, np.maximum(nu - self.dead_zone_m[sample_index, event], 0.0), nu)
         S = predicted_variance + R
         has_sample = self.has_sample[sample_index, event]
-        is_fused = has_sample & (nu * nu <= self.gate_squared[sensor_index] * S)
+        is_fused = has_sample & (nu * nu <= self.gate_squared[height_sensor_index] * S)
         if not is_fused.all():
             is_clipped = (
                 has_sample
                 & ~is_fused
                 & (self.bad_acceleration_flag.until_s > self.time_s[sample_index, event])
             )
-            innovation_limit = np.sqrt(self.gate_squared[sensor_index] * S)
+            innovation_limit = np.sqrt(self.gate_squared[height_sensor_index] * S)
             nu = np.where(is_clipped, np.clip(nu, -innovation_limit, innovation_limit), nu)
             is_fused |= is_clipped
         self.update_records[event, sample_index] = np.where(
             has_sample, (nu, S, ~is_fused, is_fused), np.nan
         )
-        K = state_height_covariance * (is_fused / (predicted_variance + R / sample_weight))[:, None]
-        return x + K * nu[:, None], P - K[:, :, None] * state_height_covariance[:, None]
+        K = (
+            covariance_with_measured_height
+            * (is_fused / (predicted_variance + R / sample_weight))[:, None]
+        )
+        return x + K * nu[:, None], P - K[:, :, None] * covariance_with_measured_height[:, None]

@@ -12,11 +12,11 @@ import numpy as np
 import pandas as pd
 
 from px4fuse.core.arrays import Array, BoolArray, IntArray, compute_median_interval_s
-from px4fuse.ekf2.earth_model import compute_position_scale
+from px4fuse.ekf2.earth_model import compute_internal_to_published_ratio
 from px4fuse.ekf2.flow import add_flow_samples
 from px4fuse.ekf2.heights import add_heights
 from px4fuse.ekf2.replay_segments import (
-    IMU_GAP_S,
+    MIN_IMU_GAP_S,
     MIN_SEGMENT_DURATION_S,
     ReplaySegment,
     find_replay_segments,
@@ -70,7 +70,7 @@ ROTATE_VISION_BIT = 64
 # contain EKF2's measurement time within about 1 ms
 SAMPLE_MATCH_TOLERANCE_S = 0.006
 # Tolerance (s) for rounding errors between sample times and prediction times
-STEP_TOLERANCE_S = 1e-4
+PREDICTION_STEP_TOLERANCE_S = 1e-4
 # EKF2 reports inertial dead reckoning after this time (s) without horizontal aiding
 # (no_aid_timeout_max, common.h)
 DEAD_RECKONING_TIMEOUT_S = 1.0
@@ -84,11 +84,11 @@ MAX_IMU_INTERVAL_S = 0.012
 MAX_MISSING_IMU_FRACTION = 0.1
 # First PX4 release with the time of the fusion horizon in estimator_states
 FIRST_RELEASE_WITH_HORIZON_TIMES = "PX4 v1.13"
-# Maximum number of successive position resets in PX4 releases without a limit: never reached
-UNLIMITED_RESETS = 1_000_000
+# Number of successive position resets that stands for "no limit" in PX4 releases without a limit
+NO_RESET_LIMIT = 1_000_000
 # In a gap of the position source, the replay fuses height and heading at least once in this time
 # (s)
-MAX_EVENT_INTERVAL_S = 0.25
+MAX_FUSION_INTERVAL_IN_GAP_S = 0.25
 
 
 @dataclass(frozen=True)
@@ -103,15 +103,15 @@ class ReceivedPositions:
         Position in NED, and variance reported by the sender; 0 if not reported.
     velocity_m_s, velocity_variance_m2_s2 : ndarray, shape (m, 3), or None
         Velocity in NED, if EKF2 fuses it with each position.
-    rejected : ndarray, shape (m,)
+    rejected_flags : ndarray, shape (m,)
         1 if EKF2's gate rejected the sample; NaN if not logged.
-    reset : ndarray of bool, shape (m,)
-        True if EKF2 reset its position to the sample.
-    uses_sender_times : bool
+    is_reset_to_sample : ndarray of bool, shape (m,)
+        True if EKF2 reset its position to the sample, computed from the log.
+    uses_sender_timestamps : bool
         True if EKF2 uses measurement times of the sender and ignores its delay parameter.
     reset_times_s : ndarray
-        Timestamps of the samples with a new ``reset_counter``, to which EKF2 resets its position.
-    has_all_resets : bool
+        Timestamps of samples with which the sender requests a reset (new ``reset_counter``).
+    is_every_reset_logged : bool
         True if the log contains all resets of EKF2's position to a sample.
     """
 
@@ -119,14 +119,14 @@ class ReceivedPositions:
     arrival_s: Array
     position_m: Array
     variance_m2: Array
-    rejected: Array
-    reset: BoolArray
+    rejected_flags: Array
+    is_reset_to_sample: BoolArray
     source: str
     velocity_m_s: Array | None = None
     velocity_variance_m2_s2: Array | None = None
-    uses_sender_times: bool = False
+    uses_sender_timestamps: bool = False
     reset_times_s: Array | tuple[()] = ()
-    has_all_resets: bool = False
+    is_every_reset_logged: bool = False
 
 
 @dataclass(frozen=True)
@@ -136,22 +136,23 @@ class FusionRules:
     Attributes
     ----------
     start_interval_s : float
-        Fusion starts if two samples arrive within this time.
+        EKF2 starts fusion if two samples arrive within this time.
     stop_timeout_s : float
-        Fusion stops after this time without a sample.
+        EKF2 stops fusion after this time without a sample.
     reset_timeout_s : float
-        The position is reset after all samples are rejected for this time.
+        EKF2 resets its position if it rejects all samples for this time.
     max_resets : int
         EKF2 stops fusing the position source after this number of successive resets.
-    min_bias_variance_m2_s4 : float or None
+    min_accelerometer_bias_variance_m2_s4 : float or None
         Minimum accelerometer bias variance (m²/s⁴).
-    uses_delay_as_horizon : bool
-        True if the largest delay parameter is the fusion horizon, not EKF2_DELAY_MAX (v1.15).
+    is_horizon_largest_delay : bool
+        True if the largest delay parameter sets the delay of the fusion horizon. Since v1.15,
+        EKF2_DELAY_MAX sets this delay.
     reset_variance_factor : float
         Ratio of the position variance after a reset to the measurement variance.
     resets_velocity : bool
-        True if velocity is reset together with position.
-    bad_acceleration_duration_s : float
+        True if EKF2 resets its velocity together with its position.
+    bad_acceleration_flag_duration_s : float
         Time for which the flag for a bad vertical acceleration stays set.
     """
 
@@ -159,11 +160,11 @@ class FusionRules:
     stop_timeout_s: float
     reset_timeout_s: float
     max_resets: int
-    min_bias_variance_m2_s4: float | None = None
-    uses_delay_as_horizon: bool = False
+    min_accelerometer_bias_variance_m2_s4: float | None = None
+    is_horizon_largest_delay: bool = False
     reset_variance_factor: float = 1.0
     resets_velocity: bool = False
-    bad_acceleration_duration_s: float = 3.0
+    bad_acceleration_flag_duration_s: float = 3.0
 
 
 # Rules of EKF2 v1.14 and later for external vision: EV_MAX_INTERVAL (ev_control.cpp),
@@ -171,13 +172,13 @@ class FusionRules:
 VISION_RULES = FusionRules(
     start_interval_s=0.2, stop_timeout_s=0.4, reset_timeout_s=1.0, max_resets=5
 )
-# Rules of EKF2 v1.16 for GNSS: a reset doubles the variance of the sample
-# (resetHorizontalPositionTo, gps_control.cpp)
+# Rules of EKF2 v1.16 for GNSS. After a position reset, the position variance is twice the variance
+# of the sample (resetHorizontalPositionTo, gps_control.cpp)
 GNSS_RULES = FusionRules(
     start_interval_s=np.inf,
     stop_timeout_s=np.inf,
     reset_timeout_s=7.0,
-    max_resets=UNLIMITED_RESETS,
+    max_resets=NO_RESET_LIMIT,
     reset_variance_factor=2.0,
     resets_velocity=True,
 )
@@ -191,7 +192,7 @@ class ReplayInputs:
     ----------
     settings : dict
         Logged EKF2 parameters that the model uses, by PX4 name.
-    received : ReceivedPositions
+    received_positions : ReceivedPositions
         Samples of the horizontal position source ``aid``.
     mean_step_s, configured_step_s : float
         Length of a prediction step: mean in the log, and EKF2_PREDICT_US.
@@ -201,17 +202,17 @@ class ReplayInputs:
         True if EKF2 fused the height of external vision.
     imu_offset_m : ndarray, shape (3,)
         Position of the IMU (EKF2_IMU_POS, body FRD).
-    max_event_interval_s : float
+    max_fusion_interval_in_gap_s : float
         Maximum interval (s) between fusions of height and heading in a gap of the position source.
-    logged_height_reason : str
+    reason_for_logged_height : str
         Reason why EKF2's logged height is used in a flight with GNSS.
-    vision : ReceivedPositions or None
+    vision_positions : ReceivedPositions or None
         Positions of external vision, fused in addition to GNSS; NaN while vision is disabled.
     """
 
     settings: dict[str, float]
     segments: tuple[ReplaySegment, ...]
-    received: ReceivedPositions
+    received_positions: ReceivedPositions
     rules: FusionRules
     mean_step_s: float
     horizon_s: float
@@ -219,9 +220,9 @@ class ReplayInputs:
     fuses_vision_height: bool
     imu_offset_m: Array
     aid: Aid = EV_POS
-    max_event_interval_s: float = MAX_EVENT_INTERVAL_S
-    logged_height_reason: str = ""
-    vision: ReceivedPositions | None = None
+    max_fusion_interval_in_gap_s: float = MAX_FUSION_INTERVAL_IN_GAP_S
+    reason_for_logged_height: str = ""
+    vision_positions: ReceivedPositions | None = None
 
 
 def prepare_inputs(  # noqa: PLR0911, PLR0912 (one return per reason)
@@ -240,7 +241,7 @@ def prepare_inputs(  # noqa: PLR0911, PLR0912 (one return per reason)
         return attitude
     if isinstance(ekf2, Unavailable):
         return ekf2
-    aid = find_replayed_aid(ekf2)
+    aid = find_replayed_position_source(ekf2)
     is_gnss = aid == GNSS_POS
     logged_ekf2 = ekf2
     if is_gnss:
@@ -249,15 +250,15 @@ def prepare_inputs(  # noqa: PLR0911, PLR0912 (one return per reason)
     horizon_s = ekf2.horizon_s
     if isinstance(fusion_record, Unavailable):
         return fusion_record
-    # Simulated flights have no earth rotation. Without a latitude, the model has none
+    # Simulated flights have no earth rotation. The model omits earth rotation without a latitude
     if SIMULATED_EKF2_NOTE in flight.log.notes:
         fusion_record = replace(fusion_record, latitude_deg=np.nan)
     if isinstance(innovations := ekf2.innovations["north"], Unavailable):
         return innovations
     flow_labels = [FLOW.label] if len(fusion_record.flow) else []
-    modelled_labels = [GNSS_POS.label, GNSS_VEL.label, *flow_labels] if is_gnss else []
+    modelled_aid_labels = [GNSS_POS.label, GNSS_VEL.label, *flow_labels] if is_gnss else []
     if unmodelled_aids := [
-        label for label in fusion_record.other_horizontal_aids if label not in modelled_labels
+        label for label in fusion_record.other_horizontal_aids if label not in modelled_aid_labels
     ]:
         switch_settings = ["EKF2_OF_CTRL 0", *([] if is_gnss else [f"{GNSS_POS.switch} 0"])]
         return Unavailable(
@@ -278,11 +279,11 @@ def prepare_inputs(  # noqa: PLR0911, PLR0912 (one return per reason)
     if not len(received_positions.timestamp_s):
         return Unavailable(
             ANALYSIS_NAME,
-            f"the log has no sample of {aid.label} while EKF2 reports its fusion",
+            f"EKF2 reports fusion of {aid.label}, but the log contains no sample of this source",
             "Record estimator_status_flags and the position source for the whole flight.",
         )
     vision_positions = (
-        _read_vision_besides_gnss(flight, logged_ekf2, fusion_record, attitude)
+        _read_vision_in_gnss_flight(flight, logged_ekf2, fusion_record, attitude)
         if is_gnss and EV_POS.name not in omitted_aids
         else None
     )
@@ -296,7 +297,7 @@ def prepare_inputs(  # noqa: PLR0911, PLR0912 (one return per reason)
     if isinstance(horizon_s, Unavailable):
         if not flight.log.firmware.startswith(FIRST_RELEASE_WITH_HORIZON_TIMES):
             return Unavailable(ANALYSIS_NAME, horizon_s.reason, horizon_s.remedy)
-        # EKF2's fusion horizon is the current time if EKF2_EV_DELAY is at most one prediction step
+        # If EKF2_EV_DELAY is at most one prediction step, EKF2 fuses positions without delay
         horizon_s = 0.0
     aiding_times_s = received_positions.timestamp_s
     flow_samples = fusion_record.flow if is_gnss else fusion_record.flow.iloc[:0]
@@ -308,28 +309,28 @@ def prepare_inputs(  # noqa: PLR0911, PLR0912 (one return per reason)
     if not segments:
         return Unavailable(
             ANALYSIS_NAME,
-            f"the flight contains no {MIN_SEGMENT_DURATION_S:g} s in which EKF2 fused "
-            f"{aid.label.removesuffix(', position')} without a gap in the source or the IMU",
+            f"EKF2 never fused {aid.label.removesuffix(', position')} for "
+            f"{MIN_SEGMENT_DURATION_S:g} s without a gap in the position source or the IMU",
             "Record without dropouts (faster SD card, fewer topics) and with a steady position "
             "source.",
         )
     if len(flow_samples):
         flow_gate = fusion_record.parameters.get(FLOW.gate, FLOW.default_gate)
         segments = tuple(add_flow_samples(segment, flow_samples, flow_gate) for segment in segments)
-    logged_height_reason = "; ".join(
+    reason_for_logged_height = "; ".join(
         f"{AIDS[name].label}: {reason}"
         for name, reason in omitted_aids.items()
         if name not in (FLOW.name, EV_POS.name)
     )
-    if is_gnss and not logged_height_reason:
+    if is_gnss and not reason_for_logged_height:
         segments_or_reason = add_heights(flight, ekf2, fusion_record, segments)
-        segments, logged_height_reason = (
+        segments, reason_for_logged_height = (
             (segments, segments_or_reason)
             if isinstance(segments_or_reason, str)
             else (segments_or_reason, "")
         )
     other_aids = [EV_POS] if vision_positions else []
-    other_aids += [MAG] if any(segment.field for segment in segments) else []
+    other_aids += [MAG] if any(segment.magnetic_field for segment in segments) else []
     height_samples = segments[0].height_samples
     other_aids += (
         [BAROMETER] if height_samples and BAROMETER.name in height_samples.fused_sensors else []
@@ -337,13 +338,13 @@ def prepare_inputs(  # noqa: PLR0911, PLR0912 (one return per reason)
     return ReplayInputs(
         settings=fill_with_defaults(fusion_record.parameters, aid, *other_aids) | lever_arm,
         segments=segments,
-        received=received_positions,
+        received_positions=received_positions,
         rules=_make_fusion_rules(fusion_record, ekf2.step_s, is_gnss=is_gnss),
         mean_step_s=ekf2.step_s,
         horizon_s=horizon_s,
         configured_step_s=read_prediction_step_s(fusion_record),
-        # While EKF2 reports a bad acceleration, it clips vision heights. The model does not, so it
-        # uses EKF2's logged height
+        # While EKF2 flags a bad acceleration, EKF2 clips innovations of vision heights. The model
+        # cannot clip them, so it uses EKF2's logged height
         fuses_vision_height=not is_gnss
         and isinstance(ekf2.fusion_flags, pd.DataFrame)
         and bool(ekf2.fusion_flags["vertical"].mean() > 0.5)
@@ -352,18 +353,18 @@ def prepare_inputs(  # noqa: PLR0911, PLR0912 (one return per reason)
             [fusion_record.parameters.get(f"EKF2_IMU_POS_{x}", 0.0) for x in "XYZ"]
         ),
         aid=aid,
-        logged_height_reason=logged_height_reason,
-        vision=vision_positions,
+        reason_for_logged_height=reason_for_logged_height,
+        vision_positions=vision_positions,
     )
 
 
 def compute_lost_imu_fraction(time_s: Array) -> float:
-    """Return the fraction of IMU samples missing from the log, without gaps above IMU_GAP_S."""
+    """Return the fraction of IMU samples missing from the log, without gaps above MIN_IMU_GAP_S."""
     intervals_s = np.diff(time_s)
-    missing_sample_counts = (
-        np.rint(intervals_s[intervals_s <= IMU_GAP_S] / np.median(intervals_s)) - 1.0
+    missing_samples_by_interval = (
+        np.rint(intervals_s[intervals_s <= MIN_IMU_GAP_S] / np.median(intervals_s)) - 1.0
     )
-    lost_count = missing_sample_counts.clip(0.0).sum()
+    lost_count = missing_samples_by_interval.clip(0.0).sum()
     return float(lost_count / (lost_count + len(time_s)))
 
 
@@ -392,26 +393,28 @@ def _make_fusion_rules(fusion_record: FusionRecord, step_s: float, *, is_gnss: b
         if not fusion_record.stores_latitude():
             # The flag for a bad acceleration stays set for 10 s (BADACC_PROBATION, common.h)
             fusion_rules = replace(
-                fusion_rules, reset_variance_factor=1.0, bad_acceleration_duration_s=10.0
+                fusion_rules, reset_variance_factor=1.0, bad_acceleration_flag_duration_s=10.0
             )
     elif uses_aid_mask(parameters):
-        fusion_rules = FusionRules(np.inf, 7.0, 7.0, UNLIMITED_RESETS)
+        fusion_rules = FusionRules(np.inf, 7.0, 7.0, NO_RESET_LIMIT)
     return replace(
         fusion_rules,
-        min_bias_variance_m2_s4=5e-8 / step_s**2 if fusion_record.stores_bias_increments else None,
-        uses_delay_as_horizon="EKF2_DELAY_MAX" not in parameters,
+        min_accelerometer_bias_variance_m2_s4=5e-8 / step_s**2
+        if fusion_record.stores_bias_increments
+        else None,
+        is_horizon_largest_delay="EKF2_DELAY_MAX" not in parameters,
     )
 
 
-def find_replayed_aid(ekf2: Ekf2) -> Aid:
+def find_replayed_position_source(ekf2: Ekf2) -> Aid:
     """Return the position source of the replay: GNSS if EKF2 fused GNSS, else external vision."""
-    vision = ekf2.aids.get(EV_POS.name)
-    is_vision_used = bool(vision and (vision.enabled is None or vision.enabled.any()))
-    has_gnss = _find_enabled_changes(ekf2, GNSS_POS) is not None
+    vision_log = ekf2.aids.get(EV_POS.name)
+    is_vision_used = bool(vision_log and (vision_log.enabled is None or vision_log.enabled.any()))
+    has_gnss = _find_enabled_flag_changes(ekf2, GNSS_POS) is not None
     return GNSS_POS if has_fused_aid(ekf2) and (has_gnss or not is_vision_used) else EV_POS
 
 
-def _find_enabled_changes(ekf2: Ekf2, aid: Aid) -> "pd.Series[float] | None":
+def _find_enabled_flag_changes(ekf2: Ekf2, aid: Aid) -> "pd.Series[float] | None":
     """Return the times at which EKF2 enables (1) or disables (0) an aiding source.
 
     Return None if the source is never enabled.
@@ -444,7 +447,7 @@ def read_gnss(
             "Set bit 1 of SDLOG_PROFILE to log all GNSS fixes.",
         )
     parameters = fusion_record.parameters
-    control_bits = int(parameters.get(GNSS_POS.switch, 7.0))
+    gnss_control_bits = int(parameters.get(GNSS_POS.switch, 7.0))
     position_samples, velocity_samples = track.samples, track.velocity
     # EKF2 ignores GNSS fixes while GNSS is disabled
     if (enabled_changes := ekf2.aids[GNSS_POS.name].enabled) is not None:
@@ -453,29 +456,29 @@ def read_gnss(
         velocity_samples = velocity_samples[is_enabled]
     # The delay is already subtracted from the times of the GNSS samples. It is added again, because
     # the replay subtracts it from all timestamps
-    logged_settings = fill_with_defaults(parameters, GNSS_POS)
-    logged_delay_s = logged_settings[GNSS_POS.delay] * 1e-3
+    logged_delay_s = fill_with_defaults(parameters, GNSS_POS)[GNSS_POS.delay] * 1e-3
     timestamp_s = position_samples.index.to_numpy() + logged_delay_s
     # Maximum reported position noise (m) that EKF2 uses (gps_control.cpp)
-    max_noise_m = max(parameters.get("EKF2_NOAID_NOISE", 10.0), 1.0)
+    max_reported_noise_m = max(parameters.get("EKF2_NOAID_NOISE", 10.0), 1.0)
     reported_variance = (
-        position_samples[Columns.POSITION_VARIANCE].fillna(0.0).clip(upper=max_noise_m**2)
+        position_samples[Columns.POSITION_VARIANCE].fillna(0.0).clip(upper=max_reported_noise_m**2)
     )
     velocity = velocity_variance = None
-    fuses_velocity = uses_aid_mask(parameters) or control_bits & GNSS_VELOCITY_BIT
+    fuses_velocity = uses_aid_mask(parameters) or gnss_control_bits & GNSS_VELOCITY_BIT
     if fuses_velocity and velocity_samples[Columns.VELOCITY].notna().all(axis=None):
         velocity = velocity_samples[Columns.VELOCITY].to_numpy()
         velocity_variance = velocity_samples[Columns.VELOCITY_VARIANCE].fillna(0.0).to_numpy()
     return ReceivedPositions(
         timestamp_s,
         timestamp_s,
-        position_samples[Columns.POSITION].to_numpy() * compute_position_scale(fusion_record),
+        position_samples[Columns.POSITION].to_numpy()
+        * compute_internal_to_published_ratio(fusion_record),
         reported_variance.to_numpy(),
         *_read_logged_decisions(ekf2, fusion_record, timestamp_s, timestamp_s, GNSS_POS),
         track.name,
         velocity,
         velocity_variance,
-        uses_sender_times=track.assumed_delay_s == 0.0 != logged_delay_s,
+        uses_sender_timestamps=track.assumed_delay_s == 0.0 != logged_delay_s,
     )
 
 
@@ -533,22 +536,22 @@ def read_vision(
         *logged_decisions,
         track.name,
         reset_times_s=reset_times_s(track),
-        has_all_resets=DEAD_RECKONING_FLAG in fusion_record.states,
+        is_every_reset_logged=DEAD_RECKONING_FLAG in fusion_record.states,
     )
 
 
-def _read_vision_besides_gnss(
+def _read_vision_in_gnss_flight(
     flight: Flight, ekf2: Ekf2, fusion_record: FusionRecord, attitude: pd.DataFrame
 ) -> ReceivedPositions | Unavailable | None:
     """Return the vision positions of a flight with GNSS; None if EKF2 did not fuse vision."""
-    if (enabled_changes := _find_enabled_changes(ekf2, EV_POS)) is None:
+    if (enabled_changes := _find_enabled_flag_changes(ekf2, EV_POS)) is None:
         return None
     if uses_aid_mask(fusion_record.parameters):
         return Unavailable(
             ANALYSIS_NAME,
-            f"in flights with GNSS, {flight.log.firmware} fuses changes of the vision position; "
-            "the EKF2 model cannot fuse changes",
-            "Use PX4 v1.14 or newer, or fly with GNSS only or with vision only.",
+            f"in flights with GNSS, {flight.log.firmware} fuses position increments of external "
+            "vision, which the EKF2 model cannot fuse",
+            "Use PX4 v1.14 or later, or fly with GNSS only or with vision only.",
         )
     received_positions = read_vision(flight, ekf2, fusion_record, attitude)
     if isinstance(received_positions, Unavailable):
@@ -556,7 +559,7 @@ def _read_vision_besides_gnss(
     is_vision_disabled = (
         sample_step_function(enabled_changes, received_positions.timestamp_s) == 0.0
     )
-    position_m = received_positions.position_m * compute_position_scale(fusion_record)
+    position_m = received_positions.position_m * compute_internal_to_published_ratio(fusion_record)
     return replace(
         received_positions, position_m=np.where(is_vision_disabled[:, None], np.nan, position_m)
     )
@@ -583,63 +586,73 @@ def _read_logged_decisions(
     measurement_times_s = timestamp_s - delay_s - 0.5 * ekf2.step_s
     # EKF2 fuses a sample when the fusion horizon reaches the measurement time of the sample. If the
     # sample arrives later than that, EKF2 fuses it on arrival
-    fusion_due_s = np.maximum.accumulate(np.maximum(measurement_times_s, arrival_s - horizon_s))
+    earliest_fusion_times_s = np.maximum.accumulate(
+        np.maximum(measurement_times_s, arrival_s - horizon_s)
+    )
     aid_rows = ekf2.aids[aid.name].samples
-    # Each row contains the time of EKF2's last fusion or reset (last_fused_s). EKF2 rejected all
-    # samples from then to the time of the row, and all samples in dead reckoning
+    # EKF2 rejected all samples between its last fusion or reset (last_fused_s) and the time of the
+    # row. EKF2 also rejected all samples during dead reckoning
     last_fusion_times_s = aid_rows.reindex(columns=["last_fused_s"]).dropna()
-    spans_since_fusion_s = np.column_stack([last_fusion_times_s, last_fusion_times_s.index])
+    spans_after_last_fusion_s = np.column_stack([last_fusion_times_s, last_fusion_times_s.index])
     dead_reckoning_spans_s = (
         _find_dead_reckoning_spans(ekf2, fusion_record)
         if aid == EV_POS
-        else spans_since_fusion_s[:0]
+        else spans_after_last_fusion_s[:0]
     )
-    rejection_row_ranges = np.searchsorted(
-        fusion_due_s,
-        np.concatenate([spans_since_fusion_s, dead_reckoning_spans_s]) + STEP_TOLERANCE_S,
+    row_ranges_of_rejections = np.searchsorted(
+        earliest_fusion_times_s,
+        np.concatenate([spans_after_last_fusion_s, dead_reckoning_spans_s])
+        + PREDICTION_STEP_TOLERANCE_S,
     )
-    for begin, end in rejection_row_ranges.tolist():
+    for begin, end in row_ranges_of_rejections.tolist():
         rejected_flags[begin : max(end - 1, 0)] = 1.0
-    is_reset_possible = np.isnan(rejected_flags)
+    may_be_reset_sample = np.isnan(rejected_flags)
     sample_rows = find_matching_samples(innovations.index.to_numpy(), measurement_times_s)
-    sample_innovations = innovations.iloc[sample_rows[sample_rows >= 0]]
-    rejected_flags[sample_rows >= 0] = sample_innovations["rejected"]
-    # If EKF2 resets its position to a sample, it logs innovation 0, and not a rejection
-    is_reset_possible[sample_rows >= 0] &= (sample_innovations["rejected"] > 0.0) | (
-        sample_innovations["innovation_m"] == 0.0
+    innovations_of_samples = innovations.iloc[sample_rows[sample_rows >= 0]]
+    rejected_flags[sample_rows >= 0] = innovations_of_samples["rejected"]
+    # EKF2 logs innovation 0 for a sample to which it resets its position. Such a sample is not
+    # logged as rejected
+    may_be_reset_sample[sample_rows >= 0] &= (innovations_of_samples["rejected"] > 0.0) | (
+        innovations_of_samples["innovation_m"] == 0.0
     )
-    last_fused_rows = rejection_row_ranges[: len(spans_since_fusion_s), 0] - 1
-    last_dead_reckoning_rows = rejection_row_ranges[len(spans_since_fusion_s) :, 1] - 1
+    rows_of_last_fusions = row_ranges_of_rejections[: len(spans_after_last_fusion_s), 0] - 1
+    last_sample_rows_in_dead_reckoning = (
+        row_ranges_of_rejections[len(spans_after_last_fusion_s) :, 1] - 1
+    )
     # A reset is visible in the next published state, one fusion horizon after the measurement
-    publication_times_s = fusion_due_s + horizon_s
+    publication_times_s = earliest_fusion_times_s + horizon_s
     for reset_s in find_horizontal_reset_times_s(ekf2):
         is_published_near_reset = (publication_times_s <= reset_s) & (
             publication_times_s > reset_s - MAX_RESET_PUBLICATION_DELAY_S
         )
-        reset_rows = np.flatnonzero(is_published_near_reset & is_reset_possible)
-        dead_reckoning_end_rows = np.intersect1d(reset_rows, last_dead_reckoning_rows)
+        reset_rows = np.flatnonzero(is_published_near_reset & may_be_reset_sample)
+        reset_rows_after_dead_reckoning = np.intersect1d(
+            reset_rows, last_sample_rows_in_dead_reckoning
+        )
         is_reset[
-            dead_reckoning_end_rows[:1] if len(dead_reckoning_end_rows) else reset_rows[-1:]
+            reset_rows_after_dead_reckoning[:1]
+            if len(reset_rows_after_dead_reckoning)
+            else reset_rows[-1:]
         ] = True
     is_fused = np.zeros(len(is_reset), bool)
-    is_fused[last_fused_rows[last_fused_rows >= 0]] = True
+    is_fused[rows_of_last_fusions[rows_of_last_fusions >= 0]] = True
     rejected_flags[is_fused & ~is_reset & np.isnan(rejected_flags)] = 0.0
     return rejected_flags, is_reset
 
 
 def _find_dead_reckoning_spans(ekf2: Ekf2, fusion_record: FusionRecord) -> Array:
-    """Return start and end (s) of each inertial dead reckoning, from the last fusion of vision on.
+    """Return start and end (s) of each time in which EKF2 used only the IMU (dead reckoning).
 
-    EKF2 reports dead reckoning DEAD_RECKONING_TIMEOUT_S after the last fusion, and immediately if
-    vision is disabled. Dead reckoning ends with a fusion or a reset.
+    The start is the last fusion of vision. EKF2 reports dead reckoning DEAD_RECKONING_TIMEOUT_S
+    later, or immediately if vision is disabled. The end is the next fusion or reset.
     """
-    dead_reckoning_changes = fusion_record.states.get(DEAD_RECKONING_FLAG)
-    vision_enabled_changes = ekf2.states.get(EV_POS.name)
-    if dead_reckoning_changes is None or vision_enabled_changes is None:
+    dead_reckoning_flag = fusion_record.states.get(DEAD_RECKONING_FLAG)
+    vision_enabled_flag = ekf2.states.get(EV_POS.name)
+    if dead_reckoning_flag is None or vision_enabled_flag is None:
         return np.zeros((0, 2))
-    spans_s = np.array(find_flight_spans(dead_reckoning_changes == 0.0, np.inf)).reshape(-1, 2)
+    spans_s = np.array(find_flight_spans(dead_reckoning_flag == 0.0, np.inf)).reshape(-1, 2)
     spans_s[:, 0] -= DEAD_RECKONING_TIMEOUT_S * (
-        sample_step_function(vision_enabled_changes, spans_s[:, 0]) > 0.0
+        sample_step_function(vision_enabled_flag, spans_s[:, 0]) > 0.0
     )
     return spans_s
 
@@ -649,12 +662,12 @@ def innovation_topic(aid: Aid) -> str:
     return f"estimator_aid_src_{aid.name}"
 
 
-def find_matching_samples(sample_s: Array, measurement_times_s: Array) -> IntArray:
-    """Return the index of the sample at each measurement time; -1 without a sample."""
-    sample_index = np.searchsorted(sample_s, measurement_times_s - SAMPLE_MATCH_TOLERANCE_S)
-    sample_index = np.minimum(sample_index, len(sample_s) - 1)
+def find_matching_samples(sample_times_s: Array, measurement_times_s: Array) -> IntArray:
+    """Return the index of the sample at each measurement time, or -1 if no sample has this time."""
+    sample_index = np.searchsorted(sample_times_s, measurement_times_s - SAMPLE_MATCH_TOLERANCE_S)
+    sample_index = np.minimum(sample_index, len(sample_times_s) - 1)
     return np.where(
-        np.abs(sample_s[sample_index] - measurement_times_s) <= SAMPLE_MATCH_TOLERANCE_S,
+        np.abs(sample_times_s[sample_index] - measurement_times_s) <= SAMPLE_MATCH_TOLERANCE_S,
         sample_index,
         -1,
     )

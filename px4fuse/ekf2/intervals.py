@@ -4,11 +4,12 @@ An interval ends with an event: the fusion of a position or, in a gap of the pos
 height and heading only. The transition is linearised about the published attitude, so it does not
 depend on EKF2's parameters and is computed once.
 
-Error states are attitude error δθ (earth frame, estimate = exp(δθ) · nominal), velocity v, position
-p, and errors of gyro bias b_g and accelerometer bias b_a. With prediction step Δt, specific force a
-= R f in NED, and gravity g:
+The states are attitude error δθ (NED, estimate = exp(δθ) · nominal), velocity v, position p, and
+the errors δb_g and δb_a of gyro bias and accelerometer bias. R is the rotation from body to NED, a
+the specific force in NED, and g gravity. A prediction step of length Δt computes:
 
-    δθ ← δθ - R Δt δb_g            v ← v - [a]× Δt δθ - R Δt δb_a + (a + g) Δt
+    δθ ← δθ - R Δt δb_g
+    v ← v - [a]× Δt δθ - R Δt δb_a + (a + g) Δt
     p ← p + (v_before + v_after) Δt / 2
 
 Sources: PX4-Autopilot ``EKF/python/ekf_derivation/derivation.py`` (predict_covariance),
@@ -25,7 +26,7 @@ from px4fuse.ekf2.inputs import ReplayInputs
 from px4fuse.ekf2.replay_segments import (
     BIASES,
     GRAVITY_M_S2,
-    IMU_STATE_COUNT,
+    MOTION_STATE_COUNT,
     POSITION,
     STATE_COUNT,
     THETA,
@@ -36,16 +37,16 @@ from px4fuse.trajectory.rotation import rotate, skew
 
 # EKF2 discards a sample that was measured more than this time (s) before the fusion horizon:
 # pop_first_older_than (RingBuffer.h)
-MAX_LATENESS_S = 0.1
-# A sample is late if fusion horizon - measurement time > this time (s), which is an error of 3 cm
-# at 1 m/s
-MIN_LATENESS_S = 0.03
+MAX_DELAY_BEHIND_HORIZON_S = 0.1
+# A sample is reported as late if EKF2 fuses it more than this time (s) after the fusion horizon has
+# passed its measurement time: an error of 3 cm at 1 m/s
+MIN_DELAY_OF_LATE_SAMPLE_S = 0.03
 # Actions of EKF2 on a position sample: none, fusion, or start of fusion with a reset to the sample
 NO_ACTION, FUSE, START_FUSION = 0, 1, 2
 # Columns of the state derivatives: with respect to the initial attitude error (0 to 2), gyro bias
 # (3 to 5), accelerometer bias (6 to 8), correction of the nominal attitude (9), acceleration (10)
-SENSITIVITY_COLUMN_COUNT = 11
-ATTITUDE_CORRECTION_COLUMN, ACCELERATION_COLUMN = 9, 10
+DERIVATIVE_COLUMN_COUNT = 11
+ATTITUDE_CORRECTION_DERIVATIVE_COLUMN, ACCELERATION_DERIVATIVE_COLUMN = 9, 10
 
 # One row per event (end of an interval), in time order
 StepEvents = np.recarray[Any, Any]
@@ -64,23 +65,24 @@ EVENT_DTYPE = np.dtype(
 
 
 class Transitions(NamedTuple):
-    """State transition and process noise of E intervals between filter events.
+    """State transition and process noise of E intervals between events of the replay.
 
     Attributes
     ----------
     transition : ndarray, shape (E, 15, 15)
-    correction_input, acceleration_input : ndarray, shape (E, 15)
-        State changes by the difference of nominal (published) and gyro rotation, and by the
-        acceleration.
-    gyro_noise, accelerometer_noise : ndarray, shape (E, 9, 9)
-        Process noise of attitude, velocity and position for a sensor noise of 1 rad/s or 1 m/s².
+    state_change_by_correction, state_change_by_acceleration : ndarray, shape (E, 15)
+        Change of the state in the interval. The correction is the difference between the rotation
+        of the nominal (published) attitude and the rotation measured by the gyro.
+    gyro_noise_covariance, accelerometer_noise_covariance : ndarray, shape (E, 9, 9)
+        Process noise of attitude, velocity and position for a sensor noise of 1 rad/s (gyro) or
+        1 m/s² (accelerometer) in each prediction step.
     """
 
     transition: Array
-    correction_input: Array
-    acceleration_input: Array
-    gyro_noise: Array
-    accelerometer_noise: Array
+    state_change_by_correction: Array
+    state_change_by_acceleration: Array
+    gyro_noise_covariance: Array
+    accelerometer_noise_covariance: Array
 
 
 @dataclass(frozen=True, eq=False)
@@ -91,52 +93,68 @@ class EventIntervals:
     ----------
     events : recarray, shape (E,)
         Event at the end of each interval, see :data:`EVENT_DTYPE`.
-    step_counts, duration_s : ndarray, shape (E,)
+    prediction_step_counts, duration_s : ndarray, shape (E,)
         Number of prediction steps, and length of each interval.
-    sensitivities : ndarray, shape (E, 9, SENSITIVITY_COLUMN_COUNT)
-        Derivatives of attitude, velocity and position at the end of each interval with respect to
-        errors at its start and to its inputs, see SENSITIVITY_COLUMN_COUNT.
+    state_derivatives : ndarray, shape (E, 9, DERIVATIVE_COLUMN_COUNT)
+        Derivatives of attitude, velocity and position at the end of each interval. Each column is
+        the derivative with respect to one quantity, see DERIVATIVE_COLUMN_COUNT.
     """
 
     events: StepEvents
-    step_counts: Array
+    prediction_step_counts: Array
     duration_s: Array
-    sensitivities: Array
+    state_derivatives: Array
 
     def compute_transitions(self, rows: slice) -> Transitions:
         """Return the matrices of the intervals ``rows`` only, to limit memory."""
-        sensitivities, duration_s = self.sensitivities[rows], self.duration_s[rows]
+        state_derivatives, duration_s = self.state_derivatives[rows], self.duration_s[rows]
         transition = np.tile(np.eye(STATE_COUNT), (len(duration_s), 1, 1))
-        correction_input, acceleration_input = np.zeros((2, len(duration_s), STATE_COUNT))
-        transition[:, :IMU_STATE_COUNT, THETA] = sensitivities[..., :3]
-        transition[:, :IMU_STATE_COUNT, BIASES] = sensitivities[..., 3:9]
-        correction_input[:, :IMU_STATE_COUNT] = sensitivities[..., ATTITUDE_CORRECTION_COLUMN]
-        acceleration_input[:, :IMU_STATE_COUNT] = sensitivities[..., ACCELERATION_COLUMN]
-        transition[:, POSITION, VELOCITY] = duration_s[:, None, None] * np.eye(3)
-        imu_process_noises = _compute_imu_process_noise(
-            self.step_counts[rows], duration_s, transition[:, VELOCITY, THETA]
+        state_change_by_correction, state_change_by_acceleration = np.zeros(
+            (2, len(duration_s), STATE_COUNT)
         )
-        return Transitions(transition, correction_input, acceleration_input, *imu_process_noises)
+        transition[:, :MOTION_STATE_COUNT, THETA] = state_derivatives[..., :3]
+        transition[:, :MOTION_STATE_COUNT, BIASES] = state_derivatives[..., 3:9]
+        state_change_by_correction[:, :MOTION_STATE_COUNT] = state_derivatives[
+            ..., ATTITUDE_CORRECTION_DERIVATIVE_COLUMN
+        ]
+        state_change_by_acceleration[:, :MOTION_STATE_COUNT] = state_derivatives[
+            ..., ACCELERATION_DERIVATIVE_COLUMN
+        ]
+        transition[:, POSITION, VELOCITY] = duration_s[:, None, None] * np.eye(3)
+        unit_noise_covariances = _compute_imu_process_noise(
+            self.prediction_step_counts[rows], duration_s, transition[:, VELOCITY, THETA]
+        )
+        return Transitions(
+            transition,
+            state_change_by_correction,
+            state_change_by_acceleration,
+            *unit_noise_covariances,
+        )
 
 
 @dataclass(frozen=True)
 class FusionDelays:
-    """Delay (s) of the timestamps of positions, and delay (s) of EKF2's fusion horizon.
+    """Delays (s) that determine when EKF2 fuses a position sample.
 
-    Timestamps minus ``delay_s`` are measurement times. The fusion horizon is the time of EKF2's
-    delayed state.
+    Attributes
+    ----------
+    delay_s : float
+        Timestamp of a position minus its time of measurement.
+    horizon_s : float
+        Present time minus the fusion horizon, which is the time of EKF2's delayed state.
     """
 
     delay_s: float
     horizon_s: float
 
 
-def make_intervals(
+def make_event_intervals(
     inputs: ReplayInputs, segment: ReplaySegment, delays: FusionDelays
 ) -> EventIntervals:
     """Compute state transition and process noise between the filter events of a segment.
 
-    The number of events is the same for all ``delays``, so that several delays run together.
+    The number of events does not depend on ``delays``, so that filters with different delays can be
+    computed in the same arrays.
     """
     events = _make_events(inputs, segment, delays)
     end_steps = events.end_step
@@ -145,60 +163,65 @@ def make_intervals(
         events,
         (end_steps - start_steps).astype(float),
         segment.time_s[end_steps] - segment.time_s[start_steps],
-        _integrate_sensitivities(segment, start_steps, end_steps),
+        _integrate_state_derivatives(segment, start_steps, end_steps),
     )
 
 
 def _make_events(inputs: ReplayInputs, segment: ReplaySegment, delays: FusionDelays) -> StepEvents:
-    received_positions = inputs.received
+    received_positions = inputs.received_positions
     time_s = segment.time_s
-    first_row, last_row = np.searchsorted(received_positions.timestamp_s, time_s[[0, -1]])
-    timestamp_s = received_positions.timestamp_s[first_row:last_row]
+    first_row, end_row = np.searchsorted(received_positions.timestamp_s, time_s[[0, -1]])
+    timestamp_s = received_positions.timestamp_s[first_row:end_row]
     last_step = len(time_s) - 1
     measurement_times_s = timestamp_s - delays.delay_s - 0.5 * inputs.mean_step_s
     # If a sample arrives after the fusion horizon has passed its measurement time, EKF2 fuses it
     # late or never
-    fusion_due_s = np.maximum(
-        measurement_times_s, received_positions.arrival_s[first_row:last_row] - delays.horizon_s
+    earliest_fusion_times_s = np.maximum(
+        measurement_times_s, received_positions.arrival_s[first_row:end_row] - delays.horizon_s
     )
-    end_steps = np.searchsorted(time_s, fusion_due_s - 1e-9)
-    is_inside = (end_steps > 0) & (end_steps <= last_step)
-    end_steps = np.maximum.accumulate(np.minimum(end_steps, last_step))
-    is_in_time = time_s[end_steps] < measurement_times_s + MAX_LATENESS_S
+    sample_end_steps = np.searchsorted(time_s, earliest_fusion_times_s - 1e-9)
+    is_inside = (sample_end_steps > 0) & (sample_end_steps <= last_step)
+    sample_end_steps = np.maximum.accumulate(np.minimum(sample_end_steps, last_step))
+    is_in_time = time_s[sample_end_steps] < measurement_times_s + MAX_DELAY_BEHIND_HORIZON_S
     is_usable = is_inside & is_in_time
     # EKF2 fuses only the newer of two samples in one prediction step
-    is_usable[:-1] &= end_steps[1:] > end_steps[:-1]
-    action, can_start = _find_sample_actions(
-        inputs, segment, measurement_times_s, end_steps, is_usable
+    is_usable[:-1] &= sample_end_steps[1:] > sample_end_steps[:-1]
+    action, can_start = _find_fusion_actions(
+        inputs, segment, measurement_times_s, sample_end_steps, is_usable
     )
     action[np.isin(timestamp_s, received_positions.reset_times_s) & (action == FUSE)] = START_FUSION
-    # In gaps of the position source, events without a sample fuse height and heading. Their number
-    # must be the same for all delays
+    # In gaps of the position source, events without a sample fuse height and heading. They are
+    # placed between timestamps, so that their number is the same for all delays
     gap_s = np.diff(np.r_[time_s[0], timestamp_s, time_s[-1]])
-    extra_event_counts = np.maximum(np.ceil(gap_s / inputs.max_event_interval_s).astype(int) - 1, 0)
-    sample_event_rows = np.cumsum(extra_event_counts[:-1] + 1) - 1
-    event_count = len(timestamp_s) + int(extra_event_counts.sum())
+    event_counts_in_gaps = np.maximum(
+        np.ceil(gap_s / inputs.max_fusion_interval_in_gap_s).astype(int) - 1, 0
+    )
+    event_row_by_sample = np.cumsum(event_counts_in_gaps[:-1] + 1) - 1
+    event_count = len(timestamp_s) + int(event_counts_in_gaps.sum())
     events = np.zeros(event_count, EVENT_DTYPE)
     events["end_step"] = np.rint(
         np.interp(
             np.arange(event_count),
-            np.r_[-1, sample_event_rows, event_count],
-            np.r_[0, end_steps, last_step],
+            np.r_[-1, event_row_by_sample, event_count],
+            np.r_[0, sample_end_steps, last_step],
         )
     )
     events["sample"], events["time_s"] = -1, time_s[events["end_step"]]
-    is_late = is_inside & is_in_time & (fusion_due_s - measurement_times_s > MIN_LATENESS_S)
-    sample_indices = np.arange(first_row, last_row)
-    is_lost = is_inside & ~is_in_time
-    events[sample_event_rows] = np.rec.fromarrays(
+    is_late = (
+        is_inside
+        & is_in_time
+        & (earliest_fusion_times_s - measurement_times_s > MIN_DELAY_OF_LATE_SAMPLE_S)
+    )
+    is_too_late = is_inside & ~is_in_time
+    events[event_row_by_sample] = np.rec.fromarrays(
         [
-            end_steps,
-            sample_indices,
+            sample_end_steps,
+            np.arange(first_row, end_row),
             action,
             is_usable,
             can_start,
             is_late,
-            is_lost,
+            is_too_late,
             measurement_times_s,
         ],
         dtype=EVENT_DTYPE,
@@ -206,7 +229,7 @@ def _make_events(inputs: ReplayInputs, segment: ReplaySegment, delays: FusionDel
     return events.view(np.recarray)
 
 
-def _find_sample_actions(
+def _find_fusion_actions(
     inputs: ReplayInputs,
     segment: ReplaySegment,
     measurement_times_s: Array,
@@ -227,7 +250,7 @@ def _find_sample_actions(
     sample_gaps_s = segment.time_s[end_steps[usable_rows] - 1] - np.concatenate(
         [[np.inf], measurement_times_s[usable_rows[:-1]]]
     )
-    is_fusing = segment.is_fusing
+    is_fusing = segment.starts_while_fusing
     for row, (interval_s, gap_s) in enumerate(
         zip(intervals_s.tolist(), sample_gaps_s.tolist(), strict=True)
     ):
@@ -240,75 +263,85 @@ def _find_sample_actions(
     return action, can_start
 
 
-def _integrate_sensitivities(
+def _integrate_state_derivatives(
     segment: ReplaySegment, start_steps: IntArray, end_steps: IntArray
 ) -> Array:
-    """Integrate :attr:`EventIntervals.sensitivities` from start to end step of each interval."""
-    step_counts = end_steps - start_steps
+    """Return the derivatives of attitude, velocity and position at the end of each interval.
+
+    The columns are described at DERIVATIVE_COLUMN_COUNT.
+    """
+    prediction_step_counts = end_steps - start_steps
     # All intervals are integrated together, step by step. They are sorted by length, so that the
     # intervals that continue are the first rows of the arrays
-    longest_first_indices = np.argsort(-step_counts, kind="stable")
-    first_start_steps = start_steps[longest_first_indices]
-    attitude_sensitivity, velocity_sensitivity, position_sensitivity = sensitivities = np.zeros(
-        (3, len(end_steps), 3, SENSITIVITY_COLUMN_COUNT)
+    longest_first_indices = np.argsort(-prediction_step_counts, kind="stable")
+    start_steps_longest_first = start_steps[longest_first_indices]
+    attitude_derivatives, velocity_derivatives, position_derivatives = state_derivatives = np.zeros(
+        (3, len(end_steps), 3, DERIVATIVE_COLUMN_COUNT)
     )
-    attitude_sensitivity[:, :, 0:3] = np.eye(3)
-    specific_force_ned_m_s2 = rotate(segment.body_to_ned[1:], segment.force_m_s2)
-    step_numbers = np.arange(int(step_counts.max(initial=0)))
+    attitude_derivatives[:, :, 0:3] = np.eye(3)
+    specific_force_ned_m_s2 = rotate(segment.body_to_ned[1:], segment.specific_force_m_s2)
+    step_numbers = np.arange(int(prediction_step_counts.max(initial=0)))
     for step_number, count in zip(
         step_numbers,
-        np.searchsorted(-step_counts[longest_first_indices], -step_numbers),
+        np.searchsorted(-prediction_step_counts[longest_first_indices], -step_numbers),
         strict=True,
     ):
-        step = first_start_steps[:count] + step_number
+        step = start_steps_longest_first[:count] + step_number
         rows = slice(count)
         dt = segment.step_s[step][:, None, None]
         force_m_s2 = specific_force_ned_m_s2[step]
         # Derivative of attitude by gyro bias, and of velocity by accelerometer bias, in one step
-        bias_sensitivity_step = -segment.body_to_ned[1:][step] * dt
-        position_sensitivity[rows] += 0.5 * dt * velocity_sensitivity[rows]
-        velocity_sensitivity[rows] += (-skew(force_m_s2) * dt) @ attitude_sensitivity[rows]
-        velocity_sensitivity[rows, :, 6:9] += bias_sensitivity_step
-        velocity_sensitivity[rows, :, ACCELERATION_COLUMN] += (force_m_s2 + GRAVITY_M_S2) * dt[
-            :, :, 0
-        ]
-        position_sensitivity[rows] += 0.5 * dt * velocity_sensitivity[rows]
-        attitude_sensitivity[rows, :, 3:6] += bias_sensitivity_step
-        attitude_sensitivity[rows, :, ATTITUDE_CORRECTION_COLUMN] -= segment.correction_rad[step]
-    sensitivities[:, longest_first_indices] = sensitivities.copy()
-    return np.concatenate(sensitivities, axis=1)
+        bias_derivative_of_step = -segment.body_to_ned[1:][step] * dt
+        position_derivatives[rows] += 0.5 * dt * velocity_derivatives[rows]
+        velocity_derivatives[rows] += (-skew(force_m_s2) * dt) @ attitude_derivatives[rows]
+        velocity_derivatives[rows, :, 6:9] += bias_derivative_of_step
+        velocity_derivatives[rows, :, ACCELERATION_DERIVATIVE_COLUMN] += (
+            force_m_s2 + GRAVITY_M_S2
+        ) * dt[:, :, 0]
+        position_derivatives[rows] += 0.5 * dt * velocity_derivatives[rows]
+        attitude_derivatives[rows, :, 3:6] += bias_derivative_of_step
+        attitude_derivatives[rows, :, ATTITUDE_CORRECTION_DERIVATIVE_COLUMN] -= (
+            segment.attitude_correction_rad[step]
+        )
+    state_derivatives[:, longest_first_indices] = state_derivatives.copy()
+    return np.concatenate(state_derivatives, axis=1)
 
 
 def _compute_imu_process_noise(
-    step_counts: Array, duration_s: Array, velocity_per_attitude_error: Array
+    prediction_step_counts: Array, duration_s: Array, velocity_derivative_by_attitude: Array
 ) -> tuple[Array, Array]:
-    """Return the process noise of each interval for 1 rad/s gyro and 1 m/s² accelerometer noise.
+    """Return the process noise of each interval for unit noise of gyro and of accelerometer.
 
-    A prediction step of length d adds d² to the variance of attitude or velocity. The specific
-    force is assumed to be constant in the interval. For the effect of gyro noise on velocity and
-    position, only the leading terms are used.
+    A noise of 1 rad/s or 1 m/s² in a prediction step of length d adds d² to the variance of
+    attitude or velocity. The specific force is assumed to be constant in the interval. For the
+    effect of gyro noise on velocity and position, only the leading terms are used.
     """
-    n = np.maximum(step_counts, 1.0)[:, None, None]
+    n = np.maximum(prediction_step_counts, 1.0)[:, None, None]
     d = duration_s[:, None, None] / n
     # m: velocity change (m/s) per attitude error (rad) in one of n equal prediction steps
-    m = velocity_per_attitude_error / n
+    m = velocity_derivative_by_attitude / n
     mm = m @ m.transpose(0, 2, 1)
     eye = np.eye(3)
-    gyro_noise, accelerometer_noise = np.zeros(
-        (2, len(step_counts), IMU_STATE_COUNT, IMU_STATE_COUNT)
+    gyro_noise_covariance, accelerometer_noise_covariance = np.zeros(
+        (2, len(prediction_step_counts), MOTION_STATE_COUNT, MOTION_STATE_COUNT)
     )
     for matrix, rows, columns, block in (
-        (gyro_noise, THETA, THETA, n * d**2 * eye),
-        (gyro_noise, VELOCITY, THETA, m * d**2 * n * (n - 1) / 2),
-        (gyro_noise, POSITION, THETA, m * d**3 * n * (n - 1) * (n - 2) / 6),
-        (gyro_noise, VELOCITY, VELOCITY, mm * d**2 * n * (n - 1) * (2 * n - 1) / 6),
-        (gyro_noise, POSITION, VELOCITY, mm * d**3 * n**4 / 8),
-        (gyro_noise, POSITION, POSITION, mm * d**4 * n**5 / 20),
-        (accelerometer_noise, VELOCITY, VELOCITY, n * d**2 * eye),
-        (accelerometer_noise, POSITION, VELOCITY, d**3 * n * (n - 1) / 2 * eye),
-        (accelerometer_noise, POSITION, POSITION, d**4 * n * (n - 1) * (2 * n - 1) / 6 * eye),
+        (gyro_noise_covariance, THETA, THETA, n * d**2 * eye),
+        (gyro_noise_covariance, VELOCITY, THETA, m * d**2 * n * (n - 1) / 2),
+        (gyro_noise_covariance, POSITION, THETA, m * d**3 * n * (n - 1) * (n - 2) / 6),
+        (gyro_noise_covariance, VELOCITY, VELOCITY, mm * d**2 * n * (n - 1) * (2 * n - 1) / 6),
+        (gyro_noise_covariance, POSITION, VELOCITY, mm * d**3 * n**4 / 8),
+        (gyro_noise_covariance, POSITION, POSITION, mm * d**4 * n**5 / 20),
+        (accelerometer_noise_covariance, VELOCITY, VELOCITY, n * d**2 * eye),
+        (accelerometer_noise_covariance, POSITION, VELOCITY, d**3 * n * (n - 1) / 2 * eye),
+        (
+            accelerometer_noise_covariance,
+            POSITION,
+            POSITION,
+            d**4 * n * (n - 1) * (2 * n - 1) / 6 * eye,
+        ),
     ):
         matrix[:, rows, columns] = block
         if rows != columns:
             matrix[:, columns, rows] = block.transpose(0, 2, 1)
-    return gyro_noise, accelerometer_noise
+    return gyro_noise_covariance, accelerometer_noise_covariance

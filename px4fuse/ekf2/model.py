@@ -1,9 +1,10 @@
 """Replay of EKF2 with logged or changed parameters, from a log with PX4's default profile.
 
-The model has 15 error states, linearised about the published attitude, and starts from the logged
-``estimator_states``. It fuses the logged positions; with GNSS also velocities and, if logged,
-heights and the magnetometer (21 states). A height or heading without a fused sensor is EKF2's
-published one. :mod:`px4fuse.ekf2.replay` compares each replay with the log.
+The model has 15 error states, linearised about the published attitude. It starts from the logged
+``estimator_states``, and fuses the logged positions. With GNSS, the model also fuses velocities
+and, if logged, heights and the magnetometer (21 states). If no height sensor or magnetometer is
+fused, the model uses EKF2's published height or heading. :mod:`px4fuse.ekf2.replay` compares the
+replay with the log.
 
 All filter configurations (parameters, states, aiding sources, gate) run together, to save time.
 """
@@ -23,7 +24,8 @@ from px4fuse.core.record import Span
 from px4fuse.ekf2.filter_recursion import (
     HEADING,
     HORIZONTAL_POSITION,
-    POSITION_COLUMNS,
+    HORIZONTAL_POSITION_COLUMNS,
+    VELOCITY_AND_POSITION,
     FilterConfiguration,
     SegmentRun,
     estimate_state_correlation,
@@ -31,15 +33,15 @@ from px4fuse.ekf2.filter_recursion import (
 )
 from px4fuse.ekf2.heights import MIN_INNOVATION_GATE
 from px4fuse.ekf2.inputs import ANALYSIS_NAME, ReplayInputs, find_matching_samples, prepare_inputs
-from px4fuse.ekf2.intervals import EventIntervals, FusionDelays, make_intervals
+from px4fuse.ekf2.intervals import EventIntervals, FusionDelays, make_event_intervals
 from px4fuse.ekf2.output_predictor import compute_published_state, sum_attitude_corrections
 from px4fuse.ekf2.replay import (
     HORIZONTAL_AXES,
-    MAX_COMPARED_REJECTED_FRACTION,
+    MAX_REJECTED_FRACTION_FOR_COMPARISON,
     Agreement,
     Ekf2Replay,
     compare_with_log,
-    with_logged_rejections,
+    judge_with_logged_rejections,
 )
 from px4fuse.ekf2.replay_segments import (
     ACCELEROMETER_BIAS,
@@ -76,23 +78,22 @@ MAX_HORIZON_DELAY_S = 1.0
 REPLAY_BATCH_SIZE = 10
 # Number of intervals whose states are computed at once, which limits memory
 EVENTS_PER_BLOCK = 512
-# State indices of velocity and position
-VELOCITY_AND_POSITION = slice(VELOCITY.start, POSITION.stop)
 
-# Field of Agreement by PX4's name of an aiding source, if their names differ
-AGREEMENT_FIELD_BY_AID = {FLOW.name: "carried_difference_m"}
+# Field of Agreement with the result of an aiding source, if it differs from PX4's name of the
+# source
+AGREEMENT_FIELD_BY_AID_NAME = {FLOW.name: "carried_difference_m"}
 
-ConfigurationRequest = Callable[[ReplayInputs], Sequence[FilterConfiguration]]
+ListConfigurations = Callable[[ReplayInputs], Sequence[FilterConfiguration]]
 
 
 @dataclass(frozen=True)
 class Ekf2Model:
-    """Flight data for replays of EKF2 with other parameters.
+    """Inputs for replays of EKF2 with other parameters, and results that are already computed.
 
     Attributes
     ----------
-    intervals : mapping from FusionDelays to tuple of EventIntervals
-        State transitions between events that are already computed, for each segment.
+    event_intervals_by_delays : mapping from FusionDelays to tuple of EventIntervals
+        Computed state transitions between the fusions of each segment.
     baseline_replay : Ekf2Replay
         Replay with the logged parameters; ``agreement`` compares it with the log.
     runs : tuple of SegmentRun
@@ -101,41 +102,46 @@ class Ekf2Model:
 
     flight: Flight
     inputs: ReplayInputs
-    intervals: Mapping[FusionDelays, tuple[EventIntervals, ...]]
+    event_intervals_by_delays: Mapping[FusionDelays, tuple[EventIntervals, ...]]
     baseline_replay: Ekf2Replay
     agreement: Agreement
     runs: tuple[SegmentRun, ...] = ()
 
 
 def prepare_ekf2_model(
-    flight: Flight, request_configurations: ConfigurationRequest = lambda _: ()
+    flight: Flight, list_later_configurations: ListConfigurations = lambda _: ()
 ) -> Ekf2Model | Unavailable:
     """Prepare a flight for EKF2 replays, and replay it with the logged parameters.
 
-    ``request_configurations`` returns filter configurations that will be needed later. They run
-    together with the logged parameters, to save time.
+    ``list_later_configurations`` returns filter configurations that will be needed later. To save
+    time, these configurations are computed in the same run as the logged parameters.
     """
-    failed_agreements: dict[str, Agreement] = {}
+    failed_agreement_by_aid: dict[str, Agreement] = {}
     while not isinstance(
-        model := _prepare_without_aids(flight, request_configurations, failed_agreements),
+        model := _prepare_without_aids(flight, list_later_configurations, failed_agreement_by_aid),
         Unavailable,
     ):
-        if not (further_omitted_aids := model.agreement.doubtful.keys() - failed_agreements.keys()):
+        if not (
+            further_omitted_aids := model.agreement.doubtful.keys() - failed_agreement_by_aid.keys()
+        ):
             break
-        failed_agreements |= dict.fromkeys(further_omitted_aids, model.agreement)
+        failed_agreement_by_aid |= dict.fromkeys(further_omitted_aids, model.agreement)
     return model
 
 
 def _prepare_without_aids(
     flight: Flight,
-    request_configurations: ConfigurationRequest,
-    failed_agreements: Mapping[str, Agreement],
+    list_later_configurations: ListConfigurations,
+    failed_agreement_by_aid: Mapping[str, Agreement],
 ) -> Ekf2Model | Unavailable:
     """Prepare a replay without the aiding sources whose earlier replay disagreed with the log.
 
-    ``failed_agreements`` contains the agreement of the earlier replay by PX4's name of the source.
+    ``failed_agreement_by_aid`` contains the agreement of the earlier replay by PX4's name of the
+    source.
     """
-    omitted_aids = {name: agreement.doubtful[name] for name, agreement in failed_agreements.items()}
+    omitted_aids = {
+        name: agreement.doubtful[name] for name, agreement in failed_agreement_by_aid.items()
+    }
     inputs = prepare_inputs(flight, omitted_aids)
     if isinstance(inputs, Unavailable):
         return structs.replace(inputs, what=ANALYSIS_NAME)
@@ -143,40 +149,44 @@ def _prepare_without_aids(
         flight = replace(flight, ekf2=replace_vision_by_gnss_innovations(flight.ekf2))
     baseline_configuration = FilterConfiguration(inputs.settings)
     delays = baseline_configuration.compute_delays(inputs)
-    intervals = tuple(make_intervals(inputs, segment, delays) for segment in inputs.segments)
+    intervals = tuple(make_event_intervals(inputs, segment, delays) for segment in inputs.segments)
     segments = tuple(estimate_state_correlation(inputs, segment) for segment in inputs.segments)
     inputs = replace(inputs, segments=segments)
     configurations = [baseline_configuration]
-    if np.mean(inputs.received.rejected > 0.0) > MAX_COMPARED_REJECTED_FRACTION:
+    if (
+        np.mean(inputs.received_positions.rejected_flags > 0.0)
+        > MAX_REJECTED_FRACTION_FOR_COMPARISON
+    ):
         configurations.append(FilterConfiguration(inputs.settings, uses_logged_decisions=True))
-    for configuration in request_configurations(inputs):
+    for configuration in list_later_configurations(inputs):
         configurations += [] if configuration in configurations else [configuration]
-    intervals_by_delays = {delays: intervals}
-    runs = run_configurations(inputs, configurations, intervals_by_delays)
+    event_intervals_by_delays = {delays: intervals}
+    runs = run_configurations(inputs, configurations, event_intervals_by_delays)
     baseline_replay = _make_replay(inputs, runs, baseline_configuration, {})
     agreement = compare_with_log(flight, baseline_replay)
     if isinstance(agreement, Unavailable):
         return agreement
-    model = Ekf2Model(flight, inputs, intervals_by_delays, baseline_replay, agreement, tuple(runs))
-    rejected_fraction = max(
-        agreement.rejected_fraction_logged, agreement.rejected_fraction_replayed
+    model = Ekf2Model(
+        flight, inputs, event_intervals_by_delays, baseline_replay, agreement, tuple(runs)
     )
     if (
-        rejected_fraction > MAX_COMPARED_REJECTED_FRACTION
-        and np.isfinite(inputs.received.rejected).any()
+        max(agreement.rejected_fraction_logged, agreement.rejected_fraction_replayed)
+        > MAX_REJECTED_FRACTION_FOR_COMPARISON
+        and np.isfinite(inputs.received_positions.rejected_flags).any()
     ):
         agreement_with_rejections = compare_with_log(flight, replay_with_logged_rejections(model))
         if isinstance(agreement_with_rejections, Agreement):
-            agreement = with_logged_rejections(agreement, agreement_with_rejections)
-    # For each omitted source, report the agreement of the earlier replay that fused the source
-    failed_results = {
-        (field_name := AGREEMENT_FIELD_BY_AID.get(name, name)): getattr(
+            agreement = judge_with_logged_rejections(agreement, agreement_with_rejections)
+    # This replay does not fuse the omitted sources. Their agreement with the log is therefore taken
+    # from the earlier replay that fused them
+    failed_agreement_by_field = {
+        (field_name := AGREEMENT_FIELD_BY_AID_NAME.get(name, name)): getattr(
             failed_agreement, field_name
         )
-        for name, failed_agreement in failed_agreements.items()
+        for name, failed_agreement in failed_agreement_by_aid.items()
     }
     agreement = structs.replace(
-        agreement, doubtful={**omitted_aids, **agreement.doubtful}, **failed_results
+        agreement, doubtful={**omitted_aids, **agreement.doubtful}, **failed_agreement_by_field
     )
     return replace(
         model,
@@ -195,7 +205,7 @@ def replay_with_settings(
     model: Ekf2Model,
     settings: Sequence[Mapping[str, float]],
     excluded_times_s: Array | None = None,
-    without: Mapping[str, float] | None = None,
+    disable_time_s_by_aid: Mapping[str, float] | None = None,
 ) -> Iterator[Ekf2Replay]:
     """Replay EKF2 with several sets of changed parameters.
 
@@ -208,7 +218,7 @@ def replay_with_settings(
         Changed parameters of each replay, by PX4 name and in PX4's units.
     excluded_times_s : ndarray, optional
         Timestamps of position samples that are not used.
-    without : mapping from PX4's name of an aiding source to float, optional
+    disable_time_s_by_aid : mapping from PX4's name of an aiding source to float, optional
         Time (s) from which the aiding source is not fused.
 
     Raises
@@ -221,52 +231,58 @@ def replay_with_settings(
     unmodelled_parameters = PARAMETERS.keys() - inputs.settings.keys()
     reasons = dict.fromkeys(
         unmodelled_parameters,
-        f"EKF2 fused {inputs.aid.label}, which this parameter does not affect",
+        f"the parameter does not affect {inputs.aid.label}, the position source of EKF2",
     )
-    logged_height_text = f"the replay uses the logged EKF2 height ({inputs.logged_height_reason})"
+    logged_height_text = (
+        f"the replay uses the logged EKF2 height ({inputs.reason_for_logged_height})"
+    )
     if inputs.aid == GNSS_POS:
         for parameter_names, reason in (
             (
                 MAG.measurement_parameters.union(MAGNETIC_FIELD_NOISE_PARAMETERS),
-                "the log lacks some fused magnetometer samples",
+                "the log does not contain all magnetometer samples that EKF2 fused",
             ),
             (
                 BAROMETER.measurement_parameters,
                 logged_height_text
-                if inputs.logged_height_reason
+                if inputs.reason_for_logged_height
                 else "EKF2 fused no barometer height",
             ),
         ):
             reasons |= dict.fromkeys(unmodelled_parameters & parameter_names, reason)
-    if inputs.rules.uses_delay_as_horizon:
-        firmware = model.flight.log.firmware
+    if inputs.rules.is_horizon_largest_delay:
         reasons["EKF2_DELAY_MAX"] = (
-            f"in {firmware} the largest delay parameter is the delay of the fusion horizon, not "
-            "EKF2_DELAY_MAX"
+            f"{model.flight.log.firmware} has no such parameter. The largest EKF2 delay parameter "
+            "sets the delay of the fusion horizon"
         )
-    if inputs.received.uses_sender_times:
-        reasons[GNSS_POS.delay] = "EKF2 uses the measurement times of the receiver driver"
+    if inputs.received_positions.uses_sender_timestamps:
+        reasons[GNSS_POS.delay] = "EKF2 uses measurement times that the GNSS driver reports"
     for name in [name for change in changes for name in change if name in reasons]:
         raise SettingsError(f"{name} has no effect in a replay of this log: {reasons[name]}.")
-    without = without or {}
-    fused_aids = list_modelled_aids(inputs) if without else []
-    if unknown_aids := without.keys() - set(fused_aids):
+    disable_time_s_by_aid = disable_time_s_by_aid or {}
+    fused_aids = list_modelled_aids(inputs) if disable_time_s_by_aid else []
+    if unknown_aids := disable_time_s_by_aid.keys() - set(fused_aids):
         fused_aids_text = ", ".join(fused_aids)
-        if inputs.logged_height_reason:
+        if inputs.reason_for_logged_height:
             fused_aids_text = f"{fused_aids_text}; {logged_height_text}"
         raise SettingsError(
             f"{min(unknown_aids)} cannot be omitted: the replay of this log fuses only "
             f"{fused_aids_text}."
         )
     if excluded_times_s is not None:
-        excluded_rows = find_matching_samples(inputs.received.timestamp_s, excluded_times_s)
-        rejected_flags = np.full(len(inputs.received.timestamp_s), np.nan)
+        excluded_rows = find_matching_samples(
+            inputs.received_positions.timestamp_s, excluded_times_s
+        )
+        rejected_flags = np.full(len(inputs.received_positions.timestamp_s), np.nan)
         rejected_flags[excluded_rows[excluded_rows >= 0]] = 1.0
         is_reset = np.zeros(len(rejected_flags), dtype=bool)
         inputs = replace(
             inputs,
-            received=replace(
-                inputs.received, rejected=rejected_flags, reset=is_reset, has_all_resets=False
+            received_positions=replace(
+                inputs.received_positions,
+                rejected_flags=rejected_flags,
+                is_reset_to_sample=is_reset,
+                is_every_reset_logged=False,
             ),
         )
         model = replace(model, inputs=inputs, runs=())
@@ -274,7 +290,7 @@ def replay_with_settings(
         FilterConfiguration(
             {**inputs.settings, **change},
             uses_logged_decisions=excluded_times_s is not None,
-            without=without,
+            disable_time_s_by_aid=disable_time_s_by_aid,
         )
         for change in changes
     ]
@@ -311,8 +327,8 @@ def list_modelled_aids(inputs: ReplayInputs) -> list[str]:
     segment = inputs.segments[0]
     is_fused = {
         inputs.aid: True,
-        GNSS_VEL: inputs.received.velocity_m_s is not None,
-        EV_POS: inputs.aid == EV_POS or inputs.vision is not None,
+        GNSS_VEL: inputs.received_positions.velocity_m_s is not None,
+        EV_POS: inputs.aid == EV_POS or inputs.vision_positions is not None,
         MAG: MAG.noise in inputs.settings,
         FLOW: segment.flow is not None,
     }
@@ -324,20 +340,24 @@ def add_position_noise(model: Ekf2Model, sigma_m: float, seed: int) -> Ekf2Model
     """Add normal noise with standard deviation ``sigma_m`` (m) to each position in the inputs."""
     inputs = model.inputs
     rng = np.random.default_rng(seed)
-    new_inputs: dict[str, Any] = {}
-    for name, samples in {"received": inputs.received, "vision": inputs.vision}.items():
+    noisy_inputs: dict[str, Any] = {}
+    for name, samples in {
+        "received_positions": inputs.received_positions,
+        "vision_positions": inputs.vision_positions,
+    }.items():
         if samples is not None:
             position_noise_m = rng.normal(scale=sigma_m, size=samples.position_m.shape)
-            new_inputs[name] = replace(samples, position_m=samples.position_m + position_noise_m)
-    # Noise changes no times, so the computed intervals stay valid; earlier runs do not
-    return replace(model, inputs=replace(inputs, **new_inputs), runs=())
+            noisy_inputs[name] = replace(samples, position_m=samples.position_m + position_noise_m)
+    # The noise does not change the times of fusions: the computed intervals are kept. Results of
+    # earlier runs are deleted
+    return replace(model, inputs=replace(inputs, **noisy_inputs), runs=())
 
 
 def misalign_positions(model: Ekf2Model, rotation_deg: float, delay_s: float) -> Ekf2Model:
     """Rotate the positions in the inputs (clockwise from above), and delay their timestamps."""
     if not rotation_deg and not delay_s:
         return model
-    received_positions = model.inputs.received
+    received_positions = model.inputs.received_positions
     rotation_matrix = Rotation.from_euler("z", rotation_deg, degrees=True).as_matrix().T
     velocity_m_s = received_positions.velocity_m_s
     received_positions = replace(
@@ -346,9 +366,9 @@ def misalign_positions(model: Ekf2Model, rotation_deg: float, delay_s: float) ->
         position_m=received_positions.position_m @ rotation_matrix,
         velocity_m_s=None if velocity_m_s is None else velocity_m_s @ rotation_matrix,
     )
-    intervals = {} if delay_s else model.intervals
-    inputs = replace(model.inputs, received=received_positions)
-    return replace(model, inputs=inputs, intervals=intervals, runs=())
+    intervals = {} if delay_s else model.event_intervals_by_delays
+    inputs = replace(model.inputs, received_positions=received_positions)
+    return replace(model, inputs=inputs, event_intervals_by_delays=intervals, runs=())
 
 
 def compute_delayed_tracks(
@@ -374,37 +394,44 @@ def _run_model(
         configuration in model.runs[0].configurations for configuration in configurations
     ):
         return model.runs
-    return run_configurations(model.inputs, configurations, model.intervals)
+    return run_configurations(model.inputs, configurations, model.event_intervals_by_delays)
 
 
 def run_configurations(
     inputs: ReplayInputs,
     configurations: Sequence[FilterConfiguration],
-    computed_intervals: Mapping[FusionDelays, Sequence[EventIntervals]],
+    event_intervals_by_delays: Mapping[FusionDelays, Sequence[EventIntervals]],
 ) -> list[SegmentRun]:
     """Run filter configurations through all segments, and return states and updates by segment.
 
-    ``computed_intervals``: transition and process noise of each segment, if already computed.
+    ``event_intervals_by_delays``: transition and process noise of each segment, if already
+    computed.
     """
-    all_delays = [configuration.compute_delays(inputs) for configuration in configurations]
+    delays_by_configuration = [
+        configuration.compute_delays(inputs) for configuration in configurations
+    ]
     segment_runs = []
     for segment_index, segment in enumerate(inputs.segments):
         intervals = {
-            delays: by_segment[segment_index] for delays, by_segment in computed_intervals.items()
+            delays: by_segment[segment_index]
+            for delays, by_segment in event_intervals_by_delays.items()
         }
-        for delays in set(all_delays) - computed_intervals.keys():
-            intervals[delays] = make_intervals(inputs, segment, delays)
+        for delays in set(delays_by_configuration) - event_intervals_by_delays.keys():
+            intervals[delays] = make_event_intervals(inputs, segment, delays)
         segment_runs.append(
             run_segment(
-                inputs, segment, configurations, [intervals[delays] for delays in all_delays]
+                inputs,
+                segment,
+                configurations,
+                [intervals[delays] for delays in delays_by_configuration],
             )
         )
     return segment_runs
 
 
 def _make_track(run: SegmentRun, position_m: Array, velocity_m_s: Array) -> pd.DataFrame:
-    """Return position, scaled like EKF2's published position, and velocity after each step."""
-    states = np.hstack([position_m / run.segment.position_scale, velocity_m_s])
+    """Return the track after each step: velocity, and position in EKF2's published coordinates."""
+    states = np.hstack([position_m / run.segment.internal_to_published_ratio, velocity_m_s])
     return pd.DataFrame(states, time_index(run.segment.time_s), Columns.STATE, copy=False)
 
 
@@ -420,7 +447,7 @@ def _make_replay(
     changed_parameters: Mapping[str, float],
 ) -> Ekf2Replay:
     configuration_index = runs[0].configurations.index(configuration)
-    delayed_tracks, published_tracks = zip(
+    horizon_tracks, published_tracks = zip(
         *(_make_state_tracks(inputs, run, configuration_index) for run in runs),
         strict=True,
     )
@@ -433,19 +460,19 @@ def _make_replay(
     }
     return Ekf2Replay(
         settings=configuration.settings,
-        changed=dict(changed_parameters),
+        changed_parameters=dict(changed_parameters),
         updates=updates_by_aid.pop(inputs.aid.name),
-        flow_only_spans_s=tuple(
+        optical_flow_only_spans_s=tuple(
             span
             for run, updates in zip(runs, aid_updates_of_runs, strict=True)
             if run.segment.flow is not None
             for span in _find_flow_only_spans(updates[inputs.aid.name], run.segment)
         ),
-        delayed=_join_segments(delayed_tracks),
-        published=_join_segments(published_tracks),
+        delayed_state=_join_segments(horizon_tracks),
+        published_state=_join_segments(published_tracks),
         other_aid_updates=updates_by_aid,
         stretches_s=tuple(tuple(run.segment.time_s[[0, -1]].tolist()) for run in runs),
-        source=inputs.received.source,
+        source=inputs.received_positions.source,
         late=sum(int(run.events[configuration_index].late.sum()) for run in runs),
         lost=sum(int(run.events[configuration_index].lost.sum()) for run in runs),
     )
@@ -465,7 +492,7 @@ def _find_flow_only_spans(updates: pd.DataFrame, segment: ReplaySegment) -> list
 def _collect_updates_by_aid(
     inputs: ReplayInputs, run: SegmentRun, configuration_index: int
 ) -> dict[str, pd.DataFrame]:
-    """Return the updates with each aiding source; the keys are PX4's names of the sources."""
+    """Return the updates of one configuration by PX4's name of the aiding source."""
     events, height_filter = run.events[configuration_index], run.height_filter
     end_s = run.segment.time_s[events.end_step]
     nu, S, R, rejected, fused, reset, variance_after = (
@@ -491,18 +518,18 @@ def _collect_updates_by_aid(
     updates_by_aid = {
         inputs.aid.name: make_axis_table(
             HORIZONTAL_AXES,
-            POSITION_COLUMNS,
+            HORIZONTAL_POSITION_COLUMNS,
             rejected,
             fused,
             reset,
             position_variance,
-            R[:, POSITION_COLUMNS],
+            R[:, HORIZONTAL_POSITION_COLUMNS],
         )
     }
     if height_filter is not None:
         for name in height_filter.fused_sensors:
             updates_by_aid[name] = height_filter.make_update_table(name, configuration_index, end_s)
-    if inputs.received.velocity_m_s is not None:
+    if inputs.received_positions.velocity_m_s is not None:
         gate = run.configurations[configuration_index].settings[GNSS_VEL.gate]
         # Innovations that EKF2 clipped to the gate count as inside: the factor allows for rounding
         squared_gate = (1.0 + 1e-9) * max(gate, MIN_INNOVATION_GATE) ** 2
@@ -538,16 +565,17 @@ def _make_state_tracks(
     heading_rad = (
         np.arctan2(segment.body_to_ned[:, 1, 0], segment.body_to_ned[:, 0, 0]) + state[:, HEADING]
     )
-    delayed_track = _make_track(run, state[:, POSITION], state[:, VELOCITY])
-    return delayed_track.assign(heading_rad=heading_rad), _make_track(
+    horizon_track = _make_track(run, state[:, POSITION], state[:, VELOCITY])
+    return horizon_track.assign(heading_rad=heading_rad), _make_track(
         run, published_position, published_velocity
     )
 
 
 def compute_delayed_states(run: SegmentRun, configuration_index: int) -> tuple[Array, Array]:
-    """Return state and sum of position resets (m) at the fusion horizon after each of n steps.
+    """Return the state at the fusion horizon after each of n prediction steps.
 
-    Shapes (n + 1, 15) and (n + 1, 3).
+    The shape is (n + 1, 15) or more. The second array, shape (n + 1, 3), contains the sum (m) of
+    all position resets before each state.
     """
     event_steps = run.events[configuration_index].end_step
     cumulative_reset_m = np.zeros((len(run.segment.time_s), 3))
@@ -566,10 +594,10 @@ def _compute_states_after_steps(run: SegmentRun, configuration_index: int, rows:
     states = np.empty((step_count + 1, event_states[0, rows].size))
     states[0] = event_states[0, rows]
     # Blocks of intervals, because the arrays of a whole flight need much memory
-    block_edges = np.searchsorted(
+    block_boundaries = np.searchsorted(
         interval_index, np.arange(0, len(event_steps) + 1, EVENTS_PER_BLOCK)
     )
-    for steps in starmap(slice, pairwise([*block_edges, step_count])):
+    for steps in starmap(slice, pairwise([*block_boundaries, step_count])):
         states[1:][steps] = _propagate_states(
             run, configuration_index, interval_index[steps], steps
         )[:, rows]
@@ -600,9 +628,9 @@ def _propagate_states(
     # θ += -R b_g Δt; v += (θ × a - R b_a + a + g) Δt; p += mean velocity · Δt
     rotation_increments_rad = -rotate(body_to_ned, state[:, GYRO_BIAS]) * step_s
     if configuration.estimates_attitude:
-        rotation_increments_rad -= segment.correction_rad[steps]
+        rotation_increments_rad -= segment.attitude_correction_rad[steps]
     state[:, THETA] += sum_since_event(rotation_increments_rad)
-    specific_force_ned_m_s2 = rotate(body_to_ned, segment.force_m_s2[steps])
+    specific_force_ned_m_s2 = rotate(body_to_ned, segment.specific_force_m_s2[steps])
     acceleration = (
         np.cross(get_state_before_step(THETA), specific_force_ned_m_s2)
         + specific_force_ned_m_s2

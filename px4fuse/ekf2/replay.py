@@ -25,7 +25,7 @@ from px4fuse.core.text import format_count
 from px4fuse.ekf2.inputs import (
     ANALYSIS_NAME,
     find_matching_samples,
-    find_replayed_aid,
+    find_replayed_position_source,
     innovation_topic,
 )
 from px4fuse.ekf2.replay_segments import REPLAY_SETTLING_S
@@ -59,7 +59,7 @@ SAME_STEP_TOLERANCE_S = 0.002
 MIN_INNOVATION_CORRELATION = 0.95
 # Maximum |median of (S replayed / S logged) - 1|: below 0.003 with complete logs, above 0.05 with a
 # downsampled position source
-MAX_S_RATIO_DEVIATION = 0.05
+MAX_INNOVATION_VARIANCE_RATIO_DEVIATION = 0.05
 # Maximum RMS difference (m) of replayed and logged position: below 0.013 m with complete logs
 MAX_PUBLISHED_DIFFERENCE_M = 0.10
 # Maximum difference (m) of replayed and logged position while optical flow, which is logged at a
@@ -67,19 +67,20 @@ MAX_PUBLISHED_DIFFERENCE_M = 0.10
 MAX_FLOW_ONLY_DIFFERENCE_M = 0.5
 # Innovations are compared sample by sample only if less than this fraction is rejected, because
 # each rejection changes many later innovations
-MAX_COMPARED_REJECTED_FRACTION = 0.05
+MAX_REJECTED_FRACTION_FOR_COMPARISON = 0.05
 # Published positions are compared only if less than this fraction of the samples is rejected. With
 # more rejections, EKF2's position is mostly integrated from the IMU
 MOSTLY_REJECTED_FRACTION = 0.5
-# Minimum correlation of replayed and logged innovations above MOSTLY_REJECTED_FRACTION
-MIN_IMU_DRIVEN_CORRELATION = 0.99
+# Minimum correlation of replayed and logged innovations if more than MOSTLY_REJECTED_FRACTION of
+# the samples is rejected
+MIN_CORRELATION_IF_MOSTLY_REJECTED = 0.99
 # Maximum |rejected fraction of the replay - rejected fraction in the log|
-MAX_REJECTED_DEVIATION = 0.05
+MAX_REJECTED_FRACTION_DIFFERENCE = 0.05
 # Maximum |mean NIS of the replay / mean NIS in the log - 1|
 MAX_RELATIVE_NIS_DIFFERENCE = 0.25
-# On flights with many rejections, the replay uses EKF2's logged rejections, and this factor
-# increases MAX_PUBLISHED_DIFFERENCE_M
-REJECTION_TOLERANCE_FACTOR = 3.0
+# Factor on MAX_PUBLISHED_DIFFERENCE_M for flights with many rejections, in which the replay uses
+# EKF2's logged rejections
+DIFFERENCE_FACTOR_WITH_MANY_REJECTIONS = 3.0
 
 
 class AxisAgreement(Record, kw_only=True):
@@ -155,7 +156,7 @@ class Agreement(Record, kw_only=True):
 
     @property
     def axes(self) -> Mapping[str, AxisAgreement]:
-        """Agreement of the position innovations by horizontal axis."""
+        """Agreement of replayed and logged position innovations, by horizontal axis."""
         return {"north": self.north, "east": self.east}
 
     def as_unavailable(self, result_name: str) -> Unavailable:
@@ -183,12 +184,12 @@ class Ekf2Replay(Record, kw_only=True, omit_defaults=False):
     late, lost : int
         Number of samples that were fused late, and number of samples too late to be fused.
     updates : DataFrame, one row per position sample, at EKF2's measurement time
-        See :func:`~px4fuse.ekf2.replay_segments.update_table`.
+        See :func:`~px4fuse.ekf2.replay_segments.make_update_table`.
     other_aid_updates : mapping from PX4's name to DataFrame
         Updates with GNSS velocity (m/s), GNSS height, barometer, and vision in addition to GNSS.
-    flow_only_spans_s : tuple of (float, float)
+    optical_flow_only_spans_s : tuple of (float, float)
         Times in which optical flow was the only horizontal aiding source.
-    delayed, published : DataFrame
+    delayed_state, published_state : DataFrame
         State (NED) at the fusion horizon, and as published, after each prediction step.
     """
 
@@ -198,22 +199,23 @@ class Ekf2Replay(Record, kw_only=True, omit_defaults=False):
     late: Count = 0
     lost: Count = 0
     agreement: Agreement | None = None
-    changed: NotWritten[Mapping[str, float]] = NOT_WRITTEN
+    changed_parameters: NotWritten[Mapping[str, float]] = NOT_WRITTEN
     updates: NotWritten[pd.DataFrame] = NOT_WRITTEN
-    delayed: NotWritten[pd.DataFrame] = NOT_WRITTEN
-    published: NotWritten[pd.DataFrame] = NOT_WRITTEN
+    delayed_state: NotWritten[pd.DataFrame] = NOT_WRITTEN
+    published_state: NotWritten[pd.DataFrame] = NOT_WRITTEN
     other_aid_updates: NotWritten[Mapping[str, pd.DataFrame]] = NOT_WRITTEN
-    flow_only_spans_s: NotWritten[Spans] = NOT_WRITTEN
+    optical_flow_only_spans_s: NotWritten[Spans] = NOT_WRITTEN
 
     def find_evaluated_spans(self) -> Spans:
-        """Return the replayed time spans (s) for comparisons.
+        """Return the time spans (s) in which the replay is compared with the log.
 
-        They exclude times with optical flow alone, and REPLAY_SETTLING_S after each start.
+        The first REPLAY_SETTLING_S of each replayed segment are excluded. Times in which optical
+        flow was the only horizontal aiding source are also excluded.
         """
         evaluated_spans_s = []
         for start, end in self.stretches_s:
             begin_s = start + REPLAY_SETTLING_S
-            for flow_start, flow_end in self.flow_only_spans_s:
+            for flow_start, flow_end in self.optical_flow_only_spans_s:
                 if begin_s < flow_start < end:
                     evaluated_spans_s.append((begin_s, flow_start))
                     begin_s = flow_end + REPLAY_SETTLING_S
@@ -223,17 +225,15 @@ class Ekf2Replay(Record, kw_only=True, omit_defaults=False):
 
 
 class _ComparedInnovations(NamedTuple):
-    """Logged and replayed innovations of common samples, and agreement along each axis."""
+    """Innovations of the samples that log and replay both contain, with the agreement by axis."""
 
     logged: pd.DataFrame
     replayed: pd.DataFrame
     agreement_by_axis: dict[str, AxisAgreement]
 
-    def compute_rejected_fractions(self) -> tuple[float, float]:
-        logged_rejected_fraction, replayed_rejected_fraction = (
-            float(np.mean(innovations["rejected"] > 0.0)) for innovations in self[:2]
-        )
-        return logged_rejected_fraction, replayed_rejected_fraction
+    def compute_rejected_fractions(self) -> list[float]:
+        """Return the rejected fraction in the log, and the rejected fraction in the replay."""
+        return [float(np.mean(innovations["rejected"] > 0.0)) for innovations in self[:2]]
 
 
 def compare_with_log(flight: Flight, replay: Ekf2Replay) -> Agreement | Unavailable:
@@ -246,55 +246,58 @@ def compare_with_log(flight: Flight, replay: Ekf2Replay) -> Agreement | Unavaila
             "EKF2's position is not logged in the replayed time",
             "Record vehicle_local_position during the whole flight.",
         )
-    aid = find_replayed_aid(ekf2)
-    position_agreement = _compare_innovations(
+    aid = find_replayed_position_source(ekf2)
+    position_comparison = _compare_innovations(
         ekf2,
         replay,
         replay.updates,
         logged_innovations(ekf2),
         innovation_topic(aid) in ekf2.innovation_topics,
     )
-    if isinstance(position_agreement, str):
+    if isinstance(position_comparison, str):
         return Unavailable(
             ANALYSIS_NAME,
-            position_agreement,
+            position_comparison,
             "Record a longer flight with motion, with SDLOG_PROFILE bit 0 (default).",
         )
     rejected_fraction_logged, rejected_fraction_replayed = (
-        position_agreement.compute_rejected_fractions()
+        position_comparison.compute_rejected_fractions()
     )
+    agreement_by_axis = position_comparison.agreement_by_axis
     is_in_agreement, reason = _judge_agreement(
-        position_agreement.agreement_by_axis, rejected_fraction_logged, rejected_fraction_replayed
+        agreement_by_axis, rejected_fraction_logged, rejected_fraction_replayed
     )
     agreement_by_aid, omitted_aids = _compare_other_aids(ekf2, replay)
-    flow_only_difference_m = _compute_flow_only_difference_m(ekf2, replay)
-    if flow_only_difference_m is not None and flow_only_difference_m > MAX_FLOW_ONLY_DIFFERENCE_M:
+    flow_position_difference_m = _compute_flow_position_difference_m(ekf2, replay)
+    if (
+        flow_position_difference_m is not None
+        and flow_position_difference_m > MAX_FLOW_ONLY_DIFFERENCE_M
+    ):
         omitted_aids[FLOW.name] = (
             f"while {FLOW.label} was the only horizontal aiding source, replayed and logged "
-            "positions differ by "
-            f"{_format_above_limit(flow_only_difference_m, MAX_FLOW_ONLY_DIFFERENCE_M)} m "
+            "positions differed by "
+            f"{_format_unlike_limit(flow_position_difference_m, MAX_FLOW_ONLY_DIFFERENCE_M)} m "
             f"(limit {MAX_FLOW_ONLY_DIFFERENCE_M:g} m)"
         )
-    is_same_decision = (position_agreement.logged["rejected"] > 0.0).to_numpy() == (
-        position_agreement.replayed["rejected"] > 0.0
+    is_same_decision = (position_comparison.logged["rejected"] > 0.0).to_numpy() == (
+        position_comparison.replayed["rejected"] > 0.0
     )
-    rms_differences_m = [
-        axis.position_rms_difference_m for axis in position_agreement.agreement_by_axis.values()
-    ]
     return Agreement(
-        north=position_agreement.agreement_by_axis["north"],
-        east=position_agreement.agreement_by_axis["east"],
-        **(agreement_by_aid | {aid.name: position_agreement.agreement_by_axis}),
+        north=agreement_by_axis["north"],
+        east=agreement_by_axis["east"],
+        **(agreement_by_aid | {aid.name: agreement_by_axis}),
         doubtful=omitted_aids,
-        samples=len(position_agreement.logged),
+        samples=len(position_comparison.logged),
         rejected_fraction_logged=rejected_fraction_logged,
         rejected_fraction_replayed=rejected_fraction_replayed,
         decisions_same=float(np.mean(is_same_decision)),
-        published_rms_difference_m=math.hypot(*rms_differences_m),
+        published_rms_difference_m=math.hypot(
+            *(axis.position_rms_difference_m for axis in agreement_by_axis.values())
+        ),
         good=is_in_agreement,
         reason=reason,
         heading_rms_difference_deg=_compute_heading_difference_deg(ekf2, replay),
-        carried_difference_m=flow_only_difference_m,
+        carried_difference_m=flow_position_difference_m,
     )
 
 
@@ -340,12 +343,13 @@ def _compare_innovations(
     )
 
 
-def _compute_flow_only_difference_m(ekf2: Ekf2, replay: Ekf2Replay) -> float | None:
-    """Return the largest difference (m) of replayed and logged position with optical flow alone.
+def _compute_flow_position_difference_m(ekf2: Ekf2, replay: Ekf2Replay) -> float | None:
+    """Return the largest position difference (m) while only optical flow aided horizontally.
 
-    Return None if other horizontal aiding sources were always available.
+    The difference is replayed minus logged position. Return None if EKF2 always fused another
+    horizontal aiding source.
     """
-    logged_state = rows_inside(ekf2.state, replay.flow_only_spans_s)
+    logged_state = rows_inside(ekf2.state, replay.optical_flow_only_spans_s)
     if logged_state.empty:
         return None
     north_difference_m, east_difference_m = (
@@ -358,7 +362,9 @@ def _compute_replayed_minus_logged(
     replay: Ekf2Replay, logged_state: pd.DataFrame, name: str
 ) -> Array:
     """Return replayed minus logged values of one column of the published state."""
-    replayed_values = np.interp(logged_state.index, replay.published.index, replay.published[name])
+    replayed_values = np.interp(
+        logged_state.index, replay.published_state.index, replay.published_state[name]
+    )
     return np.asarray(replayed_values - logged_state[name])
 
 
@@ -368,7 +374,7 @@ def _compute_heading_difference_deg(ekf2: Ekf2, replay: Ekf2Replay) -> float | N
     logged_state = rows_inside(ekf2.record.delayed, replay.find_evaluated_spans())
     if logged_state.empty:
         return None
-    replayed_heading_rad = replay.delayed["heading_rad"]
+    replayed_heading_rad = replay.delayed_state["heading_rad"]
     heading_at_log_times_rad = np.interp(
         logged_state.index, replayed_heading_rad.index, np.unwrap(replayed_heading_rad)
     )
@@ -386,15 +392,15 @@ def _compare_other_aids(ekf2: Ekf2, replay: Ekf2Replay) -> tuple[dict[str, Any],
     for name, updates in replay.other_aid_updates.items():
         if (aid_log := ekf2.aids.get(name)) is None:
             continue
-        # Barometer updates are matched by measurement time, not fusion time: the replay fuses them
-        # later than EKF2, at the end of an interval
-        matched_updates = (
+        # The replay fuses barometer samples only at the end of an interval, later than EKF2.
+        # Barometer updates are therefore matched by measurement time instead of fusion time
+        updates_to_match = (
             updates.assign(fused_at_s=updates.index) if name == BAROMETER.name else updates
         )
         comparison = _compare_innovations(
             ekf2,
             replay,
-            matched_updates,
+            updates_to_match,
             select_logged_aid_innovations(name, aid_log),
             innovation_topic(AIDS[name]) in aid_log.topics,
         )
@@ -550,13 +556,14 @@ def _judge_agreement(
     tolerance_factor: float = 1.0,
 ) -> tuple[bool, str]:
     """Return True if the replay agrees with the log, and the statistics as a reason."""
-    s_ratios = (axis.s_ratio_median for axis in axes.values())
-    worst_s_ratio = max(s_ratios, key=lambda s_ratio: abs(s_ratio - 1.0))
-    if abs(worst_s_ratio - 1.0) > MAX_S_RATIO_DEVIATION:
+    variance_ratios = (axis.s_ratio_median for axis in axes.values())
+    worst_variance_ratio = max(variance_ratios, key=lambda s_ratio: abs(s_ratio - 1.0))
+    if abs(worst_variance_ratio - 1.0) > MAX_INNOVATION_VARIANCE_RATIO_DEVIATION:
         return False, (
-            f"the innovation variance S of the replay is {worst_s_ratio:.2f} times the logged S "
-            f"(limit 1 ± {MAX_S_RATIO_DEVIATION:.2f}): EKF2 fused samples that are not in the "
-            "log"
+            "the innovation variance S of the replay is "
+            f"{worst_variance_ratio:.2f} times the logged S "
+            f"(limit 1 ± {MAX_INNOVATION_VARIANCE_RATIO_DEVIATION:.2f}): "
+            "EKF2 fused samples that are not in the log"
         )
     min_correlation = min(axis.innovation_correlation for axis in axes.values())
     correlation_text = (
@@ -567,66 +574,76 @@ def _judge_agreement(
         max_difference_m = tolerance_factor * MAX_PUBLISHED_DIFFERENCE_M
         if difference_m > max_difference_m:
             return False, (
-                "the innovations agree, but replayed and published positions differ by "
-                f"{_format_above_limit(difference_m, max_difference_m)} m RMS "
-                f"(limit {max_difference_m:g} m): the log lacks an input of EKF2's output predictor"
+                "the innovations agree with the log, but replayed and logged positions differ by "
+                f"{_format_unlike_limit(difference_m, max_difference_m)} m RMS "
+                f"(limit {max_difference_m:g} m): the log lacks data of EKF2's output predictor"
             )
         return True, correlation_text
-    if max(rejected_fraction_logged, rejected_fraction_replayed) < MAX_COMPARED_REJECTED_FRACTION:
+    if (
+        max(rejected_fraction_logged, rejected_fraction_replayed)
+        < MAX_REJECTED_FRACTION_FOR_COMPARISON
+    ):
         return False, f"{correlation_text}, below the minimum of {MIN_INNOVATION_CORRELATION:g}"
     rejected_fraction_difference = abs(rejected_fraction_replayed - rejected_fraction_logged)
     relative_nis_difference = max(
         abs(axis.nis_mean_replayed / axis.nis_mean_logged - 1.0) for axis in axes.values()
     )
-    tolerance_text = (
-        f"the replay rejected {rejected_fraction_replayed:.1%} of the samples, EKF2 in the log "
+    rejection_text = (
+        f"the replay rejected {rejected_fraction_replayed:.1%} of the samples, EKF2 rejected "
         f"{rejected_fraction_logged:.1%}; "
         f"the mean NIS differs by {relative_nis_difference:.0%}"
     )
     if (
-        rejected_fraction_difference > MAX_REJECTED_DEVIATION
+        rejected_fraction_difference > MAX_REJECTED_FRACTION_DIFFERENCE
         or relative_nis_difference > MAX_RELATIVE_NIS_DIFFERENCE
     ):
         return False, (
-            f"{tolerance_text} (limits {MAX_REJECTED_DEVIATION:.0%} and "
+            f"{rejection_text} (limits {MAX_REJECTED_FRACTION_DIFFERENCE:.0%} and "
             f"{MAX_RELATIVE_NIS_DIFFERENCE:.0%})"
         )
     return (
         True,
-        f"{tolerance_text}; single innovations are not compared, because each rejection changes "
+        f"{rejection_text}; single innovations are not compared, because each rejection changes "
         "the later innovations",
     )
 
 
-def _format_above_limit(value: float, limit: float) -> str:
+def _format_unlike_limit(value: float, limit: float) -> str:
     """Format a value with enough decimals (at least 2) to differ from the limit."""
     return next(f"{value:.{n}f}" for n in range(2, 17) if round(value, n) > limit or n == 16)
 
 
-def with_logged_rejections(agreement: Agreement, agreement_with_rejections: Agreement) -> Agreement:
-    """Judge the agreement of a replay that uses EKF2's logged rejections.
+def judge_with_logged_rejections(
+    agreement: Agreement, agreement_with_rejections: Agreement
+) -> Agreement:
+    """Return the agreement with the log for a flight with many rejections.
 
-    Such a replay is needed with many rejections, because one sample near the gate can make a
-    correct replay differ from the log. Rejected fraction and decisions are from ``agreement`` of
-    the replay with its own gate.
+    With many rejections, one sample near the gate can make a correct replay differ from the log.
+    ``agreement_with_rejections`` belongs to a second replay, which rejects the same samples as
+    EKF2. Only the fields about rejections are from ``agreement``, of the replay that applies the
+    gate.
     """
     rejected_fraction = agreement.rejected_fraction_logged
-    relies_on_imu = rejected_fraction > MOSTLY_REJECTED_FRACTION
-    tolerance_factor = np.inf if relies_on_imu else REJECTION_TOLERANCE_FACTOR
+    is_mostly_rejected = rejected_fraction > MOSTLY_REJECTED_FRACTION
+    tolerance_factor = np.inf if is_mostly_rejected else DIFFERENCE_FACTOR_WITH_MANY_REJECTIONS
     is_in_agreement, reason = _judge_agreement(
         agreement_with_rejections.axes, 0.0, 0.0, tolerance_factor
     )
     min_correlation = min(
         axis.innovation_correlation for axis in agreement_with_rejections.axes.values()
     )
-    if is_in_agreement and relies_on_imu and min_correlation < MIN_IMU_DRIVEN_CORRELATION:
+    if (
+        is_in_agreement
+        and is_mostly_rejected
+        and min_correlation < MIN_CORRELATION_IF_MOSTLY_REJECTED
+    ):
         is_in_agreement = False
         reason = (
             f"the correlation {min_correlation:.4f} of replayed and logged innovations is below "
-            f"the minimum of {MIN_IMU_DRIVEN_CORRELATION:g}"
+            f"the minimum of {MIN_CORRELATION_IF_MOSTLY_REJECTED:g}"
         )
-    reason = f"in a replay with EKF2's logged rejections, {reason}"
-    if relies_on_imu and not is_in_agreement:
+    reason = f"if the replay rejects the same samples as EKF2, {reason}"
+    if is_mostly_rejected and not is_in_agreement:
         reason = (
             f"{reason}. EKF2 rejected {rejected_fraction:.0%} of the positions and relied on the "
             "IMU. The frame of the source is probably wrong"

@@ -23,7 +23,7 @@ from px4fuse.core.arrays import (
     iterate_row_blocks,
 )
 from px4fuse.core.record import Span
-from px4fuse.ekf2.earth_model import compute_earth_rate_rad_s, compute_position_scale
+from px4fuse.ekf2.earth_model import compute_earth_rate_rad_s, compute_internal_to_published_ratio
 from px4fuse.flight.ekf2_parameters import PARAMETERS
 from px4fuse.flight.model import (
     BAD_ACCELERATION_FLAG,
@@ -52,9 +52,9 @@ from px4fuse.trajectory.rotation import (
 # EKF2 fuses gravity, fake positions or zero velocity, which the model does not contain
 RESTART_GAP_S = 2.0
 # Longer IMU intervals (s) interrupt the replay: EKF2 limits a prediction step to 2 EKF2_PREDICT_US
-IMU_GAP_S = 0.05
+MIN_IMU_GAP_S = 0.05
 # Minimum time (s) from EKF2's first position fusion to the start of the replay
-MIN_FUSION_S = 1.0
+MIN_TIME_SINCE_FIRST_FUSION_S = 1.0
 # Minimum time (s) from take-off to the start of the replay: on the ground, EKF2 also fuses zero
 # velocity and gravity
 MIN_TIME_SINCE_TAKEOFF_S = 4.0
@@ -64,7 +64,7 @@ REPLAY_SETTLING_S = 5.0
 # from this time (s) after the first fusion on
 MAGNETIC_FIELD_SETTLING_S = 1.0
 # Flight time (s) before the replay that is used to estimate correlations of the initial state
-STATE_CORRELATION_HISTORY_S = 20.0
+CORRELATION_ESTIMATION_TIME_S = 20.0
 # Rate (Hz) at which EKF2 fuses the magnetometer with SENS_MAG_RATE 15 (default)
 MAG_FUSION_HZ = 14.0
 # Minimum rate (Hz) of the logged magnetometer for a replay of its fusion
@@ -76,7 +76,7 @@ MIN_SEGMENT_DURATION_S = 10.0
 # Maximum delay (s) from a reset to its publication
 MAX_RESET_DELAY_S = 0.5
 # The EKF2 replay is interrupted if a larger fraction of the IMU samples within 1 s is clipped
-MAX_CLIPPED_FRACTION = 0.05
+MAX_CLIPPED_IMU_FRACTION = 0.05
 # If a smaller fraction of the IMU samples is missing, the EKF2 replay ignores it
 MAX_LOST_IMU_FRACTION = 0.02
 
@@ -86,44 +86,44 @@ GRAVITY_M_S2 = np.array([0.0, 0.0, 9.80665])
 # Number of states without magnetic fields
 STATE_COUNT = 15
 # Number of states that the IMU propagates: all except the biases
-IMU_STATE_COUNT = 9
+MOTION_STATE_COUNT = 9
 # State indices of attitude error, velocity, position and biases
 THETA, VELOCITY, POSITION = slice(0, 3), slice(3, 6), slice(6, 9)
 GYRO_BIAS, ACCELEROMETER_BIAS, BIASES = slice(9, 12), slice(12, 15), slice(9, 15)
 # State indices of the earth field (NED) and the body field (FRD), if there are 21 states
-EARTH_FIELD, BODY_FIELD = slice(15, 18), slice(18, 21)
+EARTH_MAGNETIC_FIELD, BODY_MAGNETIC_FIELD = slice(15, 18), slice(18, 21)
 
 
 @dataclass(frozen=True)
 class SensorSamples:
-    """Means of successive magnetometer or optical flow samples in one segment, m in total.
+    """Magnetometer or optical flow samples of one segment: m means of successive samples.
 
     Attributes
     ----------
     step_indices : ndarray of int, shape (m,)
         Prediction step that fuses the last sample of each mean.
     value : ndarray, shape (m, k)
-        Magnetic field (gauss, FRD), or optical flow velocity forward and right minus the velocity
-        change from the IMU since the start of the segment (m/s).
-    rotation_to_body : ndarray, shape (m, k, 3)
+        Magnetic field (gauss, FRD), or velocity forward and right (m/s) from optical flow. The IMU
+        velocity change since the start of the segment is subtracted from the velocity.
+    ned_to_body_rotation : ndarray, shape (m, k, 3)
         Mean rotation from NED to the body axes.
     sample_count : ndarray, shape (m,)
     noise : ndarray, shape (m,)
         R of one sample; 0 if an EKF2 parameter determines R.
     gate : float
         Innovation gate in √S; infinite if an EKF2 parameter determines the gate.
-    state_rows : tuple of slice
+    state_slices : tuple of slice
         State indices of the measured vector (NED; for example the earth field) and, optionally, of
         the sensor's bias vector (body frame).
     """
 
     step_indices: IntArray
     value: Array
-    rotation_to_body: Array
+    ned_to_body_rotation: Array
     sample_count: Array
     noise: Array
     gate: float = np.inf
-    state_rows: tuple[slice, ...] = (EARTH_FIELD, BODY_FIELD)
+    state_slices: tuple[slice, ...] = (EARTH_MAGNETIC_FIELD, BODY_MAGNETIC_FIELD)
 
 
 @dataclass(frozen=True)
@@ -142,8 +142,8 @@ class HeightSamples:
     step_indices, measurement_times_s, down_m : ndarray, shape (m,)
         Prediction step, measurement time, and height (m, down) of each barometer sample.
     dead_zone_m : ndarray, shape (m,)
-        EKF2 reduces the innovation of a height below the state by up to this distance (ground
-        effect).
+        In ground effect, EKF2 reduces the innovation by up to this distance if the barometer height
+        is below the estimated height.
     weight : ndarray, shape (m,)
         Number of barometer samples fused by EKF2 that each sample represents.
     """
@@ -162,8 +162,8 @@ class HeightSamples:
 class ReplaySegment:
     """Part of a flight without gaps, which is replayed with n prediction steps.
 
-    The model estimates the error of a nominal attitude, which is EKF2's published attitude. Vectors
-    are in NED, if not stated otherwise.
+    The nominal attitude is EKF2's published attitude. The model estimates its error. Vectors are in
+    NED, if not stated otherwise.
 
     Attributes
     ----------
@@ -171,9 +171,9 @@ class ReplaySegment:
         Start of the first step, then end of each step.
     body_to_ned : ndarray, shape (n + 1, 3, 3)
         Nominal attitude.
-    correction_rad : ndarray, shape (n, 3)
-        Rotation of the nominal attitude in each step minus rotation measured by the gyro.
-    force_m_s2 : ndarray, shape (n, 3)
+    attitude_correction_rad: ndarray, shape (n, 3)
+        Rotation of the nominal attitude in each step, minus the rotation that the gyro measured.
+    specific_force_m_s2 : ndarray, shape (n, 3)
         Specific force minus nominal bias, in the body frame at the end of the step.
     accelerometer_bias_m_s2 : ndarray, shape (3,)
         Nominal accelerometer bias: the logged bias at the start.
@@ -183,9 +183,9 @@ class ReplaySegment:
         Published height (positive down), and its variance.
     attitude_error_rad, attitude_variance_rad2 : ndarray, shape (n + 1, 3)
         Logged attitude minus nominal attitude, and its variance.
-    state_correlation : ndarray, shape (15, 15) or (21, 21)
+    initial_state_correlation : ndarray, shape (15, 15) or (21, 21)
         Estimated correlations of the initial state.
-    field, flow : SensorSamples or None
+    magnetic_field, flow : SensorSamples or None
     height_samples : HeightSamples or None
     clipped_fraction : ndarray, shape (n + 1,), or None
         Fraction of the accelerometer axes that are clipped in the step.
@@ -193,7 +193,7 @@ class ReplaySegment:
         Logged flag for a bad vertical acceleration.
     mean_bias_down_m_s2 : float
         Mean vertical accelerometer bias, computed from the published velocity.
-    position_scale : (float, float, float)
+    internal_to_published_ratio : (float, float, float)
         Ratio of EKF2's internal to its published position along each axis.
     preceding_segment : ReplaySegment or None
         Flight before the start, from which the correlations are estimated.
@@ -204,8 +204,8 @@ class ReplaySegment:
     time_s: Array
     step_s: Array
     body_to_ned: Array
-    correction_rad: Array
-    force_m_s2: Array
+    attitude_correction_rad: Array
+    specific_force_m_s2: Array
     accelerometer_bias_m_s2: Array
     state: Array
     variance: Array
@@ -213,22 +213,22 @@ class ReplaySegment:
     attitude_variance_rad2: Array
     down_variance_m2: Array
     attitude_error_rad: Array
-    state_correlation: Array
-    is_fusing: bool = True
-    field: SensorSamples | None = None
+    initial_state_correlation: Array
+    starts_while_fusing: bool = True
+    magnetic_field: SensorSamples | None = None
     height_samples: HeightSamples | None = None
     clipped_fraction: Array | None = None
     is_acceleration_bad: BoolArray | None = None
     mean_bias_down_m_s2: float = 0.0
     flow: SensorSamples | None = None
-    position_scale: tuple[float, float, float] = (1.0, 1.0, 1.0)
+    internal_to_published_ratio: tuple[float, float, float] = (1.0, 1.0, 1.0)
     preceding_segment: "ReplaySegment | None" = None
     changed_parameters: Mapping[str, float] = record_field(default_factory=dict)
 
     @cached_property
     def imu_velocity_change_m_s(self) -> Array:
         """Velocity change (m/s, NED) since the start, integrated from the IMU, shape (n + 1, 3)."""
-        acceleration_m_s2 = rotate(self.body_to_ned[1:], self.force_m_s2) + GRAVITY_M_S2
+        acceleration_m_s2 = rotate(self.body_to_ned[1:], self.specific_force_m_s2) + GRAVITY_M_S2
         return cumulative_sums(acceleration_m_s2 * self.step_s[:, None])
 
     @cached_property
@@ -326,12 +326,12 @@ def make_update_table(
     return updates.assign(fused_at_s=end_s[np.nonzero(has_innovation)[0]])
 
 
-def pad_samples(sample_arrays: Sequence[Array]) -> list[Array]:
+def pad_samples(arrays_of_samples: Sequence[Array]) -> list[Array]:
     """Pad arrays of :func:`group_samples_by_event` with zeros to the same k samples per event."""
-    max_samples_per_event = max(samples.shape[1] for samples in sample_arrays)
+    max_samples_per_event = max(samples.shape[1] for samples in arrays_of_samples)
     return [
         np.pad(samples, ((0, 0), (0, max_samples_per_event - samples.shape[1]), (0, 0)))
-        for samples in sample_arrays
+        for samples in arrays_of_samples
     ]
 
 
@@ -354,28 +354,28 @@ def find_replay_segments(
     fusion_times_s = innovations.index.to_numpy()
     state_times_s = fusion_record.delayed.index.to_numpy()
     imu_times_s = imu.index.to_numpy()
-    cut_times_s = [imu_times_s[0], imu_times_s[-1]]
-    for sample_times_s, limit in ((imu_times_s, IMU_GAP_S), (position_times_s, RESTART_GAP_S)):
+    segment_boundary_times_s = [imu_times_s[0], imu_times_s[-1]]
+    for sample_times_s, limit in ((imu_times_s, MIN_IMU_GAP_S), (position_times_s, RESTART_GAP_S)):
         gap_rows = np.flatnonzero(np.diff(sample_times_s) > limit)
-        cut_times_s += [*sample_times_s[gap_rows], *sample_times_s[gap_rows + 1]]
-    cut_times_s += _find_break_times_s(imu, ekf2) if is_gnss else ()
+        segment_boundary_times_s += [*sample_times_s[gap_rows], *sample_times_s[gap_rows + 1]]
+    segment_boundary_times_s += _find_interruption_times_s(imu, ekf2) if is_gnss else ()
     earliest_start_s = max(attitude.index[0], position_times_s[0])
     end_s = min(attitude.index[-1], position_times_s[-1] + 1.0)
     airborne = () if isinstance(flight.airborne, Unavailable) else flight.airborne
-    magnetic_field_span_s = _find_field_fusion_span(fusion_record) if is_gnss else None
-    cut_times_s += magnetic_field_span_s[1:] if magnetic_field_span_s else ()
+    magnetic_field_span_s = _find_magnetometer_3d_fusion_span(fusion_record) if is_gnss else None
+    segment_boundary_times_s += magnetic_field_span_s[1:] if magnetic_field_span_s else ()
     # The replay restarts when another EKF2 instance becomes primary, because its state differs
-    cut_times_s += [time_s for time_s, _ in ekf2.primary_instances[1:]]
+    segment_boundary_times_s += [time_s for time_s, _ in ekf2.primary_instances[1:]]
     parameter_changes = [change for change in ekf2.parameter_changes if change.name in PARAMETERS]
-    cut_times_s += [change.time_s for change in parameter_changes]
+    segment_boundary_times_s += [change.time_s for change in parameter_changes]
 
     def make_segment(start_row: int, end_s: float) -> ReplaySegment:
         segment = _make_segment(imu, attitude, ekf2, fusion_record, start_row, end_s)
-        return _add_gnss_quantities(segment, imu, ekf2, fusion_record) if is_gnss else segment
+        return _add_gnss_model_inputs(segment, imu, ekf2, fusion_record) if is_gnss else segment
 
     segments = []
     for part_start_s, part_end_s in pairwise(
-        np.unique(np.clip(cut_times_s, earliest_start_s, end_s))
+        np.unique(np.clip(segment_boundary_times_s, earliest_start_s, end_s))
     ):
         fusion_times_in_part_s = fusion_times_s[
             (fusion_times_s >= part_start_s) & (fusion_times_s <= part_end_s)
@@ -392,7 +392,10 @@ def find_replay_segments(
             earliest_starts_s.append(magnetic_field_span_s[0])
         start_row = int(
             np.searchsorted(
-                state_times_s, max([fusion_times_in_part_s[0] + MIN_FUSION_S, *earliest_starts_s])
+                state_times_s,
+                max(
+                    [fusion_times_in_part_s[0] + MIN_TIME_SINCE_FIRST_FUSION_S, *earliest_starts_s]
+                ),
             )
         )
         if (
@@ -401,7 +404,7 @@ def find_replay_segments(
         ):
             continue
         is_covered = (imu_times_s[1:] > state_times_s[start_row]) & (imu_times_s[:-1] < part_end_s)
-        if not np.all(np.diff(imu_times_s)[is_covered] <= IMU_GAP_S):
+        if not np.all(np.diff(imu_times_s)[is_covered] <= MIN_IMU_GAP_S):
             continue
         changed_parameters = {
             change.name: change.after
@@ -409,14 +412,14 @@ def find_replay_segments(
             if change.time_s <= part_start_s
         }
         segment = make_segment(start_row, part_end_s)
-        history_start_row = int(
+        preceding_start_row = int(
             np.searchsorted(
                 state_times_s,
-                max(earliest_start_s, state_times_s[start_row] - STATE_CORRELATION_HISTORY_S),
+                max(earliest_start_s, state_times_s[start_row] - CORRELATION_ESTIMATION_TIME_S),
             )
         )
-        if history_start_row < start_row:
-            preceding_segment = make_segment(history_start_row, state_times_s[start_row])
+        if preceding_start_row < start_row:
+            preceding_segment = make_segment(preceding_start_row, state_times_s[start_row])
             segment = replace(segment, preceding_segment=preceding_segment)
         if (
             magnetic_field_span_s
@@ -428,33 +431,34 @@ def find_replay_segments(
     return tuple(segments)
 
 
-def _add_gnss_quantities(
+def _add_gnss_model_inputs(
     segment: ReplaySegment, imu: pd.DataFrame, ekf2: Ekf2, fusion_record: FusionRecord
 ) -> ReplaySegment:
-    """Add quantities that only the GNSS model uses.
+    """Add the quantities that only the GNSS model uses.
 
-    These are earth rotation, position scale, clipping and mean vertical bias of the accelerometer.
+    These are earth rotation, ratio of internal to published position, clipping of the
+    accelerometer, and mean vertical accelerometer bias.
     """
-    position_scale = compute_position_scale(fusion_record)
+    internal_to_published_ratio = compute_internal_to_published_ratio(fusion_record)
     initial_state = segment.state.copy()
-    initial_state[POSITION] *= position_scale
+    initial_state[POSITION] *= internal_to_published_ratio
     earth_rotation_rad = compute_earth_rate_rad_s(fusion_record) * segment.step_s[:, None]
     start_s, end_s = span_s = segment.time_s[[0, -1]]
     velocity_change_m_s = np.diff(np.interp(span_s, ekf2.state.index, ekf2.state["down_m_s"]))[0]
-    velocity_error = segment.imu_velocity_change_m_s[-1, 2] - velocity_change_m_s
+    velocity_change_error_m_s = segment.imu_velocity_change_m_s[-1, 2] - velocity_change_m_s
     return replace(
         segment,
         state=initial_state,
-        position_scale=position_scale,
-        correction_rad=segment.correction_rad + earth_rotation_rad,
+        internal_to_published_ratio=internal_to_published_ratio,
+        attitude_correction_rad=segment.attitude_correction_rad + earth_rotation_rad,
         clipped_fraction=_compute_clipped_fraction(imu, segment.time_s),
-        mean_bias_down_m_s2=float(velocity_error / (end_s - start_s)),
+        mean_bias_down_m_s2=float(velocity_change_error_m_s / (end_s - start_s)),
     )
 
 
-def _find_break_times_s(imu: pd.DataFrame, ekf2: Ekf2) -> list[float]:
+def _find_interruption_times_s(imu: pd.DataFrame, ekf2: Ekf2) -> list[float]:
     """Return the times (s) at which the replay must be interrupted: clipping and height resets."""
-    break_times_s = [
+    interruption_times_s = [
         time
         for reset in ekf2.resets
         if reset.delta[2]
@@ -463,14 +467,15 @@ def _find_break_times_s(imu: pd.DataFrame, ekf2: Ekf2) -> list[float]:
     if "clipped" in imu:
         imu_times_s = imu.index.to_numpy()
         clipped_times_s = imu_times_s[imu["clipped"].to_numpy() > 0.0]
-        begin_rows, end_rows = (
+        window_begin_rows, window_end_rows = (
             np.searchsorted(clipped_times_s, clipped_times_s + s) for s in (-0.5, 0.5)
         )
         heavy_clipping_times_s = clipped_times_s[
-            end_rows - begin_rows > MAX_CLIPPED_FRACTION / compute_median_interval_s(imu_times_s)
+            window_end_rows - window_begin_rows
+            > MAX_CLIPPED_IMU_FRACTION / compute_median_interval_s(imu_times_s)
         ]
-        break_times_s += [*(heavy_clipping_times_s - 0.5), *(heavy_clipping_times_s + 0.5)]
-    return break_times_s
+        interruption_times_s += [*(heavy_clipping_times_s - 0.5), *(heavy_clipping_times_s + 0.5)]
+    return interruption_times_s
 
 
 def _compute_clipped_fraction(imu: pd.DataFrame, time_s: Array) -> Array:
@@ -478,13 +483,13 @@ def _compute_clipped_fraction(imu: pd.DataFrame, time_s: Array) -> Array:
     clipped_fraction_by_step = np.zeros(len(time_s))
     # "clipped" has one bit per axis
     if "clipped" in imu:
-        clipping_masks = imu.loc[(imu["clipped"] > 0.0) & (imu.index <= time_s[-1]), "clipped"]
+        clipping_bits = imu.loc[(imu["clipped"] > 0.0) & (imu.index <= time_s[-1]), "clipped"]
         clipped_fraction = (
-            np.unpackbits(clipping_masks.to_numpy(np.uint8)[:, None], axis=1).sum(axis=1) / 3.0
+            np.unpackbits(clipping_bits.to_numpy(np.uint8)[:, None], axis=1).sum(axis=1) / 3.0
         )
         np.maximum.at(
             clipped_fraction_by_step,
-            np.searchsorted(time_s, clipping_masks.index),
+            np.searchsorted(time_s, clipping_bits.index),
             clipped_fraction,
         )
     return clipped_fraction_by_step
@@ -537,11 +542,11 @@ def _make_segment(
         inverse_attitude = conjugate(interpolate(at_s, step_times_s, end_attitude))
         return at_s, multiply(attitude_samples[Columns.QUATERNION].to_numpy(), inverse_attitude)
 
-    # Rotation (in NED) from the attitude integrated from the gyro to EKF2's published attitude
-    gyro_to_published_rotation = interpolate(
+    # Rotation (in NED) that turns the gyro's integrated attitude into EKF2's published attitude
+    rotation_to_published_attitude = interpolate(
         step_times_s, *compute_relative_attitude(attitude, 0.0, gyro_attitude)
     )
-    nominal_attitude = multiply(gyro_to_published_rotation, gyro_attitude)
+    nominal_attitude = multiply(rotation_to_published_attitude, gyro_attitude)
     state_times_s, error_quaternions = compute_relative_attitude(
         fusion_record.delayed, 1e-4, nominal_attitude
     )
@@ -557,10 +562,12 @@ def _make_segment(
         step_s=step_s,
         # float32 (as in PX4) saves memory: these arrays are the largest
         body_to_ned=to_matrix(nominal_attitude).astype(np.float32),
-        correction_rad=to_rotation_vector(
-            multiply(gyro_to_published_rotation[1:], conjugate(gyro_to_published_rotation[:-1]))
+        attitude_correction_rad=to_rotation_vector(
+            multiply(
+                rotation_to_published_attitude[1:], conjugate(rotation_to_published_attitude[:-1])
+            )
         ).astype(np.float32),
-        force_m_s2=velocity_increments / step_s[:, None],
+        specific_force_m_s2=velocity_increments / step_s[:, None],
         accelerometer_bias_m_s2=accelerometer_bias,
         state=np.concatenate(
             [attitude_error_rad[0], initial_row[Columns.VELOCITY], position_m, np.zeros(6)]
@@ -574,7 +581,7 @@ def _make_segment(
         attitude_error_rad=_interpolate(
             pd.DataFrame(attitude_error_rad, state_times_s), step_times_s
         ).astype(np.float32),
-        state_correlation=np.eye(15),
+        initial_state_correlation=np.eye(15),
         is_acceleration_bad=(
             fusion_record.was_flag_set(BAD_ACCELERATION_FLAG, step_times_s)
             if BAD_ACCELERATION_FLAG in fusion_record.states
@@ -583,18 +590,16 @@ def _make_segment(
     )
 
 
-def _find_field_fusion_span(fusion_record: FusionRecord) -> Span | None:
+def _find_magnetometer_3d_fusion_span(fusion_record: FusionRecord) -> Span | None:
     """Return start and end (s) of EKF2's fusion of all three magnetometer axes.
 
     Return None if EKF2 did not fuse all three axes, or interrupted this fusion.
     """
-    is_fused_3d = (
-        fusion_record.magnetic_field_gauss["fused_3d"]
-        if len(fusion_record.magnetic_field_gauss)
-        else pd.Series(dtype=float)
-    )
-    flag_times_s = is_fused_3d.index.to_numpy()
-    is_fused = is_fused_3d.to_numpy() > 0.0
+    field_gauss = fusion_record.magnetic_field_gauss
+    if not len(field_gauss):
+        return None
+    flag_times_s = field_gauss.index.to_numpy()
+    is_fused = field_gauss["fused_3d"].to_numpy() > 0.0
     if not is_fused.any() or 1.0 / compute_median_interval_s(flag_times_s) < MIN_MAG_LOG_HZ:
         return None
     first_row, last_row = np.flatnonzero(is_fused)[[0, -1]]
@@ -612,7 +617,7 @@ def _add_magnetic_field(
     age_s = fusion_record.parameters.get("EKF2_MAG_DELAY", 0.0) * 1e-3 + 0.5 * step_s
     fused_samples_per_row = max(MAG_FUSION_HZ * compute_median_interval_s(sample_times_s), 1.0)
     measurement_times_s = sample_times_s - age_s
-    extended_segment = add_field_states(
+    segment_with_fields = add_field_states(
         segment,
         measurement_times_s,
         field_gauss.iloc[:, :3].to_numpy(),
@@ -621,26 +626,28 @@ def _add_magnetic_field(
         np.asarray(initial_row[Columns.FUSION_HORIZON_VARIANCE[-6:]]),
     )
     if Columns.MAGNETIC_FIELD_INNOVATION[0] not in field_gauss:
-        return extended_segment
-    filtered_nu_gauss = field_gauss[Columns.MAGNETIC_FIELD_INNOVATION].to_numpy()
+        return segment_with_fields
     return replace(
-        extended_segment,
-        field=_compute_mean_field(
-            segment, fusion_record.delayed, measurement_times_s, filtered_nu_gauss
+        segment_with_fields,
+        magnetic_field=_compute_mean_magnetic_field(
+            segment,
+            fusion_record.delayed,
+            measurement_times_s,
+            field_gauss[Columns.MAGNETIC_FIELD_INNOVATION].to_numpy(),
         ),
     )
 
 
-def _compute_mean_field(
+def _compute_mean_magnetic_field(
     segment: ReplaySegment,
     delayed_state: pd.DataFrame,
     measurement_times_s: Array,
-    filtered_nu_gauss: Array,
+    filtered_field_innovation_gauss: Array,
 ) -> SensorSamples:
-    """Compute the mean of the magnetometer samples between two logged rows (FRD, gauss).
+    """Return the mean of the magnetometer samples between successive logged rows (FRD, gauss).
 
-    Mean = field predicted from the logged states - innovation. The innovation is computed from two
-    successive low-pass filtered innovations in the log.
+    Mean = field predicted from the logged states - mean innovation. The mean innovation is computed
+    from two successive low-pass filtered innovations in the log.
     """
     row_interval_s = np.diff(measurement_times_s)
     is_inside = (measurement_times_s[:-1] > segment.time_s[0]) & (
@@ -657,8 +664,8 @@ def _compute_mean_field(
     )
     previous_innovation_weight = ((1.0 - new_sample_weight) ** fused_sample_counts)[:, None]
     nu_gauss = (
-        filtered_nu_gauss[gap_free_rows]
-        - previous_innovation_weight * filtered_nu_gauss[gap_free_rows - 1]
+        filtered_field_innovation_gauss[gap_free_rows]
+        - previous_innovation_weight * filtered_field_innovation_gauss[gap_free_rows - 1]
     ) / (1.0 - previous_innovation_weight)
     step_indices, weight = compute_low_pass_weights(
         segment,
@@ -667,23 +674,23 @@ def _compute_mean_field(
         row_interval_s / fused_sample_counts,
         new_sample_weight,
     )
-    rotation_to_body = segment.body_to_ned[step_indices].swapaxes(2, 3)
+    ned_to_body_rotation = segment.body_to_ned[step_indices].swapaxes(2, 3)
     earth_field_gauss, body_field_gauss = (
         _interpolate(delayed_state[names], measurement_times_s)
         for names in (Columns.EARTH_MAGNETIC_FIELD, Columns.BODY_MAGNETIC_FIELD)
     )
-    rotated_earth_field = earth_field_gauss[:, None] - np.cross(
+    earth_field_with_attitude_error = earth_field_gauss[:, None] - np.cross(
         segment.attitude_error_rad[step_indices], earth_field_gauss[:, None]
     )
     expected_field_gauss = (
-        np.einsum("ki,kiab,kib->ka", weight, rotation_to_body, rotated_earth_field)
+        np.einsum("ki,kiab,kib->ka", weight, ned_to_body_rotation, earth_field_with_attitude_error)
         + body_field_gauss
     )
-    mean = np.einsum("ki,kiab->kab", weight, rotation_to_body)
+    mean_rotation_to_body = np.einsum("ki,kiab->kab", weight, ned_to_body_rotation)
     return SensorSamples(
         step_indices[:, 0],
         expected_field_gauss - nu_gauss,
-        mean,
+        mean_rotation_to_body,
         fused_sample_counts,
         np.zeros(len(gap_free_rows)),
     )
@@ -691,21 +698,24 @@ def _compute_mean_field(
 
 def compute_low_pass_weights(
     segment: ReplaySegment,
-    newest_sample_s: Array,
+    newest_sample_times_s: Array,
     sample_count: Array,
     interval_s: Array,
     new_sample_weight: Array | float,
 ) -> tuple[IntArray, Array]:
-    """Return prediction steps and weights, shape (m, k), of up to k samples in m low-pass means.
+    """Return the samples that contribute to each low-pass filtered mean, and their weights.
+
+    The first array contains the prediction step of each sample, the second array the weight. Both
+    have the shape (m, k), for m means of up to k samples. The newest sample is first.
 
     Parameters
     ----------
-    newest_sample_s, sample_count, interval_s : ndarray, shape (m,)
+    newest_sample_times_s, sample_count, interval_s : ndarray, shape (m,)
         Time of the newest sample, number of samples, and sample interval of each mean.
     new_sample_weight : float or ndarray, shape (m,)
         Weight of a new sample in the low-pass filter.
     """
-    # In sample intervals: 0 is the newest sample of a mean
+    # Age of each sample of a mean, as a number of sample intervals; the newest sample has age 0
     age_in_samples = np.arange(int(sample_count.max(initial=1.0)))
     weight = np.where(
         age_in_samples < sample_count[:, None],
@@ -713,7 +723,7 @@ def compute_low_pass_weights(
         0.0,
     )
     weight /= weight.sum(axis=1, keepdims=True)
-    measurement_times_s = newest_sample_s[:, None] - age_in_samples * interval_s[:, None]
+    measurement_times_s = newest_sample_times_s[:, None] - age_in_samples * interval_s[:, None]
     return np.searchsorted(segment.time_s, measurement_times_s - 1e-9), weight
 
 
@@ -737,17 +747,19 @@ def add_field_states(
         Initial fields of earth (NED) and body (FRD), and their variances.
     """
     step_index, is_inside = find_sample_steps(segment, measurement_times_s)
-    rotation_to_body = segment.body_to_ned[step_index].transpose(0, 2, 1)
+    ned_to_body_rotation = segment.body_to_ned[step_index].transpose(0, 2, 1)
     sample_count = len(step_index)
     return replace(
         segment,
         state=np.concatenate([segment.state, initial_fields_gauss]),
         variance=np.concatenate([segment.variance, field_variance_gauss2]),
-        state_correlation=block_diag(segment.state_correlation, np.eye(len(initial_fields_gauss))),
-        field=SensorSamples(
+        initial_state_correlation=block_diag(
+            segment.initial_state_correlation, np.eye(len(initial_fields_gauss))
+        ),
+        magnetic_field=SensorSamples(
             step_index,
             field_gauss[is_inside],
-            rotation_to_body,
+            ned_to_body_rotation,
             np.full(sample_count, sample_weight),
             np.zeros(sample_count),
         ),
@@ -757,9 +769,9 @@ def add_field_states(
 def find_sample_steps(
     segment: ReplaySegment, measurement_times_s: Array
 ) -> tuple[IntArray, BoolArray]:
-    """Return the index of the prediction step in which each sample of the segment is fused.
+    """Return the prediction step that fuses each sample inside the segment.
 
-    The second array is True for each given sample that is in the segment.
+    The second array has one item per given sample: True if the sample is inside the segment.
     """
     step_index = np.searchsorted(segment.time_s, measurement_times_s - 1e-9)
     is_inside = (step_index > 0) & (step_index < len(segment.time_s))
@@ -790,11 +802,11 @@ def find_step_ends(
     sample_counts = np.maximum(np.rint(interval_s / median_interval_s), 1.0)
     if sample_counts.mean() <= 1.0 + MAX_LOST_IMU_FRACTION:
         sample_counts[:] = 1.0
-    sample_counts_at_ends = np.append(0.0, np.cumsum(sample_counts))[logged_end_indices]
-    needed_sample_count = compute_samples_per_step(
-        configured_step_s, median_interval_s, sample_counts_at_ends
+    sample_counts_at_logged_ends = np.append(0.0, np.cumsum(sample_counts))[logged_end_indices]
+    samples_per_step = compute_samples_per_step(
+        configured_step_s, median_interval_s, sample_counts_at_logged_ends
     )
-    logged_end_set = set(logged_end_indices.tolist())
+    logged_end_index_set = set(logged_end_indices.tolist())
     end_indices = []
     accumulated_count = accumulated_time_s = 0.0
     samples = np.stack([interval_s, sample_counts], axis=1)
@@ -805,10 +817,13 @@ def find_step_ends(
         accumulated_count = accumulated_count + sample_count
         accumulated_time_s = accumulated_time_s + interval
         is_step_complete = (
-            accumulated_count >= needed_sample_count
-            and accumulated_time_s > 0.5 * configured_step_s
+            accumulated_count >= samples_per_step and accumulated_time_s > 0.5 * configured_step_s
         )
-        if is_step_complete or accumulated_time_s > configured_step_s or sample in logged_end_set:
+        if (
+            is_step_complete
+            or accumulated_time_s > configured_step_s
+            or sample in logged_end_index_set
+        ):
             end_indices.append(sample)
             accumulated_count = accumulated_time_s = 0.0
     return np.array(end_indices, dtype=np.intp)
@@ -823,16 +838,16 @@ def downsample_imu(
     """
     start_indices = np.append(0, step_end_indices[:-1])
     cumulative_rotation_rad = cumulative_sums(rotation_vectors)
-    rotation_at_step_end_rad = np.repeat(
+    step_end_rotation_by_sample_rad = np.repeat(
         cumulative_rotation_rad[step_end_indices], step_end_indices - start_indices, axis=0
     )
-    step_count = len(rotation_at_step_end_rad)
-    rotation_at_sample_middle_rad = 0.5 * (
+    step_count = len(step_end_rotation_by_sample_rad)
+    middle_rotation_by_sample_rad = 0.5 * (
         cumulative_rotation_rad[:step_count] + cumulative_rotation_rad[1 : step_count + 1]
     )
     velocity_increments = velocity_increments[:step_count]
     rotated_increments = velocity_increments - np.cross(
-        rotation_at_step_end_rad - rotation_at_sample_middle_rad, velocity_increments
+        step_end_rotation_by_sample_rad - middle_rotation_by_sample_rad, velocity_increments
     )
     step_rotation_rad = (
         cumulative_rotation_rad[step_end_indices] - cumulative_rotation_rad[start_indices]

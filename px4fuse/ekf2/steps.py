@@ -1,11 +1,11 @@
-"""Explanation of the difference between KF (position and velocity states) and EKF2, step by step.
+"""Explanation of the difference between KF (position and velocity states) and EKF2.
 
-The flight is replayed with KF. In each step, one more property of KF is replaced by EKF2's: sample
-times, noise settings, estimated states, gate, and output predictor. A step reduces or increases the
-mean square difference from the logged EKF2.
+The flight is first replayed with KF. In each further replay, one more property of KF is replaced by
+the property of EKF2: sample times, noise settings, estimated states, rejections, output predictor.
+Each replacement reduces or increases the mean square difference from the logged EKF2.
 
-Bias states are added before EKF2's process noise, because this noise is too small for a filter
-without bias states. The steps gate and output predictor use EKF2's logged rejections.
+The accelerometer bias becomes a state before EKF2's process noise is used, because this noise is
+too small for a filter without bias states. The last two replays use EKF2's logged rejections.
 """
 
 import math
@@ -41,44 +41,44 @@ from px4fuse.filter.signals import Segment
 from px4fuse.flight.ekf2_parameters import EV_POS, FLOW, GNSS_POS, GNSS_VEL, MAG
 from px4fuse.flight.model import Columns, Ekf2, Flight, Truth, Unavailable
 
-ANALYSIS_NAME = "difference KF - EKF2"
+DIFFERENCE_ANALYSIS_NAME = "difference KF - EKF2"
 NO_TRUTH_OVERLAP = Unavailable(
     "RMSE against ground truth",
     "ground truth and replay do not overlap in time",
     "Record ground truth during the whole flight.",
 )
 # Names of the properties that differ between KF and EKF2
-SAMPLE_TIMES_STEP = "sample times and time steps"
-TIMESTAMPS_STEP = "timestamps and delay"
-MEASUREMENT_NOISE_STEP = "measurement noise"
-BIASES_STEP = "accelerometer bias as a state"
-PROCESS_NOISE_STEP = "process noise"
-ATTITUDE_STEP = "attitude and gyro bias as states"
-MAGNETOMETER_STEP = "magnetometer"
-GNSS_VELOCITY_STEP = "GNSS velocity"
-FLOW_STEP = "optical flow"
-VISION_STEP = "external vision"
-REJECTION_STEP = "rejections and resets"
-OUTPUT_PREDICTOR_STEP = "output predictor"
-# Step that adds an aiding source (PX4's name) to the fused position source
-STEP_BY_ADDITIONAL_AID = {FLOW.name: FLOW_STEP, EV_POS.name: VISION_STEP}
-# Order in which properties of KF are replaced by properties of EKF2. Additional aiding sources are
-# inserted before GATE
-REPLACEMENT_STEPS = (
-    SAMPLE_TIMES_STEP,
-    TIMESTAMPS_STEP,
-    MEASUREMENT_NOISE_STEP,
-    BIASES_STEP,
-    PROCESS_NOISE_STEP,
-    ATTITUDE_STEP,
-    REJECTION_STEP,
-    OUTPUT_PREDICTOR_STEP,
+SAMPLE_TIMES_PROPERTY = "sample times and prediction steps"
+TIMESTAMPS_PROPERTY = "timestamps and delay"
+MEASUREMENT_NOISE_PROPERTY = "measurement noise"
+ACCELEROMETER_BIAS_PROPERTY = "accelerometer bias estimated as a state"
+PROCESS_NOISE_PROPERTY = "process noise"
+ATTITUDE_PROPERTY = "attitude and gyro bias estimated as states"
+MAGNETOMETER_PROPERTY = "magnetometer"
+GNSS_VELOCITY_PROPERTY = "GNSS velocity"
+FLOW_PROPERTY = "optical flow"
+VISION_PROPERTY = "external vision"
+REJECTION_PROPERTY = "rejections and resets"
+OUTPUT_PREDICTOR_PROPERTY = "output predictor"
+# Property that stands for the fusion of an additional aiding source, by PX4's name of the source
+PROPERTY_BY_ADDITIONAL_AID = {FLOW.name: FLOW_PROPERTY, EV_POS.name: VISION_PROPERTY}
+# Properties of KF, in the order in which EKF2's properties replace them. Additional aiding sources
+# are inserted before REJECTION_PROPERTY
+REPLACED_PROPERTIES = (
+    SAMPLE_TIMES_PROPERTY,
+    TIMESTAMPS_PROPERTY,
+    MEASUREMENT_NOISE_PROPERTY,
+    ACCELEROMETER_BIAS_PROPERTY,
+    PROCESS_NOISE_PROPERTY,
+    ATTITUDE_PROPERTY,
+    REJECTION_PROPERTY,
+    OUTPUT_PREDICTOR_PROPERTY,
 )
 
 TRACK_COLUMNS = (Columns.POSITION, Columns.VELOCITY)
 
 
-class Step(Record, kw_only=True):
+class PropertyReplacement(Record, kw_only=True):
     """Effect of replacing one property of KF, such as the measurement noise, by EKF2's property.
 
     Attributes
@@ -86,9 +86,10 @@ class Step(Record, kw_only=True):
     name : str
         Name of the property.
     position_mean_square_m2, velocity_mean_square_m2_s2 : float
-        Reduction of the mean square difference from the logged EKF2; negative for an increase.
+        Reduction, by the replacement, of the mean square difference between the replay and the
+        logged EKF2; negative for an increase.
     position_moved_m, moved_at_s : float
-        Largest position change by the replacement, and its time.
+        Largest change of the replayed position by the replacement, and time of this change.
     position_rmse_to_truth_m : float or None
         Position RMSE after the replacement.
     """
@@ -109,7 +110,7 @@ class RejectionRun(Record, kw_only=True):
     duration_s : float
         Time from the first rejected sample to the next fused sample.
     distance_m : float
-        Largest position difference between the EKF2 replays with and without a gate.
+        Largest position difference between the EKF2 replays with and without rejections.
     """
 
     start_s: float
@@ -118,8 +119,8 @@ class RejectionRun(Record, kw_only=True):
     distance_m: NotNegative
 
 
-class UnreplayedDifference(Record):
-    """Largest position difference KF - EKF2 outside the replayed times, and time of the maximum."""
+class DifferenceOutsideReplay(Record):
+    """Largest position difference KF - EKF2 at times without a replay, and time of the maximum."""
 
     maximum_m: NotNegative
     at_s: float
@@ -128,8 +129,8 @@ class UnreplayedDifference(Record):
 class DifferenceExplanation(Record, kw_only=True):
     """Explanation of the mean square difference KF - EKF2 along one axis.
 
-    Each of the ``steps`` replaces one property of KF by EKF2's. Mean square = sum of the reductions
-    by all steps + unexplained remainder.
+    Each of the ``steps`` replaces one property of KF by the property of EKF2. The mean square is
+    the sum of the reductions by all steps, plus an unexplained remainder.
 
     Attributes
     ----------
@@ -139,34 +140,34 @@ class DifferenceExplanation(Record, kw_only=True):
         Mean square difference between KF and the logged EKF2.
     unexplained_mean_square_m2, unexplained_velocity_mean_square_m2_s2 : float
         Mean square difference after all steps.
-    outside : UnreplayedDifference or None
-        Difference outside the replayed times, which the steps do not explain.
+    outside : DifferenceOutsideReplay or None
+        Difference at times without a replay, which the steps do not explain.
     corrected : mapping from field of Settings to value
-        KF settings that were wrong, and are replaced by estimates before the first step.
+        Estimates that replace wrong settings of KF before the first step.
     sentences : tuple of str
         Explanations, largest contribution first.
-    times_s, kf_minus_ekf2_m, unexplained_m : ndarray
+    times_s, kf_minus_ekf2_m, unexplained_difference_m : ndarray
         EKF2 sample times, and position differences before and after all steps.
-    cause : str
+    cause_sentence: str
         Sentence about the largest contribution.
     """
 
     count: Count
     position_mean_square_m2: NotNegative
     velocity_mean_square_m2_s2: NotNegative
-    steps: tuple[Step, ...]
+    steps: tuple[PropertyReplacement, ...]
     unexplained_mean_square_m2: NotNegative
     unexplained_velocity_mean_square_m2_s2: NotNegative
     position_rmse_to_truth_m: Mapping[str, NotNegative | Unavailable]
     spans_s: Spans
     longest_rejection: RejectionRun | None = None
-    outside: UnreplayedDifference | None = None
+    outside: DifferenceOutsideReplay | None = None
     corrected: Mapping[str, float] = {}
     sentences: tuple[str, ...] = ()
     times_s: NotWritten[Array] = NOT_WRITTEN
     kf_minus_ekf2_m: NotWritten[Array] = NOT_WRITTEN
-    unexplained_m: NotWritten[Array] = NOT_WRITTEN
-    cause: NotWritten[str] = ""
+    unexplained_difference_m: NotWritten[Array] = NOT_WRITTEN
+    cause_sentence: NotWritten[str] = ""
 
     @property
     def unexplained_fraction(self) -> float:
@@ -174,10 +175,10 @@ class DifferenceExplanation(Record, kw_only=True):
         return self.unexplained_mean_square_m2 / self.position_mean_square_m2
 
 
-def explain_by_steps(
+def explain_difference_by_replacements(
     model: Ekf2Model, settings: Settings | None = None, kf_runs: Mapping[str, Replay] | None = None
 ) -> dict[str, DifferenceExplanation] | Unavailable:
-    """Explain the difference KF - EKF2 along each axis by the properties that differ.
+    """Explain the difference KF - EKF2 along each axis by replacing properties of KF.
 
     Parameters
     ----------
@@ -188,36 +189,39 @@ def explain_by_steps(
         Runs of KF along horizontal axes; default: north and east, with EKF2's sample times.
     """
     if not model.agreement.good:
-        return model.agreement.as_unavailable(ANALYSIS_NAME)
+        return model.agreement.as_unavailable(DIFFERENCE_ANALYSIS_NAME)
     kf_runs = kf_runs or {}
     ekf2 = model.flight.ekf2
     assert isinstance(ekf2, Ekf2)
-    configurations = make_step_configurations(model.inputs, settings or Settings())
-    delayed_positions = compute_delayed_tracks(model, list(configurations.values()))
+    configurations = make_replacement_configurations(model.inputs, settings or Settings())
+    horizon_tracks = compute_delayed_tracks(model, list(configurations.values()))
     baseline_replay = replay_with_logged_rejections(model)
     evaluated_spans = model.baseline_replay.find_evaluated_spans()
     state_times_s = ekf2.state.index.to_numpy()
     is_inside = is_inside_spans(state_times_s, evaluated_spans)
     # Only times at which the EKF2 replay and all runs of KF have a state are compared
-    for index in (baseline_replay.delayed.index, *(run.steps.index for run in kf_runs.values())):
+    for index in (
+        baseline_replay.delayed_state.index,
+        *(run.steps.index for run in kf_runs.values()),
+    ):
         is_inside &= (state_times_s >= index[0]) & (state_times_s <= index[-1])
     state_times_s = state_times_s[is_inside]
     if not len(state_times_s):
         return Unavailable(
-            ANALYSIS_NAME,
+            DIFFERENCE_ANALYSIS_NAME,
             "KF and the EKF2 replay do not overlap in time",
             "Analyse a segment in which EKF2 fused the source (--start, --end).",
         )
     state_span_s = float(state_times_s[0]), float(state_times_s[-1])
     directions = {name: run.axis.direction for name, run in kf_runs.items()}
     directions = directions or dict(zip(HORIZONTAL_AXES, np.eye(3), strict=False))
-    tracks_by_step = []
+    components_by_track = []
     # Tracks are computed one at a time, to limit the memory
-    tracks = chain(delayed_positions, (baseline_replay.published, ekf2.state))
-    for step_name, track in zip(
-        (*configurations, OUTPUT_PREDICTOR_STEP, "EKF2 as logged"), tracks, strict=True
+    tracks = chain(horizon_tracks, (baseline_replay.published_state, ekf2.state))
+    for property_name, track in zip(
+        (*configurations, OUTPUT_PREDICTOR_PROPERTY, "EKF2 as logged"), tracks, strict=True
     ):
-        tracks_by_step.append(
+        components_by_track.append(
             [
                 [
                     interpolate_component(track, columns, direction, state_times_s)
@@ -226,52 +230,53 @@ def explain_by_steps(
                 for direction in directions.values()
             ]
         )
-        # Before REJECTION_STEP, only EKF2's gate and output predictor are missing in the track
-        if step_name == [*configurations][-2]:
-            track_without_gate = track
+        # Before REJECTION_PROPERTY, only EKF2's gate and output predictor are missing in the track
+        if property_name == [*configurations][-2]:
+            replay_track_without_gate = track
     spans = Segment(*state_span_s, "").cut(evaluated_spans)
     longest_rejection = _find_longest_rejection(
-        baseline_replay, track_without_gate, state_span_s, evaluated_spans
+        baseline_replay, replay_track_without_gate, state_span_s, evaluated_spans
     )
     explanations = {}
     for axis_index, (axis, direction) in enumerate(directions.items()):
-        axis_tracks = [step_tracks[axis_index] for step_tracks in tracks_by_step]
-        kf_state = predict_state(kf_runs[axis], state_times_s) if kf_runs else axis_tracks[0]
-        explanations[axis] = _explain_axis(
+        axis_components = [track_components[axis_index] for track_components in components_by_track]
+        kf_state = predict_state(kf_runs[axis], state_times_s) if kf_runs else axis_components[0]
+        explanations[axis] = _explain_difference_along_axis(
             model.flight,
             direction,
-            (*configurations, OUTPUT_PREDICTOR_STEP),
+            (*configurations, OUTPUT_PREDICTOR_PROPERTY),
             state_times_s,
-            np.array([kf_state, *axis_tracks]),
+            np.array([kf_state, *axis_components]),
             spans,
             longest_rejection,
         )
     return explanations
 
 
-def _explain_axis(
+def _explain_difference_along_axis(
     flight: Flight,
     direction: Array,
-    step_names: Sequence[str],
+    property_names: Sequence[str],
     times_s: Array,
-    positions_by_step: Array,
+    components_by_track: Array,
     spans_s: Spans,
     longest_rejection: RejectionRun | None,
 ) -> DifferenceExplanation:
-    """Divide the difference KF - EKF2 along one axis among k properties that KF takes from EKF2.
+    """Divide the mean square difference KF - EKF2 along one axis among k replaced properties.
 
-    ``positions_by_step``, shape (k + 2, 2, n), contains position and velocity of KF, of k replays
-    (each with one more property of EKF2), and of the logged EKF2, at the times of EKF2's states.
+    ``components_by_track``, shape (k + 2, 2, n), contains position and velocity at n times. The
+    first track is KF, the last track the logged EKF2. Each of the k replays in between replaces one
+    more property of KF.
     """
-    difference_by_step_m = positions_by_step - positions_by_step[-1]
-    rmse_by_step = [
+    differences_by_track = components_by_track - components_by_track[-1]
+    rmse_by_track = [
         compute_rmse_to_truth(flight, track, direction, times_s)
-        for track in positions_by_step[:, 0]
+        for track in components_by_track[:, 0]
     ]
-    mean_square_differences = np.mean(difference_by_step_m[:-1] ** 2, axis=2)
-    position_change = np.abs(np.diff(positions_by_step[:-1, 0], axis=0))
+    mean_square_differences = np.mean(differences_by_track[:-1] ** 2, axis=2)
+    position_change = np.abs(np.diff(components_by_track[:-1, 0], axis=0))
     steps = tuple(
-        Step(
+        PropertyReplacement(
             name=name,
             position_mean_square_m2=position_reduction,
             velocity_mean_square_m2_s2=velocity_reduction,
@@ -280,42 +285,42 @@ def _explain_axis(
             position_rmse_to_truth_m=rmse_m,
         )
         for name, (position_reduction, velocity_reduction), position_change_m, rmse_m in zip(
-            step_names,
+            property_names,
             (mean_square_differences[:-1] - mean_square_differences[1:]).tolist(),
             position_change,
-            rmse_by_step[1:-1],
+            rmse_by_track[1:-1],
             strict=True,
         )
     )
-    total_mean_squares, *_, unexplained_mean_squares = mean_square_differences.tolist()
+    initial_mean_squares, *_, unexplained_mean_squares = mean_square_differences.tolist()
     missing_truth_reason = NO_TRUTH_OVERLAP if isinstance(flight.truth, Truth) else flight.truth
-    rmse_by_filter = {"kf": rmse_by_step[0], "ekf2": rmse_by_step[-1]}
     return DifferenceExplanation(
         count=len(times_s),
-        position_mean_square_m2=total_mean_squares[0],
-        velocity_mean_square_m2_s2=total_mean_squares[1],
+        position_mean_square_m2=initial_mean_squares[0],
+        velocity_mean_square_m2_s2=initial_mean_squares[1],
         steps=steps,
         unexplained_mean_square_m2=unexplained_mean_squares[0],
         unexplained_velocity_mean_square_m2_s2=unexplained_mean_squares[1],
         position_rmse_to_truth_m={
             name: missing_truth_reason if rmse_m is None else rmse_m
-            for name, rmse_m in rmse_by_filter.items()
+            for name, rmse_m in (("kf", rmse_by_track[0]), ("ekf2", rmse_by_track[-1]))
         },
         spans_s=spans_s,
         longest_rejection=longest_rejection,
         times_s=times_s,
         # Copied, because a view would keep the whole array in memory
-        kf_minus_ekf2_m=difference_by_step_m[0, 0].copy(),
-        unexplained_m=difference_by_step_m[-2, 0].copy(),
+        kf_minus_ekf2_m=differences_by_track[0, 0].copy(),
+        unexplained_difference_m=differences_by_track[-2, 0].copy(),
     )
 
 
-def make_step_configurations(
+def make_replacement_configurations(
     inputs: ReplayInputs, kf_settings: Settings
 ) -> dict[str, FilterConfiguration]:
-    """Return the model configurations that change KF into EKF2, one property (key) after the other.
+    """Return the configurations that change KF into EKF2, by name of the last replaced property.
 
-    The last configuration is EKF2 without output predictor.
+    Each configuration replaces one more property of KF. The last configuration is EKF2 without
+    output predictor.
     """
     logged_settings = inputs.settings
     aid = inputs.aid
@@ -324,15 +329,16 @@ def make_step_configurations(
     )
     kf_process_settings = {**logged_settings, "EKF2_ACC_NOISE": acceleration_noise_m_s2}
     kf_noise_settings = {**kf_process_settings, aid.noise: kf_settings.sigma_z_m}
-    # KF's GNSS positions have the delay already subtracted, the timestamps of the replay have not
+    # The delay is already subtracted from the GNSS times of KF, but not from the timestamps of the
+    # replay
     applied_delay_s = logged_settings[aid.delay] * 1e-3 if aid == GNSS_POS else 0.0
     time_offset_s = kf_settings.clock_offset_s - applied_delay_s
     settings_without_lever_arm = {**kf_noise_settings, **dict.fromkeys(aid.lever_arm, 0.0)}
     replayed_aids = list_modelled_aids(inputs)[1:]
-    step_by_aid = {
-        aid: step for aid, step in STEP_BY_ADDITIONAL_AID.items() if aid in replayed_aids
+    property_by_aid = {
+        aid: name for aid, name in PROPERTY_BY_ADDITIONAL_AID.items() if aid in replayed_aids
     }
-    additional_aids = [*step_by_aid]
+    additional_aids = [*property_by_aid]
     kf_configuration = FilterConfiguration(
         kf_noise_settings,
         estimates_biases=False,
@@ -340,44 +346,49 @@ def make_step_configurations(
         uses_reported_noise=False,
         has_gate=False,
         fuses_velocity=False,
-        without=dict.fromkeys((MAG.name, *additional_aids), 0.0),
+        disable_time_s_by_aid=dict.fromkeys((MAG.name, *additional_aids), 0.0),
     )
-    noise_step_configuration = replace(
+    measurement_noise_configuration = replace(
         kf_configuration, settings=kf_process_settings, uses_reported_noise=True
     )
-    process_step_configuration = replace(
-        noise_step_configuration, settings=logged_settings, estimates_biases=True
+    process_noise_configuration = replace(
+        measurement_noise_configuration, settings=logged_settings, estimates_biases=True
     )
-    latest_configuration = replace(process_step_configuration, estimates_attitude=True)
+    configuration = replace(process_noise_configuration, estimates_attitude=True)
     configurations = {
-        SAMPLE_TIMES_STEP: replace(
+        SAMPLE_TIMES_PROPERTY: replace(
             kf_configuration, settings=settings_without_lever_arm, timestamp_offset_s=time_offset_s
         ),
-        TIMESTAMPS_STEP: kf_configuration,
-        MEASUREMENT_NOISE_STEP: noise_step_configuration,
-        BIASES_STEP: replace(noise_step_configuration, estimates_biases=True),
-        PROCESS_NOISE_STEP: process_step_configuration,
-        ATTITUDE_STEP: latest_configuration,
+        TIMESTAMPS_PROPERTY: kf_configuration,
+        MEASUREMENT_NOISE_PROPERTY: measurement_noise_configuration,
+        ACCELEROMETER_BIAS_PROPERTY: replace(
+            measurement_noise_configuration, estimates_biases=True
+        ),
+        PROCESS_NOISE_PROPERTY: process_noise_configuration,
+        ATTITUDE_PROPERTY: configuration,
     }
     if MAG.name in replayed_aids:
-        configurations[MAGNETOMETER_STEP] = latest_configuration = replace(
-            latest_configuration, without=dict.fromkeys(additional_aids, 0.0)
+        configurations[MAGNETOMETER_PROPERTY] = configuration = replace(
+            configuration, disable_time_s_by_aid=dict.fromkeys(additional_aids, 0.0)
         )
     if GNSS_VEL.name in replayed_aids:
-        configurations[GNSS_VELOCITY_STEP] = latest_configuration = replace(
-            latest_configuration, fuses_velocity=True
+        configurations[GNSS_VELOCITY_PROPERTY] = configuration = replace(
+            configuration, fuses_velocity=True
         )
-    for next_index, step in enumerate(step_by_aid.values(), start=1):
-        configurations[step] = latest_configuration = replace(
-            latest_configuration, without=dict.fromkeys(additional_aids[next_index:], 0.0)
+    for next_index, name in enumerate(property_by_aid.values(), start=1):
+        configurations[name] = configuration = replace(
+            configuration, disable_time_s_by_aid=dict.fromkeys(additional_aids[next_index:], 0.0)
         )
     return configurations | {
-        REJECTION_STEP: FilterConfiguration(logged_settings, uses_logged_decisions=True)
+        REJECTION_PROPERTY: FilterConfiguration(logged_settings, uses_logged_decisions=True)
     }
 
 
 def _find_longest_rejection(
-    baseline_replay: Ekf2Replay, track_without_gate: pd.DataFrame, span: Span, spans_s: Spans
+    baseline_replay: Ekf2Replay,
+    horizon_track_without_gate: pd.DataFrame,
+    span: Span,
+    spans_s: Spans,
 ) -> RejectionRun | None:
     updates = rows_inside(baseline_replay.updates, spans_s)
     updates = updates[updates["fused_at_s"].between(*span)]
@@ -386,16 +397,19 @@ def _find_longest_rejection(
     if not is_rejected.any():
         return None
     # A run of rejections lasts from the first rejected sample to the next fused sample
-    rejection_change = np.diff(is_rejected.astype(int), prepend=0, append=0)
-    run_starts = np.flatnonzero(rejection_change == 1)
-    run_ends = np.flatnonzero(rejection_change == -1)
+    change_rows = np.flatnonzero(np.diff(is_rejected, prepend=False, append=False))
+    run_starts, run_ends = change_rows.reshape(-1, 2).T
     longest_index = int(np.argmax(run_ends - run_starts))
     begin_s = fusion_times_s[run_starts[longest_index]]
     end_s = fusion_times_s[min(run_ends[longest_index], len(fusion_times_s) - 1)]
-    track_with_gate = baseline_replay.delayed.loc[begin_s:end_s]
+    horizon_track = baseline_replay.delayed_state.loc[begin_s:end_s]
     position_difference = [
-        track_with_gate[column]
-        - np.interp(track_with_gate.index, track_without_gate.index, track_without_gate[column])
+        horizon_track[column]
+        - np.interp(
+            horizon_track.index,
+            horizon_track_without_gate.index,
+            horizon_track_without_gate[column],
+        )
         for column in Columns.POSITION[:2]
     ]
     return RejectionRun(

@@ -16,9 +16,9 @@ import pandas as pd
 
 from px4fuse.core.arrays import Array, ArrayPair, BoolArray, IntArray
 from px4fuse.ekf2.bias import BiasEstimator
-from px4fuse.ekf2.heights import MIN_INNOVATION_GATE, MIN_NOISE_SIGMA
+from px4fuse.ekf2.heights import MIN_INNOVATION_GATE, MIN_MEASUREMENT_NOISE_SIGMA
 from px4fuse.ekf2.inputs import ReplayInputs
-from px4fuse.ekf2.intervals import MAX_LATENESS_S
+from px4fuse.ekf2.intervals import MAX_DELAY_BEHIND_HORIZON_S
 from px4fuse.ekf2.replay_segments import (
     ReplaySegment,
     group_samples_by_event,
@@ -49,18 +49,20 @@ def group_vision_by_event(
     east (m), age, measurement time, fusion time (s), reported variances north and east (m²), and 1
     for a sample, 0 for padding.
     """
-    vision_positions = inputs.vision
+    vision_positions = inputs.vision_positions
     time_s = segment.time_s
     assert vision_positions is not None
     measurement_times_s = (
         vision_positions.timestamp_s - settings[EV_POS.delay] * 1e-3 - 0.5 * inputs.mean_step_s
     )
-    fusion_due_s = np.maximum(measurement_times_s, vision_positions.arrival_s - horizon_s)
-    step_index = np.maximum.accumulate(np.searchsorted(time_s, fusion_due_s - 1e-9))
+    earliest_fusion_times_s = np.maximum(
+        measurement_times_s, vision_positions.arrival_s - horizon_s
+    )
+    step_index = np.maximum.accumulate(np.searchsorted(time_s, earliest_fusion_times_s - 1e-9))
     is_usable = (
         (step_index > 0)
         & (step_index < len(time_s))
-        & (fusion_due_s < measurement_times_s + MAX_LATENESS_S)
+        & (earliest_fusion_times_s < measurement_times_s + MAX_DELAY_BEHIND_HORIZON_S)
     )
     is_usable &= np.isfinite(vision_positions.position_m[:, 0])
     # EKF2 fuses only the newer of two samples in one prediction step
@@ -70,30 +72,32 @@ def group_vision_by_event(
     position_m = (
         vision_positions.position_m[is_usable] - segment.body_to_ned[step_index] @ lever_arm_m
     )[:, :2]
-    sample_quantities = (
+    times_and_variances = (
         measurement_times_s[is_usable],
         time_s[step_index],
         *vision_positions.variance_m2[is_usable, :2].T,
     )
     return group_samples_by_event(
-        segment, event_steps, step_index, position_m, slice(0, 2), *sample_quantities
+        segment, event_steps, step_index, position_m, slice(0, 2), *times_and_variances
     )
 
 
 class VisionFilter:
-    """Fuse vision positions like EKF2 in one segment, for several filter configurations at once.
+    """Fuse vision positions as EKF2 does, in one segment and for several configurations at once.
 
-    Each event fuses the up to k samples since the previous event.
+    An event is the end of an interval of the replay. At each event, the filter fuses up to k
+    samples since the previous event.
 
     Parameters
     ----------
     segment : ReplaySegment
-    sample_arrays : sequence of ndarray, shape (8, k, events)
+    samples_by_configuration : sequence of ndarray, shape (8, k, events)
         Result of :func:`group_vision_by_event` for each filter configuration.
     is_enabled_by_aid : mapping from PX4's name of a source to ndarray of bool, (events, filters)
     parameters : mapping from parameter name to ndarray, shape (filters,)
     has_gate, uses_reported_noise : ndarray of bool, shape (filters,)
-        False to fuse every sample; False to ignore the reported variances.
+        ``has_gate`` is False to fuse every sample. ``uses_reported_noise`` is False to ignore the
+        reported variances.
 
     Attributes
     ----------
@@ -108,21 +112,22 @@ class VisionFilter:
     def __init__(
         self,
         segment: ReplaySegment,
-        sample_arrays: Sequence[Array],
+        samples_by_configuration: Sequence[Array],
         is_enabled_by_aid: Mapping[str, BoolArray],
         parameters: Mapping[str, Array],
         has_gate: BoolArray,
         uses_reported_noise: BoolArray,
     ) -> None:
-        samples = np.stack(pad_samples(sample_arrays), axis=-1)
+        samples = np.stack(pad_samples(samples_by_configuration), axis=-1)
         self.position_m = np.moveaxis(samples[:2], 0, -1)
         self.age_s, self.measurement_times_s, self.fusion_time_s = samples[2:5]
         _, sample_count, event_count, configuration_count = samples.shape
         self.update_records = np.full((event_count, sample_count, 7, configuration_count), np.nan)
         self.position_reset_m = np.zeros((event_count, configuration_count, 2))
         has_sample = (samples[7] > 0.0) & is_enabled_by_aid[EV_POS.name]
-        # GNSS is fused at the event. In one prediction step, EKF2 fuses GNSS before vision, so
-        # samples of age 0 are fused after GNSS, older samples before GNSS
+        # The first array contains vision samples that are fused before the GNSS sample of an event.
+        # The second array contains vision samples of the same prediction step as GNSS (age 0): EKF2
+        # fuses GNSS first
         self.has_sample = [has_sample & (self.age_s > 0.0), has_sample & (self.age_s == 0.0)]
         self.has_gate = has_gate
         self.is_gnss_off = ~is_enabled_by_aid[GNSS_POS.name]
@@ -130,7 +135,7 @@ class VisionFilter:
         reported_variance = samples[5:7] * (
             uses_reported_noise & (parameters[EV_POS.noise_mode_parameter] != 1.0)
         )
-        min_variance = np.maximum(parameters[EV_POS.noise], MIN_NOISE_SIGMA) ** 2
+        min_variance = np.maximum(parameters[EV_POS.noise], MIN_MEASUREMENT_NOISE_SIGMA) ** 2
         gnss_variance = np.where(self.is_gnss_off, 0.0, parameters[GNSS_POS.noise] ** 2)
         self.R_m2 = np.moveaxis(
             np.maximum(reported_variance, np.maximum(min_variance, gnss_variance)), 0, -1
@@ -142,11 +147,13 @@ class VisionFilter:
         self.was_gnss_off = self.is_gnss_off[0]
 
     def make_update_table(self, configuration_index: int, end_s: Array) -> pd.DataFrame:
-        """Return the vision updates of one configuration; ``end_s``: time (s) of each event."""
-        measurement_times_s = self.measurement_times_s[..., configuration_index].T
+        """Return the updates of one configuration with external vision, one row per sample.
+
+        ``end_s`` contains the time (s) of each event.
+        """
         return make_update_table(
             self.update_records[..., configuration_index],
-            measurement_times_s,
+            self.measurement_times_s[..., configuration_index].T,
             end_s,
             ["north", "east"],
         )
@@ -156,8 +163,8 @@ class VisionFilter:
     ) -> ArrayPair:
         """Fuse the vision samples of one event; return x and P.
 
-        ``is_last_step``: True for the samples of the last prediction step before the event, which
-        EKF2 fuses after GNSS; False for older samples.
+        ``is_last_step`` selects the samples: True for samples of the last prediction step before
+        the event, which EKF2 fuses after GNSS, False for older samples.
         """
         for sample_index, has_sample in enumerate(self.has_sample[is_last_step][:, event]):
             if has_sample.any():
@@ -179,39 +186,48 @@ class VisionFilter:
         R_m2 = self.R_m2[sample_index, event]
         HP = P[:, HORIZONTAL_POSITION] - sample_age_s[:, None] * P[:, HORIZONTAL_VELOCITY]
         S = HP[:, :, HORIZONTAL_POSITION] - sample_age_s[:, None] * HP[:, :, HORIZONTAL_VELOCITY]
-        # diagonal is a view of S: adding R to it changes S
-        diagonal = S.reshape(len(S), -1)[:, ::3]
+        # innovation_variances is a view of S: adding R to it changes S
+        innovation_variances = S.reshape(len(S), -1)[:, ::3]
         position_innovation_m = (
             self.position_m[sample_index, event]
             - x[:, HORIZONTAL_POSITION]
             + sample_age_s * x[:, HORIZONTAL_VELOCITY]
         )
-        updates_bias = has_sample & ~is_gnss_off
-        interval_s = np.where(updates_bias, fusion_time_s - self.last_sample_s, 0.0)
-        nu, R = self.bias.remove_bias(
-            position_innovation_m, diagonal.copy(), R_m2, interval_s[:, None], updates_bias[:, None]
+        is_bias_updated = has_sample & ~is_gnss_off
+        interval_s = np.where(is_bias_updated, fusion_time_s - self.last_sample_s, 0.0)
+        nu, R = self.bias.remove_and_update_bias(
+            position_innovation_m,
+            innovation_variances.copy(),
+            R_m2,
+            interval_s[:, None],
+            is_bias_updated[:, None],
         )
-        diagonal += R
-        has_restarted = (fusion_time_s - self.last_sample_s > MAX_SAMPLE_GAP_S) | (
+        innovation_variances += R
+        has_fusion_restarted = (fusion_time_s - self.last_sample_s > MAX_SAMPLE_GAP_S) | (
             is_gnss_off != self.was_gnss_off
         )
         is_outside_gate = (
-            (nu * nu > self.gate_squared * diagonal).any(axis=1) & self.has_gate & ~has_restarted
+            (nu * nu > self.gate_squared * innovation_variances).any(axis=1)
+            & self.has_gate
+            & ~has_fusion_restarted
         )
-        is_failing = is_outside_gate & (
+        is_rejection_timed_out = is_outside_gate & (
             fusion_time_s - self.last_attempt_s > MAX_REJECTION_DURATION_S
         )
-        is_restarting = has_sample & (has_restarted | is_failing)
-        is_fused = has_sample & ~is_outside_gate & ~has_restarted
+        is_restarting = has_sample & (has_fusion_restarted | is_rejection_timed_out)
+        is_fused = has_sample & ~is_outside_gate & ~has_fusion_restarted
         is_position_reset = is_restarting & (
             is_gnss_off
-            | (is_failing & (fusion_time_s - last_gnss_fusion_s > MAX_REJECTION_DURATION_S))
+            | (
+                is_rejection_timed_out
+                & (fusion_time_s - last_gnss_fusion_s > MAX_REJECTION_DURATION_S)
+            )
         )
-        is_evaluated = has_sample & ~has_restarted | is_position_reset
+        is_evaluated = has_sample & ~has_fusion_restarted | is_position_reset
         # If EKF2 resets its position to a sample, it logs innovation 0 for this sample
         update_records = (
             *np.where(is_position_reset, 0.0, nu.T),
-            *diagonal.T,
+            *innovation_variances.T,
             is_outside_gate & ~is_position_reset,
             is_fused,
             is_position_reset,
@@ -227,25 +243,25 @@ class VisionFilter:
                 np.where(is_gnss_off[:, None], position_innovation_m, nu)
                 * is_position_reset[:, None]
             )
-            restart_variance = np.where(is_gnss_off[:, None], R_m2, R)
+            position_variance_after_reset = np.where(is_gnss_off[:, None], R_m2, R)
             set_states(
                 x,
                 P,
                 is_position_reset,
                 HORIZONTAL_POSITION,
                 x[:, HORIZONTAL_POSITION] + position_reset_m,
-                restart_variance,
+                position_variance_after_reset,
             )
             self.position_reset_m[event] += position_reset_m
         if is_restarting.any():
-            initialises_bias = (is_restarting & ~is_position_reset)[:, None]
-            clears_bias = (is_position_reset & is_gnss_off)[:, None]
+            is_bias_initialised = (is_restarting & ~is_position_reset)[:, None]
+            is_bias_cleared = (is_position_reset & is_gnss_off)[:, None]
             self.bias.bias_m = np.where(
-                initialises_bias,
+                is_bias_initialised,
                 -position_innovation_m,
-                np.where(clears_bias, 0.0, self.bias.bias_m),
+                np.where(is_bias_cleared, 0.0, self.bias.bias_m),
             )
-            self.bias.variance_m2 = np.where(clears_bias, 0.0, self.bias.variance_m2)
+            self.bias.variance_m2 = np.where(is_bias_cleared, 0.0, self.bias.variance_m2)
         self.last_sample_s = np.where(has_sample, fusion_time_s, self.last_sample_s)
         self.last_attempt_s = np.where(is_fused | is_restarting, fusion_time_s, self.last_attempt_s)
         self.last_fusion_s = np.where(

@@ -55,7 +55,7 @@ HEADING_LOGGED_NOTE = (
     "magnetometer samples"
 )
 HEIGHT_REPLAYED_NOTE = "Height is replayed with the logged height sensors"
-HEIGHT_START_NOTE = (
+BAD_ACCELERATION_AT_START_NOTE = (
     "When the replay starts, EKF2's flag fs_bad_acc_vertical is set, so the replayed height may be "
     "wrong at first"
 )
@@ -63,12 +63,12 @@ HEIGHT_LOGGED_NOTE = "All replays use the logged EKF2 height"
 HEADING_NOT_REPLAYED = Unavailable(
     "heading error",
     "in a flight with external vision, the replay uses the logged EKF2 heading",
-    "Use the logged heading (vehicle_attitude) instead of a replayed heading.",
+    "Compute the heading error from the logged heading (vehicle_attitude).",
 )
 HEIGHT_NOT_REPLAYED = Unavailable(
     "height error",
     "the replay uses the logged EKF2 height",
-    "Use the logged height (vehicle_local_position) instead of a replayed height.",
+    "Compute the height error from the logged height (vehicle_local_position).",
 )
 HEIGHT_AID_NAMES = {aid.name for aid in HEIGHT_SENSORS}
 # Minimum evaluated flight time (s) after an aiding source is disabled
@@ -76,11 +76,11 @@ MIN_EVALUATED_DURATION_S = 5.0
 # Default and maximum number of parameter values in a sweep
 SWEEP_VALUE_COUNT = 9
 MAX_SWEEP_VALUES = 200
-# A rejection near the gate can change the whole replay. The replay is therefore repeated with this
-# position noise (m, 1 σ), to test if its statistics are predictable
+# A replay is repeated with this added position noise (m, 1 σ), to test if its statistics are
+# predictable: the rejection of one sample near the gate can change the rest of the replay
 ADDED_POSITION_SIGMA_M = 0.002
 # Number of repeated replays with added position noise
-NOISY_REPLAY_COUNT = 4
+REPLAYS_WITH_ADDED_NOISE = 4
 # A replay is repeated with added noise if it rejects more than this fraction of the samples
 MIN_REJECTED_FRACTION = 0.02
 # Above this rejected fraction, the statistics of a replay are unpredictable
@@ -88,15 +88,16 @@ MAX_REJECTED_FRACTION = 0.35
 # EKF2 resets the height after this time (s) without height fusion (hgt_fusion_timeout_max,
 # common.h)
 HEIGHT_TIMEOUT_S = 5.0
-# Maximum ratio of the mean NIS of repeated replays; above, the statistics are unpredictable
-MAX_REPEATED_NIS_RATIO = 1.10
-# Maximum difference of the rejected fractions of repeated replays
-MAX_REJECTED_FRACTION_SPREAD = 0.03
-# Maximum ratio of the position RMSE of repeated replays
-MAX_REPEATED_RMSE_RATIO = 1.15
+# Maximum ratio of largest to smallest mean NIS of repeated replays. Above this ratio, the
+# statistics are unpredictable
+MAX_NIS_RATIO_OF_NOISY_REPLAYS = 1.10
+# Maximum difference between largest and smallest rejected fraction of repeated replays
+MAX_REJECTED_SPREAD_OF_NOISY_REPLAYS = 0.03
+# Maximum ratio of largest to smallest position RMSE of repeated replays
+MAX_RMSE_RATIO_OF_NOISY_REPLAYS = 1.15
 
 
-class AxisSummary(Record):
+class AxisStatistics(Record):
     """EKF2 statistics along one axis, with one set of parameters.
 
     ``nis_mean`` includes rejected samples; ``sigma_p_median_m`` is the median reported σ.
@@ -109,8 +110,8 @@ class AxisSummary(Record):
     position_rmse_to_truth_m: NotNegative | Unavailable
 
 
-class HeightSummary(Record):
-    """Innovations and rejections of a height sensor, or of vision in addition to GNSS."""
+class AidStatistics(Record):
+    """Innovation statistics of an aiding source other than the position source."""
 
     nis_mean: NotNegative
     nis_band: tuple[NotNegative, NotNegative]
@@ -125,7 +126,7 @@ class HeightSummary(Record):
         return not has_reset and self.rejected_fraction <= MAX_REJECTED_FRACTION
 
 
-class Summary(Record, kw_only=True, omit_defaults=False):
+class Ekf2Statistics(Record, kw_only=True, omit_defaults=False):
     """EKF2 statistics with one set of parameters: as logged, replayed, or changed.
 
     Attributes
@@ -138,24 +139,25 @@ class Summary(Record, kw_only=True, omit_defaults=False):
         Number of horizontal position resets.
     heading_error_mean_deg : float or Unavailable
         Mean of heading minus true heading, clockwise from above.
-    heights, others : mapping from PX4's name to HeightSummary
-        Replayed height sensors, and vision that is fused in addition to GNSS.
+    heights, others : mapping from PX4's name to AidStatistics
+        ``heights``: statistics of each replayed height sensor. ``others``: statistics of vision, if
+        EKF2 fuses vision in addition to GNSS.
     late, lost : int
-        Number of samples that were fused late, and number of samples too late to be fused.
+        Number of samples that were fused late, and number of samples that arrived too late.
     is_predictable : bool
         False if the statistics depend on the rejection of single samples.
     """
 
     changed: Mapping[str, float]
-    north: AxisSummary
-    east: AxisSummary
+    north: AxisStatistics
+    east: AxisStatistics
     samples: Count
     rejected_fraction: Share
     longest_without_fusion_s: NotNegative | Unavailable
     resets: Count
     heading_error_mean_deg: float | Unavailable = HEADING_NOT_REPLAYED
-    heights: Mapping[str, HeightSummary] = {}
-    others: Mapping[str, HeightSummary] = {}
+    heights: Mapping[str, AidStatistics] = {}
+    others: Mapping[str, AidStatistics] = {}
     height_rmse_to_truth_m: NotNegative | Unavailable = HEIGHT_NOT_REPLAYED
     late: Count = 0
     lost: Count = 0
@@ -164,7 +166,7 @@ class Summary(Record, kw_only=True, omit_defaults=False):
     without: Mapping[str, float] = {}
 
     @property
-    def axes(self) -> dict[str, AxisSummary]:
+    def axes(self) -> dict[str, AxisStatistics]:
         return {"north": self.north, "east": self.east}
 
     @property
@@ -189,7 +191,7 @@ class WhatIf:
     ----------
     agreement : Agreement
         Agreement of the replay with the log.
-    whatif : tuple of Summary
+    whatif : tuple of Ekf2Statistics
         Statistics with each set of changed parameters.
     evaluated_s : tuple of (float, float)
         Time spans (start, end) of the statistics.
@@ -198,9 +200,9 @@ class WhatIf:
     """
 
     agreement: Agreement
-    logged: Summary
-    replayed: Summary
-    whatif: tuple[Summary, ...]
+    logged: Ekf2Statistics
+    replayed: Ekf2Statistics
+    whatif: tuple[Ekf2Statistics, ...]
     evaluated_s: Spans
     notes: tuple[str, ...]
 
@@ -210,7 +212,7 @@ class WhatIf:
 def what_if(
     model: Ekf2Model,
     settings: Sequence[Mapping[str, float]],
-    without: Mapping[str, float] | None = None,
+    disable_time_s_by_aid: Mapping[str, float] | None = None,
 ) -> WhatIf | Unavailable:
     """Replay EKF2 with other parameters and compare with the log.
 
@@ -219,7 +221,7 @@ def what_if(
     model : Ekf2Model
     settings : sequence of mapping
         Changed parameters of each replay, by PX4 name.
-    without : mapping from PX4's name of an aiding source to float, optional
+    disable_time_s_by_aid : mapping from PX4's name of an aiding source to float, optional
         Time (s) from which the source is not fused; only later times are evaluated.
 
     Raises
@@ -229,41 +231,43 @@ def what_if(
     """
     if not model.agreement.good:
         return model.agreement.as_unavailable(ANALYSIS_NAME)
-    without = without or {}
-    replays = replay_with_settings(model, settings, without=without)
+    disable_time_s_by_aid = disable_time_s_by_aid or {}
+    replays = replay_with_settings(model, settings, disable_time_s_by_aid=disable_time_s_by_aid)
     flight = model.flight
     spans_s = model.baseline_replay.find_evaluated_spans()
-    if without:
-        first_disable_time_s = min(without.values())
+    if disable_time_s_by_aid:
+        first_disable_time_s = min(disable_time_s_by_aid.values())
         # Only the first remaining segment is evaluated: later segments start from logged states, to
         # which the disabled source contributed
         replay_end_s = spans_s[-1][1]
-        remaining_spans = [
+        spans_after_disabling = [
             (max(start, first_disable_time_s), end)
             for start, end in spans_s
             if end - first_disable_time_s > MIN_EVALUATED_DURATION_S
         ]
-        spans_s = tuple(remaining_spans[:1])
+        spans_s = tuple(spans_after_disabling[:1])
         if not spans_s:
             raise SettingsError(
                 f"--from {first_disable_time_s:g} s leaves less than "
                 f"{MIN_EVALUATED_DURATION_S:g} s of the replayed flight, which ends at "
                 f"{replay_end_s:.0f} s. Choose an earlier time."
             )
-    summaries: list[Summary] = []
+    summaries: list[Ekf2Statistics] = []
     notes: list[str] = []
     deviation_notes: list[str] = []
     for replay in replays:
         summaries.append(_summarise_replay(flight, replay, spans_s))
         notes += _describe_replay_limits(model, replay)
-        if without:
-            deviation_notes.append(_describe_deviation(model, replay, without, spans_s))
+        if disable_time_s_by_aid:
+            deviation_notes.append(
+                _describe_deviation(model, replay, disable_time_s_by_aid, spans_s)
+            )
     is_gnss = model.inputs.aid == GNSS_POS
     return WhatIf(
         agreement=model.agreement,
         logged=_summarise_log(flight, model.baseline_replay, spans_s),
         replayed=_summarise_replay(flight, model.baseline_replay, spans_s),
-        whatif=_mark_unpredictable(model, summaries, spans_s, without),
+        whatif=_mark_unpredictable(model, summaries, spans_s, disable_time_s_by_aid),
         evaluated_s=spans_s,
         notes=(
             *(_describe_heading_and_height(model) if summaries and is_gnss else ()),
@@ -281,14 +285,16 @@ def _describe_heading_and_height(model: Ekf2Model) -> tuple[str, str]:
             "Heading is replayed with the magnetometer. With the logged parameters, the replayed "
             f"heading differs from the logged heading by {heading_difference_deg:.1f}° RMS"
         )
-    height_note = HEIGHT_LOGGED_NOTE if model.inputs.logged_height_reason else HEIGHT_REPLAYED_NOTE
+    height_note = (
+        HEIGHT_LOGGED_NOTE if model.inputs.reason_for_logged_height else HEIGHT_REPLAYED_NOTE
+    )
     bad_acceleration_flags = model.inputs.segments[0].is_acceleration_bad
     if (
         height_note == HEIGHT_REPLAYED_NOTE
         and bad_acceleration_flags is not None
         and bad_acceleration_flags[0]
     ):
-        height_note = f"{height_note}. {HEIGHT_START_NOTE}"
+        height_note = f"{height_note}. {BAD_ACCELERATION_AT_START_NOTE}"
     return heading_note, height_note
 
 
@@ -324,26 +330,30 @@ def make_sweep_values(
 
 def _mark_unpredictable(
     model: Ekf2Model,
-    summaries: Sequence[Summary],
+    summaries: Sequence[Ekf2Statistics],
     spans_s: Spans,
-    disable_times_s: Mapping[str, float],
-) -> tuple[Summary, ...]:
+    disable_time_s_by_aid: Mapping[str, float],
+) -> tuple[Ekf2Statistics, ...]:
     """Set ``is_predictable`` to False if repetitions of a replay with added noise differ.
 
     Many rejections or a height reset also set ``is_predictable`` to False.
     """
     summaries_by_replay = [[summary] for summary in summaries]
-    repeated_summaries = [
+    summaries_of_noisy_replays = [
         replay_summaries
         for replay_summaries in summaries_by_replay
         if replay_summaries[0].changed
         and MIN_REJECTED_FRACTION < replay_summaries[0].rejected_fraction <= MAX_REJECTED_FRACTION
     ]
-    changes_to_repeat = [replay_summaries[0].changed for replay_summaries in repeated_summaries]
-    for seed in range(NOISY_REPLAY_COUNT if changes_to_repeat else 0):
+    changes_for_noisy_replays = [
+        replay_summaries[0].changed for replay_summaries in summaries_of_noisy_replays
+    ]
+    for seed in range(REPLAYS_WITH_ADDED_NOISE if changes_for_noisy_replays else 0):
         noisy_model = add_position_noise(model, ADDED_POSITION_SIGMA_M, seed)
-        replays = replay_with_settings(noisy_model, changes_to_repeat, without=disable_times_s)
-        for replay_summaries, replay in zip(repeated_summaries, replays, strict=True):
+        replays = replay_with_settings(
+            noisy_model, changes_for_noisy_replays, disable_time_s_by_aid=disable_time_s_by_aid
+        )
+        for replay_summaries, replay in zip(summaries_of_noisy_replays, replays, strict=True):
             replay_summaries.append(_summarise_replay(model.flight, replay, spans_s))
     final_summaries = []
     for summary, *noisy_summaries in summaries_by_replay:
@@ -358,12 +368,12 @@ def _mark_unpredictable(
             and _results_agree([summary, *noisy_summaries])
         )
         final_summaries.append(
-            replace(summary, is_predictable=is_predictable, without=disable_times_s)
+            replace(summary, is_predictable=is_predictable, without=disable_time_s_by_aid)
         )
     return tuple(final_summaries)
 
 
-def _results_agree(summaries: Sequence[Summary]) -> bool:
+def _results_agree(summaries: Sequence[Ekf2Statistics]) -> bool:
     """Return True if mean NIS, rejected fraction and RMSE of repeated replays hardly differ."""
     rmse_values = [
         rmse_m
@@ -375,20 +385,27 @@ def _results_agree(summaries: Sequence[Summary]) -> bool:
         [summary.axes[axis].nis_mean for summary in summaries] for axis in HORIZONTAL_AXES
     ]
     return (
-        all(max(axis_nis) <= MAX_REPEATED_NIS_RATIO * min(axis_nis) for axis_nis in nis_by_axis)
-        and max(rejected_fractions) - min(rejected_fractions) <= MAX_REJECTED_FRACTION_SPREAD
-        and (not rmse_values or max(rmse_values) <= MAX_REPEATED_RMSE_RATIO * min(rmse_values))
+        all(
+            max(axis_nis) <= MAX_NIS_RATIO_OF_NOISY_REPLAYS * min(axis_nis)
+            for axis_nis in nis_by_axis
+        )
+        and max(rejected_fractions) - min(rejected_fractions)
+        <= MAX_REJECTED_SPREAD_OF_NOISY_REPLAYS
+        and (
+            not rmse_values
+            or max(rmse_values) <= MAX_RMSE_RATIO_OF_NOISY_REPLAYS * min(rmse_values)
+        )
     )
 
 
-def _summarise_replay(flight: Flight, replay: Ekf2Replay, spans_s: Spans) -> Summary:
+def _summarise_replay(flight: Flight, replay: Ekf2Replay, spans_s: Spans) -> Ekf2Statistics:
     updates = replay.updates
     evaluated_updates = rows_inside(updates, spans_s)
     update_times_s = updates["fused_at_s"].to_numpy()
     if evaluated_updates.empty:
         raise SettingsError(
             f"{_format_changes(replay)}: {replay.source} would never be fused in the evaluated "
-            f"time: {replay.lost} samples arrive after the fusion horizon has passed them",
+            f"time. {replay.lost} samples would arrive too late, after the fusion horizon",
             "Choose another parameter value.",
         )
     # Interpolated position variance: before each update (1 µs earlier), and after it
@@ -412,11 +429,11 @@ def _summarise_replay(flight: Flight, replay: Ekf2Replay, spans_s: Spans) -> Sum
         replay,
         spans_s,
         evaluated_updates,
-        replay.published,
+        replay.published_state,
         variance,
         replay.other_aid_updates,
-        replay.delayed["heading_rad"],
-        changed=replay.changed,
+        replay.delayed_state["heading_rad"],
+        changed=replay.changed_parameters,
         longest_without_fusion_s=_find_longest_gap_s(fusion_times_s, spans_s),
         resets=int(reset_count),
         late=replay.late,
@@ -424,20 +441,21 @@ def _summarise_replay(flight: Flight, replay: Ekf2Replay, spans_s: Spans) -> Sum
     )
 
 
-def _summarise_log(flight: Flight, replay: Ekf2Replay, spans_s: Spans) -> Summary:
+def _summarise_log(flight: Flight, replay: Ekf2Replay, spans_s: Spans) -> Ekf2Statistics:
     ekf2 = flight.ekf2
     assert isinstance(ekf2, Ekf2)
     evaluated_updates = rows_inside(logged_innovations(ekf2), spans_s)
     horizon_s = 0.0 if isinstance(ekf2.horizon_s, Unavailable) else ekf2.horizon_s
     reset_times_s = find_horizontal_reset_times_s(ekf2) - horizon_s
     reset_times_s = reset_times_s[is_inside_spans(reset_times_s, spans_s)]
-    replayed_count = len(rows_inside(replay.updates, spans_s))
+    replayed_update_count = len(rows_inside(replay.updates, spans_s))
     longest_gap_s: float | Unavailable = Unavailable(
         "longest time without fusion",
-        f"the log contains only {len(evaluated_updates)} of about {replayed_count} innovations",
+        f"the log contains only {len(evaluated_updates)} of about {replayed_update_count} "
+        "innovations",
         f"Log {ekf2.innovation_topics[0]} at full rate.",
     )
-    if len(evaluated_updates) > MIN_LOGGED_INNOVATION_FRACTION * replayed_count:
+    if len(evaluated_updates) > MIN_LOGGED_INNOVATION_FRACTION * replayed_update_count:
         fusion_times_s = evaluated_updates.index[evaluated_updates["rejected"] == 0]
         longest_gap_s = _find_longest_gap_s(
             np.concatenate([fusion_times_s, reset_times_s]), spans_s
@@ -475,8 +493,8 @@ def _make_summary(
     other_aid_updates: Mapping[str, pd.DataFrame],
     headings_rad: pd.Series,
     **other_fields: Any,
-) -> Summary:
-    """Compute EKF2's statistics; ``other_fields`` are fields of :class:`Summary` to add.
+) -> Ekf2Statistics:
+    """Compute EKF2's statistics; ``other_fields`` are fields of :class:`Ekf2Statistics` to add.
 
     Without ``variance``, the logged position variance is used.
     """
@@ -502,7 +520,7 @@ def _make_summary(
             median_sigma = float(
                 np.sqrt(np.median(np.interp(variance_times_s, axis_variance.index, axis_variance)))
             )
-        other_fields[axis] = AxisSummary(
+        other_fields[axis] = AxisStatistics(
             *_compute_innovation_statistics(evaluated_updates, axis),
             median_sigma,
             error_m(direction),
@@ -519,7 +537,7 @@ def _make_summary(
     if other_aid_updates.keys() & HEIGHT_AID_NAMES:
         other_fields["heights"] = aids
         other_fields["height_rmse_to_truth_m"] = error_m(np.eye(3)[2])
-    return Summary(
+    return Ekf2Statistics(
         samples=len(evaluated_updates),
         rejected_fraction=float(evaluated_updates["rejected"].mean()),
         heading_error_mean_deg=_compute_heading_error_deg(flight, replay, headings_rad, spans_s),
@@ -535,12 +553,12 @@ def _compute_innovation_statistics(
     return float(np.mean(nu**2 / S)), compute_nis_band(len(nu)), float(np.std(nu))
 
 
-def _summarise_aid(evaluated_updates: pd.DataFrame, spans_s: Spans) -> HeightSummary:
+def _summarise_aid(evaluated_updates: pd.DataFrame, spans_s: Spans) -> AidStatistics:
     fused_updates = evaluated_updates[evaluated_updates["rejected"] == 0.0]
     longest_gap_s = max(
         _find_longest_gap_s(rows_inside(fused_updates, (span,)).index, (span,)) for span in spans_s
     )
-    return HeightSummary(
+    return AidStatistics(
         *_compute_innovation_statistics(
             evaluated_updates, *list_innovation_axes(evaluated_updates)
         ),
@@ -572,35 +590,33 @@ def _find_longest_gap_s(fusion_times_s: ArrayLike, spans_s: Spans) -> float:
 
 
 def _describe_deviation(
-    model: Ekf2Model, replay: Ekf2Replay, disable_times_s: Mapping[str, float], spans_s: Spans
+    model: Ekf2Model, replay: Ekf2Replay, disable_time_s_by_aid: Mapping[str, float], spans_s: Spans
 ) -> str:
     """Describe the position difference between replays with and without an aiding source."""
     position_difference_m = rows_inside(
-        replay.published[Columns.POSITION] - model.baseline_replay.published[Columns.POSITION],
+        replay.published_state[Columns.POSITION]
+        - model.baseline_replay.published_state[Columns.POSITION],
         spans_s,
     )
-    *horizontal_m, down_difference_m = np.abs(position_difference_m.to_numpy()).T
-    horizontal_distance_m, max_height_difference_m = (
-        np.hypot(*horizontal_m),
-        down_difference_m.max(),
+    *horizontal_m, height_difference_m = np.abs(position_difference_m.to_numpy()).T
+    horizontal_distance_m = np.hypot(*horizontal_m)
+    aids_text = ", ".join(
+        f"{aid} from {from_s:g} s on" for aid, from_s in disable_time_s_by_aid.items()
     )
-    aids_text = ", ".join(f"{aid} from {from_s:g} s on" for aid, from_s in disable_times_s.items())
     height_aids = HEIGHT_AID_NAMES & model.baseline_replay.other_aid_updates.keys()
     horizontal_aids = {*list_modelled_aids(model.inputs)} - {MAG.name} - height_aids
-    at_s = position_difference_m.index[horizontal_distance_m.argmax()]
+    largest_distance_time_s = position_difference_m.index[horizontal_distance_m.argmax()]
     note = (
-        f"Without {aids_text} the published position differs from the replay with all aiding "
-        f"sources by at most {horizontal_distance_m.max():.3g} m (at {at_s:.1f} s), and by "
-        f"{horizontal_distance_m[-1]:.3g} m at the end"
+        f"Without {aids_text}, the published position differs from the replay with all aiding "
+        f"sources by at most {horizontal_distance_m.max():.3g} m "
+        f"(at {largest_distance_time_s:.1f} s). At the end, the difference is "
+        f"{horizontal_distance_m[-1]:.3g} m"
     )
-    if height_aids & {*disable_times_s}:
+    if height_aids & {*disable_time_s_by_aid}:
+        note = f"{note}. The published height differs by at most {height_difference_m.max():.3g} m"
+    if horizontal_aids <= disable_time_s_by_aid.keys():
         note = (
-            f"{note}. The heights of the two replays differ by at most "
-            f"{max_height_difference_m:.3g} m"
-        )
-    if horizontal_aids <= disable_times_s.keys():
-        note = (
-            f"{note}. The replay continues with the IMU alone; EKF2 stops publishing a position "
+            f"{note}. The replay then uses only the IMU. EKF2 stops publishing a position "
             "after EKF2_NOAID_TOUT (5 s)"
         )
     return note
@@ -608,24 +624,27 @@ def _describe_deviation(
 
 def _describe_replay_limits(model: Ekf2Model, replay: Ekf2Replay) -> Iterator[str]:
     min_noise_m = replay.settings.get(GNSS_POS.noise, 0.0)
-    if min_noise_m >= replay.changed.get(EV_POS.noise, np.inf):
+    if min_noise_m >= replay.changed_parameters.get(EV_POS.noise, np.inf):
         yield (
             f"While EKF2 fuses GNSS, the noise of vision positions is at least {GNSS_POS.noise} "
             f"({min_noise_m:g} m)"
         )
     if replay.late or replay.lost:
-        # Samples may lack an update: EKF2 fuses only the newer of two samples in a prediction step
+        # Some received samples have no update: of two samples in one prediction step, EKF2 fuses
+        # only the newer
         received_count = max(len(replay.updates), replay.late) + replay.lost
         note = (
             f"{_format_changes(replay)}: {replay.late + replay.lost} of {received_count} samples "
-            f"would arrive after the fusion horizon; EKF2 would never fuse {replay.lost} of them"
+            "would arrive late, after the fusion horizon. EKF2 would never fuse "
+            f"{replay.lost} of them"
         )
-        has_delay_max_parameter = not model.inputs.rules.uses_delay_as_horizon
-        yield f"{note}. Increase EKF2_DELAY_MAX" if has_delay_max_parameter else note
+        # If the horizon is the largest delay, the PX4 release has no parameter EKF2_DELAY_MAX
+        is_horizon_largest_delay = model.inputs.rules.is_horizon_largest_delay
+        yield note if is_horizon_largest_delay else f"{note}. Increase EKF2_DELAY_MAX"
 
 
 def _format_changes(replay: Ekf2Replay) -> str:
     return (
-        ", ".join(f"{name}={value:g}" for name, value in replay.changed.items())
+        ", ".join(f"{name}={value:g}" for name, value in replay.changed_parameters.items())
         or "Logged parameters"
     )

@@ -9,7 +9,7 @@ from px4fuse.comparison.comparison import compute_position_errors
 from px4fuse.comparison.flight_events import find_airborne_spans
 from px4fuse.core.record import Span
 from px4fuse.core.text import format_number, format_ratio
-from px4fuse.ekf2.aids import CHANGE_WINDOW_S, AidResult
+from px4fuse.ekf2.aids import INNOVATION_MEAN_WINDOW_S, AidResult
 from px4fuse.finding import Finding
 from px4fuse.findings.cause_grouping import CAUSE_KEY, INNOVATION_CHANGE_CAUSE, SOURCE_SENSOR_CAUSE
 from px4fuse.findings.model import Findings, finding, format_percent, make_note, make_warning
@@ -171,7 +171,7 @@ def _make_innovation_change_finding(name: str, aid: AidResult) -> Finding:
         f"({format_number(innovation_sigma, 2)} {aid.unit}).",
         f"Check what was switched, moved or passed near the sensor at {time_s:.0f} s.",
         {"aid": name, "axis": axis, "time_s": time_s, "moved": mean_change},
-        ((time_s, time_s + CHANGE_WINDOW_S),),
+        ((time_s, time_s + INNOVATION_MEAN_WINDOW_S),),
     )
 
 

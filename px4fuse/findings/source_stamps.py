@@ -7,10 +7,11 @@ from px4fuse.analysis import Analysis
 from px4fuse.core.arrays import Array, rank_correlation
 from px4fuse.core.text import format_metres
 from px4fuse.ekf2.fusion_conditions import (
-    AGE_TEXT_BY_WRONG_TIMESTAMP,
+    UNUSABLE_TIMESTAMPS,
+    UNUSABLE_TIMESTAMPS_EFFECT,
     find_timestamp_action,
 )
-from px4fuse.ekf2.intervals import MAX_LATENESS_S
+from px4fuse.ekf2.intervals import MAX_DELAY_BEHIND_HORIZON_S
 from px4fuse.findings.model import (
     Findings,
     compute_flag_fraction,
@@ -67,7 +68,7 @@ def detect(analysis: Analysis) -> Findings:
         yield from detect_varying_latency(analysis)
     elif clock_map.note == REPEATED_TIMESTAMPS_NOTE and clock_map.distinct_stamps:
         yield from detect_repeated_timestamps(analysis, clock_map.pairs, clock_map.distinct_stamps)
-    elif clock_map.clock in AGE_TEXT_BY_WRONG_TIMESTAMP:
+    elif clock_map.clock in UNUSABLE_TIMESTAMPS:
         yield from detect_timestamp_unit(analysis, clock_map.clock)
     elif clock_map.distinct_stamps is not None:
         yield from detect_constant_timestamps(positions_text, clock_map, clock_map.distinct_stamps)
@@ -140,10 +141,7 @@ def detect_timestamp_unit(analysis: Analysis, clock_name: str) -> Findings:
     if isinstance(fusion_flags, pd.DataFrame) and not compute_flag_fraction(
         fusion_flags["horizontal"], segment
     ):
-        fusion_sentence = (
-            "EKF2 never fused the positions: with these timestamps, the positions are "
-            f"{AGE_TEXT_BY_WRONG_TIMESTAMP[clock_name]} for EKF2. "
-        )
+        fusion_sentence = f"EKF2 never fused the positions. {UNUSABLE_TIMESTAMPS_EFFECT} "
     yield make_error(
         "source_timestamp_unit",
         f"The timestamps of the {positions_phrase(analysis.source)} are "
@@ -237,7 +235,7 @@ def detect_varying_latency(analysis: Analysis) -> Findings:
     ekf2, late_drop_sentence, dropped_fraction = analysis.flight.ekf2, "", 0.0
     if isinstance(ekf2, Ekf2) and isinstance(ekf2.horizon_s, float):
         delay_s = 1e-3 * analysis.flight.log.parameters.get(EV_POS.delay, 0.0)
-        limit_s = ekf2.horizon_s + MAX_LATENESS_S - delay_s
+        limit_s = ekf2.horizon_s + MAX_DELAY_BEHIND_HORIZON_S - delay_s
         dropped_fraction = float((position_age_s > limit_s).mean())
         late_drop_sentence = (
             f" EKF2 drops positions that arrive more than {limit_s:.2f} s after their timestamp: "

@@ -213,7 +213,7 @@ def _describe_replayed_effect(analysis: Analysis, change: Mapping[str, float]) -
         return ""
     rmses_m = []
     for replay in (ekf2_model.baseline_replay, *replay_with_settings(ekf2_model, [change])):
-        replayed_track = rows_inside(replay.published, replay.find_evaluated_spans())
+        replayed_track = rows_inside(replay.published_state, replay.find_evaluated_spans())
         axis_errors_m = [
             replayed_track[name]
             - np.interp(replayed_track.index, truth.samples.index, truth.samples[name])

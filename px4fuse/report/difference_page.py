@@ -167,7 +167,7 @@ def _draw_axis_explanation(
     )
     position_difference_m, unexplained_difference_m = (
         pd.Series(values, explanation.times_s)
-        for values in (explanation.kf_minus_ekf2_m, explanation.unexplained_m)
+        for values in (explanation.kf_minus_ekf2_m, explanation.unexplained_difference_m)
     )
     for start, end in explanation.spans_s:
         draw_curve(axes, position_difference_m.loc[start:end], **TRACK_STYLES["KF"])
@@ -206,5 +206,5 @@ def _describe_largest_difference(explanation: DifferenceExplanation) -> str:
     return (
         f"Largest difference KF - EKF2: {differences_m[row]:.2g} m at "
         f"{explanation.times_s[row]:.1f} s; RMS of the part that no setting explains: "
-        f"{np.sqrt(np.mean(explanation.unexplained_m**2)):.2g} m."
+        f"{np.sqrt(np.mean(explanation.unexplained_difference_m**2)):.2g} m."
     )

@@ -8,9 +8,9 @@ from px4fuse.ekf2.whatif import (
     ADDED_POSITION_SIGMA_M,
     HEIGHT_TIMEOUT_S,
     MAX_REJECTED_FRACTION,
-    AxisSummary,
-    HeightSummary,
-    Summary,
+    AidStatistics,
+    AxisStatistics,
+    Ekf2Statistics,
 )
 from px4fuse.filter.signals import AISLE
 from px4fuse.flight.ekf2_parameters import AIDS, PARAMETERS
@@ -53,7 +53,7 @@ def make_statistic_rows(analysis: WhatIfAnalysis) -> list[list[str]]:
     return [[label, *(column.get(label, "n/a") for column in columns)] for label in texts_by_label]
 
 
-def _format_statistics(summary: Summary, replayed_summary: Summary) -> dict[str, str]:
+def _format_statistics(summary: Ekf2Statistics, replayed_summary: Ekf2Statistics) -> dict[str, str]:
     text_by_label = dict[str, str]()
     for name, axis in summary.axes.items():
         text_by_label |= _format_nis_statistics(name, axis) | {
@@ -75,7 +75,7 @@ def _format_statistics(summary: Summary, replayed_summary: Summary) -> dict[str,
     return text_by_label
 
 
-def _format_nis_statistics(name: str, statistics: AxisSummary | HeightSummary) -> dict[str, str]:
+def _format_nis_statistics(name: str, statistics: AxisStatistics | AidStatistics) -> dict[str, str]:
     return {
         f"{name}: mean NIS": format_number(statistics.nis_mean),
         f"{name}: expected NIS": "{:.2f} to {:.2f}".format(*statistics.nis_band),
@@ -83,7 +83,7 @@ def _format_nis_statistics(name: str, statistics: AxisSummary | HeightSummary) -
     }
 
 
-def _format_fusion_statistics(summary: Summary) -> dict[str, str]:
+def _format_fusion_statistics(summary: Ekf2Statistics) -> dict[str, str]:
     return {
         "rejected": f"{summary.rejected_fraction:.1%}",
         "longest time without fusion (s)": _format_number(summary.longest_without_fusion_s, 2),
@@ -118,7 +118,7 @@ def make_sweep_table(analysis: WhatIfAnalysis) -> tuple[list[str], list[list[str
     return head, rows
 
 
-def select_sweep_summaries(analysis: WhatIfAnalysis) -> tuple[Summary, ...]:
+def select_sweep_summaries(analysis: WhatIfAnalysis) -> tuple[Ekf2Statistics, ...]:
     return analysis.whatif.whatif[analysis.sweep_start_index :]
 
 

@@ -29,7 +29,7 @@ from px4fuse.core.text import convert_nested
 from px4fuse.ekf2.aids import AidResult
 from px4fuse.ekf2.replay import Agreement, Ekf2Replay
 from px4fuse.ekf2.steps import DifferenceExplanation
-from px4fuse.ekf2.whatif import Summary
+from px4fuse.ekf2.whatif import Ekf2Statistics
 from px4fuse.filter.consistency import HorizontalNis
 from px4fuse.filter.frame_rotation import HeadingError
 from px4fuse.filter.time_offset import ClockOffset
@@ -306,9 +306,9 @@ class WhatIfResults(Record, kw_only=True, rename={"uses_estimates": "asked"}):
         Time spans (s) of all statistics.
     uses_estimates : bool
         True if the user gave no parameters: they are set to maximum-likelihood estimates.
-    logged, replayed, whatif : Summary
+    logged, replayed, whatif : Ekf2Statistics
         EKF2 as logged, replay with logged parameters, replay with changed parameters.
-    sweep : tuple of Summary
+    sweep : tuple of Ekf2Statistics
         Replays with several values of one parameter.
     """
 
@@ -318,10 +318,10 @@ class WhatIfResults(Record, kw_only=True, rename={"uses_estimates": "asked"}):
     agreement: Agreement
     evaluated_s: tuple[Span, ...]
     uses_estimates: bool
-    logged: Summary
-    replayed: Summary
-    whatif: Summary | None = None
-    sweep: tuple[Summary, ...] = ()
+    logged: Ekf2Statistics
+    replayed: Ekf2Statistics
+    whatif: Ekf2Statistics | None = None
+    sweep: tuple[Ekf2Statistics, ...] = ()
     notes: tuple[str, ...]
     provenance: Provenance
 

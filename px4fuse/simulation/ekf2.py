@@ -17,7 +17,7 @@ from px4fuse.core.arrays import Array, BoolArray, IntArray, cumulative_sums
 from px4fuse.ekf2.filter_recursion import (
     HEADING,
     HORIZONTAL_POSITION,
-    POSITION_COLUMNS,
+    HORIZONTAL_POSITION_COLUMNS,
     FilterConfiguration,
     SegmentRun,
 )
@@ -91,7 +91,7 @@ INDOOR_HEADING_SIGMA_RAD = 0.03
 # σ of EKF2's height (m) as PX4 v1.16 logs it in flight
 INDOOR_HEIGHT_SIGMA_M = 0.15
 # Maximum time (s) between two events at which the model computes variances for estimator_states
-MAX_EVENT_INTERVAL_S = 0.1
+MAX_FUSION_INTERVAL_IN_GAP_S = 0.1
 
 
 def _select_fused_aids(scenario: Scenario) -> tuple[Aid, ...]:
@@ -179,7 +179,7 @@ def simulate_ekf2(
     inputs = ReplayInputs(
         settings=settings,
         segments=(segment,),
-        received=_select_positions(source),
+        received_positions=_select_positions(source),
         # If bit 0 of EKF2_EV_CTRL is not set, EKF2 tests the positions but never starts fusion
         # (ev_pos_control.cpp). An interval of 0 has this effect: it never contains two positions
         rules=rules
@@ -192,7 +192,7 @@ def simulate_ekf2(
         fuses_vision_height=False,
         imu_offset_m=np.zeros(3),
         aid=aid,
-        max_event_interval_s=MAX_EVENT_INTERVAL_S,
+        max_fusion_interval_in_gap_s=MAX_FUSION_INTERVAL_IN_GAP_S,
     )
     model_run = run_configurations(inputs, [FilterConfiguration(settings)], {})[0]
     ekf2_output = _compute_output(inputs, model_run, time_us, true_quaternions)
@@ -251,10 +251,10 @@ def _make_segment(
             time_s=time_s,
             step_s=np.diff(time_s),
             body_to_ned=body_to_ned,
-            correction_rad=to_rotation_vector(
+            attitude_correction_rad=to_rotation_vector(
                 multiply(attitude_difference[1:], conjugate(attitude_difference[:-1]))
             ),
-            force_m_s2=velocity_increment_m_s / np.diff(time_s)[:, None],
+            specific_force_m_s2=velocity_increment_m_s / np.diff(time_s)[:, None],
             accelerometer_bias_m_s2=np.zeros(3),
             state=state,
             variance=variance,
@@ -266,8 +266,8 @@ def _make_segment(
             ),
             down_variance_m2=np.full(len(time_s), INDOOR_HEIGHT_SIGMA_M**2),
             attitude_error_rad=attitude_error_rad,
-            state_correlation=covariance / sigma[:, None] / sigma,
-            is_fusing=False,
+            initial_state_correlation=covariance / sigma[:, None] / sigma,
+            starts_while_fusing=False,
         ),
         step_times_us,
         true_quaternions,
@@ -327,8 +327,8 @@ def _select_positions(source: sensors.SimulatedPositions) -> ReceivedPositions:
         arrival_s=arrival_s[is_newer_than_previous],
         position_m=source.position_m[is_newer_than_previous].astype(np.float32).astype(np.float64),
         variance_m2=position_variance.astype(np.float64),
-        rejected=np.full(int(is_newer_than_previous.sum()), np.nan),
-        reset=np.zeros(int(is_newer_than_previous.sum()), dtype=bool),
+        rejected_flags=np.full(int(is_newer_than_previous.sum()), np.nan),
+        is_reset_to_sample=np.zeros(int(is_newer_than_previous.sum()), dtype=bool),
         source=source.topic.name,
         velocity_m_s=None if velocity_m_s is None else velocity_m_s[is_newer_than_previous],
         velocity_variance_m2_s2=velocity_variance,
@@ -347,7 +347,9 @@ def _compute_output(
         reset_sum_m[step:, :2] += reset_size_m
     # EKF2 corrects the newest IMU samples with an older gyro bias: that at the fusion horizon
     gyro_bias_rad_s = rotate(segment.body_to_ned[1:], delay_by(state[:, GYRO_BIAS], lag_steps)[1:])
-    attitude_error_steps_rad = -segment.correction_rad - gyro_bias_rad_s * segment.step_s[:, None]
+    attitude_error_steps_rad = (
+        -segment.attitude_correction_rad - gyro_bias_rad_s * segment.step_s[:, None]
+    )
     gyro_attitude_error_rad = state[0, THETA] + cumulative_sums(attitude_error_steps_rad)
     attitude_error_rad = gyro_attitude_error_rad + sum_attitude_corrections(
         state[:, THETA] - gyro_attitude_error_rad, lag_steps, inputs.mean_step_s, inputs.horizon_s
@@ -393,7 +395,7 @@ def _hold_position_without_aiding(
     resets = []
     for event in np.flatnonzero(model_run.reset[:, 0]):
         step_at_reset = int(events.end_step[event])
-        reset_size_m = model_run.innovation[event, 0, POSITION_COLUMNS]
+        reset_size_m = model_run.innovation[event, 0, HORIZONTAL_POSITION_COLUMNS]
         if not has_recent_position_aiding[step_at_reset - 1]:
             reset_size_m = (
                 state[step_at_reset, HORIZONTAL_POSITION]

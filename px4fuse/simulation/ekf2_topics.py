@@ -7,7 +7,11 @@ from typing import Any
 import numpy as np
 
 from px4fuse.core.arrays import Array, Array32, BoolArray, IntArray
-from px4fuse.ekf2.filter_recursion import HORIZONTAL_POSITION, POSITION_COLUMNS, SegmentRun
+from px4fuse.ekf2.filter_recursion import (
+    HORIZONTAL_POSITION,
+    HORIZONTAL_POSITION_COLUMNS,
+    SegmentRun,
+)
 from px4fuse.ekf2.inputs import ReplayInputs
 from px4fuse.ekf2.replay_segments import POSITION
 from px4fuse.flight.ekf2_parameters import BAROMETER, GNSS_POS, GNSS_VEL, MAG, Aid
@@ -159,7 +163,7 @@ def _make_position_aid_topics(
     model_inputs: ReplayInputs, model_run: SegmentRun, ekf2_output: Ekf2Output, rate_hz: float
 ) -> tuple[Topic, ...]:
     """Make estimator_aid_src_* of the position source, with one message per usable position."""
-    events, received_positions = model_run.events[0], model_inputs.received
+    events, received_positions = model_run.events[0], model_inputs.received_positions
     velocity_m_s = received_positions.velocity_m_s
     logged_indices = ekf2_output.find_logged_messages(events.usable, events.end_step, rate_hz)
     logged_steps, sample_indices = events.end_step[logged_indices], events.sample[logged_indices]
@@ -168,7 +172,7 @@ def _make_position_aid_topics(
     north, east = measured_m.T
     innovation_arrays = (model_run.innovation, model_run.innovation_variance, model_run.noise)
     innovation, innovation_variance, noise_variance = (
-        values[logged_indices, 0, POSITION_COLUMNS] for values in innovation_arrays
+        values[logged_indices, 0, HORIZONTAL_POSITION_COLUMNS] for values in innovation_arrays
     )
     # If EKF2 does not test a position, the innovation of the model is NaN, but EKF2 logs an
     # innovation: measured minus estimated position
@@ -260,7 +264,7 @@ def _make_magnetometer_topics(
     attitude_rate_hz: float,
 ) -> list[Topic]:
     """Return the topics that need a magnetometer, or nothing without magnetometer."""
-    field, settings = model_run.segment.field, model_inputs.settings
+    field, settings = model_run.segment.magnetic_field, model_inputs.settings
     end_step = model_run.events[0].end_step
     if field is None:
         return []
@@ -357,7 +361,7 @@ def _make_flags_topic(
         "control_status_changes": np.cumsum(has_changed)[logged_steps],
         "cs_gnss_pos": is_fusing[logged_steps] & is_gnss,
         "cs_ev_pos": is_fusing[logged_steps] & (not is_gnss),
-        "cs_mag_hdg" if model_run.segment.field is None else "cs_mag_3d": True,
+        "cs_mag_hdg" if model_run.segment.magnetic_field is None else "cs_mag_3d": True,
     }
     return make_topic(
         "estimator_status_flags",

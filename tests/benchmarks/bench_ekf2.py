@@ -22,13 +22,13 @@ import numpy as np
 from px4fuse.ekf2.model import Ekf2Model, prepare_ekf2_model, replay_with_settings
 from px4fuse.ekf2.replay import Agreement
 from px4fuse.ekf2.steps import (
-    FLOW_STEP,
-    GNSS_VELOCITY_STEP,
-    MAGNETOMETER_STEP,
-    REPLACEMENT_STEPS,
-    explain_by_steps,
+    FLOW_PROPERTY,
+    GNSS_VELOCITY_PROPERTY,
+    MAGNETOMETER_PROPERTY,
+    REPLACED_PROPERTIES,
+    explain_difference_by_replacements,
 )
-from px4fuse.ekf2.whatif import Summary, WhatIf, what_if
+from px4fuse.ekf2.whatif import Ekf2Statistics, WhatIf, what_if
 from px4fuse.flight.model import Flight, Unavailable
 from px4fuse.readers import read_log
 
@@ -97,15 +97,15 @@ def waterfalls(models: dict[str, Ekf2Model]) -> dict[str, float]:
     """
     unexplained = {}
     steps = (
-        *REPLACEMENT_STEPS[:-2],
-        MAGNETOMETER_STEP,
-        GNSS_VELOCITY_STEP,
-        FLOW_STEP,
-        *REPLACEMENT_STEPS[-2:],
+        *REPLACED_PROPERTIES[:-2],
+        MAGNETOMETER_PROPERTY,
+        GNSS_VELOCITY_PROPERTY,
+        FLOW_PROPERTY,
+        *REPLACED_PROPERTIES[-2:],
     )
     print("\nwhy EKF2 differs | total rms m | " + " | ".join(steps) + " | left")
     for name, model in models.items():
-        found = explain_by_steps(model)
+        found = explain_difference_by_replacements(model)
         assert isinstance(found, dict), found
         axes, bars = found.values(), dict.fromkeys(steps, 0.0)
         total = sum(axis.position_mean_square_m2 for axis in axes)
@@ -167,7 +167,7 @@ def write_page(table: str) -> None:
     PAGE.write_text(text.replace(in_page(), table), encoding="utf-8")
 
 
-def horizontal_rmse(summary: Summary) -> float:
+def horizontal_rmse(summary: Ekf2Statistics) -> float:
     parts = [axis.position_rmse_to_truth_m for axis in summary.axes.values()]
     assert all(isinstance(part, float) for part in parts)
     return float(np.hypot(*parts))

@@ -25,7 +25,7 @@ from px4fuse.ekf2.replay import (
     interpolate_component,
     is_inside_spans,
 )
-from px4fuse.ekf2.whatif import Summary, WhatIf, what_if
+from px4fuse.ekf2.whatif import Ekf2Statistics, WhatIf, what_if
 from px4fuse.errors import SettingsError
 from px4fuse.flight.ekf2_parameters import PARAMETERS
 from px4fuse.flight.model import Columns, Ekf2, Flight, Unavailable
@@ -65,7 +65,7 @@ def describe_agreement(flown: FlownFlight) -> str:
         if getattr(agreement, aid)
     }
     text = ", ".join(f"{aid} {correlation:.4f}" for aid, correlation in correlations.items())
-    height = flown.model.inputs.logged_height_reason
+    height = flown.model.inputs.reason_for_logged_height
     return (
         f"{text}; rejected {agreement.rejected_fraction_logged:.1%}, published position "
         f"{agreement.published_rms_difference_m:.3f} m, good {flown.model.agreement.good}"
@@ -109,7 +109,7 @@ def flown_errors_m(before: FlownFlight, after: FlownFlight, found: WhatIf) -> tu
 
 
 def describe_pair(
-    predicted: Summary, description: dict[str, Any], aid: str, errors_m: tuple[float, float]
+    predicted: Ekf2Statistics, description: dict[str, Any], aid: str, errors_m: tuple[float, float]
 ) -> tuple[str, list[bool | None]]:
     """Return the numbers of a pair, and whether NIS, rejections, RMSE and height are right."""
     figures = description["figures"]["aids"][aid]
