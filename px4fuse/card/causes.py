@@ -224,7 +224,7 @@ def _make_actions(
         shift_s = offset_trial.change[CLOCK_OFFSET_KEY]
         if offset_trial.filter == "kf":
             shift_s -= analysis.settings.clock_offset_s
-        instruction = f"{lowercase_first_letter(format_timestamp_action(shift_s))} the timestamp of each position"
+        instruction = lowercase_first_letter(format_timestamp_action(shift_s))
         sender_actions = [Action("sender", instruction)]
     alternative_action_groups: tuple[tuple[Action, ...], ...] = ()
     actions = delay_actions or sender_actions

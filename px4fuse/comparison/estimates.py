@@ -351,7 +351,10 @@ def widen_for_drift(clock_offset: ClockOffset) -> ClockOffset:
         for limit_s in clock_offset.interval_s
     )
     drift_reason = clock_offset.reason
-    if not drift_reason and (interval_high_s - interval_low_s) / 2.0 > MAX_OFFSET_INTERVAL_HALF_WIDTH_S:
+    if (
+        not drift_reason
+        and (interval_high_s - interval_low_s) / 2.0 > MAX_OFFSET_INTERVAL_HALF_WIDTH_S
+    ):
         drift_reason = (
             "the time offset differs between parts of the flight, probably because the positions "
             f"drift (95 % interval of the offset: {interval_low_s:+.2f} s to "

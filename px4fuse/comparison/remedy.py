@@ -280,8 +280,8 @@ def make_height_noise_advice(
         return ""
     return (
         f" {EV_POS.noise} is also the noise of heights, but the height noise of the source is "
-        f"{height_noise_m:.2g} m. Set {EV_POS.noise_mode_parameter} to 0, and send each position with a "
-        f"variance of {height_noise_m**2:.2g} m² for z."
+        f"{height_noise_m:.2g} m. Set {EV_POS.noise_mode_parameter} to 0, and send each position "
+        f"with a variance of {height_noise_m**2:.2g} m² for z."
     )
 
 

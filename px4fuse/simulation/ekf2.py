@@ -360,7 +360,9 @@ def _compute_output(
     return Ekf2Output(
         time_us=time_us,
         lag_steps=lag_steps,
-        attitude_at_fusion_horizon=multiply(from_rotation_vector(state[:, THETA]), true_quaternions),
+        attitude_at_fusion_horizon=multiply(
+            from_rotation_vector(state[:, THETA]), true_quaternions
+        ),
         states_at_fusion_horizon=state[:, 3:],
         velocity_m_s=velocity_m_s,
         position_m=position_m,
