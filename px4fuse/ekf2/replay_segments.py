@@ -404,7 +404,7 @@ def find_replay_segments(
         if not np.all(np.diff(imu_times_s)[is_covered] <= IMU_GAP_S):
             continue
         changed_parameters = {
-            change.name: change.after
+            change.name: change.value_after
             for change in parameter_changes
             if change.time_s <= part_start_s
         }
