@@ -50,7 +50,7 @@ def wind():
     click.echo("calm")
 """,
 }
-CATALOGUE_ENTRY = '\n[wind]\ntitle = "Wind"\nmeaning = "Wind."\nrole = "noise"\n'
+CATALOGUE_ENTRY = '\n[wind]\ntitle = "Wind"\nmeaning = "Wind."\nreport_class = "noise"\n'
 CHECKS = {
     "ulog": """
 from pathlib import Path

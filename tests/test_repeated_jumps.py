@@ -29,7 +29,7 @@ def time_s() -> np.ndarray:
 
 @pytest.mark.parametrize(("shift_m", "count", "words"), [
     (1.2 * (time_s() / 12.0 % 1.0), 9, "Possible causes: a relocalisation"),
-    (0.18 * (time_s() // 3.0 % 2.0), 39, "of two points, 0.18 m apart"),
+    (0.18 * (time_s() // 3.0 % 2.0), 39, "of two points of the vehicle, 0.18 m apart"),
 ])  # fmt: skip
 def test_position_jumps_without_reset_counter_are_reported(shift_m, count, words) -> None:
     (found,) = source_positions.detect_repeated_jumps(shifted(shift_m))

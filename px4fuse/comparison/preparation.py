@@ -358,7 +358,7 @@ def shift_clock(track: PositionTrack, clock_offset_s: float) -> PositionTrack:
         return track
     shifted_tables = {
         name: table.set_axis(table.index + clock_offset_s)
-        for name in ("samples", "orientation", "velocity", "invalid", "status")
+        for name in ("samples", "orientation", "velocity", "invalid_reasons", "status")
         if (table := getattr(track, name)) is not None
     }
     return replace(track, **shifted_tables)
