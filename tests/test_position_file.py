@@ -395,9 +395,9 @@ def test_read_position_file_drops_backward_timestamps(read, shifts_us, dropped):
 @pytest.mark.parametrize("name", ["tag_id", "tagid", "node"])
 def test_read_position_file_with_two_tags_requires_body(read, name):
     text = table({name: ["A1", "B2"] * (ROWS // 2), **PLAIN})
-    assert "It contains A1, B2. Choose one" in error_message(read, text)
+    assert "is selected: A1, B2. Choose one" in error_message(read, text)
     assert_track(read(text, body="B2"), rows=slice(1, None, 2))
-    assert "It contains A1, B2" in error_message(read, text, body="C3")
+    assert "is selected: A1, B2" in error_message(read, text, body="C3")
     assert "only one body, which has no name" in error_message(read, table(PLAIN), body="C3")
 
 

@@ -112,7 +112,7 @@ def choose_body(file_name: str, body_names: Iterable[str], wanted_body: str | No
     if len(matches) == 1:
         return matches[0]
     raise LogError(
-        f"no rigid body or tag of {file_name} is selected. It contains {', '.join(names[:12])}",
+        f"none of the rigid bodies or tags in {file_name} is selected: {', '.join(names[:12])}",
         "Choose one with --body NAME.",
     )
 
