@@ -318,7 +318,7 @@ def test_gnss_noise_above_receiver_sigma_should_be_decreased(
         log.parameters["EKF2_GPS_P_NOISE"] = least_m
     prepared = prepare(flight_of(log, tmp_path))
     monkeypatch.setattr(findings_tools, "SEGMENT", prepared.segment)
-    words = noises._format_excessive_noise(
+    words = noises._format_action_for_excessive_noise(
         stand_in(source=prepared.source, log=prepared.flight.log)
     )
     assert bool(words) is expected
