@@ -332,7 +332,7 @@ FORGERIES: dict[str, tuple[Forge, str, bool]] = {
     },
     "no annotations": (page(1, "/Annots", array()), "an annotation", True),
     # fonts
-    "glyphs exchanged by a map": (exchanged_glyphs, "/CIDToGIDMap has another type", True),
+    "glyphs exchanged by a map": (exchanged_glyphs, "PDF entry /CIDToGIDMap differs", True),
     "outlines exchanged": (
         replace_stream(descriptor, "/FontFile2", exchanged_outlines), "/FontFile2 differs",
         False,
@@ -417,8 +417,8 @@ FORGERIES: dict[str, tuple[Forge, str, bool]] = {
     ),
     "a long content": (content(lambda c: c * 5), "the PDF entry /Contents differs", False),
     "a comment": (content(lambda c: c + b"\n% x\n"), "drawing operation", False),
-    "a second content stream": (second_content, "/Contents has another type", True),
-    "an array of contents": (contents_in_an_array, "/Contents has another type", True),
+    "a second content stream": (second_content, "type of the PDF entry /Contents differs", True),
+    "an array of contents": (contents_in_an_array, "type of the PDF entry /Contents differs", True),
     "content taken for a JPEG": (jpeg_content, "the compression of the PDF entry /Contents", True),
     # resources
     "an image": (
@@ -461,7 +461,7 @@ FORGERIES: dict[str, tuple[Forge, str, bool]] = {
     "a page cut": (page(2, "/CropBox", box(0, 0, 300, 300)), "a crop box", True),
     "a page smaller": (page(2, "/MediaBox", box(0, 0, 595.2756, 400)), "the PDF entry", False),
     "a page trimmed": (page(2, "/TrimBox", box(0, 0, 300, 300)), "an entry /TrimBox", True),
-    "a page in another unit": (page(2, "/UserUnit", N(2)), "a page unit", True),
+    "a page in another unit": (page(2, "/UserUnit", N(2)), "a length unit", True),
     "a page in a group": (page(1, "/Group", dictionary(S=name("Transparency"))),
                           "an entry /Group", True),
     "a thumbnail": (page(1, "/Thumb", image()), "an entry /Thumb", True),
