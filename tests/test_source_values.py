@@ -133,7 +133,7 @@ def test_read_log_detects_unit_and_clock_of_timestamps(tmp_path, stamp, clock):
     source.fields["timestamp_sample"] = stamp(source.fields["timestamp_sample"])
     position, *_ = read_log(log.add(source).write(tmp_path / "log.ulg")).positions
     assert position.clock_map.clock == clock
-    assert clock in source_stamps.UNUSABLE_TIMESTAMPS
+    assert clock in source_stamps.EFFECT_BY_UNUSABLE_TIMESTAMP
 
 
 @pytest.mark.parametrize(("clock", "action"), [

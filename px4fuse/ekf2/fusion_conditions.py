@@ -44,15 +44,23 @@ CLOCK_SYNCHRONISATION_ACTION = (
     "Synchronise the clocks: UXRCE_DDS_SYNCT 1 with the uXRCE-DDS agent, or answer TIMESYNC of "
     "MAVLink. Send microseconds."
 )
-# Clocks that must be synchronised with the autopilot's clock
-UNSYNCHRONISED_CLOCKS = {
-    "another clock",
-    "an unknown clock",
-    *(f"UNIX time in {unit}seconds" for unit in ("nano", "micro", "milli", "")),
+# Effect of timestamps on EKF2, by clock that is not synchronised with the autopilot's clock
+EFFECT_BY_UNSYNCHRONISED_CLOCK = {
+    **dict.fromkeys(
+        ("another clock", "an unknown clock", "UNIX time in seconds"),
+        "For EKF2, the positions are too old or in the future.",
+    ),
+    **{
+        f"UNIX time in {unit}seconds": "For EKF2, the positions are in the future."
+        for unit in ("nano", "micro", "milli")
+    },
 }
-# Clocks and units of timestamps that EKF2 cannot use. 0: all timestamps are 0
-UNUSABLE_TIMESTAMPS = {"0", "nanoseconds", "milliseconds", "seconds", *UNSYNCHRONISED_CLOCKS}
-UNUSABLE_TIMESTAMPS_EFFECT = "For EKF2, the positions are too old or in the future."
+# Effect on EKF2 of timestamps in a wrong unit or of another clock. 0: all timestamps are 0
+EFFECT_BY_UNUSABLE_TIMESTAMP = {
+    **dict.fromkeys(("0", "milliseconds", "seconds"), "For EKF2, the positions are too old."),
+    **EFFECT_BY_UNSYNCHRONISED_CLOCK,
+    "nanoseconds": "For EKF2, the positions are in the future.",
+}
 # GNSS checks in the order of their bits in gps_check_fail_flags: name, parameter with the limit,
 # unit of the limit
 GNSS_CHECKS = (
@@ -211,18 +219,18 @@ def _check_position_gap(positions: UnfusedPositions) -> Iterator[UnmetCondition]
 
 def find_timestamp_action(clock_name: str) -> str:
     """Return the action for timestamps of a wrong clock or in a wrong unit."""
-    is_wrong_clock = clock_name in UNSYNCHRONISED_CLOCKS
+    is_wrong_clock = clock_name in EFFECT_BY_UNSYNCHRONISED_CLOCK
     return CLOCK_SYNCHRONISATION_ACTION if is_wrong_clock else SET_TIMESTAMP_ACTION
 
 
 def _check_timestamps(positions: UnfusedPositions) -> Iterator[UnmetCondition]:
     clock_map, status = positions.source.clock_map, positions.source.status
-    if clock_map and (clock := clock_map.clock) in UNUSABLE_TIMESTAMPS:
+    if clock_map and (clock := clock_map.clock) in EFFECT_BY_UNUSABLE_TIMESTAMP:
         yield UnmetCondition(
             "clock",
             "the timestamps are 0" if clock == "0" else f"the timestamps are in {clock}",
             "EKF2 expects timestamp_sample in microseconds since the autopilot's boot. "
-            f"{UNUSABLE_TIMESTAMPS_EFFECT}",
+            f"{EFFECT_BY_UNUSABLE_TIMESTAMP[clock]}",
             find_timestamp_action(clock),
         )
     if "age_s" not in status:

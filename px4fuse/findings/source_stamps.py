@@ -7,8 +7,7 @@ from px4fuse.analysis import Analysis
 from px4fuse.core.arrays import Array, rank_correlation
 from px4fuse.core.text import format_metres
 from px4fuse.ekf2.fusion_conditions import (
-    UNUSABLE_TIMESTAMPS,
-    UNUSABLE_TIMESTAMPS_EFFECT,
+    EFFECT_BY_UNUSABLE_TIMESTAMP,
     find_timestamp_action,
 )
 from px4fuse.ekf2.intervals import MAX_DELAY_BEHIND_HORIZON_S
@@ -68,7 +67,7 @@ def detect(analysis: Analysis) -> Findings:
         yield from detect_varying_latency(analysis)
     elif clock_map.note == REPEATED_TIMESTAMPS_NOTE and clock_map.distinct_stamps:
         yield from detect_repeated_timestamps(analysis, clock_map.pairs, clock_map.distinct_stamps)
-    elif clock_map.clock in UNUSABLE_TIMESTAMPS:
+    elif clock_map.clock in EFFECT_BY_UNUSABLE_TIMESTAMP:
         yield from detect_timestamp_unit(analysis, clock_map.clock)
     elif clock_map.distinct_stamps is not None:
         yield from detect_constant_timestamps(positions_text, clock_map, clock_map.distinct_stamps)
@@ -141,7 +140,8 @@ def detect_timestamp_unit(analysis: Analysis, clock_name: str) -> Findings:
     if isinstance(fusion_flags, pd.DataFrame) and not compute_flag_fraction(
         fusion_flags["horizontal"], segment
     ):
-        fusion_sentence = f"EKF2 never fused the positions. {UNUSABLE_TIMESTAMPS_EFFECT} "
+        effect_sentence = EFFECT_BY_UNUSABLE_TIMESTAMP[clock_name]
+        fusion_sentence = f"EKF2 never fused the positions. {effect_sentence} "
     yield make_error(
         "source_timestamp_unit",
         f"The timestamps of the {positions_phrase(analysis.source)} are "
