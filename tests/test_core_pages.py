@@ -93,7 +93,7 @@ def test_zoomed_plot_window_avoids_position_gap() -> None:
     assert end - start < 4.0  # beside the gap in the middle, not across it
     assert abs((start + end) / 2.0 - 60.0) < 12.5
     sentence = panels.describe_sigma_growth(unexplained(comparison), comparison.main)
-    assert sentence.startswith("In the gap of 20.0 s")
+    assert sentence.startswith("In the gap of the position source from 50.0 to 70.0 s, ")
     assert "σ grew to" in sentence
 
 

@@ -85,10 +85,11 @@ assert len(track.samples) == 200
 from comparisons import compare
 from flights import aisle_flight, unexplained
 from px4fuse.findings import find
-from px4fuse.report.pdf import PAGES
+from px4fuse.report.pdf import PAGE_FUNCTIONS_BY_RESULTS_TYPE
 from px4fuse.results.contract import ComparisonResults
 assert [item.title for item in find(unexplained(compare(aisle_flight()))) if item.id == "wind"]
-pages = [page for draw in PAGES[ComparisonResults][-1:] for page in draw(None, None)]
+draw_pages = PAGE_FUNCTIONS_BY_RESULTS_TYPE[ComparisonResults][-1]
+pages = list(draw_pages(None, None))
 assert "Wind page" in repr(pages[0].blocks)
 """,
     "command": """
@@ -168,7 +169,7 @@ def test_extension_guide_names_only_existing_files() -> None:
         "filter/settings.py": ["class Settings", "SETTING_RANGES"],
         "results/contract.py": ["class ChosenSettings"],
         "flight/model.py": ["SOURCE_ORIGINS"],
-        "report/pdf.py": ["PAGES"],
+        "report/pdf.py": ["PAGE_FUNCTIONS_BY_RESULTS_TYPE"],
         "cli/__init__.py": ["COMMANDS"],
     }.items():
         for name in names:

@@ -208,7 +208,7 @@ def test_python_write_report_to_wrong_suffix_is_rejected(
     analysis: px4fuse.Analysis, tmp_path: Path
 ) -> None:
     for function, name in ((px4fuse.write_report, "x.html"), (px4fuse.write_page, "x.pdf")):
-        with pytest.raises(px4fuse.Px4FuseError, match="Give a name ending in"):
+        with pytest.raises(px4fuse.Px4FuseError, match=r"must end in \.(pdf|html)"):
             function(analysis, tmp_path / name)
     bare = dataclasses.replace(analysis, request=None)
     with pytest.raises(px4fuse.Px4FuseError, match="needs the settings of the analysis"):

@@ -247,7 +247,7 @@ def _describe_rejections(explanation: DifferenceExplanation) -> list[str]:
         return []
     count_text = f"{rejection_run.samples} position{'s' if rejection_run.samples > 1 else ''}"
     return [
-        f"EKF2 rejected {count_text} in sequence, from {rejection_run.start_s:.0f} s on for "
+        f"From {rejection_run.start_s:.0f} s on, EKF2 rejected {count_text} in a row for "
         f"{rejection_run.duration_s:.1f} s. Replays with and without gate differ by up to "
         f"{rejection_run.distance_m:.2g} m in EKF2's position"
     ]
@@ -362,7 +362,7 @@ def _describe_rmse(explanation: DifferenceExplanation) -> list[str]:
     )
     rmse_before_m, rmse_after_m = rmse_by_step[largest_change_index : largest_change_index + 2]
     return [
-        f"Position RMSE: EKF2 {ekf2_rmse_m:.3f} m, KF {kf_rmse_m:.3f} m. Largest contribution to "
-        f"the difference: EKF2's {explanation.steps[largest_change_index].name} changes KF's RMSE "
-        f"from {rmse_before_m:.3f} m to {rmse_after_m:.3f} m."
+        f"Position RMSE: EKF2 {ekf2_rmse_m:.3f} m, KF {kf_rmse_m:.3f} m. KF's RMSE changes "
+        f"most with EKF2's {explanation.steps[largest_change_index].name}, from "
+        f"{rmse_before_m:.3f} to {rmse_after_m:.3f} m."
     ]

@@ -158,8 +158,9 @@ def detect_constant_timestamps(
 ) -> Findings:
     yield make_error(
         "source_timestamps_constant",
-        f"Distinct timestamps of {clock_map.pairs} {positions_text}: only {distinct_count}. The "
-        "time of measurement is unknown; px4fuse uses the receive time instead.",
+        f"The timestamps of {clock_map.pairs} {positions_text} have only {distinct_count} "
+        "distinct values. The time of measurement is unknown; px4fuse uses the receive time "
+        "instead.",
         "Send the time of measurement in the message (usec, time_usec), in microseconds and as a "
         "64-bit integer.",
         {"stamps": clock_map.pairs, "distinct": distinct_count},
