@@ -31,7 +31,7 @@ def read_rows(name: str) -> list[dict[str, str]]:
 
 
 _COLUMN_DEFINITIONS = read_rows("columns.csv")
-#: Path of each column in the results (``log.firmware``); "" if px4fuse batch computes the column
+#: Path of each table column in the results, for example ``log.firmware``
 RESULT_PATH_BY_COLUMN = {row["column"]: row["path"] for row in _COLUMN_DEFINITIONS}
 #: Data type of each table column; missing numbers are NA, and missing texts are empty
 COLUMN_TYPES = {row["column"]: row["type"] for row in _COLUMN_DEFINITIONS}
@@ -119,7 +119,7 @@ def collect_card_values(card: Card) -> Row:
 
 
 def find_first_action(card: Card) -> str:
-    """Return the commands of the first recommended action, or its text if it has no command."""
+    """Return the commands, or else the text, of the first recommended action."""
     if not card.causes:
         return ""
     first_cause = card.causes[0]

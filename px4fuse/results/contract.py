@@ -59,7 +59,7 @@ SIGNIFICANT_DIGITS = 10
 
 
 class Log(LogInfo, kw_only=True):
-    """Log, files read in addition (``joined``), and clocks that were converted to boot time."""
+    """Log, additional input files (``joined``), and clocks converted to boot time."""
 
     joined: tuple[InputFile, ...]
     clocks: tuple[ClockMap, ...]

@@ -71,7 +71,7 @@ class Verification:
     with_log : bool
         True if the analysis was repeated on the log.
     redrawn_pdf : bytes
-        Report of the repeated analysis, or empty.
+        PDF report of the repeated analysis, or empty.
     remedy : str
         Action of the user if the report was not verified.
     missing : str

@@ -195,7 +195,7 @@ class _PdfComparison:
     def _compare(
         self, submitted_value: Any, redrawn_value: Any, key: str, page_number: int
     ) -> Iterator[PageDifference]:
-        """Yield the differences of two values at one place in both PDFs, and of nested values."""
+        """Yield the differences of two PDF values, including nested values."""
         value_pairs_to_compare = [(submitted_value, redrawn_value, key)]
         while value_pairs_to_compare:
             submitted_value, redrawn_value, key = value_pairs_to_compare.pop()
@@ -254,7 +254,7 @@ class _PdfComparison:
         page_number: int,
         value_pairs_to_compare: list[tuple[Any, Any, str]],
     ) -> Iterator[PageDifference]:
-        """Yield differences in keys and streams; append value pairs of equal keys to the list."""
+        """Yield the differences in keys and streams of two PDF dictionaries."""
         submitted_keys = _select_compared_keys(submitted_dictionary, key)
         redrawn_keys = _select_compared_keys(redrawn_dictionary, key)
         for name in sorted(submitted_keys ^ redrawn_keys):
@@ -401,7 +401,7 @@ def _pdf_type_of(value: Any) -> type:
 
 
 def _select_compared_keys(value: DictionaryObject, key: str) -> set[str]:
-    """Return the keys of a PDF dictionary to compare with the redrawn PDF, without null values."""
+    """Return the keys of a PDF dictionary that are compared."""
     compared_keys = {name for name in value if not isinstance(value.raw_get(name), NullObject)}
     if isinstance(value, StreamObject):
         compared_keys -= _COMPRESSION_AND_LENGTH_KEYS

@@ -67,7 +67,7 @@ PYPDF_LIMITS: dict[str, Any] = {
     "page_tree_maximum_page_entries": 100 * MAX_PAGES,
 }
 
-# PDF compression methods (filters) for which _check_file limits the decompressed size
+# Allowed compression methods (filters) of a PDF; _check_file limits their decompressed size
 _ALLOWED_FILTERS = frozenset(("/FlateDecode", "/DCTDecode"))
 
 _STREAM_START_PATTERN = re.compile(rb"(?<!end)stream *\r?\n?")

@@ -85,7 +85,7 @@ _LinkInputFile = Callable[[str, str | None, str], str]
 
 
 class NotRepeatableError(Exception):
-    """Reason why an analysis cannot be repeated, remedy, and name of a missing file if any."""
+    """Reason why an analysis cannot be repeated, with remedy and missing file."""
 
 
 def log_sha256(results: ReportedResults) -> str:

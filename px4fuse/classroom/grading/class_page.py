@@ -70,7 +70,7 @@ def format_class_page(grades: Sequence[Grade], title: str, version_text: str) ->
 
 
 def _format_statistics(grades: Sequence[Grade], count_by_tag: Mapping[str, int]) -> str:
-    """Format the statistics of the class: number of reports by status, and histograms of points."""
+    """Format the statistics of the class: reports by status, and histograms of points."""
     total_points = [grade.total for grade in grades if grade.total is not None]
     max_points = max((grade.max_points for grade in grades if grade.max_points > 0.0), default=1.0)
     reports = counted_reports(grades)

@@ -157,7 +157,7 @@ def build_grades(
     grades : tuple of Grade
         Grades of all students, then of reports of unknown students.
     notes : tuple of str
-        Sentences about points in ``overrides.csv`` without a matching student or item.
+        Sentences about missing times, and about points without a matching student or item.
     """
     has_class_list = bool(course.class_list.people)
     class_list = course.class_list if has_class_list else _collect_students(reports, submissions)

@@ -20,7 +20,7 @@ class ItemStatistics:
     Attributes
     ----------
     point_fractions : tuple of float
-        Points of each report divided by the maximum; for a fault, 1 if the student found the fault.
+        Points of each report, divided by the maximum points.
     discrimination : float or None
         Correlation between the points for this item and for all other items.
     """

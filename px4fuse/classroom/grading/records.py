@@ -24,7 +24,7 @@ from px4fuse.verification.verification import log_sha256, recompute_report, veri
 
 # Subfolder of the output folder for the cached results
 RECORDS_FOLDER = "records"
-# Suffix of the report that px4fuse draws from the log, to be compared with the submitted PDF
+# Suffix of the report that px4fuse draws from the log
 REDRAWN_REPORT_SUFFIX = ".pdf"
 # Suffix of the report with the faults that px4fuse found, as feedback for the student
 DIAGNOSIS_SUFFIX = ".diagnosis.pdf"
@@ -149,7 +149,7 @@ def _load_record(
     path_by_sha256: Mapping[str, Path],
     assigned_hashes: frozenset[str],
 ) -> tuple[ReportedResults, Verification] | None:
-    """Load an earlier result; None if libraries or files have changed."""
+    """Load the result of an earlier verification; None without a valid result."""
     try:
         record = msgspec.json.decode(
             (records_folder / f"{sha256}.json").read_bytes(), type=VerificationRecord

@@ -14,7 +14,7 @@ Sources of the patterns:
 - Gradescope: "Exporting submissions", Help Center: ``submission_{number}``, and
   ``submission_metadata.yml`` with names, ids (``:sid:``) and times.
 - ILIAS: multi-feedback of ``components/ILIAS/Exercise`` in its repository:
-    ``{last}_{first}_{login}_{user}/``.
+  ``{last}_{first}_{login}_{user}/``.
 """
 
 import re
