@@ -20,8 +20,7 @@ from px4fuse.filter.settings import SETTING_RANGES, Settings
 from px4fuse.results import contract
 from px4fuse.results.model import provenance, schema_of
 
-# Maximum √(mean NEES) of a consistent filter (minimum: its inverse). The limits are wide, because
-# the errors in a flight are correlated and the output predictor of EKF2 delays its position
+# Maximum √(mean NEES) of a consistent filter; wide, because errors in a flight are correlated
 MAX_SQRT_MEAN_NEES = 2.0
 # Settings and flight properties that px4fuse diff compares
 SETTING_PATHS_BY_LABEL = {
@@ -49,15 +48,15 @@ def diff(
     Parameters
     ----------
     a, b : str or Path
-        Flight logs, or reports (PDF) or results (JSON) of ``px4fuse compare``. If one input is a
-        log, it is analysed with the settings in the other input.
+        Flight logs, reports (PDF), or results (JSON) of ``px4fuse compare``. A log is analysed with
+        the settings of the other input.
     progress : callable
         Called with the name of each step of the computation.
 
     Raises
     ------
     LogError, MissingDataError, ResultsError
-        A file cannot be read or is not from ``px4fuse compare``, or A and B are the same file.
+        A file cannot be read or compared, or A and B are the same file.
     """
     return list_changes(*read_diff_inputs(Path(a), Path(b), progress))
 
@@ -171,10 +170,7 @@ def _list_finding_changes(
 def _describe_worse_verdicts(
     results_a: Results, results_b: Results, findings: Iterable[contract.UnsharedFinding]
 ) -> Iterator[str]:
-    """Yield a sentence for each filter that is consistent in A but not in B, and each new error.
-
-    A new error is a finding of severity error that only B contains.
-    """
+    """Yield a sentence for each filter that is consistent only in A, and for each new error."""
     nis_and_nees_a, nis_and_nees_b = map(_collect_nis_and_nees, (results_a, results_b))
     for label, (mean_a, was_consistent) in nis_and_nees_a.items():
         mean_b, is_consistent = nis_and_nees_b.get(label, (mean_a, True))

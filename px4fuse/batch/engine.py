@@ -1,7 +1,6 @@
 """Parallel analysis of many logs on this computer or on a Dask cluster.
 
-Each log is analysed in a process of :mod:`px4fuse.core.workers`, with limits of time and memory. On
-a cluster, the Dask workers start these processes.
+Each log is analysed in a separate process, with limits of time and memory.
 """
 
 from __future__ import annotations
@@ -23,8 +22,7 @@ if TYPE_CHECKING:
 
 # Maximum time (s) to connect to the Dask scheduler, and to wait for its first worker
 CONNECT_TIMEOUT_S = 15.0
-# Maximum number of logs per Dask task. One process analyses all logs of a task, because the start
-# of a process takes 2 s
+# Maximum number of logs per Dask task; the start of a process for the task takes 2 s
 MAX_LOGS_PER_DASK_TASK = 4
 
 
@@ -32,7 +30,7 @@ MAX_LOGS_PER_DASK_TASK = 4
 def connect_cluster(scheduler: str | None = None) -> Iterator[Client | None]:
     """Connect to a Dask cluster; ``scheduler`` is the address of its scheduler.
 
-    Without an address, provide None instead of a client, so that jobs run on this computer.
+    Yield None without an address: jobs then run on this computer.
 
     Raises
     ------
@@ -92,7 +90,6 @@ def run_jobs(
 ) -> Generator[tuple[Job, Result | JobFailure]]:
     """Run jobs on a Dask cluster, or on this computer if ``client`` is None.
 
-    ``run_job_list`` runs a list of jobs in ``processes`` processes (default: the number of cores).
     Yield each job with its result as soon as it is finished.
 
     Raises
@@ -136,8 +133,7 @@ def _run_task(
     run_job_list: Callable[..., Iterator[tuple[int, Any]]], jobs: Sequence[Any]
 ) -> list[Any]:
     """Run the jobs of one Dask task in sequence, in a child process of the Dask worker."""
-    # Dask workers are daemon processes by default, and Python does not allow daemon processes to
-    # start processes
+    # Python does not allow daemon processes, such as Dask workers, to start processes
     multiprocessing.current_process().daemon = False
     results_by_index = dict(run_job_list(jobs, process_count=1))
     return [results_by_index[index] for index in range(len(jobs))]

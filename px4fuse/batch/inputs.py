@@ -20,10 +20,9 @@ from px4fuse.verification.pdf_input import MAX_PDF_BYTES, read_attached_results
 InputKind = Literal["log", "report", "results"]
 ProgressCallback = Callable[[str], None]
 Results = ComparisonResults | AidsResults
-# If A and B are about different logs, px4fuse diff analyses a log with these settings, copied from
-# the results of the other input
+# Settings that are copied from the other input if A and B are different logs
 _FILTER_SETTINGS = {*Settings.__dataclass_fields__, "axes"}
-# If A and B are about the same log, all settings except these input files are copied
+# Input files that are not copied from the other input if A and B are the same log
 _INPUT_FILE_SETTINGS = {"log", "system", "position"}
 
 
@@ -48,7 +47,7 @@ def read_diff_inputs(
     LogError, MissingDataError
         A log cannot be read, or does not contain the required data.
     ResultsError
-        An input cannot be read or is not from ``px4fuse compare``, or A and B are the same file.
+        An input cannot be read or compared, or A and B are the same file.
     """
     first_input, second_input = (_read_given_results(path) for path in (a, b))
     if a.samefile(b):
@@ -94,7 +93,7 @@ def _analyse_log(
             },
         )
     analysis = diagnose_or_check_aids(request, progress)
-    # to_json rounds all numbers, as in the results of a report
+    # to_json rounds all numbers, as in a report
     results_json = to_json(make_compare_results(request, analysis))
     results = read_results(results_json.encode())
     assert isinstance(results, Results)

@@ -31,7 +31,7 @@ class Job:
     max_bytes : int
         Maximum size of the log.
     finished_hashes : frozenset of str
-        SHA-256 of logs that were analysed in an earlier run and are not analysed again.
+        SHA-256 of logs with results from an earlier run.
     """
 
     address: str
@@ -43,10 +43,7 @@ class Job:
 
 @dataclass(frozen=True)
 class LogOutcome:
-    """Result of one log: table rows, results (JSON), and report (PDF) if requested.
-
-    ``rows`` has one row per axis, or one row with the reason if the log could not be compared.
-    """
+    """Result of one log: table rows (one per axis), results (JSON), and report (PDF)."""
 
     sha256: str
     rows: tuple[Row, ...] = ()

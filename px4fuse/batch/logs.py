@@ -31,7 +31,7 @@ class LogAddress:
     name : str
         File name.
     path_for_table : str
-        Path or URL for the table of px4fuse batch, relative if the user gave a relative path.
+        Path or URL for the table of px4fuse batch.
     address : str
         Absolute path or URL.
     size_bytes : int or None
@@ -69,7 +69,7 @@ def _find_pattern_logs(pattern: str) -> list[LogAddress]:
         if file_system.isdir(root_path):
             suffixes = LOG_SUFFIXES
             info_by_path = file_system.find(root_path, detail=True)
-        # also devices and pipes: the worker process rejects them with an error message
+        # include devices and pipes, which a worker process rejects with a message
         elif file_system.exists(root_path):
             is_file = file_system.isfile(root_path)
             info_by_path = {root_path: file_system.info(root_path) if is_file else {}}

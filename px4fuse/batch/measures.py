@@ -1,8 +1,6 @@
 """Numbers that ``px4fuse diff`` compares, with 95 % intervals.
 
-``measures.csv`` lists the path of each number in the results, such as
-``axes.*.rejected_fraction``. ``*`` stands for any key, and KF_OR_EKF2 for each of the two filters.
-The unit "share" is a fraction from 0 to 1.
+``measures.csv`` lists the path of each number in the results. ``*`` in a path is any key.
 """
 
 from collections.abc import Iterator
@@ -26,10 +24,9 @@ COMPARED_NUMBER_DEFINITIONS = [
     for row in read_rows("measures.csv")
     for name, label in (FILTER_NAMES.items() if "KF_OR_EKF2" in row["path"] else [("", "")])
 ]
-# px4fuse diff does not list a number if the values in A and B differ by at most this fraction
+# Maximum relative difference of two numbers that px4fuse diff does not list
 MAX_OMITTED_RELATIVE_DIFFERENCE = 0.01
-# px4fuse diff does not list a number if the values in A and B differ by at most this. The unit is
-# the unit of the number, for example m or s
+# Maximum difference of two numbers (in their unit) that px4fuse diff does not list
 MAX_OMITTED_DIFFERENCE = 0.001
 
 
@@ -48,7 +45,7 @@ def collect_compared_numbers(results: ComparisonResults | AidsResults) -> dict[s
     axes = {} if isinstance(results, AidsResults) else results.axes
     # EKF2 rejects north and east together, so their rejected fractions are equal: keep only one
     first_horizontal_axis = next((name for name in ("north", "east", AISLE) if name in axes), "")
-    # omit the aiding source of the positions: the results of the axes contain its numbers
+    # skip the aiding source of the positions: the axes contain its numbers
     aids_of_position_source: tuple[str, ...] = ("ev_pos", "ev_hgt") if axes else ()
     if find_value(results, "source.kind") == "gnss":
         aids_of_position_source = ("gnss_pos",)

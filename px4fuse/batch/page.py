@@ -31,14 +31,13 @@ from px4fuse.html.safe import clean_text, load_template, make_relative_url
 from px4fuse.report.card_html import MARKER_SVG_PATHS
 from px4fuse.report.card_text import SEVERITY_SIGNS, SYMBOL_BY_REFERENCE, format_consistent_ratios
 
-# Columns of σ ratios, as "<filter>_<reference>". A ratio is computed from innovations (reference
-# source) or from errors against ground truth (reference truth)
+# Columns of σ ratios from innovations (source) and from errors against ground truth (truth)
 SIGMA_RATIO_COLUMNS = ("kf_source", "kf_truth", "ekf2_source", "ekf2_truth")
 SEVERITIES = list(SEVERITY_SIGNS)
 FILE_LINKS = (("Report (PDF)", "report"), ("Results (JSON)", "results"))
-# Columns with one value per axis; the page shows them after a click on a row
+# Columns with one value per axis
 AXIS_COLUMNS = [name for name, path in RESULT_PATH_BY_COLUMN.items() if "{" in path]
-# Columns with one value per log; the page shows them after a click on a row
+# Columns with one value per log
 LOG_COLUMNS = [
     name
     for name in RESULT_PATH_BY_COLUMN
@@ -61,8 +60,7 @@ LOG_COLUMNS = [
 ]
 # Group of columns that the page hides until the user clicks on "more columns"
 OPTIONAL_COLUMN_GROUP = "numbers"
-# Labels of the drop-down lists that filter logs. Each key is the first part of a tag of a log, for
-# example "status" in the tag "status:done"
+# Labels of the drop-down lists, by the first part of a tag such as "status:done"
 DROP_DOWN_LABEL_BY_TAG_PREFIX = {
     "severity": "Diagnosis",
     "status": "Status",
@@ -71,10 +69,10 @@ DROP_DOWN_LABEL_BY_TAG_PREFIX = {
     "finding": "Finding",
     "remedy": "Action",
 }
-# The row of a log shows the numbers of the first of these groups of axes that has results
+# Preferred axes for the numbers of a log
 MAIN_AXIS_GROUPS_BY_PREFERENCE = (("aisle",), ("north", "east"), ("down",))
 
-#: Values of one log, by table column and by the further names in :func:`_summarise_log`
+#: Values of one log by name
 LogSummary = Mapping[str, Any]
 
 
@@ -84,8 +82,7 @@ def format_html(table: pd.DataFrame, title: str, version_text: str) -> str:
     Parameters
     ----------
     table : DataFrame
-        One row per log and axis, with the columns of :data:`px4fuse.batch.rows.COLUMN_TYPES`. A log
-        that could not be read has one row.
+        One row per log and axis, with the columns of :data:`px4fuse.batch.rows.COLUMN_TYPES`.
     title : str
     version_text : str
         Name and version of px4fuse.
@@ -253,7 +250,7 @@ def _make_drop_down_lists(logs: Sequence[LogSummary]) -> list[tuple[str, list[tu
 
 
 def summarise_logs(table: pd.DataFrame) -> list[LogSummary]:
-    """Combine the table rows (one per axis) of each log into one summary."""
+    """Combine the table rows of each log, one per axis, into one summary."""
     rows_by_log: dict[str, list[dict[str, Any]]] = defaultdict(list)
     for row in table.to_dict("records"):
         rows_by_log[row["log"]].append(
@@ -263,10 +260,7 @@ def summarise_logs(table: pd.DataFrame) -> list[LogSummary]:
 
 
 def _summarise_log(rows: Sequence[Mapping[str, Any]]) -> LogSummary:
-    """Return one summary of a log from its rows, one per axis; numbers are of the main axis.
-
-    The main axis is the first in MAIN_AXIS_GROUPS_BY_PREFERENCE.
-    """
+    """Combine the table rows of one log, one per axis, into one summary."""
     axis_rows = [row for row in rows if "axis" in row]
     main_axis_rows = next(
         (

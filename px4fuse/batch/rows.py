@@ -20,8 +20,7 @@ from px4fuse.results.contract import ComparisonResults, Log
 
 STATUS_DONE, STATUS_NOT_COMPARED, STATUS_FAILED = "done", "not compared", "failed"
 FINDING_SEPARATOR = ";"
-# Key of the noise estimate in the results: "horizontal" for north and east, which have one estimate
-# together. For each other axis, the key is its name
+# Key of the noise estimate in the results: north and east have one estimate together
 _NOISE_ESTIMATE_KEY_BY_AXIS = {"north": "horizontal", "east": "horizontal"}
 
 
@@ -32,7 +31,7 @@ def read_rows(name: str) -> list[dict[str, str]]:
 
 
 _COLUMN_DEFINITIONS = read_rows("columns.csv")
-#: Path of each column in the results (``log.firmware``); "" if px4fuse batch computes the column
+#: Path of each table column in the results, for example ``log.firmware``
 RESULT_PATH_BY_COLUMN = {row["column"]: row["path"] for row in _COLUMN_DEFINITIONS}
 #: Data type of each table column; missing numbers are NA, and missing texts are empty
 COLUMN_TYPES = {row["column"]: row["type"] for row in _COLUMN_DEFINITIONS}
@@ -52,7 +51,7 @@ def find_value(results: object, path: str) -> Any:
 
 
 def make_axis_rows(results: ComparisonResults) -> list[Row]:
-    """Return the table rows of one log, one per axis, as dicts without missing values."""
+    """Return the table rows of one log, one per axis."""
     common_values = collect_log_values(results.log) | collect_finding_values(
         results.findings, results.aids
     )
@@ -102,7 +101,7 @@ def collect_finding_values(findings: Iterable[Finding], aids: Mapping[str, AidRe
 
 
 def collect_card_values(card: Card) -> Row:
-    """Return headline, cause, action and σ ratios of a flight for the table of batch."""
+    """Return headline, action and σ ratios of a flight for the table of ``px4fuse batch``."""
     rmse_values_m = card.effect.position_rmse_m.values() if card.effect else ()
     return {
         "severity": card.severity,
@@ -120,7 +119,7 @@ def collect_card_values(card: Card) -> Row:
 
 
 def find_first_action(card: Card) -> str:
-    """Return the commands of the first recommended action, or its text if it has no command."""
+    """Return the commands, or else the text, of the first recommended action."""
     if not card.causes:
         return ""
     first_cause = card.causes[0]

@@ -65,7 +65,7 @@ class BatchResult:
 
 
 class CachedRows(msgspec.Struct, frozen=True):
-    """Table rows of a log in a cache file, valid for one version and set of settings of px4fuse."""
+    """Cached table rows of a log, valid for one version and one set of settings of px4fuse."""
 
     sha256: str
     px4fuse: str
@@ -80,7 +80,7 @@ class CachedRows(msgspec.Struct, frozen=True):
 
 @dataclass(eq=False)
 class _RunState:
-    """Settings of ``px4fuse batch``, and logs that are finished; changes during the run."""
+    """Settings of ``px4fuse batch``, and finished logs."""
 
     output: Path
     version: str
@@ -108,8 +108,7 @@ def run_batch(
     paths : str, Path or iterable of them
         Files, folders, globs and URLs.
     output : str or Path, optional
-        Folder for the table and the results of each log. By default no file is written. A second
-        run with this folder processes only new and failed logs.
+        Folder for the table and the results of each log; by default no file is written.
     reports : bool
         True to write a PDF report for each log.
     timeout_s : float
@@ -119,11 +118,11 @@ def run_batch(
     workers : int, optional
         Number of processes on this computer; by default the number of cores.
     memory_gb : float
-        Maximum address space for one log, only on Linux; libraries use 0.6 GB of it.
+        Maximum address space (GB) for one log, only on Linux.
     progress : callable
         Called with the activity, the number of finished logs and the number of all logs.
     **settings
-        Arguments of :func:`px4fuse.compare`, such as ``sigma_z_m``, and the arguments above.
+        Arguments of :func:`px4fuse.compare`, such as ``sigma_z_m``.
 
     Returns
     -------
@@ -162,8 +161,8 @@ def run(
 ) -> BatchResult:
     """Compare KF and EKF2 on many logs, and write a table and the results to a folder.
 
-    For the parameters see :func:`run_batch`. If the run ends early (Ctrl-C, full disk, lost
-    cluster), the results of finished logs are kept.
+    For the parameters see :func:`run_batch`. The results of finished logs are kept if the run ends
+    early.
 
     Raises
     ------
@@ -231,8 +230,7 @@ def run(
 def _find_cached_hashes(state: _RunState, reports: bool) -> dict[int | None, set[str]]:
     """Return the SHA-256 of the logs that earlier runs finished, by size of the log in bytes.
 
-    With ``reports``, a log without a PDF report is not finished. The size is None for a log at a
-    URL without a known size.
+    With ``reports``, a log without a PDF report is not finished.
     """
     hashes_by_size: dict[int | None, set[str]] = defaultdict(set)
     for cached_rows in load_cached_rows(state):

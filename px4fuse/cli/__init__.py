@@ -52,8 +52,7 @@ TERMINATION_SIGNALS = (
 )
 
 HELP_OPTIONS = ["-h", "--help"]
-# Environment variables that px4fuse removes: an invalid value stops the import of matplotlib or
-# pymavlink. No output depends on them
+# Environment variables that px4fuse removes: invalid values stop the import of libraries
 IGNORED_ENVIRONMENT_VARIABLES = ("MPLBACKEND", "SOURCE_DATE_EPOCH")
 # Minimum address space (bytes) for a run: the report of the sample log needs 0.7 GB
 MIN_ADDRESS_SPACE_BYTES = 800_000_000
@@ -163,7 +162,7 @@ def _check_memory() -> None:
 
 def main() -> None:
     """Run the command line; print an error as one line on standard error, and exit with code 2."""
-    # garbage collection needs 10 % of the run time of a short command, and 10 % more at exit
+    # garbage collection needs 10 % of the run time of a short command
     gc.disable()
     atexit.register(gc.freeze)
     _configure_libraries()
@@ -257,7 +256,7 @@ def _raise_interrupt(signal_number: int, _: object) -> None:
 
 
 def _raise_signal_again(unraisable: "sys.UnraisableHookArgs") -> None:
-    """Send a signal again if Python ignored its exception, because a finaliser was running."""
+    """Send a signal again if it arrived during a finaliser, where Python ignores exceptions."""
     error = unraisable.exc_value
     if isinstance(error, KeyboardInterrupt):
         signal_number = error.args[0] if error.args else signal.SIGINT

@@ -19,7 +19,7 @@ from px4fuse.core.input_files import check_output_folder, suspend_input_registra
 from px4fuse.core.reading import read_text
 from px4fuse.errors import OutputError, to_one_line
 
-# Maximum size (bytes) of the flight.json of an earlier export, which names the exported log
+# Maximum size (bytes) of the flight.json of an earlier export
 MAX_DESCRIPTION_BYTES = 50_000_000
 
 

@@ -131,7 +131,7 @@ memory_option = click.option(
     default=4.0,
     help="Maximum memory for one log (GB, Linux only); a log that needs more fails.",
 )
-# Not part of the settings in a report, because the size limit does not affect results
+# not in the settings of a report: the size limit does not affect results
 max_size_option = click.option(
     "--max-size",
     type=click.IntRange(1),

@@ -27,8 +27,7 @@ if TYPE_CHECKING:
     from px4fuse.request import Request
     from px4fuse.results.contract import Results
 
-# Maximum length (bytes) of a default report name (file systems allow 255), and length to which a
-# longer name is cut
+# Maximum length (bytes) of a default report name, and length to which a longer name is cut
 MAX_NAME_BYTES, SHORTENED_NAME_BYTES = 200, 180
 # Empty name and id, for a report without a student
 NO_STUDENT_NAME = ("", "")
@@ -80,7 +79,7 @@ def progress(*output_paths: Path | None) -> Iterator[ShowProgress]:
     from rich.console import Console
 
     console = Console(stderr=True)
-    # no progress bar at all: in older versions of rich, a disabled bar prints an empty line
+    # older versions of rich print an empty line for a disabled progress bar
     if not console.is_terminal or STANDARD_OUTPUT in output_paths:
         yield lambda *_: None
         return

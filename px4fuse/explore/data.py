@@ -29,7 +29,7 @@ from px4fuse.request import ComparisonRequest, command_line
 
 # Data for the web page, in JSON types
 PageData = dict[str, Any]
-# Half the range (s) of the slider for the time offset; its centre is the value in the analysis
+# Half the range (s) of the slider for the time offset
 OFFSET_SLIDER_HALF_RANGE_S = 0.6
 
 
@@ -86,7 +86,7 @@ def make_page_constants() -> PageData:
 
 
 def undo_time_offset(comparison: Comparison) -> PositionTrack:
-    """Return the positions with their original timestamps, without the applied time offset."""
+    """Return the positions with their original timestamps."""
     return shift_clock(comparison.source, -comparison.settings.clock_offset_s)
 
 
@@ -136,8 +136,7 @@ def _make_axis_inputs(
 ) -> PageData:
     """Return position measurements (m) and the time integral of acceleration (m/s) along an axis.
 
-    Measurements shortly outside the analysed time span are included, because another time offset
-    can move these measurements into the time span.
+    Measurements shortly outside the analysed time span are included, for other time offsets.
     """
     segment = comparison.segment
     time_s = source_track.samples.index.to_numpy()
@@ -179,8 +178,7 @@ def _make_axis_data(analysis: Analysis, result: AxisComparison, encoder: ArrayEn
 def _pack_nis_bands(innovation_count: int, encoder: ArrayEncoder) -> list[dict[str, int]]:
     """Return lower and upper limits of the 95 % band of the mean NIS, encoded for the page.
 
-    Row n - 1 contains the limits for n innovations. There are twice ``innovation_count`` rows,
-    because the user can change the time offset, and more measurements are then in the time span.
+    Row n - 1 contains the limits for n innovations.
     """
     innovation_counts = np.arange(1, 2 * innovation_count + 1)
     bounds = stats.chi2.interval(CONFIDENCE_LEVEL, innovation_counts)
@@ -276,8 +274,7 @@ def _format_ekf2_settings(analysis: Analysis) -> dict[str, str]:
 def _make_commands(request: ComparisonRequest, analysis: Analysis) -> PageData:
     """Return the ``px4fuse compare`` command of this analysis in two forms.
 
-    In "base", px4fuse chooses time span and main axis. In "fixed", time span and main axis are
-    those of this analysis: px4fuse could choose others with another time offset.
+    In "fixed", time span and main axis are those of this analysis. In "base", px4fuse chooses both.
     """
     offset_s = None if request.position is None else request.clock_offset_s
     defaults = ComparisonRequest(log=request.log)

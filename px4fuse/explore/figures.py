@@ -23,7 +23,7 @@ BOKEH_SOURCE_COLUMNS = (
     "z turn "  # z: measured position (m); turn: angle (rad) of an arrow head
     "row left right"  # row of the event plot; left, right: start and end (s) of the event
 )
-# JavaScript sets the colours by `name`. Line styles distinguish the filters without colour
+# JavaScript sets the colours by `name`
 KF_LINE_STYLE: BokehStyle = {"line_width": 1.6, "name": "kf"}
 EKF2_LINE_STYLE: BokehStyle = {"line_width": 1.6, "line_dash": [6, 3], "name": "ekf2"}
 TRUTH_LINE_STYLE: BokehStyle = {"line_width": 1.2, "line_dash": [1, 3], "name": "truth"}

@@ -1,8 +1,6 @@
 """Compact encoding of arrays for the web page.
 
-Numbers are scaled and rounded to integers. The differences of successive integers are split into
-bytes: first the lowest byte of each difference, then the next byte. This order compresses well
-(deflate). The result is encoded as base64.
+Numbers are rounded to integers. The bytes of their differences are compressed (deflate).
 """
 
 import base64
@@ -13,12 +11,11 @@ import numpy as np
 
 from px4fuse.core.arrays import Array
 
-# Rounding steps per m, m/s or s for the inputs of KF, because integers compress well. The rounding
-# error is 1 % of the tolerated difference between KF in JavaScript and KF in Python
+# Rounding steps per unit (m, m/s or s) for the inputs of KF; integers compress well
 KF_INPUT_STEPS_PER_UNIT = 2.0**36
 # Rounding steps per unit for values that are only drawn or averaged
 DRAWN_VALUE_STEPS_PER_UNIT = 1e6
-# Limit of the rounded values: half of the largest integer that JavaScript represents exactly
+# Limit of the rounded values: JavaScript represents integers exactly up to twice this limit
 MAX_EXACT_INTEGER = 2.0**52
 
 

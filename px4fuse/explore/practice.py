@@ -39,8 +39,7 @@ COMBINABLE_ANSWER_PAIRS = (
 MAX_QUIZ_LEVEL = 3  # level of the most difficult flights
 MAX_SEED = 2**32 - 1
 SIGMA_A_M_S2, SIGMA_Z_M = 0.10, 0.10
-# Settings of the simulated flights: less than a minute, with two turns. IMU errors are small,
-# because large errors resemble a time offset or a misaligned position frame
+# Settings of the simulated flights; IMU errors are small, because large errors resemble faults
 SCENARIO_SETTINGS: dict[str, Any] = {
     "passes": 3,
     "speed_m_s": 1.5,
@@ -58,7 +57,7 @@ FINDING_ID_BY_FAULT = {
     "jump": "source_position_jump",
     "dropout": "source_gap",
 }
-# Fault of the KF settings, not of the simulated flight: too small measurement noise
+# Fault: SIGMA_Z of KF is smaller than the noise of the simulated positions
 NOISY_UWB_FAULT = "noisy-uwb"
 
 
@@ -112,7 +111,7 @@ class QuizFlight:
 
 
 def choose_random_flights(seed: int, level: int, count: int) -> tuple[QuizFlight, ...]:
-    """Choose the faults of all simulated flights at random; all faults are equally frequent.
+    """Choose the faults of all simulated flights at random; all answers are equally frequent.
 
     Parameters
     ----------

@@ -58,11 +58,9 @@ class Server(MCPServer[Any]):
     Parameters
     ----------
     tools : sequence of (Tool, ParseArguments)
-        Tools, each with the parser of its arguments. A tool without output schema only prints text
-        and runs without a worker process.
+        Tools, each with the parser of its arguments.
     run_command : callable
-        Function (connection for progress messages, command line) that runs a command. It must be
-        pickleable for the worker process.
+        Function that runs a command line. It must be pickleable for the worker process.
     timeout_s : float
         Maximum time for one analysis.
     max_memory_bytes : int

@@ -21,8 +21,7 @@ from px4fuse.errors import SettingsError
 
 # Maximum size (bytes) of an answer form
 MAX_FORM_BYTES = 20_000
-# Maximum length (characters) of a line of an answer form: tomllib needs seconds and gigabytes for
-# very long keys with dots
+# Maximum length (characters) of a line: tomllib needs gigabytes for very long keys with dots
 MAX_LINE_LENGTH = 500
 MAX_MISTAKES = 20
 NO_FAULT_KIND = "none"
@@ -36,7 +35,7 @@ class FaultKind(Record, rename={"size_quantity": "in", "size_range": "range"}):
     Attributes
     ----------
     size_quantity : str
-        Key of the allowed units in ``form.toml``, for example "m"; "" for a fault without a size.
+        Key of the allowed units in ``form.toml``, for example "m".
     size_range : (float, float)
         Smallest and largest allowed size, in the first allowed unit.
     """
@@ -47,7 +46,7 @@ class FaultKind(Record, rename={"size_quantity": "in", "size_range": "range"}):
 
     @property
     def units(self) -> Mapping[str, float]:
-        """Allowed units of the fault's size, each with the factor that converts to the first."""
+        """Allowed units of the fault's size, with the factor that converts to the first unit."""
         return _UNITS_BY_QUANTITY[self.size_quantity]
 
 
@@ -68,7 +67,7 @@ FAULT_KINDS, EKF2_BEHAVIOURS, REPORT_PANELS = (
     _ALLOWED_ANSWERS.behaviours,
     _ALLOWED_ANSWERS.report_panels,
 )
-# Allowed units for the value of each correction of a fault, for example of a changed parameter
+# Allowed units for the value of each correction
 UNITS_BY_CORRECTION = {
     name: _UNITS_BY_QUANTITY[quantity] for name, quantity in _ALLOWED_ANSWERS.corrections.items()
 }
@@ -201,7 +200,7 @@ class Answers(Record, kw_only=True):
 
 
 QuestionKind = Literal["gain", "variance", "innovation", "nis", "prediction", "gate"]
-# KF has three questions. The kind of each question is selected at random from one of these pairs
+# Kinds of the three questions about KF; each kind is selected at random from one pair
 _QUESTION_KIND_PAIRS: tuple[tuple[QuestionKind, QuestionKind], ...] = (
     ("gain", "variance"),
     ("innovation", "nis"),
@@ -210,7 +209,7 @@ _QUESTION_KIND_PAIRS: tuple[tuple[QuestionKind, QuestionKind], ...] = (
 
 
 class FormQuestion(Record):
-    """Numeric question about KF along the main axis, which students answer with their own program.
+    """Numeric question about KF along the main axis.
 
     Attributes
     ----------
@@ -219,7 +218,7 @@ class FormQuestion(Record):
     update_number : int
         Number of the KF update, from 1. The first measurement only sets the state.
     question_parameter : float
-        Duration without update (s) for the kind "prediction", innovation gate (in √S) for "gate".
+        Duration (s) of the prediction, or innovation gate (in √S).
     """
 
     kind: QuestionKind
@@ -244,8 +243,7 @@ class FormQuestion(Record):
         return f"{quantity}; with SIGMA_A {self.sigma_a_m_s2:g} and SIGMA_Z {self.sigma_z_m:g}"
 
 
-# Number of updates after the first update in a question of kind "gate", which asks for the updates
-# whose innovations are outside the gate
+# Number of further updates in a question about the innovation gate
 GATE_QUESTION_FURTHER_UPDATES = 20
 
 

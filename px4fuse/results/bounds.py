@@ -43,10 +43,9 @@ def find_bounds(name: str) -> tuple[float, float]:
 
 
 def drop_invalid_numbers(results: T) -> T:
-    """Remove fields of type NotWritten and numbers outside their valid range from results.
+    """Remove numbers outside their valid range from results.
 
-    An optional number is set to None. If the number is required, the record that contains it is
-    deleted or replaced by an Unavailable. The reasons are added to ``missing`` or ``notes``.
+    The reasons are added to ``missing`` or ``notes``.
 
     Raises
     ------
@@ -97,7 +96,7 @@ def _check_value(value: Any, annotation: Any, path: str, reasons: list[str]) -> 
 def _check_struct(value: msgspec.Struct, path: str, reasons: list[str]) -> msgspec.Struct:
     changes: dict[str, Any] = {}
     for field in fields(value):
-        if field.type is msgspec.UnsetType:  # NotWritten
+        if field.type is msgspec.UnsetType:
             continue
         field_value, field_path = getattr(value, field.name), f"{path}.{field.name}".lstrip(".")
         try:
@@ -133,7 +132,7 @@ def _check_mapping(value: Mapping[str, Any], annotation: Any, path: str, reasons
 
 
 def _check_tuple(value: tuple[Any, ...], path: str, reasons: list[str]) -> tuple[Any, ...]:
-    # of a tuple of numbers, one invalid number invalidates the whole tuple
+    # one invalid number invalidates a tuple of numbers
     checked_elements = []
     for element in value:
         try:

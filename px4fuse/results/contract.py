@@ -1,7 +1,6 @@
 """Types of the JSON results of all commands, their JSON Schema, and writing.
 
-px4fuse reads results with an equal major version of the schema, and ignores fields of a newer minor
-version.
+px4fuse reads results with the same major version of the schema.
 """
 
 import json
@@ -60,7 +59,7 @@ SIGNIFICANT_DIGITS = 10
 
 
 class Log(LogInfo, kw_only=True):
-    """Log, files read in addition (``joined``), and clocks that were converted to boot time."""
+    """Log, additional input files (``joined``), and clocks converted to boot time."""
 
     joined: tuple[InputFile, ...]
     clocks: tuple[ClockMap, ...]
@@ -156,7 +155,7 @@ class NumberChange(Record, kw_only=True):
     a, b : float or None
         Values in A and B; None for a missing number.
     a_interval, b_interval : (float, float or None), or None
-        Their 95 % intervals.
+        95 % intervals of the values.
     """
 
     path: str
@@ -201,21 +200,19 @@ class ComparisonResults(_FlightResults):
     Attributes
     ----------
     tuning : mapping of axis name to AxisTuning
-        Estimated noises. The key "horizontal" is one estimate for north and east together.
+        Estimated noises; "horizontal" is one estimate for north and east together.
     heading : HeadingError
         Yaw misalignment between the position frame and the heading of the vehicle.
     ekf2_replay : Ekf2Replay
-        Replay of EKF2 from the log, and its agreement with the logged EKF2.
+        Replay of EKF2, and its agreement with the logged EKF2.
     difference_steps : mapping of axis name to DifferenceExplanation
-        Explanation of the difference KF - EKF2: re-runs of KF, in which settings of KF are replaced
-        step by step by settings of EKF2.
+        Re-runs of KF that explain the difference KF - EKF2.
     trials : tuple of Trial
         Re-runs of KF and EKF2, each with one change of a setting or of the data.
     card : Card
         Summary of the diagnosis.
     convention : Convention
-        Detected axes, unit, clock and orientation of the positions. None for GNSS, and for a log
-        without IMU or attitude.
+        Detected axes, unit, clock and orientation of the positions.
     """
 
     axes: Annotated[dict[AxisName, AxisComparison], Meta(min_length=1)]
@@ -301,11 +298,11 @@ class WhatIfResults(Record, kw_only=True, rename={"uses_estimates": "asked"}):
     Attributes
     ----------
     agreement : Agreement
-        Agreement of EKF2's replay with the logged EKF2, both with the logged parameters.
+        Agreement of the EKF2 replay with the logged EKF2.
     evaluated_s : tuple of (float, float)
         Time spans (s) of all statistics.
     uses_estimates : bool
-        True if the user gave no parameters: they are set to maximum-likelihood estimates.
+        True if the parameters are maximum-likelihood estimates.
     logged, replayed, whatif : Ekf2Statistics
         EKF2 as logged, replay with logged parameters, replay with changed parameters.
     sweep : tuple of Ekf2Statistics
@@ -329,8 +326,7 @@ class WhatIfResults(Record, kw_only=True, rename={"uses_estimates": "asked"}):
 class ChangeResults(Record, kw_only=True):
     """Results of ``px4fuse diff``: differences between the inputs A and B.
 
-    ``worse`` contains a sentence for each filter that is consistent only in A, and for each finding
-    of severity error that is only in B. The exit code is 1 if ``worse`` is not empty.
+    ``worse`` contains a sentence for each filter that is consistent only in A, and each new error.
     """
 
     schema: Schema
@@ -403,7 +399,7 @@ def make_schemas_of_types(types: Collection[type]) -> tuple[list[dict[str, Any]]
         }
 
     count = 0
-    # repeat, because `describe_union` finds further types that are nested
+    # repeat, because `describe_union` finds nested types
     while count < len(record_types):
         count = len(record_types)
         schemas, components = msgspec.json.schema_components(

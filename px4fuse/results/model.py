@@ -48,7 +48,7 @@ class Provenance(Record):
     libraries : mapping of str to str
         Versions of the libraries that affect the numbers in the results.
     command : str
-        Command line for users. Programs should read the field ``request`` instead.
+        Command line for users; programs read ``request`` instead.
     """
 
     px4fuse: Version

@@ -31,7 +31,7 @@ class _ResultsHeader(msgspec.Struct, frozen=True):
 
 
 def read_results(data: bytes, name: str = "results.json") -> Results:
-    """Read results of px4fuse from untrusted bytes; clean all texts by :func:`clean_text`.
+    """Read results of px4fuse from untrusted bytes.
 
     ``name`` is the file name for messages.
 

@@ -13,7 +13,7 @@ BAD_VALUE_ERRORS = (
     TypeError,
     ValueError,
 )
-# Result of comparing numbers (Status) and pages (PageStatus) of a report with a new analysis
+# Results of comparing numbers and pages of a report with a new analysis
 VerificationStatus = Literal["verified", "numbers differ", "other log", "cannot verify"]
 PageStatus = Literal["same", "differ", "not compared"]
 
@@ -29,7 +29,7 @@ class Mismatch:
     recorded : str
         Value in the report; "absent" for a missing value.
     recomputed : str
-        Value in the results of the new analysis; "absent" for a missing value.
+        Value in the new analysis; "absent" for a missing value.
     """
 
     path: str
@@ -48,7 +48,7 @@ class PageDifference:
     what : str
         Description of the difference.
     is_structural : bool
-        True for added or missing PDF objects: another program wrote the file.
+        True for added or missing PDF objects.
     """
 
     page: int
@@ -67,11 +67,11 @@ class Verification:
     Attributes
     ----------
     reasons : tuple of str
-        Differences, reason for "cannot verify", or successful checks, as sentences.
+        Sentences that explain the status.
     with_log : bool
         True if the analysis was repeated on the log.
     redrawn_pdf : bytes
-        Report of the repeated analysis; empty if the analysis was not repeated.
+        PDF report of the repeated analysis, or empty.
     remedy : str
         Action of the user if the report was not verified.
     missing : str

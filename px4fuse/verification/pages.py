@@ -1,18 +1,9 @@
 """Comparison of a submitted PDF with the report that px4fuse draws from the log ("redrawn").
 
-All objects of both files are compared pairwise, starting from the pages, the document information
-and the catalogue. Anything that px4fuse does not write is a difference, so no list of possible
-forgeries is needed.
+All objects of both files are compared pairwise. Two kinds of differences are tolerated:
 
-Two kinds of differences are tolerated:
-
-- Programs that save a PDF again change object numbers, compression, ``/ID``, the header, unused
-  objects, the notation of numbers and strings, and the name of the program, dates and identifiers
-  in the metadata.
-- Processors differ in the last digits: coordinates may differ by COORDINATE_TOLERANCE_PT, and
-  printed numbers if the results agree within their tolerances.
-
-The attached results are compared in :mod:`px4fuse.verification.verification`.
+- Changes of programs that save a PDF again: object numbers, compression and program names.
+- Different last digits on other processors: coordinates, and printed numbers.
 """
 
 import math
@@ -47,16 +38,13 @@ from px4fuse.verification.pdf_input import (
     resolve_reference,
 )
 
-# Tolerance (pt) of coordinates: different OpenBLAS kernels move points by at most 0.07 pt, and
-# 0.25 pt is not visible
+# Tolerance (pt) of coordinates; different processors move points by at most 0.07 pt
 COORDINATE_TOLERANCE_PT = 0.25
-# Relative and absolute tolerance of PDF numbers except coordinates: programs may save 32-bit floats
+# Tolerance of PDF numbers except coordinates: programs may save 32-bit floats
 PDF_NUMBER_TOLERANCE = 1e-5
-# Numbers in a text may differ by rounding only if the kerning (1/1000 em) of the text is below this
-# limit. By a larger kerning, a forger could change the order of the digits
+# Maximum kerning (1/1000 em) of texts with rounded numbers: a larger kerning could swap digits
 MAX_KERNING_PER_MILLE_EM = 200.0
-# Maximum size of the content of a submitted page, divided by the size of the redrawn page: a
-# program may write each character as an escape sequence of four bytes
+# Maximum size ratio of submitted and redrawn page; escape sequences need four bytes per character
 MAX_CONTENT_SIZE_RATIO = 4
 # Maximum time (s) for comparing two PDFs; the comparison of the largest report takes 3 s
 PDF_COMPARISON_TIMEOUT_S = 12.0
@@ -124,8 +112,7 @@ def compare_pages(
 ) -> tuple[PageDifference, ...]:
     """Compare two PDFs in a process with limits of time and memory.
 
-    ``is_same_text`` returns True if two texts are equal up to the rounding of numbers. At most
-    MAX_LISTED_DIFFERENCES are returned, in page order.
+    ``is_same_text`` returns True if two texts are equal up to the rounding of numbers.
     """
     differences = run_one_with_limits(
         _compare_pdfs,
@@ -171,15 +158,13 @@ class _PdfComparison:
     """Pairwise comparison of all objects of two PDFs."""
 
     is_same_text: TextComparison
-    # pairs of objects that are not compared again: number and generation in the submitted PDF,
-    # number in the redrawn PDF
+    # compared pairs: number and generation in the submitted PDF, number in the redrawn PDF
     compared_objects: set[tuple[int, int, int]] = field(default_factory=set)
-    # pairs of submitted and redrawn "/Parent" entries of pages. They are compared after the pages,
-    # because they refer to all pages
+    # pairs of "/Parent" entries of pages, which are compared after all pages
     parent_entry_pairs: list[tuple[Any, Any, str]] = field(default_factory=list)
     # fonts of the current page by name
     fonts: Mapping[str, Any] = field(default_factory=dict)
-    # number of compared values, which is limited because a malicious PDF may contain millions
+    # limited, because a malicious PDF may contain millions of values
     value_count: int = 0
 
     def find_differences(
@@ -203,15 +188,14 @@ class _PdfComparison:
             yield from self._compare(submitted_value, redrawn_value, key, 0)
         for values in self.parent_entry_pairs:
             yield from self._compare(*values, 0)
-        # Programs for PDF 1.4 ignore /XRefStm and use the first cross-reference table, so they
-        # could display other pages
+        # programs for PDF 1.4 ignore /XRefStm, and could display other pages
         if "/XRefStm" in submitted_pdf.trailer:
             yield PageDifference(0, SECOND_XREF_TABLE_REASON, True)
 
     def _compare(
         self, submitted_value: Any, redrawn_value: Any, key: str, page_number: int
     ) -> Iterator[PageDifference]:
-        """Yield the differences of two values at one place in both PDFs, and of nested values."""
+        """Yield the differences of two PDF values, including nested values."""
         value_pairs_to_compare = [(submitted_value, redrawn_value, key)]
         while value_pairs_to_compare:
             submitted_value, redrawn_value, key = value_pairs_to_compare.pop()
@@ -270,7 +254,7 @@ class _PdfComparison:
         page_number: int,
         value_pairs_to_compare: list[tuple[Any, Any, str]],
     ) -> Iterator[PageDifference]:
-        """Yield differences in keys and streams; append value pairs of equal keys to the list."""
+        """Yield the differences in keys and streams of two PDF dictionaries."""
         submitted_keys = _select_compared_keys(submitted_dictionary, key)
         redrawn_keys = _select_compared_keys(redrawn_dictionary, key)
         for name in sorted(submitted_keys ^ redrawn_keys):
@@ -394,21 +378,20 @@ def _find_ambiguities(pdf: bytes) -> Iterator[str]:
     if end_match is None:
         yield "the file has bytes after the end of the PDF"
     elif b"/Linearized" in pdf[:1024]:
-        # The file must end with the position of its first cross-reference table, which follows the
-        # first object. A second table could replace pages
+        # a second cross-reference table could replace pages
         xref_table_start = pdf.find(b"endobj") + len(b"endobj")
         if pdf[xref_table_start : int(end_match[1])].strip():
             yield SECOND_XREF_TABLE_REASON
 
 
 def _get_page_references(reader: pypdf.PdfReader) -> list[Any]:
-    """Return references to the pages, which px4fuse writes in one level of the page tree."""
+    """Return references to the pages of a report, whose page tree has one level."""
     page_tree: Any = reader.root_object["/Pages"]
     return [*list.__iter__(page_tree["/Kids"])]
 
 
 def _pdf_type_of(value: Any) -> type:
-    """Return the type of a PDF value; distinguish names from strings, streams from dictionaries."""
+    """Return the type of a PDF value: string, number, stream, dictionary, array or name."""
     if isinstance(value, TextStringObject | ByteStringObject):
         return str
     if isinstance(value, int | float):
@@ -418,13 +401,13 @@ def _pdf_type_of(value: Any) -> type:
 
 
 def _select_compared_keys(value: DictionaryObject, key: str) -> set[str]:
-    """Return the keys of a PDF dictionary to compare with the redrawn PDF, without null values."""
+    """Return the keys of a PDF dictionary that are compared."""
     compared_keys = {name for name in value if not isinstance(value.raw_get(name), NullObject)}
     if isinstance(value, StreamObject):
         compared_keys -= _COMPRESSION_AND_LENGTH_KEYS
     if key == "/Info":
         compared_keys -= _WRITER_KEYS
-    # The content of an attachment is compared, so /Params (dates and size) is ignored
+    # ignore dates and size of an attachment: its content is compared
     return compared_keys - {"/Params"} if value.get("/Type") == "/EmbeddedFile" else compared_keys
 
 

@@ -1,8 +1,7 @@
 """Reading of the results attached to a submitted PDF, which may be malicious.
 
-Nothing in the PDF is executed, no link is followed, and nothing is written to disk. This module
-checks sizes before pypdf reads the PDF, and sets the limits of pypdf. :mod:`px4fuse.core.workers`
-limits time and memory. The pages are counted but not read.
+Nothing in the PDF is executed, no link is followed, and nothing is written to disk. Sizes are
+checked before pypdf reads the PDF.
 """
 
 import io
@@ -39,12 +38,10 @@ _DAMAGED_REASON = "the PDF is damaged. Hand in the file that px4fuse wrote."
 _ENCRYPTED_REASON = "the PDF is encrypted. Hand in the file that px4fuse wrote."
 _TOO_COSTLY_REASON = "the PDF needs more memory or time to read than a report of px4fuse."
 
-# Exceptions that pypdf raises for damaged PDFs; AttributeError occurred in a test with 900 damaged
-# PDFs
+# Exceptions for damaged PDFs; pypdf also raised AttributeError in a test
 BROKEN_PDF_ERRORS = (*BAD_VALUE_ERRORS, PyPdfError, AttributeError, zlib.error)
 
-# Keys of PDF dictionaries with active content. Links, comments, forms and the initial view are
-# allowed, because programs add them when they save a PDF
+# Keys of PDF dictionaries with active content, which reports never contain
 _ACTIVE_CONTENT_KEY_PATTERN = re.compile(
     "/(JS|JavaScript|XFA|RichMediaContent|RichMediaSettings|Collection|RF)"
 )
@@ -53,8 +50,7 @@ _DANGEROUS_ACTION_PATTERN = re.compile(
     "/(JavaScript|Launch|SubmitForm|ImportData|GoToR|GoToE|Rendition|RichMediaExecute|Movie|Sound)"
 )
 
-# Limits of pypdf, stricter than its defaults: reports of px4fuse contain only undamaged streams
-# with one filter (Flate)
+# Limits of pypdf, stricter than its defaults: reports contain only undamaged Flate streams
 PYPDF_LIMITS: dict[str, Any] = {
     "maximum_declared_stream_length": MAX_PDF_BYTES,
     "array_based_stream_maximum_output_length": MAX_CONTENT_BYTES,
@@ -71,7 +67,7 @@ PYPDF_LIMITS: dict[str, Any] = {
     "page_tree_maximum_page_entries": 100 * MAX_PAGES,
 }
 
-# PDF compression methods (filters) for which _check_file limits the decompressed size
+# Allowed compression methods (filters) of a PDF; _check_file limits their decompressed size
 _ALLOWED_FILTERS = frozenset(("/FlateDecode", "/DCTDecode"))
 
 _STREAM_START_PATTERN = re.compile(rb"(?<!end)stream *\r?\n?")
@@ -101,7 +97,7 @@ def read_report(pdf: bytes, name: str) -> ReportedResults:
 
 
 def read_attached_results(pdf: bytes, name: str) -> Results:
-    """Read the results attached to a report PDF; control characters are removed from texts.
+    """Read the results attached to a report PDF.
 
     Raises
     ------
@@ -163,8 +159,7 @@ def _check_file(pdf: bytes) -> None:
 def _estimate_inflated_bytes(pdf: bytes, start: int, limit_bytes: int) -> int:
     """Return the size (bytes) of the decompressed zlib data at ``start``; 0 without zlib data.
 
-    If the compressed data are larger, their size is returned. The result is at least 1000 and at
-    most ``limit_bytes`` + 1.
+    The result is at least 1000 and at most ``limit_bytes`` + 1.
     """
     zlib_header = pdf[start : start + 2]
     if (
@@ -202,8 +197,7 @@ def _walk_dictionaries(reader: pypdf.PdfReader) -> Iterator[tuple[DictionaryObje
             if (value, is_action_after_click) in visited_references:
                 continue
             visited_references.add((value, is_action_after_click))
-            # count references to objects that the cross-reference table does not list: pypdf
-            # searches the whole file for each of them
+            # pypdf searches the whole file for each object that the cross-reference table omits
             number, generation = value.idnum, value.generation
             is_in_object_stream = generation == 0 and number in reader.xref_objStm
             is_listed = is_in_object_stream or number in reader.xref.get(generation, {})

@@ -1,14 +1,9 @@
 """Verification of a report (PDF): repeat its analysis on the log, and compare numbers and pages.
 
-The new results are compared with the results attached to the PDF. This confirms that the numbers
-follow from the log. It does not confirm the author: each person with the log can make the same
-report under another name.
+Verification confirms that the numbers follow from the log. It does not confirm the author.
 
-The report is also drawn from the new results, and its pages are compared with the submitted PDF
-(:mod:`px4fuse.verification.pages`). No number is read from the submitted pages.
-
-The settings in the PDF may be forged. They are decoded strictly with the ranges of all values, and
-cannot name an output file. Input files are found by SHA-256, never by name.
+The settings in the PDF may be forged. They are decoded strictly, and cannot name an output file.
+Input files are found by SHA-256, never by name.
 """
 
 import re
@@ -39,23 +34,20 @@ ASK_AUTHOR_REMEDY = (
     "Ask the author how the report was made, and for its log and all other input files."
 )
 INVALID_COMMAND_REASON = "the command in the report is not a command of px4fuse"
-# Minimum KF prediction interval DT (s): 60,000 steps for a flight of ten minutes take half a minute
+# Minimum KF prediction interval DT (s); the analysis with smaller values would take too long
 MIN_DT_S = 0.01
 ORIGINAL_PDF_REMEDY = "Ask the author of the report for the PDF that px4fuse wrote."
 VERIFICATION_SCOPE_NOTE = (
     "Verification confirms that the numbers follow from the log. It does not confirm the author."
 )
 NO_LOG_REASON = "no log was given, so the analysis could not be repeated"
-# Relative tolerance of numbers in a report: the results on four types of processors (OpenBLAS
-# kernels) differ by at most 3e-8 (six flights)
+# Relative tolerance of numbers; results of four types of processors differ by at most 3e-8
 RESULT_RELATIVE_TOLERANCE = 1e-6
 # Absolute tolerance of numbers, for the comparison of a report with a new analysis
 RESULT_ABSOLUTE_TOLERANCE = 1e-9
-# Relative tolerance of maximum-likelihood estimates in a report. The cost is flat at its minimum: a
-# change in its 12th digit changes the 4th digit of the estimate. Reports print up to three digits
+# Relative tolerance of maximum-likelihood estimates, whose cost function is flat at its minimum
 ESTIMATE_RELATIVE_TOLERANCE = 1e-3
-# Absolute tolerance of maximum-likelihood estimates, for the comparison of a report with a new
-# analysis
+# Absolute tolerance of maximum-likelihood estimates
 ESTIMATE_ABSOLUTE_TOLERANCE = 1e-5
 # Fields of the results that contain maximum-likelihood estimates, or depend on them
 ESTIMATE_FIELDS = (
@@ -73,8 +65,7 @@ ESTIMATE_FIELDS = (
 )
 # Field of the results with the number of iterations of a solver
 ITERATIONS_FIELD = "iterations"
-# Maximum difference between a solver's iterations in a report and in a new analysis: the solver may
-# stop earlier on another processor
+# Maximum difference in the number of solver iterations: another processor may stop earlier
 MAX_SOLVER_ITERATION_DIFFERENCE = 2
 # Fields of the results that are not compared, because they describe the computer
 MACHINE_DEPENDENT_FIELDS = ("provenance.python", "provenance.libraries")
@@ -89,12 +80,12 @@ _NUMBER_PATTERN = re.compile(r"(\d+(?:\.\d+)?(?:e[+-]?\d+)?)")
 
 # Results of the new analysis, and a function that draws the PDF of these results
 RecomputedReport = tuple[ReportedResults, Callable[[], bytes]]
-# Function that links an input file: file name, SHA-256, label for messages -> path of the link
+# Function that links an input file; arguments: file name, SHA-256, label for messages
 _LinkInputFile = Callable[[str, str | None, str], str]
 
 
 class NotRepeatableError(Exception):
-    """Reason why an analysis cannot be repeated, remedy, and name of a missing file if any."""
+    """Reason why an analysis cannot be repeated, with remedy and missing file."""
 
 
 def log_sha256(results: ReportedResults) -> str:
@@ -112,8 +103,7 @@ def recompute_report(
 ) -> RecomputedReport | Verification:
     """Repeat the analysis of a report with the settings in ``results``.
 
-    Return the status "cannot verify" if the settings are not valid, a file is missing, or the
-    analysis fails. ``path_by_sha256`` are paths of input files by SHA-256.
+    Return the status "cannot verify" if the analysis fails.
     """
     try:
         if tuple(results.provenance.libraries) != LIBRARIES:
@@ -143,8 +133,7 @@ def _link_input_file(
 ) -> str:
     """Link the file with this SHA-256 into a temporary folder, and return the path of the link.
 
-    The link has the name that the submitted report prints, so that the new report prints the same
-    name. ``file_label`` is for error messages.
+    The link keeps the file name, which the report prints.
     """
     path = None if sha256 is None else path_by_sha256.get(sha256)
     if path is None:
@@ -361,8 +350,7 @@ def is_same_number_up_to_rounding(
 ) -> bool:
     """Return True if two printed numbers are the rounded values of the same result.
 
-    ``agreeing_pairs`` are values of results in the report and in the new analysis, if they differ
-    by less than the tolerance.
+    ``agreeing_pairs`` are values in the report and in the new analysis.
     """
     decimals = _count_decimals(submitted_number)
     printed_pair = float(submitted_number), float(redrawn_number)
@@ -383,15 +371,12 @@ def compare_results(
     mismatches : tuple of Mismatch
         Values that differ by more than the tolerances.
     is_same_number : callable
-        Returns True if two printed numbers are the rounded values of one result, whose values in
-        the report and in the new analysis agree.
+        Returns True if two printed numbers are rounded values of one result.
     value_count : int
         Number of compared values.
     """
     command = str(new_results["provenance"]["command"])
-    # With an option "auto" or --position, KF uses a time offset or an alignment that px4fuse
-    # estimates from the log. All numbers then depend on estimates, so the tolerance of estimates
-    # applies to all numbers
+    # with estimated settings, all numbers depend on maximum-likelihood estimates
     has_estimated_settings = not {"auto", "--position"}.isdisjoint(command.split())
     recorded_values, new_values = dict(flatten(recorded_results)), dict(flatten(new_results))
     value_pair_by_path = {

@@ -84,7 +84,7 @@ def answer_key_path(folder: Path, key_option: Path | None) -> Path:
     Raises
     ------
     OutputError
-        The path is inside the students' folder, so that students could read the answers.
+        The path is inside the students' folder.
     """
     resolved_folder = folder.resolve()
     path = key_option or resolved_folder.parent / f"{resolved_folder.name}_answers.json"
@@ -108,13 +108,12 @@ def write_assignment(
 ) -> tuple[AnswerKey, int]:
     """Write log, answer form and figures of each student to a folder, and the answer key.
 
-    Existing files are not overwritten. A later call can add students to the answer key.
+    Existing files are not overwritten.
 
     Parameters
     ----------
     secret : bytes or None
-        Seed of the random numbers; None for the secret in the existing answer key, or for a new
-        random secret.
+        Seed of the random numbers; None for a random seed, which the answer key stores.
     fault_count : int, optional
         Number of injected faults of each flight; random by default.
     with_ground_truth : bool
@@ -137,7 +136,7 @@ def write_assignment(
     with suspend_input_registration():
         key = read_answer_key(key_file) if key_file.exists() else AnswerKey(kind, ())
     answers = {normalise_text(answer.student_id): answer for answer in key.answers}
-    # an answer key without any of these students was written for another class
+    # an answer key without these students belongs to another class
     is_key_of_this_class = not answers or not answers.keys().isdisjoint(
         normalise_text(student.student_id) for student in students
     )
@@ -174,7 +173,7 @@ def write_assignment(
                 partial(draw_uniform, secret, student.student_id, kind)
             )
         key = AnswerKey(kind, tuple(answers.values()), stored_secret)
-        # the secret must be stored before the log: a restart after an interruption needs it
+        # store the secret before the log: a restart after an interruption needs the secret
         write_output_files({key_file: format_answer_key(key).encode()})
         key_file.chmod(0o600)  # only the instructor can read the answer key
         write_output_files(missing_content_by_path)
@@ -184,7 +183,7 @@ def write_assignment(
 
 
 def _exists_with_same_content(path: Path, content: bytes) -> bool:
-    """Return True if the file exists with this content, and False if the file does not exist.
+    """Return True if the file exists with this content.
 
     Raises
     ------

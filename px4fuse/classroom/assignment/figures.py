@@ -1,7 +1,4 @@
-"""Multiple-choice questions about figures of simulated flights.
-
-The student gets the figures but not the logs, so that px4fuse cannot answer the questions.
-"""
+"""Multiple-choice questions about figures of simulated flights."""
 
 from collections.abc import Callable, Iterable, Mapping
 from io import BytesIO
@@ -23,9 +20,9 @@ from px4fuse.simulation.scenario import make_scenario
 FIGURE_COUNT = 3
 # Number of straight passes along the aisle in each simulated flight
 STRAIGHT_PASS_COUNT = 4
-# The background is grey while the velocity along the positive aisle direction is above this value
+# Minimum velocity (m/s) in the positive aisle direction for a grey background of the plot
 MIN_SPEED_FOR_GREY_BACKGROUND_M_S = 0.2
-# Questions about each figure, by the field of FigureAnswers that contains the right answer
+# Questions about each figure; the keys are fields of FigureAnswers
 QUESTIONS = {
     "fault": "injected fault of the flight",
     "evidence": "plots that show the fault, and plots that do not show the fault",
@@ -80,8 +77,7 @@ def _select_fault_kinds(draw_number: Callable[[str], float]) -> dict[str, str]:
 def select_choices(draw_number: Callable[[str], float]) -> tuple[tuple[Choice, ChoiceLetter], ...]:
     """Make the multiple-choice questions about a student's figures, each with its right letter.
 
-    ``draw_number`` converts a name, such as "figures fault", to a random number in [0, 1). Equal
-    names give equal numbers.
+    ``draw_number`` converts a name, such as "figures fault", to a random number in [0, 1).
     """
     choices = []
     for title, kind in _select_fault_kinds(draw_number).items():
@@ -106,7 +102,7 @@ def select_choices(draw_number: Callable[[str], float]) -> tuple[tuple[Choice, C
 def draw_figures(draw_number: Callable[[str], float]) -> bytes:
     """Simulate and plot the flights of a student's figures; return one PNG file.
 
-    ``draw_number`` is that of :func:`select_choices`.
+    ``draw_number`` converts a name to a random number in [0, 1).
     """
     comparisons = {}
     for title, kind in _select_fault_kinds(draw_number).items():
@@ -152,10 +148,7 @@ def _plot_figures(comparisons: Mapping[str, Comparison]) -> bytes:
 
 
 def _draw_errors(axes: style.Axes, result: AxisComparison, filter_name: FilterName) -> None:
-    """Plot the position error of a filter and ±2σ.
-
-    The background is grey while the vehicle flies in the positive aisle direction.
-    """
+    """Plot the position error of a filter and ±2σ."""
     name, truth = FILTER_NAMES[filter_name], result.truth
     errors = compute_position_errors(result, filter_name)
     axes.set_title(f"{name}: error along the aisle and ±2σ (m)")

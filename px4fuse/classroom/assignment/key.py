@@ -40,8 +40,7 @@ class CorrectAnswers(
     true_values : dict
         Parameters of the simulation that the log does not contain, for example ``sigma_z_m``.
     difficulty : float or None
-        Smallest size that px4fuse detects, divided by the size of the injected fault. A fault with
-        a larger difficulty is harder to detect.
+        Smallest size that px4fuse detects, divided by the size of the injected fault.
     """
 
     student_id: Annotated[str, Meta(max_length=1000, pattern=r"\S")]
@@ -63,8 +62,8 @@ class _AnswerKeySchema(msgspec.Struct, frozen=True):
 class AnswerKey(msgspec.Struct, frozen=True):
     """Right answers for all students of a class (JSON file of the instructor).
 
-    ``kind`` is the kind of flight: "aisle", "loop" or "mixed". ``secret`` is the seed of the
-    simulated flights; "" if the instructor keeps the secret in another file.
+    ``kind`` is the flight: "aisle", "loop" or "mixed". ``secret`` is the seed of the random
+    numbers.
     """
 
     kind: _Text
@@ -79,7 +78,7 @@ class AnswerKey(msgspec.Struct, frozen=True):
         return f"AnswerKey({self.kind!r}, {len(self.answers)} students)"
 
     def find_student_answers(self, student_id: str) -> CorrectAnswers | None:
-        """Return the right answers for a student, or None; the id may lack leading zeros."""
+        """Return the right answers for a student; None for an unknown student."""
         class_list = ClassList(Person(answer.student_id) for answer in self.answers)
         student_index = class_list.find_student_index(Person(student_id))
         return None if student_index is None else self.answers[student_index]

@@ -1,7 +1,6 @@
 """Random choice of a simulated flight with injected faults for each student.
 
-Random numbers are the HMAC (RFC 2104) of the student id with the instructor's secret as key.
-Students without the secret cannot predict them, and a second run gives the same flights.
+Random numbers are the HMAC (RFC 2104) of the student id, with the instructor's secret as key.
 """
 
 from __future__ import annotations
@@ -26,24 +25,18 @@ FlightKind = Literal["aisle", "loop", "mixed"]
 
 # Minimum length (characters) of the instructor's secret: a shorter secret can be guessed
 MIN_SECRET_LENGTH = 16
-# First part of each HMAC message, from which the flight of a student is computed. Do not change the
-# label: the flights would no longer agree with existing answer keys
+# Do not change this label: the flights would no longer agree with existing answer keys
 HMAC_LABEL = "px4fuse assignment 2"
-# Probabilities of 0, 1 and 2 injected faults in a flight. A loop has at most one fault, "open-end"
-# (landing far from the start). 40 % of the loops have no fault: otherwise students could guess the
-# fault
+# Probabilities of 0, 1 and 2 injected faults in a flight
 PROBABILITY_BY_FAULT_COUNT: dict[ScenarioKind, tuple[float, ...]] = {
     "aisle": (0.1, 0.5, 0.4),
     "loop": (0.4, 0.6),
 }
-# Probability of a loop if the kind of flight is "mixed"; the other flights are along an aisle
+# Probability of a loop if the kind of flight is "mixed"
 LOOP_PROBABILITY = 1 / 3
-# Range of the difficulty of an injected fault. The difficulty is the smallest size that px4fuse
-# detects, divided by the size in the flight. It is the inverse of this ratio if a fault with a
-# smaller size is easier to detect
+# Range of the difficulty: size that px4fuse detects, divided by the size of the injected fault
 EASIEST_DIFFICULTY, HARDEST_DIFFICULTY = 0.6, 1.0
-# Probability of faults with a difficulty above 1, and maximum difficulty of these faults. px4fuse
-# may not detect such faults, so students must find them without the findings of px4fuse
+# Probability and maximum difficulty of faults that px4fuse may not detect
 HARD_FAULTS_PROBABILITY, MAX_FAULT_DIFFICULTY = 0.25, 1.5
 
 
@@ -55,13 +48,9 @@ class AssignableFault(Record):
     name : str
         Name of the fault in ``px4fuse simulate --mistake``.
     group : str
-        Name of a group of faults. Faults of one group mask each other, so a flight has at most one
-        fault of each group.
+        Group of faults that mask each other; a flight has at most one of them.
     detection_limit : float or None
-        Size (in ``unit``) that px4fuse detects in 19 of 20 flights (tests/studies/rates.csv); None
-        for a fault without a size.
-    is_smaller_size_easier_to_detect : bool
-        True if a fault with a smaller size is easier to detect.
+        Size (in ``unit``) that px4fuse detects in 19 of 20 flights (tests/studies/rates.csv).
     has_either_sign : bool
         True if the sign of the size is random.
     fault_start_range_s : (float, float) or None
@@ -114,7 +103,7 @@ class AssignableFault(Record):
 class FlightRules(Record):
     """Possible faults and random parameters of one kind of simulated flight.
 
-    ``numbers`` gives (minimum, maximum, number of decimals) of each random field of the scenario.
+    ``numbers`` contains (minimum, maximum, decimals) of each random field of the scenario.
     """
 
     faults: tuple[AssignableFault, ...]
@@ -133,8 +122,7 @@ class AssignedFlight:
     mistake_options : tuple of str
         Injected faults, as values of ``px4fuse simulate --mistake``.
     difficulty : float
-        Difficulty of the fault that is hardest to detect: smallest size that px4fuse detects,
-        divided by the size in the flight. 1 without a fault.
+        Difficulty of the fault that is hardest to detect; 1 without a fault.
     """
 
     scenario: Scenario
@@ -173,8 +161,7 @@ def assign_random_flight(
     fault_count : int, optional
         Number of injected faults; random by default.
     with_ground_truth : bool
-        True to log the ground truth. The log of a loop never contains the ground truth, because
-        students have to estimate the landing place.
+        True to log the ground truth (flights along an aisle only).
 
     Raises
     ------
@@ -245,7 +232,7 @@ def derive_seed_from_secret(text: str, source_name: str) -> bytes:
     Raises
     ------
     SettingsError
-        The secret is shorter than MIN_SECRET_LENGTH; the message begins with ``source_name``.
+        The secret is shorter than MIN_SECRET_LENGTH characters.
     """
     secret = text.strip()
     if len(secret) < MIN_SECRET_LENGTH:
@@ -258,6 +245,6 @@ def derive_seed_from_secret(text: str, source_name: str) -> bytes:
 
 
 def derive_hmac_key(secret: str) -> bytes:
-    """Derive the key of the random generator from the secret; scrypt (RFC 7914) slows guessing."""
+    """Derive the HMAC key from the secret with scrypt (RFC 7914), which slows guessing."""
     text = secret.encode(errors="replace")
     return hashlib.scrypt(text, salt=HMAC_LABEL.encode(), n=2**14, r=8, p=1, dklen=32)

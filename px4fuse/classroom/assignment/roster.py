@@ -16,15 +16,14 @@ from px4fuse.errors import SettingsError
 
 MAX_NAME_LENGTH = 200
 MAX_STUDENTS = 1000
-# Maximum length (characters) of a file name without suffix: operating systems allow 255 bytes, and
-# a character has up to 4 bytes
+# Maximum length (characters) of a file name without suffix; operating systems allow 255 bytes
 MAX_STEM_LENGTH = 48
 # File names that Windows does not allow
 WINDOWS_RESERVED_NAMES = {"con", "prn", "aux", "nul"} | {
     f"{n}{i}" for n in ("com", "lpt") for i in range(10)
 }
 TITLES_BY_FIELD = read_toml(__file__, dict[str, tuple[str, ...]], "columns.toml")
-# Fields of a student that are copied from other tables if they are missing in the class list
+# Fields that are copied from other tables if the class list lacks them
 FIELDS_FROM_OTHER_TABLES = ("name", "email", "login", "submission_time", "extended_due")
 # Names in Canvas gradebooks that are not students ("Points Possible", "Student, Test")
 NON_STUDENT_ROW_NAMES = ("pointspossible", "studenttest")
@@ -41,9 +40,9 @@ class Person:
     numbers : dict
         Number that a learning platform uses for the student, by name of the platform.
     submission_time : str
-        Submission time, as text, if the table is a grading worksheet of Moodle.
+        Submission time (text) from a grading worksheet of Moodle.
     extended_due : str
-        Later due time, as text, that the instructor granted to this student; "" without it.
+        Later due time (text) that the instructor granted; "" without it.
     """
 
     student_id: str
@@ -99,8 +98,7 @@ def read_roster(path: Path) -> tuple[Person, ...]:
     Raises
     ------
     SettingsError
-        The file is not a table of students, an id cannot be used as a file name, or the number of
-        students is zero or above MAX_STUDENTS.
+        The file is not a valid table of 1 to MAX_STUDENTS students.
     """
     people = read_people(read_sheet(path))
     if not people or len(people) > MAX_STUDENTS:
@@ -149,7 +147,7 @@ def read_student(sheet: Sheet, row: Sequence[str]) -> Person | None:
 
 
 class ClassList:
-    """Students of a class. Their missing fields are copied from the tables ``other_lists``."""
+    """Students of a class; missing fields are copied from ``other_lists``."""
 
     def __init__(self, people: Iterable[Person] = (), *other_lists: Iterable[Person]) -> None:
         self.people = list(people)
@@ -168,9 +166,7 @@ class ClassList:
     def find_student_index(self, searched_person: Person) -> int | None:
         """Return the index of a person in ``people``; None for an unknown person.
 
-        The fields are compared in this order until exactly one student matches: number on the
-        learning platform, id, email, login, name. Ids may lack leading zeros, because spreadsheets
-        delete them.
+        The fields are compared in this order: platform number, id, email, login, name.
         """
         match_rules: tuple[tuple[Callable[[str, str], bool], Callable[[Person], str], str], ...] = (
             *(
@@ -218,7 +214,7 @@ def is_same_id(student_id: str, other_id: str) -> bool:
 
 
 def is_same_name(name: str, other_name: str) -> bool:
-    """Return True if two names have equal words, in any order or joined (as Canvas does).
+    """Return True if two names have equal words, in any order or joined.
 
     >>> is_same_name("Ada Lovelace", "Lovelace, Ada"), is_same_name("Ada Lovelace", "lovelaceada")
     (True, True)
@@ -255,7 +251,7 @@ def make_file_stem(student_id: str) -> str | None:
 
 
 def make_unique(names: Iterable[str], pattern: str = "{} ({})") -> list[str]:
-    """Append numbers to repeated names; names that differ only in case count as repeated.
+    """Append numbers to repeated names, ignoring case.
 
     >>> make_unique(["notes", "cover", "Notes"])
     ['notes', 'cover', 'Notes (2)']

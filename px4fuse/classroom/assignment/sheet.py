@@ -1,7 +1,6 @@
 """Reading and writing of CSV tables of learning platforms and instructors.
 
-The reader detects the encoding (UTF-8 with or without byte order mark, UTF-16, Windows-1252) and
-the separator. The writer uses the encoding and separator of the original file.
+The reader detects the encoding (UTF-8, UTF-16, Windows-1252) and the separator.
 """
 
 import codecs
@@ -22,7 +21,7 @@ COLUMN_SEPARATORS = ",;\t|"
 
 @dataclass(frozen=True)
 class Sheet:
-    """CSV table with a header (column titles); short rows are filled with empty cells."""
+    """CSV table with a header (column titles)."""
 
     path: Path
     column_titles: tuple[str, ...]

@@ -1,4 +1,4 @@
-"""Right answers to the questions that a student answers about a simulated flight."""
+"""Right answers to the questions about a simulated flight."""
 
 import math
 from collections.abc import Mapping
@@ -43,11 +43,9 @@ CLOSURE_TOLERANCE_M = 0.3
 MIN_REJECTED_FRACTION = 0.005
 # Minimum size (m) of an EKF2 position reset that the student must report
 MIN_RESET_M = 0.2
-# Position resets in this time (s) after the start of the flight are ignored, because EKF2 then
-# resets to the first position
+# Time (s) at the start in which position resets are ignored: EKF2 resets to its first position
 INITIAL_TIME_WITHOUT_RESETS_S = 5.0
-# For each behaviour of EKF2 in the answer form, such as "never fused": faults for which the student
-# must ("required") or may ("allowed") report this behaviour
+# Faults for which a student must ("required") or may ("allowed") report a behaviour of EKF2
 EKF2_BEHAVIOUR_RULES = read_toml(__file__, dict[str, dict[str, set[str]]], "did.toml")
 
 
@@ -57,7 +55,7 @@ class InjectedFault(Record):
     Attributes
     ----------
     size : float or None
-        True size, in the first unit that ``form.toml`` lists for the fault.
+        True size, in the first unit of the fault in ``form.toml``.
     low, high : float or None
         Smallest and largest size that is accepted as a right answer.
     from_s, until_s : float or None
@@ -73,7 +71,7 @@ class InjectedFault(Record):
 
 
 class CorrectVerdict(Record):
-    """Correct answer to the question if a filter is consistent.
+    """Correct answer about the consistency of a filter.
 
     Attributes
     ----------
@@ -165,8 +163,7 @@ def _make_injected_fault(
         tolerance = CLOSURE_TOLERANCE_M
     low, high = size - tolerance, size + tolerance
     if name == "clock-offset":
-        # px4fuse estimates the correction, which has the opposite sign of the offset. Offsets in
-        # the 95 % interval of the estimate are also right
+        # the estimated correction has the opposite sign of the time offset
         _, time_offset = estimate_noises_and_clock(comparison)
         if isinstance(time_offset, ClockOffset) and time_offset.is_determinable:
             low, high = min(low, -time_offset.interval_s[1]), max(high, -time_offset.interval_s[0])
@@ -195,7 +192,7 @@ def _make_correct_verdict(comparison: Comparison, filter_name: FilterName) -> Co
 def _find_ekf2_behaviours(
     comparison: Comparison, faults: tuple[InjectedFault, ...], sigma_z_m: float
 ) -> tuple[tuple[str, ...], tuple[str, ...]]:
-    """Return the behaviours of EKF2 that the student must report, and further allowed ones."""
+    """Return the behaviours of EKF2 that a student must report, and those a student may report."""
     fault_size_by_kind = {fault.kind: fault.size or 0.0 for fault in faults}
     required_behaviours, allowed_behaviours = (
         [
@@ -220,7 +217,7 @@ def _find_ekf2_behaviours(
         is_large_reset = reset.quantity == "position" and math.hypot(*reset.delta[:2]) > MIN_RESET_M
         if is_large_reset and reset.time_s > resets_count_from_s:
             required_behaviours.append("dead-reckoned, then reset")
-    # EKF2 cannot follow positions that it never fuses, so the other behaviours are only allowed
+    # if EKF2 never fuses positions, its other behaviours need not be reported
     if "never fused" in required_behaviours:
         allowed_behaviours = [*required_behaviours, *allowed_behaviours]
         required_behaviours = ["never fused"]
@@ -236,10 +233,7 @@ def _find_ekf2_behaviours(
 def compute_numeric_answer(
     axis_comparison: AxisComparison, question: FormQuestion
 ) -> float | tuple[float, ...] | None:
-    """Run KF to compute the right answer to a question; None with too few measurements.
-
-    For the kind "prediction", the answer is the position σ (m) after a prediction without updates.
-    """
+    """Run KF to compute the right answer to a question; None with too few measurements."""
     settings = Settings(question.sigma_a_m_s2, question.sigma_z_m)
     kf_replay = replay(axis_comparison.axis, settings)
     updates = kf_replay.updates.iloc[question.update_number - 1 :]

@@ -1,7 +1,4 @@
-"""Checks that give points to a student's report; ``rubric.toml`` explains them.
-
-The fields of each class are the parameters of the check.
-"""
+"""Rubric checks that give points to a student's report."""
 
 from __future__ import annotations
 
@@ -56,20 +53,16 @@ ScoreAndReason = tuple[float, str]
 class RubricItem(
     msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True, tag_field="check"
 ):
-    """Item of the rubric (the instructor's list of checks); each subclass is one type of check.
+    """Item of the rubric, the instructor's list of checks.
 
     Attributes
     ----------
     points : float
         Maximum points.
     report : {"any", "compare", "loop"}
-        px4fuse command whose reports the instructor wants to score with this item.
+        Command whose reports the instructor wants to score.
     command : {"any", "compare", "loop"}
-        px4fuse command whose reports contain the data for this type of check.
-    needs_answer_key : bool
-        True if the check requires an answer key.
-    is_scored_by_instructor : bool
-        True if the instructor enters the points.
+        Command whose reports contain the required data.
     """
 
     command: ClassVar[str] = "any"
@@ -85,7 +78,7 @@ class RubricItem(
         raise NotImplementedError
 
     def is_applicable(self, command_name: str, key: AnswerKey | None) -> bool:
-        """Return True if the item scores reports of the command, with or without answer key."""
+        """Return True if the item can score reports of a px4fuse command."""
         has_required_key = key is not None or not self.needs_answer_key
         return has_required_key and {self.report, self.command} <= {"any", command_name}
 
@@ -190,7 +183,7 @@ class ScoringInput:
         return any(finding.id in ids for finding in self.results.findings)
 
     def find_missing_reason(self, path: str) -> str:
-        """Return the reason (in brackets) why the results do not contain a value, or ""."""
+        """Return the reason for a value missing in the results, in brackets; "" if unknown."""
         parent_path = path
         while parent_path:
             for _, reason in find_values(self.values, f"{parent_path}.reason"):
@@ -238,8 +231,7 @@ class VerificationItem(RubricItem, frozen=True, tag="verified"):
 class NumberItem(RubricItem, frozen=True, tag="number"):
     """Check that a number of the report is between ``at_least`` and ``at_most``.
 
-    Outside these bounds, the points decrease linearly to zero at the value ``zero_at``. If ``path``
-    matches several numbers, the lowest score counts.
+    Outside these bounds, the points decrease linearly to zero at the value ``zero_at``.
     """
 
     path: Text
@@ -338,8 +330,7 @@ NOISE_SETTINGS: dict[NoiseSettingName, tuple[str, str, str]] = {
 class TuningItem(RubricItem, frozen=True, tag="tuning", rename={"factor_at_zero_points": "factor"}):
     """Check that SIGMA_A or SIGMA_Z is within the 95 % interval of its estimate.
 
-    Outside the interval, the points decrease to zero at ``factor_at_zero_points`` times the upper
-    bound, and at the lower bound divided by this factor.
+    Outside the interval, the points decrease to zero at a deviation of ``factor_at_zero_points``.
     """
 
     command: ClassVar[str] = "compare"
@@ -360,8 +351,7 @@ class TuningItem(RubricItem, frozen=True, tag="tuning", rename={"factor_at_zero_
             return 0.0, f"Your report has no 95 % interval for {label}{reason_text}."
         lower_bound, upper_bound = interval
         if label == "SIGMA_Z" and scoring_input.has_finding("source_may_drift", "source_drift"):
-            # SIGMA_Z is estimated from innovations, which do not contain the drift of the source.
-            # Larger values, up to the position error, are also right
+            # Larger values are also right: innovations do not contain the drift of the source
             upper_bound = max(upper_bound, _find_max_position_error_m(comparison))
         deviation_factor = max(
             chosen_value / upper_bound if upper_bound > 0.0 else math.inf,
@@ -395,9 +385,7 @@ class ConsistencyItem(
 ):
     """Check that KF is consistent, by the mean NIS of north and east together.
 
-    The points decrease to zero if the reported σ is ``factor_at_zero_points`` times too small or
-    too large. A report with SIGMA_A and SIGMA_Z within the 95 % intervals of their estimates gets
-    all points.
+    The points decrease to zero if the reported σ is wrong by ``factor_at_zero_points``.
     """
 
     command: ClassVar[str] = "compare"
@@ -438,7 +426,7 @@ class TimeOffsetItem(RubricItem, frozen=True, tag="clock"):
     margin_s : float
         Maximum distance (s) of the applied time offset from the 95 % interval of the estimate.
     undeterminable : float
-        Fraction of the points if the time offset cannot be estimated, or changes in flight.
+        Fraction of the points if the time offset cannot be estimated or changes.
     """
 
     command: ClassVar[str] = "compare"
@@ -488,9 +476,9 @@ CORRECTED_PATH_NAMES: tuple[CorrectionName, ...] = (
 class LoopItem(RubricItem, frozen=True, tag="loop"):
     """Score the analysis of a loop.
 
-    1/4 of the points for a loop closure error, 1/2 for an accepted loop closure, and all points for
-    a corrected path. If the vehicle landed far from its start, all points for a report without
-    accepted loop closure.
+    - 1/4 of the points for a loop closure error.
+    - 1/2 of the points for an accepted loop closure.
+    - All points for a corrected path.
     """
 
     def score(self, scoring_input: ScoringInput) -> ScoreAndReason:

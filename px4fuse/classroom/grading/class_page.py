@@ -70,7 +70,7 @@ def format_class_page(grades: Sequence[Grade], title: str, version_text: str) ->
 
 
 def _format_statistics(grades: Sequence[Grade], count_by_tag: Mapping[str, int]) -> str:
-    """Format the statistics of the class: number of reports by status, and histograms of points."""
+    """Format the statistics of the class: reports by status, and histograms of points."""
     total_points = [grade.total for grade in grades if grade.total is not None]
     max_points = max((grade.max_points for grade in grades if grade.max_points > 0.0), default=1.0)
     reports = counted_reports(grades)
@@ -136,7 +136,7 @@ def _make_grade_row(grade: Grade, item_titles: Sequence[str], number_titles: Seq
         *(frame.make_number_cell(points_by_title.get(title)) for title in item_titles),
         *(frame.make_number_cell(report_numbers.get(title)) for title in number_titles),
     )
-    # the points of an anonymous student cannot be entered: overrides.csv needs the id or the file
+    # overrides.csv needs an id or a file name, which an anonymous student lacks
     points_inputs = (_make_points_inputs(grade),) if grade.student_id or grade.file_name else ()
     links = (
         [("Report redrawn from the log (PDF)", make_relative_url(report.redrawn_report_path))]
@@ -152,7 +152,7 @@ def _make_grade_row(grade: Grade, item_titles: Sequence[str], number_titles: Seq
 
 
 def _make_grade_details(grade: Grade) -> Iterator[RowDetailsSection]:
-    """Yield the details of a student, which the web page shows after a click on the row."""
+    """Yield the details of a student for the web page."""
     report, comment = grade.counted_report, frame.make_prose_section("Your comment", grade.comment)
     if report is None:
         yield frame.make_list_section("Missing", ["No submission."])
@@ -238,7 +238,7 @@ def _make_points_inputs(grade: Grade) -> RowDetailsSection:
         (title, max_points_by_title[title], override.points, override.comment)
         for title, override in override_by_title.items()
     ]
-    # the page writes a complete overrides.csv, also with the points that have no input box
+    # the page writes a complete overrides.csv, also with points that have no input box
     rows_without_input_box = [
         (title, override.points, override.comment)
         for title, override in grade.overrides.items()

@@ -56,8 +56,7 @@ GERMAN_MONTHS = ("jan", "feb", "mär", "apr", "mai", "jun", "jul", "aug", "sep",
 class LateRule:
     """Deduction of points for late submissions.
 
-    For each started day or hour (``lateness_unit_s``), the fraction ``deduction_per_unit`` of the
-    maximum points is deducted, but at most ``max_deduction_fraction``.
+    Each started day or hour costs the fraction ``deduction_per_unit`` of the maximum points.
     """
 
     deduction_per_unit: float
@@ -89,11 +88,11 @@ class Course:
     logs : sequence of Path
         Flight logs, and folders of logs.
     roster : tuple of Person or None
-        Class list; None to use the students in the answer key or in the first worksheet.
+        Class list; None for the students of the answer key or first worksheet.
     worksheets : tuple of Sheet
         Tables of learning platforms, into which the grades are entered.
     column : str
-        Title of the grade column in the worksheets; "" if each worksheet has only one.
+        Title of the grade column in the worksheets.
     attempt : {"latest", "best", "first"}
         Report that counts if a student submitted several.
     due : datetime or None
@@ -136,8 +135,7 @@ class Course:
         return ClassList(people, *people_by_sheet)
 
 
-# Report that may count for the grade of a student: UNIX times of submission and zip entry (for
-# sorting), the report, and the grade of the student if this report counts
+# UNIX times of submission and zip entry, report, and grade if this report counts
 CandidateReport = tuple[tuple[float, float], GradedReport, Grade]
 
 
@@ -149,9 +147,6 @@ def build_grades(
 ) -> tuple[tuple[Grade, ...], tuple[str, ...]]:
     """Assign the reports to students, and compute the grade of each student.
 
-    The learning platform identifies the student, or else the id or the name in the report. Without
-    a class list, the students in reports and on platforms are the class.
-
     Parameters
     ----------
     reports, submissions : sequences
@@ -162,7 +157,7 @@ def build_grades(
     grades : tuple of Grade
         Grades of all students, then of reports of unknown students.
     notes : tuple of str
-        Sentences about points in ``overrides.csv`` without a matching student or item.
+        Sentences about missing times, and about points without a matching student or item.
     """
     has_class_list = bool(course.class_list.people)
     class_list = course.class_list if has_class_list else _collect_students(reports, submissions)
@@ -302,8 +297,7 @@ def _compute_points_after_deduction(candidate: CandidateReport) -> float:
 
 
 def _choose_counted_report(candidates: Sequence[CandidateReport], course: Course) -> Grade:
-    """Choose the report of a student that counts; add flags if the choice is ambiguous."""
-    # sort by time, and reports with the same time by points
+    """Choose the report that counts for a student's grade."""
     sorted_candidates = sorted(
         candidates,
         key=lambda candidate: (
@@ -312,7 +306,7 @@ def _choose_counted_report(candidates: Sequence[CandidateReport], course: Course
             candidate[1].submission,
         ),
     )
-    # prefer reports whose points need no decision of the instructor, then readable reports
+    # prefer reports without open decisions of the instructor
     readable_candidates = [candidate for candidate in sorted_candidates if candidate[1].version]
     final_candidates = [
         candidate for candidate in readable_candidates if not candidate[1].instructor_action
@@ -320,7 +314,7 @@ def _choose_counted_report(candidates: Sequence[CandidateReport], course: Course
     eligible_candidates = final_candidates or readable_candidates or sorted_candidates
     chosen_sort_key, chosen_report, grade = {
         "latest": eligible_candidates[-1],
-        # last of the reports with the earliest time, because the last has the most points
+        # of reports with the same time, the last has the most points
         "first": [
             candidate
             for candidate in eligible_candidates
@@ -413,8 +407,7 @@ def _apply_item_override(item: ItemScore, override: GradeOverride | None) -> Ite
 def read_overrides(path: Path) -> OverridesByStudent:
     """Read the instructor's points and comments from ``overrides.csv``, if the file exists.
 
-    Columns: id (as in class.csv, or the file name of the report), item (a title of the rubric,
-    "total", or empty for a comment on the whole report), points, comment.
+    Columns: id, item (rubric title, "total" or empty), points, comment.
 
     Raises
     ------
@@ -479,7 +472,7 @@ def match_overrides(
     class_list = ClassList(Person(grade.student_id, login=grade.file_name) for grade in grades)
     notes = []
     for student, override_by_item in overrides.items():
-        # the instructor may type an id, with or without leading zeros, or a file name
+        # the instructor may type an id or a file name
         student_index = class_list.find_student_index(Person(student, login=student))
         student_text = one_line(student, 40) or "(empty)"
         if student_index is None:
@@ -532,7 +525,6 @@ def parse_due_time(
     """Parse a due time: ``2026-11-20 23:59``, optionally with ``+01:00`` or ``Europe/Berlin``.
 
     A date without a time means the end of the day. The default time zone is that of this computer.
-    ``name`` is the option, for error messages.
 
     Raises
     ------

@@ -1,7 +1,6 @@
 """Sentences ("flags") for the instructor about suspicious reports, without effect on points.
 
-A flag does not prove a copy: two students may have the same flight, and students who follow the
-advice of px4fuse get the same settings.
+A flag does not prove a copy.
 """
 
 from collections import defaultdict
@@ -25,10 +24,9 @@ MIN_EQUAL_NUMBERS_OF_A_COPY = 3
 MIN_ANSWERED_CHOICES = 6
 # Maximum relative difference of numbers that count as equal: a copy may have small changes
 SAME_NUMBER_RELATIVE_TOLERANCE = 0.02
-# Minimum fraction of the log that a report must analyse (--start, --end): else it is flagged
+# Minimum fraction of the log that a report must analyse
 MIN_ANALYSED_LOG_FRACTION = 0.5
-# A report is flagged if --drift or --heading-drift is above the default times this ratio, or below
-# the default divided by this ratio
+# A report is flagged if --drift or --heading-drift differs from its default by this factor
 MAX_DRIFT_TO_DEFAULT_RATIO = 4.0
 MAX_LISTED_REPORTS = 4
 # Pairs of reports with equal contents
@@ -50,7 +48,7 @@ def flag_page_differences(verification: Verification) -> Iterator[str]:
 def flag_settings(results: ReportedResults, has_key: bool = False) -> Iterator[str]:
     """Yield sentences about unusual settings of a report.
 
-    ``has_key`` is True if the instructor handed out simulated logs, with an answer key.
+    ``has_key`` is True if the instructor handed out simulated logs.
     """
     if isinstance(results, LoopResults):
         yield from _flag_drift(results.request)
@@ -119,11 +117,7 @@ def _collect_form_numbers(report: GradedReport) -> dict[tuple[str, str], float]:
 
 
 def _count_same_numbers(numbers: Mapping[Any, float], other_numbers: Mapping[Any, float]) -> int:
-    """Count the equal numbers of two students. Numbers with one digit may be equal by chance.
-
-    Numbers are equal within SAME_NUMBER_RELATIVE_TOLERANCE. Values of corrections, and lists, must
-    be exactly equal. Numbers with one digit are not counted.
-    """
+    """Count the equal numbers of two students, except numbers with one digit."""
     return sum(
         _count_digits(number) > 1
         and abs(number - other_numbers[key])
@@ -137,9 +131,7 @@ def _identify_student(report: GradedReport) -> str:
     return normalise_text(report.student_id) or normalise_text(report.student) or report.submission
 
 
-# Checks for equal contents of two reports: sentence for the instructor, function that returns the
-# compared content, and function whose results must differ for the two reports (for example, two
-# reports of one student are not compared)
+# Sentence for the instructor, compared content of two reports, and content that must differ
 EQUAL_CONTENT_CHECKS: tuple[
     tuple[str, Callable[[GradedReport], object], Callable[[GradedReport], str]], ...
 ] = (

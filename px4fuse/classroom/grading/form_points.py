@@ -1,9 +1,6 @@
 """Points (0 to 100) for a student's answers about a flight, by comparison with the answer key.
 
-The constants in this file reproduce points that an instructor gave by hand. A score is a fraction
-of the points. To discourage guesses, each false fault (named by the student, but not in the
-flight) costs points, and a fault that can be guessed without a measurement gives points only with
-the correct size.
+The constants reproduce points that an instructor gave by hand. A score is a fraction of the points.
 """
 
 import math
@@ -28,32 +25,26 @@ from px4fuse.results.answer_form import (
     select_questions,
 )
 
-# Fraction of the points for questions about the flight; the rest is for questions about figures.
-# Small, because px4fuse itself can answer the questions about the flight
+# Fraction of the points for questions about the flight; the rest is for questions about figures
 FLIGHT_QUESTIONS_POINTS_FRACTION = 0.2
 # Points deducted for each false fault
 FALSE_FAULT_DEDUCTION = 10.0
-# From this number of false faults, the named faults give no points, because the student guessed
+# Number of false faults (guesses) at which the named faults give no points
 ZERO_POINTS_FALSE_FAULT_COUNT = 3
 # Score for the answer that names a fault similar to the injected fault
 SCORE_FOR_SIMILAR_FAULT = 0.4
-# Score for the answer ekf2-noise (wrong EKF2_EVP_NOISE) if the injected fault is r-scale (wrong
-# reported variance). Both faults make R of EKF2 wrong
+# Score for naming a wrong EKF2_EVP_NOISE if the reported variance is wrong: both make R wrong
 SCORE_FOR_WRONG_NOISE_PARAMETER = 2.0 / 3.0
-# Score for the answer that names a consequence of the injected fault, for example outliers after a
-# jump
+# Score for naming a consequence of the injected fault, for example outliers after a jump
 SCORE_FOR_NAMED_CONSEQUENCE = 0.15
 # Kinds of injected faults that can be guessed without a measurement
 GUESSABLE_FAULT_KINDS = frozenset(("open-end",))
-# The size of a guessable fault gives no points if its relative error exceeds the tolerance by this
-# fraction; within this fraction, the points decrease linearly. The fraction is small, because the
-# sizes in the flights of different students are similar
+# Relative size error beyond the tolerance at which a guessable fault gives no points
 EXCESS_SIZE_ERROR_AT_ZERO_POINTS = 0.08
 NO_BOUNDS = (-math.inf, math.inf)
 # Minimum tolerance (s) of the start and the end of an injected fault
 FAULT_TIME_TOLERANCE_S = 2.0
-# Tolerance of the start and the end of an injected fault, as a fraction of the time from the first
-# data to the start or end
+# Tolerance of the start and the end of a fault, as a fraction of the time since the first data
 FAULT_TIME_TOLERANCE_FRACTION = 0.05
 # Maximum relative error of a number that the student computed, for full points
 MAX_NUMBER_ERROR_FULL_POINTS = 0.02
@@ -71,8 +62,7 @@ class _CorrectionRule(NamedTuple):
     score_by_fault_kind : mapping
         Score of an answer that names the parameter as correction, by kind of injected fault.
     right_value_range : (float, float) or str
-        Smallest and largest right value of the parameter, or the name of a range that
-        :func:`find_accepted_corrections` computes from the injected fault.
+        Smallest and largest right value, or the name of a computed range.
     """
 
     parameter: str
@@ -119,7 +109,7 @@ def compute_form_points(answers: Answers, right_answers: CorrectFormAnswers) -> 
     if right_answers.mistakes and len(false_faults) < ZERO_POINTS_FALSE_FAULT_COUNT:
         scores |= _score_faults(matches, right_answers)
     scores["numbers"] = numbers_score = _score_numbers(answers, right_answers)
-    # the verdicts can be guessed: without a right number, they give only half of their points
+    # verdicts can be guessed, so they give half of the points without a right number
     can_verdicts_be_guessed = not numbers_score and not has_recognised_fault_free_flight
     scores["verdicts"] = _score_verdicts(answers, right_answers) * (
         0.5 if can_verdicts_be_guessed else 1.0
@@ -128,7 +118,7 @@ def compute_form_points(answers: Answers, right_answers: CorrectFormAnswers) -> 
     if has_recognised_fault_free_flight:
         points_by_form_part["mistakes"] = weights["mistakes"]
     elif right_answers.mistakes and all(fault.size is None for fault in right_answers.mistakes):
-        # If no injected fault has a size, naming the faults also gives the points for sizes
+        # without fault sizes, naming the faults also gives the points for sizes
         points_by_form_part["mistakes"] += weights["sizes"] * scores["mistakes"]
     points_by_form_part["mistakes"] -= FALSE_FAULT_DEDUCTION * len(false_faults)
     points_by_form_part["mistakes"] = max(points_by_form_part["mistakes"], 0.0)
@@ -158,7 +148,7 @@ def compute_form_points(answers: Answers, right_answers: CorrectFormAnswers) -> 
     return FormPoints(parts, feedback, did_student_name_fault)
 
 
-# Injected fault, fault that the student named for it (or None), and score
+# Injected fault, matching fault that the student named (or None), and score (0 to 1)
 FaultMatch = tuple[InjectedFault, NamedFault | None, float]
 
 
@@ -289,13 +279,7 @@ def _score_faults(matches: list[FaultMatch], right_answers: CorrectFormAnswers) 
 
 
 def score_fault_size(fault: InjectedFault, named_fault: NamedFault) -> float:
-    """Return the score for the size that the student states for a fault.
-
-    - 1: the size is within the tolerance.
-    - 1/2: the relative error is at most MAX_SIZE_ERROR_HALF_POINTS.
-    - 1/3: only the sign is wrong, or the size is right but the student named another fault.
-    - Faults in GUESSABLE_FAULT_KINDS: outside the tolerance, the score decreases to 0.
-    """
+    """Return the score (0 to 1) for the size that the student states for a fault."""
     stated_size = named_fault.convert_size_to_standard_unit()
     if fault.size is None or fault.low is None or fault.high is None or stated_size is None:
         return 0.0
@@ -342,7 +326,7 @@ def find_panels_showing_fault(fault_kind: str) -> list[str]:
 def score_correction(
     fault: InjectedFault, named_fault: NamedFault, right_answers: CorrectFormAnswers
 ) -> float:
-    """Return the score for the parameter that corrects a fault, and for the parameter's value."""
+    """Return the score (0 to 1) for the parameter and the value that correct a fault."""
     stated_value = named_fault.convert_value_to_standard_unit()
     scores = [
         score

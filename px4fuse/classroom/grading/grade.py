@@ -31,7 +31,7 @@ class GradeOutcome:
     Attributes
     ----------
     grades : tuple of Grade
-        Grades: students of the class list, then unknown students.
+        Grades of the students in the class list, then of unknown students.
     notes : tuple of str
         Sentences about ignored input, and grades that could not be entered.
     reused_count : int

@@ -20,10 +20,9 @@ class ItemStatistics:
     Attributes
     ----------
     point_fractions : tuple of float
-        Points of each report divided by the maximum; for a fault, 1 if the student found the fault.
+        Points of each report, divided by the maximum points.
     discrimination : float or None
-        Correlation between the points for this item and the points for all other items. The item
-        does not distinguish good students if the value is near or below 0.
+        Correlation between the points for this item and for all other items.
     """
 
     title: str
@@ -44,10 +43,7 @@ class ItemStatistics:
 
 
 def analyse_items(reports: Sequence[GradedReport]) -> list[ItemStatistics]:
-    """Compute points and discrimination of each rubric item, part of the answer form, and fault.
-
-    Reports that need a decision of the instructor and items without points are omitted.
-    """
+    """Compute points and discrimination of each rubric item, part of the answer form, and fault."""
     scores_by_item: dict[tuple[int, str], list[tuple[float, float, float]]] = defaultdict(list)
     for report in reports:
         if report.instructor_action:

@@ -24,15 +24,13 @@ class ExportOrigin:
     platform : str
         Name of the learning platform; "" if no platform wrote the file name.
     person : Person
-        Student, with the number of the participant (Moodle), the user (Canvas, ILIAS) or the
-        submission (Gradescope).
+        Student, with the number that the platform uses.
     time : datetime or None
         Submission time; without time zone if the platform omits it.
     is_late : bool
         True if the platform marks the file as late.
     has_forged_platform_name : bool
-        True if the part of the file name that the student chose looks like the name of a file
-        from a platform.
+        True if the student's own file name imitates that of a platform.
     """
 
     platform: str = ""
@@ -58,7 +56,7 @@ class Submission:
     name : str
         Unique, shortened name for messages.
     time : datetime or None
-        Time of the zip entry, in an unknown time zone. It may be the time of the download.
+        Time of the zip entry, in an unknown time zone.
     """
 
     file: Path
@@ -108,7 +106,7 @@ class GradedReport:
     form_part_scores : tuple of ItemScore
         Points for each part of ``form``, 100 points in total.
     redrawn_report_path : str
-        Relative path of the PDF that px4fuse draws from the log for comparison.
+        Relative path of the report (PDF) that px4fuse draws from the log.
     """
 
     submission: str
@@ -135,7 +133,7 @@ class GradedReport:
 
     @property
     def points(self) -> float:
-        """Sum of the points of all rubric items, even if the instructor has not confirmed them."""
+        """Sum of the points of all rubric items, confirmed or not."""
         return sum(item.points for item in self.items)
 
     @property

@@ -1,18 +1,11 @@
 """Output files of grading: points of the class, feedback, and tables for learning platforms.
 
-px4fuse enters grades into copies of the tables that learning platforms export, and feedback if a
-table has a feedback column. All other cells stay unchanged. The row of a student without a grade is
-not changed: platforms delete a grade if the cell is empty, and read 0 as a grade.
+px4fuse enters grades into copies of the tables that learning platforms export. The row of a student
+without a grade stays unchanged, because platforms delete a grade if the cell is empty.
 
-- Moodle: "Using Assignment", Offline grading worksheet, docs.moodle.org.
-  ``mod/assign/feedback/offline/importgradeslib.php`` finds "Identifier" ("Participant 12"), "Grade"
-  and "Last modified (grade)" by their titles, reads "Feedback comments" as HTML, ignores grades
-  above "Maximum Grade", and reads numbers in the language of the site.
-- Canvas: "How do I import grades in the Gradebook?", Instructor Guide: the exported gradebook, with
-  Student, ID, SIS User ID, SIS Login ID, Section, and ``Title (12345)`` for an assignment. Columns
-  marked "(read only)" in the row "Points Possible" are ignored.
-- Other platforms: a table with a column of ids, logins, emails or names, and a grade column with
-  the title of ``--column`` or one of :data:`GRADE_COLUMN_TITLES`.
+- Moodle: "Using Assignment", Offline grading worksheet, docs.moodle.org, and
+  ``mod/assign/feedback/offline/importgradeslib.php``.
+- Canvas: "How do I import grades in the Gradebook?", Instructor Guide.
 """
 
 import html
@@ -166,14 +159,14 @@ def write_grading_files(
 
 
 def _identify_student(grade: Grade, use_file_stem: bool = False) -> str:
-    """Return the id of a student; without an id, the name or the name of the submitted file."""
+    """Return the id of a student; without an id, the name or the file name."""
     return grade.student_id or (
         Path(grade.file_name).stem if use_file_stem else grade.student or grade.file_name
     )
 
 
 def _copy_redrawn_report(grade: Grade, stem: str, output: Path) -> Grade:
-    """Copy redrawn report and diagnosis (STEM.pdf); return the grade with the report's path."""
+    """Copy the redrawn report and the diagnosis (PDF) to the output folder."""
     report = grade.counted_report
     if report is None or not report.sha256:
         return grade
@@ -193,8 +186,7 @@ def _copy_redrawn_report(grade: Grade, stem: str, output: Path) -> Grade:
 def _anonymise_grades(grades: Sequence[Grade], path: Path) -> tuple[list[Grade], str]:
     """Replace names by pseudonyms, and sort by pseudonym.
 
-    Return the anonymous grades and a CSV table of the pseudonyms. Pseudonyms in an existing table
-    at ``path`` are kept.
+    Return the anonymous grades and a CSV table of the pseudonyms.
     """
     pseudonym_and_name_by_identity: dict[str, tuple[str, str]] = {}
     if path.exists():
@@ -347,8 +339,7 @@ def _wrap_text(text: str, indent: str = "") -> str:
 def find_grade_column(sheet: Sheet, column_title: str) -> int:
     """Return the index of the grade column in a table of a learning platform.
 
-    ``column_title`` is "" if the table has only one grade column. In a Canvas gradebook, the title
-    "Lab 3" also matches the column "Lab 3 (12345)".
+    ``column_title`` is "" if the table has only one grade column.
 
     Raises
     ------
@@ -373,8 +364,7 @@ def find_grade_column(sheet: Sheet, column_title: str) -> int:
         if normalise_text(column_title) in map(normalise_text, (title, short_title_by_index[index]))
     ]
     candidate_indices = assignment_indices if grade_column_index is None else [grade_column_index]
-    # A Moodle table has only one grade column. If --column is not the title of this column, the
-    # user gave --column for another table
+    # a Moodle table has one grade column, so another --column is for another table
     if column_title and (matching_indices or sheet.find_column_index(("identifier",)) is None):
         candidate_indices = matching_indices
     if len(candidate_indices) == 1:

@@ -24,7 +24,7 @@ from px4fuse.verification.verification import log_sha256, recompute_report, veri
 
 # Subfolder of the output folder for the cached results
 RECORDS_FOLDER = "records"
-# Suffix of the report that px4fuse draws from the log, to be compared with the submitted PDF
+# Suffix of the report that px4fuse draws from the log
 REDRAWN_REPORT_SUFFIX = ".pdf"
 # Suffix of the report with the faults that px4fuse found, as feedback for the student
 DIAGNOSIS_SUFFIX = ".diagnosis.pdf"
@@ -37,8 +37,7 @@ class VerificationRecord:
     Attributes
     ----------
     versions_and_files : dict
-        Versions of libraries, and availability of input files by SHA-256. The result is valid while
-        they are unchanged.
+        Versions of libraries, and availability of input files by SHA-256.
     results : str
         Results (JSON) that are attached to the PDF.
     """
@@ -70,8 +69,7 @@ def load_or_verify(
     Returns
     -------
     results : ComparisonResults or LoopResults
-        Results attached to the PDF. For a verified report on a log in the answer key, the results
-        contain the faults that px4fuse found.
+        Results of the report.
     verification : Verification
     is_loaded : bool
         True if an earlier result was loaded.
@@ -88,8 +86,7 @@ def load_or_verify(
     versions_and_files = _collect_versions_and_files(
         to_json(results), path_by_sha256, assigned_hashes
     )
-    # The log was assigned to a student, but is missing in --logs. Verification without any log
-    # gives the status "cannot verify" instead of "other log"
+    # without logs, the status is "cannot verify" instead of "other log"
     is_log_missing = versions_and_files.get(log_sha256(results)) == "assigned"
     verification = verify(results, pdf, {} if is_log_missing else path_by_sha256)
     files = {REDRAWN_REPORT_SUFFIX: verification.redrawn_pdf} if verification.redrawn_pdf else {}
@@ -98,8 +95,7 @@ def load_or_verify(
     stored_verification = replace(verification, redrawn_pdf=b"")
     record = VerificationRecord(versions_and_files, to_json(results), stored_verification)
     for old_file in records_folder.glob(f"{sha256}.*"):
-        # keep the JSON file until write_output_files replaces it: another process may read it now,
-        # if two students handed in the same PDF
+        # keep the JSON file: another process may read it if two students handed in the same PDF
         if old_file.suffix != ".json":
             old_file.unlink(missing_ok=True)
     files[".json"] = msgspec.json.encode(record)
@@ -130,10 +126,7 @@ def repeat_analysis_with_diagnosis(
 def _collect_versions_and_files(
     results: str, path_by_sha256: Mapping[str, Path], assigned_hashes: frozenset[str]
 ) -> dict[str, str]:
-    """Return the versions of libraries, and for each input file of the results, if it is available.
-
-    A cached verification is valid while these values do not change.
-    """
+    """Return the versions of libraries, and the availability of input files by SHA-256."""
     return _read_versions() | {
         sha256: "available"
         if sha256 in path_by_sha256
@@ -156,7 +149,7 @@ def _load_record(
     path_by_sha256: Mapping[str, Path],
     assigned_hashes: frozenset[str],
 ) -> tuple[ReportedResults, Verification] | None:
-    """Load an earlier result; None without a result, or after a change of libraries or files."""
+    """Load the result of an earlier verification; None without a valid result."""
     try:
         record = msgspec.json.decode(
             (records_folder / f"{sha256}.json").read_bytes(), type=VerificationRecord
@@ -166,7 +159,7 @@ def _load_record(
         ):
             return None
         results = read_results(record.results.encode())
-    # an unreadable result is ignored, and the report is verified again
+    # the report is verified again if the earlier result is unreadable
     except (OSError, msgspec.MsgspecError, ResultsError):
         return None
     return (results, record.verification) if isinstance(results, ReportedResults) else None

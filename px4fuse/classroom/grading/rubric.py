@@ -53,8 +53,7 @@ if TYPE_CHECKING:
 else:
     # union of all subclasses; the field "check" in the TOML file selects the subclass
     AnyRubricItem = Union[tuple(RubricItem.__subclasses__())]  # noqa: UP007
-# Rule for the points of a report. "pending": they do not count until the instructor decides;
-# "zero": no points; "count": they count
+# Rule for the points of a report; "pending" points need a decision of the instructor
 PointsRule = Literal["pending", "zero", "count"]
 
 
@@ -64,12 +63,11 @@ class Rubric(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=Tr
     Attributes
     ----------
     unverified : {"pending", "zero"}
-        Points of a report that could not be verified: they wait for a decision of the instructor
-        ("pending"), or the report gets no points ("zero").
+        Rule for a report that could not be verified.
     others_log : {"pending", "zero", "count"}
-        Points of a report on the log of another student; with "count", they count.
+        Rule for a report on the log of another student.
     pages : {"count", "pending", "zero"}
-        Points of a report whose numbers are verified, but whose pages were changed.
+        Rule for a report with verified numbers, but changed pages.
     """
 
     title: Text = ""
@@ -99,7 +97,7 @@ def read_rubric(path: Path | None) -> Rubric:
     Raises
     ------
     SettingsError
-        The file cannot be read or is not a rubric; the message names the item and the field.
+        The file cannot be read or is not a rubric.
     """
     if path is None:
         return parse_rubric(rubric_text(), DEFAULT_RUBRIC_NAME)
@@ -136,8 +134,7 @@ def score_report(
 ) -> GradedReport:
     """Compute the points of a report, and add sentences about suspicious contents.
 
-    ``submitter_id`` is the student id on the learning platform, which is used instead of the id in
-    the report.
+    ``submitter_id`` is the student id on the learning platform.
     """
     scoring_input = ScoringInput(results, verification, key, submitter_id)
     points_rule, zero_points_reason, instructor_action = _decide_points_rule(scoring_input, rubric)

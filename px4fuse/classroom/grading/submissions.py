@@ -1,8 +1,7 @@
 """Search for submitted PDFs in folders and in zip files that learning platforms export.
 
-Zip files are not unpacked to disk, and the names in them are never used as paths. The platform
-writes the beginning of a path, and students choose the rest. Therefore the first folder or file
-name that matches a pattern in ``platforms.toml`` identifies the student.
+Zip files are not unpacked to disk, and the names in them are never used as paths. Students choose
+the end of a path, so the first name that matches a pattern identifies the student.
 
 Sources of the patterns:
 
@@ -15,8 +14,7 @@ Sources of the patterns:
 - Gradescope: "Exporting submissions", Help Center: ``submission_{number}``, and
   ``submission_metadata.yml`` with names, ids (``:sid:``) and times.
 - ILIAS: multi-feedback of ``components/ILIAS/Exercise`` in its repository:
-  ``{last}_{first}_{login}_{user}/``. The name of a late file begins with "Late Submission - " if
-  the language of the instructor is English; for other languages use ``--due``.
+  ``{last}_{first}_{login}_{user}/``.
 """
 
 import re
@@ -68,8 +66,7 @@ PATH_PATTERN_BY_PLATFORM = {
     name: re.compile(pattern)
     for name, pattern in read_toml(__file__, dict[str, str], "platforms.toml").items()
 }
-# Text that Blackboard or Moodle adds to a path. A path that contains this text more often than the
-# platform adds it was forged by the student
+# Text that Blackboard or Moodle adds once to a path; students may forge the text
 _PLATFORM_TEXT_PATTERN = re.compile(r"_attempt_\d{4}-|_\d+_assignsubmission_")
 BLACKBOARD_TIME_FORMAT = "%Y-%m-%d-%H-%M-%S"
 _SUBMISSION_PATTERN = re.compile(
@@ -83,8 +80,7 @@ class _EntryError(Exception):
 
 
 _BROKEN_ZIP_ERRORS = (zipfile.BadZipFile, zlib.error, struct.error, EOFError, MemoryError)
-# BAD_VALUE_ERRORS contains RuntimeError, and so NotImplementedError, which zipfile raises for
-# unknown compression methods
+# zipfile raises NotImplementedError, a RuntimeError, for unknown compression methods
 _UNREADABLE_FILE_ERRORS = (_EntryError, *_BROKEN_ZIP_ERRORS, *BAD_VALUE_ERRORS)
 
 
@@ -101,13 +97,12 @@ def find_submissions(paths: Sequence[Path]) -> tuple[tuple[Submission, ...], tup
     Parameters
     ----------
     paths : sequence of Path
-        PDFs, folders, and zip files exported by learning platforms. A zip file inside a folder or
-        inside a zip file is from a student and is not opened.
+        PDFs, folders, and zip files exported by learning platforms.
 
     Returns
     -------
     submissions : tuple of Submission
-        Submitted PDFs, sorted by name; they may be unreadable.
+        Submitted PDFs, sorted by name.
     notes : tuple of str
         Sentences about ignored files.
 
@@ -169,10 +164,7 @@ def add_submitters(
 ) -> Iterator[Submission]:
     """Add student and learning platform, found in the file names, to submissions.
 
-    The platform of a zip file or folder is the platform whose pattern matches most file names. A
-    file with a name of another platform is not assigned to a student, because a student may have
-    chosen this name. ``origin_by_submission_number`` contains students and times from the metadata
-    of Gradescope. They replace the students and times in file names.
+    ``origin_by_submission_number`` contains students and times from the metadata of Gradescope.
     """
     export_names = [
         submission.file if submission.zip_entry else submission.name.partition("/")[0]
@@ -254,7 +246,7 @@ def _list_zip_submissions(path: Path, notes: list[str]) -> list[Submission]:
     try:
         with path.open("rb") as file, _open_zip(file) as archive:
             entries = [entry for entry in archive.infolist() if not entry.is_dir()]
-        # a false declared size cannot exceed the limit: zipfile unpacks at most the declared size
+        # declared sizes are safe: zipfile unpacks at most the declared size
         if sum(entry.file_size for entry in entries) > MAX_UNPACKED_BYTES:
             raise _EntryError(
                 f"the zip file unpacks to more than {MAX_UNPACKED_BYTES // 10**9} GB."
@@ -415,8 +407,7 @@ def parse_submission_path(
 def read_gradescope_metadata(text: str) -> dict[str, ExportOrigin]:
     r"""Read students and times from Gradescope's ``submission_metadata.yml``, by submission number.
 
-    A group submission belongs to the first student. Keys with a larger indentation are not read,
-    because they are texts of students.
+    Keys with a larger indentation are texts of students, and are not read.
 
     >>> text = "submission_7:\n  :submitters:\n  - :name: Ada\n    :sid: '12'\n"
     >>> read_gradescope_metadata(text)["7"].person.student_id
