@@ -37,7 +37,9 @@ MIN_RESIDUAL_OF_MISALIGNED_FRAME_M = 0.3
 
 @dataclass(frozen=True)
 class AlignmentProblem:
-    """Positions of a file, and the alignment parameters from the user (None: to be estimated).
+    """Positions of a file, and alignment parameters from the user.
+
+    A parameter that is None is estimated.
 
     Attributes
     ----------

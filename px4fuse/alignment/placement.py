@@ -82,7 +82,7 @@ def _explain_mismatch(
 
 # Minimum ratio of the residuals at second best and best time offset, without a warning
 MIN_RESIDUAL_RATIO_WITHOUT_WARNING = {EKF2_REFERENCE: 2.0, IMU_REFERENCE: 1.4}
-# Maximum difference (s) between the UNIX clocks of computers; more indicates another flight
+# Maximum difference (s) between the UNIX times of position file and log of one flight
 MAX_UNIX_CLOCK_DIFFERENCE_S = 60.0
 # Minimum yaw (°) for a message about a misaligned frame
 MIN_REPORTED_YAW_DEG = 1.0

@@ -1,4 +1,4 @@
-"""Correction of a path in proportion to its length, so that the loop closes; key frames."""
+"""Correction of a path by its loop closure error, and choice of key frames."""
 
 from dataclasses import replace
 

@@ -36,7 +36,7 @@ from px4fuse.trajectory.model import Trajectory, cumulative_distance
 MIN_VARIANCE_GROWTH_RATIO = 2.0
 # Minimum ratio of a reported variance to the default variance, against a division by 0
 MIN_REPORTED_TO_DEFAULT_VARIANCE_RATIO = 1e-2
-# Fraction of the poses at each end of the path for a median of the reported variances
+# Fraction of the poses that counts as start or end of the path, for median variances
 FRACTION_OF_POSES_AT_EACH_END = 0.1
 # Loop closure, and the true final pose if it is the closure of take-off and landing
 ClosureAndFinalPose = tuple[GivenClosure, TrueFinalPose | None]

@@ -36,8 +36,7 @@ from px4fuse.results.model import Student
 if TYPE_CHECKING:
     from px4fuse.analysis import Analysis
 
-# Minimum p value of the Ljung-Box test for white innovations; small, because each flight has eight
-# tests
+# Minimum p value (Ljung-Box test) of white innovations; small, because a flight has eight tests
 MIN_WHITENESS_P_VALUE = 0.001
 # Error of the reported σ
 SIGMA_ERROR_TEXTS = {"underconfident": "too large", "overconfident": "too small"}

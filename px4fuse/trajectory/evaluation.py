@@ -146,13 +146,13 @@ MAX_SCALE_ERROR = 0.1
 MIN_EVALUATED_FRACTION = 0.5
 # Minimum time offset (s) for a warning, because estimators can have smaller delays
 MIN_REPORTED_TIME_OFFSET_S = 0.1
-# Maximum ratio of the ATE with one reversed axis to the ATE, for a warning about a mirrored frame
+# A frame is mirrored if reversing one axis reduces the ATE to this fraction or less
 MAX_MIRRORED_ATE_RATIO = 0.3
-# Minimum ratio of the ATE to the extent of the reference, for the test for a mirrored frame
+# The test for a mirrored frame needs at least this ratio of ATE to extent of the reference
 MIN_ATE_TO_EXTENT_RATIO_FOR_MIRROR_TEST = 0.03
-# Maximum ratio of the ATE with a better time offset to the ATE, for a warning
+# A better time offset must reduce the ATE to this fraction or less
 MAX_ATE_RATIO_OF_BETTER_OFFSET = 0.8
-# Minimum ratio of the pose number with a better time offset to the present number, for a warning
+# A better time offset must keep at least this fraction of the evaluated poses
 MIN_POSE_COUNT_RATIO_OF_BETTER_OFFSET = 0.8
 # Above this ratio of pose intervals, reference and estimate are probably interchanged
 MAX_POSE_INTERVAL_RATIO = 5.0

@@ -22,7 +22,7 @@ from px4fuse.trajectory.model import MIN_POSES, Trajectory
 # Minimum step (s) of the time grid for the correlation of speeds
 GRID_STEP_S = 0.05
 MAX_GRID_SAMPLES = 200_000
-# Standard deviation (s) of the Gaussian filter of positions, against noise of the derivative
+# Standard deviation (s) of the Gaussian filter of positions, because their derivative is noisy
 SMOOTHING_SIGMA_S = 0.25
 # Minimum overlap in time, as fraction of the duration of the shorter trajectory
 MIN_OVERLAP_FRACTION = 0.5
@@ -264,7 +264,7 @@ def _find_candidate_offsets_s(sparse_track: Trajectory, dense_track: Trajectory)
         (mean_correlation == sliding_maximum) & (mean_correlation > MIN_SPEED_CORRELATION)
     )
     peak_indices = peak_indices[np.argsort(-mean_correlation[peak_indices])][:MAX_CANDIDATE_OFFSETS]
-    # Index k of n sparse samples is a shift by k - (n - 1) samples
+    # Correlation index k is a shift by k - (n - 1) samples, for n sparse samples
     dense_start_indices = peak_indices - (len(is_sparse_speed_known) - 1)
     lags_s = dense_start_indices * step_s + dense_track.time_s[0] - sparse_track.time_s[0]
     return list(lags_s.tolist())
@@ -405,8 +405,7 @@ def _refine_offset(
         fit = make_fit(shift_s)
         return float(((fit.dense_track_position_m - fit.aligned_position_m) ** 2).sum())
 
-    # The optimiser has a relative tolerance, so a small shift is optimised, not an offset of up to
-    # 1e9 s
+    # The optimiser has a relative tolerance, so the large offset (up to 1e9 s) is not optimised
     candidate_shifts_s = half_width_s * np.linspace(-1.0, 1.0, 21)
     best_index = int(np.argmin([compute_cost(shift) for shift in candidate_shifts_s]))
     shift_bounds_s = (

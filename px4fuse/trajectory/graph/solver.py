@@ -52,7 +52,7 @@ _MAX_GNC_STAGES = 100
 # Maximum number of dropped closures that are restored on trial
 _MAX_RESTORE_ATTEMPTS = 20
 _MAX_REWEIGHTING_ROUNDS = 20
-# Smaller scale factors of information matrices can be caused by false closures alone
+# False closures alone can cause smaller scale factors of information matrices
 MIN_INFORMATION_SCALE_FACTOR = 2.5
 # Minimum number of closures for an estimate of the scale factor of information matrices
 MIN_CLOSURES_FOR_SCALE_FACTOR = 10
@@ -63,7 +63,7 @@ class Solution(Record, kw_only=True):
 
     # Half of the sum of the squared Mahalanobis distances before the optimisation
     cost_initial: NotNegative
-    # The same sum after the optimisation, weighted
+    # Half of the weighted sum of the squared Mahalanobis distances after the optimisation
     cost: NotNegative
     # Number of accepted Levenberg-Marquardt steps
     iterations: Count
