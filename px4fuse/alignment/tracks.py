@@ -32,7 +32,6 @@ EKF2_REFERENCE, IMU_REFERENCE = "EKF2 position", "IMU"
 MIN_GAP_S = 0.5
 # Minimum horizontal motion (m) of a track
 MIN_MOTION_M = 0.5
-# Minimum number of positions of a track
 MIN_MATCHED_SAMPLES = 10
 # Minimum overlap (s) of two tracks
 MIN_OVERLAP_S = 10.0

@@ -22,7 +22,6 @@ _Z_DOWN_CONVERSIONS: dict[Frame, tuple[str, Frame, str]] = {
 }
 # Default key frame spacing as fraction of the extent of the path
 KEY_FRAME_SPACING_FRACTION = 0.02
-# Limits of the default key frame spacing (m)
 MIN_KEY_FRAME_SPACING_M = 0.02
 MAX_KEY_FRAME_SPACING_M = 0.5
 

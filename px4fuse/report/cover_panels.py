@@ -60,9 +60,7 @@ MIN_HEIGHT_FOR_TICKS_AT_2_SIGMA = 48.0
 # Minimum width (points) of a plot with six time ticks
 MIN_WIDE_PLOT_WIDTH = 200.0
 LEFT_MARGIN = 38.0  # points, for labels left of the axes
-# Height of the innovation plot as fraction of all plots
 INNOVATION_HEIGHT_FRACTION = 0.22
-# Height of the map as fraction of all plots
 MAP_HEIGHT_FRACTION = 0.25
 # Larger innovations ÷ √S are triangles at the edge of the plot
 MAX_DRAWN_SIGMAS = 4.0

@@ -145,7 +145,6 @@ def _format_gaps(source: LoggedData) -> str:
 
 
 def _format_for_narrow_column(value: float) -> str:
-    """Format a rate (Hz) or time (s) for a narrow column."""
     return f"{value:.{2 if value < 1 else 1 if value < 10 else 0}f}"
 
 

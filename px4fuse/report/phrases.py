@@ -38,7 +38,6 @@ if TYPE_CHECKING:
 
 # Minimum p value (Ljung-Box test) of white innovations; small, because a flight has eight tests
 MIN_WHITENESS_P_VALUE = 0.001
-# Error of the reported σ
 SIGMA_ERROR_TEXTS = {"underconfident": "too large", "overconfident": "too small"}
 DIFFERENCE_FIELDS = ("position_rms_m", "velocity_rms_m_s")
 RMSE_FIELDS = ("position_rmse_m", "velocity_rmse_m_s")

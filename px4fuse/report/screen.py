@@ -34,7 +34,6 @@ CARD_LINE_FUNCTIONS = {
 LABEL_CHARACTERS = 9  # width of a label
 MIN_TABLE_WIDTH = 50  # characters; narrower terminals show no tables
 POINTS_PER_COLUMN = 6.0  # points in the PDF per character on the terminal
-# Terminal styles of text colours
 STYLES_BY_COLOUR = {
     MUTED_COLOUR: "dim",
     SEVERITY_COLOURS["error"]: "bold red",

@@ -52,13 +52,11 @@ def dot_style(
     return {"color": colour, "marker": marker, "ms": size, "mew": edge_width, "ls": "none"}
 
 
-# Line style of each track
 TRACK_STYLES = {
     "KF": line_style(KF_COLOUR, 1.0),
     "EKF2": line_style(EKF2_COLOUR, 1.1, (0, (4, 1.6))),
     "ground truth": line_style(TRUTH_COLOUR, 0.7, (0, (1, 1.5))),
 }
-# Marker style of the innovations of each filter
 INNOVATION_STYLES = {
     "KF": dot_style(KF_COLOUR, "o", 2.0),
     "EKF2": dot_style(EKF2_COLOUR, "s", 2.2),
@@ -66,7 +64,6 @@ INNOVATION_STYLES = {
 # Rejected innovations of EKF2 are hollow
 REJECTED_STYLE = dot_style(EKF2_COLOUR, "s", 2.8, 0.6) | {"mfc": "white"}
 MEASUREMENT_STYLE = dot_style(MEASUREMENT_COLOUR, ".", 1.8)
-# Colour of the ±2σ band of each filter
 SIGMA_BAND_COLOURS = {"KF": KF_BAND_COLOUR, "EKF2": EKF2_BAND_COLOUR}
 
 MAX_WIDE_AXES_POINTS = 1500  # maximum per curve in wide axes

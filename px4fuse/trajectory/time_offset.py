@@ -39,7 +39,6 @@ MIN_CORRELATION_PEAK_DISTANCE_S = 1.0
 MIN_SPEED_CORRELATION = 0.3
 # Minimum ratio of the residuals at second best and best time offset: limit of an F-test
 MIN_SECOND_BEST_RESIDUAL_RATIO = 1.2
-# Maximum number of poses in the fit
 MAX_FITTED_POSES = 2000
 # Maximum residual (RMS) of an accepted fit, divided by the extent (RMS) of the motion
 MAX_RELATIVE_MISFIT = 0.5

@@ -22,7 +22,6 @@ _FIXED_POSE_INFORMATION = 1e100
 class _EliminationGroup(NamedTuple):
     """Supernode: poses that are eliminated together, with one dense matrix."""
 
-    # Number of unknowns of this group
     unknown_count: int
     # Position of the matrix of this group in the flat array of all matrices
     matrix_slice: slice
