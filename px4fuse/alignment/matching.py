@@ -1,4 +1,4 @@
-"""Frame, yaw and time offset at which a position file matches EKF2's position or the IMU best."""
+"""Search for frame, yaw and time offset at which a position file matches EKF2 or the IMU."""
 
 from dataclasses import dataclass, replace
 from functools import partial
@@ -17,40 +17,38 @@ from px4fuse.alignment.tracks import EKF2_REFERENCE, IMU_REFERENCE, NoMatchError
 from px4fuse.flight.model import Flight, Unavailable
 from px4fuse.trajectory.time_offset import GRID_STEP_S, MIN_SECOND_BEST_RESIDUAL_RATIO
 
-# Frames to try if the yaw is estimated. nwu is omitted, because it is enu with another yaw
+# Frames to try if the yaw is estimated; nwu equals enu with another yaw
 FRAMES_FOR_ESTIMATED_YAW = ("ned", "enu")
-# Frames to try if the user gives the yaw. eus and edn (y vertical) are omitted, because in a level
-# flight along one axis they fit as well as frames with z vertical
+# Frames to try if the user gives the yaw; frames with y vertical can be ambiguous
 FRAMES_FOR_GIVEN_YAW = ("ned", "enu", "nwu")
-# Maximum time span (s) of a position file, which limits the computing time to five seconds
+# Maximum duration (s) of a position file, to limit the computing time
 MAX_FILE_DURATION_S = 86400.0
-# Minimum concordance correlation coefficient (Lin 1989) between position file and reference: a
-# match with a smaller coefficient is reported with a warning
+# Minimum concordance correlation coefficient (Lin 1989) without a warning
 MIN_CONCORDANCE_WITHOUT_WARNING = {EKF2_REFERENCE: 0.9, IMU_REFERENCE: 0.7}
-# Maximum standard deviation (s) of an accepted time offset
+# Maximum standard deviation (s) of a time offset
 MAX_TIME_OFFSET_SIGMA_S = 0.5
-# Minimum ratio of the residual in the second best frame to the residual in the best frame. With a
-# smaller ratio, the frame is ambiguous
+# Minimum ratio of the residuals in the second best and the best frame, for an unambiguous result
 MIN_SECOND_TO_BEST_FRAME_RESIDUAL_RATIO = 1.3
-# A misaligned frame is reported only if the position residual with the given yaw (default 0) is
-# more than this many times the residual with estimated yaw
+# Minimum ratio of the residuals with given and estimated yaw, for a message about a wrong yaw
 MIN_GIVEN_TO_ESTIMATED_YAW_RESIDUAL_RATIO = 2.0
-# Minimum position residual (m, RMS) with the given yaw, to report a misaligned frame
+# Minimum residual (m, RMS) with the given yaw, for a message about a wrong yaw
 MIN_RESIDUAL_OF_MISALIGNED_FRAME_M = 0.3
 
 
 @dataclass(frozen=True)
 class AlignmentProblem:
-    """Positions of a file, and the alignment parameters from the user (None: to be estimated).
+    """Positions of a file, and alignment parameters from the user.
+
+    A parameter that is None is estimated.
 
     Attributes
     ----------
     samples : DataFrame
         Positions on the clock of the file.
     frames : tuple of str
-        Possible directions of x, y and z in the file, such as ("enu",); empty if unknown.
+        Possible frames of the file, such as ("enu",).
     yaw_rad : float or None
-        Yaw of the file's frame relative to the frame of EKF2.
+        Yaw of the file's frame relative to EKF2's frame.
     lag_s : float or None
         Flight time (s) of the first position in the file.
     """
@@ -63,21 +61,22 @@ class AlignmentProblem:
 
 @dataclass(frozen=True)
 class Match:
-    """Best fit of the position file to a reference track: EKF2's position or the integrated IMU.
+    """Best fit of a position file to a reference track.
 
     Attributes
     ----------
     reference : SampledTrack
+        EKF2's position, or integrated acceleration.
     frame : str
         Directions of x, y and z in the file, such as "enu".
     rms_m_by_frame : dict from frame to float
-        RMS position residual in each tried frame, best first.
+        RMS position residual (m) in each tried frame, best first.
     fit : TrackFit
-        Fit with the user's yaw; equal to ``estimated_yaw_fit`` if the user gave no yaw.
+        Fit with the yaw from the user.
     estimated_yaw_fit : TrackFit
         Fit with estimated yaw.
     is_rotated : bool
-        True if the yaw from the user is wrong: ``estimated_yaw_fit`` is much better than ``fit``.
+        True if the yaw from the user is wrong.
     """
 
     reference: SampledTrack
@@ -89,26 +88,26 @@ class Match:
 
     @property
     def time_offset_fit(self) -> TrackFit:
-        """Fit that gives the time offset. It estimates the yaw if the user's yaw is wrong."""
+        """Fit that gives the time offset."""
         return self.estimated_yaw_fit if self.is_rotated else self.fit
 
     @property
     def residuals_text(self) -> str:
-        """Residuals for messages, best frame first: "ned 0.12 m, enu 3.40 m"."""
+        """Residuals for messages, such as "ned 0.12 m, enu 3.40 m"."""
         return ", ".join(
             f"{name} {residual_m:.2f} m" for name, residual_m in self.rms_m_by_frame.items()
         )
 
 
 def find_match(flight: Flight, problem: AlignmentProblem) -> Match | None:
-    """Match the position file with EKF2's position or, if this fails, with the IMU.
+    """Match a position file with EKF2's position or, if this fails, with the IMU.
 
-    Return None if both fail, but the user gave all options.
+    Return None if both fail, but the user gave all alignment parameters.
 
     Raises
     ------
     NoMatchError
-        Both fail, so an option that the user did not give cannot be estimated.
+        Both fail, so a missing alignment parameter cannot be estimated.
     """
     user_value_by_option = {
         "clock_offset_s": problem.lag_s,
@@ -118,8 +117,7 @@ def find_match(flight: Flight, problem: AlignmentProblem) -> Match | None:
     missing_options = [f"`{name}`" for name, value in user_value_by_option.items() if value is None]
     reasons = []
     reference_factories = [tracks.make_ekf2_references]
-    # The IMU is used only to estimate missing options: its band-pass filtered motion is not
-    # accurate enough for checking given options
+    # The IMU is not accurate enough for a check of parameters from the user
     if missing_options:
         reference_factories.append(tracks.make_imu_references)
     for make_references in reference_factories:
@@ -176,10 +174,7 @@ def _find_best_match(references: list[SampledTrack], problem: AlignmentProblem) 
 
 
 def needs_rotation(horizontal_rms_m: float, estimated_yaw_fit: TrackFit, reference: str) -> bool:
-    """Return True if the fit with estimated yaw has a residual far below ``horizontal_rms_m``.
-
-    The residual must be below ``horizontal_rms_m`` / MIN_GIVEN_TO_ESTIMATED_YAW_RESIDUAL_RATIO.
-    """
+    """Return True if estimating the yaw reduces the horizontal residual (m) much."""
     return (
         horizontal_rms_m
         > MIN_GIVEN_TO_ESTIMATED_YAW_RESIDUAL_RATIO * estimated_yaw_fit.horizontal_rms_m

@@ -1,12 +1,7 @@
-"""Alignment of an external position file with a flight: time offset, frame, yaw and origin.
+"""Alignment of a position file with a flight: time offset, frame, yaw and origin.
 
-A UWB system has its own clock and its own coordinate frame. Its track is matched with EKF2's
-position. If EKF2's position is not suitable, the acceleration integrated twice is used.
-
-The time offset is found by cross-correlation at all lags and refined by robust least squares. If
-EKF2 fused late positions, the estimated time offset contains the delay of these positions.
-
-Horizontal positions are complex numbers, north + i·east. A yaw rotation is a factor e^{i·yaw}.
+The positions are matched with EKF2's position or with integrated acceleration. Horizontal positions
+are complex numbers, north + i·east, so a rotation by yaw is a factor e^{i·yaw}.
 """
 
 from collections.abc import Iterator
@@ -45,15 +40,14 @@ from px4fuse.readers.common import select_valid_rows
 from px4fuse.readers.position_file import PositionRecording
 from px4fuse.trajectory.model import NED_COMPONENTS_BY_FRAME
 
-# Maximum time span (s) of the data for a comparison of axes and unit with the IMU, which takes 1 s
-# per hour of data
+# Maximum duration (s) of the data for a comparison with the IMU, to limit the computing time
 MAX_CONVENTION_CHECK_SPAN_S = 7200.0
 
 
 def _explain_mismatch(
     flight: Flight, problem: AlignmentProblem, metres_per_unit: float
 ) -> tuple[str, str] | None:
-    """Return error message and advice if the IMU shows that axes or unit of the file are wrong."""
+    """Return error message and advice if the IMU shows wrong axes or a wrong unit of the file."""
     samples = problem.samples
     span_s = max(float(samples.index[-1] - samples.index[0]), flight.log.duration_s)
     if span_s > MAX_CONVENTION_CHECK_SPAN_S:
@@ -86,16 +80,13 @@ def _explain_mismatch(
     return "; ".join(fault_texts), " ".join(actions)
 
 
-# Minimum ratio of the position residual at the second best time offset to the residual at the best
-# time offset. A smaller ratio gives a warning. Correct matches with the noisy IMU: 1.4 to 1.7
+# Minimum ratio of the residuals at second best and best time offset, without a warning
 MIN_RESIDUAL_RATIO_WITHOUT_WARNING = {EKF2_REFERENCE: 2.0, IMU_REFERENCE: 1.4}
-# Maximum difference (s) between the UNIX clocks of computers in a lab: a larger difference
-# indicates another flight
+# Maximum difference (s) between the UNIX times of position file and log of one flight
 MAX_UNIX_CLOCK_DIFFERENCE_S = 60.0
-# Minimum rotation (°) of the frame of a position file for a message about a misaligned frame
+# Minimum yaw (°) for a message about a misaligned frame
 MIN_REPORTED_YAW_DEG = 1.0
-# Minimum distance (m) between the origins of position file and EKF2 for a message about a
-# misaligned frame
+# Minimum distance (m) between the origins for a message about a misaligned frame
 MIN_REPORTED_SHIFT_M = 1.0
 
 
@@ -107,17 +98,16 @@ def align_position_file(
     yaw_deg: float | Literal["auto"] | None = None,
     clock_offset_s: float | None = None,
 ) -> Flight:
-    """Convert the positions of a file to a flight's frame and clock; return the combined flight.
+    """Convert a position file to the frame and clock of a flight, and add it to the flight.
 
     Parameters
     ----------
     frame : {"ned", "enu", "nwu", "eus", "edn"}, optional
-        Directions of x, y, z; default: from the column names, or else the best fit.
+        Directions of x, y and z in the file.
     yaw_deg : float or "auto", optional
-        Rotation after the conversion to NED, clockwise from above; default 0. "auto" estimates yaw
-        and origin.
+        Yaw of the file's frame relative to EKF2's frame, clockwise from above; default 0.
     clock_offset_s : float, optional
-        Boot clock of the autopilot minus clock of the file; default: estimated.
+        Boot clock of the autopilot minus clock of the file.
 
     Raises
     ------
@@ -324,7 +314,7 @@ def _apply_alignment(
 def _compare_with_ekf2(
     flight: Flight, aligned_samples: pd.DataFrame
 ) -> tuple[Array, float | None] | None:
-    """Return the horizontal distances (m) and the correlation of file and EKF2 positions."""
+    """Return horizontal distances (m) and correlation between file and EKF2 positions."""
     if isinstance(flight.ekf2, Unavailable):
         return None
     try:
@@ -360,7 +350,7 @@ def _describe_frame_conflict(match: Match, distance_to_ekf2_m: Array | None, yaw
     if not is_rotated:
         return ""
     yaw_deg = np.degrees(np.angle(np.exp(1j * (fit.yaw_rad - yaw_rad))))
-    # A smaller distance of the origins is not reported: GNSS determines EKF2's origin to about 1 m
+    # GNSS determines EKF2's origin only to about 1 m
     if shift_text and abs(yaw_deg) < MIN_REPORTED_YAW_DEG and shift_m < MIN_REPORTED_SHIFT_M:
         return ""
     return (

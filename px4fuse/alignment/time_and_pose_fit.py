@@ -1,4 +1,4 @@
-"""Fit of a position file to a reference: time offset (lag), yaw and origin."""
+"""Fit of a position file to a reference track: time offset (lag), yaw and origin."""
 
 from dataclasses import dataclass, replace
 
@@ -11,36 +11,34 @@ from px4fuse.core.arrays import Array, ComplexArray
 from px4fuse.trajectory.correlation import autocovariance, compute_moments
 from px4fuse.trajectory.time_offset import GRID_STEP_S
 
-# Maximum difference (s) between the lag fitted by least squares and the lag of the correlation peak
+# Maximum correction (s) of the lag by least squares
 MAX_LAG_CORRECTION_S = 1.0
-# Minimum concordance correlation coefficient (Lin 1989) between position file and reference. With a
-# smaller coefficient, the match is rejected
+# Minimum concordance correlation coefficient (Lin 1989) of an accepted match
 MIN_CONCORDANCE_TO_ACCEPT_MATCH = {EKF2_REFERENCE: 0.7, IMU_REFERENCE: 0.5}
-# Lower limit of 1 - concordance. Without this limit, a lag with few, nearly equal samples would be
-# preferred to a match of many samples
+# Lower limit of 1 - concordance, so that few samples with equal positions are not preferred
 MIN_CONCORDANCE_DEFICIT = 1e-4
 # Minimum distance (s) between the lags of two separate correlation peaks
 MIN_PEAK_DISTANCE_S = 3.0
 # Error (m) of the interpolation of positions to the time grid
 INTERPOLATION_ERROR_M = 0.05
-# Larger position residuals (m) are set to this value before an RMS, because they may be outliers
+# Larger position residuals (m) are set to this value, because they may be outliers
 RESIDUAL_CLIP_LIMIT_M = 1.0
 
 
 @dataclass(frozen=True)
 class CorrelationPeak:
-    """Lag with the best match between position file and reference.
+    """Lag with the best match between position file and reference track.
 
     Attributes
     ----------
     lag_s : float
-        Time to add to the times of the file, which start at 0.
+        Time to add to the times of the file.
     concordance : float
-        Lin's concordance correlation coefficient, 1 for equal tracks; NaN if the user gave the lag.
+        Lin's concordance correlation coefficient, 1 for equal tracks.
     second_peak_lag_difference_s : float
         Second best lag minus best lag; NaN without a second peak.
     second_to_best_residual_ratio : float
-        Residual (RMS) at the second best lag over the residual at the best lag.
+        Residual (RMS) at the second best lag over residual at the best lag.
     """
 
     lag_s: float
@@ -58,14 +56,13 @@ class TrackFit(CorrelationPeak):
     Attributes
     ----------
     lag_sigma_s, yaw_sigma_rad : float or None
-        Standard deviations; None if the user gave the value.
+        Standard deviations of lag and yaw.
     origin_m : ndarray, shape (3,)
         Position of the file's origin: north, east, down.
     coherence : complex
         Correlation of file and reference; its phase is the yaw.
     horizontal_rms_m, residual_rms_m : float
-        RMS position residual per horizontal axis, and RMS length of the residual vector. The
-        vector contains the height if available.
+        RMS residual per horizontal axis, and RMS length of the residual.
     """
 
     lag_sigma_s: float | None
@@ -80,15 +77,14 @@ class TrackFit(CorrelationPeak):
 def find_correlation_peak(
     file_track: SampledTrack, reference: SampledTrack, yaw_rad: float | None
 ) -> CorrelationPeak:
-    """Return the lag at which a position file matches a reference best.
+    """Return the lag at which a position file matches a reference track best.
 
-    The score of a lag is -N·ln(1 - c): N is the number of common samples, c is Lin's concordance
-    correlation coefficient. The best lag has the largest score.
+    It maximises -N·ln(1 - c) with N common samples and Lin's concordance correlation coefficient c.
 
     Raises
     ------
     NoMatchError
-        No lag has sufficient overlap.
+        The tracks have too few samples.
     """
     shorter_sample_count = min(
         np.count_nonzero(file_track.is_valid), np.count_nonzero(reference.is_valid)
@@ -106,7 +102,7 @@ def find_correlation_peak(
     covariance = moments_by_lag.covariance
     square_sum_m2 = moments_by_lag.sum_of_squares_a + moments_by_lag.sum_of_squares_b
     has_overlap = common_sample_counts >= min_sample_count
-    # Exclude lags at which both tracks are at rest: their variance is a rounding error
+    # At rest, the variance is a rounding error
     has_overlap &= square_sum_m2 > 1e-9 * np.max(square_sum_m2)
     rotated_covariance = (
         np.abs(covariance) if yaw_rad is None else (np.exp(-1j * yaw_rad) * covariance).real
@@ -121,8 +117,7 @@ def find_correlation_peak(
     def compute_lag_s(index: int) -> float:
         return float(reference.time_s[0]) + (index - len(file_track.is_valid) + 1) * GRID_STEP_S
 
-    # Lags near the best lag belong to the same peak and are not a second peak. The peak ends where
-    # the concordance falls below half of its maximum, or at MIN_PEAK_DISTANCE_S from the best lag
+    # The best peak ends where the concordance falls below half of its maximum
     low_concordance_indices = np.flatnonzero(concordance < 0.5 * concordance[best_index])
     peak_start_index = np.max(
         low_concordance_indices[low_concordance_indices < best_index], initial=-1
@@ -145,7 +140,6 @@ def find_correlation_peak(
     peak = CorrelationPeak(compute_lag_s(best_index), float(concordance[best_index]))
     if not can_be_second_peak.any():
         return peak
-    # RMS residual (m) per axis at each lag, plus the interpolation error of the time grid
     mean_square_residual_m2 = np.maximum(square_sum_m2 - 2.0 * rotated_covariance, 0.0) / (
         2.0 * np.maximum(common_sample_counts, 1.0)
     )
@@ -166,15 +160,21 @@ def fit_by_least_squares(
     *,
     is_lag_estimated: bool,
 ) -> TrackFit:
-    """Fit the file to the reference by robust least squares (soft L1).
+    """Fit a position file to a reference track by robust least squares (soft L1).
 
-    The lag is fitted if ``is_lag_estimated``, and the yaw if ``yaw_rad`` is None. The origin is
-    always fitted: on a flight in one direction, an offset of the origin would look like a lag.
+    The origin is always fitted, because an error of the origin would look like a lag.
+
+    Parameters
+    ----------
+    yaw_rad : float or None
+        Given yaw; None to fit the yaw.
+    is_lag_estimated : bool
+        True to fit the lag.
 
     Raises
     ------
     NoMatchError
-        Too few samples overlap the reference.
+        Too few samples overlap in time.
     """
     reference_m, is_known = reference.at(file_track.time_s + peak.lag_s)
     is_used = is_known & file_track.is_valid
@@ -187,7 +187,7 @@ def fit_by_least_squares(
     file_position_m = file_track.to_complex_m()[is_used]
     reference_position_m = (reference_m[:, 0] + 1j * reference_m[:, 1])[is_used]
     centre_m = np.mean(file_position_m)
-    # The track is centred, because the errors of yaw and origin are then uncorrelated
+    # With centred positions, the errors of yaw and origin are uncorrelated
     file_position_m = file_position_m - centre_m
     sigma_product_m2 = float(np.sqrt(np.var(file_position_m) * np.var(reference_position_m)))
     coherence = (
@@ -200,7 +200,7 @@ def fit_by_least_squares(
     mean_of_variances_m2 = float(np.var(file_position_m) + np.var(reference_position_m)) / 2.0
     reference_horizontal_position_m = reference.to_complex_m()
 
-    # Parameters: origin north and east (m), fitted lag minus lag of the peak (s), yaw (rad)
+    # Parameters: origin north, origin east (m), lag correction (s), yaw (rad)
     reference_mean_m = reference_position_m.mean()
     parameters = np.array([reference_mean_m.real, reference_mean_m.imag, 0.0, np.angle(coherence)])
     bounds = np.array([np.inf, np.inf, MAX_LAG_CORRECTION_S, np.inf])
@@ -235,7 +235,7 @@ def fit_by_least_squares(
     complex_residuals = residuals[: len(file_position_m)] + 1j * residuals[len(file_position_m) :]
     jacobian = np.asarray(solution.jac)
     information = jacobian.T @ jacobian
-    # The added diagonal gives a huge variance instead of an error for a singular matrix
+    # The added diagonal prevents a singular matrix
     information += 1e-9 * np.diag(np.diag(information) + 1e-12)
     parameter_variance = (
         np.diag(np.linalg.inv(information))
@@ -281,12 +281,12 @@ def fit_by_least_squares(
 
 
 def _compute_robust_sigma(residual: Array) -> float:
-    """Return the standard deviation from the median absolute residual, at least 1 mm."""
+    """Return the standard deviation from the median absolute residual."""
     return max(1.4826 * float(np.median(np.abs(residual))), 1e-3)
 
 
 def _compute_autocorrelation_factor(residual: ComplexArray) -> float:
-    """Return 1 + 2Σρ, the factor by which autocorrelation increases the variance of a mean."""
+    """Return the factor by which autocorrelation increases the variance of a mean (1 + 2Σρ)."""
     clip_limit = 3.0 * _compute_robust_sigma(np.abs(residual))
     clipped_residual = residual * np.minimum(1.0, clip_limit / np.maximum(np.abs(residual), 1e-12))
     covariance_by_lag = autocovariance(clipped_residual)
@@ -300,5 +300,5 @@ def _compute_autocorrelation_factor(residual: ComplexArray) -> float:
 
 
 def compute_clipped_rms_m(residual_m: Array) -> float:
-    """Return the RMS (m) of residuals that are clipped to RESIDUAL_CLIP_LIMIT_M."""
+    """Return the RMS (m) of residuals that are limited to RESIDUAL_CLIP_LIMIT_M."""
     return float(np.sqrt(np.mean(np.minimum(np.abs(residual_m), RESIDUAL_CLIP_LIMIT_M) ** 2)))

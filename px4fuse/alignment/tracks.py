@@ -1,4 +1,4 @@
-"""Tracks for the alignment (north, east, down): the position file, and EKF2 or IMU as reference."""
+"""Tracks in north, east, down for the alignment: position file, EKF2 position and IMU."""
 
 from dataclasses import dataclass, replace
 
@@ -28,43 +28,41 @@ from px4fuse.trajectory.time_offset import GRID_STEP_S
 
 EKF2_REFERENCE, IMU_REFERENCE = "EKF2 position", "IMU"
 
-# Minimum length (s) of a gap between two samples. A gap is also longer than three median intervals
+# Minimum length (s) of a gap in a track
 MIN_GAP_S = 0.5
-# Minimum horizontal motion (m) of a track that is matched with another track
+# Minimum horizontal motion (m) of a track
 MIN_MOTION_M = 0.5
-# Minimum number of positions of a track that is matched with another track
 MIN_MATCHED_SAMPLES = 10
-# Minimum overlap (s) of two matched tracks, or half of the shorter track if that is less
+# Minimum overlap (s) of two tracks
 MIN_OVERLAP_S = 10.0
-# σ (s) of the Gaussian filter that smooths the steps of EKF2's position at updates
+# σ (s) of the Gaussian filter of EKF2's position, which has steps at updates
 SMOOTHING_SIGMA_S = 0.2
-# Frequency band (Hz) in which acceleration integrated twice equals position. At lower frequencies,
-# the integral drifts
+# Pass band (Hz) of integrated acceleration; at lower frequencies, the integral drifts
 BAND_PASS_HZ = (0.1, 1.0)
-# Time (s) near ends and gaps in which the output of the band-pass filter is not used
+# Time (s) near ends and gaps in which the band-pass filter has not settled
 BAND_PASS_SETTLING_TIME_S = 2.0
-# Maximum length (s) by which a track is extended at both ends before the band-pass filter
+# Maximum padding (s) at both ends before the band-pass filter
 BAND_PASS_PADDING_S = 10.0
 
 
 class NoMatchError(Px4FuseError):
-    """The position file does not match a reference."""
+    """Error: the position file does not match the flight."""
 
 
 @dataclass(frozen=True)
 class SampledTrack:
-    """Positions over time, of the position file or of a reference.
+    """Positions over time.
 
     Attributes
     ----------
     time_s : ndarray, shape (n,)
-        Time since the start of the log; for the position file, time since its first sample.
+        Time since the start of the log, or since the first position of a file.
     position_m : ndarray, shape (n, 3)
         Positions north, east, down; down may be NaN.
     is_valid : ndarray of bool, shape (n,)
         False inside gaps.
     name : str
-        Name of the reference; "" for the position file.
+        Name of a reference track; empty for a position file.
     """
 
     time_s: Array
@@ -73,18 +71,18 @@ class SampledTrack:
     name: str = ""
 
     def to_complex_m(self) -> ComplexArray:
-        """Return the horizontal positions as complex numbers north + i·east, shape (n,)."""
+        """Return horizontal positions as complex numbers north + i·east."""
         return self.position_m[:, 0] + 1j * self.position_m[:, 1]
 
     def at(self, time_s: Array) -> tuple[Array, BoolArray]:
-        """Interpolate the position at times; also return a mask of the times outside of gaps."""
+        """Interpolate the position at given times, and return a mask of times outside gaps."""
         columns_m = [np.interp(time_s, self.time_s, column) for column in self.position_m.T]
         is_valid = np.interp(time_s, self.time_s, self.is_valid.astype(float), 0.0, 0.0) > 0.999
         return np.stack(columns_m, axis=1), is_valid
 
 
 def convert_to_ned(samples: pd.DataFrame, frame: str) -> SampledTrack:
-    """Convert the positions of a file to north, east, down, with times from the first sample."""
+    """Convert the positions of a file from ``frame`` to north, east, down."""
     axis_order, axis_signs = NED_COMPONENTS_BY_FRAME[frame]
     position_m = samples[["x_m", "y_m", "z_m"]].to_numpy()[:, axis_order] * axis_signs
     return _make_gapless_track(samples.index.to_numpy() - samples.index[0], position_m)
@@ -95,19 +93,19 @@ def _make_gapless_track(time_s: Array, position_m: Array) -> SampledTrack:
 
 
 def resample_to_grid(track: SampledTrack) -> SampledTrack:
-    """Resample a track to a regular time grid, and mark samples inside gaps as invalid."""
+    """Resample a track to a regular time grid, and mark gaps as invalid."""
     grid_s = np.arange(track.time_s[0], track.time_s[-1], GRID_STEP_S)
     is_known = is_bracketed(grid_s, track.time_s, choose_gap_limit_s(track.time_s, MIN_GAP_S))
     return SampledTrack(grid_s, track.at(grid_s)[0], is_known)
 
 
 def remove_spikes(track: SampledTrack, window_size: int = 3) -> SampledTrack:
-    """Remove outliers with a median filter over ``window_size`` samples."""
+    """Remove outliers with a median filter."""
     return replace(track, position_m=median_filter(track.position_m, size=(window_size, 1)))
 
 
 def apply_band_pass(position_m: Array) -> Array:
-    """Filter positions on the time grid to the band BAND_PASS_HZ, without delay."""
+    """Filter positions with the pass band BAND_PASS_HZ, without delay."""
     second_order_sections = butter(2, BAND_PASS_HZ, "bandpass", fs=1.0 / GRID_STEP_S, output="sos")
     return sosfiltfilt(
         second_order_sections,
@@ -118,7 +116,7 @@ def apply_band_pass(position_m: Array) -> Array:
 
 
 def mark_transients(track: SampledTrack) -> SampledTrack:
-    """Set ``is_valid`` to False near ends and gaps, where the band-pass filter has transients."""
+    """Mark samples as invalid near ends and gaps, where the band-pass filter has not settled."""
     transient_sample_count = round(BAND_PASS_SETTLING_TIME_S / GRID_STEP_S)
     return replace(
         track,
@@ -127,7 +125,7 @@ def mark_transients(track: SampledTrack) -> SampledTrack:
 
 
 def compute_horizontal_range_m(track: SampledTrack) -> float:
-    """Return the larger of the position ranges (m) along north and east, without outliers."""
+    """Return the larger of the ranges (m) of north and east position, without outliers."""
     return float(np.max(np.ptp(remove_spikes(track, 5).position_m[:, :2], axis=0)))
 
 
@@ -149,10 +147,7 @@ def _smooth_ekf2_track(state: pd.DataFrame) -> SampledTrack:
 
 
 def make_ekf2_references(flight: Flight) -> list[SampledTrack]:
-    """Return EKF2's published position, and a copy without horizontal resets if there are any.
-
-    Height resets are not removed, because most of them correct an error from before take-off.
-    """
+    """Return EKF2's position, and a copy without horizontal resets if there are resets."""
     if isinstance(flight.ekf2, Unavailable):
         raise NoMatchError("the log has no EKF2 position")
     state = flight.ekf2.state
@@ -171,10 +166,7 @@ def make_ekf2_references(flight: Flight) -> list[SampledTrack]:
 
 
 def make_imu_references(flight: Flight) -> list[SampledTrack]:
-    """Return the IMU's motion as reference: acceleration integrated twice.
-
-    A band-pass filter after each integration removes drift.
-    """
+    """Return the double integral of the acceleration, with a band-pass filter against drift."""
     acceleration = compute_ned_acceleration(flight)
     if isinstance(acceleration, Unavailable):
         raise NoMatchError(f"the log has no acceleration in NED ({acceleration.reason})")
@@ -196,16 +188,16 @@ def make_imu_references(flight: Flight) -> list[SampledTrack]:
 def align_samples(
     samples: pd.DataFrame, frame: str, yaw_rad: float, origin_m: Array, lag_s: float
 ) -> pd.DataFrame:
-    """Convert samples of a position file to NED, with ``lag_s`` as time of the first sample.
+    """Convert the samples of a position file to north, east, down and to flight time.
 
-    Positions are R·C·p + origin: C converts the axes of ``frame`` to NED, R rotates by ``yaw_rad``.
-    Variances are the diagonal of R·C·diag(σ²)·Cᵀ·Rᵀ.
+    ``lag_s`` is the flight time of the first sample. Positions are rotated by ``yaw_rad`` and
+    shifted by ``origin_m``.
     """
     track = convert_to_ned(samples, frame)
     position_m = track.position_m
     axis_order, _ = NED_COMPONENTS_BY_FRAME[frame]
     variance_m2 = samples[["sigma_x_m", "sigma_y_m", "sigma_z_m"]].to_numpy()[:, axis_order] ** 2
-    # The rotation combines north and east, so both variances are NaN if one σ is missing
+    # The rotation combines north and east variances, so both are NaN if one is missing
     if yaw_rad:
         c, s = np.cos(yaw_rad), np.sin(yaw_rad)
         yaw_rotation = np.array([[c, -s], [s, c]])
@@ -219,7 +211,7 @@ def align_samples(
 
 
 def make_continuous_ekf2_track(ekf2: Ekf2, aligned_samples: pd.DataFrame) -> SampledTrack:
-    """Return EKF2's track after removal of resets that only moved the origin of EKF2's frame."""
+    """Return EKF2's position without resets that only moved the origin of EKF2's frame."""
     track = PositionTrack("", POSITION_FILE_ORIGIN, "", aligned_samples, "NED", "", ())
     segment = Segment(float(aligned_samples.index[0]), float(aligned_samples.index[-1]), "")
     return _smooth_ekf2_track(remove_origin_resets(ekf2, track, segment)[0])

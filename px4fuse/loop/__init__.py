@@ -1,1 +1,1 @@
-"""Loop analysis of odometry: segment of the loop, loop closures, and corrections of the path."""
+"""Loop analysis: loop closure error of odometry, and correction of the path."""

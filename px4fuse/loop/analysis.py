@@ -1,4 +1,4 @@
-"""Loop analysis of a trajectory: loop closure error, and corrected paths with ATE and RPE."""
+"""Loop closure error of a trajectory, and corrected paths with ATE and RPE."""
 
 from collections.abc import Callable
 
@@ -24,16 +24,15 @@ from px4fuse.request import GivenClosure, LoopRequest
 from px4fuse.trajectory.graph import lie
 from px4fuse.trajectory.model import Trajectory, cumulative_distance, split_by_axis
 
-# Larger times (s) in options are UNIX times, smaller times count from the first pose
+# Larger times (s) in options are UNIX times
 MIN_UNIX_TIME_S = 1e6
 # Minimum path length (m) of a loop
 MIN_PATH_LENGTH_M = 2.0
-# Minimum path length (m) for a loop analysis in ``px4fuse compare``
+# Minimum path length (m) of a loop in ``px4fuse compare``
 MIN_FLIGHT_LOOP_PATH_M = 10.0
-# Maximum distance between both ends of the path for a loop analysis in ``px4fuse compare``, as
-# fraction of the path length
+# Maximum distance between both ends of a loop in ``px4fuse compare``, as fraction of path length
 MAX_END_TO_START_DISTANCE_FRACTION = 0.10
-# Maximum value (m or °) of the options for drift, key frame spacing and σ
+# Maximum of the options for drift (m or °), key frame spacing (m) and σ (m)
 MAX_LOOP_OPTION_VALUE = 100.0
 
 
@@ -43,20 +42,21 @@ def analyse(
     reference: Trajectory | None = None,
     progress: Callable[[str], None] = lambda _: None,
 ) -> Loop:
-    """Compute the loop closure error of a trajectory or flight, and correct the path.
+    """Compute the loop closure error of a trajectory, and correct the path.
 
     Parameters
     ----------
     source : LoopSource
+        Trajectory, with its flight if it is from a flight log.
     request : LoopRequest, optional
-        Options, with times on the clock of the trajectory.
+        Options; times are on the clock of the trajectory.
     reference : Trajectory, optional
-        Reference for ATE and RPE, in addition to the ground truth in the log.
+        Additional reference for ATE and RPE.
 
     Raises
     ------
     TrajectoryError, SettingsError
-        The segment is too short, a closure is outside of the segment, or an option is out of range.
+        The trajectory is too short, or an option is out of range.
     """
     request = request or LoopRequest(source=source.trajectory.name)
     noise = OdometryNoise(request.position_drift_m, request.heading_drift_deg)
@@ -209,14 +209,14 @@ def _find_true_end(
 
 
 def _is_drift_free(trajectory: Trajectory, flight: Flight) -> bool:
-    """Return True if the trajectory is from a filter that used positions without drift."""
+    """Return True if the trajectory is from a filter that fused positions without drift."""
     has_vision = any(track.origin.is_vision for track in flight.positions)
     has_no_odometry = isinstance(find_odometry(flight), Unavailable)
     return trajectory.kind in ("ekf2", "kf") and has_vision and has_no_odometry
 
 
 def _choose_key_frames(path: Trajectory, key_frame_spacing_m: float) -> tuple[IntArray, Array]:
-    """Return the key frame indices, and the path length (m) along key frames up to each pose."""
+    """Return the key frame indices, and the path length (m) from the start to each pose."""
     _require_in_range("key_frames_m", key_frame_spacing_m, 1e-3)
     key_frame_indices = choose_key_frames(path.position_m, key_frame_spacing_m)
     distance_m = cumulative_distance(path.position_m[key_frame_indices])
@@ -271,7 +271,7 @@ def _compute_heading_error(
 
 
 def find_truth_trajectory(flight: Flight) -> Trajectory | None:
-    """Return the ground truth of a flight as a trajectory, if the log contains it."""
+    """Return the ground truth of a flight as a trajectory, or None."""
     try:
         return trajectory_of(flight, "truth")
     except MissingDataError:
@@ -281,14 +281,14 @@ def find_truth_trajectory(flight: Flight) -> Trajectory | None:
 def analyse_flight_loop(
     flight: Flight, progress: Callable[[str], None] = lambda _: None
 ) -> Loop | Unavailable:
-    """Analyse the loop of a flight's odometry, for ``px4fuse compare``.
+    """Compute the loop closure error of the odometry of a flight.
 
-    The result is Unavailable without odometry, or if the odometry does not end near its start.
+    The result is Unavailable without odometry, or if the path does not return to its start.
     """
     odometry = find_odometry(flight)
     try:
         trajectory = trajectory_of(flight, "vio")
-    except MissingDataError as error:  # the odometry has too few poses, or is missing
+    except MissingDataError as error:  # missing odometry, or too few poses
         reason = odometry.reason if isinstance(odometry, Unavailable) else str(error).rstrip(".")
         return Unavailable(
             "loop closure",

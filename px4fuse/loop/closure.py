@@ -1,7 +1,4 @@
-"""Correction of a path in proportion to its length so that the loop closes; choice of key frames.
-
-Frames have z down: NED, or FRD (forward, right, down at the start); see :func:`to_z_down`.
-"""
+"""Correction of a path by its loop closure error, and choice of key frames."""
 
 from dataclasses import replace
 
@@ -13,7 +10,7 @@ from px4fuse.trajectory.graph import lie
 from px4fuse.trajectory.model import NED_COMPONENTS_BY_FRAME, Frame, Trajectory, cumulative_distance
 
 DOWN_DIRECTION = np.array([0.0, 0.0, 1.0])
-# Conversion of each frame to z down: key of NED_COMPONENTS_BY_FRAME, new frame, note to the user
+# Conversion of each frame to z down: axis directions, new frame, note to the user
 _Z_DOWN_CONVERSIONS: dict[Frame, tuple[str, Frame, str]] = {
     "ENU": ("enu", "NED", "the axes were converted from east, north, up to north, east, down"),
     "camera": (
@@ -23,19 +20,14 @@ _Z_DOWN_CONVERSIONS: dict[Frame, tuple[str, Frame, str]] = {
     ),
     "unknown": ("nwu", "FRD", "the coordinate frame is unknown, so z is assumed to be up"),
 }
-# Default key frame spacing as fraction of the extent of the path: larger paths have wider curves,
-# for which a wider spacing is sufficient
+# Default key frame spacing as fraction of the extent of the path
 KEY_FRAME_SPACING_FRACTION = 0.02
-# Minimum and maximum of the default key frame spacing (m)
 MIN_KEY_FRAME_SPACING_M = 0.02
 MAX_KEY_FRAME_SPACING_M = 0.5
 
 
 def to_z_down(trajectory: Trajectory) -> Trajectory:
-    """Convert a trajectory to a frame with z down.
-
-    The camera axes are converted to body axes with the nose in the direction of view.
-    """
+    """Convert a trajectory to a frame with z down (NED or FRD)."""
     if trajectory.frame not in _Z_DOWN_CONVERSIONS:
         return trajectory
     axes, z_down_frame, note = _Z_DOWN_CONVERSIONS[trajectory.frame]
@@ -52,7 +44,7 @@ def to_z_down(trajectory: Trajectory) -> Trajectory:
 
 
 def from_z_down(trajectory: Trajectory, frame: Frame) -> Trajectory:
-    """Convert a result of :func:`to_z_down` back to the original ``frame``."""
+    """Convert a trajectory with z down back to its original frame."""
     if frame not in _Z_DOWN_CONVERSIONS or trajectory.frame in _Z_DOWN_CONVERSIONS:
         return trajectory
     return _rotate(trajectory, _matrix_to_ned(_Z_DOWN_CONVERSIONS[frame][0]).T, frame)
@@ -64,7 +56,7 @@ def _matrix_to_ned(axes: str) -> Array:
 
 
 def _rotate(trajectory: Trajectory, matrix: Array, frame: Frame) -> Trajectory:
-    """Rotate a trajectory to another frame, and convert camera axes to body axes or the reverse."""
+    """Rotate a trajectory to another frame, and convert between camera axes and body axes."""
     frame_rotation = Rotation.from_matrix(matrix)
     rotated = replace(
         trajectory.replace_positions(trajectory.position_m @ matrix.T, frame_rotation), frame=frame
@@ -75,7 +67,7 @@ def _rotate(trajectory: Trajectory, matrix: Array, frame: Frame) -> Trajectory:
 
 
 def compute_default_spacing_m(position_m: Array) -> float:
-    """Return the default key frame spacing (m): 2 % of the extent of the path, within limits."""
+    """Return the default key frame spacing (m)."""
     extent_m = float(np.linalg.norm(np.ptp(position_m, axis=0)))
     return float(
         np.clip(
@@ -85,10 +77,9 @@ def compute_default_spacing_m(position_m: Array) -> float:
 
 
 def choose_key_frames(position_m: Array, spacing_m: float) -> IntArray:
-    """Return indices of poses at distances of at least ``spacing_m``, including both ends.
+    """Choose key frames: poses at distances of at least ``spacing_m``, and both ends of the path.
 
-    The length along all samples of a noisy track is too large: at 30 Hz each interval adds the
-    noise of two positions. Key frames at distances above the noise avoid this error.
+    Without key frames, position noise makes the path length too large.
     """
     key_frame_indices = [0]
     last_key_frame_position_m = position_m[0]
@@ -101,7 +92,7 @@ def choose_key_frames(position_m: Array, spacing_m: float) -> IntArray:
         len(key_frame_indices) > 1
         and np.linalg.norm(position_m[-1] - last_key_frame_position_m) < spacing_m / 2.0
     ):
-        # If the last key frame is near the final pose, their distance is mostly noise
+        # The distance between two close key frames is mostly noise
         key_frame_indices.pop()
     return np.array([*key_frame_indices, len(position_m) - 1])
 
@@ -109,10 +100,17 @@ def choose_key_frames(position_m: Array, spacing_m: float) -> IntArray:
 def distribute_by_distance(
     position_m: Array, closure_error_vector_m: Array, cumulative_distance_m: Array | None = None
 ) -> Array:
-    """Subtract a part of the loop closure error from each position, in proportion to path length.
+    """Correct positions by a part of the loop closure error, in proportion to path length.
 
-    ``closure_error_vector_m`` is the final position minus the true final position. The method is
-    the compass rule of surveying (Bowditch 1808; UAT 366 module 2, Example 2).
+    Source: compass rule of surveying (Bowditch 1808; UAT 366 module 2, Example 2).
+
+    Parameters
+    ----------
+    position_m : ndarray, shape (n, 3)
+    closure_error_vector_m : ndarray, shape (3,)
+        Final position minus true final position.
+    cumulative_distance_m : ndarray, shape (n,), optional
+        Path length from the start to each position.
     """
     distance_m = (
         cumulative_distance(position_m) if cumulative_distance_m is None else cumulative_distance_m
@@ -121,9 +119,9 @@ def distribute_by_distance(
 
 
 def compute_heading_change_rad(rotation: Rotation) -> float:
-    """Return the angle (rad) about the vertical of a rotation in a frame with z down.
+    """Return the rotation angle (rad) about z, clockwise from above in a frame with z down.
 
-    It is the twist of the swing-twist decomposition about z; positive is clockwise from above.
+    It is the twist of the swing-twist decomposition.
     """
     _, _, z, w = rotation.as_quat()
     return float(lie.wrap(2.0 * np.arctan2(z, w)))
@@ -135,10 +133,9 @@ def correct_by_distance(
     closure_error_vector_m: Array,
     heading_closure_error_rad: float,
 ) -> Trajectory:
-    """Distribute the loop closure errors of position and heading in proportion to the distance.
+    """Distribute the closure errors of position and heading in proportion to path length.
 
-    The errors are final minus true final values. First, orientations and displacements between
-    poses are rotated about the vertical. Then the remaining position error is distributed.
+    The errors are final values minus true final values.
     """
     position_m = trajectory.position_m
     distance_fraction = cumulative_distance_m / cumulative_distance_m[-1]

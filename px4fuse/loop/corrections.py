@@ -1,4 +1,4 @@
-"""Corrections of odometry by loop closures: gate, corrected paths, and their ATE and RPE."""
+"""Correction of odometry by loop closures: χ² test, corrected paths, ATE and RPE."""
 
 from collections.abc import Callable, Mapping, Sequence
 from typing import Any
@@ -32,28 +32,27 @@ from px4fuse.trajectory.graph.model import PoseGraph
 from px4fuse.trajectory.graph.solver import ROBUST_SOLUTION_KEY, SOLUTION_LABELS, Solution, solve
 from px4fuse.trajectory.model import Trajectory, cumulative_distance
 
-# Minimum ratio of the variance reported at the end of the path to the variance at the start. With a
-# larger ratio, the reported variances replace the default drift of the odometry
+# Minimum growth of the reported variances along the path; otherwise they are not used
 MIN_VARIANCE_GROWTH_RATIO = 2.0
-# Minimum ratio of a reported variance to the default variance, to avoid a division by 0
+# Minimum ratio of a reported variance to the default variance, against a division by 0
 MIN_REPORTED_TO_DEFAULT_VARIANCE_RATIO = 1e-2
-# Fraction of the poses whose median variance is the variance at the start or end of the path
+# Fraction of the poses that counts as start or end of the path, for median variances
 FRACTION_OF_POSES_AT_EACH_END = 0.1
-# Loop closure, and the true final pose; None if the closure is not that of take-off and landing
+# Loop closure, and the true final pose if it is the closure of take-off and landing
 ClosureAndFinalPose = tuple[GivenClosure, TrueFinalPose | None]
 
 
 def compute_odometry_variances(
     path: Trajectory, node_indices: IntArray, noise: OdometryNoise
 ) -> tuple[Array, Array, str]:
-    """Compute the variances of the odometry between successive nodes of the pose graph.
+    """Compute the variances of odometry between successive nodes of a pose graph.
 
     Parameters
     ----------
     node_indices : ndarray of int, shape (k,)
-        Indices of the poses that are nodes of the graph.
+        Indices of the poses that are nodes.
     noise : OdometryNoise
-        Drift, used if the variances that the odometry reports do not grow.
+        Default drift, used if the reported variances do not grow.
 
     Returns
     -------
@@ -62,7 +61,7 @@ def compute_odometry_variances(
     rotation_variance_rad2 : ndarray, shape (k - 1, 3)
         Variances about the body axes.
     variance_note : str
-        Data from which the variances are computed, for the user.
+        Source of the variances, for the user.
     """
     step_length_m = np.diff(cumulative_distance(path.position_m[node_indices]))
     step_duration_s = np.diff(path.time_s[node_indices])
@@ -113,9 +112,9 @@ def compute_odometry_variances(
 
 
 def _compute_variance_increments(variance: Array | None, node_indices: IntArray) -> Array | None:
-    """Return the increases of reported variances between graph nodes, shape (k - 1, 3).
+    """Return the increases of reported variances between nodes, shape (k - 1, 3).
 
-    Return None if the variances do not grow by MIN_VARIANCE_GROWTH_RATIO along the path.
+    Return None if the variances do not grow along the path.
     """
     if variance is None:
         return None
@@ -133,15 +132,15 @@ def build_pose_graph(
     closures_and_final_poses: Sequence[ClosureAndFinalPose],
     noise: OdometryNoise,
 ) -> tuple[PoseGraph | Unavailable, IntArray, str]:
-    """Build the pose graph of a path with z down; its last edges are the loop closures.
+    """Build the pose graph of a path. Its last edges are the loop closures.
 
     Returns
     -------
     graph : PoseGraph or Unavailable
     node_indices : ndarray of int, shape (k,)
-        Indices of the poses that are nodes: key frames, and the poses nearest in time to closures.
+        Indices of the poses that are nodes.
     variance_note : str
-        Data from which the variances of the odometry are computed, for the user.
+        Source of the variances of odometry, for the user.
     """
     if path.rotation is None:
         return (
@@ -220,15 +219,14 @@ def build_pose_graph(
 UNCORRECTED_LABEL = "uncorrected"
 POSITIONS_CORRECTED_LABEL = "positions corrected in proportion to distance"
 HEADINGS_CORRECTED_LABEL = "positions and headings corrected in proportion to distance"
-# Labels of the path corrections, by the key in results.json
+# Labels of the corrected paths, by their key in results.json
 CORRECTION_LABELS: Mapping[str, str] = {
     "uncorrected": UNCORRECTED_LABEL,
     "by_distance_plain": POSITIONS_CORRECTED_LABEL,
     "by_distance": HEADINGS_CORRECTED_LABEL,
     **{f"pose_graph_{name}": label for name, label in SOLUTION_LABELS.items()},
 }
-# Corrected path and solution of its pose graph (None without a pose graph), or the reason why the
-# corrected path is missing
+# Corrected path with its pose graph solution, if any, or the reason why it is missing
 CorrectionOutcome = tuple[Trajectory, Solution | None] | Unavailable
 
 
@@ -239,7 +237,7 @@ def distribute_closure_error_by_distance(
     heading_error_deg: float | Unavailable,
     landing_closure: Closure | None,
 ) -> dict[CorrectionName, CorrectionOutcome]:
-    """Distribute the closure error along the path, in proportion to the distance flown.
+    """Distribute the loop closure error along the path, in proportion to path length.
 
     Return a path with corrected positions, and a path with corrected positions and headings.
     """
@@ -277,7 +275,7 @@ def _explain_gate_rejection(correction_name: str, closure: Closure) -> Unavailab
 def gate_closures(
     graph: PoseGraph | Unavailable, closures_and_final_poses: Sequence[ClosureAndFinalPose]
 ) -> tuple[Closure, ...]:
-    """Test the loop closures (the last edges of the graph) against odometry with a χ² gate."""
+    """Test the loop closures against odometry with a χ² test."""
     if isinstance(graph, Unavailable):
         return ()
     closure_edges = np.arange(
@@ -310,7 +308,7 @@ def solve_pose_graphs(
     closures: tuple[Closure, ...],
     progress: Callable[[str], None],
 ) -> tuple[dict[CorrectionName, CorrectionOutcome], tuple[Closure, ...]]:
-    """Optimise the pose graph with all closures, with accepted closures only, and robustly.
+    """Optimise the pose graph with all closures, with accepted closures, and robustly.
 
     Return the corrected paths, and the closures with their weights from robust optimisation.
     """
@@ -367,7 +365,7 @@ def solve_pose_graphs(
 def _interpolate_corrections(
     path: Trajectory, node_indices: IntArray, graph_poses: Array, solved_poses: Array
 ) -> Trajectory:
-    """Correct each pose by interpolation between the corrections of neighbouring graph nodes."""
+    """Correct each pose of a path by interpolation of the corrections of the graph nodes."""
     node_corrections = (
         Rotation.from_quat(solved_poses[:, 3:]) * Rotation.from_quat(graph_poses[:, 3:]).inv()
     )
@@ -395,7 +393,7 @@ def score_paths(
     corrected_paths: Mapping[CorrectionName, CorrectionOutcome],
     references: tuple[Trajectory, ...],
 ) -> dict[CorrectionName, PathResult | Unavailable]:
-    """Compute ATE and RPE of odometry and corrected paths, all with the odometry's time offset."""
+    """Compute ATE and RPE of the uncorrected path and of all corrected paths."""
     time_offset_by_reference_s: dict[str, float] = {}
 
     def evaluate_path(path: Trajectory, reference: Trajectory) -> Evaluation | Unavailable:

@@ -1,4 +1,4 @@
-"""Choice of the segment of a trajectory that is analysed as a loop, and its true final pose."""
+"""Start, end and true final pose of a loop."""
 
 from dataclasses import replace
 
@@ -14,11 +14,11 @@ from px4fuse.loop.model import TrueFinalPose
 from px4fuse.request import Landing
 from px4fuse.trajectory.model import MIN_POSES, Trajectory, format_vector, split_by_axis
 
-# Time (s) over which poses on the ground are averaged
+# Time (s) over which poses are averaged on the ground
 REST_DURATION_S = 1.0
 # Maximum extent (m) of the positions of a vehicle at rest
 MAX_POSITION_EXTENT_AT_REST_M = 0.15
-# Maximum heading change (°) of the odometry for which the true heading change is assumed to be zero
+# Maximum heading change (°) of odometry for the assumption that the true change is zero
 MAX_HEADING_CHANGE_ASSUMED_ZERO_DEG = 15.0
 
 
@@ -27,8 +27,10 @@ def cut_trajectory(
 ) -> Trajectory:
     """Return the part of a trajectory in a time segment.
 
-    If ``is_at_rest_at_both_ends``, the first and the last pose are averages over REST_DURATION_S on
-    the ground.
+    Parameters
+    ----------
+    is_at_rest_at_both_ends : bool
+        True to average poses on the ground at both ends.
 
     Raises
     ------
@@ -49,7 +51,7 @@ def cut_trajectory(
     quaternions = None if segment_track.rotation is None else segment_track.rotation.as_quat()
     for index, rest_start_s in ((0, segment.start_s - REST_DURATION_S), (-1, segment.end_s)):
         poses_at_rest = trajectory.cut_to_span(rest_start_s, rest_start_s + REST_DURATION_S)
-        # If the vehicle moves, keep the single pose at this end of the segment instead of the mean
+        # If the vehicle moves, no mean is computed
         if (
             not len(poses_at_rest)
             or np.linalg.norm(np.ptp(poses_at_rest.position_m, axis=0))
@@ -66,19 +68,19 @@ def cut_trajectory(
 def choose_loop_segment(
     flight: Flight | None, trajectory: Trajectory, start_s: float | None, end_s: float | None
 ) -> tuple[Segment, bool]:
-    """Return the segment to analyse, and True if the vehicle is on the ground at both ends.
+    """Return the segment of a loop, and True if the vehicle is on the ground at both ends.
 
     Parameters
     ----------
     flight : Flight or None
-        Flight of the trajectory; None: the segment is the whole trajectory.
+        Flight with take-off and landing times.
     start_s, end_s : float or None
-        Start and end from the user; None: take-off and landing.
+        Start and end from the user.
 
     Raises
     ------
     SettingsError
-        The segment is empty.
+        The trajectory has no poses in the segment.
     """
     segment_start_s, segment_end_s = track_start_s, track_end_s = trajectory.time_s[
         [0, -1]
@@ -114,17 +116,16 @@ def choose_loop_segment(
 
 
 def compute_heading_change_deg(path: Trajectory) -> float | None:
-    """Return final minus initial heading (°), clockwise; None without orientations."""
+    """Return the final heading minus the initial heading (°), clockwise, if known."""
     if path.rotation is None:
         return None
     return float(np.degrees(compute_heading_change_rad(path.rotation[-1] * path.rotation[0].inv())))
 
 
 def assume_landing_at_takeoff(path: Trajectory) -> TrueFinalPose:
-    """Assume that the vehicle landed at the take-off place.
+    """Return the true final pose if the vehicle landed at the take-off place.
 
-    The final heading is assumed equal to the initial heading if the odometry's heading changed by
-    at most MAX_HEADING_CHANGE_ASSUMED_ZERO_DEG. Otherwise, the final heading is unknown.
+    For a small heading change of odometry, the true heading change is assumed to be zero.
     """
     odometry_heading_change_deg = compute_heading_change_deg(path)
     is_same_heading = (
@@ -145,7 +146,7 @@ def assume_landing_at_takeoff(path: Trajectory) -> TrueFinalPose:
 
 
 def convert_measured_final_pose(path: Trajectory, landing: Landing) -> TrueFinalPose:
-    """Convert the landing place from ``--landed-at`` to the frame of the trajectory."""
+    """Convert the measured landing place to the frame of the trajectory."""
     forward_m, right_m, heading_change_deg = structs.astuple(landing)
     heading_rad = 0.0
     if path.rotation is not None:
@@ -168,7 +169,7 @@ def convert_measured_final_pose(path: Trajectory, landing: Landing) -> TrueFinal
 def find_final_pose_in_truth(
     path: Trajectory, truth: Trajectory, segment: Segment, is_at_rest_at_both_ends: bool
 ) -> TrueFinalPose | str:
-    """Return the true final pose in the odometry frame, or the reason why it is unknown."""
+    """Return the true final pose from ground truth, or the reason why it is unknown."""
     try:
         true_path = cut_trajectory(truth, segment, is_at_rest_at_both_ends)
     except TrajectoryError as error:

@@ -23,8 +23,7 @@ from px4fuse.trajectory.graph.model import PoseGraph
 from px4fuse.trajectory.graph.solver import Solution
 from px4fuse.trajectory.model import AxisComponents, Frame, Trajectory, TrajectoryKind
 
-# Name of a correction of the path. The rest of a name after "pose_graph_" is a key of
-# solver.SOLUTION_LABELS
+# Names of the corrected paths
 CorrectionName = Literal[
     "uncorrected",
     "by_distance_plain",
@@ -33,7 +32,7 @@ CorrectionName = Literal[
     "pose_graph_gated",
     "pose_graph_gnc",
 ]
-# ``Closure.source`` of the loop closure between take-off and landing
+# Source of the loop closure between take-off and landing
 LANDING_CLOSURE_SOURCE = "landing"
 
 
@@ -43,15 +42,15 @@ class TrueFinalPose(Record, kw_only=True):
     Attributes
     ----------
     displacement_m : mapping from axis name to float
-        Final position minus initial position.
+        Final position minus initial position (m).
     heading_change_deg : float or None
-        Final heading minus initial heading, clockwise; None if unknown.
+        Final heading minus initial heading (°), clockwise.
     sigma_m, sigma_heading_deg : float
-        Standard deviations of final position per axis and final heading; None: heading unknown.
+        Standard deviations of final position (per axis) and final heading.
     source : str
-        Data from which the final pose is computed, for the user.
+        Origin of the final pose, for the user.
     assumed : bool
-        True if the final position is assumed equal to the initial position.
+        True if the landing place is assumed to be the take-off place.
     """
 
     displacement_m: AxisComponents
@@ -63,22 +62,21 @@ class TrueFinalPose(Record, kw_only=True):
 
     @property
     def displacement_vector_m(self) -> Array:
-        """Final minus initial position (m), in the frame of the trajectory, shape (3,)."""
+        """Final position minus initial position (m), shape (3,)."""
         return np.array(list(self.displacement_m.values()))
 
 
 class OdometryNoise(Record, omit_defaults=False):
-    """Drift of odometry: random walks over distance and over time.
+    """Drift of odometry: random walks of position and heading.
 
-    The defaults are for indoor visual-inertial odometry: about 1 % of the distance (Delmerico and
-    Scaramuzza 2018; Intel's data sheet of the T265).
+    Sources of the defaults: Delmerico and Scaramuzza 2018; Intel's data sheet of the T265.
     """
 
-    # σ of the position per axis after 100 m, without the effect of heading errors
+    # σ (m) of the position per axis after 100 m, without heading errors
     position_m: NotNegative = 1.0
-    # σ of the heading after 100 m
+    # σ (°) of the heading after 100 m
     heading_deg: NotNegative = 3.0
-    # Drift of position (m/√s) and heading (°/√s) over time, for example while hovering
+    # Drift of position (m/√s) and heading (°/√s) over time
     position_m_per_root_s: NotNegative = 0.01
     heading_deg_per_root_s: NotNegative = 0.03
     # Tilt drift divided by heading drift; small, because gravity corrects the tilt
@@ -86,23 +84,23 @@ class OdometryNoise(Record, omit_defaults=False):
 
 
 class Closure(Record, kw_only=True):
-    """Loop closure (two times at one place), and its results in gate and robust optimisation."""
+    """Loop closure (two times at one place), with the result of its χ² test."""
 
-    # Two times at which the vehicle was at the same place, on the clock of the trajectory
+    # Two times (s) at which the vehicle was at the same place
     time_1_s: float
     time_2_s: float
-    # σ of the displacement between the two times, per axis
+    # σ (m) of the displacement between both times, per axis
     sigma_m: NotNegative
-    # "landing": closure between take-off and landing; "given": closure from ``--closure``
+    # "landing": closure of take-off and landing; "given": closure from the user
     source: str
-    # Length of the closure error: displacement by odometry minus true displacement
+    # Closure error (m) of odometry
     distance_m: NotNegative
-    # χ² gate: squared Mahalanobis distance, degrees of freedom, p-value, True for acceptance
+    # χ² test: squared Mahalanobis distance, degrees of freedom, p value, and acceptance
     d2: NotNegative
     degrees_of_freedom: Count
     p: Share
     accepted: bool
-    # Weight of this closure in robust optimisation, 0 to 1; None if it is the only closure
+    # Weight in robust optimisation, from 0 to 1
     weight_gnc: float | None = None
 
     def __str__(self) -> str:
@@ -112,13 +110,12 @@ class Closure(Record, kw_only=True):
 
 
 class PathResult(Record, kw_only=True):
-    """Corrected path, or uncorrected odometry, with ATE and RPE against each reference."""
+    """Path (corrected or not), with ATE and RPE against each reference."""
 
-    # Maximum and RMS distance between corrected and uncorrected positions
+    # Maximum and RMS distance (m) between corrected and uncorrected positions
     correction_max_m: NotNegative
     correction_rms_m: NotNegative
-    # Cost before and after optimisation of the pose graph, number of iterations, and True if the
-    # optimisation converged; None without a pose graph
+    # Results of the pose graph optimisation; None without a pose graph
     cost_initial: NotNegative | None = None
     cost: NotNegative | None = None
     iterations: Count | None = None
@@ -130,20 +127,20 @@ class PathResult(Record, kw_only=True):
 
 
 class Loop(Record, kw_only=True):
-    """Result of ``px4fuse loop``: path, true final pose, loop closure errors and corrections.
+    """Results of a loop analysis: true final pose, loop closure errors and corrected paths.
 
     Attributes
     ----------
     closure_error_m, closure_percent : float or None
-        Distance between final and true final position: in m, and in per cent of the path length.
+        Loop closure error in m, and in per cent of the path length.
     is_absolute_track : bool
-        True if the positions do not drift, because they are from a positioning system.
+        True if the positions do not drift.
     distance_m : ndarray, shape (n,)
-        Path length from the start to each pose, along the key frames.
+        Path length from the start to each pose.
     graph : PoseGraph or Unavailable
-        Pose graph with all closures, before optimisation.
+        Pose graph before optimisation.
     original_frame : Frame
-        Frame of the trajectory before the conversion to z down.
+        Frame before the conversion to z down.
     """
 
     track: str
@@ -176,50 +173,46 @@ class Loop(Record, kw_only=True):
 
     @property
     def odometry(self) -> PathResult:
-        """Odometry from take-off to landing, without correction, in a frame with z down."""
+        """Uncorrected path."""
         return self.find_paths()["uncorrected"]
 
     def find_paths(self) -> dict[CorrectionName, PathResult]:
-        """Return uncorrected odometry and all available corrected paths, by name."""
+        """Return the uncorrected path and all corrected paths, by name."""
         return {
             name: path for name, path in self.corrections.items() if isinstance(path, PathResult)
         }
 
     def select_reported_paths(self) -> tuple[PathResult, ...]:
-        """Return the available paths without duplicates."""
+        """Return the paths without duplicates."""
         duplicate_names: set[CorrectionName] = set()
         if all(closure.accepted for closure in self.closures):
-            # If the gate rejects no closure, this path is equal to "pose_graph_gated"
+            # Without a rejected closure, this path equals "pose_graph_gated"
             duplicate_names.add("pose_graph_all")
         if isinstance(self.heading_error_deg, Unavailable):
-            # Without a heading error, this path is equal to "by_distance_plain"
+            # Without a heading error, this path equals "by_distance_plain"
             duplicate_names.add("by_distance")
         return tuple(
             path for name, path in self.find_paths().items() if name not in duplicate_names
         )
 
     def choose_best_path(self) -> PathResult:
-        """Return the most reliable path.
-
-        It is the pose graph with closures accepted by the χ² gate, else the path corrected by
-        distance, else odometry.
-        """
+        """Return the most reliable of the available paths."""
         names: tuple[CorrectionName, ...] = ("pose_graph_gated", "by_distance", "uncorrected")
         paths = self.find_paths()
         return next(paths[name] for name in names if name in paths)
 
     @property
     def is_end_assumed(self) -> bool:
-        """True if the closure error assumes landing at the take-off place."""
+        """True if the landing place is assumed to be the take-off place."""
         return isinstance(self.true_end, TrueFinalPose) and self.true_end.assumed
 
     def solved_graph(self) -> PoseGraph:
-        """Return the pose graph with all closures and the poses of the best solution.
+        """Return the optimised pose graph.
 
         Raises
         ------
         MissingDataError
-            The graph is missing.
+            There is no pose graph.
         """
         if isinstance(self.graph, Unavailable):
             raise MissingDataError(f"{self.graph.what}: {self.graph.reason}.")

@@ -1,4 +1,4 @@
-"""Trajectories from files, or from tracks of a flight log: odometry, EKF2, KF, ground truth."""
+"""Trajectories from files and flight logs: odometry, EKF2, KF and ground truth."""
 
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -40,10 +40,7 @@ _G2O_TAGS = (b"VERTEX_", b"EDGE_", b"FIX")
 
 
 def find_odometry(flight: Flight) -> PositionTrack | Unavailable:
-    """Return the odometry of a flight: an external vision source with a varying orientation.
-
-    Positioning systems such as UWB send no orientation, or a constant one.
-    """
+    """Return the odometry of a flight: external vision with orientation."""
     for track in flight.positions:
         if track.origin.is_vision and track.orientation is not None:
             return track
@@ -57,13 +54,13 @@ def find_odometry(flight: Flight) -> PositionTrack | Unavailable:
 
 
 def trajectory_of(flight: Flight, track_name: TrackName) -> Trajectory:
-    """Return one track of a flight as a trajectory.
+    """Return a track of a flight as a trajectory.
 
     Parameters
     ----------
     flight : Flight
     track_name : {"vio", "ekf2", "kf", "truth"}
-        Name of the track. "kf" is KF along north, east and down, with the attitude of EKF2.
+        Odometry, EKF2, KF with the attitude of EKF2, or ground truth.
 
     Raises
     ------
@@ -75,7 +72,7 @@ def trajectory_of(flight: Flight, track_name: TrackName) -> Trajectory:
     truth = DIAGNOSIS_WITHHELD if flight.log.is_assessed else flight.truth
     track_data = {"vio": find_odometry(flight), "truth": truth, "ekf2": flight.ekf2}[track_name]
     if isinstance(track_data, PositionTrack):
-        # If the log does not contain the frame, FRD is assumed: x is forward at the start
+        # Without a frame in the log, x is assumed to be forward at the start (FRD)
         frame: Frame = "NED" if track_data.frame == "NED" else "FRD"
         note = f"{track_data.name}: {track_data.description}"
         return _make_trajectory(
@@ -123,7 +120,7 @@ def _make_trajectory(
     notes: tuple[str, ...],
     frame: Frame = "NED",
 ) -> Trajectory:
-    """Make a trajectory at the times of the positions, with interpolated orientations (slerp)."""
+    """Make a trajectory from positions, with orientations interpolated to their times."""
     position_samples = select_valid_rows(position_samples, Columns.POSITION)
     rotation = rotation_variance = None
     if isinstance(orientation, pd.DataFrame):
@@ -168,7 +165,7 @@ def _make_trajectory(
 
 
 def _read_reported_variances(samples: pd.DataFrame, columns: list[str]) -> Array | None:
-    """Return the reported variances, shape (n, 3); None if any value is missing."""
+    """Return reported variances, shape (n, 3), or None if values are missing."""
     if not set(columns) <= set(samples.columns) or samples[columns].isna().to_numpy().any():
         return None
     return samples[columns].to_numpy(np.float64)
@@ -176,7 +173,7 @@ def _read_reported_variances(samples: pd.DataFrame, columns: list[str]) -> Array
 
 @dataclass(frozen=True)
 class LoopSource:
-    """Trajectory, and the flight if the trajectory was read from a flight log."""
+    """Trajectory, with its flight if it is from a flight log."""
 
     trajectory: Trajectory
     flight: Flight | None
@@ -209,16 +206,16 @@ def read_source(
     frame: Frame | None = None,
     system: int | None = None,
 ) -> LoopSource:
-    """Read a trajectory from a file, or a track of a flight log.
+    """Read a trajectory from a file or flight log.
 
     Parameters
     ----------
     argument : str
         ``FILE``, ``LOG:TRACK``, ``TABLE:BODY`` or ``BAG:TOPIC``.
     default : {"vio", "ekf2", "kf", "truth"}, optional
-        Track of a log if ``argument`` contains none; by default odometry, else EKF2's track.
+        Default track of a flight log.
     frame : Frame, optional
-        Frame of a trajectory file; by default detected.
+        Frame of a trajectory file.
     system : int, optional
         MAVLink system id.
 
@@ -238,7 +235,7 @@ def read_source(
             f"{display_name(path)} is a pose graph, not a trajectory.",
             f"Optimise the pose graph with px4fuse loop {display_name(path)}.",
         )
-    if decode_text(file_head) is not None:  # A text file is a trajectory: flight logs are binary
+    if decode_text(file_head) is not None:  # flight logs are binary
         trajectory = read_trajectory(path, track_name)
         return LoopSource(trajectory if frame is None else replace(trajectory, frame=frame), None)
     if frame is not None:

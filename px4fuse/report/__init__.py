@@ -1,1 +1,1 @@
-"""Report: PDF pages and terminal summary."""
+"""Report as PDF, and summary on the terminal."""

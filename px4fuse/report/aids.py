@@ -1,4 +1,4 @@
-"""Report page on EKF2's aiding sources (GNSS, barometer, ...): statistics and innovation plots."""
+"""Report page on the aiding sources of EKF2, with statistics and plots of their innovations."""
 
 from collections.abc import Iterator, Mapping
 
@@ -21,15 +21,14 @@ LEAD_TEXT = (
     "Each aiding source is tested with its innovations in flight: a mean NIS of 1 is expected. "
     "The NIS hardly shows time-correlated errors, wrong delays and wrong headings."
 )
-AID_PANEL_HEIGHT = 21.0  # height (points) of the plot of one aiding source
-MAX_DRAWN_SIGMAS = 4.0  # larger |ν/√S| are drawn as triangles at the edge of the plot
-# Aiding sources of outdoor flights: if EKF2 fused one of these or more, a report has a page on all
-# aiding sources
+AID_PANEL_HEIGHT = 21.0  # points, per aiding source
+MAX_DRAWN_SIGMAS = 4.0  # larger |ν/√S| are triangles at the edge
+# Aiding sources of outdoor flights
 OUTDOOR_AIDS = ("gnss_pos", "gnss_vel", "optical_flow", "aux_global_position")
 
 
 def draw_pages(analysis: Analysis | AidingSourceAnalysis, _: object) -> Iterator[Page]:
-    """Draw the page on aiding sources; in a comparison of KF and EKF2 only for outdoor flights."""
+    """Draw the page on the aiding sources of EKF2."""
     is_comparison = isinstance(analysis, Analysis)
     aids = (
         select_aids_of_outdoor_flight(analysis) if isinstance(analysis, Analysis) else analysis.aids
@@ -42,14 +41,14 @@ def draw_pages(analysis: Analysis | AidingSourceAnalysis, _: object) -> Iterator
 
 
 def select_aids_of_outdoor_flight(analysis: Analysis) -> Mapping[str, AidResult]:
-    """Return all aiding sources if EKF2 fused GNSS or optical flow (outdoor flight), else {}."""
+    """Return all aiding sources if EKF2 fused GNSS or optical flow, else none."""
     aids = {} if isinstance(analysis.aids, Unavailable) else analysis.aids
     enabled_aid_names = {name for name, aid in aids.items() if aid.verdict != "disabled"}
     return {} if enabled_aid_names.isdisjoint(OUTDOOR_AIDS) else aids
 
 
 def write_aids(page: Page, aids: Mapping[str, AidResult]) -> None:
-    """Write a table with a row for each aiding source and axis."""
+    """Write a table of the aiding sources and their innovation statistics."""
     rows: list[list[Cell]] = []
     for aid in aids.values():
         if aid.verdict == "disabled":

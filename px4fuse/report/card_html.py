@@ -1,4 +1,4 @@
-"""Diagnosis card (summary of faults, causes and actions) as HTML, for web pages and notebooks."""
+"""Diagnosis card (faults, causes and actions) as HTML."""
 
 from collections.abc import Sequence
 
@@ -24,8 +24,7 @@ from px4fuse.report.card_text import (
     with_typed_path,
 )
 
-# SVG path of each marker of a σ ratio (actual ÷ reported σ); "below" and "above" mark ratios
-# outside the drawn axis
+# SVG paths of the markers on the axis of σ ratios (actual σ ÷ reported σ)
 MARKER_SVG_PATHS = {
     "source": "M-5.5 0a5.5 5.5 0 1 0 11 0a5.5 5.5 0 1 0-11 0",
     "truth": "M-6.5 0L0-6.5L6.5 0L0 6.5z",
@@ -39,7 +38,7 @@ SCREEN_READER_QUANTITIES = {
 
 
 def make_diagnosis_card(analysis: Analysis) -> Card:
-    """Return the summary of faults, causes and actions of an analysis."""
+    """Return the diagnosis card: faults, causes and actions of an analysis."""
     if analysis.request is None:
         raise SettingsError(
             "A diagnosis card needs the settings of the analysis. This analysis contains none.",
@@ -50,14 +49,14 @@ def make_diagnosis_card(analysis: Analysis) -> Card:
 
 
 def make_card_html(card: Card, *, is_open: bool = False, has_apply_buttons: bool = False) -> str:
-    """Return a summary of faults, causes and actions as an HTML element.
+    """Return a diagnosis card as an HTML element.
 
     Parameters
     ----------
     is_open : bool
         True to show causes and notes without a click.
     has_apply_buttons : bool
-        True to show a button beside each KF command that applies the settings in the command.
+        True to show a button beside each command that changes KF settings.
     """
     return load_template("report/card.html").render(
         card=card,
@@ -76,10 +75,7 @@ def make_card_html(card: Card, *, is_open: bool = False, has_apply_buttons: bool
 
 
 def make_sigma_ratio_html(verdicts: Sequence[Verdict], axis: str, name: str = "") -> str:
-    """Draw ratios "RMS of actual error ÷ reported σ" on a logarithmic axis as an HTML figure.
-
-    ``axis`` is the direction of the errors, as a text; ``name`` identifies the figure for scripts.
-    """
+    """Draw σ ratios (actual σ ÷ reported σ) on a logarithmic axis, as HTML."""
     return load_template("report/card_axis.html").render(
         verdicts=verdicts,
         axis=axis,
@@ -100,7 +96,7 @@ def make_sigma_ratio_html(verdicts: Sequence[Verdict], axis: str, name: str = ""
 
 
 def make_sigma_ratio_figures(analysis: Analysis) -> str:
-    """Return HTML figures of the σ ratios of KF and EKF2, one figure for each axis."""
+    """Draw the σ ratios of KF and EKF2 along each axis, as HTML."""
     return "".join(
         make_sigma_ratio_html(make_sigma_verdicts(result), describe_axis(analysis, result), name)
         for name, result in analysis.axes.items()
@@ -108,18 +104,18 @@ def make_sigma_ratio_figures(analysis: Analysis) -> str:
 
 
 def read_card_css() -> str:
-    """Return the CSS of the diagnosis card; the colours are in another style sheet."""
+    """Return the CSS of the diagnosis card, without its colours."""
     return read_asset("card.css", "px4fuse.report")
 
 
 def make_notebook_html(card: Card) -> str:
-    """Return the diagnosis card as HTML with its CSS, for a notebook."""
+    """Return a diagnosis card as HTML with CSS, for a notebook."""
     colour_css = read_asset("colours.css").replace(":root", ".px4fuse-card")
     return f"<style>{colour_css}{read_card_css()}</style>{make_card_html(card, is_open=True)}"
 
 
 def make_alternative_text(verdicts: Sequence[Verdict]) -> str:
-    """Describe σ ratios and consistency of the filters for screen readers.
+    """Describe the σ ratios of the filters as text, for screen readers.
 
     >>> verdict = Verdict(filter="kf", against="truth", ratio=7.2, word="overconfident")
     >>> make_alternative_text([verdict])
@@ -139,6 +135,5 @@ def make_alternative_text(verdicts: Sequence[Verdict]) -> str:
 
 
 def _format_svg_position(fraction: float) -> str:
-    # SVG positions are percentages, so the axis fits any width without style attributes, which the
-    # security policy of the pages forbids
+    # The security policy of the pages forbids style attributes, so positions are SVG percentages
     return f"{100.0 * min(max(fraction, 0.0), 1.0):.2f}%"

@@ -1,4 +1,4 @@
-"""Diagnosis card (summary of faults, causes and actions) as text of at most 100 columns."""
+"""Diagnosis card (faults, causes and actions) as text of at most 100 columns."""
 
 import json
 import re
@@ -27,13 +27,13 @@ from px4fuse.core.text import format_metres, format_ratio
 from px4fuse.filter.consistency import CONSISTENT_SIGMA_RATIOS, Reference
 from px4fuse.request import quote_command
 
-CARD_WIDTH = 100  # maximum number of characters per line
-AXIS_WIDTH = 37  # number of characters of the axis of σ ratios (actual ÷ reported σ)
-AXIS_INDENT = 58  # number of characters left of the axis of σ ratios
-TEXT_INDENT = 11  # number of characters of a label with the blanks around it
-# Maximum length (characters) of a command beside its label; longer commands get their own line
+CARD_WIDTH = 100  # characters per line
+AXIS_WIDTH = 37  # characters of the axis of σ ratios (actual σ ÷ reported σ)
+AXIS_INDENT = 58  # characters left of the axis of σ ratios
+TEXT_INDENT = 11  # characters of a label with blanks
+# Longer commands (characters) are not beside their label, but on their own line
 MAX_COMMAND_LENGTH = 74
-# Ticks of the axis of σ ratios that have labels
+# Ticks with labels on the axis of σ ratios
 LABELLED_RATIO_TICKS = (0.1, 0.5, 1.0, 2.0, 10.0)
 SYMBOL_BY_REFERENCE = {"source": "●", "truth": "◆"}
 QUANTITY_LABELS = {"source": "● source: innovation ÷ √S", "truth": "◆ ground truth: error ÷ σ"}
@@ -50,7 +50,7 @@ SEVERITY_STYLES = {
     "note": "cyan",
     "clean": "bold green",
 }
-# ASCII replacements of characters, for terminals with an ASCII encoding
+# Replacements of characters that ASCII terminals cannot print
 ASCII_REPLACEMENTS = str.maketrans("░●◆◀▶─÷−–²³×", ":ox<>-/--23x") | str.maketrans(
     {"√": "sqrt ", "σ": "sigma", "→": "->", "°": " deg", "±": "+-", "ν": "nu", "…": "..."}
 )
@@ -61,11 +61,7 @@ AIDS_CAPTION = (
 
 
 class Paragraph(NamedTuple):
-    """Paragraph on the terminal, in a style of the rich package.
-
-    If ``wraps``, the first line begins with ``first_indent``, the other lines with ``indent``.
-    Otherwise the ``plot`` follows the text, if the line is not too long for the terminal.
-    """
+    """Paragraph on the terminal, with its style and indents."""
 
     text: str
     style: str = ""
@@ -124,7 +120,7 @@ def format_card_lines(card: Card) -> Iterator[Paragraph]:
 
 
 def note_texts(card: Card, other_notes_place: str) -> list[str]:
-    """Format at most :data:`MAX_NOTES` notes, and state where the other notes are listed."""
+    """Format the first notes of a diagnosis card, and state where the others are."""
     texts = [
         f"note[{note.id}]: {note.text} {note.action}".rstrip() for note in card.notes[:MAX_NOTES]
     ]
@@ -134,7 +130,7 @@ def note_texts(card: Card, other_notes_place: str) -> list[str]:
 
 
 def format_closing_lines(card: Card) -> Iterator[Paragraph]:
-    """Yield the last lines of a diagnosis card: commands that print details."""
+    """Yield the last lines of a diagnosis card: commands for details."""
     actions = [action for cause in card.causes for _, action in label_alternatives(cause)]
     text = "More: -v."
     if any(action.where == "console" for action in actions):
@@ -145,7 +141,7 @@ def format_closing_lines(card: Card) -> Iterator[Paragraph]:
 
 
 def with_typed_path(card: Card, path: str | None) -> Card:
-    """Replace the file name of the log in all commands of a card by the path that the user typed.
+    """Replace the file name of the log in all commands by the path that the user typed.
 
     >>> from px4fuse.card.model import AnalysisDescription
     >>> action = Action("KF", commands=("px4fuse compare a.ulg --sigma-z 1",), where="shell")
@@ -175,7 +171,7 @@ def to_ascii(text: str) -> str:
 
 
 def format_consistent_ratios() -> str:
-    """Format the σ ratios of a consistent filter: ● position source, ◆ ground truth.
+    """Format the σ ratios of a consistent filter, against source (●) and ground truth (◆).
 
     >>> format_consistent_ratios()
     '● 0.8 to 1.25, ◆ 0.67 to 1.5'
@@ -187,7 +183,7 @@ def format_consistent_ratios() -> str:
 
 
 def draw_sigma_ratio(ratio: float | None, reference: Reference) -> str:
-    """Draw one σ ratio on a logarithmic axis with the band of consistent ratios.
+    """Draw a σ ratio as text on a logarithmic axis with the band of consistent ratios.
 
     >>> draw_sigma_ratio(0.93, "source")
     '────────────────░●░░░────────────────'
@@ -213,11 +209,7 @@ def draw_sigma_ratio(ratio: float | None, reference: Reference) -> str:
 def locate_sigma_ratio(
     ratio: float, reference: Reference, interval: tuple[float, float] | None
 ) -> dict[str, Any]:
-    """Return the positions of a σ ratio, its consistent band and its 95 % interval on the axis.
-
-    Positions are fractions of the axis length. ``mark`` is "below" or "above" if the ratio is
-    outside the axis.
-    """
+    """Return the positions of a σ ratio and its intervals, as fractions of the axis length."""
     fraction = map_ratio_to_axis(ratio)
     return {
         "fraction": fraction,
@@ -247,7 +239,7 @@ def _format_identity_lines(card: Card) -> Iterator[Paragraph]:
 
 
 def format_headline_lines(card: Card) -> Iterator[Paragraph]:
-    """Yield the first line of a diagnosis card: severity, id and title of the worst fault."""
+    """Yield the first line of a diagnosis card: severity and title of the worst fault."""
     label = "ok" if card.severity == "clean" else card.severity
     severity_and_id = f"{label}[{card.id}]" if card.id else label
     yield Paragraph(f"{severity_and_id}: {card.headline}", SEVERITY_STYLES[card.severity])
@@ -265,7 +257,7 @@ def _format_cause_lines(cause: DiagnosedCause) -> Iterator[Paragraph]:
 
 
 def label_alternatives(cause: DiagnosedCause) -> list[tuple[str, Action]]:
-    """Return the actions of a cause; alternative actions begin with "EITHER " or "OR "."""
+    """Return the actions of a cause; alternatives begin with "EITHER " or "OR "."""
     alternatives = [
         ("OR " if place else "EITHER ", action)
         for place, alternative in enumerate(cause.alternatives)
@@ -304,7 +296,7 @@ def _format_rerun_table(reruns: Sequence[Rerun]) -> Iterator[Paragraph]:
 
 
 def make_rerun_columns(reruns: Sequence[Rerun]) -> list[tuple[str, ...]]:
-    """Return the columns (heading, cells) of the table of re-runs with changed settings."""
+    """Return the table columns (heading, cells) of re-runs with changed settings."""
     rows = [
         {
             "re-run (filter, change)": rerun.label,
@@ -402,7 +394,7 @@ def _format_aid_lines(aid_rows: Sequence[AidConsistency]) -> Iterator[Paragraph]
 
 
 def format_spans(cause: DiagnosedCause) -> str:
-    """Format the time from the first to the last occurrence of a fault."""
+    """Format the time from the start of the first to the end of the last occurrence of a fault."""
     if not cause.spans_s:
         return ""
     first_start_s, last_end_s = cause.spans_s[0][0], cause.spans_s[-1][1]

@@ -1,4 +1,4 @@
-"""Texts and plot on the time offset of the position source."""
+"""Report page on the time offset of the position source."""
 
 from collections.abc import Iterable, Iterator
 
@@ -19,11 +19,11 @@ from px4fuse.report.page import Page, draw_legend_above
 from px4fuse.report.style import KF_BAND_COLOUR, TRACK_STYLES, Axes
 from px4fuse.results.contract import ComparisonResults
 
-CURVE_HEIGHT = 170.0  # height (points) of the axes of the log-likelihood
-MAX_DRAWN_DECREASE_NATS = 12.0  # largest drawn decrease of the log-likelihood from its maximum
-# Ratio of the plotted range of the time offset to its 95 % interval
+CURVE_HEIGHT = 170.0  # points
+MAX_DRAWN_DECREASE_NATS = 12.0  # largest drawn decrease of the log-likelihood
+# Plotted range of the time offset, divided by its 95 % interval
 OFFSET_PLOT_WIDTH_RATIO = 2.5
-# Findings for which the report has an appendix on the time offset
+# Faults for which the report has a page on the time offset
 TIME_OFFSET_FINDINGS = ("source_time_offset_changes", "source_time_offset", "ekf2_ev_delay_wrong")
 
 
@@ -50,7 +50,7 @@ def has_time_offset_page(analysis: Analysis, findings: Iterable[Finding]) -> boo
 def make_time_offset_advice(
     comparison: PreparedComparison, time_offset: ClockOffset | Unavailable
 ) -> dict[str, str]:
-    """Return sentences on the time offset of the position source, by label such as "Action"."""
+    """Return texts on the time offset of the position source, by label."""
     if isinstance(time_offset, Unavailable):
         reason, remedy = time_offset.reason, time_offset.remedy
         return {"Offset": f"The time offset cannot be estimated: {reason}. {remedy}"}
@@ -123,7 +123,7 @@ def _format_delay_advice(
 
 
 def draw_pages(analysis: Analysis, results: ComparisonResults) -> Iterator[Page]:
-    """Draw the appendix on a wrong or unknown time offset of the position source."""
+    """Draw the page on a wrong or unknown time offset of the position source."""
     time_offset = analysis.clock
     if isinstance(time_offset, Unavailable) or not has_time_offset_page(analysis, results.findings):
         return
@@ -149,7 +149,7 @@ def draw_pages(analysis: Analysis, results: ComparisonResults) -> Iterator[Page]
 
 
 def draw_offset_likelihood(axes: Axes, time_offset: ClockOffset) -> None:
-    """Draw the log-likelihood of the positions over the time offset, with the 95 % interval."""
+    """Draw the log-likelihood of the positions over the time offset."""
     (low_s, high_s), estimate_s, applied_offset_s = (
         time_offset.interval_s,
         time_offset.offset_s,

@@ -1,4 +1,4 @@
-"""Appendix on the consistency of KF and EKF2: mean NIS, distribution and whiteness tests."""
+"""Report page on the consistency of KF and EKF2: NIS, distribution and whiteness."""
 
 from __future__ import annotations
 
@@ -53,12 +53,12 @@ from px4fuse.report.style import (
 MAX_AUTOCORRELATION_LAG = 20
 MAX_DRAWN_SIGMAS = 4.0
 HISTOGRAM_EDGES = np.linspace(-MAX_DRAWN_SIGMAS, MAX_DRAWN_SIGMAS, 33)
-# Upper limit of the density axis; a higher one would make the normal density (up to 0.4) flat
+# Upper limit of the density axis; the normal density has a maximum of 0.4
 MAX_DENSITY_AXIS_LIMIT = 1.6
-RUNNING_NIS_HEIGHT = 140.0  # height (points) of the axes of the running mean NIS
-DISTRIBUTION_HEIGHT = 150.0  # height (points) of the axes of distribution and autocorrelation
-LEGEND_HEIGHT = 14.0  # height (points) of a legend above the axes
-# Label of each statistic, and exponent that is applied before printing (0.5: square root)
+RUNNING_NIS_HEIGHT = 140.0  # points
+DISTRIBUTION_HEIGHT = 150.0  # points
+LEGEND_HEIGHT = 14.0  # points, of a legend above a plot
+# Label of each statistic, and exponent before printing (0.5: square root)
 STATISTIC_LABELS_AND_EXPONENTS: Mapping[Statistic, tuple[str, float]] = {
     "nis": ("mean NIS", 1.0),
     "nees": ("√NEES", 0.5),
@@ -227,7 +227,7 @@ def _draw_autocorrelation(axes: Axes, innovations: InnovationsByFilter) -> None:
 
 
 def _compute_whiteness_limit(values: pd.Series[float]) -> float:
-    """Return the limit of |autocorrelation| that white noise exceeds at 5 % of the lags."""
+    """Return the limit of the autocorrelation of white noise (95 %)."""
     return float(1.96 / np.sqrt(len(values)))
 
 

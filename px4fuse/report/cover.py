@@ -1,4 +1,4 @@
-"""First page of a report: summary of faults, causes and actions (diagnosis card), and plots."""
+"""First page of a report: diagnosis card (faults, causes and actions), and plots."""
 
 from collections.abc import Iterator, Sequence
 from typing import Any
@@ -39,7 +39,7 @@ from px4fuse.results.contract import AidsResults, ComparisonResults
 
 FlightResults = ComparisonResults | AidsResults
 
-MAX_FILE_NAME_LENGTH = 56  # maximum number of characters of the file name in the page header
+MAX_FILE_NAME_LENGTH = 56  # characters
 TERMS_NOTE = (
     "Source: positions that KF and EKF2 fuse. σ and √S: standard deviations of position and "
     "innovation, as the filter reports them. KF: position and velocity along one axis, IMU "
@@ -53,7 +53,7 @@ ALL_FINDINGS_TITLE = "All findings"
 
 
 def draw_pages(analysis: Analysis | AidingSourceAnalysis, results: FlightResults) -> Iterator[Page]:
-    """Draw the first page: the diagnosis card, and plots in the space below the card."""
+    """Draw the first page: the diagnosis card with plots below."""
     page = Page()
     block = add_card(page, results.card)
     if isinstance(analysis, Analysis):
@@ -62,7 +62,7 @@ def draw_pages(analysis: Analysis | AidingSourceAnalysis, results: FlightResults
 
 
 def add_card(page: Page, card: Card) -> PageBlock:
-    """Add a summary of faults, causes and actions to a page."""
+    """Add a diagnosis card (faults, causes and actions) to a page."""
     identity = card.identity
     flight_texts = (
         identity.firmware,
@@ -111,7 +111,7 @@ def find_free_height(page: Page) -> float:
 
 
 def _shorten_middle(name: str) -> str:
-    """Cut a long file name in its middle.
+    """Shorten a long file name in its middle.
 
     >>> _shorten_middle("2026-04-02_14-13-00_" + "x" * 60 + "_issue.ulg")
     '2026-04-02_14-13-00_xxxxxxx…xxxxxxxxxxxxxxxxxx_issue.ulg'

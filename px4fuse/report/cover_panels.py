@@ -1,7 +1,4 @@
-"""Plots on the first page of a report: map, position errors of KF and EKF2, innovations ÷ √S.
-
-Values outside a plot over time are drawn as triangles at the edge of the plot.
-"""
+"""Plots on the first page of a report: map, position errors, and innovations ÷ √S."""
 
 from __future__ import annotations
 
@@ -40,61 +37,55 @@ from px4fuse.report.panels import add_legend, draw_dots, normalised_innovations
 from px4fuse.report.style import TRACK_STYLES, Axes, draw_curve
 
 POINTS_PER_MM = 72.0 / 25.4
-# Minimum ratio of length to width of a track whose map fills the page width
+# Tracks with a larger ratio of length to width can have a map of full page width
 MIN_ELONGATED_TRACK_RATIO = 2.2
-# Minimum and maximum height (points) of the map, with title and labels
+# Minimum and maximum height (points) of the map
 MAP_HEIGHT_RANGE = 40.0 * POINTS_PER_MM, 53.0 * POINTS_PER_MM
-# Minimum free height (points) on the first page for plots; otherwise they are on the next page
+# With less free height (points) on the first page, the plots are on the next page
 MIN_PLOTS_HEIGHT = 38.0 * POINTS_PER_MM
-# Minimum free height (points) on the first page for a plot of the innovations
+# Minimum free height (points) for a plot of the innovations
 MIN_HEIGHT_FOR_INNOVATION_PLOT = 50.0 * POINTS_PER_MM
-# Minimum and maximum height (points) of the innovation plot, with title and labels
+# Minimum and maximum height (points) of the innovation plot
 INNOVATION_PLOT_HEIGHT_RANGE = 27.0 * POINTS_PER_MM, 38.0 * POINTS_PER_MM
-# Minimum height (points) of each plot of a position error
+# Minimum height (points) of a plot of position errors
 MIN_ERROR_PLOT_HEIGHT = 17.0 * POINTS_PER_MM
-# Total height (points) of the plots if they are on the next page
+# Height (points) of all plots on the next page
 NEXT_PAGE_PLOTS_HEIGHT = 160.0 * POINTS_PER_MM
-TITLE_HEIGHT = 16.5  # height (points) of a title of one line, with its gaps
-TITLE_LINE_HEIGHT = 10.5  # height (points) of each further line of a title
-# Unused height (points) of the page: gap above the legend, and gap below the last plot
+TITLE_HEIGHT = 16.5  # points, for one line with gaps
+TITLE_LINE_HEIGHT = 10.5  # points, for each further line
+# Height (points) of the gaps above and below the plots
 UNUSED_PAGE_HEIGHT = 15.0
-# Minimum height (points) of an innovation plot whose axis has ticks at ±2
+# Minimum height (points) of an innovation plot with ticks at ±2
 MIN_HEIGHT_FOR_TICKS_AT_2_SIGMA = 48.0
-# Minimum width (points) of a plot with six ticks on the time axis
+# Minimum width (points) of a plot with six time ticks
 MIN_WIDE_PLOT_WIDTH = 200.0
-LEFT_MARGIN = 38.0  # width (points) for tick and axis labels left of the axes
-# Height of the innovation plot, as fraction of the height of all plots
+LEFT_MARGIN = 38.0  # points, for labels left of the axes
 INNOVATION_HEIGHT_FRACTION = 0.22
-# Height of the map, as fraction of the height of all plots
 MAP_HEIGHT_FRACTION = 0.25
-# Maximum innovation ÷ √S in the innovation plot; larger values are triangles at the edge
+# Larger innovations ÷ √S are triangles at the edge of the plot
 MAX_DRAWN_SIGMAS = 4.0
-LABELLED_HEIGHT = TICKS_HEIGHT + AXIS_LABEL_HEIGHT  # height (points) of labels below a plot
-# Ratio of the extent of the map to the extent of the tracks
+LABELLED_HEIGHT = TICKS_HEIGHT + AXIS_LABEL_HEIGHT  # points, for labels below a plot
+# Extent of the map divided by the extent of the tracks
 MAP_MARGIN_FACTOR = 1.08
-# Maximum margin of the map around the positions, as a fraction of their extent
+# Maximum margin of the map, as fraction of the extent of the positions
 MAX_MAP_MARGIN_FRACTION = 0.25
 MIN_MAP_EXTENT_M = 0.5
-# If the ratio of largest to smallest σ is below this limit, plot titles state the median of σ,
-# otherwise its range
+# For a smaller ratio of largest to smallest σ, plot titles state the median instead of the range
 MAX_SIGMA_RATIO_SHOWN_AS_MEDIAN = 1.5
-# Time (s) after the start of a filter that is excluded from σ in plot titles
+# Time (s) after the start of a filter that plot titles exclude from σ
 SIGMA_SETTLING_DURATION_S = 2.0
 Coordinates = tuple[Array, Array]
 
 
 class TimePlot(NamedTuple):
-    """Title of a plot over time, and the function that draws the plot."""
+    """Plot over time: title, and function that draws the plot."""
 
     title: str
     draw: Callable[[Axes], None]
 
 
 class FlightMap(NamedTuple):
-    """Tracks seen from above: coordinates (m) to the right and upwards.
-
-    ``x_labels`` are labels of the horizontal axis, the longest first; the first that fits is drawn.
-    """
+    """Tracks seen from above, in m to the right and upwards, with axis labels."""
 
     tracks: Mapping[str, Coordinates]
     x_labels: Sequence[str]
@@ -102,7 +93,7 @@ class FlightMap(NamedTuple):
 
 
 def write_panels(block: PageBlock, analysis: Analysis, card: Card, free_height: float) -> None:
-    """Draw legend, map and plots over time on the first page; ``free_height`` is in points."""
+    """Draw legend, map and plots over time on the first page."""
     page = Page()
     block["blocks"] = page.blocks
     legend = add_legend(page, analysis)
@@ -156,7 +147,7 @@ def write_panels(block: PageBlock, analysis: Analysis, card: Card, free_height: 
 def _draw_plots(
     page: Page, analysis: Analysis, plots: Sequence[TimePlot], plot_heights: Sequence[float]
 ) -> None:
-    """Draw plots over time; their heights (points) include titles and labels."""
+    """Draw plots over time with given heights (points)."""
     for plot, height in zip(plots, plot_heights, strict=True):
         is_last = plot is plots[-1]
         height_below_axes = LABELLED_HEIGHT if is_last else UNLABELLED_HEIGHT
@@ -176,7 +167,7 @@ def _add_panel(page: Page, title: str, axes_height: float) -> Axes:
 def _compute_plot_heights(
     page: Page, plots: Sequence[TimePlot], total_height: float
 ) -> list[float]:
-    """Return heights (points) of plots whose axes are equally high below titles of any length."""
+    """Return heights (points) of plots, so that all axes have the same height."""
     title_heights = [_find_title_height(page, plot.title) for plot in plots]
     axes_height = (total_height - sum(title_heights)) / max(len(plots), 1)
     return [axes_height + title_height for title_height in title_heights]
@@ -187,7 +178,7 @@ def _find_title_height(page: Page, title: str) -> float:
 
 
 def _make_error_plots(analysis: Analysis, card: Card) -> list[TimePlot]:
-    """Return plots of the position errors of KF and EKF2, or of KF - EKF2 without ground truth."""
+    """Return plots of the position errors of KF and EKF2, or of their difference."""
     result, effect = analysis.main.with_whole_flight_tracks(), card.effect
     errors_by_filter = {
         filter_name: errors
@@ -311,7 +302,7 @@ def _make_innovation_plot(result: AxisComparison) -> TimePlot:
 
 
 def _select_map_tracks(analysis: Analysis) -> dict[str, Coordinates]:
-    """Return north and east (m) of positions, KF, EKF2 and ground truth."""
+    """Return the positions, KF, EKF2 and ground truth tracks as north and east (m)."""
     segment, flight = analysis.segment.whole_flight, analysis.flight
 
     def cut_to_flight(track: pd.DataFrame) -> Coordinates:
@@ -331,7 +322,7 @@ def _select_map_tracks(analysis: Analysis) -> dict[str, Coordinates]:
 
 
 def _make_flight_map(analysis: Analysis, card: Card) -> FlightMap:
-    """Return the map with the main flight direction to the right; without it, north is up."""
+    """Return a map with the main flight direction to the right, or with north upwards."""
     aisle_heading_deg = next(
         (line.heading_deg for line in analysis.input_axes if line.name == AISLE), None
     )
@@ -394,7 +385,7 @@ def _compute_map_limits(
     tracks: Mapping[str, Coordinates], aspect_ratio: float
 ) -> tuple[Array, Array]:
     """Return the lower left and the upper right corner of the map (m)."""
-    # clip the tracks: the large errors of a diverged filter would make the flight tiny on the map
+    # Tracks are clipped, because a diverged filter would make the flight tiny on the map
     centres_m, sizes_m = [], []
     for axis_index in (0, 1):
         range_ends_m = [np.percentile(tracks["positions"][axis_index], (1.0, 99.0))]

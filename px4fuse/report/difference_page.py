@@ -1,4 +1,4 @@
-"""Report page that explains the difference between KF and EKF2, setting by setting."""
+"""Report page on the difference between KF and EKF2, and the contribution of each setting."""
 
 from collections.abc import Iterator, Mapping
 from typing import Any
@@ -27,11 +27,11 @@ from px4fuse.report.style import (
 )
 
 TITLE = "Difference between KF and EKF2, setting by setting"
-BAR_ROW_HEIGHT = 12.0  # height (points) of a bar with its gap
-LABEL_WIDTH = 140.0  # width (points) of the labels of bars
-LEFT_COLUMN_FRACTION = 0.62  # fraction of the page width for the column with the labels of bars
-TIME_PLOT_HEIGHT = 105.0  # height (points) of the axes of the difference over time
-# Bar style of an EKF2 setting that increases the difference KF - EKF2 when KF uses the setting
+BAR_ROW_HEIGHT = 12.0  # points
+LABEL_WIDTH = 140.0  # points
+LEFT_COLUMN_FRACTION = 0.62  # fraction of the page width
+TIME_PLOT_HEIGHT = 105.0  # points
+# Style of a bar for a setting that increases the difference KF - EKF2
 INCREASE_BAR_STYLE: dict[str, Any] = {"color": "white", "hatch": "////"}
 
 
@@ -59,10 +59,7 @@ def draw_pages(analysis: Analysis, _: object) -> Iterator[Page]:
 def _select_difference_explanations(
     analysis: Analysis,
 ) -> Mapping[str, DifferenceExplanation | Unavailable]:
-    """Return explanations of the difference KF - EKF2 by axis.
-
-    If the aisle axis is analysed, only its explanation is returned.
-    """
+    """Return the explanations of the difference KF - EKF2, by axis."""
     explanation_by_axis = analysis.difference_steps
     return (
         {AISLE: explanation_by_axis[AISLE]} if AISLE in explanation_by_axis else explanation_by_axis
@@ -76,7 +73,7 @@ def _has_explanation(
 
 
 def write_explanation(page: Page, explanation: DifferenceExplanation | Unavailable) -> None:
-    """Write the explanation of the difference KF - EKF2, or the reason why it is missing."""
+    """Write the explanation of the difference KF - EKF2, or why it is missing."""
     if isinstance(explanation, Unavailable):
         page.write_labelled(
             "KF-EKF2",
@@ -87,7 +84,7 @@ def write_explanation(page: Page, explanation: DifferenceExplanation | Unavailab
 
 
 def describe_missing_explanation(analysis: Analysis) -> str:
-    """Return the reason why the difference KF - EKF2 is not explained; "" if it is explained."""
+    """Return the reason why the difference KF - EKF2 has no explanation, if any."""
     explanation_by_axis = _select_difference_explanations(analysis)
     if isinstance(analysis.flight.ekf2, Unavailable) or _has_explanation(explanation_by_axis):
         return ""
@@ -177,7 +174,7 @@ def _draw_axis_explanation(
 def _draw_waterfall(
     axes: Axes, setting_names: list[str], reductions_percent: Array, unexplained_percent: float
 ) -> None:
-    """Draw the reduction of the mean square difference KF - EKF2 (%) by each replaced setting."""
+    """Draw the contribution (%) of each setting to the mean square difference KF - EKF2."""
     bar_ends = 100.0 - np.concatenate([[0.0], np.cumsum(reductions_percent)])
     row_count, right_end = len(setting_names) + 2, max(100.0, float(bar_ends.max()))
     kf_bar_style: dict[str, Any] = {"height": 0.7, "edgecolor": KF_COLOUR, "lw": 0.6}

@@ -1,4 +1,4 @@
-"""Page on trajectory errors: map coloured by error, APE and RPE."""
+"""Report page on trajectory errors: map, APE and RPE."""
 
 from collections.abc import Iterator
 from typing import Any
@@ -16,22 +16,22 @@ from px4fuse.trajectory.evaluation import AbsoluteError, Evaluation
 from px4fuse.trajectory.model import AXES_OF_FRAME, Trajectory
 from px4fuse.trajectory.scores import RelativeError, RmseInterval, Statistics
 
-# Indices of the position axes that are drawn to the right and upwards on a map; default (0, 1)
+# Indices of the position axes to the right and upwards on a map, by frame
 MAP_AXIS_INDICES = {"NED": (1, 0), "FRD": (1, 0), "camera": (0, 2)}
-# Minimum ratio of a pose interval to the median pose interval for a gap in the drawn path
+# Minimum pose interval of a gap in the drawn path, in median intervals
 MIN_GAP_INTERVAL_RATIO = 10.0
-MAX_PATH_POINTS = 1200  # maximum number of drawn points of a path
-MIN_ERROR_RANGE_M = 1e-3  # minimum range (m) of an error axis, so that rounding errors look small
-ERROR_PLOT_HEIGHT = 76.0  # height (points) of the axes of APE and RPE
-MAP_HEIGHT = 128.0  # height (points) of the axes of a map
-LABEL_MARGIN = 34.0  # width (points) of the labels of the vertical axis of a map
-COLOUR_BAR_MARGIN = 40.0  # width (points) of the colour bar with its labels
+MAX_PATH_POINTS = 1200  # maximum per path
+MIN_ERROR_RANGE_M = 1e-3  # so that rounding errors look small
+ERROR_PLOT_HEIGHT = 76.0  # points
+MAP_HEIGHT = 128.0  # points
+LABEL_MARGIN = 34.0  # points, left of a map
+COLOUR_BAR_MARGIN = 40.0  # points
 REFERENCE_LINE_STYLE = style.line_style(TRUTH_COLOUR, 0.8, (0, (4, 2)))
 STATISTIC_LINES = (
     ("max", "max", style.line_style(MUTED_COLOUR, 0.8, (0, (1, 1.5)))),
     ("rmse", "RMSE", style.line_style(EKF2_COLOUR, 1.4)),
 )
-NEGLIGIBLE_ERROR_M = 1e-6  # maximum position error (m) that rounding can cause
+NEGLIGIBLE_ERROR_M = 1e-6  # smaller errors can be rounding errors
 
 
 def draw_pages(evaluation: Evaluation, _: object) -> Iterator[Page]:
@@ -48,7 +48,7 @@ def draw_pages(evaluation: Evaluation, _: object) -> Iterator[Page]:
 
 
 def _draw_maps(page: Page, evaluation: Evaluation) -> None:
-    """Draw both paths from above before the alignment, and the aligned path coloured by error."""
+    """Draw both paths before alignment, and the aligned path coloured by error."""
     frame, is_aligned = evaluation.reference_track.frame, evaluation.alignment != "none"
     axis_indices = list(MAP_AXIS_INDICES.get(frame, (0, 1)))
     names = [AXES_OF_FRAME[frame][index] for index in axis_indices]
@@ -72,7 +72,7 @@ def _draw_maps(page: Page, evaluation: Evaluation) -> None:
     _draw_path(axes, evaluation, axis_indices)
     style.set_map_axes(axes, *names)
     right_column.write_small_text("Darker poses have a larger error; × marks the largest one.")
-    # one legend for both maps, so that the reference has one entry
+    # both maps share one legend
     page.add_legend([*(_get_legend_handles(axes) | unaligned_legend_handles).values()])
     page.add_columns(*[left_column] * is_aligned, right_column)
 
@@ -90,7 +90,7 @@ def _draw_path(axes: Axes, evaluation: Evaluation, axis_indices: list[int]) -> N
         path_m[::stride, 1],
         c=error_m[::stride],
         s=9.0,
-        cmap="copper_r",  # colours from light to dark, which differ in greyscale too
+        cmap="copper_r",  # differs in greyscale too
         linewidths=0,
         vmin=0.0,
         vmax=max(float(error_m.max()), MIN_ERROR_RANGE_M),
@@ -126,7 +126,7 @@ def _draw_ape_and_rpe(page: Page, evaluation: Evaluation) -> None:
 
 
 def draw_ape(axes: Axes, evaluation: Evaluation, x_values: Array, label: str) -> None:
-    """Draw the APE with its RMSE and maximum as horizontal lines."""
+    """Draw the absolute pose error (APE), with its RMSE and maximum as horizontal lines."""
     error_m, x_start, x_end = evaluation.position_error_m, float(x_values[0]), float(x_values[-1])
     drawn_x, drawn_errors_m = style.decimate_series(x_values, error_m, style.MAX_NARROW_AXES_POINTS)
     gap_indices = np.searchsorted(drawn_x, x_values[_find_gap_indices(evaluation.time_s)])
@@ -166,7 +166,7 @@ def _find_gap_indices(time_s: Array) -> IntArray:
 
 
 def plot_path(axes: Axes, positions_m: Array, time_s: Array, **style: Any) -> None:
-    """Draw a path, shape (n, 2), with gaps where the time has gaps."""
+    """Draw a path, shape (n, 2), with its gaps in time."""
     gap_indices, count = _find_gap_indices(time_s), len(positions_m)
     evenly_spaced_indices = np.linspace(0, count - 1, min(count, MAX_PATH_POINTS)).astype(np.intp)
     drawn_indices = np.unique(np.concatenate([evenly_spaced_indices, gap_indices]))
@@ -175,13 +175,13 @@ def plot_path(axes: Axes, positions_m: Array, time_s: Array, **style: Any) -> No
 
 
 def compute_time_origin_s(evaluation: Evaluation) -> float:
-    """Return the time of the first pose (s) if timestamps are UNIX time, else 0."""
+    """Return the time (s) of the first pose if times are UNIX time, else 0."""
     start_s = float(evaluation.time_s[0])
     return start_s if start_s > MIN_UNIX_TIME_S else 0.0
 
 
 def summarise_ate(evaluation: Evaluation) -> str:
-    """Summarise ATE and largest position error in one line."""
+    """Summarise ATE and largest position error."""
     worst_index = int(np.argmax(evaluation.position_error_m))
     preposition = "without" if evaluation.alignment == "none" else "after"
     error, time_s = (
@@ -247,7 +247,7 @@ def describe_unaligned_rmse(evaluation: Evaluation) -> str:
 
 
 def describe_rpe_growth(rpe: tuple[RelativeError, ...]) -> str:
-    """Return the caption of the RPE plot: growth of the RPE with distance or time."""
+    """Describe the growth of the relative pose error (RPE) with distance or time."""
     interval_note = "RMSE with its 95 % interval."
     rmse_by_unit_and_delta: dict[tuple[str, float], float] = {
         (error.unit, error.delta): error.translation_m.rmse

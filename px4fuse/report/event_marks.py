@@ -1,4 +1,4 @@
-"""Drawing of events on the time axes of plots: gaps, resets, rejections, outliers."""
+"""Events in plots over time: gaps, resets, rejections and outliers."""
 
 from collections.abc import Sequence
 from typing import Any, NamedTuple
@@ -17,7 +17,7 @@ from px4fuse.report.style import (
     label_time_axis,
 )
 
-# Bands differ in shade and hatching, so they remain distinct in greyscale
+# The bands differ in shade and hatching, because reports may be printed in greyscale
 _BAND_STYLE: dict[str, Any] = {"edgecolor": "none", "lw": 0.0}
 ON_GROUND_BAND_STYLE = _BAND_STYLE | {"facecolor": "#e4e4e4"}
 DROPOUT_BAND_STYLE = _BAND_STYLE | {"facecolor": "#a8a8a8"}
@@ -28,14 +28,17 @@ TAKE_OFF_MARKER_STYLE, LANDING_MARKER_STYLE = (
     dot_style("black", "*", 6.0),
     dot_style("black", "P", 5.0),
 )
-# At most one marker is drawn for events within this fraction of the analysed time span
+# Minimum interval between two markers, as fraction of the plotted time
 MIN_MARKER_INTERVAL_FRACTION = 1.0 / 300.0
 
 
 class EventMarkers(NamedTuple):
-    """Events of one type in a plot over time.
+    """Events of one type as markers or bands in a plot over time.
 
-    Markers at ``height``, a fraction of the axes; full-height bands if ``height`` is None.
+    Attributes
+    ----------
+    height : float or None
+        Height of markers as fraction of the axes; None for bands.
     """
 
     label: str
@@ -61,10 +64,7 @@ def _make_event_markers(
 
 
 def draw_event_markers(axes: Axes, analysis: Analysis, *, axis: str | None = None) -> None:
-    """Draw gaps, resets, rejections and outliers on a time axis.
-
-    Rejections are those along ``axis``; None is the main axis, "" draws no rejections.
-    """
+    """Draw gaps, resets, rejections and outliers on a time axis."""
     from matplotlib.collections import PolyCollection  # noqa: PLC0415
     from matplotlib.lines import Line2D  # noqa: PLC0415
 
@@ -95,7 +95,7 @@ def draw_event_markers(axes: Axes, analysis: Analysis, *, axis: str | None = Non
                 zorder=2.6,
                 clip_on=height > 0.0,
             )
-            axes.add_artist(markers)  # unlike add_line, add_artist does not change the axis limits
+            axes.add_artist(markers)  # keeps the axis limits, unlike add_line
 
 
 def add_panel(
@@ -108,7 +108,7 @@ def add_panel(
     with_time_label: bool = True,
     **options: Any,
 ) -> Axes:
-    """Add a plot over time that also shows gaps, resets, rejections and outliers."""
+    """Add a plot over time with gaps, resets, rejections and outliers."""
     axes = page.add_panel(title, height, **options)
     draw_event_markers(axes, analysis, axis=axis)
     label_time_axis(axes, with_time_label)
@@ -116,7 +116,7 @@ def add_panel(
 
 
 def find_outlier_times(analysis: Analysis) -> Array:
-    """Return the times (s) of the outliers found by noise estimation."""
+    """Return the times (s) of outliers of the position source."""
     tunings = map(analysis.tuning.get, (HORIZONTAL, analysis.main.axis.name))
     times_s = [tuning.outlier_time_s for tuning in tunings if isinstance(tuning, AxisTuning)]
     outlier_times_s: Array = np.unique(np.concatenate([[], *times_s]))
@@ -124,7 +124,7 @@ def find_outlier_times(analysis: Analysis) -> Array:
 
 
 def make_legend_entries(analysis: Analysis) -> list[Artist]:
-    """Return a legend entry for each type of event in this flight."""
+    """Return a legend entry for each type of event in the flight."""
     from matplotlib.lines import Line2D  # noqa: PLC0415
     from matplotlib.patches import Patch  # noqa: PLC0415
 
@@ -141,7 +141,7 @@ def make_legend_entries(analysis: Analysis) -> list[Artist]:
 
 
 def select_marker_times(times: Any, min_interval_s: float) -> Array:
-    """Keep one time (s) per interval, so that drawn markers do not overlap."""
+    """Keep one time (s) per interval, so that markers do not overlap."""
     times_s = np.asarray(times, dtype=np.float64)
     kept_times_s: Array = times_s[
         np.unique(np.floor(times_s / min_interval_s), return_index=True)[1]

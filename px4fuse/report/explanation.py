@@ -1,4 +1,4 @@
-"""Terminal output of ``px4fuse explain``: catalogue of the findings."""
+"""Terminal output of ``px4fuse explain``: detectable faults and their meaning."""
 
 from px4fuse.core.text import capitalise_first
 from px4fuse.errors import SettingsError, suggest_name
@@ -8,7 +8,7 @@ from px4fuse.report.page import Page
 
 
 def make_findings_list() -> Page:
-    """List the ids and titles of all findings (detectable faults), by group."""
+    """List all detectable faults (findings)."""
     page = Page()
     for group in FINDING_GROUPS:
         page.write_heading(capitalise_first(group))
@@ -22,12 +22,12 @@ def make_findings_list() -> Page:
 
 
 def make_finding_page(finding_id: str) -> Page:
-    """Format meaning, example, causes, effects and error rates of a finding (detectable fault).
+    """Explain a detectable fault (finding): meaning, example, causes and effects.
 
     Raises
     ------
     SettingsError
-        There is no finding with this id.
+        The id is unknown.
     """
     name = finding_id.lower().replace("-", "_")
     if name not in FINDING_CATALOGUE:

@@ -1,4 +1,4 @@
-"""Pages on the flight: position, velocity, innovations and σ of KF and EKF2 over time."""
+"""Report pages on position, velocity, innovations and σ of KF and EKF2 over time."""
 
 from collections.abc import Iterator
 
@@ -16,9 +16,9 @@ from px4fuse.report.page import COLUMN_GAP, PAGE_WIDTH, Page
 from px4fuse.report.phrases import get_statistics_by_filter, list_verdict_warnings
 from px4fuse.report.style import EKF2_COLOUR, KF_COLOUR, Axes
 
-ZOOM_UPDATE_COUNT = 15  # number of updates in the enlarged plot of σ_p
-MIN_ZOOM_S = 1.0  # minimum duration (s) of the enlarged plot of σ_p
-ENLARGED_PLOT_HEIGHT = 125.0  # height (points) of the axes of the enlarged plot of σ_p
+ZOOM_UPDATE_COUNT = 15  # in the enlarged plot of σ of position
+MIN_ZOOM_S = 1.0  # minimum duration of the enlarged plot
+ENLARGED_PLOT_HEIGHT = 125.0  # points
 
 
 def draw_pages(analysis: Analysis, _: object) -> Iterator[Page]:
@@ -33,7 +33,7 @@ def draw_pages(analysis: Analysis, _: object) -> Iterator[Page]:
 
 
 def draw_innovations(analysis: Analysis, _: object) -> Iterator[Page]:
-    """Draw innovations, σ_p and σ_v along the main axis over time, and σ_p over a few updates."""
+    """Draw innovations and σ along the main axis over time."""
     result = analysis.main
     page = Page(f"Innovations and variances along {result.axis.label}")
     for panel in (
@@ -51,7 +51,7 @@ def draw_innovations(analysis: Analysis, _: object) -> Iterator[Page]:
 
 
 def _draw_enlarged_sigma_plot(page: Page, analysis: Analysis) -> None:
-    """Draw the growth of σ_p by predictions and its reduction by updates over a few seconds."""
+    """Draw σ of position over a few updates."""
     result = analysis.main
     start_s, end_s = zoom_span_s = find_zoom_span(result, analysis.segment)
     title = f"σ of position (m), {end_s - start_s:.1f} s of the flight"
@@ -74,7 +74,7 @@ def _draw_enlarged_sigma_plot(page: Page, analysis: Analysis) -> None:
 
 
 def find_zoom_span(result: AxisComparison, segment: Segment) -> Span:
-    """Return start and end (s) of a few updates in the middle of the flight."""
+    """Return the start and end (s) of a few updates in the middle of the flight."""
     update_times_s = result.replay.updates.index.to_numpy()
     if len(update_times_s) < 2:
         return segment.start_s, min(segment.start_s + MIN_ZOOM_S, segment.end_s)
@@ -93,7 +93,7 @@ def find_zoom_span(result: AxisComparison, segment: Segment) -> Span:
 def _draw_sigma_at_updates(axes: Axes, result: AxisComparison, zoom_span_s: Span) -> None:
     updates, steps = result.replay.updates, result.replay.steps
     variances_m2 = pd.concat([updates["prior_position_variance_m2"], steps["position_variance_m2"]])
-    # a stable sort keeps the prior variance before the posterior variance of the same update
+    # A stable sort keeps the prior variance before the posterior variance
     variances_m2 = variances_m2.sort_index(kind="stable").loc[slice(*zoom_span_s)]
     dots = style.dot_style(KF_COLOUR, ".", 2.4) | {"ls": "-", "lw": 1.1}
     axes.plot(variances_m2.index, np.sqrt(variances_m2), **dots)
@@ -139,7 +139,7 @@ def describe_sigma_at_updates(result: AxisComparison) -> str:
 
 
 def draw_other_axes(analysis: Analysis, _: object) -> Iterator[Page]:
-    """Draw one column for each axis other than the main axis."""
+    """Draw position, velocity, innovations and σ along the other axes."""
     secondary_axes = analysis.select_secondary_axes()
     if not secondary_axes:
         return

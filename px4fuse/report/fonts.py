@@ -1,7 +1,4 @@
-"""Fonts for names and notes in any script, and characters that no installed font has.
-
-Typst shapes the text (Arabic, Devanagari, Thai); it only needs fonts with the characters.
-"""
+"""Fonts for texts in any script."""
 
 from functools import cache
 from pathlib import Path
@@ -11,7 +8,7 @@ from matplotlib.font_manager import FontEntry, FontPath
 
 from px4fuse.report.style import FONT
 
-# Words in the names of placeholder fonts, which draw each character as a box
+# Names of placeholder fonts, which draw each character as a box
 PLACEHOLDER_FONT_WORDS = ("lastresort", "last resort", "blank", "notdef")
 MISSING_GLYPH_SYMBOL = "\N{WHITE SQUARE}"
 MAX_LISTED_CHARACTERS = 12
@@ -19,7 +16,7 @@ MAX_LISTED_CHARACTERS = 12
 
 @cache
 def find_font(character: str) -> str | None:
-    """Return the name of an installed font with a character, preferably DejaVu Sans, or None."""
+    """Return the name of an installed font with a character, or None."""
     if ord(character) in _read_font_characters(font_manager.findfont(FONT)):
         return FONT
     return next(
@@ -33,7 +30,7 @@ def find_font(character: str) -> str | None:
 
 
 def find_font_names(text: str) -> list[str]:
-    """Return the names of the fonts for a text, DejaVu Sans first."""
+    """Return the names of the fonts that a text needs."""
     return list(
         dict.fromkeys([FONT, *filter(None, map(find_font, _find_non_ascii_characters(text)))])
     )
@@ -50,7 +47,7 @@ def find_font_folders(names: tuple[str, ...]) -> list[str]:
 
 
 def find_missing_characters(text: str) -> str:
-    """Return each character of a text for which no font is installed."""
+    """Return the characters of a text that no installed font contains."""
     return "".join(
         character for character in _find_non_ascii_characters(text) if find_font(character) is None
     )
@@ -80,7 +77,7 @@ def _list_fonts_except_dejavu() -> tuple[tuple[str, FontPath], ...]:
         try:
             manager.addfont(path)
         except (OSError, RuntimeError, NotImplementedError):
-            continue  # a font that matplotlib cannot read is not used
+            continue  # matplotlib cannot read this font
     entries = [
         entry
         for entry in manager.ttflist
@@ -94,9 +91,9 @@ def _list_fonts_except_dejavu() -> tuple[tuple[str, FontPath], ...]:
 
 
 def _font_sort_key(entry: FontEntry) -> tuple[object, ...]:
-    """Return a key that sorts Noto Sans first, then sans serif, then fonts of regular weight.
+    """Return a sort key for fonts, by preference.
 
-    PostScript fonts are last: they are embedded as TrueType, which some PDF viewers do not display.
+    PostScript fonts are last, because some PDF viewers do not display them.
     """
     weight = entry.weight if isinstance(entry.weight, int) else 400
     return (

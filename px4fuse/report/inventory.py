@@ -14,7 +14,7 @@ SOURCES_HEAD = ("data", "topic", "samples", "rate (Hz)", "gaps", "span (s)")
 
 
 def make_log_page(inventory: Inventory, request: ComparisonRequest) -> Page:
-    """List the contents of a log, the possible analyses, and the ``compare`` command."""
+    """List the contents of a log and the possible analyses."""
     page = Page()
     page.write(inventory.flight.log.name, bold=True)
     for label, text in _describe_log(inventory):
@@ -34,7 +34,7 @@ def make_log_page(inventory: Inventory, request: ComparisonRequest) -> Page:
         for option in inventory.abilities
     ]
     page.add_table(("possible", "analysis", ""), rows)
-    if inventory.abilities[0].possible:  # the first analysis is the comparison of KF and EKF2
+    if inventory.abilities[0].possible:  # comparison of KF and EKF2
         command = command_line(request, "compare", for_shell=True)
         page.add("command", text=command, label="Run")
     texts_by_label = {
@@ -124,7 +124,6 @@ def _make_source_rows(inventory: Inventory) -> Iterator[tuple[Cell, ...]]:
         data_type = source.part if source.part != previous_data_type else ""
         previous_data_type = source.part
         if source.unavailable:
-            # another table contains the reason for the missing data
             yield (data_type, ("none", MUTED_COLOUR), *("" for _ in SOURCES_HEAD[2:]))
             continue
         yield (
@@ -146,7 +145,6 @@ def _format_gaps(source: LoggedData) -> str:
 
 
 def _format_for_narrow_column(value: float) -> str:
-    """Format a rate (Hz) or time (s) with two or more digits, for a narrow column."""
     return f"{value:.{2 if value < 1 else 1 if value < 10 else 0}f}"
 
 

@@ -1,4 +1,4 @@
-"""Report page on a loop flight: closure error, corrected paths and errors against references."""
+"""Report page on a loop flight: loop closure error and corrected paths."""
 
 from collections.abc import Iterator
 
@@ -53,11 +53,11 @@ TRACK_TEXT_BY_KIND = {
     "unknown": "trajectory from an unknown source",
 }
 TITLE = "Loop closure"
-MAP_HEIGHT = 290.0  # height (points) of the axes of the map
+MAP_HEIGHT = 290.0  # points
 
 
 def draw_pages(analysis: Analysis, _: object) -> Iterator[Page]:
-    """Draw the appendix on loop closure if the flight contains a loop."""
+    """Draw the page on loop closure if the flight contains a loop."""
     if isinstance(analysis.loop, Loop):
         page = Page(make_appendix_title(TITLE), LEAD_TEXT)
         _write_page(page, analysis.loop)
@@ -65,7 +65,7 @@ def draw_pages(analysis: Analysis, _: object) -> Iterator[Page]:
 
 
 def draw_report(loop: Loop, results: LoopResults) -> Iterator[Page]:
-    """Draw the report page of ``px4fuse loop``, with the detected faults (findings)."""
+    """Draw the report page of ``px4fuse loop``."""
     page = Page(TITLE, LEAD_TEXT)
     if student := format_student(results.student, ", "):
         page.write_labelled("Student", student)
@@ -90,7 +90,7 @@ def _write_page(page: Page, loop: Loop) -> None:
 
 
 def draw_map(axes: Axes, loop: Loop) -> None:
-    """Draw the uncorrected and corrected paths from above, with the closure error as an arrow."""
+    """Draw the uncorrected and corrected paths from above, and the loop closure error."""
     odometry_path = loop.odometry.trajectory
     axis_names = AXES_OF_FRAME[odometry_path.frame]
     _draw_reference(axes, loop)
@@ -133,7 +133,7 @@ def _draw_reference(axes: Axes, loop: Loop) -> None:
 
 
 def make_loop_page(loop: Loop, findings: tuple[Finding, ...]) -> Page:
-    """Make the terminal output on a loop: closure error, corrected paths and detected faults."""
+    """Make the terminal output of ``px4fuse loop`` for a trajectory."""
     page = Page()
     write_loop(page, loop)
     write_closures_and_rpe(page, loop)
@@ -142,7 +142,7 @@ def make_loop_page(loop: Loop, findings: tuple[Finding, ...]) -> Page:
 
 
 def write_loop(page: Page, loop: Loop) -> None:
-    """Write the closure error, the test of the closure, and the ATE of each corrected path."""
+    """Write the loop closure error, and the ATE of each path."""
     odometry = loop.odometry.trajectory
     true_end = loop.true_end
     text_by_label = {
@@ -186,7 +186,7 @@ def write_loop(page: Page, loop: Loop) -> None:
 
 
 def write_closures_and_rpe(page: Page, loop: Loop) -> None:
-    """Write a table of the loop closures, and a table of the RPE against each reference."""
+    """Write tables of the loop closures and of the RPE."""
     rows: list[list[Cell]] = []
     for closure in loop.closures:
         cells = [
@@ -274,7 +274,7 @@ def describe_gate(closure: Closure) -> str:
 
 
 def format_closure_times(closure: Closure, loop: Loop) -> str:
-    """Format the times of the two poses of a loop closure (s)."""
+    """Format the two times (s) of a loop closure."""
     if closure.source == LANDING_CLOSURE_SOURCE:
         return "take-off and landing"
     time_origin_s = loop.start_s if loop.start_s > MIN_UNIX_TIME_S else 0.0
@@ -282,7 +282,7 @@ def format_closure_times(closure: Closure, loop: Loop) -> str:
 
 
 def explain_distance_correction(loop: Loop) -> str:
-    """Explain the correction of the path in proportion to distance; "" if it was not made."""
+    """Explain the correction of the path in proportion to distance, if it was made."""
     if "by_distance_plain" not in loop.find_paths():
         return ""
     heading_error_deg = loop.heading_error_deg
@@ -319,7 +319,7 @@ def _format_rmse(statistics: Statistics | Unavailable, digits: int = 3) -> str:
 
 
 def make_pose_graph_page(solved_graph: Graph) -> Page:
-    """Make the terminal output on a pose graph: tested closures, solver and costs."""
+    """Make the terminal output of ``px4fuse loop`` for a pose graph."""
     page, gates = Page(), solved_graph.gates
     page.write_labelled(
         "Graph",

@@ -1,7 +1,4 @@
-"""Report page with a student's answers to an assignment and notes (Markdown).
-
-HTML tags are removed, and pictures are not loaded.
-"""
+"""Report page with a student's answers and notes (Markdown)."""
 
 from __future__ import annotations
 
@@ -23,15 +20,15 @@ if TYPE_CHECKING:
     from markdown_it.tree import SyntaxTreeNode
 
 HEADING_FONT_SIZES = {"h1": 12.0, "h2": 10.8, "h3": 9.6}
-INDENT = 12.0  # indent (points) of each list level
-MAX_INDENTS = 8  # maximum number of drawn list levels; deeper levels are not indented further
-# Maximum depth of nested Markdown: each level needs three levels of Python's stack of 1000
+INDENT = 12.0  # points, per list level
+MAX_INDENTS = 8  # deeper list levels are not indented further
+# Deeper Markdown would exceed Python's recursion limit
 MAX_NESTING_DEPTH = 100
 TAG_PATTERN = re.compile(r"<!--.*?-->|<[^>]*>", re.DOTALL)
 
 
 def draw_pages(analysis_or_loop: object, results: FlightResults | LoopResults) -> Iterator[Page]:
-    """Yield a page with the student's answers and notes, or nothing if there are none."""
+    """Draw a page with the student's answers and notes, if any."""
     title, answers = "Student notes", results.student.answers
     page = Page(make_appendix_title(title) if isinstance(analysis_or_loop, Analysis) else title)
     if isinstance(answers, Answers):
@@ -57,14 +54,14 @@ def write_markdown(page: Page, notes: str) -> None:
 
 
 def parse_markdown(notes: str, name: str = "the notes") -> list[Token]:
-    """Parse Markdown into tokens; ``name`` names the text in error messages.
+    """Parse Markdown into tokens.
 
     Raises
     ------
     SettingsError
-        Emphasis, lists and quotes are nested deeper than :data:`MAX_NESTING_DEPTH`.
+        Emphasis, lists and quotes are nested too deep.
     """
-    # imported here, because reports without notes do not need it (20 ms)
+    # slow import (20 ms)
     from markdown_it import MarkdownIt  # noqa: PLC0415
 
     markdown_parser = MarkdownIt("commonmark", {"html": True}).enable(["table", "strikethrough"])
@@ -109,7 +106,7 @@ def _write_blocks(page: Page, node: SyntaxTreeNode, indent_level: int, marker: s
                 page.add_table(head, body_rows, column_widths=[1.0] * len(head))
             case "html_block":
                 page.write(TAG_PATTERN.sub("", child.content).strip(), indent=indent)
-            case _:  # paragraph; a horizontal rule, which has no text, is omitted
+            case _:  # paragraph, or horizontal rule without text
                 page.write(
                     _inline_text(child),
                     indent=indent,

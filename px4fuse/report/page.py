@@ -1,7 +1,4 @@
-"""Pages of reports: ordered blocks of titles, text, tables and plots.
-
-``report.typ`` typesets the blocks as PDF, :mod:`px4fuse.report.screen` prints them on the terminal.
-"""
+"""Page of a report: titles, texts, tables and plots, for PDF and terminal."""
 
 from __future__ import annotations
 
@@ -14,26 +11,26 @@ from px4fuse.core.text import with_log_name
 from px4fuse.report.style import FONT, MUTED_COLOUR, Artist, Axes
 from px4fuse.report.ticks import replace_ticks
 
-PAGE_WIDTH = 178.0 * 72.0 / 25.4  # width (points) of the text on a page
-COLUMN_GAP = 5.0 * 72.0 / 25.4  # gap (points) between two columns
-LABEL_WIDTH = 52.0  # width (points) of the column of labels beside texts
-AXES_LEFT_MARGIN = 30.0  # width (points) for the tick labels left of the axes
-AXES_RIGHT_MARGIN = 8.0  # margin (points) right of the axes
-LEGEND_LINE_HEIGHT = 12.0  # height (points) of one line of a legend
-LEGEND_HANDLE_WIDTH = 30.0  # width (points) of the line sample and the gaps of a legend entry
-TICKS_HEIGHT = 12.0  # height (points) of the tick labels below the axes
-AXIS_LABEL_HEIGHT = 12.5  # height (points) of the axis label below the tick labels
-UNLABELLED_HEIGHT = 3.0  # free height (points) below axes without tick labels
-# Characters that are printed although str.isprintable is False for them
+PAGE_WIDTH = 178.0 * 72.0 / 25.4  # points
+COLUMN_GAP = 5.0 * 72.0 / 25.4  # points, between two columns
+LABEL_WIDTH = 52.0  # points, of the labels beside texts
+AXES_LEFT_MARGIN = 30.0  # points, for tick labels
+AXES_RIGHT_MARGIN = 8.0  # points
+LEGEND_LINE_HEIGHT = 12.0  # points
+LEGEND_HANDLE_WIDTH = 30.0  # points, of the line sample with gaps
+TICKS_HEIGHT = 12.0  # points, of tick labels
+AXIS_LABEL_HEIGHT = 12.5  # points
+UNLABELLED_HEIGHT = 3.0  # points, below axes without tick labels
+# Printed characters for which str.isprintable is False
 PRINTED_SPECIAL_CHARACTERS = "\n\N{NO-BREAK SPACE}"
-# Words of at least 500 characters are split, because PDF/A limits strings to 32,767 characters
+# PDF/A limits strings to 32,767 characters, so very long words are split
 LONG_WORD_PATTERN = re.compile(r"[^ \n]{100}(?=[^ \n]{400})")
 PageBlock = dict[str, Any]
 Cell = str | tuple[str, str]
 
 
 class Page:
-    """Blocks (texts, plots, tables) of a section or of a column of a report."""
+    """Titles, texts, tables and plots of a page or column."""
 
     def __init__(self, title: str = "", lead_text: str = "", *, width: float = PAGE_WIDTH) -> None:
         self.blocks: list[PageBlock] = []
@@ -57,7 +54,7 @@ class Page:
         indent: float = 0.0,
         marker: str = "",
     ) -> None:
-        """Write a paragraph; lengths in points, ``marker`` precedes a list item."""
+        """Write a paragraph; lengths are in points."""
         if text or marker:
             block = styled_text(text, size, colour, bold)
             self.add("text", above=gap_above, indent=indent, mark=marker, **block)
@@ -106,9 +103,9 @@ class Page:
         head : sequence of str
         rows : sequence of sequence of str, or of (str, colour)
         column_widths : sequence of float, optional
-            Relative widths of the columns; by default they follow the content.
+            Relative widths of the columns.
         right_aligned_columns : sequence of int
-            Indices of the columns with numbers.
+            Indices of right-aligned columns.
         """
         self.add(
             "table",
@@ -129,11 +126,8 @@ class Page:
         right_margin: float = AXES_RIGHT_MARGIN,
         is_compact: bool = False,
     ) -> Axes:
-        """Add axes below a title and a caption; return the axes.
-
-        The height of the axes, the gap above the title and the margins are in points.
-        """
-        # imported here, because text-only commands do not need matplotlib (0.3 s)
+        """Add axes with a title and a caption, and return the axes; lengths are in points."""
+        # slow import (0.3 s), which texts do not need
         from matplotlib.figure import Figure  # noqa: PLC0415
 
         axes = Figure().add_axes((0.0, 0.0, 1.0, 1.0))
@@ -191,7 +185,7 @@ class Page:
 
 
 def make_two_columns(left_fraction: float = 0.5) -> tuple[Page, Page]:
-    """Return a left and a right column that fill the page."""
+    """Return two columns that fill the page width."""
     free_width = PAGE_WIDTH - COLUMN_GAP
     return Page(width=left_fraction * free_width), Page(width=(1.0 - left_fraction) * free_width)
 
@@ -208,14 +202,14 @@ def measure_text_width(text: str) -> float:
     from matplotlib import font_manager  # noqa: PLC0415 - as in :meth:`Page.add_panel`
 
     font = font_manager.get_font(font_manager.findfont(FONT))
-    # measured at a large font size, because widths are rounded to whole points
+    # widths are rounded to whole points, so the measured font is large
     font.set_size(100.0, 72.0)
     font.set_text(text, 0.0)
     return float(font.get_width_height()[0]) / 64.0 * 0.08
 
 
 def count_wrapped_lines(text: str, width: float) -> int:
-    """Return the number of lines of a text that wraps at a width (points)."""
+    """Return the number of lines of a text with a given width (points)."""
     lines, used_width = 1, 0.0
     for word in text.split(" "):
         word_width = measure_text_width(f"{word} ")
@@ -247,7 +241,7 @@ def draw_legend_above(axes: Axes) -> None:
 
 
 def replace_unprintable(text: str) -> str:
-    """Remove control characters, split long words, and replace characters without a font by □."""
+    """Replace or remove characters that cannot be printed, and split long words."""
     from px4fuse.report import fonts  # noqa: PLC0415 - as in :meth:`Page.add_panel`
 
     return "".join(
@@ -260,7 +254,7 @@ def replace_unprintable(text: str) -> str:
 
 
 def to_typst_data(block: Any, log_name: str) -> Any:
-    """Convert blocks to data for Typst: printable texts, and figures as SVG."""
+    """Convert page blocks to data for Typst, with figures as SVG."""
     if isinstance(block, str):
         return replace_unprintable(with_log_name(block, log_name))
     if isinstance(block, Mapping):

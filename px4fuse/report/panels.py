@@ -1,4 +1,4 @@
-"""Plots over time along one axis, with caption and statistics."""
+"""Plots of KF and EKF2 over time along one axis."""
 
 from __future__ import annotations
 
@@ -26,15 +26,15 @@ from px4fuse.report.style import (
     set_log_scale,
 )
 
-NARROW_AXES_HEIGHT = 72.0  # height (points) of the axes in narrow columns
-# Ratio of the axis limit to the largest innovation in a plot of innovations
+NARROW_AXES_HEIGHT = 72.0  # points
+# Axis limit divided by the largest innovation within the axis
 INNOVATION_AXIS_MARGIN_FACTOR = 1.3
-# The axis of an innovation plot grows to show innovations up to this multiple of the median √S
+# The axis shows innovations up to this multiple of the median √S
 MAX_AXIS_LIMIT_IN_SQRT_S = 5.0
 
 
 class QuantityColumns(NamedTuple):
-    """Position or velocity: unit, and names of its table columns and statistics."""
+    """Unit, table columns and statistics of position or velocity."""
 
     unit: str
     column: str
@@ -52,7 +52,7 @@ VELOCITY_QUANTITY = QuantityColumns(
 
 
 class Panel(NamedTuple):
-    """Plot over time along one axis, with caption and statistics; ``height`` is in points."""
+    """Plot over time along one axis, with caption and statistics."""
 
     title: str
     height: float
@@ -81,7 +81,7 @@ class Panel(NamedTuple):
             title,
             height,
             caption=caption,
-            # the innovation plot shows rejections as hollow dots, so axis "" omits their markers
+            # the innovation plot shows rejections as hollow dots, so it needs no markers
             axis="" if self is INNOVATIONS_PANEL else result.axis.name,
             with_time_label=with_time_label,
         )
@@ -129,7 +129,7 @@ def draw_tracks(axes: Axes, result: AxisComparison, quantity: QuantityColumns) -
             draw_curve(axes, values, **TRACK_STYLES[name], zorder=2.5)
             drawn_series.append(values)
     draw_curve(axes, kf_values, **TRACK_STYLES["KF"])
-    # the ±2σ band is very wide in the first second, so the axis is scaled to the tracks
+    # The ±2σ band is very wide at the start, so it does not set the axis limits
     all_values = pd.concat(drawn_series)
     margin = 0.08 * (all_values.max() - all_values.min()) + 1e-3
     axes.set_ylim(all_values.min() - margin, all_values.max() + margin)
@@ -174,7 +174,7 @@ def _find_innovation_limit_m(result: AxisComparison) -> float:
     limits_m = []
     for innovations in _collect_innovation_tables(result).values():
         median_sqrt_s_m = float(np.sqrt(innovations["innovation_variance_m2"].median()))
-        # a quantile, so that outliers do not enlarge the axis
+        # a quantile, because outliers would enlarge the axis
         innovation_quantile_m = float(np.quantile(innovations["innovation_m"].abs(), 0.99))
         shown_innovation_m = min(innovation_quantile_m, MAX_AXIS_LIMIT_IN_SQRT_S * median_sqrt_s_m)
         limits_m.append(max(2.0 * median_sqrt_s_m, shown_innovation_m))
@@ -186,7 +186,7 @@ def _collect_innovation_tables(result: AxisComparison) -> dict[str, pd.DataFrame
 
 
 def normalised_innovations(result: AxisComparison) -> dict[str, pd.Series[float]]:
-    """Return ν/√S of KF and, if logged, of EKF2, by filter name."""
+    """Return the normalised innovations ν/√S by filter."""
     return {
         name: (table["innovation_m"] / np.sqrt(table["innovation_variance_m2"])).dropna()
         for name, table in _collect_innovation_tables(result).items()
@@ -196,7 +196,7 @@ def normalised_innovations(result: AxisComparison) -> dict[str, pd.Series[float]
 def draw_dots(
     axes: Axes, values: pd.Series[float], axis_limit: float, marker_style: dict[str, Any]
 ) -> None:
-    """Draw dots between -limit and limit; values outside are triangles at the limits."""
+    """Draw dots; values beyond the limit are triangles at the edge."""
     draw_curve(axes, values[values.abs() <= axis_limit], **marker_style)
     for sign, marker in ((1.0, "^"), (-1.0, "v")):
         values_beyond_limit = values[sign * values > axis_limit]
@@ -206,7 +206,7 @@ def draw_dots(
 
 
 def draw_innovations(axes: Axes, result: AxisComparison) -> None:
-    """Draw the innovations of KF and EKF2 with ±2√S; rejected innovations are hollow."""
+    """Draw the innovations of KF and EKF2 with ±2√S."""
     plot_limit_m, ekf2_innovations = _find_innovation_limit_m(result), result.ekf2_innovations
     updates, kf_innovations = result.replay.updates, result.replay.updates["innovation_m"]
     draw_sigma_band(axes, 0.0 * kf_innovations, np.sqrt(updates["innovation_variance_m2"]))
@@ -229,7 +229,7 @@ def draw_innovations(axes: Axes, result: AxisComparison) -> None:
 
 
 def describe_innovations(_: Analysis, result: AxisComparison) -> str:
-    """Return the caption of the innovation plot."""
+    """Describe the innovations of KF and EKF2."""
     plot_limit_m, sentences = _find_innovation_limit_m(result), []
     innovation_tables = _collect_innovation_tables(result)
     for name, consistency in get_statistics_by_filter(result).items():
@@ -273,7 +273,7 @@ def _collect_variance_tables(result: AxisComparison) -> dict[str, pd.DataFrame]:
 
 
 def describe_sigma_growth(analysis: Analysis, result: AxisComparison) -> str:
-    """Return the caption of the σ plot: growth of σ in the longest gap of the position source."""
+    """Describe the growth of σ in the longest gap of the position source."""
     if not analysis.events.gaps:
         return ""
     start_s, end_s = max(analysis.events.gaps, key=lambda gap: gap[1] - gap[0])

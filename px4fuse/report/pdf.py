@@ -1,4 +1,4 @@
-"""PDF report: pages drawn from an analysis and its results, typeset with the results attached."""
+"""PDF report with the results attached."""
 
 import json
 from collections.abc import Callable, Iterator, Mapping
@@ -27,7 +27,7 @@ from px4fuse.results import contract
 from px4fuse.results.model import NO_STUDENT
 
 RESULTS_NAME = "results.json"
-# Functions that draw the pages of a report, in their order, by type of results
+# Functions that draw the pages of a report, by type of results
 PAGE_FUNCTIONS_BY_RESULTS_TYPE: Mapping[type, tuple[Callable[[Any, Any], Iterator[Page]], ...]] = {
     contract.ComparisonResults: (
         cover.draw_pages,
@@ -54,7 +54,7 @@ PAGE_FUNCTIONS_BY_RESULTS_TYPE: Mapping[type, tuple[Callable[[Any, Any], Iterato
 
 
 def _describe_document(results: Any) -> tuple[str, str, str]:
-    """Return the title of the report, and name and SHA-256 of its input file."""
+    """Return the title of the report, and name and SHA-256 of the input file."""
     match results:
         case contract.LoopResults(track=track):
             return f"px4fuse loop {track.name}", track.name, track.sha256
@@ -65,26 +65,23 @@ def _describe_document(results: Any) -> tuple[str, str, str]:
 
 
 def render_pdf(content: Any, results: Any, results_json: str) -> bytes:
-    """Draw all pages and typeset them as PDF.
+    """Draw all pages of a report and typeset them as PDF.
+
+    The PDF is reproducible: it contains no dates and no random identifiers.
 
     Parameters
     ----------
     content : Analysis, AidingSourceAnalysis, Loop or Evaluation
-        Source of the figures.
+        Data for the figures.
     results : Results
-        Results for the texts; their type selects the :data:`PAGE_FUNCTIONS_BY_RESULTS_TYPE`.
+        Data for the texts.
     results_json : str
-        Attached to the PDF as ``results.json``, so the PDF alone can be verified.
-
-    Returns
-    -------
-    bytes
-        Identical for the same input and versions: no dates, no random identifiers.
+        Results that are attached to the PDF as ``results.json``.
     """
     title, name, sha256 = _describe_document(results)
     blocks, report_text = list[Any](), ""
     with apply_report_style():
-        # each page is converted immediately, because the figures of all pages need much memory
+        # Converting each page immediately saves memory
         for page in (
             page
             for draw in PAGE_FUNCTIONS_BY_RESULTS_TYPE[type(results)]
@@ -94,8 +91,8 @@ def render_pdf(content: Any, results: Any, results_json: str) -> bytes:
             blocks += to_typst_data(page.blocks, name)
     producer = f"px4fuse {metadata.version('px4fuse')}"
     student = format_student(getattr(results, "student", NO_STUDENT), " · ")
-    release_free_memory()  # free the memory of the figures before Typst starts
-    # fonts for other scripts are not needed in figures: figures contain no names and no notes
+    release_free_memory()  # before Typst starts
+    # figures contain no names and notes, so they need no other fonts
     all_text = title + name + student + report_text
     return compile_pdf(
         {

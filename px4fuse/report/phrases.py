@@ -1,4 +1,4 @@
-"""Texts that the terminal output and the PDF report share."""
+"""Texts of both terminal output and PDF report."""
 
 from __future__ import annotations
 
@@ -36,10 +36,8 @@ from px4fuse.results.model import Student
 if TYPE_CHECKING:
     from px4fuse.analysis import Analysis
 
-# Minimum p value of the Ljung-Box test for white innovations: with eight tests per flight, less
-# than 1 % of the flights have a false alarm
+# Minimum p value (Ljung-Box test) of white innovations; small, because a flight has eight tests
 MIN_WHITENESS_P_VALUE = 0.001
-# Error of the σ that an underconfident or an overconfident filter reports
 SIGMA_ERROR_TEXTS = {"underconfident": "too large", "overconfident": "too small"}
 DIFFERENCE_FIELDS = ("position_rms_m", "velocity_rms_m_s")
 RMSE_FIELDS = ("position_rmse_m", "velocity_rmse_m_s")
@@ -57,14 +55,14 @@ def format_settings(settings: Settings) -> str:
 
 
 def format_verdict(consistency: Consistency | Unavailable) -> str:
-    """State whether a filter is consistent, or by which factor its reported σ is wrong."""
+    """Describe the consistency of a filter, with the factor by which its reported σ is wrong."""
     if isinstance(consistency, Unavailable):
         return "not evaluated"
     return format_sigma_verdict(consistency.verdict, consistency.sigma_error_factor)
 
 
 def format_sigma_verdict(verdict: str, factor: float) -> str:
-    """Format a result of the consistency test with the factor between reported and actual σ.
+    """Format the result of a consistency test with the factor between reported and actual σ.
 
     >>> format_sigma_verdict("overconfident", 2.41)
     'overconfident, σ 2.4× too small'
@@ -75,7 +73,7 @@ def format_sigma_verdict(verdict: str, factor: float) -> str:
 
 
 def get_statistics_by_filter(result: AxisComparison) -> dict[str, FilterSummary | UntestedFilter]:
-    """Return the statistics of each filter, without EKF2 if it is not logged, by label."""
+    """Return the consistency statistics of KF and, if logged, EKF2."""
     is_ekf2_missing = isinstance(result.ekf2_state, Unavailable)
     return {
         FILTER_NAMES[name]: statistics
@@ -88,7 +86,7 @@ VERDICT_TABLE_HEAD = ("axis", "filter", "mean\nNIS", "95 %\nband", "verdict")
 
 
 def make_verdict_row(result: AxisComparison, name: str) -> list[Cell]:
-    """Return the table row on the consistency of a filter (KF or EKF2) along an axis."""
+    """Return the table row on the consistency of a filter along an axis."""
     consistency = get_statistics_by_filter(result)[name]
     label = result.axis.label.removeprefix("the ") if name == "KF" else ""
     if isinstance(consistency, Unavailable):
@@ -101,7 +99,7 @@ def make_verdict_row(result: AxisComparison, name: str) -> list[Cell]:
 
 
 def write_error_table(page: Page, analysis: Analysis) -> None:
-    """Write a table of consistency tests and position errors of KF and EKF2 along all axes."""
+    """Write a table of consistency tests and position errors of KF and EKF2."""
     axes = (analysis.main, *analysis.select_secondary_axes())
     has_ekf2 = any(isinstance(result.difference, Difference) for result in axes)
     has_truth = isinstance(analysis.flight.truth, Truth)
@@ -124,7 +122,7 @@ def _format_rms(statistic: object, field: str) -> str:
 
 
 def list_verdict_warnings(comparison: Comparison) -> list[str]:
-    """Return warnings about consistency tests: drifting position source, correlated innovations."""
+    """Return warnings about the consistency tests of KF and EKF2."""
     consistency_rows = [
         (result.axis.label, filter_name, consistency)
         for result in comparison.axes.values()
@@ -189,7 +187,7 @@ def describe_alignment(alignment: Alignment) -> dict[str, str]:
 def make_tuning_advice(
     comparison: PreparedComparison, tuning_by_axis: Mapping[str, AxisTuning | Unavailable]
 ) -> dict[str, str]:
-    """Return recommendations from noise estimates, by their label (for example "SIGMA_Z")."""
+    """Return advice from the noise estimates, by label such as "SIGMA_Z"."""
     names = (HORIZONTAL, "aisle", *tuning_by_axis)
     axis_name = next(
         (name for name in names if isinstance(tuning_by_axis.get(name), AxisTuning)), ""

@@ -1,4 +1,4 @@
-"""Provenance page: versions, files, parameters and methods needed to repeat the analysis."""
+"""Report page on provenance: versions, files, parameters and methods of an analysis."""
 
 from collections.abc import Iterable, Iterator
 from pathlib import Path
@@ -14,11 +14,11 @@ from px4fuse.report.style import MUTED_COLOUR
 from px4fuse.request import replace_argument_names
 from px4fuse.results.contract import LoopResults
 
-LABEL_WIDTH = 168.0  # width (points) of the labels
+LABEL_WIDTH = 168.0  # points
 
 
 def draw_pages(analysis: Analysis | AidingSourceAnalysis, results: FlightResults) -> Iterator[Page]:
-    """Draw two pages of a flight: all detected faults (findings); versions, files and methods."""
+    """Draw the pages on detected faults and on provenance."""
     page = Page(ALL_FINDINGS_TITLE)
     write_findings(page, results.findings)
     page.write("" if results.findings else "None.")
@@ -71,7 +71,7 @@ def _write_log_section(page: Page, flight: Flight, source: PositionTrack | None)
     text_by_label["SHA-256"] = log.sha256
     section = Page()
     _write_section(section, "Log", text_by_label.items())
-    page.add_columns(section)  # Typst keeps a column, and so the section, on one page
+    page.add_columns(section)  # keeps the section on one page
 
 
 def _write_missing_data(page: Page, unavailable_parts: Iterable[Unavailable]) -> None:
@@ -83,7 +83,7 @@ def _write_missing_data(page: Page, unavailable_parts: Iterable[Unavailable]) ->
 
 
 def draw_loop_provenance(loop: Loop, results: LoopResults) -> Iterator[Page]:
-    """Draw the provenance page of a loop: choices, methods, versions and files."""
+    """Draw the provenance page of a loop analysis."""
     page, odometry = Page("Provenance"), loop.odometry.trajectory
     file_descriptions = [
         (
@@ -114,7 +114,7 @@ def _write_versions(page: Page, results: FlightResults | LoopResults) -> None:
 
 
 def _write_section(page: Page, title: str, texts: Iterable[str | tuple[str, str]]) -> None:
-    """Write texts, or pairs of label and text, below a title if there are any."""
+    """Write texts, or labels with texts, below a title."""
     for index, text in enumerate(texts):
         if index == 0:
             page.write_heading(title)

@@ -1,4 +1,4 @@
-"""Output of pages on the terminal; in a pipe each paragraph is one line."""
+"""Output of report pages on the terminal."""
 
 import re
 from collections.abc import Callable, Iterable, Iterator, Sequence
@@ -23,18 +23,17 @@ from px4fuse.report.page import Cell, PageBlock
 from px4fuse.report.style import GOOD_COLOUR, MUTED_COLOUR, SEVERITY_COLOURS
 from px4fuse.request import ComparisonRequest, Request, command_line
 
-# Terminal encodings that contain all characters of a diagnosis card
+# Terminal encodings with all characters of a diagnosis card
 UNICODE_ENCODINGS = ("utf-8", "utf8", "utf-16")
-# Function that yields the lines of a diagnosis card, by kind of block
+# Functions that yield the lines of a diagnosis card
 CARD_LINE_FUNCTIONS = {
     "card": format_card_lines,
     "closing": format_closing_lines,
     "headline": format_headline_lines,
 }
-LABEL_CHARACTERS = 9  # width (characters) of a label on the terminal
-MIN_TABLE_WIDTH = 50  # minimum width (characters) of a terminal for tables
-POINTS_PER_COLUMN = 6.0  # indent (points) in the PDF per character of indent on the terminal
-# Terminal styles of text colours; the other colours belong to plots
+LABEL_CHARACTERS = 9  # width of a label
+MIN_TABLE_WIDTH = 50  # characters; narrower terminals show no tables
+POINTS_PER_COLUMN = 6.0  # points in the PDF per character on the terminal
 STYLES_BY_COLOUR = {
     MUTED_COLOUR: "dim",
     SEVERITY_COLOURS["error"]: "bold red",
@@ -42,17 +41,14 @@ STYLES_BY_COLOUR = {
     SEVERITY_COLOURS["note"]: "cyan",
     GOOD_COLOUR: "green",
 }
-# Commands of px4fuse in a text; a full stop after a command is not a part of the command
+# Commands of px4fuse in a text, without the full stop at the end
 _COMMAND_PATTERN = re.compile(r"px4fuse (\w+) LOG(?![\w.])((?: --[a-z-]+ [-\w]+(?:\.\d+)?)*)")
 
 
 def print_blocks(
     console: Console, blocks: Iterable[PageBlock], request: Request | None = None
 ) -> None:
-    """Print the blocks of a page (texts, tables, diagnosis card) on the terminal.
-
-    With ``request``, commands in texts contain the log and the options of the user.
-    """
+    """Print the texts, tables and diagnosis card of a page on the terminal."""
     for block in blocks:
         match block["kind"]:
             case "text" | "heading":
@@ -107,7 +103,7 @@ def _show_labelled(console: Console, block: PageBlock, request: Request | None) 
 
 
 def shorten_commands(text: str, request: Request) -> tuple[str, list[str]]:
-    """Shorten each command in a text to its options; return the text and the complete commands.
+    """Shorten each command in a text to its options, and return the complete commands too.
 
     >>> request = ComparisonRequest(log="a b.ulg")
     >>> shorten_commands("px4fuse compare LOG --sigma-z 0.2: better.", request)
@@ -132,7 +128,7 @@ def _make_rich_text(block: PageBlock) -> Text:
 def print_paragraph(
     console: Console, text: str | Text, label: str | Text = "", *, indent: int
 ) -> None:
-    """Print a paragraph that wraps beside its label, indented by ``indent`` columns."""
+    """Print an indented paragraph beside its label."""
     body = Text(text) if isinstance(text, str) else text
     margin = Text(label) if isinstance(label, str) else label.copy()
     margin.pad_right(max(indent - margin.cell_len, 0))
@@ -143,14 +139,14 @@ def print_paragraph(
 
 
 def print_line(console: Console, label: str, text: str, style: str = "bold cyan not dim") -> None:
-    """Print a command or path on one line, so it can be copied."""
+    """Print a command or path on one line, so that the user can copy it."""
     console.print(Text(f"{label:{LABEL_CHARACTERS}}", "bold").append(text, style), soft_wrap=True)
 
 
 def _print_rows(
     console: Console, head: Sequence[str], rows: Iterable[Iterable[Cell]], **_: object
 ) -> None:
-    """Print a table on a narrow terminal as one paragraph per row."""
+    """Print the rows of a table as paragraphs, for a narrow terminal."""
     for row in (head, *rows):
         texts = (cell if isinstance(cell, str) else cell[0] for cell in row)
         print_paragraph(console, ", ".join(filter(None, texts)), indent=2)

@@ -1,7 +1,4 @@
-"""Colours, lines and matplotlib settings of all plots.
-
-KF is dark, solid and round, EKF2 lighter, dashed and square, so they remain distinct in grey.
-"""
+"""Colours and styles of all plots, which remain distinct in greyscale."""
 
 from __future__ import annotations
 
@@ -18,11 +15,11 @@ if TYPE_CHECKING:
     import pandas as pd
     from matplotlib.artist import Artist
     from matplotlib.axes import Axes
-else:  # text-only commands do not import matplotlib (0.3 s)
+else:  # matplotlib is slow to import
     Artist = Axes = Any
-__all__ = ["Artist", "Axes"]  # matplotlib types for annotations
+__all__ = ["Artist", "Axes"]  # types for annotations
 
-# Font that matplotlib installs, with Latin, Greek, Cyrillic, Arabic, Hebrew and symbols
+# Font that is part of matplotlib
 FONT = "DejaVu Sans"
 STYLE_SHEET = Path(__file__).with_name("report.mplstyle")
 TIME_LABEL = "time since first data (s)"
@@ -51,35 +48,32 @@ def line_style(colour: str, width: float, line_pattern: object = "-") -> dict[st
 def dot_style(
     colour: str, marker: str | int, size: float, edge_width: float = 0.0
 ) -> dict[str, Any]:
-    """Return the matplotlib options of markers; size and edge width in points."""
+    """Return the matplotlib options of markers; sizes are in points."""
     return {"color": colour, "marker": marker, "ms": size, "mew": edge_width, "ls": "none"}
 
 
-# Style of the line of each track, by its name in legends
 TRACK_STYLES = {
     "KF": line_style(KF_COLOUR, 1.0),
     "EKF2": line_style(EKF2_COLOUR, 1.1, (0, (4, 1.6))),
     "ground truth": line_style(TRUTH_COLOUR, 0.7, (0, (1, 1.5))),
 }
-# Style of the innovations of each filter
 INNOVATION_STYLES = {
     "KF": dot_style(KF_COLOUR, "o", 2.0),
     "EKF2": dot_style(EKF2_COLOUR, "s", 2.2),
 }
-# Innovations that EKF2 rejected are hollow in all plots
+# Rejected innovations of EKF2 are hollow
 REJECTED_STYLE = dot_style(EKF2_COLOUR, "s", 2.8, 0.6) | {"mfc": "white"}
 MEASUREMENT_STYLE = dot_style(MEASUREMENT_COLOUR, ".", 1.8)
-# Colour of the ±2σ band of each filter
 SIGMA_BAND_COLOURS = {"KF": KF_BAND_COLOUR, "EKF2": EKF2_BAND_COLOUR}
 
-MAX_WIDE_AXES_POINTS = 1500  # maximum number of drawn points of a curve in wide axes
-MAX_NARROW_AXES_POINTS = 500  # maximum number of drawn points of a curve in narrow axes
-MIN_WIDE_AXES_INCHES = 3.0  # wider axes get MAX_WIDE_AXES_POINTS points per curve
+MAX_WIDE_AXES_POINTS = 1500  # maximum per curve in wide axes
+MAX_NARROW_AXES_POINTS = 500  # maximum per curve in narrow axes
+MIN_WIDE_AXES_INCHES = 3.0  # minimum width of wide axes
 
 
 @contextmanager
 def apply_report_style() -> Iterator[None]:
-    """Apply the matplotlib settings of the report within a with block."""
+    """Apply the matplotlib settings of the report within a ``with`` block."""
     import matplotlib as mpl  # noqa: PLC0415 - slow import
 
     with mpl.rc_context({"font.family": [FONT]}, STYLE_SHEET):
@@ -102,7 +96,7 @@ def draw_sigma_band(
     sigma: pd.Series[float],
     colour: str = KF_BAND_COLOUR,
 ) -> None:
-    """Draw the ±2σ band about a series."""
+    """Draw the ±2σ band of a time series."""
     time_s = centre.index.to_numpy()
     drawn_time_s, upper_limit = decimate_series(
         time_s, np.asarray(centre + 2.0 * sigma, np.float64), _choose_max_points(axes)
@@ -117,7 +111,7 @@ def _choose_max_points(axes: Axes) -> int:
 
 
 def set_log_scale(axes: Axes) -> None:
-    """Set a log scale of y with a margin and plain numbers."""
+    """Set a logarithmic y axis with plain numbers."""
     axes.set_yscale("log")
     low, high = axes.get_ylim()
     axes.set_ylim(low / 1.15, high * 1.25)
@@ -125,7 +119,7 @@ def set_log_scale(axes: Axes) -> None:
 
 
 def set_plain_ticks(axes: Axes) -> None:
-    """Label a logarithmic y axis with plain numbers: 1, 2 and 5 of each decade if they fit."""
+    """Label a logarithmic y axis with plain numbers."""
     from matplotlib.ticker import LogLocator, NullLocator  # noqa: PLC0415
 
     axis, (low, high) = axes.yaxis, axes.get_ylim()
@@ -149,7 +143,7 @@ def label_time_axis(axes: Axes, with_time_label: bool) -> None:
 
 
 def set_map_axes(axes: Axes, x_name: str, y_name: str) -> None:
-    """Set equal scales, a grid and the axis labels (m) of a map."""
+    """Set equal scales, a grid and axis labels (m) for a map."""
     axes.set_aspect("equal", adjustable="datalim", anchor="W")
     axes.grid(True, axis="both")
     axes.set(xlabel=f"{x_name} (m)", ylabel=f"{y_name} (m)")
@@ -157,7 +151,7 @@ def set_map_axes(axes: Axes, x_name: str, y_name: str) -> None:
 
 
 def decimate_series(times: Array, values: Array, max_points: int) -> tuple[Array, Array]:
-    """Reduce a series to ``max_points`` points: the minimum and maximum of each interval."""
+    """Reduce a series to ``max_points`` points, with the minimum and maximum of each interval."""
     if len(times) <= max_points:
         return times, values
     intervals = np.array_split(np.arange(len(times)), max_points // 2)

@@ -1,4 +1,4 @@
-"""Output of ``px4fuse compare`` on the terminal: the diagnosis card, and details with ``-v``."""
+"""Terminal output of ``px4fuse compare``."""
 
 from typing import Any
 
@@ -33,7 +33,12 @@ def make_comparison_page(
 ) -> Page:
     """Make the terminal output of ``px4fuse compare``: faults, causes and actions.
 
-    ``quiet``: only the headline; ``verbose``: also settings, statistics of all axes, and findings.
+    Parameters
+    ----------
+    verbose : bool
+        True to add settings, statistics and all findings (detected faults).
+    quiet : bool
+        True for the headline only.
     """
     page = make_card_page("headline" if quiet else "card", results.card)
     if not verbose:
@@ -63,7 +68,7 @@ def _write_details(page: Page, analysis: Analysis, results: Any) -> None:
 
 
 def make_card_page(card_part: str, card: Card) -> Page:
-    """Make a page with one part of a card: "card" (all), "headline" or "closing" (last lines)."""
+    """Make a page with a diagnosis card, or with its "headline" or "closing" lines only."""
     page = Page()
     page.add(card_part, card=card)
     return page

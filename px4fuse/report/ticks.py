@@ -1,7 +1,6 @@
-"""Ticks, grid and labels of plots, drawn with few artists of matplotlib.
+"""Fast drawing of ticks, grid and labels of plots.
 
-The axis classes of matplotlib make seven artists for each tick. They need a tenth of the time of
-``px4fuse compare``.
+The axis classes of matplotlib draw seven artists for each tick, which is slow.
 """
 
 from __future__ import annotations
@@ -14,16 +13,16 @@ import numpy as np
 
 from px4fuse.report.style import Axes
 
-TICKS_ZORDER = 0.5  # below the curves, as with axes.axisbelow
-LINE_HEIGHT = 8.0  # height (points) of a tick label of 8 points
+TICKS_ZORDER = 0.5  # below the curves
+LINE_HEIGHT = 8.0  # points, for a tick label of 8 points
 
 
 def replace_ticks(axes: Axes, measure_text_width: Callable[[str], float]) -> None:
-    """Draw ticks, grid and labels as few artists, and hide the axis artists of matplotlib.
+    """Draw ticks, grid and labels of axes, and hide those of matplotlib.
 
-    Data and limits of the axes are final. ``measure_text_width`` returns a width in points.
+    The data and limits of the axes must not change afterwards.
     """
-    axes.apply_aspect()  # final limits of axes with equal scales (maps)
+    axes.apply_aspect()  # sets the final limits of maps
     for is_x, axis in ((True, axes.xaxis), (False, axes.yaxis)):
         if axes.axison and axis.get_visible():
             _draw_axis_as_artists(axes, measure_text_width, is_x=is_x)
@@ -42,7 +41,7 @@ def _draw_axis_as_artists(
     size, label_gap = rcParams["xtick.major.size"], rcParams["xtick.major.pad"]
 
     def order_xy(coordinate_along_axis: Any, coordinate_across_axis: Any) -> tuple[Any, Any]:
-        """Return (x, y) from the coordinates along this axis and perpendicular to it."""
+        """Return (x, y) from the coordinates along and across the axis."""
         return (
             (coordinate_along_axis, coordinate_across_axis)
             if is_x
@@ -54,7 +53,7 @@ def _draw_axis_as_artists(
     locations = all_locations[is_visible]
     labels = [*compress(formatter.format_ticks(all_locations.tolist()), is_visible)]
     if options["gridOn"]:
-        ends = np.tile([0.0, 1.0, np.nan], len(locations))  # nan separates the grid lines
+        ends = np.tile([0.0, 1.0, np.nan], len(locations))  # nan separates the lines
         grid = Line2D(*order_xy(np.repeat(locations, 3), ends), transform=transform("grid"))
         grid.set(color=rcParams["grid.color"], lw=rcParams["grid.linewidth"], zorder=TICKS_ZORDER)
         axes.add_artist(grid)
@@ -62,7 +61,7 @@ def _draw_axis_as_artists(
     ticks.set(marker=TICKDOWN if is_x else TICKLEFT, ms=size, color="black")
     ticks.set(mew=rcParams["xtick.major.width"], clip_on=False, zorder=TICKS_ZORDER)
     axes.add_artist(ticks)
-    tick_extent = size + label_gap  # extent (points) of ticks and tick labels beside the axis
+    tick_extent = size + label_gap  # points
     if options["labelbottom" if is_x else "labelleft"] and labels:
         get_label_transform = (
             axes.get_xaxis_text1_transform if is_x else axes.get_yaxis_text1_transform
@@ -72,7 +71,7 @@ def _draw_axis_as_artists(
             text = axes.text(*order_xy(location, 0.0), label, transform=label_transform)
             text.set(va=vertical_alignment, ha=horizontal_alignment, zorder=TICKS_ZORDER)
         tick_extent += LINE_HEIGHT if is_x else max(map(measure_text_width, labels))
-    # label of the axis, and offset text of matplotlib (such as 1e-3 for all tick labels) at its end
+    # axis label in the middle, and common factor of the tick labels (such as 1e-3) at the end
     for label, position in ((axis.get_label_text(), 0.5), (formatter.get_offset(), 1.0)):
         if not label:
             continue

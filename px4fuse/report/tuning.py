@@ -1,4 +1,4 @@
-"""Terminal output of ``px4fuse tune``: SIGMA_A and SIGMA_Z along each axis."""
+"""Terminal output of ``px4fuse tune``: estimated noises of KF."""
 
 from px4fuse.comparison.model import PreparedComparison
 from px4fuse.filter.tuning import AxisTuning
@@ -24,7 +24,7 @@ TUNING_NOTE = (
 def make_tuning_page(
     comparison: PreparedComparison, tunings: dict[str, AxisTuning | Unavailable]
 ) -> Page:
-    """Format the estimates of SIGMA_A and SIGMA_Z along each axis."""
+    """Make a page on the estimates of SIGMA_A and SIGMA_Z along each axis."""
     page, rows, sentences = Page(), [], list[str]()
     for name, tuning in tunings.items():
         if isinstance(tuning, Unavailable):

@@ -1,4 +1,4 @@
-"""Typesetting of pages by Typst, which can read no files except fonts."""
+"""Typesetting of reports as PDF with Typst."""
 
 import json
 from collections.abc import Mapping, Sequence
@@ -10,13 +10,13 @@ import typst
 
 from px4fuse.report import fonts
 
-# PDF/A-3a (archives) and PDF/UA-1 (screen readers)
+# PDF/A-3a for archives, PDF/UA-1 for screen readers
 PDF_STANDARDS: list[Any] = ["a-3a", "ua-1"]
 TEMPLATES = ("cover.typ", "report.typ")
 
 
 def compile_pdf(report: Mapping[str, Any], template: str | None = None) -> bytes:
-    """Typeset data as PDF, by default with the templates of the report."""
+    """Typeset data as PDF with Typst."""
     with TemporaryDirectory() as empty_folder:
         document = _make_compiler(report, template, empty_folder).compile(
             format="pdf", pdf_standards=PDF_STANDARDS
@@ -26,7 +26,7 @@ def compile_pdf(report: Mapping[str, Any], template: str | None = None) -> bytes
 
 
 def measure_free_height(blocks: Any, font_names: Sequence[str]) -> float:
-    """Typeset the first page, and return the free height (points) below its diagnosis card."""
+    """Return the free height (points) on the first page of a report."""
     report = dict.fromkeys(("title", "author", "head", "student", "foot"), "")
     data = {**report, "fonts": font_names, "blocks": blocks, "results": None}
     with TemporaryDirectory() as empty_folder:

@@ -1,4 +1,4 @@
-"""Terminal output of ``px4fuse whatif``: EKF2 as logged, replayed, and with other parameters."""
+"""Terminal output of ``px4fuse whatif``: EKF2 replayed with other parameters."""
 
 import math
 
@@ -37,7 +37,7 @@ def make_column_headings(analysis: WhatIfAnalysis) -> list[str]:
 
 
 def make_statistic_rows(analysis: WhatIfAnalysis) -> list[list[str]]:
-    """Return a row for each statistic of EKF2: as logged, replayed, and replayed with changes."""
+    """Return the statistics of EKF2 as logged, replayed, and replayed with other parameters."""
     result = analysis.whatif
     texts_by_label = _format_statistics(result.replayed, result.replayed)
     columns = [
@@ -92,7 +92,7 @@ def _format_fusion_statistics(summary: Ekf2Statistics) -> dict[str, str]:
 
 
 def make_sweep_table(analysis: WhatIfAnalysis) -> tuple[list[str], list[list[str]]]:
-    """Return the headings, and a row of statistics for each value of the swept parameter."""
+    """Return headings and rows of a table: EKF2 statistics for each value of a parameter."""
     parameter_name, rows = find_swept_parameter(analysis), []
     unit = PARAMETERS[parameter_name].unit
     for summary in select_sweep_summaries(analysis):
@@ -128,7 +128,7 @@ def find_swept_parameter(analysis: WhatIfAnalysis) -> str:
 
 
 def describe_sweep(analysis: WhatIfAnalysis) -> list[str]:
-    """Return sentences on the best value of the swept parameter."""
+    """Describe the best value of a parameter in the replays of EKF2."""
     sentences = []
     if summaries := [
         summary for summary in select_sweep_summaries(analysis) if summary.is_predictable

@@ -1,1 +1,1 @@
-"""Trajectories in three dimensions: pose graphs, time offsets, and errors against a reference."""
+"""Trajectories in 3D: pose graphs, time offsets, and errors against a reference."""

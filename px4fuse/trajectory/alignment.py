@@ -1,8 +1,6 @@
 """Alignment of an estimated trajectory with a reference before the error is computed.
 
-Estimators that use gravity are aligned in yaw and position (4 degrees of freedom), so tilt counts
-as error (Zhang & Scaramuzza 2018). SLAM with the frame of its first key frame is aligned in
-rotation and position (6 degrees of freedom), monocular SLAM also in scale (7).
+Source: Zhang and Scaramuzza 2018, A tutorial on quantitative trajectory evaluation.
 """
 
 from typing import Literal
@@ -17,30 +15,27 @@ from px4fuse.trajectory.model import MIN_POSES
 
 AlignmentKind = Literal["none", "yaw", "se3", "sim3"]
 
-# Minimum extent of a path along its second principal axis for an estimate of the rotation, as
-# fraction of the largest extent
+# Minimum extent of a path along its second principal axis, divided by the largest extent
 MIN_EXTENT_RATIO_FOR_ROTATION = 1e-6
-# Minimum extent (m, RMS) of a path for an estimate of the rotation
+# Minimum extent (m, RMS) of a path
 MIN_EXTENT_M = 1e-6
-# Maximum ratio of the residual (RMS) to the horizontal motion (RMS) for an estimate of the yaw. Two
-# unrelated noise tracks of equal variance have the ratio √2
+# Maximum residual (RMS) after a yaw alignment, divided by the horizontal motion (RMS)
 MAX_RESIDUAL_RATIO_FOR_YAW = 1.0
-# Maximum ratio of the residual (RMS) to the motion (RMS) along the second principal axis, for an
-# estimate of the full rotation. Two unrelated noise tracks of equal variance have the ratio √6
+# Maximum residual (RMS) after a rotation alignment, divided by the motion (RMS) perpendicular to
+# the main direction
 MAX_RESIDUAL_RATIO_FOR_ROTATION = 2.0
 
 
 class Transform(Record):
-    """Similarity transform x ↦ scale · R x + t, from the estimate's frame to the reference's.
+    """Similarity transform x ↦ scale · R x + t from the estimate's frame to the reference's.
 
     Attributes
     ----------
     quaternion_wxyz : tuple of float
         Rotation R.
     translation_m : tuple of float
-        Translation t, in the frame of the reference.
+        Translation t (m), in the frame of the reference.
     scale : float
-        Scale; exactly 1 except for Sim(3).
     degrees_of_freedom : int
         Number of fitted parameters: 0, 4, 6 or 7.
     """
@@ -76,23 +71,21 @@ def fit_alignment(
 ) -> Transform:
     """Fit the transform that minimises the squared distance of the estimate to the reference.
 
-    "se3" and "sim3" are fitted by Umeyama (1991), eqs. 40 to 43; "yaw" by the closed form of Zhang
-    & Scaramuzza (2018), section III-C, about z.
+    Sources: Umeyama (1991), eqs. 40 to 43; for "yaw" Zhang and Scaramuzza (2018), section III-C.
 
     Parameters
     ----------
     estimate_m, reference_m : ndarray, shape (n, 3)
         Positions at the same times.
     kind : {"none", "yaw", "se3", "sim3"}
-        Kind of transform. For "yaw", z must be vertical with the same direction in both frames.
+        Kind of transform. For "yaw", z must be vertical, with the same direction in both frames.
     requires_motion : bool
-        False to return one of the best transforms if the motion does not determine the transform.
+        True to raise an error if the motion does not determine the rotation.
 
     Raises
     ------
     TrajectoryError
-        Fewer than three positions, or the motion does not determine the transform: no motion, or
-        motion along a line, around which the rotation is arbitrary.
+        There are fewer than three positions, or the motion does not determine the rotation.
     """
     if len(estimate_m) < MIN_POSES:
         raise TrajectoryError(
@@ -101,8 +94,7 @@ def fit_alignment(
         )
     if kind == "none":
         return Transform((1.0, 0.0, 0.0, 0.0), (0.0, 0.0, 0.0), 1.0, 0)
-    # Motion is tested after a fit with scale, because a scale factor error does not make the
-    # rotation uncertain
+    # A scale factor error does not make the rotation uncertain
     transform = umeyama(estimate_m, reference_m, with_scale=True)
     if kind == "yaw":
         estimate_xy_m, reference_xy_m = (m[:, 0] + 1j * m[:, 1] for m in (estimate_m, reference_m))
@@ -117,15 +109,13 @@ def fit_alignment(
 
 
 def umeyama(estimate_m: Array, reference_m: Array, *, with_scale: bool) -> Transform:
-    """Fit SE(3) or Sim(3) by least squares (Umeyama 1991).
-
-    For motion along a line, the result is one of many transforms with the same residual.
+    """Fit SE(3) or Sim(3) to two sets of positions by least squares (Umeyama 1991).
 
     Parameters
     ----------
     estimate_m, reference_m : ndarray, shape (n, 3)
     with_scale : bool
-        True for Sim(3); the scale is 1 if the estimate does not move.
+        True to fit Sim(3), False to fit SE(3).
     """
     x = estimate_m - estimate_m.mean(axis=0)
     y = reference_m - reference_m.mean(axis=0)
@@ -133,7 +123,7 @@ def umeyama(estimate_m: Array, reference_m: Array, *, with_scale: bool) -> Trans
     s = np.array([1.0, 1.0, np.sign(np.linalg.det(u) * np.linalg.det(vt))])  # Umeyama eq. 43
     estimate_variance_m2 = float((x * x).sum() / len(x))  # Umeyama eq. 36
     scale = 1.0
-    if with_scale and estimate_variance_m2 > MIN_EXTENT_M**2:  # else the scale would be infinite
+    if with_scale and estimate_variance_m2 > MIN_EXTENT_M**2:  # avoid an infinite scale
         scale = float(d @ s / estimate_variance_m2)  # Umeyama eq. 42
     rotation = Rotation.from_matrix((u * s) @ vt)  # Umeyama eq. 40
     return _make_transform(rotation, estimate_m, reference_m, scale, 7 if with_scale else 6)
@@ -142,7 +132,7 @@ def umeyama(estimate_m: Array, reference_m: Array, *, with_scale: bool) -> Trans
 def _make_transform(
     rotation: Rotation, estimate_m: Array, reference_m: Array, scale: float, degrees_of_freedom: int
 ) -> Transform:
-    """Return the transform with the translation that equates both means (Umeyama eq. 41)."""
+    """Return the transform that maps the mean position to the mean reference (Umeyama eq. 41)."""
     translation_m = reference_m.mean(axis=0) - scale * rotation.apply(estimate_m.mean(axis=0))
     quaternion = tuple(rotation.as_quat(scalar_first=True).tolist())
     return Transform(quaternion, tuple(translation_m.tolist()), scale, degrees_of_freedom)

@@ -13,31 +13,29 @@ from px4fuse.trajectory.model import MIN_POSES, Trajectory
 
 AssociationMethod = Literal["interpolate", "nearest"]
 
-# Default maximum gap in the reference over which poses are interpolated, in median intervals
+# Default maximum gap in the reference for interpolation, in median pose intervals
 MAX_GAP_INTERVALS = 3.0
-# Minimum pose interval (s) of a sparse reference, which is not interpolated: its poses are paired
-# with the nearest poses of the estimate
+# A reference with fewer poses than one per this time (s) is not interpolated
 MIN_SPARSE_POSE_INTERVAL_S = 2.0
-# Minimum default limit (s) of the gaps over which poses are interpolated, for high pose rates
+# Lower limit (s) of the default maximum gap for interpolation
 MIN_GAP_LIMIT_S = 0.1
 # Default maximum time difference (s) of a pair of poses, as in the evo package
 MAX_PAIR_TIME_DIFFERENCE_S = 0.01
 
 
 class Association(Record):
-    """Result of matching the poses of two trajectories by time.
+    """Poses of two trajectories that match in time.
 
     Attributes
     ----------
     max_gap_s : float
-        Maximum gap in the reference over which poses are interpolated; for "nearest", the maximum
-        time difference of a pair.
+        Maximum gap for interpolation, or maximum time difference of a pair.
     outside, in_gaps : int
-        Numbers of unused poses of the estimate: outside the reference's time span, and in its gaps.
+        Numbers of unused poses: outside the reference's time span, and in its gaps.
     coverage_estimate : float
-        Fraction of the poses of the estimate that are used.
+        Used fraction of the poses of the estimate.
     coverage_reference : float
-        Fraction of the reference's time span that the used poses cover without long gaps.
+        Fraction of the reference's time span with used poses.
     """
 
     method: AssociationMethod
@@ -57,15 +55,14 @@ def associate(
     max_gap_s: float | None = None,
     time_offset_s: float = 0.0,
 ) -> tuple[Trajectory, Trajectory, Association]:
-    """Return the poses of both trajectories at the same times, on the clock of the estimate.
+    """Return the poses of two trajectories at the same times.
 
     Parameters
     ----------
     method : {"interpolate", "nearest"}
-        "interpolate": interpolate the reference at the times of the estimate. "nearest": pair each
-        pose of the trajectory with fewer poses with the nearest pose in time, as evo does.
+        Interpolate the reference, or pair the poses that are nearest in time.
     max_gap_s : float, optional
-        See :class:`Association`; default: :func:`choose_gap_limit_s`, or 0.01 s for "nearest".
+        Maximum gap for interpolation, or maximum time difference of a pair.
     time_offset_s : float
         Time offset added to the timestamps of the estimate.
 
@@ -74,7 +71,7 @@ def associate(
     TrajectoryError
         Fewer than three poses match.
     """
-    # A sparse reference is not interpolated, because its path between two poses is unknown
+    # The path between two poses of a sparse reference is unknown
     estimate_interval_s = compute_median_interval_s(estimate.time_s)
     if method == "interpolate" and max_gap_s is None:
         reference_interval_s = compute_median_interval_s(reference.time_s)
@@ -129,15 +126,12 @@ def associate(
 
 
 def choose_gap_limit_s(time_s: Array, min_gap_limit_s: float = MIN_GAP_LIMIT_S) -> float:
-    """Return the default maximum gap (s) between timestamps over which poses are interpolated."""
+    """Return the default maximum gap (s) for the interpolation of poses."""
     return max(MAX_GAP_INTERVALS * compute_median_interval_s(time_s), min_gap_limit_s)
 
 
 def is_bracketed(time_s: Array, reference_time_s: Array, gap_limit_s: float) -> BoolArray:
-    """Return a mask of times between two reference times with a gap of at most ``gap_limit_s``.
-
-    Times that equal a reference time are included.
-    """
+    """Return a mask of times between two reference times that are at most ``gap_limit_s`` apart."""
     next_indices = np.clip(np.searchsorted(reference_time_s, time_s), 1, len(reference_time_s) - 1)
     previous_reference_time_s = reference_time_s[next_indices - 1]
     next_reference_time_s = reference_time_s[next_indices]
@@ -170,11 +164,8 @@ def interpolate_positions(trajectory: Trajectory, time_s: Array) -> Array:
 def _pair_nearest(
     estimate_time_s: Array, reference_time_s: Array, max_difference_s: float, offset_s: float
 ) -> tuple[IntArray, IntArray]:
-    """Pair each pose of the shorter trajectory with the nearest pose (in time) of the longer one.
-
-    Return the pose indices of both, without pairs that differ by more than ``max_difference_s``.
-    """
-    # The offset is added to the longer series, so that rounding errors are those of the evo package
+    """Pair the poses of two trajectories that are nearest in time, and return their indices."""
+    # With this order of operations, rounding errors equal those of the evo package
     is_estimate_denser = len(estimate_time_s) > len(reference_time_s)
     sparse_time_s = reference_time_s if is_estimate_denser else estimate_time_s
     dense_time_s = estimate_time_s + offset_s if is_estimate_denser else reference_time_s - offset_s

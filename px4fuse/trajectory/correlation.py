@@ -1,4 +1,4 @@
-"""Cross-correlation of two series, also with gaps, and autocovariance of a series."""
+"""Cross-correlation of two series with gaps, and autocovariance of a series."""
 
 from dataclasses import dataclass
 from typing import Any, TypeVar
@@ -13,16 +13,15 @@ RealOrComplex = TypeVar("RealOrComplex", Array, ComplexArray)
 
 @dataclass(frozen=True)
 class Moments:
-    """Second moments of two series a and b over their common samples, at each lag.
+    """Second moments of two series a and b at each lag, over the common samples.
 
-    Arrays have shape (n + m - 1,). At index k, a[0] and b[k - (n - 1)] are at the same time. Sums,
-    and the means ā and b̄, are over the common samples.
+    All arrays have one value per lag, shape (n + m - 1,). ā and b̄ are the means of a and b.
 
     Attributes
     ----------
     count : ndarray
         Number of common samples.
-    covariance : ndarray, complex for complex series
+    covariance : ndarray
         Σ conj(a - ā)(b - b̄).
     sum_of_squares_a, sum_of_squares_b : ndarray
         Σ |a - ā|² and Σ |b - b̄|².
@@ -37,18 +36,16 @@ class Moments:
 def compute_moments(
     a: RealOrComplex, b: RealOrComplex, is_known_a: BoolArray, is_known_b: BoolArray
 ) -> Moments:
-    """Compute second moments of two series at each lag, for a normalised correlation.
-
-    The equations are those of Padfield (2012), 3 to 9.
+    """Compute the second moments of two series at each lag (Padfield 2012, eqs. 3 to 9).
 
     Parameters
     ----------
     a, b : ndarray, shapes (n,) and (m,)
-        Real or complex.
+        Real or complex series.
     is_known_a, is_known_b : ndarray of bool, shapes (n,) and (m,)
-        Mask of known samples, at least one per series.
+        Masks of the known samples.
     """
-    # The means are subtracted first, which improves the numerical precision
+    # Subtracting the means first improves the numerical precision
     a, b = (
         np.where(is_known, values - np.mean(values[is_known]), 0.0)
         for values, is_known in ((a, is_known_a), (b, is_known_b))
@@ -69,18 +66,12 @@ def compute_moments(
 
 
 def autocovariance(values: Array | ComplexArray) -> Array:
-    """Return the real part of Σ conj(v_k) v_(k+l) at lags 0 to n - 1, without subtracting the mean.
-
-    ``values``: shape (n,), real or complex.
-    """
+    """Return the real part of Σ conj(v_k) v_(k+l) at each lag l ≥ 0; the mean is not subtracted."""
     return _correlate(values, values)[len(values) - 1 :].real
 
 
 def _correlate(a: Array | ComplexArray, b: Array | ComplexArray) -> ComplexArray:
-    """Compute Σ a conj(b) over the common samples, at each lag.
-
-    The result equals that of ``scipy.signal.correlate``, whose import takes 0.3 s.
-    """
+    """Compute the cross-correlation of two series, like ``scipy.signal.correlate``."""
     lag_count = len(a) + len(b) - 1
     is_complex = np.iscomplexobj(a) or np.iscomplexobj(b)
     transform: Any = fft.fft if is_complex else fft.rfft

@@ -1,8 +1,7 @@
-"""Evaluation of a trajectory against a reference: ATE and RPE (Sturm 2012) with 95 % intervals.
+"""Evaluation of a trajectory against a reference: ATE and RPE with 95 % intervals.
 
-The absolute trajectory error (ATE) is the distance of each pose from the reference after alignment.
-The relative pose error (RPE) compares motions over a fixed distance or time, so drift does not
-accumulate in it.
+The absolute trajectory error (ATE) is the position error after alignment. The relative pose error
+(RPE) is the error of the motion over a fixed distance or time (Sturm 2012).
 """
 
 import re
@@ -33,35 +32,27 @@ from px4fuse.trajectory.model import MIN_POSES, Trajectory, cumulative_distance
 from px4fuse.trajectory.scores import RelativeError, RmseInterval, RpePairDistance, Statistics
 from px4fuse.trajectory.time_offset import TimeOffset, compute_clock_offset_s, estimate_time_offset
 
-# An orientation is constant if no pose is rotated from the first one by more than this angle (rad),
-# which is above 0, because files contain rounded numbers
+# Maximum rotation (rad) of a constant orientation, above 0 because files contain rounded numbers
 MAX_ROTATION_OF_CONSTANT_ORIENTATION_RAD = 1e-6
-# A constant orientation is a placeholder if the trajectory has at least this number of poses and
-# this extent (m)
+# Minimum number of poses and minimum extent (m) for the search for a constant orientation
 MIN_POSE_COUNT_FOR_PLACEHOLDER, MIN_EXTENT_FOR_PLACEHOLDER_M = 10, 1.0
-# Minimum duration (s) of a repeated position for a warning, and minimum motion (m) of the reference
-# during the repetition
+# Minimum duration (s) of a repeated position, and minimum motion (m) of the reference meanwhile
 MIN_FREEZE_DURATION_S, MIN_REFERENCE_MOTION_DURING_FREEZE_M = 2.0, 0.5
-# At a jump, the distance of successive poses is longer in the estimate than in the reference.
-# Minimum difference (m) of both distances, and its minimum ratio to the median difference
+# Minimum jump (m) relative to the reference, and its minimum ratio to the median step error
 MIN_JUMP_M, MIN_JUMP_TO_MEDIAN_RATIO = 0.5, 20.0
-# After a restart of its map, SLAM continues near the first position or the origin. Maximum distance
-# (m) from one of them
+# A jump to a position within this distance (m) of the start indicates a restart of the SLAM map
 MAX_DISTANCE_FROM_START_AFTER_RESTART_M = 0.5
-# Maximum number of jump times in the warning about jumps
 MAX_STATED_JUMPS = 5
-# Minimum mean rotation (rad) between the orientations of estimate and reference for the conclusion
-# that their body axes differ
+# Minimum rotation (rad) between the orientations of two trajectories with different body axes
 MIN_ROTATION_BETWEEN_BODY_AXES_RAD = np.radians(30.0)
-# Maximum RMS deviation (rad) of this rotation from its mean, because a rotation between body axes
-# is constant
+# Maximum variation (rad, RMS) of a rotation that counts as constant
 MAX_DEVIATION_FROM_MEAN_ROTATION_RAD = np.radians(5.0)
 # Number of alternating estimates of alignment and lever arm
 LEVER_ARM_ITERATIONS = 5
 
 
 def drop_constant_orientation(trajectory: Trajectory) -> tuple[Trajectory, tuple[str, ...]]:
-    """Remove the orientation if it is constant, because it was not measured; also return a note."""
+    """Remove a constant orientation, which was not measured, and return a note."""
     rotation, extent_m = trajectory.rotation, np.ptp(trajectory.position_m, axis=0).max()
     if (
         rotation is None
@@ -107,7 +98,7 @@ def find_frozen_poses(
 
 
 def find_jump_warnings(estimate: Trajectory, reference: Trajectory) -> tuple[str, ...]:
-    """Return a warning if matched poses of the estimate jump and those of the reference do not."""
+    """Return a warning if the estimate jumps and the reference does not."""
     steps_of_estimate_m, steps_of_reference_m = (
         np.linalg.norm(np.diff(trajectory.position_m, axis=0), axis=1)
         for trajectory in (estimate, reference)
@@ -137,7 +128,7 @@ def find_jump_warnings(estimate: Trajectory, reference: Trajectory) -> tuple[str
 
 
 def has_other_body_axes(aligned_estimate: Trajectory, reference: Trajectory) -> bool:
-    """Return True if a constant rotation separates the body axes, as between camera and vehicle."""
+    """Return True if a constant rotation separates the body axes of both trajectories."""
     if aligned_estimate.rotation is None or reference.rotation is None:
         return False
     rotation_difference = aligned_estimate.rotation.inv() * reference.rotation
@@ -149,36 +140,33 @@ def has_other_body_axes(aligned_estimate: Trajectory, reference: Trajectory) -> 
     )
 
 
-# Maximum scale factor error (ratio minus 1) of the estimate without a warning
+# Maximum deviation of the estimated scale factor from 1 without a warning
 MAX_SCALE_ERROR = 0.1
-# A warning appears if a smaller fraction of the poses of the estimate is used, or if these poses
-# cover a smaller fraction of the time of the reference
+# Minimum fraction of poses or time that is evaluated, without a warning
 MIN_EVALUATED_FRACTION = 0.5
-# Minimum estimated time offset (s) for a warning that the clocks differ. A smaller offset may be
-# the delay of an estimator
+# Minimum time offset (s) for a warning, because estimators can have smaller delays
 MIN_REPORTED_TIME_OFFSET_S = 0.1
-# An estimate counts as mirrored if one reversed axis reduces the ATE to at most this fraction
+# A frame is mirrored if reversing one axis reduces the ATE to this fraction or less
 MAX_MIRRORED_ATE_RATIO = 0.3
-# The mirror test requires an ATE of at least this fraction of the extent of the reference
+# The test for a mirrored frame needs at least this ratio of ATE to extent of the reference
 MIN_ATE_TO_EXTENT_RATIO_FOR_MIRROR_TEST = 0.03
-# A better time offset is reported if it reduces the ATE to at most this fraction
+# A better time offset must reduce the ATE to this fraction or less
 MAX_ATE_RATIO_OF_BETTER_OFFSET = 0.8
-# Minimum number of evaluated poses with the better time offset, relative to that with the used one
+# A better time offset must keep at least this fraction of the evaluated poses
 MIN_POSE_COUNT_RATIO_OF_BETTER_OFFSET = 0.8
-# Maximum ratio of the pose interval of the reference to that of the estimate; above it, the user
-# probably interchanged reference and estimate
+# Above this ratio of pose intervals, reference and estimate are probably interchanged
 MAX_POSE_INTERVAL_RATIO = 5.0
 
 _Z_DOWN_FRAMES = ("NED", "FRD")
 _Z_UP_FRAMES = ("ENU",)
-# Kinds of trajectories in a frame with unknown vertical direction
+# Sources of trajectories with unknown vertical direction
 _KINDS_WITHOUT_KNOWN_VERTICAL = ("slam", "unknown")
-# File names of monocular SLAM, of which the scale is unknown
+# File names that indicate monocular SLAM, which has an unknown scale
 _MONOCULAR_PATTERN = re.compile(r"(?<![a-z])mono(?![a-z])|monocular", re.IGNORECASE)
 
 
 class AbsoluteError(Record):
-    """ATE of position (m), with the 95 % interval of its RMSE, and of orientation (degrees)."""
+    """Absolute trajectory error (ATE): position (m) and orientation (degrees)."""
 
     translation_m: Statistics
     interval_m: OrUnavailable[RmseInterval]
@@ -186,7 +174,7 @@ class AbsoluteError(Record):
 
 
 class Evaluation(Record, kw_only=True):
-    """ATE and RPE of an estimate against a reference, with alignment, time offset and tracks.
+    """ATE and RPE of an estimated trajectory against a reference.
 
     Attributes
     ----------
@@ -195,21 +183,22 @@ class Evaluation(Record, kw_only=True):
         Reason for the choice of the alignment, a sentence.
     transform : Transform
         Transform from the frame of the estimate to the frame of the reference.
-    association : Association
     time_offset : TimeOffset
-        Time offset; its ``offset_s`` was added to the timestamps of the estimate.
+        Time offset added to the timestamps of the estimate.
     ate : AbsoluteError
+        Absolute trajectory error.
     rpe : tuple of RelativeError
+        Relative pose errors.
     notes, warnings : tuple of str
         Sentences for the user.
     estimate_track, reference_track : Trajectory
-        Complete trajectories, before association and alignment.
+        Complete trajectories before alignment.
     time_s : ndarray, shape (n,)
-        Times of the compared poses, on the clock of the estimate.
+        Times of the compared poses.
     distance_m : ndarray, shape (n,)
-        Distance along the reference, from the first compared pose.
+        Distance along the reference from the first compared pose.
     unaligned_position_m, aligned_position_m, reference_position_m : ndarray, shape (n, 3)
-        Positions of the estimate before and after alignment, and of the reference.
+        Positions of estimate (before and after alignment) and reference.
     position_error_m : ndarray, shape (n,)
     """
 
@@ -243,28 +232,27 @@ def evaluate(
     rpe_deltas: Sequence[RpePairDistance] | None = None,
     all_pairs: bool = True,
 ) -> Evaluation:
-    """Compute ATE and RPE of an estimate against a reference.
+    """Compute ATE and RPE of an estimated trajectory against a reference.
 
     Parameters
     ----------
     alignment : {"none", "yaw", "se3", "sim3"}, optional
-        By default chosen by :func:`choose_alignment`.
+        Default: see :func:`choose_alignment`.
     association : {"interpolate", "nearest"}
     max_gap_s : float, optional
         See :func:`~px4fuse.trajectory.association.associate`.
     time_offset_s : float, "auto" or None
-        Time offset added to the timestamps of the estimate. "auto" estimates the offset from the
-        motion. None uses UNIX time if both trajectories have it, else 0. If the trajectories then
-        do not overlap, the offset is estimated.
+        Time offset added to the timestamps of the estimate. "auto": estimate the offset from the
+        motion. None: use UNIX time if available.
     rpe_deltas : sequence of RpePairDistance, optional
-        Distances and times of the RPE; by default adapted to length and duration of the flight.
+        Distances and times for the RPE. Default: chosen from the length of the flight.
 
     Raises
     ------
     TrajectoryError
         The trajectories do not overlap in time, or the motion does not determine the alignment.
     SettingsError
-        A delta is not positive, or not an integer for frames.
+        A distance or time for the RPE is not positive, or a number of frames is not an integer.
     """
     (estimate, reference), constant_orientation_notes = zip(
         *map(drop_constant_orientation, (estimate, reference)), strict=True
@@ -373,12 +361,7 @@ def _apply_transform(transform: Transform, estimate: Trajectory) -> Trajectory:
 
 
 def choose_alignment(estimate: Trajectory, reference: Trajectory) -> tuple[AlignmentKind, str]:
-    """Choose the alignment by the kinds of the trajectories; also return the reason, a sentence.
-
-    Ground truth is not aligned. Estimators that use gravity are aligned in yaw and position. SLAM
-    is aligned in rotation and position, and in scale if it is monocular or the scale factor error
-    exceeds 10 %.
-    """
+    """Choose the alignment by the sources of the trajectories, and return the reason."""
     has_same_frame = estimate.frame == reference.frame != "unknown"
     if estimate.kind == "truth" and (has_same_frame or reference.kind == "truth"):
         return "none", "No alignment is applied, because the estimate is ground truth."
@@ -428,9 +411,9 @@ def choose_alignment(estimate: Trajectory, reference: Trajectory) -> tuple[Align
 def _choose_time_offset(
     estimate: Trajectory, reference: Trajectory, given_offset_s: float | Literal["auto"] | None
 ) -> tuple[TimeOffset, list[str], float | None]:
-    """Choose the offset to add to the timestamps of the estimate.
+    """Choose the time offset to add to the timestamps of the estimate.
 
-    Also return warnings, and a better offset (s) that is estimated from the motion, if any.
+    Also return warnings, and a better time offset (s) or None.
     """
     is_offset_given = given_offset_s not in (None, "auto")
     clock_offset_s = compute_clock_offset_s(estimate, reference)
@@ -474,10 +457,10 @@ def _choose_time_offset(
 def _find_better_offset_warnings(
     statistics: Statistics, evaluate_with_offset: Callable[..., Evaluation], better_offset_s: float
 ) -> list[str]:
-    """Warn if a better time offset reduces the ATE for nearly the same number of poses."""
+    """Return a warning if another time offset reduces the ATE."""
     try:
         better_statistics = evaluate_with_offset(time_offset_s=better_offset_s).ate.translation_m
-    except TrajectoryError:  # with this offset, too few poses match or have motion for an alignment
+    except TrajectoryError:  # too few poses match, or they do not move
         return []
     if (
         better_statistics.rmse > MAX_ATE_RATIO_OF_BETTER_OFFSET * statistics.rmse
@@ -494,7 +477,7 @@ def _find_better_offset_warnings(
 def _find_mirror_warnings(
     estimate: Trajectory, reference: Trajectory, alignment: AlignmentKind, ate_m: float
 ) -> Iterator[str]:
-    """Warn if the estimate fits much better with one reversed axis (left-handed frame)."""
+    """Return a warning if the estimate fits much better with one axis reversed."""
     if ate_m < MIN_ATE_TO_EXTENT_RATIO_FOR_MIRROR_TEST * np.ptp(reference.position_m, axis=0).max():
         return
     for axis, signs in (("y", (1.0, -1.0, 1.0)), ("z", (1.0, 1.0, -1.0))):
@@ -545,7 +528,7 @@ def _find_comparison_warnings(
             f"The estimate covers only {association.coverage_reference:.0%} of the time of the "
             "reference."
         )
-    if has_jumps:  # a jump changes the fitted scale, so the scale is not checked
+    if has_jumps:  # a jump changes the fitted scale
         return
     # Unlike fit_alignment, umeyama also returns the scale for motion along a line
     scale = umeyama(estimate.position_m, reference.position_m, with_scale=True).scale
@@ -564,13 +547,12 @@ def _fit_alignment_with_warning(
     *,
     is_alignment_given: bool,
 ) -> tuple[Transform, tuple[str, ...]]:
-    """Fit the alignment. If the motion does not determine it, return a best fit and a warning.
+    """Fit the alignment, and return a warning if the motion does not determine it.
 
     Raises
     ------
     TrajectoryError
-        The motion does not determine the alignment that the user requested, or there are too few
-        poses.
+        The motion does not determine the alignment that the user chose, or there are too few poses.
     """
     try:
         return fit_alignment(estimate.position_m, reference.position_m, alignment), ()
@@ -589,11 +571,7 @@ def _fit_alignment_with_warning(
 def _move_to_reference_body(
     estimate: Trajectory, reference: Trajectory, alignment: AlignmentKind
 ) -> tuple[Trajectory, tuple[str, ...]]:
-    """Convert the poses of the estimate to the body axes and body origin of the reference.
-
-    The constant rotation and the lever arm between both bodies are fitted in turn with the
-    alignment.
-    """
+    """Convert the poses of the estimate to the body axes and body origin of the reference."""
     assert estimate.rotation is not None
     assert reference.rotation is not None
     reference_rotation_matrices = reference.rotation.as_matrix()
@@ -603,7 +581,7 @@ def _move_to_reference_body(
     corrected_estimate = estimate
     for _ in range(LEVER_ARM_ITERATIONS):
         transform = fit_alignment(corrected_estimate.position_m, reference.position_m, alignment)
-        # chordal mean of the rotation differences (Hartley 2013, section 5.3)
+        # chordal mean of rotations (Hartley 2013, section 5.3)
         body_rotation = (
             (transform.to_rotation() * estimate.rotation).inv() * reference.rotation
         ).mean()
@@ -627,7 +605,7 @@ def _move_to_reference_body(
 def _rotate_to_reference_body(
     aligned_estimate: Trajectory, reference: Trajectory
 ) -> tuple[Trajectory, tuple[str, ...]]:
-    """Remove the constant rotation between camera and vehicle axes; also return a note."""
+    """Remove the constant rotation between camera and vehicle axes, and return a note."""
     vehicle_frames = (*_Z_DOWN_FRAMES, *_Z_UP_FRAMES)
     body_axes_differ = (aligned_estimate.frame == "camera") != (reference.frame == "camera") or any(
         track.kind == "slam"
@@ -638,7 +616,7 @@ def _rotate_to_reference_body(
     rotation_of_estimate = aligned_estimate.rotation
     if rotation_of_estimate is None or reference.rotation is None or not body_axes_differ:
         return aligned_estimate, ()
-    # chordal mean of the rotation differences (Hartley 2013, section 5.3)
+    # chordal mean of rotations (Hartley 2013, section 5.3)
     rotation = (rotation_of_estimate.inv() * reference.rotation).mean()
     return replace(aligned_estimate, rotation=rotation_of_estimate * rotation), (
         "Rotation errors exclude the estimated constant rotation between vehicle and camera axes, "

@@ -13,12 +13,12 @@ from scipy.spatial.transform import Rotation
 from px4fuse.core.arrays import Array, BoolArray, IntArray
 from px4fuse.core.record import Count, Record, one_line_repr
 
-# Source of a trajectory; "slam" is SLAM in the frame of its first key frame, such as ORB-SLAM3
+# Source of a trajectory; "slam": its frame is that of the first key frame
 TrajectoryKind = Literal["vio", "ekf2", "kf", "truth", "slam", "unknown"]
-# World frame: z is down in "NED" and "FRD", up in "ENU"; "camera" has y down and z forward
+# World frame; in "camera", y is down and z is forward
 Frame = Literal["NED", "FRD", "ENU", "camera", "unknown"]
 MIN_POSES = 3
-# Indices of north, east and down in (x, y, z), and the signs of these components, by frame
+# Columns of north, east and down in (x, y, z), and their signs, by frame
 NED_COMPONENTS_BY_FRAME = {
     "ned": ([0, 1, 2], [1.0, 1.0, 1.0]),
     "enu": ([1, 0, 2], [1.0, 1.0, -1.0]),
@@ -35,11 +35,9 @@ AXES_OF_FRAME: Mapping[Frame, tuple[str, str, str]] = {
 }
 
 
-# Components of a vector by axis name
 AxisComponents = Annotated[dict[str, float], Meta(min_length=3, max_length=3)]
 
 
-# Opposite direction, by direction
 OPPOSITE_DIRECTIONS = {
     "north": "south",
     "east": "west",
@@ -51,7 +49,7 @@ OPPOSITE_DIRECTIONS = {
 
 
 def format_vector(vector_m: Mapping[str, float]) -> str:
-    """Format the components of a vector with the names of their directions.
+    """Format the components of a vector as distances in named directions.
 
     >>> format_vector({"forward": 1.0, "right": -0.5}), format_vector({"x": -1.0})
     ('1.00 m forward, 0.50 m left', '-1.00 m along x')
@@ -65,12 +63,12 @@ def format_vector(vector_m: Mapping[str, float]) -> str:
 
 
 def split_by_axis(frame: Frame, vector_m: Array) -> dict[str, float]:
-    """Return the component of a vector along each axis of its frame, by axis name."""
+    """Return the components of a vector by axis name."""
     return dict(zip(AXES_OF_FRAME[frame], vector_m.tolist(), strict=True))
 
 
 class Track(Record):
-    """Description of a trajectory and its file, for results.json."""
+    """Summary of a trajectory and its file, for results.json."""
 
     name: str
     sha256: Annotated[str, Meta(pattern="^([0-9a-f]{64})?$")]
@@ -91,26 +89,27 @@ class Trajectory:
     Attributes
     ----------
     name : str
-        File name without folder; for a flight log followed by the track name ("log.ulg:vio").
+        File name; for a flight log with the name of the track ("log.ulg:vio").
     kind : TrajectoryKind
+        Source of the trajectory.
     time_s : ndarray, shape (n,)
-        Strictly increasing times (s): timestamps of the file, or time since the first data of a
-        log.
+        Strictly increasing times (s).
     position_m : ndarray, shape (n, 3)
         Positions in ``frame``.
     rotation : Rotation of n, or None
-        Rotates vectors from body (or camera) axes to ``frame``; None without orientation.
+        Rotations from body (or camera) axes to ``frame``.
     frame : Frame
+        World frame.
     unix_offset_s : float or None
         UNIX time minus ``time_s``; None if unknown.
     position_variance_m2, rotation_variance_rad2 : ndarray, shape (n, 3), or None
-        Variances reported by the estimator, for rotation about the body axes; None if not reported.
+        Variances reported by the estimator; of the rotation, about the body axes.
     sha256 : str
         SHA-256 of the file.
     size_bytes : int
         Size of the file.
     notes : tuple of str
-        Sentences on the detected format and on dropped or missing data.
+        Sentences on the format and on missing data.
     """
 
     name: str
@@ -130,14 +129,14 @@ class Trajectory:
 
     @property
     def is_from_log(self) -> bool:
-        """True for a track of a flight log, on the boot clock of the autopilot."""
+        """True for a track of a flight log."""
         return self.name.endswith(f":{self.kind}")
 
     def __len__(self) -> int:
         return len(self.time_s)
 
     def __getitem__(self, selection: slice | BoolArray | IntArray) -> Trajectory:
-        """Select poses by a slice, boolean array (n,) or integer array."""
+        """Select poses by slice, mask or indices."""
         selected_arrays: dict[str, Any] = {
             name: values[selection]
             for name, values in vars(self).items()
@@ -146,7 +145,7 @@ class Trajectory:
         return replace(self, **selected_arrays)
 
     def cut_to_span(self, start_s: float, end_s: float) -> Trajectory:
-        """Return the poses from ``start_s`` to ``end_s``, possibly none."""
+        """Return the poses from ``start_s`` to ``end_s``."""
         return self[(self.time_s >= start_s) & (self.time_s <= end_s)]
 
     def replace_positions(
@@ -154,7 +153,7 @@ class Trajectory:
     ) -> Trajectory:
         """Return the trajectory with new positions, and without reported variances.
 
-        ``world_rotation`` (one, or one per pose) rotates the orientations in the world frame.
+        ``world_rotation`` rotates the orientations in the world frame.
         """
         rotation = self.rotation
         if rotation is not None and world_rotation is not None:
@@ -168,7 +167,7 @@ class Trajectory:
         )
 
     def describe_track(self) -> Track:
-        """Return the description of the trajectory for results.json."""
+        """Return a summary of the trajectory for results.json."""
         track_fields = ("name", "sha256", "size_bytes", "kind", "frame", "notes")
         return Track(
             **{name: getattr(self, name) for name in track_fields},
@@ -180,5 +179,5 @@ class Trajectory:
 
 
 def cumulative_distance(position_m: Array) -> Array:
-    """Return the path length (m) from the start to each of the positions (n, d), shape (n,)."""
+    """Return the path length (m) from the start to each position, shape (n,)."""
     return np.concatenate([[0.0], np.cumsum(np.linalg.norm(np.diff(position_m, axis=0), axis=1))])

@@ -1,4 +1,4 @@
-"""Operations on quaternions (w, x, y, z), shape (..., 4), with the Hamilton product as in PX4."""
+"""Operations on quaternions (w, x, y, z), shape (..., 4), with the Hamilton product."""
 
 import numpy as np
 
@@ -6,7 +6,7 @@ from px4fuse.core.arrays import Array
 
 
 def multiply(a: Array, b: Array) -> Array:
-    """Compute the product a ⊗ b: rotation by b, then by a."""
+    """Compute the product a ⊗ b of quaternions: rotation by b, then by a."""
     w, x, y, z = _split_components(a)
     s, i, j, k = _split_components(b)
     product = np.empty(np.broadcast_shapes(a.shape, b.shape))
@@ -18,12 +18,12 @@ def multiply(a: Array, b: Array) -> Array:
 
 
 def _split_components(vectors: Array) -> list[Array]:
-    """Split vectors into their components: ten times as fast as np.moveaxis for few vectors."""
+    """Split vectors into components, faster than np.moveaxis for few vectors."""
     return [vectors[..., index] for index in range(vectors.shape[-1])]
 
 
 def conjugate(q: Array) -> Array:
-    """Return the conjugates of quaternions, which are the inverses of unit quaternions."""
+    """Return the conjugates of quaternions (inverse rotations)."""
     return np.asarray(q * np.array([1.0, -1.0, -1.0, -1.0]))
 
 
@@ -44,7 +44,7 @@ def to_rotation_vector(q: Array) -> Array:
 
 
 def build_matrix(*rows: tuple[Array | float, ...]) -> Array:
-    """Build matrices from their elements, row by row: numbers, or arrays of the same shape."""
+    """Build matrices from their elements, row by row."""
     shape = np.broadcast_shapes(*(np.shape(element) for row in rows for element in row))
     matrices = np.empty((*shape, len(rows), len(rows[0])))
     for i, row in enumerate(rows):
@@ -75,17 +75,13 @@ def skew(v: Array) -> Array:
 
 
 def cumulative_product(quaternions: Array) -> Array:
-    """Compute the products q_0, q_0 ⊗ q_1, q_0 ⊗ q_1 ⊗ q_2, ..., shape (n, 4).
-
-    The quaternions are arranged in about √n rows and columns, so about 2√n vectorised products are
-    sufficient.
-    """
+    """Compute the products q_0, q_0 ⊗ q_1, q_0 ⊗ q_1 ⊗ q_2, ... of quaternions, shape (n, 4)."""
     n = len(quaternions)
     width = max(1, int(np.sqrt(n)))
     rows = -(-n // width)
     identity = np.array([1.0, 0.0, 0.0, 0.0])
     padded_quaternions = np.concatenate([quaternions, np.tile(identity, (rows * width - n, 1))])
-    # Products within each row first; then each row is multiplied by the product of all earlier rows
+    # Products in rows of √n quaternions need only about 2√n vectorised products
     row_products = padded_quaternions.reshape(rows, width, 4).copy()
     for column in range(1, width):
         row_products[:, column] = multiply(row_products[:, column - 1], row_products[:, column])
@@ -113,6 +109,6 @@ def interpolate(times: Array, known_times: Array, quaternions: Array) -> Array:
 
 
 def heading(q: Array) -> Array:
-    """Return the headings (rad, clockwise from above, unwrapped) of quaternions, shape (n, 4)."""
+    """Return the headings (rad, clockwise from above, unwrapped) of quaternions in NED."""
     w, x, y, z = _split_components(q)
     return np.unwrap(np.arctan2(2 * (w * z + x * y), 1 - 2 * (y * y + z * z)))

@@ -1,7 +1,4 @@
-"""Errors of a trajectory: statistics, relative pose error (RPE), 95 % interval of the RMSE.
-
-The interval is from a block bootstrap, because errors of successive poses are correlated.
-"""
+"""Errors of a trajectory: statistics, relative pose error (RPE), and 95 % interval of the RMSE."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -20,25 +17,22 @@ from px4fuse.trajectory.model import Trajectory, cumulative_distance
 
 PairDistanceUnit = Literal["frames", "m", "s"]
 
-# Maximum relative error of the distance of a pair of poses, if all pairs are used. This is the
-# default of the evo package
+# Maximum relative error of the distance of a pose pair, as in the evo package
 MAX_RELATIVE_PAIR_DISTANCE_ERROR = 0.1
 DEFAULT_RPE_DISTANCES_M = (0.1, 0.5, 1.0, 5.0, 10.0, 50.0, 100.0, 500.0, 1000.0)
 DEFAULT_RPE_TIMES_S = (1.0, 10.0, 60.0)
-# By default, the RPE is computed for at most this many distances and this many times
 MAX_DEFAULT_RPE_DISTANCES = 3
 MAX_DEFAULT_RPE_TIMES = 2
-# Minimum default distance of pose pairs, as fraction of the path length
+# Minimum default RPE distance, as fraction of the path length
 MIN_PAIR_DISTANCE_FRACTION_OF_PATH = 1 / 200
-# Maximum default distance (time) of pose pairs, as fraction of the path length (duration)
+# Maximum default RPE distance or time, as fraction of path length or duration
 MAX_PAIR_DISTANCE_FRACTION = 1 / 5
 BOOTSTRAP_RESAMPLES = 2000
 BOOTSTRAP_SEED = 20120101
-# Probability of the bootstrap interval
 CONFIDENCE_LEVEL = 0.95
-# Length of a bootstrap block, in integrated autocorrelation times of the squared errors
+# Block length of the bootstrap, in autocorrelation times of the squared errors
 BLOCK_LENGTH_IN_CORRELATION_TIMES = 3.0
-# Number of lags in the sum of autocorrelations, in integrated autocorrelation times (Sokal 1997)
+# Lags in the sum of autocorrelations, in autocorrelation times (Sokal 1997)
 WINDOW_LENGTH_IN_CORRELATION_TIMES = 5.0
 # Minimum number of bootstrap blocks for a 95 % interval
 MIN_BOOTSTRAP_BLOCKS = 5.0
@@ -56,10 +50,7 @@ class RpePairDistance:
 
 
 class Statistics(Record):
-    """Statistics of ``count`` errors, in the unit of the errors.
-
-    The standard deviation ``std`` divides by ``count``.
-    """
+    """Statistics of a series of errors."""
 
     count: Count
     rmse: NotNegative
@@ -76,10 +67,11 @@ class RmseInterval(Record):
     Attributes
     ----------
     low, high : float
+        Limits of the interval.
     block_length : int
-        Number of errors in a block.
+        Number of successive errors in a block.
     blocks : float
-        Number of errors over block length: approximate number of independent errors.
+        Number of errors divided by the block length.
     """
 
     low: float
@@ -89,19 +81,18 @@ class RmseInterval(Record):
 
 
 class RelativeError(Record):
-    """RPE of pairs of poses with a distance of ``delta``.
+    """Relative pose error (RPE) of pairs of poses at a fixed distance.
 
     Attributes
     ----------
     delta : float
         Distance between the two poses of a pair, in ``unit``.
     all_pairs : bool
-        True if a pair starts at every pose; False if each pair starts at the end of the previous
-        pair.
+        True: pairs overlap. False: each pair starts at the end of the previous pair.
     pairs_from : str
-        Path along which distances are measured: always the reference.
+        Path along which distances are measured: the reference.
     translation_m, rotation_deg : Statistics or Unavailable
-    interval_m : Interval or Unavailable
+    interval_m : RmseInterval or Unavailable
         95 % interval of the RMSE of the translation.
     """
 
@@ -120,7 +111,7 @@ class RelativeError(Record):
 
 
 def compute_statistics(errors: Array) -> Statistics:
-    """Compute RMSE, mean, median, standard deviation and range of n ≥ 1 errors, shape (n,)."""
+    """Compute RMSE, mean, median, standard deviation and range of errors, shape (n,)."""
     return Statistics(
         count=len(errors),
         rmse=float(np.sqrt(np.mean(errors**2))),
@@ -138,13 +129,12 @@ def compute_rotation_statistics(a: Rotation, b: Rotation) -> Statistics:
 
 
 def choose_default_deltas(distance_m: Array, time_s: Array) -> tuple[RpePairDistance, ...]:
-    """Choose distances and times for the RPE that fit path length and duration of the flight."""
+    """Choose distances and times for the RPE from path length and duration of the flight."""
 
     def choose_delta_values(
         distance_or_time: Array, values: Sequence[float], min_fraction: float
     ) -> list[float]:
         total_distance_or_time = float(np.ptp(distance_or_time))
-        # The minimum distance or time of a pair is two median intervals between poses
         minimum = max(
             min_fraction * total_distance_or_time,
             2.0 * compute_median_interval_s(distance_or_time),
@@ -168,26 +158,26 @@ def choose_default_deltas(distance_m: Array, time_s: Array) -> tuple[RpePairDist
 def find_pose_pairs(
     position_m: Array, time_s: Array, delta: RpePairDistance, *, all_pairs: bool = True
 ) -> tuple[IntArray, IntArray]:
-    """Find pairs of poses with a distance of ``delta``.
+    """Find pairs of poses at a fixed distance for the RPE.
 
     Parameters
     ----------
     position_m : ndarray, shape (n, 3)
     time_s : ndarray, shape (n,)
     delta : RpePairDistance
-        Distance of a pair; in m it is measured along the path.
+        Distance of a pair: path length, time or number of frames.
     all_pairs : bool
-        True: pairs start at every pose and end at the pose nearest to delta. False: pairs start at
-        the end of the previous pair, and end at the first pose that is at least delta away.
+        True: pairs start at every pose. False: pairs do not overlap.
 
     Returns
     -------
     start_indices, end_indices : ndarray of int, shape (k,)
+        Indices of the two poses of each pair.
 
     Raises
     ------
     SettingsError
-        The delta is not positive, or not an integer for frames.
+        The distance is not positive, or the number of frames is not an integer.
     """
     if not (np.isfinite(delta.value) and delta.value > 0.0):
         raise SettingsError(f"RPE delta {delta}: the value must be positive.")
@@ -204,7 +194,7 @@ def find_pose_pairs(
     if not all_pairs:
         return _find_consecutive_pairs(np.diff(distance_or_time), delta.value)
     start_indices = np.arange(pose_count - 1)
-    # Neighbours are tested too, because rounding errors may change the nearest pose
+    # Rounding errors may change the nearest pose, so its neighbours are tested too
     nearest_indices = np.searchsorted(distance_or_time, distance_or_time + delta.value)[:-1]
     candidate_indices = np.clip(
         nearest_indices[:, None] + np.arange(-2, 2), start_indices[:, None] + 1, pose_count - 1
@@ -213,7 +203,7 @@ def find_pose_pairs(
         distance_or_time[candidate_indices] - distance_or_time[start_indices, None] - delta.value
     )
     best_candidate_columns = np.argmin(pair_distance_error, axis=1)
-    # If several poses have an equal distance (at rest), the first is used
+    # Several poses have an equal distance while the vehicle is at rest: use the first
     first_indices_at_same_distance = np.searchsorted(
         distance_or_time, distance_or_time[candidate_indices[start_indices, best_candidate_columns]]
     )
@@ -227,7 +217,7 @@ def find_pose_pairs(
 
 
 def _find_consecutive_pairs(steps: Array, delta: float) -> tuple[IntArray, IntArray]:
-    # The sum restarts with each pair, so that rounding errors are those of the evo package
+    # The sum restarts with each pair, so rounding errors equal those of the evo package
     pair_ends = [0]
     distance_or_time = 0.0
     for index, step in enumerate(steps.tolist(), 1):
@@ -246,17 +236,16 @@ def compute_relative_error(
     *,
     all_pairs: bool = True,
 ) -> RelativeError:
-    """Compute the RPE of the pairs of poses with a distance of ``delta``.
+    """Compute the relative pose error (RPE) of pairs of poses at a fixed distance.
 
-    The error of a pair is E = (Q_i⁻¹ Q_j)⁻¹ (P_i⁻¹ P_j), Sturm (2012), eq. 1.
+    The error of a pair (i, j) is E = (Q_i⁻¹ Q_j)⁻¹ (P_i⁻¹ P_j), Sturm (2012), eq. 1.
 
     Parameters
     ----------
     aligned_estimate, reference : Trajectory
-        P and Q, with the same number of poses at the same times. Only the scale of an alignment
-        affects the RPE.
+        Trajectories P and Q, with poses at the same times.
     delta, all_pairs
-        See :func:`find_pose_pairs`; distances are measured along the reference.
+        See :func:`find_pose_pairs`.
     """
     start_indices, end_indices = find_pose_pairs(
         reference.position_m, reference.time_s, delta, all_pairs=all_pairs
@@ -284,10 +273,10 @@ def compute_relative_error(
     rotations = get_rotations(aligned_estimate, reference, analysis_name)
     rotation_deg: OrUnavailable[Statistics]
     if isinstance(rotations, Unavailable):
-        # without orientations, displacements are compared in the frame of the reference
+        # without orientations, displacements are in the frame of the reference
         rotation_deg = rotations
     else:
-        # with orientations, each displacement is expressed in the axes of its first pose
+        # with orientations, each displacement is in the axes of its first pose
         start_rotation_inverses = [rotation[start_indices].inv() for rotation in rotations]
         displacements_m = [
             inverse.apply(displacement_m)
@@ -300,7 +289,7 @@ def compute_relative_error(
             for inverse, rotation in zip(start_rotation_inverses, rotations, strict=True)
         )
         rotation_deg = compute_rotation_statistics(reference_rotation, estimated_rotation)
-    # The difference is the translation of E in other axes, so it has the same length
+    # The difference of displacements has the same length as the translation of E
     translation_m = np.linalg.norm(displacements_m[0] - displacements_m[1], axis=1)
     overlapping_pair_count = int(np.median(end_indices - start_indices)) if all_pairs else 1
     rmse_interval_m = estimate_rmse_interval(
@@ -320,7 +309,7 @@ def compute_relative_error(
 def get_rotations(
     aligned_estimate: Trajectory, reference: Trajectory, analysis_name: str
 ) -> tuple[Rotation, Rotation] | Unavailable:
-    """Return the orientations of estimate and reference, or the reason if one has none."""
+    """Return the orientations of both trajectories, or Unavailable if one has none."""
     if aligned_estimate.rotation is not None and reference.rotation is not None:
         return aligned_estimate.rotation, reference.rotation
     role = "reference" if aligned_estimate.rotation else "estimate"
@@ -336,9 +325,7 @@ def estimate_rmse_interval(
 ) -> RmseInterval | Unavailable:
     """Compute the 95 % interval of the RMSE of correlated errors by circular block bootstrap.
 
-    The method is that of Politis & Romano (1992), with blocks of three integrated autocorrelation
-    times. Percentiles are widened for a small number of blocks (Hesterberg 2015, section 5.3).
-    ``min_block_length`` is the number of RPE pairs that overlap: their errors are correlated.
+    Sources: Politis and Romano (1992); Hesterberg (2015), section 5.3, for the percentiles.
     """
     squared_errors = errors**2
     error_count = len(squared_errors)
@@ -378,10 +365,7 @@ def estimate_rmse_interval(
 
 
 def compute_autocorrelation_time(values: Array) -> float:
-    """Compute the integrated autocorrelation time (samples) of a series: 1 + 2 Σ ρ, at least 1.
-
-    The sum ends at a lag of five autocorrelation times (Sokal 1997, section 3).
-    """
+    """Compute the integrated autocorrelation time (samples), 1 + 2 Σ ρ (Sokal 1997, section 3)."""
     centred_values = values - values.mean()
     if not centred_values.any():
         return 1.0

@@ -1,7 +1,6 @@
-"""Time offset between two recordings of the same motion: search over all lags, then least squares.
+"""Estimation of the time offset between two recordings of the same motion.
 
-The search correlates speeds, which do not depend on the frame. Least squares fits time offset and
-similarity transform. The result is rejected if another lag has a similar residual.
+Candidates are the peaks of the correlation of speeds. Least squares refines the best candidates.
 """
 
 from dataclasses import dataclass
@@ -20,45 +19,38 @@ from px4fuse.trajectory.association import choose_gap_limit_s, interpolate_posit
 from px4fuse.trajectory.correlation import autocovariance, compute_moments
 from px4fuse.trajectory.model import MIN_POSES, Trajectory
 
-# Minimum step (s) of the time grid on which speeds are correlated
+# Minimum step (s) of the time grid for the correlation of speeds
 GRID_STEP_S = 0.05
-# Maximum number of samples of the time grid on which speeds are correlated
 MAX_GRID_SAMPLES = 200_000
-# Standard deviation (s) of the Gaussian filter of positions, because differentiated positions are
-# noisy
+# Standard deviation (s) of the Gaussian filter of positions, because their derivative is noisy
 SMOOTHING_SIGMA_S = 0.25
-# Minimum overlap of the two trajectories in time, as fraction of the shorter trajectory
+# Minimum overlap in time, as fraction of the duration of the shorter trajectory
 MIN_OVERLAP_FRACTION = 0.5
-# Minimum number of overlapping poses, as fraction of their number at complete overlap
+# Minimum number of overlapping poses, as fraction of the number at complete overlap
 MIN_USED_POSES_FRACTION = 0.3
-# Maximum number of candidate time offsets (correlation peaks) for which the ATE is computed
 MAX_CANDIDATE_OFFSETS = 12
-# Half-width (s) of the least-squares search around a correlation peak
+# Half-width (s) of the search around a correlation peak
 SEARCH_HALF_WIDTH_S = 0.5
-# Half-width (s) of the second least-squares search, around the result of the first search
+# Half-width (s) of the second, finer search
 FINE_SEARCH_HALF_WIDTH_S = 0.1
 # Minimum distance (s) between two peaks of the speed correlation
 MIN_CORRELATION_PEAK_DISTANCE_S = 1.0
 # Minimum correlation of the speeds of both trajectories at a candidate time offset
 MIN_SPEED_CORRELATION = 0.3
-# Minimum ratio of the residuals (RMS) at the second best and the best time offset, for an
-# unambiguous result: 95 % limit of an F-test with 80 independent residuals (30 s of flight)
+# Minimum ratio of the residuals at second best and best time offset: limit of an F-test
 MIN_SECOND_BEST_RESIDUAL_RATIO = 1.2
-# Maximum number of poses in the least-squares fit of the time offset
 MAX_FITTED_POSES = 2000
-# Maximum misfit (RMS residual over RMS extent of the motion) of an accepted fit of the time offset
+# Maximum residual (RMS) of an accepted fit, divided by the extent (RMS) of the motion
 MAX_RELATIVE_MISFIT = 0.5
-# Lower limit of the misfit (RMS residual over RMS extent): better fits count as equally good
+# Lower limit of residual divided by extent (RMS): better fits count as equally good
 MISFIT_FLOOR = 1e-3
-# Minimum RMS of the residual velocity for an estimate of the time offset, as fraction of the RMS
-# speed. The residual velocity is the part that no shift, rotation or scale of the path explains
+# Minimum velocity (RMS) that no shift or rotation explains, as fraction of the speed (RMS)
 MIN_RESIDUAL_VELOCITY_FRACTION = 0.05
-# Minimum correlation of the residual velocities of both trajectories: noise is not correlated
+# Minimum correlation of the residual velocities of both trajectories
 MIN_RESIDUAL_VELOCITY_CORRELATION = 0.5
-# Maximum lag of the autocovariances that give the variance of the score (Newey & West 1987), in
-# correlation lengths of the score
+# Maximum lag in the variance estimate of Newey and West (1987), in correlation lengths
 MAX_LAG_IN_CORRELATION_LENGTHS = 4
-# Maximum half-width (s) of the 95 % interval of an accepted time offset
+# Maximum half-width (s) of the 95 % interval of a time offset
 MAX_INTERVAL_HALF_WIDTH_S = 0.5
 CONFIDENCE_LEVEL = 0.95
 
@@ -69,12 +61,12 @@ class TimeOffset(Record, kw_only=True):
     Attributes
     ----------
     offset_s : float or None
-        Offset to add to the timestamps of the estimate; None if it cannot be determined.
+        Offset to add to the timestamps of the estimate.
     interval_s : (float, float) or None
         95 % interval of the offset.
     is_determinable : bool
     reason : str
-        Method, or reason why the offset cannot be determined.
+        Method of the estimate, or reason why there is no estimate.
     """
 
     offset_s: float | None = None
@@ -84,7 +76,7 @@ class TimeOffset(Record, kw_only=True):
 
 
 def compute_clock_offset_s(estimate: Trajectory, reference: Trajectory) -> float | None:
-    """Return the time offset (s) between two trajectories from their UNIX times, if available."""
+    """Return the time offset (s) between two trajectories from UNIX times, or None."""
     if estimate.unix_offset_s is None or reference.unix_offset_s is None:
         return None
     return estimate.unix_offset_s - reference.unix_offset_s
@@ -93,14 +85,11 @@ def compute_clock_offset_s(estimate: Trajectory, reference: Trajectory) -> float
 def estimate_time_offset(estimate: Trajectory, reference: Trajectory) -> TimeOffset:
     """Estimate the time offset between two trajectories of the same motion.
 
-    Candidates are the peaks of the correlation of speeds and angular speeds (Padfield 2012; Furrer
-    2017). The candidate with the smallest ATE after a similarity alignment is refined by minimising
-    the ATE. The 95 % interval allows for correlated pose errors (Newey & West 1987).
+    Motion at constant speed along a line or circle does not determine the offset.
 
-    With constant speed along a line or circle the offset cannot be determined: it is equivalent to
-    another position or rotation.
+    Sources: Padfield (2012) and Furrer (2017) for the correlation of speeds; Newey and West (1987)
+    for the 95 % interval.
     """
-    # The trajectory with the shorter pose intervals is interpolated
     if compute_median_interval_s(estimate.time_s) >= compute_median_interval_s(reference.time_s):
         return _search_offset(estimate, reference)
     offset_of_swapped_tracks = _search_offset(reference, estimate)
@@ -115,7 +104,7 @@ def estimate_time_offset(estimate: Trajectory, reference: Trajectory) -> TimeOff
 
 
 def _search_offset(sparse_track: Trajectory, dense_track: Trajectory) -> TimeOffset:
-    """Estimate the offset to add to the timestamps of the trajectory with fewer poses (sparse)."""
+    """Estimate the time offset to add to the timestamps of the trajectory with fewer poses."""
     clock_offset_s = compute_clock_offset_s(sparse_track, dense_track)
     candidate_offsets_s = _find_candidate_offsets_s(sparse_track, dense_track)
     if clock_offset_s is not None:
@@ -149,7 +138,7 @@ def _search_offset(sparse_track: Trajectory, dense_track: Trajectory) -> TimeOff
         if fit.compute_misfit() <= MIN_SECOND_BEST_RESIDUAL_RATIO * best_fit.compute_misfit()
     ]
     if clock_offset_s is not None:
-        # Of several offsets that fit equally well, the nearest to the UNIX time is used
+        # Of several equally good offsets, the nearest to the UNIX time is used
         best_fit = min(fits_similar_to_best, key=lambda fit: abs(fit.offset_s - clock_offset_s))
     for fit in fits_similar_to_best if clock_offset_s is None else []:
         offset_difference_s = abs(fit.offset_s - best_fit.offset_s)
@@ -160,7 +149,7 @@ def _search_offset(sparse_track: Trajectory, dense_track: Trajectory) -> TimeOff
                 f"{best_fit.compute_residual_rms_m():.3g} m and "
                 f"{fit.compute_residual_rms_m():.3g} m"
             )
-    # The fit is repeated with a narrower window of offsets, within which more poses overlap in time
+    # In a narrower search window, more poses overlap in time
     best_fit = (
         _refine_offset(sparse_track, dense_track, best_fit.offset_s, FINE_SEARCH_HALF_WIDTH_S)
         or best_fit
@@ -193,7 +182,7 @@ def _make_unknown_offset(reason: str) -> TimeOffset:
 
 
 def _compute_grid_velocity(trajectory: Trajectory, step_s: float) -> tuple[Array, Array]:
-    """Return regular grid times (s), and the smoothed velocities (m/s) at these times."""
+    """Return the times (s) of a regular grid, and smoothed velocities (m/s) at these times."""
     time_s = trajectory.time_s
     grid_s = time_s[0] + step_s * np.arange(int(np.ptp(time_s) / step_s) + 1)
     return grid_s, _smooth_values(
@@ -204,7 +193,7 @@ def _compute_grid_velocity(trajectory: Trajectory, step_s: float) -> tuple[Array
 def _smooth_values(
     grid_values: Array, time_s: Array, step_s: float, derivative_order: int = 0
 ) -> Array:
-    """Smooth values on a time grid, or return their smoothed derivative per grid step (order 1)."""
+    """Smooth values on a time grid with a Gaussian filter, or return their smoothed derivative."""
     smoothing_sigma_samples = max(SMOOTHING_SIGMA_S, compute_median_interval_s(time_s)) / step_s
     return np.asarray(
         gaussian_filter1d(grid_values, smoothing_sigma_samples, axis=0, order=derivative_order)
@@ -212,20 +201,17 @@ def _smooth_values(
 
 
 def _compute_velocity(trajectory: Trajectory, time_s: Array) -> Array:
-    """Return the smoothed velocity (m/s) at times within the trajectory, shape (n, 3)."""
+    """Return the smoothed velocities (m/s) at given times, shape (n, 3)."""
     step_s = max(GRID_STEP_S, float(np.ptp(trajectory.time_s)) / MAX_GRID_SAMPLES)
     grid_s, velocity_m_s = _compute_grid_velocity(trajectory, step_s)
     return np.stack([np.interp(time_s, grid_s, column) for column in velocity_m_s.T], axis=1)
 
 
 def _compute_speeds(trajectory: Trajectory, step_s: float) -> tuple[list[Array], BoolArray]:
-    """Compute speed and, from orientations, angular speed on a time grid.
-
-    Also return a mask of the times outside of gaps.
-    """
+    """Compute speed and angular speed on a time grid, and a mask of the times outside gaps."""
     time_s = trajectory.time_s
     grid_s, velocity_m_s = _compute_grid_velocity(trajectory, step_s)
-    # Speeds are interpolated between key frames, but not across gaps with lost tracking
+    # Longer gaps than this are losses of tracking, not intervals between key frames
     is_known = is_bracketed(grid_s, time_s, max(10.0 * compute_median_interval_s(time_s), 0.5))
     linear_and_angular_speeds = [np.linalg.norm(velocity_m_s, axis=1)]
     if trajectory.rotation is not None:
@@ -250,12 +236,12 @@ def _find_candidate_offsets_s(sparse_track: Trajectory, dense_track: Trajectory)
     )
     min_count = MIN_OVERLAP_FRACTION * shorter_duration_s / step_s
     correlations = []
-    # angular speeds are only compared if both trajectories have orientations
+    # both trajectories need orientations for angular speeds
     for sparse_values, dense_values in zip(sparse_speeds, dense_speeds, strict=False):
         speed_moments = compute_moments(
             sparse_values, dense_values, is_sparse_speed_known, is_dense_speed_known
         )
-        # Exclude lags at which a trajectory is at rest: its speed variance is a rounding error
+        # At rest, the variance of the speed is a rounding error
         is_usable = speed_moments.count >= min_count
         for values, is_known, square_sum in (
             (sparse_values, is_sparse_speed_known, speed_moments.sum_of_squares_a),
@@ -277,8 +263,7 @@ def _find_candidate_offsets_s(sparse_track: Trajectory, dense_track: Trajectory)
         (mean_correlation == sliding_maximum) & (mean_correlation > MIN_SPEED_CORRELATION)
     )
     peak_indices = peak_indices[np.argsort(-mean_correlation[peak_indices])][:MAX_CANDIDATE_OFFSETS]
-    # Correlation index k aligns the first sparse sample with dense sample k - (n - 1), for n sparse
-    # samples
+    # Correlation index k is a shift by k - (n - 1) samples, for n sparse samples
     dense_start_indices = peak_indices - (len(is_sparse_speed_known) - 1)
     lags_s = dense_start_indices * step_s + dense_track.time_s[0] - sparse_track.time_s[0]
     return list(lags_s.tolist())
@@ -286,10 +271,9 @@ def _find_candidate_offsets_s(sparse_track: Trajectory, dense_track: Trajectory)
 
 @dataclass(frozen=True)
 class _OffsetFit:
-    """Fit of the trajectory with fewer poses (sparse) to that with more poses (dense).
+    """Fit of the trajectory with fewer poses (sparse) to the trajectory with more poses (dense).
 
-    ``time_s`` and ``aligned_position_m`` are times and aligned positions of the sparse trajectory,
-    ``dense_track_position_m`` the positions of the dense trajectory at these times.
+    The arrays contain the times and positions of the compared poses.
     """
 
     offset_s: float
@@ -299,12 +283,12 @@ class _OffsetFit:
     dense_track_position_m: Array
 
     def compute_residual_rms_m(self) -> float:
-        """Return the RMS (m) of the position residuals."""
+        """Return the RMS position residual (m)."""
         return compute_rms_length_m(self.dense_track_position_m - self.aligned_position_m)
 
     def compute_misfit(self) -> float:
-        """Return RMS position residual over RMS extent of the dense trajectory (0: perfect)."""
-        # The dense trajectory gives the extent, because a bad fit can shrink the sparse trajectory
+        """Return the RMS position residual divided by the RMS extent of the dense trajectory."""
+        # A bad fit can shrink the sparse trajectory, so its extent is not used
         extent_m = float(np.sqrt(self.dense_track_position_m.var(axis=0).sum()))
         return (
             max(self.compute_residual_rms_m() / extent_m, MISFIT_FLOOR)
@@ -318,8 +302,7 @@ def _compute_interval_half_width_s(
 ) -> float:
     """Compute the half-width (s) of the 95 % interval of the time offset.
 
-    The half-width is infinite if a shift, a rotation or another scale of the trajectory has the
-    same effect as a time offset.
+    It is infinite if a shift or rotation of the trajectory has the same effect as a time offset.
     """
     pose_count = len(fit.time_s)
     centred_m = fit.aligned_position_m - fit.aligned_position_m.mean(axis=0)
@@ -327,8 +310,7 @@ def _compute_interval_half_width_s(
     sparse_track_velocity_m_s = fit.transform.to_rotation().apply(
         fit.transform.scale * _compute_velocity(sparse_track, fit.time_s)
     )
-    # Remove the velocity that is equivalent to a translation, a small rotation or a scale factor,
-    # because the alignment is estimated too
+    # The alignment is estimated too, so velocity that equals a change of the alignment is removed
     columns = [np.tile(axis, (pose_count, 1)) for axis in np.eye(3)]
     columns += [np.cross(axis, centred_m) for axis in np.eye(3)]
     similarity_jacobian = np.stack([*columns, centred_m], axis=-1).reshape(3 * pose_count, 7)
@@ -353,7 +335,7 @@ def _compute_interval_half_width_s(
         residual_velocities[:, 0].reshape(pose_count, 3)
         * (fit.dense_track_position_m - fit.aligned_position_m)
     ).sum(axis=1)
-    # The Newey-West weights must extend beyond the correlation length of the score
+    # The lags must exceed the correlation length (Newey and West 1987)
     lag_count = min(
         max(1, MAX_LAG_IN_CORRELATION_LENGTHS * _compute_correlation_length(likelihood_score)),
         pose_count // 4,
@@ -374,7 +356,7 @@ def _compute_interval_half_width_s(
 
 
 def _compute_correlation_length(values: Array) -> int:
-    """Return the first lag with autocorrelation below 1/e, at most n / 4."""
+    """Return the first lag (samples) with an autocorrelation below 1/e."""
     covariance_by_lag = autocovariance(values - values.mean())
     lags_below_limit = np.flatnonzero(covariance_by_lag < covariance_by_lag[0] / np.e)
     return int(lags_below_limit[0]) if len(lags_below_limit) else len(values) // 4
@@ -383,15 +365,12 @@ def _compute_correlation_length(values: Array) -> int:
 def _refine_offset(
     sparse_track: Trajectory, dense_track: Trajectory, lag_s: float, half_width_s: float
 ) -> _OffsetFit | None:
-    """Minimise the ATE over time offsets within ``half_width_s`` of ``lag_s``.
-
-    Return None if too few poses overlap.
-    """
+    """Minimise the ATE over time offsets near ``lag_s``; return None if too few poses overlap."""
     sparse_time_s = sparse_track.time_s
     gap_limit_s = max(
         choose_gap_limit_s(dense_track.time_s), 0.5 * choose_gap_limit_s(sparse_time_s)
     )
-    # The same poses are used at every offset, so that the objective is continuous
+    # With the same poses at every offset, the cost is continuous
     is_known = [
         is_bracketed(sparse_time_s + (lag_s + shift), dense_track.time_s, gap_limit_s)
         for shift in (-half_width_s, 0.0, half_width_s)
@@ -411,8 +390,7 @@ def _refine_offset(
         dense_track_position_m = interpolate_positions(
             dense_track, sparse_time_s + (lag_s + shift_s)
         )
-        # The sparse trajectory is transformed, because a fitted scale could shrink the dense
-        # trajectory to a point
+        # Fitting a scale to the dense trajectory could shrink it to a point
         transform = umeyama(sparse_position_m, dense_track_position_m, with_scale=True)
         return _OffsetFit(
             lag_s + shift_s,
@@ -426,8 +404,7 @@ def _refine_offset(
         fit = make_fit(shift_s)
         return float(((fit.dense_track_position_m - fit.aligned_position_m) ** 2).sum())
 
-    # The shift from lag_s is optimised, not the offset of up to 1e9 s (UNIX time minus boot time):
-    # its relative tolerance in the optimiser would be seconds
+    # The optimiser has a relative tolerance, so the large offset (up to 1e9 s) is not optimised
     candidate_shifts_s = half_width_s * np.linspace(-1.0, 1.0, 21)
     best_index = int(np.argmin([compute_cost(shift) for shift in candidate_shifts_s]))
     shift_bounds_s = (

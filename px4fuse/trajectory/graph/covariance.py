@@ -1,4 +1,4 @@
-"""χ² test (gate) of loop closures against odometry, with the covariance of the odometry."""
+"""χ² test (gate) of loop closures against odometry."""
 
 from collections.abc import Sequence
 
@@ -12,24 +12,23 @@ from px4fuse.trajectory.graph import lie, model
 
 # Probability that the gate rejects a true closure
 GATE_ALPHA = 0.001
-# Minimum eigenvalue of a covariance matrix (scaled to unit diagonal). A smaller eigenvalue is a
-# rounding error
+# Smaller eigenvalues of a covariance matrix (scaled to unit diagonal) are rounding errors
 _MIN_COVARIANCE_EIGENVALUE = 1e-13
 
 
 class GateResult(Record):
-    """Test of a loop closure against odometry.
+    """Result of the χ² test of a loop closure against odometry.
 
     Attributes
     ----------
     first, second : int
-        Vertex numbers (as in the file) that the closure connects.
+        Vertex numbers of the two poses of the closure.
     d2 : float
-        Squared Mahalanobis distance between the closure and the relative pose from odometry.
+        Squared Mahalanobis distance between closure and odometry.
     degrees_of_freedom : int
-        Number of directions in which the closure has information.
+        Number of directions that the closure measures.
     p : float
-        Probability that a true closure has a distance of ``d2`` or more.
+        Probability of a larger ``d2`` for a true closure.
     accepted : bool
         True if p is at least :data:`GATE_ALPHA`.
     """
@@ -43,18 +42,14 @@ class GateResult(Record):
 
 
 def gate_edges(graph: model.PoseGraph, edge_indices: Sequence[int] | IntArray) -> list[GateResult]:
-    """Test closures against odometry alone, before the optimisation uses them.
+    """Test loop closures against odometry with a χ² test of the squared Mahalanobis distance.
 
-    The test statistic is the squared Mahalanobis distance between a closure and the relative pose
-    from odometry. The adjoint propagates the covariance of odometry (Barfoot 2017, eq. 8.96, and
-    eq. 8.108 to first order). All edges between successive poses are odometry, except the tested
-    edges.
+    Source of the covariance propagation: Barfoot 2017, eqs. 8.96 and 8.108.
 
     Raises
     ------
     TrajectoryError
-        Odometry does not connect the vertices of a closure, the information matrix of an odometry
-        edge is singular, or the information matrix of a closure is zero.
+        Odometry does not connect the poses of a closure, or has a singular information matrix.
     """
     tested_edge_indices = np.asarray(edge_indices, dtype=np.intp)
     if not len(tested_edge_indices):
@@ -75,7 +70,7 @@ def gate_edges(graph: model.PoseGraph, edge_indices: Sequence[int] | IntArray) -
             "Add an odometry edge between these vertices.",
         )
     poses = lie.accumulate_poses(model.get_odometry_steps(graph, connecting_edges))
-    # the covariances of all steps in the axes of the first pose of the chain, to sum them
+    # The covariances are sums in the axes of the first pose
     odometry_step_covariances = _propagate_covariances(
         lie.adjoint(poses[1:]), _compute_covariances(graph, connecting_edges)
     )
@@ -135,7 +130,7 @@ def _test_edge(
 
 
 def _compute_covariances(graph: model.PoseGraph, odometry_edges: IntArray) -> Array:
-    """Compute the covariance of each odometry edge, in the axes of its later pose."""
+    """Compute the covariance of each odometry edge, in the axes of the later pose."""
     scale, scaled_information = model.scale_to_unit_diagonal(graph.information[odometry_edges])
     is_full_rank = np.linalg.eigvalsh(scaled_information)[:, 0] > 1e-12
     if not np.all(is_full_rank):
@@ -147,8 +142,7 @@ def _compute_covariances(graph: model.PoseGraph, odometry_edges: IntArray) -> Ar
         )
     covariance = np.linalg.inv(scaled_information) / (scale[:, :, None] * scale[:, None, :])
     is_backward = graph.first_nodes[odometry_edges] > graph.second_nodes[odometry_edges]
-    # An edge from a later to an earlier pose is inverted: (Z exp(r))^-1 = Z^-1 exp(-Ad(Z) r), with
-    # the measured pose Z, its adjoint Ad(Z) and the residual r
+    # Inverse of a measurement Z with residual r: (Z exp(r))^-1 = Z^-1 exp(-Ad(Z) r)
     adjoint_of_measurement = lie.adjoint(graph.measurements[odometry_edges[is_backward]])
     covariance[is_backward] = _propagate_covariances(
         adjoint_of_measurement, covariance[is_backward]

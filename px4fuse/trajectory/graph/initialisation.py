@@ -13,10 +13,10 @@ from px4fuse.trajectory.graph.normal_equations import NormalEquations
 
 
 def compute_initial_poses(graph: PoseGraph) -> PoseGraph:
-    """Return the graph with initial poses from its edges; the first pose is unchanged.
+    """Compute initial poses of a pose graph from its edges.
 
-    The method is chordal initialisation (Carlone et al. 2015, Initialization techniques for 3D
-    SLAM, section IV-C). If composed odometry edges have a lower cost, their poses are used.
+    Method: chordal initialisation (Carlone et al. 2015, Initialization techniques for 3D SLAM,
+    section IV-C), or odometry if its poses have a lower cost.
 
     Raises
     ------
@@ -28,19 +28,18 @@ def compute_initial_poses(graph: PoseGraph) -> PoseGraph:
     composed_graph = model.compose_odometry(graph)
     try:
         return min(composed_graph, _compute_chordal_poses(graph), key=model.cost)
-    except TrajectoryError:  # some edges have no rotation, so only the composed poses are possible
+    except TrajectoryError:  # chordal initialisation needs edges with rotation
         return composed_graph
 
 
 def _compute_chordal_poses(graph: PoseGraph) -> PoseGraph:
-    """Compute initial poses by linear least squares: first rotations, then positions."""
+    """Compute initial rotations, then initial positions, by linear least squares."""
     dimension = graph.dimension
     rotation_information = np.trace(graph.information[:, dimension:, dimension:], axis1=1, axis2=2)
     model.require_connected(graph, rotation_information > 0.0, "edges with rotation information")
     measured_rotation = lie.rotation_matrix(graph.measurements)
     eye = np.broadcast_to(np.eye(dimension), measured_rotation.shape)
-    # Minimise the sum of weight |Zᵀ R_iᵀ - R_jᵀ|² over all matrices R, which is a linear problem. Z
-    # is the measured rotation from pose i to j. Each R is then replaced by the nearest rotation
+    # Linear least squares for matrices R_i: minimise the weighted sum of |Zᵀ R_iᵀ - R_jᵀ|²
     unconstrained_matrices = _solve_positions(
         graph,
         measured_rotation.transpose(0, 2, 1),
@@ -50,8 +49,7 @@ def _compute_chordal_poses(graph: PoseGraph) -> PoseGraph:
         lie.rotation_matrix(graph.poses[0]).T,
     )
     rotation = _find_nearest_rotations(unconstrained_matrices.transpose(0, 2, 1))
-    # An edge measures rotation Z and translation z of pose j relative to pose i. With rotations R
-    # and positions t of the poses, the residual is (R_i Z)ᵀ (t_j - t_i - R_i z)
+    # Residual of an edge with rotation Z and translation z: (R_i Z)ᵀ (t_j - t_i - R_i z)
     first_rotation = rotation[graph.first_nodes]
     predicted_second_rotation = first_rotation @ measured_rotation
     information = (
@@ -79,16 +77,16 @@ def _solve_positions(
     right_hand_side: Array,
     first_pose: Array,
 ) -> Array:
-    """Solve ``A x_i + B x_j = c`` over all edges (i, j) for x, shape (n, d, k), with given x_0.
+    """Solve ``A x_i + B x_j = c`` by least squares over all edges (i, j), with given x_0.
 
     Parameters
     ----------
     first_pose_matrix, second_pose_matrix, information : ndarray, shape (m, d, d)
-        A, B, and the weight of each edge.
+        A, B and weight of each of the m edges.
     right_hand_side : ndarray, shape (m, d, k)
         c of each edge.
     first_pose : ndarray, shape (d, k)
-        x_0.
+        Given value x_0 for the first pose.
     """
     edges = np.stack([graph.first_nodes, graph.second_nodes])
     equations = NormalEquations(edges, *first_pose.shape)

@@ -1,8 +1,7 @@
-"""Poses and tangents in SE(2) and SE(3), as arrays.
+"""Lie groups SE(2) and SE(3): poses and tangent vectors as arrays.
 
-A pose is x, y, heading (last axis 3) or x, y, z, qx, qy, qz, qw (last axis 7), in m and rad. A
-tangent has translation (rho) first, then rotation (phi): 3 or 6 numbers, in the order of g2o's
-information matrices. Perturbations are on the right, in the axes of the pose: ``X exp(xi)``.
+A pose is x, y, heading or x, y, z, qx, qy, qz, qw, in m and rad. A tangent vector is translation,
+then rotation: 3 or 6 numbers. A perturbation xi of a pose X is on the right: ``X exp(xi)``.
 
 Sources: Barfoot 2017, State Estimation for Robotics, chapter 7 and section 8.3; for SE(2) Sola,
 Deray and Atchuthan 2018, A micro Lie theory for state estimation in robotics.
@@ -15,11 +14,10 @@ from scipy.spatial.transform import Rotation
 from px4fuse.core.arrays import Array
 from px4fuse.trajectory.rotation import build_matrix, skew
 
-# Maximum angle (rad) for power series instead of quotients, which lose precision at small angles:
-# five terms of the series are accurate to 1e-14
+# Below this angle (rad), power series replace quotients, which lose precision
 SMALL_ANGLE_RAD = 0.3
-# Coefficients of the power series in theta^2 of f(theta) = (1 - theta/2 cot(theta/2)) / theta^2 and
-# of f'(theta) / theta. f is the factor of the squared matrix in an inverse Jacobian
+# Power series in theta^2 of f(theta) = (1 - theta/2 cot(theta/2)) / theta^2 and of f'(theta) /
+# theta
 _SQUARE_FACTOR_SERIES = (1 / 12, 1 / 720, 1 / 30240, 1 / 1209600, 1 / 47900160)
 _SQUARE_FACTOR_SLOPE_SERIES = (1 / 360, 1 / 7560, 1 / 201600, 1 / 5987520, 691 / 130767436800)
 
@@ -30,12 +28,7 @@ def wrap(angle: Array) -> Array:
 
 
 def rotation_matrix(pose: Array) -> Array:
-    """Return the rotations of poses as matrices.
-
-    Returns
-    -------
-    ndarray, shape (..., 2, 2) or (..., 3, 3)
-    """
+    """Return the rotation matrices of poses, shape (..., 2, 2) or (..., 3, 3)."""
     if pose.shape[-1] == 3:
         c = np.cos(pose[..., 2])
         s = np.sin(pose[..., 2])
@@ -51,12 +44,13 @@ def identity(pose_length: int) -> Array:
 
 
 def compose(a: Array, b: Array) -> Array:
-    """Compute the products ``a b``: motion a, then motion b in the axes of a.
+    """Compute the products ``a b`` of poses: motion a, then motion b in the axes of a.
+
+    Headings are not wrapped.
 
     Parameters
     ----------
     a, b : ndarray, shape (..., 3) or (..., 7)
-        Poses. Quaternions of the result are normalised; its headings are not wrapped.
     """
     d = _get_dimension(a)
     rotation = a[..., 2:] + b[..., 2:] if d == 2 else (_rotation_of(a) * _rotation_of(b)).as_quat()
@@ -71,7 +65,7 @@ def inverse(pose: Array) -> Array:
 
 
 def relative_pose(a: Array, b: Array) -> Array:
-    """Return the poses b relative to a: the inverse of a, times b."""
+    """Return the poses b relative to the poses a: inverse of a, times b."""
     d = _get_dimension(a)
     inverse_rotation = np.swapaxes(rotation_matrix(a), -1, -2)
     rotation = (
@@ -83,12 +77,12 @@ def relative_pose(a: Array, b: Array) -> Array:
 
 
 def exp(tangent: Array) -> Array:
-    """Return the poses of tangents: exponential map (Barfoot 2017, 7.35; Sola 2018, 156).
+    """Return the poses of tangent vectors: exponential map (Barfoot 2017, 7.35; Sola 2018, 156).
 
     Parameters
     ----------
     tangent : ndarray, shape (..., 3) or (..., 6)
-        Tangents with a rotation below 2 pi.
+        Tangent vectors with a rotation below 2 pi.
     """
     d = _get_dimension(tangent)
     rho = tangent[..., :d]
@@ -99,12 +93,12 @@ def exp(tangent: Array) -> Array:
 
 
 def log(pose: Array) -> Array:
-    """Return the tangents of poses (logarithm, inverse of :func:`exp`), with rotations up to pi.
+    """Return the tangent vectors of poses: logarithm, the inverse of :func:`exp`.
 
     Parameters
     ----------
     pose : ndarray, shape (..., 3) or (..., 7)
-        Poses with normalised quaternions; q and -q give the same result.
+        Poses with normalised quaternions.
     """
     d = _get_dimension(pose)
     phi = wrap(pose[..., 2:]) if d == 2 else _rotation_of(pose).as_rotvec()
@@ -114,11 +108,9 @@ def log(pose: Array) -> Array:
 
 
 def adjoint(pose: Array) -> Array:
-    """Return the adjoints: ``X exp(xi) = exp(adjoint(X) xi) X`` (Barfoot 2017, 7.45).
+    """Return the adjoint matrices of poses, shape (..., 3, 3) or (..., 6, 6).
 
-    Returns
-    -------
-    ndarray, shape (..., 3, 3) or (..., 6, 6)
+    Definition: ``X exp(xi) = exp(adjoint(X) xi) X`` (Barfoot 2017, 7.45).
     """
     rotation = rotation_matrix(pose)
     if pose.shape[-1] == 3:
@@ -134,26 +126,22 @@ def adjoint(pose: Array) -> Array:
 
 
 def right_jacobian_inverse(tangent: Array) -> Array:
-    """Return the inverse right Jacobians: derivatives of log(X exp(xi)) by xi at xi = 0.
+    """Return the inverse right Jacobians, shape (..., 3, 3) or (..., 6, 6).
 
-    X is the pose of the tangent.
+    They are the derivatives of log(X exp(xi)) with respect to xi at xi = 0, with X = exp(tangent).
 
     Parameters
     ----------
     tangent : ndarray, shape (..., 3) or (..., 6)
-        Tangents with a rotation below 2 pi.
-
-    Returns
-    -------
-    ndarray, shape (..., 3, 3) or (..., 6, 6)
+        Tangent vectors with a rotation below 2 pi.
     """
     commutator = _compute_commutator(tangent)
     commutator_squared = commutator @ commutator
     theta = np.linalg.norm(tangent[..., _get_dimension(tangent) :], axis=-1)[..., None, None]
     square_factor = _compute_square_factor(theta)
     half_square_factor_slope = 0.5 * _compute_square_factor_slope(theta)
-    # The Jacobian is the power series of x / (1 - exp(-x)), where x is the commutator matrix ad.
-    # Powers above 4 follow from ad^5 = -2 theta^2 ad^3 - theta^4 ad
+    # Power series of x / (1 - exp(-x)) for the commutator matrix x = ad, with the identity
+    # ad^5 = -2 theta^2 ad^3 - theta^4 ad
     jacobian: Array = (
         np.eye(commutator.shape[-1])
         + 0.5 * commutator
@@ -163,7 +151,7 @@ def right_jacobian_inverse(tangent: Array) -> Array:
 
 
 def _compute_commutator(tangent: Array) -> Array:
-    """Return the Lie bracket matrices ad(xi) of tangents xi (Barfoot 2017, 7.33)."""
+    """Return the Lie bracket matrices ad(xi) of tangent vectors (Barfoot 2017, 7.33)."""
     if tangent.shape[-1] == 3:
         x, y, theta = np.moveaxis(tangent, -1, 0)
         return build_matrix((0.0, -theta, y), (theta, 0.0, -x), (0.0, 0.0, 0.0))
@@ -174,15 +162,11 @@ def _compute_commutator(tangent: Array) -> Array:
 
 
 def accumulate_poses(steps: Array) -> Array:
-    """Compose n relative motions to n + 1 poses, of which the first is the identity.
+    """Compose n relative motions to n + 1 poses. The first pose is the identity.
 
     Parameters
     ----------
     steps : ndarray, shape (n, 3) or (n, 7)
-
-    Returns
-    -------
-    ndarray, shape (n + 1, 3) or (n + 1, 7)
     """
     poses = np.vstack([identity(steps.shape[-1]), steps])
     composed_count = 1
@@ -219,7 +203,7 @@ def _left_jacobian_inverse(phi: Array) -> Array:
 
 
 def _compute_square_factor(theta: Array) -> Array:
-    """Return f(theta) = (1 - theta/2 cot(theta/2)) / theta^2, the factor of ad^2 or [phi]×^2."""
+    """Return f(theta) = (1 - theta/2 cot(theta/2)) / theta^2."""
     t = np.where(theta < SMALL_ANGLE_RAD, 1.0, theta)
     closed_form_value = (1.0 - 0.5 * t / np.tan(0.5 * t)) / t**2
     return np.where(

@@ -1,4 +1,4 @@
-"""Pose graph: poses and relative measurements, with residuals, cost and connectivity."""
+"""Pose graph: poses and measurements of relative poses."""
 
 from __future__ import annotations
 
@@ -15,10 +15,8 @@ from px4fuse.errors import TrajectoryError
 from px4fuse.trajectory.graph import lie
 from px4fuse.trajectory.graph.normal_equations import NormalEquations
 
-# A measurement does not observe a direction if the eigenvalue of its information matrix (scaled to
-# unit diagonal) is below this limit
+# Directions with smaller eigenvalues of the information matrix (unit diagonal) are not measured
 MIN_EIGENVALUE_OF_OBSERVED_DIRECTION = 1e-9
-# Texts on the origin of the initial poses of a pose graph
 INITIAL_POSES_FROM_FILE = "vertices in the g2o file"
 INITIAL_POSES_FROM_ODOMETRY = "composition of the odometry edges"
 INITIAL_POSES_FROM_CHORDAL = "chordal initialisation"
@@ -29,19 +27,18 @@ class PoseGraph:
     """Poses (vertices) and measurements of relative poses (edges), in m and rad."""
 
     dimension: int
-    # Vertex numbers of the file, in ascending order
+    # Vertex numbers, in ascending order
     ids: IntArray
-    # Poses: x, y, heading in the plane; x, y, z, qx, qy, qz, qw in space
+    # Poses: x, y, heading or x, y, z, qx, qy, qz, qw
     poses: Array
-    # Indices into ``poses`` of the two vertices of each edge
+    # Indices of the two poses of each edge
     first_nodes: IntArray
     second_nodes: IntArray
-    # Measured pose of the second node relative to the first, in the axes of the first
+    # Measured pose of the second node relative to the first node
     measurements: Array
-    # Inverse covariance of each measurement, translation before rotation, in the axes of the
-    # measured pose; zero in directions that are not measured
+    # Inverse covariance of each measurement, translation before rotation
     information: Array
-    # Method or file that gave the initial poses, a text such as INITIAL_POSES_FROM_FILE
+    # Origin of the initial poses, a text
     initial_pose_origin: str = INITIAL_POSES_FROM_FILE
 
     __repr__ = one_line_repr
@@ -50,7 +47,7 @@ class PoseGraph:
         return len(self.ids)
 
     def select_edges(self, is_selected: BoolArray) -> PoseGraph:
-        """Return the graph with only the edges in the mask, shape (m,)."""
+        """Return the graph with a selection of its edges."""
         edge_fields = ("first_nodes", "second_nodes", "measurements", "information")
         return replace(self, **{name: getattr(self, name)[is_selected] for name in edge_fields})
 
@@ -66,23 +63,23 @@ class PoseGraph:
         return NormalEquations(edges, self.degrees_of_freedom)
 
     def find_successive_edges(self) -> BoolArray:
-        """Return the mask of the edges between successive poses, which are odometry by default."""
+        """Return a mask of the edges between successive poses."""
         return np.asarray(np.abs(self.first_nodes - self.second_nodes) == 1)
 
 
 @dataclass(frozen=True)
 class Residuals:
-    """Residuals of the measurements of a graph at given poses.
+    """Residuals of the measurements of a pose graph.
 
     Attributes
     ----------
     poses : ndarray, shape (n, 3) or (n, 7)
     relative_poses : ndarray, shape (m, 3) or (m, 7)
-        Second pose of each edge relative to the first.
+        Second pose of each edge relative to the first pose.
     residual : ndarray, shape (m, d)
-        ``r = log(Z^-1 X_i^-1 X_j)``, as in GTSAM's BetweenFactor.
+        ``r = log(Z^-1 X_i^-1 X_j)`` with measurement Z and poses X_i, X_j.
     chi2 : ndarray, shape (m,)
-        ``r' Omega r``, the squared Mahalanobis distance.
+        Squared Mahalanobis distance of each residual.
     """
 
     poses: Array
@@ -92,7 +89,7 @@ class Residuals:
 
 
 def residuals(graph: PoseGraph, poses: Array) -> Residuals:
-    """Compute the residuals of all edges at the poses, shape (n, 3) or (n, 7)."""
+    """Compute the residuals of all edges of a pose graph at given poses."""
     relative_poses = lie.relative_pose(poses[graph.first_nodes], poses[graph.second_nodes])
     residual = lie.log(lie.relative_pose(graph.measurements, relative_poses))
     weighted_residual = (graph.information @ residual[..., None])[..., 0]
@@ -100,15 +97,14 @@ def residuals(graph: PoseGraph, poses: Array) -> Residuals:
 
 
 def cost(graph: PoseGraph) -> float:
-    """Return half of the sum of the weighted squared residuals, like GTSAM's ``graph.error``."""
+    """Return half of the sum of the squared Mahalanobis distances of all edges."""
     return 0.5 * float(np.sum(residuals(graph, graph.poses).chi2))
 
 
 def compute_observed_directions(information: Array) -> tuple[Array, Array]:
-    """Factorise an information matrix into observed directions (columns) and variances.
+    """Return the measured directions (columns) of an information matrix, and their variances.
 
-    ``information == directions @ diag(1 / variance) @ directions.T``. Eigenvectors are those of the
-    matrix scaled to unit diagonal, because translation and rotation have different units.
+    ``information == directions @ diag(1 / variance) @ directions.T``
     """
     scale, scaled_information = scale_to_unit_diagonal(information)
     eigenvalues, eigenvectors = np.linalg.eigh(scaled_information)
@@ -117,7 +113,7 @@ def compute_observed_directions(information: Array) -> tuple[Array, Array]:
 
 
 def count_observed_directions(information: Array) -> IntArray:
-    """Return the number of directions that each measurement observes (rank of information)."""
+    """Return the rank of each information matrix: the number of measured directions."""
     _, scaled_information = scale_to_unit_diagonal(information)
     eigenvalues = np.linalg.eigvalsh(scaled_information)
     counts: IntArray = np.count_nonzero(eigenvalues > MIN_EIGENVALUE_OF_OBSERVED_DIRECTION, axis=1)
@@ -125,18 +121,14 @@ def count_observed_directions(information: Array) -> IntArray:
 
 
 def scale_to_unit_diagonal(matrices: Array) -> tuple[Array, Array]:
-    """Return the square roots of the diagonals, and the matrices scaled to unit diagonal."""
+    """Scale matrices to unit diagonal, and return the square roots of the diagonals first."""
     scale = np.sqrt(np.clip(np.diagonal(matrices, axis1=-2, axis2=-1), 0.0, None))
     inverse_scale = np.divide(1.0, scale, out=np.zeros_like(scale), where=scale > 0.0)
     return scale, matrices * (inverse_scale[..., :, None] * inverse_scale[..., None, :])
 
 
 def require_connected(graph: PoseGraph, is_used: BoolArray, edges_name: str) -> None:
-    """Raise TrajectoryError if the used edges do not connect all poses.
-
-    Edges with the information matrix 0 do not count. ``edges_name``: the used edges, for the error
-    message.
-    """
+    """Raise TrajectoryError if the used edges do not connect all poses of the graph."""
     if not len(graph.first_nodes):
         raise TrajectoryError("The pose graph has no edges", "Give a g2o file with EDGE lines.")
     is_informative = is_used & (np.trace(graph.information, axis1=1, axis2=2) > 0.0)
@@ -156,7 +148,7 @@ def require_connected(graph: PoseGraph, is_used: BoolArray, edges_name: str) -> 
 
 
 def compose_odometry(graph: PoseGraph) -> PoseGraph:
-    """Return the graph with poses composed from odometry. Odometry must connect all poses."""
+    """Return the pose graph with poses from odometry."""
     poses = lie.compose(
         graph.poses[:1], lie.accumulate_poses(get_odometry_steps(graph, find_odometry_edges(graph)))
     )
@@ -164,15 +156,12 @@ def compose_odometry(graph: PoseGraph) -> PoseGraph:
 
 
 def find_odometry_edges(graph: PoseGraph, excluded_edges: IntArray | None = None) -> IntArray:
-    """Return the index of the odometry edge from each pose to the next, or -1, shape (n - 1,).
-
-    Of several edges between two poses the first is used.
-    """
+    """Return the index of the odometry edge from each pose to the next, or -1, shape (n - 1,)."""
     odometry_edges = np.flatnonzero(graph.find_successive_edges())
     if excluded_edges is not None:
         odometry_edges = np.setdiff1d(odometry_edges, excluded_edges)
     next_edge_indices = np.full(len(graph) - 1, -1, dtype=np.intp)
-    # Reverse the edges, because NumPy keeps the last assignment to an index: the first edge is kept
+    # NumPy keeps the last assignment to an index, so this order keeps the first edge
     odometry_edges = odometry_edges[::-1]
     next_edge_indices[
         np.minimum(graph.first_nodes[odometry_edges], graph.second_nodes[odometry_edges])
@@ -181,7 +170,7 @@ def find_odometry_edges(graph: PoseGraph, excluded_edges: IntArray | None = None
 
 
 def get_odometry_steps(graph: PoseGraph, edge_indices: IntArray) -> Array:
-    """Return the measurements of edges between successive poses, from earlier to later pose."""
+    """Return measured motions between successive poses, from the earlier to the later pose."""
     relative_poses = graph.measurements[edge_indices].copy()
     is_backward = graph.first_nodes[edge_indices] > graph.second_nodes[edge_indices]
     relative_poses[is_backward] = lie.inverse(relative_poses[is_backward])

@@ -1,9 +1,5 @@
 """Normal equations of a pose graph, solved by multifrontal Cholesky factorisation.
 
-The poses are eliminated in groups of successive poses (supernodes), each with a dense matrix. The
-elimination of a group changes the equations of some later poses. This change is the Schur
-complement. It is added to the matrix of the parent group, which contains the first of these poses.
-
 Source: Liu 1992, The multifrontal method for sparse matrix solution, sections 3 to 5.
 """
 
@@ -17,49 +13,39 @@ from scipy.sparse.linalg import splu
 
 from px4fuse.core.arrays import Array, ArrayPair, IntArray
 
-# Maximum number of unknowns of a group that is a leaf of the elimination tree. Larger groups need
-# fewer calls of LAPACK, but more computations with zeros
+# Maximum number of unknowns of a leaf group; larger groups store more zeros
 _MAX_LEAF_UNKNOWNS = 96
-# Information that is added to fix the first pose: far above that of all edges, but its square does
-# not overflow
+# Large information that fixes the first pose; its square must not overflow
 _FIXED_POSE_INFORMATION = 1e100
 
 
 class _EliminationGroup(NamedTuple):
-    """Poses that are eliminated together (supernode), and indices of their equations.
+    """Supernode: poses that are eliminated together, with one dense matrix."""
 
-    The equations of a group are a dense matrix in Fortran order with a row for each unknown of the
-    group. The columns are the unknowns of the group, the unknowns of the later poses that its
-    elimination changes, and the right-hand sides.
-    """
-
-    # Number of unknowns of the group
     unknown_count: int
-    # Slice with the matrix of the group in the flat array of NormalEquations.assemble
+    # Position of the matrix of this group in the flat array of all matrices
     matrix_slice: slice
-    # Unknowns of the group, and of the later poses, as indices into the solution
+    # Indices of the unknowns of this group, and of the later unknowns in its equations
     solution_slice: slice
     later_unknowns: IntArray
-    # Index of the group that contains the first of the later poses
+    # Index of the parent group in the elimination tree
     parent_index: int
-    # Columns of the matrix of the parent to which the Schur complement of this group is added
+    # Columns of the parent's matrix to which the Schur complement is added
     columns_in_parent: IntArray
 
 
 class NormalEquations:
     """Normal equations of the least-squares problem ``A x_i + B x_j = c``, with x_0 = 0.
 
-    Each edge (i, j) of the graph gives one equation with A and B, shape (d, d), and c, shape
-    (d, k). The order of elimination and all indices are computed once, from the edges.
+    Each edge (i, j) of the pose graph gives one equation.
 
     Parameters
     ----------
     edges : ndarray of int, shape (2, m)
-        Indices i and j of the n poses. The edges must connect all poses.
+        Pose indices i and j. The edges must connect all poses.
     unknowns_per_pose : int
-        Number d of unknowns per pose.
     right_hand_side_count : int
-        Number k of right-hand sides (columns of c).
+        Number of columns of c.
     """
 
     def __init__(
@@ -83,7 +69,7 @@ class NormalEquations:
         matrix_starts = np.append(0, np.cumsum(row_counts * column_counts))
 
         def find_columns(group: IntArray, pose: IntArray) -> IntArray:
-            """Return the d columns of each pose in the matrix of ``group``, shape (poses, d)."""
+            """Return the matrix columns of each pose in the matrix of ``group``."""
             index = (
                 np.searchsorted(keys_of_group_and_later_pose, group * len(poses) + pose)
                 - later_pose_starts[group]
@@ -94,10 +80,7 @@ class NormalEquations:
             return np.asarray(column[:, None] * unknowns_per_pose + offsets_in_pose)
 
         def find_element_indices(pose: IntArray, columns: IntArray) -> IntArray:
-            """Return flat indices of the elements in the d rows of each pose and given columns.
-
-            ``columns``: shape (poses, c); the result has the shape (poses, c, d).
-            """
+            """Return flat indices of the matrix elements of each pose in the given columns."""
             group = group_by_pose[pose]
             column_start = matrix_starts[group][:, None] + columns * row_counts[group][:, None]
             rows = (pose - group_starts[group])[:, None] * unknowns_per_pose + offsets_in_pose
@@ -154,17 +137,16 @@ class NormalEquations:
         information: Array,
         right_hand_side: Array,
     ) -> ArrayPair:
-        """Sum the normal equations of ``A x_i + B x_j = c`` over all edges (i, j).
+        """Assemble the normal equations of ``A x_i + B x_j = c`` over all edges (i, j).
 
-        Return the matrices of all elimination groups (one flat array), and the right-hand sides of
-        the normal equations, shape (n, d, k).
+        Return the matrix elements (a flat array), and the right-hand sides, shape (n, d, k).
 
         Parameters
         ----------
         first_pose_matrix, second_pose_matrix, information : ndarray, shape (m, d, d)
-            A, B, and the information matrix (weight) of each edge.
+            A, B and weight of each of the m edges.
         right_hand_side : ndarray, shape (m, d, k)
-            Right-hand side c of each edge.
+            c of each edge.
         """
         pose_matrices = np.where(
             self._is_swapped,
@@ -185,7 +167,7 @@ class NormalEquations:
         return matrix_values, right_hand_sides
 
     def solve(self, matrix_values: Array, damping: float = 0.0) -> Array | None:
-        """Solve the equations with damping on the diagonal; the result has the shape (n, d, k).
+        """Solve the equations, with damping added to the diagonal.
 
         Return None if the matrix is not positive definite.
         """
@@ -220,7 +202,7 @@ class NormalEquations:
             schur_complement = blas.dsyrk(
                 -1.0, off_diagonal_factor, 1.0, schur_complement, trans=1, overwrite_c=1
             ).T
-            # only the lower triangle (row >= column) of the symmetric matrix is computed
+            # only the lower triangle of the symmetric matrix is computed
             parent = self._groups[group.parent_index]
             columns = group.columns_in_parent
             column_count_in_parent = np.searchsorted(columns, parent.unknown_count)
@@ -255,17 +237,16 @@ class NormalEquations:
 def _find_elimination_order(
     edges: IntArray, max_poses_per_leaf_group: int
 ) -> tuple[IntArray, IntArray, list[IntArray]]:
-    """Return the order of elimination of n poses, divided into g groups.
+    """Return the order of elimination of n poses in g groups.
 
     Returns
     -------
     position : ndarray of int, shape (n,)
         Index of each pose in the order of elimination.
     group_starts : ndarray of int, shape (g + 1,)
-        Index of the first pose of each group in this order, and n.
+        Index of the first pose of each group, and n.
     later_poses_by_group : list of ndarray of int
-        Later poses whose equations the elimination of each group changes, by their index in this
-        order.
+        Later poses in the equations of each group.
     """
     rows = np.tile(np.arange(edges.shape[1]), 2)
     incidence_matrix = sparse.csc_array(
@@ -275,18 +256,17 @@ def _find_elimination_order(
     first_pose_anchor_matrix = sparse.csc_array(([1.0], ([0], [0])), shape=(pose_count, pose_count))
     lu_factors = splu(
         (incidence_matrix.T @ incidence_matrix + first_pose_anchor_matrix).tocsc(),
-        # With this order, the factor has 1.1 to 1.9 times fewer nonzeros than with the default
-        # COLAMD, on public benchmark graphs
+        # This order gives fewer nonzeros than the default COLAMD
         permc_spec="MMD_AT_PLUS_A",
         diag_pivot_thresh=0.0,
-        # SuperLU does not merge columns, because the merged columns would store zeros
+        # Merged columns would store zeros
         relax=1,
         options={"SymmetricMode": True},
     )
     sparsity_pattern = lu_factors.L.sorted_indices()
     nonzero_counts = np.diff(sparsity_pattern.indptr)
-    # In the elimination tree, the parent of a pose is the first later pose whose equations its
-    # elimination changes: the row of the first nonzero below the diagonal
+    # The parent of a pose in the elimination tree is the row of the first nonzero below the
+    # diagonal
     parent = sparsity_pattern.indices[sparsity_pattern.indptr[:-2] + 1]
     last_pose = pose_count - 1
     tree = sparse.csr_array(
@@ -304,8 +284,7 @@ def _find_elimination_order(
     is_large_subtree[pose_count] = True
     leaf_group_ends = np.flatnonzero(~is_large_subtree[:-1] & is_large_subtree[parent])
     is_parent_next = parent[:-1] == np.arange(1, pose_count)
-    # A pose joins the group of its child in the tree if the columns of both have the same nonzero
-    # rows. The dense matrix of the group then contains no additional zeros
+    # Poses are merged if their columns have the same nonzero rows, because no zeros are added then
     is_merged_with_child = is_large_subtree[:-2] & is_parent_next & (np.diff(nonzero_counts) == -1)
     merged_group_starts = np.flatnonzero(
         is_large_subtree[:-1] & ~np.append(False, is_merged_with_child)

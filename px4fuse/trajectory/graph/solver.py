@@ -1,4 +1,4 @@
-"""Pose graph optimisation by Levenberg-Marquardt, optionally robust against false closures."""
+"""Pose graph optimisation by Levenberg-Marquardt, with robust rejection of false loop closures."""
 
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
@@ -14,12 +14,11 @@ from px4fuse.trajectory.graph import lie, model
 from px4fuse.trajectory.graph.covariance import GateResult, gate_edges
 from px4fuse.trajectory.graph.model import PoseGraph, Residuals
 
-# Maximum number of closures for robust optimisation by default: with more closures the optimisation
-# takes minutes
+# Maximum number of closures for robust optimisation by default: more closures take minutes
 MAX_GNC_CLOSURES = 1000
-# Key in results.json of the solution by robust optimisation (graduated non-convexity)
+# Key of the robust solution in results.json: graduated non-convexity (GNC)
 ROBUST_SOLUTION_KEY = "gnc"
-# Labels of the pose graph solutions, by the key in results.json
+# Labels of the pose graph solutions, by their key in results.json
 SOLUTION_LABELS: Mapping[str, str] = {
     "all": "pose graph with all loop closures",
     "gated": "pose graph with loop closures that pass the gate",
@@ -30,56 +29,51 @@ SOLUTION_LABELS: Mapping[str, str] = {
 MAX_ITERATIONS = 100
 # Initial damping of Levenberg-Marquardt, as in GTSAM
 _INITIAL_DAMPING = 1e-5
-# Factor on the damping of Levenberg-Marquardt after a rejected step, as in GTSAM
+# Factor on the damping after a rejected step, as in GTSAM
 _DAMPING_FACTOR = 10.0
 # Maximum damping of Levenberg-Marquardt, as in GTSAM
 _MAX_DAMPING = 1e5
-# Minimum ratio of actual to predicted cost decrease for accepting a step, as in GTSAM
+# Minimum ratio of actual to predicted cost decrease of an accepted step, as in GTSAM
 _MIN_COST_DECREASE_RATIO = 1e-3
 # Relative and absolute tolerance of the cost of a pose graph
 _COST_TOLERANCE = 1e-10
 _FLOAT_EPSILON = float(np.finfo(float).eps)
-# Relative tolerance of the cost in an intermediate stage of graduated non-convexity
+# Relative tolerance of the cost in intermediate stages of graduated non-convexity
 _GNC_STAGE_TOLERANCE = 1e-6
 _MAX_GNC_STAGE_ITERATIONS = 20
 
-# Probability that a true closure has full weight in graduated non-convexity. The bound of its χ² is
-# the quantile at this probability
+# Closures below this quantile of χ² keep full weight in graduated non-convexity
 GNC_INLIER_PROBABILITY = 0.99
-# Probability that a true closure is kept. A dropped closure adds the χ² quantile at this
-# probability to the cost, instead of its χ²
+# The cost of a dropped closure is the quantile of χ² at this probability
 KEPT_CLOSURE_PROBABILITY = 0.999
-# Factor on the control parameter of graduated non-convexity per stage (Yang 2020, section V)
+# Factor on the control parameter of graduated non-convexity (Yang 2020, section V)
 _GNC_CONTROL_FACTOR = 1.4
 _MAX_GNC_STAGES = 100
-# Maximum number of dropped closures that are restored on trial, each with an optimisation
+# Maximum number of dropped closures that are restored on trial
 _MAX_RESTORE_ATTEMPTS = 20
-# Maximum number of rounds with weights 0 and 1 after graduated non-convexity
 _MAX_REWEIGHTING_ROUNDS = 20
-# Minimum estimated scale factor by which information matrices are divided. False closures alone can
-# cause smaller factors, such as 2.1 if 40 % of the closures are false
+# False closures alone can cause smaller scale factors of information matrices
 MIN_INFORMATION_SCALE_FACTOR = 2.5
-# Minimum number of closures for estimating the scale factor of the information matrices from the
-# squared Mahalanobis distances d² of the closures
+# Minimum number of closures for an estimate of the scale factor of information matrices
 MIN_CLOSURES_FOR_SCALE_FACTOR = 10
 
 
 class Solution(Record, kw_only=True):
-    """Solution of a pose graph."""
+    """Optimised poses of a pose graph, with cost and convergence."""
 
-    # Half of the sum of the squared Mahalanobis distances at the initial poses
+    # Half of the sum of the squared Mahalanobis distances before the optimisation
     cost_initial: NotNegative
-    # Half of the weighted sum of the squared Mahalanobis distances at the solution
+    # Half of the weighted sum of the squared Mahalanobis distances after the optimisation
     cost: NotNegative
-    # Number of accepted Levenberg-Marquardt steps in all starts and stages of the solver
+    # Number of accepted Levenberg-Marquardt steps
     iterations: Count
-    # True if the last step changed the cost by less than the tolerance
+    # True if the optimisation reached the cost tolerance
     converged: bool
     # Number of edges with a weight below 0.5
     dropped: Count
-    # Optimised poses; the first pose is unchanged
+    # Optimised poses; the first pose is fixed
     poses: NotWritten[Array] = NOT_WRITTEN
-    # Factor on the information of each edge, from 0 (ignored) to 1
+    # Weight of each edge, from 0 (ignored) to 1
     weights: NotWritten[Array] = NOT_WRITTEN
 
 
@@ -93,23 +87,21 @@ class _Optimum:
 def solve(
     graph: PoseGraph, *, robust: bool = False, is_closure: BoolArray | None = None
 ) -> Solution:
-    """Optimise the poses by Levenberg-Marquardt; the first pose is fixed.
+    """Optimise a pose graph by Levenberg-Marquardt, with the first pose fixed.
 
-    Steps, damping and acceptance are those of GTSAM's LevenbergMarquardtOptimizer, so px4fuse and
-    GTSAM reach the same minimum from the same start.
+    Steps and damping are those of GTSAM's LevenbergMarquardtOptimizer.
 
     Parameters
     ----------
     robust : bool
-        True to drop false closures, by graduated non-convexity.
+        True to reject false closures by graduated non-convexity.
     is_closure : ndarray of bool, shape (m,), optional
-        Mask of the edges that may be false; default: edges between poses that are not successive.
+        Mask of the loop closures. Default: all edges between poses that are not successive.
 
     Raises
     ------
     TrajectoryError
-        The graph has no edges, is not connected, contains a number that is not finite, or robust
-        optimisation drops all edges to some poses.
+        The graph has no edges, is not connected, or contains a number that is not finite.
     """
     model.require_connected(graph, np.ones(len(graph.first_nodes), bool), "the edges")
     can_be_false = ~graph.find_successive_edges() if is_closure is None else is_closure
@@ -143,13 +135,13 @@ def _minimise(
     relative_cost_tolerance: float = _COST_TOLERANCE,
     max_iterations: int = MAX_ITERATIONS,
 ) -> _Optimum:
-    """Minimise the cost, starting at ``residuals``, like GTSAM's LevenbergMarquardtOptimizer."""
+    """Minimise the cost by Levenberg-Marquardt, like GTSAM's LevenbergMarquardtOptimizer."""
     damping = _INITIAL_DAMPING
     iterations = 0
     cost = float(np.sum(0.5 * weights * residuals.chi2))
     while iterations < max_iterations and cost > _COST_TOLERANCE:
-        # Derivatives of the residual: J with respect to x_j, -J A with respect to x_i (J: inverse
-        # right Jacobian, A: adjoint of the pose x_i relative to x_j)
+        # Derivatives of the residual: J by x_j, -J Ad(X_j^-1 X_i) by x_i, with the inverse right
+        # Jacobian J
         second_pose_jacobian = lie.right_jacobian_inverse(residuals.residual)
         first_pose_jacobian = second_pose_jacobian @ lie.adjoint(
             lie.inverse(residuals.relative_poses)
@@ -197,11 +189,7 @@ def _solve_gnc(
     unweighted_optimum: _Optimum,
     can_be_false: BoolArray,
 ) -> tuple[_Optimum, Array]:
-    """Drop false closures by graduated non-convexity, and return the optimum and the edge weights.
-
-    Of the results from two starts, the result with the lower cost is used. A dropped closure is
-    restored if this lowers the truncated cost, in which each dropped closure has a fixed cost.
-    """
+    """Reject false closures by graduated non-convexity; return the optimum and the edge weights."""
     degrees_of_freedom = model.count_observed_directions(graph.information)
     chi2_bound = np.full(len(can_be_false), np.inf)
     cost_if_dropped = np.zeros(len(can_be_false))
@@ -246,13 +234,12 @@ def _run_gnc(
     """Run graduated non-convexity from one start (Yang 2020, algorithm 1, eq. 13 and 14)."""
     residuals = start_residuals
     iteration_count = 0
-    # The initial control parameter is 1 / max(2 χ² / bound - 1) (Yang 2020, section V). If the
-    # maximum is not positive, all edges keep full weight
+    # The maximum is the inverse of the initial control parameter (Yang 2020, section V)
     inverse_control_by_edge = 2.0 * residuals.chi2 / chi2_bound - 1.0
     if np.max(inverse_control_by_edge) > 0.0:
         control_parameter = 1.0 / float(np.max(inverse_control_by_edge))
         for _ in range(_MAX_GNC_STAGES):
-            # the limit avoids a division by zero and does not change the weight, which is 1
+            # avoid a division by zero
             chi2_ratio = np.maximum(residuals.chi2 / chi2_bound, 1e-200)
             weights = np.clip(
                 np.sqrt(control_parameter * (control_parameter + 1.0) / chi2_ratio)
@@ -273,7 +260,7 @@ def _run_gnc(
         reweighted_optimum = _minimise(graph, residuals, weights)
         residuals = reweighted_optimum.residuals
         iteration_count = iteration_count + reweighted_optimum.iterations
-        # the iteration ends, because each round decreases the truncated cost
+        # each round decreases the truncated cost, so the loop ends
         new_weights = (residuals.chi2 <= chi2_bound).astype(float)
         if np.array_equal(new_weights, weights):
             break
@@ -282,24 +269,22 @@ def _run_gnc(
 
 
 class Graph(Record, kw_only=True):
-    """Pose graph for results.json: size, tests of the closures, and solutions.
+    """Results of a pose graph: size, χ² tests of the loop closures, and solutions.
 
     Attributes
     ----------
     name : str
     dimension, poses, edges : int
     initialised : str
-        Source of the initial poses.
+        Origin of the initial poses.
     reduced_chi2 : float
-        χ² of the least-squares solution ÷ degrees of freedom; 0 without degrees of freedom.
+        χ² of the least-squares solution divided by the degrees of freedom.
     reduced_chi2_interval : tuple of float
-        95 % interval of ``reduced_chi2`` for correct information matrices and closures.
+        Expected 95 % interval of ``reduced_chi2``.
     information_factor : float
-        Estimated factor by which all information matrices are too large, or 1 if the estimate is
-        below MIN_INFORMATION_SCALE_FACTOR. Gate and robust optimisation use the matrices divided by
-        this factor.
+        Estimated factor by which the information matrices are too large.
     gates : tuple of GateResult, or Unavailable
-        Tests of all edges that are not odometry.
+        χ² tests of the loop closures.
     solutions : mapping from key of :data:`SOLUTION_LABELS` to Solution
     """
 
@@ -322,11 +307,10 @@ def analyse_graph(
     *,
     use_robust_optimisation: bool | None = None,
 ) -> tuple[Graph, PoseGraph]:
-    """Test the loop closures of a pose graph, and optimise the graph by least squares and robustly.
+    """Test the loop closures of a pose graph, and optimise the graph.
 
-    Edges between successive vertices are odometry, all other edges are closures. By default, robust
-    optimisation is run with up to MAX_GNC_CLOSURES closures. Also return the pose graph with the
-    least-squares poses.
+    Edges between successive vertices are odometry, all other edges are loop closures. Also return
+    the graph with the least-squares poses.
 
     Raises
     ------
@@ -387,8 +371,7 @@ def analyse_graph(
 def _estimate_information_factor(closure_tests: tuple[GateResult, ...]) -> float:
     """Estimate the factor by which all information matrices are too large.
 
-    The factor is the median ratio of the d² of a closure to the expected median of its d².
-    The median is robust against false closures if they are a minority.
+    The median over the closures is robust against false closures.
     """
     expected_d2_medians = chdtri([gate.degrees_of_freedom for gate in closure_tests], 0.5)
     return float(np.median(np.divide([gate.d2 for gate in closure_tests], expected_d2_medians)))
