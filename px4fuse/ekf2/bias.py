@@ -1,6 +1,7 @@
 """EKF2's estimate of the bias of a height or vision sensor.
 
 EKF2 uses a separate scalar Kalman filter for each axis.
+
 Source: PX4-Autopilot ``EKF/bias_estimator`` (``bias_estimator.cpp``; before v1.15
 ``EKF/bias_estimator.cpp``).
 """

@@ -747,7 +747,7 @@ class _FusionDecisions:
         )
         time_since_fusion_s = now_s - self.last_position_s
         if self.is_every_reset_logged and not is_decision_logged:
-            # If EKF2 logs no reset after the timeout, it fused the last sample before the timeout
+            # Without a logged reset after the timeout, EKF2 has fused the sample before the timeout
             next_event = min(event + 1, len(self.time_s) - 1)
             is_last_event_before_reset_timeout = (
                 self.time_s[next_event] - self.last_position_s > fusion_rules.reset_timeout_s
@@ -802,9 +802,10 @@ def _compute_variance_growth(
     estimates_biases: BoolArray,
     estimates_attitude: BoolArray,
 ) -> ArrayPair:
-    """Return process noise per prediction step, and maximum variance, of bias and field states.
+    """Return process noise per prediction step, and maximum variance, of biases and fields.
 
-    EKF2 adds no process noise to a state whose variance exceeds the maximum.
+    The states are IMU biases and magnetic fields. EKF2 adds no process noise to a state whose
+    variance exceeds the maximum.
     """
     limit_parameter_by_noise_parameter = {"GYR_B": "GYR", "ACC_B": "ACC"}
     if segment.magnetic_field is not None:

@@ -75,7 +75,7 @@ REPLAY_BATCH_SIZE = 10
 # Number of intervals whose states are computed at once; limits the memory
 EVENTS_PER_BLOCK = 512
 
-# Fields of Agreement whose name is not PX4's name of the aiding source
+# Fields of Agreement whose names differ from PX4's name of the aiding source
 AGREEMENT_FIELD_BY_AID_NAME = {FLOW.name: "carried_difference_m"}
 
 ListConfigurations = Callable[[ReplayInputs], Sequence[FilterConfiguration]]
@@ -106,7 +106,7 @@ def prepare_ekf2_model(
 ) -> Ekf2Model | Unavailable:
     """Prepare EKF2 replays of a flight, and replay the flight with the logged parameters.
 
-    ``list_later_configurations`` returns filter configurations to compute at the same time.
+    ``list_later_configurations`` returns further filter configurations to compute.
     """
     failed_agreement_by_aid: dict[str, Agreement] = {}
     while not isinstance(
