@@ -30,8 +30,6 @@ class BadAccelerationFlag:
         True to use the logged flag.
     flag_duration_s : float
         Time for which the flag stays set after a large innovation.
-    segment : ReplaySegment
-        Part of the flight.
 
     Attributes
     ----------

@@ -171,8 +171,6 @@ class HeightFilter:
 
     Parameters
     ----------
-    segment : ReplaySegment
-        Part of the flight.
     barometer_samples_by_event : ndarray, shape (6, k, events, filters) or (6, k, events, 1)
         Result of :func:`group_barometer_by_event`.
     gnss_fix_times_s, has_gnss_fix : ndarray, shape (events, filters) or (events, 1)
@@ -181,7 +179,6 @@ class HeightFilter:
     parameters : mapping from parameter name to ndarray, shape (filters,)
     has_gate : ndarray of bool, shape (filters,)
         False to fuse every sample.
-    bad_acceleration_flag : BadAccelerationFlag
 
     Attributes
     ----------

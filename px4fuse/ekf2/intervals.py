@@ -100,7 +100,6 @@ class EventIntervals:
     state_derivatives: Array
 
     def compute_transitions(self, rows: slice) -> Transitions:
-        """Compute the matrices of the intervals ``rows``."""
         state_derivatives, duration_s = self.state_derivatives[rows], self.duration_s[rows]
         transition = np.tile(np.eye(STATE_COUNT), (len(duration_s), 1, 1))
         state_change_by_correction, state_change_by_acceleration = np.zeros(

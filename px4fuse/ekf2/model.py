@@ -126,7 +126,6 @@ def _prepare_without_aids(
     list_later_configurations: ListConfigurations,
     failed_agreement_by_aid: Mapping[str, Agreement],
 ) -> Ekf2Model | Unavailable:
-    """Prepare an EKF2 replay without the aiding sources in ``failed_agreement_by_aid``."""
     omitted_aids = {
         name: agreement.doubtful[name] for name, agreement in failed_agreement_by_aid.items()
     }
@@ -412,7 +411,6 @@ def _make_track(run: SegmentRun, position_m: Array, velocity_m_s: Array) -> pd.D
 
 
 def _join_segments(tables: Sequence[pd.DataFrame]) -> pd.DataFrame:
-    """Concatenate the tables of all flight segments."""
     return tables[0] if len(tables) == 1 else pd.concat(tables)
 
 
@@ -569,7 +567,6 @@ def _compute_states_after_steps(run: SegmentRun, configuration_index: int, rows:
     interval_index = np.searchsorted(event_steps, np.arange(step_count), side="right")
     states = np.empty((step_count + 1, event_states[0, rows].size))
     states[0] = event_states[0, rows]
-    # States are computed in blocks, to limit the memory
     block_boundaries = np.searchsorted(
         interval_index, np.arange(0, len(event_steps) + 1, EVENTS_PER_BLOCK)
     )

@@ -60,7 +60,6 @@ def compute_published_state(
     )
     acceleration_m_s2 += np.cross(published_minus_nominal_attitude_rad[1:], acceleration_m_s2)
     acceleration_m_s2 += GRAVITY_M_S2
-    # The output array is reused to save memory
     velocity_increments_m_s = np.multiply(acceleration_m_s2, step_s, out=acceleration_m_s2)
     velocity_m_s = _predict_output(
         state[:, VELOCITY],

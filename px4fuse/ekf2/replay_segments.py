@@ -371,7 +371,6 @@ def find_replay_segments(
         ]
         if not len(fusion_times_in_part_s):
             continue
-        # The replay starts MIN_TIME_SINCE_TAKEOFF_S after take-off
         earliest_starts_s = [
             start_s + MIN_TIME_SINCE_TAKEOFF_S
             for start_s, _ in airborne[:1]

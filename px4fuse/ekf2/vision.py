@@ -86,8 +86,6 @@ class VisionFilter:
 
     Parameters
     ----------
-    segment : ReplaySegment
-        Part of the flight.
     samples_by_configuration : sequence of ndarray, shape (8, k, events)
         Result of :func:`group_vision_by_event` for each filter configuration.
     is_enabled_by_aid : mapping from PX4's name of a source to ndarray of bool, (events, filters)
