@@ -31,26 +31,24 @@ AidVerdict = Literal[
 MIN_BIAS_TO_RMS_RATIO = 0.5
 # Minimum |mean innovation| / median √S of a biased aiding source
 MIN_BIAS_TO_SQRT_S_RATIO = 0.2
-# Length (s) of a window. The normalised innovations ν/√S are averaged in each window, to detect a
-# change of their mean
+# Length (s) of the windows in which normalised innovations ν/√S are averaged
 INNOVATION_MEAN_WINDOW_S = 10.0
-# A window with fewer innovations is ignored
+# Minimum number of innovations in a window
 MIN_INNOVATIONS_PER_WINDOW = 5
 # Minimum number of windows before a change of the mean innovation
 MIN_WINDOWS_BEFORE_MEAN_CHANGE = 2
-# A smaller change (√S) of the mean innovation is not significant
+# Minimum significant change (√S) of the mean innovation
 MIN_MEAN_CHANGE_IN_SIGMA = 0.5
-# Minimum ratio: change of the mean innovation / standard deviation of the window means before
+# Minimum ratio of a mean innovation change to the standard deviation of earlier window means
 MIN_MEAN_CHANGE_TO_SCATTER_RATIO = 6.0
-# Maximum time (s) for which EKF2 fuses no sample of an enabled aiding source. After 7 s, EKF2
-# resets its state to the source (reset_timeout_max)
+# Maximum time (s) without a fused sample of an enabled aiding source. After 7 s, EKF2 resets its
+# state (reset_timeout_max)
 MAX_TIME_WITHOUT_FUSION_S = 5.0
-# The same maximum time as a number of logging intervals. In a sparse log, this limit is longer
+# Maximum time without a fused sample in a sparse log, as a number of logging intervals
 MAX_LOG_INTERVALS_WITHOUT_FUSION = 10.0
-# EKF2 computes R from a noise parameter if √R differs from the parameter by at most this fraction
+# Maximum relative difference between √R and the noise parameter from which EKF2 computes R
 MEASUREMENT_NOISE_RELATIVE_TOLERANCE = 0.02
-# Aiding sources are evaluated above this height (m): near the ground, rotor downwash disturbs the
-# barometer
+# Minimum height (m) of the evaluation: near the ground, rotor downwash disturbs the barometer
 MIN_HEIGHT_M = 2.0
 # Window length (barometer samples) of the running median of the height
 HEIGHT_MEDIAN_FILTER_LENGTH = 11
@@ -68,7 +66,7 @@ class AidAxisStatistics(Record, kw_only=True):
     rejected_fraction : float
         Fraction of samples outside the gate along this axis.
     change : (float, float) or None
-        Largest significant change of the mean innovation: its time (s), and its size (√S).
+        Time (s) and size (√S) of the largest significant change of the mean innovation.
     """
 
     samples: Count
@@ -97,13 +95,13 @@ class AidResult(Record, kw_only=True):
     enabled_fraction : float or None
         Fraction of the flight in which the source was enabled; None if not logged.
     fused_fraction, rejected_fraction : float
-        Fractions of the samples while the source was enabled.
+        Fractions of the samples in the time in which the source was enabled.
     fused_logged : bool
-        False if the log contains no fusion flags: px4fuse then applies the gate.
+        True if the log contains fusion flags.
     longest_gap_s : (float, float)
-        Start and end of the longest time without a fused sample, while enabled.
+        Start and end (s) of the longest time without a fused sample.
     resets : int
-        Number of resets of EKF2's state to a sample of the source.
+        Number of resets of EKF2's state to the source.
     gate : float
         Innovation gate in √S.
     noise : float or None
@@ -133,11 +131,7 @@ class AidResult(Record, kw_only=True):
 
     @property
     def is_faulty(self) -> bool:
-        """True if the source is biased, overconfident, or enabled but not fused.
-
-        An underconfident source is not faulty. With PX4's default noises, which are too large, most
-        sources are underconfident.
-        """
+        """True if the source is biased, overconfident, or enabled but not fused."""
         return self.verdict in ("not_fused", "biased", "overconfident")
 
     @property
@@ -274,11 +268,9 @@ def _evaluate_aid(aid: Aid, aid_log: AidLog, start_s: float, end_s: float) -> Ai
 
 
 def _find_largest_mean_change(time_s: Array, normalised_innovations: Array) -> Span | None:
-    """Return the largest significant change of the mean innovation: its time (s) and size (√S).
+    """Return time (s) and size (√S) of the largest significant change of the mean innovation.
 
-    Return None if no change is significant. Innovations are averaged in windows of
-    INNOVATION_MEAN_WINDOW_S. For each window, the mean of the next two windows is compared with the
-    mean of all earlier windows. The time of the change is the start of the first changed window.
+    Return None if no change is significant.
     """
     window_index = np.floor((time_s - time_s[0]) / INNOVATION_MEAN_WINDOW_S)
     windows = pd.Series(normalised_innovations).groupby(window_index).agg(["mean", "size"])
@@ -312,10 +304,7 @@ def _compute_fraction(is_in_numerator: BoolArray, is_in_denominator: BoolArray) 
 
 
 def _find_applied_gate(aid: Aid, aid_log: AidLog) -> float:
-    """Return the gate (√S) that EKF2 applied.
-
-    The gate is computed from the logged test ratios ν²/(gate² S), or read from its parameter.
-    """
+    """Return the gate (√S) of EKF2, from logged test ratios or from the gate parameter."""
     axis = aid_log.axes[0]
     if f"ratio_{axis}" in aid_log.samples:
         rows_with_test_ratio = aid_log.samples[aid_log.samples[f"ratio_{axis}"] > 0.0]
@@ -329,7 +318,7 @@ def _find_applied_gate(aid: Aid, aid_log: AidLog) -> float:
 
 
 def _find_noise_origin(aid: Aid, aid_log: AidLog, noise_sigma: float | None) -> str:
-    """Return the origin of R: the name of a parameter, or a text such as "reported accuracy"."""
+    """Return the origin of R: a parameter name, or a text such as "reported accuracy"."""
     parameter_value = aid_log.parameters.get(aid.noise)
     if noise_sigma is None or parameter_value is None:
         return "" if noise_sigma is None else aid.noise_source_text

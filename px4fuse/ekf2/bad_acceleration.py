@@ -1,9 +1,8 @@
 """Model of EKF2's flag for a bad vertical acceleration (``fs_bad_acc_vertical``).
 
-EKF2 sets the flag if barometer and GNSS both measure a larger height than the state, one of them by
-more than 3 √S, the other by more than √S. While the flag is set, the accelerometer noise is
-increased, the accelerometer bias is constant, and vertical innovations outside the gate are clipped
-instead of rejected.
+EKF2 sets the flag if barometer and GNSS both measure a larger height than EKF2 estimates. While the
+flag is set, EKF2 increases the accelerometer noise and holds the accelerometer bias constant. EKF2
+then clips vertical innovations to the gate instead of rejecting them.
 
 Source: PX4-Autopilot ``EKF/height_control.cpp`` (checkVerticalAccelerationHealth,
 estimateInertialNavFallingLikelihood).
@@ -14,32 +13,28 @@ import numpy as np
 from px4fuse.core.arrays import Array, BoolArray
 from px4fuse.ekf2.replay_segments import ReplaySegment
 
-# EKF2 flags a bad vertical acceleration only if the normalised height innovation of barometer or
-# GNSS exceeds this value (vert_innov_test_lim, common.h)
+# Minimum normalised height innovation (√S) of barometer or GNSS for a bad-acceleration flag
+# (vert_innov_test_lim, common.h)
 MIN_HEIGHT_INNOVATION_OF_ONE_SENSOR = 3.0
-# EKF2 flags a bad vertical acceleration only if the normalised height innovations of barometer and
-# GNSS both exceed this value (vert_innov_test_min)
+# Minimum normalised height innovation (√S) of barometer and GNSS for a bad-acceleration flag
+# (vert_innov_test_min, common.h)
 MIN_HEIGHT_INNOVATION_OF_BOTH_SENSORS = 1.0
 
 
 class BadAccelerationFlag:
-    """EKF2's flag for a bad vertical acceleration, for each of several filter configurations.
+    """EKF2's flag for a bad vertical acceleration, for several filter configurations.
 
     Parameters
     ----------
     uses_logged_flag : ndarray of bool, shape (filters,)
-        True for filter configurations that use the logged flag.
+        True to use the logged flag.
     flag_duration_s : float
-        The flag remains set for this time after the last large innovation.
-    segment : ReplaySegment
-        Segment with the logged flag.
+        Time for which the flag stays set after a large innovation.
 
     Attributes
     ----------
     since_s, until_s : ndarray, shape (filters,)
-        Start and end of the latest time span in which the flag is set.
-    models_flag : bool
-        True if a filter configuration does not use the logged flag.
+        Start and end of the latest time with a set flag.
     """
 
     def __init__(
@@ -62,10 +57,9 @@ class BadAccelerationFlag:
         )
 
     def compute_bad_acceleration_fraction(self, begin_s: Array, end_s: Array) -> Array | None:
-        """Return the fraction of an interval with a bad acceleration, for each configuration.
+        """Return the fraction of a time interval with a bad acceleration, for each configuration.
 
-        Return None if no configuration has a bad acceleration in the interval. Intervals must be
-        given in time order. Only the last time span with the flag in an interval is counted.
+        Return None if the flag is not set in the interval. Call this method in time order.
         """
         if len(self.logged_since_s):
             last_row = np.searchsorted(self.logged_since_s, end_s) - 1
@@ -82,18 +76,17 @@ class BadAccelerationFlag:
         return np.asarray(np.maximum(overlap_s, 0.0) / np.maximum(end_s - begin_s, 1e-9))
 
     def update(self, time_s: Array, previous_innovations: Array, innovations: Array) -> None:
-        """Update the modelled bad-acceleration flag after all fusions of one event.
+        """Update the modelled flag after a fusion of heights.
 
         Parameters
         ----------
         time_s : ndarray, shape (filters,) or (1,)
-            Time of the event.
+            Time of the fusion.
         previous_innovations, innovations : ndarray, shape (k + 1, filters)
-            Normalised height innovations (√S, positive upwards) of the previous and of the current
-            event: k rows for barometer samples, one row for GNSS. NaN without a sample.
+            Normalised height innovations (√S, positive upwards): k of the barometer, one of GNSS.
+            NaN without a sample.
         """
-        # EKF2's test uses the latest innovation of each height sensor, so each innovation is kept
-        # until the next sample of the sensor
+        # EKF2's test uses the latest innovation of each height sensor
         gnss_height_innovation = previous_innovations[-1]
         barometer_height_innovation = np.full(len(gnss_height_innovation), np.nan)
         for sample_innovation in previous_innovations[:-1]:

@@ -1,9 +1,7 @@
 """Barometer samples that EKF2 fused, including samples that the logger dropped.
 
-PX4's default profile logs only 5 of the 10 or 20 samples per second. Some missing samples are
-computed from ``estimator_aid_src_baro_hgt`` and from the innovations in ``estimator_baro_bias``.
-The other missing samples are simulated: since PX4 v1.16, the log contains a low-pass filtered
-innovation, which determines their mean.
+PX4's default profile logs fewer barometer samples than EKF2 fuses. The missing samples are computed
+from ``estimator_aid_src_baro_hgt`` and ``estimator_baro_bias``, or simulated.
 
 Sources: PX4-Autopilot ``EKF/ekf_helper.cpp`` (updateAidSourceStatus),
 ``EKF/aid_sources/barometer/baro_height_control.cpp``, ``EKF/bias_estimator/bias_estimator.cpp``.
@@ -23,27 +21,22 @@ from px4fuse.flight.model import GROUND_EFFECT_FLAG, Ekf2, FusionRecord
 BAROMETER_HZ = 10.0
 # Rate (Hz) at which EKF2 fuses the barometer before PX4 v1.15
 BAROMETER_HZ_BEFORE_V1_15 = 15.0
-# Each logged variance of the barometer bias gives a sample interval. Their median is used only if
-# interquartile range / median is below this value
+# Maximum (interquartile range / median) of the sample intervals that are computed from the log
 MAX_RELATIVE_SPREAD_OF_INTERVALS = 0.1
-# Two logged times belong to the same barometer sample if they differ by less than this number of
-# sample intervals
+# Maximum time difference of equal barometer samples, as a fraction of the sample interval
 SAME_SAMPLE_TOLERANCE_IN_INTERVALS = 0.3
 # Maximum number of barometer samples that are reconstructed between two rows of the log
 MAX_SAMPLES_BETWEEN_LOGGED_ROWS = 30
-# Maximum weight of a logged barometer sample. The weight is 1 plus half the number of missing
-# samples before and after the logged sample
+# Maximum weight of a logged barometer sample, which also represents missing samples
 MAX_BAROMETER_SAMPLE_WEIGHT = 4.0
-# Minimum sum of the weights of missing samples, to avoid a division by zero if no sample is missing
+# Minimum sum of the weights of missing samples; prevents a division by zero
 MIN_MISSING_WEIGHT_SUM = 1e-9
 
 
 def estimate_barometer_interval_s(fusion_record: FusionRecord) -> float:
     """Return the interval (s) of the barometer samples that EKF2 fuses.
 
-    The interval Δt is computed from the variance of EKF2's barometer bias: p before an update, and
-    p' = p - p²/S after the update. Until the next update, the random walk with noise density q
-    increases the variance: p = p' + q² Δt.
+    The interval is computed from the growth of the logged barometer bias variance between updates.
     """
     barometer_bias_updates = fusion_record.height_bias_updates.get(BAROMETER.name)
     if barometer_bias_updates is not None and len(barometer_bias_updates) > 1:
@@ -64,9 +57,9 @@ def estimate_barometer_interval_s(fusion_record: FusionRecord) -> float:
 
 
 def _compute_bias_gain(barometer_bias_updates: pd.DataFrame) -> Array:
-    """Return the Kalman gain K = p/S of the logged updates of the barometer bias.
+    """Return the Kalman gain K of the logged updates of the barometer bias.
 
-    p is the bias variance before the update. The log contains the variance after it, p - p²/S.
+    K - K² = bias variance after the update / innovation variance.
     """
     posterior_to_innovation_variance_ratio = (
         barometer_bias_updates["bias_m2"] / barometer_bias_updates["variance_m2"]
@@ -79,10 +72,9 @@ def _compute_bias_gain(barometer_bias_updates: pd.DataFrame) -> Array:
 def find_fused_barometer_samples(
     ekf2: Ekf2, fusion_record: FusionRecord, logged_down_m: "pd.Series[float]"
 ) -> pd.DataFrame:
-    """Return the barometer samples that EKF2 fused, indexed by EKF2's measurement time.
+    """Return the barometer samples that EKF2 fused, indexed by EKF2's measurement time (s).
 
-    Columns: ``down_m`` (height) and ``weight`` (above 1 if neighbouring samples are missing).
-    ``logged_down_m`` is the logged height (m, down) at measurement times.
+    Columns: ``down_m`` (height, m) and ``weight`` (above 1 if neighbouring samples are missing).
     """
     interval_s = estimate_barometer_interval_s(fusion_record)
     samples = _combine_barometer_samples(ekf2, fusion_record, logged_down_m, interval_s)
@@ -107,9 +99,7 @@ def _combine_barometer_samples(
     barometer_bias_updates = fusion_record.height_bias_updates.get(
         BAROMETER.name, pd.DataFrame(zero_bias_update, index=row_times_s[:1])
     )
-    # The innovation of an update uses the bias before the update, but the log contains the bias
-    # after the update. Therefore the logged bias is used from half a sample interval after the
-    # update
+    # Innovations use the bias before an update, but the log contains the bias after it
     bias_breakpoint_times_s = np.column_stack(
         [barometer_bias_updates.index, barometer_bias_updates.index + 0.5 * interval_s]
     ).ravel()
@@ -119,7 +109,7 @@ def _combine_barometer_samples(
     bias_at_breakpoints_m = np.column_stack(
         [previous_bias_m, barometer_bias_updates["bias_m"]]
     ).ravel()
-    # Innovations in ground effect are not used: EKF2 subtracts a dead zone from them
+    # EKF2 reduces innovations in ground effect by a dead zone, so they are not used
     rows_outside_ground_effect = logged_barometer_updates[
         ~fusion_record.was_flag_set(GROUND_EFFECT_FLAG, row_times_s)
     ]
@@ -135,14 +125,13 @@ def _combine_barometer_samples(
         return np.asarray(np.interp(time_s, bias_breakpoint_times_s, bias_at_breakpoints_m))
 
     def predict_measured_down_m(time_s: Array) -> Array:
-        """Return EKF2's predicted barometer measurement (m, down): state minus bias."""
+        """Return EKF2's predicted barometer measurement (m, down)."""
         predicted_down_m = np.interp(
             time_s, rows_outside_ground_effect.index, predicted_minus_integrated_down_m
         ) + np.interp(time_s, velocity_times_s, displacement_m)
         return np.asarray(predicted_down_m - interpolate_bias_m(time_s))
 
-    # Two-dimensional arrays have one row for each interval between logged samples, and one column
-    # for each sample that EKF2 fused in the interval
+    # Arrays: one row per interval between logged samples, one column per sample in the interval
     span_s = np.diff(row_times_s)
     sample_count = np.maximum(np.rint(span_s / interval_s), 1.0).astype(int)
     is_regular = (
@@ -152,7 +141,7 @@ def _combine_barometer_samples(
     sample_interval_by_row_s = span_s / sample_count
     sample_indices = np.arange(sample_count[is_regular].max(initial=1))
     innovation_m = np.full((len(sample_count), len(sample_indices)), np.nan)
-    # Later arrays overwrite earlier arrays if several topics contain the same sample
+    # If several topics contain the same sample, the last topic in this list is used
     time_s = np.concatenate([barometer_bias_updates.index, logged_down_m.index, row_times_s])
     down_m = np.concatenate(
         [
@@ -179,7 +168,7 @@ def _combine_barometer_samples(
         np.rint(intervals_since_row[is_on_sample_grid]).astype(int) - 1,
     ] = (down_m - predict_measured_down_m(time_s))[is_on_sample_grid]
     if "filtered_down" in logged_barometer_updates:
-        # The sign is changed, because PX4 logs state minus measurement
+        # PX4 logs state minus measurement, which is the opposite sign
         filtered_nu_m = -logged_barometer_updates["filtered_down"].to_numpy()
         age_in_samples = sample_count[:, None] - 1.0 - sample_indices
         is_missing = np.isnan(innovation_m) & (age_in_samples >= 0.0) & is_regular[:, None]
@@ -218,18 +207,16 @@ def _simulate_missing_innovations(
 ) -> Array:
     """Replace missing innovations by random values that agree with the logged filtered innovation.
 
-    The low-pass filter of the returned innovations gives ``filtered_nu_m``.
-
     Parameters
     ----------
     innovation_m, is_missing : ndarray, shape (n, k)
-        Innovations of the k samples before each of n logged rows.
+        Up to k innovations before each of n logged rows.
     interval_s : ndarray, shape (n, 1)
-        Time between two samples.
+        Sample interval.
     age_in_samples : ndarray, shape (n, k)
         Number of samples from each sample to the next logged row.
     filtered_nu_m : ndarray, shape (n + 1,)
-        Low-pass filtered innovation at the start and at each logged row.
+        Logged low-pass filtered innovations.
     """
     new_sample_weight = interval_s / (interval_s + INNOVATION_TIME_CONSTANT_S)
     low_pass_weight = new_sample_weight * (1.0 - new_sample_weight) ** np.maximum(

@@ -1,4 +1,4 @@
-"""EKF2's estimate of the bias of a height or vision sensor relative to its reference sensor.
+"""EKF2's estimate of the bias of a height or vision sensor.
 
 EKF2 uses a separate scalar Kalman filter for each axis.
 
@@ -16,22 +16,24 @@ POSITION_BIAS_NOISE_M_PER_SQRT_S = 0.13
 MIN_POSITION_BIAS_VARIANCE_M2 = 1e-8
 # EKF2 updates the height or vision bias only with innovations inside this gate (√S)
 POSITION_BIAS_GATE = 3.0
-# EKF2 considers the bias wrong if |mean of (test ratio · sign of innovation)| exceeds this value
-# (isOffsetDetected, bias_estimator.cpp)
+# Above this mean test ratio, EKF2 considers the estimated bias wrong (isOffsetDetected,
+# bias_estimator.cpp)
 MAX_MEAN_TEST_RATIO_OF_VALID_BIAS = 0.2
-# Factor by which EKF2 multiplies the random walk variance of a bias that it considers wrong
+# Factor on the random walk variance of a bias that EKF2 considers wrong
 VARIANCE_FACTOR_FOR_WRONG_BIAS = 1e3
-# Time constant (s) of the low-pass filter of (test ratio · sign of innovation)
+# Time constant (s) of the low-pass filter of the test ratio
 TEST_RATIO_TIME_CONSTANT_S = 10.0
 
 
 class BiasEstimator:
-    """Kalman filter for the bias of one position or height sensor, for several EKF2 configurations.
+    """Kalman filter for the bias of one height or vision sensor.
+
+    Several EKF2 configurations are computed at once.
 
     Parameters
     ----------
     bias_m, variance_m2 : ndarray, shape (filters,) or (filters, axes)
-        Initial bias (state minus measurement), which is added to innovations, and its variance.
+        Initial bias (state minus measurement) and its variance.
     steps_s : ndarray
         Lengths of EKF2's prediction steps.
     """
@@ -52,7 +54,7 @@ class BiasEstimator:
         is_bias_updated: BoolArray,
         represented_sample_count: Array | float = 1.0,
     ) -> tuple[Array, Array]:
-        """Return innovation and R of a sample, corrected for the bias, and update the bias.
+        """Correct a measurement for the bias, and update the bias; return innovation and R.
 
         Parameters
         ----------
@@ -60,9 +62,8 @@ class BiasEstimator:
             Uncorrected innovation, HPH' and R.
         interval_s : ndarray
             Time since the previous sample; 0 if the bias is not updated.
-        is_bias_updated : ndarray of bool
         represented_sample_count : float or ndarray, shape (filters,)
-            Number of samples that EKF2 fused in place of this sample.
+            Number of EKF2 samples that this sample represents.
         """
         is_bias_wrong = np.abs(self.mean_signed_test_ratio) > MAX_MEAN_TEST_RATIO_OF_VALID_BIAS
         bias_noise_m2_per_s = np.where(

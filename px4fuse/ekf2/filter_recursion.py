@@ -1,8 +1,7 @@
-"""Main loop of the EKF2 model: predict and fuse in one flight segment.
+"""Main loop of the EKF2 model: prediction and fusion in one part of a flight.
 
-Several filter configurations (parameters, states, aiding sources) are computed at once. The segment
-is divided into intervals. The end of an interval is called an event. At an event, the model fuses a
-position or, in a gap of the position source, only height and heading.
+Several filter configurations are computed at once. Each event fuses a position. In a gap of the
+position source, an event fuses only height and heading.
 
 Symbols: x, P: state and covariance; R: measurement noise; S: innovation variance.
 
@@ -60,9 +59,9 @@ from px4fuse.ekf2.replay_segments import (
 from px4fuse.ekf2.vision import VisionFilter, group_vision_by_event, set_states
 from px4fuse.flight.ekf2_parameters import EV_POS, FLOW, GNSS_POS, GNSS_VEL, MAG
 
-# Minimum state variance, to avoid a division by zero
+# Minimum state variance; prevents a division by zero
 MIN_STATE_VARIANCE = 1e-30
-# Number of events whose transition matrices are copied at once, to limit the memory
+# Number of events whose transition matrices are copied at once; limits the memory
 EVENT_BATCH_SIZE = 64
 # Measurement variance (m² or rad²) so large that the measurement has no effect
 VARIANCE_WITHOUT_EFFECT = 1e9
@@ -78,46 +77,45 @@ PARAMETER_PREFIXES_WITHOUT_HEIGHT_EFFECT = (
     "EKF2_GPS_P_GATE",
     "EKF2_GPS_DELAY",
 )
-# Initial σ (m/s²) of the accelerometer bias: small, because EKF2 estimated the bias on the ground
+# Initial σ (m/s²) of the accelerometer bias, which EKF2 has estimated on the ground
 INITIAL_BIAS_SIGMA_M_S2 = 0.01
-# Factors on the GNSS velocity variance, NED: EKF2 multiplies the vertical σ by 1.5
+# Factors on the GNSS velocity variance (NED): EKF2 multiplies the vertical σ by 1.5
 # (gps_control.cpp)
 GNSS_VELOCITY_VARIANCE_FACTORS = np.array([1.0, 1.0, 2.25])
 GRAVITY_MAGNITUDE_M_S2 = float(GRAVITY_M_S2[2])
 # Maximum σ (m/s²) of EKF2's accelerometer bias: 0.1 g (covariance.cpp)
 MAX_BIAS_SIGMA_M_S2 = 0.1 * GRAVITY_MAGNITUDE_M_S2
-# Minimum ratio: accelerometer bias variance of an axis / largest variance of the three axes
+# Minimum ratio of an accelerometer bias variance to the largest of the three axes
 # (covariance.cpp)
 MIN_RATIO_TO_LARGEST_BIAS_VARIANCE = 0.01
 # State indices of heading error and position
 HEADING, POSITION_NORTH, POSITION_EAST, POSITION_DOWN = 2, 6, 7, 8
-# State indices of the accelerometer bias, rotated to NED
+# State indices of the accelerometer bias
 ACCELEROMETER_BIAS_NORTH, ACCELEROMETER_BIAS_EAST, ACCELEROMETER_BIAS_DOWN = 12, 13, 14
-# States whose measurements are fused in one joint update, in the order of the measurements
+# States that are measured in one joint update, in the order of the measurements
 STATES_FUSED_IN_ONE_UPDATE = np.array([HEADING, POSITION_DOWN, POSITION_NORTH, POSITION_EAST])
-# State indices of heading error and height (a slice, which does not copy the states)
+# State indices of heading error and height, as a slice to avoid copies
 HEADING_AND_DOWN = slice(HEADING, POSITION_DOWN + 1, POSITION_DOWN - HEADING)
 HORIZONTAL_POSITION = slice(POSITION_NORTH, POSITION_EAST + 1)
 # State indices of velocity and position
 VELOCITY_AND_POSITION = slice(3, 9)
-# Columns of velocity, vertical velocity and horizontal position in measurements of velocity and
-# position (six columns, NED)
+# Columns in measurements of velocity and position (six columns, NED)
 VELOCITY_COLUMNS, DOWN_COLUMN = slice(0, 3), 2
 HORIZONTAL_POSITION_COLUMNS = slice(3, 5)
 
 
 @dataclass(frozen=True)
 class FilterConfiguration:
-    """Configuration of the EKF2 model: parameters, estimated states and fused aiding sources.
+    """Configuration of the EKF2 model: parameters, estimated states and fused sources.
 
     Attributes
     ----------
     settings : dict
-        Values of all EKF2 parameters in the model, by PX4 name.
+        Values of all EKF2 parameters, by PX4 name.
     estimates_biases : bool
         True if the accelerometer bias is a state.
     estimates_attitude : bool
-        True if attitude and gyro bias are states; False to use the published attitude.
+        True if attitude and gyro bias are states.
     fuses_velocity : bool
         False to ignore the velocity of the position source.
     uses_reported_noise : bool
@@ -125,11 +123,11 @@ class FilterConfiguration:
     has_gate : bool
         False to fuse every sample.
     uses_logged_decisions : bool
-        True to use EKF2's logged rejections and resets instead of the gate.
+        True to use EKF2's logged rejections and resets.
     disable_time_s_by_aid : mapping from PX4's name of an aiding source to float
         Time (s) from which the source is not fused.
     timestamp_offset_s : float or None
-        Time (s) that is added to the timestamps of positions. EKF2's delay parameter is ignored.
+        Time that is added to position timestamps, instead of EKF2's delay parameter.
     """
 
     settings: dict[str, float]
@@ -143,9 +141,9 @@ class FilterConfiguration:
     timestamp_offset_s: float | None = None
 
     def can_use_logged_bad_acceleration_flag(self, inputs: ReplayInputs) -> bool:
-        """Return True if the configuration can use EKF2's logged bad-acceleration flag.
+        """Return True if EKF2's logged bad-acceleration flag is valid for this configuration.
 
-        The flag depends on the height innovations, and therefore on the height parameters.
+        The flag depends on the height parameters.
         """
         has_logged_height_parameters = not self.disable_time_s_by_aid and all(
             value == inputs.settings[name]
@@ -165,8 +163,7 @@ class FilterConfiguration:
             return FusionDelays(
                 delay_s, max(inputs.horizon_s, (buffer_length - 1) * inputs.mean_step_s)
             )
-        # EKF2 raises EKF2_DELAY_MAX to the largest delay parameter (EKF2.cpp), so a larger delay
-        # also delays the fusion horizon
+        # EKF2 raises EKF2_DELAY_MAX to the largest delay parameter (EKF2.cpp)
         longest_delay_ms = max(self.settings["EKF2_DELAY_MAX"], max_delay_ms)
         if longest_delay_ms == inputs.settings["EKF2_DELAY_MAX"]:
             return FusionDelays(delay_s, inputs.horizon_s)
@@ -177,16 +174,16 @@ class FilterConfiguration:
 
 @dataclass(frozen=True)
 class SegmentRun:
-    """Results of several filter configurations in one flight segment.
+    """Results of several filter configurations in one part of a flight.
 
     Attributes
     ----------
     events : tuple of recarray
-        Events of each configuration, see :data:`~px4fuse.ekf2.intervals.EVENT_DTYPE`.
+        Fusions of each configuration, see :data:`~px4fuse.ekf2.intervals.EVENT_DTYPE`.
     innovation, innovation_variance, noise : ndarray, shape (events, filters, 6)
         ν (measurement minus state), S and R of velocity (m/s) and position (m), NED.
     rejected, fused, reset : ndarray of bool, shape (events, filters)
-        True if the position sample of each event was rejected, fused, or used for a reset.
+        True if the position was rejected, fused, or used for a reset.
     position_reset_m : ndarray, shape (events, filters, 2)
         Change of the position by resets, north and east.
     state, variance : ndarray, shape (events + 1, filters, states)
@@ -196,7 +193,7 @@ class SegmentRun:
     magnetometer_updates : ndarray, shape (events, 3, filters, 3)
         Innovation (gauss, body FRD), its variance, and 1 if fused.
     height_filter : HeightFilter or None
-        None if the logged EKF2 height is used.
+        Height fusion; None if EKF2's logged height is used.
     vision_filter : VisionFilter or None
         Vision fusion in addition to GNSS.
     """
@@ -225,9 +222,9 @@ def run_segment(  # noqa: PLR0912, PLR0915 (one recursion, read from top to bott
     configurations: Sequence[FilterConfiguration],
     intervals: Sequence[EventIntervals],
 ) -> SegmentRun:
-    """Return states and innovations of several filter configurations in one flight segment.
+    """Run several filter configurations through one part of a flight.
 
-    ``intervals`` contains one item per configuration: the intervals between its fusions.
+    ``intervals`` contains the intervals between fusions, one item per configuration.
     """
     configuration_count = len(configurations)
     event_count = len(intervals[0].events)
@@ -235,7 +232,7 @@ def run_segment(  # noqa: PLR0912, PLR0915 (one recursion, read from top to bott
         name: np.array([configuration.settings[name] for configuration in configurations])
         for name in configurations[0].settings
     }
-    # A parameter change in flight is applied only to configurations with the logged parameter value
+    # A parameter change in flight does not apply to configurations that change this parameter
     for name, value in segment.changed_parameters.items():
         is_unchanged = parameters[name] == inputs.settings[name]
         parameters[name] = np.where(is_unchanged, value, parameters[name])
@@ -298,8 +295,7 @@ def run_segment(  # noqa: PLR0912, PLR0915 (one recursion, read from top to bott
     gate_squared = (
         np.maximum(np.repeat(np.stack(gates, axis=1), 3, axis=1), MIN_INNOVATION_GATE) ** 2
     )
-    # If the replay contains no height sensor or no magnetometer, it fuses EKF2's logged height or
-    # heading
+    # Logged height and heading, for replays without height sensor or magnetometer
     logged_heading_and_down = np.stack(
         [segment.attitude_error_rad[event_steps, HEADING], segment.down_m[event_steps]], axis=-1
     )
@@ -384,8 +380,7 @@ def run_segment(  # noqa: PLR0912, PLR0915 (one recursion, read from top to bott
         parameters["EKF2_ACC_NOISE"][:, None, None] ** 2, (event_count, 1, 1, 1)
     )
     if (clipped_fraction := segment.clipped_fraction) is not None:
-        # While an accelerometer clips, EKF2 uses BAD_ACCELERATION_NOISE_M_S2. An interval has the
-        # mean noise variance of its prediction steps
+        # While an accelerometer clips, EKF2 uses BAD_ACCELERATION_NOISE_M_S2
         clipped_fraction_sum_by_event = np.diff(
             np.cumsum(clipped_fraction)[event_steps], axis=0, prepend=clipped_fraction[0]
         )
@@ -396,8 +391,7 @@ def run_segment(  # noqa: PLR0912, PLR0915 (one recursion, read from top to bott
         )
     x, P = _make_start_state(segment, estimates_biases, estimates_attitude)
     if bad_acceleration_flag.until_s[0] > segment.time_s[0]:
-        # The log contains no accelerometer bias while the bad-acceleration flag is set. The replay
-        # starts with the segment's mean bias, computed from the change of the published velocity
+        # The log contains no accelerometer bias while the flag is set, so the mean bias is used
         set_states(
             x,
             P,
@@ -466,7 +460,7 @@ def run_segment(  # noqa: PLR0912, PLR0915 (one recursion, read from top to bott
             )
             variance_growth = variance_growth_per_step * step_counts[event_batch]
         phi = transition[index_in_batch]
-        # x = Φx + u, P = ΦPΦ' + Q
+        # Prediction: x = Φx + u, P = ΦPΦ' + Q
         x[:, :STATE_COUNT] = (phi @ x[:, :STATE_COUNT, None])[:, :, 0] + state_change[
             index_in_batch
         ]
@@ -513,7 +507,6 @@ def run_segment(  # noqa: PLR0912, PLR0915 (one recursion, read from top to bott
             is_outside_gate = nu * nu > gate_squared * S
             if is_outside_gate[:, DOWN_COLUMN].any():
                 # With a bad vertical acceleration, EKF2 clips the vertical innovation to the gate
-                # if the horizontal velocity is inside the gate
                 has_clipped_vertical_innovation = has_gate & (
                     bad_acceleration_flag.until_s > event_time_s[event]
                 )
@@ -538,8 +531,7 @@ def run_segment(  # noqa: PLR0912, PLR0915 (one recursion, read from top to bott
             )
             if inputs.aid == GNSS_POS:
                 if not has_magnetometer:
-                    # Without logged magnetometer samples, the correction of the tilt is unknown.
-                    # Only the tilt variance is set to its logged value
+                    # Without a magnetometer, the tilt variance is set to its logged value
                     for tilt_row in range(HEADING):
                         _, P = _compute_update_to_variance(
                             P, tilt_row, attitude_variance[event, :, tilt_row]
@@ -564,7 +556,7 @@ def run_segment(  # noqa: PLR0912, PLR0915 (one recursion, read from top to bott
             x, P = height_filter.fuse_gnss(
                 event, x, P, measured_values[event, :, 5], measurement_variance[event, :, 5]
             )
-        # With a magnetometer, heading is estimated, so only height is set to its logged value
+        # With a magnetometer, only the height is set to its logged value
         elif has_magnetometer:
             K, P = _compute_update_to_variance(
                 P, POSITION_DOWN, heading_and_down_variance[event, :, 1]
@@ -602,8 +594,7 @@ def run_segment(  # noqa: PLR0912, PLR0915 (one recursion, read from top to bott
         if vision_filter is not None:
             vision_filter.bias.bias_m = vision_filter.bias.bias_m + position_reset_m[event]
             x, P = vision_filter.fuse(event, x, P, True, fusion_decisions.last_position_s)
-            # EKF2 resets its position after a time without fusion. This time also restarts at a
-            # fusion of vision
+            # A fusion of vision also restarts EKF2's timeout for a position reset
             if inputs.rules.resets_velocity:
                 fusion_decisions.last_position_s = np.maximum(
                     fusion_decisions.last_position_s, vision_filter.last_fusion_s
@@ -658,10 +649,7 @@ def _update_jointly(x: Array, P: Array, innovation: Array, R: Array) -> ArrayPai
 
 
 def _compute_update_to_variance(P: Array, state_index: int, target_variance: Array) -> ArrayPair:
-    """Return gain and covariance of an update after which a state has ``target_variance``.
-
-    Such updates give the replay a variance that EKF2 logged.
-    """
+    """Return gain and covariance of an update after which a state has ``target_variance``."""
     state_variance = P[:, state_index, state_index]
     R = _compute_noise_for_target_variance(state_variance, target_variance)
     K = P[:, :, state_index] / (state_variance + R)[:, None]
@@ -673,9 +661,8 @@ def _update_sequentially(
 ) -> ArrayPair:
     """Fuse the components of a measurement one after the other, as EKF2 does; return x and P.
 
-    Innovations ν and their variances S are computed before the first update
-    (fuseDirectStateMeasurement, ``ekf_helper.cpp``). Each update subtracts b c c' from P, where c =
-    PH' and b = w (2 - w (HPH' + R)) with w = 1/S. This is the Joseph form with the gain K = w c.
+    All innovations ν and variances S are from before the first update (fuseDirectStateMeasurement,
+    ``ekf_helper.cpp``). P is updated in Joseph form.
     """
     nu, S, R = (array[:, components] for array in (nu, S, R))
     fused_inverse_variance = is_fused / S
@@ -700,12 +687,9 @@ def _update_sequentially(
 
 @dataclass
 class _FusionDecisions:
-    """Decisions on each position sample: rejected, fused, or used to reset the position.
+    """Decisions on each position sample: reject it, fuse it, or reset the position to it.
 
-    After a time without fusion, EKF2 resets the position. After several successive resets, EKF2
-    stops fusion until a sample may start it again (``can_start``). ``logged_rejected_flags`` and
-    ``logged_resets`` are EKF2's logged decisions. ``has_gate`` is False for configurations that
-    fuse every sample.
+    EKF2 resets the position after a time without fusion. After several resets, EKF2 stops fusion.
 
     Source: updateEvPosFusion, startEvPosFusion (``ev_pos_control.cpp``).
     """
@@ -727,8 +711,7 @@ class _FusionDecisions:
         self.last_position_s, self.last_velocity_s = np.full((2, configuration_count), self.start_s)
         self.is_stopped = np.zeros(configuration_count, bool)
         self.remaining_resets = np.full(configuration_count, self.fusion_rules.max_resets)
-        # True for events at which the log contains no start, reset or rejection: then EKF2 fuses
-        # the sample if it is inside the gate
+        # True for samples without a logged start, reset or rejection: only the gate decides
         self.only_gate_decides = (
             (self.sample_actions == FUSE).all(axis=1)
             & ~self.logged_resets
@@ -738,11 +721,9 @@ class _FusionDecisions:
     def decide_fusion(
         self, event: int, is_outside_gate: BoolArray, is_velocity_fused: BoolArray
     ) -> tuple[BoolArray, BoolArray, BoolArray, BoolArray]:
-        """Decide if each filter rejects or fuses a position sample, or resets its position to it.
+        """Decide for each filter if a position sample is rejected, fused, or used for a reset.
 
         Return four masks: position rejected, position fused, position reset, velocity fused.
-        ``is_velocity_fused`` is True if the velocity is inside its gate. A velocity is not fused if
-        the position is reset.
         """
         fusion_rules = self.fusion_rules
         now_s = self.time_s[event]
@@ -766,8 +747,7 @@ class _FusionDecisions:
         )
         time_since_fusion_s = now_s - self.last_position_s
         if self.is_every_reset_logged and not is_decision_logged:
-            # Without a fusion, EKF2 resets its position after reset_timeout_s. If the next event is
-            # later and has no reset in the log, EKF2 must have fused the current sample
+            # Without a logged reset after the timeout, EKF2 has fused the sample before the timeout
             next_event = min(event + 1, len(self.time_s) - 1)
             is_last_event_before_reset_timeout = (
                 self.time_s[next_event] - self.last_position_s > fusion_rules.reset_timeout_s
@@ -822,10 +802,10 @@ def _compute_variance_growth(
     estimates_biases: BoolArray,
     estimates_attitude: BoolArray,
 ) -> ArrayPair:
-    """Return process noise per prediction step, and maximum variance, of bias and field states.
+    """Return process noise per prediction step, and maximum variance, of biases and fields.
 
-    The states are the biases of gyro and accelerometer and, if estimated, the magnetic fields. EKF2
-    adds no process noise to a state whose variance exceeds the maximum.
+    The states are IMU biases and magnetic fields. EKF2 adds no process noise to a state whose
+    variance exceeds the maximum.
     """
     limit_parameter_by_noise_parameter = {"GYR_B": "GYR", "ACC_B": "ACC"}
     if segment.magnetic_field is not None:
@@ -844,10 +824,9 @@ def _compute_variance_growth(
 
 
 def estimate_state_correlation(inputs: ReplayInputs, segment: ReplaySegment) -> ReplaySegment:
-    """Estimate the correlations of the initial state of a segment by a replay of the time before.
+    """Estimate the correlations of the initial state by a replay of the time before.
 
-    The log contains only the variances. Without correlations, the first updates would distribute
-    corrections wrongly between tilt and accelerometer bias.
+    The log contains only the variances.
     """
     initial_state_correlation = _compute_steady_state_correlation(segment)
     if preceding_segment := segment.preceding_segment:
@@ -864,7 +843,7 @@ def estimate_state_correlation(inputs: ReplayInputs, segment: ReplaySegment) -> 
             run_segment(inputs, preceding_segment, [configuration], [intervals]).covariance[0]
         )
     if segment.magnetic_field is not None:
-        # EKF2 has just reset heading and magnetic fields, so they are uncorrelated with all states
+        # EKF2 has just reset heading and magnetic fields, so they are uncorrelated
         initial_state_correlation = block_diag(
             initial_state_correlation[:STATE_COUNT, :STATE_COUNT],
             np.eye(len(segment.state) - STATE_COUNT),
@@ -876,7 +855,7 @@ def estimate_state_correlation(inputs: ReplayInputs, segment: ReplaySegment) -> 
 
 
 def _compute_correlation(P: Array) -> Array:
-    # The lower limit prevents a division by zero: a bias that is not estimated has variance 0
+    # The lower limit prevents a division by zero if a bias is not estimated
     sigma = np.sqrt(np.maximum(np.diagonal(P), MIN_STATE_VARIANCE))
     return np.asarray(P / sigma[:, None] / sigma)
 
@@ -884,8 +863,7 @@ def _compute_correlation(P: Array) -> Array:
 def _compute_steady_state_correlation(segment: ReplaySegment) -> Array:
     """Return the correlation matrix of the states after a long fusion of velocity.
 
-    Tilt error θ and accelerometer bias b are correlated, because their acceleration errors cancel
-    each other: θ × f = R b. f is the specific force, R the rotation from body to NED.
+    The errors of tilt and accelerometer bias are correlated: their acceleration errors cancel.
     """
     state_rotation_to_ned = np.eye(STATE_COUNT)
     state_rotation_to_ned[ACCELEROMETER_BIAS, ACCELEROMETER_BIAS] = segment.body_to_ned[0]
@@ -908,7 +886,7 @@ def _compute_steady_state_correlation(segment: ReplaySegment) -> Array:
 
 
 def _get_state_variances(P: Array) -> Array:
-    """Return the state variances of all filter configurations, as a view of P."""
+    """Return the state variances (a view of P)."""
     return P.reshape(len(P), -1)[:, :: P.shape[1] + 1]
 
 
@@ -931,10 +909,9 @@ def _make_start_state(
 
 
 def _compute_noise_for_target_variance(variance: Array, target_variance: Array) -> Array:
-    """Return the R with which an update changes ``variance`` to ``target_variance``.
+    """Return the R of an update that changes ``variance`` to ``target_variance``.
 
-    1/R = 1/target_variance - 1/variance. The replay uses this R to fuse EKF2's logged height and
-    heading, so that the state variances after the update are the logged variances.
+    1/R = 1/target_variance - 1/variance.
     """
     excess_variance = variance - target_variance
     required_noise_variance = np.full(excess_variance.shape, VARIANCE_WITHOUT_EFFECT)
@@ -993,7 +970,7 @@ def _collect_measurements(
         received_positions.velocity_m_s is not None
         and received_positions.velocity_variance_m2_s2 is not None
     ):
-        # A rotating vehicle moves the antenna relative to the IMU: velocity = dR/dt · lever arm
+        # Velocity of the antenna relative to the rotating IMU: dR/dt · lever arm
         rotation_matrix_derivative_per_s = (
             np.diff(segment.body_to_ned, axis=0)[event_steps - 1]
             / segment.step_s[event_steps - 1, None, None]

@@ -1,9 +1,7 @@
 """Fusion of optical flow in the EKF2 replay, as horizontal velocity in the body frame.
 
-The logged velocity is low-pass filtered. The replay computes the unfiltered mean velocity between
-two logged samples, propagates it to the next event with the IMU
-(:mod:`px4fuse.ekf2.filter_recursion`), and fuses it.
-The range to the ground is EKF2's logged range.
+The logged velocity is low-pass filtered. The replay computes and fuses the mean velocity between
+two logged samples.
 
 Sources: PX4-Autopilot ``EKF/aid_sources/optical_flow`` (``optical_flow_control.cpp``: velocity and
 low-pass filter; ``optical_flow_fusion.cpp``: R and gate).
@@ -24,9 +22,9 @@ from px4fuse.flight.model import FLOW_FILTER_NEW_SAMPLE_WEIGHT
 
 
 def add_flow_samples(segment: ReplaySegment, flow: pd.DataFrame, gate: float) -> ReplaySegment:
-    """Add the logged optical flow (:attr:`FusionRecord.flow`) to a segment of the replay.
+    """Add the logged optical flow to a part of the flight.
 
-    ``gate`` is the innovation gate as a multiple of √S.
+    ``gate`` is the innovation gate (√S).
     """
     begin_s = flow.index - (flow["samples"] - 1.0) * flow["interval_s"]
     flow = flow[(begin_s > segment.time_s[0]) & (flow.index <= segment.time_s[-1])]

@@ -1,4 +1,4 @@
-"""Checks by which EKF2 decides to fuse positions of external vision or GNSS.
+"""Conditions for the fusion of vision or GNSS positions in EKF2.
 
 Source: PX4-Autopilot ``src/modules/ekf2``, v1.13.3 to main: ``RingBuffer.h``, ``ev_control.cpp``,
 ``ev_pos_control.cpp``, ``gnss_checks.cpp`` (``control.cpp``, ``gps_checks.cpp`` before v1.15).
@@ -16,16 +16,16 @@ from px4fuse.ekf2.intervals import MAX_DELAY_BEHIND_HORIZON_S
 from px4fuse.flight.ekf2_parameters import AID_MASK_PARAMETER, Aid
 from px4fuse.flight.model import Columns, Ekf2, PositionTrack, sample_step_function
 
-# EKF2 starts vision fusion if two samples arrive within this time (s): EV_MAX_INTERVAL of PX4 v1.14
-# and later (ev_control.cpp)
+# EKF2 starts vision fusion if two samples arrive within this time (s): EV_MAX_INTERVAL
+# (ev_control.cpp, PX4 v1.14 and later)
 EV_START_INTERVAL_S = 0.2
 # EKF2 stops vision fusion after this time (s) without a sample: 2 EV_MAX_INTERVAL
 # (ev_pos_control.cpp)
 EV_STOP_INTERVAL_S = 0.4
-# EKF2 stops GNSS fusion, and before v1.14 vision fusion, after this time (s) without a sample:
-# reset_timeout_max
+# EKF2 stops GNSS fusion after this time (s) without a sample: reset_timeout_max. Before PX4 v1.14,
+# this time also applies to vision
 FUSION_STOP_TIMEOUT_S = 7.0
-# Maximum delay (s) of EKF2's fusion horizon, if the log does not contain EKF2_DELAY_MAX
+# Maximum delay (s) of EKF2's fusion horizon, if EKF2_DELAY_MAX is not logged
 MAX_HORIZON_DELAY_S = 1.0
 # Maximum number of position samples in EKF2's buffer
 MAX_BUFFERED_POSITIONS = 20
@@ -33,7 +33,7 @@ MAX_BUFFERED_POSITIONS = 20
 INTERVAL_TOLERANCE_S = 5e-7
 # EKF2 stops fusion after it has rejected all samples for this time (s): no_aid_timeout_max
 MAX_REJECTION_DURATION_S = 1.0
-# A coordinate with a smaller range (m) in the log counts as not measured
+# A coordinate that varies less than this distance (m) counts as not measured
 MIN_RANGE_OF_MEASURED_COORDINATE_M = 1e-3
 # A GNSS check explains missing GNSS fusion if it fails for at least this fraction of the time
 MIN_GNSS_CHECK_FAILURE_FRACTION = 0.1
@@ -44,7 +44,7 @@ CLOCK_SYNCHRONISATION_ACTION = (
     "Synchronise the clocks: UXRCE_DDS_SYNCT 1 with the uXRCE-DDS agent, or answer TIMESYNC of "
     "MAVLink. Send microseconds."
 )
-# Effect of timestamps on EKF2, by clock that is not synchronised with the autopilot's clock
+# Effect on EKF2 of timestamps that are not synchronised with the autopilot's clock
 EFFECT_BY_UNSYNCHRONISED_CLOCK = {
     **dict.fromkeys(
         ("another clock", "an unknown clock", "UNIX time in seconds"),
@@ -55,14 +55,13 @@ EFFECT_BY_UNSYNCHRONISED_CLOCK = {
         for unit in ("nano", "micro", "milli")
     },
 }
-# Effect on EKF2 of timestamps in a wrong unit or of another clock. 0: all timestamps are 0
+# Effect on EKF2 of unusable timestamps, by their clock or unit
 EFFECT_BY_UNUSABLE_TIMESTAMP = {
     **dict.fromkeys(("0", "milliseconds", "seconds"), "For EKF2, the positions are too old."),
     **EFFECT_BY_UNSYNCHRONISED_CLOCK,
     "nanoseconds": "For EKF2, the positions are in the future.",
 }
-# GNSS checks in the order of their bits in gps_check_fail_flags: name, parameter with the limit,
-# unit of the limit
+# GNSS checks in the bit order of gps_check_fail_flags: name, parameter of the limit, unit
 GNSS_CHECKS = (
     ("3D fix", "", ""),
     ("number of satellites", "EKF2_REQ_NSATS", ""),
@@ -80,7 +79,7 @@ GNSS_CHECKS = (
 
 
 class UnmetCondition(NamedTuple):
-    """Condition for fusion in EKF2 that is not met: name, fault, explanation, and action."""
+    """Unmet condition for fusion in EKF2: name, fault, explanation and action."""
 
     condition: str
     fault: str
@@ -112,15 +111,12 @@ class UnfusedPositions:
 
     @property
     def has_enabling_parameter(self) -> bool:
-        """True if a parameter of this source alone enables its fusion (PX4 v1.14 and later)."""
+        """True if the source has its own parameter for fusion (PX4 v1.14 and later)."""
         return self.aid.switch in self.parameters
 
     @property
     def max_sample_age_s(self) -> float:
-        """Maximum age (s) of buffered samples: the delay of the fusion horizon.
-
-        If this delay is not logged: EKF2_DELAY_MAX, or MAX_HORIZON_DELAY_S.
-        """
+        """Maximum age (s) of a sample that EKF2 fuses: the delay of the fusion horizon."""
         horizon_delay_s = self.ekf2.horizon_s
         if isinstance(horizon_delay_s, float):
             return horizon_delay_s
@@ -131,11 +127,11 @@ class UnfusedPositions:
         return 1.0 / self.source.compute_rate_hz()
 
     def select_samples(self, samples: pd.DataFrame, lead_time_s: float = 0.0) -> pd.DataFrame:
-        """Return the samples in ``unfused_span_s``, and in the ``lead_time_s`` before this span."""
+        """Return the samples from ``lead_time_s`` (s) before the unfused time span to its end."""
         return samples.loc[self.unfused_span_s[0] - lead_time_s : self.unfused_span_s[1]]
 
     def compute_status_bit_fraction(self, field_name: str, bit: int = 0) -> float:
-        """Return the fraction of ``unfused_span_s`` with a set status bit; NaN if not logged."""
+        """Return the fraction of the unfused time with a set status bit; NaN if not logged."""
         state_changes = self.ekf2.states.get(field_name)
         if state_changes is None:
             return float("nan")
@@ -144,7 +140,7 @@ class UnfusedPositions:
 
 
 def find_unmet_condition(positions: UnfusedPositions) -> UnmetCondition:
-    """Return the first condition for fusion that is not met, or NO_UNMET_CONDITION_LOGGED."""
+    """Return the first unmet condition for fusion, or NO_UNMET_CONDITION_LOGGED."""
     checks = VISION_FUSION_CHECKS if positions.is_vision else GNSS_FUSION_CHECKS
     return next(
         (unmet for check in checks for unmet in check(positions)), NO_UNMET_CONDITION_LOGGED
@@ -174,7 +170,7 @@ def _check_enabling_parameter(positions: UnfusedPositions) -> Iterator[UnmetCond
 
 
 def constant_coordinates(source: PositionTrack) -> list[str]:
-    """Return the coordinates (x, y, z) that a position source does not measure: constant values."""
+    """Return the coordinates (x, y, z) with constant values, which the source does not measure."""
     ranges_m = np.ptp(source.samples[Columns.POSITION].to_numpy(), axis=0)
     is_constant = ranges_m < MIN_RANGE_OF_MEASURED_COORDINATE_M
     return [name for name, constant in zip("xyz", is_constant, strict=True) if constant]
@@ -205,7 +201,6 @@ def _check_position_gap(positions: UnfusedPositions) -> Iterator[UnmetCondition]
     stop_timeout_s = EV_STOP_INTERVAL_S if uses_vision_stop_timeout else FUSION_STOP_TIMEOUT_S
     times_s = positions.source.samples.index.to_numpy()
     start_s, end_s = positions.unfused_span_s
-    # EKF2 stops fusion if no position arrives for stop_timeout_s
     last_position_time_s = max(times_s[times_s < start_s], default=start_s)
     duration_s = np.min(times_s[times_s >= start_s], initial=end_s) - last_position_time_s
     if duration_s > stop_timeout_s + positions.interval_s:
@@ -235,8 +230,7 @@ def _check_timestamps(positions: UnfusedPositions) -> Iterator[UnmetCondition]:
         )
     if "age_s" not in status:
         return
-    # The log contains arrival time minus timestamp. EKF2 subtracts the delay parameter from the
-    # timestamp, so for EKF2 the age is larger by this delay
+    # EKF2 subtracts the delay parameter from the timestamp, so the delay increases the age
     delay_s = positions.parameters.get(positions.aid.delay, 0.0) * 1e-3
     age_s = float(positions.select_samples(status)["age_s"].median()) + delay_s
     if -age_s > MAX_BUFFERED_POSITIONS * positions.interval_s:
@@ -269,8 +263,7 @@ def _check_quality(positions: UnfusedPositions) -> Iterator[UnmetCondition]:
     if min_quality <= 0.0 or "quality" not in status:
         return
     quality = positions.select_samples(status)["quality"]
-    # EKF2 checks the quality of the fused sample, of the sample before it, and of the newest sample
-    # in the buffer
+    # EKF2 also checks the quality of the previous sample and of the newest sample
     sample_count = int(np.ceil(positions.max_sample_age_s / positions.interval_s)) + 2
     has_min_quality = (quality >= min_quality).astype(float)
     if has_min_quality.rolling(min(sample_count, max(len(quality), 1))).min().max() == 1.0:
@@ -295,8 +288,7 @@ def _check_quality(positions: UnfusedPositions) -> Iterator[UnmetCondition]:
 
 def _check_interval(positions: UnfusedPositions) -> Iterator[UnmetCondition]:
     intervals_s = np.diff(positions.select_samples(positions.source.samples).index)
-    # The interval of the source is unknown if positions are reconstructed from EKF2 topics, which
-    # have the rate of the logger
+    # Reconstructed positions have the rate of the logger, not the rate of the source
     is_interval_known = (
         positions.has_enabling_parameter
         and not positions.source.origin.reconstructed
@@ -347,7 +339,7 @@ def _check_gnss(positions: UnfusedPositions) -> Iterator[UnmetCondition]:
             "GNSS.",
         )
     parameters, source = positions.parameters, positions.source
-    # Bit n of EKF2_GPS_CHECK enables check n + 1 of GNSS_CHECKS; check 0, the fix, is always on
+    # Bit n of EKF2_GPS_CHECK enables check n + 1 of GNSS_CHECKS; check 0 (fix) is always enabled
     checked_mask = int(parameters.get("EKF2_GPS_CHECK", -1)) << 1 | 1
     failed_fraction_by_bit = {
         bit: positions.compute_status_bit_fraction("failed_checks", bit)
@@ -370,8 +362,7 @@ def _check_gnss(positions: UnfusedPositions) -> Iterator[UnmetCondition]:
         name, parameter, unit = GNSS_CHECKS[bit]
         check_details = [f"failed {100.0 * failed_fraction_by_bit[bit]:.0f} % of the time"]
         if np.isfinite(limit := parameters.get(parameter, np.nan)):
-            # The samples contain only positions with a fix. Their median σ may be within the limit
-            # although the check fails
+            # Only positions with a fix are logged, so their median σ may be within the limit
             if bit in reported_variance_by_check_bit:
                 median_sigma = float(np.sqrt(reported_variance_by_check_bit[bit].median()))
                 if median_sigma > limit:
@@ -417,8 +408,7 @@ VISION_FUSION_CHECKS = (
     _check_alignment,
     _check_gate,
 )
-# Checks for GNSS. _check_gnss is before _check_position_gap, because positions without a fix are
-# not logged and look like a gap
+# Checks for GNSS. _check_gnss is first: positions without a fix are not logged and look like a gap
 GNSS_FUSION_CHECKS = (
     _check_enabling_parameter,
     _check_gnss,

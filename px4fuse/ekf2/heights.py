@@ -1,8 +1,6 @@
 """Fusion of GNSS and barometer heights in the EKF2 replay.
 
-Barometer samples between two events (:mod:`px4fuse.ekf2.filter_recursion`) are fused at the later
-event. The vertical motion in between is computed from the state and the IMU. EKF2 estimates a bias
-of the height sensor that is not the height reference.
+EKF2 estimates a bias of the height sensor that is not the height reference.
 
 Sources: PX4-Autopilot ``EKF/aid_sources`` (``barometer/baro_height_control.cpp``,
 ``gnss/gnss_height_control.cpp``), before v1.16 ``EKF/baro_height_control.cpp`` and
@@ -45,9 +43,9 @@ HEIGHT_AIDS = (*HEIGHT_SENSORS, AIDS["rng_hgt"], AIDS["ev_hgt"])
 DEFAULT_GROUND_EFFECT_DEAD_ZONE_M = 4.0
 # PX4's name of the height reference, by value of EKF2_HGT_REF
 HEIGHT_AID_BY_REFERENCE = {0: BAROMETER.name, 1: GNSS_HGT.name}
-# Maximum time (s) from the start of the replay to the first logged height bias (logged at 2 Hz)
+# Maximum time (s) from the start of the replay to the first logged height bias
 MAX_BIAS_LOG_DELAY_S = 1.0
-# Minimum rate (Hz) of the logged barometer for a replay of its fusion
+# Minimum logging rate (Hz) of the barometer for a replay of its fusion
 MIN_BAROMETER_LOG_HZ = 4.0
 # Minimum innovation gate (√S) that EKF2 uses
 MIN_INNOVATION_GATE = 1.0
@@ -60,7 +58,7 @@ GNSS_HEIGHT_NOISE_FACTOR = 1.5
 def add_heights(
     flight: Flight, ekf2: Ekf2, fusion_record: FusionRecord, segments: Sequence[ReplaySegment]
 ) -> tuple[ReplaySegment, ...] | str:
-    """Add height measurements to the replay segments; if they are not logged, return the reason."""
+    """Add height measurements to the replay, or return the reason why this is impossible."""
     parameters = fusion_record.parameters
     replayed_times_s = np.concatenate([segment.time_s for segment in segments])
     if uses_aid_mask(parameters):
@@ -133,10 +131,7 @@ def add_heights(
 def select_samples_in_segment(
     segment: ReplaySegment, measurement_times_s: Array, *quantities: Array
 ) -> tuple[Any, ...]:
-    """Select the samples in a segment. Return their steps, measurement times and ``quantities``.
-
-    The step of a sample is the index of the prediction step that fuses the sample.
-    """
+    """Return prediction steps, measurement times and ``quantities`` of the samples in a segment."""
     step_indices, is_inside = find_sample_steps(segment, measurement_times_s)
     return step_indices, *(values[is_inside] for values in (measurement_times_s, *quantities))
 
@@ -144,18 +139,13 @@ def select_samples_in_segment(
 def group_barometer_by_event(
     segment: ReplaySegment, event_steps_by_interval_set: Sequence[IntArray]
 ) -> list[Array]:
-    """Group the barometer samples by event: each event fuses the samples since the previous one.
-
-    Parameters
-    ----------
-    event_steps_by_interval_set : sequence of ndarray of int
-        Prediction step of each event; one array for each set of filter events.
+    """Group the barometer samples by event: each event fuses the samples since the previous event.
 
     Returns
     -------
     list of ndarray, shape (6, k, events)
         Up to k samples per event. Rows: height (m, down), age (s), time (s), dead zone (m), weight,
-        and 1 for a sample, 0 for padding.
+        and 1 for a sample (0 for padding).
     """
     height_samples = segment.height_samples
     assert height_samples is not None
@@ -177,23 +167,18 @@ def group_barometer_by_event(
 
 
 class HeightFilter:
-    """Fuse heights as EKF2 does, in one segment and for several filter configurations at once.
-
-    An event is the end of an interval of the replay. At each event, the filter fuses up to k
-    barometer samples since the previous event, and then the GNSS height.
+    """Fusion of heights as in EKF2, for several filter configurations at once.
 
     Parameters
     ----------
-    segment : ReplaySegment
     barometer_samples_by_event : ndarray, shape (6, k, events, filters) or (6, k, events, 1)
         Result of :func:`group_barometer_by_event`.
     gnss_fix_times_s, has_gnss_fix : ndarray, shape (events, filters) or (events, 1)
-        Time of the GNSS fix of each event, and mask of the events with a fix.
+        Time of the GNSS fix of each event, and True for events with a fix.
     is_enabled_by_aid : mapping from PX4's name of a source to ndarray of bool, (events, filters)
     parameters : mapping from parameter name to ndarray, shape (filters,)
     has_gate : ndarray of bool, shape (filters,)
         False to fuse every sample.
-    bad_acceleration_flag : BadAccelerationFlag
 
     Attributes
     ----------
@@ -269,8 +254,7 @@ class HeightFilter:
         self.update_records = np.full(
             (event_count, max_samples_per_event + 1, 4, configuration_count), np.nan
         )
-        # Times of all samples of the sensor whose bias is estimated, in the order of fusion. A
-        # missing sample has the time start_s, which is never later than the latest sample
+        # A missing sample has the time start_s, so it does not change the latest sample time
         sample_times_s = np.where(self.has_sample, self.time_s, start_s)[
             samples_with_bias
         ].swapaxes(0, 1)
@@ -286,7 +270,7 @@ class HeightFilter:
     def make_update_table(
         self, sensor: str, configuration_index: int, end_s: Array
     ) -> pd.DataFrame:
-        """Return the updates of one configuration with one height sensor, one row per sample.
+        """Return a table of one configuration's updates with a height sensor.
 
         ``end_s`` contains the time (s) of each event.
         """
@@ -341,13 +325,11 @@ class HeightFilter:
         age_s: Array,
         R: Array,
     ) -> ArrayPair:
-        """Fuse a height (m, down), measured ``age_s`` (s) before the event."""
+        """Fuse a height (m, down) that was measured ``age_s`` (s) before the event."""
         if not self.any_sample[sample_index][event]:
             return x, P
         height_sensor_index = int(sample_index == len(self.down_m))
-        # The sample measured the height at an earlier time: height - age_s · vertical velocity. So
-        # H is 1 for the height and -age_s for the vertical velocity. The covariances are PH' and
-        # HPH'
+        # The sample measured an earlier height: height - age_s · vertical velocity
         covariance_with_measured_height = (
             P[:, :, POSITION_DOWN] - age_s[:, None] * P[:, :, VELOCITY_DOWN]
         )

@@ -64,30 +64,28 @@ VISION_REPETITION_INTERVALS_S = {
     "estimator_visual_odometry_aligned": 0.2,
     "estimator_aid_src_ev_pos": 0.5,
 }
-# Bit of EKF2_AID_MASK that rotates vision positions, up to PX4 v1.13
+# Bit of EKF2_AID_MASK that rotates vision positions (PX4 v1.13 and earlier)
 ROTATE_VISION_BIT = 64
-# Maximum time difference (s) between a logged innovation and its sample: estimator_aid_src topics
-# contain EKF2's measurement time within about 1 ms
+# Maximum time difference (s) between a logged innovation and its sample
 SAMPLE_MATCH_TOLERANCE_S = 0.006
 # Tolerance (s) for rounding errors between sample times and prediction times
 PREDICTION_STEP_TOLERANCE_S = 1e-4
 # EKF2 reports inertial dead reckoning after this time (s) without horizontal aiding
 # (no_aid_timeout_max, common.h)
 DEAD_RECKONING_TIMEOUT_S = 1.0
-# Bit of EKF2_GPS_CTRL that enables GNSS velocity; before PX4 v1.14 EKF2 always fuses it
+# Bit of EKF2_GPS_CTRL that enables fusion of GNSS velocity
 GNSS_VELOCITY_BIT = 4
 # Maximum time (s) from a reset to its publication: vehicle_local_position is logged every 0.1 s
 MAX_RESET_PUBLICATION_DELAY_S = 0.2
 # Maximum median IMU interval (s) for an EKF2 replay: EKF2 predicts every 8 to 13 ms
 MAX_IMU_INTERVAL_S = 0.012
-# Maximum fraction of missing IMU samples outside gaps for an EKF2 replay
+# Maximum fraction of missing IMU samples for an EKF2 replay; gaps do not count
 MAX_MISSING_IMU_FRACTION = 0.1
 # First PX4 release with the time of the fusion horizon in estimator_states
 FIRST_RELEASE_WITH_HORIZON_TIMES = "PX4 v1.13"
-# Number of successive position resets that stands for "no limit" in PX4 releases without a limit
+# Stands for an unlimited number of successive position resets
 NO_RESET_LIMIT = 1_000_000
-# In a gap of the position source, the replay fuses height and heading at least once in this time
-# (s)
+# Maximum interval (s) between fusions of height and heading in a gap of the position source
 MAX_FUSION_INTERVAL_IN_GAP_S = 0.25
 
 
@@ -102,15 +100,15 @@ class ReceivedPositions:
     position_m, variance_m2 : ndarray, shape (m, 3)
         Position in NED, and variance reported by the sender; 0 if not reported.
     velocity_m_s, velocity_variance_m2_s2 : ndarray, shape (m, 3), or None
-        Velocity in NED, if EKF2 fuses it with each position.
+        Velocity in NED, and variance reported by the sender.
     rejected_flags : ndarray, shape (m,)
-        1 if EKF2's gate rejected the sample; NaN if not logged.
+        1 if EKF2 rejected the sample; NaN if not logged.
     is_reset_to_sample : ndarray of bool, shape (m,)
-        True if EKF2 reset its position to the sample, computed from the log.
+        True if EKF2 reset its position to the sample.
     uses_sender_timestamps : bool
-        True if EKF2 uses measurement times of the sender and ignores its delay parameter.
+        True if EKF2 ignores its delay parameter and uses the sender's measurement times.
     reset_times_s : ndarray
-        Timestamps of samples with which the sender requests a reset (new ``reset_counter``).
+        Timestamps at which the sender requests a reset (``reset_counter``).
     is_every_reset_logged : bool
         True if the log contains all resets of EKF2's position to a sample.
     """
@@ -131,7 +129,7 @@ class ReceivedPositions:
 
 @dataclass(frozen=True)
 class FusionRules:
-    """Rules of one PX4 release for start, stop and reset of horizontal position fusion.
+    """Rules of one PX4 release for start, stop and reset of position fusion.
 
     Attributes
     ----------
@@ -142,18 +140,17 @@ class FusionRules:
     reset_timeout_s : float
         EKF2 resets its position if it rejects all samples for this time.
     max_resets : int
-        EKF2 stops fusing the position source after this number of successive resets.
+        EKF2 stops fusion after this number of successive resets.
     min_accelerometer_bias_variance_m2_s4 : float or None
         Minimum accelerometer bias variance (m²/s⁴).
     is_horizon_largest_delay : bool
-        True if the largest delay parameter sets the delay of the fusion horizon. Since v1.15,
-        EKF2_DELAY_MAX sets this delay.
+        True if the largest delay parameter sets the delay of the fusion horizon (before v1.15).
     reset_variance_factor : float
-        Ratio of the position variance after a reset to the measurement variance.
+        Position variance after a reset, divided by the measurement variance.
     resets_velocity : bool
         True if EKF2 resets its velocity together with its position.
     bad_acceleration_flag_duration_s : float
-        Time for which the flag for a bad vertical acceleration stays set.
+        Time for which the flag for a bad acceleration stays set.
     """
 
     start_interval_s: float
@@ -167,13 +164,12 @@ class FusionRules:
     bad_acceleration_flag_duration_s: float = 3.0
 
 
-# Rules of EKF2 v1.14 and later for external vision: EV_MAX_INTERVAL (ev_control.cpp),
+# Rules for external vision in PX4 v1.14 and later: EV_MAX_INTERVAL (ev_control.cpp),
 # no_aid_timeout_max and reset_timeout_max (common.h)
 VISION_RULES = FusionRules(
     start_interval_s=0.2, stop_timeout_s=0.4, reset_timeout_s=1.0, max_resets=5
 )
-# Rules of EKF2 v1.16 for GNSS. After a position reset, the position variance is twice the variance
-# of the sample (resetHorizontalPositionTo, gps_control.cpp)
+# Rules for GNSS in PX4 v1.16 (resetHorizontalPositionTo, gps_control.cpp)
 GNSS_RULES = FusionRules(
     start_interval_s=np.inf,
     stop_timeout_s=np.inf,
@@ -191,23 +187,23 @@ class ReplayInputs:
     Attributes
     ----------
     settings : dict
-        Logged EKF2 parameters that the model uses, by PX4 name.
+        Logged EKF2 parameters, by PX4 name.
     received_positions : ReceivedPositions
         Samples of the horizontal position source ``aid``.
     mean_step_s, configured_step_s : float
         Length of a prediction step: mean in the log, and EKF2_PREDICT_US.
     horizon_s : float
-        Time from EKF2's delayed state (fusion horizon) to the present.
+        Delay of EKF2's fusion horizon.
     fuses_vision_height : bool
         True if EKF2 fused the height of external vision.
     imu_offset_m : ndarray, shape (3,)
         Position of the IMU (EKF2_IMU_POS, body FRD).
     max_fusion_interval_in_gap_s : float
-        Maximum interval (s) between fusions of height and heading in a gap of the position source.
+        Maximum interval between fusions of height and heading in a gap of the position source.
     reason_for_logged_height : str
-        Reason why EKF2's logged height is used in a flight with GNSS.
+        Reason why a replay with GNSS uses EKF2's logged height.
     vision_positions : ReceivedPositions or None
-        Positions of external vision, fused in addition to GNSS; NaN while vision is disabled.
+        Vision positions in a flight with GNSS; NaN while vision is disabled.
     """
 
     settings: dict[str, float]
@@ -230,7 +226,7 @@ def prepare_inputs(  # noqa: PLR0911, PLR0912 (one return per reason)
 ) -> ReplayInputs | Unavailable:
     """Return the inputs of the EKF2 replay, or the reason why the log is insufficient.
 
-    ``omitted_aids`` contains aiding sources (PX4's names) that the replay omits, with the reasons.
+    ``omitted_aids`` contains PX4's names of aiding sources to omit, with the reasons.
     """
     imu = flight.imu
     attitude = flight.attitude
@@ -250,7 +246,7 @@ def prepare_inputs(  # noqa: PLR0911, PLR0912 (one return per reason)
     horizon_s = ekf2.horizon_s
     if isinstance(fusion_record, Unavailable):
         return fusion_record
-    # Simulated flights have no earth rotation. The model omits earth rotation without a latitude
+    # Without a latitude, the model omits earth rotation, which simulated flights do not contain
     if SIMULATED_EKF2_NOTE in flight.log.notes:
         fusion_record = replace(fusion_record, latitude_deg=np.nan)
     if isinstance(innovations := ekf2.innovations["north"], Unavailable):
@@ -289,7 +285,7 @@ def prepare_inputs(  # noqa: PLR0911, PLR0912 (one return per reason)
     )
     if isinstance(vision_positions, Unavailable):
         return vision_positions
-    # Since PX4 v1.17, each GNSS receiver has a separate lever arm, which its messages contain
+    # Since PX4 v1.17, GNSS messages contain the lever arm of the receiver
     gnss_track = _find_gnss_track(flight) if is_gnss else None
     lever_arm = (
         {} if gnss_track is None else dict(zip(aid.lever_arm, gnss_track.lever_arm_m, strict=True))
@@ -297,7 +293,7 @@ def prepare_inputs(  # noqa: PLR0911, PLR0912 (one return per reason)
     if isinstance(horizon_s, Unavailable):
         if not flight.log.firmware.startswith(FIRST_RELEASE_WITH_HORIZON_TIMES):
             return Unavailable(ANALYSIS_NAME, horizon_s.reason, horizon_s.remedy)
-        # If EKF2_EV_DELAY is at most one prediction step, EKF2 fuses positions without delay
+        # If EKF2_EV_DELAY is at most one prediction step, EKF2 fuses without delay
         horizon_s = 0.0
     aiding_times_s = received_positions.timestamp_s
     flow_samples = fusion_record.flow if is_gnss else fusion_record.flow.iloc[:0]
@@ -343,8 +339,7 @@ def prepare_inputs(  # noqa: PLR0911, PLR0912 (one return per reason)
         mean_step_s=ekf2.step_s,
         horizon_s=horizon_s,
         configured_step_s=read_prediction_step_s(fusion_record),
-        # While EKF2 flags a bad acceleration, EKF2 clips innovations of vision heights. The model
-        # cannot clip them, so it uses EKF2's logged height
+        # While EKF2 flags a bad acceleration, EKF2 clips vision heights, but the model cannot
         fuses_vision_height=not is_gnss
         and isinstance(ekf2.fusion_flags, pd.DataFrame)
         and bool(ekf2.fusion_flags["vertical"].mean() > 0.5)
@@ -359,7 +354,7 @@ def prepare_inputs(  # noqa: PLR0911, PLR0912 (one return per reason)
 
 
 def compute_lost_imu_fraction(time_s: Array) -> float:
-    """Return the fraction of IMU samples missing from the log, without gaps above MIN_IMU_GAP_S."""
+    """Return the fraction of missing IMU samples, without gaps above MIN_IMU_GAP_S."""
     intervals_s = np.diff(time_s)
     missing_samples_by_interval = (
         np.rint(intervals_s[intervals_s <= MIN_IMU_GAP_S] / np.median(intervals_s)) - 1.0
@@ -388,7 +383,7 @@ def _explain_missing_imu(time_s: Array) -> Unavailable | None:
 def _make_fusion_rules(fusion_record: FusionRecord, step_s: float, *, is_gnss: bool) -> FusionRules:
     fusion_rules, parameters = VISION_RULES, fusion_record.parameters
     if is_gnss:
-        # Only PX4 without EKF2_GPS_MODE (before main of 2026) resets velocity with position
+        # PX4 with EKF2_GPS_MODE (main of 2026) does not reset velocity with position
         fusion_rules = replace(GNSS_RULES, resets_velocity=GNSS_MODE_PARAMETER not in parameters)
         if not fusion_record.stores_latitude():
             # The flag for a bad acceleration stays set for 10 s (BADACC_PROBATION, common.h)
@@ -454,8 +449,7 @@ def read_gnss(
         is_enabled = sample_step_function(enabled_changes, position_samples.index) > 0.0
         position_samples = position_samples[is_enabled]
         velocity_samples = velocity_samples[is_enabled]
-    # The delay is already subtracted from the times of the GNSS samples. It is added again, because
-    # the replay subtracts it from all timestamps
+    # The delay is already subtracted. It is added here, because the replay subtracts it again
     logged_delay_s = fill_with_defaults(parameters, GNSS_POS)[GNSS_POS.delay] * 1e-3
     timestamp_s = position_samples.index.to_numpy() + logged_delay_s
     # Maximum reported position noise (m) that EKF2 uses (gps_control.cpp)
@@ -487,7 +481,7 @@ def read_vision(
 ) -> ReceivedPositions | Unavailable:
     """Return the vision positions that EKF2 received (NED), or the reason why they are incomplete.
 
-    Positions in an FRD frame are rotated to NED with EKF2's published ``attitude``.
+    Positions in FRD are rotated to NED with EKF2's published ``attitude``.
     """
     track = _find_vision_track(flight)
     if isinstance(track, Unavailable):
@@ -523,7 +517,7 @@ def read_vision(
         position_m = rotate(rotation, position_m)
         variance_m2 = rotate(rotation**2, variance_m2)
     vision_age_s = fusion_record.vision_age_s
-    # If arrival times are unknown, no sample is late
+    # With an unknown arrival time, no sample is late
     arrival_s = np.full(len(timestamp_s), -np.inf)
     if len(vision_age_s) and "vehicle_visual_odometry" in track.topics:
         arrival_s = timestamp_s + np.interp(timestamp_s, vision_age_s.index, vision_age_s)
@@ -568,7 +562,7 @@ def _read_vision_in_gnss_flight(
 def _read_logged_decisions(
     ekf2: Ekf2, fusion_record: FusionRecord, timestamp_s: Array, arrival_s: Array, aid: Aid = EV_POS
 ) -> tuple[Array, BoolArray]:
-    """Return EKF2's logged rejection of each position sample, and True for a reset to the sample.
+    """Return EKF2's logged rejection of each position, and True for a reset to this position.
 
     The rejection is 1, 0, or NaN if it is not logged.
     """
@@ -584,14 +578,12 @@ def _read_logged_decisions(
         return rejected_flags, is_reset
     delay_s = fill_with_defaults(fusion_record.parameters, aid)[aid.delay] * 1e-3
     measurement_times_s = timestamp_s - delay_s - 0.5 * ekf2.step_s
-    # EKF2 fuses a sample when the fusion horizon reaches the measurement time of the sample. If the
-    # sample arrives later than that, EKF2 fuses it on arrival
+    # EKF2 fuses a late sample when it arrives
     earliest_fusion_times_s = np.maximum.accumulate(
         np.maximum(measurement_times_s, arrival_s - horizon_s)
     )
     aid_rows = ekf2.aids[aid.name].samples
-    # EKF2 rejected all samples between its last fusion or reset (last_fused_s) and the time of the
-    # row. EKF2 also rejected all samples during dead reckoning
+    # EKF2 rejected all samples after its last fusion (last_fused_s) and during dead reckoning
     last_fusion_times_s = aid_rows.reindex(columns=["last_fused_s"]).dropna()
     spans_after_last_fusion_s = np.column_stack([last_fusion_times_s, last_fusion_times_s.index])
     dead_reckoning_spans_s = (
@@ -610,8 +602,7 @@ def _read_logged_decisions(
     sample_rows = find_matching_samples(innovations.index.to_numpy(), measurement_times_s)
     innovations_of_samples = innovations.iloc[sample_rows[sample_rows >= 0]]
     rejected_flags[sample_rows >= 0] = innovations_of_samples["rejected"]
-    # EKF2 logs innovation 0 for a sample to which it resets its position. Such a sample is not
-    # logged as rejected
+    # EKF2 logs innovation 0 for a sample to which it resets its position
     may_be_reset_sample[sample_rows >= 0] &= (innovations_of_samples["rejected"] > 0.0) | (
         innovations_of_samples["innovation_m"] == 0.0
     )
@@ -619,7 +610,7 @@ def _read_logged_decisions(
     last_sample_rows_in_dead_reckoning = (
         row_ranges_of_rejections[len(spans_after_last_fusion_s) :, 1] - 1
     )
-    # A reset is visible in the next published state, one fusion horizon after the measurement
+    # A reset is published later than its measurement by the delay of the fusion horizon
     publication_times_s = earliest_fusion_times_s + horizon_s
     for reset_s in find_horizontal_reset_times_s(ekf2):
         is_published_near_reset = (publication_times_s <= reset_s) & (
@@ -643,8 +634,7 @@ def _read_logged_decisions(
 def _find_dead_reckoning_spans(ekf2: Ekf2, fusion_record: FusionRecord) -> Array:
     """Return start and end (s) of each time in which EKF2 used only the IMU (dead reckoning).
 
-    The start is the last fusion of vision. EKF2 reports dead reckoning DEAD_RECKONING_TIMEOUT_S
-    later, or immediately if vision is disabled. The end is the next fusion or reset.
+    The start is the last fusion of vision, the end is the next fusion or reset.
     """
     dead_reckoning_flag = fusion_record.states.get(DEAD_RECKONING_FLAG)
     vision_enabled_flag = ekf2.states.get(EV_POS.name)
@@ -663,7 +653,7 @@ def innovation_topic(aid: Aid) -> str:
 
 
 def find_matching_samples(sample_times_s: Array, measurement_times_s: Array) -> IntArray:
-    """Return the index of the sample at each measurement time, or -1 if no sample has this time."""
+    """Return the index of the sample at each measurement time, or -1 without a sample."""
     sample_index = np.searchsorted(sample_times_s, measurement_times_s - SAMPLE_MATCH_TOLERANCE_S)
     sample_index = np.minimum(sample_index, len(sample_times_s) - 1)
     return np.where(
@@ -674,12 +664,12 @@ def find_matching_samples(sample_times_s: Array, measurement_times_s: Array) -> 
 
 
 def find_horizontal_reset_times_s(ekf2: Ekf2) -> Array:
-    """Return the times (s) of horizontal position resets in the published state."""
+    """Return the times (s) of EKF2's horizontal position resets."""
     return np.array([reset.time_s for reset in ekf2.find_horizontal_resets()])
 
 
 def _find_vision_track(flight: Flight) -> PositionTrack | Unavailable:
-    """Return the position track that contains all vision positions EKF2 received."""
+    """Return the vision track with all positions that EKF2 received."""
     missing_reasons = ["the log has no topic vehicle_visual_odometry"]
     for track in sorted(flight.positions, key=lambda track: track.origin == POSITION_FILE_ORIGIN):
         if track.origin.is_vision and track.origin.has_all_samples:

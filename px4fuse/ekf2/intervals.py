@@ -1,12 +1,10 @@
 """State transition and process noise between the fusions of the EKF2 replay.
 
-An interval ends with an event: the fusion of a position or, in a gap of the position source, of
-height and heading only. The transition is linearised about the published attitude, so it does not
-depend on EKF2's parameters and is computed once.
+The transition is linearised about EKF2's published (nominal) attitude.
 
-The states are attitude error δθ (NED, estimate = exp(δθ) · nominal), velocity v, position p, and
-the errors δb_g and δb_a of gyro bias and accelerometer bias. R is the rotation from body to NED, a
-the specific force in NED, and g gravity. A prediction step of length Δt computes:
+The states are attitude error δθ (NED), velocity v, position p, gyro bias error δb_g and
+accelerometer bias error δb_a. The estimated attitude is exp(δθ) · nominal attitude. R is the
+rotation from body to NED, a the specific force (NED), g gravity. A prediction step of length Δt:
 
     δθ ← δθ - R Δt δb_g
     v ← v - [a]× Δt δθ - R Δt δb_a + (a + g) Δt
@@ -35,47 +33,44 @@ from px4fuse.ekf2.replay_segments import (
 )
 from px4fuse.trajectory.rotation import rotate, skew
 
-# EKF2 discards a sample that was measured more than this time (s) before the fusion horizon:
-# pop_first_older_than (RingBuffer.h)
+# EKF2 discards a sample measured more than this time (s) before the fusion horizon
+# (pop_first_older_than, RingBuffer.h)
 MAX_DELAY_BEHIND_HORIZON_S = 0.1
-# A sample is reported as late if EKF2 fuses it more than this time (s) after the fusion horizon has
-# passed its measurement time: an error of 3 cm at 1 m/s
+# Minimum delay (s) of the fusion of a late sample: a position error of 3 cm at 1 m/s
 MIN_DELAY_OF_LATE_SAMPLE_S = 0.03
-# Actions of EKF2 on a position sample: none, fusion, or start of fusion with a reset to the sample
+# Actions of EKF2 on a position sample; START_FUSION resets the position to the sample
 NO_ACTION, FUSE, START_FUSION = 0, 1, 2
-# Columns of the state derivatives: with respect to the initial attitude error (0 to 2), gyro bias
-# (3 to 5), accelerometer bias (6 to 8), correction of the nominal attitude (9), acceleration (10)
+# Columns of the state derivatives: by initial attitude error (0 to 2), gyro bias (3 to 5),
+# accelerometer bias (6 to 8), correction of the nominal attitude (9), acceleration (10)
 DERIVATIVE_COLUMN_COUNT = 11
 ATTITUDE_CORRECTION_DERIVATIVE_COLUMN, ACCELERATION_DERIVATIVE_COLUMN = 9, 10
 
-# One row per event (end of an interval), in time order
+# One row per event: fusion of a position or, in a gap, of height and heading only
 StepEvents = np.recarray[Any, Any]
 EVENT_DTYPE = np.dtype(
     [
-        ("end_step", np.intp),  # index of the prediction step after which the event occurs
+        ("end_step", np.intp),  # prediction step of the event
         ("sample", np.intp),  # index of the position sample, -1 without a sample
         ("action", np.intp),
-        ("usable", bool),  # True if the sample arrived early enough to be fused
-        ("can_start", bool),  # True if EKF2 may start fusion with this sample after a stop
-        ("late", bool),  # True if the sample was fused late, because it arrived late
+        ("usable", bool),  # True if the sample arrived in time
+        ("can_start", bool),  # True if EKF2 may start fusion with this sample
+        ("late", bool),  # True if the sample was fused late
         ("lost", bool),  # True if the sample arrived too late to be fused
-        ("time_s", float),  # measurement time for EKF2: timestamp - delay - half a prediction step
+        ("time_s", float),  # measurement time: timestamp - delay - half a prediction step
     ]
 )
 
 
 class Transitions(NamedTuple):
-    """State transition and process noise of E intervals between events of the replay.
+    """State transition and process noise between successive fusions, for E intervals.
 
     Attributes
     ----------
     transition : ndarray, shape (E, 15, 15)
     state_change_by_correction, state_change_by_acceleration : ndarray, shape (E, 15)
-        Change of the state in the interval. The correction is the difference between the rotation
-        of the nominal (published) attitude and the rotation measured by the gyro.
+        Change of the state by attitude correction, and by acceleration.
     gyro_noise_covariance, accelerometer_noise_covariance : ndarray, shape (E, 9, 9)
-        Process noise of attitude, velocity and position for a sensor noise of 1 rad/s (gyro) or
-        1 m/s² (accelerometer) in each prediction step.
+        Process noise for a sensor noise of 1 rad/s or 1 m/s² in each prediction step.
     """
 
     transition: Array
@@ -87,17 +82,16 @@ class Transitions(NamedTuple):
 
 @dataclass(frozen=True, eq=False)
 class EventIntervals:
-    """State transition and process noise of each interval between two filter events of a segment.
+    """Intervals between successive fusions in one part of a flight.
 
     Attributes
     ----------
     events : recarray, shape (E,)
-        Event at the end of each interval, see :data:`EVENT_DTYPE`.
+        Fusion at the end of each interval, see :data:`EVENT_DTYPE`.
     prediction_step_counts, duration_s : ndarray, shape (E,)
         Number of prediction steps, and length of each interval.
     state_derivatives : ndarray, shape (E, 9, DERIVATIVE_COLUMN_COUNT)
-        Derivatives of attitude, velocity and position at the end of each interval. Each column is
-        the derivative with respect to one quantity, see DERIVATIVE_COLUMN_COUNT.
+        Derivatives of attitude, velocity and position, see DERIVATIVE_COLUMN_COUNT.
     """
 
     events: StepEvents
@@ -106,7 +100,6 @@ class EventIntervals:
     state_derivatives: Array
 
     def compute_transitions(self, rows: slice) -> Transitions:
-        """Return the matrices of the intervals ``rows`` only, to limit memory."""
         state_derivatives, duration_s = self.state_derivatives[rows], self.duration_s[rows]
         transition = np.tile(np.eye(STATE_COUNT), (len(duration_s), 1, 1))
         state_change_by_correction, state_change_by_acceleration = np.zeros(
@@ -141,7 +134,7 @@ class FusionDelays:
     delay_s : float
         Timestamp of a position minus its time of measurement.
     horizon_s : float
-        Present time minus the fusion horizon, which is the time of EKF2's delayed state.
+        Delay of EKF2's fusion horizon.
     """
 
     delay_s: float
@@ -151,10 +144,9 @@ class FusionDelays:
 def make_event_intervals(
     inputs: ReplayInputs, segment: ReplaySegment, delays: FusionDelays
 ) -> EventIntervals:
-    """Compute state transition and process noise between the filter events of a segment.
+    """Compute state transition and process noise between successive fusions.
 
-    The number of events does not depend on ``delays``, so that filters with different delays can be
-    computed in the same arrays.
+    The number of intervals does not depend on ``delays``.
     """
     events = _make_events(inputs, segment, delays)
     end_steps = events.end_step
@@ -174,8 +166,7 @@ def _make_events(inputs: ReplayInputs, segment: ReplaySegment, delays: FusionDel
     timestamp_s = received_positions.timestamp_s[first_row:end_row]
     last_step = len(time_s) - 1
     measurement_times_s = timestamp_s - delays.delay_s - 0.5 * inputs.mean_step_s
-    # If a sample arrives after the fusion horizon has passed its measurement time, EKF2 fuses it
-    # late or never
+    # EKF2 fuses a late sample when it arrives
     earliest_fusion_times_s = np.maximum(
         measurement_times_s, received_positions.arrival_s[first_row:end_row] - delays.horizon_s
     )
@@ -190,8 +181,7 @@ def _make_events(inputs: ReplayInputs, segment: ReplaySegment, delays: FusionDel
         inputs, segment, measurement_times_s, sample_end_steps, is_usable
     )
     action[np.isin(timestamp_s, received_positions.reset_times_s) & (action == FUSE)] = START_FUSION
-    # In gaps of the position source, events without a sample fuse height and heading. They are
-    # placed between timestamps, so that their number is the same for all delays
+    # In a gap of the position source, height and heading are fused at regular intervals
     gap_s = np.diff(np.r_[time_s[0], timestamp_s, time_s[-1]])
     event_counts_in_gaps = np.maximum(
         np.ceil(gap_s / inputs.max_fusion_interval_in_gap_s).astype(int) - 1, 0
@@ -236,7 +226,7 @@ def _find_fusion_actions(
     end_steps: IntArray,
     is_usable: BoolArray,
 ) -> tuple[IntArray, BoolArray]:
-    """Return the action of EKF2 on each sample, and True for samples that may start fusion.
+    """Return EKF2's action on each sample, and True for samples that may start fusion.
 
     Source: PX4-Autopilot ``ev_control.cpp``.
     """
@@ -246,7 +236,7 @@ def _find_fusion_actions(
     usable_rows = np.flatnonzero(is_usable)
     intervals_s = np.diff(measurement_times_s[usable_rows], prepend=-np.inf)
     can_start[usable_rows] = intervals_s < fusion_rules.start_interval_s
-    # Time (s) from the previous usable sample to each sample
+    # Time (s) since the previous usable sample
     sample_gaps_s = segment.time_s[end_steps[usable_rows] - 1] - np.concatenate(
         [[np.inf], measurement_times_s[usable_rows[:-1]]]
     )
@@ -266,13 +256,12 @@ def _find_fusion_actions(
 def _integrate_state_derivatives(
     segment: ReplaySegment, start_steps: IntArray, end_steps: IntArray
 ) -> Array:
-    """Return the derivatives of attitude, velocity and position at the end of each interval.
+    """Return the derivatives of attitude, velocity and position over each interval.
 
-    The columns are described at DERIVATIVE_COLUMN_COUNT.
+    Columns: see DERIVATIVE_COLUMN_COUNT.
     """
     prediction_step_counts = end_steps - start_steps
-    # All intervals are integrated together, step by step. They are sorted by length, so that the
-    # intervals that continue are the first rows of the arrays
+    # Intervals are sorted by length: intervals that continue are the first rows
     longest_first_indices = np.argsort(-prediction_step_counts, kind="stable")
     start_steps_longest_first = start_steps[longest_first_indices]
     attitude_derivatives, velocity_derivatives, position_derivatives = state_derivatives = np.zeros(
@@ -290,7 +279,7 @@ def _integrate_state_derivatives(
         rows = slice(count)
         dt = segment.step_s[step][:, None, None]
         force_m_s2 = specific_force_ned_m_s2[step]
-        # Derivative of attitude by gyro bias, and of velocity by accelerometer bias, in one step
+        # Change of attitude by gyro bias, and of velocity by accelerometer bias
         bias_derivative_of_step = -segment.body_to_ned[1:][step] * dt
         position_derivatives[rows] += 0.5 * dt * velocity_derivatives[rows]
         velocity_derivatives[rows] += (-skew(force_m_s2) * dt) @ attitude_derivatives[rows]
@@ -310,15 +299,14 @@ def _integrate_state_derivatives(
 def _compute_imu_process_noise(
     prediction_step_counts: Array, duration_s: Array, velocity_derivative_by_attitude: Array
 ) -> tuple[Array, Array]:
-    """Return the process noise of each interval for unit noise of gyro and of accelerometer.
+    """Return the process noise for unit gyro noise, and for unit accelerometer noise.
 
-    A noise of 1 rad/s or 1 m/s² in a prediction step of length d adds d² to the variance of
-    attitude or velocity. The specific force is assumed to be constant in the interval. For the
-    effect of gyro noise on velocity and position, only the leading terms are used.
+    The specific force is assumed to be constant in an interval. For the effect of gyro noise on
+    velocity and position, only the leading terms are used.
     """
     n = np.maximum(prediction_step_counts, 1.0)[:, None, None]
     d = duration_s[:, None, None] / n
-    # m: velocity change (m/s) per attitude error (rad) in one of n equal prediction steps
+    # Velocity change per attitude error in one prediction step (m/s per rad)
     m = velocity_derivative_by_attitude / n
     mm = m @ m.transpose(0, 2, 1)
     eye = np.eye(3)

@@ -1,7 +1,6 @@
-"""Fusion of all three magnetometer axes in the EKF2 replay, with earth and body fields as states.
+"""Fusion of a three-axis magnetometer in the EKF2 replay.
 
-The samples between two events (:mod:`px4fuse.ekf2.filter_recursion`) are averaged, and the mean is
-fused at the later event, because the attitude error hardly changes between events.
+The magnetic fields of earth and body are states. The samples between two fusions are averaged.
 
 Sources: PX4-Autopilot ``EKF/aid_sources/magnetometer`` (``mag_fusion.cpp``: fuseMag;
 ``mag_control.cpp``: R and its lower limit), ``EKF/covariance.cpp`` (process noise of the fields).
@@ -23,7 +22,7 @@ FLATTENED_CROSS_PRODUCT_MATRICES = skew(IDENTITY_MATRIX).reshape(3, 9)
 
 
 class EventSamples(NamedTuple):
-    """Mean of the magnetometer or optical flow samples that are fused at each event.
+    """Mean of the magnetometer or optical flow samples of each fusion.
 
     The shapes of the arrays begin with (events,) or (events, filters).
 
@@ -33,7 +32,6 @@ class EventSamples(NamedTuple):
         Magnetic field (gauss, FRD), or velocity forward and right (m/s).
     ned_to_body_rotation : ndarray
         Mean rotation from NED to the body axes.
-    sample_count : ndarray
     noise : ndarray
         R of one sample.
     """
@@ -47,10 +45,7 @@ class EventSamples(NamedTuple):
 def average_by_event(
     segment: ReplaySegment, sensor_samples: SensorSamples, event_end_steps: IntArray
 ) -> EventSamples:
-    """Return the mean of the magnetometer or optical flow samples between successive events.
-
-    Each mean is fused at the second of the two events.
-    """
+    """Return the mean of the magnetometer or optical flow samples before each fusion."""
     event_index = np.searchsorted(event_end_steps, sensor_samples.step_indices)
     event_count = len(event_end_steps)
     is_inside = event_index < event_count
@@ -66,8 +61,7 @@ def average_by_event(
         mean, (sensor_samples.value, sensor_samples.ned_to_body_rotation, sensor_samples.noise)
     )
     if VELOCITY in sensor_samples.state_slices:
-        # The IMU velocity change since the start of the segment was subtracted from optical flow
-        # samples. At the event it is added again
+        # The IMU velocity change, which was subtracted from optical flow, is added again
         velocity_m_s = segment.imu_velocity_change_m_s[event_end_steps]
         value = value + np.einsum("eab,eb->ea", ned_to_body_rotation, velocity_m_s)
     sample_count = np.bincount(event_index, sensor_samples.sample_count[is_inside], event_count)
@@ -84,22 +78,19 @@ def fuse_mean_sample(
     measured_states: slice,
     bias_states: slice | None = None,
 ) -> tuple[Array, Array, Array]:
-    """Fuse the mean of magnetometer or optical flow samples in all filter configurations.
+    """Fuse the mean of magnetometer or optical flow samples.
 
     Return state, covariance, and an array of shape (3, filters, components). Its rows are the
-    innovation, the innovation variance of a single sample (for the gate), and 1 if the mean was
-    fused. The rows are NaN for a configuration without a sample.
+    innovation, the innovation variance of one sample, and 1 if fused; NaN without a sample.
 
     Parameters
     ----------
-    mean_sample : EventSamples
-        Mean of one event.
     gate : ndarray, shape (filters,)
         Innovation gate in √S.
     measured_states : slice
-        State indices of the NED vector that the sensor measures in the body frame.
+        State indices of the measured vector (NED).
     bias_states : slice, optional
-        State indices of the sensor bias (body frame), which is part of the measurement.
+        State indices of the sensor bias (body frame).
     """
     measured_vector = x[:, measured_states]
     sample_count, R = mean_sample.sample_count, mean_sample.noise

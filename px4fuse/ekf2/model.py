@@ -1,12 +1,8 @@
-"""Replay of EKF2 with logged or changed parameters, from a log with PX4's default profile.
+"""Replay of EKF2 with the logged parameters, or with other parameters.
 
-The model has 15 error states, linearised about the published attitude. It starts from the logged
-``estimator_states``, and fuses the logged positions. With GNSS, the model also fuses velocities
-and, if logged, heights and the magnetometer (21 states). If no height sensor or magnetometer is
-fused, the model uses EKF2's published height or heading. :mod:`px4fuse.ekf2.replay` compares the
-replay with the log.
-
-All filter configurations (parameters, states, aiding sources, gate) run together, to save time.
+The replay starts from the logged ``estimator_states`` and fuses the logged measurements. The model
+has 15 error states, or 21 with a magnetometer. Without a height sensor, the replay uses EKF2's
+published height. Without a magnetometer, the replay uses EKF2's published heading.
 """
 
 from collections.abc import Callable, Iterator, Mapping, Sequence
@@ -74,13 +70,12 @@ from px4fuse.trajectory.rotation import rotate
 # Maximum delay (s) of the fusion horizon: PX4's maximum of EKF2_DELAY_MAX
 MAX_HORIZON_DELAY_S = 1.0
 
-# Number of replays that run together. A larger batch needs less time per replay, but more memory
+# Number of replays that are computed at once; limits the memory
 REPLAY_BATCH_SIZE = 10
-# Number of intervals whose states are computed at once, which limits memory
+# Number of intervals whose states are computed at once; limits the memory
 EVENTS_PER_BLOCK = 512
 
-# Field of Agreement with the result of an aiding source, if it differs from PX4's name of the
-# source
+# Fields of Agreement whose names differ from PX4's name of the aiding source
 AGREEMENT_FIELD_BY_AID_NAME = {FLOW.name: "carried_difference_m"}
 
 ListConfigurations = Callable[[ReplayInputs], Sequence[FilterConfiguration]]
@@ -88,16 +83,14 @@ ListConfigurations = Callable[[ReplayInputs], Sequence[FilterConfiguration]]
 
 @dataclass(frozen=True)
 class Ekf2Model:
-    """Inputs for replays of EKF2 with other parameters, and results that are already computed.
+    """Inputs and results of EKF2 replays of one flight.
 
     Attributes
     ----------
-    event_intervals_by_delays : mapping from FusionDelays to tuple of EventIntervals
-        Computed state transitions between the fusions of each segment.
     baseline_replay : Ekf2Replay
-        Replay with the logged parameters; ``agreement`` compares it with the log.
-    runs : tuple of SegmentRun
-        Results of the filter configurations that are already run, for each segment.
+        Replay with the logged parameters.
+    agreement : Agreement
+        Agreement of this replay with the log.
     """
 
     flight: Flight
@@ -111,10 +104,9 @@ class Ekf2Model:
 def prepare_ekf2_model(
     flight: Flight, list_later_configurations: ListConfigurations = lambda _: ()
 ) -> Ekf2Model | Unavailable:
-    """Prepare a flight for EKF2 replays, and replay it with the logged parameters.
+    """Prepare EKF2 replays of a flight, and replay the flight with the logged parameters.
 
-    ``list_later_configurations`` returns filter configurations that will be needed later. To save
-    time, these configurations are computed in the same run as the logged parameters.
+    ``list_later_configurations`` returns further filter configurations to compute.
     """
     failed_agreement_by_aid: dict[str, Agreement] = {}
     while not isinstance(
@@ -134,11 +126,6 @@ def _prepare_without_aids(
     list_later_configurations: ListConfigurations,
     failed_agreement_by_aid: Mapping[str, Agreement],
 ) -> Ekf2Model | Unavailable:
-    """Prepare a replay without the aiding sources whose earlier replay disagreed with the log.
-
-    ``failed_agreement_by_aid`` contains the agreement of the earlier replay by PX4's name of the
-    source.
-    """
     omitted_aids = {
         name: agreement.doubtful[name] for name, agreement in failed_agreement_by_aid.items()
     }
@@ -177,8 +164,7 @@ def _prepare_without_aids(
         agreement_with_rejections = compare_with_log(flight, replay_with_logged_rejections(model))
         if isinstance(agreement_with_rejections, Agreement):
             agreement = judge_with_logged_rejections(agreement, agreement_with_rejections)
-    # This replay does not fuse the omitted sources. Their agreement with the log is therefore taken
-    # from the earlier replay that fused them
+    # Agreement of the omitted sources with the log, from the replay that fused them
     failed_agreement_by_field = {
         (field_name := AGREEMENT_FIELD_BY_AID_NAME.get(name, name)): getattr(
             failed_agreement, field_name
@@ -209,11 +195,8 @@ def replay_with_settings(
 ) -> Iterator[Ekf2Replay]:
     """Replay EKF2 with several sets of changed parameters.
 
-    The replays are computed in small batches, to limit memory.
-
     Parameters
     ----------
-    model : Ekf2Model
     settings : sequence of mapping
         Changed parameters of each replay, by PX4 name and in PX4's units.
     excluded_times_s : ndarray, optional
@@ -348,13 +331,12 @@ def add_position_noise(model: Ekf2Model, sigma_m: float, seed: int) -> Ekf2Model
         if samples is not None:
             position_noise_m = rng.normal(scale=sigma_m, size=samples.position_m.shape)
             noisy_inputs[name] = replace(samples, position_m=samples.position_m + position_noise_m)
-    # The noise does not change the times of fusions: the computed intervals are kept. Results of
-    # earlier runs are deleted
+    # Earlier results are without this noise, so they are deleted
     return replace(model, inputs=replace(inputs, **noisy_inputs), runs=())
 
 
 def misalign_positions(model: Ekf2Model, rotation_deg: float, delay_s: float) -> Ekf2Model:
-    """Rotate the positions in the inputs (clockwise from above), and delay their timestamps."""
+    """Rotate measured positions and velocities (clockwise from above), and delay their times."""
     if not rotation_deg and not delay_s:
         return model
     received_positions = model.inputs.received_positions
@@ -374,10 +356,7 @@ def misalign_positions(model: Ekf2Model, rotation_deg: float, delay_s: float) ->
 def compute_delayed_tracks(
     model: Ekf2Model, configurations: Sequence[FilterConfiguration]
 ) -> Iterator[pd.DataFrame]:
-    """Yield position and velocity at the fusion horizon for each filter configuration.
-
-    The tracks are computed one at a time, to limit the memory.
-    """
+    """Yield position and velocity at the fusion horizon for each filter configuration."""
     runs = _run_model(model, configurations)
     for configuration_index in map(runs[0].configurations.index, configurations):
         tracks = []
@@ -402,11 +381,7 @@ def run_configurations(
     configurations: Sequence[FilterConfiguration],
     event_intervals_by_delays: Mapping[FusionDelays, Sequence[EventIntervals]],
 ) -> list[SegmentRun]:
-    """Run filter configurations through all segments, and return states and updates by segment.
-
-    ``event_intervals_by_delays``: transition and process noise of each segment, if already
-    computed.
-    """
+    """Run several filter configurations; return the results of each flight segment."""
     delays_by_configuration = [
         configuration.compute_delays(inputs) for configuration in configurations
     ]
@@ -430,13 +405,12 @@ def run_configurations(
 
 
 def _make_track(run: SegmentRun, position_m: Array, velocity_m_s: Array) -> pd.DataFrame:
-    """Return the track after each step: velocity, and position in EKF2's published coordinates."""
+    """Return a table of velocity (m/s) and position (m, in EKF2's published coordinates)."""
     states = np.hstack([position_m / run.segment.internal_to_published_ratio, velocity_m_s])
     return pd.DataFrame(states, time_index(run.segment.time_s), Columns.STATE, copy=False)
 
 
 def _join_segments(tables: Sequence[pd.DataFrame]) -> pd.DataFrame:
-    """Concatenate the tables of all segments; a single table is not copied."""
     return tables[0] if len(tables) == 1 else pd.concat(tables)
 
 
@@ -479,7 +453,7 @@ def _make_replay(
 
 
 def _find_flow_only_spans(updates: pd.DataFrame, segment: ReplaySegment) -> list[Span]:
-    """Return spans (s) longer than RESTART_GAP_S in which flow, but no position, was fused."""
+    """Return start and end (s) of times without a fused position, longer than RESTART_GAP_S."""
     is_used = (updates["fused"] > 0.0) | (updates["reset"] > 0.0)
     fusion_times_s = [*updates.loc[is_used, "fused_at_s"], float(segment.time_s[-1])]
     return [
@@ -492,7 +466,7 @@ def _find_flow_only_spans(updates: pd.DataFrame, segment: ReplaySegment) -> list
 def _collect_updates_by_aid(
     inputs: ReplayInputs, run: SegmentRun, configuration_index: int
 ) -> dict[str, pd.DataFrame]:
-    """Return the updates of one configuration by PX4's name of the aiding source."""
+    """Return the updates of one filter configuration, by PX4's name of the aiding source."""
     events, height_filter = run.events[configuration_index], run.height_filter
     end_s = run.segment.time_s[events.end_step]
     nu, S, R, rejected, fused, reset, variance_after = (
@@ -531,10 +505,10 @@ def _collect_updates_by_aid(
             updates_by_aid[name] = height_filter.make_update_table(name, configuration_index, end_s)
     if inputs.received_positions.velocity_m_s is not None:
         gate = run.configurations[configuration_index].settings[GNSS_VEL.gate]
-        # Innovations that EKF2 clipped to the gate count as inside: the factor allows for rounding
+        # The factor allows for rounding of innovations that EKF2 clipped to the gate
         squared_gate = (1.0 + 1e-9) * max(gate, MIN_INNOVATION_GATE) ** 2
         is_outside_gate = (nu[:, :3] ** 2 > squared_gate * S[:, :3]).any(axis=1)
-        # Without GNSS height, the replay uses EKF2's logged height and no vertical velocity
+        # Without GNSS heights, the table contains only the horizontal axes
         axes = AXIS_NAMES if GNSS_HGT.name in updates_by_aid else HORIZONTAL_AXES
         updates_by_aid[GNSS_VEL.name] = make_axis_table(axes, slice(len(axes)), is_outside_gate)
     if run.vision_filter is not None:
@@ -547,13 +521,13 @@ def _collect_updates_by_aid(
 def _make_state_tracks(
     inputs: ReplayInputs, run: SegmentRun, configuration_index: int
 ) -> tuple[pd.DataFrame, pd.DataFrame]:
-    """Return the state at the fusion horizon, and the published state, after each step."""
+    """Return two tables by time: the state at the fusion horizon, and the published state."""
     segment = run.segment
     configuration = run.configurations[configuration_index]
     state, reset = compute_delayed_states(run, configuration_index)
     horizon_s = min(configuration.compute_delays(inputs).horizon_s, MAX_HORIZON_DELAY_S)
     lag_steps = max(round(horizon_s / inputs.mean_step_s), 1)
-    # Without attitude states, the model uses EKF2's published attitude without correction
+    # Without attitude states, EKF2's published attitude is not corrected
     attitude_correction_rad = np.zeros((len(state), 3))
     if configuration.estimates_attitude:
         attitude_correction_rad = sum_attitude_corrections(
@@ -574,8 +548,8 @@ def _make_state_tracks(
 def compute_delayed_states(run: SegmentRun, configuration_index: int) -> tuple[Array, Array]:
     """Return the state at the fusion horizon after each of n prediction steps.
 
-    The shape is (n + 1, 15) or more. The second array, shape (n + 1, 3), contains the sum (m) of
-    all position resets before each state.
+    The state has the shape (n + 1, 15) or more. The second array, shape (n + 1, 3), is the sum (m)
+    of the position resets so far.
     """
     event_steps = run.events[configuration_index].end_step
     cumulative_reset_m = np.zeros((len(run.segment.time_s), 3))
@@ -586,14 +560,13 @@ def compute_delayed_states(run: SegmentRun, configuration_index: int) -> tuple[A
 
 
 def _compute_states_after_steps(run: SegmentRun, configuration_index: int, rows: slice) -> Array:
-    """Return the state components ``rows`` at the fusion horizon after each of n steps."""
+    """Return the states ``rows`` at the fusion horizon after each prediction step."""
     event_steps = run.events[configuration_index].end_step
     event_states = run.state[:, configuration_index]
     step_count = len(run.segment.step_s)
     interval_index = np.searchsorted(event_steps, np.arange(step_count), side="right")
     states = np.empty((step_count + 1, event_states[0, rows].size))
     states[0] = event_states[0, rows]
-    # Blocks of intervals, because the arrays of a whole flight need much memory
     block_boundaries = np.searchsorted(
         interval_index, np.arange(0, len(event_steps) + 1, EVENTS_PER_BLOCK)
     )
@@ -608,7 +581,7 @@ def _compute_states_after_steps(run: SegmentRun, configuration_index: int, rows:
 def _propagate_states(
     run: SegmentRun, configuration_index: int, interval_index: IntArray, steps: slice
 ) -> Array:
-    """Return the state after each prediction step, propagated from the event before the step."""
+    """Predict the state with the IMU from the last fusion to each prediction step."""
     segment, configuration = run.segment, run.configurations[configuration_index]
     start_state: Array = run.state[interval_index, configuration_index]
     state, body_to_ned = start_state.copy(), segment.body_to_ned[1:][steps]
@@ -624,8 +597,7 @@ def _propagate_states(
         previous_state = np.concatenate([state[:1, rows], state[:-1, rows]])
         return np.where(is_first_step, start_state[:, rows], previous_state)
 
-    # Prediction of the error state, as in intervals.py:
-    # θ += -R b_g Δt; v += (θ × a - R b_a + a + g) Δt; p += mean velocity · Δt
+    # Prediction of attitude error, velocity and position, see intervals.py
     rotation_increments_rad = -rotate(body_to_ned, state[:, GYRO_BIAS]) * step_s
     if configuration.estimates_attitude:
         rotation_increments_rad -= segment.attitude_correction_rad[steps]

@@ -1,10 +1,8 @@
 """Output predictor of EKF2, which computes the published state from the delayed state.
 
-EKF2's state is delayed: it belongs to the time of the fusion horizon. The output predictor
-propagates this state to the present with the IMU. In each prediction step, the error is the delayed
-state minus the earlier output for the same time. Velocity and position are then corrected by
-gain · error + 0.1 · gain² · Σ error, with gain = step / τ. This recursion is computed as a linear
-recursive (IIR) filter.
+EKF2's state belongs to the fusion horizon, which is in the past. The output predictor propagates
+this state to the present with the IMU. Each prediction step corrects velocity and position by
+gain · error + 0.1 · gain² · Σ error, with gain = step / τ and the error at the fusion horizon.
 
 Source: PX4-Autopilot ``EKF/output_predictor/output_predictor.cpp`` (``EKF/ekf.cpp`` before v1.14).
 """
@@ -24,11 +22,9 @@ from px4fuse.ekf2.replay_segments import (
 )
 from px4fuse.trajectory.rotation import rotate
 
-# Velocity and position: correction = gain · error + OUTPUT_INTEGRAL_GAIN · gain² · Σ error
-# (output_predictor.cpp)
+# Gain of the integral correction of velocity and position (output_predictor.cpp)
 OUTPUT_INTEGRAL_GAIN = 0.1
-# Attitude: correction = ATTITUDE_CORRECTION_GAIN · error · step / delay of the fusion horizon
-# (output_predictor.cpp)
+# Gain of the attitude correction (output_predictor.cpp)
 ATTITUDE_CORRECTION_GAIN = 0.5
 
 
@@ -48,11 +44,10 @@ def compute_published_state(
     state : ndarray, shape (n + 1, 15) or more
         State at the fusion horizon.
     reset_m : ndarray, shape (n + 1, 3)
-        Sum of all position resets before each state.
+        Sum of the position resets so far.
     published_minus_nominal_attitude_rad : ndarray, shape (n + 1, 3)
-        Published minus nominal attitude.
     lag_steps : int
-        Number of steps between fusion horizon and present.
+        Number of prediction steps from the fusion horizon to the present.
     settings : mapping
         EKF2 parameters by PX4 name.
     """
@@ -65,7 +60,6 @@ def compute_published_state(
     )
     acceleration_m_s2 += np.cross(published_minus_nominal_attitude_rad[1:], acceleration_m_s2)
     acceleration_m_s2 += GRAVITY_M_S2
-    # The array is reused (out) to save memory
     velocity_increments_m_s = np.multiply(acceleration_m_s2, step_s, out=acceleration_m_s2)
     velocity_m_s = _predict_output(
         state[:, VELOCITY],
@@ -74,14 +68,11 @@ def compute_published_state(
         mean_step_s,
         settings["EKF2_TAU_VEL"],
     )
-    # Mean velocity of a step = velocity before the step + half of the IMU's velocity increment.
-    # Corrections are not included, because they are added at the end of the step
+    # Mean velocity of a step = velocity before the step + half of the velocity increment
     position_increments_m = np.multiply(velocity_increments_m_s, 0.5, out=velocity_increments_m_s)
     position_increments_m += velocity_m_s[:-1]
     position_increments_m *= step_s
-    # EKF2 shifts all buffered outputs by a position reset, so a reset causes no error that the
-    # output predictor corrects. Therefore the resets are subtracted from the state here, and added
-    # at the end
+    # EKF2 shifts all outputs by a position reset, so resets bypass the output predictor
     position_m = _predict_output(
         state[:, POSITION] - reset_m,
         position_increments_m,
@@ -96,12 +87,7 @@ def compute_published_state(
 def _predict_output(
     state: Array, imu_increments: Array, lag_steps: int, step_s: float, tau_s: float
 ) -> Array:
-    """Return the output predictor's velocity or position: sum of IMU increments and corrections.
-
-    In step k, the error at the fusion horizon is e_k = o_(k-lag) - c_k. Here o is ``state`` minus
-    the sum of the IMU increments, and c the sum of the corrections. With the gain g,
-    c_(k+1) = c_k + g e_k + 0.1 g² Σ e.
-    """
+    """Return the output predictor's velocity or position: sum of IMU increments and corrections."""
     integrated_state = np.concatenate([state[:1], imu_increments])
     np.cumsum(integrated_state, axis=0, out=integrated_state)
     offset = state - integrated_state
@@ -128,9 +114,7 @@ def sum_attitude_corrections(
 ) -> Array:
     """Return the sum of the output predictor's attitude corrections (rad) after each step.
 
-    ``error_rad`` contains the attitude error at the fusion horizon as rotation vectors, shape
-    (n + 1, 3). The fusion horizon is ``lag_steps`` before the output. Each step corrects the
-    fraction 0.5 · step_s / horizon_s of the error.
+    ``error_rad``, shape (n + 1, 3), is the attitude error at the fusion horizon.
     """
     gain = ATTITUDE_CORRECTION_GAIN * step_s / max(horizon_s, step_s)
     numerator, denominator = np.zeros((2, lag_steps + 2))

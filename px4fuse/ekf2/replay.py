@@ -52,50 +52,44 @@ MIN_COMPARED_INNOVATIONS = 20
 CONSTANT_INNOVATIONS_REASON = "the logged or replayed innovations are constant"
 # Maximum time (s) from an update to its logged innovation (estimator_innovations)
 MAX_INNOVATION_AGE_S = 0.5
-# Two times are in one prediction step if they differ by less than this time (s)
+# Maximum time difference (s) of two events in one prediction step
 SAME_STEP_TOLERANCE_S = 0.002
-# Minimum correlation of replayed and logged innovations: above 0.997 with complete logs, below 0.9
-# with a downsampled source or IMU dropouts (tests/benchmarks/bench_ekf2.py)
+# Minimum correlation of replayed and logged innovations: above 0.997 with complete logs
+# (tests/benchmarks/bench_ekf2.py)
 MIN_INNOVATION_CORRELATION = 0.95
-# Maximum |median of (S replayed / S logged) - 1|: below 0.003 with complete logs, above 0.05 with a
-# downsampled position source
+# Maximum |median of (S replayed / S logged) - 1|: below 0.003 with complete logs
 MAX_INNOVATION_VARIANCE_RATIO_DEVIATION = 0.05
 # Maximum RMS difference (m) of replayed and logged position: below 0.013 m with complete logs
 MAX_PUBLISHED_DIFFERENCE_M = 0.10
-# Maximum difference (m) of replayed and logged position while optical flow, which is logged at a
-# reduced rate, is the only horizontal aiding source
+# Maximum position difference (m) with optical flow as the only horizontal source
 MAX_FLOW_ONLY_DIFFERENCE_M = 0.5
-# Innovations are compared sample by sample only if less than this fraction is rejected, because
-# each rejection changes many later innovations
+# Maximum rejected fraction for a comparison of single innovations, which depend on each rejection
 MAX_REJECTED_FRACTION_FOR_COMPARISON = 0.05
-# Published positions are compared only if less than this fraction of the samples is rejected. With
-# more rejections, EKF2's position is mostly integrated from the IMU
+# Above this rejected fraction, EKF2's position is mostly integrated from the IMU
 MOSTLY_REJECTED_FRACTION = 0.5
-# Minimum correlation of replayed and logged innovations if more than MOSTLY_REJECTED_FRACTION of
-# the samples is rejected
+# Minimum correlation of innovations if EKF2 rejects more than MOSTLY_REJECTED_FRACTION
 MIN_CORRELATION_IF_MOSTLY_REJECTED = 0.99
-# Maximum |rejected fraction of the replay - rejected fraction in the log|
+# Maximum difference of the rejected fractions in replay and log
 MAX_REJECTED_FRACTION_DIFFERENCE = 0.05
-# Maximum |mean NIS of the replay / mean NIS in the log - 1|
+# Maximum relative difference of the mean NIS in replay and log
 MAX_RELATIVE_NIS_DIFFERENCE = 0.25
-# Factor on MAX_PUBLISHED_DIFFERENCE_M for flights with many rejections, in which the replay uses
-# EKF2's logged rejections
+# Factor on MAX_PUBLISHED_DIFFERENCE_M for flights with many rejections
 DIFFERENCE_FACTOR_WITH_MANY_REJECTIONS = 3.0
 
 
 class AxisAgreement(Record, kw_only=True):
-    """Agreement of the EKF2 replay (with logged parameters) with the log along one axis.
+    """Agreement of the EKF2 replay with the log along one axis.
 
     Attributes
     ----------
     innovation_correlation : float
         Correlation of replayed and logged innovations.
     innovation_rms_difference : float
-        RMS of replayed minus logged innovations, in their unit.
+        RMS of replayed minus logged innovations.
     s_ratio_median, s_ratio_p5, s_ratio_p95 : float
         Ratio of replayed to logged innovation variance: median, 5 and 95 % quantiles.
     position_rms_difference_m, velocity_rms_difference_m_s : float
-        RMS difference between the replayed and the logged published state.
+        RMS difference between the replayed and the logged state.
     """
 
     innovation_correlation: Correlation
@@ -110,26 +104,26 @@ class AxisAgreement(Record, kw_only=True):
 
 
 class Agreement(Record, kw_only=True):
-    """Agreement of the EKF2 replay (with logged parameters) with the log.
+    """Agreement of the EKF2 replay with the log.
 
     Attributes
     ----------
     north, east : AxisAgreement
-        Position innovations of GNSS or, without GNSS, of external vision.
+        Innovations of the horizontal position source.
     ev_pos, gnss_pos, gnss_vel, gnss_hgt, baro_hgt : mapping from axis to AxisAgreement
         Innovations of each aiding source, by PX4's name.
     samples : int
-        Number of compared innovations, without the first REPLAY_SETTLING_S of each segment.
+        Number of compared innovations.
     decisions_same : float
-        Fraction of the samples that EKF2 and replay both rejected or both accepted.
+        Fraction of samples that EKF2 and replay both rejected or both accepted.
     published_rms_difference_m : float
         RMS difference of the published horizontal position.
     heading_rms_difference_deg : float or None
         None if the replay uses the logged heading.
     carried_difference_m : float or None
-        Largest position difference while optical flow was the only horizontal aiding source.
+        Largest position difference with optical flow as the only horizontal source.
     doubtful : mapping from PX4's name of an aiding source to str
-        Aiding sources whose replay does not agree with the log, and the reasons.
+        Aiding sources that do not agree with the log, and the reasons.
     good : bool
         True if the replay agrees with the log.
     reason : str
@@ -176,21 +170,21 @@ class Ekf2Replay(Record, kw_only=True, omit_defaults=False):
     Attributes
     ----------
     source : str
-        Name of the position source that was fused.
+        Name of the position source.
     stretches_s : tuple of (float, float)
-        Replayed segments of the flight.
+        Start and end of each replayed part of the flight.
     settings : mapping
-        All parameters of the model, by PX4 name.
+        EKF2 parameters, by PX4 name.
     late, lost : int
         Number of samples that were fused late, and number of samples too late to be fused.
-    updates : DataFrame, one row per position sample, at EKF2's measurement time
-        See :func:`~px4fuse.ekf2.replay_segments.make_update_table`.
+    updates : DataFrame
+        One row per position sample, at EKF2's measurement time.
     other_aid_updates : mapping from PX4's name to DataFrame
-        Updates with GNSS velocity (m/s), GNSS height, barometer, and vision in addition to GNSS.
+        Updates with each of the other aiding sources.
     optical_flow_only_spans_s : tuple of (float, float)
-        Times in which optical flow was the only horizontal aiding source.
+        Times with optical flow as the only horizontal source.
     delayed_state, published_state : DataFrame
-        State (NED) at the fusion horizon, and as published, after each prediction step.
+        State (NED) at the fusion horizon, and as published.
     """
 
     source: str
@@ -209,8 +203,7 @@ class Ekf2Replay(Record, kw_only=True, omit_defaults=False):
     def find_evaluated_spans(self) -> Spans:
         """Return the time spans (s) in which the replay is compared with the log.
 
-        The first REPLAY_SETTLING_S of each replayed segment are excluded. Times in which optical
-        flow was the only horizontal aiding source are also excluded.
+        The first REPLAY_SETTLING_S of each replayed part are excluded.
         """
         evaluated_spans_s = []
         for start, end in self.stretches_s:
@@ -225,19 +218,19 @@ class Ekf2Replay(Record, kw_only=True, omit_defaults=False):
 
 
 class _ComparedInnovations(NamedTuple):
-    """Innovations of the samples that log and replay both contain, with the agreement by axis."""
+    """Logged and replayed innovations of the same samples, and their agreement by axis."""
 
     logged: pd.DataFrame
     replayed: pd.DataFrame
     agreement_by_axis: dict[str, AxisAgreement]
 
     def compute_rejected_fractions(self) -> list[float]:
-        """Return the rejected fraction in the log, and the rejected fraction in the replay."""
+        """Return the rejected fraction in the log, and in the replay."""
         return [float(np.mean(innovations["rejected"] > 0.0)) for innovations in self[:2]]
 
 
 def compare_with_log(flight: Flight, replay: Ekf2Replay) -> Agreement | Unavailable:
-    """Compare a replay that uses the logged parameters with EKF2's logged innovations and state."""
+    """Compare an EKF2 replay with the logged innovations and states."""
     ekf2 = flight.ekf2
     assert isinstance(ekf2, Ekf2)
     if rows_inside(ekf2.state, replay.find_evaluated_spans()).empty:
@@ -308,7 +301,7 @@ def _compare_innovations(
     logged_innovations: pd.DataFrame,
     has_measurement_times: bool,
 ) -> _ComparedInnovations | str:
-    """Compare replayed with logged innovations; return a reason if this is not possible."""
+    """Compare replayed with logged innovations, or return the reason why this is impossible."""
     update_rows = match_updates(
         replayed_innovations,
         logged_innovations.index.to_numpy(),
@@ -317,7 +310,7 @@ def _compare_innovations(
     is_used = (update_rows >= 0) & is_inside_spans(
         logged_innovations.index, replay.find_evaluated_spans()
     )
-    # If EKF2 resets its state to a sample, it logs innovation 0 for this sample
+    # If EKF2 resets its state to a sample, it logs innovation 0
     is_used &= logged_innovations.filter(regex="innovation_[a-z]+_m$").any(axis=1)
     logged_innovations = logged_innovations[is_used]
     replayed_innovations = replayed_innovations.iloc[update_rows[is_used]]
@@ -344,10 +337,9 @@ def _compare_innovations(
 
 
 def _compute_flow_position_difference_m(ekf2: Ekf2, replay: Ekf2Replay) -> float | None:
-    """Return the largest position difference (m) while only optical flow aided horizontally.
+    """Return the largest position difference (m) with optical flow as the only horizontal source.
 
-    The difference is replayed minus logged position. Return None if EKF2 always fused another
-    horizontal aiding source.
+    The difference is replayed minus logged position. Return None without such a time.
     """
     logged_state = rows_inside(ekf2.state, replay.optical_flow_only_spans_s)
     if logged_state.empty:
@@ -361,7 +353,7 @@ def _compute_flow_position_difference_m(ekf2: Ekf2, replay: Ekf2Replay) -> float
 def _compute_replayed_minus_logged(
     replay: Ekf2Replay, logged_state: pd.DataFrame, name: str
 ) -> Array:
-    """Return replayed minus logged values of one column of the published state."""
+    """Return replayed minus logged values of one column of the state."""
     replayed_values = np.interp(
         logged_state.index, replay.published_state.index, replay.published_state[name]
     )
@@ -383,17 +375,16 @@ def _compute_heading_difference_deg(ekf2: Ekf2, replay: Ekf2Replay) -> float | N
 
 
 def _compare_other_aids(ekf2: Ekf2, replay: Ekf2Replay) -> tuple[dict[str, Any], dict[str, str]]:
-    """Compare replayed and logged innovations of all aiding sources except the position source.
+    """Compare innovations of all aiding sources except the position source with the log.
 
-    Return the agreement of each source, and the reasons for sources that do not agree with the log.
+    Return the agreement of each source, and the reasons for disagreement.
     """
     agreement_by_aid: dict[str, Any] = {}
     omitted_aids = {}
     for name, updates in replay.other_aid_updates.items():
         if (aid_log := ekf2.aids.get(name)) is None:
             continue
-        # The replay fuses barometer samples only at the end of an interval, later than EKF2.
-        # Barometer updates are therefore matched by measurement time instead of fusion time
+        # The replay fuses barometer samples later than EKF2, so measurement times are compared
         updates_to_match = (
             updates.assign(fused_at_s=updates.index) if name == BAROMETER.name else updates
         )
@@ -421,7 +412,7 @@ def _compare_other_aids(ekf2: Ekf2, replay: Ekf2Replay) -> tuple[dict[str, Any],
 
 
 def select_logged_aid_innovations(name: str, aid_log: AidLog) -> pd.DataFrame:
-    """Return logged innovations, S and rejections of the aiding source ``name`` (PX4's name)."""
+    """Return logged innovations, S and rejections of an aiding source (PX4's name)."""
     gate = aid_log.parameters.get(AIDS[name].gate, AIDS[name].default_gate)
     axes = [axis for axis in AXIS_NAMES if axis in aid_log.axes]
     return _join_axis_innovations(
@@ -461,16 +452,16 @@ def is_inside_spans(times_s: ArrayLike, spans_s: Spans) -> BoolArray:
 
 
 def rows_inside(table: T, spans_s: Spans) -> T:
-    """Return the rows of a table (indexed by time in s) that are inside one of the time spans."""
+    """Return the rows of a table inside the time spans; the table index is time (s)."""
     return table[is_inside_spans(table.index, spans_s)]
 
 
 def match_updates(
     updates: pd.DataFrame, logged_times_s: Array, *, has_measurement_times: bool
 ) -> IntArray:
-    """Return for each logged innovation the index of its replayed update, or -1.
+    """Return for each logged innovation the row of its replayed update, or -1.
 
-    ``has_measurement_times`` is True if the innovations are from estimator_aid_src topics.
+    ``has_measurement_times`` is True for estimator_aid_src topics.
     """
     if has_measurement_times:
         return find_matching_samples(updates.index.to_numpy(), logged_times_s)
@@ -478,8 +469,7 @@ def match_updates(
     update_rows = np.searchsorted(fusion_times_s, logged_times_s + 1e-4, side="right") - 1
     age_s = logged_times_s - fusion_times_s[np.maximum(update_rows, 0)]
     is_matched = (update_rows >= 0) & (age_s <= MAX_INNOVATION_AGE_S)
-    # A row that is logged in the same prediction step as a fusion may still contain the previous
-    # innovation, so rows at least one step after the fusion are preferred
+    # A row logged in the same prediction step as a fusion may contain the previous innovation
     is_unambiguous = is_matched & (age_s >= SAME_STEP_TOLERANCE_S)
     return np.where(
         is_unambiguous if is_unambiguous.sum() > 0.5 * is_matched.sum() else is_matched,
@@ -530,7 +520,7 @@ def interpolate_component(
 def compute_rmse_to_truth(
     flight: Flight, position_m: Array, direction: Array, times_s: Array
 ) -> float | None:
-    """Return the position RMSE (m) against ground truth along a direction; None without truth."""
+    """Return the position RMSE (m) along a direction; None without ground truth."""
     if not isinstance(flight.truth, Truth):
         return None
     samples = flight.truth.samples
@@ -555,7 +545,7 @@ def _judge_agreement(
     rejected_fraction_replayed: float,
     tolerance_factor: float = 1.0,
 ) -> tuple[bool, str]:
-    """Return True if the replay agrees with the log, and the statistics as a reason."""
+    """Return True if the replay agrees with the log, and the statistics as a text."""
     variance_ratios = (axis.s_ratio_median for axis in axes.values())
     worst_variance_ratio = max(variance_ratios, key=lambda s_ratio: abs(s_ratio - 1.0))
     if abs(worst_variance_ratio - 1.0) > MAX_INNOVATION_VARIANCE_RATIO_DEVIATION:
@@ -609,7 +599,7 @@ def _judge_agreement(
 
 
 def _format_unlike_limit(value: float, limit: float) -> str:
-    """Format a value with enough decimals (at least 2) to differ from the limit."""
+    """Format a value with enough decimals to differ from the limit."""
     return next(f"{value:.{n}f}" for n in range(2, 17) if round(value, n) > limit or n == 16)
 
 
@@ -618,10 +608,7 @@ def judge_with_logged_rejections(
 ) -> Agreement:
     """Return the agreement with the log for a flight with many rejections.
 
-    With many rejections, one sample near the gate can make a correct replay differ from the log.
-    ``agreement_with_rejections`` belongs to a second replay, which rejects the same samples as
-    EKF2. Only the fields about rejections are from ``agreement``, of the replay that applies the
-    gate.
+    ``agreement_with_rejections`` is from a replay that rejects the same samples as EKF2.
     """
     rejected_fraction = agreement.rejected_fraction_logged
     is_mostly_rejected = rejected_fraction > MOSTLY_REJECTED_FRACTION

@@ -48,26 +48,24 @@ from px4fuse.trajectory.rotation import (
     to_rotation_vector,
 )
 
-# After a longer gap (s) in the position source, the replay restarts from the logged state. In gaps
-# EKF2 fuses gravity, fake positions or zero velocity, which the model does not contain
+# After a longer gap (s) in the position source, the replay restarts from the logged state. In gaps,
+# EKF2 fuses fake positions, which the model does not contain
 RESTART_GAP_S = 2.0
-# Longer IMU intervals (s) interrupt the replay: EKF2 limits a prediction step to 2 EKF2_PREDICT_US
+# A longer IMU interval (s) is a gap: EKF2 limits a prediction step to 2 EKF2_PREDICT_US
 MIN_IMU_GAP_S = 0.05
 # Minimum time (s) from EKF2's first position fusion to the start of the replay
 MIN_TIME_SINCE_FIRST_FUSION_S = 1.0
-# Minimum time (s) from take-off to the start of the replay: on the ground, EKF2 also fuses zero
-# velocity and gravity
+# Minimum time (s) from take-off to the replay: on the ground, EKF2 also fuses zero velocity
 MIN_TIME_SINCE_TAKEOFF_S = 4.0
 # Time (s) from the start of a replay to the start of the evaluation
 REPLAY_SETTLING_S = 5.0
-# EKF2's first fusion of all magnetometer axes resets the field states. Logged field states are used
-# from this time (s) after the first fusion on
+# Time (s) after which magnetic field states are valid: EKF2's first fusion resets them
 MAGNETIC_FIELD_SETTLING_S = 1.0
-# Flight time (s) before the replay that is used to estimate correlations of the initial state
+# Flight time (s) from which the correlations of the initial state are estimated
 CORRELATION_ESTIMATION_TIME_S = 20.0
 # Rate (Hz) at which EKF2 fuses the magnetometer with SENS_MAG_RATE 15 (default)
 MAG_FUSION_HZ = 14.0
-# Minimum rate (Hz) of the logged magnetometer for a replay of its fusion
+# Minimum logging rate (Hz) of the magnetometer for a replay of its fusion
 MIN_MAG_LOG_HZ = 1.5
 # Time constant (s) of EKF2's low-pass filter of innovations (updateAidSourceStatus, ekf_helper.cpp)
 INNOVATION_TIME_CONSTANT_S = 0.5
@@ -75,9 +73,9 @@ INNOVATION_TIME_CONSTANT_S = 0.5
 MIN_SEGMENT_DURATION_S = 10.0
 # Maximum delay (s) from a reset to its publication
 MAX_RESET_DELAY_S = 0.5
-# The EKF2 replay is interrupted if a larger fraction of the IMU samples within 1 s is clipped
+# Maximum fraction of clipped IMU samples within 1 s in an EKF2 replay
 MAX_CLIPPED_IMU_FRACTION = 0.05
-# If a smaller fraction of the IMU samples is missing, the EKF2 replay ignores it
+# Maximum fraction of missing IMU samples that the EKF2 replay ignores
 MAX_LOST_IMU_FRACTION = 0.02
 
 # Gravity in NED (CONSTANTS_ONE_G in PX4)
@@ -96,25 +94,24 @@ EARTH_MAGNETIC_FIELD, BODY_MAGNETIC_FIELD = slice(15, 18), slice(18, 21)
 
 @dataclass(frozen=True)
 class SensorSamples:
-    """Magnetometer or optical flow samples of one segment: m means of successive samples.
+    """Means of magnetometer or optical flow samples in one part of a flight.
 
     Attributes
     ----------
     step_indices : ndarray of int, shape (m,)
-        Prediction step that fuses the last sample of each mean.
+        Prediction step that fuses each mean.
     value : ndarray, shape (m, k)
-        Magnetic field (gauss, FRD), or velocity forward and right (m/s) from optical flow. The IMU
-        velocity change since the start of the segment is subtracted from the velocity.
+        Magnetic field (gauss, FRD), or velocity forward and right (m/s) minus IMU velocity.
     ned_to_body_rotation : ndarray, shape (m, k, 3)
         Mean rotation from NED to the body axes.
     sample_count : ndarray, shape (m,)
+        Number of samples in each mean.
     noise : ndarray, shape (m,)
         R of one sample; 0 if an EKF2 parameter determines R.
     gate : float
         Innovation gate in √S; infinite if an EKF2 parameter determines the gate.
     state_slices : tuple of slice
-        State indices of the measured vector (NED; for example the earth field) and, optionally, of
-        the sensor's bias vector (body frame).
+        State indices of the measured vector (NED) and of the sensor bias (body frame).
     """
 
     step_indices: IntArray
@@ -128,7 +125,7 @@ class SensorSamples:
 
 @dataclass(frozen=True)
 class HeightSamples:
-    """Height measurements of one segment of the EKF2 replay.
+    """Height measurements in one part of a flight.
 
     Attributes
     ----------
@@ -137,15 +134,13 @@ class HeightSamples:
     reference : str
         PX4's name of the height reference, which has no bias.
     initial_bias_and_variance : (float, float)
-        Initial bias of the sensor that is not the reference (m, positive: too high), and its
-        variance (m²).
+        Initial bias (m, positive: too high) and variance (m²) of the other height sensor.
     step_indices, measurement_times_s, down_m : ndarray, shape (m,)
         Prediction step, measurement time, and height (m, down) of each barometer sample.
     dead_zone_m : ndarray, shape (m,)
-        In ground effect, EKF2 reduces the innovation by up to this distance if the barometer height
-        is below the estimated height.
+        Dead zone of barometer innovations in ground effect; 0 without ground effect.
     weight : ndarray, shape (m,)
-        Number of barometer samples fused by EKF2 that each sample represents.
+        Number of EKF2 samples that each sample represents.
     """
 
     fused_sensors: tuple[str, ...]
@@ -160,10 +155,9 @@ class HeightSamples:
 
 @dataclass(frozen=True)
 class ReplaySegment:
-    """Part of a flight without gaps, which is replayed with n prediction steps.
+    """Part of a flight without gaps, with n prediction steps of EKF2.
 
-    The nominal attitude is EKF2's published attitude. The model estimates its error. Vectors are in
-    NED, if not stated otherwise.
+    The nominal attitude is EKF2's published attitude. Vectors are in NED by default.
 
     Attributes
     ----------
@@ -172,7 +166,7 @@ class ReplaySegment:
     body_to_ned : ndarray, shape (n + 1, 3, 3)
         Nominal attitude.
     attitude_correction_rad: ndarray, shape (n, 3)
-        Rotation of the nominal attitude in each step, minus the rotation that the gyro measured.
+        Rotation of the nominal attitude in each step, minus rotation measured by the gyro.
     specific_force_m_s2 : ndarray, shape (n, 3)
         Specific force minus nominal bias, in the body frame at the end of the step.
     accelerometer_bias_m_s2 : ndarray, shape (3,)
@@ -185,14 +179,12 @@ class ReplaySegment:
         Logged attitude minus nominal attitude, and its variance.
     initial_state_correlation : ndarray, shape (15, 15) or (21, 21)
         Estimated correlations of the initial state.
-    magnetic_field, flow : SensorSamples or None
-    height_samples : HeightSamples or None
     clipped_fraction : ndarray, shape (n + 1,), or None
         Fraction of the accelerometer axes that are clipped in the step.
     is_acceleration_bad : ndarray of bool, shape (n + 1,), or None
         Logged flag for a bad vertical acceleration.
     mean_bias_down_m_s2 : float
-        Mean vertical accelerometer bias, computed from the published velocity.
+        Mean vertical accelerometer bias.
     internal_to_published_ratio : (float, float, float)
         Ratio of EKF2's internal to its published position along each axis.
     preceding_segment : ReplaySegment or None
@@ -227,13 +219,13 @@ class ReplaySegment:
 
     @cached_property
     def imu_velocity_change_m_s(self) -> Array:
-        """Velocity change (m/s, NED) since the start, integrated from the IMU, shape (n + 1, 3)."""
+        """Velocity change (m/s, NED) since the start, integrated from the IMU; shape (n + 1, 3)."""
         acceleration_m_s2 = rotate(self.body_to_ned[1:], self.specific_force_m_s2) + GRAVITY_M_S2
         return cumulative_sums(acceleration_m_s2 * self.step_s[:, None])
 
     @cached_property
     def imu_displacement_m(self) -> Array:
-        """Displacement (m, NED) since the start, integrated from the IMU, shape (n + 1, 3)."""
+        """Displacement (m, NED) since the start, integrated from the IMU; shape (n + 1, 3)."""
         velocity = self.imu_velocity_change_m_s
         return cumulative_sums(0.5 * (velocity[1:] + velocity[:-1]) * self.step_s[:, None])
 
@@ -246,7 +238,7 @@ def group_samples_by_event(
     axes: slice,
     *quantities: Array,
 ) -> Array:
-    """Group position samples by event: each event fuses the samples since the previous one.
+    """Group position samples by event: each event fuses the samples since the previous event.
 
     Parameters
     ----------
@@ -256,16 +248,17 @@ def group_samples_by_event(
     measurement_steps : ndarray of int, shape (m,)
         Prediction step of each sample, increasing.
     position_m : ndarray, shape (m, a)
+        Position along ``axes``.
     axes : slice
-        Axes of the position within NED.
+        Axes within NED.
     *quantities : ndarray, shape (m,)
         Further quantities of each sample.
 
     Returns
     -------
     ndarray, shape (a + 2 + len(quantities), k, events)
-        Up to k samples per event. Rows: position, propagated to the event with the IMU; age (s);
-        further quantities; and 1 for a sample, 0 for padding.
+        Up to k samples per event. Rows: position propagated to the event with the IMU, age (s),
+        further quantities, and 1 for a sample (0 for padding).
     """
     event_indices = np.searchsorted(event_steps, measurement_steps)
     event_indices = event_indices[event_indices < len(event_steps)]
@@ -301,8 +294,7 @@ def make_update_table(
     Parameters
     ----------
     update_records : ndarray, shape (events, k, ...)
-        For up to k samples of each event: innovations, their variances, and optionally further
-        columns of the table in their order; NaN without a sample.
+        Innovations, variances, and further columns of up to k samples; NaN without a sample.
     measurement_times_s : ndarray, shape (events, k)
     end_s : ndarray, shape (events,)
         Time of each event.
@@ -327,7 +319,7 @@ def make_update_table(
 
 
 def pad_samples(arrays_of_samples: Sequence[Array]) -> list[Array]:
-    """Pad arrays of :func:`group_samples_by_event` with zeros to the same k samples per event."""
+    """Pad arrays of samples with zeros to the same number k of samples per event."""
     max_samples_per_event = max(samples.shape[1] for samples in arrays_of_samples)
     return [
         np.pad(samples, ((0, 0), (0, max_samples_per_event - samples.shape[1]), (0, 0)))
@@ -345,10 +337,7 @@ def find_replay_segments(
     *,
     is_gnss: bool = False,
 ) -> tuple[ReplaySegment, ...]:
-    """Find the parts of a flight without gaps in IMU and positions, after EKF2's first fusion.
-
-    ``position_times_s`` contains the timestamps of the positions.
-    """
+    """Find the parts of a flight without gaps in IMU and positions, after EKF2's first fusion."""
     innovations = ekf2.innovations["north"]
     assert isinstance(innovations, pd.DataFrame)
     fusion_times_s = innovations.index.to_numpy()
@@ -364,7 +353,7 @@ def find_replay_segments(
     airborne = () if isinstance(flight.airborne, Unavailable) else flight.airborne
     magnetic_field_span_s = _find_magnetometer_3d_fusion_span(fusion_record) if is_gnss else None
     segment_boundary_times_s += magnetic_field_span_s[1:] if magnetic_field_span_s else ()
-    # The replay restarts when another EKF2 instance becomes primary, because its state differs
+    # The replay restarts when another EKF2 instance with another state becomes primary
     segment_boundary_times_s += [time_s for time_s, _ in ekf2.primary_instances[1:]]
     parameter_changes = [change for change in ekf2.parameter_changes if change.name in PARAMETERS]
     segment_boundary_times_s += [change.time_s for change in parameter_changes]
@@ -382,7 +371,6 @@ def find_replay_segments(
         ]
         if not len(fusion_times_in_part_s):
             continue
-        # The replay starts MIN_TIME_SINCE_TAKEOFF_S after the first take-off, if before part_end_s
         earliest_starts_s = [
             start_s + MIN_TIME_SINCE_TAKEOFF_S
             for start_s, _ in airborne[:1]
@@ -434,11 +422,7 @@ def find_replay_segments(
 def _add_gnss_model_inputs(
     segment: ReplaySegment, imu: pd.DataFrame, ekf2: Ekf2, fusion_record: FusionRecord
 ) -> ReplaySegment:
-    """Add the quantities that only the GNSS model uses.
-
-    These are earth rotation, ratio of internal to published position, clipping of the
-    accelerometer, and mean vertical accelerometer bias.
-    """
+    """Add the inputs that only the GNSS model uses, such as earth rotation and clipping."""
     internal_to_published_ratio = compute_internal_to_published_ratio(fusion_record)
     initial_state = segment.state.copy()
     initial_state[POSITION] *= internal_to_published_ratio
@@ -457,7 +441,7 @@ def _add_gnss_model_inputs(
 
 
 def _find_interruption_times_s(imu: pd.DataFrame, ekf2: Ekf2) -> list[float]:
-    """Return the times (s) at which the replay must be interrupted: clipping and height resets."""
+    """Return the times (s) of clipping and height resets, which interrupt the replay."""
     interruption_times_s = [
         time
         for reset in ekf2.resets
@@ -479,7 +463,7 @@ def _find_interruption_times_s(imu: pd.DataFrame, ekf2: Ekf2) -> list[float]:
 
 
 def _compute_clipped_fraction(imu: pd.DataFrame, time_s: Array) -> Array:
-    """Return the fraction of the three accelerometer axes that is clipped in each step."""
+    """Return the clipped fraction of the three accelerometer axes in each prediction step."""
     clipped_fraction_by_step = np.zeros(len(time_s))
     # "clipped" has one bit per axis
     if "clipped" in imu:
@@ -554,8 +538,7 @@ def _make_segment(
     published_position_m = _interpolate(ekf2.state[Columns.POSITION], step_times_s[:1])[0]
     position_m = initial_row[Columns.POSITION].to_numpy()
     position_m = np.where(np.isfinite(position_m), position_m, published_position_m)
-    # Since PX4 v1.16, heights in the logged state and published heights have different origins. The
-    # model uses published heights
+    # Since PX4 v1.16, heights in estimator_states and published heights have different origins
     position_m[2] = published_position_m[2]
     return ReplaySegment(
         time_s=step_times_s,
@@ -593,7 +576,7 @@ def _make_segment(
 def _find_magnetometer_3d_fusion_span(fusion_record: FusionRecord) -> Span | None:
     """Return start and end (s) of EKF2's fusion of all three magnetometer axes.
 
-    Return None if EKF2 did not fuse all three axes, or interrupted this fusion.
+    Return None if EKF2 interrupted this fusion, or never started it.
     """
     field_gauss = fusion_record.magnetic_field_gauss
     if not len(field_gauss):
@@ -644,10 +627,10 @@ def _compute_mean_magnetic_field(
     measurement_times_s: Array,
     filtered_field_innovation_gauss: Array,
 ) -> SensorSamples:
-    """Return the mean of the magnetometer samples between successive logged rows (FRD, gauss).
+    """Return the mean magnetic field (gauss, FRD) between successive logged rows.
 
-    Mean = field predicted from the logged states - mean innovation. The mean innovation is computed
-    from two successive low-pass filtered innovations in the log.
+    Mean field = predicted field - mean innovation. The mean innovation is computed from logged
+    low-pass filtered innovations.
     """
     row_interval_s = np.diff(measurement_times_s)
     is_inside = (measurement_times_s[:-1] > segment.time_s[0]) & (
@@ -703,10 +686,9 @@ def compute_low_pass_weights(
     interval_s: Array,
     new_sample_weight: Array | float,
 ) -> tuple[IntArray, Array]:
-    """Return the samples that contribute to each low-pass filtered mean, and their weights.
+    """Return prediction step and weight of the samples in low-pass filtered means.
 
-    The first array contains the prediction step of each sample, the second array the weight. Both
-    have the shape (m, k), for m means of up to k samples. The newest sample is first.
+    Both arrays have the shape (m, k): m means of up to k samples, newest sample first.
 
     Parameters
     ----------
@@ -715,7 +697,7 @@ def compute_low_pass_weights(
     new_sample_weight : float or ndarray, shape (m,)
         Weight of a new sample in the low-pass filter.
     """
-    # Age of each sample of a mean, as a number of sample intervals; the newest sample has age 0
+    # Age of each sample in sample intervals; the newest sample has age 0
     age_in_samples = np.arange(int(sample_count.max(initial=1.0)))
     weight = np.where(
         age_in_samples < sample_count[:, None],
@@ -735,14 +717,14 @@ def add_field_states(
     initial_fields_gauss: Array,
     field_variance_gauss2: Array,
 ) -> ReplaySegment:
-    """Add the magnetic fields of earth and body to the states of a segment.
+    """Add the magnetic fields of earth and body to the states.
 
     Parameters
     ----------
     measurement_times_s, field_gauss : ndarray, shape (m,) and (m, 3)
         Magnetometer samples (body FRD) at EKF2's measurement time.
     sample_weight : float
-        Number of samples fused by EKF2 that each logged sample represents.
+        Number of EKF2 samples that each logged sample represents.
     initial_fields_gauss, field_variance_gauss2 : ndarray, shape (6,)
         Initial fields of earth (NED) and body (FRD), and their variances.
     """
@@ -769,10 +751,7 @@ def add_field_states(
 def find_sample_steps(
     segment: ReplaySegment, measurement_times_s: Array
 ) -> tuple[IntArray, BoolArray]:
-    """Return the prediction step that fuses each sample inside the segment.
-
-    The second array has one item per given sample: True if the sample is inside the segment.
-    """
+    """Return the prediction step of each sample inside the segment, and a mask of these samples."""
     step_index = np.searchsorted(segment.time_s, measurement_times_s - 1e-9)
     is_inside = (step_index > 0) & (step_index < len(segment.time_s))
     return step_index[is_inside], is_inside
@@ -791,14 +770,9 @@ def _interpolate(table: pd.DataFrame, times_s: Array) -> Array:
 def find_step_ends(
     interval_s: Array, logged_end_indices: IntArray, configured_step_s: float
 ) -> IntArray:
-    """Return the index of the IMU sample at the end of each prediction step of EKF2.
-
-    A step ends after :func:`compute_samples_per_step` IMU samples, after ``configured_step_s``, or
-    at a logged end of a step, whichever is first.
-    """
+    """Return the index of the IMU sample at the end of each prediction step of EKF2."""
     median_interval_s = float(np.median(interval_s))
-    # Number of IMU samples in each logged interval. Few missing samples are not counted, because
-    # they may be gaps of the IMU itself
+    # Few missing samples are not counted: they may be gaps of the IMU itself
     sample_counts = np.maximum(np.rint(interval_s / median_interval_s), 1.0)
     if sample_counts.mean() <= 1.0 + MAX_LOST_IMU_FRACTION:
         sample_counts[:] = 1.0
@@ -832,7 +806,7 @@ def find_step_ends(
 def downsample_imu(
     rotation_vectors: Array, velocity_increments: Array, step_end_indices: IntArray
 ) -> ArrayPair:
-    """Return the rotation (rad) and velocity change (m/s) of each prediction step from IMU samples.
+    """Return rotation (rad) and velocity change (m/s) of each prediction step from IMU samples.
 
     The velocity change is in the body frame at the end of the step.
     """

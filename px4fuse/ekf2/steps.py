@@ -1,11 +1,11 @@
-"""Explanation of the difference between KF (position and velocity states) and EKF2.
+"""Explanation of the difference between KF and EKF2.
 
-The flight is first replayed with KF. In each further replay, one more property of KF is replaced by
-the property of EKF2: sample times, noise settings, estimated states, rejections, output predictor.
-Each replacement reduces or increases the mean square difference from the logged EKF2.
+A series of replays changes KF into EKF2. Each replay replaces one more property of KF by EKF2's:
+sample times, noise settings, estimated states, rejections, output predictor. Each replacement
+changes the mean square difference from the logged EKF2.
 
-The accelerometer bias becomes a state before EKF2's process noise is used, because this noise is
-too small for a filter without bias states. The last two replays use EKF2's logged rejections.
+EKF2's process noise is too small for a filter without bias states. Therefore the accelerometer bias
+becomes a state before EKF2's process noise is used.
 """
 
 import math
@@ -47,7 +47,7 @@ NO_TRUTH_OVERLAP = Unavailable(
     "ground truth and replay do not overlap in time",
     "Record ground truth during the whole flight.",
 )
-# Names of the properties that differ between KF and EKF2
+# Names of the properties in which KF and EKF2 differ
 SAMPLE_TIMES_PROPERTY = "sample times and prediction steps"
 TIMESTAMPS_PROPERTY = "timestamps and delay"
 MEASUREMENT_NOISE_PROPERTY = "measurement noise"
@@ -60,10 +60,9 @@ FLOW_PROPERTY = "optical flow"
 VISION_PROPERTY = "external vision"
 REJECTION_PROPERTY = "rejections and resets"
 OUTPUT_PREDICTOR_PROPERTY = "output predictor"
-# Property that stands for the fusion of an additional aiding source, by PX4's name of the source
+# Names of the properties for additional aiding sources, by PX4's name of the source
 PROPERTY_BY_ADDITIONAL_AID = {FLOW.name: FLOW_PROPERTY, EV_POS.name: VISION_PROPERTY}
-# Properties of KF, in the order in which EKF2's properties replace them. Additional aiding sources
-# are inserted before REJECTION_PROPERTY
+# Order in which the properties of KF are replaced by those of EKF2
 REPLACED_PROPERTIES = (
     SAMPLE_TIMES_PROPERTY,
     TIMESTAMPS_PROPERTY,
@@ -79,17 +78,14 @@ TRACK_COLUMNS = (Columns.POSITION, Columns.VELOCITY)
 
 
 class PropertyReplacement(Record, kw_only=True):
-    """Effect of replacing one property of KF, such as the measurement noise, by EKF2's property.
+    """Effect of replacing one property of KF, such as the measurement noise, by EKF2's.
 
     Attributes
     ----------
-    name : str
-        Name of the property.
     position_mean_square_m2, velocity_mean_square_m2_s2 : float
-        Reduction, by the replacement, of the mean square difference between the replay and the
-        logged EKF2; negative for an increase.
+        Reduction of the mean square difference from the logged EKF2; negative for an increase.
     position_moved_m, moved_at_s : float
-        Largest change of the replayed position by the replacement, and time of this change.
+        Largest change of the position by the replacement, and its time.
     position_rmse_to_truth_m : float or None
         Position RMSE after the replacement.
     """
@@ -103,14 +99,14 @@ class PropertyReplacement(Record, kw_only=True):
 
 
 class RejectionRun(Record, kw_only=True):
-    """Longest run of successive position samples that EKF2 rejected in flight.
+    """Longest series of successive position samples that EKF2 rejected in flight.
 
     Attributes
     ----------
     duration_s : float
         Time from the first rejected sample to the next fused sample.
     distance_m : float
-        Largest position difference between the EKF2 replays with and without rejections.
+        Largest position difference between EKF2 replays with and without rejections.
     """
 
     start_s: float
@@ -120,7 +116,7 @@ class RejectionRun(Record, kw_only=True):
 
 
 class DifferenceOutsideReplay(Record):
-    """Largest position difference KF - EKF2 at times without a replay, and time of the maximum."""
+    """Largest position difference KF - EKF2 at times without an EKF2 replay, and its time."""
 
     maximum_m: NotNegative
     at_s: float
@@ -129,8 +125,7 @@ class DifferenceOutsideReplay(Record):
 class DifferenceExplanation(Record, kw_only=True):
     """Explanation of the mean square difference KF - EKF2 along one axis.
 
-    Each of the ``steps`` replaces one property of KF by the property of EKF2. The mean square is
-    the sum of the reductions by all steps, plus an unexplained remainder.
+    The mean square is the sum of the reductions in ``steps``, plus an unexplained remainder.
 
     Attributes
     ----------
@@ -138,17 +133,19 @@ class DifferenceExplanation(Record, kw_only=True):
         Number of EKF2 samples.
     position_mean_square_m2, velocity_mean_square_m2_s2 : float
         Mean square difference between KF and the logged EKF2.
+    steps : tuple of PropertyReplacement
+        Replacements that change KF into EKF2.
     unexplained_mean_square_m2, unexplained_velocity_mean_square_m2_s2 : float
-        Mean square difference after all steps.
+        Mean square difference after all replacements.
     outside : DifferenceOutsideReplay or None
-        Difference at times without a replay, which the steps do not explain.
+        Difference at times without an EKF2 replay.
     corrected : mapping from field of Settings to value
-        Estimates that replace wrong settings of KF before the first step.
+        Corrected settings of KF.
     sentences : tuple of str
         Explanations, largest contribution first.
     times_s, kf_minus_ekf2_m, unexplained_difference_m : ndarray
-        EKF2 sample times, and position differences before and after all steps.
-    cause_sentence: str
+        EKF2 sample times, and position differences before and after all replacements.
+    cause_sentence : str
         Sentence about the largest contribution.
     """
 
@@ -171,7 +168,7 @@ class DifferenceExplanation(Record, kw_only=True):
 
     @property
     def unexplained_fraction(self) -> float:
-        """Fraction of the mean square position difference that remains after all steps."""
+        """Unexplained fraction of the mean square position difference KF - EKF2."""
         return self.unexplained_mean_square_m2 / self.position_mean_square_m2
 
 
@@ -182,11 +179,10 @@ def explain_difference_by_replacements(
 
     Parameters
     ----------
-    model : Ekf2Model
     settings : Settings, optional
-        Settings of KF, with the time offset of the position source that EKF2 fused.
+        Settings of KF, with the time offset of the position source.
     kf_runs : mapping from axis name to Replay, optional
-        Runs of KF along horizontal axes; default: north and east, with EKF2's sample times.
+        Results of KF by horizontal axis; default: north and east.
     """
     if not model.agreement.good:
         return model.agreement.as_unavailable(DIFFERENCE_ANALYSIS_NAME)
@@ -199,7 +195,7 @@ def explain_difference_by_replacements(
     evaluated_spans = model.baseline_replay.find_evaluated_spans()
     state_times_s = ekf2.state.index.to_numpy()
     is_inside = is_inside_spans(state_times_s, evaluated_spans)
-    # Only times at which the EKF2 replay and all runs of KF have a state are compared
+    # Only times at which the EKF2 replay and KF have a state are compared
     for index in (
         baseline_replay.delayed_state.index,
         *(run.steps.index for run in kf_runs.values()),
@@ -230,7 +226,7 @@ def explain_difference_by_replacements(
                 for direction in directions.values()
             ]
         )
-        # Before REJECTION_PROPERTY, only EKF2's gate and output predictor are missing in the track
+        # Last replay before EKF2's rejections are used
         if property_name == [*configurations][-2]:
             replay_track_without_gate = track
     spans = Segment(*state_span_s, "").cut(evaluated_spans)
@@ -265,8 +261,7 @@ def _explain_difference_along_axis(
     """Divide the mean square difference KF - EKF2 along one axis among k replaced properties.
 
     ``components_by_track``, shape (k + 2, 2, n), contains position and velocity at n times. The
-    first track is KF, the last track the logged EKF2. Each of the k replays in between replaces one
-    more property of KF.
+    first track is KF, the last track is the logged EKF2.
     """
     differences_by_track = components_by_track - components_by_track[-1]
     rmse_by_track = [
@@ -317,10 +312,9 @@ def _explain_difference_along_axis(
 def make_replacement_configurations(
     inputs: ReplayInputs, kf_settings: Settings
 ) -> dict[str, FilterConfiguration]:
-    """Return the configurations that change KF into EKF2, by name of the last replaced property.
+    """Return the filter configurations that change KF into EKF2.
 
-    Each configuration replaces one more property of KF. The last configuration is EKF2 without
-    output predictor.
+    Each configuration replaces one more property of KF, whose name is the key.
     """
     logged_settings = inputs.settings
     aid = inputs.aid
@@ -329,8 +323,7 @@ def make_replacement_configurations(
     )
     kf_process_settings = {**logged_settings, "EKF2_ACC_NOISE": acceleration_noise_m_s2}
     kf_noise_settings = {**kf_process_settings, aid.noise: kf_settings.sigma_z_m}
-    # The delay is already subtracted from the GNSS times of KF, but not from the timestamps of the
-    # replay
+    # The delay is already subtracted from KF's GNSS times, but not from the replay's timestamps
     applied_delay_s = logged_settings[aid.delay] * 1e-3 if aid == GNSS_POS else 0.0
     time_offset_s = kf_settings.clock_offset_s - applied_delay_s
     settings_without_lever_arm = {**kf_noise_settings, **dict.fromkeys(aid.lever_arm, 0.0)}
@@ -396,7 +389,7 @@ def _find_longest_rejection(
     fusion_times_s = updates["fused_at_s"].to_numpy()
     if not is_rejected.any():
         return None
-    # A run of rejections lasts from the first rejected sample to the next fused sample
+    # A series of rejections ends at the next fused sample
     change_rows = np.flatnonzero(np.diff(is_rejected, prepend=False, append=False))
     run_starts, run_ends = change_rows.reshape(-1, 2).T
     longest_index = int(np.argmax(run_ends - run_starts))

@@ -1,9 +1,8 @@
 """Fusion of external vision in addition to GNSS in the EKF2 replay.
 
-EKF2 estimates a bias of the vision frame, which adapts within seconds. Vision therefore determines
-the relative motion, GNSS the position. Without GNSS, the bias is zero, and EKF2 resets its
-position to vision. Samples between two events (:mod:`px4fuse.ekf2.filter_recursion`) are fused at
-the later event. The motion in between is computed from the state and the IMU.
+EKF2 estimates a bias of the vision positions, which adapts within seconds. Vision therefore
+determines the relative motion, GNSS the position. Without GNSS, the bias is zero, and EKF2 resets
+its position to vision.
 
 Sources: PX4-Autopilot ``EKF/aid_sources/external_vision`` (``ev_pos_control.cpp``; before v1.16
 ``EKF/ev_pos_control.cpp``), ``EKF/control.cpp`` (vision is fused after GNSS and heights).
@@ -31,8 +30,8 @@ from px4fuse.flight.ekf2_parameters import EV_POS, GNSS_POS
 HORIZONTAL_VELOCITY, HORIZONTAL_POSITION = slice(3, 5), slice(6, 8)
 # EKF2 stops vision fusion after this time (s) without a sample (2 EV_MAX_INTERVAL, ev_control.cpp)
 MAX_SAMPLE_GAP_S = 0.4
-# EKF2 resets the vision bias or the position if all vision samples are outside the gate for this
-# time (s): no_aid_timeout_max (common.h)
+# EKF2 resets the vision bias or the position after this time (s) with only rejected samples:
+# no_aid_timeout_max (common.h)
 MAX_REJECTION_DURATION_S = 1.0
 
 
@@ -43,11 +42,11 @@ def group_vision_by_event(
     settings: Mapping[str, float],
     horizon_s: float,
 ) -> Array:
-    """Group the vision samples by event: each event fuses the samples since the previous one.
+    """Group the vision samples by event: each event fuses the samples since the previous event.
 
     Return an array of shape (8, k, events) for up to k samples per event. Rows: position north and
     east (m), age, measurement time, fusion time (s), reported variances north and east (m²), and 1
-    for a sample, 0 for padding.
+    for a sample (0 for padding).
     """
     vision_positions = inputs.vision_positions
     time_s = segment.time_s
@@ -83,28 +82,25 @@ def group_vision_by_event(
 
 
 class VisionFilter:
-    """Fuse vision positions as EKF2 does, in one segment and for several configurations at once.
-
-    An event is the end of an interval of the replay. At each event, the filter fuses up to k
-    samples since the previous event.
+    """Fusion of vision positions as in EKF2, for several filter configurations at once.
 
     Parameters
     ----------
-    segment : ReplaySegment
     samples_by_configuration : sequence of ndarray, shape (8, k, events)
         Result of :func:`group_vision_by_event` for each filter configuration.
     is_enabled_by_aid : mapping from PX4's name of a source to ndarray of bool, (events, filters)
     parameters : mapping from parameter name to ndarray, shape (filters,)
-    has_gate, uses_reported_noise : ndarray of bool, shape (filters,)
-        ``has_gate`` is False to fuse every sample. ``uses_reported_noise`` is False to ignore the
-        reported variances.
+    has_gate : ndarray of bool, shape (filters,)
+        False to fuse every sample.
+    uses_reported_noise : ndarray of bool, shape (filters,)
+        False to ignore the reported variances.
 
     Attributes
     ----------
     update_records : ndarray, shape (events, k, 7, filters)
         Rows of :func:`~px4fuse.ekf2.replay_segments.make_update_table` for each sample.
     position_reset_m : ndarray, shape (events, filters, 2)
-        Change of the position by a reset at each event, north and east.
+        Change of the position by resets, north and east.
     last_fusion_s : ndarray, shape (filters,)
         Time of the last position fusion or reset.
     """
@@ -125,9 +121,7 @@ class VisionFilter:
         self.update_records = np.full((event_count, sample_count, 7, configuration_count), np.nan)
         self.position_reset_m = np.zeros((event_count, configuration_count, 2))
         has_sample = (samples[7] > 0.0) & is_enabled_by_aid[EV_POS.name]
-        # The first array contains vision samples that are fused before the GNSS sample of an event.
-        # The second array contains vision samples of the same prediction step as GNSS (age 0): EKF2
-        # fuses GNSS first
+        # Samples of the same prediction step as GNSS (age 0) are fused after GNSS, as in EKF2
         self.has_sample = [has_sample & (self.age_s > 0.0), has_sample & (self.age_s == 0.0)]
         self.has_gate = has_gate
         self.is_gnss_off = ~is_enabled_by_aid[GNSS_POS.name]
@@ -147,7 +141,7 @@ class VisionFilter:
         self.was_gnss_off = self.is_gnss_off[0]
 
     def make_update_table(self, configuration_index: int, end_s: Array) -> pd.DataFrame:
-        """Return the updates of one configuration with external vision, one row per sample.
+        """Return a table of one configuration's vision updates, one row per sample.
 
         ``end_s`` contains the time (s) of each event.
         """
@@ -163,8 +157,7 @@ class VisionFilter:
     ) -> ArrayPair:
         """Fuse the vision samples of one event; return x and P.
 
-        ``is_last_step`` selects the samples: True for samples of the last prediction step before
-        the event, which EKF2 fuses after GNSS, False for older samples.
+        ``is_last_step`` is True for the samples that EKF2 fuses after GNSS.
         """
         for sample_index, has_sample in enumerate(self.has_sample[is_last_step][:, event]):
             if has_sample.any():
@@ -224,7 +217,7 @@ class VisionFilter:
             )
         )
         is_evaluated = has_sample & ~has_fusion_restarted | is_position_reset
-        # If EKF2 resets its position to a sample, it logs innovation 0 for this sample
+        # If EKF2 resets its position to a sample, it logs innovation 0
         update_records = (
             *np.where(is_position_reset, 0.0, nu.T),
             *innovation_variances.T,
@@ -274,9 +267,9 @@ class VisionFilter:
 def set_states(
     x: Array, P: Array, is_selected: BoolArray, rows: slice, value: Array, variance: Array
 ) -> None:
-    """Set value and variance of the states ``rows`` in the selected filter configurations.
+    """Set value and variance of the states ``rows``, and set their correlations to zero.
 
-    Their correlations are set to zero. ``value`` and ``variance`` have the shape (filters, states).
+    Only the selected filters change. ``value`` and ``variance`` have the shape (filters, states).
     """
     x[is_selected, rows] = value[is_selected]
     P[is_selected, :, rows] = 0.0

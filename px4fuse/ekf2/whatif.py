@@ -1,7 +1,4 @@
-"""Statistics of the logged EKF2, of its replay, and of replays with other parameters.
-
-All statistics are from the same time spans.
-"""
+"""Statistics of EKF2 as logged, as replayed, and as replayed with other parameters."""
 
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
@@ -42,8 +39,7 @@ from px4fuse.flight.ekf2_parameters import EV_POS, GNSS_POS, GNSS_VEL, MAG, chec
 from px4fuse.flight.model import Columns, Ekf2, Flight, NedAxis, Unavailable
 
 ANALYSIS_NAME = "EKF2 replay with other parameters"
-# The longest time without fusion is computed only if the log contains at least this fraction of the
-# innovations
+# Minimum fraction of logged innovations for a computation of the longest time without fusion
 MIN_LOGGED_INNOVATION_FRACTION = 0.9
 NO_TRUTH = Unavailable(
     "RMSE against ground truth",
@@ -76,20 +72,18 @@ MIN_EVALUATED_DURATION_S = 5.0
 # Default and maximum number of parameter values in a sweep
 SWEEP_VALUE_COUNT = 9
 MAX_SWEEP_VALUES = 200
-# A replay is repeated with this added position noise (m, 1 σ), to test if its statistics are
-# predictable: the rejection of one sample near the gate can change the rest of the replay
+# Position noise (m, 1 σ) that is added to test if the statistics of a replay are predictable
 ADDED_POSITION_SIGMA_M = 0.002
 # Number of repeated replays with added position noise
 REPLAYS_WITH_ADDED_NOISE = 4
-# A replay is repeated with added noise if it rejects more than this fraction of the samples
+# Minimum rejected fraction of a replay that is repeated with added noise
 MIN_REJECTED_FRACTION = 0.02
 # Above this rejected fraction, the statistics of a replay are unpredictable
 MAX_REJECTED_FRACTION = 0.35
 # EKF2 resets the height after this time (s) without height fusion (hgt_fusion_timeout_max,
 # common.h)
 HEIGHT_TIMEOUT_S = 5.0
-# Maximum ratio of largest to smallest mean NIS of repeated replays. Above this ratio, the
-# statistics are unpredictable
+# Maximum ratio of largest to smallest mean NIS of repeated replays
 MAX_NIS_RATIO_OF_NOISY_REPLAYS = 1.10
 # Maximum difference between largest and smallest rejected fraction of repeated replays
 MAX_REJECTED_SPREAD_OF_NOISY_REPLAYS = 0.03
@@ -100,7 +94,7 @@ MAX_RMSE_RATIO_OF_NOISY_REPLAYS = 1.15
 class AxisStatistics(Record):
     """EKF2 statistics along one axis, with one set of parameters.
 
-    ``nis_mean`` includes rejected samples; ``sigma_p_median_m`` is the median reported σ.
+    ``sigma_p_median_m`` is the median reported σ. The mean NIS includes rejected samples.
     """
 
     nis_mean: NotNegative
@@ -111,7 +105,7 @@ class AxisStatistics(Record):
 
 
 class AidStatistics(Record):
-    """Innovation statistics of an aiding source other than the position source."""
+    """Innovation statistics of one aiding source."""
 
     nis_mean: NotNegative
     nis_band: tuple[NotNegative, NotNegative]
@@ -127,7 +121,7 @@ class AidStatistics(Record):
 
 
 class Ekf2Statistics(Record, kw_only=True, omit_defaults=False):
-    """EKF2 statistics with one set of parameters: as logged, replayed, or changed.
+    """EKF2 statistics with one set of parameters.
 
     Attributes
     ----------
@@ -139,11 +133,12 @@ class Ekf2Statistics(Record, kw_only=True, omit_defaults=False):
         Number of horizontal position resets.
     heading_error_mean_deg : float or Unavailable
         Mean of heading minus true heading, clockwise from above.
-    heights, others : mapping from PX4's name to AidStatistics
-        ``heights``: statistics of each replayed height sensor. ``others``: statistics of vision, if
-        EKF2 fuses vision in addition to GNSS.
+    heights : mapping from PX4's name to AidStatistics
+        Statistics of each height sensor.
+    others : mapping from PX4's name to AidStatistics
+        Statistics of vision in addition to GNSS.
     late, lost : int
-        Number of samples that were fused late, and number of samples that arrived too late.
+        Number of samples that were fused late, and number of samples too late to be fused.
     is_predictable : bool
         False if the statistics depend on the rejection of single samples.
     """
@@ -185,7 +180,7 @@ class Ekf2Statistics(Record, kw_only=True, omit_defaults=False):
 
 @dataclass(frozen=True)
 class WhatIf:
-    """Innovation and error statistics of EKF2: logged, replayed, and with other parameters.
+    """Statistics of EKF2 as logged, as replayed, and with other parameters.
 
     Attributes
     ----------
@@ -194,7 +189,7 @@ class WhatIf:
     whatif : tuple of Ekf2Statistics
         Statistics with each set of changed parameters.
     evaluated_s : tuple of (float, float)
-        Time spans (start, end) of the statistics.
+        Start and end of each evaluated time span.
     notes : tuple of str
         Limitations of the replay.
     """
@@ -237,8 +232,7 @@ def what_if(
     spans_s = model.baseline_replay.find_evaluated_spans()
     if disable_time_s_by_aid:
         first_disable_time_s = min(disable_time_s_by_aid.values())
-        # Only the first remaining segment is evaluated: later segments start from logged states, to
-        # which the disabled source contributed
+        # Later segments start from logged states, to which the disabled source contributed
         replay_end_s = spans_s[-1][1]
         spans_after_disabling = [
             (max(start, first_disable_time_s), end)
@@ -334,9 +328,9 @@ def _mark_unpredictable(
     spans_s: Spans,
     disable_time_s_by_aid: Mapping[str, float],
 ) -> tuple[Ekf2Statistics, ...]:
-    """Set ``is_predictable`` to False if repetitions of a replay with added noise differ.
+    """Set ``is_predictable`` of each replay.
 
-    Many rejections or a height reset also set ``is_predictable`` to False.
+    A replay is not predictable if repetitions with added position noise differ.
     """
     summaries_by_replay = [[summary] for summary in summaries]
     summaries_of_noisy_replays = [
@@ -408,7 +402,7 @@ def _summarise_replay(flight: Flight, replay: Ekf2Replay, spans_s: Spans) -> Ekf
             f"time. {replay.lost} samples would arrive too late, after the fusion horizon",
             "Choose another parameter value.",
         )
-    # Interpolated position variance: before each update (1 µs earlier), and after it
+    # Position variance just before (1 µs) and after each update
     variance = pd.DataFrame(index=np.column_stack([update_times_s - 1e-6, update_times_s]).ravel())
     for axis in HORIZONTAL_AXES:
         innovation_variance, noise_variance = (
@@ -460,7 +454,7 @@ def _summarise_log(flight: Flight, replay: Ekf2Replay, spans_s: Spans) -> Ekf2St
         longest_gap_s = _find_longest_gap_s(
             np.concatenate([fusion_times_s, reset_times_s]), spans_s
         )
-    # a flight with a replay has an attitude
+    # A flight with a replay has an attitude
     assert isinstance(flight.attitude, pd.DataFrame)
     headings_rad = pd.Series(heading_rad(flight.attitude), flight.attitude.index)
     other_aid_updates = {
@@ -494,7 +488,7 @@ def _make_summary(
     headings_rad: pd.Series,
     **other_fields: Any,
 ) -> Ekf2Statistics:
-    """Compute EKF2's statistics; ``other_fields`` are fields of :class:`Ekf2Statistics` to add.
+    """Return EKF2's statistics; ``other_fields`` are further fields of :class:`Ekf2Statistics`.
 
     Without ``variance``, the logged position variance is used.
     """
@@ -630,15 +624,14 @@ def _describe_replay_limits(model: Ekf2Model, replay: Ekf2Replay) -> Iterator[st
             f"({min_noise_m:g} m)"
         )
     if replay.late or replay.lost:
-        # Some received samples have no update: of two samples in one prediction step, EKF2 fuses
-        # only the newer
+        # Of two samples in one prediction step, EKF2 fuses only the newer
         received_count = max(len(replay.updates), replay.late) + replay.lost
         note = (
             f"{_format_changes(replay)}: {replay.late + replay.lost} of {received_count} samples "
             "would arrive late, after the fusion horizon. EKF2 would never fuse "
             f"{replay.lost} of them"
         )
-        # If the horizon is the largest delay, the PX4 release has no parameter EKF2_DELAY_MAX
+        # PX4 releases with this rule have no parameter EKF2_DELAY_MAX
         is_horizon_largest_delay = model.inputs.rules.is_horizon_largest_delay
         yield note if is_horizon_largest_delay else f"{note}. Increase EKF2_DELAY_MAX"
 
