@@ -30,7 +30,7 @@ class SpanConsistency(NamedTuple):
 
 
 def detect(analysis: Analysis) -> Findings:
-    """Detect EKF2 parameters that are changed in flight and that px4fuse uses."""
+    """Detect changes of EKF2 parameters in flight."""
     ekf2, segment = analysis.flight.ekf2, analysis.segment
     fusion_parameters = (find_aid(analysis).switch, AID_MASK_PARAMETER)
     changes = [
