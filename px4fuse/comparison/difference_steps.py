@@ -33,9 +33,9 @@ MIN_CONTRIBUTION_FRACTION = 0.05
 MIN_SETTING_TO_ESTIMATE_RATIO = 4.0
 # Smaller changes of the position (m) are not reported
 MIN_POSITION_CHANGE_M = 1e-6
-# Minimum reported position difference KF - EKF2 (m) while EKF2 is not replayed
+# Minimum reported position difference KF - EKF2 (m) outside the replayed time
 MIN_DIFFERENCE_OUTSIDE_REPLAY_M = 0.5
-# Minimum ratio of the position differences: while EKF2 is not replayed to while it is replayed
+# Minimum ratio of the position difference outside the replayed time to that inside
 MIN_OUTSIDE_TO_INSIDE_REPLAY_RATIO = 3.0
 
 
@@ -214,7 +214,7 @@ def add_cause_sentences(
 
 def _describe_step_effect(step: PropertyReplacement, explanation: DifferenceExplanation) -> str:
     explained_fraction = step.position_mean_square_m2 / explanation.position_mean_square_m2
-    # The contributions add up to 1. If one is above 1, others are negative
+    # The contributions add up to 1, so one above 1 means that others are negative
     opposite_effect_text = (
         " Other properties of EKF2 increase the difference KF - EKF2."
         if explained_fraction > 1.0

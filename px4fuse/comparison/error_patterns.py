@@ -18,7 +18,6 @@ from px4fuse.flight.model import Columns, Ekf2, Unavailable, rows_between
 from px4fuse.trajectory.rotation import conjugate, interpolate, multiply, to_rotation_vector
 from px4fuse.trajectory.scores import compute_autocorrelation_time
 
-# Minimum number of positions to search for error patterns
 MIN_POSITIONS = 100
 # Rows of the four neighbours of a position, relative to its own row
 NEIGHBOUR_ROW_OFFSETS = np.array([-2, -1, 1, 2])
@@ -28,7 +27,6 @@ MAX_NEIGHBOUR_SPAN_IN_INTERVALS = 8.0
 MAX_RESIDUAL_SIGMA_RATIO = 4.0
 # Number of timestamps in the running median, which removes jitter
 TIMESTAMP_MEDIAN_FILTER_LENGTH = 9
-# Half of the time (s) over which a velocity is averaged
 VELOCITY_HALF_WINDOW_S = 0.3
 # Neighbouring residuals are correlated: this number counts as one independent residual
 RESIDUAL_CORRELATION_LENGTH = 3
@@ -44,9 +42,8 @@ MIN_SIGNIFICANCE_SIGMAS = 6.0
 FLIGHT_PART_COUNT = 5
 # Minimum ratio of the correlation of noise and speed to its σ (median over the flight parts)
 MIN_NOISE_SPEED_CORRELATION_SIGMAS = 1.2
-# Quantiles of the speed in slow flight and in fast flight
+# Quantiles of the speed that limit slow flight and fast flight
 SLOW_SPEED_QUANTILE, FAST_SPEED_QUANTILE = 0.3, 0.7
-# Minimum ratio of the noise in fast flight to the noise in slow flight
 MIN_FAST_TO_SLOW_NOISE_RATIO = 1.6
 # Minimum extent of a path to fit scale factor and rotation: RMS distance (m) from its mean
 MIN_RMS_DISTANCE_FROM_PATH_MEAN_M = 0.5
@@ -66,13 +63,10 @@ MAX_REMAINING_SLOW_ERROR_FRACTION = 0.2
 MIN_PERIODIC_ERROR_FRACTION = 0.88
 # Minimum amplitude of a sinusoidal error, in σ of white noise
 MIN_AMPLITUDE_TO_WHITE_NOISE_RATIO = 1.0
-# Minimum number of periods of a sinusoidal error in the flight
 MIN_PERIOD_COUNT = 5.0
 # Maximum tested frequency (Hz) of a sinusoidal error
 MAX_FREQUENCY_HZ = 2.0
-# Step of the tested frequencies: this number of periods per flight
 FREQUENCY_STEP_IN_PERIODS_PER_FLIGHT = 0.2
-# Minimum number of time bins per period of a sinusoidal error
 MIN_BINS_PER_PERIOD = 30
 # Above this fraction of the motion at the same frequency, motion may cause the sinusoidal error
 MAX_MOTION_FRACTION_AT_ERROR_FREQUENCY = 0.1
@@ -82,7 +76,6 @@ ROTATION_INTERVAL_S = 0.01
 MAX_ATTITUDE_DELAY_S = 0.5
 # Minimum reported delay (s) of the logged attitude
 MIN_ATTITUDE_DELAY_S = 0.04
-# Maximum number of compared rotations, to limit the computing time
 MAX_ROTATION_COUNT = 20_000
 # Duration (s) of each compared rotation
 ROTATION_COMPARISON_TIME_S = 0.1

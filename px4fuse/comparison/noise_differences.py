@@ -16,11 +16,10 @@ from px4fuse.flight.model import Unavailable
 
 # Minimum ratio of the mean NIS along north and east, for separate noise estimates
 MIN_AXIS_NIS_RATIO = 1.7
-# Minimum ratio of the noise correlation of north and east to its σ: 1 in 3 million by chance
+# Minimum ratio of the noise correlation (north to east) to its σ: reached by chance once in 3
+# million flights
 MIN_CORRELATION_SIGMAS = 5.0
-# Maximum number of compared flight parts
 MAX_FLIGHT_PART_COUNT = 12
-# Minimum number of measurements in each compared flight part
 MIN_PART_MEASUREMENTS = 25
 
 

@@ -87,7 +87,6 @@ def prepare_comparison_inputs(
     if convention is not None and settings.clock_offset_s:
         convention = structs.replace(convention, late_s=0.0)
     timestamp_delay_s = find_convention_faults(convention, flight, source_track.frame).late_s
-    # Clip the time offset to its valid range
     clock_offset_limits_s = SETTING_RANGES["clock_offset_s"][:2]
     clock_offset_s = float(
         np.clip(settings.clock_offset_s - timestamp_delay_s, *clock_offset_limits_s)

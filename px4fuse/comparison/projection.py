@@ -24,7 +24,6 @@ from px4fuse.flight.model import (
 
 # Minimum measurement noise √R (m) that EKF2 uses (ev_pos_control.cpp, EKF2.cpp)
 EKF2_MIN_NOISE_M = 0.01
-# Minimum number of samples for statistics of a difference
 MIN_COMMON_SAMPLES = 3
 # NED columns of each projected quantity, and exponent of the direction cosines (2 for variances)
 PROJECTED_COLUMNS: Mapping[str, tuple[list[str], int]] = {

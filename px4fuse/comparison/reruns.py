@@ -81,8 +81,7 @@ DIFFERENCE_UNAVAILABLE = Unavailable(
     "this re-run rotates only KF's frame, so positions of KF and EKF2 are not comparable",
     "",
 )
-# Maximum factor between replay and log in position RMSE and σ ratios, to compare re-runs with the
-# log
+# Maximum ratio of RMSE or σ ratio, replay to log, to compare re-runs with the log
 MAX_REPLAYED_TO_LOGGED_RATIO = 1.10
 
 

@@ -12,7 +12,6 @@ from px4fuse.filter.consistency import Reference, classify_sigma_ratio, compute_
 from px4fuse.flight.ekf2_parameters import EV_POS
 
 Statistic = Literal["nis", "nees", "difference"]
-# Statistics that show whether a filter is consistent
 CONSISTENCY_STATISTICS: tuple[Statistic, Statistic] = ("nees", "nis")
 # Changed KF settings, EKF2 parameters or data, by name
 Change = Mapping[str, float]
@@ -24,17 +23,16 @@ Improvement = Literal["position and σ", "position", "σ only", "nothing"]
 MIN_REPORTED_NEES = 4.0
 # A smaller noise makes a filter overconfident if the mean NEES reaches this value
 MIN_OVERCONFIDENT_NEES_AFTER_CHANGE = 2.0
-# A change is a possible cause if it removes 50 % to 150 % of ln(mean NIS) or ln(mean NEES)
+# A possible cause explains 50 % to 150 % of ln(mean NIS) or ln(mean NEES)
 POSSIBLE_CAUSE_FRACTION_TOLERANCE = 0.5
-# A sensor fault is the only cause if its correction removes 75 % to 125 % of ln(mean NIS or NEES)
+# A sensor fault is the only cause if it explains 75 % to 125 % of ln(mean NIS or NEES)
 ONLY_CAUSE_FRACTION_TOLERANCE = 0.25
-# Two changes are combined in a re-run if each change removes 10 % to 190 % of ln(mean NIS or NEES)
+# Two changes are combined if each explains 10 % to 190 % of ln(mean NIS or NEES)
 COMBINED_CHANGE_FRACTION_TOLERANCE = 0.9
-# Changes that correct faulty sensor data
 SENSOR_CORRECTION_KEYS = frozenset((OUTLIERS_KEY, CLOCK_OFFSET_KEY, ROTATION_KEY, FORWARD_BIAS_KEY))
 # Changes that have an effect only together with another change
 SECONDARY_CHANGE_KEYS = frozenset(("EKF2_DELAY_MAX", EV_POS.noise_mode_parameter, RIGHT_BIAS_KEY))
-# A re-run has an effect if it changes a ratio of actual to reported σ by at least this factor
+# A re-run has an effect if it changes a σ ratio by at least this factor
 MIN_SIGMA_RATIO_CHANGE_FACTOR = 1.10
 # A re-run has an effect if it changes the position RMSE by more than this fraction
 MIN_RMSE_CHANGE_FRACTION = 0.05
