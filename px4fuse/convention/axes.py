@@ -52,20 +52,17 @@ BAROMETER_SIGMA_M = 0.5
 INDEPENDENT_HEIGHT_ERROR_COUNT = 6.0
 # Larger height errors (m) count as this value, so that outliers have little effect
 MAX_HEIGHT_ERROR_M = 20.0 * BAROMETER_SIGMA_M
-# Maximum number of hypotheses that are refined after the grid search
 MAX_REFINED_HYPOTHESES = 8
 # Hypotheses are refined if their score is at most this much (nats) below the best score
 MAX_SCORE_BELOW_BEST_TO_REFINE = 60.0
 # Maximum number of second differences in one least-squares fit, to limit the computing time
 MAX_REFINEMENT_ROWS = 1200
-# Number of Gauss-Newton iterations to refine a hypothesis
 REFINEMENT_ITERATIONS = 7
 # Maximum change (s) of the time offset in one Gauss-Newton iteration
 MAX_TIME_OFFSET_STEP_S = 0.15
 # Prior precision (σ⁻²) of Hypothesis.parameters: gyroscope heading drift (0.05 °/s), accelerometer
 # bias (0.3 m/s²)
 PARAMETER_PRIOR_PRECISION = np.array([0.0, 0.0, np.radians(0.05) ** -2, 0.0, *[0.3**-2] * 3])
-# Horizontal directions, clockwise from above
 CLOCKWISE_DIRECTIONS: tuple[Direction, ...] = ("north", "east", "south", "west")
 # Log prior odds of common directions of x, y, z
 LOG_PRIOR_ODDS_BY_AXES: Final[dict[AxisDirections, float]] = {

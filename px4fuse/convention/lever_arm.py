@@ -20,9 +20,7 @@ from px4fuse.trajectory.scores import compute_autocorrelation_time
 MIN_LEVER_ARM_M = 0.2
 # Minimum ratio of a reported lever arm to its σ: noise reaches 1.5
 MIN_LEVER_ARM_SIGMAS = 2.5
-# Minimum reported lever arm (m) with ground truth
 MIN_LEVER_ARM_WITH_TRUTH_M = 0.05
-# Minimum ratio of a reported lever arm to its σ, with ground truth
 MIN_LEVER_ARM_SIGMAS_WITH_TRUTH = 5.0
 # Maximum reported lever arm (m): larger values are frame errors of the position source
 MAX_LEVER_ARM_M = 5.0
@@ -30,9 +28,7 @@ MAX_LEVER_ARM_M = 5.0
 MAX_RESIDUAL_SIGMAS = 3.0
 # Minimum ratio of singular values in the lever arm fit with ground truth
 MIN_SINGULAR_VALUE_RATIO = 0.02
-# Minimum number of position coordinates in the lever arm fit with ground truth
 MIN_COORDINATE_COUNT = 40
-# Number of lever arm fits; each excludes the outliers of the previous one
 LEVER_ARM_FIT_COUNT = 4
 
 

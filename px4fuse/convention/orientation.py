@@ -49,9 +49,7 @@ MIN_ANGLE_DIFFERENCE_IN_SCORE_DEG = 0.7
 SCORE_WEIGHT_PER_S = 0.5
 # Minimum lead (nats) of the best convention over the second best, for the verdict "determined"
 MIN_CONVENTION_SCORE_LEAD = 4.0
-# Maximum number of compared orientations
 MAX_ORIENTATION_COUNT = 600
-# Minimum number of orientations in flight
 MIN_ORIENTATION_COUNT = 20
 
 
