@@ -16,12 +16,10 @@ from px4fuse.findings.model import Findings, finding, format_percent, make_note,
 from px4fuse.flight.ekf2_parameters import AIDS, BAROMETER, MAG
 from px4fuse.flight.model import BAD_ACCELERATION_FLAG, Unavailable
 
-# Aiding sources of external vision
 AIDS_TESTED_BY_REPLAY = ("ev_pos", "ev_hgt")
 # A barometer gap that begins within this time (s) after take-off is normal: ground effect
 GROUND_EFFECT_DURATION_S = 10.0
-# Minimum ratio of the height error in a barometer gap to the height RMSE outside, to state the
-# error
+# Minimum ratio of the height error in a barometer gap to the height RMSE outside
 MIN_GAP_ERROR_TO_HEIGHT_RMSE_RATIO = 3.0
 # Aiding sources whose vertical innovations EKF2 tests to flag a bad vertical acceleration
 AIDS_OF_VERTICAL_ACCELERATION_TEST = ("gnss_vel", "gnss_hgt", "baro_hgt")

@@ -21,7 +21,6 @@ from px4fuse.flight.model import Unavailable, source_name
 
 # Minimum factor between EKF2's noise parameter and its estimate, for severity "error"
 MIN_NOISE_FACTOR_FOR_ERROR = 2.0
-# Minimum fraction of rejected positions in the first sentence of the message
 MIN_REJECTED_FRACTION_IN_MESSAGE = 0.05
 
 

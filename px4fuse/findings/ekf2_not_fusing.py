@@ -31,9 +31,9 @@ from px4fuse.flight.model import (
     positions_phrase,
 )
 
-# Missing fusion is an error if EKF2 fuses the positions for less than this fraction of the time
+# Severity "error" if EKF2 fuses the positions for less than this fraction of the time
 FUSED_FRACTION_FOR_ERROR = 0.5
-# Missing fusion is reported if EKF2 fuses the positions for less than this fraction of the time
+# Warning if EKF2 fuses the positions for less than this fraction of the time
 FUSED_FRACTION_FOR_WARNING = 0.98
 # Minimum mean interval (s) of positions: jitter then causes intervals above EV_START_INTERVAL_S
 MIN_INTERVAL_FOR_LATE_START_S = 0.18

@@ -19,7 +19,6 @@ from px4fuse.flight.model import Ekf2, Unavailable
 
 # Minimum rejected fraction for a warning: with a gate of 5 √S, a consistent filter rejects 6e-7
 REJECTED_FRACTION_FOR_WARNING = 0.01
-# Minimum fraction of rejected positions, for severity "error"
 REJECTED_FRACTION_FOR_ERROR = 0.20
 # Maximum ratio of rejected fractions, after to before a change that prevents rejections
 MAX_REJECTED_AFTER_TO_BEFORE_RATIO = 0.5

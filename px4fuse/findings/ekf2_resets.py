@@ -21,7 +21,7 @@ from px4fuse.flight.model import Ekf2, Reset
 TAKE_OFF_DURATION_S = 10.0
 # Maximum time (s) from the end of a position gap to the EKF2 reset that it causes
 MAX_RESET_DELAY_S = 5.0
-# Maximum delay (s) of the normal reset at the start of fusion: fusion flags are logged at 1 Hz
+# Maximum delay (s) of the normal reset at the start of fusion, because flags are logged at 1 Hz
 MAX_FUSION_START_TO_RESET_S = 1.0
 
 

@@ -37,7 +37,6 @@ BIAS_LIMIT_PARAMETERS = (
 MIN_BIAS_TO_LIMIT_RATIO = 0.98
 # Minimum fraction of the flight with a bias at its limit, for a finding
 MIN_TIME_AT_LIMIT_FRACTION = 0.5
-# Length (s) of the windows in which rest is tested
 REST_WINDOW_S = 1.0
 # Time (s) before take-off in which the motors run
 MOTOR_RUN_UP_DURATION_S = 0.5

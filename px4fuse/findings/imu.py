@@ -21,7 +21,6 @@ from px4fuse.flight.model import Columns, Ekf2, Flight, sample_rate
 
 # Maximum specific force (m/s²) of real sensors: 35 g, because the largest range is 32 g
 MAX_PLAUSIBLE_SPECIFIC_FORCE_M_S2 = 343.0
-# Minimum number of implausible samples for a finding
 MIN_IMPLAUSIBLE_FORCE_SAMPLES = 3
 # Minimum accelerometer bias (m/s²), for severity "error": a position error of 0.15 m after 1 s
 MIN_BIAS_FOR_ERROR_M_S2 = 0.3
@@ -33,9 +32,8 @@ MIN_REPORTED_IMU_GAP_S = 0.2
 MIN_IMU_RATE_HZ = 50.0
 # Minimum attitude rate (Hz) for interpolation of the attitude
 MIN_ATTITUDE_RATE_HZ = 10.0
-# Clipping is reported if it lasts longer than this time (s): a touch-down clips one or two samples
+# Maximum normal duration (s) of clipping: a touch-down clips one or two samples
 MAX_CLIPPING_DURATION_S = 0.1
-# Minimum time (s) between two separate time spans of clipping
 MIN_TIME_BETWEEN_CLIPPINGS_S = 2.0
 # Mask of SDLOG_PROFILE, bit 4: full IMU rate (logged_topics.cpp)
 SDLOG_HIGH_RATE_MASK = 16

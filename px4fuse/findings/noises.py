@@ -45,7 +45,6 @@ from px4fuse.request import COMPARISON_OPTIONS
 
 # Minimum factor between a noise setting and its estimate, for a warning
 MIN_SETTING_TO_ESTIMATE_FACTOR = 1.5
-# Minimum factor between a noise setting and its estimate, for severity "error"
 MIN_NOISE_FACTOR_FOR_ERROR = 4.0
 # KF ignores new positions if its time constant exceeds this value (s)
 MIN_KF_TIME_CONSTANT_S = 2.5
@@ -54,13 +53,11 @@ INTERVAL_WIDENING_FACTOR = 1.5
 # KF lags if the lag-1 autocorrelation of its innovations exceeds this value (white noise: 0.2)
 MIN_LAG1_AUTOCORRELATION = 0.3
 
-# Minimum factor between actual and reported σ, for severity "error"
 MIN_SIGMA_FACTOR_FOR_ERROR = 2.0
 # Maximum ratio of equal noises: the median of 100 values has a standard error of 12 %
 MAX_RATIO_OF_EQUAL_NOISES = 1.25
 # EKF2 uses the reported variance if √R exceeds EKF2_EVP_NOISE by more than this factor
 MIN_USED_TO_PARAMETER_NOISE_RATIO = 1.25
-# Action if no re-run corrects the wrong σ
 UNEXPLAINED_SIGMA_ACTION = (
     "No tested change of noise, time offset, frame or outliers explains the wrong σ. Check the "
     "IMU (rate, gaps, vibration)."
@@ -82,7 +79,6 @@ KEEP_NOISE_BECAUSE_OF_CORRELATION_ACTION = (
 KEEP_NOISE_BECAUSE_OF_TRUTH_ACTION = (
     "Do not reduce noise settings: ground truth shows that a smaller σ would be too small."
 )
-# Effect of a wrong noise setting on KF, and the reason
 EFFECT_AND_REASON_BY_WRONG_SETTING = {
     (SIGMA_Z, "small"): (
         "KF follows the noise of single positions",

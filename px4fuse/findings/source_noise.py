@@ -31,24 +31,20 @@ from px4fuse.flight.model import Columns, positions_phrase, source_name
 
 # Minimum ratio of white noise σ to time-correlated noise σ, for a separate fault
 MIN_WHITE_TO_CORRELATED_SIGMA_RATIO = 0.3
-# Minimum log likelihood ratio (nats) of time-correlated to white noise: 1 of 400 flights without a
-# fault exceeds it
+# Minimum log likelihood ratio (nats): 1 of 400 flights without a fault exceeds it
 MIN_CORRELATED_NOISE_LOG_LIKELIHOOD_RATIO_NATS = 5.0
 # Minimum time-correlated error (m, 1 σ): errors of timestamps and motion cause some mm
 MIN_CORRELATED_NOISE_SIGMA_M = 0.005
 # Minimum fraction of repeated positions for a warning
 MIN_REPEATED_FRACTION = 0.05
-# Minimum fraction of repeated positions, for severity "error"
 MIN_REPEATED_FRACTION_FOR_ERROR = 0.3
-# Minimum number of repeated positions for a finding
 MIN_REPEATED_POSITION_COUNT = 10
-# Minimum ratio of the larger to the smaller position noise σ of north and east, for a finding
+# Minimum ratio of the larger to the smaller position noise σ, north and east
 MIN_AXIS_NOISE_RATIO = 1.5
-# Minimum ratio of the noise in one part of the flight to the noise in the rest, for a warning
+# Minimum ratio of the noise in one flight part to the noise in the rest, for a warning
 MIN_NOISY_PART_SIGMA_RATIO = 2.0
 # Minimum noise ratio of one flight part to the rest, without outliers, for a warning
 MIN_NOISY_PART_SIGMA_RATIO_WITHOUT_OUTLIERS = 1.5
-# Minimum ratio of the noise in one part of the flight to that in the rest, for severity "error"
 MIN_NOISY_PART_SIGMA_RATIO_FOR_ERROR = 4.0
 
 

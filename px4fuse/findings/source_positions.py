@@ -57,7 +57,7 @@ from px4fuse.flight.model import (
 
 # Minimum extent (m) of the positions of a moving vehicle (5th to 95th percentile)
 MIN_MOTION_RANGE_M = 0.5
-# Minimum extent ÷ noise σ of a moving vehicle: at rest it is 3.29; 25 % is margin
+# Minimum extent of motion, in σ of the noise: noise alone has 3.29 σ, 25 % is margin
 MIN_MOTION_RANGE_TO_NOISE_RATIO = 1.25 * 3.29
 # Minimum log likelihood ratio (nats) of low-pass filtered to white noise; unfiltered: 0 to 2
 MIN_LOW_PASS_LOG_LIKELIHOOD_RATIO_NATS = 6.0
@@ -65,9 +65,9 @@ MIN_LOW_PASS_LOG_LIKELIHOOD_RATIO_NATS = 6.0
 MIN_LOW_PASS_TO_CORRELATED_NOISE_NATS = 1.0
 # Maximum ratio of the lag from the noise correlation to the measured delay (upper 95 % limit)
 MAX_ESTIMATED_LAG_TO_DELAY_RATIO = 4.0
-# Minimum lag (s) due to a low-pass filter, for a warning: a position error of 5 cm at 1 m/s
+# Minimum filter lag (s) for a warning: a position error of 5 cm at 1 m/s
 MIN_LAG_S = 0.05
-# Minimum lag (s) due to a low-pass filter, for severity "error": a position error of 10 cm at 1 m/s
+# Minimum filter lag (s) for severity "error": a position error of 10 cm at 1 m/s
 MIN_LAG_FOR_ERROR_S = 0.10
 # Minimum position jump (m) for a warning: twice the noise of good UWB (0.1 m)
 MIN_JUMP_M = 0.2
@@ -77,7 +77,6 @@ MIN_JUMP_SIGMAS = 5.0
 MIN_JUMPS_WITH_RESET_COUNTER = 2
 # Minimum number of jumps without a change of reset_counter to report repeated jumps
 MIN_JUMPS_WITHOUT_RESET_COUNTER = 3
-# Minimum size (m) of a jump without a change of reset_counter
 MIN_JUMP_WITHOUT_RESET_COUNTER_M = 0.1
 # Minimum ratio of a jump without a change of reset_counter to the median of position changes
 MIN_JUMP_TO_MEDIAN_CHANGE_RATIO = 8.0
@@ -94,7 +93,6 @@ MAX_JUMP_TO_MEDIAN_INTERVAL_RATIO = 1.5
 MIN_OPPOSITE_JUMP_FRACTION = 0.7
 # Maximum time (s) from a position jump to the reset of EKF2 that the jump causes
 MAX_JUMP_TO_RESET_TIME_S = 5.0
-# Maximum number of jumps whose times are printed
 MAX_LISTED_JUMPS = 8
 # Maximum rounding difference (s) between the times of a position and its reset_counter
 RESET_TIME_TOLERANCE_S = 1e-4
@@ -108,7 +106,7 @@ MIN_JUMP_FOR_ERROR_M = 0.5
 MIN_SCALE_ERROR_FOR_WARNING = 0.12
 # Minimum scale factor error (ratio minus 1), for severity "error": 1 m in a distance of 7 m
 MIN_SCALE_ERROR_FOR_SEVERITY_ERROR = 0.15
-# Minimum |scale factor error| / σ of its estimate, for a warning: 0.3 % of correct sources exceed 3
+# Minimum |scale factor error| / σ: 0.3 % of correct sources exceed 3
 MIN_SCALE_ERROR_TO_SIGMA_RATIO = 3.0
 # Minimum fraction of outliers for a warning: normal noise has 0.02 % beyond 3.7 σ
 MIN_OUTLIER_FRACTION = 0.005
@@ -119,7 +117,6 @@ MIN_OUTLIERS = 3
 MIN_LOGGED_POSITION_FRACTION = 0.75
 # Minimum factor between reported and estimated position variance for a warning
 MIN_REPORTED_VARIANCE_FACTOR = 2.0
-# Minimum factor between reported and estimated position variance, for severity "error"
 MIN_REPORTED_VARIANCE_FACTOR_FOR_ERROR = 3.0
 
 

@@ -42,7 +42,6 @@ MIN_LATENCY_FOR_ERROR_S = 0.10
 MIN_LATENCY_CORRELATION = 0.8
 # Minimum fraction of positions that EKF2 drops because of their latency, for a finding
 MIN_DROPPED_POSITION_FRACTION = 0.02
-# Minimum number of positions before and after the convergence of TIMESYNC
 MIN_POSITIONS_BEFORE_AND_AFTER_TIMESYNC = 10
 # Minimum fraction of arrival times before the convergence of TIMESYNC, and of measurement times
 # after
@@ -51,7 +50,6 @@ MIN_FRACTION_OF_TIMESTAMP_KIND = 0.95
 MIN_BURST_POSITIONS = 2.5
 # Minimum number of bursts: a few pauses are gaps in the position source
 MIN_BURST_COUNT = 20
-# Maximum ratio of the duration of a burst to the pause between bursts
 MAX_BURST_TO_PAUSE_DURATION_RATIO = 0.3
 ANSWER_TIMESYNC_ACTION = (
     "Let the companion computer answer TIMESYNC (MAVROS does by default; with pymavlink answer "

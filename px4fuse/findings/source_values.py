@@ -31,7 +31,6 @@ MIN_SENDER_DISTANCE_M = 0.1
 MIN_SENDER_DISTANCE_SIGMAS = 4.0
 # Window length (samples), short because a lost sample exchanges odd and even samples
 WINDOW_SAMPLES = 16
-# Minimum number of windows to detect two senders
 MIN_WINDOWS_FOR_TWO_SENDERS = 10
 # Maximum median distance (m) of copied positions from EKF2's position
 MAX_DISTANCE_OF_COPY_M = 0.01
