@@ -30,7 +30,6 @@ HeightName = Literal["gnss", "barometer"]
 FrameName = Literal["NED", "FRD", "ENU", "camera"]
 SystemId = Annotated[int, msgspec.Meta(ge=0, le=255)]
 
-# Request fields that contain a path
 _PATH_FIELDS = ("log", "path", "source", "estimate", "reference")
 
 

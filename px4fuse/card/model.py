@@ -21,7 +21,6 @@ ActionTarget = Literal[
 RATIO_AXIS_ENDS = (0.1, 10.0)
 RATIO_AXIS_TICKS = {0.1: "1/10", 0.2: "1/5", 0.5: "1/2", 1.0: "1", 2.0: "2", 5.0: "5", 10.0: "10"}
 MAX_CAUSES_ON_CARD = 3
-# Maximum number of notes on a diagnosis card
 MAX_NOTES = 3
 MAX_HEADLINE_LENGTH = 84
 
