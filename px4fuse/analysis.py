@@ -53,12 +53,12 @@ class Analysis(Comparison, Estimates, Reruns):
         return model if isinstance(model, Unavailable) else model.baseline_replay
 
     def select_main_trials(self) -> list[Trial]:
-        """Return the re-runs along the main axis for which the log contains the results before."""
+        """Return the re-runs along the main axis that are compared with the original results."""
         main_axis = self.main.axis.name
         return [trial for trial in self.trials if trial.axis == main_axis and trial.is_logged]
 
     def select_secondary_axes(self) -> list[AxisComparison]:
-        """Return comparisons along all axes except ``main``, the axis with the largest motion."""
+        """Return the comparisons along all axes except the main axis."""
         return [axis for axis in self.axes.values() if axis is not self.main]
 
 
@@ -91,11 +91,11 @@ class WhatIfAnalysis:
     Attributes
     ----------
     changes : mapping from PX4 name to value
-        Changed parameters of EKF2; empty if the replays only test values of one parameter.
+        Changed parameters of EKF2.
     uses_estimates : bool
         True if ``changes`` are maximum-likelihood estimates.
     difference_steps : mapping from axis name to DifferenceExplanation or Unavailable
-        Causes of the difference between KF (default settings) and EKF2 as logged.
+        Causes of the difference between KF and the logged EKF2.
     without : mapping from PX4's name of an aiding source to float
         Time (s) from which EKF2 does not fuse the aiding source in the replays.
     """
@@ -111,15 +111,12 @@ class WhatIfAnalysis:
 
     @property
     def sweep_start_index(self) -> int:
-        """Index of the first replay of the parameter sweep in the tuple ``whatif.whatif``."""
+        """Index of the first replay of the parameter sweep."""
         return int(bool(self.changes or self.without))
 
 
 def find_failed_checks(analysis: Analysis | AidingSourceAnalysis) -> dict[str, str]:
-    """Return the axes and aiding sources for which EKF2 is not consistent, with the reason.
-
-    Reasons are: overconfident, or (only aiding sources) biased or not fused for a long time.
-    """
+    """Return the axes and aiding sources for which EKF2 is not consistent, with the reason."""
     failed_verdicts = {}
     if isinstance(analysis, Analysis):
         for name, axis in analysis.axes.items():

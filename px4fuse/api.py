@@ -28,7 +28,7 @@ from px4fuse.trajectory.model import Trajectory
 
 Pathlike = str | Path
 Progress = Callable[[str], None]
-# Columns of the table that table() returns: numbers, except "verdict"
+# Columns of table(): numbers, except "verdict"
 SUMMARY_COLUMNS = (
     "count",
     "nis_mean",
@@ -71,11 +71,10 @@ def compare(
     log : str, Path or Flight
         ULog or MAVLink recording, or a flight from :func:`px4fuse.read_log`.
     sigma_a_m_s2, sigma_z_m, dt_s, input
-        See :class:`px4fuse.Settings`. Default of SIGMA_Z: 0.1 m; for GNSS the measurement noise of
-        EKF2.
+        See :class:`px4fuse.Settings`. Default of SIGMA_Z: 0.1 m, but EKF2's noise for GNSS.
     clock_offset_s : float or "auto", optional
-        Time offset to add to the timestamps of the position source; "auto" estimates it. Default:
-        0, or "auto" with ``position``.
+        Time offset to add to the position timestamps. "auto" estimates it, and is the default with
+        ``position``.
     axes : str or sequence of str
         "north", "east", "down" or "aisle" (main direction of the track); default: all axes.
     heading_deg : float, optional
@@ -139,8 +138,8 @@ def compare(
 def table(analysis: Analysis) -> pd.DataFrame:
     """Return a table of the main numbers, with one row per axis and filter ("kf", "ekf2").
 
-    Columns have the names of the JSON results; ``nis_low`` and ``nis_high`` are the 95 % band of
-    the mean NIS. RMSE and NEES are against ground truth. Missing numbers are NaN.
+    ``nis_low`` and ``nis_high`` are the 95 % band of the mean NIS. RMSE and NEES are against ground
+    truth. Missing numbers are NaN.
     """
     row_by_axis_and_filter = {
         (axis_name, filter_name): _make_summary_row(summary)
@@ -327,8 +326,8 @@ def what_if(
     log : str, Path or Flight
         ULog or MAVLink recording, or a flight from :func:`px4fuse.read_log`.
     changes : mapping or sequence of mappings, optional
-        Parameter values by PX4 name, in PX4's units; one replay per mapping. Default: the
-        maximum-likelihood estimates of noise and delay of the position source.
+        Parameter values by PX4 name, in PX4's units; one replay per mapping. Default: estimates of
+        noise and delay.
     without : mapping of str to float, optional
         Time (s) from which EKF2 does not fuse an aiding source, for example ``{"gnss_pos": 60.0}``.
 

@@ -4,8 +4,7 @@
 2. prepare: position source, time span and axes
 3. filter: run KF along each axis
 4. compare: KF, EKF2 and ground truth
-5. estimate: noise σ, time offset, frame misalignment, biases. If step 2 has corrected a delay of
-   the positions, the report states the more precise estimate of this step
+5. estimate: noise σ, time offset, frame misalignment, biases
 6. rerun: replay EKF2, explain KF - EKF2, re-run both filters with one change at a time
 7. analyse the rest of the flight: loop closure, EKF2's other aiding sources, events
 8. find: faults of the flight, with their causes
@@ -71,7 +70,7 @@ def diagnose(
     *,
     keep_positions_as_sent: bool = False,
 ) -> Analysis:
-    """Read a flight, compare KF with EKF2, and find faults (steps 1 to 8 of this module).
+    """Read a flight, compare KF with EKF2, and find faults.
 
     Parameters
     ----------
@@ -112,10 +111,9 @@ def _diagnose_flight(
 
 
 def _refine_clock_offset(flight: Flight, analysis: Analysis) -> Flight | None:
-    """Return the flight with the clock offset of the position file as estimated with the IMU.
+    """Replace the clock offset of a position file by the estimate from the IMU.
 
-    :func:`read_flight` estimates the offset with EKF2's positions, which may be late. Return None
-    if the offset was not estimated with EKF2, or if the IMU gives the same offset.
+    The first estimate is from EKF2's positions, which may be late. Return None if nothing changes.
     """
     alignment, clock_offset = analysis.source.alignment, analysis.clock
     if (
@@ -145,8 +143,7 @@ def _refine_clock_offset(flight: Flight, analysis: Analysis) -> Flight | None:
 def analyse_comparison(comparison: Comparison, progress: Progress = ignore_progress) -> Analysis:
     """Estimate errors, re-run KF and EKF2, and find faults and their causes.
 
-    These are the steps 5 to 8 of this module. If students must find the faults of the flight, only
-    the comparison is returned.
+    If students must find the faults, only the comparison is returned.
     """
     if comparison.flight.log.is_assessed:
         return Analysis(
@@ -185,11 +182,7 @@ def analyse_comparison(comparison: Comparison, progress: Progress = ignore_progr
 
 
 def refine_delay(comparison: Comparison, clock_offset: ClockOffset | Unavailable) -> Comparison:
-    """Replace the reported delay of the position timestamps by the more precise ``clock_offset``.
-
-    KF is not run again: :func:`prepare_comparison_inputs` has already corrected the first estimate
-    of the delay. Re-runs test the difference, ``clock_offset.remaining_s``.
-    """
+    """Replace the detected delay of the positions by the more precise ``clock_offset``."""
     if (
         comparison.convention is None
         or isinstance(clock_offset, Unavailable)
@@ -198,8 +191,7 @@ def refine_delay(comparison: Comparison, clock_offset: ClockOffset | Unavailable
         return comparison
     # The delay is the negative time offset
     refined_convention = structs.replace(comparison.convention, late_s=-clock_offset.offset_s)
-    # If the refined delay is too small to be a fault, the first estimate is reported, because the
-    # positions were corrected by the first estimate
+    # Keep the first estimate if the refined delay is too small to be a fault
     is_delay_a_fault = all(
         find_convention_faults(convention, comparison.flight, comparison.source.frame).late_s != 0.0
         for convention in (comparison.convention, refined_convention)
@@ -249,7 +241,7 @@ def prepare_comparison(
     *,
     keep_positions_as_sent: bool = False,
 ) -> PreparedComparison:
-    """Choose position source, time span, axes and time offset; the result is the input of KF.
+    """Choose position source, time span, axes and time offset of a comparison.
 
     For arguments and errors see :func:`diagnose`.
     """
@@ -285,10 +277,10 @@ def prepare_comparison(
 def rerun(
     comparison: Comparison, estimates: Estimates, progress: Progress = ignore_progress
 ) -> Reruns:
-    """Replay EKF2, explain the difference KF - EKF2, and re-run both with one error corrected."""
+    """Explain the difference KF - EKF2, and re-run both filters with one change at a time."""
     progress("replaying EKF2")
     estimated_settings = find_corrected_noise_settings(comparison, estimates.tuning)
-    # Replay all parameter sets that the next two functions need at once, which is faster
+    # Replay all parameter sets at once, which is faster
     ekf2_model = prepare_ekf2_model(
         comparison.flight,
         lambda inputs: [

@@ -1,4 +1,4 @@
-"""Data class for a fault that the detectors in :mod:`px4fuse.findings` report."""
+"""Data class for a fault of a flight."""
 
 from collections.abc import Mapping
 from typing import Annotated, Literal
@@ -9,8 +9,8 @@ from px4fuse.core.record import Record, Span
 
 Severity = Literal["error", "warning", "note"]
 SEVERITIES: tuple[Severity, Severity, Severity] = ("error", "warning", "note")
-MAX_LISTED_SPANS = 3  # maximum number of time spans in a text; more are printed as one range
-MIN_SPAN_S = 0.05  # minimum duration (s) of a time span; a shorter span is printed as one time
+MAX_LISTED_SPANS = 3  # maximum number of time spans in a text
+MIN_SPAN_S = 0.05  # shorter time spans (s) are printed as one time
 
 
 class Finding(Record, omit_defaults=False):

@@ -1,4 +1,4 @@
-"""Requests: files and settings of one analysis, for example parsed from a command line.
+"""Requests: files and settings of one analysis.
 
 The results contain the request, so that :func:`px4fuse.diagnose.diagnose` can repeat the analysis.
 """
@@ -20,17 +20,16 @@ AUTO: Literal["auto"] = "auto"
 SIGMA_A_M_S2, SIGMA_Z_M, DT_S = 0.5, 0.10, 0.1
 AxisName = Literal["north", "east", "down", "aisle"]
 KfInputName = Literal["imu", "zero"]
-# Kinds of position source that the user can state if the messages in the log are ambiguous
+# Kinds of position source that the user can state
 SourceKind = Literal["uwb", "vio", "mocap", "gnss"]
 # Directions of x, y and z in a position file, such as east, up and south
 PositionFrame = Literal["ned", "enu", "nwu", "eus", "edn"]
-# Height source for the axis "down" of a flight with GNSS
+# Height source of a flight with GNSS
 HeightName = Literal["gnss", "barometer"]
 # Coordinate frame of a trajectory file
 FrameName = Literal["NED", "FRD", "ENU", "camera"]
 SystemId = Annotated[int, msgspec.Meta(ge=0, le=255)]
 
-# Names of all request fields that contain a path
 _PATH_FIELDS = ("log", "path", "source", "estimate", "reference")
 
 
@@ -58,9 +57,9 @@ class PositionFile(_BaseRequest, frozen=True, kw_only=True):
     ----------
     path : str
     body : str or None
-        Rigid body or tag in the file, or topic of a ROS bag; None if the file has only one.
+        Rigid body, tag or ROS topic in the file; None if there is only one.
     frame : {"ned", "enu", "nwu", "eus", "edn"} or None
-        Coordinate frame; None: from the column names, else the frame with the best fit to EKF2.
+        Coordinate frame of the positions; None: detected.
     yaw_deg : float, "auto" or None
         Clockwise rotation of the positions, seen from above; "auto" estimates yaw and origin.
     columns : tuple of str or None
@@ -122,7 +121,7 @@ class Landing(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
 
 
 class GivenClosure(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
-    """Loop closure that the user states: equal positions (σ ``sigma_m``) at two times."""
+    """Loop closure from the user: the same position (σ ``sigma_m``) at two times."""
 
     time_1_s: float
     time_2_s: float
@@ -145,7 +144,7 @@ class LoopRequest(_BaseRequest, frozen=True, kw_only=True, tag_field="command", 
     start_s, end_s : float or None
         Start and end of the loop; None: take-off and landing.
     landed_at : Landing or None
-        Measured landing place; None: the ground truth of the log, else the take-off place.
+        Measured landing place; None: from ground truth, else the take-off place.
     closed_loop : bool
         False if the vehicle did not return to the take-off place.
     closures : tuple of GivenClosure
@@ -153,7 +152,7 @@ class LoopRequest(_BaseRequest, frozen=True, kw_only=True, tag_field="command", 
     position_drift_m, heading_drift_deg : float
         Drift of the odometry after 100 m (1 σ).
     key_frames_m : float or None
-        Distance between the key frames of the pose graph; None: 2 % of the extent of the path.
+        Distance between key frames of the pose graph; None: 2 % of the path's extent.
     """
 
     source: str
@@ -189,8 +188,7 @@ class WhatIfRequest(_BaseRequest, frozen=True, kw_only=True, tag_field="command"
     system : int or None
         MAVLink system id of the vehicle; None: the id with the most messages.
     changes : mapping from PX4 name to value
-        Changed parameters in PX4's units; by default the maximum-likelihood estimates of noise and
-        delay.
+        Changed parameters in PX4's units; default: estimates of noise and delay.
     sweep : Sweep or None
         Values of one parameter, in addition to ``changes``.
     without : mapping from PX4's name of an aiding source to float
@@ -214,7 +212,7 @@ class EvaluationRequest(_BaseRequest, frozen=True, kw_only=True):
     alignment, association, max_gap_s, time_offset_s
         Arguments of :func:`px4fuse.evaluate`; None: selected automatically.
     rpe : tuple of str
-        Deltas of the RPE with their units; empty: several distances that fit the path length.
+        Deltas of the RPE with their units; empty: selected automatically.
     consecutive : bool
         True to compute the RPE over consecutive, non-overlapping pairs of poses.
     system : int or None
@@ -306,11 +304,10 @@ def command_line(
     command : str, optional
         Name of the command; by default from the type of ``request``.
     for_shell : bool
-        True to run the command here: complete paths, quoted for the shell of this system. False to
-        print it in a report: file names only, quoted for a POSIX shell.
+        True for complete paths and this system's shell; False for file names only.
     """
     shown_request = request if for_shell else request.with_file_names()
-    # fields of the request without a default are input files, and all others are options
+    # Fields without a default are input files, and all others are options
     files = [
         getattr(shown_request, field.name)
         for field in msgspec.structs.fields(shown_request)

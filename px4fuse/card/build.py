@@ -69,15 +69,15 @@ from px4fuse.request import (
 )
 
 MAX_ACTIONS = 3
-# The card states the fraction of positions that EKF2 rejected if it reaches this limit
+# Minimum fraction of rejected positions on the card
 MIN_REPORTED_REJECTED_FRACTION = 0.01
-# Aiding sources whose √S is usually too large with PX4's default noises, which is not a fault
+# Aiding sources whose √S is usually too large with PX4's default noises
 USUALLY_UNDERCONFIDENT_AIDS = frozenset({"baro_hgt", "mag", "gravity"})
 SMALL_INNOVATIONS_EXPLANATION = (
     "The innovations are smaller than expected. This is not a fault here: the source may drift, "
     "and innovations do not show drift. Do not reduce noise settings."
 )
-PRINTED_FIRST_BYTES = 4  # number of bytes printed from the start of an unreadable log
+PRINTED_FIRST_BYTES = 4  # number of first bytes of an unreadable log that are printed
 ULOG_FIRST_BYTES = "55 4C 6F 67"  # first bytes of each ULog file (hexadecimal)
 HEADING_ERROR_EXPLANATION = (
     "KF and EKF2 rotate the measured acceleration by a wrong heading. The innovations stay small, "
@@ -91,8 +91,7 @@ UNEXPLAINED_DIFFERENCE_TEXT = (
     "For KF or EKF2, innovations and errors against ground truth result in different ratios of "
     "actual to reported σ. No re-run explains the difference."
 )
-# Finding ids, and why these faults hardly change innovations but increase errors against ground
-# truth
+# Reasons why faults of the source increase errors, but hardly change innovations
 SOURCE_FAULT_EXPLANATIONS = (
     (
         {"source_axes_wrong", "source_orientation_wrong", "source_unit_wrong"},
@@ -119,7 +118,7 @@ def build_card(
     Parameters
     ----------
     request : ComparisonRequest
-        Options that recommended commands repeat.
+        Options for the recommended commands.
     student : (str, str)
         Name and id.
     """
@@ -395,7 +394,7 @@ def _format_actions(causes: Sequence[DiagnosedCause]) -> tuple[str, ...]:
 
 def _format_action(action: Action) -> str:
     if action.where == "console":
-        # do not repeat the parameter name, which is in the command
+        # The command already contains the parameter name
         value_change_text = action.sentence.partition(" ")[2]
         change_text = value_change_text if len(action.commands) == 1 else action.sentence
         return f"EKF2: {', '.join(action.commands)} ({change_text})"
@@ -409,12 +408,7 @@ def _format_action(action: Action) -> str:
 def _mark_explained_verdicts(
     sigma_verdicts: Sequence[Verdict], causes: Sequence[DiagnosedCause], *, may_drift: bool
 ) -> tuple[Verdict, ...]:
-    """Set ``is_explained`` of each inconsistent verdict that requires no change of filter settings.
-
-    A verdict is explained in three cases. A cause recommends no change of the filter, the errors
-    of the filter against ground truth are consistent, or the innovations are small and the source
-    may drift.
-    """
+    """Mark inconsistent verdicts that require no change of filter settings."""
     filters_to_keep_unchanged = {
         name
         for cause in causes
@@ -433,7 +427,7 @@ def _mark_explained_verdicts(
         and (
             FILTER_NAMES[verdict.filter] in filters_to_keep_unchanged
             or verdict.filter in filters_consistent_with_truth
-            # innovations do not contain drift, so small innovations do not prove a too large σ
+            # Innovations do not contain drift, so small innovations do not prove a too large σ
             or (may_drift and (verdict.against, verdict.word) == ("source", "underconfident"))
         )
         else verdict
@@ -444,10 +438,9 @@ def _mark_explained_verdicts(
 def _explain_verdict_differences(
     analysis: Analysis, sigma_verdicts: tuple[Verdict, ...], causes: Sequence[DiagnosedCause]
 ) -> tuple[tuple[Verdict, ...], str]:
-    """Return the verdicts with ``is_explained`` set, and an explanation of differing verdicts.
+    """Explain why verdicts from innovations differ from verdicts from errors against ground truth.
 
-    The explanation states why the verdict from innovations differs from the verdict from errors
-    against ground truth.
+    Return the verdicts with ``is_explained`` set, and the explanation.
     """
     may_drift, ekf2_errors = analysis.source.origin.may_drift, analysis.main.filters["ekf2"].truth
     sigma_verdicts = _mark_explained_verdicts(sigma_verdicts, causes, may_drift=may_drift)

@@ -36,14 +36,13 @@ from px4fuse.flight.model import PositionTrack, Unavailable
 from px4fuse.request import COMPARISON_OPTIONS, ComparisonRequest, command_line
 
 SETTING_CHANGE_KINDS = frozenset({"noises", "noise", "gate", "process noise"})
-# Kinds of change that shift the measured positions. The estimates of KF and EKF2 shift, too, so
-# only ground truth shows the effect
+# Changes that shift the positions: only ground truth shows their effect
 CHANGE_KINDS_VISIBLE_ONLY_IN_TRUTH = frozenset({"time offset", "delay", "rotation"})
 # Name endings of PX4 parameters that require a reboot (reboot_required)
 REBOOT_PARAMETER_SUFFIXES = ("_DELAY", "_DELAY_MAX", "_PREDICT_US")
-# Minimum fraction of rejected positions that the table of re-runs shows
+# Minimum fraction of rejected positions in the table of re-runs
 MIN_REJECTED_FRACTION_TO_SHOW = 0.005
-# Devices or filters to be changed, by group of the finding
+# Device or filter to change, by group of findings
 ACTION_TARGET_BY_GROUP: Mapping[str, ActionTarget] = {
     "position source": "sender",
     "time": "sender",
@@ -53,7 +52,7 @@ ACTION_TARGET_BY_GROUP: Mapping[str, ActionTarget] = {
     "loops": "source",
     "logging": "logging",
 }
-# Device or filter to be changed, for findings whose target is not the target of their group
+# Exceptions from the target of the group, by finding id
 ACTION_TARGET_BY_FINDING_ID: Mapping[str, ActionTarget] = {
     "source_drift": "source",
     "source_lever_arm": "EKF2",
@@ -64,10 +63,9 @@ ACTION_TARGET_BY_FINDING_ID: Mapping[str, ActionTarget] = {
 
 
 class RankedCause(NamedTuple):
-    """Possible cause of a fault, its rank (0 first), and the re-runs of KF and EKF2 that test it.
+    """Possible cause of a fault, its rank (0 first), and the re-runs that test it.
 
-    ``log_sigma_ratio_reduction`` is the decrease of |ln(actual / reported σ)| in the re-runs. Among
-    causes of equal rank, the cause with the largest decrease is the first.
+    ``log_sigma_ratio_reduction`` is the decrease of |ln(σ ratio)| in the re-runs.
     """
 
     finding: Finding
@@ -101,7 +99,7 @@ def rank_causes(analysis: Analysis, cause_findings: Sequence[Finding]) -> list[R
         fault_causes or ranked_causes,
         key=lambda cause: (
             cause.rank,
-            # settings (True) after faults of the source, which a changed setting may merely hide
+            # faults of the source first: a changed setting may only hide them
             cause.rank in (1, 2, 3) and _is_setting_fault(cause.finding),
             -cause.log_sigma_ratio_reduction,
         ),
@@ -129,7 +127,7 @@ def _find_cause_rank(finding: Finding, trials: Iterable[Trial]) -> int:
 
 
 def find_trials_of_finding(trials: Iterable[Trial], finding: Finding) -> tuple[Trial, ...]:
-    """Return the re-runs that test a finding: the best of each filter and kind of change."""
+    """Return the best re-run of each filter and kind of change that tests a finding."""
     tested_change_kinds = FINDING_CATALOGUE[finding.id].rerun_kinds
     tested_change_kinds |= {"defaults"} if "noises" in tested_change_kinds else set()
     best_trial_by_filter_and_kind: dict[tuple[FilterName, str], Trial] = {}
@@ -177,7 +175,7 @@ def make_cause(
 
 
 def make_cause_without_reruns(finding: Finding) -> DiagnosedCause:
-    """Make a cause from the texts of a finding alone, without results of filter re-runs."""
+    """Make a cause from the texts of a finding, without re-runs."""
     return DiagnosedCause(
         id=finding.id,
         severity="error" if finding.severity == "error" else "warning",
@@ -211,7 +209,7 @@ def _make_actions(
     ) or trial_by_filter_and_kind.get(("kf", "time offset"))
     delay_actions = []
     if delay_trial:
-        # parameters that the shift of timestamps also changes (EKF2_DELAY_MAX) are separate actions
+        # Separate actions for parameters that the time shift also changes (EKF2_DELAY_MAX)
         offset_setting_names = offset_trial.change.keys() if offset_trial else ()
         delay_parameter_values = {
             name: value
@@ -245,7 +243,7 @@ def _make_actions(
             )
             default_settings = default_noises_trial.change if default_noises_trial else {}
             change, alignment = trial.change, analysis.source.alignment
-            # --clock-offset replaces the alignment's time offset, so it must include that offset
+            # --clock-offset replaces the offset from the alignment, so it must include that offset
             if CLOCK_OFFSET_KEY in change and alignment:
                 total_s = change[CLOCK_OFFSET_KEY] + alignment.clock_offset_s
                 change = {**change, CLOCK_OFFSET_KEY: round(total_s, 3)}
@@ -253,7 +251,7 @@ def _make_actions(
         elif filter_name == "ekf2" and kind != "delay":
             changes = {name: value for name, value in trial.change.items() if name in PARAMETERS}
             actions += [make_parameter_action(analysis, changes)] if changes else []
-    # actions on KF are last: first correct the vehicle
+    # First correct the vehicle, then KF
     actions.sort(key=lambda action: action.target == "KF")
     action_targets = {
         action.target for group in (actions, *alternative_action_groups) for action in group
@@ -311,8 +309,7 @@ def make_rerun_action(
 ) -> Action:
     """Return the command that runs KF with changed settings.
 
-    ``default_settings`` are the default noises if KF improves with them, too. The action then
-    offers the choice between the default noises and the changed settings.
+    The default noises are offered too, if KF also improves with ``default_settings``.
     """
     command = command_line(structs.replace(request, **change))
     default_options_text = " and ".join(

@@ -20,9 +20,7 @@ ActionTarget = Literal[
 # Limits of the logarithmic axis in plots of the σ ratio (actual / reported σ)
 RATIO_AXIS_ENDS = (0.1, 10.0)
 RATIO_AXIS_TICKS = {0.1: "1/10", 0.2: "1/5", 0.5: "1/2", 1.0: "1", 2.0: "2", 5.0: "5", 10.0: "10"}
-# Maximum number of causes on a diagnosis card
 MAX_CAUSES_ON_CARD = 3
-# Maximum number of notes on a diagnosis card
 MAX_NOTES = 3
 MAX_HEADLINE_LENGTH = 84
 
@@ -52,7 +50,7 @@ class Verdict(Record, kw_only=True):
         "consistent", "overconfident" (reported σ too small), "underconfident" (too large), or
         "not evaluated" with a ``reason``.
     is_explained : bool
-        True if the filter is inconsistent, but its settings need no change.
+        True if an inconsistent filter needs no change of its settings.
     """
 
     filter: FilterName
@@ -123,12 +121,11 @@ class Rerun(Record, kw_only=True):
     label : str
         Filter and change, for example "KF without 26 outliers".
     is_prediction : bool
-        True for EKF2, because a replay only predicts the results of PX4; False for KF.
+        True for EKF2, because a replay predicts the results of PX4.
     from_s : float or None
         Start of the replay (s).
     position_rmse_m, source_ratio, truth_ratio, rejected_fraction : (float, float) or None
-        Before and after the change: position RMSE, σ ratio (actual / reported σ) from innovations,
-        σ ratio from errors against ground truth, and fraction of rejected positions.
+        RMSE, σ ratios (source, ground truth) and rejected fraction, before and after the change.
     improves : str
         Quantities that the change improves.
     """
@@ -153,9 +150,9 @@ class DiagnosedCause(Record, kw_only=True):
     spans_s : tuple of (float, float)
         Times of the fault (s); empty for the whole flight.
     alternatives : tuple of tuple of Action
-        Groups of actions, of which one group is necessary.
+        Groups of actions; one group is necessary.
     actions : tuple of Action
-        Actions that are necessary in addition.
+        Further necessary actions.
     reruns : tuple of Rerun
         Runs of KF and replays of EKF2 without the fault.
     after : str
@@ -214,10 +211,10 @@ class AnalysisDescription(Record, kw_only=True):
 
 
 class AidConsistency(Record, kw_only=True):
-    """Consistency of one ``component`` (for example "north") of an EKF2 aiding source.
+    """Consistency of one component (for example "north") of an EKF2 aiding source.
 
-    ``ratio`` is the RMS of innovation ÷ √S. ``is_usual`` is True for barometer, magnetometer and
-    gravity: their usual ratio is below 1, because PX4's default noise exceeds the sensor noise.
+    ``ratio`` is the RMS of innovation ÷ √S. ``is_usual`` is True for sensors whose ratio is usually
+    below 1 with PX4's default noise.
     """
 
     label: str
@@ -236,15 +233,13 @@ class Card(Record, kw_only=True):
     verdicts : tuple of Verdict
         Consistency of KF and EKF2.
     reconcile : str
-        Explanation of a filter that is consistent with the position source but not with ground
-        truth, or vice versa.
+        Explanation if the verdicts against position source and ground truth differ.
     difference : str
         Position difference KF - EKF2, before and after the first cause is corrected.
     more_causes : int
-        Number of causes omitted from ``causes`` (limit: :data:`MAX_CAUSES_ON_CARD`).
+        Number of causes omitted from ``causes``.
     facts : mapping from label to str
-        Further rows of the card: "KF" (why KF was not run); for a log that cannot be analysed,
-        "read" (size and first bytes) and "fix" (action).
+        Further rows of the card, for example the reason why KF was not run.
     """
 
     severity: CardSeverity

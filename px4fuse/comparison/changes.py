@@ -1,7 +1,6 @@
-"""Changes of filter parameters or data that may make KF or EKF2 consistent.
+"""Changes of noises, delays or data that may make KF or EKF2 consistent.
 
-Re-runs of the filters test one change at a time. In all functions, ``ekf2_inputs`` is None for
-changes of KF.
+In all functions, ``ekf2_inputs`` is None if KF is re-run.
 """
 
 from collections.abc import Iterable
@@ -33,11 +32,10 @@ from px4fuse.filter.tuning import HORIZONTAL, AxisTuning
 from px4fuse.flight.ekf2_parameters import GNSS_VEL, PARAMETERS
 from px4fuse.flight.model import LogInfo, Unavailable
 
-# Minimum SIGMA_Z (m) in a re-run of KF. Motion capture, the most accurate source, has this noise
+# Minimum SIGMA_Z (m) in a re-run of KF: the noise of motion capture
 MIN_RERUN_SIGMA_Z_M = 0.005
-# Names of KF's noise settings
 SIGMA_A, SIGMA_Z = "sigma_a_m_s2", "sigma_z_m"
-# Kind of a change (:attr:`Trial.kinds`) for each changed KF setting and each correction of the data
+# Kind of change for each KF setting and each correction of the data
 KIND_BY_CHANGE_NAME = {
     SIGMA_A: "noises",
     SIGMA_Z: "noises",
@@ -47,13 +45,10 @@ KIND_BY_CHANGE_NAME = {
     FORWARD_BIAS_KEY: "bias",
     RIGHT_BIAS_KEY: "bias",
 }
-# KF settings that a re-run may change. Other re-runs of KF correct the data, for example outliers
 KF_NOISE_SETTINGS = frozenset((SIGMA_A, SIGMA_Z))
 ACC_NOISE = "EKF2_ACC_NOISE"
-# Minimum ratio of estimated acceleration noise to EKF2_ACC_NOISE for a re-run with more noise. A
-# smaller ratio may be due to tilt errors and biases, because the estimate includes them
+# Minimum ratio to test a larger EKF2_ACC_NOISE: the estimate also contains tilt errors and biases
 MIN_ESTIMATED_TO_LOGGED_ACC_NOISE_RATIO = 3.0
-# EKF2 parameters that a re-run sets to PX4's default
 PARAMETERS_SET_TO_DEFAULT = (
     ACC_NOISE,
     "EKF2_GYR_NOISE",
@@ -62,7 +57,7 @@ PARAMETERS_SET_TO_DEFAULT = (
     GNSS_VEL.noise,
     GNSS_VEL.gate,
 )
-# A re-run corrects the yaw misalignment only if it exceeds this multiple of its σ
+# Minimum ratio of the yaw misalignment to its σ, to correct it in a re-run
 MIN_MISALIGNMENT_SIGMAS = 3.0
 
 
@@ -73,14 +68,13 @@ def find_candidate_changes(
     axis_result: AxisComparison,
     statistic: Statistic,
 ) -> list[Change]:
-    """Return the changes of settings or data that may bring ``statistic`` inside its limits."""
+    """Return the changes of settings or data that may correct the mean NIS or NEES of a filter."""
     summary = axis_result.filters["kf" if ekf2_inputs is None else "ekf2"]
     assert isinstance(summary, FilterSummary)  # an UntestedFilter has no mean NIS or NEES
     is_underconfident = statistic == "nis" and summary.nis_mean < 1.0
     axis_tuning = find_axis_tuning(estimates.tuning, axis_result.axis.name)
     changes = list[Change]()
-    # Innovations do not show the slow errors of GNSS and odometry, so small innovations do not
-    # justify a smaller noise
+    # Do not reduce the noise of GNSS or odometry: innovations do not show their slow errors
     origin = comparison.source.origin
     may_have_correlated_errors = origin.may_drift or origin.is_gnss
     if axis_tuning is not None and not (is_underconfident and may_have_correlated_errors):
@@ -113,12 +107,7 @@ def find_candidate_changes(
 def find_main_axis_changes(
     comparison: Comparison, estimates: Estimates, ekf2_inputs: ReplayInputs | None
 ) -> list[Change]:
-    """Return the changes of settings or data for re-runs along the main axis.
-
-    The list contains the changes of :func:`find_candidate_changes`. For KF, one more re-run
-    changes both noises, and one sets the default noises. For EKF2 with a wrong delay parameter,
-    one more re-run shifts the timestamps.
-    """
+    """Return the changes of settings or data for re-runs along the main axis."""
     changes = remove_repeated_changes(
         change
         for statistic in CONSISTENCY_STATISTICS[::-1]
@@ -161,7 +150,7 @@ def classify_change(
 
 
 def find_default_settings(comparison: Comparison) -> Change:
-    """Return the change to KF's default noises, for each noise that the user set differently."""
+    """Return the change that sets SIGMA_A and SIGMA_Z to their default values."""
     user_settings, default_settings = comparison.settings, Settings()
     setting_names = (SIGMA_A,) if comparison.source.origin.is_gnss else (SIGMA_A, SIGMA_Z)
     return {
@@ -177,10 +166,7 @@ def find_axis_tuning(tuning: TuningByAxis, axis: str) -> AxisTuning | None:
 
 
 def _find_offset_changes(estimates: Estimates, ekf2_inputs: ReplayInputs | None) -> list[Change]:
-    """Return the change that corrects the time offset; empty without a significant time offset.
-
-    For EKF2, EKF2_DELAY_MAX is increased if the shifted positions are too old to be fused.
-    """
+    """Return the change that corrects the time offset, if the time offset is significant."""
     clock_offset = estimates.clock
     if isinstance(clock_offset, Unavailable) or not clock_offset.is_determinable:
         return []
@@ -198,11 +184,7 @@ def _find_offset_changes(estimates: Estimates, ekf2_inputs: ReplayInputs | None)
 def _find_kf_noise_changes(
     settings: Settings, axis_tuning: AxisTuning, is_underconfident: bool
 ) -> list[Change]:
-    """Return changes of SIGMA_A and SIGMA_Z to their estimates.
-
-    A noise is changed only if KF's value is outside the 95 % interval of the estimate. The noises
-    of an underconfident KF are only reduced, and the noises of any other KF are only increased.
-    """
+    """Return changes of SIGMA_A and SIGMA_Z to their estimates, if they differ significantly."""
     changes = list[Change]()
     for name, noise in ((SIGMA_A, axis_tuning.sigma_a_two_state), (SIGMA_Z, axis_tuning.sigma_z)):
         current_sigma = getattr(settings, name)
@@ -235,19 +217,16 @@ def _find_bias_changes(estimates: Estimates) -> list[Change]:
 def _find_ekf2_noise_changes(
     ekf2_inputs: ReplayInputs, summary: FilterSummary, axis_tuning: AxisTuning
 ) -> list[Change]:
-    """Return the change to the estimated noise if EKF2's noise is outside the 95 % interval."""
+    """Return the change of EKF2's position noise to its estimate, if it differs significantly."""
     noise_m = axis_tuning.sigma_z.value
-    if noise_m is None:  # The RMS innovation replaces a missing estimate: the noise is not larger
+    if noise_m is None:  # without an estimate: RMS innovation, an upper bound of the noise
         noise_m = float(np.hypot(summary.innovation_std_m, summary.innovation_mean_m))
     change = make_estimated_noise_change(ekf2_inputs, axis_tuning.sigma_z, noise_m)
     return [change] if change else []
 
 
 def _find_default_changes(log: LogInfo, ekf2_inputs: ReplayInputs) -> list[Change]:
-    """Return one change to PX4's default for each EKF2 noise that differs from the default.
-
-    The gate is also set to its default if the logged gate is below PX4's default.
-    """
+    """Return one change to PX4's default for each EKF2 noise that differs from the default."""
     gate_parameter, logged_parameters = ekf2_inputs.aid.gate, ekf2_inputs.settings
     default_by_parameter = {
         name: log.find_default_value(name) for name in (gate_parameter, *PARAMETERS_SET_TO_DEFAULT)
@@ -264,11 +243,7 @@ def _find_default_changes(log: LogInfo, ekf2_inputs: ReplayInputs) -> list[Chang
 def _find_acc_noise_changes(
     settings: Settings, ekf2_inputs: ReplayInputs, axis_tuning: AxisTuning
 ) -> list[Change]:
-    """Return the change of EKF2_ACC_NOISE to the estimated SIGMA_A if the estimate is much larger.
-
-    Each prediction adds (EKF2_ACC_NOISE · step)² to the velocity variance of EKF2, and
-    SIGMA_A² · DT² to the velocity variance of KF.
-    """
+    """Return the change of EKF2_ACC_NOISE to its estimate, if the estimate is much larger."""
     ekf2_steps_per_dt = settings.dt_s / ekf2_inputs.mean_step_s
     logged_acc_noise, max_acc_noise = ekf2_inputs.settings[ACC_NOISE], PARAMETERS[ACC_NOISE].maximum
     if (

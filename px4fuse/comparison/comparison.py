@@ -1,4 +1,4 @@
-"""Run of KF, and comparison of KF and EKF2 with each other and with ground truth on each axis."""
+"""Comparison of KF, EKF2 and ground truth along each axis."""
 
 from collections.abc import Mapping
 from dataclasses import replace
@@ -43,7 +43,7 @@ VARIANCE_COLUMNS = ("position_variance_m2", "velocity_variance_m2_s2")
 
 
 def run_kf(prepared_comparison: PreparedComparison) -> dict[str, Replay]:
-    """Run KF along each axis of a comparison, and return the runs by axis name."""
+    """Run KF along each axis, and return the results by axis name."""
     return {
         axis.name: replay(axis, prepared_comparison.settings)
         for axis in prepared_comparison.input_axes
@@ -51,7 +51,7 @@ def run_kf(prepared_comparison: PreparedComparison) -> dict[str, Replay]:
 
 
 def compare(prepared_comparison: PreparedComparison, kf_runs: Mapping[str, Replay]) -> Comparison:
-    """Compare the runs of KF with EKF2, and both with ground truth, along each axis."""
+    """Compare KF with EKF2, and both with ground truth, along each axis."""
     notes, ekf2 = list(prepared_comparison.notes), prepared_comparison.flight.ekf2
     if isinstance(ekf2, Ekf2):
         state, note = projection.remove_origin_resets(
@@ -60,7 +60,7 @@ def compare(prepared_comparison: PreparedComparison, kf_runs: Mapping[str, Repla
         notes += [note] if note else []
         notes += ekf2.notes
         if not state.equals(ekf2.state):
-            # EKF2's logged states at the fusion horizon contain the removed resets: not used
+            # The states at the fusion horizon still contain the resets, so they are not used
             ekf2 = replace(ekf2, state=state, aids={}, record=RECORD_NOT_LOGGED)
     axes = {
         name: _compare_axis(prepared_comparison, ekf2, kf_run) for name, kf_run in kf_runs.items()
@@ -217,14 +217,14 @@ def _compute_rmse(error: Array) -> float:
 def compute_kf_error_statistics(
     kf_run: Replay, truth: TableOrUnavailable, ekf2_state: TableOrUnavailable
 ) -> ErrorsAgainstTruth | Unavailable:
-    """Compute the errors of KF against ground truth, if possible at EKF2's sample times."""
+    """Compute the errors of KF against ground truth along one axis."""
     return compute_error_statistics(*_compute_kf_track(kf_run, ekf2_state), truth)
 
 
 def _compute_kf_track(
     kf_run: Replay, ekf2_state: TableOrUnavailable
 ) -> tuple[pd.DataFrame, pd.DataFrame]:
-    """Return state and variances of KF at EKF2's sample times; without EKF2, at KF's steps."""
+    """Return state and variances of KF at EKF2's sample times, if EKF2 is logged."""
     output_times_s = (kf_run.steps if isinstance(ekf2_state, Unavailable) else ekf2_state).index
     return sample_kf_run(kf_run, output_times_s.to_numpy())
 
@@ -246,11 +246,7 @@ def sample_kf_run(kf_run: Replay, times_s: Array) -> tuple[pd.DataFrame, pd.Data
 def compute_error_statistics(
     state: TableOrUnavailable, variance: TableOrUnavailable, truth: TableOrUnavailable
 ) -> ErrorsAgainstTruth | Unavailable:
-    """Compute the errors of a filter against ground truth along one axis.
-
-    Variances are interpolated to the times of ``state``, because PX4 logs them at a tenth of the
-    rate of EKF2's state.
-    """
+    """Compute the errors of a filter against ground truth along one axis."""
     if isinstance(state, Unavailable):
         return state
     if isinstance(truth, Unavailable):
@@ -292,7 +288,7 @@ def _compute_errors(state: pd.DataFrame, truth: pd.DataFrame, column: str) -> Ar
 
 
 def interpolate_sigma(time_s: Array, variance: TableOrUnavailable, column: str) -> Array:
-    """Interpolate the reported σ to the times ``time_s``; NaN if it is unknown."""
+    """Interpolate the reported σ to ``time_s`` (s). Unknown values are NaN."""
     known_variance = _drop_missing_values(variance, column)
     if known_variance.empty:
         return np.full(len(time_s), np.nan)
@@ -311,10 +307,9 @@ def _compute_mean_nees(normalised_errors: Array) -> float | None:
 def compute_position_errors(
     axis_result: AxisComparison, filter_name: FilterName
 ) -> TableOrUnavailable:
-    """Return position errors against ground truth and reported σ (m) of one filter along an axis.
+    """Return position errors against ground truth, and the reported σ, along an axis.
 
-    The columns are ``error_m`` and ``sigma_m``, NaN if unknown. The index is the time (s) of EKF2's
-    published state or, without EKF2, of KF's predictions.
+    The columns are ``error_m`` and ``sigma_m``. The index is the time (s).
     """
     if isinstance(axis_result.truth, Unavailable):
         return axis_result.truth
@@ -335,7 +330,7 @@ def compute_position_errors(
 def compute_normalised_errors(
     axis_result: AxisComparison, filter_name: FilterName
 ) -> tuple[Array, Array] | Unavailable:
-    """Return times (s), and ratios of position error against ground truth to reported σ."""
+    """Return times (s) and normalised position errors: error against ground truth ÷ reported σ."""
     errors = compute_position_errors(axis_result, filter_name)
     if isinstance(errors, Unavailable):
         return errors
@@ -362,7 +357,7 @@ def _assess_horizontal_innovations(
     ]
     if len(tables) < 2:
         return None
-    # Only updates with innovations along both axes (equal timestamps) are used
+    # Use only times with innovations along both axes
     north_innovation_m, north_variance_m2, east_innovation_m, east_variance_m2 = (
         pd.concat(tables, axis=1, join="inner").to_numpy().T
     )

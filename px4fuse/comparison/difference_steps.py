@@ -1,9 +1,4 @@
-"""Explanation of the difference KF - EKF2 along each horizontal axis, in sentences.
-
-Settings and equations of KF are replaced by those of EKF2, one property at a time
-(:mod:`px4fuse.ekf2.steps`). The sentences describe the two properties that reduce the difference
-most.
-"""
+"""Explanation of the difference between KF and EKF2 along each horizontal axis, in sentences."""
 
 from collections.abc import Mapping
 from dataclasses import replace
@@ -30,20 +25,17 @@ from px4fuse.filter.tuning import HORIZONTAL
 from px4fuse.flight.model import Unavailable
 from px4fuse.request import COMPARISON_OPTIONS
 
-# Maximum relative difference of the position RMSEs of KF and EKF2 to report them as equal
+# Below this relative difference, the position RMSEs of KF and EKF2 are reported as equal
 MAX_RELATIVE_RMSE_DIFFERENCE = 0.05
-# Minimum fraction of the mean square difference KF - EKF2 that a property of EKF2 explains, to
-# report the property as second cause
+# Minimum fraction of the mean square difference that a reported second cause explains
 MIN_CONTRIBUTION_FRACTION = 0.05
-# Minimum ratio of a KF noise setting to its estimate (or the inverse) that dominates the difference
-# KF - EKF2. The difference is then explained for KF with the estimate instead of the setting
+# A KF noise is wrong if it differs from its estimate by more than this factor
 MIN_SETTING_TO_ESTIMATE_RATIO = 4.0
-# A property of EKF2 that changes KF's position by less than this distance (m) is not reported
+# Smaller changes of the position (m) are not reported
 MIN_POSITION_CHANGE_M = 1e-6
-# Minimum position difference KF - EKF2 (m) that is reported at times without a replay of EKF2
+# Minimum reported position difference KF - EKF2 (m) outside the replayed time
 MIN_DIFFERENCE_OUTSIDE_REPLAY_M = 0.5
-# Minimum ratio of the position difference KF - EKF2 at times without a replay to the difference at
-# replayed times, to report the difference at times without a replay
+# Minimum ratio of the position difference outside the replayed time to that inside
 MIN_OUTSIDE_TO_INSIDE_REPLAY_RATIO = 3.0
 
 
@@ -53,10 +45,9 @@ def explain_ekf2_difference(
     clock_offset: ClockOffset | Unavailable,
     estimate_by_setting: Mapping[str, Any],
 ) -> dict[str, DifferenceExplanation | Unavailable]:
-    """Explain the difference KF - EKF2 along each horizontal axis of a comparison.
+    """Explain the difference between KF and EKF2 along each horizontal axis.
 
-    ``estimate_by_setting`` is from :func:`find_corrected_noise_settings`. If only the down axis is
-    analysed, return the reason why its difference is not explained.
+    ``estimate_by_setting`` contains the corrected noises of KF.
     """
     axis_results = {
         name: axis_result for name, axis_result in comparison.axes.items() if name != "down"
@@ -99,11 +90,7 @@ def explain_ekf2_difference(
 
 
 def find_corrected_noise_settings(comparison: Comparison, tuning: TuningByAxis) -> dict[str, float]:
-    """Return the estimate of each KF noise setting that is wrong by a large factor.
-
-    The difference KF - EKF2 is explained for KF with these estimates. With a wrong noise, each
-    property of EKF2 alone would remove most of the difference.
-    """
+    """Return the estimates of those KF noises that are wrong by a large factor."""
     axis_tuning = find_first_tuning(tuning, HORIZONTAL, AISLE, "north", "east")
     if axis_tuning is None or comparison.source.origin.is_gnss:
         return {}
@@ -126,7 +113,7 @@ def find_corrected_noise_settings(comparison: Comparison, tuning: TuningByAxis) 
 def list_explanation_configurations(
     comparison: Comparison, ekf2_inputs: ReplayInputs, estimate_by_setting: Mapping[str, Any]
 ) -> list[FilterConfiguration]:
-    """Return the EKF2 configurations that are replayed to explain the difference KF - EKF2."""
+    """Return the EKF2 configurations whose replays explain the difference KF - EKF2."""
     return list(
         steps.make_replacement_configurations(
             ekf2_inputs, _make_comparable_settings(comparison, ekf2_inputs, estimate_by_setting)
@@ -173,9 +160,8 @@ def add_cause_sentences(
     explanation : DifferenceExplanation
     axis_label : str
         Name of the axis, for example "the main axis".
-    step_reasons : mapping from step name to str
-        Text on the difference between KF and EKF2 in one property, such as the measurement noise.
-        A step gives KF this property of EKF2.
+    step_reasons : mapping from str to str
+        Text for each possible cause, for example the measurement noise.
     """
     step_reasons = {
         **step_reasons,
@@ -228,7 +214,7 @@ def add_cause_sentences(
 
 def _describe_step_effect(step: PropertyReplacement, explanation: DifferenceExplanation) -> str:
     explained_fraction = step.position_mean_square_m2 / explanation.position_mean_square_m2
-    # The fractions of all properties add up to 1: with a fraction above 1, others are negative
+    # The contributions add up to 1, so one above 1 means that others are negative
     opposite_effect_text = (
         " Other properties of EKF2 increase the difference KF - EKF2."
         if explained_fraction > 1.0

@@ -1,9 +1,7 @@
 """Patterns in the errors of a position source: jitter, noise that increases with speed, and others.
 
-White noise and timestamp jitter are found without ground truth: each position is compared with a
-cubic polynomial through its four neighbours, which removes the motion. Slow errors are what remains
-of the errors against ground truth after a fit of constant offset, scale factor, rotation and time
-offset.
+White noise is the deviation from a cubic polynomial through four neighbouring positions. Slow
+errors are found only with ground truth.
 """
 
 from typing import NamedTuple
@@ -20,94 +18,74 @@ from px4fuse.flight.model import Columns, Ekf2, Unavailable, rows_between
 from px4fuse.trajectory.rotation import conjugate, interpolate, multiply, to_rotation_vector
 from px4fuse.trajectory.scores import compute_autocorrelation_time
 
-# Minimum number of positions to search for jitter and other error patterns
 MIN_POSITIONS = 100
-# Row offsets of the four neighbours from which a position is interpolated
+# Rows of the four neighbours of a position, relative to its own row
 NEIGHBOUR_ROW_OFFSETS = np.array([-2, -1, 1, 2])
-# Maximum time from the first to the last neighbour of a position, in median intervals: cubic
-# interpolation across a gap is inaccurate
+# Maximum time span of the four neighbours, in median intervals: it excludes gaps
 MAX_NEIGHBOUR_SPAN_IN_INTERVALS = 8.0
-# Maximum σ of a residual (position minus interpolation of its neighbours), in units of the
-# position's σ. Residuals with a larger σ are not used, because their interpolation is inaccurate
+# Maximum ratio of residual σ to position σ: above it, the interpolation is inaccurate
 MAX_RESIDUAL_SIGMA_RATIO = 4.0
-# Number of timestamps in a running median. The median follows missing positions, but not jitter
+# Number of timestamps in the running median, which removes jitter
 TIMESTAMP_MEDIAN_FILTER_LENGTH = 9
-# Half of the time (s) over which a velocity is averaged
 VELOCITY_HALF_WINDOW_S = 0.3
-# Number of residuals that count as one independent residual, because they have common neighbours
+# Neighbouring residuals are correlated: this number counts as one independent residual
 RESIDUAL_CORRELATION_LENGTH = 3
 # Minimum reported timestamp jitter (s, 1 σ): a position error of 8 mm at 1 m/s
 MIN_JITTER_S = 0.008
-# Jitter causes position residuals of timestamp residual · velocity. Jitter is confirmed if the
-# ratio of measured to expected position residuals is in this range
+# Accepted ratio of position residuals to those expected from jitter (timestamp residual · velocity)
 JITTER_RATIO_LIMITS = 0.6, 1.5
-# Jitter is reported if it causes at least this fraction of the RMS position residual
+# Minimum fraction of the RMS position residual that is due to jitter
 MIN_JITTER_PART_OF_RESIDUAL = 0.4
-# Minimum ratio of an estimate to its σ, to report jitter or noise that increases with speed
+# Minimum ratio of an estimate to its σ, for jitter and for noise that increases with speed
 MIN_SIGNIFICANCE_SIGMAS = 6.0
 # Number of flight parts in which the correlation of noise with speed is tested
 FLIGHT_PART_COUNT = 5
-# Minimum ratio of this correlation to its σ (median over the flight parts)
+# Minimum ratio of the correlation of noise and speed to its σ (median over the flight parts)
 MIN_NOISE_SPEED_CORRELATION_SIGMAS = 1.2
-# Quantiles of the speed: below the first, the vehicle is slow; above the second, it is fast
+# Quantiles of the speed that limit slow flight and fast flight
 SLOW_SPEED_QUANTILE, FAST_SPEED_QUANTILE = 0.3, 0.7
-# Minimum ratio of the noise at high speed to the noise at low speed, both along and across the
-# motion, to report noise that increases with speed
 MIN_FAST_TO_SLOW_NOISE_RATIO = 1.6
-# Minimum extent (m, RMS distance from its mean) of a path to fit scale factor and rotation
+# Minimum extent of a path to fit scale factor and rotation: RMS distance (m) from its mean
 MIN_RMS_DISTANCE_FROM_PATH_MEAN_M = 0.5
-# Length (s) of the running mean that is removed from the errors of odometry, which drifts
+# Length (s) of the running mean that removes drift from the errors of odometry
 DRIFT_WINDOW_S = 12.0
-# Length (s) of the flight parts with separate time offsets
+# Duration (s) of the flight parts whose time offsets are estimated separately
 OFFSET_PART_DURATION_S = 4.0
-# Minimum RMS speed (m/s) of a flight part whose time offset is estimated
+# Minimum RMS speed (m/s) of a flight part to estimate its time offset
 MIN_SPEED_FOR_OFFSET_M_S = 0.3
-# Minimum range (s) of a varying time offset to report it: a position error of 8 cm at 1 m/s
+# Minimum reported variation (s) of the time offset: a position error of 8 cm at 1 m/s
 MIN_OFFSET_RANGE_S = 0.08
-# Minimum ratio of the mean square of the slow errors to the white-noise variance, to report varying
-# time offsets. With smaller errors, the time offsets of the flight parts may only fit noise
+# Minimum ratio of slow errors (mean square) to the white-noise variance: smaller ones may be noise
 MIN_SLOW_TO_WHITE_NOISE_RATIO = 0.25
-# Varying time offsets are reported only if their correction reduces the mean square of the slow
-# errors to at most this fraction
+# Maximum fraction of the slow errors (mean square) that remains without the varying time offset
 MAX_REMAINING_SLOW_ERROR_FRACTION = 0.2
-# A sinusoidal error is reported if it explains at least this fraction of the mean square of the
-# slow errors
+# Minimum fraction of the slow errors (mean square) that a reported sinusoidal error explains
 MIN_PERIODIC_ERROR_FRACTION = 0.88
-# Minimum ratio of the amplitude of a sinusoidal error to the σ of white noise
+# Minimum amplitude of a sinusoidal error, in σ of white noise
 MIN_AMPLITUDE_TO_WHITE_NOISE_RATIO = 1.0
-# Minimum number of periods of a sinusoidal error in the flight
 MIN_PERIOD_COUNT = 5.0
 # Maximum tested frequency (Hz) of a sinusoidal error
 MAX_FREQUENCY_HZ = 2.0
-# Spacing of the tested frequencies, in periods per flight duration
 FREQUENCY_STEP_IN_PERIODS_PER_FLIGHT = 0.2
-# Minimum number of time bins per period of a sinusoidal error. The estimated amplitude is then too
-# small by at most 0.2 %
 MIN_BINS_PER_PERIOD = 30
-# Maximum fraction of the vehicle's motion (mean square) at the frequency of a reported sinusoidal
-# error. With a larger fraction, the motion may cause the error
+# Above this fraction of the motion at the same frequency, motion may cause the sinusoidal error
 MAX_MOTION_FRACTION_AT_ERROR_FREQUENCY = 0.1
-# Sampling interval (s) of the compared rotations; delays are tested in steps of two intervals
+# Sampling interval (s) of the compared rotations
 ROTATION_INTERVAL_S = 0.01
 # Maximum tested delay (s) of the logged attitude
 MAX_ATTITUDE_DELAY_S = 0.5
-# Smaller delays (s) of the logged attitude are not reported
+# Minimum reported delay (s) of the logged attitude
 MIN_ATTITUDE_DELAY_S = 0.04
-# Maximum number of rotations from attitude and gyroscopes that are compared, to limit the computing
-# time
 MAX_ROTATION_COUNT = 20_000
-# Time (s) over which a rotation from attitude is compared with the rotation from gyroscopes
+# Duration (s) of each compared rotation
 ROTATION_COMPARISON_TIME_S = 0.1
-# Larger differences (rad) between rotations from attitude and from gyroscopes are limited to this
-# value, because resets of the attitude cause them
+# Larger rotation differences (rad) are limited to this value: attitude resets cause them
 MAX_ROTATION_DIFFERENCE_RAD = 0.2
-# A delay of the attitude is reported if its correction reduces the mean square difference between
-# rotations from attitude and from gyroscopes to less than this fraction
+# Maximum fraction of the mean square rotation difference that remains without the reported delay
 MAX_REMAINING_ROTATION_DIFFERENCE_RATIO = 0.5
-# Minimum speed (m/s) of the fast part of a flight, and minimum noise (m) at this speed, to report
-# noise that increases with speed
+# Minimum speed (m/s) and noise (m) in fast flight, to report noise that increases with speed
 MIN_HIGH_SPEED_M_S, MIN_NOISE_AT_HIGH_SPEED_M = 0.3, 0.02
-# Ratio of the standard deviation to the median absolute value of normal noise
+# σ of normal noise ÷ median of its absolute values
 SIGMA_PER_MEDIAN_ABSOLUTE_VALUE = 1.4826
 
 
@@ -129,14 +107,14 @@ class SpeedDependentNoise(NamedTuple):
 
 
 class LocalResiduals(NamedTuple):
-    """Deviations of positions and timestamps from a cubic polynomial through their four neighbours.
+    """Deviations of positions and timestamps from the interpolation of their neighbours.
 
     Attributes
     ----------
     residual_m : ndarray, shape (n, 2)
-        Deviation of the horizontal position, scaled so that its σ is the position noise.
+        Deviation of the horizontal position, scaled to the σ of the position noise.
     timestamp_jitter_s : ndarray, shape (n,)
-        Deviation of the timestamp from a constant rate, scaled in the same way.
+        Deviation of the timestamp, scaled in the same way.
     ekf2_speed_m_s : ndarray, shape (n,), or None
         EKF2's horizontal speed.
     """
@@ -148,10 +126,14 @@ class LocalResiduals(NamedTuple):
 
 
 class ErrorFit(NamedTuple):
-    """Fit of constant offset, scale factor, rotation and time offset to the errors of a source.
+    """Fit of constant offset, scale factor, rotation and time offset to position errors.
 
-    ``residual_m``, shape (n, 2), is the error against ground truth that the fit does not explain.
-    ``columns``, shape (n, 2, 5), contains the effects of the fitted parameters.
+    Attributes
+    ----------
+    residual_m : ndarray, shape (n, 2)
+        Remaining error against ground truth.
+    columns : ndarray, shape (n, 2, 5)
+        Effects of the five fitted parameters.
     """
 
     time_s: Array
@@ -164,12 +146,12 @@ class ErrorFit(NamedTuple):
     scale_sigma: float
 
     def compute_slow_mean_square_m2(self) -> float:
-        """Return the mean square (m²) of the residuals minus the variance of white noise."""
+        """Return the mean square (m²) of the residuals without white noise."""
         return float(np.mean(self.residual_m**2, axis=0).sum()) - 2.0 * self.white_noise_sigma_m**2
 
 
 class PeriodicError(NamedTuple):
-    """Sinusoidal position error. ``fraction`` of the slow errors (mean square) is sinusoidal."""
+    """Sinusoidal position error, and its ``fraction`` of the mean square slow error."""
 
     period_s: float
     amplitude_m: float
@@ -205,7 +187,7 @@ def _select_distinct_positions(comparison: Comparison) -> tuple[Array, Array]:
 
 
 def compute_local_residuals(comparison: Comparison) -> LocalResiduals | None:
-    """Return the residuals of cubic fits to neighbouring positions; None with too few positions."""
+    """Return each position and timestamp minus the interpolation of its neighbours."""
     time_s, position_m = _select_distinct_positions(comparison)
     if len(time_s) < MIN_POSITIONS:
         return None
@@ -217,7 +199,7 @@ def compute_local_residuals(comparison: Comparison) -> LocalResiduals | None:
     rows, neighbour_rows, elapsed_s = (
         array[has_close_neighbours] for array in (rows, neighbour_rows, elapsed_s)
     )
-    # Weights of the neighbours in Lagrange's interpolation at the time of the position
+    # Weights of Lagrange interpolation
     weights = np.ones_like(elapsed_s)
     for neighbour in range(len(NEIGHBOUR_ROW_OFFSETS)):
         for other_neighbour in set(range(len(NEIGHBOUR_ROW_OFFSETS))) - {neighbour}:
@@ -260,10 +242,7 @@ def compute_local_residuals(comparison: Comparison) -> LocalResiduals | None:
 
 
 def find_timestamp_jitter(errors: LocalResiduals) -> float | None:
-    """Return the jitter (s, 1 σ) of the timestamps if position errors confirm the jitter.
-
-    A late timestamp causes a position error of -delay · velocity.
-    """
+    """Return the timestamp jitter (s, 1 σ), if position errors confirm it."""
     expected_residual_m = -errors.velocity_m_s * errors.timestamp_jitter_s[:, None]
     expected_square_sum_m2 = float(np.sum(expected_residual_m**2))
     jitter_s = float(np.std(errors.timestamp_jitter_s))
@@ -284,13 +263,13 @@ def find_timestamp_jitter(errors: LocalResiduals) -> float | None:
 
 
 def find_speed_dependent_noise(errors: LocalResiduals) -> SpeedDependentNoise | None:
-    """Return the noise at low and high speed if it increases with speed in all directions."""
-    # The speed is from EKF2, because a speed from the positions would contain their noise
+    """Return the position noise at low and at high speed, if it increases with speed."""
+    # Use EKF2's speed: a speed from the positions contains their noise
     speed_m_s = errors.ekf2_speed_m_s
     if speed_m_s is None:
         return None
     residual_norms_m = np.linalg.norm(errors.residual_m, axis=1)
-    # Each flight part is tested, because larger noise in one part may look like noise due to speed
+    # Test each flight part: larger noise in one part may resemble noise due to speed
     correlation_z_scores = [
         rank_correlation(residual_norms_m[part], speed_m_s[part])
         * np.sqrt(len(part) / RESIDUAL_CORRELATION_LENGTH)
@@ -312,7 +291,7 @@ def find_speed_dependent_noise(errors: LocalResiduals) -> SpeedDependentNoise | 
     direction = errors.velocity_m_s / np.maximum(source_speed_m_s, 1e-6)
     along_track_residual_m = np.abs(np.sum(errors.residual_m * direction, axis=1))
     cross_track_residual_m = np.abs(np.sum(errors.residual_m * _rotate_90(direction), axis=1))
-    # Noise must increase in both directions, because jitter causes noise only along the track
+    # Jitter causes noise only along the track, so noise must increase in both directions
     if any(
         np.median(noise_m[is_fast]) < MIN_FAST_TO_SLOW_NOISE_RATIO * np.median(noise_m[is_slow])
         for noise_m in (along_track_residual_m, cross_track_residual_m)
@@ -390,17 +369,14 @@ def fit_errors(comparison: Comparison, local_residuals: LocalResiduals) -> Error
 
 
 def _fit_least_squares(columns: Array, values: Array) -> tuple[Array, Array]:
-    """Fit ``columns``, shape (n, 2, k), to values; return the k parameters and the residuals."""
+    """Solve a linear least-squares fit; return the parameters and the residuals."""
     rows = columns.reshape(-1, columns.shape[-1])
     parameters = np.asarray(np.linalg.lstsq(rows, values.ravel(), rcond=None)[0], dtype=np.float64)
     return parameters, values - columns @ parameters
 
 
 def find_periodic_error(fit: ErrorFit) -> PeriodicError | None:
-    """Find a sinusoidal error that explains most of the slow errors.
-
-    Return None without such an error, or if the vehicle itself moves at this frequency.
-    """
+    """Return a sinusoidal error that explains most of the slow errors, if any."""
     duration_s = fit.time_s[-1] - fit.time_s[0]
     max_frequency_hz = min(MAX_FREQUENCY_HZ, 0.25 / float(np.median(np.diff(fit.time_s))))
     frequency_step_hz = FREQUENCY_STEP_IN_PERIODS_PER_FLIGHT / duration_s
@@ -410,7 +386,7 @@ def find_periodic_error(fit: ErrorFit) -> PeriodicError | None:
     )
     if rows.stop <= rows.start or fit.compute_slow_mean_square_m2() <= 0.0:
         return None
-    # Errors are summed in time bins of equal length, so that one FFT tests all frequencies
+    # Sum the errors in time bins of equal length, so that one FFT tests all frequencies
     bin_count = 2 ** int(
         np.ceil(np.log2(MIN_BINS_PER_PERIOD * max_frequency_hz / frequency_step_hz))
     )
@@ -441,11 +417,7 @@ def find_periodic_error(fit: ErrorFit) -> PeriodicError | None:
 
 
 def find_offset_variation(fit: ErrorFit) -> OffsetVariation | None:
-    """Return the range of the time offset in flight if its variation explains the slow errors.
-
-    The time offsets of all flight parts and the parameters of :class:`ErrorFit` are fitted
-    together. A time offset causes no error at rest, so it does not explain a jump or drift.
-    """
+    """Return the range of the time offset in flight if its variation explains the slow errors."""
     flight_part_indices = np.floor((fit.time_s - fit.time_s[0]) / OFFSET_PART_DURATION_S).astype(
         int
     )
@@ -454,8 +426,7 @@ def find_offset_variation(fit: ErrorFit) -> OffsetVariation | None:
     moving_part_indices = np.flatnonzero(mean_square_speeds > MIN_SPEED_FOR_OFFSET_M_S**2)
     if len(moving_part_indices) < 2:
         return None
-    # First, the best time offset of each flight part is removed from all columns of the fit. Then
-    # the parameters that are constant in flight are fitted
+    # First remove the best time offset of each flight part, then fit the constant parameters
     error_per_time_offset_m_s = -fit.velocity_m_s
     inverse_square_speed_sums = np.zeros_like(square_speed_sums)
     inverse_square_speed_sums[moving_part_indices] = 1.0 / square_speed_sums[moving_part_indices]
@@ -469,7 +440,7 @@ def find_offset_variation(fit: ErrorFit) -> OffsetVariation | None:
         )
         return velocity_weighted_sums * inverse_square_speed_sums[:, None]
 
-    # The columns are the effects of the constant parameters without time offset, and the errors
+    # The last column contains the errors
     columns = np.concatenate([fit.columns[..., :-1], fit.residual_m[..., None]], axis=-1)
     time_offsets_by_column_s = fit_time_offsets_by_part(columns)
     columns -= (
@@ -493,7 +464,7 @@ def find_offset_variation(fit: ErrorFit) -> OffsetVariation | None:
 
 
 def find_attitude_delay(imu: pd.DataFrame, attitude: pd.DataFrame) -> float | None:
-    """Return the time (s) by which the logged attitude is late, if it is not zero."""
+    """Return the delay (s) of the logged attitude relative to the gyroscopes, if any."""
     imu_time_s, attitude_time_s = imu.index.to_numpy(), attitude.index.to_numpy()
     start_s = max(imu_time_s[0], attitude_time_s[0])
     end_s = min(imu_time_s[-1], attitude_time_s[-1])
@@ -527,7 +498,7 @@ def find_attitude_delay(imu: pd.DataFrame, attitude: pd.DataFrame) -> float | No
         )
         # The median difference is due to the gyroscope bias
         rotation_differences_rad -= np.median(rotation_differences_rad, axis=0)
-        # Each difference is limited, because resets of the attitude cause large differences
+        # Limit the effect of attitude resets
         limited_angles_rad = np.minimum(
             np.linalg.norm(rotation_differences_rad, axis=1), MAX_ROTATION_DIFFERENCE_RAD
         )

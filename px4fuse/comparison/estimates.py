@@ -1,7 +1,6 @@
 """Estimates of noises, time offset, yaw misalignment and errors of the position source.
 
-If the source drifts (odometry), innovations are small, although the position error is large. The
-noise estimates do not contain the drift.
+The noise estimates do not contain the drift of odometry.
 """
 
 from collections.abc import Callable, Mapping
@@ -42,16 +41,15 @@ from px4fuse.filter.time_offset import (
 from px4fuse.filter.tuning import HORIZONTAL, AxisTuning, NoiseEstimate, tune
 from px4fuse.flight.model import DIAGNOSIS_WITHHELD, Flight, Unavailable, reset_times_s
 
-# Minimum IMU rate (Hz) for an estimate of the time offset
+# Minimum IMU rate (Hz) to estimate a time offset
 MIN_TIME_OFFSET_IMU_HZ = 1.0 / MAX_IMU_INTERVAL_S
-# Minimum IMU rate (Hz) of telemetry: PX4 publishes vehicle_imu at 200 Hz (IMU_INTEG_RATE), and
-# slower telemetry skips samples
+# PX4 publishes vehicle_imu at 200 Hz (IMU_INTEG_RATE): slower telemetry skips samples
 MIN_TELEMETRY_IMU_HZ = 200.0
-# Minimum ratio of the measured IMU rate to the required rate: measured rates are up to 2 % lower
+# Measured IMU rates are up to 2 % lower than the nominal rate
 MIN_IMU_RATE_RATIO = 0.98
 TELEMETRY_IMU_MESSAGES = ("HIGHRES_IMU", "SCALED_IMU", "SCALED_IMU2", "SCALED_IMU3")
 
-# Minimum number of time offset estimates before, and also after, a tested change of the time offset
+# Minimum number of time offset estimates before and after a change of the time offset
 MIN_ESTIMATES_BEFORE_AND_AFTER_CHANGE = 2
 
 # Axes with a noise estimate in the report; north and east have a common estimate
@@ -74,9 +72,9 @@ class Estimates:
     heading : HeadingError or Unavailable
         Yaw misalignment of the position frame.
     axis_tunings : tuple of AxisTuning
-        Separate noises along north and east, if they differ; empty for GNSS and odometry.
+        Noises along two perpendicular axes, if they differ.
     noisy_part : NoisyPart or None
-        Time span with larger innovations than in the rest of the flight; None for odometry.
+        Time span with larger innovations than in the rest of the flight.
     """
 
     tuning: TuningByAxis
@@ -107,7 +105,7 @@ def value_or_bound(noise: NoiseEstimate, fallback: float) -> float:
 
 
 def estimate(comparison: Comparison, progress: Progress = ignore_progress) -> Estimates:
-    """Estimate noises, time offset, yaw misalignment and systematic errors of the source."""
+    """Estimate noises, time offset, yaw misalignment and systematic errors of a position source."""
     tuned_axes = (
         REPORTED_AXES
         if {"north", "east"} <= {axis.name for axis in comparison.input_axes}
@@ -149,9 +147,9 @@ def estimate_noises(
     axis_names : tuple of str, optional
         Axis names, or "horizontal" for north and east together; default: all.
     progress : callable
-        Called with the name of each estimate before it is computed.
+        Called with the name of each estimate.
     motion_cache : dict, optional
-        IMU motion that several estimates share.
+        Cache of the motion from the IMU.
     """
     flight, low_imu_rate_reason = comparison.flight, explain_low_imu_rate(comparison.flight)
     if flight.log.is_assessed:
@@ -253,7 +251,7 @@ def _fit_source_errors(
         source_resets_s=reset_times_s(comparison.source).tolist(),
     )
     jumps = systematic_errors.jumps if isinstance(systematic_errors, SystematicErrors) else ()
-    # The exact time of a jump is unknown, so the measurements directly after it are excluded
+    # The exact time of a jump is unknown: exclude the measurements directly after it
     time_s, excluded_times_s = axes[0].measurement_time_s, axis_tuning.outlier_time_s
     for jump in jumps:
         is_after_jump = (time_s >= jump.time_s) & (
@@ -290,7 +288,7 @@ def _fit_source_errors(
 def _select_horizontal_axes(
     comparison: Comparison, tuning: TuningByAxis
 ) -> tuple[tuple[Axis, ...], AxisTuning] | Unavailable:
-    """Return the horizontal axes that have a common noise estimate, and this estimate."""
+    """Return the horizontal axes and their common noise estimate."""
     for name, axis_names in ((HORIZONTAL, ("north", "east")), (AISLE, (AISLE,))):
         axis_tuning = tuning.get(name)
         if isinstance(axis_tuning, AxisTuning) and comparison.axes.keys() >= set(axis_names):
@@ -305,9 +303,7 @@ def _select_horizontal_axes(
 def explain_low_imu_rate(flight: Flight) -> Unavailable | None:
     """Return a reason if the IMU rate is too low to estimate a time offset, otherwise None.
 
-    Telemetry needs a higher rate than a ULog, because a ULog sample is the mean over its interval.
-    Telemetry sends only the newest of several samples, minus EKF2's bias estimate
-    (``HIGHRES_IMU.hpp``).
+    Telemetry skips samples, so it needs a higher rate than a ULog (``HIGHRES_IMU.hpp``).
     """
     if isinstance(flight.imu, Unavailable) or len(flight.imu) < 2:
         return None
@@ -332,10 +328,9 @@ def explain_low_imu_rate(flight: Flight) -> Unavailable | None:
 
 
 def widen_for_drift(clock_offset: ClockOffset) -> ClockOffset:
-    """Widen the 95 % interval of the time offset of a source that may drift (odometry).
+    """Widen the 95 % interval of the time offset of odometry, because of its drift.
 
-    Drift increases the scatter of the time offsets of different flight parts. The interval is
-    widened by the ratio of the scatter to the reported σ of these time offsets.
+    The factor is the scatter of the time offsets of flight parts ÷ their reported σ.
     """
     offsets_s = np.array([part.offset_s for part in clock_offset.parts])
     weights = np.array([part.sigma_s**-2.0 for part in clock_offset.parts])
@@ -379,8 +374,7 @@ def _compute_weighted_square_sum(offsets_s: Array, weights: Array) -> float:
 def _compute_change_p_value(offsets_s: Array, weights: Array) -> float | None:
     """Return the p-value of the largest change of the time offset; None for a short flight.
 
-    Method: Student's t-test of the mean offsets before and after each time, with Bonferroni
-    correction. Changes below ``MIN_TIME_OFFSET_CHANGE_S`` are ignored.
+    Method: Student's t-test with Bonferroni correction.
     """
     part_count = len(offsets_s)
     split_rows = range(

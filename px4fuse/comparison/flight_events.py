@@ -11,7 +11,7 @@ from px4fuse.core.arrays import Array, select_intervals
 from px4fuse.core.record import Span
 from px4fuse.flight.model import Ekf2, Flight, Unavailable
 
-# Minimum length (s) of a gap in the position source: jitter causes longer intervals, too
+# Minimum length (s) of a gap in the position source
 MIN_GAP_S = 1.0
 # Minimum length of a gap in the position source, in sample intervals
 MIN_GAP_IN_INTERVALS = 5.0
@@ -50,18 +50,18 @@ def compute_max_interval_s(interval_s: float) -> float:
 
 
 def find_source_gaps(time_s: Array, rate_hz: float) -> tuple[Span, ...]:
-    """Return start and end (s) of each gap in the positions; ``rate_hz`` is their normal rate."""
+    """Return start and end (s) of each gap in positions with the normal rate ``rate_hz``."""
     is_gap = np.diff(time_s) > compute_max_interval_s(1.0 / rate_hz)
     return tuple(select_intervals(time_s, is_gap))
 
 
 def find_airborne_spans(flight: Flight) -> tuple[Span, ...]:
-    """Return take-off and landing (s) of each flight; empty without a land detector."""
+    """Return the take-off and landing times (s) of each flight in the log."""
     return () if isinstance(flight.airborne, Unavailable) else flight.airborne
 
 
 def collect_events(comparison: Comparison) -> Events:
-    """Collect gaps, rejections, resets, take-offs and landings in the flight of the segment."""
+    """Collect the events of a flight: gaps, rejections, resets, take-off and landing."""
     flight, segment = comparison.flight, comparison.segment.whole_flight
     start_s, end_s = segment.start_s, segment.end_s
     time_s = np.concatenate([[start_s], comparison.input_axes[0].measurement_time_s, [end_s]])

@@ -1,4 +1,4 @@
-"""Records of a comparison of KF with EKF2: inputs, and results along each axis."""
+"""Inputs and results of a comparison of KF with EKF2."""
 
 from collections.abc import Mapping
 from dataclasses import dataclass
@@ -33,10 +33,9 @@ FILTER_NAMES: Mapping[FilterName, Literal["KF", "EKF2"]] = {"kf": "KF", "ekf2": 
 
 
 class ErrorsAgainstTruth(Record, kw_only=True):
-    """Errors of one filter against ground truth, at the times of EKF2's published state.
+    """Errors of one filter against ground truth.
 
-    The mean NEES (expected 1) is None without a reported variance. No chi-square band is given,
-    because the errors in one flight are correlated.
+    The mean NEES has no 95 % band, because the errors in one flight are correlated.
     """
 
     count: Count
@@ -48,10 +47,7 @@ class ErrorsAgainstTruth(Record, kw_only=True):
 
     @property
     def has_only_lag_errors(self) -> bool:
-        """True if EKF2 is not overconfident at the fusion horizon.
-
-        Only the lag of EKF2's output predictor then makes the errors larger than σ.
-        """
+        """True if only the lag of EKF2's output predictor makes EKF2 overconfident."""
         nees = self.nees_position_horizon_mean
         return nees is not None and classify_sigma_ratio(nees**0.5, "truth") != "overconfident"
 
@@ -62,9 +58,9 @@ class FilterSummary(Consistency, kw_only=True):
     Attributes
     ----------
     sigma_p_median_m, sigma_v_median_m_s : float or None
-        Median reported σ of position and velocity; None if not logged.
+        Median reported σ of position and velocity.
     sigma_p_before_update_m, sigma_p_after_update_m : float or None
-        Median reported position σ before and after an update. EKF2: P⁻ = S - R, P⁺ = P⁻R/S.
+        Median position σ before and after an update.
     truth : ErrorsAgainstTruth or Unavailable
     """
 
@@ -100,7 +96,7 @@ class Difference(Record, kw_only=True):
 class UpdateStatistics(Record, kw_only=True):
     """Number of KF's updates along one axis, and times (s) of the first and the last update.
 
-    ``input_gap_s`` is the total time (s) without IMU data.
+    ``input_gap_s`` is the time (s) without IMU data.
     """
 
     count: Count
@@ -120,17 +116,15 @@ class AxisComparison(Record, kw_only=True):
     direction : (float, float, float)
         Unit vector in NED.
     note : str
-        Text for the user on the choice of the axis direction.
+        Reason for the direction of the axis, as text.
     rejected_fraction : float or None
         Fraction of the positions that EKF2 rejected; None if not logged.
     ekf2_state : DataFrame or Unavailable
-        Position and velocity, without resets that move the origin of EKF2's frame.
+        Position and velocity of EKF2 without resets of the frame's origin.
     ekf2_innovations : DataFrame or Unavailable
-        :attr:`Ekf2.innovations` along the axis, with the position variance before (P⁻ = S - R) and
-        after (P⁺ = P⁻R/S) each update.
+        Innovations of EKF2, and its position variance before and after each update.
     whole_flight_tracks : mapping from attribute name to DataFrame or Unavailable
-        ``ekf2_state``, ``ekf2_variance`` and ``truth`` over the whole flight, not only over the
-        analysed segment.
+        State and variance of EKF2, and ground truth, over the whole flight.
     """
 
     heading_deg: float | None = None
@@ -160,13 +154,13 @@ class PreparedComparison:
     Attributes
     ----------
     settings : Settings
-        Settings of KF; ``input`` is "zero" if the log has no acceleration.
+        Settings of KF.
     input_axes : tuple of Axis
         Axes with their measurements and accelerations, the inputs of KF.
     notes : tuple of str
         Notes for the user about the log and about automatic choices.
     convention : Convention or None
-        Detected axes, unit and clock of the positions as sent; ``source`` is already converted.
+        Axes, unit and clock of the positions as sent.
     """
 
     flight: Flight
@@ -213,7 +207,7 @@ class Comparison(PreparedComparison):
 
     @property
     def main(self) -> AxisComparison:
-        """Result along the main axis (direction of largest motion), or along the first axis."""
+        """Result along the main axis (largest motion) if analysed, else along the first axis."""
         return self.axes.get(AISLE) or next(iter(self.axes.values()))
 
 

@@ -14,14 +14,12 @@ from px4fuse.filter.signals import Axis, make_horizontal_axis
 from px4fuse.filter.tuning import AxisTuning, tune
 from px4fuse.flight.model import Unavailable
 
-# Noises are estimated separately along north and east if their mean NIS differ by this factor
+# Minimum ratio of the mean NIS along north and east, for separate noise estimates
 MIN_AXIS_NIS_RATIO = 1.7
-# Noises are estimated along the directions of the largest and the smallest noise if the correlation
-# of the noise along north and east is this number of σ: 1 of 3 million flights without correlation
+# Minimum ratio of the noise correlation (north to east) to its σ: reached by chance once in 3
+# million flights
 MIN_CORRELATION_SIGMAS = 5.0
-# Maximum number of flight parts of equal length whose innovations are compared
 MAX_FLIGHT_PART_COUNT = 12
-# Minimum number of measurements in each compared flight part
 MIN_PART_MEASUREMENTS = 25
 
 
@@ -37,8 +35,7 @@ class NoisyPart(NamedTuple):
 def tune_perpendicular_axes(comparison: Comparison) -> tuple[AxisTuning, ...]:
     """Estimate separate noises along two perpendicular axes, if the noises seem to differ.
 
-    The axes are north and east. If the noise along north and east is correlated, they are the axes
-    of the largest and the smallest noise.
+    The axes are north and east, or the directions of the largest and the smallest noise.
     """
     compared_axes = select_north_and_east(comparison)
     summaries = [axis.filters["kf"] for axis in compared_axes]
@@ -61,9 +58,8 @@ def tune_perpendicular_axes(comparison: Comparison) -> tuple[AxisTuning, ...]:
 def _find_heading_of_largest_noise(north_and_east: Sequence[AxisComparison]) -> float | None:
     """Return the heading (°, 0 to 180) of the largest noise, if north and east are correlated.
 
-    The function compares the changes of KF's innovation between two samples, because slow errors
-    (time offset, scale, misalignment) cancel in them. Median and signs are robust to outliers: the
-    correlation is sin(π/2 · mean(sign(north) · sign(east))) (Blomqvist 1950).
+    Slow errors cancel in the changes of KF's innovation between two samples. The correlation
+    of these changes is sin(π/2 · mean(sign(north) · sign(east))) (Blomqvist 1950).
     """
     innovations_m = [axis.replay.updates["innovation_m"] for axis in north_and_east]
     changes_m = pd.concat(innovations_m, axis="columns", join="inner").diff().dropna().to_numpy()
@@ -81,14 +77,11 @@ def _find_heading_of_largest_noise(north_and_east: Sequence[AxisComparison]) -> 
 def find_noisy_flight_part(
     comparison: Comparison, axis_tuning: AxisTuning | Unavailable | None
 ) -> NoisyPart | None:
-    """Find a time span with larger innovations than in the rest of the flight.
-
-    ``axis_tuning`` contains the noises of north and east for a run of KF.
-    """
+    """Find a time span with larger innovations than in the rest of the flight."""
     settings = comparison.settings
     if axis_tuning is None:
         return None
-    # Without an estimate, KF's settings are used: noisy measurements may prevent the estimation
+    # Use KF's settings if the noises could not be estimated
     sigma_a: float | None = settings.sigma_a_m_s2
     sigma_z: float | None = settings.sigma_z_m
     outlier_time_s = np.zeros(0)
@@ -110,7 +103,7 @@ def find_noisy_flight_part(
             innovations(axis_motion, sigma_a, sigma_z, is_excluded) for axis_motion in axis_motions
         ]
         magnitudes = np.abs([nu / np.sqrt(s) for nu, s in axis_innovations])
-        # A wrong noise scales all innovations by one factor. Division by the median removes it
+        # Division by the median removes the effect of a wrong noise setting
         return np.asarray(magnitudes / np.median(magnitudes, axis=1, keepdims=True))
 
     scaled_innovations = compute_scaled_innovations(None)

@@ -40,7 +40,7 @@ from px4fuse.readers.px4_topics import ORIGIN_BY_TRACK_NAME, SOURCE_TRACKS
 from px4fuse.request import ComparisonRequest, HeightName
 from px4fuse.trajectory.rotation import interpolate, to_matrix
 
-# Kind of sensor and way into the log of each position source, by PX4 topic or MAVLink message
+# Kind of sensor of each position source, by PX4 topic or MAVLink message
 ORIGIN_BY_SOURCE_NAME = ORIGIN_BY_TRACK_NAME | {
     source.track_name: source.origin for source in POSITION_MESSAGE_TYPES
 }
@@ -49,8 +49,7 @@ NO_SEPARATE_TRUTH = Unavailable(
     "KF uses the only ground truth in the log as its position source",
     "Choose another position source for KF with --position-source.",
 )
-# Default axes for sources with constant height, and for GNSS, whose height is too noisy for a
-# common SIGMA_Z
+# Default axes if the height of the source is constant or too noisy (GNSS)
 HORIZONTAL_AXES = (AISLE, "north", "east")
 
 
@@ -59,8 +58,7 @@ def prepare_comparison_inputs(
 ) -> PreparedComparison:
     """Choose position source, segment and axes of a flight for the comparison of KF with EKF2.
 
-    With ``keep_positions_as_sent``, axes, unit and clock of the positions are neither checked nor
-    corrected.
+    ``keep_positions_as_sent`` skips the check and correction of axes, unit and clock.
 
     Raises
     ------
@@ -89,7 +87,6 @@ def prepare_comparison_inputs(
     if convention is not None and settings.clock_offset_s:
         convention = structs.replace(convention, late_s=0.0)
     timestamp_delay_s = find_convention_faults(convention, flight, source_track.frame).late_s
-    # A time offset outside the valid range is set to the limit of the range
     clock_offset_limits_s = SETTING_RANGES["clock_offset_s"][:2]
     clock_offset_s = float(
         np.clip(settings.clock_offset_s - timestamp_delay_s, *clock_offset_limits_s)
@@ -177,10 +174,10 @@ def _find_missing_innovations(ekf2: Ekf2) -> tuple[Unavailable, ...]:
 
 
 def choose_source(flight: Flight, name: str | None = None) -> tuple[PositionTrack, str]:
-    """Return a position source of the log, and the reason for its choice.
+    """Choose a position source of the log, and return it with the reason.
 
-    Without a ``name``, a topic with positions as received is preferred to positions that are
-    computed from EKF2's topics. GNSS is chosen only if EKF2 fused it.
+    Positions as received are preferred to positions from EKF2's topics. GNSS is chosen only if EKF2
+    fused it.
 
     Raises
     ------
@@ -206,7 +203,7 @@ def choose_source(flight: Flight, name: str | None = None) -> tuple[PositionTrac
 
 
 def _subtract_lever_arm(track: PositionTrack, flight: Flight) -> PositionTrack:
-    """Subtract EKF2's lever arm of the sensor, so that positions are those of the vehicle."""
+    """Subtract the sensor's lever arm (EKF2 parameters) from the positions."""
     attitude = flight.attitude
     if not any(track.lever_arm_m) or isinstance(attitude, Unavailable) or track.frame != "NED":
         return track
@@ -227,10 +224,7 @@ def _subtract_lever_arm(track: PositionTrack, flight: Flight) -> PositionTrack:
 
 
 def _shift_vision_to_ekf2_origin(track: PositionTrack, flight: Flight) -> PositionTrack:
-    """Shift vision positions to EKF2's origin if EKF2 also fused GNSS.
-
-    EKF2 then estimates the constant offset of vision. The same offset is removed for KF.
-    """
+    """Shift vision positions to EKF2's origin if EKF2 also fused GNSS."""
     ekf2 = flight.ekf2
     if not (track.origin.is_vision and isinstance(ekf2, Ekf2) and has_fused_aid(ekf2)):
         return track
@@ -257,10 +251,7 @@ def _shift_vision_to_ekf2_origin(track: PositionTrack, flight: Flight) -> Positi
 def _use_barometer_height(
     track: PositionTrack, flight: Flight, height_sensor: HeightName | None
 ) -> PositionTrack:
-    """Replace GNSS height by barometer height, if requested or if EKF2 fused the barometer only.
-
-    The zero of a barometer is arbitrary, so its median difference to EKF2's height is removed.
-    """
+    """Replace GNSS height by barometer height, if requested or if EKF2 fused the barometer only."""
     ekf2, barometer_heights, log_name = flight.ekf2, flight.barometer, flight.log.name
     if height_sensor and not track.origin.is_fused_as_gnss:
         raise SettingsError(
@@ -369,7 +360,7 @@ def choose_segment(
 ) -> Segment:
     """Choose the time span to analyse: by default, the longest flight with positions.
 
-    ``start_s`` and ``end_s`` are the user's limits (seconds from the first data), if any.
+    ``start_s`` and ``end_s`` are limits in seconds from the first data.
 
     Raises
     ------

@@ -24,7 +24,6 @@ from px4fuse.flight.model import (
 
 # Minimum measurement noise √R (m) that EKF2 uses (ev_pos_control.cpp, EKF2.cpp)
 EKF2_MIN_NOISE_M = 0.01
-# Minimum number of common times of two tracks to compute statistics of their difference
 MIN_COMMON_SAMPLES = 3
 # NED columns of each projected quantity, and exponent of the direction cosines (2 for variances)
 PROJECTED_COLUMNS: Mapping[str, tuple[list[str], int]] = {
@@ -33,8 +32,7 @@ PROJECTED_COLUMNS: Mapping[str, tuple[list[str], int]] = {
     "position_variance_m2": (Columns.POSITION_VARIANCE, 2),
     "velocity_variance_m2_s2": (Columns.VELOCITY_VARIANCE, 2),
 }
-# Maximum ratio of EKF2's median squared distance from the positions without resets to the distance
-# with resets, to remove the resets
+# Resets are removed if EKF2's median squared distance from the positions decreases to this ratio
 MAX_DISTANCE_RATIO_WITHOUT_RESETS = 0.95
 
 
@@ -43,15 +41,14 @@ def remove_origin_resets(
 ) -> tuple[pd.DataFrame, str]:
     """Remove the resets of EKF2's position that only move the origin of its frame.
 
-    A reset moves only the origin if EKF2 without the reset is closer to the measured positions. All
-    other resets correct an error of EKF2 and are kept.
+    All other resets correct an error of EKF2 and are kept.
 
     Returns
     -------
     state : DataFrame
         Position and velocity as in :attr:`Ekf2.state`.
     statement : str
-        Text for the user with the numbers of removed and other resets; empty without a reset.
+        Number of removed resets and of other resets, as text.
     """
     resets_in_segment = [
         reset for reset in ekf2.resets if segment.start_s < reset.time_s <= segment.end_s
@@ -100,15 +97,12 @@ def remove_origin_resets(
 def _make_states_without_resets(
     published_state: pd.DataFrame, resets: list[Reset], axes: list[int]
 ) -> Iterator[pd.DataFrame]:
-    """Yield EKF2's positions without resets, one table for each interval between resets.
-
-    In each table, all positions are in EKF2's frame of one interval.
-    """
+    """Yield EKF2's positions without resets, in the frame of each interval between resets."""
     reset_m = np.array([reset.delta for reset in resets])[:, axes]
     is_after_reset = np.array([published_state.index >= reset.time_s for reset in resets]).T
     for earlier_count in range(len(resets) + 1):
-        # The frame is that after the first earlier_count resets. These resets are added to the
-        # positions before them; all later resets are subtracted from the positions after them
+        # Add earlier resets to positions before them, subtract later resets from positions after
+        # them
         frame_shift_m = (~is_after_reset[:, :earlier_count]) @ reset_m[
             :earlier_count
         ] - is_after_reset[:, earlier_count:] @ reset_m[earlier_count:]
@@ -145,7 +139,7 @@ def _make_no_samples_result(quantity_name: str) -> Unavailable:
 
 
 def project_variance(ekf2: Ekf2, axis: Axis, segment: Segment) -> pd.DataFrame | Unavailable:
-    """Project EKF2's variances onto an axis. Covariances between axes are not logged."""
+    """Project EKF2's variances onto an axis, without covariances, which are not logged."""
     if isinstance(ekf2.variance, Unavailable):
         return ekf2.variance
     projected_variance = project(ekf2.variance, axis, segment)
@@ -159,8 +153,7 @@ def project_fusion_horizon_position(
 ) -> pd.DataFrame | None:
     """Return EKF2's position (m) and its variance (m²) at the fusion horizon, if logged.
 
-    EKF2's variance belongs to this position. The output predictor extrapolates the published
-    position to the present. Covariances between axes are neglected, because they are not logged.
+    EKF2's variance belongs to this position, not to the published position.
     """
     weights = dict(zip(AXIS_NAMES, axis.direction.tolist(), strict=True))
     aid = ekf2.aids.get("ev_hgt" if axis.name == "down" else "ev_pos")
@@ -208,8 +201,8 @@ def project_innovations(
 ) -> pd.DataFrame | Unavailable:
     """Project EKF2's innovations onto an axis, and add EKF2's position variance at each update.
 
-    The added columns are ``prior_variance_m2`` (P⁻ = S - R) and ``posterior_variance_m2``
-    (P⁺ = P⁻R/S if fused, P⁻ if rejected). Both are NaN if R is unknown.
+    Added columns: ``prior_variance_m2`` (P⁻ = S - R), and ``posterior_variance_m2`` (P⁺ = P⁻R/S, or
+    P⁻ if the position is rejected).
     """
     if track.aid(axis.name) is None:
         return Unavailable(
@@ -249,7 +242,7 @@ def _combine_north_and_east(
     common_times = north_innovations.index.intersection(east_innovations.index)
     north, east = north_innovations.loc[common_times], east_innovations.loc[common_times]
     cosine, sine = float(direction[0]), float(direction[1])
-    # cos² and sin² are the weights of variances. All columns without variances are set below
+    # Variances have the weights cos² and sin²; other columns are set below
     combined_innovations = cosine * cosine * north + sine * sine * east
     combined_innovations["innovation_m"] = (
         cosine * north["innovation_m"] + sine * east["innovation_m"]
@@ -267,7 +260,7 @@ def find_observation_variance(
     segment: Segment,
     default_noise_m: float = math.nan,
 ) -> float:
-    """Return the R (m²) that EKF2 used for the position source; NaN if unknown.
+    """Return EKF2's measurement noise variance R (m²) of the positions; NaN if unknown.
 
     R is the square of EKF2's noise parameter, or a larger variance that the source reports.
     ``default_noise_m`` replaces a parameter that is not logged. Sources: PX4 EKF2.cpp,
@@ -281,7 +274,7 @@ def find_observation_variance(
         return math.nan
     noise_factor = GNSS_HEIGHT_NOISE_FACTOR if aid == GNSS_POS and axis.name == "down" else 1.0
     configured_variance_m2 = max(noise_factor * noise_m, EKF2_MIN_NOISE_M) ** 2
-    # For a position file or barometer, EKF2 receives no variance: only the parameter sets R
+    # EKF2 receives no variance from a position file or barometer
     ignores_reported_variance = track.alignment is not None or aid == BAROMETER
     if ignores_reported_variance or parameters.get(aid.noise_mode_parameter) == 1.0:
         return configured_variance_m2

@@ -17,24 +17,22 @@ from px4fuse.filter.tuning import HORIZONTAL, AxisTuning, NoiseEstimate
 from px4fuse.flight.ekf2_parameters import EV_POS, GNSS_POS, GNSS_VEL, PARAMETERS, Aid
 from px4fuse.flight.model import Unavailable
 
-# Values of EKF2_GPS_DELAY (ms) in the re-runs that estimate the delay of GNSS
+# Tested values of EKF2_GPS_DELAY (ms)
 GNSS_DELAYS_MS = (0.0, 150.0, 300.0)
 # Transmission time (ms) of a position message: EKF2_DELAY_MAX includes it
 TRANSMISSION_DELAY_MS = 30.0
 # EKF2_DELAY_MAX is rounded up to a multiple of this value (ms)
 EKF2_DELAY_MAX_STEP_MS = 50.0
-# A height noise that differs from the horizontal noise is reported only if EKF2 fuses heights of
-# the source for at least this fraction of the time
+# Minimum fraction of the time with fused heights, to report a different height noise
 MIN_FUSED_FRACTION_OF_HEIGHTS = 0.5
-# Minimum ratio of height noise to horizontal noise, to report that one parameter sets both noises
+# Minimum reported ratio of height noise to horizontal noise
 MIN_HEIGHT_TO_HORIZONTAL_NOISE_RATIO = 2.0
 
 
 def estimate_gnss_delay_ms(model: Ekf2Model) -> tuple[float, float] | None:
-    """Estimate the delay of GNSS and its σ (ms) in a flight with vision and GNSS velocity.
+    """Estimate the GNSS delay and its σ (ms) by replays of EKF2 with values of EKF2_GPS_DELAY.
 
-    The delay minimises the NIS of GNSS in re-runs of EKF2 with several values of EKF2_GPS_DELAY.
-    Return None if it does not differ significantly from the logged delay.
+    Return None if the delay does not differ significantly from the logged delay.
     """
     received_positions = model.inputs.received_positions
     if (
@@ -56,8 +54,7 @@ def estimate_gnss_delay_ms(model: Ekf2Model) -> tuple[float, float] | None:
             for axis in ("north", "east")
             for updates in update_tables
         ]
-        # The mean is scaled to the same number of samples in all re-runs, because the number of
-        # fused samples depends on the delay
+        # Scale the mean to the same number of samples in all replays
         nis_sums.append(float(np.mean(nis)) * len(nis) * len(received_positions.timestamp_s))
     quadratic_coefficient, linear_coefficient, _ = np.polyfit(GNSS_DELAYS_MS, nis_sums, 2)
     if quadratic_coefficient <= 0.0:
@@ -81,8 +78,7 @@ def estimate_ekf2_parameters(
 ) -> dict[str, float]:
     """Return the maximum-likelihood values of those EKF2 noises and delays that are wrong.
 
-    A value is wrong if it differs significantly from the estimate. For GNSS and odometry, a noise
-    is not reduced, because innovations do not show their slow errors.
+    Noises of GNSS and odometry are not reduced: innovations do not show their slow errors.
     """
     changes: dict[str, float] = {}
     ekf2_inputs, min_vision_noise_m = model.inputs, 0.0
@@ -136,10 +132,7 @@ def make_estimated_delay_change(
 def estimate_differing_delay_ms(
     comparison: PreparedComparison, clock_offset: ClockOffset, logged_delay_ms: float
 ) -> float | None:
-    """Return the estimated delay (ms) of the positions if it differs from the logged delay.
-
-    Return None if the difference is not significant.
-    """
+    """Return the estimated delay (ms) of the positions if it differs from the logged delay."""
     estimated_delay_ms = 1e3 * (comparison.source.assumed_delay_s - clock_offset.offset_s)
     return (
         estimated_delay_ms
@@ -151,10 +144,7 @@ def estimate_differing_delay_ms(
 def describe_delay_limit(
     parameter_name: str, estimated_delay_ms: float, logged_delay_ms: float
 ) -> str:
-    """Return the reason why PX4 does not permit a delay, as text after "cannot".
-
-    The text is "exceed 300 ms" or "be negative", and "" for a permitted delay.
-    """
+    """Return the reason why PX4 does not permit a delay: "exceed 300 ms", "be negative" or ""."""
     if estimated_delay_ms > (maximum_ms := PARAMETERS[parameter_name].maximum):
         return f"exceed {maximum_ms:g} ms"
     return "be negative" if round(estimated_delay_ms) <= 0.0 == logged_delay_ms else ""
@@ -166,10 +156,7 @@ def find_aid(comparison: PreparedComparison, axis: str = "") -> Aid:
 
 
 def find_logged_delay_ms(comparison: PreparedComparison) -> float | None:
-    """Return the logged delay (ms) that EKF2 subtracts from the timestamps of the positions.
-
-    Return None if the parameter is not logged, or if EKF2 does not use it.
-    """
+    """Return the logged delay parameter (ms) of the position source, if EKF2 uses it."""
     source = comparison.source
     if source.origin.aid is None or source.alignment is not None:
         return None
@@ -184,10 +171,7 @@ def find_logged_delay_ms(comparison: PreparedComparison) -> float | None:
 def make_estimated_noise_change(
     ekf2_inputs: ReplayInputs, noise_estimate: NoiseEstimate, noise_m: float
 ) -> dict[str, float]:
-    """Return the EKF2 parameters for the position noise ``noise_m``.
-
-    The mapping is empty if EKF2's noise is inside the 95 % interval of ``noise_estimate``.
-    """
+    """Return EKF2 parameters for ``noise_m``, if EKF2's noise differs from the estimate."""
     if (
         (noise_estimate.low or 0.0)
         <= find_used_noise_m(ekf2_inputs)
@@ -204,7 +188,7 @@ def make_noise_change(
 ) -> dict[str, float]:
     """Return the EKF2 parameters that set the position noise to ``noise_m``.
 
-    If the sender reports a larger noise (``reported_noise_m``), a parameter makes EKF2 ignore it.
+    EKF2 then ignores a larger noise that the sender reports.
     """
     changes = {aid.noise: max(float(f"{noise_m:.2g}"), PARAMETERS[aid.noise].minimum)}
     if (
@@ -217,10 +201,7 @@ def make_noise_change(
 
 
 def make_delay_change(ekf2_inputs: ReplayInputs, delay_ms: float) -> dict[str, float]:
-    """Return the EKF2 parameters for a delay of the positions. A negative delay is set to 0.
-
-    The mapping is empty if PX4 does not permit the delay, or if EKF2 ignores the parameter.
-    """
+    """Return the EKF2 parameters for a delay of the positions, if PX4 permits the delay."""
     delay_name = ekf2_inputs.aid.delay
     parameter = PARAMETERS[delay_name]
     if delay_ms > parameter.maximum or ekf2_inputs.received_positions.uses_sender_timestamps:
@@ -265,9 +246,9 @@ def _compute_reported_noise_m(ekf2_inputs: ReplayInputs) -> float:
 def make_height_noise_advice(
     comparison: PreparedComparison, tuning: TuningByAxis, noise_m: float
 ) -> str:
-    """Return an action if the height noise is much larger than the horizontal noise ``noise_m``.
+    """Return an action if the height noise is much larger than the horizontal noise.
 
-    EKF2 has one noise parameter for the horizontal position and the height of external vision.
+    EKF2 has one noise parameter for position and height of external vision.
     """
     ekf2, down_tuning = comparison.flight.ekf2, tuning.get("down")
     if isinstance(ekf2, Unavailable) or isinstance(ekf2.fusion_flags, Unavailable):
@@ -288,7 +269,7 @@ def make_height_noise_advice(
 def select_changed_settings(
     changes: Mapping[str, float], flight_settings: Mapping[str, float]
 ) -> dict[str, float]:
-    """Return the entries of ``changes`` with a value that differs from that in flight."""
+    """Return those changes that differ from the settings in flight."""
     return {
         name: value
         for name, value in changes.items()

@@ -1,7 +1,6 @@
 """Search for the cause of an inconsistent filter by re-runs with one change at a time.
 
-KF and EKF2 are re-run with each candidate change (:mod:`px4fuse.comparison.changes`). If no single
-change makes the filter consistent, the best change is combined with each of the others.
+If no single change is sufficient, the best change is combined with each other change.
 """
 
 from collections.abc import Callable, Iterable, Mapping
@@ -71,7 +70,7 @@ from px4fuse.filter.tuning import HORIZONTAL
 from px4fuse.flight.ekf2_parameters import PARAMETERS
 from px4fuse.flight.model import Columns, Unavailable
 
-# Mean NIS from which the innovations of a filter are too large for its reported σ
+# Mean NIS above which innovations are too large for the reported σ
 MAX_NORMAL_NIS = 1.5
 INNOVATION_COLUMNS = [f"innovation_{axis}_m" for axis in HORIZONTAL_AXES]
 INNOVATION_VARIANCE_COLUMNS = [f"innovation_variance_{axis}_m2" for axis in HORIZONTAL_AXES]
@@ -82,8 +81,7 @@ DIFFERENCE_UNAVAILABLE = Unavailable(
     "this re-run rotates only KF's frame, so positions of KF and EKF2 are not comparable",
     "",
 )
-# Re-runs of EKF2 are compared with the log if replay and log agree within this factor in position
-# RMSE and σ ratios. Otherwise, they are compared with the replay
+# Maximum ratio of RMSE or σ ratio, replay to log, to compare re-runs with the log
 MAX_REPLAYED_TO_LOGGED_RATIO = 1.10
 
 
@@ -97,16 +95,13 @@ class ErrorAboveSigma(NamedTuple):
 
 
 def find_error_above_sigma(summary: FilterSummary | UntestedFilter) -> ErrorAboveSigma | None:
-    """Return the position error if it exceeds the reported σ although the mean NIS is normal.
-
-    A missing mean NIS counts as normal.
-    """
+    """Return the position error if it exceeds the reported σ although the mean NIS is normal."""
     truth = summary.truth
     if isinstance(truth, Unavailable):
         return None
     nis_mean = None if isinstance(summary, Unavailable) else summary.nis_mean
     nees, rmse_m = truth.nees_position_mean or 0.0, truth.position_rmse_m
-    # The NEES at the fusion horizon does not contain errors due to the lag of the output predictor
+    # The NEES at the fusion horizon contains no errors due to the lag of the output predictor
     fusion_horizon_nees = truth.nees_position_horizon_mean or nees
     if min(nees, fusion_horizon_nees) < MIN_REPORTED_NEES or (nis_mean or 0.0) >= MAX_NORMAL_NIS:
         return None
@@ -123,7 +118,7 @@ class Reruns:
     ekf2_model : Ekf2Model or Unavailable
         Replay of EKF2 with the logged parameters.
     difference_steps : mapping from axis name to DifferenceExplanation or Unavailable
-        Contribution of each property of EKF2 to the difference KF - EKF2.
+        Causes of the difference KF - EKF2.
     trials : tuple of Trial
         Re-runs along the main axis, and along each axis with an inconsistent filter.
     """
@@ -134,10 +129,7 @@ class Reruns:
 
 
 class _Filter(NamedTuple):
-    """KF or EKF2, and a function that re-runs the filter with a change.
-
-    ``ekf2_model`` is None for KF.
-    """
+    """KF or EKF2, and a function that re-runs the filter with a change."""
 
     name: FilterName
     rerun: Callable[[AxisComparison, Change], RunStatistics]
@@ -153,7 +145,7 @@ def rerun_filters(
 ) -> tuple[Trial, ...]:
     """Re-run KF and EKF2 along each axis with each change that may make them consistent.
 
-    EKF2 is re-run only if its replay agrees with the log and it fused the analysed source.
+    EKF2 is re-run only if its replay agrees with the log.
     """
     filters = [_Filter("kf", partial(_rerun_kf, comparison, estimates.tuning))]
     if (
@@ -194,7 +186,7 @@ def list_rerun_configurations(
 
 
 def is_inconsistent(summary: FilterSummary | UntestedFilter) -> TypeGuard[FilterSummary]:
-    """Return True if the filter was tested and is over- or underconfident."""
+    """Return True if the filter is overconfident or underconfident."""
     return not isinstance(summary, Unavailable) and summary.verdict != "consistent"
 
 
@@ -204,7 +196,7 @@ def _find_changes_to_test(
     ekf2_inputs: ReplayInputs | None,
     axis_result: AxisComparison,
 ) -> list[tuple[Change, tuple[Statistic, ...]]]:
-    """Return the changes for re-runs along an axis, and the statistics that each may correct."""
+    """Return the changes to test along an axis, and the statistics that each change may correct."""
     summary = axis_result.filters["kf" if ekf2_inputs is None else "ekf2"]
     if not isinstance(summary, FilterSummary) or (
         ekf2_inputs is not None and axis_result.axis.name == "down"
@@ -274,7 +266,7 @@ def _rerun_with_changes(
 def _find_statistics_without_change(
     tested_filter: _Filter, axis_result: AxisComparison
 ) -> tuple[RunStatistics, bool]:
-    """Return the statistics without a change, and True if they are from the log, not a replay."""
+    """Return the statistics without a change, and True if they are from the log."""
     replayed_statistics, logged_state = tested_filter.rerun(axis_result, {}), axis_result.ekf2_state
     if tested_filter.ekf2_model is None:
         return replayed_statistics, True
@@ -357,8 +349,7 @@ def _rerun_kf(
         )
         axis = replace(axis, measurement_m=measured_m[np.isfinite(measured_m)])
         if rotates_gnss_positions:
-            # The heading of the acceleration is wrong. Rotating GNSS positions and ground truth
-            # has the same effect as correcting this heading
+            # Rotating positions and ground truth has the same effect as correcting the heading
             rotated_axis = replace(axis, direction=rotated_direction)
             truth = project_truth(comparison.flight.truth, rotated_axis, segment)
     if FORWARD_BIAS_KEY in change:
@@ -426,14 +417,13 @@ def _summarise_replay(
     axis_result: AxisComparison,
     change: Change,
 ) -> RunStatistics:
-    """Compute the statistics of a replay of EKF2 along one axis, in the evaluated spans.
+    """Compute the statistics of a replay of EKF2 along one axis.
 
-    The errors are those of the published state. Its reported variance is the mean of the variances
-    before and after each update, because the replay contains no variance between updates.
+    The reported variance is the mean of the variances before and after each update.
     """
     evaluated_spans_s, axis = model.baseline_replay.find_evaluated_spans(), axis_result.axis
     if ROTATION_KEY in change and comparison.source.origin.is_gnss:
-        # The rotated GNSS positions rotate EKF2's frame. The axis is rotated by the same angle
+        # Rotated positions rotate EKF2's frame, so the axis is rotated by the same angle
         axis = replace(axis, direction=_rotate_direction(axis.direction, -change[ROTATION_KEY]))
     direction_cosines, ekf2_updates = axis.direction[:2], ekf2_replay.updates
     ekf2_updates = rows_inside(ekf2_updates, evaluated_spans_s)
@@ -456,7 +446,7 @@ def _summarise_replay(
     published_track = project(ekf2_replay.published_state, axis, comparison.segment)
     published_track = rows_inside(published_track, evaluated_spans_s)
     logged_state, track_compared_with_kf = axis_result.ekf2_state, published_track
-    # Without a change, KF is compared with the logged EKF2 (as in the report), else with the replay
+    # Without a change, compare KF with the logged EKF2, as in the report
     if not change and not isinstance(logged_state, Unavailable):
         track_compared_with_kf = rows_inside(logged_state, evaluated_spans_s)
     return _summarise_run(

@@ -12,40 +12,33 @@ from px4fuse.filter.consistency import Reference, classify_sigma_ratio, compute_
 from px4fuse.flight.ekf2_parameters import EV_POS
 
 Statistic = Literal["nis", "nees", "difference"]
-# Statistics that show whether a filter is consistent
 CONSISTENCY_STATISTICS: tuple[Statistic, Statistic] = ("nees", "nis")
-# Values of KF settings, EKF2 parameters and corrections of the data, by name
+# Changed KF settings, EKF2 parameters or data, by name
 Change = Mapping[str, float]
-# Names of corrections of the data in a change: shift of the timestamps (s), clockwise rotation of
-# the positions (°), number of omitted outliers, and removed accelerometer bias (m/s²)
+# Corrected data: timestamps (s), clockwise rotation (°), number of outliers, accelerometer bias
 CLOCK_OFFSET_KEY, ROTATION_KEY, OUTLIERS_KEY = "clock_offset_s", "turned_deg", "outliers_left_out"
 FORWARD_BIAS_KEY, RIGHT_BIAS_KEY = "bias_forward_m_s2", "bias_right_m_s2"
 Improvement = Literal["position and σ", "position", "σ only", "nothing"]
-# Position errors are reported if the mean NEES exceeds this limit (2 reported σ): flights without a
-# fault have a mean NEES below 3
+# Minimum mean NEES of a reported position error: flights without a fault are below 3
 MIN_REPORTED_NEES = 4.0
-# A re-run with smaller noise makes a filter overconfident if the mean NEES was above 1 before and
-# is at least this value after the re-run
+# A smaller noise makes a filter overconfident if the mean NEES reaches this value
 MIN_OVERCONFIDENT_NEES_AFTER_CHANGE = 2.0
-# A change is a possible cause if it removes 50 % to 150 % of ln(mean NIS) or ln(mean NEES). These
-# logarithms are 0 for a consistent filter
+# A possible cause explains 50 % to 150 % of ln(mean NIS) or ln(mean NEES)
 POSSIBLE_CAUSE_FRACTION_TOLERANCE = 0.5
-# A sensor fault is the only cause if its correction removes 75 % to 125 % of ln(mean NIS or NEES)
+# A sensor fault is the only cause if it explains 75 % to 125 % of ln(mean NIS or NEES)
 ONLY_CAUSE_FRACTION_TOLERANCE = 0.25
-# Two changes are combined in a re-run if each change removes 10 % to 190 % of ln(mean NIS or NEES)
+# Two changes are combined if each explains 10 % to 190 % of ln(mean NIS or NEES)
 COMBINED_CHANGE_FRACTION_TOLERANCE = 0.9
-# Names of changes that correct faulty sensor data. Other changes are settings of a filter
 SENSOR_CORRECTION_KEYS = frozenset((OUTLIERS_KEY, CLOCK_OFFSET_KEY, ROTATION_KEY, FORWARD_BIAS_KEY))
-# Names of changes that have an effect only together with another change
+# Changes that have an effect only together with another change
 SECONDARY_CHANGE_KEYS = frozenset(("EKF2_DELAY_MAX", EV_POS.noise_mode_parameter, RIGHT_BIAS_KEY))
-# A re-run has an effect if it changes a ratio of actual to reported σ by at least this factor
+# A re-run has an effect if it changes a σ ratio by at least this factor
 MIN_SIGMA_RATIO_CHANGE_FACTOR = 1.10
 # A re-run has an effect if it changes the position RMSE by more than this fraction
 MIN_RMSE_CHANGE_FRACTION = 0.05
 # A re-run improves the position if it reduces the position RMSE by at least this fraction
 MIN_RMSE_REDUCTION = 0.20
-# A filter remains overconfident if more than this fraction of ln(actual σ / reported σ) against
-# ground truth remains after a re-run
+# A filter remains overconfident if more than this fraction of ln(σ ratio) remains after a re-run
 MAX_REMAINING_OVERCONFIDENCE_FRACTION = 0.75
 
 
@@ -75,17 +68,15 @@ class Trial(Record, kw_only=True):
     kinds : tuple of str
         Kinds of change, for example "noise", "delay", "outliers" or "rotation".
     change : mapping from name to value
-        New values of KF settings or EKF2 parameters. A correction of the data is ``turned_deg``
-        (clockwise rotation of the positions), ``outliers_left_out`` (number of outliers),
-        ``clock_offset_s`` (shift of the timestamps), or a removed accelerometer bias.
+        Changed KF settings, EKF2 parameters or data.
     discrepancies : tuple of {"nis", "nees"}
-        Statistics that are outside their limits and that the change may bring inside.
+        Statistics that the change may correct.
     before, after : RunStatistics
         Statistics without and with the change, over the same time span.
     is_logged : bool
-        True if ``before`` is from the log (EKF2) or the first run (KF), False if from a replay.
+        True if ``before`` is from the log (EKF2) or the first run (KF), not from a replay.
     from_s : float or None
-        Start of the evaluated time; None for the whole segment.
+        Start (s) of the evaluated time; None for the whole segment.
     """
 
     filter: FilterName
@@ -107,8 +98,8 @@ class Trial(Record, kw_only=True):
 def compute_explained_fraction(trial: Trial, statistic: Statistic) -> float:
     """Return the fraction of ln(mean NIS) or ln(mean NEES) that a change removes.
 
-    For the statistic "difference", return the removed fraction of the mean square difference
-    KF - EKF2. A fraction above 1 means that the change is too large. Return 0 for missing values.
+    For "difference": fraction of the mean square difference KF - EKF2. Above 1, the change is too
+    large.
     """
     value_before, value_after = trial.before.value(statistic), trial.after.value(statistic)
     if not value_before or not value_after:
@@ -133,10 +124,7 @@ def brings_inside_limits(trial: Trial, statistic: Statistic) -> bool:
 
 
 def makes_overconfident(trial: Trial, statistic: Statistic) -> bool:
-    """Return True if the change makes an underconfident filter overconfident.
-
-    The filter is underconfident against the source, then overconfident against ground truth.
-    """
+    """Return True if the change makes an underconfident filter overconfident."""
     nees_before = trial.before.nees_mean
     nis_before = trial.before.nis_mean
     nees_after = trial.after.nees_mean
@@ -152,7 +140,7 @@ def makes_overconfident(trial: Trial, statistic: Statistic) -> bool:
 def find_trials(
     trials: Iterable[Trial], filter_name: FilterName, axis: str, statistic: Statistic = "nis"
 ) -> list[Trial]:
-    """Return a filter's re-runs along an axis that may bring ``statistic`` inside its limits."""
+    """Return the re-runs of a filter along an axis that may correct the mean NIS or mean NEES."""
     return [
         trial
         for trial in trials
@@ -165,7 +153,7 @@ def find_cause_trial(
 ) -> Trial | None:
     """Return the re-run that best brings the mean NIS or mean NEES inside its limits.
 
-    One change is preferred to two changes, and a corrected sensor fault to a changed setting.
+    A corrected sensor fault is preferred to a changed setting.
     """
 
     def rank(trial: Trial) -> tuple[bool, int, bool, float]:
@@ -190,10 +178,7 @@ def find_cause_trial(
 
 
 def find_partial_corrections(trials: Iterable[Trial], statistic: Statistic) -> list[Trial]:
-    """Return the re-runs that bring a statistic closer to its limits, best first.
-
-    If one re-run brings the statistic inside its limits, return an empty list.
-    """
+    """Return the re-runs that correct a statistic only partly, best first."""
     candidates = [
         trial
         for trial in trials
@@ -213,9 +198,9 @@ def compute_sigma_ratio_deviation(statistics: RunStatistics) -> float:
 
 
 def compute_preference_key(trial: Trial) -> tuple[bool, int, float]:
-    """Return a key to sort re-runs with one kind of change, the best first.
+    """Return a key to sort re-runs, best first.
 
-    Re-runs that make a filter consistent precede others, then few changed values precede many.
+    In the best re-run, few changes make the filter consistent.
     """
     is_made_consistent = becomes_consistent(trial)
     return (
@@ -243,10 +228,7 @@ def compute_sigma_ratio_improvement(trial: Trial) -> float:
 
 
 def compare_sigma_ratios(trial: Trial) -> list[tuple[Reference, float, float]]:
-    """Return (reference, ratio before, ratio after) of actual to reported σ for each reference.
-
-    The reference is "source" (ratio from innovations) or "truth" (from errors).
-    """
+    """Return reference ("source" or "truth"), and σ ratios before and after the change."""
     sigma_ratios_before = compute_sigma_ratios(trial.before)
     sigma_ratios_after = compute_sigma_ratios(trial.after)
     return [
@@ -265,7 +247,7 @@ def becomes_consistent(trial: Trial) -> bool:
 
 
 def halves_discrepancy(trial: Trial) -> bool:
-    """Return True if a re-run halves |ln(actual σ / reported σ)| of an inconsistent filter."""
+    """Return True if a re-run halves |ln(σ ratio)| of an inconsistent filter."""
     return any(
         classify_sigma_ratio(ratio_before, reference) != "consistent"
         and abs(math.log(ratio_after)) <= 0.5 * abs(math.log(ratio_before))
@@ -274,10 +256,7 @@ def halves_discrepancy(trial: Trial) -> bool:
 
 
 def remains_overconfident(trial: Trial) -> bool:
-    """Return True if a filter is overconfident against ground truth before and after a re-run.
-
-    More than 75 % of ln(actual σ / reported σ) must remain after the re-run.
-    """
+    """Return True if a filter is overconfident against ground truth before and after a re-run."""
     return any(
         reference == "truth"
         and classify_sigma_ratio(ratio_before, reference)
@@ -291,10 +270,9 @@ def remains_overconfident(trial: Trial) -> bool:
 def find_trial(
     trials: Iterable[Trial], filter_name: FilterName, kind: str, name: str = ""
 ) -> Trial | None:
-    """Return the re-run that improves a filter most, among re-runs with one kind of change.
+    """Return the re-run with one kind of change that improves a filter most, or None.
 
-    ``name`` limits the search to changes of one setting or EKF2 parameter. Return None without an
-    improvement.
+    ``name`` limits the search to one setting or EKF2 parameter.
     """
     return min(
         (
@@ -341,9 +319,7 @@ def can_show_improvement(trial: Trial) -> bool:
 def classify_improvement(trial: Trial) -> Improvement:
     """Return the quantities that a re-run improves: position, σ, both or nothing.
 
-    The position is improved if the RMSE decreases by at least 20 %. σ is improved if a ratio of
-    actual to reported σ becomes consistent, or if the re-run halves |ln(ratio)|, and no ratio
-    becomes worse.
+    The position improves if its RMSE decreases by at least 20 %.
     """
     rmse_before_m, rmse_after_m = trial.before.position_rmse_m, trial.after.position_rmse_m
     is_position_better = bool(

@@ -1,12 +1,10 @@
 """Search for the axes, unit, rotation and delay of positions that agree with the IMU.
 
-1. Grid search: compare each combination of axes (also left-handed ones), unit and time offset with
-   the motion from the IMU. The best rotation about the vertical has a closed form.
-2. Least squares: refine the best hypotheses, together with an accelerometer bias and, if the
-   heading is integrated from the gyroscopes, its drift.
+1. Grid search: compare each combination of axes, unit and time offset with the motion from the IMU.
+2. Least squares: refine the best combinations.
 
-Residuals (m) have a Student distribution. The log likelihood is that of a hypothesis minus that of
-positions that do not depend on the motion.
+Residuals (m) have a Student distribution. The log likelihood is relative to positions that do not
+depend on the motion.
 """
 
 from collections.abc import Mapping
@@ -29,50 +27,44 @@ from px4fuse.core.arrays import Array, IntArray
 MAX_TIME_OFFSET_S = 10.0
 # Minimum time (s) with positions and IMU data, to determine axes, unit and time offset
 MIN_OVERLAP_S = 10.0
-# Lower limit of σ (m) of the horizontal residuals, because IMU noise, tilt errors and interpolation
-# errors are always present
+# Minimum σ (m) of the horizontal residuals: IMU noise and tilt errors are always present
 MIN_HORIZONTAL_SIGMA_M = 0.05
-# Lower limit of σ (m) of the vertical residuals, also because of IMU and interpolation errors
+# Minimum σ (m) of the vertical residuals
 MIN_VERTICAL_SIGMA_M = 0.08
 # Degrees of freedom of the Student distribution of the residuals
 STUDENT_DEGREES_OF_FREEDOM = 4.0
 METRES_PER_UNIT: Final[dict[Unit, float]] = {"m": 1.0, "cm": 0.01, "mm": 0.001, "feet": 0.3048}
-# A frame that is rotated from NED about the vertical by at most this angle (rad) is a misaligned
-# NED. With a larger angle it is a different frame, which has a lower prior probability
+# A frame that is rotated from NED by at most this angle (rad) is a misaligned NED frame
 SMALL_ROTATION_RAD = np.radians(8.0)
-# Hypotheses with a time offset of at most this time (s) are equally probable a priori
+# Time offsets up to this value (s) are equally probable a priori
 SMALL_TIME_OFFSET_S = 0.3
-# Logarithm of the prior odds: frame rotated by more than SMALL_ROTATION_RAD to unrotated frame
+# Log prior odds of a frame that is rotated by more than SMALL_ROTATION_RAD
 LARGE_ROTATION_LOG_PRIOR_ODDS = -1.0
-# Logarithm of the prior odds: frame rotated by at most SMALL_ROTATION_RAD to unrotated frame
+# Log prior odds of a frame that is rotated by at most SMALL_ROTATION_RAD
 SMALL_ROTATION_LOG_PRIOR_ODDS = -0.5
-# Logarithm of the prior odds: time offset above SMALL_TIME_OFFSET_S to smaller time offset
+# Log prior odds of a time offset above SMALL_TIME_OFFSET_S
 LARGE_TIME_OFFSET_LOG_PRIOR_ODDS = -2.0
-# Logarithm of the prior odds: another unit to metres
+# Log prior odds of a unit other than metres
 OTHER_UNIT_LOG_PRIOR_ODDS = -2.0
-# σ (m) of barometer heights in the comparison with the heights of the source
+# σ (m) of barometer heights
 BAROMETER_SIGMA_M = 0.5
-# Assumed number of independent height errors in a flight, for the likelihood of the heights
+# Assumed number of independent height errors in a flight
 INDEPENDENT_HEIGHT_ERROR_COUNT = 6.0
-# Limit (m) to which height errors are clipped, to limit the effect of outliers
+# Larger height errors (m) count as this value, so that outliers have little effect
 MAX_HEIGHT_ERROR_M = 20.0 * BAROMETER_SIGMA_M
-# Maximum number of hypotheses of the grid search that are refined
 MAX_REFINED_HYPOTHESES = 8
-# A hypothesis on axes, unit and delay is refined if its score (log likelihood plus log prior odds)
-# is at most this much (nats) below the best score
+# Hypotheses are refined if their score is at most this much (nats) below the best score
 MAX_SCORE_BELOW_BEST_TO_REFINE = 60.0
 # Maximum number of second differences in one least-squares fit, to limit the computing time
 MAX_REFINEMENT_ROWS = 1200
-# Number of Gauss-Newton iterations in the refinement of a hypothesis on axes, unit and delay
 REFINEMENT_ITERATIONS = 7
 # Maximum change (s) of the time offset in one Gauss-Newton iteration
 MAX_TIME_OFFSET_STEP_S = 0.15
-# Prior precision (σ⁻²) of the seven Hypothesis.parameters: heading drift of the gyroscopes (σ
-# 0.05 °/s), accelerometer bias (σ 0.3 m/s², 3 axes), no prior (0) for the others
+# Prior precision (σ⁻²) of Hypothesis.parameters: gyroscope heading drift (0.05 °/s), accelerometer
+# bias (0.3 m/s²)
 PARAMETER_PRIOR_PRECISION = np.array([0.0, 0.0, np.radians(0.05) ** -2, 0.0, *[0.3**-2] * 3])
-# Horizontal directions, clockwise from above
 CLOCKWISE_DIRECTIONS: tuple[Direction, ...] = ("north", "east", "south", "west")
-# Logarithm of the prior odds of common directions of x, y, z
+# Log prior odds of common directions of x, y, z
 LOG_PRIOR_ODDS_BY_AXES: Final[dict[AxisDirections, float]] = {
     ("north", "east", "down"): 1.0,  # NED, the convention of PX4
     ("east", "north", "up"): -0.5,
@@ -85,8 +77,6 @@ LOG_PRIOR_ODDS_BY_AXES: Final[dict[AxisDirections, float]] = {
 
 class SignedAxisPermutation(NamedTuple):
     """Choice of the vertical axis and of two horizontal axes among x, y and z.
-
-    The heading of the horizontal axes is not part of the choice.
 
     Attributes
     ----------
@@ -136,7 +126,7 @@ SIGNED_AXIS_PERMUTATIONS = tuple(
 
 @dataclass(frozen=True)
 class SentPositions:
-    """Positions of a source in its own axes and unit, and barometer times (s) and heights (m)."""
+    """Positions of a source as sent, and barometer heights (m) at barometer times (s)."""
 
     time_s: Array
     position_m: Array
@@ -147,10 +137,7 @@ class SentPositions:
         return replace(self, time_s=correct_clock_drift(self.time_s, clock_drift))
 
     def compute_second_differences(self, imu: ImuSecondDifferences) -> SourceSecondDifferences:
-        """Return second differences of the positions over the time span of ``imu``.
-
-        The time span is extended by ``max_time_offset_s`` at both ends.
-        """
+        """Return second differences of the positions over the time span of ``imu``."""
         margin_steps = round(self.max_time_offset_s / GRID_INTERVAL_S)
         grid_s = imu.time_s[0] + GRID_INTERVAL_S * np.arange(
             -margin_steps, len(imu.time_s) + margin_steps
@@ -165,19 +152,18 @@ class Hypothesis:
     Attributes
     ----------
     parameters : ndarray, shape (7,)
-        Delay of the timestamps (s), heading of the first horizontal axis (rad, clockwise from
-        north), heading drift of the gyroscopes (rad/s), drift of the source's clock (s/s),
-        accelerometer bias in FRD (m/s², 3 values).
+        Delay (s), heading of the first horizontal axis (rad), heading drift of the gyroscopes
+        (rad/s), clock drift (s/s), and accelerometer bias in FRD (m/s², 3 values).
     score : float
         Log likelihood plus log prior odds (nats).
     has_rotation : bool
         False if the rotation is fixed to a multiple of 90°.
     min_source_to_imu_displacement_ratio, max_source_to_imu_displacement_ratio : float
-        Bounds of the ratio between displacements from the source and displacements from the IMU.
+        Bounds of the ratio of displacements, source to IMU.
     residual_sigma_m : float
         Scale (m) of the Student distribution of the horizontal residuals.
     independent_residual_count : float
-        Number of independent residuals: duration of the data over SECOND_DIFFERENCE_WINDOW_S.
+        Number of independent residuals.
     """
 
     axis_permutation: SignedAxisPermutation
@@ -209,7 +195,7 @@ class Hypothesis:
 
     @property
     def heading_minus_quarter_turns_rad(self) -> float:
-        """Heading (rad) of ``first_horizontal_axis`` minus the nearest multiple of 90°."""
+        """Heading (rad) of the first horizontal axis minus the nearest multiple of 90°."""
         return float(self.parameters[1] - self.quarter_turns * np.pi / 2.0)
 
     def is_similar_to(self, other: "Hypothesis", max_difference_rad: float = np.pi / 4.0) -> bool:
@@ -231,10 +217,7 @@ def search_hypotheses(
     positions: SentPositions,
     imu_motion_by_heading_source: Mapping[HeadingSource, ImuSecondDifferences],
 ) -> list[Hypothesis]:
-    """Return the likely hypotheses on axes, unit and delay of the positions, best first.
-
-    The list is empty without motion, or with an overlap of less than ``MIN_OVERLAP_S``.
-    """
+    """Return the likely hypotheses on axes, unit and delay of the positions, best first."""
     hypotheses = []
     for heading_from, imu_motion in imu_motion_by_heading_source.items():
         source_motion = positions.compute_second_differences(imu_motion)
@@ -277,7 +260,7 @@ def find_convention_candidates(
             for step in offset_steps
         ]
     )
-    # Column 6 is 1 for valid samples, so cross_moments[:, 6, 6] is the number of common samples
+    # cross_moments[:, 6, 6] is the number of common samples
     has_overlap = cross_moments[:, 6, 6] * GRID_INTERVAL_S >= MIN_OVERLAP_S
     if not has_overlap.any():
         return []
@@ -338,7 +321,7 @@ def find_convention_candidates(
         ):
             unit_name = [*METRES_PER_UNIT][unit_index]
             axis_permutation = SIGNED_AXIS_PERMUTATIONS[permutation_index]
-            # If z is constant, the source measures no height. Then z is the vertical axis
+            # If z is constant, the source measures no height, and z is the vertical axis
             if (
                 axis_permutation.vertical_axis != 2
                 and not source_motion.second_differences[:, 2].any()
@@ -393,7 +376,7 @@ def _evaluate_hypothesis(
     source_motion: SourceSecondDifferences,
     imu_motion: ImuSecondDifferences,
 ) -> tuple[Hypothesis, Array]:
-    """Return the hypothesis with updated score, and the Gauss-Newton step of its parameters."""
+    """Compute the score of a hypothesis, and the next Gauss-Newton step of its parameters."""
     delay_s, rotation_rad, heading_drift_rad_s, clock_drift, *_ = hypothesis.parameters
     time_s = source_motion.time_s[rows]
     row_interval_s = GRID_INTERVAL_S * float(np.median(np.diff(rows)))
@@ -448,7 +431,7 @@ def _evaluate_hypothesis(
     vertical_log_likelihood, sigma_down_m = fit_student_distribution(
         residual_squares[1], 1, MIN_VERTICAL_SIGMA_M
     )
-    # A constant axis (for example without heights) is omitted from the likelihood
+    # Omit a constant axis (for example without heights) from the likelihood
     is_axis_known = unconverted_second_differences.any(axis=0)
     log_likelihood_gain += vertical_log_likelihood * is_axis_known[vertical_axis] + np.log(
         metres_per_unit
@@ -553,14 +536,14 @@ def _compute_total_log_odds(hypothesis: Hypothesis, positions: SentPositions) ->
 def _compute_height_log_likelihood_ratio(
     hypothesis: Hypothesis, positions: SentPositions, time_s: Array, barometer_height_m: Array
 ) -> float:
-    """Return the log likelihood of heights that follow the barometer minus that of a constant."""
+    """Return the log likelihood ratio of barometer heights to a constant height."""
     height_m = np.interp(positions.time_s - hypothesis.delay_s, time_s, barometer_height_m)
     down_m = (
         METRES_PER_UNIT[hypothesis.unit]
         * hypothesis.axis_permutation.vertical_sign
         * positions.position_m[:, hypothesis.axis_permutation.vertical_axis]
     )
-    # height is positive upwards, so down + height is constant for a correct hypothesis
+    # down + height is constant for a correct hypothesis
     error_m = down_m - np.median(down_m) + height_m - np.median(height_m)
     mean_square_error_m2 = float(np.mean(np.minimum(error_m**2, MAX_HEIGHT_ERROR_M**2)))
     min_variance_m2 = BAROMETER_SIGMA_M**2

@@ -38,14 +38,11 @@ from px4fuse.flight.model import Columns, Ekf2, Flight, PositionTrack
 from px4fuse.trajectory.association import choose_gap_limit_s, is_bracketed
 from px4fuse.trajectory.rotation import heading
 
-# Minimum lead (nats) in score of the best convention over the second best, for the verdict
-# "determined"
+# Minimum lead (nats) of the best convention over the second best, for the verdict "determined"
 MIN_CONVENTION_LOG_ODDS = 4.0
-# Minimum log-likelihood gain (nats) of the best convention, compared with positions that do not
-# depend on the motion
+# Minimum log-likelihood gain (nats) over positions that do not depend on the motion
 MIN_LOG_LIKELIHOOD_GAIN = 8.0
-# Minimum value of this gain per independent sample. First value: only one convention fits; second
-# value: several conventions fit
+# Minimum gain per independent sample if only one convention fits, and if several fit
 MIN_LOG_LIKELIHOOD_GAIN_PER_SAMPLE = (0.15, 0.4)
 # Accepted ratio of the source's displacements to those from the IMU
 MIN_SOURCE_TO_IMU_DISPLACEMENT_RATIO, MAX_SOURCE_TO_IMU_DISPLACEMENT_RATIO = 0.88, 1.12
@@ -53,22 +50,19 @@ MIN_SOURCE_TO_IMU_DISPLACEMENT_RATIO, MAX_SOURCE_TO_IMU_DISPLACEMENT_RATIO = 0.8
 MAX_RESIDUAL_TO_NOISE_RATIO = 2.4
 # σ (m) of the second differences of the position integrated from the IMU
 IMU_SECOND_DIFFERENCE_SIGMA_M = 0.05
-# Maximum loss in log likelihood (nats) by the use of EKF2's heading instead of the heading from the
-# gyroscopes. EKF2's heading is preferred, because it is relative to north
+# EKF2's heading is preferred up to this loss in log likelihood (nats), because it refers to north
 MAX_LIKELIHOOD_LOSS_WITH_EKF2_HEADING = 20.0
 # Minimum number of GNSS positions for a fit of the heading of the source's frame
 MIN_GNSS_POSITIONS = 30
-# The heading fitted to GNSS is used if the RMS residual is at most this fraction of the RMS extent
-# of the GNSS positions; 0.1 is a heading error of about 0.1 rad
+# Maximum RMS residual ÷ RMS extent of the GNSS positions, to use the fitted heading
 MAX_GNSS_RESIDUAL_RATIO = 0.1
-# Minimum log-likelihood gain (nats) of a hypothesis with clock drift, to correct the drift
+# Minimum log-likelihood gain (nats) to correct a clock drift
 MIN_LIKELIHOOD_GAIN_FROM_CLOCK_DRIFT = 15.0
 # Tested clock drifts (rate of the clock minus 1)
 TESTED_CLOCK_DRIFTS = np.linspace(-0.05, 0.05, 21)
-# Minimum log-likelihood gain from a low-pass filter instead of a delay. In simulated flights it
-# is above 13 with a low-pass filter, and below 3 with a delay
+# Minimum log-likelihood gain of a low-pass filter over a delay (simulated delays: below 3)
 MIN_LIKELIHOOD_GAIN_FROM_LOW_PASS = 8.0
-# Delays (s) between these limits can be the effect of a low-pass filter in the source
+# Limits (s) of delays that may be the effect of a low-pass filter
 MIN_LOW_PASS_DELAY_S, MAX_LOW_PASS_DELAY_S = 0.2, 5.0
 # Repeated positions are removed if they are less than this fraction of all positions
 MAX_REPEATED_POSITION_FRACTION = 0.5
@@ -89,13 +83,13 @@ def check_convention(
     ----------
     flight : Flight
     track : PositionTrack
-        Positions as read: north, east, down if the source follows PX4's convention.
+        Positions as read from the log.
     max_time_offset_s : float
         Maximum tested time offset (s).
 
     Returns
     -------
-    Convention, or None without IMU data, attitude or enough motion at the same time.
+    Convention, or None if IMU data, attitude or motion are missing.
     """
     inertial_data = integrate_inertial_data(flight)
     if inertial_data is None:
@@ -140,7 +134,7 @@ def check_convention(
 def _read_positions(
     flight: Flight, track: PositionTrack, max_time_offset_s: float
 ) -> SentPositions:
-    """Return the positions without repetitions; heights are 0 if the source has none."""
+    """Return the positions of a source without repeated samples."""
     samples, barometer = track.samples[Columns.POSITION], flight.barometer
     if samples["down_m"].notna().mean() < MIN_FRACTION_OF_POSITIONS_WITH_HEIGHT:
         samples = samples.assign(down_m=0.0)
@@ -160,10 +154,9 @@ def _rank_convention_hypotheses(
     positions: SentPositions,
     imu_motion_by_heading_source: dict[HeadingSource, ImuSecondDifferences],
 ) -> list[Hypothesis]:
-    """Return the likely hypotheses on axes, unit and delay, best first.
+    """Return the likely axes, units and delays of the positions, best first.
 
-    If the best hypothesis has a similar hypothesis with EKF2's heading, the latter is moved to the
-    first place. Its score may be lower by MAX_LIKELIHOOD_LOSS_WITH_EKF2_HEADING.
+    EKF2's heading is preferred if it fits nearly as well as that of the gyroscopes.
     """
     hypotheses = search_hypotheses(positions, imu_motion_by_heading_source)
     for hypothesis in hypotheses:
@@ -180,11 +173,7 @@ def _rank_convention_hypotheses(
 def _replace_delay_by_low_pass_filter(
     hypothesis: Hypothesis, positions: SentPositions, imu_motion: ImuSecondDifferences
 ) -> Hypothesis:
-    """Return the hypothesis without its delay, if a low-pass filter explains the delay better.
-
-    A first-order low-pass filter delays the positions by its time constant, and also reduces fast
-    motion. Its positions have correct timestamps.
-    """
+    """Replace the delay of a hypothesis by a low-pass filter, if the filter fits better."""
     if not MIN_LOW_PASS_DELAY_S < hypothesis.delay_s < MAX_LOW_PASS_DELAY_S:
         return hypothesis
     filtered_motion = filter_imu_motion(imu_motion, hypothesis.delay_s)
@@ -251,10 +240,7 @@ def _rotate_to_gnss(
 def _choose_convention(
     hypotheses: list[Hypothesis], positions: SentPositions, clock_drift: float
 ) -> Convention:
-    """Return the best convention and its verdict.
-
-    The verdict depends on the lead over the second best convention and on the residuals.
-    """
+    """Return the best convention and its verdict."""
     best_hypothesis = hypotheses[0]
     other_conventions = [
         hypothesis for hypothesis in hypotheses if not hypothesis.is_similar_to(best_hypothesis)
@@ -318,11 +304,7 @@ def _describe_hypothesis(hypothesis: Hypothesis) -> str:
 
 
 def compute_residual_ratio(hypothesis: Hypothesis, positions: SentPositions) -> float:
-    """Return σ of the horizontal residuals divided by σ of the noise of source and IMU.
-
-    The noise of the source is estimated from third differences of the positions, because they
-    contain hardly any motion.
-    """
+    """Return σ of the horizontal residuals divided by σ of the noise of source and IMU."""
     third_differences = np.diff(positions.position_m, 3, axis=0)
     third_difference_sigma = 1.4826 * float(
         np.median(np.abs(third_differences - np.median(third_differences, axis=0)))
@@ -338,10 +320,7 @@ def compute_residual_ratio(hypothesis: Hypothesis, positions: SentPositions) -> 
 def _estimate_clock_drift(
     positions: SentPositions, imu_motion: ImuSecondDifferences, best_hypothesis: Hypothesis
 ) -> float:
-    """Return the rate error (s/s) of the source's clock relative to the autopilot's boot clock.
-
-    Return 0 if the drift is not significant.
-    """
+    """Return the rate error (s/s) of the source's clock, or 0 if it is not significant."""
     initial_clock_drift = 0.0
     if (
         best_hypothesis.score < MIN_LOG_LIKELIHOOD_GAIN
@@ -384,10 +363,7 @@ def _check_orientation(
     best_hypothesis: Hypothesis,
     verdict: ConventionVerdict,
 ) -> OrientationConvention | None:
-    """Return the convention of the source's orientation, and the heading error if determinable.
-
-    Return None with too few orientations in flight.
-    """
+    """Return the convention of the source's orientation, and the heading error if determinable."""
     assert track.orientation is not None
     quaternions = track.orientation[Columns.QUATERNION].to_numpy()
     orientation_check_result = check_orientation(
@@ -411,7 +387,7 @@ def _check_orientation(
         imu_motion.time_s < time_s[-1] - SECOND_DIFFERENCE_WINDOW_S
     )
     imu_motion = replace(imu_motion, is_valid=imu_motion.is_valid & is_covered)
-    # possible headings (°) of the positions' x axis for an orientation without heading error
+    # Correct headings (°) of the x axis for each body and world frame
     correct_headings_deg = {"FLU to ENU": [90.0], "FLU to NWU": [0.0]}.get(
         convention.frames, [0.0, 90.0]
     )

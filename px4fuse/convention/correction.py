@@ -23,19 +23,15 @@ from px4fuse.flight.model import (
 )
 from px4fuse.trajectory.rotation import build_matrix, heading
 
-# Minimum rotation (°) that is corrected in addition to wrong axes; smaller rotations are reported
-# as a heading error
+# Minimum rotation (°) that is corrected in addition to wrong axes
 MIN_RESIDUAL_ROTATION_DEG = 8.0
-# Minimum rotation (°) that is corrected in a frame with correct axes; smaller rotations are
-# reported as a heading error
+# Minimum rotation (°) that is corrected if the axes are correct
 MIN_FRAME_ROTATION_DEG = 15.0
-# Minimum delay (s) that is corrected together with axes and unit. The estimate of the time offset
-# finds smaller delays
+# Minimum delay (s) that is corrected together with axes and unit
 MIN_DELAY_TO_CORRECT_S = 0.5
-# Minimum heading difference (°) between the source's orientation and its positions that is reported
+# Minimum reported heading difference (°) between orientation and positions
 MIN_HEADING_ERROR_DEG = 10.0
-# Fault of the source's orientation: copy of EKF2's attitude, wrong quaternion order, wrong body or
-# world frame, heading error, or no fault
+# Fault of the orientation: copy of EKF2's attitude, quaternion order, frames, or heading
 OrientationFault = Literal["", "copied", "order", "frames", "heading"]
 
 
@@ -48,17 +44,17 @@ class ConventionFaults:
     has_wrong_axes : bool
         True if the axes are not NED, even after a rotation about the vertical.
     rotation_deg : float
-        Clockwise rotation of the positions from NED, or from ENU or NWU if these are their axes.
+        Clockwise rotation of the positions from NED, ENU or NWU.
     late_s : float
         Delay of the timestamps.
     clock_drift : float
         Rate of the source's clock minus 1.
     affects_ekf2 : bool
-        True if EKF2 fused the source, so EKF2's attitude is wrong too.
+        True if EKF2 fused the source, so that EKF2's attitude is wrong.
     is_north_unknown : bool
-        True if EKF2's heading is from the source, so the log contains no independent heading.
+        True if the log contains no heading that is independent of the source.
     is_ambiguous : bool
-        True if several axes and units fit, and NED in metres is not among them.
+        True if several axes and units fit, but not NED in metres.
     """
 
     has_wrong_axes: bool = False
@@ -110,7 +106,7 @@ def find_convention_faults(
     has_wrong_axes, rotation_deg = _find_axis_fault_and_rotation(convention)
     has_wrong_heading = orientation_fault in ("order", "heading")
     uses_gyro_heading = convention.heading_from == "gyroscopes"
-    # EKF2 fused the yaw of the source, so no heading in the log is independent of the source
+    # EKF2 fused the yaw of the source, so the log contains no independent heading
     is_heading_from_source = (
         is_fused
         and uses_gyro_heading
@@ -169,8 +165,7 @@ def convert_to_px4_convention(
 ) -> tuple[Flight, PositionTrack]:
     """Convert a position source to PX4's axes (NED), unit (m) and boot clock.
 
-    If EKF2 fused the unconverted positions, EKF2's attitude is wrong. The returned flight then
-    contains the attitude integrated from the gyroscopes instead.
+    If EKF2 fused the wrong positions, the attitude from the gyroscopes replaces EKF2's attitude.
     """
     faults = find_convention_faults(convention, flight, track.frame)
     if convention is None or not faults:
@@ -199,7 +194,7 @@ def convert_to_px4_convention(
     if inertial_data is None:
         return flight, track
     attitude = inertial_data.compute_attitudes()[convention.heading_from]
-    # Positions with correct axes are not rotated. The attitude is rotated to their north instead
+    # If the axes are correct, rotate the attitude instead of the positions
     if not faults.has_wrong_axes and not faults.rotation_deg:
         heading_change_deg = convention.rotation_deg - 90.0 * CLOCKWISE_DIRECTIONS.index(
             convention.x
@@ -225,7 +220,7 @@ def _make_matrix_to_ned_metres(convention: Convention, faults: ConventionFaults)
 
 
 def _multiply_known_values(values: Array, matrix: Array) -> Array:
-    """Multiply each row by a matrix. NaN values with weight 0 do not make a result NaN."""
+    """Multiply each row by a matrix. NaN values with weight 0 are ignored."""
     is_unknown = np.isnan(values).astype(float) @ (matrix != 0.0).T > 0.0
     return np.where(is_unknown, np.nan, np.nan_to_num(values) @ matrix.T)
 

@@ -1,4 +1,4 @@
-"""Estimate of the lever arm from the IMU to the position sensor, from ground truth or turns."""
+"""Estimate of the lever arm from the IMU to the position sensor."""
 
 from typing import NamedTuple
 
@@ -18,21 +18,17 @@ from px4fuse.trajectory.scores import compute_autocorrelation_time
 
 # Minimum lever arm (m) that is reported: twice the noise of good UWB (0.1 m)
 MIN_LEVER_ARM_M = 0.2
-# Minimum ratio of a reported lever arm to its σ. Without a lever arm, the ratio reaches 1.5
+# Minimum ratio of a reported lever arm to its σ: noise reaches 1.5
 MIN_LEVER_ARM_SIGMAS = 2.5
-# Minimum lever arm (m) that is reported if it is estimated from ground truth
 MIN_LEVER_ARM_WITH_TRUTH_M = 0.05
-# Minimum ratio of a reported lever arm to its σ if it is estimated from ground truth
 MIN_LEVER_ARM_SIGMAS_WITH_TRUTH = 5.0
-# Maximum lever arm (m) that is reported: a larger one is a frame error of the position source
+# Maximum reported lever arm (m): larger values are frame errors of the position source
 MAX_LEVER_ARM_M = 5.0
-# Maximum residual (σ) of a sample that is used in the next fit of the lever arm
+# Maximum residual (σ) of a sample in the next fit
 MAX_RESIDUAL_SIGMAS = 3.0
 # Minimum ratio of singular values in the lever arm fit with ground truth
 MIN_SINGULAR_VALUE_RATIO = 0.02
-# Minimum number of position coordinates in the lever arm fit with ground truth
 MIN_COORDINATE_COUNT = 40
-# Number of lever arm fits; each excludes the outliers of the previous one
 LEVER_ARM_FIT_COUNT = 4
 
 
@@ -51,7 +47,7 @@ class LeverArm(NamedTuple):
 def estimate_lever_arm(flight: Flight, track: PositionTrack) -> LeverArm | None:
     """Estimate the error of the lever arm in EKF2's parameters (true minus parameter).
 
-    None if it is not significant. Ground truth is used if logged, else the IMU.
+    Return None if the error is not significant.
     """
     lever_arm = None
     if isinstance(flight.truth, Truth):
@@ -74,7 +70,7 @@ def _fit_lever_arm_to_truth(flight: Flight, truth: Truth, track: PositionTrack) 
         for name in columns
     ]
     error_m = position_samples.to_numpy() - np.transpose(true_positions_m)
-    # a delay is estimated too (error = velocity · delay), because it resembles a lever arm
+    # Fit a delay too, because it resembles a lever arm
     velocity_m_s = np.gradient(np.transpose(true_positions_m), time_s, axis=0)
     quaternions = attitude[Columns.QUATERNION].to_numpy()
     rotation = to_matrix(interpolate(time_s, attitude.index.to_numpy(), quaternions))[:, :2, :2]
@@ -91,7 +87,7 @@ def _fit_lever_arm_to_truth(flight: Flight, truth: Truth, track: PositionTrack) 
     if rank < design_rows.shape[1]:  # with a constant heading, a lever arm is a constant offset
         return None
     residual_m = (valid_position_errors_m - design_rows @ fitted_parameters).reshape(-1, 2)
-    # successive errors of a source may be correlated
+    # Successive errors of a source may be correlated
     variance_factor = max(map(compute_autocorrelation_time, residual_m.T))
     covariance = (
         np.linalg.inv(design_rows.T @ design_rows) * np.mean(residual_m**2) * variance_factor
@@ -132,7 +128,7 @@ def _fit_lever_arm_to_imu(flight: Flight, track: PositionTrack) -> LeverArm | No
         second_difference_error_m = source_motion.second_differences - imu_motion.table[:, :2, 0]
         design_rows = design[is_used].reshape(-1, design.shape[2])
         valid_second_difference_errors_m = second_difference_error_m[is_used].ravel()
-        # Second differences within two windows have common positions and are not independent
+        # Second differences with common positions are not independent
         independent_difference_count = (
             len(valid_second_difference_errors_m)
             * GRID_INTERVAL_S
@@ -155,7 +151,7 @@ def _fit_lever_arm_to_imu(flight: Flight, track: PositionTrack) -> LeverArm | No
         )
         lever_arm_sigma_m = float(np.sqrt(np.trace(covariance[:2, :2])))
         is_used &= residual_m < MAX_RESIDUAL_SIGMAS * sigma_m
-        # the third parameter is the time by which the timestamps are early
+        # The third parameter is the time (s) by which the timestamps are early
         time_s = time_s + fitted_parameters[2]
     lever_arm = LeverArm(
         float(fitted_parameters[0]), float(fitted_parameters[1]), lever_arm_sigma_m

@@ -44,24 +44,24 @@ class Convention(Record, kw_only=True, omit_defaults=False):
     Attributes
     ----------
     verdict : str
-        "ambiguous": several conventions fit; "doubtful": the residuals of the best convention are
-        larger than the noise; "not determinable": too little data or motion.
+        "ambiguous": several conventions fit; "doubtful": the residuals are large; "not
+        determinable": too little data or motion.
     rotation_deg : float
-        Clockwise rotation of the positions in addition to the directions of x, y and z.
+        Clockwise rotation in addition to the directions of x, y and z.
     heading_from : {"EKF2", "gyroscopes", "GNSS"}
-        Reference of the rotation: heading of EKF2, integrated gyroscopes, or GNSS positions.
+        Reference of the rotation.
     late_s : float
         Delay of the timestamps; negative if they are early.
     clock_drift : float
         Rate of the sender's clock minus 1.
     scale : float
-        Ratio of the source's displacements to those from the IMU.
+        Ratio of displacements, source to IMU.
     log_odds : float or None
-        Log likelihood ratio (with priors) to the second best convention.
+        Log odds of the best convention to the second best.
     log_likelihood_gain : float
-        Log likelihood ratio to the hypothesis that the positions do not depend on the motion.
+        Log likelihood ratio to positions that do not depend on the motion.
     alternatives : tuple of str
-        Other axes, units and delays that fit nearly as well, as texts.
+        Other axes, units and delays that fit nearly as well.
     """
 
     verdict: ConventionVerdict

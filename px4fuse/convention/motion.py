@@ -5,7 +5,7 @@ position and velocity:
 
 p(t + T) - 2 p(t) + p(t - T) = ∫ (T - |s|) a(t + s) ds, s from -T to T
 
-The running mean is subtracted, because this removes constant acceleration errors (tilt, bias).
+Subtraction of the running mean removes constant acceleration errors (tilt, bias).
 """
 
 from dataclasses import dataclass, replace
@@ -32,7 +32,7 @@ from px4fuse.trajectory.rotation import (
     to_rotation_vector,
 )
 
-# Time T (s) between successive positions of a second difference p(t + T) - 2 p(t) + p(t - T)
+# Interval T (s) of a second difference p(t + T) - 2 p(t) + p(t - T)
 SECOND_DIFFERENCE_WINDOW_S = 2.0
 # Sample interval (s) of the second differences
 GRID_INTERVAL_S = 0.1
@@ -72,7 +72,7 @@ class InertialData:
     valid_spans_s: tuple[tuple[float, float], ...]
 
     def compute_attitudes(self) -> dict[HeadingSource, Array]:
-        """Return quaternions at ``time_s`` by source of their heading; tilt is from the gyros."""
+        """Return the attitude quaternions at ``time_s`` by the source of their heading."""
         return {
             "EKF2": replace_heading(self.gyro_attitude, heading(self.logged_attitude)),
             "gyroscopes": self.gyro_attitude,
@@ -81,7 +81,7 @@ class InertialData:
 
 @dataclass(frozen=True)
 class SourceSecondDifferences:
-    """Second differences of a source's positions, in its axes and unit, every GRID_INTERVAL_S."""
+    """Second differences of the positions as sent, at a constant interval."""
 
     time_s: Array
     second_differences: Array
@@ -91,7 +91,7 @@ class SourceSecondDifferences:
     def from_positions(
         cls, time_s: Array, position: Array, grid_s: Array
     ) -> "SourceSecondDifferences":
-        """Compute second differences of positions at ``grid_s``. They are invalid in gaps."""
+        """Compute second differences of positions at the times ``grid_s`` (s)."""
         window_steps = round(SECOND_DIFFERENCE_WINDOW_S / GRID_INTERVAL_S)
         position_times_s = grid_s[0] + GRID_INTERVAL_S * np.arange(
             -window_steps, len(grid_s) + window_steps
@@ -125,10 +125,9 @@ class ImuSecondDifferences:
     time_s : ndarray, shape (n,)
     is_valid : ndarray of bool, shape (n,)
     table : ndarray, shape (n, 3, 4)
-        Column 0 is the second difference. Columns 1 to 3 are its derivatives with respect to the
-        accelerometer bias (FRD, m/s²).
+        Second difference, and its derivatives with respect to the accelerometer bias (FRD, m/s²).
     second_difference_derivative_m_s : ndarray, shape (n, 3)
-        Derivative of the second difference with respect to time.
+        Time derivative of the second difference.
     """
 
     time_s: Array
@@ -138,10 +137,7 @@ class ImuSecondDifferences:
 
 
 def integrate_inertial_data(flight: Flight) -> InertialData | None:
-    """Integrate the gyroscopes of a flight to an attitude without EKF2's corrections.
-
-    Return None if IMU data and attitude overlap for less than 8 s.
-    """
+    """Integrate the gyroscopes of a flight to an attitude without EKF2's corrections."""
     imu, attitude = flight.imu, flight.attitude
     if isinstance(imu, Unavailable) or isinstance(attitude, Unavailable):
         return None
@@ -187,8 +183,7 @@ def integrate_inertial_data(flight: Flight) -> InertialData | None:
 def _integrate_gyros(rotation_rad: Array, logged_attitude: Array) -> Array:
     """Integrate the gyroscopes without their bias, from the first logged attitude.
 
-    The bias is the median rotation rate relative to the logged attitude, so heading resets have no
-    effect.
+    The bias is a median, so heading resets have no effect.
     """
     gyro_error_rad = rotation_rad - to_rotation_vector(
         multiply(conjugate(logged_attitude[:-1]), logged_attitude[1:])
@@ -263,7 +258,7 @@ def integrate_imu_motion(inertial_data: InertialData, attitude: Array) -> ImuSec
     ]
     table = np.concatenate([acceleration, body_to_ned], axis=2)
     position_m = np.zeros((len(attitude), 3, 4))
-    # trapezoidal rule: mean velocity of each step · step; in place to limit memory
+    # Trapezoidal rule, in place to limit memory
     displacement_m = np.cumsum(table, axis=0)
     table /= 2.0
     displacement_m -= table
@@ -273,7 +268,7 @@ def integrate_imu_motion(inertial_data: InertialData, attitude: Array) -> ImuSec
     stride = round(GRID_INTERVAL_S / INTEGRATION_STEP_S)
     second_differences = compute_second_differences(position_m, window_steps)[::stride]
     time_s = inertial_data.time_s[window_steps:-window_steps][::stride]
-    # a second difference spans SECOND_DIFFERENCE_WINDOW_S before and after its time
+    # A second difference needs valid data before and after its time
     is_valid = is_inside_spans(time_s, inertial_data.valid_spans_s)
     for (_, end), (start, _) in pairwise(inertial_data.valid_spans_s):
         is_valid &= (time_s < end - SECOND_DIFFERENCE_WINDOW_S) | (

@@ -1,7 +1,6 @@
 """Determination of the quaternion order, body frame and world frame of a source's orientation.
 
-Each possible convention is compared with the attitude from the gyroscopes, in tilt and in heading
-changes.
+Each possible convention is compared with the attitude from the gyroscopes.
 """
 
 from itertools import product
@@ -27,8 +26,7 @@ IDENTITY_QUATERNION = np.array([1.0, 0.0, 0.0, 0.0])
 FLU_TO_FRD = np.array([0.0, 1.0, 0.0, 0.0])
 # Quaternion (w, x, y, z) from ENU to NED
 ENU_TO_NED = np.array([0.0, np.sqrt(0.5), np.sqrt(0.5), 0.0])
-# Quaternions that convert the world frame to NED and the body frame to FRD, by body and world frame
-# of the source's orientation
+# Quaternions to NED and to FRD, by body frame and world frame of the orientation
 QUATERNIONS_BY_FRAMES: Final[dict[BodyAndWorldFrame, tuple[Array, Array]]] = {
     "FRD to NED": (IDENTITY_QUATERNION, IDENTITY_QUATERNION),
     "FLU to ENU": (ENU_TO_NED, FLU_TO_FRD),
@@ -37,28 +35,21 @@ QUATERNIONS_BY_FRAMES: Final[dict[BodyAndWorldFrame, tuple[Array, Array]]] = {
     "FRD to ENU": (ENU_TO_NED, IDENTITY_QUATERNION),
 }
 QUATERNION_ORDERS: tuple[QuaternionOrder, QuaternionOrder] = ("w x y z", "x y z w")
-# An orientation is a copy of EKF2's attitude if their median difference is at most this (°): copies
-# differ by 0.03°, fused motion capture by more than 0.2°
+# Maximum median difference (°) of a copy of EKF2's attitude: motion capture differs by 0.2° or more
 MAX_DIFFERENCE_OF_ATTITUDE_COPY_DEG = 0.15
 # Tested delays (s) of a copy of EKF2's attitude
 COPY_DELAYS_S = np.arange(0.0, 0.205, 0.01)
-# Maximum median difference (°) between converted tilt and the gyroscopes' tilt, for a correct
-# convention
+# Maximum median tilt difference (°) from the gyroscopes, for a correct convention
 MAX_TILT_DIFFERENCE_DEG = 6.0
-# Maximum median difference (°) between converted heading and the gyroscopes' heading, for a correct
-# convention. A constant difference is subtracted first
+# Maximum median heading difference (°) from the gyroscopes, for a correct convention
 MAX_HEADING_DIFFERENCE_DEG = 12.0
-# Smaller tilt and heading differences (°) are noise and count as this value in the score
+# Smaller angle differences (°) count as this value in the score, because they are noise
 MIN_ANGLE_DIFFERENCE_IN_SCORE_DEG = 0.7
-# Weight w in the score of a convention: log prior odds - w · duration (s) · ln(tilt difference (°)
-# · heading difference (°)). The differences are those from the gyroscopes' attitude
+# Weight of the angle differences in the score of a convention (1/s)
 SCORE_WEIGHT_PER_S = 0.5
-# Minimum lead (nats) in score of the best convention over the second best, for the verdict
-# "determined"
+# Minimum lead (nats) of the best convention over the second best, for the verdict "determined"
 MIN_CONVENTION_SCORE_LEAD = 4.0
-# Maximum number of orientations that are compared with the attitude from the gyroscopes
 MAX_ORIENTATION_COUNT = 600
-# Minimum number of orientations in flight for a check of their convention
 MIN_ORIENTATION_COUNT = 20
 
 
@@ -73,7 +64,7 @@ class OrientationCandidate(NamedTuple):
     def order_and_heading_free_frames(self) -> tuple[str, str]:
         """Quaternion order, body frame and world frame; ENU counts as NWU.
 
-        ENU and NWU differ only in heading, and the constant heading difference is not compared.
+        ENU and NWU differ only in heading.
         """
         return self.convention.order, self.convention.frames.replace("ENU", "NWU")
 
@@ -81,14 +72,14 @@ class OrientationCandidate(NamedTuple):
 def check_orientation(
     inertial_data: InertialData, time_s: Array, quaternion: Array
 ) -> tuple[OrientationConvention, Array, Array] | None:
-    """Determine quaternion order and frames of a source's orientation (``quaternion`` as sent).
+    """Determine the quaternion order and frames of a source's orientation.
 
     Returns
     -------
     convention : OrientationConvention
         Convention without ``heading_error_deg``.
     time_s : ndarray, shape (m,)
-        Times (s) of the compared orientations, at most MAX_ORIENTATION_COUNT.
+        Times (s) of the compared orientations.
     attitude : ndarray, shape (m, 4)
         Orientations converted to quaternions (w, x, y, z; FRD to NED).
 
@@ -163,9 +154,7 @@ def _score_convention(
 ) -> OrientationCandidate:
     """Score one convention of the quaternions by their distance from the reference attitude.
 
-    The score decreases with the median differences of tilt and heading. The mean heading difference
-    is subtracted first. The prior prefers quaternion order w x y z, FRD to NED, a mean heading
-    difference of at most 8°, and a body frame that is not rotated by ``body_quarter_turns`` · 90°.
+    The score decreases with the median differences of tilt and heading.
     """
     convention = OrientationConvention(verdict="determined", order=order, frames=frames)
     body_rotation = from_rotation_vector(np.array([0.0, 0.0, body_quarter_turns * np.pi / 2.0]))

@@ -5,7 +5,7 @@ from collections.abc import Sequence
 from px4fuse.convention.axes import METRES_PER_UNIT
 from px4fuse.convention.model import AxisDirections, Direction, Unit
 
-# All directions: the opposite of each has the same index in the reversed tuple
+# The opposite of each direction has the same index in the reversed tuple
 DIRECTIONS: tuple[Direction, ...] = ("north", "east", "down", "up", "west", "south")
 OPPOSITE_DIRECTION = dict(zip(DIRECTIONS, DIRECTIONS[::-1], strict=True))
 FRAME_AXES: dict[str, AxisDirections] = {
@@ -31,7 +31,7 @@ def append_opposites(axes: AxisDirections) -> list[Direction]:
 def find_axes_in_file(axes: AxisDirections, frame: str) -> AxisDirections:
     """Return the true directions of x, y, z in a file that was read with a wrong ``frame``.
 
-    ``axes`` are the true directions of the north, east and down components after reading.
+    ``axes`` are the true directions of the components read as north, east and down.
     """
     true_directions = dict(zip(DIRECTIONS, append_opposites(axes), strict=True))
     x, y, z = (true_directions[name] for name in FRAME_AXES[frame])

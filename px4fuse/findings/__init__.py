@@ -1,4 +1,4 @@
-"""Findings: faults of a flight, its sensors and its settings that the log shows.
+"""Findings: faults of a flight, its sensors and its settings.
 
 Each module in :data:`DETECTORS` has a function ``detect`` that yields findings. docs/built.md lists
 the files to change for a new finding.

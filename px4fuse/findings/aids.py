@@ -16,19 +16,16 @@ from px4fuse.findings.model import Findings, finding, format_percent, make_note,
 from px4fuse.flight.ekf2_parameters import AIDS, BAROMETER, MAG
 from px4fuse.flight.model import BAD_ACCELERATION_FLAG, Unavailable
 
-# Aiding sources of external vision; the other detectors test them in replays of EKF2
 AIDS_TESTED_BY_REPLAY = ("ev_pos", "ev_hgt")
 # A barometer gap that begins within this time (s) after take-off is normal: ground effect
 GROUND_EFFECT_DURATION_S = 10.0
-# The finding on a barometer gap states EKF2's largest height error in the gap if this error exceeds
-# the height RMSE outside the gap by this factor
+# Minimum ratio of the height error in a barometer gap to the height RMSE outside
 MIN_GAP_ERROR_TO_HEIGHT_RMSE_RATIO = 3.0
 # Aiding sources whose vertical innovations EKF2 tests to flag a bad vertical acceleration
 AIDS_OF_VERTICAL_ACCELERATION_TEST = ("gnss_vel", "gnss_hgt", "baro_hgt")
-# The finding is a note if EKF2 flags its vertical acceleration as bad for at most this fraction of
-# the time, otherwise a warning
+# Maximum fraction of the time with a bad vertical acceleration for a note instead of a warning
 MAX_BAD_ACCELERATION_FRACTION_FOR_NOTE = 0.3
-# Action if EKF2 does not fuse a sensor, by the PX4 parameter that enables the fusion of the sensor
+# Action for each sensor that EKF2 does not fuse, by PX4 parameter
 ACTION_BY_SWITCH = {
     "EKF2_BARO_CTRL": "Shield the barometer from propeller wash and light.",
     "EKF2_GPS_CTRL": "Give the antenna a free view of the sky.",
@@ -100,8 +97,8 @@ def detect_aid_faults(
 ) -> Findings:
     """Detect faults of EKF2's aiding sources.
 
-    ``source_aid`` is the aiding source whose positions KF uses, ``height_error_m`` is EKF2's height
-    error in a barometer gap, if large.
+    ``source_aid`` is the aiding source that also gives KF's positions. ``height_error_m`` is EKF2's
+    height error in a barometer gap.
     """
     aids_to_test = {name: aid for name, aid in aids.items() if name not in AIDS_TESTED_BY_REPLAY}
     unfused_aids_by_switch: dict[str, list[AidResult]] = {}
@@ -176,8 +173,7 @@ def _make_innovation_change_finding(name: str, aid: AidResult) -> Finding:
 
 
 def _make_overconfident_finding(name: str, aid: AidResult, sensor_cause: str) -> Finding:
-    # No noise value is proposed, because innovations alone do not distinguish noise from a
-    # wrong delay
+    # Innovations alone do not distinguish noise from a wrong delay, so no noise value is proposed
     action = "correct the accuracy that the sensor reports"
     if noise_parameter := AIDS[name].noise:
         action = f"increase {noise_parameter}"

@@ -8,7 +8,7 @@ from px4fuse.core.record import read_toml
 from px4fuse.finding import SEVERITIES, Finding
 from px4fuse.findings.model import FINDING_CATALOGUE, split_cause_groups
 
-# Key in Finding.evidence. Its value is the cause of the finding: one of the constants ..._CAUSE
+# Key of the cause in Finding.evidence
 CAUSE_KEY = "cause"
 # Causes that a re-run of a filter confirms
 MEASUREMENT_NOISE_CAUSE = "measurement noise"
@@ -20,31 +20,29 @@ WRONG_GATE_CAUSE = "gate"
 ACCELEROMETER_CAUSE = "accelerometer"
 # No tested change of a setting corrects the filter
 UNKNOWN_CAUSE = "elsewhere"
-# Key in Finding.evidence: σ of the white position noise ÷ smallest measurement noise of KF and
-# EKF2. The evidence contains the ratio only if the white noise is a separate fault
+# Key in Finding.evidence: σ of the white position noise ÷ assumed measurement noise
 WHITE_TO_ASSUMED_NOISE_RATIO_KEY = "white_over_assumed"
-# Cause of a fault of an aiding source: the sensor of this aiding source also gives KF's positions
+# The sensor of the aiding source also gives KF's positions
 SOURCE_SENSOR_CAUSE = "the source's sensor"
-# Cause: EKF2 uses the variance that the source reports as measurement noise, and it is wrong
+# EKF2 uses a wrong variance that the source reports
 REPORTED_VARIANCE_USED_BY_EKF2_CAUSE = "EKF2's noise"
-# Cause: the mean innovation of the aiding source changes in flight
+# The mean innovation of the aiding source changes in flight
 INNOVATION_CHANGE_CAUSE = "change"
-# Cause of EKF2's position resets: each reset follows a gap in the position source
+# EKF2's position resets follow gaps in the position source
 SOURCE_GAP_CAUSE = "gap"
-# Cause of missing motion: the vehicle stayed on the ground
+# The vehicle stayed on the ground
 VEHICLE_ON_GROUND_CAUSE = "never took off"
 # Key in Finding.evidence: property with a wrong convention ("axes", "unit", "time offset", ...)
 WRONG_CONVENTION_KEY = "convention"
-# Key in Finding.evidence: time (s) of a position jump that the source announces by reset_counter
+# Key in Finding.evidence: time (s) of a position jump with a change of reset_counter
 RESET_TIME_KEY = "reset_at_s"
-# Findings that cause other findings only with severity "warning" or "error", not as a note
+# These findings cause other findings only as warning or error
 CAUSES_UNLESS_NOTE = ("ekf2_not_aligned", "parameter_changed")
-# In a report, an effect has the action of its cause. Exceptions: the actions of these effects also
-# correct the cause
+# Effects that keep their own action, because it also corrects the cause
 EFFECTS_WITH_OWN_ACTION = ("ekf2_ev_delay_wrong",)
 
 _KF_FINDINGS = ("kf_underconfident", "kf_overconfident")
-# For the id of each finding that is a cause: ids of its effects, one per line
+# Ids of the effects of each cause
 EFFECTS_BY_CAUSE: Mapping[str, str] = read_toml(__file__, dict[str, str], "consequences.toml")
 
 
@@ -86,7 +84,7 @@ def group_by_cause(findings: Iterable[Finding]) -> tuple[Finding, ...]:
 def _use_action_of_cause(cause: Finding, finding: Finding) -> Finding:
     """Give an effect the action of its cause, because its own action may be wrong.
 
-    Example: outliers cause overconfidence. A larger noise setting would only hide the outliers.
+    Example: a larger noise setting only hides outliers.
     """
     if (
         finding.caused_by is None
@@ -113,8 +111,7 @@ def _compute_report_rank(group: list[Finding]) -> int:
     )
     if is_listed_first and cause.severity != "note":
         return -1
-    # Recording warnings (rank 1) are listed before noise errors (rank 2), because a bad recording
-    # makes the noise estimates wrong
+    # A bad recording makes the noise estimates wrong, so its warnings precede noise errors
     rank_by_severity = {
         "error": 2 * (report_class == "noise"),
         "warning": 3 - 2 * (report_class == "recording"),

@@ -90,7 +90,7 @@ def format_action(analysis: Analysis, change: Mapping[str, float]) -> str:
         actions.append("Calibrate the accelerometer and the level horizon.")
         change.pop(trials.RIGHT_BIAS_KEY)
     if rotation_deg := change.pop(trials.ROTATION_KEY, None):
-        # GNSS positions refer to true north: if they are rotated, EKF2's heading is wrong
+        # GNSS refers to true north, so a rotation of its positions is a heading error of EKF2
         actions.append(
             magnetometer_advice(analysis.flight) or "Check the heading source of EKF2."
             if is_gnss

@@ -19,22 +19,20 @@ from px4fuse.findings.cause_grouping import CAUSE_KEY, REPORTED_VARIANCE_USED_BY
 from px4fuse.findings.model import Findings, finding, format_percent
 from px4fuse.flight.model import Unavailable, source_name
 
-# Minimum factor between EKF2's noise parameter and the estimated noise, for severity "error":
-# smaller factors hardly change EKF2's position error
+# Minimum factor between EKF2's noise parameter and its estimate, for severity "error"
 MIN_NOISE_FACTOR_FOR_ERROR = 2.0
-# The first sentence of the message states the fraction of rejected positions from this value on
 MIN_REJECTED_FRACTION_IN_MESSAGE = 0.05
 
 
 def detect(analysis: Analysis) -> Findings:
-    """Detect a wrong noise parameter: a replay with the estimated noise makes EKF2 consistent."""
+    """Detect a wrong noise parameter of EKF2, confirmed by a replay."""
     trial, aid = find_confirmed_noise_trial(analysis), find_aid(analysis)
     if trial is None:
         return
     assert not isinstance(analysis.ekf2_model, Unavailable)
     inputs = analysis.ekf2_model.inputs
     used_noise_m, estimated_noise_m = find_used_noise_m(inputs), trial.change[aid.noise]
-    # EKF2 uses the larger one: the σ that the source reports, or the noise parameter
+    # EKF2 uses the larger of reported σ and noise parameter
     uses_reported_sigma = used_noise_m > inputs.settings[aid.noise]
     ratio, is_set_too_small = estimated_noise_m / used_noise_m, estimated_noise_m > used_noise_m
     factor, size_word = max(ratio, 1.0 / ratio), "small" if is_set_too_small else "large"
@@ -55,8 +53,7 @@ def detect(analysis: Analysis) -> Findings:
     name = "EKF2's position noise" if uses_reported_sigma else aid.noise
     title = f"{name} is {format_factor(factor)} times too {size_word}{effect_text}"
     is_default_noise = used_noise_m == analysis.flight.log.find_default_value(aid.noise)
-    # PX4's default suits usual sensors. If the default is too small, this sensor is noisier than
-    # usual
+    # PX4's default suits usual sensors: if it is too small, this sensor is noisier
     if is_set_too_small and is_default_noise:
         filter_names = "KF and EKF2" if is_kf_noise_equal_to_ekf2 else "EKF2"
         title = (

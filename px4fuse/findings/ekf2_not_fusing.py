@@ -31,15 +31,14 @@ from px4fuse.flight.model import (
     positions_phrase,
 )
 
-# Missing fusion is an error if EKF2 fuses the positions for less than this fraction of the time
+# Severity "error" if EKF2 fuses the positions for less than this fraction of the time
 FUSED_FRACTION_FOR_ERROR = 0.5
-# Missing fusion is reported if EKF2 fuses the positions for less than this fraction of the time
+# Warning if EKF2 fuses the positions for less than this fraction of the time
 FUSED_FRACTION_FOR_WARNING = 0.98
-# A late start of fusion is possible if the mean interval between positions is at least this (s).
-# Jitter then makes single intervals longer than EV_START_INTERVAL_S
+# Minimum mean interval (s) of positions: jitter then causes intervals above EV_START_INTERVAL_S
 MIN_INTERVAL_FOR_LATE_START_S = 0.18
 MOTION_CAPTURE_TOPIC = "vehicle_mocap_odometry"
-# An invalid EKF2 position is reported from this distance (m) to ground truth or source on
+# Minimum reported error (m) of an invalid EKF2 position
 MIN_INVALID_POSITION_ERROR_M = 1.0
 
 
@@ -115,7 +114,7 @@ def detect_unfused_positions(analysis: PreparedComparison) -> Findings:
 
 
 def _find_received_source(analysis: PreparedComparison) -> PositionTrack | None:
-    """Return the track of the positions that PX4 received, without those of a position file."""
+    """Return the positions that PX4 received, if any."""
     if analysis.source.origin != POSITION_FILE_ORIGIN:
         return analysis.source
     tracks = (track for track in analysis.flight.positions if track.origin != POSITION_FILE_ORIGIN)
@@ -170,7 +169,7 @@ def _detect_slow_restart(
     """Detect that EKF2 resumes fusion late after a gap, because the position rate is too low."""
     source, rate_hz = analysis.source, analysis.source.compute_rate_hz()
     if (
-        "EKF2_EV_CTRL" not in analysis.flight.log.parameters  # earlier than v1.14
+        "EKF2_EV_CTRL" not in analysis.flight.log.parameters  # PX4 before v1.14
         or not source.origin.is_vision
         or not source.origin.has_all_samples
         or source.alignment

@@ -17,12 +17,10 @@ from px4fuse.findings.model import (
 )
 from px4fuse.flight.model import Ekf2, Unavailable
 
-# Minimum fraction of rejected positions for a warning. With a gate of 5 √S, a consistent filter
-# rejects 6e-7
+# Minimum rejected fraction for a warning: with a gate of 5 √S, a consistent filter rejects 6e-7
 REJECTED_FRACTION_FOR_WARNING = 0.01
-# Minimum fraction of rejected positions, for severity "error"
 REJECTED_FRACTION_FOR_ERROR = 0.20
-# A change prevents rejections if the rejected fraction after it ÷ before it is below this ratio
+# Maximum ratio of rejected fractions, after to before a change that prevents rejections
 MAX_REJECTED_AFTER_TO_BEFORE_RATIO = 0.5
 
 
@@ -55,8 +53,7 @@ def _detect_small_gate(analysis: Analysis, rejection_findings: tuple[Finding, ..
 
 def _detect_rejections(analysis: Analysis) -> Findings:
     ekf2, down_comparison = analysis.flight.ekf2, analysis.axes.get("down")
-    # EKF2 accepts or rejects the horizontal position as a whole, so one horizontal axis shows all
-    # rejected positions
+    # EKF2 rejects north and east together, so one horizontal axis is sufficient
     for result in (
         analysis.main,
         *([down_comparison] if down_comparison and down_comparison is not analysis.main else []),

@@ -17,12 +17,11 @@ from px4fuse.findings.model import (
 )
 from px4fuse.flight.model import Ekf2, Reset
 
-# Time (s) after take-off in which a height reset of EKF2 is normal
+# Time (s) after take-off with normal height resets
 TAKE_OFF_DURATION_S = 10.0
-# Maximum time (s) from the end of a gap in the position source to the EKF2 reset caused by the gap
+# Maximum time (s) from the end of a position gap to the EKF2 reset that it causes
 MAX_RESET_DELAY_S = 5.0
-# EKF2 starts fusion by a reset to the first position. This normal reset can be up to this time (s)
-# after the logged start of fusion, because fusion flags are logged at 1 Hz
+# Maximum delay (s) of the normal reset at the start of fusion, because flags are logged at 1 Hz
 MAX_FUSION_START_TO_RESET_S = 1.0
 
 
@@ -30,8 +29,7 @@ def detect(analysis: Analysis) -> Findings:
     ekf2, segment = analysis.flight.ekf2, analysis.segment.whole_flight
     if not isinstance(ekf2, Ekf2):
         return
-    # Resets up to the start of fusion are normal and not reported. If EKF2 fuses no position, the
-    # start is NaN and all resets are reported
+    # Resets up to the start of fusion are normal
     fusion_start_s = -np.inf
     if isinstance(ekf2.fusion_flags, pd.DataFrame):
         is_fused = ekf2.fusion_flags["horizontal"] > 0.0

@@ -28,18 +28,17 @@ from px4fuse.flight.model import (
     rows_between,
 )
 
-# Limits of EKF2's bias estimates: parameter, its unit, sensor, and columns of the bias
+# Parameter that limits a bias estimate, its unit, sensor, and columns of the bias
 BIAS_LIMIT_PARAMETERS = (
     ("EKF2_ABL_LIM", "m/s²", "accelerometer", Columns.ACCELEROMETER_BIAS),
     ("EKF2_GYR_B_LIM", "rad/s", "gyroscope", Columns.GYRO_BIAS),
 )
-# EKF2's estimate of a bias is at its limit if |bias| / limit parameter is at least this value
+# Minimum ratio of a bias to its limit parameter, for a bias at its limit
 MIN_BIAS_TO_LIMIT_RATIO = 0.98
-# Minimum fraction of the flight with EKF2's estimate of a bias at its limit, for a finding
+# Minimum fraction of the flight with a bias at its limit, for a finding
 MIN_TIME_AT_LIMIT_FRACTION = 0.5
-# Length (s) of the windows in which px4fuse tests if the vehicle is at rest
 REST_WINDOW_S = 1.0
-# Time (s) before take-off in which the motors run, so that the IMU is not at rest
+# Time (s) before take-off in which the motors run
 MOTOR_RUN_UP_DURATION_S = 0.5
 # Maximum standard deviation of angular rate (rad/s) and specific force (m/s²) at rest
 MAX_RATE_AND_FORCE_STD_AT_REST = (0.04, 1.5)
@@ -47,12 +46,11 @@ MAX_RATE_AND_FORCE_STD_AT_REST = (0.04, 1.5)
 MAX_RATE_CHANGE_AT_REST_RAD_S = 0.01
 # Minimum gyroscope bias (rad/s) for a finding: the heading turns by 90° in 30 s
 MIN_GYRO_BIAS_RAD_S = 0.05
-# The message states the vertical accelerometer bias if specific force at rest and gravity differ by
-# more than this value (m/s²)
+# Minimum difference (m/s²) of specific force at rest and gravity that the message states
 MIN_GRAVITY_ERROR_M_S2 = 0.3
-# Missing tilt or yaw alignment is reported if it lasts for a larger fraction of the flight
+# Maximum fraction of the flight without tilt or yaw alignment
 MAX_UNALIGNED_FRACTION = 0.02
-# Maximum time (s) from tilt alignment to heading alignment; a later heading alignment is a finding
+# Maximum normal time (s) from tilt alignment to heading alignment
 MAX_HEADING_ALIGNMENT_DELAY_S = 5.0
 
 
@@ -174,8 +172,7 @@ def detect_missing_alignment(
 ) -> Findings:
     """Detect that EKF2 aligned its tilt or its heading late or never.
 
-    ``source`` is None for a flight without position source. If EKF2 takes its heading from the
-    source, the alignment of the heading is not tested.
+    Heading alignment is not tested if EKF2 takes its heading from the position source.
     """
     ekf2 = flight.ekf2
     if not isinstance(ekf2, Ekf2):
@@ -215,7 +212,7 @@ def detect_missing_alignment(
 
 
 def _find_heading_action(flight: Flight, source: PositionTrack | None) -> str:
-    """Return the action for a missing heading alignment; it depends on the heading sensors."""
+    """Return the action for a missing heading alignment."""
     action = magnetometer_advice(flight) or f"Enable the magnetometer ({MAG.switch} 0)."
     if source is not None and source.origin.is_vision:
         alternative_action = "let EKF2 fuse the yaw of the source (EKF2_EV_CTRL bit 3)"

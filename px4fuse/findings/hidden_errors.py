@@ -40,7 +40,7 @@ from px4fuse.trajectory.alignment import fit_alignment
 
 # Minimum mean NEES, for severity "error": an RMS position error of 4 times the reported σ
 MIN_NEES_FOR_ERROR = 16.0
-# EKF2 has a fault that KF does not have if KF's position RMSE ÷ EKF2's is below this ratio
+# Maximum ratio of position RMSEs, KF to EKF2, for a fault of EKF2 alone
 MAX_KF_TO_EKF2_RMSE_RATIO = 0.7
 # The position frame is misaligned if alignment reduces the position RMSE to less than this fraction
 MAX_ALIGNED_RMSE_RATIO = 0.5
@@ -82,8 +82,7 @@ def find_hidden_errors(comparison: Comparison) -> list[tuple[FilterName, str, Er
     Return (filter, axis, error) for each error, largest mean NEES first.
     """
     alignment, frame_residual_rms_m = comparison.source.alignment, 0.0
-    # The frame of a position file that was fitted to EKF2's track contains EKF2's errors. Then KF's
-    # height errors, and KF's errors below the residual of the fit, are not reported
+    # A frame that was fitted to EKF2's track contains EKF2's errors
     if is_frame_fitted := alignment is not None and alignment.yaw_sigma_deg is not None:
         frame_residual_rms_m = alignment.residual_rms_m or 0.0
     errors_not_in_innovations = [
@@ -237,10 +236,7 @@ def _find_closure_error_m(loop: Loop) -> float | None:
 def _compute_alignment_rmse(
     comparison: Comparison, filter_name: FilterName
 ) -> AlignmentRmse | None:
-    """Return the horizontal position RMSE before and after alignment with ground truth.
-
-    The alignment is a shift and a rotation about the vertical axis.
-    """
+    """Return the horizontal position RMSE before and after alignment (shift and yaw rotation)."""
     axis_errors_m, true_positions_m = [], []
     for result in select_north_and_east(comparison):
         errors, truth = compute_position_errors(result, filter_name), result.truth

@@ -21,7 +21,6 @@ from px4fuse.flight.model import Columns, Ekf2, Flight, sample_rate
 
 # Maximum specific force (m/s²) of real sensors: 35 g, because the largest range is 32 g
 MAX_PLAUSIBLE_SPECIFIC_FORCE_M_S2 = 343.0
-# Minimum number of samples above MAX_PLAUSIBLE_SPECIFIC_FORCE_M_S2 for a finding
 MIN_IMPLAUSIBLE_FORCE_SAMPLES = 3
 # Minimum accelerometer bias (m/s²), for severity "error": a position error of 0.15 m after 1 s
 MIN_BIAS_FOR_ERROR_M_S2 = 0.3
@@ -31,11 +30,10 @@ TILT_DEG_PER_M_S2 = float(np.degrees(1.0 / 9.80665))
 MIN_REPORTED_IMU_GAP_S = 0.2
 # Minimum IMU rate (Hz): 5 samples in each DT of 0.1 s, so that vibration is not aliased
 MIN_IMU_RATE_HZ = 50.0
-# Minimum attitude rate (Hz) for interpolation of the attitude to the times of IMU samples
+# Minimum attitude rate (Hz) for interpolation of the attitude
 MIN_ATTITUDE_RATE_HZ = 10.0
-# Clipping is reported if it lasts longer than this time (s): a touch-down clips one or two samples
+# Maximum normal duration (s) of clipping: a touch-down clips one or two samples
 MAX_CLIPPING_DURATION_S = 0.1
-# Minimum time (s) without clipped samples between two reported time spans of clipping
 MIN_TIME_BETWEEN_CLIPPINGS_S = 2.0
 # Mask of SDLOG_PROFILE, bit 4: full IMU rate (logged_topics.cpp)
 SDLOG_HIGH_RATE_MASK = 16
@@ -107,8 +105,7 @@ def detect_accelerometer_bias(analysis: Analysis) -> Findings:
             },
         )
     elif ekf2_bias_m_s2 is not None:
-        # If the positions show that the horizontal bias is not significant, only the vertical
-        # component of EKF2's bias is tested
+        # If the horizontal bias is not significant, test only the vertical bias
         bias_m_s2 = float(
             np.linalg.norm(
                 ekf2_bias_m_s2[2:]
@@ -193,7 +190,7 @@ def detect_imu_gaps(analysis: Analysis) -> Findings:
     if gap_s > max(MIN_REPORTED_IMU_GAP_S, 2.0 * interval_s):
         log = analysis.flight.log
         spans = _find_gap_spans(imu, analysis.segment) if isinstance(imu, pd.DataFrame) else ()
-        # KF needs IMU and attitude: if the IMU has no gap, the attitude has one
+        # If the IMU has no gap, the attitude has one
         missing_data = "IMU" if spans else "Attitude"
         action = ""
         if log.format.startswith("MAVLink"):
@@ -237,7 +234,7 @@ def detect_missing_imu_samples(analysis: Analysis) -> Findings:
 
 
 def _find_gap_spans(imu: pd.DataFrame, segment: Segment) -> tuple[Span, ...]:
-    """Return start and end (s) of each IMU gap in a segment, also at both ends of the segment."""
+    """Return start and end (s) of each IMU gap in a segment."""
     time_s = imu.index.to_numpy()
     gaps = select_intervals(time_s, find_imu_gaps(time_s))
     spans_at_segment_ends = (

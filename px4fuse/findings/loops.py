@@ -6,12 +6,10 @@ from px4fuse.findings.model import Findings, make_error, make_note, make_warning
 from px4fuse.loop.model import LANDING_CLOSURE_SOURCE, Closure, Loop
 from px4fuse.trajectory.graph.covariance import GATE_ALPHA
 
-# The stated odometry drift is too small if robust optimisation rejects a larger fraction of the
-# loop closures
+# Maximum fraction of rejected loop closures if the stated odometry drift is correct
 MAX_REJECTED_CLOSURE_FRACTION = 0.5
 CLOSURE_FIELDS = ("time_1_s", "time_2_s", "distance_m", "d2", "degrees_of_freedom", "p")
-# Minimum weight of a loop closure that graduated non-convexity (GNC) accepts; final weights are
-# near 0 or 1 (Yang et al. 2020)
+# Minimum weight of an accepted loop closure: GNC weights end near 0 or 1 (Yang et al. 2020)
 MIN_GNC_WEIGHT = 0.5
 
 

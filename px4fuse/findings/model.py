@@ -25,17 +25,14 @@ class CatalogueEntry(Record):
     group : str
         One of :data:`FINDING_GROUPS`.
     report_class : str
-        Class that determines the place in the list of findings. Listed first: "unusable" (all
-        positions are wrong), "misleading" (some positions are wrong) and "first" (other important
-        causes). "noise" is listed after other errors, "recording" before other warnings.
+        Class that determines the order of the findings, for example "unusable" or "noise".
     verdict : str
-        "meaningless": the verdicts on KF and EKF2 (consistent, over- or underconfident) are not
-        valid in a flight with this finding. "repeated": the finding itself states a verdict.
+        "meaningless": the verdicts on KF and EKF2 are not valid. "repeated": the finding states a
+        verdict.
     rerun_kinds : frozenset of str
-        Kinds of changes (``Trial.kinds``) that px4fuse tests in re-runs to confirm the finding.
+        Kinds of re-runs that confirm the finding.
     status_if_convention_wrong : str
-        Treatment of the finding if axes, unit or clock of the positions are wrong. "effect": listed
-        as an effect of the wrong convention. "withdrawn": removed. Empty: unchanged.
+        "effect" or "withdrawn" if axes, unit or clock of the positions are wrong; empty: unchanged.
     """
 
     title: str
@@ -47,7 +44,7 @@ class CatalogueEntry(Record):
     status_if_convention_wrong: Literal["", "effect", "withdrawn"] = ""
 
 
-# All possible findings by id; findings of equal severity are listed in this order
+# All findings by id, in the order in which findings of equal severity are listed
 FINDING_CATALOGUE: Mapping[str, CatalogueEntry] = read_toml(
     __file__, dict[str, CatalogueEntry], "catalogue.toml"
 )

@@ -1,7 +1,6 @@
 """Wrong SIGMA_Z or SIGMA_A of KF, and over- or underconfidence of KF or EKF2.
 
-SIGMA_A and SIGMA_Z are estimated together by maximum likelihood, because the mean NIS does not
-distinguish them.
+SIGMA_A and SIGMA_Z are estimated together, because the mean NIS does not distinguish them.
 """
 
 from typing import NamedTuple
@@ -44,27 +43,21 @@ from px4fuse.flight.model import Columns, Unavailable, sample_rate
 from px4fuse.readers.px4_innovations import has_fused_aid
 from px4fuse.request import COMPARISON_OPTIONS
 
-# Minimum factor between a noise setting and its estimate, for a warning: smaller factors hardly
-# change the track
+# Minimum factor between a noise setting and its estimate, for a warning
 MIN_SETTING_TO_ESTIMATE_FACTOR = 1.5
-# Minimum factor between a noise setting and its estimate, for severity "error"
 MIN_NOISE_FACTOR_FOR_ERROR = 4.0
-# KF ignores new positions if KF's time constant exceeds this value (s): vehicles turn in less time
+# KF ignores new positions if its time constant exceeds this value (s)
 MIN_KF_TIME_CONSTANT_S = 2.5
-# Factor that widens the 95 % interval of ln(noise estimate), so that only 0.3 % of the correct
-# noise settings are outside
+# Factor on the 95 % interval of ln(noise): 0.3 % of the correct noise settings are outside
 INTERVAL_WIDENING_FACTOR = 1.5
-# KF lags if the lag-1 autocorrelation of its innovations exceeds this value; white innovations
-# reach 0.2
+# KF lags if the lag-1 autocorrelation of its innovations exceeds this value (white noise: 0.2)
 MIN_LAG1_AUTOCORRELATION = 0.3
 
-# Minimum factor between actual and reported σ, for severity "error"
 MIN_SIGMA_FACTOR_FOR_ERROR = 2.0
-# Two noise σ count as equal up to this ratio: the median of 100 values has a standard error of 12 %
+# Maximum ratio of equal noises: the median of 100 values has a standard error of 12 %
 MAX_RATIO_OF_EQUAL_NOISES = 1.25
-# If EKF2's √R is larger than EKF2_EVP_NOISE times this factor, R is the variance in the messages
+# EKF2 uses the reported variance if √R exceeds EKF2_EVP_NOISE by more than this factor
 MIN_USED_TO_PARAMETER_NOISE_RATIO = 1.25
-# Action if no change in a re-run corrects the wrong σ
 UNEXPLAINED_SIGMA_ACTION = (
     "No tested change of noise, time offset, frame or outliers explains the wrong σ. Check the "
     "IMU (rate, gaps, vibration)."
@@ -86,7 +79,6 @@ KEEP_NOISE_BECAUSE_OF_CORRELATION_ACTION = (
 KEEP_NOISE_BECAUSE_OF_TRUTH_ACTION = (
     "Do not reduce noise settings: ground truth shows that a smaller σ would be too small."
 )
-# Effect of a noise setting that is too small or too large on KF, and the reason
 EFFECT_AND_REASON_BY_WRONG_SETTING = {
     (SIGMA_Z, "small"): (
         "KF follows the noise of single positions",
@@ -107,10 +99,9 @@ AxisWithSummary = tuple[AxisComparison, FilterSummary]
 
 
 class SettingDeviation(NamedTuple):
-    """Deviation of a noise setting from its estimate.
+    """Deviation of a noise setting from its estimate, or from the upper bound of the estimate.
 
-    ``estimate`` is the estimated noise, or its upper bound if the data give only a bound.
-    ``factor`` is the larger of setting / estimate and estimate / setting.
+    ``factor`` is the ratio of the larger to the smaller value.
     """
 
     estimate: float
@@ -138,8 +129,7 @@ def detect_wrong_settings(analysis: Analysis) -> Findings:
         for name, noise in noise_estimates.items()
         if (deviation := find_setting_deviation(name, settings[name], noise))
     }
-    # The estimate is from innovations, which do not show drift and time-correlated errors. A larger
-    # setting may include these errors, so only smaller settings are reported
+    # Innovations do not show drift, so a larger setting may be correct
     may_drift = analysis.source.origin.may_drift
     if (
         may_drift
@@ -213,7 +203,7 @@ def format_setting_action(analysis: Analysis, name: str, value: float) -> str:
 def find_setting_deviation(
     name: str, setting: float, noise_estimate: NoiseEstimate
 ) -> SettingDeviation | None:
-    """Return the deviation of a noise setting from its estimate; None if it is not significant."""
+    """Return the deviation of a noise setting from its estimate, if it is significant."""
     if not (estimate := noise_estimate.value or noise_estimate.high):
         return None
     low, high = (
@@ -235,8 +225,7 @@ def detect_process_noise_near_zero(analysis: Analysis) -> Findings:
     """Detect a SIGMA_A so small that KF ignores new positions."""
     for result in sorted(analysis.axes.values(), key=lambda result: result is not analysis.main):
         updates, summary = result.replay.updates, result.filters["kf"]
-        # Without motion, a small SIGMA_A is correct. KF is then not overconfident, or its
-        # innovations are white
+        # Without motion, a small SIGMA_A is correct
         if (
             isinstance(summary, Unavailable)
             or summary.verdict != "overconfident"
@@ -406,8 +395,7 @@ def _has_default_noises(
     log = analysis.flight.log
     default_noise = log.find_default_value(noise_parameter)
     is_parameter_default = log.parameters.get(noise_parameter, default_noise) == default_noise
-    # EKF2 uses the default, unless R is the variance that the source reports. Unknown R (NaN) is
-    # treated as the default
+    # `not >` instead of `<=`: unknown R (NaN) counts as the default
     return is_parameter_default and not abs(
         np.log(find_ekf2_noise_m(result) / default_noise)
     ) > np.log(MAX_RATIO_OF_EQUAL_NOISES)

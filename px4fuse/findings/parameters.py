@@ -14,7 +14,7 @@ from px4fuse.findings.model import Findings, make_note, make_warning
 from px4fuse.flight.ekf2_parameters import AID_MASK_PARAMETER, PARAMETERS
 from px4fuse.flight.model import Ekf2, Unavailable
 
-# A parameter change has an effect if σ ratio or position RMSE change by at least this factor
+# A parameter change has an effect if σ ratio or RMSE change by at least this factor
 MIN_SIGMA_RATIO_OR_RMSE_CHANGE_FACTOR = 1.5
 
 
@@ -30,7 +30,7 @@ class SpanConsistency(NamedTuple):
 
 
 def detect(analysis: Analysis) -> Findings:
-    """Detect EKF2 parameters that are changed in flight and that px4fuse uses."""
+    """Detect changes of EKF2 parameters in flight."""
     ekf2, segment = analysis.flight.ekf2, analysis.segment
     fusion_parameters = (find_aid(analysis).switch, AID_MASK_PARAMETER)
     changes = [

@@ -86,7 +86,7 @@ def detect_lost_data(flight: Flight) -> Findings:
 
 
 def detect_decreasing_clocks(flight: Flight) -> Findings:
-    """Detect a boot clock that jumps back (restart of the autopilot), or receive times that do."""
+    """Detect a boot clock (restart of the autopilot) or receive times that jump back."""
     log = flight.log
     if log.restarts:
         yield make_warning(

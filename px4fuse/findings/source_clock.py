@@ -16,8 +16,7 @@ from px4fuse.flight.model import Unavailable
 
 # Minimum time offset (s), for severity "error": a position error of 0.1 m at 1 m/s
 MIN_OFFSET_FOR_ERROR_S = 0.10
-# A time offset is reported only if KF's position RMSE with corrected timestamps ÷ RMSE without
-# correction is at most this ratio
+# Maximum ratio of KF's position RMSE with corrected timestamps to the RMSE without correction
 MAX_RMSE_RATIO_AFTER_CORRECTION = 1.005
 CORRECT_AT_SENDER_ACTION = "Correct the position timestamps before sending."
 
@@ -57,7 +56,7 @@ def detect_time_offset(analysis: Analysis, time_offset: ClockOffset) -> Findings
         )
         return
     abs_offset_s = abs(time_offset.remaining_s)
-    # If timestamps are arrival times in a part of the flight, one offset cannot correct them
+    # One offset cannot correct timestamps that are partly arrival times
     if (
         not time_offset.is_significant(time_offset.remaining_s)
         or find_timesync_convergence(analysis) is not None
@@ -139,14 +138,13 @@ def _find_offset_remedy(analysis: Analysis, time_offset: ClockOffset) -> str:
 
 def compute_offset_for_option_s(comparison: PreparedComparison, time_offset: ClockOffset) -> float:
     """Return the value (s) of ``--clock-offset`` that corrects a time offset."""
-    # --clock-offset replaces the offset that the alignment of a position file found and applied
+    # --clock-offset replaces the offset from the alignment, so it must include that offset
     alignment = comparison.source.alignment
     return time_offset.offset_s + (0.0 if alignment is None else alignment.clock_offset_s)
 
 
 def detect_wrong_delay(analysis: Analysis, time_offset: ClockOffset) -> Findings:
-    # Only vision is tested: a wrong EKF2_GPS_DELAY is part of the time offset of GNSS positions,
-    # which detect_time_offset reports
+    # Only vision is tested: detect_time_offset reports a wrong EKF2_GPS_DELAY
     delay_ms = remedy.find_logged_delay_ms(analysis) if analysis.source.origin.is_vision else None
     estimated_delay_ms = -1e3 * time_offset.offset_s
     if (

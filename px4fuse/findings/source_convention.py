@@ -32,8 +32,7 @@ from px4fuse.flight.model import PositionTrack, positions_phrase, source_name
 POSITION_INDEPENDENT_FINDING_GROUPS = ("logging", "IMU")
 
 
-# Content of a finding on wrong axes, unit, clock or orientation: finding id, kind of fault (value
-# of the evidence WRONG_CONVENTION_KEY), message, action
+# Finding id, kind of fault, message and action
 ConventionFaultTexts = tuple[str, str, str, str]
 
 
@@ -58,7 +57,7 @@ def detect(analysis: Comparison) -> Findings:
 def remove_convention_effects(analysis: Comparison, findings: Sequence[Finding]) -> list[Finding]:
     """Remove findings that are only effects of wrong axes, unit, clock or orientation.
 
-    Findings on EKF2 are kept and marked as effects, because EKF2 used the wrong positions.
+    Findings on EKF2 are kept and marked as effects.
     """
     faults = _find_convention_faults(analysis)
     cause_findings = [item for item in findings if WRONG_CONVENTION_KEY in item.evidence]

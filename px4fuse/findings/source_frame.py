@@ -38,8 +38,7 @@ MIN_MISALIGNMENT_SIGMAS = 4.0
 MIN_HEADING_ERROR_DEG = 5.0
 # Minimum yaw misalignment (°), for severity "error": 26 % of the motion appears on the other axis
 MIN_SEVERE_HEADING_ERROR_DEG = 15.0
-# EKF2's heading drifts if its drift against ground truth is at least this fraction of its drift
-# against the positions. Otherwise the frame of the positions drifts
+# Minimum ratio of EKF2's heading drift against ground truth to its drift against the positions
 MIN_TRUE_TO_RELATIVE_HEADING_DRIFT_RATIO = 0.5
 # Topic of the positions that EKF2 rotated into the frame of its state (EKF2.cpp)
 ALIGNED_VISION_TOPIC = "estimator_visual_odometry_aligned"

@@ -38,20 +38,17 @@ MIN_LOST_POSITION_FRACTION = 0.02
 MIN_INTERVAL_COUNT = 50
 # Minimum fraction of missing positions to report downsampling: a radio link loses fewer
 MIN_MISSING_FRACTION_FOR_DOWNSAMPLING = 0.25
-# Downsampled positions have intervals of two lengths, n and n + 1 source periods (30 Hz to 20 Hz: 1
-# and 2). Minimum fraction of intervals with one of the two lengths
+# Minimum fraction of intervals that have one of two lengths (n or n + 1 source periods)
 MIN_FRACTION_OF_BOTH_INTERVAL_LENGTHS = 0.85
-# Downsampled positions have intervals of two lengths. Minimum fraction of the rarer length
+# Minimum fraction of the rarer interval length
 MIN_FRACTION_OF_RARER_INTERVAL_LENGTH = 0.1
-# Intervals are multiples of a period if the RMS of (interval / period - nearest integer) is at most
-# this value: jitter causes 0.03, random intervals cause 0.29
+# Maximum RMS deviation of intervals from multiples of the period (jitter: 0.03, random: 0.29)
 MAX_ROUNDING_RMS_ERROR = 0.06
-# Tested values of the source period: median interval / n, with n from 1 to this number
+# Tested source periods: median interval ÷ 1, 2, ... up to this number
 MAX_PERIODS_IN_MEDIAN_INTERVAL = 4
-# Minimum length (s) of a gap at the start or end of the flight for a finding: shorter gaps may be
-# errors of take-off and landing times, because the land detector is seconds late
+# Minimum gap (s) at take-off or landing: the land detector is seconds late
 MIN_GAP_AT_START_OR_END_S = 3.0
-# KF's predicted state is read this time (s) before the position that updates it
+# KF's predicted state is read this time (s) before the update
 TIME_BEFORE_UPDATE_S = 1e-6
 
 
@@ -151,10 +148,7 @@ def _make_stop_or_begin_finding(analysis: Analysis, span_s: Span, fused_aids: li
 
 
 def _find_ekf2_errors_at_end(analysis: Analysis, span_s: Span) -> dict[str, float]:
-    """Return EKF2's horizontal position error and reported σ (m) at the end of a time span.
-
-    The mapping does not contain unknown values.
-    """
+    """Return EKF2's horizontal position error and reported σ (m) at the end of a time span."""
     axes = [analysis.axes[name] for name in ("north", "east") if name in analysis.axes]
     squared_errors_m2 = []
     for result in axes if len(axes) == 2 else [analysis.main]:
@@ -269,8 +263,7 @@ def detect_lost_samples(analysis: Analysis) -> Findings:
 def detect_downsampling(analysis: Analysis) -> Findings:
     """Detect positions that were downsampled before PX4 received them."""
     source = analysis.source
-    # The timestamps must show the intervals at which PX4 received the positions. This is not so if
-    # px4fuse converted the timestamps, or if EKF2 processed the positions before PX4 logged them
+    # The timestamps must be the times at which PX4 received the positions
     if (
         source.clock_map is not None
         or source.origin.find_preference_rank() >= ALIGNED_BY_EKF2_ORIGIN.find_preference_rank()
@@ -335,8 +328,7 @@ def _compute_intervals_s(analysis: Analysis) -> tuple[Array, float]:
 
 def _find_period(intervals_s: Array) -> tuple[float, Array] | None:
     """Return the period (s) of the source, and the number of periods in each interval."""
-    # The upper median is one of the intervals, and thus a multiple of the period. numpy.median may
-    # be the mean of two intervals
+    # The upper median is one of the intervals; numpy.median may be the mean of two
     median_interval_s = float(np.sort(intervals_s)[len(intervals_s) // 2])
     for median_count in range(1, MAX_PERIODS_IN_MEDIAN_INTERVAL + 1):
         periods_in_intervals = np.rint(intervals_s * median_count / median_interval_s)

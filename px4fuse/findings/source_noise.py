@@ -1,7 +1,6 @@
 """Detect position noise that R does not describe, and repeated positions.
 
-R describes white noise with constant σ. The detected noise is time-correlated, unequal
-between axes, or varies in flight.
+R describes white noise with constant σ.
 """
 
 from dataclasses import asdict
@@ -30,28 +29,22 @@ from px4fuse.findings.source_positions import (
 )
 from px4fuse.flight.model import Columns, positions_phrase, source_name
 
-# White noise is a separate fault if its σ ÷ σ of the time-correlated noise is above this ratio
+# Minimum ratio of white noise σ to time-correlated noise σ, for a separate fault
 MIN_WHITE_TO_CORRELATED_SIGMA_RATIO = 0.3
-# Minimum log likelihood ratio (nats) of time-correlated to white noise: 1 of 400 flights without a
-# fault exceeds it
+# Minimum log likelihood ratio (nats): 1 of 400 flights without a fault exceeds it
 MIN_CORRELATED_NOISE_LOG_LIKELIHOOD_RATIO_NATS = 5.0
-# Minimum time-correlated error (m, 1 σ): timestamps in ms cause 2 mm at 4 m/s, and the motion from
-# IMU or ground truth also has errors of some mm
+# Minimum time-correlated error (m, 1 σ): errors of timestamps and motion cause some mm
 MIN_CORRELATED_NOISE_SIGMA_M = 0.005
 # Minimum fraction of repeated positions for a warning
 MIN_REPEATED_FRACTION = 0.05
-# Minimum fraction of repeated positions, for severity "error"
 MIN_REPEATED_FRACTION_FOR_ERROR = 0.3
-# Minimum number of repeated positions for a finding
 MIN_REPEATED_POSITION_COUNT = 10
-# Minimum ratio of the larger to the smaller position noise σ of north and east, for a finding
+# Minimum ratio of the larger to the smaller position noise σ, north and east
 MIN_AXIS_NOISE_RATIO = 1.5
-# Minimum ratio of the noise in one part of the flight to the noise in the rest, for a warning
+# Minimum ratio of the noise in one flight part to the noise in the rest, for a warning
 MIN_NOISY_PART_SIGMA_RATIO = 2.0
-# Minimum ratio of the noise in one part of the flight to the noise in the rest, without outliers,
-# for a warning
+# Minimum noise ratio of one flight part to the rest, without outliers, for a warning
 MIN_NOISY_PART_SIGMA_RATIO_WITHOUT_OUTLIERS = 1.5
-# Minimum ratio of the noise in one part of the flight to that in the rest, for severity "error"
 MIN_NOISY_PART_SIGMA_RATIO_FOR_ERROR = 4.0
 
 
@@ -95,7 +88,7 @@ def detect_time_correlated_noise(analysis: Analysis) -> Findings:
         and noise.white_m > MIN_WHITE_TO_CORRELATED_SIGMA_RATIO * noise.slow_m
     ):
         evidence[WHITE_TO_ASSUMED_NOISE_RATIO_KEY] = white_noise_to_setting_ratio
-    # Time-correlated errors are normal for GNSS: if they are within the reported σ, they are a note
+    # Time-correlated errors of GNSS are normal: if σ contains them, they are only a note
     make_finding = (
         make_note if is_gnss and not _has_error_above_reported_sigma(analysis) else make_warning
     )
@@ -153,7 +146,7 @@ def detect_repeated_positions(analysis: Analysis) -> Findings:
 def detect_unequal_noise(analysis: Analysis) -> Findings:
     """Detect that the position noise differs between two horizontal directions."""
     if analysis.source.origin.is_gnss:
-        return  # the estimate of SIGMA_Z lacks the time-correlated noise, which dominates in GNSS
+        return  # the estimate lacks time-correlated noise, which dominates in GNSS
     axis_noise_estimates = sorted(
         (noise.value, noise.low, noise.high, axis_tuning.name)
         for axis_tuning in analysis.axis_tunings
@@ -193,8 +186,7 @@ def detect_noise_variation(analysis: Analysis) -> Findings:
     if (
         noisy_part is None
         or noisy_part.sigma_ratio < MIN_NOISY_PART_SIGMA_RATIO
-        # An outlier that KF fuses also increases the next innovations. The noise of the part must
-        # therefore be larger even without the outliers
+        # An outlier also increases the next innovations, so the noise is tested without outliers
         or noisy_part.sigma_ratio_without_outliers < MIN_NOISY_PART_SIGMA_RATIO_WITHOUT_OUTLIERS
     ):
         return

@@ -35,7 +35,7 @@ from px4fuse.findings.source_positions import (
 from px4fuse.findings.source_stamps import detect_bursts
 from px4fuse.flight.model import positions_phrase, source_name
 
-# Minimum scale factor error (ratio minus 1) against ground truth for a finding: 0.8 m in 10 m
+# Minimum scale factor error (ratio minus 1) against ground truth: 0.8 m in 10 m
 MIN_SCALE_ERROR_AGAINST_TRUTH = 0.08
 # Minimum jitter (s), for severity "error": a position error of 3 cm at 1 m/s
 MIN_JITTER_FOR_ERROR_S = 0.03

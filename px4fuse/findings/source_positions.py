@@ -55,23 +55,19 @@ from px4fuse.flight.model import (
     source_name,
 )
 
-# The vehicle moves if the extent (m) of the positions is at least this (5th to 95th percentile)
+# Minimum extent (m) of the positions of a moving vehicle (5th to 95th percentile)
 MIN_MOTION_RANGE_M = 0.5
-# The vehicle moves if the extent of the positions (5th to 95th percentile) ÷ position noise σ is at
-# least this ratio. At rest, white noise has an extent of 3.29 σ; 25 % is margin
+# Minimum extent of motion, in σ of the noise: noise alone has 3.29 σ, 25 % is margin
 MIN_MOTION_RANGE_TO_NOISE_RATIO = 1.25 * 3.29
-# Minimum log likelihood ratio (nats) of low-pass filtered to white noise; for positions that are
-# not filtered it is 0 to 2
+# Minimum log likelihood ratio (nats) of low-pass filtered to white noise; unfiltered: 0 to 2
 MIN_LOW_PASS_LOG_LIKELIHOOD_RATIO_NATS = 6.0
-# Minimum log likelihood ratio (nats) of low-pass filtered to time-correlated noise, to report a
-# low-pass filter. A low-pass filter delays the positions, time-correlated noise does not
+# Minimum log likelihood ratio (nats) of low-pass filtered to time-correlated noise
 MIN_LOW_PASS_TO_CORRELATED_NOISE_NATS = 1.0
-# The lag due to a low-pass filter is estimated from the noise correlation. If this lag exceeds the
-# upper 95 % limit of the measured delay by this factor, the measured delay is reported as the lag
+# Maximum ratio of the lag from the noise correlation to the measured delay (upper 95 % limit)
 MAX_ESTIMATED_LAG_TO_DELAY_RATIO = 4.0
-# Minimum lag (s) due to a low-pass filter, for a warning: a position error of 5 cm at 1 m/s
+# Minimum filter lag (s) for a warning: a position error of 5 cm at 1 m/s
 MIN_LAG_S = 0.05
-# Minimum lag (s) due to a low-pass filter, for severity "error": a position error of 10 cm at 1 m/s
+# Minimum filter lag (s) for severity "error": a position error of 10 cm at 1 m/s
 MIN_LAG_FOR_ERROR_S = 0.10
 # Minimum position jump (m) for a warning: twice the noise of good UWB (0.1 m)
 MIN_JUMP_M = 0.2
@@ -81,30 +77,24 @@ MIN_JUMP_SIGMAS = 5.0
 MIN_JUMPS_WITH_RESET_COUNTER = 2
 # Minimum number of jumps without a change of reset_counter to report repeated jumps
 MIN_JUMPS_WITHOUT_RESET_COUNTER = 3
-# Minimum size (m) of a jump without a change of reset_counter
 MIN_JUMP_WITHOUT_RESET_COUNTER_M = 0.1
 # Minimum ratio of a jump without a change of reset_counter to the median of position changes
 MIN_JUMP_TO_MEDIAN_CHANGE_RATIO = 8.0
-# A jump is compared with the median of this number of position changes around it
+# Number of position changes in the median with which a jump is compared
 JUMP_WINDOW_SAMPLES = 61
-# Minimum number of positions to detect jumps
 MIN_POSITIONS_FOR_JUMPS = 100
 # Minimum time (s) and number of positions that a jump lasts: outliers go back to the track earlier
 MIN_JUMP_DURATION_S, MIN_JUMP_DURATION_SAMPLES = 0.6, 9
-# A jump lasts if the medians of the positions after and before the jump differ by the size of the
-# jump, with a deviation below this fraction of the size
+# Maximum difference between a jump and the shift of the medians, as fraction of the jump
 MAX_MEDIAN_SHIFT_DEVIATION_FRACTION = 0.5
-# Maximum ratio of the interval before a jump to the median interval: a position change in a longer
-# interval may be motion
+# Maximum ratio of the interval before a jump to the median interval: long intervals contain motion
 MAX_JUMP_TO_MEDIAN_INTERVAL_RATIO = 1.5
-# The positions alternate between two points if at least this fraction of the jumps is opposite to
-# the previous jump
+# Minimum fraction of jumps opposite to the previous jump, for two alternating positions
 MIN_OPPOSITE_JUMP_FRACTION = 0.7
 # Maximum time (s) from a position jump to the reset of EKF2 that the jump causes
 MAX_JUMP_TO_RESET_TIME_S = 5.0
-# Maximum number of jumps whose times are printed
 MAX_LISTED_JUMPS = 8
-# Maximum rounding difference (s) between the time of a position and that of its reset_counter
+# Maximum rounding difference (s) between the times of a position and its reset_counter
 RESET_TIME_TOLERANCE_S = 1e-4
 # Bit masks of EKF2_EV_CTRL: EKF2 fuses the horizontal position (bit 0) or the height (bit 1)
 EV_CTRL_HORIZONTAL_MASK, EV_CTRL_HEIGHT_MASK = 1, 2
@@ -116,19 +106,17 @@ MIN_JUMP_FOR_ERROR_M = 0.5
 MIN_SCALE_ERROR_FOR_WARNING = 0.12
 # Minimum scale factor error (ratio minus 1), for severity "error": 1 m in a distance of 7 m
 MIN_SCALE_ERROR_FOR_SEVERITY_ERROR = 0.15
-# Minimum |scale factor error| / σ of its estimate, for a warning: 0.3 % of correct sources exceed 3
+# Minimum |scale factor error| / σ: 0.3 % of correct sources exceed 3
 MIN_SCALE_ERROR_TO_SIGMA_RATIO = 3.0
 # Minimum fraction of outliers for a warning: normal noise has 0.02 % beyond 3.7 σ
 MIN_OUTLIER_FRACTION = 0.005
 # Minimum fraction of outliers, for severity "error": one outlier in 10 s at 5 Hz
 MIN_OUTLIER_FRACTION_FOR_ERROR = 0.02
-# Minimum number of outliers for a finding
 MIN_OUTLIERS = 3
 # Minimum fraction of positions with logged innovations, to state the number of rejected outliers
 MIN_LOGGED_POSITION_FRACTION = 0.75
 # Minimum factor between reported and estimated position variance for a warning
 MIN_REPORTED_VARIANCE_FACTOR = 2.0
-# Minimum factor between reported and estimated position variance, for severity "error"
 MIN_REPORTED_VARIANCE_FACTOR_FOR_ERROR = 3.0
 
 
@@ -159,8 +147,7 @@ def find_low_pass(analysis: Analysis) -> SourceLowPass | None:
     ):
         return None
     time_offset, correlated_noise = analysis.clock, analysis.time_correlated_noise
-    # The lag from the noise correlation is inaccurate if it is much larger than the measured delay,
-    # for example at a high rate. The measured delay (-time offset) is then the lag
+    # At a high rate, the lag from the noise correlation is inaccurate: use the measured delay
     lag_limit_s = (
         -MAX_ESTIMATED_LAG_TO_DELAY_RATIO * time_offset.interval_s[0]
         if isinstance(time_offset, ClockOffset)
@@ -168,7 +155,7 @@ def find_low_pass(analysis: Analysis) -> SourceLowPass | None:
     )
     if isinstance(time_offset, ClockOffset) and low_pass.lag_s > lag_limit_s >= MIN_LAG_S:
         low_pass = replace(low_pass, lag_s=-time_offset.offset_s)
-    # A low-pass filter delays the positions. Correlated errors without delay have another cause
+    # Without a delay, correlated errors are not due to a low-pass filter
     if (
         isinstance(correlated_noise, TimeCorrelatedNoise)
         and correlated_noise.low_pass_gain_nats < MIN_LOW_PASS_TO_CORRELATED_NOISE_NATS
@@ -200,8 +187,7 @@ def detect_low_pass(analysis: Analysis) -> Findings:
 def detect_jumps(analysis: Analysis) -> Findings:
     """Detect position jumps that the IMU does not measure."""
     systematic_errors = analysis.systematic_errors
-    # If the timestamps change from arrival to measurement times, the positions of a moving vehicle
-    # shift as in a jump
+    # A change from arrival to measurement times resembles a jump
     if not isinstance(systematic_errors, SystematicErrors) or any(
         detect_arrival_timestamps(analysis)
     ):
@@ -265,7 +251,7 @@ def detect_constant_coordinates(analysis: Analysis) -> Findings:
     if not (is_single_coordinate or is_height_only(source)) or (
         is_single_coordinate and source.rounding_step_m > 0.0
     ):
-        return  # coarsely rounded positions may be constant while the vehicle moves
+        return  # rounded positions may be constant in motion
     values_m = dict(zip("xyz", source.samples[Columns.POSITION].median().tolist(), strict=True))
     finding_id, mask_of_constant, make_finding = (
         "source_coordinate_constant",
@@ -367,16 +353,11 @@ def detect_repeated_jumps(analysis: Analysis) -> Findings:
 
 
 def _find_jumps(analysis: Analysis) -> tuple[list[tuple[float, Array]], bool]:
-    """Return time (s) and step (m) of each jump, and True if ``reset_counter`` announces the jumps.
-
-    Jumps that are not announced must last for :data:`MIN_JUMP_DURATION_S`, and must be
-    :data:`MIN_JUMP_TO_MEDIAN_CHANGE_RATIO` times larger than other position changes.
-    """
+    """Return time (s) and step (m) of each jump, and True if ``reset_counter`` announces them."""
     position_m = cut_to_segment(analysis.source.samples, analysis.segment)[
         Columns.POSITION[:2]
     ].dropna()
-    # Drop repeated positions. The position change after a repetition contains the motion of two
-    # intervals and resembles a jump
+    # A position change after a repeated position contains the motion of two intervals
     position_m = position_m[(position_m.diff() != 0.0).any(axis=1)]
     time_s, position_changes_m = position_m.index.to_numpy(), np.diff(position_m.to_numpy(), axis=0)
     if len(position_changes_m) < MIN_POSITIONS_FOR_JUMPS:
@@ -434,9 +415,9 @@ def detect_scale_error(analysis: Analysis) -> Findings:
         return
     if (
         analysis.source.origin.is_gnss  # GNSS has no scale factor error
-        or isinstance(analysis.flight.truth, Truth)  # source_patterns.py uses it
+        or isinstance(analysis.flight.truth, Truth)  # with ground truth, see source_patterns.py
         or not isinstance(systematic_errors, SystematicErrors)
-        # the effect of a low-pass filter or of time-correlated noise may resemble a scale error
+        # A low-pass filter or time-correlated noise may resemble a scale error
         or find_low_pass(analysis) is not None
         or not isinstance(analysis.time_correlated_noise, Unavailable)
         or not _has_valid_time_offset(analysis)
@@ -460,7 +441,7 @@ def detect_scale_error(analysis: Analysis) -> Findings:
 
 
 def detect_outliers(analysis: Analysis) -> Findings:
-    """Detect more outliers of the innovations than Gaussian noise causes."""
+    """Detect more outliers than Gaussian noise causes."""
     axis_tuning = analysis.tuning.get(HORIZONTAL) or next(iter(analysis.tuning.values()), None)
     if not isinstance(axis_tuning, AxisTuning):
         return
@@ -565,8 +546,7 @@ def detect_wrong_variance(analysis: Analysis) -> Findings:
     reported_sigma_m = float(np.sqrt(reported_variance_m2.to_numpy().mean(axis=1)).mean())
     variance_ratio = (reported_sigma_m / noise_m) ** 2
     variance_error_factor = max(variance_ratio, 1.0 / variance_ratio)
-    # A reported variance near the mean square error against ground truth is correct. It contains
-    # the time-correlated errors, which R has to include and which innovations do not show
+    # A reported variance near the mean square error against ground truth is correct
     rmse_m = _compute_rmse_per_axis_m(analysis) if variance_ratio > 1.0 else None
     if rmse_m is not None and reported_sigma_m**2 < MIN_REPORTED_VARIANCE_FACTOR * rmse_m**2:
         return

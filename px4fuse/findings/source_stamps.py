@@ -30,29 +30,26 @@ from px4fuse.flight.model import (
     positions_phrase,
 )
 
-# Jitter of receive times is reported above this value (s): a position error of 1 cm at 1 m/s
+# Maximum normal jitter (s) of receive times: a position error of 1 cm at 1 m/s
 MAX_RECEIPT_JITTER_S = 0.010
-# A timestamp is an arrival time if PX4 publishes the position within this time (s) after it
+# Maximum time (s) from an arrival timestamp to the publication by PX4
 MAX_ARRIVAL_TO_PUBLICATION_DELAY_S = 0.001
 # Minimum latency (s) for a warning: a position error of 2 cm at 1 m/s
 MIN_LATENCY_S = 0.02
 # Minimum latency (s), for severity "error": a position error of 10 cm at 1 m/s
 MIN_LATENCY_FOR_ERROR_S = 0.10
-# The latency of the positions grows in flight if its rank correlation with time is at least this
+# Minimum rank correlation of latency with time, for a latency that grows in flight
 MIN_LATENCY_CORRELATION = 0.8
 # Minimum fraction of positions that EKF2 drops because of their latency, for a finding
 MIN_DROPPED_POSITION_FRACTION = 0.02
-# Minimum number of positions before and after the convergence of TIMESYNC, to detect the
-# convergence
 MIN_POSITIONS_BEFORE_AND_AFTER_TIMESYNC = 10
-# Minimum fraction of arrival times among the timestamps before the convergence of TIMESYNC, and of
-# measurement times among the timestamps after it
+# Minimum fraction of arrival times before the convergence of TIMESYNC, and of measurement times
+# after
 MIN_FRACTION_OF_TIMESTAMP_KIND = 0.95
-# Minimum mean number of positions that arrive together (burst)
+# Minimum mean number of positions in a burst (positions that arrive together)
 MIN_BURST_POSITIONS = 2.5
-# Minimum number of bursts. With fewer bursts, the pauses are gaps in the position source
+# Minimum number of bursts: a few pauses are gaps in the position source
 MIN_BURST_COUNT = 20
-# Maximum ratio of the duration of a burst to the pause between bursts
 MAX_BURST_TO_PAUSE_DURATION_RATIO = 0.3
 ANSWER_TIMESYNC_ACTION = (
     "Let the companion computer answer TIMESYNC (MAVROS does by default; with pymavlink answer "
@@ -180,8 +177,7 @@ def detect_constant_timestamps(
 def detect_arrival_timestamps(analysis: Analysis) -> Findings:
     """Detect timestamps that are arrival times instead of times of measurement.
 
-    Without TIMESYNC, PX4 uses the arrival time as timestamp (Timesync.cpp). The age of a position
-    when PX4 publishes it is then zero instead of the latency.
+    Without TIMESYNC, PX4 uses the arrival time as timestamp (Timesync.cpp).
     """
     position_age_s = _find_position_age_s(analysis)
     if position_age_s is None:
@@ -270,8 +266,7 @@ def find_timesync_convergence(analysis: Analysis) -> tuple[float, float] | None:
     if position_age_s is None:
         return None
     is_arrival_time = (position_age_s.abs() < MAX_ARRIVAL_TO_PUBLICATION_DELAY_S).to_numpy()
-    # TIMESYNC may have converged after each position. Number of timestamps that contradict each of
-    # these times: measurement times before the convergence, and arrival times after it
+    # Count the timestamps that contradict convergence after each position
     contradicting_timestamp_counts: Array = (
         np.cumsum(~is_arrival_time) + np.sum(is_arrival_time) - np.cumsum(is_arrival_time)
     )
@@ -295,10 +290,7 @@ def find_timesync_convergence(analysis: Analysis) -> tuple[float, float] | None:
 
 
 def _find_position_age_s(analysis: Analysis) -> pd.Series | None:
-    """Return the age (s) of each position at its publication, from timestamp_sample.
-
-    Return None if the log does not contain it.
-    """
+    """Return the age (s) of each position at its publication, if logged (timestamp_sample)."""
     ekf2, source, segment = analysis.flight.ekf2, analysis.source, analysis.segment
     fusion_record = ekf2.record if isinstance(ekf2, Ekf2) else None
     if (

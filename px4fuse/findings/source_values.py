@@ -23,32 +23,25 @@ from px4fuse.readers.px4_positions import NO_FIX_ACTION
 
 # Minimum reported rounding step (m): errors due to smaller steps are below the noise of UWB
 MIN_ROUNDING_STEP_M = 0.05
-# A lever arm is reported if a replay of EKF2 with the estimated lever arm reduces the position RMSE
-# at least to this fraction
+# Maximum ratio of EKF2's position RMSE with the estimated lever arm to the RMSE without it
 MAX_LEVER_ARM_RMSE_RATIO = 0.7
-# Minimum distance (m) between the positions of two alternating senders, for a finding: smaller
-# distances may be the noise of good UWB
+# Minimum distance (m) between two alternating senders: smaller distances may be noise
 MIN_SENDER_DISTANCE_M = 0.1
-# Minimum distance between the positions of two senders ÷ scatter of the distance (1 σ). With one
-# sender, noise reaches the value 2
+# Minimum ratio of the senders' distance to its scatter (1 σ): one sender reaches 2
 MIN_SENDER_DISTANCE_SIGMAS = 4.0
-# Window length (samples) for the detection of two senders: odd samples are from one sender, even
-# samples from another sender. After a lost sample, odd becomes even, so windows are short
+# Window length (samples), short because a lost sample exchanges odd and even samples
 WINDOW_SAMPLES = 16
-# Minimum number of windows to detect two senders: in fewer windows, outliers of one sender resemble
-# a second sender
 MIN_WINDOWS_FOR_TWO_SENDERS = 10
-# Positions are a copy of EKF2's position if their median distance is below this limit (m)
+# Maximum median distance (m) of copied positions from EKF2's position
 MAX_DISTANCE_OF_COPY_M = 0.01
-# Fused positions are a copy of EKF2's position if their median distance is below this limit (m).
-# The limit is smaller, because EKF2's position is always near fused positions
+# Smaller limit (m) for fused positions, which are always near EKF2's position
 MAX_DISTANCE_OF_FUSED_COPY_M = 0.001
-# Positions are compared with EKF2's position above this speed (m/s): at rest, any source may agree
+# Minimum speed (m/s) for the comparison with EKF2's position: at rest, any source may agree
 MIN_SPEED_FOR_COPY_TEST_M_S = 0.2
 # Tested delays (s) between EKF2's position and a source that sends it back
 TESTED_COPY_DELAYS_S = np.arange(0.0, 0.305, 0.005)
 NO_ESTIMATES_SENTENCE = "px4fuse estimates nothing from these positions."
-# For each reason of an invalid position: id of the finding, fault, and action
+# Finding id, fault and action for each reason of an invalid position
 INVALID_POSITION_TEXTS: Mapping[str, tuple[str, str, str]] = {
     "zero": (
         "source_zero_positions",
@@ -164,7 +157,7 @@ def detect_rounding(analysis: Analysis) -> Findings:
 
 
 def detect_lever_arm(analysis: Analysis) -> Findings:
-    """Detect a position sensor whose lever arm from the IMU is wrong in EKF2's parameters."""
+    """Detect a wrong lever arm of the position sensor in EKF2's parameters."""
     source, convention = analysis.source, analysis.convention
     has_truth = isinstance(analysis.flight.truth, Truth)
     is_convention_determined = convention is not None and convention.verdict == "determined"
@@ -203,8 +196,7 @@ def detect_lever_arm(analysis: Analysis) -> Findings:
 def _describe_replayed_effect(analysis: Analysis, change: Mapping[str, float]) -> str | None:
     """Describe EKF2's position RMSE in replays without and with a change of parameters.
 
-    Return "" if EKF2 cannot be replayed. Return None if the change reduces the RMSE too little:
-    the position error then has another cause.
+    Return None if the change reduces the RMSE too little.
     """
     ekf2_model, truth = analysis.ekf2_model, analysis.flight.truth
     if isinstance(ekf2_model, Unavailable) or isinstance(truth, Unavailable):
