@@ -408,7 +408,7 @@ def maximise_likelihood(
             np.median(expected_squared_errors_m2 / measured_axis_counts)
             / (chdtri(measured_axis_counts[0], 0.5) / measured_axis_counts[0])
         )
-        # No measurement is an outlier if most errors are larger than the search range
+        # No measurement is an outlier if most errors exceed the search range of SIGMA_Z
         if robust_variance_m2 > SIGMA_Z_SEARCH_RANGE_M[1] ** 2:
             break
         limited_sigma_z_variance_m2 = min(

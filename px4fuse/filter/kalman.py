@@ -201,7 +201,7 @@ def _run_with_floats(
 def _find_previous_steps(run: Replay, times_s: Array) -> tuple[IntArray, Array, BoolArray]:
     """Find for each time the last step of KF before it.
 
-    Return its index, the time (s) since this step, and True for times outside the run.
+    Return its index, the time (s) since this step, and True for times outside KF's time span.
     """
     step_times_s = run.steps.index.to_numpy()
     step_index = np.clip(
