@@ -36,7 +36,7 @@ from px4fuse.flight.model import Flight, Unavailable
 MIN_MEASUREMENTS = 100
 # Maximum number of positions in a noise fit, from the middle of the flight
 MAX_MEASUREMENTS = 2000
-# An interval above this multiple of the median interval is a gap: noise is uncorrelated across it
+# Noise is not correlated across an interval above this multiple of the median interval
 MAX_INTERVAL_TO_MEDIAN_INTERVAL_RATIO = 3.0
 # Time constants (s) in the coarse search for time-correlated noise
 COARSE_TAUS_S = (0.2, 0.6, 2.0, 6.0)
@@ -46,7 +46,6 @@ COARSE_CORRELATED_VARIANCE_FRACTIONS = (0.12, 0.35, 0.8)
 COARSE_SIGMA_A_FACTORS = (0.4, 0.9)
 # Tested factors on all σ in the coarse search
 COARSE_SIGMA_FACTORS = np.geomspace(0.7, 1.6, 12)
-# Approximate number of positions in the coarse search
 COARSE_MEASUREMENT_COUNT = 1000
 # Minimum log-likelihood gain over white noise in the coarse search; below it, no full fit is made
 MIN_GAIN_FOR_FULL_FIT_NATS = 0.5
@@ -255,7 +254,7 @@ def fit_time_correlation(  # noqa: PLR0915 (two models with common data)
 
     def fit_low_pass(log_tau: float) -> tuple[float, NoiseParameters]:
         motion_of_unfiltered_positions, minus_log_jacobian = undo_low_pass(float(np.exp(log_tau)))
-        # The IMU motion is available, because it was for τ = 0 at the same times
+        # The IMU motion was available for τ = 0 at the same times
         assert not isinstance(motion_of_unfiltered_positions, Unavailable)
         noise_fit = _fit_noises_at_offset(
             motion_of_unfiltered_positions, 0.0, white_noise_fit.noise_parameters

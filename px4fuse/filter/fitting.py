@@ -38,11 +38,8 @@ MAX_FINAL_ITERATIONS = 50
 MAX_COARSE_ITERATIONS = 3
 # Minimum ratio of the outliers' σ to SIGMA_Z
 MIN_OUTLIER_SIGMA_RATIO = 3.0
-# Initial value of the fraction of outliers
 INITIAL_OUTLIER_FRACTION = 0.005
-# Initial value of the ratio of the outliers' σ to SIGMA_Z
 INITIAL_OUTLIER_SIGMA_RATIO = 10.0
-# Upper limit of the estimated fraction of outliers
 MAX_OUTLIER_FRACTION = 0.4
 # Maximum ratio of SIGMA_Z to its robust estimate from the median squared error
 MAX_SIGMA_Z_TO_MEDIAN_BASED_SIGMA_Z_RATIO = 1.2

@@ -32,13 +32,9 @@ FLIGHT_PART_DURATION_S = 2.0
 HEADING_FIT_DURATION_S = 15.0
 # Minimum duration (s) of a flight part if the heading error is fitted to positions
 MIN_HEADING_FIT_DURATION_S = 5.0
-# Minimum number of flight parts for a heading error from orientations
 MIN_FLIGHT_PART_COUNT = 3
-# Minimum number of positions for an estimate of the heading error
 MIN_MEASUREMENTS = 50
-# Minimum number of orientation samples in a flight part
 MIN_FLIGHT_PART_SAMPLES = 3
-# Maximum number of positions in the estimate of the heading error
 MAX_MEASUREMENTS = 1000
 # The heading error changes in flight if the p-value of a constant error is below this limit
 MAX_DRIFT_P_VALUE = 0.002
@@ -50,7 +46,6 @@ MAX_YAW_RATE_DEG_S = 10.0
 MIN_HEADING_SIGMA_DEG = 0.5
 # Maximum median interval (s) of the logged attitude
 MAX_ATTITUDE_INTERVAL_S = 0.11
-# Maximum number of iterations in the fit of the heading error
 MAX_HEADING_FIT_ITERATIONS = 5
 # Convergence limit (rad) for the change of the heading error in one iteration
 MAX_HEADING_CHANGE_AT_CONVERGENCE_RAD = 0.01
@@ -58,7 +53,6 @@ MAX_HEADING_CHANGE_AT_CONVERGENCE_RAD = 0.01
 HEADING_SIGMA_RAD = 1.0
 # Minimum estimated scale factor of the positions, to avoid a division by zero
 MIN_FITTED_SCALE_FACTOR = 0.1
-# Index of the heading error among the fitted constants
 HEADING_ERROR_INDEX = 2
 
 
@@ -171,7 +165,7 @@ def estimate_heading_error(  # noqa: PLR0911 (one return per missing input)
     ]
     position_samples = position_samples.set_axis(position_samples.index.to_numpy() + offset_s)
     noise_parameters = NoiseParameters(settings.sigma_a_m_s2, sigma_z_m)
-    # The mounting angle of the source is unknown, so orientations show only changes
+    # The mounting angle of the source is unknown, so its orientations give only yaw changes
     return _estimate_heading_error_from_positions(
         flight,
         position_samples,

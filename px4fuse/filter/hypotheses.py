@@ -41,14 +41,13 @@ TILT_PRIOR_SIGMA_RAD = 0.002
 # Interval (s) between the knots of the slow acceleration error, which is piecewise linear
 SLOW_ERROR_KNOT_SPACING_S = 15.0
 MAX_SLOW_ERROR_KNOTS = 40
-# Columns of the design matrix: accelerometer bias forward and right (body frame), frame yaw
+# Columns of the design matrix: forward and right bias (body frame), yaw of the source frame
 FORWARD_BIAS_COLUMN, RIGHT_BIAS_COLUMN, FRAME_ROTATION_COLUMN = range(3)
 CONSTANT_ERROR_COLUMN_COUNT = 3
 # Tested multiples of KF's SIGMA_A, mostly below 1: KF's SIGMA_A includes biases and tilt
 TESTED_SIGMA_A_FACTORS = np.geomspace(0.2, 2.0, 7)
 # Tested scale factors of the position source
 TESTED_SCALE_FACTORS = np.linspace(0.7, 1.3, 7)
-# Maximum number of times at which a jump of the positions is tested
 MAX_TESTED_JUMP_TIMES = 800
 # Number of jump times that are tested at once, to limit the memory
 JUMP_BATCH_SIZE = 80
@@ -67,7 +66,6 @@ MAX_JUMPS = 3
 MIN_BIAS_M_S2 = 0.2
 # Minimum ratio of a reported accelerometer bias to its σ
 MIN_BIAS_TO_SIGMA_RATIO = 4.0
-# Minimum number of measurements before a jump, and also after it
 MIN_MEASUREMENTS_BEFORE_AND_AFTER_JUMP = 8
 
 

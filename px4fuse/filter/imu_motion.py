@@ -50,15 +50,12 @@ MAX_REMOVED_GYRO_BIAS_RAD_S = 0.4
 MAX_SEGMENT_DURATION_S = 30.0
 # Maximum tested time offset (s) between position source and IMU
 MAX_TESTED_TIME_OFFSET_S = 0.6
-# Number of tested time offsets in the coarse search
 COARSE_OFFSET_COUNT = 25
-# Approximate number of positions in the coarse search for a time offset
 COARSE_MEASUREMENT_COUNT = 600
 # Maximum number of array elements at once, to limit the memory
 MAX_BATCH_ELEMENTS = 2**16
 # Minimum number of position measurements in all segments together
 MIN_TOTAL_MEASUREMENTS = 30
-# Minimum number of position measurements in a segment
 MIN_SEGMENT_MEASUREMENTS = 15
 # Minimum number of position measurements in a segment after downsampling
 MIN_KEPT_MEASUREMENTS = 5

@@ -3,9 +3,9 @@
 A segment is a part of the flight without a gap in the IMU data. Each segment has an unknown initial
 state and unknown constants (biases and other constant errors).
 
-Given the acceleration, the states (position, velocity) at the measurements are smoothed: normal
-equations Ax = b with a banded matrix A. The likelihood equals that of KF's innovations (Schweppe
-1965).
+Given the acceleration, position and velocity at the measurements are estimated by least squares.
+The normal equations Ax = b have a banded matrix A. The likelihood equals that of KF's innovations
+(Schweppe 1965).
 
 The constants are estimated by linear regression. Its inputs are the data, and their derivatives
 with respect to each constant. The Gram matrix contains the weighted inner products of the inputs.
@@ -282,8 +282,8 @@ def fit_positions(
     """Fit constant errors (such as biases) to positions, with given SIGMA_A and variances.
 
     The inputs of the fit are the data, and their derivatives with respect to each constant error.
-    ``measured_m``, shape (axes, 1 or time offsets, k, measurements), contains the positions of the
-    first k inputs (default: the data). The others have positions of zero.
+    ``measured_m``, shape (axes, 1 or time offsets, inputs, measurements), contains the positions of
+    the first inputs (default: the data). The positions of the others are zero.
     """
     if measured_m is None:
         measured_m = np.nan_to_num(positions.measurement_m.T)[:, None, None]
@@ -378,7 +378,6 @@ def estimate_squared_errors(
     data_and_derivative_weights = np.concatenate(
         [np.ones((len(constant_errors), 1)), constant_errors], axis=1
     )
-    # Correct Δp and Δv of each interval with the constant errors of its segment
     data_and_derivative_weights_by_interval = np.repeat(
         data_and_derivative_weights, np.diff([*positions.segment_starts, len(variance_m2)]), axis=0
     )[1:]
@@ -424,7 +423,6 @@ def compute_segment_inner_products(
     inner_products_by_batch = []
     for begin in range(0, right_positions_m.shape[1], INNER_PRODUCTS_PER_BATCH):
         batch = np.s_[:, begin : begin + INNER_PRODUCTS_PER_BATCH]
-        # Inputs of the fit: left inputs, right inputs, and derivatives of the data
         dp, dv = (
             np.concatenate(
                 [increment[batch], 0.0 * increment[batch], increment_per_constant_error], axis=1

@@ -38,9 +38,7 @@ from px4fuse.flight.model import Flight, Unavailable
 
 HORIZONTAL = "horizontal"
 NoiseInterval = tuple[NotNegative, NotNegative | None]
-# Minimum number of positions from which SIGMA_A and SIGMA_Z are estimated
 MIN_MEASUREMENTS = 30
-# Maximum fraction of outliers for an estimate of SIGMA_A and SIGMA_Z
 MAX_OUTLIER_FRACTION = 0.3
 # Initial values of SIGMA_A, as multiples of KF's SIGMA_A
 START_SIGMA_A_FACTORS = (0.1, 0.3, 1.0)
@@ -230,7 +228,7 @@ def tune_axes(
     imu_motion_fit = None
     if flight is not None and settings.input == "imu":
         measured_m = np.column_stack([axis.measurement_m for axis in axes])
-        # The first measurement is KF's initial state and has no weight in KF's fit: use 1
+        # The first measurement is KF's initial state, without a weight in KF's fit: use weight 1
         measurement_weights = np.concatenate(
             [np.ones(len(measured_m) - measurement_count), kf_fit.measurement_weights]
         )
