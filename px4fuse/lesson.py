@@ -24,7 +24,7 @@ ODOMETRY_CORNERS_M = ((0.0, 0.0), (20.3, 0.2), (20.6, 20.4), (0.8, 20.9), (1.2, 
 
 
 def run_aisle_example() -> Replay:
-    """Run KF on Example 1: UWB every 0.5 s along an aisle at 1 m/s, initial velocity unknown."""
+    """Run KF on Example 1: UWB positions every 0.5 s along an aisle at 1 m/s."""
     settings = Settings(sigma_a_m_s2=0.5, sigma_z_m=0.10, dt_s=0.1, input="zero")
     time_s = settings.dt_s * np.arange(
         PREDICTIONS_PER_UPDATE, PREDICTION_COUNT + 1, PREDICTIONS_PER_UPDATE, dtype=np.float64
@@ -46,7 +46,7 @@ def run_aisle_example() -> Replay:
 
 
 def format_kalman_lines() -> Iterator[str]:
-    """Yield the lines of Example 1, as in the course: the state after each UWB update."""
+    """Yield the lines of Example 1: the state after each UWB update."""
     kf_run = run_aisle_example()
     for index, state in kf_run.steps.loc[kf_run.updates.index].iterrows():
         time_s = float(str(index))

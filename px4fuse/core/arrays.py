@@ -13,12 +13,12 @@ ArrayPair = tuple[Array, Array]
 IntArray = NDArray[np.intp]
 BoolArray = NDArray[np.bool_]
 
-# Maximum number of rows in a slice from iterate_row_blocks
+# Maximum number of rows that are processed at once
 BLOCK_ROWS = 2**14
 
 
 def iterate_row_blocks(count: int) -> Iterator[slice]:
-    """Yield slices of at most BLOCK_ROWS rows, so that temporary arrays need little memory."""
+    """Yield slices of at most BLOCK_ROWS rows, to process a long array in parts."""
     return (slice(first, first + BLOCK_ROWS) for first in range(0, count, BLOCK_ROWS))
 
 
@@ -36,7 +36,7 @@ def integrate_cumulatively(values: Array, time_s: Array) -> Array:
 
 
 def cumulative_sums(rows: Array) -> Array:
-    """Return the sums of the first 0, 1, ..., n rows, shape (n + 1, k)."""
+    """Return cumulative sums of the rows, shape (n + 1, k); the first sum is zero."""
     return np.concatenate([np.zeros((1, rows.shape[1])), np.cumsum(rows, axis=0)])
 
 

@@ -1,7 +1,6 @@
-"""Protection of the input files of a command from being overwritten by its outputs.
+"""Protection of input files from being overwritten by outputs of the same command.
 
-Each file that is read is registered. Files are compared by device and inode, because different
-paths may lead to one file. A worker process registers no files: the main process registers them.
+Files are compared by device and inode, because different paths may lead to one file.
 """
 
 import os
@@ -13,16 +12,16 @@ from pathlib import Path
 
 from px4fuse.errors import OutputError
 
-# Device and inode of a file or folder; its path on a file system without inodes
+# Device and inode of a file, or its path on a file system without inodes
 _FileIdentity = tuple[int, int] | str
 
 
-@dataclass(eq=False)  # not frozen, because files are added during the run
+@dataclass(eq=False)  # mutable, because input files are added later
 class _InputRegister:
     """Input files and folders of the running command."""
 
     inputs: set[_FileIdentity] = field(default_factory=set)
-    # input of each folder that contains inputs; if there are several, the first that was read
+    # first registered input file in each folder
     first_input_by_folder: dict[_FileIdentity, Path] = field(default_factory=dict)
     registered_folders: set[Path] = field(default_factory=set)
 
@@ -32,7 +31,7 @@ _input_register: ContextVar[_InputRegister | None] = ContextVar("register", defa
 
 @contextmanager
 def protect_inputs() -> Iterator[None]:
-    """Register all files that are read inside this context; outputs cannot overwrite them."""
+    """Register all files that are read in this context, so that no output overwrites them."""
     context_token = _input_register.set(_InputRegister())
     try:
         yield
@@ -42,7 +41,7 @@ def protect_inputs() -> Iterator[None]:
 
 @contextmanager
 def suspend_input_registration() -> Iterator[None]:
-    """Do not register files that are read inside this context, so outputs can overwrite them."""
+    """Allow outputs to overwrite files that are read in this context."""
     context_token = _input_register.set(None)
     try:
         yield
@@ -78,7 +77,7 @@ def check_outputs(output_paths: Iterable[Path]) -> None:
 
 
 def check_output_folder(folder: Path) -> None:
-    """Raise an OutputError if the output folder is a file, or contains a registered input."""
+    """Raise an OutputError if the output folder is a file, or contains an input file."""
     if folder.exists() and not folder.is_dir():
         raise OutputError(
             f"{folder} is a file, but the output needs a folder. Choose another name."

@@ -5,6 +5,6 @@ import sys
 
 
 def release_free_memory() -> None:
-    """Return freed memory, which the C library (glibc) keeps, to the operating system."""
+    """Return freed memory to the operating system (only on Linux with glibc)."""
     if sys.platform == "linux" and hasattr(c_library := ctypes.CDLL(None), "malloc_trim"):
         c_library.malloc_trim(0)

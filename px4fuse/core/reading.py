@@ -1,8 +1,6 @@
 """Reading of input files: regular files only, up to a size limit.
 
-Type and size are checked before a file is opened: reading a device or named pipe may never end, and
-a sparse file may be larger than the memory. Each file is registered as an input, so that no output
-replaces it.
+Type and size are checked before a file is opened: reading a device or pipe may never end.
 """
 
 import gzip
@@ -27,7 +25,7 @@ else:
 
 #: Maximum size (bytes) of a flight log; the option ``--max-size`` overrides it
 max_log_bytes: ContextVar[int] = ContextVar("max_log_bytes", default=2_000_000_000)
-#: Folders from which ``px4fuse mcp`` may read files (option ``--root``); all folders if empty
+#: Folders that ``px4fuse mcp`` may read (option ``--root``); all folders if empty
 readable_folders: ContextVar[tuple[Path, ...]] = ContextVar("readable_folders", default=())
 LOG_SIZE_REMEDY = (
     "Cut the log to the time span of the flight, or increase the size limit with --max-size MB."
@@ -35,7 +33,7 @@ LOG_SIZE_REMEDY = (
 
 
 def display_name(path: Path) -> str:
-    r"""Return the file name in a path for messages, on one line.
+    r"""Return the file name of a path on one line, for messages.
 
     >>> display_name(Path("logs/a.ulg")), display_name(Path(".")), display_name(Path("a\nb"))
     ('a.ulg', '.', 'a b')
@@ -44,7 +42,7 @@ def display_name(path: Path) -> str:
 
 
 def split_path_and_part(argument: str) -> tuple[Path, str | None]:
-    """Split ``FILE:PART``. PART is a track, a body in a motion-capture file, or a ROS topic."""
+    """Split ``FILE:PART`` into a path and the name of a part, for example a ROS topic."""
     path, colon, part_name = argument.rpartition(":")
     if colon and not Path(argument).exists() and (part_name.isidentifier() or Path(path).exists()):
         return Path(path), part_name
@@ -52,9 +50,9 @@ def split_path_and_part(argument: str) -> tuple[Path, str | None]:
 
 
 def check_readable(path: Path, folders: Sequence[Path]) -> None:
-    """Raise a LogError if a file is outside of all ``folders`` (after resolving symbolic links).
+    """Raise a LogError if a file is outside all ``folders``; symbolic links are resolved.
 
-    Without folders, each path is accepted.
+    If ``folders`` is empty, all paths are accepted.
     """
     resolved_path = Path(os.path.realpath(path))
     if folders and not any(map(resolved_path.is_relative_to, folders)):
@@ -71,7 +69,7 @@ def file_size(path: Path, error_type: type[Px4FuseError], name: str = "") -> int
     Raises
     ------
     Px4FuseError
-        The file is missing, not accessible, or not a regular file; of type ``error_type``.
+        Type ``error_type``: the file is missing, not accessible, or not a regular file.
     LogError
         The file is outside :data:`readable_folders`.
     """
@@ -110,20 +108,19 @@ def read_bytes_limited(
 ) -> bytes:
     """Read all bytes of a regular file up to a size limit.
 
-    ``remedy_if_too_large`` and ``remedy_if_empty`` are advice to the user. Without
-    ``remedy_if_empty``, empty files are accepted.
+    Empty files are accepted if ``remedy_if_empty`` is None.
 
     Raises
     ------
     Px4FuseError
-        The file cannot be read, is too large or empty; of type ``error_type``.
+        Type ``error_type``: the file cannot be read, is too large or empty.
     """
     name = name or display_name(path)
     size_bytes = file_size(path, error_type, name)
     content = (
         b"" if size_bytes > limit_bytes else _read_bytes(path, size_bytes + 1, error_type, name)
     )
-    if len(content) > size_bytes:  # the file grew, or it is in /proc (size 0)
+    if len(content) > size_bytes:  # the file has grown, or is in /proc, where the size is 0
         content = _read_bytes(path, limit_bytes + 1, error_type, name)
     if (actual_size_bytes := max(size_bytes, len(content))) > limit_bytes:
         raise error_type(
@@ -159,9 +156,9 @@ def read_text(
     name: str = "",
     remedy_if_too_large: str = "Shorten the file.",
 ) -> str:
-    """Read a text file in UTF-8, or in UTF-16 as written by Windows shells.
+    """Read a text file in UTF-8 or UTF-16.
 
-    Arguments and errors are those of :func:`read_bytes_limited`.
+    For arguments and errors see :func:`read_bytes_limited`.
     """
     name = name or display_name(path)
     content = read_bytes_limited(
@@ -178,10 +175,9 @@ def read_text(
 
 
 def hash_files(paths: Iterable[Path]) -> dict[str, Path]:
-    """Return files, and all regular files in folders, by their SHA-256.
+    """Return a mapping from SHA-256 to file, for files and all files in folders.
 
-    Files in folders that are larger than :data:`max_log_bytes` are ignored. Of identical files,
-    only the first is returned.
+    Files in folders are ignored if they are larger than :data:`max_log_bytes`.
 
     Raises
     ------
@@ -214,9 +210,9 @@ def hash_files(paths: Iterable[Path]) -> dict[str, Path]:
 
 
 def list_files_recursively(folder: Path) -> list[Path]:
-    """Return all files in a folder and its subfolders, sorted; links to folders are not followed.
+    """Return all files in a folder and its subfolders; links to folders are not followed.
 
-    A folder that cannot be listed is returned like a file, so that the caller gets an error.
+    A folder that cannot be listed is returned too, so that reading it raises an error.
     """
     files: list[Path] = []
     pending_folders = [folder]
@@ -242,7 +238,7 @@ def _read_bytes(path: Path, byte_count: int, error_type: type[Px4FuseError], nam
 
 
 def _open_decompressed(path: Path) -> Any:
-    """Open a file; decompress a file that was compressed by gzip or zstd."""
+    """Open a file; decompress it if it is compressed by gzip or zstd."""
     with path.open("rb") as file:
         compression_module = {b"\x1f\x8b\x08": gzip, b"\x28\xb5\x2f": zstd}.get(file.read(3))
     return compression_module.open(path) if compression_module else path.open("rb")
@@ -256,7 +252,7 @@ def _make_read_error(
 
 
 def format_size_limit(name: str, size_bytes: int, limit_bytes: int) -> str:
-    """Format the error message for a file that is too large."""
+    """Return the error message for a file that exceeds the size limit."""
     size_mb_text, limit_mb_text = (
         f"{byte_count / 1e6:,.{0 if byte_count >= 10_000_000 else 2}f}"
         for byte_count in (size_bytes, limit_bytes)

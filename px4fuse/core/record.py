@@ -1,4 +1,4 @@
-"""Base class for immutable data classes (records), and :class:`Unavailable` for missing data."""
+"""Base class of immutable data classes, and :class:`Unavailable` for missing data."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ def display_html(result: object) -> str | None:
 
 
 def one_line_repr(result: Any) -> str:
-    """Format a record on one line; arrays and tables are replaced by their shape.
+    """Format a data class on one line; arrays and tables are replaced by their shape.
 
     >>> import pandas as pd
     >>> from px4fuse.flight.model import Truth
@@ -63,17 +63,14 @@ Span = tuple[float, float]
 Vector = tuple[float, float, float]
 
 
-# Default value of a field that is not written to the JSON results
+# Default value of fields that are not written to the JSON results
 NOT_WRITTEN: Any = msgspec.UNSET
 
 
-# for type checkers: the fields of subclasses cannot be assigned
+# type checkers report assignments to fields of subclasses
 @dataclass_transform(frozen_default=True)
 class Record(msgspec.Struct, frozen=True, forbid_unknown_fields=True, omit_defaults=True):
-    """Immutable data class; fields that are None are not written to the JSON results.
-
-    Fields of the type :class:`NotWritten` (arrays, tables) are not written either.
-    """
+    """Immutable data class; fields that are None are not written to the JSON results."""
 
     __repr__ = one_line_repr
 
@@ -111,16 +108,15 @@ if TYPE_CHECKING:
 else:
 
     class NotWritten:
-        """``NotWritten[T]``: a field of type T (such as Array) that the JSON results omit."""
+        """Type of fields, such as arrays, that are not written to the JSON results."""
 
         def __class_getitem__(cls, kind: object) -> type:
             return msgspec.UnsetType
 
     class RecordOrUnavailable:
-        """``RecordOrUnavailable[T, A]``: a record T, or a subclass A of :class:`Unavailable`.
+        """Union of a record type and a subclass of :class:`Unavailable`.
 
-        msgspec decodes only unions with a tag field. This union has none, so
-        :func:`decode_record_or_unavailable` decodes it.
+        msgspec cannot decode this union; :func:`decode_record_or_unavailable` does.
         """
 
         def __class_getitem__(cls, kinds: tuple[type, type]) -> type:
@@ -132,14 +128,14 @@ else:
             return union_class
 
     class OrUnavailable:
-        """``OrUnavailable[T]``: a record T, or :class:`Unavailable`."""
+        """Union of a record type and :class:`Unavailable`."""
 
         def __class_getitem__(cls, kind: type) -> type:
             return RecordOrUnavailable[kind, Unavailable]
 
 
 def decode_record_or_unavailable(union_type: Any, value: Any) -> Any:
-    """Decode a :class:`RecordOrUnavailable` (argument ``dec_hook`` of msgspec)."""
+    """Decode a record or :class:`Unavailable` (argument ``dec_hook`` of msgspec)."""
     record_type, unavailable_type = union_type.union_members
     record_class = (
         unavailable_type

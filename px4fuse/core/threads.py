@@ -3,7 +3,7 @@
 Several threads are slower for the small matrices of px4fuse.
 """
 
-# Environment variables, to be set before the libraries are loaded
+# Set these variables before the linear algebra libraries are loaded
 ONE_THREAD_ENVIRONMENT = {
     "OMP_NUM_THREADS": "1",
     "OPENBLAS_NUM_THREADS": "1",

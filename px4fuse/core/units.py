@@ -10,7 +10,7 @@ from px4fuse.core.record import read_toml
 _UNIT_TABLES = read_toml(__file__, dict[str, dict[str, Any]])
 # Full name of each unit, by its symbol
 UNIT_NAMES: Mapping[str, str] = _UNIT_TABLES["names"]
-# Conversion factors to a base unit, by quantity and unit (lower case)
+# Conversion factors to the base unit of each quantity
 _UNIT_FACTORS: Mapping[str, Mapping[str, float]] = _UNIT_TABLES["typed"]
 _NUMBER_WITH_UNIT = re.compile(r"([-+]?[\d.,]+(?:e[-+]?\d+)?)\s*(\S*)", re.IGNORECASE)
 

@@ -1,9 +1,7 @@
 """Worker processes for untrusted files, with limits of time and memory for each job.
 
-Each process has a pipe and a deadline, so that a job may hang, crash or use all memory without
-effect on other jobs. Process pools are not sufficient: in ``concurrent.futures`` a killed process
-ends the pool (BrokenProcessPool), ``multiprocessing.Pool`` waits forever for the result of a killed
-process, and Pebble's pool (5.2) ends if a process dies before its job is registered.
+A job may hang, crash or use all memory without effect on other jobs.
+Process pools are not suitable, because they stop or wait forever if one process is killed.
 """
 
 import math
@@ -27,14 +25,13 @@ from px4fuse.errors import Px4FuseError
 Job = TypeVar("Job")
 Result = TypeVar("Result")
 
-# Maximum number of jobs of a worker process: caches of libraries grow, but a new process takes 2 s
+# Maximum number of jobs of a worker process, because caches of libraries grow
 MAX_JOBS_PER_WORKER = 80
-# Default limits of time (s) and memory (bytes) of a job; a report on 10 minutes takes 60 s
+# Default limits of time (s) and memory (bytes) for each job
 JOB_TIMEOUT_S, MAX_MEMORY_BYTES = 120.0, 4_000_000_000
-# Maximum time (s) for the start of a process on a slow and busy computer
+# Maximum time (s) for the start of a worker process
 WORKER_START_TIMEOUT_S = 180.0
-# Environment variables of worker processes. With PYTHONSAFEPATH, Python does not import files from
-# the current folder, which may contain files of a student
+# PYTHONSAFEPATH: do not import Python files of students from the current folder
 _WORKER_ENVIRONMENT = {"PYTHONSAFEPATH": "1", **ONE_THREAD_ENVIRONMENT}
 
 
@@ -46,7 +43,7 @@ class JobFailure:
 
 
 class _Worker:
-    """Worker process, its current job, and the pipe that transfers jobs and results."""
+    """Worker process with its current job, and the pipe for jobs and results."""
 
     def __init__(
         self, function: Callable[[Any], Any], max_memory_bytes: int | None, job_index: int
@@ -80,11 +77,11 @@ class _Worker:
 
 @contextmanager
 def _block_interrupts() -> Iterator[None]:
-    """Block Ctrl-C in this process and in processes that start meanwhile."""
+    """Block Ctrl-C in this process and in processes that it starts."""
     if not hasattr(signal, "pthread_sigmask"):  # Windows
         yield
         return
-    # The start of the resource tracker unblocks Ctrl-C, so it is started before Ctrl-C is blocked
+    # The start of the resource tracker would unblock Ctrl-C
     resource_tracker.ensure_running()
     signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})
     try:
@@ -103,20 +100,18 @@ def run_with_limits(
 ) -> Generator[tuple[int, Result | JobFailure]]:
     """Call a function on every job in worker processes, with limits of time and memory.
 
-    A process that hangs, dies or uses too much memory is replaced, and the other jobs continue. All
-    processes end when this generator ends (error, Ctrl-C, ``close``).
+    A process that hangs, dies or uses too much memory is replaced. The other jobs continue.
 
     Parameters
     ----------
     function : callable
-        Function at the top level of a module. Function, jobs and results are pickled.
+        Function at the top level of a module (it is pickled).
     process_count : int, optional
         Number of parallel processes; by default the number of cores.
     timeout_s : float
-        Maximum time for one job, without the start of its process.
+        Maximum time for one job.
     max_memory_bytes : int or None
-        Maximum address space of one process on Linux (RLIMIT_AS), of which libraries use about
-        0.6 GB; None for no limit.
+        Maximum address space of one process on Linux; None for no limit.
 
     Yields
     ------
@@ -137,16 +132,15 @@ def poll_with_limits(
     max_memory_bytes: int | None,
     max_wait_s: float = math.inf,
 ) -> Generator[tuple[int, Result | JobFailure] | None]:
-    """Yield results like :func:`run_with_limits`; None after ``max_wait_s`` without a result."""
+    """Yield the results of jobs, and None if no job ends within ``max_wait_s``."""
     waiting_indices = list(range(len(jobs)))[::-1]
     workers: dict[Connection, _Worker] = {}
     try:
         while waiting_indices or workers:
             while waiting_indices and len(workers) < (process_count or os.cpu_count() or 1):
-                # take the job first: if the process does not start, only this job fails
+                # if the process does not start, only this job fails
                 new_worker = _Worker(function, max_memory_bytes, waiting_indices.pop())
                 workers[new_worker.pipe] = new_worker
-            # wait for the first deadline, or until a pipe has data
             first_deadline = min(worker.deadline for worker in workers.values())
             remaining_s = max(0.0, first_deadline - time.monotonic())
             ready_pipes = wait(workers, min(remaining_s, max_wait_s))
@@ -169,7 +163,7 @@ def poll_with_limits(
                             continue
                         worker.job_index = waiting_indices.pop()
                     worker.deadline = time.monotonic() + timeout_s
-                    # a worker process that has died is found by the next read of its pipe
+                    # a dead worker process is found at the next read of its pipe
                     with suppress(BrokenPipeError, ConnectionResetError):
                         pipe.send(jobs[worker.job_index])
                 elif time.monotonic() >= worker.deadline:

@@ -1,4 +1,4 @@
-"""Writing of output files: each file is written under a temporary name and then renamed."""
+"""Writing of output files; an interruption leaves no incomplete file."""
 
 import errno
 import os
@@ -16,14 +16,14 @@ from px4fuse.errors import OutputError
 STANDARD_OUTPUT = Path("-")
 # Maximum time (s) to wait for a program that reads a named pipe
 PIPE_READER_TIMEOUT_S = 5.0
-# True on Windows: a file that another program has open cannot be replaced
+# Windows does not replace a file that another program has open
 LOCKS_OPEN_FILES = sys.platform == "win32"
 # Advice to the user if an output cannot be written, by error number
 REMEDY_BY_ERRNO = {
     errno.ENOSPC: "Free disk space, or choose another disk.",
     errno.EROFS: "Choose a folder with write permission.",
 }
-# Maximum number of paths in a message; a longer list is replaced by its length
+# Messages about more paths contain only the number of paths
 _MAX_LISTED_PATHS = 4
 
 
@@ -32,8 +32,7 @@ def write_output_files(
 ) -> None:
     """Write output files; create missing folders.
 
-    Each file is written under a temporary name and renamed, so that an interruption leaves no
-    incomplete file. ``on_written`` is called with the path of each written file.
+    An interruption leaves no incomplete file. ``on_written`` is called with each written path.
 
     Raises
     ------
@@ -101,7 +100,7 @@ def _read_file_mode(path: Path) -> int:
 def _replace_file(target: Path, content: bytes) -> None:
     is_new_folder = not target.parent.exists()
     target.parent.mkdir(parents=True, exist_ok=True)
-    # a short name, because the name of the target may already have the maximum length
+    # a short name, because the target name may have the maximum length
     temporary_path = target.with_name(f".px4fuse-{secrets.token_hex(8)}")
     try:
         with temporary_path.open("xb") as file:
@@ -114,7 +113,7 @@ def _replace_file(target: Path, content: bytes) -> None:
 
 
 def _open_pipe(path: Path) -> IO[bytes]:
-    """Open a named pipe; wait at most PIPE_READER_TIMEOUT_S for a program that reads the pipe."""
+    """Open a named pipe for writing; wait at most PIPE_READER_TIMEOUT_S for a reader."""
     deadline = time.monotonic() + PIPE_READER_TIMEOUT_S
     while True:
         try:

@@ -1,1 +1,1 @@
-"""KF: model, input, run, likelihood and consistency; estimates of noises and time offset."""
+"""Two-state Kalman filter (KF), its consistency tests, and estimates of its noises."""

@@ -1,8 +1,6 @@
-"""Tests of innovations against the innovation variance that KF or EKF2 reports.
+"""Consistency tests of a filter's innovations: mean NIS, bias and autocorrelation.
 
-The tests are the mean NIS, the mean innovation (bias), and the autocorrelation (whiteness).
-
-Definitions: Bar-Shalom, Li and Kirubarajan (2001), Estimation with Applications to Tracking and
+Sources: Bar-Shalom, Li and Kirubarajan (2001), Estimation with Applications to Tracking and
 Navigation, section 5.4; Ljung and Box (1978), Biometrika 65(2).
 """
 
@@ -24,36 +22,35 @@ from px4fuse.core.record import (
 )
 from px4fuse.core.text import format_count
 
-# Result of a consistency test: "underconfident" if the reported σ is too large, "overconfident" if
-# it is too small
+# Underconfident: the reported σ is too large. Overconfident: the reported σ is too small.
 SigmaVerdict = Literal["consistent", "underconfident", "overconfident"]
 
 Limits = tuple[float, float]
-# Minimum number of innovations in a consistency test; their mean NIS has the 95 % band 0.3 to 2.1
+# Minimum number of innovations in a consistency test
 MIN_INNOVATIONS = 10
 CONFIDENCE_LEVEL = 0.95
 # Maximum number of lags of the Ljung-Box whiteness test
 MAX_LJUNG_BOX_LAG_COUNT = 10
-# Data that give the actual σ: innovations of the position source, or ground truth
+# Reference for the actual σ: innovations of the position source, or ground truth
 Reference = Literal["source", "truth"]
-# A filter is consistent if actual σ / reported σ is in this range. It is wider for ground truth,
+# Range of actual σ / reported σ for a consistent filter. It is wider for ground truth,
 # because EKF2's σ excludes the lag of its output predictor
 CONSISTENT_SIGMA_RATIOS: Mapping[Reference, Limits] = {"source": (0.8, 1.25), "truth": (0.67, 1.5)}
-# Innovation gate (√S) for KF and for logs without a gate parameter: default of EKF2_EVP_GATE
+# Default innovation gate (in √S): PX4's default of EKF2_EVP_GATE
 DEFAULT_GATE = 5.0
 
 
 class NisVerdict(Record, kw_only=True):
-    """Mean NIS with its 95 % band, and the classification of the filter as consistent or not.
+    """Mean NIS with its 95 % band: the filter is consistent, overconfident or underconfident.
 
     Attributes
     ----------
     nis_mean : float
         Mean of ν²/S per degree of freedom; expected 1.
     nis_band : (float, float)
-        Two-sided 95 % chi-square band of the mean NIS of white innovations.
+        95 % chi-square band of the mean NIS.
     sigma_ratio : float
-        Ratio of actual to reported σ, √nis_mean; above 1, the filter is overconfident.
+        Actual σ over reported σ, √nis_mean; above 1: overconfident.
     """
 
     count: Count
@@ -64,7 +61,7 @@ class NisVerdict(Record, kw_only=True):
 
     @property
     def sigma_error_factor(self) -> float:
-        """Ratio of the larger to the smaller of reported and actual σ; at least 1."""
+        """Ratio of actual to reported σ or its inverse, whichever is larger."""
         return float(max(self.nis_mean, 1.0 / self.nis_mean) ** 0.5)
 
 
@@ -74,15 +71,15 @@ class Consistency(NisVerdict, kw_only=True):
     Attributes
     ----------
     sqrt_s_median_m : float
-        Median of √S, the standard deviation that the filter expects of the innovations.
+        Median of √S, the expected standard deviation of the innovations.
     fraction_outside_two_sigma : float
         Fraction of the innovations outside ±2√S; expected 0.046.
     bias_t, bias_p : float
-        Student's t statistic of the mean innovation against zero, and its two-sided p-value.
+        t statistic of the mean innovation, and its two-sided p-value.
     lag1_autocorrelation : float
-        Autocorrelation of ν/√S at lag 1; positive if the filter lags behind the positions.
+        Autocorrelation of ν/√S at lag 1; expected 0.
     ljung_box_p : float
-        p-value of the Ljung-Box whiteness test over ``ljung_box_lags`` lags.
+        p-value of the Ljung-Box whiteness test.
     """
 
     innovation_mean_m: float
@@ -100,12 +97,12 @@ class Consistency(NisVerdict, kw_only=True):
 class HorizontalNis(NisVerdict, kw_only=True):
     """NIS of north and east together (two degrees of freedom), divided by two.
 
-    The covariance between north and east is omitted, because EKF2 does not log it.
+    The covariance between north and east is ignored, because EKF2 does not log it.
     """
 
 
 def compute_nis_band(count: int, dimension_count: int = 1) -> Limits:
-    """Return the two-sided 95 % chi-square band of the mean of ``count`` NIS values.
+    """Return the 95 % chi-square band of the mean of ``count`` NIS values.
 
     Each NIS is divided by its number of dimensions, so that the expected mean is 1.
 
@@ -113,7 +110,7 @@ def compute_nis_band(count: int, dimension_count: int = 1) -> Limits:
     >>> round(2 * low, 2), round(2 * high, 2)
     (1.67, 2.36)
     """
-    # Half of the sum of all NIS values has a gamma distribution with this shape parameter
+    # Half the sum of the NIS values has a gamma distribution with this shape parameter
     gamma_shape = 0.5 * count * dimension_count
     low, high = (
         float(gammaincinv(gamma_shape, (1 + sign * CONFIDENCE_LEVEL) / 2)) / gamma_shape
@@ -127,8 +124,8 @@ def classify_sigma_ratio(
 ) -> SigmaVerdict:
     """Classify a filter by the ratio of its actual to its reported σ.
 
-    The filter is consistent if the ratio is inside :data:`CONSISTENT_SIGMA_RATIOS`, or if the 95 %
-    ``interval`` of the ratio contains 1.
+    A ratio inside :data:`CONSISTENT_SIGMA_RATIOS` is consistent.
+    A 95 % ``interval`` that contains 1 is also consistent.
     """
     low, high = CONSISTENT_SIGMA_RATIOS[reference]
     if low <= ratio <= high or (interval is not None and interval[0] <= 1.0 <= interval[1]):
@@ -137,7 +134,7 @@ def classify_sigma_ratio(
 
 
 def compute_sigma_ratio_interval(nis_mean: float, nis_band: Limits) -> Limits:
-    """Return the 95 % interval of √(mean NIS)."""
+    """Return the 95 % interval of the σ ratio √(mean NIS)."""
     return (nis_mean / nis_band[1]) ** 0.5, (nis_mean / nis_band[0]) ** 0.5
 
 
@@ -160,10 +157,7 @@ def _compute_nis_verdict_fields(nis: Array, dimension_count: int = 1) -> dict[st
 
 
 def compute_autocorrelation(values: Array, lag_count: int) -> Array:
-    """Return the autocorrelation of a series at lags 1 to ``lag_count``: Σ ν(k) ν(k+l) / Σ ν(k)².
-
-    The mean is not subtracted, because ``Consistency.bias_p`` tests it separately.
-    """
+    """Return the autocorrelation at lags 1 to ``lag_count``, without subtracting the mean."""
     square_sum = float(np.dot(values, values))
     return np.array(
         [np.dot(values[:-lag], values[lag:]) / square_sum for lag in range(1, lag_count + 1)]
@@ -173,9 +167,9 @@ def compute_autocorrelation(values: Array, lag_count: int) -> Array:
 def assess_innovations(
     innovation_m: Array, innovation_variance_m2: Array, gate: float = DEFAULT_GATE
 ) -> Consistency | Unavailable:
-    """Test innovations in time order against their reported variances: NIS, bias, whiteness.
+    """Test innovations against the innovation variances: NIS, bias, whiteness.
 
-    ``gate`` is the innovation gate in √S. Fewer than ten finite innovations are not tested.
+    ``gate`` is the innovation gate in √S. At least ten finite innovations are needed.
     """
     is_usable = np.isfinite(innovation_m) & (innovation_variance_m2 > 0)
     nu_m = innovation_m[is_usable]
@@ -220,7 +214,7 @@ def assess_innovations(
 def assess_horizontal_nis(north: ArrayPair, east: ArrayPair) -> HorizontalNis | None:
     """Test the innovations along north and east together; None if there are fewer than ten.
 
-    ``north`` and ``east`` contain innovations (m) and innovation variances (m²) at equal times.
+    ``north`` and ``east`` are pairs of arrays: innovations (m) and innovation variances (m²).
     """
     is_usable = (north[1] > 0) & (east[1] > 0) & np.isfinite(north[0]) & np.isfinite(east[0])
     nis = np.sum([nu[is_usable] ** 2 / s[is_usable] for nu, s in (north, east)], axis=0)

@@ -1,15 +1,13 @@
 """Time correlation of position errors: low-pass filtered positions or time-correlated noise.
 
-Both models are compared with white noise by the likelihood of the positions given the IMU motion
-(:mod:`px4fuse.filter.imu_motion`).
+Both models are compared with white noise by the likelihood of the positions given the IMU motion.
 
-- Low pass: z_k = (1 - ρ) u_k + ρ z_(k-1), ρ = exp(-Δt/τ). The unfiltered positions u have white
-  noise and no lag. The likelihood of z is that of u times |du/dz| = Π 1/(1 - ρ).
-- Time-correlated noise: z = p + c + v with c_k = ρ c_(k-1) + √(1 - ρ²) σ_c w. It causes no lag.
-  Its fit may shift the timestamps, because a time offset also looks like a lag.
+- Low pass: z_k = (1 - ρ) u_k + ρ z_(k-1), with measured positions z, unfiltered positions u and
+  ρ = exp(-Δt/τ). The unfiltered positions have white noise.
+- Time-correlated noise: a first-order Gauss-Markov process in addition to white noise.
 
-If τ is above 1 s, the IMU determines only a lower bound of τ. With ground truth, τ is fitted to the
-position errors by restricted likelihood (Patterson and Thompson 1971).
+With ground truth, τ is fitted to the position errors by restricted likelihood (Patterson and
+Thompson 1971).
 """
 
 from collections.abc import Sequence
@@ -36,54 +34,44 @@ from px4fuse.filter.signals import Axis, report_too_few_measurements
 from px4fuse.flight.model import Flight, Unavailable
 
 MIN_MEASUREMENTS = 100
-# Maximum number of positions in a noise fit. If the flight has more, only its middle is used
+# Maximum number of positions in a noise fit, from the middle of the flight
 MAX_MEASUREMENTS = 2000
-# The noise of two successive positions is uncorrelated if the interval between them exceeds this
-# multiple of the median interval
+# Noise is not correlated across an interval above this multiple of the median interval
 MAX_INTERVAL_TO_MEDIAN_INTERVAL_RATIO = 3.0
 # Time constants (s) in the coarse search for time-correlated noise
 COARSE_TAUS_S = (0.2, 0.6, 2.0, 6.0)
-# Tested fractions σ_c² / SIGMA_Z² in the coarse search. σ_c² is the time-correlated part of the
-# total variance SIGMA_Z²
+# Tested fractions of the variance SIGMA_Z² that is time-correlated, in the coarse search
 COARSE_CORRELATED_VARIANCE_FRACTIONS = (0.12, 0.35, 0.8)
-# Tested multiples of SIGMA_A in the coarse search, for each fraction and time constant above
+# Tested multiples of SIGMA_A in the coarse search
 COARSE_SIGMA_A_FACTORS = (0.4, 0.9)
-# Tested factors on all σ (SIGMA_A, SIGMA_Z, σ_c) in the coarse search, for each combination above
+# Tested factors on all σ in the coarse search
 COARSE_SIGMA_FACTORS = np.geomspace(0.7, 1.6, 12)
-# Approximate number of position measurements in the coarse search for time-correlated noise
 COARSE_MEASUREMENT_COUNT = 1000
-# Minimum log-likelihood gain of time-correlated over white noise in the coarse search. Below it, no
-# full fit is run
+# Minimum log-likelihood gain over white noise in the coarse search; below it, no full fit is made
 MIN_GAIN_FOR_FULL_FIT_NATS = 0.5
-# If the estimated position noise (SIGMA_Z) is below this limit (m), the source probably low-pass
-# filters its positions
+# Below this SIGMA_Z (m), the source probably low-pass filters its positions
 MAX_SIGMA_Z_OF_LOW_PASS_SOURCE_M = 0.01
-# Minimum log-likelihood gain of time-correlated over white noise to report time-correlated noise
+# Minimum log-likelihood gain over white noise to report time-correlated noise
 MIN_LIKELIHOOD_GAIN_NATS = 2.0
-# Penalty (nats) on the score of time-correlated noise if its fit also shifts the timestamps. A
-# model with more parameters fits any data better (Akaike 1974)
+# Penalty (nats) on a fit with a time offset, because it has one more parameter (Akaike 1974)
 TIME_OFFSET_PENALTY_NATS = 2.0
 # Search range (s) of the time constant of a low pass
 LOW_PASS_TAU_RANGE_S = (0.02, 3.0)
-# Tolerance of ln τ in the search for the time constant τ of a low pass
+# Tolerance of ln τ in the search for the time constant of a low pass
 LOG_TAU_TOLERANCE = 0.05
-# Maximum number of position errors against ground truth in the noise fit, to limit computing time
+# Maximum number of positions in the fit to ground truth, to limit computing time
 MAX_TRUTH_MEASUREMENTS = 300
-# Minimum log-likelihood gain of time-correlated over white noise in the fit to the position errors
-# against ground truth
+# Minimum log-likelihood gain over white noise in the fit to ground truth
 MIN_TRUTH_LIKELIHOOD_GAIN_NATS = 5.0
-# If no position error (m) against ground truth reaches this limit, ground truth is a copy of the
-# positions
+# If all position errors (m) are smaller, ground truth is a copy of the positions
 MAX_RESIDUAL_OF_COPIED_TRUTH_M = 1e-5
-# Maximum time difference (s) between a position and the nearest ground truth sample. Interpolation
-# error: 1 cm at 2 m/s²
+# Maximum time difference (s) between a position and the nearest ground truth sample
 MAX_TRUTH_TIME_DIFFERENCE_S = 0.1
-# The noise fit to ground truth estimates one time offset for each of this number of flight parts
+# Number of flight parts in the fit to ground truth; each has its own time offset
 FLIGHT_PART_COUNT = 12
-# Tested time constants (s) of time-correlated noise in the noise fit to ground truth
+# Tested time constants (s) in the fit to ground truth
 TESTED_TAUS_S = np.geomspace(0.3, 80.0, 17)
-# Tested values of σ_c² / (total error variance) in the noise fit to ground truth; σ_c² is the
-# variance of the time-correlated error
+# Tested fractions of the error variance that is time-correlated, in the fit to ground truth
 TESTED_CORRELATED_FRACTIONS = np.linspace(0.05, 0.999, 20)
 
 
@@ -94,13 +82,13 @@ class SourceLowPass:
     Attributes
     ----------
     correlation : float
-        Correlation of the noise of successive positions; 0 without a low-pass filter.
+        Correlation of the noise of successive positions; 0 for no filter.
     lag_s : float
         Lag of the positions at constant velocity.
     gain_nats : float
-        Log-likelihood with the low-pass filter minus log-likelihood with white noise.
+        Log-likelihood gain of the low-pass filter over white noise.
     sigma_z_m : float
-        Standard deviation of the white position noise before the low-pass filter.
+        White position noise before the low-pass filter (1 σ).
     """
 
     correlation: float
@@ -116,14 +104,13 @@ class TimeCorrelatedNoise:
     Attributes
     ----------
     tau_s, low_s, high_s : float
-        Correlation time, and the limits of its 95 % interval. ``high_s`` is infinite without ground
-        truth.
+        Correlation time, and the ends of its 95 % interval.
     slow_m, white_m : float
-        Standard deviation of the time-correlated (slow) noise, and of the white noise, per axis.
+        Standard deviation of time-correlated (slow) and of white noise, per axis.
     gain_nats : float
-        Log-likelihood with time-correlated noise minus log-likelihood with white noise.
+        Log-likelihood gain over white noise.
     low_pass_gain_nats : float
-        Log-likelihood of the model with a low-pass filter minus that with time-correlated noise.
+        Log-likelihood gain of a low-pass filter over time-correlated noise.
     """
 
     tau_s: float
@@ -149,10 +136,8 @@ def fit_time_correlation(  # noqa: PLR0915 (two models with common data)
 
     Parameters
     ----------
-    flight : Flight
     axes : tuple of Axis
         Axes with the same measurement times.
-    settings : Settings
     noise_parameters : NoiseParameters
         Initial values: estimates with white noise.
     outlier_time_s : ndarray
@@ -160,7 +145,7 @@ def fit_time_correlation(  # noqa: PLR0915 (two models with common data)
     clock_offset_s : float
         Time offset (s) estimated with white noise.
     jumps : sequence of Jump
-        Jumps of the positions along ``axes``, which are subtracted.
+        Jumps of the positions, which are subtracted.
     """
     time_s = axes[0].measurement_time_s
     if len(time_s) < MIN_MEASUREMENTS:
@@ -186,8 +171,7 @@ def fit_time_correlation(  # noqa: PLR0915 (two models with common data)
     def undo_low_pass(tau_s: float) -> tuple[PositionsAndImuMotion | Unavailable, float]:
         """Undo a low-pass filter with time constant ``tau_s``.
 
-        Return the positions u before the filter with their IMU motion, and -ln|du/dz|. The
-        likelihood of the measured positions z is -ln p(z) = -ln p(u) - ln|du/dz|.
+        Return the unfiltered positions with their IMU motion, and the change of -ln p.
         """
         rho = np.zeros(len(time_s))
         if tau_s:
@@ -210,7 +194,7 @@ def fit_time_correlation(  # noqa: PLR0915 (two models with common data)
         )
         if isinstance(motion_of_unfiltered_positions, Unavailable):
             return motion_of_unfiltered_positions, 0.0
-        # The likelihood does not contain the first position of a segment, which sets the state
+        # The first position of a segment sets the state, and is not part of the likelihood
         is_used = np.isin(
             time_s,
             np.delete(
@@ -226,7 +210,7 @@ def fit_time_correlation(  # noqa: PLR0915 (two models with common data)
     tested_offsets_s = sorted({0.0, clock_offset_s})
     sigma_z_m = noise_parameters.sigma_z_m
     downsampled_motion = imu_motion.downsample(COARSE_MEASUREMENT_COUNT)
-    # Default result: the source has no low-pass filter
+    # Default result: no low-pass filter
     source_low_pass = SourceLowPass(0.0, 0.0, 0.0, sigma_z_m)
     correlated_candidates = [
         replace(
@@ -263,15 +247,14 @@ def fit_time_correlation(  # noqa: PLR0915 (two models with common data)
     )
     white_noise_score = white_noise_fit.compute_score()
     correlated_noise_score = correlated_noise_fit.compute_score()
-    # Low-pass filtered noise is also time-correlated or very small. In other cases, the low-pass
-    # filter is not fitted
+    # A low-pass filter is fitted only if the noise is time-correlated or very small
     is_correlated = white_noise_score - correlated_noise_score >= MIN_LIKELIHOOD_GAIN_NATS
     if not (is_correlated or is_sigma_z_small):
         return source_low_pass, no_correlation_found
 
     def fit_low_pass(log_tau: float) -> tuple[float, NoiseParameters]:
         motion_of_unfiltered_positions, minus_log_jacobian = undo_low_pass(float(np.exp(log_tau)))
-        # The IMU motion is available: it was for τ = 0, which has the same measurement times
+        # The IMU motion was available for τ = 0 at the same times
         assert not isinstance(motion_of_unfiltered_positions, Unavailable)
         noise_fit = _fit_noises_at_offset(
             motion_of_unfiltered_positions, 0.0, white_noise_fit.noise_parameters
@@ -320,8 +303,7 @@ def fit_time_correlation_to_truth(
 ) -> TimeCorrelatedNoise | Unavailable:
     """Fit time-correlated noise to the position errors against ground truth.
 
-    Frame errors and time offsets are removed from the errors. ``noise_from_imu`` and ``low_pass``
-    are the results of :func:`fit_time_correlation`. ``noise_from_imu`` is returned if its
+    Frame errors and time offsets are removed from the errors. ``noise_from_imu`` is returned if its
     log-likelihood gain over white noise is larger.
     """
     min_likelihood_gain_nats = MIN_TRUTH_LIKELIHOOD_GAIN_NATS
@@ -430,10 +412,7 @@ def _search_coarse_grid(
     offsets_s: Sequence[float],
     candidate_parameters: Sequence[NoiseParameters],
 ) -> tuple[float, NoiseParameters]:
-    """Return the lowest score on a coarse grid of time offsets and noises, and these noises.
-
-    The score is -ln p of the positions.
-    """
+    """Return the lowest score (-ln p) and its noises from a grid of time offsets and noises."""
     scored_parameters = []
     for positions in map(imu_motion.make_positions_at_offset, offsets_s):
         for candidate, sigma_a_factor in product(candidate_parameters, COARSE_SIGMA_A_FACTORS):

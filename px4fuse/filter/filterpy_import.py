@@ -1,7 +1,4 @@
-"""filterpy's KalmanFilter, imported without scipy.stats, which would take 0.2 s and 17 MB.
-
-filterpy uses scipy.stats only in plots and densities, which load it when they are called.
-"""
+"""Import of filterpy's KalmanFilter without scipy.stats, which is slow to import."""
 
 import sys
 from importlib import import_module
@@ -10,14 +7,14 @@ from typing import Any
 
 
 class _LazyDistribution:
-    """Distribution of scipy.stats that imports scipy.stats at the first use of an attribute."""
+    """Distribution of scipy.stats that is imported at its first use."""
 
     def __init__(self, name: str) -> None:
         self._name = name
 
     def __getattr__(self, attribute: str) -> Any:
         stats = import_module("scipy.stats")
-        # filterpy calls logpdf already during its import, when scipy.stats cannot be loaded
+        # filterpy calls logpdf during its import, when scipy.stats cannot be loaded
         if stats.__spec__ is None:
             return lambda *_, **__: 0.0
         return getattr(getattr(stats, self._name), attribute)

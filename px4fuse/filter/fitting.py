@@ -1,10 +1,9 @@
 """Maximum-likelihood estimates of SIGMA_A and SIGMA_Z, and outliers among the positions.
 
-The noise parameters maximise the likelihood of the innovations (Schweppe 1965). Outliers have a
-normal distribution with a larger σ (Tukey 1960). Expectation maximisation estimates the fraction of
-outliers, the ratio of their σ to SIGMA_Z and the probability that a measurement is an outlier.
+The noises maximise the likelihood of the innovations (Schweppe 1965). Outliers have a normal
+distribution with a larger σ (Tukey 1960), which is estimated by expectation maximisation.
 
-A score is a negative log-likelihood (-ln p): the lowest is the best.
+A score is a negative log-likelihood (-ln p): lower is better.
 """
 
 from collections.abc import Iterable, Sequence
@@ -29,41 +28,34 @@ from px4fuse.filter.model import INITIAL_COVARIANCE
 
 # Search range (m/s²) of SIGMA_A
 SIGMA_A_SEARCH_RANGE_M_S2 = (1e-3, 30.0)
-# Search range (m) of SIGMA_Z: no positioning system is better than 1 mm
+# Search range (m) of SIGMA_Z
 SIGMA_Z_SEARCH_RANGE_M = (1e-3, 10.0)
-# Maximum number of expectation maximisation iterations that estimate the outliers
+# Maximum number of expectation maximisation iterations
 MAX_OUTLIER_ITERATIONS = 12
-# Maximum number of L-BFGS-B iterations in the first fit, and after the outlier probabilities have
-# converged
+# Maximum number of L-BFGS-B iterations of a complete fit
 MAX_FINAL_ITERATIONS = 50
 # Maximum number of L-BFGS-B iterations between two estimates of the outlier probabilities
 MAX_COARSE_ITERATIONS = 3
-# Minimum ratio of the outliers' σ to SIGMA_Z: outliers with a smaller σ look like normal noise
+# Minimum ratio of the outliers' σ to SIGMA_Z
 MIN_OUTLIER_SIGMA_RATIO = 3.0
-# Initial value of the fraction of outliers
 INITIAL_OUTLIER_FRACTION = 0.005
-# Initial value of the ratio of the outliers' σ to SIGMA_Z
 INITIAL_OUTLIER_SIGMA_RATIO = 10.0
-# Upper limit of the estimated fraction of outliers
 MAX_OUTLIER_FRACTION = 0.4
-# Outliers increase the maximum-likelihood estimate of SIGMA_Z. To classify outliers, SIGMA_Z is
-# limited to this multiple of the value from the median squared error
+# Maximum ratio of SIGMA_Z to its robust estimate from the median squared error
 MAX_SIGMA_Z_TO_MEDIAN_BASED_SIGMA_Z_RATIO = 1.2
-# Expectation maximisation has converged if no outlier probability changes by more than this
+# Convergence limit for the change of outlier probabilities
 MAX_OUTLIER_PROBABILITY_CHANGE = 0.01
-# Value of -ln p per measurement if the likelihood cannot be computed: larger than any real value
+# Value of -ln p per measurement if the likelihood cannot be computed
 UNCOMPUTABLE_SCORE = 1e6
 # Step of ln σ for numerical derivatives of the log-likelihood
 LOG_STEP_FOR_DERIVATIVES = 1e-4
-# The negative log-likelihood is interpolated on a grid over ln(SIGMA_A/SIGMA_Z) and ln SIGMA_Z.
-# Number of grid nodes in each dimension, and distance between two nodes
+# Grid for the interpolation of the log-likelihood: number of nodes, and spacing in ln σ
 GRID_NODE_COUNT_AND_SPACING = 10, 0.25
-# Number and distance of the nodes of a smaller grid, which is less accurate. It is used until the
-# outlier probabilities have converged
+# Smaller, less accurate grid for the first iterations: number of nodes, and spacing in ln σ
 COARSE_GRID_NODE_COUNT_AND_SPACING = 6, 0.2
-# A noise fit to a long flight is initialised with a fit to this number of its first measurements
+# Number of measurements that give the initial values for a long flight
 INITIAL_FIT_MEASUREMENT_COUNT = 2000
-# Precision of a known initial position (1/m²) and velocity (s²/m²): σ of 1 µm and 1 µm/s
+# Precision of a known initial position (1/m²) and velocity (s²/m²)
 KNOWN_INITIAL_STATE_PRECISION = 1e12
 
 
@@ -74,13 +66,13 @@ class NoiseParameters:
     Attributes
     ----------
     sigma_a_m_s2 : float
-        Standard deviation of the acceleration error over one prediction step of length DT.
+        Standard deviation of the acceleration error over one step DT.
     sigma_z_m : float
-        Standard deviation of the white noise of a position.
+        Standard deviation of the white position noise.
     random_walk_m : float
-        Random walk of the source (m/√s); 0 if the source does not drift.
+        Random walk of the source (m/√s); 0 for none.
     correlated_sigma_m, tau_s : float
-        Standard deviation and time constant of time-correlated noise; 0 without it.
+        Standard deviation and time constant of time-correlated noise; 0 for none.
     """
 
     sigma_a_m_s2: float
@@ -103,19 +95,18 @@ NOISE_SEARCH_RANGES = {
 class NegativeLogLikelihood:
     """Negative log-likelihood (-ln p) of the measurements as a function of the noise parameters.
 
-    Constant terms are omitted. For white noise, -ln p is computed on a grid over
-    ln(SIGMA_A/SIGMA_Z) and ln SIGMA_Z. Between the grid nodes it is interpolated by polynomials.
+    Constant terms are omitted. For white noise, -ln p is interpolated on a grid.
 
     Parameters
     ----------
     axis_positions : sequence of PositionsAndIncrements
-        Positions with one time offset.
+        Positions along each axis.
     measurement_weights : ndarray, shape (m,)
         The variance of a measurement is SIGMA_Z² / weight.
     sigma_z_m : float
-        Approximate SIGMA_Z, by which all σ are divided.
+        Approximate SIGMA_Z.
     is_coarse : bool
-        True for fewer nodes, if an approximate maximum is sufficient.
+        True for a smaller grid, which is faster but less accurate.
     """
 
     def __init__(
@@ -168,7 +159,7 @@ class NegativeLogLikelihood:
         self._compute_scores_at_nodes = compute_scores_at_nodes
 
     def __call__(self, noise_parameters: NoiseParameters) -> float:
-        """Return -ln p of the measurements, without the constant term that contains ln 2π."""
+        """Return -ln p of the measurements, without the constant term with ln 2π."""
         if (
             noise_parameters.random_walk_m
             or noise_parameters.correlated_sigma_m
@@ -204,10 +195,7 @@ def _compute_barycentric_weights(node_count: int) -> Array:
 
 
 def _compute_interpolation_weights(position_in_node_steps: float, node_count: int) -> Array:
-    """Return the weights of the values at nodes 0, 1, ... for an interpolated value between nodes.
-
-    Method: barycentric interpolation, Berrut and Trefethen (2004).
-    """
+    """Return the weights of barycentric interpolation (Berrut and Trefethen 2004)."""
     node_distances = position_in_node_steps - np.arange(node_count)
     if not node_distances.all():
         return np.asarray(node_distances == 0.0, dtype=np.float64)
@@ -224,9 +212,8 @@ def fit_with_sigma_ratios(
 ) -> list[PositionFit]:
     """Fit constant errors (such as biases) to positions, for each ratio SIGMA_A / SIGMA_Z (1/s²).
 
-    All σ are divided by SIGMA_Z. The batches contain the same positions with different time offsets
-    of the source. Each returned fit (one per ratio) contains all time offsets.
-    ``random_walk_to_sigma_z_ratio`` (1/√s) is the random walk of the source, divided by SIGMA_Z.
+    The batches contain the same positions with different time offsets. The result has one fit for
+    each ratio. ``random_walk_to_sigma_z_ratio`` has the unit 1/√s.
     """
     batches_over_sigma_z = (
         positions.divide_sigmas_by_sigma_z(
@@ -257,8 +244,8 @@ def fit_constant_errors(
 ) -> PositionFit:
     """Fit constant errors (such as biases) to positions, with given noise parameters.
 
-    The batches contain the same positions with different time offsets of the source. The returned
-    fit contains all time offsets. The variance of a measurement is SIGMA_Z² / weight.
+    The batches contain the same positions with different time offsets. The variance of a
+    measurement is SIGMA_Z² / weight.
     """
     sigma_z_m = noise_parameters.sigma_z_m
     if noise_parameters.correlated_sigma_m:
@@ -304,13 +291,13 @@ class NoiseFit:
     outlier_fraction, outlier_sigma_ratio : float
         Fraction of outliers, and ratio of their σ to SIGMA_Z.
     outlier_probability : ndarray, shape (m,)
+        Probability of each measurement to be an outlier.
     measurement_weights : ndarray, shape (m,)
-        1 for a good measurement, 1/``outlier_sigma_ratio``² for an outlier.
+        1 for a good measurement, smaller for an outlier.
     score : NegativeLogLikelihood
         -ln p as a function of the noise parameters.
     log_sigma_z_variance_factor : float
-        Factor (at least 1) on the variance of ln SIGMA_Z, because the classification of outliers is
-        uncertain.
+        Increase of the variance of ln SIGMA_Z by uncertain outliers; at least 1.
     """
 
     noise_parameters: NoiseParameters
@@ -329,9 +316,9 @@ class NoiseFit:
 def convert_to_positions_and_increments(
     preintegrated_motion: PreintegratedMotion,
 ) -> PositionsAndIncrements:
-    """Convert the inputs of KF to the inputs of :func:`fit_constant_errors`, as one segment.
+    """Convert the inputs of KF to the inputs of :func:`fit_constant_errors`.
 
-    The constant errors of the segment are the errors of the initial position and velocity.
+    The constant errors are those of the initial position and velocity.
     """
     measurement_count = len(preintegrated_motion.measurement_m)
     prior_precision = np.zeros((measurement_count + 1, 2))
@@ -342,8 +329,7 @@ def convert_to_positions_and_increments(
     dp, dv = np.zeros((2, 1, 1, 3, measurement_count))
     dp[0, 0, 0] = preintegrated_motion.delta_position_m
     dv[0, 0, 0] = preintegrated_motion.delta_velocity_m_s
-    # Derivatives with respect to the errors of the initial position and velocity. These errors
-    # enter in the first interval only: later intervals start from the estimated state
+    # Errors of the initial position and velocity enter in the first interval only
     dp[0, 0, 1:, 0] = (1.0, preintegrated_motion.interval_s[0])
     dv[0, 0, 2, 0] = 1.0
     return subtract_smooth_path(
@@ -369,15 +355,12 @@ def maximise_likelihood(
 ) -> NoiseFit:
     """Estimate the noises and the outliers by maximum likelihood.
 
-    The initial values for a long flight are estimated from its first measurements, to reduce
-    computing time.
-
     Parameters
     ----------
     axis_positions : sequence of PositionsAndIncrements
         Positions along each axis, at equal times.
     start_parameters : NoiseParameters
-        Initial values. A random walk or time-correlated noise of zero stays zero.
+        Initial values. Random walk or time-correlated noise of zero stays zero.
     measurement_weights : ndarray, shape (m,)
         Initial weight of each measurement.
     fits_outliers : bool
@@ -417,14 +400,12 @@ def maximise_likelihood(
         expected_squared_errors_m2, measured_axis_counts = _estimate_squared_errors(
             axis_positions, noise_parameters, measurement_weights
         )
-        # Outliers increase the estimated SIGMA_Z, and would then not be classified as outliers.
-        # They hardly change the median of the squared errors
+        # Outliers increase the estimated SIGMA_Z, but hardly change the median of squared errors
         robust_variance_m2 = float(
             np.median(expected_squared_errors_m2 / measured_axis_counts)
             / (chdtri(measured_axis_counts[0], 0.5) / measured_axis_counts[0])
         )
-        # If even the median error exceeds the search range of SIGMA_Z, most errors are large, and
-        # no measurement is an outlier
+        # No measurement is an outlier if most errors exceed the search range of SIGMA_Z
         if robust_variance_m2 > SIGMA_Z_SEARCH_RANGE_M[1] ** 2:
             break
         limited_sigma_z_variance_m2 = min(
@@ -493,10 +474,7 @@ def maximise_likelihood(
 def estimate_outlier_probability(
     axis_positions: Sequence[PositionsAndIncrements], fit: NoiseFit, measurement_count: int
 ) -> Array:
-    """Return the probability of each measurement to be an outlier.
-
-    Noise parameters and fraction of outliers are those of ``fit``.
-    """
+    """Return the probability of each measurement to be an outlier, with the noises of ``fit``."""
     outlier_probability = np.zeros(measurement_count)
     for _ in range(MAX_COARSE_ITERATIONS):
         measurement_weights = 1.0 - outlier_probability * (1.0 - fit.outlier_sigma_ratio**-2.0)
@@ -563,12 +541,10 @@ def compute_log_sigma_z_variance_factor(
     outlier_probability: Array,
     outlier_sigma_ratio: float,
 ) -> float:
-    """Return the variance of ln SIGMA_Z divided by its variance if all outliers were known.
+    """Return the variance of ln SIGMA_Z, relative to its variance with known outliers.
 
-    The information matrix is that of known outliers minus the missing information (Louis 1982).
-    Its parameters are ln SIGMA_Z, ln ``outlier_sigma_ratio`` and the log odds of an outlier.
-    ``normalised_squares`` is the squared error of each measurement, divided by SIGMA_Z² and summed
-    over its ``measured_axis_counts`` axes.
+    Method: missing information (Louis 1982). ``normalised_squares`` are squared errors over
+    SIGMA_Z², summed over ``measured_axis_counts`` axes.
     """
     outlier_fraction = np.mean(outlier_probability)
     log_sigma_z_information = 2.0 * float(np.sum(measured_axis_counts))
@@ -590,8 +566,7 @@ def compute_log_sigma_z_variance_factor(
     )
     missing_information = (scores * (outlier_probability * (1.0 - outlier_probability))) @ scores.T
     observed_information = information_with_known_outliers - missing_information
-    # With very few outliers, the information matrix may not be positive definite. The outliers then
-    # hardly change the factor
+    # With very few outliers, the information matrix may not be positive definite
     if np.linalg.eigvalsh(observed_information)[0] <= 0.0:
         return 1.0
     return max(1.0, log_sigma_z_information * float(np.linalg.inv(observed_information)[0, 0]))
@@ -607,12 +582,10 @@ def _maximise_by_gradient(
     measurement_count = len(likelihood.measurement_weights)
 
     def score_per_measurement(log_parameters: Array) -> float:
-        # The score is divided by the number of measurements. The gradient is then near 1, and
-        # L-BFGS-B begins with a step of suitable size
+        # Dividing by the number of measurements gives L-BFGS-B a suitable first step
         try:
             return likelihood(to_noise_parameters(log_parameters)) / measurement_count
-        # If the equations are singular because of rounding errors, a large score is returned.
-        # L-BFGS-B then tries a shorter step
+        # After a large score, L-BFGS-B tries a shorter step
         except np.linalg.LinAlgError:
             return UNCOMPUTABLE_SCORE
 

@@ -1,13 +1,8 @@
 """Misalignment in yaw between the position source's frame and EKF2's heading, over the flight.
 
 Indoors, a disturbed magnetometer may rotate EKF2's heading by tens of degrees within one flight.
-The misalignment is therefore estimated for each part of the flight:
-
-- If the position source measures an orientation, its heading is compared with EKF2's heading.
-- Otherwise the heading is integrated from the gyroscopes. Its error in each part of the flight is
-  estimated from positions and acceleration (:mod:`px4fuse.filter.imu_motion`).
-
-A chi-square test decides if the misalignment changes.
+The misalignment is estimated from orientations of the source, or from positions and IMU data. A
+chi-square test decides if it changes in flight.
 """
 
 from typing import Literal
@@ -31,40 +26,33 @@ from px4fuse.filter.signals import Segment, cut_to_segment, report_too_few_measu
 from px4fuse.flight.model import Columns, Flight, PositionTrack, Unavailable
 from px4fuse.trajectory.rotation import heading
 
-# A flight is divided into parts, each with its own heading error. Duration (s) of a part if the
-# heading error is estimated from orientations
+# Duration (s) of each flight part if the heading error is estimated from orientations
 FLIGHT_PART_DURATION_S = 2.0
-# Duration (s) of a flight part if the heading error is fitted to positions
+# Duration (s) of each flight part if the heading error is fitted to positions
 HEADING_FIT_DURATION_S = 15.0
 # Minimum duration (s) of a flight part if the heading error is fitted to positions
 MIN_HEADING_FIT_DURATION_S = 5.0
-# Minimum number of flight parts for a heading error from orientations
 MIN_FLIGHT_PART_COUNT = 3
-# Minimum number of positions for an estimate of the heading error
 MIN_MEASUREMENTS = 50
-# Minimum number of orientation samples in a flight part
 MIN_FLIGHT_PART_SAMPLES = 3
-# Maximum number of positions in the estimate of the heading error; more are downsampled
 MAX_MEASUREMENTS = 1000
 # The heading error changes in flight if the p-value of a constant error is below this limit
 MAX_DRIFT_P_VALUE = 0.002
 # Minimum reported change (°) of the heading error in flight
 MIN_HEADING_DRIFT_DEG = 5.5
-# Maximum yaw rate (°/s) for a comparison of headings: a delay of 0.2 s then causes 2° error
+# Maximum yaw rate (°/s) at which headings are compared: a delay of 0.2 s causes 2° error
 MAX_YAW_RATE_DEG_S = 10.0
 # Minimum σ (°) of a heading difference between source and EKF2
 MIN_HEADING_SIGMA_DEG = 0.5
-# Maximum median interval (s) between logged attitudes for estimating the heading error
+# Maximum median interval (s) of the logged attitude
 MAX_ATTITUDE_INTERVAL_S = 0.11
-# Maximum number of iterations in the fit of the heading error
 MAX_HEADING_FIT_ITERATIONS = 5
-# The fit has converged if an iteration changes the heading error by less than this angle (rad)
+# Convergence limit (rad) for the change of the heading error in one iteration
 MAX_HEADING_CHANGE_AT_CONVERGENCE_RAD = 0.01
 # Prior σ (rad) of the heading error
 HEADING_SIGMA_RAD = 1.0
 # Minimum estimated scale factor of the positions, to avoid a division by zero
 MIN_FITTED_SCALE_FACTOR = 0.1
-# Index of the heading error in the vector of constants that are fitted to each flight part
 HEADING_ERROR_INDEX = 2
 
 
@@ -83,9 +71,9 @@ class HeadingError(Record):
     Attributes
     ----------
     misalignment_deg, sigma_deg : float
-        Angle in yaw: mean over the flight, and σ of the mean.
+        Mean angle over the flight, and its σ.
     drifts : bool
-        True if the angle changes significantly in flight, by ``MIN_HEADING_DRIFT_DEG`` or more.
+        True if the angle changes significantly in flight.
     parts : tuple of HeadingPart
         Angles in consecutive parts of the flight, clockwise from above.
     drift_p : float
@@ -139,9 +127,6 @@ def estimate_heading_error(  # noqa: PLR0911 (one return per missing input)
 
     Parameters
     ----------
-    flight : Flight
-    track : PositionTrack
-    segment : Segment
     settings : Settings
         ``sigma_a_m_s2`` is the initial value of the acceleration noise.
     sigma_z_m : float
@@ -180,8 +165,7 @@ def estimate_heading_error(  # noqa: PLR0911 (one return per missing input)
     ]
     position_samples = position_samples.set_axis(position_samples.index.to_numpy() + offset_s)
     noise_parameters = NoiseParameters(settings.sigma_a_m_s2, sigma_z_m)
-    # The mounting angle of the source is unknown, so orientations do not give the misalignment.
-    # They show only that it is constant
+    # The mounting angle of the source is unknown, so its orientations give only yaw changes
     return _estimate_heading_error_from_positions(
         flight,
         position_samples,
@@ -196,10 +180,9 @@ def _average_flight_parts(
 ) -> tuple[HeadingPart, ...]:
     """Average yaw misalignment and σ (rad) over flight parts of equal duration.
 
-    Parts with fewer than ``MIN_FLIGHT_PART_SAMPLES`` samples are omitted. The errors in one part
-    are correlated, so averaging does not reduce σ: it is the RMS of the samples' σ.
+    σ is not reduced by averaging, because errors in one part are correlated.
     """
-    # At a low sample rate, parts are longer than FLIGHT_PART_DURATION_S, to contain enough samples
+    # At a low sample rate, parts are longer, to contain enough samples
     part_count = max(
         int(
             min(
@@ -230,7 +213,7 @@ def heading_rad(quaternions: pd.DataFrame) -> Array:
 def _compare_orientations(
     attitude: pd.DataFrame, orientation: pd.DataFrame, segment: Segment, offset_s: float
 ) -> HeadingError | None:
-    """Compare the position source's heading with EKF2's; None with too few samples."""
+    """Compare the position source's heading with EKF2's; None if there are too few samples."""
     orientation_samples = cut_to_segment(orientation, segment)
     time_s = orientation_samples.index.to_numpy() + offset_s
     attitude_time_s = attitude.index.to_numpy()
@@ -247,7 +230,7 @@ def _compare_orientations(
         return None
     time_s = time_s[has_low_yaw_rate]
     misalignment_rad = misalignment_rad[has_low_yaw_rate]
-    # Robust σ from the median absolute difference of successive samples
+    # Robust σ from the differences of successive samples
     noise_sigma_rad = 1.4826 * np.median(np.abs(np.diff(misalignment_rad))) / np.sqrt(2.0)
     sigma_rad = np.full(len(time_s), max(float(noise_sigma_rad), np.radians(MIN_HEADING_SIGMA_DEG)))
     heading_parts = _average_flight_parts(time_s, misalignment_rad, sigma_rad)
@@ -309,8 +292,7 @@ def _estimate_heading_error_from_positions(
                 "Analyse a longer segment.",
             )
         positions = motion.make_positions_at_offset(0.0)
-        # The derivative with respect to the heading is the rotated smooth path. Noise of the IMU
-        # motion would bias the heading error towards zero
+        # Noise of the IMU motion would bias the heading error to zero, so the smooth path is used
         for increments in (positions.delta_position_m, positions.delta_velocity_m_s):
             north_m, east_m = increments[:, :, -1]
             increments[:, :, HEADING_ERROR_INDEX] = -east_m, north_m
@@ -324,8 +306,7 @@ def _estimate_heading_error_from_positions(
         constant_errors_covariance = np.linalg.inv(position_fit.compute_constants_information())[
             is_part_long_enough, 0
         ]
-        # This derivative contains the scale factor of the positions, so the fitted heading error is
-        # divided by the factor
+        # The fitted angle contains the scale factor of the positions
         position_scale = np.maximum(1.0 + constant_errors[:, -1], MIN_FITTED_SCALE_FACTOR)
         error_rad = constant_errors[:, HEADING_ERROR_INDEX] / position_scale
         heading_variance_rad2 = (
@@ -339,11 +320,10 @@ def _estimate_heading_error_from_positions(
         if abs(correction_rad) < MAX_HEADING_CHANGE_AT_CONVERGENCE_RAD:
             break
     deviation_rad = error_rad - correction_rad
-    # The estimates vary because of noise and because of drift. Variance due to drift: variance of
-    # the estimates minus their noise variance
+    # Variance due to drift: variance of the estimates minus their noise variance
     variance_above_noise_rad2 = max(float(np.mean(deviation_rad**2 - heading_variance_rad2)), 0.0)
     heading_drift_variance_rad2 = 0.0 if has_constant_heading else variance_above_noise_rad2
-    # The more uncertain a flight part is, the nearer its result is to the mean heading error
+    # Uncertain estimates are moved towards the mean heading error
     weight_of_part_estimate = heading_drift_variance_rad2 / (
         heading_drift_variance_rad2 + heading_variance_rad2
     )

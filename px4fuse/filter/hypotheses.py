@@ -1,13 +1,10 @@
 """Estimate of biases, scale factor error and jumps from KF's innovations.
 
-KF is linear: each error of its inputs changes the innovations in proportion to its size. The
-errors are accelerometer biases, a rotation of the frame, a slow tilt error and jumps of the
-positions. The change due to an error of size 1 (1 m/s², 1 rad or 1 m) is a column of a design
-matrix. Weighted least squares estimates the sizes of all errors together (generalised likelihood
-ratio, Willsky and Jones 1976).
+KF is linear: each input error changes the innovations in proportion to its size. Weighted least
+squares estimates the sizes of all errors (generalised likelihood ratio, Willsky and Jones 1976).
 
-The scale factor is not estimated by this regression, because acceleration noise would bias it
-(errors in variables). Instead, the fit is repeated with several scale factors (Deming 1943).
+In this regression, acceleration noise would bias the scale factor (errors in variables). The fit
+is therefore repeated with several scale factors (Deming 1943).
 """
 
 from __future__ import annotations
@@ -41,39 +38,34 @@ ANALYSIS_NAME = "biases, scale factor error and jumps"
 MIN_MEASUREMENTS = 50
 # Prior σ (rad) of the slow tilt error of the logged attitude
 TILT_PRIOR_SIGMA_RAD = 0.002
-# The slow acceleration error is piecewise linear in time. Interval (s) between its knots
+# Interval (s) between the knots of the slow acceleration error, which is piecewise linear
 SLOW_ERROR_KNOT_SPACING_S = 15.0
 MAX_SLOW_ERROR_KNOTS = 40
-# Columns of the design matrix with constant errors: accelerometer bias forward (body axis x) and
-# right (y), and rotation of the position source's frame about the vertical
+# Columns of the design matrix: forward and right bias (body frame), yaw of the source frame
 FORWARD_BIAS_COLUMN, RIGHT_BIAS_COLUMN, FRAME_ROTATION_COLUMN = range(3)
 CONSTANT_ERROR_COLUMN_COUNT = 3
-# Tested multiples of KF's SIGMA_A. Most are below 1: KF's SIGMA_A includes the effect of biases and
-# tilt, but this fit estimates biases and tilt separately
+# Tested multiples of KF's SIGMA_A, mostly below 1: KF's SIGMA_A includes biases and tilt
 TESTED_SIGMA_A_FACTORS = np.geomspace(0.2, 2.0, 7)
 # Tested scale factors of the position source
 TESTED_SCALE_FACTORS = np.linspace(0.7, 1.3, 7)
-# Maximum number of times at which a jump of the positions is tested
 MAX_TESTED_JUMP_TIMES = 800
 # Number of jump times that are tested at once, to limit the memory
 JUMP_BATCH_SIZE = 80
-# Positions within this time (s) after a tested jump are ignored: a burst of outliers is no jump
+# Positions within this time (s) after a tested jump are ignored, because they may be outliers
 OUTLIER_BURST_DURATION_S = 1.0
-# Outliers within this time (s) after a jump are tested again: positions after a jump look like
-# outliers
+# Outliers within this time (s) after a jump are tested again
 OUTLIER_RETEST_DURATION_AFTER_JUMP_S = 6.0
 # Maximum false alarm probability of a jump, per flight
 MAX_JUMP_FALSE_ALARM_P = 1e-3
 # Probability that a good measurement near a jump is classified as an outlier
 MAX_FALSE_OUTLIER_P = 1e-3
-# Maximum number of times that are tested to find the exact time of a detected jump
+# Maximum number of times that are tested to locate a detected jump
 MAX_CANDIDATE_JUMP_TIMES = 6
 MAX_JUMPS = 3
 # Minimum accelerometer bias (m/s²) that is reported: half of EKF2_ABL_LIM
 MIN_BIAS_M_S2 = 0.2
-# Minimum ratio of an accelerometer bias to its σ to report it: false alarm rate 6e-5
+# Minimum ratio of a reported accelerometer bias to its σ
 MIN_BIAS_TO_SIGMA_RATIO = 4.0
-# Minimum number of measurements before a jump, and also after it
 MIN_MEASUREMENTS_BEFORE_AND_AFTER_JUMP = 8
 
 
@@ -105,13 +97,13 @@ class SystematicErrors:
     Attributes
     ----------
     forward_bias_m_s2, right_bias_m_s2 : Estimate
-        Accelerometer bias. At constant heading, a tilt error has an equal effect.
+        Accelerometer bias in the body frame.
     rotation_rad : Estimate
-        Yaw of the position source's frame relative to the attitude (clockwise from above).
+        Yaw of the position source's frame relative to the attitude.
     scale : Estimate
-        Scale factor error: distances from positions over distances from the IMU, minus 1.
+        Scale factor error of the positions relative to the IMU.
     sigma_a_m_s2 : float
-        White noise of the acceleration that remains after the fit.
+        White noise of the acceleration after the fit.
     """
 
     forward_bias_m_s2: Estimate
@@ -137,8 +129,7 @@ class SystematicErrors:
 def estimate_mean_acceleration_error(axis: Axis) -> float | None:
     """Fit a constant error of the acceleration (m/s²) along an axis to its positions.
 
-    Start position, start velocity and the error are fitted to the measurements minus the doubly
-    integrated acceleration. None without IMU, with a gap in the IMU, or with few measurements.
+    None without complete IMU data, or with few measurements.
     """
     acceleration, time_s = axis.acceleration, axis.measurement_time_s
     if (
@@ -169,10 +160,8 @@ def fit_systematic_errors(
 
     Parameters
     ----------
-    flight : Flight
     axes : tuple of Axis
         Horizontal axes with the same measurement times.
-    settings : Settings
     sigma_a_m_s2, sigma_z_m : float
         KF's maximum-likelihood noises.
     outlier_time_s : ndarray
@@ -180,7 +169,7 @@ def fit_systematic_errors(
     clock_offset_s : float
         Time offset added to the timestamps.
     source_resets_s : sequence of float
-        Timestamps at which the position source reports a reset (``reset_counter``).
+        Timestamps of resets that the position source reports.
     """
     design_matrix = make_design_matrix(flight, axes, settings, sigma_z_m, clock_offset_s)
     if isinstance(design_matrix, Unavailable):
@@ -224,10 +213,7 @@ def _fit_sigma_a(
 
 
 def _index_of_minimum(score: Callable[[int], float], count: int) -> int:
-    """Return the index of the only minimum of ``score(0)`` to ``score(count - 1)``.
-
-    The search starts in the middle, to compute few scores.
-    """
+    """Return the index of the only minimum of ``score(0)`` to ``score(count - 1)``."""
     index = count // 2
     direction = 1 if index + 1 < count and score(index + 1) < score(index) else -1
     while 0 <= index + direction < count and score(index + direction) < score(index):
@@ -242,8 +228,7 @@ def _fit_scale(design_matrix: DesignMatrix, sigma_a: float, is_skipped: BoolArra
             sigma_a, is_skipped, float(TESTED_SCALE_FACTORS[scale_index])
         )
     )
-    # A larger tested scale factor of the positions increases S. ln S is omitted from the score,
-    # because it would bias the estimated scale factor to zero
+    # ln S is omitted from the score, because it would bias the scale factor to zero
     best_scale_index = _index_of_minimum(
         lambda scale_index: fit_with_scale(scale_index).residual_and_prior_square_sum,
         len(TESTED_SCALE_FACTORS),
@@ -277,13 +262,12 @@ def _find_jumps(
 ) -> tuple[tuple[Jump, ...], BoolArray]:
     """Detect lasting jumps of the positions; return them in time order, and a mask of outliers.
 
-    A jump is tested at each reset that the source reports, at the first of successive outliers
-    (positions after a jump look like outliers), and at the most likely time of the flight.
+    Tested times: resets of the source, first outliers of a burst, and the most likely time.
     """
     jumps: list[Jump] = []
 
     def mask_outliers_near_jump(jump_time_s: float) -> BoolArray:
-        # If the source reports a reset, the positions after the jump are valid and are used
+        # After a reset that the source reports, its positions are valid
         if jump_time_s in source_resets_s:
             return is_skipped & ~_is_in_window(
                 design_matrix.time_s, jump_time_s, OUTLIER_RETEST_DURATION_AFTER_JUMP_S
@@ -342,7 +326,7 @@ def _find_significant_jump_times(
     is_skipped: BoolArray,
     candidate_times_s: Array | None = None,
 ) -> list[float]:
-    """Return the times at which a jump is significant, largest χ² first.
+    """Return the times of significant jumps, largest χ² first.
 
     By default, all measurement times are tested.
     """
@@ -405,10 +389,9 @@ def _compute_jump_chi_squares(
 def _locate_jump(
     design_matrix: DesignMatrix, sigma_a: float, is_skipped: BoolArray, jump: Jump
 ) -> tuple[Jump, BoolArray]:
-    """Return a detected jump with its exact time and change (m), and a mask of outliers to skip."""
+    """Return a detected jump with its exact time and size (m), and a mask of outliers."""
     is_near_jump = np.abs(design_matrix.time_s - jump.time_s) <= OUTLIER_BURST_DURATION_S
-    # The jump is fitted without the measurements near it. Outliers after the jump are used again if
-    # their residual is small in this fit
+    # Measurements near the jump may be outliers, so the first fit omits them
     residual_squares = design_matrix.add_jump(jump.time_s)[0].compute_residual_squares(
         sigma_a, is_skipped | is_near_jump
     )
@@ -435,8 +418,7 @@ def _locate_jump(
         outlier_mask_by_jump_time[jump_time_s] = np.where(
             is_near_jump, residual_squares > max_residual_square, is_skipped
         )
-    # The best jump time has the fewest outliers, because with a wrong jump time good measurements
-    # look like outliers
+    # With a wrong jump time, good measurements look like outliers
     best_jump_time_s = min(
         outlier_mask_by_jump_time,
         key=lambda jump_time_s: np.count_nonzero(outlier_mask_by_jump_time[jump_time_s]),
@@ -493,16 +475,17 @@ class InnovationRegression:
     Attributes
     ----------
     axis : ndarray of int, shape (n,)
-        Axis index of each row; rows are sorted by axis.
+        Axis index of each row.
     residual : ndarray, shape (n,)
         Normalised innovations minus the fit.
     coefficients, covariance : ndarray, shape (k,) and (k, k)
+        Estimated errors, and their covariance.
     residual_and_prior_square_sum : float
-        Sum of the squared residuals, and of the squared coefficients over their prior variances.
+        Sum of squared residuals, and of squared coefficients over prior variances.
     score : float
         Restricted negative log-likelihood of the innovations.
     residual_rms : float
-        RMS of the residual. It is 1 if SIGMA_A and SIGMA_Z are correct.
+        RMS of the residual; 1 if SIGMA_A and SIGMA_Z are correct.
     """
 
     axis: IntArray
@@ -519,10 +502,9 @@ class InnovationRegression:
         return np.sqrt(np.maximum(mean_square, 1.0))
 
     def estimate(self, column: int) -> Estimate:
-        """Return the estimated error that belongs to a column of the design matrix, and its σ.
+        """Return the estimated error of one column of the design matrix, and its σ.
 
-        If the residuals are larger than expected (``residual_rms`` above 1), σ is multiplied by
-        ``residual_rms``.
+        σ is increased if the residuals are larger than expected.
         """
         coefficient_sigma = float(np.sqrt(self.covariance[column, column])) * max(
             self.residual_rms, 1.0
@@ -534,22 +516,19 @@ class InnovationRegression:
 class DesignMatrix:
     """Regression of KF's innovations on systematic errors, such as biases and jumps.
 
-    KF filters the data, and each systematic error with size 1 instead of the data. The innovations
-    of an error are a column of the design matrix. The slow acceleration error is linear between
-    knots.
+    A column of the design matrix contains the innovations due to one error of size 1.
 
     Attributes
     ----------
     time_s : ndarray, shape (m,)
         Timestamps of the measurements.
     preintegrated_inputs : PreintegratedMotion
-        Inputs of KF, one in each column. Four columns for each axis: data, 1 m/s² forward bias,
-        1 m/s² right bias and 1 rad rotation. Last columns, shared by the axes: slow acceleration
-        error of 1 m/s² at each knot.
+        Inputs of KF, one in each column. Columns of each axis: data, forward bias, right bias,
+        rotation. Last columns: slow acceleration error.
     prior_sigma : ndarray, shape (k,)
         Prior σ of the coefficients, except those of jumps.
     jump_columns : ndarray, shape (m, j)
-        Unit steps at the times of j jumps.
+        Unit steps at the times of the jumps.
     """
 
     time_s: Array
@@ -560,7 +539,7 @@ class DesignMatrix:
     jump_columns: Array
 
     def add_jump(self, time_s: float) -> tuple[DesignMatrix, IntArray]:
-        """Return a design matrix with one more jump, and the column index of the jump by axis."""
+        """Return a design matrix with one more jump, and the jump's column index for each axis."""
         design_matrix = replace(
             self,
             jump_columns=np.hstack([self.jump_columns, make_unit_steps(self.time_s, [time_s])]),
@@ -572,10 +551,9 @@ class DesignMatrix:
     def compute_normalised_innovations(
         self, dp: Array, dv: Array, measured_m: Array, sigma_a: float, is_skipped: BoolArray
     ) -> tuple[Array, float]:
-        """Run KF on k inputs at once; return its normalised innovations ν/√S, shape (m, k).
+        """Run KF on several inputs; return normalised innovations ν/√S, one column per input.
 
-        ``dp``, ``dv`` and ``measured_m`` have one column for each input. The second result is
-        Σ ln S over the fused measurements.
+        The second result is Σ ln S over the fused measurements.
         """
         preintegrated_inputs = replace(
             self.preintegrated_inputs,
@@ -592,9 +570,8 @@ class DesignMatrix:
     ) -> InnovationRegression:
         """Fit biases, rotation, slow error and jumps to KF's innovations by least squares.
 
-        ``scale`` is a trial scale factor of the positions. Instead of dividing the positions by it,
-        the acceleration and its noise are multiplied by it. ``is_skipped``, shape (m,), is True for
-        measurements that are not used.
+        ``scale`` is a trial scale factor of the positions; the acceleration is multiplied by it.
+        ``is_skipped`` is True for measurements that are not used.
         """
         return self.fit_columns_to_innovations(
             *self.compute_innovations_and_design_matrix(sigma_a, is_skipped, scale), is_skipped
@@ -619,7 +596,7 @@ class DesignMatrix:
             self.prior_sigma, np.full(column_count - len(self.prior_sigma), np.inf)
         )
         information = np.diag(prior_sigma**-2.0) + design_columns.T @ design_columns
-        # A small diagonal prevents a singular matrix: in hover, the column of the rotation is zero
+        # A small diagonal prevents a singular matrix: in hover, the rotation has no effect
         information += 1e-12 * np.diag(np.diag(information)) + 1e-12 * np.eye(column_count)
         right_hand_side = design_columns.T @ innovations_by_axis
         information_factor = cho_factor(information)
@@ -649,9 +626,9 @@ class DesignMatrix:
         )
 
     def compute_residual_squares(self, sigma_a: float, is_skipped: BoolArray) -> Array:
-        """Return the squared residual of each measurement over S, summed over axes.
+        """Return the squared normalised residual of each measurement, summed over axes.
 
-        Measurements in ``is_skipped`` have residuals, but are not used in the fit.
+        Measurements in ``is_skipped`` are not used in the fit.
         """
         normalised_innovations, columns, sum_of_log_variances = (
             self.compute_innovations_and_design_matrix(sigma_a, is_skipped)
@@ -665,19 +642,16 @@ class DesignMatrix:
     def compute_innovations_and_design_matrix(
         self, sigma_a: float, is_skipped: BoolArray, scale: float = 1.0
     ) -> tuple[Array, Array, float]:
-        """Return KF's normalised innovations, and the design matrix.
+        """Return KF's normalised innovations ν/√S, the design matrix, and Σ ln S.
 
-        Normalised innovations ν/√S have the shape (axes, measurements). The design matrix, shape
-        (axes, measurements, columns), contains the normalised innovations
-        due to each error of size 1. The third result is Σ ln S.
+        Shapes: (axes, measurements) and (axes, measurements, columns).
         """
         preintegrated_inputs, axis_count = self.preintegrated_inputs, self.axis_count
         jump_count = self.jump_columns.shape[1]
         column_count = len(self.prior_sigma)
         normalised_innovations = np.empty((axis_count, len(is_skipped)))
         columns = np.zeros((axis_count, len(is_skipped), column_count + axis_count * jump_count))
-        # Data and rotation contain the measured acceleration, so they are multiplied by the scale
-        # factor. The biases are always 1 m/s²
+        # Only inputs with measured acceleration are multiplied by the scale factor
         data_input_indices = (1 + CONSTANT_ERROR_COLUMN_COUNT) * np.arange(axis_count)
         input_scale_factors = np.ones(preintegrated_inputs.measurement_m.shape[1])
         input_scale_factors[
@@ -721,7 +695,7 @@ def make_design_matrix(
     sigma_z_m: float,
     clock_offset_s: float,
 ) -> DesignMatrix | Unavailable:
-    """Make the design matrix with columns for biases, rotation and slow error, but not for jumps.
+    """Make the design matrix of biases, rotation and slow acceleration error, without jumps.
 
     ``clock_offset_s`` is added to the timestamps of the positions.
     """
@@ -777,7 +751,7 @@ def make_design_matrix(
         delta_position_m=dp,
         delta_velocity_m_s=dv,
         measurement_m=measured_m,
-        # All axes have the same process noise. In IMU gaps, it is the mean over the axes
+        # One process noise for all axes: the mean
         process_noise_independent_of_sigma_a=np.mean(
             [
                 preintegrated_motion.process_noise_independent_of_sigma_a
@@ -839,8 +813,7 @@ def _integrate_unit_errors(attitude: pd.DataFrame, acceleration: Acceleration) -
 def _make_interpolation_weights(start_s: float, end_s: float) -> ArrayPair:
     """Return times (s), and the weight of each knot at these times, shape (knots, times).
 
-    The knots are the times between which the slow acceleration error is interpolated linearly.
-    Their interval is :data:`SLOW_ERROR_KNOT_SPACING_S`.
+    The slow acceleration error is linear between the knots.
     """
     knot_count = (
         int(
@@ -858,5 +831,5 @@ def _make_interpolation_weights(start_s: float, end_s: float) -> ArrayPair:
 
 
 def make_unit_steps(time_s: Array, starts_s: Iterable[float]) -> Array:
-    """Return step functions, shape (times, steps): 0 before each time in ``starts_s``, then 1."""
+    """Return steps from 0 to 1 at the times ``starts_s``, shape (times, steps)."""
     return np.asarray(time_s[:, None] >= np.fromiter(starts_s, float)[None, :], dtype=np.float64)

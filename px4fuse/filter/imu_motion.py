@@ -4,14 +4,11 @@ A segment is a part of the flight, at most 30 s long, without a gap in IMU or at
 is integrated from the gyroscopes, starting at EKF2's attitude. EKF2's later attitude is not used,
 because EKF2 corrected it with the positions to be tested.
 
-Each segment has unknown constant errors: of the initial attitude (rad, NED), gyro biases (rad/s,
-body), accelerometer biases (m/s², body) and the scale factor error of the positions. For small
-errors, the motion is linear in them. The derivatives of the motion with respect to these errors are
-integrated once, and interpolated for any time offset.
+The constant errors are those of initial attitude, gyros, accelerometers and position scale. For
+small errors, the motion is linear in them.
 
-The derivative with respect to the scale factor error is a smooth path through the positions
-(:func:`px4fuse.filter.marginal_likelihood.subtract_smooth_path`). The IMU motion is not used for
-this derivative, because its noise would bias the scale (errors in variables, Fuller 1987).
+The derivative with respect to the scale is a smooth path through the positions. Noise of the IMU
+motion would bias the scale (errors in variables, Fuller 1987).
 """
 
 from __future__ import annotations
@@ -43,57 +40,49 @@ from px4fuse.trajectory.rotation import (
 
 # Prior σ (rad) of the errors of tilt and heading at the start of a segment
 HEADING_SIGMA_RAD = 0.05
-# Prior σ of the unknown constants, wide for consumer sensors: initial tilt and heading (rad), gyro
-# bias (rad/s), accelerometer bias (m/s²), scale of the positions (1)
+# Prior σ: initial attitude (rad), gyro bias (rad/s), accelerometer bias (m/s²), scale (1)
 PRIOR_SIGMAS_OF_SEGMENT_CONSTANTS = np.repeat([HEADING_SIGMA_RAD, 0.004, 0.3, 0.1], [3, 3, 3, 1])
-# Maximum gyro bias (rad/s) that is fitted to the positions: 5 σ of its prior. A larger bias is
-# first estimated from EKF2's attitude and subtracted
+# A larger gyro bias (rad/s) is subtracted before the fit: 5 σ of its prior
 MAX_PRIOR_GYRO_BIAS_RAD_S = 0.02
 # Maximum gyro bias (rad/s) that EKF2 can remove from its attitude: the maximum of EKF2_GYR_B_LIM
 MAX_REMOVED_GYRO_BIAS_RAD_S = 0.4
-# Maximum length (s) of a segment: in 30 s a gyro bias of 0.004 rad/s rotates the attitude by
-# 0.12 rad. The linearised acceleration then has an error of 0.07 m/s²: g · 0.12² / 2
+# Maximum length (s) of a segment: attitude errors must stay small for the linearisation
 MAX_SEGMENT_DURATION_S = 30.0
 # Maximum tested time offset (s) between position source and IMU
 MAX_TESTED_TIME_OFFSET_S = 0.6
-# Number of tested time offsets in the coarse search
 COARSE_OFFSET_COUNT = 25
-# Approximate number of position measurements in the coarse search for a time offset
 COARSE_MEASUREMENT_COUNT = 600
-# Maximum number of array elements in a batch of time offsets, to limit the memory
+# Maximum number of array elements at once, to limit the memory
 MAX_BATCH_ELEMENTS = 2**16
 # Minimum number of position measurements in all segments together
 MIN_TOTAL_MEASUREMENTS = 30
-# Minimum number of position measurements in a segment
 MIN_SEGMENT_MEASUREMENTS = 15
 # Minimum number of position measurements in a segment after downsampling
 MIN_KEPT_MEASUREMENTS = 5
 # Interval (s) over which the IMU is averaged before integration
 INTEGRATION_STEP_S = 0.02
-# Prior precision of position (1/m²) and of velocity (s²/m²) at the start of a segment: so small
-# that it only prevents a singular matrix
+# Small prior precision of initial position (1/m²) and velocity (s²/m²) against a singular matrix
 INITIAL_STATE_PRIOR_PRECISIONS = 1e-6, 1e-4
-# Maximum median interval (s) between IMU samples for an estimate of the motion
+# Maximum median interval (s) between IMU samples
 MAX_IMU_INTERVAL_S = 0.025
 
 
 @dataclass(frozen=True)
 class SegmentMotion:
-    """Motion of one segment from the IMU, and its derivatives with respect to the IMU's errors.
+    """Motion of one segment from the IMU, and its derivatives with respect to IMU errors.
 
-    ``motion_and_derivatives``, shape (times, 2, 3, 1 + c), contains position and velocity along
-    NED. The last dimension contains the motion without errors, then its derivative with respect to
-    each of c = 9 constants: initial attitude error, gyro bias and accelerometer bias. The
-    acceleration is constant between successive times.
+    ``motion_and_derivatives``, shape (times, 2, 3, 10), contains position and velocity along NED.
+    The last dimension is the motion, then its derivatives with respect to initial attitude error,
+    gyro bias and accelerometer bias.
     """
 
     time_s: Array
     motion_and_derivatives: Array
 
     def interpolate(self, time_s: Array) -> tuple[Array, Array]:
-        """Return position and velocity at other times, each with the shape (..., 3, 1 + c).
+        """Return position and velocity at other times, each with the shape (..., 3, 10).
 
-        The last dimension contains the motion, then its derivatives with respect to c constants.
+        The last dimension contains the motion, then its derivatives.
         """
         last_index = len(self.time_s) - 2
         row = np.clip(np.searchsorted(self.time_s, time_s, side="right") - 1, 0, last_index)
@@ -111,20 +100,18 @@ MotionCache = dict[Span, SegmentMotion]
 
 @dataclass(frozen=True)
 class PositionsAndImuMotion:
-    """Position measurements, and the motion from the IMU at their times.
+    """Position measurements, and the IMU motion at their times.
 
     Symbols in shapes: s segments, m measurements, a axes.
 
     Attributes
     ----------
-    time_s : ndarray, shape (m,)
     measurement_m : ndarray, shape (m, a)
         Positions relative to the segment's first position; NaN if missing.
     measurement_weights : ndarray, shape (m,)
         The variance of a measurement is SIGMA_Z² / weight.
     segment_edges : ndarray of int, shape (s + 1,)
-        Index of the first measurement of each segment; the last element is m.
-    segment_motions : tuple of SegmentMotion
+        Index of the first measurement of each segment, then m.
     directions : ndarray, shape (a, 3)
         Unit vectors of the axes in NED.
     dt_s : float
@@ -144,11 +131,7 @@ class PositionsAndImuMotion:
     heading_sigma_rad: float = HEADING_SIGMA_RAD
 
     def downsample(self, max_measurement_count: int) -> PositionsAndImuMotion:
-        """Keep about ``max_measurement_count`` measurements.
-
-        Segments with fewer than ``MIN_KEPT_MEASUREMENTS`` of them are dropped. If this would drop
-        all segments, all measurements are kept.
-        """
+        """Keep about ``max_measurement_count`` measurements; drop segments with too few of them."""
         is_kept = (
             np.arange(len(self.time_s)) % max(1, round(len(self.time_s) / max_measurement_count))
             == 0
@@ -170,10 +153,9 @@ class PositionsAndImuMotion:
         )
 
     def make_positions_and_increments(self, time_offsets_s: Array) -> PositionsAndIncrements:
-        """Return the positions, and for each time offset the IMU increments between them.
+        """Return the positions, and for each time offset the IMU increments Δp and Δv between them.
 
-        The increments are the changes of position and velocity that the IMU measured. The result
-        contains no derivative for the scale factor of the positions.
+        The scale factor of the positions cannot be estimated from the result.
         """
         interval_s = np.diff(self.time_s)
         process_noise_per_sigma_a_squared = self.dt_s * np.stack(
@@ -189,8 +171,7 @@ class PositionsAndImuMotion:
             self.segment_edges, self.segment_edges[1:], self.segment_motions, strict=False
         ):
             measurement_time_s = self.time_s[begin:end]
-            # Shape (axes, time offsets, 1 + constants, times). The third dimension contains the
-            # motion, then its derivative with respect to each constant
+            # Shape (axes, time offsets, 1 + constants, times): the motion, then its derivatives
             position, velocity = (
                 np.moveaxis(self.directions @ signal, (2, 0, 3, 1), range(4))
                 for signal in segment_motion.interpolate(
@@ -217,9 +198,9 @@ class PositionsAndImuMotion:
         )
 
     def make_positions_at_offset(self, offset_s: float) -> PositionsAndIncrements:
-        """Return the positions, and the IMU increments between them with one time offset.
+        """Return the positions, and the IMU increments Δp and Δv for one time offset.
 
-        The result contains the derivative for the scale factor, so that a fit can estimate it.
+        The scale factor of the positions can be estimated from the result.
         """
         return next(self.make_position_batches(np.array([offset_s])))
 
@@ -228,7 +209,7 @@ class PositionsAndImuMotion:
     ) -> Iterator[PositionsAndIncrements]:
         """Yield positions and IMU increments for batches of time offsets.
 
-        With ``estimates_scale``, the scale factor of the positions is a constant to be fitted.
+        With ``estimates_scale``, the scale factor of the positions can be estimated.
         """
         values_per_offset = (
             len(self.time_s) * len(self.directions) * (1 + len(PRIOR_SIGMAS_OF_SEGMENT_CONSTANTS))
@@ -251,8 +232,7 @@ class PositionsAndImuMotion:
     ) -> tuple[float, NoiseParameters]:
         """Return the time offset and SIGMA_A with the maximum likelihood on a coarse grid.
 
-        ``sigma_a_factors`` are the tested multiples of SIGMA_A. With ``estimates_scale``, the
-        scale factor of the positions is estimated.
+        ``sigma_a_factors`` are the tested multiples of SIGMA_A.
         """
         tested_offsets_s = np.linspace(
             -MAX_TESTED_TIME_OFFSET_S, MAX_TESTED_TIME_OFFSET_S, COARSE_OFFSET_COUNT
@@ -304,13 +284,12 @@ def compute_imu_motion(
 
     Parameters
     ----------
-    flight : Flight
-    time_s : ndarray, shape (m,)
-    measurement_m : ndarray, shape (m, a)
+    time_s, measurement_m : ndarray, shape (m,) and (m, a)
+        Positions (m) and their times.
     directions, dt_s, measurement_weights, heading_sigma_rad
         See :class:`PositionsAndImuMotion`; weights are 1 by default.
     motion_cache : dict, optional
-        IMU motion of this flight that is already computed; new motion is added.
+        IMU motion that is already computed; new motion is added.
     max_segment_duration_s : float
         Maximum length of a segment.
     """
@@ -365,8 +344,7 @@ def compute_imu_motion(
             "Analyse a longer segment.",
         )
     segment_edges = np.cumsum([0, *map(len, rows_by_segment)])
-    # The initial position of a segment is unknown. Its first position is subtracted, because
-    # smaller numbers have smaller rounding errors
+    # Positions relative to the first one have smaller rounding errors
     measured_m = pd.DataFrame(measurement_m[used_rows])
     segment_index = np.repeat(np.arange(len(rows_by_segment)), np.diff(segment_edges))
     first_position_m = measured_m.groupby(segment_index).transform("first")
@@ -384,7 +362,7 @@ def compute_imu_motion(
 
 
 def _find_covered_spans(imu_time_s: Array, attitude_time_s: Array) -> list[Span]:
-    """Find the time spans (s) without a gap in IMU or attitude; none if the IMU rate is too low."""
+    """Find time spans (s) without a gap in IMU or attitude; none if the IMU rate is too low."""
     if len(imu_time_s) < 2 or np.median(np.diff(imu_time_s)) > MAX_IMU_INTERVAL_S:
         return []
     gap_indices = np.flatnonzero(find_imu_gaps(imu_time_s))
@@ -433,8 +411,7 @@ def make_segment_motion(
     acceleration = np.zeros_like(velocity)
     acceleration[:, :, 0] = specific_force_ned_m_s2
     acceleration[:, 2, 0] += constants.g
-    # A small attitude error θ adds θ × f to the acceleration. A gyro bias b causes the attitude
-    # error θ = -∫ R b dt
+    # An attitude error θ adds θ × f to the acceleration; a gyro bias b causes θ = -∫ R b dt
     attitude_error_by_unit_gyro_bias = -INTEGRATION_STEP_S * (
         np.cumsum(body_to_ned, axis=0) - body_to_ned / 2.0
     )
@@ -461,11 +438,10 @@ def make_segment_motion(
 def _estimate_large_gyro_bias(
     step_times_s: Array, gyro_integral_rad: Array, attitude: pd.DataFrame
 ) -> Array:
-    """Return a large gyro bias (rad/s): the difference of gyros and logged attitude.
+    """Return a large gyro bias (rad/s), estimated from the logged attitude.
 
-    The result is zero if the bias is at most ``MAX_PRIOR_GYRO_BIAS_RAD_S``, because a later fit
-    estimates small biases. It is also zero above ``MAX_REMOVED_GYRO_BIAS_RAD_S``, because the
-    logged attitude is then wrong.
+    A small bias gives zero, because a later fit estimates it. A bias above
+    ``MAX_REMOVED_GYRO_BIAS_RAD_S`` gives zero, because the logged attitude is then wrong.
     """
     samples = rows_between(attitude, step_times_s[0], step_times_s[-1])[Columns.QUATERNION]
     if len(samples) < MIN_KEPT_MEASUREMENTS:
@@ -489,10 +465,9 @@ def _estimate_large_gyro_bias(
 def _integrate_gyros(
     step_times_s: Array, gyro_integral_rad: Array, attitude: pd.DataFrame
 ) -> Array:
-    """Return attitudes from angular increments, starting at the logged attitude.
+    """Integrate the gyroscopes to attitudes, starting at the logged attitude.
 
-    ``gyro_integral_rad`` is the integral of the angular rate. The attitudes are quaternions from
-    body to NED, w first.
+    The attitudes are quaternions from body to NED, w first.
     """
     attitude_time_s = attitude.index.to_numpy()
     nearby_rows = slice(

@@ -1,14 +1,13 @@
 """KF: the two-state Kalman filter of the lesson UAT 366, module 2, computed with filterpy.
 
-State x = [position, velocity] along one axis; the input u is the acceleration over the step::
+State x = [position, velocity] along one axis; the input u is the acceleration::
 
     predict    x = Fx + Bu        P = FPFᵀ + Q
     update     y = z - Hx         S = HPHᵀ + R      K = PHᵀS⁻¹
                x = x + Ky         P = (I - KH)P
 
-F, B, Q and H are defined in :mod:`px4fuse.filter.model`, the prediction steps in
-:mod:`px4fuse.filter.steps`. :mod:`~px4fuse.filter.likelihood` runs KF with fewer predictions; the
-results are equal to 1e-9.
+F, B, Q and H are defined in :mod:`px4fuse.filter.model`. The module
+:mod:`~px4fuse.filter.likelihood` runs KF with fewer predictions and equal results.
 """
 
 from collections.abc import Sequence
@@ -47,11 +46,11 @@ class Replay:
     Attributes
     ----------
     steps : DataFrame, shape (n, 7)
-        State and covariance after each step, and the acceleration of the next step.
+        State and covariance after each step.
     updates : DataFrame, shape (m, 8)
-        Innovation ν = z - Hx⁻, S = HP⁻Hᵀ + R, gains and predicted state at each measurement.
+        Innovation, innovation variance, gains and predicted state at each measurement.
     input_gap_s : float
-        Time without IMU data, in which Q is increased.
+        Time without IMU data.
     """
 
     axis: Axis
@@ -70,12 +69,10 @@ def replay(
 
     Parameters
     ----------
-    axis : Axis
-    settings : Settings
     initial : InitialState, optional
-        Default: the first measurement (which is then not fused) and velocity zero.
+        Default: the first measurement, with velocity zero.
     fast : bool
-        True to compute with Python floats instead of filterpy; results are equal to 1e-9.
+        True to compute with Python floats instead of filterpy (faster, equal results).
 
     Raises
     ------
@@ -118,7 +115,7 @@ def replay(
 
 
 def _make_table(rows: TableRows, index: "pd.Index[float]", columns: list[str]) -> pd.DataFrame:
-    # an array first, because pandas needs twice the time for a list of tuples
+    # pandas needs twice the time for a list of tuples
     values = np.fromiter(chain.from_iterable(rows), np.float64, len(rows) * len(columns))
     return pd.DataFrame(values.reshape(-1, len(columns)), index, columns)
 
@@ -154,7 +151,7 @@ def _run_with_filterpy(
     for u, B, F, Q, measured_m in zip(*matrices, inputs[3], strict=True):
         kalman.predict(u=u, B=B, F=F, Q=Q)
         if measured_m is not None:
-            # Without the argument H, filterpy would convert and copy the scalar measurement (slow)
+            # Without the argument H, filterpy copies the measurement (slow)
             kalman.update(measured_m, H=kalman.H)
             x, P, K = kalman.x_prior, kalman.P_prior, kalman.K
             updates.append(
@@ -177,7 +174,7 @@ def _run_with_filterpy(
 def _run_with_floats(
     initial_state: InitialState, measurement_variance: float, *inputs: Sequence[Any]
 ) -> tuple[TableRows, TableRows]:
-    """Run KF with Python floats: a fast replacement of :func:`_run_with_filterpy`."""
+    """Run KF with Python floats, which is faster than filterpy."""
     position, velocity, covariance = (
         initial_state.position_m,
         initial_state.velocity_m_s,
@@ -204,8 +201,7 @@ def _run_with_floats(
 def _find_previous_steps(run: Replay, times_s: Array) -> tuple[IntArray, Array, BoolArray]:
     """Find for each time the last step of KF before it.
 
-    Return the index of this step, the time (s) since this step, and a mask: True for times before
-    the start or after the end of KF.
+    Return its index, the time (s) since this step, and True for times outside KF's time span.
     """
     step_times_s = run.steps.index.to_numpy()
     step_index = np.clip(
@@ -221,8 +217,7 @@ def _find_previous_steps(run: Replay, times_s: Array) -> tuple[IntArray, Array, 
 def predict_state(run: Replay, times_s: Array) -> Array:
     """Predict position (m) and velocity (m/s) at each time from KF's last step before it.
 
-    The state is not interpolated, because the next step contains a later measurement. Times before
-    the start or after the end of KF give NaN.
+    Interpolation would use later measurements. Times outside the time span of KF give NaN.
     """
     step_index, elapsed_s, is_outside = _find_previous_steps(run, times_s)
     position, velocity, acceleration = (
@@ -234,7 +229,7 @@ def predict_state(run: Replay, times_s: Array) -> Array:
 
 
 def predict_variance(run: Replay, times_s: Array) -> Array:
-    """Return the variances (m², m²/s²) of the results of :func:`predict_state`: FPFᵀ + Q."""
+    """Return the variances (m², m²/s²) of position and velocity from :func:`predict_state`."""
     step_index, elapsed_s, is_outside = _find_previous_steps(run, times_s)
     p00, p01, p11 = run.steps[model.COVARIANCE_COLUMNS].to_numpy()[step_index].T
     imu_gap_variance_m2_s4 = run.steps["input_variance_m2_s4"].to_numpy()[step_index]

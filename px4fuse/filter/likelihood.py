@@ -1,8 +1,7 @@
 """KF with one prediction per measurement, and 95 % likelihood intervals of its noises.
 
-The acceleration is first integrated between measurements, so KF needs few predictions and is fast.
-If SIGMA_A and SIGMA_Z are at least 1e-3, the innovations equal those of
-:mod:`px4fuse.filter.kalman` to 1e-9.
+The acceleration is first integrated between measurements, which is faster. If all σ are at least
+1e-3, the innovations equal those of :mod:`px4fuse.filter.kalman` to 1e-9.
 """
 
 from __future__ import annotations
@@ -29,15 +28,13 @@ from px4fuse.filter.settings import InitialState, Settings
 from px4fuse.filter.signals import Axis
 from px4fuse.filter.steps import PredictionSteps, make_prediction_steps
 
-# Decrease of the log-likelihood (nats) from its maximum to the ends of a 95 % interval: half of the
-# 95 % point of χ²(1)
+# Log-likelihood decrease (nats) at the ends of a 95 % interval: half the 95 % point of χ²(1)
 MAX_LOG_LIKELIHOOD_DROP = float(chdtri(1, 0.05)) / 2.0
-# Initial step (of ln σ) in the search for an end of the 95 % interval of σ, from its estimate
+# Initial step of ln σ in the search for an end of the 95 % interval
 INITIAL_LOG_SIGMA_SEARCH_STEP = 0.05
-# For each tested value of SIGMA_A, the best SIGMA_Z is searched (or vice versa). Maximum change of
-# the logarithm of this other σ from one tested value to the next
+# Maximum change of ln SIGMA_Z between two tested values of SIGMA_A, or vice versa
 MAX_OTHER_LOG_SIGMA_CHANGE = 1.0
-# Tolerance of the logarithm of the other σ in the search for its best value
+# Tolerance of ln σ in the search for the best SIGMA_Z with given SIGMA_A, or vice versa
 OTHER_LOG_SIGMA_TOLERANCE = 2e-3
 
 
@@ -45,20 +42,16 @@ OTHER_LOG_SIGMA_TOLERANCE = 2e-3
 class PreintegratedMotion:
     """Positions for KF, and IMU acceleration integrated over the intervals between them.
 
-    Arrays have the shape (m,), if not stated otherwise.
+    Arrays have one row for each position.
 
     Attributes
     ----------
     interval_s : ndarray
-        Time from the initial state or the previous position to each position.
+        Time since the previous position (first: since the initial state).
     delta_position_m, delta_velocity_m_s : ndarray
         Δp and Δv in each interval due to the acceleration.
     process_noise_per_sigma_a_squared, process_noise_independent_of_sigma_a : ndarray, shape (m, 3)
-        Elements 00, 01, 11 of the process noise Q in each interval: Q / SIGMA_A², and the
-        additional Q in gaps of the IMU.
-    measurement_m : ndarray
-        Measured positions.
-    initial_state : InitialState
+        Q / SIGMA_A² of each interval, and additional Q in IMU gaps: elements 00, 01, 11.
     """
 
     interval_s: Array
@@ -113,7 +106,7 @@ def integrate_acceleration(
 ) -> ArrayPair:
     """Integrate an acceleration over the intervals between measurements: Δp (m) and Δv (m/s).
 
-    ``acceleration_m_s2``, shape (n - 1,), contains the acceleration in each prediction step.
+    ``acceleration_m_s2`` contains the acceleration in each prediction step.
     """
     _, interval_index, time_from_step_to_interval_end_s = _assign_steps_to_intervals(
         prediction_steps
@@ -156,15 +149,12 @@ def innovations(
     sigma_z_m: float,
     is_skipped: BoolArray | None = None,
 ) -> ArrayPair:
-    """Run KF; return ν (m) and S (m²) of each measurement, shape (m,).
+    """Run KF; return the innovation ν (m) and its variance S (m²) of each measurement.
 
-    KF can filter k inputs at once: if Δp, Δv and the measurements have k columns, ν has the shape
-    (m, k).
+    With k columns of measurements and increments, KF filters them at once: ν has the shape (m, k).
 
     Parameters
     ----------
-    preintegrated_motion : PreintegratedMotion
-    sigma_a_m_s2, sigma_z_m : float
     is_skipped : ndarray of bool, shape (m,), optional
         True for measurements that KF does not fuse. Their innovation is also returned.
     """
@@ -201,8 +191,7 @@ def innovations(
         variance_and_gains_by_measurement.append((s, 0.0, 0.0) if skips_update else (s, k0, k1))
         covariance = covariance if skips_update else updated_covariance
     s, k0, k1 = np.array(variance_and_gains_by_measurement).T
-    # The next predicted state is F(x + K(z - Hx)) + [Δp, Δv], with the gain K. These equations are
-    # linear in the states x, so LAPACK solves them for all measurements at once
+    # The predicted states solve linear equations, so LAPACK computes all of them at once
     dt = preintegrated_motion.interval_s[1:]
     position_gain = k0[:-1] + dt * k1[:-1]
     measured_m = np.ascontiguousarray(preintegrated_motion.measurement_m.T)
@@ -234,8 +223,7 @@ def innovations(
 def fit_parabola_vertex(profile: Array, index: int) -> tuple[float, float]:
     """Fit a parabola to ``profile[index]`` and its two neighbours.
 
-    Return the distance from ``index`` to the minimum (0 without a minimum), and the second
-    difference of the profile.
+    Return the distance from ``index`` to the minimum of the parabola, and its second difference.
     """
     left_value, middle_value, right_value = profile[index - 1 : index + 2]
     curvature = left_value - 2.0 * middle_value + right_value
@@ -247,8 +235,7 @@ def compute_profile_likelihood_interval(
 ) -> tuple[float | None, float | None]:
     """Return the interval of a parameter in which -ln p on a grid is close to its minimum.
 
-    At its ends, -ln p is ``max_log_likelihood_drop`` larger than the minimum; the default gives a
-    95 % interval. An end outside the grid is None.
+    By default this is the 95 % interval. An end outside the grid is None.
     """
     score_rises = profile - profile.min()
     first_index, last_index = np.flatnonzero(score_rises <= max_log_likelihood_drop)[[0, -1]]
@@ -280,14 +267,13 @@ def find_profile_likelihood_interval(
     Parameters
     ----------
     score : callable
-        -ln p as a function of the logarithms of the parameter and of a second parameter, over
-        which -ln p is minimised.
+        -ln p as a function of the logarithms of this parameter and of a second one.
     best_log_sigmas : (float, float)
         Natural logarithms of both parameters at the minimum.
     parameter_bounds : (float, float)
-        Bounds of the first parameter, not of its logarithm.
+        Bounds of the first parameter.
     variance_factor : float
-        Factor on the parameter's variance, for uncertainty that ``score`` does not include.
+        Factor on the variance, for uncertainty that ``score`` omits.
     """
     best_score = score(*best_log_sigmas)
     max_sqrt_log_likelihood_drop = float(np.sqrt(MAX_LOG_LIKELIHOOD_DROP * variance_factor))

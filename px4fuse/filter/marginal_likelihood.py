@@ -3,22 +3,12 @@
 A segment is a part of the flight without a gap in the IMU data. Each segment has an unknown initial
 state and unknown constants (biases and other constant errors).
 
-Given the acceleration, -2 ln p of the states x_k = [p, v] at the measurements is a sum of squares:
+Given the acceleration, position and velocity at the measurements are estimated by least squares.
+The normal equations Ax = b have a banded matrix A. The likelihood equals that of KF's innovations
+(Schweppe 1965).
 
-- x_{k+1} - Fx_k - [Δp, Δv] of each interval, weighted by Q⁻¹;
-- z - p of each measurement, over its variance.
-
-The minimum of this sum is given by normal equations Ax = b. The likelihood follows from log|A| and
-from the squared residuals at the minimum; it equals that of KF's innovations (Schweppe 1965). A has
-only three bands below the diagonal, so LAPACK factorises A for a whole flight in a millisecond.
-
-The constants are estimated by linear regression. Its inputs are the data, and the derivative of the
-data with respect to each constant. Each input contains z, Δp and Δv of all measurements. The Gram
-matrix contains the inner products of the inputs, weighted by the inverse covariance of the
-positions. The constants are eliminated by its Schur complement.
-
-Time-correlated noise is a third state, c_{k+1} = ρ c_k + noise. The residual of a measurement is
-then z - p - c.
+The constants are estimated by linear regression. Its inputs are the data, and their derivatives
+with respect to each constant. The Gram matrix contains the weighted inner products of the inputs.
 
 Symbols in shapes: m measurements, a axes, s segments, T time offsets, c constants.
 """
@@ -39,13 +29,11 @@ from px4fuse.core.arrays import Array, ArrayPair, BoolArray, IntArray
 UNCHANGED_SIGMAS = np.ones(1)
 # Acceleration noise and position noise of the smoother that estimates a path from the positions
 PATH_SMOOTHER_SIGMA_A_M_S2, PATH_SMOOTHER_SIGMA_Z_M = 0.5, 0.1
-# Minimum prior precision (1/m² or s²/m²) of a state that counts as known. Smaller values only
-# prevent a singular matrix
+# Minimum prior precision (1/m² or s²/m²) of a state that counts as known
 MIN_PRECISION_OF_KNOWN_STATE = 1e-3
-# A process noise matrix Q can be singular. To make Q invertible, a small variance is added to its
-# position variance Q₀₀. The square root of this variance is this fraction of √(R + Q₀₀)
+# Q can be singular, so a small variance is added to Q₀₀: its σ as a fraction of √(R + Q₀₀)
 REGULARISATION_TO_POSITION_SIGMA_RATIO = 1e-5
-# Number of inner products (each of a pair of inputs) that are computed at once, to limit memory
+# Number of inner products that are computed at once, to limit the memory
 INNER_PRODUCTS_PER_BATCH = 8
 # Minimum ratio |Q| / (Q₀₀ Q₁₁): a smaller determinant is a rounding error
 MIN_DETERMINANT_TO_VARIANCE_PRODUCT_RATIO = 1e-12
@@ -53,7 +41,7 @@ MIN_DETERMINANT_TO_VARIANCE_PRODUCT_RATIO = 1e-12
 
 @dataclass(frozen=True)
 class PositionsAndIncrements:
-    """Positions of one source along several axes, and the IMU increments Δp and Δv between them.
+    """Positions of one source along several axes, with the IMU increments Δp and Δv between them.
 
     Symbols in shapes: m measurements, a axes, s segments, T tested time offsets, c unknown
     constants (biases, ...).
@@ -61,22 +49,21 @@ class PositionsAndIncrements:
     Attributes
     ----------
     measurement_m : ndarray, shape (m, a)
-        Measured positions; NaN if an axis has no measurement.
+        Measured positions; NaN if an axis has none.
     segment_starts : ndarray of int, shape (s,)
         Index of the first measurement of each segment.
     interval_s : ndarray, shape (m - 1,)
-        Intervals between measurements; not used between two segments.
+        Intervals between measurements.
     process_noise_per_sigma_a_squared : ndarray, shape (3, m - 1)
         Elements 00, 01, 11 of Q / SIGMA_A² in each interval.
     process_noise_independent_of_sigma_a : ndarray, shape (3, m - 1)
-        Elements 00, 01, 11 of further process noise in each interval, for example in IMU gaps.
+        Elements 00, 01, 11 of further process noise, for example in IMU gaps.
     prior_precision : ndarray, shape (m, 2)
         Prior precision of position and velocity; 0 without a prior.
     constant_prior_sigmas : ndarray, shape (c,)
         Prior σ of the unknown constants of each segment.
     delta_position_m, delta_velocity_m_s : ndarray, shape (a, T, 1 + c, m - 1)
-        Change of position and velocity in each interval due to the acceleration. The third
-        dimension contains this change, then its derivative with respect to each constant.
+        Δp and Δv in each interval, then their derivatives with respect to each constant.
     correlated_noise : (float, float) or None
         Standard deviation (m) and time constant (s) of time-correlated noise.
     """
@@ -127,9 +114,8 @@ class PositionsAndIncrements:
     ) -> tuple[PositionsAndIncrements, Array]:
         """Divide all σ by SIGMA_Z; return the result and the variance of each measurement.
 
-        ``random_walk_to_sigma_z_ratio`` (1/√s) is the random walk of the source divided by SIGMA_Z.
-        The variance is 1 / weight. If there are fewer weights than measurements, the first
-        measurements are initial states, with the variance 1.
+        The variance is 1 / weight. Measurements without weight are initial states with variance 1.
+        ``random_walk_to_sigma_z_ratio`` has the unit 1/√s.
         """
         process_noise_independent_of_sigma_a = (
             self.process_noise_independent_of_sigma_a / sigma_z_m**2
@@ -154,8 +140,8 @@ class PositionsAndIncrements:
     ) -> Iterator[tuple[list[int], BandedNormalEquations, int]]:
         """Factorise the normal equations of positions and velocities, for each group of axes.
 
-        A group contains all axes with the same measurement times, because their equations are
-        equal. Yield (indices of the axes, factorised equations, degrees of freedom of one axis).
+        Axes with the same measurement times form one group, because their equations are equal.
+        Yield axis indices, equations, and degrees of freedom of one axis.
         """
         is_measured = np.isfinite(self.measurement_m)
         process_noise = (
@@ -172,8 +158,7 @@ class PositionsAndIncrements:
             ]
             remaining_axes = [axis for axis in remaining_axes if axis not in axes]
             measurement_and_prior_precision = self.prior_precision.copy()
-            # Fewer than two measurements do not determine the initial state of a segment. A prior
-            # determines it, and the segment does not contribute to the likelihood
+            # A segment with fewer than two measurements does not contribute to the likelihood
             has_too_few_measurements = (
                 np.add.reduceat(is_axis_measured.astype(int), self.segment_starts) < 2
             )
@@ -216,10 +201,9 @@ class PositionFit:
     Attributes
     ----------
     gram_matrix : ndarray, shape (segments, time offsets, 1 + c, 1 + c)
-        Inner products between c + 1 inputs: the data, and the derivative of the data with respect
-        to each constant. The weight is the inverse covariance of the positions.
+        Inner products of the data and their derivatives, weighted by the inverse covariance.
     covariance_log_determinant : float
-        Logarithm of the determinant of the covariance of the positions.
+        Log determinant of the covariance of the positions.
     degrees_of_freedom : int
         Number of measured positions minus the number needed for the initial states.
     constant_prior_sigmas : ndarray, shape (c,)
@@ -241,11 +225,11 @@ class PositionFit:
         )
 
     def compute_constants_information(self) -> Array:
-        """Return information matrices of c constants, shape (segments, time offsets, c, c)."""
+        """Return information matrices of the constant errors, shape (segments, offsets, c, c)."""
         return np.asarray(self.gram_matrix[..., 1:, 1:] + np.diag(self.constant_prior_sigmas**-2.0))
 
     def estimate_segment_constants(self) -> Array:
-        """Return the best c constant errors (such as biases), shape (segments, time offsets, c)."""
+        """Return the estimated constant errors, shape (segments, time offsets, c)."""
         return np.asarray(
             -np.linalg.solve(self.compute_constants_information(), self.gram_matrix[..., 1:, :1])[
                 ..., 0
@@ -253,10 +237,10 @@ class PositionFit:
         )
 
     def compute_segment_scores(self, sigma_factors: Array = UNCHANGED_SIGMAS) -> Array:
-        """Return the negative log-likelihood of the positions in each segment.
+        """Return -ln p of the positions in each segment, shape (factors, segments, time offsets).
 
-        The shape is (factors, segments, time offsets): one value for all σ times each of
-        ``sigma_factors``. A term that is equal for all time offsets is omitted.
+        All σ are multiplied by each of ``sigma_factors``. A term that is equal for all time offsets
+        is omitted.
         """
         gram_matrix_over_sigma_factor_squared = (
             self.gram_matrix / sigma_factors[:, None, None, None, None] ** 2
@@ -297,10 +281,9 @@ def fit_positions(
 ) -> PositionFit:
     """Fit constant errors (such as biases) to positions, with given SIGMA_A and variances.
 
-    The inputs of the fit are the data, and the derivative of the data with respect to each
-    constant error. ``measured_m``, shape (axes, 1 or time offsets, k, measurements), contains the
-    measured positions of the first k inputs; by default k is 1, the data. The other inputs have
-    measured positions of zero.
+    The inputs of the fit are the data, and their derivatives with respect to each constant error.
+    ``measured_m``, shape (axes, 1 or time offsets, inputs, measurements), contains the positions of
+    the first inputs (default: the data). The positions of the others are zero.
     """
     if measured_m is None:
         measured_m = np.nan_to_num(positions.measurement_m.T)[:, None, None]
@@ -335,9 +318,9 @@ def fit_positions(
 
 
 def _compute_gram_matrix(whitened_inputs: Array) -> Array:
-    """Return the inner products of the inputs, XXᵀ, summed over the axes.
+    """Return the inner products of the inputs, summed over the axes.
 
-    The whitened_inputs inputs X have the shape (axes, ..., inputs, values).
+    ``whitened_inputs`` has the shape (axes, ..., inputs, values).
     """
     return np.asarray((whitened_inputs @ np.swapaxes(whitened_inputs, -1, -2)).sum(axis=0))
 
@@ -345,11 +328,10 @@ def _compute_gram_matrix(whitened_inputs: Array) -> Array:
 def subtract_smooth_path(
     positions: PositionsAndIncrements, *, estimates_scale: bool = False
 ) -> PositionsAndIncrements:
-    """Subtract a smooth path through the positions from the positions and from the IMU increments.
+    """Subtract a smooth path through the positions from the positions and the IMU increments.
 
-    The residuals do not change, but smaller numbers have smaller rounding errors. With
-    ``estimates_scale``, the scale factor error of the positions is the last constant error. The
-    path then becomes the derivative of the data with respect to this error.
+    Smaller numbers have smaller rounding errors. With ``estimates_scale``, the path becomes the
+    derivative of the data with respect to the scale factor error.
     """
     measured_m = positions.measurement_m.copy()
     dp = positions.delta_position_m.copy()
@@ -368,8 +350,7 @@ def subtract_smooth_path(
         path_position_increment_m = (
             np.diff(path_m) - positions.interval_s * path_velocity_m_s[..., :-1]
         )
-        # Each time offset has a separate path. The data of all time offsets contain the same
-        # measured positions, so the path of the first time offset is subtracted from all of them
+        # All time offsets have the same measured positions, so the same path is subtracted
         for array, increment in ((dp, path_position_increment_m), (dv, np.diff(path_velocity_m_s))):
             array[axes, :, 0] -= increment[:, :1]
             if estimates_scale:
@@ -383,26 +364,20 @@ def estimate_squared_errors(
     variance_m2: Array,
     constant_errors: Array,
 ) -> ArrayPair:
-    """Return the expected squared error (m²) and the number of measured axes of each measurement.
+    """Return the expected squared error (m²) of each measurement, and its number of measured axes.
 
-    The error is measured minus true position. Its expected square is (measured minus smoothed
-    position)² plus the variance of the smoothed position, summed over the axes.
+    It is the squared distance to the smoothed position plus its variance, summed over the axes.
 
     Parameters
     ----------
-    positions : PositionsAndIncrements
-        Positions with one time offset.
-    sigma_a_m_s2 : float
     variance_m2 : ndarray, shape (m,)
         Variance of each measurement.
     constant_errors : ndarray, shape (segments, c)
-        Maximum-likelihood values of the c constant errors (such as biases).
+        Estimated constant errors (such as biases).
     """
     data_and_derivative_weights = np.concatenate(
         [np.ones((len(constant_errors), 1)), constant_errors], axis=1
     )
-    # Correct Δp and Δv of each interval with the constant errors of its segment: 1 · Δp plus the
-    # derivatives of Δp times the constant errors
     data_and_derivative_weights_by_interval = np.repeat(
         data_and_derivative_weights, np.diff([*positions.segment_starts, len(variance_m2)]), axis=0
     )[1:]
@@ -426,23 +401,19 @@ def compute_segment_inner_products(
     left_positions_and_increments: Sequence[Array],
     right_positions_m: Array,
 ) -> Array:
-    """Return the inner products uᵀC⁻¹v of k pairs (u, v) of inputs, shape (segments, k).
+    """Return inner products uᵀC⁻¹v of k pairs (u, v) of inputs, shape (segments, k).
 
-    Each input contains measured positions, Δp and Δv. C is the covariance of the positions if the
-    acceleration is given. It includes the effect of unknown constant errors (such as biases).
+    C is the covariance of the positions, given the acceleration. It includes unknown constant
+    errors (such as biases).
 
     Parameters
     ----------
-    positions : PositionsAndIncrements
-        Positions with one time offset.
-    sigma_a_m_s2 : float
     variance_m2 : ndarray, shape (m,)
         Variance of each measurement.
     left_positions_and_increments : three ndarray
-        Left input u of each pair: measured positions, shape (axes, k, m); Δp and Δv, shape (axes,
-        k, m - 1).
+        Positions, Δp and Δv of each u, shapes (axes, k, m) and twice (axes, k, m - 1).
     right_positions_m : ndarray, shape (axes, k, m)
-        Measured positions of the right input v of each pair. Its Δp and Δv are zero.
+        Positions of each v; its Δp and Δv are zero.
     """
     left_positions_m, *increments = left_positions_and_increments
     increments_per_constant_error = (
@@ -452,8 +423,6 @@ def compute_segment_inner_products(
     inner_products_by_batch = []
     for begin in range(0, right_positions_m.shape[1], INNER_PRODUCTS_PER_BATCH):
         batch = np.s_[:, begin : begin + INNER_PRODUCTS_PER_BATCH]
-        # Inputs of the fit: all left inputs, all right inputs, and the derivatives of the data with
-        # respect to the constant errors
         dp, dv = (
             np.concatenate(
                 [increment[batch], 0.0 * increment[batch], increment_per_constant_error], axis=1
@@ -493,23 +462,22 @@ def compute_segment_inner_products(
 
 @dataclass(frozen=True)
 class BandedNormalEquations:
-    """Normal equations Ax = b with factorised A, for positions and velocities x at measurements.
+    """Factorised normal equations Ax = b for positions and velocities x at the measurements.
 
     Attributes
     ----------
     precision : ndarray, shape (m, 2)
-        Precision of position (1/m²) and velocity (s²/m²): that of the measurement plus the prior.
+        Precision of position (1/m²) and velocity (s²/m²), including the prior.
     interval_s : ndarray, shape (m - 1,)
         Time between successive measurements.
     inverse_q : ndarray, shape (3, m - 1)
-        Elements 00, 01, 11 of the inverse process noise Q⁻¹; zero for intervals between segments.
+        Elements 00, 01, 11 of Q⁻¹; zero between segments.
     inverse_velocity_noise_sigma : ndarray, shape (m - 1,)
-        1/√Q₁₁, with the velocity variance Q₁₁; zero for intervals between segments.
+        1/√Q₁₁, with the velocity variance Q₁₁; zero between segments.
     bands, cholesky_factor : ndarray, shape (2 + state_count, state_count · m)
         A and its Cholesky factor in LAPACK's band storage.
     log_determinant : float
-        Logarithm of the determinant of the covariance of the positions: ln|A| + Σ ln|Q| - Σ ln
-        precision.
+        Log determinant of the covariance of the positions.
     """
 
     precision: Array
@@ -542,18 +510,15 @@ class BandedNormalEquations:
     def whiten(
         self, measured_m: Array, delta_position_m: Array, delta_velocity_m_s: Array
     ) -> ArrayPair:
-        """Return two arrays for the inner products of inputs, which :func:`fit_positions` needs.
+        """Return two arrays for the inner products of inputs in :func:`fit_positions`.
 
-        The first array w contains Δp and Δv of each input, divided by the square root of Q. The
-        second array e contains the part of each input that the states explain. The inner product
-        of inputs i and j is wᵢᵀwⱼ - eᵢᵀeⱼ + zᵢᵀzⱼ/σ², with the measured positions z.
-        ``measured_m``, shape (..., k, m), contains z of the first k inputs; z of the others is
-        zero.
+        The first array contains Δp and Δv divided by the square root of Q. The second array
+        contains the part of each input that the states explain.
         """
         whitened_increments, right_hand_side = self._whiten_increments(
             measured_m, delta_position_m, delta_velocity_m_s
         )
-        # LAPACK solves a triangular system with unit diagonal 30 % faster: without divisions
+        # LAPACK solves a triangular system with unit diagonal 30 % faster
         diagonal = self.cholesky_factor[0]
         unit_diagonal_factor = self.cholesky_factor / diagonal
         part_explained_by_states, _ = lapack.dtbtrs(
@@ -564,10 +529,9 @@ class BandedNormalEquations:
         )
 
     def solve(self, measured_m: Array, delta_position_m: Array, delta_velocity_m_s: Array) -> Array:
-        """Return the estimated states, shape (..., number of measurements, number of states).
+        """Return the estimated states, shape (..., measurements, states).
 
-        The states are position (m), velocity (m/s) and, if it is fitted, time-correlated noise (m).
-        ``delta_position_m`` and ``delta_velocity_m_s`` are changes measured by the IMU.
+        States: position (m), velocity (m/s), and time-correlated noise (m) if it is fitted.
         """
         _, right_hand_side = self._whiten_increments(
             measured_m, delta_position_m, delta_velocity_m_s
@@ -613,9 +577,7 @@ class BandedNormalEquations:
     def position_variance(self) -> Array:
         """Return the variance (m²) of the smoothed position at each measurement.
 
-        The information of earlier measurements is a block of the Cholesky factor of A. The
-        information of later measurements is a block of the factor of A in reverse time order. Both
-        are added (Fraser and Potter 1969).
+        The information of earlier and of later measurements is added (Fraser and Potter 1969).
         """
         # The Cholesky factor of A in reverse time order contains the later measurements
         time_reversed_bands = np.zeros_like(self.bands)
@@ -627,8 +589,8 @@ class BandedNormalEquations:
         time_reversed_cholesky_factor, _ = lapack.dpbtrf(
             time_reversed_bands, lower=1, overwrite_ab=1
         )
-        # Diagonal blocks of the Cholesky factors: [[a, 0], [b, c]] of A, and [[d, 0], [e, f]] of A
-        # in reverse order, in which velocity precedes position
+        # Diagonal blocks of the Cholesky factors: [[a, 0], [b, c]], and in reverse time order
+        # [[d, 0], [e, f]]. In reverse order, velocity precedes position
         (a, c) = (self.cholesky_factor[0, first_row::2] for first_row in (0, 1))
         b = self.cholesky_factor[1, 0::2]
         (d, f) = (time_reversed_cholesky_factor[0, first_row::2][::-1] for first_row in (0, 1))
@@ -646,7 +608,7 @@ def factorise(
     measurement_and_prior_precision: Array,
     correlated_noise: tuple[float, float] | None = None,
 ) -> BandedNormalEquations:
-    """Return the normal equations Ax = b of the states x at the measurements, with factorised A.
+    """Return the factorised normal equations Ax = b of the states at the measurements.
 
     Parameters
     ----------
@@ -657,7 +619,7 @@ def factorise(
     is_within_segment : ndarray of bool, shape (m - 1,)
         False for intervals between segments.
     measurement_and_prior_precision : ndarray, shape (m, 2)
-        Precision of position (1/m²) and velocity (s²/m²): that of the measurement plus the prior.
+        Precision of position (1/m²) and velocity (s²/m²), including the prior.
         With time-correlated noise, the prior must be negligible.
     correlated_noise : (float, float), optional
         Standard deviation (m) and time constant (s) of time-correlated noise.
@@ -672,8 +634,8 @@ def factorise(
     regularisation_variance_m2 = REGULARISATION_TO_POSITION_SIGMA_RATIO**2 * (
         1.0 / np.median(position_measurement_precision[position_measurement_precision > 0.0]) + q00
     )
-    # Q of one prediction step is singular: its determinant is zero or a rounding error, which is
-    # set to zero. The added variance makes Q invertible
+    # Q of one prediction step is singular, so a small variance is added. A tiny determinant is a
+    # rounding error
     variance_product = q00 * q11
     raw_q_determinant = variance_product - q01**2
     q_determinant = (
@@ -692,8 +654,7 @@ def factorise(
     # Elements of Q⁻¹, and element 10 of FᵀQ⁻¹
     inverse_q00, inverse_q01, inverse_q11 = inverse_q
     position_velocity_weight = inverse_q00 * interval_s + inverse_q01
-    # Information matrix of the states: A = diag(precision) + Σ [-F I]ᵀ Q⁻¹ [-F I] over the
-    # intervals, with KF's transition matrix F. It is stored by columns in LAPACK's band format
+    # A = diag(precision) + Σ [-F I]ᵀ Q⁻¹ [-F I] over the intervals, in LAPACK's band format
     state_count = 2 if correlated_noise is None else 3
     band_storage = np.zeros((len(measurement_and_prior_precision), state_count, state_count + 2))
     position_bands = band_storage[:, 0]
@@ -713,8 +674,7 @@ def factorise(
     if correlated_noise is not None:
         correlated_sigma_m, tau_s = correlated_noise
         rho = np.where(is_within_segment, np.exp(-interval_s / tau_s), 0.0)
-        # Variance of the noise in c_{k+1} = ρ c_k + noise, a first-order Gauss-Markov process: σ_c²
-        # at the first measurement of a segment, then (1 - ρ²) σ_c²
+        # Variance of a Gauss-Markov process: σ_c² at the start of a segment, then (1 - ρ²) σ_c²
         correlated_noise_step_variance_m2 = correlated_sigma_m**2 * np.append(1.0, 1.0 - rho**2)
         correlated_noise_bands = band_storage[:, 2]
         position_bands[:, 2] = position_measurement_precision

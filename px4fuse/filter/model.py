@@ -1,16 +1,14 @@
 """Formulas of KF along one axis.
 
-State x = [position, velocity]; input a, the acceleration averaged over the step::
+State x = [position, velocity]; input a, the mean acceleration of the step::
 
     F = [[1, dt], [0, 1]]    B = [dt²/2, dt]    H = [1, 0]    R = SIGMA_Z²
     Q(dt) = SIGMA_A² · DT · [[dt³/4, dt²/2], [dt²/2, dt]]
 
-With dt = DT, Q is SIGMA_A² · [[dt⁴/4, dt³/2], [dt³/2, dt²]], as in the lesson UAT 366, module 2.
-The velocity noise per second does not depend on dt, so SIGMA_A does not depend on the measurement
-rate.
+With dt = DT, Q equals that of the lesson UAT 366, module 2. The velocity noise per second does not
+depend on dt.
 
-The functions accept floats (one filter) and arrays (many filters). Floats are fifty times faster
-than arrays of one element. A covariance is a tuple of its elements 00, 01, 11.
+The functions accept floats and arrays. A covariance is a tuple of its elements 00, 01, 11.
 """
 
 from typing import TypeVar
@@ -42,19 +40,12 @@ def make_transition_matrix(dt_s: float | Array) -> Array:
 
 
 def compute_process_noise_per_density(dt_s: T) -> SymmetricElements[T]:
-    """Return Q / noise density of one prediction step of length ``dt_s``: elements 00, 01, 11.
-
-    The noise density is SIGMA_A² · DT.
-    """
+    """Return Q / (SIGMA_A² · DT) of one prediction step of length ``dt_s``: elements 00, 01, 11."""
     return dt_s**3 / 4.0, dt_s**2 / 2.0, dt_s
 
 
 def compute_continuous_process_noise_per_density(dt_s: T) -> SymmetricElements[T]:
-    """Return Q / noise density of continuous white acceleration noise over ``dt_s``.
-
-    The noise density is SIGMA_A² · DT. The result (elements 00, 01, 11) is the limit of many short
-    prediction steps.
-    """
+    """Return Q / (SIGMA_A² · DT) of continuous white acceleration noise: elements 00, 01, 11."""
     return dt_s**3 / 3.0, dt_s**2 / 2.0, dt_s
 
 
@@ -80,7 +71,7 @@ def predict_step(
 ) -> tuple[T, T, SymmetricElements[T]]:
     """Return the predicted position, velocity and covariance: Fx + Ba and FPFᵀ + Q.
 
-    ``noise_density`` (m²/s³) is SIGMA_A² · DT: the velocity variance increases by it each second.
+    ``noise_density`` (m²/s³) is SIGMA_A² · DT.
     """
     p00, p01, p11 = propagate_covariance(covariance, dt_s)
     q00, q01, q11 = compute_process_noise_per_density(dt_s)
@@ -98,8 +89,7 @@ def update_step(
 ) -> tuple[tuple[T, T, T, T], tuple[T, T, SymmetricElements[T]]]:
     """Update with a measurement: ν = z - Hx, S = HPHᵀ + R, K = PHᵀS⁻¹, x = x + Kν, P = (I - KH)P.
 
-    Return (ν in m, S in m², gain of position, gain of velocity), and the updated (position,
-    velocity, covariance).
+    Return (ν in m, S in m², position gain, velocity gain), and the updated state and covariance.
     """
     p00, p01, p11 = covariance
     nu = measured_m - position

@@ -17,7 +17,7 @@ INPUT_NAMES: tuple[KfInputName, ...] = get_args(KfInputName)
 
 
 class Range(NamedTuple):
-    """Valid range of a numeric setting, and its unit and name for messages."""
+    """Valid range of a numeric setting, with its unit and name."""
 
     low: float
     high: float
@@ -31,7 +31,7 @@ SETTING_RANGES = {
     "dt_s": Range(1e-3, 1.0, "s", "DT"),
     "clock_offset_s": Range(-10.0, 10.0, "s", "time offset added to the source timestamps"),
 }
-# Numeric settings of KF, without the time offset, which is a property of the position source
+# Numeric settings of KF; the time offset belongs to the position source
 KF_NUMERIC_SETTINGS = tuple(name for name in SETTING_RANGES if name != "clock_offset_s")
 
 
@@ -42,13 +42,13 @@ class Settings:
     Attributes
     ----------
     sigma_a_m_s2 : float
-        Process noise SIGMA_A: standard deviation of the acceleration input over one DT.
+        Process noise SIGMA_A: standard deviation of the acceleration over one DT.
     sigma_z_m : float
         Measurement noise SIGMA_Z.
     dt_s : float
         Prediction interval DT.
     input : {"imu", "zero"}
-        "zero" is the constant-velocity model.
+        IMU acceleration, or zero acceleration (constant-velocity model).
     clock_offset_s : float
         Time offset added to the timestamps of the position source.
 
@@ -78,10 +78,9 @@ class Settings:
 
 
 def requested_settings(request: ComparisonRequest) -> Settings:
-    """Return the KF settings that the user requested, and defaults for all others."""
+    """Return the KF settings that the user requested; all others have default values."""
     values = {name: getattr(request, name) for name in Settings.__dataclass_fields__}
-    # No time offset is set here: "auto" is estimated later, and the reader of a position file adds
-    # its time offset to the timestamps
+    # The time offset is estimated later, or added by the reader of a position file
     if request.clock_offset_s == AUTO or request.position is not None:
         del values["clock_offset_s"]
     return Settings(**{name: value for name, value in values.items() if value is not None})

@@ -29,12 +29,11 @@ from px4fuse.flight.model import (
 
 # Name of the axis along the main horizontal direction of the flight
 AISLE = "aisle"
-# Minimum length (s) of a gap in the IMU
+# Minimum length (s) of an IMU gap
 MIN_IMU_GAP_S = 0.1
-# Minimum length of a gap in the IMU, as multiple of the median sample interval
+# Minimum length of an IMU gap, as multiple of the median sample interval
 MIN_IMU_GAP_INTERVALS = 5.0
-# Positions at a higher rate are downsampled to 1 to 2 times this rate (Hz) before the noises are
-# estimated: at short intervals, position errors are time-correlated and add no information
+# Positions at a higher rate (Hz) are downsampled, because their errors are time-correlated
 MAX_INDEPENDENT_ERROR_RATE_HZ = 25.0
 # Minimum number of position measurements to run KF along an axis
 MIN_MEASUREMENTS = 3
@@ -71,10 +70,9 @@ class Acceleration:
     ----------
     time_s : ndarray, shape (n,)
     acceleration_integral_m_s : ndarray, shape (3, n)
-        Velocity change (NED) since the first IMU sample: integral of the acceleration without
-        gravity. This array is the same for all axes.
+        Velocity change (NED) since the first IMU sample, without gravity.
     acceleration_products_m2_s4 : ndarray, shape (3, 3)
-        Mean product of each two components (NED) of the acceleration in the segment.
+        Mean products of the acceleration components (NED) in the segment.
     direction : ndarray, shape (3,)
         Unit vector of the axis in NED.
     gap_edge_time_s : ndarray, shape (k,)
@@ -97,7 +95,7 @@ class Acceleration:
         return np.asarray(self.direction @ self.acceleration_integral_m_s)
 
     def compute_rms_m_s2(self) -> float:
-        """Return the RMS acceleration in the segment, used as σ of the acceleration in IMU gaps."""
+        """Return the RMS acceleration (m/s²) along the axis in the segment."""
         return float(np.sqrt(self.direction @ self.acceleration_products_m2_s4 @ self.direction))
 
 
@@ -113,8 +111,7 @@ class Axis:
     heading_deg : float or None
         Heading of a horizontal axis, clockwise from north.
     note : str
-        Text for the user on the choice of the aisle's heading.
-    measurement_time_s, measurement_m : ndarray, shape (n,)
+        Explanation of the aisle's heading for the user.
     acceleration : Acceleration or Unavailable
         Input of KF.
     """
@@ -144,7 +141,7 @@ class Axis:
 
 
 def imu_and_attitude(flight: Flight) -> tuple[pd.DataFrame, pd.DataFrame] | Unavailable:
-    """Return two tables: the IMU samples during the time span of the attitude, and the attitude."""
+    """Return the IMU samples during the time span of the attitude, and the attitude."""
     imu, attitude = flight.imu, flight.attitude
     if isinstance(imu, Unavailable):
         return imu
@@ -163,8 +160,7 @@ def imu_and_attitude(flight: Flight) -> tuple[pd.DataFrame, pd.DataFrame] | Unav
 def compute_ned_acceleration(flight: Flight) -> pd.DataFrame | Unavailable:
     """Return the acceleration in NED without gravity (m/s²) for each IMU sample.
 
-    The attitude is interpolated (slerp, Shoemake 1985), because PX4 by default logs it at a tenth
-    of the IMU rate.
+    The attitude is interpolated (slerp, Shoemake 1985), because PX4 logs it at a lower rate.
     """
     if isinstance(imu_with_attitude := imu_and_attitude(flight), Unavailable):
         return imu_with_attitude
@@ -187,9 +183,9 @@ def estimate_aisle_heading(track: PositionTrack, segment: Segment) -> tuple[floa
     Returns
     -------
     heading_deg : float
-        0 to 180, because both directions along an aisle are equivalent.
+        Heading of this direction, 0 to 180.
     length_to_width_ratio : float
-        Ratio of the standard deviations of the positions along and across this direction.
+        Standard deviation along this direction, divided by that across it.
     """
     position_m = cut_to_segment(track.samples, segment)[Columns.POSITION[:2]].dropna().to_numpy()
     centred_m = position_m - position_m.mean(axis=0)
@@ -213,11 +209,8 @@ def make_axes(
 
     Parameters
     ----------
-    flight : Flight
-    track : PositionTrack
-    segment : Segment
     names : tuple of str, optional
-        Names of the axes; by default all four, without those that have no positions.
+        Names of the axes; by default all that have positions.
     heading_deg : float, optional
         Heading of the aisle, clockwise from north; default: main direction of the positions.
 
@@ -273,7 +266,7 @@ def make_axes(
 
 
 def make_horizontal_axis(north_and_east: Sequence[Axis], heading_deg: float) -> Axis:
-    """Combine the axes north and east, with equal measurement times, to one of another heading."""
+    """Combine the axes north and east to a horizontal axis with another heading."""
     north, east = north_and_east
     angle_rad = np.radians(heading_deg)
     direction = np.cos(angle_rad) * north.direction + np.sin(angle_rad) * east.direction
@@ -292,7 +285,7 @@ def make_horizontal_axis(north_and_east: Sequence[Axis], heading_deg: float) -> 
 
 
 def make_downsampling_slice(time_s: Array) -> slice:
-    """Return a slice that downsamples positions at a high rate to every k-th position.
+    """Return a slice that keeps every k-th position if the rate is high.
 
     The rate is then 1 to 2 times ``MAX_INDEPENDENT_ERROR_RATE_HZ``.
     """
@@ -373,7 +366,7 @@ def project_acceleration(
 
 
 def find_imu_gaps(time_s: Array) -> BoolArray:
-    """Return True for each interval between IMU samples that is a gap, shape (n - 1,)."""
+    """Return a mask of the intervals between IMU samples that are gaps, shape (n - 1,)."""
     interval_s = np.diff(time_s)
     return interval_s > max(MIN_IMU_GAP_S, MIN_IMU_GAP_INTERVALS * float(np.median(interval_s)))
 
@@ -381,7 +374,7 @@ def find_imu_gaps(time_s: Array) -> BoolArray:
 def compute_mean_step_acceleration(
     acceleration: Acceleration, step_edges_s: ArrayLike
 ) -> tuple[Array, Array]:
-    """Return the mean acceleration of each prediction step, and its fraction of time in IMU gaps.
+    """Return the mean acceleration of each prediction step, and its fraction in IMU gaps.
 
     ``step_edges_s`` contains the start of the first step, and the end (s) of each step.
     """

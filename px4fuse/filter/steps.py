@@ -10,7 +10,7 @@ from px4fuse.filter.settings import InitialState, Settings
 from px4fuse.filter.signals import Axis, compute_mean_step_acceleration
 from px4fuse.flight.model import Unavailable
 
-# Two timestamps up to this difference (s) are equal: half of their resolution of 1 µs
+# Timestamps with a smaller difference (s) are equal: half of PX4's resolution of 1 µs
 MAX_EQUAL_TIME_DIFFERENCE_S = 5e-7
 
 
@@ -27,7 +27,7 @@ class PredictionSteps:
     acceleration_m_s2 : ndarray, shape (n - 1,)
         Mean acceleration over each step.
     input_variance_m2_s4 : ndarray, shape (n - 1,)
-        Variance that is added to SIGMA_A² in gaps of the IMU.
+        Additional acceleration variance in gaps of the IMU.
     input_gap_s : float
         Time without IMU data.
     """
@@ -80,8 +80,8 @@ def make_prediction_steps(
         )
     mean_acceleration_m_s2, gap_fraction = compute_mean_step_acceleration(axis.acceleration, time_s)
     gap_s = gap_fraction * np.diff(time_s)
-    # In an IMU gap of T seconds, the unknown acceleration is assumed to be constant. The velocity
-    # error is then rms·T instead of rms·√(DT·T) with white noise: the variance is T/DT times larger
+    # Unlike white noise, the unknown acceleration is constant in an IMU gap of T seconds. This
+    # increases the velocity variance by the factor T/DT
     interval_index = np.searchsorted(
         np.flatnonzero(measurement_index >= 0), np.arange(1, len(time_s))
     )

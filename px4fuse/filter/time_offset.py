@@ -1,13 +1,10 @@
 """Time offset between position source and IMU, estimated by maximum likelihood.
 
-KF follows late positions, so a time offset τ hardly increases the innovations. Only the comparison
-of positions with the acceleration shows it. The likelihood of the positions given the acceleration
-is maximised over τ and the noises. Constant errors with a similar effect are estimated too: biases,
-tilt and scale (:mod:`px4fuse.filter.imu_motion`).
+The likelihood of the positions given the acceleration is maximised over time offset and noises.
+Biases, tilt and scale are estimated too, because their effects are similar.
 
-The curvature of the likelihood gives a variance of τ that is too small, because it does not contain
-all effects of the IMU noise. A simulation estimates the missing factor on the variance. The factor
-widens the 95 % interval (sandwich estimate, White 1982).
+IMU noise increases the variance of the time offset. The factor is simulated, and widens the 95 %
+interval (sandwich estimate, White 1982).
 """
 
 from collections.abc import Callable
@@ -41,25 +38,23 @@ from px4fuse.flight.model import Columns, Flight, PositionTrack, Unavailable
 
 # Number of time offsets near the maximum at which the likelihood is computed
 FINE_GRID_OFFSET_COUNT = 11
-# Number of time offsets to which the likelihood is interpolated (the curve in the report)
+# Number of points of the likelihood curve in the report
 LIKELIHOOD_CURVE_POINT_COUNT = 121
-# Prior σ (rad) of EKF2's heading with GNSS: large, because a wrong GNSS delay (0.2 s) rotates
-# EKF2's heading (5°)
+# Prior σ (rad) of EKF2's heading with GNSS: a wrong GNSS delay (0.2 s) causes an error of 5°
 GNSS_HEADING_SIGMA_RAD = 0.2
 # Maximum half-width (s) of the 95 % interval of an accepted time offset
 MAX_OFFSET_INTERVAL_HALF_WIDTH_S = 0.15
-# A segment whose time offset has a larger σ (s) is excluded from the test for a changed time offset
+# Maximum σ (s) of a segment's time offset in the test for a changed time offset
 MAX_SEGMENT_OFFSET_SIGMA_S = 0.15
 # The time offset changes in flight if the p-value of a constant offset is below this limit
 MAX_P_VALUE_OF_CHANGED_OFFSET = 0.005
 # Minimum change (s) of the time offset in flight: a smaller change may be drift of the source
 MIN_TIME_OFFSET_CHANGE_S = 0.10
-# A time offset is significant if it exceeds this multiple of its σ: false alarm probability 0.3 %
+# Minimum ratio of a significant time offset to its σ
 MIN_OFFSET_SIGMAS = 3.0
-# A time offset is significant if it exceeds this time (s): position error of 3 cm at 1 m/s
+# Minimum significant time offset (s): position error of 3 cm at 1 m/s
 MIN_TIME_OFFSET_S = 0.03
-# The variance of the time offset is simulated with IMU noise. Number of simulated groups of flight
-# segments, and number of segments in a group
+# Simulation of IMU noise: number of groups of flight segments, and segments in each group
 SIMULATED_GROUP_COUNT, SEGMENTS_PER_SIMULATED_GROUP = 96, 12
 
 
@@ -82,17 +77,17 @@ class ClockOffset(Record, kw_only=True):
     interval_s : (float, float)
         95 % interval.
     applied_s : float
-        Time offset that was already added to the timestamps before the estimate.
+        Time offset that was already added to the timestamps.
     is_determinable : bool
-        True if the 95 % interval is narrow; otherwise ``reason`` contains the cause.
+        True if the 95 % interval is narrow.
     parts : tuple of PartOffset
         Offsets of consecutive parts of the flight.
     drift_ppm, drift_sigma_ppm : float or None
-        Drift of the source's clock; None with fewer than three parts.
+        Clock drift of the source; None with fewer than three parts.
     change_p_value : float or None
-        p-value of a constant offset (likelihood ratio test); None with one part.
+        p-value of a constant offset; None with one part.
     curve_time_offsets_s, curve_log_likelihood_drops : ndarray, shape (n,)
-        Tested time offsets (s), and the log-likelihood of each: its decrease from the maximum.
+        Tested time offsets, and decrease of the log-likelihood from its maximum.
     """
 
     offset_s: float
@@ -113,7 +108,7 @@ class ClockOffset(Record, kw_only=True):
 
     @property
     def remaining_s(self) -> float:
-        """Estimated offset (s) minus the offset that was already added to the timestamps."""
+        """Estimated offset (s) minus the offset that was already added."""
         return self.offset_s - self.applied_s
 
     @property
@@ -121,7 +116,7 @@ class ClockOffset(Record, kw_only=True):
         return MIN_OFFSET_SIGMAS * self.sigma_s
 
     def has_changed(self) -> bool:
-        """Return True if the offset changes significantly, by MIN_TIME_OFFSET_CHANGE_S or more."""
+        """Return True if the offset changes significantly in flight."""
         if self.change_p_value is None or self.change_p_value >= MAX_P_VALUE_OF_CHANGED_OFFSET:
             return False
         return abs(self.parts[-1].offset_s - self.parts[0].offset_s) >= MIN_TIME_OFFSET_CHANGE_S
@@ -144,22 +139,18 @@ def estimate_time_offset(
 
     Parameters
     ----------
-    flight : Flight
-    track : PositionTrack
-    segment : Segment
     settings : Settings
         ``clock_offset_s`` is a time offset that was already added.
     noise_parameters : NoiseParameters
-        Initial values. The random walk is above zero if the source may drift (odometry).
+        Initial values; the random walk is above zero for odometry, which may drift.
     outlier_time_s : ndarray, optional
         Timestamps of measurements to exclude.
     progress : callable
         Called with the name of each step of the analysis.
     motion_cache : dict, optional
-        IMU motion that several estimates share.
+        IMU motion that is already computed; new motion is added.
     """
-    # GNSS height is noisier than the horizontal position. It is omitted, because all axes have the
-    # same SIGMA_Z
+    # GNSS height is omitted: it is noisier, but all axes have the same SIGMA_Z
     axis_count = 2 if track.origin.is_gnss else 3
     position_samples = cut_to_segment(track.samples, segment)[Columns.POSITION[:axis_count]]
     position_samples = position_samples.dropna(subset=Columns.POSITION[:2])
@@ -213,8 +204,7 @@ def estimate_time_offset(
     )
     has_both_interval_ends = interval_low_s is not None and interval_high_s is not None
     offset_s = _fit_minimum_and_sigma(curve_time_offsets_s, profile_scores)[0]
-    # The timestamp of an IMU sample may be any time in the interval that the sample averages. This
-    # timing error (σ of half an interval) widens both sides of the 95 % interval by 1.96 σ
+    # IMU samples are averages, so the timing error (half a sample interval, 1 σ) is added
     resolution_s = 0.5 * imu_motion.imu_interval_s
     interval_limits_s = (
         curve_time_offsets_s[0] if interval_low_s is None else interval_low_s,
@@ -270,11 +260,10 @@ def _compute_offset_likelihood_curve(
     half_width_s: float,
     max_score_increase: float,
 ) -> tuple[Array, Array, float | None, float | None]:
-    """Compute the negative log-likelihood (-ln p) of the positions as a function of time offset.
+    """Compute -ln p of the positions as a function of the time offset.
 
     Return tested time offsets (s), -ln p of each, and both ends (s) of an interval around the
-    minimum. In this interval, -ln p is at most ``max_score_increase`` above its minimum. An end
-    outside the search range is None.
+    minimum. An end outside the search range is None.
     """
     while True:
         computed_offsets_s, curve_time_offsets_s = (
@@ -312,12 +301,10 @@ def _simulate_variance_increase_by_imu_noise(
     noise_parameters: NoiseParameters,
     fisher_information: float,
 ) -> float:
-    """Return the factor by which IMU noise increases the variance of the estimated time offset.
+    """Return the factor by which IMU noise increases the variance of the time offset.
 
-    Without this effect the variance is 1 / ``fisher_information``, the curvature of -ln p. The
-    derivative of -ln p with respect to the time offset is eᵀM(v + n), with residuals e of the
-    positions, inverse covariance M, velocity v, and noise n of the velocity from the IMU. Simulated
-    noise gives the variance of eᵀMn. It is not negligible, because e also contains n.
+    Without IMU noise, the variance is 1 / ``fisher_information``. IMU noise is in the residuals and
+    in the velocity, so its effect is not negligible.
     """
     positions_at_offset = imu_motion.make_positions_at_offset(offset_s)
     is_within_segment = positions_at_offset.is_within_segment
@@ -344,11 +331,11 @@ def _simulate_variance_increase_by_imu_noise(
     )
     dv[..., is_within_segment] += q01 / q00 * dp[..., is_within_segment]
     error_m = noise_parameters.sigma_z_m * draw_normal(measurement_count)
-    # The velocity noise of the IMU is the sum of the noise of Δv since the start of the segment
+    # Velocity noise of the IMU: sum of the noise of Δv since the start of the segment
     velocity_noise = np.zeros_like(error_m)
     for begin, end in positions_at_offset.segments:
         np.cumsum(dv[..., begin : end - 1], axis=-1, out=velocity_noise[..., begin + 1 : end])
-    # The random walk is an error of the positions: it changes Δp, but not the velocity from the IMU
+    # The random walk changes the positions, but not the velocity from the IMU
     if noise_parameters.random_walk_m:
         dp[..., is_within_segment] += (
             noise_parameters.random_walk_m
@@ -389,9 +376,9 @@ def _estimate_flight_part_offsets(
     noise_parameters: NoiseParameters,
     offset_variance_factor: float,
 ) -> tuple[tuple[PartOffset, ...], float | None]:
-    """Estimate the time offset in each segment of the flight, and test for a constant offset.
+    """Estimate the time offset of each flight segment, and test for a constant offset.
 
-    The second value is the p-value of the test; None with fewer than two offsets.
+    Return also the p-value of the test; None with fewer than two offsets.
     """
     coarse_offsets_s = offset_s + np.linspace(
         -MAX_TESTED_TIME_OFFSET_S, MAX_TESTED_TIME_OFFSET_S, COARSE_OFFSET_COUNT
@@ -427,10 +414,7 @@ def _estimate_flight_part_offsets(
 
 
 def _fit_clock_drift(part_offsets: tuple[PartOffset, ...]) -> tuple[float | None, float | None]:
-    """Return the clock drift of the position source and its σ (ppm).
-
-    Return None with fewer than three flight parts.
-    """
+    """Return clock drift and its σ (ppm) of the source; None with fewer than three flight parts."""
     if len(part_offsets) < 3:
         return None, None
     time_s, offset_s, sigma_s = np.transpose(

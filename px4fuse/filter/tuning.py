@@ -1,8 +1,7 @@
 """Maximum-likelihood SIGMA_A and SIGMA_Z with 95 % intervals.
 
-Two values of SIGMA_A are estimated. The first is the noise of the acceleration alone: biases, tilt
-and time offset are estimated too (:mod:`px4fuse.filter.imu_motion`). The second is for KF, which
-needs a larger SIGMA_A because it has no states for biases.
+Two values of SIGMA_A are estimated: the acceleration noise alone, and a larger value for KF. KF has
+no states for biases and tilt, so its SIGMA_A includes them.
 """
 
 from __future__ import annotations
@@ -39,24 +38,20 @@ from px4fuse.flight.model import Flight, Unavailable
 
 HORIZONTAL = "horizontal"
 NoiseInterval = tuple[NotNegative, NotNegative | None]
-# Minimum number of positions from which SIGMA_A and SIGMA_Z are estimated
 MIN_MEASUREMENTS = 30
-# SIGMA_A and SIGMA_Z are not estimated if a larger fraction of the positions are outliers
 MAX_OUTLIER_FRACTION = 0.3
-# Initial values of SIGMA_A in the estimate with IMU biases, as multiples of KF's SIGMA_A
+# Initial values of SIGMA_A, as multiples of KF's SIGMA_A
 START_SIGMA_A_FACTORS = (0.1, 0.3, 1.0)
-# Initial value (m/√s) in the search for the random walk of a source that may drift
+# Initial value (m/√s) of the random walk of a source that may drift
 START_RANDOM_WALK_M = 0.02
-# An estimate that differs from an end of its search range by less than this factor is not reported
-# as a value, but only as an upper or lower bound
+# Estimates within this factor of an end of the search range are reported as bounds only
 SEARCH_RANGE_END_TOLERANCE_FACTOR = 1.001
 
 
 class NoiseEstimate(Record):
     """Maximum-likelihood estimate of one noise parameter, with its 95 % interval.
 
-    ``value`` is None if the maximum is outside the search range. ``low`` is None if the noise may
-    be zero, ``high`` is None without an upper bound.
+    ``value`` is None if the maximum is outside the search range. A missing bound is None.
     """
 
     value: float | None
@@ -80,14 +75,14 @@ class NoiseEstimate(Record):
 
 
 class HeldOutCheck(Record):
-    """Noises that are estimated from the first half of a flight, and their test on the second half.
+    """Noises estimated from the first half of a flight, and their test on the second half.
 
     Attributes
     ----------
     count : int
         Number of measurements in the second half.
     log_likelihood_gain_per_measurement : float
-        Log-likelihood (nats) of the second half minus that with KF's current settings.
+        Log-likelihood gain (nats) over KF's current settings in the second half.
     """
 
     sigma_a_m_s2: NotNegative
@@ -97,26 +92,24 @@ class HeldOutCheck(Record):
 
 
 class AxisTuning(Record, kw_only=True):
-    """Estimated noises of KF for one axis, or for north and east together, with 95 % intervals.
+    """Estimated noises of KF for one axis, or for north and east together.
 
-    A noise is None if its estimate is outside the search range. An interval begins at 0 if the
-    noise may be zero.
+    A noise is None if its estimate is outside the search range.
 
     Attributes
     ----------
     sigma_a_two_state_m_s2 : float or None
-        SIGMA_A for KF. It also covers biases and tilt, for which KF has no states.
+        SIGMA_A for KF, which includes biases and tilt.
     log_likelihood_gain_per_measurement : float
-        Log-likelihood (nats) with the estimated settings of KF minus that with its current ones.
+        Log-likelihood gain (nats) of the estimated over the current settings.
     before, after : Consistency or Unavailable
-        Consistency of KF along the first axis, with its current and with the estimated settings.
+        Consistency of KF with the current and with the estimated settings.
     outliers : int
         Number of measurements with an outlier probability above 0.5.
     biases_fitted : bool
-        False if the IMU rate is too low to estimate biases. KF's SIGMA_A is then only an upper
-        bound of the acceleration noise.
+        False if the IMU rate is too low to estimate biases.
     noises : NoiseParameters
-        Maximum-likelihood noises, including the random walk of a drifting source.
+        Maximum-likelihood noises, including the random walk of the source.
     """
 
     sigma_a_m_s2: NotNegative | None = None
@@ -138,12 +131,12 @@ class AxisTuning(Record, kw_only=True):
 
     @property
     def sigma_a(self) -> NoiseEstimate:
-        """Estimated SIGMA_A (m/s²) for the acceleration noise alone, without biases and tilt."""
+        """Estimated SIGMA_A (m/s²) of the acceleration noise alone, without biases and tilt."""
         return NoiseEstimate.from_fields(self.sigma_a_m_s2, self.sigma_a_m_s2_interval)
 
     @property
     def sigma_a_two_state(self) -> NoiseEstimate:
-        """Estimated SIGMA_A (m/s²) for KF. It covers biases and tilt: KF has no states for them."""
+        """Estimated SIGMA_A (m/s²) for KF, including biases and tilt."""
         return NoiseEstimate.from_fields(
             self.sigma_a_two_state_m_s2, self.sigma_a_two_state_m_s2_interval
         )
@@ -166,7 +159,6 @@ def tune(
 
     Parameters
     ----------
-    axes : tuple of Axis
     settings : Settings
         Current settings of KF, with which the estimates are compared.
     names : tuple of str, optional
@@ -174,11 +166,11 @@ def tune(
     progress : callable
         Called with the name of each axis.
     flight : Flight, optional
-        Flight whose IMU data separate biases and tilt from noise.
+        Flight with IMU data, which separate biases and tilt from noise.
     may_drift : bool
         True if the source may drift (odometry).
     motion_cache : dict, optional
-        IMU motion that several estimates share.
+        IMU motion that is already computed; new motion is added.
     """
     axes_by_name: dict[str, tuple[Axis, ...]] = {axis.name: (axis,) for axis in axes}
     if {"north", "east"} <= axes_by_name.keys():
@@ -197,8 +189,7 @@ def tune(
                     name, group_axes, settings, flight, may_drift, motion_cache
                 )
             except np.linalg.LinAlgError as error:
-                # Positions far from the path caused rounding errors, which made the normal
-                # equations singular
+                # Positions far from the path cause rounding errors
                 tunings[name] = Unavailable(
                     f"estimate of SIGMA_A and SIGMA_Z ({name})",
                     str(error),
@@ -215,7 +206,7 @@ def tune_axes(
     may_drift: bool = False,
     motion_cache: MotionCache | None = None,
 ) -> AxisTuning | Unavailable:
-    """Estimate noises that several axes with equal measurement times share.
+    """Estimate the noises of several axes with equal measurement times.
 
     See :func:`tune` for the parameters.
     """
@@ -237,7 +228,7 @@ def tune_axes(
     imu_motion_fit = None
     if flight is not None and settings.input == "imu":
         measured_m = np.column_stack([axis.measurement_m for axis in axes])
-        # KF's fit has no weight for the first measurement, which is its initial state: use weight 1
+        # The first measurement is KF's initial state, without a weight in KF's fit: use weight 1
         measurement_weights = np.concatenate(
             [np.ones(len(measured_m) - measurement_count), kf_fit.measurement_weights]
         )
@@ -291,8 +282,7 @@ def tune_axes(
         sigma_a if imu_motion_fit is None else _estimate_kf_sigma_a(kf_fit, final_sigma_z_m)
     )
     if imu_motion_fit is None and flight is not None and settings.input == "imu":
-        # Without estimates of biases and tilt, KF's SIGMA_A also covers them, and is only an upper
-        # bound of the acceleration noise
+        # Without estimates of biases and tilt, KF's SIGMA_A is an upper bound of the noise
         sigma_a = NoiseEstimate(None, None, kf_sigma_a.high)
     final_parameters = NoiseParameters(
         kf_sigma_a.value or kf_sigma_a.high or kf_fit.noise_parameters.sigma_a_m_s2, final_sigma_z_m

@@ -22,10 +22,9 @@ class Column(NamedTuple):
     Attributes
     ----------
     kind : str
-        "name": a click unfolds the row; "full": text that is never cut; "line": text on one line;
-        "rank": text that is sorted by a number; "ratio": number that is drawn on an axis.
+        Type of the cells. "name" unfolds the row; "rank" sorts texts by a number.
     group : str
-        Check box with which users show or hide the column; "" for a column that is always shown.
+        Check box that shows or hides the column; "" if it is always shown.
     min_screen_size : str
         Smallest screen size on which the column is shown.
     """
@@ -56,7 +55,7 @@ def make_number_cell(
     return Cell(format_value(value), value, second_line)
 
 
-# Section of the details that open below a table row, as a list for frame.js: kind, title, contents
+# Section of the details of a table row, as a list for frame.js: kind, title, contents
 RowDetailsSection = list[Any]
 
 
@@ -64,7 +63,7 @@ RowDetailsSection = list[Any]
 class Row:
     """Row of the table; drop-down lists filter rows by ``tags``.
 
-    After a click, the page shows ``details`` on the left and ``side_sections`` on the right.
+    The page shows ``details`` and ``side_sections`` after a click on the row.
     """
 
     cells: tuple[Cell, ...]
@@ -111,7 +110,7 @@ def make_input_boxes_section(
     rows: Sequence[tuple[str, float, float | None, str]],
     rows_without_boxes: Sequence[tuple[str, float | None, str]],
 ) -> RowDetailsSection:
-    """Return a section with input boxes, in which an instructor enters points and comments.
+    """Return a section in which an instructor enters points and comments.
 
     Parameters
     ----------
@@ -155,10 +154,9 @@ def page(
     search_placeholder : str
         Hint in the search field.
     full_table_note : str
-        Sentence about the file with all rows, for browsers without scripts.
+        Sentence about the file with all rows.
     sigma_ratio_axis : mapping, optional
-        Axis of the columns with σ ratios: ``ends`` (range), ``bands`` (shaded) and ``marks`` (SVG
-        paths).
+        Axis of the columns with σ ratios: range, shaded bands and marks.
     """
     css_text = "".join(map(read_asset, ("colours.css", "base.css", "frame.css")))
     script = "".join(map(read_asset, ("dom.js", "frame.js")))

@@ -15,8 +15,7 @@ from jinja2 import Environment, PackageLoader, StrictUndefined, Template
 from px4fuse.core.text import convert_nested
 
 MAX_TEXT_LENGTH = 20_000
-# Control characters except tab and line feed, surrogates, and characters that change the text
-# direction
+# Control characters, surrogates, and characters that change the text direction
 HARMFUL_CHARACTER_PATTERN = re.compile(
     "[\0-\x08\x0b-\x1f\x7f-\x9f\ud800-\udfff\u202a-\u202e\u2066-\u2069]"
 )
@@ -42,7 +41,7 @@ def clean_values(value: Any, max_length: int = MAX_TEXT_LENGTH) -> Any:
 
 
 def encode_safe_json(value: object) -> str:
-    """Encode as JSON without the characters <, > and &, so that it cannot contain HTML tags."""
+    """Encode as JSON without <, > and &, so that it cannot contain HTML tags."""
     text = json.dumps(value, ensure_ascii=True, allow_nan=False, separators=(",", ":"))
     return text.replace("<", r"\u003c").replace(">", r"\u003e").replace("&", r"\u0026")
 

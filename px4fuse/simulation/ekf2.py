@@ -1,11 +1,10 @@
 """EKF2 topics of a simulated flight as PX4 v1.16 logs them, computed by :mod:`px4fuse.ekf2`.
 
-This model of EKF2 starts at rest with PX4's initial variances, and runs on the simulated
-IMU and positions. Its error states are linearised about the true attitude.
+The EKF2 model starts at rest and runs on the simulated IMU and positions. Its error states are
+linearised about the true attitude.
 
-Outdoors, EKF2 fuses magnetometer and barometer. Indoors, EKF2's heading and height have a simulated
-slow error. Indoors, vehicle_attitude is simulated without the model: KF uses the attitude, and the
-results of KF must not change with EKF2 parameters.
+Outdoors, EKF2 fuses magnetometer and barometer. Indoors, its heading and height have a simulated
+slow error. KF uses vehicle_attitude, so indoors it must not depend on EKF2 parameters.
 """
 
 from collections.abc import Mapping
@@ -72,9 +71,9 @@ from px4fuse.trajectory.rotation import (
 
 # Length (µs) of EKF2's prediction step: parameter EKF2_PREDICT_US
 PREDICTION_STEP_US = 10_000
-# σ (gauss) per axis of earth field and magnetometer bias at the start of the log
+# Initial σ (gauss) of earth field and magnetometer bias, on each axis
 MAGNETIC_FIELD_SIGMA_GAUSS = 0.03
-# Time (s) without fusion of an aiding source after which EKF2 holds the position: EKF2_NOAID_TOUT
+# Time (s) without fusion after which EKF2 holds the position: EKF2_NOAID_TOUT
 # (fake_pos_control.cpp)
 NO_AID_TIMEOUT_S = 5.0
 # Initial σ of tilt, velocity, position, gyro bias and accelerometer bias: EKF2_ANGERR_INIT,
@@ -82,15 +81,14 @@ NO_AID_TIMEOUT_S = 5.0
 INITIAL_STATE_SIGMA = np.repeat([0.1, 0.3, 0.5, 0.1, 0.2], 3)
 # Simulated time (s) at rest before the log starts
 REST_BEFORE_LOG_S = 10.0
-# σ of specific force (m/s²), angular rate (rad/s) and velocity (m/s) at rest. With these values the
-# model has the σ that EKF2 v1.16 reports on the ground: gyro bias 0.0005 rad/s, velocity 0.06 m/s,
-# horizontal accelerometer bias 0.17 m/s²
+# σ of specific force (m/s²), angular rate (rad/s) and velocity (m/s) at rest, chosen to give the σ
+# that EKF2 v1.16 reports on the ground
 MEASUREMENT_SIGMA_AT_REST = np.repeat([0.05, 0.0005, 0.06], 3)
 # σ of EKF2's heading (rad) as PX4 v1.16 logs it in flight
 INDOOR_HEADING_SIGMA_RAD = 0.03
 # σ of EKF2's height (m) as PX4 v1.16 logs it in flight
 INDOOR_HEIGHT_SIGMA_M = 0.15
-# Maximum time (s) between two events at which the model computes variances for estimator_states
+# Maximum interval (s) of the variances in estimator_states
 MAX_FUSION_INTERVAL_IN_GAP_S = 0.1
 
 
@@ -106,7 +104,7 @@ def make_parameters(scenario: Scenario, faults: FaultSizes) -> dict[str, int | f
     delay_ms = defaults[aid.delay] if faults.ekf2_delay_s is None else 1e3 * faults.ekf2_delay_s
     aid_parameters: dict[str, float] = {aid.noise_mode_parameter: 1}
     if is_gnss:
-        # with EKF2_MAG_TYPE 1 EKF2 fuses the magnetic heading only, with 0 all axes
+        # EKF2_MAG_TYPE 1: EKF2 fuses the magnetic heading only; 0: all axes
         magnetometer_fusion_type = int(bool(faults.heading_deg))
         aid_parameters = {
             GNSS_VEL.noise: scenario.sigma_gnss_m_s,
@@ -120,8 +118,7 @@ def make_parameters(scenario: Scenario, faults: FaultSizes) -> dict[str, int | f
             aid.noise: faults.ekf2_noise_m or sensors.compute_reported_sigma_m(scenario, faults),
             aid.gate: faults.ekf2_gate,
             aid.delay: delay_ms,
-            # EKF2 discards positions with a delay above EKF2_DELAY_MAX (ms). With the fault
-            # clock-jump, positions arrive late by the size of the jump
+            # EKF2 discards positions with a larger delay (ms), which the fault clock-jump may cause
             "EKF2_DELAY_MAX": max(defaults["EKF2_DELAY_MAX"], 100.0 + 1e3 * faults.clock_jump_s),
             "EKF2_PREDICT_US": PREDICTION_STEP_US,
         }
@@ -137,11 +134,9 @@ def simulate_ekf2(
     other_sensors: tuple[Topic, ...],
     log_parameters: Mapping[str, int | float],
 ) -> tuple[Topic, ...]:
-    """Simulate EKF2 and return EKF2's topics, without empty topics.
+    """Simulate EKF2 and return its topics, without empty topics.
 
-    ``imu``, ``source`` and ``other_sensors`` (outdoors magnetometer and barometer) contain all
-    samples that EKF2 receives; the log may contain fewer. ``log_parameters`` are all parameters in
-    the log, by PX4 name.
+    ``imu``, ``source`` and ``other_sensors`` contain all samples, also those that are not logged.
     """
     aid, fused_aids = scenario.aid, _select_fused_aids(scenario)
     segment, time_us, true_quaternions = _make_segment(scenario, faults, motion, imu)
@@ -180,8 +175,8 @@ def simulate_ekf2(
         settings=settings,
         segments=(segment,),
         received_positions=_select_positions(source),
-        # If bit 0 of EKF2_EV_CTRL is not set, EKF2 tests the positions but never starts fusion
-        # (ev_pos_control.cpp). An interval of 0 has this effect: it never contains two positions
+        # If bit 0 of EKF2_EV_CTRL is not set, EKF2 tests the positions but never fuses them
+        # (ev_pos_control.cpp). A start interval of 0 has this effect
         rules=rules
         if int(log_parameters[aid.switch]) & 1
         else replace(rules, start_interval_s=0.0),
@@ -208,7 +203,7 @@ def simulate_ekf2(
 def _make_segment(
     scenario: Scenario, faults: FaultSizes, motion: Motion, imu: Topic
 ) -> tuple[ReplaySegment, IntArray, Array]:
-    """Prepare the input of the EKF2 model, and the times (µs) and true attitudes of its steps."""
+    """Return the input of the EKF2 model, and times (µs) and true attitudes of its steps."""
     time_us = sensors.get_time_us(imu)
     interval_s = np.diff(time_us) * 1e-6
     step_end_indices = find_step_ends(
@@ -260,7 +255,7 @@ def _make_segment(
             variance=variance,
             down_m=motion.compute_true_state(time_s).position_m[:, 2]
             + sensors.simulate_height_error(scenario, time_s),
-            # The variance of tilt measurements is infinite, so only positions correct the tilt
+            # Infinite variance: only positions correct the tilt
             attitude_variance_rad2=np.tile(
                 [np.inf, np.inf, INDOOR_HEADING_SIGMA_RAD**2], (len(time_s), 1)
             ),
@@ -279,8 +274,7 @@ def _compute_state_at_rest(
 ) -> tuple[Array, Array]:
     """Return EKF2's error state and covariance at the start of the log, after a time at rest.
 
-    They result from PX4's initial covariance and one Kalman update. The update uses the known
-    values at rest: specific force -g, angular rate 0 and velocity 0.
+    One Kalman update of PX4's initial covariance uses the known specific force, rate and velocity.
     """
     H = np.zeros((9, STATE_COUNT))
     H[0:3, THETA] = -skew(rotation @ specific_force_m_s2)
@@ -301,7 +295,7 @@ def _compute_state_at_rest(
 def _select_positions(source: sensors.SimulatedPositions) -> ReceivedPositions:
     """List the positions that EKF2 accepts, in order of arrival.
 
-    EKF2 ignores a position that is older than the previous one (estimator_interface.cpp).
+    EKF2 ignores positions that are older than the previous one (estimator_interface.cpp).
     """
     topic_fields = source.topic.fields
     timestamp_s, arrival_s = (
@@ -345,7 +339,7 @@ def _compute_output(
     reset_sum_m = np.zeros((len(state), 3))
     for step, reset_size_m in resets:
         reset_sum_m[step:, :2] += reset_size_m
-    # EKF2 corrects the newest IMU samples with an older gyro bias: that at the fusion horizon
+    # EKF2 corrects the newest IMU samples with the older gyro bias of the fusion horizon
     gyro_bias_rad_s = rotate(segment.body_to_ned[1:], delay_by(state[:, GYRO_BIAS], lag_steps)[1:])
     attitude_error_steps_rad = (
         -segment.attitude_correction_rad - gyro_bias_rad_s * segment.step_s[:, None]
@@ -375,10 +369,9 @@ def _compute_output(
 def _hold_position_without_aiding(
     model_run: SegmentRun, state: Array
 ) -> tuple[list[tuple[int, Array]], BoolArray]:
-    """Keep the position in ``state`` constant during times without aiding (fake_pos_control.cpp).
+    """Hold the position in ``state`` during times without aiding (fake_pos_control.cpp).
 
-    Return the position resets (step, size in m), and a mask of steps: True if an aiding source was
-    fused in the last NO_AID_TIMEOUT_S.
+    Return the position resets (step, size in m), and a mask of the steps with recent aiding.
     """
     events, time_s = model_run.events[0], model_run.segment.time_s
     events_with_aiding = np.flatnonzero(model_run.fused[:, 0] | model_run.reset[:, 0])

@@ -20,11 +20,9 @@ from px4fuse.readers.px4_positions import unproject
 from px4fuse.simulation import sensors
 from px4fuse.simulation.ulog_writer import Topic, make_topic
 
-# Logging rate (Hz) of estimator_aid_src_ev_pos on a vehicle (PX4 v1.16, logged_topics.cpp); PX4's
-# simulation (SITL) logs all messages
+# Rate limit (Hz) of estimator_aid_src_ev_pos on a vehicle (PX4 v1.16, logged_topics.cpp)
 VEHICLE_AID_SOURCE_LOG_RATE_HZ = 2.0
-# Logging rates (Hz) of EKF2 topics and vehicle_magnetometer on a vehicle (PX4 v1.16,
-# logged_topics.cpp)
+# Rate limits (Hz) of other topics on a vehicle (PX4 v1.16, logged_topics.cpp)
 STATES_LOG_RATE_HZ = 2.0
 LOCAL_POSITION_LOG_RATE_HZ = 10.0
 FLAGS_LOG_RATE_HZ = 1.0
@@ -36,18 +34,18 @@ PUBLICATION_DELAY_US = 100
 
 @dataclass(frozen=True)
 class Ekf2Output:
-    """States of the EKF2 model at the start and after each of n prediction steps (n + 1 rows).
+    """States of the EKF2 model at the start and after each prediction step.
 
     Attributes
     ----------
     time_us : ndarray of int
         Times of the rows, µs from the first data.
     lag_steps : int
-        Number of prediction steps from the fusion horizon (delayed time) to the publication.
+        Number of prediction steps from the fusion horizon to the publication.
     attitude_at_fusion_horizon, states_at_fusion_horizon : ndarray
-        Quaternions, and velocity, position, gyro and accelerometer bias, at the fusion horizon.
+        Attitude quaternions; velocity, position and IMU biases.
     velocity_m_s, position_m, attitude : ndarray
-        State that the output predictor publishes.
+        State that EKF2 publishes.
     resets : tuple of (int, ndarray)
         Step and size (m, north and east) of each reset of the published position.
     has_recent_position_aiding : ndarray of bool
@@ -67,9 +65,9 @@ class Ekf2Output:
     def make_timestamps(
         self, steps: IntArray, measurement_times_s: Array | None = None
     ) -> dict[str, Any]:
-        """Return the timestamps of messages that EKF2 publishes after the prediction ``steps``.
+        """Return the timestamps of EKF2 messages after the prediction ``steps``.
 
-        ``measurement_times_s`` are the measurement times (s), by default the times of the steps.
+        ``measurement_times_s`` are by default the times of the steps.
         """
         sample_times_us = self.time_us[steps]
         if measurement_times_s is not None:
@@ -97,8 +95,8 @@ def make_ekf2_topics(
 ) -> tuple[Topic, ...]:
     """Return the EKF2 topics of a flight, without empty topics.
 
-    ``attitude_rate_hz`` is the rate of vehicle_attitude, and ``aid_source_log_rate_hz`` the rate at
-    which estimator_aid_src_ev_pos is logged (0: all messages).
+    ``attitude_rate_hz`` is the rate of vehicle_attitude. With
+    ``aid_source_log_rate_hz`` 0, all messages of estimator_aid_src_ev_pos are logged.
     """
     topics = (
         _make_local_position_topic(model_inputs, ekf2_output),
@@ -174,8 +172,7 @@ def _make_position_aid_topics(
     innovation, innovation_variance, noise_variance = (
         values[logged_indices, 0, HORIZONTAL_POSITION_COLUMNS] for values in innovation_arrays
     )
-    # If EKF2 does not test a position, the innovation of the model is NaN, but EKF2 logs an
-    # innovation: measured minus estimated position
+    # Without a test, EKF2 logs measured minus estimated position as innovation
     innovation, innovation_variance = np.where(
         np.isnan(innovation[:, :1]),
         (

@@ -1,7 +1,6 @@
-"""Injected faults of a simulated flight; ``faults.toml`` describes them.
+"""Injected faults of a simulated flight, described in ``faults.toml``.
 
-Examples of sizes on the command line: ``0.08``, ``80ms``, ``5%``, ``8s,40s``. Without a size, the
-fault has a default size that px4fuse detects easily.
+Examples of sizes on the command line: ``0.08``, ``80ms``, ``5%``, ``8s,40s``.
 """
 
 from collections.abc import Iterable, Mapping
@@ -25,11 +24,10 @@ def _make_start_time_field() -> Any:
 
 @dataclass(frozen=True)
 class FaultSizes:
-    """Sizes of the faults to inject into a simulated flight; ``faults.toml`` explains each fault.
+    """Sizes of the faults in a simulated flight; ``faults.toml`` explains each fault.
 
-    A field begins with the name of its fault in ``faults.toml``. Fields that end in ``_at_s`` are
-    start times. By default, no fault is injected. ``ekf2_noise_m`` 0 and ``ekf2_delay_s`` None are
-    the correct noise and delay of EKF2.
+    Fields that end in ``_at_s`` are start times. By default, no fault is injected.
+    ``ekf2_noise_m`` 0 and ``ekf2_delay_s`` None are the correct noise and delay of EKF2.
     """
 
     clock_offset_s: float = make_bounded_field(0.0, -5.0, 5.0, "s", "SECONDS")
@@ -57,7 +55,7 @@ class FaultSizes:
     jump_at_s: float | None = _make_start_time_field()
     # Time constant of the low-pass filter of the position source
     smoothed_s: float = make_bounded_field(0.0, 0.0, 10.0, "s", "SECONDS")
-    # The time-correlated position error has this σ
+    # σ of the time-correlated position error
     slow_error_m: float = make_bounded_field(0.0, 0.0, 100.0, "m", "METRES")
     # Correlation time of the time-correlated position error
     slow_error_s: float = make_bounded_field(30.0, 0.1, 1e4, "s", "TIME")
@@ -84,7 +82,7 @@ class FaultSizes:
 
 
 BOUNDS_BY_FIELD = collect_field_bounds(FaultSizes)
-# ASCII spelling of units, for sizes of injected faults on the command line
+# ASCII spelling of units on the command line
 _ASCII_UNITS = {"°": "deg", "m/s²": "m/s2"}
 
 
@@ -97,11 +95,11 @@ class FaultType:
     default : float or True
         Default size of the fault; True for a fault without a size.
     finding : str
-        Effect of the fault in the report, which a student is expected to find.
+        Result that a student is expected to find in the report.
     changes_ekf2 : bool
         True if the fault changes EKF2 parameters.
     field_names : tuple of str
-        Fields of :class:`FaultSizes` that the fault sets: the size, then optional values.
+        Fields of :class:`FaultSizes` that the fault sets; the size is the first.
     """
 
     default: float | bool
@@ -113,7 +111,7 @@ class FaultType:
 
     @property
     def value_field_names(self) -> tuple[str, ...]:
-        """Fields of FaultSizes that the user sets; empty for a fault without a size."""
+        """Fields of FaultSizes with values that the user can set."""
         return () if self.default is True else self.field_names
 
     @property
@@ -131,7 +129,7 @@ class FaultType:
 FAULT_TYPES: Mapping[str, FaultType] = {
     name: replace(
         fault_type,
-        # the names of the fields of FaultSizes begin with the name of the fault
+        # field names begin with the name of the fault
         field_names=tuple(
             field for field in vars(FaultSizes()) if field.startswith(name.replace("-", "_"))
         ),

@@ -1,4 +1,4 @@
-"""Simulated flights as PX4 topics, ULog or Flight; answer key with injected faults and truth."""
+"""Simulated flights as PX4 topics, ULog or Flight, and their answer keys."""
 
 from collections.abc import Mapping
 from dataclasses import asdict, dataclass
@@ -27,7 +27,7 @@ FUSION_SWITCH_VALUES = {EV_POS.switch: 1, GNSS_POS.switch: 5}
 LOG_PROFILE_WITH_VISION = 129
 # SDLOG_PROFILE that does not log the topics of external vision
 LOG_PROFILE_WITHOUT_VISION = 1
-# Version number of PX4 v1.16.0, the release whose topics are simulated
+# PX4 v1.16.0, whose topics are simulated, as a version number
 PX4_RELEASE = 1 << 24 | 16 << 16 | 255
 SIMULATION_HARDWARE = "px4fuse simulation"
 ANSWER_SCHEMA = {"name": "px4fuse-answer", "version": 1}
@@ -35,7 +35,7 @@ ANSWER_SCHEMA = {"name": "px4fuse-answer", "version": 1}
 
 @dataclass(frozen=True)
 class Simulation:
-    """Simulated flight: logged topics and parameters, and values that the log does not contain."""
+    """Simulated flight: logged topics and parameters, injected faults and true motion."""
 
     scenario: Scenario
     faults: FaultSizes
@@ -111,9 +111,9 @@ def simulate_flight(scenario: Scenario, faults: FaultSizes = NO_FAULTS) -> Fligh
 
 
 def to_ulog(simulation: Simulation, *, is_assessed: bool = False) -> bytes:
-    """Encode the flight as a ULog file, which contains no information about the injected faults.
+    """Encode the flight as a ULog file, without information about the injected faults.
 
-    ``is_assessed`` marks the log as a student assignment, whose faults px4fuse does not show.
+    ``is_assessed`` marks the log as a student assignment.
     """
     info: dict[str, int | str] = {
         "sys_name": "PX4",

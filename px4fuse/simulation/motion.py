@@ -1,9 +1,7 @@
 """True motion of a simulated flight: a smooth path, and the attitude of a quadrotor on this path.
 
-Each velocity change is a quintic ramp, so that the acceleration is continuous and the jerk bounded.
-In the air, a slow deviation (sum of sines) is added to the path. Thrust is along the body z axis
-and there is no drag, so the direction of the specific force a - g determines roll and pitch
-(Mellinger and Kumar 2011, eq. 6 to 8).
+Velocity changes are quintic ramps, so the acceleration is continuous. Thrust is along the body z
+axis, so the specific force determines roll and pitch (Mellinger and Kumar 2011, eq. 6 to 8).
 """
 
 from __future__ import annotations
@@ -26,32 +24,30 @@ TIME_ON_GROUND_S = 6.0
 MAX_CLIMB_RATE_M_S = 0.75
 # Duration (s) of each change of the climb rate
 CLIMB_RAMP_DURATION_S = 1.5
-# Maximum flight time (s): the log then has 70 MB
+# Maximum flight time (s), to limit the size of the log
 MAX_FLIGHT_S = 3600.0
-# Time (s) in which the slow deviation from the path increases to its full size after take-off, and
-# decreases to zero before landing
+# Time (s) in which the path deviation grows after take-off, and shrinks before landing
 PATH_DEVIATION_RAMP_DURATION_S = 3.0
 # Time (s) of a 180° turn at the end of the aisle with --yaw follow
 TURN_ROUND_DURATION_S = 4.0
-# Minimum distance (s) of the breakpoints of piecewise polynomials; nearer breakpoints are merged
+# Minimum distance (s) of the breakpoints of piecewise polynomials
 MIN_POLYNOMIAL_BREAKPOINT_DISTANCE_S = 1e-9
 # Range of the periods (s) of the slow deviation from the path, a sum of sines
 DEVIATION_PERIOD_RANGE_S = (3.0, 20.0)
-# A slow path deviation or sensor error is a sum of this number of sines
+# Number of sines in a slow path deviation or sensor error
 SLOW_ERROR_SINE_COUNT = 4
 
 
 def _sum_ramps(ramps: Sequence[tuple[float, float, Array]]) -> PPoly:
-    """Return a function of time that changes in quintic ramps, and is constant between them.
+    """Return a function of time that is constant between quintic ramps.
 
-    ``ramps`` are tuples of start (s), duration (s) and change. Before the first ramp, the function
-    is zero.
+    ``ramps`` are tuples of start (s), duration (s) and change. The function starts at zero.
     """
     start_s, duration_s, change = (np.array(values) for values in zip(*ramps, strict=True))
     value_after_ramp = np.concatenate([0.0 * change[:1], np.cumsum(change, axis=0)])
     end_s = start_s + duration_s
     times_s = np.r_[start_s[0] - 1.0, np.column_stack([start_s, end_s]).ravel(), end_s[-1] + 1.0]
-    # If a ramp starts at the end of the previous ramp, keep only one of the two equal breakpoints
+    # If two ramps meet, keep only one of the two equal breakpoints
     is_used = np.diff(times_s, prepend=-np.inf) > MIN_POLYNOMIAL_BREAKPOINT_DISTANCE_S
     values = np.repeat(value_after_ramp, 2, axis=0)[is_used]
     derivatives = np.stack([values, 0.0 * values, 0.0 * values], axis=1)
@@ -59,17 +55,14 @@ def _sum_ramps(ramps: Sequence[tuple[float, float, Array]]) -> PPoly:
 
 
 def _differentiate(ramp_function: PPoly, time_s: Array, orders: Sequence[int]) -> list[Array]:
-    """Return the derivatives of a sum of ramps with the given orders, each of shape (t, k).
-
-    Order 0 is the function, and order -1 is its integral.
-    """
+    """Return derivatives of a sum of ramps, shape (t, k) each; order -1 is the integral."""
     clipped_times_s = np.clip(time_s, *ramp_function.x[[0, -1]])
     return [np.asarray(ramp_function.derivative(order)(clipped_times_s)) for order in orders]
 
 
 @dataclass(frozen=True)
 class Sines:
-    """Sum of m sines on each of k axes: angular frequencies, shape (m,), and amplitudes, (m, k)."""
+    """Sum of m sines on each of k axes: angular frequencies (m,), and amplitudes (m, k)."""
 
     angular_frequency_rad_s: Array
     sine: Array
@@ -87,7 +80,7 @@ class Sines:
         return cls(angular_frequency, amplitude * np.cos(phase), amplitude * np.sin(phase))
 
     def compute_values(self, time_s: Array, output_count: int = 1) -> list[Array]:
-        """Return ``output_count`` arrays (t, k): sum of the sines, then its time derivatives."""
+        """Return the sum of the sines and its time derivatives: ``output_count`` arrays (t, k)."""
         angle = np.outer(time_s, self.angular_frequency_rad_s)
         basis = np.concatenate([np.sin(angle), np.cos(angle)], axis=1)
         amplitudes = [np.concatenate([self.sine, self.cosine])]
@@ -126,7 +119,7 @@ class Motion:
     duration_s: float
 
     def compute_true_state(self, time_s: Array) -> TrueState:
-        """Return the true state at the times ``time_s``, which are seconds from the first data."""
+        """Return the true state at times in seconds from the first data."""
         position, velocity, acceleration, jerk = _differentiate(
             self.velocity, time_s, (-1, 0, 1, 2)
         )
@@ -157,7 +150,7 @@ class Motion:
 
 @dataclass(frozen=True)
 class AttitudeAndImu:
-    """Attitude at n times, with angular rate and specific force that an ideal IMU measures.
+    """Attitude at n times, with the measurements of an ideal IMU.
 
     Attributes
     ----------
@@ -166,7 +159,7 @@ class AttitudeAndImu:
     angular_rate_rad_s : ndarray, shape (n, 3)
         Body FRD.
     specific_force_m_s2 : ndarray, shape (n, 3)
-        Body FRD. Only the z component is not zero, because a quadrotor has thrust along z only.
+        Body FRD; only the z component (thrust) is not zero.
     """
 
     body_to_ned: Array
@@ -189,7 +182,7 @@ def compute_attitude(state: TrueState) -> AttitudeAndImu:
         np.stack([np.cos(angle), np.sin(angle), np.zeros_like(angle)], axis=1)
         for angle in (yaw_rad, yaw_rad + np.pi / 2.0)
     )
-    # unnormalised_y = z × forward_direction: direction of the body's y axis, but not of length 1
+    # direction of the body's y axis, not normalised: z × forward direction
     unnormalised_y = np.cross(z, forward_direction)
     unnormalised_y_derivative_per_s = np.cross(
         z_derivative_per_s, forward_direction
@@ -212,7 +205,7 @@ def compute_attitude(state: TrueState) -> AttitudeAndImu:
 
 
 def _dot(a: Array, b: Array) -> Array:
-    """Compute the dot products of the vectors of two series, shape (n,)."""
+    """Return the dot products of two series of vectors, shape (n,)."""
     return np.asarray(np.einsum("ij,ij->i", a, b))
 
 
@@ -222,8 +215,7 @@ def plan_flight(scenario: Scenario, faults: FaultSizes, rng: np.random.Generator
     Raises
     ------
     SettingsError
-        The distance from start to end of the loop is longer than the last side, or the flight
-        takes too long.
+        The last side of the square is too short, or the flight takes too long.
     """
     flight_plan = _FlightBuilder(TIME_ON_GROUND_S, scenario.heading_deg)
     climb_rate_m_s = min(MAX_CLIMB_RATE_M_S, scenario.altitude_m / 2.0)
@@ -256,24 +248,21 @@ def plan_flight(scenario: Scenario, faults: FaultSizes, rng: np.random.Generator
 
 
 class _FlightBuilder:
-    """Builder of a flight: a list of velocity ramps, and a list of yaw ramps.
+    """Builder of a flight from velocity ramps and yaw ramps.
 
-    ``ramp_centre_s`` is the time of the centre of the velocity ramp that is added next.
+    ``ramp_centre_s`` is the centre of the next velocity ramp.
     """
 
     def __init__(self, climb_start_s: float, heading_deg: float) -> None:
         self.ramp_centre_s = climb_start_s + CLIMB_RAMP_DURATION_S / 2.0
         self.velocity_ramps: list[tuple[float, float, Array]] = []
-        # initial yaw: a ramp from 0 to the heading that ends before the first data
+        # initial yaw: a ramp that ends before the first data
         self.yaw_ramps = [(-1.0, 1.0, np.radians([heading_deg]))]
 
     def add_velocity_change(
         self, velocity_change_m_s: Array, duration_s: float, time_to_next_ramp_s: float
     ) -> None:
-        """Append a velocity ramp.
-
-        ``time_to_next_ramp_s`` is the time from its centre to the centre of the next velocity ramp.
-        """
+        """Append a velocity ramp; the centre of the next ramp is ``time_to_next_ramp_s`` later."""
         self.velocity_ramps.append(
             (self.ramp_centre_s - duration_s / 2.0, duration_s, velocity_change_m_s)
         )

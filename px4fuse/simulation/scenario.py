@@ -13,12 +13,12 @@ YawMode = Literal["fixed", "follow"]
 SCENARIO_KINDS: tuple[ScenarioKind, ...] = get_args(ScenarioKind)
 YAW_MODES: tuple[YawMode, ...] = get_args(YawMode)
 
-# Averaging time (s) for which the accelerometer noise SIGMA_A is defined: DT of KF
+# Averaging time (s) of the accelerometer noise SIGMA_A: DT of KF
 DT_S = 0.1
 # Duration (s) of acceleration and braking along the aisle
 SPEED_RAMP_DURATION_S = 1.5
 CORNER_DURATION_S = 2.0
-# Defaults of the scenario that depend on the kind of flight
+# Default values that depend on the kind of flight
 DEFAULTS_BY_KIND: Mapping[ScenarioKind, Mapping[str, float]] = {
     "aisle": {},
     "loop": {"passes": 1},
@@ -28,10 +28,9 @@ DEFAULTS_BY_KIND: Mapping[ScenarioKind, Mapping[str, float]] = {
 
 @dataclass(frozen=True)
 class Bounds:
-    """Limits and unit (:data:`px4fuse.core.units.UNIT_NAMES`) of a number on the command line.
+    """Limits and unit of a number on the command line.
 
-    ``option_or_placeholder`` is the name of an option, such as --speed. For the size of a fault, it
-    is a placeholder such as SECONDS. ``help_text`` is the help of the option; empty for a fault.
+    ``option_or_placeholder`` is the name of an option (--speed), or a placeholder (SECONDS).
     """
 
     low: float
@@ -48,12 +47,12 @@ class Bounds:
 
 
 def make_bounded_field(default: Any, *bounds: Any) -> Any:
-    """Make a dataclass field with a default, and with :class:`Bounds` from ``bounds``."""
+    """Make a dataclass field with a default value and :class:`Bounds`."""
     return field(default=default, metadata={"quantity": Bounds(*bounds)})
 
 
 def collect_field_bounds(dataclass_type: type) -> dict[str, Bounds]:
-    """Return the bounds of each field of a dataclass that has :class:`Bounds`, by field name."""
+    """Return the bounds of dataclass fields that have :class:`Bounds`, by field name."""
     return {
         dataclass_field.name: dataclass_field.metadata["quantity"]
         for dataclass_field in fields(dataclass_type)
@@ -65,22 +64,22 @@ def collect_field_bounds(dataclass_type: type) -> dict[str, Bounds]:
 class Scenario:
     """Path and sensors of a simulated flight, without injected faults.
 
-    Noises are standard deviations of white noise, on each axis. The GNSS noises are horizontal.
+    Noises are standard deviations of white noise on each axis.
 
     Attributes
     ----------
     kind : {"aisle", "loop", "outdoor"}
-        Passes along a straight line with UWB, laps of a square with VIO, or laps with GNSS.
+        UWB along a straight line, VIO around a square, or GNSS around a square.
     yaw : {"fixed", "follow"} or None
-        Constant heading, or nose in the direction of flight; None: fixed for "aisle", else follow.
+        Constant heading, or nose in the direction of flight.
     pause_s : float
         Time of hover at each end of the aisle.
     wander_m : float
         RMS of the slow deviation from the planned path, on each axis.
     vio_walk_m : float
-        Random walk of the VIO drift, m per √m flown, on each axis.
+        Random walk of the VIO drift (m/√m), on each axis.
     tilt_error_deg, yaw_error_deg : float
-        RMS of the slow error of the logged attitude. Indoors, EKF2 has this heading error.
+        RMS of the slow error of the logged attitude.
 
     Raises
     ------
@@ -200,7 +199,7 @@ class Scenario:
 
     @property
     def accelerometer_noise_m_s2(self) -> float:
-        """White noise of one accelerometer sample (m/s²); SIGMA_A is the noise of a 0.1 s mean."""
+        """White noise (m/s²) of one accelerometer sample; SIGMA_A is that of a 0.1 s mean."""
         return self.sigma_a_m_s2 * math.sqrt(DT_S * self.imu_rate_hz)
 
 

@@ -26,14 +26,14 @@ FIRST_TIMESTAMP_US = 12_000_000
 POSITION_LATENCY_S = 0.030
 # Standard deviation (s) of the latency of positions
 POSITION_LATENCY_SIGMA_S = 0.003
-# Minimum simulated latency (s) of positions: smaller random values are set to it
+# Minimum simulated latency (s) of positions
 MIN_POSITION_LATENCY_S = 0.005
 # Standard deviation of the times of position measurements, as fraction of their interval
 INTERVAL_JITTER_FRACTION = 0.02
 # Time (s) from the first data to the first position
 FIRST_POSITION_TIME_S = 0.1
-# Time (s) until PX4 uses the sender's timestamps instead of arrival times: 500 TIMESYNC replies at
-# 10 Hz (Timesync.cpp)
+# Time (s) until TIMESYNC converges: 500 replies at 10 Hz (Timesync.cpp). PX4 then uses the
+# sender's timestamps
 TIMESYNC_CONVERGENCE_TIME_S = 50.0
 # Mean number of positions in a burst of outliers
 MEAN_OUTLIER_BURST_POSITION_COUNT = 3
@@ -51,17 +51,16 @@ SIGMA_BAROMETER_M = 0.4
 BAROMETER_RATE_HZ = 10.0
 # RMS (m) of the slow height error that weather and wind cause
 HEIGHT_ERROR_RMS_M = 0.03
-# Time constant (s) with which EKF2's heading follows a compass error that starts in flight
+# Time constant (s) of EKF2's heading after the start of a compass error
 HEADING_TIME_CONSTANT_S = 3.0
-# Range of the periods (s) of the sines whose sum is the slow attitude or height error
+# Range of the periods (s) of slow attitude and height errors
 SLOW_ERROR_PERIOD_RANGE_S = (20.0, 60.0)
 # Time (µs) from the measurement to the publication of vehicle_attitude
 ATTITUDE_LATENCY_US = 200
 LAND_DETECTOR_INTERVAL_US = 1_000_000
 
 
-# Independent random number streams, one for each sensor and kind of error. A fault of one sensor
-# therefore does not change the noise of the others
+# One random number stream for each sensor and error: a fault does not change other noises
 RandomStream = IntEnum(
     "RandomStream",
     "PATH_DEVIATION IMU_BIAS IMU_NOISE ATTITUDE_ERROR POSITION_TIMES POSITION_NOISE VIO_DRIFT "
@@ -77,7 +76,7 @@ def make_random_generator(scenario: Scenario, random_stream: RandomStream) -> np
 
 @dataclass(frozen=True)
 class SimulatedPositions:
-    """Simulated positions, without the positions that injected faults remove.
+    """Simulated positions, without those that injected faults remove.
 
     Attributes
     ----------
@@ -134,7 +133,7 @@ def simulate_imu(scenario: Scenario, faults: FaultSizes, motion: Motion) -> Topi
 def simulate_magnetometer(scenario: Scenario, faults: FaultSizes, motion: Motion) -> Topic:
     time_us = _make_sample_times_us(motion, MAGNETOMETER_RATE_HZ)
     body_to_ned = compute_attitude(motion.compute_true_state(to_seconds(time_us))).body_to_ned
-    # The measured field is rotated, which causes EKF2's heading error outdoors
+    # The rotated field causes EKF2's heading error outdoors
     if faults.heading_deg:
         body_to_ned = (
             simulate_attitude_error(scenario, faults, to_seconds(time_us)).as_matrix() @ body_to_ned
@@ -192,7 +191,7 @@ def select_logged_imu(full_rate_topic: Topic, faults: FaultSizes, motion: Motion
 
 
 def get_time_us(topic: Topic, field: str = "timestamp") -> IntArray:
-    """Return a time in µs from the first data: the timestamp of each message, or another field."""
+    """Return the times of a topic in µs from the first data."""
     return np.asarray(topic.fields[field].astype(np.int64) - FIRST_TIMESTAMP_US)
 
 
@@ -206,7 +205,7 @@ def measure_imu(
 ) -> ArrayPair:
     """Simulate specific force (m/s²) and angular rate (rad/s), with bias and white noise.
 
-    The noise is that of the mean of ``samples_per_average`` samples.
+    The noise is that of a mean over ``samples_per_average`` samples.
     """
     truth = compute_attitude(motion.compute_true_state(time_s))
     rng, measurements = make_random_generator(scenario, random_stream), []
@@ -410,8 +409,7 @@ def simulate_outliers(
 ) -> tuple[Array, BoolArray]:
     """Simulate outliers; return the errors (m, NED), shape (n, 3), and a mask of the outliers.
 
-    Outliers occur in bursts in one horizontal direction, as from an anchor without line of sight.
-    The sizes are 0.5 to 1.5 times ``nlos_size_m``.
+    Outliers occur in bursts in one horizontal direction, as without line of sight.
     """
     outlier_error_m = np.zeros((len(is_airborne), 3))
     is_outlier = np.zeros(len(is_airborne), np.bool_)
@@ -428,7 +426,7 @@ def simulate_outliers(
         len(airborne_indices) - outlier_count, np.full(burst_count + 1, 1.0 / (burst_count + 1))
     )
     burst_index_by_outlier = np.repeat(np.arange(burst_count), burst_lengths)
-    # The index of an outlier is the number of positions before it: outliers, and good positions
+    # Index of an outlier: number of outliers and good positions before it
     outlier_indices = airborne_indices[
         np.arange(outlier_count)
         + np.cumsum(good_position_counts_between_bursts)[burst_index_by_outlier]
@@ -442,10 +440,10 @@ def simulate_outliers(
 
 
 def is_kept_at_rate(time_s: Array, rate_hz: float) -> BoolArray:
-    """Return a mask: True for samples that a logger with a rate limit (Hz) writes; 0: no limit."""
+    """Return a mask of samples that a logger with a rate limit (Hz) writes; 0: no limit."""
     if rate_hz <= 0.0:
         return np.ones(len(time_s), np.bool_)
-    # the added 1e-6 prevents that rounding moves a sample into the previous logging interval
+    # 1e-6 prevents rounding errors at the edges of logging intervals
     return np.asarray(np.diff(np.floor(time_s * rate_hz + 1e-6), prepend=-1.0) > 0.0)
 
 
@@ -532,7 +530,7 @@ def to_seconds(time_us: IntArray) -> Array:
 
 
 def make_timestamps(time_us: IntArray, delay_us: int | IntArray = 0) -> dict[str, Any]:
-    """Return ``timestamp_sample``, and ``timestamp`` (publication, ``delay_us`` later)."""
+    """Return ``timestamp_sample``, and ``timestamp`` (``delay_us`` later)."""
     return {
         "timestamp": _to_boot_time(time_us + delay_us),
         "timestamp_sample": _to_boot_time(time_us),

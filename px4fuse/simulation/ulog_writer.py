@@ -15,10 +15,10 @@ from px4fuse.core.record import read_toml
 from px4fuse.readers import ULOG_MAGIC
 
 _ULOG_VERSION = b"\x01"
-# ULog names of numpy types; for integer types ULog adds "_t"
+# ULog names of numpy types; names of integer types end in "_t"
 _ULOG_TYPES = {"float64": "double", "float32": "float", "bool": "bool"}
 _FLAG_BITS_MESSAGE = bytes(40)
-# Types, defaults and names of the fields of each topic
+# Fields of each topic, with types and default values
 FIELD_DEFINITIONS_BY_TOPIC = read_toml(__file__, dict[str, str], "topics.toml")
 
 
@@ -72,7 +72,7 @@ def encode_ulog(
     info: Mapping[str, int | str],
     start_us: int,
 ) -> bytes:
-    """Encode a ULog file with its messages sorted by timestamp; equal input gives equal bytes.
+    """Encode a ULog file with messages sorted by timestamp; equal input gives equal bytes.
 
     ``start_us`` is the boot time (µs) at which logging starts.
     """
