@@ -648,7 +648,7 @@ class Ekf2:
     accelerometer_bias: TableOrUnavailable = BIAS_NOT_LOGGED
     # Prediction interval (s) of EKF2
     step_s: float = EKF2_STEP_S
-    # Delay (s) of the fusion horizon: EKF2's state contains measurements up to this age
+    # Delay (s) of the fusion horizon: EKF2 fuses measurements at this age
     horizon_s: float | Unavailable = HORIZON_NOT_LOGGED
     record: FusionRecord | Unavailable = RECORD_NOT_LOGGED
     aids: Mapping[str, AidLog] = field(default_factory=dict)
