@@ -65,7 +65,7 @@ class SourceOrigin(Record):
 
     @property
     def has_all_samples(self) -> bool:
-        """True if the log contains all positions of the sender."""
+        """True if all positions of the sender are available."""
         return self.path in ("given file", "as received")
 
     @property
@@ -167,7 +167,7 @@ class Sender(Record):
 class ClockMap(Record):
     """Linear conversion of a clock to the autopilot's boot clock.
 
-    boot = timestamp + offset + drift · (timestamp - middle of the timestamps)
+    boot time = timestamp + offset + drift · (timestamp - middle of the timestamps)
     """
 
     # Name of the clock ("UNIX time of system 1, component 197")
@@ -417,7 +417,7 @@ class PositionTrack:
     orientation: pd.DataFrame | None = None
     # Velocity (NED) and its variances, for GNSS
     velocity: pd.DataFrame | None = None
-    # Delay that EKF2 assumes. It is already subtracted from the times of ``samples``
+    # Delay from measurement to timestamp that EKF2 assumes; already subtracted from the times
     assumed_delay_s: float = 0.0
     # Barometer height, if it replaces the height of the source
     barometer: pd.DataFrame | None = None
@@ -439,7 +439,7 @@ class PositionTrack:
         return self.origin.aid if axis != "down" or self.barometer is None else BAROMETER
 
     def description_fields(self) -> dict[str, Any]:
-        """Return the fields that describe the track in results.json."""
+        """Return the fields that describe the position source in results.json."""
         names = (
             "name",
             "kind",
@@ -564,7 +564,7 @@ class FusionRecord:
     magnetic_field_gauss: pd.DataFrame = field(default_factory=pd.DataFrame)
     # Velocity from optical flow (body FRD), computed from EKF2's low-pass filtered velocity
     flow: pd.DataFrame = field(default_factory=pd.DataFrame)
-    # Latitude of the local NED frame's origin
+    # Latitude of the origin of the local NED frame
     latitude_deg: float = np.nan
     # Altitude of the origin, if EKF2 stores altitude above sea level (since PX4 v1.16)
     altitude_m: float = 0.0
@@ -673,7 +673,7 @@ class Truth:
     Attributes
     ----------
     name : str
-        Topic, message or track name.
+        Name of the topic or message.
     samples : DataFrame, shape (n, 6)
         Position and velocity (m, m/s, NED); velocity is NaN if not logged.
     attitude : DataFrame, shape (m, 4), or None

@@ -14,7 +14,7 @@ MAX_IMU_READING = 1e4
 MIN_INVALID_ZERO_DISTANCE_M = 0.3
 # Minimum distance (m) of a damaged position from the median position
 MIN_DAMAGED_DISTANCE_M = 1e4
-# Minimum distance of a damaged position, as a multiple of the median distance
+# Minimum distance of a damaged position from the median position, in median distances
 MIN_DAMAGED_TO_MEDIAN_DISTANCE_RATIO = 100.0
 # Minimum duration (s) of equal positions that are rejected as frozen
 MIN_FROZEN_S = 1.0
@@ -24,7 +24,7 @@ MIN_FROZEN_POSITION_COUNT = 5
 MAX_FROZEN_FRACTION = 0.5
 # Maximum probability that randomly repeated positions are rejected as frozen
 MAX_FALSE_FROZEN_PROBABILITY = 0.01
-# Tolerance (fraction of the step) for the detection of rounded values
+# Tolerance (fraction of the quantisation step) for the detection of rounded values
 MAX_DIFFERENCE_FROM_INTEGER = 0.01
 # Minimum norm of a valid quaternion; senders without attitude send zeros
 MIN_QUATERNION_NORM = 0.5

@@ -22,11 +22,11 @@ class Layout:
 
     # PX4 topic or MAVLink message
     topic: str = ""
-    # Required field of each column, for example ``q[0]``
+    # Message field for each required column, for example ``q[0]``
     columns: Mapping[str, str] = field(default_factory=dict)
-    # Field of each column that only some PX4 releases log
+    # Message field for each column that only some PX4 releases log
     optional_columns: Mapping[str, str] = field(default_factory=dict)
-    # Factor of each column; 1 if absent
+    # Factor from the message field to the unit of each column; 1 if absent
     scale: Mapping[str, float] = field(default_factory=dict)
 
 

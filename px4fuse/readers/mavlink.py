@@ -221,7 +221,7 @@ def _read_ekf2(
 def _compute_variance_from_accuracy(recording: Recording) -> pd.DataFrame:
     """Compute position variances (m²) from the accuracies (1 σ, m) in ESTIMATOR_STATUS.
 
-    PX4's horizontal accuracy includes two axes (``get_ekf_lpos_accuracy``).
+    PX4's horizontal accuracy is √(σ_north² + σ_east²) (``get_ekf_lpos_accuracy``).
     """
     accuracy = recording.read(messages.MESSAGE_LAYOUTS["accuracy"])
     horizontal_variance_m2 = accuracy["horizontal_m"] ** 2 / 2.0

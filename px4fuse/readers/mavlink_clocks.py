@@ -28,7 +28,7 @@ MAX_CLOCK_FIT_INTERVALS = 200
 MIN_DRIFT_SPAN_S = 30.0
 # Maximum relative difference of two clock rates; more shows a replay at another speed
 MAX_RELATIVE_CLOCK_RATE_DIFFERENCE = 0.01
-# Maximum ratio of two clock rates. It is above 1e9, because the fit also corrects ns read as s
+# Maximum ratio of two clock rates; above 1e9, for timestamps in ns that were read as s
 MAX_RATIO_OF_CLOCK_RATES = 1e12
 MIN_TIMESYNC_REPLIES = 3
 # Minimum fraction of distinct timestamps of a running clock
@@ -120,7 +120,7 @@ def _is_plausible_rate_ratio(slope: float) -> bool:
 
 
 def is_running_clock(timestamps_s: Array) -> bool:
-    """Return True if enough timestamps are distinct."""
+    """Return True if the timestamps are of a running clock: enough of them are distinct."""
     return len(np.unique(timestamps_s)) >= max(MIN_DISTINCT_TIME_FRACTION * len(timestamps_s), 2)
 
 

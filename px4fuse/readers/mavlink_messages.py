@@ -99,7 +99,7 @@ _SCALED_IMU_LAYOUTS = (
     replace(MESSAGE_LAYOUTS["scaled_imu"], topic=f"SCALED_IMU{number}") for number in ("", "2", "3")
 )
 IMU_LAYOUTS = (MESSAGE_LAYOUTS["highres_imu"], *_SCALED_IMU_LAYOUTS)
-# Attitude messages in order of preference, if they have the same number of samples
+# Attitude messages; the message with most samples is used
 ATTITUDE_LAYOUTS = (
     MESSAGE_LAYOUTS["quaternion"],
     MESSAGE_LAYOUTS["angles"],

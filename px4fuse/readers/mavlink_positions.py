@@ -46,11 +46,6 @@ def read_positions(
         Advice to the user if no positions were recorded.
     delay_s : float
         Delay (s) from GNSS measurement to timestamp that the autopilot assumes.
-
-    Returns
-    -------
-    positions : tuple of PositionTrack
-    missing : tuple of Unavailable
     """
     tracks_or_unavailable: list[PositionTrack | Unavailable] = []
     for message in dict.fromkeys(source.message for source in messages.POSITION_MESSAGE_TYPES):

@@ -59,7 +59,7 @@ MIN_INTERVAL_S = 0.9 / 200
 MAX_INTERVAL_S = 1.1 / 0.2
 # Plausible time units and median intervals (s) of trajectories
 TRAJECTORY_TIME_UNITS, TRAJECTORY_INTERVAL_RANGE_S = ("s", "ns"), (1e-3, 1e3)
-# Maximum median interval (s) of UNIX times; otherwise, the time unit is smaller
+# Maximum median interval (s) of timestamps that are UNIX times
 MAX_UNIX_TIME_INTERVAL_S = 60.0
 # Maximum extent (m) of an indoor flight; otherwise, the positions are probably in mm
 MAX_INDOOR_EXTENT_M = 200.0

@@ -43,7 +43,7 @@ STATE_COUNT = 22
 MAG_3D_FUSION_BIT = 5
 # Minimum rate (Hz) of a complete magnetometer log; EKF2 uses 14 Hz
 MIN_MAGNETOMETER_HZ = 10.0
-# Rounding of an interval ratio is ambiguous at this distance from a half-integer
+# Distance from a half-integer at which the rounding of an interval ratio is ambiguous
 MAX_DISTANCE_FROM_HALF_INTEGER = 0.05
 # Maximum interval (s) for the inversion of EKF2's low-pass filter of optical flow
 MAX_FLOW_INTERVAL_S = 0.5
@@ -244,7 +244,7 @@ def compute_samples_per_step(
 ) -> int:
     """Return the number of IMU samples in one EKF2 prediction: the rounded ratio of both intervals.
 
-    ``step_ends`` (IMU sample indices at which logged predictions end) decide ambiguous rounding.
+    ``step_ends`` are the indices of the IMU samples at which logged predictions end.
 
     >>> compute_samples_per_step(0.010, 0.00375), compute_samples_per_step(0.010, 0.004)
     (3, 3)

@@ -57,7 +57,7 @@ MAX_HEIGHT_TIME_DIFFERENCE_S = 0.05
 # At a lower rate (Hz), the logger dropped GNSS fixes; receivers send 5 to 20 Hz
 MAX_DOWNSAMPLED_HZ = 4.0
 POSITION_STATUS_COLUMNS = ["reset_counter", "quality", "age_s"]
-# Possible units of timestamps in µs
+# Duration (µs) of possible time units
 MICROSECONDS_BY_UNIT = {
     "microseconds": 1.0,
     "milliseconds": 1e3,
@@ -76,7 +76,7 @@ def read_positions(
 ) -> tuple[tuple[PositionTrack, ...], tuple[Unavailable, ...]]:
     """Read the positions of all sources in a log, best source first, and the missing sources."""
     fusion_flags = ekf2.fusion_flags if isinstance(ekf2, Ekf2) else ekf2
-    # A source whose yaw EKF2 fused is odometry
+    # If EKF2 fused the yaw of the source, the source is odometry
     is_odometry = isinstance(fusion_flags, pd.DataFrame) and bool((fusion_flags["yaw"] > 0).any())
     return split_tracks(
         [
