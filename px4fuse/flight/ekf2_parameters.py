@@ -1,7 +1,6 @@
 """Aiding sources of EKF2, and EKF2 parameters with PX4's defaults, units and ranges.
 
-The data are in ``ekf2_parameters.toml``. Parameter names of an aiding source are its attributes,
-for example ``EV_POS.noise``.
+The data are in ``ekf2_parameters.toml``.
 """
 
 import math
@@ -17,54 +16,47 @@ from px4fuse.errors import SettingsError, suggest_name
 
 @dataclass(frozen=True)
 class Aid:
-    """Aiding source of EKF2: a kind of measurement that EKF2 can fuse, and its PX4 parameters.
+    """Aiding source of EKF2, such as GNSS position, with the names of its PX4 parameters."""
 
-    The attributes ``switch``, ``noise``, ``gate``, ``delay`` and ``lever_arm`` contain names of
-    parameters, not values.
-    """
-
-    # Name in PX4, as in ``estimator_aid_src_<name>``
+    # Name in PX4's topic ``estimator_aid_src_<name>``
     name: str
-    # Parameter that enables fusion from PX4 v1.14 on; EKF2_AID_MASK in older releases
+    # Name of the parameter that enables fusion (since PX4 v1.14)
     switch: str = ""
-    # Parameters for the measurement noise (σ) and the innovation gate (√S)
+    # Names of the parameters for measurement noise (σ) and innovation gate (√S)
     noise: str = ""
     gate: str = ""
-    # Parameter for the delay (ms) from measurement to timestamp
+    # Name of the parameter for the delay (ms) from measurement to timestamp
     delay: str = ""
-    # Parameter that makes EKF2 ignore reported variances if it is 1
+    # Name of the parameter that is 1 if EKF2 ignores reported variances
     noise_mode_parameter: str = ""
-    # Parameters for the position of the sensor (m, FRD)
+    # Names of the parameters for the sensor position (m, body FRD)
     lever_arm: tuple[str, ...] = ()
     # Name of the aiding source in reports
     label: str = ""
     # Unit of the innovations
     unit: str = "m"
-    # Text for users (noun phrase): data from which EKF2 computes R. "" if R is only ``noise``
-    # squared
+    # Noun phrase for users: data from which EKF2 computes the measurement variance R
     noise_source_text: str = ""
-    # Gate (√S) for logs without the parameter ``gate``
+    # Innovation gate (√S) if the log contains no gate parameter
     default_gate: float = 5.0
     # Axes of the innovations, in the order of PX4
     axes: tuple[str, ...] = ()
-    # Fields of the topics estimator_innovations and estimator_innovation_variances, one for each
-    # axis: ``ev_hpos[]`` stands for ``ev_hpos[0] ev_hpos[1]``
+    # Fields of the topic estimator_innovations, one for each axis
     fields: str = ""
-    # Fields of ekf2_innovations (v1.8 to v1.10); ``_var`` is appended for the variance
+    # Fields of the topic ekf2_innovations (PX4 v1.8 to v1.10)
     ekf2_innovations_fields: str = ""
-    # Flags of estimator_status_flags that are 1 while fusion of the aiding source is enabled. Each
-    # element holds the flag of one PX4 release, or several flags separated by commas
+    # Flags of the topic estimator_status_flags that are 1 while fusion is enabled
     flags: tuple[str, ...] = ()
-    # Bit of estimator_status.control_mode_flags that is used if ``flags`` are not logged
+    # Bit of estimator_status.control_mode_flags that is 1 while fusion is enabled
     status_bit: int | None = None
 
     @property
     def measurement_parameters(self) -> frozenset[str]:
-        """Names of the parameters for noise, gate and delay, without the parameter ``switch``."""
+        """Names of the PX4 parameters for noise, gate and delay."""
         return frozenset((self.noise, self.gate, self.delay, self.noise_mode_parameter))
 
     def logged_parameters(self, logged_values: Mapping[str, float]) -> dict[str, float]:
-        """Return the logged parameters for noise, delay, gate and fusion of this aiding source."""
+        """Return the logged PX4 parameters of this aiding source, such as noise and gate."""
         names = (
             self.noise,
             self.delay,
@@ -77,16 +69,16 @@ class Aid:
 
 
 AID_MASK_PARAMETER = "EKF2_AID_MASK"
-# Parameter of PX4 main since 2026, with which EKF2 uses the GNSS driver's measurement times
+# PX4 parameter since 2026: EKF2 uses the measurement times of the GNSS driver
 GNSS_MODE_PARAMETER = "EKF2_GPS_MODE"
-# Relative tolerance of PX4's parameter ranges, because logged values are float32 (rounding 6e-8)
+# Relative tolerance of parameter ranges, because logged values are rounded to float32
 FLOAT32_TOLERANCE = 1e-6
-# Parameters for the delay (ms) from fix to timestamp of the first GNSS receiver (since PX4 v1.17)
+# Delay (ms) from fix to timestamp of the first GNSS receiver (since PX4 v1.17)
 RECEIVER_DELAY_PARAMETERS = ("SENS_GNSS0_DELAY", "SENS_GPS0_DELAY")
 
 
 class Parameter(NamedTuple):
-    """Unit of an EKF2 parameter, PX4's default from v1.14 on, and PX4's range (ends included)."""
+    """Unit, default (since PX4 v1.14) and permitted range of an EKF2 parameter."""
 
     unit: str
     default: float
@@ -95,11 +87,11 @@ class Parameter(NamedTuple):
 
     @property
     def printed_unit(self) -> str:
-        """Unit with superscripts: "m/s²" for "m/s^2"."""
+        """Unit with superscripts, for example "m/s²" instead of "m/s^2"."""
         return self.unit.replace("^2", "²").replace("^3", "³")
 
     def describe_range_error(self, name: str, value: float) -> str:
-        """Return "EKF2_EVP_NOISE 9 m is outside PX4's range 0.01 to 5", or "" inside the range."""
+        """Return an error message if the value is outside PX4's range, otherwise ""."""
         lower_limit = self.minimum - FLOAT32_TOLERANCE * abs(self.minimum)
         upper_limit = self.maximum + FLOAT32_TOLERANCE * abs(self.maximum)
         if lower_limit <= value <= upper_limit:
@@ -109,9 +101,9 @@ class Parameter(NamedTuple):
 
 
 PARAMETER_TABLES = read_toml(__file__, dict)
-# Keys of PARAMETER_TABLES whose value is a list of names, separated by blanks
+# TOML keys for lists of names, separated by blanks
 NAME_LIST_KEYS = ("axes", "lever_arm", "flags")
-# Aiding sources, and other status flags of EKF2, by name
+# Aiding sources and other status flags of EKF2, by PX4 name
 AIDS, STATUS_FLAGS = (
     {
         name: msgspec.convert(
@@ -134,28 +126,27 @@ PARAMETERS, _LOGGED_PARAMETERS = (
     )
     for table in ("parameters", "logged")
 )
-# Parameters of the EKF2 model, and other logged parameters that px4fuse needs
+# All parameters with a known unit, default and range
 KNOWN_PARAMETERS = PARAMETERS | _LOGGED_PARAMETERS
 MAGNETIC_FIELD_NOISE_PARAMETERS = ("EKF2_MAG_E_NOISE", "EKF2_MAG_B_NOISE")
-# Value of EKF2_MAG_TYPE with which EKF2 does not use the magnetometer ("None")
+# Value of EKF2_MAG_TYPE for "None": EKF2 does not use the magnetometer
 MAG_TYPE_NONE = 5
-# Bit mask of EKF2_EV_CTRL: EKF2 fuses the yaw of external vision
+# Bit of EKF2_EV_CTRL that enables fusion of the yaw of external vision
 EV_CTRL_YAW_MASK = 8
-# Defaults of PX4 up to v1.13 that differ from the defaults of later releases (ekf2_params.c)
+# Parameter defaults up to PX4 v1.13 that differ from later releases (ekf2_params.c)
 DEFAULTS_BEFORE_V1_14: Mapping[str, float] = {EV_POS.delay: 175.0}
-# Names of the logged parameters that the results contain
+# Logged parameters that px4fuse writes to its results
 PARAMETERS_IN_RESULTS: tuple[str, ...] = tuple(PARAMETER_TABLES["reported"].split())
 
 
 def fill_with_defaults(
     logged_values: Mapping[str, float], aid: Aid = EV_POS, *other_aids: Aid
 ) -> dict[str, float]:
-    """Return all parameters of the EKF2 model: the logged value or, if not logged, PX4's default.
+    """Return the parameters of EKF2: logged values, or PX4's defaults if not logged.
 
-    Parameters of aiding sources other than ``aid`` and ``other_aids`` are omitted.
+    Parameters of other aiding sources are omitted.
     """
-    # One parameter enables all aiding sources of one sensor, such as GNSS position and velocity, so
-    # their parameters are returned together
+    # One parameter enables all aiding sources of a sensor, such as GNSS position and velocity
     used_switches = {fused_aid.switch for fused_aid in (aid, *other_aids)}
     excluded_names = {
         name
@@ -178,16 +169,14 @@ def fill_with_defaults(
 
 
 def uses_aid_mask(logged_values: Mapping[str, float]) -> bool:
-    """Return True if EKF2_AID_MASK selects the aiding sources in this log (PX4 up to v1.13)."""
+    """Return True if EKF2_AID_MASK selects the aiding sources (PX4 up to v1.13)."""
     return AID_MASK_PARAMETER in logged_values and EV_POS.switch not in logged_values
 
 
 def replace_invalid_parameters(
     logged_values: Mapping[str, float],
 ) -> tuple[dict[str, float], tuple[str, ...]]:
-    """Replace invalid logged parameters by their defaults, and return a note on each.
-
-    Parameters without a known default are omitted.
+    """Replace invalid logged parameters by PX4's defaults, and return a note on each.
 
     Examples
     --------
@@ -214,12 +203,12 @@ def replace_invalid_parameters(
 
 
 def check_parameters(changes: Mapping[str, float]) -> dict[str, float]:
-    """Check changes of EKF2 parameters.
+    """Check names and values of changed EKF2 parameters.
 
     Raises
     ------
     SettingsError
-        The EKF2 model does not contain a parameter, or a value is outside PX4's range.
+        A parameter is unknown, or its value is outside PX4's range.
 
     Examples
     --------

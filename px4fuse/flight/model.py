@@ -1,12 +1,8 @@
-"""Data model of a flight, created by the readers and used by all other modules.
+"""Data model of a flight.
 
-Times are seconds on the autopilot's boot clock since the first sample of data, whose boot time is
-``LogInfo.boot_time_s``. They are *measurement* times, not publication times. Vectors are NED
-(north, east, down) in m, m/s and m/s², or body FRD (forward, right, down) if stated. Time series
-are pandas frames with the index ``time_s``; column names contain the unit.
-
-Missing data are :class:`Unavailable`, with a reason that the report prints. They are never
-replaced by zeros.
+Times are measurement times (s) on the autopilot's boot clock since the first sample.
+Vectors are NED (north, east, down) in m, m/s and m/s², or body FRD if stated.
+Missing data are :class:`Unavailable` with a reason. They are never replaced by zeros.
 """
 
 from __future__ import annotations
@@ -46,35 +42,30 @@ PositionRoute = Literal[
 
 
 class SourceOrigin(Record):
-    """Kind of a position source, and data of the log that contain its positions."""
+    """Kind of a position source, and logged data that contain its positions."""
 
-    # Kind of device, inferred from the data: "vio" sends a changing orientation, "uwb" only noisy
-    # positions, "unknown" only precise positions
+    # Kind of the sensor, inferred from the data
     kind: PositionKind
-    # Data in the log from which the positions are read, for example "as received" by the autopilot
+    # Logged data that contain the positions, for example "as received" by the autopilot
     path: PositionRoute
-    # Aiding source of EKF2 for these positions; None if EKF2 never fuses them
+    # EKF2's aiding source for these positions; None if EKF2 never fuses them
     aid: Aid | None
-    # True if px4fuse may select the source without --position-source
+    # True if px4fuse may select the source by default
     is_auto_candidate: bool = True
 
     @property
     def may_drift(self) -> bool:
-        """True if the position error may grow with the distance travelled, as for odometry.
-
-        A log does not distinguish odometry from motion capture sent in the same messages, so both
-        may drift.
-        """
+        """True if the position error may grow with the distance travelled, as for odometry."""
         return self.kind == "vio"
 
     @property
     def reconstructed(self) -> bool:
-        """True if the positions are derived from EKF2's logged data, not logged as received."""
+        """True if the positions are reconstructed from EKF2's logged data."""
         return self.path in ("kept by EKF2", "rebuilt from innovations")
 
     @property
     def has_all_samples(self) -> bool:
-        """True if the position track contains all samples of the sender."""
+        """True if all positions of the sender are available."""
         return self.path in ("given file", "as received")
 
     @property
@@ -87,18 +78,14 @@ class SourceOrigin(Record):
 
     @property
     def is_gnss(self) -> bool:
-        """True for GNSS, whose errors (multipath, atmosphere) are correlated over minutes.
-
-        Differences of consecutive positions do not show these errors, but R has to include them.
-        """
+        """True for GNSS, whose errors (multipath, atmosphere) are correlated over minutes."""
         return self.kind == "gnss"
 
     def find_preference_rank(self) -> int:
-        """Return the index in SOURCE_ORIGINS. px4fuse chooses the source with the smallest rank."""
+        """Return the rank of the source. px4fuse prefers the source with the smallest rank."""
         return [(origin.aid, origin.path) for origin in SOURCE_ORIGINS].index((self.aid, self.path))
 
 
-# Possible origins of positions: kind of the source, and data in the log that contain the positions
 POSITION_FILE_ORIGIN = SourceOrigin("file", "given file", EV_POS)
 AS_RECEIVED_ORIGIN = SourceOrigin("uwb", "as received", EV_POS)
 MOTION_CAPTURE_ORIGIN = SourceOrigin("mocap", "as received", None)
@@ -106,7 +93,7 @@ ALIGNED_BY_EKF2_ORIGIN = SourceOrigin("uwb", "aligned by EKF2", EV_POS)
 KEPT_BY_EKF2_ORIGIN = SourceOrigin("uwb", "kept by EKF2", EV_POS)
 REBUILT_FROM_INNOVATIONS_ORIGIN = SourceOrigin("uwb", "rebuilt from innovations", EV_POS)
 GNSS_ORIGIN = SourceOrigin("gnss", "as received", GNSS_POS, is_auto_candidate=False)
-# All origins; a source with an earlier origin is preferred for the analysis
+# All origins of positions, in order of preference
 SOURCE_ORIGINS = (
     POSITION_FILE_ORIGIN,
     AS_RECEIVED_ORIGIN,
@@ -126,7 +113,7 @@ def find_source_origin(kind: str, path: str) -> SourceOrigin:
 
 
 def reclassify_as_vio(origin: SourceOrigin, *, has_changing_orientation: bool) -> SourceOrigin:
-    """Change the kind "uwb" to "vio" if the source sends orientations that change."""
+    """Change the kind "uwb" to "vio" if the orientation of the source changes."""
     return (
         replace(origin, kind="vio") if origin.kind == "uwb" and has_changing_orientation else origin
     )
@@ -135,9 +122,9 @@ def reclassify_as_vio(origin: SourceOrigin, *, has_changing_orientation: bool) -
 REPEATED_TIMESTAMPS_NOTE = (
     "most timestamps of the sender are repeated, so its clock is not converted"
 )
-# Clock of timestamps that an external sender set. In a ULog, PX4 has converted or replaced them
+# Clock name for timestamps of an external sender
 SENDER_CLOCK = "sender timestamps"
-# Replacement for results that would show a student the injected fault of an assignment
+# The diagnosis would show students the injected fault of an assignment
 DIAGNOSIS_WITHHELD = Unavailable(
     "diagnosis",
     "the flight is a student assignment, for which px4fuse shows no diagnosis",
@@ -146,7 +133,7 @@ DIAGNOSIS_WITHHELD = Unavailable(
 
 
 class Dropout(Record):
-    """Time span (s) in which the logger of the autopilot lost data."""
+    """Time span (s) in which the autopilot's logger lost data."""
 
     start_s: float
     duration_s: NotNegative
@@ -160,12 +147,11 @@ class Sender(Record):
     system, component : int
         MAVLink ids.
     description : str
-        Type from the heartbeat of the sender ("PX4 quadrotor", "companion computer").
+        Type of the sender, for example "PX4 quadrotor".
     messages : int
         Number of messages with a valid checksum.
     lost_fraction : float or None
-        Fraction of the sender's messages that the recording does not contain, from the sequence
-        numbers; None if the sender does not count its messages.
+        Fraction of lost messages, from the sequence numbers; None if unknown.
     chosen : bool
         True for the autopilot of the analysed flight.
     """
@@ -181,13 +167,12 @@ class Sender(Record):
 class ClockMap(Record):
     """Linear conversion of a clock to the autopilot's boot clock.
 
-    boot = timestamp + offset + drift · (timestamp - middle of the timestamps)
+    boot time = timestamp + offset + drift · (timestamp - middle of the timestamps)
     """
 
     # Name of the clock ("UNIX time of system 1, component 197")
     clock: str
-    # Source of the conversion: "boot clock", "TIMESYNC", "SYSTEM_TIME", "receive time" (at the
-    # recording computer), "arrival time" (at the autopilot) or "message order"
+    # Source of the conversion, for example "TIMESYNC" or "receive time"
     method: str
     # Number of simultaneous readings of this clock and the boot clock
     pairs: Count
@@ -195,12 +180,11 @@ class ClockMap(Record):
     offset_s: float
     # Rate of the boot clock minus rate of this clock
     drift_ppm: float
-    # Standard deviation of the readings from the fitted line (1.4826 · median absolute deviation)
+    # Robust standard deviation of the readings from the fitted line
     jitter_s: NotNegative
     # Limitation of the conversion, if any
     note: str = ""
-    # Number of distinct timestamps, if they are too few to convert them to boot time; otherwise
-    # None
+    # Number of distinct timestamps, if they are too few for a conversion
     distinct_stamps: Count | None = None
 
 
@@ -209,7 +193,7 @@ def describe_repeated_timestamps(
 ) -> ClockMap | None:
     """Describe a clock that cannot be converted, because most timestamps are repeated.
 
-    Return None if at least half of the timestamps are distinct.
+    Return None if more than half of the timestamps are distinct.
     """
     if 2 * distinct_count > sample_count:
         return None
@@ -220,7 +204,7 @@ def describe_repeated_timestamps(
 
 @dataclass(frozen=True)
 class DataSource:
-    """Topics or messages of one kind of data, clock of their timestamps, and file name."""
+    """Origin of one kind of data: topics or messages, clock of their timestamps, file name."""
 
     topics: tuple[str, ...]
     clock: str
@@ -229,7 +213,7 @@ class DataSource:
 
 @dataclass(frozen=True)
 class UnusedData:
-    """Topic or message with position data that px4fuse does not use, and its number of messages."""
+    """Topic or message with positions that px4fuse does not use, and the reason."""
 
     name: str
     count: int
@@ -237,7 +221,7 @@ class UnusedData:
 
 
 class InputFile(Record):
-    """Input file in addition to the log: name without folder, SHA-256, size (bytes) and role."""
+    """Input file in addition to the log: name without folder, SHA-256 and size (bytes)."""
 
     name: str
     sha256: Sha256
@@ -246,21 +230,20 @@ class InputFile(Record):
 
 
 class LogInfo(Record, omit_defaults=False):
-    """Description of the log file; "unknown" for texts that are not in the log."""
+    """Description of the log file; texts that are not logged are "unknown"."""
 
     # File name without folder
     name: str
     sha256: Sha256
     bytes: Count
-    # A "MAVLink tlog" contains receive times, a "MAVLink stream" does not
+    # A MAVLink tlog contains receive times, a MAVLink stream does not
     format: Literal["ULog", "MAVLink tlog", "MAVLink stream"]
     firmware: str
     firmware_hash: str
     hardware: str
-    # Boot clock at the first sample, which is time zero of the flight
+    # Boot time of the first sample, which is time zero of the flight
     boot_time_s: float
-    # Time span of the IMU samples, or of the topic with the most samples if the IMU is not logged.
-    # MAVLink: time span of the boot times. Outlying timestamps are ignored
+    # Time span of the data, without outlying timestamps
     duration_s: NotNegative
     dropouts: tuple[Dropout, ...] = ()
     # PX4 parameters for fusion and logging at the start of the log
@@ -276,25 +259,25 @@ class LogInfo(Record, omit_defaults=False):
     vehicle: str = ""
     # Sentences about damaged bytes of the file
     damage: tuple[str, ...] = ()
-    # Number of bytes that were read as complete messages
+    # Number of bytes in complete messages
     bytes_read: Count = 0
     # True if the land detector reports flight at the end of the data
     ends_in_flight: bool = False
-    # Number of restarts of the boot clock; only data between two restarts are used
+    # Number of restarts of the boot clock
     restarts: Count | None = None
     # Number of backward jumps of the recording computer's clock
     receive_time_reversals: Count | None = None
     # Number of samples with invalid timestamps, by topic, message or file
     dropped: Mapping[str, Count] = {}
-    # Firmware defaults of the changed EKF2 parameters; ULog only
+    # Firmware defaults of changed EKF2 parameters (ULog only)
     parameter_defaults: Mapping[str, int | float] = {}
-    # True for a student assignment (``px4fuse simulate --assignment``): px4fuse hides the faults
+    # True for a student assignment, for which px4fuse hides the faults
     is_assessed: Literal[True] | msgspec.UnsetType = msgspec.UNSET
 
     __repr__ = one_line_repr
 
     def find_default_value(self, parameter: str) -> float:
-        """Return the default of an EKF2 parameter: the logged default, else PX4's since v1.14."""
+        """Return the default of an EKF2 parameter, from the log if possible."""
         return self.parameter_defaults.get(parameter, PARAMETERS[parameter].default)
 
     @property
@@ -305,26 +288,24 @@ class LogInfo(Record, omit_defaults=False):
 
 NedAxis = Literal["north", "east", "down"]
 TableOrUnavailable = pd.DataFrame | Unavailable
-# Step functions of flight time (s) by name: a value is valid until the time of the next value
+# Step functions of time (s) by name: each value is valid until the next value
 StepFunctions: TypeAlias = "Mapping[str, pd.Series[float]]"
 # Intervals (start, end) in s of flight time
 Spans = tuple[Span, ...]
-# Minimum fraction of sample intervals that are at most three median intervals. Below it, the
-# samples arrive in bursts
+# Minimum fraction of regular sample intervals; with fewer, the samples arrive in bursts
 MIN_REGULAR_INTERVAL_FRACTION = 0.8
-# Values of ClockMap.method for which the timestamps are not times of measurement
+# Clock conversions that do not give measurement times
 METHODS_WITHOUT_MEASUREMENT_TIMES = ("arrival time", "receive time", "message order")
-# Reason for missing positions if the source measures only the height
 HEIGHT_ONLY_REASON = "x and y are NaN in all messages, so the source measures only the height"
 # Ratio of the median absolute second difference to the σ of white noise
 SECOND_DIFFERENCE_PER_SIGMA = 6.0**0.5 / 1.4826
 # Minimum number of positions to estimate their noise
 MIN_NOISE_SAMPLES = 10
-# Positions with less noise (1 σ, m) are not classified as UWB
+# Minimum noise (1 σ, m) of UWB positions
 MIN_UWB_NOISE_M = 0.03
-# Positions at a higher rate (Hz) are not classified as UWB
+# Maximum rate (Hz) of UWB positions
 MAX_UWB_RATE_HZ = 25.0
-# Minimum time (s) on the ground between two flights: shorter landings are detector errors
+# Minimum time (s) on the ground between two flights; shorter landings are detector errors
 MIN_LANDED_DURATION_S = 5.0
 BODY_AXES = ("forward", "right", "down")
 AXIS_NAMES: tuple[NedAxis, NedAxis, NedAxis] = ("north", "east", "down")
@@ -338,12 +319,12 @@ SOURCE_NAMES: Mapping[PositionKind, str] = {
 }
 
 
-# The dtype is object, because pandas reserves 1 GB of address space for a first column of strings
+# dtype object: pandas reserves 1 GB of address space for the first column of strings
 NO_INVALID_ROWS: pd.Series[str] = pd.Series(dtype=object, index=pd.Index([], dtype=np.float64))
 
 
 class Columns:
-    """Column names of all tables of a flight, with units."""
+    """Column names of the tables of a flight, with units."""
 
     GEODETIC: Final = ["latitude_deg", "longitude_deg", "altitude_m"]
     POSITION: Final = ["north_m", "east_m", "down_m"]
@@ -355,7 +336,7 @@ class Columns:
     ANGULAR_RATE: Final = ["forward_rad_s", "right_rad_s", "down_rad_s"]
     QUATERNION: Final = ["w", "x", "y", "z"]
     ROTATION_VARIANCE: Final = ["forward_rad2", "right_rad2", "down_rad2"]
-    # Columns of EKF2's state and variances at the fusion horizon, the same for all PX4 releases
+    # EKF2's state and variances at the fusion horizon
     GYRO_BIAS: Final = [f"gyro_bias_{axis}_rad_s" for axis in BODY_AXES]
     ACCELEROMETER_BIAS: Final = [f"accelerometer_bias_{axis}_m_s2" for axis in BODY_AXES]
     EARTH_MAGNETIC_FIELD: Final = [f"earth_field_{axis}_gauss" for axis in AXIS_NAMES]
@@ -381,34 +362,34 @@ class Columns:
 
 
 class Alignment(Record, kw_only=True):
-    """Alignment of an external position file with the flight in time and space.
+    """Alignment of a position file with the flight in time and space.
 
-    A position p of the file becomes origin + Rz(yaw) · C · p, where C converts the frame of the
-    file to NED.
+    A position p of the file becomes origin + Rz(yaw) · C · p in NED. C converts the axes of the
+    file to NED axes.
     """
 
     # Frame of the file: "ned", "enu", "nwu", "eus" or "edn"
     frame: str
     frame_reason: str
-    # Rotation after the conversion to NED, clockwise from above
+    # Rotation about the vertical, clockwise from above
     yaw_deg: float
     yaw_sigma_deg: NotNegative | None = None
     yaw_reason: str
-    # Position of the origin of the file in NED
+    # Origin of the file in NED
     origin_m: Vector
-    # Offset added to the timestamps of the file to obtain boot times
+    # Boot time minus timestamp of the file
     clock_offset_s: float
     clock_offset_sigma_s: NotNegative | None = None
     clock_reason: str
-    # Reference for the estimated alignment: "EKF2 position", "IMU", or "" without an estimate
+    # Reference of the alignment: "EKF2 position", "IMU" or "" (no estimate)
     reference: str
-    # Correlation of the aligned track with the reference; 1 is perfect
+    # Correlation of the aligned positions with the reference
     correlation: float | None = None
-    # Horizontal residual (RMS per axis); None if the reference has no position
+    # Horizontal position residual (RMS per axis)
     residual_rms_m: NotNegative | None = None
-    # Errors of the coordinate frame (wrong axes, yaw or origin), one sentence each
+    # Sentences about wrong axes, yaw or origin
     misplaced: tuple[str, ...] = ()
-    # Alignment estimates with a large uncertainty, one sentence each
+    # Sentences about alignment estimates with a large uncertainty
     warnings: tuple[str, ...]
 
 
@@ -416,53 +397,49 @@ class Alignment(Record, kw_only=True):
 class PositionTrack:
     """Positions of one external source over time."""
 
-    # Name for ``--position-source``: the PX4 topic, if there is one
+    # Name for the option ``--position-source``, usually the PX4 topic
     name: str
     origin: SourceOrigin
     description: str
-    # Position in NED and the reported variances (columns POSITION and POSITION_VARIANCE); NaN for
-    # variances that are not logged
+    # Position (NED) and reported variances; variances are NaN if not logged
     samples: pd.DataFrame
-    # "NED", "FRD" (world-fixed, x is the initial heading) or "unknown"
+    # Frame: "NED", "FRD" (fixed, x along the initial heading) or "unknown"
     frame: str
-    # Name of the clock of the timestamps, for example "boot clock"
+    # Clock of the timestamps, for example "boot clock"
     clock: str
-    # Topics or messages with the data, and name of their file
+    # Topics or messages that contain the positions
     topics: tuple[str, ...]
     log: str = ""
-    # Conversion of the sender's clock to the boot clock, if px4fuse made one
+    # Conversion of the sender's clock to the boot clock
     clock_map: ClockMap | None = None
     alignment: Alignment | None = None
-    # Quaternion body FRD to ``frame``, and variances about the body axes (NaN if not sent). None if
-    # the source sends no orientation or a constant one
+    # Quaternion from body FRD to ``frame``, and variances about the body axes
     orientation: pd.DataFrame | None = None
-    # Velocity in NED and its variances, if the source measures velocity (GNSS)
+    # Velocity (NED) and its variances, for GNSS
     velocity: pd.DataFrame | None = None
-    # Delay that EKF2 assumes from measurement to timestamp. The times in ``samples`` are timestamps
-    # minus this delay
+    # Delay from measurement to timestamp that EKF2 assumes; already subtracted from the times
     assumed_delay_s: float = 0.0
-    # Barometer height ``down_m``, if it replaces the height of the source
+    # Barometer height, if it replaces the height of the source
     barometer: pd.DataFrame | None = None
-    # Position of the sensor in the body frame (FRD) that EKF2 assumes
+    # Sensor position (body FRD) that EKF2 assumes
     lever_arm_m: tuple[float, float, float] = (0.0, 0.0, 0.0)
-    # One sentence per kind of sample that was interpolated, reconstructed or dropped
+    # Sentences about interpolated, reconstructed or dropped samples
     notes: tuple[str, ...] = ()
-    # Reason for each row that is not a measurement: "NaN", "zero" (0, 0, 0), "far"
-    # (damaged) or "held" (the last position sent again)
+    # Reason why a row is not a measurement, for example "NaN"
     invalid_reasons: pd.Series[str] = field(default_factory=lambda: NO_INVALID_ROWS)
-    # ``reset_counter``, ``quality`` and ``age_s`` (arrival in PX4 minus timestamp), if logged
+    # Reset counter, quality and delay until arrival in PX4, if logged
     status: pd.DataFrame = field(default_factory=pd.DataFrame)
-    # Quantisation step of the horizontal position as sent; 0 if it is not quantised
+    # Quantisation step of the horizontal position; 0 if not quantised
     rounding_step_m: float = 0.0
 
     __repr__ = one_line_repr
 
     def aid(self, axis: str) -> Aid | None:
-        """Return EKF2's aiding source for the positions of this track along an axis, if any."""
+        """Return EKF2's aiding source for the positions along an axis, if any."""
         return self.origin.aid if axis != "down" or self.barometer is None else BAROMETER
 
     def description_fields(self) -> dict[str, Any]:
-        """Return the fields that describe the track in results.json, by name."""
+        """Return the fields that describe the position source in results.json."""
         names = (
             "name",
             "kind",
@@ -481,24 +458,21 @@ class PositionTrack:
         }
 
     def compute_rate_hz(self) -> float:
-        """Return the sample rate (Hz) outside of gaps; NaN for fewer than two samples."""
+        """Return the sample rate (Hz) without gaps; NaN for fewer than two samples."""
         return sample_rate(self.samples)
 
 
 def estimate_white_noise_m(position_m: Array) -> float:
     """Estimate the white noise (1 σ, m) of positions, shape (n, axes), along the noisiest axis.
 
-    It is computed from second differences, because they are zero at constant velocity.
+    The estimate uses second differences, which are zero at constant velocity.
     """
     second_difference_m = np.abs(np.diff(position_m, 2, axis=0))
     return float(np.median(second_difference_m, axis=0).max()) / SECOND_DIFFERENCE_PER_SIGMA
 
 
 def infer_position_kind(samples: pd.DataFrame) -> PositionKind:
-    """Infer the kind of a source without orientation: noisy and slow is "uwb", else "unknown".
-
-    Motion capture, odometry and other precise systems may also send positions only.
-    """
+    """Infer the kind of a position source: "uwb" for noisy positions, otherwise "unknown"."""
     position_m = samples[Columns.POSITION[:2]].dropna().drop_duplicates().to_numpy()
     is_uwb = (
         len(position_m) >= MIN_NOISE_SAMPLES
@@ -509,18 +483,18 @@ def infer_position_kind(samples: pd.DataFrame) -> PositionKind:
 
 
 def source_name(source: PositionTrack) -> str:
-    """Return the name of a position source for users, such as "UWB", instead of its topic."""
+    """Return the name of a position source for users, such as "UWB"."""
     return SOURCE_NAMES[source.origin.kind]
 
 
 def reset_times_s(track: PositionTrack) -> Array:
-    """Return the times at which ``reset_counter`` of the source changes."""
+    """Return the times (s) at which the reset counter of the source changes."""
     reset_counter = track.status.get("reset_counter", pd.Series(dtype=float))
     return np.asarray(reset_counter.index[1:][np.diff(reset_counter) != 0.0], dtype=np.float64)
 
 
 def positions_phrase(source: PositionTrack) -> str:
-    """Return the noun phrase for the positions of a source: "UWB positions"."""
+    """Return the name of the positions for users, such as "UWB positions"."""
     if source.origin.kind == "file":
         return "positions from the file"
     return f"{source_name(source)} positions"
@@ -528,7 +502,7 @@ def positions_phrase(source: PositionTrack) -> str:
 
 @dataclass(frozen=True)
 class Reset:
-    """Reset of EKF2's published state: ``delta`` is added to the state.
+    """Reset of EKF2's position or velocity to a new value.
 
     Attributes
     ----------
@@ -537,7 +511,7 @@ class Reset:
     quantity : str
         "position" or "velocity".
     delta : tuple of float
-        North, east, down (m or m/s); 0 for axes that were not reset.
+        Change of the state (m or m/s; north, east, down).
     """
 
     time_s: float
@@ -565,7 +539,7 @@ RECORD_NOT_LOGGED = Unavailable(
 )
 
 
-# Names of status flags of EKF2 in FusionRecord.states
+# PX4's names of EKF2 status flags
 GROUND_EFFECT_FLAG, BAD_ACCELERATION_FLAG = "gnd_effect", "bad_acc_vertical"
 DEAD_RECKONING_FLAG = "inertial_dead_reckoning"
 # Weight of a new sample in EKF2's low-pass filter of optical flow (_flow_vel_body_lpf in ekf.h)
@@ -574,37 +548,29 @@ FLOW_FILTER_NEW_SAMPLE_WEIGHT = 0.1
 
 @dataclass(frozen=True)
 class FusionRecord:
-    """Logged data for the EKF2 replay: EKF2's states at the fusion horizon, and measurements."""
+    """Logged data for the EKF2 replay: states at the fusion horizon and measurements."""
 
-    # All EKF2_ parameters at the start of the log, by PX4 name, in PX4 units
+    # All EKF2 parameters at the start of the log, in PX4 units
     parameters: Mapping[str, float]
-    # State and variances at the fusion horizon, in the columns FUSION_HORIZON_STATE and
-    # FUSION_HORIZON_VARIANCE. The horizontal position is NaN if PX4 stores latitude and longitude
+    # EKF2's state and variances at the fusion horizon
     delayed: pd.DataFrame
-    # True if the PX4 release stores biases as increments per prediction (up to v1.14)
+    # True if EKF2 stores biases as increments per prediction (up to PX4 v1.14)
     stores_bias_increments: bool
-    # Names of the fused aiding sources of horizontal position and velocity, except vision position
+    # Other aiding sources that EKF2 fuses as horizontal position or velocity
     other_horizontal_aids: tuple[str, ...]
     # Delay (s) from measurement to publication of each external vision sample
     vision_age_s: pd.Series
-    # Measured magnetic field (body FRD). ``fused_3d`` is 1 while EKF2 fuses all components, 0 for
-    # heading only. Logs since v1.16 also fill the columns MAGNETIC_FIELD_INNOVATION: EKF2's
-    # low-pass filtered innovations (predicted minus measured)
+    # Measured magnetic field (body FRD). ``fused_3d`` is 0 while EKF2 fuses the heading only
     magnetic_field_gauss: pd.DataFrame = field(default_factory=pd.DataFrame)
-    # Velocity from optical flow (body FRD), computed from the logged low-pass filtered velocity.
-    # Each row is a weighted mean of the ``samples`` measurements since the previous row.
-    # ``interval_s`` is the interval of the measurements, ``noise_m2_s2`` the variance R of one
-    # measurement
+    # Velocity from optical flow (body FRD), computed from EKF2's low-pass filtered velocity
     flow: pd.DataFrame = field(default_factory=pd.DataFrame)
-    # Latitude of the origin
+    # Latitude of the origin of the local NED frame
     latitude_deg: float = np.nan
-    # Altitude of the origin if EKF2 stores altitude above sea level (since v1.16), else 0
+    # Altitude of the origin, if EKF2 stores altitude above sea level (since PX4 v1.16)
     altitude_m: float = 0.0
-    # Logged updates of EKF2's height bias estimators, by aiding source: ``bias_m`` and its variance
-    # ``bias_m2`` after the update, ``innovation_m`` and its variance ``variance_m2``
+    # Logged updates of EKF2's height bias estimators, by aiding source
     height_bias_updates: Mapping[str, pd.DataFrame] = field(default_factory=dict)
-    # Status flags of EKF2 by PX4 name, 1 while set: GROUND_EFFECT_FLAG (wrong barometer height),
-    # BAD_ACCELERATION_FLAG (vertical accelerometer) and DEAD_RECKONING_FLAG
+    # Status flags of EKF2 by PX4 name; 1 while set
     states: StepFunctions = field(default_factory=dict)
 
     __repr__ = one_line_repr
@@ -614,7 +580,7 @@ class FusionRecord:
         return not np.isfinite(self.delayed["north_m"]).any()
 
     def was_flag_set(self, flag: str, times_s: Array) -> BoolArray:
-        """Return a mask of the times at which a status flag of EKF2 (key of ``states``) was set."""
+        """Return True for each time at which the status flag of EKF2 was set."""
         step_function = self.states.get(flag)
         return (
             np.zeros(len(times_s), bool)
@@ -630,30 +596,28 @@ class AidLog:
     # Topics with the innovations and their variances
     topics: tuple[str, ...]
     axes: tuple[str, ...]
-    # Columns for each axis: ``innovation_<axis>`` (measurement minus prediction) and
-    # ``variance_<axis>`` (S). The topics estimator_aid_src also contain R, the test ratio,
-    # ``fused`` and ``rejected``
+    # Innovation (measurement minus prediction) and innovation variance S of each axis
     samples: pd.DataFrame
-    # 1 while fusion of the source is enabled, otherwise 0; None if not logged
+    # 1 while fusion is enabled, otherwise 0; None if not logged
     enabled: pd.Series[float] | None
     # EKF2 parameters of the aiding source at the start of the log
     parameters: Mapping[str, float] = field(default_factory=dict)
-    # Number of innovations that were dropped because no variance is near in time
+    # Number of innovations without a logged variance near in time
     excluded_sample_count: int = 0
-    # Times of innovations for which the log does not show whether EKF2 fused them
+    # Times (s) of innovations for which the log does not state if EKF2 fused them
     times_with_unknown_fusion_s: Array = field(default_factory=lambda: np.zeros(0))
 
     __repr__ = one_line_repr
 
 
 def sample_step_function(step_function: pd.Series[float], times: pd.Index[float] | Array) -> Array:
-    """Return the values of a step function at times; before its start, the first value."""
+    """Return the values of a step function at the given times."""
     previous_rows = np.clip(np.searchsorted(step_function.index, times, side="right") - 1, 0, None)
     return np.asarray(step_function, dtype=np.float64)[previous_rows]
 
 
 class ParameterChange(NamedTuple):
-    """Change of a PX4 parameter in flight, with the values before and after it."""
+    """Change of a PX4 parameter in flight."""
 
     time_s: float
     name: str
@@ -663,40 +627,34 @@ class ParameterChange(NamedTuple):
 
 @dataclass(frozen=True)
 class Ekf2:
-    """State, variances and innovations of EKF2, from the primary instance at each time."""
+    """State, variances and innovations of EKF2's primary instance."""
 
     # Position and velocity (NED) as published, including resets
     state: pd.DataFrame
     variance: TableOrUnavailable
-    # Columns ``innovation_m`` (measurement minus prediction, opposite to PX4's sign),
-    # ``innovation_variance_m2``, ``observation_variance_m2``, ``test_ratio``, ``fused`` and
-    # ``rejected`` (1 or 0); NaN if not logged
+    # Innovations are measurement minus prediction, opposite to PX4's sign
     innovations: Mapping[NedAxis, TableOrUnavailable]
     innovation_topics: tuple[str, ...]
-    # 1 while EKF2 reports fusion of the external vision components ``horizontal``, ``vertical`` and
-    # ``yaw``
+    # 1 while EKF2 fuses the horizontal position, height or yaw of external vision
     fusion_flags: TableOrUnavailable
     resets: tuple[Reset, ...]
     # Start time (s) and number of each primary instance of EKF2
     primary_instances: tuple[tuple[float, int], ...]
     # Innovation gate (√S) of the position source, for example EKF2_EVP_GATE
     gate: float
-    # Sentences on dropped samples and on the origin of the timestamps
+    # Sentences about dropped samples and timestamps
     notes: tuple[str, ...] = ()
-    # Estimated bias (m/s², body FRD) that EKF2 subtracts from the specific force
+    # EKF2's estimate of the accelerometer bias (m/s², body FRD)
     accelerometer_bias: TableOrUnavailable = BIAS_NOT_LOGGED
     # Prediction interval (s) of EKF2
     step_s: float = EKF2_STEP_S
-    # Delay (s) of the fusion horizon. The state at time t contains measurements up to t minus this
-    # delay, and the IMU data up to t
+    # Delay (s) of the fusion horizon: EKF2 fuses measurements at this age
     horizon_s: float | Unavailable = HORIZON_NOT_LOGGED
     record: FusionRecord | Unavailable = RECORD_NOT_LOGGED
     aids: Mapping[str, AidLog] = field(default_factory=dict)
-    # Logged status flags of EKF2, 1 while set: one for each enabled aiding source (PX4 name), the
-    # flags in FusionRecord.states, ``tilt_align``, ``yaw_align``, ``gnss_fault``, ``xy_valid`` and
-    # ``xy_global``. In addition the bit mask gps_check_fail_flags, as ``failed_checks``
+    # Status flags of EKF2, 1 while set; ``failed_checks`` is the bit mask gps_check_fail_flags
     states: StepFunctions = field(default_factory=dict)
-    # All EKF2_ parameters at take-off, by PX4 name, in PX4 units
+    # All EKF2 parameters at take-off, in PX4 units
     parameters: Mapping[str, float] = field(default_factory=dict)
     parameter_changes: tuple[ParameterChange, ...] = ()
 
@@ -710,12 +668,12 @@ class Ekf2:
 
 @dataclass(frozen=True)
 class Truth:
-    """Ground truth that no estimator used: from simulation or motion capture.
+    """Ground truth from simulation or motion capture.
 
     Attributes
     ----------
     name : str
-        Topic, message or track name.
+        Name of the topic or message.
     samples : DataFrame, shape (n, 6)
         Position and velocity (m, m/s, NED); velocity is NaN if not logged.
     attitude : DataFrame, shape (m, 4), or None
@@ -729,28 +687,25 @@ class Truth:
     __repr__ = one_line_repr
 
 
-# Flights are compared by identity (eq=False), because == of DataFrames has no single truth value
+# eq=False, because == of DataFrames has no single truth value
 @dataclass(frozen=True, eq=False)
 class Flight:
     """One recorded flight.
 
     Attributes
     ----------
-    log : LogInfo
     imu : DataFrame or Unavailable
         Specific force (m/s²) and angular rate (rad/s), body FRD, without bias correction.
     attitude : DataFrame or Unavailable
         Quaternion w, x, y, z that rotates body FRD to NED.
     positions : tuple of PositionTrack
-        All external position tracks, in order of preference.
-    ekf2 : Ekf2 or Unavailable
-    truth : Truth or Unavailable
+        Position sources, in order of preference.
     airborne : tuple of (float, float), or Unavailable
         Intervals (s) in which the land detector reports flight.
     """
 
     log: LogInfo
-    # ``clipped``, if logged, is above 0 if an accelerometer reached the limit of its range
+    # Column ``clipped``: above 0 if an accelerometer reached the limit of its range
     imu: TableOrUnavailable
     attitude: TableOrUnavailable
     positions: tuple[PositionTrack, ...]
@@ -758,24 +713,23 @@ class Flight:
     truth: Truth | Unavailable
     airborne: Spans | Unavailable
     missing: tuple[Unavailable, ...] = ()
-    # Topics of each kind of data: "imu", "attitude", "ekf2_state", "ekf2_variance",
-    # "ekf2_innovations", "ekf2_fusing", "truth", "airborne"
+    # Topics of each kind of data, for example of "imu" or "ekf2_state"
     streams: Mapping[str, DataSource] = field(default_factory=dict)
     clocks: tuple[ClockMap, ...] = ()
-    # Other position-related data in the log that px4fuse does not use
+    # Position data in the log that px4fuse does not use
     unused: tuple[UnusedData, ...] = ()
     # Files read in addition to the log
     inputs: tuple[InputFile, ...] = ()
-    # Intervals (s) in which PX4's failure detector reports roll or pitch beyond the limits
+    # Intervals (s) in which PX4's failure detector reports excessive roll or pitch
     excessive_tilt_spans_s: Spans = ()
-    # Barometer height, negative: ``down_m`` is positive down. The zero level is unknown
+    # Barometer height as ``down_m`` (positive down), with unknown zero level
     barometer: pd.DataFrame | None = None
 
     __repr__ = one_line_repr
 
 
 def join_flights(airborne: Spans) -> Spans:
-    """Return start and end (s) of flights with at least MIN_LANDED_DURATION_S between them."""
+    """Join flights (start and end in s) that are less than MIN_LANDED_DURATION_S apart."""
     flight_spans_s: list[Span] = []
     for start_s, end_s in airborne:
         if flight_spans_s and start_s - flight_spans_s[-1][1] < MIN_LANDED_DURATION_S:
@@ -791,7 +745,7 @@ def longest_flight(airborne: Spans) -> Span:
 
 
 def time_index(time_s: NDArray[Any]) -> pd.Index[float]:
-    """Return times (s) as the index "time_s" of a DataFrame."""
+    """Convert times (s) to a DataFrame index with the name "time_s"."""
     index: pd.Index[float] = pd.Index(time_s, name="time_s")
     return index
 
@@ -799,7 +753,7 @@ def time_index(time_s: NDArray[Any]) -> pd.Index[float]:
 def rows_between(samples: pd.DataFrame, start_s: float, end_s: float) -> pd.DataFrame:
     """Return the rows from ``start_s`` to ``end_s`` of a table that is indexed by time (s).
 
-    ``samples.loc[start_s:end_s]`` would build a hash table of all times, as large as four columns.
+    This needs less memory than ``samples.loc``, which builds a hash table of all times.
     """
     time_s = samples.index.to_numpy()
     first_row = int(np.searchsorted(time_s, start_s))
@@ -807,10 +761,9 @@ def rows_between(samples: pd.DataFrame, start_s: float, end_s: float) -> pd.Data
 
 
 def sample_rate(samples: pd.DataFrame) -> float:
-    """Return the sample rate (Hz) outside of gaps of a table that is indexed by time.
+    """Return the sample rate (Hz) without gaps; NaN for fewer than two samples.
 
-    The mean interval is used, because a decimated topic alternates between two intervals. The
-    result is NaN for fewer than two samples.
+    It is the inverse of the mean interval, because decimated topics have two different intervals.
     """
     if len(samples) < 2:
         return np.nan

@@ -1,1 +1,1 @@
-"""Contents of a log: list for ``px4fuse info``, and tables for ``px4fuse extract``."""
+"""Contents of a log, for the commands ``px4fuse info`` and ``px4fuse extract``."""

@@ -1,4 +1,4 @@
-"""Contents of a log, possible analyses, and advice on logging for the next flight."""
+"""Contents of a log, possible analyses, and logging advice for the next flight."""
 
 from collections.abc import Iterator
 from dataclasses import dataclass
@@ -52,7 +52,7 @@ DATA_LABELS = {
     "truth": "ground truth",
     "airborne": "land detector",
 }
-# Samples that each analysis of px4fuse compare requires. The text follows the number of samples
+# Data that each analysis requires
 REQUIRED_SAMPLES_BY_ANALYSIS = {
     "EKF2 states": "samples of EKF2's position and velocity",
     "EKF2 variances": "samples of EKF2's position and velocity variances",
@@ -65,10 +65,7 @@ TimeSpans = tuple[tuple[float, float], ...]
 
 @dataclass(frozen=True)
 class AnalysisOption:
-    """Analysis that may be possible with a log.
-
-    ``reason``: the data that the analysis uses, or why it is not possible.
-    """
+    """Analysis, with the data that it uses or the reason why it is not possible."""
 
     name: str
     possible: bool
@@ -77,7 +74,7 @@ class AnalysisOption:
 
 @dataclass(frozen=True)
 class LoggingAdvice:
-    """Change for the next flight (``remedy``), and data or analyses that it adds (``improves``)."""
+    """Logging advice for the next flight, and the data or analyses that it improves."""
 
     remedy: str
     improves: tuple[str, ...]
@@ -85,7 +82,7 @@ class LoggingAdvice:
 
 @dataclass(frozen=True)
 class GapStatistics:
-    """Sample intervals longer than ``limit_s``: number, sum (s) and maximum (s)."""
+    """Gaps longer than ``limit_s`` between samples: number, total and longest duration (s)."""
 
     count: int
     total_s: float
@@ -95,12 +92,12 @@ class GapStatistics:
 
 @dataclass(frozen=True)
 class LoggedData:
-    """Data of one type in a log with topics, rate and gaps, or the reason why they are missing.
+    """Logged data of one type: topics, rate and gaps, or the reason why they are missing.
 
     Attributes
     ----------
     part : str
-        Type of data, for example "IMU"; a value of :data:`DATA_LABELS`.
+        Type of data, for example "IMU".
     name : str
         Name of the position source, or of the first topic.
     log : str
@@ -108,11 +105,11 @@ class LoggedData:
     samples : int or None
         Number of samples; None for the land detector.
     start_s, end_s : float or None
-        Times (s) of the first and last sample since the first data.
+        Times (s) of the first and last sample.
     chosen : bool
         True for the position source that ``px4fuse compare`` uses by default.
     unavailable : str
-        Reason why the data are missing; "" for available data.
+        Reason why the data are missing, otherwise "".
     """
 
     part: str
@@ -132,24 +129,22 @@ class LoggedData:
 
 @dataclass(frozen=True)
 class Inventory:
-    """Contents of a log, as ``px4fuse info`` shows them.
+    """Contents of a log, as shown by ``px4fuse info``.
 
     Attributes
     ----------
-    flight : Flight
-        Flight with the EKF2 innovations of the default position source.
     start_utc : str or None
-        UTC of the first data, ISO 8601.
+        Time of the first sample (UTC, ISO 8601).
     sources : tuple of LoggedData
-        Data by type. The position sources are in order of preference.
+        Logged data by type.
     source_reason : str
-        Reason for the choice of the position source in ``px4fuse compare``, or why none is used.
+        Reason for the choice of the position source.
     segment : Segment or None
         Time span that ``px4fuse compare`` analyses by default.
     abilities : tuple of AnalysisOption
-        All analyses of px4fuse; each states whether the log is sufficient.
+        Analyses that are possible or not possible with the log.
     advice : tuple of LoggingAdvice
-        Changes for the next flight.
+        Logging advice for the next flight.
     """
 
     flight: Flight
@@ -163,7 +158,7 @@ class Inventory:
 
 
 def list_log_contents(flight: Flight) -> Inventory:
-    """List the data in a log, the possible analyses, and changes for the next flight."""
+    """List the data in a log, the possible analyses and the logging advice."""
     comparison, reason, position_remedy = None, "", ""
     try:
         comparison = prepare_comparison_inputs(
@@ -200,7 +195,7 @@ def list_log_contents(flight: Flight) -> Inventory:
 
 
 def to_json_dict(inventory: Inventory) -> dict[str, Any]:
-    """Convert an inventory to dicts and lists for JSON; None and NaN are omitted."""
+    """Convert the contents of a log to JSON types; None and NaN are omitted."""
     inventory_fields = {**vars(inventory)}
     flight: Flight = inventory_fields.pop("flight")
     flight_fields = {name: getattr(flight, name) for name in FLIGHT_FIELDS_IN_JSON}
@@ -213,13 +208,13 @@ def to_json_dict(inventory: Inventory) -> dict[str, Any]:
 
 
 def _collect_data_by_stream(flight: Flight) -> dict[str, pd.DataFrame | TimeSpans | Unavailable]:
-    """Return all data of a flight except positions, by the keys of :data:`DATA_LABELS`."""
+    """Return all data of a flight except positions, by type."""
     ekf2, truth = flight.ekf2, flight.truth
     data_by_stream = {"imu": flight.imu, "attitude": flight.attitude}
     if isinstance(ekf2, Unavailable):
         data_by_stream["ekf2_state"] = ekf2
     else:
-        # the axis with most innovations, because a log may lack the innovations of other axes
+        # use the axis with most innovations, because some axes may not be logged
         innovations = max(
             ekf2.innovations.values(),
             key=lambda samples: len(samples) if isinstance(samples, pd.DataFrame) else -1,
@@ -275,7 +270,7 @@ def _make_logged_data(
 
 
 def _measure_gaps(samples: pd.DataFrame, *, is_imu: bool) -> GapStatistics:
-    """Find sample intervals that are longer than a limit, which differs for IMU and other data."""
+    """Return number and duration of the gaps between samples."""
     intervals_s = np.diff(samples.index.to_numpy())
     limit_s = (
         max(MIN_IMU_GAP_S, MIN_IMU_GAP_INTERVALS * float(np.median(intervals_s)))
@@ -376,9 +371,9 @@ def _list_ekf2_and_truth_analyses(
 def _collect_logging_advice(
     flight: Flight, comparison: PreparedComparison | None, position_remedy: str
 ) -> tuple[LoggingAdvice, ...]:
-    """Collect the changes that avoid missing data and recording faults in the next flight.
+    """Collect logging advice for the next flight.
 
-    ``position_remedy`` is the change for a log without positions.
+    ``position_remedy`` is the advice for a log without positions.
     """
     if flight.log.is_assessed:
         return (LoggingAdvice("None", (DIAGNOSIS_WITHHELD.reason,)),)
@@ -394,7 +389,7 @@ def _collect_logging_advice(
     actions_and_purposes += [
         (finding.remedy, finding_title(finding.id)) for finding in findings if finding.remedy
     ]
-    # data that a MAVLink recording can contain, in addition to positions
+    # data that a MAVLink recording can contain
     data_in_mavlink_logs = (flight.imu, flight.attitude, flight.ekf2, flight.airborne)
     actions_and_purposes += [
         (missing_data.remedy, missing_data.what)

@@ -1,4 +1,4 @@
-"""Tables of a flight for ``px4fuse extract``, with a data dictionary of all columns."""
+"""Tables of a flight for ``px4fuse extract``, with descriptions of all columns."""
 
 import re
 from collections.abc import Iterable, Iterator, Mapping
@@ -20,16 +20,16 @@ from px4fuse.flight.model import Ekf2, Flight, PositionTrack, Truth, Unavailable
 
 SCHEMA_NAME = "px4fuse-flight"
 SCHEMA_VERSION = "1.0"
-# Names that replace a placeholder in columns.csv: one row of the file gives one row for each name
+# Placeholders in columns.csv, and the names that replace them
 NAMES_BY_PLACEHOLDER = {
     "{axis}": ("north", "east", "down"),
     "{body_axis}": ("forward", "right", "down"),
     "{element}": ("w", "x", "y", "z"),
 }
 COLUMN_DESCRIPTION_FIELDS = ["table", "column", "unit", "frame", "meaning", "source_topic", "clock"]
-# Characters that are replaced in file names, because some systems do not allow them
+# Characters that some systems do not allow in file names
 _UNSAFE_CHARACTERS = re.compile(r"[^A-Za-z0-9_-]+")
-# Maximum length (characters) of a table name, which is a file name
+# Maximum length (characters) of a table name
 MAX_TABLE_NAME_LENGTH = 80
 NO_POSITION = Unavailable(
     "external position",
@@ -48,7 +48,7 @@ class DescribedTable:
 
 
 def add_source_innovations(flight: Flight) -> Flight:
-    """Add the EKF2 innovations of the default position source to a flight."""
+    """Add EKF2's innovations of the default position source to a flight."""
     try:
         return select_source_innovations(flight, choose_source(flight)[0])
     except MissingDataError:
@@ -58,7 +58,7 @@ def add_source_innovations(flight: Flight) -> Flight:
 def tables(flight: Flight) -> Mapping[str, pd.DataFrame]:
     """Return the tables of a flight by name, with one row per sample.
 
-    Data that are missing in the log have no table; see :func:`list_missing_data`.
+    Missing data have no table.
     """
     return {table.name: table.data for table in _make_described_tables(flight)}
 
@@ -92,7 +92,7 @@ def list_missing_data(flight: Flight) -> tuple[Unavailable, ...]:
 
 
 def describe_flight(flight: Flight) -> dict[str, Any]:
-    """Describe log, topics, clocks and missing data of a flight, for flight.json."""
+    """Describe log, topics, clocks and missing data of a flight (flight.json)."""
     ekf2 = flight.ekf2
     description_fields: dict[str, Any] = {
         "schema": {"name": SCHEMA_NAME, "version": SCHEMA_VERSION},
@@ -132,16 +132,14 @@ def _describe_table(
     name_in_columns_csv: str = "",
     **placeholder_values: str,
 ) -> DescribedTable:
-    """Keep the columns that have a row in columns.csv, and add their descriptions.
+    """Add column descriptions from columns.csv to a table, and remove other columns.
 
     Parameters
     ----------
-    topics_and_clock : tuple
-        Source topics and clock of the table.
     name_in_columns_csv : str
         Name of the table in columns.csv; by default ``name``.
     placeholder_values : str
-        Replacements for names in braces in columns.csv.
+        Texts that replace names in braces in columns.csv.
     """
     csv_table_names = ["any table"] * ("time_s" in data) + [name_in_columns_csv or name]
     column_descriptions = (
@@ -218,7 +216,7 @@ def _make_described_tables(flight: Flight) -> Iterator[DescribedTable]:
         )
     if flight.clocks:
         clock_table = pd.DataFrame([structs.asdict(clock) for clock in flight.clocks])
-        # float, because the number of distinct timestamps is NaN for some clocks
+        # float, because the number of distinct timestamps may be NaN
         yield _describe_table("clocks", clock_table.astype({"distinct_stamps": np.float64}))
 
 
@@ -266,10 +264,10 @@ def _make_ekf2_tables(flight: Flight, ekf2: Ekf2) -> Iterator[DescribedTable]:
 
 
 def _list_tracks_with_table_names(flight: Flight) -> Iterator[tuple[str, PositionTrack]]:
-    """Yield each position track with a table name, unique for file systems that ignore case."""
+    """Yield each position track with a unique table name."""
     used_names: set[str] = set()
     for track in flight.positions:
-        # a name with this prefix is never reserved on Windows (con, aux, ...)
+        # the prefix avoids names that Windows reserves (con, aux, ...)
         stem = _UNSAFE_CHARACTERS.sub("_", f"position_{track.name}")[:MAX_TABLE_NAME_LENGTH].rstrip(
             "_"
         )

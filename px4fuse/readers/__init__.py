@@ -1,4 +1,4 @@
-"""Flight log readers, one per format, selected by the content of the file."""
+"""Readers of flight logs. The format is detected from the content of the file."""
 
 from pathlib import Path
 
@@ -7,10 +7,10 @@ from px4fuse.errors import LogError, SettingsError
 from px4fuse.flight.model import Flight
 from px4fuse.readers.text_table import refuse_foreign_format
 
-# Number of bytes at the start of a file that are read to detect its format
+# Number of bytes that are read to detect the format of a file
 _FORMAT_DETECTION_BYTES = 100
 ULOG_MAGIC = b"\x55\x4c\x6f\x67\x01\x12\x35"
-# Text files that users give by mistake instead of a flight log: suffixes, format and advice
+# Advice for text files that users give instead of a flight log
 _ADVICE_BY_TEXT_SUFFIX = {
     (".csv", ".tsv", ".jsonl"): (
         "table",
@@ -26,24 +26,21 @@ def read_log(path: str | Path, *, system: int | None = None) -> Flight:
     Parameters
     ----------
     path : str or Path
-        A PX4 ULog (``.ulg``) or a MAVLink recording (``.tlog`` or a raw stream), possibly
-        compressed with gzip or zstd.
+        PX4 ULog or MAVLink recording, possibly compressed with gzip or zstd.
     system : int, optional
         MAVLink system id of the vehicle; by default the autopilot with the most messages.
 
     Raises
     ------
     LogError
-        The file is missing, empty, not a regular file, larger than
-        :data:`px4fuse.core.reading.max_log_bytes`, of an unknown format, or contains no usable
-        data.
+        The file is missing, too large, of an unknown format, or contains no usable data.
     SettingsError
-        ``system`` is not a system id in the recording, or the log is a ULog.
+        The recording does not contain the system id, or the log is a ULog.
     """
     path = Path(path)
     name = display_name(path)
     first_bytes = read_head(path, _FORMAT_DETECTION_BYTES, LogError)
-    # Imports are local, because the import of pyulog or pymavlink takes 0.1 s or more
+    # Local imports, because pyulog and pymavlink take 0.1 s or more to import
     if first_bytes.startswith(ULOG_MAGIC):
         if system is not None:
             raise SettingsError(

@@ -6,38 +6,32 @@ import pandas as pd
 from px4fuse.core.arrays import Array, BoolArray
 from px4fuse.flight.model import Columns, Ekf2, Spans, Unavailable
 
-# Maximum absolute value (SI units) of valid positions, velocities, accelerations and angles:
-# larger values are from damaged bytes
+# Maximum absolute value (SI units) of valid data; larger values are from damaged bytes
 MAX_VALID_SI_VALUE = 1e9
-# Maximum absolute value (m/s², rad/s) of valid IMU data: above the range of accelerometers (400 g)
-# and gyros (4000 °/s)
+# Maximum absolute value (m/s², rad/s) of valid IMU data, above the range of sensors
 MAX_IMU_READING = 1e4
-# Minimum distance (m) of a rejected position 0, 0, 0 from the previous and the next position: 3 σ
-# of accurate UWB (0.1 m)
+# Minimum distance (m) of an invalid position 0, 0, 0 from its neighbours (3 σ of UWB)
 MIN_INVALID_ZERO_DISTANCE_M = 0.3
 # Minimum distance (m) of a damaged position from the median position
 MIN_DAMAGED_DISTANCE_M = 1e4
-# Minimum distance of a damaged position from the median position, as a multiple of the median of
-# these distances
+# Minimum distance of a damaged position from the median position, in median distances
 MIN_DAMAGED_TO_MEDIAN_DISTANCE_RATIO = 100.0
-# Minimum duration (s) of equal positions that are rejected as frozen: some sources repeat each
-# position for a shorter time
+# Minimum duration (s) of equal positions that are rejected as frozen
 MIN_FROZEN_S = 1.0
 # Minimum number of successive equal positions that are rejected as frozen
 MIN_FROZEN_POSITION_COUNT = 5
-# Maximum fraction of frozen positions. With more, none is rejected: the vehicle may be at rest
+# Maximum fraction of frozen positions; with more, the vehicle may be at rest
 MAX_FROZEN_FRACTION = 0.5
-# Maximum probability that positions repeated at random are rejected as frozen
+# Maximum probability that randomly repeated positions are rejected as frozen
 MAX_FALSE_FROZEN_PROBABILITY = 0.01
-# Values are rounded to a step if each quotient difference / step differs by less than this from a
-# whole number
+# Tolerance (fraction of the quantisation step) for the detection of rounded values
 MAX_DIFFERENCE_FROM_INTEGER = 0.01
-# Minimum norm of a valid quaternion: senders without attitude send zeros
+# Minimum norm of a valid quaternion; senders without attitude send zeros
 MIN_QUATERNION_NORM = 0.5
 
 
 def collect_unavailable(*flight_data: object) -> tuple[Unavailable, ...]:
-    """Return the records of data that a flight or its EKF2 data lack, each with its reason."""
+    """Return the missing data of a flight, each with its reason."""
     for data in flight_data:
         if isinstance(data, Ekf2):
             flight_data += (data.variance, *data.innovations.values(), data.fusion_flags)
@@ -45,7 +39,7 @@ def collect_unavailable(*flight_data: object) -> tuple[Unavailable, ...]:
 
 
 def find_flight_spans(landed_flags: pd.Series, duration_s: float) -> Spans:
-    """Return start and end (s) of each flight: the intervals in which the flags are 0 or False."""
+    """Return start and end (s) of each flight, from the flags of the land detector."""
     landed_changes = landed_flags[landed_flags.ne(landed_flags.shift())]
     start_times_s = np.maximum.accumulate(np.maximum(landed_changes.index.to_numpy(), 0.0)).tolist()
     spans = zip(start_times_s, [*start_times_s[1:], duration_s], landed_changes, strict=False)
@@ -60,7 +54,7 @@ def ends_in_flight(airborne: Spans | Unavailable, duration_s: float) -> bool:
 
 
 def format_truncation(item: str, duration_s: float, in_flight: bool) -> str:
-    """Return a note that the file ends in the middle of an item: a "frame" or "message"."""
+    """Return a note that the file ends within a frame or message."""
     return (
         f"the file ends within a {item} after {duration_s:.1f} s{', in flight' * in_flight}; later "
         "data are missing"
@@ -76,10 +70,12 @@ def select_valid_rows(
 
 
 def classify_invalid_positions(samples: pd.DataFrame, columns: list[str]) -> "pd.Series[str]":
-    """Return for each position the reason why it is not a measurement; "" for a measurement.
+    """Return the reason why each position is invalid; "" for a valid position.
 
-    "NaN": a coordinate is not finite. "zero": the source sent 0, 0, 0 instead of a position. "far":
-    the position is damaged. "held": the source sent its last position again.
+    - "NaN": a coordinate is not finite.
+    - "zero": the source sent 0, 0, 0 instead of a position.
+    - "far": the position is damaged.
+    - "held": the source sent its last position again.
     """
     values, time_s = samples[columns].to_numpy(), samples.index.to_numpy()
     reason_by_row = pd.Series("", index=samples.index)
@@ -106,7 +102,7 @@ def classify_invalid_positions(samples: pd.DataFrame, columns: list[str]) -> "pd
         valid_rows = valid_rows[~is_far_from_median]
     is_repeated = np.all(np.diff(values[valid_rows], axis=0) == 0.0, axis=1)
     run_starts = np.flatnonzero(np.append(True, ~is_repeated))
-    # Longest run of equal positions that is likely if the source repeats positions at random
+    # Longest likely sequence of equal positions if the source repeats positions at random
     repeated_position_fraction = (
         np.clip(np.mean(is_repeated), 1e-6, 1.0 - 1e-6) if len(is_repeated) else 0.5
     )
@@ -131,8 +127,7 @@ def estimate_rounding_step(values: Array) -> float:
     differences = np.diff(np.unique(values[np.isfinite(values)]))
     if not len(differences):
         return 0.0
-    # If the smallest difference is almost 0, the quotients overflow to infinity or NaN, and the
-    # result is 0
+    # The quotients may overflow to infinity or NaN. The values are then not rounded
     with np.errstate(over="ignore", invalid="ignore"):
         step_counts = differences / differences.min()
         is_multiple_of_step = (
@@ -142,7 +137,7 @@ def estimate_rounding_step(values: Array) -> float:
 
 
 def interpolate_inside(time_s: pd.Index | Array, values: "pd.Series[float]") -> Array:
-    """Interpolate a time series at the times ``time_s``; NaN outside its time span."""
+    """Interpolate a time series at the given times; NaN outside its time span."""
     return np.asarray(np.interp(time_s, values.index, values, left=np.nan, right=np.nan))
 
 
@@ -164,15 +159,15 @@ def join_nearest(
 
 
 def select_rows_with_attitude(samples: pd.DataFrame) -> pd.DataFrame:
-    """Return the rows with a valid quaternion; norm 0 means that no attitude was sent."""
+    """Return the rows with a valid quaternion."""
     norm: Array = np.linalg.norm(samples[Columns.QUATERNION].to_numpy(), axis=1)
     return samples[(norm > MIN_QUATERNION_NORM) & (norm < MAX_VALID_SI_VALUE)]
 
 
 def read_orientation(samples: pd.DataFrame) -> pd.DataFrame | None:
-    """Return the orientation of each sample with its variances; None if it never changes.
+    """Return the orientation of each sample with its variances; None if it is constant.
 
-    A variance of 0 becomes NaN: it means "not sent" (``EKF2.cpp``).
+    A variance of 0 means "not sent" (``EKF2.cpp``) and becomes NaN.
     """
     orientation = select_rows_with_attitude(
         samples.reindex(columns=Columns.QUATERNION + Columns.ROTATION_VARIANCE)
@@ -185,6 +180,6 @@ def read_orientation(samples: pd.DataFrame) -> pd.DataFrame | None:
 
 
 def read_attitude(samples: pd.DataFrame | None) -> pd.DataFrame | None:
-    """Return the quaternions from :func:`read_orientation`, without variances."""
+    """Return the attitude quaternions; None if they are missing or constant."""
     orientation = None if samples is None else read_orientation(samples)
     return None if orientation is None else orientation[Columns.QUATERNION]

@@ -1,6 +1,6 @@
 """Conversion of message fields to DataFrame columns.
 
-``px4_topics.toml`` (PX4 topics) and ``mavlink_messages.toml`` (MAVLink messages) define it.
+The definitions are in ``px4_topics.toml`` and ``mavlink_messages.toml``.
 """
 
 import re
@@ -12,8 +12,7 @@ import msgspec
 
 from px4fuse.flight.model import Columns
 
-# Maximum absolute value of valid fields: larger values are from damaged bytes. The largest valid
-# values are UNIX times in µs (1.8e15)
+# Maximum absolute value of valid fields, above UNIX times in µs (1.8e15)
 MAX_FIELD_VALUE = 1e17
 
 
@@ -21,18 +20,18 @@ MAX_FIELD_VALUE = 1e17
 class Layout:
     """Fields of a PX4 topic or MAVLink message, and the DataFrame columns that they become."""
 
-    # PX4 topic or MAVLink message; if empty, the name of the position source is the topic
+    # PX4 topic or MAVLink message
     topic: str = ""
-    # Required field of each column; ``name[i]`` is an array element
+    # Message field for each required column, for example ``q[0]``
     columns: Mapping[str, str] = field(default_factory=dict)
-    # Field of each column that only some PX4 releases log; empty for MAVLink
+    # Message field for each column that only some PX4 releases log
     optional_columns: Mapping[str, str] = field(default_factory=dict)
-    # Factor of each column, by which the field is multiplied; 1 if absent
+    # Factor from the message field to the unit of each column; 1 if absent
     scale: Mapping[str, float] = field(default_factory=dict)
 
 
 def expand_layouts(toml_tables: Mapping[str, Any]) -> dict[str, Layout]:
-    """Convert TOML tables to layouts; expand lists such as ``q[]`` to one field per column."""
+    """Convert TOML tables to definitions with one message field per column."""
     return {
         name: replace(
             layout,
@@ -45,11 +44,9 @@ def expand_layouts(toml_tables: Mapping[str, Any]) -> dict[str, Layout]:
 
 
 def assign_fields_to_columns(fields: Mapping[str, Any]) -> dict[str, Any]:
-    """Return the message field (or the number) of each DataFrame column.
+    """Return the message field of each DataFrame column.
 
-    A key of ``fields`` lists column names, or is the name of a list in :class:`Columns`. Its value
-    lists one field per column. The value ``q[]`` stands for the elements of an array field,
-    ``covariance[0 6]`` for its elements 0 and 6. A number applies to all columns of the key.
+    ``q[]`` stands for all elements of an array, ``covariance[0 6]`` for the elements 0 and 6.
 
     Examples
     --------

@@ -14,14 +14,14 @@ from px4fuse.trajectory.graph.initialisation import compute_initial_poses
 from px4fuse.trajectory.graph.model import INITIAL_POSES_FROM_FILE, PoseGraph
 
 MAX_FILE_BYTES = 500_000_000
-# Number of vertex ids, and number of values after the ids, in a g2o line with each tag (first word)
+# Number of vertex ids and number of values in a g2o line, by its first word
 _ID_AND_VALUE_COUNTS_BY_TAG = {
     "VERTEX_SE2": (1, 3),
     "VERTEX_SE3:QUAT": (1, 7),
     "EDGE_SE2": (2, 3 + 6),
     "EDGE_SE3:QUAT": (2, 7 + 21),
 }
-# Lines whose tag begins with one of these words are ignored: parameters and laser scans
+# Ignored lines begin with these words: parameters and laser scans
 _SKIPPED_TAGS = ("PARAMS", "ROBOTLASER", "RAWLASER", "FLASER", "RLASER")
 _FORMAT_REMEDY = (
     "Give poses as VERTEX_SE2 or VERTEX_SE3:QUAT, and edges as EDGE_SE2 or EDGE_SE3:QUAT. Remove "
@@ -30,20 +30,17 @@ _FORMAT_REMEDY = (
 _VERTEX_ID_PATTERN = re.compile("[+-]?[0-9]{1,19}")
 # Maximum vertex id: GTSAM writes 64-bit symbols, such as 6989586621679009792 for a0
 _MAX_VERTEX_ID = 2**63 - 1
-# A negative eigenvalue λ of an information matrix is a rounding error if |λ| is below this fraction
-# of the largest eigenvalue
+# Negative eigenvalues below this fraction of the largest eigenvalue are rounding errors
 _EIGENVALUE_TOLERANCE = 1e-9
-# Minimum and maximum valid element (1/m², 1/rad²) of an information matrix: the product of two
-# elements neither overflows nor becomes zero
+# Valid range (1/m², 1/rad²) of information matrix elements, so that their products do not overflow
 _MIN_INFORMATION_ELEMENT, _MAX_INFORMATION_ELEMENT = 1e-50, 1e50
 
 
 def read_g2o(path: str | Path) -> PoseGraph:
     """Read a pose graph from a g2o file.
 
-    If the file contains no vertices, the initial poses are computed from the edges. VERTEX_SE2,
-    EDGE_SE2, VERTEX_SE3:QUAT and EDGE_SE3:QUAT are read. FIX is ignored, because px4fuse always
-    fixes the first pose.
+    The file contains lines with VERTEX_SE2 and EDGE_SE2, or VERTEX_SE3:QUAT and EDGE_SE3:QUAT.
+    Without vertices, the initial poses are computed from the edges.
 
     Raises
     ------
@@ -59,7 +56,7 @@ def read_g2o(path: str | Path) -> PoseGraph:
 
 
 def parse_g2o(text: str, name: str) -> PoseGraph:
-    """Parse the text of a g2o file. ``name`` is the file name, for error messages."""
+    """Parse the text of a g2o file. ``name`` is the file name for error messages."""
     rows_by_tag = _group_rows_by_tag(text, name)
     is_2d = any(rows.lines for tag, rows in rows_by_tag.items() if tag.endswith("SE2"))
     dimension, pose_type, values_per_pose = (2, "SE2", 3) if is_2d else (3, "SE3:QUAT", 7)
@@ -120,10 +117,7 @@ def parse_g2o(text: str, name: str) -> PoseGraph:
 
 
 def format_g2o(graph: PoseGraph) -> str:
-    """Return the text of a g2o file with the vertices, a FIX of the first vertex, and the edges.
-
-    Numbers have all digits of float64.
-    """
+    """Write a pose graph as the text of a g2o file, with all digits of float64."""
     pose_type = "SE2" if graph.dimension == 2 else "SE3:QUAT"
     ids = graph.ids.tolist()
     upper_triangle = np.triu_indices(graph.degrees_of_freedom)
@@ -170,7 +164,7 @@ def _group_rows_by_tag(text: str, name: str) -> dict[str, TextTableRows]:
 
 
 def _parse_rows(rows: TextTableRows, tag: str) -> tuple[IntArray, Array]:
-    """Return the vertex ids, shape (n, 1 or 2), and the other numbers of all lines with a tag."""
+    """Return the vertex ids, shape (n, 1 or 2), and the numbers of all lines."""
     vertex_count, value_count = _ID_AND_VALUE_COUNTS_BY_TAG[tag]
     cells, numbers = rows.parse(1 + vertex_count, value_count)
     is_invalid_id = [
@@ -184,7 +178,7 @@ def _parse_rows(rows: TextTableRows, tag: str) -> tuple[IntArray, Array]:
     )
     remedy = "Correct or remove this line."
     rows.raise_where(~np.isfinite(numbers), "the line contains a number that is not finite", remedy)
-    # The first three numbers are x, y, z (m) or, in SE2, x, y (m) and the angle (rad)
+    # The first three numbers are x, y, z (m), or x, y (m) and angle (rad)
     rows.raise_where(
         np.abs(numbers[:, :3]) >= MAX_COORDINATE_M,
         f"a position (m) or angle (rad) is outside ±{MAX_COORDINATE_M:.0e}",
@@ -203,7 +197,7 @@ def _normalise_quaternions(rows: TextTableRows, poses: Array) -> Array:
         "the quaternion does not have unit length",
         "Give the unit quaternion qx qy qz qw after the position.",
     )
-    # Unit quaternions are not changed, so that a written file is read back with the same digits
+    # Unit quaternions keep their digits
     quaternion_norms[np.abs(quaternion_norms - 1.0) <= UNIT_NORM_TOLERANCE] = 1.0
     return np.hstack([poses[:, :3], poses[:, 3:] / quaternion_norms[:, None]])
 

@@ -1,7 +1,6 @@
 """Reader of MAVLink recordings of a flight: ``.tlog`` files and raw streams.
 
-``mavlink_messages.toml`` defines the fields of the messages. Sources: PX4's ``src/modules/mavlink``
-(v1.13 to v1.16) and MAVLink's ``common.xml``.
+Sources: PX4's ``src/modules/mavlink`` (v1.13 to v1.16) and MAVLink's ``common.xml``.
 """
 
 from collections.abc import Mapping
@@ -51,13 +50,12 @@ VARIANCE_COLUMNS = Columns.POSITION_VARIANCE + Columns.VELOCITY_VARIANCE
 REAL32_PARAMETER_TYPE = 9
 
 
-# No warnings for damaged values: they become NaN or infinite, and their samples are dropped
+# No warnings for damaged values; their samples are dropped
 @np.errstate(invalid="ignore", over="ignore", divide="ignore")
 def read_mavlink(name: str, content: bytes, system_id: int | None = None) -> Flight:
     """Read a MAVLink recording: a ``.tlog``, or a raw stream of MAVLink 1 and 2.
 
-    ``system_id`` is the MAVLink system id of the vehicle. By default, the autopilot with the most
-    messages is read.
+    ``system_id`` is the MAVLink id of the vehicle, by default of the one with most messages.
 
     Raises
     ------
@@ -77,7 +75,7 @@ def read_mavlink(name: str, content: bytes, system_id: int | None = None) -> Fli
     imu = _read_imu(recording, remedies["imu"])
     attitude = _read_attitude(recording, remedies["attitude"])
     ekf2 = _read_ekf2(recording, parameters, autopilot)
-    # Only PX4 has a parameter for the delay between a GNSS fix and its timestamp
+    # Only PX4 has a parameter for the delay of GNSS
     delay_parameters = fill_with_defaults(parameters, GNSS_POS) if autopilot == "PX4" else {}
     gnss_delay_s = 1e-3 * delay_parameters.get(GNSS_POS.delay, 0.0)
     positions, unavailable_positions = read_positions(
@@ -88,7 +86,7 @@ def read_mavlink(name: str, content: bytes, system_id: int | None = None) -> Fli
     is_in_flight = common.ends_in_flight(airborne_spans_s, recording.duration_s)
     pressure_hpa = recording.read(messages.MESSAGE_LAYOUTS["pressure"])["pressure_hpa"]
     return Flight(
-        # The log description is made last, because it counts the samples that the readers dropped
+        # Last, because the description counts the samples that the readers dropped
         log=_describe_log(recording, parameters, replaced_parameter_notes, autopilot, is_in_flight),
         imu=imu,
         attitude=attitude,
@@ -110,8 +108,7 @@ def read_mavlink(name: str, content: bytes, system_id: int | None = None) -> Fli
 
 def _read_imu(recording: Recording, remedy: str) -> TableOrUnavailable:
     layouts_with_rows = [(layout, recording.rows(layout.topic)) for layout in messages.IMU_LAYOUTS]
-    # HIGHRES_IMU is preferred, because it has SI units and µs timestamps; without HIGHRES_IMU, the
-    # message with most samples is used
+    # HIGHRES_IMU is preferred, because it has SI units and µs timestamps
     layout, rows = layouts_with_rows[0]
     if len(rows) < 2:
         layout, rows = max(layouts_with_rows, key=lambda layout_rows: len(layout_rows[1]))
@@ -151,8 +148,7 @@ def _read_ekf2(
     odometry_count, local_position_count = (
         len(recording.rows(layout.topic)) for layout in messages.STATE_LAYOUTS
     )
-    # ODOMETRY has variances, so it is preferred unless its message rate is below half of the rate
-    # of LOCAL_POSITION_NED
+    # ODOMETRY has variances, so it is preferred unless its rate is much lower
     layout = (
         odometry_layout if 2 * odometry_count >= local_position_count else local_position_layout
     )
@@ -225,8 +221,7 @@ def _read_ekf2(
 def _compute_variance_from_accuracy(recording: Recording) -> pd.DataFrame:
     """Compute position variances (m²) from the accuracies (1 σ, m) in ESTIMATOR_STATUS.
 
-    PX4's horizontal accuracy is the square root of the sum of both axes' variances
-    (``get_ekf_lpos_accuracy``).
+    PX4's horizontal accuracy is √(σ_north² + σ_east²) (``get_ekf_lpos_accuracy``).
     """
     accuracy = recording.read(messages.MESSAGE_LAYOUTS["accuracy"])
     horizontal_variance_m2 = accuracy["horizontal_m"] ** 2 / 2.0
@@ -252,10 +247,7 @@ def _read_airborne_spans(recording: Recording, remedy: str) -> Spans | Unavailab
 
 
 def _read_parameters(recording: Recording, autopilot: str) -> dict[str, float]:
-    """Read the first value of each parameter.
-
-    PX4 sends integers as raw bytes in a float field.
-    """
+    """Read the first value of each parameter. PX4 sends integers as raw bytes in a float field."""
     table = recording.frames.table("PARAM_VALUE", recording.rows("PARAM_VALUE"))
     is_sent_as_bytes = (autopilot == "PX4") & (table["param_type"] < REAL32_PARAMETER_TYPE)
     raw_values = np.ascontiguousarray(table["param_value"])
@@ -325,11 +317,7 @@ def _describe_log(
 
 
 def _estimate_start_unix_s(recording: Recording) -> float | None:
-    """Return the UNIX time (s) at flight time zero.
-
-    The clock of the autopilot is preferred to the clock of the recording computer. Return None if
-    the recording contains no UNIX time.
-    """
+    """Return the UNIX time (s) at flight time zero; None if the recording has no UNIX time."""
     if recording.time_origin_s >= MIN_UNIX_TIME_S:
         return recording.time_origin_s
     boot_to_unix_fit = map_boot_to_unix(recording)

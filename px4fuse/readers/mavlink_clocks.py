@@ -1,9 +1,8 @@
 """Conversion of sender clocks and receive times to the autopilot's boot clock (MAVLink).
 
-The delay between a message's timestamp and its receive time is never negative and often large. A
-line is therefore fitted to the messages with the smallest delay: the lower envelope of receive time
-minus timestamp. Clock readings in TIMESYNC messages (MAVLink "Time Synchronization Protocol v2")
-are fitted by the same method.
+The delay from timestamp to receive time is never negative and often large. A line is therefore
+fitted to the messages with the smallest delay. Source for TIMESYNC messages: MAVLink "Time
+Synchronization Protocol v2".
 """
 
 from __future__ import annotations
@@ -16,29 +15,25 @@ from scipy.stats import theilslopes
 from px4fuse.core.arrays import Array
 from px4fuse.flight.model import ClockMap
 
-# Maximum median difference (s) between boot times and the receive times on the boot clock. With a
-# larger difference, the timestamps are from another clock
+# Maximum median difference (s) between timestamps and receive times on the same clock
 MAX_BOOT_TIME_DIFFERENCE_S = 10.0
-# Minimum reduction (s) by TIMESYNC of the difference between timestamps and receive times. With a
-# smaller reduction, the timestamps are already boot times
+# Minimum improvement (s) by TIMESYNC of the agreement with receive times
 MIN_REDUCTION_BY_TIMESYNC_S = 0.1
-# Minimum UNIX time (s), 2001-09-09: smaller times are times since boot
+# Minimum UNIX time (s), in 2001; smaller times are times since boot
 MIN_UNIX_TIME_S = 1e9
-# The clock fit uses one message per interval of this length (s): the message with the least delay
+# The clock fit uses the message with the least delay in each interval of this length (s)
 CLOCK_FIT_INTERVAL_S = 2.0
 MAX_CLOCK_FIT_INTERVALS = 200
-# Minimum time span (s) to estimate a clock drift; for a shorter span, the drift is assumed to be 0
+# Minimum time span (s) to estimate a clock drift
 MIN_DRIFT_SPAN_S = 30.0
-# Maximum relative difference between the rates of two clocks. If the difference is larger, the
-# recording was replayed faster or slower than real time
+# Maximum relative difference of two clock rates; more shows a replay at another speed
 MAX_RELATIVE_CLOCK_RATE_DIFFERENCE = 0.01
-# Maximum valid ratio of the rates of two clocks. It is above 1e9, the ratio of a clock in ns that
-# was read as s, because the fit corrects this error
+# Maximum ratio of two clock rates; above 1e9, for timestamps in ns that were read as s
 MAX_RATIO_OF_CLOCK_RATES = 1e12
 MIN_TIMESYNC_REPLIES = 3
 # Minimum fraction of distinct timestamps of a running clock
 MIN_DISTINCT_TIME_FRACTION = 0.1
-# Maximum regular interval (s) between positions: a longer interval is a gap
+# Maximum interval (s) between positions; a longer interval is a gap
 MAX_REGULAR_SAMPLE_INTERVAL_S = 1.0
 
 
@@ -46,11 +41,9 @@ MAX_REGULAR_SAMPLE_INTERVAL_S = 1.0
 class ClockLine:
     """Linear relation between readings x of a source clock and y of a target clock.
 
-    y = y0 + slope · (x - x0).
+    y = y0 + slope · (x - x0)
 
-    ``reading_pair_count`` is the number of pairs x, y to which the line is fitted. ``jitter_s``
-    (unit of y) is their robust standard deviation from the line, 1.4826 · median absolute
-    deviation.
+    ``jitter_s`` is the robust standard deviation of the clock readings from the line.
     """
 
     x0: float
@@ -60,11 +53,11 @@ class ClockLine:
     reading_pair_count: int
 
     def at(self, x: Array | float) -> Array:
-        """Return the readings y of the target clock at readings x of the source clock."""
+        """Convert readings x of the source clock to readings y of the target clock."""
         return np.asarray(self.y0 + self.slope * (x - self.x0), dtype=np.float64)
 
     def inverse(self) -> ClockLine:
-        """Return the inverse map, from y to x."""
+        """Return the inverse relation, from y to x."""
         return ClockLine(
             self.y0, self.x0, 1.0 / self.slope, self.jitter_s / self.slope, self.reading_pair_count
         )
@@ -73,8 +66,7 @@ class ClockLine:
 def fit_clock_line(x: Array, y: Array) -> ClockLine:
     """Fit a line to clock readings x and y (s); y is read after x, with an unknown delay.
 
-    The pairs x, y with the least delay determine the line. Its slope is 1 if the time span is too
-    short to estimate a drift.
+    The fit uses the readings with the least delay.
     """
     time_order = np.argsort(x, kind="stable")
     x = x[time_order]
@@ -101,8 +93,7 @@ def fit_clock_line(x: Array, y: Array) -> ClockLine:
 
     relative_delay_s, least_delay_rows = find_least_delays(slope)
     if span_s >= MIN_DRIFT_SPAN_S and len(least_delay_rows) > 1:
-        # The slope is fitted twice, because a corrected slope changes which messages have the least
-        # delay
+        # Fit the slope twice, because it affects the selection of messages with the least delay
         for _ in range(2):
             corrected_slope = slope + _compute_median_slope(
                 x[least_delay_rows], relative_delay_s[least_delay_rows]
@@ -119,7 +110,7 @@ def fit_clock_line(x: Array, y: Array) -> ClockLine:
 
 
 def _compute_median_slope(x: Array, y: Array) -> float:
-    """Return the Theil-Sen slope of y over x, which is not finite if all x are almost equal."""
+    """Return the Theil-Sen slope of y over x; not finite if all x are almost equal."""
     with np.errstate(over="ignore", invalid="ignore"):
         return float(theilslopes(y, x)[0])
 
@@ -129,7 +120,7 @@ def _is_plausible_rate_ratio(slope: float) -> bool:
 
 
 def is_running_clock(timestamps_s: Array) -> bool:
-    """Return True if at least MIN_DISTINCT_TIME_FRACTION of the timestamps are distinct."""
+    """Return True if the timestamps are of a running clock: enough of them are distinct."""
     return len(np.unique(timestamps_s)) >= max(MIN_DISTINCT_TIME_FRACTION * len(timestamps_s), 2)
 
 
@@ -140,10 +131,9 @@ def robust_std(values: Array) -> float:
 
 @dataclass(frozen=True)
 class ClockMapping:
-    """Conversion of a sender's timestamps to the autopilot's boot clock, with its description.
+    """Conversion of a sender's timestamps to the autopilot's boot clock, with a description.
 
-    ``sender_to_boot_fit`` is None if most timestamps are equal. Receive times then replace the
-    timestamps.
+    ``sender_to_boot_fit`` is None if receive times replace the timestamps.
     """
 
     sender_to_boot_fit: ClockLine | None
@@ -161,7 +151,7 @@ def map_clock_to_boot(
     *,
     has_receive_times: bool,
 ) -> ClockMapping:
-    """Find the relation of a sender's clock to the autopilot's boot clock.
+    """Find the conversion of a sender's clock to the autopilot's boot clock.
 
     TIMESYNC is preferred, then SYSTEM_TIME, then the receive times.
 
@@ -170,15 +160,13 @@ def map_clock_to_boot(
     receipt_to_boot_fit : ClockLine
         Conversion of receive times to the boot clock.
     sender_replies : tuple of ndarray
-        Replies of the sender to TIMESYNC requests: request times (s) on the boot clock, and reply
-        times (s) on the sender's clock.
+        TIMESYNC request times (s, boot clock) and reply times (s, sender's clock).
     autopilot_replies : tuple of ndarray
-        Replies of the autopilot to TIMESYNC requests: request times (s) on the sender's clock, and
-        reply times (s) on the boot clock.
+        TIMESYNC request times (s, sender's clock) and reply times (s, boot clock).
     boot_to_unix_fit : ClockLine or None
-        Conversion of the boot clock to UNIX time, from the autopilot's SYSTEM_TIME.
+        Conversion of the boot clock to UNIX time.
     has_receive_times : bool
-        True if the recording contains receive times, False if only the order of the messages.
+        True if the recording contains receive times.
     """
     time_source = "receive time" if has_receive_times else "message order"
     boot_time_at_receipt_s = receipt_to_boot_fit.at(receive_times_s)
@@ -188,7 +176,7 @@ def map_clock_to_boot(
             f"the {len(timestamps_s)} timestamps have only {distinct_count} distinct values, so "
             f"px4fuse uses the {time_source}"
         )
-        # Jitter of the receive time, assuming that the sender sends at regular intervals
+        # Jitter of the receive time, if the sender sends at regular intervals
         intervals_s = np.diff(receive_times_s)
         intervals_s = intervals_s[intervals_s < MAX_REGULAR_SAMPLE_INTERVAL_S]
         jitter_s = float(np.std(intervals_s) / np.sqrt(2.0)) if len(intervals_s) else 0.0
@@ -202,8 +190,7 @@ def map_clock_to_boot(
 
     timesync_fit = _fit_timesync(sender_replies, autopilot_replies)
     difference_from_receipt_s = compute_difference_from_receipt_s(timestamps_s)
-    # A clock that started seconds after the boot clock looks like the boot clock, unless TIMESYNC
-    # reduces the difference from the receive times
+    # Without TIMESYNC, a clock that started seconds later looks like the boot clock
     reduction_by_timesync_s = 0.0
     if timesync_fit is not None:
         reduction_by_timesync_s = difference_from_receipt_s - compute_difference_from_receipt_s(
@@ -227,8 +214,7 @@ def map_clock_to_boot(
         unix_note = "assumption: the UNIX clocks of sender and autopilot are synchronised"
         candidate_fits.append(("SYSTEM_TIME", boot_to_unix_fit.inverse(), unix_note))
     for method, sender_to_boot_fit, note in candidate_fits:
-        # If the converted timestamps disagree with the receive times, the conversion belongs to
-        # another clock
+        # Converted timestamps that disagree with the receive times are from another clock
         if (
             compute_difference_from_receipt_s(sender_to_boot_fit.at(timestamps_s))
             <= MAX_BOOT_TIME_DIFFERENCE_S
@@ -248,11 +234,10 @@ def map_clock_to_boot(
 def _fit_timesync(
     sender_replies: tuple[Array, Array], autopilot_replies: tuple[Array, Array]
 ) -> ClockLine | None:
-    """Fit the relation of sender clock to boot clock by TIMESYNC, averaged over both directions."""
+    """Fit the conversion of sender clock to boot clock by TIMESYNC, as mean of both directions."""
     clock_fits = []
     if len(sender_replies[0]) >= MIN_TIMESYNC_REPLIES:
-        # The autopilot's request (boot time) is before the sender's reply, so the fit converts boot
-        # to sender time
+        # Inverse, because the request (boot time) is before the reply (sender time)
         clock_fits.append(fit_clock_line(*sender_replies).inverse())
     if len(autopilot_replies[0]) >= MIN_TIMESYNC_REPLIES:
         clock_fits.append(fit_clock_line(*autopilot_replies))

@@ -1,8 +1,6 @@
 """Decoder of the MAVLink wire format: bytes to frames (packets), and frames to arrays of fields.
 
-The checksum is tested at every byte at which a frame of a known message could begin. Invalid bytes
-and incomplete frames are skipped and counted, so no valid frame is lost. All frames of one message
-type are decoded at once, with the field definitions of pymavlink.
+Invalid bytes and incomplete frames are skipped and counted.
 
 Sources: MAVLink developer guide, "Packet Serialization"; pymavlink's generated dialects.
 """
@@ -34,30 +32,28 @@ SIGNED_FLAG = 0x01
 MAX_FRAME_BYTES = HEADER_BYTES_V2 + 255 + CHECKSUM_BYTES + SIGNATURE_BYTES
 # Receive time that QGroundControl and MAVProxy write before each frame: µs, big-endian
 RECEIVE_TIME_BYTES = 8
-# Frames are searched in blocks of this number of bytes, so that malicious files need little memory
+# Block size (bytes) of the search for frames, which limits the memory
 BLOCK_BYTES = 1 << 16
-# Number of frames that are decoded at once, to limit the memory
+# Number of frames that are decoded at once, which limits the memory
 DECODE_BATCH_SIZE = 1 << 12
-# Minimum fraction of the bytes of a MAVLink recording that are in frames with a valid checksum. In
-# random data, one such frame is expected in about eight million bytes
+# Minimum fraction of bytes in valid frames; otherwise, the file is not MAVLink
 MIN_VALID_FRAME_FRACTION = 0.01
-# A receive time is damaged if it differs by more than this time (µs) from the median receive time;
-# pymavlink has the same limit
+# Maximum difference (µs) of a valid receive time from the median, as in pymavlink
 MAX_RECEIVE_TIME_DIFFERENCE_US = 3 * 24 * 3600 * 1_000_000
 MESSAGE_IDS: Mapping[str, int] = {
     message.msgname: number for number, message in dialect.mavlink_map.items()
 }
-# Vehicle type by number of the MAV_TYPE: "quadrotor" for MAV_TYPE_QUADROTOR
+# Vehicle types, such as "quadrotor", by MAV_TYPE number
 VEHICLE_TYPES = {
     number: entry.name.removeprefix("MAV_TYPE_").replace("_", " ").lower()
     for number, entry in dialect.enums["MAV_TYPE"].items()
 } | {6: "ground station", 18: "companion computer"}
-# CRC_EXTRA by message id, the last byte in the checksum; -1 for unknown messages
+# CRC_EXTRA byte of the checksum by message id; -1 for unknown messages
 _CRC_EXTRA = np.full(
     max(1 << 16, *(number + 1 for number in dialect.mavlink_map)), -1, dtype=np.int16
 )
 _CRC_EXTRA[[*dialect.mavlink_map]] = [message.crc_extra for message in dialect.mavlink_map.values()]
-# CRC of each byte value, to append the byte CRC_EXTRA to the CRC of a frame
+# CRC of each byte value
 _CRC_TABLE = np.array([mcrf4xx(bytes([byte]), 0) for byte in range(256)], dtype=np.uint16)
 
 
@@ -68,7 +64,7 @@ class MavlinkFrames:
     name: str
     content: bytes
     sha256: str
-    # Offset of the first byte of each frame in the content
+    # Offset of the first byte of each frame
     start_offsets: Int64Array
     message_ids: NDArray[np.int32]
     system_ids: ByteArray
@@ -76,37 +72,36 @@ class MavlinkFrames:
     sequence_numbers: ByteArray
     payload_offsets: Int64Array
     payload_lengths: ByteArray
-    # Receive times (UNIX time); damaged values are interpolated. None for a raw stream
+    # Receive times (UNIX time); None for a raw stream
     receive_times_us: Int64Array | None
-    # Number of complete frames with messages that are not in the dialect
+    # Number of frames with unknown messages
     unknown_frame_count: int
     # Number of bytes that are not part of a frame
     byte_count_outside_frames: int
     # True if the file ends within a frame
     is_last_frame_incomplete: bool
-    # Number of damaged receive times
     damaged_receive_time_count: int
 
     def __len__(self) -> int:
         return len(self.start_offsets)
 
     def rows(self, message: str) -> IntArray:
-        """Return the indices of the frames that contain a message, by its MAVLink name."""
+        """Return the indices of the frames with the given MAVLink message."""
         return np.flatnonzero(self.message_ids == MESSAGE_IDS[message])
 
     def is_sent_by(
         self, address: MavlinkAddress, rows: IntArray | slice = slice(None)
     ) -> BoolArray:
-        """Return True for each frame in ``rows`` (default: all) that ``address`` sent."""
+        """Return True for each frame that was sent by ``address``."""
         system, component = address
         return np.asarray(
             (self.system_ids[rows] == system) & (self.component_ids[rows] == component)
         )
 
     def table(self, message: str, rows: IntArray) -> NDArray[Any]:
-        """Decode frames of one message to a structured array with its fields, in MAVLink units.
+        """Decode frames with one message to a structured array with its fields, in MAVLink units.
 
-        MAVLink 2 omits trailing zero bytes of the payload; they are added again.
+        MAVLink 2 omits trailing zero bytes of the payload. They are added again.
         """
         layout = wire_layout(MESSAGE_IDS[message])
         payload = np.zeros((len(rows), layout.itemsize), dtype=np.uint8)
@@ -120,7 +115,7 @@ class MavlinkFrames:
                 bytes_by_start_offset = np.lib.stride_tricks.sliding_window_view(
                     content_bytes, byte_count
                 )
-                # Indexing copies the payloads, so frames are decoded in batches
+                # Batches limit the memory, because indexing copies the payloads
                 for batch_start in range(0, len(rows_with_length), DECODE_BATCH_SIZE):
                     batch_rows = rows_with_length[batch_start : batch_start + DECODE_BATCH_SIZE]
                     payload[batch_rows, :byte_count] = bytes_by_start_offset[
@@ -175,7 +170,7 @@ def read_frames(name: str, content: bytes) -> MavlinkFrames:
         )
     content_bytes = np.frombuffer(content, dtype=np.uint8)
     is_version_2 = content_bytes[start_offsets] == MAGIC_BYTE_V2
-    # Sequence, system and component are consecutive bytes of the header
+    # Sequence number, system id and component id are consecutive bytes
     sequence_offsets = start_offsets + np.where(is_version_2, 4, 2)
     unknown_frame_count, byte_count_outside_frames, is_last_frame_incomplete = (
         _count_bytes_outside_frames(
@@ -207,7 +202,7 @@ def read_frames(name: str, content: bytes) -> MavlinkFrames:
 
 
 def _find_valid_frames(content: bytes) -> Int64Array:
-    """Return first byte, end and message id of each frame with a valid checksum, shape (n, 3)."""
+    """Return start, end and message id of each frame with a valid checksum, shape (n, 3)."""
     content_bytes = np.frombuffer(content, dtype=np.uint8)
     content_view = memoryview(content)
     valid_frames = [np.zeros((0, 3), dtype=np.int64)]
@@ -227,12 +222,7 @@ def _find_valid_frames(content: bytes) -> Int64Array:
 
 
 def _remove_nested_frames(frames: Int64Array) -> Int64Array:
-    """Remove frames that overlap with another frame.
-
-    Frames overlap if a payload contains a frame (message TUNNEL), or if a receive time looks like a
-    frame header. The kept frame begins directly after the previous frame, or after the receive time
-    that follows the previous frame.
-    """
+    """Remove frames inside other frames, such as in the payload of the message TUNNEL."""
     if not np.any(frames[1:, 0] < frames[:-1, 1]):
         return frames
     start_offsets = frames[:, 0].tolist()
@@ -254,10 +244,9 @@ def _remove_nested_frames(frames: Int64Array) -> Int64Array:
 def _find_possible_frames(
     content_bytes: ByteArray, block_start: int
 ) -> tuple[Int64Array, Int64Array]:
-    """Find the frames that begin in one block of the file, before their checksum is tested.
+    """Find possible frames that begin in one block of the file, without a test of the checksum.
 
-    The block has BLOCK_BYTES and begins at ``block_start``. Return first byte, end and message id
-    of each possible frame, shape (n, 3), and the offset of its checksum, shape (n,).
+    Return start, end and message id of each frame, shape (n, 3), and the checksum offset.
     """
     block = content_bytes[block_start : block_start + BLOCK_BYTES]
     start_offsets = block_start + np.flatnonzero(
@@ -292,7 +281,7 @@ def _find_possible_frames(
 
 
 def _has_receive_times(start_offsets: Int64Array, end_offsets: Int64Array) -> bool:
-    """Return True if a receive time of eight bytes precedes most frames, as in a ``.tlog``."""
+    """Return True if receive times precede most frames, as in a ``.tlog``."""
     gap_sizes_bytes = start_offsets[1:] - end_offsets[:-1]
     frame_count_with_receive_time = int(np.count_nonzero(gap_sizes_bytes == RECEIVE_TIME_BYTES))
     frame_count_without_receive_time = int(np.count_nonzero(gap_sizes_bytes == 0))
@@ -304,10 +293,9 @@ def _has_receive_times(start_offsets: Int64Array, end_offsets: Int64Array) -> bo
 def _count_bytes_outside_frames(
     content: bytes, start_offsets: Int64Array, end_offsets: Int64Array, receive_time_bytes: int
 ) -> tuple[int, int, bool]:
-    """Count the frames of unknown messages, and all other bytes that are not in valid frames.
+    """Count the frames with unknown messages, and the bytes outside frames.
 
-    The third value is True if the file ends within a frame. ``receive_time_bytes`` is the length of
-    the receive time before each frame: 8, or 0 without receive times.
+    The third value is True if the file ends within a frame.
     """
     unknown_frame_count = 0
     byte_count_outside_frames = 0
@@ -336,10 +324,7 @@ def _count_bytes_outside_frames(
 def _measure_unknown_frames(
     content: bytes, offset: int, gap_end: int, receive_time_bytes: int
 ) -> Iterator[int]:
-    """Yield the size (bytes) of each frame with an unknown message in a gap between valid frames.
-
-    ``receive_time_bytes`` is the length of the receive time before each frame.
-    """
+    """Yield the size (bytes) of each frame with an unknown message between valid frames."""
     while offset + receive_time_bytes + HEADER_BYTES_V1 + CHECKSUM_BYTES <= gap_end:
         header = content[
             offset + receive_time_bytes : offset + receive_time_bytes + HEADER_BYTES_V2
@@ -364,11 +349,10 @@ def _measure_unknown_frames(
 def _read_receive_times(
     content_bytes: ByteArray, start_offsets: Int64Array, end_offsets: Int64Array
 ) -> tuple[Int64Array, int]:
-    """Return the receive time (UNIX, µs) of each frame, and the number of damaged receive times."""
+    """Return the receive time (UNIX, µs) of each frame, and the number of damaged times."""
     is_usable = start_offsets >= RECEIVE_TIME_BYTES
     is_usable[1:] &= start_offsets[1:] - end_offsets[:-1] >= RECEIVE_TIME_BYTES
     eight_byte_windows = np.lib.stride_tricks.sliding_window_view(content_bytes, RECEIVE_TIME_BYTES)
-    # If the first frame has no receive time, other bytes are read here, but not marked as usable
     unchecked_receive_times_us = np.ascontiguousarray(
         eight_byte_windows[np.maximum(start_offsets - RECEIVE_TIME_BYTES, 0)]
     ).view(">u8")[:, 0]
@@ -380,7 +364,7 @@ def _read_receive_times(
     receive_times_us = np.where(is_usable, receive_times_us, 0)
     if np.any(is_usable):
         rows = np.flatnonzero(is_usable)
-        # Times are relative to the first receive time, so that float64 resolves microseconds
+        # Interpolate times relative to the first, so that float64 resolves microseconds
         time_since_first_receipt_us = np.interp(
             np.arange(len(start_offsets)), rows, receive_times_us[rows] - receive_times_us[rows[0]]
         )

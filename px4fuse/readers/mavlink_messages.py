@@ -1,6 +1,6 @@
-"""MAVLink messages that px4fuse reads: fields, units, coordinate frames, directions.
+"""MAVLink messages that px4fuse reads: fields, units and coordinate frames.
 
-To support another message with a position, add tables to ``mavlink_messages.toml``.
+The data are in ``mavlink_messages.toml``.
 """
 
 from collections.abc import Mapping
@@ -22,9 +22,9 @@ ARDUPILOT_REPLAY_UNAVAILABLE = Unavailable(
     "px4fuse has no model of ArduPilot's estimator (EKF3)",
     "Give a PX4 ULog. px4fuse replays only PX4's EKF2.",
 )
-# Messages whose field time_usec is boot time; in other messages it may be from another clock
+# Messages with boot time in the field time_usec
 BOOT_CLOCK_MESSAGES = ("HIGHRES_IMU", "ODOMETRY", "ESTIMATOR_STATUS")
-# Messages that only an autopilot sends; they identify the autopilot among the senders
+# Messages that only an autopilot sends
 AUTOPILOT_MESSAGES = (
     "HIGHRES_IMU",
     "SCALED_IMU",
@@ -41,21 +41,21 @@ AUTOPILOT_MESSAGES = (
 
 @dataclass(frozen=True)
 class PositionMessageType:
-    """Message type that carries an external position to the autopilot: fields, frame, clock."""
+    """MAVLink message with an external position for the autopilot: fields, frame and clock."""
 
-    # Key in MESSAGE_LAYOUTS of the fields that are read from this message
+    # Name of the field definition in ``mavlink_messages.toml``
     layout_name: str
     description: str
     # Name of the position source for the option --position-source
     track_name: str = ""
     kind: str = "uwb"
-    # Coordinate frame of the positions. If "unknown", the message may contain the MAV_FRAME
+    # Coordinate frame of the positions
     frame: str = "unknown"
     # Field with the sender's timestamp (µs)
     timestamp_field: str = "time_usec"
     # Required MAV_ESTIMATOR_TYPE, if any
     estimator_type: int | None = None
-    # True if PX4 ignores the covariance: MAV_ESTIMATOR_TYPE_NAIVE (mavlink_receiver.cpp)
+    # True if PX4 ignores the covariance of this estimator type (mavlink_receiver.cpp)
     drops_covariance: bool = False
 
     @property
@@ -73,7 +73,7 @@ class PositionMessageType:
 
 @dataclass(frozen=True)
 class FrameConversion:
-    """Conversion of vectors in a MAV_FRAME to NED or FRD: order and signs of the components."""
+    """Conversion of vectors from a MAV_FRAME to NED or FRD: order and signs of the components."""
 
     name: str
     axis_order: tuple[int, int, int] = (0, 1, 2)
@@ -99,13 +99,13 @@ _SCALED_IMU_LAYOUTS = (
     replace(MESSAGE_LAYOUTS["scaled_imu"], topic=f"SCALED_IMU{number}") for number in ("", "2", "3")
 )
 IMU_LAYOUTS = (MESSAGE_LAYOUTS["highres_imu"], *_SCALED_IMU_LAYOUTS)
-# Attitude messages. The one with most samples is used; if equal, the first
+# Attitude messages; the message with most samples is used
 ATTITUDE_LAYOUTS = (
     MESSAGE_LAYOUTS["quaternion"],
     MESSAGE_LAYOUTS["angles"],
     MESSAGE_LAYOUTS["attitude_of_odometry"],
 )
-# Messages with EKF2's state; ODOMETRY is first because it contains variances
+# Messages with EKF2's state, in order of preference
 STATE_LAYOUTS = (MESSAGE_LAYOUTS["odometry"], MESSAGE_LAYOUTS["local_position"])
 # Messages with ground truth of a simulation
 TRUTH_LAYOUTS = (MESSAGE_LAYOUTS["truth"], MESSAGE_LAYOUTS["sim_state"])
@@ -113,10 +113,7 @@ GNSS_LAYOUTS = (MESSAGE_LAYOUTS["gnss"], replace(MESSAGE_LAYOUTS["gnss"], topic=
 
 
 def remedies_of_autopilot(autopilot: str) -> tuple[Mapping[str, str], Unavailable]:
-    """Return advice for missing data, and the reason why the estimator cannot be replayed.
-
-    The advice is a sentence for each kind of data, such as "imu", with the message to record.
-    """
+    """Return advice for each kind of missing data, and the reason why no replay is possible."""
     if autopilot == "ArduPilot":
         return _MESSAGE_TABLES["remedies"][autopilot], ARDUPILOT_REPLAY_UNAVAILABLE
     return _MESSAGE_TABLES["remedies"]["PX4"], RECORD_NOT_LOGGED

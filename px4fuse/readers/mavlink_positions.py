@@ -27,32 +27,25 @@ from px4fuse.readers.mavlink_recording import BOOT_CLOCK_TEXT, RECEIPT_CLOCK_TEX
 from px4fuse.readers.mavlink_senders import find_senders
 from px4fuse.readers.px4_positions import GeodeticPosition, project_to_ned, unproject
 
-# Maximum median difference (s) between GNSS timestamps in boot time and their receive times. If the
-# difference is larger, the timestamps are not boot time
+# Maximum median difference (s) between boot-time GNSS timestamps and receive times
 MAX_BOOT_TIME_DIFFERENCE_S = 5.0
-# Maximum time difference (s) of the global and local position from which the origin of the local
-# frame is computed; at 1 m/s, the error of the origin is 5 cm
+# Maximum time (s) between global and local position for the origin: 5 cm error at 1 m/s
 MAX_ORIGIN_TIME_DIFFERENCE_S = 0.05
 
 
 def read_positions(
     recording: Recording, clocks: dict[MavlinkAddress, ClockMapping], remedy: str, delay_s: float
 ) -> tuple[tuple[PositionTrack, ...], tuple[Unavailable, ...]]:
-    """Read the external positions sent to the autopilot, best first, and the GNSS positions.
+    """Read the external positions sent to the autopilot, and the GNSS positions.
 
     Parameters
     ----------
     clocks : mapping from address to ClockMapping
-        Conversion of each sender's clock to the boot clock.
+        Conversion of each sender's clock to the autopilot's boot clock.
     remedy : str
         Advice to the user if no positions were recorded.
     delay_s : float
         Delay (s) from GNSS measurement to timestamp that the autopilot assumes.
-
-    Returns
-    -------
-    positions : tuple of PositionTrack
-    missing : tuple of Unavailable
     """
     tracks_or_unavailable: list[PositionTrack | Unavailable] = []
     for message in dict.fromkeys(source.message for source in messages.POSITION_MESSAGE_TYPES):
@@ -82,7 +75,7 @@ def _read_track(
     remedy: str,
     senders: list[MavlinkAddress],
 ) -> PositionTrack | Unavailable | None:
-    """Read the positions in one message type from one sender; None if it sent no such message."""
+    """Read the positions from one sender and message type; None without messages."""
     rows = recording.rows(source.message, sender)
     table = recording.frames.table(source.message, rows)
     if source.estimator_type is not None:
@@ -101,7 +94,7 @@ def _read_track(
     samples = recording.read(source.layout, rows, sample_boot_time_s, track_name)
     frame = source.frame
     if "frame_id" in samples and len(samples):
-        # A track has one coordinate frame: the frame of the last sample, as in PX4
+        # The coordinate frame of the last sample applies to all samples, as in PX4
         frame_conversion = messages.CONVERSION_BY_MAV_FRAME.get(int(samples["frame_id"].iloc[-1]))
         frame = "unknown" if frame_conversion is None else frame_conversion.name
     if source.drops_covariance:
@@ -128,9 +121,9 @@ def _read_track(
 def _read_gnss(
     recording: Recording, layout: Layout, delay_s: float
 ) -> PositionTrack | Unavailable | None:
-    """Read GNSS fixes as NED positions from the autopilot's local origin; None without messages.
+    """Read GNSS fixes as NED positions relative to the local origin; None without messages.
 
-    The autopilot repeats each fix until the next one; repeated fixes are dropped.
+    Repeated fixes are dropped.
     """
     rows = recording.rows(layout.topic)
     if not len(rows):
@@ -143,7 +136,7 @@ def _read_gnss(
         len(rows)
         and np.median(np.abs(receipt_boot_times_s - gnss_boot_time_s)) > MAX_BOOT_TIME_DIFFERENCE_S
     ):
-        # The timestamps are not boot times, for example UNIX times: use the receive times
+        # Use the receive times, because the timestamps are not boot times
         gnss_boot_time_s = receipt_boot_times_s
     fixes = recording.read(layout, rows, gnss_boot_time_s - delay_s)
     fixes = fixes[fixes["fix_type"] >= px4_positions.FIX_TYPE_3D]
@@ -179,10 +172,9 @@ def compute_pressure_altitude_m(pressure_hpa: pd.Series[float]) -> pd.Series[flo
 
 
 def find_local_origin(recording: Recording) -> GeodeticPosition | None:
-    """Return latitude, longitude (degrees) and altitude (m) of the autopilot's local origin.
+    """Return latitude, longitude (degrees) and altitude (m) of the local NED origin.
 
-    The origin is read from GPS_GLOBAL_ORIGIN, or computed from global and local positions. Return
-    None if the recording contains none of them.
+    It is read from GPS_GLOBAL_ORIGIN, or computed from global and local positions.
     """
     sent_origins = recording.read(messages.MESSAGE_LAYOUTS["origin"]).dropna()
     if len(sent_origins):
@@ -210,11 +202,10 @@ def find_local_origin(recording: Recording) -> GeodeticPosition | None:
 def read_truth(
     recording: Recording, positions: tuple[PositionTrack, ...], remedies: Mapping[str, str]
 ) -> Truth | Unavailable:
-    """Read ground truth from the simulation, or from motion capture if EKF2 uses another source.
+    """Read ground truth from simulation or motion capture.
 
-    Simulation ground truth has receive times, because ``HIL_STATE_QUATERNION.time_usec`` is 0 in
-    PX4. The origin of NED is the autopilot's origin if the position source is GNSS, else the first
-    sample of ground truth.
+    Simulation ground truth has receive times, because PX4 sends no timestamp in
+    ``HIL_STATE_QUATERNION``.
     """
     for layout in messages.TRUTH_LAYOUTS:
         rows = recording.rows(layout.topic)
@@ -226,7 +217,7 @@ def read_truth(
             continue
         samples = samples.reindex(columns=Columns.GEODETIC + Columns.VELOCITY + Columns.QUATERNION)
         if not samples[Columns.VELOCITY].to_numpy().any():
-            # Velocities that are zero in all samples were not sent
+            # If all velocities are zero, they were not sent
             samples[Columns.VELOCITY] = np.nan
         recording.record_stream("truth", layout.topic, clock=RECEIPT_CLOCK_TEXT)
         origin = find_local_origin(recording) if positions and positions[0].origin.is_gnss else None

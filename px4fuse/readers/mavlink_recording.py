@@ -31,51 +31,48 @@ from px4fuse.trajectory.rotation import rotate
 
 BOOT_CLOCK_TEXT = "autopilot boot clock"
 RECEIPT_CLOCK_TEXT = "autopilot boot clock, estimated from receive times"
-# Minimum backward step (s) of the boot clock at a restart; a smaller step is a late packet
+# Minimum backward step (s) of the boot clock at a restart
 MIN_BACKWARD_STEP_AT_RESTART_S = 5.0
-# Number of messages before and after a backward step of the boot clock that have to confirm a
-# restart
+# Number of messages before and after a backward step that must confirm a restart
 RESTART_CHECK_MESSAGES = 20
-# A group of timestamps between two gaps is damaged if its size is below this fraction of the size
-# of the largest group
+# Minimum size of a valid group of timestamps, relative to the largest group
 MIN_TIMESTAMP_GROUP_FRACTION = 0.01
-# Maximum distance (s) of a valid timestamp from the analysed time span, or from the next timestamp
+# Maximum time (s) of a valid timestamp outside the analysed time span
 MAX_TIME_OUTSIDE_FLIGHT_S = 60.0
-# A file is damaged if a larger fraction of its bytes is outside of MAVLink frames
+# Maximum fraction of bytes outside MAVLink frames in an undamaged file
 MAX_STRAY_BYTE_FRACTION = 0.002
-# Minimum number of timestamps to detect a stopped clock, most of whose timestamps are equal
+# Minimum number of timestamps to detect a stopped clock
 MIN_STOPPED_CLOCK_TIMESTAMPS = 10
 
 
 @dataclass(eq=False)  # not frozen: the readers add streams and counts
 class Recording:
-    """MAVLink recording of one flight, with the relation of receive time to the boot clock."""
+    """MAVLink recording of one flight, with the conversion of receive times to boot times."""
 
     frames: MavlinkFrames
     # Address of the autopilot of this flight
     address: MavlinkAddress
-    # Analysed frames: the longest part of the recording between two restarts of the autopilot
+    # Analysed frames, between two restarts of the autopilot
     analysed_frame_slice: slice
-    # Receive time of each frame (s since the first frame). If the file contains no receive times,
-    # the boot time of the last autopilot message before the frame replaces them
+    # Receive time of each frame (s), or the last boot time before the frame
     receive_times_s: Array
     # Conversion of receive times to the boot clock
     receipt_to_boot_fit: ClockLine
-    # Boot time (s) at flight time zero: the start of the analysed frames
+    # Boot time (s) at flight time zero
     time_origin_s: float
     duration_s: float
     notes: list[str]
-    # Sentences on unreadable parts of the file
+    # Sentences about unreadable parts of the file
     damage_notes: tuple[str, ...] = ()
     restart_count: int | None = None
     receive_time_reversal_count: int | None = None
     # Number of samples with an invalid timestamp, by message
     dropped_count_by_message: dict[str, int] = field(default_factory=dict)
-    # Messages that contain each kind of data, such as "imu", and the clock of their timestamps
+    # Messages and clock of each kind of data, such as "imu"
     data_source_by_kind: dict[str, DataSource] = field(default_factory=dict)
 
     def rows_of_all_senders(self, message: str) -> IntArray:
-        """Return the indices of the analysed frames with one message type, from all senders."""
+        """Return the indices of the analysed frames with a message, from all senders."""
         rows = self.frames.rows(message)
         return np.asarray(
             rows[
@@ -84,10 +81,7 @@ class Recording:
         )
 
     def rows(self, message: str, address: MavlinkAddress | None = None) -> IntArray:
-        """Return the indices of the frames of one message type that ``address`` sent.
-
-        The default of ``address`` is the autopilot.
-        """
+        """Return the indices of the frames with a message from ``address`` (default: autopilot)."""
         rows = self.rows_of_all_senders(message)
         return rows[self.frames.is_sent_by(address or self.address, rows)]
 
@@ -100,19 +94,18 @@ class Recording:
     ) -> pd.DataFrame:
         """Read one message as a DataFrame with strictly increasing flight times (s).
 
-        Euler angles are converted to quaternions, other coordinate frames to NED (or FRD).
+        Euler angles are converted to quaternions, and vectors to NED (or FRD).
 
         Parameters
         ----------
         layout : Layout
             Message and fields to read.
         rows : ndarray, shape (n,), optional
-            Frame indices from :meth:`rows`; by default all from the autopilot.
+            Frame indices; by default all frames from the autopilot.
         boot_times_s : ndarray, shape (n,), optional
-            Times since boot, by default the timestamps of the messages. Samples with NaN are
-            dropped.
+            Times since boot; by default the timestamps of the messages.
         name : str, optional
-            Key in :attr:`dropped_count_by_message`; by default the message name.
+            Name for the count of dropped samples; by default the message name.
         """
         rows = self.rows(layout.topic) if rows is None else rows
         table = self.frames.table(layout.topic, rows)
@@ -122,7 +115,7 @@ class Recording:
         selected_rows = self._find_rows_with_valid_time(name or layout.topic, boot_times_s)
         if len(selected_rows) < len(table):
             table = table[selected_rows]
-        # One hour of IMU data has hundreds of megabytes, so fields are copied only once
+        # Copy fields only once, because one hour of IMU data has hundreds of megabytes
         values = np.empty((len(selected_rows), len(layout.columns)))
         for column_index, (column, field_name) in enumerate(layout.columns.items()):
             array_name, _, element_index_text = field_name.removesuffix("]").partition("[")
@@ -142,14 +135,14 @@ class Recording:
         return _to_ned(samples) if "frame_id" in samples else samples
 
     def _find_rows_with_valid_time(self, name: str, boot_times_s: Array) -> IntArray:
-        """Return the indices of valid and increasing boot times; count all others as dropped."""
+        """Return the indices of valid and increasing boot times; count the others as dropped."""
         time_s = boot_times_s - self.time_origin_s
         is_inside = (time_s >= -MAX_TIME_OUTSIDE_FLIGHT_S) & (
             time_s <= self.duration_s + MAX_TIME_OUTSIDE_FLIGHT_S
         )
         rows = np.flatnonzero(is_inside & (boot_times_s > 0.0))
         time_us = np.rint(boot_times_s[rows] * 1e6).astype(np.int64)
-        # A message that is received twice, over two links, is one sample
+        # A message may be received twice, over two links
         first_row_of_each_time = np.sort(np.unique(time_us, return_index=True)[1])
         increasing_time_rows = longest_increasing_run(time_us[first_row_of_each_time])
         if (
@@ -164,13 +157,12 @@ class Recording:
     def compute_receipt_boot_times_s(self, rows: IntArray) -> Array:
         """Return receive times of frames, converted to the boot clock (s).
 
-        The minimum delay of the link is removed, because the conversion is fitted to the messages
-        with the least delay.
+        The conversion removes the minimum delay of the link.
         """
         return self.receipt_to_boot_fit.at(self.receive_times_s[rows])
 
     def compute_boot_times_s(self, table: NDArray[Any], rows: IntArray) -> Array:
-        """Return the time since boot (s) of each message, or its receive time if it has none."""
+        """Return the time since boot (s) of each message; without timestamp, its receive time."""
         if not self.receipt_to_boot_fit.reading_pair_count:  # no message contains the boot clock
             return self.compute_receipt_boot_times_s(rows)
         if "time_boot_ms" in (table.dtype.names or ()):
@@ -182,16 +174,15 @@ class Recording:
         return np.where(is_boot_time, timestamp_s, self.compute_receipt_boot_times_s(rows))
 
     def record_stream(self, data_kind: str, *messages: str, clock: str = BOOT_CLOCK_TEXT) -> None:
-        """Store for the report which messages and clock supply data such as "imu"."""
+        """Store the messages and the clock of a kind of data, such as "imu", for the report."""
         self.data_source_by_kind[data_kind] = DataSource(messages, clock, self.frames.name)
 
 
 def _to_ned(samples: pd.DataFrame) -> pd.DataFrame:
     """Convert ODOMETRY samples to NED (or FRD); values in unsupported frames become NaN.
 
-    The velocity is in the child frame of the message: the body frame in PX4 up to v1.13, NED later
-    (``streams/ODOMETRY.hpp``). Orientations in frames other than NED or FRD are dropped, because
-    the sender's body axes are unknown.
+    PX4 up to v1.13 sends the velocity in the body frame, later releases in NED
+    (``streams/ODOMETRY.hpp``).
     """
     quaternions = samples[Columns.QUATERNION].to_numpy(copy=True)
     has_quaternion = np.linalg.norm(quaternions, axis=1) > MIN_QUATERNION_NORM
@@ -218,7 +209,7 @@ def _to_ned(samples: pd.DataFrame) -> pd.DataFrame:
             if is_body_frame and rows.any():
                 rotation = Rotation.from_quat(quaternions[rows], scalar_first=True).as_matrix()
                 vectors = rotate(rotation, vectors)
-                # Diagonal of R diag(σ²) Rᵀ, the covariance matrix in NED
+                # Variances in NED: diagonal of R diag(σ²) Rᵀ with the rotation matrix R
                 variances = rotate(rotation**2, variances)
             converted_samples.loc[rows, vector_columns] = vectors
             converted_samples.loc[rows, variance_columns] = variances
@@ -226,7 +217,7 @@ def _to_ned(samples: pd.DataFrame) -> pd.DataFrame:
 
 
 def _read_boot_times(frames: MavlinkFrames, address: MavlinkAddress) -> tuple[IntArray, Array]:
-    """Return the indices of the autopilot's frames with a time since boot, and these times (s)."""
+    """Return the indices of the autopilot's frames with a boot time, and these times (s)."""
     is_from_autopilot = frames.is_sent_by(address)
     rows_by_message = [np.zeros(0, dtype=np.intp)]
     times_by_message_s = [np.zeros(0)]
@@ -254,15 +245,12 @@ def _read_boot_times(frames: MavlinkFrames, address: MavlinkAddress) -> tuple[In
 
 
 def read_recording(frames: MavlinkFrames, address: MavlinkAddress) -> Recording:
-    """Return the longest part of a recording without a restart of the autopilot.
-
-    Receive times are converted to the boot clock.
-    """
+    """Return the longest part of a recording without a restart of the autopilot."""
     notes: list[str] = []
     rows, boot_times_s = _read_boot_times(frames, address)
     analysed_frame_slice = slice(0, len(frames))
     restart_rows = np.flatnonzero(np.diff(boot_times_s) < -MIN_BACKWARD_STEP_AT_RESTART_S) + 1
-    # A single late or early packet is not a restart: the packets before and after have to agree
+    # A single late or early packet is not a restart
     boot_time_before_restart_s = boot_times_s[
         np.maximum(restart_rows - 1 - RESTART_CHECK_MESSAGES, 0)
     ]
@@ -300,7 +288,7 @@ def read_recording(frames: MavlinkFrames, address: MavlinkAddress) -> Recording:
         if len(rows):
             receipt_to_boot_fit = fit_clock_line(boot_times_s, receive_times_s[rows]).inverse()
     elif len(rows):
-        # A raw stream has no receive times; the last boot time before each frame is used instead
+        # A raw stream has no receive times. Use the last boot time before each frame
         previous_message_index = np.searchsorted(rows, np.arange(len(frames)), side="right") - 1
         receive_times_s = boot_times_s[np.maximum(previous_message_index, 0)]
     else:
@@ -322,12 +310,12 @@ def read_recording(frames: MavlinkFrames, address: MavlinkAddress) -> Recording:
         "not part of a complete MAVLink frame"
     )
     damage_notes: tuple[str, ...] = ()
-    # Incomplete frames at the beginning and end of the file do not count as damage
+    # Incomplete frames at the beginning and end of the file are not damage
     if byte_count_outside_frames - 2 * MAX_FRAME_BYTES > MAX_STRAY_BYTE_FRACTION * byte_count:
         damage_notes = (f"the file is damaged: {stray_bytes_note}",)
     elif byte_count_outside_frames:
         notes.append(stray_bytes_note)
-    # Without boot times, the time axis is the receive time
+    # Without boot times, use the receive times
     time_origin_s, end_s = (
         boot_times_s if len(boot_times_s) else np.array([0.0, receive_times_s.max()])
     )[[0, -1]].tolist()
@@ -347,11 +335,7 @@ def read_recording(frames: MavlinkFrames, address: MavlinkAddress) -> Recording:
 
 
 def _remove_stray_timestamps(times_s: Array, rows: IntArray) -> IntArray:
-    """Remove small groups of timestamps at the beginning and at the end of a recording.
-
-    Groups are separated by gaps of more than MAX_TIME_OUTSIDE_FLIGHT_S. A group is small if it has
-    less than MIN_TIMESTAMP_GROUP_FRACTION of the timestamps of the largest group.
-    """
+    """Remove a few isolated timestamps at the beginning and end of a recording."""
     timestamp_groups = np.split(
         rows, np.flatnonzero(np.diff(times_s[rows]) > MAX_TIME_OUTSIDE_FLIGHT_S) + 1
     )
@@ -363,7 +347,7 @@ def _remove_stray_timestamps(times_s: Array, rows: IntArray) -> IntArray:
 
 
 def map_boot_to_unix(recording: Recording) -> ClockLine | None:
-    """Return the relation of boot clock to UNIX time; None if SYSTEM_TIME has no UNIX time."""
+    """Return the conversion of boot time to UNIX time; None if SYSTEM_TIME has no UNIX time."""
     table = recording.frames.table("SYSTEM_TIME", recording.rows("SYSTEM_TIME"))
     table = table[table["time_unix_usec"] * 1e-6 > MIN_UNIX_TIME_S]
     if not len(table):

@@ -1,4 +1,4 @@
-"""Detection of the autopilot and position senders in a MAVLink recording, and of their clocks."""
+"""Autopilot and position senders in a MAVLink recording, and their clocks."""
 
 from collections import Counter
 from collections.abc import Iterator
@@ -23,15 +23,13 @@ from px4fuse.readers.mavlink_recording import (
     map_boot_to_unix,
 )
 
-# Maximum number of senders that are read; senders with more messages are preferred
+# Maximum number of senders that are read
 MAX_SENDERS = 32
-# Maximum fraction of lost messages: above it, the sender does not number its messages in sequence
+# Maximum fraction of lost messages; with more, the sequence numbers are not usable
 MAX_LOST_MESSAGE_FRACTION = 0.9
-# A message is late, not lost, if at most this many later messages of its sender arrive before it
-# (over a faster link)
+# A message is late, not lost, if at most this number of later messages arrives first
 MAX_LATE_MESSAGES = 16
-# Maximum difference (s) of TIMESYNC timestamps from a sender's position timestamps: a larger
-# difference shows another clock
+# Maximum difference (s) between TIMESYNC and position timestamps of the same clock
 MAX_TIMESYNC_TO_POSITION_TIME_DIFFERENCE_S = 1e5
 
 
@@ -49,7 +47,7 @@ def _read_addresses(frames: MavlinkFrames, rows: IntArray | slice) -> Iterator[M
 def _count_frames(
     frames: MavlinkFrames, rows: IntArray | slice = slice(None)
 ) -> list[tuple[MavlinkAddress, int]]:
-    """Count frames by sender, most frames first."""
+    """Count the frames of each sender, most frames first."""
     counts = Counter(_read_addresses(frames, rows))
     return sorted(counts.items(), key=lambda item: (-item[1], item[0]))
 
@@ -59,9 +57,9 @@ def _is_vehicle(vehicle_type: int, autopilot: int) -> bool:
 
 
 def choose_autopilot(frames: MavlinkFrames, system_id: int | None) -> tuple[MavlinkAddress, str]:
-    """Return the address of an autopilot, and its type: "PX4", "ArduPilot" or another.
+    """Return the address of the autopilot, and its type, such as "PX4".
 
-    ``system_id`` is its MAVLink system id; None selects the autopilot with the most messages.
+    ``system_id`` None selects the autopilot with the most messages.
 
     Raises
     ------
@@ -77,9 +75,7 @@ def choose_autopilot(frames: MavlinkFrames, system_id: int | None) -> tuple[Mavl
     ]
     rows = np.concatenate([frames.rows(message) for message in messages.AUTOPILOT_MESSAGES])
     message_count_by_autopilot = dict(_count_frames(frames, rows))
-    # Companion computers may send autopilot heartbeats, so senders of messages that only autopilots
-    # send are preferred. Without a heartbeat, these messages or the component id identify the
-    # autopilot
+    # A heartbeat is not sufficient, because companion computers may also send autopilot heartbeats
     candidates = (
         [address for address in vehicle_addresses if address in message_count_by_autopilot]
         or [address for address in message_count_by_autopilot if address not in vehicle_types]
@@ -89,7 +85,7 @@ def choose_autopilot(frames: MavlinkFrames, system_id: int | None) -> tuple[Mavl
             for address in frame_count_by_address
             if address[1] == messages.AUTOPILOT_COMPONENT_ID
         ]
-        # If no message is from an autopilot, assume that each system has one that sent nothing
+        # If no message is from an autopilot, assume one in each system
         or [(address[0], messages.AUTOPILOT_COMPONENT_ID) for address in frame_count_by_address]
     )
     if system_id is not None:
@@ -110,7 +106,7 @@ def choose_autopilot(frames: MavlinkFrames, system_id: int | None) -> tuple[Mavl
 
 
 def find_senders(recording: Recording, message: str) -> list[MavlinkAddress]:
-    """Return the senders of a message type, such as companion computers, without autopilots."""
+    """Return the senders of a message, such as companion computers, without autopilots."""
     frames = recording.frames
     autopilot_address = recording.address
     other_vehicle_ids = {
@@ -127,7 +123,7 @@ def find_senders(recording: Recording, message: str) -> list[MavlinkAddress]:
 
 
 def map_sender_clocks(recording: Recording) -> dict[MavlinkAddress, ClockMapping]:
-    """Return the relation of each position sender's clock to the autopilot's boot clock."""
+    """Return the conversion of each position sender's clock to the autopilot's boot clock."""
     message_names = {source.message for source in messages.POSITION_MESSAGE_TYPES}
     senders = {address for message in message_names for address in find_senders(recording, message)}
     boot_to_unix_fit = map_boot_to_unix(recording)
@@ -152,13 +148,12 @@ def _map_sender_clock(
     timesync = frames.table("TIMESYNC", rows)
     sender_reply_times_s = timesync["tc1"] * 1e-9
     timesync_request_times_s = timesync["ts1"] * 1e-9
-    # A TIMESYNC reply repeats the time of the request in ts1. Only requests of the autopilot have
-    # boot time
+    # A TIMESYNC reply repeats the request time in ts1; requests of the autopilot have boot time
     is_sender_reply = (sender_reply_times_s != 0.0) & (
         np.abs(timesync_request_times_s - recording.compute_receipt_boot_times_s(rows))
         <= MIN_BACKWARD_STEP_AT_RESTART_S
     )
-    # The sender reads its clock just before it sends a TIMESYNC request: the delay is smallest
+    # TIMESYNC requests have a small delay, because the sender reads its clock just before
     is_timesync_request = (
         has_running_clock
         & (sender_reply_times_s == 0.0)
@@ -202,7 +197,7 @@ def _read_other_request_times(recording: Recording, sender: MavlinkAddress) -> I
 def describe_clock_conversions(
     recording: Recording, clock_mappings: dict[MavlinkAddress, ClockMapping]
 ) -> tuple[ClockMap, ...]:
-    """Describe the conversions of sender clocks and of the receive time to the boot clock."""
+    """Describe the conversions of sender clocks and receive times to the boot clock."""
     clock_descriptions = [mapping.description for mapping in clock_mappings.values()]
     receive_times_us = recording.frames.receive_times_us
     receipt_to_boot_fit = recording.receipt_to_boot_fit
@@ -250,9 +245,9 @@ def describe_senders(recording: Recording) -> tuple[Sender, ...]:
 
 
 def _estimate_lost_fraction(frames: MavlinkFrames, address: MavlinkAddress) -> float | None:
-    """Return the fraction of a sender's messages that are lost, from gaps in the sequence numbers.
+    """Return the fraction of lost messages of a sender, from gaps in the sequence numbers.
 
-    Return None if the sender does not count its messages, or counts them separately on two links.
+    Return None if the sequence numbers are not usable.
     """
     sequence_numbers = frames.sequence_numbers[frames.is_sent_by(address)].astype(np.int64)
     sequence_steps = np.mod(np.diff(sequence_numbers) + MAX_LATE_MESSAGES, 256) - MAX_LATE_MESSAGES

@@ -1,9 +1,8 @@
 """Reader of position files from UWB, motion capture and other positioning systems.
 
-The standard format is a header and the columns ``time, x, y, z`` in seconds and metres, optionally
-``sigma`` or ``sigma_x, sigma_y, sigma_z``. Other formats, separators, column names and units are
-detected and reported. Options override the detected columns and units. The positions keep the clock
-and the coordinate frame of the file.
+The standard format has a header and the columns ``time, x, y, z`` in seconds and metres, optionally
+``sigma`` or ``sigma_x, sigma_y, sigma_z``. Other formats, column names and units are detected.
+The positions keep the clock and the coordinate frame of the file.
 """
 
 import hashlib
@@ -49,24 +48,22 @@ from px4fuse.readers.ulog_topics import longest_increasing_run
 SIGMA_COLUMNS = ["sigma_x_m", "sigma_y_m", "sigma_z_m"]
 SAMPLE_COLUMNS = ["x_m", "y_m", "z_m", *SIGMA_COLUMNS]
 
-# Maximum number of UWB tags in a column; a column with more different values is a counter
+# Maximum number of UWB tags in a column; with more values, the column is a counter
 MAX_TAGS_IN_FILE = 100
 MIN_USABLE_ROWS = 3
-# Minimum fraction of rows with increasing times in a file without header, and of rows with whole
-# seconds in a file with another column for nanoseconds
+# Minimum fraction of rows with the expected pattern, such as increasing times
 MIN_MATCHING_ROW_FRACTION = 0.9
-# Minimum plausible median interval (s): UWB systems send at most 200 positions per second, ±10 %
+# Minimum plausible median interval (s): 200 UWB positions per second, ±10 %
 MIN_INTERVAL_S = 0.9 / 200
-# Maximum plausible median interval (s): UWB systems send a position every 5 s or more often, ±10 %
+# Maximum plausible median interval (s): one UWB position every 5 s, ±10 %
 MAX_INTERVAL_S = 1.1 / 0.2
-# Plausible units of timestamps in trajectories, and plausible median intervals (s)
+# Plausible time units and median intervals (s) of trajectories
 TRAJECTORY_TIME_UNITS, TRAJECTORY_INTERVAL_RANGE_S = ("s", "ns"), (1e-3, 1e3)
-# Maximum median interval (s) of timestamps that are read as UNIX times. Timestamps with a longer
-# interval are boot times, and their unit is smaller
+# Maximum median interval (s) of timestamps that are UNIX times
 MAX_UNIX_TIME_INTERVAL_S = 60.0
-# Maximum extent (m) of an indoor flight. Positions with a larger extent are probably in mm
+# Maximum extent (m) of an indoor flight; otherwise, the positions are probably in mm
 MAX_INDOOR_EXTENT_M = 200.0
-# Maximum absolute coordinate in the unit of the file: larger values are timestamps or damaged text
+# Maximum absolute coordinate; larger values are timestamps or damaged text
 MAX_COORDINATE_IN_FILE_UNIT = 1e9
 
 
@@ -77,14 +74,13 @@ class PositionRecording:
     name: str
     sha256: str
     size_bytes: int
-    # Position and σ (SAMPLE_COLUMNS), indexed by increasing time (s); NaN if not in the file. Axes
-    # x, y, z in frame "ned": north, east, down; in "enu": east, north, up
+    # Position and σ, indexed by increasing time (s); NaN if not in the file
     samples: pd.DataFrame
-    # "UNIX" if the timestamps are UNIX times between 2000 and 2100
+    # "UNIX" if the timestamps are UNIX times
     clock_kind: Literal["UNIX", "local"]
-    # Coordinate frames that column names and format allow; empty if all are possible
+    # Possible coordinate frames; empty if all are possible
     frames: tuple[str, ...]
-    # Sentences about the detected format, such as unit or frame
+    # Sentences about the detected format, for example the unit
     format_detection_notes: tuple[str, ...]
     # Warnings, and sentences about dropped rows
     notes: tuple[str, ...]
@@ -92,13 +88,13 @@ class PositionRecording:
     dropped_row_count: int = 0
     # Factor that converted the positions of the file to metres
     metres_per_unit: float = 1.0
-    # Dropped rows, each with the reason from :func:`classify_invalid_positions`
+    # Reason for each row without a valid position
     reason_by_invalid_row: "pd.Series[str]" = field(default_factory=lambda: NO_INVALID_ROWS)
-    # Quantisation step of the horizontal position; 0 if it is not quantised
+    # Quantisation step of the horizontal position; 0 if not quantised
     rounding_step_m: float = 0.0
     # Name of the format; "" for a table with a header
     format: str = ""
-    # Number of rows in the file that contain the body or tag which is read
+    # Number of rows with the selected rigid body or UWB tag
     row_count: int = 0
     # Orientation of each sample (x, y, z, w)
     quaternions: Array | None = None
@@ -117,7 +113,7 @@ def read_position_file(
     body: str | None = None,
     is_trajectory: bool = False,
 ) -> PositionRecording:
-    """Read positions and their σ from a file that a positioning system recorded.
+    """Read positions and their σ from the file of a positioning system.
 
     Parameters
     ----------
@@ -130,16 +126,16 @@ def read_position_file(
     length_unit : {"m", "cm", "mm"}, optional
         Unit of positions and sigmas; overrides detection.
     body : str, optional
-        Rigid body or UWB tag whose positions are read, or topic of a ROS bag.
+        Name of the rigid body or UWB tag, or topic of a ROS bag.
     is_trajectory : bool
-        True if the extent may be large, and 0, 0, 0 is a valid position.
+        True for trajectories: a large extent and the position 0, 0, 0 are valid.
 
     Raises
     ------
     LogError
         The file cannot be read, or contains no table of times and positions.
     SettingsError
-        An option has an invalid value or names a column that is not in the file.
+        An argument is invalid, or the file does not contain a given column.
     """
     _check_options(columns, time_unit, length_unit)
     path, body_in_path = split_path_and_part(str(path))
@@ -278,7 +274,7 @@ def read_position_file(
 def _open_table(
     path: Path, columns: tuple[str, ...] | None, body_name: str | None
 ) -> tuple[PositionTable, str, int]:
-    """Return the table of positions in a file or ROS bag, and the SHA-256 and size (bytes)."""
+    """Return the positions in a file or ROS bag, and its SHA-256 and size (bytes)."""
     if is_bag(path):
         return read_bag(path, body_name)
     content = read_bytes_limited(
@@ -292,7 +288,7 @@ def _open_table(
 def _find_increasing_rows(times_s: Array) -> IntArray:
     """Return the indices of the rows with strictly increasing times before 2100."""
     usable_rows = np.flatnonzero(np.abs(times_s) < MAX_VALID_UNIX_TIME_S)
-    # Ranks are used instead of times, because longest_increasing_run requires positive values
+    # Ranks, because longest_increasing_run requires positive values
     time_ranks = np.unique(times_s[usable_rows], return_inverse=True)[1].astype(np.int64)
     return usable_rows[longest_increasing_run(time_ranks + 1)]
 
@@ -322,16 +318,15 @@ def _read_numbers(
     quaternion_columns: list[int],
     body_name: str | None,
 ) -> tuple[pd.DataFrame, bool]:
-    """Convert the text of the needed columns to numbers.
+    """Convert the text of the needed columns to numbers, and dates (ISO 8601) to UNIX times.
 
-    Dates in ISO 8601 become UNIX times, and their unit in ``column_meanings`` becomes "s". The
-    second value is False for dates without time zone, otherwise True.
+    The second value is False for dates without time zone.
     """
     known_columns = [index for index, meaning in enumerate(column_meanings) if meaning.kind]
     texts = table.read_cells([*given_columns, *quaternion_columns, *known_columns])
     texts = _select_body(table, texts, column_meanings, body_name)
     may_have_decimal_comma = table.separator != ","
-    # DataFrame.apply returns dtype object for an empty table, so the dtype is set here
+    # DataFrame.apply returns dtype object for an empty table
     numbers = texts.apply(_to_numbers, may_have_decimal_comma=may_have_decimal_comma).astype(
         np.float64
     )
@@ -346,7 +341,7 @@ def _read_numbers(
 
 
 def _drop_invalid_sigmas(samples: pd.DataFrame) -> list[str]:
-    """Replace zero and negative sigmas in ``samples`` by NaN; return a note with their number."""
+    """Replace zero and negative σ in ``samples`` by NaN, and return a note with their number."""
     is_not_positive = samples[SIGMA_COLUMNS] <= 0.0
     samples[SIGMA_COLUMNS] = samples[SIGMA_COLUMNS].mask(is_not_positive)
     count = int(is_not_positive.any(axis=1).sum())
@@ -358,14 +353,14 @@ def _drop_invalid_sigmas(samples: pd.DataFrame) -> list[str]:
 
 
 def _to_numbers(texts: "pd.Series[str]", *, may_have_decimal_comma: bool) -> "pd.Series[float]":
-    """Convert texts to numbers; a comma is the decimal mark if most cells contain one."""
+    """Convert texts to numbers, with a decimal comma if most cells contain one."""
     if may_have_decimal_comma and texts.str.contains(",", regex=False).mean() > 0.5:
         texts = texts.str.replace(",", ".", regex=False)
     return pd.to_numeric(texts, errors="coerce").astype(np.float64)
 
 
 def _read_dates(texts: "pd.Series[str]") -> tuple["pd.Series[float]", bool]:
-    """Convert dates in ISO 8601 to UNIX time (s), and return True if they have a time zone."""
+    """Convert dates (ISO 8601) to UNIX time (s). The second value: they have a time zone."""
     texts = texts.str.replace(",", ".", regex=False)
     dates = pd.to_datetime(texts, format="ISO8601", utc=True, errors="coerce")
     unix_time_s = (dates - pd.Timestamp(0, tz="UTC")).dt.total_seconds()
@@ -378,7 +373,7 @@ def _select_body(
     column_meanings: Sequence[ColumnMeaning],
     body_name: str | None,
 ) -> pd.DataFrame:
-    """Return the rows of one rigid body or UWB tag, if a column contains their names."""
+    """Return the rows of one rigid body or UWB tag."""
     for index, meaning in enumerate(column_meanings):
         if meaning.kind == "tag":
             tags = texts[index].dropna().unique().tolist()
@@ -394,7 +389,7 @@ def _select_body(
 
 def _find_column_indices(table: PositionTable, wanted_columns: tuple[str, ...]) -> list[int]:
     names = [name.casefold() for name in table.column_names]
-    # A number selects the column with this name, or else the column at this position in the header
+    # A number is a column name or, otherwise, a position in the header
     names += [str(index + 1) for index in range(len(names))]
     indices = []
     for column in wanted_columns:
@@ -419,16 +414,16 @@ def _choose_columns(
     given_columns: list[int],
     numbers: pd.DataFrame,
 ) -> tuple[int, _ColumnIndices, _ColumnIndices, str | None, str]:
-    """Choose the columns of time, position and σ; return also the frame and the time format.
+    """Choose the columns of time, position and σ, the frame, and a text on the time column.
 
-    A column with the time of measurement is preferred to the time of recording.
+    The time of measurement is preferred to the time of recording.
     """
     if given_columns:
         time_column = given_columns[0]
         time_text = table.format_labels(time_column)
         frame = None
         axis_columns: _ColumnIndices = (*given_columns[1:4], None)[:3]
-        # Only the names of the given columns may define the frame and so the order of the axes
+        # Only the names of the given columns may define the frame
         meanings_of_given_columns = [
             meaning if index in axis_columns else ColumnMeaning()
             for index, meaning in enumerate(column_meanings)
@@ -485,8 +480,7 @@ def _choose_time_unit(
 ) -> tuple[str, str]:
     """Return the unit of the timestamps, and the reason for this unit.
 
-    Without a unit from the user or in the column name, the unit is chosen that gives UNIX times
-    after 2000, or the first in ``units`` that gives a median interval in ``interval_range_s``.
+    A missing unit is detected from UNIX times, or from a plausible median interval.
     """
     if given_unit is not None:
         return given_unit, "the unit was given with --position-time-unit"
@@ -526,17 +520,16 @@ def _choose_length_units(
     given_unit: str | None,
     max_extent_m: float,
 ) -> tuple[dict[int, float], str]:
-    """Return the factor from each column's unit to metres, and a text on the unit of the positions.
+    """Return the factor from each column's unit to metres, and the reason for the unit.
 
-    Without a unit from the user or in the column names, positions are in mm if their extent in
-    metres exceeds ``max_extent_m``.
+    Without a unit in the column names, positions with a very large extent are in mm.
     """
     column_name_units = {
         index: meaning.unit
         for index, meaning in enumerate(column_meanings)
         if meaning.unit in METRES_BY_LENGTH_UNIT
     }
-    # The extent is the range from 5 % to 95 %, so that outliers do not determine the unit
+    # The range from 5 % to 95 % excludes outliers
     extents = numbers[position_columns].quantile(0.95) - numbers[position_columns].quantile(0.05)
     max_extent = float(extents.max())
     unit = "m"

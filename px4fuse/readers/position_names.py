@@ -10,7 +10,7 @@ from px4fuse.core.record import read_toml
 SECONDS_BY_TIME_UNIT = {"s": 1.0, "ms": 1e-3, "us": 1e-6, "ns": 1e-9}
 METRES_BY_LENGTH_UNIT = {"m": 1.0, "cm": 1e-2, "mm": 1e-3}
 
-# Column indices of x, y and z; None without height
+# Column indices of x, y and z; z is None without height
 PositionColumns = tuple[int, int, int | None]
 _WORD_TABLES = read_toml(__file__, dict[str, dict[str, str]])
 _UNIT_BY_WORD, _AXIS_BY_WORD = (
@@ -32,14 +32,13 @@ _TIME_WORDS = (
 )
 # Kinds of time columns, in order of preference
 TIME_KINDS = ["time of measurement", "time", "time of recording"]
-# Column names of two words without separator, such as "px" (position, x) and "xstd" (x, sigma)
+# Two words without separator, such as "px" (position, x) and "xstd" (x, sigma)
 _NAME_WITHOUT_SEPARATOR_PATTERN = re.compile(
     r"(pos|p|t|sigma|std|s)([xyzneud])|([xyz])(pos|std|sigma)"
 )
 # Quaternion components, such as "qx", "q_RS_w []" and "pose.orientation.x"
 _QUATERNION_NAME_PATTERN = re.compile(r"(?:\bq|orientation|rotation|quat)(?:\w*_|[ .])?([wxyz])\b")
-# Axis names by coordinate frame. The frame of a file is the first of which both horizontal axes are
-# among the columns
+# Axis names by coordinate frame, in order of preference
 _AXIS_NAMES_BY_FRAME: tuple[tuple[str | None, tuple[str, str, str]], ...] = (
     ("ned", ("north", "east", "down")),
     ("enu", ("east", "north", "up")),
@@ -51,7 +50,7 @@ _AXIS_NAMES_BY_FRAME: tuple[tuple[str | None, tuple[str, str, str]], ...] = (
 
 @dataclass(frozen=True)
 class ColumnMeaning:
-    """Quantity, axis and unit in one column name; empty texts if the name is unknown.
+    """Quantity, axis and unit in a column name; empty texts if the name is unknown.
 
     Attributes
     ----------
@@ -59,11 +58,10 @@ class ColumnMeaning:
         "time", "position", "sigma" or "tag" (number of a UWB tag).
     axis : str
         Axis of a position or sigma, such as "x" or "north".
-    unit : str
     group : str
-        Column name without axis and unit: equal for the columns x, y and z of one position.
+        Column name without axis and unit.
     time_kind : str
-        For a time, one of :data:`TIME_KINDS`.
+        Kind of a time, for example "time of measurement".
     """
 
     kind: str = ""
@@ -125,7 +123,7 @@ def find_position_columns(
 ) -> tuple[str | None, PositionColumns] | None:
     """Return the coordinate frame of the position, and the column indices of its axes.
 
-    A position with height is preferred. Return None if no column contains a position.
+    Return None if no column contains a position.
     """
     columns_by_group: dict[str, dict[str, int]] = {}
     for index, column in enumerate(column_meanings):
@@ -143,7 +141,7 @@ def find_position_columns(
 def find_sigma_columns(
     column_meanings: Sequence[ColumnMeaning], frame: str | None
 ) -> tuple[int | None, ...]:
-    """Return the index of each axis's sigma column; one column may apply to all axes."""
+    """Return the index of the σ column for each axis."""
     sigma_columns: dict[str, int] = {}
     for index, meaning in enumerate(column_meanings):
         if meaning.kind == "sigma":
@@ -156,7 +154,7 @@ def find_sigma_columns(
 
 
 def find_quaternion_columns(names: Sequence[str]) -> list[int]:
-    """Return the column indices of the quaternion x, y, z, w; empty if the file has none."""
+    """Return the column indices of the quaternion (x, y, z, w); empty without quaternion."""
     indices: dict[str, int] = {}
     for index, name in enumerate(names):
         if match := _QUATERNION_NAME_PATTERN.search(name.casefold()):

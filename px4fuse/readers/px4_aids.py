@@ -1,7 +1,6 @@
-"""Reader of the innovations of all EKF2 aiding sources in a ULog, with variances and rejections.
+"""Reader of the innovations of all EKF2 aiding sources in a ULog.
 
-Source: PX4-Autopilot ``EKF2.cpp`` (PublishInnovations, PublishAidSourceStatus), v1.8 to main. The
-field names are in ``ekf2_parameters.toml``.
+Source: PX4-Autopilot ``EKF2.cpp`` (PublishInnovations, PublishAidSourceStatus), v1.8 to main.
 """
 
 from __future__ import annotations
@@ -19,12 +18,11 @@ from px4fuse.readers.common import join_nearest
 from px4fuse.readers.field_maps import Layout, assign_fields_to_columns
 from px4fuse.readers.ulog_topics import Topics
 
-# Maximum time difference (s) between a logged innovation and its logged variance S. By default, PX4
-# logs each topic every 0.5 s, and S changes little in this time
+# Maximum time (s) between innovation and variance S; PX4 logs them every 0.5 s by default
 MAX_VARIANCE_TIME_DIFFERENCE_S = 0.6
-# Column name and estimator_aid_src field of the time of the last fusion
+# Column and PX4 field for the time of the last fusion
 LAST_FUSION_FIELD = {"last_fused_us": "time_last_fuse"}
-# Fields of estimator_aid_src topics that are read if they are logged, by aid and column name
+# Optional fields of the topics estimator_aid_src_*, by aiding source and column
 OPTIONAL_FIELDS = {
     "baro_hgt": {"observation_down": "observation", "filtered_down": "innovation_filtered"},
     "ev_pos": LAST_FUSION_FIELD,
@@ -33,17 +31,16 @@ OPTIONAL_FIELDS = {
 
 
 def read_aids(topics: Topics, enabled_aids: StepFunctions) -> dict[str, AidLog]:
-    """Read the innovations of each aiding source of EKF2; the keys are PX4's names of the sources.
+    """Read the innovations of each aiding source of EKF2, by PX4 name.
 
-    Since v1.14, a topic ``estimator_aid_src_...`` contains each fusion attempt. Older topics
-    contain all aiding sources, and repeat each innovation until the next fusion.
+    Since v1.14, each aiding source has a topic ``estimator_aid_src_...``. Older topics contain all
+    aiding sources, and repeat each innovation until the next fusion.
     """
     log_by_aid = {}
     for name, aid in AIDS.items():
         enabled_flag = enabled_aids.get(name)
         aid_log = _read_aid_topic(topics, aid, enabled_flag)
-        # While the fusion of a source is disabled, the topics that are common to all sources
-        # contain old values, or values of other sources
+        # Older topics contain wrong values of a source while its fusion is disabled
         if aid_log is None and (
             name.startswith("ev_") if enabled_flag is None else enabled_flag.any()
         ):
@@ -54,11 +51,7 @@ def read_aids(topics: Topics, enabled_aids: StepFunctions) -> dict[str, AidLog]:
 
 
 def read_enabled_aids(topics: Topics) -> dict[str, pd.Series[float]]:
-    """Return a time series for each aiding source: 1 while EKF2 enables its fusion, otherwise 0.
-
-    The flags are in ``estimator_status_flags``; in older logs, in the control bits of
-    ``estimator_status``.
-    """
+    """Return a time series for each aiding source: 1 while its fusion is enabled, otherwise 0."""
     enabled_aids = {}
     tables = topics.tables_of(px4.STATUS_FLAGS)
     all_aids = (*AIDS.values(), *STATUS_FLAGS.values())
@@ -113,10 +106,7 @@ def _read_aid_topic(
 def _read_common_topics(
     topics: Topics, aid: Aid, enabled_flag: pd.Series[float] | None
 ) -> AidLog | None:
-    """Read the innovations of an aiding source from a topic that contains all aiding sources.
-
-    The topic is ``estimator_innovations`` or, in older logs, ``ekf2_innovations``.
-    """
+    """Read the innovations of an aiding source from a topic that contains all aiding sources."""
     is_in_gauss = aid.name == "mag_heading" and any(
         "cs_mag" in table for table in topics.tables_of(px4.STATUS_FLAGS)
     )
@@ -143,8 +133,7 @@ def _read_common_topics(
             topics.primary_samples(variance_layout)[f"variance_{aid.axes[0]}"],
         )
         if variance_layout is not value_layout:
-            # Innovations and variances S are in two topics that the logger downsamples separately.
-            # The nearest S is used, because S changes slowly
+            # The nearest variance S is used, because PX4 logs it at other times
             variance_samples = topics.primary_samples(variance_layout).dropna()
             samples = join_nearest(samples, variance_samples, MAX_VARIANCE_TIME_DIFFERENCE_S)
         excluded_sample_count = len(samples) - len(samples := samples.dropna())
@@ -160,7 +149,7 @@ def _read_common_topics(
 
 
 def _drop_repeats_and_zeros(samples: pd.DataFrame) -> pd.DataFrame:
-    """Remove repeated innovations, and zeros, which PX4 logs before the first fusion."""
+    """Remove repeated innovations, and the zeros that PX4 logs before the first fusion."""
     finite_samples = samples.dropna()
     first_column = finite_samples.iloc[:, 0]
     return finite_samples[first_column.ne(first_column.shift()) & (first_column != 0.0)]
@@ -169,8 +158,7 @@ def _drop_repeats_and_zeros(samples: pd.DataFrame) -> pd.DataFrame:
 def _find_times_with_unknown_fusion(innovation: pd.Series, variance: pd.Series) -> Array:
     """Return the times (s) at which EKF2 may have fused a sample that is not logged.
 
-    At these times, the innovation is 0 (EKF2 has no sample) or the variance S is new. A new S shows
-    that EKF2 fused a sample, but the logged innovation may belong to an older sample.
+    At these times, the innovation is 0 or the innovation variance S is new.
     """
     is_new_variance = (variance > 0.0) & variance.ne(variance.shift())
     return np.union1d(innovation.index[innovation == 0.0], variance.index[is_new_variance])
@@ -190,7 +178,7 @@ def _make_aid_log(
 ) -> AidLog | None:
     """Return the innovations of an aiding source; None without a positive innovation variance.
 
-    The sign is changed, because PX4 logs predicted minus measured.
+    The sign is changed, because PX4 logs prediction minus measurement.
     """
     samples = samples[(samples[[f"variance_{axis}" for axis in aid.axes]] > 0.0).all(axis=1)]
     if samples.empty:

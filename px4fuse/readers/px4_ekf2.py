@@ -1,7 +1,7 @@
 """Reader of EKF2 data in a ULog: state, variances, innovations, resets, fusion horizon.
 
-Sources: PX4-Autopilot ``EKF2.cpp`` (PublishStates), ``EKF/common.h`` (order of the states),
-``msg/EstimatorStatusFlags.msg`` and ``msg/EstimatorStatus.msg`` (flags of aiding sources).
+Sources: PX4-Autopilot ``EKF2.cpp``, ``EKF/common.h``, ``msg/EstimatorStatusFlags.msg`` and
+``msg/EstimatorStatus.msg``.
 """
 
 from typing import Literal
@@ -35,23 +35,19 @@ from px4fuse.readers.px4_innovations import collect_innovations_by_axis
 from px4fuse.readers.ulog_topics import Topics, measurement_time_us
 
 VISION_TOPIC = "vehicle_visual_odometry"
-# Fields of vehicle_local_position that are 1 while EKF2 reports a valid horizontal position
+# Fields of vehicle_local_position that are 1 while the horizontal position is valid
 VALIDITY_FLAGS = ("xy_valid", "xy_global")
-# Number of EKF2 states that are read: attitude, velocity, position, biases and magnetic fields.
-# Wind and terrain are not read
+# Number of EKF2 states that are read; wind and terrain are not read
 STATE_COUNT = 22
-# Bit of filter_control_status_u (common.h) that is set while EKF2 fuses the 3D magnetic field
+# Bit of filter_control_status_u (common.h) for fusion of the 3D magnetic field
 MAG_3D_FUSION_BIT = 5
-# Minimum logged rate (Hz) of magnetometer samples to assume that no sample is missing: EKF2 uses 14
-# samples per second
+# Minimum rate (Hz) of a complete magnetometer log; EKF2 uses 14 Hz
 MIN_MAGNETOMETER_HZ = 10.0
-# EKF2 rounds the ratio of prediction interval to IMU interval to a whole number. If the ratio is
-# closer to n + 0.5 than this limit, both whole numbers are possible
+# Distance from a half-integer at which the rounding of an interval ratio is ambiguous
 MAX_DISTANCE_FROM_HALF_INTEGER = 0.05
-# EKF2 logs low-pass filtered optical flow. The filter is inverted only between two samples of at
-# most this interval (s)
+# Maximum interval (s) for the inversion of EKF2's low-pass filter of optical flow
 MAX_FLOW_INTERVAL_S = 0.5
-# Aiding sources of horizontal position and velocity, except for the external vision position
+# Aiding sources of horizontal position and velocity, without external vision position
 OTHER_HORIZONTAL_AIDS = (
     "gnss_pos",
     "gnss_vel",
@@ -156,9 +152,9 @@ def read_ekf2(topics: Topics) -> Ekf2 | Unavailable:
 
 
 def _find_state_vector(topics: Topics) -> tuple[str, int]:
-    """Return the topic with EKF2's state vector, and its number of attitude variances (3 or 4).
+    """Return the topic with EKF2's state vector, and the number of attitude variances.
 
-    The topic is "" if it is not logged. The number is 0 if no PX4 release has this state vector.
+    The topic is "" if it is not logged. The number is 0 for an unknown state vector.
     """
     for topic in px4.STATE_VECTOR_TOPICS:
         for table in topics.tables_of(topic)[:1]:
@@ -174,8 +170,7 @@ def _find_state_vector(topics: Topics) -> tuple[str, int]:
 def _read_horizon_state(topics: Topics, step_s: float) -> TableOrUnavailable:
     """Read EKF2's state and variances at the fusion horizon.
 
-    The columns are equal for all PX4 releases. Older releases log the IMU biases as increments per
-    prediction; they are divided by the prediction interval ``step_s`` (s).
+    Older PX4 releases log IMU biases per prediction. They are divided by the interval ``step_s``.
     """
     topic, attitude_variance_count = _find_state_vector(topics)
     if not topic:
@@ -206,12 +201,12 @@ def _read_horizon_state(topics: Topics, step_s: float) -> TableOrUnavailable:
 
 
 def configured_step_s(topics: Topics) -> float:
-    """Return the configured prediction interval, EKF2_PREDICT_US, in s."""
+    """Return the prediction interval EKF2_PREDICT_US in s."""
     return topics.log.parameters.get("EKF2_PREDICT_US", EKF2_STEP_S * 1e6) * 1e-6
 
 
 def _estimate_step_s(topics: Topics) -> float:
-    """Return EKF2's prediction interval (s), a multiple of the IMU interval (ImuDownSampler)."""
+    """Return EKF2's actual prediction interval (s), a multiple of the IMU interval."""
     configured_interval_s = configured_step_s(topics)
     imu_time_s = topics.read(Layout(px4.IMU_LAYOUT.topic, {"time": "timestamp"})).index.to_numpy()
     if (
@@ -223,7 +218,7 @@ def _estimate_step_s(topics: Topics) -> float:
     imu_rows_at_prediction_ends = find_rows_of_timestamps(
         imu_time_s, topics.primary_samples(layout).index
     )
-    # Sample indices are computed from times, because IMU samples may be missing in the log
+    # Compute sample indices from times, because IMU samples may be missing in the log
     prediction_end_indices = np.rint(
         (imu_time_s[imu_rows_at_prediction_ends] - imu_time_s[0]) / interval_s
     )
@@ -234,7 +229,7 @@ def _estimate_step_s(topics: Topics) -> float:
 
 
 def find_rows_of_timestamps(times_s: Array, wanted_times_s: ArrayLike) -> IntArray:
-    """Return the indices of the ``times_s`` (increasing) that equal a wanted time to 1 µs."""
+    """Return the indices of ``times_s`` (increasing) that equal a wanted time, rounded to 1 µs."""
     times_us, wanted_times_us = (
         np.rint(np.asarray(times, float) * 1e6) for times in (times_s, wanted_times_s)
     )
@@ -247,10 +242,9 @@ def find_rows_of_timestamps(times_s: Array, wanted_times_s: ArrayLike) -> IntArr
 def compute_samples_per_step(
     configured_step_s: float, imu_interval_s: float, step_ends: ArrayLike = ()
 ) -> int:
-    """Return the number of IMU samples in one EKF2 prediction.
+    """Return the number of IMU samples in one EKF2 prediction: the rounded ratio of both intervals.
 
-    This is the ratio of both intervals, rounded. A ratio near n + 0.5 is rounded to n if only n
-    fits the logged predictions. ``step_ends``: indices of the IMU samples at which they end.
+    ``step_ends`` are the indices of the IMU samples at which logged predictions end.
 
     >>> compute_samples_per_step(0.010, 0.00375), compute_samples_per_step(0.010, 0.004)
     (3, 3)
@@ -258,7 +252,7 @@ def compute_samples_per_step(
     2
     """
     interval_ratio = configured_step_s / imu_interval_s
-    # n + 0.5 is rounded up; 1e-6 is added, because the IMU interval may contain rounding errors
+    # 1e-6 compensates rounding errors of the IMU interval
     sample_count = max(int(interval_ratio + 0.5 + 1e-6), 1)
     samples_between_logged_ends = np.diff(np.asarray(step_ends, dtype=float))
     if (
@@ -287,8 +281,7 @@ def _read_accelerometer_bias(
 def _compute_horizon_delay_s(topics: Topics, step_s: float) -> float | Unavailable:
     """Return the median delay (s) from EKF2's fusion horizon to the publication of its state.
 
-    The delay is not available before v1.13, where timestamp_sample is the time of the newest IMU
-    sample instead of the fusion horizon.
+    PX4 before v1.13 does not log the time of the fusion horizon.
     """
     delay_s = _compute_publication_delay_s(topics, _find_state_vector(topics)[0])
     if len(delay_s) and (median_delay_s := float(delay_s.median())) > step_s:
@@ -297,10 +290,7 @@ def _compute_horizon_delay_s(topics: Topics, step_s: float) -> float | Unavailab
 
 
 def _compute_publication_delay_s(topics: Topics, topic: str) -> pd.Series:
-    """Return the delay (s) from measurement to publication of each sample of a topic.
-
-    The index is the measurement time (s).
-    """
+    """Return the delay (s) from measurement to publication, indexed by measurement time (s)."""
     for table in topics.tables_of(topic)[:1]:
         if "timestamp_sample" in table:
             sample_times_us = measurement_time_us(table)
@@ -332,10 +322,7 @@ def _read_fusion_flags(topics: Topics, enabled_aids: StepFunctions) -> TableOrUn
 
 
 def read_resets(local_samples: pd.DataFrame) -> tuple[Reset, ...]:
-    """Return the resets of EKF2's position and velocity: time, and change along each axis.
-
-    A reset increments a counter in ``vehicle_local_position`` (uint8).
-    """
+    """Return the resets of EKF2's position and velocity, from ``vehicle_local_position``."""
     resets = []
     for quantity, counter_field, delta_fields in _RESET_FIELDS:
         if counter_field not in local_samples:
@@ -360,10 +347,7 @@ def _read_fusion_record(
     enabled_aids: StepFunctions,
     step_s: float,
 ) -> FusionRecord | Unavailable:
-    """Read the data that the replay of EKF2 needs.
-
-    ``local_samples`` contains ``vehicle_local_position``, EKF2's published position.
-    """
+    """Read the data for the EKF2 replay. ``local_samples`` are of ``vehicle_local_position``."""
     topic, attitude_variance_count = _find_state_vector(topics)
     if topic != px4.STATE_VECTOR_TOPICS[0] or isinstance(horizon_state, Unavailable):
         return RECORD_NOT_LOGGED
@@ -373,8 +357,8 @@ def _read_fusion_record(
         return RECORD_NOT_LOGGED
     horizontal_columns = Columns.POSITION[:2]
     altitude_m = 0.0
-    # Since v1.16 EKF2 stores latitude and longitude, which are logged as zero. Once EKF2 has an
-    # origin, the height is altitude above sea level (ekf_helper.cpp)
+    # Since v1.16, EKF2 logs zeros for the horizontal position, and altitude as height
+    # (ekf_helper.cpp)
     if not usable_state[horizontal_columns].to_numpy().any():
         usable_state[horizontal_columns] = np.nan
         altitude_m = _last_finite_value(local_samples, "ref_alt", 0.0)
@@ -409,15 +393,11 @@ def _last_finite_value(samples: pd.DataFrame, column: str, default: float) -> fl
 
 
 def _read_magnetic_field(topics: Topics, step_s: float) -> pd.DataFrame:
-    """Read the measured magnetic field from the magnetometer topic or from EKF2's observations.
-
-    Order of preference: a topic without missing samples, EKF2's observations (logged with the
-    innovations), the incomplete magnetometer topic.
-    """
+    """Read the measured magnetic field from the magnetometer topic or from EKF2's observations."""
     magnetic_field_tables = [
         topics.primary_samples(layout).dropna() for layout in px4.MAGNETIC_FIELD_LAYOUTS
     ]
-    # EKF2 subtracts EKF2_MAG_DELAY and half a prediction step from the times of its observations
+    # EKF2 subtracts EKF2_MAG_DELAY and half a prediction interval from the times
     delay_s = topics.ekf2_parameters.get("EKF2_MAG_DELAY", 0.0) * 1e-3 + 0.5 * step_s
     magnetic_field_tables[1] = magnetic_field_tables[1].set_axis(
         magnetic_field_tables[1].index + delay_s
@@ -441,7 +421,7 @@ def _read_magnetic_field(topics: Topics, step_s: float) -> pd.DataFrame:
 
 
 def _read_optical_flow(topics: Topics, enabled_aids: StepFunctions) -> pd.DataFrame:
-    """Invert EKF2's low-pass filter: return the mean optical flow between logged samples."""
+    """Compute the mean optical flow between logged samples: inverse of EKF2's low-pass filter."""
     flow_velocity, flow_intervals, flow_noise = (
         topics.primary_samples(px4.TOPIC_LAYOUTS[f"flow_{quantity}"]).dropna()
         for quantity in ("velocity", "interval", "noise")
@@ -450,7 +430,6 @@ def _read_optical_flow(topics: Topics, enabled_aids: StepFunctions) -> pd.DataFr
     if not interval_s > 0.0 or flow_noise.empty:
         return pd.DataFrame()
     times_s = flow_velocity.index.to_numpy()
-    # Only rows at most MAX_FLOW_INTERVAL_S after the previous row are used
     steps_s = np.diff(times_s)
     used_rows = np.flatnonzero((steps_s > 0.5 * interval_s) & (steps_s <= MAX_FLOW_INTERVAL_S)) + 1
     if FLOW.name in enabled_aids:
@@ -486,8 +465,7 @@ def _read_optical_flow(topics: Topics, enabled_aids: StepFunctions) -> pd.DataFr
 def _convert_attitude_variance(quaternion: Array, variance: Array) -> Array:
     """Convert quaternion variances to variances (rad²) of the attitude error about the NED axes.
 
-    The attitude error is δθ = 2 Im(δq ⊗ q*). Correlations of the quaternion elements are assumed to
-    be zero, because they are not logged.
+    The attitude error is δθ = 2 Im(δq ⊗ q*). Correlations are not logged and assumed to be zero.
     """
     w, x, y, z = quaternion.T
     attitude_error_jacobian = np.array([[-x, w, -z, y], [-y, z, w, -x], [-z, -y, x, w]])

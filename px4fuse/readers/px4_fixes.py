@@ -1,4 +1,4 @@
-"""Reconstruction of GNSS fixes that EKF2 used but that are not logged."""
+"""Reconstruction of GNSS fixes that EKF2 used, but the log does not contain."""
 
 import numpy as np
 import pandas as pd
@@ -10,34 +10,26 @@ from px4fuse.readers.common import interpolate_inside
 from px4fuse.readers.px4_innovations import replace_vision_by_gnss_innovations
 from px4fuse.readers.ulog_topics import Topics
 
-# A logged fix and an EKF2 observation are from one GNSS measurement if their times differ by less
-# than this limit (s): receivers send at most 20 fixes per second
+# Maximum time (s) between a logged fix and the EKF2 observation of the same fix
 MAX_TIME_DIFFERENCE_OF_SAME_FIX_S = 0.01
-# EKF2's observation is a latitude (°) if it differs by less than this limit from the logged
-# latitude, otherwise a local position (m)
+# Maximum difference (°) between logged latitude and EKF2's observation of latitude
 MAX_DIFFERENCE_FROM_LOGGED_LATITUDE_DEG = 1.0
 # Possible intervals (s) between the fixes of a GNSS receiver: 4 to 20 fixes per second
 CANDIDATE_FIX_INTERVALS_S = np.arange(0.05, 0.26, 0.0005)
-# Maximum deviation (s) of the interval between two logged fixes from a whole multiple of the
-# receiver's interval: half an EKF2 prediction interval, plus clock jitter
+# Maximum deviation (s) of a logged interval from a multiple of the receiver's interval
 MAX_DEVIATION_FROM_MULTIPLE_S = 0.006
-# Minimum number of fixes that are both logged and reconstructed, to measure the error
+# Minimum number of logged fixes to measure the error of the reconstruction
 MIN_LOGGED_FIXES = 10
-# The receiver interval is known if some logged intervals are n times as long, others n + 1 times.
-# Minimum number of logged intervals with each of these multiples
+# Minimum number of logged intervals for each multiple of the receiver's interval
 MIN_LOGGED_INTERVALS_PER_MULTIPLE = 3
-# Maximum RMS error (m) of reconstructed fixes, measured at fixes that are both logged and
-# reconstructed
+# Maximum RMS error (m) of reconstructed fixes, compared with logged fixes
 MAX_FIX_RECONSTRUCTION_ERROR_M = 0.1
 
 
 def read_unlogged_fixes(
     topics: Topics, logged_fixes: pd.DataFrame, ekf2: Ekf2 | Unavailable
 ) -> pd.DataFrame:
-    """Read GNSS fixes from EKF2's topics that are not in ``logged_fixes`` (PX4 v1.16 and newer).
-
-    The logger writes at most 10 fixes per second.
-    """
+    """Read GNSS fixes that only EKF2's topics contain (PX4 v1.16 and newer)."""
     position_and_velocity_layouts = (
         px4.TOPIC_LAYOUTS["fused_position"],
         px4.TOPIC_LAYOUTS["fused_velocity"],
@@ -47,16 +39,15 @@ def read_unlogged_fixes(
     ):
         return pd.DataFrame()
     position, velocity = map(topics.primary_samples, position_and_velocity_layouts)
-    # Rows of EKF2's GNSS topic that are neither fused nor rejected contain no new fix
+    # A row that is neither fused nor rejected contains no new fix
     position = position[position[["fused", "rejected"]].any(axis=1)]
     position = position.drop(columns=["fused", "rejected"])
     fixes = position.join(velocity, how="inner").dropna()
-    # Use the height of EKF2's topic only if GNSS is the height reference. Otherwise, the height
-    # contains EKF2's estimate of the GNSS height bias
+    # If GNSS is not the height reference, EKF2's height contains a bias estimate
     height_layout = px4.TOPIC_LAYOUTS["fused_height"]
     if topics.find_layout(height_layout) and topics.ekf2_parameters.get("EKF2_HGT_REF", 1.0) == 1.0:
         fixes = fixes.join(topics.primary_samples(height_layout))
-    # Undo EKF2's shift of GNSS times by half a prediction step (estimator_interface.cpp)
+    # EKF2 shifts GNSS times by half a prediction interval (estimator_interface.cpp)
     fixes = fixes.set_axis(fixes.index + 0.5 * ekf2.step_s)
     next_row = np.clip(np.searchsorted(logged_fixes.index, fixes.index), 1, len(logged_fixes) - 1)
     distance_s = np.minimum(
@@ -70,7 +61,7 @@ def read_unlogged_fixes(
     )
     matched_fixes = fixes[distance_s <= MAX_TIME_DIFFERENCE_OF_SAME_FIX_S]
     unlogged_fixes = fixes[(distance_s > MAX_TIME_DIFFERENCE_OF_SAME_FIX_S) & is_between_fixes]
-    # Before v1.16 the topic contains a local position (m) instead of latitude and longitude
+    # Before v1.16, the topic contains a local position (m), no latitude and longitude
     is_in_degrees = (
         matched_fixes["latitude_deg"].sub(logged_fixes["latitude_deg"].median()).abs().median()
         < MAX_DIFFERENCE_FROM_LOGGED_LATITUDE_DEG
@@ -81,15 +72,15 @@ def read_unlogged_fixes(
 def reconstruct_fixes(
     fixes: pd.DataFrame, ekf2: Ekf2 | Unavailable, delay_s: float
 ) -> tuple[pd.DataFrame, str]:
-    """Reconstruct GNSS fixes that are not logged, as EKF2 position plus innovation (up to v1.15).
+    """Reconstruct GNSS fixes that are not logged: EKF2 position plus innovation (up to v1.15).
 
-    Return the fixes, with interpolated heights, and a note for the user. Both are empty if the
-    error of reconstructed fixes exceeds MAX_FIX_RECONSTRUCTION_ERROR_M.
+    Return the fixes with interpolated heights, and a note for the user. Both are empty if the error
+    exceeds MAX_FIX_RECONSTRUCTION_ERROR_M.
 
     Parameters
     ----------
     fixes : DataFrame
-        Logged fixes (m, NED) and variances, indexed by the measurement time that EKF2 assumes.
+        Logged fixes (m, NED) and variances, indexed by measurement time (s).
     delay_s : float
         Delay from measurement to timestamp that EKF2 assumes.
     """
@@ -106,11 +97,10 @@ def reconstruct_fixes(
         or isinstance(east_innovations, Unavailable)
     ):
         return empty_result
-    # If a fix is older than the fusion horizon, EKF2 fuses it at the horizon (RingBuffer.h)
+    # EKF2 fuses a fix that is older than the fusion horizon at the horizon (RingBuffer.h)
     delay_beyond_horizon_s = max(0.0, delay_s - ekf2.horizon_s)
     fusion_times_s = north_innovations.index.to_numpy() - delay_beyond_horizon_s
-    # Each innovation belongs to the latest fix before it. This fix is logged if less than one
-    # receiver interval has elapsed since the latest logged fix
+    # Each innovation belongs to the latest fix before it, logged or not
     previous_fix_index = np.searchsorted(logged_fix_times_s, fusion_times_s) - 1
     intervals_since_logged_fix = (
         fusion_times_s - logged_fix_times_s[previous_fix_index]
@@ -118,7 +108,7 @@ def reconstruct_fixes(
     is_between_fixes = (previous_fix_index >= 0) & (
         previous_fix_index < len(logged_fix_times_s) - 1
     )
-    # Skip innovations within one EKF2 step after a fix, which may belong to the previous fix
+    # An innovation immediately after a fix may belong to the previous fix
     has_unique_fix = is_between_fixes & (
         intervals_since_logged_fix % 1.0 > ekf2.step_s / receiver_interval_s
     )
@@ -163,10 +153,9 @@ def reconstruct_fixes(
 
 
 def _estimate_receiver_interval(fix_times_s: Array) -> float | None:
-    """Estimate the interval (s) of a GNSS receiver of which the log contains only some fixes.
+    """Estimate the interval (s) between the fixes of a GNSS receiver, from some of its fixes.
 
-    It is the longest interval of which all logged intervals are multiples. Return None if all
-    logged intervals are equal, because the multiple is then unknown.
+    All logged intervals are multiples of this interval. Return None if the multiples are unknown.
     """
     logged_intervals_s = np.diff(fix_times_s)[:, None]
     multiples = logged_intervals_s / CANDIDATE_FIX_INTERVALS_S
@@ -176,8 +165,7 @@ def _estimate_receiver_interval(fix_times_s: Array) -> float | None:
     if not len(possible_indices):
         return None
     longest_interval_s = CANDIDATE_FIX_INTERVALS_S[possible_indices[-1]]
-    # Of the candidates within 10 % of the longest possible interval, use the best fit to the logged
-    # intervals
+    # Best fit among the candidates within 10 % of the longest possible interval
     candidate_indices_near_longest = np.flatnonzero(
         np.abs(CANDIDATE_FIX_INTERVALS_S - longest_interval_s) < 0.1 * longest_interval_s
     )

@@ -1,4 +1,4 @@
-"""Innovations of external vision or GNSS along each axis, from EKF2's aiding sources."""
+"""EKF2's innovations of external vision or GNSS along each axis."""
 
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
@@ -15,17 +15,17 @@ Innovations = dict[NedAxis, TableOrUnavailable]
 
 @dataclass(frozen=True)
 class Ekf2PositionSource:
-    """Position source (external vision or GNSS), and the EKF2 aiding sources that use it."""
+    """Position source (external vision or GNSS) and its EKF2 aiding sources."""
 
     name: str
     # PX4's names of the aiding sources for horizontal position and height
     horizontal_aid: str
     vertical_aid: str
-    # Advice to enable the fusion, by "horizontal" and "vertical" (height)
+    # Advice to enable fusion, for "horizontal" and "vertical" position
     remedies: Mapping[str, str]
-    # Advice to the user if the innovations are not logged
+    # Advice if the innovations are not logged
     logging_remedy: str
-    # Name of the height sensor, if it is not the position source itself
+    # Name of a separate height sensor, if any
     height_sensor: str = ""
 
 
@@ -46,10 +46,7 @@ GNSS_WITH_BAROMETER_HEIGHT = replace(
 
 
 def has_fused_aid(ekf2: Ekf2 | Unavailable, aid: str = GNSS_POS.name) -> bool:
-    """Return True if EKF2 fused the aiding source at any time.
-
-    If the log contains no fusion flags, EKF2 is assumed to fuse an enabled aiding source.
-    """
+    """Return True if EKF2 fused the aiding source at any time."""
     if isinstance(ekf2, Unavailable):
         return False
     if aid_log := ekf2.aids.get(aid):
@@ -57,14 +54,14 @@ def has_fused_aid(ekf2: Ekf2 | Unavailable, aid: str = GNSS_POS.name) -> bool:
             return bool(aid_log.samples["fused"].any())
         if aid_log.enabled is not None:
             return True
-    # without fusion flags, a valid global position shows that EKF2 fused GNSS
+    # a valid global position shows that EKF2 fused GNSS
     if aid != GNSS_POS.name or "tilt_align" in ekf2.states or "xy_global" not in ekf2.states:
         return False
     return bool(ekf2.states["xy_global"].any())
 
 
 def replace_vision_by_gnss_innovations(ekf2: Ekf2, source: Ekf2PositionSource = GNSS) -> Ekf2:
-    """Return the EKF2 data with the innovations of ``source`` instead of external vision."""
+    """Return the EKF2 data with innovations of GNSS instead of external vision."""
     enabled_flags = {
         group: ekf2.states[name]
         for group, name in (
@@ -100,16 +97,9 @@ def collect_innovations_by_axis(
     gate: float,
     source: Ekf2PositionSource = VISION,
 ) -> tuple[Innovations, tuple[str, ...]]:
-    """Return the innovations along each axis, and the topics from which they are read.
+    """Return the innovations along each axis, and the topics that contain them.
 
-    Parameters
-    ----------
-    aids : mapping from PX4 name to AidLog
-    fusion_flags : DataFrame or Unavailable
-        Fusion flags, see :class:`~px4fuse.flight.model.Ekf2`.
-    gate : float
-        Innovation gate (√S), used to compute rejections if they are not logged.
-    source : Ekf2PositionSource
+    ``gate`` (√S) is the innovation gate, for logs without rejection flags.
     """
     innovations: Innovations = {}
     used_topics: dict[str, None] = {}
@@ -139,9 +129,9 @@ def collect_innovations_by_axis(
 
 
 def select_axis_innovations(log: AidLog, axis: NedAxis, gate: float) -> pd.DataFrame:
-    """Return innovations along one axis, with flags "fused" and "rejected".
+    """Return the innovations along one axis, with the flags "fused" and "rejected".
 
-    A sample is rejected along all axes if any axis exceeds the ``gate`` (√S).
+    ``gate`` (√S) is the innovation gate. EKF2 rejects a sample along all its axes together.
     """
     samples = log.samples
     nis_by_axis = {

@@ -1,4 +1,4 @@
-"""Reader of the positions and the ground truth in a ULog."""
+"""Reader of positions and ground truth in a ULog."""
 
 from __future__ import annotations
 
@@ -48,39 +48,35 @@ MIN_TRACK_SAMPLES = 3
 EARTH_RADIUS_M = 6_371_000.0  # PX4's CONSTANTS_RADIUS_OF_EARTH, src/lib/geo/geo.h
 FIX_TYPE_3D = 3
 NO_FIX_ACTION = "Give the antenna a free view of the sky and wait for a fix."
-# Maximum delay (µs) from timestamp to publication if PX4 set the timestamp at the arrival
+# Maximum delay (µs) from timestamp to publication, if the timestamp is the arrival time
 MAX_ARRIVAL_TO_PUBLICATION_DELAY_US = 100
-# If at least this fraction of the timestamps are arrival times, the log has no measurement times
+# Minimum fraction of arrival times in a log without measurement times
 MIN_ARRIVAL_TIME_FRACTION = 0.9
-# Maximum time difference (s) between a height and the horizontal position to which it is joined:
-# at a climb rate of 0.5 m/s, the height error is 2.5 cm
+# Maximum time (s) between height and horizontal position: 2.5 cm error at 0.5 m/s
 MAX_HEIGHT_TIME_DIFFERENCE_S = 0.05
-# Maximum logged rate (Hz) of GNSS fixes which shows that the logger dropped fixes: receivers send 5
-# to 20 Hz
+# At a lower rate (Hz), the logger dropped GNSS fixes; receivers send 5 to 20 Hz
 MAX_DOWNSAMPLED_HZ = 4.0
 POSITION_STATUS_COLUMNS = ["reset_counter", "quality", "age_s"]
-# Length (µs) of each possible unit of timestamps
+# Duration (µs) of possible time units
 MICROSECONDS_BY_UNIT = {
     "microseconds": 1.0,
     "milliseconds": 1e3,
     "seconds": 1e6,
     "nanoseconds": 1e-3,
 }
-# Maximum relative difference between the rate of timestamps in their unit and the rate of the boot
-# clock
+# Maximum relative difference between the rates of a clock and the boot clock
 MAX_CLOCK_RATE_ERROR_FRACTION = 0.05
 AUTOPILOT_CLOCK_TEXT = "autopilot boot clock (PX4 converted the sender's timestamps)"
-# Latitude and longitude in degrees, optionally altitude in m
+# Latitude and longitude (degrees), optionally altitude (m)
 GeodeticPosition = tuple[float, ...]
 
 
 def read_positions(
     topics: Topics, ekf2: Ekf2 | Unavailable
 ) -> tuple[tuple[PositionTrack, ...], tuple[Unavailable, ...]]:
-    """Read the positions of all sources in the log, best first, and the missing sources."""
+    """Read the positions of all sources in a log, best source first, and the missing sources."""
     fusion_flags = ekf2.fusion_flags if isinstance(ekf2, Ekf2) else ekf2
-    # EKF2's position observations contain no orientation. If EKF2 fused the yaw of the source, the
-    # source is odometry
+    # If EKF2 fused the yaw of the source, the source is odometry
     is_odometry = isinstance(fusion_flags, pd.DataFrame) and bool((fusion_flags["yaw"] > 0).any())
     return split_tracks(
         [
@@ -103,7 +99,7 @@ def split_tracks(
 
 
 def unavailable_source(name: str, reason: str = "", remedy: str = "") -> Unavailable:
-    """Make the record of a missing position source. The default reason: its topic is not logged."""
+    """Describe a missing position source. The default reason: its topic is not logged."""
     return Unavailable(
         f"position source {name}",
         reason or f"{name} is not logged",
@@ -121,15 +117,14 @@ def make_track(
     remedy: str = "",
     **track_fields: Any,
 ) -> PositionTrack | Unavailable:
-    """Make a position track from the valid samples; with fewer than three, return the reason.
+    """Make a position track from valid samples, or return the reason if they are too few.
 
     Parameters
     ----------
     samples : DataFrame
-        Positions (m) and variances (m²). Missing columns and variances of 0 become NaN: in PX4, a
-        variance of 0 means "not sent" (``EKF2.cpp``).
+        Positions (m) and variances (m²). A variance of 0 means "not sent" (``EKF2.cpp``).
     needed_columns : list of str
-        Columns that are finite in a valid sample.
+        Columns that must be finite.
     track_fields
         Other fields of :class:`~px4fuse.flight.model.PositionTrack`.
     """
@@ -179,11 +174,7 @@ def _make_ulog_track(
     is_auto_candidate: bool = True,
     **track_fields: Any,
 ) -> PositionTrack | Unavailable:
-    """Make a position track with the properties of the source ``name`` in ``px4_topics.toml``.
-
-    ``is_odometry``: the source sends a changing orientation. ``is_auto_candidate``:
-    px4fuse may use the source without the option ``--position-source``.
-    """
+    """Make a position track of a source that is defined in ``px4_topics.toml``."""
     source = px4.TRACK_SOURCES[name]
     origin = reclassify_as_vio(source.origin, has_changing_orientation=is_odometry)
     origin = structs.replace(origin, is_auto_candidate=is_auto_candidate)
@@ -200,7 +191,7 @@ def _read_logged_track(topics: Topics, name: str) -> PositionTrack | Unavailable
     layout = topics.find_layout(*px4.find_track_layouts(name))
     if layout is None:
         return unavailable_source(name)
-    # Topics of EKF2 have one topic instance per EKF2 instance
+    # EKF2's topics have one instance for each EKF2 instance
     is_ekf2 = layout.topic.startswith("estimator_")
     samples = topics.primary_samples(layout) if is_ekf2 else topics.read_instance(layout)
     frame = px4.TRACK_SOURCES[name].frame
@@ -228,10 +219,9 @@ def _read_logged_track(topics: Topics, name: str) -> PositionTrack | Unavailable
 
 
 def _describe_clock_of_arrival_times(topics: Topics, topic: str) -> ClockMap | None:
-    """Describe the clock of a topic with arrival times or repeated timestamps; else return None.
+    """Describe the clock of a topic without measurement times; otherwise return None.
 
-    PX4 logs arrival times as timestamps until it has received 500 TIMESYNC replies
-    (``Timesync.cpp``). px4fuse uses arrival times if ``timestamp_sample`` is not boot time in µs.
+    PX4 logs arrival times until it has received 500 TIMESYNC replies (``Timesync.cpp``).
     """
     table = topics.tables_of(topic)[0]
     if "timestamp_sample" not in table or len(table["timestamp"]) < MIN_TRACK_SAMPLES:
@@ -253,7 +243,7 @@ def _describe_clock_of_arrival_times(topics: Topics, topic: str) -> ClockMap | N
 
 
 def _describe_timestamp_clock(published_us: IntArray, sample_timestamps_us: IntArray) -> str:
-    """Return clock and unit of timestamps that are not boot time in µs: "UNIX time in seconds"."""
+    """Return clock and unit of timestamps, for example "UNIX time in seconds"."""
     if not sample_timestamps_us.any():
         return "0"
     rate_ratio = float(np.ptp(published_us)) / max(float(np.ptp(sample_timestamps_us)), 1.0)
@@ -283,8 +273,7 @@ def _read_fused_observation(topics: Topics, is_odometry: bool) -> PositionTrack 
         topics.primary_samples(horizontal_layout),
         topics.primary_samples(vertical_layout) if has_height else None,
         (horizontal_layout.topic, vertical_layout.topic)[: 1 + has_height],
-        # EKF2 subtracts half its prediction interval from measurement times
-        # (estimator_interface.cpp)
+        # EKF2 subtracts half a prediction interval from times (estimator_interface.cpp)
         shift_s=0.5 * configured_step_s(topics),
         is_odometry=is_odometry,
     )
@@ -302,8 +291,7 @@ def _make_track_from_ekf2_topics(
 ) -> PositionTrack | Unavailable:
     """Make a position track from horizontal positions and heights in EKF2's topics.
 
-    The logger downsamples both topics separately, so the height that is nearest in time is used.
-    EKF2 subtracted EKF2_EV_DELAY from the sender's timestamps; the delay is added again.
+    EKF2 subtracted EKF2_EV_DELAY from the timestamps. The delay is added again.
     """
     notes: tuple[str, ...] = ()
     if height_samples is not None:
@@ -336,7 +324,7 @@ def _reconstruct_track(
 ) -> PositionTrack | Unavailable:
     """Reconstruct external vision positions that are not logged: EKF2 position plus innovation.
 
-    The times are those of the innovations, up to one interval of the source after the measurement.
+    The times may be late by up to one interval of the position source.
     """
     if isinstance(ekf2, Unavailable):
         return unavailable_source(px4.RECONSTRUCTED_TRACK_NAME, "the log contains no EKF2 state")
@@ -365,7 +353,7 @@ def _reconstruct_track(
 def project(
     latitude_deg: Array, longitude_deg: Array, origin: GeodeticPosition
 ) -> tuple[Array, Array]:
-    """Convert latitude and longitude to north and east (m): azimuthal equidistant projection.
+    """Convert latitude and longitude (degrees) to north and east (m) from the origin.
 
     Source: PX4 ``MapProjection::project``, src/lib/geo/geo.cpp (Snyder 1987, equation 25-2).
     """
@@ -391,7 +379,7 @@ def project(
 
 
 def unproject(north_m: Array, east_m: Array, origin: GeodeticPosition) -> tuple[Array, Array]:
-    """Convert north and east (m) to latitude and longitude (degrees): inverse of :func:`project`.
+    """Convert north and east (m) from the origin to latitude and longitude (degrees).
 
     Source: PX4 ``MapProjection::reproject``, src/lib/geo/geo.cpp (Snyder 1987, equation 20-14).
     """
@@ -410,10 +398,7 @@ def unproject(north_m: Array, east_m: Array, origin: GeodeticPosition) -> tuple[
 
 
 def _find_local_origin(topics: Topics) -> GeodeticPosition | None:
-    """Return EKF2's origin: latitude, longitude (degrees), altitude (m).
-
-    Return None if the log contains no origin.
-    """
+    """Return latitude, longitude (degrees) and altitude (m) of EKF2's origin, if logged."""
     columns = ["ref_lat", "ref_lon", "ref_alt"]
     origin = select_valid_rows(
         topics.read(px4.LOCAL_POSITION_LAYOUT).reindex(columns=columns), columns
@@ -425,8 +410,7 @@ def _find_local_origin(topics: Topics) -> GeodeticPosition | None:
 def project_to_ned(global_positions: pd.DataFrame, origin: GeodeticPosition | None) -> pd.DataFrame:
     """Convert latitude, longitude and altitude to north, east and down (m) from the origin.
 
-    If ``origin`` is None, the first sample is the origin. Samples with latitude and longitude 0
-    become NaN, because receivers without a fix may report them.
+    The default origin is the first sample. Latitude and longitude 0 mean "no fix" and become NaN.
     """
     global_positions = global_positions[Columns.GEODETIC]
     is_missing = (global_positions.iloc[:, :2] == 0.0).all(axis=1)
@@ -441,9 +425,8 @@ def project_to_ned(global_positions: pd.DataFrame, origin: GeodeticPosition | No
 def _read_gnss_track(topics: Topics, ekf2: Ekf2 | Unavailable) -> PositionTrack | Unavailable:
     """Read GNSS positions with the measurement times that EKF2 assumes.
 
-    EKF2 subtracts EKF2_GPS_DELAY from the timestamps. Since 2026, PX4 uses the measurement times of
-    the GNSS driver if they differ from the timestamps (EKF2.cpp UpdateGpsSample,
-    estimator_interface.cpp).
+    EKF2 subtracts EKF2_GPS_DELAY from the timestamps. Since 2026, it may use the measurement times
+    of the GNSS driver instead (EKF2.cpp UpdateGpsSample, estimator_interface.cpp).
     """
     layout = topics.find_layout(*px4.find_track_layouts(px4.GPS_POSITION))
     if layout is None:
@@ -475,7 +458,7 @@ def _read_gnss_track(topics: Topics, ekf2: Ekf2 | Unavailable) -> PositionTrack 
     if len(unlogged_fixes):
         fixes = pd.concat([fixes, unlogged_fixes]).sort_index()
         interpolated_count = int(fixes["altitude_m"].isna().sum())
-        # EKF2's topics lack some fields of a fix, which are copied from the previous fix
+        # Copy fields that EKF2's topics do not contain from the previous fix
         fixes = fixes.assign(altitude_m=fixes["altitude_m"].interpolate("index")).ffill()
     samples = _convert_gnss_fixes(fixes, _find_local_origin(topics))
     rate_hz = sample_rate(samples)
@@ -496,7 +479,7 @@ def _read_gnss_track(topics: Topics, ekf2: Ekf2 | Unavailable) -> PositionTrack 
             samples = pd.concat([samples, reconstructed_fixes]).sort_index()
             notes.append(note)
     track_fields: dict[str, Any] = {}
-    # Since v1.17, the lever arm of each receiver is logged
+    # The lever arm of the receiver is logged since v1.17
     if {*px4.ANTENNA_COLUMNS} <= {*fixes}:
         track_fields["lever_arm_m"] = tuple(fixes[px4.ANTENNA_COLUMNS].iloc[-1].tolist())
     track = _make_ulog_track(
@@ -528,8 +511,7 @@ def _convert_gnss_fixes(fixes: pd.DataFrame, origin: GeodeticPosition | None) ->
         # EKF2 uses the horizontal accuracy as σ of each horizontal axis (gps_control.cpp)
         samples["north_m2"] = samples["east_m2"] = fixes["eph_m"].to_numpy() ** 2
         samples["down_m2"] = fixes["epv_m"].to_numpy() ** 2
-    # The velocity is added here, so that it is dropped together with a damaged position. The
-    # variance of each velocity component is the reported speed accuracy squared
+    # Add the velocity here, so that it is dropped together with a damaged position
     velocity = fixes.reindex(columns=Columns.VELOCITY).set_axis(samples.index)
     speed_accuracy_m_s = fixes.get("speed_accuracy_m_s", pd.Series(np.nan, fixes.index)).to_numpy()
     samples = samples.assign(
@@ -539,7 +521,7 @@ def _convert_gnss_fixes(fixes: pd.DataFrame, origin: GeodeticPosition | None) ->
 
 
 def barometer(altitude_m: pd.Series[float], delay_s: float = 0.0) -> pd.DataFrame | None:
-    """Convert barometer altitude to the column ``down_m`` (m); subtract ``delay_s`` from the times.
+    """Convert barometer altitude (m) to ``down_m``, positive down, corrected for a delay (s).
 
     Return None with fewer than three samples.
     """
@@ -552,10 +534,9 @@ def barometer(altitude_m: pd.Series[float], delay_s: float = 0.0) -> pd.DataFram
 def read_truth(
     topics: Topics, positions: tuple[PositionTrack, ...], ekf2: Ekf2 | Unavailable
 ) -> Truth | Unavailable:
-    """Read ground truth from the simulation, or from motion capture if EKF2 uses another source.
+    """Read ground truth from simulation or motion capture.
 
-    Up to v1.13, the simulation logs latitude and longitude only. If EKF2 fused GNSS, the ground
-    truth is shifted from the origin of the simulation to EKF2's origin.
+    If EKF2 fused GNSS, ground truth is shifted from the simulation's origin to EKF2's origin.
     """
     attitude = read_attitude(topics.read(px4.TOPIC_LAYOUTS["truth_attitude"]))
     local_layout = px4.TOPIC_LAYOUTS["truth_local"]
@@ -588,8 +569,7 @@ def read_truth(
 def find_motion_capture_truth(positions: tuple[PositionTrack, ...]) -> Truth | None:
     """Return motion capture as ground truth, or None if EKF2 may have fused it.
 
-    EKF2 may have fused it if the log contains no external vision. Motion capture in FRD is not
-    used, because its north is unknown.
+    Motion capture in FRD is not used, because its north direction is unknown.
     """
     tracks = (track for track in positions if track.origin.kind == "mocap")
     track = next((track for track in tracks if track.frame != "FRD"), None)

@@ -1,9 +1,6 @@
 """PX4 topic and field names of all supported PX4 releases.
 
-``px4_topics.toml`` contains one or more layouts of each quantity: topic, fields and DataFrame
-columns. The reader uses the first layout whose topic and required fields are in the log. The names
-are from PX4-Autopilot's ``msg/*.msg`` at the releases in the comments of ``px4_topics.toml``.
-The names of EKF2's aiding sources are in ``ekf2_parameters.toml``.
+The data are in ``px4_topics.toml``. Source: PX4-Autopilot ``msg/*.msg``.
 """
 
 from collections.abc import Mapping
@@ -21,21 +18,19 @@ from px4fuse.readers.field_maps import Layout, expand_layouts
 
 @dataclass(frozen=True)
 class TrackSource:
-    """Description of a position source in ``px4_topics.toml``: topic, fields, frame, advice."""
+    """Description of a position source: kind, coordinate frame, topics and logging advice."""
 
-    # Kind of the source, such as "uwb", and how its positions reached the log (see SourceOrigin)
+    # Kind of the source, such as "uwb"
     kind: str
     path: str
     description: str
-    # Advice to the user if the positions of this source are not logged
+    # Advice if the positions of this source are not logged
     remedy: str
     # False if EKF2 never fuses these positions
     fused: bool = True
-    # Coordinate frame of the positions. If "unknown", a field of the topic may contain it, see
-    # FRAME_BY_FIELD_VALUE
+    # Coordinate frame of the positions; if "unknown", the topic may contain it
     frame: str = "unknown"
-    # Possible layouts of this topic (keys in TOPIC_LAYOUTS), preferred layout first. Empty for
-    # positions that are computed from several topics
+    # Names of the possible topic definitions in ``px4_topics.toml``, preferred first
     layouts: tuple[str, ...] = ()
 
     @property
@@ -55,15 +50,13 @@ IMU_LAYOUT, LOCAL_POSITION_LAYOUT = TOPIC_LAYOUTS["imu"], TOPIC_LAYOUTS["local_p
 HEIGHT_BIAS_LAYOUT_BY_AID = {
     name: TOPIC_LAYOUTS[f"bias_of_{name}"] for name in ("baro_hgt", "gnss_hgt")
 }
-# Advice to the user if a topic of the default logging profile is not logged
+# Advice if a topic of the default logging profile is not logged
 DEFAULT_PROFILE_REMEDY = "Record with SDLOG_PROFILE bit 0 (default)."
 # Topics with EKF2's state vector and variances, in order of preference
 STATE_VECTOR_TOPICS = ("estimator_states", "estimator_status")  # since v1.12, v1.8 to v1.11
-# Layouts of the measured magnetic field: magnetometer topic, and observation in EKF2's aiding
-# source topic (since v1.14)
+# Measured magnetic field, from the magnetometer topic or EKF2's observations (since v1.14)
 MAGNETIC_FIELD_LAYOUTS = TOPIC_LAYOUTS["magnetometer"], TOPIC_LAYOUTS["observed_field"]
-# Number of attitude variances by the numbers of logged states and of logged variances. 4 variances
-# are of the quaternion, 3 of the rotation error (generated/state.h, v1.15.4 and v1.16)
+# Number of attitude variances, by number of logged states and variances (generated/state.h)
 ATTITUDE_VARIANCE_COUNT_BY_ARRAY_LENGTHS: Mapping[tuple[int, int], int] = {
     (24, 24): 4,
     (24, 23): 3,
@@ -72,31 +65,27 @@ ATTITUDE_VARIANCE_COUNT_BY_ARRAY_LENGTHS: Mapping[tuple[int, int], int] = {
 }
 QUATERNION_VARIANCE_COUNT = 4
 ANTENNA_COLUMNS = ["antenna_forward_m", "antenna_right_m", "antenna_down_m"]
-# Values of the option --position-source: positions that EKF2 fused, positions reconstructed as EKF2
-# position plus innovation, GNSS positions
+# Values of the option --position-source
 FUSED_OBSERVATION_TRACK_NAME = "estimator_aid_src_ev_pos"
 RECONSTRUCTED_TRACK_NAME = "ekf2_state_plus_innovation"
 GPS_POSITION = "vehicle_gps_position"
-# Position sources, other than GNSS, with a topic that contains the positions
+# Position sources with a topic of their own, without GNSS
 SOURCE_TRACKS = [
     name for name, track in TRACK_SOURCES.items() if track.layouts and name != GPS_POSITION
 ]
 ORIGIN_BY_TRACK_NAME = {name: track.origin for name, track in TRACK_SOURCES.items()}
-# Aiding sources whose flag "fused" is always set in v1.15 and v1.16. The flag is not used
+# The flag "fused" of these aiding sources is always set in v1.15 and v1.16
 AIDS_ALWAYS_FUSED = ("gravity", "drag")
-# Aiding sources whose logged observation is a local position; that of GNSS is a latitude
+# Aiding sources whose logged observation is a local position
 AIDS_WITH_LOCAL_POSITION_OBSERVATION = ("ev_pos", "ev_hgt")
 STATUS_FLAGS, STATUS_TOPIC = "estimator_status_flags", "estimator_status"
-# Topics with the innovations and the innovation variances of all aiding sources (since v1.12)
+# Topics with innovations and innovation variances of all aiding sources (since v1.12)
 INNOVATION_TOPICS = "estimator_innovations", "estimator_innovation_variances"
 OLD_INNOVATION_TOPIC = "ekf2_innovations"
 
 
 def find_track_layouts(source_name: str) -> list[Layout]:
-    """Return the possible topics and fields of a position source, best first.
-
-    In a layout without topic, the name of the position source becomes the topic.
-    """
+    """Return the possible topics and fields of a position source, best first."""
     layouts = [TOPIC_LAYOUTS[name] for name in TRACK_SOURCES[source_name].layouts]
     return [replace(layout, topic=layout.topic or source_name) for layout in layouts]
 

@@ -1,8 +1,7 @@
 """Detection of the table in a position file, and its conversion to named columns.
 
-A table with a header is found by its column names. Other formats are recognised by their
-structure: headers of Motive and Vicon Nexus, JSON lines, KITTI matrices, tables without a header,
-and the text formats of UWB systems in ``formats.toml``.
+Supported are tables with or without header, exports of Motive and Vicon Nexus, JSON lines, KITTI
+poses, and text formats of UWB systems.
 """
 
 import csv
@@ -22,11 +21,11 @@ from px4fuse.readers import position_names
 from px4fuse.readers.position_names import read_column_name
 from px4fuse.readers.text_table import UWB_TEXT_FORMATS, decode_text, is_number, quote
 
-# Maximum size (bytes) of a position file: several days of UWB positions
+# Maximum size (bytes) of a position file
 MAX_FILE_BYTES = 500_000_000
-# Number of lines at the beginning of the file in which the header is searched
+# Number of lines in which the header is searched
 MAX_HEADER_LINES = 1000
-# Number of characters at the beginning of the file in which the header is searched
+# Number of characters in which the header is searched
 MAX_HEADER_CHARS = 200_000
 MAX_COLUMNS = 200
 COLUMNS_OPTION = "`columns` TIME,X,Y,Z"
@@ -46,19 +45,18 @@ class PositionTable:
     # Text of the rows, without the header
     rows_text: str
     separator: str = ","
-    # Line number of the header, 0 without a header. None if rows of the table are not lines of the
-    # file, as in JSON
+    # Line number of the header, 0 without header; None for formats without lines
     header_line: int | None = None
-    # Coordinate frames that are possible for the format; empty if all are
+    # Possible coordinate frames; empty if all are possible
     frames: tuple[str, ...] = ()
-    # Frame rate, if the time column contains frame numbers instead of times
+    # Frame rate, if the time column contains frame numbers
     rate_hz: float | None = None
-    # True if the table contains only the rigid body, tag or topic that the user selected
+    # True if the table contains only one rigid body, tag or topic
     has_only_chosen_body: bool = False
     notes: tuple[str, ...] = ()
 
     def format_labels(self, *columns: int | None) -> str:
-        """Join the names of columns for a message; repeated indices and None are omitted."""
+        """Join the names of columns for a message to the user."""
         labels = dict.fromkeys(
             quote(self.column_names[index]) if self.column_names[index] else f"column {index + 1}"
             for index in columns
@@ -67,13 +65,13 @@ class PositionTable:
         return ", ".join([*labels][:12]) + (", ..." if len(labels) > 12 else "")
 
     def format_first_line_number(self, rows: pd.Index) -> str:
-        """Return " (first: line N)" for the first of ``rows``; "" if rows are not lines."""
+        """Return the line number of the first row as text, such as " (first: line 7)"."""
         return (
             "" if self.header_line is None else f" (first: line {self.header_line + 1 + rows[0]})"
         )
 
     def read_cells(self, columns: Iterable[int]) -> pd.DataFrame:
-        """Return the text in each cell of the given columns, without empty rows."""
+        """Return the text of the given columns, without empty rows."""
         column_indices = sorted({*columns})
         try:
             texts = pd.read_csv(
@@ -97,14 +95,14 @@ class PositionTable:
 
 
 def choose_body(file_name: str, body_names: Iterable[str], wanted_body: str | None) -> str:
-    """Return the name of the rigid body whose positions are read.
+    """Return the name of the selected rigid body.
 
     ``drone`` also selects ``drone:drone``, because Vicon Nexus repeats the name of a body.
 
     Raises
     ------
     LogError
-        The file does not contain ``wanted_body``, or this is None and the file has several bodies.
+        The file does not contain the body, or contains several and none is selected.
     """
     names = [*dict.fromkeys(body_names)]
     matches = names if wanted_body is None else [name for name in names if name == wanted_body]
@@ -125,18 +123,16 @@ def find_table(
     Parameters
     ----------
     path : Path
-        Path of the file. The times of KITTI poses are read from another file in its folder.
-    content : bytes
-        Content of the file.
+        Path of the file; the times of KITTI poses are in the same folder.
     columns : tuple of str or None
-        Names or numbers of the columns that the table must contain.
+        Names or numbers of required columns.
     body : str or None
-        Rigid body whose positions are read, if the file contains several.
+        Name of the rigid body, if the file contains several.
 
     Raises
     ------
     LogError
-        The content is not a text, or contains no table of positions.
+        The file is not a text file, or contains no table of positions.
     """
     file_name = display_name(path)
     text = decode_text(content)
@@ -197,10 +193,7 @@ def _split_line(line: str, separator: str) -> list[str]:
 def _find_header_table(
     file_name: str, text: str, lines: Sequence[str], wanted_names: set[str]
 ) -> PositionTable | None:
-    """Find the header: the first line with column names for time and position.
-
-    If ``wanted_names`` is not empty, the header is the first line with these column names.
-    """
+    """Find a table whose header contains ``wanted_names``, by default time and position."""
     for index, line in enumerate(lines):
         for separator in SEPARATORS:
             column_names = _split_line(line.strip("#% "), separator)
@@ -234,7 +227,7 @@ def _find_body_table(
         row_by_title = {row[1]: row for row in rows[2:header_index]}
         body_names, body_types = (row_by_title.get(title, axes) for title in ("Name", "Type"))
         used_body_types = {"Rigid Body"} if "Rigid Body" in body_types else {*body_types}
-        # Rotations get no column name, so they are not read: a rigid body's axes are not FRD
+        # Rotations are not read, because the axes of a rigid body are not FRD
         column_names = [
             f"{axis}_{unit}" if group == "Position" and body_type in used_body_types else ""
             for axis, group, body_type in zip(
@@ -263,7 +256,7 @@ def _find_body_table(
         column_names,
         rows_text,
         header_line=header_index + 1,
-        # Motive exports y up by default, and z up by an option that the file does not contain
+        # Motive exports y up by default, or z up; the file does not state which
         frames=("eus", "enu") if is_motive else (),
         rate_hz=None if is_motive else float(rows[1][0]),
         has_only_chosen_body=True,
@@ -272,7 +265,7 @@ def _find_body_table(
 
 
 def _find_stream_table(file_name: str, text: str, lines: Sequence[str]) -> PositionTable | None:
-    """Find the positions in a text format of ``formats.toml``, such as the output of a UWB tag."""
+    """Find the positions in a text format of a UWB system (``formats.toml``)."""
     for stream_format in UWB_TEXT_FORMATS:
         pattern = re.compile(stream_format["row"], re.MULTILINE)
         first_row = next((line for line in lines if pattern.match(line)), None)
@@ -291,7 +284,7 @@ def _find_stream_table(file_name: str, text: str, lines: Sequence[str]) -> Posit
 
 
 def _find_json_table(file_name: str, text: str) -> PositionTable | None:
-    """Convert a file of JSON lines to a table with column names like ``data.coordinates.x``."""
+    """Convert JSON lines to a table with column names such as ``data.coordinates.x``."""
     if not text.lstrip().startswith(("{", "[{")):
         return None
     try:
@@ -320,7 +313,7 @@ def _find_json_table(file_name: str, text: str) -> PositionTable | None:
 
 
 def _find_headerless_table(path: Path, text: str, lines: Sequence[str]) -> PositionTable | None:
-    """Find a table without header: columns time, x, y, z, or the 3x4 matrices of KITTI poses."""
+    """Find a table without header: columns time, x, y, z, or KITTI poses."""
     plain_lines = (line.partition("#")[0] for line in lines)
     first_row = next((line for line in plain_lines if line.strip(" \t%")), "")
     for separator in SEPARATORS:
@@ -351,7 +344,7 @@ def _remove_comments(text: str) -> str:
 
 
 def _read_kitti_table(path: Path, text: str) -> PositionTable:
-    """Read poses from the 3x4 matrices of a KITTI file, and times from a file in its folder."""
+    """Read KITTI poses (3x4 matrices), and their times from a file in the same folder."""
     # imported here, because most recordings need no rotations
     from scipy.spatial.transform import Rotation  # noqa: PLC0415
 

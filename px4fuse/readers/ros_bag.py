@@ -1,4 +1,4 @@
-"""Reader of positions in ROS bags of ROS 1 and 2 (SQLite, MCAP), with the library rosbags."""
+"""Reader of positions in bags of ROS 1 and ROS 2, with the library rosbags."""
 
 import hashlib
 from collections import deque
@@ -37,7 +37,7 @@ _POSITION_MESSAGE_TYPES = (
 
 
 def _read_pose_values(message: Any) -> list[float]:
-    """Return x, y, z and, if the message contains them, qx, qy, qz, qw and the σ of x, y and z."""
+    """Return x, y, z and, if available, the quaternion (x, y, z, w) and the position σ."""
     if hasattr(message, "q"):
         return [*message.position.tolist(), *np.roll(message.q, -1).tolist()]
     pose = getattr(message, "pose", None) or getattr(message, "transform", message)
@@ -57,18 +57,17 @@ def _read_pose_values(message: Any) -> list[float]:
 
 
 def is_bag(path: Path) -> bool:
-    """Return True for the folder of a ROS 2 bag, or a file with the suffix of a bag."""
+    """Return True if the path is a ROS bag (file or folder)."""
     return (path / "metadata.yaml").exists() or path.suffix.lower() in _BAG_SUFFIXES
 
 
 def read_bag(path: Path, topic: str | None) -> tuple[PositionTable, str, int]:
-    """Read the poses in one topic of a bag; return also the SHA-256 and size (bytes) of the bag.
+    """Read the poses in one topic of a ROS bag, and its SHA-256 and size (bytes).
 
     Raises
     ------
     LogError
-        The library rosbags is not installed, the bag cannot be read or is too large, or the topic
-        contains no positions.
+        The library rosbags is missing, the bag cannot be read, or the topic has no positions.
     """
     name = display_name(path)
     try:

@@ -1,7 +1,4 @@
-"""Functions to read text files: unsupported formats, decoding, numbers, errors with line number.
-
-The readers of position files and pose graphs (g2o) use them.
-"""
+"""Functions for text files: unsupported formats, decoding, numbers, errors with line number."""
 
 import re
 from dataclasses import dataclass, field
@@ -16,12 +13,12 @@ from px4fuse.core.record import read_toml
 from px4fuse.errors import Px4FuseError, TrajectoryError
 
 _TEXT_FORMATS = read_toml(__file__, dict[str, list[dict[str, Any]]], "formats.toml")
-# Text formats of UWB systems: name, and regular expressions of a position and of the ranges
+# Text formats of UWB systems
 UWB_TEXT_FORMATS = _TEXT_FORMATS["streams"]
 
 
 def refuse_foreign_format(path: Path, first_bytes: bytes, error_type: type[Px4FuseError]) -> None:
-    """Raise an error that names the file format, if px4fuse does not support it."""
+    """Raise an error if px4fuse does not support the file format."""
     name = display_name(path)
     for foreign_format in _TEXT_FORMATS["foreign"]:
         if any(
@@ -31,10 +28,9 @@ def refuse_foreign_format(path: Path, first_bytes: bytes, error_type: type[Px4Fu
             raise error_type(f"{name}: the file is {foreign_format['name']}", remedy)
 
 
-# Minimum and maximum valid UNIX time (s): the years 2000 and 2100
+# Valid UNIX times (s): years 2000 to 2100
 MIN_VALID_UNIX_TIME_S, MAX_VALID_UNIX_TIME_S = 946_684_800.0, 4_102_444_800.0
-# Number of first characters that are searched for a control character, which shows a binary file.
-# NUL is searched in the whole file
+# Number of characters that are searched for signs of a binary file
 _CHECKED_CHAR_COUNT = 100_000
 # Byte order marks of UTF-16, the encoding of texts from Windows shells
 _UTF_16_BYTE_ORDER_MARKS = (b"\xff\xfe", b"\xfe\xff")
@@ -45,10 +41,7 @@ _NUMBER_PATTERN = re.compile(
 
 
 def decode_text(content: bytes) -> str | None:
-    """Decode a text in UTF-8, UTF-16 with byte order mark, or Latin-1; None if it is binary.
-
-    All line ends become line feeds.
-    """
+    """Decode a text in UTF-8, UTF-16 or Latin-1, with line feeds as line ends; None if binary."""
     if content.startswith(_UTF_16_BYTE_ORDER_MARKS):
         text = content[: len(content) // 2 * 2].decode("utf-16", errors="replace")
     else:
@@ -63,17 +56,17 @@ def decode_text(content: bytes) -> str | None:
 
 
 def is_number(text: str) -> bool:
-    """Return True if the text is a number, also with decimal point or exponent, NaN or infinity."""
+    """Return True if the text is a number, NaN or infinity."""
     return _NUMBER_PATTERN.fullmatch(text) is not None
 
 
 def quote(text: str) -> str:
-    """Put a text in quotation marks, shortened to 40 characters."""
+    """Put a text in quotation marks, and shorten it to 40 characters."""
     return repr(text if len(text) <= 40 else text[:37] + "...")
 
 
 def make_line_error(name: str, line_number: int, fault: str, remedy: str) -> TrajectoryError:
-    """Make an error message with the file name and the line number of the fault.
+    """Make an error with the file name and the line number of the fault.
 
     >>> str(make_line_error("uwb.csv", 7, "'x' is not a number", "Correct or remove this line."))
     "uwb.csv, line 7: 'x' is not a number. Correct or remove this line."
@@ -83,25 +76,17 @@ def make_line_error(name: str, line_number: int, fault: str, remedy: str) -> Tra
 
 @dataclass(eq=False)  # not frozen: the reader appends lines
 class TextTableRows:
-    """Rows of a text table, with the line number of each row for error messages.
-
-    Attributes
-    ----------
-    file_name : str
-        File name for error messages.
-    lines : list of (int, str)
-        Line number in the file, and text of the line.
-    """
+    """Rows of a text table. ``lines`` contains line number and text of each row."""
 
     file_name: str
     lines: list[tuple[int, str]] = field(default_factory=list)
 
     def make_row_error(self, row: int, description: str, remedy: str) -> TrajectoryError:
-        """Make an error message with the line number of a row."""
+        """Make an error with the line number of a row."""
         return make_line_error(self.file_name, self.lines[row][0], description, remedy)
 
     def raise_where(self, is_invalid: BoolArray, description: str, remedy: str) -> None:
-        """Raise TrajectoryError for the first invalid row; ``is_invalid``: shape (n,) or (n, k)."""
+        """Raise TrajectoryError for the first invalid row, if any."""
         invalid_indices = np.argwhere(is_invalid)
         if len(invalid_indices):
             raise self.make_row_error(int(invalid_indices[0, 0]), description, remedy)
@@ -111,20 +96,12 @@ class TextTableRows:
     ) -> tuple[np.ndarray[Any, np.dtype[np.str_]], Array]:
         """Parse rows of text columns followed by number columns, separated by white space.
 
-        Parameters
-        ----------
-        text_column_count, number_column_count : int
-            Numbers of text columns and of number columns.
-
-        Returns
-        -------
-        texts : ndarray of str, shape (n, text_column_count)
-        numbers : ndarray, shape (n, number_column_count)
+        Return the texts and the numbers, with one row for each line.
 
         Raises
         ------
         TrajectoryError
-            A row has too few or too many columns, or a cell in a number column is not a number.
+            A row has the wrong number of columns, or a cell is not a number.
         """
         lines = [text for _, text in self.lines]
         columns = [

@@ -1,7 +1,6 @@
 """Reader of trajectories: TUM, EuRoC, ORB-SLAM3, KITTI, ROS bags, and all position files.
 
-The format is detected from the content. ORB-SLAM3's ``SaveTrajectoryEuRoC`` writes TUM columns with
-nanoseconds, and omits frames without tracking.
+The format is detected from the content.
 """
 
 import math
@@ -21,40 +20,36 @@ from px4fuse.trajectory.model import Frame, Trajectory, TrajectoryKind
 
 # Maximum deviation of a valid quaternion from norm 1
 MAX_QUATERNION_NORM_ERROR = 0.1
-# Maximum absolute coordinate (m): larger values are timestamps or damaged text
+# Maximum absolute coordinate (m); larger values are timestamps or damaged text
 MAX_COORDINATE_M = 1e9
-# Quaternions are normalised if their norm deviates by more than this from 1 (rounding of float64)
+# Maximum deviation of a unit quaternion from norm 1 (rounding of float64)
 UNIT_NORM_TOLERANCE = 1e-15
-# A file with a larger fraction of invalid rows is rejected: its timestamps are probably rounded, or
-# it contains several recordings
+# Maximum fraction of invalid rows; with more, the timestamps are probably rounded
 MAX_DROPPED_ROW_FRACTION = 0.01
-# The first pose is the identity, as in SLAM, if its coordinates (m) and rotation angle (rad) are
-# below this limit
+# Maximum coordinate (m) and rotation angle (rad) of a first pose that is the identity
 MAX_DEVIATION_FROM_IDENTITY = 1e-6
-# Maximum ratio smallest / second RMS extent along the principal axes, for a motion in a plane
+# Maximum ratio of smallest to second RMS extent of a motion in a plane
 MAX_SMALLEST_TO_SECOND_EXTENT_RATIO = 1 / 3
-# Minimum ratio second / largest RMS extent along the principal axes, for a motion in a plane: a
-# straight motion has no unique plane
+# Minimum ratio of second to largest RMS extent; a straight motion has no unique plane
 MIN_SECOND_TO_LARGEST_EXTENT_RATIO = 0.1
 # Maximum angle (rad) between the normal of the plane of motion and the y axis of a camera frame
 MAX_TILT_RAD = math.radians(20.0)
-# Minimum fraction of pose intervals that are near the median interval, for a regular frame rate
+# Minimum fraction of intervals near the median interval, for a regular frame rate
 MIN_REGULAR_INTERVAL_FRACTION = 0.9
-# A pose interval is near the median interval if it differs by at most this fraction
+# Maximum relative difference of a regular interval from the median interval
 MAX_MEDIAN_INTERVAL_DEVIATION = 0.5
-# Minimum interval between two poses that counts as a gap, in median intervals
+# Minimum duration of a gap between two poses, in median intervals
 MIN_GAP_IN_MEDIAN_INTERVALS = 2.5
-# Minimum interval (s) between two poses that counts as a gap
+# Minimum duration (s) of a gap between two poses
 MIN_POSE_GAP_S = 0.3
 
-# Words in comments and file names that indicate ground truth; b_w_RS_S is the column of the gyro
-# bias in EuRoC ground truth
+# Words that indicate ground truth; b_w_RS_S is the gyro bias in EuRoC ground truth
 _TRUTH_NAME_PATTERN = re.compile(
     r"truth|vicon|leica|mocap|(?<![a-z])gt(?![a-z])|b_w_RS_S", re.IGNORECASE
 )
-# Number of bytes at the start of a file in which comments are searched
+# Number of bytes in which comments are searched
 _COMMENT_SEARCH_BYTES = 4096
-# Frame of a trajectory, by the possible frames of the position file
+# Coordinate frame of a trajectory, by the possible frames of the position file
 _FRAME_BY_RECORDING_FRAMES: dict[tuple[str, ...], Frame] = {
     ("ned",): "NED",
     ("enu",): "ENU",
@@ -63,9 +58,9 @@ _FRAME_BY_RECORDING_FRAMES: dict[tuple[str, ...], Frame] = {
 
 
 def read_trajectory(path: str | Path, body: str | None = None) -> Trajectory:
-    """Read a trajectory file, and detect whether it is ground truth or SLAM, and its frame.
+    """Read a trajectory file, and detect its kind (ground truth or SLAM) and coordinate frame.
 
-    ``body`` selects a rigid body or UWB tag in the file, or a topic of a ROS bag.
+    ``body`` selects a rigid body, a UWB tag or a topic of a ROS bag.
 
     Raises
     ------
@@ -76,7 +71,7 @@ def read_trajectory(path: str | Path, body: str | None = None) -> Trajectory:
     try:
         recording = read_position_file(path, body=body, is_trajectory=True)
     except LogError as error:
-        # The commands for trajectories have no option for columns: remove this advice
+        # Remove advice on an option that trajectory commands do not have
         remedy = re.sub(f" [^.]*{COLUMNS_OPTION}.", "", error.remedy)
         raise TrajectoryError(error.reason, remedy) from error
     name, samples = recording.name, recording.samples
@@ -120,14 +115,12 @@ def read_trajectory(path: str | Path, body: str | None = None) -> Trajectory:
 
 
 def format_tum(trajectory: Trajectory) -> str:
-    """Return the text of a TUM file with the trajectory; numbers have all digits of float64.
-
-    Timestamps are UNIX time if ``trajectory.unix_offset_s`` is known.
+    """Write a trajectory as the text of a TUM file, with all digits of float64.
 
     Raises
     ------
     TrajectoryError
-        The trajectory has no orientations, which a TUM file must contain.
+        The trajectory has no orientations.
     """
     if trajectory.rotation is None:
         raise TrajectoryError(
@@ -159,7 +152,7 @@ def _read_rotation(recording: PositionRecording) -> Rotation | None:
 def _detect_trajectory_kind(
     path: Path, comment_text: str, position_m: Array, rotation: Rotation | None
 ) -> tuple[TrajectoryKind, str]:
-    # EuRoC files are always called data.csv; their folder name indicates the kind
+    # EuRoC files are always called data.csv, so the folder name is searched
     folder = path.absolute().parent.name if path.name == "data.csv" else ""
     searched_text_by_note = {
         "A comment in the file states that the trajectory is ground truth.": comment_text,

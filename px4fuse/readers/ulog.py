@@ -28,10 +28,9 @@ from px4fuse.readers.ulog_topics import (
 )
 
 INVALID_ACCELEROMETER_OFFSET_US = 0x7FFFFFFF
-# IMU samples are missing in an interval longer than this (s); 4 ms is normal
+# Minimum duration (s) of a gap in the IMU data
 MIN_IMU_GAP_S = 0.2
-# Minimum and maximum valid UTC (UNIX time, s) of a GNSS receiver: GPS_EPOCH_SECS of PX4
-# (gps_helper.h), and the year 2100
+# Valid UNIX times (s) of GNSS: from PX4's GPS_EPOCH_SECS (gps_helper.h) to 2100
 VALID_UNIX_TIME_RANGE_S = (1_234_567_890.0, 4_102_444_800.0)
 
 
@@ -115,7 +114,7 @@ def _describe_damage(
 
 
 def _estimate_start_unix_s(topics: Topics) -> float | None:
-    """Return the UNIX time (s) at flight time zero, from the GNSS fixes; None without UTC."""
+    """Return the UNIX time (s) at flight time zero, from GNSS; None if not logged."""
     gps_samples = topics.read(*px4.find_track_layouts(px4.GPS_POSITION))
     if "utc_us" not in gps_samples:
         return None
@@ -129,7 +128,7 @@ def _estimate_start_unix_s(topics: Topics) -> float | None:
 def _require_samples(
     topics: Topics, samples: pd.DataFrame, name: str, layout: Layout, remedy: str
 ) -> TableOrUnavailable:
-    """Return the samples of a topic, or the reason why the log contains fewer than two."""
+    """Return the samples of a topic, or the reason if there are fewer than two."""
     topic = layout.topic
     if topics.find_layout(layout) is None:
         return Unavailable(name, f"{topic} is not logged", px4.DEFAULT_PROFILE_REMEDY)
@@ -141,7 +140,7 @@ def _require_samples(
 
 def _read_imu(topics: Topics) -> pd.DataFrame:
     imu = topics.read(px4.IMU_LAYOUT)
-    # single arrays instead of tables, because a copy of all samples needs much memory
+    # single arrays, because a copy of the whole table needs much memory
     columns = {name: values.to_numpy() for name, values in imu.items()}
     time_s, rows = imu.index.to_numpy(), np.arange(len(imu))
     if (offset_us := columns.pop("accelerometer_offset_us", None)) is not None:

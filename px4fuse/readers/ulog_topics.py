@@ -1,7 +1,7 @@
 """Topics of a ULog file as tables with valid timestamps.
 
-pyulog parses the file. This module removes samples with invalid timestamps: in real logs,
-timestamps may be zero, decrease or jump by hours. It also merges two subscriptions to one topic.
+Samples with invalid timestamps are removed. In real logs, timestamps may be zero, decrease or jump
+by hours.
 """
 
 import contextlib
@@ -42,22 +42,19 @@ from px4fuse.readers.field_maps import MAX_FIELD_VALUE, Layout
 from px4fuse.readers.px4_topics import IMU_LAYOUT, TOPIC_LAYOUTS, list_topics
 
 _MICROSECOND_S = 1e-6
-# Maximum delay (s) from measurement to publication. With a longer delay, the measurement time is
-# not boot time: GPS topics before v1.16 contain receiver time, ground truth in v1.13 contains 0
+# Maximum delay (s) from measurement to publication; otherwise, timestamp_sample is not boot time
 MAX_PUBLICATION_LAG_S = 10.0
-# Samples more than this time (s) before or after the IMU data are invalid
+# Maximum time (s) of a valid sample before or after the IMU data
 MAX_TIME_OUTSIDE_IMU_DATA_S = 2.0
-# ULog info message with a note from the author of the log to its users
+# ULog info message with a note for the users of the log
 NOTE_KEY = "px4fuse_note"
-# ULog info message which states that the log is an assignment for a student
+# ULog info message that marks a student assignment
 ASSIGNMENT_FLAG_KEY = "px4fuse_assessed"
-# True while an instructor's command reads logs. The message ASSIGNMENT_FLAG_KEY then does not hide
-# the diagnosis of the assignment
+# True for commands of instructors, which show the diagnosis of an assignment
 ignores_assignment_flag = ContextVar("ignores_assignment_flag", default=False)
-# Maximum interval (s) between IMU timestamps of one flight: after a longer interval, the autopilot
-# was restarted
+# Maximum interval (s) between valid IMU timestamps
 MAX_DATA_GAP_S = 600.0
-# Maximum number of fields of all topics (300 bytes of memory each); real logs have 3,300
+# Maximum number of fields of all topics, to limit the memory; real logs have 3,300
 MAX_FIELDS = 200_000
 # Length (bytes) of a ULog message header
 HEADER_BYTES = 3
@@ -66,18 +63,14 @@ HEADER_BYTES = 3
 TopicArrays = dict[str, NDArray[Any]]
 # Tables by topic name and instance number
 Tables = dict[tuple[str, int], TopicArrays]
-# For each change of the primary EKF2 instance: time (s) and number of the new primary instance
+# Time (s) and number of each new primary EKF2 instance
 InstanceSwitches = tuple[tuple[float, int], ...]
-# Without the selector topic, EKF2 instance 0 is primary at all times
+# EKF2 instance 0 is always primary
 NO_INSTANCE_SWITCHES: InstanceSwitches = ((-np.inf, 0),)
 
 
 class _SkippedByteCounter(io.BytesIO):
-    """Content of a ULog file; counts the damaged bytes that pyulog skips.
-
-    pyulog reads a message header of 3 bytes, then the message. After an invalid header, pyulog
-    skips one byte, or all bytes until the next synchronisation message.
-    """
+    """Content of a ULog file; counts the damaged bytes that pyulog skips."""
 
     skipped_bytes = 0
     header_start_offset = read_end_offset = position = 0  # byte offsets in the file
@@ -92,8 +85,7 @@ class _SkippedByteCounter(io.BytesIO):
         return io.BytesIO.read(self, size)
 
     def seek(self, offset: int, whence: int = io.SEEK_SET, /) -> int:
-        # pyulog seeks back by the length that it requested, even if the file has fewer bytes. The
-        # position counts requested bytes, or pyulog would read the end of the file endlessly
+        # Count requested bytes. Otherwise, pyulog reads the end of a truncated file endlessly
         if whence == io.SEEK_CUR:
             offset += self.position
         self.position = super().seek(offset)
@@ -103,7 +95,7 @@ class _SkippedByteCounter(io.BytesIO):
 def _skip_if_short(parse: Callable[..., Any]) -> Callable[..., Any]:
     """Decorate a message parser to raise ValueError for messages that are too short.
 
-    pyulog then skips the message. After struct.error, pyulog would not read the rest of the file.
+    After ValueError, pyulog skips the message. After struct.error, it stops.
     """
 
     def parse_or_raise_value_error(*arguments: Any, **keywords: Any) -> Any:
@@ -120,9 +112,9 @@ class _MessageData(ULog._MessageData):  # type: ignore[misc]  # pyulog has no ty
 
 
 class _TolerantULogParser(ULog):  # type: ignore[misc]
-    """ULog parser of pyulog that continues after damaged bytes and limits the number of fields.
+    """ULog parser that continues after damaged bytes and limits the number of fields.
 
-    A format definition of 20 bytes can define 65,535 fields, and nested formats multiply them.
+    In a malicious file, a few bytes can define millions of fields.
     """
 
     fields = 0
@@ -134,7 +126,7 @@ class _TolerantULogParser(ULog):  # type: ignore[misc]
     MessageLoggingTagged = staticmethod(_skip_if_short(ULog.MessageLoggingTagged))
 
     def _check_packet_corruption(self, header: Any) -> bool:
-        # pyulog accepts unknown message types up to 10,000 bytes; valid types are capital letters
+        # pyulog accepts unknown message types, but valid types are capital letters
         is_corrupt: bool = super()._check_packet_corruption(header)
         if not ord("A") <= header.msg_type <= ord("Z"):
             self._file_corrupt = is_corrupt = True
@@ -158,37 +150,36 @@ class _TolerantULogParser(ULog):  # type: ignore[misc]
 
 @dataclass(eq=False)  # not frozen: the readers add streams and counts
 class Topics:
-    """Decoded topics of one ULog, and its description."""
+    """Decoded topics of a ULog, and a description of the log."""
 
-    # Description of the log
     log: LogInfo
     tables: Tables
     # Boot time (µs) at flight time zero
     time_origin_us: int
     # Number of samples with an invalid timestamp, by topic and instance
     dropped: dict[tuple[str, int], int]
-    # All EKF2_ parameters at take-off; ``log.parameters`` has only PARAMETERS_IN_RESULTS
+    # All EKF2 parameters at take-off
     ekf2_parameters: Mapping[str, float]
     # True if the file ends within a message
     is_truncated: bool
     # True if pyulog skipped invalid bytes or messages
     is_damaged: bool
-    # Topics that contain each kind of data, such as "imu", and the clock of their timestamps
+    # Topics and clock of each kind of data, such as "imu"
     data_source_by_kind: dict[str, DataSource] = field(default_factory=dict)
-    # Changes of EKF2_ parameters after take-off
+    # Changes of EKF2 parameters after take-off
     parameter_changes: tuple[ParameterChange, ...] = ()
 
     def instances(self, topic: str) -> list[int]:
-        """Return the instance numbers of a topic that contain samples, in ascending order."""
+        """Return the instance numbers of a topic, in ascending order."""
         return sorted(instance for name, instance in self.tables if name == topic)
 
     def tables_of(self, topic: str) -> list[TopicArrays]:
-        """Return the tables of all instances of a topic, in order of the instance number."""
+        """Return the tables of all instances of a topic, by ascending instance number."""
         return [self.tables[topic, number] for number in self.instances(topic)]
 
     @cached_property
     def primary_instances(self) -> InstanceSwitches:
-        """Time (s) at which an EKF2 instance becomes primary, and its number (``EKF2Selector``)."""
+        """Time (s) and number of each new primary EKF2 instance (PX4's ``EKF2Selector``)."""
         instances = self.read(TOPIC_LAYOUTS["selector"], is_step_function=True)["instance"]
         instances = instances[instances < 255]  # 255 means that no instance is selected yet
         primary_instance_changes = instances[instances.ne(instances.shift())]
@@ -197,7 +188,7 @@ class Topics:
         return tuple(zip(switch_times_s, numbers, strict=False)) or NO_INSTANCE_SWITCHES
 
     def find_layout(self, *layouts: Layout) -> Layout | None:
-        """Return the first layout whose required fields are in the log, or None."""
+        """Return the first topic definition whose required fields are in the log, or None."""
         for layout in layouts:
             if any(
                 {*layout.columns.values()} <= table.keys() for table in self.tables_of(layout.topic)
@@ -212,17 +203,15 @@ class Topics:
 
         Parameters
         ----------
-        layout : Layout
-            A layout that :meth:`find_layout` returned.
         instance : int
-            Number of the topic instance; if it is not in the log, the lowest number is read.
+            Number of the topic instance; if not logged, the lowest number is read.
         is_step_function : bool
-            True if a value is valid until the next sample: samples before time zero are then kept.
+            True if a value is valid until the next sample.
 
         Returns
         -------
         DataFrame
-            Strictly increasing in time; may be empty.
+            Samples with strictly increasing times.
         """
         instance_numbers = self.instances(layout.topic)
         instance_number = instance if instance in instance_numbers else instance_numbers[0]
@@ -252,7 +241,7 @@ class Topics:
         )
 
     def read(self, *layouts: Layout, is_step_function: bool = False) -> pd.DataFrame:
-        """Read the first layout whose required fields are in the log; empty without them."""
+        """Read the first topic definition whose required fields are in the log; else empty."""
         layout = self.find_layout(*layouts)
         return (
             _empty_frame(layouts[0])
@@ -269,14 +258,7 @@ class Topics:
     ) -> pd.DataFrame:
         """Read an EKF2 topic from the EKF2 instance that was primary at each time.
 
-        The table is empty if the topic is not in the log.
-
-        Parameters
-        ----------
-        layout, is_step_function
-            See :meth:`read_instance`.
-        select_rows : callable, optional
-            Function that selects rows from the samples of each instance.
+        ``select_rows`` is an optional function that selects rows from each instance's samples.
         """
         if self.find_layout(layout) is None:
             return _empty_frame(layout)
@@ -302,7 +284,7 @@ class Topics:
         return joined_tables[~joined_tables.index.duplicated()]
 
     def record_stream(self, data_kind: str, *topics: str) -> None:
-        """Store for the report which topics and timestamps supply data such as "imu"."""
+        """Store the topics and the clock of a kind of data, such as "imu", for the report."""
         # The timestamp of sensor_combined is the gyro's measurement time
         has_measurement_time = data_kind == "imu" or any(
             np.any(measurement_time_us(table) != table["timestamp"].astype(np.int64))
@@ -322,8 +304,8 @@ def _empty_frame(layout: Layout) -> pd.DataFrame:
 def measurement_time_us(table: TopicArrays) -> NDArray[np.int64]:
     """Return the measurement time since boot (µs) of each sample: ``timestamp_sample``.
 
-    If it is missing or not boot time, return the publication time: ``timestamp``. In EKF2 topics,
-    the publication is up to 0.2 s later.
+    If it is missing or invalid, return the publication time (``timestamp``). It is invalid in GPS
+    topics before v1.16 (receiver time) and in ground truth of v1.13 (0).
     """
     published_us = table["timestamp"].astype(np.int64)
     sample_timestamps_us = table.get("timestamp_sample")
@@ -331,7 +313,7 @@ def measurement_time_us(table: TopicArrays) -> NDArray[np.int64]:
         return published_us
     sample_timestamps_us = sample_timestamps_us.astype(np.int64)
     lag_s = np.abs(published_us - sample_timestamps_us) * _MICROSECOND_S
-    # Isolated invalid measurement times, such as the first, are replaced by publication times
+    # Publication times replace isolated invalid measurement times
     is_plausible = (sample_timestamps_us > 0) & (lag_s <= MAX_PUBLICATION_LAG_S)
     if np.count_nonzero(is_plausible) * 2 < len(is_plausible):
         return published_us
@@ -341,15 +323,14 @@ def measurement_time_us(table: TopicArrays) -> NDArray[np.int64]:
 def longest_increasing_run(time_us: NDArray[np.int64]) -> IntArray:
     """Return the indices of the longest strictly increasing subsequence of positive timestamps.
 
-    If one timestamp is hours too late, only this sample is removed. A running maximum would remove
-    all samples after it. Method: patience sorting, Fredman 1975.
+    Do not use a running maximum: a single late timestamp would remove all samples after it.
+    Method: patience sorting, Fredman 1975.
     """
     positive_time_indices = np.flatnonzero(time_us > 0)
     positive_times = time_us[positive_time_indices]
     if len(positive_times) < 2 or np.all(np.diff(positive_times) > 0):
         return positive_time_indices
-    # At index k: smallest timestamp at which an increasing subsequence of k + 1 timestamps ends,
-    # and the index of this timestamp
+    # At index k: smallest last timestamp of an increasing subsequence of k + 1 timestamps
     smallest_end_times: list[int] = []
     end_indices: list[int] = []
     previous_index = np.empty(len(positive_times), dtype=np.intp)
@@ -367,7 +348,7 @@ def longest_increasing_run(time_us: NDArray[np.int64]) -> IntArray:
 
 
 def describe_dropped_samples(dropped_counts: Iterable[tuple[str, int]]) -> tuple[str, ...]:
-    """Return one note per topic on the samples that were dropped, with their number."""
+    """Return one note per topic with the number of dropped samples."""
     return tuple(
         f"number of samples of {topic} dropped because of an invalid timestamp: {count}"
         for topic, count in dropped_counts
@@ -375,7 +356,7 @@ def describe_dropped_samples(dropped_counts: Iterable[tuple[str, int]]) -> tuple
 
 
 def read_topics(name: str, content: bytes) -> Topics:
-    """Decode those topics of a ULog that px4fuse uses.
+    """Decode the topics of a ULog that px4fuse uses.
 
     Raises
     ------
@@ -387,7 +368,7 @@ def read_topics(name: str, content: bytes) -> Topics:
         with contextlib.redirect_stdout(io.StringIO()):  # suppress the warnings that pyulog prints
             ulog = _TolerantULogParser(content_reader, message_name_filter_list=list_topics())
             tables = _read_tables(ulog)
-            # If px4fuse uses no topic of the log, the other topics give the duration of the log
+            # Without known topics, read all topics for the duration of the log
             tables_for_time_span = tables or _read_tables(
                 _TolerantULogParser(_SkippedByteCounter(content))
             )
@@ -460,7 +441,7 @@ def read_topics(name: str, content: bytes) -> Topics:
 def _read_parameters(
     ulog: ULog, tables: Tables, time_origin_us: int
 ) -> tuple[dict[str, float], tuple[ParameterChange, ...]]:
-    """Return the parameters at take-off (or log start), and later changes of EKF2_ parameters."""
+    """Return the parameters at take-off, and later changes of EKF2 parameters."""
     parameter_values = {
         name: float(value)
         for name, value in ulog.initial_parameters.items()
@@ -487,11 +468,7 @@ def _read_parameters(
 
 
 def _read_tables(ulog: ULog) -> Tables:
-    """Return the samples of each topic instance.
-
-    If the log contains two subscriptions to one instance, their samples are merged, and only the
-    common fields are kept.
-    """
+    """Return the samples of each topic instance. Two subscriptions to one instance are merged."""
     tables: Tables = {}
     for subscription in ulog.data_list:
         table: TopicArrays = subscription.data
@@ -511,14 +488,14 @@ def _read_tables(ulog: ULog) -> Tables:
 
 
 def _find_data_span_us(tables: Tables, name: str) -> tuple[int, int]:
-    """Return first and last time (µs) of the IMU data; without IMU, of the largest topic."""
+    """Return first and last time (µs) of the IMU data, or of the largest topic without IMU."""
     for key in sorted(
         tables, key=lambda key: (key[0] != IMU_LAYOUT.topic, -len(tables[key]["timestamp"]))
     ):
         time_us = tables[key]["timestamp"].astype(np.int64)
         increasing_times_us = time_us[longest_increasing_run(time_us)]
         if len(increasing_times_us):
-            # Invalid timestamps may be hours away, so only the longest run without a gap is used
+            # Use the longest part without a gap, because invalid timestamps may be hours away
             gap_rows = (
                 np.flatnonzero(np.diff(increasing_times_us) > MAX_DATA_GAP_S / _MICROSECOND_S) + 1
             )
@@ -541,7 +518,6 @@ def _format_firmware(info: dict[str, Any]) -> str:
     major, minor, patch, release_type = (release & 0xFFFFFFFF).to_bytes(4, "big")
     if (major, minor, patch) == (0, 0, 0):
         return "PX4 development version"
-    # Release type in the last byte: 0 development, 64 alpha, 128 beta, 192 release candidate, 255
-    # release
+    # The last byte is 0 (development), 64 (alpha), 128 (beta), 192 (candidate) or 255 (release)
     suffix = ("-dev", "-alpha", "-beta", "-rc", "")[(release_type + 1) // 64]
     return f"{_read_printable_text(info, 'sys_name', 'PX4')} v{major}.{minor}.{patch}{suffix}"
