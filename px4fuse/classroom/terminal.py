@@ -20,7 +20,7 @@ def assignment_page(key: AnswerKey, folder: Path, key_file: Path, written_count:
         for mistake in answer.mistakes or ("none",)
     )
     difficulties = [answer.difficulty for answer in key.answers if answer.difficulty is not None]
-    folder_text, key_file_text = (to_one_line(str(path)) for path in (folder, key_file))
+    folder_text, key_path_text = (to_one_line(str(path)) for path in (folder, key_file))
     flight_count = len(key.answers)
     text_by_label = {
         "Class": f"{format_count(flight_count, 'student')}, {key.kind}",
@@ -32,7 +32,7 @@ def assignment_page(key: AnswerKey, folder: Path, key_file: Path, written_count:
         "that px4fuse detects in 19 of 20 flights, divided by the size in the flight.",
         "Flights": f"{folder_text} ({written_count} logs written, {flight_count - written_count} "
         "existed already)",
-        "Answers": f"{key_file_text} (not for students: the file lists the injected faults)",
+        "Answers": f"{key_path_text} (not for students: the file lists the injected faults)",
     }
     if key.secret:
         text_by_label["Secret"] = (

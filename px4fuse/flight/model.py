@@ -128,7 +128,7 @@ SENDER_CLOCK = "sender timestamps"
 DIAGNOSIS_WITHHELD = Unavailable(
     "diagnosis",
     "the flight is a student assignment, for which px4fuse shows no diagnosis",
-    "Analyse the flight with your own settings. Give your answers with px4fuse compare --answers.",
+    "Analyse the flight with your own settings. Give the answer form with compare --answers.",
 )
 
 

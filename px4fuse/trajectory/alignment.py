@@ -166,7 +166,7 @@ def _require_sufficient_motion(
         max_extent_m = float(np.linalg.norm(reference_extents_m))
         max_residual_ratio = MAX_RESIDUAL_RATIO_FOR_YAW
         motion_text = "horizontal motion"
-        remedy = "Use `alignment` none."
+        remedy = "Choose `alignment` none: the trajectories are then compared without alignment."
     else:
         # motion along a line does not determine the rotation around the line
         max_extent_m, extent_m, _ = np.minimum(

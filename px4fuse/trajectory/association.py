@@ -131,7 +131,7 @@ def choose_gap_limit_s(time_s: Array, min_gap_limit_s: float = MIN_GAP_LIMIT_S) 
 
 
 def is_bracketed(time_s: Array, reference_time_s: Array, gap_limit_s: float) -> BoolArray:
-    """Return a mask of times between two reference times that are at most ``gap_limit_s`` apart."""
+    """Return a mask of times whose neighbouring reference times differ by at most a limit."""
     next_indices = np.clip(np.searchsorted(reference_time_s, time_s), 1, len(reference_time_s) - 1)
     previous_reference_time_s = reference_time_s[next_indices - 1]
     next_reference_time_s = reference_time_s[next_indices]

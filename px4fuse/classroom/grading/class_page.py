@@ -71,16 +71,16 @@ def format_class_page(grades: Sequence[Grade], title: str, version_text: str) ->
 
 def _format_statistics(grades: Sequence[Grade], count_by_tag: Mapping[str, int]) -> str:
     """Format the statistics of the class: reports by status, and histograms of points."""
-    total_points = [grade.total for grade in grades if grade.total is not None]
+    points_of_students = [grade.total for grade in grades if grade.total is not None]
     max_points = max((grade.max_points for grade in grades if grade.max_points > 0.0), default=1.0)
     reports = counted_reports(grades)
     return load_template("classroom/grading/above.html").render(
         students=len(grades),
         counts=count_by_tag,
-        averages=(statistics.fmean(total_points), statistics.median(total_points))
-        if total_points
+        averages=(statistics.fmean(points_of_students), statistics.median(points_of_students))
+        if points_of_students
         else (),
-        totals=compute_histogram(total_points, max_points) if total_points else (),
+        totals=compute_histogram(points_of_students, max_points) if points_of_students else (),
         max_points_text=format_cell_number(max_points),
         max_points_edge=format_number(max_points),
         pending_points=[report.points for report in reports if report.instructor_action],
