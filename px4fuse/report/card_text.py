@@ -257,13 +257,13 @@ def _format_cause_lines(cause: DiagnosedCause) -> Iterator[Paragraph]:
 
 
 def label_alternatives(cause: DiagnosedCause) -> list[tuple[str, Action]]:
-    """Return the actions of a cause; alternatives begin with "EITHER " or "OR "."""
+    """Return the actions of a cause with "EITHER ", "OR " or "AND " if there are alternatives."""
     alternatives = [
         ("OR " if place else "EITHER ", action)
         for place, alternative in enumerate(cause.alternatives)
         for action in alternative
     ]
-    return alternatives + [("", action) for action in cause.actions]
+    return alternatives + [("AND " if alternatives else "", action) for action in cause.actions]
 
 
 def format_target(action: Action) -> str:
@@ -352,7 +352,7 @@ def _format_verdict_lines(card: Card) -> Iterator[Paragraph]:
     yield Paragraph(f"{legend:{AXIS_INDENT}}", plot=_format_tick_labels())
     if any(verdict.is_explained for verdict in card.verdicts):
         yield Paragraph(
-            "  A verdict in brackets is not a fault of the filter: its settings need no change."
+            "  A verdict in brackets has another reason than the settings of the filter; see below."
         )
     yield from map(_format_verdict_line, card.verdicts)
 

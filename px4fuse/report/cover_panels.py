@@ -105,7 +105,10 @@ def write_panels(block: PageBlock, analysis: Analysis, card: Card, free_height: 
     plots_height = free_height - legend["height"] - UNUSED_PAGE_HEIGHT
     if plots_height < MIN_PLOTS_HEIGHT:
         plots_height = NEXT_PAGE_PLOTS_HEIGHT
-        page.blocks.insert(0, {"kind": "break"})
+        note = Page()
+        if free_height > UNUSED_PAGE_HEIGHT:
+            note.write_small_text("Plots of the map, the errors and the innovations: next page.")
+        page.blocks[:0] = [*note.blocks, {"kind": "break"}]
     min_wide_map_height = (
         MAP_HEIGHT_RANGE[0]
         + INNOVATION_PLOT_HEIGHT_RANGE[0]
