@@ -64,7 +64,7 @@ def test_diagnosis_text_joins_alternative_actions_by_either_or() -> None:
     assert SENDER.sentence in lines[first]
     assert lines[first + 1].startswith("  OR EKF2 (console)  EKF2_EV_DELAY 0 → 264 ms")
     assert lines[first + 2].split() == ["param", "set", "EKF2_EV_DELAY", "264"]
-    assert lines[first + 3].startswith("  KF (shell)  ")
+    assert lines[first + 3].startswith("  AND KF (shell)  ")
     closing = " ".join(line.text for line in card_text.format_closing_lines(card))
     assert "Console means the MAVLink Console" in closing
     assert closing.endswith(f"px4fuse explain {card.id}")

@@ -69,7 +69,7 @@ ANTENNA_COLUMNS = ["antenna_forward_m", "antenna_right_m", "antenna_down_m"]
 FUSED_OBSERVATION_TRACK_NAME = "estimator_aid_src_ev_pos"
 RECONSTRUCTED_TRACK_NAME = "ekf2_state_plus_innovation"
 GPS_POSITION = "vehicle_gps_position"
-# Position sources with a topic of their own, without GNSS
+# Position sources that have their own topic, without GNSS
 SOURCE_TRACKS = [
     name for name, track in TRACK_SOURCES.items() if track.layouts and name != GPS_POSITION
 ]
