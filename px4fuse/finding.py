@@ -49,7 +49,7 @@ class Finding(Record, omit_defaults=False):
     def spans_text(self) -> str:
         """Times of the fault as text; "" for the whole flight."""
         if len(self.spans_s) > MAX_LISTED_SPANS:
-            return f"from {self.spans_s[0][0]:.1f} s to {self.spans_s[-1][1]:.1f} s"
+            return f"{self.spans_s[0][0]:.1f} s to {self.spans_s[-1][1]:.1f} s"
         return ", ".join(
             f"{start:.1f} s to {end:.1f} s" if end - start > MIN_SPAN_S else f"{start:.1f} s"
             for start, end in self.spans_s

@@ -48,12 +48,12 @@ NO_TRUTH_OVERLAP = Unavailable(
     "Record ground truth during the whole flight.",
 )
 # Names of the properties in which KF and EKF2 differ
-SAMPLE_TIMES_PROPERTY = "sample times and prediction steps"
+SAMPLE_TIMES_PROPERTY = "sample times and steps"
 TIMESTAMPS_PROPERTY = "timestamps and delay"
 MEASUREMENT_NOISE_PROPERTY = "measurement noise"
-ACCELEROMETER_BIAS_PROPERTY = "accelerometer bias estimated as a state"
+ACCELEROMETER_BIAS_PROPERTY = "accelerometer bias state"
 PROCESS_NOISE_PROPERTY = "process noise"
-ATTITUDE_PROPERTY = "attitude and gyro bias estimated as states"
+ATTITUDE_PROPERTY = "attitude and gyro bias states"
 MAGNETOMETER_PROPERTY = "magnetometer"
 GNSS_VELOCITY_PROPERTY = "GNSS velocity"
 FLOW_PROPERTY = "optical flow"

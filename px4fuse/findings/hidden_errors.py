@@ -159,10 +159,13 @@ def make_hidden_error_finding(
     is_fault_of_ekf2_only = is_kf_better and all(
         filter_name == "ekf2" for filter_name, *_ in errors_not_in_innovations
     )
-    remedy = (
-        "Check the time offset of the positions (px4fuse sync LOG). "
-        f"{find_source_texts(analysis.source).slow_error_check}."
-    )
+    time_offset_check = "Check the time offset of the positions (px4fuse sync LOG)."
+    if isinstance(analysis.clock, Unavailable):
+        time_offset_check = (
+            "A time offset of the positions is possible, but this log cannot show it: "
+            f"{analysis.clock.reason}. {analysis.clock.remedy}"
+        )
+    remedy = f"{time_offset_check} {find_source_texts(analysis.source).slow_error_check}."
     if cause is not None:
         remedy = format_action(analysis, cause.change)
     elif is_misaligned:

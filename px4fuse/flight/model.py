@@ -729,7 +729,7 @@ class Flight:
 
 
 def join_flights(airborne: Spans) -> Spans:
-    """Join flights (start and end in s) that are less than MIN_LANDED_DURATION_S apart."""
+    """Join flights (start and end in s) that are separated by less than MIN_LANDED_DURATION_S."""
     flight_spans_s: list[Span] = []
     for start_s, end_s in airborne:
         if flight_spans_s and start_s - flight_spans_s[-1][1] < MIN_LANDED_DURATION_S:

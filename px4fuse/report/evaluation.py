@@ -152,7 +152,7 @@ def _draw_rpe(axes: Axes, evaluation: Evaluation) -> None:
     axes.set_xticks(range(len(delta_texts)), delta_texts)
     axes.set_ylim(0.0, max(1.05 * axes.get_ylim()[1], MIN_ERROR_RANGE_M))
     axes.margins(x=0.1)
-    axes.set_xlabel("delta: distance, time or frames between two compared poses")
+    axes.set_xlabel("delta: distance, time or frames between poses")
 
 
 def _collect_rpe_statistics(evaluation: Evaluation) -> list[tuple[RelativeError, Statistics]]:
