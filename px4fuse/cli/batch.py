@@ -67,7 +67,7 @@ def batch(
         message = "no log was finished, and nothing was written."
         if (output / "rows").is_dir():
             message = (
-                f"results of finished logs are in {output}. Run the same command for the others."
+                f"results of finished logs are in {output}. Run the same command to continue."
             )
         raise outputs.Interrupted(interrupt, message) from None
     outputs.write_and_print_results(

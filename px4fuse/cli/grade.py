@@ -181,7 +181,7 @@ def grade(
             )
     except KeyboardInterrupt as interrupt:
         interruption_note = (
-            f"results of verified reports are in {output}. Run the same command for the others."
+            f"results of verified reports are in {output}. Run the same command to continue."
         )
         raise Interrupted(interrupt, interruption_note) from None
     write_and_print_results({}, grading_page(outcome), written_files=outcome.written_paths)
