@@ -91,6 +91,8 @@ def test_severity_of_noise_setting_depends_on_error_factor(
     assert (off.severity, off.factor) == (expected[0], pytest.approx(expected[1], rel=0.01))
 
 
+UNTESTED_SIGMA_Z = noises.UNTESTED_ESTIMATE_ACTION.format(other="SIGMA_A")
+UNTESTED_SIGMA_A = noises.UNTESTED_ESTIMATE_ACTION.format(other="SIGMA_Z")
 SIGMA_A_TO_0_1, BOTH = {"sigma_a_m_s2": 0.1}, {"sigma_a_m_s2": 0.1, "sigma_z_m": 0.5}
 
 
@@ -99,14 +101,14 @@ SIGMA_A_TO_0_1, BOTH = {"sigma_a_m_s2": 0.1}, {"sigma_a_m_s2": 0.1, "sigma_z_m":
     [
         ((trial(SIGMA_A_TO_0_1),),
          [("sigma_a_too_large", "error", "Set SIGMA_A to 0.1 m/s² (--sigma-a 0.1)."),
-          ("sigma_z_too_large", "warning", "To test the estimate, run again with --sigma-z 0.5.")]),
+          ("sigma_z_too_large", "warning", UNTESTED_SIGMA_Z)]),
         ((trial(BOTH), trial(SIGMA_A_TO_0_1, 9.0)),
          [(name, level, "Set SIGMA_A to 0.1 m/s² (--sigma-a 0.1) and SIGMA_Z to 0.5 m (--sigma-z "
            "0.5).")
           for name, level in (("sigma_a_too_large", "error"), ("sigma_z_too_large", "warning"))]),
         # a re-run that improves nothing: the other setting is the cause
         ((trial(SIGMA_A_TO_0_1, 9.0),),
-         [("sigma_z_too_large", "warning", "To test the estimate, run again with --sigma-z 0.5."),
+         [("sigma_z_too_large", "warning", UNTESTED_SIGMA_Z),
           ("sigma_a_too_large", "note", noises.NO_IMPROVEMENT_ACTION)]),
     ],
 )  # fmt: skip
@@ -122,7 +124,7 @@ def test_action_for_wrong_noise_uses_values_of_best_rerun(trials: Any, expected:
 @pytest.mark.parametrize(
     ("nis_mean", "rmse_m", "expected"),
     [
-        (0.78, None, ("error", "To test the estimate, run again with --sigma-a 0.1.")),
+        (0.78, None, ("error", UNTESTED_SIGMA_A)),
         (0.78, 0.3, ("note", noises.NO_IMPROVEMENT_ACTION)),
         (0.5, None, ("note", noises.NO_IMPROVEMENT_ACTION)),
     ],
@@ -159,10 +161,11 @@ def test_wrong_noise_report_contains_factor_and_estimated_noise() -> None:
     assert named(noises.detect_wrong_settings, analysis(source=MOVING)) == {}
 
 
-def test_recommended_sigma_z_is_at_least_5_mm() -> None:
+def test_sigma_z_below_5_mm_states_smallest_rerun_value() -> None:
     bounded = tuned(NoiseEstimate(None, None, 0.0021))
     finding = only(noises.detect_wrong_settings, analysis(source=MOVING, tuning=bounded))
-    assert finding.remedy == "To test the estimate, run again with --sigma-z 0.005."
+    assert finding.remedy == UNTESTED_SIGMA_Z
+    assert finding.message.endswith("Re-runs use a SIGMA_Z of at least 0.005 m.")
     assert finding.title.startswith("SIGMA_Z is at least 480 times too large")
     assert "estimate is at most 0.0021 m. KF's" in finding.message
 
