@@ -39,6 +39,7 @@ from px4fuse.findings.noises import _has_default_noises
 from px4fuse.flight.ekf2_parameters import EV_POS, GNSS_POS, PARAMETERS
 from px4fuse.flight.model import AS_RECEIVED_ORIGIN, GNSS_ORIGIN
 from px4fuse.loop.model import Closure, Loop, TrueFinalPose
+from px4fuse.report.phrases import make_tuning_advice
 
 MOVING = source(samples=positions(np.arange(0.0, 120.0), np.arange(120.0)))
 HOVERING = source(samples=positions(np.arange(0.0, 120.0)))
@@ -159,6 +160,23 @@ def test_wrong_noise_report_contains_factor_and_estimated_noise() -> None:
         "is 9 m/s². KF's covariance P grows too little" in worse.message
     )
     assert named(noises.detect_wrong_settings, analysis(source=MOVING)) == {}
+
+
+@pytest.mark.parametrize(
+    ("origin", "sigma_z_m", "expected"),
+    [
+        (GNSS_ORIGIN, 0.2, {"GNSS"}), (GNSS_ORIGIN, 3.0, {"Action"}),
+        (AS_RECEIVED_ORIGIN, 0.2, {"Action"}),
+    ],
+)  # fmt: skip
+def test_tune_advises_no_smaller_noise_of_gnss(
+    origin: Any, sigma_z_m: float, expected: set[str]
+) -> None:
+    fitted = tuned(NoiseEstimate(sigma_z_m, 0.9 * sigma_z_m, 1.1 * sigma_z_m), biases_fitted=False)
+    flight = analysis(
+        source=source(samples=MOVING.samples, origin=origin), log=log(autopilot="ArduPilot")
+    )
+    assert make_tuning_advice(flight, fitted).keys() == expected
 
 
 def test_sigma_z_below_5_mm_states_smallest_rerun_value() -> None:
