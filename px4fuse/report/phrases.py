@@ -266,9 +266,9 @@ def make_tuning_advice(
     ):
         bound_text = "" if tuning.sigma_a.value is not None else "at most "
         advice_by_label["SIGMA_A"] = (
-            f"Accelerometer noise alone is {bound_text}{accelerometer_noise:.2g} m/s². The estimate "
-            f"of SIGMA_A, {sigma_a.value:.2g} m/s², also includes accelerometer bias and tilt "
-            "error, which are not states of KF."
+            f"Accelerometer noise alone is {bound_text}{accelerometer_noise:.2g} m/s². The "
+            f"estimate of SIGMA_A, {sigma_a.value:.2g} m/s², also includes accelerometer bias and "
+            "tilt error, which are not states of KF."
         )
     if len(tuning.outlier_time_s):
         advice_by_label["Outliers"] = (
