@@ -5,21 +5,27 @@ from __future__ import annotations
 from types import SimpleNamespace
 from typing import Any
 
+import findings_tools
 import pytest
 from cards import verdicts
 from comparisons import compare
 from exchange import replace
 
 from px4fuse.analysis import Analysis
-from px4fuse.card.build import build_card, build_unusable_log_card
-from px4fuse.card.causes import make_cause, rank_causes
-from px4fuse.card.model import Action
+from px4fuse.card.build import (
+    _format_actions,
+    _format_changed_settings,
+    build_card,
+    build_unusable_log_card,
+)
+from px4fuse.card.causes import _find_action_target, make_cause, rank_causes
+from px4fuse.card.model import Action, Note
 from px4fuse.comparison.trials import RunStatistics, Trial, classify_improvement
 from px4fuse.diagnose import analyse_comparison
 from px4fuse.errors import LogError
 from px4fuse.filter.settings import Settings
 from px4fuse.findings import Finding
-from px4fuse.flight.model import AS_RECEIVED_ORIGIN
+from px4fuse.flight.model import AS_RECEIVED_ORIGIN, GNSS_ORIGIN
 from px4fuse.readers import read_log
 from px4fuse.report.card_text import format_card_lines
 from px4fuse.request import ComparisonRequest
@@ -189,6 +195,29 @@ def test_diagnosis_of_clean_flight_advises_no_change(sample: Analysis) -> None:
     assert (card.severity, card.id, card.causes) == ("clean", "", ())
     assert card.headline == "No fault found: KF and EKF2 are consistent"
     assert card.do_this == ("Change nothing.",)
+
+
+def test_actions_without_fault_agree_with_notes() -> None:
+    noise = Note("sigma_a_too_large", "", "Set SIGMA_A to 0.1 m/s² (--sigma-a 0.1).")
+    kept_noise = Note("kf_underconfident", "", "Do not reduce noise settings.")
+    expected = ("Optional: set SIGMA_A to 0.1 m/s² (--sigma-a 0.1).",)
+    assert _format_actions((), (kept_noise, noise)) == expected
+    assert _format_actions((), (kept_noise,)) == ("Change nothing.",)
+
+
+def test_changed_sigma_z_of_gnss_names_its_parameter() -> None:
+    gnss = findings_tools.analysis(source=findings_tools.source(origin=GNSS_ORIGIN))
+    changed = _format_changed_settings(gnss, ComparisonRequest(log="a.ulg", sigma_z_m=0.1))
+    assert changed == ("--sigma-z 0.1 (default from EKF2_GPS_P_NOISE)",)
+
+
+@pytest.mark.parametrize(
+    ("remedy", "target"),
+    [("Check EKF2_EV_DELAY.", "EKF2"), ("Correct the timestamps at the sender.", "sender")],
+)
+def test_owner_of_delay_action_is_named_device(remedy: str, target: str) -> None:
+    delay = findings_tools.made(Finding, id="ekf2_ev_delay_wrong", remedy=remedy)
+    assert _find_action_target(delay) == target
 
 
 def test_diagnosis_explains_differing_nis_and_nees_verdicts() -> None:

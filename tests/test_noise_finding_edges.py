@@ -39,6 +39,7 @@ from px4fuse.findings.noises import _has_default_noises
 from px4fuse.flight.ekf2_parameters import EV_POS, GNSS_POS, PARAMETERS
 from px4fuse.flight.model import AS_RECEIVED_ORIGIN, GNSS_ORIGIN
 from px4fuse.loop.model import Closure, Loop, TrueFinalPose
+from px4fuse.report.phrases import make_tuning_advice
 
 MOVING = source(samples=positions(np.arange(0.0, 120.0), np.arange(120.0)))
 HOVERING = source(samples=positions(np.arange(0.0, 120.0)))
@@ -91,6 +92,8 @@ def test_severity_of_noise_setting_depends_on_error_factor(
     assert (off.severity, off.factor) == (expected[0], pytest.approx(expected[1], rel=0.01))
 
 
+UNTESTED_SIGMA_Z = noises.UNTESTED_ESTIMATE_ACTION.format(other="SIGMA_A")
+UNTESTED_SIGMA_A = noises.UNTESTED_ESTIMATE_ACTION.format(other="SIGMA_Z")
 SIGMA_A_TO_0_1, BOTH = {"sigma_a_m_s2": 0.1}, {"sigma_a_m_s2": 0.1, "sigma_z_m": 0.5}
 
 
@@ -99,14 +102,14 @@ SIGMA_A_TO_0_1, BOTH = {"sigma_a_m_s2": 0.1}, {"sigma_a_m_s2": 0.1, "sigma_z_m":
     [
         ((trial(SIGMA_A_TO_0_1),),
          [("sigma_a_too_large", "error", "Set SIGMA_A to 0.1 m/s² (--sigma-a 0.1)."),
-          ("sigma_z_too_large", "warning", "To test the estimate, run again with --sigma-z 0.5.")]),
+          ("sigma_z_too_large", "warning", UNTESTED_SIGMA_Z)]),
         ((trial(BOTH), trial(SIGMA_A_TO_0_1, 9.0)),
          [(name, level, "Set SIGMA_A to 0.1 m/s² (--sigma-a 0.1) and SIGMA_Z to 0.5 m (--sigma-z "
            "0.5).")
           for name, level in (("sigma_a_too_large", "error"), ("sigma_z_too_large", "warning"))]),
         # a re-run that improves nothing: the other setting is the cause
         ((trial(SIGMA_A_TO_0_1, 9.0),),
-         [("sigma_z_too_large", "warning", "To test the estimate, run again with --sigma-z 0.5."),
+         [("sigma_z_too_large", "warning", UNTESTED_SIGMA_Z),
           ("sigma_a_too_large", "note", noises.NO_IMPROVEMENT_ACTION)]),
     ],
 )  # fmt: skip
@@ -122,7 +125,7 @@ def test_action_for_wrong_noise_uses_values_of_best_rerun(trials: Any, expected:
 @pytest.mark.parametrize(
     ("nis_mean", "rmse_m", "expected"),
     [
-        (0.78, None, ("error", "To test the estimate, run again with --sigma-a 0.1.")),
+        (0.78, None, ("error", UNTESTED_SIGMA_A)),
         (0.78, 0.3, ("note", noises.NO_IMPROVEMENT_ACTION)),
         (0.5, None, ("note", noises.NO_IMPROVEMENT_ACTION)),
     ],
@@ -159,10 +162,28 @@ def test_wrong_noise_report_contains_factor_and_estimated_noise() -> None:
     assert named(noises.detect_wrong_settings, analysis(source=MOVING)) == {}
 
 
-def test_recommended_sigma_z_is_at_least_5_mm() -> None:
+@pytest.mark.parametrize(
+    ("origin", "sigma_z_m", "expected"),
+    [
+        (GNSS_ORIGIN, 0.2, {"GNSS"}), (GNSS_ORIGIN, 3.0, {"Action"}),
+        (AS_RECEIVED_ORIGIN, 0.2, {"Action"}),
+    ],
+)  # fmt: skip
+def test_tune_advises_no_smaller_noise_of_gnss(
+    origin: Any, sigma_z_m: float, expected: set[str]
+) -> None:
+    fitted = tuned(NoiseEstimate(sigma_z_m, 0.9 * sigma_z_m, 1.1 * sigma_z_m), biases_fitted=False)
+    flight = analysis(
+        source=source(samples=MOVING.samples, origin=origin), log=log(autopilot="ArduPilot")
+    )
+    assert make_tuning_advice(flight, fitted).keys() == expected
+
+
+def test_sigma_z_below_5_mm_states_smallest_rerun_value() -> None:
     bounded = tuned(NoiseEstimate(None, None, 0.0021))
     finding = only(noises.detect_wrong_settings, analysis(source=MOVING, tuning=bounded))
-    assert finding.remedy == "To test the estimate, run again with --sigma-z 0.005."
+    assert finding.remedy == UNTESTED_SIGMA_Z
+    assert finding.message.endswith("Re-runs use a SIGMA_Z of at least 0.005 m.")
     assert finding.title.startswith("SIGMA_Z is at least 480 times too large")
     assert "estimate is at most 0.0021 m. KF's" in finding.message
 

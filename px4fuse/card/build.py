@@ -129,7 +129,7 @@ def build_card(
         student,
         source=f"{source_name(source)} {source.compute_rate_hz():.1f} Hz",
         settings=_format_settings(analysis, request),
-        changed=_format_changed_settings(request),
+        changed=_format_changed_settings(analysis, request),
         parameters=_format_changed_parameters(analysis),
         segment=f"{segment.start_s:.1f} to {segment.end_s:.1f} s, {segment.reason}",
     )
@@ -147,19 +147,20 @@ def build_card(
     effect = _summarise_errors(analysis)
     has_fault = any(verdict.is_fault for verdict in sigma_verdicts)
     severity: CardSeverity = "note" if has_fault else "clean"
+    notes = _make_notes(cause_findings, request.log)
     return Card(
         severity=causes[0].severity if causes else severity,
         id=causes[0].id if causes else "",
         headline=_make_headline(causes, sigma_verdicts),
         effect=effect,
         effect_text=_describe_effect(analysis, effect, sigma_verdicts),
-        do_this=_format_actions(causes),
+        do_this=_format_actions(causes, notes),
         verdicts=sigma_verdicts,
         reconcile=explanation,
         difference=_describe_difference(effect, ranked_causes),
         causes=causes,
         more_causes=max(len(ranked_causes) - MAX_CAUSES_ON_CARD, 0),
-        notes=_make_notes(cause_findings, request.log),
+        notes=notes,
         identity=analysis_description,
     )
 
@@ -172,14 +173,15 @@ def build_aids_card(
     faults = [finding for finding in cause_findings if finding.severity != "note"]
     causes = tuple(make_cause_without_reruns(finding) for finding in faults[:MAX_CAUSES_ON_CARD])
     missing_data = analysis.missing_data
+    notes = _make_notes(cause_findings, request.log)
     return Card(
         severity=causes[0].severity if causes else "clean",
         id=causes[0].id if causes else "",
         headline=causes[0].title if causes else "No fault found in EKF2's aiding sources",
-        do_this=_format_actions(causes),
+        do_this=_format_actions(causes, notes),
         causes=causes,
         more_causes=max(len(faults) - MAX_CAUSES_ON_CARD, 0),
-        notes=_make_notes(cause_findings, request.log),
+        notes=notes,
         aids=tuple(
             AidConsistency(
                 label=aid.label,
@@ -373,9 +375,11 @@ def _format_lengths(length_by_filter_m: Mapping[FilterName, float]) -> str:
     )
 
 
-def _format_actions(causes: Sequence[DiagnosedCause]) -> tuple[str, ...]:
+def _format_actions(causes: Sequence[DiagnosedCause], notes: Sequence[Note]) -> tuple[str, ...]:
     if not causes:
-        return ("Change nothing.",)
+        changes = [note.action for note in notes if note.action.startswith("Set ")]
+        optional_actions = [f"Optional: {lowercase_first_letter(change)}" for change in changes]
+        return tuple(dict.fromkeys(optional_actions))[:MAX_ACTIONS] or ("Change nothing.",)
     numbered_sentences: list[str] = []
     for number, cause in enumerate(causes, 1):
         alternative_texts = [
@@ -593,12 +597,14 @@ def _format_settings(analysis: Analysis, request: ComparisonRequest) -> str:
     return ", ".join(setting_texts)
 
 
-def _format_changed_settings(request: ComparisonRequest) -> tuple[str, ...]:
-    defaults = Settings()
+def _format_changed_settings(analysis: Analysis, request: ComparisonRequest) -> tuple[str, ...]:
+    default_texts = {name: f"{getattr(Settings(), name):g}" for name in KF_NUMERIC_SETTINGS}
+    if analysis.source.origin.is_gnss:
+        default_texts["sigma_z_m"] = f"from {find_aid(analysis).noise}"
     return tuple(
-        f"{COMPARISON_OPTIONS[name]} {value:g} (default {getattr(defaults, name):g})"
+        f"{COMPARISON_OPTIONS[name]} {value:g} (default {default_texts[name]})"
         for name in KF_NUMERIC_SETTINGS
-        if (value := getattr(request, name)) is not None and value != getattr(defaults, name)
+        if (value := getattr(request, name)) is not None and f"{value:g}" != default_texts[name]
     )
 
 

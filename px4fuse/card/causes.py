@@ -300,6 +300,8 @@ def _explain_missing_action(
 def _find_action_target(finding: Finding, source: PositionTrack | None = None) -> ActionTarget:
     group = FINDING_CATALOGUE[finding.id].group
     target = ACTION_TARGET_BY_FINDING_ID.get(finding.id) or ACTION_TARGET_BY_GROUP[group]
+    if target == "sender" and finding.remedy.startswith(("Set EKF2_", "Check EKF2_")):
+        target = "EKF2"
     is_gnss_receiver = target == "sender" and source is not None and source.origin.is_gnss
     return "receiver" if is_gnss_receiver else target
 

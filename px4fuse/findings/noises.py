@@ -41,7 +41,6 @@ from px4fuse.findings.source_positions import has_little_motion
 from px4fuse.flight.ekf2_parameters import BAROMETER, EV_POS, GNSS_POS, PARAMETERS
 from px4fuse.flight.model import Columns, Unavailable, sample_rate
 from px4fuse.readers.px4_innovations import has_fused_aid
-from px4fuse.request import COMPARISON_OPTIONS
 
 # Minimum factor between a noise setting and its estimate, for a warning
 MIN_SETTING_TO_ESTIMATE_FACTOR = 1.5
@@ -65,6 +64,11 @@ UNEXPLAINED_SIGMA_ACTION = (
 UNKNOWN_NOISE_ACTION = "The noise could not be estimated; px4fuse tune LOG states the reason."
 NO_IMPROVEMENT_ACTION = (
     "Change nothing: a re-run with the estimated noise improves neither KF's position nor its σ."
+)
+# One value of the joint estimate alone can make a consistent KF inconsistent
+UNTESTED_ESTIMATE_ACTION = (
+    "Do not change this setting alone: it is estimated together with {other}, and no re-run "
+    "confirmed the estimate."
 )
 
 
@@ -163,7 +167,9 @@ def _make_setting_finding(
     label, size_word = SETTING_RANGES[name].label, "small" if setting < estimated_noise else "large"
     is_upper_bound = noise.value is None
     effect, reason = EFFECT_AND_REASON_BY_WRONG_SETTING[name, size_word]
-    action = format_setting_action(analysis, name, estimated_noise)
+    action = format_setting_action(analysis, name)
+    if name == SIGMA_Z and estimated_noise < MIN_RERUN_SIGMA_Z_M:
+        reason += f" Re-runs use a SIGMA_Z of at least {MIN_RERUN_SIGMA_Z_M:g} m."
     return finding(
         "note" if action == NO_IMPROVEMENT_ACTION else severity,
         f"{label.lower()}_too_{size_word}",
@@ -188,7 +194,8 @@ def format_estimate(name: str, setting: float, noise: NoiseEstimate) -> str:
     return f"{label} is {setting:g} {unit}; its maximum-likelihood estimate is {value}"
 
 
-def format_setting_action(analysis: Analysis, name: str, value: float) -> str:
+def format_setting_action(analysis: Analysis, name: str) -> str:
+    """Return the change that a re-run confirmed, or the reason to change nothing."""
     if trial := find_trial(analysis.select_main_trials(), "kf", "noises", name):
         return format_kf_settings(trial.change)
     if any(
@@ -196,8 +203,8 @@ def format_setting_action(analysis: Analysis, name: str, value: float) -> str:
         for trial in analysis.select_main_trials()
     ):
         return NO_IMPROVEMENT_ACTION
-    value = max(value, MIN_RERUN_SIGMA_Z_M) if name == SIGMA_Z else value
-    return f"To test the estimate, run again with {COMPARISON_OPTIONS[name]} {value:.3g}."
+    other_name = SIGMA_A if name == SIGMA_Z else SIGMA_Z
+    return UNTESTED_ESTIMATE_ACTION.format(other=SETTING_RANGES[other_name].label)
 
 
 def find_setting_deviation(
@@ -245,7 +252,7 @@ def detect_process_noise_near_zero(analysis: Analysis) -> Findings:
             estimate_text = (
                 f"{format_estimate(SIGMA_A, sigma_a_m_s2, axis_tuning.sigma_a_two_state)}. "
             )
-            action = format_setting_action(analysis, SIGMA_A, estimated_sigma_a)
+            action = format_setting_action(analysis, SIGMA_A)
         yield make_error(
             "process_noise_near_zero",
             f"{title}: KF ignores new positions. {estimate_text}KF's position gain decreases to "

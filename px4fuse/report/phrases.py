@@ -27,6 +27,7 @@ from px4fuse.filter.consistency import Consistency
 from px4fuse.filter.settings import KF_NUMERIC_SETTINGS, SETTING_RANGES, Settings
 from px4fuse.filter.tuning import HORIZONTAL, AxisTuning, NoiseEstimate
 from px4fuse.findings import Finding, finding_title, split_cause_groups
+from px4fuse.findings.noises import KEEP_NOISE_BECAUSE_OF_CORRELATION_ACTION
 from px4fuse.flight.ekf2_parameters import EV_POS
 from px4fuse.flight.model import Alignment, ClockMap, Columns, Truth, Unavailable
 from px4fuse.report.page import Cell, Page, styled_text
@@ -202,12 +203,20 @@ def make_tuning_advice(
             "The position source may drift. The estimates describe the noise without the drift. Do "
             "not set SIGMA_Z or EKF2_EVP_NOISE below the error shown by ground truth or a loop."
         )
+    settings = comparison.settings
+    # Same restriction as the finding kf_underconfident of px4fuse compare
+    reduces_gnss_noise = comparison.source.origin.is_gnss and any(
+        noise.value is not None and noise.high is not None and noise.high < setting
+        for noise, setting in ((sigma_a, settings.sigma_a_m_s2), (sigma_z, settings.sigma_z_m))
+    )
+    if reduces_gnss_noise:
+        advice_by_label["GNSS"] = KEEP_NOISE_BECAUSE_OF_CORRELATION_ACTION.format(sensor="GNSS")
     option_texts = [
         f" {option} {noise.value:.3g}"
         for option, noise in (("--sigma-a", sigma_a), ("--sigma-z", sigma_z))
-        if noise.value is not None and not may_drift
+        if noise.value is not None
     ]
-    if option_texts:
+    if option_texts and not (may_drift or reduces_gnss_noise):
         command = f"px4fuse compare LOG{''.join(option_texts)}"
         advice_by_label["Action"] = f"Re-run with the estimates of {axis_name}: {command}"
     if sigma_z.value is None and sigma_z.low is not None:
@@ -257,9 +266,9 @@ def make_tuning_advice(
     ):
         bound_text = "" if tuning.sigma_a.value is not None else "at most "
         advice_by_label["SIGMA_A"] = (
-            f"Accelerometer noise alone is {bound_text}{accelerometer_noise:.2g} m/s². Set SIGMA_A "
-            f"to {sigma_a.value:.2g} m/s² to include accelerometer bias and tilt error, which are "
-            "not states of KF."
+            f"Accelerometer noise alone is {bound_text}{accelerometer_noise:.2g} m/s². The "
+            f"estimate of SIGMA_A, {sigma_a.value:.2g} m/s², also includes accelerometer bias and "
+            "tilt error, which are not states of KF."
         )
     if len(tuning.outlier_time_s):
         advice_by_label["Outliers"] = (
