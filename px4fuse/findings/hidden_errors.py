@@ -224,7 +224,7 @@ def _make_drift_finding(
         f"{sensor_name} drifts: {drift_text}. {rmse_sentence}The innovations of "
         f"{' and '.join(filter_labels)} do not show the drift, because the estimates follow "
         f"{sensor_name}. Do not reduce {noise_setting_names}.",
-        DRIFT_REMEDY if find_usable_loop(analysis) is None else f"{DRIFT_REMEDY} {LOOP_REMEDY}",
+        DRIFT_REMEDY if loop is None else f"{DRIFT_REMEDY} {LOOP_REMEDY}",
         evidence,
     )
 
@@ -290,5 +290,8 @@ def make_possible_drift_finding(analysis: Analysis) -> Finding:
             f"{loop.path_length_m:.0f} m."
         )
     loop_text = "" if loop is None else "from the loop closure error (px4fuse loop LOG) or "
-    action = f"Measure the drift {loop_text}with ground truth (ATT_POS_MOCAP). If the source is motion capture, run again with --source-kind mocap."
+    action = (
+        f"Measure the drift {loop_text}with ground truth (ATT_POS_MOCAP). If the source is motion "
+        "capture, run again with --source-kind mocap."
+    )
     return make_note("source_may_drift", message, action, evidence)

@@ -2,6 +2,7 @@
 
 import re
 from collections.abc import Callable, Iterable, Iterator, Sequence
+from functools import partial
 from itertools import zip_longest
 from typing import Literal
 
@@ -29,6 +30,8 @@ UNICODE_ENCODINGS = ("utf-8", "utf8", "utf-16")
 CARD_LINE_FUNCTIONS = {
     "card": format_card_lines,
     "closing": format_closing_lines,
+    "verbose card": partial(format_card_lines, verbose=True),
+    "verbose closing": partial(format_closing_lines, verbose=True),
     "headline": format_headline_lines,
 }
 LABEL_CHARACTERS = 9  # width of a label
@@ -68,7 +71,7 @@ def print_blocks(
                 print_line(console, block["label"], block["text"])
             case "blank":
                 console.print()
-            case "card" | "closing" | "headline":
+            case "card" | "closing" | "headline" | "verbose card" | "verbose closing":
                 _show_card(console, CARD_LINE_FUNCTIONS[block["kind"]], block["card"], request)
 
 
