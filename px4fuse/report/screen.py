@@ -27,7 +27,7 @@ from px4fuse.request import ComparisonRequest, Request, command_line
 # Terminal encodings with all characters of a diagnosis card
 UNICODE_ENCODINGS = ("utf-8", "utf8", "utf-16")
 # Functions that yield the lines of a diagnosis card
-CARD_LINE_FUNCTIONS = {
+CARD_LINE_FUNCTIONS: dict[str, Callable[[Card], Iterator[Paragraph]]] = {
     "card": format_card_lines,
     "closing": format_closing_lines,
     "verbose card": partial(format_card_lines, verbose=True),
