@@ -176,7 +176,7 @@ def analyse_comparison(comparison: Comparison, progress: Progress = ignore_progr
         **vars(reruns),
         events=collect_events(comparison),
         aids=evaluate_aids(flight),
-        loop=analyse_flight_loop(flight, progress),
+        loop=analyse_flight_loop(flight, progress, comparison.segment.flight_span_s),
     )
     return replace(analysis, findings=find(analysis))
 

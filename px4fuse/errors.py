@@ -15,18 +15,21 @@ arguments in backticks (`sigma_z_m`) are replaced by options (--sigma-z); the ex
 """
 
 from collections.abc import Iterable
+from pathlib import PurePath
 
 
-def suggest_name(name: str, known_names: Iterable[str]) -> str:
-    """Return "Did you mean X? " with the most similar known name X, or "".
+def suggest_name(
+    name: str, known_names: Iterable[str], folder: PurePath | None = None, cutoff: float = 0.7
+) -> str:
+    """Return "Did you mean X? " with the most similar known name X (in ``folder``), or "".
 
     >>> suggest_name("EKF2_EVP_NOIS", ["EKF2_EVP_GATE", "EKF2_EVP_NOISE"]), suggest_name("x", ["y"])
     ('Did you mean EKF2_EVP_NOISE? ', '')
     """
     import difflib  # noqa: PLC0415 - needed for errors only
 
-    similar_names = difflib.get_close_matches(name, list(known_names), n=1, cutoff=0.7)
-    return f"Did you mean {similar_names[0]}? " if similar_names else ""
+    similar_names = difflib.get_close_matches(name, list(known_names), n=1, cutoff=cutoff)
+    return f"Did you mean {PurePath(folder or '', similar_names[0])}? " if similar_names else ""
 
 
 def to_one_line(text: str) -> str:

@@ -121,7 +121,9 @@ def test_read_log_of_unsuitable_file_suggests_another_command(
 
 def test_read_log_with_mistyped_name_suggests_existing_file(tmp_path):
     make_log().write(tmp_path / "aisle_uwb.ulg")
-    assert read_error(tmp_path / "aisle_uvb.ulg").endswith("Did you mean aisle_uwb.ulg?")
+    assert read_error(tmp_path / "aisle_uvb.ulg").endswith(
+        f"Did you mean {tmp_path / 'aisle_uwb.ulg'}?"
+    )
 
 
 def test_read_log_without_known_topics_reports_no_data(tmp_path):

@@ -70,6 +70,18 @@ def test_diagnosis_text_joins_alternative_actions_by_either_or() -> None:
     assert closing.endswith(f"px4fuse explain {card.id}")
 
 
+def test_verbose_diagnosis_does_not_advise_verbose_output() -> None:
+    notes = tuple(Note(f"note_{number}", f"Text {number}.") for number in range(5))
+    card = replace(SMALL_SIGMA_A, notes=notes, more_causes=3)
+    for verbose in (False, True):
+        lines = (
+            *card_text.format_card_lines(card, verbose=verbose),
+            *card_text.format_closing_lines(card, verbose=verbose),
+        )
+        assert any("-v" in line.text.split() for line in lines[:-1]) is not verbose
+        assert lines[-1].text.startswith("More: -v.") is not verbose
+
+
 def test_diagnosis_text_has_numbered_causes_and_count_of_notes() -> None:
     notes = tuple(Note(f"note_{number}", f"Text {number}.") for number in range(5))
     card = replace(SMALL_SIGMA_A, causes=2 * SMALL_SIGMA_A.causes, notes=notes)

@@ -427,3 +427,13 @@ def test_ekf2_replay_segments_end_at_vision_and_imu_gaps(monkeypatch):
     assert segments(monkeypatch, fused=np.array([])) == []
     assert segments(monkeypatch, vision=np.arange(5.0, 40.0, 0.1)) == [(6.0, 40.9)]
     assert read_prediction_step_s(made(FusionRecord, parameters={})) == 0.01
+
+
+@pytest.mark.parametrize(
+    ("name", "suggestion"),
+    [("EKF2_EVP_NOIS", "Did you mean EKF2_EVP_NOISE?"), ("EKF2_EV_CTRL", ""), ("EKF2_EV_QMIN", "")],
+)
+def test_parameter_check_suggests_only_for_typing_errors(name: str, suggestion: str) -> None:
+    with pytest.raises(SettingsError, match=f"does not contain {name}, so") as raised:
+        check_parameters({name: 1.0})
+    assert raised.value.remedy.startswith(f"{suggestion} Choose from".lstrip())

@@ -872,6 +872,7 @@ def test_arrival_times_used_until_clock_sync_are_reported() -> None:
     assert finding.evidence == {"until_s": 32.0, "latency_s": 0.05}
     assert finding.spans_s == ((20.0, 32.0),)
     assert source_stamps.find_timesync_convergence(one) == (32.0, 0.05)
+    assert finding.remedy.endswith("(--start 32).")
     assert source_stamps.find_timesync_convergence(analysis(ekf2=ages(30, 0))) is None
 
 

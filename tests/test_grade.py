@@ -23,6 +23,7 @@ from px4fuse.classroom.grading.entries import Course, parse_late_rule
 from px4fuse.classroom.grading.grade import GradeOutcome, grade
 from px4fuse.classroom.grading.model import Grade, GradedReport
 from px4fuse.classroom.grading.rubric import read_rubric
+from px4fuse.classroom.terminal import grading_page
 from px4fuse.cli.outputs import Interrupted
 from px4fuse.core.reading import hash_files
 from px4fuse.core.workers import JobFailure
@@ -255,3 +256,10 @@ def test_grade_write_rubric_does_not_overwrite_existing_file(tmp_path, monkeypat
     run_checked("grade", "--write-rubric", "lab.toml")
     assert read_rubric(Path("lab.toml")) == read_rubric(None)
     assert "not overwritten" in error_line("grade", "--write-rubric", "lab.toml")
+
+
+def test_grading_page_counts_students_without_report() -> None:
+    unnamed = Grade("", "", Mock(status="verified"), max_points=1.0)
+    missing = Grade("Ada", "1", None, max_points=1.0)
+    page = grading_page(Mock(grades=(missing, unnamed), reports=(), notes=(), reused_count=0))
+    assert any("no submission from 1 student;" in str(block) for block in page.blocks)

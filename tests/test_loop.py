@@ -321,8 +321,16 @@ def test_loop_without_ground_truth_notes_assumed_landing_point(
     found = analyse(LoopSource(sample.trajectory, replace(sample.flight, truth=blind)))
     (finding,) = find_loop_findings(found)
     assert (finding.id, finding.severity) == ("loop_landing_assumed", "note")
-    assert "--landed-at" in finding.remedy
+    assert "px4fuse loop --landed-at" in finding.remedy
     assert find_loop_findings(analyse_loop(sample, landed_at=Landing(0.0, 0.0))) == ()
+
+
+@pytest.mark.parametrize("share", [1.0, 0.5])
+def test_loop_of_part_of_flight_is_unavailable(sample: LoopSource, share: float) -> None:
+    take_off_s, landing_s = sample.flight.airborne[0]
+    span_s = (take_off_s, take_off_s + share * (landing_s - take_off_s))
+    found = analyse_flight_loop(sample.flight, analysed_span_s=span_s)
+    assert isinstance(found, Unavailable) is (share < 1.0)
 
 
 def test_odometry_that_stops_in_flight_gets_no_loop_closure(sample: LoopSource) -> None:

@@ -31,6 +31,7 @@ from findings_tools import (
 )
 
 from px4fuse.comparison.trials import RunStatistics, Trial
+from px4fuse.convention.model import Convention, OrientationConvention
 from px4fuse.filter.settings import Settings
 from px4fuse.filter.tuning import NoiseEstimate
 from px4fuse.findings import cause_text, ekf2_noise, hidden_errors, loops, noises
@@ -548,6 +549,18 @@ def test_possible_drift_finding_states_loop_closure_error() -> None:
     assert "closure error" not in unclosed.message
 
 
+@pytest.mark.parametrize("heading_error_deg", [0.0, 90.0])
+def test_loop_advice_needs_correct_source_orientation(heading_error_deg: float) -> None:
+    orientation = OrientationConvention(
+        verdict="determined", heading_error_deg=heading_error_deg, tilt_difference_deg=0.1
+    )
+    convention = Convention(verdict="determined", orientation=orientation)
+    one = analysis(source=ODOMETRY, loop=closing(1.25), convention=convention)
+    remedy = only(hidden_errors.detect, one).remedy
+    assert ("px4fuse loop LOG" in remedy) is (heading_error_deg == 0.0)
+    assert (loops.find_usable_loop(one) is None) is (heading_error_deg != 0.0)
+
+
 END = TrueFinalPose(displacement_m={"forward": 0.0, "right": 0.0, "down": 0.0}, sigma_m=0.1,
               source="given", assumed=False)  # fmt: skip
 
@@ -570,7 +583,8 @@ def test_source_drift_title_states_closure_error_if_it_is_known(
     finding = only(hidden_errors.detect, one)
     assert (finding.id, finding.severity) == ("source_drift", "error")
     assert finding.title == f"VIO drifts: {size or 'position RMSE 0.40 m against ground truth'}"
-    assert finding.remedy == hidden_errors.DRIFT_REMEDY
+    assert finding.remedy.startswith(hidden_errors.DRIFT_REMEDY)
+    assert ("px4fuse loop LOG" in finding.remedy) is (loop is not NONE)
     assert ("closure_error_m" in finding.evidence) is (size is not None)
 
 

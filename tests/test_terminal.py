@@ -270,6 +270,14 @@ def test_report_is_not_replaced_by_report_on_log_of_same_name(desk, sample_log) 
     run_checked("compare", "l.ulg")
 
 
+@pytest.mark.usefixtures("no_drawing")
+def test_report_is_replaced_by_report_with_answers(desk) -> None:
+    run_checked("compare", "l.ulg")
+    run_checked("answers", "l.ulg")
+    run_checked("compare", "l.ulg", "--answers", "l.answers.toml")
+    assert b"log_sha256" in Path("reports/l.json").read_bytes()
+
+
 def test_explore_page_of_another_log_is_not_overwritten(desk, sample_log) -> None:
     (desk / "b").mkdir()
     shutil.copy(sample_log, desk / "b" / "l.ulg")

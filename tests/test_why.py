@@ -120,7 +120,10 @@ def test_report_without_ekf2_replay_omits_difference_page(sample: Analysis) -> N
 
 @pytest.mark.parametrize(
     ("share", "text"),
-    [(0.47, "decreases by 47 %."), (1.4, "decreases by 140 %. Other properties")],
+    [
+        (0.47, "decreases by 47 %."),
+        (1.4, "is 1.4 times the mean square difference KF - EKF2: other properties"),
+    ],
 )
 def test_kf_ekf2_difference_text_names_largest_contribution(sample, share, text) -> None:
     explanation = of(sample)

@@ -297,7 +297,10 @@ def _describe_effect(
 ) -> str:
     sentences, segment, flight = [], analysis.segment, analysis.segment.whole_flight
     if analysis.flight.airborne == () and has_little_motion(analysis):
-        return "The vehicle stayed on the ground, so the errors of KF and EKF2 are not evaluated."
+        return (
+            "The vehicle stayed on the ground, so the errors of KF and EKF2 apply only to a "
+            "vehicle at rest."
+        )
     if is_height_only(analysis.source):
         return "The source measures only the height, so horizontal errors are not evaluated."
     if effect.position_rmse_m:

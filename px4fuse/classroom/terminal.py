@@ -67,7 +67,7 @@ def grading_page(outcome: GradeOutcome) -> Page:
     missing_student_count = sum(grade.counted_report is None for grade in outcome.grades)
     page.write(
         f"{len(outcome.reports)} submissions: {counts_text or 'none'}; no submission from "
-        f"{missing_student_count} of {len(outcome.grades)} students; verified in an earlier run: "
+        f"{format_count(missing_student_count, 'student')}; verified in an earlier run: "
         f"{outcome.reused_count} submissions"
     )
     for grade in outcome.grades:

@@ -83,7 +83,7 @@ def compare(
     page = make_comparison_page(outcome, results, verbose=verbose, quiet=quiet)
     outputs.write_and_print_results(contents, page, request)
     if not quiet and STANDARD_OUTPUT not in contents:
-        outputs.show_page(make_card_page("closing", results.card))
+        outputs.show_page(make_card_page("closing", results.card, verbose=verbose))
     failed_verdicts = find_failed_checks(outcome) if checks else {}
     for name, verdict in failed_verdicts.items():
         click.echo(f"{name}: {verdict.replace('_', ' ')}", err=True)

@@ -163,10 +163,14 @@ def _is_same_report(
     from px4fuse.results.contract import find_file_hashes, to_json
 
     existing_results = read(existing_content, "report")
-    existing_hashes = find_file_hashes(to_json(existing_results))
-    return existing_hashes == find_file_hashes(to_json(new_results)) and _get_student_name_and_id(
-        existing_results
-    ) in (NO_STUDENT_NAME, _get_student_name_and_id(new_results))
+    # Sets, because answers of a student repeat the hash of the log
+    existing_hashes, new_hashes = (
+        set(find_file_hashes(to_json(results))) for results in (existing_results, new_results)
+    )
+    return existing_hashes == new_hashes and _get_student_name_and_id(existing_results) in (
+        NO_STUDENT_NAME,
+        _get_student_name_and_id(new_results),
+    )
 
 
 def _get_student_name_and_id(results: Results) -> tuple[str, str]:

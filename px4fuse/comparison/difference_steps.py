@@ -214,16 +214,18 @@ def add_cause_sentences(
 
 def _describe_step_effect(step: PropertyReplacement, explanation: DifferenceExplanation) -> str:
     explained_fraction = step.position_mean_square_m2 / explanation.position_mean_square_m2
-    # The contributions add up to 1, so one above 1 means that others are negative
-    opposite_effect_text = (
-        " Other properties of EKF2 increase the difference KF - EKF2."
-        if explained_fraction > 1.0
-        else ""
-    )
-    return (
+    change_text = (
         f"If KF uses EKF2's {step.name}, KF's position changes by up to "
-        f"{step.position_moved_m:.2f} m (at {step.moved_at_s:.1f} s), and the mean square "
-        f"difference KF - EKF2 decreases by {100 * explained_fraction:.0f} %.{opposite_effect_text}"
+        f"{step.position_moved_m:.2f} m (at {step.moved_at_s:.1f} s)"
+    )
+    if explained_fraction > 1.0:  # the contributions add up to 1, so others are negative
+        return (
+            f"{change_text}. This contribution is {explained_fraction:.2g} times the mean square "
+            "difference KF - EKF2: other properties of EKF2 have the opposite effect."
+        )
+    return (
+        f"{change_text}, and the mean square difference KF - EKF2 decreases by "
+        f"{100 * explained_fraction:.0f} %."
     )
 
 
@@ -298,7 +300,8 @@ def _describe_property_differences(
         steps.VISION_PROPERTY: "EKF2 fuses external vision and GNSS; KF uses one position source",
         steps.REJECTION_PROPERTY: (
             f"EKF2 rejects {100 * model.agreement.rejected_fraction_logged:.1f} % of the "
-            "positions; KF has no innovation gate and uses all positions"
+            f"positions of {ekf2_inputs.received_positions.source}; KF has no innovation gate "
+            "and uses all positions"
         ),
         steps.OUTPUT_PREDICTOR_PROPERTY: (
             f"EKF2 fuses positions with a delay of {1e3 * ekf2_inputs.horizon_s:.0f} ms. EKF2's "

@@ -396,6 +396,11 @@ def choose_segment(
             chosen_start_s = min(chosen_start_s, available_start_s)
             chosen_end_s = max(chosen_end_s, available_end_s)
             reason = "the whole time span with positions, because there are no positions in flight"
+    if start_s is not None and end_s is not None and end_s <= start_s:
+        raise SettingsError(
+            f"The end ({end_s:.6g} s) is not after the start ({start_s:.6g} s).",
+            "Change --start or --end.",
+        )
     if start_s is not None or end_s is not None:
         chosen_start_s = chosen_start_s if start_s is None else start_s
         chosen_end_s = chosen_end_s if end_s is None else end_s

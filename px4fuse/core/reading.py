@@ -81,7 +81,8 @@ def file_size(path: Path, error_type: type[Px4FuseError], name: str = "") -> int
         suggestion = ""
         with suppress(OSError):  # no suggestion if the folder cannot be listed
             if isinstance(error, FileNotFoundError):
-                suggestion = suggest_name(path.name, os.listdir(path.parent)).strip()  # noqa: PTH208
+                folder = path.parent
+                suggestion = suggest_name(path.name, os.listdir(folder), folder).strip()  # noqa: PTH208
         raise _make_read_error(name, error, error_type, suggestion) from error
     if stat.S_ISDIR(file_status.st_mode):
         raise error_type(f"{name} is a folder", "Give a file.")

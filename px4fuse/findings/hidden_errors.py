@@ -26,6 +26,7 @@ from px4fuse.filter.tuning import HORIZONTAL, AxisTuning
 from px4fuse.finding import Finding
 from px4fuse.findings.cause_grouping import CAUSE_KEY
 from px4fuse.findings.cause_text import classify_cause, format_action, rerun_refutes_cause
+from px4fuse.findings.loops import find_usable_loop
 from px4fuse.findings.model import (
     Findings,
     find_source_texts,
@@ -44,10 +45,8 @@ MIN_NEES_FOR_ERROR = 16.0
 MAX_KF_TO_EKF2_RMSE_RATIO = 0.7
 # The position frame is misaligned if alignment reduces the position RMSE to less than this fraction
 MAX_ALIGNED_RMSE_RATIO = 0.5
-DRIFT_REMEDY = (
-    "In the next flight, send an absolute position (GNSS, UWB) as well. To correct the path of "
-    "this flight by a loop closure, run px4fuse loop LOG."
-)
+DRIFT_REMEDY = "In the next flight, send an absolute position (GNSS, UWB) as well."
+LOOP_REMEDY = "To correct the path of this flight by a loop closure, run px4fuse loop LOG."
 FRAME_REMEDY = "Rotate and shift the positions into the frame of the ground truth."
 EKF2_REMEDY = (
     "Check delay, heading and other aiding sources of EKF2: KF has a smaller error with the "
@@ -197,7 +196,7 @@ def _make_drift_finding(
 
     ``filter_labels`` are the filters whose position error exceeds their reported σ.
     """
-    sensor_name, loop = source_name(analysis.source), analysis.loop
+    sensor_name, loop = source_name(analysis.source), find_usable_loop(analysis)
     drift_text = f"position RMSE {format_metres(worst_error.rmse_m)} m against ground truth"
     rmse_sentence = ""
     if alignment_rmse is not None:
@@ -208,7 +207,7 @@ def _make_drift_finding(
         rmse_sentence = (
             f"Before the alignment the RMSE is {format_metres(alignment_rmse.rmse_before_m)} m. "
         )
-    if isinstance(loop, Loop) and (closure_error_m := _find_closure_error_m(loop)) is not None:
+    if loop is not None and (closure_error_m := _find_closure_error_m(loop)) is not None:
         length_m = loop.path_length_m
         evidence = {**evidence, "closure_error_m": closure_error_m, "path_length_m": length_m}
         rmse_sentence = (
@@ -225,7 +224,7 @@ def _make_drift_finding(
         f"{sensor_name} drifts: {drift_text}. {rmse_sentence}The innovations of "
         f"{' and '.join(filter_labels)} do not show the drift, because the estimates follow "
         f"{sensor_name}. Do not reduce {noise_setting_names}.",
-        DRIFT_REMEDY,
+        DRIFT_REMEDY if loop is None else f"{DRIFT_REMEDY} {LOOP_REMEDY}",
         evidence,
     )
 
@@ -271,7 +270,7 @@ def _compute_alignment_rmse(
 
 
 def make_possible_drift_finding(analysis: Analysis) -> Finding:
-    sensor_name, loop = source_name(analysis.source), analysis.loop
+    sensor_name, loop = source_name(analysis.source), find_usable_loop(analysis)
     horizontal_tuning = analysis.tuning.get(HORIZONTAL)
     evidence: dict[str, float | str] = {"source": analysis.source.name}
     message = (
@@ -284,14 +283,15 @@ def make_possible_drift_finding(analysis: Analysis) -> Finding:
         bound_text = "at most " if horizontal_tuning.sigma_z.value is None else ""
         evidence |= {"short_term_noise_m": noise_m}
         message += f" The position noise (1 σ) is {bound_text}{noise_m:.2g} m, without the drift."
-    if isinstance(loop, Loop) and (closure_error_m := loop.closure_error_m) is not None:
+    if loop is not None and (closure_error_m := loop.closure_error_m) is not None:
         evidence |= {"closure_error_m": closure_error_m, "path_length_m": loop.path_length_m}
         message += (
             f" The loop closure error is {format_metres(closure_error_m)} m after a path of "
             f"{loop.path_length_m:.0f} m."
         )
+    loop_text = "" if loop is None else "from the loop closure error (px4fuse loop LOG) or "
     action = (
-        "Measure the drift from the loop closure error (px4fuse loop LOG) or with ground truth "
-        "(ATT_POS_MOCAP). If the source is motion capture, run again with --source-kind mocap."
+        f"Measure the drift {loop_text}with ground truth (ATT_POS_MOCAP). If the source is motion "
+        "capture, run again with --source-kind mocap."
     )
     return make_note("source_may_drift", message, action, evidence)

@@ -1,6 +1,7 @@
 """Faults of loop closures: contradictions to odometry, and wrong assumptions about the loop."""
 
 from px4fuse.analysis import Analysis
+from px4fuse.convention.correction import find_convention_faults
 from px4fuse.finding import Finding
 from px4fuse.findings.model import Findings, make_error, make_note, make_warning
 from px4fuse.loop.model import LANDING_CLOSURE_SOURCE, Closure, Loop
@@ -14,8 +15,19 @@ MIN_GNC_WEIGHT = 0.5
 
 
 def detect(analysis: Analysis) -> Findings:
-    if isinstance(analysis.loop, Loop):
-        yield from detect_loop_faults(analysis.loop)
+    if (loop := find_usable_loop(analysis)) is not None:
+        yield from detect_loop_faults(loop)
+
+
+def find_usable_loop(analysis: Analysis) -> Loop | None:
+    """Return the loop of the flight, or None if poses of the source have a wrong convention.
+
+    A loop closure then deforms the path, for example if the orientation has a wrong heading.
+    """
+    faults = find_convention_faults(analysis.convention, analysis.flight, analysis.source.frame)
+    if faults.orientation or faults.has_wrong_axes or faults.has_wrong_unit or faults.is_ambiguous:
+        return None
+    return analysis.loop if isinstance(analysis.loop, Loop) else None
 
 
 def detect_loop_faults(loop: Loop) -> Findings:
@@ -70,8 +82,8 @@ def detect_wrong_loop_assumptions(loop: Loop) -> Findings:
             "loop_landing_assumed",
             "The landing place is unknown, so px4fuse assumes the take-off place. If the vehicle "
             "landed elsewhere, the loop closure error contains the distance between both places.",
-            "Measure the landing place and state it: --landed-at FORWARD,RIGHT (m, along and to "
-            "the right of the nose at take-off).",
+            "Measure the landing place and state it: px4fuse loop --landed-at FORWARD,RIGHT (m, "
+            "along and to the right of the nose at take-off).",
             evidence,
         )
 
@@ -84,8 +96,8 @@ def _make_false_closure_finding(closure: Closure, is_end_assumed: bool) -> Findi
     action = "Remove this loop closure. In this run, px4fuse already ignores it."
     if is_landing:
         action = (
-            "If the vehicle landed elsewhere, state the place (--landed-at FORWARD,RIGHT) or "
-            "ignore the landing (--open)."
+            "If the vehicle landed elsewhere, state the place (px4fuse loop --landed-at "
+            "FORWARD,RIGHT) or ignore the landing (px4fuse loop --open)."
         )
     return make_error(
         "false_loop_closure",

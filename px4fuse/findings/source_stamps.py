@@ -1,5 +1,7 @@
 """Position timestamps that are constant, or that are arrival times instead of measurement times."""
 
+import math
+
 import numpy as np
 import pandas as pd
 
@@ -198,7 +200,7 @@ def detect_arrival_timestamps(analysis: Analysis) -> Findings:
             "(PX4 needs 500 answers). Later timestamps are times of measurement, "
             f"{latency_s:.3f} s before arrival. One time offset cannot correct the whole flight.",
             "Let the clocks synchronise for one minute before take-off. Analyse only the later "
-            f"time (--start {convergence_time_s:.0f}).",
+            f"time (--start {math.ceil(convergence_time_s)}).",
             {"until_s": convergence_time_s, "latency_s": latency_s},
             ((float(position_age_s.index[0]), convergence_time_s),),
         )

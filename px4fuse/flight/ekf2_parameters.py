@@ -73,6 +73,8 @@ AID_MASK_PARAMETER = "EKF2_AID_MASK"
 GNSS_MODE_PARAMETER = "EKF2_GPS_MODE"
 # Relative tolerance of parameter ranges, because logged values are rounded to float32
 FLOAT32_TOLERANCE = 1e-6
+# Minimum similarity (difflib ratio, 0 to 1) of a mistyped name; other PX4 parameters have less
+MIN_SIMILARITY_OF_MISTYPED_PARAMETER = 0.9
 # Delay (ms) from fix to timestamp of the first GNSS receiver (since PX4 v1.17)
 RECEIVER_DELAY_PARAMETERS = ("SENS_GNSS0_DELAY", "SENS_GPS0_DELAY")
 
@@ -218,9 +220,11 @@ def check_parameters(changes: Mapping[str, float]) -> dict[str, float]:
     for name, value in changes.items():
         parameter = PARAMETERS.get(name)
         if parameter is None:
+            # EKF2_EV_CTRL is a parameter of PX4 and not a typing error of EKF2_EV_DELAY
+            suggestion = suggest_name(name, PARAMETERS, cutoff=MIN_SIMILARITY_OF_MISTYPED_PARAMETER)
             raise SettingsError(
-                f"{name} is not a parameter of the EKF2 replay",
-                f"{suggest_name(name, PARAMETERS)}Choose from {', '.join(PARAMETERS)}.",
+                f"The EKF2 replay does not contain {name}, so a change cannot be replayed",
+                f"{suggestion}Choose from {', '.join(PARAMETERS)}.",
             )
         if fault := parameter.describe_range_error(name, value):
             raise SettingsError(f"{fault} (default {parameter.default:g}).")

@@ -5,6 +5,7 @@ from collections.abc import Callable
 import numpy as np
 
 from px4fuse.core.arrays import Array, IntArray
+from px4fuse.core.record import Span
 from px4fuse.errors import MissingDataError, SettingsError, TrajectoryError
 from px4fuse.filter.signals import Segment
 from px4fuse.flight.model import DIAGNOSIS_WITHHELD, Flight, Unavailable
@@ -265,7 +266,7 @@ def _compute_heading_error(
             quantity,
             f"the final heading differs by {heading_change_deg:+.0f}° from the initial heading, "
             "and the true heading change is unknown",
-            "Give the true heading change as DEG in --landed-at FORWARD,RIGHT,DEG.",
+            "Give the true heading change as DEG: px4fuse loop --landed-at FORWARD,RIGHT,DEG.",
         )
     return float(np.degrees(lie.wrap(np.radians(heading_change_deg - true_end.heading_change_deg))))
 
@@ -279,12 +280,24 @@ def find_truth_trajectory(flight: Flight) -> Trajectory | None:
 
 
 def analyse_flight_loop(
-    flight: Flight, progress: Callable[[str], None] = lambda _: None
+    flight: Flight,
+    progress: Callable[[str], None] = lambda _: None,
+    analysed_span_s: Span | None = None,
 ) -> Loop | Unavailable:
     """Compute the loop closure error of the odometry of a flight.
 
-    The result is Unavailable without odometry, or if the path does not return to its start.
+    The result is Unavailable without odometry, if the path does not return to its start, or if
+    the analysed time span (s) begins or ends in flight.
     """
+    if analysed_span_s is not None and not isinstance(flight.airborne, Unavailable):
+        for take_off_s, landing_s in flight.airborne:
+            if any(take_off_s < limit_s < landing_s for limit_s in analysed_span_s):
+                return Unavailable(
+                    "loop closure",
+                    "the analysed time span begins or ends in flight, so it is not a loop",
+                    "Analyse the whole flight (without --start and --end), or give two times at "
+                    "one place with px4fuse loop --closure.",
+                )
     odometry = find_odometry(flight)
     try:
         trajectory = trajectory_of(flight, "vio")

@@ -267,8 +267,8 @@ def _explain_gate_rejection(correction_name: str, closure: Closure) -> Unavailab
         correction_name,
         f"the χ² gate rejects {closure} (squared Mahalanobis distance {closure.d2:.1f}, "
         f"p {closure.p:.1g})",
-        "Measure the landing place (--landed-at), assume a larger odometry drift (--drift), or "
-        "give --open if the path does not return to its start.",
+        "Measure the landing place (px4fuse loop --landed-at), assume a larger odometry drift "
+        "(--drift), or give --open if the path does not return to its start.",
     )
 
 

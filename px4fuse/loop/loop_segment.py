@@ -82,6 +82,11 @@ def choose_loop_segment(
     SettingsError
         The trajectory has no poses in the segment.
     """
+    if start_s is not None and end_s is not None and end_s <= start_s:
+        raise SettingsError(
+            f"The end ({end_s:.12g} s) is not after the start ({start_s:.12g} s).",
+            "Change --from or --to.",
+        )
     segment_start_s, segment_end_s = track_start_s, track_end_s = trajectory.time_s[
         [0, -1]
     ].tolist()

@@ -86,7 +86,8 @@ class Paragraph(NamedTuple):
         )
 
 
-def format_card_lines(card: Card) -> Iterator[Paragraph]:
+def format_card_lines(card: Card, *, verbose: bool = False) -> Iterator[Paragraph]:
+    other_findings_place = "below" if verbose else "with -v"
     if card.severity == "refused":
         yield Paragraph(f"error[{card.id}]: {card.headline}", SEVERITY_STYLES["error"])
         for label, text in card.facts.items():
@@ -106,7 +107,7 @@ def format_card_lines(card: Card) -> Iterator[Paragraph]:
         yield from _format_labelled_lines(label, cause.why)
         yield from _format_cause_lines(cause)
     if card.more_causes:
-        yield Paragraph(f"{card.more_causes} more causes are listed with -v")
+        yield Paragraph(f"{card.more_causes} more causes are listed {other_findings_place}")
     for label, text in card.facts.items():
         yield from _format_labelled_lines(label, text)
     yield from _format_verdict_lines(card)
@@ -115,7 +116,7 @@ def format_card_lines(card: Card) -> Iterator[Paragraph]:
         yield from _wrap_lines(text, "  ", "  ")
     if card.notes:
         yield Paragraph("")
-    for text in note_texts(card, "with -v"):
+    for text in note_texts(card, other_findings_place):
         yield from _wrap_lines(text, "", "  ")
 
 
@@ -129,15 +130,16 @@ def note_texts(card: Card, other_notes_place: str) -> list[str]:
     return texts
 
 
-def format_closing_lines(card: Card) -> Iterator[Paragraph]:
-    """Yield the last lines of a diagnosis card: commands for details."""
+def format_closing_lines(card: Card, *, verbose: bool = False) -> Iterator[Paragraph]:
+    """Yield the last lines of a diagnosis card: commands for details, and terms."""
     actions = [action for cause in card.causes for _, action in label_alternatives(cause)]
-    text = "More: -v."
+    sentences = [] if verbose else ["More: -v."]
     if any(action.where == "console" for action in actions):
-        text += " Console means the MAVLink Console of QGroundControl."
+        sentences.append("Console means the MAVLink Console of QGroundControl.")
     if card.id:
-        text += f" Meaning: px4fuse explain {card.id}"
-    yield from _wrap_lines(text, "", "")
+        sentences.append(f"Meaning: px4fuse explain {card.id}")
+    if sentences:
+        yield from _wrap_lines(" ".join(sentences), "", "")
 
 
 def with_typed_path(card: Card, path: str | None) -> Card:

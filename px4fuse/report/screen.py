@@ -2,6 +2,7 @@
 
 import re
 from collections.abc import Callable, Iterable, Iterator, Sequence
+from functools import partial
 from itertools import zip_longest
 from typing import Literal
 
@@ -26,9 +27,11 @@ from px4fuse.request import ComparisonRequest, Request, command_line
 # Terminal encodings with all characters of a diagnosis card
 UNICODE_ENCODINGS = ("utf-8", "utf8", "utf-16")
 # Functions that yield the lines of a diagnosis card
-CARD_LINE_FUNCTIONS = {
+CARD_LINE_FUNCTIONS: dict[str, Callable[[Card], Iterator[Paragraph]]] = {
     "card": format_card_lines,
     "closing": format_closing_lines,
+    "verbose card": partial(format_card_lines, verbose=True),
+    "verbose closing": partial(format_closing_lines, verbose=True),
     "headline": format_headline_lines,
 }
 LABEL_CHARACTERS = 9  # width of a label
@@ -68,7 +71,7 @@ def print_blocks(
                 print_line(console, block["label"], block["text"])
             case "blank":
                 console.print()
-            case "card" | "closing" | "headline":
+            case "card" | "closing" | "headline" | "verbose card" | "verbose closing":
                 _show_card(console, CARD_LINE_FUNCTIONS[block["kind"]], block["card"], request)
 
 

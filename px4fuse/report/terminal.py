@@ -40,7 +40,7 @@ def make_comparison_page(
     quiet : bool
         True for the headline only.
     """
-    page = make_card_page("headline" if quiet else "card", results.card)
+    page = make_card_page("headline" if quiet else "card", results.card, verbose=verbose)
     if not verbose:
         return page
     if isinstance(analysis, AidingSourceAnalysis):
@@ -67,10 +67,11 @@ def _write_details(page: Page, analysis: Analysis, results: Any) -> None:
     write_findings(page, results.findings)
 
 
-def make_card_page(card_part: str, card: Card) -> Page:
+def make_card_page(card_part: str, card: Card, *, verbose: bool = False) -> Page:
     """Make a page with a diagnosis card, or with its "headline" or "closing" lines only."""
     page = Page()
-    page.add(card_part, card=card)
+    is_shorter_if_verbose = verbose and card_part != "headline"
+    page.add(f"verbose {card_part}" if is_shorter_if_verbose else card_part, card=card)
     return page
 
 
