@@ -66,9 +66,7 @@ def batch(
     except KeyboardInterrupt as interrupt:
         message = "no log was finished, and nothing was written."
         if (output / "rows").is_dir():
-            message = (
-                f"results of finished logs are in {output}. Run the same command to continue."
-            )
+            message = f"results of finished logs are in {output}. Run the same command to continue."
         raise outputs.Interrupted(interrupt, message) from None
     outputs.write_and_print_results(
         {}, format_summary(batch_result), written_files=batch_result.written_paths

@@ -186,7 +186,7 @@ def detect_wrong_gnss_delay(analysis: Analysis) -> Findings:
     ekf2_model = analysis.ekf2_model
     if isinstance(ekf2_model, Unavailable) or not ekf2_model.agreement.good:
         return
-    estimate = remedy.estimate_gnss_delay_ms(ekf2_model)
+    estimate = remedy.estimate_gnss_delay_ms(analysis, ekf2_model, analysis.clock)
     if estimate is None:
         return
     delay_ms, (estimated_delay_ms, sigma_ms) = ekf2_model.inputs.settings[GNSS_POS.delay], estimate
