@@ -10,7 +10,7 @@ from px4fuse.analysis import Analysis
 from px4fuse.card.model import Action, ActionTarget, DiagnosedCause, Rerun, Verdict
 from px4fuse.comparison.changes import SIGMA_A, SIGMA_Z
 from px4fuse.comparison.model import FILTER_NAMES, FilterName
-from px4fuse.comparison.remedy import select_changed_settings
+from px4fuse.comparison.remedy import make_delay_change, select_changed_settings
 from px4fuse.comparison.trials import (
     CLOCK_OFFSET_KEY,
     OUTLIERS_KEY,
@@ -203,6 +203,14 @@ def _make_actions(
     if finding.remedy:
         remedy = with_log_name(finding.remedy, request.log)
         sender_actions.append(Action(_find_action_target(finding, analysis.source), remedy))
+    model = analysis.ekf2_model
+    if (
+        finding.id == "ekf2_gps_delay_wrong"
+        and not ranked_cause.trials  # estimated by re-runs of the finding itself
+        and not isinstance(model, Unavailable)
+        and (change := make_delay_change(model.inputs, float(finding.evidence["estimate_ms"])))
+    ):
+        sender_actions = [make_parameter_action(analysis, change)]
     delay_trial = trial_by_filter_and_kind.get(("ekf2", "delay"))
     offset_trial = trial_by_filter_and_kind.get(
         ("ekf2", "time offset")
@@ -300,6 +308,9 @@ def _explain_missing_action(
 def _find_action_target(finding: Finding, source: PositionTrack | None = None) -> ActionTarget:
     group = FINDING_CATALOGUE[finding.id].group
     target = ACTION_TARGET_BY_FINDING_ID.get(finding.id) or ACTION_TARGET_BY_GROUP[group]
+    # EKF2_REMEDY and parameters of EKF2
+    if finding.id == "error_exceeds_reported_sigma" and "kf_sigma_p_m" not in finding.evidence:
+        target = "EKF2"
     is_gnss_receiver = target == "sender" and source is not None and source.origin.is_gnss
     return "receiver" if is_gnss_receiver else target
 

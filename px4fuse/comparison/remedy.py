@@ -147,8 +147,17 @@ def _find_differing_delay_ms(
 def estimate_differing_delay_ms(
     comparison: PreparedComparison, clock_offset: ClockOffset, logged_delay_ms: float
 ) -> float | None:
-    """Return the estimated delay (ms) of the positions if it differs from the logged delay."""
-    estimated_delay_ms = 1e3 * (comparison.source.assumed_delay_s - clock_offset.offset_s)
+    """Return the estimated delay (ms) of the positions if it differs from the logged delay.
+
+    A time offset from the user (--clock-offset) is kept if it is within the 95 % interval.
+    """
+    offset_s, (low_s, high_s) = clock_offset.offset_s, clock_offset.interval_s
+    faults = find_convention_faults(
+        comparison.convention, comparison.flight, comparison.source.frame
+    )
+    if clock_offset.applied_s and not faults.late_s and low_s <= clock_offset.applied_s <= high_s:
+        offset_s = clock_offset.applied_s
+    estimated_delay_ms = 1e3 * (comparison.source.assumed_delay_s - offset_s)
     return (
         estimated_delay_ms
         if clock_offset.is_significant(1e-3 * (logged_delay_ms - estimated_delay_ms))
