@@ -192,6 +192,16 @@ def find_logged_delay_ms(comparison: PreparedComparison) -> float | None:
     )
 
 
+def find_delay_max_change(
+    comparison: PreparedComparison, position_age_ms: float
+) -> dict[str, float]:
+    """Return a larger EKF2_DELAY_MAX than logged if it is required for this age (ms)."""
+    # log.parameters contain only the parameters of the results, without EKF2_DELAY_MAX
+    ekf2 = comparison.flight.ekf2
+    parameters = {} if isinstance(ekf2, Unavailable) else ekf2.parameters
+    return make_delay_max_change(parameters, position_age_ms)
+
+
 def make_estimated_noise_change(
     ekf2_inputs: ReplayInputs, noise_estimate: NoiseEstimate, noise_m: float
 ) -> dict[str, float]:

@@ -130,7 +130,7 @@ def _find_offset_remedy(analysis: Analysis, time_offset: ClockOffset) -> str:
         total_offset_s = compute_offset_for_option_s(analysis, time_offset)
         return f"Run again with --clock-offset {total_offset_s:.3f}."
     position_age_ms = (remedy.find_logged_delay_ms(analysis) or 0.0) - 1e3 * time_offset.remaining_s
-    delay_max_change = remedy.make_delay_max_change(analysis.flight.log.parameters, position_age_ms)
+    delay_max_change = remedy.find_delay_max_change(analysis, position_age_ms)
     delay_action = (
         f", and set {remedy.format_settings(delay_max_change)}" if delay_max_change else ""
     )
