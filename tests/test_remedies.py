@@ -2,6 +2,8 @@
 
 import re
 from functools import cache
+from types import SimpleNamespace
+from typing import Any
 
 import pytest
 from comparisons import compare
@@ -24,6 +26,7 @@ from px4fuse.ekf2.whatif import what_if
 from px4fuse.filter.settings import Settings
 from px4fuse.filter.tuning import AxisTuning, NoiseEstimate
 from px4fuse.findings import Finding, ekf2_rejecting, find, source_clock
+from px4fuse.findings.cause_text import format_sender_action
 from px4fuse.flight.model import GNSS_ORIGIN
 from px4fuse.simulation.faults import parse_faults
 from px4fuse.simulation.flights import simulate_flight
@@ -263,3 +266,10 @@ def test_gnss_delay_after_clock_offset_is_fault_of_ekf2(sample: Analysis) -> Non
     assert not list(source_clock.detect_time_offset(analysis, clock))
     # without --clock-offset, source_time_offset reports the same fault
     assert not list(source_clock.detect_wrong_delay(analysis, analysis.clock))
+
+
+def test_sender_without_timesync_answers_it_before_shifting() -> None:
+    """PX4 ignores the timestamps of a sender that does not answer TIMESYNC."""
+    for method, expected in ("arrival time", "Answer TIMESYNC"), ("TIMESYNC", "Subtract 0.400 s"):
+        source: Any = SimpleNamespace(clock_map=SimpleNamespace(method=method))
+        assert format_sender_action(source, -0.4).startswith(expected)

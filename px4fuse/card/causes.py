@@ -29,7 +29,7 @@ from px4fuse.filter.consistency import classify_sigma_ratio
 from px4fuse.filter.tuning import HORIZONTAL, AxisTuning
 from px4fuse.finding import Finding
 from px4fuse.findings.cause_grouping import WRONG_CONVENTION_KEY
-from px4fuse.findings.cause_text import format_timestamp_action
+from px4fuse.findings.cause_text import format_sender_action
 from px4fuse.findings.model import FINDING_CATALOGUE
 from px4fuse.flight.ekf2_parameters import PARAMETERS
 from px4fuse.flight.model import PositionTrack, Unavailable
@@ -230,7 +230,7 @@ def _make_actions(
         shift_s = offset_trial.change[CLOCK_OFFSET_KEY]
         if offset_trial.filter == "kf":
             shift_s -= analysis.settings.clock_offset_s
-        instruction = lowercase_first_letter(format_timestamp_action(shift_s))
+        instruction = lowercase_first_letter(format_sender_action(analysis.source, shift_s))
         sender_actions = [Action("sender", instruction)]
     alternative_action_groups: tuple[tuple[Action, ...], ...] = ()
     actions = delay_actions or sender_actions

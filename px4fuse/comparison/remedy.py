@@ -151,13 +151,17 @@ def estimate_differing_delay_ms(
 
     A time offset from the user (--clock-offset) is kept if it is within the 95 % interval.
     """
-    offset_s, (low_s, high_s) = clock_offset.offset_s, clock_offset.interval_s
-    faults = find_convention_faults(
-        comparison.convention, comparison.flight, comparison.source.frame
-    )
-    if clock_offset.applied_s and not faults.late_s and low_s <= clock_offset.applied_s <= high_s:
-        offset_s = clock_offset.applied_s
-    estimated_delay_ms = 1e3 * (comparison.source.assumed_delay_s - offset_s)
+    offset_s, applied_s, source = clock_offset.offset_s, clock_offset.applied_s, comparison.source
+    low_s, high_s = clock_offset.interval_s
+    if (
+        applied_s
+        and low_s <= applied_s <= high_s
+        and not find_convention_faults(
+            comparison.convention, comparison.flight, source.frame
+        ).late_s  # px4fuse applied this offset itself
+    ):
+        offset_s = applied_s
+    estimated_delay_ms = 1e3 * (source.assumed_delay_s - offset_s)
     return (
         estimated_delay_ms
         if clock_offset.is_significant(1e-3 * (logged_delay_ms - estimated_delay_ms))

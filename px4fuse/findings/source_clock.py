@@ -7,7 +7,7 @@ from px4fuse.comparison import remedy
 from px4fuse.comparison.model import FilterName, PreparedComparison
 from px4fuse.comparison.trials import Trial
 from px4fuse.filter.time_offset import ClockOffset
-from px4fuse.findings.cause_text import format_timestamp_action
+from px4fuse.findings.cause_text import format_sender_action
 from px4fuse.findings.model import Findings, finding, make_error, make_warning
 from px4fuse.findings.source_positions import find_low_pass
 from px4fuse.findings.source_stamps import find_timesync_convergence
@@ -134,7 +134,7 @@ def _find_offset_remedy(analysis: Analysis, time_offset: ClockOffset) -> str:
     delay_action = (
         f", and set {remedy.format_settings(delay_max_change)}" if delay_max_change else ""
     )
-    return f"{format_timestamp_action(time_offset.remaining_s)}{delay_action}."
+    return f"{format_sender_action(analysis.source, time_offset.remaining_s)}{delay_action}."
 
 
 def compute_offset_for_option_s(comparison: PreparedComparison, time_offset: ClockOffset) -> float:
