@@ -208,9 +208,11 @@ def _make_actions(
         finding.id == "ekf2_gps_delay_wrong"
         and not ranked_cause.trials  # estimated by re-runs of the finding itself
         and not isinstance(model, Unavailable)
-        and (change := make_delay_change(model.inputs, float(finding.evidence["estimate_ms"])))
+        and (
+            delay_change := make_delay_change(model.inputs, float(finding.evidence["estimate_ms"]))
+        )
     ):
-        sender_actions = [make_parameter_action(analysis, change)]
+        sender_actions = [make_parameter_action(analysis, delay_change)]
     delay_trial = trial_by_filter_and_kind.get(("ekf2", "delay"))
     offset_trial = trial_by_filter_and_kind.get(
         ("ekf2", "time offset")
