@@ -83,7 +83,9 @@ def test_recommended_actions_do_not_increase_rmse_when_applied(settings, mistake
             again = compare(analysis.flight, chosen, axes=AXES, **segment)
             assert errors_m(again) <= ROUNDING * errors_m(comparison), remedy
             followed += 1
-        if changes := parameters(remedy):
+        changes = parameters(remedy)
+        # EKF2_DELAY_MAX alone is only one part of the action; the sender does the other part
+        if changes.keys() - {"EKF2_DELAY_MAX"}:
             done = what_if(model, [changes])
             before, after = (
                 each.position_rmse_to_truth_m for each in (done.replayed, *done.whatif)
