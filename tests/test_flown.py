@@ -7,13 +7,14 @@ from typing import Any, NamedTuple
 import numpy as np
 import pytest
 from comparisons import compare
+from exchange import replace
 from flights import with_noises
 
 from px4fuse.card.build import build_card
 from px4fuse.comparison.model import FILTER_NAMES
 from px4fuse.diagnose import analyse_comparison
 from px4fuse.filter.time_offset import MAX_P_VALUE_OF_CHANGED_OFFSET
-from px4fuse.findings import find
+from px4fuse.findings import find, source_clock
 from px4fuse.readers import read_log
 from px4fuse.report.clock import make_time_offset_advice
 from px4fuse.request import ComparisonRequest
@@ -221,5 +222,10 @@ def test_recorded_flights_give_listed_findings_and_severities(
     assert ("ekf2_gps_delay_wrong" in found) == (name == "eg1_d0")
     if name == "eg1_d0":  # the true delay is 110 ms
         assert found["ekf2_gps_delay_wrong"].evidence["estimate_ms"] == pytest.approx(110.0, abs=15)
+        # vision with a wrong unit or time offset is no reference for GNSS
+        wrong_unit = replace(analysis.convention, unit="cm", verdict="determined")
+        late = replace(analysis.clock, offset_s=-0.2)
+        for wrong in replace(analysis, convention=wrong_unit), replace(analysis, clock=late):
+            assert "ekf2_gps_delay_wrong" not in {item.id for item in source_clock.detect(wrong)}
     if name == "eg1_evp20":
         assert "EKF2_EVP_NOISE to 0.1 m" in found["ekf2_underconfident"].remedy

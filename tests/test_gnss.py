@@ -666,7 +666,7 @@ def test_gnss_time_offset_advice_names_delay_parameter(delay_ms, age_s, remainin
         frame="NED",
     )
     log = SimpleNamespace(name="x.ulg", parameters={"EKF2_GPS_DELAY": delay_ms})
-    flight = SimpleNamespace(log=log)
+    flight = SimpleNamespace(log=log, ekf2=SimpleNamespace(parameters={}))
     comparison = SimpleNamespace(source=source, flight=flight, convention=None)
     clock = late(remaining_s, drift_ppm=None, drift_sigma_ppm=None)
     advice = make_time_offset_advice(comparison, clock).get("PX4")  # type: ignore[arg-type]

@@ -2,6 +2,8 @@
 
 import re
 from functools import cache
+from types import SimpleNamespace
+from typing import Any
 
 import pytest
 from comparisons import compare
@@ -24,6 +26,8 @@ from px4fuse.ekf2.whatif import what_if
 from px4fuse.filter.settings import Settings
 from px4fuse.filter.tuning import AxisTuning, NoiseEstimate
 from px4fuse.findings import Finding, ekf2_rejecting, find, source_clock
+from px4fuse.findings.cause_text import format_sender_action
+from px4fuse.flight.model import GNSS_ORIGIN
 from px4fuse.simulation.faults import parse_faults
 from px4fuse.simulation.flights import simulate_flight
 from px4fuse.simulation.scenario import Scenario
@@ -79,7 +83,9 @@ def test_recommended_actions_do_not_increase_rmse_when_applied(settings, mistake
             again = compare(analysis.flight, chosen, axes=AXES, **segment)
             assert errors_m(again) <= ROUNDING * errors_m(comparison), remedy
             followed += 1
-        if changes := parameters(remedy):
+        changes = parameters(remedy)
+        # EKF2_DELAY_MAX alone is only one part of the action; the sender does the other part
+        if changes.keys() - {"EKF2_DELAY_MAX"}:
             done = what_if(model, [changes])
             before, after = (
                 each.position_rmse_to_truth_m for each in (done.replayed, *done.whatif)
@@ -239,3 +245,33 @@ def test_advice_states_height_noise_if_it_differs_from_setting(sample: Analysis)
     assert "height noise of the source is 0.6 m. " in advice
     assert "send each position with a variance of 0.36 m² for z." in advice
     assert remedies.make_height_noise_advice(fused, tuning, 0.4) == ""
+
+
+def test_ekf2_delay_keeps_clock_offset_inside_interval(sample: Analysis) -> None:
+    clock = offset(sample, -0.145).clock  # the interval is ± 0.01 s
+    for applied_s, expected_ms in ((0.0, 145.0), (-0.15, 150.0), (-0.2, 145.0)):
+        clock = replace(clock, applied_s=applied_s)
+        delay_ms = remedies.estimate_differing_delay_ms(sample, clock, 0.0)
+        assert delay_ms == pytest.approx(expected_ms)
+
+
+def test_gnss_delay_after_clock_offset_is_fault_of_ekf2(sample: Analysis) -> None:
+    """--clock-offset corrects KF only."""
+    log = replace(sample.flight.log, parameters={"EKF2_GPS_DELAY": 0.0})
+    source = replace(sample.source, origin=GNSS_ORIGIN)
+    analysis = replace(
+        offset(sample, -0.15), source=source, flight=replace(sample.flight, log=log), trials=()
+    )
+    clock = replace(analysis.clock, applied_s=-0.15)
+    (finding,) = source_clock.detect_wrong_delay(analysis, clock)
+    assert finding.id == "ekf2_gps_delay_wrong"
+    assert not list(source_clock.detect_time_offset(analysis, clock))
+    # without --clock-offset, source_time_offset reports the same fault
+    assert not list(source_clock.detect_wrong_delay(analysis, analysis.clock))
+
+
+def test_sender_without_timesync_answers_it_before_shifting() -> None:
+    """PX4 ignores the timestamps of a sender that does not answer TIMESYNC."""
+    for method, expected in ("arrival time", "Answer TIMESYNC"), ("TIMESYNC", "Subtract 0.400 s"):
+        source: Any = SimpleNamespace(clock_map=SimpleNamespace(method=method))
+        assert format_sender_action(source, -0.4).startswith(expected)

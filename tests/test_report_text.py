@@ -203,7 +203,8 @@ def offset(**changes: Any) -> ClockOffset:
 
 def with_clock(found: ClockOffset | Unavailable, delay_ms: float = 0.0) -> Any:
     log = SimpleNamespace(name="x.ulg", parameters={"EKF2_EV_DELAY": delay_ms})
-    settings, flight = SimpleNamespace(clock_offset_s=0.0), SimpleNamespace(log=log)
+    ekf2 = SimpleNamespace(parameters={"EKF2_DELAY_MAX": 200.0})
+    settings, flight = SimpleNamespace(clock_offset_s=0.0), SimpleNamespace(log=log, ekf2=ekf2)
     return SimpleNamespace(
         clock=found, settings=settings, flight=flight, source=source(), convention=None
     )
@@ -242,12 +243,17 @@ def test_report_omits_time_offset_page_if_not_significant() -> None:
          {"Result": "0.250 s late", "Re-run": "--clock-offset -0.250", "PX4": "agrees"}),
         ({"offset_s": 0.25, "interval_s": (0.22, 0.28)}, 0.0,
          {"Result": "0.250 s early", "PX4": "cannot be negative"}),
-        ({"offset_s": 0.009, "interval_s": (0.008, 0.0095)}, 0.0, {"Result": "no significant"}),
+        ({"offset_s": 0.009, "interval_s": (0.008, 0.0095)}, 0.0,
+         {"Result": "below the limit for a correction of 0.036 s", "Offset": "The estimate is"}),
+        ({"offset_s": -0.25, "interval_s": (-0.28, -0.22)}, 0.0,
+         {"PX4": "250 ms (now 0 ms), or correct the sender's clock. For either correction, set "
+          "EKF2_DELAY_MAX to 300 ms."}),
         ({"change_p_value": 0.001}, 0.0, {"Changes": "+0.00 s from 10 s"}),
         ({"drift_ppm": 1000.0}, 0.0, {"Drift": "+1000 ± 588 ppm (95 %)."}),
         ({"drift_ppm": 100.0}, 0.0, {"Drift": "not significant"}),
     ],
-    ids=["fits", "other delay", "late", "early", "negligible", "changes", "drift", "no drift"],
+    ids=["fits", "other delay", "late", "early", "negligible", "delay max", "changes", "drift",
+         "no drift"],
 )  # fmt: skip
 def test_report_on_time_offset_reports_estimate_and_action(
     changes: dict[str, Any], delay_ms: float, expected: dict[str, str]

@@ -10,7 +10,7 @@ from px4fuse.analysis import Analysis
 from px4fuse.card.model import Action, ActionTarget, DiagnosedCause, Rerun, Verdict
 from px4fuse.comparison.changes import SIGMA_A, SIGMA_Z
 from px4fuse.comparison.model import FILTER_NAMES, FilterName
-from px4fuse.comparison.remedy import select_changed_settings
+from px4fuse.comparison.remedy import make_delay_change, select_changed_settings
 from px4fuse.comparison.trials import (
     CLOCK_OFFSET_KEY,
     OUTLIERS_KEY,
@@ -29,7 +29,7 @@ from px4fuse.filter.consistency import classify_sigma_ratio
 from px4fuse.filter.tuning import HORIZONTAL, AxisTuning
 from px4fuse.finding import Finding
 from px4fuse.findings.cause_grouping import WRONG_CONVENTION_KEY
-from px4fuse.findings.cause_text import format_timestamp_action
+from px4fuse.findings.cause_text import format_sender_action
 from px4fuse.findings.model import FINDING_CATALOGUE
 from px4fuse.flight.ekf2_parameters import PARAMETERS
 from px4fuse.flight.model import PositionTrack, Unavailable
@@ -203,6 +203,16 @@ def _make_actions(
     if finding.remedy:
         remedy = with_log_name(finding.remedy, request.log)
         sender_actions.append(Action(_find_action_target(finding, analysis.source), remedy))
+    model = analysis.ekf2_model
+    if (
+        finding.id == "ekf2_gps_delay_wrong"
+        and not ranked_cause.trials  # estimated by re-runs of the finding itself
+        and not isinstance(model, Unavailable)
+        and (
+            delay_change := make_delay_change(model.inputs, float(finding.evidence["estimate_ms"]))
+        )
+    ):
+        sender_actions = [make_parameter_action(analysis, delay_change)]
     delay_trial = trial_by_filter_and_kind.get(("ekf2", "delay"))
     offset_trial = trial_by_filter_and_kind.get(
         ("ekf2", "time offset")
@@ -222,7 +232,7 @@ def _make_actions(
         shift_s = offset_trial.change[CLOCK_OFFSET_KEY]
         if offset_trial.filter == "kf":
             shift_s -= analysis.settings.clock_offset_s
-        instruction = lowercase_first_letter(format_timestamp_action(shift_s))
+        instruction = lowercase_first_letter(format_sender_action(analysis.source, shift_s))
         sender_actions = [Action("sender", instruction)]
     alternative_action_groups: tuple[tuple[Action, ...], ...] = ()
     actions = delay_actions or sender_actions
@@ -300,7 +310,11 @@ def _explain_missing_action(
 def _find_action_target(finding: Finding, source: PositionTrack | None = None) -> ActionTarget:
     group = FINDING_CATALOGUE[finding.id].group
     target = ACTION_TARGET_BY_FINDING_ID.get(finding.id) or ACTION_TARGET_BY_GROUP[group]
-    if target == "sender" and finding.remedy.startswith(("Set EKF2_", "Check EKF2_")):
+    is_ekf2_parameter_set = finding.remedy.startswith(("Set EKF2_", "Check EKF2_"))
+    is_ekf2_error_only = (
+        finding.id == "error_exceeds_reported_sigma" and "kf_sigma_p_m" not in finding.evidence
+    )
+    if (target == "sender" and is_ekf2_parameter_set) or is_ekf2_error_only:
         target = "EKF2"
     is_gnss_receiver = target == "sender" and source is not None and source.origin.is_gnss
     return "receiver" if is_gnss_receiver else target

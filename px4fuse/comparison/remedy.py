@@ -8,6 +8,7 @@ import numpy as np
 
 from px4fuse.comparison.estimates import TuningByAxis, find_first_tuning
 from px4fuse.comparison.model import Comparison, PreparedComparison
+from px4fuse.convention.correction import find_convention_faults
 from px4fuse.ekf2.inputs import ReplayInputs
 from px4fuse.ekf2.model import Ekf2Model, replay_with_settings
 from px4fuse.ekf2.replay import rows_inside
@@ -29,14 +30,22 @@ MIN_FUSED_FRACTION_OF_HEIGHTS = 0.5
 MIN_HEIGHT_TO_HORIZONTAL_NOISE_RATIO = 2.0
 
 
-def estimate_gnss_delay_ms(model: Ekf2Model) -> tuple[float, float] | None:
+def estimate_gnss_delay_ms(
+    comparison: Comparison, model: Ekf2Model, clock_offset: ClockOffset | Unavailable
+) -> tuple[float, float] | None:
     """Estimate the GNSS delay and its σ (ms) by replays of EKF2 with values of EKF2_GPS_DELAY.
 
-    Return None if the delay does not differ significantly from the logged delay.
+    Return None if the delay does not differ significantly from the logged delay, or if the vision
+    that GNSS is compared with was not checked, or has a wrong convention or time offset.
     """
-    received_positions = model.inputs.received_positions
+    received_positions, vision = model.inputs.received_positions, model.inputs.vision_positions
+    convention, flight, source = comparison.convention, comparison.flight, comparison.source
     if (
-        model.inputs.vision_positions is None
+        vision is None
+        or source.name != vision.source
+        or find_convention_faults(convention, flight, source.frame)
+        or _find_differing_delay_ms(comparison, clock_offset, model.inputs.settings[EV_POS.delay])
+        is not None
         or received_positions.velocity_m_s is None
         or received_positions.uses_sender_timestamps
     ):
@@ -86,7 +95,7 @@ def estimate_ekf2_parameters(
         ekf2_inputs.vision_positions is not None
         and comparison.source.name == ekf2_inputs.vision_positions.source
     ):
-        if (gnss_delay := estimate_gnss_delay_ms(model)) is not None:
+        if (gnss_delay := estimate_gnss_delay_ms(comparison, model, clock_offset)) is not None:
             changes |= make_delay_change(ekf2_inputs, gnss_delay[0])
         # While EKF2 fuses GNSS, it increases the noise of vision at least to that of GNSS
         min_vision_noise_m = ekf2_inputs.settings[GNSS_POS.noise]
@@ -121,19 +130,38 @@ def is_source_fused(comparison: Comparison, ekf2_inputs: ReplayInputs) -> bool:
 def make_estimated_delay_change(
     comparison: Comparison, ekf2_inputs: ReplayInputs, clock_offset: ClockOffset | Unavailable
 ) -> dict[str, float]:
-    if isinstance(clock_offset, Unavailable) or not clock_offset.is_determinable:
-        return {}
-    estimated_delay_ms = estimate_differing_delay_ms(
+    estimated_delay_ms = _find_differing_delay_ms(
         comparison, clock_offset, ekf2_inputs.settings[ekf2_inputs.aid.delay]
     )
     return {} if estimated_delay_ms is None else make_delay_change(ekf2_inputs, estimated_delay_ms)
 
 
+def _find_differing_delay_ms(
+    comparison: Comparison, clock_offset: ClockOffset | Unavailable, logged_delay_ms: float
+) -> float | None:
+    if isinstance(clock_offset, Unavailable) or not clock_offset.is_determinable:
+        return None
+    return estimate_differing_delay_ms(comparison, clock_offset, logged_delay_ms)
+
+
 def estimate_differing_delay_ms(
     comparison: PreparedComparison, clock_offset: ClockOffset, logged_delay_ms: float
 ) -> float | None:
-    """Return the estimated delay (ms) of the positions if it differs from the logged delay."""
-    estimated_delay_ms = 1e3 * (comparison.source.assumed_delay_s - clock_offset.offset_s)
+    """Return the estimated delay (ms) of the positions if it differs from the logged delay.
+
+    A time offset from the user (--clock-offset) is kept if it is within the 95 % interval.
+    """
+    offset_s, applied_s, source = clock_offset.offset_s, clock_offset.applied_s, comparison.source
+    low_s, high_s = clock_offset.interval_s
+    if (
+        applied_s
+        and low_s <= applied_s <= high_s
+        and not find_convention_faults(
+            comparison.convention, comparison.flight, source.frame
+        ).late_s  # px4fuse applied this offset itself
+    ):
+        offset_s = applied_s
+    estimated_delay_ms = 1e3 * (source.assumed_delay_s - offset_s)
     return (
         estimated_delay_ms
         if clock_offset.is_significant(1e-3 * (logged_delay_ms - estimated_delay_ms))
@@ -166,6 +194,16 @@ def find_logged_delay_ms(comparison: PreparedComparison) -> float | None:
         if source.origin.is_fused_as_gnss and source.assumed_delay_s == 0.0 != logged_delay_ms
         else logged_delay_ms
     )
+
+
+def find_delay_max_change(
+    comparison: PreparedComparison, position_age_ms: float
+) -> dict[str, float]:
+    """Return a larger EKF2_DELAY_MAX than logged if it is required for this age (ms)."""
+    # log.parameters contain only the parameters of the results, without EKF2_DELAY_MAX
+    ekf2 = comparison.flight.ekf2
+    parameters = {} if isinstance(ekf2, Unavailable) else ekf2.parameters
+    return make_delay_max_change(parameters, position_age_ms)
 
 
 def make_estimated_noise_change(

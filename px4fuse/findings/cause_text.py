@@ -20,7 +20,7 @@ from px4fuse.filter.settings import SETTING_RANGES
 from px4fuse.findings import cause_grouping as kinds
 from px4fuse.findings.model import find_source_texts, format_percent, magnetometer_advice
 from px4fuse.flight.ekf2_parameters import PARAMETERS
-from px4fuse.flight.model import Unavailable
+from px4fuse.flight.model import PositionTrack, Unavailable
 from px4fuse.request import COMPARISON_OPTIONS
 
 
@@ -105,6 +105,19 @@ def format_action(analysis: Analysis, change: Mapping[str, float]) -> str:
     if settings:
         actions.append(format_kf_settings(settings))
     return " ".join(actions)
+
+
+def format_sender_action(source: PositionTrack, shift_s: float) -> str:
+    """Format the action of the sender for a time offset, without full stop.
+
+    PX4 ignores the timestamps of a sender that does not answer TIMESYNC.
+    """
+    if source.clock_map is not None and source.clock_map.method == "arrival time":
+        return (
+            "Answer TIMESYNC, so that PX4 uses the timestamps of the sender. Then measure the time "
+            "offset in a new flight (px4fuse sync)"
+        )
+    return format_timestamp_action(shift_s)
 
 
 def format_timestamp_action(shift_s: float) -> str:

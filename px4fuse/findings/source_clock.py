@@ -7,7 +7,7 @@ from px4fuse.comparison import remedy
 from px4fuse.comparison.model import FilterName, PreparedComparison
 from px4fuse.comparison.trials import Trial
 from px4fuse.filter.time_offset import ClockOffset
-from px4fuse.findings.cause_text import format_timestamp_action
+from px4fuse.findings.cause_text import format_sender_action
 from px4fuse.findings.model import Findings, finding, make_error, make_warning
 from px4fuse.findings.source_positions import find_low_pass
 from px4fuse.findings.source_stamps import find_timesync_convergence
@@ -19,6 +19,7 @@ MIN_OFFSET_FOR_ERROR_S = 0.10
 # Maximum ratio of KF's position RMSE with corrected timestamps to the RMSE without correction
 MAX_RMSE_RATIO_AFTER_CORRECTION = 1.005
 CORRECT_AT_SENDER_ACTION = "Correct the position timestamps before sending."
+CHECK_RECEIVER_ACTION = f"Check the delay of the GNSS receiver ({GNSS_POS.delay})."
 
 
 def detect(analysis: Analysis) -> Findings:
@@ -129,11 +130,11 @@ def _find_offset_remedy(analysis: Analysis, time_offset: ClockOffset) -> str:
         total_offset_s = compute_offset_for_option_s(analysis, time_offset)
         return f"Run again with --clock-offset {total_offset_s:.3f}."
     position_age_ms = (remedy.find_logged_delay_ms(analysis) or 0.0) - 1e3 * time_offset.remaining_s
-    delay_max_change = remedy.make_delay_max_change(analysis.flight.log.parameters, position_age_ms)
+    delay_max_change = remedy.find_delay_max_change(analysis, position_age_ms)
     delay_action = (
         f", and set {remedy.format_settings(delay_max_change)}" if delay_max_change else ""
     )
-    return f"{format_timestamp_action(time_offset.remaining_s)}{delay_action}."
+    return f"{format_sender_action(analysis.source, time_offset.remaining_s)}{delay_action}."
 
 
 def compute_offset_for_option_s(comparison: PreparedComparison, time_offset: ClockOffset) -> float:
@@ -144,15 +145,19 @@ def compute_offset_for_option_s(comparison: PreparedComparison, time_offset: Clo
 
 
 def detect_wrong_delay(analysis: Analysis, time_offset: ClockOffset) -> Findings:
-    # Only vision is tested: detect_time_offset reports a wrong EKF2_GPS_DELAY
-    delay_ms = remedy.find_logged_delay_ms(analysis) if analysis.source.origin.is_vision else None
-    estimated_delay_ms = -1e3 * time_offset.offset_s
-    if (
-        delay_ms is None
-        or remedy.estimate_differing_delay_ms(analysis, time_offset, delay_ms) is None
-    ):
+    source, delay_ms = analysis.source, remedy.find_logged_delay_ms(analysis)
+    is_gnss = source.origin.is_fused_as_gnss
+    if not (source.origin.is_vision or is_gnss) or delay_ms is None:
         return
-    delay_low_ms, delay_high_ms = (-1e3 * end_s for end_s in reversed(time_offset.interval_s))
+    # detect_time_offset reports a wrong EKF2_GPS_DELAY, unless --clock-offset corrects it for KF
+    if is_gnss and time_offset.is_significant(time_offset.remaining_s):
+        return
+    estimated_delay_ms = remedy.estimate_differing_delay_ms(analysis, time_offset, delay_ms)
+    if estimated_delay_ms is None:
+        return
+    delay_low_ms, delay_high_ms = (
+        1e3 * (source.assumed_delay_s - end_s) for end_s in reversed(time_offset.interval_s)
+    )
     interval_low_ms, interval_high_ms, abs_delay_ms = (
         round(delay_low_ms),
         round(delay_high_ms),
@@ -168,16 +173,21 @@ def detect_wrong_delay(analysis: Analysis, time_offset: ClockOffset) -> Findings
         )
     else:
         delay_text = f"the positions are {abs_delay_ms} ms late"
-    limit_text = remedy.describe_delay_limit("EKF2_EV_DELAY", estimated_delay_ms, delay_ms)
+    parameter = remedy.find_aid(analysis).delay
+    limit_text = remedy.describe_delay_limit(parameter, estimated_delay_ms, delay_ms)
+    sigma_ms = 1e3 * time_offset.sigma_s
+    correct_action = CHECK_RECEIVER_ACTION if is_gnss else CORRECT_AT_SENDER_ACTION
     yield make_warning(
-        "ekf2_ev_delay_wrong",
-        f"EKF2_EV_DELAY is {delay_ms:g} ms, but {delay_text}. The 95 % interval is "
+        "ekf2_gps_delay_wrong" if is_gnss else "ekf2_ev_delay_wrong",
+        f"{parameter} is {delay_ms:g} ms, but {delay_text}. The 95 % interval is "
         f"{interval_low_ms} to {interval_high_ms} ms. EKF2 fuses each position at the wrong time, "
         "so its track leads or "
         "lags the "
-        f"motion.{f' The parameter EKF2_EV_DELAY cannot {limit_text}.' if limit_text else ''}",
-        CORRECT_AT_SENDER_ACTION if limit_text else _find_delay_remedy(analysis),
-        {"ekf2_ev_delay_ms": delay_ms, "asked_ms": estimated_delay_ms},
+        f"motion.{f' The parameter {parameter} cannot {limit_text}.' if limit_text else ''}",
+        correct_action if limit_text else _find_delay_remedy(analysis, parameter, correct_action),
+        {"ekf2_gps_delay_ms": delay_ms, "estimate_ms": estimated_delay_ms, "sigma_ms": sigma_ms}
+        if is_gnss
+        else {"ekf2_ev_delay_ms": delay_ms, "asked_ms": estimated_delay_ms},
     )
 
 
@@ -186,30 +196,31 @@ def detect_wrong_gnss_delay(analysis: Analysis) -> Findings:
     ekf2_model = analysis.ekf2_model
     if isinstance(ekf2_model, Unavailable) or not ekf2_model.agreement.good:
         return
-    estimate = remedy.estimate_gnss_delay_ms(ekf2_model)
+    estimate = remedy.estimate_gnss_delay_ms(analysis, ekf2_model, analysis.clock)
     if estimate is None:
         return
     delay_ms, (estimated_delay_ms, sigma_ms) = ekf2_model.inputs.settings[GNSS_POS.delay], estimate
+    change = remedy.make_delay_change(ekf2_model.inputs, estimated_delay_ms)
     yield make_warning(
         "ekf2_gps_delay_wrong",
         f"{GNSS_POS.delay} is {delay_ms:g} ms, but GNSS positions and velocities are "
         f"{estimated_delay_ms:.0f} ms late (± {1.96 * sigma_ms:.0f} ms, 95 %, compared with "
         "vision). EKF2 fuses each GNSS sample at the wrong time, so its track leads or lags the "
         "motion.",
-        f"Set {remedy.format_settings({GNSS_POS.delay: round(estimated_delay_ms)})}.",
+        f"Set {remedy.format_settings(change)}." if change else CHECK_RECEIVER_ACTION,
         {"ekf2_gps_delay_ms": delay_ms, "estimate_ms": estimated_delay_ms, "sigma_ms": sigma_ms},
     )
 
 
-def _find_delay_remedy(analysis: Analysis) -> str:
+def _find_delay_remedy(analysis: Analysis, parameter: str, action_if_not_confirmed: str) -> str:
     trial = _find_trial(analysis, "ekf2", "delay")
     if trial is None:
-        return "Check EKF2_EV_DELAY."
+        return f"Check {parameter}."
     after_to_before_ratio = _compute_rmse_ratio(trial)
     if math.isnan(after_to_before_ratio) and trial.before.nis_mean and trial.after.nis_mean:
         after_to_before_ratio = trial.after.nis_mean / trial.before.nis_mean
     return (
         f"Set {remedy.format_settings(trial.change)}."
         if after_to_before_ratio < 1.0
-        else CORRECT_AT_SENDER_ACTION
+        else action_if_not_confirmed
     )

@@ -8,7 +8,9 @@ from px4fuse.comparison.remedy import (
     describe_delay_limit,
     estimate_differing_delay_ms,
     find_aid,
+    find_delay_max_change,
     find_logged_delay_ms,
+    format_settings,
 )
 from px4fuse.convention.correction import find_convention_faults
 from px4fuse.filter.time_offset import ClockOffset
@@ -74,6 +76,14 @@ def make_time_offset_advice(
         )
         suggested_offset_s = compute_offset_for_option_s(comparison, time_offset)
         advice_by_label["Re-run"] = f"px4fuse compare LOG --clock-offset {suggested_offset_s:.3f}"
+    elif not low_offset_s <= 0.0 <= high_offset_s:
+        advice_by_label["Result"] = (
+            f"The time offset is below the limit for a correction of {time_offset.limit_s:.3f} s."
+        )
+        advice_by_label["Offset"] = (
+            f"The estimate is {offset_s:+.3f} s (95 % {low_offset_s:+.3f} to {high_offset_s:+.3f} "
+            "s)."
+        )
     if (logged_delay_ms := find_logged_delay_ms(comparison)) is not None:
         advice_by_label["PX4"] = _format_delay_advice(comparison, time_offset, logged_delay_ms)
     if time_offset.has_changed():
@@ -116,9 +126,15 @@ def _format_delay_advice(
             f"The maximum-likelihood {delay_parameter} is {fitted_delay_ms:.0f} ms, but "
             f"{delay_parameter} cannot {limit_text}. Correct the sender's clock."
         )
+    delay_max_change = find_delay_max_change(comparison, fitted_delay_ms)
+    delay_max_text = (
+        f" For either correction, set {format_settings(delay_max_change)}."
+        if delay_max_change
+        else ""
+    )
     return (
         f"Set {delay_parameter} to {max(fitted_delay_ms, 0.0):.0f} ms (now {logged_delay_ms:g} "
-        "ms), or correct the sender's clock."
+        f"ms), or correct the sender's clock.{delay_max_text}"
     )
 
 
