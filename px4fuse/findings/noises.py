@@ -41,6 +41,7 @@ from px4fuse.findings.source_positions import has_little_motion
 from px4fuse.flight.ekf2_parameters import BAROMETER, EV_POS, GNSS_POS, PARAMETERS
 from px4fuse.flight.model import Columns, Unavailable, sample_rate
 from px4fuse.readers.px4_innovations import has_fused_aid
+from px4fuse.request import COMPARISON_OPTIONS
 
 # Minimum factor between a noise setting and its estimate, for a warning
 MIN_SETTING_TO_ESTIMATE_FACTOR = 1.5
@@ -203,6 +204,8 @@ def format_setting_action(analysis: Analysis, name: str) -> str:
         for trial in analysis.select_main_trials()
     ):
         return NO_IMPROVEMENT_ACTION
+    if getattr(analysis.request, name, None) is not None:
+        return f"To test the default value, run again without {COMPARISON_OPTIONS[name]}."
     other_name = SIGMA_A if name == SIGMA_Z else SIGMA_Z
     return UNTESTED_ESTIMATE_ACTION.format(other=SETTING_RANGES[other_name].label)
 
