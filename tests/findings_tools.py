@@ -142,7 +142,7 @@ def analysis(
             "time_correlated_noise",
         ),
         NONE,
-    ) | {"convention": None}
+    ) | {"convention": None, "request": None}
     by_name = {each.axis.name: each for each in axes}
     return SimpleNamespace(  # type: ignore[return-value]
         flight=SimpleNamespace(log=log, ekf2=ekf2, **flown), source=source, axes=by_name,

@@ -610,3 +610,11 @@ def test_changed_setting_text_contains_old_and_new_value(
     model = SimpleNamespace(inputs=SimpleNamespace(settings=dict.fromkeys(PARAMETERS, 7.0)))
     one = analysis(settings=replace(CHOSEN, clock_offset_s=0.1), ekf2_model=model)
     assert cause_text.format_change(one, tried(owner, change)) == expected
+
+
+def test_unconfirmed_noise_that_the_user_set_is_compared_with_default() -> None:
+    request = SimpleNamespace(sigma_z_m=0.3, sigma_a_m_s2=None)
+    one = analysis(request=request, trials=())
+    default_text = "To test the default value, run again without --sigma-z."
+    assert noises.format_setting_action(one, "sigma_z_m") == default_text
+    assert noises.format_setting_action(one, "sigma_a_m_s2").startswith("Do not change")
