@@ -66,7 +66,7 @@ def trial(
 
 
 def analysis(*trials: Trial) -> Any:
-    source = SimpleNamespace(origin=AS_RECEIVED_ORIGIN, alignment=None)
+    source = SimpleNamespace(origin=AS_RECEIVED_ORIGIN, alignment=None, clock_map=None)
     model = SimpleNamespace(inputs=SimpleNamespace(settings={"EKF2_ACC_NOISE": 0.35}))
     return SimpleNamespace(
         select_main_trials=lambda: trials,

@@ -271,7 +271,7 @@ def test_evaluated_segment_uses_start_and_end_options():
         assert ("--start" in segment.reason) == (start_s is not None)
         assert ("--end" in segment.reason) == (end_s is not None)
     for start_s, end_s, said in (
-        (9.0, 9.0, "no positions"), (9.0, 5.0, "no positions"), (50.0, None, "no positions"),
+        (9.0, 9.0, "is not after"), (9.0, 5.0, "is not after"), (50.0, None, "no positions"),
         (5.0, 5.3, "at least 3"), (18.5, 19.5, "at least 3"),
     ):  # fmt: skip
         with pytest.raises(SettingsError, match=said):
