@@ -281,10 +281,13 @@ def detect_constant_coordinates(analysis: Analysis) -> Findings:
             make_finding = make_note
         action = f"{setting_action}, so that EKF2 does not fuse {coordinates_text}. "
     values_text = ", ".join(f"{values_m[each]:g}" for each in coordinates)
+    subject, verb, pronoun = ("coordinates", "are", "them")
+    if is_single_coordinate:
+        subject, verb, pronoun = ("coordinate", "is", "it")
     yield make_finding(
         finding_id,
-        f"The source {source.name} does not measure {coordinates_text}: the value is always "
-        f"{values_text} m. {consequence}",
+        f"The {subject} {coordinates_text} of {source.name} {verb} constant ({values_text} m): the "
+        f"source does not measure {pronoun}. {consequence}",
         f"{action}Send NaN for a coordinate that is not measured.",
         {f"{each}_m": value for each, value in values_m.items()},
     )
