@@ -216,12 +216,14 @@ def test_explore_page_step_view_shows_one_measurement_at_a_time(
     updates, steps = result.replay.updates, result.replay.steps
     open_view(page, "step")
     first = page.ask("document.getElementById('now').textContent")
-    assert first == f"Measurement 1 of {len(updates)}, at {updates.index[0]:.3f} s"
+    measurement_text = f"Measurement 1 of {len(updates)}, at {updates.index[0]:.3f} s"
+    assert first == f"{measurement_text}: after the update of KF"
     page.click("#next")
     page.click("#next")
     page.click("#previous")
     now = page.ask("document.getElementById('now').textContent")
-    assert now == f"Measurement 2 of {len(updates)}, at {updates.index[1]:.3f} s"
+    measurement_text = f"Measurement 2 of {len(updates)}, at {updates.index[1]:.3f} s"
+    assert now == f"{measurement_text}: after the update of KF"
     text = page.ask("document.getElementById('numbers').innerText")
     row, after = updates.iloc[1], steps.loc[updates.index[1]]
     for part in (

@@ -234,7 +234,7 @@ def simulation_of(typed: str) -> flights.Simulation:
     names = {field.name for field in dataclasses.fields(Scenario)} - {"kind", "truth", "ekf2"}
     chosen = {name: given[name] for name in names if given.get(name) is not None}
     scenario = make_scenario(given["kind"], truth=not given["no_truth"], **chosen)
-    return flights.simulate(scenario, parse_faults(given["mistake"]))
+    return flights.simulate(scenario, parse_faults(given["fault_texts"]))
 
 
 def answers_of(form: dict[str, Any]) -> Answers:
