@@ -244,7 +244,8 @@ def test_report_omits_time_offset_page_if_not_significant() -> None:
         ({"offset_s": 0.25, "interval_s": (0.22, 0.28)}, 0.0,
          {"Result": "0.250 s early", "PX4": "cannot be negative"}),
         ({"offset_s": 0.009, "interval_s": (0.008, 0.0095)}, 0.0,
-         {"Result": "below the limit for a correction of 0.036 s", "Offset": "The estimate is"}),
+         {"Result": "too small for a correction: the limit is 0.036 s",
+          "Offset": "The estimate is"}),
         ({"offset_s": -0.25, "interval_s": (-0.28, -0.22)}, 0.0,
          {"PX4": "250 ms (now 0 ms), or correct the sender's clock. For either correction, set "
           "EKF2_DELAY_MAX to 300 ms."}),

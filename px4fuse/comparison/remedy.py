@@ -307,7 +307,7 @@ def make_height_noise_advice(
 def select_changed_settings(
     changes: Mapping[str, float], flight_settings: Mapping[str, float]
 ) -> dict[str, float]:
-    """Return those changes that differ from the settings in flight."""
+    """Return the changes whose values differ from the parameters used in flight."""
     return {
         name: value
         for name, value in changes.items()

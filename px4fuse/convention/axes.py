@@ -53,7 +53,7 @@ INDEPENDENT_HEIGHT_ERROR_COUNT = 6.0
 # Larger height errors (m) count as this value, so that outliers have little effect
 MAX_HEIGHT_ERROR_M = 20.0 * BAROMETER_SIGMA_M
 MAX_REFINED_HYPOTHESES = 8
-# Hypotheses are refined if their score is at most this much (nats) below the best score
+# Maximum log-likelihood (nats) below that of the best hypothesis, to refine a hypothesis
 MAX_SCORE_BELOW_BEST_TO_REFINE = 60.0
 # Maximum number of second differences in one least-squares fit, to limit the computing time
 MAX_REFINEMENT_ROWS = 1200

@@ -170,7 +170,7 @@ def _check_enabling_parameter(positions: UnfusedPositions) -> Iterator[UnmetCond
 
 
 def constant_coordinates(source: PositionTrack) -> list[str]:
-    """Return the coordinates (x, y, z) with constant values, which the source does not measure."""
+    """Return the names of the coordinates (x, y, z) that are constant in all positions."""
     ranges_m = np.ptp(source.samples[Columns.POSITION].to_numpy(), axis=0)
     is_constant = ranges_m < MIN_RANGE_OF_MEASURED_COORDINATE_M
     return [name for name, constant in zip("xyz", is_constant, strict=True) if constant]
@@ -237,8 +237,8 @@ def _check_timestamps(positions: UnfusedPositions) -> Iterator[UnmetCondition]:
         yield UnmetCondition(
             "age",
             f"the timestamps are {-age_s:.2f} s in the future",
-            f"EKF2 buffers only {MAX_BUFFERED_POSITIONS} positions. New positions overwrite a "
-            "position before the time of its timestamp.",
+            f"EKF2 buffers only {MAX_BUFFERED_POSITIONS} positions. Newer positions overwrite "
+            "each position before EKF2 reaches its timestamp.",
             CLOCK_SYNCHRONISATION_ACTION,
         )
     if age_s > positions.max_sample_age_s + MAX_DELAY_BEHIND_HORIZON_S:

@@ -122,12 +122,12 @@ class ClockOffset(Record, kw_only=True):
         return abs(self.parts[-1].offset_s - self.parts[0].offset_s) >= MIN_TIME_OFFSET_CHANGE_S
 
     @property
-    def limit_s(self) -> float:
-        """Maximum time offset (s) that is not corrected."""
+    def min_significant_offset_s(self) -> float:
+        """Time offset (s) above which an offset is significant."""
         return max(MIN_TIME_OFFSET_S, self.significance_limit_s)
 
     def is_significant(self, offset_s: float) -> bool:
-        return abs(offset_s) > self.limit_s
+        return abs(offset_s) > self.min_significant_offset_s
 
 
 def estimate_time_offset(

@@ -1,1 +1,1 @@
-"""Loop analysis: loop closure error of odometry, and correction of the path."""
+"""Loop closure error of an odometry path, and corrections of the path."""

@@ -78,7 +78,8 @@ def make_time_offset_advice(
         advice_by_label["Re-run"] = f"px4fuse compare LOG --clock-offset {suggested_offset_s:.3f}"
     elif not low_offset_s <= 0.0 <= high_offset_s:
         advice_by_label["Result"] = (
-            f"The time offset is below the limit for a correction of {time_offset.limit_s:.3f} s."
+            "The time offset is too small for a correction: the limit is "
+            f"{time_offset.min_significant_offset_s:.3f} s."
         )
         advice_by_label["Offset"] = (
             f"The estimate is {offset_s:+.3f} s (95 % {low_offset_s:+.3f} to {high_offset_s:+.3f} "

@@ -102,7 +102,7 @@ def cost(graph: PoseGraph) -> float:
 
 
 def compute_observed_directions(information: Array) -> tuple[Array, Array]:
-    """Return the measured directions (columns) of an information matrix, and their variances.
+    """Return the directions (columns) in which an edge has information, and their variances.
 
     ``information == directions @ diag(1 / variance) @ directions.T``
     """

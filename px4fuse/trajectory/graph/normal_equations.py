@@ -143,10 +143,8 @@ class NormalEquations:
 
         Parameters
         ----------
-        first_pose_matrix, second_pose_matrix, information : ndarray, shape (m, d, d)
-            A, B and weight of each of the m edges.
-        right_hand_side : ndarray, shape (m, d, k)
-            c of each edge.
+        first_pose_matrix, second_pose_matrix, information, right_hand_side : ndarray
+            A, B and weight, shape (m, d, d), and c, shape (m, d, k), of each of the m edges.
         """
         pose_matrices = np.where(
             self._is_swapped,
