@@ -302,35 +302,35 @@ WHITE = b"q 1 g 50 690 300 90 re f Q"
 # Forgery, the beginning of a difference, and whether it is one of structure
 FORGERIES: dict[str, tuple[Forge, str, bool]] = {
     # form fields
-    "an empty form": (catalogue("/AcroForm", dictionary(Fields=array())), "form fields", True),
-    "a text field": (field("Tx", V=STRING("0.95"), DA=STRING("/f0 8 Tf")), "an annotation", True),
-    "a button": (field("Btn", MK=dictionary(CA=STRING("ok"))), "an annotation", True),
-    "a choice": (field("Ch", V=STRING("a"), Opt=array(STRING("a"))), "an annotation", True),
-    "a signature": (field("Sig"), "an annotation", True),
-    "a widget without a form": (annotation("Widget", FT=name("Tx")), "an annotation", True),
+    "an empty form": (catalogue("/AcroForm", dictionary(Fields=array())), "an entry /AcroForm", True),
+    "a text field": (field("Tx", V=STRING("0.95"), DA=STRING("/f0 8 Tf")), "an entry /Annots", True),
+    "a button": (field("Btn", MK=dictionary(CA=STRING("ok"))), "an entry /Annots", True),
+    "a choice": (field("Ch", V=STRING("a"), Opt=array(STRING("a"))), "an entry /Annots", True),
+    "a signature": (field("Sig"), "an entry /Annots", True),
+    "a widget without a form": (annotation("Widget", FT=name("Tx")), "an entry /Annots", True),
     "an XFA form": (
-        catalogue("/AcroForm", dictionary(Fields=array(), XFA=STRING("x"))), "form fields", True,
+        catalogue("/AcroForm", dictionary(Fields=array(), XFA=STRING("x"))), "an entry /AcroForm", True,
     ),
     # layers
     "a layer for print": (
         layer(b"\n/OC /MC0 BDC " + WHITE + b" EMC", Print=dictionary(PrintState=name("ON")),
-              View=dictionary(ViewState=name("OFF"))), "layers", True,
+              View=dictionary(ViewState=name("OFF"))), "an entry /OCProperties", True,
     ),
     "a layer for the screen": (
         layer(b"\n/OC /MC0 BDC " + WHITE + b" EMC", View=dictionary(ViewState=name("ON"))),
-        "layers", True,
+        "an entry /OCProperties", True,
     ),
-    "a list of layers": (catalogue("/OCProperties", dictionary(OCGs=array())), "layers", True),
+    "a list of layers": (catalogue("/OCProperties", dictionary(OCGs=array())), "an entry /OCProperties", True),
     # annotations
     **{
-        f"annotation {kind}": (annotation(kind, **entries), "an annotation", True)
+        f"annotation {kind}": (annotation(kind, **entries), "an entry /Annots", True)
         for kind, entries in {
             "FreeText": {"Contents": STRING("0.01"), "DA": STRING("/f0 8 Tf")},
             "Stamp": {"F": N(4)}, "Square": {"F": N(36)}, "Highlight": {}, "Ink": {},
             "Link": {}, "Redact": {}, "Watermark": {"F": N(4)}, "Popup": {}, "Line": {},
         }.items()
     },
-    "no annotations": (page(1, "/Annots", array()), "an annotation", True),
+    "no annotations": (page(1, "/Annots", array()), "an entry /Annots", True),
     # fonts
     "glyphs exchanged by a map": (exchanged_glyphs, "PDF entry /CIDToGIDMap differs", True),
     "outlines exchanged": (
@@ -423,22 +423,22 @@ FORGERIES: dict[str, tuple[Forge, str, bool]] = {
     # resources
     "an image": (
         draw_on_page(b"q 300 0 0 90 50 690 cm /X Do Q", resource("/XObject", "/X", image())),
-        "an image or embedded drawing", True,
+        "an entry /XObject", True,
     ),
     "an image with alternates": (
         resource("/XObject", "/X", image(Alternates=array(dictionary(DefaultForPrinting=ON)))),
-        "an image or embedded drawing", True,
+        "an entry /XObject", True,
     ),
     "an image with a proxy": (
-        resource("/XObject", "/X", image(OPI=dictionary())), "an image or embedded drawing", True,
+        resource("/XObject", "/X", image(OPI=dictionary())), "an entry /XObject", True,
     ),
     "an image with a mask": (
-        resource("/XObject", "/X", image(SMask=image())), "an image or embedded drawing", True,
+        resource("/XObject", "/X", image(SMask=image())), "an entry /XObject", True,
     ),
     "a form XObject": (
         draw_on_page(b"/X Do", resource("/XObject", "/X", stream(WHITE, Subtype=name("Form"),
                                                           BBox=box(0, 0, 600, 850)))),
-        "an image or embedded drawing", True,
+        "an entry /XObject", True,
     ),
     "a soft mask": (
         draw_on_page(b"/g9 gs", resource("/ExtGState", "/g9", dictionary(SMask=name("None")))),
@@ -457,20 +457,20 @@ FORGERIES: dict[str, tuple[Forge, str, bool]] = {
         "an entry /Properties", True,
     ),
     # pages
-    "a page turned": (page(2, "/Rotate", N(180)), "a rotation", True),
-    "a page cut": (page(2, "/CropBox", box(0, 0, 300, 300)), "a crop box", True),
+    "a page turned": (page(2, "/Rotate", N(180)), "an entry /Rotate", True),
+    "a page cut": (page(2, "/CropBox", box(0, 0, 300, 300)), "an entry /CropBox", True),
     "a page smaller": (page(2, "/MediaBox", box(0, 0, 595.2756, 400)), "the PDF entry", False),
     "a page trimmed": (page(2, "/TrimBox", box(0, 0, 300, 300)), "an entry /TrimBox", True),
-    "a page in another unit": (page(2, "/UserUnit", N(2)), "a length unit", True),
+    "a page in another unit": (page(2, "/UserUnit", N(2)), "an entry /UserUnit", True),
     "a page in a group": (page(1, "/Group", dictionary(S=name("Transparency"))),
                           "an entry /Group", True),
     "a thumbnail": (page(1, "/Thumb", image()), "an entry /Thumb", True),
-    "an action of a page": (page(1, "/AA", dictionary()), "action that runs automatically", True),
+    "an action of a page": (page(1, "/AA", dictionary()), "an entry /AA", True),
     "a page shown for a second": (page(1, "/Dur", N(1)), "an entry /Dur", True),
-    "another parent": (rotated_parent, "a rotation", True),
+    "another parent": (rotated_parent, "an entry /Rotate", True),
     "an inherited rotation": (
         lambda w: w.root_object["/Pages"].update({NameObject("/Rotate"): N(90)}),  # type: ignore[attr-defined]
-        "a rotation", True,
+        "an entry /Rotate", True,
     ),
     "the first page away": (kids(lambda k: k[1:]), "", False),
     "a page twice": (kids(lambda k: [*k[:2], *k[1:]]), "", False),
@@ -478,9 +478,9 @@ FORGERIES: dict[str, tuple[Forge, str, bool]] = {
     "two pages exchanged": (kids(lambda k: [k[1], k[0], *k[2:]]), "", False),
     # the document
     "an opening action": (
-        catalogue("/OpenAction", array()), "action that runs automatically", True,
+        catalogue("/OpenAction", array()), "an entry /OpenAction", True,
     ),
-    "actions": (catalogue("/AA", dictionary()), "action that runs automatically", True),
+    "actions": (catalogue("/AA", dictionary()), "an entry /AA", True),
     "a mode of display": (catalogue("/PageMode", name("FullScreen")), "an entry /PageMode", True),
     "a layout": (catalogue("/PageLayout", name("TwoPageLeft")), "an entry /PageLayout", True),
     "page labels": (
@@ -491,7 +491,7 @@ FORGERIES: dict[str, tuple[Forge, str, bool]] = {
         catalogue("/ViewerPreferences", dictionary(HideMenubar=ON)), "an entry /HideMenubar", True,
     ),
     "a bookmark": (bookmark, "the PDF entry /Title was changed: 'consistent'", False),
-    "no bookmarks": (lambda w: w.root_object.pop("/Outlines"), "bookmarks is missing", True),
+    "no bookmarks": (lambda w: w.root_object.pop("/Outlines"), "an entry /Outlines is missing", True),
     "named places": (catalogue("/Dests", dictionary()), "an entry /Dests", True),
     "a base address": (
         catalogue("/URI", dictionary(Base=STRING("http://x"))), "an entry /URI", True,

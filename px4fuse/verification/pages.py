@@ -65,18 +65,6 @@ MAX_XMP_BYTES = 100_000
 # Typst version in the PDF; not compared, because different versions produce equal pages
 _TYPST_VERSION_PATTERN = re.compile(r"Typst \d+(\.\d+)*")
 _END_OF_FILE_PATTERN = re.compile(rb"startxref\s+(\d{1,10})\s+%%EOF\s*\Z")
-_ENTRY_DESCRIPTIONS = {
-    "/AA": "a PDF action that runs automatically",
-    "/AcroForm": "form fields",
-    "/Annots": "an annotation",
-    "/CropBox": "a crop box",
-    "/OCProperties": "layers",
-    "/OpenAction": "a PDF action that runs automatically",
-    "/Outlines": "bookmarks",
-    "/Rotate": "a rotation",
-    "/UserUnit": "a length unit other than 1/72 inch",
-    "/XObject": "an image or embedded drawing",
-}
 # Tokens of PDF page content (ISO 32000-1, 7.2 and 7.3): strings, hexadecimal strings, and others
 _TOKEN_PATTERN = re.compile(
     r"\(((?:[^\\()]|\\.|\((?:[^\\()]|\\.)*+\))*+)\)|<([0-9A-Fa-f]*)>"
@@ -137,10 +125,7 @@ def _compare_pdfs(job: tuple[bytes, bytes, TextComparison]) -> tuple[PageDiffere
                 submitted_pdf, redrawn_pdf
             )
             differences = [
-                *(
-                    PageDifference(0, ambiguity, True)
-                    for ambiguity in _find_ambiguities(submitted_bytes)
-                ),
+                *_find_ambiguities(submitted_bytes),
                 *islice(page_differences, MAX_LISTED_DIFFERENCES),
             ]
             producer = (submitted_pdf.metadata or DictionaryObject()).get("/Producer")
@@ -182,10 +167,8 @@ class _PdfComparison:
             self.fonts = resolve_reference(redrawn_page.get_object()["/Resources"].get("/Font", {}))
             yield from self._compare(submitted_page, redrawn_page, "/Page", page_number)
         for key in ("/Info", "/Root"):
-            submitted_value, redrawn_value = (
-                dict.get(reader.trailer, key) for reader in (submitted_pdf, redrawn_pdf)
-            )
-            yield from self._compare(submitted_value, redrawn_value, key, 0)
+            trailers = submitted_pdf.trailer, redrawn_pdf.trailer
+            yield from self._compare(*(dict.get(trailer, key) for trailer in trailers), key, 0)
         for values in self.parent_entry_pairs:
             yield from self._compare(*values, 0)
         # programs for PDF 1.4 ignore /XRefStm, and could display other pages
@@ -220,21 +203,16 @@ class _PdfComparison:
                 resolve_reference, (submitted_value, redrawn_value)
             )
             if _pdf_type_of(submitted_value) is not _pdf_type_of(redrawn_value):
-                yield PageDifference(
-                    page_number,
-                    f"the type of the PDF entry {key} differs from the report drawn from the log",
-                    True,
-                )
+                description = f"the type of the PDF entry {key} differs from the new report"
+                yield PageDifference(page_number, description, True)
             elif isinstance(redrawn_value, DictionaryObject):
                 yield from self._compare_dictionaries(
                     submitted_value, redrawn_value, key, page_number, value_pairs_to_compare
                 )
             elif isinstance(redrawn_value, ArrayObject):
-                if len(submitted_value) != len(redrawn_value):
-                    description = (
-                        f"the PDF array {key} has {len(submitted_value)} elements instead of "
-                        f"{len(redrawn_value)}"
-                    )
+                lengths = len(submitted_value), len(redrawn_value)
+                if lengths[0] != lengths[1]:
+                    description = f"the PDF array {key} has {lengths[0]} elements, not {lengths[1]}"
                     yield PageDifference(page_number, description, True)
                     continue
                 pairs = zip(*map(list.__iter__, (submitted_value, redrawn_value)), strict=True)
@@ -258,17 +236,18 @@ class _PdfComparison:
         submitted_keys = _select_compared_keys(submitted_dictionary, key)
         redrawn_keys = _select_compared_keys(redrawn_dictionary, key)
         for name in sorted(submitted_keys ^ redrawn_keys):
-            entry_description = _ENTRY_DESCRIPTIONS.get(name, f"an entry {one_line(name, 40)}")
-            description = f"{entry_description} is missing"
+            description = f"an entry {one_line(name, 40)} is missing"
             if name in submitted_keys:
-                description = f"the PDF contains {entry_description}, which px4fuse does not write"
+                description = (
+                    f"the PDF contains an entry {one_line(name, 40)}, which px4fuse does not write"
+                )
             yield PageDifference(page_number, description, True)
         for name in sorted(submitted_keys & redrawn_keys, reverse=True):
-            (
-                self.parent_entry_pairs
-                if page_number and name == "/Parent"
-                else value_pairs_to_compare
-            ).append((submitted_dictionary.raw_get(name), redrawn_dictionary.raw_get(name), name))
+            pair = submitted_dictionary.raw_get(name), redrawn_dictionary.raw_get(name), name
+            if page_number and name == "/Parent":
+                self.parent_entry_pairs.append(pair)
+            else:
+                value_pairs_to_compare.append(pair)
         if isinstance(redrawn_dictionary, StreamObject):
             yield from self._compare_streams(
                 submitted_dictionary, redrawn_dictionary, key, page_number
@@ -302,11 +281,8 @@ class _PdfComparison:
             return
         filters = resolve_reference(submitted_stream.get("/Filter"))
         if filters not in (None, "/FlateDecode", ["/FlateDecode"]):  # pypdf does not decode JPEG
-            yield PageDifference(
-                page_number,
-                f"the compression of the PDF entry {key} is not supported: px4fuse cannot read it",
-                True,
-            )
+            description = f"the compression of the PDF entry {key} is not supported"
+            yield PageDifference(page_number, description, True)
             return
         submitted_data, redrawn_data = submitted_stream.get_data(), redrawn_stream.get_data()
         if submitted_data == redrawn_data or (
@@ -316,10 +292,8 @@ class _PdfComparison:
             return
         is_page_content = key == "/Contents" or stream_type == "/Pattern"
         if not is_page_content or len(submitted_data) > MAX_CONTENT_SIZE_RATIO * len(redrawn_data):
-            yield PageDifference(
-                page_number,
-                f"the content of the PDF entry {key} differs from the report drawn from the log",
-            )
+            description = f"the content of the PDF entry {key} differs from the new report"
+            yield PageDifference(page_number, description)
         elif description := self._describe_operation_difference(submitted_data, redrawn_data):
             yield PageDifference(page_number, description)
 
@@ -329,7 +303,7 @@ class _PdfComparison:
         """Describe the first drawing operation that differs; "" if all are equal."""
         operation_lists = map(_parse_drawing_operations, (submitted_content, redrawn_content))
         font_name = ""
-        for operation_number, operations in enumerate(
+        for number, operations in enumerate(
             zip_longest(*operation_lists, fillvalue=("", ())), start=1
         ):
             (submitted_operator, submitted_operands), (redrawn_operator, redrawn_operands) = (
@@ -342,19 +316,15 @@ class _PdfComparison:
                 and _has_near_operands(redrawn_operator, submitted_operands, redrawn_operands)
             ):
                 continue
-            if {submitted_operator, redrawn_operator} <= _TEXT_OPERATORS:
-                texts = [self._decode_text(operands, font_name) for _, operands in operations]
-                kerning = [abs(value) for value in submitted_operands if isinstance(value, float)]
-                has_small_kerning = max(kerning, default=0.0) < MAX_KERNING_PER_MILLE_EM
-                if texts[0] != texts[1] and has_small_kerning and self.is_same_text(*texts):
-                    continue
+            if not {submitted_operator, redrawn_operator} <= _TEXT_OPERATORS:
+                operator_text = one_line(redrawn_operator, 9)
+                return f"drawing operation {number} ({operator_text}) differs from the new report"
+            texts = [self._decode_text(operands, font_name) for _, operands in operations]
+            kerning = [abs(value) for value in submitted_operands if isinstance(value, float)]
+            has_small_kerning = max(kerning, default=0.0) < MAX_KERNING_PER_MILLE_EM
+            if texts[0] == texts[1] or not has_small_kerning or not self.is_same_text(*texts):
                 submitted_text, redrawn_text = (one_line(text, 60) for text in texts)
                 return f"the text is {submitted_text!r}; px4fuse prints {redrawn_text!r}"
-            operator_text = one_line(redrawn_operator, 9)
-            return (
-                f"drawing operation {operation_number} of the page differs from that of the report "
-                f"drawn from the log ({operator_text})"
-            )
         return ""
 
     def _decode_text(self, operands: tuple[Operand, ...], font: str) -> str:
@@ -372,16 +342,16 @@ class _PdfComparison:
         return utf16_text.decode("utf-16-be", "replace")
 
 
-def _find_ambiguities(pdf: bytes) -> Iterator[str]:
-    """Yield a description of each file structure that PDF programs may interpret differently."""
+def _find_ambiguities(pdf: bytes) -> Iterator[PageDifference]:
+    """Yield each file structure that PDF programs may interpret differently."""
     end_match = _END_OF_FILE_PATTERN.search(pdf[-1024:])
     if end_match is None:
-        yield "the file has bytes after the end of the PDF"
+        yield PageDifference(0, "the file has bytes after the end of the PDF", True)
     elif b"/Linearized" in pdf[:1024]:
         # a second cross-reference table could replace pages
         xref_table_start = pdf.find(b"endobj") + len(b"endobj")
         if pdf[xref_table_start : int(end_match[1])].strip():
-            yield SECOND_XREF_TABLE_REASON
+            yield PageDifference(0, SECOND_XREF_TABLE_REASON, True)
 
 
 def _get_page_references(reader: pypdf.PdfReader) -> list[Any]:
@@ -455,24 +425,20 @@ def _has_near_operands(
     operator: str, submitted_operands: Sequence[Operand], redrawn_operands: Sequence[Operand]
 ) -> bool:
     """Return True if the operands of a PDF drawing operator are equal within the tolerances."""
+    if len(submitted_operands) != len(redrawn_operands):
+        return False
     first_coordinate_index = _FIRST_COORDINATE_INDEX.get(operator, len(redrawn_operands))
-    return len(submitted_operands) == len(redrawn_operands) and all(
-        submitted_operand == redrawn_operand
-        or (
-            isinstance(submitted_operand, float)
-            and isinstance(redrawn_operand, float)
-            and math.isclose(
-                submitted_operand,
-                redrawn_operand,
-                rel_tol=PDF_NUMBER_TOLERANCE,
-                abs_tol=(
-                    COORDINATE_TOLERANCE_PT
-                    if index >= first_coordinate_index
-                    else PDF_NUMBER_TOLERANCE
-                ),
-            )
-        )
-        for index, (submitted_operand, redrawn_operand) in enumerate(
-            zip(submitted_operands, redrawn_operands, strict=True)
-        )
-    )
+    for index, (submitted_operand, redrawn_operand) in enumerate(
+        zip(submitted_operands, redrawn_operands, strict=True)
+    ):
+        if submitted_operand == redrawn_operand:
+            continue
+        if not isinstance(submitted_operand, float) or not isinstance(redrawn_operand, float):
+            return False
+        is_coordinate = index >= first_coordinate_index
+        tolerance = COORDINATE_TOLERANCE_PT if is_coordinate else PDF_NUMBER_TOLERANCE
+        if not math.isclose(
+            submitted_operand, redrawn_operand, rel_tol=PDF_NUMBER_TOLERANCE, abs_tol=tolerance
+        ):
+            return False
+    return True
