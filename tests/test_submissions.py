@@ -173,16 +173,6 @@ def test_unreadable_gradescope_metadata_give_a_note(tmp_path):
     )
 
 
-def test_find_submissions_reads_times_of_zip_entries(tmp_path):
-    out = io.BytesIO()
-    with zipfile.ZipFile(out, "w") as archive:
-        archive.writestr(zipfile.ZipInfo("a.pdf", (2026, 11, 20, 12, 34, 56)), PDF)
-        archive.writestr(zipfile.ZipInfo("b.pdf"), PDF)
-    found, _ = find_submissions([write(tmp_path / "x.zip", out.getvalue())])
-    times = {each.name: each.time and each.time.isoformat() for each in found}
-    assert times == {"a.pdf": "2026-11-20T12:34:56", "b.pdf": None}
-
-
 def test_find_submissions_does_not_open_nested_zip(tmp_path):
     name = "Roe_1_assignsubmission_file_/work.zip"
     handed_in = zipped({"report.pdf": PDF, "more.zip": zipped({"deep.pdf": PDF})})

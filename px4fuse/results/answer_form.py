@@ -62,11 +62,9 @@ class AllowedAnswers(Record):
 
 _ALLOWED_ANSWERS = read_toml(__file__, AllowedAnswers, "form.toml")
 _UNITS_BY_QUANTITY: Mapping[str, Mapping[str, float]] = {"": {}, **_ALLOWED_ANSWERS.units}
-FAULT_KINDS, EKF2_BEHAVIOURS, REPORT_PANELS = (
-    _ALLOWED_ANSWERS.fault_kinds,
-    _ALLOWED_ANSWERS.behaviours,
-    _ALLOWED_ANSWERS.report_panels,
-)
+FAULT_KINDS = _ALLOWED_ANSWERS.fault_kinds
+EKF2_BEHAVIOURS = _ALLOWED_ANSWERS.behaviours
+REPORT_PANELS = _ALLOWED_ANSWERS.report_panels
 # Allowed units for the value of each correction
 UNITS_BY_CORRECTION = {
     name: _UNITS_BY_QUANTITY[quantity] for name, quantity in _ALLOWED_ANSWERS.corrections.items()
@@ -83,22 +81,17 @@ ChoiceLetter = Literal["", "a", "b", "c", "d", "e"]
 NUMBER_HELP = (
     "a number with a decimal point such as 0.2, without quotes or unit, or a list such as [61, 64]"
 )
-# Description of the accepted answers, by field of the form
+# Description of the accepted answers, by field of the form; other fields contain numbers
 ACCEPTED_ANSWER_BY_FIELD = {
     **dict.fromkeys(("verdict_kf", "verdict_ekf2"), f"one of {', '.join(VERDICTS)}"),
+    **dict.fromkeys(("kind", "unit", "parameter", "value_unit", "panel"), "a text in quotes"),
     "when": '"whole flight", or "" with times in from_s and until_s',
     "ekf2_did": "a list of texts, each in quotes",
     "choices": "a letter from a to e in quotes",
-    "log_sha256": "the SHA-256 of the log, which px4fuse answers LOG writes into an empty form",
-    **dict.fromkeys(
-        ("kind", "unit", "parameter", "value_unit", "panel"),
-        "a text in quotes",
-    ),
+    "log_sha256": "the SHA-256 of the log, as in the form that px4fuse answers LOG writes",
 }
 # Answer to a question about KF: a number, a list of KF updates, or None if left blank
 NumericAnswer = Number | Annotated[tuple[Number, ...], Meta(max_length=200)] | None
-
-
 # Letters of the answers to a multiple-choice question
 CHOICE_LETTERS: tuple[ChoiceLetter, ...] = get_args(ChoiceLetter)[1:]
 MAX_CHOICES = 20
@@ -255,17 +248,15 @@ def select_questions(log_sha256: str) -> tuple[FormQuestion, ...]:
         return round(low + (high - low) * next(random_bytes) / 255.0, decimals)
 
     sigmas = (draw_number_between(0.2, 0.45, 2), draw_number_between(0.06, 0.14, 3))
-    first_question_kind, second_question_kind, third_question_kind = (
+    first_kind, second_kind, third_kind = (
         pair[next(random_bytes) % 2] for pair in _QUESTION_KIND_PAIRS
     )
-    parameter_range = (1.0, 4.0) if third_question_kind == "prediction" else (0.8, 1.3)
+    parameter_range = (1.0, 4.0) if third_kind == "prediction" else (0.8, 1.3)
     question_parameter = draw_number_between(*parameter_range, 1)
     return (
-        FormQuestion(first_question_kind, 2 + next(random_bytes) % 7, *sigmas),
-        FormQuestion(second_question_kind, 20 + next(random_bytes) % 130, *sigmas),
-        FormQuestion(
-            third_question_kind, 20 + next(random_bytes) % 100, *sigmas, question_parameter
-        ),
+        FormQuestion(first_kind, 2 + next(random_bytes) % 7, *sigmas),
+        FormQuestion(second_kind, 20 + next(random_bytes) % 130, *sigmas),
+        FormQuestion(third_kind, 20 + next(random_bytes) % 100, *sigmas, question_parameter),
     )
 
 
@@ -299,26 +290,26 @@ def _describe_error(error: Exception, form_toml: str, form_values: dict[str, Any
         content = one_line(form_toml.splitlines()[int(line) - 1], 60)
         return f"line {line} ({content}) is not valid; give {NUMBER_HELP}, or a word in quotes"
     reason, _, path = message.partition(" - at `$.")
-    path_names = re.findall(r"\w+", path)
-    if not path_names:
+    names = re.findall(r"\w+", path)  # for example "mistakes", "0" and "size"
+    if not names:
         return message
     invalid_value: Any = form_values
-    for name in path_names:
+    for name in names:
         invalid_value = invalid_value[int(name) if name.isdigit() else name]
-    field_name, number = path_names[-1], int(path_names[1]) + 1 if len(path_names) > 1 else 0
-    if isinstance(invalid_value, dict):
-        return f"mistake {number}: {reason}"
-    accepted_values = ACCEPTED_ANSWER_BY_FIELD.get(
-        path_names[0], ACCEPTED_ANSWER_BY_FIELD.get(field_name, NUMBER_HELP)
+    label = names[0]
+    if len(names) > 1:
+        number = int(names[1]) + 1
+        if isinstance(invalid_value, dict):
+            return f"mistake {number}: {reason}"
+        label = f"{names[-1]} of mistake {number}" if label == "mistakes" else f"{label[0]}{number}"
+    accepted_values = ACCEPTED_ANSWER_BY_FIELD.get(names[0]) or ACCEPTED_ANSWER_BY_FIELD.get(
+        names[-1], NUMBER_HELP
     )
-    if path_names[0] in ("quantities", "choices"):
-        field_name = f"{path_names[0][0]}{number}"
-    mistake_text = f" of mistake {number}" if path_names[0] == "mistakes" else ""
-    value_text = one_line(str(invalid_value), 60)
-    return f"{field_name}{mistake_text} is {value_text!r}; give {accepted_values}"
+    return f"{label} is {one_line(str(invalid_value), 60)!r}; give {accepted_values}"
 
 
 def _convert_form(form: dict[str, Any]) -> dict[str, Any]:
+    """Convert the tables of a form to the fields of :class:`Answers`."""
     filled_form = _remove_empty_values(form)
     mistakes = filled_form.pop("mistake", ())
     quantities, choices = (
@@ -327,20 +318,17 @@ def _convert_form(form: dict[str, Any]) -> dict[str, Any]:
     )
     quantity_fields = [f"q{number}" for number in range(1, len(_QUESTION_KIND_PAIRS) + 1)]
     choice_fields = [f"c{number}" for number in range(1, MAX_CHOICES + 1)]
-    if unknown_fields := sorted(
-        {*quantities, *({"mistakes"} & filled_form.keys())} - set(quantity_fields)
-        | choices.keys() - set(choice_fields)
-    ):
+    unknown_fields = quantities.keys() - quantity_fields | choices.keys() - choice_fields
+    if unknown_fields or "mistakes" in filled_form:
         raise ValueError(
-            f"the field {unknown_fields[0]} is unknown; known fields: mistake, "
-            f"{', '.join(quantity_fields)}"
+            f"the field {min(unknown_fields, default='mistakes')} is unknown; known fields: "
+            f"mistake, {', '.join(quantity_fields)}"
         )
-    answered_choice_fields = choice_fields if choices else ()
     return {
         **filled_form,
         "mistakes": mistakes,
         "quantities": tuple(map(quantities.get, quantity_fields)),
-        "choices": tuple(choices.get(name, "") for name in answered_choice_fields),
+        "choices": tuple(choices.get(name, "") for name in choice_fields if choices),
     }
 
 
@@ -357,46 +345,38 @@ def _remove_empty_values(value: Any) -> Any:
 def check_answers(answers: Answers) -> None:
     """Raise ValueError for an answer that is not allowed, out of range, or repeated."""
     kinds = [named_fault.kind for named_fault in answers.mistakes]
-    for kind in kinds:
-        _require_allowed_answer("kind", kind, FAULT_KINDS)
-        if kinds.count(kind) > 1:
-            raise ValueError(
-                f"the form names the kind {kind!r} twice; name each kind of fault once"
-            )
     if NO_FAULT_KIND in kinds and len(kinds) > 1:
         raise ValueError('the form names "none" and a fault; name only one of them')
     for behaviour in answers.ekf2_did:
         _require_allowed_answer("ekf2_did", behaviour, EKF2_BEHAVIOURS)
     for named_fault in answers.mistakes:
-        fault_kind = FAULT_KINDS[named_fault.kind]
+        kind = named_fault.kind
+        _require_allowed_answer("kind", kind, FAULT_KINDS)
+        if kinds.count(kind) > 1:
+            raise ValueError(f"the form names {kind!r} twice; name each kind of fault once")
+        units = FAULT_KINDS[kind].units
+        value_units = UNITS_BY_CORRECTION.get(named_fault.parameter, {named_fault.value_unit: 1.0})
         for field_name, allowed_answers in (
             ("parameter", UNITS_BY_CORRECTION),
             ("panel", REPORT_PANELS),
-            ("unit", fault_kind.units),
-            ("value_unit", UNITS_BY_CORRECTION.get(named_fault.parameter)),
+            ("unit", units),
+            ("value_unit", value_units),
         ):
-            chosen_name = getattr(named_fault, field_name)
-            if chosen_name and allowed_answers is not None:
-                _require_allowed_answer(
-                    f"{named_fault.kind}: {field_name}", chosen_name, allowed_answers
-                )
-        min_size, max_size = fault_kind.size_range
+            if chosen_name := getattr(named_fault, field_name):
+                _require_allowed_answer(f"{kind}: {field_name}", chosen_name, allowed_answers)
+        min_size, max_size = FAULT_KINDS[kind].size_range
         size = named_fault.convert_size_to_standard_unit()
         if size is not None and not min_size <= size <= max_size:
-            unit = next(iter(fault_kind.units))
             raise ValueError(
-                f"{named_fault.kind}: size {size:g} is out of range "
-                f"({min_size:g} to {max_size:g} {unit})"
+                f"{kind}: size {size:g} is out of range "
+                f"({min_size:g} to {max_size:g} {next(iter(units))})"
             )
 
 
-def _require_allowed_answer(field_name: str, answer: str, allowed_answers: Any) -> None:
+def _require_allowed_answer(field_name: str, answer: str, allowed_answers: Iterable[str]) -> None:
     if answer not in allowed_answers:
-        choices_text = _join_quoted(allowed_answers)
-        fault = (
-            f"is not one of {choices_text}" if choices_text else "is not allowed: leave it empty"
-        )
-        raise ValueError(f"{field_name} {answer!r} {fault}")
+        choices_text = _join_quoted(allowed_answers) or "the allowed answers: leave it empty"
+        raise ValueError(f"{field_name} {answer!r} is not one of {choices_text}")
 
 
 def form_name(log_name: str) -> str:
@@ -415,26 +395,27 @@ def format_answer_form(log_name: str, log_sha256: str, choices: Sequence[Choice]
         f'# {question.text}\nq{number} = ""{"    # such as [61, 64]" * (question.kind == "gate")}'
         for number, question in enumerate(select_questions(log_sha256), start=1)
     ]
-    kind_lines = (
-        f"{name:13} {kind.description}{_format_units(kind.units)}"
-        for name, kind in FAULT_KINDS.items()
-    )
-    return Template(template).substitute(
+    form = Template(template).substitute(
         log=log_name,
         form=form_name(log_name),
         sha256=log_sha256,
         verdicts=_join_quoted(VERDICTS),
-        behaviours=_format_comment_lines(_format_rows_of_three(EKF2_BEHAVIOURS)),
-        kinds=_format_comment_lines(kind_lines),
-        corrections=_format_comment_lines(
-            name + _format_units(UNITS_BY_CORRECTION[name]) for name in UNITS_BY_CORRECTION
+        behaviours=_format_comment_lines(EKF2_BEHAVIOURS),
+        kinds=_format_comment_lines(
+            f"{name:13} {kind.description}{_format_units(kind.units)}"
+            for name, kind in FAULT_KINDS.items()
         ),
-        panels=_format_comment_lines(_format_rows_of_three(REPORT_PANELS)),
+        corrections=_format_comment_lines(
+            name + _format_units(units) for name, units in UNITS_BY_CORRECTION.items()
+        ),
+        panels=_format_comment_lines(REPORT_PANELS),
         questions="\n".join(questions),
-    ) + "".join(
-        f'{FIGURE_QUESTIONS_COMMENT * (number == 1)}# {choice.text}\nc{number} = ""\n'
-        for number, choice in enumerate(choices, start=1)
     )
+    if choices:
+        form += FIGURE_QUESTIONS_COMMENT
+    for number, choice in enumerate(choices, start=1):
+        form += f'# {choice.text}\nc{number} = ""\n'
+    return form
 
 
 def form_rows(answers: Answers) -> Iterator[tuple[str, str]]:
@@ -483,7 +464,3 @@ def _format_comment_lines(lines: Iterable[str]) -> str:
 
 def _join_quoted(names: Iterable[str]) -> str:
     return ", ".join(f'"{name}"' for name in names)
-
-
-def _format_rows_of_three(names: tuple[str, ...]) -> Iterator[str]:
-    return (_join_quoted(names[start : start + 3]) for start in range(0, len(names), 3))

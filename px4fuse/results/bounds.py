@@ -79,18 +79,36 @@ def list_types(annotation: Any) -> tuple[Any, ...]:
 
 
 def _check_value(value: Any, annotation: Any, path: str, reasons: list[str]) -> Any:
-    if isinstance(value, float):
-        low, high = find_bounds(path.rpartition(".")[2])
-        if not math.isfinite(value):
-            raise _OutOfBoundsError(f"{path} has a value that is not finite")
-        if not low <= value <= high:
-            raise _OutOfBoundsError(f"{path} is {value:.3g} (allowed: {low:g} to {high:g})")
-        return value
-    if isinstance(value, msgspec.Struct):
-        return _check_struct(value, path, reasons)
-    if isinstance(value, Mapping):
-        return _check_mapping(value, annotation, path, reasons)
-    return _check_tuple(value, path, reasons) if isinstance(value, tuple) else value
+    """Return the value without invalid numbers, or an Unavailable if ``annotation`` allows it."""
+    try:
+        if isinstance(value, msgspec.Struct):
+            return _check_struct(value, path, reasons)
+        if isinstance(value, Mapping):
+            return _check_mapping(value, annotation, path, reasons)
+        if isinstance(value, tuple):
+            return _check_tuple(value, path, reasons)
+        if isinstance(value, float):
+            _require_valid_number(value, path)
+    except _OutOfBoundsError as error:
+        for unavailable_type in list_types(annotation):
+            if isinstance(unavailable_type, type) and issubclass(unavailable_type, Unavailable):
+                text_fields = {"what": path, "reason": str(error), "remedy": CHECK_LOG_REMEDY}
+                other_fields = {
+                    field.name: _check_value(getattr(value, field.name), field.type, path, reasons)
+                    for field in fields(unavailable_type)
+                    if field.name not in text_fields and hasattr(value, field.name)
+                }
+                return unavailable_type(**text_fields, **other_fields)
+        raise
+    return value
+
+
+def _require_valid_number(value: float, path: str) -> None:
+    low, high = find_bounds(path.rpartition(".")[2])
+    if not math.isfinite(value):
+        raise _OutOfBoundsError(f"{path} has a value that is not finite")
+    if not low <= value <= high:
+        raise _OutOfBoundsError(f"{path} is {value:.3g} (allowed: {low:g} to {high:g})")
 
 
 def _check_struct(value: msgspec.Struct, path: str, reasons: list[str]) -> msgspec.Struct:
@@ -100,9 +118,7 @@ def _check_struct(value: msgspec.Struct, path: str, reasons: list[str]) -> msgsp
             continue
         field_value, field_path = getattr(value, field.name), f"{path}.{field.name}".lstrip(".")
         try:
-            changes[field.name] = _check_or_replace_value(
-                field_value, field.type, field_path, reasons
-            )
+            changes[field.name] = _check_value(field_value, field.type, field_path, reasons)
         except _OutOfBoundsError as error:
             if field.default is not None:
                 raise
@@ -119,9 +135,7 @@ def _check_mapping(value: Mapping[str, Any], annotation: Any, path: str, reasons
     checked_elements: dict[str, Any] = {}
     for key, element in value.items():
         try:
-            checked_elements[key] = _check_or_replace_value(
-                element, value_type, f"{path}.{key}", reasons
-            )
+            checked_elements[key] = _check_value(element, value_type, f"{path}.{key}", reasons)
         except _OutOfBoundsError as error:
             reasons.append(str(error))
     if not checked_elements and any(
@@ -142,20 +156,3 @@ def _check_tuple(value: tuple[Any, ...], path: str, reasons: list[str]) -> tuple
                 raise
             reasons.append(str(error))
     return tuple(checked_elements)
-
-
-def _check_or_replace_value(value: Any, annotation: Any, path: str, reasons: list[str]) -> Any:
-    """Return the value, or an Unavailable if a number in the value is outside its valid range."""
-    try:
-        return _check_value(value, annotation, path, reasons)
-    except _OutOfBoundsError as error:
-        for unavailable_type in list_types(annotation):
-            if isinstance(unavailable_type, type) and issubclass(unavailable_type, Unavailable):
-                text_fields = {"what": path, "reason": str(error), "remedy": CHECK_LOG_REMEDY}
-                other_fields = {
-                    field.name: _check_value(getattr(value, field.name), field.type, path, reasons)
-                    for field in fields(unavailable_type)
-                    if field.name not in text_fields and hasattr(value, field.name)
-                }
-                return unavailable_type(**text_fields, **other_fields)
-        raise

@@ -167,8 +167,9 @@ class _PdfComparison:
             self.fonts = resolve_reference(redrawn_page.get_object()["/Resources"].get("/Font", {}))
             yield from self._compare(submitted_page, redrawn_page, "/Page", page_number)
         for key in ("/Info", "/Root"):
-            trailers = submitted_pdf.trailer, redrawn_pdf.trailer
-            yield from self._compare(*(dict.get(trailer, key) for trailer in trailers), key, 0)
+            submitted_value = dict.get(submitted_pdf.trailer, key)
+            redrawn_value = dict.get(redrawn_pdf.trailer, key)
+            yield from self._compare(submitted_value, redrawn_value, key, 0)
         for values in self.parent_entry_pairs:
             yield from self._compare(*values, 0)
         # programs for PDF 1.4 ignore /XRefStm, and could display other pages

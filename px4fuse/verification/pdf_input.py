@@ -18,7 +18,7 @@ from pypdf.generic import ArrayObject, DictionaryObject, IndirectObject, StreamO
 from px4fuse.core.text import one_line
 from px4fuse.errors import ResultsError
 from px4fuse.report.pdf import RESULTS_NAME
-from px4fuse.results.contract import AidsResults, ReportedResults, Results
+from px4fuse.results.contract import ReportedResults, Results
 from px4fuse.results.reading import MAX_RESULTS_BYTES as MAX_ATTACHMENT_BYTES
 from px4fuse.results.reading import read_results
 from px4fuse.verification.model import BAD_VALUE_ERRORS
@@ -88,12 +88,11 @@ def read_report(pdf: bytes, name: str) -> ReportedResults:
         The PDF is not a report, or is a report without KF results.
     """
     results = read_attached_results(pdf, name)
-    if isinstance(results, ReportedResults):
-        return results
-    reason = f"the attached {RESULTS_NAME} contains no results of compare or loop"
-    if isinstance(results, AidsResults):
-        reason = f"the attached {RESULTS_NAME} contains only EKF2 aiding sources, no KF results"
-    raise ResultsError(f"{one_line(name, 200)}: {reason}.")
+    if not isinstance(results, ReportedResults):
+        raise ResultsError(
+            f"{one_line(name, 200)}: the attached {RESULTS_NAME} has no results of KF or a loop."
+        )
+    return results
 
 
 def read_attached_results(pdf: bytes, name: str) -> Results:
@@ -236,14 +235,10 @@ def _find_unexpected_features(
     if is_stream:
         filters = resolve_reference(dictionary.get("/Filter"))
         filters = filters if isinstance(filters, ArrayObject) else [filters]
-        all_filter_names = [
-            _read_pdf_name(filter_object) for filter_object in filters if filter_object is not None
-        ]
-        if not _ALLOWED_FILTERS.issuperset(all_filter_names) or len(set(all_filter_names)) != len(
-            all_filter_names
-        ):
-            compression_text = " ".join(name or "?" for name in all_filter_names[:3])
-            yield f"a stream with unsupported compression ({one_line(compression_text, 60)})"
+        names = [_read_pdf_name(each) or "?" for each in filters if each is not None]
+        if not _ALLOWED_FILTERS.issuperset(names) or len(set(names)) < len(names):
+            compression_text = one_line(" ".join(names[:3]), 60)
+            yield f"a stream with unsupported compression ({compression_text})"
 
 
 def resolve_reference(value: Any) -> Any:
@@ -259,23 +254,16 @@ def _read_pdf_name(value: object) -> str | None:
 def _read_attachment(reader: pypdf.PdfReader) -> bytes:
     """Return the content of the attached file RESULTS_NAME; other attachments are an error."""
     file_specifications: list[DictionaryObject] = []
-    streams: dict[int, StreamObject] = {}
+    streams: dict[int, Any] = {}
     unexpected_features: set[str] = set()
     for dictionary, is_action_after_click in _walk_dictionaries(reader):
         unexpected_features.update(_find_unexpected_features(dictionary, is_action_after_click))
-        embedded_files: list[object] = (
-            [dictionary] if _read_pdf_name(dictionary.get("/Type")) == "/EmbeddedFile" else []
-        )
+        if _read_pdf_name(dictionary.get("/Type")) == "/EmbeddedFile":
+            streams[id(dictionary)] = dictionary
         if "/EF" in dictionary:
             file_specifications.append(dictionary)
-            embedded_file_streams = resolve_reference(dictionary.get("/EF"))
-            embedded_files += (
-                embedded_file_streams.values()
-                if isinstance(embedded_file_streams, DictionaryObject)
-                else ()
-            )
-        objects = map(resolve_reference, embedded_files)
-        streams |= {id(each): each for each in objects if isinstance(each, StreamObject)}
+            embedded_files = map(resolve_reference, dictionary["/EF"].values())
+            streams |= {id(embedded_file): embedded_file for embedded_file in embedded_files}
     if unexpected_features:
         feature_names = ", ".join(sorted(unexpected_features))
         raise ResultsError(f"the PDF contains {feature_names}, which px4fuse never writes.")

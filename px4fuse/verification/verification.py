@@ -17,7 +17,7 @@ from typing import Any
 
 from msgspec.structs import replace
 
-from px4fuse.core.text import clean_text, one_line
+from px4fuse.core.text import clean_text, join_first_names, one_line
 from px4fuse.errors import Px4FuseError, SettingsError
 from px4fuse.results.contract import (
     ComparisonResults,
@@ -92,12 +92,6 @@ def log_sha256(results: ReportedResults) -> str:
     return results.track.sha256 if isinstance(results, LoopResults) else results.log.sha256
 
 
-def log_name(results: ReportedResults) -> str:
-    if isinstance(results, LoopResults):
-        return split_track(results.track.name)[0]
-    return results.log.name
-
-
 def recompute_report(
     results: ReportedResults, path_by_sha256: Mapping[str, Path]
 ) -> RecomputedReport | Verification:
@@ -141,9 +135,7 @@ def _link_input_file(
         reason = f"none of the given files has the SHA-256 of {file_label}"
         raise NotRepeatableError(reason, f"Add {missing_file_name} to --logs.", missing_file_name)
     if name != Path(name).name or name == ".." or "\\" in name or not name.isprintable():
-        reason = (
-            f"{INVALID_COMMAND_REASON}: a file name contains a folder or unprintable characters"
-        )
+        reason = f"{INVALID_COMMAND_REASON}: a file name is a path or not printable"
         raise NotRepeatableError(reason, ASK_AUTHOR_REMEDY)
     # a separate folder for each link, because file names may be equal
     target = Path(tempfile.mkdtemp(dir=folder), name)
@@ -232,21 +224,22 @@ def verify(
     """
     report_version, installed_version = results.provenance.px4fuse, metadata.version("px4fuse")
     if report_version != installed_version:
-        report_version = one_line(report_version, 40)
         reason = (
             f"the report was made with px4fuse {report_version}; the installed version is "
             f"{installed_version}"
         )
         return make_unverifiable_result(reason, f"Verify the report with px4fuse {report_version}.")
-    log_file_name = one_line(log_name(results), 80) or "the log"
+    log_name = (
+        split_track(results.track.name)[0] if isinstance(results, LoopResults) else results.log.name
+    )
+    log_file_name = one_line(log_name, 80) or "the log"
     if not path_by_sha256:
         return make_unverifiable_result(
             NO_LOG_REASON, f"Add {log_file_name} to --logs.", log_file_name
         )
     sha256 = log_sha256(results)
     if sha256 not in path_by_sha256:
-        expected_hash = one_line(sha256, 64) or "none"
-        reason = f"the given files do not contain the log (SHA-256 {expected_hash})"
+        reason = f"the given files do not contain the log (SHA-256 {sha256 or 'none'})"
         remedy = f"If you have the log, add {log_file_name} to --logs."
         return Verification("other log", (reason,), False, remedy=remedy, missing=log_file_name)
     if results.student.notes.count("\n") > MAX_NOTES_LINES:
@@ -262,9 +255,8 @@ def make_unverifiable_result(
     reason: str, remedy: str = "", missing_input: str = ""
 ) -> Verification:
     """Return the status "cannot verify" with its reason."""
-    return Verification(
-        "cannot verify", (one_line(reason, 400),), False, remedy=remedy, missing=missing_input
-    )
+    reasons = (one_line(reason, 400),)
+    return Verification("cannot verify", reasons, False, remedy=remedy, missing=missing_input)
 
 
 def _compare_with_new_report(
@@ -291,8 +283,7 @@ def _compare_with_new_report(
         f"{RESULT_RELATIVE_TOLERANCE:g}, estimates within {ESTIMATE_RELATIVE_TOLERANCE:g})"
     ]
     if mismatches:
-        paths_text = ", ".join(mismatch.path for mismatch in mismatches[:3])
-        paths_text += ", …" * (len(mismatches) > 3)
+        paths_text = join_first_names([mismatch.path for mismatch in mismatches], 3)
         reasons = [
             f"{len(mismatches)} of {value_count} values differ from a new run on the log: "
             f"{paths_text}"
@@ -300,24 +291,21 @@ def _compare_with_new_report(
     page_differences = compare_pages(
         pdf, redrawn_pdf, partial(is_same_text_up_to_rounding, is_same_number=is_same_number)
     )
-    is_from_other_program = any(difference.is_structural for difference in page_differences)
-    installed_libraries = new_results.provenance.libraries.items()
-    differing_libraries = (
-        {*submitted_results.provenance.libraries.items()} - {*installed_libraries}
-        if page_differences
-        else ()
-    )
     # another PDF program or other library versions may change pages without a forgery
-    is_comparable = not (is_from_other_program or differing_libraries)
-    page_status: PageStatus = "same"
+    is_from_other_program = any(difference.is_structural for difference in page_differences)
+    other_libraries: set[tuple[str, str]] = set()
     if page_differences:
-        page_status = "differ" if is_comparable else "not compared"
-    status: VerificationStatus = "verified" if is_comparable else "cannot verify"
+        submitted_libraries = submitted_results.provenance.libraries.items()
+        other_libraries = submitted_libraries - new_results.provenance.libraries.items()
+    status: VerificationStatus = "verified"
+    page_status: PageStatus = "differ" if page_differences else "same"
+    if is_from_other_program or other_libraries:
+        status, page_status = "cannot verify", "not compared"
     if mismatches:
         status = "numbers differ"
-    difference_sentences = [difference.sentence for difference in page_differences]
-    listed_sentences = difference_sentences[:MAX_LISTED_PAGE_DIFFERENCES]
-    if unlisted_count := len(difference_sentences) - len(listed_sentences):
+    listed_sentences = [each.sentence for each in page_differences[:MAX_LISTED_PAGE_DIFFERENCES]]
+    if len(page_differences) > MAX_LISTED_PAGE_DIFFERENCES:
+        unlisted_count = len(page_differences) - MAX_LISTED_PAGE_DIFFERENCES
         listed_sentences.append(f"{unlisted_count} further differences are not listed")
     # the decisive reason is first: some tables show only one reason
     if status == "cannot verify":
@@ -325,14 +313,15 @@ def _compare_with_new_report(
     else:
         reasons += listed_sentences
     remedy = ORIGINAL_PDF_REMEDY if is_from_other_program else ""
-    if differing_libraries:
-        versions_text = one_line(", ".join(map(" ".join, sorted(differing_libraries))), 300)
+    if other_libraries:
+        versions_text = one_line(", ".join(map(" ".join, sorted(other_libraries))), 300)
         reasons.append(
             f"the report was made with {versions_text}; this computer has other versions, which "
             "may draw other pages"
         )
         remedy = remedy or f"Verify the report with {versions_text}."
-    reasons += [VERIFICATION_SCOPE_NOTE] * (status == "verified")
+    if status == "verified":
+        reasons.append(VERIFICATION_SCOPE_NOTE)
     return Verification(
         status,
         tuple(reasons),
@@ -384,24 +373,21 @@ def compare_results(
         for path in {**new_values, **recorded_values}
         if not path.startswith(MACHINE_DEPENDENT_FIELDS)
     }
-    agreement_by_path = {
-        path: _is_within_tolerance(
-            path, *value_pair, has_estimated_settings or path.startswith(ESTIMATE_FIELDS)
-        )
-        for path, value_pair in value_pair_by_path.items()
-        if all(map(is_number, value_pair))
-    }
-    agreeing_pairs = (
-        value_pair_by_path[path] for path, agrees in agreement_by_path.items() if agrees
-    )
-    unequal_pairs = tuple((float(a), float(b)) for a, b in agreeing_pairs if a != b)
-    is_same_number = partial(is_same_number_up_to_rounding, unequal_pairs)
-    mismatched_paths = [path for path, agrees in agreement_by_path.items() if not agrees]
+    mismatched_paths, other_paths, unequal_numbers = [], [], []
+    for path, (recorded_value, new_value) in value_pair_by_path.items():
+        if not is_number(recorded_value) or not is_number(new_value):
+            other_paths.append(path)
+            continue
+        is_estimated = has_estimated_settings or path.startswith(ESTIMATE_FIELDS)
+        if not _is_within_tolerance(path, recorded_value, new_value, is_estimated):
+            mismatched_paths.append(path)
+        elif recorded_value != new_value:
+            unequal_numbers.append((float(recorded_value), float(new_value)))
+    is_same_number = partial(is_same_number_up_to_rounding, unequal_numbers)
     mismatched_paths += [
         path
-        for path in value_pair_by_path
-        if path not in agreement_by_path
-        and not _is_equal_after_rounding(*value_pair_by_path[path], is_same_number)
+        for path in other_paths
+        if not _is_equal_after_rounding(*value_pair_by_path[path], is_same_number)
     ]
     mismatches = (
         Mismatch(one_line(path, MAX_TEXT_LENGTH), *map(_format_value, value_pair_by_path[path]))

@@ -88,10 +88,10 @@ def answer_key_path(folder: Path, key_option: Path | None) -> Path:
     """
     resolved_folder = folder.resolve()
     path = key_option or resolved_folder.parent / f"{resolved_folder.name}_answers.json"
-    if resolved_folder in (path.resolve(), *path.resolve().parents):
+    if path.resolve().is_relative_to(resolved_folder):
         raise OutputError(
-            f"The answer key {path} would be in the students' folder, where students can read it. "
-            "Choose another folder with --answer."
+            f"The answer key {path} would be in the students' folder. Choose another folder with "
+            "--answer."
         )
     return path
 
@@ -137,9 +137,8 @@ def write_assignment(
         key = read_answer_key(key_file) if key_file.exists() else AnswerKey(kind, ())
     answers = {normalise_text(answer.student_id): answer for answer in key.answers}
     # an answer key without these students belongs to another class
-    is_key_of_this_class = not answers or not answers.keys().isdisjoint(
-        normalise_text(student.student_id) for student in students
-    )
+    is_known_student = [normalise_text(student.student_id) in answers for student in students]
+    is_key_of_this_class = not answers or any(is_known_student)
     _require_key_of_same_flights(key_file, key.kind == kind and is_key_of_this_class)
     stored_secret = key.secret
     if secret is None:
@@ -158,16 +157,17 @@ def write_assignment(
         empty_form = format_answer_form(
             student.log_file_name, answer.sha256, [choice for choice, _ in choices]
         )
+        log_file = folder / student.log_file_name
         content_by_path = {
-            folder / student.log_file_name: log,
-            folder / form_name(student.log_file_name): empty_form.encode(),
+            log_file: log,
+            log_file.with_name(form_name(log_file.name)): empty_form.encode(),
         }
         missing_content_by_path = {
             path: content
             for path, content in content_by_path.items()
             if not _exists_with_same_content(path, content)
         }
-        figures_file = folder / Path(student.log_file_name).with_suffix(".png")
+        figures_file = log_file.with_suffix(".png")
         if not figures_file.exists():
             missing_content_by_path[figures_file] = draw_figures(
                 partial(draw_uniform, secret, student.student_id, kind)
@@ -177,7 +177,7 @@ def write_assignment(
         write_output_files({key_file: format_answer_key(key).encode()})
         key_file.chmod(0o600)  # only the instructor can read the answer key
         write_output_files(missing_content_by_path)
-        written_count += folder / student.log_file_name in missing_content_by_path
+        written_count += log_file in missing_content_by_path
         progress(finished_count, len(students))
     return key, written_count
 
@@ -195,8 +195,8 @@ def _exists_with_same_content(path: Path, content: bytes) -> bool:
     if path.is_file() and path.stat().st_size == len(content) and path.read_bytes() == content:
         return True
     raise OutputError(
-        f"{path} exists with other content and was not overwritten. Use the same secret and "
-        "options as for the existing files, or another folder (-o)."
+        f"{path} exists with other content and was not overwritten. Repeat secret and options of "
+        "the existing files, or choose another folder (-o)."
     )
 
 
@@ -204,6 +204,6 @@ def _require_key_of_same_flights(key_file: Path, has_same_flights: bool) -> None
     if not has_same_flights:
         raise OutputError(
             f"{key_file} is the answer key of other flights and was not overwritten. Choose "
-            "another file with --answer. To add students to this key, repeat its secret, options "
-            "and students."
+            "another file with --answer. To add students, repeat secret, options and students of "
+            "the key."
         )

@@ -9,6 +9,7 @@ from msgspec import Meta
 from px4fuse.classroom.assignment.roster import MAX_STUDENTS, ClassList, Person, normalise_text
 from px4fuse.classroom.assignment.truth import CorrectFormAnswers
 from px4fuse.core.reading import read_text
+from px4fuse.core.record import Sha256
 from px4fuse.errors import SettingsError
 
 # Maximum size (bytes) of an answer key: the key of 1000 students has 2 million bytes
@@ -46,7 +47,7 @@ class CorrectAnswers(
     student_id: Annotated[str, Meta(max_length=1000, pattern=r"\S")]
     name: _Text
     file: _Text
-    sha256: Annotated[str, Meta(pattern="^[0-9a-f]{64}$")]
+    sha256: Sha256
     scenario: dict[str, str | int | float | bool | None] = {}
     mistakes: _ShortTexts = ()
     true_values: dict[str, _Number] = {}

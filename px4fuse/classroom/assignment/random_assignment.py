@@ -73,9 +73,7 @@ class AssignableFault(Record):
         is_masked = other_fault.group in (self.group, *self.masked_fault_groups)
         return not is_masked and self.group not in other_fault.masked_fault_groups
 
-    def format_option(
-        self, difficulty: float, sign: float = 1.0, fault_start_fraction: float = 0.5
-    ) -> str:
+    def format_option(self, difficulty: float, sign: float, fault_start_fraction: float) -> str:
         """Return the value of the option ``px4fuse simulate --mistake`` for this fault.
 
         Parameters
@@ -169,41 +167,37 @@ def assign_random_flight(
         A flight cannot have ``fault_count`` injected faults.
     """
     possible_kinds = PROBABILITY_BY_FAULT_COUNT if kind == "mixed" else (kind,)
-    max_fault_count = (
-        min(len(PROBABILITY_BY_FAULT_COUNT[scenario_kind]) for scenario_kind in possible_kinds) - 1
-    )
+    max_fault_count = min(len(PROBABILITY_BY_FAULT_COUNT[each]) for each in possible_kinds) - 1
     if fault_count is not None and not 0 <= fault_count <= max_fault_count:
         raise SettingsError(
             f"--mistakes {fault_count} is out of range: a flight of kind {kind} has 0 to "
             f"{max_fault_count} faults."
         )
     if kind == "mixed":
-        kind = (
-            "loop" if draw_uniform(secret, student_id, kind, "kind") < LOOP_PROBABILITY else "aisle"
-        )
+        is_loop = draw_uniform(secret, student_id, kind, "kind") < LOOP_PROBABILITY
+        kind = "loop" if is_loop else "aisle"
     draw_number = partial(draw_uniform, secret, student_id, kind)
     if fault_count is None:
         fault_count = bisect(
             list(accumulate(PROBABILITY_BY_FAULT_COUNT[kind][:-1])), draw_number("count")
         )
-    faults: list[AssignableFault] = []
-    flight_rules = FLIGHT_RULES_BY_KIND[kind]
-    for fault in sorted(flight_rules.faults, key=lambda each: draw_number(f"order {each.name}")):
-        if len(faults) < fault_count and all(map(fault.is_detectable_with, faults)):
-            faults.append(fault)
-    difficulty_range = EASIEST_DIFFICULTY, HARDEST_DIFFICULTY
+    low, high = EASIEST_DIFFICULTY, HARDEST_DIFFICULTY
     if draw_number("undetectable") < HARD_FAULTS_PROBABILITY:
-        difficulty_range = HARDEST_DIFFICULTY, MAX_FAULT_DIFFICULTY
+        low, high = HARDEST_DIFFICULTY, MAX_FAULT_DIFFICULTY
+    faults: list[AssignableFault] = []
     difficulties, mistake_options = [], []
-    for fault in faults:
-        name, fault_difficulty = fault.name, EASIEST_DIFFICULTY
+    possible_faults = FLIGHT_RULES_BY_KIND[kind].faults
+    for fault in sorted(possible_faults, key=lambda each: draw_number(f"order {each.name}")):
+        if len(faults) == fault_count or not all(map(fault.is_detectable_with, faults)):
+            continue
+        faults.append(fault)
+        difficulty = EASIEST_DIFFICULTY
         if fault.detection_limit is not None:
-            low, high = difficulty_range
-            fault_difficulty = low + (high - low) * draw_number(f"size {name}")
-        sign = -1.0 if fault.has_either_sign and draw_number(f"sign {name}") < 0.5 else 1.0
-        difficulties.append(fault_difficulty)
+            difficulty = low + (high - low) * draw_number(f"size {fault.name}")
+        sign = -1.0 if fault.has_either_sign and draw_number(f"sign {fault.name}") < 0.5 else 1.0
+        difficulties.append(difficulty)
         mistake_options.append(
-            fault.format_option(fault_difficulty, sign, draw_number(f"at {name}"))
+            fault.format_option(difficulty, sign, draw_number(f"at {fault.name}"))
         )
     scenario = make_scenario(
         kind,
@@ -238,8 +232,8 @@ def derive_seed_from_secret(text: str, source_name: str) -> bytes:
     if len(secret) < MIN_SECRET_LENGTH:
         raise SettingsError(
             f"{source_name}: the secret has only {len(secret)} characters and can be guessed.",
-            f"Use {MIN_SECRET_LENGTH} or more characters, or omit the secret: px4fuse then "
-            "generates a secret and stores it in the answer key.",
+            f"Use {MIN_SECRET_LENGTH} or more characters, or omit the secret: then px4fuse "
+            "stores a random secret in the answer key.",
         )
     return derive_hmac_key(secret)
 

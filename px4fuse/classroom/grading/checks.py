@@ -34,16 +34,9 @@ from px4fuse.verification.verification import flatten, is_number, log_sha256
 MAX_QUOTE_LENGTH = 160
 FORM_MISMATCH_REASON = "your answer form and your report are about different logs"
 BOTH_AXES_ADVICE = "Make the report without --axis: the axes north and east are required"
-# Regular expression of one character, without control characters
-_PLAIN_CHARACTER_PATTERN = r"[^\x00-\x1f\x7f]"
-Text = Annotated[str, Meta(max_length=200, pattern=rf"^{_PLAIN_CHARACTER_PATTERN}*$")]
-Title = Annotated[
-    str,
-    Meta(
-        max_length=200,
-        pattern=rf"^{_PLAIN_CHARACTER_PATTERN}*[^\s\x00-\x1f\x7f]{_PLAIN_CHARACTER_PATTERN}*$",
-    ),
-]
+# Text without control characters; a title is not blank
+Text = Annotated[str, Meta(max_length=200, pattern=r"^[^\x00-\x1f\x7f]*$")]
+Title = Annotated[str, Meta(max_length=200, pattern=r"^(?=.*\S)[^\x00-\x1f\x7f]*$")]
 Bound = Annotated[float, Meta(ge=-1e12, le=1e12)]
 ErrorFactorAtZeroPoints = Annotated[float, Meta(ge=1.0, le=1000.0)]
 # Fraction of the maximum points (0 to 1), and reason for the student
@@ -123,20 +116,17 @@ class ScoringInput:
     @cached_property
     def right_answers(self) -> CorrectAnswers | None:
         """Right answers for the log of the report; None if the log is not in the answer key."""
-        return (
-            None
-            if self.key is None
-            else self.key.find_answers_by_log_sha256(log_sha256(self.results))
-        )
+        if self.key is None:
+            return None
+        return self.key.find_answers_by_log_sha256(log_sha256(self.results))
 
     @cached_property
     def assigned_log_answers(self) -> CorrectAnswers | None:
         """Right answers for the log that the instructor gave to the student."""
         if self.key is None:
             return None
-        stated_id = shorten_text(self.results.student.id)
         return self.key.find_student_answers(self.submitter_id) or self.key.find_student_answers(
-            stated_id
+            shorten_text(self.results.student.id)
         )
 
     @cached_property
@@ -244,10 +234,8 @@ class NumberItem(RubricItem, frozen=True, tag="number"):
 
     def __post_init__(self) -> None:
         is_bounded = math.isfinite(self.at_least) or math.isfinite(self.at_most)
-        is_zero_at_outside_bounds = (
-            self.zero_at is None or self._compute_excess(self.zero_at) >= 0.0
-        )
-        if not is_bounded or self.at_least > self.at_most or not is_zero_at_outside_bounds:
+        has_zero_points_inside = self.zero_at is not None and self._compute_excess(self.zero_at) < 0
+        if not is_bounded or self.at_least > self.at_most or has_zero_points_inside:
             raise ValueError(
                 "give at_least, at_most or both (at_least <= at_most); zero_at must be outside"
             )
@@ -257,15 +245,11 @@ class NumberItem(RubricItem, frozen=True, tag="number"):
         return max(self.at_least - number, number - self.at_most)
 
     def _score_number(self, number: float) -> float:
-        excess_over_bound = self._compute_excess(number)
-        if excess_over_bound <= 0.0:
+        excess = self._compute_excess(number)
+        if excess <= 0.0:
             return 1.0
-        excess_for_zero_points = 0.0 if self.zero_at is None else self._compute_excess(self.zero_at)
-        return (
-            max(1.0 - excess_over_bound / excess_for_zero_points, 0.0)
-            if excess_for_zero_points > 0.0
-            else 0.0
-        )
+        excess_at_zero_points = 0.0 if self.zero_at is None else self._compute_excess(self.zero_at)
+        return 0.0 if excess >= excess_at_zero_points else 1.0 - excess / excess_at_zero_points
 
     def score(self, scoring_input: ScoringInput) -> ScoreAndReason:
         values = find_values(scoring_input.values, self.path)

@@ -5,8 +5,6 @@ import statistics
 from collections import Counter
 from collections.abc import Iterator, Mapping, Sequence
 
-import numpy as np
-
 from px4fuse.classroom.assignment.sheet import format_cell_number
 from px4fuse.classroom.grading.item_analysis import analyse_items
 from px4fuse.classroom.grading.model import (
@@ -14,15 +12,14 @@ from px4fuse.classroom.grading.model import (
     Grade,
     GradeOverride,
     counted_reports,
-    list_titles,
+    list_item_titles,
 )
-from px4fuse.core.text import format_count, format_number
+from px4fuse.core.text import format_count
 from px4fuse.html import frame
 from px4fuse.html.frame import Cell, Column, Row, RowDetailsSection
 from px4fuse.html.safe import load_template, make_relative_url
 from px4fuse.results.answer_form import form_rows
 
-HISTOGRAM_BIN_COUNT = 10
 NO_SUBMISSION_STATUS = "no submission"
 # CSS style and symbol of each verification status, in sort order
 STATUS_STYLES: dict[str, tuple[str, str]] = {
@@ -39,7 +36,7 @@ TABLE_FILTER_TAGS = (*STATUSES, "pending", "to read", "flagged", "late", "change
 
 def format_class_page(grades: Sequence[Grade], title: str, version_text: str) -> str:
     """Format the web page of the class; ``version_text`` is name and version of px4fuse."""
-    item_titles, number_titles = list_titles(grades)
+    item_titles = list_item_titles(grades)
     count_by_tag = Counter(tag for grade in grades for tag in _make_grade_tags(grade))
     tags = (
         *TABLE_FILTER_TAGS,
@@ -59,47 +56,40 @@ def format_class_page(grades: Sequence[Grade], title: str, version_text: str) ->
             Column("Handed in", "line", min_screen_size="desk"),
             Column("Flags", "rank", min_screen_size="desk"),
             *(Column(title, "number", "items") for title in item_titles),
-            *(Column(title, "number", "numbers") for title in number_titles),
         ),
-        rows=[_make_grade_row(grade, item_titles, number_titles) for grade in grades],
+        rows=[_make_grade_row(grade, item_titles) for grade in grades],
         filters=[("Status", [("", f"Everyone ({len(grades)})"), *options])],
-        column_groups=(("items", "Points of each rubric item"), ("numbers", "Numbers")),
+        column_groups=(("items", "Points of each rubric item"),),
         search_placeholder="search for name, id, file or flag",
         full_table_note="class.csv contains the table of all students.",
     )
 
 
 def _format_statistics(grades: Sequence[Grade], count_by_tag: Mapping[str, int]) -> str:
-    """Format the statistics of the class: reports by status, and histograms of points."""
-    points_of_students = [grade.total for grade in grades if grade.total is not None]
-    max_points = max((grade.max_points for grade in grades if grade.max_points > 0.0), default=1.0)
+    """Format the statistics of the class: reports by status, and points of students and items."""
+    totals = [grade.total for grade in grades if grade.total is not None]
+    max_points = max((grade.max_points for grade in grades), default=0.0) or 1.0
     reports = counted_reports(grades)
+    pending_points = [report.points for report in reports if report.instructor_action]
+    # title, value and note; zeros are not shown
+    numbers: list[tuple[str, float | str, str]] = [
+        ("Students", len(grades), ""),
+        ("Verified", count_by_tag["verified"], ""),
+        ("Missing", count_by_tag[NO_SUBMISSION_STATUS], ""),
+        ("Flagged", count_by_tag["flagged"], ""),
+        ("Late", count_by_tag["late"], ""),
+    ]
+    if totals:
+        maximum_text = f"of {max_points:g}"
+        numbers += [
+            ("Mean points", f"{statistics.fmean(totals):.1f}", maximum_text),
+            ("Median points", f"{statistics.median(totals):.1f}", maximum_text),
+        ]
+    pending_text = f"{format_cell_number(sum(pending_points))} points, not counted"
+    numbers.append(("Pending items", len(pending_points), pending_text))
     return load_template("classroom/grading/above.html").render(
-        students=len(grades),
-        counts=count_by_tag,
-        averages=(statistics.fmean(points_of_students), statistics.median(points_of_students))
-        if points_of_students
-        else (),
-        totals=compute_histogram(points_of_students, max_points) if points_of_students else (),
-        max_points_text=format_cell_number(max_points),
-        max_points_edge=format_number(max_points),
-        pending_points=[report.points for report in reports if report.instructor_action],
-        number=format_cell_number,
-        items=[
-            (each, compute_histogram(each.point_fractions, 1.0)) for each in analyse_items(reports)
-        ],
+        numbers=numbers, items=analyse_items(reports)
     )
-
-
-def compute_histogram(values: Sequence[float], maximum: float) -> list[tuple[int, str]]:
-    """Compute a histogram of ten bins from 0 to ``maximum``; return (count, lower edge) per bin.
-
-    >>> compute_histogram([0.0, 5.0, 5.5, 9.0], 10.0)[5]
-    (2, '5')
-    """
-    counts, edges = np.histogram(np.clip(values, 0.0, maximum), HISTOGRAM_BIN_COUNT, (0.0, maximum))
-    lower_edges = (format_number(round(edge, 2)) for edge in edges.tolist())
-    return list(zip(counts.tolist(), lower_edges, strict=False))
 
 
 def _make_grade_tags(grade: Grade) -> list[str]:
@@ -117,7 +107,7 @@ def _make_grade_tags(grade: Grade) -> list[str]:
     return tags + ["changed by instructor"] * bool(grade.overrides or grade.comment)
 
 
-def _make_grade_row(grade: Grade, item_titles: Sequence[str], number_titles: Sequence[str]) -> Row:
+def _make_grade_row(grade: Grade, item_titles: Sequence[str]) -> Row:
     report = grade.counted_report
     status = report.status if report else NO_SUBMISSION_STATUS
     css_class, symbol = STATUS_STYLES[status]
@@ -125,7 +115,6 @@ def _make_grade_row(grade: Grade, item_titles: Sequence[str], number_titles: Seq
     flag_count_text = format_count(flag_count, "flag") if flag_count else ""
     late_text = f"{math.ceil(grade.lateness_s / 60.0)} min late" if grade.lateness_s else ""
     points_by_title = {item.title: item.points for item in report.items} if report else {}
-    report_numbers = report.numbers if report else {}
     cells = (
         Cell(grade.display_name, second_line=grade.file_name),
         Cell(grade.student_id),
@@ -134,7 +123,6 @@ def _make_grade_row(grade: Grade, item_titles: Sequence[str], number_titles: Seq
         Cell(grade.submission_time, second_line=late_text),
         Cell("\n".join(grade.flags), float(flag_count), "", "flags"),
         *(frame.make_number_cell(points_by_title.get(title)) for title in item_titles),
-        *(frame.make_number_cell(report_numbers.get(title)) for title in number_titles),
     )
     # overrides.csv needs an id or a file name, which an anonymous student lacks
     points_inputs = (_make_points_inputs(grade),) if grade.student_id or grade.file_name else ()
@@ -153,10 +141,10 @@ def _make_grade_row(grade: Grade, item_titles: Sequence[str], number_titles: Seq
 
 def _make_grade_details(grade: Grade) -> Iterator[RowDetailsSection]:
     """Yield the details of a student for the web page."""
-    report, comment = grade.counted_report, frame.make_prose_section("Your comment", grade.comment)
+    report = grade.counted_report
+    yield frame.make_prose_section("Your comment", grade.comment)
     if report is None:
         yield frame.make_list_section("Missing", ["No submission."])
-        yield comment
         return
     verification = report.verification
     differences = [
@@ -172,13 +160,7 @@ def _make_grade_details(grade: Grade) -> Iterator[RowDetailsSection]:
         )
         for item in report.items
     ]
-    fault_texts = [
-        f"{kind}: the student {'named' if is_named else 'did not name'} this fault"
-        for kind, is_named in report.did_student_name_fault.items()
-    ]
-    other_report_texts = [
-        f"{other_report.submission}: {other_report.status}" for other_report in grade.other_reports
-    ]
+    other_report_texts = [f"{other.submission}: {other.status}" for other in grade.other_reports]
     yield frame.make_list_section("Flags", grade.flags, is_warning=True)
     yield frame.make_list_section(
         "Required decision of the instructor",
@@ -191,8 +173,6 @@ def _make_grade_details(grade: Grade) -> Iterator[RowDetailsSection]:
     )
     title = "Points (proposed)" if report.instructor_action else "Points"
     yield frame.make_table_section(title, items, ("Item", "Points", "Of", "Comment"), (1, 2))
-    yield comment
-    yield frame.make_list_section("Injected faults of this flight", fault_texts)
     yield frame.make_name_value_section(
         "Answer form", [*form_rows(report.form)] if report.form else []
     )
@@ -203,18 +183,14 @@ def _make_grade_details(grade: Grade) -> Iterator[RowDetailsSection]:
 def _make_points_cell(grade: Grade) -> Cell:
     report = grade.counted_report
     if grade.total is None:
-        proposed_points_text = (
-            f"{format_cell_number(report.points)} proposed"
-            if report and report.counted_points is None
-            else ""
-        )
-        return Cell("pending" if proposed_points_text else "–", None, proposed_points_text)
-    notes = [f"{format_cell_number(grade.deducted_points)} deducted (late)"] * bool(
-        grade.deducted_points
-    )
-    notes += ["changed by instructor"] * any(
-        override.points is not None for override in grade.overrides.values()
-    )
+        if report is None or report.counted_points is not None:
+            return Cell("–")
+        return Cell("pending", None, f"{format_cell_number(report.points)} proposed")
+    notes = []
+    if grade.deducted_points:
+        notes.append(f"{format_cell_number(grade.deducted_points)} deducted (late)")
+    if any(override.points is not None for override in grade.overrides.values()):
+        notes.append("changed by instructor")
     return Cell(
         f"{format_cell_number(grade.total)} / {format_cell_number(grade.max_points)}",
         grade.total,
@@ -231,13 +207,10 @@ def _make_points_inputs(grade: Grade) -> RowDetailsSection:
         if item.is_scored_by_instructor
     }
     max_points_by_title[TOTAL_TITLE] = grade.max_points
-    override_by_title = {
-        title: grade.overrides.get(title, GradeOverride()) for title in max_points_by_title
-    }
-    rows = [
-        (title, max_points_by_title[title], override.points, override.comment)
-        for title, override in override_by_title.items()
-    ]
+    rows = []
+    for title, max_points in max_points_by_title.items():
+        override = grade.overrides.get(title, GradeOverride())
+        rows.append((title, max_points, override.points, override.comment))
     # the page writes a complete overrides.csv, also with points that have no input box
     rows_without_input_box = [
         (title, override.points, override.comment)

@@ -11,8 +11,9 @@ from contextlib import suppress
 from dataclasses import dataclass, replace
 from datetime import datetime, tzinfo
 from functools import cached_property
+from operator import attrgetter
 from pathlib import Path
-from typing import Literal
+from typing import Literal, NamedTuple
 from zoneinfo import ZoneInfo, ZoneInfoNotFoundError
 
 from px4fuse.classroom.assignment.key import AnswerKey
@@ -42,10 +43,7 @@ MAX_COMMENT_LENGTH = 10_000
 # Points and comment of the instructor, by student id and rubric item ("" for the whole report)
 OverridesByStudent = Mapping[str, Mapping[str, GradeOverride]]
 # Syntax of the option --late, for example "10 % / day up to 50 %"
-_LATE_RULE_PATTERN = re.compile(
-    r"(?P<rate>\d+(?:\.\d+)?)\s*%\s*/\s*(?P<unit>day|hour)"
-    r"(?:\s+up to\s+(?P<most>\d+(?:\.\d+)?)\s*%)?"
-)
+_LATE_RULE_PATTERN = re.compile(r"(\d+\.?\d*)\s*%\s*/\s*(day|hour)(?:\s+up to\s+(\d+\.?\d*)\s*%)?")
 # Formats of submission times in English tables of Moodle, with a 12-hour and a 24-hour clock
 _MOODLE_TIME_FORMATS = ("%A, %d %B %Y, %I:%M %p", "%A, %d %B %Y, %H:%M")
 # First letters of the German names of months, January first
@@ -135,8 +133,24 @@ class Course:
         return ClassList(people, *people_by_sheet)
 
 
-# UNIX times of submission and zip entry, report, and grade if this report counts
-CandidateReport = tuple[tuple[float, float], GradedReport, Grade]
+class _Candidate(NamedTuple):
+    """Report that may count for a student's grade.
+
+    Attributes
+    ----------
+    time_s : float
+        UNIX time of submission; 0 if unknown.
+    grade : Grade
+        Grade of the student if this report counts.
+    """
+
+    time_s: float
+    report: GradedReport
+    grade: Grade
+
+    @property
+    def points_after_deduction(self) -> float:
+        return max(self.report.points - self.grade.deducted_points, 0.0)
 
 
 def build_grades(
@@ -161,7 +175,7 @@ def build_grades(
     """
     has_class_list = bool(course.class_list.people)
     class_list = course.class_list if has_class_list else _collect_students(reports, submissions)
-    candidates_by_student_index: dict[int | None, list[CandidateReport]] = defaultdict(list)
+    candidates_by_student_index: dict[int | None, list[_Candidate]] = defaultdict(list)
     for report, submission in zip(reports, submissions, strict=True):
         student_index = class_list.find_student_index(submission.origin.person)
         if student_index is None:
@@ -188,15 +202,15 @@ def build_grades(
     grades_with_report = [grade for grade in grades if grade.counted_report]
     unknown_time_count = sum(grade.lateness_s is None for grade in grades_with_report)
     if course.late_rule and unknown_time_count:
-        notes += (
+        notes.append(
             f"The submission time is unknown for {unknown_time_count} of {len(grades_with_report)} "
-            "students, so no points were deducted. Add the times with --worksheet.",
+            "students, so no points were deducted. Add the times with --worksheet."
         )
     final_grades = (
         _apply_overrides(*grade_and_overrides, flags_by_submission, course)
         for grade_and_overrides in zip(grades, overrides_per_grade, strict=True)
     )
-    return tuple(final_grades), notes
+    return tuple(final_grades), tuple(notes)
 
 
 def _collect_students(
@@ -227,134 +241,92 @@ def _make_candidate(
     course: Course,
     student_index: int | None,
     class_list: ClassList,
-) -> CandidateReport:
-    """Return a report, its times, and the grade of the student if this report counts."""
+) -> _Candidate:
+    """Return a report, its time, and the grade of the student if this report counts."""
     origin, platform = submission.origin, submission.origin.platform.capitalize()
     person = (
         Person(report.student_id) if student_index is None else class_list.people[student_index]
     )
-    due_time = course.due
+    due_time, late_rule = course.due, course.late_rule
     if due_time is not None and person.extended_due:
-        due_time = parse_due_time(
-            person.extended_due, f"extension of {one_line(person.student_id, 40)}:", due_time.tzinfo
-        )
-    platform_time = origin.time or parse_moodle_time(person.submission_time)
-    submission_time, zip_time = (
-        submission_time and add_time_zone(submission_time, due_time)
-        for submission_time in (platform_time, submission.time)
-    )
-    lateness_s, flags = None, []
+        name = f"extension of {one_line(person.student_id, 40)}:"
+        due_time = parse_due_time(person.extended_due, name, due_time.tzinfo)
+    submission_time = origin.time or parse_moodle_time(person.submission_time)
+    if submission_time is not None:
+        submission_time = add_time_zone(submission_time, due_time)
+    lateness_s, deducted_points, flags = None, 0.0, []
     if due_time is not None and submission_time is not None:
         # UNIX times, because differences of datetime objects ignore daylight saving time
         lateness_s = submission_time.timestamp() - due_time.timestamp()
         lateness_s = lateness_s if lateness_s > course.grace_s else 0.0
+        if late_rule is not None:
+            deducted_points = late_rule.compute_deduction(lateness_s, report.max_points)
     elif origin.is_late:
         flags.append(
             f"{platform} marks the file as late without a time, so no points were deducted."
         )
-    elif course.late_rule and due_time and zip_time and zip_time.timestamp() > due_time.timestamp():
-        flags.append(
-            f"The time in the zip file ({zip_time:{TIME_FORMAT}}) is after the due time. It may be "
-            "the time of the download, so no points were deducted."
-        )
-    if origin.has_forged_platform_name:
-        flags.append(
-            "The student chose a file name that looks like the file names of a learning platform "
-            f"(platform of the export: {platform or 'none'}). Check who handed in the file."
-        )
-    reported_student_index = (
-        class_list.find_student_index(Person(report.student_id)) if platform else None
-    )
-    if reported_student_index is not None and student_index not in (None, reported_student_index):
-        reported_person = class_list.people[reported_student_index]
+    reported_index = class_list.find_student_index(Person(report.student_id)) if platform else None
+    if reported_index is not None and student_index not in (None, reported_index):
+        reported_person = class_list.people[reported_index]
         flags.append(
             f"The id in the report is that of {reported_person.student_id} "
             f"({reported_person.name or 'no name'}), but {platform} names another student."
         )
-    late_rule = course.late_rule
     grade = Grade(
         person.name or one_line(report.student or origin.person.name, 200),
         person.student_id,
         report,
-        submission_time="" if submission_time is None else submission_time.strftime(TIME_FORMAT),
+        submission_time=f"{submission_time:{TIME_FORMAT}}" if submission_time else "",
         lateness_s=lateness_s,
-        deducted_points=late_rule.compute_deduction(lateness_s, report.max_points)
-        if late_rule and lateness_s
-        else 0.0,
+        deducted_points=deducted_points,
         max_points=report.max_points,
         flags=tuple(flags),
     )
-    sort_key = (
-        submission_time.timestamp() if submission_time else 0.0,
-        zip_time.timestamp() if zip_time else 0.0,
-    )
-    return sort_key, report, grade
+    time_s = submission_time.timestamp() if submission_time else 0.0
+    return _Candidate(time_s, report, grade)
 
 
-def _compute_points_after_deduction(candidate: CandidateReport) -> float:
-    _, report, grade = candidate
-    return max(report.points - grade.deducted_points, 0.0)
-
-
-def _choose_counted_report(candidates: Sequence[CandidateReport], course: Course) -> Grade:
+def _choose_counted_report(candidates: Sequence[_Candidate], course: Course) -> Grade:
     """Choose the report that counts for a student's grade."""
-    sorted_candidates = sorted(
+    candidates = sorted(
         candidates,
-        key=lambda candidate: (
-            candidate[0],
-            _compute_points_after_deduction(candidate),
-            candidate[1].submission,
-        ),
+        key=lambda each: (each.time_s, each.points_after_deduction, each.report.submission),
     )
     # prefer reports without open decisions of the instructor
-    readable_candidates = [candidate for candidate in sorted_candidates if candidate[1].version]
-    final_candidates = [
-        candidate for candidate in readable_candidates if not candidate[1].instructor_action
-    ]
-    eligible_candidates = final_candidates or readable_candidates or sorted_candidates
-    chosen_sort_key, chosen_report, grade = {
-        "latest": eligible_candidates[-1],
+    readable = [each for each in candidates if each.report.version]
+    final = [each for each in readable if not each.report.instructor_action]
+    eligible = final or readable or candidates
+    chosen = eligible[-1]
+    if course.attempt == "first":
         # of reports with the same time, the last has the most points
-        "first": [
-            candidate
-            for candidate in eligible_candidates
-            if candidate[0] == eligible_candidates[0][0]
-        ][-1],
-        "best": max(reversed(eligible_candidates), key=_compute_points_after_deduction),
-    }[course.attempt]
-    flags = list(grade.flags)
-    other_reports = tuple(
-        report for _, report, _ in sorted_candidates if report is not chosen_report
-    )
-    forms = [
-        report.form for sort_key, report, _ in eligible_candidates if sort_key == chosen_sort_key
-    ]
+        chosen = [each for each in eligible if each.time_s == eligible[0].time_s][-1]
+    elif course.attempt == "best":
+        chosen = max(reversed(eligible), key=attrgetter("points_after_deduction"))
+    report, flags = chosen.report, list(chosen.grade.flags)
     # without this rule, students could hand in several answer forms with different guesses
-    if course.attempt != "best" and len(set(forms)) > 1:
+    forms = [each.report.form for each in eligible if each.time_s == chosen.time_s]
+    if course.attempt == "best":
+        if len({each.report.form for each in readable}) > 1:
+            flags.append(
+                f"The student handed in {len(candidates)} reports with different answer forms."
+            )
+    elif len(set(forms)) > 1:
         action = (
             f"The answer forms of {len(forms)} reports differ. Ask the student which report counts."
         )
-        chosen_report = replace(chosen_report, instructor_action=action)
-    elif (
-        course.attempt == "best" and len({report.form for _, report, _ in readable_candidates}) > 1
-    ):
-        flags.append(
-            f"The student handed in {len(candidates)} reports with different answer forms."
-        )
-    elif len(forms) > 1 and any(chosen_sort_key):
-        flags.append(f"{len(forms)} reports have the same time; the one with most points counts.")
-    for sort_key, report, _ in sorted_candidates:
-        if (
-            report in other_reports
-            and sort_key >= chosen_sort_key
-            and (report.instructor_action or not report.version)
-        ):
-            status = "pending" if report.version else "not a report"
-            flags.append(
-                f"The file {one_line(report.submission, 80)} does not count: it is {status}."
-            )
+        report = replace(report, instructor_action=action)
+    others = [each for each in candidates if each is not chosen]
+    for other in others:
+        is_report = bool(other.report.version)
+        if other.time_s >= chosen.time_s and (other.report.instructor_action or not is_report):
+            status = "pending" if is_report else "not a report"
+            name = one_line(other.report.submission, 80)
+            flags.append(f"The file {name} does not count: it is {status}.")
     return replace(
-        grade, counted_report=chosen_report, other_reports=other_reports, flags=tuple(flags)
+        chosen.grade,
+        counted_report=report,
+        other_reports=tuple(other.report for other in others),
+        flags=tuple(flags),
     )
 
 
@@ -456,7 +428,7 @@ def read_overrides(path: Path) -> OverridesByStudent:
 
 def match_overrides(
     overrides: OverridesByStudent, grades: Sequence[Grade]
-) -> tuple[list[dict[str, GradeOverride]], tuple[str, ...]]:
+) -> tuple[list[dict[str, GradeOverride]], list[str]]:
     """Assign the instructor's points and comments to students and rubric items.
 
     Returns
@@ -478,24 +450,26 @@ def match_overrides(
         if student_index is None:
             notes.append(f"{OVERRIDES_NAME}: no student has the id {student_text}.")
             continue
+        matched = matched_overrides[student_index]
         max_points_by_title = {TOTAL_TITLE: max_total_points, "": math.inf}
         if report := grades[student_index].counted_report:
-            max_points_by_title |= {item.title: item.max_points for item in report.items}
             max_points_by_title[TOTAL_TITLE] = report.max_points
+            max_points_by_title |= {item.title: item.max_points for item in report.items}
         title_by_normalised_title = {normalise_text(title): title for title in max_points_by_title}
         for item_title, override in override_by_item.items():
-            title, problem = title_by_normalised_title.get(normalise_text(item_title)), ""
+            title = title_by_normalised_title.get(normalise_text(item_title))
             if title is None:
                 problem = f"student {student_text} has no item {one_line(item_title, 60)!r}"
-            elif title in matched_overrides[student_index]:
+            elif title in matched:
                 problem = f"student {student_text} has two rows for {title or 'the whole report'!r}"
             elif (override.points or 0.0) > max_points_by_title[title]:
                 limit_text = f"{max_points_by_title[title]:g} points of {one_line(title, 60)!r}"
                 problem = f"points of student {student_text} are above the maximum, {limit_text}"
             else:
-                matched_overrides[student_index][title] = override
-            notes += [f"{OVERRIDES_NAME}: {problem}."] if problem else []
-    return matched_overrides, tuple(notes)
+                matched[title] = override
+                continue
+            notes.append(f"{OVERRIDES_NAME}: {problem}.")
+    return matched_overrides, notes
 
 
 # ------------------------------------------------------------------ due time
@@ -510,13 +484,14 @@ def parse_late_rule(text: str) -> LateRule:
         The text is not a late rule.
     """
     match = _LATE_RULE_PATTERN.fullmatch(text.strip())
-    if match is None or not 0.0 <= float(match["rate"]) <= 100.0:
+    if match is None or float(match[1]) > 100.0:
         raise SettingsError(
             f"--late {text!r} is not a deduction, such as 10%/day or 10%/day up to 50%."
         )
-    unit_s = {"day": 86_400.0, "hour": 3_600.0}[match["unit"]]
-    max_deduction_fraction = min(float(match["most"] or 100.0) / 100.0, 1.0)
-    return LateRule(float(match["rate"]) / 100.0, unit_s, max_deduction_fraction)
+    deduction_text, unit, limit_text = match.groups()
+    unit_s = 86_400.0 if unit == "day" else 3_600.0
+    max_deduction_fraction = min(float(limit_text or 100.0) / 100.0, 1.0)
+    return LateRule(float(deduction_text) / 100.0, unit_s, max_deduction_fraction)
 
 
 def parse_due_time(

@@ -102,50 +102,45 @@ class FormPoints:
 
 def compute_form_points(answers: Answers, right_answers: CorrectFormAnswers) -> FormPoints:
     """Compare a student's answers with the right answers, and compute the points."""
-    has_recognised_fault_free_flight = not right_answers.mistakes and answers.states_no_fault
-    weights = POINTS_CONFIG["weights_clean" if has_recognised_fault_free_flight else "weights"]
+    is_recognised_as_fault_free = not right_answers.mistakes and answers.states_no_fault
+    weights = POINTS_CONFIG["weights_clean" if is_recognised_as_fault_free else "weights"]
     scores = dict.fromkeys(FORM_PART_NAMES, 0.0)
     matches, false_faults = _match_faults(answers, right_answers)
     if right_answers.mistakes and len(false_faults) < ZERO_POINTS_FALSE_FAULT_COUNT:
         scores |= _score_faults(matches, right_answers)
-    scores["numbers"] = numbers_score = _score_numbers(answers, right_answers)
-    # verdicts can be guessed, so they give half of the points without a right number
-    can_verdicts_be_guessed = not numbers_score and not has_recognised_fault_free_flight
-    scores["verdicts"] = _score_verdicts(answers, right_answers) * (
-        0.5 if can_verdicts_be_guessed else 1.0
-    )
-    points_by_form_part = {name: weights[name] * score for name, score in scores.items()}
-    if has_recognised_fault_free_flight:
-        points_by_form_part["mistakes"] = weights["mistakes"]
+    scores["numbers"] = _score_numbers(answers, right_answers)
+    scores["verdicts"] = _score_verdicts(answers, right_answers)
+    if not scores["numbers"] and not is_recognised_as_fault_free:
+        # verdicts can be guessed, so they give half of the points without a right number
+        scores["verdicts"] *= 0.5
+    points = {name: weights[name] * score for name, score in scores.items()}
+    if is_recognised_as_fault_free:
+        points["mistakes"] = weights["mistakes"]
     elif right_answers.mistakes and all(fault.size is None for fault in right_answers.mistakes):
         # without fault sizes, naming the faults also gives the points for sizes
-        points_by_form_part["mistakes"] += weights["sizes"] * scores["mistakes"]
-    points_by_form_part["mistakes"] -= FALSE_FAULT_DEDUCTION * len(false_faults)
-    points_by_form_part["mistakes"] = max(points_by_form_part["mistakes"], 0.0)
+        points["mistakes"] += weights["sizes"] * scores["mistakes"]
+    points["mistakes"] -= FALSE_FAULT_DEDUCTION * len(false_faults)
+    points["mistakes"] = max(points["mistakes"], 0.0)
     if right_answers.choices:
-        weights = {
-            name: FLIGHT_QUESTIONS_POINTS_FRACTION * points for name, points in weights.items()
-        }
+        weights, points = (
+            {name: FLIGHT_QUESTIONS_POINTS_FRACTION * value for name, value in values.items()}
+            for values in (weights, points)
+        )
         weights["figures"] = 100.0 * (1.0 - FLIGHT_QUESTIONS_POINTS_FRACTION)
-        points_by_form_part = {
-            name: FLIGHT_QUESTIONS_POINTS_FRACTION * points
-            for name, points in points_by_form_part.items()
-        }
-        points_by_form_part["figures"] = weights["figures"] * _score_choices(answers, right_answers)
+        points["figures"] = weights["figures"] * _score_choices(answers, right_answers)
     named_kinds = [named_fault.kind for named_fault in answers.mistakes]
-    did_student_name_fault = {
-        fault.kind: fault.kind in named_kinds for fault in right_answers.mistakes
-    }
     feedback = (
-        *_describe_fault_answers(matches, false_faults, has_recognised_fault_free_flight),
+        *_describe_fault_answers(matches, false_faults, is_recognised_as_fault_free),
         *_describe_wrong_answers(answers, right_answers),
     )
     parts = tuple(
-        ItemScore(name, points_by_form_part[name], max_points, "")
+        ItemScore(name, points[name], max_points, "")
         for name, max_points in weights.items()
         if max_points
     )
-    return FormPoints(parts, feedback, did_student_name_fault)
+    return FormPoints(
+        parts, feedback, {fault.kind: fault.kind in named_kinds for fault in right_answers.mistakes}
+    )
 
 
 # Injected fault, matching fault that the student named (or None), and score (0 to 1)
@@ -153,14 +148,11 @@ FaultMatch = tuple[InjectedFault, NamedFault | None, float]
 
 
 def _describe_fault_answers(
-    matches: list[FaultMatch],
-    false_faults: list[NamedFault],
-    has_recognised_fault_free_flight: bool,
+    matches: list[FaultMatch], false_faults: list[NamedFault], states_no_fault: bool
 ) -> Iterator[str]:
     """Yield feedback on each injected fault, and on named faults that the flight does not have."""
     if not matches:
-        form_text = ", as your form states" * has_recognised_fault_free_flight
-        yield f"your flight has no injected fault{form_text}"
+        yield f"your flight has no injected fault{', as your form states' * states_no_fault}"
     for fault, named_fault, _ in matches:
         fault_text = f"{fault.kind} ({FAULT_KINDS[fault.kind].description})"
         right_answer = describe_right_answer(fault)
@@ -195,17 +187,12 @@ def _describe_wrong_answers(answers: Answers, right_answers: CorrectFormAnswers)
     ]
     if _score_ekf2_behaviour(answers, right_answers) < 1.0:
         rows.append(("behaviour of EKF2", answers.ekf2_did, right_answers.ekf2_did))
+    tolerance_text = f"within {100.0 * MAX_NUMBER_ERROR_FULL_POINTS:g} %"
     for question, given, right in zip_longest(
         select_questions(answers.log_sha256), answers.quantities, right_answers.quantities
     ):
         if right not in (None, ()) and _score_number(given, right) < 1.0:
-            rows.append(
-                (
-                    f"{question.text}, within {100.0 * MAX_NUMBER_ERROR_FULL_POINTS:g} %",
-                    given,
-                    right,
-                )
-            )
+            rows.append((f"{question.text}, {tolerance_text}", given, right))
     for letter, (choice, right_letter) in zip_longest(
         answers.choices[: len(right_answers.choices)], right_answers.choices
     ):
@@ -229,23 +216,23 @@ def _match_faults(
 
     Return the matches, and the named faults that match no injected fault.
     """
-    unmatched_faults = [
+    false_faults = [
         named_fault for named_fault in answers.mistakes if named_fault.kind != NO_FAULT_KIND
     ]
     match_by_kind: dict[str, tuple[NamedFault, float]] = {}
     candidates = [
         (score_fault_kind(fault.kind, named_fault.kind), fault.kind, named_fault)
         for fault in right_answers.mistakes
-        for named_fault in unmatched_faults
+        for named_fault in false_faults
     ]
     for score, kind, named_fault in sorted(candidates, key=lambda each: -each[0]):
-        if score and kind not in match_by_kind and named_fault in unmatched_faults:
+        if score and kind not in match_by_kind and named_fault in false_faults:
             match_by_kind[kind] = named_fault, score
-            unmatched_faults.remove(named_fault)
+            false_faults.remove(named_fault)
     matches = [
         (fault, *match_by_kind.get(fault.kind, (None, 0.0))) for fault in right_answers.mistakes
     ]
-    return matches, unmatched_faults
+    return matches, false_faults
 
 
 def score_fault_kind(kind: str, named_kind: str) -> float:
@@ -290,10 +277,8 @@ def score_fault_size(fault: InjectedFault, named_fault: NamedFault) -> float:
     relative_error = abs(stated_size - fault.size) / abs(fault.size)
     score_outside_range = 0.5 * (relative_error <= MAX_SIZE_ERROR_HALF_POINTS)
     if fault.kind in GUESSABLE_FAULT_KINDS:
-        relative_tolerance = (fault.high - fault.low) / (2.0 * abs(fault.size))
-        score_outside_range = max(
-            1.0 - (relative_error - relative_tolerance) / EXCESS_SIZE_ERROR_AT_ZERO_POINTS, 0.0
-        )
+        excess_error = relative_error - (fault.high - fault.low) / (2.0 * abs(fault.size))
+        score_outside_range = max(1.0 - excess_error / EXCESS_SIZE_ERROR_AT_ZERO_POINTS, 0.0)
     return _score_number_in_range(stated_size, fault.low, fault.high, score_outside_range)
 
 
@@ -354,7 +339,7 @@ AcceptedCorrection = tuple[str, tuple[float, float], float]
 
 def find_accepted_corrections(
     fault: InjectedFault, right_answers: CorrectFormAnswers
-) -> tuple[AcceptedCorrection, ...]:
+) -> list[AcceptedCorrection]:
     size, lower_bound, upper_bound = (value or 0.0 for value in (fault.size, fault.low, fault.high))
     fault_start_s = fault.from_s or 0.0
     fault_end_s = fault_start_s if fault.until_s is None else fault.until_s
@@ -368,27 +353,26 @@ def find_accepted_corrections(
         "after": (fault_end_s - 1.0, fault_end_s + 15.0),
         "before": (fault_start_s - 15.0, fault_start_s + 1.0),
     }
-    return tuple(
-        (
-            rule.parameter,
-            range_by_name[values] if isinstance(values := rule.right_value_range, str) else values,
-            rule.score_by_fault_kind[fault.kind],
-        )
-        for rule in CORRECTION_RULES
-        if fault.kind in rule.score_by_fault_kind
+    accepted_corrections = []
+    for rule in CORRECTION_RULES:
+        bounds = rule.right_value_range
         # EKF2_EV_DELAY cannot be negative, so it does not correct timestamps that are too early
-        and (size > 0.0 or rule.right_value_range != "late milliseconds")
-    )
+        is_possible = size > 0.0 or bounds != "late milliseconds"
+        if fault.kind in rule.score_by_fault_kind and is_possible:
+            bounds = range_by_name[bounds] if isinstance(bounds, str) else bounds
+            score = rule.score_by_fault_kind[fault.kind]
+            accepted_corrections.append((rule.parameter, bounds, score))
+    return accepted_corrections
 
 
 def _score_verdicts(answers: Answers, right_answers: CorrectFormAnswers) -> float:
     """Return the mean of three scores (0 to 1): verdict on KF, on EKF2, and behaviour of EKF2."""
-    answered_and_right_verdicts = (
-        (answers.verdict_kf, right_answers.kf.verdict),
-        (answers.verdict_ekf2, right_answers.ekf2.verdict),
-    )
     right_verdict_count = sum(
-        answer == (right or NOT_AVAILABLE) for answer, right in answered_and_right_verdicts
+        answer == (right.verdict or NOT_AVAILABLE)
+        for answer, right in (
+            (answers.verdict_kf, right_answers.kf),
+            (answers.verdict_ekf2, right_answers.ekf2),
+        )
     )
     return (right_verdict_count + _score_ekf2_behaviour(answers, right_answers)) / 3.0
 
@@ -408,17 +392,11 @@ def _score_ekf2_behaviour(answers: Answers, right_answers: CorrectFormAnswers) -
 
 def _score_choices(answers: Answers, right_answers: CorrectFormAnswers) -> float:
     """Return the mean score of the multiple-choice questions; random answers give 0 on average."""
-    wrong_choice_points = -1.0 / (len(CHOICE_LETTERS) - 1)
-    points = (
-        1.0 if letter == right_letter else wrong_choice_points
-        for letter, right_letter in zip(
-            answers.choices,
-            (right_letter for _, right_letter in right_answers.choices),
-            strict=False,
-        )
-        if letter
-    )
-    return sum(points) / len(right_answers.choices)
+    points = 0.0
+    for letter, (_, right_letter) in zip(answers.choices, right_answers.choices, strict=False):
+        if letter:
+            points += 1.0 if letter == right_letter else -1.0 / (len(CHOICE_LETTERS) - 1)
+    return points / len(right_answers.choices)
 
 
 def _score_numbers(answers: Answers, right_answers: CorrectFormAnswers) -> float:
@@ -438,11 +416,9 @@ def _score_number(answer: NumericAnswer, right_answer: NumericAnswer) -> float:
         has_right_number = not set(answer).isdisjoint(right_answer)
         return max(1.0 - 0.5 * difference_count, 0.0) * has_right_number
     if isinstance(answer, float | int) and isinstance(right_answer, float | int):
-        error = abs(answer - right_answer)
-        for tolerance, score in (
-            (MAX_NUMBER_ERROR_FULL_POINTS, 1.0),
-            (MAX_NUMBER_ERROR_HALF_POINTS, 0.5),
-        ):
-            if error <= tolerance * abs(right_answer):
-                return score
+        error, magnitude = abs(answer - right_answer), abs(right_answer)
+        if error <= MAX_NUMBER_ERROR_FULL_POINTS * magnitude:
+            return 1.0
+        if error <= MAX_NUMBER_ERROR_HALF_POINTS * magnitude:
+            return 0.5
     return 0.0

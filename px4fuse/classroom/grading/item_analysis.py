@@ -10,7 +10,6 @@ from px4fuse.classroom.grading.model import GradedReport
 
 # Minimum number of reports for the correlation of an item with the other items
 MIN_REPORTS_FOR_CORRELATION = 5
-ITEM_STATISTICS_TITLES = ("item", "reports", "mean_fraction", "discrimination", "without_points")
 
 
 @dataclass(frozen=True)
@@ -19,61 +18,44 @@ class ItemStatistics:
 
     Attributes
     ----------
-    point_fractions : tuple of float
-        Points of each report, divided by the maximum points.
     discrimination : float or None
         Correlation between the points for this item and for all other items.
     """
 
     title: str
-    point_fractions: tuple[float, ...]
+    mean_points: float
     max_points: float
     discrimination: float | None
-
-    @property
-    def csv_row(self) -> tuple[str | float | None, ...]:
-        """Cells of the row of ``items.csv``, in the order of ITEM_STATISTICS_TITLES."""
-        return (
-            self.title,
-            len(self.point_fractions),
-            round(float(np.mean(self.point_fractions)), 3),
-            self.discrimination,
-            self.point_fractions.count(0.0),
-        )
 
 
 def analyse_items(reports: Sequence[GradedReport]) -> list[ItemStatistics]:
     """Compute points and discrimination of each rubric item, part of the answer form, and fault."""
-    scores_by_item: dict[tuple[int, str], list[tuple[float, float, float]]] = defaultdict(list)
+    item_scores, form_scores, fault_scores = (
+        defaultdict[str, list[tuple[float, float, float]]](list) for _ in range(3)
+    )
     for report in reports:
         if report.instructor_action:
             continue
-        for group_index, prefix, items in (
-            (0, "", report.items),
-            (1, "Answer form: ", report.form_part_scores),
+        for prefix, items, scores_by_title in (
+            ("", report.items, item_scores),
+            ("Answer form: ", report.form_part_scores, form_scores),
         ):
             total_points = sum(item.points for item in items)
             for item in items:
-                if item.is_awaiting_points:
-                    continue
-                score = item.points, item.max_points, total_points - item.points
-                scores_by_item[group_index, f"{prefix}{item.title}"].append(score)
+                if not item.is_awaiting_points:
+                    scores_by_title[f"{prefix}{item.title}"].append(
+                        (item.points, item.max_points, total_points - item.points)
+                    )
         for kind, is_named in report.did_student_name_fault.items():
-            scores_by_item[2, f"Fault: {kind}"].append((float(is_named), 1.0, report.points))
+            fault_scores[f"Fault: {kind}"].append((float(is_named), 1.0, report.points))
     statistics = []
-    for (_, title), scores in sorted(scores_by_item.items(), key=lambda item: item[0][0]):
-        item_points, max_points, points_of_other_items = np.transpose(scores)
+    for title, scores in (item_scores | form_scores | fault_scores).items():
+        points, max_points, other_points = np.transpose(scores)
         discrimination = None
-        if (
-            len(scores) >= MIN_REPORTS_FOR_CORRELATION
-            and np.ptp(item_points)
-            and np.ptp(points_of_other_items)
-        ):
-            discrimination = round(float(np.corrcoef(item_points, points_of_other_items)[0, 1]), 2)
-        point_fractions = item_points / np.where(max_points > 0.0, max_points, 1.0)
+        has_variation = np.ptp(points) > 0.0 and np.ptp(other_points) > 0.0
+        if len(scores) >= MIN_REPORTS_FOR_CORRELATION and has_variation:
+            discrimination = float(np.corrcoef(points, other_points)[0, 1])
         statistics.append(
-            ItemStatistics(
-                title, tuple(point_fractions.tolist()), float(max(max_points)), discrimination
-            )
+            ItemStatistics(title, float(points.mean()), float(max_points.max()), discrimination)
         )
     return statistics

@@ -29,15 +29,12 @@ class ExportOrigin:
         Submission time; without time zone if the platform omits it.
     is_late : bool
         True if the platform marks the file as late.
-    has_forged_platform_name : bool
-        True if the student's own file name imitates that of a platform.
     """
 
     platform: str = ""
     person: Person = UNKNOWN_PERSON
     time: datetime | None = None
     is_late: bool = False
-    has_forged_platform_name: bool = False
 
 
 UNKNOWN_ORIGIN = ExportOrigin()
@@ -55,14 +52,11 @@ class Submission:
         Name of the entry in the zip file; "" for a file.
     name : str
         Unique, shortened name for messages.
-    time : datetime or None
-        Time of the zip entry, in an unknown time zone.
     """
 
     file: Path
     zip_entry: str
     name: str
-    time: datetime | None = None
     origin: ExportOrigin = UNKNOWN_ORIGIN
 
 
@@ -219,10 +213,7 @@ def counted_reports(grades: Sequence[Grade]) -> list[GradedReport]:
     return [report for grade in grades if (report := grade.counted_report)]
 
 
-def list_titles(grades: Sequence[Grade]) -> tuple[tuple[str, ...], tuple[str, ...]]:
-    """Return the column titles of the rubric items, and of the numbers from the reports."""
-    reports = counted_reports(grades)
-    item_titles = dict.fromkeys(item.title for report in reports for item in report.items)
-    return tuple(item_titles), tuple(
-        dict.fromkeys(title for report in reports for title in report.numbers)
-    )
+def list_item_titles(grades: Sequence[Grade]) -> list[str]:
+    """Return the titles of all rubric items that score a report."""
+    items = (item for report in counted_reports(grades) for item in report.items)
+    return [*dict.fromkeys(item.title for item in items)]

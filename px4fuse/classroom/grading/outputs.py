@@ -9,14 +9,14 @@ without a grade stays unchanged, because platforms delete a grade if the cell is
 """
 
 import html
-import itertools
 import random
 import re
 import textwrap
 from collections.abc import Iterable, Sequence
 from dataclasses import replace
+from functools import partial
 from importlib import metadata
-from operator import itemgetter
+from operator import attrgetter
 from pathlib import Path
 
 from px4fuse.classroom.assignment.roster import (
@@ -30,13 +30,12 @@ from px4fuse.classroom.assignment.sheet import Sheet, format_cell_number, parse_
 from px4fuse.classroom.grading.checks import shorten_text
 from px4fuse.classroom.grading.class_page import format_class_page
 from px4fuse.classroom.grading.entries import OVERRIDES_NAME, OVERRIDES_TEMPLATE, Course
-from px4fuse.classroom.grading.item_analysis import ITEM_STATISTICS_TITLES, analyse_items
 from px4fuse.classroom.grading.model import (
     TOTAL_TITLE,
     Grade,
     GradedReport,
     counted_reports,
-    list_titles,
+    list_item_titles,
 )
 from px4fuse.classroom.grading.oral_check import format_questions
 from px4fuse.classroom.grading.records import (
@@ -118,31 +117,28 @@ def write_grading_files(
         The folder cannot be written.
     """
     class_title = course.title or course.rubric.title or "Class"
-    file_stems = make_file_names([_identify_student(grade, use_file_stem=True) for grade in grades])
+    file_stems = make_file_names(grade.student_id or Path(grade.file_name).stem for grade in grades)
     page_grades = [
         _copy_redrawn_report(grade, stem, output)
         for grade, stem in zip(grades, file_stems, strict=True)
     ]
     has_redrawn_reports = any(report.redrawn_report_path for report in counted_reports(page_grades))
     feedback_texts = [feedback_text(grade, class_title) for grade in grades]
-    item_rows = (statistics.csv_row for statistics in analyse_items(counted_reports(grades)))
-    contents = {
-        "class.csv": format_class_table(grades).encode(),
-        "items.csv": _format_csv(ITEM_STATISTICS_TITLES, item_rows).encode(),
-    }
+    texts = {"class.csv": format_class_table(grades)}
     if course.anonymous:
-        page_grades, pseudonym_csv = _anonymise_grades(page_grades, output / PSEUDONYMS_FILE)
-        contents[PSEUDONYMS_FILE] = pseudonym_csv.encode()
-    contents["class.html"] = format_class_page(
+        page_grades, texts[PSEUDONYMS_FILE] = _anonymise_grades(
+            page_grades, output / PSEUDONYMS_FILE
+        )
+    texts["class.html"] = format_class_page(
         page_grades, class_title, f"px4fuse {metadata.version('px4fuse')}"
-    ).encode()
+    )
     if course.question_count and course.key is not None:
-        text = format_questions(grades, course.key, course.question_count)
-        contents[QUESTIONS_FILE] = text.encode()
+        texts[QUESTIONS_FILE] = format_questions(grades, course.key, course.question_count)
     if not (output / OVERRIDES_NAME).exists():
-        contents[OVERRIDES_NAME] = OVERRIDES_TEMPLATE.encode()
+        texts[OVERRIDES_NAME] = OVERRIDES_TEMPLATE
     for stem, text in zip(file_stems, feedback_texts, strict=True):
-        contents[f"{FEEDBACK_FOLDER}/{stem}.txt"] = text.encode()
+        texts[f"{FEEDBACK_FOLDER}/{stem}.txt"] = text
+    contents = {name: text.encode() for name, text in texts.items()}
     notes: list[str] = []
     table_names = make_unique((sheet.path.name for sheet in course.worksheets), "{1}-{0}")
     for sheet, name in zip(course.worksheets, table_names, strict=True):
@@ -158,11 +154,8 @@ def write_grading_files(
     return tuple(output / name for name in output_names), tuple(notes)
 
 
-def _identify_student(grade: Grade, use_file_stem: bool = False) -> str:
-    """Return the id of a student; without an id, the name or the file name."""
-    return grade.student_id or (
-        Path(grade.file_name).stem if use_file_stem else grade.student or grade.file_name
-    )
+def _identify_student(grade: Grade) -> str:
+    return grade.student_id or grade.student or grade.file_name
 
 
 def _copy_redrawn_report(grade: Grade, stem: str, output: Path) -> Grade:
@@ -188,40 +181,31 @@ def _anonymise_grades(grades: Sequence[Grade], path: Path) -> tuple[list[Grade],
 
     Return the anonymous grades and a CSV table of the pseudonyms.
     """
-    pseudonym_and_name_by_identity: dict[str, tuple[str, str]] = {}
+    pseudonym_by_identity: dict[str, str] = {}
     if path.exists():
         with suspend_input_registration():
             sheet = read_sheet(path)
         for row in sheet.rows:
-            pseudonym, identity, student = (
+            pseudonym, identity, _ = (
                 sheet.find_cell(row, (title,)).removeprefix("'") for title in PSEUDONYM_TITLES
             )
-            pseudonym_and_name_by_identity[identity] = pseudonym, student
-    used_pseudonyms = {pseudonym for pseudonym, _ in pseudonym_and_name_by_identity.values()}
-    numbered_pseudonyms = (f"Student {number:03}" for number in itertools.count(1))
-    free_pseudonyms = (
-        pseudonym for pseudonym in numbered_pseudonyms if pseudonym not in used_pseudonyms
+            pseudonym_by_identity[identity] = pseudonym
+    name_by_identity = {_identify_student(grade): grade.student for grade in grades}
+    new_identities = name_by_identity.keys() - pseudonym_by_identity.keys()
+    all_numbers = range(1, len(new_identities) + len(pseudonym_by_identity) + 1)
+    all_pseudonyms = {f"Student {number:03}" for number in all_numbers}
+    free_pseudonyms = sorted(all_pseudonyms - {*pseudonym_by_identity.values()})
+    free_pseudonyms = free_pseudonyms[: len(new_identities)]
+    random.SystemRandom().shuffle(free_pseudonyms)
+    pseudonym_by_identity |= zip(new_identities, free_pseudonyms, strict=True)
+    rows = sorted(
+        (pseudonym_by_identity[identity], identity, name)
+        for identity, name in name_by_identity.items()
     )
-    students = {_identify_student(grade): grade.student for grade in grades}
-    new_identities = [
-        identity for identity in students if identity not in pseudonym_and_name_by_identity
-    ]
-    random.SystemRandom().shuffle(new_identities)
-    for identity in new_identities:
-        pseudonym_and_name_by_identity[identity] = next(free_pseudonyms), students[identity]
-    rows = (
-        (pseudonym, identity, student)
-        for identity, (pseudonym, student) in sorted(
-            pseudonym_and_name_by_identity.items(), key=itemgetter(1)
-        )
+    anonymous_grades = (
+        anonymise_grade(grade, pseudonym_by_identity[_identify_student(grade)]) for grade in grades
     )
-    anonymous_grades = [
-        anonymise_grade(grade, pseudonym_and_name_by_identity[_identify_student(grade)][0])
-        for grade in grades
-    ]
-    return sorted(anonymous_grades, key=lambda grade: grade.student), (
-        _format_csv(PSEUDONYM_TITLES, rows)
-    )
+    return sorted(anonymous_grades, key=attrgetter("student")), _format_csv(PSEUDONYM_TITLES, rows)
 
 
 def anonymise_grade(grade: Grade, pseudonym: str) -> Grade:
@@ -237,7 +221,6 @@ def anonymise_grade(grade: Grade, pseudonym: str) -> Grade:
             instructor_action=report.instructor_action
             and "The points are not final: the instructor has to decide.",
             form=report.form,
-            numbers=report.numbers,
             did_student_name_fault=report.did_student_name_fault,
             form_part_scores=report.form_part_scores,
         )
@@ -259,7 +242,10 @@ def anonymise_grade(grade: Grade, pseudonym: str) -> Grade:
 
 def format_class_table(grades: Sequence[Grade]) -> str:
     """Format a table with one row per student as CSV for Excel and LibreOffice."""
-    item_titles, number_titles = list_titles(grades)
+    item_titles = list_item_titles(grades)
+    number_titles = dict.fromkeys(
+        title for report in counted_reports(grades) for title in report.numbers
+    )
     titles = (*TITLES_BEFORE_ITEMS, *item_titles, *number_titles, *TITLES_AFTER_ITEMS)
     rows = []
     for grade in grades:
@@ -317,20 +303,9 @@ def feedback_text(grade: Grade, class_name: str = "") -> str:
         is_total_set=TOTAL_TITLE in grade.overrides,
         line=shorten_text,
         number=format_cell_number,
-        wrapped=_wrap_text,
+        wrapped=partial(textwrap.fill, width=88, break_long_words=False, break_on_hyphens=False),
     )
     return text.rstrip("\n") + "\n"
-
-
-def _wrap_text(text: str, indent: str = "") -> str:
-    return textwrap.fill(
-        text,
-        88,
-        initial_indent=indent,
-        subsequent_indent=indent,
-        break_long_words=False,
-        break_on_hyphens=False,
-    )
 
 
 # ------------------------------------------------------------------ platform tables
@@ -346,36 +321,33 @@ def find_grade_column(sheet: Sheet, column_title: str) -> int:
     SettingsError
         No column matches, or several columns match.
     """
-    title_by_index = {
-        index: title
-        for index, title in enumerate(sheet.column_titles)
+    titles = sheet.column_titles
+    short_titles = [_ASSIGNMENT_NUMBER_PATTERN.sub("", title) for title in titles]
+    editable_indices = [
+        index
+        for index in range(len(titles))
         if not any(READ_ONLY_TEXT in row[index] for row in sheet.rows[:3])
-    }
-    grade_column_index = sheet.find_column_index(GRADE_COLUMN_TITLES)
-    short_title_by_index = {
-        index: _ASSIGNMENT_NUMBER_PATTERN.sub("", title) for index, title in title_by_index.items()
-    }
+    ]
     assignment_indices = [
-        index for index, title in title_by_index.items() if short_title_by_index[index] != title
+        index for index in editable_indices if short_titles[index] != titles[index]
     ]
     matching_indices = [
         index
-        for index, title in title_by_index.items()
-        if normalise_text(column_title) in map(normalise_text, (title, short_title_by_index[index]))
+        for index in editable_indices
+        if normalise_text(column_title) in map(normalise_text, (titles[index], short_titles[index]))
     ]
+    grade_column_index = sheet.find_column_index(GRADE_COLUMN_TITLES)
     candidate_indices = assignment_indices if grade_column_index is None else [grade_column_index]
     # a Moodle table has one grade column, so another --column is for another table
     if column_title and (matching_indices or sheet.find_column_index(("identifier",)) is None):
         candidate_indices = matching_indices
     if len(candidate_indices) == 1:
         return candidate_indices[0]
-    problem = (
-        "the table has several grade columns" if candidate_indices else "no grade column was found"
+    problem = "several grade columns" if candidate_indices else "no grade column was found"
+    listed_titles = ", ".join(
+        one_line(short_titles[index], 40) for index in assignment_indices or editable_indices
     )
-    titles = ", ".join(
-        one_line(short_title_by_index[index], 40) for index in assignment_indices or title_by_index
-    )
-    remedy = f"Choose the grade column with --column: {one_line(titles, 300)}."
+    remedy = f"Choose the grade column with --column: {one_line(listed_titles, 300)}."
     raise SettingsError(f"{sheet.path}: {problem}.", remedy)
 
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import re
 import tomllib
+from collections.abc import Iterator
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Literal, Union
 
@@ -106,7 +107,7 @@ def read_rubric(path: Path | None) -> Rubric:
 
 def parse_rubric(text: str, source_name: str) -> Rubric:
     try:
-        return msgspec.convert(tomllib.loads(text.replace("\r\n", "\n")), Rubric)
+        return msgspec.convert(tomllib.loads(text), Rubric)
     # tomllib raises ValueError for a syntax error, and for an integer with very many digits
     except (msgspec.ValidationError, ValueError, RecursionError) as error:
         message = re.sub(r"`\$\.item\[(\d+)\]\.?([^`]*)`", _format_item_and_field, str(error))
@@ -137,19 +138,19 @@ def score_report(
     ``submitter_id`` is the student id on the learning platform.
     """
     scoring_input = ScoringInput(results, verification, key, submitter_id)
-    points_rule, zero_points_reason, instructor_action = _decide_points_rule(scoring_input, rubric)
     student, command = results.student, "loop" if isinstance(results, LoopResults) else "compare"
+    problems = [*_find_problems(scoring_input, rubric)]
+    zero_points_reasons = [reason for rule, reason, _ in problems if rule == "zero"]
     graded_items = []
     for item in rubric.items:
         if not item.is_applicable(command, key):
             continue
-        fraction, comment = 0.0, f"No points: {zero_points_reason}."
-        if points_rule != "zero":
-            fraction, comment = item.score(scoring_input)
-        is_awaiting_points = (
-            item.is_scored_by_instructor and bool(student.notes.strip()) and points_rule != "zero"
-        )
-        points = round(item.points * min(max(fraction, 0.0), 1.0), 2)
+        is_awaiting_points = item.is_scored_by_instructor and bool(student.notes.strip())
+        fraction, comment = item.score(scoring_input)
+        if zero_points_reasons:
+            fraction, comment = 0.0, f"No points: {zero_points_reasons[0]}."
+            is_awaiting_points = False
+        points = round(item.points * fraction, 2)
         graded_items.append(
             ItemScore(
                 item.title,
@@ -163,6 +164,7 @@ def score_report(
     form_result, values = scoring_input.form_points, scoring_input.values
     if isinstance(form_result, str) or not scoring_input.is_own_log:
         form_result = FormPoints()
+    pending_actions = [action for rule, _, action in problems if rule == "pending"]
     return GradedReport(
         "",
         student.name,
@@ -171,11 +173,11 @@ def score_report(
         tuple(graded_items),
         flags=(
             *flag_page_differences(verification),
-            *flag_settings(results, key is not None),
+            *flag_settings(results),
             *([] if scoring_input.is_own_log else [_make_other_students_log_advice(scoring_input)]),
             *([FORM_MISMATCH_ADVICE] if scoring_input.has_form_of_other_log else []),
         ),
-        instructor_action=instructor_action,
+        instructor_action="" if zero_points_reasons else " ".join(pending_actions),
         did_student_name_fault=form_result.did_student_name_fault,
         form_part_scores=form_result.parts,
         form=scoring_input.form if isinstance(scoring_input.form, Answers) else None,
@@ -188,51 +190,31 @@ def score_report(
     )
 
 
-def _decide_points_rule(scoring_input: ScoringInput, rubric: Rubric) -> tuple[PointsRule, str, str]:
-    """Decide if the points of a report count.
-
-    Return the decision, the reason for zero points, and the required action of the instructor.
-    """
+def _find_problems(
+    scoring_input: ScoringInput, rubric: Rubric
+) -> Iterator[tuple[PointsRule, str, str]]:
+    """Yield rule, reason for the student and action of the instructor for each problem."""
     verification = scoring_input.verification
-    first_reason = format_reason("".join(verification.reasons[:1]))
+    reason_text = format_reason("".join(verification.reasons[:1]))
     if verification.status == "numbers differ":
-        return "zero", f"the numbers of your report differ from those of its log{first_reason}", ""
-    # each problem has a rule, a reason for the student, and an action of the instructor
-    problems: list[tuple[PointsRule, str, str]] = []
-    if verification.status != "verified":
-        action = (
-            verification.remedy or f"Check the report by hand: it was not verified{first_reason}."
-        )
-        problems.append(
-            (rubric.unverified, f"your report could not be verified{first_reason}", action)
-        )
+        yield "zero", f"the numbers of your report differ from those of its log{reason_text}", ""
+    elif verification.status != "verified":
+        action = verification.remedy or f"Check the report by hand: not verified{reason_text}."
+        yield rubric.unverified, f"your report could not be verified{reason_text}", action
     elif verification.page_status == "differ":
-        reason_text = "pages of your PDF differ from those that px4fuse draws from the log"
-        problems.append(
-            (
-                rubric.pages,
-                reason_text,
-                "Compare the pages with the report that px4fuse drew from the log.",
-            )
+        yield (
+            rubric.pages,
+            "pages of your PDF differ from those that px4fuse draws from the log",
+            "Compare the pages with the report that px4fuse drew from the log.",
         )
     if not scoring_input.is_own_log:
-        reason_text = "your report is not about the log that you were given"
-        problems.append(
-            (rubric.others_log, reason_text, _make_other_students_log_advice(scoring_input))
-        )
+        action = _make_other_students_log_advice(scoring_input)
+        yield rubric.others_log, "your report is not about the log that you were given", action
     if scoring_input.has_form_of_other_log:
-        problems.append(("pending", FORM_MISMATCH_REASON, FORM_MISMATCH_ADVICE))
+        yield "pending", FORM_MISMATCH_REASON, FORM_MISMATCH_ADVICE
     if scoring_input.key is not None and getattr(scoring_input.results.request, "position", None):
-        action = (
-            "Ask where the position file (--position) is from: the assignment contains no position "
-            "files."
-        )
-        problems.append(("pending", "", action))
-    for rule, reason_text, _ in problems:
-        if rule == "zero":
-            return "zero", reason_text, ""
-    action = " ".join(action for rule, _, action in problems if rule == "pending")
-    return "pending" if action else "count", "", action
+        action = "Ask for the origin of the position file: the assignment has no --position."
+        yield "pending", "", action
 
 
 def _make_other_students_log_advice(scoring_input: ScoringInput) -> str:

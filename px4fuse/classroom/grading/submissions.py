@@ -49,8 +49,6 @@ MAX_UNPACKED_BYTES = 4_000_000_000
 MAX_COMPRESSION_RATIO = 100
 # Maximum length (characters) of a file name in messages
 MAX_NAME_LENGTH = 200
-# Year that zip programs write if an entry has no time
-ZIP_EPOCH_YEAR = 1980
 
 _TOO_LARGE_REASON = (
     f"the file is larger than {MAX_PDF_BYTES // 1_000_000} MB; reports are below 2 MB."
@@ -66,8 +64,6 @@ PATH_PATTERN_BY_PLATFORM = {
     name: re.compile(pattern)
     for name, pattern in read_toml(__file__, dict[str, str], "platforms.toml").items()
 }
-# Text that Blackboard or Moodle adds once to a path; students may forge the text
-_PLATFORM_TEXT_PATTERN = re.compile(r"_attempt_\d{4}-|_\d+_assignsubmission_")
 BLACKBOARD_TIME_FORMAT = "%Y-%m-%d-%H-%M-%S"
 _SUBMISSION_PATTERN = re.compile(
     r"^(?:submission_)?(\d+)(?:\.pdf)?:\s*\n((?:[ -].*\n?)*)", re.MULTILINE
@@ -145,12 +141,7 @@ def find_submissions(paths: Sequence[Path]) -> tuple[tuple[Submission, ...], tup
         raise SettingsError(one_line(" ".join(["No PDF found.", *notes]), 500))
     submissions = sorted(
         submission_by_path.values(),
-        key=lambda submission: (
-            submission.name.casefold(),
-            submission.name,
-            submission.file,
-            submission.zip_entry,
-        ),
+        key=lambda each: (each.name.casefold(), each.name, each.file, each.zip_entry),
     )
     names = make_unique(_shorten_name(submission.name) for submission in submissions)
     named_submissions = [
@@ -172,14 +163,11 @@ def add_submitters(
     ]
     platform_counts_by_export: dict[object, Counter[str]] = defaultdict(Counter)
     for export_name, submission in zip(export_names, submissions, strict=True):
-        platform_counts_by_export[export_name].update(
-            filter(None, [parse_submission_path(submission.name).platform])
-        )
+        if platform := parse_submission_path(submission.name).platform:
+            platform_counts_by_export[export_name][platform] += 1
     for export_name, submission in zip(export_names, submissions, strict=True):
-        platforms = [
-            platform for platform, _ in platform_counts_by_export[export_name].most_common(1)
-        ]
-        origin = parse_submission_path(submission.name, platforms)
+        most_common = platform_counts_by_export[export_name].most_common(1)
+        origin = parse_submission_path(submission.name, [platform for platform, _ in most_common])
         if origin.platform in ("gradescope", ""):
             # Gradescope exports PDFs as SUBMISSION_NUMBER.pdf
             stem = submission.name.rpartition("/")[2].casefold().removesuffix(".pdf")
@@ -263,14 +251,10 @@ def _list_zip_submissions(path: Path, notes: list[str]) -> list[Submission]:
             "Export the submissions again.",
         )
     submissions = (
-        Submission(path.resolve(), name, _make_entry_label(entry), _read_entry_time(entry))
+        Submission(path.resolve(), name, _make_entry_label(entry))
         for name, entry in last_entry_by_name.items()
     )
-    return [
-        submission
-        for submission in submissions
-        if not any(map(_is_hidden, submission.name.split("/")))
-    ]
+    return [each for each in submissions if not any(map(_is_hidden, each.name.split("/")))]
 
 
 def _list_folder_submissions(path: Path, notes: list[str]) -> Iterator[Submission]:
@@ -306,15 +290,6 @@ def _is_hidden(name: str) -> bool:
     return name.startswith(".") or name == "__MACOSX"
 
 
-def _read_entry_time(entry: zipfile.ZipInfo) -> datetime | None:
-    """Return the time of a zip entry (unknown time zone), or None."""
-    try:
-        time = datetime(*entry.date_time)
-    except ValueError:
-        return None
-    return time if time.year > ZIP_EPOCH_YEAR else None
-
-
 def _make_entry_label(entry: zipfile.ZipInfo) -> str:
     """Return the path of a zip entry without ``.``, ``..`` and drive letters, for messages."""
     name = entry.filename
@@ -334,21 +309,18 @@ def _read_entry(archive: zipfile.ZipFile, name: str) -> bytes:
     """Read a zip entry; reject encrypted, linked and very large entries."""
     entry = archive.getinfo(name)
     max_unpacked_bytes = max(1_000_000, MAX_COMPRESSION_RATIO * entry.compress_size)
-    rejection_reason = ""
     if entry.flag_bits & _ENCRYPTED_FLAG:
-        rejection_reason = "the zip entry is encrypted."
-    elif stat.S_ISLNK(entry.external_attr >> 16):
-        rejection_reason = "the zip entry is a symbolic link."
-    elif entry.compress_type not in (zipfile.ZIP_STORED, zipfile.ZIP_DEFLATED):
-        rejection_reason = "the compression method of the zip entry is not supported."
-    elif entry.file_size > MAX_PDF_BYTES:
-        rejection_reason = _TOO_LARGE_REASON
-    elif entry.file_size > max_unpacked_bytes:
-        rejection_reason = (
+        raise _EntryError("the zip entry is encrypted.")
+    if stat.S_ISLNK(entry.external_attr >> 16):
+        raise _EntryError("the zip entry is a symbolic link.")
+    if entry.compress_type not in (zipfile.ZIP_STORED, zipfile.ZIP_DEFLATED):
+        raise _EntryError("the compression method of the zip entry is not supported.")
+    if entry.file_size > MAX_PDF_BYTES:
+        raise _EntryError(_TOO_LARGE_REASON)
+    if entry.file_size > max_unpacked_bytes:
+        raise _EntryError(
             f"the zip entry unpacks to more than {MAX_COMPRESSION_RATIO} times its packed size."
         )
-    if rejection_reason:
-        raise _EntryError(rejection_reason)
     return archive.read(entry)
 
 
@@ -393,13 +365,7 @@ def parse_submission_path(
             numbers = {platform: matched_fields["number"]} if "number" in matched_fields else {}
             full_name, login = " ".join(filter(None, person_names)), matched_fields.get("login", "")
             person = Person("", full_name, "", login, numbers)
-            # Moodle and Blackboard add this text once to each path
-            has_forged_platform_name = len(_PLATFORM_TEXT_PATTERN.findall(name)) > (
-                platform in ("moodle", "blackboard")
-            )
-            return ExportOrigin(
-                platform, person, time, bool(matched_fields.get("late")), has_forged_platform_name
-            )
+            return ExportOrigin(platform, person, time, bool(matched_fields.get("late")))
         remaining_path = remaining_path.partition("/")[2]
     return UNKNOWN_ORIGIN
 
