@@ -38,9 +38,7 @@ PEOPLE = (Person("1", "Ada Lovelace", login="ada"), Person("2", "Grace Hopper", 
 def make_grades(files, term=LATEST, overrides=None, people=PEOPLE):
     """Make the grades of reports, given by file name."""
     reports = [replace(one, submission=name, sha256=name) for name, one in files.items()]
-    found = [
-        Submission(Path("x.zip"), name, name, parse_submission_path(name)) for name in files
-    ]
+    found = [Submission(Path("x.zip"), name, name, parse_submission_path(name)) for name in files]
     return build_grades(reports, found, replace(term, roster=people), overrides or {})
 
 
@@ -188,10 +186,14 @@ def test_grade_keeps_first_report_if_later_one_needs_review() -> None:
     assert ada.counted_report.submission == "a.pdf"
 
 
-def test_time_in_file_name_of_student_is_not_the_submission_time() -> None:
+def test_submission_named_like_a_platform_export_is_flagged() -> None:
     name = blackboard("ada", "20-10-00-00", "ada_attempt_2026-11-18-10-00-00_r.pdf")
     (ada, _), _ = make_grades({name: graded_report("", 4.0)})
     assert ada.submission_time == "2026-11-20 10:00"
+    assert ada.flags == (
+        "The student chose a file name that looks like the file names of a learning platform "
+        "(platform of the export: Blackboard). Check who handed in the file.",
+    )
 
 
 def test_grade_with_several_reports_in_attempt_uses_best() -> None:

@@ -355,6 +355,8 @@ class TestFeedback:
         ({"request__end_s": 50.0, "settings__end_s": 50.0}, ("37%",)),
         ({"request__start_s": 1.0}, ()),
         ({"settings__end_s": 50.0}, ()),
+        ({"settings__input": "zero"}, ("IMU",)),
+        ({"source__path": "kept by EKF2"}, ("kept by EKF2",)),
     ],
 )
 def test_report_with_suspicious_settings_is_flagged(values, said):

@@ -262,8 +262,8 @@ def _read_attachment(reader: pypdf.PdfReader) -> bytes:
             streams[id(dictionary)] = dictionary
         if "/EF" in dictionary:
             file_specifications.append(dictionary)
-            embedded_files = map(resolve_reference, dictionary["/EF"].values())
-            streams |= {id(embedded_file): embedded_file for embedded_file in embedded_files}
+            file_by_key: Any = dictionary["/EF"]
+            streams |= {id(each): each for each in map(resolve_reference, file_by_key.values())}
     if unexpected_features:
         feature_names = ", ".join(sorted(unexpected_features))
         raise ResultsError(f"the PDF contains {feature_names}, which px4fuse never writes.")

@@ -6,7 +6,6 @@ from collections import Counter
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass, field, replace
 from itertools import chain
-from operator import attrgetter
 from pathlib import Path
 
 from px4fuse.classroom.assignment.sheet import Sheet, read_sheet
@@ -163,33 +162,22 @@ class ClassList:
                     student, numbers=other_person.numbers | student.numbers, **fields
                 )
 
-    def find_student_index(self, searched_person: Person) -> int | None:
+    def find_student_index(self, searched: Person) -> int | None:
         """Return the index of a person in ``people``; None for an unknown person.
 
         The fields are compared in this order: platform number, id, email, login, name.
         """
-        match_rules: tuple[tuple[Callable[[str, str], bool], Callable[[Person], str], str], ...] = (
-            *(
-                (_is_same_text, lambda person, at=platform: person.numbers.get(at, ""), value)
-                for platform, value in searched_person.numbers.items()
-            ),
-            (_is_same_text, attrgetter("student_id"), searched_person.student_id),
-            (is_same_id, attrgetter("student_id"), searched_person.student_id),
-            (_is_same_text, attrgetter("email"), searched_person.email),
+        conditions: tuple[Callable[[Person], bool], ...] = (
+            lambda person: bool(person.numbers.items() & searched.numbers.items()),
+            lambda person: _is_same_text(person.student_id, searched.student_id),
+            lambda person: is_same_id(person.student_id, searched.student_id),
+            lambda person: _is_same_text(person.email, searched.email),
             # a class list without a login column may contain logins in its id column
-            (
-                _is_same_text,
-                lambda person: person.login or person.student_id,
-                searched_person.login,
-            ),
-            (is_same_name, attrgetter("name"), searched_person.name),
+            lambda person: _is_same_text(person.login or person.student_id, searched.login),
+            lambda person: is_same_name(person.name, searched.name),
         )
-        for is_same, get_field, value in match_rules:
-            matches = [
-                index
-                for index, person in enumerate(self.people)
-                if is_same(get_field(person), value)
-            ]
+        for is_same_person in conditions:
+            matches = [index for index, each in enumerate(self.people) if is_same_person(each)]
             if len(matches) == 1:
                 return matches[0]
         return None
@@ -221,17 +209,13 @@ def is_same_name(name: str, other_name: str) -> bool:
     >>> is_same_name("Ada", "ada lovelace"), is_same_name("", "")
     (False, False)
     """
-    words, other_words = (
-        re.findall(r"[^\W_]+", normalise_text(text)) for text in (name, other_name)
+    shorter, longer = sorted(
+        (re.findall(r"[^\W_]+", normalise_text(text)) for text in (name, other_name)), key=len
     )
-    shorter_words, longer_words = sorted((words, other_words), key=len)
-    joined_names = (
-        "".join(longer_words[start:] + longer_words[:start]) for start in range(len(longer_words))
-    )
-    is_joined_name = (
-        len(shorter_words) == 1 < len(longer_words) and shorter_words[0] in joined_names
-    )
-    return bool(shorter_words) and (sorted(words) == sorted(other_words) or is_joined_name)
+    if len(shorter) == 1 < len(longer):
+        rotations = (longer[start:] + longer[:start] for start in range(len(longer)))
+        return shorter[0] in map("".join, rotations)
+    return sorted(shorter) == sorted(longer) != []
 
 
 def make_file_stem(student_id: str) -> str | None:

@@ -193,41 +193,39 @@ def _find_ekf2_behaviours(
     comparison: Comparison, faults: tuple[InjectedFault, ...], sigma_z_m: float
 ) -> tuple[tuple[str, ...], tuple[str, ...]]:
     """Return the behaviours of EKF2 that a student must report, and those a student may report."""
-    fault_size_by_kind = {fault.kind: fault.size or 0.0 for fault in faults}
-    required_behaviours, allowed_behaviours = (
+    size_by_kind = {fault.kind: fault.size or 0.0 for fault in faults}
+    required, allowed = (
         [
             behaviour
             for behaviour, kinds in EKF2_BEHAVIOUR_RULES[rule].items()
-            if kinds & fault_size_by_kind.keys()
+            if kinds & size_by_kind.keys()
         ]
         for rule in ("required", "allowed")
     )
-    if fault_size_by_kind.get("ekf2-noise", 0.0) > sigma_z_m:
-        required_behaviours.append("weighted the positions too little")
+    if size_by_kind.get("ekf2-noise", 0.0) > sigma_z_m:
+        required.append("weighted the positions too little")
     innovations = comparison.main.ekf2_innovations
-    if not isinstance(innovations, Unavailable):
-        has_bad_samples = "nlos" in fault_size_by_kind or "jump" in fault_size_by_kind
-        if (innovations["rejected"] > 0).mean() > MIN_REJECTED_FRACTION:
-            required_behaviours.append(
-                "rejected outliers" if has_bad_samples else "rejected good samples"
-            )
+    if (
+        not isinstance(innovations, Unavailable)
+        and (innovations["rejected"] > 0).mean() > MIN_REJECTED_FRACTION
+    ):
+        has_bad_samples = not size_by_kind.keys().isdisjoint({"nlos", "jump"})
+        required.append("rejected outliers" if has_bad_samples else "rejected good samples")
     ekf2 = comparison.flight.ekf2
     resets_count_from_s = comparison.segment.start_s + INITIAL_TIME_WITHOUT_RESETS_S
-    for reset in ekf2.resets if isinstance(ekf2, Ekf2) else ():
-        is_large_reset = reset.quantity == "position" and math.hypot(*reset.delta[:2]) > MIN_RESET_M
-        if is_large_reset and reset.time_s > resets_count_from_s:
-            required_behaviours.append("dead-reckoned, then reset")
+    if any(
+        reset.quantity == "position"
+        and reset.time_s > resets_count_from_s
+        and math.hypot(*reset.delta[:2]) > MIN_RESET_M
+        for reset in (ekf2.resets if isinstance(ekf2, Ekf2) else ())
+    ):
+        required.append("dead-reckoned, then reset")
     # if EKF2 never fuses positions, its other behaviours need not be reported
-    if "never fused" in required_behaviours:
-        allowed_behaviours = [*required_behaviours, *allowed_behaviours]
-        required_behaviours = ["never fused"]
-    if not required_behaviours:
-        required_behaviours.append("normal")
-        allowed_behaviours.insert(0, "followed the positions")
-    required_behaviours = [*dict.fromkeys(required_behaviours)]
-    return tuple(required_behaviours), tuple(
-        each for each in dict.fromkeys(allowed_behaviours) if each not in required_behaviours
-    )
+    if "never fused" in required:
+        required, allowed = ["never fused"], [*required, *allowed]
+    if not required:
+        required, allowed = ["normal"], ["followed the positions", *allowed]
+    return tuple(required), tuple(each for each in dict.fromkeys(allowed) if each not in required)
 
 
 def compute_numeric_answer(

@@ -265,6 +265,11 @@ def _make_candidate(
         flags.append(
             f"{platform} marks the file as late without a time, so no points were deducted."
         )
+    if origin.has_forged_platform_name:
+        flags.append(
+            "The student chose a file name that looks like the file names of a learning platform "
+            f"(platform of the export: {platform or 'none'}). Check who handed in the file."
+        )
     reported_index = class_list.find_student_index(Person(report.student_id)) if platform else None
     if reported_index is not None and student_index not in (None, reported_index):
         reported_person = class_list.people[reported_index]

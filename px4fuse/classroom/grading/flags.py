@@ -32,12 +32,9 @@ MAX_LISTED_REPORTS = 4
 def flag_page_differences(verification: Verification) -> Iterator[str]:
     """Yield the first difference between a PDF and the report drawn from its log, if any."""
     if verification.pages:
-        first_difference, *further_differences = verification.pages
-        count = len(further_differences)
-        further_text = f" Further differences: {count}." if count else ""
         yield (
             "The PDF differs from the report that px4fuse draws from the log. "
-            f"{capitalise_first(first_difference.sentence)}.{further_text} Read the redrawn report."
+            f"{capitalise_first(verification.pages[0].sentence)}. Read the redrawn report."
         )
 
 
@@ -55,6 +52,17 @@ def flag_settings(results: ReportedResults) -> Iterator[str]:
         yield (
             f"The student analysed only {analysed_fraction:.0%} of the log ({settings.start_s:.1f} "
             f"to {settings.end_s:.1f} s of {log_duration_s:.1f} s). Ask the student for the reason."
+        )
+    has_no_imu = any(finding.id == "acceleration_not_logged" for finding in results.findings)
+    if settings.input == "zero" and not has_no_imu:
+        yield "KF did not use the IMU (--input zero)."
+    source = results.source
+    if source.path != "as received" and any(
+        track.path == "as received" for track in source.available
+    ):
+        yield (
+            f"The position source is {source.name} ({source.path}). The log also contains the "
+            "positions as received by PX4."
         )
 
 

@@ -93,11 +93,11 @@ def grade(
             "" if student_index is None else course.class_list.people[student_index].student_id
         )
         jobs.append((submission, submitter_id))
-    rubric_and_key, log_by_sha256 = (course.rubric, course.key), hash_files(course.logs)
     grade_job = partial(
         grade_submission,
-        *rubric_and_key,
-        log_by_sha256,
+        course.rubric,
+        course.key,
+        hash_files(course.logs),
         output / RECORDS_FOLDER,
         max_log_bytes.get(),
     )
@@ -108,15 +108,16 @@ def grade(
         for index, result in results:
             if isinstance(result, JobFailure):
                 reason = f"the grading of this file failed: {result.reason}"
-                report = grade_unreadable_file(*rubric_and_key, reason, HARMFUL_FILE_REMEDY)
-                is_loaded = False
+                report = grade_unreadable_file(
+                    course.rubric, course.key, reason, HARMFUL_FILE_REMEDY
+                )
             else:
                 report, is_loaded = result
+                reused_count += is_loaded
             submission, student = found_submissions[index], report.student
             if not student and not report.student_id:
                 student = submission.origin.person.name
             report_by_index[index] = replace(report, submission=submission.name, student=student)
-            reused_count += is_loaded
             progress(len(report_by_index), len(found_submissions))
     grades, override_notes = build_grades(
         [report_by_index[index] for index in range(len(found_submissions))],

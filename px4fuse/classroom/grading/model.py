@@ -29,12 +29,15 @@ class ExportOrigin:
         Submission time; without time zone if the platform omits it.
     is_late : bool
         True if the platform marks the file as late.
+    has_forged_platform_name : bool
+        True if the student's own file name imitates that of a platform.
     """
 
     platform: str = ""
     person: Person = UNKNOWN_PERSON
     time: datetime | None = None
     is_late: bool = False
+    has_forged_platform_name: bool = False
 
 
 UNKNOWN_ORIGIN = ExportOrigin()

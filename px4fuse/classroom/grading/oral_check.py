@@ -2,6 +2,7 @@
 
 import textwrap
 from collections.abc import Iterator, Sequence
+from itertools import zip_longest
 
 from px4fuse.classroom.assignment.key import AnswerKey
 from px4fuse.classroom.assignment.truth import CorrectFormAnswers
@@ -36,18 +37,19 @@ def ask_about_form(
     """Yield questions about the faults and figures in a student's answers, wrong answers first."""
     named_kinds = [fault.kind for fault in answers.mistakes]
     true_kinds = [fault.kind for fault in right_answers.mistakes]
-    true_faults_text = ", ".join(true_kinds) or "no fault"
     for kind in named_kinds:
-        if kind in (*true_kinds, NO_FAULT_KIND):
-            continue
-        yield (
-            f"You named {kind} ({FAULT_KINDS[kind].description}). Which plot would show this "
-            "fault, and does this plot in your report show the fault?",
-            f"{kind} would be visible in {' or '.join(find_panels_showing_fault(kind))}. The plots "
-            f"do not show {kind}, because the injected fault of the flight is: {true_faults_text}.",
-        )
+        if kind not in (*true_kinds, NO_FAULT_KIND):
+            yield (
+                f"You named {kind} ({FAULT_KINDS[kind].description}). Which plot would show this "
+                "fault? Does this plot in your report show the fault?",
+                f"{kind} would be visible in {' or '.join(find_panels_showing_fault(kind))}. "
+                f"Injected fault of the flight: {', '.join(true_kinds) or 'no fault'}.",
+            )
     for fault in right_answers.mistakes:
-        description = FAULT_KINDS[fault.kind].description
+        description, panels = (
+            FAULT_KINDS[fault.kind].description,
+            find_panels_showing_fault(fault.kind),
+        )
         if fault.kind not in named_kinds:
             yield (
                 f"Your flight also has this fault: {description}. Show this fault in a plot of "
@@ -55,20 +57,15 @@ def ask_about_form(
                 f"{describe_right_answer(fault)}.",
             )
             continue
-        other_panels = [
-            panel for panel in REPORT_PANELS if panel not in find_panels_showing_fault(fault.kind)
-        ]
+        other_panels = [panel for panel in REPORT_PANELS if panel not in panels]
         yield (
             f"You named {fault.kind} ({description}). Show this fault in a plot of your report. "
             "Name a plot that cannot show this fault, with the reason.",
             f"{describe_right_answer(fault)}. Examples of plots that cannot show {fault.kind}: "
             f"{' or '.join(other_panels[:2])}.",
         )
-    given_letters = dict(enumerate(answers.choices))
-    questions = [
-        (*each, given_letters.get(index)) for index, each in enumerate(right_answers.choices)
-    ]
-    for choice, right_letter, letter in sorted(questions, key=lambda each: each[1] == each[2]):
+    questions = zip_longest(right_answers.choices, answers.choices[: len(right_answers.choices)])
+    for (choice, right_letter), letter in sorted(questions, key=lambda each: each[0][1] == each[1]):
         answer_text = choice.answer_text(letter) if letter else "none"
         yield (
             f"{choice.question}. Your answer: {answer_text}. Explain this answer with the figure.",

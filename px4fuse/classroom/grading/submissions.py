@@ -64,6 +64,8 @@ PATH_PATTERN_BY_PLATFORM = {
     name: re.compile(pattern)
     for name, pattern in read_toml(__file__, dict[str, str], "platforms.toml").items()
 }
+# Text that Blackboard or Moodle adds once to a path; students may forge the text
+_PLATFORM_TEXT_PATTERN = re.compile(r"_attempt_\d{4}-|_\d+_assignsubmission_")
 BLACKBOARD_TIME_FORMAT = "%Y-%m-%d-%H-%M-%S"
 _SUBMISSION_PATTERN = re.compile(
     r"^(?:submission_)?(\d+)(?:\.pdf)?:\s*\n((?:[ -].*\n?)*)", re.MULTILINE
@@ -365,7 +367,13 @@ def parse_submission_path(
             numbers = {platform: matched_fields["number"]} if "number" in matched_fields else {}
             full_name, login = " ".join(filter(None, person_names)), matched_fields.get("login", "")
             person = Person("", full_name, "", login, numbers)
-            return ExportOrigin(platform, person, time, bool(matched_fields.get("late")))
+            # Moodle and Blackboard add this text once to each path
+            has_forged_platform_name = len(_PLATFORM_TEXT_PATTERN.findall(name)) > (
+                platform in ("moodle", "blackboard")
+            )
+            return ExportOrigin(
+                platform, person, time, bool(matched_fields.get("late")), has_forged_platform_name
+            )
         remaining_path = remaining_path.partition("/")[2]
     return UNKNOWN_ORIGIN
 
