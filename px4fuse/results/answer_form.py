@@ -324,11 +324,12 @@ def _convert_form(form: dict[str, Any]) -> dict[str, Any]:
             f"the field {min(unknown_fields, default='mistakes')} is unknown; known fields: "
             f"mistake, {', '.join(quantity_fields)}"
         )
+    answered_choice_fields = choice_fields if choices else ()
     return {
         **filled_form,
         "mistakes": mistakes,
         "quantities": tuple(map(quantities.get, quantity_fields)),
-        "choices": tuple(choices.get(name, "") for name in choice_fields if choices),
+        "choices": tuple(choices.get(name, "") for name in answered_choice_fields),
     }
 
 
@@ -355,15 +356,15 @@ def check_answers(answers: Answers) -> None:
         if kinds.count(kind) > 1:
             raise ValueError(f"the form names {kind!r} twice; name each kind of fault once")
         units = FAULT_KINDS[kind].units
-        value_units = UNITS_BY_CORRECTION.get(named_fault.parameter, {named_fault.value_unit: 1.0})
         for field_name, allowed_answers in (
             ("parameter", UNITS_BY_CORRECTION),
             ("panel", REPORT_PANELS),
             ("unit", units),
-            ("value_unit", value_units),
+            ("value_unit", UNITS_BY_CORRECTION.get(named_fault.parameter)),
         ):
-            if chosen_name := getattr(named_fault, field_name):
-                _require_allowed_answer(f"{kind}: {field_name}", chosen_name, allowed_answers)
+            answer = getattr(named_fault, field_name)
+            if answer and allowed_answers is not None:
+                _require_allowed_answer(f"{kind}: {field_name}", answer, allowed_answers)
         min_size, max_size = FAULT_KINDS[kind].size_range
         size = named_fault.convert_size_to_standard_unit()
         if size is not None and not min_size <= size <= max_size:
@@ -375,8 +376,9 @@ def check_answers(answers: Answers) -> None:
 
 def _require_allowed_answer(field_name: str, answer: str, allowed_answers: Iterable[str]) -> None:
     if answer not in allowed_answers:
-        choices_text = _join_quoted(allowed_answers) or "the allowed answers: leave it empty"
-        raise ValueError(f"{field_name} {answer!r} is not one of {choices_text}")
+        choices_text = _join_quoted(allowed_answers)
+        fault = f"not one of {choices_text}" if choices_text else "not allowed: leave it empty"
+        raise ValueError(f"{field_name} {answer!r} is {fault}")
 
 
 def form_name(log_name: str) -> str:

@@ -6,7 +6,6 @@ A cached result is valid while library versions and available input files are un
 import hashlib
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
-from functools import cache
 from pathlib import Path
 
 import msgspec
@@ -127,20 +126,14 @@ def _collect_versions_and_files(
     results: str, path_by_sha256: Mapping[str, Path], assigned_hashes: frozenset[str]
 ) -> dict[str, str]:
     """Return the versions of libraries, and the availability of input files by SHA-256."""
-    return _read_versions() | {
-        sha256: "available"
-        if sha256 in path_by_sha256
-        else "assigned"
-        if sha256 in assigned_hashes
-        else "missing"
-        for sha256 in sorted(set(find_file_hashes(results)))
-    }
-
-
-@cache
-def _read_versions() -> dict[str, str]:
     versions = provenance("")
-    return {**versions.libraries, "px4fuse": versions.px4fuse}
+    versions_and_files = {**versions.libraries, "px4fuse": versions.px4fuse}
+    for sha256 in find_file_hashes(results):
+        if sha256 in path_by_sha256:
+            versions_and_files[sha256] = "available"
+        else:
+            versions_and_files[sha256] = "assigned" if sha256 in assigned_hashes else "missing"
+    return versions_and_files
 
 
 def _load_record(
