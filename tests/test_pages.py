@@ -302,35 +302,38 @@ WHITE = b"q 1 g 50 690 300 90 re f Q"
 # Forgery, the beginning of a difference, and whether it is one of structure
 FORGERIES: dict[str, tuple[Forge, str, bool]] = {
     # form fields
-    "an empty form": (catalogue("/AcroForm", dictionary(Fields=array())), "an entry /AcroForm", True),
-    "a text field": (field("Tx", V=STRING("0.95"), DA=STRING("/f0 8 Tf")), "an entry /Annots", True),
-    "a button": (field("Btn", MK=dictionary(CA=STRING("ok"))), "an entry /Annots", True),
-    "a choice": (field("Ch", V=STRING("a"), Opt=array(STRING("a"))), "an entry /Annots", True),
-    "a signature": (field("Sig"), "an entry /Annots", True),
-    "a widget without a form": (annotation("Widget", FT=name("Tx")), "an entry /Annots", True),
+    "an empty form": (catalogue("/AcroForm", dictionary(Fields=array())), "entry /AcroForm", True),
+    "a text field": (field("Tx", V=STRING("0.95"), DA=STRING("/f0 8 Tf")), "entry /Annots", True),
+    "a button": (field("Btn", MK=dictionary(CA=STRING("ok"))), "entry /Annots", True),
+    "a choice": (field("Ch", V=STRING("a"), Opt=array(STRING("a"))), "entry /Annots", True),
+    "a signature": (field("Sig"), "entry /Annots", True),
+    "a widget without a form": (annotation("Widget", FT=name("Tx")), "entry /Annots", True),
     "an XFA form": (
-        catalogue("/AcroForm", dictionary(Fields=array(), XFA=STRING("x"))), "an entry /AcroForm", True,
+        catalogue("/AcroForm", dictionary(Fields=array(), XFA=STRING("x"))),
+        "entry /AcroForm", True,
     ),
     # layers
     "a layer for print": (
         layer(b"\n/OC /MC0 BDC " + WHITE + b" EMC", Print=dictionary(PrintState=name("ON")),
-              View=dictionary(ViewState=name("OFF"))), "an entry /OCProperties", True,
+              View=dictionary(ViewState=name("OFF"))), "entry /OCProperties", True,
     ),
     "a layer for the screen": (
         layer(b"\n/OC /MC0 BDC " + WHITE + b" EMC", View=dictionary(ViewState=name("ON"))),
-        "an entry /OCProperties", True,
+        "entry /OCProperties", True,
     ),
-    "a list of layers": (catalogue("/OCProperties", dictionary(OCGs=array())), "an entry /OCProperties", True),
+    "a list of layers": (
+        catalogue("/OCProperties", dictionary(OCGs=array())), "entry /OCProperties", True,
+    ),
     # annotations
     **{
-        f"annotation {kind}": (annotation(kind, **entries), "an entry /Annots", True)
+        f"annotation {kind}": (annotation(kind, **entries), "entry /Annots", True)
         for kind, entries in {
             "FreeText": {"Contents": STRING("0.01"), "DA": STRING("/f0 8 Tf")},
             "Stamp": {"F": N(4)}, "Square": {"F": N(36)}, "Highlight": {}, "Ink": {},
             "Link": {}, "Redact": {}, "Watermark": {"F": N(4)}, "Popup": {}, "Line": {},
         }.items()
     },
-    "no annotations": (page(1, "/Annots", array()), "an entry /Annots", True),
+    "no annotations": (page(1, "/Annots", array()), "entry /Annots", True),
     # fonts
     "glyphs exchanged by a map": (exchanged_glyphs, "PDF entry /CIDToGIDMap differs", True),
     "outlines exchanged": (
@@ -491,7 +494,7 @@ FORGERIES: dict[str, tuple[Forge, str, bool]] = {
         catalogue("/ViewerPreferences", dictionary(HideMenubar=ON)), "an entry /HideMenubar", True,
     ),
     "a bookmark": (bookmark, "the PDF entry /Title was changed: 'consistent'", False),
-    "no bookmarks": (lambda w: w.root_object.pop("/Outlines"), "an entry /Outlines is missing", True),
+    "no bookmarks": (lambda w: w.root_object.pop("/Outlines"), "/Outlines is missing", True),
     "named places": (catalogue("/Dests", dictionary()), "an entry /Dests", True),
     "a base address": (
         catalogue("/URI", dictionary(Base=STRING("http://x"))), "an entry /URI", True,

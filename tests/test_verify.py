@@ -468,7 +468,7 @@ DOCUMENT: dict[str, tuple[Forge, str, str]] = {
     ),
     "another title": (document_info(Title="my report"), "page differs", "document: the PDF entry"),
     "a form": (
-        catalogue("/AcroForm", dictionary(Fields=array())), "cannot verify", "an entry /AcroForm, which",
+        catalogue("/AcroForm", dictionary(Fields=array())), "cannot verify", "/AcroForm, which",
     ),
     "an annotation": (
         lambda w: w.add_annotation(1, Link(rect=(50, 50, 200, 70), url="http://example.org")),
