@@ -18,18 +18,6 @@ from px4fuse.results.model import SCHEMA_VERSION
 MAX_RESULTS_BYTES, MAX_INTEGER_BITS = 5_000_000, 64
 
 
-class _SchemaVersion(msgspec.Struct, frozen=True):
-    name: str
-    version: str
-
-
-class _ResultsHeader(msgspec.Struct, frozen=True):
-    """Fields that results of all schema versions contain."""
-
-    schema: _SchemaVersion
-    provenance: Any = None
-
-
 def read_results(data: bytes, name: str = "results.json") -> Results:
     """Read results of px4fuse from untrusted bytes.
 
@@ -50,20 +38,16 @@ def read_results(data: bytes, name: str = "results.json") -> Results:
     except (msgspec.DecodeError, ValueError) as error:
         raise ResultsError(f"{name} is not JSON ({one_line(str(error), 100)}).") from error
     try:
-        header = msgspec.convert(decoded_results, _ResultsHeader)
-        results_type = RESULTS_BY_SCHEMA[header.schema.name]
-    except (msgspec.ValidationError, KeyError) as error:
+        schema = decoded_results["schema"]
+        results_type, version = RESULTS_BY_SCHEMA[schema["name"]], str(schema["version"])
+    except (KeyError, TypeError) as error:
         raise ResultsError(f"{name} contains no results of px4fuse.") from error
-    version, (major, minor) = header.schema.version, SCHEMA_VERSION.split(".")
+    major, minor = SCHEMA_VERSION.split(".")
     if not re.fullmatch(rf"{major}\.[0-9]{{1,4}}", version):
-        writer_version = (
-            header.provenance.get("px4fuse") if isinstance(header.provenance, dict) else None
-        )
-        version_text = (
-            f"px4fuse {one_line(str(writer_version), 60)}"
-            if writer_version
-            else "the version that wrote the results"
-        )
+        version_text = "the version that wrote the results"
+        provenance = decoded_results.get("provenance")
+        if isinstance(provenance, dict) and "px4fuse" in provenance:
+            version_text = f"px4fuse {one_line(str(provenance['px4fuse']), 60)}"
         raise ResultsError(
             f"{name} uses schema version {one_line(version, 20)}; px4fuse reads version {major}.",
             f"Create the report again, or read it with {version_text}.",
