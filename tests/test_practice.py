@@ -204,7 +204,7 @@ def test_practice_page_html_source_does_not_show_solutions(quiz: Path) -> None:
         flight = json.loads(content)["flight"]
         assert flight.keys().isdisjoint({"findings", "summary", "card"})
         assert "mistake" not in content
-        assert "px4fuse compare 'flight" in flight["command"]["base"]
+        assert "px4fuse compare 'flight" in flight["command"]
     for one in answers:
         assert "px4fuse-card" in one["card"]
         # a flight with a fault is never called consistent
@@ -228,7 +228,7 @@ def renewed(page: Browser, button: str) -> None:
     while time.monotonic() < end:
         with contextlib.suppress(AssertionError):  # no page while it reloads
             if page.ask(
-                "window.before === undefined && document.querySelector('#table tbody tr') !== null"
+                "window.before === undefined && document.querySelector('#span').textContent !== ''"
                 " && document.getElementById('quiz-title').textContent !== ''"
             ):
                 break
@@ -264,21 +264,14 @@ def test_practice_page_scores_right_and_wrong_answers(browser: Browser, quiz: Pa
         if not key["mistakes"]:
             assert "no fault" in element_text(page, "quiz-solution")
         for mistake in key["mistakes"]:
-            assert (mistake["span"] is not None) == (key["right"] == ["source"])
+            assert (mistake["time"] != "whole flight") == (key["right"] == ["source"])
             for name in ("fault", "size", "time", "symptom"):
                 assert mistake[name] in element_text(page, "quiz-solution")
         assert f"Score: {points} of {number + 1} answered flights" in element_text(
             page, "quiz-score"
         )
-        for mistake in key["mistakes"]:
-            page.click("#quiz-solution button")
-            settle(page)
-            span = page.ask("document.getElementById('span').textContent")
-            low, high = (float(word) for word in span.removesuffix(" s").split(" s to "))
-            if mistake["span"] is not None:
-                assert low < mistake["span"][0] < high < low + 25.0
         # after the answer the page shows the card
-        assert page.ask("document.querySelector('#card [data-part=headline]').textContent")
+        assert page.ask("document.querySelector('#card h2').textContent")
         assert "RMSE" in element_text(page, "card")
         assert page.ask("[...document.querySelectorAll('[name=choice]')].every((b) => b.disabled)")
         if number < COUNT - 1:
@@ -290,20 +283,10 @@ def test_practice_page_scores_right_and_wrong_answers(browser: Browser, quiz: Pa
     assert page.ask("document.getElementById('quiz-next').hidden")
     assert page.complaints() == []
     assert page.requests() <= {"file", "data", "blob"}
-    renewed(page, "#quiz-again")
-    assert element_text(page, "quiz-title") == f"Flight 1 of {COUNT}: find the fault"
-    assert element_text(page, "quiz-score") == ""
 
 
 def test_practice_page_gives_half_a_point_for_half_an_answer(browser: Browser, quiz: Path) -> None:
-    page = show(browser, quiz)
-    for name in ("gate", "clock", "nothing"):
-        page.click(f"[name=choice][value={name}]")
-    chosen = "[...document.querySelectorAll('[name=choice]:checked')].map((b) => b.value)"
-    assert page.ask(chosen) == ["nothing"]
-    page.click("[name=choice][value=gate]")
-    assert page.ask(chosen) == ["gate"]
-    points = page.ask(
+    points = show(browser, quiz).ask(
         "['gate', 'clock gate', 'frame gate', 'clock'].map((answer) =>"
         "Practice.points(answer, {right: ['clock', 'gate']}))"
     )

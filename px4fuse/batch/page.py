@@ -15,7 +15,6 @@ from px4fuse.batch.rows import (
     STATUS_FAILED,
     STATUS_NOT_COMPARED,
 )
-from px4fuse.card.model import RATIO_AXIS_ENDS
 from px4fuse.core.text import (
     format_count,
     format_metres,
@@ -23,12 +22,11 @@ from px4fuse.core.text import (
     format_ratio,
     join_first_names,
 )
-from px4fuse.filter.consistency import CONSISTENT_SIGMA_RATIOS
 from px4fuse.findings import finding_title
 from px4fuse.html import frame
 from px4fuse.html.frame import Cell, Column, Row, RowDetailsSection
 from px4fuse.html.safe import clean_text, load_template, make_relative_url
-from px4fuse.report.card_html import MARKER_SVG_PATHS
+from px4fuse.report.card_html import SIGMA_RATIO_AXIS
 from px4fuse.report.card_text import SEVERITY_SIGNS, SYMBOL_BY_REFERENCE, format_consistent_ratios
 
 # Columns of σ ratios from innovations (source) and from errors against ground truth (truth)
@@ -128,11 +126,7 @@ def format_html(table: pd.DataFrame, title: str, version_text: str) -> str:
         column_groups=[(OPTIONAL_COLUMN_GROUP, "more columns")],
         search_placeholder="search by name, vehicle, firmware or finding",
         full_table_note="fleet.csv contains the table of all logs.",
-        sigma_ratio_axis={
-            "bands": CONSISTENT_SIGMA_RATIOS,
-            "ends": RATIO_AXIS_ENDS,
-            "marks": MARKER_SVG_PATHS,
-        },
+        sigma_ratio_axis=SIGMA_RATIO_AXIS,
     )
 
 

@@ -9,28 +9,25 @@ import pandas as pd
 from scipy import stats
 
 from px4fuse.analysis import Analysis
-from px4fuse.card.build import describe_axis
-from px4fuse.card.model import RATIO_AXIS_ENDS
-from px4fuse.card.verdicts import make_sigma_verdicts
-from px4fuse.comparison.model import AxisComparison, Comparison, ErrorsAgainstTruth
+from px4fuse.comparison.model import AxisComparison, Comparison
 from px4fuse.comparison.preparation import shift_clock
 from px4fuse.comparison.remedy import find_aid
 from px4fuse.explore.packing import DRAWN_VALUE_STEPS_PER_UNIT, ArrayEncoder
-from px4fuse.filter.consistency import CONFIDENCE_LEVEL, CONSISTENT_SIGMA_RATIOS
+from px4fuse.filter.consistency import CONFIDENCE_LEVEL
 from px4fuse.filter.model import INITIAL_COVARIANCE
-from px4fuse.filter.settings import KF_NUMERIC_SETTINGS, SETTING_RANGES, Settings
+from px4fuse.filter.settings import KF_NUMERIC_SETTINGS, SETTING_RANGES
 from px4fuse.filter.signals import AISLE, Acceleration, Axis, find_imu_gaps, weighted_sum
 from px4fuse.filter.time_offset import ClockOffset
 from px4fuse.filter.tuning import HORIZONTAL, AxisTuning
 from px4fuse.flight.ekf2_parameters import PARAMETERS
 from px4fuse.flight.model import Columns, PositionTrack, Unavailable
-from px4fuse.report.card_html import MARKER_SVG_PATHS
 from px4fuse.request import ComparisonRequest, command_line
 
 # Data for the web page, in JSON types
 PageData = dict[str, Any]
 # Half the range (s) of the slider for the time offset
 OFFSET_SLIDER_HALF_RANGE_S = 0.6
+OFFSET_FIXED_REASON = "You cannot change this offset: it aligns the position file with the log."
 
 
 def make_flight_data(analysis: Analysis, encoder: ArrayEncoder) -> PageData:
@@ -38,6 +35,10 @@ def make_flight_data(analysis: Analysis, encoder: ArrayEncoder) -> PageData:
     inputs = make_kf_inputs(analysis, encoder)
     events, request = analysis.events, analysis.request
     assert request is not None
+    offset_s = analysis.settings.clock_offset_s
+    # a position file is aligned with the log, so its offset is fixed
+    half_range_s = OFFSET_SLIDER_HALF_RANGE_S if request.position is None else 0.0
+    limits = {name: (low, high) for name, (low, high, *_) in SETTING_RANGES.items()}
     return {
         "log": analysis.flight.log.name,
         "settings": asdict(analysis.settings),
@@ -55,8 +56,12 @@ def make_flight_data(analysis: Analysis, encoder: ArrayEncoder) -> PageData:
             "ground": events.ground_spans_s,
             "reset": list(events.reset_times_s),
         },
-        "command": _make_commands(request, analysis),
-        "offset": _make_offset_slider(request, analysis),
+        "command": _make_command(request, analysis),
+        "limits": limits | {"clock_offset_s": (offset_s - half_range_s, offset_s + half_range_s)},
+        "offset": {
+            "likely": _find_estimated_offset(analysis),
+            "why": OFFSET_FIXED_REASON if request.position is not None else "",
+        },
         "flown": _format_ekf2_settings(analysis),
     }
 
@@ -74,35 +79,17 @@ def make_kf_inputs(comparison: Comparison, encoder: ArrayEncoder) -> PageData:
     }
 
 
-def make_page_constants() -> PageData:
-    """Return ranges and defaults of the KF settings, and the constants of σ ratio plots."""
-    return {
-        "settings": {name: (low, high) for name, (low, high, *_) in SETTING_RANGES.items()},
-        "lesson": asdict(Settings()),
-        "bands": CONSISTENT_SIGMA_RATIOS,
-        "ends": RATIO_AXIS_ENDS,
-        "marks": MARKER_SVG_PATHS,
-    }
-
-
 def undo_time_offset(comparison: Comparison) -> PositionTrack:
     """Return the positions with their original timestamps."""
     return shift_clock(comparison.source, -comparison.settings.clock_offset_s)
 
 
-def _make_offset_slider(request: ComparisonRequest, analysis: Analysis) -> PageData:
-    """Return range and estimate of the time offset, or the reason why it cannot be changed."""
-    if request.position is not None:
-        return {"why": "You cannot change this offset: it aligns the position file with the log."}
-    applied_offset_s, clock_offset = analysis.settings.clock_offset_s, analysis.clock
-    estimated_offset_s = None
-    if isinstance(clock_offset, ClockOffset) and clock_offset.is_determinable:
-        estimated_offset_s = applied_offset_s + clock_offset.remaining_s
-    return {
-        "from": applied_offset_s - OFFSET_SLIDER_HALF_RANGE_S,
-        "to": applied_offset_s + OFFSET_SLIDER_HALF_RANGE_S,
-        "likely": estimated_offset_s,
-    }
+def _find_estimated_offset(analysis: Analysis) -> float | None:
+    """Return the maximum-likelihood estimate of the time offset (s), or None."""
+    estimate = analysis.clock
+    if isinstance(estimate, ClockOffset) and estimate.is_determinable:
+        return analysis.settings.clock_offset_s + estimate.remaining_s
+    return None
 
 
 def _make_imu_data(comparison: Comparison, encoder: ArrayEncoder) -> PageData | str:
@@ -163,9 +150,6 @@ def _make_axis_inputs(
 def _make_axis_data(analysis: Analysis, result: AxisComparison, encoder: ArrayEncoder) -> PageData:
     name = result.axis.name
     return {
-        "called": result.axis.label,
-        "along": describe_axis(analysis, result),
-        "ratios": [verdict.ratio for verdict in make_sigma_verdicts(result)],
         "note": result.axis.note,
         "bands": _pack_nis_bands(len(result.axis.measurement_time_s), encoder),
         # key of the noise estimate: north and east may have a common estimate
@@ -196,21 +180,12 @@ def _make_ekf2_data(
         "state": _pack_table(state, ["position_m", "velocity_m_s"], encoder),
         "variance": [],
         "innovations": [],
-        "summary": {"why": summary.reason}
-        if isinstance(summary, Unavailable)
-        else {
-            "why": "",
-            "count": summary.count,
-            "outside": summary.fraction_outside_two_sigma,
-            "lag1": summary.lag1_autocorrelation,
+        "summary": {
+            "outside": getattr(summary, "fraction_outside_two_sigma", None),
+            "rmse": getattr(summary.truth, "position_rmse_m", None),
         },
         "r": None,
     }
-    if isinstance(summary.truth, ErrorsAgainstTruth):
-        ekf2_data["summary"] |= {
-            "truthP": summary.truth.position_rmse_m,
-            "truthV": summary.truth.velocity_rmse_m_s,
-        }
     if isinstance(result.ekf2_variance, pd.DataFrame):
         sigma = result.ekf2_variance.dropna().pow(0.5)
         ekf2_data["variance"] = _pack_table(
@@ -271,29 +246,23 @@ def _format_ekf2_settings(analysis: Analysis) -> dict[str, str]:
     }
 
 
-def _make_commands(request: ComparisonRequest, analysis: Analysis) -> PageData:
-    """Return the ``px4fuse compare`` command of this analysis in two forms.
+def _make_command(request: ComparisonRequest, analysis: Analysis) -> str:
+    """Return the ``px4fuse compare`` command with time span and main axis of this analysis.
 
-    In "fixed", time span and main axis are those of this analysis. In "base", px4fuse chooses both.
+    The web page appends the settings of KF.
     """
-    offset_s = None if request.position is None else request.clock_offset_s
     defaults = ComparisonRequest(log=request.log)
-    kf_defaults = {name: getattr(defaults, name) for name in (*KF_NUMERIC_SETTINGS, "input")}
-    base_request = msgspec.structs.replace(request, clock_offset_s=offset_s, **kf_defaults)
+    replaced_settings = {name: getattr(defaults, name) for name in (*KF_NUMERIC_SETTINGS, "input")}
+    if request.position is None:
+        replaced_settings["clock_offset_s"] = None
     heading_deg = request.heading_deg
     if heading_deg is None and AISLE in analysis.axes:
         heading_deg = analysis[AISLE].heading_deg
     fixed_request = msgspec.structs.replace(
-        base_request,
+        request,
+        **replaced_settings,
         start_s=analysis.segment.start_s,
         end_s=analysis.segment.end_s,
         heading_deg=heading_deg,
     )
-    return {
-        "base": command_line(base_request, for_shell=True),
-        "fixed": command_line(fixed_request, for_shell=True),
-        "input": request.input,
-        "default_input": "zero"
-        if isinstance(analysis.main.axis.acceleration, Unavailable)
-        else "imu",
-    }
+    return command_line(fixed_request, for_shell=True)

@@ -193,26 +193,19 @@ def _simulate_flight_data(
     flight = flights.to_flight(simulation, f"flight {flight_index + 1}")
     request = ComparisonRequest(log=flight.log.name, sigma_a_m_s2=SIGMA_A_M_S2, sigma_z_m=SIGMA_Z_M)
     # without the automatic correction of axes and timestamps, which would hide the injected fault
-    analysis, encoder = (
-        diagnose(request, flight=flight, keep_positions_as_sent=True),
-        ArrayEncoder(),
-    )
-    data, card = make_flight_data(analysis, encoder), build_card(analysis, request)
+    analysis = diagnose(request, flight=flight, keep_positions_as_sent=True)
     fault_descriptions = [_describe_fault(*pair, analysis.findings) for pair in faults_and_sizes]
+    card = _with_fault_headline(build_card(analysis, request), fault_descriptions)
     answer_key = {
         "right": practice_flight.correct_answers,
         "mistakes": fault_descriptions,
-        "card": make_card_html(
-            _with_fault_headline(card, fault_descriptions), has_apply_buttons=True
-        ),
+        "card": make_card_html(card, has_apply_buttons=True),
     }
     compressed_key = base64.b64encode(zlib.compress(json.dumps(answer_key).encode())).decode()
-    flight_html = make_data_elements(data, analysis, encoder, f"-{flight_index}")
-    return (
-        data,
-        f'{flight_html}\n<script type="text/plain" id="key-{flight_index}">'
-        f"{compressed_key}</script>",
-    )
+    key_html = f'<script type="text/plain" id="key-{flight_index}">{compressed_key}</script>'
+    encoder = ArrayEncoder()
+    data = make_flight_data(analysis, encoder)
+    return data, make_data_elements(data, analysis, encoder, f"-{flight_index}") + key_html
 
 
 def _describe_fault(fault: QuizFault, size: str, findings: tuple[Finding, ...]) -> dict[str, Any]:
@@ -225,7 +218,6 @@ def _describe_fault(fault: QuizFault, size: str, findings: tuple[Finding, ...]) 
         "time": time_text,
         "symptom": fault.symptom,
         "view": fault.view,
-        "span": list(spans[0]) if spans else None,
     }
 
 
