@@ -184,7 +184,7 @@ class Browser:
         """Return the names in the rows of the table."""
         return list(
             self.ask(
-                "[...document.querySelectorAll('.list > tbody > tr[data-row] .name')]"
+                "[...document.querySelectorAll('.list > tbody > tr:not(.more) .name')]"
                 ".map((name) => name.textContent)"
             )
         )

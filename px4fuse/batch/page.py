@@ -99,7 +99,7 @@ def format_html(table: pd.DataFrame, title: str, version_text: str) -> str:
         title=title,
         subtitle=f"{format_count(len(logs), 'log')}. Compared by {version_text}.",
         html_above_table=load_template("batch/axis.html").render(limits=format_consistent_ratios()),
-        row_nouns=("log", "logs"),
+        rows_name="logs",
         columns=(
             Column("Sign", "rank"),
             Column("Log", "name"),
@@ -108,11 +108,11 @@ def format_html(table: pd.DataFrame, title: str, version_text: str) -> str:
                 Column(
                     f"{filter_name.upper()} {SYMBOL_BY_REFERENCE[reference_name]}",
                     "ratio",
-                    min_screen_size="tablet",
+                    is_on_phones=False,
                 )
                 for filter_name, reference_name in (name.split("_") for name in SIGMA_RATIO_COLUMNS)
             ),
-            Column("KF − EKF2 (m)", "number", min_screen_size="tablet"),
+            Column("KF − EKF2 (m)", "number", is_on_phones=False),
             *(
                 Column(label, "line", OPTIONAL_COLUMN_GROUP)
                 for label in ("Date (UTC)", "Vehicle", "Firmware")
