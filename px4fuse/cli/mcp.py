@@ -218,15 +218,15 @@ def _parse_arguments(
     parameters: Mapping[str, click.Parameter],
     folders: Sequence[Path],
     arguments: Mapping[str, Any],
-) -> tuple[list[str], list[Path]]:
-    """Convert the arguments of a tool to a command line; also return the input files.
+) -> list[str]:
+    """Convert the arguments of a tool to a command line.
 
     Raises
     ------
     LogError
         A file is outside the folders.
     """
-    command_words, operands, files = [command_name], ["--"], list[Path]()
+    command_words, operands = [command_name], ["--"]
     for name, parameter in parameters.items():
         if name not in arguments:
             continue
@@ -236,14 +236,13 @@ def _parse_arguments(
         argument_texts = [str(text) for text in (value if isinstance(value, list) else [value])]
         if isinstance(parameter.type, options.InputPath):
             argument_texts = [_find_file(argument_texts[0], folders)]
-            files.append(split_path_and_part(argument_texts[0])[0])
         if isinstance(parameter, click.Argument):
             operands += argument_texts
         elif isinstance(value, bool):
             command_words += [option] * value
         else:
             command_words += [f"{option}={text}" for text in argument_texts]
-    return command_words + operands, files
+    return command_words + operands
 
 
 def _find_file(file_argument: str, folders: Sequence[Path]) -> str:

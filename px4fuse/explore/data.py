@@ -15,13 +15,13 @@ from px4fuse.comparison.remedy import find_aid
 from px4fuse.explore.packing import DRAWN_VALUE_STEPS_PER_UNIT, ArrayEncoder
 from px4fuse.filter.consistency import CONFIDENCE_LEVEL
 from px4fuse.filter.model import INITIAL_COVARIANCE
-from px4fuse.filter.settings import KF_NUMERIC_SETTINGS, SETTING_RANGES
+from px4fuse.filter.settings import SETTING_RANGES
 from px4fuse.filter.signals import AISLE, Acceleration, Axis, find_imu_gaps, weighted_sum
 from px4fuse.filter.time_offset import ClockOffset
 from px4fuse.filter.tuning import HORIZONTAL, AxisTuning
 from px4fuse.flight.ekf2_parameters import PARAMETERS
 from px4fuse.flight.model import Columns, PositionTrack, Unavailable
-from px4fuse.request import ComparisonRequest, command_line
+from px4fuse.request import DT_S, SIGMA_A_M_S2, ComparisonRequest, command_line
 
 # Data for the web page, in JSON types
 PageData = dict[str, Any]
@@ -73,9 +73,7 @@ def make_kf_inputs(comparison: Comparison, encoder: ArrayEncoder) -> PageData:
         "segment": [comparison.segment.start_s, comparison.segment.end_s],
         "start": list(INITIAL_COVARIANCE),
         "imu": _make_imu_data(comparison, encoder),
-        "axes": [
-            _make_axis_inputs(comparison, axis, source, encoder) for axis in comparison.input_axes
-        ],
+        "axes": [_make_axis_inputs(axis, source, encoder) for axis in comparison.input_axes],
     }
 
 
@@ -93,7 +91,7 @@ def _find_estimated_offset(analysis: Analysis) -> float | None:
 
 
 def _make_imu_data(comparison: Comparison, encoder: ArrayEncoder) -> PageData | str:
-    """Return sample times, gaps and time span (s) of the acceleration, or why it is missing."""
+    """Return sample times and gaps (s) of the acceleration, or why it is missing."""
     acceleration = comparison.input_axes[0].acceleration
     if isinstance(acceleration, Unavailable):
         return acceleration.reason
@@ -102,46 +100,28 @@ def _make_imu_data(comparison: Comparison, encoder: ArrayEncoder) -> PageData | 
     gap_bounds_s = np.stack([time_s[gap_start_indices], time_s[gap_start_indices + 1]], 1)
     cumulative_gap_duration_s = np.cumsum(np.diff(gap_bounds_s, prepend=gap_bounds_s[:, :1]))
     return {
-        "time": encoder.add_times(time_s[_find_segment_slice(comparison, acceleration)]),
-        "span": [time_s[0], time_s[-1]],
+        "time": encoder.add_times(time_s),
         "gapEdges": gap_bounds_s.ravel().tolist(),
         # total duration (s) of all gaps up to each start and each end of a gap
         "gapSum": cumulative_gap_duration_s.tolist(),
     }
 
 
-def _find_segment_slice(comparison: Comparison, acceleration: Acceleration) -> slice:
-    """Return the slice of IMU samples in the analysed time span, plus one sample at each end."""
-    segment, time_s = comparison.segment, acceleration.time_s
-    first_row = int(np.searchsorted(time_s, segment.start_s, side="right")) - 1
-    end_row = int(np.searchsorted(time_s, segment.end_s)) + 1
-    return slice(max(first_row, 0), end_row)
-
-
-def _make_axis_inputs(
-    comparison: Comparison, axis: Axis, source_track: PositionTrack, encoder: ArrayEncoder
-) -> PageData:
+def _make_axis_inputs(axis: Axis, source_track: PositionTrack, encoder: ArrayEncoder) -> PageData:
     """Return position measurements (m) and the time integral of acceleration (m/s) along an axis.
 
-    Measurements shortly outside the analysed time span are included, for other time offsets.
+    Data outside the analysed time span are included, for other time offsets.
     """
-    segment = comparison.segment
-    time_s = source_track.samples.index.to_numpy()
     position_m = weighted_sum(source_track.samples, Columns.POSITION, axis.direction)
-    margin_s = OFFSET_SLIDER_HALF_RANGE_S + abs(comparison.settings.clock_offset_s)
-    is_near_segment = (time_s >= segment.start_s - margin_s) & (time_s <= segment.end_s + margin_s)
-    is_near_segment &= np.isfinite(position_m)
+    is_finite = np.isfinite(position_m)
     axis_data: PageData = {
         "name": axis.name,
-        "time": encoder.add_times(time_s[is_near_segment]),
-        "z": encoder.add(position_m[is_near_segment]),
+        "time": encoder.add_times(source_track.samples.index.to_numpy()[is_finite]),
+        "z": encoder.add(position_m[is_finite]),
     }
     if isinstance(axis.acceleration, Acceleration):
-        acceleration_integral_m_s = axis.acceleration.compute_velocity_change_m_s()[
-            _find_segment_slice(comparison, axis.acceleration)
-        ]
         axis_data |= {
-            "integral": encoder.add(acceleration_integral_m_s - acceleration_integral_m_s[0]),
+            "integral": encoder.add(axis.acceleration.compute_velocity_change_m_s()),
             "rms": axis.acceleration.compute_rms_m_s2(),
         }
     return axis_data
@@ -249,18 +229,18 @@ def _format_ekf2_settings(analysis: Analysis) -> dict[str, str]:
 def _make_command(request: ComparisonRequest, analysis: Analysis) -> str:
     """Return the ``px4fuse compare`` command with time span and main axis of this analysis.
 
-    The web page appends the settings of KF.
+    The settings of KF are omitted; the web page appends them.
     """
-    defaults = ComparisonRequest(log=request.log)
-    replaced_settings = {name: getattr(defaults, name) for name in (*KF_NUMERIC_SETTINGS, "input")}
-    if request.position is None:
-        replaced_settings["clock_offset_s"] = None
     heading_deg = request.heading_deg
     if heading_deg is None and AISLE in analysis.axes:
         heading_deg = analysis[AISLE].heading_deg
     fixed_request = msgspec.structs.replace(
         request,
-        **replaced_settings,
+        sigma_a_m_s2=SIGMA_A_M_S2,
+        sigma_z_m=None,
+        dt_s=DT_S,
+        input=None,
+        clock_offset_s=None if request.position is None else request.clock_offset_s,
         start_s=analysis.segment.start_s,
         end_s=analysis.segment.end_s,
         heading_deg=heading_deg,

@@ -28,7 +28,7 @@ const Engine = (() => {
     const velocity = interp(edges, imu.time, axis.integral);
     const gap = interp(edges, imu.gapEdges, imu.gapSum);
     const n = edges.length - 1, mean = new Float64Array(n), gapFraction = mean.slice();
-    const clip = (t) => clamp(t, ...imu.span);
+    const clip = (t) => clamp(t, imu.time[0], imu.time.at(-1));
     for (let i = 0; i < n; i++) {
       const length = edges[i + 1] - edges[i];
       mean[i] = (velocity[i + 1] - velocity[i]) / length;
