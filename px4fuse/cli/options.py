@@ -21,7 +21,12 @@ from msgspec import Struct, structs
 from px4fuse.batch import LOG_ANALYSIS_TIMEOUT_S
 from px4fuse.cli.outputs import OPENS_OUTPUT_KEY
 from px4fuse.core.input_files import add_input
-from px4fuse.core.reading import max_log_bytes, read_log_bytes, read_text
+from px4fuse.core.reading import (
+    max_log_bytes,
+    read_log_bytes,
+    read_text,
+    split_path_and_part,
+)
 from px4fuse.core.text import replace_unencodable
 from px4fuse.core.units import UNIT_NAMES, convert_to_unit
 from px4fuse.errors import SettingsError
@@ -64,8 +69,7 @@ class InputPath(NonEmptyPath):
 
     def convert(self, value: Any, param: Any, ctx: Any) -> Any:
         path = super().convert(value, param, ctx)
-        file, separator, _ = str(path).rpartition(":")
-        add_input(Path(file) if separator and not Path(path).exists() else Path(path))
+        add_input(split_path_and_part(str(path))[0])
         return path
 
 

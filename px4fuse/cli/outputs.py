@@ -179,19 +179,18 @@ def _get_student_name_and_id(results: Results) -> tuple[str, str]:
 
 
 def choose_web_page_path(output: Path | None, default: Path) -> Path:
-    """Return the path of a web page (value of -o, or the default), and check it.
+    """Return the path of a web page: the value of -o, or the default.
 
     Raises
     ------
     OutputError
-        The name does not end in .html or .htm, or the path cannot be written.
+        The name does not end in .html or .htm.
     """
     page_path = output or default
     if page_path.suffix.lower() not in (".html", ".htm") and page_path != STANDARD_OUTPUT:
         raise OutputError(
             f"{page_path}: the output is a web page. Give a name ending in .html (-o)."
         )
-    check_output_paths([page_path])
     return page_path
 
 
