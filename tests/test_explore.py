@@ -237,7 +237,7 @@ def test_explore_page_zoom_buttons_set_time_axis_of_all_plots(page: Browser) -> 
     assert 0.0 < low < high
     points = ask(
         page,
-        "Explore.then((e) => Array.from(e.model('sigma_p:steps-source').data.t.slice(0, 2)))",
+        "Explore.then((e) => Array.from(e.model('sigma_p:kf-source').data.t.slice(0, 2)))",
     )
     assert low - 1.0 < points[0] <= low
     page.click("#later")
@@ -263,8 +263,8 @@ def test_explore_page_tooltips_show_values(page: Browser) -> None:
         ".concat(all(node.shadowRoot)) : []);"
         "return all(document.body).join(' '); })()"
     )
-    assert re.search(r"KF: *-?[\d.]+ m", tooltips.replace("EKF2", ""))
-    assert re.search(r"EKF2: *-?[\d.]+ m", tooltips)
+    assert re.search(r"KF: *-?\d+\.\d+", tooltips.replace("EKF2", ""))
+    assert re.search(r"EKF2: *-?\d+\.\d+", tooltips)
 
 
 def test_explore_page_shows_markup_in_log_name_as_text(browser: Browser, tmp_path: Path) -> None:

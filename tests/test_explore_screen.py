@@ -189,10 +189,10 @@ def test_explore_page_ekf2_curves_equal_logged_values(
     result = explored[1].main
     state, variance = result.ekf2_state.dropna(), result.ekf2_variance.dropna()
     for view, name, column, logged in (
-        ("track", "position:state", "p", state["position_m"]),
-        ("speed", "velocity:state", "v", state["velocity_m_s"]),
-        ("sigma", "sigma_p:variance", "sp", variance["position_variance_m2"].pow(0.5)),
-        ("sigma", "sigma_v:variance", "sv", variance["velocity_variance_m2_s2"].pow(0.5)),
+        ("track", "position:ekf2", "p", state["position_m"]),
+        ("speed", "velocity:ekf2", "v", state["velocity_m_s"]),
+        ("sigma", "sigma_p:ekf2", "sp", variance["position_variance_m2"].pow(0.5)),
+        ("sigma", "sigma_v:ekf2", "sv", variance["velocity_variance_m2_s2"].pow(0.5)),
     ):
         open_view(page, view)
         data = f"e.model('{name}-source').data"

@@ -1,11 +1,13 @@
 """Data of one flight for the interactive web page of ``px4fuse explore``."""
 
+from collections.abc import Iterable
 from dataclasses import asdict
 from typing import Any
 
 import msgspec
 import numpy as np
 import pandas as pd
+from numpy.typing import ArrayLike
 from scipy import stats
 
 from px4fuse.analysis import Analysis
@@ -154,11 +156,17 @@ def _make_ekf2_data(
 ) -> PageData | str:
     if isinstance(result.ekf2_state, Unavailable):
         return result.ekf2_state.reason
-    state = result.ekf2_state.dropna()
-    summary = result.filters["ekf2"]
+    state, summary = result.ekf2_state.dropna(), result.filters["ekf2"]
+    state_columns = [state["position_m"], state["velocity_m_s"]]
+    if isinstance(result.ekf2_variance, pd.DataFrame):
+        sigma = result.ekf2_variance.dropna().pow(0.5)
+        state_columns += [
+            np.interp(state.index, sigma.index, sigma[name])
+            for name in ("position_variance_m2", "velocity_variance_m2_s2")
+            if len(sigma)
+        ]
     ekf2_data: PageData = {
-        "state": _pack_table(state, ["position_m", "velocity_m_s"], encoder),
-        "variance": [],
+        "state": _pack_series(state.index, state_columns, encoder),
         "innovations": [],
         "summary": {
             "outside": getattr(summary, "fraction_outside_two_sigma", None),
@@ -166,23 +174,17 @@ def _make_ekf2_data(
         },
         "r": None,
     }
-    if isinstance(result.ekf2_variance, pd.DataFrame):
-        sigma = result.ekf2_variance.dropna().pow(0.5)
-        ekf2_data["variance"] = _pack_table(
-            sigma, ["position_variance_m2", "velocity_variance_m2_s2"], encoder
-        )
     if isinstance(result.ekf2_innovations, pd.DataFrame):
         innovations = result.ekf2_innovations
-        valid_rows = innovations[
+        rows = innovations[
             np.isfinite(innovations["innovation_m"]) & (innovations["innovation_variance_m2"] > 0)
         ]
-        drawn_innovations = valid_rows.assign(
-            rejected=(valid_rows["rejected"] > 0).astype(float),
-            sigma=np.sqrt(valid_rows["innovation_variance_m2"]),
-        )
-        ekf2_data["innovations"] = _pack_table(
-            drawn_innovations, ["innovation_m", "sigma", "rejected"], encoder
-        )
+        columns = [
+            rows["innovation_m"],
+            np.sqrt(rows["innovation_variance_m2"]),
+            rows["rejected"] > 0,
+        ]
+        ekf2_data["innovations"] = _pack_series(rows.index, columns, encoder)
         variance_m2 = innovations["observation_variance_m2"].dropna()
         ekf2_data["r"] = float(np.sqrt(variance_m2.median())) if len(variance_m2) else None
     return ekf2_data
@@ -191,21 +193,21 @@ def _make_ekf2_data(
 def _make_truth_data(result: AxisComparison, encoder: ArrayEncoder) -> PageData | str:
     if isinstance(result.truth, Unavailable):
         return result.truth.reason
-    position = result.truth[["position_m"]].dropna()
-    velocity = result.truth[["velocity_m_s"]].dropna()
+    position_m, velocity_m_s = (
+        result.truth[name].dropna() for name in ("position_m", "velocity_m_s")
+    )
     return {
-        "p": _pack_table(position, ["position_m"], encoder),
-        "v": _pack_table(velocity, ["velocity_m_s"], encoder) if len(velocity) else None,
+        "p": _pack_series(position_m.index, [position_m], encoder),
+        "v": _pack_series(velocity_m_s.index, [velocity_m_s], encoder),
     }
 
 
-def _pack_table(
-    table: pd.DataFrame, columns: list[str], encoder: ArrayEncoder
+def _pack_series(
+    time_s: ArrayLike, columns: Iterable[ArrayLike], encoder: ArrayEncoder
 ) -> list[dict[str, int]]:
-    values = [
-        encoder.add(table[column].to_numpy(), DRAWN_VALUE_STEPS_PER_UNIT) for column in columns
-    ]
-    return [encoder.add_times(table.index.to_numpy()), *values]
+    """Encode times and columns that the page only draws or averages."""
+    values = [encoder.add(np.asarray(column), DRAWN_VALUE_STEPS_PER_UNIT) for column in columns]
+    return [encoder.add_times(np.asarray(time_s)), *values]
 
 
 def _collect_estimated_noises(analysis: Analysis) -> PageData:

@@ -27,14 +27,15 @@ BOKEH_SOURCE_COLUMNS = (
     "k0 k1 "  # KF gain: k0 of position, k1 of velocity (1/s)
     "e minus plus "  # e: position error (m); minus, plus: limits (m) of its 2σ band
     "x y marker "  # x: innovation ÷ √S; y: drawn value; marker: arrow head outside the plot
-    "z "  # z: measured position (m)
     "row left right"  # row of the event plot; left, right: start and end (s) of the event
 )
-LINE_STYLES: dict[str, BokehStyle] = {
-    "kf": {"line_width": 1.6, "line_color": KF_COLOUR},
-    "dotted": {"line_width": 1.6, "line_color": KF_COLOUR, "line_dash": [2, 2]},
-    "ekf2": {"line_width": 1.6, "line_color": EKF2_COLOUR, "line_dash": [6, 3]},
-    "truth": {"line_width": 1.2, "line_color": TRUTH_COLOUR, "line_dash": [1, 3]},
+KF_LINE_STYLE: BokehStyle = {"line_width": 1.6, "line_color": KF_COLOUR}
+# Style and name in the tooltip of each line, by its data source
+LINE_STYLES: dict[str, tuple[BokehStyle, str]] = {
+    "kf": (KF_LINE_STYLE, "KF"),
+    "gain": (KF_LINE_STYLE, "KF"),
+    "ekf2": ({"line_width": 1.6, "line_color": EKF2_COLOUR, "line_dash": [6, 3]}, "EKF2"),
+    "truth": ({"line_width": 1.2, "line_color": TRUTH_COLOUR, "line_dash": [1, 3]}, "ground truth"),
 }
 KF_BAND_STYLE: BokehStyle = {"fill_color": KF_COLOUR, "fill_alpha": 0.25}
 # Limit (±) of innovation ÷ √S for 95 % of the innovations of a consistent filter
@@ -48,17 +49,11 @@ EVENT_LEFT_MARGIN_PIXELS = 82
 
 
 class Plot(Record):
-    """Plot of several quantities over time.
+    """Plot of one column of several data sources (keys of :data:`LINE_STYLES`) over time."""
 
-    Attributes
-    ----------
-    line_definitions : tuple of (str, str, str, str)
-        Data source, column, key of :data:`LINE_STYLES`, and label in the tooltip of each line.
-    """
-
-    line_definitions: tuple[tuple[str, str, str, str], ...]
+    column: str
+    lines: tuple[str, ...] = ()
     scale: Literal["linear", "log"] = "linear"
-    unit: str = ""
 
 
 class PageTab(Record):
@@ -115,20 +110,19 @@ def _make_plot(name: str, plot: Plot, data: PageData, shared_time_range: Range1d
         min_border_left=EVENT_LEFT_MARGIN_PIXELS if name == "position" else LEFT_MARGIN_PIXELS,
     )
     if name == "position":
-        _draw_dots(plot_figure, get_source("measured"), "t z", 3, fill_color=MEASUREMENT_COLOUR)
+        _draw_dots(plot_figure, get_source("measured"), "t p", 3, fill_color=MEASUREMENT_COLOUR)
     if name == "innovation":
         _draw_innovations(plot_figure, get_source, with_ekf2=_has_track(data, "ekf2"))
     if name == "error":
-        plot_figure.varea("t", "minus", "plus", source=get_source("error"), **KF_BAND_STYLE)
+        plot_figure.varea("t", "minus", "plus", source=get_source("kf"), **KF_BAND_STYLE)
     line_renderers: list[Any] = []
-    for source_name, column, style_name, label in plot.line_definitions:
-        if style_name in ("ekf2", "truth") and not _has_track(data, style_name):
+    for line in plot.lines:
+        if line in ("ekf2", "truth") and not _has_track(data, line):
             continue
-        line_renderer = plot_figure.line(
-            "t", column, source=get_source(source_name), **LINE_STYLES[style_name]
-        )
-        line_renderers.append(line_renderer)
-        _add_hover(plot_figure, line_renderer, label, f"@{column}{{0.000}} {plot.unit}")
+        style, label = LINE_STYLES[line]
+        renderer = plot_figure.line("t", plot.column, source=get_source(line), **style)
+        line_renderers.append(renderer)
+        _add_hover(plot_figure, renderer, label, f"@{plot.column}{{0.000}}")
     if name == "error":  # scale the axis without the 2σ band, which is very wide at the start
         plot_figure.y_range.renderers = line_renderers
     for start_s, end_s in data["events"]["gap"]:
@@ -253,7 +247,7 @@ def _make_phase_plot() -> Any:
         )
     )
     before, now, mean = map(_make_data_source, ("before", "now", "mean"))
-    plot_figure.line("p", "v", source=before, **LINE_STYLES["kf"] | {"line_dash": [6, 3]})
-    plot_figure.patch("p", "v", source=now, **LINE_STYLES["kf"] | KF_BAND_STYLE)
+    plot_figure.line("p", "v", source=before, line_dash=[6, 3], **KF_LINE_STYLE)
+    plot_figure.patch("p", "v", source=now, **KF_LINE_STYLE, **KF_BAND_STYLE)
     _draw_dots(plot_figure, mean, "p v", 7, fill_color=KF_COLOUR)
     return plot_figure

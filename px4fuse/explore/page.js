@@ -100,32 +100,26 @@ const Explore = (async () => {
   const model = (name) => Bokeh.documents[0].get_model_by_name(name);
   const setSource = (name, data) => { model(`${name}-source`).data = data; };
   /* Draw columns, reduced to MAX_POINTS, in each visible plot with this source */
-  function drawSource(name, columns, keys) {
-    for (const { id } of queryAll(`.plot[data-view=${view}] > div`)) {
+  function drawSource(name, columns) {
+    for (const { id, dataset } of queryAll(`.plot[data-view=${view}] > div`)) {
       const source = model(`${id}:${name}-source`);
-      if (source) source.data = decimate(columns, keys);
+      if (source) source.data = decimate(columns, columns[dataset.column]);
     }
   }
   const timeRange = model("time");
   const figures = queryAll(".plot > div").map(({ id }) => model(id));
-  /* Rows within the visible time range; of long series only minimum and maximum of `keys` in each time bin */
-  function decimate(columns, keys) {
+  /* Rows within the visible time range; of long series only minimum and maximum of `y` in each time bin */
+  function decimate(columns, y) {
     const t = columns.t, n = t.length;
     const from = Math.max(t.findIndex((time) => time >= timeRange.start) - 1, 0);
     const last = t.findIndex((time) => time >= timeRange.end), to = last < 0 ? n : Math.min(last + 2, n);
     const mapColumns = (select) => Object.fromEntries(Object.entries(columns).map(([name, column]) => [name, select(column)]));
     if (to - from <= MAX_POINTS) return mapColumns((column) => column.slice(from, to));
-    const bins = Math.floor(MAX_POINTS / 2 / keys.length), indices = [];
-    for (let b = 0; b < bins; b++) {
-      const low = from + Math.floor((to - from) * b / bins);
-      const high = from + Math.floor((to - from) * (b + 1) / bins), extremes = new Set();
-      for (const key of keys) {
-        const y = columns[key];
-        let least = low, most = low;
-        for (let i = low; i < high; i++) { if (y[i] < y[least]) least = i; if (y[i] > y[most]) most = i; }
-        extremes.add(least).add(most);
-      }
-      indices.push(...[...extremes].sort((a, b) => a - b));
+    const bins = MAX_POINTS / 2, edge = (bin) => from + Math.floor((to - from) * bin / bins), indices = [];
+    for (let bin = 0; bin < bins; bin++) {
+      let least = edge(bin), most = least;
+      for (let i = least; i < edge(bin + 1); i++) { if (y[i] < y[least]) least = i; if (y[i] > y[most]) most = i; }
+      indices.push(Math.min(least, most), Math.max(least, most));
     }
     return mapColumns((column) => indices.map((i) => column[i]));
   }
@@ -195,63 +189,54 @@ const Explore = (async () => {
   }
 
   // ------------------------------------------------------------------ plots over time
-  const table = (names, columns) => Object.fromEntries(
-    names.map((name, i) => [name, columns[i] ?? []]));
+  // times and values of an empty series
+  const NO_POINTS = [[], []];
   /* Innovations ÷ √S for the plot; those outside the plot are arrow heads at its edge */
   function innovationRows(t, nu, sigma, marker) {
     const edge = 0.95 * model("innovation").y_range.end, x = Array.from(nu, (value, i) => value / sigma[i]);
     return { t, x, y: x.map((value) => clamp(value, -edge, edge)),
       marker: x.map((value) => value > edge ? "triangle" : value < -edge ? "inverted_triangle" : marker) };
   }
-  function drawKf({ run, axis }) {
-    const { steps, updates } = run;
-    const n = steps.time.length, m = updates.nu.length;
-    const sawtooth = table(["t", "p", "v", "sp", "sv"], Array.from({ length: 5 }, () => new Float64Array(n + m)));
-    let row = 0;
-    const add = (step, { p, v, p00, p11 }, i) => {
-      sawtooth.t[row] = steps.time[step]; sawtooth.p[row] = p[i]; sawtooth.v[row] = v[i];
-      sawtooth.sp[row] = Math.sqrt(p00[i]); sawtooth.sv[row++] = Math.sqrt(p11[i]);
-    };
-    for (let i = 0, u = 0; i < n; i++) {
-      // the state before the update is an additional row
-      if (u < m && updates.step[u] === i) add(i, updates, u++);
-      add(i, steps, i);
-    }
-    drawSource("steps", sawtooth, ["p", "sp"]);
-    drawSource("updates", { t: updates.time, k0: updates.k0, k1: updates.k1 }, ["k0"]);
-    drawSource("innovations", innovationRows(updates.time, updates.nu, updates.s.map(Math.sqrt), "circle"), ["x"]);
-    drawSource("measured", { t: axis.time.map((t) => t + settings.clock_offset_s), z: axis.z }, ["z"]);
-    const expected = reference(axis, steps.time);
-    if (expected !== null) {
-      const e = steps.p.map((p, i) => p - expected[i]), plus = steps.p00.map((x) => 2 * Math.sqrt(x));
-      drawSource("error", { t: steps.time, e, plus, minus: plus.map((x) => -x) }, ["e", "plus"]);
-    }
+  /* Differences of positions to those of a reference [times, positions] */
+  function errors(t, p, reference) {
+    const expected = Engine.interp(t, ...reference, NaN);
+    return p.map((position, i) => position - expected[i]);
   }
-  /* Position of ground truth at these times; without ground truth that of EKF2; null without both */
-  function reference(axis, times) {
-    if (!isText(axis.truth)) return Engine.interp(times, ...axis.truth.p, NaN);
-    return isText(axis.ekf2) ? null : Engine.interp(times, ...axis.ekf2.state.slice(0, 2), NaN);
+  function drawKf({ run: { steps, updates }, axis: { ekf2, truth, time, z } }) {
+    const rows = { t: [], p: [], v: [], sp: [], sv: [] };
+    const add = (t, { p, v, p00, p11 }, i) => {
+      rows.t.push(t);
+      rows.p.push(p[i]);
+      rows.v.push(v[i]);
+      rows.sp.push(Math.sqrt(p00[i]));
+      rows.sv.push(Math.sqrt(p11[i]));
+    };
+    for (let i = 0, u = 0; i < steps.time.length; i++) {
+      // the state before the update is an additional row
+      if (updates.step[u] === i) add(steps.time[i], updates, u++);
+      add(steps.time[i], steps, i);
+    }
+    const reference = !isText(truth) ? truth.p : isText(ekf2) ? NO_POINTS : ekf2.state.slice(0, 2);
+    const plus = rows.sp.map((sigma) => 2 * sigma), minus = plus.map((x) => -x);
+    drawSource("kf", { ...rows, plus, minus, e: errors(rows.t, rows.p, reference) });
+    drawSource("gain", { t: updates.time, k0: updates.k0, k1: updates.k1 });
+    drawSource("innovations", innovationRows(updates.time, updates.nu, updates.s.map(Math.sqrt), "circle"));
+    drawSource("measured", { t: time.map((t) => t + settings.clock_offset_s), p: z });
   }
   /* Draw EKF2 and ground truth */
   function drawReferences({ ekf2, truth }) {
     if (!isText(ekf2)) {
-      drawSource("state", table(["t", "p", "v"], ekf2.state), ["p", "v"]);
-      drawSource("variance", table(["t", "sp", "sv"], ekf2.variance), ["sp", "sv"]);
-      const [t = [], nu = [], sigma = [], rejected] = ekf2.innovations;
+      const [t, p, v, sp, sv] = ekf2.state, e = errors(t, p, isText(truth) ? NO_POINTS : truth.p);
+      drawSource("ekf2", { t, p, v, e, ...sp && { sp, sv } });
+      const [time = [], nu = [], sigma = [], rejected] = ekf2.innovations;
       for (const [name, flag] of [["fused", 0], ["rejected", 1]]) {
-        const columns = [t, nu, sigma].map((values) => values.filter((_, i) => rejected[i] === flag));
-        drawSource(name, innovationRows(...columns, "square"), ["x"]);
+        const columns = [time, nu, sigma].map((values) => values.filter((_, i) => rejected[i] === flag));
+        drawSource(name, innovationRows(...columns, "square"));
       }
     }
-    if (!isText(truth)) {
-      const { p, v } = truth;
-      drawSource("truth_p", { t: p[0], p: p[1] }, ["p"]);
-      if (v !== null) drawSource("truth_v", { t: v[0], v: v[1] }, ["v"]);
-      if (!isText(ekf2)) {
-        const [t, position] = ekf2.state, expected = Engine.interp(t, ...p, NaN);
-        drawSource("error_ekf2", { t, e: position.map((x, i) => x - expected[i]) }, ["e"]);
-      }
-    }
+    if (isText(truth)) return;
+    const [t, p] = truth.p;
+    drawSource("truth", { t, p, v: Engine.interp(t, ...truth.v, NaN) });
   }
   function drawEvents({ ekf2 }) {
     const { events } = flight, minWidth = (lastTime - firstTime) / 800, widen = (t) => [t, t + minWidth];
@@ -275,7 +260,6 @@ const Explore = (async () => {
     const both = (name, format) => [["KF", kf?.[name]], ["EKF2", ekf2[name]]]
       .flatMap(([filter, value]) => value ? [`${filter} ${format(value)}`] : []).join(", ");
     title("innovation", `innovations outside ±2√S (expected 5 %): ${both("outside", (x) => `${(100 * x).toFixed(0)} %`)}`);
-    title("gain", "KF: position gain (solid), velocity gain (dotted, 1/s)");
     const rms = isText(axis.truth) ? `KF − EKF2, RMS ${both("differenceRms", Card.formatMetres)}`
       : `against ground truth, RMSE ${both("rmse", Card.formatMetres)}`;
     title("error", `${rms} · shaded: ±2σ reported by KF, hatched: gap in the position source`);

@@ -110,6 +110,7 @@ def make_page_html(
         made_with=f"px4fuse {version('px4fuse')}",
         choices=choices,
         tabs=PAGE_LAYOUT.tabs,
+        plots=PAGE_LAYOUT.plots,
         axis_names=[axis["name"] for axis in data["axes"]],
         has_truth_or_ekf2=has_truth_or_ekf2(data),
         **fields,
