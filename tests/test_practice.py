@@ -47,20 +47,22 @@ def test_practice_flights_contain_each_fault_equally_often(
     rounds = choose_random_flights(seed, level, count)
     assert choose_random_flights(seed, level, count) == rounds
     assert len(rounds) == count
-    first = Counter(one.faults[0].choice if one.faults else "nothing" for one in rounds)
+    first = Counter(
+        one.faults_and_sizes[0][0].choice if one.faults_and_sizes else "nothing" for one in rounds
+    )
     assert max(first.values()) - min(first[name] for name in QUIZ_ANSWERS) <= 1
     for one in rounds:
         assert set(one.correct_answers) <= set(QUIZ_ANSWERS)
-        assert len(one.correct_answers) == max(len(one.faults), 1)
-        assert len(one.faults) <= (2 if level == 3 else 1)
-        for mistake, size in zip(one.faults, one.fault_sizes, strict=True):
+        assert len(one.correct_answers) == max(len(one.faults_and_sizes), 1)
+        assert len(one.faults_and_sizes) <= (2 if level == 3 else 1)
+        for mistake, size in one.faults_and_sizes:
             assert size.removeprefix("-") == mistake.sizes[level - 1]
             assert mistake.has_random_sign or not size.startswith("-")
 
 
 def test_practice_level_3_has_some_flights_with_two_faults() -> None:
     rounds = [one for seed in range(5) for one in choose_random_flights(seed, 3, 12)]
-    two = sum(len(one.faults) == 2 for one in rounds)
+    two = sum(len(one.faults_and_sizes) == 2 for one in rounds)
     assert 0.15 * len(rounds) < two < 0.5 * len(rounds)
 
 
@@ -185,7 +187,7 @@ def test_too_small_ekf2_gate_rejects_consistent_innovations(level: int, seed: in
 @pytest.fixture(scope="module")
 def quiz(tmp_path_factory: pytest.TempPathFactory) -> Path:
     file = tmp_path_factory.mktemp("practice") / "quiz.html"
-    file.write_bytes(practice.make_practice_page(SEED, 1, COUNT).encode())
+    file.write_bytes(practice.make_practice_page(SEED, 1, COUNT, lambda *_: None).encode())
     return file
 
 

@@ -102,12 +102,11 @@ class QuizFlight:
     """Simulated flight of the quiz, with its injected faults and their sizes."""
 
     scenario: Scenario
-    faults: tuple[QuizFault, ...]
-    fault_sizes: tuple[str, ...]
+    faults_and_sizes: tuple[tuple[QuizFault, str], ...]
 
     @property
     def correct_answers(self) -> list[str]:
-        return sorted({fault.choice for fault in self.faults}) or ["nothing"]
+        return sorted({fault.choice for fault, _ in self.faults_and_sizes}) or ["nothing"]
 
 
 def choose_random_flights(seed: int, level: int, count: int) -> tuple[QuizFlight, ...]:
@@ -139,12 +138,13 @@ def _draw_flight(rng: np.random.Generator, right_answer: str, level: int) -> Qui
         faults += draw_one_fault(
             [fault for fault, pair in faults_and_answers if pair in COMBINABLE_ANSWER_PAIRS]
         )
-    fault_sizes, sigma_uwb_m = [], SIGMA_Z_M
+    faults_and_sizes, sigma_uwb_m = [], SIGMA_Z_M
     for fault in faults:
         sign = "-" if fault.has_random_sign and rng.random() < 0.5 else ""
-        fault_sizes.append(f"{sign}{fault.sizes[level - 1]}")
+        size = f"{sign}{fault.sizes[level - 1]}"
+        faults_and_sizes.append((fault, size))
         if fault.name == NOISY_UWB_FAULT:
-            sigma_uwb_m = float(fault_sizes[-1])
+            sigma_uwb_m = float(size)
     scenario = Scenario(
         **SCENARIO_SETTINGS,
         length_m=round(float(rng.uniform(*AISLE_LENGTH_RANGE_M)), 1),
@@ -152,14 +152,11 @@ def _draw_flight(rng: np.random.Generator, right_answer: str, level: int) -> Qui
         sigma_uwb_m=sigma_uwb_m,
         seed=int(rng.integers(MAX_SEED)),
     )
-    return QuizFlight(scenario, tuple(faults), tuple(fault_sizes))
+    return QuizFlight(scenario, tuple(faults_and_sizes))
 
 
 def make_practice_page(
-    seed: int,
-    level: int,
-    count: int,
-    progress: Callable[[str, int, int], None] = lambda *_: None,
+    seed: int, level: int, count: int, progress: Callable[[str, int, int], None]
 ) -> str:
     """Simulate and analyse ``count`` flights, and return the quiz page (HTML).
 
@@ -185,7 +182,7 @@ def make_practice_page(
 def _simulate_flight_data(
     practice_flight: QuizFlight, flight_index: int
 ) -> tuple[dict[str, Any], str]:
-    faults_and_sizes = [*zip(practice_flight.faults, practice_flight.fault_sizes, strict=True)]
+    faults_and_sizes = practice_flight.faults_and_sizes
     fault_options = [
         f"{fault.name}={size}" for fault, size in faults_and_sizes if fault.name != NOISY_UWB_FAULT
     ]
