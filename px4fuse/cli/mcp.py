@@ -164,10 +164,20 @@ def make_tools(folders: tuple[Path, ...]) -> list[tuple[Any, Any]]:
                 get_args(result_type) or (result_type,)
             )
             output_schema = {"type": "object", "anyOf": schemas, "$defs": definitions}
+        input_schema = {
+            "type": "object",
+            "properties": {key: _make_schema(parameter) for key, parameter in parameters.items()},
+            "required": [
+                key
+                for key, parameter in parameters.items()
+                if isinstance(parameter, click.Argument)
+            ],
+            "additionalProperties": False,
+        }
         tool = Tool(
             name=name,
             description=help_text(command_name) if parameters else "List the ids of all findings.",
-            input_schema=_make_input_schema(parameters),
+            input_schema=input_schema,
             output_schema=output_schema,
         )
         tools.append((tool, partial(_parse_arguments, command_name, parameters, folders)))
@@ -181,18 +191,6 @@ def _list_parameters(command_name: str) -> dict[str, click.Parameter]:
         for parameter in find_command(command_name).params
         if parameter.expose_value
         and (name := str(parameter.name)) not in PARAMETERS_WITHOUT_TOOL_ARGUMENT
-    }
-
-
-def _make_input_schema(parameters: Mapping[str, click.Parameter]) -> dict[str, Any]:
-    argument_names = [
-        name for name, parameter in parameters.items() if isinstance(parameter, click.Argument)
-    ]
-    return {
-        "type": "object",
-        "properties": {name: _make_schema(parameter) for name, parameter in parameters.items()},
-        "required": argument_names,
-        "additionalProperties": False,
     }
 
 

@@ -427,15 +427,9 @@ def read_student(option_values: dict[str, Any], log: Path) -> Student:
             f"Give the form of {log.name}, or make one with px4fuse answers {log.name}.",
         )
     name, student_id = (replace_unencodable(text or "") for text in (name, student_id))
-    student = Student(name, student_id, notes, answers)
-    _warn_missing_fonts(student.name + student.id + student.notes)
-    return student
+    if not (texts := name + student_id + notes).isascii():
+        from px4fuse.report.fonts import find_missing_characters, format_font_advice
 
-
-def _warn_missing_fonts(text: str) -> None:
-    if text.isascii():
-        return
-    from px4fuse.report.fonts import find_missing_characters, format_font_advice
-
-    if characters := find_missing_characters(text):
-        click.echo(f"px4fuse: {format_font_advice(characters)}", err=True)
+        if characters := find_missing_characters(texts):
+            click.echo(f"px4fuse: {format_font_advice(characters)}", err=True)
+    return Student(name, student_id, notes, answers)
