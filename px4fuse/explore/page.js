@@ -189,8 +189,6 @@ const Explore = (async () => {
   }
 
   // ------------------------------------------------------------------ plots over time
-  // times and values of an empty series
-  const NO_POINTS = [[], []];
   /* Innovations ÷ √S for the plot; those outside the plot are arrow heads at its edge */
   function innovationRows(t, nu, sigma, marker) {
     const edge = 0.95 * model("innovation").y_range.end, x = Array.from(nu, (value, i) => value / sigma[i]);
@@ -216,27 +214,25 @@ const Explore = (async () => {
       if (updates.step[u] === i) add(steps.time[i], updates, u++);
       add(steps.time[i], steps, i);
     }
-    const reference = !isText(truth) ? truth.p : isText(ekf2) ? NO_POINTS : ekf2.state.slice(0, 2);
+    const reference = !isText(truth) ? truth.p : isText(ekf2) ? [[], []] : ekf2.state.slice(0, 2);
     const plus = rows.sp.map((sigma) => 2 * sigma), minus = plus.map((x) => -x);
     drawSource("kf", { ...rows, plus, minus, e: errors(rows.t, rows.p, reference) });
     drawSource("gain", { t: updates.time, k0: updates.k0, k1: updates.k1 });
     drawSource("innovations", innovationRows(updates.time, updates.nu, updates.s.map(Math.sqrt), "circle"));
     drawSource("measured", { t: time.map((t) => t + settings.clock_offset_s), p: z });
   }
-  /* Draw EKF2 and ground truth */
-  function drawReferences({ ekf2, truth }) {
-    if (!isText(ekf2)) {
-      const [t, p, v, sp, sv] = ekf2.state, e = errors(t, p, isText(truth) ? NO_POINTS : truth.p);
-      drawSource("ekf2", { t, p, v, e, ...sp && { sp, sv } });
-      const [time = [], nu = [], sigma = [], rejected] = ekf2.innovations;
-      for (const [name, flag] of [["fused", 0], ["rejected", 1]]) {
-        const columns = [time, nu, sigma].map((values) => values.filter((_, i) => rejected[i] === flag));
-        drawSource(name, innovationRows(...columns, "square"));
-      }
+  /* Draw EKF2 and ground truth; missing data are drawn as empty or NaN */
+  function drawReferences(axis) {
+    const truth = isText(axis.truth) ? { p: [[], []], v: [[], []] } : axis.truth, [truthTime, truthP] = truth.p;
+    drawSource("truth", { t: truthTime, p: truthP, v: Engine.interp(truthTime, ...truth.v, NaN) });
+    const ekf2 = isText(axis.ekf2) ? { state: [[], [], []], innovations: [] } : axis.ekf2;
+    const [t, p, v, sp = p.map(() => NaN), sv = sp] = ekf2.state;
+    drawSource("ekf2", { t, p, v, sp, sv, e: errors(t, p, truth.p) });
+    const [time = [], nu = [], sigma = [], rejected] = ekf2.innovations;
+    for (const [name, flag] of [["fused", 0], ["rejected", 1]]) {
+      const columns = [time, nu, sigma].map((values) => values.filter((_, i) => rejected[i] === flag));
+      drawSource(name, innovationRows(...columns, "square"));
     }
-    if (isText(truth)) return;
-    const [t, p] = truth.p;
-    drawSource("truth", { t, p, v: Engine.interp(t, ...truth.v, NaN) });
   }
   function drawEvents({ ekf2 }) {
     const { events } = flight, minWidth = (lastTime - firstTime) / 800, widen = (t) => [t, t + minWidth];
@@ -258,7 +254,7 @@ const Explore = (async () => {
     };
     const ekf2 = isText(axis.ekf2) ? {} : axis.ekf2.summary;
     const both = (name, format) => [["KF", kf?.[name]], ["EKF2", ekf2[name]]]
-      .flatMap(([filter, value]) => value ? [`${filter} ${format(value)}`] : []).join(", ");
+      .filter(([, value]) => Number.isFinite(value)).map(([filter, value]) => `${filter} ${format(value)}`).join(", ");
     title("innovation", `innovations outside ±2√S (expected 5 %): ${both("outside", (x) => `${(100 * x).toFixed(0)} %`)}`);
     const rms = isText(axis.truth) ? `KF − EKF2, RMS ${both("differenceRms", Card.formatMetres)}`
       : `against ground truth, RMSE ${both("rmse", Card.formatMetres)}`;
