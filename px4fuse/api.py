@@ -182,15 +182,18 @@ def evaluate(
         A file cannot be read, the times do not overlap, the motion is too small for the alignment,
         or an RPE delta is not above zero.
     """
-    if not isinstance(estimate, Trajectory):
-        estimate = read_source(str(estimate)).trajectory
-    return evaluation.evaluate(estimate, _read_reference(reference), **options)
+    return evaluation.evaluate(
+        _read_trajectory(estimate), _read_trajectory(reference, default="truth"), **options
+    )
 
 
-def _read_reference(reference: Pathlike | Trajectory) -> Trajectory:
-    if isinstance(reference, Trajectory):
-        return reference
-    return read_source(str(reference), default="truth").trajectory
+def _read_trajectory(
+    source: Pathlike | Trajectory, default: Literal["truth"] | None = None
+) -> Trajectory:
+    """Read a trajectory; ``default`` is the track of a flight log."""
+    if isinstance(source, Trajectory):
+        return source
+    return read_source(str(source), default=default).trajectory
 
 
 def close_loop(
@@ -246,7 +249,7 @@ def close_loop(
         loop_source = LoopSource(source, None)
     else:
         loop_source = read_source(str(source), frame=frame)
-    reference_track = None if reference is None else _read_reference(reference)
+    reference_track = None if reference is None else _read_trajectory(reference, default="truth")
     return analyse(loop_source, request.LoopRequest(**request_fields), reference_track, progress)
 
 

@@ -120,7 +120,6 @@ class Browser:
     def open(self, path: Path, *, scripts: bool = True, width: int = 1400) -> None:
         self.call("Emulation.setScriptExecutionDisabled", value=not scripts)
         self._measure(width, 900)
-        self.scheme("")
         self.events.clear()
         self.call("Page.navigate", url=path.as_uri())
         while not any(event["method"] == "Page.loadEventFired" for event in self.events):
@@ -150,11 +149,6 @@ class Browser:
         )
         assert "exceptionDetails" not in answer, answer
         return answer["result"].get("value")
-
-    def scheme(self, name: str) -> None:
-        """Set the preferred colour scheme, "light" or "dark"; "" for the default."""
-        features = [{"name": "prefers-color-scheme", "value": name}] if name else []
-        self.call("Emulation.setEmulatedMedia", features=features)
 
     def click(self, selector: str) -> None:
         """Click at the position of an element, so that a covered or hidden one fails."""
@@ -190,7 +184,7 @@ class Browser:
         """Return the names in the rows of the table."""
         return list(
             self.ask(
-                "[...document.querySelectorAll('.list > tbody > tr[data-row] .name')]"
+                "[...document.querySelectorAll('.list > tbody > tr:not(.more) .name')]"
                 ".map((name) => name.textContent)"
             )
         )

@@ -39,11 +39,9 @@ def page(browser: Browser, explored: tuple[Path, Analysis]) -> Iterator[Browser]
     assert browser.requests() <= {"file", "data", "blob"}
 
 
-def show(browser: Browser, file: Path, at: str = "", width: int = 1400) -> Browser:
+def show(browser: Browser, file: Path, width: int = 1400) -> Browser:
     browser.open(file, width=width)
-    if at:
-        browser.ask(f"location.hash = {json.dumps(at)}")
-    ready = "document.querySelector('#table tbody tr') !== null"
+    ready = "document.querySelector('#span').textContent !== ''"
     end = time.monotonic() + 30.0
     while not browser.ask(ready):
         assert time.monotonic() < end, browser.complaints()

@@ -12,7 +12,6 @@ from cli_tools import contents, run_main
 from conftest import LOG
 
 posix = pytest.mark.skipif(os.name == "nt", reason="folders in use and limits are those of POSIX")
-linux = pytest.mark.skipif(sys.platform != "linux", reason="only Linux has the limit")
 
 
 def started(
@@ -70,17 +69,6 @@ def test_command_in_deleted_folder_reports_missing_folder(tmp_path, command) -> 
     code, out, err = started(command.format(log=LOG), before='rmdir "$PWD";', folder=gone)
     said = "px4fuse: the current folder no longer exists; nothing was written. "
     assert (code, out, err) == (2, "", f"{said}Change to an existing folder.\n")
-
-
-@linux
-def test_command_under_small_memory_limit_reports_the_limit(tmp_path) -> None:
-    for command in (f"compare {LOG} -o r.pdf", f"explore {LOG} -o r.html", f"info {LOG}"):
-        code, out, err = started(command, before="ulimit -v 400000;", folder=tmp_path)
-        assert (code, out) == (2, "")
-        assert err.startswith("px4fuse: px4fuse needs 800 MB of address space; the limit is 410 MB")
-        assert len(err.splitlines()) == 1
-    assert started("--help", before="ulimit -v 400000;", folder=tmp_path)[0] == 0
-    assert contents(tmp_path) == {}
 
 
 def test_command_out_of_memory_prints_one_error_line(monkeypatch, capsys, tmp_path) -> None:

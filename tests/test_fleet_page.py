@@ -163,7 +163,7 @@ def test_batch_page_sorts_filters_and_opens_rows(page: Browser) -> None:
     }
     assert page.names()[:3] == sorted(ratios, key=lambda name: ratios[name])[:3]
     # a ratio beyond the axis is a triangle at its end
-    mark = "document.querySelector('td.ratio.truth svg path').getAttribute('d')"
+    mark = "document.querySelector('td.k-ratio.truth svg path').getAttribute('d')"
     assert page.ask(mark) == MARKER_SVG_PATHS["above"]
     assert "flight%20" in page.ask("document.querySelector('.more a').href")
     page.choose("#filter-1", "status:failed")
@@ -202,14 +202,10 @@ def test_batch_page_of_5000_logs_shows_100_rows(browser: Browser, tmp_path: Path
     browser.write("v1.14")
     assert browser.ask(rows) == MAX_PAGE_ROWS
     browser.click("#all")
-    # the keys n and p go to the next page and back
-    browser.click(".list > tbody > tr:last-child .name")
-    name = browser.names()[-1]
-    browser.press("n", "n")
-    assert browser.ask("document.querySelector('#place').textContent") == "Logs 101 to 200 of 5000"
-    browser.press("p", "p")
-    assert browser.ask("document.querySelector('tr.open .name').textContent") == name
-    assert browser.ask(rows) == MAX_PAGE_ROWS + 1
+    browser.click("#more")
+    assert browser.ask(rows) == 2 * MAX_PAGE_ROWS
+    browser.click("tbody tr:last-child .name")
+    assert browser.ask(rows) == 2 * MAX_PAGE_ROWS + 1
     assert browser.complaints() == []
     assert browser.requests() <= {"file", "data"}
 
@@ -221,12 +217,9 @@ def test_batch_page_without_javascript_shows_a_note(browser: Browser, tmp_path: 
     assert "Enable JavaScript to show the logs. fleet.csv contains the table of all logs." in text
 
 
-@pytest.mark.parametrize(("scheme", "width"), [("light", 360), ("dark", 1400)])
-def test_batch_page_has_no_serious_accessibility_violation(
-    page: Browser, scheme: str, width: int
-) -> None:
+@pytest.mark.parametrize("width", [360, 1400])
+def test_batch_page_has_no_serious_accessibility_violation(page: Browser, width: int) -> None:
     page.resize(width, 800)
-    page.scheme(scheme)
     page.click("tbody tr:nth-child(3) .name")
     assert page.ask("document.documentElement.scrollWidth") <= width
     page.ask(axe())

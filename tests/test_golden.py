@@ -180,7 +180,7 @@ def test_mcp_session_in_docs_equals_current_server_answers(
     parsers = {tool.name: parse for tool, parse in make_tools((SAMPLES,))}
 
     def with_answer(call: re.Match[str]) -> str:
-        words, _ = parsers[call[1]](json.loads(call[2]))
+        words = parsers[call[1]](json.loads(call[2]))
         answer, _ = copy_context().run(run_command, (SAMPLES,), 10**9, None, None, words)
         lines = [line.rstrip() for line in answer.strip().splitlines()]
         return "\n".join([f"> {call[1]} {call[2]}", *lines, "```"])

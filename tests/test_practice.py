@@ -47,20 +47,22 @@ def test_practice_flights_contain_each_fault_equally_often(
     rounds = choose_random_flights(seed, level, count)
     assert choose_random_flights(seed, level, count) == rounds
     assert len(rounds) == count
-    first = Counter(one.faults[0].choice if one.faults else "nothing" for one in rounds)
+    first = Counter(
+        one.faults_and_sizes[0][0].choice if one.faults_and_sizes else "nothing" for one in rounds
+    )
     assert max(first.values()) - min(first[name] for name in QUIZ_ANSWERS) <= 1
     for one in rounds:
         assert set(one.correct_answers) <= set(QUIZ_ANSWERS)
-        assert len(one.correct_answers) == max(len(one.faults), 1)
-        assert len(one.faults) <= (2 if level == 3 else 1)
-        for mistake, size in zip(one.faults, one.fault_sizes, strict=True):
+        assert len(one.correct_answers) == max(len(one.faults_and_sizes), 1)
+        assert len(one.faults_and_sizes) <= (2 if level == 3 else 1)
+        for mistake, size in one.faults_and_sizes:
             assert size.removeprefix("-") == mistake.sizes[level - 1]
             assert mistake.has_random_sign or not size.startswith("-")
 
 
 def test_practice_level_3_has_some_flights_with_two_faults() -> None:
     rounds = [one for seed in range(5) for one in choose_random_flights(seed, 3, 12)]
-    two = sum(len(one.faults) == 2 for one in rounds)
+    two = sum(len(one.faults_and_sizes) == 2 for one in rounds)
     assert 0.15 * len(rounds) < two < 0.5 * len(rounds)
 
 
@@ -185,7 +187,7 @@ def test_too_small_ekf2_gate_rejects_consistent_innovations(level: int, seed: in
 @pytest.fixture(scope="module")
 def quiz(tmp_path_factory: pytest.TempPathFactory) -> Path:
     file = tmp_path_factory.mktemp("practice") / "quiz.html"
-    file.write_bytes(practice.make_practice_page(SEED, 1, COUNT).encode())
+    file.write_bytes(practice.make_practice_page(SEED, 1, COUNT, lambda *_: None).encode())
     return file
 
 
@@ -204,7 +206,7 @@ def test_practice_page_html_source_does_not_show_solutions(quiz: Path) -> None:
         flight = json.loads(content)["flight"]
         assert flight.keys().isdisjoint({"findings", "summary", "card"})
         assert "mistake" not in content
-        assert "px4fuse compare 'flight" in flight["command"]["base"]
+        assert "px4fuse compare 'flight" in flight["command"]
     for one in answers:
         assert "px4fuse-card" in one["card"]
         # a flight with a fault is never called consistent
@@ -228,7 +230,7 @@ def renewed(page: Browser, button: str) -> None:
     while time.monotonic() < end:
         with contextlib.suppress(AssertionError):  # no page while it reloads
             if page.ask(
-                "window.before === undefined && document.querySelector('#table tbody tr') !== null"
+                "window.before === undefined && document.querySelector('#span').textContent !== ''"
                 " && document.getElementById('quiz-title').textContent !== ''"
             ):
                 break
@@ -264,21 +266,14 @@ def test_practice_page_scores_right_and_wrong_answers(browser: Browser, quiz: Pa
         if not key["mistakes"]:
             assert "no fault" in element_text(page, "quiz-solution")
         for mistake in key["mistakes"]:
-            assert (mistake["span"] is not None) == (key["right"] == ["source"])
+            assert (mistake["time"] != "whole flight") == (key["right"] == ["source"])
             for name in ("fault", "size", "time", "symptom"):
                 assert mistake[name] in element_text(page, "quiz-solution")
         assert f"Score: {points} of {number + 1} answered flights" in element_text(
             page, "quiz-score"
         )
-        for mistake in key["mistakes"]:
-            page.click("#quiz-solution button")
-            settle(page)
-            span = page.ask("document.getElementById('span').textContent")
-            low, high = (float(word) for word in span.removesuffix(" s").split(" s to "))
-            if mistake["span"] is not None:
-                assert low < mistake["span"][0] < high < low + 25.0
         # after the answer the page shows the card
-        assert page.ask("document.querySelector('#card [data-part=headline]').textContent")
+        assert page.ask("document.querySelector('#card h2').textContent")
         assert "RMSE" in element_text(page, "card")
         assert page.ask("[...document.querySelectorAll('[name=choice]')].every((b) => b.disabled)")
         if number < COUNT - 1:
@@ -290,20 +285,10 @@ def test_practice_page_scores_right_and_wrong_answers(browser: Browser, quiz: Pa
     assert page.ask("document.getElementById('quiz-next').hidden")
     assert page.complaints() == []
     assert page.requests() <= {"file", "data", "blob"}
-    renewed(page, "#quiz-again")
-    assert element_text(page, "quiz-title") == f"Flight 1 of {COUNT}: find the fault"
-    assert element_text(page, "quiz-score") == ""
 
 
 def test_practice_page_gives_half_a_point_for_half_an_answer(browser: Browser, quiz: Path) -> None:
-    page = show(browser, quiz)
-    for name in ("gate", "clock", "nothing"):
-        page.click(f"[name=choice][value={name}]")
-    chosen = "[...document.querySelectorAll('[name=choice]:checked')].map((b) => b.value)"
-    assert page.ask(chosen) == ["nothing"]
-    page.click("[name=choice][value=gate]")
-    assert page.ask(chosen) == ["gate"]
-    points = page.ask(
+    points = show(browser, quiz).ask(
         "['gate', 'clock gate', 'frame gate', 'clock'].map((answer) =>"
         "Practice.points(answer, {right: ['clock', 'gate']}))"
     )

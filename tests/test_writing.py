@@ -233,31 +233,6 @@ def test_stop_signal_while_writing_lists_the_written_files(desk, name, code) -> 
     assert names(desk) == ["c.tum", "l.ulg", "pipe", "s.tum"]
 
 
-# A finaliser in which the signal arrives; Python ignores exceptions of finalisers
-SIGNAL_IN_FINALISER = """
-import click, signal, sys, time
-from px4fuse.cli import main
-class Dying:
-    def __del__(self):
-        signal.raise_signal(signal.SIGTERM)
-def work(*_):
-    Dying()
-    time.sleep(60)
-click.Group.invoke = work
-sys.argv = ["px4fuse", "info"]
-main()
-"""
-
-
-@posix
-def test_stop_signal_in_python_finaliser_ends_the_command(tmp_path) -> None:
-    done = subprocess.run(
-        [sys.executable, "-c", SIGNAL_IN_FINALISER], capture_output=True, timeout=50, check=False
-    )
-    assert done.returncode == 143
-    assert done.stderr == b"px4fuse: interrupted; nothing was written.\n"
-
-
 def test_stop_signal_after_writing_lists_the_written_files(desk, monkeypatch, capsys) -> None:
     from px4fuse.report import screen
 

@@ -135,12 +135,11 @@ def compare_numbers(
             )
         ):
             continue
-        existing_number = number_a or number_b
-        assert existing_number is not None
+        described_number = number_a or numbers_b[path]
         yield contract.NumberChange(
             path=path,
-            label=existing_number.label,
-            unit=existing_number.unit,
+            label=described_number.label,
+            unit=described_number.unit,
             a=getattr(number_a, "value", None),
             b=getattr(number_b, "value", None),
             a_interval=getattr(number_a, "interval", None),

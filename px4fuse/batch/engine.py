@@ -20,7 +20,7 @@ from px4fuse.errors import Px4FuseError, SettingsError
 if TYPE_CHECKING:
     from distributed import Client
 
-# Maximum time (s) to connect to the Dask scheduler, and to wait for its first worker
+# Maximum time (s) to connect to the Dask scheduler
 CONNECT_TIMEOUT_S = 15.0
 # Maximum number of logs per Dask task; the start of a process for the task takes 2 s
 MAX_LOGS_PER_DASK_TASK = 4
@@ -35,8 +35,8 @@ def connect_cluster(scheduler: str | None = None) -> Iterator[Client | None]:
     Raises
     ------
     SettingsError
-        Dask is not installed, the scheduler does not answer or has no workers, or a worker
-        has another version of px4fuse.
+        Dask is not installed, the scheduler does not answer, or a worker has another version of
+        px4fuse.
     """
     if scheduler is None:
         yield None
@@ -58,25 +58,16 @@ def connect_cluster(scheduler: str | None = None) -> Iterator[Client | None]:
         ) from error
     # without this, Dask prints tracebacks when the scheduler ends
     with silence_logging_cmgr(logging.CRITICAL), client, client.as_current():
-        _check_workers(client)
+        _check_versions(client)
         yield client
 
 
-def _check_workers(client: Client) -> None:
-    address = client.scheduler_info()["address"]
-    try:
-        client.wait_for_workers(1, timeout=CONNECT_TIMEOUT_S)
-    except TimeoutError as error:
-        raise SettingsError(
-            f"The Dask scheduler {address} has no workers.",
-            f"Start workers with: dask worker {address} --nthreads 1",
-        ) from error
+def _check_versions(client: Client) -> None:
     own_version = metadata.version("px4fuse")
-    for name, worker_version in client.run(metadata.version, "px4fuse", on_error="return").items():
-        if worker_version != own_version:
-            version_text = worker_version if isinstance(worker_version, str) else "missing"
+    for name, version in client.run(metadata.version, "px4fuse", on_error="return").items():
+        if version != own_version:
             raise SettingsError(
-                f"px4fuse of Dask worker {name} is {version_text}, that of this computer is "
+                f"px4fuse of Dask worker {name} is {version}, that of this computer is "
                 f"{own_version}.",
                 "Install the same version of px4fuse on the worker and on this computer.",
             )
@@ -107,13 +98,8 @@ def run_jobs(
         jobs[start : start + MAX_LOGS_PER_DASK_TASK]
         for start in range(0, len(jobs), MAX_LOGS_PER_DASK_TASK)
     ]
-    jobs_by_future = dict(
-        zip(
-            client.map(partial(_run_task, run_job_list), job_lists, pure=False),
-            job_lists,
-            strict=True,
-        )
-    )
+    futures = client.map(partial(_run_task, run_job_list), job_lists, pure=False)
+    jobs_by_future = dict(zip(futures, job_lists, strict=True))
     try:
         for future in as_completed(list(jobs_by_future)):
             jobs_of_task = jobs_by_future.pop(future)
@@ -125,7 +111,7 @@ def run_jobs(
             results = [failure] * len(jobs_of_task) if error else future.result()
             yield from zip(jobs_of_task, results, strict=True)
     finally:
-        if jobs_by_future and client.status == "running":
+        if client.status == "running":
             client.cancel(list(jobs_by_future))
 
 

@@ -57,11 +57,11 @@ def analyse(job: Job) -> LogOutcome:
     max_log_bytes.set(job.max_bytes)
     try:
         with local_file(job.address) as path:
-            sha256 = _compute_sha256(path)
+            (sha256,) = hash_files([path])
             if sha256 in job.finished_hashes:
                 return LogOutcome(sha256)
             outcome = _compare_log(job, path, sha256)
-            if _compute_sha256(path) != sha256:
+            if sha256 not in hash_files([path]):
                 raise LogError(
                     "the file changed while it was read",
                     "Run the same command again when the file is complete.",
@@ -112,11 +112,6 @@ def _compare_log(job: Job, path: Path, sha256: str) -> LogOutcome:
     return LogOutcome(
         sha256, tuple(make_axis_rows(comparison_results)), results_json.encode(), report_pdf
     )
-
-
-def _compute_sha256(path: Path) -> str:
-    (sha256,) = hash_files([path])
-    return sha256
 
 
 def make_file_stem(name: str, sha256: str) -> str:

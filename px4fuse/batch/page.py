@@ -3,7 +3,6 @@
 import math
 from collections import Counter, defaultdict
 from collections.abc import Iterable, Mapping, Sequence
-from pathlib import PurePosixPath
 from typing import Any
 
 import pandas as pd
@@ -15,7 +14,7 @@ from px4fuse.batch.rows import (
     STATUS_FAILED,
     STATUS_NOT_COMPARED,
 )
-from px4fuse.card.model import RATIO_AXIS_ENDS
+from px4fuse.comparison.model import FILTER_NAMES
 from px4fuse.core.text import (
     format_count,
     format_metres,
@@ -23,12 +22,11 @@ from px4fuse.core.text import (
     format_ratio,
     join_first_names,
 )
-from px4fuse.filter.consistency import CONSISTENT_SIGMA_RATIOS
 from px4fuse.findings import finding_title
 from px4fuse.html import frame
 from px4fuse.html.frame import Cell, Column, Row, RowDetailsSection
 from px4fuse.html.safe import clean_text, load_template, make_relative_url
-from px4fuse.report.card_html import MARKER_SVG_PATHS
+from px4fuse.report.card_html import SIGMA_RATIO_AXIS
 from px4fuse.report.card_text import SEVERITY_SIGNS, SYMBOL_BY_REFERENCE, format_consistent_ratios
 
 # Columns of σ ratios from innovations (source) and from errors against ground truth (truth)
@@ -37,27 +35,12 @@ SEVERITIES = list(SEVERITY_SIGNS)
 FILE_LINKS = (("Report (PDF)", "report"), ("Results (JSON)", "results"))
 # Columns with one value per axis
 AXIS_COLUMNS = [name for name, path in RESULT_PATH_BY_COLUMN.items() if "{" in path]
-# Columns with one value per log
-LOG_COLUMNS = [
-    name
-    for name in RESULT_PATH_BY_COLUMN
-    if name
-    not in (
-        *AXIS_COLUMNS,
-        "axis",
-        "status",
-        "reason",
-        "remedy",
-        "severity",
-        "headline",
-        "action",
-        "changed",
-        "verdicts",
-        "findings",
-        "results",
-        "report",
-    )
-]
+# Columns with one value per log, except values in other cells of the page
+LOG_COLUMNS = (
+    *("log", "log_sha256", "px4fuse", "settings", "vehicle", "firmware", "firmware_hash"),
+    *("airframe", "hardware", "date", "duration_s", "source", "source_rate_hz", "aids"),
+    "position_rmse_m",
+)
 # Group of columns that the page hides until the user clicks on "more columns"
 OPTIONAL_COLUMN_GROUP = "numbers"
 # Labels of the drop-down lists, by the first part of a tag such as "status:done"
@@ -69,8 +52,8 @@ DROP_DOWN_LABEL_BY_TAG_PREFIX = {
     "finding": "Finding",
     "remedy": "Action",
 }
-# Preferred axes for the numbers of a log
-MAIN_AXIS_GROUPS_BY_PREFERENCE = (("aisle",), ("north", "east"), ("down",))
+# Axes in the order in which they give the numbers of a log
+AXES_BY_PREFERENCE = ("aisle", "north", "east", "down")
 
 #: Values of one log by name
 LogSummary = Mapping[str, Any]
@@ -101,20 +84,17 @@ def format_html(table: pd.DataFrame, title: str, version_text: str) -> str:
         title=title,
         subtitle=f"{format_count(len(logs), 'log')}. Compared by {version_text}.",
         html_above_table=load_template("batch/axis.html").render(limits=format_consistent_ratios()),
-        row_nouns=("log", "logs"),
+        rows_name="logs",
         columns=(
             Column("Sign", "rank"),
             Column("Log", "name"),
             Column("Diagnosis and first action", "full"),
             *(
-                Column(
-                    f"{filter_name.upper()} {SYMBOL_BY_REFERENCE[reference_name]}",
-                    "ratio",
-                    min_screen_size="tablet",
-                )
-                for filter_name, reference_name in (name.split("_") for name in SIGMA_RATIO_COLUMNS)
+                Column(f"{filter_label} {symbol}", "ratio", is_on_phones=False)
+                for filter_label in FILTER_NAMES.values()
+                for symbol in SYMBOL_BY_REFERENCE.values()
             ),
-            Column("KF − EKF2 (m)", "number", min_screen_size="tablet"),
+            Column("KF − EKF2 (m)", "number", is_on_phones=False),
             *(
                 Column(label, "line", OPTIONAL_COLUMN_GROUP)
                 for label in ("Date (UTC)", "Vehicle", "Firmware")
@@ -128,11 +108,7 @@ def format_html(table: pd.DataFrame, title: str, version_text: str) -> str:
         column_groups=[(OPTIONAL_COLUMN_GROUP, "more columns")],
         search_placeholder="search by name, vehicle, firmware or finding",
         full_table_note="fleet.csv contains the table of all logs.",
-        sigma_ratio_axis={
-            "bands": CONSISTENT_SIGMA_RATIOS,
-            "ends": RATIO_AXIS_ENDS,
-            "marks": MARKER_SVG_PATHS,
-        },
+        sigma_ratio_axis=SIGMA_RATIO_AXIS,
     )
 
 
@@ -230,19 +206,16 @@ def _format_value(value: str | float) -> str:
 
 def _make_drop_down_lists(logs: Sequence[LogSummary]) -> list[tuple[str, list[tuple[str, str]]]]:
     """Return the lists that filter logs: label, and options (tag, text), most frequent first."""
-    count_by_tag = Counter(tag for log in logs for tag in log["tags"])
-    label_by_tag: Mapping[str, str] = {
-        tag: label for log in logs for tag, label in log["tags"].items()
-    }
+    counts = Counter(tag_and_label for log in logs for tag_and_label in log["tags"].items())
     drop_down_lists = []
-    for kind, label in DROP_DOWN_LABEL_BY_TAG_PREFIX.items():
+    for kind, list_label in DROP_DOWN_LABEL_BY_TAG_PREFIX.items():
         options = [
-            (tag, f"{clean_text(label_by_tag[tag], 60)} ({count})")
-            for tag, count in count_by_tag.most_common()
+            (tag, f"{clean_text(label, 60)} ({count})")
+            for (tag, label), count in counts.most_common()
             if tag.startswith(f"{kind}:")
         ]
         if options:
-            drop_down_lists.append((label, [("", "All"), *options]))
+            drop_down_lists.append((list_label, [("", "All"), *options]))
     return drop_down_lists
 
 
@@ -261,30 +234,20 @@ def summarise_logs(table: pd.DataFrame) -> list[LogSummary]:
 
 def _summarise_log(rows: Sequence[Mapping[str, Any]]) -> LogSummary:
     """Combine the table rows of one log, one per axis, into one summary."""
-    axis_rows = [row for row in rows if "axis" in row]
-    main_axis_rows = next(
-        (
-            preferred_rows
-            for names in MAIN_AXIS_GROUPS_BY_PREFERENCE
-            if (preferred_rows := [row for row in axis_rows if row["axis"] in names])
-        ),
-        rows,
-    )
     log: dict[str, Any] = {}
-    for row in reversed((*main_axis_rows, *rows)):
+    for row in sorted(
+        rows, key=lambda row: AXES_BY_PREFERENCE.index(row.get("axis", "aisle")), reverse=True
+    ):
         log |= row
+    is_done = any(row["status"] == STATUS_DONE for row in rows)
     reasons_and_remedies = ((row.get("reason", ""), row.get("remedy", "")) for row in rows)
+    status = STATUS_DONE if is_done else rows[0]["status"]
+    status_text = status if status == STATUS_NOT_COMPARED else "refused"
     log |= {
-        "name": log.get("name") or PurePosixPath(log["log"]).name or "unnamed",
-        "status": STATUS_DONE
-        if any(row["status"] == STATUS_DONE for row in rows)
-        else rows[0]["status"],
+        "status": status,
         "missing_results": tuple(dict.fromkeys(pair for pair in reasons_and_remedies if any(pair))),
-        "axes": axis_rows,
+        "axes": [row for row in rows if "axis" in row],
         "findings": [id_ for id_ in log.get("findings", "").split(FINDING_SEPARATOR) if id_],
-    }
-    status_text = log["status"] if log["status"] == STATUS_NOT_COMPARED else "refused"
-    log |= {
         "severity": log.get("severity", "refused"),
         "headline": log.get("headline", f"{status_text}: {log.get('reason', '')}"),
         "action": log.get("action") or log.get("remedy", "") * ("headline" not in log),

@@ -73,10 +73,6 @@ class CachedRows(msgspec.Struct, frozen=True):
     size_bytes: int | None
     rows: Annotated[list[Row], msgspec.Meta(min_length=1)]
 
-    @property
-    def relative_path(self) -> str:
-        return f"rows/{self.sha256}.json"
-
 
 @dataclass(eq=False)
 class _RunState:
@@ -85,13 +81,12 @@ class _RunState:
     output: Path
     version: str
     settings: str
-    # SHA-256 of finished logs
+    # finished logs by SHA-256, also of earlier runs
+    cached_rows_by_hash: dict[str, CachedRows] = field(default_factory=dict)
     hash_by_address: dict[str, str] = field(default_factory=dict)
-    # first of several identical logs; only this log has results in the table
-    first_log_by_hash: dict[str, LogAddress] = field(default_factory=dict)
     failed_row_by_address: dict[str, Row] = field(default_factory=dict)
     # SHA-256 of logs that were finished in an earlier run
-    hashes_from_earlier_runs: set[str] = field(default_factory=set)
+    reused_hashes: set[str] = field(default_factory=set)
 
 
 def run_batch(
@@ -189,16 +184,14 @@ def run(
         raise SettingsError("A position file belongs to one flight. Omit `position` for many logs.")
     requested_settings(request)  # raises SettingsError if a setting is out of range
     state = _RunState(output, metadata.version("px4fuse"), command_line(request))
-    hashes_by_size = _find_cached_hashes(state, reports)
+    hashes_by_size: dict[int | None, set[str]] = defaultdict(set)
+    for cached_rows in load_cached_rows(state, reports):
+        state.cached_rows_by_hash[cached_rows.sha256] = cached_rows
+        hashes_by_size[cached_rows.size_bytes].add(cached_rows.sha256)
     log_by_address = {log.address: log for log in logs}
+    max_bytes = max_log_bytes.get()
     jobs = [
-        Job(
-            log.address,
-            request,
-            reports,
-            max_log_bytes.get(),
-            frozenset(hashes_by_size[log.size_bytes]),
-        )
+        Job(log.address, request, reports, max_bytes, frozenset(hashes_by_size[log.size_bytes]))
         for log in logs
     ]
     run_in_processes = partial(
@@ -210,47 +203,35 @@ def run(
     ):
         progress("comparing logs", 0, len(jobs))
         try:
-            try:
-                for number, (job, outcome) in enumerate(finished_jobs, 1):
-                    _cache_outcome(state, log_by_address[job.address], outcome)
-                    progress(
-                        f"comparing logs, {len(state.failed_row_by_address)} failed",
-                        number,
-                        len(jobs),
-                    )
-            finally:
-                if state.hash_by_address or state.failed_row_by_address:
-                    batch_result = _write_table(state, logs)
+            for number, (job, outcome) in enumerate(finished_jobs, 1):
+                _cache_outcome(state, log_by_address[job.address], outcome)
+                failure_count = len(state.failed_row_by_address)
+                progress(f"comparing logs, {failure_count} failed", number, len(jobs))
         except Px4FuseError as error:
             resume_note = RESUME_NOTE if (output / "rows").is_dir() else ""
             raise type(error)(f"{error} {resume_note}".rstrip()) from error
+        finally:
+            if state.hash_by_address or state.failed_row_by_address:
+                batch_result = _write_table(state, logs)
     return batch_result
 
 
-def _find_cached_hashes(state: _RunState, reports: bool) -> dict[int | None, set[str]]:
-    """Return the SHA-256 of the logs that earlier runs finished, by size of the log in bytes.
+def load_cached_rows(state: _RunState, reports: bool) -> Iterator[CachedRows]:
+    """Yield the cached table rows of logs that an earlier run finished with the same settings.
 
     With ``reports``, a log without a PDF report is not finished.
     """
-    hashes_by_size: dict[int | None, set[str]] = defaultdict(set)
-    for cached_rows in load_cached_rows(state):
-        first_row = cached_rows.rows[0]
-        output_file_columns = OUTPUT_FILE_COLUMNS[: 1 + reports] if "axis" in first_row else ()
-        if all(
-            (state.output / first_row.get(column, "")).is_file() for column in output_file_columns
-        ):
-            hashes_by_size[cached_rows.size_bytes].add(cached_rows.sha256)
-    return hashes_by_size
-
-
-def load_cached_rows(state: _RunState) -> Iterator[CachedRows]:
-    """Yield the cached table rows that are valid for the version and the settings in ``state``."""
     for cache_file in sorted((state.output / "rows").glob("*.json")):
         try:
             cached_rows = msgspec.json.decode(cache_file.read_bytes(), type=CachedRows)
         except (OSError, msgspec.MsgspecError):
             continue  # an unreadable file is ignored, and the log is compared again
-        if (cached_rows.px4fuse, cached_rows.settings) == (state.version, state.settings):
+        first_row = cached_rows.rows[0]
+        output_file_columns = OUTPUT_FILE_COLUMNS[: 1 + reports] if "axis" in first_row else ()
+        output_files = [state.output / first_row.get(column, "") for column in output_file_columns]
+        if (cached_rows.px4fuse, cached_rows.settings) == (state.version, state.settings) and all(
+            file.is_file() for file in output_files
+        ):
             yield cached_rows
 
 
@@ -258,22 +239,19 @@ def _cache_outcome(state: _RunState, log: LogAddress, outcome: LogOutcome | JobF
     """Register a finished log in ``state``, and write its results."""
     if isinstance(outcome, JobFailure):
         remedy = "Increase --timeout or --memory, or run px4fuse compare on this log."
-        outcome = LogOutcome(
-            "", (make_failure_row(LogError(outcome.reason.rstrip("."), remedy), STATUS_FAILED),)
-        )
+        error = LogError(outcome.reason.rstrip("."), remedy)
+        outcome = LogOutcome("", (make_failure_row(error, STATUS_FAILED),))
     if outcome.rows and outcome.rows[0]["status"] == STATUS_FAILED:
         state.failed_row_by_address[log.address] = outcome.rows[0]
         return
-    first_log = min(log, state.first_log_by_hash.get(outcome.sha256, log))
     if not outcome.rows:
-        state.hashes_from_earlier_runs.add(outcome.sha256)
-    elif first_log is log:
-        _write_log(state, log, outcome)
+        state.reused_hashes.add(outcome.sha256)
+    elif outcome.sha256 not in state.cached_rows_by_hash:  # otherwise two logs are identical
+        state.cached_rows_by_hash[outcome.sha256] = _write_log(state, log, outcome)
     state.hash_by_address[log.address] = outcome.sha256
-    state.first_log_by_hash[outcome.sha256] = first_log
 
 
-def _write_log(state: _RunState, log: LogAddress, outcome: LogOutcome) -> None:
+def _write_log(state: _RunState, log: LogAddress, outcome: LogOutcome) -> CachedRows:
     path_stem = f"results/{make_file_stem(log.name, outcome.sha256)}"
     content_by_name = {
         f"{path_stem}.json": outcome.results_json,
@@ -285,31 +263,29 @@ def _write_log(state: _RunState, log: LogAddress, outcome: LogOutcome) -> None:
     }
     rows = [clean_row(row) | path_by_column for row in outcome.rows]
     cached_rows = CachedRows(outcome.sha256, state.version, state.settings, log.size_bytes, rows)
-    contents = content_by_name | {cached_rows.relative_path: msgspec.json.encode(cached_rows)}
+    content_by_name[f"rows/{outcome.sha256}.json"] = msgspec.json.encode(cached_rows)
     write_output_files(
-        {state.output / name: content for name, content in contents.items() if content}
+        {state.output / name: content for name, content in content_by_name.items() if content}
     )
+    return cached_rows
 
 
 def _write_table(state: _RunState, logs: Iterable[LogAddress]) -> BatchResult:
     """Write the table of the finished logs as CSV, Parquet and web page."""
     severities: set[str] = set()
-    rows_by_hash = {cached_rows.sha256: cached_rows.rows for cached_rows in load_cached_rows(state)}
+    first_log_by_hash: dict[str, LogAddress] = {}
 
-    def find_rows(log: LogAddress) -> Iterable[Row]:
+    def find_rows(log: LogAddress) -> list[Row]:
         if log.address in state.failed_row_by_address:
             return [state.failed_row_by_address[log.address]]
         if log.address not in state.hash_by_address:  # batch stopped before this log
             return []
         sha256 = state.hash_by_address[log.address]
-        first_log = state.first_log_by_hash[sha256]
-        if first_log is log and sha256 in rows_by_hash:
-            return rows_by_hash[sha256]
-        status, reason = STATUS_NOT_COMPARED, f"the log is identical to {first_log.path_for_table}"
+        first_log = first_log_by_hash.setdefault(sha256, log)
         if first_log is log:
-            status = STATUS_FAILED
-            reason = "another run of px4fuse batch changed the results of this log"
-        return [{"status": status, "log_sha256": sha256, "reason": reason}]
+            return state.cached_rows_by_hash[sha256].rows
+        reason = f"the log is identical to {first_log.path_for_table}"
+        return [{"status": STATUS_NOT_COMPARED, "log_sha256": sha256, "reason": reason}]
 
     def make_complete_rows() -> Iterator[Row]:
         for log in logs:
@@ -320,14 +296,11 @@ def _write_table(state: _RunState, logs: Iterable[LogAddress]) -> BatchResult:
                 yield replace_name_by_path(row, log.path_for_table) | common_values
 
     table = make_table(make_complete_rows())
+    page = format_html(table, state.output.resolve().name, f"px4fuse {state.version}")
     contents = {
         state.output / "fleet.parquet": table.to_parquet(index=False),
         state.output / "fleet.csv": format_csv(table),
-        state.output / "fleet.html": (
-            format_html(table, state.output.resolve().name, f"px4fuse {state.version}")
-        ).encode(),
+        state.output / "fleet.html": page.encode(),
     }
     write_output_files(contents)
-    return BatchResult(
-        table, len(state.hashes_from_earlier_runs), frozenset(severities), tuple(contents)
-    )
+    return BatchResult(table, len(state.reused_hashes), frozenset(severities), tuple(contents))

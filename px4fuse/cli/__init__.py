@@ -9,7 +9,6 @@ import os
 import shlex
 import signal
 import sys
-import threading
 from pathlib import Path
 
 import click
@@ -51,12 +50,8 @@ TERMINATION_SIGNALS = (
     *([signal.SIGHUP] if hasattr(signal, "SIGHUP") else []),
 )
 
-HELP_OPTIONS = ["-h", "--help"]
 # Environment variables that px4fuse removes: invalid values stop the import of libraries
 IGNORED_ENVIRONMENT_VARIABLES = ("MPLBACKEND", "SOURCE_DATE_EPOCH")
-# Minimum address space (bytes) for a run: the report of the sample log needs 0.7 GB
-MIN_ADDRESS_SPACE_BYTES = 800_000_000
-
 # Commands that need pyarrow; other commands do not import it, which saves 70 MB of memory
 COMMANDS_WITH_PARQUET = ("batch", "extract")
 
@@ -115,7 +110,8 @@ def help_text(name: str) -> str:
 
 
 @click.group(
-    cls=LazyCommandGroup, context_settings={"help_option_names": HELP_OPTIONS, "show_default": True}
+    cls=LazyCommandGroup,
+    context_settings={"help_option_names": ["-h", "--help"], "show_default": True},
 )
 @click.version_option(package_name="px4fuse")
 def cli() -> None:
@@ -145,21 +141,6 @@ def _make_system_error(error: MemoryError | OSError, files_sentence: str) -> Px4
     return OutputError(f"standard output cannot be written ({error.strerror}); {files_sentence}")
 
 
-def _check_memory() -> None:
-    # below MIN_ADDRESS_SPACE_BYTES, libraries end the process without an error message
-    try:
-        import resource
-    except ImportError:  # Windows has no memory limit for a process
-        return
-    limit_bytes = resource.getrlimit(resource.RLIMIT_AS)[0]
-    if limit_bytes != resource.RLIM_INFINITY and limit_bytes < MIN_ADDRESS_SPACE_BYTES:
-        raise SettingsError(
-            f"px4fuse needs {MIN_ADDRESS_SPACE_BYTES / 1e6:.0f} MB of address space; the limit is "
-            f"{limit_bytes / 1e6:.0f} MB",
-            "Raise the memory limit, for example with ulimit -v unlimited.",
-        )
-
-
 def main() -> None:
     """Run the command line; print an error as one line on standard error, and exit with code 2."""
     # garbage collection needs 10 % of the run time of a short command
@@ -173,11 +154,7 @@ def main() -> None:
     for signal_number in TERMINATION_SIGNALS:
         if signal.getsignal(signal_number) is signal.SIG_DFL:  # under nohup, SIGHUP is ignored
             signal.signal(signal_number, _raise_interrupt)
-    if hasattr(signal, "pthread_kill"):  # not on Windows
-        sys.unraisablehook = _raise_signal_again
     try:
-        if not {*HELP_OPTIONS, "--version"} & set(sys.argv):
-            _check_memory()
         exit_code = cli.main(standalone_mode=False)
     except click.exceptions.NoArgsIsHelpError as error:
         error.show()
@@ -253,19 +230,6 @@ def _print_error(text: str) -> None:
 def _raise_interrupt(signal_number: int, _: object) -> None:
     # handle a termination signal like Ctrl-C, so that temporary files are deleted
     raise KeyboardInterrupt(signal_number)
-
-
-def _raise_signal_again(unraisable: "sys.UnraisableHookArgs") -> None:
-    """Send a signal again if it arrived during a finaliser, where Python ignores exceptions."""
-    error = unraisable.exc_value
-    if isinstance(error, KeyboardInterrupt):
-        signal_number = error.args[0] if error.args else signal.SIGINT
-        # wait 0.1 s, so that the finaliser has ended
-        threading.Timer(
-            0.1, signal.pthread_kill, [threading.main_thread().ident, signal_number]
-        ).start()
-    else:
-        sys.__unraisablehook__(unraisable)
 
 
 def _discard_output() -> None:

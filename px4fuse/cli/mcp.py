@@ -164,10 +164,20 @@ def make_tools(folders: tuple[Path, ...]) -> list[tuple[Any, Any]]:
                 get_args(result_type) or (result_type,)
             )
             output_schema = {"type": "object", "anyOf": schemas, "$defs": definitions}
+        input_schema = {
+            "type": "object",
+            "properties": {key: _make_schema(parameter) for key, parameter in parameters.items()},
+            "required": [
+                key
+                for key, parameter in parameters.items()
+                if isinstance(parameter, click.Argument)
+            ],
+            "additionalProperties": False,
+        }
         tool = Tool(
             name=name,
             description=help_text(command_name) if parameters else "List the ids of all findings.",
-            input_schema=_make_input_schema(parameters),
+            input_schema=input_schema,
             output_schema=output_schema,
         )
         tools.append((tool, partial(_parse_arguments, command_name, parameters, folders)))
@@ -181,18 +191,6 @@ def _list_parameters(command_name: str) -> dict[str, click.Parameter]:
         for parameter in find_command(command_name).params
         if parameter.expose_value
         and (name := str(parameter.name)) not in PARAMETERS_WITHOUT_TOOL_ARGUMENT
-    }
-
-
-def _make_input_schema(parameters: Mapping[str, click.Parameter]) -> dict[str, Any]:
-    argument_names = [
-        name for name, parameter in parameters.items() if isinstance(parameter, click.Argument)
-    ]
-    return {
-        "type": "object",
-        "properties": {name: _make_schema(parameter) for name, parameter in parameters.items()},
-        "required": argument_names,
-        "additionalProperties": False,
     }
 
 
@@ -218,15 +216,15 @@ def _parse_arguments(
     parameters: Mapping[str, click.Parameter],
     folders: Sequence[Path],
     arguments: Mapping[str, Any],
-) -> tuple[list[str], list[Path]]:
-    """Convert the arguments of a tool to a command line; also return the input files.
+) -> list[str]:
+    """Convert the arguments of a tool to a command line.
 
     Raises
     ------
     LogError
         A file is outside the folders.
     """
-    command_words, operands, files = [command_name], ["--"], list[Path]()
+    command_words, operands = [command_name], ["--"]
     for name, parameter in parameters.items():
         if name not in arguments:
             continue
@@ -236,14 +234,13 @@ def _parse_arguments(
         argument_texts = [str(text) for text in (value if isinstance(value, list) else [value])]
         if isinstance(parameter.type, options.InputPath):
             argument_texts = [_find_file(argument_texts[0], folders)]
-            files.append(split_path_and_part(argument_texts[0])[0])
         if isinstance(parameter, click.Argument):
             operands += argument_texts
         elif isinstance(value, bool):
             command_words += [option] * value
         else:
             command_words += [f"{option}={text}" for text in argument_texts]
-    return command_words + operands, files
+    return command_words + operands
 
 
 def _find_file(file_argument: str, folders: Sequence[Path]) -> str:

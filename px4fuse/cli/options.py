@@ -21,7 +21,12 @@ from msgspec import Struct, structs
 from px4fuse.batch import LOG_ANALYSIS_TIMEOUT_S
 from px4fuse.cli.outputs import OPENS_OUTPUT_KEY
 from px4fuse.core.input_files import add_input
-from px4fuse.core.reading import max_log_bytes, read_log_bytes, read_text
+from px4fuse.core.reading import (
+    max_log_bytes,
+    read_log_bytes,
+    read_text,
+    split_path_and_part,
+)
 from px4fuse.core.text import replace_unencodable
 from px4fuse.core.units import UNIT_NAMES, convert_to_unit
 from px4fuse.errors import SettingsError
@@ -64,8 +69,7 @@ class InputPath(NonEmptyPath):
 
     def convert(self, value: Any, param: Any, ctx: Any) -> Any:
         path = super().convert(value, param, ctx)
-        file, separator, _ = str(path).rpartition(":")
-        add_input(Path(file) if separator and not Path(path).exists() else Path(path))
+        add_input(split_path_and_part(str(path))[0])
         return path
 
 
@@ -423,15 +427,9 @@ def read_student(option_values: dict[str, Any], log: Path) -> Student:
             f"Give the form of {log.name}, or make one with px4fuse answers {log.name}.",
         )
     name, student_id = (replace_unencodable(text or "") for text in (name, student_id))
-    student = Student(name, student_id, notes, answers)
-    _warn_missing_fonts(student.name + student.id + student.notes)
-    return student
+    if not (texts := name + student_id + notes).isascii():
+        from px4fuse.report.fonts import find_missing_characters, format_font_advice
 
-
-def _warn_missing_fonts(text: str) -> None:
-    if text.isascii():
-        return
-    from px4fuse.report.fonts import find_missing_characters, format_font_advice
-
-    if characters := find_missing_characters(text):
-        click.echo(f"px4fuse: {format_font_advice(characters)}", err=True)
+        if characters := find_missing_characters(texts):
+            click.echo(f"px4fuse: {format_font_advice(characters)}", err=True)
+    return Student(name, student_id, notes, answers)

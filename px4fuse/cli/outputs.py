@@ -120,9 +120,9 @@ def choose_default_report_path(report_stem: str, results: Results) -> Path:
         short_stem = os.fsencode(report_stem)[:SHORTENED_NAME_BYTES].decode(errors="ignore")
         report_stem = f"{short_stem}_{hashlib.sha256(os.fsencode(report_stem)).hexdigest()[:8]}"
     path = Path("reports", f"{report_stem}.pdf")
-    mismatch_reason = "the file is not recognised as a report on the same input files and student"
+    kind = "a report on the same input files and student"
     for target, read in (path, read_attached_results), (path.with_suffix(".json"), read_results):
-        _require_replaceable_file(target, mismatch_reason, partial(_is_same_report, results, read))
+        _require_replaceable_file(target, kind, partial(_is_same_report, results, read))
     return path
 
 
@@ -137,21 +137,19 @@ def check_default_page(path: Path, page: str) -> None:
     generator_tags = GENERATOR_PATTERN.findall(page)
     _require_replaceable_file(
         path,
-        "the file is not recognised as a web page of the same command and log",
+        "a web page of the same command and log",
         lambda content: GENERATOR_PATTERN.findall(content.decode()) == generator_tags,
     )
 
 
-def _require_replaceable_file(
-    path: Path, mismatch_reason: str, can_replace: Callable[[bytes], bool]
-) -> None:
+def _require_replaceable_file(path: Path, kind: str, can_replace: Callable[[bytes], bool]) -> None:
     try:
         may_replace = not path.exists() or can_replace(path.read_bytes())
     except (OSError, UnicodeDecodeError, ResultsError):
         may_replace = False
     if not may_replace:
         raise OutputError(
-            f"{path} exists and was not overwritten, because {mismatch_reason}",
+            f"{path} exists and was not overwritten, because the file is not recognised as {kind}",
             "Choose another name with -o.",
         )
 
@@ -179,19 +177,18 @@ def _get_student_name_and_id(results: Results) -> tuple[str, str]:
 
 
 def choose_web_page_path(output: Path | None, default: Path) -> Path:
-    """Return the path of a web page (value of -o, or the default), and check it.
+    """Return the path of a web page: the value of -o, or the default.
 
     Raises
     ------
     OutputError
-        The name does not end in .html or .htm, or the path cannot be written.
+        The name does not end in .html or .htm.
     """
     page_path = output or default
     if page_path.suffix.lower() not in (".html", ".htm") and page_path != STANDARD_OUTPUT:
         raise OutputError(
             f"{page_path}: the output is a web page. Give a name ending in .html (-o)."
         )
-    check_output_paths([page_path])
     return page_path
 
 

@@ -28,7 +28,7 @@ const Engine = (() => {
     const velocity = interp(edges, imu.time, axis.integral);
     const gap = interp(edges, imu.gapEdges, imu.gapSum);
     const n = edges.length - 1, mean = new Float64Array(n), gapFraction = mean.slice();
-    const clip = (t) => clamp(t, ...imu.span);
+    const clip = (t) => clamp(t, imu.time[0], imu.time.at(-1));
     for (let i = 0; i < n; i++) {
       const length = edges[i + 1] - edges[i];
       mean[i] = (velocity[i + 1] - velocity[i]) / length;
@@ -132,38 +132,34 @@ const Engine = (() => {
     return { steps, updates, settings };
   }
 
-  // Position, velocity and position variance at other ascending times, NaN outside the KF run
+  // Position and its variance at other ascending times, NaN outside the KF run
   // (kalman.predict_state and predict_variance)
   function stateAt(run, times) {
     const { steps: s, settings } = run, { time, p, v, acceleration } = s, n = time.length;
-    const position = new Float64Array(times.length), velocity = position.slice(), variance = position.slice();
+    const position = new Float64Array(times.length).fill(NaN), variance = position.slice();
     let j = 0;
     for (let i = 0; i < times.length; i++) {
       const t = times[i];
-      if (t < time[0] || t > time[n - 1]) { position[i] = velocity[i] = variance[i] = NaN; continue; }
+      if (t < time[0] || t > time[n - 1]) continue;
       while (j < n - 1 && time[j + 1] <= t) j++;
-      const ahead = t - time[j], a = j < n - 1 ? acceleration[j] : 0;
-      position[i] = p[j] + v[j] * ahead + a * ahead * ahead / 2;
-      velocity[i] = v[j] + a * ahead;
-      const q = processNoise(settings, s.extra[j] ?? 0);
+      const ahead = t - time[j], q = processNoise(settings, s.extra[j] ?? 0);
+      position[i] = p[j] + v[j] * ahead + (acceleration[j] ?? 0) * ahead * ahead / 2;
       variance[i] = s.p00[j] + 2 * ahead * s.p01[j] + ahead * ahead * s.p11[j] + q * ahead ** 3 / 4;
     }
-    return { p: position, v: velocity, p00: variance };
+    return { p: position, p00: variance };
   }
 
   /* Statistics of innovations (consistency.assess_innovations); null for fewer than MIN_INNOVATIONS */
   function assess(nu, s) {
-    let square = 0, outside = 0, product = 0, previous = 0;
+    let square = 0, outside = 0;
     const n = nu.length;
     if (n < MIN_INNOVATIONS) return null;
     for (let i = 0; i < n; i++) {
       const normalised = nu[i] / Math.sqrt(s[i]);
       square += normalised * normalised;
       if (Math.abs(normalised) > 2) outside++;
-      product += normalised * previous;
-      previous = normalised;
     }
-    return { count: n, nis: square / n, outside: outside / n, lag1: product / square };
+    return { count: n, nis: square / n, outside: outside / n };
   }
 
   /* Root mean square difference of two series, null for fewer than MIN_COMMON_SAMPLES */
@@ -194,5 +190,5 @@ const Engine = (() => {
     });
   }
 
-  return { interp, replay, stateAt, assess, rmse, unpack };
+  return { interp, replay, processNoise, stateAt, assess, rmse, unpack };
 })();

@@ -1,2 +1,2 @@
 /* Empty replacement of practice.js for px4fuse explore, whose page asks no questions. */
-const Practice = { suffix: "", toAddress: () => ({}), start() {} };
+const Practice = { suffix: "", start() {} };

@@ -6,7 +6,7 @@ from importlib.metadata import version
 from bokeh.resources import Resources
 
 from px4fuse.analysis import Analysis
-from px4fuse.explore.data import PageData, make_flight_data, make_page_constants
+from px4fuse.explore.data import PageData, make_flight_data
 from px4fuse.explore.figures import PAGE_LAYOUT, has_truth_or_ekf2, make_document_json
 from px4fuse.explore.packing import ArrayEncoder
 from px4fuse.html.safe import (
@@ -17,6 +17,7 @@ from px4fuse.html.safe import (
     read_asset,
 )
 from px4fuse.report.card_html import (
+    SIGMA_RATIO_AXIS,
     make_card_html,
     make_diagnosis_card,
     make_sigma_ratio_figures,
@@ -25,7 +26,6 @@ from px4fuse.report.card_html import (
 
 # Maximum length (characters) of a text from a log on the web page
 MAX_LOG_TEXT_LENGTH = 2000
-SCRIPT_NAMES = ("card", "step", "times")
 ASSET_PACKAGE = "px4fuse.explore"
 
 
@@ -51,25 +51,21 @@ def make_data_elements(
     bokeh_document, name_by_plot_id = make_document_json(data)
     content = {
         "flight": data,
-        "ranges": make_page_constants(),
+        "ratio_axis": SIGMA_RATIO_AXIS,
         "packed": encoder.array_specs,
         "places": name_by_plot_id,
     }
-    figures_html = (
-        f'<template id="figures{suffix}">{make_sigma_ratio_figures(analysis)}</template>\n'
+    text_by_name = {
+        "content": encode_safe_json(clean_values(content, MAX_LOG_TEXT_LENGTH)),
+        "document": encode_safe_json(bokeh_document),
+        "arrays": encoder.text(),
+    }
+    figures = f'<template id="figures{suffix}">{make_sigma_ratio_figures(analysis)}</template>'
+    scripts = (
+        f'<script type="text/plain" id="{name}{suffix}">{text}</script>'
+        for name, text in text_by_name.items()
     )
-    return figures_html + "\n".join(
-        f'<script type="{kind}" id="{name}{suffix}">{text}</script>'
-        for name, kind, text in (
-            (
-                "content",
-                "application/json",
-                encode_safe_json(clean_values(content, MAX_LOG_TEXT_LENGTH)),
-            ),
-            ("document", "application/json", encode_safe_json(bokeh_document)),
-            ("arrays", "text/plain", encoder.text()),
-        )
-    )
+    return "\n".join((figures, *scripts))
 
 
 def make_page_html(
@@ -95,16 +91,13 @@ def make_page_html(
     fields
         Further fields of the template ``page.html``.
     """
-    practice_script_name = "practice" if choices else "no_practice"
+    script_names = ("card", "step", "practice" if choices else "no_practice", "page")
     scripts_by_name = {
         # BokehJS without widgets, tables and formulas; js_raw[1] only sets the log level
         "bokeh": Resources(mode="inline", components=["bokeh"]).js_raw[0],
         "engine": read_asset("engine.js", ASSET_PACKAGE),
         "script": read_asset("dom.js")
-        + "".join(
-            read_asset(f"{name}.js", ASSET_PACKAGE)
-            for name in (*SCRIPT_NAMES, practice_script_name, "page")
-        ),
+        + "".join(read_asset(f"{name}.js", ASSET_PACKAGE) for name in script_names),
     }
     return load_template("explore/page.html").render(
         {f"{name}_hash": compute_csp_hash(text) for name, text in scripts_by_name.items()},
@@ -117,6 +110,8 @@ def make_page_html(
         made_with=f"px4fuse {version('px4fuse')}",
         choices=choices,
         tabs=PAGE_LAYOUT.tabs,
+        plots=PAGE_LAYOUT.plots,
+        axis_names=[axis["name"] for axis in data["axes"]],
         has_truth_or_ekf2=has_truth_or_ekf2(data),
         **fields,
     )

@@ -102,12 +102,11 @@ class QuizFlight:
     """Simulated flight of the quiz, with its injected faults and their sizes."""
 
     scenario: Scenario
-    faults: tuple[QuizFault, ...]
-    fault_sizes: tuple[str, ...]
+    faults_and_sizes: tuple[tuple[QuizFault, str], ...]
 
     @property
     def correct_answers(self) -> list[str]:
-        return sorted({fault.choice for fault in self.faults}) or ["nothing"]
+        return sorted({fault.choice for fault, _ in self.faults_and_sizes}) or ["nothing"]
 
 
 def choose_random_flights(seed: int, level: int, count: int) -> tuple[QuizFlight, ...]:
@@ -139,12 +138,13 @@ def _draw_flight(rng: np.random.Generator, right_answer: str, level: int) -> Qui
         faults += draw_one_fault(
             [fault for fault, pair in faults_and_answers if pair in COMBINABLE_ANSWER_PAIRS]
         )
-    fault_sizes, sigma_uwb_m = [], SIGMA_Z_M
+    faults_and_sizes, sigma_uwb_m = [], SIGMA_Z_M
     for fault in faults:
         sign = "-" if fault.has_random_sign and rng.random() < 0.5 else ""
-        fault_sizes.append(f"{sign}{fault.sizes[level - 1]}")
+        size = f"{sign}{fault.sizes[level - 1]}"
+        faults_and_sizes.append((fault, size))
         if fault.name == NOISY_UWB_FAULT:
-            sigma_uwb_m = float(fault_sizes[-1])
+            sigma_uwb_m = float(size)
     scenario = Scenario(
         **SCENARIO_SETTINGS,
         length_m=round(float(rng.uniform(*AISLE_LENGTH_RANGE_M)), 1),
@@ -152,14 +152,11 @@ def _draw_flight(rng: np.random.Generator, right_answer: str, level: int) -> Qui
         sigma_uwb_m=sigma_uwb_m,
         seed=int(rng.integers(MAX_SEED)),
     )
-    return QuizFlight(scenario, tuple(faults), tuple(fault_sizes))
+    return QuizFlight(scenario, tuple(faults_and_sizes))
 
 
 def make_practice_page(
-    seed: int,
-    level: int,
-    count: int,
-    progress: Callable[[str, int, int], None] = lambda *_: None,
+    seed: int, level: int, count: int, progress: Callable[[str, int, int], None]
 ) -> str:
     """Simulate and analyse ``count`` flights, and return the quiz page (HTML).
 
@@ -185,7 +182,7 @@ def make_practice_page(
 def _simulate_flight_data(
     practice_flight: QuizFlight, flight_index: int
 ) -> tuple[dict[str, Any], str]:
-    faults_and_sizes = [*zip(practice_flight.faults, practice_flight.fault_sizes, strict=True)]
+    faults_and_sizes = practice_flight.faults_and_sizes
     fault_options = [
         f"{fault.name}={size}" for fault, size in faults_and_sizes if fault.name != NOISY_UWB_FAULT
     ]
@@ -193,26 +190,19 @@ def _simulate_flight_data(
     flight = flights.to_flight(simulation, f"flight {flight_index + 1}")
     request = ComparisonRequest(log=flight.log.name, sigma_a_m_s2=SIGMA_A_M_S2, sigma_z_m=SIGMA_Z_M)
     # without the automatic correction of axes and timestamps, which would hide the injected fault
-    analysis, encoder = (
-        diagnose(request, flight=flight, keep_positions_as_sent=True),
-        ArrayEncoder(),
-    )
-    data, card = make_flight_data(analysis, encoder), build_card(analysis, request)
+    analysis = diagnose(request, flight=flight, keep_positions_as_sent=True)
     fault_descriptions = [_describe_fault(*pair, analysis.findings) for pair in faults_and_sizes]
+    card = _with_fault_headline(build_card(analysis, request), fault_descriptions)
     answer_key = {
         "right": practice_flight.correct_answers,
         "mistakes": fault_descriptions,
-        "card": make_card_html(
-            _with_fault_headline(card, fault_descriptions), has_apply_buttons=True
-        ),
+        "card": make_card_html(card, has_apply_buttons=True),
     }
     compressed_key = base64.b64encode(zlib.compress(json.dumps(answer_key).encode())).decode()
-    flight_html = make_data_elements(data, analysis, encoder, f"-{flight_index}")
-    return (
-        data,
-        f'{flight_html}\n<script type="text/plain" id="key-{flight_index}">'
-        f"{compressed_key}</script>",
-    )
+    key_html = f'<script type="text/plain" id="key-{flight_index}">{compressed_key}</script>'
+    encoder = ArrayEncoder()
+    data = make_flight_data(analysis, encoder)
+    return data, make_data_elements(data, analysis, encoder, f"-{flight_index}") + key_html
 
 
 def _describe_fault(fault: QuizFault, size: str, findings: tuple[Finding, ...]) -> dict[str, Any]:
@@ -225,7 +215,6 @@ def _describe_fault(fault: QuizFault, size: str, findings: tuple[Finding, ...]) 
         "time": time_text,
         "symptom": fault.symptom,
         "view": fault.view,
-        "span": list(spans[0]) if spans else None,
     }
 
 

@@ -1,11 +1,9 @@
 /* Script of a page with one table: sorts, searches, filters and unfolds its rows. */
 (() => {
-  const { columns, rows, size, nouns, axis } = JSON.parse($("content").textContent);
+  const { columns, rows, size, axis } = JSON.parse($("content").textContent);
   const collator = new Intl.Collator(undefined, { numeric: true, sensitivity: "base" });
   const fold = (text) => text.normalize("NFD").replace(/\p{M}/gu, "").toLowerCase();
-  const frame = query(".frame");
   const selects = queryAll(".controls select");
-  const shownGroups = queryAll("[data-group]");
 
   /* Node with a text of unknown writing direction */
   const makeIsolated = (tag, text, className = "") => make(tag, text, { className, dir: "auto" });
@@ -13,19 +11,19 @@
     node.append(...children);
     return node;
   };
-  const makeSvg = (tag, attributes) => {
+  const makeSvg = (tag, attributes, children = []) => {
     const node = document.createElementNS("http://www.w3.org/2000/svg", tag);
     for (const [name, value] of Object.entries(attributes)) node.setAttribute(name, value);
-    return node;
+    return fill(node, children);
   };
 
   const isNumeric = columns.map(([, kind]) => ["number", "rank", "ratio"].includes(kind));
-  const entries = rows.map(([cells, tags, details, beside], index) => ({
-    index, cells, tags: new Set(tags), details, beside, open: false,
-    searchText: fold(cells.map(([text, , below]) => [text, below]).join("\n")),
+  const entries = rows.map(([cells, tags, details, beside]) => ({
+    cells, tags, details, beside, isOpen: false, row: null, detailRow: null,
+    searchText: fold(cells.map(([text, , below]) => `${text}\n${below}`).join("\n")),
     values: cells.map(([text, value], column) => isNumeric[column] ? value : text || null),
   }));
-  let order = entries, matches = entries, firstShown = 0, current = null;
+  let order = entries, matches = entries, shownCount = size;
 
   // ------------------------------------------------------------ sections of an unfolded row
 
@@ -50,13 +48,7 @@
   const overrides = new Map();
   let hasUnsavedInput = false;
   const setOverride = (...row) => overrides.set(row.slice(0, 2).join("\0"), row);
-  for (const [kind, , owner, rows, otherRows] of entries.flatMap(({ details }) => details)) {
-    if (kind !== "boxes") continue;
-    for (const [item, points, comment] of [...rows.map(([item, , ...row]) => [item, ...row]), ...otherRows]) {
-      if (points !== null || comment) setOverride(owner, item, points ?? "", comment);
-    }
-  }
-  const boxes = (owner, rows, otherRows) => {
+  const boxes = (owner, rows) => {
     const node = make("div", "", "boxes");
     for (const [item, max, points, comment] of rows) {
       const number = make("input", "", { inputMode: "decimal", size: 6, value: points ?? "" });
@@ -70,9 +62,14 @@
         });
       }
     }
-    if (otherRows.length) node.append(make("small", `${otherRows.length} other rows of overrides.csv (corrected points) stay unchanged.`));
     return node;
   };
+  for (const [kind, , owner, rows, otherRows] of entries.flatMap(({ details }) => details)) {
+    if (kind !== "boxes") continue;
+    for (const [item, points, comment] of [...rows.map(([item, , ...row]) => [item, ...row]), ...otherRows]) {
+      if (points !== null || comment) setOverride(owner, item, points ?? "", comment);
+    }
+  }
   const overridesText = () => {
     const quoted = (cell) => {
       const text = String(cell);
@@ -84,10 +81,13 @@
   };
   const makers = { list, prose, pairs, table, links, boxes };
 
-  const section = (contents, className) => fill(make("section", "", className), contents.flatMap(
-    ([kind, title, ...rest]) => [...title ? [make("h2", title)] : [], makers[kind](...rest)]));
-  const detail = ({ details, beside }) => fill(make("div", "", beside.length ? "detail" : "detail bare"),
-    [section(details, ""), ...beside.length ? [section(beside, "beside")] : []]);
+  const section = (contents) => fill(make("section"), contents.flatMap(
+    ([kind, title, ...rest]) => [make("h2", title), makers[kind](...rest)]));
+  const makeDetailRow = ({ details, beside }) => {
+    const sections = [details, beside].filter((contents) => contents.length).map(section);
+    const cell = fill(make("td", "", { colSpan: columns.length }), [fill(make("div", "", "detail"), sections)]);
+    return fill(make("tr", "", "more"), [cell]);
+  };
 
   // ------------------------------------------------------------ the table
 
@@ -95,7 +95,7 @@
   const ratioMark = (ratio, against) => {
     const width = 70, place = axisFraction(ratio, axis.ends);
     const [from, to] = axis.bands[against].map((end) => width * axisFraction(end, axis.ends));
-    return fill(makeSvg("svg", { width: width + 14, height: 20, viewBox: `-7 -10 ${width + 14} 20`, "aria-hidden": "true" }), [
+    return makeSvg("svg", { width: width + 14, height: 20, viewBox: `-7 -10 ${width + 14} 20`, "aria-hidden": "true" }, [
       makeSvg("rect", { x: from, y: -8, width: to - from, height: 16, class: "band" }),
       makeSvg("line", { x2: width, class: "track" }),
       makeSvg("path", { d: axis.marks[place < 0 ? "below" : place > 1 ? "above" : against],
@@ -103,88 +103,55 @@
   };
 
   const nameColumn = Math.max(columns.findIndex(([, kind]) => kind === "name"), 0);
-  const classes = (kind, minScreenSize, group) =>
-    `${{ number: "n", line: "line", full: "full", ratio: "ratio" }[kind] ?? ""} ${minScreenSize} ${group && `g-${group}`}`;
-  const cell = ([text, value, below, style], column) => {
-    const [, kind, group, minScreenSize] = columns[column];
-    const hasStyle = style === "flags" || ["ratio", "full"].includes(kind);
-    const node = make(column === nameColumn ? "th" : "td", "",
-      `${classes(kind, minScreenSize, group)} ${hasStyle ? style : ""}`);
-    if (style === "flags") node.append(list(text ? text.split("\n") : []));
-    else if (text) {
-      node.append(...kind === "ratio" ? [ratioMark(value, style.split(" ")[1]), make("span", text)]
-        : [style && kind !== "full" ? make("span", text, `chip ${style}`) : makeIsolated("span", text)]);
-    }
+  const classes = ([, kind, group, isOnPhones]) =>
+    `k-${kind} ${group && `g-${group}`} ${isOnPhones ? "" : "large"}`;
+  const makeCell = ([text, value, below, style], column) => {
+    const kind = columns[column][1], hasStyle = style === "flags" || ["ratio", "full"].includes(kind);
+    const node = make(column === nameColumn ? "th" : "td", "", `${classes(columns[column])} ${hasStyle ? style : ""}`);
+    if (style === "flags") node.append(list(text.split("\n").filter(Boolean)));
+    else if (kind === "ratio" && text) node.append(ratioMark(value, style.split(" ")[1]), make("span", text));
+    else if (text) node.append(makeIsolated("span", text, style && !hasStyle ? `chip ${style}` : ""));
     if (below) node.append(makeIsolated("span", below, "file"));
     return node;
   };
-
-  const unfold = (entry, open) => {
-    entry.open = open;
-    if (!entry.row) return;
-    if (open && !entry.more) {
-      entry.more = fill(make("tr", "", { className: "more", id: `more-${entry.index}` }),
-        [fill(make("td", "", { colSpan: columns.length }), [detail(entry)])]);
-      entry.button.setAttribute("aria-controls", entry.more.id);
-    }
-    if (open) entry.row.after(entry.more);
-    else entry.more?.remove();
-    entry.row.classList.toggle("open", open);
-    entry.button.setAttribute("aria-expanded", String(open));
-  };
-
   const makeRow = (entry) => {
-    entry.row = fill(make("tr"), entry.cells.map(cell));
-    entry.row.dataset.row = entry.index;
-    entry.more = null;
-    const head = entry.row.cells[nameColumn], name = head.firstChild;
+    const row = fill(make("tr"), entry.cells.map(makeCell)), head = row.cells[nameColumn], name = head.firstChild;
     head.scope = "row";
     name.className = "name";
-    entry.button = fill(make("button", "", "unfold"), [name]);
-    entry.button.addEventListener("click", () => {
-      current = entry;
-      unfold(entry, !entry.open);
+    const button = fill(make("button", "", { className: "unfold", ariaExpanded: "false" }), [name]);
+    button.addEventListener("click", () => {
+      entry.isOpen = !entry.isOpen;
+      entry.detailRow ??= makeDetailRow(entry);
+      if (entry.isOpen) row.after(entry.detailRow);
+      else entry.detailRow.remove();
+      button.ariaExpanded = String(entry.isOpen);
     });
-    head.prepend(entry.button);
-    return entry.row;
+    head.prepend(button);
+    return row;
   };
 
   const listTable = make("table", "", "list"), headRow = listTable.createTHead().insertRow();
   const body = listTable.createTBody();
-  const heads = columns.map(([title, kind, group, minScreenSize], column) => {
-    const button = make("button", title);
-    button.addEventListener("click", () => sort(column));
-    return fill(make("th", "", { className: classes(kind, minScreenSize, group), scope: "col", ariaSort: "none" }), [button]);
+  const heads = columns.map((column, index) => {
+    const button = make("button", column[0]);
+    button.addEventListener("click", () => sort(index));
+    return fill(make("th", "", { className: classes(column), scope: "col", ariaSort: "none" }), [button]);
   });
   headRow.append(...heads);
 
   const draw = () => {
-    for (const entry of entries) entry.row = null;
-    const shown = matches.slice(firstShown, firstShown + size);
-    body.replaceChildren(...shown.map(makeRow));
-    for (const entry of shown) unfold(entry, entry.open);
-    const last = Math.ceil(matches.length / size);
-    query(".pager").hidden = last < 2;
-    $("place").textContent = `${nouns[1][0].toUpperCase()}${nouns[1].slice(1)} ${firstShown + 1} to ${firstShown + shown.length} of ${matches.length}`;
-    $("back").disabled = firstShown === 0;
-    $("on").disabled = firstShown + size >= matches.length;
-    fit();
-  };
-
-  const fit = () => {
-    frame.classList.remove("wide");
-    const isWide = listTable.scrollWidth > frame.clientWidth;
-    frame.classList.toggle("wide", isWide);
-    // the keyboard must reach a region that scrolls
-    frame.tabIndex = isWide ? 0 : -1;
-    frame.style.setProperty("--width", `${frame.clientWidth}px`);
+    body.replaceChildren(...matches.slice(0, shownCount).flatMap((entry) => {
+      entry.row ??= makeRow(entry);
+      return entry.isOpen ? [entry.row, entry.detailRow] : [entry.row];
+    }));
+    $("more").hidden = shownCount >= matches.length;
   };
 
   const sort = (column) => {
     const isAscending = heads[column].ariaSort !== "ascending", sign = isAscending ? 1 : -1;
     for (const head of heads) head.ariaSort = "none";
     heads[column].ariaSort = isAscending ? "ascending" : "descending";
-    order = order.slice().sort((one, other) => {
+    order = order.toSorted((one, other) => {
       const a = one.values[column], b = other.values[column];
       // rows without a value are last in both sort directions
       if (a === null || b === null) return (a === null) - (b === null);
@@ -194,70 +161,25 @@
   };
 
   const filter = () => {
-    const searched = fold($("text").value).split(/\s+/).filter(Boolean);
+    const searched = fold($("text").value).split(/\s+/);
     const tags = selects.map((select) => select.value).filter(Boolean);
-    matches = order.filter((entry) => tags.every((tag) => entry.tags.has(tag))
+    matches = order.filter((entry) => tags.every((tag) => entry.tags.includes(tag))
       && searched.every((word) => entry.searchText.includes(word)));
-    firstShown = 0;
+    shownCount = size;
     query(".count").textContent = `Showing ${matches.length} of ${entries.length}`;
-    query(".none").hidden = matches.length > 0;
-    $("all").hidden = matches.length === entries.length;
     draw();
   };
 
-  const groups = () => {
-    for (const box of shownGroups) listTable.classList.toggle(`with-${box.dataset.group}`, box.checked);
-    fit();
-  };
-
-  const goTo = (to) => {
-    firstShown = to;
-    draw();
-    frame.scrollIntoView({ block: "start" });
-  };
-
-  /* Turn to the page of a row and unfold its details, and fold those of the previous row */
-  const show = (entry) => {
-    const place = matches.indexOf(entry);
-    if (current && current !== entry) unfold(current, false);
-    current = entry;
-    entry.open = true;
-    const start = place - place % size;
-    if (start !== firstShown) {
-      firstShown = start;
-      draw();
-    } else unfold(entry, true);
-    entry.button.focus({ preventScroll: true });
-    entry.row.scrollIntoView({ block: "start" });
-  };
-
-  const step = (by) => {
-    const place = matches.indexOf(current);
-    const next = matches[place < 0 ? (by > 0 ? firstShown : firstShown - 1) : place + by];
-    if (next) show(next);
-  };
-
-  const KEYS = {
-    n: () => step(1), p: () => step(-1),
-    "/": () => $("text").focus(),
-    Escape: () => {
-      if (current) unfold(current, false);
-      if (current?.row) current.button.focus();
-    },
-  };
-
-  document.addEventListener("keydown", (event) => {
-    const busy = event.target.closest("input, select, textarea") && event.key !== "Escape";
-    if (busy || event.ctrlKey || event.metaKey || event.altKey || !KEYS[event.key]) return;
-    event.preventDefault();
-    KEYS[event.key]();
-  });
   query(".controls").addEventListener("submit", (event) => event.preventDefault());
   addEventListener("beforeunload", (event) => hasUnsavedInput && event.preventDefault());
   $("text").addEventListener("input", filter);
   onClick("all", () => {
     for (const field of [$("text"), ...selects]) field.value = "";
     filter();
+  });
+  onClick("more", () => {
+    shownCount += size;
+    draw();
   });
   onClick("save", () => {
     const link = make("a", "", { download: "overrides.csv",
@@ -266,16 +188,10 @@
     hasUnsavedInput = false;
     URL.revokeObjectURL(link.href);
   });
-  onClick("back", () => goTo(Math.max(firstShown - size, 0)));
-  onClick("on", () => goTo(firstShown + size));
   for (const select of selects) select.addEventListener("change", filter);
-  for (const box of shownGroups) {
-    box.checked = false;
-    box.addEventListener("change", groups);
+  for (const box of queryAll("[data-group]")) {
+    box.addEventListener("change", () => listTable.classList.toggle(`with-${box.dataset.group}`, box.checked));
   }
-  addEventListener("resize", fit);
-  for (const node of queryAll(".controls, .keys")) node.hidden = false;
-  frame.prepend(listTable);
+  query(".frame").prepend(listTable);
   filter();
-  groups();
 })();

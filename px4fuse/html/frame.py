@@ -25,14 +25,14 @@ class Column(NamedTuple):
         Type of the cells. "name" unfolds the row; "rank" sorts texts by a number.
     group : str
         Check box that shows or hides the column; "" if it is always shown.
-    min_screen_size : str
-        Smallest screen size on which the column is shown.
+    is_on_phones : bool
+        False if the column is hidden on small screens.
     """
 
     title: str
     kind: Literal["text", "name", "full", "line", "number", "rank", "ratio"] = "text"
     group: str = ""
-    min_screen_size: Literal["always", "tablet", "desk"] = "always"
+    is_on_phones: bool = True
 
 
 class Cell(NamedTuple):
@@ -124,6 +124,10 @@ def make_input_boxes_section(
     return ["boxes", title, student_id, rows, rows_without_boxes]
 
 
+def _omit_empty(sections: Sequence[RowDetailsSection]) -> list[RowDetailsSection]:
+    return [section for section in sections if section[2]]
+
+
 # ------------------------------------------------------------------ the page
 
 
@@ -132,7 +136,7 @@ def page(
     title: str,
     subtitle: str,
     html_above_table: str = "",
-    row_nouns: tuple[str, str],
+    rows_name: str,
     columns: Sequence[Column],
     rows: Sequence[Row],
     filters: Sequence[tuple[str, Sequence[tuple[str, str]]]],
@@ -145,8 +149,8 @@ def page(
 
     Parameters
     ----------
-    row_nouns : (str, str)
-        Name of a row, singular and plural.
+    rows_name : str
+        Name of the rows (plural).
     filters : sequence of (label, ((tag, text), ...))
         Drop-down lists that filter rows by a tag.
     column_groups : sequence of (group, label)
@@ -163,18 +167,10 @@ def page(
     page_data = {
         "columns": columns,
         "rows": [
-            (
-                row.cells,
-                row.tags,
-                *(
-                    [section for section in column_sections if section[2]]
-                    for column_sections in (row.details, row.side_sections)
-                ),
-            )
+            (row.cells, row.tags, _omit_empty(row.details), _omit_empty(row.side_sections))
             for row in rows
         ],
         "size": MAX_PAGE_ROWS,
-        "nouns": row_nouns,
         "axis": sigma_ratio_axis or {},
     }
     return load_template("html/frame.html").render(
@@ -188,7 +184,7 @@ def page(
         placeholder=search_placeholder,
         filters=filters,
         groups=column_groups,
-        row_nouns=row_nouns,
+        rows_name=rows_name,
         full_table_note=full_table_note,
         content=encode_safe_json(clean_values(page_data)),
     )

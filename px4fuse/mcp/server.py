@@ -18,7 +18,6 @@ from mcp.server.mcpserver.prompts import Prompt
 from mcp.server.mcpserver.resources import FunctionResource
 from mcp.types import CallToolResult, TextContent, Tool
 
-from px4fuse.core.reading import hash_files
 from px4fuse.core.record import read_toml
 from px4fuse.core.text import one_line
 from px4fuse.core.workers import JobFailure, poll_with_limits
@@ -26,8 +25,6 @@ from px4fuse.errors import Px4FuseError
 from px4fuse.findings.model import FINDING_TITLES
 from px4fuse.results.contract import schema, to_json
 
-# Maximum number of cached tool results (5 to 100 kB each)
-MAX_CACHED_ANSWERS = 32
 # Interval (s) for reading the progress of an analysis
 POLL_INTERVAL_S = 0.05
 INSTRUCTIONS = (
@@ -44,8 +41,8 @@ GLOSSARY_FOLDERS = (Path(__file__).parent, Path(__file__).parents[2] / "docs")
 
 # Terminal output of a command, and results of the command or None
 CommandOutput = tuple[str, Any]
-# Function that converts the arguments of a tool to a command line and the list of its input files
-ParseArguments = Callable[[Mapping[str, Any]], tuple[list[str], list[Path]]]
+# Function that converts the arguments of a tool to a command line without ``px4fuse``
+ParseArguments = Callable[[Mapping[str, Any]], list[str]]
 
 
 # Title and text of each prompt, by name
@@ -82,7 +79,7 @@ class Server(MCPServer[Any]):
         )
         self._tools = {tool.name: (tool, parse) for tool, parse in tools}
         self._run_command, self._limits = run_command, (timeout_s, max_memory_bytes)
-        self._one_at_a_time, self._cache = anyio.Lock(), dict[tuple[str, ...], CommandOutput]()
+        self._one_at_a_time = anyio.Lock()
         self._add_resource("glossary", "Glossary", "text/markdown", _read_glossary)
         self._add_resource(
             "results", "JSON Schema of results", "application/json", lambda: to_json(schema())
@@ -112,12 +109,12 @@ class Server(MCPServer[Any]):
         tool, parse = self._tools[name]
         try:
             jsonschema.validate(arguments, tool.input_schema)
-            command_words, files = parse(arguments)
+            command_words = parse(arguments)
             if tool.output_schema is None:
                 text, results = self._run_command(None, command_words)
             else:
                 async with self._one_at_a_time:
-                    text, results = await self._analyse(command_words, files, context)
+                    text, results = await self._analyse(command_words, context)
         except jsonschema.ValidationError as error:
             argument_path = error.json_path.replace("$", name, 1)
             raise ToolError(f"{argument_path}: {one_line(error.message, 300)}.") from error
@@ -128,12 +125,7 @@ class Server(MCPServer[Any]):
             structured_content=results,
         )
 
-    async def _analyse(
-        self, command_words: list[str], files: list[Path], context: Any
-    ) -> CommandOutput:
-        cache_key = await _make_cache_key(command_words, files)
-        if cache_key in self._cache:
-            return self._cache[cache_key]
+    async def _analyse(self, command_words: list[str], context: Any) -> CommandOutput:
         receiver, sender = Pipe(duplex=False)
         job_results = poll_with_limits(
             partial(self._run_command, sender), [command_words], 1, *self._limits, max_wait_s=0.0
@@ -150,11 +142,6 @@ class Server(MCPServer[Any]):
         _, result = outcome
         if isinstance(result, JobFailure):
             raise Px4FuseError(result.reason)
-        # do not cache the result if a file changed during the analysis
-        if cache_key is not None and cache_key == await _make_cache_key(command_words, files):
-            self._cache[cache_key] = result
-            if len(self._cache) > MAX_CACHED_ANSWERS:
-                del self._cache[next(iter(self._cache))]
         return result
 
     def _add_resource(
@@ -179,12 +166,3 @@ def _make_prompt(name: str, title: str, text: str) -> Prompt:
 def _read_glossary() -> str:
     paths = (folder / "glossary.md" for folder in GLOSSARY_FOLDERS)
     return next(path for path in paths if path.exists()).read_text(encoding="utf-8")
-
-
-async def _make_cache_key(
-    command_words: Sequence[str], files: Sequence[Path]
-) -> tuple[str, ...] | None:
-    """Return the command line and the SHA-256 of the input files; None if an input is a folder."""
-    if any(file.is_dir() for file in files):
-        return None
-    return (*command_words, *await anyio.to_thread.run_sync(hash_files, files))

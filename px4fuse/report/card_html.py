@@ -4,11 +4,18 @@ from collections.abc import Sequence
 
 from px4fuse.analysis import Analysis
 from px4fuse.card.build import build_card, describe_axis
-from px4fuse.card.model import RATIO_AXIS_TICKS, Card, Verdict, map_ratio_to_axis
+from px4fuse.card.model import (
+    RATIO_AXIS_ENDS,
+    RATIO_AXIS_TICKS,
+    Card,
+    Verdict,
+    map_ratio_to_axis,
+)
 from px4fuse.card.verdicts import make_sigma_verdicts
 from px4fuse.comparison.model import FILTER_NAMES
 from px4fuse.core.text import format_ratio
 from px4fuse.errors import SettingsError
+from px4fuse.filter.consistency import CONSISTENT_SIGMA_RATIOS
 from px4fuse.html.safe import load_template, read_asset
 from px4fuse.report.card_text import (
     LABELLED_RATIO_TICKS,
@@ -30,6 +37,12 @@ MARKER_SVG_PATHS = {
     "truth": "M-6.5 0L0-6.5L6.5 0L0 6.5z",
     "below": "M5-7L-7 0L5 7z",
     "above": "M-5-7L7 0L-5 7z",
+}
+# Axis of σ ratios, for the scripts of web pages
+SIGMA_RATIO_AXIS = {
+    "bands": CONSISTENT_SIGMA_RATIOS,
+    "ends": RATIO_AXIS_ENDS,
+    "marks": MARKER_SVG_PATHS,
 }
 SCREEN_READER_QUANTITIES = {
     "source": "innovation over root S",

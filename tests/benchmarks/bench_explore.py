@@ -23,7 +23,7 @@ SCRIPT = """(async () => {
   for (let move = 0; move < 60; move++) {
     await frame();
     await frame();
-    slider.value = 150 + 5 * move;
+    slider.value = Number(slider.min) + (slider.max - slider.min) * (0.25 + move / 120);
     let start = performance.now();
     slider.dispatchEvent(new Event("input"));
     await frame();
