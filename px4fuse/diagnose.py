@@ -41,7 +41,6 @@ from px4fuse.comparison.preparation import (
 )
 from px4fuse.comparison.remedy import estimate_ekf2_parameters
 from px4fuse.comparison.reruns import Reruns, list_rerun_configurations, rerun_filters
-from px4fuse.convention.correction import find_convention_faults
 from px4fuse.core.memory import release_free_memory
 from px4fuse.core.reading import display_name
 from px4fuse.ekf2.aids import evaluate_aids
@@ -191,12 +190,12 @@ def refine_delay(comparison: Comparison, clock_offset: ClockOffset | Unavailable
         return comparison
     # The delay is the negative time offset
     refined_convention = structs.replace(comparison.convention, late_s=-clock_offset.offset_s)
+    refined_comparison = replace(comparison, convention=refined_convention)
     # Keep the first estimate if the refined delay is too small to be a fault
-    is_delay_a_fault = all(
-        find_convention_faults(convention, comparison.flight, comparison.source.frame).late_s != 0.0
-        for convention in (comparison.convention, refined_convention)
+    is_delay_a_fault = (
+        comparison.convention_faults.late_s and refined_comparison.convention_faults.late_s
     )
-    return replace(comparison, convention=refined_convention) if is_delay_a_fault else comparison
+    return refined_comparison if is_delay_a_fault else comparison
 
 
 def read_flight(request: ComparisonRequest, progress: Progress = ignore_progress) -> Flight:

@@ -8,7 +8,6 @@ import numpy as np
 
 from px4fuse.comparison.estimates import TuningByAxis, find_first_tuning
 from px4fuse.comparison.model import Comparison, PreparedComparison
-from px4fuse.convention.correction import find_convention_faults
 from px4fuse.ekf2.inputs import ReplayInputs
 from px4fuse.ekf2.model import Ekf2Model, replay_with_settings
 from px4fuse.ekf2.replay import rows_inside
@@ -39,11 +38,10 @@ def estimate_gnss_delay_ms(
     that GNSS is compared with was not checked, or has a wrong convention or time offset.
     """
     received_positions, vision = model.inputs.received_positions, model.inputs.vision_positions
-    convention, flight, source = comparison.convention, comparison.flight, comparison.source
     if (
         vision is None
-        or source.name != vision.source
-        or find_convention_faults(convention, flight, source.frame)
+        or comparison.source.name != vision.source
+        or comparison.convention_faults
         or _find_differing_delay_ms(comparison, clock_offset, model.inputs.settings[EV_POS.delay])
         is not None
         or received_positions.velocity_m_s is None
@@ -151,22 +149,17 @@ def estimate_differing_delay_ms(
 
     A time offset from the user (--clock-offset) is kept if it is within the 95 % interval.
     """
-    offset_s, applied_s, source = clock_offset.offset_s, clock_offset.applied_s, comparison.source
+    offset_s, applied_s = clock_offset.offset_s, clock_offset.applied_s
     low_s, high_s = clock_offset.interval_s
     if (
         applied_s
         and low_s <= applied_s <= high_s
-        and not find_convention_faults(
-            comparison.convention, comparison.flight, source.frame
-        ).late_s  # px4fuse applied this offset itself
+        and not comparison.convention_faults.late_s  # px4fuse applied this offset itself
     ):
         offset_s = applied_s
-    estimated_delay_ms = 1e3 * (source.assumed_delay_s - offset_s)
-    return (
-        estimated_delay_ms
-        if clock_offset.is_significant(1e-3 * (logged_delay_ms - estimated_delay_ms))
-        else None
-    )
+    estimated_delay_ms = 1e3 * (comparison.source.assumed_delay_s - offset_s)
+    is_significant = clock_offset.is_significant(1e-3 * (logged_delay_ms - estimated_delay_ms))
+    return estimated_delay_ms if is_significant else None
 
 
 def describe_delay_limit(

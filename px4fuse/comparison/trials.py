@@ -237,10 +237,11 @@ def compare_sigma_ratios(trial: Trial) -> list[tuple[Reference, float, float]]:
     ]
 
 
-def becomes_consistent(trial: Trial) -> bool:
-    """Return True if a re-run makes an inconsistent filter consistent."""
+def becomes_consistent(trial: Trial, tested_reference: Reference | None = None) -> bool:
+    """Return True if a re-run makes an inconsistent filter consistent, against any reference."""
     return any(
-        classify_sigma_ratio(ratio_before, reference) != "consistent"
+        tested_reference in (None, reference)
+        and classify_sigma_ratio(ratio_before, reference) != "consistent"
         and classify_sigma_ratio(ratio_after, reference) == "consistent"
         for reference, ratio_before, ratio_after in compare_sigma_ratios(trial)
     )

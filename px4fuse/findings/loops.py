@@ -1,7 +1,6 @@
 """Faults of loop closures: contradictions to odometry, and wrong assumptions about the loop."""
 
 from px4fuse.analysis import Analysis
-from px4fuse.convention.correction import find_convention_faults
 from px4fuse.finding import Finding
 from px4fuse.findings.model import Findings, make_error, make_note, make_warning
 from px4fuse.loop.model import LANDING_CLOSURE_SOURCE, Closure, Loop
@@ -24,7 +23,7 @@ def find_usable_loop(analysis: Analysis) -> Loop | None:
 
     A loop closure then deforms the path, for example if the orientation has a wrong heading.
     """
-    faults = find_convention_faults(analysis.convention, analysis.flight, analysis.source.frame)
+    faults = analysis.convention_faults
     if faults.orientation or faults.has_wrong_axes or faults.has_wrong_unit or faults.is_ambiguous:
         return None
     return analysis.loop if isinstance(analysis.loop, Loop) else None
