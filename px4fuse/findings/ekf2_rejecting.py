@@ -44,8 +44,7 @@ def _detect_small_gate(analysis: Analysis, rejection_findings: tuple[Finding, ..
                 "ekf2_gate_too_small",
                 f"{aid.gate} {ekf2.gate:g} is too small: EKF2 rejects "
                 f"{format_percent(rejected_fraction)} of the positions. Without any fault, this "
-                f"gate rejects {format_percent(expected_rejected_fraction)} of the positions. "
-                "Rejected positions do not correct EKF2.",
+                f"gate rejects {format_percent(expected_rejected_fraction)} of the positions.",
                 f"Set {aid.gate} to {aid.default_gate:g} (PX4's default, in multiples of √S).",
                 {"gate": ekf2.gate, "rejected_by_gate": expected_rejected_fraction},
             )
@@ -54,12 +53,12 @@ def _detect_small_gate(analysis: Analysis, rejection_findings: tuple[Finding, ..
 def _detect_rejections(analysis: Analysis) -> Findings:
     ekf2, down_comparison = analysis.flight.ekf2, analysis.axes.get("down")
     # EKF2 rejects north and east together, so one horizontal axis is sufficient
-    for result in (
-        analysis.main,
-        *([down_comparison] if down_comparison and down_comparison is not analysis.main else []),
-    ):
+    results = [analysis.main]
+    if down_comparison is not None and down_comparison is not analysis.main:
+        results.append(down_comparison)
+    for result in results:
         innovations = result.ekf2_innovations
-        if isinstance(innovations, Unavailable) or not isinstance(ekf2, Ekf2):
+        if isinstance(innovations, Unavailable) or isinstance(ekf2, Unavailable):
             continue
         rejected_flags = innovations["rejected"].dropna()
         rejected_fraction = float(rejected_flags.mean())  # NaN without logged flags
@@ -95,14 +94,11 @@ def _find_rejection_remedy(analysis: Analysis, result: AxisComparison) -> str:
 
 
 def _prevents_rejections(trial: Trial) -> bool:
-    rejected_before, rejected_after = trial.before.rejected_fraction, trial.after.rejected_fraction
-    if (
-        rejected_before is None
-        or rejected_after is None
-        or classify_improvement(trial) == "nothing"
-    ):
-        return False
+    before, after = trial.before.rejected_fraction, trial.after.rejected_fraction
     return (
-        len(trial.kinds) == 1
-        and rejected_after < MAX_REJECTED_AFTER_TO_BEFORE_RATIO * rejected_before
+        before is not None
+        and after is not None
+        and len(trial.kinds) == 1
+        and classify_improvement(trial) != "nothing"
+        and after < MAX_REJECTED_AFTER_TO_BEFORE_RATIO * before
     )

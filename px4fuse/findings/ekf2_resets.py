@@ -1,6 +1,7 @@
 """Resets of EKF2's position, and changes of the primary EKF2 instance."""
 
-import numpy as np
+import math
+
 import pandas as pd
 
 from px4fuse.analysis import Analysis
@@ -30,7 +31,7 @@ def detect(analysis: Analysis) -> Findings:
     if not isinstance(ekf2, Ekf2):
         return
     # Resets up to the start of fusion are normal
-    fusion_start_s = -np.inf
+    fusion_start_s = -math.inf
     if isinstance(ekf2.fusion_flags, pd.DataFrame):
         is_fused = ekf2.fusion_flags["horizontal"] > 0.0
         fusion_start_s = is_fused.index[is_fused].min() + MAX_FUSION_START_TO_RESET_S
@@ -45,34 +46,31 @@ def detect(analysis: Analysis) -> Findings:
     ]
     if position_resets:
         horizontal_resets = [reset for reset in position_resets if any(reset.delta[:2])]
-        reported_resets = horizontal_resets or position_resets
-        sizes_m = [float(np.linalg.norm(reset.delta)) for reset in reported_resets]
+        resets = horizontal_resets or position_resets
         follows_gap = all(
             any(
                 start <= reset.time_s <= end + MAX_RESET_DELAY_S
                 for start, end in analysis.events.gaps
             )
-            for reset in reported_resets
+            for reset in resets
         )
-        largest_reset_time_s = reported_resets[int(np.argmax(sizes_m))].time_s
-        _, reset_statement = remove_origin_resets(ekf2, analysis.source, analysis.segment)
-        if reset_statement:
-            reset_statement = f" Treatment in the comparison: {reset_statement}."
+        largest_reset = max(resets, key=lambda reset: math.hypot(*reset.delta))
+        largest_m, time_s = math.hypot(*largest_reset.delta), largest_reset.time_s
+        _, treatment = remove_origin_resets(ekf2, analysis.source, analysis.segment)
         yield finding(
             "warning" if horizontal_resets else "note",
             "ekf2_resets",
             f"EKF2 reset its {'horizontal position' if horizontal_resets else 'height'} "
-            f"{format_count(len(sizes_m))} (largest reset: {max(sizes_m):.2f} m at "
-            f"{largest_reset_time_s:.1f} s).{reset_statement}",
-            "Run px4fuse explore LOG and compare position and innovation at "
-            f"{largest_reset_time_s:.1f} s.",
+            f"{format_count(len(resets))} (largest reset: {largest_m:.2f} m at {time_s:.1f} s)."
+            f"{f' Treatment in the comparison: {treatment}.' if treatment else ''}",
+            f"Run px4fuse explore LOG and compare position and innovation at {time_s:.1f} s.",
             {
-                "count": len(sizes_m),
-                "largest_m": max(sizes_m),
-                "at_s": largest_reset_time_s,
+                "count": len(resets),
+                "largest_m": largest_m,
+                "at_s": time_s,
                 CAUSE_KEY: SOURCE_GAP_CAUSE if follows_gap else UNKNOWN_CAUSE,
             },
-            make_zero_length_spans(reset.time_s for reset in reported_resets),
+            make_zero_length_spans(reset.time_s for reset in resets),
         )
     yield from detect_instance_switches(ekf2, (segment.start_s, segment.end_s))
 
@@ -86,7 +84,7 @@ def detect_instance_switches(ekf2: Ekf2, span_s: Span) -> Findings:
             f"The primary EKF2 instance changed {format_count(len(switch_times_s))}, first at "
             f"{switch_times_s[0]:.1f} s. The comparison uses the primary instance at each time.",
             "Compare vibration and clipping of the IMUs (vehicle_imu_status). For a lab flight set "
-            "EKF2_MULTI_IMU to 1, so that EKF2 uses only one IMU.",
+            "EKF2_MULTI_IMU to 1: EKF2 then uses one IMU.",
             {"count": len(switch_times_s), "at_s": switch_times_s[0]},
             make_zero_length_spans(switch_times_s),
         )

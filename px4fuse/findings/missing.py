@@ -44,25 +44,21 @@ def detect_unavailable_data(analysis: Analysis) -> Findings:
 
 def detect_source_not_logged(analysis: PreparedComparison) -> Findings:
     """Detect that the log lacks the positions which PX4 received."""
-    source, rank_as_received = analysis.source, AS_RECEIVED_ORIGIN.find_preference_rank()
-    has_positions_as_received = any(
+    source, parameters = analysis.source, analysis.flight.log.parameters
+    rank_as_received = AS_RECEIVED_ORIGIN.find_preference_rank()
+    if source.origin.has_all_samples or any(
         track.origin.find_preference_rank() == rank_as_received
         for track in analysis.flight.positions
-    )
-    if source.origin.has_all_samples or has_positions_as_received:
+    ):
         return
-    rate_hz, parameters = source.compute_rate_hz(), analysis.flight.log.parameters
+    rate_hz = source.compute_rate_hz()
     sdlog_profile = int(parameters.get("SDLOG_PROFILE", DEFAULT_SDLOG_PROFILE))
-    reasons = (
-        missing_data.reason
-        for missing_data in analysis.missing
-        if missing_data.source == VISION_TOPIC
-    )
+    reason_by_source = {item.source: item.reason for item in reversed(analysis.missing)}
+    reason = reason_by_source.get(VISION_TOPIC, f"{VISION_TOPIC} is not in this log")
     yield make_warning(
         "source_not_logged",
-        f"The log lacks the {positions_phrase(source)} as PX4 received them. Reason: "
-        f"{next(reasons, f'{VISION_TOPIC} is not in this log')}. px4fuse uses {source.name} "
-        f"({source.description}) at {rate_hz:.1f} Hz instead.",
+        f"The log lacks the {positions_phrase(source)} as PX4 received them. Reason: {reason}. "
+        f"px4fuse uses {source.name} ({source.description}) at {rate_hz:.1f} Hz instead.",
         f"Set SDLOG_PROFILE to {sdlog_profile | VISION_PROFILE_MASK} (bit 7: vision topics) and "
         "fly again.",
         {"rate_hz": rate_hz, "sdlog_profile": sdlog_profile},
