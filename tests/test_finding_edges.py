@@ -45,8 +45,8 @@ from px4fuse.filter.hypotheses import Estimate, SystematicErrors
 from px4fuse.filter.settings import Settings
 from px4fuse.filter.signals import Segment
 from px4fuse.filter.tuning import NoiseEstimate
+from px4fuse.finding import Finding
 from px4fuse.findings import (
-    Finding,
     ekf2_not_fusing,
     ekf2_rejecting,
     ekf2_resets,
@@ -60,7 +60,6 @@ from px4fuse.findings import (
     source_noise,
     source_positions,
     source_stamps,
-    split_cause_groups,
 )
 from px4fuse.findings.cause_grouping import SOURCE_GAP_CAUSE, UNKNOWN_CAUSE
 from px4fuse.findings.model import (
@@ -68,6 +67,7 @@ from px4fuse.findings.model import (
     compute_flag_fraction,
     find_spans_with_value,
     make_zero_length_spans,
+    split_cause_groups,
 )
 from px4fuse.flight.model import (
     ALIGNED_BY_EKF2_ORIGIN,

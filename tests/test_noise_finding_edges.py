@@ -93,8 +93,11 @@ def test_severity_of_noise_setting_depends_on_error_factor(
     assert (off.severity, off.factor) == (expected[0], pytest.approx(expected[1], rel=0.01))
 
 
-UNTESTED_SIGMA_Z = noises.UNTESTED_ESTIMATE_ACTION.format(other="SIGMA_A")
-UNTESTED_SIGMA_A = noises.UNTESTED_ESTIMATE_ACTION.format(other="SIGMA_Z")
+UNTESTED_SIGMA_Z, UNTESTED_SIGMA_A = (
+    f"Do not change this setting alone: it is estimated together with {other}, and no re-run "
+    "confirmed the estimate."
+    for other in ("SIGMA_A", "SIGMA_Z")
+)
 SIGMA_A_TO_0_1, BOTH = {"sigma_a_m_s2": 0.1}, {"sigma_a_m_s2": 0.1, "sigma_z_m": 0.5}
 
 

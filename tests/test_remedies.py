@@ -25,7 +25,8 @@ from px4fuse.diagnose import analyse_comparison
 from px4fuse.ekf2.whatif import what_if
 from px4fuse.filter.settings import Settings
 from px4fuse.filter.tuning import AxisTuning, NoiseEstimate
-from px4fuse.findings import Finding, ekf2_rejecting, find, source_clock
+from px4fuse.finding import Finding
+from px4fuse.findings import ekf2_rejecting, find, source_clock
 from px4fuse.findings.cause_text import format_sender_action
 from px4fuse.flight.model import GNSS_ORIGIN
 from px4fuse.simulation.faults import parse_faults

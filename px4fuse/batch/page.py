@@ -24,7 +24,7 @@ from px4fuse.core.text import (
     join_first_names,
 )
 from px4fuse.filter.consistency import CONSISTENT_SIGMA_RATIOS
-from px4fuse.findings import finding_title
+from px4fuse.findings.model import finding_title
 from px4fuse.html import frame
 from px4fuse.html.frame import Cell, Column, Row, RowDetailsSection
 from px4fuse.html.safe import clean_text, load_template, make_relative_url

@@ -10,7 +10,7 @@ from px4fuse.analysis import Analysis
 from px4fuse.comparison.flight_events import find_airborne_spans
 from px4fuse.ekf2.aids import AidResult
 from px4fuse.filter.signals import Segment
-from px4fuse.finding import Finding, Severity
+from px4fuse.finding import Finding
 from px4fuse.findings import (
     aids,
     ekf2_noise,
@@ -36,21 +36,10 @@ from px4fuse.findings import (
     source_values,
 )
 from px4fuse.findings.cause_grouping import group_by_cause
-from px4fuse.findings.model import FINDING_TITLES, make_warning, split_cause_groups
+from px4fuse.findings.model import make_warning
 from px4fuse.flight.model import Ekf2, Flight
 from px4fuse.loop.model import Loop
 from px4fuse.readers.px4_positions import NO_FIX_ACTION
-
-__all__ = [
-    "FINDING_TITLES",
-    "Finding",
-    "Severity",
-    "find",
-    "find_aid_findings",
-    "find_loop_findings",
-    "finding_title",
-    "split_cause_groups",
-]
 
 DETECTORS = (
     aids,
@@ -106,12 +95,3 @@ def find_aid_findings(
         )
         findings += ekf2_state.detect_missing_alignment(flight, segment)
     return group_by_cause(findings)
-
-
-def finding_title(finding_id: str) -> str:
-    """Return the title of a finding. If its id is unknown, return the id with blanks.
-
-    >>> finding_title("source_gap"), finding_title("of_a_later_version")
-    ('Gap in the position source', 'of a later version')
-    """
-    return FINDING_TITLES.get(finding_id, finding_id.replace("_", " "))

@@ -80,7 +80,7 @@ def measure_imu_at_rest(flight: Flight) -> pd.Series | None:
     stds = windows.std()
     is_rate_constant = np.linalg.norm(stds[Columns.ANGULAR_RATE], axis=1) < MAX_RATE_STD_AT_REST
     is_force_constant = np.linalg.norm(stds[Columns.SPECIFIC_FORCE], axis=1) < MAX_FORCE_STD_AT_REST
-    means = windows.mean()[is_rate_constant & is_force_constant]
+    means: pd.DataFrame = windows.mean()[is_rate_constant & is_force_constant]
     rates_rad_s = means[Columns.ANGULAR_RATE]
     if means.empty or np.ptp(rates_rad_s, axis=0).max() > MAX_RATE_CHANGE_AT_REST_RAD_S:
         return None

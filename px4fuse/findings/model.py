@@ -52,6 +52,15 @@ FINDING_GROUPS = ("position source", "time", "IMU", "tuning", "EKF2", "loops", "
 FINDING_TITLES: Mapping[str, str] = {name: entry.title for name, entry in FINDING_CATALOGUE.items()}
 
 
+def finding_title(finding_id: str) -> str:
+    """Return the title of a finding. If its id is unknown, return the id with blanks.
+
+    >>> finding_title("source_gap"), finding_title("of_a_later_version")
+    ('Gap in the position source', 'of a later version')
+    """
+    return FINDING_TITLES.get(finding_id, finding_id.replace("_", " "))
+
+
 class FindingExample(Record):
     """Example of a finding, and its rates on simulated flights (tests/studies/rates.csv).
 

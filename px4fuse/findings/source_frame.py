@@ -127,7 +127,7 @@ def detect_misalignment(analysis: Analysis, heading_error: HeadingError) -> Find
         "error" if abs(rotation_deg) >= MIN_SEVERE_HEADING_ERROR_DEG else "warning",
         finding_id,
         f"{positions_phrase(analysis.source)} are rotated by {rotation_deg:+.0f}° relative to "
-        f"{reference} (± {1.96 * sigma_deg:.0f}°, 95 %; clockwise from above). The rotation is "
+        f"{reference}. The rotation (± {1.96 * sigma_deg:.0f}°, 95 %) is clockwise from above and "
         f"constant over the flight. {reason}",
         action,
         {"misalignment_deg": rotation_deg, "sigma_deg": sigma_deg},

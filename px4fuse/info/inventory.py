@@ -23,7 +23,8 @@ from px4fuse.filter.signals import (
     cut_to_segment,
     imu_and_attitude,
 )
-from px4fuse.findings import ekf2_not_fusing, finding_title, imu, missing, recording
+from px4fuse.findings import ekf2_not_fusing, imu, missing, recording
+from px4fuse.findings.model import finding_title
 from px4fuse.flight.model import (
     DIAGNOSIS_WITHHELD,
     DataSource,
