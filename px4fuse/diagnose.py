@@ -124,18 +124,16 @@ def _refine_clock_offset(flight: Flight, analysis: Analysis) -> Flight | None:
         or any(WRONG_CONVENTION_KEY in finding.evidence for finding in analysis.findings)
     ):
         return None
-    delay_text = (
-        f"{abs(clock_offset.offset_s):.3f} s {'late' if clock_offset.offset_s < 0 else 'early'}"
-    )
+    offset_s = clock_offset.offset_s
     alignment = structs.replace(
         alignment,
-        clock_offset_s=alignment.clock_offset_s + clock_offset.offset_s,
+        clock_offset_s=alignment.clock_offset_s + offset_s,
         clock_offset_sigma_s=clock_offset.sigma_s,
-        clock_reason=f"the offset was estimated with the IMU; EKF2's position is {delay_text} "
-        "compared with the IMU",
+        clock_reason="the offset was estimated with the IMU; EKF2's position is "
+        f"{abs(offset_s):.3f} s {'late' if offset_s < 0 else 'early'} compared with the IMU",
     )
     file_track, *other_tracks = flight.positions
-    shifted_track = replace(shift_clock(file_track, clock_offset.offset_s), alignment=alignment)
+    shifted_track = replace(shift_clock(file_track, offset_s), alignment=alignment)
     return replace(flight, positions=(shifted_track, *other_tracks))
 
 
@@ -258,16 +256,15 @@ def prepare_comparison(
             "State the offset (--clock-offset SECONDS), or omit --clock-offset.",
         )
     if not clock_offset.is_significant(clock_offset.remaining_s):
-        low_offset_s, high_offset_s = (
-            limit_s - clock_offset.applied_s for limit_s in clock_offset.interval_s
-        )
+        applied_s = clock_offset.applied_s
+        low_s, high_s = (limit_s - applied_s for limit_s in clock_offset.interval_s)
         notes = [
             *prepared_comparison.notes,
             f"--clock-offset auto: the time offset {clock_offset.remaining_s:+.3f} s (95 % "
-            f"{low_offset_s:+.3f} to {high_offset_s:+.3f} s) is not significant and not applied",
+            f"{low_s:+.3f} to {high_s:+.3f} s) is not significant and not applied",
         ]
-        if clock_offset.applied_s:
-            notes.append(f"the timestamps were shifted by {clock_offset.applied_s:+.3f} s")
+        if applied_s:
+            notes.append(f"the timestamps were shifted by {applied_s:+.3f} s")
         return replace(prepared_comparison, notes=tuple(notes))
     request = structs.replace(request, clock_offset_s=clock_offset.offset_s)
     return prepare_comparison_inputs(flight, request, keep_positions_as_sent=keep_positions_as_sent)

@@ -245,7 +245,7 @@ def detect_process_noise_near_zero(analysis: Analysis) -> Findings:
         yield make_error(
             "process_noise_near_zero",
             f"{title}: KF ignores new positions. {estimate_text}KF's position gain decreases to "
-            f"{gain:.2g}, so KF follows a position change in {time_constant_s:.0f} s.",
+            f"{gain:.2g}, so KF needs {time_constant_s:.0f} s to follow a change.",
             action,
             {"gain": gain, "response_s": time_constant_s, "axis": result.axis.name},
         )
