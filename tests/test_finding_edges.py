@@ -511,7 +511,7 @@ def test_misaligned_frame_report_contains_rotation_to_apply() -> None:
     finding = only(source_frame.detect, analysis(heading=heading_error(20.0, sigma_deg=2.0)))
     assert finding.id == "source_frame_misaligned"
     assert finding.title == "UWB positions are rotated by +20° relative to the IMU"
-    assert "± 4°; the rotation is clockwise" in finding.message
+    assert "The rotation (± 4°, 95 %) is clockwise" in finding.message
     assert "Rotate the positions by -20°" in finding.remedy
     aligned = source(name="estimator_visual_odometry_aligned")
     one = analysis(heading=heading_error(20.0), source=aligned)

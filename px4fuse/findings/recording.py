@@ -102,7 +102,8 @@ def detect_other_estimators(analysis: Analysis) -> Findings:
     if SIMULATED_EKF2_NOTE in log.notes:
         yield make_note(
             "ekf2_simulated",
-            "This log is simulated: px4fuse's model of EKF2 computed the EKF2 estimates, not PX4.",
+            "This log is simulated: px4fuse's own model of EKF2 computed the EKF2 estimates, not "
+            "PX4's code.",
             "To assess PX4's EKF2, analyse a real flight.",
         )
     if not isinstance(ekf2, Ekf2):

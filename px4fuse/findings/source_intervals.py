@@ -241,8 +241,8 @@ def detect_lost_samples(analysis: Analysis) -> Findings:
         yield make_note(
             "source_samples_lost",
             f"The recording lacks {format_percent(lost_fraction)} of the "
-            f"{positions_phrase(source)}: {lost_count} of {sent_count}, at one per "
-            f"{median_interval_s:.2f} s. EKF2 may have received them.",
+            f"{positions_phrase(source)}. {lost_count} of {sent_count} positions are missing (one "
+            f"per {median_interval_s:.2f} s is expected). EKF2 may have received them.",
             action,
             {"lost": lost_count, "lost_fraction": lost_fraction},
         )

@@ -62,8 +62,8 @@ def detect_jitter_and_speed_noise(analysis: Analysis, local_residuals: LocalResi
         yield (make_error if jitter_s >= MIN_JITTER_FOR_ERROR_S else make_warning)(
             "source_timestamp_jitter",
             f"The timestamps of the {positions_phrase(analysis.source)} jitter by "
-            f"{1e3 * jitter_s:.0f} ms (1 σ), although the positions are measured at a constant "
-            f"interval. At 1 m/s this is a position error of {format_metres(jitter_s)} m.",
+            f"{1e3 * jitter_s:.0f} ms (1 σ). The positions are measured at a constant interval. At "
+            f"1 m/s the jitter is a position error of {format_metres(jitter_s)} m.",
             "Send the time of measurement with each position, not the time of processing, sending "
             "or receiving.",
             {"jitter_s": jitter_s},

@@ -255,11 +255,13 @@ def detect_constant_coordinates(analysis: Analysis) -> Findings:
             make_finding = make_note
         action = f"{setting_action}, so that EKF2 does not fuse {coordinates_text}. "
     values_text = ", ".join(f"{values_m[each]:g}" for each in coordinates)
-    subject, verb = ("coordinate", "is") if is_single_coordinate else ("coordinates", "are")
+    subject, verb, pronoun = "coordinates", "are", "them"
+    if is_single_coordinate:
+        subject, verb, pronoun = "coordinate", "is", "it"
     yield make_finding(
         finding_id,
         f"The {subject} {coordinates_text} of {source.name} {verb} constant ({values_text} m): the "
-        f"source does not measure {coordinates_text}. {consequence}",
+        f"source does not measure {pronoun}. {consequence}",
         f"{action}Send NaN for a coordinate that is not measured.",
         {f"{each}_m": value for each, value in values_m.items()},
     )
@@ -575,8 +577,8 @@ def detect_little_motion(analysis: Analysis) -> Findings:
     if has_little_motion(analysis):
         yield make_warning(
             "no_motion",
-            f"The vehicle moved only {extent_m:.2f} m horizontally (5th to 95th percentile of the "
-            "positions). Velocity, heading and time offset cannot be estimated.",
+            f"The vehicle moved only {extent_m:.2f} m horizontally. Velocity, heading and time "
+            "offset cannot be estimated from positions of this range (5th to 95th percentile).",
             "Fly several passes of 5 m or more, with clear starts and stops.",
             {"range_m": extent_m}
             | ({CAUSE_KEY: VEHICLE_ON_GROUND_CAUSE} if analysis.flight.airborne == () else {}),

@@ -68,7 +68,8 @@ def detect(analysis: Analysis) -> Findings:
         yield from detect_constant_timestamps(positions_text, clock_map, clock_map.distinct_stamps)
     elif clock_map.method in METHODS_WITHOUT_MEASUREMENT_TIMES:
         kf_times_sentence = (
-            f"KF uses the timestamps of the messages, converted to boot time by {clock_map.method}."
+            "KF uses the timestamps of the messages, converted to boot time by the "
+            f"{clock_map.method}."
         )
         if clock_map.method == "arrival time":
             kf_times_sentence = "KF also uses arrival times: both tracks lag by the latency."
@@ -197,8 +198,8 @@ def detect_arrival_timestamps(analysis: Analysis) -> Findings:
     ):
         yield make_warning(
             "source_timestamps_are_arrival_times",
-            "Position timestamps are arrival times in the whole flight, late by the latency. The "
-            "source was never synchronised with the autopilot (TIMESYNC).",
+            "Position timestamps are arrival times in the whole flight. The source was never "
+            "synchronised with the autopilot (TIMESYNC), so positions are late by their latency.",
             ANSWER_TIMESYNC_ACTION,
             {"until_s": float(position_age_s.index[-1])},
         )
