@@ -36,14 +36,10 @@ from px4fuse.readers.px4_innovations import (
     replace_vision_by_gnss_innovations,
 )
 from px4fuse.readers.px4_positions import NO_FIX_ACTION
-from px4fuse.readers.px4_topics import ORIGIN_BY_TRACK_NAME, SOURCE_TRACKS
+from px4fuse.readers.px4_topics import SOURCE_TRACKS
 from px4fuse.request import ComparisonRequest, HeightName
 from px4fuse.trajectory.rotation import interpolate, to_matrix
 
-# Kind of sensor of each position source, by PX4 topic or MAVLink message
-ORIGIN_BY_SOURCE_NAME = ORIGIN_BY_TRACK_NAME | {
-    source.track_name: source.origin for source in POSITION_MESSAGE_TYPES
-}
 NO_SEPARATE_TRUTH = Unavailable(
     "ground truth",
     "KF uses the only ground truth in the log as its position source",
@@ -312,17 +308,7 @@ def _explain_choice(flight: Flight, track: PositionTrack) -> str:
     if track.origin.is_fused_as_gnss:
         return "the only position source in the log, fused by EKF2"
     log_text = f" (from {track.log})" if track.log and track.log != flight.log.name else ""
-    unusable_sources = [
-        missing.source
-        for missing in flight.missing
-        if missing.source in ORIGIN_BY_SOURCE_NAME
-        and ORIGIN_BY_SOURCE_NAME[missing.source].find_preference_rank()
-        < track.origin.find_preference_rank()
-    ]
-    if not unusable_sources:
-        return f"chosen automatically: positions as received by PX4{log_text}"
-    sources_text = ", ".join(unusable_sources)
-    return f"chosen automatically{log_text}; preferred sources are not usable: {sources_text}"
+    return f"chosen automatically: positions {track.origin.path}{log_text}"
 
 
 def shift_clock(track: PositionTrack, clock_offset_s: float) -> PositionTrack:
