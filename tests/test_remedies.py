@@ -26,7 +26,7 @@ from px4fuse.ekf2.whatif import what_if
 from px4fuse.filter.settings import Settings
 from px4fuse.filter.tuning import AxisTuning, NoiseEstimate
 from px4fuse.finding import Finding
-from px4fuse.findings import ekf2_rejecting, find, source_clock
+from px4fuse.findings import ekf2_settings, find, source_clock
 from px4fuse.findings.cause_text import format_sender_action
 from px4fuse.flight.model import GNSS_ORIGIN
 from px4fuse.simulation.faults import parse_faults
@@ -219,7 +219,7 @@ def test_ekf2_noise_advice_with_logged_variance_sets_noise_mode(sample: Analysis
 
 
 def only(name: str, analysis: Analysis) -> Finding:
-    found = (*ekf2_rejecting.detect(analysis), *source_clock.detect(analysis))
+    found = (*ekf2_settings.detect_rejections(analysis), *source_clock.detect(analysis))
     (finding,) = [each for each in found if each.id == name]
     return finding
 

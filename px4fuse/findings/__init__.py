@@ -13,17 +13,13 @@ from px4fuse.filter.signals import Segment
 from px4fuse.finding import Finding
 from px4fuse.findings import (
     aids,
-    ekf2_noise,
     ekf2_not_fusing,
-    ekf2_rejecting,
-    ekf2_resets,
+    ekf2_settings,
     ekf2_state,
     hidden_errors,
     imu,
     loops,
-    missing,
     noises,
-    parameters,
     recording,
     source_clock,
     source_convention,
@@ -43,17 +39,13 @@ from px4fuse.readers.px4_positions import NO_FIX_ACTION
 
 DETECTORS = (
     aids,
-    ekf2_noise,
     ekf2_not_fusing,
-    ekf2_rejecting,
-    ekf2_resets,
+    ekf2_settings,
     ekf2_state,
     hidden_errors,
     imu,
     loops,
-    missing,
     noises,
-    parameters,
     recording,
     source_clock,
     source_convention,
@@ -90,7 +82,7 @@ def find_aid_findings(
     if flight is not None and isinstance(flight.ekf2, Ekf2):
         spans_s = find_airborne_spans(flight) or ((0.0, flight.log.duration_s),)
         segment = Segment(spans_s[0][0], spans_s[-1][1], "")
-        findings += ekf2_resets.detect_instance_switches(
+        findings += ekf2_state.detect_instance_switches(
             flight.ekf2, (segment.start_s, segment.end_s)
         )
         findings += ekf2_state.detect_missing_alignment(flight, segment)

@@ -1,4 +1,4 @@
-"""IMU biases that EKF2 cannot estimate, and a tilt or heading that EKF2 did not align."""
+"""State of EKF2: resets, instance changes, biases that it cannot estimate, missing alignment."""
 
 import math
 
@@ -9,15 +9,22 @@ from scipy import constants
 from px4fuse.analysis import Analysis
 from px4fuse.comparison.flight_events import find_airborne_spans
 from px4fuse.comparison.model import ErrorsAgainstTruth
+from px4fuse.comparison.projection import remove_origin_resets
+from px4fuse.core.record import Span
 from px4fuse.core.text import format_metres
 from px4fuse.filter.signals import Segment, cut_to_segment
+from px4fuse.findings.cause_grouping import CAUSE_KEY, SOURCE_GAP_CAUSE, UNKNOWN_CAUSE
 from px4fuse.findings.model import (
     Findings,
     compute_flag_fraction,
     find_spans_with_value,
+    finding,
+    format_count,
     format_percent,
     magnetometer_advice,
     make_error,
+    make_warning,
+    make_zero_length_spans,
 )
 from px4fuse.flight.ekf2_parameters import BAROMETER, EV_CTRL_YAW_MASK, EV_POS, MAG
 from px4fuse.flight.model import (
@@ -26,6 +33,7 @@ from px4fuse.flight.model import (
     Ekf2,
     Flight,
     PositionTrack,
+    Reset,
     Unavailable,
     rows_between,
 )
@@ -54,12 +62,21 @@ MIN_GRAVITY_ERROR_M_S2 = 0.3
 MAX_UNALIGNED_FRACTION = 0.02
 # Maximum normal time (s) from tilt alignment to heading alignment
 MAX_HEADING_ALIGNMENT_DELAY_S = 5.0
+# Time (s) after take-off with normal height resets
+TAKE_OFF_DURATION_S = 10.0
+# Maximum time (s) from the end of a position gap to the EKF2 reset that it causes
+MAX_RESET_DELAY_S = 5.0
+# Maximum delay (s) of the normal reset at the start of fusion, because flags are logged at 1 Hz
+MAX_FUSION_START_TO_RESET_S = 1.0
 
 
 def detect(analysis: Analysis) -> Findings:
     ekf2 = analysis.flight.ekf2
     if not isinstance(ekf2, Ekf2):
         return
+    flight_segment = analysis.segment.whole_flight
+    yield from detect_resets(analysis, ekf2)
+    yield from detect_instance_switches(ekf2, (flight_segment.start_s, flight_segment.end_s))
     median_imu_at_rest = measure_imu_at_rest(analysis.flight)
     if not isinstance(ekf2.record, Unavailable):
         bias_states = cut_to_segment(ekf2.record.delayed, analysis.segment)
@@ -215,3 +232,72 @@ def _find_heading_action(flight: Flight, source: PositionTrack | None) -> str:
                 "orientation is missing or constant"
             )
     return f"{action} Alternatively, {alternative}."
+
+
+def detect_resets(analysis: Analysis, ekf2: Ekf2) -> Findings:
+    """Detect resets of EKF2's position and height, except normal ones at take-off."""
+    segment = analysis.segment.whole_flight
+    # Resets up to the start of fusion are normal
+    fusion_start_s = -math.inf
+    if isinstance(ekf2.fusion_flags, pd.DataFrame):
+        is_fused = ekf2.fusion_flags["horizontal"] > 0.0
+        fusion_start_s = is_fused.index[is_fused].min() + MAX_FUSION_START_TO_RESET_S
+    position_resets = [
+        reset
+        for reset in ekf2.resets
+        if segment.start_s < reset.time_s <= segment.end_s
+        and reset.quantity == "position"
+        and any(reset.delta)
+        and not _is_take_off_height_reset(analysis, reset)
+        and not reset.time_s <= fusion_start_s
+    ]
+    if position_resets:
+        horizontal_resets = [reset for reset in position_resets if any(reset.delta[:2])]
+        resets = horizontal_resets or position_resets
+        follows_gap = all(
+            any(
+                start <= reset.time_s <= end + MAX_RESET_DELAY_S
+                for start, end in analysis.events.gaps
+            )
+            for reset in resets
+        )
+        largest_reset = max(resets, key=lambda reset: math.hypot(*reset.delta))
+        largest_m, time_s = math.hypot(*largest_reset.delta), largest_reset.time_s
+        _, treatment = remove_origin_resets(ekf2, analysis.source, analysis.segment)
+        yield finding(
+            "warning" if horizontal_resets else "note",
+            "ekf2_resets",
+            f"EKF2 reset its {'horizontal position' if horizontal_resets else 'height'} "
+            f"{format_count(len(resets))} (largest reset: {largest_m:.2f} m at {time_s:.1f} s)."
+            f"{f' Treatment in the comparison: {treatment}.' if treatment else ''}",
+            f"Run px4fuse explore LOG and compare position and innovation at {time_s:.1f} s.",
+            {
+                "count": len(resets),
+                "largest_m": largest_m,
+                "at_s": time_s,
+                CAUSE_KEY: SOURCE_GAP_CAUSE if follows_gap else UNKNOWN_CAUSE,
+            },
+            make_zero_length_spans(reset.time_s for reset in resets),
+        )
+
+
+def detect_instance_switches(ekf2: Ekf2, span_s: Span) -> Findings:
+    """Detect changes of the primary EKF2 instance in a time span (s)."""
+    switch_times_s = [time for time, _ in ekf2.primary_instances if span_s[0] < time <= span_s[1]]
+    if switch_times_s:
+        yield make_warning(
+            "ekf2_instance_switch",
+            f"The primary EKF2 instance changed {format_count(len(switch_times_s))}, first at "
+            f"{switch_times_s[0]:.1f} s. The comparison uses the primary instance at each time.",
+            "Compare vibration and clipping of the IMUs (vehicle_imu_status). For a lab flight set "
+            "EKF2_MULTI_IMU to 1: EKF2 then uses one IMU.",
+            {"count": len(switch_times_s), "at_s": switch_times_s[0]},
+            make_zero_length_spans(switch_times_s),
+        )
+
+
+def _is_take_off_height_reset(analysis: Analysis, reset: Reset) -> bool:
+    return not any(reset.delta[:2]) and any(
+        start_s <= reset.time_s <= start_s + TAKE_OFF_DURATION_S
+        for start_s, _ in find_airborne_spans(analysis.flight)
+    )

@@ -15,8 +15,8 @@ from px4fuse.filter.hypotheses import (
 )
 from px4fuse.filter.signals import Segment, cut_to_segment, find_imu_gaps
 from px4fuse.finding import MIN_SPAN_S
-from px4fuse.findings.missing import DEFAULT_SDLOG_PROFILE, VISION_PROFILE_MASK
 from px4fuse.findings.model import Findings, finding, format_percent, make_error, make_warning
+from px4fuse.findings.recording import DEFAULT_SDLOG_PROFILE, VISION_PROFILE_MASK
 from px4fuse.flight.model import Columns, Ekf2, Flight, sample_rate
 
 # Maximum specific force (m/s²) of real sensors: 35 g, because the largest range is 32 g

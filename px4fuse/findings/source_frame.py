@@ -9,8 +9,8 @@ from px4fuse.comparison.remedy import find_aid, format_settings
 from px4fuse.core.text import lowercase_first_letter
 from px4fuse.filter.frame_rotation import HeadingError
 from px4fuse.finding import Finding
-from px4fuse.findings.ekf2_noise import find_confirmed_noise_trial
 from px4fuse.findings.ekf2_not_fusing import FUSED_FRACTION_FOR_ERROR
+from px4fuse.findings.ekf2_settings import find_confirmed_noise_trial
 from px4fuse.findings.model import (
     Findings,
     compute_flag_fraction,
