@@ -203,7 +203,9 @@ def collect_examples() -> dict[str, ExampleFlight]:
     aids = {"gnss_pos": log_with_outage, "baro_hgt": aid_log(sigma=1.5), "mag": aid_log(mean=-0.4),
             "mag_heading": log_with_innovation_change}  # fmt: skip
     aid_results = evaluate_aids(replace(flight, ekf2=replace(flight.ekf2, aids=aids)))
-    add_examples(find_aid_findings(aid_results), "simulated innovations of the aiding sources")
+    add_examples(
+        find_aid_findings(aid_results, flight), "simulated innovations of the aiding sources"
+    )
     add_examples(simulate_late_timestamps(), "a simulated flight with changed timestamps")
     for fault in FAULTS:
         if fault.id in example_by_id:

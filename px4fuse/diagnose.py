@@ -19,7 +19,7 @@ from typing import TypeVar
 from msgspec import structs
 
 from px4fuse.analysis import AidingSourceAnalysis, Analysis, WhatIfAnalysis
-from px4fuse.comparison.comparison import compare, run_kf
+from px4fuse.comparison.comparison import compare
 from px4fuse.comparison.difference_steps import (
     explain_ekf2_difference,
     find_corrected_noise_settings,
@@ -104,8 +104,7 @@ def _diagnose_flight(
         flight, request, progress, keep_positions_as_sent=keep_positions_as_sent
     )
     progress("running KF")
-    kf_runs = run_kf(prepared_comparison)
-    comparison = compare(prepared_comparison, kf_runs)
+    comparison = compare(prepared_comparison)
     return replace(analyse_comparison(comparison, progress), request=request)
 
 
@@ -359,7 +358,7 @@ def run_what_if(
         if ekf2_model.agreement.good and not flight.log.is_assessed:
             comparison_request = structs.replace(comparison_request, axes=("north", "east", AISLE))
             prepared_comparison = prepare_comparison_inputs(flight, comparison_request)
-            comparison = compare(prepared_comparison, run_kf(prepared_comparison))
+            comparison = compare(prepared_comparison)
     except MissingDataError:  # Without KF, only parameter changes from the user can be replayed
         if has_no_user_change:
             raise

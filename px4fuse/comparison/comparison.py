@@ -1,6 +1,5 @@
 """Comparison of KF, EKF2 and ground truth along each axis."""
 
-from collections.abc import Mapping
 from dataclasses import replace
 from typing import Any
 
@@ -44,16 +43,8 @@ VARIANCE_COLUMNS = ("position_variance_m2", "velocity_variance_m2_s2")
 INNOVATION_COLUMNS = ["innovation_m", "innovation_variance_m2"]
 
 
-def run_kf(prepared_comparison: PreparedComparison) -> dict[str, Replay]:
-    """Run KF along each axis, and return the results by axis name."""
-    return {
-        axis.name: replay(axis, prepared_comparison.settings)
-        for axis in prepared_comparison.input_axes
-    }
-
-
-def compare(prepared_comparison: PreparedComparison, kf_runs: Mapping[str, Replay]) -> Comparison:
-    """Compare KF with EKF2, and both with ground truth, along each axis."""
+def compare(prepared_comparison: PreparedComparison) -> Comparison:
+    """Run KF along each axis, and compare KF with EKF2, and both with ground truth."""
     notes, ekf2 = prepared_comparison.notes, prepared_comparison.flight.ekf2
     if isinstance(ekf2, Ekf2):
         state, note = projection.remove_origin_resets(
@@ -64,7 +55,8 @@ def compare(prepared_comparison: PreparedComparison, kf_runs: Mapping[str, Repla
             # The states at the fusion horizon still contain the resets, so they are not used
             ekf2 = replace(ekf2, state=state, aids={}, record=RECORD_NOT_LOGGED)
     axes = {
-        name: _compare_axis(prepared_comparison, ekf2, kf_run) for name, kf_run in kf_runs.items()
+        axis.name: _compare_axis(prepared_comparison, ekf2, axis)
+        for axis in prepared_comparison.input_axes
     }
     horizontal_axes = [axes[name] for name in ("north", "east") if name in axes]
     innovations: dict[FilterName, list[TableOrUnavailable]] = {
@@ -81,9 +73,10 @@ def compare(prepared_comparison: PreparedComparison, kf_runs: Mapping[str, Repla
 
 
 def _compare_axis(
-    prepared_comparison: PreparedComparison, ekf2: Ekf2 | Unavailable, kf_run: Replay
+    prepared_comparison: PreparedComparison, ekf2: Ekf2 | Unavailable, axis: Axis
 ) -> AxisComparison:
-    axis, segment, flight = kf_run.axis, prepared_comparison.segment, prepared_comparison.flight
+    segment, flight = prepared_comparison.segment, prepared_comparison.flight
+    kf_run = replay(axis, prepared_comparison.settings)
     tracks = project_tracks(ekf2, flight.truth, axis, segment)
     ekf2_state, ekf2_variance, truth = tracks.values()
     ekf2_errors = compute_error_statistics(ekf2_state, ekf2_variance, truth)

@@ -70,16 +70,14 @@ def find_loop_findings(loop: Loop) -> tuple[Finding, ...]:
     return () if loop.is_assessed else group_by_cause(loops.detect_loop_faults(loop))
 
 
-def find_aid_findings(
-    aid_results: Mapping[str, AidResult], flight: Flight | None = None
-) -> tuple[Finding, ...]:
+def find_aid_findings(aid_results: Mapping[str, AidResult], flight: Flight) -> tuple[Finding, ...]:
     """Return the findings on EKF2 and its aiding sources, for a flight without position source."""
     findings = list(aids.detect_aid_faults(aid_results))
-    for item in flight.missing if flight is not None else ():
+    for item in flight.missing:
         if item.remedy == NO_FIX_ACTION:
             message = f"The GNSS receiver had no position: {item.reason}."
             findings.append(make_warning("source_without_position", message, item.remedy))
-    if flight is not None and isinstance(flight.ekf2, Ekf2):
+    if isinstance(flight.ekf2, Ekf2):
         spans_s = find_airborne_spans(flight) or ((0.0, flight.log.duration_s),)
         segment = Segment(spans_s[0][0], spans_s[-1][1], "")
         findings += ekf2_state.detect_instance_switches(
