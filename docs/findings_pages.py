@@ -44,16 +44,15 @@ from px4fuse.diagnose import analyse_comparison  # noqa: E402
 from px4fuse.ekf2.aids import evaluate_aids  # noqa: E402
 from px4fuse.filter.frame_rotation import HeadingPart, combine_heading_parts  # noqa: E402
 from px4fuse.filter.settings import Settings  # noqa: E402
-from px4fuse.findings import (  # noqa: E402
-    FINDING_TITLES,
-    Finding,
-    find,
-    find_aid_findings,
-    find_loop_findings,
-    source_frame,
-)
+from px4fuse.finding import Finding  # noqa: E402
+from px4fuse.findings import find, find_aid_findings, find_loop_findings, source_frame  # noqa: E402
 from px4fuse.findings.cause_grouping import EFFECTS_BY_CAUSE, find_effect_ids  # noqa: E402
-from px4fuse.findings.model import FINDING_CATALOGUE, FINDING_GROUPS, load_examples  # noqa: E402
+from px4fuse.findings.model import (  # noqa: E402
+    FINDING_CATALOGUE,
+    FINDING_GROUPS,
+    FINDING_TITLES,
+    load_examples,
+)
 from px4fuse.flight.model import Columns  # noqa: E402
 from px4fuse.report.panels import INNOVATIONS_PANEL, POSITION_PANEL, POSITION_SIGMA_PANEL  # noqa: E402
 from px4fuse.simulation.faults import parse_faults  # noqa: E402
@@ -204,7 +203,9 @@ def collect_examples() -> dict[str, ExampleFlight]:
     aids = {"gnss_pos": log_with_outage, "baro_hgt": aid_log(sigma=1.5), "mag": aid_log(mean=-0.4),
             "mag_heading": log_with_innovation_change}  # fmt: skip
     aid_results = evaluate_aids(replace(flight, ekf2=replace(flight.ekf2, aids=aids)))
-    add_examples(find_aid_findings(aid_results), "simulated innovations of the aiding sources")
+    add_examples(
+        find_aid_findings(aid_results, flight), "simulated innovations of the aiding sources"
+    )
     add_examples(simulate_late_timestamps(), "a simulated flight with changed timestamps")
     for fault in FAULTS:
         if fault.id in example_by_id:

@@ -19,7 +19,7 @@ from typing import TypeVar
 from msgspec import structs
 
 from px4fuse.analysis import AidingSourceAnalysis, Analysis, WhatIfAnalysis
-from px4fuse.comparison.comparison import compare, run_kf
+from px4fuse.comparison.comparison import compare
 from px4fuse.comparison.difference_steps import (
     explain_ekf2_difference,
     find_corrected_noise_settings,
@@ -41,7 +41,6 @@ from px4fuse.comparison.preparation import (
 )
 from px4fuse.comparison.remedy import estimate_ekf2_parameters
 from px4fuse.comparison.reruns import Reruns, list_rerun_configurations, rerun_filters
-from px4fuse.convention.correction import find_convention_faults
 from px4fuse.core.memory import release_free_memory
 from px4fuse.core.reading import display_name
 from px4fuse.ekf2.aids import evaluate_aids
@@ -105,8 +104,7 @@ def _diagnose_flight(
         flight, request, progress, keep_positions_as_sent=keep_positions_as_sent
     )
     progress("running KF")
-    kf_runs = run_kf(prepared_comparison)
-    comparison = compare(prepared_comparison, kf_runs)
+    comparison = compare(prepared_comparison)
     return replace(analyse_comparison(comparison, progress), request=request)
 
 
@@ -125,18 +123,16 @@ def _refine_clock_offset(flight: Flight, analysis: Analysis) -> Flight | None:
         or any(WRONG_CONVENTION_KEY in finding.evidence for finding in analysis.findings)
     ):
         return None
-    delay_text = (
-        f"{abs(clock_offset.offset_s):.3f} s {'late' if clock_offset.offset_s < 0 else 'early'}"
-    )
+    offset_s = clock_offset.offset_s
     alignment = structs.replace(
         alignment,
-        clock_offset_s=alignment.clock_offset_s + clock_offset.offset_s,
+        clock_offset_s=alignment.clock_offset_s + offset_s,
         clock_offset_sigma_s=clock_offset.sigma_s,
-        clock_reason=f"the offset was estimated with the IMU; EKF2's position is {delay_text} "
-        "compared with the IMU",
+        clock_reason="the offset was estimated with the IMU; EKF2's position is "
+        f"{abs(offset_s):.3f} s {'late' if offset_s < 0 else 'early'} compared with the IMU",
     )
     file_track, *other_tracks = flight.positions
-    shifted_track = replace(shift_clock(file_track, clock_offset.offset_s), alignment=alignment)
+    shifted_track = replace(shift_clock(file_track, offset_s), alignment=alignment)
     return replace(flight, positions=(shifted_track, *other_tracks))
 
 
@@ -191,12 +187,12 @@ def refine_delay(comparison: Comparison, clock_offset: ClockOffset | Unavailable
         return comparison
     # The delay is the negative time offset
     refined_convention = structs.replace(comparison.convention, late_s=-clock_offset.offset_s)
+    refined_comparison = replace(comparison, convention=refined_convention)
     # Keep the first estimate if the refined delay is too small to be a fault
-    is_delay_a_fault = all(
-        find_convention_faults(convention, comparison.flight, comparison.source.frame).late_s != 0.0
-        for convention in (comparison.convention, refined_convention)
+    is_delay_a_fault = (
+        comparison.convention_faults.late_s and refined_comparison.convention_faults.late_s
     )
-    return replace(comparison, convention=refined_convention) if is_delay_a_fault else comparison
+    return refined_comparison if is_delay_a_fault else comparison
 
 
 def read_flight(request: ComparisonRequest, progress: Progress = ignore_progress) -> Flight:
@@ -259,16 +255,15 @@ def prepare_comparison(
             "State the offset (--clock-offset SECONDS), or omit --clock-offset.",
         )
     if not clock_offset.is_significant(clock_offset.remaining_s):
-        low_offset_s, high_offset_s = (
-            limit_s - clock_offset.applied_s for limit_s in clock_offset.interval_s
-        )
+        applied_s = clock_offset.applied_s
+        low_s, high_s = (limit_s - applied_s for limit_s in clock_offset.interval_s)
         notes = [
             *prepared_comparison.notes,
             f"--clock-offset auto: the time offset {clock_offset.remaining_s:+.3f} s (95 % "
-            f"{low_offset_s:+.3f} to {high_offset_s:+.3f} s) is not significant and not applied",
+            f"{low_s:+.3f} to {high_s:+.3f} s) is not significant and not applied",
         ]
-        if clock_offset.applied_s:
-            notes.append(f"the timestamps were shifted by {clock_offset.applied_s:+.3f} s")
+        if applied_s:
+            notes.append(f"the timestamps were shifted by {applied_s:+.3f} s")
         return replace(prepared_comparison, notes=tuple(notes))
     request = structs.replace(request, clock_offset_s=clock_offset.offset_s)
     return prepare_comparison_inputs(flight, request, keep_positions_as_sent=keep_positions_as_sent)
@@ -363,7 +358,7 @@ def run_what_if(
         if ekf2_model.agreement.good and not flight.log.is_assessed:
             comparison_request = structs.replace(comparison_request, axes=("north", "east", AISLE))
             prepared_comparison = prepare_comparison_inputs(flight, comparison_request)
-            comparison = compare(prepared_comparison, run_kf(prepared_comparison))
+            comparison = compare(prepared_comparison)
     except MissingDataError:  # Without KF, only parameter changes from the user can be replayed
         if has_no_user_change:
             raise

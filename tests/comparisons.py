@@ -34,4 +34,4 @@ def compare(flight: Flight, settings: Settings | None = None, **choices: Any) ->
 
 
 def compare_prepared(prepared: PreparedComparison) -> Comparison:
-    return comparison.compare(prepared, comparison.run_kf(prepared))
+    return comparison.compare(prepared)

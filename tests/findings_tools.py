@@ -13,13 +13,14 @@ from exchange import replace
 from px4fuse.analysis import Analysis
 from px4fuse.comparison.model import FILTER_NAMES, ErrorsAgainstTruth, FilterSummary, UntestedFilter
 from px4fuse.comparison.trials import RunStatistics, Trial
+from px4fuse.convention.correction import find_convention_faults
 from px4fuse.filter.consistency import Consistency
 from px4fuse.filter.hypotheses import Estimate, Jump, SystematicErrors
 from px4fuse.filter.settings import Settings
-from px4fuse.filter.signals import Segment
+from px4fuse.filter.signals import Segment, cut_to_segment
 from px4fuse.filter.time_offset import ClockOffset, PartOffset
 from px4fuse.filter.tuning import HORIZONTAL, AxisTuning, NoiseEstimate
-from px4fuse.findings import Finding
+from px4fuse.finding import Finding
 from px4fuse.flight.ekf2_parameters import PARAMETERS
 from px4fuse.flight.model import (
     AS_RECEIVED_ORIGIN,
@@ -144,8 +145,13 @@ def analysis(
         NONE,
     ) | {"convention": None, "request": None}
     by_name = {each.axis.name: each for each in axes}
+    one_flight: Any = SimpleNamespace(log=log, ekf2=ekf2, **flown)
     return SimpleNamespace(  # type: ignore[return-value]
-        flight=SimpleNamespace(log=log, ekf2=ekf2, **flown), source=source, axes=by_name,
+        flight=one_flight, source=source, axes=by_name,
+        source_samples=cut_to_segment(source.samples, SEGMENT),
+        convention_faults=find_convention_faults(
+            parts.get("convention"), one_flight, source.frame
+        ),
         main=next(iter(axes), axis()), input_axes=tuple(each.axis for each in axes),
         segment=SEGMENT, settings=settings, notes=notes, missing=missing,
         **{"tuning": {}, "difference_steps": {}, "trials": (), **usual, **parts},

@@ -176,7 +176,7 @@ def test_aiding_source_fault_report_contains_sensor_and_times() -> None:
         gnss_pos=with_gap, gnss_vel=with_gap, baro_hgt=aid_log(sigma=1.5), mag=aid_log(mean=-0.4),
         ev_pos=aid_log(sigma=9.0), rng_hgt=log,
     ))  # fmt: skip
-    by_id = {one.id: one for one in find_aid_findings(found)}
+    by_id = {one.id: one for one in find_aid_findings(found, aids_only())}
     assert set(by_id) == {"aid_not_fused", "aid_overconfident", "aid_innovation_bias"}
     assert "GNSS position, GNSS velocity" in by_id["aid_not_fused"].title
     assert by_id["aid_not_fused"].spans_s == ((20.0, 41.0),)
@@ -235,7 +235,7 @@ def test_shift_of_mean_innovation_is_reported_with_its_time() -> None:
         when_s, moved = found.axes["east"].change  # type: ignore[misc]
         assert when_s == pytest.approx(expected_s, abs=0.5)
         assert moved == pytest.approx(-1.4, abs=0.4)
-    (finding,) = find_aid_findings({"mag": found})
+    (finding,) = find_aid_findings({"mag": found}, aids_only())
     assert (finding.id, finding.severity, finding.evidence["axis"]) == (
         "aid_innovation_shift",
         "warning",

@@ -24,7 +24,7 @@ from px4fuse.comparison.trials import RunStatistics, Trial, classify_improvement
 from px4fuse.diagnose import analyse_comparison
 from px4fuse.errors import LogError
 from px4fuse.filter.settings import Settings
-from px4fuse.findings import Finding
+from px4fuse.finding import Finding
 from px4fuse.flight.model import AS_RECEIVED_ORIGIN, GNSS_ORIGIN
 from px4fuse.readers import read_log
 from px4fuse.report.card_text import format_card_lines

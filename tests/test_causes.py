@@ -6,7 +6,7 @@ import pytest
 from exchange import replace
 
 from px4fuse.analysis import Analysis
-from px4fuse.findings import FINDING_TITLES, Finding
+from px4fuse.finding import Finding
 from px4fuse.findings.cause_grouping import (
     EFFECTS_BY_CAUSE,
     SOURCE_GAP_CAUSE,
@@ -14,6 +14,7 @@ from px4fuse.findings.cause_grouping import (
     find_effect_ids,
     group_by_cause,
 )
+from px4fuse.findings.model import FINDING_TITLES
 from px4fuse.flight.model import Unavailable
 from px4fuse.report.phrases import format_verdict, list_verdict_warnings
 

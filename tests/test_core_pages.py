@@ -14,7 +14,7 @@ from page_tools import axes_of, words
 
 from px4fuse.analysis import Analysis
 from px4fuse.comparison.model import Comparison
-from px4fuse.findings import Finding
+from px4fuse.finding import Finding
 from px4fuse.flight.model import Dropout, Reset
 from px4fuse.report import cover, event_marks, flight, panels
 from px4fuse.report.page import Page

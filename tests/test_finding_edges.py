@@ -45,14 +45,13 @@ from px4fuse.filter.hypotheses import Estimate, SystematicErrors
 from px4fuse.filter.settings import Settings
 from px4fuse.filter.signals import Segment
 from px4fuse.filter.tuning import NoiseEstimate
+from px4fuse.finding import Finding
 from px4fuse.findings import (
-    Finding,
     ekf2_not_fusing,
-    ekf2_rejecting,
-    ekf2_resets,
+    ekf2_settings,
+    ekf2_state,
     hidden_errors,
     imu,
-    missing,
     recording,
     source_clock,
     source_frame,
@@ -60,7 +59,6 @@ from px4fuse.findings import (
     source_noise,
     source_positions,
     source_stamps,
-    split_cause_groups,
 )
 from px4fuse.findings.cause_grouping import SOURCE_GAP_CAUSE, UNKNOWN_CAUSE
 from px4fuse.findings.model import (
@@ -68,6 +66,7 @@ from px4fuse.findings.model import (
     compute_flag_fraction,
     find_spans_with_value,
     make_zero_length_spans,
+    split_cause_groups,
 )
 from px4fuse.flight.model import (
     ALIGNED_BY_EKF2_ORIGIN,
@@ -133,7 +132,7 @@ NO_GAP = SimpleNamespace(gaps=())
 def test_ekf2_resets_outside_evaluated_segment_are_ignored(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
-    monkeypatch.setattr(ekf2_resets, "remove_origin_resets", lambda *_: (None, "resets undone"))
+    monkeypatch.setattr(ekf2_state, "remove_origin_resets", lambda *_: (None, "resets undone"))
     switches = tuple((time, 1) for time in (-np.inf, 10.0, 10.5, 110.0, 110.1))
     resets = (
         Reset(10.0, "position", (9.0, 0.0, 0.0)), Reset(10.5, "position", (3.0, 0.0, -4.0)),
@@ -141,7 +140,7 @@ def test_ekf2_resets_outside_evaluated_segment_are_ignored(
         Reset(110.0, "position", (0.0, 0.0, 1.0)), Reset(110.1, "position", (9.0, 0.0, 0.0)),
     )  # fmt: skip
     one = analysis(ekf2={"primary_instances": switches, "resets": resets}, events=NO_GAP)
-    reset, switch = ekf2_resets.detect(one)
+    reset, switch = ekf2_state.detect(one)
     assert switch.evidence == {"count": 2, "at_s": 10.5}
     # the reset of the height alone is not counted
     assert reset.evidence == {"count": 1, "largest_m": 5.0, "at_s": 10.5, "cause": UNKNOWN_CAUSE}
@@ -163,11 +162,11 @@ def test_ekf2_resets_outside_evaluated_segment_are_ignored(
 def test_ekf2_height_reset_at_take_off_is_not_reported(
     reset: Reset, gaps: Any, expected: Any, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(ekf2_resets, "remove_origin_resets", lambda *_: (None, "resets kept"))
+    monkeypatch.setattr(ekf2_state, "remove_origin_resets", lambda *_: (None, "resets kept"))
     one = analysis(ekf2={"primary_instances": (), "resets": (reset,)},
                    flight={"airborne": ((20.0, 90.0),)},
                    events=SimpleNamespace(gaps=gaps))  # fmt: skip
-    found = [(each.severity, each.evidence["cause"]) for each in ekf2_resets.detect(one)]
+    found = [(each.severity, each.evidence["cause"]) for each in ekf2_state.detect(one)]
     assert found == ([] if expected is None else [expected])
 
 
@@ -287,8 +286,8 @@ def test_severity_of_rejections_depends_on_rejected_percentage(
         (level, "of the positions. Their innovations are outside its gate of 5 √S", CHECK_FIRST),
         (down, "of the heights", CHECK_FIRST),
     ):
-        assert severity(ekf2_rejecting.detect, one) == expected
-        for finding in ekf2_rejecting.detect(one):
+        assert severity(ekf2_settings.detect_rejections, one) == expected
+        for finding in ekf2_settings.detect_rejections(one):
             assert finding.spans_s == make_zero_length_spans(20.0 + np.arange(count))
             assert quantity in finding.message
             assert finding.remedy.endswith(remedy)
@@ -307,7 +306,7 @@ def test_rejection_action_requires_rerun_with_half_of_rejections() -> None:
         )  # fmt: skip
         one = analysis(ekf2={"gate": 5.0}, axes=(axis("north", ekf2_innovations=frame),),
                        trials=(trial,))  # fmt: skip
-        assert only(ekf2_rejecting.detect, one).remedy == action
+        assert only(ekf2_settings.detect_rejections, one).remedy == action
 
 
 CHECK_FIRST = (
@@ -433,7 +432,7 @@ def test_finding_states_why_received_positions_are_not_logged() -> None:
     for origin in (ALIGNED_BY_EKF2_ORIGIN, KEPT_BY_EKF2_ORIGIN, REBUILT_FROM_INNOVATIONS_ORIGIN):
         of = source(origin=origin)
         found = only(
-            missing.detect_source_not_logged, analysis(source=of, missing=lacks, log=profile)
+            recording.detect_source_not_logged, analysis(source=of, missing=lacks, log=profile)
         )
         assert found.id == "source_not_logged"
         assert "Reason: it was disabled." in found.message
@@ -443,7 +442,7 @@ def test_finding_states_why_received_positions_are_not_logged() -> None:
         (ALIGNED_BY_EKF2_ORIGIN, (SimpleNamespace(origin=AS_RECEIVED_ORIGIN),)),
     ):  # fmt: skip
         one = analysis(source=source(origin=origin), flight={"positions": tracks})
-        assert named(missing.detect_source_not_logged, one) == {}
+        assert named(recording.detect_source_not_logged, one) == {}
 
 
 @pytest.mark.parametrize(("rate_hz", "least_s"), [(2.0, 2.5), (10.0, 1.0)])
@@ -511,7 +510,7 @@ def test_misaligned_frame_report_contains_rotation_to_apply() -> None:
     finding = only(source_frame.detect, analysis(heading=heading_error(20.0, sigma_deg=2.0)))
     assert finding.id == "source_frame_misaligned"
     assert finding.title == "UWB positions are rotated by +20° relative to the IMU"
-    assert "± 4°; the rotation is clockwise" in finding.message
+    assert "The rotation (± 4°, 95 %) is clockwise" in finding.message
     assert "Rotate the positions by -20°" in finding.remedy
     aligned = source(name="estimator_visual_odometry_aligned")
     one = analysis(heading=heading_error(20.0), source=aligned)

@@ -21,8 +21,15 @@ from px4fuse.diagnose import prepare_comparison, read_flight
 from px4fuse.ekf2.inputs import SIMULATED_EKF2_NOTE
 from px4fuse.filter.consistency import MIN_INNOVATIONS
 from px4fuse.filter.settings import Settings
-from px4fuse.findings import FINDING_TITLES, Finding, find, split_cause_groups
-from px4fuse.findings.model import FINDING_CATALOGUE, FINDING_GROUPS, load_examples
+from px4fuse.finding import Finding
+from px4fuse.findings import find
+from px4fuse.findings.model import (
+    FINDING_CATALOGUE,
+    FINDING_GROUPS,
+    FINDING_TITLES,
+    load_examples,
+    split_cause_groups,
+)
 from px4fuse.flight.model import (
     ALIGNED_BY_EKF2_ORIGIN,
     AXIS_NAMES,

@@ -27,7 +27,8 @@ from px4fuse.filter.hypotheses import (
 from px4fuse.filter.kalman import replay
 from px4fuse.filter.likelihood import innovations, preintegrate
 from px4fuse.filter.settings import Settings
-from px4fuse.findings import Finding, imu, noises, source_clock, source_convention
+from px4fuse.finding import Finding
+from px4fuse.findings import imu, noises, source_clock, source_convention
 from px4fuse.findings import source_intervals as intervals
 from px4fuse.findings import source_positions as sent
 from px4fuse.findings import source_stamps as stamps

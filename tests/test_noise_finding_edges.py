@@ -34,8 +34,9 @@ from px4fuse.comparison.trials import RunStatistics, Trial
 from px4fuse.convention.model import Convention, OrientationConvention
 from px4fuse.filter.settings import Settings
 from px4fuse.filter.tuning import NoiseEstimate
-from px4fuse.findings import cause_text, ekf2_noise, hidden_errors, loops, noises
+from px4fuse.findings import cause_text, hidden_errors, loops, noises
 from px4fuse.findings.cause_grouping import group_by_cause
+from px4fuse.findings.ekf2_settings import detect_wrong_noise
 from px4fuse.findings.noises import _has_default_noises
 from px4fuse.flight.ekf2_parameters import EV_POS, GNSS_POS, PARAMETERS
 from px4fuse.flight.model import AS_RECEIVED_ORIGIN, GNSS_ORIGIN
@@ -93,8 +94,11 @@ def test_severity_of_noise_setting_depends_on_error_factor(
     assert (off.severity, off.factor) == (expected[0], pytest.approx(expected[1], rel=0.01))
 
 
-UNTESTED_SIGMA_Z = noises.UNTESTED_ESTIMATE_ACTION.format(other="SIGMA_A")
-UNTESTED_SIGMA_A = noises.UNTESTED_ESTIMATE_ACTION.format(other="SIGMA_Z")
+UNTESTED_SIGMA_Z, UNTESTED_SIGMA_A = (
+    f"Do not change this setting alone: it is estimated together with {other}, and no re-run "
+    "confirmed the estimate."
+    for other in ("SIGMA_A", "SIGMA_Z")
+)
 SIGMA_A_TO_0_1, BOTH = {"sigma_a_m_s2": 0.1}, {"sigma_a_m_s2": 0.1, "sigma_z_m": 0.5}
 
 
@@ -473,19 +477,21 @@ def test_title_of_wrong_default_noise_names_the_position_sensor(
         axes=(result,), trials=(rerun,), ekf2_model=model, source=source(origin=origin),
         settings=Settings(1.0, flown_m),
     )  # fmt: skip
-    finding = only(ekf2_noise.detect, one)
+    finding = only(detect_wrong_noise, one)
     assert (finding.id, finding.severity, finding.title) == expected
     assert finding.remedy == f"Set {aid.noise} to {estimate_m:.3g} m."
     assert finding.message.endswith(f"KF takes SIGMA_Z from {aid.noise}.") is (kind == "gnss")
     received.variance_m2[:] = 9.0
     if kind == "uwb" and estimate_m < flown_m:
         rerun.change["EKF2_EV_NOISE_MD"] = 1.0
-        assert "the σ that UWB reports (EKF2_EV_NOISE_MD 0)" in only(ekf2_noise.detect, one).message
+        assert (
+            "the σ that UWB reports (EKF2_EV_NOISE_MD 0)" in only(detect_wrong_noise, one).message
+        )
     # innovations outside their band after the change, or a change of EKF2_ACC_NOISE
     worse = replace(rerun, after=RunStatistics(nis_mean=2.0))
     other = replace(rerun, kinds=("process noise",))
     for trials in ((worse,), (other,), ()):
-        assert not [*ekf2_noise.detect(analysis(axes=(result,), trials=trials, ekf2_model=model))]
+        assert not [*detect_wrong_noise(analysis(axes=(result,), trials=trials, ekf2_model=model))]
 
 
 # ---------------------------------------------------------------- the loop and the drift

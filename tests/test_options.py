@@ -9,7 +9,7 @@ import pytest
 from conftest import SAMPLES
 from exchange import replace
 
-from px4fuse.comparison.comparison import compare, run_kf
+from px4fuse.comparison.comparison import compare
 from px4fuse.diagnose import prepare_comparison, read_flight
 from px4fuse.errors import Px4FuseError
 from px4fuse.flight.model import SOURCE_ORIGINS, Flight, find_source_origin
@@ -53,7 +53,7 @@ def outcome(request: ComparisonRequest) -> str:
         prepared = prepare_comparison(flight, request)
     except Px4FuseError as error:
         return str(error)
-    compared, source = compare(prepared, run_kf(prepared)), prepared.source
+    compared, source = compare(prepared), prepared.source
     numbers = {
         name: (axis.direction, axis.filters["kf"].nis_mean) for name, axis in compared.axes.items()
     }

@@ -5,7 +5,7 @@ from exchange import replace
 from flights import Estimator, aisle_flight, unexplained
 
 from px4fuse.finding import Finding
-from px4fuse.findings import find, parameters
+from px4fuse.findings import ekf2_settings, find
 from px4fuse.flight.model import Flight, ParameterChange
 
 
@@ -15,7 +15,7 @@ def with_change(flight: Flight, name: str, before: float, after: float) -> Fligh
 
 
 def found(flight: Flight) -> Finding:
-    (finding,) = parameters.detect(unexplained(compare(flight)))
+    (finding,) = ekf2_settings.detect_parameter_changes(unexplained(compare(flight)))
     return finding
 
 

@@ -25,7 +25,8 @@ from px4fuse.diagnose import analyse_comparison
 from px4fuse.ekf2.whatif import what_if
 from px4fuse.filter.settings import Settings
 from px4fuse.filter.tuning import AxisTuning, NoiseEstimate
-from px4fuse.findings import Finding, ekf2_rejecting, find, source_clock
+from px4fuse.finding import Finding
+from px4fuse.findings import ekf2_settings, find, source_clock
 from px4fuse.findings.cause_text import format_sender_action
 from px4fuse.flight.model import GNSS_ORIGIN
 from px4fuse.simulation.faults import parse_faults
@@ -218,7 +219,7 @@ def test_ekf2_noise_advice_with_logged_variance_sets_noise_mode(sample: Analysis
 
 
 def only(name: str, analysis: Analysis) -> Finding:
-    found = (*ekf2_rejecting.detect(analysis), *source_clock.detect(analysis))
+    found = (*ekf2_settings.detect_rejections(analysis), *source_clock.detect(analysis))
     (finding,) = [each for each in found if each.id == name]
     return finding
 
@@ -242,7 +243,7 @@ def test_advice_states_height_noise_if_it_differs_from_setting(sample: Analysis)
     ekf2 = replace(sample.flight.ekf2, fusion_flags=flags)
     fused = replace(sample, flight=replace(sample.flight, ekf2=ekf2))
     advice = remedies.make_height_noise_advice(fused, tuning, 0.1)
-    assert "height noise of the source is 0.6 m. " in advice
+    assert "but the height noise is 0.6 m. " in advice
     assert "send each position with a variance of 0.36 m² for z." in advice
     assert remedies.make_height_noise_advice(fused, tuning, 0.4) == ""
 

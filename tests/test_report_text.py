@@ -18,7 +18,7 @@ from page_tools import set_by_typst
 
 from px4fuse.analysis import Analysis
 from px4fuse.filter.time_offset import ClockOffset, PartOffset
-from px4fuse.findings import Finding
+from px4fuse.finding import Finding
 from px4fuse.flight.model import Unavailable
 from px4fuse.report import clock, fonts, notes
 from px4fuse.report.notes import write_markdown

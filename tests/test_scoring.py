@@ -24,7 +24,7 @@ from px4fuse.classroom.grading.model import Grade, GradedReport
 from px4fuse.classroom.grading.outputs import feedback_text
 from px4fuse.classroom.grading.rubric import parse_rubric, read_rubric, score_report
 from px4fuse.errors import ResultsError
-from px4fuse.findings import FINDING_TITLES
+from px4fuse.findings.model import FINDING_TITLES
 from px4fuse.results.answer_form import Answers, NamedFault
 from px4fuse.verification.model import Verification
 from px4fuse.verification.pdf_input import read_report

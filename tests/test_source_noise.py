@@ -19,7 +19,8 @@ from px4fuse.filter import correlated_noise
 from px4fuse.filter.correlated_noise import fit_time_correlation
 from px4fuse.filter.fitting import NoiseParameters
 from px4fuse.filter.settings import Settings
-from px4fuse.findings import Finding, find
+from px4fuse.finding import Finding
+from px4fuse.findings import find
 from px4fuse.findings.source_noise import detect, detect_noise_variation
 from px4fuse.flight.model import Columns, Flight, Unavailable
 from px4fuse.readers import read_log

@@ -22,7 +22,7 @@ from px4fuse.core.text import (
     format_ratio,
     join_first_names,
 )
-from px4fuse.findings import finding_title
+from px4fuse.findings.model import finding_title
 from px4fuse.html import frame
 from px4fuse.html.frame import Cell, Column, Row, RowDetailsSection
 from px4fuse.html.safe import clean_text, load_template, make_relative_url

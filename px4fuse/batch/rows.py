@@ -14,7 +14,7 @@ from px4fuse.core.record import Unavailable
 from px4fuse.core.spreadsheet import neutralise_formulas
 from px4fuse.core.text import format_utc_time, replace_unencodable
 from px4fuse.ekf2.aids import AidResult
-from px4fuse.findings import Finding
+from px4fuse.finding import Finding
 from px4fuse.request import quote_command
 from px4fuse.results.contract import ComparisonResults, Log
 

@@ -85,17 +85,17 @@ def find_candidate_changes(
         )
     if axis_tuning is not None and not is_underconfident and len(axis_tuning.outlier_time_s):
         changes.append({OUTLIERS_KEY: float(len(axis_tuning.outlier_time_s))})
-    delay_change = (
-        {}
-        if ekf2_inputs is None
-        else make_estimated_delay_change(comparison, ekf2_inputs, estimates.clock)
+    delay_change = ekf2_inputs and make_estimated_delay_change(
+        comparison, ekf2_inputs, estimates.clock
     )
     changes += [delay_change] if delay_change else _find_offset_changes(estimates, ekf2_inputs)
     if axis_result.axis.name == "down":
         return changes
-    if isinstance(heading := estimates.heading, HeadingError):
-        is_significant = abs(heading.misalignment_deg) > MIN_MISALIGNMENT_SIGMAS * heading.sigma_deg
-        changes += [{ROTATION_KEY: -round(heading.misalignment_deg, 1)}] if is_significant else []
+    if (
+        isinstance(heading := estimates.heading, HeadingError)
+        and abs(heading.misalignment_deg) > MIN_MISALIGNMENT_SIGMAS * heading.sigma_deg
+    ):
+        changes.append({ROTATION_KEY: -round(heading.misalignment_deg, 1)})
     if ekf2_inputs is None:
         return changes + _find_bias_changes(estimates)
     changes += _find_default_changes(comparison.flight.log, ekf2_inputs)
@@ -116,14 +116,16 @@ def find_main_axis_changes(
         )
     )
     if ekf2_inputs is not None:
-        has_delay_change = any(ekf2_inputs.aid.delay in change for change in changes)
-        offset_changes = _find_offset_changes(estimates, ekf2_inputs) if has_delay_change else []
-        return remove_repeated_changes([*changes, *offset_changes])
+        if any(ekf2_inputs.aid.delay in change for change in changes):
+            changes += _find_offset_changes(estimates, ekf2_inputs)
+        return remove_repeated_changes(changes)
     noise_changes = [change for change in changes if change.keys() <= KF_NOISE_SETTINGS]
     if len(noise_changes) > 1:
         changes.append({name: value for change in noise_changes for name, value in change.items()})
     default_settings = find_default_settings(comparison)
-    return [*changes, *([default_settings] if default_settings and noise_changes else [])]
+    if default_settings and noise_changes:
+        changes.append(default_settings)
+    return changes
 
 
 def remove_repeated_changes(changes: Iterable[Change]) -> list[Change]:
@@ -136,17 +138,12 @@ def classify_change(
     """Return the kind of each changed value, for example ("noise",) or ("delay", "outliers")."""
     if ekf2_inputs is None and change == find_default_settings(comparison):
         return ("defaults",)
-    kind_by_parameter: dict[str, str] = {}
+    kinds = dict(KIND_BY_CHANGE_NAME)
     if ekf2_inputs is not None:
         aid = ekf2_inputs.aid
-        kind_by_parameter = {aid.noise: "noise", aid.gate: "gate", aid.delay: "delay"}
-    changed_names = [name for name in change if name not in SECONDARY_CHANGE_KEYS]
-    return tuple(
-        dict.fromkeys(
-            KIND_BY_CHANGE_NAME.get(name) or kind_by_parameter.get(name, "process noise")
-            for name in changed_names
-        )
-    )
+        kinds |= {aid.noise: "noise", aid.gate: "gate", aid.delay: "delay"}
+    changed_names = (name for name in change if name not in SECONDARY_CHANGE_KEYS)
+    return tuple(dict.fromkeys(kinds.get(name, "process noise") for name in changed_names))
 
 
 def find_default_settings(comparison: Comparison) -> Change:
@@ -168,10 +165,12 @@ def find_axis_tuning(tuning: TuningByAxis, axis: str) -> AxisTuning | None:
 def _find_offset_changes(estimates: Estimates, ekf2_inputs: ReplayInputs | None) -> list[Change]:
     """Return the change that corrects the time offset, if the time offset is significant."""
     clock_offset = estimates.clock
-    if isinstance(clock_offset, Unavailable) or not clock_offset.is_determinable:
-        return []
-    if not clock_offset.is_significant(
-        clock_offset.remaining_s if ekf2_inputs is None else clock_offset.offset_s
+    if (
+        isinstance(clock_offset, Unavailable)
+        or not clock_offset.is_determinable
+        or not clock_offset.is_significant(
+            clock_offset.offset_s if ekf2_inputs else clock_offset.remaining_s
+        )
     ):
         return []
     change = {CLOCK_OFFSET_KEY: round(clock_offset.offset_s, 3)}
@@ -187,19 +186,17 @@ def _find_kf_noise_changes(
     """Return changes of SIGMA_A and SIGMA_Z to their estimates, if they differ significantly."""
     changes = list[Change]()
     for name, noise in ((SIGMA_A, axis_tuning.sigma_a_two_state), (SIGMA_Z, axis_tuning.sigma_z)):
-        current_sigma = getattr(settings, name)
-        estimated_sigma = noise.value or (noise.high if is_underconfident else None) or 0.0
-        interval_end = noise.high if is_underconfident else noise.low
+        setting = getattr(settings, name)
+        if is_underconfident:
+            estimate = noise.value or noise.high or 0.0
+            is_significant = noise.high is not None and setting > noise.high
+        else:
+            estimate = noise.value or 0.0
+            is_significant = noise.low is not None and setting < noise.low
         if noise.value is None and name == SIGMA_Z:
-            estimated_sigma = max(estimated_sigma, MIN_RERUN_SIGMA_Z_M)
-        if (
-            estimated_sigma
-            and interval_end is not None
-            and (
-                current_sigma > interval_end if is_underconfident else current_sigma < interval_end
-            )
-        ):
-            changes.append({name: float(f"{estimated_sigma:.3g}")})
+            estimate = max(estimate, MIN_RERUN_SIGMA_Z_M)
+        if estimate and is_significant:
+            changes.append({name: float(f"{estimate:.3g}")})
     return changes
 
 
@@ -227,34 +224,26 @@ def _find_ekf2_noise_changes(
 
 def _find_default_changes(log: LogInfo, ekf2_inputs: ReplayInputs) -> list[Change]:
     """Return one change to PX4's default for each EKF2 noise that differs from the default."""
-    gate_parameter, logged_parameters = ekf2_inputs.aid.gate, ekf2_inputs.settings
-    default_by_parameter = {
-        name: log.find_default_value(name) for name in (gate_parameter, *PARAMETERS_SET_TO_DEFAULT)
-    }
-    return [
-        {name: value}
-        for name, value in default_by_parameter.items()
-        if name in logged_parameters
-        and not np.isclose(logged_parameters[name], value, rtol=1e-3)
-        and (name != gate_parameter or logged_parameters[name] < value)
-    ]
+    gate, logged_parameters, changes = ekf2_inputs.aid.gate, ekf2_inputs.settings, list[Change]()
+    for name in (gate, *PARAMETERS_SET_TO_DEFAULT):
+        default, value = log.find_default_value(name), logged_parameters.get(name, np.nan)
+        # NaN is not larger and not smaller
+        if abs(value - default) > 1e-3 * abs(default) and (name != gate or value < default):
+            changes.append({name: default})
+    return changes
 
 
 def _find_acc_noise_changes(
     settings: Settings, ekf2_inputs: ReplayInputs, axis_tuning: AxisTuning
 ) -> list[Change]:
     """Return the change of EKF2_ACC_NOISE to its estimate, if the estimate is much larger."""
-    ekf2_steps_per_dt = settings.dt_s / ekf2_inputs.mean_step_s
-    logged_acc_noise, max_acc_noise = ekf2_inputs.settings[ACC_NOISE], PARAMETERS[ACC_NOISE].maximum
+    logged_acc_noise, sigma_a = ekf2_inputs.settings[ACC_NOISE], axis_tuning.sigma_a_two_state
+    acc_noise_per_sigma_a = (settings.dt_s / ekf2_inputs.mean_step_s) ** 0.5
+    min_acc_noise = (sigma_a.low or 0.0) * acc_noise_per_sigma_a
+    acc_noise = min((sigma_a.value or 0.0) * acc_noise_per_sigma_a, PARAMETERS[ACC_NOISE].maximum)
     if (
-        axis_tuning.sigma_a_two_state.low or 0.0
-    ) * ekf2_steps_per_dt**0.5 <= MIN_ESTIMATED_TO_LOGGED_ACC_NOISE_RATIO * logged_acc_noise:
+        min_acc_noise <= MIN_ESTIMATED_TO_LOGGED_ACC_NOISE_RATIO * logged_acc_noise
+        or acc_noise <= logged_acc_noise
+    ):
         return []
-    estimated_acc_noise = min(
-        (axis_tuning.sigma_a_two_state.value or 0.0) * ekf2_steps_per_dt**0.5, max_acc_noise
-    )
-    return (
-        [{ACC_NOISE: float(f"{estimated_acc_noise:.2g}")}]
-        if estimated_acc_noise > logged_acc_noise
-        else []
-    )
+    return [{ACC_NOISE: float(f"{acc_noise:.2g}")}]

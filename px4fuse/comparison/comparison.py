@@ -1,6 +1,5 @@
 """Comparison of KF, EKF2 and ground truth along each axis."""
 
-from collections.abc import Mapping
 from dataclasses import replace
 from typing import Any
 
@@ -23,6 +22,7 @@ from px4fuse.comparison.model import (
 from px4fuse.core.arrays import Array
 from px4fuse.filter.consistency import (
     DEFAULT_GATE,
+    Consistency,
     HorizontalNis,
     assess_horizontal_nis,
     assess_innovations,
@@ -40,50 +40,46 @@ from px4fuse.flight.model import (
 )
 
 VARIANCE_COLUMNS = ("position_variance_m2", "velocity_variance_m2_s2")
+INNOVATION_COLUMNS = ["innovation_m", "innovation_variance_m2"]
 
 
-def run_kf(prepared_comparison: PreparedComparison) -> dict[str, Replay]:
-    """Run KF along each axis, and return the results by axis name."""
-    return {
-        axis.name: replay(axis, prepared_comparison.settings)
-        for axis in prepared_comparison.input_axes
-    }
-
-
-def compare(prepared_comparison: PreparedComparison, kf_runs: Mapping[str, Replay]) -> Comparison:
-    """Compare KF with EKF2, and both with ground truth, along each axis."""
-    notes, ekf2 = list(prepared_comparison.notes), prepared_comparison.flight.ekf2
+def compare(prepared_comparison: PreparedComparison) -> Comparison:
+    """Run KF along each axis, and compare KF with EKF2, and both with ground truth."""
+    notes, ekf2 = prepared_comparison.notes, prepared_comparison.flight.ekf2
     if isinstance(ekf2, Ekf2):
         state, note = projection.remove_origin_resets(
             ekf2, prepared_comparison.source, prepared_comparison.segment
         )
-        notes += [note] if note else []
-        notes += ekf2.notes
+        notes = (*notes, *filter(None, (note,)), *ekf2.notes)
         if not state.equals(ekf2.state):
             # The states at the fusion horizon still contain the resets, so they are not used
             ekf2 = replace(ekf2, state=state, aids={}, record=RECORD_NOT_LOGGED)
     axes = {
-        name: _compare_axis(prepared_comparison, ekf2, kf_run) for name, kf_run in kf_runs.items()
+        axis.name: _compare_axis(prepared_comparison, ekf2, axis)
+        for axis in prepared_comparison.input_axes
     }
-    innovations: dict[FilterName, dict[str, TableOrUnavailable]] = {
-        "kf": {name: axis.replay.updates for name, axis in axes.items()},
-        "ekf2": {name: axis.ekf2_innovations for name, axis in axes.items()},
+    horizontal_axes = [axes[name] for name in ("north", "east") if name in axes]
+    innovations: dict[FilterName, list[TableOrUnavailable]] = {
+        "kf": [axis.replay.updates for axis in horizontal_axes],
+        "ekf2": [axis.ekf2_innovations for axis in horizontal_axes],
     }
     horizontal_nis = {
         name: nis
         for name, tables in innovations.items()
         if (nis := _assess_horizontal_innovations(tables))
     }
-    prepared_comparison = replace(prepared_comparison, notes=tuple(notes))
+    prepared_comparison = replace(prepared_comparison, notes=notes)
     return Comparison(**vars(prepared_comparison), axes=axes, horizontal=horizontal_nis)
 
 
 def _compare_axis(
-    prepared_comparison: PreparedComparison, ekf2: Ekf2 | Unavailable, kf_run: Replay
+    prepared_comparison: PreparedComparison, ekf2: Ekf2 | Unavailable, axis: Axis
 ) -> AxisComparison:
-    axis, segment, flight = kf_run.axis, prepared_comparison.segment, prepared_comparison.flight
+    segment, flight = prepared_comparison.segment, prepared_comparison.flight
+    kf_run = replay(axis, prepared_comparison.settings)
     tracks = project_tracks(ekf2, flight.truth, axis, segment)
     ekf2_state, ekf2_variance, truth = tracks.values()
+    ekf2_errors = compute_error_statistics(ekf2_state, ekf2_variance, truth)
     innovations: TableOrUnavailable
     if isinstance(ekf2, Unavailable):
         innovations, gate = ekf2, DEFAULT_GATE
@@ -92,21 +88,22 @@ def _compare_axis(
             flight, ekf2, prepared_comparison.source, axis, segment
         )
         gate = ekf2.gate
-    ekf2_errors = compute_error_statistics(ekf2_state, ekf2_variance, truth)
-    if isinstance(ekf2_errors, ErrorsAgainstTruth) and isinstance(ekf2, Ekf2):
-        fusion_horizon_nees = _compute_nees_at_fusion_horizon(
-            projection.project_fusion_horizon_position(ekf2, axis, segment), truth
-        )
-        ekf2_errors = structs.replace(ekf2_errors, nees_position_horizon_mean=fusion_horizon_nees)
+        if isinstance(ekf2_errors, ErrorsAgainstTruth):
+            fusion_horizon_nees = _compute_nees_at_fusion_horizon(
+                projection.project_fusion_horizon_position(ekf2, axis, segment), truth
+            )
+            ekf2_errors = structs.replace(
+                ekf2_errors, nees_position_horizon_mean=fusion_horizon_nees
+            )
     updates = kf_run.updates.assign(
         prior_variance_m2=kf_run.updates["prior_position_variance_m2"],
         posterior_variance_m2=kf_run.steps["position_variance_m2"].reindex(kf_run.updates.index),
     )
-    north_component, east_component, down_component = axis.direction.tolist()
+    north, east, down = axis.direction.tolist()
     rejected_flags = _drop_missing_values(innovations, "rejected")
     return AxisComparison(
         heading_deg=axis.heading_deg,
-        direction=(north_component, east_component, down_component),
+        direction=(north, east, down),
         note=axis.note,
         updates=UpdateStatistics(
             count=len(updates),
@@ -140,15 +137,14 @@ def project_tracks(
     ekf2: Ekf2 | Unavailable, truth: Truth | Unavailable, axis: Axis, segment: Segment
 ) -> dict[str, TableOrUnavailable]:
     """Project EKF2's state, EKF2's variances and ground truth onto an axis."""
-    state: TableOrUnavailable
-    variance: TableOrUnavailable
-    if isinstance(ekf2, Unavailable):
-        state = variance = ekf2
-    else:
-        state = projection.project(ekf2.state, axis, segment)
-        variance = projection.project_variance(ekf2, axis, segment)
     projected_truth = projection.project_truth(truth, axis, segment)
-    return {"ekf2_state": state, "ekf2_variance": variance, "truth": projected_truth}
+    if isinstance(ekf2, Unavailable):
+        return {"ekf2_state": ekf2, "ekf2_variance": ekf2, "truth": projected_truth}
+    return {
+        "ekf2_state": projection.project(ekf2.state, axis, segment),
+        "ekf2_variance": projection.project_variance(ekf2, axis, segment),
+        "truth": projected_truth,
+    }
 
 
 def _summarise_filter(
@@ -166,16 +162,15 @@ def _summarise_filter(
             ("sigma_p_after_update_m", _drop_missing_values(innovations, "posterior_variance_m2")),
         )
     }
-    if not isinstance(innovations, Unavailable):
-        innovation_m = innovations["innovation_m"]
-        innovation_variance_m2 = innovations["innovation_variance_m2"]
-        consistency = assess_innovations(
-            innovation_m.to_numpy(), innovation_variance_m2.to_numpy(), gate
-        )
-        if not isinstance(consistency, Unavailable):
-            return FilterSummary(**structs.asdict(consistency), **sigmas, truth=truth)
-        innovations = consistency
-    return UntestedFilter(**structs.asdict(innovations), **sigmas, truth=truth)
+    consistency: Consistency | Unavailable
+    if isinstance(innovations, Unavailable):
+        consistency = innovations
+    else:
+        innovation_m, variance_m2 = innovations[INNOVATION_COLUMNS].to_numpy().T
+        consistency = assess_innovations(innovation_m, variance_m2, gate)
+    if isinstance(consistency, Unavailable):
+        return UntestedFilter(**structs.asdict(consistency), **sigmas, truth=truth)
+    return FilterSummary(**structs.asdict(consistency), **sigmas, truth=truth)
 
 
 def _drop_missing_values(table: TableOrUnavailable, column: str) -> pd.Series:
@@ -297,11 +292,9 @@ def interpolate_sigma(time_s: Array, variance: TableOrUnavailable, column: str) 
 
 
 def _compute_mean_nees(normalised_errors: Array) -> float | None:
-    return (
-        float(np.nanmean(np.square(normalised_errors)))
-        if np.isfinite(normalised_errors).any()
-        else None
-    )
+    if not np.isfinite(normalised_errors).any():
+        return None
+    return float(np.nanmean(normalised_errors**2))
 
 
 def compute_position_errors(
@@ -313,14 +306,11 @@ def compute_position_errors(
     """
     if isinstance(axis_result.truth, Unavailable):
         return axis_result.truth
-    state: pd.DataFrame
-    variance: TableOrUnavailable
+    state, variance = axis_result.ekf2_state, axis_result.ekf2_variance
     if filter_name == "kf":
-        state, variance = _compute_kf_track(axis_result.replay, axis_result.ekf2_state)
-    elif isinstance(axis_result.ekf2_state, Unavailable):
-        return axis_result.ekf2_state
-    else:
-        state, variance = axis_result.ekf2_state, axis_result.ekf2_variance
+        state, variance = _compute_kf_track(axis_result.replay, state)
+    if isinstance(state, Unavailable):
+        return state
     time_s = state.index.to_numpy()
     errors_m = _compute_errors(state, axis_result.truth, STATE_COLUMNS[0])
     sigma_m = interpolate_sigma(time_s, variance, VARIANCE_COLUMNS[0])
@@ -341,19 +331,16 @@ def compute_normalised_errors(
         return Unavailable(
             "error against ground truth",
             "no analysed sample has both a reported σ and ground truth",
-            "Choose a time span in which the log contains reported σ and ground truth.",
+            "Choose a time span with reported σ and ground truth.",
         )
     return normalised_errors.index.to_numpy(), normalised_errors.to_numpy()
 
 
 def _assess_horizontal_innovations(
-    axis_innovations: Mapping[str, TableOrUnavailable],
+    north_and_east: list[TableOrUnavailable],
 ) -> HorizontalNis | None:
-    columns = ["innovation_m", "innovation_variance_m2"]
     tables = [
-        table[columns]
-        for name in ("north", "east")
-        if isinstance(table := axis_innovations.get(name), pd.DataFrame)
+        table[INNOVATION_COLUMNS] for table in north_and_east if isinstance(table, pd.DataFrame)
     ]
     if len(tables) < 2:
         return None

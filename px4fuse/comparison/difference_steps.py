@@ -5,12 +5,12 @@ from dataclasses import replace
 from typing import Any
 
 import numpy as np
-import pandas as pd
 from msgspec import structs
 
 from px4fuse.comparison.estimates import TuningByAxis, find_first_tuning
 from px4fuse.comparison.model import AxisComparison, Comparison
 from px4fuse.comparison.remedy import find_used_noise_m
+from px4fuse.core.text import format_count
 from px4fuse.ekf2 import steps
 from px4fuse.ekf2.filter_recursion import FilterConfiguration
 from px4fuse.ekf2.inputs import ReplayInputs
@@ -49,18 +49,14 @@ def explain_ekf2_difference(
 
     ``estimate_by_setting`` contains the corrected noises of KF.
     """
-    axis_results = {
-        name: axis_result for name, axis_result in comparison.axes.items() if name != "down"
-    }
+    axis_results = {name: result for name, result in comparison.axes.items() if name != "down"}
     if not axis_results:
         reason = "EKF2 can be replayed for horizontal positions only"
         action = "Analyse a horizontal axis, too (for example --axis north)."
         return {"down": Unavailable(steps.DIFFERENCE_ANALYSIS_NAME, reason, action)}
     if isinstance(model, Unavailable):
-        return {
-            name: structs.replace(model, what=steps.DIFFERENCE_ANALYSIS_NAME)
-            for name in axis_results
-        }
+        unavailable = structs.replace(model, what=steps.DIFFERENCE_ANALYSIS_NAME)
+        return dict.fromkeys(axis_results, unavailable)
     kf_settings = _make_comparable_settings(comparison, model.inputs, estimate_by_setting)
     changed_settings = replace(comparison.settings, **estimate_by_setting)
     kf_runs = {
@@ -95,18 +91,17 @@ def find_corrected_noise_settings(comparison: Comparison, tuning: TuningByAxis) 
     if axis_tuning is None or comparison.source.origin.is_gnss:
         return {}
     estimate_by_setting = {}
-    for name, noise in (
-        ("sigma_a_m_s2", axis_tuning.sigma_a_two_state),
-        ("sigma_z_m", axis_tuning.sigma_z),
+    for name, estimate in (
+        ("sigma_a_m_s2", axis_tuning.sigma_a_two_state.value),
+        ("sigma_z_m", axis_tuning.sigma_z.value),
     ):
-        current_value = getattr(comparison.settings, name)
-        if noise.value is None or current_value == getattr(Settings(), name):
-            continue
+        setting = getattr(comparison.settings, name)
         if (
-            max(current_value / noise.value, noise.value / current_value)
-            >= MIN_SETTING_TO_ESTIMATE_RATIO
+            estimate is not None
+            and setting != getattr(Settings(), name)
+            and max(setting / estimate, estimate / setting) >= MIN_SETTING_TO_ESTIMATE_RATIO
         ):
-            estimate_by_setting[name] = float(f"{noise.value:.3g}")
+            estimate_by_setting[name] = float(f"{estimate:.3g}")
     return estimate_by_setting
 
 
@@ -132,22 +127,14 @@ def _make_comparable_settings(
 def _compare_outside_replay(
     axis_result: AxisComparison, kf_run: Replay, spans_s: Spans
 ) -> DifferenceOutsideReplay | None:
-    if not isinstance(axis_result.ekf2_state, pd.DataFrame):
+    if isinstance(axis_result.ekf2_state, Unavailable):
         return None
-    state_outside_replay = axis_result.ekf2_state[
-        ~is_inside_spans(axis_result.ekf2_state.index, spans_s)
-    ]
-    times_outside_replay_s = state_outside_replay.index.to_numpy()
-    difference_m = np.abs(
-        predict_state(kf_run, times_outside_replay_s)[0]
-        - state_outside_replay["position_m"].to_numpy()
-    )
+    position_m = axis_result.ekf2_state["position_m"]
+    position_m = position_m[~is_inside_spans(position_m.index, spans_s)]
+    difference_m = (position_m - predict_state(kf_run, position_m.index.to_numpy())[0]).abs()
     if not np.isfinite(difference_m).any():
         return None
-    largest_index = int(np.nanargmax(difference_m))
-    return DifferenceOutsideReplay(
-        float(difference_m[largest_index]), float(times_outside_replay_s[largest_index])
-    )
+    return DifferenceOutsideReplay(float(difference_m.max()), float(difference_m.idxmax()))
 
 
 def add_cause_sentences(
@@ -163,18 +150,15 @@ def add_cause_sentences(
     step_reasons : mapping from str to str
         Text for each possible cause, for example the measurement noise.
     """
-    step_reasons = {
-        **step_reasons,
-        steps.REJECTION_PROPERTY: ". ".join(
-            [step_reasons[steps.REJECTION_PROPERTY], *_describe_rejections(explanation)]
-        ),
-    }
-    largest_contribution, second_contribution, *_ = sorted(
-        explanation.steps, key=lambda step: -step.position_mean_square_m2
+    first, second, *_ = sorted(explanation.steps, key=lambda step: -step.position_mean_square_m2)
+    first_reason, second_reason = (
+        step_reasons[step.name]
+        + (_describe_rejections(explanation) if step.name == steps.REJECTION_PROPERTY else "")
+        for step in (first, second)
     )
     cause_text = (
-        f"Largest contribution to the difference KF - EKF2 along {axis_label}: "
-        f"{largest_contribution.name}. {step_reasons[largest_contribution.name]}."
+        f"Largest contribution to the difference KF - EKF2 along {axis_label}: {first.name}. "
+        f"{first_reason}."
     )
     sentences = []
     if explanation.corrected:
@@ -182,32 +166,26 @@ def add_cause_sentences(
             f"{COMPARISON_OPTIONS[name]} {value:g}" for name, value in explanation.corrected.items()
         )
         sentences.append(
-            f"KF was run again with the estimated noise ({settings_text}). The following sentences "
-            "explain the difference between this run and EKF2."
+            f"The following sentences explain a run of KF with the estimated noise "
+            f"({settings_text})."
         )
-    sentences.append(f"{cause_text} {_describe_step_effect(largest_contribution, explanation)}")
-    if (
-        second_contribution.position_mean_square_m2
-        >= MIN_CONTRIBUTION_FRACTION * explanation.position_mean_square_m2
-    ):
+    sentences.append(f"{cause_text} {_describe_step_effect(first, explanation)}")
+    min_contribution_m2 = MIN_CONTRIBUTION_FRACTION * explanation.position_mean_square_m2
+    if second.position_mean_square_m2 >= min_contribution_m2:
         sentences.append(
-            f"Second largest contribution: {second_contribution.name}. "
-            f"{step_reasons[second_contribution.name]}. "
-            f"{_describe_step_effect(second_contribution, explanation)}"
+            f"Second largest contribution: {second.name}. {second_reason}. "
+            f"{_describe_step_effect(second, explanation)}"
         )
     sentences += [_describe_unexplained_fractions(explanation), *_describe_rmse(explanation)]
-    min_reported_difference_m = max(
-        MIN_DIFFERENCE_OUTSIDE_REPLAY_M,
-        MIN_OUTSIDE_TO_INSIDE_REPLAY_RATIO * float(np.max(np.abs(explanation.kf_minus_ekf2_m))),
-    )
-    if (
-        explanation.outside is not None
-        and explanation.outside.maximum_m > min_reported_difference_m
+    outside = explanation.outside
+    inside_maximum_m = np.max(np.abs(explanation.kf_minus_ekf2_m))
+    if outside is not None and outside.maximum_m > max(
+        MIN_DIFFERENCE_OUTSIDE_REPLAY_M, MIN_OUTSIDE_TO_INSIDE_REPLAY_RATIO * inside_maximum_m
     ):
         sentences.append(
             "Outside the replayed times (while EKF2 initialises or does not fuse positions) the "
-            f"positions of KF and EKF2 differ by up to {explanation.outside.maximum_m:.1f} m (at "
-            f"{explanation.outside.at_s:.0f} s)."
+            f"positions of KF and EKF2 differ by up to {outside.maximum_m:.1f} m (at "
+            f"{outside.at_s:.0f} s)."
         )
     return structs.replace(explanation, sentences=tuple(sentences), cause_sentence=cause_text)
 
@@ -229,50 +207,47 @@ def _describe_step_effect(step: PropertyReplacement, explanation: DifferenceExpl
     )
 
 
-def _describe_rejections(explanation: DifferenceExplanation) -> list[str]:
-    rejection_run = explanation.longest_rejection
-    if rejection_run is None:
-        return []
-    count_text = f"{rejection_run.samples} position{'s' if rejection_run.samples > 1 else ''}"
-    return [
-        f"From {rejection_run.start_s:.0f} s on, EKF2 rejected {count_text} in a row for "
-        f"{rejection_run.duration_s:.1f} s. Replays with and without gate differ by up to "
-        f"{rejection_run.distance_m:.2g} m in EKF2's position"
-    ]
+def _describe_rejections(explanation: DifferenceExplanation) -> str:
+    rejections = explanation.longest_rejection
+    if rejections is None:
+        return ""
+    return (
+        f". From {rejections.start_s:.0f} s on, EKF2 rejected "
+        f"{format_count(rejections.samples, 'position')} in a row for "
+        f"{rejections.duration_s:.1f} s. Replays with and without gate differ by up to "
+        f"{rejections.distance_m:.2g} m in EKF2's position"
+    )
 
 
 def _describe_property_differences(
     comparison: Comparison, model: Ekf2Model, clock_offset: ClockOffset | Unavailable
 ) -> dict[str, str]:
-    kf_settings, ekf2_inputs, source = comparison.settings, model.inputs, comparison.source
-    ekf2_parameters, aid = ekf2_inputs.settings, ekf2_inputs.aid
+    kf_settings, inputs, source = comparison.settings, model.inputs, comparison.source
+    parameters, aid, ekf2_source = inputs.settings, inputs.aid, inputs.received_positions.source
     prediction_text = (
         f"KF predicts every {kf_settings.dt_s:g} s, starting at its first position; EKF2 predicts "
-        f"every {1e3 * ekf2_inputs.mean_step_s:.0f} ms"
+        f"every {1e3 * inputs.mean_step_s:.0f} ms"
     )
     if kf_settings.input == "zero":
         prediction_text = "KF uses no acceleration (--input zero); EKF2 uses the IMU"
-    elif source.name != ekf2_inputs.received_positions.source:
-        prediction_text = (
-            f"KF uses positions of {source.name}; EKF2 uses {ekf2_inputs.received_positions.source}"
-        )
+    elif source.name != ekf2_source:
+        prediction_text = f"KF uses positions of {source.name}; EKF2 uses {ekf2_source}"
     position_age_ms = 1e3 * (source.assumed_delay_s - kf_settings.clock_offset_s)
     delay_text = (
-        f"EKF2 assumes that positions are {ekf2_parameters[aid.delay]:g} ms old ({aid.delay}), KF "
+        f"EKF2 assumes that positions are {parameters[aid.delay]:g} ms old ({aid.delay}), KF "
         f"assumes {position_age_ms:.0f} ms"
     )
     if isinstance(clock_offset, ClockOffset) and clock_offset.is_determinable:
-        offset_high_low_s = (clock_offset.offset_s, *clock_offset.interval_s[::-1])
-        estimated_delay_ms, delay_low_ms, delay_high_ms = (
-            1e3 * (source.assumed_delay_s - offset_s) for offset_s in offset_high_low_s
+        age_ms, low_ms, high_ms = (
+            1e3 * (source.assumed_delay_s - offset_s)
+            for offset_s in (clock_offset.offset_s, *clock_offset.interval_s[::-1])
         )
-        delay_text = (
-            f"{delay_text}. The maximum-likelihood estimate of the age of positions is "
-            f"{estimated_delay_ms:.0f} ms (95 % {delay_low_ms:.0f} to {delay_high_ms:.0f} ms)"
+        delay_text += (
+            f". The maximum-likelihood estimate is {age_ms:.0f} ms (95 % {low_ms:.0f} to "
+            f"{high_ms:.0f} ms)"
         )
-    acc_noise_as_sigma_a = ekf2_parameters["EKF2_ACC_NOISE"] * np.sqrt(
-        ekf2_inputs.mean_step_s / kf_settings.dt_s
-    )
+    acc_noise = parameters["EKF2_ACC_NOISE"]
+    acc_noise_as_sigma_a = acc_noise * np.sqrt(inputs.mean_step_s / kf_settings.dt_s)
     higher_weighted_input = (
         "IMU" if acc_noise_as_sigma_a < kf_settings.sigma_a_m_s2 else "positions"
     )
@@ -280,12 +255,12 @@ def _describe_property_differences(
         steps.SAMPLE_TIMES_PROPERTY: prediction_text,
         steps.TIMESTAMPS_PROPERTY: delay_text,
         steps.MEASUREMENT_NOISE_PROPERTY: (
-            f"EKF2 uses a measurement noise of {find_used_noise_m(model.inputs):.2g} m "
+            f"EKF2 uses a measurement noise of {find_used_noise_m(inputs):.2g} m "
             f"({aid.noise}), KF uses {kf_settings.sigma_z_m:.2g} m"
         ),
         steps.ACCELEROMETER_BIAS_PROPERTY: "EKF2 estimates the accelerometer bias; KF does not",
         steps.PROCESS_NOISE_PROPERTY: (
-            f"EKF2_ACC_NOISE {ekf2_parameters['EKF2_ACC_NOISE']:g} has the same effect as SIGMA_A "
+            f"EKF2_ACC_NOISE {acc_noise:g} has the same effect as SIGMA_A "
             f"{acc_noise_as_sigma_a:.2g} m/s²; KF has SIGMA_A {kf_settings.sigma_a_m_s2:.2g} m/s². "
             f"EKF2 gives the {higher_weighted_input} more weight than KF"
         ),
@@ -300,21 +275,19 @@ def _describe_property_differences(
         steps.VISION_PROPERTY: "EKF2 fuses external vision and GNSS; KF uses one position source",
         steps.REJECTION_PROPERTY: (
             f"EKF2 rejects {100 * model.agreement.rejected_fraction_logged:.1f} % of the "
-            f"positions of {ekf2_inputs.received_positions.source}; KF has no innovation gate "
-            "and uses all positions"
+            f"positions of {ekf2_source}; KF has no innovation gate and uses all positions"
         ),
         steps.OUTPUT_PREDICTOR_PROPERTY: (
-            f"EKF2 fuses positions with a delay of {1e3 * ekf2_inputs.horizon_s:.0f} ms. EKF2's "
-            f"output predictor (EKF2_TAU_POS {ekf2_parameters['EKF2_TAU_POS']:g} s) extrapolates "
+            f"EKF2 fuses positions with a delay of {1e3 * inputs.horizon_s:.0f} ms. EKF2's "
+            f"output predictor (EKF2_TAU_POS {parameters['EKF2_TAU_POS']:g} s) extrapolates "
             "to the present. KF has no delay"
         ),
     }
 
 
 def _describe_unexplained_fractions(explanation: DifferenceExplanation) -> str:
-    position_mean_square_m2 = explanation.position_mean_square_m2
     velocity_mean_square_m2_s2 = explanation.velocity_mean_square_m2_s2
-    unexplained_position_text, unexplained_velocity_text = (
+    position_text, velocity_text = (
         f"{100 * min(fraction, 1.0):.1f} %"
         for fraction in (
             explanation.unexplained_fraction,
@@ -322,10 +295,11 @@ def _describe_unexplained_fractions(explanation: DifferenceExplanation) -> str:
         )
     )
     return (
-        f"RMS difference KF - EKF2 over the replayed times: {np.sqrt(position_mean_square_m2):.3f} "
-        f"m and {np.sqrt(velocity_mean_square_m2_s2):.3f} m/s. The replay does not explain "
-        f"{unexplained_position_text} of the mean square position difference and "
-        f"{unexplained_velocity_text} of the mean square velocity difference."
+        "RMS difference KF - EKF2 over the replayed times: "
+        f"{explanation.position_mean_square_m2**0.5:.3f} m and "
+        f"{velocity_mean_square_m2_s2**0.5:.3f} m/s. The replay does not explain {position_text} "
+        f"of the mean square position difference and {velocity_text} of the mean square velocity "
+        "difference."
     )
 
 
@@ -339,19 +313,13 @@ def _describe_rmse(explanation: DifferenceExplanation) -> list[str]:
             f"{100 * MAX_RELATIVE_RMSE_DIFFERENCE:.0f} %): KF {kf_rmse_m:.3f} m, EKF2 "
             f"{ekf2_rmse_m:.3f} m."
         ]
-    rmse_by_step = [
-        kf_rmse_m,
-        *(step.position_rmse_to_truth_m or 0.0 for step in explanation.steps),
-    ]
-    mean_square_changes = np.diff(np.square(rmse_by_step))
-    largest_change_index = int(
-        np.argmin(mean_square_changes)
-        if ekf2_rmse_m < kf_rmse_m
-        else np.argmax(mean_square_changes)
-    )
-    rmse_before_m, rmse_after_m = rmse_by_step[largest_change_index : largest_change_index + 2]
+    rmses_m = [kf_rmse_m, *(step.position_rmse_to_truth_m or 0.0 for step in explanation.steps)]
+    mean_square_changes = np.diff(np.square(rmses_m))
+    if ekf2_rmse_m < kf_rmse_m:
+        mean_square_changes *= -1.0
+    index = int(np.argmax(mean_square_changes))
     return [
         f"Position RMSE: EKF2 {ekf2_rmse_m:.3f} m, KF {kf_rmse_m:.3f} m. KF's RMSE changes "
-        f"most with EKF2's {explanation.steps[largest_change_index].name}, from "
-        f"{rmse_before_m:.3f} to {rmse_after_m:.3f} m."
+        f"most with EKF2's {explanation.steps[index].name}, from {rmses_m[index]:.3f} to "
+        f"{rmses_m[index + 1]:.3f} m."
     ]

@@ -13,7 +13,6 @@ from scipy.ndimage import median_filter, uniform_filter1d
 
 from px4fuse.comparison.model import Comparison
 from px4fuse.core.arrays import Array, integrate_cumulatively, rank_correlation
-from px4fuse.filter.signals import cut_to_segment
 from px4fuse.flight.model import Columns, Ekf2, Unavailable, rows_between
 from px4fuse.trajectory.rotation import conjugate, interpolate, multiply, to_rotation_vector
 from px4fuse.trajectory.scores import compute_autocorrelation_time
@@ -180,8 +179,7 @@ def _rotate_90(vectors: Array) -> Array:
 
 
 def _select_distinct_positions(comparison: Comparison) -> tuple[Array, Array]:
-    samples = cut_to_segment(comparison.source.samples, comparison.segment)
-    samples = samples[Columns.POSITION[:2]].dropna()
+    samples = comparison.source_samples[Columns.POSITION[:2]].dropna()
     samples = samples[~(samples.diff() == 0.0).all(axis=1)]  # without repeated positions
     return samples.index.to_numpy(), samples.to_numpy()
 

@@ -106,30 +106,29 @@ def value_or_bound(noise: NoiseEstimate, fallback: float) -> float:
 
 def estimate(comparison: Comparison, progress: Progress = ignore_progress) -> Estimates:
     """Estimate noises, time offset, yaw misalignment and systematic errors of a position source."""
-    tuned_axes = (
-        REPORTED_AXES
-        if {"north", "east"} <= {axis.name for axis in comparison.input_axes}
-        else None
+    has_north_and_east = {"north", "east"} <= {axis.name for axis in comparison.input_axes}
+    tuning, clock_offset = estimate_noises_and_clock(
+        comparison, progress, REPORTED_AXES if has_north_and_east else None
     )
-    tuning, clock_offset = estimate_noises_and_clock(comparison, progress, tuned_axes)
     systematic_errors, source_low_pass, correlated_noise = _fit_source_errors(
         comparison, tuning, clock_offset
     )
     progress("heading")
-    source, is_odometry = comparison.source, comparison.source.orientation is not None
+    heading_error = estimate_frame_rotation(comparison, tuning, clock_offset)
+    axis_tunings, noisy_part = tuple[AxisTuning, ...](), None
+    if comparison.source.orientation is None:  # no odometry
+        if not comparison.source.origin.is_gnss:
+            axis_tunings = tune_perpendicular_axes(comparison)
+        noisy_part = find_noisy_flight_part(comparison, tuning.get(HORIZONTAL))
     return Estimates(
         tuning=tuning,
         clock=clock_offset,
-        heading=estimate_frame_rotation(comparison, tuning, clock_offset),
+        heading=heading_error,
         systematic_errors=systematic_errors,
         source_low_pass=source_low_pass,
         time_correlated_noise=correlated_noise,
-        axis_tunings=()
-        if is_odometry or source.origin.is_gnss
-        else tune_perpendicular_axes(comparison),
-        noisy_part=None
-        if is_odometry
-        else find_noisy_flight_part(comparison, tuning.get(HORIZONTAL)),
+        axis_tunings=axis_tunings,
+        noisy_part=noisy_part,
     )
 
 
@@ -180,21 +179,21 @@ def estimate_noises_and_clock(
         return tuning, DIAGNOSIS_WITHHELD
     if low_imu_rate_reason := explain_low_imu_rate(comparison.flight):
         return tuning, low_imu_rate_reason
-    settings, axis_tuning = comparison.settings, find_first_tuning(tuning, HORIZONTAL, *tuning)
+    settings, outlier_time_s = comparison.settings, None
+    noises = NoiseParameters(settings.sigma_a_m_s2, settings.sigma_z_m)
+    if axis_tuning := find_first_tuning(tuning, HORIZONTAL, *tuning):
+        noises, outlier_time_s = axis_tuning.noises, axis_tuning.outlier_time_s
     clock_offset = estimate_time_offset(
         comparison.flight,
         comparison.source,
         comparison.segment,
         settings,
-        axis_tuning.noises
-        if axis_tuning
-        else NoiseParameters(settings.sigma_a_m_s2, settings.sigma_z_m),
-        axis_tuning.outlier_time_s if axis_tuning else None,
+        noises,
+        outlier_time_s,
         progress,
         motion_cache,
     )
-    may_drift = comparison.source.origin.may_drift
-    if may_drift and isinstance(clock_offset, ClockOffset):
+    if comparison.source.origin.may_drift and isinstance(clock_offset, ClockOffset):
         clock_offset = widen_for_drift(clock_offset)
     return tuning, clock_offset
 
@@ -205,8 +204,8 @@ def estimate_frame_rotation(
     clock_offset: ClockOffset | Unavailable,
 ) -> HeadingError | Unavailable:
     """Estimate the yaw misalignment of the position frame."""
-    axis_tuning, sigma_z_m = find_first_tuning(tuning, HORIZONTAL), comparison.settings.sigma_z_m
-    if axis_tuning is not None:
+    sigma_z_m = comparison.settings.sigma_z_m
+    if axis_tuning := find_first_tuning(tuning, HORIZONTAL):
         sigma_z_m = value_or_bound(axis_tuning.sigma_z, sigma_z_m)
     offset_s = 0.0
     if isinstance(clock_offset, ClockOffset) and clock_offset.is_determinable:
@@ -338,29 +337,24 @@ def widen_for_drift(clock_offset: ClockOffset) -> ClockOffset:
         return structs.replace(
             clock_offset, change_p_value=None, drift_ppm=None, drift_sigma_ppm=None
         )
-    sigma_widening_factor = np.sqrt(
-        max(1.0, _compute_weighted_square_sum(offsets_s, weights) / (len(offsets_s) - 1))
-    )
-    interval_low_s, interval_high_s = (
-        clock_offset.offset_s + sigma_widening_factor * (limit_s - clock_offset.offset_s)
+    variance_factor = _compute_weighted_square_sum(offsets_s, weights) / (len(offsets_s) - 1)
+    widening_factor = max(1.0, variance_factor) ** 0.5
+    low_s, high_s = (
+        clock_offset.offset_s + widening_factor * (limit_s - clock_offset.offset_s)
         for limit_s in clock_offset.interval_s
     )
-    drift_reason = clock_offset.reason
-    if (
-        not drift_reason
-        and (interval_high_s - interval_low_s) / 2.0 > MAX_OFFSET_INTERVAL_HALF_WIDTH_S
-    ):
-        drift_reason = (
+    reason = clock_offset.reason
+    if not reason and (high_s - low_s) / 2.0 > MAX_OFFSET_INTERVAL_HALF_WIDTH_S:
+        reason = (
             "the time offset differs between parts of the flight, probably because the positions "
-            f"drift (95 % interval of the offset: {interval_low_s:+.2f} s to "
-            f"{interval_high_s:+.2f} s)"
+            f"drift (95 % interval of the offset: {low_s:+.2f} s to {high_s:+.2f} s)"
         )
     return structs.replace(
         clock_offset,
-        interval_s=(float(interval_low_s), float(interval_high_s)),
-        sigma_s=float(clock_offset.sigma_s * sigma_widening_factor),
-        is_determinable=not drift_reason,
-        reason=drift_reason,
+        interval_s=(low_s, high_s),
+        sigma_s=clock_offset.sigma_s * widening_factor,
+        is_determinable=not reason,
+        reason=reason,
         drift_ppm=None,
         drift_sigma_ppm=None,
         change_p_value=_compute_change_p_value(offsets_s, weights),
@@ -376,39 +370,22 @@ def _compute_change_p_value(offsets_s: Array, weights: Array) -> float | None:
 
     Method: Student's t-test with Bonferroni correction.
     """
-    part_count = len(offsets_s)
+    degrees_of_freedom = len(offsets_s) - 2
     split_rows = range(
         MIN_ESTIMATES_BEFORE_AND_AFTER_CHANGE,
-        part_count - MIN_ESTIMATES_BEFORE_AND_AFTER_CHANGE + 1,
+        len(offsets_s) - MIN_ESTIMATES_BEFORE_AND_AFTER_CHANGE + 1,
     )
     smallest_p_value = 1.0
     for split_row in split_rows:
-        parts_before_and_after = [
-            (offsets_s[rows], weights[rows])
-            for rows in (slice(None, split_row), slice(split_row, None))
-        ]
-        offset_change_s = float(
-            np.diff(
-                [
-                    np.average(side_offsets_s, weights=side_weights)
-                    for side_offsets_s, side_weights in parts_before_and_after
-                ]
-            )[0]
-        )
-        if abs(offset_change_s) < MIN_TIME_OFFSET_CHANGE_S:
+        means_s, square_sum, variance_sum = [], 0.0, 0.0
+        for rows in (slice(None, split_row), slice(split_row, None)):
+            means_s.append(np.average(offsets_s[rows], weights=weights[rows]))
+            square_sum += _compute_weighted_square_sum(offsets_s[rows], weights[rows])
+            variance_sum += 1.0 / np.sum(weights[rows])
+        change_s = float(np.ptp(means_s))
+        if change_s < MIN_TIME_OFFSET_CHANGE_S:
             continue
-        variance_factor = max(
-            1.0,
-            sum(
-                _compute_weighted_square_sum(side_offsets_s, side_weights)
-                for side_offsets_s, side_weights in parts_before_and_after
-            )
-            / (part_count - 2),
-        )
-        offset_change_sigma_s = np.sqrt(
-            variance_factor
-            * sum(1.0 / np.sum(side_weights) for _, side_weights in parts_before_and_after)
-        )
-        p_value = 2.0 * float(stdtr(part_count - 2, -abs(offset_change_s) / offset_change_sigma_s))
+        change_sigma_s = np.sqrt(max(1.0, square_sum / degrees_of_freedom) * variance_sum)
+        p_value = 2.0 * float(stdtr(degrees_of_freedom, -change_s / change_sigma_s))
         smallest_p_value = min(smallest_p_value, p_value * len(split_rows))
     return smallest_p_value if split_rows else None

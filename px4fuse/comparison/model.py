@@ -4,8 +4,10 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Literal
 
+import pandas as pd
 from msgspec import structs
 
+from px4fuse.convention.correction import ConventionFaults, find_convention_faults
 from px4fuse.convention.model import Convention
 from px4fuse.core.record import (
     NOT_WRITTEN,
@@ -25,7 +27,7 @@ from px4fuse.errors import MissingDataError, suggest_name
 from px4fuse.filter.consistency import Consistency, HorizontalNis, classify_sigma_ratio
 from px4fuse.filter.kalman import Replay
 from px4fuse.filter.settings import Settings
-from px4fuse.filter.signals import AISLE, Axis, Segment
+from px4fuse.filter.signals import AISLE, Axis, Segment, cut_to_segment
 from px4fuse.flight.model import Flight, PositionTrack, TableOrUnavailable
 
 FilterName = Literal["kf", "ekf2"]
@@ -174,6 +176,16 @@ class PreparedComparison:
     convention: Convention | None
 
     __repr__ = one_line_repr
+
+    @property
+    def source_samples(self) -> pd.DataFrame:
+        """Positions of the source and reported variances in the analysed segment."""
+        return cut_to_segment(self.source.samples, self.segment)
+
+    @property
+    def convention_faults(self) -> ConventionFaults:
+        """Deviations of the source from PX4's convention: axes, unit, clock, orientation."""
+        return find_convention_faults(self.convention, self.flight, self.source.frame)
 
 
 @dataclass(frozen=True, repr=False)

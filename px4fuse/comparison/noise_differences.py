@@ -78,18 +78,15 @@ def find_noisy_flight_part(
     comparison: Comparison, axis_tuning: AxisTuning | Unavailable | None
 ) -> NoisyPart | None:
     """Find a time span with larger innovations than in the rest of the flight."""
-    settings = comparison.settings
-    if axis_tuning is None:
-        return None
     # Use KF's settings if the noises could not be estimated
+    settings, outlier_time_s = comparison.settings, np.zeros(0)
     sigma_a: float | None = settings.sigma_a_m_s2
     sigma_z: float | None = settings.sigma_z_m
-    outlier_time_s = np.zeros(0)
     if isinstance(axis_tuning, AxisTuning):
         sigma_a, sigma_z = axis_tuning.sigma_a_two_state.value, axis_tuning.sigma_z.value
         outlier_time_s = axis_tuning.outlier_time_s
     axes = [axis_result.axis for axis_result in select_north_and_east(comparison)]
-    if sigma_a is None or sigma_z is None or len(axes) < 2:
+    if axis_tuning is None or sigma_a is None or sigma_z is None or len(axes) < 2:
         return None
     axis_motions = [preintegrate(axis, settings) for axis in axes]
     time_s = axes[0].measurement_time_s[-len(axis_motions[0].measurement_m) :]
@@ -107,38 +104,22 @@ def find_noisy_flight_part(
         return np.asarray(magnitudes / np.median(magnitudes, axis=1, keepdims=True))
 
     scaled_innovations = compute_scaled_innovations(None)
-    median_magnitude_by_part = np.array(
-        [
-            np.median(scaled_innovations[:, first_row:end_row])
-            for first_row, end_row in pairwise(part_edges)
-        ]
+    part_medians = np.array(
+        [np.median(scaled_innovations[:, first:end]) for first, end in pairwise(part_edges)]
     )
-    is_noisy = median_magnitude_by_part > np.sqrt(
-        median_magnitude_by_part.min() * median_magnitude_by_part.max()
-    )
-    first_noisy_index = int(np.argmax(is_noisy))
-    end_noisy_index = first_noisy_index + int(
-        np.argmin(np.append(is_noisy[first_noisy_index:], False))
-    )
-    if (
-        is_noisy.sum() != end_noisy_index - first_noisy_index
-        or is_noisy.all()
-        or not is_noisy.any()
-    ):
-        return None  # the noisy parts are not one continuous time span
-    is_outside_noisy_part = np.ones(len(time_s), bool)
-    is_outside_noisy_part[part_edges[first_noisy_index] : part_edges[end_noisy_index]] = False
+    noisy_parts = np.flatnonzero(part_medians > np.sqrt(part_medians.min() * part_medians.max()))
+    # The noisy parts must be one continuous time span, but not the whole flight
+    if len(noisy_parts) in (0, part_count) or np.ptp(noisy_parts) >= len(noisy_parts):
+        return None
+    first_row, end_row = part_edges[noisy_parts[0]], part_edges[noisy_parts[-1] + 1]
+    is_noisy = np.zeros(len(time_s), bool)
+    is_noisy[first_row:end_row] = True
     sigma_ratios = (
-        float(
-            np.median(magnitudes[:, ~is_outside_noisy_part])
-            / np.median(magnitudes[:, is_outside_noisy_part])
-        )
+        float(np.median(magnitudes[:, is_noisy]) / np.median(magnitudes[:, ~is_noisy]))
         for magnitudes in (
             scaled_innovations,
             compute_scaled_innovations(np.isin(time_s, outlier_time_s)),
         )
     )
-    start_s, end_s = time_s[
-        [part_edges[first_noisy_index], part_edges[end_noisy_index] - 1]
-    ].tolist()
+    start_s, end_s = time_s[[first_row, end_row - 1]].tolist()
     return NoisyPart(start_s, end_s, *sigma_ratios)

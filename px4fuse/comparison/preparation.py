@@ -36,14 +36,10 @@ from px4fuse.readers.px4_innovations import (
     replace_vision_by_gnss_innovations,
 )
 from px4fuse.readers.px4_positions import NO_FIX_ACTION
-from px4fuse.readers.px4_topics import ORIGIN_BY_TRACK_NAME, SOURCE_TRACKS
+from px4fuse.readers.px4_topics import SOURCE_TRACKS
 from px4fuse.request import ComparisonRequest, HeightName
 from px4fuse.trajectory.rotation import interpolate, to_matrix
 
-# Kind of sensor of each position source, by PX4 topic or MAVLink message
-ORIGIN_BY_SOURCE_NAME = ORIGIN_BY_TRACK_NAME | {
-    source.track_name: source.origin for source in POSITION_MESSAGE_TYPES
-}
 NO_SEPARATE_TRUTH = Unavailable(
     "ground truth",
     "KF uses the only ground truth in the log as its position source",
@@ -86,38 +82,31 @@ def prepare_comparison_inputs(
     # A time offset from the user replaces the detected one
     if convention is not None and settings.clock_offset_s:
         convention = structs.replace(convention, late_s=0.0)
-    timestamp_delay_s = find_convention_faults(convention, flight, source_track.frame).late_s
-    clock_offset_limits_s = SETTING_RANGES["clock_offset_s"][:2]
-    clock_offset_s = float(
-        np.clip(settings.clock_offset_s - timestamp_delay_s, *clock_offset_limits_s)
-    )
-    settings = replace(settings, clock_offset_s=clock_offset_s)
+    late_s = find_convention_faults(convention, flight, source_track.frame).late_s
+    offset_range = SETTING_RANGES["clock_offset_s"]
+    clock_offset_s = np.clip(settings.clock_offset_s - late_s, offset_range.low, offset_range.high)
+    settings = replace(settings, clock_offset_s=float(clock_offset_s))
     flight, source_track = convert_to_px4_convention(flight, source_track, convention)
     source_track = _subtract_lever_arm(source_track, flight)
     source_track = _shift_vision_to_ekf2_origin(source_track, flight)
     source_track = _use_barometer_height(source_track, flight, request.height)
     flight = select_source_innovations(flight, source_track)
-    missing_data = flight.missing
+    missing_data, is_gnss = flight.missing, source_track.origin.is_fused_as_gnss
     segment = choose_segment(flight, source_track, request.start_s, request.end_s)
-    has_height = not source_track.origin.is_fused_as_gnss and "z" not in constant_coordinates(
-        source_track
-    )
-    axis_names = request.axes or (None if has_height else HORIZONTAL_AXES)
+    has_no_height = is_gnss or "z" in constant_coordinates(source_track)
+    axis_names = request.axes or (HORIZONTAL_AXES if has_no_height else None)
     compared_axes = make_axes(
         flight, source_track, segment, names=axis_names, heading_deg=request.heading_deg
     )
     if isinstance(flight.truth, Truth) and flight.truth.name == source_track.name:
         flight = replace(flight, truth=NO_SEPARATE_TRUTH)
     notes = (*flight.log.notes, *source_track.notes)
-    if source_track.origin.is_fused_as_gnss and request.sigma_z_m is None:
+    if is_gnss and request.sigma_z_m is None:
         default_noise_m = PARAMETERS[GNSS_POS.noise].default
-        sigma_z_m = (
-            find_observation_variance(
-                flight, source_track, compared_axes[0], segment, default_noise_m
-            )
-            ** 0.5
+        noise_variance_m2 = find_observation_variance(
+            flight, source_track, compared_axes[0], segment, default_noise_m
         )
-        if sigma_z_m >= SETTING_RANGES["sigma_z_m"].low:
+        if (sigma_z_m := noise_variance_m2**0.5) >= SETTING_RANGES["sigma_z_m"].low:
             settings = replace(settings, sigma_z_m=float(f"{sigma_z_m:.3g}"))
     acceleration = compared_axes[0].acceleration
     if settings.input == "imu" and isinstance(acceleration, Unavailable):
@@ -148,29 +137,24 @@ def select_source_innovations(flight: Flight, track: PositionTrack) -> Flight:
     """Return a copy of the flight with EKF2's GNSS innovations if the position source is GNSS."""
     if isinstance(flight.ekf2, Unavailable) or not track.origin.is_fused_as_gnss:
         return flight
-    # GNSS innovations replace those of vision, so missing vision innovations are not reported
-    missing_vision_innovations = _find_missing_innovations(flight.ekf2)
     streams = dict(flight.streams)
     ekf2 = replace_vision_by_gnss_innovations(
         flight.ekf2, GNSS if track.barometer is None else GNSS_WITH_BAROMETER_HEIGHT
     )
-    other_missing_data = tuple(
+    # GNSS innovations replace those of vision, so missing vision innovations are not reported
+    missing_vision_innovations, missing_gnss_innovations = (
+        [item for item in each.innovations.values() if isinstance(item, Unavailable)]
+        for each in (flight.ekf2, ekf2)
+    )
+    other_missing_data = [
         item
         for item in flight.missing
         if not item.source and item not in missing_vision_innovations
-    )
+    ]
     if "ekf2_state" in streams and ekf2.aids:
         streams["ekf2_innovations"] = replace(streams["ekf2_state"], topics=ekf2.innovation_topics)
-    return replace(
-        flight,
-        ekf2=ekf2,
-        streams=streams,
-        missing=other_missing_data + _find_missing_innovations(ekf2),
-    )
-
-
-def _find_missing_innovations(ekf2: Ekf2) -> tuple[Unavailable, ...]:
-    return tuple(item for item in ekf2.innovations.values() if isinstance(item, Unavailable))
+    missing_data = (*other_missing_data, *missing_gnss_innovations)
+    return replace(flight, ekf2=ekf2, streams=streams, missing=missing_data)
 
 
 def choose_source(flight: Flight, name: str | None = None) -> tuple[PositionTrack, str]:
@@ -225,25 +209,24 @@ def _subtract_lever_arm(track: PositionTrack, flight: Flight) -> PositionTrack:
 
 def _shift_vision_to_ekf2_origin(track: PositionTrack, flight: Flight) -> PositionTrack:
     """Shift vision positions to EKF2's origin if EKF2 also fused GNSS."""
-    ekf2 = flight.ekf2
-    if not (track.origin.is_vision and isinstance(ekf2, Ekf2) and has_fused_aid(ekf2)):
+    ekf2, samples = flight.ekf2, track.samples.copy()
+    if (
+        track.frame != "NED"
+        or not track.origin.is_vision
+        or isinstance(ekf2, Unavailable)
+        or not has_fused_aid(ekf2)
+    ):
         return track
-    samples = track.samples.copy()
-    median_offset_m = [
-        float(
-            np.nanmedian(
-                samples[column] - np.interp(samples.index, ekf2.state.index, ekf2.state[column])
-            )
-        )
+    north_m, east_m, down_m = offset_m = [
+        (samples[column] - np.interp(samples.index, ekf2.state.index, ekf2.state[column])).median()
         for column in Columns.POSITION
     ]
-    if track.frame != "NED" or not np.isfinite(median_offset_m).all():
+    if not np.isfinite(offset_m).all():
         return track
-    samples[Columns.POSITION] -= median_offset_m
-    north_m, east_m, down_m = median_offset_m
+    samples[Columns.POSITION] -= offset_m
     origin_note = (
-        f"positions of {track.name} were shifted to EKF2's origin: their median offset from EKF2 "
-        f"({north_m:.1f} m north, {east_m:.1f} m east, {down_m:.1f} m down) was subtracted"
+        f"positions of {track.name} were shifted to EKF2's origin by their median offset "
+        f"({north_m:.1f} m north, {east_m:.1f} m east, {down_m:.1f} m down)"
     )
     return replace(track, samples=samples, notes=(*track.notes, origin_note))
 
@@ -269,18 +252,18 @@ def _use_barometer_height(
                 f"{log_name}: the log contains no barometer height.", GNSS.logging_remedy
             )
         return track
-    barometer_offset_down_m = barometer_heights["down_m"].iloc[0]
+    offset_m = barometer_heights["down_m"].iloc[0]
     height_note = "heights are barometer heights relative to the first barometer sample"
     if isinstance(ekf2, Ekf2):
         ekf2_down_m = np.interp(
             barometer_heights.index, ekf2.state.index, ekf2.state["down_m"], np.nan, np.nan
         )
         if np.isfinite(ekf2_down_m).any():
-            barometer_offset_down_m = float(np.nanmedian(barometer_heights["down_m"] - ekf2_down_m))
+            offset_m = float(np.nanmedian(barometer_heights["down_m"] - ekf2_down_m))
         height_note = "heights are barometer heights minus their median difference to EKF2's height"
     return replace(
         track,
-        barometer=barometer_heights - barometer_offset_down_m,
+        barometer=barometer_heights - offset_m,
         description=f"{track.description}, barometer height",
         notes=(*track.notes, height_note),
     )
@@ -295,30 +278,25 @@ def explain_missing_source(flight: Flight) -> Unavailable:
     )
     if flight.log.format.startswith("MAVLink"):
         topics = ", ".join(dict.fromkeys(source.message for source in POSITION_MESSAGE_TYPES))
-        remedy = "give the position file of the positioning system as argument `position`"
+        or_ulog = ", or analyse the ULog of this flight" if flight.log.writes_ulog else ""
         remedy = (
-            f"{remedy}, or analyse the ULog of this flight."
-            if flight.log.writes_ulog
-            else f"{remedy}."
+            f"give the position file of the positioning system as argument `position`{or_ulog}."
         )
-    if flight.positions:
-        track_name = flight.positions[0].name
+    for track in flight.positions[:1]:
         remedy = (
-            f"use {track_name}, which EKF2 did not fuse (--position-source {track_name}), "
+            f"use {track.name}, which EKF2 did not fuse (--position-source {track.name}), "
             f"or {remedy}"
         )
     reason = f"no external position in this log (possible sources: {topics})"
-    height_only_reason = next(
-        (item for item in flight.missing if item.reason == HEIGHT_ONLY_REASON), None
-    )
-    if height_only_reason is not None:
-        reason = f"{height_only_reason.source}: {HEIGHT_ONLY_REASON}"
+    for item in flight.missing:
+        if item.reason == HEIGHT_ONLY_REASON:
+            reason = f"{item.source}: {HEIGHT_ONLY_REASON}"
     if flight.log.damage:
         reason = f"the file is damaged, and {reason}"
-    gnss_without_fix = next((item for item in flight.missing if item.remedy == NO_FIX_ACTION), None)
-    if gnss_without_fix is not None:
-        reason += f"; {gnss_without_fix.source}: {gnss_without_fix.reason}"
-        remedy = f"{gnss_without_fix.remedy} Or {remedy}"
+    for item in flight.missing:
+        if item.remedy == NO_FIX_ACTION:
+            reason += f"; {item.source}: {item.reason}"
+            remedy = f"{NO_FIX_ACTION} Or {remedy}"
     if flight.log.autopilot != "PX4":
         reason += f"; the autopilot is {flight.log.autopilot}, so there is no EKF2"
     return Unavailable("position source", reason, capitalise_first(remedy))
@@ -330,17 +308,7 @@ def _explain_choice(flight: Flight, track: PositionTrack) -> str:
     if track.origin.is_fused_as_gnss:
         return "the only position source in the log, fused by EKF2"
     log_text = f" (from {track.log})" if track.log and track.log != flight.log.name else ""
-    unusable_sources = [
-        missing.source
-        for missing in flight.missing
-        if missing.source in ORIGIN_BY_SOURCE_NAME
-        and ORIGIN_BY_SOURCE_NAME[missing.source].find_preference_rank()
-        < track.origin.find_preference_rank()
-    ]
-    if not unusable_sources:
-        return f"chosen automatically: positions as received by PX4{log_text}"
-    sources_text = ", ".join(unusable_sources)
-    return f"chosen automatically{log_text}; preferred sources are not usable: {sources_text}"
+    return f"chosen automatically: positions {track.origin.path}{log_text}"
 
 
 def shift_clock(track: PositionTrack, clock_offset_s: float) -> PositionTrack:
@@ -367,69 +335,69 @@ def choose_segment(
     SettingsError
         The segment is empty or contains fewer than three measurements.
     """
-    source_span_s = track.samples.index[[0, -1]].tolist()
+    source_span_s, log = track.samples.index[[0, -1]].tolist(), flight.log
     available_start_s = max(source_span_s[0], 0.0)
-    available_end_s = min(source_span_s[1], flight.log.duration_s)
+    available_end_s = min(source_span_s[1], log.duration_s)
     chosen_start_s, chosen_end_s = available_start_s, available_end_s
+    reason = "the whole time span with positions, because "
     if isinstance(flight.airborne, Unavailable):
-        reason = "the whole time span with positions, because the log contains no land detector"
+        reason += "the log contains no land detector"
     elif not flight.airborne:
-        reason = "the whole time span with positions, because the vehicle stayed on the ground"
+        reason += "the vehicle stayed on the ground"
     else:
         flight_spans_s = join_flights(flight.airborne)
-        chosen_start_s, chosen_end_s = max(
+        flight_start_s, flight_end_s = max(
             flight_spans_s,
             key=lambda span: min(span[1], available_end_s) - max(span[0], available_start_s),
         )
-        reason = "positions available and vehicle airborne"
-        if len(flight_spans_s) > 1:
-            other_flights_text = ", ".join(
+        if max(flight_start_s, available_start_s) < min(flight_end_s, available_end_s):
+            chosen_start_s, chosen_end_s = flight_start_s, flight_end_s
+            reason = "positions available and vehicle airborne"
+            other_flight_texts = [
                 f"{start_s:.1f} to {end_s:.1f} s (--start {start_s:.1f} --end {end_s:.1f})"
                 for start_s, end_s in flight_spans_s
-                if start_s != chosen_start_s
-            )
-            reason += (
-                f"; this is the longest of {len(flight_spans_s)} flights; the others: "
-                f"{other_flights_text}"
-            )
-        if not max(chosen_start_s, available_start_s) < min(chosen_end_s, available_end_s):
-            chosen_start_s = min(chosen_start_s, available_start_s)
-            chosen_end_s = max(chosen_end_s, available_end_s)
-            reason = "the whole time span with positions, because there are no positions in flight"
+                if start_s != flight_start_s
+            ]
+            if other_flight_texts:
+                reason += (
+                    f"; this is the longest of {len(flight_spans_s)} flights; the others: "
+                    f"{', '.join(other_flight_texts)}"
+                )
+        else:
+            chosen_start_s = min(flight_start_s, available_start_s)
+            chosen_end_s = max(flight_end_s, available_end_s)
+            reason += "there are no positions in flight"
     if start_s is not None and end_s is not None and end_s <= start_s:
         raise SettingsError(
             f"The end ({end_s:.6g} s) is not after the start ({start_s:.6g} s).",
             "Change --start or --end.",
         )
-    if start_s is not None or end_s is not None:
+    options = {"--start": start_s, "--end": end_s}
+    if given_options := [name for name, time_s in options.items() if time_s is not None]:
         chosen_start_s = chosen_start_s if start_s is None else start_s
         chosen_end_s = chosen_end_s if end_s is None else end_s
-        time_options = {"--start": start_s, "--end": end_s}
-        given_options = [option for option, time_s in time_options.items() if time_s is not None]
         reason = f"chosen with {' and '.join(given_options)}"
-        clipped_span_s = max(chosen_start_s, 0.0), min(chosen_end_s, flight.log.duration_s)
-        if (
-            clipped_span_s != (chosen_start_s, chosen_end_s)
-            and clipped_span_s[0] < clipped_span_s[1]
-        ):
+        clipped_span_s = max(chosen_start_s, 0.0), min(chosen_end_s, log.duration_s)
+        if (chosen_start_s, chosen_end_s) != clipped_span_s and clipped_span_s[0] < clipped_span_s[
+            1
+        ]:
             chosen_start_s, chosen_end_s = clipped_span_s
             reason += "; the log covers only part of the chosen time"
     if not chosen_start_s < chosen_end_s:
         raise SettingsError(
-            f"{flight.log.name}: no positions between {chosen_start_s:.6g} s and "
-            f"{chosen_end_s:.6g} s; the positions are from "
-            f"{source_span_s[0]:.2f} s to {source_span_s[1]:.2f} s. Change --start or --end."
+            f"{log.name}: no positions between {chosen_start_s:.6g} s and {chosen_end_s:.6g} s; "
+            f"the positions are from {source_span_s[0]:.2f} s to {source_span_s[1]:.2f} s. Change "
+            "--start or --end."
         )
-    segment_start_s = max(chosen_start_s, available_start_s)
-    segment_end_s = min(chosen_end_s, available_end_s)
-    if segment_start_s >= segment_end_s:
-        segment_start_s, segment_end_s = chosen_start_s, chosen_end_s
-    segment = Segment(segment_start_s, segment_end_s, reason, (chosen_start_s, chosen_end_s))
+    segment_span_s = max(chosen_start_s, available_start_s), min(chosen_end_s, available_end_s)
+    if segment_span_s[0] >= segment_span_s[1]:
+        segment_span_s = chosen_start_s, chosen_end_s
+    segment = Segment(*segment_span_s, reason, (chosen_start_s, chosen_end_s))
     position_count = len(cut_to_segment(track.samples, segment))
     if position_count < MIN_MEASUREMENTS:
         raise SettingsError(
-            f"{flight.log.name}: {track.name} has only {position_count} measurements between "
-            f"{segment.start_s:.2f} s and {segment.end_s:.2f} s; at least "
-            f"{MIN_MEASUREMENTS} are needed. Choose a longer segment (--start, --end)."
+            f"{log.name}: {track.name} has only {position_count} measurements between "
+            f"{segment.start_s:.2f} s and {segment.end_s:.2f} s; at least {MIN_MEASUREMENTS} are "
+            "needed. Choose a longer segment (--start, --end)."
         )
     return segment

@@ -54,7 +54,9 @@ def remove_origin_resets(
         reset for reset in ekf2.resets if segment.start_s < reset.time_s <= segment.end_s
     ]
     state = ekf2.state.copy() if resets_in_segment else ekf2.state
-    removed_reset_texts, kept_reset_texts = list[str](), list[str]()
+    removed = "EKF2 resets that only move the origin of EKF2's frame were removed"
+    kept = "EKF2 resets that correct an error of EKF2 were kept"
+    resets_by_treatment: dict[str, list[str]] = {removed: [], kept: []}
     for label, quantity, columns in (
         ("horizontal position", "position", Columns.POSITION[:2]),
         ("height", "position", Columns.POSITION[2:]),
@@ -69,7 +71,7 @@ def remove_origin_resets(
         ]
         if not resets:
             continue
-        group = kept_reset_texts
+        treatment = kept
         if quantity == "position":  # a velocity does not depend on the origin
             samples = cut_to_segment(track.samples, segment)[columns].dropna()
             compute_squared_distance_m2 = partial(_compute_squared_distance_m2, samples)
@@ -78,20 +80,14 @@ def remove_origin_resets(
             if compute_squared_distance_m2(
                 closest_state
             ) < MAX_DISTANCE_RATIO_WITHOUT_RESETS * compute_squared_distance_m2(ekf2.state):
-                state[columns], group = closest_state, removed_reset_texts
-        group.append(f"{len(resets)} of {label}")
-    reset_statements = (
-        f"{treatment}: {', '.join(reset_texts)}"
-        for treatment, reset_texts in (
-            (
-                "EKF2 resets that only move the origin of EKF2's frame were removed",
-                removed_reset_texts,
-            ),
-            ("EKF2 resets that correct an error of EKF2 were kept", kept_reset_texts),
-        )
-        if reset_texts
+                state[columns], treatment = closest_state, removed
+        resets_by_treatment[treatment].append(f"{len(resets)} of {label}")
+    statements = (
+        f"{treatment}: {', '.join(texts)}"
+        for treatment, texts in resets_by_treatment.items()
+        if texts
     )
-    return state, "; ".join(reset_statements)
+    return state, "; ".join(statements)
 
 
 def _make_states_without_resets(
@@ -121,14 +117,10 @@ def _compute_squared_distance_m2(samples: pd.DataFrame, state: pd.DataFrame) -> 
 def project(table: pd.DataFrame, axis: Axis, segment: Segment) -> pd.DataFrame:
     """Project positions, velocities and variances onto an axis."""
     rows = cut_to_segment(table, segment)
-    available_columns = {
-        name: (columns, exponent)
-        for name, (columns, exponent) in PROJECTED_COLUMNS.items()
-        if columns[0] in table
-    }
     projected_columns = {
         name: weighted_sum(rows, columns, axis.direction**exponent)
-        for name, (columns, exponent) in available_columns.items()
+        for name, (columns, exponent) in PROJECTED_COLUMNS.items()
+        if columns[0] in table
     }
     return pd.DataFrame(projected_columns, index=rows.index)
 
@@ -173,16 +165,14 @@ def project_fusion_horizon_position(
         )
         if axis.name == "down":
             position = position + _find_altitude_offset_m(ekf2, position)
-        fusion_horizon_positions = pd.DataFrame(
-            {"position_m": position, "position_variance_m2": variance}
-        )
-        return fusion_horizon_positions[fusion_horizon_positions["position_variance_m2"] > 0.0]
+        positions = pd.DataFrame({"position_m": position, "position_variance_m2": variance})
+        return positions[positions["position_variance_m2"] > 0.0]
     if isinstance(ekf2.record, Unavailable):
         return None
     # Logs of PX4 before v1.16 contain the state at the fusion horizon
-    fusion_horizon_state = project(ekf2.record.delayed, axis, segment)
-    fusion_horizon_positions = fusion_horizon_state[["position_m", "position_variance_m2"]].dropna()
-    return fusion_horizon_positions if len(fusion_horizon_positions) else None
+    state = project(ekf2.record.delayed, axis, segment)
+    positions = state[["position_m", "position_variance_m2"]].dropna()
+    return positions if len(positions) else None
 
 
 def _find_altitude_offset_m(ekf2: Ekf2, down_m: pd.Series) -> float:
@@ -215,7 +205,7 @@ def project_innovations(
         if isinstance(innovations := ekf2.innovations[name], Unavailable):
             return innovations
         axis_innovations.append(innovations)
-    rows = cut_to_segment(axis_innovations[0], segment).copy()
+    rows = cut_to_segment(axis_innovations[0], segment)
     if axis.name == AISLE:
         rows = _combine_north_and_east(rows, axis_innovations[1], axis.direction)
     if rows.empty:
@@ -223,17 +213,15 @@ def project_innovations(
     noise_variance = rows["observation_variance_m2"].fillna(
         find_observation_variance(flight, track, axis, segment)
     )
-    innovation_variance = rows["innovation_variance_m2"]
-    prior_variance = (innovation_variance - noise_variance).where(
-        innovation_variance > noise_variance
+    prior_variance = rows["innovation_variance_m2"] - noise_variance
+    prior_variance = prior_variance.where(prior_variance > 0.0)
+    posterior_variance = prior_variance * noise_variance / rows["innovation_variance_m2"]
+    return rows.assign(
+        observation_variance_m2=noise_variance,
+        prior_variance_m2=prior_variance,
+        # EKF2 does not change P if it rejects a position
+        posterior_variance_m2=posterior_variance.where(~(rows["rejected"] > 0), prior_variance),
     )
-    rows["observation_variance_m2"] = noise_variance
-    rows["prior_variance_m2"] = prior_variance
-    # EKF2 does not change P if it rejects a position
-    rows["posterior_variance_m2"] = (prior_variance * noise_variance / innovation_variance).where(
-        ~(rows["rejected"] > 0), prior_variance
-    )
-    return rows
 
 
 def _combine_north_and_east(
@@ -267,10 +255,12 @@ def find_observation_variance(
     ev_pos_control.cpp, gps_control.cpp, gnss_height_control.cpp, baro_height_control.cpp.
     """
     aid, parameters, ekf2 = track.aid(axis.name), flight.log.parameters, flight.ekf2
-    if aid is not None and isinstance(ekf2, Ekf2) and aid.name in ekf2.aids:
+    if aid is None:
+        return math.nan
+    if isinstance(ekf2, Ekf2) and aid.name in ekf2.aids:
         parameters = {**parameters, **ekf2.aids[aid.name].parameters}
-    noise_m = default_noise_m if aid is None else parameters.get(aid.noise, default_noise_m)
-    if aid is None or math.isnan(noise_m):
+    noise_m = parameters.get(aid.noise, default_noise_m)
+    if math.isnan(noise_m):
         return math.nan
     noise_factor = GNSS_HEIGHT_NOISE_FACTOR if aid == GNSS_POS and axis.name == "down" else 1.0
     configured_variance_m2 = max(noise_factor * noise_m, EKF2_MIN_NOISE_M) ** 2

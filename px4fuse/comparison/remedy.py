@@ -8,13 +8,12 @@ import numpy as np
 
 from px4fuse.comparison.estimates import TuningByAxis, find_first_tuning
 from px4fuse.comparison.model import Comparison, PreparedComparison
-from px4fuse.convention.correction import find_convention_faults
 from px4fuse.ekf2.inputs import ReplayInputs
 from px4fuse.ekf2.model import Ekf2Model, replay_with_settings
 from px4fuse.ekf2.replay import rows_inside
 from px4fuse.filter.signals import AISLE
 from px4fuse.filter.time_offset import MIN_OFFSET_SIGMAS, MIN_TIME_OFFSET_S, ClockOffset
-from px4fuse.filter.tuning import HORIZONTAL, AxisTuning, NoiseEstimate
+from px4fuse.filter.tuning import HORIZONTAL, NoiseEstimate
 from px4fuse.flight.ekf2_parameters import EV_POS, GNSS_POS, GNSS_VEL, PARAMETERS, Aid
 from px4fuse.flight.model import Unavailable
 
@@ -39,11 +38,10 @@ def estimate_gnss_delay_ms(
     that GNSS is compared with was not checked, or has a wrong convention or time offset.
     """
     received_positions, vision = model.inputs.received_positions, model.inputs.vision_positions
-    convention, flight, source = comparison.convention, comparison.flight, comparison.source
     if (
         vision is None
-        or source.name != vision.source
-        or find_convention_faults(convention, flight, source.frame)
+        or comparison.source.name != vision.source
+        or comparison.convention_faults
         or _find_differing_delay_ms(comparison, clock_offset, model.inputs.settings[EV_POS.delay])
         is not None
         or received_positions.velocity_m_s is None
@@ -68,15 +66,12 @@ def estimate_gnss_delay_ms(
     quadratic_coefficient, linear_coefficient, _ = np.polyfit(GNSS_DELAYS_MS, nis_sums, 2)
     if quadratic_coefficient <= 0.0:
         return None
-    gnss_delay_ms = -0.5 * linear_coefficient / quadratic_coefficient
-    delay_sigma_ms = quadratic_coefficient**-0.5
-    min_delay_error_ms = max(1e3 * MIN_TIME_OFFSET_S, MIN_OFFSET_SIGMAS * delay_sigma_ms)
-    delay_error_ms = abs(gnss_delay_ms - model.inputs.settings[GNSS_POS.delay])
-    return (
-        (gnss_delay_ms, delay_sigma_ms)
-        if delay_error_ms > min_delay_error_ms and gnss_delay_ms >= 0.0
-        else None
-    )
+    delay_ms = -0.5 * linear_coefficient / quadratic_coefficient
+    sigma_ms = quadratic_coefficient**-0.5
+    error_ms = abs(delay_ms - model.inputs.settings[GNSS_POS.delay])
+    if delay_ms < 0.0 or error_ms <= max(1e3 * MIN_TIME_OFFSET_S, MIN_OFFSET_SIGMAS * sigma_ms):
+        return None
+    return delay_ms, sigma_ms
 
 
 def estimate_ekf2_parameters(
@@ -90,35 +85,26 @@ def estimate_ekf2_parameters(
     Noises of GNSS and odometry are not reduced: innovations do not show their slow errors.
     """
     changes: dict[str, float] = {}
-    ekf2_inputs, min_vision_noise_m = model.inputs, 0.0
-    if (
-        ekf2_inputs.vision_positions is not None
-        and comparison.source.name == ekf2_inputs.vision_positions.source
-    ):
+    inputs, origin, min_vision_noise_m = model.inputs, comparison.source.origin, 0.0
+    vision = inputs.vision_positions
+    if vision is not None and comparison.source.name == vision.source:
         if (gnss_delay := estimate_gnss_delay_ms(comparison, model, clock_offset)) is not None:
-            changes |= make_delay_change(ekf2_inputs, gnss_delay[0])
+            changes |= make_delay_change(inputs, gnss_delay[0])
         # While EKF2 fuses GNSS, it increases the noise of vision at least to that of GNSS
-        min_vision_noise_m = ekf2_inputs.settings[GNSS_POS.noise]
-        ekf2_inputs = replace(
-            ekf2_inputs, aid=EV_POS, received_positions=ekf2_inputs.vision_positions
-        )
-    if not is_source_fused(comparison, ekf2_inputs):
+        min_vision_noise_m = inputs.settings[GNSS_POS.noise]
+        inputs = replace(inputs, aid=EV_POS, received_positions=vision)
+    if not is_source_fused(comparison, inputs):
         return {}
     axis_tuning = find_first_tuning(tuning, HORIZONTAL, AISLE, "north", "east")
-    may_have_correlated_errors = (
-        comparison.source.origin.may_drift or comparison.source.origin.is_gnss
-    )
-    noise_m = None if axis_tuning is None else axis_tuning.sigma_z.value
-    used_noise_m = find_used_noise_m(ekf2_inputs)
-    min_noise_m = used_noise_m if may_have_correlated_errors else 0.0
+    used_noise_m = find_used_noise_m(inputs)
+    min_noise_m = used_noise_m if origin.may_drift or origin.is_gnss else 0.0
     if (
         axis_tuning
-        and noise_m
-        and noise_m > min_noise_m
-        and (max(noise_m, used_noise_m) > min_vision_noise_m)
+        and (noise_m := axis_tuning.sigma_z.value or 0.0) > min_noise_m
+        and max(noise_m, used_noise_m) > min_vision_noise_m
     ):
-        changes |= make_estimated_noise_change(ekf2_inputs, axis_tuning.sigma_z, noise_m)
-    return changes | make_estimated_delay_change(comparison, ekf2_inputs, clock_offset)
+        changes |= make_estimated_noise_change(inputs, axis_tuning.sigma_z, noise_m)
+    return changes | make_estimated_delay_change(comparison, inputs, clock_offset)
 
 
 def is_source_fused(comparison: Comparison, ekf2_inputs: ReplayInputs) -> bool:
@@ -151,22 +137,17 @@ def estimate_differing_delay_ms(
 
     A time offset from the user (--clock-offset) is kept if it is within the 95 % interval.
     """
-    offset_s, applied_s, source = clock_offset.offset_s, clock_offset.applied_s, comparison.source
+    offset_s, applied_s = clock_offset.offset_s, clock_offset.applied_s
     low_s, high_s = clock_offset.interval_s
     if (
         applied_s
         and low_s <= applied_s <= high_s
-        and not find_convention_faults(
-            comparison.convention, comparison.flight, source.frame
-        ).late_s  # px4fuse applied this offset itself
+        and not comparison.convention_faults.late_s  # px4fuse applied this offset itself
     ):
         offset_s = applied_s
-    estimated_delay_ms = 1e3 * (source.assumed_delay_s - offset_s)
-    return (
-        estimated_delay_ms
-        if clock_offset.is_significant(1e-3 * (logged_delay_ms - estimated_delay_ms))
-        else None
-    )
+    estimated_delay_ms = 1e3 * (comparison.source.assumed_delay_s - offset_s)
+    is_significant = clock_offset.is_significant(1e-3 * (logged_delay_ms - estimated_delay_ms))
+    return estimated_delay_ms if is_significant else None
 
 
 def describe_delay_limit(
@@ -229,12 +210,9 @@ def make_noise_change(
     EKF2 then ignores a larger noise that the sender reports.
     """
     changes = {aid.noise: max(float(f"{noise_m:.2g}"), PARAMETERS[aid.noise].minimum)}
-    if (
-        aid.noise_mode_parameter
-        and settings.get(aid.noise_mode_parameter, 0.0) == 0.0
-        and noise_m < reported_noise_m
-    ):
-        changes[aid.noise_mode_parameter] = 1.0
+    mode_parameter = aid.noise_mode_parameter
+    if mode_parameter and not settings.get(mode_parameter, 0.0) and noise_m < reported_noise_m:
+        changes[mode_parameter] = 1.0
     return changes
 
 
@@ -256,25 +234,19 @@ def make_delay_max_change(
 
     PX4 has this parameter since v1.14.
     """
-    required_delay_max_ms = position_age_ms + TRANSMISSION_DELAY_MS
-    if required_delay_max_ms <= settings.get("EKF2_DELAY_MAX", math.inf):
+    required_ms = position_age_ms + TRANSMISSION_DELAY_MS
+    if required_ms <= settings.get("EKF2_DELAY_MAX", math.inf):
         return {}
-    return {
-        "EKF2_DELAY_MAX": EKF2_DELAY_MAX_STEP_MS
-        * math.ceil(required_delay_max_ms / EKF2_DELAY_MAX_STEP_MS)
-    }
+    step_count = math.ceil(required_ms / EKF2_DELAY_MAX_STEP_MS)
+    return {"EKF2_DELAY_MAX": EKF2_DELAY_MAX_STEP_MS * step_count}
 
 
 def find_used_noise_m(ekf2_inputs: ReplayInputs) -> float:
     """Return the median √R (m) that EKF2 used for the positions."""
-    aid, logged_parameters = ekf2_inputs.aid, ekf2_inputs.settings
-    ignores_reported_noise = (
-        aid.noise_mode_parameter and logged_parameters[aid.noise_mode_parameter] == 1.0
-    )
-    return max(
-        logged_parameters[aid.noise],
-        0.0 if ignores_reported_noise else _compute_reported_noise_m(ekf2_inputs),
-    )
+    aid, parameters = ekf2_inputs.aid, ekf2_inputs.settings
+    if parameters.get(aid.noise_mode_parameter) == 1.0:  # EKF2 ignores the reported noise
+        return parameters[aid.noise]
+    return max(parameters[aid.noise], _compute_reported_noise_m(ekf2_inputs))
 
 
 def _compute_reported_noise_m(ekf2_inputs: ReplayInputs) -> float:
@@ -288,17 +260,20 @@ def make_height_noise_advice(
 
     EKF2 has one noise parameter for position and height of external vision.
     """
-    ekf2, down_tuning = comparison.flight.ekf2, tuning.get("down")
-    if isinstance(ekf2, Unavailable) or isinstance(ekf2.fusion_flags, Unavailable):
-        return ""
-    if not isinstance(down_tuning, AxisTuning) or not comparison.source.origin.is_vision:
+    ekf2, down_tuning = comparison.flight.ekf2, find_first_tuning(tuning, "down")
+    if (
+        isinstance(ekf2, Unavailable)
+        or isinstance(ekf2.fusion_flags, Unavailable)
+        or down_tuning is None
+        or not comparison.source.origin.is_vision
+    ):
         return ""
     height_noise_m = down_tuning.sigma_z.value or 0.0
     is_fused = ekf2.fusion_flags["vertical"].mean() > MIN_FUSED_FRACTION_OF_HEIGHTS
     if not is_fused or height_noise_m < MIN_HEIGHT_TO_HORIZONTAL_NOISE_RATIO * noise_m:
         return ""
     return (
-        f" {EV_POS.noise} is also the noise of heights, but the height noise of the source is "
+        f" {EV_POS.noise} is also the noise of heights, but the height noise is "
         f"{height_noise_m:.2g} m. Set {EV_POS.noise_mode_parameter} to 0, and send each position "
         f"with a variance of {height_noise_m**2:.2g} m² for z."
     )

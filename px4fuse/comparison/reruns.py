@@ -55,14 +55,13 @@ from px4fuse.core.arrays import Array
 from px4fuse.ekf2.filter_recursion import FilterConfiguration
 from px4fuse.ekf2.inputs import ReplayInputs
 from px4fuse.ekf2.model import Ekf2Model, misalign_positions, replay_with_settings
-from px4fuse.ekf2.replay import HORIZONTAL_AXES, Ekf2Replay, rows_inside
+from px4fuse.ekf2.replay import HORIZONTAL_AXES, Ekf2Replay, Spans, rows_inside
 from px4fuse.ekf2.steps import DifferenceExplanation
 from px4fuse.filter.kalman import replay
 from px4fuse.filter.settings import Settings
 from px4fuse.filter.signals import (
     Acceleration,
     compute_ned_acceleration,
-    cut_to_segment,
     project_acceleration,
     weighted_sum,
 )
@@ -72,15 +71,6 @@ from px4fuse.flight.model import Columns, Unavailable
 
 # Mean NIS above which innovations are too large for the reported σ
 MAX_NORMAL_NIS = 1.5
-INNOVATION_COLUMNS = [f"innovation_{axis}_m" for axis in HORIZONTAL_AXES]
-INNOVATION_VARIANCE_COLUMNS = [f"innovation_variance_{axis}_m2" for axis in HORIZONTAL_AXES]
-POSITION_VARIANCE_COLUMNS = [f"position_variance_{axis}_m2" for axis in HORIZONTAL_AXES]
-OBSERVATION_VARIANCE_COLUMNS = [f"observation_variance_{axis}_m2" for axis in HORIZONTAL_AXES]
-DIFFERENCE_UNAVAILABLE = Unavailable(
-    "difference KF - EKF2",
-    "this re-run rotates only KF's frame, so positions of KF and EKF2 are not comparable",
-    "",
-)
 # Maximum ratio of RMSE or σ ratio, replay to log, to compare re-runs with the log
 MAX_REPLAYED_TO_LOGGED_RATIO = 1.10
 
@@ -133,11 +123,9 @@ class _Filter(NamedTuple):
 
     name: FilterName
     rerun: Callable[[AxisComparison, Change], RunStatistics]
-    ekf2_model: Ekf2Model | None = None
-
-    @property
-    def ekf2_inputs(self) -> ReplayInputs | None:
-        return None if self.ekf2_model is None else self.ekf2_model.inputs
+    # For EKF2 only: inputs of the replay, and evaluated time spans (s)
+    ekf2_inputs: ReplayInputs | None = None
+    evaluated_spans_s: Spans | None = None
 
 
 def rerun_filters(
@@ -161,7 +149,8 @@ def rerun_filters(
                 replays[change_key] = _replay_ekf2(comparison, estimates.tuning, model, change)
             return _summarise_replay(comparison, model, replays[change_key], axis_result, change)
 
-        filters.append(_Filter("ekf2", rerun_ekf2, model))
+        evaluated_spans_s = model.baseline_replay.find_evaluated_spans()
+        filters.append(_Filter("ekf2", rerun_ekf2, model.inputs, evaluated_spans_s))
     return tuple(
         trial
         for tested_filter in filters
@@ -232,6 +221,7 @@ def _rerun_with_changes(
     if not changes:
         return []
     original_statistics, is_logged = _find_statistics_without_change(tested_filter, axis_result)
+    spans_s = tested_filter.evaluated_spans_s
 
     def make_trial(change: Change, discrepancies: Iterable[Statistic]) -> Trial:
         changed_statistics = tested_filter.rerun(axis_result, change)
@@ -248,9 +238,7 @@ def _rerun_with_changes(
             before=original_statistics,
             is_logged=is_logged,
             after=changed_statistics,
-            from_s=None
-            if tested_filter.ekf2_model is None
-            else tested_filter.ekf2_model.baseline_replay.find_evaluated_spans()[0][0],
+            from_s=None if spans_s is None else spans_s[0][0],
         )
 
     trials = [make_trial(change, discrepancies) for change, discrepancies in changes]
@@ -267,63 +255,49 @@ def _find_statistics_without_change(
     tested_filter: _Filter, axis_result: AxisComparison
 ) -> tuple[RunStatistics, bool]:
     """Return the statistics without a change, and True if they are from the log."""
-    replayed_statistics, logged_state = tested_filter.rerun(axis_result, {}), axis_result.ekf2_state
-    if tested_filter.ekf2_model is None:
-        return replayed_statistics, True
-    innovations = axis_result.ekf2_innovations
+    replayed, logged_state = tested_filter.rerun(axis_result, {}), axis_result.ekf2_state
+    evaluated_spans_s, innovations = tested_filter.evaluated_spans_s, axis_result.ekf2_innovations
+    if evaluated_spans_s is None:
+        return replayed, True
     if isinstance(logged_state, Unavailable) or isinstance(innovations, Unavailable):
-        return replayed_statistics, False
-    evaluated_spans_s = tested_filter.ekf2_model.baseline_replay.find_evaluated_spans()
-    compared_state = rows_inside(logged_state, evaluated_spans_s)
+        return replayed, False
+    logged_state = rows_inside(logged_state, evaluated_spans_s)
     innovations = rows_inside(innovations, evaluated_spans_s)
     rejected_flags = innovations["rejected"].dropna()
-    logged_statistics = _summarise_run(
+    logged = _summarise_run(
         innovations["innovation_m"].to_numpy(),
         innovations["innovation_variance_m2"].to_numpy(),
-        compute_error_statistics(compared_state, axis_result.ekf2_variance, axis_result.truth),
-        compute_difference_statistics(axis_result.replay, compared_state),
+        compute_error_statistics(logged_state, axis_result.ekf2_variance, axis_result.truth),
+        compute_difference_statistics(axis_result.replay, logged_state),
         float((rejected_flags > 0.0).mean()) if len(rejected_flags) else None,
     )
-    compared_values = (
-        (
-            logged_statistics.position_rmse_m,
-            replayed_statistics.position_rmse_m,
-            MAX_REPLAYED_TO_LOGGED_RATIO,
-        ),
-        (logged_statistics.nis_mean, replayed_statistics.nis_mean, MAX_REPLAYED_TO_LOGGED_RATIO**2),
-        (
-            logged_statistics.nees_mean,
-            replayed_statistics.nees_mean,
-            MAX_REPLAYED_TO_LOGGED_RATIO**2,
-        ),
-    )
     is_replay_similar = all(
-        logged_value and replayed_value and 1.0 / factor <= logged_value / replayed_value <= factor
-        for logged_value, replayed_value, factor in compared_values
+        logged_value and replayed_value and 1.0 / limit <= logged_value / replayed_value <= limit
+        for logged_value, replayed_value, limit in (
+            (logged.position_rmse_m, replayed.position_rmse_m, MAX_REPLAYED_TO_LOGGED_RATIO),
+            (logged.nis_mean, replayed.nis_mean, MAX_REPLAYED_TO_LOGGED_RATIO**2),
+            (logged.nees_mean, replayed.nees_mean, MAX_REPLAYED_TO_LOGGED_RATIO**2),
+        )
         if logged_value is not None
     )
-    return (logged_statistics, True) if is_replay_similar else (replayed_statistics, False)
+    return (logged, True) if is_replay_similar else (replayed, False)
 
 
 def _summarise_run(
     innovation_m: Array,
     innovation_variance_m2: Array,
     errors: ErrorsAgainstTruth | Unavailable,
-    kf_minus_ekf2: Difference | Unavailable,
+    kf_minus_ekf2: Difference | Unavailable | None,
     rejected_fraction: float | None = None,
 ) -> RunStatistics:
-    known_errors = errors if isinstance(errors, ErrorsAgainstTruth) else None
-    has_innovations = len(innovation_m) > 0
+    # Attributes of missing results are None
+    nis = innovation_m**2 / innovation_variance_m2
     return RunStatistics(
-        innovations=len(innovation_m),
-        nis_mean=float(np.mean(innovation_m**2 / innovation_variance_m2))
-        if has_innovations
-        else None,
-        position_rmse_m=None if known_errors is None else known_errors.position_rmse_m,
-        nees_mean=None if known_errors is None else known_errors.nees_position_mean,
-        difference_rms_m=None
-        if isinstance(kf_minus_ekf2, Unavailable)
-        else kf_minus_ekf2.position_rms_m,
+        innovations=len(nis),
+        nis_mean=float(np.mean(nis)) if len(nis) else None,
+        position_rmse_m=getattr(errors, "position_rmse_m", None),
+        nees_mean=getattr(errors, "nees_position_mean", None),
+        difference_rms_m=getattr(kf_minus_ekf2, "position_rms_m", None),
         rejected_fraction=rejected_fraction,
     )
 
@@ -335,23 +309,20 @@ def _rotate_direction(direction: Array, rotation_deg: float) -> Array:
 def _rerun_kf(
     comparison: Comparison, tuning: TuningByAxis, axis_result: AxisComparison, change: Change
 ) -> RunStatistics:
-    source, segment, axis = comparison.source, comparison.segment, axis_result.axis
+    axis, truth, ekf2_state = axis_result.axis, axis_result.truth, axis_result.ekf2_state
     kf_settings: dict[str, Any] = {
         name: change[name] for name in change if name in vars(Settings())
     }
     changed_settings = replace(comparison.settings, **kf_settings)
-    truth = axis_result.truth
-    rotates_gnss_positions = ROTATION_KEY in change and source.origin.is_gnss
+    rotates_gnss_positions = ROTATION_KEY in change and comparison.source.origin.is_gnss
     if ROTATION_KEY in change:
         rotated_direction = _rotate_direction(axis.direction, change[ROTATION_KEY])
-        measured_m = weighted_sum(
-            cut_to_segment(source.samples, segment), Columns.POSITION, rotated_direction
-        )
+        measured_m = weighted_sum(comparison.source_samples, Columns.POSITION, rotated_direction)
         axis = replace(axis, measurement_m=measured_m[np.isfinite(measured_m)])
         if rotates_gnss_positions:
             # Rotating positions and ground truth has the same effect as correcting the heading
             rotated_axis = replace(axis, direction=rotated_direction)
-            truth = project_truth(comparison.flight.truth, rotated_axis, segment)
+            truth = project_truth(comparison.flight.truth, rotated_axis, comparison.segment)
     if FORWARD_BIAS_KEY in change:
         acceleration = _remove_accelerometer_bias(comparison, change, axis.direction)
         axis = replace(axis, acceleration=acceleration)
@@ -365,14 +336,13 @@ def _rerun_kf(
         measurement_time_s=time_s[is_used] + shift_s,
         measurement_m=axis.measurement_m[is_used],
     )
-    kf_run, ekf2_state = replay(axis, changed_settings, fast=True), axis_result.ekf2_state
+    kf_run = replay(axis, changed_settings, fast=True)
+    # With a rotated frame, positions of KF and EKF2 are not comparable
     return _summarise_run(
         kf_run.updates["innovation_m"].to_numpy(),
         kf_run.updates["innovation_variance_m2"].to_numpy(),
         compute_kf_error_statistics(kf_run, truth, ekf2_state),
-        DIFFERENCE_UNAVAILABLE
-        if rotates_gnss_positions or isinstance(ekf2_state, Unavailable)
-        else compute_difference_statistics(kf_run, ekf2_state),
+        None if rotates_gnss_positions else compute_difference_statistics(kf_run, ekf2_state),
     )
 
 
@@ -425,23 +395,20 @@ def _summarise_replay(
     if ROTATION_KEY in change and comparison.source.origin.is_gnss:
         # Rotated positions rotate EKF2's frame, so the axis is rotated by the same angle
         axis = replace(axis, direction=_rotate_direction(axis.direction, -change[ROTATION_KEY]))
-    direction_cosines, ekf2_updates = axis.direction[:2], ekf2_replay.updates
-    ekf2_updates = rows_inside(ekf2_updates, evaluated_spans_s)
-    innovation_variance_m2 = weighted_sum(
-        ekf2_updates, INNOVATION_VARIANCE_COLUMNS, direction_cosines**2
+    cosines, updates = axis.direction[:2], rows_inside(ekf2_replay.updates, evaluated_spans_s)
+    innovation_variance_m2, observation_variance_m2, posterior_variance_m2 = (
+        weighted_sum(
+            updates, [f"{name}_{horizontal}_m2" for horizontal in HORIZONTAL_AXES], cosines**2
+        )
+        for name in ("innovation_variance", "observation_variance", "position_variance")
     )
-    prior_variance_m2 = innovation_variance_m2 - weighted_sum(
-        ekf2_updates, OBSERVATION_VARIANCE_COLUMNS, direction_cosines**2
-    )
-    posterior_variance_m2 = weighted_sum(
-        ekf2_updates, POSITION_VARIANCE_COLUMNS, direction_cosines**2
-    )
+    prior_variance_m2 = innovation_variance_m2 - observation_variance_m2
     variance_by_time = pd.DataFrame(
         {
             "position_variance_m2": 0.5 * (prior_variance_m2 + posterior_variance_m2),
             "velocity_variance_m2_s2": np.nan,
         },
-        index=pd.Index(ekf2_updates["fused_at_s"].to_numpy()),
+        index=pd.Index(updates["fused_at_s"].to_numpy()),
     )
     published_track = project(ekf2_replay.published_state, axis, comparison.segment)
     published_track = rows_inside(published_track, evaluated_spans_s)
@@ -450,9 +417,9 @@ def _summarise_replay(
     if not change and not isinstance(logged_state, Unavailable):
         track_compared_with_kf = rows_inside(logged_state, evaluated_spans_s)
     return _summarise_run(
-        weighted_sum(ekf2_updates, INNOVATION_COLUMNS, direction_cosines),
+        weighted_sum(updates, [f"innovation_{name}_m" for name in HORIZONTAL_AXES], cosines),
         innovation_variance_m2,
         compute_error_statistics(published_track, variance_by_time, axis_result.truth),
         compute_difference_statistics(axis_result.replay, track_compared_with_kf),
-        float((ekf2_updates["rejected"] > 0.0).mean()) if len(ekf2_updates) else None,
+        float((updates["rejected"] > 0.0).mean()) if len(updates) else None,
     )

@@ -101,12 +101,12 @@ def compute_explained_fraction(trial: Trial, statistic: Statistic) -> float:
     For "difference": fraction of the mean square difference KF - EKF2. Above 1, the change is too
     large.
     """
-    value_before, value_after = trial.before.value(statistic), trial.after.value(statistic)
-    if not value_before or not value_after:
+    before, after = trial.before.value(statistic), trial.after.value(statistic)
+    if not before or not after:
         return 0.0
     if statistic == "difference":
-        return 1.0 - (value_after / value_before) ** 2
-    return 1.0 - float(np.log(value_after) / np.log(value_before))
+        return 1.0 - (after / before) ** 2
+    return 1.0 - float(np.log(after) / np.log(before))
 
 
 def _compute_explained_fraction_error(trial: Trial, statistic: Statistic) -> float:
@@ -115,26 +115,20 @@ def _compute_explained_fraction_error(trial: Trial, statistic: Statistic) -> flo
 
 def brings_inside_limits(trial: Trial, statistic: Statistic) -> bool:
     """Return True if the change brings the mean NIS or mean NEES inside its limits."""
-    low, high = (
-        compute_nis_band(trial.after.innovations)
-        if statistic == "nis"
-        else (0.0, MIN_REPORTED_NEES)
-    )
+    low, high = 0.0, MIN_REPORTED_NEES
+    if statistic == "nis":
+        low, high = compute_nis_band(trial.after.innovations)
     return low <= (trial.after.value(statistic) or np.nan) <= high
 
 
 def makes_overconfident(trial: Trial, statistic: Statistic) -> bool:
     """Return True if the change makes an underconfident filter overconfident."""
-    nees_before = trial.before.nees_mean
-    nis_before = trial.before.nis_mean
-    nees_after = trial.after.nees_mean
-    if statistic != "nis" or nis_before is None or nis_before >= 1.0 or nees_after is None:
+    if statistic != "nis" or (trial.before.nis_mean or 1.0) >= 1.0:
         return False
-    return nees_after >= (
-        MIN_OVERCONFIDENT_NEES_AFTER_CHANGE
-        if nees_before and nees_before > 1.0
-        else MIN_REPORTED_NEES
-    )
+    min_nees = MIN_REPORTED_NEES
+    if (trial.before.nees_mean or 0.0) > 1.0:
+        min_nees = MIN_OVERCONFIDENT_NEES_AFTER_CHANGE
+    return (trial.after.nees_mean or 0.0) >= min_nees
 
 
 def find_trials(
@@ -212,15 +206,11 @@ def compute_preference_key(trial: Trial) -> tuple[bool, int, float]:
 
 def compute_sigma_ratios(statistics: RunStatistics) -> dict[Reference, float]:
     """Return the ratios of actual to reported σ against position source and ground truth."""
-    squared_sigma_ratios: dict[Reference, float | None] = {
+    squared_ratios: dict[Reference, float | None] = {
         "source": statistics.nis_mean,
         "truth": statistics.nees_mean,
     }
-    return {
-        reference: math.sqrt(squared_sigma_ratio)
-        for reference, squared_sigma_ratio in squared_sigma_ratios.items()
-        if squared_sigma_ratio
-    }
+    return {name: math.sqrt(value) for name, value in squared_ratios.items() if value}
 
 
 def compute_sigma_ratio_improvement(trial: Trial) -> float:
@@ -229,18 +219,15 @@ def compute_sigma_ratio_improvement(trial: Trial) -> float:
 
 def compare_sigma_ratios(trial: Trial) -> list[tuple[Reference, float, float]]:
     """Return reference ("source" or "truth"), and σ ratios before and after the change."""
-    sigma_ratios_before = compute_sigma_ratios(trial.before)
-    sigma_ratios_after = compute_sigma_ratios(trial.after)
-    return [
-        (reference, sigma_ratios_before[reference], sigma_ratios_after[reference])
-        for reference in sigma_ratios_before.keys() & sigma_ratios_after.keys()
-    ]
+    before, after = compute_sigma_ratios(trial.before), compute_sigma_ratios(trial.after)
+    return [(name, before[name], after[name]) for name in before.keys() & after.keys()]
 
 
-def becomes_consistent(trial: Trial) -> bool:
-    """Return True if a re-run makes an inconsistent filter consistent."""
+def becomes_consistent(trial: Trial, tested_reference: Reference | None = None) -> bool:
+    """Return True if a re-run makes an inconsistent filter consistent, against any reference."""
     return any(
-        classify_sigma_ratio(ratio_before, reference) != "consistent"
+        tested_reference in (None, reference)
+        and classify_sigma_ratio(ratio_before, reference) != "consistent"
         and classify_sigma_ratio(ratio_after, reference) == "consistent"
         for reference, ratio_before, ratio_after in compare_sigma_ratios(trial)
     )
@@ -290,18 +277,16 @@ def find_trial(
 
 def has_effect(trial: Trial) -> bool:
     """Return True if a re-run changes a σ ratio by 10 % or the position RMSE by 5 %."""
-    if any(
-        not 1.0 / MIN_SIGMA_RATIO_CHANGE_FACTOR
-        <= ratio_after / ratio_before
-        <= MIN_SIGMA_RATIO_CHANGE_FACTOR
-        for _, ratio_before, ratio_after in compare_sigma_ratios(trial)
-    ):
-        return True
     rmse_before_m, rmse_after_m = trial.before.position_rmse_m, trial.after.position_rmse_m
-    return bool(
+    if (
         rmse_before_m
         and rmse_after_m
         and abs(rmse_after_m / rmse_before_m - 1.0) > MIN_RMSE_CHANGE_FRACTION
+    ):
+        return True
+    return any(
+        max(after / before, before / after) > MIN_SIGMA_RATIO_CHANGE_FACTOR
+        for _, before, after in compare_sigma_ratios(trial)
     )
 
 

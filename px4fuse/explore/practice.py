@@ -22,7 +22,7 @@ from px4fuse.diagnose import diagnose
 from px4fuse.explore.data import make_flight_data
 from px4fuse.explore.packing import ArrayEncoder
 from px4fuse.explore.page import make_data_elements, make_page_html
-from px4fuse.findings import Finding
+from px4fuse.finding import Finding
 from px4fuse.report.card_html import make_card_html
 from px4fuse.request import ComparisonRequest
 from px4fuse.simulation import flights

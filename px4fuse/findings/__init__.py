@@ -10,20 +10,16 @@ from px4fuse.analysis import Analysis
 from px4fuse.comparison.flight_events import find_airborne_spans
 from px4fuse.ekf2.aids import AidResult
 from px4fuse.filter.signals import Segment
-from px4fuse.finding import Finding, Severity
+from px4fuse.finding import Finding
 from px4fuse.findings import (
     aids,
-    ekf2_noise,
     ekf2_not_fusing,
-    ekf2_rejecting,
-    ekf2_resets,
+    ekf2_settings,
     ekf2_state,
     hidden_errors,
     imu,
     loops,
-    missing,
     noises,
-    parameters,
     recording,
     source_clock,
     source_convention,
@@ -36,35 +32,20 @@ from px4fuse.findings import (
     source_values,
 )
 from px4fuse.findings.cause_grouping import group_by_cause
-from px4fuse.findings.model import FINDING_TITLES, make_warning, split_cause_groups
+from px4fuse.findings.model import make_warning
 from px4fuse.flight.model import Ekf2, Flight
 from px4fuse.loop.model import Loop
 from px4fuse.readers.px4_positions import NO_FIX_ACTION
 
-__all__ = [
-    "FINDING_TITLES",
-    "Finding",
-    "Severity",
-    "find",
-    "find_aid_findings",
-    "find_loop_findings",
-    "finding_title",
-    "split_cause_groups",
-]
-
 DETECTORS = (
     aids,
-    ekf2_noise,
     ekf2_not_fusing,
-    ekf2_rejecting,
-    ekf2_resets,
+    ekf2_settings,
     ekf2_state,
     hidden_errors,
     imu,
     loops,
-    missing,
     noises,
-    parameters,
     recording,
     source_clock,
     source_convention,
@@ -89,29 +70,18 @@ def find_loop_findings(loop: Loop) -> tuple[Finding, ...]:
     return () if loop.is_assessed else group_by_cause(loops.detect_loop_faults(loop))
 
 
-def find_aid_findings(
-    aid_results: Mapping[str, AidResult], flight: Flight | None = None
-) -> tuple[Finding, ...]:
+def find_aid_findings(aid_results: Mapping[str, AidResult], flight: Flight) -> tuple[Finding, ...]:
     """Return the findings on EKF2 and its aiding sources, for a flight without position source."""
     findings = list(aids.detect_aid_faults(aid_results))
-    for item in flight.missing if flight is not None else ():
+    for item in flight.missing:
         if item.remedy == NO_FIX_ACTION:
             message = f"The GNSS receiver had no position: {item.reason}."
             findings.append(make_warning("source_without_position", message, item.remedy))
-    if flight is not None and isinstance(flight.ekf2, Ekf2):
+    if isinstance(flight.ekf2, Ekf2):
         spans_s = find_airborne_spans(flight) or ((0.0, flight.log.duration_s),)
         segment = Segment(spans_s[0][0], spans_s[-1][1], "")
-        findings += ekf2_resets.detect_instance_switches(
+        findings += ekf2_state.detect_instance_switches(
             flight.ekf2, (segment.start_s, segment.end_s)
         )
         findings += ekf2_state.detect_missing_alignment(flight, segment)
     return group_by_cause(findings)
-
-
-def finding_title(finding_id: str) -> str:
-    """Return the title of a finding. If its id is unknown, return the id with blanks.
-
-    >>> finding_title("source_gap"), finding_title("of_a_later_version")
-    ('Gap in the position source', 'of a later version')
-    """
-    return FINDING_TITLES.get(finding_id, finding_id.replace("_", " "))

@@ -10,6 +10,7 @@ from px4fuse.comparison.flight_events import find_airborne_spans
 from px4fuse.core.record import Span
 from px4fuse.core.text import format_number, format_ratio
 from px4fuse.ekf2.aids import INNOVATION_MEAN_WINDOW_S, AidResult
+from px4fuse.filter.signals import cut_to_segment
 from px4fuse.finding import Finding
 from px4fuse.findings.cause_grouping import CAUSE_KEY, INNOVATION_CHANGE_CAUSE, SOURCE_SENSOR_CAUSE
 from px4fuse.findings.model import Findings, finding, format_percent, make_note, make_warning
@@ -43,10 +44,9 @@ def detect(analysis: Analysis) -> Findings:
         return
     aid = analysis.source.origin.aid
     take_off_times_s = [start_s for start_s, _ in find_airborne_spans(analysis.flight)]
-    barometer = analysis.aids.get(BAROMETER.name)
-    height_error_m = (
-        _find_large_height_error_m(analysis, barometer.longest_gap_s) if barometer else None
-    )
+    height_error_m = None
+    if barometer := analysis.aids.get(BAROMETER.name):
+        height_error_m = _find_large_height_error_m(analysis, barometer.longest_gap_s)
     yield from detect_aid_faults(
         analysis.aids, aid.name if aid else "", take_off_times_s, height_error_m
     )
@@ -58,10 +58,7 @@ def detect_bad_acceleration(analysis: Analysis, aids: Mapping[str, AidResult]) -
     ekf2 = analysis.flight.ekf2
     if isinstance(ekf2, Unavailable) or isinstance(ekf2.record, Unavailable):
         return
-    state_times_s = ekf2.state.index.to_numpy()
-    state_times_s = state_times_s[
-        (state_times_s >= analysis.segment.start_s) & (state_times_s <= analysis.segment.end_s)
-    ]
+    state_times_s = cut_to_segment(ekf2.state, analysis.segment).index.to_numpy()
     is_flagged_bad = ekf2.record.was_flag_set(BAD_ACCELERATION_FLAG, state_times_s)
     if not is_flagged_bad.any():
         return
@@ -70,11 +67,11 @@ def detect_bad_acceleration(analysis: Analysis, aids: Mapping[str, AidResult]) -
         for name in AIDS_OF_VERTICAL_ACCELERATION_TEST
         if name in aids and aids[name].verdict == "overconfident"
     }
-    cause = "Normal measurement noise can set EKF2's flag fs_bad_acc_vertical for some seconds."
-    remedy = "If fs_bad_acc_vertical stays set, check the IMU for vibration and clipping."
+    cause = "Normal noise can set the flag fs_bad_acc_vertical for some seconds."
+    remedy = "If the flag stays set, check the IMU for vibration and clipping."
     if too_small_noises:
         parameters_text = " and ".join(sorted(too_small_noises))
-        cause = f"EKF2's measurement noise is set too small: {parameters_text}."
+        cause = f"The measurement noise is set too small: {parameters_text}."
         remedy = f"Increase {parameters_text} to the true noise of the sensor."
     flagged_fraction = float(is_flagged_bad.mean())
     start_s = float(state_times_s[is_flagged_bad.argmax()])
@@ -128,9 +125,10 @@ def _make_not_fused_finding(
     height_error_m: float | None,
 ) -> Finding:
     aid_with_longest_gap = max(aids_of_sensor, key=lambda aid: aid.longest_gap_duration_s)
-    aid_labels_text = ", ".join(_format_aid_label(aid) for aid in aids_of_sensor)
+    aid_labels_text = ", ".join(map(_format_aid_label, aids_of_sensor))
     has_innovation_shift = any(axis.change for aid in aids_of_sensor for axis in aid.axes.values())
-    is_barometer, height_error_text = fusion_parameter == BAROMETER.switch, ""
+    is_barometer = fusion_parameter == BAROMETER.switch
+    height_error_text = ""
     if is_barometer and height_error_m is not None:
         height_error_text = f": EKF2's height error is {height_error_m:.2f} m"
     return finding(
@@ -138,8 +136,7 @@ def _make_not_fused_finding(
         "aid_not_fused",
         f"EKF2 fused no sample of {aid_labels_text} for "
         f"{aid_with_longest_gap.longest_gap_duration_s:.0f} s{height_error_text}. EKF2 rejected "
-        f"{format_percent(aid_with_longest_gap.rejected_fraction)} of the samples, and relied on "
-        "the IMU and other aiding sources.",
+        f"{format_percent(aid_with_longest_gap.rejected_fraction)} of the samples.",
         ACTION_BY_SWITCH.get(fusion_parameter, DEFAULT_ACTION),
         {
             "aid": aid_labels_text,
@@ -153,19 +150,15 @@ def _make_not_fused_finding(
 
 
 def _make_innovation_change_finding(name: str, aid: AidResult) -> Finding:
-    innovation_change_by_axis = {
-        axis: result.change for axis, result in aid.axes.items() if result.change
-    }
-    axis, (time_s, mean_change) = max(
-        innovation_change_by_axis.items(), key=lambda item: abs(item[1][1])
-    )
+    changes = [(result.change, axis) for axis, result in aid.axes.items() if result.change]
+    (time_s, mean_change), axis = max(changes, key=lambda item: abs(item[0][1]))
     innovation_sigma = aid.axes[axis].s_sqrt_median
     return make_warning(
         "aid_innovation_shift",
         f"{_format_aid_label(aid)}: the mean {axis} innovation shifts by "
         f"{format_number(abs(mean_change) * innovation_sigma, 2)} {aid.unit} at {time_s:.0f} s. "
-        f"This is {abs(mean_change):.1f} times its expected standard deviation √S "
-        f"({format_number(innovation_sigma, 2)} {aid.unit}).",
+        f"This is {abs(mean_change):.1f} times √S ({format_number(innovation_sigma, 2)} "
+        f"{aid.unit}).",
         f"Check what was switched, moved or passed near the sensor at {time_s:.0f} s.",
         {"aid": name, "axis": axis, "time_s": time_s, "moved": mean_change},
         ((time_s, time_s + INNOVATION_MEAN_WINDOW_S),),
@@ -174,20 +167,19 @@ def _make_innovation_change_finding(name: str, aid: AidResult) -> Finding:
 
 def _make_overconfident_finding(name: str, aid: AidResult, sensor_cause: str) -> Finding:
     # Innovations alone do not distinguish noise from a wrong delay, so no noise value is proposed
+    noise_parameter, noise_text = AIDS[name].noise, ""
     action = "correct the accuracy that the sensor reports"
-    if noise_parameter := AIDS[name].noise:
+    if noise_parameter:
         action = f"increase {noise_parameter}"
-    noise_text = ""
     if aid.noise is not None:
         noise_text = f" ({format_number(aid.noise)} {aid.unit}, from {aid.noise_from})"
     return make_warning(
         "aid_overconfident",
         f"EKF2 is overconfident about {_format_aid_label(aid)}: σ is "
         f"{format_ratio(aid.nis_mean**0.5)} times too small. The mean NIS is "
-        f"{format_number(aid.nis_mean)} (expected 1). "
-        f"EKF2 rejects {format_percent(aid.rejected_fraction)} of the samples. Possible "
-        f"causes: errors of this sensor larger than its √R{noise_text}, or errors of "
-        "another sensor.",
+        f"{format_number(aid.nis_mean)} (expected 1). EKF2 rejects "
+        f"{format_percent(aid.rejected_fraction)} of the samples. Possible causes: errors above "
+        f"√R{noise_text}, or errors of another sensor.",
         f"Check delay and mounting of the sensor first. Then {action}.",
         {
             "aid": name,
@@ -206,9 +198,9 @@ def _make_innovation_bias_finding(name: str, aid: AidResult) -> Finding:
         "aid_innovation_bias",
         f"{_format_aid_label(aid)}: the mean {axis} innovation is "
         f"{format_number(worst_axis.innovation_mean)} {aid.unit}, expected 0 (√S "
-        f"{format_number(worst_axis.s_sqrt_median)} {aid.unit}). The sensor "
-        "contradicts another sensor.",
-        "Calibrate the sensor. Changed noise settings do not correct a bias.",
+        f"{format_number(worst_axis.s_sqrt_median)} {aid.unit}). The sensor contradicts another "
+        "sensor.",
+        "Calibrate the sensor. Noise settings do not correct a bias.",
         {
             "aid": name,
             "axis": axis,
@@ -227,11 +219,8 @@ def _find_large_height_error_m(analysis: Analysis, span_s: Span) -> float | None
     is_in_span = (error_m.index >= span_s[0]) & (error_m.index <= span_s[1])
     rmse_outside_gap_m = float(np.sqrt(np.mean(error_m[~is_in_span] ** 2)))
     largest_error_m = float(error_m[is_in_span].max())
-    return (
-        largest_error_m
-        if largest_error_m > MIN_GAP_ERROR_TO_HEIGHT_RMSE_RATIO * rmse_outside_gap_m
-        else None
-    )
+    is_large = largest_error_m > MIN_GAP_ERROR_TO_HEIGHT_RMSE_RATIO * rmse_outside_gap_m
+    return largest_error_m if is_large else None
 
 
 def _format_aid_label(aid: AidResult) -> str:

@@ -50,7 +50,7 @@ def group_by_cause(findings: Iterable[Finding]) -> tuple[Finding, ...]:
     """Sort findings by severity; each cause is followed by its effects."""
     ids = list(FINDING_CATALOGUE)
     groups = sorted(split_cause_groups(findings), key=lambda group: ids.index(group[0].id))
-    for cause, effects in EFFECTS_BY_CAUSE.items():
+    for cause, effects_text in EFFECTS_BY_CAUSE.items():
         cause_group = next((group for group in groups if group[0].id == cause), None)
         if (
             cause_group is None
@@ -58,41 +58,24 @@ def group_by_cause(findings: Iterable[Finding]) -> tuple[Finding, ...]:
             or WHITE_TO_ASSUMED_NOISE_RATIO_KEY in cause_group[0].evidence
         ):
             continue
-        effect_finding_groups = [
-            group
-            for group in groups
-            if group is not cause_group
-            and not {group[0].id, f"{group[0].id}: {group[0].evidence.get(CAUSE_KEY)}"}.isdisjoint(
-                effects.splitlines()
-            )
-        ]
-        groups = [group for group in groups if group not in effect_finding_groups]
-        for effect, *further_effects in effect_finding_groups:
-            cause_group += [replace(effect, caused_by=cause), *further_effects]
-        severities = (
-            effect.severity for effect, *_ in effect_finding_groups if effect.id not in _KF_FINDINGS
-        )
-        severity = min((cause_group[0].severity, *severities), key=SEVERITIES.index)
+        effects, severity = effects_text.splitlines(), cause_group[0].severity
+        for group in [group for group in groups if group is not cause_group]:
+            effect = group[0]
+            if effect.id in effects or f"{effect.id}: {effect.evidence.get(CAUSE_KEY)}" in effects:
+                groups.remove(group)
+                cause_group += [replace(effect, caused_by=cause), *group[1:]]
+                if effect.id not in _KF_FINDINGS:
+                    severity = min(severity, effect.severity, key=SEVERITIES.index)
         cause_group[0] = replace(cause_group[0], severity=severity)
-    return tuple(
-        _use_action_of_cause(group[0], finding)
-        for group in sorted(groups, key=_compute_report_rank)
-        for finding in group
-    )
-
-
-def _use_action_of_cause(cause: Finding, finding: Finding) -> Finding:
-    """Give an effect the action of its cause, because its own action may be wrong.
-
-    Example: a larger noise setting only hides outliers.
-    """
-    if (
-        finding.caused_by is None
-        or cause.severity == "note"
-        or finding.id in EFFECTS_WITH_OWN_ACTION
-    ):
-        return finding
-    return replace(finding, remedy=cause.remedy)
+    findings = list[Finding]()
+    for cause_finding, *effect_findings in sorted(groups, key=_compute_report_rank):
+        findings.append(cause_finding)
+        for effect in effect_findings:
+            # The action of an effect may be wrong: a larger noise setting only hides outliers
+            keeps_action = cause_finding.severity == "note" or effect.id in EFFECTS_WITH_OWN_ACTION
+            remedy = effect.remedy if keeps_action else cause_finding.remedy
+            findings.append(replace(effect, remedy=remedy))
+    return tuple(findings)
 
 
 def find_effect_ids(cause: str) -> tuple[str, ...]:
@@ -104,16 +87,15 @@ def find_effect_ids(cause: str) -> tuple[str, ...]:
 def _compute_report_rank(group: list[Finding]) -> int:
     cause = group[0]
     report_class = FINDING_CATALOGUE[cause.id].report_class
-    is_listed_first = WRONG_CONVENTION_KEY in cause.evidence or report_class in (
+    if cause.severity == "note":
+        return 4
+    if WRONG_CONVENTION_KEY in cause.evidence or report_class in (
         "unusable",
         "misleading",
         "first",
-    )
-    if is_listed_first and cause.severity != "note":
+    ):
         return -1
     # A bad recording makes the noise estimates wrong, so its warnings precede noise errors
-    rank_by_severity = {
-        "error": 2 * (report_class == "noise"),
-        "warning": 3 - 2 * (report_class == "recording"),
-    }
-    return rank_by_severity.get(cause.severity, 4)
+    if cause.severity == "error":
+        return 2 if report_class == "noise" else 0
+    return 1 if report_class == "recording" else 3

@@ -39,10 +39,10 @@ def classify_cause(analysis: Analysis, cause: Trial | None) -> str:
         aid.noise: kinds.MEASUREMENT_NOISE_CAUSE,
         aid.gate: kinds.WRONG_GATE_CAUSE,
     }
-    return next(
-        (kind for name, kind in kind_by_change.items() if name in cause.change),
-        kinds.PROCESS_NOISE_CAUSE,
-    )
+    for name, kind in kind_by_change.items():
+        if name in cause.change:
+            return kind
+    return kinds.PROCESS_NOISE_CAUSE
 
 
 def rerun_refutes_cause(analysis: Analysis, filter_name: FilterName, cause: Trial) -> bool:
@@ -57,11 +57,10 @@ def rerun_refutes_cause(analysis: Analysis, filter_name: FilterName, cause: Tria
 
 def format_change(analysis: Analysis, cause: Trial) -> str:
     """Format the changes of a re-run: "SIGMA_Z 0.1 m instead of 0.05 m"."""
-    change = select_changed_settings(cause.change, _find_used_settings(analysis))
-    names = change.keys() - trials.SECONDARY_CHANGE_KEYS or change
-    return " and ".join(
-        _format_one_change(analysis, cause, name) for name in cause.change if name in names
-    )
+    changed = select_changed_settings(cause.change, _find_used_settings(analysis))
+    names = changed.keys() - trials.SECONDARY_CHANGE_KEYS or changed
+    texts = (_format_one_change(analysis, cause, name) for name in changed if name in names)
+    return " and ".join(texts)
 
 
 def _find_used_settings(analysis: Analysis) -> Mapping[str, float]:
@@ -82,28 +81,26 @@ def describe_explained_part(cause: Trial, statistic: Statistic) -> str:
 
 
 def format_action(analysis: Analysis, change: Mapping[str, float]) -> str:
-    actions, change = [], dict(change)
-    is_gnss = analysis.source.origin.is_gnss
-    if change.pop(trials.OUTLIERS_KEY, None):
+    actions = []
+    if change.get(trials.OUTLIERS_KEY):
         actions.append(find_source_texts(analysis.source).outlier_action)
-    if change.pop(trials.FORWARD_BIAS_KEY, None) is not None:
+    if trials.FORWARD_BIAS_KEY in change:
         actions.append("Calibrate the accelerometer and the level horizon.")
-        change.pop(trials.RIGHT_BIAS_KEY)
-    if rotation_deg := change.pop(trials.ROTATION_KEY, None):
+    if rotation_deg := change.get(trials.ROTATION_KEY):
+        action = f"Rotate the positions by {rotation_deg:+.0f}° before they are sent."
         # GNSS refers to true north, so a rotation of its positions is a heading error of EKF2
+        if analysis.source.origin.is_gnss:
+            action = magnetometer_advice(analysis.flight) or "Check the heading source of EKF2."
+        actions.append(action)
+    if trials.CLOCK_OFFSET_KEY in change:
         actions.append(
-            magnetometer_advice(analysis.flight) or "Check the heading source of EKF2."
-            if is_gnss
-            else f"Rotate the positions by {rotation_deg:+.0f}° before they are sent."
+            f"{format_timestamp_action(change[trials.CLOCK_OFFSET_KEY])} before sending."
         )
-    if (offset_s := change.pop(trials.CLOCK_OFFSET_KEY, None)) is not None:
-        actions.append(f"{format_timestamp_action(offset_s)} before sending.")
-    settings = {name: change.pop(name) for name in changes.KF_NOISE_SETTINGS & change.keys()}
-    if change:
-        change = select_changed_settings(change, _find_used_settings(analysis))
-        actions.append(f"Set {format_settings(change)}.")
-    if settings:
-        actions.append(format_kf_settings(settings))
+    if parameters := {name: change[name] for name in change if name in PARAMETERS}:
+        parameters = select_changed_settings(parameters, _find_used_settings(analysis))
+        actions.append(f"Set {format_settings(parameters)}.")
+    if kf_settings := {name: change[name] for name in changes.KF_NOISE_SETTINGS & change.keys()}:
+        actions.append(format_kf_settings(kf_settings))
     return " ".join(actions)
 
 
@@ -153,11 +150,11 @@ def _format_one_change(analysis: Analysis, cause: Trial, name: str) -> str:
             )
         case trials.ROTATION_KEY:
             is_drifting = isinstance(analysis.heading, HeadingError) and analysis.heading.drifts
-            average_text = " on average" if is_drifting else ""
+            angle_text = f"{value:+.0f}°{' on average' if is_drifting else ''}"
             return (
-                f"EKF2's heading corrected (error {value:+.0f}°{average_text})"
+                f"EKF2's heading corrected (error {angle_text})"
                 if analysis.source.origin.is_gnss
-                else f"positions rotated in yaw by {value:+.0f}°{average_text}"
+                else f"positions rotated in yaw by {angle_text}"
             )
         case changes.SIGMA_A | changes.SIGMA_Z:
             unit, label = SETTING_RANGES[name][2:]

@@ -57,20 +57,20 @@ def detect_unfused_positions(analysis: PreparedComparison) -> Findings:
     fusion_flag = ekf2.fusion_flags["horizontal"]
     fused_fraction = compute_flag_fraction(fusion_flag, analysis.segment)
     if fused_fraction >= FUSED_FRACTION_FOR_ERROR:
-        yield from _detect_slow_restart(analysis, ekf2, fusion_flag)
+        yield from _detect_slow_restart(analysis, fusion_flag)
     if source is None or fused_fraction >= FUSED_FRACTION_FOR_WARNING:
         return
-    positions_text, aid = positions_phrase(source), source.origin.aid
+    title = f"EKF2 never fused the {positions_phrase(source)}"
     evidence: dict[str, float | str] = {
         "fused_fraction": fused_fraction,
         "source_interval_s": 1.0 / source.compute_rate_hz(),
     }
-    if aid is None:
+    if source.origin.aid is None:
         if source.name == MOTION_CAPTURE_TOPIC and not fused_fraction:
             yield make_warning(
                 "ekf2_not_fusing",
-                f"EKF2 never fused the {positions_text}: EKF2 does not read {source.name}. This "
-                "topic contains ground truth: ATT_POS_MOCAP, or ODOMETRY of estimator type MOCAP.",
+                f"{title}: EKF2 does not read {source.name}. This topic contains ground truth: "
+                "ATT_POS_MOCAP, or ODOMETRY of estimator type MOCAP.",
                 "To fuse these positions, send VISION_POSITION_ESTIMATE, or ODOMETRY of "
                 "estimator type VISION.",
                 evidence,
@@ -80,45 +80,46 @@ def detect_unfused_positions(analysis: PreparedComparison) -> Findings:
     longest_span_s = max(spans, key=lambda span: span[1] - span[0])
     parameters = {**analysis.flight.log.parameters, **ekf2.parameters}
     unmet_condition = find_unmet_condition(
-        UnfusedPositions(ekf2, source, aid, parameters, longest_span_s)
+        UnfusedPositions(ekf2, source, source.origin.aid, parameters, longest_span_s)
     )
-    evidence["condition"] = unmet_condition.condition
-    action = unmet_condition.action
-    if not unmet_condition.condition and not source.origin.has_all_samples:
+    condition, action = unmet_condition.condition, unmet_condition.action
+    evidence["condition"] = condition
+    if not condition and not source.origin.has_all_samples:
         action = f"Record with SDLOG_PROFILE 129 (default and vision). {action}"
-    title = f"EKF2 fused the {positions_text} only {format_percent(fused_fraction)} of the time"
-    if not fused_fraction:
-        title = f"EKF2 never fused the {positions_text}"
-    message = (
-        f"{title}{unmet_condition.fault and ': '}{unmet_condition.fault}. {unmet_condition.reason}"
+    if fused_fraction:
+        title = (
+            f"EKF2 fused the {positions_phrase(source)} only {format_percent(fused_fraction)} of "
+            "the time"
+        )
+    if unmet_condition.fault:
+        title += f": {unmet_condition.fault}"
+    message = f"{title}. {unmet_condition.reason}"
+    if fused_fraction >= FUSED_FRACTION_FOR_ERROR:
+        message += (
+            f" For up to {longest_span_s[1] - longest_span_s[0]:.1f} s EKF2 relied on the IMU and "
+            "other aiding sources."
+        )
+        yield make_warning("ekf2_fusion_interrupted", message, action, evidence, spans)
+        return
+    is_disabled_gnss = source.origin.is_fused_as_gnss and condition == "switch"
+    yield finding(
+        "note" if is_disabled_gnss else "error",
+        "ekf2_not_fusing",
+        message,
+        action,
+        evidence,
+        spans if fused_fraction else (),
     )
-    if fused_fraction < FUSED_FRACTION_FOR_ERROR:
-        is_disabled_gnss = source.origin.is_fused_as_gnss and unmet_condition.condition == "switch"
-        yield finding(
-            "note" if is_disabled_gnss else "error",
-            "ekf2_not_fusing",
-            message,
-            action,
-            evidence,
-            spans if fused_fraction else (),
-        )
-    else:
-        yield make_warning(
-            "ekf2_fusion_interrupted",
-            f"{message} For up to {longest_span_s[1] - longest_span_s[0]:.1f} s EKF2 relied on the "
-            "IMU and other aiding sources.",
-            action,
-            evidence,
-            spans,
-        )
 
 
 def _find_received_source(analysis: PreparedComparison) -> PositionTrack | None:
     """Return the positions that PX4 received, if any."""
     if analysis.source.origin != POSITION_FILE_ORIGIN:
         return analysis.source
-    tracks = (track for track in analysis.flight.positions if track.origin != POSITION_FILE_ORIGIN)
-    return next((track for track in tracks if track.origin.is_vision), None)
+    for track in analysis.flight.positions:
+        if track.origin.is_vision and track.origin != POSITION_FILE_ORIGIN:
+            return track
+    return None
 
 
 def _detect_invalid_position(analysis: Comparison, ekf2: Ekf2) -> Findings:
@@ -133,18 +134,17 @@ def _detect_invalid_position(analysis: Comparison, ekf2: Ekf2) -> Findings:
     if distance_m < MIN_INVALID_POSITION_ERROR_M:
         return
     reference = "ground truth" if isinstance(analysis.flight.truth, Truth) else "position source"
-    distance_sentence = (
-        f" The invalid position is up to {format_metres(distance_m)} m from the {reference}."
-    )
-    if not np.isfinite(distance_m):
-        distance_sentence = ""
+    distance_sentence = ""
+    if np.isfinite(distance_m):
+        distance_sentence = (
+            f" The invalid position is up to {format_metres(distance_m)} m from the {reference}."
+        )
     yield finding(
         "error" if invalid_fraction > FUSED_FRACTION_FOR_ERROR else "warning",
         "ekf2_position_invalid",
         f"EKF2's horizontal position is invalid {format_percent(invalid_fraction)} of the time "
         f"(xy_valid 0), and PX4 does not use this position.{distance_sentence}",
-        "First restore the fusion of positions. The error of an invalid EKF2 position does not "
-        "depend on noise settings.",
+        "First restore the fusion of positions. Noise settings do not change the error.",
         {"invalid_fraction": invalid_fraction, "distance_m": distance_m},
         spans,
     )
@@ -163,9 +163,7 @@ def _find_largest_distance_m(analysis: Comparison, ekf2: Ekf2, spans: tuple[Span
     return float(np.hypot(*differences_m).max())
 
 
-def _detect_slow_restart(
-    analysis: PreparedComparison, ekf2: Ekf2, fusion_flag: pd.Series
-) -> Findings:
+def _detect_slow_restart(analysis: PreparedComparison, fusion_flag: pd.Series) -> Findings:
     """Detect that EKF2 resumes fusion late after a gap, because the position rate is too low."""
     source, rate_hz = analysis.source, analysis.source.compute_rate_hz()
     if (
@@ -178,27 +176,25 @@ def _detect_slow_restart(
         return
     time_s = source.samples.index.to_numpy()
     gap_ends_s = time_s[1:][np.diff(time_s) > EV_STOP_INTERVAL_S]
-    restart_delay_spans = []
+    delay_spans = []
     for start_s, end_s in find_spans_with_value(0.0, fusion_flag, analysis.segment):
-        gap_ends_while_not_fusing_s = gap_ends_s[
-            (gap_ends_s > start_s - EV_STOP_INTERVAL_S) & (gap_ends_s < end_s)
-        ]
-        if not len(gap_ends_while_not_fusing_s):
-            continue
-        unfused_times_s = time_s[(time_s >= gap_ends_while_not_fusing_s[-1]) & (time_s < end_s)]
+        # Positions from the last gap end on, while EKF2 does not fuse
+        last_gap_end_s = gap_ends_s[gap_ends_s < end_s].max(initial=-np.inf)
+        unfused_times_s = time_s[(time_s >= last_gap_end_s) & (time_s < end_s)]
         if (
-            len(unfused_times_s) > 2
+            last_gap_end_s > start_s - EV_STOP_INTERVAL_S
+            and len(unfused_times_s) > 2
             and unfused_times_s[1] - unfused_times_s[0] >= EV_START_INTERVAL_S
         ):
-            restart_delay_spans.append((float(unfused_times_s[0]), end_s))
-    if restart_delay_spans:
-        longest_delay_s = max(end - start for start, end in restart_delay_spans)
+            delay_spans.append((float(unfused_times_s[0]), end_s))
+    if delay_spans:
+        longest_delay_s = max(end - start for start, end in delay_spans)
         yield make_note(
             "source_rate_at_limit",
             f"After a gap EKF2 resumed fusion {longest_delay_s:.1f} s late: "
             f"{positions_phrase(source)} come at only {rate_hz:.1f} Hz. EKF2 (v1.14 and later) "
             f"starts fusion when two positions arrive within {EV_START_INTERVAL_S:g} s.",
             "Send the position at 10 Hz.",
-            {"rate_hz": rate_hz, "longest_s": longest_delay_s, "count": len(restart_delay_spans)},
-            tuple(restart_delay_spans),
+            {"rate_hz": rate_hz, "longest_s": longest_delay_s, "count": len(delay_spans)},
+            tuple(delay_spans),
         )

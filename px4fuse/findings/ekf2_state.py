@@ -1,21 +1,30 @@
-"""IMU biases that EKF2 cannot estimate, and a tilt or heading that EKF2 did not align."""
+"""State of EKF2: resets, instance changes, biases that it cannot estimate, missing alignment."""
+
+import math
 
 import numpy as np
 import pandas as pd
 from scipy import constants
 
 from px4fuse.analysis import Analysis
+from px4fuse.comparison.flight_events import find_airborne_spans
 from px4fuse.comparison.model import ErrorsAgainstTruth
-from px4fuse.core.arrays import Array
+from px4fuse.comparison.projection import remove_origin_resets
+from px4fuse.core.record import Span
 from px4fuse.core.text import format_metres
 from px4fuse.filter.signals import Segment, cut_to_segment
+from px4fuse.findings.cause_grouping import CAUSE_KEY, SOURCE_GAP_CAUSE, UNKNOWN_CAUSE
 from px4fuse.findings.model import (
     Findings,
     compute_flag_fraction,
     find_spans_with_value,
+    finding,
+    format_count,
     format_percent,
     magnetometer_advice,
     make_error,
+    make_warning,
+    make_zero_length_spans,
 )
 from px4fuse.flight.ekf2_parameters import BAROMETER, EV_CTRL_YAW_MASK, EV_POS, MAG
 from px4fuse.flight.model import (
@@ -24,6 +33,7 @@ from px4fuse.flight.model import (
     Ekf2,
     Flight,
     PositionTrack,
+    Reset,
     Unavailable,
     rows_between,
 )
@@ -41,7 +51,7 @@ REST_WINDOW_S = 1.0
 # Time (s) before take-off in which the motors run
 MOTOR_RUN_UP_DURATION_S = 0.5
 # Maximum standard deviation of angular rate (rad/s) and specific force (m/s²) at rest
-MAX_RATE_AND_FORCE_STD_AT_REST = (0.04, 1.5)
+MAX_RATE_STD_AT_REST, MAX_FORCE_STD_AT_REST = 0.04, 1.5
 # Maximum change (rad/s) of the mean angular rate between windows at rest
 MAX_RATE_CHANGE_AT_REST_RAD_S = 0.01
 # Minimum gyroscope bias (rad/s) for a finding: the heading turns by 90° in 30 s
@@ -52,12 +62,21 @@ MIN_GRAVITY_ERROR_M_S2 = 0.3
 MAX_UNALIGNED_FRACTION = 0.02
 # Maximum normal time (s) from tilt alignment to heading alignment
 MAX_HEADING_ALIGNMENT_DELAY_S = 5.0
+# Time (s) after take-off with normal height resets
+TAKE_OFF_DURATION_S = 10.0
+# Maximum time (s) from the end of a position gap to the EKF2 reset that it causes
+MAX_RESET_DELAY_S = 5.0
+# Maximum delay (s) of the normal reset at the start of fusion, because flags are logged at 1 Hz
+MAX_FUSION_START_TO_RESET_S = 1.0
 
 
 def detect(analysis: Analysis) -> Findings:
     ekf2 = analysis.flight.ekf2
     if not isinstance(ekf2, Ekf2):
         return
+    flight_segment = analysis.segment.whole_flight
+    yield from detect_resets(analysis, ekf2)
+    yield from detect_instance_switches(ekf2, (flight_segment.start_s, flight_segment.end_s))
     median_imu_at_rest = measure_imu_at_rest(analysis.flight)
     if not isinstance(ekf2.record, Unavailable):
         bias_states = cut_to_segment(ekf2.record.delayed, analysis.segment)
@@ -69,28 +88,20 @@ def detect(analysis: Analysis) -> Findings:
 
 def measure_imu_at_rest(flight: Flight) -> pd.Series | None:
     """Return the median angular rate and specific force at rest before take-off, if known."""
-    if (
-        not isinstance(flight.imu, pd.DataFrame)
-        or isinstance(flight.airborne, Unavailable)
-        or not flight.airborne
-    ):
+    airborne_spans = find_airborne_spans(flight)
+    if isinstance(flight.imu, Unavailable) or not airborne_spans:
         return None
-    end_s = flight.airborne[0][0] - MOTOR_RUN_UP_DURATION_S
+    end_s = airborne_spans[0][0] - MOTOR_RUN_UP_DURATION_S
     imu = rows_between(flight.imu, -np.inf, end_s).astype(np.float64)
     windows = imu.groupby(np.floor(imu.index / REST_WINDOW_S))
-    window_means, window_stds = windows.mean(), windows.std()
-    is_at_rest = np.ones(len(window_means), bool)
-    for columns, limit in zip(
-        (Columns.ANGULAR_RATE, Columns.SPECIFIC_FORCE), MAX_RATE_AND_FORCE_STD_AT_REST, strict=True
-    ):
-        is_at_rest &= np.linalg.norm(window_stds[columns], axis=1) < limit
-    window_means = window_means[is_at_rest]
-    if (
-        window_means.empty
-        or np.ptp(window_means[Columns.ANGULAR_RATE], axis=0).max() > MAX_RATE_CHANGE_AT_REST_RAD_S
-    ):
+    stds = windows.std()
+    is_rate_constant = np.linalg.norm(stds[Columns.ANGULAR_RATE], axis=1) < MAX_RATE_STD_AT_REST
+    is_force_constant = np.linalg.norm(stds[Columns.SPECIFIC_FORCE], axis=1) < MAX_FORCE_STD_AT_REST
+    means: pd.DataFrame = windows.mean()[is_rate_constant & is_force_constant]
+    rates_rad_s = means[Columns.ANGULAR_RATE]
+    if means.empty or np.ptp(rates_rad_s, axis=0).max() > MAX_RATE_CHANGE_AT_REST_RAD_S:
         return None
-    return window_means.median()
+    return means.median()
 
 
 def _detect_bias_at_limit(
@@ -98,33 +109,30 @@ def _detect_bias_at_limit(
 ) -> Findings:
     for parameter, unit, sensor, columns in BIAS_LIMIT_PARAMETERS:
         limit = ekf2.parameters.get(parameter, 0.0)
-        time_at_limit_fractions = (
-            (bias_states[columns].abs() >= MIN_BIAS_TO_LIMIT_RATIO * limit).mean().to_numpy()
-        )
-        axis_index = int(np.argmax(time_at_limit_fractions))
-        time_at_limit_fraction = float(time_at_limit_fractions[axis_index])
-        if limit <= 0.0 or time_at_limit_fraction < MIN_TIME_AT_LIMIT_FRACTION:
+        fractions = (bias_states[columns].abs() >= MIN_BIAS_TO_LIMIT_RATIO * limit).mean()
+        axis_index = int(np.argmax(fractions))
+        limited_fraction = float(fractions.iloc[axis_index])
+        if limit <= 0.0 or limited_fraction < MIN_TIME_AT_LIMIT_FRACTION:
             continue
         median_bias = float(bias_states[columns[axis_index]].median())
         message = (
             f"EKF2's {sensor} bias is at its limit {parameter} {limit:.3g} {unit} for "
-            f"{format_percent(time_at_limit_fraction)} of the flight. The estimate is "
-            f"{median_bias:+.3g} {unit} {BODY_AXES[axis_index]}; "
-            "EKF2 cannot estimate a larger bias."
+            f"{format_percent(limited_fraction)} of the flight. The estimate is "
+            f"{median_bias:+.3g} {unit} {BODY_AXES[axis_index]}."
         )
         if sensor == "accelerometer" and median_imu_at_rest is not None:
-            force_m_s2 = float(np.linalg.norm(median_imu_at_rest[Columns.SPECIFIC_FORCE]))
+            force_m_s2 = np.linalg.norm(median_imu_at_rest[Columns.SPECIFIC_FORCE])
             if abs(force_m_s2 - constants.g) > MIN_GRAVITY_ERROR_M_S2:
                 message += (
                     f" At rest before take-off the accelerometer measures {force_m_s2:.2f} m/s² "
-                    f"instead of {constants.g:.2f}. Its bias along the down axis is "
-                    f"{constants.g - force_m_s2:+.2f} m/s²."
+                    f"instead of {constants.g:.2f} (bias down: {constants.g - force_m_s2:+.2f} "
+                    "m/s²)."
                 )
         yield make_error(
             "ekf2_bias_at_limit",
             message + (_describe_height_error(analysis, ekf2) if axis_index == 2 else ""),
             f"Calibrate the {sensor}s at the temperature of the flight.",
-            {"bias": median_bias, "limit": limit, "limited_fraction": time_at_limit_fraction},
+            {"bias": median_bias, "limit": limit, "limited_fraction": limited_fraction},
         )
 
 
@@ -146,24 +154,22 @@ def _describe_height_error(analysis: Analysis, ekf2: Ekf2) -> str:
 def _detect_gyro_bias(bias_states: pd.DataFrame, median_imu_at_rest: pd.Series | None) -> Findings:
     if median_imu_at_rest is None:
         return
-    measured_biases_rad_s: Array = median_imu_at_rest[Columns.ANGULAR_RATE].to_numpy()
-    estimated_biases_rad_s: Array = bias_states[Columns.GYRO_BIAS].median().to_numpy()
-    differences_rad_s = np.abs(measured_biases_rad_s - estimated_biases_rad_s)
-    axis_index = int(np.argmax(differences_rad_s))
-    if differences_rad_s[axis_index] < MIN_GYRO_BIAS_RAD_S:
+    biases_rad_s = zip(
+        median_imu_at_rest[Columns.ANGULAR_RATE].tolist(),
+        bias_states[Columns.GYRO_BIAS].median().tolist(),
+        ("forward", "right", "down (vertical)"),
+        strict=True,
+    )
+    measured, estimated, direction = max(biases_rad_s, key=lambda item: abs(item[0] - item[1]))
+    if abs(measured - estimated) < MIN_GYRO_BIAS_RAD_S:
         return
-    direction = ("forward", "right", "down (vertical)")[axis_index]
     yield make_error(
         "gyroscope_bias",
-        f"The gyroscope measures {measured_biases_rad_s[axis_index]:+.2f} rad/s about {direction} "
-        f"at rest. EKF2 estimates only {estimated_biases_rad_s[axis_index]:+.3f} rad/s of this "
-        "bias in flight (median), so its attitude turns by "
-        f"{np.degrees(differences_rad_s[axis_index]):.0f}°/s.",
-        "Calibrate the gyroscopes, and keep the vehicle at rest during the calibration.",
-        {
-            "measured_rad_s": float(measured_biases_rad_s[axis_index]),
-            "estimated_rad_s": float(estimated_biases_rad_s[axis_index]),
-        },
+        f"The gyroscope measures {measured:+.2f} rad/s about {direction} at rest. EKF2 estimates "
+        f"only {estimated:+.3f} rad/s of this bias in flight (median), so its attitude turns by "
+        f"{math.degrees(abs(measured - estimated)):.0f}°/s.",
+        "Calibrate the gyroscopes while the vehicle is at rest.",
+        {"measured_rad_s": measured, "estimated_rad_s": estimated},
     )
 
 
@@ -182,16 +188,17 @@ def detect_missing_alignment(
         isinstance(fusion_flags, pd.DataFrame)
         and compute_flag_fraction(fusion_flags["yaw"], segment) > 0.0
     )
+    tilt_action = "Keep the vehicle at rest after boot until EKF2 is ready."
+    quantities = [("tilt_align", "tilt", "tilt is", tilt_action)]
+    if not fuses_source_yaw:
+        heading_action = _find_heading_action(flight, source)
+        quantities.append(("yaw_align", "heading", "tilt and heading are", heading_action))
     alignment_end_s = segment.start_s
-    for flag, quantity, action in (
-        ("tilt_align", "tilt", "Keep the vehicle at rest after boot until EKF2 is ready."),
-        ("yaw_align", "heading", _find_heading_action(flight, source)),
-    ):
-        alignment_flag = ekf2.states.get(flag)
-        if alignment_flag is None or (flag == "yaw_align" and fuses_source_yaw):
+    for flag, quantity, required_text, action in quantities:
+        if flag not in ekf2.states:
             continue
-        spans = find_spans_with_value(0.0, alignment_flag, segment)
-        unaligned_fraction = 1.0 - compute_flag_fraction(alignment_flag, segment)
+        spans = find_spans_with_value(0.0, ekf2.states[flag], segment)
+        unaligned_fraction = 1.0 - compute_flag_fraction(ekf2.states[flag], segment)
         if (
             unaligned_fraction > MAX_UNALIGNED_FRACTION
             and spans[-1][1] > alignment_end_s + MAX_HEADING_ALIGNMENT_DELAY_S
@@ -204,7 +211,7 @@ def detect_missing_alignment(
                 "ekf2_not_aligned",
                 f"EKF2 has not aligned its {quantity}{until_text}. cs_{flag} is 0 for "
                 f"{format_percent(unaligned_fraction)} of the flight. EKF2 fuses no position "
-                f"before {'tilt is' if flag == 'tilt_align' else 'tilt and heading are'} aligned.",
+                f"before {required_text} aligned.",
                 action,
                 {"unaligned_fraction": unaligned_fraction, "flag": flag},
                 spans,
@@ -214,14 +221,83 @@ def detect_missing_alignment(
 def _find_heading_action(flight: Flight, source: PositionTrack | None) -> str:
     """Return the action for a missing heading alignment."""
     action = magnetometer_advice(flight) or f"Enable the magnetometer ({MAG.switch} 0)."
-    if source is not None and source.origin.is_vision:
-        alternative_action = "let EKF2 fuse the yaw of the source (EKF2_EV_CTRL bit 3)"
-        if source.orientation is None:
-            alternative_action = "send the orientation of the source and set EKF2_EV_CTRL bit 3"
-            if int(flight.log.parameters.get(EV_POS.switch, 0)) & EV_CTRL_YAW_MASK:
-                alternative_action = (
-                    "send the orientation of the source: EKF2_EV_CTRL bit 3 is set, but the "
-                    "orientation is missing or constant"
-                )
-        action += f" Alternatively, {alternative_action}."
-    return action
+    if source is None or not source.origin.is_vision:
+        return action
+    alternative = "let EKF2 fuse the yaw of the source (EKF2_EV_CTRL bit 3)"
+    if source.orientation is None:
+        alternative = "send the orientation of the source and set EKF2_EV_CTRL bit 3"
+        if int(flight.log.parameters.get(EV_POS.switch, 0)) & EV_CTRL_YAW_MASK:
+            alternative = (
+                "send the orientation of the source: EKF2_EV_CTRL bit 3 is set, but the "
+                "orientation is missing or constant"
+            )
+    return f"{action} Alternatively, {alternative}."
+
+
+def detect_resets(analysis: Analysis, ekf2: Ekf2) -> Findings:
+    """Detect resets of EKF2's position and height, except normal ones at take-off."""
+    segment = analysis.segment.whole_flight
+    # Resets up to the start of fusion are normal
+    fusion_start_s = -math.inf
+    if isinstance(ekf2.fusion_flags, pd.DataFrame):
+        is_fused = ekf2.fusion_flags["horizontal"] > 0.0
+        fusion_start_s = is_fused.index[is_fused].min() + MAX_FUSION_START_TO_RESET_S
+    position_resets = [
+        reset
+        for reset in ekf2.resets
+        if segment.start_s < reset.time_s <= segment.end_s
+        and reset.quantity == "position"
+        and any(reset.delta)
+        and not _is_take_off_height_reset(analysis, reset)
+        and not reset.time_s <= fusion_start_s
+    ]
+    if position_resets:
+        horizontal_resets = [reset for reset in position_resets if any(reset.delta[:2])]
+        resets = horizontal_resets or position_resets
+        follows_gap = all(
+            any(
+                start <= reset.time_s <= end + MAX_RESET_DELAY_S
+                for start, end in analysis.events.gaps
+            )
+            for reset in resets
+        )
+        largest_reset = max(resets, key=lambda reset: math.hypot(*reset.delta))
+        largest_m, time_s = math.hypot(*largest_reset.delta), largest_reset.time_s
+        _, treatment = remove_origin_resets(ekf2, analysis.source, analysis.segment)
+        yield finding(
+            "warning" if horizontal_resets else "note",
+            "ekf2_resets",
+            f"EKF2 reset its {'horizontal position' if horizontal_resets else 'height'} "
+            f"{format_count(len(resets))} (largest reset: {largest_m:.2f} m at {time_s:.1f} s)."
+            f"{f' Treatment in the comparison: {treatment}.' if treatment else ''}",
+            f"Run px4fuse explore LOG and compare position and innovation at {time_s:.1f} s.",
+            {
+                "count": len(resets),
+                "largest_m": largest_m,
+                "at_s": time_s,
+                CAUSE_KEY: SOURCE_GAP_CAUSE if follows_gap else UNKNOWN_CAUSE,
+            },
+            make_zero_length_spans(reset.time_s for reset in resets),
+        )
+
+
+def detect_instance_switches(ekf2: Ekf2, span_s: Span) -> Findings:
+    """Detect changes of the primary EKF2 instance in a time span (s)."""
+    switch_times_s = [time for time, _ in ekf2.primary_instances if span_s[0] < time <= span_s[1]]
+    if switch_times_s:
+        yield make_warning(
+            "ekf2_instance_switch",
+            f"The primary EKF2 instance changed {format_count(len(switch_times_s))}, first at "
+            f"{switch_times_s[0]:.1f} s. The comparison uses the primary instance at each time.",
+            "Compare vibration and clipping of the IMUs (vehicle_imu_status). For a lab flight set "
+            "EKF2_MULTI_IMU to 1: EKF2 then uses one IMU.",
+            {"count": len(switch_times_s), "at_s": switch_times_s[0]},
+            make_zero_length_spans(switch_times_s),
+        )
+
+
+def _is_take_off_height_reset(analysis: Analysis, reset: Reset) -> bool:
+    return not any(reset.delta[:2]) and any(
+        start_s <= reset.time_s <= start_s + TAKE_OFF_DURATION_S
+        for start_s, _ in find_airborne_spans(analysis.flight)
+    )

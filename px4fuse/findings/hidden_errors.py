@@ -36,7 +36,6 @@ from px4fuse.findings.model import (
     make_note,
 )
 from px4fuse.flight.model import Unavailable, source_name
-from px4fuse.loop.model import Loop
 from px4fuse.trajectory.alignment import fit_alignment
 
 # Minimum mean NEES, for severity "error": an RMS position error of 4 times the reported σ
@@ -53,8 +52,8 @@ EKF2_REMEDY = (
     "same positions."
 )
 EKF2_HEIGHT_REMEDY = (
-    "Check the height sensors that EKF2 fuses (EKF2_HGT_REF) and the accelerometer: KF has a "
-    "smaller height error."
+    "Check EKF2's height sensors (EKF2_HGT_REF) and the accelerometer: KF has a smaller height "
+    "error."
 )
 
 
@@ -80,19 +79,17 @@ def find_hidden_errors(comparison: Comparison) -> list[tuple[FilterName, str, Er
 
     Return (filter, axis, error) for each error, largest mean NEES first.
     """
-    alignment, frame_residual_rms_m = comparison.source.alignment, 0.0
+    alignment, min_kf_rmse_by_axis = comparison.source.alignment, dict[str, float]()
     # A frame that was fitted to EKF2's track contains EKF2's errors
-    if is_frame_fitted := alignment is not None and alignment.yaw_sigma_deg is not None:
-        frame_residual_rms_m = alignment.residual_rms_m or 0.0
+    if alignment is not None and alignment.yaw_sigma_deg is not None:
+        min_kf_rmse_by_axis = dict.fromkeys(comparison.axes, alignment.residual_rms_m or 0.0)
+        min_kf_rmse_by_axis["down"] = np.inf
     errors_not_in_innovations = [
         (filter_name, name, error)
         for name, result in comparison.axes.items()
         for filter_name, summary in result.filters.items()
         if (error := find_error_above_sigma(summary))
-        and (
-            filter_name == "ekf2"
-            or (error.rmse_m > frame_residual_rms_m and not (is_frame_fitted and name == "down"))
-        )
+        and (filter_name == "ekf2" or error.rmse_m > min_kf_rmse_by_axis.get(name, 0.0))
     ]
     return sorted(errors_not_in_innovations, key=lambda entry: -entry[2].nees)
 
@@ -110,76 +107,71 @@ def make_hidden_error_finding(
     errors_not_in_innovations = sorted(
         errors_not_in_innovations, key=lambda entry: entry[1] != analysis.main.axis.name
     )
-    worst_filter, main_axis, worst_error = errors_not_in_innovations[0]
-    evidence: dict[str, float | str] = {"axis": main_axis, "filter": worst_filter}
-    sigma_ratio_by_filter, sentences = dict[str, float](), list[str]()
+    worst_filter, worst_axis, worst_error = errors_not_in_innovations[0]
+    # The first error of each filter
+    error_by_filter = {entry[0]: entry[1:] for entry in reversed(errors_not_in_innovations)}
+    evidence: dict[str, float | str] = {"axis": worst_axis, "filter": worst_filter}
+    ratio_texts, sentences = dict[str, str](), list[str]()
     trial_by_filter = dict[FilterName, Trial]()
-    for filter_name in FILTER_NAMES:
-        label = FILTER_NAMES[filter_name]
-        for _, axis, hidden_error in [
-            entry for entry in errors_not_in_innovations if entry[0] == filter_name
-        ][:1]:
-            if hidden_error.nis_mean is not None:
-                evidence[f"{filter_name}_nis_mean"] = hidden_error.nis_mean
-            evidence |= {
-                f"{filter_name}_nees_position_mean": hidden_error.nees,
-                f"{filter_name}_position_rmse_m": hidden_error.rmse_m,
-                f"{filter_name}_sigma_p_m": hidden_error.reported_sigma_m,
-            }
-            cause = find_cause_trial(analysis.trials, filter_name, axis, "nees")
-            if cause is not None and not rerun_refutes_cause(analysis, filter_name, cause):
-                trial_by_filter[filter_name] = cause
-            sigma_ratio_by_filter[label] = hidden_error.nees**0.5
-            sentences.append(
-                f"{label}: position RMSE {format_metres(hidden_error.rmse_m)} m along "
-                f"{analysis.axes[axis].axis.label}, reported σ "
-                f"{format_metres(hidden_error.reported_sigma_m)} m."
-            )
+    for filter_name, label in FILTER_NAMES.items():
+        if filter_name not in error_by_filter:
+            continue
+        axis, error = error_by_filter[filter_name]
+        if error.nis_mean is not None:
+            evidence[f"{filter_name}_nis_mean"] = error.nis_mean
+        evidence |= {
+            f"{filter_name}_nees_position_mean": error.nees,
+            f"{filter_name}_position_rmse_m": error.rmse_m,
+            f"{filter_name}_sigma_p_m": error.reported_sigma_m,
+        }
+        cause = find_cause_trial(analysis.trials, filter_name, axis, "nees")
+        if cause is not None and not rerun_refutes_cause(analysis, filter_name, cause):
+            trial_by_filter[filter_name] = cause
+        ratio_texts[label] = f"{label} error {format_ratio(error.nees**0.5)} times the reported σ"
+        sentences.append(
+            f"{label}: position RMSE {format_metres(error.rmse_m)} m along "
+            f"{analysis.axes[axis].axis.label}, reported σ "
+            f"{format_metres(error.reported_sigma_m)} m."
+        )
     cause = trial_by_filter.get(worst_filter) or next(iter(trial_by_filter.values()), None)
-    evidence |= {CAUSE_KEY: classify_cause(analysis, cause)}
+    evidence[CAUSE_KEY] = classify_cause(analysis, cause)
     alignment_rmse = None if trial_by_filter else _compute_alignment_rmse(analysis, worst_filter)
+    is_misaligned = False
     if alignment_rmse is not None:
         evidence |= {
             "position_rmse_horizontal_m": alignment_rmse.rmse_before_m,
             "position_rmse_aligned_m": alignment_rmse.rmse_after_m,
         }
-    is_misaligned = alignment_rmse is not None and alignment_rmse.is_misaligned
+        if is_misaligned := alignment_rmse.is_misaligned:
+            sentences.append(f"The position frame is misaligned: {alignment_rmse}.")
     if analysis.source.origin.may_drift and not trial_by_filter and not is_misaligned:
         return _make_drift_finding(
-            analysis, alignment_rmse, worst_error, evidence, tuple(sigma_ratio_by_filter)
+            analysis, alignment_rmse, worst_error, evidence, tuple(ratio_texts)
         )
-    if is_misaligned and alignment_rmse is not None:
-        sentences.append(f"The position frame is misaligned: {alignment_rmse}.")
-    kf_errors = analysis.axes[main_axis].filters["kf"].truth
-    is_kf_better = (
-        isinstance(kf_errors, ErrorsAgainstTruth)
-        and kf_errors.position_rmse_m < MAX_KF_TO_EKF2_RMSE_RATIO * worst_error.rmse_m
-    )
-    is_fault_of_ekf2_only = is_kf_better and all(
-        filter_name == "ekf2" for filter_name, *_ in errors_not_in_innovations
-    )
-    time_offset_check = "Check the time offset of the positions (px4fuse sync LOG)."
-    if isinstance(analysis.clock, Unavailable):
-        time_offset_check = (
-            "A time offset of the positions is possible, but this log cannot show it: "
-            f"{analysis.clock.reason}. {analysis.clock.remedy}"
-        )
-    remedy = f"{time_offset_check} {find_source_texts(analysis.source).slow_error_check}."
+    kf_errors = analysis.axes[worst_axis].filters["kf"].truth
     if cause is not None:
         remedy = format_action(analysis, cause.change)
     elif is_misaligned:
         remedy = FRAME_REMEDY
-    elif is_fault_of_ekf2_only:
-        remedy = EKF2_HEIGHT_REMEDY if main_axis == "down" else EKF2_REMEDY
-    ratio_texts = (
-        f"{label} error {format_ratio(ratio)} times the reported σ"
-        for label, ratio in sigma_ratio_by_filter.items()
-    )
-    title = f"Position errors that innovations do not show: {', '.join(ratio_texts)}"
+    elif (
+        "kf" not in error_by_filter
+        and isinstance(kf_errors, ErrorsAgainstTruth)
+        and kf_errors.position_rmse_m < MAX_KF_TO_EKF2_RMSE_RATIO * worst_error.rmse_m
+    ):
+        remedy = EKF2_HEIGHT_REMEDY if worst_axis == "down" else EKF2_REMEDY
+    else:
+        remedy = "Check the time offset of the positions (px4fuse sync LOG)."
+        if isinstance(analysis.clock, Unavailable):
+            remedy = (
+                "A time offset of the positions is possible, but this log cannot show it: "
+                f"{analysis.clock.reason}. {analysis.clock.remedy}"
+            )
+        remedy += f" {find_source_texts(analysis.source).slow_error_check}."
     return finding(
         "error" if worst_error.nees >= MIN_NEES_FOR_ERROR else "warning",
         "error_exceeds_reported_sigma",
-        f"{title}. {' '.join(sentences)}",
+        f"Position errors that innovations do not show: {', '.join(ratio_texts.values())}. "
+        f"{' '.join(sentences)}",
         remedy,
         evidence,
     )
@@ -207,66 +199,60 @@ def _make_drift_finding(
         rmse_sentence = (
             f"Before the alignment the RMSE is {format_metres(alignment_rmse.rmse_before_m)} m. "
         )
-    if loop is not None and (closure_error_m := _find_closure_error_m(loop)) is not None:
+    if (
+        loop is not None
+        and not (loop.is_end_assumed or loop.is_absolute_track)
+        and not isinstance(loop.true_end, Unavailable)
+        and (closure_error_m := loop.closure_error_m) is not None
+    ):
         length_m = loop.path_length_m
         evidence = {**evidence, "closure_error_m": closure_error_m, "path_length_m": length_m}
-        rmse_sentence = (
-            "" if alignment_rmse is None else f"{capitalise_first(str(alignment_rmse))}. "
-        )
+        if alignment_rmse is not None:
+            rmse_sentence = f"{capitalise_first(str(alignment_rmse))}. "
         drift_text = (
             f"loop closure error {format_metres(closure_error_m)} m, "
             f"{format_percent(closure_error_m / length_m, 1)} of a path of {length_m:.0f} m"
         )
-    noise_parameter = "" if analysis.source.origin.aid is None else analysis.source.origin.aid.noise
-    noise_setting_names = " or ".join(filter(None, ("SIGMA_Z", noise_parameter)))
+    aid = analysis.source.origin.aid
     return make_error(
         "source_drift",
         f"{sensor_name} drifts: {drift_text}. {rmse_sentence}The innovations of "
-        f"{' and '.join(filter_labels)} do not show the drift, because the estimates follow "
-        f"{sensor_name}. Do not reduce {noise_setting_names}.",
+        f"{' and '.join(filter_labels)} do not show the drift. Do not reduce SIGMA_Z"
+        f"{f' or {aid.noise}' if aid else ''}.",
         DRIFT_REMEDY if loop is None else f"{DRIFT_REMEDY} {LOOP_REMEDY}",
         evidence,
     )
-
-
-def _find_closure_error_m(loop: Loop) -> float | None:
-    if isinstance(loop.true_end, Unavailable) or loop.is_end_assumed or loop.is_absolute_track:
-        return None
-    return loop.closure_error_m
 
 
 def _compute_alignment_rmse(
     comparison: Comparison, filter_name: FilterName
 ) -> AlignmentRmse | None:
     """Return the horizontal position RMSE before and after alignment (shift and yaw rotation)."""
-    axis_errors_m, true_positions_m = [], []
+    true_positions_m, positions_m = [], []
     for result in select_north_and_east(comparison):
         errors, truth = compute_position_errors(result, filter_name), result.truth
         if isinstance(errors, Unavailable) or isinstance(truth, Unavailable):
             return None
-        axis_errors_m.append(errors["error_m"])
         true_positions_m.append(np.interp(errors.index, truth.index, truth["position_m"]))
-    if len(axis_errors_m) < 2:
+        positions_m.append(true_positions_m[-1] + errors["error_m"].to_numpy())
+    if len(positions_m) < 2:
         return None
-    zero_down_column, is_known = (
-        np.zeros(len(axis_errors_m[0])),
-        np.isfinite(axis_errors_m).all(axis=0),
-    )
-    error_m, true_position_m = (
-        np.column_stack([*columns, zero_down_column])[is_known]
-        for columns in (axis_errors_m, true_positions_m)
+    is_known = np.isfinite(positions_m).all(axis=0)
+    # Columns north, east, down; all heights are zero
+    true_position_m, position_m = (
+        np.pad(np.column_stack(columns), ((0, 0), (0, 1)))[is_known]
+        for columns in (true_positions_m, positions_m)
     )
     try:
-        aligned_position_m = fit_alignment(true_position_m + error_m, true_position_m, "yaw").apply(
-            true_position_m + error_m
-        )
+        aligned_position_m = fit_alignment(position_m, true_position_m, "yaw").apply(position_m)
     except TrajectoryError:  # the track is too short to determine a rotation
         return None
-    rmse_m, aligned_rmse_m = (
-        float(np.linalg.norm(errors)) / len(true_position_m) ** 0.5
-        for errors in (error_m, aligned_position_m - true_position_m)
+    return AlignmentRmse(
+        *(
+            float(np.linalg.norm(estimate_m - true_position_m)) / len(true_position_m) ** 0.5
+            for estimate_m in (position_m, aligned_position_m)
+        )
     )
-    return AlignmentRmse(rmse_m, aligned_rmse_m)
 
 
 def make_possible_drift_finding(analysis: Analysis) -> Finding:
@@ -274,14 +260,14 @@ def make_possible_drift_finding(analysis: Analysis) -> Finding:
     horizontal_tuning = analysis.tuning.get(HORIZONTAL)
     evidence: dict[str, float | str] = {"source": analysis.source.name}
     message = (
-        f"{sensor_name} may drift: its messages contain a heading, like those of odometry. Filters "
-        "follow a drifting source, so innovations do not show the drift."
+        f"{sensor_name} may drift: its messages contain a heading, like those of odometry. "
+        "Filters follow the source, so innovations do not show the drift."
     )
     if isinstance(horizontal_tuning, AxisTuning) and (
         noise_m := horizontal_tuning.sigma_z.value or horizontal_tuning.sigma_z.high
     ):
         bound_text = "at most " if horizontal_tuning.sigma_z.value is None else ""
-        evidence |= {"short_term_noise_m": noise_m}
+        evidence["short_term_noise_m"] = noise_m
         message += f" The position noise (1 σ) is {bound_text}{noise_m:.2g} m, without the drift."
     if loop is not None and (closure_error_m := loop.closure_error_m) is not None:
         evidence |= {"closure_error_m": closure_error_m, "path_length_m": loop.path_length_m}
@@ -291,7 +277,7 @@ def make_possible_drift_finding(analysis: Analysis) -> Finding:
         )
     loop_text = "" if loop is None else "from the loop closure error (px4fuse loop LOG) or "
     action = (
-        f"Measure the drift {loop_text}with ground truth (ATT_POS_MOCAP). If the source is motion "
-        "capture, run again with --source-kind mocap."
+        f"Measure the drift {loop_text}with ground truth (ATT_POS_MOCAP). For motion capture, run "
+        "again with --source-kind mocap."
     )
     return make_note("source_may_drift", message, action, evidence)

@@ -15,8 +15,8 @@ from px4fuse.filter.hypotheses import (
 )
 from px4fuse.filter.signals import Segment, cut_to_segment, find_imu_gaps
 from px4fuse.finding import MIN_SPAN_S
-from px4fuse.findings.missing import DEFAULT_SDLOG_PROFILE, VISION_PROFILE_MASK
 from px4fuse.findings.model import Findings, finding, format_percent, make_error, make_warning
+from px4fuse.findings.recording import DEFAULT_SDLOG_PROFILE, VISION_PROFILE_MASK
 from px4fuse.flight.model import Columns, Ekf2, Flight, sample_rate
 
 # Maximum specific force (m/s²) of real sensors: 35 g, because the largest range is 32 g
@@ -57,18 +57,19 @@ def detect_impossible_acceleration(analysis: Analysis) -> Findings:
     if not isinstance(imu, pd.DataFrame):
         return
     samples = cut_to_segment(imu, analysis.segment)[Columns.SPECIFIC_FORCE]
-    force_m_s2 = np.linalg.norm(samples.to_numpy(), axis=1)
-    time_s = samples.index[force_m_s2 > MAX_PLAUSIBLE_SPECIFIC_FORCE_M_S2].to_numpy()
-    if len(time_s) < MIN_IMPLAUSIBLE_FORCE_SAMPLES:
+    force_m_s2 = np.linalg.norm(samples, axis=1)
+    times_s = samples.index[force_m_s2 > MAX_PLAUSIBLE_SPECIFIC_FORCE_M_S2].tolist()
+    if len(times_s) < MIN_IMPLAUSIBLE_FORCE_SAMPLES:
         return
+    max_force_m_s2, start_s = float(np.nanmax(force_m_s2)), times_s[0]
     yield make_error(
         "imu_values_impossible",
-        f"The accelerometer values are impossible: up to {np.nanmax(force_m_s2):,.0f} m/s², "
-        f"first at {time_s[0]:.1f} s. Sensors of autopilots measure at most 32 g (314 m/s²). The "
-        "simulator has diverged, or the log is damaged. px4fuse estimates nothing from this time.",
-        f"Analyse only the time before these values (--end {max(time_s[0] - 1.0, 0.0):.1f}).",
-        {"max_m_s2": float(np.nanmax(force_m_s2)), "count": len(time_s), "at_s": float(time_s[0])},
-        ((float(time_s[0]), float(time_s[-1])),),
+        f"The accelerometer values are impossible: up to {max_force_m_s2:,.0f} m/s², first at "
+        f"{start_s:.1f} s. Sensors of autopilots measure at most 32 g (314 m/s²). The simulator "
+        "has diverged, or the log is damaged.",
+        f"Analyse only the time before these values (--end {max(start_s - 1.0, 0.0):.1f}).",
+        {"max_m_s2": max_force_m_s2, "count": len(times_s), "at_s": start_s},
+        ((start_s, times_s[-1]),),
     )
 
 
@@ -76,64 +77,50 @@ def detect_accelerometer_bias(analysis: Analysis) -> Findings:
     """Detect an accelerometer bias, estimated from the positions or by EKF2."""
     systematic_errors = analysis.systematic_errors
     ekf2_bias_m_s2 = _find_ekf2_accelerometer_bias(analysis)
+    sensor_text, min_bias_for_error_m_s2 = "accelerometers", MIN_BIAS_FOR_ERROR_M_S2
+    evidence = dict[str, float]()
     if isinstance(systematic_errors, SystematicErrors) and systematic_errors.has_significant_bias():
-        forward_bias, right_bias, bias_m_s2 = (
-            systematic_errors.forward_bias_m_s2,
-            systematic_errors.right_bias_m_s2,
-            systematic_errors.compute_horizontal_bias().value,
-        )
+        horizontal_bias = systematic_errors.compute_horizontal_bias()
+        forward_bias = systematic_errors.forward_bias_m_s2
+        bias_m_s2, evidence = horizontal_bias.value, {"sigma_m_s2": horizontal_bias.sigma}
         message = (
             f"The accelerometer is biased by {forward_bias.value:+.2f} m/s² forward and "
-            f"{right_bias.value:+.2f} m/s² right. The estimate is from the positions (± "
-            f"{1.96 * forward_bias.sigma:.2f} m/s², 95 %). A tilt error of "
-            f"{bias_m_s2 * TILT_DEG_PER_M_S2:.1f}° has the same effect. KF does not estimate "
-            "biases."
+            f"{systematic_errors.right_bias_m_s2.value:+.2f} m/s² right. The estimate is from the "
+            f"positions (± {1.96 * forward_bias.sigma:.2f} m/s², 95 %). A tilt error of "
+            f"{bias_m_s2 * TILT_DEG_PER_M_S2:.1f}° has the same effect."
         )
         if ekf2_bias_m_s2 is not None:
             message += (
                 f" EKF2's estimate of the bias is {ekf2_bias_m_s2[0]:+.2f} m/s² forward and "
                 f"{ekf2_bias_m_s2[1]:+.2f} m/s² right."
             )
-        yield finding(
-            "error" if bias_m_s2 >= MIN_BIAS_FOR_ERROR_M_S2 else "warning",
-            "accelerometer_bias",
-            message,
-            "Calibrate the accelerometers and the level horizon at the temperature of the flight.",
-            {
-                "bias_m_s2": bias_m_s2,
-                "sigma_m_s2": systematic_errors.compute_horizontal_bias().sigma,
-            },
-        )
+        sensor_text = "accelerometers and the level horizon"
     elif ekf2_bias_m_s2 is not None:
         # If the horizontal bias is not significant, test only the vertical bias
-        bias_m_s2 = float(
-            np.linalg.norm(
-                ekf2_bias_m_s2[2:]
-                if isinstance(systematic_errors, SystematicErrors)
-                else ekf2_bias_m_s2
-            )
+        is_horizontal_known = isinstance(systematic_errors, SystematicErrors)
+        bias_m_s2 = float(np.linalg.norm(ekf2_bias_m_s2[2 * is_horizontal_known :]))
+        message = (
+            f"EKF2 estimates an accelerometer bias of {bias_m_s2:.2f} m/s². Its components are "
+            f"{ekf2_bias_m_s2[0]:+.2f} forward, {ekf2_bias_m_s2[1]:+.2f} right and "
+            f"{ekf2_bias_m_s2[2]:+.2f} down."
         )
-        if bias_m_s2 >= MIN_BIAS_M_S2:
-            yield make_warning(
-                "accelerometer_bias",
-                f"EKF2 estimates an accelerometer bias of {bias_m_s2:.2f} m/s². Its components are "
-                f"{ekf2_bias_m_s2[0]:+.2f} forward, {ekf2_bias_m_s2[1]:+.2f} right and "
-                f"{ekf2_bias_m_s2[2]:+.2f} down. KF does not estimate biases.",
-                "Calibrate the accelerometers at the temperature of the flight.",
-                {"bias_m_s2": bias_m_s2},
-            )
-    elif (down := analysis.axes.get("down")) is not None:
-        error_m_s2 = estimate_mean_acceleration_error(down.axis)
-        if error_m_s2 is None or abs(error_m_s2) < MIN_BIAS_M_S2:
-            return
-        yield finding(
-            "error" if abs(error_m_s2) >= MIN_BIAS_FOR_ERROR_M_S2 else "warning",
-            "accelerometer_bias",
+        min_bias_for_error_m_s2 = np.inf  # a bias that EKF2 estimates does not affect EKF2
+    else:
+        down = analysis.axes.get("down")
+        error_m_s2 = (estimate_mean_acceleration_error(down.axis) if down else None) or 0.0
+        bias_m_s2 = abs(error_m_s2)
+        message = (
             f"The accelerometer is biased by {error_m_s2:+.2f} m/s² down, compared with the heights"
             f" of the source. A scale factor of {1.0 - error_m_s2 / constants.g:.3f} has the same "
-            "effect. KF does not estimate biases.",
-            "Calibrate the accelerometers at the temperature of the flight.",
-            {"bias_m_s2": abs(error_m_s2)},
+            "effect."
+        )
+    if bias_m_s2 >= MIN_BIAS_M_S2:
+        yield finding(
+            "error" if bias_m_s2 >= min_bias_for_error_m_s2 else "warning",
+            "accelerometer_bias",
+            f"{message} KF does not estimate biases.",
+            f"Calibrate the {sensor_text} at the temperature of the flight.",
+            {"bias_m_s2": bias_m_s2, **evidence},
         )
 
 
@@ -149,12 +136,12 @@ def _find_ekf2_accelerometer_bias(analysis: Analysis) -> list[float] | None:
 def detect_tumbling(analysis: Analysis) -> Findings:
     """Detect roll or pitch beyond the limits of PX4's failure detector."""
     if spans := analysis.segment.cut(analysis.flight.excessive_tilt_spans_s):
-        end_s = max(spans[0][0] - 1.0, 0.0)
+        start_s = spans[0][0]
         yield make_error(
             "attitude_failure",
             f"Roll or pitch exceeded PX4's failure-detector limits (FD_FAIL_R, FD_FAIL_P) at "
-            f"{spans[0][0]:.1f} s. Later data do not represent normal flight.",
-            f"Analyse only the time before the attitude failure (--end {end_s:.1f}).",
+            f"{start_s:.1f} s. Later data do not represent normal flight.",
+            f"Analyse only the time before (--end {max(start_s - 1.0, 0.0):.1f}).",
             {"total_s": sum(end - start for start, end in spans)},
             spans,
         )
@@ -169,38 +156,36 @@ def detect_clipping(analysis: Analysis) -> Findings:
     time_s = imu_samples.index[imu_samples["clipped"] > 0.0].to_numpy()
     clipped_duration_s = len(time_s) / sample_rate(imu)
     if clipped_duration_s > MAX_CLIPPING_DURATION_S:
-        clipping_times_by_burst_s = np.split(
+        bursts_s = np.split(
             time_s, np.flatnonzero(np.diff(time_s) > MIN_TIME_BETWEEN_CLIPPINGS_S) + 1
         )
         yield make_warning(
             "accelerometer_clipping",
             f"The accelerometer was clipped for {clipped_duration_s:.2f} s ({len(time_s)} "
-            "samples). The log lacks motion beyond the sensor range. Height and vertical velocity "
-            "are affected first; the error resembles a bias.",
+            "samples). The error resembles a bias and affects height and vertical velocity first.",
             "Check propellers, motors and mounting for vibration or impacts. Analyse a segment "
             "without clipping (--start, --end).",
             {"count": len(time_s), "total_s": clipped_duration_s},
-            tuple((float(times_s[0]), float(times_s[-1])) for times_s in clipping_times_by_burst_s),
+            tuple((float(burst_s[0]), float(burst_s[-1])) for burst_s in bursts_s),
         )
 
 
 def detect_imu_gaps(analysis: Analysis) -> Findings:
-    gap_s, imu = analysis.main.replay.input_gap_s, analysis.flight.imu
-    interval_s = 1.0 / sample_rate(imu) if isinstance(imu, pd.DataFrame) else 0.0
+    gap_s, imu, log = analysis.main.replay.input_gap_s, analysis.flight.imu, analysis.flight.log
+    interval_s, spans = 0.0, tuple[Span, ...]()
+    if isinstance(imu, pd.DataFrame):
+        interval_s, spans = 1.0 / sample_rate(imu), _find_gap_spans(imu, analysis.segment)
     if gap_s > max(MIN_REPORTED_IMU_GAP_S, 2.0 * interval_s):
-        log = analysis.flight.log
-        spans = _find_gap_spans(imu, analysis.segment) if isinstance(imu, pd.DataFrame) else ()
-        # If the IMU has no gap, the attitude has one
-        missing_data = "IMU" if spans else "Attitude"
         action = ""
         if log.format.startswith("MAVLink"):
             action = "Record on a link without message loss. "
         elif log.dropouts:
             action = "Use a faster SD card. "
+        # If the IMU has no gap, the attitude has one
         yield make_warning(
             "imu_gap",
-            f"{missing_data} samples are missing for {gap_s:.2f} s. In this gap KF increases "
-            "SIGMA_A to the standard deviation of the measured acceleration.",
+            f"{'IMU' if spans else 'Attitude'} samples are missing for {gap_s:.2f} s. In this gap "
+            "KF increases SIGMA_A to the standard deviation of the measured acceleration.",
             f"{action}Analyse a segment without the gap (--start, --end).",
             {"total_s": gap_s},
             spans,
@@ -217,18 +202,15 @@ def detect_missing_imu_samples(analysis: Analysis) -> Findings:
     if lost_fraction <= MAX_MISSING_IMU_FRACTION:
         return
     sdlog_profile = int(log.parameters.get("SDLOG_PROFILE", DEFAULT_SDLOG_PROFILE))
-    action = "Use a faster SD card."
-    if other_topics := sdlog_profile & ~(DEFAULT_SDLOG_PROFILE | VISION_PROFILE_MASK):
-        action = (
-            "Use a faster SD card, or log fewer topics: set SDLOG_PROFILE to "
-            f"{sdlog_profile ^ other_topics}."
-        )
+    needed_profile = sdlog_profile & (DEFAULT_SDLOG_PROFILE | VISION_PROFILE_MASK)
+    action = "Use a faster SD card"
+    if sdlog_profile != needed_profile:
+        action += f", or log fewer topics: set SDLOG_PROFILE to {needed_profile}"
     yield make_warning(
         "imu_samples_missing",
         f"{format_percent(lost_fraction)} of the IMU samples are missing from the log. KF "
-        "increases Q in these gaps. EKF2 cannot be replayed, so the effect of changed parameters "
-        "is unknown.",
-        action,
+        "increases Q in these gaps. EKF2 cannot be replayed with changed parameters.",
+        f"{action}.",
         {"lost_fraction": lost_fraction, "sdlog_profile": sdlog_profile},
     )
 
@@ -237,11 +219,8 @@ def _find_gap_spans(imu: pd.DataFrame, segment: Segment) -> tuple[Span, ...]:
     """Return start and end (s) of each IMU gap in a segment."""
     time_s = imu.index.to_numpy()
     gaps = select_intervals(time_s, find_imu_gaps(time_s))
-    spans_at_segment_ends = (
-        (segment.start_s, float(time_s[0])),
-        (float(time_s[-1]), segment.end_s),
-    )
-    gaps += [(start, end) for start, end in spans_at_segment_ends if end - start > MIN_SPAN_S]
+    for start, end in ((segment.start_s, float(time_s[0])), (float(time_s[-1]), segment.end_s)):
+        gaps += [(start, end)] if end - start > MIN_SPAN_S else []
     gaps_inside = (span for span in gaps if span[1] > segment.start_s and span[0] < segment.end_s)
     return tuple(sorted(gaps_inside))
 
@@ -259,15 +238,15 @@ def detect_low_rates(flight: Flight) -> Findings:
     ):
         topic = flight.streams[name].topics[0] if name in flight.streams else default_topic
         if isinstance(samples, pd.DataFrame) and is_rate_too_low(samples, required_rate_hz):
-            rate_hz, requested_rate_hz = sample_rate(samples), 2.0 * required_rate_hz
-            sdlog_profile = (
-                int(log.parameters.get("SDLOG_PROFILE", DEFAULT_SDLOG_PROFILE))
-                | SDLOG_HIGH_RATE_MASK
+            rate_hz = sample_rate(samples)
+            sdlog_profile = int(log.parameters.get("SDLOG_PROFILE", DEFAULT_SDLOG_PROFILE))
+            action = (
+                f"Set SDLOG_PROFILE to {sdlog_profile | SDLOG_HIGH_RATE_MASK} (bit 4 logs {topic} "
+                "at full rate)."
             )
-            action = f"Set SDLOG_PROFILE to {sdlog_profile} (bit 4 logs {topic} at full rate)."
             if log.format.startswith("MAVLink"):
                 action = (
-                    f"Request {topic} at {requested_rate_hz:g} Hz "
+                    f"Request {topic} at {2.0 * required_rate_hz:g} Hz "
                     "(MAV_CMD_SET_MESSAGE_INTERVAL)"
                     f"{', or give the ULog of the flight' if log.writes_ulog else ''}."
                 )

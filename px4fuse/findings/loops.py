@@ -1,7 +1,6 @@
 """Faults of loop closures: contradictions to odometry, and wrong assumptions about the loop."""
 
 from px4fuse.analysis import Analysis
-from px4fuse.convention.correction import find_convention_faults
 from px4fuse.finding import Finding
 from px4fuse.findings.model import Findings, make_error, make_note, make_warning
 from px4fuse.loop.model import LANDING_CLOSURE_SOURCE, Closure, Loop
@@ -24,7 +23,7 @@ def find_usable_loop(analysis: Analysis) -> Loop | None:
 
     A loop closure then deforms the path, for example if the orientation has a wrong heading.
     """
-    faults = find_convention_faults(analysis.convention, analysis.flight, analysis.source.frame)
+    faults = analysis.convention_faults
     if faults.orientation or faults.has_wrong_axes or faults.has_wrong_unit or faults.is_ambiguous:
         return None
     return analysis.loop if isinstance(analysis.loop, Loop) else None
@@ -38,31 +37,27 @@ def detect_loop_faults(loop: Loop) -> Findings:
 
 def detect_inconsistent_closures(loop: Loop) -> Findings:
     """Detect loop closures that contradict the odometry drift or other loop closures."""
-    robust_weights = [
-        1.0 if closure.weight_gnc is None else closure.weight_gnc for closure in loop.closures
-    ]
-    rejected_count = sum(robust_weight < MIN_GNC_WEIGHT for robust_weight in robust_weights)
-    are_most_closures_rejected = rejected_count > MAX_REJECTED_CLOSURE_FRACTION * len(
-        robust_weights
-    )
+    weights = [1.0 if item.weight_gnc is None else item.weight_gnc for item in loop.closures]
+    rejected_count = sum(weight < MIN_GNC_WEIGHT for weight in weights)
+    are_most_closures_rejected = rejected_count > MAX_REJECTED_CLOSURE_FRACTION * len(weights)
     if are_most_closures_rejected:
         yield make_warning(
             "loop_drift_too_small",
-            f"Robust optimisation rejects {rejected_count} of {len(robust_weights)} loop closures. "
-            "The stated odometry drift is probably too small.",
+            f"Robust optimisation rejects {rejected_count} of {len(weights)} loop closures. The "
+            "stated odometry drift is probably too small.",
             "Increase the stated drift (--drift or --heading-drift).",
-            {"dropped": rejected_count, "closures": len(robust_weights)},
+            {"dropped": rejected_count, "closures": len(weights)},
         )
-    for closure, robust_weight in zip(loop.closures, robust_weights, strict=True):
+    for closure, weight in zip(loop.closures, weights, strict=True):
         if not closure.accepted:
             yield _make_false_closure_finding(closure, loop.is_end_assumed)
-        elif robust_weight < MIN_GNC_WEIGHT and not are_most_closures_rejected:
+        elif weight < MIN_GNC_WEIGHT and not are_most_closures_rejected:
             yield make_warning(
                 "loop_closure_inconsistent",
                 f"{closure!s} contradicts the other loop closures, so robust optimisation rejects "
                 "it. Odometry drift alone could explain the closure error.",
                 "Remove this loop closure, or use the path of the robust optimisation (GNC).",
-                _make_closure_evidence(closure) | {"gnc_weight": robust_weight},
+                _make_closure_evidence(closure) | {"gnc_weight": weight},
             )
 
 
@@ -72,16 +67,16 @@ def detect_wrong_loop_assumptions(loop: Loop) -> Findings:
     if loop.is_absolute_track:
         yield make_warning(
             "loop_on_absolute_positions",
-            "This track consists of absolute positions, which do not drift. The loop closure error "
-            "is only position noise, so a correction makes the path worse.",
+            "This track consists of absolute positions, which do not drift. The closure error is "
+            "position noise, so a correction makes the path worse.",
             "Use odometry for loop closures: send visual-inertial odometry to PX4 as ODOMETRY.",
             evidence,
         )
     if evidence and loop.is_end_assumed:
         yield make_note(
             "loop_landing_assumed",
-            "The landing place is unknown, so px4fuse assumes the take-off place. If the vehicle "
-            "landed elsewhere, the loop closure error contains the distance between both places.",
+            "The landing place is unknown, so px4fuse assumes the take-off place. The loop closure "
+            "error contains the distance between both places.",
             "Measure the landing place and state it: px4fuse loop --landed-at FORWARD,RIGHT (m, "
             "along and to the right of the nose at take-off).",
             evidence,
@@ -101,12 +96,10 @@ def _make_false_closure_finding(closure: Closure, is_end_assumed: bool) -> Findi
         )
     return make_error(
         "false_loop_closure",
-        f"False loop closure: {closure_text}. The closure error of {closure.distance_m:.2f} m is "
-        "larger than the stated odometry drift explains (squared Mahalanobis distance "
-        f"{closure.d2:.0f}, {closure.degrees_of_freedom} degrees of freedom, p {closure.p:.1g}). "
-        "This closure would deform the path.",
-        f"{action} If the odometry has more drift than stated, increase --drift and "
-        "--heading-drift.",
+        f"False loop closure: {closure_text}. The stated odometry drift does not explain the "
+        f"closure error of {closure.distance_m:.2f} m (squared Mahalanobis distance "
+        f"{closure.d2:.0f}, {closure.degrees_of_freedom} degrees of freedom, p {closure.p:.1g}).",
+        f"{action} If the odometry drifts more than stated, increase --drift and --heading-drift.",
         _make_closure_evidence(closure),
     )
 

@@ -52,6 +52,15 @@ FINDING_GROUPS = ("position source", "time", "IMU", "tuning", "EKF2", "loops", "
 FINDING_TITLES: Mapping[str, str] = {name: entry.title for name, entry in FINDING_CATALOGUE.items()}
 
 
+def finding_title(finding_id: str) -> str:
+    """Return the title of a finding. If its id is unknown, return the id with blanks.
+
+    >>> finding_title("source_gap"), finding_title("of_a_later_version")
+    ('Gap in the position source', 'of a later version')
+    """
+    return FINDING_TITLES.get(finding_id, finding_id.replace("_", " "))
+
+
 class FindingExample(Record):
     """Example of a finding, and its rates on simulated flights (tests/studies/rates.csv).
 
@@ -163,14 +172,14 @@ def find_spans_with_value(
     value: float, step_function: pd.Series, segment: Segment
 ) -> tuple[Span, ...]:
     """Return the time spans (s) in a segment in which a step function equals ``value``."""
-    step_times_s = np.clip(
+    edges_s = np.clip(
         np.append(step_function.index.to_numpy(), np.inf), segment.start_s, segment.end_s
     )
-    step_times_s[0] = segment.start_s
-    is_inside = np.diff(step_times_s) > 0.0
-    has_value = np.concatenate([[False], step_function.to_numpy()[is_inside] == value, [False]])
-    step_times_s = np.append(step_times_s[:-1][is_inside], segment.end_s)
-    change_times_s = step_times_s[np.flatnonzero(np.diff(has_value.astype(np.int8)))].tolist()
+    edges_s[0] = segment.start_s
+    is_inside = np.diff(edges_s) > 0.0
+    has_value = np.pad(step_function.to_numpy()[is_inside] == value, 1)
+    edges_s = np.append(edges_s[:-1][is_inside], segment.end_s)
+    change_times_s = edges_s[has_value[1:] != has_value[:-1]].tolist()
     return tuple(zip(change_times_s[::2], change_times_s[1::2], strict=True))
 
 

@@ -66,13 +66,6 @@ UNKNOWN_NOISE_ACTION = "The noise could not be estimated; px4fuse tune LOG state
 NO_IMPROVEMENT_ACTION = (
     "Change nothing: a re-run with the estimated noise improves neither KF's position nor its σ."
 )
-# One value of the joint estimate alone can make a consistent KF inconsistent
-UNTESTED_ESTIMATE_ACTION = (
-    "Do not change this setting alone: it is estimated together with {other}, and no re-run "
-    "confirmed the estimate."
-)
-
-
 AXIS_GROUPS = {"horizontal": ("north", "east", "aisle"), "vertical": ("down",)}
 KEEP_NOISE_BECAUSE_OF_DRIFT_ACTION = (
     "Do not reduce noise settings: innovations do not show the drift of the source."
@@ -100,8 +93,6 @@ EFFECT_AND_REASON_BY_WRONG_SETTING = {
     ),
 }
 
-AxisWithSummary = tuple[AxisComparison, FilterSummary]
-
 
 class SettingDeviation(NamedTuple):
     """Deviation of a noise setting from its estimate, or from the upper bound of the estimate.
@@ -125,36 +116,31 @@ def detect_wrong_settings(analysis: Analysis) -> Findings:
     axis_tuning = find_first_tuning(analysis.tuning, HORIZONTAL, "aisle", "down")
     if axis_tuning is None:
         return
-    settings = {SIGMA_Z: analysis.settings.sigma_z_m, SIGMA_A: analysis.settings.sigma_a_m_s2}
     noise_estimates = {SIGMA_Z: axis_tuning.sigma_z, SIGMA_A: axis_tuning.sigma_a_two_state}
     if has_little_motion(analysis):  # without motion SIGMA_A cannot be estimated
         del noise_estimates[SIGMA_A]
-    deviation_by_setting = {
-        name: deviation
-        for name, noise in noise_estimates.items()
-        if (deviation := find_setting_deviation(name, settings[name], noise))
-    }
-    # Innovations do not show drift, so a larger setting may be correct
     may_drift = analysis.source.origin.may_drift
-    if (
+    # Innovations do not show drift, so a larger setting may be correct
+    may_be_larger = (
         may_drift
         or analysis.source.origin.is_gnss
         or any(filter_name == "kf" for filter_name, *_ in find_hidden_errors(analysis))
-    ):
-        deviation_by_setting = {
-            name: deviation
-            for name, deviation in deviation_by_setting.items()
-            if settings[name] < deviation.estimate
-            and not (may_drift and deviation.severity == "note")
-        }
-    cause = None
-    findings = [
-        _make_setting_finding(analysis, axis_tuning, name, deviation)
-        for name, deviation in sorted(
-            deviation_by_setting.items(), key=lambda item: -item[1].factor
+    )
+    findings = []
+    for name, noise in noise_estimates.items():
+        setting = getattr(analysis.settings, name)
+        deviation = find_setting_deviation(name, setting, noise)
+        if deviation is None or (
+            may_be_larger
+            and (setting >= deviation.estimate or (may_drift and deviation.severity == "note"))
+        ):
+            continue
+        setting_finding = _make_setting_finding(analysis, axis_tuning, name, deviation)
+        findings.append(
+            (SEVERITIES.index(setting_finding.severity), -deviation.factor, setting_finding)
         )
-    ]
-    for setting_finding in sorted(findings, key=lambda item: SEVERITIES.index(item.severity)):
+    cause = None
+    for *_, setting_finding in sorted(findings, key=lambda item: item[:2]):
         yield structs.replace(setting_finding, caused_by=cause)
         cause = cause or setting_finding.id
 
@@ -206,8 +192,12 @@ def format_setting_action(analysis: Analysis, name: str) -> str:
         return NO_IMPROVEMENT_ACTION
     if getattr(analysis.request, name, None) is not None:
         return f"To test the default value, run again without {COMPARISON_OPTIONS[name]}."
-    other_name = SIGMA_A if name == SIGMA_Z else SIGMA_Z
-    return UNTESTED_ESTIMATE_ACTION.format(other=SETTING_RANGES[other_name].label)
+    # One value of the joint estimate alone can make a consistent KF inconsistent
+    other_label = "SIGMA_A" if name == SIGMA_Z else "SIGMA_Z"
+    return (
+        f"Do not change this setting alone: it is estimated together with {other_label}, and no "
+        "re-run confirmed the estimate."
+    )
 
 
 def find_setting_deviation(
@@ -216,11 +206,9 @@ def find_setting_deviation(
     """Return the deviation of a noise setting from its estimate, if it is significant."""
     if not (estimate := noise_estimate.value or noise_estimate.high):
         return None
-    low, high = (
-        (0.0, estimate)
-        if noise_estimate.value is None
-        else (noise_estimate.low or 0.0, noise_estimate.high or np.inf)
-    )
+    low, high = 0.0, estimate
+    if noise_estimate.value is not None:
+        low, high = noise_estimate.low or 0.0, noise_estimate.high or np.inf
     low, high = (estimate * (end / estimate) ** INTERVAL_WIDENING_FACTOR for end in (low, high))
     factor = max(setting / estimate, estimate / setting)
     if low <= setting <= high or factor < MIN_SETTING_TO_ESTIMATE_FACTOR:
@@ -242,27 +230,24 @@ def detect_process_noise_near_zero(analysis: Analysis) -> Findings:
             or summary.lag1_autocorrelation < MIN_LAG1_AUTOCORRELATION
         ):
             continue
-        steady_position_gain = float(updates["gain_position"].iloc[len(updates) // 2 :].median())
-        time_constant_s = 1.0 / (sample_rate(updates) * steady_position_gain)
+        gain = float(updates["gain_position"].iloc[len(updates) // 2 :].median())
+        time_constant_s = 1.0 / (sample_rate(updates) * gain)
         if time_constant_s < MIN_KF_TIME_CONSTANT_S:
             continue
         sigma_a_m_s2 = analysis.settings.sigma_a_m_s2
         axis_tuning = find_axis_tuning(analysis.tuning, result.axis.name)
         title, estimate_text = f"Process noise SIGMA_A is almost zero ({sigma_a_m_s2:g} m/s²)", ""
         action = "Increase SIGMA_A (--sigma-a)."
-        if axis_tuning is not None and (estimated_sigma_a := axis_tuning.sigma_a_two_state.value):
-            title = f"SIGMA_A is {format_factor(estimated_sigma_a / sigma_a_m_s2)} times too small"
-            estimate_text = (
-                f"{format_estimate(SIGMA_A, sigma_a_m_s2, axis_tuning.sigma_a_two_state)}. "
-            )
+        if axis_tuning is not None and (estimate := axis_tuning.sigma_a_two_state).value:
+            title = f"SIGMA_A is {format_factor(estimate.value / sigma_a_m_s2)} times too small"
+            estimate_text = f"{format_estimate(SIGMA_A, sigma_a_m_s2, estimate)}. "
             action = format_setting_action(analysis, SIGMA_A)
         yield make_error(
             "process_noise_near_zero",
             f"{title}: KF ignores new positions. {estimate_text}KF's position gain decreases to "
-            f"{steady_position_gain:.2g}, so KF needs {time_constant_s:.0f} s to follow a position "
-            "change.",
+            f"{gain:.2g}, so KF needs {time_constant_s:.0f} s to follow a change.",
             action,
-            {"gain": steady_position_gain, "response_s": time_constant_s, "axis": result.axis.name},
+            {"gain": gain, "response_s": time_constant_s, "axis": result.axis.name},
         )
         return
 
@@ -272,11 +257,11 @@ def detect_inconsistent_variances(analysis: Analysis) -> Findings:
         for is_underconfident in (True, False):
             first_finding_id = None
             for axis_group, axes in AXIS_GROUPS.items():
-                results = [analysis.axes[name] for name in axes if name in analysis.axes]
                 inconsistent_axes = [
-                    (result, summary)
-                    for result in results
-                    if is_inconsistent(summary := result.filters[filter_name])
+                    (analysis.axes[name], summary)
+                    for name in axes
+                    if name in analysis.axes
+                    and is_inconsistent(summary := analysis.axes[name].filters[filter_name])
                     and (summary.sigma_ratio < 1.0) == is_underconfident
                 ]
                 if inconsistent_axes:
@@ -291,7 +276,7 @@ def _make_wrong_sigma_finding(
     analysis: Analysis,
     filter_name: FilterName,
     axis_group: str,
-    inconsistent_axes: list[AxisWithSummary],
+    inconsistent_axes: list[tuple[AxisComparison, FilterSummary]],
 ) -> Finding:
     worst_axis, summary = max(
         inconsistent_axes,
@@ -401,14 +386,13 @@ def _has_default_noises(
         return all(
             getattr(settings, name) == getattr(defaults, name) for name in (SIGMA_Z, SIGMA_A)
         )
-    noise_parameter = find_aid(analysis, result.axis.name).noise
-    log = analysis.flight.log
-    default_noise = log.find_default_value(noise_parameter)
-    is_parameter_default = log.parameters.get(noise_parameter, default_noise) == default_noise
+    parameter, log = find_aid(analysis, result.axis.name).noise, analysis.flight.log
+    default_noise = log.find_default_value(parameter)
+    ratio = find_ekf2_noise_m(result) / default_noise
     # `not >` instead of `<=`: unknown R (NaN) counts as the default
-    return is_parameter_default and not abs(
-        np.log(find_ekf2_noise_m(result) / default_noise)
-    ) > np.log(MAX_RATIO_OF_EQUAL_NOISES)
+    return log.parameters.get(parameter, default_noise) == default_noise and not (
+        max(ratio, 1.0 / ratio) > MAX_RATIO_OF_EQUAL_NOISES
+    )
 
 
 def _find_action_for_wrong_sigma(
@@ -440,29 +424,22 @@ def _find_sigma_action_without_replay(
         return UNEXPLAINED_SIGMA_ACTION
     noise_m, used_noise_m = max(estimated_noise_m, EKF2_MIN_NOISE_M), find_ekf2_noise_m(result)
     ratio = used_noise_m / noise_m if ekf2_summary.sigma_ratio < 1.0 else noise_m / used_noise_m
-    if ratio > MAX_RATIO_OF_EQUAL_NOISES:
-        parameters = analysis.flight.log.parameters
-        uses_reported_noise = used_noise_m > MIN_USED_TO_PARAMETER_NOISE_RATIO * parameters.get(
-            aid.noise, np.inf
-        )
-        changes = {
-            name: value
-            for name, value in make_noise_change(
-                aid, parameters, used_noise_m * uses_reported_noise, noise_m
-            ).items()
-            if value != parameters.get(name)
-        }
-        if not changes:
-            return UNEXPLAINED_SIGMA_ACTION
+    if not ratio > MAX_RATIO_OF_EQUAL_NOISES:  # the comparison is False for NaN
         return (
-            f"Set {format_settings(changes)}. EKF2 used a measurement noise of {used_noise_m:.2g} "
-            "m. "
-            "Fly again to test the change, because EKF2 cannot be replayed."
+            f"EKF2's measurement noise ({used_noise_m:.2g} m) equals the estimated position noise. "
+            "Check the time offset (px4fuse sync LOG) and the IMU (gaps, vibration)."
         )
+    parameters, reported_noise_m = analysis.flight.log.parameters, 0.0
+    parameter_noise_m = parameters.get(aid.noise, np.inf)
+    if used_noise_m > MIN_USED_TO_PARAMETER_NOISE_RATIO * parameter_noise_m:
+        reported_noise_m = used_noise_m
+    noise_change = make_noise_change(aid, parameters, reported_noise_m, noise_m)
+    changes = {name: value for name, value in noise_change.items() if value != parameters.get(name)}
+    if not changes:
+        return UNEXPLAINED_SIGMA_ACTION
     return (
-        f"EKF2's measurement noise ({used_noise_m:.2g} m) equals the estimated position noise. "
-        "The wrong σ has another cause: check the time offset (px4fuse sync LOG) and the IMU "
-        "(gaps, vibration)."
+        f"Set {format_settings(changes)}. EKF2 used a measurement noise of {used_noise_m:.2g} m. "
+        "Fly again to test the change, because EKF2 cannot be replayed."
     )
 
 

@@ -1,4 +1,4 @@
-"""Faults of the log: lost data, restarts, clock jumps, and estimators other than EKF2."""
+"""Faults of the log: lost or missing data, restarts, clock jumps, other estimators than EKF2."""
 
 import pandas as pd
 
@@ -6,8 +6,12 @@ from px4fuse.analysis import Analysis
 from px4fuse.comparison.model import PreparedComparison
 from px4fuse.core.text import capitalise_first, format_number
 from px4fuse.ekf2.inputs import SIMULATED_EKF2_NOTE
-from px4fuse.findings.model import Findings, finding, format_count, make_note, make_warning
-from px4fuse.flight.model import Ekf2, Flight
+from px4fuse.findings.model import Findings, format_count, make_note, make_warning
+from px4fuse.flight.model import AS_RECEIVED_ORIGIN, Ekf2, Flight, Unavailable, positions_phrase
+
+VISION_TOPIC = "vehicle_visual_odometry"
+# SDLOG_PROFILE: default value, and mask of bit 7 for external vision (logged_topics.cpp)
+DEFAULT_SDLOG_PROFILE, VISION_PROFILE_MASK = 1, 128
 
 
 def detect(analysis: Analysis) -> Findings:
@@ -15,28 +19,27 @@ def detect(analysis: Analysis) -> Findings:
     yield from detect_lost_data(analysis.flight)
     yield from detect_decreasing_clocks(analysis.flight)
     yield from detect_other_estimators(analysis)
+    yield from detect_unavailable_data(analysis)
+    yield from detect_source_not_logged(analysis)
 
 
 def detect_dropouts(analysis: PreparedComparison) -> Findings:
     """Detect dropouts of PX4's logger in the analysed time."""
-    segment = analysis.segment
-    dropouts = [
-        dropout
+    spans = tuple(
+        (dropout.start_s, end_s)
         for dropout in analysis.flight.log.dropouts
-        if dropout.start_s <= segment.end_s
-        and dropout.start_s + dropout.duration_s >= segment.start_s
-    ]
-    if dropouts:
-        total_s = sum(dropout.duration_s for dropout in dropouts)
-        longest_dropout_s = max(dropout.duration_s for dropout in dropouts)
+        if dropout.start_s <= analysis.segment.end_s
+        and (end_s := dropout.start_s + dropout.duration_s) >= analysis.segment.start_s
+    )
+    if spans:
+        durations_s = [end - start for start, end in spans]
         yield make_warning(
             "logger_dropouts",
-            f"The logger lost {total_s:.2f} s of data. Number of dropouts: {len(dropouts)}, "
-            "longest "
-            f"dropout: {longest_dropout_s:.2f} s.",
+            f"The logger lost {sum(durations_s):.2f} s of data. Number of dropouts: {len(spans)}, "
+            f"longest dropout: {max(durations_s):.2f} s.",
             "Use a faster SD card, or log fewer topics (SDLOG_PROFILE).",
-            {"count": len(dropouts), "total_s": total_s},
-            tuple((dropout.start_s, dropout.start_s + dropout.duration_s) for dropout in dropouts),
+            {"count": len(spans), "total_s": sum(durations_s)},
+            spans,
         )
 
 
@@ -44,44 +47,36 @@ def detect_lost_data(flight: Flight) -> Findings:
     """Detect unreadable bytes, a log that ends in flight, and wrong timestamps."""
     log = flight.log
     if log.damage or log.ends_in_flight:
-        fault = f"The log ends in flight after {log.duration_s:.1f} s. The landing is missing."
+        make_finding = make_note
+        message = f"The log ends in flight after {log.duration_s:.1f} s. The landing is missing."
+        action = "Stop logging only after landing. If the file is incomplete, copy the file again."
         if log.damage:
-            lost_fraction = 1.0 - log.bytes_read / log.bytes if log.bytes else 0.0
-            damage_text = "the log is damaged"
-            if lost_fraction:
-                lost_percent_text = format_number(100.0 * lost_fraction, 2)
-                damage_text = (
-                    f"the log is damaged: {lost_percent_text} % of its bytes cannot be read"
-                )
-            fault = " ".join(f"{_capitalise_note(note)}." for note in (damage_text, *log.damage))
-        action = "Copy the log again. If this does not help, replace the SD card."
-        if not log.damage:
-            action = (
-                "Stop logging only after landing. If the file is incomplete, copy the file again."
-            )
-        elif log.format.startswith("MAVLink"):
-            action = "Record on a link that loses no bytes: by cable, or on the companion computer."
-        yield finding(
-            "warning" if log.damage else "note",
+            make_finding = make_warning
+            lost_bytes, damage_text = log.bytes - log.bytes_read, "the log is damaged"
+            if log.bytes and lost_bytes:
+                lost_percent_text = format_number(100.0 * lost_bytes / log.bytes, 2)
+                damage_text += f": {lost_percent_text} % of its bytes cannot be read"
+            message = " ".join(f"{_capitalise_note(note)}." for note in (damage_text, *log.damage))
+            action = "Copy the log again. If this does not help, replace the SD card."
+            if log.format.startswith("MAVLink"):
+                action = "Record on a link without loss: by cable, or on the companion computer."
+        yield make_finding(
             "log_damaged",
-            fault,
+            message,
             action,
             {"lost_bytes": log.bytes - log.bytes_read, "ends_in_flight": float(log.ends_in_flight)},
         )
     for topic, count in list(log.dropped.items())[:1]:
-        other_topic_count = len(log.dropped) - 1
-        other_topics_sentence = (
-            f" Other topics with wrong timestamps: {other_topic_count}."
-            if other_topic_count
-            else ""
-        )
+        other_topics_sentence = ""
+        if len(log.dropped) > 1:
+            other_topics_sentence = f" Other topics with wrong timestamps: {len(log.dropped) - 1}."
         yield make_note(
             "samples_out_of_order",
             f"{count} samples of {topic} have wrong timestamps: zero, or earlier than the sample "
             f"before. px4fuse ignores these samples.{other_topics_sentence} Possible cause: a "
             "clock was set back, or messages arrived in another order.",
             "Synchronise the clock of the sending computer before take-off (TIMESYNC).",
-            {"notes": other_topic_count + 1},
+            {"notes": len(log.dropped)},
         )
 
 
@@ -92,7 +87,7 @@ def detect_decreasing_clocks(flight: Flight) -> Findings:
         yield make_warning(
             "autopilot_restarted",
             f"The autopilot's boot clock restarted {format_count(log.restarts)}. px4fuse reads "
-            "only the longest recording between restarts.",
+            "only the longest recording.",
             "Record each flight in a separate file.",
             {"count": log.restarts},
         )
@@ -101,8 +96,8 @@ def detect_decreasing_clocks(flight: Flight) -> Findings:
             "receive_time_went_back",
             f"The recorded receive time decreased {format_count(reversals)}. Possible cause: the "
             "clock of the recording computer was set back, or the file consists of several "
-            "recordings. Timestamps in the messages are not affected.",
-            "Switch off time synchronisation of the recording computer while recording.",
+            "recordings. Timestamps in the messages are correct.",
+            "Do not synchronise the clock of the recording computer while recording.",
             {"count": reversals},
         )
 
@@ -122,23 +117,72 @@ def detect_other_estimators(analysis: Analysis) -> Findings:
     if log.autopilot != "PX4":
         yield make_note(
             "not_px4",
-            f"This log is from {log.autopilot}, not PX4. {log.autopilot} does not have the PX4 "
-            "parameters that the report names.",
+            f"This log is from {log.autopilot}, not PX4. {log.autopilot} lacks the PX4 parameters "
+            "of the report.",
             f'In this report, "EKF2" means the estimator of {log.autopilot}.',
             {"autopilot": log.autopilot},
         )
     if log.format.startswith("MAVLink"):
         contents = "states and variances" if isinstance(ekf2.variance, pd.DataFrame) else "states"
+        action = "Give the ULog of this flight as argument LOG."
+        if not log.writes_ulog:
+            action = "The innovations are in the DataFlash log (.BIN), which px4fuse does not read."
         yield make_note(
             "innovations_need_ulog",
             f"A MAVLink recording contains the {contents} of EKF2, but no innovations. The "
             "consistency of EKF2 cannot be tested.",
-            "Give the ULog of this flight as argument LOG."
-            if log.writes_ulog
-            else "The innovations are in the autopilot's DataFlash log (.BIN), which px4fuse does "
-            "not read.",
+            action,
         )
 
 
 def _capitalise_note(note: str) -> str:
     return note if "." in note.split(" ", 1)[0] else capitalise_first(note)
+
+
+def detect_unavailable_data(analysis: Analysis) -> Findings:
+    """Detect a missing EKF2 state, a missing acceleration, and too few innovations."""
+    ekf2, acceleration = analysis.flight.ekf2, analysis.input_axes[0].acceleration
+    if isinstance(ekf2, Unavailable):
+        reason = capitalise_first(ekf2.reason)
+        message = f"The log contains no EKF2 state. {reason}. The report contains KF only."
+        yield make_warning("ekf2_not_logged", message, ekf2.remedy)
+    if isinstance(acceleration, Unavailable):
+        yield make_warning(
+            "acceleration_not_logged",
+            "The acceleration is missing, so KF assumes constant velocity. Missing "
+            f"{acceleration.what}: {acceleration.reason}.",
+            acceleration.remedy,
+        )
+    for result in analysis.axes.values():
+        kf_summary = result.filters["kf"]
+        if isinstance(kf_summary, Unavailable):
+            yield make_warning(
+                "too_few_innovations",
+                f"The consistency of KF is not tested: {kf_summary.reason}.",
+                kf_summary.remedy,
+                {"count": len(result.replay.updates)},
+            )
+            return
+
+
+def detect_source_not_logged(analysis: PreparedComparison) -> Findings:
+    """Detect that the log lacks the positions which PX4 received."""
+    source, parameters = analysis.source, analysis.flight.log.parameters
+    rank_as_received = AS_RECEIVED_ORIGIN.find_preference_rank()
+    if source.origin.has_all_samples or any(
+        track.origin.find_preference_rank() == rank_as_received
+        for track in analysis.flight.positions
+    ):
+        return
+    rate_hz = source.compute_rate_hz()
+    sdlog_profile = int(parameters.get("SDLOG_PROFILE", DEFAULT_SDLOG_PROFILE))
+    reason_by_source = {item.source: item.reason for item in reversed(analysis.missing)}
+    reason = reason_by_source.get(VISION_TOPIC, f"{VISION_TOPIC} is not in this log")
+    yield make_warning(
+        "source_not_logged",
+        f"The log lacks the {positions_phrase(source)} as PX4 received them. Reason: {reason}. "
+        f"px4fuse uses {source.name} ({source.description}) at {rate_hz:.1f} Hz instead.",
+        f"Set SDLOG_PROFILE to {sdlog_profile | VISION_PROFILE_MASK} (bit 7: vision topics) and "
+        "fly again.",
+        {"rate_hz": rate_hz, "sdlog_profile": sdlog_profile},
+    )

@@ -23,11 +23,11 @@ CHECK_RECEIVER_ACTION = f"Check the delay of the GNSS receiver ({GNSS_POS.delay}
 
 
 def detect(analysis: Analysis) -> Findings:
-    time_offset, is_reconstructed = analysis.clock, analysis.source.origin.reconstructed
+    time_offset = analysis.clock
     if (
         isinstance(time_offset, ClockOffset)
         and time_offset.is_determinable
-        and not is_reconstructed
+        and not analysis.source.origin.reconstructed
     ):
         yield from detect_time_offset(analysis, time_offset)
         yield from detect_wrong_delay(analysis, time_offset)
@@ -37,26 +37,25 @@ def detect(analysis: Analysis) -> Findings:
 def detect_time_offset(analysis: Analysis, time_offset: ClockOffset) -> Findings:
     if find_low_pass(analysis) is not None:  # a low-pass filter delays positions, not timestamps
         return
-    interval_low_s, interval_high_s = time_offset.interval_s
+    low_s, high_s = time_offset.interval_s
     evidence = {
         "offset_s": time_offset.offset_s,
-        "interval_low_s": interval_low_s,
-        "interval_high_s": interval_high_s,
+        "interval_low_s": low_s,
+        "interval_high_s": high_s,
     }
     if time_offset.has_changed() and time_offset.change_p_value is not None:
-        start_offset_s, end_offset_s = time_offset.parts[0].offset_s, time_offset.parts[-1].offset_s
         yield make_error(
             "source_time_offset_changes",
-            f"The time offset of the positions changes in flight from {start_offset_s:+.2f} s to "
-            f"{end_offset_s:+.2f} s (significance test: p {time_offset.change_p_value:.1g}). No "
-            "single --clock-offset corrects the whole flight. Possible cause: PX4 uses arrival "
-            "times until 500 TIMESYNC answers have synchronised the clocks.",
+            "The time offset of the positions changes in flight from "
+            f"{time_offset.parts[0].offset_s:+.2f} s to {time_offset.parts[-1].offset_s:+.2f} s "
+            f"(significance test: p {time_offset.change_p_value:.1g}). No single --clock-offset "
+            "corrects the whole flight. Possible cause: PX4 uses arrival times until 500 TIMESYNC "
+            "answers have synchronised the clocks.",
             "Let the clocks synchronise for one minute before take-off. Analyse only the time "
-            "before or after the change of the offset (--start, --end).",
+            "before or after the change (--start, --end).",
             {**evidence, "change_p_value": time_offset.change_p_value},
         )
         return
-    abs_offset_s = abs(time_offset.remaining_s)
     # One offset cannot correct timestamps that are partly arrival times
     if (
         not time_offset.is_significant(time_offset.remaining_s)
@@ -65,37 +64,29 @@ def detect_time_offset(analysis: Analysis, time_offset: ClockOffset) -> Findings
         > MAX_RMSE_RATIO_AFTER_CORRECTION
     ):
         return
-    interval_s, has_late_timestamps = (
-        (interval_low_s - time_offset.applied_s, interval_high_s - time_offset.applied_s),
-        time_offset.remaining_s < 0,
+    offset_s, low_s, high_s = (
+        value - time_offset.applied_s for value in (time_offset.offset_s, low_s, high_s)
     )
-    abs_offset_low_s, abs_offset_high_s = (
-        (-interval_s[1], -interval_s[0]) if has_late_timestamps else interval_s
-    )
+    late_or_early = "early"
+    if offset_s < 0.0:
+        offset_s, low_s, high_s, late_or_early = -offset_s, -high_s, -low_s, "late"
     yield finding(
-        "error" if abs_offset_s > MIN_OFFSET_FOR_ERROR_S else "warning",
+        "error" if offset_s > MIN_OFFSET_FOR_ERROR_S else "warning",
         "source_time_offset",
-        f"Position timestamps are {abs_offset_s:.2f} s {'late' if has_late_timestamps else 'early'}"
-        f". The estimate from IMU and positions is {abs_offset_s:.3f} s (95 % "
-        f"{abs_offset_low_s:.3f} "
-        f"to {abs_offset_high_s:.3f} s). At 1 m/s this is a position error of {abs_offset_s:.2f} m "
-        "in "
-        "KF and EKF2. Innovations hardly show this "
-        f"error.{_format_assumed_delay(analysis, time_offset)}",
+        f"Position timestamps are {offset_s:.2f} s {late_or_early}. The estimate from IMU and "
+        f"positions is {offset_s:.3f} s (95 % {low_s:.3f} to {high_s:.3f} s). At 1 m/s this is a "
+        f"position error of {offset_s:.2f} m, which innovations hardly "
+        f"show.{_format_assumed_delay(analysis, time_offset)}",
         _find_offset_remedy(analysis, time_offset),
         evidence,
     )
 
 
 def _find_trial(analysis: Analysis, filter_name: FilterName, kind: str) -> Trial | None:
-    return next(
-        (
-            trial
-            for trial in analysis.select_main_trials()
-            if (trial.filter, trial.kinds) == (filter_name, (kind,))
-        ),
-        None,
-    )
+    for trial in analysis.select_main_trials():
+        if (trial.filter, trial.kinds) == (filter_name, (kind,)):
+            return trial
+    return None
 
 
 def _compute_rmse_ratio(trial: Trial | None) -> float:
@@ -106,21 +97,19 @@ def _compute_rmse_ratio(trial: Trial | None) -> float:
 
 
 def _find_receiver_delay_parameter(analysis: Analysis) -> str | None:
-    parameters = analysis.flight.log.parameters
-    names = (name for name in (*RECEIVER_DELAY_PARAMETERS, GNSS_POS.delay) if name in parameters)
-    return next(names, None) if analysis.source.origin.is_fused_as_gnss else None
+    for name in (*RECEIVER_DELAY_PARAMETERS, GNSS_POS.delay):
+        if analysis.source.origin.is_fused_as_gnss and name in analysis.flight.log.parameters:
+            return name
+    return None
 
 
 def _format_assumed_delay(analysis: Analysis, time_offset: ClockOffset) -> str:
     delay_parameter = _find_receiver_delay_parameter(analysis)
     if delay_parameter is None:
         return ""
-    assumed_delay_ms = analysis.flight.log.parameters[delay_parameter]
-    estimated_delay_ms = max(assumed_delay_ms - 1e3 * time_offset.remaining_s, 0.0)
-    return (
-        f" {delay_parameter} is {assumed_delay_ms:g} ms; the estimate is "
-        f"{estimated_delay_ms:.0f} ms."
-    )
+    delay_ms = analysis.flight.log.parameters[delay_parameter]
+    estimated_delay_ms = max(delay_ms - 1e3 * time_offset.remaining_s, 0.0)
+    return f" {delay_parameter} is {delay_ms:g} ms; the estimate is {estimated_delay_ms:.0f} ms."
 
 
 def _find_offset_remedy(analysis: Analysis, time_offset: ClockOffset) -> str:
@@ -130,11 +119,10 @@ def _find_offset_remedy(analysis: Analysis, time_offset: ClockOffset) -> str:
         total_offset_s = compute_offset_for_option_s(analysis, time_offset)
         return f"Run again with --clock-offset {total_offset_s:.3f}."
     position_age_ms = (remedy.find_logged_delay_ms(analysis) or 0.0) - 1e3 * time_offset.remaining_s
-    delay_max_change = remedy.find_delay_max_change(analysis, position_age_ms)
-    delay_action = (
-        f", and set {remedy.format_settings(delay_max_change)}" if delay_max_change else ""
-    )
-    return f"{format_sender_action(analysis.source, time_offset.remaining_s)}{delay_action}."
+    action = format_sender_action(analysis.source, time_offset.remaining_s)
+    if delay_max_change := remedy.find_delay_max_change(analysis, position_age_ms):
+        action += f", and set {remedy.format_settings(delay_max_change)}"
+    return f"{action}."
 
 
 def compute_offset_for_option_s(comparison: PreparedComparison, time_offset: ClockOffset) -> float:
@@ -147,47 +135,46 @@ def compute_offset_for_option_s(comparison: PreparedComparison, time_offset: Clo
 def detect_wrong_delay(analysis: Analysis, time_offset: ClockOffset) -> Findings:
     source, delay_ms = analysis.source, remedy.find_logged_delay_ms(analysis)
     is_gnss = source.origin.is_fused_as_gnss
-    if not (source.origin.is_vision or is_gnss) or delay_ms is None:
-        return
-    # detect_time_offset reports a wrong EKF2_GPS_DELAY, unless --clock-offset corrects it for KF
-    if is_gnss and time_offset.is_significant(time_offset.remaining_s):
+    if (
+        not (source.origin.is_vision or is_gnss)
+        or delay_ms is None
+        # detect_time_offset reports a wrong EKF2_GPS_DELAY, unless --clock-offset corrects it
+        or (is_gnss and time_offset.is_significant(time_offset.remaining_s))
+    ):
         return
     estimated_delay_ms = remedy.estimate_differing_delay_ms(analysis, time_offset, delay_ms)
     if estimated_delay_ms is None:
         return
-    delay_low_ms, delay_high_ms = (
+    low_ms, high_ms = (
         1e3 * (source.assumed_delay_s - end_s) for end_s in reversed(time_offset.interval_s)
     )
-    interval_low_ms, interval_high_ms, abs_delay_ms = (
-        round(delay_low_ms),
-        round(delay_high_ms),
-        round(abs(estimated_delay_ms)),
-    )
-    if delay_low_ms <= 0.0 <= delay_high_ms:
+    delay_text = f"the positions are {estimated_delay_ms:.0f} ms late"
+    if low_ms <= 0.0 <= high_ms:
         delay_text = "the positions have no significant delay"
     elif estimated_delay_ms < 0.0:
-        delay_text, interval_low_ms, interval_high_ms = (
-            f"the timestamps are {abs_delay_ms} ms early",
-            -interval_high_ms,
-            -interval_low_ms,
-        )
-    else:
-        delay_text = f"the positions are {abs_delay_ms} ms late"
+        delay_text = f"the timestamps are {-estimated_delay_ms:.0f} ms early"
+        low_ms, high_ms = -high_ms, -low_ms
     parameter = remedy.find_aid(analysis).delay
-    limit_text = remedy.describe_delay_limit(parameter, estimated_delay_ms, delay_ms)
-    sigma_ms = 1e3 * time_offset.sigma_s
-    correct_action = CHECK_RECEIVER_ACTION if is_gnss else CORRECT_AT_SENDER_ACTION
+    finding_id, action = "ekf2_ev_delay_wrong", CORRECT_AT_SENDER_ACTION
+    evidence = {"ekf2_ev_delay_ms": delay_ms, "asked_ms": estimated_delay_ms}
+    if is_gnss:
+        finding_id, action = "ekf2_gps_delay_wrong", CHECK_RECEIVER_ACTION
+        evidence = {
+            "ekf2_gps_delay_ms": delay_ms,
+            "estimate_ms": estimated_delay_ms,
+            "sigma_ms": 1e3 * time_offset.sigma_s,
+        }
+    limit_sentence = ""
+    if limit_text := remedy.describe_delay_limit(parameter, estimated_delay_ms, delay_ms):
+        limit_sentence = f" The parameter {parameter} cannot {limit_text}."
+    else:
+        action = _find_delay_remedy(analysis, parameter, action)
     yield make_warning(
-        "ekf2_gps_delay_wrong" if is_gnss else "ekf2_ev_delay_wrong",
-        f"{parameter} is {delay_ms:g} ms, but {delay_text}. The 95 % interval is "
-        f"{interval_low_ms} to {interval_high_ms} ms. EKF2 fuses each position at the wrong time, "
-        "so its track leads or "
-        "lags the "
-        f"motion.{f' The parameter {parameter} cannot {limit_text}.' if limit_text else ''}",
-        correct_action if limit_text else _find_delay_remedy(analysis, parameter, correct_action),
-        {"ekf2_gps_delay_ms": delay_ms, "estimate_ms": estimated_delay_ms, "sigma_ms": sigma_ms}
-        if is_gnss
-        else {"ekf2_ev_delay_ms": delay_ms, "asked_ms": estimated_delay_ms},
+        finding_id,
+        f"{parameter} is {delay_ms:g} ms, but {delay_text}. The 95 % interval is {round(low_ms)} "
+        f"to {round(high_ms)} ms. EKF2's track leads or lags the motion.{limit_sentence}",
+        action,
+        evidence,
     )
 
 
@@ -205,8 +192,7 @@ def detect_wrong_gnss_delay(analysis: Analysis) -> Findings:
         "ekf2_gps_delay_wrong",
         f"{GNSS_POS.delay} is {delay_ms:g} ms, but GNSS positions and velocities are "
         f"{estimated_delay_ms:.0f} ms late (± {1.96 * sigma_ms:.0f} ms, 95 %, compared with "
-        "vision). EKF2 fuses each GNSS sample at the wrong time, so its track leads or lags the "
-        "motion.",
+        "vision). EKF2's track leads or lags the motion.",
         f"Set {remedy.format_settings(change)}." if change else CHECK_RECEIVER_ACTION,
         {"ekf2_gps_delay_ms": delay_ms, "estimate_ms": estimated_delay_ms, "sigma_ms": sigma_ms},
     )
@@ -216,11 +202,9 @@ def _find_delay_remedy(analysis: Analysis, parameter: str, action_if_not_confirm
     trial = _find_trial(analysis, "ekf2", "delay")
     if trial is None:
         return f"Check {parameter}."
-    after_to_before_ratio = _compute_rmse_ratio(trial)
-    if math.isnan(after_to_before_ratio) and trial.before.nis_mean and trial.after.nis_mean:
-        after_to_before_ratio = trial.after.nis_mean / trial.before.nis_mean
+    ratio = _compute_rmse_ratio(trial)
+    if math.isnan(ratio) and trial.before.nis_mean and trial.after.nis_mean:
+        ratio = trial.after.nis_mean / trial.before.nis_mean
     return (
-        f"Set {remedy.format_settings(trial.change)}."
-        if after_to_before_ratio < 1.0
-        else action_if_not_confirmed
+        f"Set {remedy.format_settings(trial.change)}." if ratio < 1.0 else action_if_not_confirmed
     )

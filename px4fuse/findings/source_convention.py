@@ -9,11 +9,7 @@ from msgspec.structs import replace
 
 from px4fuse.comparison.model import Comparison
 from px4fuse.convention.axes import METRES_PER_UNIT
-from px4fuse.convention.correction import (
-    MIN_RESIDUAL_ROTATION_DEG,
-    ConventionFaults,
-    find_convention_faults,
-)
+from px4fuse.convention.correction import MIN_RESIDUAL_ROTATION_DEG, ConventionFaults
 from px4fuse.convention.model import Convention, OrientationConvention
 from px4fuse.convention.texts import (
     FRAME_AXES,
@@ -37,7 +33,7 @@ ConventionFaultTexts = tuple[str, str, str, str]
 
 
 def detect(analysis: Comparison) -> Findings:
-    convention, faults = analysis.convention, _find_convention_faults(analysis)
+    convention, faults = analysis.convention, analysis.convention_faults
     if convention is None:
         return
     for name, kind, message, action in (
@@ -59,7 +55,7 @@ def remove_convention_effects(analysis: Comparison, findings: Sequence[Finding])
 
     Findings on EKF2 are kept and marked as effects.
     """
-    faults = _find_convention_faults(analysis)
+    faults = analysis.convention_faults
     cause_findings = [item for item in findings if WRONG_CONVENTION_KEY in item.evidence]
     unusable_findings = [
         item for item in findings if FINDING_CATALOGUE[item.id].report_class == "unusable"
@@ -120,22 +116,19 @@ def _is_effect_of_wrong_convention(item: Finding) -> bool:
     return FINDING_CATALOGUE[item.id].status_if_convention_wrong == "effect"
 
 
-def _find_convention_faults(analysis: Comparison) -> ConventionFaults:
-    return find_convention_faults(analysis.convention, analysis.flight, analysis.source.frame)
-
-
 def _find_position_faults(
     convention: Convention, faults: ConventionFaults, source: PositionTrack
 ) -> Iterator[ConventionFaultTexts]:
-    positions_text, alignment = positions_phrase(source), source.alignment
-    is_position_file = alignment is not None
+    positions_text = positions_phrase(source)
+    is_position_file = source.alignment is not None
     log_odds = 99.0 if convention.log_odds is None else min(convention.log_odds, 99.0)
     evidence_sentence = (
-        "Of all tested axes, units and time offsets, these fit the IMU best (log likelihood ratio "
-        f"to the second best {'above ' if log_odds == 99.0 else ''}{log_odds:.0f} nats)."
+        "This convention fits the IMU best (log likelihood ratio to the second best "
+        f"{'above ' if log_odds == 99.0 else ''}{log_odds:.0f} nats)."
     )
-    stated_frame = alignment.frame.upper() if alignment else "NED"
-    axes, rotation_deg = find_axes_in_file(convention.axes, stated_frame), faults.rotation_deg
+    stated_frame = source.alignment.frame.upper() if source.alignment else "NED"
+    axes = find_axes_in_file(convention.axes, stated_frame)
+    rotation_deg = faults.rotation_deg
     has_hardly_rotated_file = (
         is_position_file and abs(convention.rotation_deg) <= MIN_RESIDUAL_ROTATION_DEG
     )
@@ -153,9 +146,7 @@ def _find_position_faults(
             axes, stated_frame, is_mirrored=convention.is_mirrored, is_file=is_position_file
         )
         if faults.has_wrong_axes and rotation_deg:
-            fault_text += (
-                f". The frame is also rotated by {rotation_deg:+.0f}° clockwise from above"
-            )
+            fault_text += f". The frame is also rotated clockwise by {rotation_deg:+.0f}°"
         if orientation and orientation.frames.startswith("FLU"):
             action += f" {describe_quaternion_conversion(orientation.frames)}"
         message = f"{fault_text}. {evidence_sentence} {frame_sentence}"
@@ -166,19 +157,15 @@ def _find_position_faults(
             "gyroscopes": "the heading at take-off",
             "GNSS": "the GNSS positions",
         }[convention.heading_from]
-        cause_sentence = (
-            "The x axis of the source does not point north."
-            if convention.heading_from == "GNSS"
-            else f"The x axis of the source does not point north, or {reference_text} is wrong."
-        )
+        other_cause = "" if convention.heading_from == "GNSS" else f", or {reference_text} is wrong"
         message = (
             f"{positions_text} are rotated by {rotation_deg:+.0f}° (clockwise from above) "
-            f"relative to {reference_text}. {cause_sentence} {evidence_sentence} "
-            "The analysis rotates the positions to NED."
+            f"relative to {reference_text}. The x axis of the source does not point north"
+            f"{other_cause}. {evidence_sentence} The analysis rotates the positions to NED."
         )
         action = (
-            "Align the frame of the positioning system with north, or rotate positions and "
-            f"orientation by {-rotation_deg:+.0f}° before sending."
+            "Align the frame of the source with north, or rotate positions and orientation by "
+            f"{-rotation_deg:+.0f}° before sending."
         )
         if is_position_file:
             action = "Run again with --position-yaw auto."
@@ -189,22 +176,19 @@ def _find_position_faults(
         )
         distance_ratio = convention.scale / METRES_PER_UNIT[convention.unit]
         message = (
-            f"{fault_text}. Distances are {distance_ratio:.3g} times those that the IMU measures. "
+            f"{fault_text}. Distances are {distance_ratio:.3g} times those of the IMU. "
             f"{evidence_sentence} The analysis uses the positions in metres."
         )
         yield "source_unit_wrong", "unit", message, action
-    late_s, clock_drift_percent = convention.late_s, 100.0 * faults.clock_drift
-    if clock_drift_percent:
+    late_s = convention.late_s
+    if faults.clock_drift:
         message = (
-            f"The clock of the position timestamps is {abs(clock_drift_percent):.1f} % too "
-            f"{'fast' if clock_drift_percent > 0 else 'slow'}. In the middle of the flight the "
+            f"The clock of the position timestamps is {100.0 * abs(faults.clock_drift):.1f} % too "
+            f"{'fast' if faults.clock_drift > 0 else 'slow'}. In the middle of the flight the "
             f"timestamps are {late_s:+.2f} s late. {evidence_sentence} The analysis uses corrected "
             "timestamps."
         )
-        action = (
-            "Take timestamps from a clock. Timestamps computed as frame number ÷ nominal rate "
-            "drift."
-        )
+        action = "Take timestamps from a clock, not from frame number ÷ nominal rate."
         yield "source_time_offset_changes", "clock drift", message, action
     elif faults.late_s:
         message = (
@@ -212,8 +196,8 @@ def _find_position_faults(
             f"{evidence_sentence} The analysis uses corrected timestamps."
         )
         action = (
-            "Synchronise the clocks (TIMESYNC; uXRCE-DDS: UXRCE_DDS_SYNCT 1) and set the timestamp "
-            "at the time of measurement."
+            "Synchronise the clocks (TIMESYNC; uXRCE-DDS: UXRCE_DDS_SYNCT 1), and send the time of "
+            "measurement."
         )
         if is_position_file:
             action = "Run again with --clock-offset auto."
@@ -237,29 +221,28 @@ def _find_orientation_faults(
     if faults.orientation == "copied":
         message = (
             "The orientation of the source is the autopilot's own attitude, sent back. The "
-            "median difference is below 0.15°. The orientation contains no measurement, so "
-            "px4fuse ignores it."
+            "median difference is below 0.15°. px4fuse ignores this orientation."
         )
         action = (
-            "Send no orientation (quaternion of NaN), and let EKF2 fuse the position only "
-            "(EKF2_EV_CTRL without bit 3)."
+            "Send no orientation (quaternion of NaN), and do not fuse the yaw (EKF2_EV_CTRL "
+            "without bit 3)."
         )
         yield "source_orientation_copied", "copied", message, action
         return
     agreement_text = (
-        "the roll and pitch of the source agree with the autopilot (median difference "
+        "After correction, roll and pitch agree with the autopilot (median difference "
         f"{orientation.tilt_difference_deg:.1f}°)"
     )
     fault_text, action = {
         "order": (
             f"The quaternion of {source} is sent in the order x, y, z, w, but PX4 reads w, x, y, "
-            f"z. After a correction of the order, {agreement_text}",
+            f"z. {agreement_text}",
             "Write w first (px4_msgs: q[0] is w). Eigen coeffs(), SciPy as_quat() and "
-            "geometry_msgs have the order x, y, z, w.",
+            "geometry_msgs have w last.",
         ),
         "frames": (
             f"The orientation of {source} rotates {orientation.frames}, but PX4 expects "
-            f"FRD to NED. After a conversion of the frames, {agreement_text}",
+            f"FRD to NED. {agreement_text}",
             describe_quaternion_conversion(orientation.frames),
         ),
         "heading": (
@@ -267,7 +250,7 @@ def _find_orientation_faults(
             f"{orientation.heading_error_deg or 0.0:+.0f}° (clockwise from above) from the heading "
             "that its positions and the IMU show",
             "Define the rigid body with x forward. An error of 90° is often an unconverted ENU "
-            "heading, which is zero at east.",
+            "heading.",
         ),
     }[faults.orientation]
     message = (

@@ -8,9 +8,9 @@ from px4fuse.analysis import Analysis
 from px4fuse.comparison.remedy import find_aid, format_settings
 from px4fuse.core.text import lowercase_first_letter
 from px4fuse.filter.frame_rotation import HeadingError
-from px4fuse.finding import Finding, Severity
-from px4fuse.findings.ekf2_noise import find_confirmed_noise_trial
+from px4fuse.finding import Finding
 from px4fuse.findings.ekf2_not_fusing import FUSED_FRACTION_FOR_ERROR
+from px4fuse.findings.ekf2_settings import find_confirmed_noise_trial
 from px4fuse.findings.model import (
     Findings,
     compute_flag_fraction,
@@ -56,43 +56,39 @@ def detect(analysis: Analysis) -> Findings:
 
 def make_frd_positions_finding(analysis: Analysis) -> Finding:
     """Make the finding that positions are in FRD, so that their x axis is not north."""
-    ekf2, log = analysis.flight.ekf2, analysis.flight.log
+    ekf2 = analysis.flight.ekf2
     fusion_flags = ekf2.fusion_flags if isinstance(ekf2, Ekf2) else None
     sensor_name = source_name(analysis.source)
     fault = (
         f"{positions_phrase(analysis.source)} are in FRD: their x axis points "
         "along the heading at the start, not north."
     )
-    fusion_sentence, action = "", f"In this report, north is the x axis of {sensor_name}."
+    note_action = f"In this report, north is the x axis of {sensor_name}."
     if isinstance(fusion_flags, Unavailable):
-        fusion_sentence = f"The log does not show whether EKF2 fused the yaw of {sensor_name}."
-        if log.writes_ulog:
-            action += " Give the ULog of this flight as well: it shows the frame that EKF2 uses."
-    elif (
+        if analysis.flight.log.writes_ulog:
+            note_action += " Give the ULog of this flight, too: it shows EKF2's frame."
+        message = f"{fault} The log does not show whether EKF2 fused the yaw of {sensor_name}."
+        return make_note("source_frame_frd", message, note_action)
+    if (
         fusion_flags is not None
         and compute_flag_fraction(fusion_flags["yaw"], analysis.segment) > FUSED_FRACTION_FOR_ERROR
     ):
-        fusion_sentence = (
-            f"EKF2 fused the yaw of {sensor_name}, so EKF2's axes are those of {sensor_name}."
-        )
-    has_yaw = analysis.source.orientation is not None
-    if fusion_sentence:
-        return make_note("source_frame_frd", f"{fault} {fusion_sentence}", action)
+        message = f"{fault} EKF2 fused the yaw of {sensor_name}, so EKF2 has the same axes."
+        return make_note("source_frame_frd", message, note_action)
+    action = "Send the position in NED."
+    if analysis.source.orientation is not None:
+        action += " Alternatively, let EKF2 fuse the yaw of the source (EKF2_EV_CTRL bit 3)."
     return make_warning(
         "source_frame_frd",
-        f"{fault} EKF2 did not fuse the yaw of {sensor_name}, so EKF2's axes are NED. The axes of "
-        "positions and EKF2 may differ.",
-        "Send the position in NED."
-        + " Alternatively, let EKF2 fuse the yaw of the source (EKF2_EV_CTRL bit 3)." * has_yaw,
+        f"{fault} EKF2 did not fuse the yaw of {sensor_name}, so EKF2's axes are NED.",
+        action,
     )
 
 
 def detect_misalignment(analysis: Analysis, heading_error: HeadingError) -> Findings:
     """Detect a yaw misalignment between positions and IMU."""
-    rotation_deg, sigma_deg = (
-        math.remainder(heading_error.misalignment_deg, 360.0),
-        heading_error.sigma_deg,
-    )
+    rotation_deg = math.remainder(heading_error.misalignment_deg, 360.0)
+    sigma_deg = heading_error.sigma_deg
     if heading_error.drifts:
         if not _truth_contradicts_heading_drift(analysis.flight, heading_error):
             yield _make_heading_drift_finding(analysis, heading_error)
@@ -108,17 +104,14 @@ def detect_misalignment(analysis: Analysis, heading_error: HeadingError) -> Find
         MIN_MISALIGNMENT_SIGMAS * sigma_deg, MIN_HEADING_ERROR_DEG
     ):
         return
-    positions_text = positions_phrase(analysis.source)
     finding_id, reference = "ekf2_heading_error", "EKF2's heading"
+    calibration_advice = magnetometer_advice(analysis.flight)
     if analysis.source.origin.is_gnss:
         reason = "GNSS positions refer to true north, so EKF2's heading is wrong by this rotation."
         _, action = _explain_gnss_heading_error(analysis)
+        calibration_advice = ""
     elif analysis.source.name == ALIGNED_VISION_TOPIC:
-        reason = (
-            "EKF2 rotated these positions into its own frame. The IMU nevertheless measures "
-            "another "
-            "direction of the motion."
-        )
+        reason = "EKF2 rotated these positions into its own frame, but the IMU contradicts them."
         action = "Align the positioning frame with north."
     else:
         finding_id, reference = "source_frame_misaligned", "the IMU"
@@ -128,16 +121,14 @@ def detect_misalignment(analysis: Analysis, heading_error: HeadingError) -> Find
         action = f"Rotate the positions by {-rotation_deg:+.0f}° before they are sent."
         if analysis.source.alignment is not None:
             action = "Run again with --position-yaw auto."
-    if not analysis.source.origin.is_gnss and (
-        calibration_advice := magnetometer_advice(analysis.flight)
-    ):
+    if calibration_advice:
         action += f" Alternatively: {lowercase_first_letter(calibration_advice)}"
     yield finding(
         "error" if abs(rotation_deg) >= MIN_SEVERE_HEADING_ERROR_DEG else "warning",
         finding_id,
-        f"{positions_text} are rotated by {rotation_deg:+.0f}° relative to {reference}. The 95 % "
-        f"interval is ± {1.96 * sigma_deg:.0f}°; the rotation is clockwise from above and constant "
-        f"over the flight. {reason}",
+        f"{positions_phrase(analysis.source)} are rotated by {rotation_deg:+.0f}° relative to "
+        f"{reference}. The rotation (± {1.96 * sigma_deg:.0f}°, 95 %) is clockwise from above and "
+        f"constant over the flight. {reason}",
         action,
         {"misalignment_deg": rotation_deg, "sigma_deg": sigma_deg},
     )
@@ -146,10 +137,7 @@ def detect_misalignment(analysis: Analysis, heading_error: HeadingError) -> Find
 def _explain_gnss_heading_error(analysis: Analysis) -> tuple[str, str]:
     """Return the possible cause of a wrong heading in a flight with GNSS, and the action."""
     if (trial := find_confirmed_noise_trial(analysis)) is not None:
-        cause = (
-            f"a wrong {find_aid(analysis).noise}, which determines the influence of GNSS on EKF2's "
-            "heading"
-        )
+        cause = f"a wrong {find_aid(analysis).noise}, with which GNSS affects EKF2's heading"
         return cause, f"Set {format_settings(trial.change)}. Then check the heading again."
     advice = magnetometer_advice(analysis.flight)
     cause = "a magnetometer near currents or steel" if advice else "a wrong heading source of EKF2"
@@ -164,56 +152,49 @@ def _truth_contradicts_heading_drift(flight: Flight, heading_error: HeadingError
         or isinstance(attitude, Unavailable)
     ):
         return False
-    heading_errors_deg, (first_part, last_part) = [], heading_error.find_extreme_parts()
-    for part in (first_part, last_part):
+    errors_rad, parts = [], heading_error.find_extreme_parts()
+    for part in parts:
         samples = rows_between(attitude, part.start_s, part.end_s)[Columns.QUATERNION]
         true_attitude = interpolate(
             samples.index.to_numpy(), truth.attitude.index.to_numpy(), truth.attitude.to_numpy()
         )
         error_rad = heading_of(samples.to_numpy()) - heading_of(true_attitude)
-        wrapped_error_rad = np.arctan2(np.sin(error_rad), np.cos(error_rad))
-        heading_errors_deg.append(float(np.degrees(np.median(wrapped_error_rad))))
-    heading_change_deg = abs(last_part.heading_error_deg - first_part.heading_error_deg)
-    return (
-        abs(heading_errors_deg[1] - heading_errors_deg[0])
-        < MIN_TRUE_TO_RELATIVE_HEADING_DRIFT_RATIO * heading_change_deg
-    )
+        errors_rad.append(np.median(np.arctan2(np.sin(error_rad), np.cos(error_rad))))
+    true_drift_deg = np.degrees(np.ptp(errors_rad))
+    relative_drift_deg = np.ptp([part.heading_error_deg for part in parts])
+    return bool(true_drift_deg < MIN_TRUE_TO_RELATIVE_HEADING_DRIFT_RATIO * relative_drift_deg)
 
 
 def _make_heading_drift_finding(analysis: Analysis, heading_error: HeadingError) -> Finding:
+    source, log = analysis.source, analysis.flight.log
     first_part, last_part = heading_error.find_extreme_parts()
-    heading_errors_deg = [
-        math.remainder(part.heading_error_deg, 360.0) for part in (first_part, last_part)
-    ]
+    error_texts = (
+        f"{math.remainder(part.heading_error_deg, 360.0):+.0f}° from {part.start_s:.0f} to "
+        f"{part.end_s:.0f} s"
+        for part in (first_part, last_part)
+    )
     heading_change_deg = last_part.heading_error_deg - first_part.heading_error_deg
     estimation_data_text = "positions and IMU"
     if heading_error.by == "orientation":
-        estimation_data_text = f"the orientation of {source_name(analysis.source)}"
-    calibration_advice, has_yaw = (
-        magnetometer_advice(analysis.flight),
-        analysis.source.orientation is not None,
-    )
+        estimation_data_text = f"the orientation of {source_name(source)}"
+    calibration_advice, action = magnetometer_advice(analysis.flight), ""
     possible_cause = "a magnetometer indoors" if calibration_advice else "a gyroscope bias"
-    possible_cause += ", or heading drift of the odometry" * has_yaw
-    action = ""
-    is_yaw_fused = int(analysis.flight.log.parameters.get(EV_POS.switch, 0.0)) & EV_CTRL_YAW_MASK
-    if has_yaw and not is_yaw_fused:
-        action = "Let EKF2 fuse the yaw of the source (EKF2_EV_CTRL bit 3)."
-    if analysis.source.origin.is_gnss:
+    if source.orientation is not None:
+        possible_cause += ", or heading drift of the odometry"
+        if not int(log.parameters.get(EV_POS.switch, 0.0)) & EV_CTRL_YAW_MASK:
+            fusing_system = "EKF2" if log.writes_ulog else "the autopilot"
+            action = f"Let {fusing_system} fuse the yaw of the source"
+            action += " (EKF2_EV_CTRL bit 3)." if log.writes_ulog else "."
+    if source.origin.is_gnss:
         calibration_advice = ""
         possible_cause, action = _explain_gnss_heading_error(analysis)
-    elif action and not analysis.flight.log.writes_ulog:
-        action = "Let the autopilot fuse the yaw of the source."
     return finding(
         "error" if abs(heading_change_deg) >= MIN_SEVERE_HEADING_ERROR_DEG else "warning",
         "ekf2_heading_error",
         f"EKF2's heading drifts by {heading_change_deg:+.0f}° relative to the "
-        f"{positions_phrase(analysis.source)}. Its error is {heading_errors_deg[0]:+.0f}° from "
-        f"{first_part.start_s:.0f} to {first_part.end_s:.0f} s and {heading_errors_deg[1]:+.0f}° "
-        f"from {last_part.start_s:.0f} to {last_part.end_s:.0f} s (clockwise from above, estimated "
-        f"from {estimation_data_text}). A constant rotation of the positions cannot correct the "
-        "drift. "
-        f"Possible cause: {possible_cause}.",
+        f"{positions_phrase(source)}. Its error is {' and '.join(error_texts)} (clockwise from "
+        f"above, estimated from {estimation_data_text}). A constant rotation of the positions "
+        f"cannot correct the drift. Possible cause: {possible_cause}.",
         " Alternatively: ".join(filter(None, (calibration_advice, action)))
         or "Check the heading source of EKF2.",
         {
@@ -231,12 +212,9 @@ def detect_uncertain_alignment(analysis: Analysis) -> Findings:
     alignment = analysis.source.alignment
     if alignment is None:
         return
-    severities: list[Severity] = ["error"] * len(alignment.misplaced)
-    severities += ["warning"] * len(alignment.warnings)
-    sentences = (*alignment.misplaced, *alignment.warnings)
-    for severity, sentence in zip(severities, sentences, strict=True):
+    for sentence in (*alignment.misplaced, *alignment.warnings):
         yield finding(
-            severity,
+            "error" if sentence in alignment.misplaced else "warning",
             "position_file_alignment",
             f"{sentence.rstrip('.')}.",
             "If time offset, frame and yaw of the file are known, run again with --clock-offset, "

@@ -12,8 +12,7 @@ from px4fuse.core.text import format_metres
 from px4fuse.ekf2.aids import MAX_TIME_WITHOUT_FUSION_S
 from px4fuse.ekf2.fusion_conditions import EV_START_INTERVAL_S
 from px4fuse.filter.kalman import predict_state, predict_variance
-from px4fuse.filter.signals import cut_to_segment
-from px4fuse.finding import Finding
+from px4fuse.finding import Finding, Severity
 from px4fuse.findings.model import (
     Findings,
     find_source_texts,
@@ -61,88 +60,82 @@ def detect(analysis: Analysis) -> Findings:
 def detect_source_gaps(analysis: Analysis) -> Findings:
     """Detect gaps in the position source."""
     flight, source, ekf2 = analysis.segment.whole_flight, analysis.source, analysis.flight.ekf2
-    gap_spans, gap_spans_only_in_log = list[Span](), list[Span]()
+    gaps, gaps_only_in_log = list[Span](), list[Span]()
     invalid_times_s = analysis.source.invalid_reasons.index
-    for gap in analysis.events.gaps:
-        if np.any((invalid_times_s > gap[0]) & (invalid_times_s < gap[1])):
+    for start_s, end_s in analysis.events.gaps:
+        if np.any((invalid_times_s > start_s) & (invalid_times_s < end_s)):
             continue  # source_values.py reports these invalid positions
-        aids = _find_fused_aids(ekf2, gap)
+        aids = _find_fused_aids(ekf2, (start_s, end_s))
         if source.origin.aid in aids and source.alignment is None:
-            gap_spans_only_in_log.append(gap)
-        elif gap[0] == flight.start_s or gap[1] == flight.end_s:
-            if gap[1] - gap[0] > MIN_GAP_AT_START_OR_END_S:
-                yield _make_stop_or_begin_finding(analysis, gap, aids)
+            gaps_only_in_log.append((start_s, end_s))
+        elif start_s != flight.start_s and end_s != flight.end_s:
+            gaps.append((start_s, end_s))
+        elif end_s - start_s > MIN_GAP_AT_START_OR_END_S:
+            yield _make_stop_or_begin_finding(analysis, (start_s, end_s), aids)
+    for finding_id, spans in (("source_gap_in_log", gaps_only_in_log), ("source_gap", gaps)):
+        if not spans:
+            continue
+        start_s, end_s = max(spans, key=lambda span: span[1] - span[0])
+        duration_text = f"{end_s - start_s:.1f} s"
+        if len(spans) > 1:
+            duration_text += f", the longest of {len(spans)} gaps"
+        if spans is gaps:
+            errors_text = describe_errors_after_gap(analysis, (start_s, end_s))
+            message = f"No position for {duration_text}. {errors_text}"
+            action = f"{find_source_texts(source).data_link_check} at {start_s:.1f} s."
         else:
-            gap_spans.append(gap)
-    positions_text = positions_phrase(source)
-    if gap_spans_only_in_log:
-        start_s, end_s, gap_count_text = _find_longest_gap(gap_spans_only_in_log)
+            message = (
+                f"{positions_phrase(source)} are missing in the log for {duration_text}, but EKF2 "
+                "fused them. KF has no measurement in this time."
+            )
+            action = _find_action_for_unlogged_positions(analysis, start_s, end_s)
         yield make_warning(
-            "source_gap_in_log",
-            f"{positions_text} are missing in the log for {end_s - start_s:.1f} s{gap_count_text}, "
-            "but EKF2 fused them. The source did not stop; KF has no measurement in this time.",
-            _find_remedy_for_unlogged_positions(analysis, start_s, end_s),
-            {"count": len(gap_spans_only_in_log), "longest_s": end_s - start_s, "at_s": start_s},
-            tuple(gap_spans_only_in_log),
-        )
-    if gap_spans:
-        start_s, end_s, gap_count_text = _find_longest_gap(gap_spans)
-        yield make_warning(
-            "source_gap",
-            f"No position for {end_s - start_s:.1f} s{gap_count_text}. "
-            f"{describe_errors_after_gap(analysis, (start_s, end_s))}",
-            f"{find_source_texts(source).data_link_check} at {start_s:.1f} s.",
-            {"count": len(gap_spans), "longest_s": end_s - start_s, "at_s": start_s},
-            tuple(gap_spans),
+            finding_id,
+            message,
+            action,
+            {"count": len(spans), "longest_s": end_s - start_s, "at_s": start_s},
+            tuple(spans),
         )
 
 
-def _find_longest_gap(gaps: list[Span]) -> tuple[float, float, str]:
-    start_s, end_s = max(gaps, key=lambda gap: gap[1] - gap[0])
-    return start_s, end_s, "" if len(gaps) == 1 else f", the longest of {len(gaps)} gaps"
-
-
-def _find_remedy_for_unlogged_positions(analysis: Analysis, start_s: float, end_s: float) -> str:
+def _find_action_for_unlogged_positions(analysis: Analysis, start_s: float, end_s: float) -> str:
     for track in analysis.flight.positions:
         if track.origin.aid == analysis.source.origin.aid and len(track.samples[start_s:end_s]) > 2:
             return f"Run again with --position-source {track.name}, which contains these positions."
-    if analysis.flight.log.dropouts:
-        return "Use a faster SD card, or log fewer topics (SDLOG_PROFILE)."
-    return "Log fewer topics (SDLOG_PROFILE)."
+    faster_card = "Use a faster SD card, or log" if analysis.flight.log.dropouts else "Log"
+    return f"{faster_card} fewer topics (SDLOG_PROFILE)."
 
 
 def _make_stop_or_begin_finding(analysis: Analysis, span_s: Span, fused_aids: list[Aid]) -> Finding:
     (start_s, end_s), source = span_s, analysis.source
-    is_source_stop = end_s == analysis.segment.whole_flight.end_s
-    event_verb, start_or_stop_s, before_or_after = (
-        ("stop", start_s, "after") if is_source_stop else ("begin", end_s, "before")
-    )
-    action = "" if is_source_stop or source.alignment else " Take off only when positions arrive."
-    ekf2_errors_at_end, duration_s = _find_ekf2_errors_at_end(analysis, span_s), end_s - start_s
-    time_text = f"{duration_s:.1f} s {'before the end' if is_source_stop else 'after the start'}"
-    effect_sentence = ""
-    if "error_m" in ekf2_errors_at_end:
-        error_text = format_metres(ekf2_errors_at_end["error_m"])
-        effect_sentence = f"EKF2's position error at the end of this time is {error_text} m. "
-    elif "sigma_m" in ekf2_errors_at_end:
-        sigma_text = format_metres(ekf2_errors_at_end["sigma_m"])
-        effect_sentence = f"EKF2's reported σ at the end of this time is {sigma_text} m. "
-    has_aids, aiding_sentence = _has_aiding_sources(analysis.flight.ekf2), ""
+    duration_s, effect_sentence, action = end_s - start_s, "", ""
+    if end_s == analysis.segment.whole_flight.end_s:
+        finding_id, event, event_s = "source_stops", "stop", start_s
+        before_or_after, flight_edge = "after", "before the end"
+    else:
+        finding_id, event, event_s = "source_begins", "begin", end_s
+        before_or_after, flight_edge = "before", "after the start"
+        action = "" if source.alignment else " Take off only when positions arrive."
+    ekf2_errors_at_end = _find_ekf2_errors_at_end(analysis, span_s)
+    for name, quantity in (("error_m", "position error"), ("sigma_m", "reported σ")):
+        if name in ekf2_errors_at_end and not effect_sentence:
+            effect_sentence = (
+                f" EKF2's {quantity} at the end of this time is "
+                f"{format_metres(ekf2_errors_at_end[name])} m."
+            )
+    has_aids = _has_aiding_sources(analysis.flight.ekf2)
+    aiding_sentence = ""
     if has_aids:
         labels = [aid.label for aid in fused_aids] or ["the IMU alone (dead reckoning)"]
-        aiding_sentence = f"For {duration_s:.1f} s EKF2 relied on {' and '.join(labels)}. "
+        aiding_sentence = f" For {duration_s:.1f} s EKF2 relied on {' and '.join(labels)}."
+    is_dead_reckoning = has_aids and not fused_aids and duration_s > MAX_TIME_WITHOUT_FUSION_S
     return finding(
-        "error"
-        if has_aids and not fused_aids and duration_s > MAX_TIME_WITHOUT_FUSION_S
-        else "warning",
-        "source_stops" if is_source_stop else "source_begins",
-        f"{positions_phrase(source)} {event_verb} in flight at {start_or_stop_s:.1f} "
-        f"s, {time_text}. {aiding_sentence}{effect_sentence}px4fuse evaluates KF and EKF2 only "
-        "while positions "
-        "arrive.",
-        f"{find_source_texts(source).data_link_check} {before_or_after} {start_or_stop_s:.1f} "
-        f"s.{action}",
-        {"at_s": start_or_stop_s, "duration_s": duration_s, **ekf2_errors_at_end},
+        "error" if is_dead_reckoning else "warning",
+        finding_id,
+        f"{positions_phrase(source)} {event} in flight at {event_s:.1f} s, {duration_s:.1f} s "
+        f"{flight_edge}.{aiding_sentence}{effect_sentence}",
+        f"{find_source_texts(source).data_link_check} {before_or_after} {event_s:.1f} s.{action}",
+        {"at_s": event_s, "duration_s": duration_s, **ekf2_errors_at_end},
         (span_s,),
     )
 
@@ -156,20 +149,16 @@ def _find_ekf2_errors_at_end(analysis: Analysis, span_s: Span) -> dict[str, floa
         if isinstance(tracks.ekf2_state, Unavailable):
             return {}
         position_m = tracks.ekf2_state["position_m"].loc[slice(*span_s)]
-        time_s, true_position_m = position_m.index.to_numpy(), np.full(len(position_m), np.nan)
+        time_s, error_m = position_m.index.to_numpy(), np.full(len(position_m), np.nan)
         if isinstance(tracks.truth, pd.DataFrame):
-            true_positions = tracks.truth["position_m"]
-            true_position_m = np.interp(
-                time_s, true_positions.index, true_positions, np.nan, np.nan
-            )
+            true_m = tracks.truth["position_m"]
+            error_m = position_m - np.interp(time_s, true_m.index, true_m, np.nan, np.nan)
         sigma_m = interpolate_sigma(time_s, tracks.ekf2_variance, "position_variance_m2")
-        squared_errors_m2.append([(position_m - true_position_m) ** 2, sigma_m**2])
-    quantities_and_square_sums = zip(
-        ("error_m", "sigma_m"), np.sum(squared_errors_m2, axis=0), strict=True
-    )
+        squared_errors_m2.append([error_m**2, sigma_m**2])
+    error_m, sigma_m = np.sqrt(np.sum(squared_errors_m2, axis=0))
     return {
-        name: float(np.sqrt(values[np.isfinite(values)][-1]))
-        for name, values in quantities_and_square_sums
+        name: float(values[np.isfinite(values)][-1])
+        for name, values in (("error_m", error_m), ("sigma_m", sigma_m))
         if np.isfinite(values).any()
     }
 
@@ -177,39 +166,37 @@ def _find_ekf2_errors_at_end(analysis: Analysis, span_s: Span) -> dict[str, floa
 def describe_errors_after_gap(analysis: Analysis, gap_span_s: Span) -> str:
     """Describe the position errors of KF and EKF2 at the end of a gap."""
     result, (start_s, end_s) = analysis.main, gap_span_s
-    start_and_end_times_s = np.array([start_s, end_s - TIME_BEFORE_UPDATE_S])
-    axis, ekf2_state = result.axis, result.ekf2_state
+    axis, ekf2, ekf2_state = result.axis, analysis.flight.ekf2, result.ekf2_state
     reference_m = float(axis.measurement_m[np.searchsorted(axis.measurement_time_s, end_s)])
-    quantity = "Distance from estimate to first position after the gap"
+    quantity = "Distance to the first position after the gap"
     if isinstance(result.truth, pd.DataFrame):
-        true_positions_m = result.truth["position_m"]
-        reference_m, quantity = (
-            float(np.interp(end_s, true_positions_m.index, true_positions_m)),
-            "Position error at the end of the gap",
-        )
-    error_texts = []
-    aiding_sentence = "In the gap KF relies on the IMU alone."
+        true_m = result.truth["position_m"]
+        reference_m = float(np.interp(end_s, true_m.index, true_m))
+        quantity = "Position error at the end of the gap"
+    ekf2_text, aiding_sentence = "", "In the gap KF relies on the IMU alone."
     if isinstance(ekf2_state, pd.DataFrame) and len(
         positions_before := ekf2_state["position_m"].loc[:end_s]
     ):
-        if _has_aiding_sources(analysis.flight.ekf2):
+        if other_aids := _find_fused_aids(ekf2, gap_span_s):
+            labels_text = " and ".join(aid.label for aid in other_aids)
+            aiding_sentence += f" EKF2 also relies on {labels_text}."
+        elif _has_aiding_sources(ekf2):
             aiding_sentence = "In the gap KF and EKF2 rely on the IMU alone."
-        if other_aids := _find_fused_aids(analysis.flight.ekf2, gap_span_s):
-            aid_labels_text = " and ".join(aid.label for aid in other_aids)
-            aiding_sentence = (
-                f"In the gap KF relies on the IMU alone. EKF2 also relies on {aid_labels_text}."
-            )
-        variance, state_time_s = result.ekf2_variance, float(positions_before.index[-1])
-        sigma_text = ""
+        ekf2_text = f"EKF2 {format_metres(abs(positions_before.iloc[-1] - reference_m))} m"
+        variance = result.ekf2_variance
         if isinstance(variance, pd.DataFrame) and len(variance):
-            variance_m2 = np.interp(state_time_s, variance.index, variance["position_variance_m2"])
-            sigma_text = f" (σ {format_metres(float(np.sqrt(variance_m2)))} m)"
-        error_m = abs(float(positions_before.iloc[-1]) - reference_m)
-        error_texts.append(f"EKF2 {format_metres(error_m)} m{sigma_text}")
-    kf_error_m = abs(float(predict_state(result.replay, start_and_end_times_s)[0][1]) - reference_m)
-    kf_sigma_m = float(np.sqrt(predict_variance(result.replay, start_and_end_times_s)[0][1]))
-    error_texts.append(f"KF {format_metres(kf_error_m)} m (σ {format_metres(kf_sigma_m)} m)")
-    return f"{aiding_sentence} {quantity} along {axis.label}: {', '.join(error_texts)}."
+            variance_m2 = np.interp(
+                positions_before.index[-1], variance.index, variance["position_variance_m2"]
+            )
+            ekf2_text += f" (σ {format_metres(variance_m2**0.5)} m)"
+        ekf2_text += ", "
+    times_s = np.array([start_s, end_s - TIME_BEFORE_UPDATE_S])
+    kf_error_m = abs(predict_state(result.replay, times_s)[0][1] - reference_m)
+    kf_sigma_m = predict_variance(result.replay, times_s)[0][1] ** 0.5
+    return (
+        f"{aiding_sentence} {quantity} along {axis.label}: {ekf2_text}KF "
+        f"{format_metres(kf_error_m)} m (σ {format_metres(kf_sigma_m)} m)."
+    )
 
 
 def _has_aiding_sources(ekf2: Ekf2 | Unavailable) -> bool:
@@ -219,16 +206,16 @@ def _has_aiding_sources(ekf2: Ekf2 | Unavailable) -> bool:
 def _find_fused_aids(ekf2: Ekf2 | Unavailable, span_s: Span) -> list[Aid]:
     """Return the horizontal aiding sources that EKF2 fused during a whole time span."""
     aids, (start_s, end_s) = list[Aid](), span_s
+    aid_logs = {} if isinstance(ekf2, Unavailable) else ekf2.aids
     for name in (EV_POS.name, *OTHER_HORIZONTAL_AIDS):
-        aid_log = None if isinstance(ekf2, Unavailable) else ekf2.aids.get(name)
-        if aid_log is None:
+        if name not in aid_logs:
             continue
-        samples = aid_log.samples.loc[start_s:end_s]
+        samples, enabled = aid_logs[name].samples.loc[start_s:end_s], aid_logs[name].enabled
         is_fused = np.zeros(len(samples), bool)
         if "fused" in samples:
             is_fused = samples["fused"].to_numpy() > 0.0
-        elif aid_log.enabled is not None:
-            is_fused = sample_step_function(aid_log.enabled, samples.index) > 0.0
+        elif enabled is not None:
+            is_fused = sample_step_function(enabled, samples.index) > 0.0
         times_s = [start_s, *samples.index[is_fused], end_s]
         if np.diff(times_s).max() < 0.5 * (end_s - start_s):
             aids.append(AIDS[name])
@@ -246,17 +233,18 @@ def detect_lost_samples(analysis: Analysis) -> Findings:
     intervals_s, median_interval_s = _compute_intervals_s(analysis)
     lost_count = int(np.sum(np.rint(intervals_s / median_interval_s) - 1.0))
     sent_count = lost_count + len(intervals_s)
-    if len(intervals_s) > 1 and lost_count / sent_count > MIN_LOST_POSITION_FRACTION:
+    lost_fraction = lost_count / max(sent_count, 1)
+    if len(intervals_s) > 1 and lost_fraction > MIN_LOST_POSITION_FRACTION:
         action = "Record on the companion computer or on a link without message loss."
         if analysis.flight.log.writes_ulog:
             action += " Or set SDLOG_PROFILE to 129: the ULog then contains the received positions."
         yield make_note(
             "source_samples_lost",
-            f"The recording lacks {format_percent(lost_count / sent_count)} of the "
+            f"The recording lacks {format_percent(lost_fraction)} of the "
             f"{positions_phrase(source)}. {lost_count} of {sent_count} positions are missing (one "
             f"per {median_interval_s:.2f} s is expected). EKF2 may have received them.",
             action,
-            {"lost": lost_count, "lost_fraction": lost_count / sent_count},
+            {"lost": lost_count, "lost_fraction": lost_fraction},
         )
 
 
@@ -275,53 +263,43 @@ def detect_downsampling(analysis: Analysis) -> Findings:
         or (period_and_multiples := _find_period(intervals_s)) is None
     ):
         return
-    period_s, periods_in_intervals = period_and_multiples
-    lost_fraction = 1.0 - 1.0 / float(np.mean(periods_in_intervals))
-    fraction_by_interval_length = np.bincount(periods_in_intervals.astype(np.intp)) / len(
-        periods_in_intervals
-    )
-    fraction_by_pair_of_lengths = fraction_by_interval_length[:-1] + fraction_by_interval_length[1:]
-    periods_in_shorter_interval = int(np.argmax(fraction_by_pair_of_lengths))
-    has_two_interval_lengths = (
-        fraction_by_pair_of_lengths[periods_in_shorter_interval]
-        >= MIN_FRACTION_OF_BOTH_INTERVAL_LENGTHS
-        and fraction_by_interval_length[
-            periods_in_shorter_interval : periods_in_shorter_interval + 2
-        ].min()
-        >= MIN_FRACTION_OF_RARER_INTERVAL_LENGTH
-    )
-    if lost_fraction < MIN_MISSING_FRACTION_FOR_DOWNSAMPLING or not has_two_interval_lengths:
+    period_s, multiples = period_and_multiples
+    lost_fraction = 1.0 - 1.0 / float(np.mean(multiples))
+    fraction_by_multiple = np.bincount(multiples.astype(np.intp)) / len(multiples)
+    fractions_of_pairs = fraction_by_multiple[:-1] + fraction_by_multiple[1:]
+    smaller_multiple = int(np.argmax(fractions_of_pairs))
+    fractions_of_pair = fraction_by_multiple[smaller_multiple : smaller_multiple + 2]
+    if (
+        lost_fraction < MIN_MISSING_FRACTION_FOR_DOWNSAMPLING
+        or fractions_of_pair.sum() < MIN_FRACTION_OF_BOTH_INTERVAL_LENGTHS
+        or fractions_of_pair.min() < MIN_FRACTION_OF_RARER_INTERVAL_LENGTH
+    ):
         return
     mean_interval_s = float(np.mean(intervals_s))
-    is_too_slow = mean_interval_s > EV_START_INTERVAL_S
+    rate_hz, source_rate_hz = 1.0 / mean_interval_s, 1.0 / period_s
+    severity: Severity = "warning"
     message = (
-        f"{positions_phrase(source)} arrive at {1.0 / mean_interval_s:.2g} Hz, "
-        f"downsampled from {1.0 / period_s:.2g} Hz. The intervals are whole multiples of "
-        f"{period_s:.3g} s, so {format_percent(lost_fraction)} of the positions are missing."
+        f"{positions_phrase(source)} arrive at {rate_hz:.2g} Hz, downsampled from "
+        f"{source_rate_hz:.2g} Hz. The intervals are whole multiples of {period_s:.3g} s, so "
+        f"{format_percent(lost_fraction)} of the positions are missing."
     )
-    if is_too_slow:
+    if mean_interval_s > EV_START_INTERVAL_S:
+        severity = "error"
         message += (
             " EKF2 (v1.14 and later) cannot start fusion at this rate: two positions must arrive "
             f"within {EV_START_INTERVAL_S:g} s."
         )
     yield finding(
-        "error" if is_too_slow else "warning",
+        severity,
         "source_downsampled",
         message,
-        "Increase the message rate of the positions (MAVROS, bridge, link), and remove any rate "
-        "limit.",
-        {
-            "rate_hz": 1.0 / mean_interval_s,
-            "source_rate_hz": 1.0 / period_s,
-            "lost_fraction": lost_fraction,
-        },
+        "Increase the message rate of the positions (MAVROS, bridge, link).",
+        {"rate_hz": rate_hz, "source_rate_hz": source_rate_hz, "lost_fraction": lost_fraction},
     )
 
 
 def _compute_intervals_s(analysis: Analysis) -> tuple[Array, float]:
-    intervals_s = np.diff(
-        cut_to_segment(analysis.source.samples, analysis.segment).index.to_numpy()
-    )
+    intervals_s = np.diff(analysis.source_samples.index.to_numpy())
     median_interval_s = float(np.median(intervals_s)) if len(intervals_s) else np.nan
     return intervals_s[intervals_s <= compute_max_interval_s(median_interval_s)], median_interval_s
 
@@ -331,13 +309,11 @@ def _find_period(intervals_s: Array) -> tuple[float, Array] | None:
     # The upper median is one of the intervals; numpy.median may be the mean of two
     median_interval_s = float(np.sort(intervals_s)[len(intervals_s) // 2])
     for median_count in range(1, MAX_PERIODS_IN_MEDIAN_INTERVAL + 1):
-        periods_in_intervals = np.rint(intervals_s * median_count / median_interval_s)
-        if np.any(periods_in_intervals < 1.0):
+        multiples = np.rint(intervals_s * median_count / median_interval_s)
+        if np.any(multiples < 1.0):
             continue
-        period_s = float(np.sum(intervals_s) / np.sum(periods_in_intervals))
-        if (
-            float(np.sqrt(np.mean((intervals_s / period_s - periods_in_intervals) ** 2)))
-            <= MAX_ROUNDING_RMS_ERROR
-        ):
-            return period_s, periods_in_intervals
+        period_s = float(np.sum(intervals_s) / np.sum(multiples))
+        rounding_errors = intervals_s / period_s - multiples
+        if np.mean(rounding_errors**2) ** 0.5 <= MAX_ROUNDING_RMS_ERROR:
+            return period_s, multiples
     return None

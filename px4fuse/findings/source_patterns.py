@@ -23,15 +23,11 @@ from px4fuse.filter.time_offset import ClockOffset
 from px4fuse.findings.model import (
     Findings,
     find_source_texts,
-    finding,
     format_percent,
     make_error,
     make_warning,
 )
-from px4fuse.findings.source_positions import (
-    MIN_SCALE_ERROR_FOR_SEVERITY_ERROR,
-    MIN_SCALE_ERROR_TO_SIGMA_RATIO,
-)
+from px4fuse.findings.source_positions import MIN_SCALE_ERROR_TO_SIGMA_RATIO, make_scale_finding
 from px4fuse.findings.source_stamps import detect_bursts
 from px4fuse.flight.model import positions_phrase, source_name
 
@@ -47,11 +43,9 @@ def detect(analysis: Analysis) -> Findings:
     yield from detect_attitude_delay(analysis)
     burst_findings = [*detect_bursts(analysis)]
     yield from burst_findings
-    local_residuals = (
-        None
-        if burst_findings or analysis.source.origin.reconstructed
-        else compute_local_residuals(analysis)
-    )
+    if burst_findings or analysis.source.origin.reconstructed:
+        return
+    local_residuals = compute_local_residuals(analysis)
     if local_residuals is None:
         return
     yield from detect_jitter_and_speed_noise(analysis, local_residuals)
@@ -68,11 +62,10 @@ def detect_jitter_and_speed_noise(analysis: Analysis, local_residuals: LocalResi
         yield (make_error if jitter_s >= MIN_JITTER_FOR_ERROR_S else make_warning)(
             "source_timestamp_jitter",
             f"The timestamps of the {positions_phrase(analysis.source)} jitter by "
-            f"{1e3 * jitter_s:.0f} ms (1 σ). The positions are measured at a constant interval, "
-            "but their timestamps are not. At 1 m/s this is a position error of "
-            f"{format_metres(jitter_s)} m along the motion.",
-            "Send the time of measurement with each position, not the time at which it was "
-            "processed, sent or received.",
+            f"{1e3 * jitter_s:.0f} ms (1 σ). The positions are measured at a constant interval. At "
+            f"1 m/s the jitter is a position error of {format_metres(jitter_s)} m.",
+            "Send the time of measurement with each position, not the time of processing, sending "
+            "or receiving.",
             {"jitter_s": jitter_s},
         )
     speed_noise = find_speed_dependent_noise(local_residuals)
@@ -82,10 +75,10 @@ def detect_jitter_and_speed_noise(analysis: Analysis, local_residuals: LocalResi
             f"{source_name(analysis.source)} noise grows with speed: "
             f"{format_metres(speed_noise.slow_m)} m at {speed_noise.slow_m_s:.1f} m/s and "
             f"{format_metres(speed_noise.fast_m)} m at {speed_noise.fast_m_s:.1f} m/s (1 σ). The "
-            "noise grows along and across the motion, so time offset and jitter are not the cause. "
+            "noise also grows across the motion, so time offset and jitter are not the cause. "
             "No single measurement noise fits the whole flight.",
-            "Let the source send a variance that grows with speed (EKF2_EV_NOISE_MD 0). "
-            "Shorten the time of one measurement: exposure time or ranging time.",
+            "Send a variance that grows with speed (EKF2_EV_NOISE_MD 0). Shorten the exposure or "
+            "ranging time.",
             speed_noise._asdict(),
         )
 
@@ -101,8 +94,7 @@ def detect_periodic_errors_and_offset_changes(analysis: Analysis, error_fit: Err
             f"The error of the {positions_text} is periodic: amplitude "
             f"{format_metres(periodic_error.amplitude_m)} m, period {periodic_error.period_s:.1f} "
             f"s. This sinusoid explains {format_percent(min(periodic_error.fraction, 1.0))} of the "
-            "slow errors against ground truth. KF and EKF2 follow this error, so innovations "
-            "hardly show it.",
+            "slow errors against ground truth. Innovations hardly show this error.",
             f"{find_source_texts(analysis.source).slow_error_check}. Look for a process with this "
             "period, such as a rotating part or a control loop.",
             periodic_error._asdict(),
@@ -117,11 +109,10 @@ def detect_periodic_errors_and_offset_changes(analysis: Analysis, error_fit: Err
             f"The time offset of the {positions_text} varies in flight by "
             f"{offset_change.most_s - offset_change.least_s:.2f} s. Its deviation from the "
             f"mean is {offset_change.least_s:+.2f} s at {offset_change.least_at_s:.0f} s and "
-            f"{offset_change.most_s:+.2f} s at {offset_change.most_at_s:.0f} s. The estimate is "
-            "from position errors against ground truth. No single --clock-offset corrects the "
-            "whole flight.",
-            "Synchronise the clocks during the whole flight. Send the time of measurement, not the "
-            "time at which a position was sent or received.",
+            f"{offset_change.most_s:+.2f} s at {offset_change.most_at_s:.0f} s (estimated with "
+            "ground truth). No single --clock-offset corrects the whole flight.",
+            "Synchronise the clocks during the whole flight. Send the time of measurement, not of "
+            "sending or receiving.",
             offset_change._asdict(),
         )
 
@@ -130,15 +121,12 @@ def detect_scale_error(analysis: Analysis, error_fit: ErrorFit) -> Findings:
     if abs(error_fit.scale) >= max(
         MIN_SCALE_ERROR_AGAINST_TRUTH, MIN_SCALE_ERROR_TO_SIGMA_RATIO * error_fit.scale_sigma
     ):
-        yield finding(
-            "error" if abs(error_fit.scale) >= MIN_SCALE_ERROR_FOR_SEVERITY_ERROR else "warning",
-            "source_scale_error",
-            f"{source_name(analysis.source)} distances are {format_percent(abs(error_fit.scale))} "
-            f"too {'long' if error_fit.scale > 0.0 else 'short'}. The comparison with ground truth "
-            f"is accurate to ± {format_percent(1.96 * error_fit.scale_sigma, 1)} (95 %). "
-            "Innovations do not show a scale factor error.",
+        yield make_scale_finding(
+            analysis.source,
+            error_fit.scale,
+            error_fit.scale_sigma,
+            f"ground truth is accurate to ± {format_percent(1.96 * error_fit.scale_sigma, 1)}",
             f"{find_source_texts(analysis.source).scale_check}.",
-            {"scale": 1.0 + error_fit.scale, "sigma": error_fit.scale_sigma},
         )
 
 
@@ -151,9 +139,9 @@ def detect_attitude_delay(analysis: Analysis) -> Findings:
         yield make_warning(
             "attitude_late",
             f"The logged attitude is {abs(delay_s):.2f} s {'late' if delay_s > 0.0 else 'early'} "
-            "relative to the gyroscopes. KF rotates the acceleration by this attitude, so the "
-            f"acceleration is wrong by {format_ratio(abs(delay_s) * constants.g)} m/s² for each "
-            "rad/s of roll or pitch rate.",
+            "relative to the gyroscopes. KF's acceleration is therefore wrong by "
+            f"{format_ratio(abs(delay_s) * constants.g)} m/s² for each rad/s of roll or pitch "
+            "rate.",
             "Check the timestamps of the attitude: IMU and attitude must have the same clock.",
             {"delay_s": delay_s},
         )

@@ -3,7 +3,6 @@
 A wrong scale factor, a wrong reported variance and too little motion are also detected.
 """
 
-from collections.abc import Sequence
 from dataclasses import asdict, replace
 
 import numpy as np
@@ -18,12 +17,10 @@ from px4fuse.filter.correlated_noise import SourceLowPass, TimeCorrelatedNoise
 from px4fuse.filter.hypotheses import (
     OUTLIER_BURST_DURATION_S,
     OUTLIER_RETEST_DURATION_AFTER_JUMP_S,
-    SystematicErrors,
 )
-from px4fuse.filter.signals import cut_to_segment
 from px4fuse.filter.time_offset import ClockOffset
 from px4fuse.filter.tuning import HORIZONTAL, AxisTuning
-from px4fuse.finding import Severity
+from px4fuse.finding import Finding, Severity
 from px4fuse.findings.cause_grouping import (
     CAUSE_KEY,
     REPORTED_VARIANCE_USED_BY_EKF2_CAUSE,
@@ -35,7 +32,6 @@ from px4fuse.findings.model import (
     Findings,
     find_source_texts,
     finding,
-    format_count,
     format_percent,
     make_error,
     make_note,
@@ -47,6 +43,7 @@ from px4fuse.flight.ekf2_parameters import EV_POS
 from px4fuse.flight.model import (
     Columns,
     Ekf2,
+    PositionTrack,
     Truth,
     Unavailable,
     estimate_white_noise_m,
@@ -140,32 +137,31 @@ def find_low_pass(analysis: Analysis) -> SourceLowPass | None:
     if (
         source.orientation is not None  # odometry: its errors are correlated because of drift
         or source.origin.reconstructed
-        or not _has_valid_time_offset(analysis)
-        or not isinstance(low_pass, SourceLowPass)
+        or (time_offset := _find_valid_time_offset(analysis)) is None
+        or isinstance(low_pass, Unavailable)
         or low_pass.gain_nats < MIN_LOW_PASS_LOG_LIKELIHOOD_RATIO_NATS
         or low_pass.lag_s < MIN_LAG_S
     ):
         return None
-    time_offset, correlated_noise = analysis.clock, analysis.time_correlated_noise
-    # At a high rate, the lag from the noise correlation is inaccurate: use the measured delay
-    lag_limit_s = (
-        -MAX_ESTIMATED_LAG_TO_DELAY_RATIO * time_offset.interval_s[0]
-        if isinstance(time_offset, ClockOffset)
-        else 0.0
-    )
-    if isinstance(time_offset, ClockOffset) and low_pass.lag_s > lag_limit_s >= MIN_LAG_S:
-        low_pass = replace(low_pass, lag_s=-time_offset.offset_s)
+    correlated_noise = analysis.time_correlated_noise
     # Without a delay, correlated errors are not due to a low-pass filter
     if (
         isinstance(correlated_noise, TimeCorrelatedNoise)
         and correlated_noise.low_pass_gain_nats < MIN_LOW_PASS_TO_CORRELATED_NOISE_NATS
     ):
         return None
+    # At a high rate, the lag from the noise correlation is inaccurate: use the measured delay
+    lag_limit_s = -MAX_ESTIMATED_LAG_TO_DELAY_RATIO * time_offset.interval_s[0]
+    if low_pass.lag_s > lag_limit_s >= MIN_LAG_S:
+        return replace(low_pass, lag_s=-time_offset.offset_s)
     return low_pass
 
 
-def _has_valid_time_offset(analysis: Analysis) -> bool:
-    return isinstance(analysis.clock, ClockOffset) and not any(detect_arrival_timestamps(analysis))
+def _find_valid_time_offset(analysis: Analysis) -> ClockOffset | None:
+    """Return the time offset, unless timestamps are arrival times."""
+    if isinstance(analysis.clock, Unavailable) or any(detect_arrival_timestamps(analysis)):
+        return None
+    return analysis.clock
 
 
 def detect_low_pass(analysis: Analysis) -> Findings:
@@ -177,9 +173,9 @@ def detect_low_pass(analysis: Analysis) -> Findings:
             f"{positions_phrase(analysis.source)} are low-pass filtered and lag by "
             f"{low_pass.lag_s:.2f} s. The correlation of successive errors is "
             f"{low_pass.correlation:.1f}; the noise before filtering is {low_pass.sigma_z_m:.2g} "
-            "m. KF and EKF2 assume independent errors, so both are overconfident and lag.",
+            "m. KF and EKF2 lag, and their σ is too small.",
             f"{find_source_texts(analysis.source).low_pass_action} Do not change the timestamps: "
-            "the positions lag behind the vehicle, but their timestamps are correct.",
+            "they are correct.",
             asdict(low_pass),
         )
 
@@ -188,59 +184,44 @@ def detect_jumps(analysis: Analysis) -> Findings:
     """Detect position jumps that the IMU does not measure."""
     systematic_errors = analysis.systematic_errors
     # A change from arrival to measurement times resembles a jump
-    if not isinstance(systematic_errors, SystematicErrors) or any(
-        detect_arrival_timestamps(analysis)
-    ):
+    if isinstance(systematic_errors, Unavailable) or any(detect_arrival_timestamps(analysis)):
         return
-    correlated_noise = analysis.time_correlated_noise
-    min_jump_m = MIN_JUMP_M
+    min_jump_m, correlated_noise = MIN_JUMP_M, analysis.time_correlated_noise
     if not isinstance(correlated_noise, Unavailable):
         # Smaller jumps may be changes of the time-correlated noise
         min_jump_m = max(min_jump_m, MIN_JUMP_SIGMAS * correlated_noise.slow_m)
-    large_jumps = [jump for jump in systematic_errors.jumps if jump.size_m >= min_jump_m]
-    counter_change_times_s = reset_times_s(analysis.source)
-    if large_jumps:
-        largest_jump = max(large_jumps, key=lambda jump: jump.size_m)
-        size_m, jump_time_s, sigma_m = (
-            largest_jump.size_m,
-            largest_jump.time_s,
-            max(step.sigma for step in largest_jump.step_m),
-        )
-        positions_text = positions_phrase(analysis.source)
-        source_texts = find_source_texts(analysis.source)
-        cause = source_texts.jump_causes
-        evidence = {
-            "count": len(large_jumps),
-            "size_m": size_m,
-            "at_s": jump_time_s,
-            "sigma_m": sigma_m,
-        }
-        if np.any(np.abs(counter_change_times_s - jump_time_s) < MAX_JUMP_TO_RESET_COUNTER_TIME_S):
-            evidence[RESET_TIME_KEY] = float(
-                counter_change_times_s[np.argmin(np.abs(counter_change_times_s - jump_time_s))]
-            )
-            cause = (
-                "The source announced the jump (reset_counter): it relocalised or set a new origin."
-            )
-        jump_text = f"jump by {size_m:.2f} m"
-        jump_vectors_m = np.array([[step.value for step in jump.step_m] for jump in large_jumps])
-        after_jump_text = "stay there"
-        if np.linalg.norm(jump_vectors_m.sum(axis=0)) < MIN_JUMP_M:
-            after_jump_text = "return afterwards"
-        if len(large_jumps) > 1:
-            jump_text = f"jump {format_count(len(large_jumps))}, by up to {size_m:.2f} m"
-        yield finding(
-            "error" if size_m >= MIN_JUMP_FOR_ERROR_M else "warning",
-            "source_position_jump",
-            f"{positions_text} {jump_text} at {jump_time_s:.1f} s and {after_jump_text}. The IMU "
-            f"does not measure this motion (± {1.96 * sigma_m:.2f} m, 95 %). {cause} KF and EKF2 "
-            "follow "
-            "the jump, and their innovations stay consistent.",
-            f"{source_texts.jump_action} Analyse only the time before or after the jump (--start, "
-            "--end).",
-            evidence,
-            make_zero_length_spans(jump.time_s for jump in large_jumps),
-        )
+    jumps = [jump for jump in systematic_errors.jumps if jump.size_m >= min_jump_m]
+    if not jumps:
+        return
+    largest_jump = max(jumps, key=lambda jump: jump.size_m)
+    size_m, time_s = largest_jump.size_m, largest_jump.time_s
+    sigma_m = max(step.sigma for step in largest_jump.step_m)
+    source_texts = find_source_texts(analysis.source)
+    cause = source_texts.jump_causes
+    evidence = {"count": len(jumps), "size_m": size_m, "at_s": time_s, "sigma_m": sigma_m}
+    counter_time_s = min(
+        reset_times_s(analysis.source), key=lambda at_s: abs(at_s - time_s), default=np.inf
+    )
+    if abs(counter_time_s - time_s) < MAX_JUMP_TO_RESET_COUNTER_TIME_S:
+        evidence[RESET_TIME_KEY] = float(counter_time_s)
+        cause = "The source announced the jump (reset_counter): it relocalised or set a new origin."
+    jump_text = f"jump by {size_m:.2f} m"
+    if len(jumps) > 1:
+        jump_text = f"jump {len(jumps)} times, by up to {size_m:.2f} m"
+    total_step_m = np.sum([[step.value for step in jump.step_m] for jump in jumps], axis=0)
+    returns = np.linalg.norm(total_step_m) < MIN_JUMP_M
+    yield finding(
+        "error" if size_m >= MIN_JUMP_FOR_ERROR_M else "warning",
+        "source_position_jump",
+        f"{positions_phrase(analysis.source)} {jump_text} at {time_s:.1f} s and "
+        f"{'return afterwards' if returns else 'stay there'}. The IMU does not measure this motion "
+        f"(± {1.96 * sigma_m:.2f} m, 95 %). {cause} KF and EKF2 follow the jump with consistent "
+        "innovations.",
+        f"{source_texts.jump_action} Analyse only the time before or after the jump (--start, "
+        "--end).",
+        evidence,
+        make_zero_length_spans(jump.time_s for jump in jumps),
+    )
 
 
 def detect_constant_coordinates(analysis: Analysis) -> Findings:
@@ -253,37 +234,30 @@ def detect_constant_coordinates(analysis: Analysis) -> Findings:
     ):
         return  # rounded positions may be constant in motion
     values_m = dict(zip("xyz", source.samples[Columns.POSITION].median().tolist(), strict=True))
-    finding_id, mask_of_constant, make_finding = (
-        "source_coordinate_constant",
-        EV_CTRL_HORIZONTAL_MASK,
-        make_error,
-    )
+    finding_id, make_finding = "source_coordinate_constant", make_error
+    mask_of_constant, mask_of_measured = EV_CTRL_HORIZONTAL_MASK, EV_CTRL_HEIGHT_MASK
     consequence = "px4fuse estimates nothing from these positions."
     if coordinates == ["z"]:
-        finding_id, mask_of_constant, make_finding = (
-            "source_height_constant",
-            EV_CTRL_HEIGHT_MASK,
-            make_warning,
-        )
-        consequence = "The height is not a measurement, so it is not evaluated."
+        finding_id, make_finding = "source_height_constant", make_warning
+        mask_of_constant, mask_of_measured = mask_of_measured, mask_of_constant
+        consequence = "The height is not evaluated."
     elif coordinates == ["x", "y"]:
         make_finding = make_warning
-        consequence = "Only the height is a measurement. The horizontal position is not evaluated."
+        consequence = "Only the height is evaluated."
     action, coordinates_text = "", " and ".join(coordinates)
     if fusion_parameter in analysis.flight.log.parameters:
-        fusion_parameter_value = int(analysis.flight.log.parameters[fusion_parameter])
-        setting_action = f"Leave {fusion_parameter} at {fusion_parameter_value}"
-        if fusion_parameter_value & mask_of_constant:
-            mask_of_measured = EV_CTRL_HORIZONTAL_MASK + EV_CTRL_HEIGHT_MASK - mask_of_constant
-            new_value = fusion_parameter_value & ~mask_of_constant | mask_of_measured
+        value = int(analysis.flight.log.parameters[fusion_parameter])
+        setting_action = f"Leave {fusion_parameter} at {value}"
+        if value & mask_of_constant:
+            new_value = value & ~mask_of_constant | mask_of_measured
             setting_action = f"Set {fusion_parameter} to {new_value}"
         elif coordinates == ["z"]:
             make_finding = make_note
         action = f"{setting_action}, so that EKF2 does not fuse {coordinates_text}. "
     values_text = ", ".join(f"{values_m[each]:g}" for each in coordinates)
-    subject, verb, pronoun = ("coordinates", "are", "them")
+    subject, verb, pronoun = "coordinates", "are", "them"
     if is_single_coordinate:
-        subject, verb, pronoun = ("coordinate", "is", "it")
+        subject, verb, pronoun = "coordinate", "is", "it"
     yield make_finding(
         finding_id,
         f"The {subject} {coordinates_text} of {source.name} {verb} constant ({values_text} m): the "
@@ -299,32 +273,20 @@ def detect_repeated_jumps(analysis: Analysis) -> Findings:
     jumps, is_announced_by_source = _find_jumps(analysis)
     if len(jumps) < MIN_JUMPS_WITHOUT_RESET_COUNTER and not is_announced_by_source:
         return
-    times_s, jump_vectors_m = (
-        np.array([time_s for time_s, _ in jumps]),
-        np.array([step_m for _, step_m in jumps]),
-    )
+    times_s = np.array([time_s for time_s, _ in jumps])
+    jump_vectors_m = np.array([step_m for _, step_m in jumps])
     jump_sizes_m = np.linalg.norm(jump_vectors_m, axis=1)
-    ekf2_reset_times_s = [
-        reset.time_s
-        for reset in (ekf2.resets if isinstance(ekf2, Ekf2) else ())
-        if reset.quantity == "position" and any(reset.delta[:2])
+    ekf2_resets = ekf2.find_horizontal_resets() if isinstance(ekf2, Ekf2) else []
+    first_reset_delays_s = [
+        min((reset.time_s - at_s for reset in ekf2_resets if reset.time_s > at_s), default=np.inf)
+        for at_s in times_s
     ]
-    reset_delays_after_jump_s = [
-        min(delays_after_jump_s)
-        for jump_time_s in times_s
-        if (
-            delays_after_jump_s := [
-                at_s - jump_time_s
-                for at_s in ekf2_reset_times_s
-                if 0.0 < at_s - jump_time_s < MAX_JUMP_TO_RESET_TIME_S
-            ]
-        )
-    ]
+    reset_delays_s = [delay for delay in first_reset_delays_s if delay < MAX_JUMP_TO_RESET_TIME_S]
     reset_sentence = ""
-    if reset_delays_after_jump_s:
+    if reset_delays_s:
         reset_sentence = (
             " EKF2 rejects the positions after a jump and resets its position "
-            f"{np.median(reset_delays_after_jump_s):.1f} s later."
+            f"{np.median(reset_delays_s):.1f} s later."
         )
     jump_times_text = ", ".join(f"{at_s:.1f}" for at_s in times_s[:MAX_LISTED_JUMPS])
     is_reversal = np.sum(jump_vectors_m[1:] * jump_vectors_m[:-1], axis=1) < 0.0
@@ -339,7 +301,7 @@ def detect_repeated_jumps(analysis: Analysis) -> Findings:
             "The source alternately sends the positions of two points of the vehicle, "
             f"{np.median(jump_sizes_m):.2f} m apart."
         )
-        action = "Send the position of the same point of the vehicle, for example of one tag."
+        action = "Send the position of one point of the vehicle, for example of one tag."
     yield make_error(
         "source_relocalises",
         f"The source jumps {len(jumps)} times, by up to {jump_sizes_m.max():.2f} m. The "
@@ -357,18 +319,19 @@ def detect_repeated_jumps(analysis: Analysis) -> Findings:
 
 def _find_jumps(analysis: Analysis) -> tuple[list[tuple[float, Array]], bool]:
     """Return time (s) and step (m) of each jump, and True if ``reset_counter`` announces them."""
-    position_m = cut_to_segment(analysis.source.samples, analysis.segment)[
-        Columns.POSITION[:2]
-    ].dropna()
+    position_m = analysis.source_samples[Columns.POSITION[:2]].dropna()
     # A position change after a repeated position contains the motion of two intervals
     position_m = position_m[(position_m.diff() != 0.0).any(axis=1)]
-    time_s, position_changes_m = position_m.index.to_numpy(), np.diff(position_m.to_numpy(), axis=0)
+    time_s = position_m.index.to_numpy()
+    position_changes_m = np.diff(position_m.to_numpy(), axis=0)
     if len(position_changes_m) < MIN_POSITIONS_FOR_JUMPS:
         return [], False
     jump_vectors_m = position_changes_m[1:-1] - 0.5 * (
         position_changes_m[:-2] + position_changes_m[2:]
     )
-    jump_sizes_m, intervals_s = np.linalg.norm(jump_vectors_m, axis=1), np.diff(time_s)[1:-1]
+    jump_sizes_m = np.linalg.norm(jump_vectors_m, axis=1)
+    intervals_s = np.diff(time_s)[1:-1]
+    median_interval_s = float(np.median(intervals_s))
     reset_rows = (
         np.searchsorted(time_s, reset_times_s(analysis.source) - RESET_TIME_TOLERANCE_S) - 2
     )
@@ -384,24 +347,16 @@ def _find_jumps(analysis: Analysis) -> tuple[list[tuple[float, Array]], bool]:
         MIN_JUMP_TO_MEDIAN_CHANGE_RATIO * local_median_change_m.to_numpy(),
     )
     is_jump = (jump_sizes_m > min_jump_sizes_m) & (
-        intervals_s < MAX_JUMP_TO_MEDIAN_INTERVAL_RATIO * np.median(intervals_s)
+        intervals_s < MAX_JUMP_TO_MEDIAN_INTERVAL_RATIO * median_interval_s
     )
-    window_sample_count = max(
-        MIN_JUMP_DURATION_SAMPLES, round(MIN_JUMP_DURATION_S / float(np.median(intervals_s)))
-    )
+    window_size = max(MIN_JUMP_DURATION_SAMPLES, round(MIN_JUMP_DURATION_S / median_interval_s))
     jumps = []
     for row in np.flatnonzero(is_jump) + 2:  # the first position after the jump
-        positions_before_m, positions_after_m = (
-            position_m.iloc[max(row - window_sample_count, 0) : row],
-            position_m.iloc[row:][:window_sample_count],
-        )
-        nearby_changes_m = position_changes_m[
-            max(row - window_sample_count, 0) : row + window_sample_count
-        ]
+        first_row, end_row = max(row - window_size, 0), row + window_size
         median_shift_m = (
-            positions_after_m.median()
-            - positions_before_m.median()
-            - window_sample_count * np.median(nearby_changes_m, axis=0)
+            position_m.iloc[row:end_row].median()
+            - position_m.iloc[first_row:row].median()
+            - window_size * np.median(position_changes_m[first_row:end_row], axis=0)
         )
         if (
             np.linalg.norm(median_shift_m - jump_vectors_m[row - 2])
@@ -414,33 +369,44 @@ def _find_jumps(analysis: Analysis) -> tuple[list[tuple[float, Array]], bool]:
 def detect_scale_error(analysis: Analysis) -> Findings:
     """Detect a scale factor error of the positions relative to the IMU."""
     imu, systematic_errors = analysis.flight.imu, analysis.systematic_errors
-    if not isinstance(imu, pd.DataFrame) or is_rate_too_low(imu, MIN_IMU_RATE_HZ):
-        return
     if (
-        analysis.source.origin.is_gnss  # GNSS has no scale factor error
+        isinstance(imu, Unavailable)
+        or is_rate_too_low(imu, MIN_IMU_RATE_HZ)
+        or analysis.source.origin.is_gnss  # GNSS has no scale factor error
         or isinstance(analysis.flight.truth, Truth)  # with ground truth, see source_patterns.py
-        or not isinstance(systematic_errors, SystematicErrors)
+        or isinstance(systematic_errors, Unavailable)
         # A low-pass filter or time-correlated noise may resemble a scale error
         or find_low_pass(analysis) is not None
         or not isinstance(analysis.time_correlated_noise, Unavailable)
-        or not _has_valid_time_offset(analysis)
+        or _find_valid_time_offset(analysis) is None
     ):
         return
     scale_error, sigma = systematic_errors.scale.value, systematic_errors.scale.sigma
     if abs(scale_error) >= max(MIN_SCALE_ERROR_FOR_WARNING, MIN_SCALE_ERROR_TO_SIGMA_RATIO * sigma):
-        yield finding(
-            "error" if abs(scale_error) >= MIN_SCALE_ERROR_FOR_SEVERITY_ERROR else "warning",
-            "source_scale_error",
-            f"{source_name(analysis.source)} distances are "
-            f"{format_percent(abs(scale_error))} too {'long' if scale_error > 0 else 'short'}. The "
-            f"comparison with the IMU is accurate to ± {format_percent(1.96 * sigma)} (95 %). "
-            "Innovations do not show a scale factor error.",
+        yield make_scale_finding(
+            analysis.source,
+            scale_error,
+            sigma,
+            f"the IMU is accurate to ± {format_percent(1.96 * sigma)}",
             "Measure a known distance with the source. "
             f"{find_source_texts(analysis.source).scale_check}. If the distance is right, "
-            "calibrate the "
-            "accelerometers.",
-            {"scale": 1.0 + scale_error, "sigma": sigma},
+            "calibrate the accelerometers.",
         )
+
+
+def make_scale_finding(
+    source: PositionTrack, scale_error: float, sigma: float, accuracy_text: str, action: str
+) -> Finding:
+    """Make the finding on a scale factor error; ``accuracy_text`` names the reference."""
+    return finding(
+        "error" if abs(scale_error) >= MIN_SCALE_ERROR_FOR_SEVERITY_ERROR else "warning",
+        "source_scale_error",
+        f"{source_name(source)} distances are {format_percent(abs(scale_error))} too "
+        f"{'long' if scale_error > 0.0 else 'short'}. The comparison with {accuracy_text} (95 %). "
+        "Innovations do not show a scale factor error.",
+        action,
+        {"scale": 1.0 + scale_error, "sigma": sigma},
+    )
 
 
 def detect_outliers(analysis: Analysis) -> Findings:
@@ -448,44 +414,34 @@ def detect_outliers(analysis: Analysis) -> Findings:
     axis_tuning = analysis.tuning.get(HORIZONTAL) or next(iter(analysis.tuning.values()), None)
     if not isinstance(axis_tuning, AxisTuning):
         return
-    systematic_errors = analysis.systematic_errors
-    jump_times_s = (
-        [jump.time_s for jump in systematic_errors.jumps]
-        if isinstance(systematic_errors, SystematicErrors)
-        else []
-    )
-    outlier_times_s = [
-        time_s
-        for time_s in axis_tuning.outlier_time_s.tolist()
-        if not any(
-            jump_time_s - OUTLIER_BURST_DURATION_S
-            <= time_s
-            < jump_time_s + OUTLIER_RETEST_DURATION_AFTER_JUMP_S
-            for jump_time_s in jump_times_s
+    outlier_time_s, systematic_errors = axis_tuning.outlier_time_s, analysis.systematic_errors
+    for jump in () if isinstance(systematic_errors, Unavailable) else systematic_errors.jumps:
+        is_near_jump = (outlier_time_s >= jump.time_s - OUTLIER_BURST_DURATION_S) & (
+            outlier_time_s < jump.time_s + OUTLIER_RETEST_DURATION_AFTER_JUMP_S
         )
-    ]
-    outlier_count, outlier_fraction = len(outlier_times_s), len(outlier_times_s) / axis_tuning.count
+        outlier_time_s = outlier_time_s[~is_near_jump]
+    outlier_count = len(outlier_time_s)
+    outlier_fraction = outlier_count / axis_tuning.count
     if outlier_fraction < MIN_OUTLIER_FRACTION or outlier_count < MIN_OUTLIERS:
         return
     source_texts = find_source_texts(analysis.source)
-    outlier_sizes_m, reference = compute_outlier_sizes_m(analysis, np.array(outlier_times_s))
+    outlier_sizes_m, reference = compute_outlier_sizes_m(analysis, outlier_time_s)
     yield finding(
         "error" if outlier_fraction >= MIN_OUTLIER_FRACTION_FOR_ERROR else "warning",
         "source_outliers",
         f"{outlier_count} of {axis_tuning.count} {positions_phrase(analysis.source)} "
         f"({format_percent(outlier_fraction, 1)}) are outliers of up to "
-        f"{format_metres(float(outlier_sizes_m.max()))} m. Their median distance to {reference} is "
-        f"{format_metres(float(np.median(outlier_sizes_m)))} m. "
-        f"{source_texts.outlier_causes} KF rejects no outliers and follows each "
-        f"outlier.{_format_rejected_outliers(analysis, outlier_times_s)}",
+        f"{format_metres(outlier_sizes_m.max())} m. Their median distance to {reference} is "
+        f"{format_metres(float(np.median(outlier_sizes_m)))} m. {source_texts.outlier_causes} KF "
+        f"follows each outlier.{_format_rejected_outliers(analysis, outlier_time_s)}",
         source_texts.outlier_action,
         {
             "count": outlier_count,
             "share": outlier_fraction,
-            "first_s": outlier_times_s[0],
+            "first_s": float(outlier_time_s[0]),
             "max_m": float(outlier_sizes_m.max()),
         },
-        make_zero_length_spans(outlier_times_s),
+        make_zero_length_spans(outlier_time_s),
     )
 
 
@@ -513,80 +469,77 @@ def compute_outlier_sizes_m(analysis: Analysis, outlier_time_s: Array) -> tuple[
     return np.sqrt(squared_distances_m2), reference
 
 
-def _format_rejected_outliers(analysis: Analysis, outlier_times_s: Sequence[float]) -> str:
+def _format_rejected_outliers(analysis: Analysis, outlier_time_s: Array) -> str:
     innovations = analysis.main.ekf2_innovations
-    if not isinstance(innovations, pd.DataFrame) or innovations["rejected"].isna().any():
-        return ""
-    if len(innovations) < MIN_LOGGED_POSITION_FRACTION * len(analysis.main.axis.measurement_time_s):
+    position_count = len(analysis.main.axis.measurement_time_s)
+    if (
+        isinstance(innovations, Unavailable)
+        or innovations["rejected"].isna().any()
+        or len(innovations) < MIN_LOGGED_POSITION_FRACTION * position_count
+    ):
         return ""
     rejection_times_s = innovations.index[innovations["rejected"] > 0.0].to_numpy()
-    tolerance_s = 0.5 / analysis.source.compute_rate_hz()
-    rejected_count = sum(
-        bool(np.any(np.abs(rejection_times_s - time_s) < tolerance_s)) for time_s in outlier_times_s
-    )
-    return f" EKF2's gate rejected {rejected_count} of the {len(outlier_times_s)} outliers."
+    distances_s = np.abs(rejection_times_s - outlier_time_s[:, None])
+    is_rejected = np.any(distances_s < 0.5 / analysis.source.compute_rate_hz(), axis=1)
+    return f" EKF2's gate rejected {is_rejected.sum()} of the {len(is_rejected)} outliers."
 
 
 def detect_wrong_variance(analysis: Analysis) -> Findings:
     """Detect a reported variance that differs from the estimated position noise."""
     source, axis_tuning = analysis.source, analysis.tuning.get(HORIZONTAL)
-    may_be_low_pass_filtered = (
-        isinstance(analysis.source_low_pass, Unavailable) or find_low_pass(analysis) is not None
-    )
     if (
-        may_be_low_pass_filtered
+        isinstance(analysis.source_low_pass, Unavailable)
+        or find_low_pass(analysis) is not None
         or not isinstance(axis_tuning, AxisTuning)
         or not source.origin.is_vision
     ):
         return
-    reported_variance_m2 = cut_to_segment(source.samples, analysis.segment)[
-        Columns.POSITION_VARIANCE[:2]
-    ].dropna()
-    noise = axis_tuning.sigma_z
-    noise_m, low, high = noise.value, noise.low, noise.high
+    reported_variance_m2 = analysis.source_samples[Columns.POSITION_VARIANCE[:2]].dropna()
+    noise_m, low, high = (
+        axis_tuning.sigma_z.value,
+        axis_tuning.sigma_z.low,
+        axis_tuning.sigma_z.high,
+    )
     if reported_variance_m2.empty or noise_m is None or low is None or high is None:
         return
-    reported_sigma_m = float(np.sqrt(reported_variance_m2.to_numpy().mean(axis=1)).mean())
+    reported_sigma_m = float(np.sqrt(reported_variance_m2.mean(axis=1)).mean())
     variance_ratio = (reported_sigma_m / noise_m) ** 2
-    variance_error_factor = max(variance_ratio, 1.0 / variance_ratio)
+    error_factor = max(variance_ratio, 1.0 / variance_ratio)
     # A reported variance near the mean square error against ground truth is correct
     rmse_m = _compute_rmse_per_axis_m(analysis) if variance_ratio > 1.0 else None
-    if rmse_m is not None and reported_sigma_m**2 < MIN_REPORTED_VARIANCE_FACTOR * rmse_m**2:
-        return
     if (
-        variance_error_factor >= MIN_REPORTED_VARIANCE_FACTOR
-        and not low <= reported_sigma_m <= high
+        (rmse_m is not None and reported_sigma_m**2 < MIN_REPORTED_VARIANCE_FACTOR * rmse_m**2)
+        or error_factor < MIN_REPORTED_VARIANCE_FACTOR
+        or low <= reported_sigma_m <= high
     ):
-        size_word, correlation_note = "small" if variance_ratio < 1.0 else "large", ""
-        if size_word == "large" and rmse_m is None:
-            correlation_note = (
-                " The reported σ may be correct: innovations do not show time-correlated errors."
-            )
-        severity: Severity = (
-            "error"
-            if variance_error_factor >= MIN_REPORTED_VARIANCE_FACTOR_FOR_ERROR
-            else "warning"
+        return
+    size_word, correlation_note = "small" if variance_ratio < 1.0 else "large", ""
+    if variance_ratio > 1.0 and rmse_m is None:
+        correlation_note = (
+            " The reported σ may be correct: innovations do not show time-correlated errors."
         )
-        effect = (
-            "EKF2 uses the larger of reported variance and EKF2_EVP_NOISE² (EKF2_EV_NOISE_MD 0)."
-        )
-        if analysis.flight.log.parameters.get("EKF2_EV_NOISE_MD") == 1:
-            severity, effect = "note", "EKF2 ignores reported variances (EKF2_EV_NOISE_MD 1)."
-        yield finding(
-            severity,
-            "source_reported_variance_wrong",
-            f"The variance that {source_name(source)} reports is "
-            f"{format_factor(variance_error_factor)} times too {size_word}. The reported σ is "
-            f"{reported_sigma_m:.3g} m, the position noise {noise_m:.3g} m (95 % {low:.3g} to "
-            f"{high:.3g} m). {effect}{correlation_note}",
-            f"Report a variance of {noise_m**2:.2g} m² with each position.",
-            {
-                "reported_sigma_m": reported_sigma_m,
-                "sigma_z_m": noise_m,
-                "variance_factor": variance_ratio,
-                CAUSE_KEY: REPORTED_VARIANCE_USED_BY_EKF2_CAUSE if severity != "note" else "",
-            },
-        )
+    severity: Severity = (
+        "error" if error_factor >= MIN_REPORTED_VARIANCE_FACTOR_FOR_ERROR else "warning"
+    )
+    cause = REPORTED_VARIANCE_USED_BY_EKF2_CAUSE
+    effect = "EKF2 uses the larger of reported variance and EKF2_EVP_NOISE² (EKF2_EV_NOISE_MD 0)."
+    if analysis.flight.log.parameters.get("EKF2_EV_NOISE_MD") == 1:
+        severity, cause = "note", ""
+        effect = "EKF2 ignores reported variances (EKF2_EV_NOISE_MD 1)."
+    yield finding(
+        severity,
+        "source_reported_variance_wrong",
+        f"The variance that {source_name(source)} reports is {format_factor(error_factor)} times "
+        f"too {size_word}. The reported σ is {reported_sigma_m:.3g} m, the position noise "
+        f"{noise_m:.3g} m (95 % {low:.3g} to {high:.3g} m). {effect}{correlation_note}",
+        f"Report a variance of {noise_m**2:.2g} m² with each position.",
+        {
+            "reported_sigma_m": reported_sigma_m,
+            "sigma_z_m": noise_m,
+            "variance_factor": variance_ratio,
+            CAUSE_KEY: cause,
+        },
+    )
 
 
 def _compute_rmse_per_axis_m(analysis: Analysis) -> float | None:
@@ -604,16 +557,14 @@ def _compute_rmse_per_axis_m(analysis: Analysis) -> float | None:
 
 def compute_motion_range_m(comparison: Comparison) -> float:
     """Return the larger extent (m) of the positions, north or east, 5th to 95th percentile."""
-    samples = cut_to_segment(comparison.source.samples, comparison.segment)
-    low, high = samples[Columns.POSITION[:2]].quantile([0.05, 0.95]).to_numpy()
+    positions = comparison.source_samples[Columns.POSITION[:2]]
+    low, high = positions.quantile([0.05, 0.95]).to_numpy()
     return float(np.max(high - low))
 
 
 def has_little_motion(comparison: Comparison) -> bool:
     """Return True if the extent of the positions is small, or not larger than their noise."""
-    positions = cut_to_segment(comparison.source.samples, comparison.segment)[
-        Columns.POSITION[:2]
-    ].dropna()
+    positions = comparison.source_samples[Columns.POSITION[:2]].dropna()
     noise_m = estimate_white_noise_m(positions.to_numpy())
     return compute_motion_range_m(comparison) < max(
         MIN_MOTION_RANGE_M, MIN_MOTION_RANGE_TO_NOISE_RATIO * noise_m
@@ -626,9 +577,8 @@ def detect_little_motion(analysis: Analysis) -> Findings:
     if has_little_motion(analysis):
         yield make_warning(
             "no_motion",
-            f"The vehicle moved only {extent_m:.2f} m horizontally. This is the range of the "
-            "positions (5th to 95th percentile). Velocity, heading and time offset cannot be "
-            "estimated from this flight.",
+            f"The vehicle moved only {extent_m:.2f} m horizontally. Velocity, heading and time "
+            "offset cannot be estimated from positions of this range (5th to 95th percentile).",
             "Fly several passes of 5 m or more, with clear starts and stops.",
             {"range_m": extent_m}
             | ({CAUSE_KEY: VEHICLE_ON_GROUND_CAUSE} if analysis.flight.airborne == () else {}),

@@ -6,12 +6,9 @@ import numpy as np
 import pandas as pd
 
 from px4fuse.analysis import Analysis
-from px4fuse.core.arrays import Array, rank_correlation
+from px4fuse.core.arrays import rank_correlation
 from px4fuse.core.text import format_metres
-from px4fuse.ekf2.fusion_conditions import (
-    EFFECT_BY_UNUSABLE_TIMESTAMP,
-    find_timestamp_action,
-)
+from px4fuse.ekf2.fusion_conditions import EFFECT_BY_UNUSABLE_TIMESTAMP, find_timestamp_action
 from px4fuse.ekf2.intervals import MAX_DELAY_BEHIND_HORIZON_S
 from px4fuse.findings.model import (
     Findings,
@@ -27,7 +24,6 @@ from px4fuse.flight.model import (
     REPEATED_TIMESTAMPS_NOTE,
     ClockMap,
     Ekf2,
-    FusionRecord,
     Unavailable,
     positions_phrase,
 )
@@ -72,13 +68,11 @@ def detect(analysis: Analysis) -> Findings:
         yield from detect_constant_timestamps(positions_text, clock_map, clock_map.distinct_stamps)
     elif clock_map.method in METHODS_WITHOUT_MEASUREMENT_TIMES:
         kf_times_sentence = (
-            "KF uses the timestamps of the messages. px4fuse converts them to boot time by the "
+            "KF uses the timestamps of the messages, converted to boot time by the "
             f"{clock_map.method}."
         )
         if clock_map.method == "arrival time":
-            kf_times_sentence = (
-                "KF uses arrival times like EKF2. Both tracks lag by the latency of the positions."
-            )
+            kf_times_sentence = "KF also uses arrival times: both tracks lag by the latency."
         yield make_warning(
             "companion_not_synchronised",
             f"The source of the {positions_text} never synchronised its clock (TIMESYNC). EKF2 "
@@ -94,8 +88,9 @@ def detect_bursts(analysis: Analysis) -> Findings:
     is_pause = intervals_s > intervals_s.mean()
     if np.count_nonzero(is_pause) < MIN_BURST_COUNT:
         return
-    burst_size, pause_s = 1.0 / float(is_pause.mean()), float(np.median(intervals_s[is_pause]))
-    burst_duration_s = burst_size * float(np.median(intervals_s[~is_pause]))
+    burst_size = 1.0 / float(is_pause.mean())
+    pause_s = float(np.median(intervals_s[is_pause]))
+    burst_duration_s = burst_size * np.median(intervals_s[~is_pause])
     if (
         burst_size < MIN_BURST_POSITIONS
         or burst_duration_s > MAX_BURST_TO_PAUSE_DURATION_RATIO * pause_s
@@ -104,11 +99,9 @@ def detect_bursts(analysis: Analysis) -> Findings:
     yield make_error(
         "source_timestamp_jitter",
         f"The timestamps of the {positions_phrase(analysis.source)} come in bursts of "
-        f"{burst_size:.0f}, every {pause_s:.2g} s "
-        f"({analysis.source.compute_rate_hz():.3g} Hz on average). "
-        "They are arrival times: the positions were "
-        f"measured up to {pause_s:.2g} s earlier. At 1 m/s this is a position error of up to "
-        f"{format_metres(pause_s)} m along the motion.",
+        f"{burst_size:.0f}, every {pause_s:.2g} s ({analysis.source.compute_rate_hz():.3g} Hz on "
+        f"average). The positions were measured up to {pause_s:.2g} s earlier. At 1 m/s this is a "
+        f"position error of up to {format_metres(pause_s)} m.",
         "Send each position at once, with its time of measurement.",
         {"burst_size": burst_size, "interval_s": pause_s},
     )
@@ -124,8 +117,7 @@ def detect_repeated_timestamps(
         f"The timestamps of the {positions_phrase(analysis.source)} have a resolution of "
         f"{resolution_s:.3g} s. The {sample_count} samples ({rate_hz:.2g} Hz) have only "
         f"{distinct_count} different timestamps. px4fuse uses the first sample of each timestamp. "
-        "At 1 m/s the position error due to this resolution is up to "
-        f"{format_metres(resolution_s)} m.",
+        f"At 1 m/s the position error is up to {format_metres(resolution_s)} m.",
         "Send the time of measurement with a resolution of microseconds.",
         {"resolution_s": resolution_s, "samples": sample_count, "distinct": distinct_count},
     )
@@ -133,20 +125,20 @@ def detect_repeated_timestamps(
 
 def detect_timestamp_unit(analysis: Analysis, clock_name: str) -> Findings:
     """Report timestamps in a wrong unit or from another clock."""
-    ekf2, segment = analysis.flight.ekf2, analysis.segment
+    ekf2, fusion_sentence = analysis.flight.ekf2, ""
     fusion_flags = ekf2.fusion_flags if isinstance(ekf2, Ekf2) else ekf2
-    fusion_sentence = ""
     if isinstance(fusion_flags, pd.DataFrame) and not compute_flag_fraction(
-        fusion_flags["horizontal"], segment
+        fusion_flags["horizontal"], analysis.segment
     ):
-        effect_sentence = EFFECT_BY_UNUSABLE_TIMESTAMP[clock_name]
-        fusion_sentence = f"EKF2 never fused the positions. {effect_sentence} "
+        fusion_sentence = (
+            f"EKF2 never fused the positions. {EFFECT_BY_UNUSABLE_TIMESTAMP[clock_name]} "
+        )
     yield make_error(
         "source_timestamp_unit",
         f"The timestamps of the {positions_phrase(analysis.source)} are "
         f"{'0 in every message' if clock_name == '0' else f'in {clock_name}'}. PX4 expects "
         f"timestamp_sample in microseconds since the autopilot's boot. {fusion_sentence}px4fuse "
-        "uses the arrival times, which are later than the times of measurement.",
+        "uses the arrival times, which are late by the latency.",
         find_timestamp_action(clock_name),
         {"clock": clock_name},
     )
@@ -158,20 +150,16 @@ def detect_constant_timestamps(
     yield make_error(
         "source_timestamps_constant",
         f"The timestamps of {clock_map.pairs} {positions_text} have only {distinct_count} "
-        "distinct values. The time of measurement is unknown; px4fuse uses the receive time "
-        "instead.",
-        "Send the time of measurement in the message (usec, time_usec), in microseconds and as a "
-        "64-bit integer.",
+        "distinct values. The time of measurement is unknown; px4fuse uses the receive time.",
+        "Send the time of measurement (usec, time_usec) in microseconds, as a 64-bit integer.",
         {"stamps": clock_map.pairs, "distinct": distinct_count},
     )
     if (jitter_s := clock_map.jitter_s) > MAX_RECEIPT_JITTER_S:
         yield make_warning(
             "source_timestamp_jitter",
             f"The receive times of the {positions_text} jitter by {jitter_s * 1e3:.0f} ms (1 σ). "
-            "px4fuse uses them as timestamps. At 1 m/s this is a position error of "
-            f"{format_metres(jitter_s)} m.",
-            "Send the time of measurement in the message, and record the log on the computer that "
-            "sends the positions.",
+            f"At 1 m/s this is a position error of {format_metres(jitter_s)} m.",
+            "Send the time of measurement, and record on the computer that sends the positions.",
             {"jitter_s": jitter_s},
         )
 
@@ -196,9 +184,9 @@ def detect_arrival_timestamps(analysis: Analysis) -> Findings:
         yield make_finding(
             "source_timestamps_are_arrival_times",
             f"Position timestamps are arrival times until {convergence_time_s:.1f} s, when "
-            "TIMESYNC converged "
-            "(PX4 needs 500 answers). Later timestamps are times of measurement, "
-            f"{latency_s:.3f} s before arrival. One time offset cannot correct the whole flight.",
+            "TIMESYNC converged (PX4 needs 500 answers). Later timestamps are times of "
+            f"measurement, {latency_s:.3f} s before arrival. One time offset cannot correct the "
+            "whole flight.",
             "Let the clocks synchronise for one minute before take-off. Analyse only the later "
             f"time (--start {math.ceil(convergence_time_s)}).",
             {"until_s": convergence_time_s, "latency_s": latency_s},
@@ -211,7 +199,7 @@ def detect_arrival_timestamps(analysis: Analysis) -> Findings:
         yield make_warning(
             "source_timestamps_are_arrival_times",
             "Position timestamps are arrival times in the whole flight. The source was never "
-            "synchronised with the autopilot (TIMESYNC), so every position is late by its latency.",
+            "synchronised with the autopilot (TIMESYNC), so positions are late by their latency.",
             ANSWER_TIMESYNC_ACTION,
             {"until_s": float(position_age_s.index[-1])},
         )
@@ -228,7 +216,7 @@ def detect_varying_latency(analysis: Analysis) -> Findings:
         for age_s in (position_age_s.iloc[:sample_count], position_age_s.iloc[-sample_count:])
     )
     change_verb = "grows"
-    rank_correlation_of_age_with_time = rank_correlation(
+    correlation_with_time = rank_correlation(
         position_age_s.index.to_numpy(), position_age_s.to_numpy()
     )
     ekf2, late_drop_sentence, dropped_fraction = analysis.flight.ekf2, "", 0.0
@@ -240,19 +228,13 @@ def detect_varying_latency(analysis: Analysis) -> Findings:
             f" EKF2 drops positions that arrive more than {limit_s:.2f} s after their timestamp: "
             f"{format_percent(dropped_fraction)} in this flight."
         )
-    if (
-        end_s - start_s < MIN_LATENCY_FOR_ERROR_S
-        or rank_correlation_of_age_with_time < MIN_LATENCY_CORRELATION
-    ):
-        if (
-            not MIN_DROPPED_POSITION_FRACTION
-            < dropped_fraction
-            < 1.0 - MIN_DROPPED_POSITION_FRACTION
-        ):
+    is_any_dropped = dropped_fraction > MIN_DROPPED_POSITION_FRACTION
+    if end_s - start_s < MIN_LATENCY_FOR_ERROR_S or correlation_with_time < MIN_LATENCY_CORRELATION:
+        if not is_any_dropped or dropped_fraction >= 1.0 - MIN_DROPPED_POSITION_FRACTION:
             return
         change_verb = "varies"
         start_s, end_s = position_age_s.quantile([0.05, 0.95]).tolist()
-    yield (make_error if dropped_fraction > MIN_DROPPED_POSITION_FRACTION else make_warning)(
+    yield (make_error if is_any_dropped else make_warning)(
         "source_latency_varies",
         f"The latency of the {positions_phrase(analysis.source)} {change_verb} in flight from "
         f"{start_s:.2f} s to {end_s:.2f} s (time from measurement to arrival).{late_drop_sentence}",
@@ -268,42 +250,28 @@ def find_timesync_convergence(analysis: Analysis) -> tuple[float, float] | None:
     if position_age_s is None:
         return None
     is_arrival_time = (position_age_s.abs() < MAX_ARRIVAL_TO_PUBLICATION_DELAY_S).to_numpy()
-    # Count the timestamps that contradict convergence after each position
-    contradicting_timestamp_counts: Array = (
-        np.cumsum(~is_arrival_time) + np.sum(is_arrival_time) - np.cumsum(is_arrival_time)
-    )
-    converged_index = int(np.argmin(contradicting_timestamp_counts)) + 1
+    # The best time of convergence has the most arrival times before and the fewest after
+    converged_index = int(np.argmax(np.cumsum(np.where(is_arrival_time, 1, -1)))) + 1
+    is_arrival_before, is_arrival_after = np.split(is_arrival_time, [converged_index])
     if (
-        np.mean(is_arrival_time) >= MIN_FRACTION_OF_TIMESTAMP_KIND
-        or min(converged_index, len(position_age_s) - converged_index)
+        is_arrival_time.mean() >= MIN_FRACTION_OF_TIMESTAMP_KIND
+        or min(len(is_arrival_before), len(is_arrival_after))
         < MIN_POSITIONS_BEFORE_AND_AFTER_TIMESYNC
+        or min(is_arrival_before.mean(), 1.0 - is_arrival_after.mean())
+        < MIN_FRACTION_OF_TIMESTAMP_KIND
     ):
         return None
     latency_s = float(position_age_s.iloc[converged_index:].median())
-    min_matching_timestamp_fraction = min(
-        np.mean(is_arrival_time[:converged_index]), np.mean(~is_arrival_time[converged_index:])
-    )
-    if (
-        min_matching_timestamp_fraction < MIN_FRACTION_OF_TIMESTAMP_KIND
-        or latency_s < MIN_LATENCY_S
-    ):
-        return None
-    return float(position_age_s.index[converged_index]), latency_s
+    convergence_time_s = float(position_age_s.index[converged_index])
+    return None if latency_s < MIN_LATENCY_S else (convergence_time_s, latency_s)
 
 
 def _find_position_age_s(analysis: Analysis) -> pd.Series | None:
     """Return the age (s) of each position at its publication, if logged (timestamp_sample)."""
     ekf2, source, segment = analysis.flight.ekf2, analysis.source, analysis.segment
-    fusion_record = ekf2.record if isinstance(ekf2, Ekf2) else None
-    if (
-        not isinstance(fusion_record, FusionRecord)
-        or source.origin.reconstructed
-        or source.clock_map
-    ):
+    fusion_record = ekf2.record if isinstance(ekf2, Ekf2) else ekf2
+    if isinstance(fusion_record, Unavailable) or source.origin.reconstructed or source.clock_map:
         return None
     position_age_s = fusion_record.vision_age_s.loc[segment.start_s : segment.end_s]
-    return (
-        position_age_s
-        if len(position_age_s) >= 2 * MIN_POSITIONS_BEFORE_AND_AFTER_TIMESYNC
-        else None
-    )
+    is_long_enough = len(position_age_s) >= 2 * MIN_POSITIONS_BEFORE_AND_AFTER_TIMESYNC
+    return position_age_s if is_long_enough else None

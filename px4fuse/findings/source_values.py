@@ -11,11 +11,9 @@ from px4fuse.comparison.flight_events import compute_max_interval_s
 from px4fuse.comparison.remedy import find_aid, format_settings, is_source_fused
 from px4fuse.convention.lever_arm import estimate_lever_arm
 from px4fuse.core.arrays import Array
-from px4fuse.core.record import Span
 from px4fuse.core.text import format_metres
 from px4fuse.ekf2.model import replay_with_settings
 from px4fuse.ekf2.replay import rows_inside
-from px4fuse.filter.signals import cut_to_segment
 from px4fuse.findings.model import Findings, find_source_texts, make_error, make_note, make_warning
 from px4fuse.findings.source_intervals import describe_errors_after_gap
 from px4fuse.flight.model import Columns, Ekf2, Truth, Unavailable, positions_phrase, source_name
@@ -45,29 +43,21 @@ NO_ESTIMATES_SENTENCE = "px4fuse estimates nothing from these positions."
 INVALID_POSITION_TEXTS: Mapping[str, tuple[str, str, str]] = {
     "zero": (
         "source_zero_positions",
-        "{positions} are exactly 0, 0, 0: the source sends zeros when it has no position",
+        "are exactly 0, 0, 0: the source sends zeros when it has no position",
         "Send nothing, or NaN, while the position is unknown.",
     ),
     "held": (
         "source_position_held",
-        "{positions} repeat the last position: the source has lost tracking",
+        "repeat the last position: the source has lost tracking",
         "Stop sending, or send NaN, while tracking is lost.",
     ),
     "far": (
         "source_without_position",
-        "{positions} are more than 10 km from the other positions: wrong origin, or no fix",
+        "are more than 10 km from the other positions: wrong origin, or no fix",
         "",
     ),
-    "no fix": (
-        "source_without_position",
-        "{positions} were measured without a 3D fix",
-        NO_FIX_ACTION,
-    ),
-    "NaN": (
-        "source_without_position",
-        "{positions} are NaN: the source had no fix",
-        "",
-    ),
+    "no fix": ("source_without_position", "were measured without a 3D fix", NO_FIX_ACTION),
+    "NaN": ("source_without_position", "are NaN: the source had no fix", ""),
 }
 
 
@@ -79,58 +69,42 @@ def detect(analysis: Analysis) -> Findings:
     yield from detect_copied_estimate(analysis)
 
 
-def _find_invalid_spans(time_s: Array, valid_times_s: Array) -> tuple[Span, ...]:
-    # Invalid samples form one span if no valid sample is between them
-    valid_counts_before_sample = np.searchsorted(valid_times_s, time_s)
-    span_start_indices = np.flatnonzero(np.diff(valid_counts_before_sample, prepend=-1))
-    span_end_indices = np.append(span_start_indices[1:], len(time_s)) - 1
-    return tuple(
-        zip(time_s[span_start_indices].tolist(), time_s[span_end_indices].tolist(), strict=True)
-    )
-
-
 def detect_invalid_rows(analysis: Analysis) -> Findings:
     source, segment = analysis.source, analysis.segment
     invalid_reasons = source.invalid_reasons[segment.start_s : segment.end_s]
-    for reason, (name, fault_template, action) in INVALID_POSITION_TEXTS.items():
-        time_s = invalid_reasons[invalid_reasons == reason].index.to_numpy()
-        if not (count := len(time_s)):
+    for reason, (name, fault, action) in INVALID_POSITION_TEXTS.items():
+        time_s = invalid_reasons.index[invalid_reasons == reason].to_series()
+        if time_s.empty:
             continue
-        spans = _find_invalid_spans(time_s, source.samples.index.to_numpy())
-        longest_span_s = max(spans, key=lambda span: span[1] - span[0])
-        duration_s, total_s = (
-            longest_span_s[1] - longest_span_s[0],
-            sum(end - start for start, end in spans),
-        )
-        fault_sentence = fault_template.format(positions=f"{count} {positions_phrase(source)}")
+        # Invalid samples form one span if no valid sample is between them
+        times_by_span = time_s.groupby(np.searchsorted(source.samples.index, time_s))
+        spans = tuple(zip(times_by_span.min().tolist(), times_by_span.max().tolist(), strict=True))
+        start_s, end_s = max(spans, key=lambda span: span[1] - span[0])
+        total_s = sum(end - start for start, end in spans)
         times_text = f"{len(spans)} time spans between {spans[0][0]:.1f} s and {spans[-1][1]:.1f} s"
         if len(spans) <= 3:
             times_text = " and ".join(f"{start:.1f} s to {end:.1f} s" for start, end in spans)
         error_text, make_finding = "", make_note if reason == "NaN" else make_warning
-        if duration_s > compute_max_interval_s(1.0 / source.compute_rate_hz()):
+        if end_s - start_s > compute_max_interval_s(1.0 / source.compute_rate_hz()):
             make_finding = make_warning
-            valid_times_s = _find_valid_times_around(analysis, longest_span_s)
-            error_text = f" {describe_errors_after_gap(analysis, valid_times_s)}"
+            # Last position before the span, and first position after it
+            valid_s = analysis.input_axes[0].measurement_time_s
+            first, last = np.clip(np.searchsorted(valid_s, (start_s, end_s)), 1, len(valid_s) - 1)
+            gap_span_s = float(valid_s[first - 1]), float(valid_s[last])
+            error_text = f" {describe_errors_after_gap(analysis, gap_span_s)}"
         yield make_finding(
             name,
-            f"{fault_sentence}. Times of these positions: {times_text} ({total_s:.1f} s in total). "
-            f"KF does not use them.{error_text}",
-            action or f"{find_source_texts(source).data_link_check} at {longest_span_s[0]:.1f} s.",
+            f"{len(time_s)} {positions_phrase(source)} {fault}. Times: {times_text} ({total_s:.1f} "
+            f"s in total). KF does not use these positions.{error_text}",
+            action or f"{find_source_texts(source).data_link_check} at {start_s:.1f} s.",
             {
-                "count": count,
-                "longest_s": duration_s,
+                "count": len(time_s),
+                "longest_s": end_s - start_s,
                 "total_s": total_s,
-                "at_s": longest_span_s[0],
+                "at_s": start_s,
             },
             spans,
         )
-
-
-def _find_valid_times_around(analysis: Analysis, span_s: Span) -> Span:
-    """Return the times (s) of the last position before a time span and of the first after it."""
-    time_s = analysis.input_axes[0].measurement_time_s
-    indices = np.clip(np.searchsorted(time_s, span_s), 1, len(time_s) - 1)
-    return float(time_s[indices[0] - 1]), float(time_s[indices[1]])
 
 
 def detect_rounding(analysis: Analysis) -> Findings:
@@ -140,7 +114,7 @@ def detect_rounding(analysis: Analysis) -> Findings:
         return
     cause_text, action = "", "Send the positions with more digits."
     if np.log2(step_m) % 1.0 == 0.0:
-        cause_text = " Possible cause: the source stores large coordinates (UTM) as 32-bit floats."
+        cause_text = " Possible cause: large coordinates (UTM) in 32-bit floats."
         action += (
             " At the sender, subtract a local origin in double precision (64 bit) before the "
             "conversion to 32-bit float."
@@ -148,8 +122,7 @@ def detect_rounding(analysis: Analysis) -> Findings:
     yield make_warning(
         "source_positions_rounded",
         f"{positions_phrase(source)} are rounded to steps of {step_m:.3g} m.{cause_text} The "
-        "rounding "
-        f"error is {step_m / 12.0**0.5:.2g} m (1 σ) and correlated in time. "
+        f"rounding error is {step_m / 12.0**0.5:.2g} m (1 σ) and correlated in time. "
         f"{NO_ESTIMATES_SENTENCE}",
         action,
         {"step_m": step_m},
@@ -166,30 +139,26 @@ def detect_lever_arm(analysis: Analysis) -> Findings:
     lever_arm = estimate_lever_arm(analysis.flight, source)
     if lever_arm is None:
         return
-    lever_arm_forward_m, lever_arm_right_m, sigma_m = lever_arm
     # + 0.0 replaces -0.0 by 0.0
     lever_arm_m = np.add(source.lever_arm_m[:2], lever_arm[:2]).round(2) + 0.0
     change = dict(zip(find_aid(analysis).lever_arm, lever_arm_m.tolist(), strict=False))
     effect_sentence = _describe_replayed_effect(analysis, change)
     if effect_sentence is None:
         return
-    lever_arm_forward_m, lever_arm_right_m = (
-        round(part, 2) + 0.0 for part in (lever_arm_forward_m, lever_arm_right_m)
-    )
+    forward_m, right_m = (round(part, 2) + 0.0 for part in lever_arm[:2])
+    sigma_m = lever_arm[2]
     sensor_text, action = f"{source_name(source)} sensor", f"Set {format_settings(change)}."
     if source.alignment is not None:  # no EKF2 parameter corrects positions of a file
         sensor_text = "sensor"
         action = "Subtract this lever arm, rotated to NED by the attitude, from the positions."
     yield make_warning(
         "source_lever_arm",
-        f"The {sensor_text} is mounted {np.hypot(lever_arm_forward_m, lever_arm_right_m):.2f} m "
-        "from the "
-        f"mounting point that EKF2 assumes: {lever_arm_forward_m:+.2f} m forward, "
-        f"{lever_arm_right_m:+.2f} m "
-        f"right (± {1.96 * sigma_m:.2f} m, 95 %). When the vehicle turns, the error of the "
-        f"positions changes by up to twice this distance. {effect_sentence}{NO_ESTIMATES_SENTENCE}",
+        f"The {sensor_text} is mounted {np.hypot(forward_m, right_m):.2f} m from the mounting "
+        f"point that EKF2 assumes: {forward_m:+.2f} m forward, {right_m:+.2f} m right (± "
+        f"{1.96 * sigma_m:.2f} m, 95 %). When the vehicle turns, the position error changes by up "
+        f"to twice this distance. {effect_sentence}{NO_ESTIMATES_SENTENCE}",
         f"{action} Measure the position of the sensor relative to the IMU.",
-        {"forward_m": lever_arm_forward_m, "right_m": lever_arm_right_m, "sigma_m": sigma_m},
+        {"forward_m": forward_m, "right_m": right_m, "sigma_m": sigma_m},
     )
 
 
@@ -199,9 +168,12 @@ def _describe_replayed_effect(analysis: Analysis, change: Mapping[str, float]) -
     Return None if the change reduces the RMSE too little.
     """
     ekf2_model, truth = analysis.ekf2_model, analysis.flight.truth
-    if isinstance(ekf2_model, Unavailable) or isinstance(truth, Unavailable):
-        return ""
-    if not ekf2_model.agreement.good or not is_source_fused(analysis, ekf2_model.inputs):
+    if (
+        isinstance(ekf2_model, Unavailable)
+        or isinstance(truth, Unavailable)
+        or not ekf2_model.agreement.good
+        or not is_source_fused(analysis, ekf2_model.inputs)
+    ):
         return ""
     rmses_m = []
     for replay in (ekf2_model.baseline_replay, *replay_with_settings(ekf2_model, [change])):
@@ -220,8 +192,7 @@ def _describe_replayed_effect(analysis: Analysis, change: Mapping[str, float]) -
 
 def detect_two_senders(analysis: Analysis) -> Findings:
     """Detect two senders whose positions alternate."""
-    samples = cut_to_segment(analysis.source.samples, analysis.segment)[Columns.POSITION]
-    samples = samples.dropna(axis=1, how="all").dropna()
+    samples = analysis.source_samples[Columns.POSITION].dropna(axis=1, how="all").dropna()
     window_count, rate_hz = (len(samples) - 2) // WINDOW_SAMPLES, analysis.source.compute_rate_hz()
     if window_count < MIN_WINDOWS_FOR_TWO_SENDERS:
         return
@@ -229,32 +200,27 @@ def detect_two_senders(analysis: Analysis) -> Findings:
     weight = ((time_s[1:-1] - time_s[:-2]) / (time_s[2:] - time_s[:-2]))[:, None]
     deviations_m = position_m[1:-1] - (1.0 - weight) * position_m[:-2] - weight * position_m[2:]
     deviations_m[::2] *= -1.0
-    window_median_deviations_m = np.median(
-        deviations_m[: window_count * WINDOW_SAMPLES].reshape(window_count, WINDOW_SAMPLES, -1),
-        axis=1,
+    windows_m = deviations_m[: window_count * WINDOW_SAMPLES].reshape(
+        window_count, WINDOW_SAMPLES, -1
     )
-    largest_deviation_m = window_median_deviations_m[
-        np.argmax(np.linalg.norm(window_median_deviations_m, axis=1))
-    ]
-    window_median_deviations_m[window_median_deviations_m @ largest_deviation_m < 0.0] *= -1.0
-    median_deviation_m = np.median(window_median_deviations_m, axis=0)
-    scatter_m = 1.4826 * float(
-        np.median(np.abs(window_median_deviations_m - median_deviation_m), axis=0).max()
-    )
-    distance_m = float(np.linalg.norm(median_deviation_m))
+    medians_m = np.median(windows_m, axis=1)
+    largest_median_m = medians_m[np.argmax(np.linalg.norm(medians_m, axis=1))]
+    medians_m[medians_m @ largest_median_m < 0.0] *= -1.0
+    deviation_m = np.median(medians_m, axis=0)
+    scatter_m = 1.4826 * np.median(np.abs(medians_m - deviation_m), axis=0).max()
+    distance_m = float(np.linalg.norm(deviation_m))
     if distance_m < max(MIN_SENDER_DISTANCE_M, MIN_SENDER_DISTANCE_SIGMAS * scatter_m):
         return
     distance_texts = ", ".join(
         f"{abs(part):.2f} m {name.partition('_')[0]}"
-        for part, name in zip(median_deviation_m, samples.columns, strict=True)
+        for part, name in zip(deviation_m, samples.columns, strict=True)
     )
     yield make_error(
         "source_two_senders",
         f"Two systems alternately send positions that differ by {distance_m:.2f} m. Without the "
         f"motion of the vehicle, successive {positions_phrase(analysis.source)} ({rate_hz:.3g} Hz "
         f"in total) differ by {distance_texts}. {NO_ESTIMATES_SENTENCE}",
-        "Send the positions of one system only, for example stop the second node, bridge or "
-        "MAVROS plugin.",
+        "Send the positions of one system only: stop the second node, bridge or MAVROS plugin.",
         {"distance_m": distance_m, "rate_hz": rate_hz},
     )
 
@@ -264,45 +230,35 @@ def detect_copied_estimate(analysis: Analysis) -> Findings:
     source, ekf2, segment = analysis.source, analysis.flight.ekf2, analysis.segment
     if not isinstance(ekf2, Ekf2) or source.alignment is not None or source.origin.reconstructed:
         return
-    samples = cut_to_segment(source.samples, segment)[Columns.POSITION].dropna()
-    state = ekf2.state.dropna()
+    samples, state = analysis.source_samples[Columns.POSITION].dropna(), ekf2.state.dropna()
     if len(samples) < WINDOW_SAMPLES or len(state) < WINDOW_SAMPLES:
         return
     time_s, position_m = samples.index.to_numpy(), samples.to_numpy()
-    distances_m = [
-        _compute_median_distance_m(position_m, time_s - delay_s, state)
-        for delay_s in TESTED_COPY_DELAYS_S
-    ]
-    best_index = int(np.nanargmin(distances_m)) if np.isfinite(distances_m).any() else 0
+    distance_m, delay_s = min(
+        (_compute_median_distance_m(position_m, time_s - delay_s, state), delay_s)
+        for delay_s in TESTED_COPY_DELAYS_S.tolist()
+    )
     fusion_flags = ekf2.fusion_flags
     is_fused = isinstance(fusion_flags, Unavailable) or bool(
         (fusion_flags["horizontal"][segment.start_s : segment.end_s] > 0.0).any()
     )
-    if not distances_m[best_index] < (
-        MAX_DISTANCE_OF_FUSED_COPY_M if is_fused else MAX_DISTANCE_OF_COPY_M
-    ):
+    if distance_m >= (MAX_DISTANCE_OF_FUSED_COPY_M if is_fused else MAX_DISTANCE_OF_COPY_M):
         return
-    convention = analysis.convention
-    orientation = convention.orientation if convention else None
-    is_copied = orientation and orientation.verdict == "copied"
-    copied_quantity = "position and attitude" if is_copied else "position"
+    orientation = analysis.convention.orientation if analysis.convention else None
+    is_attitude_copied = orientation is not None and orientation.verdict == "copied"
     yield make_error(
         "source_is_ekf2_estimate",
-        f"{source_name(source)} sends EKF2's own {copied_quantity} back. The positions equal those "
-        f"that EKF2 estimated {1e3 * TESTED_COPY_DELAYS_S[best_index]:.0f} ms before (median "
-        f"difference {1e3 * distances_m[best_index]:.1f} mm). They contain no measurement, so "
-        "fusion reduces EKF2's σ, but not its error.",
+        f"{source_name(source)} sends EKF2's own position{' and attitude' * is_attitude_copied} "
+        f"back. The positions equal those that EKF2 estimated {1e3 * delay_s:.0f} ms before "
+        f"(median difference {1e3 * distance_m:.1f} mm). They are not measurements.",
         "Send the position of the positioning system. Do not connect the autopilot's local "
         "position (MAVROS local_position) to its vision input.",
-        {
-            "delay_s": float(TESTED_COPY_DELAYS_S[best_index]),
-            "difference_m": distances_m[best_index],
-        },
+        {"delay_s": delay_s, "difference_m": distance_m},
     )
 
 
 def _compute_median_distance_m(position_m: Array, time_s: Array, ekf2_state: pd.DataFrame) -> float:
-    """Return the median distance (m) of positions from EKF2's position at ``time_s``."""
+    """Return the median distance (m) from EKF2's position at ``time_s``; infinity if unknown."""
     state_times_s = ekf2_state.index.to_numpy()
     ekf2_position_spline = CubicHermiteSpline(
         state_times_s, ekf2_state[Columns.POSITION], ekf2_state[Columns.VELOCITY]
@@ -312,6 +268,6 @@ def _compute_median_distance_m(position_m: Array, time_s: Array, ekf2_state: pd.
     )
     is_inside = (time_s > state_times_s[0]) & (time_s < state_times_s[-1]) & is_moving
     if np.count_nonzero(is_inside) < WINDOW_SAMPLES:
-        return np.nan
+        return np.inf
     distance_m = np.linalg.norm(position_m - ekf2_position_spline(time_s), axis=1)
     return float(np.median(distance_m[is_inside]))

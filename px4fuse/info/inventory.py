@@ -23,7 +23,8 @@ from px4fuse.filter.signals import (
     cut_to_segment,
     imu_and_attitude,
 )
-from px4fuse.findings import ekf2_not_fusing, finding_title, imu, missing, recording
+from px4fuse.findings import ekf2_not_fusing, imu, recording
+from px4fuse.findings.model import finding_title
 from px4fuse.flight.model import (
     DIAGNOSIS_WITHHELD,
     DataSource,
@@ -381,7 +382,7 @@ def _collect_logging_advice(
     actions_and_purposes = [(position_remedy, "position")] if position_remedy else []
     if comparison is not None:
         findings += [
-            *missing.detect_source_not_logged(comparison),
+            *recording.detect_source_not_logged(comparison),
             *ekf2_not_fusing.detect_unfused_positions(comparison),
         ]
         findings += recording.detect_dropouts(comparison)

@@ -8,7 +8,7 @@ import numpy as np
 import pandas as pd
 from scipy.spatial.transform import Rotation, Slerp
 
-from px4fuse.comparison.comparison import compare, run_kf
+from px4fuse.comparison.comparison import compare
 from px4fuse.comparison.preparation import prepare_comparison_inputs
 from px4fuse.comparison.projection import remove_origin_resets
 from px4fuse.core.arrays import Array
@@ -99,7 +99,7 @@ def trajectory_of(flight: Flight, track_name: TrackName) -> Trajectory:
 def _make_kf_trajectory(flight: Flight) -> Trajectory:
     request = ComparisonRequest(log=flight.log.name, sigma_z_m=SIGMA_Z_M, axes=AXIS_NAMES)
     prepared_comparison = prepare_comparison_inputs(flight, request)
-    kf_comparison = compare(prepared_comparison, run_kf(prepared_comparison))
+    kf_comparison = compare(prepared_comparison)
     columns = zip(Columns.POSITION, kf_comparison.axes.values(), strict=True)
     position_samples = pd.DataFrame(
         {name: axis.replay.steps["position_m"] for name, axis in columns}

@@ -73,7 +73,6 @@ GPS_POSITION = "vehicle_gps_position"
 SOURCE_TRACKS = [
     name for name, track in TRACK_SOURCES.items() if track.layouts and name != GPS_POSITION
 ]
-ORIGIN_BY_TRACK_NAME = {name: track.origin for name, track in TRACK_SOURCES.items()}
 # The flag "fused" of these aiding sources is always set in v1.15 and v1.16
 AIDS_ALWAYS_FUSED = ("gravity", "drag")
 # Aiding sources whose logged observation is a local position

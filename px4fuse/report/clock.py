@@ -14,7 +14,7 @@ from px4fuse.comparison.remedy import (
 )
 from px4fuse.convention.correction import find_convention_faults
 from px4fuse.filter.time_offset import ClockOffset
-from px4fuse.findings import Finding
+from px4fuse.finding import Finding
 from px4fuse.findings.source_clock import compute_offset_for_option_s
 from px4fuse.flight.model import Unavailable
 from px4fuse.report.page import Page, draw_legend_above

@@ -6,7 +6,7 @@ import numpy as np
 
 from px4fuse.analysis import Analysis
 from px4fuse.core.text import capitalise_first, format_number, format_p_value, join_first_names
-from px4fuse.findings import Finding
+from px4fuse.finding import Finding
 from px4fuse.flight.model import Unavailable
 from px4fuse.loop import corrections
 from px4fuse.loop.analysis import MIN_UNIX_TIME_S

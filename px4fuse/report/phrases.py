@@ -26,7 +26,8 @@ from px4fuse.core.text import capitalise_first, format_factor, format_number
 from px4fuse.filter.consistency import Consistency
 from px4fuse.filter.settings import KF_NUMERIC_SETTINGS, SETTING_RANGES, Settings
 from px4fuse.filter.tuning import HORIZONTAL, AxisTuning, NoiseEstimate
-from px4fuse.findings import Finding, finding_title, split_cause_groups
+from px4fuse.finding import Finding
+from px4fuse.findings.model import finding_title, split_cause_groups
 from px4fuse.findings.noises import KEEP_NOISE_BECAUSE_OF_CORRELATION_ACTION
 from px4fuse.flight.ekf2_parameters import EV_POS
 from px4fuse.flight.model import Alignment, ClockMap, Columns, Truth, Unavailable

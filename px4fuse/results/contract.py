@@ -33,7 +33,7 @@ from px4fuse.filter.consistency import HorizontalNis
 from px4fuse.filter.frame_rotation import HeadingError
 from px4fuse.filter.time_offset import ClockOffset
 from px4fuse.filter.tuning import AxisTuning
-from px4fuse.findings import Finding
+from px4fuse.finding import Finding
 from px4fuse.flight.model import (
     Alignment,
     ClockMap,

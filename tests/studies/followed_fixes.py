@@ -33,7 +33,7 @@ from equal_statements import NUMBER, PARAMETER, Job, jobs, texts_of
 from msgspec import structs
 
 from px4fuse.analysis import Analysis
-from px4fuse.comparison.comparison import compare, run_kf
+from px4fuse.comparison.comparison import compare
 from px4fuse.comparison.model import Comparison, ErrorsAgainstTruth, PreparedComparison
 from px4fuse.diagnose import diagnose, prepare_comparison, read_flight
 from px4fuse.ekf2.model import Ekf2Model, misalign_positions, prepare_ekf2_model
@@ -79,7 +79,7 @@ def rmse_m(comparison: Comparison) -> float:
 
 
 def compare_with_kf(prepared: PreparedComparison) -> Comparison:
-    return compare(prepared, run_kf(prepared))
+    return compare(prepared)
 
 
 def limit_m(before_m: float, duration_s: float) -> float:

@@ -6,7 +6,7 @@ from typing import Any
 
 import numpy as np
 
-from px4fuse.comparison.comparison import compare, run_kf
+from px4fuse.comparison.comparison import compare
 from px4fuse.comparison.estimates import estimate_noises_and_clock
 from px4fuse.comparison.model import AxisComparison, Comparison, FilterName, FilterSummary
 from px4fuse.comparison.preparation import prepare_comparison_inputs
@@ -144,7 +144,7 @@ def compare_simulation(simulation: flights.Simulation) -> Comparison:
         # do not correct frame and clock: the student has to find these faults
         keep_positions_as_sent=True,
     )
-    return compare(prepared_comparison, run_kf(prepared_comparison))
+    return compare(prepared_comparison)
 
 
 def _make_injected_fault(

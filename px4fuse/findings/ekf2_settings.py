@@ -1,0 +1,295 @@
+"""Wrong settings of EKF2: noise, innovation gate, and parameters that change in flight."""
+
+import math
+from itertools import pairwise
+from typing import NamedTuple
+
+from px4fuse.analysis import Analysis
+from px4fuse.comparison.comparison import compute_position_errors
+from px4fuse.comparison.model import AxisComparison
+from px4fuse.comparison.remedy import (
+    find_aid,
+    find_used_noise_m,
+    format_settings,
+    make_height_noise_advice,
+    select_changed_settings,
+)
+from px4fuse.comparison.trials import (
+    Trial,
+    becomes_consistent,
+    classify_improvement,
+    compute_preference_key,
+    find_trial,
+)
+from px4fuse.core.text import format_factor, format_metres, format_ratio
+from px4fuse.filter.consistency import Consistency, assess_innovations
+from px4fuse.filter.tuning import HORIZONTAL, AxisTuning
+from px4fuse.finding import Finding
+from px4fuse.findings.cause_grouping import CAUSE_KEY, REPORTED_VARIANCE_USED_BY_EKF2_CAUSE
+from px4fuse.findings.cause_text import format_action
+from px4fuse.findings.model import (
+    Findings,
+    find_source_texts,
+    finding,
+    format_percent,
+    make_note,
+    make_warning,
+    make_zero_length_spans,
+)
+from px4fuse.flight.ekf2_parameters import AID_MASK_PARAMETER, PARAMETERS
+from px4fuse.flight.model import Ekf2, Unavailable, source_name
+
+# Minimum factor between EKF2's noise parameter and its estimate, for severity "error"
+MIN_NOISE_FACTOR_FOR_ERROR = 2.0
+MIN_REJECTED_FRACTION_IN_MESSAGE = 0.05
+# Minimum rejected fraction for a warning: with a gate of 5 √S, a consistent filter rejects 6e-7
+REJECTED_FRACTION_FOR_WARNING = 0.01
+REJECTED_FRACTION_FOR_ERROR = 0.20
+# Maximum ratio of rejected fractions, after to before a change that prevents rejections
+MAX_REJECTED_AFTER_TO_BEFORE_RATIO = 0.5
+# A parameter change has an effect if σ ratio or RMSE change by at least this factor
+MIN_SIGMA_RATIO_OR_RMSE_CHANGE_FACTOR = 1.5
+
+
+def detect(analysis: Analysis) -> Findings:
+    yield from detect_wrong_noise(analysis)
+    yield from detect_rejections(analysis)
+    yield from detect_parameter_changes(analysis)
+
+
+def detect_wrong_noise(analysis: Analysis) -> Findings:
+    """Detect a wrong noise parameter of EKF2, confirmed by a replay."""
+    trial, aid = find_confirmed_noise_trial(analysis), find_aid(analysis)
+    if trial is None:
+        return
+    assert not isinstance(analysis.ekf2_model, Unavailable)
+    inputs = analysis.ekf2_model.inputs
+    used_noise_m, estimated_noise_m = find_used_noise_m(inputs), trial.change[aid.noise]
+    # EKF2 uses the larger of reported σ and noise parameter
+    parameter_noise_m = inputs.settings[aid.noise]
+    uses_reported_sigma = used_noise_m > parameter_noise_m
+    ratio = estimated_noise_m / used_noise_m
+    factor, size_word, gain_size_word = ratio, "small", "large"
+    if ratio < 1.0:
+        factor, size_word, gain_size_word = 1.0 / ratio, "large", "small"
+    sensor_name = source_name(analysis.source)
+    is_kf_noise_equal_to_ekf2 = analysis.source.origin.is_gnss and math.isclose(
+        analysis.settings.sigma_z_m, used_noise_m, rel_tol=1e-2
+    )
+    effect_text = ""
+    reason = f"EKF2's gain is too {gain_size_word}, and its reported σ is too {size_word}."
+    rejected_fraction = analysis.main.rejected_fraction or 0.0
+    if rejected_fraction >= MIN_REJECTED_FRACTION_IN_MESSAGE:
+        effect_text = f": EKF2 rejects {format_percent(rejected_fraction)} of the positions"
+        reason = f"EKF2 rejects normal {sensor_name} noise as outliers."
+    name = "EKF2's position noise" if uses_reported_sigma else aid.noise
+    title = f"{name} is {format_factor(factor)} times too {size_word}"
+    is_default_noise = used_noise_m == analysis.flight.log.find_default_value(aid.noise)
+    # PX4's default suits usual sensors: if it is too small, this sensor is noisier
+    if ratio > 1.0 and is_default_noise:
+        filter_names = "KF and EKF2" if is_kf_noise_equal_to_ekf2 else "EKF2"
+        title = (
+            f"{sensor_name} noise is {format_factor(factor)} times the noise setting of "
+            f"{filter_names}"
+        )
+    interval_text, horizontal_tuning = "", analysis.tuning.get(HORIZONTAL)
+    if isinstance(horizontal_tuning, AxisTuning):
+        low_m, high_m = horizontal_tuning.sigma_z.low, horizontal_tuning.sigma_z.high
+        interval_text = f" (95 % {low_m:.3g} to {high_m:.3g} m)" if low_m and high_m else ""
+    message = (
+        f"{title}{effect_text}. {name} is {used_noise_m:.3g} m; the maximum-likelihood estimate is "
+        f"{estimated_noise_m:.3g} m{interval_text}. {reason}"
+    )
+    action = f"Set {format_settings(select_changed_settings(trial.change, inputs.settings))}."
+    if uses_reported_sigma:
+        mode_text = f" ({aid.noise_mode_parameter} 0)" if aid.noise_mode_parameter else ""
+        message += (
+            f" EKF2 uses the σ that {sensor_name} reports{mode_text}, because this σ is larger "
+            f"than {aid.noise} ({parameter_noise_m:g} m)."
+        )
+        action += f" Alternatively, report a variance of {estimated_noise_m**2:.2g} m²."
+    if is_kf_noise_equal_to_ekf2:
+        message += f" KF takes SIGMA_Z from {aid.noise}."
+    yield finding(
+        "error" if factor >= MIN_NOISE_FACTOR_FOR_ERROR else "warning",
+        f"ekf2_noise_too_{size_word}",
+        message,
+        action + make_height_noise_advice(analysis, analysis.tuning, estimated_noise_m),
+        {
+            "flown_m": used_noise_m,
+            "estimate_m": estimated_noise_m,
+            "factor": ratio,
+            CAUSE_KEY: REPORTED_VARIANCE_USED_BY_EKF2_CAUSE if uses_reported_sigma else "",
+        },
+    )
+
+
+def find_confirmed_noise_trial(analysis: Analysis) -> Trial | None:
+    """Return a re-run in which another EKF2 measurement noise makes EKF2 consistent, or None."""
+    trial = find_trial(analysis.select_main_trials(), "ekf2", "noise", find_aid(analysis).noise)
+    is_confirmed = trial is not None and becomes_consistent(trial, "source")
+    return trial if is_confirmed else None
+
+
+def detect_rejections(analysis: Analysis) -> Findings:
+    rejection_findings = tuple(_find_rejections(analysis))
+    yield from _detect_small_gate(analysis, rejection_findings)
+    yield from rejection_findings
+
+
+def _detect_small_gate(analysis: Analysis, rejection_findings: tuple[Finding, ...]) -> Findings:
+    """Detect a gate so small that a consistent filter would reject 1 % of the positions."""
+    ekf2 = analysis.flight.ekf2
+    if isinstance(ekf2, Ekf2) and rejection_findings:
+        # Probability that both innovations, north and east, are inside the gate: erf(gate/√2)²
+        expected_rejected_fraction = 1.0 - math.erf(ekf2.gate / math.sqrt(2.0)) ** 2
+        if expected_rejected_fraction >= REJECTED_FRACTION_FOR_WARNING:
+            aid = find_aid(analysis)
+            rejected_fraction = float(rejection_findings[0].evidence["rejected_fraction"])
+            yield finding(
+                rejection_findings[0].severity,
+                "ekf2_gate_too_small",
+                f"{aid.gate} {ekf2.gate:g} is too small: EKF2 rejects "
+                f"{format_percent(rejected_fraction)} of the positions. Without any fault, this "
+                f"gate rejects {format_percent(expected_rejected_fraction)} of the positions.",
+                f"Set {aid.gate} to {aid.default_gate:g} (PX4's default, in multiples of √S).",
+                {"gate": ekf2.gate, "rejected_by_gate": expected_rejected_fraction},
+            )
+
+
+def _find_rejections(analysis: Analysis) -> Findings:
+    ekf2, down_comparison = analysis.flight.ekf2, analysis.axes.get("down")
+    # EKF2 rejects north and east together, so one horizontal axis is sufficient
+    results = [analysis.main]
+    if down_comparison is not None and down_comparison is not analysis.main:
+        results.append(down_comparison)
+    for result in results:
+        innovations = result.ekf2_innovations
+        if isinstance(innovations, Unavailable) or isinstance(ekf2, Unavailable):
+            continue
+        rejected_flags = innovations["rejected"].dropna()
+        rejected_fraction = float(rejected_flags.mean())  # NaN without logged flags
+        if rejected_fraction >= REJECTED_FRACTION_FOR_WARNING:
+            quantity = "heights" if result is down_comparison else "positions"
+            yield finding(
+                "error" if rejected_fraction >= REJECTED_FRACTION_FOR_ERROR else "warning",
+                "ekf2_rejects_positions",
+                f"EKF2 rejects {format_percent(rejected_fraction)} of the {quantity}. Their "
+                f"innovations are outside its gate of {ekf2.gate:g} √S. Possible causes: outliers, "
+                "measurement noise set too small, or late timestamps.",
+                _find_rejection_remedy(analysis, result),
+                {
+                    "rejected_fraction": rejected_fraction,
+                    "count": len(innovations),
+                    "axis": result.axis.name,
+                },
+                make_zero_length_spans(rejected_flags.index[rejected_flags > 0.0]),
+            )
+
+
+def _find_rejection_remedy(analysis: Analysis, result: AxisComparison) -> str:
+    aid = find_aid(analysis, result.axis.name)
+    helpful_trials = [
+        trial for trial in analysis.select_main_trials() if _prevents_rejections(trial)
+    ]
+    if helpful_trials and result is analysis.main:
+        return format_action(analysis, min(helpful_trials, key=compute_preference_key).change)
+    return (
+        f"{find_source_texts(analysis.source).data_link_check}. Then check {aid.delay} and "
+        f"{aid.noise}. Increase {aid.gate} only if no fault is found."
+    )
+
+
+def _prevents_rejections(trial: Trial) -> bool:
+    before, after = trial.before.rejected_fraction, trial.after.rejected_fraction
+    return (
+        before is not None
+        and after is not None
+        and len(trial.kinds) == 1
+        and classify_improvement(trial) != "nothing"
+        and after < MAX_REJECTED_AFTER_TO_BEFORE_RATIO * before
+    )
+
+
+class SpanConsistency(NamedTuple):
+    """Consistency and position RMSE of EKF2 between two parameter changes, if known."""
+
+    consistency: Consistency | Unavailable
+    rmse_m: float
+
+
+def detect_parameter_changes(analysis: Analysis) -> Findings:
+    """Detect changes of EKF2 parameters in flight."""
+    ekf2, segment = analysis.flight.ekf2, analysis.segment
+    fusion_parameters = (find_aid(analysis).switch, AID_MASK_PARAMETER)
+    changes = [
+        change
+        for change in (ekf2.parameter_changes if isinstance(ekf2, Ekf2) else ())
+        if change.name in (*PARAMETERS, *fusion_parameters)
+        and segment.start_s < change.time_s < segment.end_s
+    ]
+    edges_s = [segment.start_s, *(change.time_s for change in changes), segment.end_s]
+    spans = [_assess_span(analysis, *span_s) for span_s in pairwise(edges_s)]
+    for (time_s, name, value_before, value_after), (before, after) in zip(
+        changes, pairwise(spans), strict=True
+    ):
+        unit = "" if name in fusion_parameters else f" {PARAMETERS[name].printed_unit}".rstrip()
+        effect_sentences, has_effect = "", name in fusion_parameters
+        nis_before, nis_after = before.consistency, after.consistency
+        if not isinstance(nis_before, Unavailable) and not isinstance(nis_after, Unavailable):
+            has_effect |= nis_before.verdict != nis_after.verdict
+            has_effect |= _differ_by_min_factor(nis_before.sigma_ratio, nis_after.sigma_ratio)
+            effect_sentences = (
+                f" EKF2 is {_format_verdict(nis_before)} before the change and "
+                f"{_format_verdict(nis_after)} after it (innovations along the main axis)."
+            )
+        if _differ_by_min_factor(before.rmse_m, after.rmse_m):
+            has_effect = True
+            effect_sentences += (
+                " EKF2's position RMSE along the main axis is "
+                f"{format_metres(before.rmse_m)} m before the change and "
+                f"{format_metres(after.rmse_m)} m after it."
+            )
+        action = (
+            f"Analyse the flight before (--end {time_s:.1f}) and after the change "
+            f"(--start {time_s:.1f}) separately."
+        )
+        if name in fusion_parameters:
+            action = f"Do not change {name} in flight. {action}"
+        yield (make_warning if has_effect else make_note)(
+            "parameter_changed",
+            f"{name} changed from {value_before:g} to {value_after:g}{unit} at {time_s:.1f} "
+            f"s.{effect_sentences}",
+            action,
+            {"parameter": name, "before": value_before, "after": value_after, "at_s": time_s},
+            ((time_s, time_s),),
+        )
+
+
+def _differ_by_min_factor(before: float, after: float) -> bool:
+    """Return True if both values are known and differ by more than the minimum factor."""
+    low, high = sorted((before, after))
+    return low > 0.0 and high > MIN_SIGMA_RATIO_OR_RMSE_CHANGE_FACTOR * low
+
+
+def _format_verdict(consistency: Consistency) -> str:
+    if consistency.verdict == "consistent":
+        return "consistent"
+    size_word = "small" if consistency.sigma_ratio > 1.0 else "large"
+    factor = format_ratio(consistency.sigma_error_factor)
+    return f"{consistency.verdict} (σ {factor} times too {size_word})"
+
+
+def _assess_span(analysis: Analysis, start_s: float, end_s: float) -> SpanConsistency:
+    rmse_m = math.nan
+    errors = compute_position_errors(analysis.main, "ekf2")
+    if not isinstance(errors, Unavailable):
+        rmse_m = float((errors["error_m"].loc[start_s:end_s] ** 2).mean() ** 0.5)
+    innovations = analysis.main.ekf2_innovations
+    if isinstance(innovations, Unavailable):
+        return SpanConsistency(innovations, rmse_m)
+    samples = innovations[(innovations.index >= start_s) & (innovations.index < end_s)]
+    consistency = assess_innovations(
+        samples["innovation_m"].to_numpy(), samples["innovation_variance_m2"].to_numpy(), math.inf
+    )
+    return SpanConsistency(consistency, rmse_m)
