@@ -108,9 +108,9 @@ def _draw_aid_panels(page: Page, flight: Flight, aids: Mapping[str, AidResult]) 
         f"±{MAX_DRAWN_SIGMAS:g}."
     )
     for name in enabled_aid_names:
-        axes = page.add_panel(aids[name].label, AID_PANEL_HEIGHT, gap_above=1.0)
+        axes = page.add_panel(aids[name].label, AID_PANEL_HEIGHT)
         _draw_innovations(axes, flight.ekf2.aids[name], flight_span_s)
-        style.label_time_axis(axes, name == enabled_aid_names[-1])
+    axes.set_xlabel(style.TIME_LABEL)
 
 
 def _draw_innovations(axes: style.Axes, aid_log: AidLog, span_s: Span) -> None:

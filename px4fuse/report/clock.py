@@ -159,9 +159,7 @@ def draw_pages(analysis: Analysis, results: ComparisonResults) -> Iterator[Page]
         "interval includes the IMU noise; the curve does not, so the curve is narrower."
     )
     title = "Log-likelihood of the positions: decrease below its maximum (nats)"
-    draw_offset_likelihood(
-        page.add_panel(title, CURVE_HEIGHT, caption=curve_sentence, gap_above=14.0), time_offset
-    )
+    draw_offset_likelihood(page.add_panel(title, CURVE_HEIGHT, caption=curve_sentence), time_offset)
     yield page
 
 

@@ -47,7 +47,7 @@ from px4fuse.report.style import (
     draw_curve,
     draw_zero_line,
     line_style,
-    set_plain_ticks,
+    set_log_scale,
 )
 
 MAX_AUTOCORRELATION_LAG = 20
@@ -57,7 +57,6 @@ HISTOGRAM_EDGES = np.linspace(-MAX_DRAWN_SIGMAS, MAX_DRAWN_SIGMAS, 33)
 MAX_DENSITY_AXIS_LIMIT = 1.6
 RUNNING_NIS_HEIGHT = 140.0  # points
 DISTRIBUTION_HEIGHT = 150.0  # points
-LEGEND_HEIGHT = 14.0  # points, of a legend above a plot
 # Label of each statistic, and exponent before printing (0.5: square root)
 STATISTIC_LABELS_AND_EXPONENTS: Mapping[Statistic, tuple[str, float]] = {
     "nis": ("mean NIS", 1.0),
@@ -81,18 +80,15 @@ def draw_pages(analysis: Analysis, _: object) -> Iterator[Page]:
     )
     if innovations := _select_tested_innovations(result):
         title = "Running mean NIS (log scale)"
-        axes = event_marks.add_panel(
-            page, analysis, title, RUNNING_NIS_HEIGHT, gap_above=LEGEND_HEIGHT
-        )
+        axes = event_marks.add_panel(page, analysis, title, RUNNING_NIS_HEIGHT)
         left_column, right_column = make_two_columns()
         histogram_axes = left_column.add_panel(
-            "Distribution of ν/√S", DISTRIBUTION_HEIGHT, gap_above=LEGEND_HEIGHT, left_margin=4.0
+            "Distribution of ν/√S", DISTRIBUTION_HEIGHT, left_margin=4.0
         )
         autocorrelation_axes = right_column.add_panel(
             "Autocorrelation",
             DISTRIBUTION_HEIGHT,
             caption=_describe_whiteness(result, innovations),
-            gap_above=LEGEND_HEIGHT,
         )
         _draw_running_nis(axes, innovations)
         _draw_histogram(histogram_axes, innovations)
@@ -184,8 +180,8 @@ def _draw_running_nis(axes: Axes, innovations: InnovationsByFilter) -> None:
         min_drawn_nis = min(min_drawn_nis, 0.7 * nis_after_first_quarter.min())
         max_drawn_nis = max(max_drawn_nis, 1.4 * nis_after_first_quarter.max())
     axes.axhline(1.0, color="black", lw=0.5)
-    axes.set(yscale="log", ylim=(min_drawn_nis, max_drawn_nis))
-    set_plain_ticks(axes)
+    axes.set_ylim(min_drawn_nis, max_drawn_nis)
+    set_log_scale(axes)
 
 
 def _draw_histogram(axes: Axes, innovations: InnovationsByFilter) -> None:

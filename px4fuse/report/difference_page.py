@@ -194,7 +194,6 @@ def _draw_waterfall(
     axes.set_ylim(row_count - 0.4, -0.6)
     axes.set_xlim(min(0.0, float(bar_ends.min())), 1.2 * right_end)
     axes.set_xlabel("% of the mean square difference KF - EKF2")
-    axes.grid(visible=False)
 
 
 def _describe_largest_difference(explanation: DifferenceExplanation) -> str:

@@ -24,7 +24,6 @@ MAX_PATH_POINTS = 1200  # maximum per path
 MIN_ERROR_RANGE_M = 1e-3  # so that rounding errors look small
 ERROR_PLOT_HEIGHT = 76.0  # points
 MAP_HEIGHT = 128.0  # points
-LABEL_MARGIN = 34.0  # points, left of a map
 COLOUR_BAR_MARGIN = 40.0  # points
 REFERENCE_LINE_STYLE = style.line_style(TRUTH_COLOUR, 0.8, (0, (4, 2)))
 STATISTIC_LINES = (
@@ -55,7 +54,7 @@ def _draw_maps(page: Page, evaluation: Evaluation) -> None:
     left_column, right_column = make_two_columns()
     unaligned_legend_handles: dict[str, Artist] = {}
     if is_aligned:
-        axes = left_column.add_panel("Before alignment", MAP_HEIGHT, left_margin=LABEL_MARGIN)
+        axes = left_column.add_panel("Before alignment", MAP_HEIGHT)
         for position_m, line_style, label in (
             (evaluation.reference_position_m, REFERENCE_LINE_STYLE, "reference"),
             (evaluation.unaligned_position_m, {"color": KF_COLOUR, "lw": 1.2}, "estimate"),
@@ -66,9 +65,7 @@ def _draw_maps(page: Page, evaluation: Evaluation) -> None:
         unaligned_legend_handles = _get_legend_handles(axes)
         left_column.write_small_text(describe_unaligned_rmse(evaluation))
     title = f"{'Aligned path' if is_aligned else 'Path'} coloured by error"
-    axes = right_column.add_panel(
-        title, MAP_HEIGHT, left_margin=LABEL_MARGIN, right_margin=COLOUR_BAR_MARGIN
-    )
+    axes = right_column.add_panel(title, MAP_HEIGHT, right_margin=COLOUR_BAR_MARGIN)
     _draw_path(axes, evaluation, axis_indices)
     style.set_map_axes(axes, *names)
     right_column.write_small_text("Darker poses have a larger error; × marks the largest one.")
@@ -128,7 +125,7 @@ def _draw_ape_and_rpe(page: Page, evaluation: Evaluation) -> None:
 def draw_ape(axes: Axes, evaluation: Evaluation, x_values: Array, label: str) -> None:
     """Draw the absolute pose error (APE), with its RMSE and maximum as horizontal lines."""
     error_m, x_start, x_end = evaluation.position_error_m, float(x_values[0]), float(x_values[-1])
-    drawn_x, drawn_errors_m = style.decimate_series(x_values, error_m, style.MAX_NARROW_AXES_POINTS)
+    drawn_x, drawn_errors_m = style.decimate_series(x_values, error_m)
     gap_indices = np.searchsorted(drawn_x, x_values[_find_gap_indices(evaluation.time_s)])
     curve_with_gaps = np.insert([drawn_x, drawn_errors_m], gap_indices, np.nan, axis=1)
     axes.plot(*curve_with_gaps, color=KF_COLOUR, lw=0.8)
@@ -137,7 +134,6 @@ def draw_ape(axes: Axes, evaluation: Evaluation, x_values: Array, label: str) ->
         axes.axhline(value, label=f"{title} {format_metres(value)} m", zorder=3, **line_style)
     axes.set(xlim=(x_start, max(x_end, x_start + 1e-6)), xlabel=label)
     axes.set_ylim(0.0, 1.08 * max(float(error_m.max()), MIN_ERROR_RANGE_M))
-    axes.locator_params(axis="x", nbins=6)
 
 
 def _draw_rpe(axes: Axes, evaluation: Evaluation) -> None:

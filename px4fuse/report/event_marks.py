@@ -11,10 +11,10 @@ from px4fuse.filter.tuning import HORIZONTAL, AxisTuning
 from px4fuse.report.page import Page
 from px4fuse.report.style import (
     REJECTED_STYLE,
+    TIME_LABEL,
     Artist,
     Axes,
     dot_style,
-    label_time_axis,
 )
 
 # The bands differ in shade and hatching, because reports may be printed in greyscale
@@ -111,7 +111,8 @@ def add_panel(
     """Add a plot over time with gaps, resets, rejections and outliers."""
     axes = page.add_panel(title, height, **options)
     draw_event_markers(axes, analysis, axis=axis)
-    label_time_axis(axes, with_time_label)
+    if with_time_label:
+        axes.set_xlabel(TIME_LABEL)
     return axes
 
 

@@ -77,7 +77,7 @@ def draw_report(loop: Loop, results: LoopResults) -> Iterator[Page]:
 
 def _write_page(page: Page, loop: Loop) -> None:
     write_loop(page, loop)
-    axes = page.add_panel("Map in the frame of the odometry", MAP_HEIGHT, left_margin=36.0)
+    axes = page.add_panel("Map in the frame of the odometry", MAP_HEIGHT)
     draw_map(axes, loop)
     page.add_legend(axes.get_legend_handles_labels()[0])
     page.write_heading("Loop closures and RPE")

@@ -34,7 +34,7 @@ def draw_pages(analysis_or_loop: object, results: FlightResults | LoopResults) -
     if isinstance(answers, Answers):
         page.write_heading("Answer form")
         rows = [list(row) for row in form_rows(answers)]
-        page.add_table(("Question", "Answer"), rows, column_widths=[3.0, 4.0])
+        page.add_table(("Question", "Answer"), rows)
     write_markdown(page, results.student.notes)
     if len(page.blocks) > 1:
         yield page
@@ -103,7 +103,7 @@ def _write_blocks(page: Page, node: SyntaxTreeNode, indent_level: int, marker: s
             case "table":
                 rows = [row.children for section in child.children for row in section.children]
                 head, *body_rows = ([_inline_text(cell) for cell in row] for row in rows)
-                page.add_table(head, body_rows, column_widths=[1.0] * len(head))
+                page.add_table(head, body_rows)
             case "html_block":
                 page.write(TAG_PATTERN.sub("", child.content).strip(), indent=indent)
             case _:  # paragraph, or horizontal rule without text

@@ -85,8 +85,6 @@ class Panel(NamedTuple):
             axis="" if self is INNOVATIONS_PANEL else result.axis.name,
             with_time_label=with_time_label,
         )
-        if is_narrow:
-            axes.locator_params(axis="x", nbins=4)
         self.draw(axes, result.with_whole_flight_tracks())
         page.write_small_text(statistics_text)
 
