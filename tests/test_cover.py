@@ -140,7 +140,7 @@ def test_report_cover_lists_sigma_ratios_of_aiding_sources() -> None:
     )
     card = replace(SMALL_SIGMA_A, verdicts=(), causes=(), effect=None, aids=aids)
     text = text_of(card)
-    assert "barometer height 0.57" in text
+    assert "barometer height ● 0.57" in text
     assert "magnetometer x not evaluated" in text
     assert "such a value is usual and not a fault" in text
 
