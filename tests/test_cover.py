@@ -87,7 +87,7 @@ def test_report_cover_shows_3_notes_and_counts_the_others() -> None:
     text = text_of(replace(SMALL_SIGMA_A, notes=notes, more_causes=4))
     assert "note[note_2]: Text 2." in text
     assert "note_3" not in text
-    assert "2 more notes are listed in All findings" in text
+    assert "2 more notes are listed in All findings of the report" in text
     assert "4 more causes are listed in All findings" in text
 
 

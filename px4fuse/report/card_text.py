@@ -1,6 +1,5 @@
 """Diagnosis card (faults, causes and actions) as text of at most 100 columns."""
 
-import json
 import re
 import shlex
 import textwrap
@@ -23,7 +22,7 @@ from px4fuse.card.model import (
     map_ratio_to_axis,
 )
 from px4fuse.comparison.model import FILTER_NAMES
-from px4fuse.core.text import format_metres, format_ratio
+from px4fuse.core.text import convert_nested, format_metres, format_ratio
 from px4fuse.filter.consistency import CONSISTENT_SIGMA_RATIOS, Reference
 from px4fuse.request import quote_command
 
@@ -54,6 +53,7 @@ SEVERITY_STYLES = {
 ASCII_REPLACEMENTS = str.maketrans("░●◆◀▶─÷−–²³×", ":ox<>-/--23x") | str.maketrans(
     {"√": "sqrt ", "σ": "sigma", "→": "->", "°": " deg", "±": "+-", "ν": "nu", "…": "..."}
 )
+ALL_FINDINGS_PLACE = "in All findings of the report"
 AIDS_CAPTION = (
     "RMS of innovation ÷ √S of each aiding source that EKF2 fused. A value below 1 means that √S "
     "is too large. For barometer, magnetometer and gravity, such a value is usual and not a fault."
@@ -61,33 +61,38 @@ AIDS_CAPTION = (
 
 
 class Paragraph(NamedTuple):
-    """Paragraph on the terminal, with its style and indents."""
+    """Paragraph on the terminal, with its style and indents.
+
+    Attributes
+    ----------
+    wrap_indent : str or None
+        Indent of further lines; None if the paragraph is one line, such as a command.
+    plot : str
+        Plot on the right, omitted on a narrow terminal.
+    """
 
     text: str
     style: str = ""
     first_indent: str = ""
-    indent: str = ""
-    wraps: bool = False
+    wrap_indent: str | None = None
     plot: str = ""
 
     def wrap(self, width: int) -> list[str]:
-        if not self.wraps:
-            text = f"{self.first_indent}{self.text}"
-            if not self.plot or len(text) + len(self.plot) <= width:
-                return [text + self.plot]
-            return [text.rstrip()] if text.strip() else []
-        return textwrap.wrap(
-            self.text,
-            width,
-            initial_indent=self.first_indent,
-            subsequent_indent=self.indent,
-            break_long_words=False,
-            break_on_hyphens=False,
-        )
+        if self.wrap_indent is not None:
+            return textwrap.wrap(
+                self.text,
+                width,
+                initial_indent=self.first_indent,
+                subsequent_indent=self.wrap_indent,
+                break_long_words=False,
+                break_on_hyphens=False,
+            )
+        if not self.plot or len(self.text) + len(self.plot) <= width:
+            return [self.text + self.plot]
+        return [self.text.rstrip()] if self.text.strip() else []
 
 
-def format_card_lines(card: Card, *, verbose: bool = False) -> Iterator[Paragraph]:
-    other_findings_place = "below" if verbose else "with -v"
+def format_card_lines(card: Card) -> Iterator[Paragraph]:
     if card.severity == "refused":
         yield Paragraph(f"error[{card.id}]: {card.headline}", SEVERITY_STYLES["error"])
         for label, text in card.facts.items():
@@ -107,7 +112,7 @@ def format_card_lines(card: Card, *, verbose: bool = False) -> Iterator[Paragrap
         yield from _format_labelled_lines(label, cause.why)
         yield from _format_cause_lines(cause)
     if card.more_causes:
-        yield Paragraph(f"{card.more_causes} more causes are listed {other_findings_place}")
+        yield Paragraph(f"{card.more_causes} more causes are listed {ALL_FINDINGS_PLACE}")
     for label, text in card.facts.items():
         yield from _format_labelled_lines(label, text)
     yield from _format_verdict_lines(card)
@@ -116,17 +121,17 @@ def format_card_lines(card: Card, *, verbose: bool = False) -> Iterator[Paragrap
         yield from _wrap_lines(text, "  ", "  ")
     if card.notes:
         yield Paragraph("")
-    for text in note_texts(card, other_findings_place):
+    for text in note_texts(card):
         yield from _wrap_lines(text, "", "  ")
 
 
-def note_texts(card: Card, other_notes_place: str) -> list[str]:
+def note_texts(card: Card) -> list[str]:
     """Format the first notes of a diagnosis card, and state where the others are."""
     texts = [
         f"note[{note.id}]: {note.text} {note.action}".rstrip() for note in card.notes[:MAX_NOTES]
     ]
     if (omitted_count := len(card.notes) - MAX_NOTES) > 0:
-        texts.append(f"{omitted_count} more notes are listed {other_notes_place}")
+        texts.append(f"{omitted_count} more notes are listed {ALL_FINDINGS_PLACE}")
     return texts
 
 
@@ -138,8 +143,7 @@ def format_closing_lines(card: Card, *, verbose: bool = False) -> Iterator[Parag
         sentences.append("Console means the MAVLink Console of QGroundControl.")
     if card.id:
         sentences.append(f"Meaning: px4fuse explain {card.id}")
-    if sentences:
-        yield from _wrap_lines(" ".join(sentences), "", "")
+    yield from _wrap_lines(" ".join(sentences), "", "")
 
 
 def with_typed_path(card: Card, path: str | None) -> Card:
@@ -155,12 +159,14 @@ def with_typed_path(card: Card, path: str | None) -> Card:
     """
     if path is None:
         return card
-    quoted_name, quoted_path = (
-        json.dumps(text)[1:-1] for text in (shlex.quote(card.identity.file), quote_command([path]))
-    )
-    command = re.compile(rf"(px4fuse \w+ ){re.escape(quoted_name)}")
-    card_json = command.sub(lambda match: match[1] + quoted_path, json.dumps(to_builtins(card)))
-    return convert(json.loads(card_json), Card)
+    command = re.compile(rf"(px4fuse \w+ ){re.escape(shlex.quote(card.identity.file))}")
+
+    def replace_name(element: Any) -> Any:
+        if not isinstance(element, str):
+            return element
+        return command.sub(lambda match: match[1] + quote_command([path]), element)
+
+    return convert(convert_nested(to_builtins(card), replace_name), Card)
 
 
 def to_ascii(text: str) -> str:
@@ -364,7 +370,7 @@ def _format_verdict_line(verdict: Verdict) -> Paragraph:
     label_text = f"  {filter_label:4} {QUANTITY_LABELS[verdict.against]:25}"
     if verdict.ratio is None:
         verdict_text = f"{'–':>7}  not evaluated: {verdict.reason}"
-        return Paragraph(verdict_text, "", label_text, " " * 41, wraps=True)
+        return Paragraph(verdict_text, "", label_text, " " * 41)
     verdict_word = f"({verdict.word})" if verdict.is_explained else verdict.word
     verdict_text = f"{label_text}{format_ratio(verdict.ratio):>7}  {verdict_word}"
     style = "bold" if verdict.is_fault else ""
@@ -413,4 +419,4 @@ def _format_labelled_lines(label: str, text: str) -> Iterator[Paragraph]:
 
 def _wrap_lines(text: str, first_indent: str, indent: str) -> Iterator[Paragraph]:
     if text:
-        yield Paragraph(text, "", first_indent, indent, wraps=True)
+        yield Paragraph(text, "", first_indent, indent)

@@ -95,7 +95,7 @@ def add_card(page: Page, card: Card) -> PageBlock:
         ],
         rows=[*map(_make_verdict_row, card.verdicts), *map(_make_aid_row, card.aids)],
         causes=list(map(_make_cause_fields, card.causes)),
-        notes=note_texts(card, f"in {ALL_FINDINGS_TITLE}"),
+        notes=note_texts(card),
         terms=AIDS_TERMS_NOTE if card.aids else TERMS_NOTE,
         blocks=[],
     )
