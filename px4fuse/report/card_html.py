@@ -85,8 +85,8 @@ def make_sigma_ratio_html(verdicts: Sequence[Verdict], axis: str, name: str = ""
         percent=_format_svg_position,
         alternative=make_alternative_text(verdicts),
         ticks=[
-            (_format_svg_position(map_ratio_to_axis(tick)), label, tick not in LABELLED_RATIO_TICKS)
-            for tick, label in RATIO_AXIS_TICKS.items()
+            (_format_svg_position(map_ratio_to_axis(tick)), RATIO_AXIS_TICKS[tick])
+            for tick in LABELLED_RATIO_TICKS
         ],
         limits=format_consistent_ratios(),
         names=FILTER_NAMES,

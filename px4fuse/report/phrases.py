@@ -20,11 +20,11 @@ from px4fuse.comparison.remedy import format_settings as format_parameters
 from px4fuse.comparison.remedy import (
     make_height_noise_advice,
     make_noise_change,
-    select_changed_settings,
 )
 from px4fuse.core.text import capitalise_first, format_factor, format_number
 from px4fuse.filter.consistency import Consistency
 from px4fuse.filter.settings import KF_NUMERIC_SETTINGS, SETTING_RANGES, Settings
+from px4fuse.filter.signals import AISLE
 from px4fuse.filter.tuning import HORIZONTAL, AxisTuning, NoiseEstimate
 from px4fuse.findings import Finding, finding_title, split_cause_groups
 from px4fuse.findings.noises import KEEP_NOISE_BECAUSE_OF_CORRELATION_ACTION
@@ -189,36 +189,36 @@ def make_tuning_advice(
     comparison: PreparedComparison, tuning_by_axis: Mapping[str, AxisTuning | Unavailable]
 ) -> dict[str, str]:
     """Return advice from the noise estimates, by label such as "SIGMA_Z"."""
-    names = (HORIZONTAL, "aisle", *tuning_by_axis)
-    axis_name = next(
-        (name for name in names if isinstance(tuning_by_axis.get(name), AxisTuning)), ""
-    )
-    tuning = tuning_by_axis.get(axis_name)
-    if not isinstance(tuning, AxisTuning):
+    names = (HORIZONTAL, AISLE, *tuning_by_axis)
+    tunings = [
+        tuning for name in names if isinstance(tuning := tuning_by_axis.get(name), AxisTuning)
+    ]
+    if not tunings:
         return {}
-    advice_by_label, sigma_a, sigma_z = {}, tuning.sigma_a_two_state, tuning.sigma_z
-    may_drift, log = comparison.source.origin.may_drift, comparison.flight.log
-    if may_drift:
+    tuning, axis_name = tunings[0], tunings[0].name
+    sigma_a, sigma_z = tuning.sigma_a_two_state, tuning.sigma_z
+    advice_by_label, origin = dict[str, str](), comparison.source.origin
+    settings = comparison.settings
+    if origin.may_drift:
         advice_by_label["Drift"] = (
             "The position source may drift. The estimates describe the noise without the drift. Do "
             "not set SIGMA_Z or EKF2_EVP_NOISE below the error shown by ground truth or a loop."
         )
-    settings = comparison.settings
     # Same restriction as the finding kf_underconfident of px4fuse compare
-    reduces_gnss_noise = comparison.source.origin.is_gnss and any(
+    elif origin.is_gnss and any(
         noise.value is not None and noise.high is not None and noise.high < setting
         for noise, setting in ((sigma_a, settings.sigma_a_m_s2), (sigma_z, settings.sigma_z_m))
-    )
-    if reduces_gnss_noise:
+    ):
         advice_by_label["GNSS"] = KEEP_NOISE_BECAUSE_OF_CORRELATION_ACTION.format(sensor="GNSS")
-    option_texts = [
-        f" {option} {noise.value:.3g}"
-        for option, noise in (("--sigma-a", sigma_a), ("--sigma-z", sigma_z))
-        if noise.value is not None
-    ]
-    if option_texts and not (may_drift or reduces_gnss_noise):
-        command = f"px4fuse compare LOG{''.join(option_texts)}"
-        advice_by_label["Action"] = f"Re-run with the estimates of {axis_name}: {command}"
+    elif sigma_a.value is not None or sigma_z.value is not None:
+        options_text = "".join(
+            f" {option} {noise.value:.3g}"
+            for option, noise in (("--sigma-a", sigma_a), ("--sigma-z", sigma_z))
+            if noise.value is not None
+        )
+        advice_by_label["Action"] = (
+            f"Re-run with the estimates of {axis_name}: px4fuse compare LOG{options_text}"
+        )
     if sigma_z.value is None and sigma_z.low is not None:
         advice_by_label["SIGMA_Z"] = (
             f"SIGMA_Z is at least {sigma_z.low:.2g} m. The source may not measure the position "
@@ -230,26 +230,8 @@ def make_tuning_advice(
             f"SIGMA_Z{bound_text} cannot be estimated, because the process noise between two "
             "logged positions is too large. Log the source at a higher rate."
         )
-    elif log.autopilot == "PX4" and not may_drift and comparison.source.origin.is_vision:
-        logged_noise_m, name = log.parameters.get(EV_POS.noise), EV_POS.noise
-        variance_m2 = comparison.source.samples[Columns.POSITION_VARIANCE[:2]].median().mean()
-        reported_sigma_m = 0.0 if np.isnan(variance_m2) else float(np.sqrt(variance_m2))
-        changes = make_noise_change(EV_POS, log.parameters, reported_sigma_m, sigma_z.value)
-        logged_noise_text = "" if logged_noise_m is None else f" (now {logged_noise_m:g} m)"
-        advice_by_label["PX4"] = f"Set {name} to {changes[name]:g} m{logged_noise_text}."
-        is_logged_within_interval = logged_noise_m is not None and (
-            sigma_z.low or 0.0
-        ) <= logged_noise_m <= (sigma_z.high or 0.0)
-        if EV_POS.noise_mode_parameter in changes and reported_sigma_m > (sigma_z.high or np.inf):
-            changes = select_changed_settings(changes, log.parameters)
-            advice_by_label["PX4"] = (
-                f"Set {format_parameters(changes)}. EKF2 now uses the σ that the source reports: "
-                f"{reported_sigma_m:.2g} m. The estimated noise is smaller."
-            )
-        elif is_logged_within_interval:
-            advice_by_label["PX4"] = (
-                f"{name} {logged_noise_m:g} m is within the 95 % interval of the estimate."
-            )
+    elif comparison.flight.log.autopilot == "PX4" and not origin.may_drift and origin.is_vision:
+        advice_by_label["PX4"] = _make_vision_noise_advice(comparison, sigma_z)
         advice_by_label["PX4"] += make_height_noise_advice(
             comparison, tuning_by_axis, sigma_z.value
         )
@@ -277,6 +259,25 @@ def make_tuning_advice(
             "them."
         )
     return advice_by_label
+
+
+def _make_vision_noise_advice(comparison: PreparedComparison, estimate: NoiseEstimate) -> str:
+    """Return advice on the position noise of EKF2 for external vision."""
+    assert estimate.value is not None
+    name, parameters = EV_POS.noise, comparison.flight.log.parameters
+    low_m, high_m = estimate.low or 0.0, estimate.high or np.inf
+    variance_m2 = comparison.source.samples[Columns.POSITION_VARIANCE[:2]].median().mean()
+    reported_sigma_m = 0.0 if np.isnan(variance_m2) else float(np.sqrt(variance_m2))
+    changes = make_noise_change(EV_POS, parameters, reported_sigma_m, estimate.value)
+    logged_noise_m = parameters.get(name, np.nan)
+    if EV_POS.noise_mode_parameter in changes and reported_sigma_m > high_m:
+        return (
+            f"Set {format_parameters(changes)}. EKF2 now uses the σ that the source reports: "
+            f"{reported_sigma_m:.2g} m."
+        )
+    if low_m <= logged_noise_m <= high_m:
+        return f"{name} {logged_noise_m:g} m is within the 95 % interval of the estimate."
+    return f"Set {name} to {changes[name]:g} m (now {logged_noise_m:g} m)."
 
 
 def format_student(student: Student, separator: str) -> str:
