@@ -16,6 +16,7 @@ from cli_tools import error_line, run_checked
 from conftest import blank_page
 from exchange import replace
 from rich.console import Console
+from rich.text import Text
 
 from px4fuse.analysis import Analysis
 from px4fuse.cli.outputs import choose_default_report_path, make_console, progress
@@ -102,7 +103,8 @@ def test_terminal_summary_wraps_without_cutting_text(document, monkeypatch) -> N
 
 def test_terminal_paragraph_has_hanging_indent(capsys) -> None:
     console = Console(width=30, highlight=False)
-    print_paragraph(console, "one two three four five six seven", "Label", indent=9)
+    text = Text("one two three four five six seven")
+    print_paragraph(console, text, Text("Label"), indent=9)
     lines = ["Label    one two three four", "         five six seven"]
     assert capsys.readouterr().out.splitlines() == lines
 

@@ -41,7 +41,7 @@ MAP_HEIGHT_FRACTION = 0.33  # of the height of all plots
 # With less free height (points) on the first page, the plots are on the next page
 MIN_PLOTS_HEIGHT = 190.0
 NEXT_PAGE_PLOTS_HEIGHT = 450.0  # points, of all plots on the next page
-UNUSED_PAGE_HEIGHT = 15.0  # points, above and below the plots
+UNUSED_PAGE_HEIGHT = 21.0  # points, above and below the plots
 TITLE_HEIGHT = 16.5  # points, of a title above a plot
 TITLE_LINE_HEIGHT = 10.5  # points; titles in a column have up to two lines
 MAX_DRAWN_SIGMAS = 4.0  # larger innovations ÷ √S are triangles at the edge
@@ -86,7 +86,7 @@ def write_panels(block: PageBlock, analysis: Analysis, card: Card, free_height: 
     left_column, right_column = make_two_columns()
     _draw_map(left_column, analysis, flight_map, plots_height)
     _draw_plots(right_column, analysis, plots, plots_height)
-    page.add_columns(left_column, right_column, gap_above=0.0)
+    page.add_columns(left_column, right_column)
 
 
 def _draw_plots(

@@ -46,7 +46,7 @@ def draw_pages(analysis: Analysis, _: object) -> Iterator[Page]:
     spans_text = ", ".join(f"{start:.0f} to {end:.0f} s" for start, end in explanation.spans_s)
     page.write_heading(f"{name}, {spans_text}")
     for sentence in explanation.sentences:
-        page.write(sentence, size=8.5, gap_above=1.0)
+        page.write(sentence)
     left_column, right_column = make_two_columns(LEFT_COLUMN_FRACTION)
     _draw_waterfall(
         left_column,

@@ -35,7 +35,7 @@ def draw_pages(evaluation: Evaluation, _: object) -> Iterator[Page]:
         "APE: distance of one pose from the reference (its RMSE over all poses is "
         "the ATE). RPE: error of the relative motion over a fixed distance or time.",
     )
-    page.write(_summarise_ate(evaluation), size=9.0, bold=True)
+    page.write(_summarise_ate(evaluation), bold=True)
     write_evaluation(page, evaluation)
     _draw_maps(page, evaluation)
     left_column, right_column = make_two_columns()

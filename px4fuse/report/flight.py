@@ -26,7 +26,7 @@ def draw_pages(analysis: Analysis, _: object) -> Iterator[Page]:
     panels.add_legend(page, analysis)
     panels.POSITION_PANEL.draw_on_page(page, analysis, result, with_time_label=False)
     panels.VELOCITY_PANEL.draw_on_page(page, analysis, result, with_time_label=True)
-    page.write(describe_missing_explanation(analysis), gap_above=6.0)
+    page.write(describe_missing_explanation(analysis))
     yield page
 
 

@@ -19,7 +19,6 @@ if TYPE_CHECKING:
     from markdown_it.token import Token
     from markdown_it.tree import SyntaxTreeNode
 
-HEADING_FONT_SIZES = {"h1": 12.0, "h2": 10.8, "h3": 9.6}
 INDENT = 12.0  # points, per list level
 MAX_INDENTS = 8  # deeper list levels are not indented further
 # Deeper Markdown would exceed Python's recursion limit
@@ -88,8 +87,7 @@ def _write_blocks(page: Page, node: SyntaxTreeNode, indent_level: int, marker: s
     for child in children:
         match child.type:
             case "heading":
-                size = HEADING_FONT_SIZES.get(child.tag, 8.0)
-                page.write(_inline_text(child), size=size, bold=True, indent=indent, gap_above=6.0)
+                page.write_heading(_inline_text(child))
             case "bullet_list" | "ordered_list":
                 first_number = int(child.attrs.get("start", 1))
                 for number, item in enumerate(child.children, first_number):
@@ -107,12 +105,7 @@ def _write_blocks(page: Page, node: SyntaxTreeNode, indent_level: int, marker: s
             case "html_block":
                 page.write(TAG_PATTERN.sub("", child.content).strip(), indent=indent)
             case _:  # paragraph, or horizontal rule without text
-                page.write(
-                    _inline_text(child),
-                    indent=indent,
-                    marker=marker,
-                    gap_above=0.0 if marker else 2.0,
-                )
+                page.write(_inline_text(child), indent=indent, marker=marker)
         marker = ""
 
 

@@ -50,42 +50,31 @@ class Page:
         self,
         text: str,
         *,
-        size: float = 8.0,
         bold: bool = False,
         colour: str = "black",
-        gap_above: float = 0.0,
         indent: float = 0.0,
         marker: str = "",
     ) -> None:
-        """Write a paragraph; lengths are in points."""
+        """Write a paragraph; ``indent`` is in points."""
         if text or marker:
-            block = styled_text(text, size, colour, bold)
-            self.add("text", above=gap_above, indent=indent, mark=marker, **block)
+            self.add("text", indent=indent, mark=marker, **styled_text(text, colour, bold=bold))
 
     def write_heading(self, text: str) -> None:
-        self.add("heading", **styled_text(text, 9.5, bold=True))
+        self.add("heading", **styled_text(text, bold=True))
 
     def write_small_text(self, text: str) -> None:
-        self.write(text, colour=MUTED_COLOUR, gap_above=-1.0)
+        self.write(text, colour=MUTED_COLOUR)
 
     def write_labelled(
         self,
         label: str,
         *texts: str | PageBlock,
         label_width: float = LABEL_WIDTH,
-        gap_above: float = 0.0,
         colour: str = "black",
-        bold: bool = True,
     ) -> None:
         styled_texts = [styled_text(text) if isinstance(text, str) else text for text in texts]
-        styled_label = styled_text(label, 8.0, colour, bold)
-        self.add(
-            "labelled",
-            label=styled_label,
-            texts=styled_texts,
-            width=label_width,
-            above=gap_above,
-        )
+        styled_label = styled_text(label, colour, bold=True)
+        self.add("labelled", label=styled_label, texts=styled_texts, width=label_width)
 
     def write_labelled_texts(self, texts: Mapping[str, str]) -> None:
         for label, text in texts.items():
@@ -122,7 +111,7 @@ class Page:
             "panel",
             title=title,
             caption=caption,
-            alt=": ".join(filter(None, (title, caption))),
+            alt=f"{title} {caption}".strip(),
             axes=axes,
             margins=(left_margin, right_margin),
             height=height,
@@ -164,9 +153,9 @@ class Page:
             "legend", alt=f"Legend: {labels}", width=self.width, height=height, figure=figure
         )
 
-    def add_columns(self, *columns: Page, gap_above: float = 6.0) -> None:
+    def add_columns(self, *columns: Page) -> None:
         blocks, widths = [column.blocks for column in columns], [column.width for column in columns]
-        self.add("columns", columns=blocks, widths=widths, gap=COLUMN_GAP, above=gap_above)
+        self.add("columns", columns=blocks, widths=widths, gap=COLUMN_GAP)
 
 
 def make_two_columns(left_fraction: float = 0.5) -> tuple[Page, Page]:
@@ -175,11 +164,8 @@ def make_two_columns(left_fraction: float = 0.5) -> tuple[Page, Page]:
     return Page(width=left_fraction * free_width), Page(width=(1.0 - left_fraction) * free_width)
 
 
-def styled_text(
-    text: str, size: float = 8.0, colour: str = "black", bold: bool = False
-) -> PageBlock:
-    """Return a text with its size (points), colour and weight."""
-    return {"text": text, "size": size, "colour": colour, "weight": "bold" if bold else "regular"}
+def styled_text(text: str, colour: str = "black", *, bold: bool = False) -> PageBlock:
+    return {"text": text, "colour": colour, "weight": "bold" if bold else "regular"}
 
 
 def make_appendix_title(title: str) -> str:

@@ -6,6 +6,7 @@ from importlib import metadata
 from typing import Any
 
 from px4fuse.core.memory import release_free_memory
+from px4fuse.core.text import one_line
 from px4fuse.report import (
     aids,
     clock,
@@ -98,16 +99,11 @@ def render_pdf(content: Any, results: Any, results_json: str) -> bytes:
         {
             "title": title,
             "author": producer,
-            "head": _shorten(f"px4fuse · {name} · SHA-256 {sha256[:12]}", 90),
-            "student": _shorten(student, 40),
+            "head": one_line(replace_unprintable(f"px4fuse · {name} · SHA-256 {sha256[:12]}"), 90),
+            "student": one_line(replace_unprintable(student), 40),
             "foot": producer,
             "fonts": fonts.find_font_names(all_text),
             "blocks": blocks,
             "results": results_json,
         }
     )
-
-
-def _shorten(text: str, max_length: int) -> str:
-    line = " ".join(replace_unprintable(text).split())
-    return line if len(line) <= max_length else f"{line[: max_length - 1]}…"

@@ -296,7 +296,6 @@ def write_findings(page: Page, findings: tuple[Finding, ...]) -> None:
         page.write_labelled(
             f"{finding.severity}\n{finding.spans_text}".strip(),
             *texts,
-            gap_above=2.0,
             colour=SEVERITY_COLOURS[finding.severity],
         )
 

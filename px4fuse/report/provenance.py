@@ -10,7 +10,6 @@ from px4fuse.report import clock
 from px4fuse.report.cover import ALL_FINDINGS_TITLE, FlightResults
 from px4fuse.report.page import Page
 from px4fuse.report.phrases import describe_alignment, format_clock_map, write_findings
-from px4fuse.report.style import MUTED_COLOUR
 from px4fuse.request import replace_argument_names
 from px4fuse.results.contract import LoopResults
 
@@ -121,9 +120,7 @@ def _write_section(page: Page, title: str, texts: Iterable[str | tuple[str, str]
         if isinstance(text, str):
             page.write(text)
         else:
-            page.write_labelled(
-                *text, label_width=LABEL_WIDTH, gap_above=-1.0, colour=MUTED_COLOUR, bold=False
-            )
+            page.write_labelled(*text, label_width=LABEL_WIDTH)
 
 
 def _write_methods(page: Page, name: str) -> None:

@@ -2,7 +2,6 @@
 
 import re
 from collections.abc import Iterable, Sequence
-from itertools import zip_longest
 from typing import Literal
 
 from rich.console import Console
@@ -43,11 +42,8 @@ def print_blocks(
     for block in blocks:
         match block["kind"]:
             case "text" | "heading":
-                print_paragraph(
-                    console,
-                    _make_rich_text(block),
-                    indent=round(block.get("indent", 0.0) / POINTS_PER_COLUMN),
-                )
+                indent = round(block.get("indent", 0.0) / POINTS_PER_COLUMN)
+                print_paragraph(console, _make_rich_text(block), Text(), indent=indent)
             case "labelled":
                 _show_labelled(console, block, request)
             case "table":
@@ -77,15 +73,14 @@ def _show_card(console: Console, block: PageBlock, request: Request | None) -> N
 
 
 def _show_labelled(console: Console, block: PageBlock, request: Request | None) -> None:
-    label_lines = block["label"]["text"].split("\n")
-    labels = [line for line in label_lines if len(line) < LABEL_CHARACTERS]
-    long_label_text = "".join(f" ({line})" for line in label_lines if len(line) >= LABEL_CHARACTERS)
-    for index, (label, text_block) in enumerate(zip_longest(labels, block["texts"])):
-        text, commands = Text() if text_block is None else _make_rich_text(text_block), list[str]()
+    label, _, spans_text = block["label"]["text"].partition("\n")
+    for index, text_block in enumerate(block["texts"]):
+        text, commands = _make_rich_text(text_block), list[str]()
         if request is not None:
             text.plain, commands = shorten_commands(text.plain, request)
-        text.append("" if index else long_label_text)
-        styled_label = _make_rich_text({**block["label"], "text": label or ""})
+        if spans_text and index == 0:
+            text.append(f" ({spans_text})")
+        styled_label = _make_rich_text(block["label"] | {"text": "" if index else f"{label} "})
         print_paragraph(console, text, styled_label, indent=LABEL_CHARACTERS)
         for command in commands:
             print_line(console, "", command)
@@ -114,14 +109,11 @@ def _make_rich_text(block: PageBlock) -> Text:
     return Text(block["text"], f"{style} bold" if block["weight"] == "bold" else style)
 
 
-def print_paragraph(
-    console: Console, text: str | Text, label: str | Text = "", *, indent: int
-) -> None:
+def print_paragraph(console: Console, text: Text, label: Text, *, indent: int) -> None:
     """Print an indented paragraph beside its label."""
-    body = Text(text) if isinstance(text, str) else text
-    margin = Text(label) if isinstance(label, str) else label.copy()
+    margin = label.copy()
     margin.pad_right(max(indent - margin.cell_len, 0))
-    for line in body.wrap(console, max(console.width - indent, 1)):
+    for line in text.wrap(console, max(console.width - indent, 1)):
         line.rstrip()
         console.print(margin.append_text(line), soft_wrap=True)
         margin = Text(" " * indent)
