@@ -31,10 +31,6 @@ MARKER_SVG_PATHS = {
     "below": "M5-7L-7 0L5 7z",
     "above": "M-5-7L7 0L-5 7z",
 }
-SCREEN_READER_QUANTITIES = {
-    "source": "innovation over root S",
-    "truth": "position error over sigma",
-}
 
 
 def make_diagnosis_card(analysis: Analysis) -> Card:
@@ -83,7 +79,6 @@ def make_sigma_ratio_html(verdicts: Sequence[Verdict], axis: str, name: str = ""
         marks=locate_sigma_ratio,
         paths=MARKER_SVG_PATHS,
         percent=_format_svg_position,
-        alternative=make_alternative_text(verdicts),
         ticks=[
             (_format_svg_position(map_ratio_to_axis(tick)), RATIO_AXIS_TICKS[tick])
             for tick in LABELLED_RATIO_TICKS
@@ -112,26 +107,6 @@ def make_notebook_html(card: Card) -> str:
     """Return a diagnosis card as HTML with CSS, for a notebook."""
     colour_css = read_asset("colours.css").replace(":root", ".px4fuse-card")
     return f"<style>{colour_css}{read_card_css()}</style>{make_card_html(card, is_open=True)}"
-
-
-def make_alternative_text(verdicts: Sequence[Verdict]) -> str:
-    """Describe the σ ratios of the filters as text, for screen readers.
-
-    >>> verdict = Verdict(filter="kf", against="truth", ratio=7.2, word="overconfident")
-    >>> make_alternative_text([verdict])
-    'KF, position error over sigma: 7.2, overconfident.'
-    """
-    sentences = []
-    for verdict in verdicts:
-        verdict_text = f"not evaluated, {verdict.reason}"
-        if verdict.ratio is not None:
-            explained_note = ", explained" if verdict.is_explained else ""
-            verdict_text = f"{format_ratio(verdict.ratio)}, {verdict.word}{explained_note}"
-        sentences.append(
-            f"{FILTER_NAMES[verdict.filter]}, {SCREEN_READER_QUANTITIES[verdict.against]}: "
-            f"{verdict_text}."
-        )
-    return " ".join(sentences)
 
 
 def _format_svg_position(fraction: float) -> str:

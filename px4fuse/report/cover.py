@@ -108,38 +108,45 @@ def find_free_height(page: Page) -> float:
 
 
 def _make_verdict_row(verdict: Verdict) -> dict[str, Any]:
-    verdict_text = f"{verdict.word}, explained" if verdict.is_explained else verdict.word
-    if verdict.ratio is None:
-        verdict_text = f"not evaluated: {verdict.reason}"
-    return {
-        "filter": verdict.filter,
-        "label": FILTER_NAMES[verdict.filter] if verdict.against == "source" else "",
-        "quantity": QUANTITY_LABELS[verdict.against],
-        "word": verdict_text,
-        "quiet": verdict.is_explained,
-        "loud": verdict.is_fault,
-        **_make_sigma_ratio_fields(verdict.ratio, verdict.against, verdict.interval),
-    }
+    word = f"{verdict.word}, explained" if verdict.is_explained else verdict.word
+    return _make_ratio_row(
+        verdict.ratio,
+        verdict.against,
+        verdict.interval,
+        filter=verdict.filter,
+        label=FILTER_NAMES[verdict.filter] if verdict.against == "source" else "",
+        quantity=QUANTITY_LABELS[verdict.against],
+        word=f"not evaluated: {verdict.reason}" if verdict.ratio is None else word,
+        quiet=verdict.is_explained,
+        loud=verdict.is_fault,
+    )
 
 
 def _make_aid_row(aid: AidConsistency) -> dict[str, Any]:
-    return {
-        "filter": "ekf2",
-        "label": "",
-        "quantity": f"{aid.label} {aid.component}".strip(),
-        "word": "not evaluated" if aid.ratio is None else "",
-        "quiet": aid.is_usual,
-        "loud": False,
-        **_make_sigma_ratio_fields(aid.ratio, "source", None),
-    }
+    return _make_ratio_row(
+        aid.ratio,
+        filter="ekf2",
+        label="",
+        quantity=f"{aid.label} {aid.component}".strip(),
+        word="not evaluated" if aid.ratio is None else "",
+        quiet=aid.is_usual,
+        loud=False,
+    )
 
 
-def _make_sigma_ratio_fields(
-    ratio: float | None, reference: Reference, interval: tuple[float, float] | None
+def _make_ratio_row(
+    ratio: float | None,
+    reference: Reference = "source",
+    interval: tuple[float, float] | None = None,
+    **fields: str | bool,
 ) -> dict[str, Any]:
     if ratio is None:
-        return {"ratio": ""}
-    return {"ratio": format_ratio(ratio), **locate_sigma_ratio(ratio, reference, interval)}
+        return {"ratio": "", **fields}
+    return {
+        "ratio": format_ratio(ratio),
+        **locate_sigma_ratio(ratio, reference, interval),
+        **fields,
+    }
 
 
 def _make_cause_fields(cause: DiagnosedCause) -> dict[str, Any]:
