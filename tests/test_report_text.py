@@ -20,7 +20,7 @@ from px4fuse.analysis import Analysis
 from px4fuse.filter.time_offset import ClockOffset, PartOffset
 from px4fuse.findings import Finding
 from px4fuse.flight.model import Unavailable
-from px4fuse.report import clock, fonts, notes
+from px4fuse.report import clock, fonts, notes, typesetting
 from px4fuse.report.notes import write_markdown
 from px4fuse.report.page import Page, PageBlock, replace_unprintable
 from px4fuse.report.typesetting import compile_pdf
@@ -180,9 +180,10 @@ def test_typst_code_in_student_notes_is_printed_as_text() -> None:
      'image(bytes("<svg xmlns=\'http://www.w3.org/2000/svg\'><image href=\'/etc/hostname\' '
      'width=\'1\' height=\'1\'/></svg>"), format: "svg")'],
 )  # fmt: skip
-def test_typst_template_cannot_read_files(code: str) -> None:
+def test_typst_template_cannot_read_files(code: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(typesetting, "read_template", lambda: f"#{code}")
     with pytest.raises(typst.TypstError):
-        compile_pdf({"fonts": [fonts.FONT]}, f"#{code}")
+        compile_pdf({"fonts": [fonts.FONT]})
 
 
 def offset(**changes: Any) -> ClockOffset:

@@ -84,17 +84,6 @@ def draw_pages(analysis: Analysis, _: object) -> Iterator[Page]:
     yield page
 
 
-def write_explanation(page: Page, explanation: DifferenceExplanation | Unavailable) -> None:
-    """Write the explanation of the difference KF - EKF2, or why it is missing."""
-    if isinstance(explanation, Unavailable):
-        page.write_labelled(
-            "KF-EKF2",
-            f"The difference between KF and EKF2 cannot be explained: {explanation.reason}.",
-        )
-    else:
-        page.write_labelled("KF-EKF2", explanation.sentences[0])
-
-
 def describe_missing_explanation(analysis: Analysis) -> str:
     """Return the reason why the difference KF - EKF2 has no explanation, if any."""
     explanation = analysis.difference_steps.get(analysis.main.axis.name)

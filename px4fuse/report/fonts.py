@@ -1,5 +1,6 @@
 """Fonts for texts in any script."""
 
+from collections.abc import Sequence
 from functools import cache
 from pathlib import Path
 
@@ -37,7 +38,7 @@ def find_font_names(text: str) -> list[str]:
     )
 
 
-def find_font_folders(names: tuple[str, ...]) -> list[str]:
+def find_font_folders(names: Sequence[str]) -> list[str]:
     path_by_name = dict(_list_fonts_except_dejavu()) if len(names) > 1 else {}
     font_files = [font_manager.findfont(FONT), *filter(None, map(path_by_name.get, names))]
     return list(dict.fromkeys(str(Path(str(file)).parent) for file in font_files))

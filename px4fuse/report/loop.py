@@ -18,6 +18,7 @@ from px4fuse.report.style import (
     EKF2_COLOUR,
     KF_COLOUR,
     SEVERITY_COLOURS,
+    TEXT_COLOUR,
     TRACK_STYLES,
     Axes,
     line_style,
@@ -189,7 +190,7 @@ def write_closures_and_rpe(page: Page, loop: Loop) -> None:
             "accepted" if closure.accepted else "REJECTED",
             "–" if closure.weight_gnc is None else f"{closure.weight_gnc:.2f}",
         ]
-        colour = "black" if closure.accepted else ERROR_COLOUR
+        colour = TEXT_COLOUR if closure.accepted else ERROR_COLOUR
         rows.append([(cell, colour) for cell in cells])
     if rows:
         head = ["closure", "distance\n(m)", "d²", "degrees of\nfreedom", "p", "gate", "GNC\nweight"]

@@ -8,7 +8,7 @@ from collections.abc import Iterable, Mapping, Sequence
 from typing import Any
 
 from px4fuse.core.text import with_log_name
-from px4fuse.report.style import MUTED_COLOUR, Artist, Axes
+from px4fuse.report.style import MUTED_COLOUR, TEXT_COLOUR, Artist, Axes
 
 PAGE_WIDTH = 178.0 * 72.0 / 25.4  # points
 COLUMN_GAP = 5.0 * 72.0 / 25.4  # points, between two columns
@@ -51,7 +51,7 @@ class Page:
         text: str,
         *,
         bold: bool = False,
-        colour: str = "black",
+        colour: str = TEXT_COLOUR,
         indent: float = 0.0,
         marker: str = "",
     ) -> None:
@@ -70,7 +70,7 @@ class Page:
         label: str,
         *texts: str | PageBlock,
         label_width: float = LABEL_WIDTH,
-        colour: str = "black",
+        colour: str = TEXT_COLOUR,
     ) -> None:
         styled_texts = [styled_text(text) if isinstance(text, str) else text for text in texts]
         styled_label = styled_text(label, colour, bold=True)
@@ -164,7 +164,7 @@ def make_two_columns(left_fraction: float = 0.5) -> tuple[Page, Page]:
     return Page(width=left_fraction * free_width), Page(width=(1.0 - left_fraction) * free_width)
 
 
-def styled_text(text: str, colour: str = "black", *, bold: bool = False) -> PageBlock:
+def styled_text(text: str, colour: str = TEXT_COLOUR, *, bold: bool = False) -> PageBlock:
     return {"text": text, "colour": colour, "weight": "bold" if bold else "regular"}
 
 

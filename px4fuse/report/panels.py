@@ -15,7 +15,7 @@ from px4fuse.filter.consistency import Consistency
 from px4fuse.flight.model import Unavailable
 from px4fuse.report import event_marks, style
 from px4fuse.report.page import Page, PageBlock
-from px4fuse.report.phrases import format_verdict, get_statistics_by_filter
+from px4fuse.report.phrases import format_sigma_verdict, get_statistics_by_filter
 from px4fuse.report.style import (
     INNOVATION_STYLES,
     TRACK_STYLES,
@@ -221,8 +221,9 @@ def _describe_innovations(result: AxisComparison) -> str:
         if isinstance(consistency, Unavailable):
             sentences.append(f"{name}: {consistency.reason}.")
             continue
+        verdict_text = format_sigma_verdict(consistency.verdict, consistency.sigma_error_factor)
         sentences.append(
-            f"{name}: {consistency.count} innovations, {format_verdict(consistency)}; mean "
+            f"{name}: {consistency.count} innovations, {verdict_text}; mean "
             f"{consistency.innovation_mean_m:+.3f} m, standard deviation "
             f"{consistency.innovation_std_m:.3f} m, median √S {consistency.sqrt_s_median_m:.3f} m."
         )

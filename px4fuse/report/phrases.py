@@ -11,7 +11,6 @@ from px4fuse.comparison.model import (
     FILTER_NAMES,
     AxisComparison,
     Comparison,
-    Difference,
     FilterSummary,
     PreparedComparison,
     UntestedFilter,
@@ -29,7 +28,7 @@ from px4fuse.filter.tuning import HORIZONTAL, AxisTuning, NoiseEstimate
 from px4fuse.findings import Finding, finding_title, split_cause_groups
 from px4fuse.findings.noises import KEEP_NOISE_BECAUSE_OF_CORRELATION_ACTION
 from px4fuse.flight.ekf2_parameters import EV_POS
-from px4fuse.flight.model import Alignment, ClockMap, Columns, Truth, Unavailable
+from px4fuse.flight.model import Alignment, ClockMap, Columns, Unavailable
 from px4fuse.report.page import Cell, Page, styled_text
 from px4fuse.report.style import GOOD_COLOUR, MUTED_COLOUR, SEVERITY_COLOURS
 from px4fuse.results.model import Student
@@ -53,13 +52,6 @@ def format_settings(settings: Settings) -> str:
         for name in KF_NUMERIC_SETTINGS
     )
     return f"{', '.join(setting_texts)}, input {settings.input}{offset_text}"
-
-
-def format_verdict(consistency: Consistency | Unavailable) -> str:
-    """Describe the consistency of a filter, with the factor by which its reported σ is wrong."""
-    if isinstance(consistency, Unavailable):
-        return "not evaluated"
-    return format_sigma_verdict(consistency.verdict, consistency.sigma_error_factor)
 
 
 def format_sigma_verdict(verdict: str, factor: float) -> str:
@@ -91,29 +83,26 @@ def make_verdict_row(result: AxisComparison, name: str) -> list[Cell]:
     consistency = get_statistics_by_filter(result)[name]
     label = result.axis.label.removeprefix("the ") if name == "KF" else ""
     if isinstance(consistency, Unavailable):
-        return [label, name, "", "", (format_verdict(consistency), MUTED_COLOUR)]
+        return [label, name, "", "", ("not evaluated", MUTED_COLOUR)]
     is_consistent = consistency.verdict == "consistent"
     colour = GOOD_COLOUR if is_consistent else SEVERITY_COLOURS["warning"]
     band_text = "{:.2f} – {:.2f}".format(*consistency.nis_band)
-    verdict = format_verdict(consistency), colour
-    return [label, name, format_number(consistency.nis_mean), band_text, verdict]
+    verdict_text = format_sigma_verdict(consistency.verdict, consistency.sigma_error_factor)
+    return [label, name, format_number(consistency.nis_mean), band_text, (verdict_text, colour)]
 
 
 def write_error_table(page: Page, analysis: Analysis) -> None:
     """Write a table of consistency tests and position errors of KF and EKF2."""
-    axes = (analysis.main, *analysis.select_secondary_axes())
-    has_ekf2 = any(isinstance(result.difference, Difference) for result in axes)
-    has_truth = isinstance(analysis.flight.truth, Truth)
-
     rows = []
-    for result in axes:
+    for result in (analysis.main, *analysis.select_secondary_axes()):
         for name, consistency in get_statistics_by_filter(result).items():
             difference = result.difference if name == "KF" else None
-            cells = [_format_rms(difference, field) for field in DIFFERENCE_FIELDS if has_ekf2]
-            cells += [_format_rms(consistency.truth, field) for field in RMSE_FIELDS if has_truth]
+            cells = [
+                *(_format_rms(difference, field) for field in DIFFERENCE_FIELDS),
+                *(_format_rms(consistency.truth, field) for field in RMSE_FIELDS),
+            ]
             rows.append([*make_verdict_row(result, name), *cells])
-    head = [*VERDICT_TABLE_HEAD, *(["KF-EKF2\n(m)", "RMS\n(m/s)"] if has_ekf2 else [])]
-    head += ["RMSE\n(m)", "\n(m/s)"] if has_truth else []
+    head = [*VERDICT_TABLE_HEAD, "KF-EKF2\n(m)", "RMS\n(m/s)", "RMSE\n(m)", "\n(m/s)"]
     page.add_table(head, rows, right_aligned_columns=(2, 3, 5, 6, 7, 8))
 
 
@@ -124,12 +113,6 @@ def _format_rms(statistic: object, field: str) -> str:
 
 def list_verdict_warnings(comparison: Comparison) -> list[str]:
     """Return warnings about the consistency tests of KF and EKF2."""
-    consistency_rows = [
-        (result.axis.label, filter_name, consistency)
-        for result in comparison.axes.values()
-        for filter_name, consistency in get_statistics_by_filter(result).items()
-        if isinstance(consistency, Consistency)
-    ]
     notes = []
     if comparison.source.origin.may_drift:
         notes.append(
@@ -137,9 +120,13 @@ def list_verdict_warnings(comparison: Comparison) -> list[str]:
             "not with the true position. Check the error with ground truth or a loop closure."
         )
     autocorrelated_innovation_texts = [
-        f"{filter_name} along {axis}, lag-1 autocorrelation {consistency.lag1_autocorrelation:+.2f}"
-        for axis, filter_name, consistency in consistency_rows
-        if consistency.verdict == "consistent" and consistency.ljung_box_p < MIN_WHITENESS_P_VALUE
+        f"{filter_name} along {result.axis.label}, lag-1 autocorrelation "
+        f"{consistency.lag1_autocorrelation:+.2f}"
+        for result in comparison.axes.values()
+        for filter_name, consistency in get_statistics_by_filter(result).items()
+        if isinstance(consistency, Consistency)
+        and consistency.verdict == "consistent"
+        and consistency.ljung_box_p < MIN_WHITENESS_P_VALUE
     ]
     if autocorrelated_innovation_texts:
         notes.append(
@@ -167,8 +154,8 @@ def describe_alignment(alignment: Alignment) -> dict[str, str]:
     """Describe the alignment of a position file with the flight, by label."""
     north_m, east_m, down_m = alignment.origin_m
     yaw_sigma_text = "" if alignment.yaw_sigma_deg is None else f" ± {alignment.yaw_sigma_deg:.2f}°"
-    clock_offset_sigma_s, residual_rms_m = alignment.clock_offset_sigma_s, alignment.residual_rms_m
-    clock_sigma_text = "" if clock_offset_sigma_s is None else f" ± {clock_offset_sigma_s:.3f} s"
+    clock_sigma_s, residual_rms_m = alignment.clock_offset_sigma_s, alignment.residual_rms_m
+    clock_sigma_text = "" if clock_sigma_s is None else f" ± {clock_sigma_s:.3f} s"
     text_by_label = {
         "frame": f"{alignment.frame} ({alignment.frame_reason})",
         "yaw": f"{alignment.yaw_deg:.2f}°{yaw_sigma_text} ({alignment.yaw_reason})",
@@ -177,11 +164,11 @@ def describe_alignment(alignment: Alignment) -> dict[str, str]:
         f"({alignment.clock_reason})",
     }
     if alignment.correlation is not None:
-        residual_text = (
-            "" if residual_rms_m is None else f", residual {residual_rms_m:.3f} m RMS per axis"
+        text_by_label["match"] = (
+            f"correlation {alignment.correlation:.4f} with {alignment.reference}"
         )
-        correlation_text = f"correlation {alignment.correlation:.4f} with {alignment.reference}"
-        text_by_label["match"] = correlation_text + residual_text
+        if residual_rms_m is not None:
+            text_by_label["match"] += f", residual {residual_rms_m:.3f} m RMS per axis"
     return text_by_label
 
 

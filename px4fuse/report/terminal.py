@@ -7,7 +7,6 @@ from px4fuse.card.model import Card
 from px4fuse.core.text import capitalise_first
 from px4fuse.ekf2.steps import DifferenceExplanation
 from px4fuse.report.aids import select_aids_of_outdoor_flight, write_aids
-from px4fuse.report.difference_page import write_explanation
 from px4fuse.report.page import Page
 from px4fuse.report.phrases import (
     describe_alignment,
@@ -69,7 +68,7 @@ def _write_details(page: Page, analysis: Analysis, results: Any) -> None:
         page.write_small_text(note)
     explanation = analysis.difference_steps.get(analysis.main.axis.name)
     if isinstance(explanation, DifferenceExplanation):
-        write_explanation(page, explanation)
+        page.write_labelled("KF-EKF2", explanation.sentences[0])
     if aids := select_aids_of_outdoor_flight(analysis):
         write_aids(page, aids)
     write_findings(page, results.findings)
