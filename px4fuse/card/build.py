@@ -451,18 +451,16 @@ def _explain_verdict_differences(
     may_drift, ekf2_errors = analysis.source.origin.may_drift, analysis.main.filters["ekf2"].truth
     sigma_verdicts = _mark_explained_verdicts(sigma_verdicts, causes, may_drift=may_drift)
     *previous_verdicts, ekf2_verdict = sigma_verdicts
-    fusion_horizon_sigma_ratio = math.inf
+    horizon_nees = getattr(ekf2_errors, "nees_position_horizon_mean", None)
+    horizon_sigma_ratio = math.sqrt(horizon_nees or math.inf)
     if (
         not causes
         and ekf2_verdict.word == "overconfident"
-        and isinstance(ekf2_errors, ErrorsAgainstTruth)
-        and ekf2_errors.nees_position_horizon_mean
+        and classify_sigma_ratio(horizon_sigma_ratio, "truth") == "consistent"
     ):
-        fusion_horizon_sigma_ratio = math.sqrt(ekf2_errors.nees_position_horizon_mean)
-    if classify_sigma_ratio(fusion_horizon_sigma_ratio, "truth") == "consistent":
         return (*previous_verdicts, replace(ekf2_verdict, is_explained=True)), (
             "EKF2 reports σ for its delayed position at the fusion horizon. The error of the "
-            f"delayed position is {format_ratio(fusion_horizon_sigma_ratio)} times σ, so EKF2 is "
+            f"delayed position is {format_ratio(horizon_sigma_ratio)} times σ, so EKF2 is "
             "consistent. The output predictor adds a lag error to the published position."
         )
     explanation = _explain_differing_verdicts(analysis, sigma_verdicts, causes)
@@ -483,16 +481,13 @@ def _explain_differing_verdicts(
         if rerun.improves == "position and σ"
     }
     filters_with_differing_ratios = [
-        filter_name
-        for filter_name in FILTER_NAMES
-        for source, truth in [
-            [verdict for verdict in sigma_verdicts if verdict.filter == filter_name]
-        ]
+        source.filter
+        for source, truth in zip(sigma_verdicts[::2], sigma_verdicts[1::2], strict=True)
         if source.ratio is not None
         and truth.ratio is not None
         and (
             source.word != truth.word
-            or (truth.ratio > 2.0 * source.ratio and filter_name not in corrected_filters)
+            or (truth.ratio > 2.0 * source.ratio and source.filter not in corrected_filters)
         )
     ]
     if not filters_with_differing_ratios:
@@ -512,9 +507,11 @@ def _explain_differing_verdicts(
         )
     horizontal_tuning = analysis.tuning.get(HORIZONTAL)
     if analysis.source.origin.may_drift:
-        sigma_z = horizontal_tuning.sigma_z if isinstance(horizontal_tuning, AxisTuning) else None
-        noise_m = sigma_z and (sigma_z.value or sigma_z.high)
-        noise_text = f" of {format_metres(noise_m)} m" if noise_m else ""
+        noise_text = ""
+        if isinstance(horizontal_tuning, AxisTuning):
+            sigma_z = horizontal_tuning.sigma_z
+            noise_m = sigma_z.value or sigma_z.high
+            noise_text = f" of {format_metres(noise_m)} m" if noise_m else ""
         return (
             f"The position noise{noise_text} is smaller than KF and EKF2 assume, so innovations "
             "are small. Only ground truth shows the drift of the source."
@@ -524,12 +521,11 @@ def _explain_differing_verdicts(
             "KF and EKF2 follow position errors that change slowly. Innovations do not show slow "
             "errors; only ground truth does."
         )
-    has_heading_error = "ekf2_heading_error" in finding_ids
-    explanation = HEADING_ERROR_EXPLANATION if has_heading_error else UNEXPLAINED_DIFFERENCE_TEXT
-    has_rejected_outliers = (
-        "source_outliers" in finding_ids and "ekf2" in filters_with_differing_ratios
-    )
-    return OUTLIER_EXPLANATION if has_rejected_outliers else explanation
+    if "source_outliers" in finding_ids and "ekf2" in filters_with_differing_ratios:
+        return OUTLIER_EXPLANATION
+    if "ekf2_heading_error" in finding_ids:
+        return HEADING_ERROR_EXPLANATION
+    return UNEXPLAINED_DIFFERENCE_TEXT
 
 
 def _describe_difference(effect: FlightErrors, ranked_causes: Sequence[RankedCause]) -> str:

@@ -12,11 +12,10 @@ from px4fuse.ekf2.aids import AidResult, find_flight_span
 from px4fuse.flight.model import AidLog, Flight, Unavailable, sample_step_function
 from px4fuse.report import style
 from px4fuse.report.event_marks import ON_GROUND_BAND_STYLE
-from px4fuse.report.page import Cell, Page, make_appendix_title
+from px4fuse.report.page import Cell, Page
 from px4fuse.report.panels import draw_dots
 from px4fuse.report.phrases import format_sigma_verdict
 
-TITLE = "Aiding sources of EKF2"
 LEAD_TEXT = (
     "Each aiding source is tested with its innovations in flight: a mean NIS of 1 is expected. "
     "The NIS hardly shows time-correlated errors, wrong delays and wrong headings."
@@ -30,11 +29,11 @@ OUTDOOR_AIDS = ("gnss_pos", "gnss_vel", "optical_flow", "aux_global_position")
 def draw_pages(analysis: Analysis | AidingSourceAnalysis, _: object) -> Iterator[Page]:
     """Draw the page on the aiding sources of EKF2."""
     if isinstance(analysis, Analysis):
-        title, aids = make_appendix_title(TITLE), select_aids_of_outdoor_flight(analysis)
+        title, aids = "Appendix: aiding sources", select_aids_of_outdoor_flight(analysis)
     else:
-        title, aids = TITLE, analysis.aids
+        title, aids = "Aiding sources", analysis.aids
     if aids:
-        page = Page(title, LEAD_TEXT)
+        page = Page(f"{title} of EKF2", LEAD_TEXT)
         write_aids(page, aids)
         _draw_aid_panels(page, analysis.flight, aids)
         yield page

@@ -9,6 +9,7 @@ from px4fuse.card.verdicts import make_sigma_verdicts
 from px4fuse.comparison.model import FILTER_NAMES
 from px4fuse.core.text import format_ratio
 from px4fuse.errors import SettingsError
+from px4fuse.finding import format_spans
 from px4fuse.html.safe import load_template, read_asset
 from px4fuse.report.card_text import (
     LABELLED_RATIO_TICKS,
@@ -16,7 +17,6 @@ from px4fuse.report.card_text import (
     SEVERITY_SIGNS,
     format_consistent_ratios,
     format_rerun_note,
-    format_spans,
     format_target,
     label_alternatives,
     locate_sigma_ratio,

@@ -24,6 +24,7 @@ from px4fuse.card.model import (
 from px4fuse.comparison.model import FILTER_NAMES
 from px4fuse.core.text import convert_nested, format_metres, format_ratio
 from px4fuse.filter.consistency import CONSISTENT_SIGMA_RATIOS, Reference
+from px4fuse.finding import format_spans
 from px4fuse.request import quote_command
 
 CARD_WIDTH = 100  # characters per line
@@ -254,7 +255,7 @@ def format_headline_lines(card: Card) -> Iterator[Paragraph]:
 
 
 def _format_cause_lines(cause: DiagnosedCause) -> Iterator[Paragraph]:
-    yield from _format_labelled_lines("when", format_spans(cause))
+    yield from _format_labelled_lines("when", format_spans(cause.spans_s))
     actions = label_alternatives(cause)
     labels = [f"{prefix}{format_target(action)}" for prefix, action in actions]
     label_width = max(map(len, labels), default=0) + 2
@@ -399,18 +400,6 @@ def _format_aid_lines(aid_rows: Sequence[AidConsistency]) -> Iterator[Paragraph]
         ratio_text = "–" if row.ratio is None else format_ratio(row.ratio)
         label_text = f"  {label:13}{row.component:6}{ratio_text:>7}"
         yield Paragraph(f"{label_text:{indent}}", plot=draw_sigma_ratio(row.ratio, "source"))
-
-
-def format_spans(cause: DiagnosedCause) -> str:
-    """Format the time from the start of the first to the end of the last occurrence of a fault."""
-    if not cause.spans_s:
-        return ""
-    first_start_s, last_end_s = cause.spans_s[0][0], cause.spans_s[-1][1]
-    return (
-        f"{first_start_s:.1f} s"
-        if last_end_s - first_start_s < 0.05
-        else f"{first_start_s:.1f} to {last_end_s:.1f} s"
-    )
 
 
 def _format_labelled_lines(label: str, text: str) -> Iterator[Paragraph]:

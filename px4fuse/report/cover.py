@@ -17,6 +17,7 @@ from px4fuse.card.model import (
 from px4fuse.comparison.model import FILTER_NAMES
 from px4fuse.core.text import format_ratio, one_line
 from px4fuse.filter.consistency import Reference
+from px4fuse.finding import format_spans
 from px4fuse.report import fonts
 from px4fuse.report.card_text import (
     AIDS_CAPTION,
@@ -24,7 +25,6 @@ from px4fuse.report.card_text import (
     SEVERITY_SIGNS,
     format_consistent_ratios,
     format_rerun_note,
-    format_spans,
     label_alternatives,
     locate_sigma_ratio,
     make_rerun_columns,
@@ -155,7 +155,7 @@ def _make_cause_fields(cause: DiagnosedCause) -> dict[str, Any]:
     return {
         "title": cause.title,
         "id": cause.id,
-        "when": f"{cause.severity} · {format_spans(cause) or 'whole flight'}",
+        "when": f"{cause.severity} · {format_spans(cause.spans_s) or 'whole flight'}",
         "why": cause.why,
         "actions": [
             structs.asdict(action) | {"label": f"{prefix}{action.target}"}

@@ -115,64 +115,53 @@ def _find_title_height(page: Page) -> float:
 def _make_error_plots(analysis: Analysis, card: Card) -> list[TimePlot]:
     """Return plots of the position errors of KF and EKF2, or of their difference."""
     result, effect = analysis.main.with_whole_flight_tracks(), card.effect
-    errors_by_filter = {
-        filter_name: errors
-        for filter_name in FILTER_NAMES
-        if isinstance(errors := compute_position_errors(result, filter_name), pd.DataFrame)
-        and errors["error_m"].notna().any()
-    }
-    if errors_by_filter:
-        half_range_m = 1.1 * max(map(_compute_error_axis_limit_m, errors_by_filter.values()))
-        rmse_by_filter_m = effect.position_rmse_m if effect else {}
-        return [
-            _make_error_plot(
-                f"{FILTER_NAMES[filter_name]} error (m)",
-                ("RMSE", rmse_by_filter_m.get(filter_name)),
-                errors["error_m"],
-                {FILTER_NAMES[filter_name]: errors["sigma_m"]},
-                half_range_m,
-            )
-            for filter_name, errors in errors_by_filter.items()
-        ]
-    if not isinstance(result.ekf2_state, pd.DataFrame):
-        return []
-    time_s = result.ekf2_state.index.to_numpy()
-    state, variance = sample_kf_run(result.replay, time_s)
-    difference_m = state["position_m"] - result.ekf2_state["position_m"]
-    if not difference_m.notna().any():
-        return []
-    sigmas_m = {
-        name: pd.Series(interpolate_sigma(time_s, table, "position_variance_m2"), time_s)
-        for name, table in (("KF", variance), ("EKF2", result.ekf2_variance))
-    }
+    plots = []
+    for filter_name, label in FILTER_NAMES.items():
+        errors = compute_position_errors(result, filter_name)
+        if isinstance(errors, pd.DataFrame) and errors["error_m"].notna().any():
+            rmse_m = effect.position_rmse_m.get(filter_name) if effect else None
+            title = f"{label} error (m): RMSE"
+            plots.append((title, rmse_m, errors["error_m"], {label: errors["sigma_m"]}))
+    if not plots and isinstance(result.ekf2_state, pd.DataFrame):
+        time_s = result.ekf2_state.index.to_numpy()
+        state, variance = sample_kf_run(result.replay, time_s)
+        difference_m = state["position_m"] - result.ekf2_state["position_m"]
+        sigmas_m = {
+            name: pd.Series(interpolate_sigma(time_s, table, "position_variance_m2"), time_s)
+            for name, table in (("KF", variance), ("EKF2", result.ekf2_variance))
+        }
+        difference_rms_m = effect.difference_rms_m if effect else None
+        if difference_m.notna().any():
+            plots.append(("KF − EKF2 (m): RMS", difference_rms_m, difference_m, sigmas_m))
+    half_range_m = 1.1 * max(
+        (_compute_error_axis_limit_m(error_m, sigmas_m) for _, _, error_m, sigmas_m in plots),
+        default=0.0,
+    )
+    return [_make_error_plot(*plot, half_range_m) for plot in plots]
+
+
+def _compute_error_axis_limit_m(
+    error_m: pd.Series[float], sigmas_m: Mapping[str, pd.Series[float]]
+) -> float:
+    largest_error_m = max(float(error_m.abs().max()), 1e-3)
     sigma_limits_m = [2.2 * sigma.median() for sigma in sigmas_m.values()]
-    half_range_m = 1.1 * float(np.nanmax([difference_m.abs().max(), *sigma_limits_m]))
-    label_and_rms = ("RMS", effect.difference_rms_m if effect else None)
-    return [_make_error_plot("KF − EKF2 (m)", label_and_rms, difference_m, sigmas_m, half_range_m)]
-
-
-def _compute_error_axis_limit_m(errors: pd.DataFrame) -> float:
-    largest_error_m = max(float(errors["error_m"].abs().max()), 1e-3)
-    sigma_limit_m = np.minimum(2.2 * errors["sigma_m"].median(), 3.0 * largest_error_m)
-    return float(np.fmax(largest_error_m, sigma_limit_m))
+    # The σ band is larger than the plot if σ is much too large
+    return float(np.nanmax([largest_error_m, *np.minimum(sigma_limits_m, 3.0 * largest_error_m)]))
 
 
 def _make_error_plot(
-    label: str,
-    label_and_rms: tuple[str, float | None],
+    title: str,
+    rms_m: float | None,
     error_m: pd.Series[float],
     sigmas_m: Mapping[str, pd.Series[float]],
     half_range_m: float,
 ) -> TimePlot:
-    rms_label, rms_m = label_and_rms
-    statistic_texts = [] if rms_m is None else [f"{rms_label} {format_metres(rms_m)}"]
     known_sigmas_m = {
         name: sigma.dropna() for name, sigma in sigmas_m.items() if sigma.notna().any()
     }
-    statistic_texts += [
-        f"median σ of {name} {format_metres(sigma.median())}"
-        for name, sigma in known_sigmas_m.items()
-    ]
+    title += " –" if rms_m is None else f" {format_metres(rms_m)}"
+    for name, sigma in known_sigmas_m.items():
+        title += f", median σ of {name} {format_metres(sigma.median())}"
     is_difference = len(sigmas_m) > 1
     line = style.line_style("black", 1.0) if is_difference else TRACK_STYLES[next(iter(sigmas_m))]
 
@@ -183,7 +172,7 @@ def _make_error_plot(
         style.draw_zero_line(axes)
         draw_curve(axes, error_m, **line)
 
-    return TimePlot(f"{label}: {', '.join(statistic_texts)}", draw)
+    return TimePlot(title, draw)
 
 
 def _make_innovation_plot(result: AxisComparison) -> TimePlot:

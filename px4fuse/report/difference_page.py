@@ -50,7 +50,7 @@ def draw_pages(analysis: Analysis, _: object) -> Iterator[Page]:
     left_column, right_column = make_two_columns(LEFT_COLUMN_FRACTION)
     _draw_waterfall(
         left_column,
-        f"position difference, {np.sqrt(explanation.position_mean_square_m2):.3f} m RMS",
+        "position difference",
         {step.name: step.position_mean_square_m2 for step in explanation.steps},
         explanation.unexplained_mean_square_m2,
         explanation.position_mean_square_m2,
@@ -58,7 +58,7 @@ def draw_pages(analysis: Analysis, _: object) -> Iterator[Page]:
     )
     _draw_waterfall(
         right_column,
-        f"velocity difference, {np.sqrt(explanation.velocity_mean_square_m2_s2):.3f} m/s RMS",
+        "velocity difference",
         {step.name: step.velocity_mean_square_m2_s2 for step in explanation.steps},
         explanation.unexplained_velocity_mean_square_m2_s2,
         explanation.velocity_mean_square_m2_s2,

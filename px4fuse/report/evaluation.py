@@ -35,7 +35,6 @@ def draw_pages(evaluation: Evaluation, _: object) -> Iterator[Page]:
         "APE: distance of one pose from the reference (its RMSE over all poses is "
         "the ATE). RPE: error of the relative motion over a fixed distance or time.",
     )
-    page.write(_summarise_ate(evaluation), bold=True)
     write_evaluation(page, evaluation)
     _draw_maps(page, evaluation)
     left_column, right_column = make_two_columns()
@@ -55,7 +54,12 @@ def _draw_maps(page: Page, evaluation: Evaluation) -> None:
     axes = right_column.add_panel(title, MAP_HEIGHT, right_margin=COLOUR_BAR_MARGIN)
     _draw_path(axes, evaluation, axis_indices)
     style.set_map_axes(axes, *names)
-    right_column.write_small_text("Darker poses have a larger error; × marks the largest one.")
+    worst_index = int(np.argmax(evaluation.position_error_m))
+    worst_time_s = evaluation.time_s[worst_index] - _compute_time_origin_s(evaluation)
+    right_column.write_small_text(
+        f"Darker poses have a larger error; × marks the largest one, at {worst_time_s:.1f} s and "
+        f"{evaluation.distance_m[worst_index]:.1f} m."
+    )
     legend_handles = axes.get_legend_handles_labels()[0]
     if is_aligned:
         axes = left_column.add_panel("Before alignment", MAP_HEIGHT)
@@ -138,19 +142,6 @@ def _compute_time_origin_s(evaluation: Evaluation) -> float:
     """Return the time (s) of the first pose if times are UNIX time, else 0."""
     start_s = float(evaluation.time_s[0])
     return start_s if start_s > MIN_UNIX_TIME_S else 0.0
-
-
-def _summarise_ate(evaluation: Evaluation) -> str:
-    """Summarise ATE and largest position error."""
-    worst_index = int(np.argmax(evaluation.position_error_m))
-    preposition = "without" if evaluation.alignment == "none" else "after"
-    error = evaluation.ate.translation_m
-    time_s = evaluation.time_s - _compute_time_origin_s(evaluation)
-    return (
-        f"ATE {format_metres(error.rmse)} m (RMSE {preposition} alignment). Largest error "
-        f"{format_metres(error.max)} m at {time_s[worst_index]:.1f} s, after a path of "
-        f"{evaluation.distance_m[worst_index]:.1f} m."
-    )
 
 
 def write_evaluation(page: Page, evaluation: Evaluation) -> None:

@@ -12,7 +12,7 @@ from px4fuse.loop import corrections
 from px4fuse.loop.analysis import MIN_UNIX_TIME_S
 from px4fuse.loop.model import LANDING_CLOSURE_SOURCE, Closure, Loop
 from px4fuse.report.evaluation import describe_method, format_interval, plot_path
-from px4fuse.report.page import Cell, Page, make_appendix_title
+from px4fuse.report.page import Cell, Page
 from px4fuse.report.phrases import format_student, write_findings
 from px4fuse.report.style import (
     EKF2_COLOUR,
@@ -49,21 +49,20 @@ PATH_STYLES = {
     SOLUTION_LABELS["gated"]: line_style(KF_COLOUR, 1.2),
     SOLUTION_LABELS["all"]: line_style("#8d6a9f", 0.9, (0, (2, 1))),
 }
-TITLE = "Loop closure"
 MAP_HEIGHT = 290.0  # points
 
 
 def draw_pages(analysis: Analysis, _: object) -> Iterator[Page]:
     """Draw the page on loop closure if the flight contains a loop."""
     if isinstance(analysis.loop, Loop):
-        page = Page(make_appendix_title(TITLE), LEAD_TEXT)
+        page = Page("Appendix: loop closure", LEAD_TEXT)
         _write_page(page, analysis.loop)
         yield page
 
 
 def draw_report(loop: Loop, results: LoopResults) -> Iterator[Page]:
     """Draw the report page of ``px4fuse loop``."""
-    page = Page(TITLE, LEAD_TEXT)
+    page = Page("Loop closure", LEAD_TEXT)
     if student := format_student(results.student, ", "):
         page.write_labelled("Student", student)
     page.write_labelled("SHA-256", loop.odometry.trajectory.sha256)

@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING
 from px4fuse.analysis import Analysis
 from px4fuse.errors import SettingsError
 from px4fuse.report.cover import FlightResults
-from px4fuse.report.page import Page, make_appendix_title
+from px4fuse.report.page import Page
 from px4fuse.report.style import MUTED_COLOUR
 from px4fuse.results.answer_form import Answers, form_rows
 from px4fuse.results.contract import LoopResults
@@ -28,8 +28,8 @@ TAG_PATTERN = re.compile(r"<!--.*?-->|<[^>]*>", re.DOTALL)
 
 def draw_pages(analysis_or_loop: object, results: FlightResults | LoopResults) -> Iterator[Page]:
     """Draw a page with the student's answers and notes, if any."""
-    title, answers = "Student notes", results.student.answers
-    page = Page(make_appendix_title(title) if isinstance(analysis_or_loop, Analysis) else title)
+    answers, is_appendix = results.student.answers, isinstance(analysis_or_loop, Analysis)
+    page = Page("Appendix: student notes" if is_appendix else "Student notes")
     if isinstance(answers, Answers):
         page.write_heading("Answer form")
         rows = [list(row) for row in form_rows(answers)]

@@ -168,15 +168,6 @@ def styled_text(text: str, colour: str = TEXT_COLOUR, *, bold: bool = False) -> 
     return {"text": text, "colour": colour, "weight": "bold" if bold else "regular"}
 
 
-def make_appendix_title(title: str) -> str:
-    """Return the title of an appendix page.
-
-    >>> make_appendix_title("Notes by the student")
-    'Appendix: notes by the student'
-    """
-    return f"Appendix: {title[0].lower()}{title[1:]}"
-
-
 def draw_legend_above(axes: Axes) -> None:
     axes.legend(
         loc="lower right",

@@ -25,6 +25,7 @@ from px4fuse.filter.consistency import Consistency
 from px4fuse.filter.settings import KF_NUMERIC_SETTINGS, SETTING_RANGES, Settings
 from px4fuse.filter.signals import AISLE
 from px4fuse.filter.tuning import HORIZONTAL, AxisTuning, NoiseEstimate
+from px4fuse.finding import format_spans
 from px4fuse.findings import Finding, finding_title, split_cause_groups
 from px4fuse.findings.noises import KEEP_NOISE_BECAUSE_OF_CORRELATION_ACTION
 from px4fuse.flight.ekf2_parameters import EV_POS
@@ -281,7 +282,7 @@ def write_findings(page: Page, findings: tuple[Finding, ...]) -> None:
             effect_titles = " ".join(f"{effect.title} [{effect.id}]." for effect in effects)
             texts.append(styled_text(f"Consequences: {effect_titles}", colour=MUTED_COLOUR))
         page.write_labelled(
-            f"{finding.severity}\n{finding.spans_text}".strip(),
+            f"{finding.severity}\n{format_spans(finding.spans_s)}".strip(),
             *texts,
             colour=SEVERITY_COLOURS[finding.severity],
         )
