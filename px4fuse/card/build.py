@@ -521,11 +521,12 @@ def _explain_differing_verdicts(
             "KF and EKF2 follow position errors that change slowly. Innovations do not show slow "
             "errors; only ground truth does."
         )
-    if "source_outliers" in finding_ids and "ekf2" in filters_with_differing_ratios:
-        return OUTLIER_EXPLANATION
+    explanation = UNEXPLAINED_DIFFERENCE_TEXT
     if "ekf2_heading_error" in finding_ids:
-        return HEADING_ERROR_EXPLANATION
-    return UNEXPLAINED_DIFFERENCE_TEXT
+        explanation = HEADING_ERROR_EXPLANATION
+    if "source_outliers" in finding_ids and "ekf2" in filters_with_differing_ratios:
+        explanation = OUTLIER_EXPLANATION
+    return explanation
 
 
 def _describe_difference(effect: FlightErrors, ranked_causes: Sequence[RankedCause]) -> str:

@@ -49,6 +49,7 @@ MAP_MARGIN_FACTOR = 1.08  # extent of the map divided by the extent of the track
 # Maximum margin of the map, as fraction of the extent of the positions
 MAX_MAP_MARGIN_FRACTION = 0.25
 MIN_MAP_EXTENT_M = 0.5
+SigmaByFilter = Mapping[str, "pd.Series[float]"]
 
 
 class TimePlot(NamedTuple):
@@ -115,7 +116,7 @@ def _find_title_height(page: Page) -> float:
 def _make_error_plots(analysis: Analysis, card: Card) -> list[TimePlot]:
     """Return plots of the position errors of KF and EKF2, or of their difference."""
     result, effect = analysis.main.with_whole_flight_tracks(), card.effect
-    plots = []
+    plots: list[tuple[str, float | None, pd.Series[float], SigmaByFilter]] = []
     for filter_name, label in FILTER_NAMES.items():
         errors = compute_position_errors(result, filter_name)
         if isinstance(errors, pd.DataFrame) and errors["error_m"].notna().any():
@@ -140,9 +141,7 @@ def _make_error_plots(analysis: Analysis, card: Card) -> list[TimePlot]:
     return [_make_error_plot(*plot, half_range_m) for plot in plots]
 
 
-def _compute_error_axis_limit_m(
-    error_m: pd.Series[float], sigmas_m: Mapping[str, pd.Series[float]]
-) -> float:
+def _compute_error_axis_limit_m(error_m: pd.Series[float], sigmas_m: SigmaByFilter) -> float:
     largest_error_m = max(float(error_m.abs().max()), 1e-3)
     sigma_limits_m = [2.2 * sigma.median() for sigma in sigmas_m.values()]
     # The σ band is larger than the plot if σ is much too large
@@ -153,7 +152,7 @@ def _make_error_plot(
     title: str,
     rms_m: float | None,
     error_m: pd.Series[float],
-    sigmas_m: Mapping[str, pd.Series[float]],
+    sigmas_m: SigmaByFilter,
     half_range_m: float,
 ) -> TimePlot:
     known_sigmas_m = {

@@ -196,7 +196,7 @@ def write_closures_and_rpe(page: Page, loop: Loop) -> None:
         page.add_table(head, rows, right_aligned_columns=(1, 2, 3, 4, 6))
     for reference in loop.references:
         page.write_heading(f"RPE against {reference.name}")
-        head, rpe_rows, notes = list[str](), [], dict[str, None]()
+        head, rpe_rows, notes = list[str](), list[list[str]](), dict[str, None]()
         for path in loop.select_reported_paths():
             score = path.scores[reference.name]
             if isinstance(score, Unavailable):
