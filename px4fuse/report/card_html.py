@@ -20,7 +20,7 @@ from px4fuse.report.card_text import (
     format_target,
     label_alternatives,
     locate_sigma_ratio,
-    make_rerun_columns,
+    make_rerun_rows,
     with_typed_path,
 )
 
@@ -62,7 +62,7 @@ def make_card_html(card: Card, *, is_open: bool = False, has_apply_buttons: bool
         if card.verdicts and card.effect is not None
         else "",
         label_alternatives=label_alternatives,
-        rerun_rows=lambda reruns: zip(*make_rerun_columns(reruns), strict=True),
+        rerun_rows=make_rerun_rows,
         signs=SEVERITY_SIGNS,
         target=format_target,
         format_spans=format_spans,

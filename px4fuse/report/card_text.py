@@ -236,15 +236,23 @@ def _compute_axis_column(ratio: float) -> int:
 
 def _format_identity_lines(card: Card) -> Iterator[Paragraph]:
     identity = card.identity
-    flight_text = f"{identity.firmware}, {identity.duration_s:.1f} s, {identity.source}"
     student_text = ", ".join(filter(None, (identity.student, identity.student_id)))
-    yield Paragraph("  ".join(filter(None, (identity.file, flight_text, student_text))))
+    texts = (identity.file, ", ".join(list_flight_texts(card)), student_text)
+    yield Paragraph("  ".join(filter(None, texts)))
     if identity.settings:
         yield from _wrap_lines(f"KF: {identity.settings}", "  ", "      ")
     changed_options = (*identity.changed, *identity.parameters)
     if changed_options:
         yield from _wrap_lines(f"changed: {'; '.join(changed_options)}", "  ", "           ")
     yield Paragraph("")
+
+
+def list_flight_texts(card: Card) -> list[str]:
+    """Return firmware, hardware, duration and position source of a flight."""
+    identity = card.identity
+    duration_text = f"{identity.duration_s:.1f} s"
+    texts = (identity.firmware, identity.hardware, duration_text, identity.source)
+    return [text for text in texts if text]
 
 
 def format_headline_lines(card: Card) -> Iterator[Paragraph]:
@@ -295,17 +303,16 @@ def _format_action_lines(label: str, label_width: int, action: Action) -> Iterat
 
 
 def _format_rerun_table(reruns: Sequence[Rerun]) -> Iterator[Paragraph]:
-    columns = make_rerun_columns(reruns)
-    widths = [max(map(len, column)) for column in columns]
-    for row in zip(*columns, strict=True):
+    rows = make_rerun_rows(reruns)
+    widths = [max(map(len, column)) for column in zip(*rows, strict=True)]
+    for row in rows:
         cells = (f"{cell:{width}}" for cell, width in zip(row, widths, strict=True))
         yield Paragraph(f"  {'  '.join(cells)}".rstrip())
-    if note := format_rerun_note(reruns):
-        yield from _wrap_lines(note, "  ", "  ")
+    yield from _wrap_lines(format_rerun_note(reruns), "  ", "  ")
 
 
-def make_rerun_columns(reruns: Sequence[Rerun]) -> list[tuple[str, ...]]:
-    """Return the table columns (heading, cells) of re-runs with changed settings."""
+def make_rerun_rows(reruns: Sequence[Rerun]) -> list[list[str]]:
+    """Return the table (first row: headings) of re-runs with changed settings."""
     rows = [
         {
             "re-run (filter, change)": rerun.label,
@@ -317,9 +324,10 @@ def make_rerun_columns(reruns: Sequence[Rerun]) -> list[tuple[str, ...]]:
         }
         for rerun in reruns
     ]
-    headings = rows[0] if rows else ()
-    columns = [(head, *(row[head] for row in rows)) for head in headings]
-    return [column for column in columns if any(column[1:])]
+    if not rows:
+        return []
+    headings = [head for head in rows[0] if any(row[head] for row in rows)]
+    return [headings, *([row[head] for head in headings] for row in rows)]
 
 
 def format_rerun_note(reruns: Sequence[Rerun]) -> str:

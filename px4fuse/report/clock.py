@@ -30,9 +30,9 @@ TIME_OFFSET_FINDINGS = ("source_time_offset_changes", "source_time_offset", "ekf
 
 
 def summarise_offset(analysis: Analysis, findings: Iterable[Finding]) -> str:
-    """Summarise the time offset of the position source in one line."""
+    """Summarise the time offset in one line; "" if the report has a page on the time offset."""
     if has_time_offset_page(analysis, findings):
-        return "See the appendix on the time offset for the estimated time offset."
+        return ""
     advice_by_label = make_time_offset_advice(analysis, analysis.clock)
     return " ".join(
         advice_by_label[label] for label in ("Result", "Offset") if label in advice_by_label

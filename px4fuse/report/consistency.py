@@ -61,8 +61,7 @@ def draw_pages(analysis: Analysis, _: object) -> Iterator[Page]:
     page = Page(
         "Appendix: consistency",
         "Innovations ν of a consistent filter have variance S (mean NIS = mean of ν²/S = 1), "
-        "are normally distributed with mean 0, and are white. The plots show KF and EKF2 "
-        f"along {axis_text}; the table lists all axes.",
+        f"are normally distributed with mean 0, and are white. The plots are along {axis_text}.",
     )
     if innovations := _select_tested_innovations(result):
         nis_axes = event_marks.add_panel(

@@ -26,8 +26,9 @@ from px4fuse.report.card_text import (
     format_consistent_ratios,
     format_rerun_note,
     label_alternatives,
+    list_flight_texts,
     locate_sigma_ratio,
-    make_rerun_columns,
+    make_rerun_rows,
     note_texts,
 )
 from px4fuse.report.cover_panels import write_panels
@@ -61,18 +62,11 @@ def draw_pages(analysis: Analysis | AidingSourceAnalysis, results: FlightResults
 
 def add_card(page: Page, card: Card) -> PageBlock:
     """Add a diagnosis card (faults, causes and actions) to a page."""
-    identity = card.identity
-    flight_texts = (
-        identity.firmware,
-        identity.hardware,
-        f"{identity.duration_s:.1f} s",
-        identity.source,
-    )
     direction_text = f", {card.effect.axis}" if card.effect else ""
     ratio_text = f"RMS of actual error ÷ reported σ{direction_text}"
     return page.add(
         "cover",
-        identity=structs.asdict(identity),
+        identity=structs.asdict(card.identity),
         headline=card.headline,
         effect=card.effect_text,
         do_this=card.do_this,
@@ -82,8 +76,8 @@ def add_card(page: Page, card: Card) -> PageBlock:
         more_causes=card.more_causes,
         sign=SEVERITY_SIGNS[card.severity],
         colour=SEVERITY_COLOURS[card.severity],
-        file=one_line(identity.file, MAX_FILE_NAME_LENGTH),
-        flight=" · ".join(filter(None, flight_texts)),
+        file=one_line(card.identity.file, MAX_FILE_NAME_LENGTH),
+        flight=" · ".join(list_flight_texts(card)),
         axis_text=AIDS_CAPTION if card.aids else ratio_text,
         axis_legend=(
             f"grey: ratio of a consistent filter ({format_consistent_ratios()}) · ━ 95 % interval "
@@ -150,8 +144,7 @@ def _make_ratio_row(
 
 
 def _make_cause_fields(cause: DiagnosedCause) -> dict[str, Any]:
-    columns = make_rerun_columns(cause.reruns)
-    head, *rows = zip(*columns, strict=True) if columns else ((),)
+    head, *rows = make_rerun_rows(cause.reruns) or [[]]
     return {
         "title": cause.title,
         "id": cause.id,

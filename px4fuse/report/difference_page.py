@@ -18,7 +18,6 @@ from px4fuse.report.style import (
     EKF2_COLOUR,
     KF_BAND_COLOUR,
     KF_COLOUR,
-    MUTED_COLOUR,
     TRACK_STYLES,
     draw_curve,
 )
@@ -143,7 +142,6 @@ def _draw_waterfall(
     ):
         bar_style = INCREASE_BAR_STYLE if percent < 0.0 else {"color": KF_BAND_COLOUR}
         axes.barh(row, -percent, left=bar_start, **kf_bar_style, **bar_style)
-        axes.plot([bar_start] * 2, [row - 1.35, row + 0.35], color=MUTED_COLOUR, lw=0.5)
     ekf2_bar_style = kf_bar_style | {"color": EKF2_BAND_COLOUR, "edgecolor": EKF2_COLOUR}
     axes.barh(last_row, percents[-1], **ekf2_bar_style)
     for row, percent in enumerate(percents):

@@ -103,10 +103,7 @@ def draw_other_axes(analysis: Analysis, _: object) -> Iterator[Page]:
     secondary_axes = analysis.select_secondary_axes()
     if not secondary_axes:
         return
-    page = Page(
-        "Appendix: other axes",
-        "Position, velocity, innovations and σ of the other axes, drawn as for the main axis.",
-    )
+    page = Page("Appendix: other axes")
     width = (PAGE_WIDTH - COLUMN_GAP * (len(secondary_axes) - 1)) / max(len(secondary_axes), 2)
     for panel in (
         panels.POSITION_PANEL,

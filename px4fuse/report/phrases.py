@@ -153,23 +153,23 @@ def format_clock_map(clock: ClockMap) -> str:
 
 def describe_alignment(alignment: Alignment) -> dict[str, str]:
     """Describe the alignment of a position file with the flight, by label."""
-    north_m, east_m, down_m = alignment.origin_m
-    yaw_sigma_text = "" if alignment.yaw_sigma_deg is None else f" ± {alignment.yaw_sigma_deg:.2f}°"
-    clock_sigma_s, residual_rms_m = alignment.clock_offset_sigma_s, alignment.residual_rms_m
-    clock_sigma_text = "" if clock_sigma_s is None else f" ± {clock_sigma_s:.3f} s"
+    yaw_text, clock_text = f"{alignment.yaw_deg:.2f}°", f"{alignment.clock_offset_s:+.3f} s"
+    if alignment.yaw_sigma_deg is not None:
+        yaw_text += f" ± {alignment.yaw_sigma_deg:.2f}°"
+    if alignment.clock_offset_sigma_s is not None:
+        clock_text += f" ± {alignment.clock_offset_sigma_s:.3f} s"
     text_by_label = {
         "frame": f"{alignment.frame} ({alignment.frame_reason})",
-        "yaw": f"{alignment.yaw_deg:.2f}°{yaw_sigma_text} ({alignment.yaw_reason})",
-        "origin": f"north {north_m:.3f} m, east {east_m:.3f} m, down {down_m:.3f} m",
-        "clock": f"{alignment.clock_offset_s:+.3f} s{clock_sigma_text} to the boot clock "
-        f"({alignment.clock_reason})",
+        "yaw": f"{yaw_text} ({alignment.yaw_reason})",
+        "origin": "north {:.3f} m, east {:.3f} m, down {:.3f} m".format(*alignment.origin_m),
+        "clock": f"{clock_text} to the boot clock ({alignment.clock_reason})",
     }
     if alignment.correlation is not None:
         text_by_label["match"] = (
             f"correlation {alignment.correlation:.4f} with {alignment.reference}"
         )
-        if residual_rms_m is not None:
-            text_by_label["match"] += f", residual {residual_rms_m:.3f} m RMS per axis"
+        if alignment.residual_rms_m is not None:
+            text_by_label["match"] += f", residual {alignment.residual_rms_m:.3f} m RMS per axis"
     return text_by_label
 
 

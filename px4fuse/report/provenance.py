@@ -29,8 +29,8 @@ def draw_pages(analysis: Analysis | AidingSourceAnalysis, results: FlightResults
         _write_section(
             page, "Offset and drift of other clocks to the autopilot's boot clock", clock_texts
         )
-        offset_text = clock.summarise_offset(analysis, results.findings)
-        _write_section(page, f"Time offset between {source.name} and the IMU", [offset_text])
+        if offset_text := clock.summarise_offset(analysis, results.findings):
+            _write_section(page, f"Time offset between {source.name} and the IMU", [offset_text])
         if source.alignment is not None:
             alignment_texts = describe_alignment(source.alignment).items()
             _write_section(page, f"Alignment of {source.name}", alignment_texts)

@@ -26,7 +26,7 @@ def compile_pdf(report: Mapping[str, Any]) -> bytes:
 
 def measure_free_height(blocks: Any, font_names: Sequence[str]) -> float:
     """Return the free height (points) on the first page of a report."""
-    report = dict.fromkeys(("title", "author", "head", "student", "foot"), "")
+    report = dict.fromkeys(("title", "author", "head", "student"), "")
     data = {**report, "fonts": font_names, "blocks": blocks, "results": None}
     with _open_compiler(data) as compiler:
         return float(json.loads(compiler.query("<free>", field="value", one=True)))
