@@ -69,9 +69,7 @@ def draw_pages(analysis: Analysis, _: object) -> Iterator[Page]:
         )
         _draw_running_nis(nis_axes, innovations)
         left_column, right_column = make_two_columns()
-        histogram_axes = left_column.add_panel(
-            "Distribution of ν/√S", DISTRIBUTION_HEIGHT, left_margin=4.0
-        )
+        histogram_axes = left_column.add_panel("Distribution of ν/√S", DISTRIBUTION_HEIGHT)
         _draw_histogram(histogram_axes, innovations)
         autocorrelation_axes = right_column.add_panel("Autocorrelation", DISTRIBUTION_HEIGHT)
         _draw_autocorrelation(autocorrelation_axes, innovations)

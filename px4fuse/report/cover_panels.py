@@ -25,7 +25,6 @@ from px4fuse.report.page import (
     AXES_LEFT_MARGIN,
     AXES_RIGHT_MARGIN,
     LABELLED_HEIGHT,
-    PAGE_WIDTH,
     UNLABELLED_HEIGHT,
     Page,
     PageBlock,
@@ -41,9 +40,8 @@ MAP_HEIGHT_FRACTION = 0.33  # of the height of all plots
 # With less free height (points) on the first page, the plots are on the next page
 MIN_PLOTS_HEIGHT = 190.0
 NEXT_PAGE_PLOTS_HEIGHT = 450.0  # points, of all plots on the next page
-UNUSED_PAGE_HEIGHT = 21.0  # points, above and below the plots
-TITLE_HEIGHT = 16.5  # points, of a title above a plot
-TITLE_LINE_HEIGHT = 10.5  # points; titles in a column have up to two lines
+UNUSED_PAGE_HEIGHT = 32.0  # points, for gaps, and for a second line of a title
+TITLE_HEIGHT = 18.5  # points, of a title above a plot
 MAX_DRAWN_SIGMAS = 4.0  # larger innovations ÷ √S are triangles at the edge
 MAP_MARGIN_FACTOR = 1.08  # extent of the map divided by the extent of the tracks
 # Maximum margin of the map, as fraction of the extent of the positions
@@ -95,7 +93,7 @@ def _draw_plots(
 ) -> None:
     """Draw plots over time with axes of equal height."""
     axes_height = (total_height - LABELLED_HEIGHT + UNLABELLED_HEIGHT) / len(plots) - (
-        _find_title_height(page) + UNLABELLED_HEIGHT
+        TITLE_HEIGHT + UNLABELLED_HEIGHT
     )
     for plot in plots:
         axes = event_marks.add_panel(
@@ -104,13 +102,8 @@ def _draw_plots(
             plot.title,
             axes_height,
             with_time_label=plot is plots[-1],
-            is_compact=True,
         )
         plot.draw(axes)
-
-
-def _find_title_height(page: Page) -> float:
-    return TITLE_HEIGHT if page.width == PAGE_WIDTH else TITLE_HEIGHT + TITLE_LINE_HEIGHT
 
 
 def _make_error_plots(analysis: Analysis, card: Card) -> list[TimePlot]:
@@ -159,9 +152,10 @@ def _make_error_plot(
         name: sigma.dropna() for name, sigma in sigmas_m.items() if sigma.notna().any()
     }
     title += " –" if rms_m is None else f" {format_metres(rms_m)}"
-    for name, sigma in known_sigmas_m.items():
-        title += f", median σ of {name} {format_metres(sigma.median())}"
     is_difference = len(sigmas_m) > 1
+    for name, sigma in known_sigmas_m.items():
+        label = f"σ of {name}" if is_difference else "σ"
+        title += f", median {label} {format_metres(sigma.median())}"
     line = style.line_style("black", 1.0) if is_difference else TRACK_STYLES[next(iter(sigmas_m))]
 
     def draw(axes: Axes) -> None:
@@ -233,7 +227,7 @@ def _select_map_tracks(analysis: Analysis) -> dict[str, Array]:
 
 def _draw_map(page: Page, analysis: Analysis, flight_map: FlightMap, height: float) -> None:
     tracks = flight_map.tracks
-    axes_height = height - _find_title_height(page) - LABELLED_HEIGHT
+    axes_height = height - TITLE_HEIGHT - LABELLED_HEIGHT
     axes_width = page.width - AXES_LEFT_MARGIN - AXES_RIGHT_MARGIN
     limits = _compute_map_limits(tracks, axes_width / axes_height)
     distance_texts = []
@@ -244,7 +238,7 @@ def _draw_map(page: Page, analysis: Analysis, flight_map: FlightMap, height: flo
     title = "Map"
     if distance_texts:
         title = f"Map; largest distance of points outside the map: {', '.join(distance_texts)}"
-    axes = page.add_panel(title, axes_height, is_compact=True)
+    axes = page.add_panel(title, axes_height)
     style.set_map_axes(axes, flight_map.x_name, flight_map.y_name)
     (left, bottom), (right, top) = limits
     axes.set(xlim=(left, right), ylim=(bottom, top))

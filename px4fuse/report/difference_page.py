@@ -1,7 +1,6 @@
 """Report page on the difference between KF and EKF2, and the contribution of each setting."""
 
 from collections.abc import Iterator, Mapping
-from typing import Any
 
 import numpy as np
 import pandas as pd
@@ -14,7 +13,6 @@ from px4fuse.flight.model import Unavailable
 from px4fuse.report import event_marks
 from px4fuse.report.page import Page, make_two_columns
 from px4fuse.report.style import (
-    EKF2_BAND_COLOUR,
     EKF2_COLOUR,
     KF_BAND_COLOUR,
     KF_COLOUR,
@@ -23,11 +21,8 @@ from px4fuse.report.style import (
 )
 
 BAR_ROW_HEIGHT = 12.0  # points
-LABEL_WIDTH = 140.0  # points
-LEFT_COLUMN_FRACTION = 0.62  # fraction of the page width
+LABEL_WIDTH = 125.0  # points
 TIME_PLOT_HEIGHT = 105.0  # points
-# Style of a bar for a setting that increases the difference KF - EKF2
-INCREASE_BAR_STYLE: dict[str, Any] = {"color": "white", "hatch": "////"}
 
 
 def draw_pages(analysis: Analysis, _: object) -> Iterator[Page]:
@@ -40,24 +35,23 @@ def draw_pages(analysis: Analysis, _: object) -> Iterator[Page]:
         "Difference between KF and EKF2, setting by setting",
         "px4fuse replays KF and replaces its settings and equations by those of EKF2, one after "
         "another. Each bar is the reduction of the mean square difference KF - EKF2 by one "
-        "replacement; a hatched bar is an increase. The bars add up to 100 %.",
+        "replacement; a negative bar is an increase. The bars add up to 100 %.",
     )
     spans_text = ", ".join(f"{start:.0f} to {end:.0f} s" for start, end in explanation.spans_s)
     page.write_heading(f"{name}, {spans_text}")
     for sentence in explanation.sentences:
         page.write(sentence)
-    left_column, right_column = make_two_columns(LEFT_COLUMN_FRACTION)
-    _draw_waterfall(
+    left_column, right_column = make_two_columns()
+    _draw_contributions(
         left_column,
-        "position difference",
+        "Position difference: contribution of each setting",
         {step.name: step.position_mean_square_m2 for step in explanation.steps},
         explanation.unexplained_mean_square_m2,
         explanation.position_mean_square_m2,
-        with_labels=True,
     )
-    _draw_waterfall(
+    _draw_contributions(
         right_column,
-        "velocity difference",
+        "Velocity difference: contribution of each setting",
         {step.name: step.velocity_mean_square_m2_s2 for step in explanation.steps},
         explanation.unexplained_velocity_mean_square_m2_s2,
         explanation.velocity_mean_square_m2_s2,
@@ -118,36 +112,24 @@ def format_replay_agreement(agreement: Agreement) -> str:
     return ". ".join(sentences)
 
 
-def _draw_waterfall(
+def _draw_contributions(
     column: Page,
     title: str,
     reduction_by_setting: Mapping[str, float],
     unexplained: float,
     total: float,
-    *,
-    with_labels: bool = False,
 ) -> None:
     """Draw the contribution (%) of each setting to the mean square difference KF - EKF2."""
-    names = ["total difference", *reduction_by_setting, "unexplained"]
-    percents = 100.0 / total * np.array([total, *reduction_by_setting.values(), unexplained])
-    bar_ends = 100.0 - np.concatenate([[0.0], np.cumsum(percents[1:-1])])
-    last_row, right_end = len(names) - 1, max(100.0, float(bar_ends.max()))
-    axes = column.add_panel(
-        title, BAR_ROW_HEIGHT * len(names), left_margin=LABEL_WIDTH if with_labels else 4.0
-    )
-    kf_bar_style: dict[str, Any] = {"height": 0.7, "edgecolor": KF_COLOUR, "lw": 0.6}
-    axes.barh(0, 100.0, **kf_bar_style, color=KF_COLOUR)
-    for row, (percent, bar_start) in enumerate(
-        zip(percents[1:-1], bar_ends, strict=False), start=1
-    ):
-        bar_style = INCREASE_BAR_STYLE if percent < 0.0 else {"color": KF_BAND_COLOUR}
-        axes.barh(row, -percent, left=bar_start, **kf_bar_style, **bar_style)
-    ekf2_bar_style = kf_bar_style | {"color": EKF2_BAND_COLOUR, "edgecolor": EKF2_COLOUR}
-    axes.barh(last_row, percents[-1], **ekf2_bar_style)
+    names = [*reduction_by_setting, "unexplained"]
+    percents = 100.0 / total * np.array([*reduction_by_setting.values(), unexplained])
+    axes = column.add_panel(title, BAR_ROW_HEIGHT * len(names), left_margin=LABEL_WIDTH)
+    rows = range(len(names))
+    axes.barh(rows, percents, height=0.7, color=KF_BAND_COLOUR, edgecolor=KF_COLOUR, lw=0.6)
+    axes.set_yticks(rows, names)
     for row, percent in enumerate(percents):
         digits = 1 if 0.05 <= abs(percent) < 9.95 else 0
-        axes.text(1.03 * right_end, row, f"{percent:z.{digits}f} %", va="center", size=8.0)
-    axes.set_yticks(range(len(names)), names if with_labels else [""] * len(names))
-    axes.set_ylim(last_row + 0.6, -0.6)
-    axes.set_xlim(min(0.0, float(bar_ends.min())), 1.2 * right_end)
-    axes.set_xlabel("% of the mean square difference KF - EKF2")
+        text = f"{percent:z.{digits}f} %"
+        axes.text(1.05 * percents.max(), row, text, va="center", size=8.0)
+    axes.set_ylim(len(names) - 0.4, -0.6)
+    axes.set_xlim(min(0.0, 1.1 * percents.min()), 1.5 * percents.max())
+    axes.set_xlabel("% of the mean square")

@@ -98,7 +98,6 @@ class Page:
         caption: str = "",
         left_margin: float = AXES_LEFT_MARGIN,
         right_margin: float = AXES_RIGHT_MARGIN,
-        is_compact: bool = False,
     ) -> Axes:
         """Add axes with a title and a caption, and return the axes; lengths are in points."""
         # slow import (0.3 s), which texts do not need
@@ -117,7 +116,6 @@ class Page:
             height=height,
             width=self.width,
             figure=axes.figure,
-            compact=is_compact,
         )
         return axes
 
@@ -158,10 +156,10 @@ class Page:
         self.add("columns", columns=blocks, widths=widths, gap=COLUMN_GAP)
 
 
-def make_two_columns(left_fraction: float = 0.5) -> tuple[Page, Page]:
+def make_two_columns() -> tuple[Page, Page]:
     """Return two columns that fill the page width."""
-    free_width = PAGE_WIDTH - COLUMN_GAP
-    return Page(width=left_fraction * free_width), Page(width=(1.0 - left_fraction) * free_width)
+    width = (PAGE_WIDTH - COLUMN_GAP) / 2.0
+    return Page(width=width), Page(width=width)
 
 
 def styled_text(text: str, colour: str = TEXT_COLOUR, *, bold: bool = False) -> PageBlock:
