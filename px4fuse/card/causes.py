@@ -355,14 +355,12 @@ def make_parameter_action(analysis: Analysis, change: Mapping[str, float]) -> Ac
 
 
 def _make_rerun(trial: Trial, trials: Sequence[Trial]) -> Rerun:
-    rejected_fractions = trial.before.rejected_fraction, trial.after.rejected_fraction
+    before, after = trial.before, trial.after
     values_before_and_after: dict[str, Any] = {
         f"{reference}_ratio": tuple(ratios) for reference, *ratios in compare_sigma_ratios(trial)
     }
-    values_before_and_after["position_rmse_m"] = (
-        trial.before.position_rmse_m,
-        trial.after.position_rmse_m,
-    )
+    values_before_and_after["position_rmse_m"] = before.position_rmse_m, after.position_rmse_m
+    rejected_fractions = before.rejected_fraction, after.rejected_fraction
     if max(fraction or 0.0 for fraction in rejected_fractions) >= MIN_REJECTED_FRACTION_TO_SHOW:
         values_before_and_after["rejected_fraction"] = rejected_fractions
     return Rerun(

@@ -123,8 +123,6 @@ def _draw_innovations(axes: style.Axes, aid_log: AidLog, span_s: Span) -> None:
         ):
             marker_style = dot_style | {"ms": 1.4}
             draw_dots(axes, innovations[is_drawn], MAX_DRAWN_SIGMAS, marker_style)
-    for limit in (-2.0, 2.0):
-        axes.axhline(limit, color="black", lw=0.4, ls=(0, (1, 1.5)))
     if aid_log.enabled is not None:
         times_s = np.linspace(*span_s, 2000)
         is_disabled = sample_step_function(aid_log.enabled, pd.Index(times_s)) <= 0.0

@@ -111,7 +111,11 @@ def _draw_ape(page: Page, evaluation: Evaluation) -> None:
 
 
 def _draw_rpe(page: Page, evaluation: Evaluation) -> None:
-    rpe_statistics = _collect_rpe_statistics(evaluation)
+    rpe_statistics = [
+        (error, error.translation_m)
+        for error in evaluation.rpe
+        if isinstance(error.translation_m, Statistics)
+    ]
     if not rpe_statistics:
         return
     axes = page.add_panel("RPE (m) of pose pairs at distance delta", ERROR_PLOT_HEIGHT)
@@ -124,10 +128,6 @@ def _draw_rpe(page: Page, evaluation: Evaluation) -> None:
     axes.margins(x=0.1)
     axes.set_xlabel("delta: distance, time or frames between poses")
     page.write_small_text(describe_rpe_growth(evaluation.rpe))
-
-
-def _collect_rpe_statistics(evaluation: Evaluation) -> list[tuple[RelativeError, Statistics]]:
-    return [(e, e.translation_m) for e in evaluation.rpe if isinstance(e.translation_m, Statistics)]
 
 
 def plot_path(axes: Axes, positions_m: Array, time_s: Array, **style: Any) -> None:

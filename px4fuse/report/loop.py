@@ -63,7 +63,7 @@ def draw_pages(analysis: Analysis, _: object) -> Iterator[Page]:
 def draw_report(loop: Loop, results: LoopResults) -> Iterator[Page]:
     """Draw the report page of ``px4fuse loop``."""
     page = Page("Loop closure", LEAD_TEXT)
-    if student := format_student(results.student, ", "):
+    if student := format_student(results.student):
         page.write_labelled("Student", student)
     page.write_labelled("SHA-256", loop.odometry.trajectory.sha256)
     write_findings(page, results.findings)

@@ -81,23 +81,20 @@ class Panel(NamedTuple):
         is_narrow: bool = False,
     ) -> None:
         """Draw the plot on a page; a narrow plot has no caption."""
-        title, caption, height = self.title, "", NARROW_AXES_HEIGHT
-        statistics_text = self.make_statistics_text(result)
+        texts = [self.make_statistics_text(result)]
         if not is_narrow:
-            caption, height = self.make_caption(result), self.height
-            title, statistics_text = ": ".join(filter(None, (title, statistics_text))), ""
+            texts.append(self.make_caption(result))
         axes = event_marks.add_panel(
             page,
             analysis,
-            title,
-            height,
-            caption=caption,
+            self.title,
+            NARROW_AXES_HEIGHT if is_narrow else self.height,
+            caption=". ".join(filter(None, texts)),
             # the innovation plot shows rejections as hollow dots, so it needs no markers
             axis="" if self is INNOVATIONS_PANEL else result.axis.name,
             with_time_label=with_time_label,
         )
         self.draw(axes, result.with_whole_flight_tracks())
-        page.write_small_text(statistics_text)
 
 
 def add_legend(page: Page, analysis: Analysis) -> PageBlock:

@@ -83,7 +83,7 @@ def render_pdf(content: Any, results: Any, results_json: str) -> bytes:
             report_text += json.dumps(page.blocks, ensure_ascii=False, default=repr)
             blocks += to_typst_data(page.blocks, source.name)
     producer = f"px4fuse {metadata.version('px4fuse')}"
-    student = format_student(getattr(results, "student", NO_STUDENT), " · ")
+    student = format_student(getattr(results, "student", NO_STUDENT))
     release_free_memory()  # before Typst starts
     # figures contain no names and notes, so they need no other fonts
     all_text = title + source.name + student + report_text

@@ -268,8 +268,8 @@ def _make_vision_noise_advice(comparison: PreparedComparison, estimate: NoiseEst
     return f"Set {name} to {changes[name]:g} m (now {logged_noise_m:g} m)."
 
 
-def format_student(student: Student, separator: str) -> str:
-    return separator.join(filter(None, (student.name, student.id)))
+def format_student(student: Student) -> str:
+    return ", ".join(filter(None, (student.name, student.id)))
 
 
 def write_findings(page: Page, findings: tuple[Finding, ...]) -> None:
