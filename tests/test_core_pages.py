@@ -53,7 +53,7 @@ def eventful() -> Analysis:
 def test_event_symbols_in_plots_are_labelled_by_event_type(eventful: Analysis) -> None:
     labels = [artist.get_label() for artist in event_marks.make_legend_entries(eventful)]
     assert labels == [
-        "on the ground", "gap in position source", "log dropout",
+        "on the ground", "position gap", "log dropout",
         "EKF2 rejected", "outlier", "EKF2 reset", "take-off", "landing",
     ]  # fmt: skip
     axes = event_marks.add_panel(Page(), eventful, "Events", 100.0)

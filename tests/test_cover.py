@@ -200,7 +200,7 @@ def test_cover_map_title_states_farthest_distance_outside_map() -> None:
     analysis = unexplained(compare(flight))
     titles = panels_by_title(drawn(analysis))
     (title,) = (title for title in titles if title.startswith("Map"))
-    assert title.startswith("Map; largest distance of points outside the map: EKF2 3")
+    assert title.startswith("Map; largest distance outside the map: EKF2 3")
 
 
 def test_innovations_beyond_plot_scale_are_drawn_as_triangles(eventful: Analysis) -> None:

@@ -31,8 +31,6 @@ CARD_WIDTH = 100  # characters per line
 AXIS_WIDTH = 37  # characters of the axis of σ ratios (actual σ ÷ reported σ)
 AXIS_INDENT = 58  # characters left of the axis of σ ratios
 TEXT_INDENT = 11  # characters of a label with blanks
-# Longer commands (characters) are not beside their label, but on their own line
-MAX_COMMAND_LENGTH = 74
 # Ticks with labels on the axis of σ ratios
 LABELLED_RATIO_TICKS = (0.1, 0.5, 1.0, 2.0, 10.0)
 SYMBOL_BY_REFERENCE = {"source": "●", "truth": "◆"}
@@ -288,15 +286,10 @@ def format_target(action: Action) -> str:
 
 
 def _format_action_lines(label: str, label_width: int, action: Action) -> Iterator[Paragraph]:
-    indent = " " * (2 + label_width)
-    label_text = f"  {label:{label_width}}"
+    indent, label_text = " " * (2 + label_width), f"  {label:{label_width}}"
     if action.sentence:
         yield from _wrap_lines(action.sentence, label_text, indent)
         label_text = indent
-    if any(len(command) > MAX_COMMAND_LENGTH for command in action.commands):
-        if label_text.strip():
-            yield Paragraph(label_text.rstrip())
-        label_text = indent = "    "
     for command in action.commands:
         yield Paragraph(f"{label_text}{command}", "bold")
         label_text = indent

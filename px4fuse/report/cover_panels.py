@@ -230,14 +230,13 @@ def _draw_map(page: Page, analysis: Analysis, flight_map: FlightMap, height: flo
     axes_height = height - TITLE_HEIGHT - LABELLED_HEIGHT
     axes_width = page.width - AXES_LEFT_MARGIN - AXES_RIGHT_MARGIN
     limits = _compute_map_limits(tracks, axes_width / axes_height)
-    distance_texts = []
-    for name, track in tracks.items():
-        distance_m = np.nanmax(np.abs(track.T - np.clip(track.T, *limits)))
-        if distance_m > 0.0:
-            distance_texts.append(f"{name} {format_metres(distance_m)} m")
+    distance_m, name = max(
+        (np.nanmax(np.abs(track.T - np.clip(track.T, *limits))), name)
+        for name, track in tracks.items()
+    )
     title = "Map"
-    if distance_texts:
-        title = f"Map; largest distance of points outside the map: {', '.join(distance_texts)}"
+    if distance_m > 0.0:
+        title += f"; largest distance outside the map: {name} {format_metres(distance_m)} m"
     axes = page.add_panel(title, axes_height)
     style.set_map_axes(axes, flight_map.x_name, flight_map.y_name)
     (left, bottom), (right, top) = limits

@@ -90,17 +90,15 @@ def describe_missing_explanation(analysis: Analysis) -> str:
 
 
 def format_replay_agreement(agreement: Agreement) -> str:
-    correlation_text = ", ".join(
-        f"{axis.innovation_correlation:.4f} ({name})" for name, axis in agreement.axes.items()
-    )
-    ratio_text = ", ".join(
-        f"{axis.s_ratio_median:.3f} (5 to 95 % {axis.s_ratio_p5:.3f} to {axis.s_ratio_p95:.3f})"
-        for axis in agreement.axes.values()
-    )
+    axis_texts = [
+        f"{name} correlation {axis.innovation_correlation:.4f}, replayed ÷ logged innovation "
+        f"variance S {axis.s_ratio_median:.3f} (5 to 95 % {axis.s_ratio_p5:.3f} to "
+        f"{axis.s_ratio_p95:.3f})"
+        for name, axis in agreement.axes.items()
+    ]
     sentences = [
         f"{'agrees' if agreement.good else 'does not agree'} with the log ({agreement.reason})",
-        f"Correlation of {agreement.samples} replayed with logged innovations: {correlation_text}",
-        f"Replayed ÷ logged innovation variance S: {ratio_text}",
+        f"Replayed and logged innovations of {agreement.samples} samples: {'; '.join(axis_texts)}",
         f"Rejected samples: {agreement.rejected_fraction_replayed:.1%} in the replay, "
         f"{agreement.rejected_fraction_logged:.1%} in the log",
         *(

@@ -53,7 +53,7 @@ def _make_event_markers(
     events = analysis.events
     event_markers = (
         EventMarkers("on the ground", events.ground_spans_s, ON_GROUND_BAND_STYLE),
-        EventMarkers("gap in position source", events.gaps, GAP_BAND_STYLE),
+        EventMarkers("position gap", events.gaps, GAP_BAND_STYLE),
         EventMarkers("log dropout", events.dropouts, DROPOUT_BAND_STYLE),
         EventMarkers("EKF2 rejected", rejection_times_s, REJECTED_STYLE, 0.025),
         EventMarkers("outlier", find_outlier_times(analysis), OUTLIER_MARKER_STYLE, 0.075),

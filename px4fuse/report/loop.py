@@ -33,12 +33,9 @@ from px4fuse.trajectory.scores import RmseInterval, Statistics
 
 LEAD_TEXT = (
     "The closure error is the distance between the end of the odometry and the true end. It is "
-    "distributed along the path by distance, or by pose graph optimisation. px4fuse first tests "
-    "each closure, because a false closure would deform the whole path."
-)
-DISTANCE_CORRECTION_NOTE = (
-    "The correction by distance shifts each position in proportion to its distance from the start, "
-    "and the end by the closure error (lesson UAT 366, module 2, Example 2)."
+    "distributed along the path in proportion to the distance from the start (lesson UAT 366, "
+    "module 2, Example 2), or by pose graph optimisation. px4fuse first tests each closure, "
+    "because a false closure would deform the whole path."
 )
 MAX_LISTED_CLOSURES = 10
 ERROR_COLOUR = SEVERITY_COLOURS["error"]
@@ -139,8 +136,6 @@ def write_loop(page: Page, loop: Loop) -> None:
             "True end": "not used" if isinstance(true_end, Unavailable) else true_end.source,
         }
     )
-    if "by_distance_plain" in loop.find_paths():
-        page.write_small_text(DISTANCE_CORRECTION_NOTE)
     missing_reasons = {
         f"{correction.what}: {correction.reason}": None
         for correction in loop.corrections.values()

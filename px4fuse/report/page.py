@@ -3,8 +3,9 @@
 from __future__ import annotations
 
 import io
+import math
 import re
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from typing import Any
 
 from px4fuse.core.text import with_log_name
@@ -119,36 +120,18 @@ class Page:
         )
         return axes
 
-    def add_legend(self, entries: Iterable[Artist]) -> PageBlock:
+    def add_legend(self, entries: Sequence[Artist]) -> PageBlock:
         from matplotlib.figure import Figure  # noqa: PLC0415 - as in :meth:`add_panel`
 
-        rows: list[list[Artist]] = [[]]
-        free_width = self.width
-        for entry in entries:
-            label = str(entry.get_label())
-            entry_width = LEGEND_HANDLE_WIDTH + LEGEND_CHARACTER_WIDTH * len(label)
-            if rows[-1] and entry_width > free_width:
-                rows.append([])
-                free_width = self.width
-            rows[-1].append(entry)
-            free_width -= entry_width
-        height = LEGEND_HEIGHT * len(rows)
+        labels = [str(entry.get_label()) for entry in entries]
+        entry_width = LEGEND_HANDLE_WIDTH + LEGEND_CHARACTER_WIDTH * max(map(len, labels))
+        column_count = max(int(self.width / entry_width), 1)
+        height = LEGEND_HEIGHT * math.ceil(len(labels) / column_count)
         figure = Figure(figsize=(self.width / 72.0, height / 72.0))
-        for row_index, row in enumerate(rows):
-            figure.legend(
-                handles=row,
-                loc="upper left",
-                ncols=len(row),
-                borderaxespad=0.0,
-                borderpad=0.0,
-                bbox_to_anchor=(0.0, 1.0 - row_index / len(rows)),
-                handlelength=2.0,
-                handletextpad=0.5,
-                columnspacing=1.2,
-            )
-        labels = ", ".join(str(artist.get_label()) for row in rows for artist in row)
+        figure.legend(handles=entries, loc="upper left", ncols=column_count, borderpad=0.0)
+        alternative_text = f"Legend: {', '.join(labels)}"
         return self.add(
-            "legend", alt=f"Legend: {labels}", width=self.width, height=height, figure=figure
+            "legend", alt=alternative_text, width=self.width, height=height, figure=figure
         )
 
     def add_columns(self, *columns: Page) -> None:
@@ -167,15 +150,7 @@ def styled_text(text: str, colour: str = TEXT_COLOUR, *, bold: bool = False) -> 
 
 
 def draw_legend_above(axes: Axes) -> None:
-    axes.legend(
-        loc="lower right",
-        bbox_to_anchor=(1.0, 1.0),
-        ncols=9,
-        borderaxespad=0.0,
-        borderpad=0.1,
-        columnspacing=1.2,
-        handlelength=1.4,
-    )
+    axes.legend(loc="lower right", bbox_to_anchor=(1.0, 1.0), ncols=9)
 
 
 def replace_unprintable(text: str) -> str:

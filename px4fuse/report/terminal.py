@@ -4,12 +4,10 @@ from typing import Any
 
 from px4fuse.analysis import AidingSourceAnalysis, Analysis
 from px4fuse.card.model import Card
-from px4fuse.core.text import capitalise_first
 from px4fuse.ekf2.steps import DifferenceExplanation
 from px4fuse.report.aids import select_aids_of_outdoor_flight, write_aids
 from px4fuse.report.page import Page
 from px4fuse.report.phrases import (
-    describe_alignment,
     list_verdict_warnings,
     write_error_table,
     write_findings,
@@ -57,9 +55,6 @@ def _write_details(page: Page, analysis: Analysis, results: Any) -> None:
         f"{source.name}: {source.description}, {source.compute_rate_hz():.1f} Hz, "
         f"{source.frame}; {analysis.source_reason}",
     )
-    if source.alignment is not None:
-        for label, text in describe_alignment(source.alignment).items():
-            page.write_labelled(capitalise_first(label), text)
     page.write_labelled(
         "Segment", f"{segment.start_s:.2f} s to {segment.end_s:.2f} s, {segment.reason}"
     )
