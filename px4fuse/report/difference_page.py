@@ -6,7 +6,7 @@ import numpy as np
 import pandas as pd
 
 from px4fuse.analysis import Analysis
-from px4fuse.ekf2.replay import Agreement, Ekf2Replay
+from px4fuse.ekf2.replay import Agreement
 from px4fuse.ekf2.steps import DifferenceExplanation
 from px4fuse.flight.ekf2_parameters import AIDS
 from px4fuse.flight.model import Unavailable
@@ -27,7 +27,7 @@ TIME_PLOT_HEIGHT = 105.0  # points
 
 def draw_pages(analysis: Analysis, _: object) -> Iterator[Page]:
     """Draw the contribution of each EKF2 setting to the mean square difference KF - EKF2."""
-    name, replay = analysis.main.axis.name, analysis.ekf2_replay
+    name, model = analysis.main.axis.name, analysis.ekf2_model
     explanation = analysis.difference_steps.get(name)
     if not isinstance(explanation, DifferenceExplanation):
         return
@@ -72,9 +72,8 @@ def draw_pages(analysis: Analysis, _: object) -> Iterator[Page]:
     for start, end in explanation.spans_s:
         draw_curve(axes, difference_m.loc[start:end], **TRACK_STYLES["KF"])
         draw_curve(axes, unexplained_difference_m.loc[start:end], color=EKF2_COLOUR, lw=0.8)
-    assert isinstance(replay, Ekf2Replay)
-    assert replay.agreement is not None
-    page.write_small_text(f"EKF2 replay: {format_replay_agreement(replay.agreement)}.")
+    assert not isinstance(model, Unavailable)
+    page.write_small_text(f"EKF2 replay: {format_replay_agreement(model.agreement)}.")
     yield page
 
 

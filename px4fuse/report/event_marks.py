@@ -105,8 +105,7 @@ def find_outlier_times(analysis: Analysis) -> Array:
     """Return the times (s) of outliers of the position source."""
     tunings = map(analysis.tuning.get, (HORIZONTAL, analysis.main.axis.name))
     times_s = [tuning.outlier_time_s for tuning in tunings if isinstance(tuning, AxisTuning)]
-    outlier_times_s: Array = np.unique(np.concatenate([[], *times_s]))
-    return outlier_times_s
+    return np.asarray(np.unique(np.concatenate([[], *times_s])))
 
 
 def make_legend_entries(analysis: Analysis) -> list[Artist]:

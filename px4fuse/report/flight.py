@@ -53,24 +53,18 @@ def _draw_enlarged_sigma_plot(page: Page, result: AxisComparison) -> None:
     # A stable sort keeps the prior variance before the posterior variance
     variances_m2 = variances_m2.sort_index(kind="stable").loc[start_s:end_s]
     axes.plot(np.sqrt(variances_m2), **TRACK_STYLES["KF"])
-    note = "The line is σ of KF; it decreases at each measurement."
     if isinstance(result.ekf2_innovations, pd.DataFrame):
-        ekf2_variances_m2 = result.ekf2_innovations.loc[start_s:end_s].dropna(
-            subset=["prior_variance_m2"]
-        )
-        prior_sigma_m, posterior_sigma_m = (
-            np.sqrt(ekf2_variances_m2[f"{side}_variance_m2"]) for side in ("prior", "posterior")
-        )
-        axes.vlines(prior_sigma_m.index, posterior_sigma_m, prior_sigma_m, color=EKF2_COLOUR)
-        axes.plot(prior_sigma_m, **style.dot_style(EKF2_COLOUR, "^", 3.6, 0.7), mfc="none")
-        axes.plot(posterior_sigma_m, **style.dot_style(EKF2_COLOUR, "v", 3.6))
-        note += " EKF2: ▵ before and ▾ after an update, □ logged σ."
+        ekf2_updates = result.ekf2_innovations.loc[start_s:end_s]
+        for side, marker in (("prior", "^"), ("posterior", "v")):
+            sigma_m = np.sqrt(ekf2_updates[f"{side}_variance_m2"])
+            axes.plot(sigma_m, **style.dot_style(EKF2_COLOUR, marker, 3.6, 0.7), mfc="none")
     if isinstance(result.ekf2_variance, pd.DataFrame):
         logged_sigma_m = np.sqrt(result.ekf2_variance["position_variance_m2"].loc[start_s:end_s])
         axes.plot(logged_sigma_m, **style.dot_style(EKF2_COLOUR, "s", 3.0, 0.7), mfc="white")
     axes.set_xlim(*zoom_span_s)
     axes.set_xlabel(style.TIME_LABEL)
-    page.write_small_text(note)
+    if isinstance(result.ekf2_state, pd.DataFrame):
+        page.write_small_text("EKF2: ▵ before and ▿ after an update, □ logged σ.")
 
 
 def find_zoom_span(result: AxisComparison) -> Span:
@@ -86,7 +80,8 @@ def find_zoom_span(result: AxisComparison) -> Span:
 
 def _describe_sigma_at_updates(result: AxisComparison) -> str:
     sentences = [
-        f"σ of KF grows in each prediction (SIGMA_A {result.replay.settings.sigma_a_m_s2:g} m/s²)."
+        "The line is σ of KF, which grows in each prediction (SIGMA_A "
+        f"{result.replay.settings.sigma_a_m_s2:g} m/s²)."
     ]
     for name, filter_summary in get_statistics_by_filter(result).items():
         before_m = filter_summary.sigma_p_before_update_m

@@ -10,8 +10,6 @@ from px4fuse.report.phrases import format_clock_map
 from px4fuse.report.style import GOOD_COLOUR, MUTED_COLOUR, SEVERITY_COLOURS
 from px4fuse.request import ComparisonRequest, command_line
 
-SOURCES_HEAD = ("data", "topic", "samples", "rate (Hz)", "gaps", "span (s)")
-
 
 def make_log_page(inventory: Inventory, request: ComparisonRequest) -> Page:
     """List the contents of a log and the possible analyses."""
@@ -28,11 +26,10 @@ def make_log_page(inventory: Inventory, request: ComparisonRequest) -> Page:
         for sender in inventory.flight.log.senders
     ]
     if sender_rows:
-        head = ("sender", "type", "messages", "lost")
-        page.add_table(head, sender_rows, right_aligned_columns=(2, 3))
-    page.add_table(
-        SOURCES_HEAD, list(_make_source_rows(inventory)), right_aligned_columns=(2, 3, 4, 5)
-    )
+        sender_head = ("sender", "type", "messages", "lost")
+        page.add_table(sender_head, sender_rows, right_aligned_columns=(2, 3))
+    head = ("data", "topic", "samples", "rate (Hz)", "gaps", "span (s)")
+    page.add_table(head, [*_make_source_rows(inventory)], right_aligned_columns=(2, 3, 4, 5))
     yes, no = ("yes", GOOD_COLOUR), ("no", SEVERITY_COLOURS["warning"])
     rows = [
         (yes if option.possible else no, option.name, option.reason)
@@ -46,7 +43,7 @@ def make_log_page(inventory: Inventory, request: ComparisonRequest) -> Page:
         "Action": [
             f"{advice.remedy} ({'; '.join(advice.improves)})" for advice in inventory.advice
         ],
-        "Clocks": _format_clock_lines(inventory),
+        "Clocks": [*map(format_clock_map, inventory.flight.clocks)],
         "Not used": [
             f"{topic.name}, {topic.count} messages: {topic.reason}"
             for topic in inventory.flight.unused
@@ -101,7 +98,7 @@ def _make_source_rows(inventory: Inventory) -> Iterator[tuple[Cell, ...]]:
         data_type = source.part if source.part != previous_data_type else ""
         previous_data_type = source.part
         if source.unavailable:
-            yield (data_type, ("none", MUTED_COLOUR), *("" for _ in SOURCES_HEAD[2:]))
+            yield data_type, ("none", MUTED_COLOUR), "", "", "", ""
             continue
         yield (
             f"{data_type:8} (used)" if source.chosen else data_type,
@@ -130,15 +127,3 @@ def _format_time_span(source: LoggedData) -> str:
         return ""
     digits = 1 if source.end_s < 10 else 0
     return f"{source.start_s:z.{digits}f} to {source.end_s:z.{digits}f}"
-
-
-def _format_clock_lines(inventory: Inventory) -> list[str]:
-    source_names_by_clock: dict[str, dict[str, None]] = {}
-    for source in inventory.sources:
-        if source.clock:
-            name = source.name if source.part == "position" else source.part
-            source_names_by_clock.setdefault(source.clock, {})[name] = None
-    return [
-        *(f"{clock}: {', '.join(names)}" for clock, names in source_names_by_clock.items()),
-        *map(format_clock_map, inventory.flight.clocks),
-    ]

@@ -13,7 +13,7 @@ from px4fuse.loop.analysis import MIN_UNIX_TIME_S
 from px4fuse.loop.model import LANDING_CLOSURE_SOURCE, Closure, Loop
 from px4fuse.report.evaluation import describe_method, format_interval, plot_path
 from px4fuse.report.page import Cell, Page
-from px4fuse.report.phrases import format_student, write_findings
+from px4fuse.report.phrases import write_findings
 from px4fuse.report.style import (
     EKF2_COLOUR,
     KF_COLOUR,
@@ -60,9 +60,6 @@ def draw_pages(analysis: Analysis, _: object) -> Iterator[Page]:
 def draw_report(loop: Loop, results: LoopResults) -> Iterator[Page]:
     """Draw the report page of ``px4fuse loop``."""
     page = Page("Loop closure", LEAD_TEXT)
-    if student := format_student(results.student):
-        page.write_labelled("Student", student)
-    page.write_labelled("SHA-256", loop.odometry.trajectory.sha256)
     write_findings(page, results.findings)
     _write_page(page, loop)
     yield page

@@ -129,10 +129,8 @@ class Page:
         height = LEGEND_HEIGHT * math.ceil(len(labels) / column_count)
         figure = Figure(figsize=(self.width / 72.0, height / 72.0))
         figure.legend(handles=entries, loc="upper left", ncols=column_count, borderpad=0.0)
-        alternative_text = f"Legend: {', '.join(labels)}"
-        return self.add(
-            "legend", alt=alternative_text, width=self.width, height=height, figure=figure
-        )
+        alt = f"Legend: {', '.join(labels)}"
+        return self.add("legend", alt=alt, width=self.width, height=height, figure=figure)
 
     def add_columns(self, *columns: Page) -> None:
         blocks, widths = [column.blocks for column in columns], [column.width for column in columns]

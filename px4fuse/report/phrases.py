@@ -291,9 +291,9 @@ def write_findings(page: Page, findings: tuple[Finding, ...]) -> None:
 def format_noise_estimate(noise: NoiseEstimate) -> str:
     """Format a maximum-likelihood noise with its 95 % interval."""
     if noise.value is None:
-        bounds = (("at most", noise.high), ("at least", noise.low))
-        bound_texts = (f"{prefix} {bound:.2g}" for prefix, bound in bounds if bound is not None)
-        return next(bound_texts, "not identifiable")
+        if noise.high is not None:
+            return f"at most {noise.high:.2g}"
+        return "not identifiable" if noise.low is None else f"at least {noise.low:.2g}"
     lower_limit_text = "0" if noise.low is None else f"{noise.low:.2g}"
     upper_limit_text = "?" if noise.high is None else f"{noise.high:.2g}"
     return f"{noise.value:.3g} ({lower_limit_text}-{upper_limit_text})"

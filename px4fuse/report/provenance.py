@@ -111,9 +111,10 @@ def _write_versions(page: Page, results: FlightResults | LoopResults) -> None:
 
 def _write_section(page: Page, title: str, texts: Iterable[str | tuple[str, str]]) -> None:
     """Write texts, or labels with texts, below a title."""
-    for index, text in enumerate(texts):
-        if index == 0:
-            page.write_heading(title)
+    texts = list(texts)
+    if texts:
+        page.write_heading(title)
+    for text in texts:
         if isinstance(text, str):
             page.write(text)
         else:

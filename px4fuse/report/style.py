@@ -125,7 +125,7 @@ def decimate_series(times: Array, values: Array) -> tuple[Array, Array]:
     if len(times) <= MAX_DRAWN_POINTS:
         return times, values
     intervals = np.array_split(np.arange(len(times)), MAX_DRAWN_POINTS // 2)
-    rows_of_minima = [rows[values[rows].argmin()] for rows in intervals]
-    rows_of_maxima = [rows[values[rows].argmax()] for rows in intervals]
-    selected_rows = np.unique(rows_of_minima + rows_of_maxima)
+    selected_rows = np.unique(
+        [rows[find(values[rows])] for rows in intervals for find in (np.argmin, np.argmax)]
+    )
     return times[selected_rows], values[selected_rows]
