@@ -11,7 +11,6 @@ from px4fuse.comparison.trials import Trial
 from px4fuse.core.record import display_html, one_line_repr
 from px4fuse.ekf2.aids import AidResult
 from px4fuse.ekf2.replay import Ekf2Replay
-from px4fuse.ekf2.steps import DifferenceExplanation
 from px4fuse.ekf2.whatif import WhatIf
 from px4fuse.finding import Finding
 from px4fuse.flight.model import Flight, Unavailable
@@ -94,8 +93,6 @@ class WhatIfAnalysis:
         Changed parameters of EKF2.
     uses_estimates : bool
         True if ``changes`` are maximum-likelihood estimates.
-    difference_steps : mapping from axis name to DifferenceExplanation or Unavailable
-        Causes of the difference between KF and the logged EKF2.
     without : mapping from PX4's name of an aiding source to float
         Time (s) from which EKF2 does not fuse the aiding source in the replays.
     """
@@ -104,7 +101,6 @@ class WhatIfAnalysis:
     whatif: WhatIf
     changes: Mapping[str, float]
     uses_estimates: bool
-    difference_steps: Mapping[str, DifferenceExplanation | Unavailable]
     without: Mapping[str, float] = field(default_factory=dict)
 
     __repr__ = one_line_repr

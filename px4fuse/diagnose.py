@@ -11,7 +11,6 @@
 """
 
 import math
-from collections.abc import Mapping
 from dataclasses import replace
 from pathlib import Path
 from typing import TypeVar
@@ -45,7 +44,6 @@ from px4fuse.core.memory import release_free_memory
 from px4fuse.core.reading import display_name
 from px4fuse.ekf2.aids import evaluate_aids
 from px4fuse.ekf2.model import Ekf2Model, prepare_ekf2_model
-from px4fuse.ekf2.steps import DifferenceExplanation
 from px4fuse.ekf2.whatif import make_sweep_values, what_if
 from px4fuse.errors import MissingDataError, SettingsError
 from px4fuse.filter.signals import AISLE
@@ -352,31 +350,17 @@ def run_what_if(
         )
     progress("replaying EKF2")
     ekf2_model = require_available(prepare_ekf2_model(flight), flight)
-    explanation_by_axis: Mapping[str, DifferenceExplanation | Unavailable] = {}
-    comparison = None
-    try:
-        if ekf2_model.agreement.good and not flight.log.is_assessed:
-            comparison_request = structs.replace(comparison_request, axes=("north", "east", AISLE))
-            prepared_comparison = prepare_comparison_inputs(flight, comparison_request)
-            comparison = compare(prepared_comparison)
-    except MissingDataError:  # Without KF, only parameter changes from the user can be replayed
-        if has_no_user_change:
-            raise
-    if comparison is not None:
+    if has_no_user_change and ekf2_model.agreement.good:
+        comparison_request = structs.replace(comparison_request, axes=("north", "east", AISLE))
+        prepared_comparison = prepare_comparison_inputs(flight, comparison_request)
+        comparison = compare(prepared_comparison)
         tuning, clock_offset = estimate_noises_and_clock(comparison, progress)
-        estimated_settings = find_corrected_noise_settings(comparison, tuning)
-        explanation_by_axis = explain_ekf2_difference(
-            comparison, ekf2_model, clock_offset, estimated_settings
-        )
-        if has_no_user_change:
-            changes = estimate_ekf2_parameters(comparison, ekf2_model, tuning, clock_offset)
+        changes = estimate_ekf2_parameters(comparison, ekf2_model, tuning, clock_offset)
     parameter_sets = [changes] if changes or request.without else []
     parameter_sets += [changes | values for values in swept_settings]
     progress("replaying EKF2 with other parameters")
     what_if_result = require_available(what_if(ekf2_model, parameter_sets, request.without), flight)
-    return WhatIfAnalysis(
-        flight, what_if_result, changes, has_no_user_change, explanation_by_axis, request.without
-    )
+    return WhatIfAnalysis(flight, what_if_result, changes, has_no_user_change, request.without)
 
 
 def require_available(result: Result | Unavailable, flight: Flight) -> Result:

@@ -1,6 +1,6 @@
 """Data class for a fault of a flight."""
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from typing import Annotated, Literal
 
 from msgspec import Meta
@@ -45,15 +45,15 @@ class Finding(Record, omit_defaults=False):
     caused_by: str | None = None
     spans_s: tuple[Span, ...] = ()
 
-    @property
-    def spans_text(self) -> str:
-        """Times of the fault as text; "" for the whole flight."""
-        if len(self.spans_s) > MAX_LISTED_SPANS:
-            return f"{self.spans_s[0][0]:.1f} s to {self.spans_s[-1][1]:.1f} s"
-        return ", ".join(
-            f"{start:.1f} s to {end:.1f} s" if end - start > MIN_SPAN_S else f"{start:.1f} s"
-            for start, end in self.spans_s
-        )
-
     def __repr__(self) -> str:
         return f"<{self.severity} {self.id}: {self.message} {self.remedy}>"
+
+
+def format_spans(spans_s: Sequence[Span]) -> str:
+    """Format the times of a fault; many spans as one from the first start to the last end."""
+    if len(spans_s) > MAX_LISTED_SPANS:
+        spans_s = [(spans_s[0][0], spans_s[-1][1])]
+    return ", ".join(
+        f"{start:.1f} s to {end:.1f} s" if end - start > MIN_SPAN_S else f"{start:.1f} s"
+        for start, end in spans_s
+    )

@@ -77,7 +77,7 @@ def pdf_of(*pages: Page) -> bytes:
     with apply_report_style():
         blocks = to_typst_data([block for page in pages for block in page.blocks], "log.ulg")
     report = {
-        "title": "t", "author": "a", "head": "", "student": "", "foot": "", "results": None,
+        "title": "t", "author": "a", "head": "", "student": "", "results": None,
         "fonts": [fonts.FONT], "blocks": blocks,
     }  # fmt: skip
     return compile_pdf(report)

@@ -13,8 +13,8 @@ from exchange import replace
 
 from px4fuse.analysis import Analysis
 from px4fuse.card.build import (
+    _describe_kf_settings,
     _format_actions,
-    _format_changed_settings,
     build_card,
     build_unusable_log_card,
 )
@@ -207,7 +207,7 @@ def test_actions_without_fault_agree_with_notes() -> None:
 
 def test_changed_sigma_z_of_gnss_names_its_parameter() -> None:
     gnss = findings_tools.analysis(source=findings_tools.source(origin=GNSS_ORIGIN))
-    changed = _format_changed_settings(gnss, ComparisonRequest(log="a.ulg", sigma_z_m=0.1))
+    _, changed = _describe_kf_settings(gnss, ComparisonRequest(log="a.ulg", sigma_z_m=0.1))
     assert changed == ("--sigma-z 0.1 (default from EKF2_GPS_P_NOISE)",)
 
 

@@ -87,7 +87,7 @@ def test_report_cover_shows_3_notes_and_counts_the_others() -> None:
     text = text_of(replace(SMALL_SIGMA_A, notes=notes, more_causes=4))
     assert "note[note_2]: Text 2." in text
     assert "note_3" not in text
-    assert "2 more notes are listed in All findings" in text
+    assert "2 more notes are listed in All findings of the report" in text
     assert "4 more causes are listed in All findings" in text
 
 
@@ -140,7 +140,7 @@ def test_report_cover_lists_sigma_ratios_of_aiding_sources() -> None:
     )
     card = replace(SMALL_SIGMA_A, verdicts=(), causes=(), effect=None, aids=aids)
     text = text_of(card)
-    assert "barometer height 0.57" in text
+    assert "barometer height ● 0.57" in text
     assert "magnetometer x not evaluated" in text
     assert "such a value is usual and not a fault" in text
 
@@ -200,7 +200,7 @@ def test_cover_map_title_states_farthest_distance_outside_map() -> None:
     analysis = unexplained(compare(flight))
     titles = panels_by_title(drawn(analysis))
     (title,) = (title for title in titles if title.startswith("Map"))
-    assert title.startswith("Map; largest distance of points outside the map: EKF2 3")
+    assert title.startswith("Map; largest distance outside the map: EKF2 3")
 
 
 def test_innovations_beyond_plot_scale_are_drawn_as_triangles(eventful: Analysis) -> None:

@@ -45,7 +45,7 @@ from px4fuse.filter.hypotheses import Estimate, SystematicErrors
 from px4fuse.filter.settings import Settings
 from px4fuse.filter.signals import Segment
 from px4fuse.filter.tuning import NoiseEstimate
-from px4fuse.finding import Finding
+from px4fuse.finding import Finding, format_spans
 from px4fuse.findings import (
     ekf2_not_fusing,
     ekf2_settings,
@@ -105,7 +105,7 @@ def make_finding(name: str, level: Any = "error", caused_by: str | None = None) 
     ],
 )  # fmt: skip
 def test_fault_report_lists_times_of_occurrence(spans: Any, expected: str) -> None:
-    assert replace(make_finding("x"), spans_s=spans).spans_text == expected
+    assert format_spans(spans) == expected
 
 
 def test_status_flag_has_first_logged_value_at_earlier_times() -> None:

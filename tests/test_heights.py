@@ -507,9 +507,7 @@ def test_what_if_results_contain_each_height_sensor(models: dict[str, Ekf2Model]
     model, changes, without = models["nominal"], {"EKF2_BARO_GATE": 1.5}, {"gnss_hgt": 100.0}
     request = WhatIfRequest(log=model.flight.log.name, changes=changes, without=without)
     asked = what_if(model, [changes], without)
-    found = WhatIfAnalysis(
-        model.flight, asked, changes, uses_estimates=False, difference_steps={}, without=without
-    )
+    found = WhatIfAnalysis(model.flight, asked, changes, uses_estimates=False, without=without)
     results = json.loads(to_json(make_whatif_results(request, found)))
     jsonschema.validate(results, schema())
     assert results["whatif"]["heights"].keys() == {"baro_hgt"}

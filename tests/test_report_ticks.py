@@ -4,13 +4,9 @@ from collections.abc import Callable
 
 import numpy as np
 import pytest
-from matplotlib.figure import Figure
 
-from px4fuse.report.page import measure_text_width
-from px4fuse.report.style import Axes, apply_report_style, set_map_axes, set_plain_ticks
-from px4fuse.report.ticks import replace_ticks
-
-MAX_DISTANCE_POINTS = 3.0  # between the places of a text in both drawings
+from px4fuse.report.page import Page, to_typst_data
+from px4fuse.report.style import Axes, apply_report_style, set_log_scale, set_map_axes
 
 
 def plot_metres(axes: Axes) -> None:
@@ -18,16 +14,10 @@ def plot_metres(axes: Axes) -> None:
     axes.set(xlabel="time (s)", xlim=(0.0, 30.0))
 
 
-def plot_utm_coordinates(axes: Axes) -> None:
-    axes.plot(5.8e6 + np.arange(5.0), 4.7e6 + np.arange(5.0))
-    axes.set(xlabel="east (m)", ylabel="north (m)")
-
-
 def plot_on_log_scale(axes: Axes) -> None:
     axes.plot([0.0, 30.0], [0.02, 1.5])
-    axes.set_yscale("log")
-    set_plain_ticks(axes)
-    axes.tick_params(axis="x", labelbottom=False)
+    set_log_scale(axes)
+    axes.set_xlabel("time (s)")
 
 
 def plot_map(axes: Axes) -> None:
@@ -38,53 +28,72 @@ def plot_map(axes: Axes) -> None:
 def plot_named_rows(axes: Axes) -> None:
     axes.barh([0, 1], [3.0, 5.0])
     axes.set_yticks([0, 1], ["process noise", "unexplained"])
-    axes.grid(visible=False)
+    axes.set_xlabel("%")
 
 
-PLOTS = (plot_metres, plot_utm_coordinates, plot_on_log_scale, plot_map, plot_named_rows)
+PLOTS = (plot_metres, plot_on_log_scale, plot_map, plot_named_rows)
 
 
-def drawn_texts(
-    plot: Callable[[Axes], None], *, few_artists: bool
-) -> list[tuple[str, float, float]]:
-    """Return the texts of a plot, each with x and y (points) of its centre."""
-    with apply_report_style():
-        axes = Figure(figsize=(4.0, 2.6), dpi=72.0).add_axes((0.3, 0.3, 0.6, 0.6))
-        plot(axes)
-        if few_artists:
-            replace_ticks(axes, measure_text_width)
-            texts = axes.texts
-        else:
-            axes.figure.draw_without_rendering()
-            texts = [axes.xaxis.label, axes.yaxis.label]
-            for axis in (axes.xaxis, axes.yaxis):
-                low, high = axis.get_view_interval()
-                shown = [tick for tick in axis.get_major_ticks() if low <= tick.get_loc() <= high]
-                texts += [tick.label1 for tick in shown if tick.label1.get_visible()]
-                texts += [axis.get_offset_text()]
-        boxes = {text: text.get_window_extent() for text in texts if text.get_text()}
-    return sorted(
-        (text.get_text(), (box.x0 + box.x1) / 2.0, (box.y0 + box.y1) / 2.0)
-        for text, box in boxes.items()
-    )
+def rendered_axes(plot: Callable[[Axes], None]) -> Axes:
+    page = Page()
+    axes = page.add_panel("Panel", 150.0)
+    plot(axes)
+    to_typst_data(page.blocks, "")
+    return axes
+
+
+def tick_labels(axes: Axes) -> list[str]:
+    """Return the texts of matplotlib's visible ticks."""
+    axes.figure.draw_without_rendering()
+    texts = []
+    for axis in (axes.xaxis, axes.yaxis):
+        low, high = axis.get_view_interval()
+        shown = [tick for tick in axis.get_major_ticks() if low <= tick.get_loc() <= high]
+        texts += [tick.label1.get_text() for tick in shown]
+    return texts
 
 
 @pytest.mark.parametrize("plot", PLOTS, ids=lambda plot: plot.__name__)
-def test_fast_tick_labels_have_matplotlib_texts_and_positions(plot: Callable[[Axes], None]) -> None:
-    expected = drawn_texts(plot, few_artists=False)
-    drawn = drawn_texts(plot, few_artists=True)
-    assert [text for text, *_ in drawn] == [text for text, *_ in expected]
-    for (_, *place), (text, *expected_place) in zip(drawn, expected, strict=True):
-        if not text.startswith("+"):  # the common summand stands left of the axis
-            assert place == pytest.approx(expected_place, abs=MAX_DISTANCE_POINTS), text
-
-
-def test_replaced_ticks_keep_the_grid_of_each_axis() -> None:
+def test_drawn_tick_labels_are_those_of_matplotlib(plot: Callable[[Axes], None]) -> None:
     with apply_report_style():
-        for grid_axis, expected_count in (("y", 1), ("both", 2)):
-            axes = Figure().add_axes((0.0, 0.0, 1.0, 1.0))
-            axes.grid(visible=False)
-            axes.grid(visible=True, axis=grid_axis)
-            replace_ticks(axes, measure_text_width)
-            colours = [line.get_color() for line in axes.lines]
-            assert colours.count("#e3e3e3") == expected_count
+        drawn = rendered_axes(plot)
+        expected = Page().add_panel("Panel", 150.0)
+        plot(expected)
+        expected.set_position(drawn.get_position())
+        expected.figure.set_size_inches(drawn.figure.get_size_inches())
+        assert [text.get_text() for text in drawn.texts] == tick_labels(expected)
+        assert drawn.get_xlim() == expected.get_xlim()
+        assert drawn.get_ylim() == expected.get_ylim()
+
+
+def test_drawn_tick_labels_are_at_their_ticks() -> None:
+    with apply_report_style():
+        axes = rendered_axes(plot_metres)
+        for text in axes.texts:
+            box = text.get_window_extent()
+            x, y = axes.transData.inverted().transform(
+                [(box.x0 + box.x1) / 2.0, (box.y0 + box.y1) / 2.0]
+            )
+            is_x_label = box.y1 < axes.bbox.y0
+            number = float(text.get_text().replace("\N{MINUS SIGN}", "-"))
+            assert (x if is_x_label else y) == pytest.approx(
+                number, abs=0.2 if is_x_label else 0.02
+            )
+
+
+def test_common_summand_of_tick_labels_is_part_of_axis_label() -> None:
+    def plot_utm_coordinates(axes: Axes) -> None:
+        axes.plot(5.8e6 + np.arange(5.0), 4.7e6 + np.arange(5.0))
+        set_map_axes(axes, "east", "north")
+
+    with apply_report_style():
+        axes = rendered_axes(plot_utm_coordinates)
+    assert axes.get_xlabel() == "east (m) +5.8e6"
+    assert axes.get_ylabel() == "north (m) +4.7e6"
+
+
+def test_axes_without_label_have_no_tick_labels_along_x() -> None:
+    with apply_report_style():
+        axes = rendered_axes(lambda axes: axes.plot([0.0, 1.0], [10.0, 11.0]))
+    assert axes.texts
+    assert all(float(text.get_text()) >= 10.0 for text in axes.texts)

@@ -107,7 +107,9 @@ def test_report_without_ekf2_replay_omits_difference_page(sample: Analysis) -> N
     explanation = explain_ekf2_difference(sample, doubtful, sample.clock, {})
     parted = replace(sample, ekf2_model=doubtful, difference_steps=explanation)
     absent = Unavailable("EKF2 replay", "no IMU", "Record it.")
-    without = replace(sample, ekf2_model=absent, difference_steps={"north": absent, "east": absent})
+    without = replace(
+        sample, ekf2_model=absent, difference_steps=dict.fromkeys(sample.axes, absent)
+    )
     for analysis, reason in ((parted, "they part"), (without, "no IMU")):
         assert drawn(analysis) == []
         line = describe_missing_explanation(analysis)

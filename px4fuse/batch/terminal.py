@@ -103,11 +103,11 @@ def format_differences(results: ChangeResults) -> Page:
     )
     for finding in results.findings:
         styled_message = styled_text(
-            f"{finding.severity}: {finding.message}", 8.0, SEVERITY_COLOURS[finding.severity]
+            f"{finding.severity}: {finding.message}", SEVERITY_COLOURS[finding.severity]
         )
         page.write_labelled(f"Only {finding.only_in}", styled_message)
     for text in results.worse:
-        page.write_labelled("Worse", styled_text(text, 8.0, ERROR_COLOUR))
+        page.write_labelled("Worse", styled_text(text, ERROR_COLOUR))
     if not results.worse:
         page.write("Compared with A, B has no new inconsistent filter and no new error.")
     return page

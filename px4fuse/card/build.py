@@ -123,13 +123,14 @@ def build_card(
         Name and id.
     """
     source, segment = analysis.source, analysis.segment
+    settings_text, changed_options = _describe_kf_settings(analysis, request)
     analysis_description = _describe_analysis(
         analysis.flight.log,
         request,
         student,
         source=f"{source_name(source)} {source.compute_rate_hz():.1f} Hz",
-        settings=_format_settings(analysis, request),
-        changed=_format_changed_settings(analysis, request),
+        settings=settings_text,
+        changed=changed_options,
         parameters=_format_changed_parameters(analysis),
         segment=f"{segment.start_s:.1f} to {segment.end_s:.1f} s, {segment.reason}",
     )
@@ -238,14 +239,13 @@ def _make_headline(causes: Sequence[DiagnosedCause], sigma_verdicts: Sequence[Ve
             f"{'small' if ratio > 1.0 else 'large'} compared with "
             f"{'the innovations' if worst_verdict.against == 'source' else 'ground truth'}"
         )
-    if all(verdict.word == "not evaluated" for verdict in sigma_verdicts):
+    consistent_filters = dict.fromkeys(
+        FILTER_NAMES[verdict.filter] for verdict in sigma_verdicts if verdict.word == "consistent"
+    )
+    if not consistent_filters:
         return "No fault found; KF and EKF2 could not be evaluated"
-    consistent_filters = {
-        verdict.filter for verdict in sigma_verdicts if verdict.word == "consistent"
-    }
-    if len(consistent_filters) == 2:
-        return "No fault found: KF and EKF2 are consistent"
-    return f"No fault found: {FILTER_NAMES[consistent_filters.pop()]} is consistent"
+    verb = "is" if len(consistent_filters) == 1 else "are"
+    return f"No fault found: {' and '.join(consistent_filters)} {verb} consistent"
 
 
 def _summarise_errors(analysis: Analysis) -> FlightErrors:
@@ -354,12 +354,11 @@ def _describe_worst_axis(analysis: Analysis) -> list[str]:
         and truth.nees_position_mean
         and not (truth.has_only_lag_errors and result is not analysis.main)
     ]
-    if not nees_axis_rmse_tuples:
-        return []
-    nees, worst_result, rmse_m = max(nees_axis_rmse_tuples, key=lambda item: item[0])
+    nees, worst_result, rmse_m = max(
+        nees_axis_rmse_tuples, key=lambda item: item[0], default=(1.0, analysis.main, 0.0)
+    )
     ratio = math.sqrt(nees)
-    is_overconfident = classify_sigma_ratio(ratio, "truth") == "overconfident"
-    if worst_result is analysis.main or not is_overconfident:
+    if worst_result is analysis.main or classify_sigma_ratio(ratio, "truth") != "overconfident":
         return []
     return [
         f"EKF2's RMSE along {worst_result.axis.label} is {format_metres(rmse_m)} m, "
@@ -452,18 +451,16 @@ def _explain_verdict_differences(
     may_drift, ekf2_errors = analysis.source.origin.may_drift, analysis.main.filters["ekf2"].truth
     sigma_verdicts = _mark_explained_verdicts(sigma_verdicts, causes, may_drift=may_drift)
     *previous_verdicts, ekf2_verdict = sigma_verdicts
-    fusion_horizon_sigma_ratio = math.inf
+    horizon_nees = getattr(ekf2_errors, "nees_position_horizon_mean", None)
+    horizon_sigma_ratio = math.sqrt(horizon_nees or math.inf)
     if (
         not causes
         and ekf2_verdict.word == "overconfident"
-        and isinstance(ekf2_errors, ErrorsAgainstTruth)
-        and ekf2_errors.nees_position_horizon_mean
+        and classify_sigma_ratio(horizon_sigma_ratio, "truth") == "consistent"
     ):
-        fusion_horizon_sigma_ratio = math.sqrt(ekf2_errors.nees_position_horizon_mean)
-    if classify_sigma_ratio(fusion_horizon_sigma_ratio, "truth") == "consistent":
         return (*previous_verdicts, replace(ekf2_verdict, is_explained=True)), (
             "EKF2 reports σ for its delayed position at the fusion horizon. The error of the "
-            f"delayed position is {format_ratio(fusion_horizon_sigma_ratio)} times σ, so EKF2 is "
+            f"delayed position is {format_ratio(horizon_sigma_ratio)} times σ, so EKF2 is "
             "consistent. The output predictor adds a lag error to the published position."
         )
     explanation = _explain_differing_verdicts(analysis, sigma_verdicts, causes)
@@ -484,16 +481,13 @@ def _explain_differing_verdicts(
         if rerun.improves == "position and σ"
     }
     filters_with_differing_ratios = [
-        filter_name
-        for filter_name in FILTER_NAMES
-        for source, truth in [
-            [verdict for verdict in sigma_verdicts if verdict.filter == filter_name]
-        ]
+        source.filter
+        for source, truth in zip(sigma_verdicts[::2], sigma_verdicts[1::2], strict=True)
         if source.ratio is not None
         and truth.ratio is not None
         and (
             source.word != truth.word
-            or (truth.ratio > 2.0 * source.ratio and filter_name not in corrected_filters)
+            or (truth.ratio > 2.0 * source.ratio and source.filter not in corrected_filters)
         )
     ]
     if not filters_with_differing_ratios:
@@ -513,9 +507,11 @@ def _explain_differing_verdicts(
         )
     horizontal_tuning = analysis.tuning.get(HORIZONTAL)
     if analysis.source.origin.may_drift:
-        sigma_z = horizontal_tuning.sigma_z if isinstance(horizontal_tuning, AxisTuning) else None
-        noise_m = sigma_z and (sigma_z.value or sigma_z.high)
-        noise_text = f" of {format_metres(noise_m)} m" if noise_m else ""
+        noise_text = ""
+        if isinstance(horizontal_tuning, AxisTuning):
+            sigma_z = horizontal_tuning.sigma_z
+            noise_m = sigma_z.value or sigma_z.high
+            noise_text = f" of {format_metres(noise_m)} m" if noise_m else ""
         return (
             f"The position noise{noise_text} is smaller than KF and EKF2 assume, so innovations "
             "are small. Only ground truth shows the drift of the source."
@@ -525,12 +521,12 @@ def _explain_differing_verdicts(
             "KF and EKF2 follow position errors that change slowly. Innovations do not show slow "
             "errors; only ground truth does."
         )
-    has_heading_error = "ekf2_heading_error" in finding_ids
-    explanation = HEADING_ERROR_EXPLANATION if has_heading_error else UNEXPLAINED_DIFFERENCE_TEXT
-    has_rejected_outliers = (
-        "source_outliers" in finding_ids and "ekf2" in filters_with_differing_ratios
-    )
-    return OUTLIER_EXPLANATION if has_rejected_outliers else explanation
+    explanation = UNEXPLAINED_DIFFERENCE_TEXT
+    if "ekf2_heading_error" in finding_ids:
+        explanation = HEADING_ERROR_EXPLANATION
+    if "source_outliers" in finding_ids and "ekf2" in filters_with_differing_ratios:
+        explanation = OUTLIER_EXPLANATION
+    return explanation
 
 
 def _describe_difference(effect: FlightErrors, ranked_causes: Sequence[RankedCause]) -> str:
@@ -586,29 +582,26 @@ def _describe_analysis(
     )
 
 
-def _format_settings(analysis: Analysis, request: ComparisonRequest) -> str:
-    settings = analysis.settings
-    setting_texts = []
+def _describe_kf_settings(
+    analysis: Analysis, request: ComparisonRequest
+) -> tuple[str, tuple[str, ...]]:
+    """Return all settings of KF with their origin, and the options that change a default."""
+    setting_texts, changed_options = [], []
     for name in KF_NUMERIC_SETTINGS:
-        value, value_origin = getattr(settings, name), "set by the user"
+        value, default, chosen = (
+            getattr(settings, name) for settings in (analysis.settings, Settings(), request)
+        )
+        default_text = f"{default:g}"
+        value_origin = "default" if value == default else "set by the user"
+        if name == "sigma_z_m" and analysis.source.origin.is_gnss:
+            default_text = f"from {find_aid(analysis).noise}"
+            value_origin = default_text if chosen is None else value_origin
         unit, label = SETTING_RANGES[name][2:]
-        if name == "sigma_z_m" and request.sigma_z_m is None and analysis.source.origin.is_gnss:
-            value_origin = f"from {find_aid(analysis).noise}"
-        elif value == getattr(Settings(), name):
-            value_origin = "default"
         setting_texts.append(f"{label} {value:g} {unit} ({value_origin})")
-    return ", ".join(setting_texts)
-
-
-def _format_changed_settings(analysis: Analysis, request: ComparisonRequest) -> tuple[str, ...]:
-    default_texts = {name: f"{getattr(Settings(), name):g}" for name in KF_NUMERIC_SETTINGS}
-    if analysis.source.origin.is_gnss:
-        default_texts["sigma_z_m"] = f"from {find_aid(analysis).noise}"
-    return tuple(
-        f"{COMPARISON_OPTIONS[name]} {value:g} (default {default_texts[name]})"
-        for name in KF_NUMERIC_SETTINGS
-        if (value := getattr(request, name)) is not None and f"{value:g}" != default_texts[name]
-    )
+        if chosen is not None and f"{chosen:g}" != default_text:
+            option = f"{COMPARISON_OPTIONS[name]} {chosen:g}"
+            changed_options.append(f"{option} (default {default_text})")
+    return ", ".join(setting_texts), tuple(changed_options)
 
 
 def _format_changed_parameters(analysis: Analysis) -> tuple[str, ...]:

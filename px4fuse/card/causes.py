@@ -199,25 +199,12 @@ def _make_actions(
     """
     finding = ranked_cause.finding
     trial_by_filter_and_kind = {(trial.filter, trial.kinds[0]): trial for trial in useful_trials}
-    sender_actions: list[Action] = []
-    if finding.remedy:
-        remedy = with_log_name(finding.remedy, request.log)
-        sender_actions.append(Action(_find_action_target(finding, analysis.source), remedy))
-    model = analysis.ekf2_model
-    if (
-        finding.id == "ekf2_gps_delay_wrong"
-        and not ranked_cause.trials  # estimated by re-runs of the finding itself
-        and not isinstance(model, Unavailable)
-        and (
-            delay_change := make_delay_change(model.inputs, float(finding.evidence["estimate_ms"]))
-        )
-    ):
-        sender_actions = [make_parameter_action(analysis, delay_change)]
     delay_trial = trial_by_filter_and_kind.get(("ekf2", "delay"))
     offset_trial = trial_by_filter_and_kind.get(
         ("ekf2", "time offset")
     ) or trial_by_filter_and_kind.get(("kf", "time offset"))
-    delay_actions = []
+    actions = _make_sender_actions(analysis, ranked_cause, offset_trial, request)
+    alternative_action_groups: tuple[tuple[Action, ...], ...] = ()
     if delay_trial:
         # Separate actions for parameters that the time shift also changes (EKF2_DELAY_MAX)
         offset_setting_names = offset_trial.change.keys() if offset_trial else ()
@@ -226,41 +213,27 @@ def _make_actions(
             for name, value in delay_trial.change.items()
             if name not in offset_setting_names
         }
-        delay_actions = [make_parameter_action(analysis, delay_parameter_values)]
-    # users cannot shift the timestamps of a GNSS receiver
-    if offset_trial and not (analysis.source.origin.is_gnss and sender_actions):
-        shift_s = offset_trial.change[CLOCK_OFFSET_KEY]
-        if offset_trial.filter == "kf":
-            shift_s -= analysis.settings.clock_offset_s
-        instruction = lowercase_first_letter(format_sender_action(analysis.source, shift_s))
-        sender_actions = [Action("sender", instruction)]
-    alternative_action_groups: tuple[tuple[Action, ...], ...] = ()
-    actions = delay_actions or sender_actions
-    if offset_trial and delay_trial:
-        actions, alternative_action_groups = [], (tuple(sender_actions), tuple(delay_actions))
-    elif (
-        not offset_trial and not delay_trial and _is_setting_fault(finding) and ranked_cause.trials
-    ):
+        delay_action = make_parameter_action(analysis, delay_parameter_values)
+        if offset_trial:
+            actions, alternative_action_groups = [], (tuple(actions), (delay_action,))
+        else:
+            actions = [delay_action]
+    elif not offset_trial and _is_setting_fault(finding) and ranked_cause.trials:
         actions = []
     for (filter_name, kind), trial in trial_by_filter_and_kind.items():
-        if (
-            filter_name == "kf"
-            and kind != "defaults"
-            and trial.change.keys() <= COMPARISON_OPTIONS.keys()
-        ):
-            default_noises_trial = (
-                trial_by_filter_and_kind.get(("kf", "defaults")) if kind == "noises" else None
-            )
-            default_settings = default_noises_trial.change if default_noises_trial else {}
-            change, alignment = trial.change, analysis.source.alignment
+        change = dict(trial.change)
+        if filter_name == "ekf2":
+            change = {name: value for name, value in change.items() if name in PARAMETERS}
+            if change and kind != "delay":
+                actions.append(make_parameter_action(analysis, change))
+        elif kind != "defaults" and change.keys() <= COMPARISON_OPTIONS.keys():
+            defaults_trial = trial_by_filter_and_kind.get(("kf", "defaults"))
+            default_settings = defaults_trial.change if defaults_trial and kind == "noises" else {}
             # --clock-offset replaces the offset from the alignment, so it must include that offset
-            if CLOCK_OFFSET_KEY in change and alignment:
+            if CLOCK_OFFSET_KEY in change and (alignment := analysis.source.alignment):
                 total_s = change[CLOCK_OFFSET_KEY] + alignment.clock_offset_s
-                change = {**change, CLOCK_OFFSET_KEY: round(total_s, 3)}
+                change[CLOCK_OFFSET_KEY] = round(total_s, 3)
             actions.append(make_rerun_action(request, change, default_settings))
-        elif filter_name == "ekf2" and kind != "delay":
-            changes = {name: value for name, value in trial.change.items() if name in PARAMETERS}
-            actions += [make_parameter_action(analysis, changes)] if changes else []
     # First correct the vehicle, then KF
     actions.sort(key=lambda action: action.target == "KF")
     action_targets = {
@@ -276,6 +249,34 @@ def _make_actions(
         reason_by_filter = {"KF, EKF2": reason_by_filter["KF"]}
     actions += [Action(target, reason) for target, reason in reason_by_filter.items()]
     return alternative_action_groups, tuple(actions)
+
+
+def _make_sender_actions(
+    analysis: Analysis,
+    ranked_cause: RankedCause,
+    offset_trial: Trial | None,
+    request: ComparisonRequest,
+) -> list[Action]:
+    """Return the action on the position source, or on the delay of GNSS in EKF2."""
+    finding, source, model = ranked_cause.finding, analysis.source, analysis.ekf2_model
+    # users cannot shift the timestamps of a GNSS receiver
+    if offset_trial and not (source.origin.is_gnss and finding.remedy):
+        shift_s = offset_trial.change[CLOCK_OFFSET_KEY]
+        if offset_trial.filter == "kf":
+            shift_s -= analysis.settings.clock_offset_s
+        return [Action("sender", lowercase_first_letter(format_sender_action(source, shift_s)))]
+    if (
+        finding.id == "ekf2_gps_delay_wrong"
+        and not ranked_cause.trials  # estimated by re-runs of the finding itself
+        and not isinstance(model, Unavailable)
+    ):
+        delay_change = make_delay_change(model.inputs, float(finding.evidence["estimate_ms"]))
+        if delay_change:
+            return [make_parameter_action(analysis, delay_change)]
+    if not finding.remedy:
+        return []
+    remedy = with_log_name(finding.remedy, request.log)
+    return [Action(_find_action_target(finding, source), remedy)]
 
 
 def _explain_missing_action(
@@ -354,14 +355,12 @@ def make_parameter_action(analysis: Analysis, change: Mapping[str, float]) -> Ac
 
 
 def _make_rerun(trial: Trial, trials: Sequence[Trial]) -> Rerun:
-    rejected_fractions = trial.before.rejected_fraction, trial.after.rejected_fraction
+    before, after = trial.before, trial.after
     values_before_and_after: dict[str, Any] = {
         f"{reference}_ratio": tuple(ratios) for reference, *ratios in compare_sigma_ratios(trial)
     }
-    values_before_and_after["position_rmse_m"] = (
-        trial.before.position_rmse_m,
-        trial.after.position_rmse_m,
-    )
+    values_before_and_after["position_rmse_m"] = before.position_rmse_m, after.position_rmse_m
+    rejected_fractions = before.rejected_fraction, after.rejected_fraction
     if max(fraction or 0.0 for fraction in rejected_fractions) >= MIN_REJECTED_FRACTION_TO_SHOW:
         values_before_and_after["rejected_fraction"] = rejected_fractions
     return Rerun(

@@ -12,11 +12,10 @@ from px4fuse.ekf2.aids import AidResult, find_flight_span
 from px4fuse.flight.model import AidLog, Flight, Unavailable, sample_step_function
 from px4fuse.report import style
 from px4fuse.report.event_marks import ON_GROUND_BAND_STYLE
-from px4fuse.report.page import Cell, Page, make_appendix_title
+from px4fuse.report.page import Cell, Page
 from px4fuse.report.panels import draw_dots
 from px4fuse.report.phrases import format_sigma_verdict
 
-TITLE = "Aiding sources of EKF2"
 LEAD_TEXT = (
     "Each aiding source is tested with its innovations in flight: a mean NIS of 1 is expected. "
     "The NIS hardly shows time-correlated errors, wrong delays and wrong headings."
@@ -29,12 +28,12 @@ OUTDOOR_AIDS = ("gnss_pos", "gnss_vel", "optical_flow", "aux_global_position")
 
 def draw_pages(analysis: Analysis | AidingSourceAnalysis, _: object) -> Iterator[Page]:
     """Draw the page on the aiding sources of EKF2."""
-    is_comparison = isinstance(analysis, Analysis)
-    aids = (
-        select_aids_of_outdoor_flight(analysis) if isinstance(analysis, Analysis) else analysis.aids
-    )
+    if isinstance(analysis, Analysis):
+        title, aids = "Appendix: aiding sources", select_aids_of_outdoor_flight(analysis)
+    else:
+        title, aids = "Aiding sources", analysis.aids
     if aids:
-        page = Page(make_appendix_title(TITLE) if is_comparison else TITLE, LEAD_TEXT)
+        page = Page(f"{title} of EKF2", LEAD_TEXT)
         write_aids(page, aids)
         _draw_aid_panels(page, analysis.flight, aids)
         yield page
@@ -43,32 +42,29 @@ def draw_pages(analysis: Analysis | AidingSourceAnalysis, _: object) -> Iterator
 def select_aids_of_outdoor_flight(analysis: Analysis) -> Mapping[str, AidResult]:
     """Return all aiding sources if EKF2 fused GNSS or optical flow, else none."""
     aids = {} if isinstance(analysis.aids, Unavailable) else analysis.aids
-    enabled_aid_names = {name for name, aid in aids.items() if aid.verdict != "disabled"}
-    return {} if enabled_aid_names.isdisjoint(OUTDOOR_AIDS) else aids
+    return {} if _select_enabled_aids(aids).keys().isdisjoint(OUTDOOR_AIDS) else aids
+
+
+def _select_enabled_aids(aids: Mapping[str, AidResult]) -> dict[str, AidResult]:
+    return {name: aid for name, aid in aids.items() if aid.verdict != "disabled"}
 
 
 def write_aids(page: Page, aids: Mapping[str, AidResult]) -> None:
     """Write a table of the aiding sources and their innovation statistics."""
     rows: list[list[Cell]] = []
-    for aid in aids.values():
-        if aid.verdict == "disabled":
-            continue
-        enabled_fraction_text = (
-            "" if aid.enabled_fraction is None else f"{aid.enabled_fraction:.0%}"
-        )
-        noise_text = "" if aid.noise is None else f"{format_number(aid.noise)} {aid.unit}"
+    for aid in _select_enabled_aids(aids).values():
         verdict_colour = style.GOOD_COLOUR if aid.verdict == "consistent" else style.MUTED_COLOUR
         if aid.is_faulty:
             verdict_colour = style.SEVERITY_COLOURS["warning"]
         aid_cells: list[Cell] = [
             aid.label,
             (format_aid_verdict(aid), verdict_colour),
-            enabled_fraction_text,
+            "" if aid.enabled_fraction is None else f"{aid.enabled_fraction:.0%}",
             f"{aid.rejected_fraction:.1%}",
             f"{aid.longest_gap_duration_s:.1f}",
-            noise_text,
+            "" if aid.noise is None else f"{format_number(aid.noise)} {aid.unit}",
         ]
-        axis_rows: list[list[Cell]] = [
+        axis_rows = [
             [
                 name,
                 f"{axis.samples}",
@@ -77,8 +73,8 @@ def write_aids(page: Page, aids: Mapping[str, AidResult]) -> None:
                 f"{axis.mean_normalised_innovation:+.2f}",
             ]
             for name, axis in aid.axes.items()
-        ] or [[""] * 5]
-        for axis_cells in axis_rows:
+        ]
+        for axis_cells in axis_rows or [[""] * 5]:
             rows.append([*aid_cells, *axis_cells])
             aid_cells = [""] * 6
     column_heads = ["aiding source", "verdict", "enabled", "rejec-\nted", "longest\ngap (s)", "√R"]
@@ -97,20 +93,23 @@ def format_aid_verdict(aid: AidResult) -> str:
 
 
 def _draw_aid_panels(page: Page, flight: Flight, aids: Mapping[str, AidResult]) -> None:
-    flight_span_s = find_flight_span(flight)
-    if isinstance(flight.ekf2, Unavailable) or isinstance(flight_span_s, Unavailable):
+    flight_span_s, enabled_aids = find_flight_span(flight), _select_enabled_aids(aids)
+    if (
+        not enabled_aids
+        or isinstance(flight.ekf2, Unavailable)
+        or isinstance(flight_span_s, Unavailable)
+    ):
         return
-    enabled_aid_names = [name for name, aid in aids.items() if aid.verdict != "disabled"]
     page.write_heading("Normalised innovations of each aiding source")
     page.write_small_text(
         "95 % of the normalised innovations ν/√S are expected within ±2 (lines). Hollow samples "
         "were not fused. Grey: fusion was disabled. Triangles: values beyond "
         f"±{MAX_DRAWN_SIGMAS:g}."
     )
-    for name in enabled_aid_names:
-        axes = page.add_panel(aids[name].label, AID_PANEL_HEIGHT, gap_above=1.0)
+    for name, aid in enabled_aids.items():
+        axes = page.add_panel(aid.label, AID_PANEL_HEIGHT)
         _draw_innovations(axes, flight.ekf2.aids[name], flight_span_s)
-        style.label_time_axis(axes, name == enabled_aid_names[-1])
+    axes.set_xlabel(style.TIME_LABEL)
 
 
 def _draw_innovations(axes: style.Axes, aid_log: AidLog, span_s: Span) -> None:
@@ -124,22 +123,10 @@ def _draw_innovations(axes: style.Axes, aid_log: AidLog, span_s: Span) -> None:
         ):
             marker_style = dot_style | {"ms": 1.4}
             draw_dots(axes, innovations[is_drawn], MAX_DRAWN_SIGMAS, marker_style)
-    for limit in (-2.0, 2.0):
-        axes.axhline(limit, color="black", lw=0.4, ls=(0, (1, 1.5)))
     if aid_log.enabled is not None:
         times_s = np.linspace(*span_s, 2000)
         is_disabled = sample_step_function(aid_log.enabled, pd.Index(times_s)) <= 0.0
-        if is_disabled.any():
-            axes.fill_between(
-                times_s,
-                -MAX_DRAWN_SIGMAS,
-                MAX_DRAWN_SIGMAS,
-                where=is_disabled.tolist(),
-                zorder=0.1,
-                **ON_GROUND_BAND_STYLE,
-            )
-    axes.set(
-        xlim=span_s,
-        ylim=(-1.1 * MAX_DRAWN_SIGMAS, 1.1 * MAX_DRAWN_SIGMAS),
-        yticks=(-2.0, 2.0),
-    )
+        band_style = ON_GROUND_BAND_STYLE | {"zorder": 0.1}
+        axes.fill_between(times_s, -5.0, 5.0, where=is_disabled.tolist(), **band_style)
+    limit = 1.1 * MAX_DRAWN_SIGMAS
+    axes.set(xlim=span_s, ylim=(-limit, limit), yticks=(-2.0, 2.0))

@@ -16,6 +16,7 @@ from px4fuse.comparison.model import FILTER_NAMES
 from px4fuse.core.text import format_ratio
 from px4fuse.errors import SettingsError
 from px4fuse.filter.consistency import CONSISTENT_SIGMA_RATIOS
+from px4fuse.finding import format_spans
 from px4fuse.html.safe import load_template, read_asset
 from px4fuse.report.card_text import (
     LABELLED_RATIO_TICKS,
@@ -23,11 +24,10 @@ from px4fuse.report.card_text import (
     SEVERITY_SIGNS,
     format_consistent_ratios,
     format_rerun_note,
-    format_spans,
     format_target,
     label_alternatives,
     locate_sigma_ratio,
-    make_rerun_columns,
+    make_rerun_rows,
     with_typed_path,
 )
 
@@ -43,10 +43,6 @@ SIGMA_RATIO_AXIS = {
     "bands": CONSISTENT_SIGMA_RATIOS,
     "ends": RATIO_AXIS_ENDS,
     "marks": MARKER_SVG_PATHS,
-}
-SCREEN_READER_QUANTITIES = {
-    "source": "innovation over root S",
-    "truth": "position error over sigma",
 }
 
 
@@ -79,7 +75,7 @@ def make_card_html(card: Card, *, is_open: bool = False, has_apply_buttons: bool
         if card.verdicts and card.effect is not None
         else "",
         label_alternatives=label_alternatives,
-        rerun_rows=lambda reruns: zip(*make_rerun_columns(reruns), strict=True),
+        rerun_rows=make_rerun_rows,
         signs=SEVERITY_SIGNS,
         target=format_target,
         format_spans=format_spans,
@@ -96,10 +92,9 @@ def make_sigma_ratio_html(verdicts: Sequence[Verdict], axis: str, name: str = ""
         marks=locate_sigma_ratio,
         paths=MARKER_SVG_PATHS,
         percent=_format_svg_position,
-        alternative=make_alternative_text(verdicts),
         ticks=[
-            (_format_svg_position(map_ratio_to_axis(tick)), label, tick not in LABELLED_RATIO_TICKS)
-            for tick, label in RATIO_AXIS_TICKS.items()
+            (_format_svg_position(map_ratio_to_axis(tick)), RATIO_AXIS_TICKS[tick])
+            for tick in LABELLED_RATIO_TICKS
         ],
         limits=format_consistent_ratios(),
         names=FILTER_NAMES,
@@ -125,26 +120,6 @@ def make_notebook_html(card: Card) -> str:
     """Return a diagnosis card as HTML with CSS, for a notebook."""
     colour_css = read_asset("colours.css").replace(":root", ".px4fuse-card")
     return f"<style>{colour_css}{read_card_css()}</style>{make_card_html(card, is_open=True)}"
-
-
-def make_alternative_text(verdicts: Sequence[Verdict]) -> str:
-    """Describe the σ ratios of the filters as text, for screen readers.
-
-    >>> verdict = Verdict(filter="kf", against="truth", ratio=7.2, word="overconfident")
-    >>> make_alternative_text([verdict])
-    'KF, position error over sigma: 7.2, overconfident.'
-    """
-    sentences = []
-    for verdict in verdicts:
-        verdict_text = f"not evaluated, {verdict.reason}"
-        if verdict.ratio is not None:
-            explained_note = ", explained" if verdict.is_explained else ""
-            verdict_text = f"{format_ratio(verdict.ratio)}, {verdict.word}{explained_note}"
-        sentences.append(
-            f"{FILTER_NAMES[verdict.filter]}, {SCREEN_READER_QUANTITIES[verdict.against]}: "
-            f"{verdict_text}."
-        )
-    return " ".join(sentences)
 
 
 def _format_svg_position(fraction: float) -> str:

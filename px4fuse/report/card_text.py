@@ -1,6 +1,5 @@
 """Diagnosis card (faults, causes and actions) as text of at most 100 columns."""
 
-import json
 import re
 import shlex
 import textwrap
@@ -23,16 +22,15 @@ from px4fuse.card.model import (
     map_ratio_to_axis,
 )
 from px4fuse.comparison.model import FILTER_NAMES
-from px4fuse.core.text import format_metres, format_ratio
+from px4fuse.core.text import convert_nested, format_metres, format_ratio
 from px4fuse.filter.consistency import CONSISTENT_SIGMA_RATIOS, Reference
+from px4fuse.finding import format_spans
 from px4fuse.request import quote_command
 
 CARD_WIDTH = 100  # characters per line
 AXIS_WIDTH = 37  # characters of the axis of σ ratios (actual σ ÷ reported σ)
 AXIS_INDENT = 58  # characters left of the axis of σ ratios
 TEXT_INDENT = 11  # characters of a label with blanks
-# Longer commands (characters) are not beside their label, but on their own line
-MAX_COMMAND_LENGTH = 74
 # Ticks with labels on the axis of σ ratios
 LABELLED_RATIO_TICKS = (0.1, 0.5, 1.0, 2.0, 10.0)
 SYMBOL_BY_REFERENCE = {"source": "●", "truth": "◆"}
@@ -54,6 +52,7 @@ SEVERITY_STYLES = {
 ASCII_REPLACEMENTS = str.maketrans("░●◆◀▶─÷−–²³×", ":ox<>-/--23x") | str.maketrans(
     {"√": "sqrt ", "σ": "sigma", "→": "->", "°": " deg", "±": "+-", "ν": "nu", "…": "..."}
 )
+ALL_FINDINGS_PLACE = "in All findings of the report"
 AIDS_CAPTION = (
     "RMS of innovation ÷ √S of each aiding source that EKF2 fused. A value below 1 means that √S "
     "is too large. For barometer, magnetometer and gravity, such a value is usual and not a fault."
@@ -61,33 +60,38 @@ AIDS_CAPTION = (
 
 
 class Paragraph(NamedTuple):
-    """Paragraph on the terminal, with its style and indents."""
+    """Paragraph on the terminal, with its style and indents.
+
+    Attributes
+    ----------
+    wrap_indent : str or None
+        Indent of further lines; None if the paragraph is one line, such as a command.
+    plot : str
+        Plot on the right, omitted on a narrow terminal.
+    """
 
     text: str
     style: str = ""
     first_indent: str = ""
-    indent: str = ""
-    wraps: bool = False
+    wrap_indent: str | None = None
     plot: str = ""
 
     def wrap(self, width: int) -> list[str]:
-        if not self.wraps:
-            text = f"{self.first_indent}{self.text}"
-            if not self.plot or len(text) + len(self.plot) <= width:
-                return [text + self.plot]
-            return [text.rstrip()] if text.strip() else []
-        return textwrap.wrap(
-            self.text,
-            width,
-            initial_indent=self.first_indent,
-            subsequent_indent=self.indent,
-            break_long_words=False,
-            break_on_hyphens=False,
-        )
+        if self.wrap_indent is not None:
+            return textwrap.wrap(
+                self.text,
+                width,
+                initial_indent=self.first_indent,
+                subsequent_indent=self.wrap_indent,
+                break_long_words=False,
+                break_on_hyphens=False,
+            )
+        if not self.plot or len(self.text) + len(self.plot) <= width:
+            return [self.text + self.plot]
+        return [self.text.rstrip()] if self.text.strip() else []
 
 
-def format_card_lines(card: Card, *, verbose: bool = False) -> Iterator[Paragraph]:
-    other_findings_place = "below" if verbose else "with -v"
+def format_card_lines(card: Card) -> Iterator[Paragraph]:
     if card.severity == "refused":
         yield Paragraph(f"error[{card.id}]: {card.headline}", SEVERITY_STYLES["error"])
         for label, text in card.facts.items():
@@ -107,7 +111,7 @@ def format_card_lines(card: Card, *, verbose: bool = False) -> Iterator[Paragrap
         yield from _format_labelled_lines(label, cause.why)
         yield from _format_cause_lines(cause)
     if card.more_causes:
-        yield Paragraph(f"{card.more_causes} more causes are listed {other_findings_place}")
+        yield Paragraph(f"{card.more_causes} more causes are listed {ALL_FINDINGS_PLACE}")
     for label, text in card.facts.items():
         yield from _format_labelled_lines(label, text)
     yield from _format_verdict_lines(card)
@@ -116,17 +120,17 @@ def format_card_lines(card: Card, *, verbose: bool = False) -> Iterator[Paragrap
         yield from _wrap_lines(text, "  ", "  ")
     if card.notes:
         yield Paragraph("")
-    for text in note_texts(card, other_findings_place):
+    for text in note_texts(card):
         yield from _wrap_lines(text, "", "  ")
 
 
-def note_texts(card: Card, other_notes_place: str) -> list[str]:
+def note_texts(card: Card) -> list[str]:
     """Format the first notes of a diagnosis card, and state where the others are."""
     texts = [
         f"note[{note.id}]: {note.text} {note.action}".rstrip() for note in card.notes[:MAX_NOTES]
     ]
     if (omitted_count := len(card.notes) - MAX_NOTES) > 0:
-        texts.append(f"{omitted_count} more notes are listed {other_notes_place}")
+        texts.append(f"{omitted_count} more notes are listed {ALL_FINDINGS_PLACE}")
     return texts
 
 
@@ -138,8 +142,7 @@ def format_closing_lines(card: Card, *, verbose: bool = False) -> Iterator[Parag
         sentences.append("Console means the MAVLink Console of QGroundControl.")
     if card.id:
         sentences.append(f"Meaning: px4fuse explain {card.id}")
-    if sentences:
-        yield from _wrap_lines(" ".join(sentences), "", "")
+    yield from _wrap_lines(" ".join(sentences), "", "")
 
 
 def with_typed_path(card: Card, path: str | None) -> Card:
@@ -155,12 +158,14 @@ def with_typed_path(card: Card, path: str | None) -> Card:
     """
     if path is None:
         return card
-    quoted_name, quoted_path = (
-        json.dumps(text)[1:-1] for text in (shlex.quote(card.identity.file), quote_command([path]))
-    )
-    command = re.compile(rf"(px4fuse \w+ ){re.escape(quoted_name)}")
-    card_json = command.sub(lambda match: match[1] + quoted_path, json.dumps(to_builtins(card)))
-    return convert(json.loads(card_json), Card)
+    command = re.compile(rf"(px4fuse \w+ ){re.escape(shlex.quote(card.identity.file))}")
+
+    def replace_name(element: Any) -> Any:
+        if not isinstance(element, str):
+            return element
+        return command.sub(lambda match: match[1] + quote_command([path]), element)
+
+    return convert(convert_nested(to_builtins(card), replace_name), Card)
 
 
 def to_ascii(text: str) -> str:
@@ -229,15 +234,23 @@ def _compute_axis_column(ratio: float) -> int:
 
 def _format_identity_lines(card: Card) -> Iterator[Paragraph]:
     identity = card.identity
-    flight_text = f"{identity.firmware}, {identity.duration_s:.1f} s, {identity.source}"
     student_text = ", ".join(filter(None, (identity.student, identity.student_id)))
-    yield Paragraph("  ".join(filter(None, (identity.file, flight_text, student_text))))
+    texts = (identity.file, ", ".join(list_flight_texts(card)), student_text)
+    yield Paragraph("  ".join(filter(None, texts)))
     if identity.settings:
         yield from _wrap_lines(f"KF: {identity.settings}", "  ", "      ")
     changed_options = (*identity.changed, *identity.parameters)
     if changed_options:
         yield from _wrap_lines(f"changed: {'; '.join(changed_options)}", "  ", "           ")
     yield Paragraph("")
+
+
+def list_flight_texts(card: Card) -> list[str]:
+    """Return firmware, hardware, duration and position source of a flight."""
+    identity = card.identity
+    duration_text = f"{identity.duration_s:.1f} s"
+    texts = (identity.firmware, identity.hardware, duration_text, identity.source)
+    return [text for text in texts if text]
 
 
 def format_headline_lines(card: Card) -> Iterator[Paragraph]:
@@ -248,7 +261,7 @@ def format_headline_lines(card: Card) -> Iterator[Paragraph]:
 
 
 def _format_cause_lines(cause: DiagnosedCause) -> Iterator[Paragraph]:
-    yield from _format_labelled_lines("when", format_spans(cause))
+    yield from _format_labelled_lines("when", format_spans(cause.spans_s))
     actions = label_alternatives(cause)
     labels = [f"{prefix}{format_target(action)}" for prefix, action in actions]
     label_width = max(map(len, labels), default=0) + 2
@@ -273,32 +286,26 @@ def format_target(action: Action) -> str:
 
 
 def _format_action_lines(label: str, label_width: int, action: Action) -> Iterator[Paragraph]:
-    indent = " " * (2 + label_width)
-    label_text = f"  {label:{label_width}}"
+    indent, label_text = " " * (2 + label_width), f"  {label:{label_width}}"
     if action.sentence:
         yield from _wrap_lines(action.sentence, label_text, indent)
         label_text = indent
-    if any(len(command) > MAX_COMMAND_LENGTH for command in action.commands):
-        if label_text.strip():
-            yield Paragraph(label_text.rstrip())
-        label_text = indent = "    "
     for command in action.commands:
         yield Paragraph(f"{label_text}{command}", "bold")
         label_text = indent
 
 
 def _format_rerun_table(reruns: Sequence[Rerun]) -> Iterator[Paragraph]:
-    columns = make_rerun_columns(reruns)
-    widths = [max(map(len, column)) for column in columns]
-    for row in zip(*columns, strict=True):
+    rows = make_rerun_rows(reruns)
+    widths = [max(map(len, column)) for column in zip(*rows, strict=True)]
+    for row in rows:
         cells = (f"{cell:{width}}" for cell, width in zip(row, widths, strict=True))
         yield Paragraph(f"  {'  '.join(cells)}".rstrip())
-    if note := format_rerun_note(reruns):
-        yield from _wrap_lines(note, "  ", "  ")
+    yield from _wrap_lines(format_rerun_note(reruns), "  ", "  ")
 
 
-def make_rerun_columns(reruns: Sequence[Rerun]) -> list[tuple[str, ...]]:
-    """Return the table columns (heading, cells) of re-runs with changed settings."""
+def make_rerun_rows(reruns: Sequence[Rerun]) -> list[list[str]]:
+    """Return the table (first row: headings) of re-runs with changed settings."""
     rows = [
         {
             "re-run (filter, change)": rerun.label,
@@ -310,9 +317,10 @@ def make_rerun_columns(reruns: Sequence[Rerun]) -> list[tuple[str, ...]]:
         }
         for rerun in reruns
     ]
-    headings = rows[0] if rows else ()
-    columns = [(head, *(row[head] for row in rows)) for head in headings]
-    return [column for column in columns if any(column[1:])]
+    if not rows:
+        return []
+    headings = [head for head in rows[0] if any(row[head] for row in rows)]
+    return [headings, *([row[head] for head in headings] for row in rows)]
 
 
 def format_rerun_note(reruns: Sequence[Rerun]) -> str:
@@ -364,7 +372,7 @@ def _format_verdict_line(verdict: Verdict) -> Paragraph:
     label_text = f"  {filter_label:4} {QUANTITY_LABELS[verdict.against]:25}"
     if verdict.ratio is None:
         verdict_text = f"{'–':>7}  not evaluated: {verdict.reason}"
-        return Paragraph(verdict_text, "", label_text, " " * 41, wraps=True)
+        return Paragraph(verdict_text, "", label_text, " " * 41)
     verdict_word = f"({verdict.word})" if verdict.is_explained else verdict.word
     verdict_text = f"{label_text}{format_ratio(verdict.ratio):>7}  {verdict_word}"
     style = "bold" if verdict.is_fault else ""
@@ -395,22 +403,10 @@ def _format_aid_lines(aid_rows: Sequence[AidConsistency]) -> Iterator[Paragraph]
         yield Paragraph(f"{label_text:{indent}}", plot=draw_sigma_ratio(row.ratio, "source"))
 
 
-def format_spans(cause: DiagnosedCause) -> str:
-    """Format the time from the start of the first to the end of the last occurrence of a fault."""
-    if not cause.spans_s:
-        return ""
-    first_start_s, last_end_s = cause.spans_s[0][0], cause.spans_s[-1][1]
-    return (
-        f"{first_start_s:.1f} s"
-        if last_end_s - first_start_s < 0.05
-        else f"{first_start_s:.1f} to {last_end_s:.1f} s"
-    )
-
-
 def _format_labelled_lines(label: str, text: str) -> Iterator[Paragraph]:
     yield from _wrap_lines(text, f"  {label:{TEXT_INDENT - 2}}", " " * TEXT_INDENT)
 
 
 def _wrap_lines(text: str, first_indent: str, indent: str) -> Iterator[Paragraph]:
     if text:
-        yield Paragraph(text, "", first_indent, indent, wraps=True)
+        yield Paragraph(text, "", first_indent, indent)

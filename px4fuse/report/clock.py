@@ -2,6 +2,8 @@
 
 from collections.abc import Iterable, Iterator
 
+import numpy as np
+
 from px4fuse.analysis import Analysis
 from px4fuse.comparison.model import PreparedComparison
 from px4fuse.comparison.remedy import (
@@ -22,17 +24,15 @@ from px4fuse.report.style import KF_BAND_COLOUR, TRACK_STYLES, Axes
 from px4fuse.results.contract import ComparisonResults
 
 CURVE_HEIGHT = 170.0  # points
-MAX_DRAWN_DECREASE_NATS = 12.0  # largest drawn decrease of the log-likelihood
-# Plotted range of the time offset, divided by its 95 % interval
-OFFSET_PLOT_WIDTH_RATIO = 2.5
+CURVE_TO_INTERVAL_RATIO = 1.25  # half width of the drawn curve, divided by the 95 % interval
 # Faults for which the report has a page on the time offset
 TIME_OFFSET_FINDINGS = ("source_time_offset_changes", "source_time_offset", "ekf2_ev_delay_wrong")
 
 
 def summarise_offset(analysis: Analysis, findings: Iterable[Finding]) -> str:
-    """Summarise the time offset of the position source in one line."""
+    """Summarise the time offset in one line; "" if the report has a page on the time offset."""
     if has_time_offset_page(analysis, findings):
-        return "See the appendix on the time offset for the estimated time offset."
+        return ""
     advice_by_label = make_time_offset_advice(analysis, analysis.clock)
     return " ".join(
         advice_by_label[label] for label in ("Result", "Offset") if label in advice_by_label
@@ -62,12 +62,10 @@ def make_time_offset_advice(
             "Action": "Fly passes of 5 m or more, and stop after each pass.",
         }
     offset_s, (low_offset_s, high_offset_s) = time_offset.offset_s, time_offset.interval_s
+    offset_text = f"{offset_s:+.3f} s (95 % {low_offset_s:+.3f} to {high_offset_s:+.3f} s)"
     advice_by_label = {
         "Result": "The position source has no significant time offset.",
-        "Offset": (
-            f"Add {offset_s:+.3f} s (95 % {low_offset_s:+.3f} to {high_offset_s:+.3f} s) to the "
-            "timestamps of the position source."
-        ),
+        "Offset": f"Add {offset_text} to the timestamps of the position source.",
     }
     if time_offset.is_significant(offset_s):
         late_or_early = "late" if offset_s < 0.0 else "early"
@@ -81,10 +79,7 @@ def make_time_offset_advice(
             "The time offset is too small for a correction: the limit is "
             f"{time_offset.min_significant_offset_s:.3f} s."
         )
-        advice_by_label["Offset"] = (
-            f"The estimate is {offset_s:+.3f} s (95 % {low_offset_s:+.3f} to {high_offset_s:+.3f} "
-            "s)."
-        )
+        advice_by_label["Offset"] = f"The estimate is {offset_text}."
     if (logged_delay_ms := find_logged_delay_ms(comparison)) is not None:
         advice_by_label["PX4"] = _format_delay_advice(comparison, time_offset, logged_delay_ms)
     if time_offset.has_changed():
@@ -103,12 +98,10 @@ def make_time_offset_advice(
         )
     elif time_offset.drift_ppm is not None and time_offset.drift_sigma_ppm is not None:
         half_width_ppm = 1.96 * time_offset.drift_sigma_ppm
-        significance_text = (
-            ", not significant" if abs(time_offset.drift_ppm) < half_width_ppm else ""
-        )
+        is_significant = abs(time_offset.drift_ppm) >= half_width_ppm
         advice_by_label["Drift"] = (
             f"The clock of the source drifts by {time_offset.drift_ppm:+.0f} ± "
-            f"{half_width_ppm:.0f} ppm (95 %){significance_text}."
+            f"{half_width_ppm:.0f} ppm (95 %){'' if is_significant else ', not significant'}."
         )
     return advice_by_label
 
@@ -116,10 +109,8 @@ def make_time_offset_advice(
 def _format_delay_advice(
     comparison: PreparedComparison, time_offset: ClockOffset, logged_delay_ms: float
 ) -> str:
-    delay_parameter, fitted_delay_ms = (
-        find_aid(comparison).delay,
-        estimate_differing_delay_ms(comparison, time_offset, logged_delay_ms),
-    )
+    delay_parameter = find_aid(comparison).delay
+    fitted_delay_ms = estimate_differing_delay_ms(comparison, time_offset, logged_delay_ms)
     if fitted_delay_ms is None:
         return f"{delay_parameter} {logged_delay_ms:g} ms agrees with the estimated time offset."
     if limit_text := describe_delay_limit(delay_parameter, fitted_delay_ms, logged_delay_ms):
@@ -127,16 +118,13 @@ def _format_delay_advice(
             f"The maximum-likelihood {delay_parameter} is {fitted_delay_ms:.0f} ms, but "
             f"{delay_parameter} cannot {limit_text}. Correct the sender's clock."
         )
-    delay_max_change = find_delay_max_change(comparison, fitted_delay_ms)
-    delay_max_text = (
-        f" For either correction, set {format_settings(delay_max_change)}."
-        if delay_max_change
-        else ""
-    )
-    return (
+    text = (
         f"Set {delay_parameter} to {max(fitted_delay_ms, 0.0):.0f} ms (now {logged_delay_ms:g} "
-        f"ms), or correct the sender's clock.{delay_max_text}"
+        "ms), or correct the sender's clock."
     )
+    if delay_max_change := find_delay_max_change(comparison, fitted_delay_ms):
+        text += f" For either correction, set {format_settings(delay_max_change)}."
+    return text
 
 
 def draw_pages(analysis: Analysis, results: ComparisonResults) -> Iterator[Page]:
@@ -152,48 +140,23 @@ def draw_pages(analysis: Analysis, results: ComparisonResults) -> Iterator[Page]
         "is from the gyros, not from EKF2, because EKF2 fused the same positions.",
     )
     page.write_labelled_texts(make_time_offset_advice(analysis, time_offset))
-    (low_offset_s, high_offset_s), estimate_s = time_offset.interval_s, time_offset.offset_s
-    curve_sentence = (
-        f"The log-likelihood of {time_offset.count} measurements has its maximum at "
-        f"{estimate_s:+.3f} s; 95 % interval {low_offset_s:+.3f} to {high_offset_s:+.3f} s. The "
-        "interval includes the IMU noise; the curve does not, so the curve is narrower."
+    caption = (
+        f"Likelihood of {time_offset.count} measurements. The interval includes the IMU noise; the "
+        "curve does not, so the curve is narrower."
     )
     title = "Log-likelihood of the positions: decrease below its maximum (nats)"
-    draw_offset_likelihood(
-        page.add_panel(title, CURVE_HEIGHT, caption=curve_sentence, gap_above=14.0), time_offset
-    )
+    _draw_likelihood(page.add_panel(title, CURVE_HEIGHT, caption=caption), time_offset)
     yield page
 
 
-def draw_offset_likelihood(axes: Axes, time_offset: ClockOffset) -> None:
+def _draw_likelihood(axes: Axes, time_offset: ClockOffset) -> None:
     """Draw the log-likelihood of the positions over the time offset."""
-    (low_s, high_s), estimate_s, applied_offset_s = (
-        time_offset.interval_s,
-        time_offset.offset_s,
-        time_offset.applied_s,
-    )
+    low_s, high_s = time_offset.interval_s
+    offsets_s, drops = time_offset.curve_time_offsets_s, time_offset.curve_log_likelihood_drops
+    is_near = np.abs(offsets_s - time_offset.offset_s) <= CURVE_TO_INTERVAL_RATIO * (high_s - low_s)
     axes.axvspan(low_s, high_s, color=KF_BAND_COLOUR, lw=0, label="95 % interval")
-    axes.plot(
-        time_offset.curve_time_offsets_s,
-        time_offset.curve_log_likelihood_drops,
-        **TRACK_STYLES["KF"],
-    )
-    axes.axvline(applied_offset_s, color="black", lw=0.8, ls="--", label="as analysed")
-    axes.set_ylim(
-        min(MAX_DRAWN_DECREASE_NATS, float(time_offset.curve_log_likelihood_drops.max()) * 1.05),
-        0.0,
-    )
-    half_width_s = OFFSET_PLOT_WIDTH_RATIO * max(high_s - estimate_s, estimate_s - low_s)
-    margin_s = 0.1 * half_width_s
-    axes.set_xlim(
-        min(
-            max(estimate_s - half_width_s, time_offset.curve_time_offsets_s[0]),
-            applied_offset_s - margin_s,
-        ),
-        max(
-            min(estimate_s + half_width_s, time_offset.curve_time_offsets_s[-1]),
-            applied_offset_s + margin_s,
-        ),
-    )
+    axes.plot(offsets_s[is_near], drops[is_near], **TRACK_STYLES["KF"])
+    axes.axvline(time_offset.applied_s, color="black", lw=0.8, ls="--", label="as analysed")
+    axes.set_ylim(1.05 * drops[is_near].max(), 0.0)
     axes.set_xlabel("offset added to the source's timestamps (s)")
     draw_legend_above(axes)

@@ -4,33 +4,28 @@ from collections.abc import Iterator
 from typing import Any
 
 import numpy as np
+import pandas as pd
 
-from px4fuse.core.arrays import Array, IntArray
+from px4fuse.core.arrays import Array
 from px4fuse.core.text import format_metres
 from px4fuse.flight.model import Unavailable
 from px4fuse.loop.analysis import MIN_UNIX_TIME_S
 from px4fuse.report import style
 from px4fuse.report.page import Page, make_two_columns
-from px4fuse.report.style import EKF2_COLOUR, KF_COLOUR, MUTED_COLOUR, TRUTH_COLOUR, Artist, Axes
+from px4fuse.report.style import EKF2_COLOUR, KF_COLOUR, TRUTH_COLOUR, Axes
 from px4fuse.trajectory.evaluation import AbsoluteError, Evaluation
-from px4fuse.trajectory.model import AXES_OF_FRAME, Trajectory
+from px4fuse.trajectory.model import AXES_OF_FRAME
 from px4fuse.trajectory.scores import RelativeError, RmseInterval, Statistics
 
 # Indices of the position axes to the right and upwards on a map, by frame
 MAP_AXIS_INDICES = {"NED": (1, 0), "FRD": (1, 0), "camera": (0, 2)}
 # Minimum pose interval of a gap in the drawn path, in median intervals
 MIN_GAP_INTERVAL_RATIO = 10.0
-MAX_PATH_POINTS = 1200  # maximum per path
 MIN_ERROR_RANGE_M = 1e-3  # so that rounding errors look small
-ERROR_PLOT_HEIGHT = 76.0  # points
-MAP_HEIGHT = 128.0  # points
-LABEL_MARGIN = 34.0  # points, left of a map
+ERROR_PLOT_HEIGHT = 110.0  # points
+MAP_HEIGHT = 150.0  # points
 COLOUR_BAR_MARGIN = 40.0  # points
 REFERENCE_LINE_STYLE = style.line_style(TRUTH_COLOUR, 0.8, (0, (4, 2)))
-STATISTIC_LINES = (
-    ("max", "max", style.line_style(MUTED_COLOUR, 0.8, (0, (1, 1.5)))),
-    ("rmse", "RMSE", style.line_style(EKF2_COLOUR, 1.4)),
-)
 NEGLIGIBLE_ERROR_M = 1e-6  # smaller errors can be rounding errors
 
 
@@ -40,10 +35,12 @@ def draw_pages(evaluation: Evaluation, _: object) -> Iterator[Page]:
         "APE: distance of one pose from the reference (its RMSE over all poses is "
         "the ATE). RPE: error of the relative motion over a fixed distance or time.",
     )
-    page.write(summarise_ate(evaluation), size=9.0, bold=True)
     write_evaluation(page, evaluation)
     _draw_maps(page, evaluation)
-    _draw_ape_and_rpe(page, evaluation)
+    left_column, right_column = make_two_columns()
+    _draw_ape(left_column, evaluation)
+    _draw_rpe(right_column, evaluation)
+    page.add_columns(left_column, right_column)
     yield page
 
 
@@ -53,38 +50,33 @@ def _draw_maps(page: Page, evaluation: Evaluation) -> None:
     axis_indices = list(MAP_AXIS_INDICES.get(frame, (0, 1)))
     names = [AXES_OF_FRAME[frame][index] for index in axis_indices]
     left_column, right_column = make_two_columns()
-    unaligned_legend_handles: dict[str, Artist] = {}
-    if is_aligned:
-        axes = left_column.add_panel("Before alignment", MAP_HEIGHT, left_margin=LABEL_MARGIN)
-        for position_m, line_style, label in (
-            (evaluation.reference_position_m, REFERENCE_LINE_STYLE, "reference"),
-            (evaluation.unaligned_position_m, {"color": KF_COLOUR, "lw": 1.2}, "estimate"),
-        ):
-            drawn_position_m = position_m[:, axis_indices]
-            plot_path(axes, drawn_position_m, evaluation.time_s, label=label, **line_style)
-        style.set_map_axes(axes, *names)
-        unaligned_legend_handles = _get_legend_handles(axes)
-        left_column.write_small_text(describe_unaligned_rmse(evaluation))
     title = f"{'Aligned path' if is_aligned else 'Path'} coloured by error"
-    axes = right_column.add_panel(
-        title, MAP_HEIGHT, left_margin=LABEL_MARGIN, right_margin=COLOUR_BAR_MARGIN
-    )
+    axes = right_column.add_panel(title, MAP_HEIGHT, right_margin=COLOUR_BAR_MARGIN)
     _draw_path(axes, evaluation, axis_indices)
     style.set_map_axes(axes, *names)
-    right_column.write_small_text("Darker poses have a larger error; × marks the largest one.")
-    # both maps share one legend
-    page.add_legend([*(_get_legend_handles(axes) | unaligned_legend_handles).values()])
+    worst_index = int(np.argmax(evaluation.position_error_m))
+    worst_time_s = evaluation.time_s[worst_index] - _compute_time_origin_s(evaluation)
+    right_column.write_small_text(
+        f"Darker poses have a larger error; × marks the largest one, at {worst_time_s:.1f} s and "
+        f"{evaluation.distance_m[worst_index]:.1f} m."
+    )
+    legend_handles = axes.get_legend_handles_labels()[0]
+    if is_aligned:
+        axes = left_column.add_panel("Before alignment", MAP_HEIGHT)
+        reference_m = evaluation.reference_position_m[:, axis_indices]
+        plot_path(axes, reference_m, evaluation.time_s, **REFERENCE_LINE_STYLE)
+        estimate_m = evaluation.unaligned_position_m[:, axis_indices]
+        plot_path(axes, estimate_m, evaluation.time_s, label="estimate", color=KF_COLOUR)
+        style.set_map_axes(axes, *names)
+        left_column.write_small_text(describe_unaligned_rmse(evaluation))
+        legend_handles += axes.get_legend_handles_labels()[0]
+    page.add_legend(legend_handles)
     page.add_columns(*[left_column] * is_aligned, right_column)
-
-
-def _get_legend_handles(axes: Axes) -> dict[str, Artist]:
-    handles, labels = axes.get_legend_handles_labels()
-    return dict(zip(labels, handles, strict=True))
 
 
 def _draw_path(axes: Axes, evaluation: Evaluation, axis_indices: list[int]) -> None:
     error_m, path_m = evaluation.position_error_m, evaluation.aligned_position_m[:, axis_indices]
-    stride = max(1, len(error_m) // MAX_PATH_POINTS)
+    stride = max(1, len(error_m) // style.MAX_DRAWN_POINTS)
     dots = axes.scatter(
         path_m[::stride, 0],
         path_m[::stride, 1],
@@ -105,108 +97,79 @@ def _draw_path(axes: Axes, evaluation: Evaluation, axis_indices: list[int]) -> N
     colour_bar.outline.set_linewidth(0.5)
 
 
-def _draw_ape_and_rpe(page: Page, evaluation: Evaluation) -> None:
-    left_column, right_column = make_two_columns()
-    axes = left_column.add_panel("APE over time (m)", ERROR_PLOT_HEIGHT)
-    time_origin_s = compute_time_origin_s(evaluation)
-    label = "time from the first pose (s)" if time_origin_s else "time (s)"
-    draw_ape(axes, evaluation, evaluation.time_s - time_origin_s, label)
-    page.add_legend(axes.get_legend_handles_labels()[0])
-    axes = right_column.add_panel("APE over distance (m)", ERROR_PLOT_HEIGHT)
-    draw_ape(axes, evaluation, evaluation.distance_m, "distance along the reference (m)")
-    page.add_columns(left_column, right_column)
-    if _collect_rpe_statistics(evaluation):
-        left_column, right_column = make_two_columns()
-        _draw_rpe(
-            left_column.add_panel("RPE (m) of pose pairs at distance delta", ERROR_PLOT_HEIGHT),
-            evaluation,
-        )
-        right_column.write(describe_rpe_growth(evaluation.rpe), colour=MUTED_COLOUR, gap_above=24.0)
-        page.add_columns(left_column, right_column)
+def _draw_ape(page: Page, evaluation: Evaluation) -> None:
+    """Draw the absolute pose error (APE) over time, with its RMSE as a horizontal line."""
+    time_origin_s = _compute_time_origin_s(evaluation)
+    error_m = pd.Series(evaluation.position_error_m, evaluation.time_s - time_origin_s)
+    rmse_m = evaluation.ate.translation_m.rmse
+    title = f"APE over time (m); line: RMSE {format_metres(rmse_m)} m"
+    axes = page.add_panel(title, ERROR_PLOT_HEIGHT)
+    style.draw_curve(axes, error_m, color=KF_COLOUR, lw=0.8)
+    axes.axhline(rmse_m, **style.line_style(EKF2_COLOUR, 1.4))
+    axes.set_ylim(0.0, 1.08 * max(error_m.max(), MIN_ERROR_RANGE_M))
+    axes.set_xlabel("time from the first pose (s)" if time_origin_s else "time (s)")
 
 
-def draw_ape(axes: Axes, evaluation: Evaluation, x_values: Array, label: str) -> None:
-    """Draw the absolute pose error (APE), with its RMSE and maximum as horizontal lines."""
-    error_m, x_start, x_end = evaluation.position_error_m, float(x_values[0]), float(x_values[-1])
-    drawn_x, drawn_errors_m = style.decimate_series(x_values, error_m, style.MAX_NARROW_AXES_POINTS)
-    gap_indices = np.searchsorted(drawn_x, x_values[_find_gap_indices(evaluation.time_s)])
-    curve_with_gaps = np.insert([drawn_x, drawn_errors_m], gap_indices, np.nan, axis=1)
-    axes.plot(*curve_with_gaps, color=KF_COLOUR, lw=0.8)
-    for name, title, line_style in STATISTIC_LINES:
-        value = getattr(evaluation.ate.translation_m, name)
-        axes.axhline(value, label=f"{title} {format_metres(value)} m", zorder=3, **line_style)
-    axes.set(xlim=(x_start, max(x_end, x_start + 1e-6)), xlabel=label)
-    axes.set_ylim(0.0, 1.08 * max(float(error_m.max()), MIN_ERROR_RANGE_M))
-    axes.locator_params(axis="x", nbins=6)
-
-
-def _draw_rpe(axes: Axes, evaluation: Evaluation) -> None:
-    for index, (error, statistics) in enumerate(
-        rpe_statistics := _collect_rpe_statistics(evaluation)
-    ):
+def _draw_rpe(page: Page, evaluation: Evaluation) -> None:
+    rpe_statistics = [
+        (error, error.translation_m)
+        for error in evaluation.rpe
+        if isinstance(error.translation_m, Statistics)
+    ]
+    if not rpe_statistics:
+        return
+    axes = page.add_panel("RPE (m) of pose pairs at distance delta", ERROR_PLOT_HEIGHT)
+    for index, (error, statistics) in enumerate(rpe_statistics):
         if isinstance(error.interval_m, RmseInterval):
-            interval = error.interval_m.low, error.interval_m.high
-            axes.plot([index] * 2, interval, color=KF_COLOUR, lw=1.6, solid_capstyle="butt")
+            axes.vlines(index, error.interval_m.low, error.interval_m.high, color=KF_COLOUR, lw=1.6)
         axes.plot(index, statistics.rmse, "D", color=EKF2_COLOUR, mec="black", mew=0.5, ms=3.6)
-    delta_texts = [error.delta_text for error, _ in rpe_statistics]
-    axes.set_xticks(range(len(delta_texts)), delta_texts)
-    axes.set_ylim(0.0, max(1.05 * axes.get_ylim()[1], MIN_ERROR_RANGE_M))
+    axes.set_xticks(range(len(rpe_statistics)), [error.delta_text for error, _ in rpe_statistics])
+    axes.set_ylim(0.0, max(axes.get_ylim()[1], MIN_ERROR_RANGE_M))
     axes.margins(x=0.1)
     axes.set_xlabel("delta: distance, time or frames between poses")
-
-
-def _collect_rpe_statistics(evaluation: Evaluation) -> list[tuple[RelativeError, Statistics]]:
-    return [(e, e.translation_m) for e in evaluation.rpe if isinstance(e.translation_m, Statistics)]
-
-
-def _find_gap_indices(time_s: Array) -> IntArray:
-    intervals_s = np.diff(time_s)
-    is_gap = intervals_s > MIN_GAP_INTERVAL_RATIO * np.median(intervals_s)
-    return np.asarray(np.flatnonzero(is_gap) + 1)
+    page.write_small_text(describe_rpe_growth(evaluation.rpe))
 
 
 def plot_path(axes: Axes, positions_m: Array, time_s: Array, **style: Any) -> None:
     """Draw a path, shape (n, 2), with its gaps in time."""
-    gap_indices, count = _find_gap_indices(time_s), len(positions_m)
-    evenly_spaced_indices = np.linspace(0, count - 1, min(count, MAX_PATH_POINTS)).astype(np.intp)
-    drawn_indices = np.unique(np.concatenate([evenly_spaced_indices, gap_indices]))
-    gap_rows = np.searchsorted(drawn_indices, gap_indices)
-    axes.plot(*np.insert(positions_m[drawn_indices], gap_rows, np.nan, axis=0).T, **style)
+    intervals_s = np.diff(time_s)
+    is_gap = intervals_s > MIN_GAP_INTERVAL_RATIO * np.median(intervals_s)
+    gap_indices = np.flatnonzero(is_gap) + 1
+    axes.plot(*np.insert(positions_m, gap_indices, np.nan, axis=0).T, **style)
 
 
-def compute_time_origin_s(evaluation: Evaluation) -> float:
+def _compute_time_origin_s(evaluation: Evaluation) -> float:
     """Return the time (s) of the first pose if times are UNIX time, else 0."""
     start_s = float(evaluation.time_s[0])
     return start_s if start_s > MIN_UNIX_TIME_S else 0.0
 
 
-def summarise_ate(evaluation: Evaluation) -> str:
-    """Summarise ATE and largest position error."""
-    worst_index = int(np.argmax(evaluation.position_error_m))
-    preposition = "without" if evaluation.alignment == "none" else "after"
-    error, time_s = (
-        evaluation.ate.translation_m,
-        evaluation.time_s - compute_time_origin_s(evaluation),
-    )
-    return (
-        f"ATE {format_metres(error.rmse)} m (RMSE {preposition} alignment). Largest error "
-        f"{format_metres(error.max)} m at {time_s[worst_index]:.1f} s, after a path of "
-        f"{evaluation.distance_m[worst_index]:.1f} m."
-    )
-
-
 def write_evaluation(page: Page, evaluation: Evaluation) -> None:
-    page.write_labelled("Estimate", describe_track(evaluation.estimate_track))
-    page.write_labelled("Against", describe_track(evaluation.reference_track))
+    for label, track in (
+        ("Estimate", evaluation.estimate_track),
+        ("Against", evaluation.reference_track),
+    ):
+        duration_s = track.time_s[-1] - track.time_s[0]
+        page.write_labelled(
+            label,
+            f"{track.name}: {track.kind}, {len(track)} poses over {duration_s:.1f} s, frame "
+            f"{track.frame}",
+        )
     page.write_labelled("Method", describe_method(evaluation))
     for text in evaluation.warnings:
         page.write(text, bold=True, colour=style.SEVERITY_COLOURS["warning"])
     head = ["error", "RMSE", "95 %", "mean", "median", "std", "max", "n", "rotation\nRMSE (°)"]
-    page.add_table(head, make_error_rows(evaluation), right_aligned_columns=range(1, len(head)))
-    page.write_small_text(" ".join([*list_missing_reasons(evaluation), *evaluation.notes]))
+    page.add_table(head, _make_error_rows(evaluation), right_aligned_columns=range(1, len(head)))
+    ate, rpe_translations = evaluation.ate, (error.translation_m for error in evaluation.rpe)
+    missing_reasons = {
+        f"No {quantity.what}: {quantity.reason}.": None
+        for quantity in (ate.interval_m, ate.rotation_deg, *rpe_translations)
+        if isinstance(quantity, Unavailable)
+    }
+    page.write_small_text(" ".join([*missing_reasons, *evaluation.notes]))
 
 
-def make_error_rows(evaluation: Evaluation) -> list[list[str]]:
+def _make_error_rows(evaluation: Evaluation) -> list[list[str]]:
     error_by_name: dict[str, AbsoluteError | RelativeError] = {"ATE (m)": evaluation.ate}
     error_by_name |= {f"RPE {error.delta_text} (m)": error for error in evaluation.rpe}
     rows = []
@@ -220,16 +183,6 @@ def make_error_rows(evaluation: Evaluation) -> list[list[str]]:
         rotation_text = f"{errors_deg.rmse:.2f}" if isinstance(errors_deg, Statistics) else "–"
         rows.append([name, *cells, rotation_text])
     return rows
-
-
-def list_missing_reasons(evaluation: Evaluation) -> list[str]:
-    ate, rpe_translations = evaluation.ate, (error.translation_m for error in evaluation.rpe)
-    reasons = {
-        f"No {quantity.what}: {quantity.reason}.": None
-        for quantity in (ate.interval_m, ate.rotation_deg, *rpe_translations)
-        if isinstance(quantity, Unavailable)
-    }
-    return list(reasons)
 
 
 def describe_unaligned_rmse(evaluation: Evaluation) -> str:
@@ -249,27 +202,21 @@ def describe_unaligned_rmse(evaluation: Evaluation) -> str:
 def describe_rpe_growth(rpe: tuple[RelativeError, ...]) -> str:
     """Describe the growth of the relative pose error (RPE) with distance or time."""
     interval_note = "RMSE with its 95 % interval."
-    rmse_by_unit_and_delta: dict[tuple[str, float], float] = {
-        (error.unit, error.delta): error.translation_m.rmse
-        for error in rpe
-        if isinstance(error.translation_m, Statistics)
-        and error.translation_m.rmse > NEGLIGIBLE_ERROR_M
-    }
-    units = [unit for unit, _ in rmse_by_unit_and_delta]
-    unit = max(units, key=units.count, default="")
-    deltas = sorted(delta for delta_unit, delta in rmse_by_unit_and_delta if delta_unit == unit)
-    if len(deltas) < 2:
+    rmse_by_unit: dict[str, dict[float, float]] = {}
+    for error in rpe:
+        errors_m = error.translation_m
+        if isinstance(errors_m, Statistics) and errors_m.rmse > NEGLIGIBLE_ERROR_M:
+            rmse_by_unit.setdefault(error.unit, {})[error.delta] = errors_m.rmse
+    unit = max(rmse_by_unit, key=lambda unit: len(rmse_by_unit[unit]), default="")
+    rmse_by_delta = rmse_by_unit.get(unit, {})
+    if len(rmse_by_delta) < 2:
         return f"{interval_note} Add a distance (--rpe): drift grows with distance, noise does not."
-    smallest_delta, *_, largest_delta = deltas
-    delta_ratio = largest_delta / smallest_delta
-    rmse_growth_factor = (
-        rmse_by_unit_and_delta[unit, largest_delta] / rmse_by_unit_and_delta[unit, smallest_delta]
-    )
+    smallest, largest = min(rmse_by_delta), max(rmse_by_delta)
     return (
-        f"{interval_note} From {smallest_delta:g} to {largest_delta:g} {unit}, the RMSE grows "
-        f"{rmse_growth_factor:.2g} times. Expected factor: 1 for independent noise, "
-        f"{np.sqrt(delta_ratio):.2g} for a random walk, {delta_ratio:.3g} for a scale or heading "
-        "error."
+        f"{interval_note} From {smallest:g} to {largest:g} {unit}, the RMSE grows "
+        f"{rmse_by_delta[largest] / rmse_by_delta[smallest]:.2g} times. Expected factor: 1 for "
+        f"independent noise, {np.sqrt(largest / smallest):.2g} for a random walk, "
+        f"{largest / smallest:.3g} for a scale or heading error."
     )
 
 
@@ -277,19 +224,12 @@ def format_interval(interval: RmseInterval | Unavailable) -> str:
     return f"{interval.low:.3f}–{interval.high:.3f}" if isinstance(interval, RmseInterval) else ""
 
 
-def describe_track(track: Trajectory) -> str:
-    return (
-        f"{track.name}: {track.kind}, {len(track)} poses over "
-        f"{track.time_s[-1] - track.time_s[0]:.1f} s, frame {track.frame}"
-    )
-
-
 def describe_method(evaluation: Evaluation) -> str:
     association, offset_s = evaluation.association, evaluation.time_offset.offset_s
-    method_texts = [
-        f"alignment {evaluation.alignment} ({evaluation.alignment_reason.rstrip('.')})",
+    offset_text = f"; time offset {offset_s:+.3f} s" if offset_s else ""
+    return (
+        f"alignment {evaluation.alignment} ({evaluation.alignment_reason.rstrip('.')}); "
         f"{association.poses} pose pairs, which cover {association.coverage_estimate:.0%} of the "
         f"time of the estimate and {association.coverage_reference:.0%} of the time of the "
-        "reference",
-    ]
-    return "; ".join(method_texts + [f"time offset {offset_s:+.3f} s"] * bool(offset_s))
+        f"reference{offset_text}"
+    )

@@ -55,9 +55,8 @@ def make_finding_page(finding_id: str) -> Page:
             for name, rate in example.detection_rate_by_fault.items()
         ]
         rate_sentences = [
-            f"False alarms occurred on {example.false_alarm_count} of "
-            f"{example.fault_free_flight_count} simulated "
-            "flights without an injected fault.",
+            f"False alarms: {example.false_alarm_count} of {example.fault_free_flight_count} "
+            "simulated flights without an injected fault.",
             "Detected fraction of the simulated flights with the injected fault: "
             f"{'; '.join(detection_rate_texts)}.",
         ]

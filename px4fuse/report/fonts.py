@@ -1,11 +1,13 @@
 """Fonts for texts in any script."""
 
+from collections.abc import Sequence
 from functools import cache
 from pathlib import Path
 
 from matplotlib import font_manager
 from matplotlib.font_manager import FontEntry, FontPath
 
+from px4fuse.core.text import one_line
 from px4fuse.report.style import FONT
 
 # Names of placeholder fonts, which draw each character as a box
@@ -36,14 +38,10 @@ def find_font_names(text: str) -> list[str]:
     )
 
 
-def find_font_folders(names: tuple[str, ...]) -> list[str]:
-    paths = (
-        {name: path for name, path in _list_fonts_except_dejavu() if name in names}
-        if len(names) > 1
-        else {}
-    )
-    font_files = [font_manager.findfont(FONT), *paths.values()]
-    return list(dict.fromkeys(str(Path(str(path)).parent) for path in font_files))
+def find_font_folders(names: Sequence[str]) -> list[str]:
+    path_by_name = dict(_list_fonts_except_dejavu()) if len(names) > 1 else {}
+    font_files = [font_manager.findfont(FONT), *filter(None, map(path_by_name.get, names))]
+    return list(dict.fromkeys(str(Path(str(file)).parent) for file in font_files))
 
 
 def find_missing_characters(text: str) -> str:
@@ -54,9 +52,7 @@ def find_missing_characters(text: str) -> str:
 
 
 def format_font_advice(characters: str) -> str:
-    listed_characters = characters[:MAX_LISTED_CHARACTERS] + (
-        "…" if len(characters) > MAX_LISTED_CHARACTERS else ""
-    )
+    listed_characters = one_line(characters, MAX_LISTED_CHARACTERS)
     return (
         f"No installed font has the characters {listed_characters}; the report shows "
         f"{MISSING_GLYPH_SYMBOL} instead. Install a font with them, for example Noto Sans of "

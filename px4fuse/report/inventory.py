@@ -10,27 +10,29 @@ from px4fuse.report.phrases import format_clock_map
 from px4fuse.report.style import GOOD_COLOUR, MUTED_COLOUR, SEVERITY_COLOURS
 from px4fuse.request import ComparisonRequest, command_line
 
-SOURCES_HEAD = ("data", "topic", "samples", "rate (Hz)", "gaps", "span (s)")
-
 
 def make_log_page(inventory: Inventory, request: ComparisonRequest) -> Page:
     """List the contents of a log and the possible analyses."""
     page = Page()
     page.write(inventory.flight.log.name, bold=True)
-    for label, text in _describe_log(inventory):
-        page.write_labelled(label, text)
-    if inventory.flight.log.senders:
-        page.add_table(
-            ("sender", "type", "messages", "lost"),
-            _make_mavlink_sender_rows(inventory),
-            right_aligned_columns=(2, 3),
+    page.write_labelled_texts(dict(_describe_log(inventory)))
+    sender_rows = [
+        (
+            f"{sender.system}/{sender.component}",
+            sender.description + (" (this flight)" if sender.chosen else ""),
+            f"{sender.messages}",
+            "unknown" if sender.lost_fraction is None else f"{sender.lost_fraction:.1%}",
         )
-    page.add_table(
-        SOURCES_HEAD, list(_make_source_rows(inventory)), right_aligned_columns=(2, 3, 4, 5)
-    )
-    cell_by_is_possible = {True: ("yes", GOOD_COLOUR), False: ("no", SEVERITY_COLOURS["warning"])}
+        for sender in inventory.flight.log.senders
+    ]
+    if sender_rows:
+        sender_head = ("sender", "type", "messages", "lost")
+        page.add_table(sender_head, sender_rows, right_aligned_columns=(2, 3))
+    head = ("data", "topic", "samples", "rate (Hz)", "gaps", "span (s)")
+    page.add_table(head, [*_make_source_rows(inventory)], right_aligned_columns=(2, 3, 4, 5))
+    yes, no = ("yes", GOOD_COLOUR), ("no", SEVERITY_COLOURS["warning"])
     rows = [
-        (cell_by_is_possible[option.possible], option.name, option.reason)
+        (yes if option.possible else no, option.name, option.reason)
         for option in inventory.abilities
     ]
     page.add_table(("possible", "analysis", ""), rows)
@@ -41,7 +43,7 @@ def make_log_page(inventory: Inventory, request: ComparisonRequest) -> Page:
         "Action": [
             f"{advice.remedy} ({'; '.join(advice.improves)})" for advice in inventory.advice
         ],
-        "Clocks": _format_clock_lines(inventory),
+        "Clocks": [*map(format_clock_map, inventory.flight.clocks)],
         "Not used": [
             f"{topic.name}, {topic.count} messages: {topic.reason}"
             for topic in inventory.flight.unused
@@ -54,68 +56,40 @@ def make_log_page(inventory: Inventory, request: ComparisonRequest) -> Page:
     return page
 
 
-def _describe_log(inventory: Inventory) -> list[tuple[str, str]]:
-    log = inventory.flight.log
+def _describe_log(inventory: Inventory) -> Iterator[tuple[str, str]]:
+    log, airborne_spans = inventory.flight.log, inventory.flight.airborne
     size_text = f"{log.bytes / 1e6:.1f} MB" if log.bytes >= 1e5 else f"{log.bytes} bytes"
+    yield "Log", f"{log.format}, {size_text}, SHA-256 {log.sha256[:12]}"
     firmware_text = (
         log.firmware if log.firmware != "unknown" else f"{log.autopilot}, version unknown"
     )
     git_text = "" if log.firmware_hash == "unknown" else f" (git {log.firmware_hash[:8]})"
     hardware_text = "hardware unknown" if log.hardware == "unknown" else log.hardware
-    labelled_texts = [
-        ("Log", f"{log.format}, {size_text}, SHA-256 {log.sha256[:12]}"),
-        ("Vehicle", f"{firmware_text}{git_text}, {hardware_text}"),
-        ("Data", f"{_format_duration(log.duration_s)}, {_format_start(inventory)}"),
-        ("Airborne", _format_airborne_spans(inventory)),
-    ]
-    if log.dropouts:
-        dropout_total_s = sum(dropout.duration_s for dropout in log.dropouts)
-        longest_dropout_s = max(dropout.duration_s for dropout in log.dropouts)
-        dropouts_text = (
-            f"{len(log.dropouts)} logger dropouts of {dropout_total_s:.2f} s in total, at most "
-            f"{longest_dropout_s:.2f} s"
-        )
-        labelled_texts.append(("Dropouts", dropouts_text))
-    labelled_texts += [
-        (file.role.capitalize(), f"{file.name}, SHA-256 {file.sha256[:12]}")
-        for file in inventory.flight.inputs
-    ]
-    return labelled_texts
-
-
-def _format_duration(seconds: float) -> str:
-    if not seconds:
-        return "all samples have the same timestamp"
-    return f"{seconds:.{1 if seconds >= 1 else 3}f} s"
-
-
-def _format_start(inventory: Inventory) -> str:
-    if inventory.start_utc is None:
-        boot_time_s = inventory.flight.log.boot_time_s
-        return f"the data start {boot_time_s:.1f} s after boot (the log contains no UTC)"
-    return f"the data start at {inventory.start_utc[:19].replace('T', ' ')} UTC"
-
-
-def _format_airborne_spans(inventory: Inventory) -> str:
-    airborne_spans = inventory.flight.airborne
+    yield "Vehicle", f"{firmware_text}{git_text}, {hardware_text}"
+    start_text = f"{log.boot_time_s:.1f} s after boot (the log contains no UTC)"
+    if inventory.start_utc is not None:
+        start_text = f"at {inventory.start_utc[:19].replace('T', ' ')} UTC"
+    duration_text = f"{log.duration_s:.{1 if log.duration_s >= 1.0 else 3}f} s"
+    if not log.duration_s:
+        duration_text = "all samples have the same timestamp"
+    yield "Data", f"{duration_text}, the data start {start_text}"
     if isinstance(airborne_spans, Unavailable):
-        return "unknown (the log contains no land detector)"
-    if not airborne_spans:
-        return "the land detector never reported a flight"
-    span_texts = [f"{start:.1f} s to {end:.1f} s" for start, end in airborne_spans]
-    return join_first_names(span_texts, 3)
-
-
-def _make_mavlink_sender_rows(inventory: Inventory) -> list[tuple[str, ...]]:
-    return [
-        (
-            f"{sender.system}/{sender.component}",
-            sender.description + (" (this flight)" if sender.chosen else ""),
-            f"{sender.messages}",
-            "unknown" if sender.lost_fraction is None else f"{sender.lost_fraction:.1%}",
+        airborne_text = "unknown (the log contains no land detector)"
+    else:
+        span_texts = [f"{start:.1f} s to {end:.1f} s" for start, end in airborne_spans]
+        airborne_text = (
+            join_first_names(span_texts, 3) or "the land detector never reported a flight"
         )
-        for sender in inventory.flight.log.senders
-    ]
+    yield "Airborne", airborne_text
+    if log.dropouts:
+        durations_s = [dropout.duration_s for dropout in log.dropouts]
+        yield (
+            "Dropouts",
+            f"{len(durations_s)} logger dropouts of {sum(durations_s):.2f} s in total, at most "
+            f"{max(durations_s):.2f} s",
+        )
+    for file in inventory.flight.inputs:
+        yield file.role.capitalize(), f"{file.name}, SHA-256 {file.sha256[:12]}"
 
 
 def _make_source_rows(inventory: Inventory) -> Iterator[tuple[Cell, ...]]:
@@ -124,7 +98,7 @@ def _make_source_rows(inventory: Inventory) -> Iterator[tuple[Cell, ...]]:
         data_type = source.part if source.part != previous_data_type else ""
         previous_data_type = source.part
         if source.unavailable:
-            yield (data_type, ("none", MUTED_COLOUR), *("" for _ in SOURCES_HEAD[2:]))
+            yield data_type, ("none", MUTED_COLOUR), "", "", "", ""
             continue
         yield (
             f"{data_type:8} (used)" if source.chosen else data_type,
@@ -153,15 +127,3 @@ def _format_time_span(source: LoggedData) -> str:
         return ""
     digits = 1 if source.end_s < 10 else 0
     return f"{source.start_s:z.{digits}f} to {source.end_s:z.{digits}f}"
-
-
-def _format_clock_lines(inventory: Inventory) -> list[str]:
-    source_names_by_clock: dict[str, dict[str, None]] = {}
-    for source in inventory.sources:
-        if source.clock:
-            name = source.name if source.part == "position" else source.part
-            source_names_by_clock.setdefault(source.clock, {})[name] = None
-    return [
-        *(f"{clock}: {', '.join(names)}" for clock, names in source_names_by_clock.items()),
-        *map(format_clock_map, inventory.flight.clocks),
-    ]

@@ -12,12 +12,13 @@ from px4fuse.loop import corrections
 from px4fuse.loop.analysis import MIN_UNIX_TIME_S
 from px4fuse.loop.model import LANDING_CLOSURE_SOURCE, Closure, Loop
 from px4fuse.report.evaluation import describe_method, format_interval, plot_path
-from px4fuse.report.page import Cell, Page, make_appendix_title
-from px4fuse.report.phrases import format_student, write_findings
+from px4fuse.report.page import Cell, Page
+from px4fuse.report.phrases import write_findings
 from px4fuse.report.style import (
     EKF2_COLOUR,
     KF_COLOUR,
     SEVERITY_COLOURS,
+    TEXT_COLOUR,
     TRACK_STYLES,
     Axes,
     line_style,
@@ -32,8 +33,9 @@ from px4fuse.trajectory.scores import RmseInterval, Statistics
 
 LEAD_TEXT = (
     "The closure error is the distance between the end of the odometry and the true end. It is "
-    "distributed along the path by distance, or by pose graph optimisation. px4fuse first tests "
-    "each closure, because a false closure would deform the whole path."
+    "distributed along the path in proportion to the distance from the start (lesson UAT 366, "
+    "module 2, Example 2), or by pose graph optimisation. px4fuse first tests each closure, "
+    "because a false closure would deform the whole path."
 )
 MAX_LISTED_CLOSURES = 10
 ERROR_COLOUR = SEVERITY_COLOURS["error"]
@@ -44,32 +46,20 @@ PATH_STYLES = {
     SOLUTION_LABELS["gated"]: line_style(KF_COLOUR, 1.2),
     SOLUTION_LABELS["all"]: line_style("#8d6a9f", 0.9, (0, (2, 1))),
 }
-TRACK_TEXT_BY_KIND = {
-    "vio": "odometry (external vision)",
-    "ekf2": "EKF2 track",
-    "kf": "KF track",
-    "truth": "ground truth",
-    "slam": "SLAM trajectory",
-    "unknown": "trajectory from an unknown source",
-}
-TITLE = "Loop closure"
 MAP_HEIGHT = 290.0  # points
 
 
 def draw_pages(analysis: Analysis, _: object) -> Iterator[Page]:
     """Draw the page on loop closure if the flight contains a loop."""
     if isinstance(analysis.loop, Loop):
-        page = Page(make_appendix_title(TITLE), LEAD_TEXT)
+        page = Page("Appendix: loop closure", LEAD_TEXT)
         _write_page(page, analysis.loop)
         yield page
 
 
 def draw_report(loop: Loop, results: LoopResults) -> Iterator[Page]:
     """Draw the report page of ``px4fuse loop``."""
-    page = Page(TITLE, LEAD_TEXT)
-    if student := format_student(results.student, ", "):
-        page.write_labelled("Student", student)
-    page.write_labelled("SHA-256", loop.odometry.trajectory.sha256)
+    page = Page("Loop closure", LEAD_TEXT)
     write_findings(page, results.findings)
     _write_page(page, loop)
     yield page
@@ -77,14 +67,15 @@ def draw_report(loop: Loop, results: LoopResults) -> Iterator[Page]:
 
 def _write_page(page: Page, loop: Loop) -> None:
     write_loop(page, loop)
-    axes = page.add_panel("Map in the frame of the odometry", MAP_HEIGHT, left_margin=36.0)
+    axes = page.add_panel("Map in the frame of the odometry", MAP_HEIGHT)
     draw_map(axes, loop)
     page.add_legend(axes.get_legend_handles_labels()[0])
     page.write_heading("Loop closures and RPE")
     page.write_small_text(
         "d²: squared Mahalanobis distance of the closure error, given drift and closure noise. p: "
-        "probability that a true closure has a larger d². Weight of GNC (graduated non-convexity): "
-        "1 for a used closure, 0 for an excluded closure."
+        "probability that a true closure has a larger d²; the gate rejects a closure with p below "
+        f"{GATE_ALPHA:g}. Weight of GNC (graduated non-convexity): 1 for a used closure, 0 for an "
+        "excluded closure."
     )
     write_closures_and_rpe(page, loop)
 
@@ -104,20 +95,10 @@ def draw_map(axes: Axes, loop: Loop) -> None:
     end_label = "end of the odometry path"
     axes.plot(*end, "s", color=EKF2_COLOUR, mec="black", mew=0.6, ms=5, label=end_label, zorder=5)
     if loop.closure_error_axes_m is not None:
-        true_end_xy_m = end - np.array(list(loop.closure_error_axes_m.values()))[[1, 0]]
-        arrow_style = {
-            "arrowstyle": "->",
-            "color": ERROR_COLOUR,
-            "lw": 1.2,
-            "shrinkA": 3,
-            "shrinkB": 0,
-        }
-        axes.annotate("", xy=true_end_xy_m, xytext=end, zorder=6, arrowprops=arrow_style)
+        true_end = end - np.array(list(loop.closure_error_axes_m.values()))[[1, 0]]
         label = f"closure error {loop.closure_error_m:.2f} m"
-        axes.plot([], [], color=ERROR_COLOUR, lw=1.2, label=label)
-        axes.plot(
-            *true_end_xy_m, "x", color=ERROR_COLOUR, ms=5, mew=1.2, zorder=6, label="true end"
-        )
+        axes.plot(*np.transpose([end, true_end]), color=ERROR_COLOUR, lw=1.2, label=label)
+        axes.plot(*true_end, "x", color=ERROR_COLOUR, ms=5, mew=1.2, zorder=6, label="true end")
     set_map_axes(axes, axis_names[1], axis_names[0])
 
 
@@ -125,11 +106,9 @@ def _draw_reference(axes: Axes, loop: Loop) -> None:
     for reference in loop.references[:1]:
         evaluation = loop.choose_best_path().scores.get(reference.name)
         if isinstance(evaluation, Evaluation):
-            reference_m = evaluation.transform.apply_inverse(evaluation.reference_position_m)[
-                :, (1, 0)
-            ]
-            line = TRACK_STYLES["ground truth"]
-            plot_path(axes, reference_m, evaluation.time_s, label=reference.name, zorder=4, **line)
+            reference_m = evaluation.transform.apply_inverse(evaluation.reference_position_m)
+            line = TRACK_STYLES["ground truth"] | {"label": reference.name, "zorder": 4}
+            plot_path(axes, reference_m[:, (1, 0)], evaluation.time_s, **line)
 
 
 def make_loop_page(loop: Loop, findings: tuple[Finding, ...]) -> Page:
@@ -145,18 +124,22 @@ def write_loop(page: Page, loop: Loop) -> None:
     """Write the loop closure error, and the ATE of each path."""
     odometry = loop.odometry.trajectory
     true_end = loop.true_end
-    text_by_label = {
-        "Track": f"{odometry.name}: {TRACK_TEXT_BY_KIND[odometry.kind]}, {len(odometry)} poses, "
-        f"{loop.key_frames} key frames, spacing {loop.key_frame_spacing_m:.2g} m",
-        "Segment": f"{_format_span(loop)}, {loop.part_reason}",
-        "Closure": describe_closure_error(loop),
-        "True end": "not used" if isinstance(true_end, Unavailable) else true_end.source,
+    page.write_labelled_texts(
+        {
+            "Track": f"{odometry.name}: {len(odometry)} poses, {loop.key_frames} key frames, "
+            f"spacing {loop.key_frame_spacing_m:.2g} m",
+            "Segment": f"{_format_span(loop)}, {loop.part_reason}",
+            "Closure": _describe_closure_error(loop),
+            "True end": "not used" if isinstance(true_end, Unavailable) else true_end.source,
+        }
+    )
+    missing_reasons = {
+        f"{correction.what}: {correction.reason}": None
+        for correction in loop.corrections.values()
+        if isinstance(correction, Unavailable)
     }
-    for closure in loop.closures[:1]:
-        text_by_label["Gate"] = describe_gate(closure)
-    page.write_labelled_texts(text_by_label)
-    for note in (explain_distance_correction(loop), *list_missing_corrections(loop)):
-        page.write_small_text(note)
+    for reason in missing_reasons:
+        page.write_small_text(reason)
     reference_names = [reference.name for reference in loop.references]
     head = [
         "path",
@@ -190,7 +173,7 @@ def write_closures_and_rpe(page: Page, loop: Loop) -> None:
     rows: list[list[Cell]] = []
     for closure in loop.closures:
         cells = [
-            format_closure_times(closure, loop),
+            _format_closure_times(closure, loop),
             f"{closure.distance_m:.2f}",
             f"{closure.d2:.1f}",
             f"{closure.degrees_of_freedom}",
@@ -198,43 +181,30 @@ def write_closures_and_rpe(page: Page, loop: Loop) -> None:
             "accepted" if closure.accepted else "REJECTED",
             "–" if closure.weight_gnc is None else f"{closure.weight_gnc:.2f}",
         ]
-        colour = "black" if closure.accepted else ERROR_COLOUR
+        colour = TEXT_COLOUR if closure.accepted else ERROR_COLOUR
         rows.append([(cell, colour) for cell in cells])
     if rows:
-        head = [
-            "closure",
-            "distance\n(m)",
-            "d²",
-            "d² degrees\nof freedom",
-            "p",
-            "gate",
-            "GNC\nweight",
-        ]
+        head = ["closure", "distance\n(m)", "d²", "degrees of\nfreedom", "p", "gate", "GNC\nweight"]
         page.add_table(head, rows, right_aligned_columns=(1, 2, 3, 4, 6))
     for reference in loop.references:
         page.write_heading(f"RPE against {reference.name}")
-        evaluations, reasons = dict[str, Evaluation](), dict[str, None]()
+        head, rpe_rows, notes = list[str](), list[list[str]](), dict[str, None]()
         for path in loop.select_reported_paths():
-            evaluation = path.scores[reference.name]
-            if isinstance(evaluation, Unavailable):
-                reasons[evaluation.reason] = None
-            else:
-                evaluations[path.name] = evaluation
-        for reason in reasons:
-            page.write(reason)
-        rows = [
-            [
-                name,
-                *(_format_error(error.translation_m, error.interval_m) for error in evaluation.rpe),
-                _format_rmse(evaluation.ate.rotation_deg, 2),
+            score = path.scores[reference.name]
+            if isinstance(score, Unavailable):
+                notes[score.reason] = None
+                continue
+            if not rpe_rows:
+                head = ["path", *(f"{error.delta_text} (m)" for error in score.rpe), "rotation (°)"]
+                notes |= dict.fromkeys((describe_method(score), *score.notes, *score.warnings))
+            rpe_texts = [
+                _format_error(error.translation_m, error.interval_m) for error in score.rpe
             ]
-            for name, evaluation in evaluations.items()
-        ]
-        for evaluation in [*evaluations.values()][:1]:
-            rpe_column_titles = [f"{error.delta_text} (m)" for error in evaluation.rpe]
-            page.add_table(["path", *rpe_column_titles, "rotation (°)"], rows)
-            for text in (describe_method(evaluation), *evaluation.notes, *evaluation.warnings):
-                page.write_small_text(capitalise_first(text))
+            rpe_rows.append([path.name, *rpe_texts, _format_rmse(score.ate.rotation_deg, 2)])
+        if rpe_rows:
+            page.add_table(head, rpe_rows)
+        for note in notes:
+            page.write_small_text(capitalise_first(note))
 
 
 def _format_span(loop: Loop) -> str:
@@ -243,9 +213,9 @@ def _format_span(loop: Loop) -> str:
     return f"{loop.start_s:.1f} s to {loop.end_s:.1f} s"
 
 
-def describe_closure_error(loop: Loop) -> str:
+def _describe_closure_error(loop: Loop) -> str:
     error_m, error_components_m = loop.closure_error_m, loop.closure_error_axes_m
-    length_m = loop.path_length_m
+    length_m, heading_error_deg = loop.path_length_m, loop.heading_error_deg
     if error_m is None or error_components_m is None:
         if loop.is_assessed:
             return f"error hidden in an assignment; path length {length_m:.1f} m"
@@ -253,60 +223,22 @@ def describe_closure_error(loop: Loop) -> str:
             f"no closure error: --open states that the path ({length_m:.1f} m) does not return to "
             "its start"
         )
-    error_text = (
-        f"{error_m:.2f} m after {length_m:.1f} m ({error_m / length_m:.2%}): "
-        f"{format_vector(error_components_m)}"
-    )
-    heading_error_deg = loop.heading_error_deg
-    if isinstance(heading_error_deg, Unavailable):
-        return f"{error_text}; heading error unknown: {heading_error_deg.reason}"
-    return f"{error_text}; heading error {heading_error_deg:+.1f}°"
-
-
-def describe_gate(closure: Closure) -> str:
-    gate_decision = (
-        "accepted" if closure.accepted else "REJECTED: the drift is too small for this error"
+    heading_text = (
+        f"heading error unknown: {heading_error_deg.reason}"
+        if isinstance(heading_error_deg, Unavailable)
+        else f"heading error {heading_error_deg:+.1f}°"
     )
     return (
-        f"{gate_decision}. d² {closure.d2:.1f} with {closure.degrees_of_freedom} degrees of "
-        f"freedom, p {closure.p:.2g} (minimum {GATE_ALPHA:g})"
+        f"{error_m:.2f} m after {length_m:.1f} m ({error_m / length_m:.2%}): "
+        f"{format_vector(error_components_m)}; {heading_text}"
     )
 
 
-def format_closure_times(closure: Closure, loop: Loop) -> str:
-    """Format the two times (s) of a loop closure."""
+def _format_closure_times(closure: Closure, loop: Loop) -> str:
     if closure.source == LANDING_CLOSURE_SOURCE:
         return "take-off and landing"
     time_origin_s = loop.start_s if loop.start_s > MIN_UNIX_TIME_S else 0.0
     return f"{closure.time_1_s - time_origin_s:.2f} s and {closure.time_2_s - time_origin_s:.2f} s"
-
-
-def explain_distance_correction(loop: Loop) -> str:
-    """Explain the correction of the path in proportion to distance, if it was made."""
-    if "by_distance_plain" not in loop.find_paths():
-        return ""
-    heading_error_deg = loop.heading_error_deg
-    heading_sentence = (
-        "The correction with headings also distributes the heading error along the path."
-    )
-    if isinstance(heading_error_deg, Unavailable):
-        heading_sentence = (
-            f"The headings of the path are not corrected: {heading_error_deg.reason}."
-        )
-    return (
-        "The correction by distance shifts each position in proportion to its distance from the "
-        "start, and the end by the closure error (lesson UAT 366, module 2, Example 2). "
-        f"{heading_sentence}"
-    )
-
-
-def list_missing_corrections(loop: Loop) -> list[str]:
-    reasons = {
-        f"{correction.what}: {correction.reason}": None
-        for correction in loop.corrections.values()
-        if isinstance(correction, Unavailable)
-    }
-    return list(reasons)
 
 
 def _format_error(errors_m: Statistics | Unavailable, interval: RmseInterval | Unavailable) -> str:
@@ -326,28 +258,32 @@ def make_pose_graph_page(solved_graph: Graph) -> Page:
         f"{solved_graph.name}: {solved_graph.dimension}-D, {solved_graph.poses} poses, "
         f"{solved_graph.edges} edges; initial poses: {solved_graph.initialised}",
     )
-    expected_chi2_low, expected_chi2_high = solved_graph.reduced_chi2_interval
-    if expected_chi2_high > 0.0:
-        fit_text = (
-            f"χ² per degree of freedom {format_number(solved_graph.reduced_chi2)} (expected "
-            f"{format_number(expected_chi2_low)} to {format_number(expected_chi2_high)}, 95 %)."
-        )
+    chi2, (expected_low, expected_high) = (
+        solved_graph.reduced_chi2,
+        solved_graph.reduced_chi2_interval,
+    )
+    if expected_high > 0.0:
+        cause_text = ""
         if (factor := solved_graph.information_factor) > 1.0:
-            fit_text += (
-                " Probable cause: all information matrices are about "
-                f"{format_number(factor, 2)} times too large. Gate and robust optimisation "
-                "therefore divide the information matrices by this factor."
+            cause_text = (
+                f"Probable cause: all information matrices are about {format_number(factor, 2)} "
+                "times too large. Gate and robust optimisation therefore divide the information "
+                "matrices by this factor."
             )
-        elif solved_graph.reduced_chi2 > expected_chi2_high:
-            fit_text += (
-                " χ² is too large. Possible causes: false closures, or too large information "
+        elif chi2 > expected_high:
+            cause_text = (
+                "χ² is too large. Possible causes: false closures, or too large information "
                 "matrices."
             )
-        elif solved_graph.reduced_chi2 < expected_chi2_low:
-            fit_text += (
-                " The information matrices are too small, so the gate may accept false closures."
+        elif chi2 < expected_low:
+            cause_text = (
+                "The information matrices are too small, so the gate may accept false closures."
             )
-        page.write_labelled("Fit", fit_text)
+        page.write_labelled(
+            "Fit",
+            f"χ² per degree of freedom {format_number(chi2)} (expected "
+            f"{format_number(expected_low)} to {format_number(expected_high)}, 95 %). {cause_text}",
+        )
     if isinstance(gates, Unavailable):
         page.write_labelled("Gate", f"not applied: {gates.reason}")
     elif not gates:
@@ -366,20 +302,15 @@ def make_pose_graph_page(solved_graph: Graph) -> Page:
                 "Robust",
                 "not solved, because the graph has many loop closures. Add --robust to solve it.",
             )
-    unconverged_solutions, rows = [], []
+    rows = []
     for key, solution in solved_graph.solutions.items():
+        label = SOLUTION_LABELS[key]
         if not solution.converged:
-            unconverged_solutions.append(SOLUTION_LABELS[key])
-        cost_texts = [f"{cost:.6g}" for cost in (solution.cost_initial, solution.cost)]
+            not_converged_text = f"not converged: {label}. The cost is not at its minimum."
+            page.write_labelled("Solver", not_converged_text)
+        costs = (f"{cost:.6g}" for cost in (solution.cost_initial, solution.cost))
         dropped_count_text = "" if key == "all" else f"{solution.dropped}"
-        rows.append(
-            [SOLUTION_LABELS[key], *cost_texts, f"{solution.iterations}", dropped_count_text]
-        )
-    if unconverged_solutions:
-        page.write_labelled(
-            "Solver",
-            f"not converged: {', '.join(unconverged_solutions)}. The cost is not at its minimum.",
-        )
+        rows.append([label, *costs, f"{solution.iterations}", dropped_count_text])
     head = ("path", "initial cost", "final cost", "iterations", "dropped closures")
     page.add_table(head, rows, right_aligned_columns=(1, 2, 3, 4))
     return page

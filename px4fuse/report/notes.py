@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING
 from px4fuse.analysis import Analysis
 from px4fuse.errors import SettingsError
 from px4fuse.report.cover import FlightResults
-from px4fuse.report.page import Page, make_appendix_title
+from px4fuse.report.page import Page
 from px4fuse.report.style import MUTED_COLOUR
 from px4fuse.results.answer_form import Answers, form_rows
 from px4fuse.results.contract import LoopResults
@@ -19,7 +19,6 @@ if TYPE_CHECKING:
     from markdown_it.token import Token
     from markdown_it.tree import SyntaxTreeNode
 
-HEADING_FONT_SIZES = {"h1": 12.0, "h2": 10.8, "h3": 9.6}
 INDENT = 12.0  # points, per list level
 MAX_INDENTS = 8  # deeper list levels are not indented further
 # Deeper Markdown would exceed Python's recursion limit
@@ -29,12 +28,12 @@ TAG_PATTERN = re.compile(r"<!--.*?-->|<[^>]*>", re.DOTALL)
 
 def draw_pages(analysis_or_loop: object, results: FlightResults | LoopResults) -> Iterator[Page]:
     """Draw a page with the student's answers and notes, if any."""
-    title, answers = "Student notes", results.student.answers
-    page = Page(make_appendix_title(title) if isinstance(analysis_or_loop, Analysis) else title)
+    answers, is_appendix = results.student.answers, isinstance(analysis_or_loop, Analysis)
+    page = Page("Appendix: student notes" if is_appendix else "Student notes")
     if isinstance(answers, Answers):
         page.write_heading("Answer form")
         rows = [list(row) for row in form_rows(answers)]
-        page.add_table(("Question", "Answer"), rows, column_widths=[3.0, 4.0])
+        page.add_table(("Question", "Answer"), rows)
     write_markdown(page, results.student.notes)
     if len(page.blocks) > 1:
         yield page
@@ -88,8 +87,7 @@ def _write_blocks(page: Page, node: SyntaxTreeNode, indent_level: int, marker: s
     for child in children:
         match child.type:
             case "heading":
-                size = HEADING_FONT_SIZES.get(child.tag, 8.0)
-                page.write(_inline_text(child), size=size, bold=True, indent=indent, gap_above=6.0)
+                page.write_heading(_inline_text(child))
             case "bullet_list" | "ordered_list":
                 first_number = int(child.attrs.get("start", 1))
                 for number, item in enumerate(child.children, first_number):
@@ -103,16 +101,11 @@ def _write_blocks(page: Page, node: SyntaxTreeNode, indent_level: int, marker: s
             case "table":
                 rows = [row.children for section in child.children for row in section.children]
                 head, *body_rows = ([_inline_text(cell) for cell in row] for row in rows)
-                page.add_table(head, body_rows, column_widths=[1.0] * len(head))
+                page.add_table(head, body_rows)
             case "html_block":
                 page.write(TAG_PATTERN.sub("", child.content).strip(), indent=indent)
             case _:  # paragraph, or horizontal rule without text
-                page.write(
-                    _inline_text(child),
-                    indent=indent,
-                    marker=marker,
-                    gap_above=0.0 if marker else 2.0,
-                )
+                page.write(_inline_text(child), indent=indent, marker=marker)
         marker = ""
 
 

@@ -3,24 +3,28 @@
 from __future__ import annotations
 
 import io
+import math
 import re
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from typing import Any
 
 from px4fuse.core.text import with_log_name
-from px4fuse.report.style import FONT, MUTED_COLOUR, Artist, Axes
-from px4fuse.report.ticks import replace_ticks
+from px4fuse.report.style import MUTED_COLOUR, TEXT_COLOUR, Artist, Axes
 
 PAGE_WIDTH = 178.0 * 72.0 / 25.4  # points
 COLUMN_GAP = 5.0 * 72.0 / 25.4  # points, between two columns
 LABEL_WIDTH = 52.0  # points, of the labels beside texts
-AXES_LEFT_MARGIN = 30.0  # points, for tick labels
+AXES_LEFT_MARGIN = 38.0  # points, for tick labels and axis label
 AXES_RIGHT_MARGIN = 8.0  # points
-LEGEND_LINE_HEIGHT = 12.0  # points
+LEGEND_HEIGHT = 12.0  # points, of each line
 LEGEND_HANDLE_WIDTH = 30.0  # points, of the line sample with gaps
-TICKS_HEIGHT = 12.0  # points, of tick labels
-AXIS_LABEL_HEIGHT = 12.5  # points
-UNLABELLED_HEIGHT = 3.0  # points, below axes without tick labels
+LEGEND_CHARACTER_WIDTH = 5.0  # points, more than the mean width in DejaVu Sans of 8 points
+TICK_LABEL_GAP = 4.0  # points, between an axis and its tick labels
+TICK_SPACING = 62.0  # points, approximate minimum
+TICK_LABELS_HEIGHT = 12.0  # points
+# Height (points) below the axes with and without tick labels and axis label
+LABELLED_HEIGHT, UNLABELLED_HEIGHT = 24.5, 3.0
+GRID_STYLE: dict[str, Any] = {"colors": "#e3e3e3", "lw": 0.5, "zorder": 0.5}
 # Printed characters for which str.isprintable is False
 PRINTED_SPECIAL_CHARACTERS = "\n\N{NO-BREAK SPACE}"
 # PDF/A limits strings to 32,767 characters, so very long words are split
@@ -47,42 +51,31 @@ class Page:
         self,
         text: str,
         *,
-        size: float = 8.0,
         bold: bool = False,
-        colour: str = "black",
-        gap_above: float = 0.0,
+        colour: str = TEXT_COLOUR,
         indent: float = 0.0,
         marker: str = "",
     ) -> None:
-        """Write a paragraph; lengths are in points."""
+        """Write a paragraph; ``indent`` is in points."""
         if text or marker:
-            block = styled_text(text, size, colour, bold)
-            self.add("text", above=gap_above, indent=indent, mark=marker, **block)
+            self.add("text", indent=indent, mark=marker, **styled_text(text, colour, bold=bold))
 
     def write_heading(self, text: str) -> None:
-        self.add("heading", **styled_text(text, 9.5, bold=True))
+        self.add("heading", **styled_text(text, bold=True))
 
     def write_small_text(self, text: str) -> None:
-        self.write(text, colour=MUTED_COLOUR, gap_above=-1.0)
+        self.write(text, colour=MUTED_COLOUR)
 
     def write_labelled(
         self,
         label: str,
         *texts: str | PageBlock,
         label_width: float = LABEL_WIDTH,
-        gap_above: float = 0.0,
-        colour: str = "black",
-        bold: bool = True,
+        colour: str = TEXT_COLOUR,
     ) -> None:
         styled_texts = [styled_text(text) if isinstance(text, str) else text for text in texts]
-        styled_label = styled_text(label, 8.0, colour, bold)
-        self.add(
-            "labelled",
-            label=styled_label,
-            texts=styled_texts,
-            width=label_width,
-            above=gap_above,
-        )
+        styled_label = styled_text(label, colour, bold=True)
+        self.add("labelled", label=styled_label, texts=styled_texts, width=label_width)
 
     def write_labelled_texts(self, texts: Mapping[str, str]) -> None:
         for label, text in texts.items():
@@ -93,27 +86,10 @@ class Page:
         head: Sequence[str],
         rows: Sequence[Sequence[Cell]],
         *,
-        column_widths: Sequence[float] | None = None,
         right_aligned_columns: Sequence[int] = (),
     ) -> None:
-        """Add a table with a heading row.
-
-        Parameters
-        ----------
-        head : sequence of str
-        rows : sequence of sequence of str, or of (str, colour)
-        column_widths : sequence of float, optional
-            Relative widths of the columns.
-        right_aligned_columns : sequence of int
-            Indices of right-aligned columns.
-        """
-        self.add(
-            "table",
-            head=head,
-            rows=rows,
-            column_widths=column_widths,
-            right=right_aligned_columns,
-        )
+        """Add a table with a heading row; a cell is a text, or a text and its colour."""
+        self.add("table", head=head, rows=rows, right=right_aligned_columns)
 
     def add_panel(
         self,
@@ -121,123 +97,58 @@ class Page:
         height: float,
         *,
         caption: str = "",
-        gap_above: float = 4.0,
         left_margin: float = AXES_LEFT_MARGIN,
         right_margin: float = AXES_RIGHT_MARGIN,
-        is_compact: bool = False,
     ) -> Axes:
         """Add axes with a title and a caption, and return the axes; lengths are in points."""
         # slow import (0.3 s), which texts do not need
         from matplotlib.figure import Figure  # noqa: PLC0415
 
         axes = Figure().add_axes((0.0, 0.0, 1.0, 1.0))
-        axes.locator_params(axis="x", nbins=8)
-        axes.locator_params(axis="y", nbins=4)
-        block = self.add(
+        axes.locator_params(axis="x", nbins=round(self.width / TICK_SPACING))
+        axes.locator_params(axis="y", nbins=max(4, round(height / TICK_SPACING)))
+        self.add(
             "panel",
             title=title,
             caption=caption,
-            alt=": ".join(filter(None, (title, caption))),
+            alt=f"{title} {caption}".strip(),
             axes=axes,
-            margins=(left_margin, right_margin, gap_above),
+            margins=(left_margin, right_margin),
             height=height,
             width=self.width,
             figure=axes.figure,
-            compact=is_compact,
         )
-        _place_axes(block)
         return axes
 
-    def add_legend(self, entries: Iterable[Artist]) -> PageBlock:
-        from matplotlib.figure import Figure  # noqa: PLC0415
+    def add_legend(self, entries: Sequence[Artist]) -> PageBlock:
+        from matplotlib.figure import Figure  # noqa: PLC0415 - as in :meth:`add_panel`
 
-        rows: list[list[Artist]] = [[]]
-        used_width = 0.0
-        for entry in entries:
-            width = measure_text_width(str(entry.get_label())) + LEGEND_HANDLE_WIDTH
-            if rows[-1] and used_width + width > self.width:
-                rows.append([])
-                used_width = 0.0
-            rows[-1].append(entry)
-            used_width += width
-        height = LEGEND_LINE_HEIGHT * len(rows)
+        labels = [str(entry.get_label()) for entry in entries]
+        entry_width = LEGEND_HANDLE_WIDTH + LEGEND_CHARACTER_WIDTH * max(map(len, labels))
+        column_count = max(int(self.width / entry_width), 1)
+        height = LEGEND_HEIGHT * math.ceil(len(labels) / column_count)
         figure = Figure(figsize=(self.width / 72.0, height / 72.0))
-        for row_index, row in enumerate(rows):
-            figure.legend(
-                handles=row,
-                loc="upper left",
-                ncols=len(row),
-                borderaxespad=0.0,
-                borderpad=0.0,
-                bbox_to_anchor=(0.0, 1.0 - row_index / len(rows)),
-                handlelength=2.0,
-                handletextpad=0.5,
-                columnspacing=1.2,
-            )
-        labels = ", ".join(str(artist.get_label()) for row in rows for artist in row)
-        return self.add(
-            "legend", alt=f"Legend: {labels}", width=self.width, height=height, figure=figure
-        )
+        figure.legend(handles=entries, loc="upper left", ncols=column_count, borderpad=0.0)
+        alt = f"Legend: {', '.join(labels)}"
+        return self.add("legend", alt=alt, width=self.width, height=height, figure=figure)
 
-    def add_columns(self, *columns: Page, gap_above: float = 6.0) -> None:
+    def add_columns(self, *columns: Page) -> None:
         blocks, widths = [column.blocks for column in columns], [column.width for column in columns]
-        self.add("columns", columns=blocks, widths=widths, gap=COLUMN_GAP, above=gap_above)
+        self.add("columns", columns=blocks, widths=widths, gap=COLUMN_GAP)
 
 
-def make_two_columns(left_fraction: float = 0.5) -> tuple[Page, Page]:
+def make_two_columns() -> tuple[Page, Page]:
     """Return two columns that fill the page width."""
-    free_width = PAGE_WIDTH - COLUMN_GAP
-    return Page(width=left_fraction * free_width), Page(width=(1.0 - left_fraction) * free_width)
+    width = (PAGE_WIDTH - COLUMN_GAP) / 2.0
+    return Page(width=width), Page(width=width)
 
 
-def styled_text(
-    text: str, size: float = 8.0, colour: str = "black", bold: bool = False
-) -> PageBlock:
-    """Return a text with its size (points), colour and weight."""
-    return {"text": text, "size": size, "colour": colour, "weight": "bold" if bold else "regular"}
-
-
-def measure_text_width(text: str) -> float:
-    """Return the width (points) of a text in DejaVu Sans of 8 points."""
-    from matplotlib import font_manager  # noqa: PLC0415 - as in :meth:`Page.add_panel`
-
-    font = font_manager.get_font(font_manager.findfont(FONT))
-    # widths are rounded to whole points, so the measured font is large
-    font.set_size(100.0, 72.0)
-    font.set_text(text, 0.0)
-    return float(font.get_width_height()[0]) / 64.0 * 0.08
-
-
-def count_wrapped_lines(text: str, width: float) -> int:
-    """Return the number of lines of a text with a given width (points)."""
-    lines, used_width = 1, 0.0
-    for word in text.split(" "):
-        word_width = measure_text_width(f"{word} ")
-        if used_width and used_width + measure_text_width(word) > width:
-            lines, used_width = lines + 1, 0.0
-        used_width += word_width
-    return lines
-
-
-def make_appendix_title(title: str) -> str:
-    """Return the title of an appendix page.
-
-    >>> make_appendix_title("Notes by the student")
-    'Appendix: notes by the student'
-    """
-    return f"Appendix: {title[0].lower()}{title[1:]}"
+def styled_text(text: str, colour: str = TEXT_COLOUR, *, bold: bool = False) -> PageBlock:
+    return {"text": text, "colour": colour, "weight": "bold" if bold else "regular"}
 
 
 def draw_legend_above(axes: Axes) -> None:
-    axes.legend(
-        loc="lower right",
-        bbox_to_anchor=(1.0, 1.0),
-        ncols=9,
-        borderaxespad=0.0,
-        borderpad=0.1,
-        columnspacing=1.2,
-        handlelength=1.4,
-    )
+    axes.legend(loc="lower right", bbox_to_anchor=(1.0, 1.0), ncols=9)
 
 
 def replace_unprintable(text: str) -> str:
@@ -272,7 +183,7 @@ def to_typst_data(block: Any, log_name: str) -> Any:
 def _render_figure_svg(block: Mapping[str, Any]) -> str:
     if "axes" in block:
         _place_axes(block)
-        replace_ticks(block["axes"], measure_text_width)
+        _draw_ticks(block["axes"])
     buffer = io.StringIO()
     block["figure"].savefig(buffer, format="svg", metadata={"Date": None, "Creator": None})
     return buffer.getvalue()
@@ -280,18 +191,50 @@ def _render_figure_svg(block: Mapping[str, Any]) -> str:
 
 def _place_axes(block: Mapping[str, Any]) -> None:
     axes, width, height = block["axes"], block["width"], block["height"]
-    left_margin, right_margin, top_margin = block["margins"]
-    has_tick_labels = axes.axison and axes.xaxis.get_tick_params()["labelbottom"]
-    bottom_margin = (TICKS_HEIGHT if has_tick_labels else UNLABELLED_HEIGHT) + (
-        AXIS_LABEL_HEIGHT if axes.get_xlabel() else 0.0
-    )
+    left_margin, right_margin = block["margins"]
+    top_margin = 14.0 if axes.get_legend() else 4.0
+    bottom_margin = LABELLED_HEIGHT if axes.get_xlabel() else UNLABELLED_HEIGHT
     total_height = top_margin + height + bottom_margin
     block["figure"].set_size_inches(width / 72.0, total_height / 72.0)
+    axes_width = width - left_margin - right_margin
     axes.set_position(
         (
             left_margin / width,
             bottom_margin / total_height,
-            (width - left_margin - right_margin) / width,
+            axes_width / width,
             height / total_height,
         )
     )
+    axes.xaxis.set_label_coords(0.5, -TICK_LABELS_HEIGHT / height)
+    axes.yaxis.set_label_coords((10.0 - left_margin) / axes_width, 0.5)
+
+
+def _draw_ticks(axes: Axes) -> None:
+    """Draw grid and tick labels; the data and limits of the axes must not change afterwards.
+
+    The ticks of matplotlib are slow: each tick consists of five artists.
+    """
+    axes.apply_aspect()  # sets the final limits of maps
+    axes.set(xlim=axes.get_xlim(), ylim=axes.get_ylim())
+    for axis, draw_lines, get_line_transform, get_label_transform in (
+        (axes.xaxis, axes.vlines, axes.get_xaxis_transform, axes.get_xaxis_text1_transform),
+        (axes.yaxis, axes.hlines, axes.get_yaxis_transform, axes.get_yaxis_text1_transform),
+    ):
+        formatter, locations = axis.get_major_formatter(), axis.get_majorticklocs().tolist()
+        low, high = sorted(axis.get_view_interval())
+        tolerance = 1e-9 * (high - low)
+        label_by_location = {
+            location: label
+            for location, label in zip(locations, formatter.format_ticks(locations), strict=True)
+            if low - tolerance <= location <= high + tolerance
+        }
+        draw_lines([*label_by_location], 0.0, 1.0, transform=get_line_transform(), **GRID_STYLE)
+        axis.set_label_text(f"{axis.get_label_text()} {formatter.get_offset()}".strip())
+        axis.set_ticks([])
+        if axis is axes.xaxis and not axes.get_xlabel():
+            continue
+        transform, vertical_alignment, horizontal_alignment = get_label_transform(TICK_LABEL_GAP)
+        for location, label in label_by_location.items():
+            x, y = (location, 0.0) if axis is axes.xaxis else (0.0, location)
+            text = axes.text(x, y, label, transform=transform)
+            text.set(va=vertical_alignment, ha=horizontal_alignment)

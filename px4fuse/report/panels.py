@@ -15,7 +15,7 @@ from px4fuse.filter.consistency import Consistency
 from px4fuse.flight.model import Unavailable
 from px4fuse.report import event_marks, style
 from px4fuse.report.page import Page, PageBlock
-from px4fuse.report.phrases import format_verdict, get_statistics_by_filter
+from px4fuse.report.phrases import format_sigma_verdict, get_statistics_by_filter
 from px4fuse.report.style import (
     INNOVATION_STYLES,
     TRACK_STYLES,
@@ -40,25 +40,36 @@ class QuantityColumns(NamedTuple):
     column: str
     variance_column: str
     rmse_field_name: str
+    difference_field_name: str
     median_sigma_field_name: str
 
 
 POSITION_QUANTITY = QuantityColumns(
-    "m", "position_m", "position_variance_m2", "position_rmse_m", "sigma_p_median_m"
+    "m",
+    "position_m",
+    "position_variance_m2",
+    "position_rmse_m",
+    "position_rms_m",
+    "sigma_p_median_m",
 )
 VELOCITY_QUANTITY = QuantityColumns(
-    "m/s", "velocity_m_s", "velocity_variance_m2_s2", "velocity_rmse_m_s", "sigma_v_median_m_s"
+    "m/s",
+    "velocity_m_s",
+    "velocity_variance_m2_s2",
+    "velocity_rmse_m_s",
+    "velocity_rms_m_s",
+    "sigma_v_median_m_s",
 )
 
 
 class Panel(NamedTuple):
-    """Plot over time along one axis, with caption and statistics."""
+    """Plot over time along one axis, with statistics and caption."""
 
     title: str
     height: float
     draw: Callable[[Axes, AxisComparison], None]
-    make_caption: Callable[[Analysis, AxisComparison], str]
     make_statistics_text: Callable[[AxisComparison], str]
+    make_caption: Callable[[AxisComparison], str] = lambda _: ""
 
     def draw_on_page(
         self,
@@ -70,25 +81,20 @@ class Panel(NamedTuple):
         is_narrow: bool = False,
     ) -> None:
         """Draw the plot on a page; a narrow plot has no caption."""
-        title, caption, height = self.title, "", NARROW_AXES_HEIGHT
-        statistics_text = self.make_statistics_text(result)
+        texts = [self.make_statistics_text(result)]
         if not is_narrow:
-            caption, height = self.make_caption(analysis, result), self.height
-            title, statistics_text = ": ".join(filter(None, (title, statistics_text))), ""
+            texts.append(self.make_caption(result))
         axes = event_marks.add_panel(
             page,
             analysis,
-            title,
-            height,
-            caption=caption,
+            self.title,
+            NARROW_AXES_HEIGHT if is_narrow else self.height,
+            caption=". ".join(filter(None, texts)),
             # the innovation plot shows rejections as hollow dots, so it needs no markers
             axis="" if self is INNOVATIONS_PANEL else result.axis.name,
             with_time_label=with_time_label,
         )
-        if is_narrow:
-            axes.locator_params(axis="x", nbins=4)
         self.draw(axes, result.with_whole_flight_tracks())
-        page.write_small_text(statistics_text)
 
 
 def add_legend(page: Page, analysis: Analysis) -> PageBlock:
@@ -135,39 +141,17 @@ def draw_tracks(axes: Axes, result: AxisComparison, quantity: QuantityColumns) -
     axes.set_ylim(all_values.min() - margin, all_values.max() + margin)
 
 
-def _describe_measurements(_: Analysis, result: AxisComparison) -> str:
-    extent_m = float(np.ptp(result.axis.measurement_m))
-    return f"{len(result.replay.updates)} measurements over {extent_m:.3g} m."
-
-
-def _format_rmse(result: AxisComparison, quantity: QuantityColumns) -> list[str]:
+def _describe_errors(result: AxisComparison, quantity: QuantityColumns) -> str:
     rmse_texts = [
         f"{name} {rmse:.3f} {quantity.unit}"
         for name, filter_summary in get_statistics_by_filter(result).items()
         if (rmse := getattr(filter_summary.truth, quantity.rmse_field_name, None)) is not None
     ]
-    return [f"RMSE against ground truth {', '.join(rmse_texts)}"] if rmse_texts else []
-
-
-def _describe_position_difference(result: AxisComparison) -> str:
-    difference, difference_texts = result.difference, _format_rmse(result, POSITION_QUANTITY)
-    if isinstance(difference, Unavailable):
-        difference_texts.append(f"{difference.what}: {difference.reason}")
-    else:
-        difference_texts.append(
-            f"position KF - EKF2 RMS {difference.position_rms_m:.3f} m, mean "
-            f"{difference.position_mean_m:+.3f} m, maximum {difference.position_maximum_m:.2f} m"
-        )
-    return "; ".join(difference_texts)
-
-
-def _describe_velocity_difference(result: AxisComparison) -> str:
-    difference_texts = _format_rmse(result, VELOCITY_QUANTITY)
+    texts = [f"RMSE against ground truth {', '.join(rmse_texts)}"] if rmse_texts else []
     if isinstance(result.difference, Difference):
-        difference_texts.append(
-            f"velocity KF - EKF2 RMS {result.difference.velocity_rms_m_s:.3f} m/s"
-        )
-    return "; ".join(difference_texts)
+        difference_rms = getattr(result.difference, quantity.difference_field_name)
+        texts.append(f"KF - EKF2 RMS {difference_rms:.3f} {quantity.unit}")
+    return "; ".join(texts)
 
 
 def _find_innovation_limit_m(result: AxisComparison) -> float:
@@ -175,9 +159,9 @@ def _find_innovation_limit_m(result: AxisComparison) -> float:
     for innovations in _collect_innovation_tables(result).values():
         median_sqrt_s_m = float(np.sqrt(innovations["innovation_variance_m2"].median()))
         # a quantile, because outliers would enlarge the axis
-        innovation_quantile_m = float(np.quantile(innovations["innovation_m"].abs(), 0.99))
-        shown_innovation_m = min(innovation_quantile_m, MAX_AXIS_LIMIT_IN_SQRT_S * median_sqrt_s_m)
-        limits_m.append(max(2.0 * median_sqrt_s_m, shown_innovation_m))
+        quantile_m = float(np.quantile(innovations["innovation_m"].abs(), 0.99))
+        limits_in_sqrt_s = np.array([2.0, MAX_AXIS_LIMIT_IN_SQRT_S])
+        limits_m.append(float(np.clip(quantile_m, *limits_in_sqrt_s * median_sqrt_s_m)))
     return INNOVATION_AXIS_MARGIN_FACTOR * max(limits_m)
 
 
@@ -228,26 +212,30 @@ def draw_innovations(axes: Axes, result: AxisComparison) -> None:
     axes.set_ylim(-1.04 * plot_limit_m, 1.04 * plot_limit_m)
 
 
-def describe_innovations(_: Analysis, result: AxisComparison) -> str:
-    """Describe the innovations of KF and EKF2."""
-    plot_limit_m, sentences = _find_innovation_limit_m(result), []
-    innovation_tables = _collect_innovation_tables(result)
+def _describe_innovations(result: AxisComparison) -> str:
+    sentences = []
     for name, consistency in get_statistics_by_filter(result).items():
         if isinstance(consistency, Unavailable):
             sentences.append(f"{name}: {consistency.reason}.")
             continue
-        outside_count = int((innovation_tables[name]["innovation_m"].abs() > plot_limit_m).sum())
-        outside_text = f" Outside the plot (triangles): {outside_count}." if outside_count else ""
+        verdict_text = format_sigma_verdict(consistency.verdict, consistency.sigma_error_factor)
         sentences.append(
-            f"{name}: {consistency.count} innovations, {format_verdict(consistency)}; mean "
+            f"{name}: {consistency.count} innovations, {verdict_text}; mean "
             f"{consistency.innovation_mean_m:+.3f} m, standard deviation "
-            f"{consistency.innovation_std_m:.3f} m, median √S {consistency.sqrt_s_median_m:.3f} m"
-            f".{outside_text}"
+            f"{consistency.innovation_std_m:.3f} m, median √S {consistency.sqrt_s_median_m:.3f} m."
         )
     if isinstance(result.ekf2_state, Unavailable):
         sentences.append(f"EKF2: {result.ekf2_state.reason}.")
-    elif "EKF2" in innovation_tables:
-        rejected_count = int((innovation_tables["EKF2"]["rejected"] > 0).sum())
+    plot_limit_m, innovation_tables = (
+        _find_innovation_limit_m(result),
+        _collect_innovation_tables(result),
+    )
+    if any(
+        table["innovation_m"].abs().max() > plot_limit_m for table in innovation_tables.values()
+    ):
+        sentences.append("Triangles: values outside the plot.")
+    if isinstance(result.ekf2_innovations, pd.DataFrame):
+        rejected_count = int((result.ekf2_innovations["rejected"] > 0).sum())
         if rejected_count:
             sentences.append(f"EKF2 rejected {rejected_count} positions (hollow dots).")
     return " ".join(sentences)
@@ -263,31 +251,10 @@ def _format_fraction_outside(result: AxisComparison) -> str:
 
 
 def _draw_sigma(axes: Axes, result: AxisComparison, quantity: QuantityColumns) -> None:
-    for name, variance in _collect_variance_tables(result).items():
-        draw_curve(axes, np.sqrt(variance[quantity.variance_column]), **TRACK_STYLES[name])
+    variance_tables = select_available_tables(KF=result.replay.steps, EKF2=result.ekf2_variance)
+    for name, table in variance_tables.items():
+        draw_curve(axes, np.sqrt(table[quantity.variance_column]), **TRACK_STYLES[name])
     set_log_scale(axes)
-
-
-def _collect_variance_tables(result: AxisComparison) -> dict[str, pd.DataFrame]:
-    return select_available_tables(KF=result.replay.steps, EKF2=result.ekf2_variance)
-
-
-def describe_sigma_growth(analysis: Analysis, result: AxisComparison) -> str:
-    """Describe the growth of σ in the longest gap of the position source."""
-    if not analysis.events.gaps:
-        return ""
-    start_s, end_s = max(analysis.events.gaps, key=lambda gap: gap[1] - gap[0])
-    sigma_texts = []
-    for name, table in _collect_variance_tables(result.with_whole_flight_tracks()).items():
-        variance_m2 = table.loc[start_s:end_s, "position_variance_m2"]
-        if len(variance_m2) > 1 and np.isfinite(variance_m2.max()):
-            sigma_texts.append(f"{np.sqrt(variance_m2.max()):.2g} m ({name})")
-    if not sigma_texts:
-        return ""
-    return (
-        f"In the gap of the position source from {start_s:.1f} to {end_s:.1f} s, σ grew to "
-        f"{' and '.join(sigma_texts)}."
-    )
 
 
 def _format_median_sigma(result: AxisComparison, quantity: QuantityColumns) -> str:
@@ -303,34 +270,27 @@ POSITION_PANEL = Panel(
     "Position (m)",
     150.0,
     partial(draw_tracks, quantity=POSITION_QUANTITY),
-    _describe_measurements,
-    _describe_position_difference,
+    partial(_describe_errors, quantity=POSITION_QUANTITY),
 )
 VELOCITY_PANEL = Panel(
     "Velocity (m/s)",
     150.0,
     partial(draw_tracks, quantity=VELOCITY_QUANTITY),
-    lambda *_: "Velocity is not measured: each filter estimates it from positions and IMU.",
-    _describe_velocity_difference,
+    partial(_describe_errors, quantity=VELOCITY_QUANTITY),
+    lambda _: "Velocity is not measured: each filter estimates it from positions and IMU.",
 )
 INNOVATIONS_PANEL = Panel(
-    "Innovations (m)",
-    140.0,
-    draw_innovations,
-    describe_innovations,
-    _format_fraction_outside,
+    "Innovations (m)", 140.0, draw_innovations, _format_fraction_outside, _describe_innovations
 )
 POSITION_SIGMA_PANEL = Panel(
     "σ of position (m), log scale",
     80.0,
     partial(_draw_sigma, quantity=POSITION_QUANTITY),
-    describe_sigma_growth,
     partial(_format_median_sigma, quantity=POSITION_QUANTITY),
 )
 VELOCITY_SIGMA_PANEL = Panel(
     "σ of velocity (m/s), log scale",
     60.0,
     partial(_draw_sigma, quantity=VELOCITY_QUANTITY),
-    lambda *_: "",
     partial(_format_median_sigma, quantity=VELOCITY_QUANTITY),
 )

@@ -6,6 +6,7 @@ from importlib import metadata
 from typing import Any
 
 from px4fuse.core.memory import release_free_memory
+from px4fuse.core.text import one_line
 from px4fuse.report import (
     aids,
     clock,
@@ -53,17 +54,6 @@ PAGE_FUNCTIONS_BY_RESULTS_TYPE: Mapping[type, tuple[Callable[[Any, Any], Iterato
 }
 
 
-def _describe_document(results: Any) -> tuple[str, str, str]:
-    """Return the title of the report, and name and SHA-256 of the input file."""
-    match results:
-        case contract.LoopResults(track=track):
-            return f"px4fuse loop {track.name}", track.name, track.sha256
-        case contract.EvaluationResults(estimate=track, reference=reference):
-            return f"px4fuse evaluate {track.name} {reference.name}", track.name, track.sha256
-    log = results.log
-    return f"px4fuse compare {log.name}", log.name, log.sha256
-
-
 def render_pdf(content: Any, results: Any, results_json: str) -> bytes:
     """Draw all pages of a report and typeset them as PDF.
 
@@ -78,7 +68,10 @@ def render_pdf(content: Any, results: Any, results_json: str) -> bytes:
     results_json : str
         Results that are attached to the PDF as ``results.json``.
     """
-    title, name, sha256 = _describe_document(results)
+    title = results.provenance.command
+    # the log, the odometry of a loop, or the evaluated trajectory
+    fields = (field for field in ("log", "track", "estimate") if hasattr(results, field))
+    source = getattr(results, next(fields))
     blocks, report_text = list[Any](), ""
     with apply_report_style():
         # Converting each page immediately saves memory
@@ -88,26 +81,22 @@ def render_pdf(content: Any, results: Any, results_json: str) -> bytes:
             for page in draw(content, results)
         ):
             report_text += json.dumps(page.blocks, ensure_ascii=False, default=repr)
-            blocks += to_typst_data(page.blocks, name)
+            blocks += to_typst_data(page.blocks, source.name)
     producer = f"px4fuse {metadata.version('px4fuse')}"
-    student = format_student(getattr(results, "student", NO_STUDENT), " · ")
+    student = format_student(getattr(results, "student", NO_STUDENT))
     release_free_memory()  # before Typst starts
     # figures contain no names and notes, so they need no other fonts
-    all_text = title + name + student + report_text
+    all_text = title + source.name + student + report_text
     return compile_pdf(
         {
             "title": title,
             "author": producer,
-            "head": _shorten(f"px4fuse · {name} · SHA-256 {sha256[:12]}", 90),
-            "student": _shorten(student, 40),
-            "foot": producer,
+            "head": one_line(
+                replace_unprintable(f"px4fuse · {source.name} · SHA-256 {source.sha256[:12]}"), 90
+            ),
+            "student": one_line(replace_unprintable(student), 40),
             "fonts": fonts.find_font_names(all_text),
             "blocks": blocks,
             "results": results_json,
         }
     )
-
-
-def _shorten(text: str, max_length: int) -> str:
-    line = " ".join(replace_unprintable(text).split())
-    return line if len(line) <= max_length else f"{line[: max_length - 1]}…"

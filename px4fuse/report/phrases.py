@@ -11,7 +11,6 @@ from px4fuse.comparison.model import (
     FILTER_NAMES,
     AxisComparison,
     Comparison,
-    Difference,
     FilterSummary,
     PreparedComparison,
     UntestedFilter,
@@ -20,17 +19,17 @@ from px4fuse.comparison.remedy import format_settings as format_parameters
 from px4fuse.comparison.remedy import (
     make_height_noise_advice,
     make_noise_change,
-    select_changed_settings,
 )
 from px4fuse.core.text import capitalise_first, format_factor, format_number
 from px4fuse.filter.consistency import Consistency
 from px4fuse.filter.settings import KF_NUMERIC_SETTINGS, SETTING_RANGES, Settings
+from px4fuse.filter.signals import AISLE
 from px4fuse.filter.tuning import HORIZONTAL, AxisTuning, NoiseEstimate
-from px4fuse.finding import Finding
+from px4fuse.finding import Finding, format_spans
 from px4fuse.findings.model import finding_title, split_cause_groups
 from px4fuse.findings.noises import KEEP_NOISE_BECAUSE_OF_CORRELATION_ACTION
 from px4fuse.flight.ekf2_parameters import EV_POS
-from px4fuse.flight.model import Alignment, ClockMap, Columns, Truth, Unavailable
+from px4fuse.flight.model import Alignment, ClockMap, Columns, Unavailable
 from px4fuse.report.page import Cell, Page, styled_text
 from px4fuse.report.style import GOOD_COLOUR, MUTED_COLOUR, SEVERITY_COLOURS
 from px4fuse.results.model import Student
@@ -54,13 +53,6 @@ def format_settings(settings: Settings) -> str:
         for name in KF_NUMERIC_SETTINGS
     )
     return f"{', '.join(setting_texts)}, input {settings.input}{offset_text}"
-
-
-def format_verdict(consistency: Consistency | Unavailable) -> str:
-    """Describe the consistency of a filter, with the factor by which its reported σ is wrong."""
-    if isinstance(consistency, Unavailable):
-        return "not evaluated"
-    return format_sigma_verdict(consistency.verdict, consistency.sigma_error_factor)
 
 
 def format_sigma_verdict(verdict: str, factor: float) -> str:
@@ -92,29 +84,26 @@ def make_verdict_row(result: AxisComparison, name: str) -> list[Cell]:
     consistency = get_statistics_by_filter(result)[name]
     label = result.axis.label.removeprefix("the ") if name == "KF" else ""
     if isinstance(consistency, Unavailable):
-        return [label, name, "", "", (format_verdict(consistency), MUTED_COLOUR)]
+        return [label, name, "", "", ("not evaluated", MUTED_COLOUR)]
     is_consistent = consistency.verdict == "consistent"
     colour = GOOD_COLOUR if is_consistent else SEVERITY_COLOURS["warning"]
     band_text = "{:.2f} – {:.2f}".format(*consistency.nis_band)
-    verdict = format_verdict(consistency), colour
-    return [label, name, format_number(consistency.nis_mean), band_text, verdict]
+    verdict_text = format_sigma_verdict(consistency.verdict, consistency.sigma_error_factor)
+    return [label, name, format_number(consistency.nis_mean), band_text, (verdict_text, colour)]
 
 
 def write_error_table(page: Page, analysis: Analysis) -> None:
     """Write a table of consistency tests and position errors of KF and EKF2."""
-    axes = (analysis.main, *analysis.select_secondary_axes())
-    has_ekf2 = any(isinstance(result.difference, Difference) for result in axes)
-    has_truth = isinstance(analysis.flight.truth, Truth)
-
     rows = []
-    for result in axes:
+    for result in (analysis.main, *analysis.select_secondary_axes()):
         for name, consistency in get_statistics_by_filter(result).items():
             difference = result.difference if name == "KF" else None
-            cells = [_format_rms(difference, field) for field in DIFFERENCE_FIELDS if has_ekf2]
-            cells += [_format_rms(consistency.truth, field) for field in RMSE_FIELDS if has_truth]
+            cells = [
+                *(_format_rms(difference, field) for field in DIFFERENCE_FIELDS),
+                *(_format_rms(consistency.truth, field) for field in RMSE_FIELDS),
+            ]
             rows.append([*make_verdict_row(result, name), *cells])
-    head = [*VERDICT_TABLE_HEAD, *(["KF-EKF2\n(m)", "RMS\n(m/s)"] if has_ekf2 else [])]
-    head += ["RMSE\n(m)", "\n(m/s)"] if has_truth else []
+    head = [*VERDICT_TABLE_HEAD, "KF-EKF2\n(m)", "RMS\n(m/s)", "RMSE\n(m)", "\n(m/s)"]
     page.add_table(head, rows, right_aligned_columns=(2, 3, 5, 6, 7, 8))
 
 
@@ -125,12 +114,6 @@ def _format_rms(statistic: object, field: str) -> str:
 
 def list_verdict_warnings(comparison: Comparison) -> list[str]:
     """Return warnings about the consistency tests of KF and EKF2."""
-    consistency_rows = [
-        (result.axis.label, filter_name, consistency)
-        for result in comparison.axes.values()
-        for filter_name, consistency in get_statistics_by_filter(result).items()
-        if isinstance(consistency, Consistency)
-    ]
     notes = []
     if comparison.source.origin.may_drift:
         notes.append(
@@ -138,9 +121,13 @@ def list_verdict_warnings(comparison: Comparison) -> list[str]:
             "not with the true position. Check the error with ground truth or a loop closure."
         )
     autocorrelated_innovation_texts = [
-        f"{filter_name} along {axis}, lag-1 autocorrelation {consistency.lag1_autocorrelation:+.2f}"
-        for axis, filter_name, consistency in consistency_rows
-        if consistency.verdict == "consistent" and consistency.ljung_box_p < MIN_WHITENESS_P_VALUE
+        f"{filter_name} along {result.axis.label}, lag-1 autocorrelation "
+        f"{consistency.lag1_autocorrelation:+.2f}"
+        for result in comparison.axes.values()
+        for filter_name, consistency in get_statistics_by_filter(result).items()
+        if isinstance(consistency, Consistency)
+        and consistency.verdict == "consistent"
+        and consistency.ljung_box_p < MIN_WHITENESS_P_VALUE
     ]
     if autocorrelated_innovation_texts:
         notes.append(
@@ -166,23 +153,23 @@ def format_clock_map(clock: ClockMap) -> str:
 
 def describe_alignment(alignment: Alignment) -> dict[str, str]:
     """Describe the alignment of a position file with the flight, by label."""
-    north_m, east_m, down_m = alignment.origin_m
-    yaw_sigma_text = "" if alignment.yaw_sigma_deg is None else f" ± {alignment.yaw_sigma_deg:.2f}°"
-    clock_offset_sigma_s, residual_rms_m = alignment.clock_offset_sigma_s, alignment.residual_rms_m
-    clock_sigma_text = "" if clock_offset_sigma_s is None else f" ± {clock_offset_sigma_s:.3f} s"
+    yaw_text, clock_text = f"{alignment.yaw_deg:.2f}°", f"{alignment.clock_offset_s:+.3f} s"
+    if alignment.yaw_sigma_deg is not None:
+        yaw_text += f" ± {alignment.yaw_sigma_deg:.2f}°"
+    if alignment.clock_offset_sigma_s is not None:
+        clock_text += f" ± {alignment.clock_offset_sigma_s:.3f} s"
     text_by_label = {
         "frame": f"{alignment.frame} ({alignment.frame_reason})",
-        "yaw": f"{alignment.yaw_deg:.2f}°{yaw_sigma_text} ({alignment.yaw_reason})",
-        "origin": f"north {north_m:.3f} m, east {east_m:.3f} m, down {down_m:.3f} m",
-        "clock": f"{alignment.clock_offset_s:+.3f} s{clock_sigma_text} to the boot clock "
-        f"({alignment.clock_reason})",
+        "yaw": f"{yaw_text} ({alignment.yaw_reason})",
+        "origin": "north {:.3f} m, east {:.3f} m, down {:.3f} m".format(*alignment.origin_m),
+        "clock": f"{clock_text} to the boot clock ({alignment.clock_reason})",
     }
     if alignment.correlation is not None:
-        residual_text = (
-            "" if residual_rms_m is None else f", residual {residual_rms_m:.3f} m RMS per axis"
+        text_by_label["match"] = (
+            f"correlation {alignment.correlation:.4f} with {alignment.reference}"
         )
-        correlation_text = f"correlation {alignment.correlation:.4f} with {alignment.reference}"
-        text_by_label["match"] = correlation_text + residual_text
+        if alignment.residual_rms_m is not None:
+            text_by_label["match"] += f", residual {alignment.residual_rms_m:.3f} m RMS per axis"
     return text_by_label
 
 
@@ -190,36 +177,36 @@ def make_tuning_advice(
     comparison: PreparedComparison, tuning_by_axis: Mapping[str, AxisTuning | Unavailable]
 ) -> dict[str, str]:
     """Return advice from the noise estimates, by label such as "SIGMA_Z"."""
-    names = (HORIZONTAL, "aisle", *tuning_by_axis)
-    axis_name = next(
-        (name for name in names if isinstance(tuning_by_axis.get(name), AxisTuning)), ""
-    )
-    tuning = tuning_by_axis.get(axis_name)
-    if not isinstance(tuning, AxisTuning):
+    names = (HORIZONTAL, AISLE, *tuning_by_axis)
+    tunings = [
+        tuning for name in names if isinstance(tuning := tuning_by_axis.get(name), AxisTuning)
+    ]
+    if not tunings:
         return {}
-    advice_by_label, sigma_a, sigma_z = {}, tuning.sigma_a_two_state, tuning.sigma_z
-    may_drift, log = comparison.source.origin.may_drift, comparison.flight.log
-    if may_drift:
+    tuning, axis_name = tunings[0], tunings[0].name
+    sigma_a, sigma_z = tuning.sigma_a_two_state, tuning.sigma_z
+    advice_by_label, origin = dict[str, str](), comparison.source.origin
+    settings = comparison.settings
+    if origin.may_drift:
         advice_by_label["Drift"] = (
             "The position source may drift. The estimates describe the noise without the drift. Do "
             "not set SIGMA_Z or EKF2_EVP_NOISE below the error shown by ground truth or a loop."
         )
-    settings = comparison.settings
     # Same restriction as the finding kf_underconfident of px4fuse compare
-    reduces_gnss_noise = comparison.source.origin.is_gnss and any(
+    elif origin.is_gnss and any(
         noise.value is not None and noise.high is not None and noise.high < setting
         for noise, setting in ((sigma_a, settings.sigma_a_m_s2), (sigma_z, settings.sigma_z_m))
-    )
-    if reduces_gnss_noise:
+    ):
         advice_by_label["GNSS"] = KEEP_NOISE_BECAUSE_OF_CORRELATION_ACTION.format(sensor="GNSS")
-    option_texts = [
-        f" {option} {noise.value:.3g}"
-        for option, noise in (("--sigma-a", sigma_a), ("--sigma-z", sigma_z))
-        if noise.value is not None
-    ]
-    if option_texts and not (may_drift or reduces_gnss_noise):
-        command = f"px4fuse compare LOG{''.join(option_texts)}"
-        advice_by_label["Action"] = f"Re-run with the estimates of {axis_name}: {command}"
+    elif sigma_a.value is not None or sigma_z.value is not None:
+        options_text = "".join(
+            f" {option} {noise.value:.3g}"
+            for option, noise in (("--sigma-a", sigma_a), ("--sigma-z", sigma_z))
+            if noise.value is not None
+        )
+        advice_by_label["Action"] = (
+            f"Re-run with the estimates of {axis_name}: px4fuse compare LOG{options_text}"
+        )
     if sigma_z.value is None and sigma_z.low is not None:
         advice_by_label["SIGMA_Z"] = (
             f"SIGMA_Z is at least {sigma_z.low:.2g} m. The source may not measure the position "
@@ -231,26 +218,8 @@ def make_tuning_advice(
             f"SIGMA_Z{bound_text} cannot be estimated, because the process noise between two "
             "logged positions is too large. Log the source at a higher rate."
         )
-    elif log.autopilot == "PX4" and not may_drift and comparison.source.origin.is_vision:
-        logged_noise_m, name = log.parameters.get(EV_POS.noise), EV_POS.noise
-        variance_m2 = comparison.source.samples[Columns.POSITION_VARIANCE[:2]].median().mean()
-        reported_sigma_m = 0.0 if np.isnan(variance_m2) else float(np.sqrt(variance_m2))
-        changes = make_noise_change(EV_POS, log.parameters, reported_sigma_m, sigma_z.value)
-        logged_noise_text = "" if logged_noise_m is None else f" (now {logged_noise_m:g} m)"
-        advice_by_label["PX4"] = f"Set {name} to {changes[name]:g} m{logged_noise_text}."
-        is_logged_within_interval = logged_noise_m is not None and (
-            sigma_z.low or 0.0
-        ) <= logged_noise_m <= (sigma_z.high or 0.0)
-        if EV_POS.noise_mode_parameter in changes and reported_sigma_m > (sigma_z.high or np.inf):
-            changes = select_changed_settings(changes, log.parameters)
-            advice_by_label["PX4"] = (
-                f"Set {format_parameters(changes)}. EKF2 now uses the σ that the source reports: "
-                f"{reported_sigma_m:.2g} m. The estimated noise is smaller."
-            )
-        elif is_logged_within_interval:
-            advice_by_label["PX4"] = (
-                f"{name} {logged_noise_m:g} m is within the 95 % interval of the estimate."
-            )
+    elif comparison.flight.log.autopilot == "PX4" and not origin.may_drift and origin.is_vision:
+        advice_by_label["PX4"] = _make_vision_noise_advice(comparison, sigma_z)
         advice_by_label["PX4"] += make_height_noise_advice(
             comparison, tuning_by_axis, sigma_z.value
         )
@@ -280,8 +249,27 @@ def make_tuning_advice(
     return advice_by_label
 
 
-def format_student(student: Student, separator: str) -> str:
-    return separator.join(filter(None, (student.name, student.id)))
+def _make_vision_noise_advice(comparison: PreparedComparison, estimate: NoiseEstimate) -> str:
+    """Return advice on the position noise of EKF2 for external vision."""
+    assert estimate.value is not None
+    name, parameters = EV_POS.noise, comparison.flight.log.parameters
+    low_m, high_m = estimate.low or 0.0, estimate.high or np.inf
+    variance_m2 = comparison.source.samples[Columns.POSITION_VARIANCE[:2]].median().mean()
+    reported_sigma_m = 0.0 if np.isnan(variance_m2) else float(np.sqrt(variance_m2))
+    changes = make_noise_change(EV_POS, parameters, reported_sigma_m, estimate.value)
+    logged_noise_m = parameters.get(name, np.nan)
+    if EV_POS.noise_mode_parameter in changes and reported_sigma_m > high_m:
+        return (
+            f"Set {format_parameters(changes)}. EKF2 now uses the σ that the source reports: "
+            f"{reported_sigma_m:.2g} m."
+        )
+    if low_m <= logged_noise_m <= high_m:
+        return f"{name} {logged_noise_m:g} m is within the 95 % interval of the estimate."
+    return f"Set {name} to {changes[name]:g} m (now {logged_noise_m:g} m)."
+
+
+def format_student(student: Student) -> str:
+    return ", ".join(filter(None, (student.name, student.id)))
 
 
 def write_findings(page: Page, findings: tuple[Finding, ...]) -> None:
@@ -294,9 +282,8 @@ def write_findings(page: Page, findings: tuple[Finding, ...]) -> None:
             effect_titles = " ".join(f"{effect.title} [{effect.id}]." for effect in effects)
             texts.append(styled_text(f"Consequences: {effect_titles}", colour=MUTED_COLOUR))
         page.write_labelled(
-            f"{finding.severity}\n{finding.spans_text}".strip(),
+            f"{finding.severity}\n{format_spans(finding.spans_s)}".strip(),
             *texts,
-            gap_above=2.0,
             colour=SEVERITY_COLOURS[finding.severity],
         )
 
@@ -304,9 +291,9 @@ def write_findings(page: Page, findings: tuple[Finding, ...]) -> None:
 def format_noise_estimate(noise: NoiseEstimate) -> str:
     """Format a maximum-likelihood noise with its 95 % interval."""
     if noise.value is None:
-        bounds = (("at most", noise.high), ("at least", noise.low))
-        bound_texts = (f"{prefix} {bound:.2g}" for prefix, bound in bounds if bound is not None)
-        return next(bound_texts, "not identifiable")
+        if noise.high is not None:
+            return f"at most {noise.high:.2g}"
+        return "not identifiable" if noise.low is None else f"at least {noise.low:.2g}"
     lower_limit_text = "0" if noise.low is None else f"{noise.low:.2g}"
     upper_limit_text = "?" if noise.high is None else f"{noise.high:.2g}"
     return f"{noise.value:.3g} ({lower_limit_text}-{upper_limit_text})"

@@ -10,7 +10,6 @@ from px4fuse.report import clock
 from px4fuse.report.cover import ALL_FINDINGS_TITLE, FlightResults
 from px4fuse.report.page import Page
 from px4fuse.report.phrases import describe_alignment, format_clock_map, write_findings
-from px4fuse.report.style import MUTED_COLOUR
 from px4fuse.request import replace_argument_names
 from px4fuse.results.contract import LoopResults
 
@@ -23,14 +22,15 @@ def draw_pages(analysis: Analysis | AidingSourceAnalysis, results: FlightResults
     write_findings(page, results.findings)
     page.write("" if results.findings else "None.")
     yield page
+    flight = analysis.flight
     if isinstance(analysis, Analysis):
         page, source = Page("Appendix: provenance"), analysis.source
-        clock_texts = map(format_clock_map, analysis.flight.clocks)
+        clock_texts = map(format_clock_map, flight.clocks)
         _write_section(
             page, "Offset and drift of other clocks to the autopilot's boot clock", clock_texts
         )
-        offset_text = clock.summarise_offset(analysis, results.findings)
-        _write_section(page, f"Time offset between {source.name} and the IMU", [offset_text])
+        if offset_text := clock.summarise_offset(analysis, results.findings):
+            _write_section(page, f"Time offset between {source.name} and the IMU", [offset_text])
         if source.alignment is not None:
             alignment_texts = describe_alignment(source.alignment).items()
             _write_section(page, f"Alignment of {source.name}", alignment_texts)
@@ -39,39 +39,36 @@ def draw_pages(analysis: Analysis | AidingSourceAnalysis, results: FlightResults
         _write_methods(page, "methods.md")
     else:
         page, source = Page("Provenance"), None
-        _write_section(page, "Automatic choices", analysis.flight.log.notes or ["none"])
-        _write_missing_data(page, (analysis.missing_data, *analysis.flight.missing))
+        _write_section(page, "Automatic choices", flight.log.notes or ["none"])
+        _write_missing_data(page, (analysis.missing_data, *flight.missing))
     _write_versions(page, results)
-    _write_log_section(page, analysis.flight, source)
+    section = Page()
+    _write_section(section, "Log", _describe_log(flight, source))
+    page.add_columns(section)  # keeps the section on one page
     yield page
 
 
-def _write_log_section(page: Page, flight: Flight, source: PositionTrack | None) -> None:
+def _describe_log(flight: Flight, source: PositionTrack | None) -> Iterator[tuple[str, str]]:
     log = flight.log
+    yield "firmware", f"{log.firmware}, git {log.firmware_hash}"
+    yield "time zero", f"{log.boot_time_s:.6f} s after boot (first data sample)"
+    if source is not None:
+        yield (
+            "position source",
+            f"{source.name} ({source.origin.kind}, {source.origin.path}) from "
+            f"{', '.join(source.topics)}; clock: {source.clock}",
+        )
     other_source_texts = (
         f"{track.name} ({track.compute_rate_hz():.1f} Hz)"
         for track in flight.positions
         if track is not source
     )
+    yield "other positions", ", ".join(other_source_texts) or "none"
     parameters = (f"{name} {value:g}" for name, value in log.parameters.items())
-    text_by_label = {
-        "firmware": f"{log.firmware}, git {log.firmware_hash}",
-        "time zero": f"{log.boot_time_s:.6f} s after boot (first data sample)",
-    }
-    if source is not None:
-        text_by_label["position source"] = (
-            f"{source.name} ({source.origin.kind}, {source.origin.path}) from "
-            f"{', '.join(source.topics)}; clock: {source.clock}"
-        )
-    text_by_label["other positions"] = ", ".join(other_source_texts) or "none"
-    text_by_label["parameters"] = ", ".join(parameters) or "none"
+    yield "parameters", ", ".join(parameters) or "none"
     for file in flight.inputs:
-        text_by_label[file.role] = f"{file.name}, {file.bytes} bytes, SHA-256 {file.sha256}"
-    text_by_label["file"] = f"{log.name}, {log.bytes} bytes, {log.format}"
-    text_by_label["SHA-256"] = log.sha256
-    section = Page()
-    _write_section(section, "Log", text_by_label.items())
-    page.add_columns(section)  # keeps the section on one page
+        yield file.role, f"{file.name}, {file.bytes} bytes, SHA-256 {file.sha256}"
+    yield "file", f"{log.name}, {log.bytes} bytes, {log.format}, SHA-256 {log.sha256}"
 
 
 def _write_missing_data(page: Page, unavailable_parts: Iterable[Unavailable]) -> None:
@@ -102,12 +99,11 @@ def draw_loop_provenance(loop: Loop, results: LoopResults) -> Iterator[Page]:
 
 def _write_versions(page: Page, results: FlightResults | LoopResults) -> None:
     provenance = results.provenance
+    libraries = (f"{name} {version}" for name, version in provenance.libraries.items())
     text_by_label = {
         "command": provenance.command,
         "px4fuse": f"{provenance.px4fuse} on Python {provenance.python}",
-        "libraries": ", ".join(
-            f"{name} {version}" for name, version in provenance.libraries.items()
-        ),
+        "libraries": ", ".join(libraries),
         "results": "attached to this PDF as results.json",
     }
     _write_section(page, "Made with", text_by_label.items())
@@ -115,15 +111,14 @@ def _write_versions(page: Page, results: FlightResults | LoopResults) -> None:
 
 def _write_section(page: Page, title: str, texts: Iterable[str | tuple[str, str]]) -> None:
     """Write texts, or labels with texts, below a title."""
-    for index, text in enumerate(texts):
-        if index == 0:
-            page.write_heading(title)
+    texts = list(texts)
+    if texts:
+        page.write_heading(title)
+    for text in texts:
         if isinstance(text, str):
             page.write(text)
         else:
-            page.write_labelled(
-                *text, label_width=LABEL_WIDTH, gap_above=-1.0, colour=MUTED_COLOUR, bold=False
-            )
+            page.write_labelled(*text, label_width=LABEL_WIDTH)
 
 
 def _write_methods(page: Page, name: str) -> None:

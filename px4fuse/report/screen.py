@@ -1,19 +1,15 @@
 """Output of report pages on the terminal."""
 
 import re
-from collections.abc import Callable, Iterable, Iterator, Sequence
-from functools import partial
-from itertools import zip_longest
+from collections.abc import Iterable, Sequence
 from typing import Literal
 
 from rich.console import Console
 from rich.table import Table
 from rich.text import Text
 
-from px4fuse.card.model import Card
 from px4fuse.report.card_text import (
     CARD_WIDTH,
-    Paragraph,
     format_card_lines,
     format_closing_lines,
     format_headline_lines,
@@ -26,16 +22,7 @@ from px4fuse.request import ComparisonRequest, Request, command_line
 
 # Terminal encodings with all characters of a diagnosis card
 UNICODE_ENCODINGS = ("utf-8", "utf8", "utf-16")
-# Functions that yield the lines of a diagnosis card
-CARD_LINE_FUNCTIONS: dict[str, Callable[[Card], Iterator[Paragraph]]] = {
-    "card": format_card_lines,
-    "closing": format_closing_lines,
-    "verbose card": partial(format_card_lines, verbose=True),
-    "verbose closing": partial(format_closing_lines, verbose=True),
-    "headline": format_headline_lines,
-}
 LABEL_CHARACTERS = 9  # width of a label
-MIN_TABLE_WIDTH = 50  # characters; narrower terminals show no tables
 POINTS_PER_COLUMN = 6.0  # points in the PDF per character on the terminal
 STYLES_BY_COLOUR = {
     MUTED_COLOUR: "dim",
@@ -55,35 +42,30 @@ def print_blocks(
     for block in blocks:
         match block["kind"]:
             case "text" | "heading":
-                print_paragraph(
-                    console,
-                    _make_rich_text(block),
-                    indent=round(block.get("indent", 0.0) / POINTS_PER_COLUMN),
-                )
+                indent = round(block.get("indent", 0.0) / POINTS_PER_COLUMN)
+                print_paragraph(console, _make_rich_text(block), Text(), indent=indent)
             case "labelled":
                 _show_labelled(console, block, request)
             case "table":
-                if console.width >= MIN_TABLE_WIDTH:
-                    console.print(_make_rich_table(**block))
-                else:
-                    _print_rows(console, **block)
+                console.print(_make_rich_table(**block))
             case "command":
                 print_line(console, block["label"], block["text"])
             case "blank":
                 console.print()
-            case "card" | "closing" | "headline" | "verbose card" | "verbose closing":
-                _show_card(console, CARD_LINE_FUNCTIONS[block["kind"]], block["card"], request)
+            case "card" | "closing" | "headline":
+                _show_card(console, block, request)
 
 
-def _show_card(
-    console: Console,
-    make_lines: Callable[[Card], Iterator[Paragraph]],
-    card: Card,
-    request: Request | None,
-) -> None:
+def _show_card(console: Console, block: PageBlock, request: Request | None) -> None:
+    card = with_typed_path(block["card"], getattr(request, "log", None))
+    if block["kind"] == "card":
+        lines = format_card_lines(card)
+    elif block["kind"] == "closing":
+        lines = format_closing_lines(card, verbose=block["verbose"])
+    else:
+        lines = format_headline_lines(card)
     is_ascii_terminal = console.encoding.lower() not in UNICODE_ENCODINGS
-    log_argument = None if request is None else getattr(request, "log", None)
-    for line in make_lines(with_typed_path(card, log_argument)):
+    for line in lines:
         for text in line.wrap(min(console.width, CARD_WIDTH)):
             console.print(
                 Text(to_ascii(text) if is_ascii_terminal else text, line.style), soft_wrap=True
@@ -91,15 +73,14 @@ def _show_card(
 
 
 def _show_labelled(console: Console, block: PageBlock, request: Request | None) -> None:
-    label_lines = block["label"]["text"].split("\n")
-    labels = [line for line in label_lines if len(line) < LABEL_CHARACTERS]
-    long_label_text = "".join(f" ({line})" for line in label_lines if len(line) >= LABEL_CHARACTERS)
-    for index, (label, text_block) in enumerate(zip_longest(labels, block["texts"])):
-        text, commands = Text() if text_block is None else _make_rich_text(text_block), list[str]()
+    label, _, spans_text = block["label"]["text"].partition("\n")
+    for index, text_block in enumerate(block["texts"]):
+        text, commands = _make_rich_text(text_block), list[str]()
         if request is not None:
             text.plain, commands = shorten_commands(text.plain, request)
-        text.append("" if index else long_label_text)
-        styled_label = _make_rich_text({**block["label"], "text": label or ""})
+        if spans_text and index == 0:
+            text.append(f" ({spans_text})")
+        styled_label = _make_rich_text(block["label"] | {"text": "" if index else f"{label} "})
         print_paragraph(console, text, styled_label, indent=LABEL_CHARACTERS)
         for command in commands:
             print_line(console, "", command)
@@ -128,14 +109,11 @@ def _make_rich_text(block: PageBlock) -> Text:
     return Text(block["text"], f"{style} bold" if block["weight"] == "bold" else style)
 
 
-def print_paragraph(
-    console: Console, text: str | Text, label: str | Text = "", *, indent: int
-) -> None:
+def print_paragraph(console: Console, text: Text, label: Text, *, indent: int) -> None:
     """Print an indented paragraph beside its label."""
-    body = Text(text) if isinstance(text, str) else text
-    margin = Text(label) if isinstance(label, str) else label.copy()
+    margin = label.copy()
     margin.pad_right(max(indent - margin.cell_len, 0))
-    for line in body.wrap(console, max(console.width - indent, 1)):
+    for line in text.wrap(console, max(console.width - indent, 1)):
         line.rstrip()
         console.print(margin.append_text(line), soft_wrap=True)
         margin = Text(" " * indent)
@@ -144,15 +122,6 @@ def print_paragraph(
 def print_line(console: Console, label: str, text: str, style: str = "bold cyan not dim") -> None:
     """Print a command or path on one line, so that the user can copy it."""
     console.print(Text(f"{label:{LABEL_CHARACTERS}}", "bold").append(text, style), soft_wrap=True)
-
-
-def _print_rows(
-    console: Console, head: Sequence[str], rows: Iterable[Iterable[Cell]], **_: object
-) -> None:
-    """Print the rows of a table as paragraphs, for a narrow terminal."""
-    for row in (head, *rows):
-        texts = (cell if isinstance(cell, str) else cell[0] for cell in row)
-        print_paragraph(console, ", ".join(filter(None, texts)), indent=2)
 
 
 def _make_rich_table(

@@ -30,6 +30,7 @@ EKF2_COLOUR = "#b85400"
 EKF2_BAND_COLOUR = "#f0dccd"
 TRUTH_COLOUR = "#111111"
 MEASUREMENT_COLOUR = "#9a9a9a"
+TEXT_COLOUR = "#000000"
 MUTED_COLOUR = "#444444"
 GOOD_COLOUR = "#1d5e34"
 SEVERITY_COLOURS = {
@@ -66,9 +67,7 @@ REJECTED_STYLE = dot_style(EKF2_COLOUR, "s", 2.8, 0.6) | {"mfc": "white"}
 MEASUREMENT_STYLE = dot_style(MEASUREMENT_COLOUR, ".", 1.8)
 SIGMA_BAND_COLOURS = {"KF": KF_BAND_COLOUR, "EKF2": EKF2_BAND_COLOUR}
 
-MAX_WIDE_AXES_POINTS = 1500  # maximum per curve in wide axes
-MAX_NARROW_AXES_POINTS = 500  # maximum per curve in narrow axes
-MIN_WIDE_AXES_INCHES = 3.0  # minimum width of wide axes
+MAX_DRAWN_POINTS = 1000  # maximum per curve
 
 
 @contextmanager
@@ -82,12 +81,7 @@ def apply_report_style() -> Iterator[None]:
 
 def draw_curve(axes: Axes, values: pd.Series[float], **style: Any) -> None:
     """Draw a time series with a limited number of points."""
-    axes.plot(
-        *decimate_series(
-            values.index.to_numpy(), np.asarray(values, np.float64), _choose_max_points(axes)
-        ),
-        **style,
-    )
+    axes.plot(*decimate_series(values.index.to_numpy(), np.asarray(values, np.float64)), **style)
 
 
 def draw_sigma_band(
@@ -98,64 +92,40 @@ def draw_sigma_band(
 ) -> None:
     """Draw the ±2σ band of a time series."""
     time_s = centre.index.to_numpy()
-    drawn_time_s, upper_limit = decimate_series(
-        time_s, np.asarray(centre + 2.0 * sigma, np.float64), _choose_max_points(axes)
-    )
+    upper_limit = np.asarray(centre + 2.0 * sigma, np.float64)
+    drawn_time_s, drawn_upper_limit = decimate_series(time_s, upper_limit)
     lower_limit = np.interp(drawn_time_s, time_s, (centre - 2.0 * sigma).to_numpy())
-    axes.fill_between(drawn_time_s, lower_limit, upper_limit, color=colour, lw=0)
-
-
-def _choose_max_points(axes: Axes) -> int:
-    is_wide = axes.bbox.width / axes.figure.dpi > MIN_WIDE_AXES_INCHES
-    return MAX_WIDE_AXES_POINTS if is_wide else MAX_NARROW_AXES_POINTS
+    axes.fill_between(drawn_time_s, lower_limit, drawn_upper_limit, color=colour, lw=0)
 
 
 def set_log_scale(axes: Axes) -> None:
     """Set a logarithmic y axis with plain numbers."""
-    axes.set_yscale("log")
-    low, high = axes.get_ylim()
-    axes.set_ylim(low / 1.15, high * 1.25)
-    set_plain_ticks(axes)
-
-
-def set_plain_ticks(axes: Axes) -> None:
-    """Label a logarithmic y axis with plain numbers."""
     from matplotlib.ticker import LogLocator, NullLocator  # noqa: PLC0415
 
-    axis, (low, high) = axes.yaxis, axes.get_ylim()
-    tick_multiples = (
-        (1.0, 2.0, 5.0) if high / low < 30.0 else (1.0, 3.0) if high / low < 300.0 else (1.0,)
-    )
-    axis.set_major_locator(LogLocator(base=10.0, subs=tick_multiples))
-    axis.set_major_formatter(lambda value, _: f"{value:g}")
-    axis.set_minor_locator(NullLocator())
+    axes.set_yscale("log")
+    low, high = axes.get_ylim()
+    tick_multiples = (1.0, 2.0, 5.0) if high / low < 100.0 else (1.0,)
+    axes.yaxis.set_major_locator(LogLocator(subs=tick_multiples))
+    axes.yaxis.set_major_formatter(lambda value, _: f"{value:g}")
+    axes.yaxis.set_minor_locator(NullLocator())
 
 
 def draw_zero_line(axes: Axes) -> None:
     axes.axhline(0.0, color="black", lw=0.5)
 
 
-def label_time_axis(axes: Axes, with_time_label: bool) -> None:
-    if with_time_label:
-        axes.set_xlabel(TIME_LABEL)
-    else:
-        axes.tick_params(axis="x", labelbottom=False)
-
-
 def set_map_axes(axes: Axes, x_name: str, y_name: str) -> None:
-    """Set equal scales, a grid and axis labels (m) for a map."""
+    """Set equal scales and axis labels (m) for a map."""
     axes.set_aspect("equal", adjustable="datalim", anchor="W")
-    axes.grid(True, axis="both")
     axes.set(xlabel=f"{x_name} (m)", ylabel=f"{y_name} (m)")
-    axes.locator_params(nbins=6)
 
 
-def decimate_series(times: Array, values: Array, max_points: int) -> tuple[Array, Array]:
-    """Reduce a series to ``max_points`` points, with the minimum and maximum of each interval."""
-    if len(times) <= max_points:
+def decimate_series(times: Array, values: Array) -> tuple[Array, Array]:
+    """Limit the points of a series; the minimum and maximum of each interval remain."""
+    if len(times) <= MAX_DRAWN_POINTS:
         return times, values
-    intervals = np.array_split(np.arange(len(times)), max_points // 2)
-    rows_of_minima = [rows[values[rows].argmin()] for rows in intervals]
-    rows_of_maxima = [rows[values[rows].argmax()] for rows in intervals]
-    selected_rows = np.unique(rows_of_minima + rows_of_maxima)
+    intervals = np.array_split(np.arange(len(times)), MAX_DRAWN_POINTS // 2)
+    selected_rows = np.unique(
+        [rows[find(values[rows])] for rows in intervals for find in (np.argmin, np.argmax)]
+    )
     return times[selected_rows], values[selected_rows]

@@ -4,23 +4,17 @@ from typing import Any
 
 from px4fuse.analysis import AidingSourceAnalysis, Analysis
 from px4fuse.card.model import Card
-from px4fuse.comparison.model import Comparison
-from px4fuse.core.text import capitalise_first
 from px4fuse.ekf2.steps import DifferenceExplanation
 from px4fuse.report.aids import select_aids_of_outdoor_flight, write_aids
-from px4fuse.report.difference_page import write_explanation
 from px4fuse.report.page import Page
 from px4fuse.report.phrases import (
-    describe_alignment,
-    format_settings,
     list_verdict_warnings,
     write_error_table,
     write_findings,
 )
 
 ERROR_LEGEND = (
-    "KF-EKF2 is the RMS difference of position and velocity; RMSE is against ground truth. A "
-    "filter is consistent if its σ ratio is 0.8 to 1.25, or if its 95 % interval contains 1."
+    "KF-EKF2 is the RMS difference of position and velocity; RMSE is against ground truth."
 )
 
 
@@ -40,7 +34,7 @@ def make_comparison_page(
     quiet : bool
         True for the headline only.
     """
-    page = make_card_page("headline" if quiet else "card", results.card, verbose=verbose)
+    page = make_card_page("headline" if quiet else "card", results.card)
     if not verbose:
         return page
     if isinstance(analysis, AidingSourceAnalysis):
@@ -54,14 +48,22 @@ def make_comparison_page(
 
 
 def _write_details(page: Page, analysis: Analysis, results: Any) -> None:
+    source, segment = analysis.source, analysis.segment
     page.add("blank")
-    page.write_labelled_texts(_describe_setup(analysis))
+    page.write_labelled(
+        "Position",
+        f"{source.name}: {source.description}, {source.compute_rate_hz():.1f} Hz, "
+        f"{source.frame}; {analysis.source_reason}",
+    )
+    page.write_labelled(
+        "Segment", f"{segment.start_s:.2f} s to {segment.end_s:.2f} s, {segment.reason}"
+    )
     write_error_table(page, analysis)
     for note in (ERROR_LEGEND, *list_verdict_warnings(analysis)):
         page.write_small_text(note)
     explanation = analysis.difference_steps.get(analysis.main.axis.name)
     if isinstance(explanation, DifferenceExplanation):
-        write_explanation(page, explanation)
+        page.write_labelled("KF-EKF2", explanation.sentences[0])
     if aids := select_aids_of_outdoor_flight(analysis):
         write_aids(page, aids)
     write_findings(page, results.findings)
@@ -70,21 +72,5 @@ def _write_details(page: Page, analysis: Analysis, results: Any) -> None:
 def make_card_page(card_part: str, card: Card, *, verbose: bool = False) -> Page:
     """Make a page with a diagnosis card, or with its "headline" or "closing" lines only."""
     page = Page()
-    is_shorter_if_verbose = verbose and card_part != "headline"
-    page.add(f"verbose {card_part}" if is_shorter_if_verbose else card_part, card=card)
+    page.add(card_part, card=card, verbose=verbose)
     return page
-
-
-def _describe_setup(comparison: Comparison) -> dict[str, str]:
-    source, segment = comparison.source, comparison.segment
-    position_text = (
-        f"{source.name}: {source.description}, {source.compute_rate_hz():.1f} Hz, "
-        f"{source.frame}; {comparison.source_reason}"
-    )
-    alignment_texts = {} if source.alignment is None else describe_alignment(source.alignment)
-    return {
-        "Filter": format_settings(comparison.settings),
-        "Position": position_text,
-        **{capitalise_first(label): text for label, text in alignment_texts.items()},
-        "Segment": f"{segment.start_s:.2f} s to {segment.end_s:.2f} s, {segment.reason}",
-    }

@@ -1,7 +1,8 @@
 """Typesetting of reports as PDF with Typst."""
 
 import json
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import contextmanager
 from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import Any
@@ -15,42 +16,39 @@ PDF_STANDARDS: list[Any] = ["a-3a", "ua-1"]
 TEMPLATES = ("cover.typ", "report.typ")
 
 
-def compile_pdf(report: Mapping[str, Any], template: str | None = None) -> bytes:
+def compile_pdf(report: Mapping[str, Any]) -> bytes:
     """Typeset data as PDF with Typst."""
-    with TemporaryDirectory() as empty_folder:
-        document = _make_compiler(report, template, empty_folder).compile(
-            format="pdf", pdf_standards=PDF_STANDARDS
-        )
+    with _open_compiler(report) as compiler:
+        document = compiler.compile(format="pdf", pdf_standards=PDF_STANDARDS)
     assert isinstance(document, bytes)
     return document
 
 
 def measure_free_height(blocks: Any, font_names: Sequence[str]) -> float:
     """Return the free height (points) on the first page of a report."""
-    report = dict.fromkeys(("title", "author", "head", "student", "foot"), "")
+    report = dict.fromkeys(("title", "author", "head", "student"), "")
     data = {**report, "fonts": font_names, "blocks": blocks, "results": None}
+    with _open_compiler(data) as compiler:
+        return float(json.loads(compiler.query("<free>", field="value", one=True)))
+
+
+def read_template() -> str:
+    folder = Path(__file__).parent
+    return "\n".join((folder / name).read_text(encoding="utf-8") for name in TEMPLATES)
+
+
+@contextmanager
+def _open_compiler(report: Mapping[str, Any]) -> Iterator[typst.Compiler]:
     with TemporaryDirectory() as empty_folder:
-        query_result = _make_compiler(data, None, empty_folder).query(
-            "<free>", field="value", one=True
+        yield typst.Compiler(
+            input=read_template().encode(),
+            root=empty_folder,
+            font_paths=typst.Fonts(
+                include_system_fonts=False,
+                include_embedded_fonts=False,
+                font_paths=fonts.find_font_folders(report["fonts"]),
+            ),
+            package_path=empty_folder,
+            package_cache_path=empty_folder,
+            sys_inputs={"data": json.dumps(report)},
         )
-    return float(json.loads(query_result))
-
-
-def _make_compiler(
-    report: Mapping[str, Any], template: str | None, empty_folder: str
-) -> typst.Compiler:
-    if template is None:
-        folder = Path(__file__).parent
-        template = "\n".join((folder / name).read_text(encoding="utf-8") for name in TEMPLATES)
-    return typst.Compiler(
-        input=template.encode(),
-        root=empty_folder,
-        font_paths=typst.Fonts(
-            include_system_fonts=False,
-            include_embedded_fonts=False,
-            font_paths=fonts.find_font_folders(tuple(report["fonts"])),
-        ),
-        package_path=empty_folder,
-        package_cache_path=empty_folder,
-        sys_inputs={"data": json.dumps(report)},
-    )

@@ -12,10 +12,9 @@ from px4fuse.ekf2.whatif import (
     AxisStatistics,
     Ekf2Statistics,
 )
-from px4fuse.filter.signals import AISLE
 from px4fuse.flight.ekf2_parameters import AIDS, PARAMETERS
 from px4fuse.flight.model import Unavailable
-from px4fuse.report.difference_page import format_replay_agreement, write_explanation
+from px4fuse.report.difference_page import format_replay_agreement
 from px4fuse.report.page import Page
 
 NOT_PREDICTABLE_TEXT = "not predictable"
@@ -129,10 +128,9 @@ def find_swept_parameter(analysis: WhatIfAnalysis) -> str:
 
 def describe_sweep(analysis: WhatIfAnalysis) -> list[str]:
     """Describe the best value of a parameter in the replays of EKF2."""
+    summaries = [summary for summary in select_sweep_summaries(analysis) if summary.is_predictable]
     sentences = []
-    if summaries := [
-        summary for summary in select_sweep_summaries(analysis) if summary.is_predictable
-    ]:
+    if summaries:
         parameter_name = find_swept_parameter(analysis)
         best_summary = min(summaries, key=lambda s: abs(math.log(s.nis_mean)))
         sentences.append(
@@ -140,17 +138,16 @@ def describe_sweep(analysis: WhatIfAnalysis) -> list[str]:
             f"{format_number(best_summary.changed[parameter_name])} "
             f"({format_number(best_summary.nis_mean)})."
         )
-        parameter_value_by_rmse_m = {
-            rmse_m: summary.changed[parameter_name]
+        rmse_value_pairs = [
+            (rmse_m, summary.changed[parameter_name])
             for summary in summaries
             if isinstance(rmse_m := summary.position_rmse_to_truth_m, float)
-        }
-        if parameter_value_by_rmse_m:
-            min_rmse_m = min(parameter_value_by_rmse_m)
+        ]
+        if rmse_value_pairs:
+            rmse_m, value = min(rmse_value_pairs)
             sentences.append(
                 "The horizontal position RMSE against ground truth is smallest at "
-                f"{parameter_name} {format_number(parameter_value_by_rmse_m[min_rmse_m])} "
-                f"({min_rmse_m:.3f} m)."
+                f"{parameter_name} {format_number(value)} ({rmse_m:.3f} m)."
             )
     if not all(summary.is_predictable for summary in analysis.whatif.whatif):
         sentences.append(
@@ -168,8 +165,6 @@ def _format_number(value: float | Unavailable, digits: int = 3) -> str:
 
 def make_whatif_page(analysis: WhatIfAnalysis) -> Page:
     page = Page()
-    if AISLE in analysis.difference_steps:
-        write_explanation(page, analysis.difference_steps[AISLE])
     log, whatif_result = analysis.flight.log, analysis.whatif
     page.write_labelled("Log", f"{log.name}, {log.firmware}, {log.duration_s:.1f} s")
     spans_text = ", ".join(

@@ -141,7 +141,7 @@ def _plot_figures(comparisons: Mapping[str, Comparison]) -> bytes:
             for axis, filter_name in zip(axes[1:3], FILTER_NAMES, strict=True):
                 _draw_errors(axis, result, filter_name)
             for axis in axes[:3]:
-                style.label_time_axis(axis, with_time_label=True)
+                axis.set_xlabel(style.TIME_LABEL)
             _draw_map(axes[3], comparison)
         figure.savefig(png_buffer, format="png", dpi=90, metadata={"Software": None})
     return png_buffer.getvalue()
