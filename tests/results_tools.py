@@ -89,7 +89,7 @@ LOOP = to_json_dict(
                 "uncorrected": correction(0.41, 0.0),
                 "by_distance_plain": NONE,
                 "by_distance": correction(0.26, 1.4),
-                **{f"pose_graph_{name}": NONE for name in ("all", "gated", "gnc")},
+                **{f"pose_graph_{name}": NONE for name in ("gated", "gnc")},
             },
             notes=(),
         ),

@@ -37,9 +37,9 @@ def test_sparse_solution_equals_solution_with_dense_matrices(
     right = weighted.T @ values.reshape(-1, sides)
     for damping in (0.0, 10.0):
         expected = np.linalg.solve(weighted.T @ dense + damping * np.eye(len(right)), right)
-        equations = NormalEquations(edges, size, sides)
+        equations = NormalEquations(edges, size)
         assembled, right_sides = equations.assemble(first, second, weights, values)
-        solution = equations.solve(assembled, damping)
+        solution = equations.solve(assembled, right_sides, damping)
         assert not solution[0].any()
         np.testing.assert_allclose(
             solution[1:].reshape(-1, sides), expected, rtol=1e-7, atol=1e-9 * abs(expected).max()
@@ -51,4 +51,4 @@ def test_solution_of_singular_matrix_is_none() -> None:
     edges, first, second, weights, values = random_equations(100, 3, 1, 5)
     weights[:] = 0.0
     equations = NormalEquations(edges, 3)
-    assert equations.solve(equations.assemble(first, second, weights, values)[0]) is None
+    assert equations.solve(*equations.assemble(first, second, weights, values)) is None

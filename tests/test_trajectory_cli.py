@@ -121,10 +121,8 @@ def test_loop_g2o_file_contains_the_optimised_pose_graph(made, found, tmp_path) 
     assert [gate["accepted"] for gate in again["gates"]] == [True]
     rejected = results("loop", made[0] / "r.g2o")["graph"]
     assert [gate["accepted"] for gate in rejected["gates"]] == [True, False]
-    judged, corrections = found["loop"]["closures"][1], found["loop"]["corrections"]
+    judged = found["loop"]["closures"][1]
     assert rejected["gates"][1]["degrees_of_freedom"] == judged["degrees_of_freedom"]
-    cost = rejected["solutions"]["all"]["cost"]
-    assert cost == pytest.approx(corrections["pose_graph_all"]["cost"], rel=1e-3)
 
 
 def test_loop_results_json_contains_command_to_repeat_run(desk, tmp_path) -> None:

@@ -109,31 +109,29 @@ def find_match(flight: Flight, problem: AlignmentProblem) -> Match | None:
     NoMatchError
         Both fail, so a missing alignment parameter cannot be estimated.
     """
-    user_value_by_option = {
-        "clock_offset_s": problem.lag_s,
-        "frame": problem.frames[0] if len(problem.frames) == 1 else None,
-        "yaw_deg": problem.yaw_rad,
-    }
-    missing_options = [f"`{name}`" for name, value in user_value_by_option.items() if value is None]
+    missing_options = [
+        f"`{name}`"
+        for name, is_missing in (
+            ("clock_offset_s", problem.lag_s is None),
+            ("frame", len(problem.frames) != 1),
+            ("yaw_deg", problem.yaw_rad is None),
+        )
+        if is_missing
+    ]
     reasons = []
-    reference_factories = [tracks.make_ekf2_references]
-    # The IMU is not accurate enough for a check of parameters from the user
-    if missing_options:
-        reference_factories.append(tracks.make_imu_references)
-    for make_references in reference_factories:
+    for make_references in (tracks.make_ekf2_references, tracks.make_imu_references):
         try:
             match = _find_best_match(make_references(flight), problem)
             _require_unique_match(match)
             return _refit_without_origin_resets(flight, match, problem)
         except NoMatchError as error:
-            if error.remedy and missing_options:
+            # The IMU is not accurate enough for a check of parameters from the user
+            if not missing_options:
+                return None
+            if error.remedy:
                 raise
             reasons.append(error.reason)
-    if missing_options:
-        raise NoMatchError(
-            "; ".join(dict.fromkeys(reasons)), f"Give {' and '.join(missing_options)}"
-        )
-    return None
+    raise NoMatchError("; ".join(dict.fromkeys(reasons)), f"Give {' and '.join(missing_options)}")
 
 
 def _find_best_match(references: list[SampledTrack], problem: AlignmentProblem) -> Match:
@@ -157,16 +155,19 @@ def _find_best_match(references: list[SampledTrack], problem: AlignmentProblem) 
     matches = []
     for reference in references:
         reference_name = reference.name
-        fit_file_in_frame = partial(_fit_file_in_frame, problem, reference)
-        frames_and_fits = [(frame, fit_file_in_frame(frame, yaw_rad)) for frame in frames]
-        frames_and_fits.sort(key=lambda frame_and_fit: frame_and_fit[1].residual_rms_m)
-        best_frame, fit = frames_and_fits[0]
-        estimated_yaw_fit = fit if yaw_rad is None else fit_file_in_frame(best_frame, None)
+        fits = {frame: _fit_file_in_frame(problem, reference, frame, yaw_rad) for frame in frames}
+        rms_m_by_frame = {
+            frame: fits[frame].residual_rms_m
+            for frame in sorted(fits, key=lambda frame: fits[frame].residual_rms_m)
+        }
+        best_frame = next(iter(rms_m_by_frame))
+        fit = estimated_yaw_fit = fits[best_frame]
+        if yaw_rad is not None:
+            estimated_yaw_fit = _fit_file_in_frame(problem, reference, best_frame, None)
         is_rotated = is_reliable_fit(estimated_yaw_fit, reference_name) and (
             fit.concordance < MIN_CONCORDANCE_TO_ACCEPT_MATCH[reference_name]
             or needs_rotation(fit.horizontal_rms_m, estimated_yaw_fit, reference_name)
         )
-        rms_m_by_frame = {frame: fit.residual_rms_m for frame, fit in frames_and_fits}
         matches.append(
             Match(reference, best_frame, rms_m_by_frame, fit, estimated_yaw_fit, is_rotated)
         )

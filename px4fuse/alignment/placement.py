@@ -189,17 +189,13 @@ def align_position_file(
         f"{recording.name}: {text}"
         for text in (*recording.format_detection_notes, *recording.notes)
     ]
-    dropped_counts = (
-        {recording.name: recording.dropped_row_count}
-        if recording.dropped_row_count and not clock_map
-        else {}
-    )
     log = flight.log
+    dropped_counts = dict(log.dropped)
+    if recording.dropped_row_count and not clock_map:
+        dropped_counts[recording.name] = recording.dropped_row_count
     return replace(
         flight,
-        log=structs.replace(
-            log, notes=(*log.notes, *notes), dropped={**log.dropped, **dropped_counts}
-        ),
+        log=structs.replace(log, notes=(*log.notes, *notes), dropped=dropped_counts),
         positions=(track, *flight.positions),
         inputs=(InputFile(recording.name, recording.sha256, recording.size_bytes, "position"),),
     )

@@ -117,32 +117,23 @@ def find_correlation_peak(
     def compute_lag_s(index: int) -> float:
         return float(reference.time_s[0]) + (index - len(file_track.is_valid) + 1) * GRID_STEP_S
 
-    # The best peak ends where the concordance falls below half of its maximum
-    low_concordance_indices = np.flatnonzero(concordance < 0.5 * concordance[best_index])
-    peak_start_index = np.max(
-        low_concordance_indices[low_concordance_indices < best_index], initial=-1
-    )
-    peak_end_index = np.min(
-        low_concordance_indices[low_concordance_indices > best_index],
-        initial=len(common_sample_counts),
-    )
     can_be_second_peak = (
         has_overlap
         & (common_sample_counts >= 0.5 * common_sample_counts[best_index])
         & (square_sum_m2 >= 0.25 * square_sum_m2[best_index])
         & (concordance >= MIN_CONCORDANCE_TO_ACCEPT_MATCH[reference.name])
     )
-    min_peak_distance_steps = round(MIN_PEAK_DISTANCE_S / GRID_STEP_S)
-    best_peak_start_index = max(peak_start_index + 1, best_index - min_peak_distance_steps)
-    can_be_second_peak[
-        best_peak_start_index : min(peak_end_index, best_index + min_peak_distance_steps + 1)
-    ] = False
+    # The best peak ends where the concordance falls below half of its maximum
+    is_high = concordance >= 0.5 * concordance[best_index]
+    for indices_from_best in (np.arange(best_index, -1, -1), np.arange(best_index, len(is_high))):
+        near_indices = indices_from_best[: round(MIN_PEAK_DISTANCE_S / GRID_STEP_S) + 1]
+        is_in_best_peak = np.logical_and.accumulate(is_high[near_indices])
+        can_be_second_peak[near_indices[is_in_best_peak]] = False
     peak = CorrelationPeak(compute_lag_s(best_index), float(concordance[best_index]))
     if not can_be_second_peak.any():
         return peak
-    mean_square_residual_m2 = np.maximum(square_sum_m2 - 2.0 * rotated_covariance, 0.0) / (
-        2.0 * np.maximum(common_sample_counts, 1.0)
-    )
+    residual_square_sum_m2 = np.maximum(square_sum_m2 - 2.0 * rotated_covariance, 0.0)
+    mean_square_residual_m2 = residual_square_sum_m2 / (2.0 * np.maximum(common_sample_counts, 1.0))
     residual_m = np.sqrt(mean_square_residual_m2 + INTERPOLATION_ERROR_M**2)
     second_peak_index = int(np.argmin(np.where(can_be_second_peak, residual_m, np.inf)))
     return replace(
@@ -189,15 +180,10 @@ def fit_by_least_squares(
     centre_m = np.mean(file_position_m)
     # With centred positions, the errors of yaw and origin are uncorrelated
     file_position_m = file_position_m - centre_m
-    sigma_product_m2 = float(np.sqrt(np.var(file_position_m) * np.var(reference_position_m)))
-    coherence = (
-        complex(
-            np.vdot(file_position_m, reference_position_m) / len(file_position_m) / sigma_product_m2
-        )
-        if sigma_product_m2 > 0
-        else 0j
-    )
-    mean_of_variances_m2 = float(np.var(file_position_m) + np.var(reference_position_m)) / 2.0
+    file_variance_m2, reference_variance_m2 = np.var(file_position_m), np.var(reference_position_m)
+    sigma_product_m2 = float(np.sqrt(file_variance_m2 * reference_variance_m2))
+    covariance_m2 = np.vdot(file_position_m, reference_position_m) / len(file_position_m)
+    coherence = complex(covariance_m2 / sigma_product_m2) if sigma_product_m2 > 0.0 else 0j
     reference_horizontal_position_m = reference.to_complex_m()
 
     # Parameters: origin north, origin east (m), lag correction (s), yaw (rad)
@@ -233,41 +219,29 @@ def fit_by_least_squares(
     parameters[is_fitted] = solution.x
     origin_north_m, origin_east_m, lag_correction_s, fitted_yaw_rad = parameters.tolist()
     complex_residuals = residuals[: len(file_position_m)] + 1j * residuals[len(file_position_m) :]
-    jacobian = np.asarray(solution.jac)
-    information = jacobian.T @ jacobian
-    # The added diagonal prevents a singular matrix
-    information += 1e-9 * np.diag(np.diag(information) + 1e-12)
-    parameter_variance = (
-        np.diag(np.linalg.inv(information))
-        * _compute_robust_sigma(residuals) ** 2
-        * _compute_autocorrelation_factor(complex_residuals)
-    )
-    parameter_sigma = np.sqrt(np.maximum(parameter_variance, 0.0))
-    is_lag_at_limit = is_lag_estimated and abs(lag_correction_s) > 0.99 * MAX_LAG_CORRECTION_S
+    parameter_sigma = _compute_parameter_sigma(np.asarray(solution.jac), complex_residuals)
+    lag_sigma_s = float(parameter_sigma[2]) if is_lag_estimated else None
+    if abs(lag_correction_s) > 0.99 * MAX_LAG_CORRECTION_S:
+        lag_sigma_s = np.inf
     reference_ned_m, _ = reference.at(reference_time_s + lag_correction_s)
     down_difference_m = reference_ned_m[:, 2] - file_track.position_m[is_used, 2]
     down_difference_m = down_difference_m[np.isfinite(down_difference_m)]
-    origin_down_m = float(np.median(down_difference_m)) if len(down_difference_m) else 0.0
     horizontal_rms_m = compute_clipped_rms_m(np.abs(complex_residuals)) / np.sqrt(2.0)
-    vertical_rms_m = (
-        compute_clipped_rms_m(down_difference_m - origin_down_m) if len(down_difference_m) else 0.0
-    )
+    origin_down_m = vertical_rms_m = 0.0
+    if len(down_difference_m):
+        origin_down_m = float(np.median(down_difference_m))
+        vertical_rms_m = compute_clipped_rms_m(down_difference_m - origin_down_m)
     concordance = peak.concordance
     if np.isnan(concordance):
         correlation_after_rotation = float((np.exp(-1j * fitted_yaw_rad) * coherence).real)
-        concordance = (
-            correlation_after_rotation * sigma_product_m2 / mean_of_variances_m2
-            if sigma_product_m2 > 0
-            else 0.0
-        )
+        mean_of_variances_m2 = max(float(file_variance_m2 + reference_variance_m2) / 2.0, 1e-300)
+        concordance = correlation_after_rotation * sigma_product_m2 / mean_of_variances_m2
     complex_origin_m = (
         complex(origin_north_m, origin_east_m) - np.exp(1j * fitted_yaw_rad) * centre_m
     )
     return TrackFit(
         lag_s=peak.lag_s + lag_correction_s,
-        lag_sigma_s=(np.inf if is_lag_at_limit else float(parameter_sigma[2]))
-        if is_lag_estimated
-        else None,
+        lag_sigma_s=lag_sigma_s,
         concordance=concordance,
         second_peak_lag_difference_s=peak.second_peak_lag_difference_s,
         second_to_best_residual_ratio=peak.second_to_best_residual_ratio,
@@ -278,6 +252,22 @@ def fit_by_least_squares(
         horizontal_rms_m=float(horizontal_rms_m),
         residual_rms_m=float(np.sqrt(2.0 * horizontal_rms_m**2 + vertical_rms_m**2)),
     )
+
+
+def _compute_parameter_sigma(jacobian: Array, complex_residuals: ComplexArray) -> Array:
+    """Return the standard deviations of the fitted parameters."""
+    information = jacobian.T @ jacobian
+    # The added diagonal prevents a singular matrix
+    information += 1e-9 * np.diag(np.diag(information) + 1e-12)
+    residual_sigma = _compute_robust_sigma(
+        np.concatenate([complex_residuals.real, complex_residuals.imag])
+    )
+    parameter_variance = (
+        np.diag(np.linalg.inv(information))
+        * residual_sigma**2
+        * _compute_autocorrelation_factor(complex_residuals)
+    )
+    return np.sqrt(np.maximum(parameter_variance, 0.0))
 
 
 def _compute_robust_sigma(residual: Array) -> float:
@@ -292,11 +282,9 @@ def _compute_autocorrelation_factor(residual: ComplexArray) -> float:
     covariance_by_lag = autocovariance(clipped_residual)
     if covariance_by_lag[0] <= 0.0:
         return 1.0
-    nonpositive_lags = np.flatnonzero(covariance_by_lag <= 0.0)
-    first_nonpositive_lag = nonpositive_lags[0] if len(nonpositive_lags) else len(covariance_by_lag)
-    return float(
-        1.0 + 2.0 * np.sum(covariance_by_lag[1:first_nonpositive_lag]) / covariance_by_lag[0]
-    )
+    # Only the lags before the first negative autocorrelation are used
+    is_used = np.logical_and.accumulate(covariance_by_lag > 0.0)
+    return float(2.0 * np.sum(covariance_by_lag[is_used]) / covariance_by_lag[0] - 1.0)
 
 
 def compute_clipped_rms_m(residual_m: Array) -> float:

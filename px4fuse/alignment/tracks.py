@@ -9,7 +9,7 @@ from scipy.ndimage import binary_erosion, gaussian_filter1d, median_filter
 from scipy.signal import butter, sosfiltfilt
 
 from px4fuse.comparison.projection import remove_origin_resets
-from px4fuse.core.arrays import Array, BoolArray, ComplexArray
+from px4fuse.core.arrays import Array, BoolArray, ComplexArray, interpolate_columns
 from px4fuse.errors import Px4FuseError
 from px4fuse.filter.signals import Segment, compute_ned_acceleration
 from px4fuse.flight.model import (
@@ -76,9 +76,8 @@ class SampledTrack:
 
     def at(self, time_s: Array) -> tuple[Array, BoolArray]:
         """Interpolate the position at given times, and return a mask of times outside gaps."""
-        columns_m = [np.interp(time_s, self.time_s, column) for column in self.position_m.T]
         is_valid = np.interp(time_s, self.time_s, self.is_valid.astype(float), 0.0, 0.0) > 0.999
-        return np.stack(columns_m, axis=1), is_valid
+        return interpolate_columns(time_s, self.time_s, self.position_m), is_valid
 
 
 def convert_to_ned(samples: pd.DataFrame, frame: str) -> SampledTrack:

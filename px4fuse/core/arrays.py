@@ -40,6 +40,11 @@ def cumulative_sums(rows: Array) -> Array:
     return np.concatenate([np.zeros((1, rows.shape[1])), np.cumsum(rows, axis=0)])
 
 
+def interpolate_columns(time_s: Array, known_time_s: Array, values: Array) -> Array:
+    """Interpolate each column of values linearly at given times, shape (n, k)."""
+    return np.stack([np.interp(time_s, known_time_s, column) for column in values.T], axis=1)
+
+
 def select_intervals(time_s: Array, is_selected: BoolArray) -> list[tuple[float, float]]:
     """Return start and end (s) of the selected intervals between successive times."""
     starts_s, ends_s = time_s[:-1][is_selected], time_s[1:][is_selected]

@@ -19,7 +19,7 @@ from px4fuse.loop.corrections import (
     score_paths,
     solve_pose_graphs,
 )
-from px4fuse.loop.model import LANDING_CLOSURE_SOURCE, Loop, OdometryNoise, TrueFinalPose
+from px4fuse.loop.model import Loop, OdometryNoise, TrueFinalPose
 from px4fuse.loop.tracks import LoopSource, find_odometry, trajectory_of
 from px4fuse.request import GivenClosure, LoopRequest
 from px4fuse.trajectory.graph import lie
@@ -75,35 +75,26 @@ def analyse(
         None if time_s is None else convert_to_trajectory_time_s(time_s)
         for time_s in (request.start_s, request.end_s)
     )
-    segment, is_at_rest_at_both_ends = loop_segment.choose_loop_segment(
-        flight, trajectory, start_s, end_s
-    )
+    segment = loop_segment.choose_loop_segment(flight, trajectory, start_s, end_s)
     truth = None if flight is None or trajectory.kind == "truth" else find_truth_trajectory(flight)
     z_down_trajectory = to_z_down(trajectory)
-    path = loop_segment.cut_trajectory(z_down_trajectory, segment, is_at_rest_at_both_ends)
+    path = loop_segment.cut_trajectory(z_down_trajectory, segment)
     final_pose_in_truth = None
     if truth and request.closed_loop and request.landed_at is None:
-        final_pose_in_truth = loop_segment.find_final_pose_in_truth(
-            path, truth, segment, is_at_rest_at_both_ends
-        )
+        final_pose_in_truth = loop_segment.find_final_pose_in_truth(path, truth, segment)
     true_end = _find_true_end(path, request, final_pose_in_truth, segment, is_assessed=is_assessed)
-    given_closures = [
-        GivenClosure(
-            convert_to_trajectory_time_s(closure.time_1_s),
-            convert_to_trajectory_time_s(closure.time_2_s),
-            closure.sigma_m,
-        )
-        for closure in request.closures
-    ]
-    for closure in given_closures:
-        _require_valid_closure(closure, path)
-    closures_and_final_poses: list[ClosureAndFinalPose] = [
-        (closure, None) for closure in given_closures
-    ]
+    closures_and_final_poses: list[ClosureAndFinalPose] = []
     if not isinstance(true_end, Unavailable):
-        closures_and_final_poses.insert(
-            0, (GivenClosure(segment.start_s, segment.end_s, true_end.sigma_m), true_end)
+        landing_closure = GivenClosure(segment.start_s, segment.end_s, true_end.sigma_m)
+        closures_and_final_poses.append((landing_closure, true_end))
+    for given_closure in request.closures:
+        closure = GivenClosure(
+            convert_to_trajectory_time_s(given_closure.time_1_s),
+            convert_to_trajectory_time_s(given_closure.time_2_s),
+            given_closure.sigma_m,
         )
+        _require_valid_closure(closure, path)
+        closures_and_final_poses.append((closure, None))
     key_frame_spacing_m = request.key_frames_m
     if key_frame_spacing_m is None:
         key_frame_spacing_m = compute_default_spacing_m(path.position_m)
@@ -114,28 +105,25 @@ def analyse(
     notes = [*z_down_trajectory.notes, variance_note]
     if isinstance(final_pose_in_truth, str):
         notes.append(f"the ground truth does not contain the landing place: {final_pose_in_truth}")
-    tested_closures = gate_closures(graph, closures_and_final_poses)
     pose_graph_corrections, tested_closures = solve_pose_graphs(
-        path, node_indices, graph, tested_closures, progress
+        path, node_indices, graph, gate_closures(graph, closures_and_final_poses), progress
     )
     displacement_m = path.position_m[-1] - path.position_m[0]
     odometry_heading_change_deg = loop_segment.compute_heading_change_deg(path)
-    closure_error_vector_m = (
-        true_end
-        if isinstance(true_end, Unavailable)
-        else displacement_m - true_end.displacement_vector_m
-    )
+    closure_error_vector_m: Array | Unavailable
+    closure_error_m = closure_percent = closure_error_axes_m = None
+    if isinstance(true_end, Unavailable):
+        closure_error_vector_m = true_end
+    else:
+        closure_error_vector_m = error_m = displacement_m - true_end.displacement_vector_m
+        closure_error_m = float(np.linalg.norm(error_m))
+        closure_percent = 100.0 * closure_error_m / float(distance_m[-1])
+        closure_error_axes_m = split_by_axis(path.frame, error_m)
     heading_error_deg = _compute_heading_error(true_end, odometry_heading_change_deg)
-    landing_closure = next((c for c in tested_closures if c.source == LANDING_CLOSURE_SOURCE), None)
     paths_corrected_by_distance = distribute_closure_error_by_distance(
-        path, distance_m, closure_error_vector_m, heading_error_deg, landing_closure
+        path, distance_m, closure_error_vector_m, heading_error_deg, tested_closures
     )
     references = tuple(track for track in (truth, reference) if track is not None)
-    closure_error_m = closure_percent = closure_error_axes_m = None
-    if not isinstance(closure_error_vector_m, Unavailable):
-        closure_error_m = float(np.linalg.norm(closure_error_vector_m))
-        closure_percent = 100.0 * closure_error_m / float(distance_m[-1])
-        closure_error_axes_m = split_by_axis(path.frame, closure_error_vector_m)
     return Loop(
         track=path.name,
         kind=path.kind,
@@ -308,14 +296,13 @@ def analyse_flight_loop(
             reason,
             "Send visual-inertial odometry to PX4 as MAVLink message ODOMETRY.",
         )
-    segment, _ = loop_segment.choose_loop_segment(flight, trajectory, None, None)
+    segment = loop_segment.choose_loop_segment(flight, trajectory, None, None)
     segment_position_m = trajectory.cut_to_span(segment.start_s, segment.end_s).position_m
     extent_m = end_to_start_distance_m = 0.0
     if len(segment_position_m):
+        displacement_m = segment_position_m[-1] - segment_position_m[0]
         extent_m = float(np.linalg.norm(np.ptp(segment_position_m, axis=0)))
-        end_to_start_distance_m = float(
-            np.linalg.norm(segment_position_m[-1] - segment_position_m[0])
-        )
+        end_to_start_distance_m = float(np.linalg.norm(displacement_m))
     if (
         2.0 * extent_m < MIN_FLIGHT_LOOP_PATH_M
         or end_to_start_distance_m > MAX_END_TO_START_DISTANCE_FRACTION * 2.0 * extent_m

@@ -31,16 +31,9 @@ def to_z_down(trajectory: Trajectory) -> Trajectory:
     if trajectory.frame not in _Z_DOWN_CONVERSIONS:
         return trajectory
     axes, z_down_frame, note = _Z_DOWN_CONVERSIONS[trajectory.frame]
-    axis_order, _ = NED_COMPONENTS_BY_FRAME[axes]
-    position_variance_m2 = trajectory.position_variance_m2
-    return replace(
-        _rotate(trajectory, _matrix_to_ned(axes), z_down_frame),
-        position_variance_m2=None
-        if position_variance_m2 is None
-        else position_variance_m2[:, axis_order],
-        rotation_variance_rad2=trajectory.rotation_variance_rad2,
-        notes=(*trajectory.notes, note),
-    )
+    # Only trajectories of flight logs have variances, and their z is down
+    rotated = _rotate(trajectory, _matrix_to_ned(axes), z_down_frame)
+    return replace(rotated, notes=(*trajectory.notes, note))
 
 
 def from_z_down(trajectory: Trajectory, frame: Frame) -> Trajectory:
@@ -139,18 +132,17 @@ def correct_by_distance(
     """
     position_m = trajectory.position_m
     distance_fraction = cumulative_distance_m / cumulative_distance_m[-1]
-    correction_rotation = Rotation.from_rotvec(
-        np.outer(-distance_fraction * heading_closure_error_rad, DOWN_DIRECTION)
-    )
-    step_middle_distance_fraction = (distance_fraction[1:] + distance_fraction[:-1]) / 2.0
-    rotation_at_step_middle = Rotation.from_rotvec(
-        np.outer(-step_middle_distance_fraction * heading_closure_error_rad, DOWN_DIRECTION)
-    )
+
+    def rotate_heading(fraction: Array) -> Rotation:
+        rotation_rad = np.outer(-fraction * heading_closure_error_rad, DOWN_DIRECTION)
+        return Rotation.from_rotvec(rotation_rad)
+
+    rotation_at_step_middle = rotate_heading((distance_fraction[1:] + distance_fraction[:-1]) / 2.0)
     rotated_position_m = position_m[0] + cumulative_sums(
         rotation_at_step_middle.apply(np.diff(position_m, axis=0))
     )
     remaining_error_m = rotated_position_m[-1] - (position_m[-1] - closure_error_vector_m)
     return trajectory.replace_positions(
         distribute_by_distance(rotated_position_m, remaining_error_m, cumulative_distance_m),
-        correction_rotation,
+        rotate_heading(distance_fraction),
     )

@@ -1,7 +1,6 @@
 """Correction of odometry by loop closures: χ² test, corrected paths, ATE and RPE."""
 
 from collections.abc import Callable, Mapping, Sequence
-from typing import Any
 
 import numpy as np
 from msgspec import structs
@@ -29,7 +28,7 @@ from px4fuse.trajectory.evaluation import Evaluation, evaluate
 from px4fuse.trajectory.graph import lie
 from px4fuse.trajectory.graph.covariance import gate_edges
 from px4fuse.trajectory.graph.model import PoseGraph
-from px4fuse.trajectory.graph.solver import ROBUST_SOLUTION_KEY, SOLUTION_LABELS, Solution, solve
+from px4fuse.trajectory.graph.solver import ROBUST_SOLUTION_LABEL, Solution, solve
 from px4fuse.trajectory.model import Trajectory, cumulative_distance
 
 # Minimum growth of the reported variances along the path; otherwise they are not used
@@ -216,15 +215,13 @@ def build_pose_graph(
     return graph, node_indices, variance_note
 
 
-UNCORRECTED_LABEL = "uncorrected"
-POSITIONS_CORRECTED_LABEL = "positions corrected in proportion to distance"
-HEADINGS_CORRECTED_LABEL = "positions and headings corrected in proportion to distance"
 # Labels of the corrected paths, by their key in results.json
-CORRECTION_LABELS: Mapping[str, str] = {
-    "uncorrected": UNCORRECTED_LABEL,
-    "by_distance_plain": POSITIONS_CORRECTED_LABEL,
-    "by_distance": HEADINGS_CORRECTED_LABEL,
-    **{f"pose_graph_{name}": label for name, label in SOLUTION_LABELS.items()},
+CORRECTION_LABELS: Mapping[CorrectionName, str] = {
+    "uncorrected": "uncorrected",
+    "by_distance_plain": "positions corrected in proportion to distance",
+    "by_distance": "positions and headings corrected in proportion to distance",
+    "pose_graph_gated": "pose graph with loop closures that pass the gate",
+    "pose_graph_gnc": ROBUST_SOLUTION_LABEL,
 }
 # Corrected path with its pose graph solution, if any, or the reason why it is missing
 CorrectionOutcome = tuple[Trajectory, Solution | None] | Unavailable
@@ -235,21 +232,20 @@ def distribute_closure_error_by_distance(
     distance_m: Array,
     closure_error_vector_m: Array | Unavailable,
     heading_error_deg: float | Unavailable,
-    landing_closure: Closure | None,
+    closures: tuple[Closure, ...],
 ) -> dict[CorrectionName, CorrectionOutcome]:
     """Distribute the loop closure error along the path, in proportion to path length.
 
     Return a path with corrected positions, and a path with corrected positions and headings.
     """
-    if landing_closure is not None and not landing_closure.accepted:
-        closure_error_vector_m = _explain_gate_rejection(
-            "distribution of the closure error along the path", landing_closure
-        )
+    for closure in closures:
+        if closure.source == LANDING_CLOSURE_SOURCE and not closure.accepted:
+            closure_error_vector_m = _explain_gate_rejection(
+                "distribution of the closure error along the path", closure
+            )
     if isinstance(closure_error_vector_m, Unavailable):
         return {"by_distance_plain": closure_error_vector_m, "by_distance": closure_error_vector_m}
-    corrected_position_m = distribute_by_distance(
-        path.position_m, closure_error_vector_m, distance_m
-    )
+    position_m = distribute_by_distance(path.position_m, closure_error_vector_m, distance_m)
     heading_error_rad = (
         0.0 if isinstance(heading_error_deg, Unavailable) else float(np.radians(heading_error_deg))
     )
@@ -257,7 +253,7 @@ def distribute_closure_error_by_distance(
         path, distance_m, closure_error_vector_m, heading_error_rad
     )
     return {
-        "by_distance_plain": (path.replace_positions(corrected_position_m), None),
+        "by_distance_plain": (path.replace_positions(position_m), None),
         "by_distance": (corrected_path, None),
     }
 
@@ -285,17 +281,22 @@ def gate_closures(
     for gate_result, (closure, true_end) in zip(
         gate_edges(graph, closure_edges), closures_and_final_poses, strict=True
     ):
-        odometry_displacement_m = (
-            graph.poses[gate_result.second, :3] - graph.poses[gate_result.first, :3]
-        )
-        closure_fields = structs.asdict(closure) | structs.asdict(gate_result)
-        del closure_fields["first"], closure_fields["second"]
-        closure_fields["source"] = "given" if true_end is None else LANDING_CLOSURE_SOURCE
-        true_displacement_m = np.zeros(3) if true_end is None else true_end.displacement_vector_m
+        error_m = graph.poses[gate_result.second, :3] - graph.poses[gate_result.first, :3]
+        source = "given"
+        if true_end is not None:
+            error_m = error_m - true_end.displacement_vector_m
+            source = LANDING_CLOSURE_SOURCE
         closures.append(
             Closure(
-                distance_m=float(np.linalg.norm(odometry_displacement_m - true_displacement_m)),
-                **closure_fields,
+                time_1_s=closure.time_1_s,
+                time_2_s=closure.time_2_s,
+                sigma_m=closure.sigma_m,
+                source=source,
+                distance_m=float(np.linalg.norm(error_m)),
+                d2=gate_result.d2,
+                degrees_of_freedom=gate_result.degrees_of_freedom,
+                p=gate_result.p,
+                accepted=gate_result.accepted,
             )
         )
     return tuple(closures)
@@ -308,11 +309,10 @@ def solve_pose_graphs(
     closures: tuple[Closure, ...],
     progress: Callable[[str], None],
 ) -> tuple[dict[CorrectionName, CorrectionOutcome], tuple[Closure, ...]]:
-    """Optimise the pose graph with all closures, with accepted closures, and robustly.
+    """Optimise the pose graph with accepted closures, and robustly with all closures.
 
     Return the corrected paths, and the closures with their weights from robust optimisation.
     """
-    corrections: dict[Any, CorrectionOutcome] = {}
     if not closures and not isinstance(graph, Unavailable):
         graph = Unavailable(
             "pose graph",
@@ -320,45 +320,34 @@ def solve_pose_graphs(
             "Give two times at one place with --closure.",
         )
     if isinstance(graph, Unavailable):
-        corrections = {f"pose_graph_{solution_name}": graph for solution_name in SOLUTION_LABELS}
-        return corrections, ()
-    edge_indices = np.arange(len(graph.first_nodes))
-    is_closure = edge_indices >= len(edge_indices) - len(closures)
-    is_rejected = np.zeros(len(edge_indices), bool)
-    is_rejected[is_closure] = [not closure.accepted for closure in closures]
-    for solution_name, label in SOLUTION_LABELS.items():
-        name = f"pose_graph_{solution_name}"
-        is_robust = solution_name == ROBUST_SOLUTION_KEY
-        is_gated = solution_name == "gated"
-        progress(f"optimising: {label}")
-        if is_robust and len(closures) < 2:
-            corrections[name] = Unavailable(
-                label,
-                "Robust optimisation compares loop closures with each other, but the path has only "
-                "one loop closure. Only the χ² gate can test this loop closure.",
-                "Give more loop closures with --closure.",
-            )
-        elif is_gated and is_rejected[is_closure].all():
-            corrections[name] = _explain_gate_rejection("pose graph", closures[0])
-        elif is_gated and not is_rejected.any():
-            corrections[name] = corrections["pose_graph_all"]
-        else:
-            is_used = ~is_rejected if is_gated else np.ones_like(is_rejected)
-            solution = solve(
-                graph.select_edges(is_used),
-                robust=is_robust,
-                is_closure=is_closure[is_used],
-            )
-            corrected_path = _interpolate_corrections(
-                path, node_indices, graph.poses, solution.poses
-            )
-            corrections[name] = corrected_path, solution
-            if is_robust:
-                weights = solution.weights[is_closure].tolist()
-                closures = tuple(
-                    structs.replace(closure, weight_gnc=weight)
-                    for closure, weight in zip(closures, weights, strict=True)
-                )
+        return {"pose_graph_gated": graph, "pose_graph_gnc": graph}, ()
+    is_closure = np.arange(len(graph.first_nodes)) >= len(graph.first_nodes) - len(closures)
+    is_used = ~is_closure
+    is_used[is_closure] = [closure.accepted for closure in closures]
+    corrections: dict[CorrectionName, CorrectionOutcome] = {}
+    if not is_used[is_closure].any():
+        corrections["pose_graph_gated"] = _explain_gate_rejection("pose graph", closures[0])
+    else:
+        progress(f"optimising: {CORRECTION_LABELS['pose_graph_gated']}")
+        solution = solve(graph.select_edges(is_used))
+        corrected_path = _interpolate_corrections(path, node_indices, graph.poses, solution.poses)
+        corrections["pose_graph_gated"] = corrected_path, solution
+    if len(closures) < 2:
+        corrections["pose_graph_gnc"] = Unavailable(
+            ROBUST_SOLUTION_LABEL,
+            "Robust optimisation compares loop closures with each other, but the path has only "
+            "one loop closure. Only the χ² gate can test this loop closure.",
+            "Give more loop closures with --closure.",
+        )
+    else:
+        progress(f"optimising: {ROBUST_SOLUTION_LABEL}")
+        solution = solve(graph, robust=True, is_closure=is_closure)
+        corrected_path = _interpolate_corrections(path, node_indices, graph.poses, solution.poses)
+        corrections["pose_graph_gnc"] = corrected_path, solution
+        closures = tuple(
+            structs.replace(closure, weight_gnc=weight)
+            for closure, weight in zip(closures, solution.weights[is_closure].tolist(), strict=True)
+        )
     return corrections, closures
 
 
@@ -369,23 +358,18 @@ def _interpolate_corrections(
     node_corrections = (
         Rotation.from_quat(solved_poses[:, 3:]) * Rotation.from_quat(graph_poses[:, 3:]).inv()
     )
-    previous_node_indices = np.searchsorted(node_indices, np.arange(len(path)), side="right") - 1
-    previous_node_indices = np.clip(previous_node_indices, 0, len(node_indices) - 2)
-    time_s = path.time_s
-    next_node_fraction = (time_s - time_s[node_indices[previous_node_indices]]) / (
-        time_s[node_indices[previous_node_indices + 1]]
-        - time_s[node_indices[previous_node_indices]]
-    )
+    time_s, node_time_s = path.time_s, path.time_s[node_indices]
+    # The first and the last pose of the path are nodes
+    previous_nodes = np.searchsorted(node_time_s[1:-1], time_s, side="right")
+    next_node_weight = np.interp(time_s, node_time_s, np.arange(len(node_time_s))) - previous_nodes
     position_corrected_by_previous_node_m, position_corrected_by_next_node_m = (
         solved_poses[node, :3]
         + node_corrections[node].apply(path.position_m - graph_poses[node, :3])
-        for node in (previous_node_indices, previous_node_indices + 1)
+        for node in (previous_nodes, previous_nodes + 1)
     )
-    next_node_weight = np.clip(next_node_fraction, 0.0, 1.0)[:, None]
-    position_m = (
-        1.0 - next_node_weight
-    ) * position_corrected_by_previous_node_m + next_node_weight * position_corrected_by_next_node_m
-    return path.replace_positions(position_m, Slerp(time_s[node_indices], node_corrections)(time_s))
+    position_m = (1.0 - next_node_weight[:, None]) * position_corrected_by_previous_node_m
+    position_m += next_node_weight[:, None] * position_corrected_by_next_node_m
+    return path.replace_positions(position_m, Slerp(node_time_s, node_corrections)(time_s))
 
 
 def score_paths(
@@ -432,11 +416,6 @@ def score_paths(
     for name, corrected_path in corrected_paths.items():
         if isinstance(corrected_path, Unavailable):
             scored_paths[name] = corrected_path
-        elif name == "pose_graph_gated" and corrected_path is corrected_paths["pose_graph_all"]:
-            path_with_all_closures = scored_paths["pose_graph_all"]
-            scored_paths[name] = structs.replace(
-                path_with_all_closures, name=CORRECTION_LABELS[name]
-            )
         else:
             scored_paths[name] = score_path(name, *corrected_path)
     return scored_paths

@@ -22,15 +22,10 @@ MAX_POSITION_EXTENT_AT_REST_M = 0.15
 MAX_HEADING_CHANGE_ASSUMED_ZERO_DEG = 15.0
 
 
-def cut_trajectory(
-    trajectory: Trajectory, segment: Segment, is_at_rest_at_both_ends: bool = False
-) -> Trajectory:
+def cut_trajectory(trajectory: Trajectory, segment: Segment) -> Trajectory:
     """Return the part of a trajectory in a time segment.
 
-    Parameters
-    ----------
-    is_at_rest_at_both_ends : bool
-        True to average poses on the ground at both ends.
+    In a segment from take-off to landing, poses on the ground are averaged at both ends.
 
     Raises
     ------
@@ -45,30 +40,28 @@ def cut_trajectory(
             f"poses between {segment.start_s:.2f} s and {segment.end_s:.2f} s; at least "
             f"{MIN_POSES} are needed"
         )
-    if not is_at_rest_at_both_ends:
+    if segment.flight_span_s is None:
         return segment_track
     position_m = segment_track.position_m.copy()
     quaternions = None if segment_track.rotation is None else segment_track.rotation.as_quat()
     for index, rest_start_s in ((0, segment.start_s - REST_DURATION_S), (-1, segment.end_s)):
         poses_at_rest = trajectory.cut_to_span(rest_start_s, rest_start_s + REST_DURATION_S)
-        # If the vehicle moves, no mean is computed
-        if (
-            not len(poses_at_rest)
-            or np.linalg.norm(np.ptp(poses_at_rest.position_m, axis=0))
-            > MAX_POSITION_EXTENT_AT_REST_M
-        ):
+        if not len(poses_at_rest):
             continue
-        position_m[index] = poses_at_rest.position_m.mean(axis=0)
-        if quaternions is not None and poses_at_rest.rotation is not None:
-            quaternions[index] = poses_at_rest.rotation.mean().as_quat()
+        extent_m = np.linalg.norm(np.ptp(poses_at_rest.position_m, axis=0))
+        # If the vehicle moves, no mean is computed
+        if extent_m <= MAX_POSITION_EXTENT_AT_REST_M:
+            position_m[index] = poses_at_rest.position_m.mean(axis=0)
+            if quaternions is not None and poses_at_rest.rotation is not None:
+                quaternions[index] = poses_at_rest.rotation.mean().as_quat()
     rotation = None if quaternions is None else Rotation.from_quat(quaternions)
     return replace(segment_track, position_m=position_m, rotation=rotation)
 
 
 def choose_loop_segment(
     flight: Flight | None, trajectory: Trajectory, start_s: float | None, end_s: float | None
-) -> tuple[Segment, bool]:
-    """Return the segment of a loop, and True if the vehicle is on the ground at both ends.
+) -> Segment:
+    """Return the segment of a loop; ``flight_span_s`` is given from take-off to landing.
 
     Parameters
     ----------
@@ -87,10 +80,9 @@ def choose_loop_segment(
             f"The end ({end_s:.12g} s) is not after the start ({start_s:.12g} s).",
             "Change --from or --to.",
         )
-    segment_start_s, segment_end_s = track_start_s, track_end_s = trajectory.time_s[
-        [0, -1]
-    ].tolist()
-    is_at_rest_at_both_ends, flight_span_s = False, None
+    track_start_s, track_end_s = trajectory.time_s[[0, -1]].tolist()
+    segment_start_s, segment_end_s = track_start_s, track_end_s
+    flight_span_s = None
     if flight is None:
         reason = "the whole trajectory"
     elif isinstance(flight.airborne, Unavailable) or not flight.airborne:
@@ -103,7 +95,7 @@ def choose_loop_segment(
         if len(flight.airborne) > 1:
             reason = f"from the first take-off to the last of {len(flight.airborne)} landings"
         if start_s is None and end_s is None:
-            is_at_rest_at_both_ends, flight_span_s = True, (take_off_s, landing_s)
+            flight_span_s = take_off_s, landing_s
     if start_s is not None or end_s is not None:
         segment_start_s = segment_start_s if start_s is None else start_s
         segment_end_s = segment_end_s if end_s is None else end_s
@@ -117,7 +109,7 @@ def choose_loop_segment(
         )
     if limited_span_s != (segment_start_s, segment_end_s):
         reason = f"{reason}; times without poses are omitted"
-    return Segment(*limited_span_s, reason, flight_span_s), is_at_rest_at_both_ends
+    return Segment(*limited_span_s, reason, flight_span_s)
 
 
 def compute_heading_change_deg(path: Trajectory) -> float | None:
@@ -137,15 +129,13 @@ def assume_landing_at_takeoff(path: Trajectory) -> TrueFinalPose:
         odometry_heading_change_deg is not None
         and abs(odometry_heading_change_deg) <= MAX_HEADING_CHANGE_ASSUMED_ZERO_DEG
     )
-    source = "assumption: the vehicle landed at the take-off place with an unknown heading"
-    if is_same_heading:
-        source = "assumption: the vehicle landed at the take-off place with the initial heading"
+    heading_text = "the initial heading" if is_same_heading else "an unknown heading"
     return TrueFinalPose(
         displacement_m=split_by_axis(path.frame, np.zeros(3)),
         heading_change_deg=0.0 if is_same_heading else None,
         sigma_m=0.10,
         sigma_heading_deg=5.0 if is_same_heading else None,
-        source=source,
+        source=f"assumption: the vehicle landed at the take-off place with {heading_text}",
         assumed=True,
     )
 
@@ -172,11 +162,11 @@ def convert_measured_final_pose(path: Trajectory, landing: Landing) -> TrueFinal
 
 
 def find_final_pose_in_truth(
-    path: Trajectory, truth: Trajectory, segment: Segment, is_at_rest_at_both_ends: bool
+    path: Trajectory, truth: Trajectory, segment: Segment
 ) -> TrueFinalPose | str:
     """Return the true final pose from ground truth, or the reason why it is unknown."""
     try:
-        true_path = cut_trajectory(truth, segment, is_at_rest_at_both_ends)
+        true_path = cut_trajectory(truth, segment)
     except TrajectoryError as error:
         return str(error)
     displacement_m = true_path.position_m[-1] - true_path.position_m[0]

@@ -28,7 +28,6 @@ CorrectionName = Literal[
     "uncorrected",
     "by_distance_plain",
     "by_distance",
-    "pose_graph_all",
     "pose_graph_gated",
     "pose_graph_gnc",
 ]
@@ -184,16 +183,11 @@ class Loop(Record, kw_only=True):
 
     def select_reported_paths(self) -> tuple[PathResult, ...]:
         """Return the paths without duplicates."""
-        duplicate_names: set[CorrectionName] = set()
-        if all(closure.accepted for closure in self.closures):
-            # Without a rejected closure, this path equals "pose_graph_gated"
-            duplicate_names.add("pose_graph_all")
+        paths = self.find_paths()
         if isinstance(self.heading_error_deg, Unavailable):
             # Without a heading error, this path equals "by_distance_plain"
-            duplicate_names.add("by_distance")
-        return tuple(
-            path for name, path in self.find_paths().items() if name not in duplicate_names
-        )
+            paths.pop("by_distance", None)
+        return tuple(paths.values())
 
     def choose_best_path(self) -> PathResult:
         """Return the most reliable of the available paths."""
@@ -207,7 +201,7 @@ class Loop(Record, kw_only=True):
         return isinstance(self.true_end, TrueFinalPose) and self.true_end.assumed
 
     def solved_graph(self) -> PoseGraph:
-        """Return the optimised pose graph.
+        """Return the optimised pose graph; without accepted closures, the poses are odometry.
 
         Raises
         ------
@@ -216,7 +210,7 @@ class Loop(Record, kw_only=True):
         """
         if isinstance(self.graph, Unavailable):
             raise MissingDataError(f"{self.graph.what}: {self.graph.reason}.")
-        paths = self.find_paths()
-        pose_graph_path = paths.get("pose_graph_gated") or paths.get("pose_graph_all")
-        solution = None if pose_graph_path is None else pose_graph_path.solution
-        return self.graph if solution is None else replace(self.graph, poses=solution.poses)
+        corrected_path = self.corrections["pose_graph_gated"]
+        if isinstance(corrected_path, Unavailable) or corrected_path.solution is None:
+            return self.graph
+        return replace(self.graph, poses=corrected_path.solution.poses)

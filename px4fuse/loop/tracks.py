@@ -11,7 +11,7 @@ from scipy.spatial.transform import Rotation, Slerp
 from px4fuse.comparison.comparison import compare
 from px4fuse.comparison.preparation import prepare_comparison_inputs
 from px4fuse.comparison.projection import remove_origin_resets
-from px4fuse.core.arrays import Array
+from px4fuse.core.arrays import Array, interpolate_columns
 from px4fuse.core.reading import display_name, read_head, split_path_and_part
 from px4fuse.errors import MissingDataError, SettingsError, TrajectoryError
 from px4fuse.filter.signals import Segment
@@ -125,10 +125,7 @@ def _make_trajectory(
     rotation = rotation_variance = None
     if isinstance(orientation, pd.DataFrame):
         orientation_times_s = orientation.index.to_numpy()
-        covered_samples = position_samples[
-            (position_samples.index >= orientation_times_s[0])
-            & (position_samples.index <= orientation_times_s[-1])
-        ]
+        covered_samples = position_samples.loc[orientation_times_s[0] : orientation_times_s[-1]]
         if len(covered_samples) >= MIN_POSES:
             position_samples = covered_samples
             rotations = Rotation.from_quat(
@@ -137,11 +134,8 @@ def _make_trajectory(
             rotation = Slerp(orientation_times_s, rotations)(position_samples.index.to_numpy())
             reported_variance = _read_reported_variances(orientation, Columns.ROTATION_VARIANCE)
             if reported_variance is not None:
-                rotation_variance = np.column_stack(
-                    [
-                        np.interp(position_samples.index, orientation_times_s, column)
-                        for column in reported_variance.T
-                    ]
+                rotation_variance = interpolate_columns(
+                    position_samples.index.to_numpy(), orientation_times_s, reported_variance
                 )
     if len(position_samples) < MIN_POSES:
         raise MissingDataError(
@@ -250,11 +244,9 @@ def read_source(
             f"Use one of {', '.join(TRACK_NAMES)}.",
         )
     chosen_track_name = track_name or default
-    if chosen_track_name is None:
-        odometry = find_odometry(flight)
-        chosen_track_name = "vio"
-        if isinstance(odometry, Unavailable):
-            chosen_track_name = "ekf2"
-            if isinstance(flight.ekf2, Unavailable):
-                raise MissingDataError(f"{flight.log.name}: {odometry.reason}", odometry.remedy)
-    return LoopSource(trajectory_of(flight, chosen_track_name), flight)
+    odometry = find_odometry(flight)
+    if chosen_track_name is None and isinstance(odometry, Unavailable):
+        if isinstance(flight.ekf2, Unavailable):
+            raise MissingDataError(f"{flight.log.name}: {odometry.reason}", odometry.remedy)
+        chosen_track_name = "ekf2"
+    return LoopSource(trajectory_of(flight, chosen_track_name or "vio"), flight)

@@ -8,8 +8,8 @@ from px4fuse.analysis import Analysis
 from px4fuse.core.text import capitalise_first, format_number, format_p_value, join_first_names
 from px4fuse.finding import Finding
 from px4fuse.flight.model import Unavailable
-from px4fuse.loop import corrections
 from px4fuse.loop.analysis import MIN_UNIX_TIME_S
+from px4fuse.loop.corrections import CORRECTION_LABELS
 from px4fuse.loop.model import LANDING_CLOSURE_SOURCE, Closure, Loop
 from px4fuse.report.evaluation import describe_method, format_interval, plot_path
 from px4fuse.report.page import Cell, Page
@@ -40,11 +40,10 @@ LEAD_TEXT = (
 MAX_LISTED_CLOSURES = 10
 ERROR_COLOUR = SEVERITY_COLOURS["error"]
 PATH_STYLES = {
-    corrections.UNCORRECTED_LABEL: TRACK_STYLES["EKF2"],
-    corrections.POSITIONS_CORRECTED_LABEL: line_style("#79b294", 1.3, (0, (1.2, 1.2))),
-    corrections.HEADINGS_CORRECTED_LABEL: line_style("#3a7d5c", 1.0, (0, (6, 1.2, 1, 1.2))),
-    SOLUTION_LABELS["gated"]: line_style(KF_COLOUR, 1.2),
-    SOLUTION_LABELS["all"]: line_style("#8d6a9f", 0.9, (0, (2, 1))),
+    CORRECTION_LABELS["uncorrected"]: TRACK_STYLES["EKF2"],
+    CORRECTION_LABELS["by_distance_plain"]: line_style("#79b294", 1.3, (0, (1.2, 1.2))),
+    CORRECTION_LABELS["by_distance"]: line_style("#3a7d5c", 1.0, (0, (6, 1.2, 1, 1.2))),
+    CORRECTION_LABELS["pose_graph_gated"]: line_style(KF_COLOUR, 1.2),
 }
 MAP_HEIGHT = 290.0  # points
 

@@ -153,14 +153,12 @@ def _require_sufficient_motion(
     transform: Transform, estimate_m: Array, reference_m: Array, kind: str
 ) -> None:
     """Raise TrajectoryError if the motion is too small to estimate the rotation."""
-    estimate_extents_m, reference_extents_m = map(
-        _compute_principal_extents_m, (estimate_m, reference_m)
-    )
+    reference_extents_m = _compute_principal_extents_m(reference_m)
     residuals_m = reference_m - transform.apply(estimate_m)
     if kind == "yaw":
         extent_m = min(
-            float(np.hypot(*_compute_principal_extents_m(m[:, :2])))
-            for m in (estimate_m, reference_m)
+            float(np.linalg.norm(position_m[:, :2].std(axis=0)))
+            for position_m in (estimate_m, reference_m)
         )
         residuals_m = residuals_m[:, :2]
         max_extent_m = float(np.linalg.norm(reference_extents_m))
@@ -170,7 +168,7 @@ def _require_sufficient_motion(
     else:
         # motion along a line does not determine the rotation around the line
         max_extent_m, extent_m, _ = np.minimum(
-            transform.scale * estimate_extents_m, reference_extents_m
+            transform.scale * _compute_principal_extents_m(estimate_m), reference_extents_m
         )
         max_residual_ratio = MAX_RESIDUAL_RATIO_FOR_ROTATION
         motion_text = "motion perpendicular to the main direction of flight"

@@ -6,7 +6,13 @@ from typing import Literal
 import numpy as np
 from scipy.spatial.transform import Slerp
 
-from px4fuse.core.arrays import Array, BoolArray, IntArray, compute_median_interval_s
+from px4fuse.core.arrays import (
+    Array,
+    BoolArray,
+    IntArray,
+    compute_median_interval_s,
+    interpolate_columns,
+)
 from px4fuse.core.record import Count, NotNegative, Record
 from px4fuse.errors import TrajectoryError
 from px4fuse.trajectory.model import MIN_POSES, Trajectory
@@ -79,26 +85,25 @@ def associate(
             method, max_gap_s = "nearest", estimate_interval_s
     time_s = estimate.time_s + time_offset_s
     reference_start_s, reference_end_s = reference.time_s[[0, -1]]
+    max_time_outside_reference_s = 0.0
     if method == "nearest":
-        gap_limit_s = max_time_outside_reference_s = (
+        max_gap_s = max_time_outside_reference_s = (
             MAX_PAIR_TIME_DIFFERENCE_S if max_gap_s is None else max_gap_s
         )
         pose_indices, reference_indices = _pair_nearest(
-            estimate.time_s, reference.time_s, gap_limit_s, time_offset_s
+            estimate.time_s, reference.time_s, max_gap_s, time_offset_s
         )
         matched_reference = reference[reference_indices]
     else:
-        gap_limit_s = choose_gap_limit_s(reference.time_s) if max_gap_s is None else max_gap_s
-        max_time_outside_reference_s = 0.0
-        pose_indices = np.flatnonzero(is_bracketed(time_s, reference.time_s, gap_limit_s))
+        max_gap_s = choose_gap_limit_s(reference.time_s) if max_gap_s is None else max_gap_s
+        pose_indices = np.flatnonzero(is_bracketed(time_s, reference.time_s, max_gap_s))
         matched_reference = _interpolate_poses(reference, time_s[pose_indices])
     if len(pose_indices) < MIN_POSES:
         raise TrajectoryError(
             f"{estimate.name}: {len(pose_indices)} poses match in time; at least {MIN_POSES} are "
-            "needed. With the time offset "
-            f"{time_offset_s:.12g} s, the estimate is from {time_s[0]:.3f} to {time_s[-1]:.3f} s; "
-            f"the reference {reference.name} is from {reference_start_s:.3f} to "
-            f"{reference_end_s:.3f} s.",
+            f"needed. With the time offset {time_offset_s:.12g} s, the estimate is from "
+            f"{time_s[0]:.3f} to {time_s[-1]:.3f} s; the reference {reference.name} is from "
+            f"{reference_start_s:.3f} to {reference_end_s:.3f} s.",
             "Check that both trajectories are of the same flight. If clocks differ, give "
             "`time_offset_s` auto.",
         )
@@ -106,20 +111,18 @@ def associate(
         time_s > reference_end_s + max_time_outside_reference_s
     )
     pose_count_outside_reference = int(is_outside.sum())
-    intervals_of_used_poses_s = np.diff(time_s[pose_indices])
-    intervals_of_used_poses_s = intervals_of_used_poses_s[
-        intervals_of_used_poses_s <= max(5.0 * estimate_interval_s, 0.5)
-    ]
+    intervals_s = np.diff(time_s[pose_indices])
+    covered_duration_s = intervals_s[intervals_s <= max(5.0 * estimate_interval_s, 0.5)].sum()
     used_pose_count, pose_count = len(np.unique(pose_indices)), len(estimate)
     association = Association(
         method=method,
         poses=len(pose_indices),
-        max_gap_s=gap_limit_s,
+        max_gap_s=max_gap_s,
         outside=pose_count_outside_reference,
         in_gaps=pose_count - pose_count_outside_reference - used_pose_count,
         coverage_estimate=used_pose_count / pose_count,
         coverage_reference=min(
-            float(intervals_of_used_poses_s.sum() / (reference_end_s - reference_start_s)), 1.0
+            float(covered_duration_s / (reference_end_s - reference_start_s)), 1.0
         ),
     )
     return estimate[pose_indices], matched_reference, association
@@ -132,16 +135,15 @@ def choose_gap_limit_s(time_s: Array, min_gap_limit_s: float = MIN_GAP_LIMIT_S) 
 
 def is_bracketed(time_s: Array, reference_time_s: Array, gap_limit_s: float) -> BoolArray:
     """Return a mask of times whose neighbouring reference times differ by at most a limit."""
-    next_indices = np.clip(np.searchsorted(reference_time_s, time_s), 1, len(reference_time_s) - 1)
-    previous_reference_time_s = reference_time_s[next_indices - 1]
-    next_reference_time_s = reference_time_s[next_indices]
-    is_between = (
-        (previous_reference_time_s <= time_s)
-        & (time_s <= next_reference_time_s)
-        & (next_reference_time_s - previous_reference_time_s <= gap_limit_s)
+    next_indices = np.searchsorted(reference_time_s[1:-1], time_s) + 1
+    previous_time_s, next_time_s = (
+        reference_time_s[next_indices - 1],
+        reference_time_s[next_indices],
     )
+    is_between = (previous_time_s <= time_s) & (time_s <= next_time_s)
+    is_near = next_time_s - previous_time_s <= gap_limit_s
     return np.asarray(
-        is_between | (previous_reference_time_s == time_s) | (next_reference_time_s == time_s)
+        (is_between & is_near) | (previous_time_s == time_s) | (next_time_s == time_s)
     )
 
 
@@ -150,15 +152,9 @@ def _interpolate_poses(trajectory: Trajectory, time_s: Array) -> Trajectory:
     rotation = trajectory.rotation
     if rotation is not None and len(time_s):
         rotation = Slerp(trajectory.time_s, rotation)(time_s)
-    poses = trajectory.replace_positions(interpolate_positions(trajectory, time_s))
+    position_m = interpolate_columns(time_s, trajectory.time_s, trajectory.position_m)
+    poses = trajectory.replace_positions(position_m)
     return replace(poses, rotation=rotation, time_s=time_s)
-
-
-def interpolate_positions(trajectory: Trajectory, time_s: Array) -> Array:
-    """Interpolate the positions at times within the trajectory, shape (n, 3)."""
-    return np.stack(
-        [np.interp(time_s, trajectory.time_s, column) for column in trajectory.position_m.T], -1
-    )
 
 
 def _pair_nearest(
@@ -169,23 +165,10 @@ def _pair_nearest(
     is_estimate_denser = len(estimate_time_s) > len(reference_time_s)
     sparse_time_s = reference_time_s if is_estimate_denser else estimate_time_s
     dense_time_s = estimate_time_s + offset_s if is_estimate_denser else reference_time_s - offset_s
-    next_indices = np.minimum(
-        np.searchsorted(dense_time_s, sparse_time_s, side="right"),
-        len(dense_time_s) - 1,
-    )
-    previous_indices = np.maximum(next_indices - 1, 0)
-    nearest_indices = np.where(
-        np.abs(dense_time_s[next_indices] - sparse_time_s)
-        < np.abs(sparse_time_s - dense_time_s[previous_indices]),
-        next_indices,
-        previous_indices,
-    )
-    paired_indices = np.flatnonzero(
-        np.abs(dense_time_s[nearest_indices] - sparse_time_s) <= max_difference_s
-    )
-    nearest_indices = nearest_indices[paired_indices]
-    return (
-        (nearest_indices, paired_indices)
-        if is_estimate_denser
-        else (paired_indices, nearest_indices)
-    )
+    next_indices = np.searchsorted(dense_time_s[1:-1], sparse_time_s, side="right") + 1
+    time_to_previous_s = np.abs(sparse_time_s - dense_time_s[next_indices - 1])
+    is_next_nearer = np.abs(dense_time_s[next_indices] - sparse_time_s) < time_to_previous_s
+    nearest_indices = next_indices - 1 + is_next_nearer
+    is_paired = np.abs(dense_time_s[nearest_indices] - sparse_time_s) <= max_difference_s
+    pair_indices = np.flatnonzero(is_paired), nearest_indices[is_paired]
+    return pair_indices[::-1] if is_estimate_denser else pair_indices

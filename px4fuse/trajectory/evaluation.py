@@ -12,9 +12,8 @@ from itertools import pairwise
 from typing import Literal
 
 import numpy as np
-from msgspec import structs
 
-from px4fuse.core.arrays import Array, BoolArray, compute_median_interval_s
+from px4fuse.core.arrays import Array, BoolArray
 from px4fuse.core.record import NOT_WRITTEN, NotWritten, OrUnavailable, Record
 from px4fuse.core.text import capitalise_first, format_metres
 from px4fuse.errors import TrajectoryError
@@ -40,8 +39,6 @@ MIN_POSE_COUNT_FOR_PLACEHOLDER, MIN_EXTENT_FOR_PLACEHOLDER_M = 10, 1.0
 MIN_FREEZE_DURATION_S, MIN_REFERENCE_MOTION_DURING_FREEZE_M = 2.0, 0.5
 # Minimum jump (m) relative to the reference, and its minimum ratio to the median step error
 MIN_JUMP_M, MIN_JUMP_TO_MEDIAN_RATIO = 0.5, 20.0
-# A jump to a position within this distance (m) of the start indicates a restart of the SLAM map
-MAX_DISTANCE_FROM_START_AFTER_RESTART_M = 0.5
 MAX_STATED_JUMPS = 5
 # Minimum rotation (rad) between the orientations of two trajectories with different body axes
 MIN_ROTATION_BETWEEN_BODY_AXES_RAD = np.radians(30.0)
@@ -72,21 +69,19 @@ def find_frozen_poses(
 ) -> tuple[BoolArray, tuple[str, ...]]:
     """Return a mask of repeated positions while the reference moves, and warnings."""
     is_frozen, warnings = np.zeros(len(estimate), bool), []
-    is_new_position = np.r_[True, np.any(np.diff(estimate.position_m, axis=0) != 0.0, axis=1)]
-    for start_index, end_index in pairwise(
-        [*np.flatnonzero(is_new_position).tolist(), len(estimate)]
-    ):
+    is_new_position = np.append(True, np.diff(estimate.position_m, axis=0).any(axis=1))
+    new_position_indices = np.append(np.flatnonzero(is_new_position), len(estimate)).tolist()
+    for start_index, end_index in pairwise(new_position_indices):
         start_s, end_s = estimate.time_s[[start_index, end_index - 1]].tolist()
         if end_s - start_s < MIN_FREEZE_DURATION_S:
             continue
         reference_position_m = reference.cut_to_span(
             start_s + time_offset_s, end_s + time_offset_s
         ).position_m
-        if (
-            len(reference_position_m)
-            and (motion_m := np.linalg.norm(np.ptp(reference_position_m, axis=0)))
-            > MIN_REFERENCE_MOTION_DURING_FREEZE_M
-        ):
+        motion_m = 0.0
+        if len(reference_position_m):
+            motion_m = float(np.linalg.norm(np.ptp(reference_position_m, axis=0)))
+        if motion_m > MIN_REFERENCE_MOTION_DURING_FREEZE_M:
             is_frozen[start_index + 1 : end_index] = True
             warnings.append(
                 f"The position of {estimate.name} does not change from "
@@ -110,20 +105,11 @@ def find_jump_warnings(estimate: Trajectory, reference: Trajectory) -> tuple[str
         return ()
     times_s = estimate.time_s[jump_indices + 1] - estimate.time_s[0]
     times_text = ", ".join(f"{time_s:.1f}" for time_s in times_s[:MAX_STATED_JUMPS])
-    distances_m = [
-        np.linalg.norm(estimate.position_m[jump_indices + 1] - origin_m, axis=1)
-        for origin_m in (estimate.position_m[0], 0.0)
-    ]
-    cause_text = "The SLAM system probably lost track or relocalised."
-    if np.min(distances_m) < MAX_DISTANCE_FROM_START_AFTER_RESTART_M:
-        cause_text = (
-            "The SLAM system probably restarted its map, because a jump ends near the start."
-        )
     return (
         f"{estimate.name} jumps by up to {step_differences_m[jump_indices].max():.1f} m, "
-        f"{times_text} s after its start. {cause_text} ATE and RPE contain the jumps. "
-        "Evaluate the poses before and after a jump as separate files, because one alignment does "
-        "not fit both.",
+        f"{times_text} s after its start. The SLAM system probably lost track, relocalised or "
+        "restarted its map. ATE and RPE contain the jumps. Evaluate the poses before and after a "
+        "jump as separate files, because one alignment does not fit both.",
     )
 
 
@@ -154,11 +140,8 @@ MIN_ATE_TO_EXTENT_RATIO_FOR_MIRROR_TEST = 0.03
 MAX_ATE_RATIO_OF_BETTER_OFFSET = 0.8
 # A better time offset must keep at least this fraction of the evaluated poses
 MIN_POSE_COUNT_RATIO_OF_BETTER_OFFSET = 0.8
-# Above this ratio of pose intervals, reference and estimate are probably interchanged
-MAX_POSE_INTERVAL_RATIO = 5.0
 
 _Z_DOWN_FRAMES = ("NED", "FRD")
-_Z_UP_FRAMES = ("ENU",)
 # Sources of trajectories with unknown vertical direction
 _KINDS_WITHOUT_KNOWN_VERTICAL = ("slam", "unknown")
 # File names that indicate monocular SLAM, which has an unknown scale
@@ -254,16 +237,15 @@ def evaluate(
     SettingsError
         A distance or time for the RPE is not positive, or a number of frames is not an integer.
     """
-    (estimate, reference), constant_orientation_notes = zip(
-        *map(drop_constant_orientation, (estimate, reference)), strict=True
-    )
+    estimate, estimate_notes = drop_constant_orientation(estimate)
+    reference, reference_notes = drop_constant_orientation(reference)
     time_offset, offset_warnings, better_offset_s = _choose_time_offset(
         estimate, reference, time_offset_s
     )
     added_offset_s = time_offset.offset_s or 0.0
     is_frozen, frozen_warnings = find_frozen_poses(estimate, reference, added_offset_s)
     matched_estimate, matched_reference, association_result = associate(
-        estimate[~is_frozen] if is_frozen.any() else estimate,
+        estimate[~is_frozen],
         reference,
         method=association,
         max_gap_s=max_gap_s,
@@ -287,6 +269,12 @@ def evaluate(
             matched_estimate.position_m, matched_reference.position_m, alignment
         )
         aligned_estimate = _apply_transform(transform, matched_estimate)
+    argument_order_warnings = []
+    if estimate.kind == "truth" != reference.kind:
+        argument_order_warnings.append(
+            f"{estimate.name} is ground truth, but {reference.name} is not. Check the order of the "
+            "arguments: first the estimate, then the reference."
+        )
     distance_m = cumulative_distance(matched_reference.position_m)
     position_error_m = np.linalg.norm(
         aligned_estimate.position_m - matched_reference.position_m, axis=1
@@ -335,12 +323,12 @@ def evaluate(
         aligned_position_m=aligned_estimate.position_m,
         reference_position_m=matched_reference.position_m,
         position_error_m=position_error_m,
-        notes=(*constant_orientation_notes[0], *constant_orientation_notes[1], *notes),
+        notes=(*estimate_notes, *reference_notes, *notes),
         warnings=(
             *frozen_warnings,
             *jump_warnings,
             *line_motion_warnings,
-            *_find_argument_order_warnings(estimate, reference),
+            *argument_order_warnings,
             *_find_mirror_warnings(
                 matched_estimate, matched_reference, alignment, position_statistics.rmse
             ),
@@ -366,9 +354,8 @@ def choose_alignment(estimate: Trajectory, reference: Trajectory) -> tuple[Align
     if estimate.kind == "truth" and (has_same_frame or reference.kind == "truth"):
         return "none", "No alignment is applied, because the estimate is ground truth."
     frames_text = f"{estimate.frame} and {reference.frame}"
-    has_common_vertical = any(
-        {estimate.frame, reference.frame} <= set(vertical_frames)
-        for vertical_frames in (_Z_DOWN_FRAMES, _Z_UP_FRAMES)
+    has_common_vertical = estimate.frame == reference.frame == "ENU" or (
+        estimate.frame in _Z_DOWN_FRAMES and reference.frame in _Z_DOWN_FRAMES
     )
     if has_common_vertical and estimate.kind not in _KINDS_WITHOUT_KNOWN_VERTICAL:
         return "yaw", (
@@ -415,43 +402,31 @@ def _choose_time_offset(
 
     Also return warnings, and a better time offset (s) or None.
     """
-    is_offset_given = given_offset_s not in (None, "auto")
-    clock_offset_s = compute_clock_offset_s(estimate, reference)
     if isinstance(given_offset_s, float | int):
-        clock_offset_s = given_offset_s
+        reason = "The user chose the time offset."
+        return TimeOffset(offset_s=given_offset_s, is_determinable=True, reason=reason), [], None
+    clock_offset_s = compute_clock_offset_s(estimate, reference)
+    added_offset_s = clock_offset_s or 0.0
     match_text = (
         f"Poses are matched by {'UNIX time' if clock_offset_s else 'unchanged timestamps'}."
     )
-    added_offset_s = clock_offset_s or 0.0
-    offset_without_estimate = TimeOffset(
-        offset_s=added_offset_s,
-        is_determinable=True,
-        reason="The user chose the time offset." if is_offset_given else match_text,
-    )
+    estimated_offset = estimate_time_offset(estimate, reference)
     start_s, end_s = estimate.time_s[[0, -1]] + added_offset_s
     is_disjoint = start_s > reference.time_s[-1] or end_s < reference.time_s[0]
-    is_estimated = given_offset_s == "auto" or is_disjoint
-    if is_offset_given:
-        return offset_without_estimate, [], None
-    estimated_offset = estimate_time_offset(estimate, reference)
-    if is_estimated:
+    if given_offset_s == "auto" or is_disjoint:
         if estimated_offset.is_determinable:
             return estimated_offset, [], None
-        fallback_offset = structs.replace(
-            offset_without_estimate, is_determinable=False, reason=estimated_offset.reason
-        )
-        return (
-            fallback_offset,
-            [f"{estimated_offset.reason} {match_text}"],
-            None,
-        )
+        reason = estimated_offset.reason
+        fallback = TimeOffset(offset_s=added_offset_s, is_determinable=False, reason=reason)
+        return fallback, [f"{reason} {match_text}"], None
     low_s, high_s = estimated_offset.interval_s or (added_offset_s, added_offset_s)
     best_offset_s = estimated_offset.offset_s or added_offset_s
     has_better_offset = (
         not low_s <= added_offset_s <= high_s
         and abs(best_offset_s - added_offset_s) >= MIN_REPORTED_TIME_OFFSET_S
     )
-    return offset_without_estimate, [], best_offset_s if has_better_offset else None
+    time_offset = TimeOffset(offset_s=added_offset_s, is_determinable=True, reason=match_text)
+    return time_offset, [], best_offset_s if has_better_offset else None
 
 
 def _find_better_offset_warnings(
@@ -493,21 +468,6 @@ def _find_mirror_warnings(
                 "estimate to a right-handed frame such as ENU or NED."
             )
             return
-
-
-def _find_argument_order_warnings(estimate: Trajectory, reference: Trajectory) -> Iterator[str]:
-    if reference.kind == "truth" != estimate.kind:
-        return
-    estimate_interval_s = compute_median_interval_s(estimate.time_s)
-    reference_interval_s = compute_median_interval_s(reference.time_s)
-    action = "Check the order of the arguments: first the estimate, then the reference."
-    if estimate.kind == "truth" != reference.kind:
-        yield f"{estimate.name} is ground truth, but {reference.name} is not. {action}"
-    if reference_interval_s > MAX_POSE_INTERVAL_RATIO * estimate_interval_s:
-        yield (
-            f"The reference has a pose every {reference_interval_s:.3g} s, the estimate every "
-            f"{estimate_interval_s:.3g} s. {action}"
-        )
 
 
 def _find_comparison_warnings(
@@ -606,7 +566,7 @@ def _rotate_to_reference_body(
     aligned_estimate: Trajectory, reference: Trajectory
 ) -> tuple[Trajectory, tuple[str, ...]]:
     """Remove the constant rotation between camera and vehicle axes, and return a note."""
-    vehicle_frames = (*_Z_DOWN_FRAMES, *_Z_UP_FRAMES)
+    vehicle_frames = (*_Z_DOWN_FRAMES, "ENU")
     body_axes_differ = (aligned_estimate.frame == "camera") != (reference.frame == "camera") or any(
         track.kind == "slam"
         and other_track.frame in vehicle_frames

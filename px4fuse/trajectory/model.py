@@ -127,11 +127,6 @@ class Trajectory:
 
     __repr__ = one_line_repr
 
-    @property
-    def is_from_log(self) -> bool:
-        """True for a track of a flight log."""
-        return self.name.endswith(f":{self.kind}")
-
     def __len__(self) -> int:
         return len(self.time_s)
 
@@ -158,13 +153,8 @@ class Trajectory:
         rotation = self.rotation
         if rotation is not None and world_rotation is not None:
             rotation = world_rotation * rotation
-        return replace(
-            self,
-            position_m=position_m,
-            rotation=rotation,
-            position_variance_m2=None,
-            rotation_variance_rad2=None,
-        )
+        without_variances = replace(self, position_variance_m2=None, rotation_variance_rad2=None)
+        return replace(without_variances, position_m=position_m, rotation=rotation)
 
     def describe_track(self) -> Track:
         """Return a summary of the trajectory for results.json."""

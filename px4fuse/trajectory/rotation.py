@@ -2,7 +2,7 @@
 
 import numpy as np
 
-from px4fuse.core.arrays import Array
+from px4fuse.core.arrays import Array, interpolate_columns
 
 
 def multiply(a: Array, b: Array) -> Array:
@@ -96,15 +96,9 @@ def cumulative_product(quaternions: Array) -> Array:
 
 def interpolate(times: Array, known_times: Array, quaternions: Array) -> Array:
     """Interpolate quaternions linearly and normalise them, for small angles between them."""
-    relative_signs = np.sign(np.sum(quaternions[1:] * quaternions[:-1], axis=1))
-    continuity_signs = np.concatenate(
-        [[1.0], np.cumprod(np.where(relative_signs == 0.0, 1.0, relative_signs))]
-    )
-    continuous_quaternions = quaternions * continuity_signs[:, None]
-    q = np.stack(
-        [np.interp(times, known_times, component) for component in continuous_quaternions.T],
-        axis=-1,
-    )
+    is_sign_changed = np.sum(quaternions[1:] * quaternions[:-1], axis=1) < 0.0
+    continuity_signs = np.append(1.0, np.cumprod(np.where(is_sign_changed, -1.0, 1.0)))
+    q = interpolate_columns(times, known_times, quaternions * continuity_signs[:, None])
     return np.asarray(q / np.linalg.norm(q, axis=-1, keepdims=True))
 
 

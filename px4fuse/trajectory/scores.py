@@ -2,6 +2,7 @@
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from functools import partial
 from typing import Literal
 
 import numpy as np
@@ -134,16 +135,9 @@ def choose_default_deltas(distance_m: Array, time_s: Array) -> tuple[RpePairDist
     def choose_delta_values(
         distance_or_time: Array, values: Sequence[float], min_fraction: float
     ) -> list[float]:
-        total_distance_or_time = float(np.ptp(distance_or_time))
-        minimum = max(
-            min_fraction * total_distance_or_time,
-            2.0 * compute_median_interval_s(distance_or_time),
-        )
-        return [
-            value
-            for value in values
-            if minimum <= value <= MAX_PAIR_DISTANCE_FRACTION * total_distance_or_time
-        ]
+        total = float(np.ptp(distance_or_time))
+        minimum = max(min_fraction * total, 2.0 * compute_median_interval_s(distance_or_time))
+        return [value for value in values if minimum <= value <= MAX_PAIR_DISTANCE_FRACTION * total]
 
     distances_m = choose_delta_values(
         distance_m, DEFAULT_RPE_DISTANCES_M, MIN_PAIR_DISTANCE_FRACTION_OF_PATH
@@ -186,9 +180,7 @@ def find_pose_pairs(
         frame_step = int(delta.value)
         if frame_step != delta.value:
             raise SettingsError(f"RPE delta {delta}: the number of frames must be an integer.")
-        start_indices = np.arange(
-            0, max(pose_count - frame_step, 0), 1 if all_pairs else frame_step
-        )
+        start_indices = np.arange(0, pose_count - frame_step, 1 if all_pairs else frame_step)
         return start_indices, start_indices + frame_step
     distance_or_time = cumulative_distance(position_m) if delta.unit == "m" else time_s - time_s[0]
     if not all_pairs:
@@ -199,21 +191,15 @@ def find_pose_pairs(
     candidate_indices = np.clip(
         nearest_indices[:, None] + np.arange(-2, 2), start_indices[:, None] + 1, pose_count - 1
     )
-    pair_distance_error = np.abs(
-        distance_or_time[candidate_indices] - distance_or_time[start_indices, None] - delta.value
-    )
-    best_candidate_columns = np.argmin(pair_distance_error, axis=1)
+    candidates = distance_or_time[candidate_indices]
+    pair_distance_error = np.abs(candidates - distance_or_time[start_indices, None] - delta.value)
+    best_columns = np.argmin(pair_distance_error, axis=1)
     # Several poses have an equal distance while the vehicle is at rest: use the first
-    first_indices_at_same_distance = np.searchsorted(
-        distance_or_time, distance_or_time[candidate_indices[start_indices, best_candidate_columns]]
-    )
-    is_near = (
-        pair_distance_error[start_indices, best_candidate_columns]
-        <= MAX_RELATIVE_PAIR_DISTANCE_ERROR * delta.value
-    )
-    return start_indices[is_near], np.maximum(first_indices_at_same_distance, start_indices + 1)[
-        is_near
-    ]
+    end_indices = np.searchsorted(distance_or_time, candidates[start_indices, best_columns])
+    end_indices = np.maximum(end_indices, start_indices + 1)
+    min_error = pair_distance_error[start_indices, best_columns]
+    is_near = min_error <= MAX_RELATIVE_PAIR_DISTANCE_ERROR * delta.value
+    return start_indices[is_near], end_indices[is_near]
 
 
 def _find_consecutive_pairs(steps: Array, delta: float) -> tuple[IntArray, IntArray]:
@@ -251,21 +237,14 @@ def compute_relative_error(
         reference.position_m, reference.time_s, delta, all_pairs=all_pairs
     )
     analysis_name = f"RPE over {delta}"
+    make_result = partial(RelativeError, delta.value, delta.unit, all_pairs, "reference")
     if not len(start_indices):
         no_pairs_result = Unavailable(
             analysis_name,
             f"the reference has no pair of poses with a distance of {delta}",
             "Use another distance of RPE pairs (delta).",
         )
-        return RelativeError(
-            delta.value,
-            delta.unit,
-            all_pairs,
-            "reference",
-            no_pairs_result,
-            no_pairs_result,
-            no_pairs_result,
-        )
+        return make_result(no_pairs_result, no_pairs_result, no_pairs_result)
     displacements_m = [
         track.position_m[end_indices] - track.position_m[start_indices]
         for track in (aligned_estimate, reference)
@@ -295,15 +274,7 @@ def compute_relative_error(
     rmse_interval_m = estimate_rmse_interval(
         translation_m, analysis_name, min_block_length=overlapping_pair_count
     )
-    return RelativeError(
-        delta.value,
-        delta.unit,
-        all_pairs,
-        "reference",
-        compute_statistics(translation_m),
-        rmse_interval_m,
-        rotation_deg,
-    )
+    return make_result(compute_statistics(translation_m), rmse_interval_m, rotation_deg)
 
 
 def get_rotations(
@@ -329,14 +300,9 @@ def estimate_rmse_interval(
     """
     squared_errors = errors**2
     error_count = len(squared_errors)
+    correlation_time = compute_autocorrelation_time(squared_errors)
     block_length = max(
-        int(
-            np.ceil(
-                BLOCK_LENGTH_IN_CORRELATION_TIMES * compute_autocorrelation_time(squared_errors)
-            )
-        ),
-        min_block_length,
-        1,
+        int(np.ceil(BLOCK_LENGTH_IN_CORRELATION_TIMES * correlation_time)), min_block_length
     )
     if error_count < MIN_BOOTSTRAP_BLOCKS * block_length:
         return Unavailable(
@@ -345,12 +311,12 @@ def estimate_rmse_interval(
             f"fewer than {MIN_BOOTSTRAP_BLOCKS:.0f} independent blocks",
             "Use a longer flight.",
         )
-    cumulative_squared_errors = np.concatenate(
-        ([0.0], np.cumsum(np.concatenate((squared_errors, squared_errors[: block_length - 1]))))
+    circular_errors = np.append(squared_errors, squared_errors[: block_length - 1])
+    cumulative_errors = np.append(0.0, np.cumsum(circular_errors))
+    # Mean squared error of each circular block
+    block_means = (cumulative_errors[block_length:] - cumulative_errors[:-block_length]) / (
+        block_length
     )
-    block_means = (
-        cumulative_squared_errors[block_length:] - cumulative_squared_errors[:-block_length]
-    ) / block_length  # mean squared error of each circular block
     block_count = error_count / block_length
     block_starts = np.random.default_rng(BOOTSTRAP_SEED).integers(
         0, error_count, (BOOTSTRAP_RESAMPLES, round(block_count))
@@ -358,9 +324,8 @@ def estimate_rmse_interval(
     resampled_means = block_means[block_starts].mean(axis=1)
     student_t_quantile = float(stdtrit(block_count - 1.0, 0.5 + CONFIDENCE_LEVEL / 2.0))
     tail_probability = float(ndtr(-student_t_quantile * np.sqrt(block_count / (block_count - 1.0))))
-    low, high = np.sqrt(
-        np.maximum(np.quantile(resampled_means, [tail_probability, 1.0 - tail_probability]), 0.0)
-    )
+    limits = np.quantile(resampled_means, [tail_probability, 1.0 - tail_probability])
+    low, high = np.sqrt(np.maximum(limits, 0.0))
     return RmseInterval(float(low), float(high), block_length, block_count)
 
 
@@ -372,14 +337,9 @@ def compute_autocorrelation_time(values: Array) -> float:
     sample_count = len(centred_values)
     covariance_by_lag = autocovariance(centred_values)
     correlation_times = 2.0 * np.cumsum(covariance_by_lag / covariance_by_lag[0]) - 1.0
-    possible_window_lengths = np.flatnonzero(
+    is_long_enough = (
         np.arange(sample_count) >= WINDOW_LENGTH_IN_CORRELATION_TIMES * correlation_times
     )
-    return max(
-        1.0,
-        float(
-            correlation_times[possible_window_lengths[0]]
-            if len(possible_window_lengths)
-            else sample_count
-        ),
-    )
+    if not is_long_enough.any():
+        return float(sample_count)
+    return max(1.0, float(correlation_times[np.argmax(is_long_enough)]))

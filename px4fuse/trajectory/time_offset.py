@@ -12,10 +12,10 @@ from scipy.optimize import minimize_scalar
 from scipy.spatial.transform import Slerp
 from scipy.special import stdtrit
 
-from px4fuse.core.arrays import Array, BoolArray, compute_median_interval_s
+from px4fuse.core.arrays import Array, BoolArray, compute_median_interval_s, interpolate_columns
 from px4fuse.core.record import Record, Span
 from px4fuse.trajectory.alignment import Transform, compute_rms_length_m, umeyama
-from px4fuse.trajectory.association import choose_gap_limit_s, interpolate_positions, is_bracketed
+from px4fuse.trajectory.association import choose_gap_limit_s, is_bracketed
 from px4fuse.trajectory.correlation import autocovariance, compute_moments
 from px4fuse.trajectory.model import MIN_POSES, Trajectory
 
@@ -92,14 +92,12 @@ def estimate_time_offset(estimate: Trajectory, reference: Trajectory) -> TimeOff
     """
     if compute_median_interval_s(estimate.time_s) >= compute_median_interval_s(reference.time_s):
         return _search_offset(estimate, reference)
-    offset_of_swapped_tracks = _search_offset(reference, estimate)
-    if offset_of_swapped_tracks.offset_s is None or offset_of_swapped_tracks.interval_s is None:
-        return offset_of_swapped_tracks
-    low_s, high_s = offset_of_swapped_tracks.interval_s
+    swapped_offset = _search_offset(reference, estimate)
+    if swapped_offset.offset_s is None or swapped_offset.interval_s is None:
+        return swapped_offset
+    low_s, high_s = swapped_offset.interval_s
     return structs.replace(
-        offset_of_swapped_tracks,
-        offset_s=-offset_of_swapped_tracks.offset_s,
-        interval_s=(-high_s, -low_s),
+        swapped_offset, offset_s=-swapped_offset.offset_s, interval_s=(-high_s, -low_s)
     )
 
 
@@ -114,61 +112,49 @@ def _search_offset(sparse_track: Trajectory, dense_track: Trajectory) -> TimeOff
             "the speeds of both trajectories are not correlated at any time offset (no motion, "
             "constant speed, or different flights)"
         )
-    offset_fits = (
-        _refine_offset(sparse_track, dense_track, lag, SEARCH_HALF_WIDTH_S)
-        for lag in candidate_offsets_s
-    )
-    accepted_fits = sorted(
-        (
-            fit
-            for fit in offset_fits
-            if fit is not None and fit.compute_misfit() <= MAX_RELATIVE_MISFIT
-        ),
-        key=_OffsetFit.compute_misfit,
-    )
+    offset_fits = [
+        _refine_offset(sparse_track, dense_track, offset_s, SEARCH_HALF_WIDTH_S)
+        for offset_s in candidate_offsets_s
+    ]
+    accepted_fits = [
+        fit for fit in offset_fits if fit and fit.compute_misfit() <= MAX_RELATIVE_MISFIT
+    ]
     if not accepted_fits:
         return _make_unknown_offset(
             "at all time offsets with correlated speeds, the positions do not match or too few "
             "poses overlap"
         )
-    best_fit = accepted_fits[0]
-    fits_similar_to_best = [
-        fit
-        for fit in accepted_fits
-        if fit.compute_misfit() <= MIN_SECOND_BEST_RESIDUAL_RATIO * best_fit.compute_misfit()
-    ]
+    best_fit = min(accepted_fits, key=_OffsetFit.compute_misfit)
+    max_misfit = MIN_SECOND_BEST_RESIDUAL_RATIO * best_fit.compute_misfit()
+    fits_similar_to_best = [fit for fit in accepted_fits if fit.compute_misfit() <= max_misfit]
     if clock_offset_s is not None:
         # Of several equally good offsets, the nearest to the UNIX time is used
         best_fit = min(fits_similar_to_best, key=lambda fit: abs(fit.offset_s - clock_offset_s))
-    for fit in fits_similar_to_best if clock_offset_s is None else []:
-        offset_difference_s = abs(fit.offset_s - best_fit.offset_s)
-        if offset_difference_s > MIN_CORRELATION_PEAK_DISTANCE_S:
-            return _make_unknown_offset(
-                "the motion is periodic: two time offsets that differ by "
-                f"{offset_difference_s:.1f} s give an ATE of "
-                f"{best_fit.compute_residual_rms_m():.3g} m and "
-                f"{fit.compute_residual_rms_m():.3g} m"
-            )
+    else:
+        for fit in sorted(fits_similar_to_best, key=_OffsetFit.compute_misfit):
+            offset_difference_s = abs(fit.offset_s - best_fit.offset_s)
+            if offset_difference_s > MIN_CORRELATION_PEAK_DISTANCE_S:
+                return _make_unknown_offset(
+                    "the motion is periodic: two time offsets that differ by "
+                    f"{offset_difference_s:.1f} s give an ATE of "
+                    f"{best_fit.compute_residual_rms_m():.3g} m and "
+                    f"{fit.compute_residual_rms_m():.3g} m"
+                )
     # In a narrower search window, more poses overlap in time
     best_fit = (
         _refine_offset(sparse_track, dense_track, best_fit.offset_s, FINE_SEARCH_HALF_WIDTH_S)
         or best_fit
     )
-    interval_half_width_s = _compute_interval_half_width_s(sparse_track, dense_track, best_fit)
-    if not interval_half_width_s <= MAX_INTERVAL_HALF_WIDTH_S:
-        interval_text = (
-            f" (95 %: ±{interval_half_width_s:.2g} s)" if np.isfinite(interval_half_width_s) else ""
-        )
+    half_width_s = _compute_interval_half_width_s(sparse_track, dense_track, best_fit)
+    if half_width_s > MAX_INTERVAL_HALF_WIDTH_S:
+        interval_text = f" (95 %: ±{half_width_s:.2g} s)" if np.isfinite(half_width_s) else ""
         return _make_unknown_offset(
             "the speed is nearly constant, so a time offset cannot be distinguished from a "
             f"position offset{interval_text}"
         )
     return TimeOffset(
         offset_s=best_fit.offset_s,
-        interval_s=(
-            best_fit.offset_s - interval_half_width_s,
-            best_fit.offset_s + interval_half_width_s,
-        ),
+        interval_s=(best_fit.offset_s - half_width_s, best_fit.offset_s + half_width_s),
         is_determinable=True,
         reason="The time offset is estimated from correlated speeds, and minimises the ATE "
         f"({best_fit.compute_residual_rms_m():.3g} m, {len(best_fit.time_s)} poses).",
@@ -181,13 +167,18 @@ def _make_unknown_offset(reason: str) -> TimeOffset:
     )
 
 
+def _choose_grid_step_s(*trajectories: Trajectory) -> float:
+    """Return the step (s) of a time grid, which is larger for very long trajectories."""
+    duration_s = max(float(np.ptp(trajectory.time_s)) for trajectory in trajectories)
+    return max(GRID_STEP_S, duration_s / MAX_GRID_SAMPLES)
+
+
 def _compute_grid_velocity(trajectory: Trajectory, step_s: float) -> tuple[Array, Array]:
     """Return the times (s) of a regular grid, and smoothed velocities (m/s) at these times."""
     time_s = trajectory.time_s
     grid_s = time_s[0] + step_s * np.arange(int(np.ptp(time_s) / step_s) + 1)
-    return grid_s, _smooth_values(
-        interpolate_positions(trajectory, grid_s), time_s, step_s, derivative_order=1
-    ) / step_s
+    grid_position_m = interpolate_columns(grid_s, time_s, trajectory.position_m)
+    return grid_s, _smooth_values(grid_position_m, time_s, step_s, derivative_order=1) / step_s
 
 
 def _smooth_values(
@@ -202,9 +193,8 @@ def _smooth_values(
 
 def _compute_velocity(trajectory: Trajectory, time_s: Array) -> Array:
     """Return the smoothed velocities (m/s) at given times, shape (n, 3)."""
-    step_s = max(GRID_STEP_S, float(np.ptp(trajectory.time_s)) / MAX_GRID_SAMPLES)
-    grid_s, velocity_m_s = _compute_grid_velocity(trajectory, step_s)
-    return np.stack([np.interp(time_s, grid_s, column) for column in velocity_m_s.T], axis=1)
+    grid_s, velocity_m_s = _compute_grid_velocity(trajectory, _choose_grid_step_s(trajectory))
+    return interpolate_columns(time_s, grid_s, velocity_m_s)
 
 
 def _compute_speeds(trajectory: Trajectory, step_s: float) -> tuple[list[Array], BoolArray]:
@@ -217,54 +207,45 @@ def _compute_speeds(trajectory: Trajectory, step_s: float) -> tuple[list[Array],
     if trajectory.rotation is not None:
         rotations = Slerp(time_s, trajectory.rotation)(grid_s)
         rates_rad_s = (rotations[:-1].inv() * rotations[1:]).as_rotvec() / step_s
-        rates_rad_s = np.concatenate((rates_rad_s, rates_rad_s[-1:]))
-        linear_and_angular_speeds.append(
-            np.linalg.norm(_smooth_values(rates_rad_s, time_s, step_s), axis=1)
-        )
+        rates_rad_s = np.append(rates_rad_s, rates_rad_s[-1:], axis=0)
+        smoothed_rates_rad_s = _smooth_values(rates_rad_s, time_s, step_s)
+        linear_and_angular_speeds.append(np.linalg.norm(smoothed_rates_rad_s, axis=1))
     return linear_and_angular_speeds, is_known
 
 
 def _find_candidate_offsets_s(sparse_track: Trajectory, dense_track: Trajectory) -> list[float]:
     """Find the time offsets with correlated speeds, best first (Padfield 2012, eqs. 3 to 9)."""
-    durations_s = [float(np.ptp(track.time_s)) for track in (sparse_track, dense_track)]
-    step_s = max(GRID_STEP_S, max(durations_s) / MAX_GRID_SAMPLES)
-    shorter_duration_s = min(durations_s)
+    step_s = _choose_grid_step_s(sparse_track, dense_track)
+    shorter_duration_s = min(float(np.ptp(track.time_s)) for track in (sparse_track, dense_track))
     if shorter_duration_s < 10 * step_s:
         return []
-    (sparse_speeds, is_sparse_speed_known), (dense_speeds, is_dense_speed_known) = (
-        _compute_speeds(track, step_s) for track in (sparse_track, dense_track)
-    )
-    min_count = MIN_OVERLAP_FRACTION * shorter_duration_s / step_s
+    sparse_speeds, is_sparse_known = _compute_speeds(sparse_track, step_s)
+    dense_speeds, is_dense_known = _compute_speeds(dense_track, step_s)
     correlations = []
-    # both trajectories need orientations for angular speeds
+    # Both trajectories need orientations for angular speeds
     for sparse_values, dense_values in zip(sparse_speeds, dense_speeds, strict=False):
-        speed_moments = compute_moments(
-            sparse_values, dense_values, is_sparse_speed_known, is_dense_speed_known
-        )
+        moments = compute_moments(sparse_values, dense_values, is_sparse_known, is_dense_known)
+        is_usable = moments.count >= MIN_OVERLAP_FRACTION * shorter_duration_s / step_s
         # At rest, the variance of the speed is a rounding error
-        is_usable = speed_moments.count >= min_count
         for values, is_known, square_sum in (
-            (sparse_values, is_sparse_speed_known, speed_moments.sum_of_squares_a),
-            (dense_values, is_dense_speed_known, speed_moments.sum_of_squares_b),
+            (sparse_values, is_sparse_known, moments.sum_of_squares_a),
+            (dense_values, is_dense_known, moments.sum_of_squares_b),
         ):
-            total_square_sum = float(np.var(values[is_known])) * np.count_nonzero(is_known)
-            is_usable &= square_sum > 1e-3 * total_square_sum / len(values) * speed_moments.count
-        scale = np.sqrt(
-            np.where(
-                is_usable, speed_moments.sum_of_squares_a * speed_moments.sum_of_squares_b, 1.0
-            )
-        )
-        correlations.append(np.where(is_usable, speed_moments.covariance.real / scale, 0.0))
-    mean_correlation = np.mean(correlations, axis=0)
+            mean_square = np.var(values[is_known]) * np.mean(is_known)
+            is_usable &= square_sum > 1e-3 * mean_square * moments.count
+        square_product = moments.sum_of_squares_a * moments.sum_of_squares_b
+        scale = np.sqrt(np.where(is_usable, square_product, np.inf))
+        correlations.append(moments.covariance.real / scale)
+    correlation = np.mean(correlations, axis=0)
     sliding_maximum = maximum_filter1d(
-        mean_correlation, round(2 * MIN_CORRELATION_PEAK_DISTANCE_S / step_s) + 1
+        correlation, round(2 * MIN_CORRELATION_PEAK_DISTANCE_S / step_s) + 1
     )
     peak_indices = np.flatnonzero(
-        (mean_correlation == sliding_maximum) & (mean_correlation > MIN_SPEED_CORRELATION)
+        (correlation == sliding_maximum) & (correlation > MIN_SPEED_CORRELATION)
     )
-    peak_indices = peak_indices[np.argsort(-mean_correlation[peak_indices])][:MAX_CANDIDATE_OFFSETS]
+    peak_indices = peak_indices[np.argsort(-correlation[peak_indices])][:MAX_CANDIDATE_OFFSETS]
     # Correlation index k is a shift by k - (n - 1) samples, for n sparse samples
-    dense_start_indices = peak_indices - (len(is_sparse_speed_known) - 1)
+    dense_start_indices = peak_indices - (len(is_sparse_known) - 1)
     lags_s = dense_start_indices * step_s + dense_track.time_s[0] - sparse_track.time_s[0]
     return list(lags_s.tolist())
 
@@ -290,11 +271,9 @@ class _OffsetFit:
         """Return the RMS position residual divided by the RMS extent of the dense trajectory."""
         # A bad fit can shrink the sparse trajectory, so its extent is not used
         extent_m = float(np.sqrt(self.dense_track_position_m.var(axis=0).sum()))
-        return (
-            max(self.compute_residual_rms_m() / extent_m, MISFIT_FLOOR)
-            if extent_m > 0.0
-            else float("inf")
-        )
+        if extent_m == 0.0:
+            return float("inf")
+        return max(self.compute_residual_rms_m() / extent_m, MISFIT_FLOOR)
 
 
 def _compute_interval_half_width_s(
@@ -387,8 +366,8 @@ def _refine_offset(
     sparse_position_m = sparse_track.position_m[pose_indices]
 
     def make_fit(shift_s: float) -> _OffsetFit:
-        dense_track_position_m = interpolate_positions(
-            dense_track, sparse_time_s + (lag_s + shift_s)
+        dense_track_position_m = interpolate_columns(
+            sparse_time_s + (lag_s + shift_s), dense_track.time_s, dense_track.position_m
         )
         # Fitting a scale to the dense trajectory could shrink it to a point
         transform = umeyama(sparse_position_m, dense_track_position_m, with_scale=True)
@@ -405,10 +384,7 @@ def _refine_offset(
         return float(((fit.dense_track_position_m - fit.aligned_position_m) ** 2).sum())
 
     # The optimiser has a relative tolerance, so the large offset (up to 1e9 s) is not optimised
-    candidate_shifts_s = half_width_s * np.linspace(-1.0, 1.0, 21)
-    best_index = int(np.argmin([compute_cost(shift) for shift in candidate_shifts_s]))
-    shift_bounds_s = (
-        candidate_shifts_s[max(best_index - 1, 0)],
-        candidate_shifts_s[min(best_index + 1, len(candidate_shifts_s) - 1)],
-    )
+    shifts_s = half_width_s * np.linspace(-1.0, 1.0, 21)
+    best_index = int(np.argmin([compute_cost(shift_s) for shift_s in shifts_s]))
+    shift_bounds_s = shifts_s[max(best_index - 1, 0)], shifts_s[min(best_index + 1, 20)]
     return make_fit(float(minimize_scalar(compute_cost, bounds=shift_bounds_s, method="bounded").x))

@@ -89,15 +89,14 @@ def _solve_positions(
         Given value x_0 for the first pose.
     """
     edges = np.stack([graph.first_nodes, graph.second_nodes])
-    equations = NormalEquations(edges, *first_pose.shape)
+    equations = NormalEquations(edges, len(first_pose))
     fixed_first_pose = np.zeros((len(graph), *first_pose.shape))
     fixed_first_pose[0] = first_pose
     for pose_matrix, nodes in zip((first_pose_matrix, second_pose_matrix), edges, strict=True):
         right_hand_side = right_hand_side - pose_matrix @ fixed_first_pose[nodes]
-    matrix_values, _ = equations.assemble(
-        first_pose_matrix, second_pose_matrix, information, right_hand_side
+    solution = equations.solve(
+        *equations.assemble(first_pose_matrix, second_pose_matrix, information, right_hand_side)
     )
-    solution = equations.solve(matrix_values)
     if solution is None:
         raise TrajectoryError(
             "The edges do not determine all initial poses", "Give VERTEX lines with initial poses."

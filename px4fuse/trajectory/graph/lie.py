@@ -113,16 +113,10 @@ def adjoint(pose: Array) -> Array:
     Definition: ``X exp(xi) = exp(adjoint(X) xi) X`` (Barfoot 2017, 7.45).
     """
     rotation = rotation_matrix(pose)
+    translation = pose[..., : _get_dimension(pose)]
     if pose.shape[-1] == 3:
-        adjoint_matrix = np.zeros((*pose.shape, 3))
-        adjoint_matrix[..., :2, :2] = rotation
-        adjoint_matrix[..., 0, 2], adjoint_matrix[..., 1, 2] = pose[..., 1], -pose[..., 0]
-        adjoint_matrix[..., 2, 2] = 1.0
-        return adjoint_matrix
-    adjoint_matrix = np.zeros((*pose.shape[:-1], 6, 6))
-    adjoint_matrix[..., :3, :3] = adjoint_matrix[..., 3:, 3:] = rotation
-    adjoint_matrix[..., :3, 3:] = skew(pose[..., :3]) @ rotation
-    return adjoint_matrix
+        return _build_block_matrix(rotation, _cross_vertical(translation), 1.0)
+    return _build_block_matrix(rotation, skew(translation) @ rotation, rotation)
 
 
 def right_jacobian_inverse(tangent: Array) -> Array:
@@ -152,13 +146,34 @@ def right_jacobian_inverse(tangent: Array) -> Array:
 
 def _compute_commutator(tangent: Array) -> Array:
     """Return the Lie bracket matrices ad(xi) of tangent vectors (Barfoot 2017, 7.33)."""
-    if tangent.shape[-1] == 3:
-        x, y, theta = np.moveaxis(tangent, -1, 0)
-        return build_matrix((0.0, -theta, y), (theta, 0.0, -x), (0.0, 0.0, 0.0))
-    commutator = np.zeros((*tangent.shape, 6))
-    commutator[..., :3, :3] = commutator[..., 3:, 3:] = skew(tangent[..., 3:])
-    commutator[..., :3, 3:] = skew(tangent[..., :3])
-    return commutator
+    d = _get_dimension(tangent)
+    rho, rotation = tangent[..., :d], _make_skew_matrix(tangent[..., d:])
+    if d == 2:
+        return _build_block_matrix(rotation, _cross_vertical(rho), 0.0)
+    return _build_block_matrix(rotation, skew(rho), rotation)
+
+
+def _build_block_matrix(rotation: Array, coupling: Array, corner: Array | float) -> Array:
+    """Build the matrices [[rotation, coupling], [0, corner]], translation before rotation."""
+    d = rotation.shape[-1]
+    size = d + coupling.shape[-1]
+    matrix = np.zeros((*rotation.shape[:-2], size, size))
+    matrix[..., :d, :d] = rotation
+    matrix[..., :d, d:] = coupling
+    matrix[..., d:, d:] = corner
+    return matrix
+
+
+def _cross_vertical(vector: Array) -> Array:
+    """Return the cross products of vectors in the plane with a vertical unit vector, as columns."""
+    return build_matrix((vector[..., 1],), (-vector[..., 0],))
+
+
+def _make_skew_matrix(phi: Array) -> Array:
+    """Return the skew-symmetric matrices of rotation vectors in the plane or in space."""
+    if phi.shape[-1] == 1:
+        return build_matrix((0.0, -phi[..., 0]), (phi[..., 0], 0.0))
+    return skew(phi)
 
 
 def accumulate_poses(steps: Array) -> Array:
@@ -190,10 +205,7 @@ def _multiply_vectors(matrix: Array, vector: Array) -> Array:
 
 def _left_jacobian_inverse(phi: Array) -> Array:
     """Return the inverse left Jacobians of SO(2) or SO(3) (Barfoot 2017, 7.37)."""
-    if phi.shape[-1] == 1:
-        skew_matrix = build_matrix((0.0, -phi[..., 0]), (phi[..., 0], 0.0))
-    else:
-        skew_matrix = skew(phi)
+    skew_matrix = _make_skew_matrix(phi)
     return (
         np.eye(skew_matrix.shape[-1])
         - 0.5 * skew_matrix

@@ -3,6 +3,7 @@
 Source: Liu 1992, The multifrontal method for sparse matrix solution, sections 3 to 5.
 """
 
+from collections import defaultdict
 from typing import NamedTuple
 
 import numpy as np
@@ -19,19 +20,17 @@ _MAX_LEAF_UNKNOWNS = 96
 _FIXED_POSE_INFORMATION = 1e100
 
 
-class _EliminationGroup(NamedTuple):
-    """Supernode: poses that are eliminated together, with one dense matrix."""
+class _Front(NamedTuple):
+    """Dense matrix in which a group of poses is eliminated together (supernode)."""
 
-    unknown_count: int
-    # Position of the matrix of this group in the flat array of all matrices
-    matrix_slice: slice
-    # Indices of the unknowns of this group, and of the later unknowns in its equations
-    solution_slice: slice
+    # Range of the unknowns of the group, and indices of the later unknowns in its equations
+    unknowns: slice
     later_unknowns: IntArray
-    # Index of the parent group in the elimination tree
+    # Range of the matrix elements in the flat array of all fronts
+    elements: slice
+    # Parent in the elimination tree, and the rows of its front with the later unknowns
     parent_index: int
-    # Columns of the parent's matrix to which the Schur complement is added
-    columns_in_parent: IntArray
+    rows_in_parent: IntArray
 
 
 class NormalEquations:
@@ -44,91 +43,63 @@ class NormalEquations:
     edges : ndarray of int, shape (2, m)
         Pose indices i and j. The edges must connect all poses.
     unknowns_per_pose : int
-    right_hand_side_count : int
-        Number of columns of c.
     """
 
-    def __init__(
-        self, edges: IntArray, unknowns_per_pose: int, right_hand_side_count: int = 1
-    ) -> None:
+    def __init__(self, edges: IntArray, unknowns_per_pose: int) -> None:
         position, group_starts, later_poses_by_group = _find_elimination_order(
             edges, _MAX_LEAF_UNKNOWNS // unknowns_per_pose
         )
         poses, offsets_in_pose = np.arange(len(position)), np.arange(unknowns_per_pose)
-        pose_counts = np.diff(group_starts)
-        group_by_pose = np.repeat(np.arange(len(later_poses_by_group)), pose_counts)
-        later_pose_counts = np.array([len(later_poses) for later_poses in later_poses_by_group])
-        later_pose_starts = np.append(0, np.cumsum(later_pose_counts))
-        later_poses_of_all_groups = np.concatenate(later_poses_by_group)
-        keys_of_group_and_later_pose = (
-            np.repeat(np.arange(len(later_poses_by_group)), later_pose_counts) * len(poses)
-            + later_poses_of_all_groups
+        groups, pose_counts = np.arange(len(later_poses_by_group)), np.diff(group_starts)
+        group_by_pose = np.repeat(groups, pose_counts)
+        rows_by_group = [
+            np.append(poses[slice(*group_starts[group : group + 2])], later_poses_by_group[group])
+            for group in groups
+        ]
+        row_counts = np.array([len(rows) for rows in rows_by_group])
+        row_starts = np.append(0, np.cumsum(row_counts))
+        keys_of_group_and_row = np.repeat(groups, row_counts) * len(poses) + np.concatenate(
+            rows_by_group
         )
-        row_counts = pose_counts * unknowns_per_pose
-        column_counts = row_counts + later_pose_counts * unknowns_per_pose + right_hand_side_count
-        matrix_starts = np.append(0, np.cumsum(row_counts * column_counts))
+        column_counts = pose_counts * unknowns_per_pose
+        element_starts = np.append(0, np.cumsum(row_counts * unknowns_per_pose * column_counts))
 
-        def find_columns(group: IntArray, pose: IntArray) -> IntArray:
-            """Return the matrix columns of each pose in the matrix of ``group``."""
-            index = (
-                np.searchsorted(keys_of_group_and_later_pose, group * len(poses) + pose)
-                - later_pose_starts[group]
+        def find_rows(group: IntArray, pose: IntArray) -> IntArray:
+            """Return the rows of each pose in the front of ``group``, shape (n, d)."""
+            row = np.searchsorted(keys_of_group_and_row, group * len(poses) + pose)
+            return np.asarray(
+                (row - row_starts[group])[:, None] * unknowns_per_pose + offsets_in_pose
             )
-            column = pose - group_starts[group]
-            is_in_later_group = column >= pose_counts[group]
-            column = np.where(is_in_later_group, pose_counts[group] + index, column)
-            return np.asarray(column[:, None] * unknowns_per_pose + offsets_in_pose)
 
-        def find_element_indices(pose: IntArray, columns: IntArray) -> IntArray:
-            """Return flat indices of the matrix elements of each pose in the given columns."""
-            group = group_by_pose[pose]
-            column_start = matrix_starts[group][:, None] + columns * row_counts[group][:, None]
-            rows = (pose - group_starts[group])[:, None] * unknowns_per_pose + offsets_in_pose
-            return np.asarray(column_start[:, :, None] + rows[:, None])
+        def find_elements(row_pose: IntArray, column_pose: IntArray) -> IntArray:
+            """Return the flat indices of the matrix block of two poses, shape (n, d, d)."""
+            group = group_by_pose[column_pose]
+            columns = (column_pose - group_starts[group])[:, None] * unknowns_per_pose
+            row_offsets = find_rows(group, row_pose) * column_counts[group][:, None]
+            first_elements = element_starts[group][:, None] + columns + offsets_in_pose
+            return np.asarray(row_offsets[:, :, None] + first_elements[:, None])
 
-        edge_positions = np.sort(position[edges], axis=0)
-        pose_block_indices = find_element_indices(poses, find_columns(group_by_pose, poses))
-        edge_block_indices = find_element_indices(
-            edge_positions[0], find_columns(group_by_pose[edge_positions[0]], edge_positions[1])
+        edge_positions = position[edges]
+        diagonal_blocks = find_elements(poses, poses)
+        off_diagonal_blocks = find_elements(edge_positions.max(axis=0), edge_positions.min(axis=0))
+        self._element_indices = np.concatenate(
+            [diagonal_blocks[edge_positions].ravel(), off_diagonal_blocks.ravel()]
         )
-        right_hand_side_columns = np.arange(-right_hand_side_count, 0) + column_counts[:, None]
-        right_hand_side_indices = find_element_indices(
-            poses, right_hand_side_columns[group_by_pose]
-        )
-        self._indices = np.concatenate(
-            [
-                element_indices.ravel()
-                for element_indices in (
-                    pose_block_indices[edge_positions],
-                    edge_block_indices,
-                    right_hand_side_indices[edge_positions],
-                )
-            ]
-        )
-        self._is_swapped = (position[edges[0]] > position[edges[1]])[:, None, None]
+        self._edges = edges
         self._position = position
-        self._diagonal = np.diagonal(pose_block_indices, axis1=1, axis2=2)
-        self._right_hand_side_indices = right_hand_side_indices[position].swapaxes(1, 2)
-        parent_by_group = group_by_pose[
-            [later_poses[0] if len(later_poses) else -1 for later_poses in later_poses_by_group]
-        ]
-        parent_columns_of_later_poses = find_columns(
-            np.repeat(parent_by_group, later_pose_counts), later_poses_of_all_groups
-        )
-        self._groups = [
-            _EliminationGroup(
-                int(row_counts[group]),
-                slice(*matrix_starts[group : group + 2]),
-                slice(*group_starts[group : group + 2] * unknowns_per_pose),
-                (later_poses[:, None] * unknowns_per_pose + offsets_in_pose).ravel(),
-                int(parent_by_group[group]),
-                np.append(
-                    parent_columns_of_later_poses[slice(*later_pose_starts[group : group + 2])],
-                    right_hand_side_columns[parent_by_group[group]],
-                ),
+        self._diagonal = np.diagonal(diagonal_blocks, axis1=1, axis2=2)
+        self._fronts = []
+        for group, later_poses in enumerate(later_poses_by_group):
+            parent_index = int(group_by_pose[later_poses[0]]) if len(later_poses) else group
+            self._fronts.append(
+                _Front(
+                    slice(*group_starts[group : group + 2] * unknowns_per_pose),
+                    (later_poses[:, None] * unknowns_per_pose + offsets_in_pose).ravel(),
+                    slice(*element_starts[group : group + 2]),
+                    parent_index,
+                    find_rows(np.full(len(later_poses), parent_index), later_poses).ravel(),
+                )
             )
-            for group, later_poses in enumerate(later_poses_by_group)
-        ]
 
     def assemble(
         self,
@@ -146,88 +117,65 @@ class NormalEquations:
         first_pose_matrix, second_pose_matrix, information, right_hand_side : ndarray
             A, B and weight, shape (m, d, d), and c, shape (m, d, k), of each of the m edges.
         """
-        pose_matrices = np.where(
-            self._is_swapped,
-            (second_pose_matrix, first_pose_matrix),
-            (first_pose_matrix, second_pose_matrix),
-        )
+        pose_matrices = np.stack([first_pose_matrix, second_pose_matrix])
         weighted_matrices = pose_matrices.swapaxes(2, 3) @ information
-        weighted_right_hand_sides = (weighted_matrices @ right_hand_side).swapaxes(2, 3)
-        blocks_by_edge = (
-            weighted_matrices @ pose_matrices,
-            weighted_matrices[1] @ pose_matrices[0],
-            weighted_right_hand_sides,
+        off_diagonal_blocks = weighted_matrices[0] @ second_pose_matrix
+        is_first_earlier = np.less(*self._position[self._edges])
+        off_diagonal_blocks[is_first_earlier] = off_diagonal_blocks[is_first_earlier].swapaxes(1, 2)
+        blocks = np.concatenate(
+            [(weighted_matrices @ pose_matrices).ravel(), off_diagonal_blocks.ravel()]
         )
-        edge_terms = np.concatenate([product.ravel() for product in blocks_by_edge])
-        matrix_values = np.asarray(np.bincount(self._indices, edge_terms), dtype=float)
-        right_hand_sides = matrix_values[self._right_hand_side_indices]
-        matrix_values[self._diagonal[self._position[0]]] = _FIXED_POSE_INFORMATION
-        return matrix_values, right_hand_sides
+        matrix_elements = np.asarray(np.bincount(self._element_indices, blocks), dtype=float)
+        matrix_elements[self._diagonal[self._position[0]]] = _FIXED_POSE_INFORMATION
+        right_hand_sides = np.zeros((len(self._position), *right_hand_side.shape[1:]))
+        np.add.at(right_hand_sides, self._edges, weighted_matrices @ right_hand_side)
+        return matrix_elements, right_hand_sides
 
-    def solve(self, matrix_values: Array, damping: float = 0.0) -> Array | None:
+    def solve(
+        self, matrix_elements: Array, right_hand_sides: Array, damping: float = 0.0
+    ) -> Array | None:
         """Solve the equations, with damping added to the diagonal.
 
         Return None if the matrix is not positive definite.
         """
-        matrix_values = matrix_values.copy()
-        matrix_values[self._diagonal] += damping
-        right_hand_side_count = self._right_hand_side_indices.shape[2]
-        schur_complements: dict[int, Array] = {}
-        group_factors = []
-        for index, group in enumerate(self._groups):
-            group_matrix = matrix_values[group.matrix_slice].reshape(-1, group.unknown_count).T
-            cholesky_factor, failed_row = lapack.dpotrf(
-                group_matrix[:, : group.unknown_count], overwrite_a=1
-            )
+        matrix_elements = matrix_elements.copy()
+        matrix_elements[self._diagonal] += damping
+        solution = np.empty_like(right_hand_sides)
+        solution[self._position] = right_hand_sides
+        solution = solution.reshape(self._diagonal.size, -1)
+        schur_complements = defaultdict[int, list[tuple[IntArray, Array]]](list)
+        factors = []
+        for index, front in enumerate(self._fronts):
+            unknowns, later_unknowns = front.unknowns, front.later_unknowns
+            size = unknowns.stop - unknowns.start
+            matrix = np.zeros((size + len(later_unknowns),) * 2)
+            matrix[:, :size] = matrix_elements[front.elements].reshape(-1, size)
+            for rows, schur_complement in schur_complements.pop(index, ()):
+                matrix[rows[:, None], rows] += schur_complement
+            cholesky_factor, failed_row = lapack.dpotrf(matrix[:size, :size].T)
             if failed_row:
                 return None
-            off_diagonal_factor = blas.dtrsm(
-                1.0,
-                cholesky_factor,
-                group_matrix[:, group.unknown_count :],
-                trans_a=1,
-                overwrite_b=1,
+            solution[unknowns] = blas.dtrsm(1.0, cholesky_factor, solution[unknowns], trans_a=1)
+            off_diagonal_factor = matrix[size:, :size].T
+            if len(later_unknowns):
+                off_diagonal_factor = blas.dtrsm(
+                    1.0, cholesky_factor, off_diagonal_factor, trans_a=1
+                )
+                # Only the lower triangle of the symmetric matrix is computed
+                schur_complement = blas.dsyrk(
+                    -1.0, off_diagonal_factor, 1.0, matrix[size:, size:].T, trans=1
+                ).T
+                schur_complements[front.parent_index].append(
+                    (front.rows_in_parent, schur_complement)
+                )
+                solution[later_unknowns] -= off_diagonal_factor.T @ solution[unknowns]
+            factors.append((unknowns, later_unknowns, cholesky_factor, off_diagonal_factor))
+        for unknowns, later_unknowns, cholesky_factor, off_diagonal_factor in reversed(factors):
+            terms_of_solved_unknowns = off_diagonal_factor @ solution[later_unknowns]
+            solution[unknowns] = blas.dtrsm(
+                1.0, cholesky_factor, solution[unknowns] - terms_of_solved_unknowns
             )
-            group_factors.append((group, cholesky_factor, off_diagonal_factor))
-            if group is self._groups[-1]:
-                break
-            complement_size = off_diagonal_factor.shape[1]
-            schur_complement = (
-                schur_complements.pop(index, np.zeros(complement_size**2))
-                .reshape(complement_size, complement_size)
-                .T
-            )
-            schur_complement = blas.dsyrk(
-                -1.0, off_diagonal_factor, 1.0, schur_complement, trans=1, overwrite_c=1
-            ).T
-            # only the lower triangle of the symmetric matrix is computed
-            parent = self._groups[group.parent_index]
-            columns = group.columns_in_parent
-            column_count_in_parent = np.searchsorted(columns, parent.unknown_count)
-            parent_values = matrix_values[parent.matrix_slice]
-            parent_value_indices = (
-                columns[:, None] * parent.unknown_count + columns[:column_count_in_parent]
-            )
-            parent_values[parent_value_indices] += schur_complement[:, :column_count_in_parent]
-            columns = columns[column_count_in_parent:] - parent.unknown_count
-            parent_complement_size = len(parent.later_unknowns) + right_hand_side_count
-            parent_schur_complement = schur_complements.setdefault(
-                group.parent_index, np.zeros(parent_complement_size**2)
-            )
-            parent_schur_complement[columns[:, None] * parent_complement_size + columns] += (
-                schur_complement[column_count_in_parent:, column_count_in_parent:]
-            )
-        solution = np.empty((self._diagonal.size, right_hand_side_count))
-        for group, cholesky_factor, off_diagonal_factor in reversed(group_factors):
-            terms_of_solved_unknowns = (
-                off_diagonal_factor[:, :-right_hand_side_count] @ solution[group.later_unknowns]
-            )
-            solution[group.solution_slice] = blas.dtrsm(
-                1.0,
-                cholesky_factor,
-                off_diagonal_factor[:, -right_hand_side_count:] - terms_of_solved_unknowns,
-            )
-        solution = solution.reshape(self._right_hand_side_indices.shape)[self._position]
+        solution = solution.reshape(right_hand_sides.shape)[self._position]
         solution[0] = 0.0
         return solution if np.all(np.isfinite(solution)) else None
 
@@ -261,11 +209,10 @@ def _find_elimination_order(
         relax=1,
         options={"SymmetricMode": True},
     )
-    sparsity_pattern = lu_factors.L.sorted_indices()
-    nonzero_counts = np.diff(sparsity_pattern.indptr)
-    # The parent of a pose in the elimination tree is the row of the first nonzero below the
-    # diagonal
-    parent = sparsity_pattern.indices[sparsity_pattern.indptr[:-2] + 1]
+    factor = lu_factors.L.sorted_indices()
+    nonzero_counts = np.diff(factor.indptr)
+    # The parent of a pose in the elimination tree is the first row below the diagonal
+    parent = factor.indices[factor.indptr[:-2] + 1]
     last_pose = pose_count - 1
     tree = sparse.csr_array(
         (nonzero_counts[:-1], (last_pose - parent, last_pose - np.arange(last_pose))),
@@ -281,21 +228,14 @@ def _find_elimination_order(
     is_large_subtree = subtree_size > max_poses_per_leaf_group
     is_large_subtree[pose_count] = True
     leaf_group_ends = np.flatnonzero(~is_large_subtree[:-1] & is_large_subtree[parent])
+    # A pose is merged with its child if both columns have the same nonzero rows
     is_parent_next = parent[:-1] == np.arange(1, pose_count)
-    # Poses are merged if their columns have the same nonzero rows, because no zeros are added then
     is_merged_with_child = is_large_subtree[:-2] & is_parent_next & (np.diff(nonzero_counts) == -1)
-    merged_group_starts = np.flatnonzero(
-        is_large_subtree[:-1] & ~np.append(False, is_merged_with_child)
-    )
-    group_starts = np.sort(
-        np.concatenate(
-            [leaf_group_ends - subtree_size[leaf_group_ends] + 1, merged_group_starts, [pose_count]]
-        )
-    )
+    is_group_start = is_large_subtree[:-1] & ~np.append(False, is_merged_with_child)
+    is_group_start[leaf_group_ends - subtree_size[leaf_group_ends] + 1] = True
+    group_starts = np.append(np.flatnonzero(is_group_start), pose_count)
     later_poses_by_group = [
-        np.sort(
-            position[sparsity_pattern.indices[slice(*sparsity_pattern.indptr[pose : pose + 2])]]
-        )[1:]
+        np.sort(position[factor.indices[slice(*factor.indptr[pose : pose + 2])]])[1:]
         for pose in elimination_order[group_starts[1:] - 1]
     ]
     return position[lu_factors.perm_c], group_starts, later_poses_by_group

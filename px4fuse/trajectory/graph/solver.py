@@ -16,13 +16,12 @@ from px4fuse.trajectory.graph.model import PoseGraph, Residuals
 
 # Maximum number of closures for robust optimisation by default: more closures take minutes
 MAX_GNC_CLOSURES = 1000
-# Key of the robust solution in results.json: graduated non-convexity (GNC)
-ROBUST_SOLUTION_KEY = "gnc"
+# Label of the solution by graduated non-convexity (GNC)
+ROBUST_SOLUTION_LABEL = "pose graph, robust (GNC)"
 # Labels of the pose graph solutions, by their key in results.json
 SOLUTION_LABELS: Mapping[str, str] = {
     "all": "pose graph with all loop closures",
-    "gated": "pose graph with loop closures that pass the gate",
-    ROBUST_SOLUTION_KEY: "pose graph, robust (GNC)",
+    "gnc": ROBUST_SOLUTION_LABEL,
 }
 
 
@@ -146,7 +145,7 @@ def _minimise(
         first_pose_jacobian = second_pose_jacobian @ lie.adjoint(
             lie.inverse(residuals.relative_poses)
         )
-        matrix_values, gradient = graph.normal_equations.assemble(
+        matrix_elements, gradient = graph.normal_equations.assemble(
             -first_pose_jacobian,
             second_pose_jacobian,
             weights[:, None, None] * graph.information,
@@ -156,7 +155,7 @@ def _minimise(
             cost_decrease = 0.0
             predicted_decrease = 0.0
             is_converged = False
-            step = graph.normal_equations.solve(matrix_values, damping)
+            step = graph.normal_equations.solve(matrix_elements, gradient, damping)
             if step is not None:
                 predicted_decrease = 0.5 * float(np.sum(step * (damping * step + gradient)))
                 trial_residuals = model.residuals(
@@ -351,8 +350,8 @@ def analyse_graph(
         if use_robust_optimisation is None
         else use_robust_optimisation
     ):
-        progress(f"optimising: {SOLUTION_LABELS[ROBUST_SOLUTION_KEY]}")
-        solutions[ROBUST_SOLUTION_KEY] = solve(scaled_graph, robust=True, is_closure=is_closure)
+        progress(f"optimising: {ROBUST_SOLUTION_LABEL}")
+        solutions["gnc"] = solve(scaled_graph, robust=True, is_closure=is_closure)
     results = Graph(
         name=name,
         dimension=graph.dimension,
