@@ -56,10 +56,10 @@ class BadAccelerationFlag:
             len(uses_logged_flag), time_s[0] + flag_duration_s * float(logged_flag[0])
         )
 
-    def compute_bad_acceleration_fraction(self, begin_s: Array, end_s: Array) -> Array | None:
+    def compute_bad_acceleration_fraction(self, begin_s: Array, end_s: Array) -> Array:
         """Return the fraction of a time interval with a bad acceleration, for each configuration.
 
-        Return None if the flag is not set in the interval. Call this method in time order.
+        Call this method in time order.
         """
         if len(self.logged_since_s):
             last_row = np.searchsorted(self.logged_since_s, end_s) - 1
@@ -70,8 +70,6 @@ class BadAccelerationFlag:
             self.until_s = np.where(
                 uses_logged_flag_span, self.logged_until_s[last_row], self.until_s
             )
-        if not (self.until_s > begin_s).any():
-            return None
         overlap_s = np.minimum(self.until_s, end_s) - np.maximum(self.since_s, begin_s)
         return np.asarray(np.maximum(overlap_s, 0.0) / np.maximum(end_s - begin_s, 1e-9))
 

@@ -318,13 +318,16 @@ def make_update_table(
     return updates.assign(fused_at_s=end_s[np.nonzero(has_innovation)[0]])
 
 
-def pad_samples(arrays_of_samples: Sequence[Array]) -> list[Array]:
-    """Pad arrays of samples with zeros to the same number k of samples per event."""
-    max_samples_per_event = max(samples.shape[1] for samples in arrays_of_samples)
-    return [
-        np.pad(samples, ((0, 0), (0, max_samples_per_event - samples.shape[1]), (0, 0)))
-        for samples in arrays_of_samples
-    ]
+def stack_samples(samples_by_filter: Sequence[Array]) -> Array:
+    """Stack the samples of all filters along the last axis, with zeros up to equal numbers k."""
+    max_samples_per_event = max(samples.shape[1] for samples in samples_by_filter)
+    return np.stack(
+        [
+            np.pad(samples, ((0, 0), (0, max_samples_per_event - samples.shape[1]), (0, 0)))
+            for samples in samples_by_filter
+        ],
+        axis=-1,
+    )
 
 
 def find_replay_segments(

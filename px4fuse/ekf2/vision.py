@@ -22,7 +22,7 @@ from px4fuse.ekf2.replay_segments import (
     ReplaySegment,
     group_samples_by_event,
     make_update_table,
-    pad_samples,
+    stack_samples,
 )
 from px4fuse.flight.ekf2_parameters import EV_POS, GNSS_POS
 
@@ -114,7 +114,7 @@ class VisionFilter:
         has_gate: BoolArray,
         uses_reported_noise: BoolArray,
     ) -> None:
-        samples = np.stack(pad_samples(samples_by_configuration), axis=-1)
+        samples = stack_samples(samples_by_configuration)
         self.position_m = np.moveaxis(samples[:2], 0, -1)
         self.age_s, self.measurement_times_s, self.fusion_time_s = samples[2:5]
         _, sample_count, event_count, configuration_count = samples.shape
