@@ -54,10 +54,10 @@ def sampled(
     reference: str = "gnss_hgt", dead_zone_m: float = 0.0, weight: float = 1.0,
 ) -> HeightSamples:  # fmt: skip
     step = np.array(steps)
+    samples = {"down_m": down_m, "dead_zone_m": dead_zone_m, "weight": weight}
     return HeightSamples(
-        fused, reference, (0.0, 1.0), step, STEP_S * step, np.array(down_m),
-        np.full(len(step), dead_zone_m), np.full(len(step), weight),
-    )  # fmt: skip
+        fused, reference, np.array([0.0, 1.0]), step, pd.DataFrame(samples, STEP_S * step)
+    )
 
 
 def of_baro(steps: list[int], down_m: list[float], **more: float) -> HeightSamples:

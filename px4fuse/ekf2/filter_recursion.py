@@ -402,10 +402,8 @@ def run_segment(  # noqa: PLR0912, PLR0915 (one recursion, read from top to bott
             BAD_ACCELERATION_NOISE_M_S2**2 - acceleration_variance[event]
         )
         # Prediction: x = Φx + u, P = ΦPΦ' + Q
-        x[:, :STATE_COUNT] = (
-            (phi @ x[:, :STATE_COUNT, None])[:, :, 0]
-            + state_change_by_acceleration
-            + estimates_attitude[:, None] * state_change_by_correction
+        x[:, :STATE_COUNT] = (phi @ x[:, :STATE_COUNT, None])[:, :, 0] + (
+            state_change_by_acceleration + estimates_attitude[:, None] * state_change_by_correction
         )
         P[:, :STATE_COUNT] = phi @ P[:, :STATE_COUNT]
         P[:, :, :STATE_COUNT] = P[:, :, :STATE_COUNT] @ np.swapaxes(phi, 1, 2)
@@ -509,7 +507,7 @@ def run_segment(  # noqa: PLR0912, PLR0915 (one recursion, read from top to bott
                 fusion_decisions.last_position_s = np.maximum(
                     fusion_decisions.last_position_s, vision_filter.last_fusion_s
                 )
-        if height_filter is not None and bad_acceleration_flag.models_flag:
+        if height_filter is not None:
             if has_sample[event] and has_velocity:
                 height_filter.update_records[event, -1, 0] = np.where(
                     can_fuse_velocity[event], nu[:, DOWN_COLUMN], np.nan

@@ -9,7 +9,6 @@ Sources: PX4-Autopilot ``EKF/aid_sources`` (``barometer/baro_height_control.cpp`
 
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
-from typing import Any
 
 import numpy as np
 import pandas as pd
@@ -78,24 +77,21 @@ def add_heights(
         (reference,) = fused_aids
     if reference not in fused_aids:
         return "EKF2's height reference is neither GNSS nor barometer, or not logged"
-    measurement_times_s, down_m, sample_weight = np.zeros((3, 0))
+    barometer_samples = pd.DataFrame(columns=["down_m", "weight"], dtype=float)
     if BAROMETER.name in fused_aids and flight.barometer is not None:
         barometer_down_m = flight.barometer["down_m"]
         barometer_down_m = barometer_down_m.set_axis(barometer_down_m.index - 0.5 * ekf2.step_s)
         barometer_samples = find_fused_barometer_samples(ekf2, fusion_record, barometer_down_m)
-        measurement_times_s = barometer_samples.index.to_numpy()
-        down_m = barometer_samples["down_m"].to_numpy() + fusion_record.altitude_m
-        sample_weight = barometer_samples["weight"].to_numpy()
-    dead_zone_m = np.where(
-        fusion_record.was_flag_set(GROUND_EFFECT_FLAG, measurement_times_s),
-        parameters.get("EKF2_GND_EFF_DZ", DEFAULT_GROUND_EFFECT_DEAD_ZONE_M),
-        0.0,
-    )
+    barometer_samples["down_m"] += fusion_record.altitude_m
+    sample_times_s = barometer_samples.index.to_numpy(float)
+    barometer_samples["dead_zone_m"] = fusion_record.was_flag_set(
+        GROUND_EFFECT_FLAG, sample_times_s
+    ) * parameters.get("EKF2_GND_EFF_DZ", DEFAULT_GROUND_EFFECT_DEAD_ZONE_M)
     segments_with_heights = []
     delayed_down_m = fusion_record.delayed["down_m"]
     for segment in segments:
         start_s = float(segment.time_s[0])
-        bias_and_variance = (0.0, 0.0)
+        bias_and_variance = np.zeros(2)
         for aid_name in {*fused_aids} - {reference}:
             logged_bias = fusion_record.height_bias_updates.get(aid_name)
             if (
@@ -103,15 +99,14 @@ def add_heights(
                 or not logged_bias.index[0] - MAX_BIAS_LOG_DELAY_S < start_s < logged_bias.index[-1]
             ):
                 return f"EKF2's bias of the {AIDS[aid_name].label} is not logged"
-            bias_m, bias_variance_m2 = (
-                float(np.interp(start_s, logged_bias.index, logged_bias[name]))
-                for name in ("bias_m", "bias_m2")
+            bias_and_variance = np.array(
+                [
+                    np.interp(start_s, logged_bias.index, logged_bias[name])
+                    for name in ("bias_m", "bias_m2")
+                ]
             )
-            bias_and_variance = bias_m, bias_variance_m2
-        segment_samples = select_samples_in_segment(
-            segment, measurement_times_s, down_m, dead_zone_m, sample_weight
-        )
-        rate_hz = len(segment_samples[0]) / float(segment.time_s[-1] - start_s)
+        step_indices, is_inside = find_sample_steps(segment, sample_times_s)
+        rate_hz = len(step_indices) / (segment.time_s[-1] - start_s)
         if BAROMETER.name in fused_aids and rate_hz < MIN_BAROMETER_LOG_HZ:
             return (
                 f"the barometer is logged at {rate_hz:.1f} Hz; a replay of its fusion needs "
@@ -120,20 +115,16 @@ def add_heights(
         initial_state = segment.state.copy()
         initial_state[POSITION_DOWN] = np.interp(start_s, delayed_down_m.index, delayed_down_m)
         height_samples = HeightSamples(
-            tuple(fused_aids), reference, bias_and_variance, *segment_samples
+            tuple(fused_aids),
+            reference,
+            bias_and_variance,
+            step_indices,
+            barometer_samples[is_inside],
         )
         segments_with_heights.append(
             replace(segment, state=initial_state, height_samples=height_samples)
         )
     return tuple(segments_with_heights)
-
-
-def select_samples_in_segment(
-    segment: ReplaySegment, measurement_times_s: Array, *quantities: Array
-) -> tuple[Any, ...]:
-    """Return prediction steps, measurement times and ``quantities`` of the samples in a segment."""
-    step_indices, is_inside = find_sample_steps(segment, measurement_times_s)
-    return step_indices, *(values[is_inside] for values in (measurement_times_s, *quantities))
 
 
 class HeightFilter:
@@ -173,18 +164,18 @@ class HeightFilter:
         self.bad_acceleration_flag = bad_acceleration_flag
         height_samples = segment.height_samples
         assert height_samples is not None
-        self.fused_sensors = height_samples.fused_sensors
+        self.fused_sensors, samples = height_samples.fused_sensors, height_samples.samples
         barometer_samples = stack_samples(
             [
                 group_samples_by_event(
                     segment,
                     end_steps,
                     height_samples.step_indices,
-                    height_samples.down_m[:, None],
+                    samples[["down_m"]].to_numpy(),
                     slice(2, 3),
-                    height_samples.measurement_times_s,
-                    height_samples.dead_zone_m,
-                    height_samples.weight,
+                    *samples.reset_index(names="time_s")[["time_s", "dead_zone_m", "weight"]]
+                    .to_numpy()
+                    .T,
                 )
                 for end_steps in event_steps.T
             ]

@@ -133,24 +133,21 @@ class HeightSamples:
         PX4's names of the fused height sensors.
     reference : str
         PX4's name of the height reference, which has no bias.
-    initial_bias_and_variance : (float, float)
+    initial_bias_and_variance : ndarray, shape (2,)
         Initial bias (m, positive: too high) and variance (m²) of the other height sensor.
-    step_indices, measurement_times_s, down_m : ndarray, shape (m,)
-        Prediction step, measurement time, and height (m, down) of each barometer sample.
-    dead_zone_m : ndarray, shape (m,)
-        Dead zone of barometer innovations in ground effect; 0 without ground effect.
-    weight : ndarray, shape (m,)
-        Number of EKF2 samples that each sample represents.
+    step_indices : ndarray of int, shape (m,)
+        Prediction step of each barometer sample.
+    samples : DataFrame, shape (m, 3)
+        Barometer samples, indexed by measurement time: height ``down_m``; dead zone
+        ``dead_zone_m`` of the innovation in ground effect, else 0; ``weight``, the number of EKF2
+        samples that the sample represents.
     """
 
     fused_sensors: tuple[str, ...]
     reference: str
-    initial_bias_and_variance: tuple[float, float]
+    initial_bias_and_variance: Array
     step_indices: IntArray
-    measurement_times_s: Array
-    down_m: Array
-    dead_zone_m: Array
-    weight: Array
+    samples: pd.DataFrame
 
 
 @dataclass(frozen=True)

@@ -11,6 +11,7 @@ from collections.abc import Mapping
 from dataclasses import replace
 
 import numpy as np
+import pandas as pd
 
 from px4fuse.core.arrays import Array, BoolArray, IntArray, cumulative_sums
 from px4fuse.ekf2.filter_recursion import (
@@ -20,7 +21,6 @@ from px4fuse.ekf2.filter_recursion import (
     FilterConfiguration,
     SegmentRun,
 )
-from px4fuse.ekf2.heights import select_samples_in_segment
 from px4fuse.ekf2.inputs import GNSS_RULES, VISION_RULES, ReceivedPositions, ReplayInputs
 from px4fuse.ekf2.model import compute_delayed_states, run_configurations
 from px4fuse.ekf2.output_predictor import (
@@ -39,6 +39,7 @@ from px4fuse.ekf2.replay_segments import (
     ReplaySegment,
     add_field_states,
     downsample_imu,
+    find_sample_steps,
     find_step_ends,
 )
 from px4fuse.flight.ekf2_parameters import (
@@ -148,15 +149,17 @@ def simulate_ekf2(
             sensors.to_seconds(sensors.get_time_us(topic)) - 0.5 * step_s for topic in other_sensors
         )
         # the barometer is EKF2's only height source outdoors
-        down_m = sensors.HOME_POSITION[2] - barometer_topic.fields["baro_alt_meter"].astype(
-            np.float64
+        down_m = sensors.HOME_POSITION[2] - barometer_topic.fields["baro_alt_meter"].astype(float)
+        barometer_samples = pd.DataFrame(
+            {"down_m": down_m, "dead_zone_m": 0.0, "weight": 1.0}, barometer_times_s
         )
-        dead_zone_m, sample_weight = np.zeros(len(down_m)), np.ones(len(down_m))
-        barometer_samples = select_samples_in_segment(
-            segment, barometer_times_s, down_m, dead_zone_m, sample_weight
-        )
+        step_indices, is_inside = find_sample_steps(segment, barometer_times_s)
         height_samples = HeightSamples(
-            (BAROMETER.name,), BAROMETER.name, (0.0, 0.0), *barometer_samples
+            (BAROMETER.name,),
+            BAROMETER.name,
+            np.zeros(2),
+            step_indices,
+            barometer_samples[is_inside],
         )
         segment = replace(segment, height_samples=height_samples)
         if not logged_values[MAG.switch]:

@@ -235,19 +235,14 @@ def _make_barometer_topics(
     updates = updates[sensors.is_kept_at_rate(updates.index.to_numpy(), OTHER_AIDS_LOG_RATE_HZ)]
     innovation, innovation_variance, is_rejected, is_fused, step_by_update = updates.to_numpy().T
     measurement_times_s, steps = updates.index.to_numpy(), step_by_update.astype(np.intp)
-    measured_m = (
-        height_samples.down_m[
-            np.searchsorted(height_samples.measurement_times_s, measurement_times_s)
-        ]
-        - sensors.HOME_POSITION[2]
-    )
+    measured_down_m = height_samples.samples["down_m"][measurement_times_s].to_numpy()
     noise_variance = np.full(len(steps), model_inputs.settings[BAROMETER.noise] ** 2)
     return [
         _make_aid_source_topic(
             BAROMETER,
             model_inputs.settings,
             ekf2_output.make_timestamps(steps, measurement_times_s),
-            measured_m,
+            measured_down_m - sensors.HOME_POSITION[2],
             (innovation, innovation_variance, noise_variance),
             (is_rejected > 0, is_fused > 0),
         )
