@@ -75,7 +75,7 @@ def test_ekf2_model_state_between_updates_is_imu_prediction(
     configuration = FilterConfiguration(model.inputs.settings, estimates_attitude=attitude)
     (part,) = run_configurations(model.inputs, [configuration], model.event_intervals_by_delays)
     kept = np.random.default_rng(4).normal(0.0, 0.05, part.state.shape)
-    state, _ = compute_delayed_states(replace(part, state=kept), 0)
+    state = compute_delayed_states(replace(part, state=kept), 0)
     segment, ends = part.segment, part.events[0].end_step
     if not attitude:
         segment = replace(

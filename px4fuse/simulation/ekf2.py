@@ -337,7 +337,7 @@ def _compute_output(
 ) -> Ekf2Output:
     segment = model_run.segment
     lag_steps = round(inputs.horizon_s / inputs.mean_step_s)
-    state, _ = compute_delayed_states(model_run, 0)
+    state = compute_delayed_states(model_run, 0)
     resets, has_recent_position_aiding = _hold_position_without_aiding(model_run, state)
     reset_sum_m = np.zeros((len(state), 3))
     for step, reset_size_m in resets:
