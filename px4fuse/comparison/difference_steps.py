@@ -209,7 +209,7 @@ def add_cause_sentences(
             f"positions of KF and EKF2 differ by up to {explanation.outside.maximum_m:.1f} m (at "
             f"{explanation.outside.at_s:.0f} s)."
         )
-    return structs.replace(explanation, sentences=tuple(sentences), cause_sentence=cause_text)
+    return structs.replace(explanation, sentences=tuple(sentences))
 
 
 def _describe_step_effect(step: PropertyReplacement, explanation: DifferenceExplanation) -> str:
