@@ -57,7 +57,7 @@ from px4fuse.simulation.ekf2_topics import (
     make_ekf2_topics,
 )
 from px4fuse.simulation.faults import FaultSizes
-from px4fuse.simulation.motion import Motion, compute_attitude
+from px4fuse.simulation.motion import Motion
 from px4fuse.simulation.scenario import Scenario
 from px4fuse.simulation.ulog_writer import Topic
 from px4fuse.trajectory.rotation import (
@@ -221,7 +221,7 @@ def _make_segment(
     )
     step_times_us = time_us[np.concatenate([[0], step_end_indices])]
     time_s = step_times_us * 1e-6
-    body_to_ned = compute_attitude(motion.compute_true_state(time_s)).body_to_ned
+    body_to_ned = motion.compute_body_to_ned(time_s)
     true_quaternions = sensors.to_quaternions(body_to_ned)
     integrated_attitude = cumulative_product(
         np.concatenate([true_quaternions[:1], from_rotation_vector(rotation_rad)])
