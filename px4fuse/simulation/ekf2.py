@@ -300,34 +300,30 @@ def _select_positions(source: sensors.SimulatedPositions) -> ReceivedPositions:
 
     EKF2 ignores positions that are older than the previous one (estimator_interface.cpp).
     """
-    topic_fields = source.topic.fields
     timestamp_s, arrival_s = (
         sensors.to_seconds(sensors.get_time_us(source.topic, name))
         for name in ("timestamp_sample", "timestamp")
     )
     latest_timestamp_s = np.maximum.accumulate(np.concatenate([[-np.inf], timestamp_s[:-1]]))
-    is_newer_than_previous = timestamp_s > latest_timestamp_s
-    velocity_m_s = source.velocity_m_s
-    if velocity_m_s is not None:
-        sigmas_m = np.stack([topic_fields["eph"], topic_fields["eph"], topic_fields["epv"]], axis=1)
-        position_variance = sigmas_m[is_newer_than_previous] ** 2
-        velocity_variance = np.repeat(
-            topic_fields["s_variance_m_s"][is_newer_than_previous, None] ** 2, 3, axis=1
-        )
+    is_newer = timestamp_s > latest_timestamp_s
+    fields = {name: values[is_newer] for name, values in source.topic.fields.items()}
+    velocity_m_s = velocity_variance = None
+    if source.velocity_m_s is None:
+        position_variance = fields["position_variance"]
     else:
-        position_variance, velocity_variance = (
-            topic_fields["position_variance"][is_newer_than_previous],
-            None,
-        )
+        velocity_m_s = source.velocity_m_s[is_newer]
+        velocity_variance = np.repeat(fields["s_variance_m_s"][:, None] ** 2, 3, axis=1)
+        position_variance = np.stack([fields[name] for name in ("eph", "eph", "epv")], axis=1) ** 2
+    count = int(is_newer.sum())
     return ReceivedPositions(
-        timestamp_s=timestamp_s[is_newer_than_previous],
-        arrival_s=arrival_s[is_newer_than_previous],
-        position_m=source.position_m[is_newer_than_previous].astype(np.float32).astype(np.float64),
+        timestamp_s=timestamp_s[is_newer],
+        arrival_s=arrival_s[is_newer],
+        position_m=source.position_m[is_newer].astype(np.float32).astype(np.float64),
         variance_m2=position_variance.astype(np.float64),
-        rejected_flags=np.full(int(is_newer_than_previous.sum()), np.nan),
-        is_reset_to_sample=np.zeros(int(is_newer_than_previous.sum()), dtype=bool),
+        rejected_flags=np.full(count, np.nan),
+        is_reset_to_sample=np.zeros(count, dtype=bool),
         source=source.topic.name,
-        velocity_m_s=None if velocity_m_s is None else velocity_m_s[is_newer_than_previous],
+        velocity_m_s=velocity_m_s,
         velocity_variance_m2_s2=velocity_variance,
     )
 
@@ -377,11 +373,9 @@ def _hold_position_without_aiding(
     Return the position resets (step, size in m), and a mask of the steps with recent aiding.
     """
     events, time_s = model_run.events[0], model_run.segment.time_s
-    events_with_aiding = np.flatnonzero(model_run.fused[:, 0] | model_run.reset[:, 0])
+    aiding_steps = events.end_step[model_run.fused[:, 0] | model_run.reset[:, 0]]
     time_of_aiding_s = np.zeros(len(time_s))
-    time_of_aiding_s[events.end_step[events_with_aiding]] = time_s[
-        events.end_step[events_with_aiding]
-    ]
+    time_of_aiding_s[aiding_steps] = time_s[aiding_steps]
     has_recent_position_aiding = (
         time_s - np.maximum.accumulate(time_of_aiding_s) <= NO_AID_TIMEOUT_S
     )
