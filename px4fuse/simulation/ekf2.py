@@ -100,18 +100,16 @@ def _select_fused_aids(scenario: Scenario) -> tuple[Aid, ...]:
 def make_parameters(scenario: Scenario, faults: FaultSizes) -> dict[str, int | float]:
     """Return the values of all EKF2 parameters that the model uses, by PX4 name."""
     aid = scenario.aid
-    is_gnss = aid == GNSS_POS
     defaults = fill_with_defaults({}, *_select_fused_aids(scenario))
     delay_ms = defaults[aid.delay] if faults.ekf2_delay_s is None else 1e3 * faults.ekf2_delay_s
     aid_parameters: dict[str, float] = {aid.noise_mode_parameter: 1}
-    if is_gnss:
-        # EKF2_MAG_TYPE 1: EKF2 fuses the magnetic heading only; 0: all axes
-        magnetometer_fusion_type = int(bool(faults.heading_deg))
+    if aid == GNSS_POS:
         aid_parameters = {
             GNSS_VEL.noise: scenario.sigma_gnss_m_s,
-            MAG.switch: magnetometer_fusion_type,
+            # EKF2_MAG_TYPE 1: EKF2 fuses the magnetic heading only; 0: all axes
+            MAG.switch: int(bool(faults.heading_deg)),
+            BAROMETER.noise: sensors.SIGMA_BAROMETER_M,
         }
-        aid_parameters |= {BAROMETER.noise: sensors.SIGMA_BAROMETER_M}
     return (
         defaults
         | aid_parameters
@@ -212,12 +210,10 @@ def _make_segment(
     step_end_indices = find_step_ends(
         interval_s, np.array([], dtype=np.intp), PREDICTION_STEP_US * 1e-6
     )
-    delta_angle_rad, delta_velocity_m_s = (
-        imu.fields[name][1:].astype(np.float64) * interval_s[:, None]
-        for name in ("gyro_rad", "accelerometer_m_s2")
-    )
     rotation_rad, velocity_increment_m_s = downsample_imu(
-        delta_angle_rad, delta_velocity_m_s, step_end_indices
+        imu.fields["gyro_rad"][1:].astype(float) * interval_s[:, None],
+        imu.fields["accelerometer_m_s2"][1:].astype(float) * interval_s[:, None],
+        step_end_indices,
     )
     step_times_us = time_us[np.concatenate([[0], step_end_indices])]
     time_s = step_times_us * 1e-6
@@ -227,10 +223,8 @@ def _make_segment(
         np.concatenate([true_quaternions[:1], from_rotation_vector(rotation_rad)])
     )
     attitude_difference = multiply(true_quaternions, conjugate(integrated_attitude))
-    attitude_error_rad = np.zeros((len(time_s), 3))
-    attitude_error_rad[:, HEADING] = sensors.simulate_attitude_error(
-        scenario, faults, time_s
-    ).as_rotvec()[:, HEADING]
+    attitude_error_rad = sensors.simulate_attitude_error(scenario, faults, time_s).as_rotvec()
+    attitude_error_rad[:, :HEADING] = 0.0
     specific_force_m_s2, rate_rad_s = sensors.measure_imu(
         scenario,
         faults,
@@ -240,7 +234,7 @@ def _make_segment(
         REST_BEFORE_LOG_S * scenario.imu_rate_hz,
     )
     state, covariance = _compute_state_at_rest(
-        body_to_ned[0], specific_force_m_s2[0], rate_rad_s[0], float(attitude_error_rad[0, HEADING])
+        body_to_ned[0], specific_force_m_s2[0], rate_rad_s[0], attitude_error_rad[0, HEADING]
     )
     variance = np.diagonal(covariance).copy()
     sigma = np.sqrt(variance)
