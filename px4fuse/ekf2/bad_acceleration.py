@@ -9,7 +9,6 @@ estimateInertialNavFallingLikelihood).
 """
 
 import numpy as np
-import pandas as pd
 
 from px4fuse.core.arrays import Array, BoolArray
 from px4fuse.ekf2.replay_segments import ReplaySegment
@@ -59,11 +58,14 @@ class BadAccelerationFlag:
 
         Call this method in time order.
         """
-        last_row = np.searchsorted(self.logged_spans_s[:, 0], end_s) - 1
-        follows_log = self.uses_logged_flag & (last_row >= 0)
-        self.since_s[follows_log], self.until_s[follows_log] = self.logged_spans_s[
-            last_row[follows_log]
-        ].T
+        if len(self.logged_spans_s):
+            last_row = np.searchsorted(self.logged_spans_s[:, 0], end_s) - 1
+            follows_log = self.uses_logged_flag & (last_row >= 0)
+            self.since_s[follows_log], self.until_s[follows_log] = self.logged_spans_s[
+                last_row[follows_log]
+            ].T
+        if not (self.until_s > begin_s).any():
+            return np.zeros_like(end_s)
         overlap_s = np.minimum(self.until_s, end_s) - np.maximum(self.since_s, begin_s)
         return np.asarray(np.maximum(overlap_s, 0.0) / np.maximum(end_s - begin_s, 1e-9))
 
@@ -81,13 +83,13 @@ class BadAccelerationFlag:
         *previous_barometer, previous_gnss = previous_innovations
         *barometer, gnss = innovations
         # EKF2's test uses the latest innovation of each height sensor
-        latest_barometer = (
-            pd.DataFrame([np.full_like(gnss, np.nan), *previous_barometer, *barometer])
-            .ffill()
-            .to_numpy()[len(previous_barometer) :]
-        )
-        is_acceleration_bad = _indicates_falling(latest_barometer, previous_gnss).any(axis=0)
-        is_acceleration_bad |= _indicates_falling(latest_barometer[-1], gnss)
+        latest_barometer = np.full_like(gnss, np.nan)
+        is_acceleration_bad = np.zeros(len(gnss), bool)
+        for sample_number, sample in enumerate((*previous_barometer, *barometer), start=1):
+            latest_barometer = np.where(np.isnan(sample), latest_barometer, sample)
+            if sample_number >= len(previous_barometer):
+                is_acceleration_bad |= _indicates_falling(latest_barometer, previous_gnss)
+        is_acceleration_bad |= _indicates_falling(latest_barometer, gnss)
         is_acceleration_bad &= ~self.uses_logged_flag
         self.since_s = np.where(is_acceleration_bad & (self.until_s < time_s), time_s, self.since_s)
         self.until_s = np.where(is_acceleration_bad, time_s + self.flag_duration_s, self.until_s)

@@ -377,6 +377,7 @@ def run_segment(  # noqa: PLR0912, PLR0915 (one recursion, read from top to bott
     states[0] = x
     state_variances[0] = _get_state_variances(P)
     innovation, R = np.empty((2, configuration_count, 4))
+    is_component_fused = np.zeros((configuration_count, HORIZONTAL_POSITION_COLUMNS.stop), bool)
     start_s = np.full(configuration_count, segment.time_s[0])
     reset_rules = [
         (HORIZONTAL_POSITION, HORIZONTAL_POSITION_COLUMNS, inputs.rules.reset_variance_factor)
@@ -384,17 +385,23 @@ def run_segment(  # noqa: PLR0912, PLR0915 (one recursion, read from top to bott
     if has_velocity and inputs.rules.resets_velocity:
         reset_rules.append((VELOCITY, VELOCITY_COLUMNS, 1.0))
     for event in range(event_count):
-        if event % EVENT_BATCH_SIZE == 0:
+        index_in_batch = event % EVENT_BATCH_SIZE
+        if not index_in_batch:
             event_batch = slice(event, event + EVENT_BATCH_SIZE)
             transitions = {one: one.compute_transitions(event_batch) for one in set(intervals)}
-            transition_batch = _stack_by_filter([transitions[one] for one in intervals])
-        (
-            phi,
-            state_change_by_correction,
-            state_change_by_acceleration,
-            gyro_noise_covariance,
-            accelerometer_noise_covariance,
-        ) = (array[event % EVENT_BATCH_SIZE] for array in transition_batch)
+            (
+                transition,
+                state_change_by_correction,
+                state_change_by_acceleration,
+                gyro_noise_covariance,
+                accelerometer_noise_covariance,
+            ) = _stack_by_filter([transitions[one] for one in intervals])
+            state_change = (
+                state_change_by_acceleration
+                + estimates_attitude[:, None] * state_change_by_correction
+            )
+            gyro_process_noise = gyro_variance * gyro_noise_covariance
+        phi = transition[index_in_batch]
         bad_acceleration_fraction = bad_acceleration_flag.compute_bad_acceleration_fraction(
             event_time_s[event - 1] if event else start_s, event_time_s[event]
         )
@@ -402,14 +409,14 @@ def run_segment(  # noqa: PLR0912, PLR0915 (one recursion, read from top to bott
             BAD_ACCELERATION_NOISE_M_S2**2 - acceleration_variance[event]
         )
         # Prediction: x = Φx + u, P = ΦPΦ' + Q
-        x[:, :STATE_COUNT] = (phi @ x[:, :STATE_COUNT, None])[:, :, 0] + (
-            state_change_by_acceleration + estimates_attitude[:, None] * state_change_by_correction
-        )
+        x[:, :STATE_COUNT] = (phi @ x[:, :STATE_COUNT, None])[:, :, 0]
+        x[:, :STATE_COUNT] += state_change[index_in_batch]
         P[:, :STATE_COUNT] = phi @ P[:, :STATE_COUNT]
         P[:, :, :STATE_COUNT] = P[:, :, :STATE_COUNT] @ np.swapaxes(phi, 1, 2)
         P[:, :MOTION_STATE_COUNT, :MOTION_STATE_COUNT] += (
-            gyro_variance * gyro_noise_covariance
-            + acceleration_variance[event, :, None, None] * accelerometer_noise_covariance
+            gyro_process_noise[index_in_batch]
+            + acceleration_variance[event, :, None, None]
+            * accelerometer_noise_covariance[index_in_batch]
         )
         is_bias_constant = bad_acceleration_flag.until_s > event_time_s[event]
         bias_before_fusion = x[:, ACCELEROMETER_BIAS].copy()
@@ -459,11 +466,12 @@ def run_segment(  # noqa: PLR0912, PLR0915 (one recursion, read from top to bott
                         _, P = _update_to_variance(
                             P, tilt_row, attitude_variance[event, :, tilt_row]
                         )
-                is_component_fused = np.repeat(
-                    [is_velocity_fused & has_velocity, is_fused[event]], [3, 2], axis=0
-                )
+                is_component_fused[:, VELOCITY_COLUMNS] = (is_velocity_fused & has_velocity)[
+                    :, None
+                ]
+                is_component_fused[:, HORIZONTAL_POSITION_COLUMNS] = is_fused[event, :, None]
                 x, P = _update_sequentially(
-                    x, P, nu, S, measurement_variance[event], is_component_fused.T
+                    x, P, nu, S, measurement_variance[event], is_component_fused
                 )
             else:
                 innovation[:, 2:] = nu[:, HORIZONTAL_POSITION_COLUMNS]
@@ -507,7 +515,7 @@ def run_segment(  # noqa: PLR0912, PLR0915 (one recursion, read from top to bott
                 fusion_decisions.last_position_s = np.maximum(
                     fusion_decisions.last_position_s, vision_filter.last_fusion_s
                 )
-        if height_filter is not None:
+        if height_filter is not None and not all(uses_logged_flag):
             if has_sample[event] and has_velocity:
                 height_filter.update_records[event, -1, 0] = np.where(
                     can_fuse_velocity[event], nu[:, DOWN_COLUMN], np.nan
@@ -579,7 +587,7 @@ def _update_sequentially(
     """
     component_count = is_fused.shape[1]
     # Components without a measurement are NaN
-    nu, S, R = (np.where(is_fused, array[:, :component_count], 1.0) for array in (nu, S, R))
+    nu, S, R = np.where(is_fused, np.array([nu, S, R])[:, :, :component_count], 1.0)
     fused_inverse_variance = is_fused / S
     inverse_variance_squared = fused_inverse_variance * fused_inverse_variance
     b = 2.0 * fused_inverse_variance - inverse_variance_squared * R

@@ -188,6 +188,7 @@ class HeightFilter:
         self.samples[5, :-1] *= is_enabled_by_aid[BAROMETER.name]
         if GNSS_HGT.name in self.fused_sensors:
             self.samples[5, -1] = has_gnss_fix & is_enabled_by_aid[GNSS_HGT.name]
+        self.has_samples = np.any(self.samples[5], axis=2).tolist()
         self.barometer_sample_count = barometer_samples.shape[1]
         gates = [
             np.maximum(parameters.get(aid.gate, MIN_INNOVATION_GATE), MIN_INNOVATION_GATE)
@@ -249,12 +250,12 @@ class HeightFilter:
         self, aid: Aid, event: int, sample_index: int, x: Array, P: Array, R: Array
     ) -> ArrayPair:
         """Fuse a height (m, down) that was measured before the event."""
+        if not self.has_samples[sample_index][event]:
+            return x, P
         down_m, age_s, time_s, dead_zone_m, weight, has_sample = self.samples[
             :, sample_index, event
         ]
         has_sample = has_sample > 0.0
-        if not has_sample.any():
-            return x, P
         # The sample measured an earlier height: height - age_s · vertical velocity
         PH = P[:, :, POSITION_DOWN] - age_s[:, None] * P[:, :, VELOCITY_DOWN]
         predicted_variance = PH[:, POSITION_DOWN] - age_s * PH[:, VELOCITY_DOWN]
@@ -267,13 +268,15 @@ class HeightFilter:
             nu, R = self.bias.remove_and_update_bias(
                 nu, predicted_variance, R, interval_s, is_bias_updated, weight
             )
-        nu = np.where(nu > 0.0, np.maximum(nu - dead_zone_m, 0.0), nu)
+        nu = nu - np.minimum(np.maximum(nu, 0.0), dead_zone_m)
         S = predicted_variance + R
         gate_squared = self.gate_squared[HEIGHT_SENSORS.index(aid)]
-        is_clipped = has_sample & (self.bad_acceleration_flag.until_s > time_s)
-        limit = np.where(is_clipped, np.sqrt(gate_squared * S), np.inf)
-        nu = np.clip(nu, -limit, limit)
-        is_fused = is_clipped | (has_sample & (nu * nu <= gate_squared * S))
+        is_fused = has_sample & (nu * nu <= gate_squared * S)
+        if not is_fused.all():
+            is_clipped = has_sample & (self.bad_acceleration_flag.until_s > time_s)
+            limit = np.where(is_clipped, np.sqrt(gate_squared * S), np.inf)
+            nu = np.clip(nu, -limit, limit)
+            is_fused |= is_clipped
         self.update_records[event, sample_index] = np.where(
             has_sample, (nu, S, ~is_fused, is_fused), np.nan
         )

@@ -16,6 +16,8 @@ from px4fuse.trajectory.rotation import skew
 
 # Minimum magnetometer noise (gauss) that EKF2 uses
 MIN_MAGNETOMETER_SIGMA_GAUSS = 0.01
+# For a vector v, v @ FLATTENED_CROSS_PRODUCT_MATRICES is the flattened cross product matrix [v]×
+FLATTENED_CROSS_PRODUCT_MATRICES = skew(np.eye(3)).reshape(3, 9)
 
 
 class EventSamples(NamedTuple):
@@ -90,9 +92,14 @@ def fuse_mean_sample(
     """
     measured_vector = x[:, measured_states]
     sample_count, R = mean_sample.sample_count, mean_sample.noise
+    # Faster than skew() for few vectors
+    measured_vector_cross_matrix, theta_cross_matrix = (
+        (vectors @ FLATTENED_CROSS_PRODUCT_MATRICES).reshape(-1, 3, 3)
+        for vectors in (measured_vector, x[:, THETA])
+    )
     H = np.zeros((len(x), mean_sample.value.shape[-1], x.shape[1]))
-    H[:, :, THETA] = mean_sample.ned_to_body_rotation @ skew(measured_vector)
-    H[:, :, measured_states] = mean_sample.ned_to_body_rotation @ (np.eye(3) - skew(x[:, THETA]))
+    H[:, :, THETA] = mean_sample.ned_to_body_rotation @ measured_vector_cross_matrix
+    H[:, :, measured_states] = mean_sample.ned_to_body_rotation @ (np.eye(3) - theta_cross_matrix)
     predicted_value = (H[:, :, measured_states] @ measured_vector[:, :, None])[:, :, 0]
     if bias_states is not None:
         H[:, :, bias_states] = np.eye(3)
@@ -100,13 +107,15 @@ def fuse_mean_sample(
     nu = mean_sample.value - predicted_value
     HP = H @ P
     S = HP @ H.transpose(0, 2, 1)
-    S_of_one_sample = np.diagonal(S, axis1=1, axis2=2) + R[:, None]
+    # innovation_variances is a view of S: adding R to it changes S
+    innovation_variances = S.reshape(len(S), -1)[:, :: nu.shape[1] + 1]
     has_sample = sample_count > 0.0
-    is_fused = has_sample & (nu * nu <= gate[:, None] ** 2 * S_of_one_sample).all(axis=1)
-    update = np.stack([nu, S_of_one_sample, np.tile(is_fused, (nu.shape[1], 1)).T])
+    update = np.empty((3, *nu.shape))
+    update[0], update[1] = nu, innovation_variances + R[:, None]
+    is_fused = has_sample & (nu * nu <= gate[:, None] ** 2 * update[1]).all(axis=1)
+    update[2] = is_fused[:, None]
     update[:, ~has_sample] = np.nan
-    R_of_mean = np.where(has_sample, R / np.maximum(sample_count, 1.0), 1.0)
-    S += R_of_mean[:, None, None] * np.eye(nu.shape[1])
+    innovation_variances += np.where(has_sample, R / np.maximum(sample_count, 1.0), 1.0)[:, None]
     K = (np.linalg.inv(S) @ HP).transpose(0, 2, 1) * is_fused[:, None, None]
     x = x + (K @ nu[:, :, None])[:, :, 0]
     P = P - K @ HP
