@@ -19,7 +19,6 @@ from px4fuse.core.record import (
     PositiveFloat,
     Record,
     Share,
-    Span,
 )
 from px4fuse.core.text import format_count
 from px4fuse.ekf2.inputs import (
@@ -39,12 +38,12 @@ from px4fuse.flight.model import (
     Ekf2,
     Flight,
     NedAxis,
+    Spans,
     Truth,
     Unavailable,
 )
 from px4fuse.readers.px4_innovations import select_axis_innovations
 
-Spans = tuple[Span, ...]
 T = TypeVar("T", pd.DataFrame, "pd.Series[float]")
 HORIZONTAL_AXES: tuple[NedAxis, NedAxis] = ("north", "east")
 # Minimum number of logged innovations for a comparison with the EKF2 replay

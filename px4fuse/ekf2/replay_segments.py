@@ -1,6 +1,9 @@
-"""Flight segments without gaps for the EKF2 replay: prediction steps and initial state.
+"""Flight segments without gaps for the EKF2 replay: prediction steps, initial state and samples.
 
-Source: PX4-Autopilot ``EKF/imu_down_sampler/imu_down_sampler.cpp``.
+Sources: PX4-Autopilot ``EKF/imu_down_sampler/imu_down_sampler.cpp``, ``EKF/ekf_helper.cpp``
+(calcEarthRateNED), ``EKF/ekf.cpp`` (predictState), ``lib/lat_lon_alt/lat_lon_alt.cpp``
+(computeRadiiOfCurvature), ``EKF/aid_sources/optical_flow`` (``optical_flow_control.cpp``: velocity
+and low-pass filter; ``optical_flow_fusion.cpp``: R and gate).
 """
 
 from collections.abc import Mapping, Sequence
@@ -22,10 +25,10 @@ from px4fuse.core.arrays import (
     cumulative_sums,
 )
 from px4fuse.core.record import Span
-from px4fuse.ekf2.earth_model import compute_earth_rate_rad_s, compute_internal_to_published_ratio
 from px4fuse.flight.ekf2_parameters import PARAMETERS
 from px4fuse.flight.model import (
     BAD_ACCELERATION_FLAG,
+    FLOW_FILTER_NEW_SAMPLE_WEIGHT,
     Columns,
     Ekf2,
     Flight,
@@ -36,6 +39,7 @@ from px4fuse.flight.model import (
     time_index,
 )
 from px4fuse.readers.px4_ekf2 import compute_samples_per_step, find_rows_of_timestamps
+from px4fuse.readers.px4_positions import EARTH_RADIUS_M
 from px4fuse.trajectory.rotation import (
     conjugate,
     cumulative_product,
@@ -77,6 +81,8 @@ MAX_CLIPPED_IMU_FRACTION = 0.05
 # Maximum fraction of missing IMU samples that the EKF2 replay ignores
 MAX_LOST_IMU_FRACTION = 0.02
 
+EARTH_RATE_RAD_S = 7.292115e-5
+EQUATORIAL_RADIUS_M, ECCENTRICITY = 6_378_137.0, 0.0818191908425
 # Gravity in NED (CONSTANTS_ONE_G in PX4)
 GRAVITY_M_S2 = np.array([0.0, 0.0, 9.80665])
 
@@ -431,6 +437,32 @@ def _add_gnss_model_inputs(
     )
 
 
+def compute_earth_rate_rad_s(fusion_record: FusionRecord) -> Array:
+    """Return the earth rotation rate (rad/s, NED, shape (3,)); 0 if the latitude is unknown."""
+    latitude_rad = np.radians(fusion_record.latitude_deg)
+    return np.nan_to_num(
+        EARTH_RATE_RAD_S * np.array([np.cos(latitude_rad), 0.0, -np.sin(latitude_rad)])
+    )
+
+
+def compute_internal_to_published_ratio(fusion_record: FusionRecord) -> tuple[float, float, float]:
+    """Return the ratio of EKF2's internal to its published position along north, east and down.
+
+    Since PX4 v1.16, EKF2 computes positions on an ellipsoid, but publishes positions on a sphere.
+    """
+    if np.isnan(fusion_record.latitude_deg) or not fusion_record.stores_latitude():
+        return 1.0, 1.0, 1.0
+    eccentricity_squared = ECCENTRICITY**2
+    q = 1.0 - eccentricity_squared * np.sin(np.radians(fusion_record.latitude_deg)) ** 2
+    # PX4 uses the exponent 2.5 for the meridian radius; the exponent of an ellipsoid is 1.5
+    radii_m = (
+        EQUATORIAL_RADIUS_M * np.array([(1.0 - eccentricity_squared) / q**2.5, q**-0.5])
+        + fusion_record.altitude_m
+    )
+    north_to_sphere_radius_ratio, east_to_sphere_radius_ratio = (radii_m / EARTH_RADIUS_M).tolist()
+    return north_to_sphere_radius_ratio, east_to_sphere_radius_ratio, 1.0
+
+
 def _find_interruption_times_s(imu: pd.DataFrame, ekf2: Ekf2) -> list[float]:
     """Return the times (s) of clipping and height resets, which interrupt the replay."""
     interruption_times_s = [
@@ -665,6 +697,35 @@ def _compute_mean_magnetic_field(
         fused_sample_counts,
         np.zeros(len(gap_free_rows)),
     )
+
+
+def add_flow_samples(segment: ReplaySegment, flow: pd.DataFrame, gate: float) -> ReplaySegment:
+    """Add the logged optical flow to a part of the flight, as horizontal velocity (body frame).
+
+    The logged velocity is low-pass filtered. The replay fuses the mean velocity between two logged
+    samples. ``gate`` is the innovation gate (√S).
+    """
+    begin_s = flow.index - (flow["samples"] - 1.0) * flow["interval_s"]
+    flow = flow[(begin_s > segment.time_s[0]) & (flow.index <= segment.time_s[-1])]
+    sample_count = flow["samples"].to_numpy()
+    interval_s = flow["interval_s"].to_numpy()
+    step_index, weight = compute_low_pass_weights(
+        segment, flow.index.to_numpy(), sample_count, interval_s, FLOW_FILTER_NEW_SAMPLE_WEIGHT
+    )
+    ned_to_body_rotation = segment.body_to_ned[step_index].swapaxes(2, 3)[:, :, :2]
+    imu_velocity_m_s = np.einsum(
+        "ki,kiab,kib->ka", weight, ned_to_body_rotation, segment.imu_velocity_change_m_s[step_index]
+    )
+    sensor_samples = SensorSamples(
+        step_index[:, 0],
+        flow[["forward_m_s", "right_m_s"]].to_numpy() - imu_velocity_m_s,
+        np.einsum("ki,kiab->kab", weight, ned_to_body_rotation),
+        sample_count,
+        flow["noise_m2_s2"].to_numpy(),
+        gate,
+        (VELOCITY,),
+    )
+    return replace(segment, flow=sensor_samples)
 
 
 def compute_low_pass_weights(

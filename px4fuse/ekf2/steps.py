@@ -29,7 +29,6 @@ from px4fuse.ekf2.model import (
 from px4fuse.ekf2.replay import (
     HORIZONTAL_AXES,
     Ekf2Replay,
-    Spans,
     compute_rmse_to_truth,
     interpolate_component,
     is_inside_spans,
@@ -39,7 +38,7 @@ from px4fuse.filter.kalman import Replay, predict_state
 from px4fuse.filter.settings import Settings
 from px4fuse.filter.signals import Segment
 from px4fuse.flight.ekf2_parameters import EV_POS, FLOW, GNSS_POS, GNSS_VEL, MAG
-from px4fuse.flight.model import Columns, Ekf2, Flight, Truth, Unavailable
+from px4fuse.flight.model import Columns, Ekf2, Flight, Spans, Truth, Unavailable
 
 DIFFERENCE_ANALYSIS_NAME = "difference KF - EKF2"
 NO_TRUTH_OVERLAP = Unavailable(

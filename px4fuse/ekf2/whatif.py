@@ -23,7 +23,6 @@ from px4fuse.ekf2.replay import (
     HORIZONTAL_AXES,
     Agreement,
     Ekf2Replay,
-    Spans,
     compute_rmse_to_truth,
     interpolate_component,
     is_inside_spans,
@@ -36,7 +35,7 @@ from px4fuse.errors import SettingsError
 from px4fuse.filter.consistency import compute_nis_band
 from px4fuse.filter.frame_rotation import heading_rad
 from px4fuse.flight.ekf2_parameters import EV_POS, GNSS_POS, GNSS_VEL, MAG, check_parameters
-from px4fuse.flight.model import Columns, Ekf2, Flight, NedAxis, Unavailable
+from px4fuse.flight.model import Columns, Ekf2, Flight, NedAxis, Spans, Unavailable
 
 ANALYSIS_NAME = "EKF2 replay with other parameters"
 # Minimum fraction of logged innovations for a computation of the longest time without fusion
