@@ -10,6 +10,12 @@ from px4fuse.flight.model import Flight
 from px4fuse.trajectory.rotation import skew
 
 EYE = np.eye(15)
+# Properties of KF in the order in which EKF2's replace them, without additional aiding sources
+REPLACED_PROPERTIES = (
+    "sample times and steps", "timestamps and delay", "measurement noise",
+    "accelerometer bias state", "process noise", "attitude and gyro bias states",
+    "rejections and resets", "output predictor",
+)  # fmt: skip
 # rules of v1.16
 RULES = FusionRules(0.2, 0.4, 1.0, 5, None, False)
 

@@ -7,8 +7,11 @@ from ekf2_tools import opened
 from exchange import replace
 from findings_tools import made
 
-from px4fuse.ekf2.earth_model import compute_earth_rate_rad_s, compute_internal_to_published_ratio
 from px4fuse.ekf2.inputs import SIMULATED_EKF2_NOTE
+from px4fuse.ekf2.replay_segments import (
+    compute_earth_rate_rad_s,
+    compute_internal_to_published_ratio,
+)
 from px4fuse.flight.model import FusionRecord
 from px4fuse.readers.px4_positions import EARTH_RADIUS_M
 from px4fuse.simulation.faults import parse_faults

@@ -21,6 +21,7 @@ from px4fuse.ekf2.replay import (
     _compare_other_aids,
     _compute_heading_difference_deg,
     _judge_agreement,
+    _subtract_logged_state,
     compare_with_log,
     is_inside_spans,
     judge_with_logged_rejections,
@@ -149,11 +150,10 @@ def test_ekf2_replay_agreement_statistics_equal_their_formulas():
     nu_log = np.tile([2.0, -2.0], 51)[:101]
     frame = {"innovation_east_m": nu_log, "innovation_variance_east_m2": s_log}
     model = pd.DataFrame({"innovation_east_m": nu_log + 0.5, "innovation_variance_east_m2": s})
-    index = pd.Index([16.0, 17.0, 99.0])
-    still = pd.DataFrame(0.0, index=index, columns=Columns.STATE)
-    off = still.assign(**{Columns.STATE[1]: [3.0, 4.0, 50.0], Columns.STATE[4]: 0.25})
-    replay = SimpleNamespace(published_state=off, find_evaluated_spans=lambda: ((15.0, 20.0),))
-    found = _compare_axis("east", pd.DataFrame(frame), model, made(Ekf2, state=still), replay)  # type: ignore[arg-type]
+    still = pd.DataFrame(0.0, index=pd.Index([16.0, 17.0]), columns=Columns.STATE)
+    off = still.assign(**{Columns.STATE[1]: [3.0, 4.0], Columns.STATE[4]: 0.25})
+    difference = _subtract_logged_state(SimpleNamespace(published_state=off), still)  # type: ignore[arg-type]
+    found = _compare_axis("east", pd.DataFrame(frame), model, difference)
     assert found.innovation_correlation == pytest.approx(1.0)
     assert found.innovation_rms_difference == pytest.approx(0.5)
     ratios = found.s_ratio_p5, found.s_ratio_median, found.s_ratio_p95
@@ -169,7 +169,7 @@ def test_correlation_of_constant_innovations_is_unavailable():
     index = pd.Index(10.0 + np.arange(30.0))
     columns = ["innovation_north_m", "innovation_east_m", "innovation_variance_north_m2",
                "innovation_variance_east_m2", "rejected"]  # fmt: skip
-    updates = pd.DataFrame(0.1, index=index, columns=columns)
+    updates = pd.DataFrame(0.1, index=index, columns=columns).assign(fused_at_s=index)
     axes = ("north", "east")
     columns = [f"{of}_{axis}" for of in ("innovation", "variance") for axis in axes]
     samples = pd.DataFrame(0.1, index=index, columns=columns)
@@ -179,7 +179,8 @@ def test_correlation_of_constant_innovations_is_unavailable():
     replay = SimpleNamespace(
         find_evaluated_spans=lambda: ((0.0, 99.0),), other_aid_updates={"gnss_vel": updates}
     )
-    assert _compare_other_aids(ekf2, replay) == ({}, {"gnss_vel": CONSTANT_INNOVATIONS_REASON})
+    found = _compare_other_aids(ekf2, replay, pd.DataFrame())
+    assert found == ({}, {"gnss_vel": CONSTANT_INNOVATIONS_REASON})
 
 
 def test_ekf2_replay_heading_error_without_logged_state_is_none():

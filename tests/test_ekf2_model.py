@@ -43,12 +43,14 @@ def test_ekf2_model_transition_equals_product_of_step_matrices(model: Ekf2Model)
         model.inputs.segments[0],
         next(iter(model.event_intervals_by_delays.values()))[0],
     )
-    made, end = intervals.compute_transitions(slice(None)), intervals.events.end_step
+    transition, correction, acceleration, gyro_noise, acceleration_noise = (
+        intervals.compute_transitions(slice(None))
+    )
+    end = intervals.events.end_step
     starts = np.concatenate([[0], end[:-1]])
     gyro, force = (model.inputs.settings[f"EKF2_{name}_NOISE"] for name in ("GYR", "ACC"))
-    noise = np.zeros_like(made.transition)
-    noise[:, :9, :9] = gyro**2 * made.gyro_noise_covariance
-    noise[:, :9, :9] += force**2 * made.accelerometer_noise_covariance
+    noise = np.zeros_like(transition)
+    noise[:, :9, :9] = gyro**2 * gyro_noise + force**2 * acceleration_noise
     for at in (0, 1, 57, 300, len(end) - 1):
         F, Q = np.eye(15), np.zeros((15, 15))
         x = x0 = np.random.default_rng(at).normal(0.0, 0.01, 15)
@@ -57,9 +59,8 @@ def test_ekf2_model_transition_equals_product_of_step_matrices(model: Ekf2Model)
             old = step_matrix(segment, k, trapezoid=False)
             Q = old @ Q @ old.T + step_noise(segment, k, gyro, force)
             x = step_state(segment, k, x)
-        assert made.transition[at] == pytest.approx(F, abs=1e-12)
-        change = made.state_change_by_correction[at] + made.state_change_by_acceleration[at]
-        moved = made.transition[at] @ x0 + change
+        assert transition[at] == pytest.approx(F, abs=1e-12)
+        moved = transition[at] @ x0 + correction[at] + acceleration[at]
         assert moved == pytest.approx(x, abs=1e-12)
         # closed forms assume equal steps and a mean force; the real ones vary
         part = slice(0, 9)
@@ -75,7 +76,7 @@ def test_ekf2_model_state_between_updates_is_imu_prediction(
     configuration = FilterConfiguration(model.inputs.settings, estimates_attitude=attitude)
     (part,) = run_configurations(model.inputs, [configuration], model.event_intervals_by_delays)
     kept = np.random.default_rng(4).normal(0.0, 0.05, part.state.shape)
-    state, _ = compute_delayed_states(replace(part, state=kept), 0)
+    state = compute_delayed_states(replace(part, state=kept), 0)
     segment, ends = part.segment, part.events[0].end_step
     if not attitude:
         segment = replace(

@@ -195,7 +195,8 @@ def test_north_and_east_innovations_precede_both_updates():
     P, nu, R = root @ np.swapaxes(root, 1, 2), rng.normal(size=(2, 6)), np.full((2, 6), 0.5)
     S = np.diagonal(P, axis1=1, axis2=2)[:, 3:9] + R
     taken = np.array([True, False])
-    x, left = _update_sequentially(np.zeros((2, 15)), P, nu, S, R, slice(3, 5), taken[:, None])
+    fused = np.outer(taken, [False, False, False, True, True])
+    x, left = _update_sequentially(np.zeros((2, 15)), P, nu, S, R, fused)
     expected, state = P[0], np.zeros(15)
     for column, row in ((3, 6), (4, 7)):
         K = expected[:, row] / S[0, column]

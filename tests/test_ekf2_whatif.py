@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 import pandas as pd
 import pytest
-from ekf2_tools import RULES, opened
+from ekf2_tools import REPLACED_PROPERTIES, RULES, opened
 from exchange import replace
 from findings_tools import NONE, made
 from msgspec import structs
@@ -25,7 +25,6 @@ from px4fuse.ekf2.steps import (
     MAGNETOMETER_PROPERTY,
     OUTPUT_PREDICTOR_PROPERTY,
     REJECTION_PROPERTY,
-    REPLACED_PROPERTIES,
     DifferenceExplanation,
     _find_longest_rejection,
     explain_difference_by_replacements,

@@ -9,11 +9,10 @@ from ekf2_tools import opened
 from exchange import replace
 from ulog_tools import gnss_log, seconds_of, stamps, topic
 
-from px4fuse.ekf2.flow import add_flow_samples
 from px4fuse.ekf2.inputs import read_gnss
 from px4fuse.ekf2.magnetometer import EventSamples, average_by_event, fuse_mean_sample
 from px4fuse.ekf2.model import Ekf2Model, replay_with_settings
-from px4fuse.ekf2.replay_segments import VELOCITY
+from px4fuse.ekf2.replay_segments import VELOCITY, add_flow_samples
 from px4fuse.ekf2.whatif import what_if
 from px4fuse.flight.model import Columns, Flight, Reset
 from px4fuse.readers import read_log

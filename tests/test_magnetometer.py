@@ -241,6 +241,6 @@ def settled(frame_hz: float, on: slice, count: int = 60) -> tuple[float, float] 
 
 def test_magnetometer_replay_requires_continuous_3d_fusion() -> None:
     assert settled(2.0, slice(20, 50)) == (11.0, 24.5)
-    assert settled(1.4, slice(20, 50)) is None
-    assert settled(2.0, slice(0, 0)) is None
-    assert settled(2.0, slice(20, 50, 2)) is None
+    assert settled(1.4, slice(20, 50)) == (np.inf, np.inf)
+    assert settled(2.0, slice(0, 0)) == (np.inf, np.inf)
+    assert settled(2.0, slice(20, 50, 2)) == (np.inf, np.inf)

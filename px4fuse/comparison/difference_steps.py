@@ -15,14 +15,14 @@ from px4fuse.ekf2 import steps
 from px4fuse.ekf2.filter_recursion import FilterConfiguration
 from px4fuse.ekf2.inputs import ReplayInputs
 from px4fuse.ekf2.model import Ekf2Model
-from px4fuse.ekf2.replay import Spans, is_inside_spans
+from px4fuse.ekf2.replay import is_inside_spans
 from px4fuse.ekf2.steps import DifferenceExplanation, DifferenceOutsideReplay, PropertyReplacement
 from px4fuse.filter.kalman import Replay, predict_state, replay
 from px4fuse.filter.settings import Settings
 from px4fuse.filter.signals import AISLE
 from px4fuse.filter.time_offset import ClockOffset
 from px4fuse.filter.tuning import HORIZONTAL
-from px4fuse.flight.model import Unavailable
+from px4fuse.flight.model import Spans, Unavailable
 from px4fuse.request import COMPARISON_OPTIONS
 
 # Below this relative difference, the position RMSEs of KF and EKF2 are reported as equal
@@ -187,7 +187,7 @@ def add_cause_sentences(
             f"positions of KF and EKF2 differ by up to {outside.maximum_m:.1f} m (at "
             f"{outside.at_s:.0f} s)."
         )
-    return structs.replace(explanation, sentences=tuple(sentences), cause_sentence=cause_text)
+    return structs.replace(explanation, sentences=tuple(sentences))
 
 
 def _describe_step_effect(step: PropertyReplacement, explanation: DifferenceExplanation) -> str:

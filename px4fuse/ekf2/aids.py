@@ -47,7 +47,7 @@ MAX_TIME_WITHOUT_FUSION_S = 5.0
 # Maximum time without a fused sample in a sparse log, as a number of logging intervals
 MAX_LOG_INTERVALS_WITHOUT_FUSION = 10.0
 # Maximum relative difference between √R and the noise parameter from which EKF2 computes R
-MEASUREMENT_NOISE_RELATIVE_TOLERANCE = 0.02
+NOISE_RELATIVE_TOLERANCE = 0.02
 # Minimum height (m) of the evaluation: near the ground, rotor downwash disturbs the barometer
 MIN_HEIGHT_M = 2.0
 # Window length (barometer samples) of the running median of the height
@@ -192,14 +192,7 @@ def _evaluate_aid(aid: Aid, aid_log: AidLog, start_s: float, end_s: float) -> Ai
         return samples[[f"{name}_{axis}" for axis in aid_log.axes]].to_numpy()
 
     innovation, innovation_variance = map(select_axis_columns, ("innovation", "variance"))
-    is_enabled = np.ones(len(samples), bool)
-    enabled_fraction = None
-    if aid_log.enabled is not None:
-        is_enabled = np.asarray(sample_step_function(aid_log.enabled, samples.index) > 0.0)
-        flight_grid_times_s = pd.Index(np.arange(start_s, end_s, 0.1))
-        enabled_fraction = float(
-            np.mean(sample_step_function(aid_log.enabled, flight_grid_times_s) > 0.0)
-        )
+    is_enabled = _was_enabled(aid_log, sample_times_s)
     is_fusion_logged = "fused" in samples
     is_reset = np.zeros(len(samples), bool)
     noise_sigma_median = None
@@ -217,7 +210,7 @@ def _evaluate_aid(aid: Aid, aid_log: AidLog, start_s: float, end_s: float) -> Ai
         is_fused = ~is_rejected
     is_evaluated = (is_fused | is_rejected) & is_enabled & ~is_reset
     longest_gap_s = _find_longest_gap(
-        sample_times_s, is_fused & is_enabled, aid_log, start_s, end_s
+        sample_times_s[is_fused & is_enabled], aid_log, start_s, end_s
     )
     axes = {}
     for axis_index, axis in enumerate(aid_log.axes):
@@ -249,7 +242,9 @@ def _evaluate_aid(aid: Aid, aid_log: AidLog, start_s: float, end_s: float) -> Ai
         label=aid.label,
         unit=aid.unit,
         topic=aid_log.topics[0],
-        enabled_fraction=enabled_fraction,
+        enabled_fraction=None
+        if aid_log.enabled is None
+        else float(np.mean(_was_enabled(aid_log, np.arange(start_s, end_s, 0.1)))),
         fused_fraction=_compute_fraction(is_fused, is_enabled),
         fused_logged=is_fusion_logged,
         rejected_fraction=_compute_fraction(is_rejected, is_enabled),
@@ -265,6 +260,13 @@ def _evaluate_aid(aid: Aid, aid_log: AidLog, start_s: float, end_s: float) -> Ai
         if is_evaluated.any()
         else "disabled",
     )
+
+
+def _was_enabled(aid_log: AidLog, times_s: Array) -> BoolArray:
+    """Return True for each time at which fusion was enabled, or may have been enabled."""
+    if aid_log.enabled is None:
+        return np.ones(len(times_s), bool)
+    return np.asarray(sample_step_function(aid_log.enabled, times_s) > 0.0)
 
 
 def _find_largest_mean_change(time_s: Array, normalised_innovations: Array) -> Span | None:
@@ -307,13 +309,10 @@ def _find_applied_gate(aid: Aid, aid_log: AidLog) -> float:
     """Return the gate (√S) of EKF2, from logged test ratios or from the gate parameter."""
     axis = aid_log.axes[0]
     if f"ratio_{axis}" in aid_log.samples:
-        rows_with_test_ratio = aid_log.samples[aid_log.samples[f"ratio_{axis}"] > 0.0]
-        nis = (
-            rows_with_test_ratio[f"innovation_{axis}"] ** 2
-            / rows_with_test_ratio[f"variance_{axis}"]
-        )
-        if len(rows_with_test_ratio) and (nis > 0.0).any():
-            return float(np.sqrt(np.median(nis / rows_with_test_ratio[f"ratio_{axis}"])))
+        rows = aid_log.samples[aid_log.samples[f"ratio_{axis}"] > 0.0]
+        nis = rows[f"innovation_{axis}"] ** 2 / rows[f"variance_{axis}"]
+        if (nis > 0.0).any():
+            return float(np.sqrt(np.median(nis / rows[f"ratio_{axis}"])))
     return max(aid_log.parameters.get(aid.gate, aid.default_gate), 0.01)
 
 
@@ -322,34 +321,22 @@ def _find_noise_origin(aid: Aid, aid_log: AidLog, noise_sigma: float | None) -> 
     parameter_value = aid_log.parameters.get(aid.noise)
     if noise_sigma is None or parameter_value is None:
         return "" if noise_sigma is None else aid.noise_source_text
-    for expected_noise in (
+    expected_noises = (
         parameter_value,
         GNSS_HEIGHT_NOISE_FACTOR * parameter_value,
-        np.sqrt(parameter_value),
-    ):
-        if (
-            abs(noise_sigma - expected_noise)
-            <= MEASUREMENT_NOISE_RELATIVE_TOLERANCE * expected_noise
-        ):
-            return aid.noise
+        math.sqrt(parameter_value),
+    )
+    if np.isclose(noise_sigma, expected_noises, NOISE_RELATIVE_TOLERANCE, 0.0).any():
+        return aid.noise
     return aid.noise_source_text or aid.noise
 
 
-def _find_longest_gap(
-    sample_times_s: Array, is_fused: BoolArray, aid_log: AidLog, start_s: float, end_s: float
-) -> Span:
-    is_inside = (aid_log.times_with_unknown_fusion_s > start_s) & (
-        aid_log.times_with_unknown_fusion_s < end_s
-    )
-    gap_limits_s = np.union1d(
-        np.r_[start_s, sample_times_s[is_fused], end_s],
-        aid_log.times_with_unknown_fusion_s[is_inside],
-    )
-    gap_starts_s = gap_limits_s[:-1]
-    is_enabled = np.ones(len(gap_starts_s), bool)
-    if aid_log.enabled is not None:
-        # EKF2 disables an aiding source up to 1 s after the last fused sample
-        is_enabled = sample_step_function(aid_log.enabled, pd.Index(gap_starts_s + 1.0)) > 0.0
+def _find_longest_gap(fusion_times_s: Array, aid_log: AidLog, start_s: float, end_s: float) -> Span:
+    unknown_times_s = aid_log.times_with_unknown_fusion_s
+    is_inside = (unknown_times_s > start_s) & (unknown_times_s < end_s)
+    gap_limits_s = np.unique(np.r_[start_s, fusion_times_s, end_s, unknown_times_s[is_inside]])
+    # EKF2 disables an aiding source up to 1 s after the last fused sample
+    is_enabled = _was_enabled(aid_log, gap_limits_s[:-1] + 1.0)
     longest_index = int(np.argmax(np.diff(gap_limits_s) * is_enabled))
     if not is_enabled[longest_index]:
         return start_s, start_s

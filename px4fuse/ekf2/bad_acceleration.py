@@ -44,34 +44,28 @@ class BadAccelerationFlag:
         logged_flag = segment.is_acceleration_bad
         if logged_flag is None:
             logged_flag = np.zeros(len(time_s), bool)
-        self.models_flag = not uses_logged_flag.all()
         self.uses_logged_flag = uses_logged_flag
         self.flag_duration_s = flag_duration_s
         flag_change_steps = np.flatnonzero(np.diff(logged_flag, prepend=False, append=False))
-        self.logged_since_s, self.logged_until_s = (
-            np.append(time_s, np.inf)[flag_change_steps].reshape(-1, 2).T
-        )
+        self.logged_spans_s = np.append(time_s, np.inf)[flag_change_steps].reshape(-1, 2)
         self.since_s = np.full(len(uses_logged_flag), time_s[0])
         self.until_s = np.full(
             len(uses_logged_flag), time_s[0] + flag_duration_s * float(logged_flag[0])
         )
 
-    def compute_bad_acceleration_fraction(self, begin_s: Array, end_s: Array) -> Array | None:
+    def compute_bad_acceleration_fraction(self, begin_s: Array, end_s: Array) -> Array:
         """Return the fraction of a time interval with a bad acceleration, for each configuration.
 
-        Return None if the flag is not set in the interval. Call this method in time order.
+        Call this method in time order.
         """
-        if len(self.logged_since_s):
-            last_row = np.searchsorted(self.logged_since_s, end_s) - 1
-            uses_logged_flag_span = self.uses_logged_flag & (last_row >= 0)
-            self.since_s = np.where(
-                uses_logged_flag_span, self.logged_since_s[last_row], self.since_s
-            )
-            self.until_s = np.where(
-                uses_logged_flag_span, self.logged_until_s[last_row], self.until_s
-            )
+        if len(self.logged_spans_s):
+            last_row = np.searchsorted(self.logged_spans_s[:, 0], end_s) - 1
+            follows_log = self.uses_logged_flag & (last_row >= 0)
+            self.since_s[follows_log], self.until_s[follows_log] = self.logged_spans_s[
+                last_row[follows_log]
+            ].T
         if not (self.until_s > begin_s).any():
-            return None
+            return np.zeros_like(end_s)
         overlap_s = np.minimum(self.until_s, end_s) - np.maximum(self.since_s, begin_s)
         return np.asarray(np.maximum(overlap_s, 0.0) / np.maximum(end_s - begin_s, 1e-9))
 
@@ -86,34 +80,24 @@ class BadAccelerationFlag:
             Normalised height innovations (√S, positive upwards): k of the barometer, one of GNSS.
             NaN without a sample.
         """
+        *previous_barometer, previous_gnss = previous_innovations
+        *barometer, gnss = innovations
         # EKF2's test uses the latest innovation of each height sensor
-        gnss_height_innovation = previous_innovations[-1]
-        barometer_height_innovation = np.full(len(gnss_height_innovation), np.nan)
-        for sample_innovation in previous_innovations[:-1]:
-            barometer_height_innovation = np.where(
-                np.isnan(sample_innovation), barometer_height_innovation, sample_innovation
-            )
-        is_acceleration_bad = _indicates_falling(
-            barometer_height_innovation, gnss_height_innovation
-        )
-        for sample_innovation in innovations[:-1]:
-            barometer_height_innovation = np.where(
-                np.isnan(sample_innovation), barometer_height_innovation, sample_innovation
-            )
-            is_acceleration_bad |= _indicates_falling(
-                barometer_height_innovation, gnss_height_innovation
-            )
-        is_acceleration_bad |= _indicates_falling(barometer_height_innovation, innovations[-1])
+        latest_barometer = np.full_like(gnss, np.nan)
+        is_acceleration_bad = np.zeros(len(gnss), bool)
+        for sample_number, sample in enumerate((*previous_barometer, *barometer), start=1):
+            latest_barometer = np.where(np.isnan(sample), latest_barometer, sample)
+            if sample_number >= len(previous_barometer):
+                is_acceleration_bad |= _indicates_falling(latest_barometer, previous_gnss)
+        is_acceleration_bad |= _indicates_falling(latest_barometer, gnss)
         is_acceleration_bad &= ~self.uses_logged_flag
         self.since_s = np.where(is_acceleration_bad & (self.until_s < time_s), time_s, self.since_s)
         self.until_s = np.where(is_acceleration_bad, time_s + self.flag_duration_s, self.until_s)
 
 
-def _indicates_falling(
-    barometer_height_innovation: Array, gnss_height_innovation: Array
-) -> BoolArray:
-    larger_innovation = np.maximum(barometer_height_innovation, gnss_height_innovation)
-    smaller_innovation = np.minimum(barometer_height_innovation, gnss_height_innovation)
+def _indicates_falling(barometer_innovation: Array, gnss_innovation: Array) -> BoolArray:
+    larger_innovation = np.maximum(barometer_innovation, gnss_innovation)
+    smaller_innovation = np.minimum(barometer_innovation, gnss_innovation)
     return np.asarray(
         (larger_innovation > MIN_HEIGHT_INNOVATION_OF_ONE_SENSOR)
         & (smaller_innovation > MIN_HEIGHT_INNOVATION_OF_BOTH_SENSORS)

@@ -13,7 +13,6 @@ import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from operator import attrgetter
-from typing import Any
 
 import numpy as np
 from scipy.linalg import block_diag
@@ -22,11 +21,9 @@ from px4fuse.core.arrays import Array, Array32, ArrayPair, BoolArray, IntArray
 from px4fuse.ekf2.bad_acceleration import BadAccelerationFlag
 from px4fuse.ekf2.heights import (
     GNSS_HEIGHT_NOISE_FACTOR,
-    HEIGHT_SENSORS,
     MIN_INNOVATION_GATE,
     MIN_MEASUREMENT_NOISE_SIGMA,
     HeightFilter,
-    group_barometer_by_event,
 )
 from px4fuse.ekf2.inputs import FusionRules, ReplayInputs
 from px4fuse.ekf2.intervals import (
@@ -57,7 +54,7 @@ from px4fuse.ekf2.replay_segments import (
     ReplaySegment,
 )
 from px4fuse.ekf2.vision import VisionFilter, group_vision_by_event, set_states
-from px4fuse.flight.ekf2_parameters import EV_POS, FLOW, GNSS_POS, GNSS_VEL, MAG
+from px4fuse.flight.ekf2_parameters import AIDS, EV_POS, FLOW, GNSS_POS, GNSS_VEL, MAG
 
 # Minimum state variance; prevents a division by zero
 MIN_STATE_VARIANCE = 1e-30
@@ -158,18 +155,16 @@ class FilterConfiguration:
             return FusionDelays(-self.timestamp_offset_s - 0.5 * inputs.mean_step_s, np.inf)
         delay_s = self.settings[inputs.aid.delay] * 1e-3
         max_delay_ms = max(self.settings.get(aid.delay, 0.0) for aid in (GNSS_POS, EV_POS))
-        if inputs.rules.is_horizon_largest_delay:  # IMU buffer length = largest delay parameter
-            buffer_length = math.ceil(max_delay_ms * 1e-3 / inputs.configured_step_s)
-            return FusionDelays(
-                delay_s, max(inputs.horizon_s, (buffer_length - 1) * inputs.mean_step_s)
-            )
-        # EKF2 raises EKF2_DELAY_MAX to the largest delay parameter (EKF2.cpp)
-        longest_delay_ms = max(self.settings["EKF2_DELAY_MAX"], max_delay_ms)
-        if longest_delay_ms == inputs.settings["EKF2_DELAY_MAX"]:
-            return FusionDelays(delay_s, inputs.horizon_s)
+        min_horizon_s = inputs.horizon_s
+        if not inputs.rules.is_horizon_largest_delay:
+            # EKF2 raises EKF2_DELAY_MAX to the largest delay parameter (EKF2.cpp)
+            max_delay_ms = max(max_delay_ms, self.settings["EKF2_DELAY_MAX"])
+            if max_delay_ms == inputs.settings["EKF2_DELAY_MAX"]:
+                return FusionDelays(delay_s, inputs.horizon_s)
+            min_horizon_s = inputs.mean_step_s
         # Number of samples in the IMU buffer (initialise_interface, estimator_interface.cpp)
-        buffer_length = max(math.ceil(longest_delay_ms * 1e-3 / inputs.configured_step_s), 2)
-        return FusionDelays(delay_s, (buffer_length - 1) * inputs.mean_step_s)
+        buffer_length = math.ceil(max_delay_ms * 1e-3 / inputs.configured_step_s)
+        return FusionDelays(delay_s, max((buffer_length - 1) * inputs.mean_step_s, min_horizon_s))
 
 
 @dataclass(frozen=True)
@@ -230,12 +225,19 @@ def run_segment(  # noqa: PLR0912, PLR0915 (one recursion, read from top to bott
     event_count = len(intervals[0].events)
     parameters = {
         name: np.array([configuration.settings[name] for configuration in configurations])
-        for name in configurations[0].settings
+        for name in inputs.settings
     }
     # A parameter change in flight does not apply to configurations that change this parameter
     for name, value in segment.changed_parameters.items():
-        is_unchanged = parameters[name] == inputs.settings[name]
-        parameters[name] = np.where(is_unchanged, value, parameters[name])
+        parameters[name][parameters[name] == inputs.settings[name]] = value
+    get_switches = attrgetter(
+        "estimates_biases",
+        "estimates_attitude",
+        "has_gate",
+        "uses_logged_decisions",
+        "uses_reported_noise",
+        "fuses_velocity",
+    )
     (
         estimates_biases,
         estimates_attitude,
@@ -243,44 +245,18 @@ def run_segment(  # noqa: PLR0912, PLR0915 (one recursion, read from top to bott
         uses_logged_decisions,
         uses_reported_noise,
         fuses_velocity,
-    ) = np.array(
-        [
-            attrgetter(
-                "estimates_biases",
-                "estimates_attitude",
-                "has_gate",
-                "uses_logged_decisions",
-                "uses_reported_noise",
-                "fuses_velocity",
-            )(configuration)
-            for configuration in configurations
-        ]
-    ).T
-    interval_sets = list(dict.fromkeys(intervals))
-    interval_set_index_by_configuration = (
-        list(map(interval_sets.index, intervals)) if len(interval_sets) > 1 else slice(None)
-    )
-
-    def select_by_configuration(arrays_by_interval_set: Sequence[Any]) -> Any:
-        return np.stack(arrays_by_interval_set, axis=1)[:, interval_set_index_by_configuration]
-
-    event_table = select_by_configuration(
-        [interval_arrays.events for interval_arrays in interval_sets]
-    )
-    action = np.where(has_gate, event_table["action"], FUSE * event_table["usable"])
-    event_steps = event_table["end_step"]
-    has_action = action > NO_ACTION
+    ) = np.array([get_switches(configuration) for configuration in configurations]).T
+    # The arrays of events have the shape (events, filters, ...)
+    events = np.stack([interval_arrays.events for interval_arrays in intervals], axis=1)
+    event_steps = events["end_step"]
     event_time_s = segment.time_s[event_steps]
+    action = np.where(has_gate, events["action"], FUSE * events["usable"])
+    has_action = action > NO_ACTION
     has_sample = np.any(has_action, axis=1).tolist()
     is_enabled_by_aid = {
-        aid.name: event_time_s
-        < np.array(
-            [
-                configuration.disable_time_s_by_aid.get(aid.name, np.inf)
-                for configuration in configurations
-            ]
-        )
-        for aid in (inputs.aid, GNSS_VEL, MAG, FLOW, EV_POS, *HEIGHT_SENSORS)
+        name: event_time_s
+        < np.array([one.disable_time_s_by_aid.get(name, np.inf) for one in configurations])
+        for name in AIDS
     }
     can_fuse_velocity = (action == FUSE) & is_enabled_by_aid[GNSS_VEL.name] & fuses_velocity
     sample_indices = np.maximum(intervals[0].events.sample, 0)
@@ -288,13 +264,9 @@ def run_segment(  # noqa: PLR0912, PLR0915 (one recursion, read from top to bott
         inputs, segment, sample_indices, event_steps, parameters, uses_reported_noise
     )
     has_velocity = inputs.received_positions.velocity_m_s is not None
-    gates = [
-        parameters.get(GNSS_VEL.gate, np.ones(configuration_count)),
-        parameters[inputs.aid.gate],
-    ]
-    gate_squared = (
-        np.maximum(np.repeat(np.stack(gates, axis=1), 3, axis=1), MIN_INNOVATION_GATE) ** 2
-    )
+    position_gate = parameters[inputs.aid.gate]
+    gates = parameters.get(GNSS_VEL.gate, position_gate), position_gate
+    gate_squared = np.maximum(np.repeat(gates, 3, axis=0).T, MIN_INNOVATION_GATE) ** 2
     # Logged height and heading, for replays without height sensor or magnetometer
     logged_heading_and_down = np.stack(
         [segment.attitude_error_rad[event_steps, HEADING], segment.down_m[event_steps]], axis=-1
@@ -303,30 +275,21 @@ def run_segment(  # noqa: PLR0912, PLR0915 (one recursion, read from top to bott
     heading_and_down_variance = np.stack(
         [attitude_variance[:, :, HEADING], segment.down_variance_m2[event_steps]], axis=-1
     )
-    height_filter = vision_filter = None
     has_magnetometer = segment.magnetic_field is not None
-    event_steps_by_interval_set = [
-        interval_arrays.events.end_step for interval_arrays in interval_sets
-    ]
     sensor_means = []
     for aid, samples in ((MAG, segment.magnetic_field), (FLOW, segment.flow)):
         if samples is not None:
-            sample_means_by_interval = [
-                average_by_event(segment, samples, end_steps)
-                for end_steps in event_steps_by_interval_set
-            ]
-            mean_samples_by_event = EventSamples(
-                *map(select_by_configuration, zip(*sample_means_by_interval, strict=True))
+            mean_samples = EventSamples(
+                *_stack_by_filter(
+                    [average_by_event(segment, samples, end_steps) for end_steps in event_steps.T]
+                )
             )
+            mean_samples.sample_count[:] *= is_enabled_by_aid[aid.name]
             if aid == MAG:
                 R = np.maximum(parameters[MAG.noise], MIN_MAGNETOMETER_SIGMA_GAUSS) ** 2
-                mean_samples_by_event = mean_samples_by_event._replace(
-                    noise=mean_samples_by_event.noise + R
-                )
-            sample_count = mean_samples_by_event.sample_count * is_enabled_by_aid[aid.name]
+                mean_samples.noise[:] = R
             gate = parameters.get(aid.gate, np.full(configuration_count, samples.gate))
-            mean_samples_by_event = mean_samples_by_event._replace(sample_count=sample_count)
-            sensor_means.append((mean_samples_by_event, gate, samples.state_slices))
+            sensor_means.append((mean_samples, gate, samples.state_slices))
     uses_logged_flag = [
         segment.height_samples is None
         or segment.is_acceleration_bad is None
@@ -336,14 +299,12 @@ def run_segment(  # noqa: PLR0912, PLR0915 (one recursion, read from top to bott
     bad_acceleration_flag = BadAccelerationFlag(
         np.array(uses_logged_flag), inputs.rules.bad_acceleration_flag_duration_s, segment
     )
+    height_filter = vision_filter = None
     if segment.height_samples is not None:
-        barometer_samples_by_event = np.stack(
-            group_barometer_by_event(segment, event_steps_by_interval_set), axis=-1
-        )
         height_filter = HeightFilter(
             segment,
-            barometer_samples_by_event[..., interval_set_index_by_configuration],
-            event_table["time_s"],
+            event_steps,
+            events["time_s"],
             has_action,
             is_enabled_by_aid,
             parameters,
@@ -351,42 +312,33 @@ def run_segment(  # noqa: PLR0912, PLR0915 (one recursion, read from top to bott
             bad_acceleration_flag,
         )
     if inputs.vision_positions is not None:
-        grouped_vision_samples = [
+        vision_samples = [
             group_vision_by_event(
                 inputs,
                 segment,
-                interval_arrays.events.end_step,
+                end_steps,
                 configuration.settings,
                 configuration.compute_delays(inputs).horizon_s,
             )
-            for interval_arrays, configuration in zip(intervals, configurations, strict=True)
+            for end_steps, configuration in zip(event_steps.T, configurations, strict=True)
         ]
         vision_filter = VisionFilter(
-            segment,
-            grouped_vision_samples,
-            is_enabled_by_aid,
-            parameters,
-            has_gate,
-            uses_reported_noise,
+            segment, vision_samples, is_enabled_by_aid, parameters, has_gate, uses_reported_noise
         )
-    gyro_variance = np.where(estimates_attitude, parameters["EKF2_GYR_NOISE"] ** 2, 0.0)[
-        :, None, None
-    ]
+    gyro_variance = (estimates_attitude * parameters["EKF2_GYR_NOISE"] ** 2)[:, None, None]
     variance_growth_per_step, max_variance_for_growth = _compute_variance_growth(
         inputs, segment, parameters, estimates_biases, estimates_attitude
     )
-    step_counts = np.diff(event_steps, axis=0, prepend=0)[:, :, None]
-    acceleration_variance = np.tile(
-        parameters["EKF2_ACC_NOISE"][:, None, None] ** 2, (event_count, 1, 1, 1)
-    )
+    step_counts = np.diff(event_steps, axis=0, prepend=0)
+    acceleration_variance = np.tile(parameters["EKF2_ACC_NOISE"] ** 2, (event_count, 1))
     if (clipped_fraction := segment.clipped_fraction) is not None:
         # While an accelerometer clips, EKF2 uses BAD_ACCELERATION_NOISE_M_S2
         clipped_fraction_sum_by_event = np.diff(
             np.cumsum(clipped_fraction)[event_steps], axis=0, prepend=clipped_fraction[0]
         )
         acceleration_variance += (
-            clipped_fraction_sum_by_event[:, :, None, None]
-            / np.maximum(step_counts, 1)[..., None]
+            clipped_fraction_sum_by_event
+            / np.maximum(step_counts, 1)
             * (BAD_ACCELERATION_NOISE_M_S2**2 - acceleration_variance)
         )
     x, P = _make_start_state(segment, estimates_biases, estimates_attitude)
@@ -405,7 +357,7 @@ def run_segment(  # noqa: PLR0912, PLR0915 (one recursion, read from top to bott
         inputs.rules,
         segment.time_s[0],
         np.where(is_aid_enabled, action, NO_ACTION),
-        event_table["can_start"] & is_aid_enabled,
+        events["can_start"] & is_aid_enabled,
         event_time_s,
         has_gate,
         uses_logged_decisions,
@@ -425,9 +377,6 @@ def run_segment(  # noqa: PLR0912, PLR0915 (one recursion, read from top to bott
     states[0] = x
     state_variances[0] = _get_state_variances(P)
     innovation, R = np.empty((2, configuration_count, 4))
-    measured_columns = slice(
-        0 if has_velocity else HORIZONTAL_POSITION_COLUMNS.start, HORIZONTAL_POSITION_COLUMNS.stop
-    )
     is_component_fused = np.zeros((configuration_count, HORIZONTAL_POSITION_COLUMNS.stop), bool)
     start_s = np.full(configuration_count, segment.time_s[0])
     reset_rules = [
@@ -439,64 +388,53 @@ def run_segment(  # noqa: PLR0912, PLR0915 (one recursion, read from top to bott
         index_in_batch = event % EVENT_BATCH_SIZE
         if not index_in_batch:
             event_batch = slice(event, event + EVENT_BATCH_SIZE)
-            transition_batches = [
-                interval_arrays.compute_transitions(event_batch)
-                for interval_arrays in interval_sets
-            ]
+            transitions = {one: one.compute_transitions(event_batch) for one in set(intervals)}
             (
                 transition,
                 state_change_by_correction,
                 state_change_by_acceleration,
                 gyro_noise_covariance,
                 accelerometer_noise_covariance,
-            ) = map(select_by_configuration, zip(*transition_batches, strict=True))
+            ) = _stack_by_filter([transitions[one] for one in intervals])
             state_change = (
                 state_change_by_acceleration
                 + estimates_attitude[:, None] * state_change_by_correction
             )
-            process_noise = (
-                gyro_variance * gyro_noise_covariance
-                + acceleration_variance[event_batch] * accelerometer_noise_covariance
-            )
-            variance_growth = variance_growth_per_step * step_counts[event_batch]
+            gyro_process_noise = gyro_variance * gyro_noise_covariance
         phi = transition[index_in_batch]
-        # Prediction: x = Φx + u, P = ΦPΦ' + Q
-        x[:, :STATE_COUNT] = (phi @ x[:, :STATE_COUNT, None])[:, :, 0] + state_change[
-            index_in_batch
-        ]
-        P[:, :STATE_COUNT] = phi @ P[:, :STATE_COUNT]
-        P[:, :, :STATE_COUNT] = P[:, :, :STATE_COUNT] @ np.swapaxes(phi, 1, 2)
-        P[:, :MOTION_STATE_COUNT, :MOTION_STATE_COUNT] += process_noise[index_in_batch]
-        is_bias_constant = None
-        flagged_fraction = bad_acceleration_flag.compute_bad_acceleration_fraction(
+        bad_acceleration_fraction = bad_acceleration_flag.compute_bad_acceleration_fraction(
             event_time_s[event - 1] if event else start_s, event_time_s[event]
         )
-        if flagged_fraction is not None:
-            variance_increase = flagged_fraction * (
-                BAD_ACCELERATION_NOISE_M_S2**2 - acceleration_variance[event, :, 0, 0]
-            )
-            P[:, :MOTION_STATE_COUNT, :MOTION_STATE_COUNT] += (
-                variance_increase[:, None, None] * accelerometer_noise_covariance[index_in_batch]
-            )
-            is_bias_constant = bad_acceleration_flag.until_s > event_time_s[event]
-            bias_before_fusion = x[:, ACCELEROMETER_BIAS].copy()
-            bias_covariance = P[:, ACCELEROMETER_BIAS, ACCELEROMETER_BIAS].copy()
+        acceleration_variance[event] += bad_acceleration_fraction * (
+            BAD_ACCELERATION_NOISE_M_S2**2 - acceleration_variance[event]
+        )
+        # Prediction: x = Φx + u, P = ΦPΦ' + Q
+        x[:, :STATE_COUNT] = (phi @ x[:, :STATE_COUNT, None])[:, :, 0]
+        x[:, :STATE_COUNT] += state_change[index_in_batch]
+        P[:, :STATE_COUNT] = phi @ P[:, :STATE_COUNT]
+        P[:, :, :STATE_COUNT] = P[:, :, :STATE_COUNT] @ np.swapaxes(phi, 1, 2)
+        P[:, :MOTION_STATE_COUNT, :MOTION_STATE_COUNT] += (
+            gyro_process_noise[index_in_batch]
+            + acceleration_variance[event, :, None, None]
+            * accelerometer_noise_covariance[index_in_batch]
+        )
+        is_bias_constant = bad_acceleration_flag.until_s > event_time_s[event]
+        bias_before_fusion = x[:, ACCELEROMETER_BIAS].copy()
+        bias_covariance = P[:, ACCELEROMETER_BIAS, ACCELEROMETER_BIAS].copy()
         bias_variance = _get_state_variances(P)[:, BIASES.start :]
-        bias_variance += (bias_variance < max_variance_for_growth) * variance_growth[index_in_batch]
-        if inputs.rules.min_accelerometer_bias_variance_m2_s4 is not None:
-            _limit_bias_variance(
-                P, inputs.rules.min_accelerometer_bias_variance_m2_s4, estimates_biases
-            )
+        bias_variance += (bias_variance < max_variance_for_growth) * (
+            variance_growth_per_step * step_counts[event, :, None]
+        )
+        if min_bias_variance := inputs.rules.min_accelerometer_bias_variance_m2_s4:
+            _limit_bias_variance(P, min_bias_variance, estimates_biases)
         innovation[:, 2:] = 0.0
         R[:, 2:] = VARIANCE_WITHOUT_EFFECT
-        for mean_samples_by_event, gate, state_slices in sensor_means:
-            if mean_samples_by_event.sample_count[event].any():
-                mean_sample = EventSamples(*(quantity[event] for quantity in mean_samples_by_event))
-                x, P, innovation_variance_and_fused = fuse_mean_sample(
-                    x, P, mean_sample, gate, *state_slices
-                )
+        for mean_samples, gate, state_slices in sensor_means:
+            if mean_samples.sample_count[event].any():
+                mean_sample = EventSamples(*(quantity[event] for quantity in mean_samples))
+                x, P, update = fuse_mean_sample(x, P, mean_sample, gate, *state_slices)
                 if EARTH_MAGNETIC_FIELD in state_slices:
-                    magnetometer_updates[event] = innovation_variance_and_fused
+                    magnetometer_updates[event] = update
         if vision_filter is not None:
             x, P = vision_filter.fuse(event, x, P, False, fusion_decisions.last_position_s)
         if height_filter is not None:
@@ -507,19 +445,11 @@ def run_segment(  # noqa: PLR0912, PLR0915 (one recursion, read from top to bott
             is_outside_gate = nu * nu > gate_squared * S
             if is_outside_gate[:, DOWN_COLUMN].any():
                 # With a bad vertical acceleration, EKF2 clips the vertical innovation to the gate
-                has_clipped_vertical_innovation = has_gate & (
-                    bad_acceleration_flag.until_s > event_time_s[event]
-                )
-                has_clipped_vertical_innovation &= ~is_outside_gate[:, :DOWN_COLUMN].any(axis=1)
-                innovation_limit = np.sqrt(gate_squared * S)[
-                    has_clipped_vertical_innovation, DOWN_COLUMN
-                ]
-                nu[has_clipped_vertical_innovation, DOWN_COLUMN] = np.clip(
-                    nu[has_clipped_vertical_innovation, DOWN_COLUMN],
-                    -innovation_limit,
-                    innovation_limit,
-                )
-                is_outside_gate[:, DOWN_COLUMN] &= ~has_clipped_vertical_innovation
+                is_clipped = has_gate & (bad_acceleration_flag.until_s > event_time_s[event])
+                is_clipped &= ~is_outside_gate[:, :DOWN_COLUMN].any(axis=1)
+                limit = np.sqrt(gate_squared * S)
+                nu[is_clipped, DOWN_COLUMN] = np.clip(nu, -limit, limit)[is_clipped, DOWN_COLUMN]
+                is_outside_gate[is_clipped, DOWN_COLUMN] = False
             innovations[event] = nu
             variances[event] = S
             is_velocity_fused = can_fuse_velocity[event] & ~(
@@ -533,19 +463,15 @@ def run_segment(  # noqa: PLR0912, PLR0915 (one recursion, read from top to bott
                 if not has_magnetometer:
                     # Without a magnetometer, the tilt variance is set to its logged value
                     for tilt_row in range(HEADING):
-                        _, P = _compute_update_to_variance(
+                        _, P = _update_to_variance(
                             P, tilt_row, attitude_variance[event, :, tilt_row]
                         )
-                is_component_fused[:, VELOCITY_COLUMNS] = is_velocity_fused[:, None]
+                is_component_fused[:, VELOCITY_COLUMNS] = (is_velocity_fused & has_velocity)[
+                    :, None
+                ]
                 is_component_fused[:, HORIZONTAL_POSITION_COLUMNS] = is_fused[event, :, None]
                 x, P = _update_sequentially(
-                    x,
-                    P,
-                    nu,
-                    S,
-                    measurement_variance[event],
-                    measured_columns,
-                    is_component_fused[:, measured_columns],
+                    x, P, nu, S, measurement_variance[event], is_component_fused
                 )
             else:
                 innovation[:, 2:] = nu[:, HORIZONTAL_POSITION_COLUMNS]
@@ -558,28 +484,20 @@ def run_segment(  # noqa: PLR0912, PLR0915 (one recursion, read from top to bott
             )
         # With a magnetometer, only the height is set to its logged value
         elif has_magnetometer:
-            K, P = _compute_update_to_variance(
-                P, POSITION_DOWN, heading_and_down_variance[event, :, 1]
-            )
+            K, P = _update_to_variance(P, POSITION_DOWN, heading_and_down_variance[event, :, 1])
             x = x + K * (logged_heading_and_down[event, :, 1] - x[:, POSITION_DOWN])[:, None]
             x[:, POSITION_DOWN] = logged_heading_and_down[event, :, 1]
         if not has_magnetometer:
-            np.subtract(
-                logged_heading_and_down[event], x[:, HEADING_AND_DOWN], out=innovation[:, :2]
-            )
+            innovation[:, :2] = logged_heading_and_down[event] - x[:, HEADING_AND_DOWN]
             R[:, :2] = _compute_noise_for_target_variance(
                 _get_state_variances(P)[:, HEADING_AND_DOWN], heading_and_down_variance[event]
             )
             heading_error_rad = np.where(estimates_attitude, x[:, HEADING] + innovation[:, 0], 0.0)
             if inputs.fuses_vision_height or height_filter is not None:
                 R[:, 1] = VARIANCE_WITHOUT_EFFECT
-                if has_sample[event] and height_filter is None:
-                    innovation[:, 1] = nu[:, 5]
-                    R[:, 1] = np.where(
-                        has_action[event],
-                        measurement_variance[event, :, 5],
-                        VARIANCE_WITHOUT_EFFECT,
-                    )
+            if inputs.fuses_vision_height and has_sample[event]:
+                innovation[:, 1] = nu[:, 5]
+                R[has_action[event], 1] = measurement_variance[event, has_action[event], 5]
             x, P = _update_jointly(x, P, innovation, R)
             x[:, HEADING] = heading_error_rad
         if has_sample[event] and is_reset[event].any():
@@ -588,9 +506,7 @@ def run_segment(  # noqa: PLR0912, PLR0915 (one recursion, read from top to bott
                 set_states(
                     x, P, is_reset[event], rows, measured_values[event, :, columns], reset_variance
                 )
-            position_reset_m[event, is_reset[event]] = nu[
-                is_reset[event], HORIZONTAL_POSITION_COLUMNS
-            ]
+            position_reset_m[event] = is_reset[event, :, None] * nu[:, HORIZONTAL_POSITION_COLUMNS]
         if vision_filter is not None:
             vision_filter.bias.bias_m = vision_filter.bias.bias_m + position_reset_m[event]
             x, P = vision_filter.fuse(event, x, P, True, fusion_decisions.last_position_s)
@@ -599,14 +515,14 @@ def run_segment(  # noqa: PLR0912, PLR0915 (one recursion, read from top to bott
                 fusion_decisions.last_position_s = np.maximum(
                     fusion_decisions.last_position_s, vision_filter.last_fusion_s
                 )
-        if height_filter is not None and bad_acceleration_flag.models_flag:
+        if height_filter is not None and not all(uses_logged_flag):
             if has_sample[event] and has_velocity:
                 height_filter.update_records[event, -1, 0] = np.where(
                     can_fuse_velocity[event], nu[:, DOWN_COLUMN], np.nan
                 )
                 height_filter.update_records[event, -1, 1] = S[:, DOWN_COLUMN]
             height_filter.update_bad_acceleration_flag(event, event_time_s[event])
-        if is_bias_constant is not None:
+        if is_bias_constant.any():
             x[is_bias_constant, ACCELEROMETER_BIAS] = bias_before_fusion[is_bias_constant]
             P[is_bias_constant, ACCELEROMETER_BIAS, ACCELEROMETER_BIAS] = bias_covariance[
                 is_bias_constant
@@ -637,6 +553,11 @@ def run_segment(  # noqa: PLR0912, PLR0915 (one recursion, read from top to bott
     )
 
 
+def _stack_by_filter(tuples_by_filter: Sequence[tuple[Array, ...]]) -> list[Array]:
+    """Stack the arrays of all filters along axis 1."""
+    return [np.stack(arrays, axis=1) for arrays in zip(*tuples_by_filter, strict=True)]
+
+
 def _update_jointly(x: Array, P: Array, innovation: Array, R: Array) -> ArrayPair:
     """Fuse all measurements together: K = PH'(HPH' + R)⁻¹, x = x + Kν, P = P - KHP."""
     HP = np.take(P, STATES_FUSED_IN_ONE_UPDATE, axis=1)
@@ -648,7 +569,7 @@ def _update_jointly(x: Array, P: Array, innovation: Array, R: Array) -> ArrayPai
     return x, 0.5 * (P + np.swapaxes(P, 1, 2))
 
 
-def _compute_update_to_variance(P: Array, state_index: int, target_variance: Array) -> ArrayPair:
+def _update_to_variance(P: Array, state_index: int, target_variance: Array) -> ArrayPair:
     """Return gain and covariance of an update after which a state has ``target_variance``."""
     state_variance = P[:, state_index, state_index]
     R = _compute_noise_for_target_variance(state_variance, target_variance)
@@ -657,29 +578,27 @@ def _compute_update_to_variance(P: Array, state_index: int, target_variance: Arr
 
 
 def _update_sequentially(
-    x: Array, P: Array, nu: Array, S: Array, R: Array, components: slice, is_fused: BoolArray
+    x: Array, P: Array, nu: Array, S: Array, R: Array, is_fused: BoolArray
 ) -> ArrayPair:
-    """Fuse the components of a measurement one after the other, as EKF2 does; return x and P.
+    """Fuse velocity and horizontal position, one component after the other; return x and P.
 
     All innovations ν and variances S are from before the first update (fuseDirectStateMeasurement,
     ``ekf_helper.cpp``). P is updated in Joseph form.
     """
-    nu, S, R = (array[:, components] for array in (nu, S, R))
+    component_count = is_fused.shape[1]
+    # Components without a measurement are NaN
+    nu, S, R = np.where(is_fused, np.array([nu, S, R])[:, :, :component_count], 1.0)
     fused_inverse_variance = is_fused / S
     inverse_variance_squared = fused_inverse_variance * fused_inverse_variance
     b = 2.0 * fused_inverse_variance - inverse_variance_squared * R
-    rows = slice(
-        VELOCITY_AND_POSITION.start + components.start,
-        VELOCITY_AND_POSITION.start + components.stop,
-    )
+    rows = slice(VELOCITY.start, VELOCITY.start + component_count)
     columns = P[:, rows].copy()
-    for j in range(nu.shape[1]):
+    for j in range(component_count):
         column = columns[:, j : j + 1]
         measurement_covariance = columns[:, j, rows]
         b[:, j] -= inverse_variance_squared[:, j] * measurement_covariance[:, j]
-        if j + 1 < nu.shape[1]:
-            factor = b[:, j, None] * measurement_covariance[:, j + 1 :]
-            columns[:, j + 1 :] -= factor[:, :, None] * column
+        factor = b[:, j, None] * measurement_covariance[:, j + 1 :]
+        columns[:, j + 1 :] -= factor[:, :, None] * column
     x = x + ((fused_inverse_variance * nu)[:, None] @ columns)[:, 0]
     covariance_reduction_factor = np.sqrt(b)[:, :, None] * columns
     return x, P - np.swapaxes(covariance_reduction_factor, 1, 2) @ covariance_reduction_factor
@@ -707,7 +626,6 @@ class _FusionDecisions:
 
     def __post_init__(self) -> None:
         configuration_count = len(self.has_gate)
-
         self.last_position_s, self.last_velocity_s = np.full((2, configuration_count), self.start_s)
         self.is_stopped = np.zeros(configuration_count, bool)
         self.remaining_resets = np.full(configuration_count, self.fusion_rules.max_resets)
@@ -725,42 +643,34 @@ class _FusionDecisions:
 
         Return four masks: position rejected, position fused, position reset, velocity fused.
         """
-        fusion_rules = self.fusion_rules
-        now_s = self.time_s[event]
-        action = self.sample_actions[event]
-        has_gate = self.has_gate
-        uses_logged_decisions = self.uses_logged_decisions
+        fusion_rules, uses_logged_decisions = self.fusion_rules, self.uses_logged_decisions
+        now_s, action, is_reset_logged = (
+            values[event] for values in (self.time_s, self.sample_actions, self.logged_resets)
+        )
         may_fuse = action == FUSE
         is_decision_logged = math.isfinite(self.logged_rejected_flags[event])
         self.last_velocity_s = np.where(is_velocity_fused, now_s, self.last_velocity_s)
         if self.only_gate_decides[event] and not (is_outside_gate.any() or self.is_stopped.any()):
             self.last_position_s = now_s
             return is_outside_gate, may_fuse, is_outside_gate, is_velocity_fused
-        is_rejected = (
-            np.where(
-                uses_logged_decisions & is_decision_logged,
-                self.logged_rejected_flags[event] > 0.0,
-                is_outside_gate,
-            )
-            & has_gate
-            & may_fuse
+        is_rejected = np.where(
+            uses_logged_decisions & is_decision_logged,
+            self.logged_rejected_flags[event] > 0.0,
+            is_outside_gate,
         )
-        time_since_fusion_s = now_s - self.last_position_s
+        is_rejected &= self.has_gate & may_fuse
         if self.is_every_reset_logged and not is_decision_logged:
             # Without a logged reset after the timeout, EKF2 has fused the sample before the timeout
             next_event = min(event + 1, len(self.time_s) - 1)
-            is_last_event_before_reset_timeout = (
-                self.time_s[next_event] - self.last_position_s > fusion_rules.reset_timeout_s
-            )
             is_rejected &= ~(
                 uses_logged_decisions
-                & is_last_event_before_reset_timeout
+                & (self.time_s[next_event] - self.last_position_s > fusion_rules.reset_timeout_s)
                 & ~self.logged_resets[next_event]
             )
-        is_fused = may_fuse & ~is_rejected & ~self.is_stopped
-        is_fusion_starting = has_gate & (
+        is_fusion_starting = self.has_gate & (
             (action == START_FUSION) | (self.is_stopped & self.can_start[event])
         )
+        time_since_fusion_s = now_s - self.last_position_s
         is_rejection_timed_out = (
             is_rejected & ~self.is_stopped & (time_since_fusion_s > fusion_rules.reset_timeout_s)
         )
@@ -769,30 +679,28 @@ class _FusionDecisions:
             is_rejection_timed_out &= is_velocity_timed_out | (
                 time_since_fusion_s > 2.0 * fusion_rules.reset_timeout_s
             )
-        is_fusion_restarted = is_fusion_starting | (
-            is_rejection_timed_out & (self.remaining_resets > 0)
+        uses_logged_resets = uses_logged_decisions & (
+            is_decision_logged or is_reset_logged or self.is_every_reset_logged
         )
-        if is_decision_logged or self.logged_resets[event] or self.is_every_reset_logged:
-            is_fusion_restart_logged = has_gate & (
-                self.logged_resets[event] | (action == START_FUSION)
-            )
-            is_fusion_restarted = np.where(
-                uses_logged_decisions, is_fusion_restart_logged, is_fusion_restarted
-            )
-            is_fused &= ~is_fusion_restarted
-            is_rejection_timed_out &= ~uses_logged_decisions
-        self.last_position_s = np.where(is_fused | is_fusion_restarted, now_s, self.last_position_s)
-        self.last_velocity_s = np.where(is_fusion_restarted, now_s, self.last_velocity_s)
+        is_rejection_timed_out &= ~uses_logged_resets
+        is_reset_after_timeout = is_rejection_timed_out & (self.remaining_resets > 0)
+        is_reset = np.where(
+            uses_logged_resets,
+            self.has_gate & (is_reset_logged | (action == START_FUSION)),
+            is_fusion_starting | is_reset_after_timeout,
+        )
+        is_fused = may_fuse & ~(is_rejected | self.is_stopped | is_reset)
+        self.last_position_s = np.where(is_fused | is_reset, now_s, self.last_position_s)
+        self.last_velocity_s = np.where(is_reset, now_s, self.last_velocity_s)
         self.is_stopped = (self.is_stopped & ~is_fusion_starting) | (
-            is_rejection_timed_out & (self.remaining_resets == 0)
-        )
-        remaining_resets = self.remaining_resets - (
-            is_rejection_timed_out & (self.remaining_resets > 0)
+            is_rejection_timed_out & ~is_reset_after_timeout
         )
         self.remaining_resets = np.where(
-            is_fusion_starting, fusion_rules.max_resets, remaining_resets
+            is_fusion_starting,
+            fusion_rules.max_resets,
+            self.remaining_resets - is_reset_after_timeout,
         )
-        return is_rejected, is_fused, is_fusion_restarted, is_velocity_fused & ~is_fusion_restarted
+        return is_rejected, is_fused, is_reset, is_velocity_fused & ~is_reset
 
 
 def _compute_variance_growth(
@@ -810,17 +718,16 @@ def _compute_variance_growth(
     limit_parameter_by_noise_parameter = {"GYR_B": "GYR", "ACC_B": "ACC"}
     if segment.magnetic_field is not None:
         limit_parameter_by_noise_parameter |= {"MAG_E": "MAG", "MAG_B": "MAG"}
-    noise_density, max_variance_for_growth = (
-        np.stack([parameters[f"EKF2_{name}_NOISE"] for name in parameter_names], axis=-1)
-        for parameter_names in (
+    noise_density, max_sigma_for_growth = (
+        np.repeat([parameters[f"EKF2_{name}_NOISE"] for name in names], 3, axis=0).T
+        for names in (
             limit_parameter_by_noise_parameter,
             limit_parameter_by_noise_parameter.values(),
         )
     )
-    noise_density[:, :2] *= np.stack([estimates_attitude, estimates_biases], axis=-1)
-    return np.repeat((noise_density * inputs.mean_step_s) ** 2, 3, axis=-1), np.repeat(
-        max_variance_for_growth**2, 3, axis=-1
-    )
+    noise_density[:, :3] *= estimates_attitude[:, None]
+    noise_density[:, 3:6] *= estimates_biases[:, None]
+    return (noise_density * inputs.mean_step_s) ** 2, max_sigma_for_growth**2
 
 
 def estimate_state_correlation(inputs: ReplayInputs, segment: ReplaySegment) -> ReplaySegment:
@@ -945,26 +852,28 @@ def _collect_measurements(
     uses_reported_noise: BoolArray,
 ) -> ArrayPair:
     """Return measurements and variances, shape (events, filters, 6): velocity, position (NED)."""
-    received_positions = inputs.received_positions
-    aid = inputs.aid
+    received_positions, aid = inputs.received_positions, inputs.aid
     sensor_offset_m = (
         np.stack([parameters[name] for name in aid.lever_arm], -1) - inputs.imu_offset_m
     )[:, :, None]
     measured_values, measurement_variance = np.full(
         (2, len(event_steps), len(sensor_offset_m), 6), np.nan
     )
-    lever_arm_ned_m = (segment.body_to_ned[event_steps] @ sensor_offset_m)[..., 0]
+
+    def limit_variance(reported_variance: Array, noise_parameter: str) -> Array:
+        min_sigma = np.maximum(parameters[noise_parameter], MIN_MEASUREMENT_NOISE_SIGMA)
+        return np.asarray(np.maximum(reported_variance, min_sigma[:, None] ** 2))
+
+    body_to_ned = segment.body_to_ned[event_steps]
     measured_values[..., 3:] = (
-        received_positions.position_m[sample_indices][:, None] - lever_arm_ned_m
+        received_positions.position_m[sample_indices][:, None]
+        - (body_to_ned @ sensor_offset_m)[..., 0]
     )
     if aid.noise_mode_parameter:
         uses_reported_noise = uses_reported_noise & (parameters[aid.noise_mode_parameter] != 1.0)
-    reported_variance = np.where(
-        uses_reported_noise[:, None], received_positions.variance_m2[sample_indices][:, None], 0.0
-    )
-    measurement_variance[..., 3:] = np.maximum(
-        reported_variance,
-        np.maximum(parameters[aid.noise], MIN_MEASUREMENT_NOISE_SIGMA)[:, None] ** 2,
+    measurement_variance[..., 3:] = limit_variance(
+        received_positions.variance_m2[sample_indices][:, None] * uses_reported_noise[:, None],
+        aid.noise,
     )
     if (
         received_positions.velocity_m_s is not None
@@ -972,19 +881,14 @@ def _collect_measurements(
     ):
         # Velocity of the antenna relative to the rotating IMU: dR/dt · lever arm
         rotation_matrix_derivative_per_s = (
-            np.diff(segment.body_to_ned, axis=0)[event_steps - 1]
-            / segment.step_s[event_steps - 1, None, None]
-        )
-        lever_arm_velocity_m_s = (rotation_matrix_derivative_per_s @ sensor_offset_m)[..., 0]
+            body_to_ned - segment.body_to_ned[event_steps - 1]
+        ) / segment.step_s[event_steps - 1, None, None]
         measured_values[..., :3] = (
-            received_positions.velocity_m_s[sample_indices][:, None] - lever_arm_velocity_m_s
+            received_positions.velocity_m_s[sample_indices][:, None]
+            - (rotation_matrix_derivative_per_s @ sensor_offset_m)[..., 0]
         )
-        reported_variance = received_positions.velocity_variance_m2_s2[sample_indices][:, None]
-        min_variance = (
-            np.maximum(parameters[GNSS_VEL.noise], MIN_MEASUREMENT_NOISE_SIGMA)[:, None] ** 2
-        )
-        measurement_variance[..., :3] = (
-            np.maximum(reported_variance, min_variance) * GNSS_VELOCITY_VARIANCE_FACTORS
+        measurement_variance[..., :3] = GNSS_VELOCITY_VARIANCE_FACTORS * limit_variance(
+            received_positions.velocity_variance_m2_s2[sample_indices][:, None], GNSS_VEL.noise
         )
     if aid == GNSS_POS:
         measurement_variance[..., 5] = np.maximum(

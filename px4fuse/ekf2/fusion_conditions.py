@@ -342,17 +342,15 @@ def _check_gnss(positions: UnfusedPositions) -> Iterator[UnmetCondition]:
     # Bit n of EKF2_GPS_CHECK enables check n + 1 of GNSS_CHECKS; check 0 (fix) is always enabled
     checked_mask = int(parameters.get("EKF2_GPS_CHECK", -1)) << 1 | 1
     failed_fraction_by_bit = {
-        bit: positions.compute_status_bit_fraction("failed_checks", bit)
+        bit: fraction
         for bit in range(len(GNSS_CHECKS))
+        if checked_mask >> bit & 1
+        and (fraction := positions.compute_status_bit_fraction("failed_checks", bit))
+        > MIN_GNSS_CHECK_FAILURE_FRACTION
     }
-    failed_bits = [
-        bit
-        for bit in failed_fraction_by_bit
-        if checked_mask >> bit & 1 and failed_fraction_by_bit[bit] > MIN_GNSS_CHECK_FAILURE_FRACTION
-    ]
-    if not failed_bits:
+    if not failed_fraction_by_bit:
         return
-    failed_bits.sort(key=lambda bit: -failed_fraction_by_bit[bit])
+    failed_bits = sorted(failed_fraction_by_bit, key=lambda bit: -failed_fraction_by_bit[bit])
     samples = positions.select_samples(source.samples)
     reported_variance_by_check_bit = {3: samples["north_m2"], 4: samples["down_m2"]}
     if source.velocity is not None:

@@ -12,13 +12,13 @@ import numpy as np
 import pandas as pd
 
 from px4fuse.core.arrays import Array, BoolArray, IntArray, compute_median_interval_s
-from px4fuse.ekf2.earth_model import compute_internal_to_published_ratio
-from px4fuse.ekf2.flow import add_flow_samples
 from px4fuse.ekf2.heights import add_heights
 from px4fuse.ekf2.replay_segments import (
     MIN_IMU_GAP_S,
     MIN_SEGMENT_DURATION_S,
     ReplaySegment,
+    add_flow_samples,
+    compute_internal_to_published_ratio,
     find_replay_segments,
     read_prediction_step_s,
 )

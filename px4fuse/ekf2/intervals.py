@@ -15,7 +15,7 @@ Sources: PX4-Autopilot ``EKF/python/ekf_derivation/derivation.py`` (predict_cova
 """
 
 from dataclasses import dataclass
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 
@@ -61,25 +61,6 @@ EVENT_DTYPE = np.dtype(
 )
 
 
-class Transitions(NamedTuple):
-    """State transition and process noise between successive fusions, for E intervals.
-
-    Attributes
-    ----------
-    transition : ndarray, shape (E, 15, 15)
-    state_change_by_correction, state_change_by_acceleration : ndarray, shape (E, 15)
-        Change of the state by attitude correction, and by acceleration.
-    gyro_noise_covariance, accelerometer_noise_covariance : ndarray, shape (E, 9, 9)
-        Process noise for a sensor noise of 1 rad/s or 1 m/s² in each prediction step.
-    """
-
-    transition: Array
-    state_change_by_correction: Array
-    state_change_by_acceleration: Array
-    gyro_noise_covariance: Array
-    accelerometer_noise_covariance: Array
-
-
 @dataclass(frozen=True, eq=False)
 class EventIntervals:
     """Intervals between successive fusions in one part of a flight.
@@ -99,7 +80,17 @@ class EventIntervals:
     duration_s: Array
     state_derivatives: Array
 
-    def compute_transitions(self, rows: slice) -> Transitions:
+    def compute_transitions(self, rows: slice) -> tuple[Array, ...]:
+        """Return state transition and process noise of E intervals.
+
+        Returns
+        -------
+        transition : ndarray, shape (E, 15, 15)
+        state_change_by_correction, state_change_by_acceleration : ndarray, shape (E, 15)
+            Change of the state by attitude correction, and by acceleration.
+        gyro_noise_covariance, accelerometer_noise_covariance : ndarray, shape (E, 9, 9)
+            Process noise for a sensor noise of 1 rad/s or 1 m/s² in each prediction step.
+        """
         state_derivatives, duration_s = self.state_derivatives[rows], self.duration_s[rows]
         transition = np.tile(np.eye(STATE_COUNT), (len(duration_s), 1, 1))
         state_change_by_correction, state_change_by_acceleration = np.zeros(
@@ -114,14 +105,13 @@ class EventIntervals:
             ..., ACCELERATION_DERIVATIVE_COLUMN
         ]
         transition[:, POSITION, VELOCITY] = duration_s[:, None, None] * np.eye(3)
-        unit_noise_covariances = _compute_imu_process_noise(
-            self.prediction_step_counts[rows], duration_s, transition[:, VELOCITY, THETA]
-        )
-        return Transitions(
+        return (
             transition,
             state_change_by_correction,
             state_change_by_acceleration,
-            *unit_noise_covariances,
+            *_compute_imu_process_noise(
+                self.prediction_step_counts[rows], duration_s, transition[:, VELOCITY, THETA]
+            ),
         )
 
 
@@ -234,21 +224,21 @@ def _find_fusion_actions(
     action = np.full(len(measurement_times_s), NO_ACTION)
     can_start = np.zeros(len(measurement_times_s), dtype=bool)
     usable_rows = np.flatnonzero(is_usable)
-    intervals_s = np.diff(measurement_times_s[usable_rows], prepend=-np.inf)
-    can_start[usable_rows] = intervals_s < fusion_rules.start_interval_s
+    usable_times_s = measurement_times_s[usable_rows]
+    can_start[usable_rows] = (
+        np.diff(usable_times_s, prepend=-np.inf) < fusion_rules.start_interval_s
+    )
     # Time (s) since the previous usable sample
-    sample_gaps_s = segment.time_s[end_steps[usable_rows] - 1] - np.concatenate(
-        [[np.inf], measurement_times_s[usable_rows[:-1]]]
+    sample_gaps_s = segment.time_s[end_steps[usable_rows] - 1] - np.append(
+        np.inf, usable_times_s[:-1]
     )
     is_fusing = segment.starts_while_fusing
-    for row, (interval_s, gap_s) in enumerate(
-        zip(intervals_s.tolist(), sample_gaps_s.tolist(), strict=True)
-    ):
+    for row, gap_s in zip(usable_rows.tolist(), sample_gaps_s.tolist(), strict=True):
         is_fusing = is_fusing and not gap_s > fusion_rules.stop_timeout_s
         if is_fusing:
-            action[usable_rows[row]] = FUSE
-        elif interval_s < fusion_rules.start_interval_s:
-            action[usable_rows[row]] = START_FUSION
+            action[row] = FUSE
+        elif can_start[row]:
+            action[row] = START_FUSION
             is_fusing = True
     return action, can_start
 
@@ -310,24 +300,21 @@ def _compute_imu_process_noise(
     m = velocity_derivative_by_attitude / n
     mm = m @ m.transpose(0, 2, 1)
     eye = np.eye(3)
+    # Sums of k and of k² for k = 0 to n - 1
+    sum_k, sum_k_squared = n * (n - 1) / 2, n * (n - 1) * (2 * n - 1) / 6
     gyro_noise_covariance, accelerometer_noise_covariance = np.zeros(
         (2, len(prediction_step_counts), MOTION_STATE_COUNT, MOTION_STATE_COUNT)
     )
     for matrix, rows, columns, block in (
         (gyro_noise_covariance, THETA, THETA, n * d**2 * eye),
-        (gyro_noise_covariance, VELOCITY, THETA, m * d**2 * n * (n - 1) / 2),
+        (gyro_noise_covariance, VELOCITY, THETA, m * d**2 * sum_k),
         (gyro_noise_covariance, POSITION, THETA, m * d**3 * n * (n - 1) * (n - 2) / 6),
-        (gyro_noise_covariance, VELOCITY, VELOCITY, mm * d**2 * n * (n - 1) * (2 * n - 1) / 6),
+        (gyro_noise_covariance, VELOCITY, VELOCITY, mm * d**2 * sum_k_squared),
         (gyro_noise_covariance, POSITION, VELOCITY, mm * d**3 * n**4 / 8),
         (gyro_noise_covariance, POSITION, POSITION, mm * d**4 * n**5 / 20),
         (accelerometer_noise_covariance, VELOCITY, VELOCITY, n * d**2 * eye),
-        (accelerometer_noise_covariance, POSITION, VELOCITY, d**3 * n * (n - 1) / 2 * eye),
-        (
-            accelerometer_noise_covariance,
-            POSITION,
-            POSITION,
-            d**4 * n * (n - 1) * (2 * n - 1) / 6 * eye,
-        ),
+        (accelerometer_noise_covariance, POSITION, VELOCITY, d**3 * sum_k * eye),
+        (accelerometer_noise_covariance, POSITION, POSITION, d**4 * sum_k_squared * eye),
     ):
         matrix[:, rows, columns] = block
         if rows != columns:

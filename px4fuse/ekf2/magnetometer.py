@@ -16,9 +16,8 @@ from px4fuse.trajectory.rotation import skew
 
 # Minimum magnetometer noise (gauss) that EKF2 uses
 MIN_MAGNETOMETER_SIGMA_GAUSS = 0.01
-IDENTITY_MATRIX = np.eye(3)
 # For a vector v, v @ FLATTENED_CROSS_PRODUCT_MATRICES is the flattened cross product matrix [v]×
-FLATTENED_CROSS_PRODUCT_MATRICES = skew(IDENTITY_MATRIX).reshape(3, 9)
+FLATTENED_CROSS_PRODUCT_MATRICES = skew(np.eye(3)).reshape(3, 9)
 
 
 class EventSamples(NamedTuple):
@@ -47,15 +46,14 @@ def average_by_event(
 ) -> EventSamples:
     """Return the mean of the magnetometer or optical flow samples before each fusion."""
     event_index = np.searchsorted(event_end_steps, sensor_samples.step_indices)
-    event_count = len(event_end_steps)
-    is_inside = event_index < event_count
-    event_index = event_index[is_inside]
-    sample_counts = np.maximum(np.bincount(event_index, minlength=event_count), 1)
+    # The last row contains the samples after the last event
+    row_count = len(event_end_steps) + 1
+    rows_by_event = np.maximum(np.bincount(event_index, minlength=row_count), 1)
 
-    def mean(rows: Array) -> Array:
-        sum_by_event = np.zeros((event_count, *rows.shape[1:]))
-        np.add.at(sum_by_event, event_index, rows[is_inside])
-        return np.asarray((sum_by_event.T / sample_counts).T)
+    def mean(values: Array) -> Array:
+        sum_by_event = np.zeros((row_count, *values.shape[1:]))
+        np.add.at(sum_by_event, event_index, values)
+        return np.asarray((sum_by_event.T / rows_by_event).T[:-1])
 
     value, ned_to_body_rotation, noise_variance = map(
         mean, (sensor_samples.value, sensor_samples.ned_to_body_rotation, sensor_samples.noise)
@@ -64,7 +62,7 @@ def average_by_event(
         # The IMU velocity change, which was subtracted from optical flow, is added again
         velocity_m_s = segment.imu_velocity_change_m_s[event_end_steps]
         value = value + np.einsum("eab,eb->ea", ned_to_body_rotation, velocity_m_s)
-    sample_count = np.bincount(event_index, sensor_samples.sample_count[is_inside], event_count)
+    sample_count = np.bincount(event_index, sensor_samples.sample_count, row_count)[:-1]
     return EventSamples(
         value, ned_to_body_rotation, np.asarray(sample_count, float), noise_variance
     )
@@ -94,35 +92,31 @@ def fuse_mean_sample(
     """
     measured_vector = x[:, measured_states]
     sample_count, R = mean_sample.sample_count, mean_sample.noise
+    # Faster than skew() for few vectors
     measured_vector_cross_matrix, theta_cross_matrix = (
         (vectors @ FLATTENED_CROSS_PRODUCT_MATRICES).reshape(-1, 3, 3)
         for vectors in (measured_vector, x[:, THETA])
     )
     H = np.zeros((len(x), mean_sample.value.shape[-1], x.shape[1]))
     H[:, :, THETA] = mean_sample.ned_to_body_rotation @ measured_vector_cross_matrix
-    H[:, :, measured_states] = mean_sample.ned_to_body_rotation @ (
-        IDENTITY_MATRIX - theta_cross_matrix
-    )
+    H[:, :, measured_states] = mean_sample.ned_to_body_rotation @ (np.eye(3) - theta_cross_matrix)
     predicted_value = (H[:, :, measured_states] @ measured_vector[:, :, None])[:, :, 0]
     if bias_states is not None:
-        H[:, :, bias_states] = IDENTITY_MATRIX
+        H[:, :, bias_states] = np.eye(3)
         predicted_value += x[:, bias_states]
     nu = mean_sample.value - predicted_value
     HP = H @ P
     S = HP @ H.transpose(0, 2, 1)
     # innovation_variances is a view of S: adding R to it changes S
     innovation_variances = S.reshape(len(S), -1)[:, :: nu.shape[1] + 1]
-    innovation_variance_and_fused = np.empty((3, *nu.shape))
-    innovation_variance_and_fused[0] = nu
-    innovation_variance_and_fused[1] = innovation_variances + R[:, None]
     has_sample = sample_count > 0.0
-    is_fused = has_sample & (nu * nu <= gate[:, None] ** 2 * innovation_variance_and_fused[1]).all(
-        axis=1
-    )
-    innovation_variance_and_fused[2] = is_fused[:, None]
-    innovation_variance_and_fused[:, ~has_sample] = np.nan
+    update = np.empty((3, *nu.shape))
+    update[0], update[1] = nu, innovation_variances + R[:, None]
+    is_fused = has_sample & (nu * nu <= gate[:, None] ** 2 * update[1]).all(axis=1)
+    update[2] = is_fused[:, None]
+    update[:, ~has_sample] = np.nan
     innovation_variances += np.where(has_sample, R / np.maximum(sample_count, 1.0), 1.0)[:, None]
     K = (np.linalg.inv(S) @ HP).transpose(0, 2, 1) * is_fused[:, None, None]
     x = x + (K @ nu[:, :, None])[:, :, 0]
     P = P - K @ HP
-    return x, 0.5 * (P + P.transpose(0, 2, 1)), innovation_variance_and_fused
+    return x, 0.5 * (P + P.transpose(0, 2, 1)), update

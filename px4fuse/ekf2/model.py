@@ -7,7 +7,8 @@ published height. Without a magnetometer, the replay uses EKF2's published headi
 
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
-from itertools import pairwise, starmap
+from itertools import pairwise
+from types import MappingProxyType
 from typing import Any
 
 import numpy as np
@@ -15,13 +16,12 @@ import pandas as pd
 from msgspec import structs
 from scipy.spatial.transform import Rotation
 
-from px4fuse.core.arrays import Array, IntArray
+from px4fuse.core.arrays import Array, BoolArray, IntArray
 from px4fuse.core.record import Span
 from px4fuse.ekf2.filter_recursion import (
     HEADING,
     HORIZONTAL_POSITION,
     HORIZONTAL_POSITION_COLUMNS,
-    VELOCITY_AND_POSITION,
     FilterConfiguration,
     SegmentRun,
     estimate_state_correlation,
@@ -102,36 +102,24 @@ class Ekf2Model:
 
 
 def prepare_ekf2_model(
-    flight: Flight, list_later_configurations: ListConfigurations = lambda _: ()
+    flight: Flight,
+    list_later_configurations: ListConfigurations = lambda _: (),
+    failed_agreement_by_aid: Mapping[str, Agreement] = MappingProxyType({}),
 ) -> Ekf2Model | Unavailable:
     """Prepare EKF2 replays of a flight, and replay the flight with the logged parameters.
 
     ``list_later_configurations`` returns further filter configurations to compute.
+    ``failed_agreement_by_aid`` contains the aiding sources to omit, with the agreement of the
+    replay that fused them. If further aiding sources do not agree with the log, the function calls
+    itself without them.
     """
-    failed_agreement_by_aid: dict[str, Agreement] = {}
-    while not isinstance(
-        model := _prepare_without_aids(flight, list_later_configurations, failed_agreement_by_aid),
-        Unavailable,
-    ):
-        if not (
-            further_omitted_aids := model.agreement.doubtful.keys() - failed_agreement_by_aid.keys()
-        ):
-            break
-        failed_agreement_by_aid |= dict.fromkeys(further_omitted_aids, model.agreement)
-    return model
-
-
-def _prepare_without_aids(
-    flight: Flight,
-    list_later_configurations: ListConfigurations,
-    failed_agreement_by_aid: Mapping[str, Agreement],
-) -> Ekf2Model | Unavailable:
     omitted_aids = {
         name: agreement.doubtful[name] for name, agreement in failed_agreement_by_aid.items()
     }
     inputs = prepare_inputs(flight, omitted_aids)
     if isinstance(inputs, Unavailable):
         return structs.replace(inputs, what=ANALYSIS_NAME)
+    logged_flight = flight
     if inputs.aid == GNSS_POS and isinstance(flight.ekf2, Ekf2):
         flight = replace(flight, ekf2=replace_vision_by_gnss_innovations(flight.ekf2))
     baseline_configuration = FilterConfiguration(inputs.settings)
@@ -140,11 +128,6 @@ def _prepare_without_aids(
     segments = tuple(estimate_state_correlation(inputs, segment) for segment in inputs.segments)
     inputs = replace(inputs, segments=segments)
     configurations = [baseline_configuration]
-    if (
-        np.mean(inputs.received_positions.rejected_flags > 0.0)
-        > MAX_REJECTED_FRACTION_FOR_COMPARISON
-    ):
-        configurations.append(FilterConfiguration(inputs.settings, uses_logged_decisions=True))
     for configuration in list_later_configurations(inputs):
         configurations += [] if configuration in configurations else [configuration]
     event_intervals_by_delays = {delays: intervals}
@@ -153,6 +136,12 @@ def _prepare_without_aids(
     agreement = compare_with_log(flight, baseline_replay)
     if isinstance(agreement, Unavailable):
         return agreement
+    if further_omitted_aids := agreement.doubtful.keys() - failed_agreement_by_aid.keys():
+        return prepare_ekf2_model(
+            logged_flight,
+            list_later_configurations,
+            {**failed_agreement_by_aid, **dict.fromkeys(further_omitted_aids, agreement)},
+        )
     model = Ekf2Model(
         flight, inputs, event_intervals_by_delays, baseline_replay, agreement, tuple(runs)
     )
@@ -211,9 +200,8 @@ def replay_with_settings(
     """
     changes = [check_parameters(change) for change in settings]
     inputs = model.inputs
-    unmodelled_parameters = PARAMETERS.keys() - inputs.settings.keys()
     reasons = dict.fromkeys(
-        unmodelled_parameters,
+        PARAMETERS.keys() - inputs.settings.keys(),
         f"the parameter does not affect {inputs.aid.label}, the position source of EKF2",
     )
     logged_height_text = (
@@ -232,7 +220,7 @@ def replay_with_settings(
                 else "EKF2 fused no barometer height",
             ),
         ):
-            reasons |= dict.fromkeys(unmodelled_parameters & parameter_names, reason)
+            reasons |= dict.fromkeys(reasons.keys() & parameter_names, reason)
     if inputs.rules.is_horizon_largest_delay:
         reasons["EKF2_DELAY_MAX"] = (
             f"{model.flight.log.firmware} has no such parameter. The largest EKF2 delay parameter "
@@ -253,21 +241,15 @@ def replay_with_settings(
             f"{fused_aids_text}."
         )
     if excluded_times_s is not None:
-        excluded_rows = find_matching_samples(
-            inputs.received_positions.timestamp_s, excluded_times_s
+        received_positions = inputs.received_positions
+        is_excluded = _find_excluded_rows(received_positions.timestamp_s, excluded_times_s)
+        received_positions = replace(
+            received_positions,
+            rejected_flags=np.where(is_excluded, 1.0, np.nan),
+            is_reset_to_sample=np.zeros_like(is_excluded),
+            is_every_reset_logged=False,
         )
-        rejected_flags = np.full(len(inputs.received_positions.timestamp_s), np.nan)
-        rejected_flags[excluded_rows[excluded_rows >= 0]] = 1.0
-        is_reset = np.zeros(len(rejected_flags), dtype=bool)
-        inputs = replace(
-            inputs,
-            received_positions=replace(
-                inputs.received_positions,
-                rejected_flags=rejected_flags,
-                is_reset_to_sample=is_reset,
-                is_every_reset_logged=False,
-            ),
-        )
+        inputs = replace(inputs, received_positions=received_positions)
         model = replace(model, inputs=inputs, runs=())
     configurations = [
         FilterConfiguration(
@@ -278,6 +260,11 @@ def replay_with_settings(
         for change in changes
     ]
     return _run_replays(model, configurations, changes, excluded_times_s)
+
+
+def _find_excluded_rows(sample_times_s: Array, excluded_times_s: Array) -> BoolArray:
+    excluded_rows = find_matching_samples(sample_times_s, excluded_times_s)
+    return np.isin(np.arange(len(sample_times_s)), excluded_rows)
 
 
 def _run_replays(
@@ -296,11 +283,8 @@ def _run_replays(
         updates = replay.updates
         if excluded_times_s is not None:
             age_s = configuration.settings[inputs.aid.delay] * 1e-3 + 0.5 * inputs.mean_step_s
-            excluded_rows = find_matching_samples(
-                updates.index.to_numpy(), excluded_times_s - age_s
-            )
-            updates = updates.iloc[
-                np.delete(np.arange(len(updates)), excluded_rows[excluded_rows >= 0])
+            updates = updates[
+                ~_find_excluded_rows(updates.index.to_numpy(), excluded_times_s - age_s)
             ]
         yield structs.replace(replay, updates=updates, agreement=model.agreement)
 
@@ -321,18 +305,14 @@ def list_modelled_aids(inputs: ReplayInputs) -> list[str]:
 
 def add_position_noise(model: Ekf2Model, sigma_m: float, seed: int) -> Ekf2Model:
     """Add normal noise with standard deviation ``sigma_m`` (m) to each position in the inputs."""
-    inputs = model.inputs
     rng = np.random.default_rng(seed)
     noisy_inputs: dict[str, Any] = {}
-    for name, samples in {
-        "received_positions": inputs.received_positions,
-        "vision_positions": inputs.vision_positions,
-    }.items():
-        if samples is not None:
+    for name in ("received_positions", "vision_positions"):
+        if samples := getattr(model.inputs, name):
             position_noise_m = rng.normal(scale=sigma_m, size=samples.position_m.shape)
             noisy_inputs[name] = replace(samples, position_m=samples.position_m + position_noise_m)
     # Earlier results are without this noise, so they are deleted
-    return replace(model, inputs=replace(inputs, **noisy_inputs), runs=())
+    return replace(model, inputs=replace(model.inputs, **noisy_inputs), runs=())
 
 
 def misalign_positions(model: Ekf2Model, rotation_deg: float, delay_s: float) -> Ekf2Model:
@@ -358,12 +338,11 @@ def compute_delayed_tracks(
 ) -> Iterator[pd.DataFrame]:
     """Yield position and velocity at the fusion horizon for each filter configuration."""
     runs = _run_model(model, configurations)
-    for configuration_index in map(runs[0].configurations.index, configurations):
-        tracks = []
-        for run in runs:
-            motion = _compute_states_after_steps(run, configuration_index, VELOCITY_AND_POSITION)
-            tracks.append(_make_track(run, motion[:, 3:], motion[:, :3]))
-        yield _join_segments(tracks)
+    for index in map(runs[0].configurations.index, configurations):
+        states = [(run, compute_delayed_states(run, index)) for run in runs]
+        yield pd.concat(
+            [_make_track(run, state[:, VELOCITY], state[:, POSITION]) for run, state in states]
+        )
 
 
 def _run_model(
@@ -385,33 +364,25 @@ def run_configurations(
     delays_by_configuration = [
         configuration.compute_delays(inputs) for configuration in configurations
     ]
-    segment_runs = []
-    for segment_index, segment in enumerate(inputs.segments):
-        intervals = {
-            delays: by_segment[segment_index]
-            for delays, by_segment in event_intervals_by_delays.items()
-        }
-        for delays in set(delays_by_configuration) - event_intervals_by_delays.keys():
-            intervals[delays] = make_event_intervals(inputs, segment, delays)
-        segment_runs.append(
-            run_segment(
-                inputs,
-                segment,
-                configurations,
-                [intervals[delays] for delays in delays_by_configuration],
-            )
+    intervals_by_delays = dict(event_intervals_by_delays)
+    for delays in set(delays_by_configuration) - intervals_by_delays.keys():
+        intervals_by_delays[delays] = [
+            make_event_intervals(inputs, segment, delays) for segment in inputs.segments
+        ]
+    return [
+        run_segment(inputs, segment, configurations, intervals)
+        for segment, *intervals in zip(
+            inputs.segments,
+            *(intervals_by_delays[delays] for delays in delays_by_configuration),
+            strict=True,
         )
-    return segment_runs
+    ]
 
 
-def _make_track(run: SegmentRun, position_m: Array, velocity_m_s: Array) -> pd.DataFrame:
+def _make_track(run: SegmentRun, velocity_m_s: Array, position_m: Array) -> pd.DataFrame:
     """Return a table of velocity (m/s) and position (m, in EKF2's published coordinates)."""
     states = np.hstack([position_m / run.segment.internal_to_published_ratio, velocity_m_s])
     return pd.DataFrame(states, time_index(run.segment.time_s), Columns.STATE, copy=False)
-
-
-def _join_segments(tables: Sequence[pd.DataFrame]) -> pd.DataFrame:
-    return tables[0] if len(tables) == 1 else pd.concat(tables)
 
 
 def _make_replay(
@@ -422,8 +393,7 @@ def _make_replay(
 ) -> Ekf2Replay:
     configuration_index = runs[0].configurations.index(configuration)
     horizon_tracks, published_tracks = zip(
-        *(_make_state_tracks(inputs, run, configuration_index) for run in runs),
-        strict=True,
+        *(_make_state_tracks(inputs, run, configuration_index) for run in runs), strict=True
     )
     aid_updates_of_runs = [
         _collect_updates_by_aid(inputs, run, configuration_index) for run in runs
@@ -442,8 +412,8 @@ def _make_replay(
             if run.segment.flow is not None
             for span in _find_flow_only_spans(updates[inputs.aid.name], run.segment)
         ),
-        delayed_state=_join_segments(horizon_tracks),
-        published_state=_join_segments(published_tracks),
+        delayed_state=pd.concat(horizon_tracks),
+        published_state=pd.concat(published_tracks),
         other_aid_updates=updates_by_aid,
         stretches_s=tuple(tuple(run.segment.time_s[[0, -1]].tolist()) for run in runs),
         source=inputs.received_positions.source,
@@ -524,7 +494,10 @@ def _make_state_tracks(
     """Return two tables by time: the state at the fusion horizon, and the published state."""
     segment = run.segment
     configuration = run.configurations[configuration_index]
-    state, reset = compute_delayed_states(run, configuration_index)
+    state = compute_delayed_states(run, configuration_index)
+    reset_m = np.zeros((len(state), 3))
+    event_steps = run.events[configuration_index].end_step
+    np.add.at(reset_m[:, :2], event_steps, run.position_reset_m[:, configuration_index])
     horizon_s = min(configuration.compute_delays(inputs).horizon_s, MAX_HORIZON_DELAY_S)
     lag_steps = max(round(horizon_s / inputs.mean_step_s), 1)
     # Without attitude states, EKF2's published attitude is not corrected
@@ -533,48 +506,40 @@ def _make_state_tracks(
         attitude_correction_rad = sum_attitude_corrections(
             state[:, THETA] - segment.attitude_error_rad, lag_steps, inputs.mean_step_s, horizon_s
         )
-    published_velocity, published_position = compute_published_state(
-        segment, state, reset, attitude_correction_rad, lag_steps, configuration.settings
+    published_state = compute_published_state(
+        segment,
+        state,
+        np.cumsum(reset_m, axis=0),
+        attitude_correction_rad,
+        lag_steps,
+        configuration.settings,
     )
     heading_rad = (
         np.arctan2(segment.body_to_ned[:, 1, 0], segment.body_to_ned[:, 0, 0]) + state[:, HEADING]
     )
-    horizon_track = _make_track(run, state[:, POSITION], state[:, VELOCITY])
-    return horizon_track.assign(heading_rad=heading_rad), _make_track(
-        run, published_position, published_velocity
-    )
+    horizon_track = _make_track(run, state[:, VELOCITY], state[:, POSITION])
+    return horizon_track.assign(heading_rad=heading_rad), _make_track(run, *published_state)
 
 
-def compute_delayed_states(run: SegmentRun, configuration_index: int) -> tuple[Array, Array]:
+def compute_delayed_states(run: SegmentRun, configuration_index: int) -> Array:
     """Return the state at the fusion horizon after each of n prediction steps.
 
-    The state has the shape (n + 1, 15) or more. The second array, shape (n + 1, 3), is the sum (m)
-    of the position resets so far.
+    The state has the shape (n + 1, 15) or more.
     """
-    event_steps = run.events[configuration_index].end_step
-    cumulative_reset_m = np.zeros((len(run.segment.time_s), 3))
-    position_reset_m = run.position_reset_m[:, configuration_index]
-    for event_index in np.flatnonzero(position_reset_m.any(axis=1)):
-        cumulative_reset_m[event_steps[event_index] :, :2] += position_reset_m[event_index]
-    return _compute_states_after_steps(run, configuration_index, slice(None)), cumulative_reset_m
-
-
-def _compute_states_after_steps(run: SegmentRun, configuration_index: int, rows: slice) -> Array:
-    """Return the states ``rows`` at the fusion horizon after each prediction step."""
     event_steps = run.events[configuration_index].end_step
     event_states = run.state[:, configuration_index]
     step_count = len(run.segment.step_s)
     interval_index = np.searchsorted(event_steps, np.arange(step_count), side="right")
-    states = np.empty((step_count + 1, event_states[0, rows].size))
-    states[0] = event_states[0, rows]
-    block_boundaries = np.searchsorted(
-        interval_index, np.arange(0, len(event_steps) + 1, EVENTS_PER_BLOCK)
-    )
-    for steps in starmap(slice, pairwise([*block_boundaries, step_count])):
+    states = np.empty((step_count + 1, event_states.shape[1]))
+    states[0] = event_states[0]
+    for first_event in range(0, len(event_steps) + 1, EVENTS_PER_BLOCK):
+        steps = slice(
+            *np.searchsorted(interval_index, [first_event, first_event + EVENTS_PER_BLOCK])
+        )
         states[1:][steps] = _propagate_states(
             run, configuration_index, interval_index[steps], steps
-        )[:, rows]
-    states[event_steps] = event_states[1:, rows]
+        )
+    states[event_steps] = event_states[1:]
     return states
 
 

@@ -60,7 +60,7 @@ def compute_published_state(
     )
     acceleration_m_s2 += np.cross(published_minus_nominal_attitude_rad[1:], acceleration_m_s2)
     acceleration_m_s2 += GRAVITY_M_S2
-    velocity_increments_m_s = np.multiply(acceleration_m_s2, step_s, out=acceleration_m_s2)
+    velocity_increments_m_s = acceleration_m_s2 * step_s
     velocity_m_s = _predict_output(
         state[:, VELOCITY],
         velocity_increments_m_s,
@@ -69,9 +69,7 @@ def compute_published_state(
         settings["EKF2_TAU_VEL"],
     )
     # Mean velocity of a step = velocity before the step + half of the velocity increment
-    position_increments_m = np.multiply(velocity_increments_m_s, 0.5, out=velocity_increments_m_s)
-    position_increments_m += velocity_m_s[:-1]
-    position_increments_m *= step_s
+    position_increments_m = (0.5 * velocity_increments_m_s + velocity_m_s[:-1]) * step_s
     # EKF2 shifts all outputs by a position reset, so resets bypass the output predictor
     position_m = _predict_output(
         state[:, POSITION] - reset_m,
@@ -88,20 +86,14 @@ def _predict_output(
     state: Array, imu_increments: Array, lag_steps: int, step_s: float, tau_s: float
 ) -> Array:
     """Return the output predictor's velocity or position: sum of IMU increments and corrections."""
-    integrated_state = np.concatenate([state[:1], imu_increments])
-    np.cumsum(integrated_state, axis=0, out=integrated_state)
-    offset = state - integrated_state
-    offset -= (start_offset := offset[0].copy())
+    integrated_state = np.cumsum(np.concatenate([state[:1], imu_increments]), axis=0)
     gain = step_s / np.clip(tau_s, step_s, 10.0)
     integral_gain = OUTPUT_INTEGRAL_GAIN * gain**2
-    correction_sum = _apply_recursive_filter(
+    return integrated_state + _apply_recursive_filter(
         np.array([gain + integral_gain, -gain]),
         np.array([1.0, gain + integral_gain - 2.0, 1.0 - gain]),
-        delay_by(offset, lag_steps),
+        delay_by(state - integrated_state, lag_steps),
     )
-    correction_sum += start_offset
-    integrated_state += correction_sum
-    return integrated_state
 
 
 def delay_by(values: Array, lag_steps: int) -> Array:

@@ -2,7 +2,7 @@
 
 import math
 from collections.abc import Mapping
-from typing import Any, NamedTuple, TypeVar
+from typing import Any, TypeVar
 
 import numpy as np
 import pandas as pd
@@ -19,7 +19,6 @@ from px4fuse.core.record import (
     PositiveFloat,
     Record,
     Share,
-    Span,
 )
 from px4fuse.core.text import format_count
 from px4fuse.ekf2.inputs import (
@@ -39,12 +38,12 @@ from px4fuse.flight.model import (
     Ekf2,
     Flight,
     NedAxis,
+    Spans,
     Truth,
     Unavailable,
 )
 from px4fuse.readers.px4_innovations import select_axis_innovations
 
-Spans = tuple[Span, ...]
 T = TypeVar("T", pd.DataFrame, "pd.Series[float]")
 HORIZONTAL_AXES: tuple[NedAxis, NedAxis] = ("north", "east")
 # Minimum number of logged innovations for a comparison with the EKF2 replay
@@ -217,91 +216,74 @@ class Ekf2Replay(Record, kw_only=True, omit_defaults=False):
         return tuple(evaluated_spans_s)
 
 
-class _ComparedInnovations(NamedTuple):
-    """Logged and replayed innovations of the same samples, and their agreement by axis."""
-
-    logged: pd.DataFrame
-    replayed: pd.DataFrame
-    agreement_by_axis: dict[str, AxisAgreement]
-
-    def compute_rejected_fractions(self) -> list[float]:
-        """Return the rejected fraction in the log, and in the replay."""
-        return [float(np.mean(innovations["rejected"] > 0.0)) for innovations in self[:2]]
-
-
 def compare_with_log(flight: Flight, replay: Ekf2Replay) -> Agreement | Unavailable:
     """Compare an EKF2 replay with the logged innovations and states."""
     ekf2 = flight.ekf2
     assert isinstance(ekf2, Ekf2)
-    if rows_inside(ekf2.state, replay.find_evaluated_spans()).empty:
+    state_difference = _subtract_logged_state(
+        replay, rows_inside(ekf2.state, replay.find_evaluated_spans())
+    )
+    if state_difference.empty:
         return Unavailable(
             ANALYSIS_NAME,
             "EKF2's position is not logged in the replayed time",
             "Record vehicle_local_position during the whole flight.",
         )
     aid = find_replayed_position_source(ekf2)
-    position_comparison = _compare_innovations(
-        ekf2,
+    agreement_by_axis, statistics = _compare_innovations(
         replay,
         replay.updates,
         logged_innovations(ekf2),
         innovation_topic(aid) in ekf2.innovation_topics,
+        state_difference,
     )
-    if isinstance(position_comparison, str):
+    if not agreement_by_axis:
         return Unavailable(
             ANALYSIS_NAME,
-            position_comparison,
+            statistics["reason"],
             "Record a longer flight with motion, with SDLOG_PROFILE bit 0 (default).",
         )
-    rejected_fraction_logged, rejected_fraction_replayed = (
-        position_comparison.compute_rejected_fractions()
+    agreement_by_aid, omitted_aids = _compare_other_aids(ekf2, replay, state_difference)
+    flow_only_difference = _subtract_logged_state(
+        replay, rows_inside(ekf2.state, replay.optical_flow_only_spans_s)
     )
-    agreement_by_axis = position_comparison.agreement_by_axis
-    is_in_agreement, reason = _judge_agreement(
-        agreement_by_axis, rejected_fraction_logged, rejected_fraction_replayed
-    )
-    agreement_by_aid, omitted_aids = _compare_other_aids(ekf2, replay)
-    flow_position_difference_m = _compute_flow_position_difference_m(ekf2, replay)
-    if (
-        flow_position_difference_m is not None
-        and flow_position_difference_m > MAX_FLOW_ONLY_DIFFERENCE_M
-    ):
-        omitted_aids[FLOW.name] = (
-            f"while {FLOW.label} was the only horizontal aiding source, replayed and logged "
-            "positions differed by "
-            f"{_format_unlike_limit(flow_position_difference_m, MAX_FLOW_ONLY_DIFFERENCE_M)} m "
-            f"(limit {MAX_FLOW_ONLY_DIFFERENCE_M:g} m)"
+    flow_position_difference_m = None
+    if len(flow_only_difference):
+        flow_position_difference_m = float(
+            np.hypot(flow_only_difference["north_m"], flow_only_difference["east_m"]).max()
         )
-    is_same_decision = (position_comparison.logged["rejected"] > 0.0).to_numpy() == (
-        position_comparison.replayed["rejected"] > 0.0
-    )
+        if flow_position_difference_m > MAX_FLOW_ONLY_DIFFERENCE_M:
+            omitted_aids[FLOW.name] = (
+                f"while {FLOW.label} was the only horizontal aiding source, replayed and logged "
+                "positions differed by "
+                f"{_format_unlike_limit(flow_position_difference_m, MAX_FLOW_ONLY_DIFFERENCE_M)} m "
+                f"(limit {MAX_FLOW_ONLY_DIFFERENCE_M:g} m)"
+            )
     return Agreement(
         north=agreement_by_axis["north"],
         east=agreement_by_axis["east"],
-        **(agreement_by_aid | {aid.name: agreement_by_axis}),
+        **(agreement_by_aid | {aid.name: agreement_by_axis} | statistics),
         doubtful=omitted_aids,
-        samples=len(position_comparison.logged),
-        rejected_fraction_logged=rejected_fraction_logged,
-        rejected_fraction_replayed=rejected_fraction_replayed,
-        decisions_same=float(np.mean(is_same_decision)),
         published_rms_difference_m=math.hypot(
             *(axis.position_rms_difference_m for axis in agreement_by_axis.values())
         ),
-        good=is_in_agreement,
-        reason=reason,
         heading_rms_difference_deg=_compute_heading_difference_deg(ekf2, replay),
         carried_difference_m=flow_position_difference_m,
     )
 
 
 def _compare_innovations(
-    ekf2: Ekf2,
     replay: Ekf2Replay,
     replayed_innovations: pd.DataFrame,
     logged_innovations: pd.DataFrame,
     has_measurement_times: bool,
-) -> _ComparedInnovations | str:
-    """Compare replayed with logged innovations, or return the reason why this is impossible."""
+    state_difference: pd.DataFrame,
+) -> tuple[dict[str, AxisAgreement], dict[str, Any]]:
+    """Compare replayed with logged innovations.
+
+    Return the agreement by axis (empty if the innovations cannot be compared), and fields of
+    :class:`Agreement` for all axes together.
+    """
     update_rows = match_updates(
         replayed_innovations,
         logged_innovations.index.to_numpy(),
@@ -310,54 +292,56 @@ def _compare_innovations(
     is_used = (update_rows >= 0) & is_inside_spans(
         logged_innovations.index, replay.find_evaluated_spans()
     )
+    axes = list_innovation_axes(replayed_innovations)
+    columns = [f"innovation_{axis}_m" for axis in axes]
     # If EKF2 resets its state to a sample, it logs innovation 0
-    is_used &= logged_innovations.filter(regex="innovation_[a-z]+_m$").any(axis=1)
+    is_used &= logged_innovations[columns].any(axis=1)
     logged_innovations = logged_innovations[is_used]
     replayed_innovations = replayed_innovations.iloc[update_rows[is_used]]
     if len(logged_innovations) < MIN_COMPARED_INNOVATIONS:
-        return (
+        reason = (
             f"the log contains only {format_count(len(logged_innovations), 'innovation')} in the "
             f"replayed time (at least {MIN_COMPARED_INNOVATIONS} are needed)"
         )
+        return {}, {"good": False, "reason": reason}
     axes = list_innovation_axes(replayed_innovations)
     columns = [f"innovation_{axis}_m" for axis in axes]
     if not all(
         np.ptp(innovations[columns], axis=0).all()
         for innovations in (logged_innovations, replayed_innovations)
     ):
-        return CONSTANT_INNOVATIONS_REASON
-    return _ComparedInnovations(
-        logged_innovations,
-        replayed_innovations,
+        return {}, {"good": False, "reason": CONSTANT_INNOVATIONS_REASON}
+    is_rejected_in_log, is_rejected_in_replay = is_rejected = np.array(
+        [logged_innovations["rejected"] > 0.0, replayed_innovations["rejected"] > 0.0]
+    )
+    agreement_by_axis: dict[str, AxisAgreement] = {
+        axis: _compare_axis(axis, logged_innovations, replayed_innovations, state_difference)
+        for axis in axes
+    }
+    logged_fraction, replayed_fraction = is_rejected.mean(axis=1).tolist()
+    is_in_agreement, reason = _judge_agreement(
+        agreement_by_axis, logged_fraction, replayed_fraction
+    )
+    return agreement_by_axis, {
+        "samples": len(logged_innovations),
+        "rejected_fraction_logged": logged_fraction,
+        "rejected_fraction_replayed": replayed_fraction,
+        "decisions_same": float(np.mean(is_rejected_in_log == is_rejected_in_replay)),
+        "good": is_in_agreement,
+        "reason": reason,
+    }
+
+
+def _subtract_logged_state(replay: Ekf2Replay, logged_state: pd.DataFrame) -> pd.DataFrame:
+    """Return the replayed minus the logged state, at the times of the logged state."""
+    published_state = replay.published_state
+    return pd.DataFrame(
         {
-            axis: _compare_axis(axis, logged_innovations, replayed_innovations, ekf2, replay)
-            for axis in axes
-        },
+            name: np.interp(logged_state.index, published_state.index, published_state[name])
+            - logged_state[name]
+            for name in Columns.STATE
+        }
     )
-
-
-def _compute_flow_position_difference_m(ekf2: Ekf2, replay: Ekf2Replay) -> float | None:
-    """Return the largest position difference (m) with optical flow as the only horizontal source.
-
-    The difference is replayed minus logged position. Return None without such a time.
-    """
-    logged_state = rows_inside(ekf2.state, replay.optical_flow_only_spans_s)
-    if logged_state.empty:
-        return None
-    north_difference_m, east_difference_m = (
-        _compute_replayed_minus_logged(replay, logged_state, name) for name in Columns.POSITION[:2]
-    )
-    return float(np.hypot(north_difference_m, east_difference_m).max())
-
-
-def _compute_replayed_minus_logged(
-    replay: Ekf2Replay, logged_state: pd.DataFrame, name: str
-) -> Array:
-    """Return replayed minus logged values of one column of the state."""
-    replayed_values = np.interp(
-        logged_state.index, replay.published_state.index, replay.published_state[name]
-    )
-    return np.asarray(replayed_values - logged_state[name])
 
 
 def _compute_heading_difference_deg(ekf2: Ekf2, replay: Ekf2Replay) -> float | None:
@@ -374,7 +358,9 @@ def _compute_heading_difference_deg(ekf2: Ekf2, replay: Ekf2Replay) -> float | N
     return float(np.degrees(rms(difference_rad)))
 
 
-def _compare_other_aids(ekf2: Ekf2, replay: Ekf2Replay) -> tuple[dict[str, Any], dict[str, str]]:
+def _compare_other_aids(
+    ekf2: Ekf2, replay: Ekf2Replay, state_difference: pd.DataFrame
+) -> tuple[dict[str, Any], dict[str, str]]:
     """Compare innovations of all aiding sources except the position source with the log.
 
     Return the agreement of each source, and the reasons for disagreement.
@@ -385,28 +371,19 @@ def _compare_other_aids(ekf2: Ekf2, replay: Ekf2Replay) -> tuple[dict[str, Any],
         if (aid_log := ekf2.aids.get(name)) is None:
             continue
         # The replay fuses barometer samples later than EKF2, so measurement times are compared
-        updates_to_match = (
-            updates.assign(fused_at_s=updates.index) if name == BAROMETER.name else updates
-        )
-        comparison = _compare_innovations(
-            ekf2,
+        times_s = updates.index if name == BAROMETER.name else updates["fused_at_s"]
+        agreement_by_axis, statistics = _compare_innovations(
             replay,
-            updates_to_match,
+            updates.assign(fused_at_s=times_s),
             select_logged_aid_innovations(name, aid_log),
             innovation_topic(AIDS[name]) in aid_log.topics,
+            state_difference,
         )
-        if isinstance(comparison, str):
-            is_in_agreement, reason = (
-                name == GNSS_VEL.name and comparison != CONSTANT_INNOVATIONS_REASON,
-                comparison,
-            )
-        else:
-            agreement_by_aid[name] = comparison.agreement_by_axis
-            is_in_agreement, reason = _judge_agreement(
-                comparison.agreement_by_axis, *comparison.compute_rejected_fractions()
-            )
-            is_in_agreement |= name == GNSS_VEL.name
-        if not is_in_agreement:
+        if agreement_by_axis:
+            agreement_by_aid[name] = agreement_by_axis
+        reason = statistics["reason"]
+        is_velocity = name == GNSS_VEL.name
+        if not statistics["good"] and (not is_velocity or reason == CONSTANT_INNOVATIONS_REASON):
             omitted_aids[name] = reason
     return agreement_by_aid, omitted_aids
 
@@ -482,8 +459,7 @@ def _compare_axis(
     axis: NedAxis,
     logged_innovations: pd.DataFrame,
     replayed_innovations: pd.DataFrame,
-    ekf2: Ekf2,
-    ekf2_replay: Ekf2Replay,
+    state_difference: pd.DataFrame,
 ) -> AxisAgreement:
     nu, nu_logged, S, S_logged = (
         innovations[name].to_numpy()
@@ -491,11 +467,6 @@ def _compare_axis(
         for innovations in (replayed_innovations, logged_innovations)
     )
     s_ratio_p5, s_ratio_median, s_ratio_p95 = np.percentile(S / S_logged, [5, 50, 95]).tolist()
-    logged_state = rows_inside(ekf2.state, ekf2_replay.find_evaluated_spans())
-    position_m, velocity_m_s = (
-        _compute_replayed_minus_logged(ekf2_replay, logged_state, f"{axis}_{unit}")
-        for unit in ("m", "m_s")
-    )
     return AxisAgreement(
         innovation_correlation=float(np.corrcoef(nu, nu_logged)[0, 1]),
         innovation_rms_difference=rms(nu - nu_logged),
@@ -504,8 +475,8 @@ def _compare_axis(
         s_ratio_p95=s_ratio_p95,
         nis_mean_logged=float(np.mean(nu_logged**2 / S_logged)),
         nis_mean_replayed=float(np.mean(nu**2 / S)),
-        position_rms_difference_m=rms(position_m),
-        velocity_rms_difference_m_s=rms(velocity_m_s),
+        position_rms_difference_m=rms(state_difference[f"{axis}_m"]),
+        velocity_rms_difference_m_s=rms(state_difference[f"{axis}_m_s"]),
     )
 
 
@@ -535,7 +506,7 @@ def compute_rmse_to_truth(
     return rms(error_m) if len(error_m) else None
 
 
-def rms(values: Array) -> float:
+def rms(values: "Array | pd.Series[float]") -> float:
     return float(np.sqrt(np.mean(values**2)))
 
 

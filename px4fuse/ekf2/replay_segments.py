@@ -1,13 +1,16 @@
-"""Flight segments without gaps for the EKF2 replay: prediction steps and initial state.
+"""Flight segments without gaps for the EKF2 replay: prediction steps, initial state and samples.
 
-Source: PX4-Autopilot ``EKF/imu_down_sampler/imu_down_sampler.cpp``.
+Sources: PX4-Autopilot ``EKF/imu_down_sampler/imu_down_sampler.cpp``, ``EKF/ekf_helper.cpp``
+(calcEarthRateNED), ``EKF/ekf.cpp`` (predictState), ``lib/lat_lon_alt/lat_lon_alt.cpp``
+(computeRadiiOfCurvature), ``EKF/aid_sources/optical_flow`` (``optical_flow_control.cpp``: velocity
+and low-pass filter; ``optical_flow_fusion.cpp``: R and gate).
 """
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from dataclasses import field as record_field
 from functools import cached_property
-from itertools import chain, pairwise
+from itertools import pairwise
 
 import numpy as np
 import pandas as pd
@@ -20,13 +23,12 @@ from px4fuse.core.arrays import (
     IntArray,
     compute_median_interval_s,
     cumulative_sums,
-    iterate_row_blocks,
 )
 from px4fuse.core.record import Span
-from px4fuse.ekf2.earth_model import compute_earth_rate_rad_s, compute_internal_to_published_ratio
 from px4fuse.flight.ekf2_parameters import PARAMETERS
 from px4fuse.flight.model import (
     BAD_ACCELERATION_FLAG,
+    FLOW_FILTER_NEW_SAMPLE_WEIGHT,
     Columns,
     Ekf2,
     Flight,
@@ -37,6 +39,7 @@ from px4fuse.flight.model import (
     time_index,
 )
 from px4fuse.readers.px4_ekf2 import compute_samples_per_step, find_rows_of_timestamps
+from px4fuse.readers.px4_positions import EARTH_RADIUS_M
 from px4fuse.trajectory.rotation import (
     conjugate,
     cumulative_product,
@@ -78,6 +81,8 @@ MAX_CLIPPED_IMU_FRACTION = 0.05
 # Maximum fraction of missing IMU samples that the EKF2 replay ignores
 MAX_LOST_IMU_FRACTION = 0.02
 
+EARTH_RATE_RAD_S = 7.292115e-5
+EQUATORIAL_RADIUS_M, ECCENTRICITY = 6_378_137.0, 0.0818191908425
 # Gravity in NED (CONSTANTS_ONE_G in PX4)
 GRAVITY_M_S2 = np.array([0.0, 0.0, 9.80665])
 
@@ -133,24 +138,21 @@ class HeightSamples:
         PX4's names of the fused height sensors.
     reference : str
         PX4's name of the height reference, which has no bias.
-    initial_bias_and_variance : (float, float)
+    initial_bias_and_variance : ndarray, shape (2,)
         Initial bias (m, positive: too high) and variance (m²) of the other height sensor.
-    step_indices, measurement_times_s, down_m : ndarray, shape (m,)
-        Prediction step, measurement time, and height (m, down) of each barometer sample.
-    dead_zone_m : ndarray, shape (m,)
-        Dead zone of barometer innovations in ground effect; 0 without ground effect.
-    weight : ndarray, shape (m,)
-        Number of EKF2 samples that each sample represents.
+    step_indices : ndarray of int, shape (m,)
+        Prediction step of each barometer sample.
+    samples : DataFrame, shape (m, 3)
+        Barometer samples, indexed by measurement time: height ``down_m``; dead zone
+        ``dead_zone_m`` of the innovation in ground effect, else 0; ``weight``, the number of EKF2
+        samples that the sample represents.
     """
 
     fused_sensors: tuple[str, ...]
     reference: str
-    initial_bias_and_variance: tuple[float, float]
+    initial_bias_and_variance: Array
     step_indices: IntArray
-    measurement_times_s: Array
-    down_m: Array
-    dead_zone_m: Array
-    weight: Array
+    samples: pd.DataFrame
 
 
 @dataclass(frozen=True)
@@ -261,22 +263,22 @@ def group_samples_by_event(
         further quantities, and 1 for a sample (0 for padding).
     """
     event_indices = np.searchsorted(event_steps, measurement_steps)
-    event_indices = event_indices[event_indices < len(event_steps)]
-    sample_count = len(event_indices)
-    measurement_steps = measurement_steps[:sample_count]
+    # Samples after the last event are not used
+    sample_count = int(np.searchsorted(event_indices, len(event_steps)))
+    event_indices, measurement_steps = (
+        event_indices[:sample_count],
+        measurement_steps[:sample_count],
+    )
     event_step = event_steps[event_indices]
     age_s = segment.time_s[event_step] - segment.time_s[measurement_steps]
-    displacement_m = segment.imu_displacement_m[:, axes]
-    velocity_m_s = segment.imu_velocity_change_m_s[:, axes]
     displacement_m = (
-        displacement_m[event_step]
-        - displacement_m[measurement_steps]
-        - velocity_m_s[event_step] * age_s[:, None]
+        segment.imu_displacement_m[event_step]
+        - segment.imu_displacement_m[measurement_steps]
+        - segment.imu_velocity_change_m_s[event_step] * age_s[:, None]
     )
     index_in_event = np.arange(sample_count) - np.searchsorted(event_indices, event_indices)
-    position_m = position_m[:sample_count] + displacement_m
     columns = (
-        *position_m.T,
+        *(position_m[:sample_count] + displacement_m[:, axes]).T,
         age_s,
         *(column[:sample_count] for column in quantities),
         np.ones(sample_count),
@@ -318,13 +320,16 @@ def make_update_table(
     return updates.assign(fused_at_s=end_s[np.nonzero(has_innovation)[0]])
 
 
-def pad_samples(arrays_of_samples: Sequence[Array]) -> list[Array]:
-    """Pad arrays of samples with zeros to the same number k of samples per event."""
-    max_samples_per_event = max(samples.shape[1] for samples in arrays_of_samples)
-    return [
-        np.pad(samples, ((0, 0), (0, max_samples_per_event - samples.shape[1]), (0, 0)))
-        for samples in arrays_of_samples
-    ]
+def stack_samples(samples_by_filter: Sequence[Array]) -> Array:
+    """Stack the samples of all filters along the last axis, with zeros up to equal numbers k."""
+    max_samples_per_event = max(samples.shape[1] for samples in samples_by_filter)
+    return np.stack(
+        [
+            np.pad(samples, ((0, 0), (0, max_samples_per_event - samples.shape[1]), (0, 0)))
+            for samples in samples_by_filter
+        ],
+        axis=-1,
+    )
 
 
 def find_replay_segments(
@@ -340,23 +345,27 @@ def find_replay_segments(
     """Find the parts of a flight without gaps in IMU and positions, after EKF2's first fusion."""
     innovations = ekf2.innovations["north"]
     assert isinstance(innovations, pd.DataFrame)
-    fusion_times_s = innovations.index.to_numpy()
     state_times_s = fusion_record.delayed.index.to_numpy()
     imu_times_s = imu.index.to_numpy()
-    segment_boundary_times_s = [imu_times_s[0], imu_times_s[-1]]
+    # The replay restarts when another EKF2 instance with another state becomes primary
+    boundary_times_s = [imu_times_s[0], imu_times_s[-1]]
+    boundary_times_s += [time_s for time_s, _ in ekf2.primary_instances[1:]]
     for sample_times_s, limit in ((imu_times_s, MIN_IMU_GAP_S), (position_times_s, RESTART_GAP_S)):
-        gap_rows = np.flatnonzero(np.diff(sample_times_s) > limit)
-        segment_boundary_times_s += [*sample_times_s[gap_rows], *sample_times_s[gap_rows + 1]]
-    segment_boundary_times_s += _find_interruption_times_s(imu, ekf2) if is_gnss else ()
+        is_gap = np.diff(sample_times_s) > limit
+        boundary_times_s += [*sample_times_s[:-1][is_gap], *sample_times_s[1:][is_gap]]
+    magnetic_field_start_s = magnetic_field_end_s = np.inf
+    if is_gnss:
+        boundary_times_s += _find_interruption_times_s(imu, ekf2)
+        magnetic_field_start_s, magnetic_field_end_s = _find_magnetometer_3d_fusion_span(
+            fusion_record
+        )
+    parameter_changes = [change for change in ekf2.parameter_changes if change.name in PARAMETERS]
+    boundary_times_s += [magnetic_field_end_s, *(change.time_s for change in parameter_changes)]
     earliest_start_s = max(attitude.index[0], position_times_s[0])
     end_s = min(attitude.index[-1], position_times_s[-1] + 1.0)
-    airborne = () if isinstance(flight.airborne, Unavailable) else flight.airborne
-    magnetic_field_span_s = _find_magnetometer_3d_fusion_span(fusion_record) if is_gnss else None
-    segment_boundary_times_s += magnetic_field_span_s[1:] if magnetic_field_span_s else ()
-    # The replay restarts when another EKF2 instance with another state becomes primary
-    segment_boundary_times_s += [time_s for time_s, _ in ekf2.primary_instances[1:]]
-    parameter_changes = [change for change in ekf2.parameter_changes if change.name in PARAMETERS]
-    segment_boundary_times_s += [change.time_s for change in parameter_changes]
+    takeoff_s = -np.inf
+    if not isinstance(flight.airborne, Unavailable) and flight.airborne:
+        takeoff_s = flight.airborne[0][0]
 
     def make_segment(start_row: int, end_s: float) -> ReplaySegment:
         segment = _make_segment(imu, attitude, ekf2, fusion_record, start_row, end_s)
@@ -364,28 +373,17 @@ def find_replay_segments(
 
     segments = []
     for part_start_s, part_end_s in pairwise(
-        np.unique(np.clip(segment_boundary_times_s, earliest_start_s, end_s))
+        np.unique(np.clip(boundary_times_s, earliest_start_s, end_s))
     ):
-        fusion_times_in_part_s = fusion_times_s[
-            (fusion_times_s >= part_start_s) & (fusion_times_s <= part_end_s)
-        ]
+        fusion_times_in_part_s = rows_between(innovations, part_start_s, part_end_s).index
         if not len(fusion_times_in_part_s):
             continue
-        earliest_starts_s = [
-            start_s + MIN_TIME_SINCE_TAKEOFF_S
-            for start_s, _ in airborne[:1]
-            if start_s < part_end_s
-        ]
-        if magnetic_field_span_s and part_start_s <= magnetic_field_span_s[0] < part_end_s:
-            earliest_starts_s.append(magnetic_field_span_s[0])
-        start_row = int(
-            np.searchsorted(
-                state_times_s,
-                max(
-                    [fusion_times_in_part_s[0] + MIN_TIME_SINCE_FIRST_FUSION_S, *earliest_starts_s]
-                ),
-            )
-        )
+        start_s = fusion_times_in_part_s[0] + MIN_TIME_SINCE_FIRST_FUSION_S
+        if takeoff_s < part_end_s:
+            start_s = max(start_s, takeoff_s + MIN_TIME_SINCE_TAKEOFF_S)
+        if part_start_s <= magnetic_field_start_s < part_end_s:
+            start_s = max(start_s, magnetic_field_start_s)
+        start_row = int(np.searchsorted(state_times_s, start_s))
         if (
             start_row == len(state_times_s)
             or part_end_s - state_times_s[start_row] < MIN_SEGMENT_DURATION_S
@@ -410,9 +408,8 @@ def find_replay_segments(
             preceding_segment = make_segment(preceding_start_row, state_times_s[start_row])
             segment = replace(segment, preceding_segment=preceding_segment)
         if (
-            magnetic_field_span_s
-            and magnetic_field_span_s[0] <= state_times_s[start_row]
-            and part_end_s <= magnetic_field_span_s[1]
+            magnetic_field_start_s <= state_times_s[start_row]
+            and part_end_s <= magnetic_field_end_s
         ):
             segment = _add_magnetic_field(segment, fusion_record, start_row, ekf2.step_s)
         segments.append(replace(segment, changed_parameters=changed_parameters))
@@ -438,6 +435,32 @@ def _add_gnss_model_inputs(
         clipped_fraction=_compute_clipped_fraction(imu, segment.time_s),
         mean_bias_down_m_s2=float(velocity_change_error_m_s / (end_s - start_s)),
     )
+
+
+def compute_earth_rate_rad_s(fusion_record: FusionRecord) -> Array:
+    """Return the earth rotation rate (rad/s, NED, shape (3,)); 0 if the latitude is unknown."""
+    latitude_rad = np.radians(fusion_record.latitude_deg)
+    return np.nan_to_num(
+        EARTH_RATE_RAD_S * np.array([np.cos(latitude_rad), 0.0, -np.sin(latitude_rad)])
+    )
+
+
+def compute_internal_to_published_ratio(fusion_record: FusionRecord) -> tuple[float, float, float]:
+    """Return the ratio of EKF2's internal to its published position along north, east and down.
+
+    Since PX4 v1.16, EKF2 computes positions on an ellipsoid, but publishes positions on a sphere.
+    """
+    if np.isnan(fusion_record.latitude_deg) or not fusion_record.stores_latitude():
+        return 1.0, 1.0, 1.0
+    eccentricity_squared = ECCENTRICITY**2
+    q = 1.0 - eccentricity_squared * np.sin(np.radians(fusion_record.latitude_deg)) ** 2
+    # PX4 uses the exponent 2.5 for the meridian radius; the exponent of an ellipsoid is 1.5
+    radii_m = (
+        EQUATORIAL_RADIUS_M * np.array([(1.0 - eccentricity_squared) / q**2.5, q**-0.5])
+        + fusion_record.altitude_m
+    )
+    north_to_sphere_radius_ratio, east_to_sphere_radius_ratio = (radii_m / EARTH_RADIUS_M).tolist()
+    return north_to_sphere_radius_ratio, east_to_sphere_radius_ratio, 1.0
 
 
 def _find_interruption_times_s(imu: pd.DataFrame, ekf2: Ekf2) -> list[float]:
@@ -500,16 +523,12 @@ def _make_segment(
     )
     accelerometer_bias = np.asarray(initial_row[Columns.ACCELEROMETER_BIAS])
     gyro_bias = np.asarray(initial_row[Columns.GYRO_BIAS])
-    rotation_vectors, velocity_increments = np.zeros((2, len(step_end_indices), 3))
-    for steps in iterate_row_blocks(len(step_end_indices)):
-        first_row = step_end_indices[steps.start - 1] if steps.start else 0
-        rows = slice(first_row, step_end_indices[steps][-1])
-        samples, intervals_s = imu.iloc[rows.start + 1 : rows.stop + 1], imu_intervals_s[rows, None]
-        rotation_vectors[steps], velocity_increments[steps] = downsample_imu(
-            (samples[Columns.ANGULAR_RATE].to_numpy() - gyro_bias) * intervals_s,
-            (samples[Columns.SPECIFIC_FORCE].to_numpy() - accelerometer_bias) * intervals_s,
-            step_end_indices[steps] - first_row,
-        )
+    rotation_vectors, velocity_increments = downsample_imu(
+        (imu[Columns.ANGULAR_RATE].to_numpy()[1:] - gyro_bias) * imu_intervals_s[:, None],
+        (imu[Columns.SPECIFIC_FORCE].to_numpy()[1:] - accelerometer_bias)
+        * imu_intervals_s[:, None],
+        step_end_indices,
+    )
     step_times_s = imu_times_s[np.append(0, step_end_indices)]
     step_s = np.diff(step_times_s)
     gyro_attitude = cumulative_product(
@@ -573,22 +592,23 @@ def _make_segment(
     )
 
 
-def _find_magnetometer_3d_fusion_span(fusion_record: FusionRecord) -> Span | None:
+def _find_magnetometer_3d_fusion_span(fusion_record: FusionRecord) -> Span:
     """Return start and end (s) of EKF2's fusion of all three magnetometer axes.
 
-    Return None if EKF2 interrupted this fusion, or never started it.
+    Both are infinite if EKF2 interrupted this fusion, or never started it.
     """
     field_gauss = fusion_record.magnetic_field_gauss
-    if not len(field_gauss):
-        return None
-    flag_times_s = field_gauss.index.to_numpy()
-    is_fused = field_gauss["fused_3d"].to_numpy() > 0.0
-    if not is_fused.any() or 1.0 / compute_median_interval_s(flag_times_s) < MIN_MAG_LOG_HZ:
-        return None
-    first_row, last_row = np.flatnonzero(is_fused)[[0, -1]]
-    if not is_fused[first_row:last_row].all():
-        return None
-    return float(flag_times_s[first_row]) + MAGNETIC_FIELD_SETTLING_S, float(flag_times_s[last_row])
+    if len(field_gauss) and field_gauss["fused_3d"].any():
+        flag_times_s = field_gauss.index.to_numpy()
+        is_fused = field_gauss["fused_3d"].to_numpy() > 0.0
+        first_row, last_row = np.flatnonzero(is_fused)[[0, -1]]
+        if (
+            is_fused[first_row:last_row].all()
+            and 1.0 / compute_median_interval_s(flag_times_s) >= MIN_MAG_LOG_HZ
+        ):
+            start_s, end_s = flag_times_s[[first_row, last_row]].tolist()
+            return start_s + MAGNETIC_FIELD_SETTLING_S, end_s
+    return np.inf, np.inf
 
 
 def _add_magnetic_field(
@@ -677,6 +697,35 @@ def _compute_mean_magnetic_field(
         fused_sample_counts,
         np.zeros(len(gap_free_rows)),
     )
+
+
+def add_flow_samples(segment: ReplaySegment, flow: pd.DataFrame, gate: float) -> ReplaySegment:
+    """Add the logged optical flow to a part of the flight, as horizontal velocity (body frame).
+
+    The logged velocity is low-pass filtered. The replay fuses the mean velocity between two logged
+    samples. ``gate`` is the innovation gate (√S).
+    """
+    begin_s = flow.index - (flow["samples"] - 1.0) * flow["interval_s"]
+    flow = flow[(begin_s > segment.time_s[0]) & (flow.index <= segment.time_s[-1])]
+    sample_count = flow["samples"].to_numpy()
+    interval_s = flow["interval_s"].to_numpy()
+    step_index, weight = compute_low_pass_weights(
+        segment, flow.index.to_numpy(), sample_count, interval_s, FLOW_FILTER_NEW_SAMPLE_WEIGHT
+    )
+    ned_to_body_rotation = segment.body_to_ned[step_index].swapaxes(2, 3)[:, :, :2]
+    imu_velocity_m_s = np.einsum(
+        "ki,kiab,kib->ka", weight, ned_to_body_rotation, segment.imu_velocity_change_m_s[step_index]
+    )
+    sensor_samples = SensorSamples(
+        step_index[:, 0],
+        flow[["forward_m_s", "right_m_s"]].to_numpy() - imu_velocity_m_s,
+        np.einsum("ki,kiab->kab", weight, ned_to_body_rotation),
+        sample_count,
+        flow["noise_m2_s2"].to_numpy(),
+        gate,
+        (VELOCITY,),
+    )
+    return replace(segment, flow=sensor_samples)
 
 
 def compute_low_pass_weights(
@@ -783,18 +832,13 @@ def find_step_ends(
     logged_end_index_set = set(logged_end_indices.tolist())
     end_indices = []
     accumulated_count = accumulated_time_s = 0.0
-    samples = np.stack([interval_s, sample_counts], axis=1)
     for sample, (interval, sample_count) in enumerate(
-        chain.from_iterable(samples[rows].tolist() for rows in iterate_row_blocks(len(samples))),
-        start=1,
+        zip(interval_s.tolist(), sample_counts.tolist(), strict=True), start=1
     ):
-        accumulated_count = accumulated_count + sample_count
-        accumulated_time_s = accumulated_time_s + interval
-        is_step_complete = (
-            accumulated_count >= samples_per_step and accumulated_time_s > 0.5 * configured_step_s
-        )
+        accumulated_count += sample_count
+        accumulated_time_s += interval
         if (
-            is_step_complete
+            (accumulated_count >= samples_per_step and accumulated_time_s > 0.5 * configured_step_s)
             or accumulated_time_s > configured_step_s
             or sample in logged_end_index_set
         ):
@@ -811,19 +855,16 @@ def downsample_imu(
     The velocity change is in the body frame at the end of the step.
     """
     start_indices = np.append(0, step_end_indices[:-1])
-    cumulative_rotation_rad = cumulative_sums(rotation_vectors)
-    step_end_rotation_by_sample_rad = np.repeat(
-        cumulative_rotation_rad[step_end_indices], step_end_indices - start_indices, axis=0
+    used_count = step_end_indices[-1]
+    velocity_increments = velocity_increments[:used_count]
+    rotation_rad = cumulative_sums(rotation_vectors[:used_count])
+    middle_rotation_rad = 0.5 * (rotation_rad[:-1] + rotation_rad[1:])
+    step_end_rotation_rad = np.repeat(
+        rotation_rad[step_end_indices], step_end_indices - start_indices, axis=0
     )
-    step_count = len(step_end_rotation_by_sample_rad)
-    middle_rotation_by_sample_rad = 0.5 * (
-        cumulative_rotation_rad[:step_count] + cumulative_rotation_rad[1 : step_count + 1]
-    )
-    velocity_increments = velocity_increments[:step_count]
     rotated_increments = velocity_increments - np.cross(
-        step_end_rotation_by_sample_rad - middle_rotation_by_sample_rad, velocity_increments
+        step_end_rotation_rad - middle_rotation_rad, velocity_increments
     )
-    step_rotation_rad = (
-        cumulative_rotation_rad[step_end_indices] - cumulative_rotation_rad[start_indices]
+    return rotation_rad[step_end_indices] - rotation_rad[start_indices], np.add.reduceat(
+        rotated_increments, start_indices, axis=0
     )
-    return step_rotation_rad, np.add.reduceat(rotated_increments, start_indices, axis=0)

@@ -29,7 +29,6 @@ from px4fuse.ekf2.model import (
 from px4fuse.ekf2.replay import (
     HORIZONTAL_AXES,
     Ekf2Replay,
-    Spans,
     compute_rmse_to_truth,
     interpolate_component,
     is_inside_spans,
@@ -39,7 +38,7 @@ from px4fuse.filter.kalman import Replay, predict_state
 from px4fuse.filter.settings import Settings
 from px4fuse.filter.signals import Segment
 from px4fuse.flight.ekf2_parameters import EV_POS, FLOW, GNSS_POS, GNSS_VEL, MAG
-from px4fuse.flight.model import Columns, Ekf2, Flight, Truth, Unavailable
+from px4fuse.flight.model import Columns, Ekf2, Flight, Spans, Truth, Unavailable
 
 DIFFERENCE_ANALYSIS_NAME = "difference KF - EKF2"
 NO_TRUTH_OVERLAP = Unavailable(
@@ -62,19 +61,6 @@ REJECTION_PROPERTY = "rejections and resets"
 OUTPUT_PREDICTOR_PROPERTY = "output predictor"
 # Names of the properties for additional aiding sources, by PX4's name of the source
 PROPERTY_BY_ADDITIONAL_AID = {FLOW.name: FLOW_PROPERTY, EV_POS.name: VISION_PROPERTY}
-# Order in which the properties of KF are replaced by those of EKF2
-REPLACED_PROPERTIES = (
-    SAMPLE_TIMES_PROPERTY,
-    TIMESTAMPS_PROPERTY,
-    MEASUREMENT_NOISE_PROPERTY,
-    ACCELEROMETER_BIAS_PROPERTY,
-    PROCESS_NOISE_PROPERTY,
-    ATTITUDE_PROPERTY,
-    REJECTION_PROPERTY,
-    OUTPUT_PREDICTOR_PROPERTY,
-)
-
-TRACK_COLUMNS = (Columns.POSITION, Columns.VELOCITY)
 
 
 class PropertyReplacement(Record, kw_only=True):
@@ -145,8 +131,6 @@ class DifferenceExplanation(Record, kw_only=True):
         Explanations, largest contribution first.
     times_s, kf_minus_ekf2_m, unexplained_difference_m : ndarray
         EKF2 sample times, and position differences before and after all replacements.
-    cause_sentence : str
-        Sentence about the largest contribution.
     """
 
     count: Count
@@ -164,7 +148,6 @@ class DifferenceExplanation(Record, kw_only=True):
     times_s: NotWritten[Array] = NOT_WRITTEN
     kf_minus_ekf2_m: NotWritten[Array] = NOT_WRITTEN
     unexplained_difference_m: NotWritten[Array] = NOT_WRITTEN
-    cause_sentence: NotWritten[str] = ""
 
     @property
     def unexplained_fraction(self) -> float:
@@ -211,36 +194,36 @@ def explain_difference_by_replacements(
     state_span_s = float(state_times_s[0]), float(state_times_s[-1])
     directions = {name: run.axis.direction for name, run in kf_runs.items()}
     directions = directions or dict(zip(HORIZONTAL_AXES, np.eye(3), strict=False))
+    property_names = (*configurations, OUTPUT_PREDICTOR_PROPERTY)
     components_by_track = []
     # Tracks are computed one at a time, to limit the memory
     tracks = chain(horizon_tracks, (baseline_replay.published_state, ekf2.state))
-    for property_name, track in zip(
-        (*configurations, OUTPUT_PREDICTOR_PROPERTY, "EKF2 as logged"), tracks, strict=True
-    ):
+    for property_name, track in zip((*property_names, "EKF2 as logged"), tracks, strict=True):
         components_by_track.append(
             [
                 [
                     interpolate_component(track, columns, direction, state_times_s)
-                    for columns in TRACK_COLUMNS
+                    for columns in (Columns.POSITION, Columns.VELOCITY)
                 ]
                 for direction in directions.values()
             ]
         )
         # Last replay before EKF2's rejections are used
-        if property_name == [*configurations][-2]:
+        if property_name == property_names[-3]:
             replay_track_without_gate = track
     spans = Segment(*state_span_s, "").cut(evaluated_spans)
     longest_rejection = _find_longest_rejection(
         baseline_replay, replay_track_without_gate, state_span_s, evaluated_spans
     )
     explanations = {}
-    for axis_index, (axis, direction) in enumerate(directions.items()):
-        axis_components = [track_components[axis_index] for track_components in components_by_track]
+    for (axis, direction), axis_components in zip(
+        directions.items(), np.swapaxes(components_by_track, 0, 1), strict=True
+    ):
         kf_state = predict_state(kf_runs[axis], state_times_s) if kf_runs else axis_components[0]
         explanations[axis] = _explain_difference_along_axis(
             model.flight,
             direction,
-            (*configurations, OUTPUT_PREDICTOR_PROPERTY),
+            property_names,
             state_times_s,
             np.array([kf_state, *axis_components]),
             spans,

@@ -22,7 +22,7 @@ from px4fuse.ekf2.replay_segments import (
     ReplaySegment,
     group_samples_by_event,
     make_update_table,
-    pad_samples,
+    stack_samples,
 )
 from px4fuse.flight.ekf2_parameters import EV_POS, GNSS_POS
 
@@ -114,7 +114,7 @@ class VisionFilter:
         has_gate: BoolArray,
         uses_reported_noise: BoolArray,
     ) -> None:
-        samples = np.stack(pad_samples(samples_by_configuration), axis=-1)
+        samples = stack_samples(samples_by_configuration)
         self.position_m = np.moveaxis(samples[:2], 0, -1)
         self.age_s, self.measurement_times_s, self.fusion_time_s = samples[2:5]
         _, sample_count, event_count, configuration_count = samples.shape
@@ -129,11 +129,11 @@ class VisionFilter:
         reported_variance = samples[5:7] * (
             uses_reported_noise & (parameters[EV_POS.noise_mode_parameter] != 1.0)
         )
-        min_variance = np.maximum(parameters[EV_POS.noise], MIN_MEASUREMENT_NOISE_SIGMA) ** 2
-        gnss_variance = np.where(self.is_gnss_off, 0.0, parameters[GNSS_POS.noise] ** 2)
-        self.R_m2 = np.moveaxis(
-            np.maximum(reported_variance, np.maximum(min_variance, gnss_variance)), 0, -1
+        min_variance = np.maximum(
+            np.maximum(parameters[EV_POS.noise], MIN_MEASUREMENT_NOISE_SIGMA) ** 2,
+            np.where(self.is_gnss_off, 0.0, parameters[GNSS_POS.noise] ** 2),
         )
+        self.R_m2 = np.moveaxis(np.maximum(reported_variance, min_variance), 0, -1)
         bias = np.zeros((configuration_count, 2))
         self.bias = BiasEstimator(bias, bias + np.inf, segment.step_s)
         self.last_sample_s, self.last_attempt_s = np.full((2, configuration_count), -np.inf)
@@ -173,36 +173,33 @@ class VisionFilter:
         P: Array,
         last_gnss_fusion_s: Array,
     ) -> ArrayPair:
-        sample_age_s = self.age_s[sample_index, event][:, None]
-        fusion_time_s = self.fusion_time_s[sample_index, event]
+        age_s, fusion_time_s, R_m2 = (
+            array[sample_index, event] for array in (self.age_s, self.fusion_time_s, self.R_m2)
+        )
         is_gnss_off = self.is_gnss_off[event]
-        R_m2 = self.R_m2[sample_index, event]
-        HP = P[:, HORIZONTAL_POSITION] - sample_age_s[:, None] * P[:, HORIZONTAL_VELOCITY]
-        S = HP[:, :, HORIZONTAL_POSITION] - sample_age_s[:, None] * HP[:, :, HORIZONTAL_VELOCITY]
-        # innovation_variances is a view of S: adding R to it changes S
-        innovation_variances = S.reshape(len(S), -1)[:, ::3]
+        HP = P[:, HORIZONTAL_POSITION] - age_s[:, None, None] * P[:, HORIZONTAL_VELOCITY]
+        HPH = HP[:, :, HORIZONTAL_POSITION] - age_s[:, None, None] * HP[:, :, HORIZONTAL_VELOCITY]
+        predicted_variance = np.diagonal(HPH, axis1=1, axis2=2)
         position_innovation_m = (
             self.position_m[sample_index, event]
             - x[:, HORIZONTAL_POSITION]
-            + sample_age_s * x[:, HORIZONTAL_VELOCITY]
+            + age_s[:, None] * x[:, HORIZONTAL_VELOCITY]
         )
+        time_since_sample_s = fusion_time_s - self.last_sample_s
         is_bias_updated = has_sample & ~is_gnss_off
-        interval_s = np.where(is_bias_updated, fusion_time_s - self.last_sample_s, 0.0)
         nu, R = self.bias.remove_and_update_bias(
             position_innovation_m,
-            innovation_variances.copy(),
+            predicted_variance,
             R_m2,
-            interval_s[:, None],
+            np.where(is_bias_updated, time_since_sample_s, 0.0)[:, None],
             is_bias_updated[:, None],
         )
-        innovation_variances += R
-        has_fusion_restarted = (fusion_time_s - self.last_sample_s > MAX_SAMPLE_GAP_S) | (
+        S = predicted_variance + R
+        has_fusion_restarted = (time_since_sample_s > MAX_SAMPLE_GAP_S) | (
             is_gnss_off != self.was_gnss_off
         )
         is_outside_gate = (
-            (nu * nu > self.gate_squared * innovation_variances).any(axis=1)
-            & self.has_gate
-            & ~has_fusion_restarted
+            (nu * nu > self.gate_squared * S).any(axis=1) & self.has_gate & ~has_fusion_restarted
         )
         is_rejection_timed_out = is_outside_gate & (
             fusion_time_s - self.last_attempt_s > MAX_REJECTION_DURATION_S
@@ -216,46 +213,37 @@ class VisionFilter:
                 & (fusion_time_s - last_gnss_fusion_s > MAX_REJECTION_DURATION_S)
             )
         )
-        is_evaluated = has_sample & ~has_fusion_restarted | is_position_reset
         # If EKF2 resets its position to a sample, it logs innovation 0
-        update_records = (
+        update_record = (
             *np.where(is_position_reset, 0.0, nu.T),
-            *innovation_variances.T,
+            *S.T,
             is_outside_gate & ~is_position_reset,
             is_fused,
             is_position_reset,
         )
-        self.update_records[event, sample_index] = np.where(
-            is_evaluated, np.stack(update_records), np.nan
-        )
-        K = (np.linalg.inv(S) @ HP).transpose(0, 2, 1) * is_fused[:, None, None]
+        is_evaluated = has_sample & ~has_fusion_restarted | is_position_reset
+        self.update_records[event, sample_index] = np.where(is_evaluated, update_record, np.nan)
+        K = (np.linalg.inv(HPH + R[:, :, None] * np.eye(2)) @ HP).transpose(0, 2, 1)
+        K *= is_fused[:, None, None]
         x = x + (K @ nu[:, :, None])[:, :, 0]
         P = P - K @ HP
-        if is_position_reset.any():
-            position_reset_m = (
-                np.where(is_gnss_off[:, None], position_innovation_m, nu)
-                * is_position_reset[:, None]
-            )
-            position_variance_after_reset = np.where(is_gnss_off[:, None], R_m2, R)
-            set_states(
-                x,
-                P,
-                is_position_reset,
-                HORIZONTAL_POSITION,
-                x[:, HORIZONTAL_POSITION] + position_reset_m,
-                position_variance_after_reset,
-            )
-            self.position_reset_m[event] += position_reset_m
-        if is_restarting.any():
-            is_bias_initialised = (is_restarting & ~is_position_reset)[:, None]
-            is_bias_cleared = (is_position_reset & is_gnss_off)[:, None]
-            self.bias.bias_m = np.where(
-                is_bias_initialised,
-                -position_innovation_m,
-                np.where(is_bias_cleared, 0.0, self.bias.bias_m),
-            )
-            self.bias.variance_m2 = np.where(is_bias_cleared, 0.0, self.bias.variance_m2)
-        self.last_sample_s = np.where(has_sample, fusion_time_s, self.last_sample_s)
+        position_reset_m = (
+            np.where(is_gnss_off[:, None], position_innovation_m, nu) * is_position_reset[:, None]
+        )
+        set_states(
+            x,
+            P,
+            is_position_reset,
+            HORIZONTAL_POSITION,
+            x[:, HORIZONTAL_POSITION] + position_reset_m,
+            np.where(is_gnss_off[:, None], R_m2, R),
+        )
+        self.position_reset_m[event] += position_reset_m
+        is_bias_initialised = is_restarting & ~is_position_reset
+        is_bias_cleared = is_position_reset & is_gnss_off
+        self.bias.bias_m[is_bias_initialised] = -position_innovation_m[is_bias_initialised]
+        self.bias.bias_m[is_bias_cleared] = self.bias.variance_m2[is_bias_cleared] = 0.0
+        self.last_sample_s[has_sample] = fusion_time_s[has_sample]
         self.last_attempt_s = np.where(is_fused | is_restarting, fusion_time_s, self.last_attempt_s)
         self.last_fusion_s = np.where(
             is_fused | is_position_reset, fusion_time_s, self.last_fusion_s

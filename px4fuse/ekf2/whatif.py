@@ -23,7 +23,6 @@ from px4fuse.ekf2.replay import (
     HORIZONTAL_AXES,
     Agreement,
     Ekf2Replay,
-    Spans,
     compute_rmse_to_truth,
     interpolate_component,
     is_inside_spans,
@@ -36,7 +35,7 @@ from px4fuse.errors import SettingsError
 from px4fuse.filter.consistency import compute_nis_band
 from px4fuse.filter.frame_rotation import heading_rad
 from px4fuse.flight.ekf2_parameters import EV_POS, GNSS_POS, GNSS_VEL, MAG, check_parameters
-from px4fuse.flight.model import Columns, Ekf2, Flight, NedAxis, Unavailable
+from px4fuse.flight.model import Columns, Ekf2, Flight, NedAxis, Spans, Unavailable
 
 ANALYSIS_NAME = "EKF2 replay with other parameters"
 # Minimum fraction of logged innovations for a computation of the longest time without fusion
@@ -51,10 +50,6 @@ HEADING_LOGGED_NOTE = (
     "magnetometer samples"
 )
 HEIGHT_REPLAYED_NOTE = "Height is replayed with the logged height sensors"
-BAD_ACCELERATION_AT_START_NOTE = (
-    "When the replay starts, EKF2's flag fs_bad_acc_vertical is set, so the replayed height may be "
-    "wrong at first"
-)
 HEIGHT_LOGGED_NOTE = "All replays use the logged EKF2 height"
 HEADING_NOT_REPLAYED = Unavailable(
     "heading error",
@@ -248,26 +243,20 @@ def what_if(
             )
     summaries: list[Ekf2Statistics] = []
     notes: list[str] = []
-    deviation_notes: list[str] = []
+    if settings and model.inputs.aid == GNSS_POS:
+        notes += _describe_heading_and_height(model)
     for replay in replays:
         summaries.append(_summarise_replay(flight, replay, spans_s))
         notes += _describe_replay_limits(model, replay)
         if disable_time_s_by_aid:
-            deviation_notes.append(
-                _describe_deviation(model, replay, disable_time_s_by_aid, spans_s)
-            )
-    is_gnss = model.inputs.aid == GNSS_POS
+            notes.append(_describe_deviation(model, replay, disable_time_s_by_aid, spans_s))
     return WhatIf(
         agreement=model.agreement,
         logged=_summarise_log(flight, model.baseline_replay, spans_s),
         replayed=_summarise_replay(flight, model.baseline_replay, spans_s),
         whatif=_mark_unpredictable(model, summaries, spans_s, disable_time_s_by_aid),
         evaluated_s=spans_s,
-        notes=(
-            *(_describe_heading_and_height(model) if summaries and is_gnss else ()),
-            *notes,
-            *deviation_notes,
-        ),
+        notes=tuple(notes),
     )
 
 
@@ -279,17 +268,8 @@ def _describe_heading_and_height(model: Ekf2Model) -> tuple[str, str]:
             "Heading is replayed with the magnetometer. With the logged parameters, the replayed "
             f"heading differs from the logged heading by {heading_difference_deg:.1f}° RMS"
         )
-    height_note = (
-        HEIGHT_LOGGED_NOTE if model.inputs.reason_for_logged_height else HEIGHT_REPLAYED_NOTE
-    )
-    bad_acceleration_flags = model.inputs.segments[0].is_acceleration_bad
-    if (
-        height_note == HEIGHT_REPLAYED_NOTE
-        and bad_acceleration_flags is not None
-        and bad_acceleration_flags[0]
-    ):
-        height_note = f"{height_note}. {BAD_ACCELERATION_AT_START_NOTE}"
-    return heading_note, height_note
+    is_height_logged = bool(model.inputs.reason_for_logged_height)
+    return heading_note, HEIGHT_LOGGED_NOTE if is_height_logged else HEIGHT_REPLAYED_NOTE
 
 
 def make_sweep_values(
@@ -333,32 +313,29 @@ def _mark_unpredictable(
     A replay is not predictable if repetitions with added position noise differ.
     """
     summaries_by_replay = [[summary] for summary in summaries]
-    summaries_of_noisy_replays = [
+    uncertain_replays = [
         replay_summaries
         for replay_summaries in summaries_by_replay
         if replay_summaries[0].changed
         and MIN_REJECTED_FRACTION < replay_summaries[0].rejected_fraction <= MAX_REJECTED_FRACTION
     ]
-    changes_for_noisy_replays = [
-        replay_summaries[0].changed for replay_summaries in summaries_of_noisy_replays
-    ]
-    for seed in range(REPLAYS_WITH_ADDED_NOISE if changes_for_noisy_replays else 0):
+    changes = [replay_summaries[0].changed for replay_summaries in uncertain_replays]
+    for seed in range(REPLAYS_WITH_ADDED_NOISE if changes else 0):
         noisy_model = add_position_noise(model, ADDED_POSITION_SIGMA_M, seed)
         replays = replay_with_settings(
-            noisy_model, changes_for_noisy_replays, disable_time_s_by_aid=disable_time_s_by_aid
+            noisy_model, changes, disable_time_s_by_aid=disable_time_s_by_aid
         )
-        for replay_summaries, replay in zip(summaries_of_noisy_replays, replays, strict=True):
+        for replay_summaries, replay in zip(uncertain_replays, replays, strict=True):
             replay_summaries.append(_summarise_replay(model.flight, replay, spans_s))
     final_summaries = []
     for summary, *noisy_summaries in summaries_by_replay:
-        rejected_fractions = [
-            axis_summary.rejected_fraction for axis_summary in summary.others.values()
-        ]
-        if summary.changed:
-            rejected_fractions.append(summary.rejected_fraction)
         is_predictable = (
             all(height.is_predictable for height in summary.heights.values())
-            and max(rejected_fractions, default=0.0) <= MAX_REJECTED_FRACTION
+            and all(
+                other.rejected_fraction <= MAX_REJECTED_FRACTION
+                for other in summary.others.values()
+            )
+            and (not summary.changed or summary.rejected_fraction <= MAX_REJECTED_FRACTION)
             and _results_agree([summary, *noisy_summaries])
         )
         final_summaries.append(
@@ -405,12 +382,11 @@ def _summarise_replay(flight: Flight, replay: Ekf2Replay, spans_s: Spans) -> Ekf
     # Position variance just before (1 µs) and after each update
     variance = pd.DataFrame(index=np.column_stack([update_times_s - 1e-6, update_times_s]).ravel())
     for axis in HORIZONTAL_AXES:
-        innovation_variance, noise_variance = (
-            updates[f"{quantity}_variance_{axis}_m2"] for quantity in ("innovation", "observation")
+        prior_variance_m2 = (
+            updates[f"innovation_variance_{axis}_m2"] - updates[f"observation_variance_{axis}_m2"]
         )
-        posterior_variance_m2 = updates[f"position_variance_{axis}_m2"]
         variance[f"{axis}_m2"] = np.column_stack(
-            [innovation_variance - noise_variance, posterior_variance_m2]
+            [prior_variance_m2, updates[f"position_variance_{axis}_m2"]]
         ).ravel()
     fusion_times_s = evaluated_updates["fused_at_s"][
         evaluated_updates[["fused", "reset"]].any(axis=1)

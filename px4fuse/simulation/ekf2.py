@@ -11,6 +11,7 @@ from collections.abc import Mapping
 from dataclasses import replace
 
 import numpy as np
+import pandas as pd
 
 from px4fuse.core.arrays import Array, BoolArray, IntArray, cumulative_sums
 from px4fuse.ekf2.filter_recursion import (
@@ -20,7 +21,6 @@ from px4fuse.ekf2.filter_recursion import (
     FilterConfiguration,
     SegmentRun,
 )
-from px4fuse.ekf2.heights import select_samples_in_segment
 from px4fuse.ekf2.inputs import GNSS_RULES, VISION_RULES, ReceivedPositions, ReplayInputs
 from px4fuse.ekf2.model import compute_delayed_states, run_configurations
 from px4fuse.ekf2.output_predictor import (
@@ -39,6 +39,7 @@ from px4fuse.ekf2.replay_segments import (
     ReplaySegment,
     add_field_states,
     downsample_imu,
+    find_sample_steps,
     find_step_ends,
 )
 from px4fuse.flight.ekf2_parameters import (
@@ -56,7 +57,7 @@ from px4fuse.simulation.ekf2_topics import (
     make_ekf2_topics,
 )
 from px4fuse.simulation.faults import FaultSizes
-from px4fuse.simulation.motion import Motion, compute_attitude
+from px4fuse.simulation.motion import Motion
 from px4fuse.simulation.scenario import Scenario
 from px4fuse.simulation.ulog_writer import Topic
 from px4fuse.trajectory.rotation import (
@@ -99,18 +100,16 @@ def _select_fused_aids(scenario: Scenario) -> tuple[Aid, ...]:
 def make_parameters(scenario: Scenario, faults: FaultSizes) -> dict[str, int | float]:
     """Return the values of all EKF2 parameters that the model uses, by PX4 name."""
     aid = scenario.aid
-    is_gnss = aid == GNSS_POS
     defaults = fill_with_defaults({}, *_select_fused_aids(scenario))
     delay_ms = defaults[aid.delay] if faults.ekf2_delay_s is None else 1e3 * faults.ekf2_delay_s
     aid_parameters: dict[str, float] = {aid.noise_mode_parameter: 1}
-    if is_gnss:
-        # EKF2_MAG_TYPE 1: EKF2 fuses the magnetic heading only; 0: all axes
-        magnetometer_fusion_type = int(bool(faults.heading_deg))
+    if aid == GNSS_POS:
         aid_parameters = {
             GNSS_VEL.noise: scenario.sigma_gnss_m_s,
-            MAG.switch: magnetometer_fusion_type,
+            # EKF2_MAG_TYPE 1: EKF2 fuses the magnetic heading only; 0: all axes
+            MAG.switch: int(bool(faults.heading_deg)),
+            BAROMETER.noise: sensors.SIGMA_BAROMETER_M,
         }
-        aid_parameters |= {BAROMETER.noise: sensors.SIGMA_BAROMETER_M}
     return (
         defaults
         | aid_parameters
@@ -148,15 +147,17 @@ def simulate_ekf2(
             sensors.to_seconds(sensors.get_time_us(topic)) - 0.5 * step_s for topic in other_sensors
         )
         # the barometer is EKF2's only height source outdoors
-        down_m = sensors.HOME_POSITION[2] - barometer_topic.fields["baro_alt_meter"].astype(
-            np.float64
+        down_m = sensors.HOME_POSITION[2] - barometer_topic.fields["baro_alt_meter"].astype(float)
+        barometer_samples = pd.DataFrame(
+            {"down_m": down_m, "dead_zone_m": 0.0, "weight": 1.0}, barometer_times_s
         )
-        dead_zone_m, sample_weight = np.zeros(len(down_m)), np.ones(len(down_m))
-        barometer_samples = select_samples_in_segment(
-            segment, barometer_times_s, down_m, dead_zone_m, sample_weight
-        )
+        step_indices, is_inside = find_sample_steps(segment, barometer_times_s)
         height_samples = HeightSamples(
-            (BAROMETER.name,), BAROMETER.name, (0.0, 0.0), *barometer_samples
+            (BAROMETER.name,),
+            BAROMETER.name,
+            np.zeros(2),
+            step_indices,
+            barometer_samples[is_inside],
         )
         segment = replace(segment, height_samples=height_samples)
         if not logged_values[MAG.switch]:
@@ -209,25 +210,21 @@ def _make_segment(
     step_end_indices = find_step_ends(
         interval_s, np.array([], dtype=np.intp), PREDICTION_STEP_US * 1e-6
     )
-    delta_angle_rad, delta_velocity_m_s = (
-        imu.fields[name][1:].astype(np.float64) * interval_s[:, None]
-        for name in ("gyro_rad", "accelerometer_m_s2")
-    )
     rotation_rad, velocity_increment_m_s = downsample_imu(
-        delta_angle_rad, delta_velocity_m_s, step_end_indices
+        imu.fields["gyro_rad"][1:].astype(float) * interval_s[:, None],
+        imu.fields["accelerometer_m_s2"][1:].astype(float) * interval_s[:, None],
+        step_end_indices,
     )
     step_times_us = time_us[np.concatenate([[0], step_end_indices])]
     time_s = step_times_us * 1e-6
-    body_to_ned = compute_attitude(motion.compute_true_state(time_s)).body_to_ned
+    body_to_ned = motion.compute_body_to_ned(time_s)
     true_quaternions = sensors.to_quaternions(body_to_ned)
     integrated_attitude = cumulative_product(
         np.concatenate([true_quaternions[:1], from_rotation_vector(rotation_rad)])
     )
     attitude_difference = multiply(true_quaternions, conjugate(integrated_attitude))
-    attitude_error_rad = np.zeros((len(time_s), 3))
-    attitude_error_rad[:, HEADING] = sensors.simulate_attitude_error(
-        scenario, faults, time_s
-    ).as_rotvec()[:, HEADING]
+    attitude_error_rad = sensors.simulate_attitude_error(scenario, faults, time_s).as_rotvec()
+    attitude_error_rad[:, :HEADING] = 0.0
     specific_force_m_s2, rate_rad_s = sensors.measure_imu(
         scenario,
         faults,
@@ -237,7 +234,7 @@ def _make_segment(
         REST_BEFORE_LOG_S * scenario.imu_rate_hz,
     )
     state, covariance = _compute_state_at_rest(
-        body_to_ned[0], specific_force_m_s2[0], rate_rad_s[0], float(attitude_error_rad[0, HEADING])
+        body_to_ned[0], specific_force_m_s2[0], rate_rad_s[0], attitude_error_rad[0, HEADING]
     )
     variance = np.diagonal(covariance).copy()
     sigma = np.sqrt(variance)
@@ -297,34 +294,30 @@ def _select_positions(source: sensors.SimulatedPositions) -> ReceivedPositions:
 
     EKF2 ignores positions that are older than the previous one (estimator_interface.cpp).
     """
-    topic_fields = source.topic.fields
     timestamp_s, arrival_s = (
         sensors.to_seconds(sensors.get_time_us(source.topic, name))
         for name in ("timestamp_sample", "timestamp")
     )
     latest_timestamp_s = np.maximum.accumulate(np.concatenate([[-np.inf], timestamp_s[:-1]]))
-    is_newer_than_previous = timestamp_s > latest_timestamp_s
-    velocity_m_s = source.velocity_m_s
-    if velocity_m_s is not None:
-        sigmas_m = np.stack([topic_fields["eph"], topic_fields["eph"], topic_fields["epv"]], axis=1)
-        position_variance = sigmas_m[is_newer_than_previous] ** 2
-        velocity_variance = np.repeat(
-            topic_fields["s_variance_m_s"][is_newer_than_previous, None] ** 2, 3, axis=1
-        )
+    is_newer = timestamp_s > latest_timestamp_s
+    fields = {name: values[is_newer] for name, values in source.topic.fields.items()}
+    velocity_m_s = velocity_variance = None
+    if source.velocity_m_s is None:
+        position_variance = fields["position_variance"]
     else:
-        position_variance, velocity_variance = (
-            topic_fields["position_variance"][is_newer_than_previous],
-            None,
-        )
+        velocity_m_s = source.velocity_m_s[is_newer]
+        velocity_variance = np.repeat(fields["s_variance_m_s"][:, None] ** 2, 3, axis=1)
+        position_variance = np.stack([fields[name] for name in ("eph", "eph", "epv")], axis=1) ** 2
+    count = int(is_newer.sum())
     return ReceivedPositions(
-        timestamp_s=timestamp_s[is_newer_than_previous],
-        arrival_s=arrival_s[is_newer_than_previous],
-        position_m=source.position_m[is_newer_than_previous].astype(np.float32).astype(np.float64),
+        timestamp_s=timestamp_s[is_newer],
+        arrival_s=arrival_s[is_newer],
+        position_m=source.position_m[is_newer].astype(np.float32).astype(np.float64),
         variance_m2=position_variance.astype(np.float64),
-        rejected_flags=np.full(int(is_newer_than_previous.sum()), np.nan),
-        is_reset_to_sample=np.zeros(int(is_newer_than_previous.sum()), dtype=bool),
+        rejected_flags=np.full(count, np.nan),
+        is_reset_to_sample=np.zeros(count, dtype=bool),
         source=source.topic.name,
-        velocity_m_s=None if velocity_m_s is None else velocity_m_s[is_newer_than_previous],
+        velocity_m_s=velocity_m_s,
         velocity_variance_m2_s2=velocity_variance,
     )
 
@@ -334,7 +327,7 @@ def _compute_output(
 ) -> Ekf2Output:
     segment = model_run.segment
     lag_steps = round(inputs.horizon_s / inputs.mean_step_s)
-    state, _ = compute_delayed_states(model_run, 0)
+    state = compute_delayed_states(model_run, 0)
     resets, has_recent_position_aiding = _hold_position_without_aiding(model_run, state)
     reset_sum_m = np.zeros((len(state), 3))
     for step, reset_size_m in resets:
@@ -374,11 +367,9 @@ def _hold_position_without_aiding(
     Return the position resets (step, size in m), and a mask of the steps with recent aiding.
     """
     events, time_s = model_run.events[0], model_run.segment.time_s
-    events_with_aiding = np.flatnonzero(model_run.fused[:, 0] | model_run.reset[:, 0])
+    aiding_steps = events.end_step[model_run.fused[:, 0] | model_run.reset[:, 0]]
     time_of_aiding_s = np.zeros(len(time_s))
-    time_of_aiding_s[events.end_step[events_with_aiding]] = time_s[
-        events.end_step[events_with_aiding]
-    ]
+    time_of_aiding_s[aiding_steps] = time_s[aiding_steps]
     has_recent_position_aiding = (
         time_s - np.maximum.accumulate(time_of_aiding_s) <= NO_AID_TIMEOUT_S
     )

@@ -181,14 +181,9 @@ def _make_position_aid_topics(
         ),
         (innovation, innovation_variance),
     )
-    fusion_times_us = np.where(
-        model_run.fused[logged_indices, 0] | model_run.reset[logged_indices, 0],
-        ekf2_output.time_us[logged_steps],
-        -1,
-    )
-    newest_fusion_us = np.maximum.accumulate(fusion_times_us)
-    last_fused_us = np.where(
-        newest_fusion_us >= 0, sensors.FIRST_TIMESTAMP_US + newest_fusion_us, 0
+    is_used = model_run.fused[logged_indices, 0] | model_run.reset[logged_indices, 0]
+    last_fused_us = np.maximum.accumulate(
+        is_used * (sensors.FIRST_TIMESTAMP_US + ekf2_output.time_us[logged_steps])
     )
     observation = north, east
     if velocity_m_s is not None:
@@ -198,26 +193,29 @@ def _make_position_aid_topics(
         model_inputs.settings,
         timestamps | {"time_last_fuse": last_fused_us},
         np.stack(observation, axis=1),
-        (innovation, innovation_variance, noise_variance),
-        (model_run.rejected[logged_indices, 0], model_run.fused[logged_indices, 0]),
+        innovation,
+        innovation_variance,
+        noise_variance,
+        model_run.rejected[logged_indices, 0],
+        model_run.fused[logged_indices, 0],
     )
     if velocity_m_s is None:
         return (position_topic,)
-    velocity_innovation, velocity_innovation_variance, velocity_noise_variance = (
+    innovation, innovation_variance, noise_variance = (
         values[logged_indices, 0, :3] for values in innovation_arrays
     )
-    is_outside_gate = np.any(
-        velocity_innovation**2
-        > model_inputs.settings[GNSS_VEL.gate] ** 2 * velocity_innovation_variance,
-        axis=1,
-    )
+    squared_gate = model_inputs.settings[GNSS_VEL.gate] ** 2
+    is_outside_gate = np.any(innovation**2 > squared_gate * innovation_variance, axis=1)
     return position_topic, _make_aid_source_topic(
         GNSS_VEL,
         model_inputs.settings,
         timestamps,
         velocity_m_s[sample_indices],
-        (velocity_innovation, velocity_innovation_variance, velocity_noise_variance),
-        (is_outside_gate, ~is_outside_gate & np.isfinite(velocity_innovation).all(axis=1)),
+        innovation,
+        innovation_variance,
+        noise_variance,
+        is_outside_gate,
+        ~is_outside_gate & np.isfinite(innovation).all(axis=1),
     )
 
 
@@ -235,21 +233,18 @@ def _make_barometer_topics(
     updates = updates[sensors.is_kept_at_rate(updates.index.to_numpy(), OTHER_AIDS_LOG_RATE_HZ)]
     innovation, innovation_variance, is_rejected, is_fused, step_by_update = updates.to_numpy().T
     measurement_times_s, steps = updates.index.to_numpy(), step_by_update.astype(np.intp)
-    measured_m = (
-        height_samples.down_m[
-            np.searchsorted(height_samples.measurement_times_s, measurement_times_s)
-        ]
-        - sensors.HOME_POSITION[2]
-    )
-    noise_variance = np.full(len(steps), model_inputs.settings[BAROMETER.noise] ** 2)
+    measured_down_m = height_samples.samples["down_m"][measurement_times_s].to_numpy()
     return [
         _make_aid_source_topic(
             BAROMETER,
             model_inputs.settings,
             ekf2_output.make_timestamps(steps, measurement_times_s),
-            measured_m,
-            (innovation, innovation_variance, noise_variance),
-            (is_rejected > 0, is_fused > 0),
+            measured_down_m - sensors.HOME_POSITION[2],
+            innovation,
+            innovation_variance,
+            model_inputs.settings[BAROMETER.noise] ** 2,
+            is_rejected > 0,
+            is_fused > 0,
         )
     ]
 
@@ -274,7 +269,6 @@ def _make_magnetometer_topics(
     observed_gauss = field.value[
         np.searchsorted(field.step_indices, logged_steps, side="right") - 1
     ]
-    noise_variance = np.full(innovation.shape, settings[MAG.noise] ** 2)
     is_fused = fused_fraction[:, 0] > 0.0
     logged_attitude_steps, logged_status_steps = (
         np.flatnonzero(sensors.is_kept_at_rate(sensors.to_seconds(time_us), rate_hz))
@@ -295,8 +289,11 @@ def _make_magnetometer_topics(
             settings,
             ekf2_output.make_timestamps(logged_steps),
             observed_gauss,
-            (innovation, innovation_variance, noise_variance),
-            (~is_fused, is_fused),
+            innovation,
+            innovation_variance,
+            settings[MAG.noise] ** 2,
+            ~is_fused,
+            is_fused,
         ),
         make_topic(
             "estimator_status",
@@ -311,24 +308,22 @@ def _make_aid_source_topic(
     settings: Mapping[str, float],
     timestamps: Mapping[str, Any],
     observation: Array,
-    innovation_with_variances: tuple[Array | Array32, ...],
-    rejected_and_fused_masks: tuple[BoolArray, BoolArray],
+    innovation: Array | Array32,
+    innovation_variance: Array | Array32,
+    noise_variance: Array | Array32 | float,
+    is_rejected: BoolArray,
+    is_fused: BoolArray,
 ) -> Topic:
-    """Return estimator_aid_src_* of an aiding source.
-
-    ``innovation_with_variances`` are innovation, its variance S, and the measurement variance R.
-    ``rejected_and_fused_masks`` are masks of rejected and of fused samples.
-    """
-    innovation, innovation_variance, noise_variance = innovation_with_variances
+    """Return estimator_aid_src_* of an aiding source, with innovations measurement - state."""
     fields = {
         **timestamps,
         "observation": observation,
-        "observation_variance": noise_variance,
+        "observation_variance": np.broadcast_to(noise_variance, innovation.shape),
         "innovation": -innovation,
         "innovation_variance": innovation_variance,
         "test_ratio": innovation**2 / (max(settings[aid.gate], 1.0) ** 2 * innovation_variance),
-        "innovation_rejected": rejected_and_fused_masks[0],
-        "fused": rejected_and_fused_masks[1],
+        "innovation_rejected": is_rejected,
+        "fused": is_fused,
     }
     return make_topic(f"estimator_aid_src_{aid.name}", fields)
 
@@ -338,29 +333,23 @@ def _make_flags_topic(
 ) -> Topic:
     """Return estimator_status_flags: a message each second, and at each start or end of fusion."""
     events, time_s = model_run.events[0], model_run.segment.time_s
-    fusion_attempt_indices = np.flatnonzero(
+    attempt_steps = events.end_step[
         model_run.fused[:, 0] | model_run.rejected[:, 0] | model_run.reset[:, 0]
-    )
-    is_fusing = np.zeros(len(time_s), np.bool_)
-    next_fusion_attempts_s = np.append(time_s[events.end_step[fusion_attempt_indices]], np.inf)[1:]
-    for step, next_fusion_attempt_s in zip(
-        events.end_step[fusion_attempt_indices].tolist(),
-        next_fusion_attempts_s.tolist(),
-        strict=True,
-    ):
-        stop_s = time_s[step] + model_inputs.rules.stop_timeout_s
-        is_fusing[step : int(np.searchsorted(time_s, min(next_fusion_attempt_s, stop_s)))] = True
+    ]
+    last_attempt_s = np.full(len(time_s), -np.inf)
+    last_attempt_s[attempt_steps] = time_s[attempt_steps]
+    time_since_attempt_s = time_s - np.maximum.accumulate(last_attempt_s)
+    is_fusing = time_since_attempt_s < model_inputs.rules.stop_timeout_s
     has_changed = np.diff(is_fusing.astype(int), prepend=0) != 0
     is_logged = has_changed | sensors.is_kept_at_rate(time_s, FLAGS_LOG_RATE_HZ)
     logged_steps = np.flatnonzero(is_logged[: len(time_s) - ekf2_output.lag_steps])
     is_gnss = model_inputs.aid == GNSS_POS
+    is_fusing = is_fusing[logged_steps]
     fields = ekf2_output.make_timestamps(logged_steps) | {
         "control_status_changes": np.cumsum(has_changed)[logged_steps],
-        "cs_gnss_pos": is_fusing[logged_steps] & is_gnss,
-        "cs_ev_pos": is_fusing[logged_steps] & (not is_gnss),
+        "cs_gnss_pos": is_fusing & is_gnss,
+        "cs_ev_pos": is_fusing & (not is_gnss),
         "cs_mag_hdg" if model_run.segment.magnetic_field is None else "cs_mag_3d": True,
     }
-    return make_topic(
-        "estimator_status_flags",
-        fields | ({"cs_gnss_vel": is_fusing[logged_steps]} if is_gnss else {}),
-    )
+    fields |= {"cs_gnss_vel": is_fusing} if is_gnss else {}
+    return make_topic("estimator_status_flags", fields)

@@ -147,6 +147,10 @@ class Motion:
             yaw_rate_rad_s=yaw_rate_rad_s[:, 0],
         )
 
+    def compute_body_to_ned(self, time_s: Array) -> Array:
+        """Return the true attitude, shape (n, 3, 3); the columns are the body axes, FRD."""
+        return compute_attitude(self.compute_true_state(time_s)).body_to_ned
+
 
 @dataclass(frozen=True)
 class AttitudeAndImu:

@@ -115,35 +115,34 @@ def simulate_imu(scenario: Scenario, faults: FaultSizes, motion: Motion) -> Topi
     specific_force_m_s2, rate_rad_s = measure_imu(
         scenario, faults, motion, to_seconds(time_us), RandomStream.IMU_NOISE
     )
-    if faults.vibration_m_s2:
-        vibration_sigma_m_s2 = faults.vibration_m_s2 * np.sqrt(DT_S * scenario.imu_rate_hz)
-        specific_force_m_s2 += vibration_sigma_m_s2 * make_random_generator(
-            scenario, RandomStream.VIBRATION
-        ).standard_normal(specific_force_m_s2.shape)
+    vibration_sigma_m_s2 = faults.vibration_m_s2 * np.sqrt(DT_S * scenario.imu_rate_hz)
+    specific_force_m_s2 += vibration_sigma_m_s2 * make_random_generator(
+        scenario, RandomStream.VIBRATION
+    ).standard_normal(specific_force_m_s2.shape)
     interval_us = round(1e6 / scenario.imu_rate_hz)
-    integral_fields = dict.fromkeys(("gyro_integral_dt", "accelerometer_integral_dt"), interval_us)
     sample_fields: dict[str, Any] = {
         "timestamp": _to_boot_time(time_us),
         "gyro_rad": rate_rad_s,
+        "gyro_integral_dt": interval_us,
         "accelerometer_m_s2": specific_force_m_s2,
+        "accelerometer_integral_dt": interval_us,
     }
-    return make_topic("sensor_combined", sample_fields | integral_fields)
+    return make_topic("sensor_combined", sample_fields)
 
 
 def simulate_magnetometer(scenario: Scenario, faults: FaultSizes, motion: Motion) -> Topic:
     time_us = _make_sample_times_us(motion, MAGNETOMETER_RATE_HZ)
-    body_to_ned = compute_attitude(motion.compute_true_state(to_seconds(time_us))).body_to_ned
+    time_s = to_seconds(time_us)
+    body_to_ned = motion.compute_body_to_ned(time_s)
     # The rotated field causes EKF2's heading error outdoors
     if faults.heading_deg:
-        body_to_ned = (
-            simulate_attitude_error(scenario, faults, to_seconds(time_us)).as_matrix() @ body_to_ned
-        )
+        body_to_ned = simulate_attitude_error(scenario, faults, time_s).as_matrix() @ body_to_ned
     field_gauss = np.einsum("nji,j->ni", body_to_ned, EARTH_FIELD_GAUSS)
     field_gauss += SIGMA_MAGNETOMETER_GAUSS * make_random_generator(
         scenario, RandomStream.MAGNETOMETER_NOISE
     ).standard_normal(field_gauss.shape)
     disturbance_start_s = motion.duration_s / 2.0 if faults.mag_at_s is None else faults.mag_at_s
-    field_gauss[to_seconds(time_us) >= disturbance_start_s, 1] += faults.mag_gauss
+    field_gauss[time_s >= disturbance_start_s, 1] += faults.mag_gauss
     return make_topic(
         "vehicle_magnetometer", make_timestamps(time_us) | {"magnetometer_ga": field_gauss}
     )
@@ -151,12 +150,11 @@ def simulate_magnetometer(scenario: Scenario, faults: FaultSizes, motion: Motion
 
 def simulate_barometer(scenario: Scenario, motion: Motion) -> Topic:
     time_us = _make_sample_times_us(motion, BAROMETER_RATE_HZ)
-    height_m = HOME_POSITION[2] - motion.compute_true_state(to_seconds(time_us)).position_m[:, 2]
-    height_m -= simulate_height_error(scenario, to_seconds(time_us))
-    unit_noise = make_random_generator(scenario, RandomStream.BAROMETER_NOISE).standard_normal(
-        len(time_us)
-    )
-    height_m += SIGMA_BAROMETER_M * unit_noise
+    time_s = to_seconds(time_us)
+    height_m = HOME_POSITION[2] - motion.compute_true_state(time_s).position_m[:, 2]
+    height_m -= simulate_height_error(scenario, time_s)
+    rng = make_random_generator(scenario, RandomStream.BAROMETER_NOISE)
+    height_m += SIGMA_BAROMETER_M * rng.standard_normal(len(time_us))
     return make_topic("vehicle_air_data", make_timestamps(time_us) | {"baro_alt_meter": height_m})
 
 
@@ -224,16 +222,16 @@ def measure_imu(
 def simulate_logged_attitude(scenario: Scenario, faults: FaultSizes, motion: Motion) -> Topic:
     """Simulate vehicle_attitude without the EKF2 model: true attitude with a slow error."""
     time_us = _make_sample_times_us(motion, scenario.attitude_rate_hz)
-    true_rotation = compute_attitude(motion.compute_true_state(to_seconds(time_us))).body_to_ned
-    error_rotation = simulate_attitude_error(scenario, faults, to_seconds(time_us)).as_matrix()
-    logged_quaternions = to_quaternions(error_rotation @ true_rotation)
+    time_s = to_seconds(time_us)
+    error_rotation = simulate_attitude_error(scenario, faults, time_s).as_matrix()
+    logged_quaternions = to_quaternions(error_rotation @ motion.compute_body_to_ned(time_s))
     return make_attitude_topic("vehicle_attitude", time_us, ATTITUDE_LATENCY_US, logged_quaternions)
 
 
 def simulate_true_attitude(scenario: Scenario, motion: Motion) -> Topic:
     time_us = _make_sample_times_us(motion, scenario.truth_rate_hz)
-    truth = compute_attitude(motion.compute_true_state(to_seconds(time_us))).body_to_ned
-    return make_attitude_topic("vehicle_attitude_groundtruth", time_us, 0, to_quaternions(truth))
+    truth = to_quaternions(motion.compute_body_to_ned(to_seconds(time_us)))
+    return make_attitude_topic("vehicle_attitude_groundtruth", time_us, 0, truth)
 
 
 def to_quaternions(body_to_ned: Array) -> Array:
@@ -251,25 +249,23 @@ def simulate_attitude_error(scenario: Scenario, faults: FaultSizes, time_s: Arra
     rms_rad = np.radians([tilt_rms_deg, tilt_rms_deg, scenario.yaw_error_deg])
     rng = make_random_generator(scenario, RandomStream.ATTITUDE_ERROR)
     error_rad = Sines.draw(rng, rms_rad, SLOW_ERROR_PERIOD_RANGE_S).compute_values(time_s)[0]
-    if faults.heading_deg:
-        heading_error_rad = np.radians(faults.heading_deg)
-        if faults.heading_at_s is not None:
-            heading_error_rad *= -np.expm1(
-                -np.maximum(time_s - faults.heading_at_s, 0.0) / HEADING_TIME_CONSTANT_S
-            )
-        error_rad[:, 2] += heading_error_rad
+    heading_error_rad = np.radians(faults.heading_deg)
+    if faults.heading_at_s is not None:
+        heading_error_rad *= -np.expm1(
+            -np.maximum(time_s - faults.heading_at_s, 0.0) / HEADING_TIME_CONSTANT_S
+        )
+    error_rad[:, 2] += heading_error_rad
     return Rotation.from_rotvec(error_rad)
 
 
 def simulate_land_detector(motion: Motion) -> Topic:
     """Simulate vehicle_land_detected, logged once a second and at take-off and landing."""
-    landed_changes_us = np.rint(np.array([motion.take_off_s, motion.touch_down_s]) * 1e6).astype(
-        np.int64
-    )
+    take_off_us, touch_down_us = round(motion.take_off_s * 1e6), round(motion.touch_down_s * 1e6)
     time_us = np.union1d(
-        np.arange(0, int(motion.duration_s * 1e6), LAND_DETECTOR_INTERVAL_US), landed_changes_us
+        np.arange(0, int(motion.duration_s * 1e6), LAND_DETECTOR_INTERVAL_US),
+        [take_off_us, touch_down_us],
     )
-    is_landed = (time_us < landed_changes_us[0]) | (time_us >= landed_changes_us[1])
+    is_landed = (time_us < take_off_us) | (time_us >= touch_down_us)
     landed_flags = dict.fromkeys(("ground_contact", "maybe_landed", "landed"), is_landed)
     return make_topic(
         "vehicle_land_detected", {"timestamp": _to_boot_time(time_us), **landed_flags}
@@ -303,11 +299,9 @@ def simulate_positions(
     position_m = state.position_m.copy()
     speed_m_s = np.hypot(state.velocity_m_s[:, 0], state.velocity_m_s[:, 1])
     distance_m = cumulative_trapezoid(speed_m_s, time_s, initial=0)
-    drift_m = np.zeros_like(position_m)
-    if scenario.kind == "loop":
-        drift_m = simulate_vio_drift(scenario, distance_m)
+    is_loop, is_outdoor = scenario.kind == "loop", scenario.kind == "outdoor"
+    drift_m = simulate_vio_drift(scenario, distance_m) * is_loop
     position_m += drift_m
-    is_outdoor = scenario.kind == "outdoor"
     sigma_m = scenario.source_sigma_m * (GNSS_SIGMA_FACTORS if is_outdoor else 1.0)
     position_m += sigma_m * make_random_generator(
         scenario, RandomStream.POSITION_NOISE
@@ -315,54 +309,39 @@ def simulate_positions(
     is_airborne = (time_s > motion.take_off_s) & (time_s < motion.touch_down_s)
     outlier_offset_m, is_outlier = simulate_outliers(scenario, faults, is_airborne)
     position_m += outlier_offset_m
-    if faults.slow_error_m:
-        position_m += simulate_correlated_noise(scenario, faults, len(time_s), interval_s)
+    position_m += simulate_correlated_noise(scenario, faults, len(time_s), interval_s)
     if faults.smoothed_s:
         position_m = _apply_low_pass(position_m, interval_s, faults.smoothed_s)
     position_m *= 1.0 + faults.scale_percent / 100.0
     if faults.yaw_deg:
         position_m = Rotation.from_euler("z", faults.yaw_deg, degrees=True).apply(position_m)
-    if faults.jump_m:
-        jump_start_s = motion.duration_s / 1.5 if faults.jump_at_s is None else faults.jump_at_s
-        position_m[time_s >= jump_start_s] += faults.jump_m * compute_direction(
-            scenario.heading_deg
-        )
+    jump_start_s = motion.duration_s / 1.5 if faults.jump_at_s is None else faults.jump_at_s
+    position_m[time_s >= jump_start_s] += faults.jump_m * compute_direction(scenario.heading_deg)
     is_logged = _is_outside_gap(
         time_s, faults.dropout_s, faults.dropout_at_s, motion.duration_s
     ) & is_kept_at_rate(time_s, faults.decimate_hz)
     arrival_times_us, timestamp_us = _simulate_position_times_us(faults, time_s, timing_rng)
     reported_sigma_m = compute_reported_sigma_m(scenario, faults)
     velocity_m_s = None
+    position_m = position_m[is_logged]
+    arrival_times_us, timestamp_us = arrival_times_us[is_logged], timestamp_us[is_logged]
     if is_outdoor:
-        unit_velocity_noise = make_random_generator(
-            scenario, RandomStream.GNSS_VELOCITY_NOISE
-        ).standard_normal(position_m.shape)
+        rng = make_random_generator(scenario, RandomStream.GNSS_VELOCITY_NOISE)
+        velocity_sigma_m_s = scenario.sigma_gnss_m_s * GNSS_SIGMA_FACTORS
         velocity_m_s = (
-            state.velocity_m_s + scenario.sigma_gnss_m_s * GNSS_SIGMA_FACTORS * unit_velocity_noise
+            state.velocity_m_s + velocity_sigma_m_s * rng.standard_normal(state.velocity_m_s.shape)
         )[is_logged]
-        gnss_timestamp_us = timestamp_us + round(1e6 * GNSS_DELAY_S)
-        topic = _make_gnss_topic(
-            gnss_timestamp_us[is_logged],
-            position_m[is_logged],
-            velocity_m_s,
-            reported_sigma_m,
-            scenario,
-        )
+        timestamp_us += round(1e6 * GNSS_DELAY_S)
+        topic = _make_gnss_topic(timestamp_us, position_m, velocity_m_s, reported_sigma_m, scenario)
     else:
-        body_to_ned = (
-            compute_attitude(state).body_to_ned[is_logged] if scenario.kind == "loop" else None
-        )
+        body_to_ned = compute_attitude(state).body_to_ned[is_logged] if is_loop else None
         topic = _make_odometry_topic(
-            arrival_times_us[is_logged],
-            timestamp_us[is_logged],
-            position_m[is_logged],
-            reported_sigma_m,
-            body_to_ned,
+            arrival_times_us, timestamp_us, position_m, reported_sigma_m, body_to_ned
         )
     return SimulatedPositions(
         topic=topic,
         is_outlier=is_outlier[is_logged],
-        position_m=position_m[is_logged],
+        position_m=position_m,
         velocity_m_s=velocity_m_s,
         measurement_times_s=time_s[is_logged],
         distance_m=float(distance_m[-1]),
@@ -380,12 +359,8 @@ def simulate_correlated_noise(
     scenario: Scenario, faults: FaultSizes, sample_count: int, interval_s: float
 ) -> Array:
     """Simulate time-correlated noise (m), shape (n, 3): a first-order Gauss-Markov process."""
-    noise_m = (
-        make_random_generator(scenario, RandomStream.SLOW_POSITION_ERROR).standard_normal(
-            (sample_count, 3)
-        )
-        * faults.slow_error_m
-    )
+    rng = make_random_generator(scenario, RandomStream.SLOW_POSITION_ERROR)
+    noise_m = rng.standard_normal((sample_count, 3)) * faults.slow_error_m
     decay_factor = np.exp(-interval_s / faults.slow_error_s)
     noise_m[1:] *= np.sqrt(1.0 - decay_factor**2)
     return np.asarray(lfilter([1.0], [1.0, -decay_factor], noise_m, axis=0))
@@ -459,9 +434,8 @@ def _simulate_position_times_us(
     offset_s = faults.clock_offset_s + faults.clock_drift_ppm * 1e-6 * time_s
     timestamp_us = np.rint((time_s + offset_s) * 1e6).astype(np.int64)
     if faults.clock_jump_s:
-        timestamp_us = np.where(
-            time_s < TIMESYNC_CONVERGENCE_TIME_S, arrival_times_us, timestamp_us
-        )
+        is_unsynchronised = time_s < TIMESYNC_CONVERGENCE_TIME_S
+        timestamp_us[is_unsynchronised] = arrival_times_us[is_unsynchronised]
     return arrival_times_us, timestamp_us
 
 

@@ -17,7 +17,6 @@ from px4fuse.readers import ULOG_MAGIC
 _ULOG_VERSION = b"\x01"
 # ULog names of numpy types; names of integer types end in "_t"
 _ULOG_TYPES = {"float64": "double", "float32": "float", "bool": "bool"}
-_FLAG_BITS_MESSAGE = bytes(40)
 # Fields of each topic, with types and default values
 FIELD_DEFINITIONS_BY_TOPIC = read_toml(__file__, dict[str, str], "topics.toml")
 
@@ -79,32 +78,24 @@ def encode_ulog(
     content = [
         ULOG_MAGIC + _ULOG_VERSION,
         struct.pack("<Q", start_us),
-        _pack_message("B", _FLAG_BITS_MESSAGE),
+        _pack_message("B", bytes(40)),  # flag bits
     ]
-    format_texts = dict.fromkeys(_make_format_definition(topic) for topic in topics)
+    format_texts = dict.fromkeys(map(_make_format_definition, topics))
     content += [_pack_message("F", format_text.encode()) for format_text in format_texts]
     for name, info_value in info.items():
         if isinstance(info_value, str):
-            info_bytes = info_value.encode()
-            content.append(_pack_keyed_message("I", f"char[{len(info_bytes)}] {name}", info_bytes))
+            ulog_type, value_bytes = f"char[{len(info_value.encode())}]", info_value.encode()
         else:
-            content.append(
-                _pack_keyed_message("I", f"uint32_t {name}", struct.pack("<I", info_value))
-            )
-    for name, parameter_value in parameters.items():
-        ulog_type, struct_code = (
-            ("int32_t", "<i") if isinstance(parameter_value, int) else ("float", "<f")
-        )
-        content.append(
-            _pack_keyed_message(
-                "P", f"{ulog_type} {name}", struct.pack(struct_code, parameter_value)
-            )
-        )
+            ulog_type, value_bytes = "uint32_t", struct.pack("<I", info_value)
+        content.append(_pack_keyed_message("I", f"{ulog_type} {name}", value_bytes))
+    for name, value in parameters.items():
+        ulog_type, struct_code = ("int32_t", "<i") if isinstance(value, int) else ("float", "<f")
+        value_bytes = struct.pack(struct_code, value)
+        content.append(_pack_keyed_message("P", f"{ulog_type} {name}", value_bytes))
     data_messages: list[bytes] = []
     for topic_id, topic in enumerate(topics):
-        content.append(
-            _pack_message("A", struct.pack("<BH", topic.instance, topic_id) + topic.name.encode())
-        )
+        subscription = struct.pack("<BH", topic.instance, topic_id) + topic.name.encode()
+        content.append(_pack_message("A", subscription))
         data_messages += _encode_data_messages(topic, topic_id)
     timestamps_us = [np.maximum.accumulate(topic.fields["timestamp"]) for topic in topics]
     content += [
@@ -132,23 +123,16 @@ def _make_format_definition(topic: Topic) -> str:
 
 
 def _encode_data_messages(topic: Topic, topic_id: int) -> list[bytes]:
-    header_fields = [("size", "<u2"), ("kind", "u1"), ("number", "<u2")]
-    topic_fields = [
+    topic_fields = (
         (name, values.dtype.newbyteorder("<"), values.shape[1:])
         for name, values in topic.fields.items()
-    ]
-    # the underscore avoids conflicts of header names with PX4 fields
-    dtype = np.dtype(
-        [(f"_{name}", message_type) for name, message_type in header_fields] + topic_fields
     )
+    # the underscore avoids conflicts of header names with PX4 fields
+    dtype = np.dtype([("_size", "<u2"), ("_kind", "u1"), ("_number", "<u2"), *topic_fields])
     records = np.zeros(len(topic.fields["timestamp"]), dtype)
     records["_size"] = dtype.itemsize - 3  # the size excludes 3 bytes: size and message type
     records["_kind"] = ord("D")
     records["_number"] = topic_id
     for name, values in topic.fields.items():
         records[name] = values
-    message_bytes, message_size = records.tobytes(), dtype.itemsize
-    return [
-        message_bytes[start : start + message_size]
-        for start in range(0, len(message_bytes), message_size)
-    ]
+    return [record.tobytes() for record in records]

@@ -22,10 +22,17 @@ import numpy as np
 from px4fuse.ekf2.model import Ekf2Model, prepare_ekf2_model, replay_with_settings
 from px4fuse.ekf2.replay import Agreement
 from px4fuse.ekf2.steps import (
+    ACCELEROMETER_BIAS_PROPERTY,
+    ATTITUDE_PROPERTY,
     FLOW_PROPERTY,
     GNSS_VELOCITY_PROPERTY,
     MAGNETOMETER_PROPERTY,
-    REPLACED_PROPERTIES,
+    MEASUREMENT_NOISE_PROPERTY,
+    OUTPUT_PREDICTOR_PROPERTY,
+    PROCESS_NOISE_PROPERTY,
+    REJECTION_PROPERTY,
+    SAMPLE_TIMES_PROPERTY,
+    TIMESTAMPS_PROPERTY,
     explain_difference_by_replacements,
 )
 from px4fuse.ekf2.whatif import Ekf2Statistics, WhatIf, what_if
@@ -99,11 +106,17 @@ def waterfalls(models: dict[str, Ekf2Model]) -> dict[str, float]:
     """
     unexplained = {}
     steps = (
-        *REPLACED_PROPERTIES[:-2],
+        SAMPLE_TIMES_PROPERTY,
+        TIMESTAMPS_PROPERTY,
+        MEASUREMENT_NOISE_PROPERTY,
+        ACCELEROMETER_BIAS_PROPERTY,
+        PROCESS_NOISE_PROPERTY,
+        ATTITUDE_PROPERTY,
         MAGNETOMETER_PROPERTY,
         GNSS_VELOCITY_PROPERTY,
         FLOW_PROPERTY,
-        *REPLACED_PROPERTIES[-2:],
+        REJECTION_PROPERTY,
+        OUTPUT_PREDICTOR_PROPERTY,
     )
     print("\nwhy EKF2 differs | total rms m | " + " | ".join(steps) + " | left")
     for name, model in models.items():
