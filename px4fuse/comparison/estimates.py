@@ -23,7 +23,6 @@ from px4fuse.filter.correlated_noise import (
     fit_time_correlation,
     fit_time_correlation_to_truth,
 )
-from px4fuse.filter.fitting import NoiseParameters
 from px4fuse.filter.frame_rotation import HeadingError, estimate_heading_error
 from px4fuse.filter.hypotheses import (
     OUTLIER_RETEST_DURATION_AFTER_JUMP_S,
@@ -31,6 +30,7 @@ from px4fuse.filter.hypotheses import (
     fit_systematic_errors,
 )
 from px4fuse.filter.imu_motion import MAX_IMU_INTERVAL_S, MotionCache
+from px4fuse.filter.marginal_likelihood import NoiseParameters
 from px4fuse.filter.signals import AISLE, Axis
 from px4fuse.filter.time_offset import (
     MAX_OFFSET_INTERVAL_HALF_WIDTH_S,

@@ -14,13 +14,15 @@ from scipy.special import chdtrc
 
 from px4fuse.core.arrays import Array, compute_median_interval_s
 from px4fuse.core.record import NotNegative, Record, Share
-from px4fuse.filter.fitting import NoiseParameters, fit_constant_errors, maximise_likelihood
+from px4fuse.filter.fitting import maximise_likelihood
 from px4fuse.filter.imu_motion import (
+    HEADING_ERROR_INDEX,
     MAX_IMU_INTERVAL_S,
     MIN_SEGMENT_MEASUREMENTS,
     MotionCache,
     compute_imu_motion,
 )
+from px4fuse.filter.marginal_likelihood import NoiseParameters, fit_constant_errors
 from px4fuse.filter.settings import Settings
 from px4fuse.filter.signals import Segment, cut_to_segment, report_too_few_measurements
 from px4fuse.flight.model import Columns, Flight, PositionTrack, Unavailable
@@ -53,7 +55,6 @@ MAX_HEADING_CHANGE_AT_CONVERGENCE_RAD = 0.01
 HEADING_SIGMA_RAD = 1.0
 # Minimum estimated scale factor of the positions, to avoid a division by zero
 MIN_FITTED_SCALE_FACTOR = 0.1
-HEADING_ERROR_INDEX = 2
 
 
 class HeadingPart(Record):
@@ -294,24 +295,22 @@ def _estimate_heading_error_from_positions(
         positions = motion.make_positions_at_offset(0.0)
         # Noise of the IMU motion would bias the heading error to zero, so the smooth path is used
         for increments in (positions.delta_position_m, positions.delta_velocity_m_s):
-            north_m, east_m = increments[:, :, -1]
-            increments[:, :, HEADING_ERROR_INDEX] = -east_m, north_m
+            north_m, east_m = increments[:, -1]
+            increments[:, HEADING_ERROR_INDEX] = -east_m, north_m
         noise_parameters = maximise_likelihood(
             [positions], noise_parameters, motion.measurement_weights, fits_outliers=False
         ).noise_parameters
-        position_fit = fit_constant_errors(
-            [positions], noise_parameters, motion.measurement_weights
+        constant_errors, covariances = (
+            values[is_part_long_enough]
+            for values in fit_constant_errors(
+                positions, noise_parameters, motion.measurement_weights
+            ).estimate_constants()
         )
-        constant_errors = position_fit.estimate_segment_constants()[is_part_long_enough, 0]
-        constant_errors_covariance = np.linalg.inv(position_fit.compute_constants_information())[
-            is_part_long_enough, 0
-        ]
         # The fitted angle contains the scale factor of the positions
         position_scale = np.maximum(1.0 + constant_errors[:, -1], MIN_FITTED_SCALE_FACTOR)
         error_rad = constant_errors[:, HEADING_ERROR_INDEX] / position_scale
         heading_variance_rad2 = (
-            constant_errors_covariance[:, HEADING_ERROR_INDEX, HEADING_ERROR_INDEX]
-            / position_scale**2
+            covariances[:, HEADING_ERROR_INDEX, HEADING_ERROR_INDEX] / position_scale**2
         )
         correction_rad, weight_sum = np.average(
             error_rad, weights=1.0 / heading_variance_rad2, returned=True

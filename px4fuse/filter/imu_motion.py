@@ -13,7 +13,7 @@ motion would bias the scale (errors in variables, Fuller 1987).
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -23,8 +23,13 @@ from scipy.spatial.transform import Rotation, Slerp
 
 from px4fuse.core.arrays import Array, IntArray, integrate_cumulatively
 from px4fuse.core.record import Span
-from px4fuse.filter.fitting import NoiseParameters, fit_with_sigma_ratios
-from px4fuse.filter.marginal_likelihood import PositionsAndIncrements, subtract_smooth_path
+from px4fuse.filter.marginal_likelihood import (
+    NoiseParameters,
+    PositionFit,
+    PositionsAndIncrements,
+    fit_constant_errors,
+    subtract_smooth_path,
+)
 from px4fuse.filter.model import compute_continuous_process_noise_per_density
 from px4fuse.filter.signals import find_imu_gaps
 from px4fuse.flight.model import Columns, Flight, Unavailable, rows_between
@@ -40,6 +45,8 @@ from px4fuse.trajectory.rotation import (
 
 # Prior σ (rad) of the errors of tilt and heading at the start of a segment
 HEADING_SIGMA_RAD = 0.05
+# Index of the heading error in the constant errors of a segment
+HEADING_ERROR_INDEX = 2
 # Prior σ: initial attitude (rad), gyro bias (rad/s), accelerometer bias (m/s²), scale (1)
 PRIOR_SIGMAS_OF_SEGMENT_CONSTANTS = np.repeat([HEADING_SIGMA_RAD, 0.004, 0.3, 0.1], [3, 3, 3, 1])
 # A larger gyro bias (rad/s) is subtracted before the fit: 5 σ of its prior
@@ -50,10 +57,11 @@ MAX_REMOVED_GYRO_BIAS_RAD_S = 0.4
 MAX_SEGMENT_DURATION_S = 30.0
 # Maximum tested time offset (s) between position source and IMU
 MAX_TESTED_TIME_OFFSET_S = 0.6
-COARSE_OFFSET_COUNT = 25
+# Time offsets (s) in a coarse search
+COARSE_TIME_OFFSETS_S = np.linspace(
+    -MAX_TESTED_TIME_OFFSET_S, MAX_TESTED_TIME_OFFSET_S, 25
+).tolist()
 COARSE_MEASUREMENT_COUNT = 600
-# Maximum number of array elements at once, to limit the memory
-MAX_BATCH_ELEMENTS = 2**16
 # Minimum number of position measurements in all segments together
 MIN_TOTAL_MEASUREMENTS = 30
 MIN_SEGMENT_MEASUREMENTS = 15
@@ -152,120 +160,76 @@ class PositionsAndImuMotion:
             ),
         )
 
-    def make_positions_and_increments(self, time_offsets_s: Array) -> PositionsAndIncrements:
-        """Return the positions, and for each time offset the IMU increments Δp and Δv between them.
+    def make_positions_at_offset(
+        self, offset_s: float, *, estimates_scale: bool = True
+    ) -> PositionsAndIncrements:
+        """Return the positions, and the IMU increments Δp and Δv for one time offset.
 
-        The scale factor of the positions cannot be estimated from the result.
+        With ``estimates_scale``, the scale factor of the positions can be estimated.
         """
         interval_s = np.diff(self.time_s)
         process_noise_per_sigma_a_squared = self.dt_s * np.stack(
             compute_continuous_process_noise_per_density(interval_s)
         )
-        prior_precision = np.zeros((len(self.time_s), 2))
-        prior_precision[self.segment_edges[:-1]] = INITIAL_STATE_PRIOR_PRECISIONS
-        column_count = 1 + len(PRIOR_SIGMAS_OF_SEGMENT_CONSTANTS)
+        constant_prior_sigmas = PRIOR_SIGMAS_OF_SEGMENT_CONSTANTS.copy()
+        constant_prior_sigmas[HEADING_ERROR_INDEX] = self.heading_sigma_rad
         dp, dv = np.zeros(
-            (2, len(self.directions), len(time_offsets_s), column_count, len(interval_s))
+            (2, len(self.directions), 1 + len(constant_prior_sigmas), len(interval_s))
         )
         for begin, end, segment_motion in zip(
             self.segment_edges, self.segment_edges[1:], self.segment_motions, strict=False
         ):
             measurement_time_s = self.time_s[begin:end]
-            # Shape (axes, time offsets, 1 + constants, times): the motion, then its derivatives
+            # Shape (axes, 1 + constants, times): the motion, then its derivatives
             position, velocity = (
-                np.moveaxis(self.directions @ signal, (2, 0, 3, 1), range(4))
-                for signal in segment_motion.interpolate(
-                    measurement_time_s + time_offsets_s[:, None]
-                )
+                np.moveaxis(self.directions @ signal, 0, 2)
+                for signal in segment_motion.interpolate(measurement_time_s + offset_s)
             )
-            interval_rows = np.s_[:, :, :-1, begin : end - 1]
+            # The last constant is the scale factor
+            interval_rows = np.s_[:, :-1, begin : end - 1]
             dv[interval_rows] = np.diff(velocity)
             dp[interval_rows] = np.diff(position) - velocity[..., :-1] * np.diff(measurement_time_s)
-        return PositionsAndIncrements(
+        positions = PositionsAndIncrements(
             measurement_m=self.measurement_m,
             segment_starts=self.segment_edges[:-1],
             interval_s=interval_s,
             process_noise_per_sigma_a_squared=process_noise_per_sigma_a_squared,
             process_noise_independent_of_sigma_a=np.zeros_like(process_noise_per_sigma_a_squared),
-            prior_precision=prior_precision,
-            constant_prior_sigmas=np.r_[
-                PRIOR_SIGMAS_OF_SEGMENT_CONSTANTS[:2],
-                self.heading_sigma_rad,
-                PRIOR_SIGMAS_OF_SEGMENT_CONSTANTS[3:],
-            ],
+            initial_state_precision=INITIAL_STATE_PRIOR_PRECISIONS,
+            is_initial_state_known=False,
+            constant_prior_sigmas=constant_prior_sigmas,
             delta_position_m=dp,
             delta_velocity_m_s=dv,
         )
+        return subtract_smooth_path(positions) if estimates_scale else positions
 
-    def make_positions_at_offset(self, offset_s: float) -> PositionsAndIncrements:
-        """Return the positions, and the IMU increments Δp and Δv for one time offset.
-
-        The scale factor of the positions can be estimated from the result.
-        """
-        return next(self.make_position_batches(np.array([offset_s])))
-
-    def make_position_batches(
-        self, time_offsets_s: Array, *, estimates_scale: bool = True
-    ) -> Iterator[PositionsAndIncrements]:
-        """Yield positions and IMU increments for batches of time offsets.
-
-        With ``estimates_scale``, the scale factor of the positions can be estimated.
-        """
-        values_per_offset = (
-            len(self.time_s) * len(self.directions) * (1 + len(PRIOR_SIGMAS_OF_SEGMENT_CONSTANTS))
+    def fit_at_offset(self, offset_s: float, noise_parameters: NoiseParameters) -> PositionFit:
+        """Fit the constant errors with given time offset and noises."""
+        return fit_constant_errors(
+            self.make_positions_at_offset(offset_s), noise_parameters, self.measurement_weights
         )
-        batch_size = max(1, MAX_BATCH_ELEMENTS // values_per_offset)
-        for batch in np.split(time_offsets_s, range(batch_size, len(time_offsets_s), batch_size)):
-            positions = self.make_positions_and_increments(batch)
-            yield (
-                subtract_smooth_path(positions, estimates_scale=True)
-                if estimates_scale
-                else positions
-            )
 
-    def search_offset(
+    def search_grid(
         self,
-        noise_parameters: NoiseParameters,
-        sigma_a_factors: Sequence[float] = (1.0,),
+        candidate_parameters: Sequence[NoiseParameters],
+        time_offsets_s: Sequence[float] = COARSE_TIME_OFFSETS_S,
+        sigma_factors: Sequence[float] = (1.0,),
         *,
         estimates_scale: bool = True,
-    ) -> tuple[float, NoiseParameters]:
-        """Return the time offset and SIGMA_A with the maximum likelihood on a coarse grid.
+    ) -> tuple[float, float, NoiseParameters]:
+        """Return the lowest score (-ln p), and its time offset (s) and noises.
 
-        ``sigma_a_factors`` are the tested multiples of SIGMA_A.
+        ``sigma_factors`` are factors on all σ of the candidates.
         """
-        tested_offsets_s = np.linspace(
-            -MAX_TESTED_TIME_OFFSET_S, MAX_TESTED_TIME_OFFSET_S, COARSE_OFFSET_COUNT
-        )
-        sigma_z_m = noise_parameters.sigma_z_m
-        sigma_a_to_sigma_z_ratios = [
-            sigma_a_factor * noise_parameters.sigma_a_m_s2 / sigma_z_m
-            for sigma_a_factor in sigma_a_factors
-        ]
-        coarse_motion = self.downsample(COARSE_MEASUREMENT_COUNT)
-        position_batches = coarse_motion.make_position_batches(
-            tested_offsets_s, estimates_scale=estimates_scale
-        )
-        fits_by_sigma_ratio = fit_with_sigma_ratios(
-            position_batches,
-            sigma_a_to_sigma_z_ratios,
-            noise_parameters.random_walk_m / sigma_z_m,
-            coarse_motion.measurement_weights,
-            sigma_z_m,
-        )
-        minus_log_likelihood = np.stack(
-            [
-                ratio_fit.scale_sigmas(sigma_z_m).compute_scores()[0]
-                for ratio_fit in fits_by_sigma_ratio
-            ]
-        )
-        factor_index, offset_index = np.unravel_index(
-            np.argmin(minus_log_likelihood), minus_log_likelihood.shape
-        )
-        return float(tested_offsets_s[offset_index]), replace(
-            noise_parameters,
-            sigma_a_m_s2=noise_parameters.sigma_a_m_s2 * sigma_a_factors[int(factor_index)],
-        )
+        scored_candidates = []
+        for offset_s in time_offsets_s:
+            positions = self.make_positions_at_offset(offset_s, estimates_scale=estimates_scale)
+            for candidate in candidate_parameters:
+                position_fit = fit_constant_errors(positions, candidate, self.measurement_weights)
+                for factor in sigma_factors:
+                    score = position_fit.compute_score(factor)
+                    scored_candidates.append((score, offset_s, candidate.multiply_sigmas(factor)))
+        return min(scored_candidates, key=lambda scored: scored[0])
 
 
 def compute_imu_motion(
@@ -415,19 +379,9 @@ def make_segment_motion(
     attitude_error_by_unit_gyro_bias = -INTEGRATION_STEP_S * (
         np.cumsum(body_to_ned, axis=0) - body_to_ned / 2.0
     )
-    for axis in range(3):
-        second_axis = (axis + 1) % 3
-        third_axis = (axis + 2) % 3
-        acceleration[:, second_axis, 1 + axis] = -specific_force_ned_m_s2[:, third_axis]
-        acceleration[:, third_axis, 1 + axis] = specific_force_ned_m_s2[:, second_axis]
-        acceleration[:, axis, 4:7] = (
-            attitude_error_by_unit_gyro_bias[:, second_axis]
-            * specific_force_ned_m_s2[:, [third_axis]]
-        )
-        acceleration[:, axis, 4:7] -= (
-            attitude_error_by_unit_gyro_bias[:, third_axis]
-            * specific_force_ned_m_s2[:, [second_axis]]
-        )
+    specific_force = specific_force_ned_m_s2[:, :, None]
+    acceleration[:, :, 1:4] = np.cross(np.eye(3)[None], specific_force, axis=1)
+    acceleration[:, :, 4:7] = np.cross(attitude_error_by_unit_gyro_bias, specific_force, axis=1)
     acceleration[:, :, 7:10] = -body_to_ned
     np.cumsum(acceleration[:-1] * INTEGRATION_STEP_S, axis=0, out=velocity[1:])
     mean_velocity_in_step = velocity[:-1] + acceleration[:-1] * (INTEGRATION_STEP_S / 2.0)

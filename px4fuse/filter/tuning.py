@@ -6,12 +6,14 @@ no states for biases and tilt, so its SIGMA_A includes them.
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable
 from dataclasses import replace
+from functools import cache
 from typing import Any
 
 import numpy as np
-from scipy.optimize import minimize_scalar
+from scipy.optimize import brentq, minimize_scalar
 
 from px4fuse.core.arrays import Array, BoolArray
 from px4fuse.core.record import NOT_WRITTEN, Count, NotNegative, NotWritten, OrUnavailable, Record
@@ -20,18 +22,18 @@ from px4fuse.filter.fitting import (
     SIGMA_A_SEARCH_RANGE_M_S2,
     SIGMA_Z_SEARCH_RANGE_M,
     NoiseFit,
-    NoiseParameters,
     convert_to_positions_and_increments,
     estimate_outlier_probability,
     maximise_likelihood,
 )
-from px4fuse.filter.imu_motion import MotionCache, compute_imu_motion
+from px4fuse.filter.imu_motion import COARSE_MEASUREMENT_COUNT, MotionCache, compute_imu_motion
 from px4fuse.filter.likelihood import (
+    MAX_LOG_LIKELIHOOD_DROP,
     PreintegratedMotion,
-    find_profile_likelihood_interval,
     innovations,
     preintegrate,
 )
+from px4fuse.filter.marginal_likelihood import NoiseParameters
 from px4fuse.filter.settings import Settings
 from px4fuse.filter.signals import Axis, make_downsampling_slice, report_too_few_measurements
 from px4fuse.flight.model import Flight, Unavailable
@@ -46,6 +48,12 @@ START_SIGMA_A_FACTORS = (0.1, 0.3, 1.0)
 START_RANDOM_WALK_M = 0.02
 # Estimates within this factor of an end of the search range are reported as bounds only
 SEARCH_RANGE_END_TOLERANCE_FACTOR = 1.001
+# Initial step of ln σ in the search for an end of the 95 % interval
+INITIAL_LOG_SIGMA_SEARCH_STEP = 0.05
+# Maximum change of ln SIGMA_Z between two tested values of SIGMA_A, or vice versa
+MAX_OTHER_LOG_SIGMA_CHANGE = 1.0
+# Tolerance of ln σ in the search for the best SIGMA_Z with given SIGMA_A, or vice versa
+OTHER_LOG_SIGMA_TOLERANCE = 2e-3
 
 
 class NoiseEstimate(Record):
@@ -185,7 +193,7 @@ def tune(
         if names is None or name in names:
             progress(name)
             try:
-                tunings[name] = tune_axes(
+                tunings[name] = _tune_axes(
                     name, group_axes, settings, flight, may_drift, motion_cache
                 )
             except np.linalg.LinAlgError as error:
@@ -198,13 +206,13 @@ def tune(
     return tunings
 
 
-def tune_axes(
+def _tune_axes(
     name: str,
     axes: tuple[Axis, ...],
     settings: Settings,
-    flight: Flight | None = None,
-    may_drift: bool = False,
-    motion_cache: MotionCache | None = None,
+    flight: Flight | None,
+    may_drift: bool,
+    motion_cache: MotionCache,
 ) -> AxisTuning | Unavailable:
     """Estimate the noises of several axes with equal measurement times.
 
@@ -246,8 +254,14 @@ def tune_axes(
                 kf_fit.noise_parameters, random_walk_m=START_RANDOM_WALK_M if may_drift else 0.0
             )
             # An approximate time offset is sufficient: it hardly changes the noises
-            offset_s, start_parameters = imu_motion.search_offset(
-                start_parameters, START_SIGMA_A_FACTORS, estimates_scale=False
+            _, offset_s, start_parameters = imu_motion.downsample(
+                COARSE_MEASUREMENT_COUNT
+            ).search_grid(
+                [
+                    replace(start_parameters, sigma_a_m_s2=factor * start_parameters.sigma_a_m_s2)
+                    for factor in START_SIGMA_A_FACTORS
+                ],
+                estimates_scale=False,
             )
             imu_motion_fit = maximise_likelihood(
                 [imu_motion.make_positions_at_offset(offset_s)],
@@ -276,7 +290,14 @@ def tune_axes(
             "estimate SIGMA_Z",
             "Reduce the outliers of the positioning system.",
         )
-    sigma_a, sigma_z = (_estimate_noise(best_fit, noise_index) for noise_index in (0, 1))
+    sigma_a = estimate_noise(best_fit, "sigma_a_m_s2", "sigma_z_m", SIGMA_A_SEARCH_RANGE_M_S2)
+    sigma_z = estimate_noise(
+        best_fit,
+        "sigma_z_m",
+        "sigma_a_m_s2",
+        SIGMA_Z_SEARCH_RANGE_M,
+        best_fit.log_sigma_z_variance_factor,
+    )
     final_sigma_z_m = sigma_z.value or sigma_z.high or best_fit.noise_parameters.sigma_z_m
     kf_sigma_a = (
         sigma_a if imu_motion_fit is None else _estimate_kf_sigma_a(kf_fit, final_sigma_z_m)
@@ -305,57 +326,109 @@ def tune_axes(
     )
 
 
-def _estimate_noise(fit: NoiseFit, noise_index: int) -> NoiseEstimate:
-    """Return SIGMA_A (``noise_index`` 0) or SIGMA_Z (1) of a fit with its 95 % interval."""
-    best_parameters = fit.noise_parameters.sigma_a_m_s2, fit.noise_parameters.sigma_z_m
-
-    def score(log_sigma: float, log_other_sigma: float) -> float:
-        log_parameters = (
-            (log_sigma, log_other_sigma) if noise_index == 0 else (log_other_sigma, log_sigma)
-        )
-        sigma_a, sigma_z = np.exp(log_parameters).tolist()
-        return fit.score(NoiseParameters(sigma_a, sigma_z, fit.noise_parameters.random_walk_m))
-
-    search_range = (SIGMA_A_SEARCH_RANGE_M_S2, SIGMA_Z_SEARCH_RANGE_M)[noise_index]
-    variance_factor = (1.0, fit.log_sigma_z_variance_factor)[noise_index]
-    return _make_noise_estimate(
-        score,
-        (np.log(best_parameters[noise_index]), np.log(best_parameters[1 - noise_index])),
-        search_range,
-        variance_factor,
-    )
-
-
-def _estimate_kf_sigma_a(fit: NoiseFit, sigma_z_m: float) -> NoiseEstimate:
-    def score(log_sigma_a: float, _: float = 0.0) -> float:
-        return fit.score(NoiseParameters(float(np.exp(log_sigma_a)), sigma_z_m))
-
-    low_log_sigma, high_log_sigma = np.log(SIGMA_A_SEARCH_RANGE_M_S2)
-    best_log_sigma_a = float(
-        minimize_scalar(score, bounds=(low_log_sigma, high_log_sigma), options={"xatol": 1e-3}).x
-    )
-    return _make_noise_estimate(score, (best_log_sigma_a, 0.0), SIGMA_A_SEARCH_RANGE_M_S2)
-
-
-def _make_noise_estimate(
-    score: Callable[[float, float], float],
-    best_log_sigmas: tuple[float, float],
+def estimate_noise(
+    fit: NoiseFit,
+    name: str,
+    other_name: str,
     search_range: tuple[float, float],
     variance_factor: float = 1.0,
 ) -> NoiseEstimate:
-    estimate = float(np.exp(best_log_sigmas[0]))
-    interval_low, interval_high = find_profile_likelihood_interval(
-        score, best_log_sigmas, search_range, variance_factor
-    )
+    """Return SIGMA_A or SIGMA_Z of a fit; its 95 % interval has the best value of the other."""
+    best_value = getattr(fit.noise_parameters, name)
+
+    def find_end(search_limit: float) -> float | None:
+        other_log_sigma = math.log(getattr(fit.noise_parameters, other_name))
+
+        def score_with_best_other_noise(log_sigma: float) -> float:
+            nonlocal other_log_sigma
+            best_other_noise = minimize_scalar(
+                lambda tested_log_sigma: fit.score(
+                    replace(
+                        fit.noise_parameters,
+                        **{name: math.exp(log_sigma), other_name: math.exp(tested_log_sigma)},
+                    )
+                ),
+                bounds=(
+                    other_log_sigma - MAX_OTHER_LOG_SIGMA_CHANGE,
+                    other_log_sigma + MAX_OTHER_LOG_SIGMA_CHANGE,
+                ),
+                options={"xatol": OTHER_LOG_SIGMA_TOLERANCE},
+            )
+            other_log_sigma = best_other_noise.x
+            return float(best_other_noise.fun)
+
+        return find_interval_end(
+            score_with_best_other_noise,
+            (math.log(best_value), fit.lowest_score),
+            math.log(search_limit),
+            variance_factor,
+        )
+
+    low, high = map(find_end, search_range)
+    return _make_noise_estimate(best_value, low, high, search_range)
+
+
+def _estimate_kf_sigma_a(fit: NoiseFit, sigma_z_m: float) -> NoiseEstimate:
+    def score(log_sigma_a: float) -> float:
+        return fit.score(NoiseParameters(math.exp(log_sigma_a), sigma_z_m))
+
+    log_limits = np.log(SIGMA_A_SEARCH_RANGE_M_S2).tolist()
+    best = minimize_scalar(score, bounds=log_limits, options={"xatol": 1e-3})
+    low, high = (find_interval_end(score, (best.x, best.fun), limit) for limit in log_limits)
+    return _make_noise_estimate(math.exp(best.x), low, high, SIGMA_A_SEARCH_RANGE_M_S2)
+
+
+def _make_noise_estimate(
+    estimate: float, low: float | None, high: float | None, search_range: tuple[float, float]
+) -> NoiseEstimate:
     is_inside = (
         search_range[0] * SEARCH_RANGE_END_TOLERANCE_FACTOR
         < estimate
         < search_range[1] / SEARCH_RANGE_END_TOLERANCE_FACTOR
     )
-    has_both_ends = interval_low is not None and interval_high is not None
-    return NoiseEstimate(
-        estimate if is_inside and has_both_ends else None, interval_low, interval_high
+    has_both_ends = low is not None and high is not None
+    return NoiseEstimate(estimate if is_inside and has_both_ends else None, low, high)
+
+
+def find_interval_end(
+    score: Callable[[float], float],
+    minimum: tuple[float, float],
+    search_limit: float,
+    variance_factor: float = 1.0,
+) -> float | None:
+    """Find one end of the 95 % likelihood interval of a noise; None if beyond the search limit.
+
+    Parameters
+    ----------
+    score : callable
+        -ln p as a function of the logarithm of the noise.
+    minimum : (float, float)
+        Logarithm of the noise with the lowest score, and this score.
+    search_limit : float
+        Limit of the logarithm of the noise, in the direction of the end.
+    variance_factor : float
+        Factor on the variance, for uncertainty that ``score`` omits.
+    """
+    best_log_sigma, best_score = minimum
+    max_sqrt_log_likelihood_drop = math.sqrt(MAX_LOG_LIKELIHOOD_DROP * variance_factor)
+
+    # √(decrease of the log-likelihood) is nearly linear in ln σ, so brentq needs few steps
+    @cache
+    def compute_log_likelihood_drop_excess(log_sigma_change: float) -> float:
+        drop = score(best_log_sigma + log_sigma_change) - best_score if log_sigma_change else 0.0
+        return math.sqrt(max(drop, 0.0)) - max_sqrt_log_likelihood_drop
+
+    max_change = search_limit - best_log_sigma
+    step = math.copysign(INITIAL_LOG_SIGMA_SEARCH_STEP, max_change)
+    tested_change = min(step, max_change, key=abs)
+    while compute_log_likelihood_drop_excess(tested_change) < 0.0:
+        if tested_change == max_change:
+            return None
+        tested_change = min(2.0 * tested_change, max_change, key=abs)
+    log_sigma_change = brentq(
+        compute_log_likelihood_drop_excess, 0.0, tested_change, xtol=1e-3 * abs(tested_change)
     )
+    return math.exp(best_log_sigma + log_sigma_change)
 
 
 def _assess_kf_consistency(
@@ -382,7 +455,7 @@ def _test_noises_on_second_half(
         )
     # One more position than measurements, because the first position is KF's initial state
     first_half_positions = [
-        positions.first(1 + first_half_count) for positions in fit.score.axis_positions
+        positions.first(1 + first_half_count) for positions in fit.axis_positions
     ]
     first_half_fit = maximise_likelihood(
         first_half_positions,
