@@ -365,7 +365,7 @@ def _rerun_kf(
         measurement_time_s=time_s[is_used] + shift_s,
         measurement_m=axis.measurement_m[is_used],
     )
-    kf_run, ekf2_state = replay(axis, changed_settings, fast=True), axis_result.ekf2_state
+    kf_run, ekf2_state = replay(axis, changed_settings), axis_result.ekf2_state
     return _summarise_run(
         kf_run.updates["innovation_m"].to_numpy(),
         kf_run.updates["innovation_variance_m2"].to_numpy(),
