@@ -45,7 +45,8 @@ def plain_replay(axis: Axis, chosen: Settings) -> tuple[list[list[float]], list[
     z_at = dict(zip(measured, axis.measurement_m.tolist(), strict=True))
     steps = steps_of(measured, chosen.dt_s)
     if chosen.input == "imu":
-        imu = axis.acceleration.time_s, axis.acceleration.compute_velocity_change_m_s()
+        velocity = axis.acceleration.compute_velocity_change_m_s(axis.direction)
+        imu = axis.acceleration.time_s, velocity
     q, r = chosen.sigma_a_m_s2**2 * chosen.dt_s, chosen.sigma_z_m**2
     x = [z_at[measured[0]], 0.0]
     P = [[0.5**2, 0.0], [0.0, 1.0**2]]

@@ -63,7 +63,7 @@ from px4fuse.filter.signals import (
     Acceleration,
     compute_ned_acceleration,
     cut_to_segment,
-    project_acceleration,
+    integrate_ned_acceleration,
     weighted_sum,
 )
 from px4fuse.filter.tuning import HORIZONTAL
@@ -353,7 +353,7 @@ def _rerun_kf(
             rotated_axis = replace(axis, direction=rotated_direction)
             truth = project_truth(comparison.flight.truth, rotated_axis, segment)
     if FORWARD_BIAS_KEY in change:
-        acceleration = _remove_accelerometer_bias(comparison, change, axis.direction)
+        acceleration = _remove_accelerometer_bias(comparison, change)
         axis = replace(axis, acceleration=acceleration)
     time_s, axis_tuning = axis.measurement_time_s, find_axis_tuning(tuning, axis.name)
     is_used = np.ones(len(time_s), dtype=bool)
@@ -377,7 +377,7 @@ def _rerun_kf(
 
 
 def _remove_accelerometer_bias(
-    comparison: Comparison, change: Change, direction: Array
+    comparison: Comparison, change: Change
 ) -> Acceleration | Unavailable:
     flight, imu = comparison.flight, comparison.flight.imu
     if isinstance(imu, Unavailable):
@@ -386,7 +386,7 @@ def _remove_accelerometer_bias(
         [change[FORWARD_BIAS_KEY], change[RIGHT_BIAS_KEY], 0.0], Columns.SPECIFIC_FORCE
     )
     flight = replace(flight, imu=imu.assign(**(imu[Columns.SPECIFIC_FORCE] - accelerometer_bias)))
-    return project_acceleration(compute_ned_acceleration(flight), direction, comparison.segment)
+    return integrate_ned_acceleration(compute_ned_acceleration(flight), comparison.segment)
 
 
 def _replay_ekf2(

@@ -150,12 +150,12 @@ def _make_axis_inputs(
         "z": encoder.add(position_m[is_near_segment]),
     }
     if isinstance(axis.acceleration, Acceleration):
-        acceleration_integral_m_s = axis.acceleration.compute_velocity_change_m_s()[
+        acceleration_integral_m_s = axis.acceleration.compute_velocity_change_m_s(axis.direction)[
             _find_segment_slice(comparison, axis.acceleration)
         ]
         axis_data |= {
             "integral": encoder.add(acceleration_integral_m_s - acceleration_integral_m_s[0]),
-            "rms": axis.acceleration.compute_rms_m_s2(),
+            "rms": axis.acceleration.compute_rms_m_s2(axis.direction),
         }
     return axis_data
 

@@ -19,9 +19,13 @@ from dataclasses import dataclass, replace
 import numpy as np
 import pandas as pd
 from scipy import constants
-from scipy.spatial.transform import Rotation, Slerp
 
-from px4fuse.core.arrays import Array, IntArray, integrate_cumulatively
+from px4fuse.core.arrays import (
+    Array,
+    IntArray,
+    compute_median_interval_s,
+    integrate_cumulatively,
+)
 from px4fuse.core.record import Span
 from px4fuse.filter.marginal_likelihood import (
     NoiseParameters,
@@ -37,6 +41,7 @@ from px4fuse.trajectory.rotation import (
     conjugate,
     cumulative_product,
     from_rotation_vector,
+    interpolate,
     multiply,
     rotate,
     to_matrix,
@@ -265,40 +270,32 @@ def compute_imu_motion(
         return attitude
     motion_cache = {} if motion_cache is None else motion_cache
     segment_motions: list[SegmentMotion] = []
-    imu_time_s = imu.index.to_numpy()
-    attitude_time_s = attitude.index.to_numpy()
     rows_by_segment: list[IntArray] = []
-    for begin_s, end_s in _find_covered_spans(imu_time_s, attitude_time_s):
-        rows_with_imu_data = np.flatnonzero(
-            (time_s >= begin_s + MAX_TESTED_TIME_OFFSET_S)
-            & (time_s <= end_s - MAX_TESTED_TIME_OFFSET_S)
-        )
-        if not len(rows_with_imu_data):
+    imu_time_s, attitude_time_s = imu.index.to_numpy(), attitude.index.to_numpy()
+    imu_interval_s = compute_median_interval_s(imu_time_s) if len(imu_time_s) > 1 else np.inf
+    imu_parts_s = []
+    if imu_interval_s <= MAX_IMU_INTERVAL_S:
+        imu_parts_s = np.split(imu_time_s, np.flatnonzero(find_imu_gaps(imu_time_s)) + 1)
+    for imu_part_s in imu_parts_s:
+        begin_s = max(imu_part_s[0], attitude_time_s[0]) + MAX_TESTED_TIME_OFFSET_S
+        end_s = min(imu_part_s[-1], attitude_time_s[-1]) - MAX_TESTED_TIME_OFFSET_S
+        covered_rows = np.flatnonzero((time_s >= begin_s) & (time_s <= end_s))
+        if not len(covered_rows):
             continue
-        times_with_imu_data_s = time_s[rows_with_imu_data]
-        segment_count = max(
-            1,
-            int(
-                np.ceil(
-                    (times_with_imu_data_s[-1] - times_with_imu_data_s[0]) / max_segment_duration_s
-                )
-            ),
-        )
-        cut_times_s = np.linspace(
-            times_with_imu_data_s[0], times_with_imu_data_s[-1], segment_count + 1
-        )[1:-1]
-        for segment_rows in np.split(
-            rows_with_imu_data, np.searchsorted(times_with_imu_data_s, cut_times_s)
-        ):
-            if len(segment_rows) >= MIN_SEGMENT_MEASUREMENTS:
-                rows_by_segment.append(segment_rows)
-                imu_span_s = (
-                    time_s[segment_rows[0]] - MAX_TESTED_TIME_OFFSET_S,
-                    time_s[segment_rows[-1]] + MAX_TESTED_TIME_OFFSET_S,
-                )
-                if imu_span_s not in motion_cache:
-                    motion_cache[imu_span_s] = make_segment_motion(imu, attitude, imu_span_s)
-                segment_motions.append(motion_cache[imu_span_s])
+        first_s, last_s = time_s[covered_rows[[0, -1]]]
+        segment_count = max(1, int(np.ceil((last_s - first_s) / max_segment_duration_s)))
+        cut_times_s = np.linspace(first_s, last_s, segment_count + 1)[1:-1]
+        for rows in np.split(covered_rows, np.searchsorted(time_s[covered_rows], cut_times_s)):
+            if len(rows) < MIN_SEGMENT_MEASUREMENTS:
+                continue
+            rows_by_segment.append(rows)
+            imu_span_s = (
+                time_s[rows[0]] - MAX_TESTED_TIME_OFFSET_S,
+                time_s[rows[-1]] + MAX_TESTED_TIME_OFFSET_S,
+            )
+            if imu_span_s not in motion_cache:
+                motion_cache[imu_span_s] = make_segment_motion(imu, attitude, imu_span_s)
+            segment_motions.append(motion_cache[imu_span_s])
     used_rows = np.concatenate([np.zeros(0, dtype=np.intp), *rows_by_segment])
     if len(used_rows) < MIN_TOTAL_MEASUREMENTS:
         return Unavailable(
@@ -320,73 +317,59 @@ def compute_imu_motion(
         tuple(segment_motions),
         directions,
         dt_s,
-        float(np.median(np.diff(imu_time_s))),
+        imu_interval_s,
         heading_sigma_rad,
     )
-
-
-def _find_covered_spans(imu_time_s: Array, attitude_time_s: Array) -> list[Span]:
-    """Find time spans (s) without a gap in IMU or attitude; none if the IMU rate is too low."""
-    if len(imu_time_s) < 2 or np.median(np.diff(imu_time_s)) > MAX_IMU_INTERVAL_S:
-        return []
-    gap_indices = np.flatnonzero(find_imu_gaps(imu_time_s))
-    starts_s = np.maximum(imu_time_s[np.r_[0, gap_indices + 1]], attitude_time_s[0])
-    ends_s = np.minimum(imu_time_s[np.r_[gap_indices, len(imu_time_s) - 1]], attitude_time_s[-1])
-    return list(zip(starts_s.tolist(), ends_s.tolist(), strict=True))
 
 
 def make_segment_motion(
     imu: pd.DataFrame, attitude: pd.DataFrame, imu_span_s: Span
 ) -> SegmentMotion:
     """Compute the motion in NED from the IMU, and its derivatives with respect to IMU errors."""
+    imu = rows_between(
+        imu, imu_span_s[0] - 2 * INTEGRATION_STEP_S, imu_span_s[1] + 2 * INTEGRATION_STEP_S
+    )
     imu_time_s = imu.index.to_numpy()
-    first_row, end_row = np.searchsorted(
-        imu_time_s,
-        [imu_span_s[0] - 2 * INTEGRATION_STEP_S, imu_span_s[1] + 2 * INTEGRATION_STEP_S],
-        side="left",
-    )
-    imu_samples = imu.iloc[first_row:end_row]
-    imu_time_s = imu_time_s[first_row:end_row]
-    imu_integral = integrate_cumulatively(
-        imu_samples[[*Columns.SPECIFIC_FORCE, *Columns.ANGULAR_RATE]].to_numpy(), imu_time_s
-    )
     step_times_s = np.arange(imu_time_s[0], imu_time_s[-1], INTEGRATION_STEP_S)
-    imu_integrals_at_steps = np.column_stack(
-        [np.interp(step_times_s, imu_time_s, column) for column in imu_integral.T]
+    specific_force_integral_m_s, gyro_integral_rad = (
+        _interpolate_columns(
+            step_times_s, imu_time_s, integrate_cumulatively(imu[columns].to_numpy(), imu_time_s)
+        )
+        for columns in (Columns.SPECIFIC_FORCE, Columns.ANGULAR_RATE)
     )
-    specific_force_integral_m_s = imu_integrals_at_steps[:, :3]
-    gyro_integral_rad = imu_integrals_at_steps[:, 3:]
-    gyro_integral_rad -= np.outer(
-        step_times_s, _estimate_large_gyro_bias(step_times_s, gyro_integral_rad, attitude)
-    )
-    attitude_quaternion = _integrate_gyros(step_times_s, gyro_integral_rad, attitude)
+    gyro_bias_rad_s = _estimate_large_gyro_bias(step_times_s, gyro_integral_rad, attitude)
+    rotation_rad = np.diff(gyro_integral_rad, axis=0) - INTEGRATION_STEP_S * gyro_bias_rad_s
+    attitude_quaternion = _integrate_gyros(step_times_s[0], rotation_rad, attitude)
     # The mean specific force of each step is rotated by the attitude in the middle of the step
     mean_specific_force_m_s2 = np.diff(specific_force_integral_m_s, axis=0) / INTEGRATION_STEP_S
     body_to_ned = to_matrix(
-        multiply(
-            attitude_quaternion[:-1], from_rotation_vector(np.diff(gyro_integral_rad, axis=0) / 2.0)
-        )
+        multiply(attitude_quaternion[:-1], from_rotation_vector(rotation_rad / 2.0))
     )
-    specific_force_ned_m_s2 = rotate(body_to_ned, mean_specific_force_m_s2)
+    specific_force_ned_m_s2 = rotate(body_to_ned, mean_specific_force_m_s2)[:, :, None]
     motion_and_derivatives = np.zeros(
-        (len(mean_specific_force_m_s2), 2, 3, len(PRIOR_SIGMAS_OF_SEGMENT_CONSTANTS))
+        (len(body_to_ned), 2, 3, len(PRIOR_SIGMAS_OF_SEGMENT_CONSTANTS))
     )
     position, velocity = np.moveaxis(motion_and_derivatives, 1, 0)
     acceleration = np.zeros_like(velocity)
-    acceleration[:, :, 0] = specific_force_ned_m_s2
+    acceleration[:, :, :1] = specific_force_ned_m_s2
     acceleration[:, 2, 0] += constants.g
     # An attitude error θ adds θ × f to the acceleration; a gyro bias b causes θ = -∫ R b dt
     attitude_error_by_unit_gyro_bias = -INTEGRATION_STEP_S * (
         np.cumsum(body_to_ned, axis=0) - body_to_ned / 2.0
     )
-    specific_force = specific_force_ned_m_s2[:, :, None]
-    acceleration[:, :, 1:4] = np.cross(np.eye(3)[None], specific_force, axis=1)
-    acceleration[:, :, 4:7] = np.cross(attitude_error_by_unit_gyro_bias, specific_force, axis=1)
+    acceleration[:, :, 1:4] = np.cross(np.eye(3)[None], specific_force_ned_m_s2, axis=1)
+    acceleration[:, :, 4:7] = np.cross(
+        attitude_error_by_unit_gyro_bias, specific_force_ned_m_s2, axis=1
+    )
     acceleration[:, :, 7:10] = -body_to_ned
-    np.cumsum(acceleration[:-1] * INTEGRATION_STEP_S, axis=0, out=velocity[1:])
-    mean_velocity_in_step = velocity[:-1] + acceleration[:-1] * (INTEGRATION_STEP_S / 2.0)
-    np.cumsum(mean_velocity_in_step * INTEGRATION_STEP_S, axis=0, out=position[1:])
+    increments = INTEGRATION_STEP_S * acceleration[:-1]
+    velocity[1:] = np.cumsum(increments, axis=0)
+    position[1:] = INTEGRATION_STEP_S * np.cumsum(velocity[:-1] + increments / 2.0, axis=0)
     return SegmentMotion(step_times_s[:-1], motion_and_derivatives)
+
+
+def _interpolate_columns(times_s: Array, known_times_s: Array, columns: Array) -> Array:
+    return np.column_stack([np.interp(times_s, known_times_s, column) for column in columns.T])
 
 
 def _estimate_large_gyro_bias(
@@ -401,9 +384,7 @@ def _estimate_large_gyro_bias(
     if len(samples) < MIN_KEPT_MEASUREMENTS:
         return np.zeros(3)
     attitude_time_s, quaternions = samples.index.to_numpy(), samples.to_numpy()
-    gyro_angle_rad = np.column_stack(
-        [np.interp(attitude_time_s, step_times_s, column) for column in gyro_integral_rad.T]
-    )
+    gyro_angle_rad = _interpolate_columns(attitude_time_s, step_times_s, gyro_integral_rad)
     rotation_difference_rad = np.diff(gyro_angle_rad, axis=0) - to_rotation_vector(
         multiply(conjugate(quaternions[:-1]), quaternions[1:])
     )
@@ -416,27 +397,17 @@ def _estimate_large_gyro_bias(
     return bias_rad_s if is_bias_removed else np.zeros(3)
 
 
-def _integrate_gyros(
-    step_times_s: Array, gyro_integral_rad: Array, attitude: pd.DataFrame
-) -> Array:
-    """Integrate the gyroscopes to attitudes, starting at the logged attitude.
+def _integrate_gyros(start_s: float, rotation_rad: Array, attitude: pd.DataFrame) -> Array:
+    """Integrate rotations from the gyroscopes to attitudes, starting at the logged attitude.
 
     The attitudes are quaternions from body to NED, w first.
     """
-    attitude_time_s = attitude.index.to_numpy()
-    nearby_rows = slice(
-        *np.clip(
-            np.searchsorted(attitude_time_s, step_times_s[0]) + np.array([-2, 3]),
-            0,
-            len(attitude_time_s),
-        )
+    row = int(np.searchsorted(attitude.index, start_s))
+    nearby_samples = attitude.iloc[max(row - 2, 0) : row + 3]
+    start_quaternion = interpolate(
+        np.array([start_s]),
+        nearby_samples.index.to_numpy(),
+        nearby_samples[Columns.QUATERNION].to_numpy(),
     )
-    logged_quaternions = attitude.iloc[nearby_rows][Columns.QUATERNION].to_numpy(copy=True)
-    nearby_attitude_time_s = attitude_time_s[nearby_rows]
-    start_s = np.clip(step_times_s[0], nearby_attitude_time_s[0], nearby_attitude_time_s[-1])
-    slerp = Slerp(nearby_attitude_time_s, Rotation.from_quat(logged_quaternions, scalar_first=True))
-    start_quaternion = slerp(start_s).as_quat(scalar_first=True)
-    rotation_since_start = cumulative_product(
-        from_rotation_vector(np.diff(gyro_integral_rad, axis=0))
-    )
+    rotation_since_start = cumulative_product(from_rotation_vector(rotation_rad))
     return np.vstack([start_quaternion, multiply(start_quaternion, rotation_since_start)])
