@@ -18,11 +18,12 @@ from px4fuse.core.arrays import Array, IntArray
 from px4fuse.filter.fitting import (
     INITIAL_OUTLIER_FRACTION,
     INITIAL_OUTLIER_SIGMA_RATIO,
+    NOISE_SEARCH_RANGES,
     NoiseFit,
     _compute_outlier_probability,
     compute_log_sigma_z_variance_factor,
     compute_score,
-    convert_to_positions_and_increments,
+    make_kf_positions,
     maximise_likelihood,
 )
 from px4fuse.filter.likelihood import MAX_LOG_LIKELIHOOD_DROP, innovations, preintegrate
@@ -64,7 +65,8 @@ def test_banded_solver_equals_dense_normal_equations(seed: int) -> None:
     prior = 0.3, 0.5
     precision = np.stack([weight, np.zeros(count)], 1)
     precision[unmeasured, 0] = 0.0
-    measured, dp, dv = (rng.normal(size=(3, width)) for width in (count, count - 1, count - 1))
+    dp, dv = rng.normal(size=(2, 3, count - 1))
+    measured = np.outer([1.0, 0.0, 0.0], rng.normal(size=count))  # only the data have positions
     # rows of the measurements and the prior, divided by their σ
     rows = np.diag(np.sqrt(precision.ravel()))
     known = np.zeros((2 * count, 3))
@@ -86,7 +88,7 @@ def test_banded_solver_equals_dense_normal_equations(seed: int) -> None:
     left, normal = known - rows @ expected, rows.T @ rows
 
     positions = PositionsAndIncrements(
-        measurement_m=np.where(np.arange(count) == unmeasured, np.nan, 1.0)[:, None],
+        measurement_m=np.where(np.arange(count) == unmeasured, np.nan, measured[0])[:, None],
         segment_starts=np.array([0, second]), interval_s=length,
         process_noise_per_sigma_a_squared=0.0 * noise, process_noise_independent_of_sigma_a=noise,
         initial_state_precision=prior, is_initial_state_known=True,
@@ -95,9 +97,9 @@ def test_banded_solver_equals_dense_normal_equations(seed: int) -> None:
     noises = NoiseParameters(1.0, 1.0)
     ((axes, system),) = positions.factorise_equations(noises, weight)
     assert axes == [0]
-    state = system.solve(measured, dp, dv).reshape(3, 2 * count)
-    np.testing.assert_allclose(state.T, expected, rtol=1e-6, atol=1e-6)
-    found = fit_constant_errors(positions, noises, weight, measured[None])
+    state = system.solve(measured[:1], dp[:1], dv[:1]).ravel()
+    np.testing.assert_allclose(state, expected[:, 0], rtol=1e-6, atol=1e-6)
+    found = fit_constant_errors(positions, noises, weight)
     np.testing.assert_allclose(found.gram_matrix.sum(axis=0), left.T @ left, rtol=1e-6, atol=1e-6)
     log_determinant += np.linalg.slogdet(normal)[1]
     assert system.log_determinant == pytest.approx(log_determinant, abs=1e-6)
@@ -350,7 +352,7 @@ def test_likelihood_by_banded_matrix_equals_kf_likelihood(interval: float | None
     weight = np.ones(len(legs.measurement_m))
     assert np.ptp(expected) > 50.0
     np.testing.assert_allclose(score_grid([legs], a, z, weight), expected, rtol=1e-9)
-    part = [convert_to_positions_and_increments(legs)]
+    part = [make_kf_positions(axis, chosen)]
     found_values = np.array([compute_score(part, NoiseParameters(*pair), weight) for pair in pairs])
     np.testing.assert_allclose(
         found_values - found_values[0], expected - expected[0], rtol=1e-6, atol=2e-3
@@ -363,20 +365,25 @@ def test_likelihood_by_banded_matrix_equals_kf_likelihood(interval: float | None
 
 
 @pytest.mark.parametrize("slope", [0.0, 0.1, 0.8, -3.0])
-def test_profile_likelihood_interval_of_parabola_is_1_96_sigma(slope: float) -> None:
+def test_profile_likelihood_interval_of_parabola_is_1_96_sigma(
+    monkeypatch: pytest.MonkeyPatch, slope: float
+) -> None:
     """With the other parameter maximised out, σ is the marginal one."""
     sigma, other_sigma = 0.2, 0.05
 
     def score(noises: NoiseParameters) -> float:
-        at, other = np.log([noises.sigma_a_m_s2, noises.sigma_z_m])
+        other, at = np.log([noises.sigma_a_m_s2, noises.sigma_z_m])
         along, across = (at - 1.0) / sigma, (other - 2.0 - slope * (at - 1.0)) / other_sigma
         return 0.5 * along**2 + 0.5 * across**2
 
     def log_interval(bounds: tuple[float, float], variance_factor: float = 1.0) -> Array:
-        best = NoiseParameters(np.exp(1.0), np.exp(2.0))
-        fit = part_of(NoiseFit, noise_parameters=best, lowest_score=0.0)
-        object.__setattr__(fit, "score", score)
-        found = estimate_noise(fit, "sigma_a_m_s2", "sigma_z_m", bounds, variance_factor)
+        best = NoiseParameters(np.exp(2.0), np.exp(1.0))
+        fit = part_of(
+            NoiseFit, noise_parameters=best, lowest_score=0.0, score=score,
+            log_sigma_z_variance_factor=variance_factor,
+        )  # fmt: skip
+        monkeypatch.setitem(NOISE_SEARCH_RANGES, "sigma_z_m", bounds)
+        found = estimate_noise(fit, "sigma_z_m")
         return np.log(np.array([found.low, found.high], dtype=float))
 
     reach = sigma * np.sqrt(2.0 * MAX_LOG_LIKELIHOOD_DROP)
@@ -414,7 +421,7 @@ def bursts(seed: int, share: float, length: int) -> Array:
 
 
 def noises_of(*axes: Axis) -> NoiseFit:
-    parts = [convert_to_positions_and_increments(preintegrate(axis, TRUE)) for axis in axes]
+    parts = [make_kf_positions(axis, TRUE) for axis in axes]
     return maximise_likelihood(
         parts, NoiseParameters(TRUE.sigma_a_m_s2, TRUE.sigma_z_m), np.ones(MANY)
     )
@@ -489,7 +496,7 @@ def test_sigma_of_noise_estimate_follows_likelihood_curvature(axes, share, width
 
 def test_noise_fit_without_outliers_uses_measurement_weights() -> None:
     weight = np.random.default_rng(1).uniform(0.2, 1.0, MANY)
-    parts = [convert_to_positions_and_increments(preintegrate(pair(1)[0], TRUE))]
+    parts = [make_kf_positions(pair(1)[0], TRUE)]
     found = maximise_likelihood(parts, NoiseParameters(0.5, 0.1), weight, fits_outliers=False)
     np.testing.assert_array_equal(found.measurement_weights, weight)
     assert not found.outlier_probability.any()

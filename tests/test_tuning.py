@@ -18,7 +18,6 @@ from px4fuse.filter.signals import Axis
 from px4fuse.filter.tuning import (
     HORIZONTAL,
     MIN_MEASUREMENTS,
-    SIGMA_Z_SEARCH_RANGE_M,
     AxisTuning,
     NoiseEstimate,
     tune,
@@ -176,7 +175,7 @@ def test_noise_interval_ends_where_profile_likelihood_drops() -> None:
 def test_tune_on_noise_free_positions_gives_sigma_z_upper_limit(sigma_a: float) -> None:
     found = tuned(modelled(3, 500, sigma_a=sigma_a, sigma_z=0.0))
     assert found.sigma_z.value is found.sigma_z.low is None
-    assert SIGMA_Z_SEARCH_RANGE_M[0] <= found.sigma_z.high < 0.003
+    assert fitting.SIGMA_Z_SEARCH_RANGE_M[0] <= found.sigma_z.high < 0.003
     assert found.sigma_a.low <= sigma_a <= found.sigma_a.high or sigma_a < 0.1
 
 

@@ -14,7 +14,7 @@ from scipy.optimize import minimize
 from scipy.special import chdtri, expit
 
 from px4fuse.core.arrays import Array, ArrayPair
-from px4fuse.filter.likelihood import PreintegratedMotion
+from px4fuse.filter.likelihood import preintegrate
 from px4fuse.filter.marginal_likelihood import (
     NoiseParameters,
     PositionsAndIncrements,
@@ -23,6 +23,8 @@ from px4fuse.filter.marginal_likelihood import (
     subtract_smooth_path,
 )
 from px4fuse.filter.model import INITIAL_COVARIANCE
+from px4fuse.filter.settings import Settings
+from px4fuse.filter.signals import Axis
 
 # Search range (m/s²) of SIGMA_A
 SIGMA_A_SEARCH_RANGE_M_S2 = (1e-3, 30.0)
@@ -105,28 +107,26 @@ def compute_score(
     )
 
 
-def convert_to_positions_and_increments(
-    preintegrated_motion: PreintegratedMotion,
-) -> PositionsAndIncrements:
-    """Convert the inputs of KF to the inputs of :func:`fit_constant_errors`.
+def make_kf_positions(axis: Axis, settings: Settings) -> PositionsAndIncrements:
+    """Return the inputs of KF along one axis as inputs of :func:`fit_constant_errors`.
 
     The first row is KF's initial state, which has no measurement.
     """
+    motion = preintegrate(axis, settings)
     return subtract_smooth_path(
         PositionsAndIncrements(
-            measurement_m=np.append(
-                np.nan,
-                preintegrated_motion.measurement_m - preintegrated_motion.initial_state.position_m,
-            )[:, None],
+            measurement_m=np.append(np.nan, motion.measurement_m - motion.initial_state.position_m)[
+                :, None
+            ],
             segment_starts=np.array([0]),
-            interval_s=preintegrated_motion.interval_s,
-            process_noise_per_sigma_a_squared=preintegrated_motion.process_noise_per_sigma_a_squared.T,
-            process_noise_independent_of_sigma_a=preintegrated_motion.process_noise_independent_of_sigma_a.T,
+            interval_s=motion.interval_s,
+            process_noise_per_sigma_a_squared=motion.process_noise_per_sigma_a_squared.T,
+            process_noise_independent_of_sigma_a=motion.process_noise_independent_of_sigma_a.T,
             initial_state_precision=(1.0 / INITIAL_COVARIANCE[0], 1.0 / INITIAL_COVARIANCE[2]),
             is_initial_state_known=True,
             constant_prior_sigmas=np.zeros(0),
-            delta_position_m=preintegrated_motion.delta_position_m[None, None],
-            delta_velocity_m_s=preintegrated_motion.delta_velocity_m_s[None, None],
+            delta_position_m=motion.delta_position_m[None, None],
+            delta_velocity_m_s=motion.delta_velocity_m_s[None, None],
         )
     )
 

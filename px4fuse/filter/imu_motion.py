@@ -107,10 +107,6 @@ class SegmentMotion:
         return position, velocity
 
 
-# Motion that is already computed for segments of a flight, by start and end time (s)
-MotionCache = dict[Span, SegmentMotion]
-
-
 @dataclass(frozen=True)
 class PositionsAndImuMotion:
     """Position measurements, and the IMU motion at their times.
@@ -245,7 +241,6 @@ def compute_imu_motion(
     directions: Array,
     dt_s: float,
     measurement_weights: Array | None = None,
-    motion_cache: MotionCache | None = None,
     heading_sigma_rad: float = HEADING_SIGMA_RAD,
     max_segment_duration_s: float = MAX_SEGMENT_DURATION_S,
 ) -> PositionsAndImuMotion | Unavailable:
@@ -257,8 +252,6 @@ def compute_imu_motion(
         Positions (m) and their times.
     directions, dt_s, measurement_weights, heading_sigma_rad
         See :class:`PositionsAndImuMotion`; weights are 1 by default.
-    motion_cache : dict, optional
-        IMU motion that is already computed; new motion is added.
     max_segment_duration_s : float
         Maximum length of a segment.
     """
@@ -268,8 +261,6 @@ def compute_imu_motion(
         return imu
     if isinstance(attitude, Unavailable):
         return attitude
-    motion_cache = {} if motion_cache is None else motion_cache
-    segment_motions: list[SegmentMotion] = []
     rows_by_segment: list[IntArray] = []
     imu_time_s, attitude_time_s = imu.index.to_numpy(), attitude.index.to_numpy()
     imu_interval_s = compute_median_interval_s(imu_time_s) if len(imu_time_s) > 1 else np.inf
@@ -285,17 +276,11 @@ def compute_imu_motion(
         first_s, last_s = time_s[covered_rows[[0, -1]]]
         segment_count = max(1, int(np.ceil((last_s - first_s) / max_segment_duration_s)))
         cut_times_s = np.linspace(first_s, last_s, segment_count + 1)[1:-1]
-        for rows in np.split(covered_rows, np.searchsorted(time_s[covered_rows], cut_times_s)):
-            if len(rows) < MIN_SEGMENT_MEASUREMENTS:
-                continue
-            rows_by_segment.append(rows)
-            imu_span_s = (
-                time_s[rows[0]] - MAX_TESTED_TIME_OFFSET_S,
-                time_s[rows[-1]] + MAX_TESTED_TIME_OFFSET_S,
-            )
-            if imu_span_s not in motion_cache:
-                motion_cache[imu_span_s] = make_segment_motion(imu, attitude, imu_span_s)
-            segment_motions.append(motion_cache[imu_span_s])
+        rows_by_segment += [
+            rows
+            for rows in np.split(covered_rows, np.searchsorted(time_s[covered_rows], cut_times_s))
+            if len(rows) >= MIN_SEGMENT_MEASUREMENTS
+        ]
     used_rows = np.concatenate([np.zeros(0, dtype=np.intp), *rows_by_segment])
     if len(used_rows) < MIN_TOTAL_MEASUREMENTS:
         return Unavailable(
@@ -314,7 +299,17 @@ def compute_imu_motion(
         (measured_m - first_position_m).to_numpy(),
         np.ones(len(used_rows)) if measurement_weights is None else measurement_weights[used_rows],
         segment_edges,
-        tuple(segment_motions),
+        tuple(
+            make_segment_motion(
+                imu,
+                attitude,
+                (
+                    time_s[rows[0]] - MAX_TESTED_TIME_OFFSET_S,
+                    time_s[rows[-1]] + MAX_TESTED_TIME_OFFSET_S,
+                ),
+            )
+            for rows in rows_by_segment
+        ),
         directions,
         dt_s,
         imu_interval_s,

@@ -25,6 +25,7 @@ import numpy as np
 from scipy.linalg import lapack
 
 from px4fuse.core.arrays import Array, ArrayPair, BoolArray, IntArray
+from px4fuse.filter.model import make_symmetric_matrix, make_transition_matrix
 
 # Q can be singular, so a small variance is added to Q₀₀: its σ as a fraction of √(R + Q₀₀)
 REGULARISATION_TO_POSITION_SIGMA_RATIO = 1e-5
@@ -202,12 +203,11 @@ class PositionsAndIncrements:
 
         A = diag(precision) + Σ [-F I]ᵀ Q⁻¹ [-F I] over the intervals, in LAPACK's band format.
         """
-        interval_s = self.interval_s
         q00, q01, q11 = (
             noise_parameters.sigma_a_m_s2**2 * self.process_noise_per_sigma_a_squared
             + self.process_noise_independent_of_sigma_a
         )
-        q00 = q00 + noise_parameters.random_walk_m**2 * interval_s
+        q00 = q00 + noise_parameters.random_walk_m**2 * self.interval_s
         # Q of one prediction step is singular, so a small variance is added. A tiny determinant is
         # a rounding error
         q_determinant = q00 * q11 - q01**2
@@ -218,37 +218,30 @@ class PositionsAndIncrements:
         log_determinant = np.sum(np.log(q_determinant[self.is_within_segment]))
         u00, u11 = np.where(self.is_within_segment, np.sqrt([q11 / q_determinant, 1.0 / q11]), 0.0)
         u01 = -u00 * q01 / q11
-        # Elements of Q⁻¹, and element 10 of FᵀQ⁻¹
-        inverse_q00, inverse_q01, inverse_q11 = u00**2, u00 * u01, u01**2 + u11**2
-        position_velocity_weight = inverse_q00 * interval_s + inverse_q01
+        inverse_q = make_symmetric_matrix((u00**2, u00 * u01, u01**2 + u11**2))
+        transition = make_transition_matrix(self.interval_s)
+        # Columns of A for each measurement; the first rows belong to the same measurement
         state_count = 3 if noise_parameters.correlated_sigma_m else 2
-        band_storage = np.zeros((len(precision), state_count, state_count + 2))
-        band_storage[self.segment_starts, :2, 0] = initial_precision
-        position_bands, velocity_bands = band_storage[:, 0], band_storage[:, 1]
-        position_bands[:, 0] += precision
-        position_bands[1:, 0] += inverse_q00
-        position_bands[1:, 1] = inverse_q01
-        velocity_bands[1:, 0] += inverse_q11
-        position_bands[:-1, 0] += inverse_q00
-        position_bands[:-1, 1] += position_velocity_weight
-        velocity_bands[:-1, 0] += (position_velocity_weight + inverse_q01) * interval_s
-        velocity_bands[:-1, 0] += inverse_q11
-        position_bands[:-1, state_count] = -inverse_q00
-        position_bands[:-1, state_count + 1] = -inverse_q01
-        velocity_bands[:-1, state_count - 1] = -position_velocity_weight
-        velocity_bands[:-1, state_count] = -(inverse_q01 * interval_s + inverse_q11)
+        columns = np.zeros((len(precision), 2 * state_count + 1, state_count))
+        columns[:, 0, 0] = precision
+        columns[self.segment_starts, [[0], [1]], [[0], [1]]] += initial_precision.T
+        columns[1:, :2, :2] += inverse_q
+        columns[:-1, :2, :2] += np.swapaxes(transition, 1, 2) @ inverse_q @ transition
+        columns[:-1, state_count : state_count + 2, :2] = -inverse_q @ transition
         if noise_parameters.correlated_sigma_m:
-            rho = np.exp(-interval_s / noise_parameters.tau_s) * self.is_within_segment
+            rho = np.exp(-self.interval_s / noise_parameters.tau_s) * self.is_within_segment
             # Variance of a Gauss-Markov process: σ_c² at the start of a segment, then (1 - ρ²) σ_c²
             step_variance_m2 = noise_parameters.correlated_sigma_m**2 * np.append(1.0, 1.0 - rho**2)
-            position_bands[:, 2] = precision
-            correlated_noise_bands = band_storage[:, 2]
-            correlated_noise_bands[:, 0] = precision + 1.0 / step_variance_m2
-            correlated_noise_bands[:-1, 0] += rho**2 / step_variance_m2[1:]
-            correlated_noise_bands[:-1, 3] = -rho / step_variance_m2[1:]
+            columns[:, 2, 0] = precision
+            columns[:, 2, 2] = precision + 1.0 / step_variance_m2
+            columns[:-1, 2, 2] += rho**2 / step_variance_m2[1:]
+            columns[:-1, 5, 2] = -rho / step_variance_m2[1:]
             log_determinant += np.sum(np.log(step_variance_m2))
-        bands = band_storage.reshape(-1, state_count + 2).T
-        return bands, np.stack([u00, u01, u11]), float(log_determinant)
+        bands = np.stack(
+            [columns[:, state : state + state_count + 2, state] for state in range(state_count)],
+            axis=1,
+        ).reshape(-1, state_count + 2)
+        return bands.T, np.stack([u00, u01, u11]), float(log_determinant)
 
 
 @dataclass(frozen=True)
@@ -315,39 +308,38 @@ def fit_constant_errors(
     positions: PositionsAndIncrements,
     noise_parameters: NoiseParameters,
     measurement_weights: Array,
-    measured_m: Array | None = None,
 ) -> PositionFit:
     """Fit constant errors (such as biases) to positions, with given noise parameters.
 
     The inputs of the fit are the data, and their derivatives with respect to each constant error.
-    ``measured_m``, shape (a, inputs, m), contains the positions of the first inputs (default: the
-    data). The positions of the others are zero. The variance of a measurement is SIGMA_Z² / weight.
+    The variance of a measurement is SIGMA_Z² / weight.
     """
-    if measured_m is None:
-        measured_m = np.nan_to_num(positions.measurement_m.T)[:, None]
-    measured_inputs = slice(measured_m.shape[1])
     input_count = positions.delta_position_m.shape[1]
     gram_matrix = np.zeros((len(positions.segments), input_count, input_count))
     log_determinant, degrees_of_freedom = 0.0, 0
     for axes, system in positions.factorise_equations(noise_parameters, measurement_weights):
         log_determinant += len(axes) * system.log_determinant
         degrees_of_freedom += len(axes) * system.degrees_of_freedom
-        # segment by segment, which is faster for long flights
+        # Segment by segment, which is faster for long flights
         for segment, (begin, end) in enumerate(positions.segments):
-            segment_measured_m = measured_m[axes, :, begin:end]
-            whitened_increments, part_explained_by_states = system.whiten(
-                segment_measured_m,
+            measured_m = np.nan_to_num(positions.measurement_m[begin:end, axes].T)
+            whitened_increments, right_hand_side = system.make_right_hand_side(
+                measured_m,
                 positions.delta_position_m[axes, :, begin : end - 1],
                 positions.delta_velocity_m_s[axes, :, begin : end - 1],
                 begin,
-                end,
+            )
+            state_columns = slice(system.state_count * begin, system.state_count * end)
+            part_explained_by_states, _ = lapack.dtbtrs(
+                system.cholesky_factor[:, state_columns], right_hand_side.T, uplo="L"
             )
             gram_matrix[segment] += _compute_inner_products(
                 whitened_increments
-            ) - _compute_inner_products(part_explained_by_states)
-            gram_matrix[segment, measured_inputs, measured_inputs] += _compute_inner_products(
-                np.sqrt(system.precision[begin:end]) * segment_measured_m
+            ) - _compute_inner_products(
+                part_explained_by_states.T.reshape(len(axes), input_count, -1)
             )
+            # Only the data have measured positions
+            gram_matrix[segment, 0, 0] += np.sum(system.precision[begin:end] * measured_m**2)
     return PositionFit(
         gram_matrix, log_determinant, degrees_of_freedom, positions.constant_prior_sigmas
     )
@@ -370,7 +362,7 @@ def subtract_smooth_path(positions: PositionsAndIncrements) -> PositionsAndIncre
     for axes, system in positions.factorise_equations(
         PATH_SMOOTHER_NOISE, np.ones(len(measured_m))
     ):
-        path = system.solve(np.nan_to_num(measured_m[:, axes].T), dp[axes, 0], dv[axes, 0])
+        path = system.solve(measured_m[:, axes].T, dp[axes, 0], dv[axes, 0])
         path[:, positions.segment_starts] = 0.0
         path_m, path_velocity_m_s = path[..., 0], path[..., 1]
         measured_m[:, axes] -= path_m.T
@@ -402,50 +394,11 @@ def estimate_squared_errors(
     expected_squared_error_m2 = np.zeros(len(positions.measurement_m))
     for axes, system in positions.factorise_equations(noise_parameters, measurement_weights):
         measured_m = positions.measurement_m[:, axes].T
-        error_m = measured_m - system.solve(np.nan_to_num(measured_m), dp[axes], dv[axes])[..., 0]
+        error_m = measured_m - system.solve(measured_m, dp[axes], dv[axes])[..., 0]
         expected_squared_error_m2 += np.nansum(
             error_m**2 + np.where(np.isnan(error_m), np.nan, system.position_variance()), axis=0
         )
     return expected_squared_error_m2, np.isfinite(positions.measurement_m).sum(axis=1)
-
-
-def compute_segment_inner_products(
-    positions: PositionsAndIncrements,
-    noise_parameters: NoiseParameters,
-    measurement_weights: Array,
-    left_positions_and_increments: tuple[Array, Array, Array],
-    right_positions_m: Array,
-) -> Array:
-    """Return the inner product uᵀC⁻¹v of two inputs u and v in each segment.
-
-    C is the covariance of the positions, given the acceleration. It includes unknown constant
-    errors (such as biases).
-
-    Parameters
-    ----------
-    left_positions_and_increments : three ndarray
-        Positions, Δp and Δv of u, shapes (a, m) and twice (a, m - 1).
-    right_positions_m : ndarray, shape (a, m)
-        Positions of v; its Δp and Δv are zero.
-    """
-    left_positions_m, *left_increments = left_positions_and_increments
-    # Inputs: u, v, then the derivatives with respect to the constant errors
-    dp, dv = (
-        np.insert(increments, 1, 0.0, axis=1)
-        for increments in (positions.delta_position_m, positions.delta_velocity_m_s)
-    )
-    dp[:, 0], dv[:, 0] = left_increments
-    gram_matrix = fit_constant_errors(
-        replace(positions, delta_position_m=dp, delta_velocity_m_s=dv),
-        noise_parameters,
-        measurement_weights,
-        np.stack([left_positions_m, right_positions_m], axis=1),
-    ).gram_matrix
-    information = gram_matrix[:, 2:, 2:] + np.diag(positions.constant_prior_sigmas**-2.0)
-    product_explained_by_constants = gram_matrix[:, :1, 2:] @ np.linalg.solve(
-        information, gram_matrix[:, 2:, 1:2]
-    )
-    return np.asarray(gram_matrix[:, 0, 1] - product_explained_by_constants[:, 0, 0])
 
 
 @dataclass(frozen=True)
@@ -460,7 +413,7 @@ class BandedNormalEquations:
         Time between successive measurements.
     inverse_q_factor : ndarray, shape (3, m - 1)
         Elements 00, 01, 11 of U in Q⁻¹ = UᵀU; zero between segments.
-    bands, cholesky_factor : ndarray, shape (2 + state_count, state_count · m)
+    bands, cholesky_factor : ndarray, shape (2 + states, states · m)
         A and its Cholesky factor in LAPACK's band storage.
     log_determinant : float
         Log determinant of the covariance of the positions.
@@ -476,55 +429,43 @@ class BandedNormalEquations:
     log_determinant: float
     degrees_of_freedom: int
 
-    def whiten(self, measured_m: Array, dp: Array, dv: Array, begin: int, end: int) -> ArrayPair:
-        """Return U [Δp, Δv], and the part of each input that the states explain.
-
-        The inputs are those of the measurements ``begin`` to ``end`` - 1, which are one segment.
-        Shapes: (2, a, k, m - 1) and (a, k, states · m).
-        """
-        whitened_increments, right_hand_side = self._make_right_hand_side(
-            measured_m, dp, dv, begin, end
-        )
-        state_count = self.count_states()
-        explained_part, _ = lapack.dtbtrs(
-            self.cholesky_factor[:, state_count * begin : state_count * end],
-            right_hand_side.T,
-            uplo="L",
-            overwrite_b=1,
-        )
-        return whitened_increments, explained_part.T.reshape(*dp.shape[:-1], -1)
+    @property
+    def state_count(self) -> int:
+        """2 (position, velocity), or 3 with time-correlated noise."""
+        return len(self.bands) - 2
 
     def solve(self, measured_m: Array, dp: Array, dv: Array) -> Array:
-        """Return the estimated states, shape (..., measurements, states).
+        """Return the estimated states of each axis, shape (a, m, states).
 
         States: position (m), velocity (m/s), and time-correlated noise (m) if it is fitted.
         """
-        _, right_hand_side = self._make_right_hand_side(measured_m, dp, dv, 0, len(self.precision))
-        state, _ = lapack.dpbtrs(self.cholesky_factor, right_hand_side.T, lower=1, overwrite_b=1)
+        _, right_hand_side = self.make_right_hand_side(
+            np.nan_to_num(measured_m), dp[:, None], dv[:, None]
+        )
+        state, _ = lapack.dpbtrs(self.cholesky_factor, right_hand_side.T, lower=1)
         return np.asarray(state.T.reshape(*measured_m.shape, -1))
 
-    def _make_right_hand_side(
-        self, measured_m: Array, dp: Array, dv: Array, begin: int, end: int
+    def make_right_hand_side(
+        self, measured_m: Array, dp: Array, dv: Array, begin: int = 0
     ) -> ArrayPair:
-        """Return U [Δp, Δv], and the right-hand side b of Ax = b, shape (inputs, states · m)."""
+        """Return U [Δp, Δv], and the right-hand side b of Ax = b, shape (a · k, states · m).
+
+        Shapes of the arguments: (a, m), and twice (a, k, m - 1). ``begin`` is the index of the
+        first measurement.
+        """
+        end = begin + measured_m.shape[1]
         u00, u01, u11 = self.inverse_q_factor[:, begin : end - 1]
         w0, w1 = whitened_increments = np.array([u00 * dp + u01 * dv, u11 * dv])
         # Q⁻¹ [Δp, Δv]
         g0, g1 = u00 * w0, u01 * w0 + u11 * w1
-        right_hand_side = np.zeros((*dp.shape[:-1], end - begin, self.count_states()))
+        right_hand_side = np.zeros((*dp.shape[:2], end - begin, self.state_count))
         right_hand_side[..., 1:, 0] = g0
         right_hand_side[..., 1:, 1] = g1
         right_hand_side[..., :-1, 0] -= g0
         right_hand_side[..., :-1, 1] -= self.interval_s[begin : end - 1] * g0 + g1
-        weighted_measurements = self.precision[begin:end] * measured_m
-        # Only the first inputs have positions
-        right_hand_side_of_first_inputs = right_hand_side[..., : measured_m.shape[-2], :, :]
-        right_hand_side_of_first_inputs[..., 0] += weighted_measurements
-        right_hand_side_of_first_inputs[..., 2:] += weighted_measurements[..., None]
-        return whitened_increments, right_hand_side.reshape(-1, self.count_states() * (end - begin))
-
-    def count_states(self) -> int:
-        return len(self.bands) - 2
+        # Position and time-correlated noise are measured together
+        right_hand_side[:, 0, :, ::2] += (self.precision[begin:end] * measured_m)[..., None]
+        return whitened_increments, right_hand_side.reshape(-1, self.state_count * (end - begin))
 
     def position_variance(self) -> Array:
         """Return the variance (m²) of the smoothed position at each measurement.

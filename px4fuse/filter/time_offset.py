@@ -8,6 +8,7 @@ interval (sandwich estimate, White 1982).
 """
 
 from collections.abc import Callable
+from dataclasses import replace
 
 import numpy as np
 from scipy.interpolate import CubicSpline
@@ -21,7 +22,6 @@ from px4fuse.filter.imu_motion import (
     COARSE_TIME_OFFSETS_S,
     HEADING_SIGMA_RAD,
     MAX_TESTED_TIME_OFFSET_S,
-    MotionCache,
     PositionsAndImuMotion,
     compute_imu_motion,
 )
@@ -30,7 +30,7 @@ from px4fuse.filter.likelihood import (
     compute_profile_likelihood_interval,
     fit_parabola_vertex,
 )
-from px4fuse.filter.marginal_likelihood import NoiseParameters, compute_segment_inner_products
+from px4fuse.filter.marginal_likelihood import NoiseParameters, fit_constant_errors
 from px4fuse.filter.settings import Settings
 from px4fuse.filter.signals import Segment, cut_to_segment, make_downsampling_slice
 from px4fuse.flight.model import Columns, Flight, PositionTrack, Unavailable
@@ -135,7 +135,6 @@ def estimate_time_offset(
     noise_parameters: NoiseParameters,
     outlier_time_s: Array | None = None,
     progress: Callable[[str], None] = lambda _: None,
-    motion_cache: MotionCache | None = None,
 ) -> ClockOffset | Unavailable:
     """Estimate the time offset to add to the timestamps of a position source.
 
@@ -149,8 +148,6 @@ def estimate_time_offset(
         Timestamps of measurements to exclude.
     progress : callable
         Called with the name of each step of the analysis.
-    motion_cache : dict, optional
-        IMU motion that is already computed; new motion is added.
     """
     # GNSS height is omitted: it is noisier, but all axes have the same SIGMA_Z
     axis_count = 2 if track.origin.is_gnss else 3
@@ -165,7 +162,6 @@ def estimate_time_offset(
         position_samples.to_numpy(),
         directions=np.eye(3)[:axis_count],
         dt_s=settings.dt_s,
-        motion_cache=motion_cache,
         heading_sigma_rad=GNSS_HEADING_SIGMA_RAD if track.origin.is_gnss else HEADING_SIGMA_RAD,
     )
     if isinstance(imu_motion, Unavailable):
@@ -339,15 +335,21 @@ def _simulate_variance_increase_by_imu_noise(
             * np.sqrt(positions.interval_s[is_within_segment])
             * draw_normal(interval_count_within_segments)
         )
-    residual_and_noise_inner_products = [
-        compute_segment_inner_products(
-            positions, noise_parameters, imu_motion.measurement_weights, inputs[:3], inputs[3]
+    inner_products = []
+    for index, error in enumerate(error_m):
+        positions.delta_position_m[:, 0] = dp[index]
+        positions.delta_velocity_m_s[:, 0] = dv[index]
+        scores_of_sum, scores_of_difference = (
+            fit_constant_errors(
+                replace(positions, measurement_m=0.0 * positions.measurement_m + noise.T),
+                noise_parameters,
+                imu_motion.measurement_weights,
+            ).compute_segment_scores()
+            for noise in (error + velocity_noise[index], error - velocity_noise[index])
         )
-        for inputs in zip(error_m, dp, dv, velocity_noise, strict=True)
-    ]
-    group_sums = np.add.reduceat(
-        residual_and_noise_inner_products, first_segment_of_each_group, axis=1
-    )
+        # The scores are half the square sums of residual ± velocity noise
+        inner_products.append((scores_of_sum - scores_of_difference) / 2.0)
+    group_sums = np.add.reduceat(inner_products, first_segment_of_each_group, axis=1)
     return 1.0 + float(group_sums.var(axis=0).sum()) / fisher_information
 
 

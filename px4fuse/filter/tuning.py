@@ -19,14 +19,14 @@ from px4fuse.core.arrays import Array, BoolArray
 from px4fuse.core.record import NOT_WRITTEN, Count, NotNegative, NotWritten, OrUnavailable, Record
 from px4fuse.filter.consistency import Consistency, assess_innovations
 from px4fuse.filter.fitting import (
+    NOISE_SEARCH_RANGES,
     SIGMA_A_SEARCH_RANGE_M_S2,
-    SIGMA_Z_SEARCH_RANGE_M,
     NoiseFit,
-    convert_to_positions_and_increments,
     estimate_outlier_probability,
+    make_kf_positions,
     maximise_likelihood,
 )
-from px4fuse.filter.imu_motion import COARSE_MEASUREMENT_COUNT, MotionCache, compute_imu_motion
+from px4fuse.filter.imu_motion import COARSE_MEASUREMENT_COUNT, compute_imu_motion
 from px4fuse.filter.likelihood import (
     MAX_LOG_LIKELIHOOD_DROP,
     PreintegratedMotion,
@@ -161,7 +161,6 @@ def tune(
     progress: Callable[[str], None] = lambda _: None,
     flight: Flight | None = None,
     may_drift: bool = False,
-    motion_cache: MotionCache | None = None,
 ) -> dict[str, AxisTuning | Unavailable]:
     """Estimate SIGMA_A and SIGMA_Z of each axis, and of north and east together.
 
@@ -177,8 +176,6 @@ def tune(
         Flight with IMU data, which separate biases and tilt from noise.
     may_drift : bool
         True if the source may drift (odometry).
-    motion_cache : dict, optional
-        IMU motion that is already computed; new motion is added.
     """
     axes_by_name: dict[str, tuple[Axis, ...]] = {axis.name: (axis,) for axis in axes}
     if {"north", "east"} <= axes_by_name.keys():
@@ -188,14 +185,11 @@ def tune(
         ):
             axes_by_name[HORIZONTAL] = horizontal_axes
     tunings = {}
-    motion_cache = {} if motion_cache is None else motion_cache
     for name, group_axes in axes_by_name.items():
         if names is None or name in names:
             progress(name)
             try:
-                tunings[name] = _tune_axes(
-                    name, group_axes, settings, flight, may_drift, motion_cache
-                )
+                tunings[name] = _tune_axes(name, group_axes, settings, flight, may_drift)
             except np.linalg.LinAlgError as error:
                 # Positions far from the path cause rounding errors
                 tunings[name] = Unavailable(
@@ -212,51 +206,45 @@ def _tune_axes(
     settings: Settings,
     flight: Flight | None,
     may_drift: bool,
-    motion_cache: MotionCache,
 ) -> AxisTuning | Unavailable:
     """Estimate the noises of several axes with equal measurement times.
 
     See :func:`tune` for the parameters.
     """
     analysis_name = f"estimate of SIGMA_A and SIGMA_Z ({name})"
-    preintegrated_motions = [preintegrate(axis, settings) for axis in axes]
-    measurement_time_before_downsampling_s = axes[0].measurement_time_s[
-        -len(preintegrated_motions[0].measurement_m) :
-    ]
-    axes = tuple(axis.keep_rows(make_downsampling_slice(axis.measurement_time_s)) for axis in axes)
-    axis_positions = [
-        convert_to_positions_and_increments(preintegrate(axis, settings)) for axis in axes
-    ]
-    measurement_count = len(axis_positions[0].measurement_m) - 1
-    if measurement_count < MIN_MEASUREMENTS:
-        return report_too_few_measurements(analysis_name, measurement_count, MIN_MEASUREMENTS)
+    motion = preintegrate(axes[0], settings)
+    measurement_time_s = axes[0].measurement_time_s[-len(motion.measurement_m) :]
+    # Noises are estimated from positions at a low rate, whose errors are independent
+    used_axes = [axis.keep_rows(make_downsampling_slice(axis.measurement_time_s)) for axis in axes]
+    axis_positions = [make_kf_positions(axis, settings) for axis in used_axes]
+    used_count = len(axis_positions[0].measurement_m) - 1
+    if used_count < MIN_MEASUREMENTS:
+        return report_too_few_measurements(analysis_name, used_count, MIN_MEASUREMENTS)
     current_parameters = NoiseParameters(settings.sigma_a_m_s2, settings.sigma_z_m)
-    kf_fit = maximise_likelihood(axis_positions, current_parameters, np.ones(measurement_count))
+    kf_fit = maximise_likelihood(axis_positions, current_parameters, np.ones(used_count))
     # The estimate with biases, tilt and time offset needs IMU data
+    flight_with_imu = flight if settings.input == "imu" else None
     imu_motion_fit = None
-    if flight is not None and settings.input == "imu":
-        measured_m = np.column_stack([axis.measurement_m for axis in axes])
+    if flight_with_imu is not None:
+        used_time_s = used_axes[0].measurement_time_s
         # The first measurement is KF's initial state, without a weight in KF's fit: use weight 1
-        measurement_weights = np.concatenate(
-            [np.ones(len(measured_m) - measurement_count), kf_fit.measurement_weights]
-        )
+        measurement_weights = np.ones(len(used_time_s))
+        measurement_weights[-used_count:] = kf_fit.measurement_weights
         imu_motion = compute_imu_motion(
-            flight,
-            axes[0].measurement_time_s,
-            measured_m,
-            directions=np.array([axis.direction for axis in axes]),
+            flight_with_imu,
+            used_time_s,
+            np.column_stack([axis.measurement_m for axis in used_axes]),
+            directions=np.array([axis.direction for axis in used_axes]),
             dt_s=settings.dt_s,
             measurement_weights=measurement_weights,
-            motion_cache=motion_cache,
         )
         if not isinstance(imu_motion, Unavailable):
             start_parameters = replace(
                 kf_fit.noise_parameters, random_walk_m=START_RANDOM_WALK_M if may_drift else 0.0
             )
+            coarse_motion = imu_motion.downsample(COARSE_MEASUREMENT_COUNT)
             # An approximate time offset is sufficient: it hardly changes the noises
-            _, offset_s, start_parameters = imu_motion.downsample(
-                COARSE_MEASUREMENT_COUNT
-            ).search_grid(
+            _, offset_s, start_parameters = coarse_motion.search_grid(
                 [
                     replace(start_parameters, sigma_a_m_s2=factor * start_parameters.sigma_a_m_s2)
                     for factor in START_SIGMA_A_FACTORS
@@ -268,21 +256,13 @@ def _tune_axes(
                 start_parameters,
                 imu_motion.measurement_weights,
             )
-    best_fit = kf_fit if imu_motion_fit is None else imu_motion_fit
-    is_outlier = kf_fit.outlier_probability > 0.5
-    if len(measurement_time_before_downsampling_s) > measurement_count:
-        axis_positions_before_downsampling = [
-            convert_to_positions_and_increments(preintegrated_motion)
-            for preintegrated_motion in preintegrated_motions
-        ]
-        is_outlier = (
-            estimate_outlier_probability(
-                axis_positions_before_downsampling,
-                kf_fit,
-                len(measurement_time_before_downsampling_s),
-            )
-            > 0.5
+    best_fit = imu_motion_fit or kf_fit
+    outlier_probability = kf_fit.outlier_probability
+    if len(measurement_time_s) > used_count:
+        outlier_probability = estimate_outlier_probability(
+            [make_kf_positions(axis, settings) for axis in axes], kf_fit, len(measurement_time_s)
         )
+    is_outlier = outlier_probability > 0.5
     if np.mean(is_outlier) > MAX_OUTLIER_FRACTION:
         return Unavailable(
             analysis_name,
@@ -290,19 +270,12 @@ def _tune_axes(
             "estimate SIGMA_Z",
             "Reduce the outliers of the positioning system.",
         )
-    sigma_a = estimate_noise(best_fit, "sigma_a_m_s2", "sigma_z_m", SIGMA_A_SEARCH_RANGE_M_S2)
-    sigma_z = estimate_noise(
-        best_fit,
-        "sigma_z_m",
-        "sigma_a_m_s2",
-        SIGMA_Z_SEARCH_RANGE_M,
-        best_fit.log_sigma_z_variance_factor,
-    )
+    sigma_a, sigma_z = (estimate_noise(best_fit, name) for name in ("sigma_a_m_s2", "sigma_z_m"))
     final_sigma_z_m = sigma_z.value or sigma_z.high or best_fit.noise_parameters.sigma_z_m
     kf_sigma_a = (
         sigma_a if imu_motion_fit is None else _estimate_kf_sigma_a(kf_fit, final_sigma_z_m)
     )
-    if imu_motion_fit is None and flight is not None and settings.input == "imu":
+    if imu_motion_fit is None and flight_with_imu is not None:
         # Without estimates of biases and tilt, KF's SIGMA_A is an upper bound of the noise
         sigma_a = NoiseEstimate(None, None, kf_sigma_a.high)
     final_parameters = NoiseParameters(
@@ -314,11 +287,11 @@ def _tune_axes(
         **sigma_a.as_fields("sigma_a_m_s2"),
         **sigma_z.as_fields("sigma_z_m"),
         **kf_sigma_a.as_fields("sigma_a_two_state_m_s2"),
-        log_likelihood_gain_per_measurement=log_likelihood_gain_nats / measurement_count,
-        before=_assess_kf_consistency(preintegrated_motions[0], current_parameters, is_outlier),
-        after=_assess_kf_consistency(preintegrated_motions[0], final_parameters, is_outlier),
-        outlier_time_s=measurement_time_before_downsampling_s[is_outlier],
-        count=len(measurement_time_before_downsampling_s),
+        log_likelihood_gain_per_measurement=log_likelihood_gain_nats / used_count,
+        before=_assess_kf_consistency(motion, current_parameters, is_outlier),
+        after=_assess_kf_consistency(motion, final_parameters, is_outlier),
+        outlier_time_s=measurement_time_s[is_outlier],
+        count=len(measurement_time_s),
         outliers=int(np.count_nonzero(is_outlier)),
         held_out=_test_noises_on_second_half(name, current_parameters, kf_fit),
         noises=best_fit.noise_parameters,
@@ -326,14 +299,13 @@ def _tune_axes(
     )
 
 
-def estimate_noise(
-    fit: NoiseFit,
-    name: str,
-    other_name: str,
-    search_range: tuple[float, float],
-    variance_factor: float = 1.0,
-) -> NoiseEstimate:
-    """Return SIGMA_A or SIGMA_Z of a fit; its 95 % interval has the best value of the other."""
+def estimate_noise(fit: NoiseFit, name: str) -> NoiseEstimate:
+    """Return SIGMA_A or SIGMA_Z of a fit, with its 95 % profile-likelihood interval.
+
+    ``name`` is "sigma_a_m_s2" or "sigma_z_m".
+    """
+    other_name = "sigma_z_m" if name == "sigma_a_m_s2" else "sigma_a_m_s2"
+    variance_factor = fit.log_sigma_z_variance_factor if name == "sigma_z_m" else 1.0
     best_value = getattr(fit.noise_parameters, name)
 
     def find_end(search_limit: float) -> float | None:
@@ -364,8 +336,8 @@ def estimate_noise(
             variance_factor,
         )
 
-    low, high = map(find_end, search_range)
-    return _make_noise_estimate(best_value, low, high, search_range)
+    low, high = map(find_end, NOISE_SEARCH_RANGES[name])
+    return _make_noise_estimate(best_value, low, high, NOISE_SEARCH_RANGES[name])
 
 
 def _estimate_kf_sigma_a(fit: NoiseFit, sigma_z_m: float) -> NoiseEstimate:
