@@ -142,10 +142,9 @@ def reconstruct_fixes(
     if rms_error_m > MAX_FIX_RECONSTRUCTION_ERROR_M:
         return empty_result
     for column in (Columns.POSITION[2], *Columns.POSITION_VARIANCE):
-        if column in fixes:
-            reconstructed_fixes[column] = np.interp(
-                reconstructed_fixes.index, logged_fix_times_s, fixes[column]
-            )
+        reconstructed_fixes[column] = np.interp(
+            reconstructed_fixes.index, logged_fix_times_s, fixes[column]
+        )
     return reconstructed_fixes, (
         f"{len(reconstructed_fixes)} GNSS fixes are not logged. They are computed as EKF2 position "
         f"plus innovation, with an RMS error of {rms_error_m:.2f} m along each axis"
