@@ -91,8 +91,10 @@ def read_column_name(name: str) -> ColumnMeaning:
     split_words: list[str] = []
     for word in column_words:
         match = _NAME_WITHOUT_SEPARATOR_PATTERN.fullmatch(word)
-        is_one_word = match is None or word in sigma_and_context_words
-        split_words += [word] if is_one_word else filter(None, match.groups())
+        if match and word not in sigma_and_context_words:
+            split_words += filter(None, match.groups())
+        else:
+            split_words.append(word)
     axes = [_AXIS_BY_WORD[word] for word in split_words if word in _AXIS_BY_WORD]
     other_words = [word for word in split_words if word not in _AXIS_BY_WORD]
     is_known = (

@@ -246,12 +246,12 @@ def _find_body_table(
         column_names = axes + "_" + header[axes_row + 1]
         rows_text = re.split(r"\n[, ]*\n", rows_text.partition("\n")[2], maxsplit=1)[0] + "\n"
     chosen_body_name = choose_body(file_name, body_names[is_position], wanted_body)
-    column_names = column_names.where(is_position & (body_names == chosen_body_name), "").tolist()
-    column_names[:2] = rows[axes_row][:2] if is_motive else ["time", ""]
+    is_chosen = is_position & (body_names == chosen_body_name)
+    first_columns = rows[axes_row][:2] if is_motive else ["time", ""]
     return PositionTable(
         file_name,
         "OptiTrack Motive CSV export" if is_motive else "Vicon Nexus CSV export",
-        column_names,
+        [*first_columns, *column_names.where(is_chosen, "")[2:]],
         rows_text,
         header_line=axes_row + 1,
         # Motive exports y up by default, or z up; the file does not state which
