@@ -1,5 +1,6 @@
 """MAVLink recording of one vehicle, with all message times on its boot clock."""
 
+from collections.abc import Sequence
 from dataclasses import dataclass, field
 from typing import Any
 
@@ -83,6 +84,10 @@ class Recording:
         """Return the indices of the frames with a message from ``address`` (default: autopilot)."""
         rows = self.rows_of_all_senders(message)
         return rows[self.frames.is_sent_by(address or self.address, rows)]
+
+    def find_most_frequent(self, layouts: Sequence[Layout]) -> Layout:
+        """Return the layout whose message the autopilot sent most often."""
+        return max(layouts, key=lambda layout: len(self.rows(layout.topic)))
 
     def read(
         self,

@@ -50,15 +50,11 @@ def read_unlogged_fixes(
     # EKF2 shifts GNSS times by half a prediction interval (estimator_interface.cpp)
     fixes = fixes.set_axis(fixes.index + 0.5 * ekf2.step_s)
     next_row = np.clip(np.searchsorted(logged_fixes.index, fixes.index), 1, len(logged_fixes) - 1)
+    times_s, logged_times_s = fixes.index.to_numpy(), logged_fixes.index.to_numpy()
     distance_s = np.minimum(
-        *(
-            np.abs(logged_fixes.index.to_numpy()[next_row - offset] - fixes.index)
-            for offset in (0, 1)
-        )
+        np.abs(logged_times_s[next_row] - times_s), np.abs(logged_times_s[next_row - 1] - times_s)
     )
-    is_between_fixes = (fixes.index > logged_fixes.index[0]) & (
-        fixes.index < logged_fixes.index[-1]
-    )
+    is_between_fixes = (times_s > logged_times_s[0]) & (times_s < logged_times_s[-1])
     matched_fixes = fixes[distance_s <= MAX_TIME_DIFFERENCE_OF_SAME_FIX_S]
     unlogged_fixes = fixes[(distance_s > MAX_TIME_DIFFERENCE_OF_SAME_FIX_S) & is_between_fixes]
     # Before v1.16, the topic contains a local position (m), no latitude and longitude
