@@ -15,7 +15,6 @@ from px4fuse.flight.model import (
     PositionTrack,
     Truth,
     Unavailable,
-    reclassify_as_vio,
 )
 from px4fuse.readers import mavlink_messages as messages
 from px4fuse.readers import px4_positions
@@ -104,8 +103,9 @@ def _read_track(
     return px4_positions.make_track(
         track_name,
         samples,
-        reclassify_as_vio(source.origin, has_changing_orientation=orientation is not None),
+        source.origin,
         remedy=remedy,
+        is_odometry=orientation is not None,
         description=source.description,
         frame=frame,
         clock=clock_map.clock

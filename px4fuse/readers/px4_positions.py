@@ -22,7 +22,6 @@ from px4fuse.flight.model import (
     Unavailable,
     describe_repeated_timestamps,
     infer_position_kind,
-    reclassify_as_vio,
     sample_rate,
     time_index,
 )
@@ -115,6 +114,7 @@ def make_track(
     *,
     needed_columns: list[str] = Columns.POSITION,
     remedy: str = "",
+    is_odometry: bool = False,
     **track_fields: Any,
 ) -> PositionTrack | Unavailable:
     """Make a position track from valid samples, or return the reason if they are too few.
@@ -125,6 +125,8 @@ def make_track(
         Positions (m) and variances (m²). A variance of 0 means "not sent" (``EKF2.cpp``).
     needed_columns : list of str
         Columns that must be finite.
+    is_odometry : bool
+        True if the orientation of the source changes, so that the source is not UWB.
     track_fields
         Other fields of :class:`~px4fuse.flight.model.PositionTrack`.
     """
@@ -146,7 +148,8 @@ def make_track(
             fault = HEIGHT_ONLY_REASON
         return unavailable_source(name, fault, remedy)
     if origin.kind == "uwb":
-        origin = structs.replace(origin, kind=infer_position_kind(samples))
+        kind = "vio" if is_odometry else infer_position_kind(samples)
+        origin = structs.replace(origin, kind=kind)
     variance = samples[Columns.POSITION_VARIANCE]
     return PositionTrack(
         name=name,
@@ -164,14 +167,12 @@ def _make_ulog_track(
     samples: pd.DataFrame,
     topic_names: tuple[str, ...],
     *,
-    is_odometry: bool = False,
     is_auto_candidate: bool = True,
     **track_fields: Any,
 ) -> PositionTrack | Unavailable:
     """Make a position track of a source that is defined in ``px4_topics.toml``."""
     source = px4.TRACK_SOURCES[name]
-    origin = reclassify_as_vio(source.origin, has_changing_orientation=is_odometry)
-    origin = structs.replace(origin, is_auto_candidate=is_auto_candidate)
+    origin = structs.replace(source.origin, is_auto_candidate=is_auto_candidate)
     if origin.aid is not None:
         parameters = topics.ekf2_parameters
         lever_arm_m = tuple(parameters.get(parameter, 0.0) for parameter in origin.aid.lever_arm)
