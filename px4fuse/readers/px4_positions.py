@@ -8,7 +8,7 @@ import numpy as np
 import pandas as pd
 from msgspec import structs
 
-from px4fuse.core.arrays import Array, IntArray
+from px4fuse.core.arrays import Array, ArrayPair, IntArray
 from px4fuse.flight.ekf2_parameters import EV_POS, GNSS_MODE_PARAMETER, GNSS_POS, fill_with_defaults
 from px4fuse.flight.model import (
     HEIGHT_ONLY_REASON,
@@ -341,9 +341,7 @@ def _reconstruct_track(
     )
 
 
-def project(
-    latitude_deg: Array, longitude_deg: Array, origin: GeodeticPosition
-) -> tuple[Array, Array]:
+def project(latitude_deg: Array, longitude_deg: Array, origin: GeodeticPosition) -> ArrayPair:
     """Convert latitude and longitude (degrees) to north and east (m) from the origin.
 
     Source: PX4 ``MapProjection::project``, src/lib/geo/geo.cpp (Snyder 1987, equation 25-2).
@@ -365,7 +363,7 @@ def project(
     return north_m, scale_m * cos_latitude * np.sin(longitude_step_rad)
 
 
-def unproject(north_m: Array, east_m: Array, origin: GeodeticPosition) -> tuple[Array, Array]:
+def unproject(north_m: Array, east_m: Array, origin: GeodeticPosition | ArrayPair) -> ArrayPair:
     """Convert north and east (m) from the origin to latitude and longitude (degrees).
 
     Source: PX4 ``MapProjection::reproject``, src/lib/geo/geo.cpp (Snyder 1987, equation 20-14).

@@ -9,6 +9,7 @@ import io
 import re
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, replace
+from itertools import zip_longest
 from pathlib import Path
 
 import msgspec
@@ -228,7 +229,7 @@ def _find_body_table(
     if not is_motive and not is_number(rows[1][0]):
         return None
     # One row for each column of the file, one column for each line of the header
-    header = pd.DataFrame(rows).fillna("").T[: len(rows[axes_row])]
+    header = pd.DataFrame(zip_longest(*rows, fillvalue=""))[: len(rows[axes_row])]
     axes, rows_text = header[axes_row], text.split("\n", axes_row + 1)[axes_row + 1]
     if is_motive:
         unit = dict(zip(rows[0][::2], rows[0][1::2], strict=False)).get("Length Units", "")
