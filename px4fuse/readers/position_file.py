@@ -422,12 +422,10 @@ def _choose_columns(
         )
         time_text = table.format_labels(time_column)
         for index in [*other_time_columns]:
-            has_whole_seconds = (
-                numbers[time_column] % 1.0 == 0.0
-            ).mean() > MIN_MATCHING_ROW_FRACTION
+            is_whole_second = numbers[time_column] % 1.0 == 0.0
             if (
-                has_whole_seconds
-                and column_meanings[index].unit == "ns"
+                column_meanings[index].unit == "ns"
+                and is_whole_second.mean() > MIN_MATCHING_ROW_FRACTION
                 and numbers[index].max() < 1e9
             ):
                 numbers[time_column] += numbers[index] * 1e-9
@@ -481,12 +479,11 @@ def _choose_time_unit(
             "with --position-time-unit"
         )
     unit, *other_units = plausible_units
-    reasons = [
-        f"in this unit, the median interval is {median_step * SECONDS_BY_TIME_UNIT[unit]:.3g} s"
-    ]
+    interval_s = median_step * SECONDS_BY_TIME_UNIT[unit]
+    reason = f"in this unit, the median interval is {interval_s:.3g} s"
     if other_units:
-        reasons.append(f"if the unit is {other_units[0]}, give --position-time-unit")
-    return unit, "; ".join(reasons)
+        reason += f"; if the unit is {other_units[0]}, give --position-time-unit"
+    return unit, reason
 
 
 def _choose_length_units(
