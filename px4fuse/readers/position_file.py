@@ -167,7 +167,7 @@ def read_position_file(
     unit, unit_text = "frame numbers", f"the frame rate is {table.rate_hz or 0:g} Hz"
     if table.rate_hz is None:
         unit, unit_text = _choose_time_unit(
-            numbers[time_column].to_numpy(),
+            numbers[time_column],
             column_meanings[time_column].unit,
             time_unit,
             time_units,
@@ -199,7 +199,7 @@ def read_position_file(
             f"a median interval of {median_interval_s:.3g} s is unusual: check the unit of time "
             "(--position-time-unit)"
         )
-    scale_by_column, length_unit_text = _choose_length_units(
+    metres_per_unit, length_unit_text = _choose_length_units(
         numbers,
         position_columns,
         column_meanings,
@@ -207,7 +207,7 @@ def read_position_file(
         np.inf if is_trajectory else MAX_INDOOR_EXTENT_M,
     )
     columns_m = {
-        name: np.nan if index is None else numbers[index] * scale_by_column[index]
+        name: np.nan if index is None else numbers[index] * metres_per_unit[index]
         for name, index in zip(SAMPLE_COLUMNS, (*axis_columns, *sigma_columns), strict=True)
     }
     samples = pd.DataFrame(columns_m, index=numbers.index).replace([np.inf, -np.inf], np.nan)
@@ -246,7 +246,7 @@ def read_position_file(
             f"sigma: columns {table.format_labels(*sigma_columns) or 'none'}",
         ),
         notes=tuple(notes),
-        metres_per_unit=scale_by_column[position_columns[0]],
+        metres_per_unit=float(metres_per_unit[position_columns[0]]),
         reason_by_invalid_row=pd.concat(
             [
                 invalid_reasons[~is_valid],
@@ -446,7 +446,7 @@ def _choose_columns(
 
 
 def _choose_time_unit(
-    times: Array,
+    times: "pd.Series[float]",
     unit_in_column_name: str,
     given_unit: str | None,
     units: Container[str],
@@ -458,14 +458,13 @@ def _choose_time_unit(
     """
     if given_unit is not None:
         return given_unit, "the unit was given with --position-time-unit"
-    median_time = float(np.median(times)) if len(times) else 0.0
+    median_time, time_steps = times.median(), times.diff()
     if (
         abs(median_time) * SECONDS_BY_TIME_UNIT.get(unit_in_column_name, np.inf)
         < MAX_VALID_UNIX_TIME_S
     ):
         return unit_in_column_name, "from the column name"
-    time_steps = np.diff(times)
-    median_step = float(np.median(time_steps[time_steps > 0])) if (time_steps > 0).any() else 0.0
+    median_step = time_steps[time_steps > 0.0].median()
     plausible_units = []
     for unit, unit_s in SECONDS_BY_TIME_UNIT.items():
         is_unix = MIN_VALID_UNIX_TIME_S <= median_time * unit_s < MAX_VALID_UNIX_TIME_S
@@ -492,7 +491,7 @@ def _choose_length_units(
     column_meanings: Sequence[ColumnMeaning],
     given_unit: str | None,
     max_extent_m: float,
-) -> tuple[dict[int, float], str]:
+) -> tuple["pd.Series[float]", str]:
     """Return the factor from each column's unit to metres, and the reason for the unit.
 
     Without a unit in the column names, positions with a very large extent are in mm.
@@ -524,11 +523,13 @@ def _choose_length_units(
             "px4fuse assumes metres, because in each unit the extent is too large for an indoor "
             "flight; set another unit with --position-unit"
         )
-    unit_by_column = {int(index): named_units.get(int(index), unit) for index in numbers.columns}
-    scale_by_column = {index: METRES_BY_LENGTH_UNIT[name] for index, name in unit_by_column.items()}
-    extent_m = max(float(extents[index]) * scale_by_column[index] for index in position_columns)
-    units_text = ", ".join(dict.fromkeys(unit_by_column[index] for index in position_columns))
+    column_units = pd.Series(
+        {index: named_units.get(index, unit) for index in map(int, numbers.columns)}
+    )
+    metres_per_unit = column_units.map(METRES_BY_LENGTH_UNIT)
+    extent_m = float((extents * metres_per_unit).max())
+    units_text = ", ".join(dict.fromkeys(column_units[position_columns]))
     return (
-        scale_by_column,
+        metres_per_unit,
         f"{units_text} ({reason}); 90 % of the positions are within {extent_m:.3g} m",
     )
