@@ -53,8 +53,12 @@ def read_enabled_aids(topics: Topics) -> dict[str, pd.Series[float]]:
     """Return a time series for each aiding source: 1 while its fusion is enabled, otherwise 0."""
     all_aids = (*AIDS.values(), *STATUS_FLAGS.values())
     flag_names = {flag for aid in all_aids for group in aid.flags for flag in group.split(",")}
-    layout = Layout(px4.STATUS_FLAGS, optional_columns={name: name for name in flag_names})
-    flags = topics.primary_samples(layout, is_step_function=True)
+    layout = Layout(
+        px4.STATUS_FLAGS,
+        optional_columns={name: name for name in flag_names},
+        is_step_function=True,
+    )
+    flags = topics.primary_samples(layout)
     enabled_aids = {}
     for aid in all_aids if len(flags) else ():
         groups = (group.split(",") for group in aid.flags)
@@ -63,9 +67,7 @@ def read_enabled_aids(topics: Topics) -> dict[str, pd.Series[float]]:
             enabled_aids[aid.name] = flags[group].max(axis=1)
     if not flags.columns.empty:
         return enabled_aids
-    control_bits = topics.primary_samples(px4.TOPIC_LAYOUTS["control_bits"], is_step_function=True)[
-        "bits"
-    ].dropna()
+    control_bits = topics.primary_samples(px4.TOPIC_LAYOUTS["control_bits"])["bits"].dropna()
     for aid in all_aids if len(control_bits) else ():
         if aid.status_bit is not None:
             is_enabled = control_bits.astype(np.int64) & (1 << aid.status_bit) > 0

@@ -118,9 +118,7 @@ def read_ekf2(topics: Topics) -> Ekf2 | Unavailable:
     status_flags = enabled_aids | {
         name: local_position[name] for name in VALIDITY_FLAGS if name in local_position
     }
-    failed_gnss_checks = topics.primary_samples(
-        px4.TOPIC_LAYOUTS["gnss_checks"], is_step_function=True
-    )["failed"].dropna()
+    failed_gnss_checks = topics.primary_samples(px4.TOPIC_LAYOUTS["gnss_checks"])["failed"].dropna()
     if len(failed_gnss_checks):
         status_flags["failed_checks"] = failed_gnss_checks
     step_s = _estimate_step_s(topics)
@@ -396,9 +394,7 @@ def _read_magnetic_field(topics: Topics, step_s: float) -> pd.DataFrame:
     if not candidates and Columns.MAGNETIC_FIELD_INNOVATION[0] in observations:
         candidates = [observations]
     field = max(candidates or [magnetometer, observations], key=len)
-    control_bits = topics.read(px4.TOPIC_LAYOUTS["control_bits"], is_step_function=True)[
-        "bits"
-    ].dropna()
+    control_bits = topics.read(px4.TOPIC_LAYOUTS["control_bits"])["bits"].dropna()
     if field.empty or control_bits.empty:
         return pd.DataFrame()
     flags = sample_step_function(control_bits, field.index).astype(np.int64)

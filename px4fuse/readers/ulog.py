@@ -60,9 +60,7 @@ def read_ulog(name: str, content: bytes) -> Flight:
     barometer_delay_s = topics.ekf2_parameters.get(BAROMETER.delay, 0.0) * 1e-3
     is_in_flight = common.ends_in_flight(airborne_spans_s, topics.log.duration_s)
     dropped_counts = dict(sorted(topics.dropped.items()))
-    tilt_failure_flags = topics.read(px4.TOPIC_LAYOUTS["failure"], is_step_function=True)[
-        ["roll", "pitch"]
-    ]
+    tilt_failure_flags = topics.read(px4.TOPIC_LAYOUTS["failure"])[["roll", "pitch"]]
     return Flight(
         log=structs.replace(
             topics.log,
@@ -153,7 +151,7 @@ def _read_imu(topics: Topics) -> pd.DataFrame:
 
 
 def _read_airborne_spans(topics: Topics) -> Spans | Unavailable:
-    land_detected = topics.read(px4.TOPIC_LAYOUTS["land_detected"], is_step_function=True)
+    land_detected = topics.read(px4.TOPIC_LAYOUTS["land_detected"])
     if land_detected.empty:
         return Unavailable(
             "land detector",

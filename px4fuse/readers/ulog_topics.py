@@ -181,7 +181,7 @@ class Topics:
     @cached_property
     def primary_instances(self) -> InstanceSwitches:
         """Time (s) and number of each new primary EKF2 instance (PX4's ``EKF2Selector``)."""
-        instances = self.read(TOPIC_LAYOUTS["selector"], is_step_function=True)["instance"]
+        instances = self.read(TOPIC_LAYOUTS["selector"])["instance"]
         instances = instances[instances < 255]  # 255 means that no instance is selected yet
         primary_instance_changes = instances[instances.ne(instances.shift())]
         switch_times_s = [-np.inf, *primary_instance_changes.index[1:]]
@@ -197,17 +197,13 @@ class Topics:
                 return layout
         return None
 
-    def read_instance(
-        self, layout: Layout, instance: int = 0, *, is_step_function: bool = False
-    ) -> pd.DataFrame:
+    def read_instance(self, layout: Layout, instance: int = 0) -> pd.DataFrame:
         """Read the fields of a topic instance as float64, indexed by measurement time (s).
 
         Parameters
         ----------
         instance : int
             Number of the topic instance; if not logged, the lowest number is read.
-        is_step_function : bool
-            True if a value is valid until the next sample.
 
         Returns
         -------
@@ -234,27 +230,19 @@ class Topics:
                 row[~(np.abs(row) < MAX_FIELD_VALUE)] = np.nan  # damaged values
         index = time_index((time_us[kept_rows] - self.time_origin_us) * _MICROSECOND_S)
         samples = pd.DataFrame(values.T, index, list(fields), copy=False)
+        if layout.is_step_function:
+            return samples
         end_s = self.log.duration_s + MAX_TIME_OUTSIDE_IMU_DATA_S
-        return (
-            samples
-            if is_step_function
-            else rows_between(samples, -MAX_TIME_OUTSIDE_IMU_DATA_S, end_s)
-        )
+        return rows_between(samples, -MAX_TIME_OUTSIDE_IMU_DATA_S, end_s)
 
-    def read(self, *layouts: Layout, is_step_function: bool = False) -> pd.DataFrame:
+    def read(self, *layouts: Layout) -> pd.DataFrame:
         """Read the first topic definition whose required fields are in the log; else empty."""
         layout = self.find_layout(*layouts)
-        return (
-            _empty_frame(layouts[0])
-            if layout is None
-            else self.read_instance(layout, is_step_function=is_step_function)
-        )
+        return _empty_frame(layouts[0]) if layout is None else self.read_instance(layout)
 
     def primary_samples(
         self,
         layout: Layout,
-        *,
-        is_step_function: bool = False,
         select_rows: Callable[[pd.DataFrame], pd.DataFrame] | None = None,
     ) -> pd.DataFrame:
         """Read an EKF2 topic from the EKF2 instance that was primary at each time.
@@ -268,7 +256,7 @@ class Topics:
         primary_number = pd.Series(dict(self.primary_instances), dtype=np.float64)
         instance_tables: list[pd.DataFrame] = []
         for number in instance_numbers[:1] if has_single_instance else instance_numbers:
-            samples = self.read_instance(layout, number, is_step_function=is_step_function)
+            samples = self.read_instance(layout, number)
             samples = samples if select_rows is None else select_rows(samples)
             is_primary = sample_step_function(primary_number, samples.index) == number
             instance_tables.append(samples[is_primary | has_single_instance])
