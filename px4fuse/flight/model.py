@@ -592,8 +592,6 @@ class AidLog:
     enabled: pd.Series[float] | None
     # EKF2 parameters of the aiding source at the start of the log
     parameters: Mapping[str, float] = field(default_factory=dict)
-    # Number of innovations without a logged variance near in time
-    excluded_sample_count: int = 0
     # Times (s) of innovations for which the log does not state if EKF2 fused them
     times_with_unknown_fusion_s: Array = field(default_factory=lambda: np.zeros(0))
 

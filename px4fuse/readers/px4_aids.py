@@ -131,7 +131,7 @@ def _read_common_topics(
             # The nearest variance S is used, because PX4 logs it at other times
             variance_samples = topics.primary_samples(variance_layout).dropna()
             samples = join_nearest(samples, variance_samples, MAX_VARIANCE_TIME_DIFFERENCE_S)
-        excluded_sample_count = len(samples) - len(samples := samples.dropna())
+        samples = samples.dropna()
         if enabled_flag is not None:
             samples = samples[sample_step_function(enabled_flag, samples.index) > 0.0]
         aid_log = _make_aid_log(
@@ -140,7 +140,6 @@ def _read_common_topics(
             aid,
             samples,
             enabled_flag,
-            excluded_sample_count=excluded_sample_count,
             # EKF2 may have fused a sample that is not logged, if the innovation is 0 or S is new
             times_with_unknown_fusion_s=np.union1d(
                 innovation.index[innovation == 0.0], variance.index[is_new_variance]

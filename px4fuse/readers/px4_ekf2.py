@@ -30,7 +30,7 @@ from px4fuse.flight.model import (
 )
 from px4fuse.readers import px4_topics as px4
 from px4fuse.readers.field_maps import Layout
-from px4fuse.readers.px4_aids import MAX_VARIANCE_TIME_DIFFERENCE_S, read_aids, read_enabled_aids
+from px4fuse.readers.px4_aids import read_aids, read_enabled_aids
 from px4fuse.readers.px4_innovations import collect_innovations_by_axis
 from px4fuse.readers.ulog_topics import Topics, measurement_time_us
 
@@ -102,19 +102,12 @@ def read_ekf2(topics: Topics) -> Ekf2 | Unavailable:
     innovations, innovation_topics = collect_innovations_by_axis(aids, fusion_flags, vision_gate)
     if innovation_topics:
         topics.record_stream("ekf2_innovations", *innovation_topics)
-    notes = [
+    notes = tuple(
         f"{topic} has no measurement times, so the times of EKF2 innovations are publication times "
         "(up to 0.2 s late)"
         for topic in innovation_topics[:1]
         if not any("timestamp_sample" in table for table in topics.tables_of(topic))
-    ]
-    notes += [
-        f"{log.excluded_sample_count} samples of {log.topics[0]} ({', '.join(log.axes)}) were "
-        f"dropped, because {log.topics[-1]} has no variance within "
-        f"{MAX_VARIANCE_TIME_DIFFERENCE_S:g} s"
-        for log in (aids[name] for name in ("ev_pos", "ev_hgt") if name in aids)
-        if log.excluded_sample_count
-    ]
+    )
     status_flags = enabled_aids | {
         name: local_position[name] for name in VALIDITY_FLAGS if name in local_position
     }
@@ -139,7 +132,7 @@ def read_ekf2(topics: Topics) -> Ekf2 | Unavailable:
         resets=read_resets(local_position),
         primary_instances=topics.primary_instances,
         gate=vision_gate,
-        notes=tuple(notes),
+        notes=notes,
         accelerometer_bias=_read_accelerometer_bias(topics, horizon_state),
         step_s=step_s,
         horizon_s=_compute_horizon_delay_s(topics, step_s),

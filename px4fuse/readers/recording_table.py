@@ -267,20 +267,16 @@ def _find_stream_table(file_name: str, text: str, lines: Sequence[str]) -> Posit
     """Find the positions in a text format of a UWB system (``formats.toml``)."""
     for stream_format in UWB_TEXT_FORMATS:
         pattern = re.compile(stream_format["row"], re.MULTILINE)
-        first_row = next(filter(pattern.match, lines), None)
-        if first_row is None:
+        if not any(map(pattern.match, lines)):
             continue
         rows = pattern.findall(text)
-        uwb_range_count = len(re.findall(stream_format["ranges"], first_row))
-        notes = [f"px4fuse does not use the {uwb_range_count} UWB ranges in each line"]
-        if lost_count := text.count("\n") - len(rows):
-            notes.append(f"lines without a position: {lost_count}")
+        lost_count = text.count("\n") - len(rows)
         return PositionTable(
             file_name,
             stream_format["name"],
             [*pattern.groupindex],
             "".join(f"{','.join(row)}\n" for row in rows),
-            notes=tuple(notes),
+            notes=(f"lines without a position: {lost_count}",) if lost_count else (),
         )
     return None
 

@@ -117,21 +117,13 @@ def _read_topic(name: str, reader: Any, topic: str | None) -> PositionTable:
     )
     if message_type == _PATH_MESSAGE_TYPE:
         messages = deque(messages, maxlen=1)  # the last path repeats the poses of all others
-    lags_s, csv_rows, pose_frames = [], [], set()
-    for connection, receive_ns, raw_message in messages:
+    csv_rows, pose_frames = [], set()
+    for connection, _, raw_message in messages:
         message = reader.deserialize(raw_message, connection.msgtype)
         for stamped_message in message.poses if message_type == _PATH_MESSAGE_TYPE else [message]:
-            time_ns = _read_time_ns(stamped_message)
             pose_frames.add(getattr(stamped_message, "pose_frame", None))
-            lags_s.append((receive_ns - time_ns) * 1e-9)
-            csv_rows.append(f"{time_ns},{str(_read_pose_values(stamped_message))[1:-1]}\n")
-    notes = [f"the topic is {topic} ({message_type})"]
-    if csv_rows:
-        low_lag_s, median_lag_s, high_lag_s = np.percentile(lags_s, [2.5, 50.0, 97.5])
-        notes.append(
-            f"the timestamps in the messages are used; they were received {median_lag_s:.3f} s "
-            f"later (95 % {low_lag_s:.3f} to {high_lag_s:.3f} s)"
-        )
+            values = _read_time_ns(stamped_message), *_read_pose_values(stamped_message)
+            csv_rows.append(f"{','.join(map(str, values))}\n")
     return PositionTable(
         name,
         "ROS bag",
@@ -139,7 +131,7 @@ def _read_topic(name: str, reader: Any, topic: str | None) -> PositionTable:
         "".join(csv_rows),
         has_only_chosen_body=True,
         frames=("ned",) if pose_frames == {_FRAME_NED} else (),
-        notes=tuple(notes),
+        notes=(f"the topic is {topic} ({message_type})",),
     )
 
 
