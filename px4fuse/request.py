@@ -38,14 +38,12 @@ class _BaseRequest(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
 
     def with_file_names(self) -> Self:
         """Replace paths by file names."""
-        paths = {name: getattr(self, name, None) for name in _PATH_FIELDS}
         changes: dict[str, Any] = {
-            field_name: _extract_file_name(path)
-            for field_name, path in paths.items()
-            if path is not None
+            name: _extract_file_name(path)
+            for name in _PATH_FIELDS
+            if (path := getattr(self, name, None)) is not None
         }
-        position = getattr(self, "position", None)
-        if position is not None:
+        if (position := getattr(self, "position", None)) is not None:
             changes["position"] = position.with_file_names()
         return msgspec.structs.replace(self, **changes)
 
@@ -104,7 +102,7 @@ class ComparisonRequest(
     clock_offset_s: float | Literal["auto"] | None = None
 
 
-class Landing(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
+class Landing(_BaseRequest, frozen=True):
     """Landing place and heading relative to take-off, as measured by the user.
 
     Attributes
@@ -120,7 +118,7 @@ class Landing(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     turned_deg: float | None = None
 
 
-class GivenClosure(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
+class GivenClosure(_BaseRequest, frozen=True):
     """Loop closure from the user: the same position (σ ``sigma_m``) at two times."""
 
     time_1_s: float
@@ -169,7 +167,7 @@ class LoopRequest(_BaseRequest, frozen=True, kw_only=True, tag_field="command", 
     key_frames_m: float | None = None
 
 
-class Sweep(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
+class Sweep(_BaseRequest, frozen=True):
     """Range of an EKF2 parameter for replays; the spacing is logarithmic if ``low`` is above 0."""
 
     parameter: str
@@ -316,9 +314,8 @@ def command_line(
     # without "./", a path that begins with "-" is read as an option
     files = [f"./{path}" if path.startswith("-") else path for path in files]
     arguments = [command or str(type(shown_request).__struct_config__.tag or "evaluate"), *files]
-    arguments += [
-        word for pair in _list_changed_options(shown_request) for word in pair if word is not None
-    ]
+    for option, value_text in _list_changed_options(shown_request):
+        arguments += [option] if value_text is None else [option, value_text]
     if isinstance(shown_request, WhatIfRequest):
         for name, value in shown_request.changes.items():
             arguments += ["--set", f"{name}={_format_value(value)}"]

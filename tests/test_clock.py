@@ -3,6 +3,7 @@
 from types import SimpleNamespace
 
 import numpy as np
+import pandas as pd
 import pytest
 from comparisons import compare
 from exchange import replace
@@ -58,8 +59,8 @@ from px4fuse.flight.model import (
     Columns,
     Flight,
     Unavailable,
-    reclassify_as_vio,
 )
+from px4fuse.readers.px4_positions import make_track
 from px4fuse.report.clock import make_time_offset_advice
 
 DT = SETTINGS.dt_s
@@ -478,8 +479,10 @@ def stated(
     ],
 )
 def test_vision_source_with_orientation_is_treated_as_drifting(origin, drifts) -> None:
-    assert reclassify_as_vio(origin, has_changing_orientation=True).may_drift is drifts
-    assert not reclassify_as_vio(origin, has_changing_orientation=False).may_drift
+    samples = pd.DataFrame(np.arange(15.0).reshape(5, 3), np.arange(5.0), Columns.POSITION)
+    fields = {"description": "", "frame": "NED", "clock": "", "topics": ()}
+    assert make_track("a", samples, origin, is_odometry=True, **fields).origin.may_drift is drifts
+    assert not make_track("a", samples, origin, **fields).origin.may_drift
 
 
 def test_time_offset_interval_widens_if_flight_parts_differ() -> None:

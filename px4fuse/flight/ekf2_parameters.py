@@ -117,10 +117,13 @@ AIDS, STATUS_FLAGS = (
     }
     for rows in (PARAMETER_TABLES["aids"], PARAMETER_TABLES["disturbances"])
 )
-EV_POS, GNSS_POS, GNSS_VEL, GNSS_HGT, BAROMETER, FLOW, MAG = map(
-    AIDS.__getitem__,
-    ("ev_pos", "gnss_pos", "gnss_vel", "gnss_hgt", "baro_hgt", "optical_flow", "mag"),
-)
+EV_POS = AIDS["ev_pos"]
+GNSS_POS = AIDS["gnss_pos"]
+GNSS_VEL = AIDS["gnss_vel"]
+GNSS_HGT = AIDS["gnss_hgt"]
+BAROMETER = AIDS["baro_hgt"]
+FLOW = AIDS["optical_flow"]
+MAG = AIDS["mag"]
 PARAMETERS, _LOGGED_PARAMETERS = (
     msgspec.convert(
         {name: row for names, row in PARAMETER_TABLES[table].items() for name in names.split()},

@@ -14,7 +14,6 @@ from typing import Any, Final, Literal, NamedTuple, TypeAlias
 import msgspec
 import numpy as np
 import pandas as pd
-from msgspec.structs import replace
 from numpy.typing import NDArray
 
 from px4fuse.core.arrays import Array, BoolArray
@@ -110,13 +109,6 @@ def find_source_origin(kind: str, path: str) -> SourceOrigin:
         if (origin.kind, origin.path) == (kind, path):
             return origin
     raise ValueError(f"no position source has the kind {kind!r} and the path {path!r}")
-
-
-def reclassify_as_vio(origin: SourceOrigin, *, has_changing_orientation: bool) -> SourceOrigin:
-    """Change the kind "uwb" to "vio" if the orientation of the source changes."""
-    return (
-        replace(origin, kind="vio") if origin.kind == "uwb" and has_changing_orientation else origin
-    )
 
 
 REPEATED_TIMESTAMPS_NOTE = (
@@ -355,9 +347,7 @@ class Columns:
         *(f"attitude_{axis}_rad2" for axis in AXIS_NAMES),
         *VELOCITY_VARIANCE,
         *POSITION_VARIANCE,
-        *(f"{name.removesuffix('_rad_s')}_rad2_s2" for name in GYRO_BIAS),
-        *(f"{name.removesuffix('_m_s2')}_m2_s4" for name in ACCELEROMETER_BIAS),
-        *(f"{name}2" for name in (*EARTH_MAGNETIC_FIELD, *BODY_MAGNETIC_FIELD)),
+        *(f"{name}_squared" for name in FUSION_HORIZON_STATE[10:]),
     ]
 
 
@@ -602,8 +592,6 @@ class AidLog:
     enabled: pd.Series[float] | None
     # EKF2 parameters of the aiding source at the start of the log
     parameters: Mapping[str, float] = field(default_factory=dict)
-    # Number of innovations without a logged variance near in time
-    excluded_sample_count: int = 0
     # Times (s) of innovations for which the log does not state if EKF2 fused them
     times_with_unknown_fusion_s: Array = field(default_factory=lambda: np.zeros(0))
 

@@ -1,6 +1,6 @@
 """Contents of a log, possible analyses, and logging advice for the next flight."""
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 from typing import Any
 
@@ -31,6 +31,7 @@ from px4fuse.flight.model import (
     Ekf2,
     Flight,
     PositionTrack,
+    Spans,
     Unavailable,
     sample_rate,
 )
@@ -41,11 +42,10 @@ SCHEMA_NAME = "px4fuse-info"
 SCHEMA_VERSION = "1.0"
 # Fields of the class Flight that px4fuse info writes to JSON
 FLIGHT_FIELDS_IN_JSON = ("log", "airborne", "clocks", "missing", "unused", "inputs")
-# Label of each type of data in a log
-DATA_LABELS = {
+# Label of each type of data in a log, except positions
+STREAM_LABELS = {
     "imu": "IMU",
     "attitude": "attitude",
-    "position": "position",
     "ekf2_state": "EKF2 state",
     "ekf2_variance": "EKF2 variance",
     "ekf2_innovations": "innovations",
@@ -61,7 +61,6 @@ REQUIRED_SAMPLES_BY_ANALYSIS = {
     "error": "samples of ground truth",
 }
 NO_COMPARISON = Unavailable("comparison", "the log contains no position source for KF", "")
-TimeSpans = tuple[tuple[float, float], ...]
 
 
 @dataclass(frozen=True)
@@ -208,47 +207,47 @@ def to_json_dict(inventory: Inventory) -> dict[str, Any]:
     }
 
 
-def _collect_data_by_stream(flight: Flight) -> dict[str, pd.DataFrame | TimeSpans | Unavailable]:
-    """Return all data of a flight except positions, by type."""
+def _list_logged_data(
+    flight: Flight, comparison: PreparedComparison | None, reason: str
+) -> Iterator[LoggedData]:
     ekf2, truth = flight.ekf2, flight.truth
-    data_by_stream = {"imu": flight.imu, "attitude": flight.attitude}
+    yield from _list_streams(flight, {"imu": flight.imu, "attitude": flight.attitude})
+    for track in flight.positions:
+        yield _make_logged_data(
+            "position",
+            track.samples,
+            track,
+            name=track.name,
+            description=track.description,
+            chosen=comparison is not None and track.name == comparison.source.name,
+        )
+    if not flight.positions:
+        yield LoggedData("position", unavailable=reason)
     if isinstance(ekf2, Unavailable):
-        data_by_stream["ekf2_state"] = ekf2
+        yield LoggedData(STREAM_LABELS["ekf2_state"], unavailable=ekf2.reason)
     else:
         # use the axis with most innovations, because some axes may not be logged
         innovations = max(
             ekf2.innovations.values(),
             key=lambda samples: len(samples) if isinstance(samples, pd.DataFrame) else -1,
         )
-        data_by_stream |= {"ekf2_state": ekf2.state, "ekf2_variance": ekf2.variance}
+        data_by_stream = {"ekf2_state": ekf2.state, "ekf2_variance": ekf2.variance}
         data_by_stream |= {"ekf2_innovations": innovations, "ekf2_fusing": ekf2.fusion_flags}
-    samples = truth if isinstance(truth, Unavailable) else truth.samples
-    return {**data_by_stream, "truth": samples, "airborne": flight.airborne}
+        yield from _list_streams(flight, data_by_stream)
+    truth_samples = truth if isinstance(truth, Unavailable) else truth.samples
+    yield from _list_streams(flight, {"truth": truth_samples, "airborne": flight.airborne})
 
 
-def _list_logged_data(
-    flight: Flight, comparison: PreparedComparison | None, reason: str
+def _list_streams(
+    flight: Flight, data_by_stream: Mapping[str, pd.DataFrame | Spans | Unavailable]
 ) -> Iterator[LoggedData]:
-    data_by_stream = _collect_data_by_stream(flight)
-    for key, name in DATA_LABELS.items():
-        if key in data_by_stream:
-            yield _make_logged_data(name, data_by_stream[key], flight.streams.get(key))
-        for track in flight.positions if key == "position" else ():
-            yield _make_logged_data(
-                name,
-                track.samples,
-                track,
-                name=track.name,
-                description=track.description,
-                chosen=comparison is not None and track.name == comparison.source.name,
-            )
-        if key == "position" and not flight.positions:
-            yield LoggedData(name, unavailable=reason)
+    for name, data in data_by_stream.items():
+        yield _make_logged_data(STREAM_LABELS[name], data, flight.streams.get(name))
 
 
 def _make_logged_data(
     data_label: str,
-    data: pd.DataFrame | TimeSpans | Unavailable,
+    data: pd.DataFrame | Spans | Unavailable,
     stream: DataSource | PositionTrack | None,
     **data_fields: Any,
 ) -> LoggedData:
@@ -262,7 +261,7 @@ def _make_logged_data(
         times_s = data.index.tolist()
         if len(data) > 1:
             data_fields["rate_hz"] = sample_rate(data)
-            data_fields["gaps"] = _measure_gaps(data, is_imu=data_label == DATA_LABELS["imu"])
+            data_fields["gaps"] = _measure_gaps(data, is_imu=data_label == STREAM_LABELS["imu"])
     else:
         times_s = [time_s for span in data for time_s in span]
     if times_s:
@@ -336,37 +335,29 @@ def _list_ekf2_and_truth_analyses(
     flight: Flight, comparison: PreparedComparison | None
 ) -> Iterator[AnalysisOption]:
     """Yield the analyses that need EKF2 data or ground truth."""
-    required_data_by_analysis: dict[str, object] = dict.fromkeys(
-        REQUIRED_SAMPLES_BY_ANALYSIS, flight.ekf2
-    )
-    required_data_by_analysis["error"] = flight.truth
-    if comparison is not None:
-        main_axis, segment, ekf2 = comparison.input_axes[0], comparison.segment, flight.ekf2
-        ekf2_state, ekf2_variance, truth = project_tracks(
-            ekf2, comparison.flight.truth, main_axis, segment
-        ).values()
-        innovations = (
+    ekf2, truth = flight.ekf2, flight.truth
+    required_data: list[object]
+    if comparison is None:
+        required_data = [
+            data if isinstance(data, Unavailable) else NO_COMPARISON
+            for data in (ekf2, ekf2, ekf2, truth)
+        ]
+    else:
+        main_axis, segment = comparison.input_axes[0], comparison.segment
+        required_data = [
+            *project_tracks(ekf2, comparison.flight.truth, main_axis, segment).values()
+        ]
+        required_data.insert(
+            2,
             ekf2
             if isinstance(ekf2, Unavailable)
-            else project_innovations(flight, ekf2, comparison.source, main_axis, segment)
+            else project_innovations(flight, ekf2, comparison.source, main_axis, segment),
         )
-        required_data_by_analysis = dict(
-            zip(
-                required_data_by_analysis,
-                (ekf2_state, ekf2_variance, innovations, truth),
-                strict=True,
-            )
-        )
-    for name, data in required_data_by_analysis.items():
-        has_data = not isinstance(data, Unavailable)
-        count_text = (
-            f"{len(data)} {REQUIRED_SAMPLES_BY_ANALYSIS[name]}"
-            if isinstance(data, pd.DataFrame)
-            else ""
-        )
-        yield _make_analysis_option(
-            name, NO_COMPARISON if comparison is None and has_data else data, count_text
-        )
+    for (name, sample_text), data in zip(
+        REQUIRED_SAMPLES_BY_ANALYSIS.items(), required_data, strict=True
+    ):
+        count_text = f"{len(data)} {sample_text}" if isinstance(data, pd.DataFrame) else ""
+        yield _make_analysis_option(name, data, count_text)
 
 
 def _collect_logging_advice(

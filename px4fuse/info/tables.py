@@ -16,7 +16,14 @@ from px4fuse.comparison.preparation import choose_source, select_source_innovati
 from px4fuse.core.text import to_json_types
 from px4fuse.errors import MissingDataError
 from px4fuse.filter.signals import compute_ned_acceleration, imu_and_attitude
-from px4fuse.flight.model import Ekf2, Flight, PositionTrack, Truth, Unavailable
+from px4fuse.flight.model import (
+    DataSource,
+    Ekf2,
+    Flight,
+    PositionTrack,
+    Truth,
+    Unavailable,
+)
 
 SCHEMA_NAME = "px4fuse-flight"
 SCHEMA_VERSION = "1.0"
@@ -39,12 +46,32 @@ NO_POSITION = Unavailable(
 
 
 @dataclass(frozen=True)
-class DescribedTable:
-    """Exported table with a description of its columns."""
+class ExportedTable:
+    """Table with its name, and the topics and clock of its data (``stream``).
+
+    ``kind`` is the name of the table in columns.csv; by default ``name``.
+    """
 
     name: str
     data: pd.DataFrame
-    column_descriptions: pd.DataFrame
+    stream: DataSource | PositionTrack | None = None
+    kind: str = ""
+
+    def describe_columns(self) -> pd.DataFrame:
+        """Return unit, frame, meaning, topic and clock of each column."""
+        # Tables without time have the default index
+        kinds = [] if isinstance(self.data.index, pd.RangeIndex) else ["any table"]
+        descriptions = _read_column_descriptions().loc[[*kinds, self.kind or self.name]]
+        return descriptions.map(lambda cell: cell.format(track=self.stream)).assign(
+            table=self.name,
+            source_topic=" ".join(self.stream.topics) if self.stream else "",
+            clock=self.stream.clock if self.stream else "",
+        )
+
+    def format_rows(self) -> pd.DataFrame:
+        """Return the described columns of the table, with the time (s) in the first column."""
+        rows = self.data.rename_axis("time_s").reset_index()
+        return rows.reindex(columns=[*self.describe_columns()["column"]])
 
 
 def add_source_innovations(flight: Flight) -> Flight:
@@ -60,15 +87,15 @@ def tables(flight: Flight) -> Mapping[str, pd.DataFrame]:
 
     Missing data have no table.
     """
-    return {table.name: table.data for table in _make_described_tables(flight)}
+    return {table.name: table.format_rows() for table in _make_tables(flight)}
 
 
 def data_dictionary(flight: Flight) -> pd.DataFrame:
     """Describe each column of all tables: unit, frame, meaning, topic and clock."""
-    descriptions = [table.column_descriptions for table in _make_described_tables(flight)]
-    if not descriptions:
-        return pd.DataFrame(columns=COLUMN_DESCRIPTION_FIELDS)
-    return pd.concat(descriptions, ignore_index=True)[COLUMN_DESCRIPTION_FIELDS]
+    descriptions = [table.describe_columns() for table in _make_tables(flight)]
+    return pd.concat([*descriptions, pd.DataFrame()], ignore_index=True).reindex(
+        columns=COLUMN_DESCRIPTION_FIELDS
+    )
 
 
 def to_bytes(table: pd.DataFrame, file_format: str) -> bytes:
@@ -125,99 +152,57 @@ def _read_column_descriptions() -> pd.DataFrame:
     return pd.read_csv(StringIO("\n".join(csv_lines)), index_col="table", keep_default_na=False)
 
 
-def _describe_table(
-    name: str,
-    data: pd.DataFrame,
-    topics_and_clock: tuple[tuple[str, ...], str] = ((), ""),
-    name_in_columns_csv: str = "",
-    **placeholder_values: str,
-) -> DescribedTable:
-    """Add column descriptions from columns.csv to a table, and remove other columns.
-
-    Parameters
-    ----------
-    name_in_columns_csv : str
-        Name of the table in columns.csv; by default ``name``.
-    placeholder_values : str
-        Texts that replace names in braces in columns.csv.
-    """
-    csv_table_names = ["any table"] * ("time_s" in data) + [name_in_columns_csv or name]
-    column_descriptions = (
-        _read_column_descriptions()
-        .loc[csv_table_names]
-        .map(lambda cell: cell.format(**placeholder_values))
-    )
-    topics, clock_name = topics_and_clock
-    column_descriptions = column_descriptions.assign(
-        table=name, source_topic=" ".join(topics), clock=clock_name
-    )
-    described_data = data.reindex(columns=[*column_descriptions["column"]])
-    return DescribedTable(name, described_data, column_descriptions)
+def _make_stream_tables(
+    flight: Flight, data_by_stream: Mapping[str, pd.DataFrame | Unavailable]
+) -> Iterator[ExportedTable]:
+    """Yield a table for each stream of a flight; missing data have no table."""
+    for name, data in data_by_stream.items():
+        if isinstance(data, pd.DataFrame):
+            yield ExportedTable(name, data, flight.streams.get(name))
 
 
-def _make_stream_table(
-    flight: Flight, name: str, data: pd.DataFrame | Unavailable
-) -> Iterator[DescribedTable]:
-    if isinstance(data, pd.DataFrame):
-        yield _describe_table(name, _with_time_column(data), _find_topics_and_clock(flight, name))
+def _make_time_table(columns: list[str], rows: Iterable[tuple[float, ...]]) -> pd.DataFrame:
+    """Return a table with times (s) as index, which are the first value of each row."""
+    return pd.DataFrame(list(rows), columns=["time_s", *columns], dtype=float).set_index("time_s")
 
 
-def _with_time_column(data: pd.DataFrame) -> pd.DataFrame:
-    return data.rename_axis("time_s").reset_index()
-
-
-def _make_described_tables(flight: Flight) -> Iterator[DescribedTable]:
+def _make_tables(flight: Flight) -> Iterator[ExportedTable]:
     imu = flight.imu
-    yield from _make_stream_table(
-        flight, "imu", imu if isinstance(imu, Unavailable) else imu.astype(np.float64)
-    )
-    yield from _make_stream_table(flight, "attitude", flight.attitude)
+    imu = imu if isinstance(imu, Unavailable) else imu.astype(np.float64)
+    yield from _make_stream_tables(flight, {"imu": imu, "attitude": flight.attitude})
     acceleration = compute_ned_acceleration(flight)
     if isinstance(acceleration, pd.DataFrame):
         acceleration = acceleration.set_axis(["north_m_s2", "east_m_s2", "down_m_s2"], axis=1)
-        imu_topics, imu_clock_name = _find_topics_and_clock(flight, "imu")
-        attitude_topics, _ = _find_topics_and_clock(flight, "attitude")
-        yield _describe_table(
-            "acceleration_ned",
-            _with_time_column(acceleration),
-            ((*imu_topics, *attitude_topics), imu_clock_name),
+        no_source = DataSource((), "", "")
+        imu_source, attitude_source = (
+            flight.streams.get(name, no_source) for name in ("imu", "attitude")
+        )
+        topics = (*imu_source.topics, *attitude_source.topics)
+        yield ExportedTable(
+            "acceleration_ned", acceleration, DataSource(topics, imu_source.clock, "")
         )
     for name, track in _list_tracks_with_table_names(flight):
-        placeholder_values = {"frame": track.frame, "description": track.description}
-        topics_and_clock = (track.topics, track.clock)
-        position_table = _with_time_column(track.samples)
-        yield _describe_table(
-            name, position_table, topics_and_clock, "position", **placeholder_values
-        )
+        yield ExportedTable(name, track.samples, track, "position")
         if track.orientation is not None:
-            yield _describe_table(
-                name.replace("position_", "orientation_", 1),
-                _with_time_column(track.orientation),
-                topics_and_clock,
-                "orientation",
-                **placeholder_values,
-            )
+            orientation_name = name.replace("position_", "orientation_", 1)
+            yield ExportedTable(orientation_name, track.orientation, track, "orientation")
     if isinstance(flight.ekf2, Ekf2):
         yield from _make_ekf2_tables(flight, flight.ekf2)
     if isinstance(flight.truth, Truth):
-        yield from _make_stream_table(flight, "truth", flight.truth.samples)
-    log = flight.log
+        yield from _make_stream_tables(flight, {"truth": flight.truth.samples})
     if not isinstance(flight.airborne, Unavailable):
-        airborne_table = _make_numeric_table(["time_s", "end_s"], flight.airborne)
-        yield _describe_table(
-            "airborne", airborne_table, _find_topics_and_clock(flight, "airborne")
-        )
-    if log.dropouts:
-        rows = [(dropout.start_s, dropout.duration_s) for dropout in log.dropouts]
-        yield _describe_table("dropouts", _make_numeric_table(["time_s", "duration_s"], rows))
+        airborne = _make_time_table(["end_s"], flight.airborne)
+        yield from _make_stream_tables(flight, {"airborne": airborne})
+    if flight.log.dropouts:
+        rows = ((dropout.start_s, dropout.duration_s) for dropout in flight.log.dropouts)
+        yield ExportedTable("dropouts", _make_time_table(["duration_s"], rows))
     if parameters := _collect_logged_parameters(flight):
-        yield _describe_table(
-            "parameters", pd.DataFrame(parameters.items(), columns=["name", "value"])
-        )
+        parameter_table = pd.DataFrame(parameters.items(), columns=["name", "value"])
+        yield ExportedTable("parameters", parameter_table)
     if flight.clocks:
         clock_table = pd.DataFrame([structs.asdict(clock) for clock in flight.clocks])
         # float, because the number of distinct timestamps may be NaN
-        yield _describe_table("clocks", clock_table.astype({"distinct_stamps": np.float64}))
+        yield ExportedTable("clocks", clock_table.astype({"distinct_stamps": np.float64}))
 
 
 def _collect_logged_parameters(flight: Flight) -> dict[str, float]:
@@ -230,37 +215,31 @@ def _collect_logged_parameters(flight: Flight) -> dict[str, float]:
     return logged_values
 
 
-def _make_numeric_table(columns: list[str], rows: Iterable[tuple[float, ...]]) -> pd.DataFrame:
-    return pd.DataFrame(list(rows), columns=columns, dtype=np.float64)
-
-
-def _make_ekf2_tables(flight: Flight, ekf2: Ekf2) -> Iterator[DescribedTable]:
-    yield from _make_stream_table(flight, "ekf2_state", ekf2.state)
-    yield from _make_stream_table(flight, "ekf2_variance", ekf2.variance)
+def _make_ekf2_tables(flight: Flight, ekf2: Ekf2) -> Iterator[ExportedTable]:
     axis_tables = [
         axis_innovations.assign(axis=axis)
         for axis, axis_innovations in ekf2.innovations.items()
         if isinstance(axis_innovations, pd.DataFrame)
     ]
+    data_by_stream = {"ekf2_state": ekf2.state, "ekf2_variance": ekf2.variance}
     if axis_tables:
-        innovation_table = pd.concat(axis_tables).sort_index(kind="stable")
-        yield from _make_stream_table(flight, "ekf2_innovations", innovation_table)
-    yield from _make_stream_table(flight, "ekf2_fusing", ekf2.fusion_flags)
-    topics_and_clock = _find_topics_and_clock(flight, "ekf2_state")
-    delta_rows = [reset.delta for reset in ekf2.resets]
-    reset_table = _make_numeric_table(["delta_north", "delta_east", "delta_down"], delta_rows)
-    reset_table["time_s"] = np.array([reset.time_s for reset in ekf2.resets], np.float64)
-    reset_table["quantity"] = np.array([reset.quantity for reset in ekf2.resets], object)
-    yield _describe_table("resets", reset_table, topics_and_clock)
+        data_by_stream["ekf2_innovations"] = pd.concat(axis_tables).sort_index(kind="stable")
+    data_by_stream["ekf2_fusing"] = ekf2.fusion_flags
+    yield from _make_stream_tables(flight, data_by_stream)
+    state_source = flight.streams.get("ekf2_state")
+    resets = _make_time_table(
+        ["delta_north", "delta_east", "delta_down"],
+        ((reset.time_s, *reset.delta) for reset in ekf2.resets),
+    )
+    resets["quantity"] = np.array([reset.quantity for reset in ekf2.resets], object)
+    yield ExportedTable("resets", resets, state_source)
     # the first instance starts at minus infinity, but the table needs a finite time
     first_time_s = min(float(ekf2.state.index[0]), 0.0)
-    instance_rows = [
-        (max(time_s, first_time_s), instance) for time_s, instance in ekf2.primary_instances
-    ]
-    instance_table = _make_numeric_table(["time_s", "instance"], instance_rows).astype(
-        {"instance": np.int64}
+    instances = _make_time_table(
+        ["instance"],
+        ((max(time_s, first_time_s), instance) for time_s, instance in ekf2.primary_instances),
     )
-    yield _describe_table("instances", instance_table, topics_and_clock)
+    yield ExportedTable("instances", instances.astype(np.int64), state_source)
 
 
 def _list_tracks_with_table_names(flight: Flight) -> Iterator[tuple[str, PositionTrack]]:
@@ -277,8 +256,3 @@ def _list_tracks_with_table_names(flight: Flight) -> Iterator[tuple[str, Positio
             name = f"{stem}_{number}"
         used_names.add(name.lower())
         yield name, track
-
-
-def _find_topics_and_clock(flight: Flight, stream_name: str) -> tuple[tuple[str, ...], str]:
-    stream = flight.streams.get(stream_name)
-    return ((), "") if stream is None else (stream.topics, stream.clock)

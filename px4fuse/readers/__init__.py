@@ -10,14 +10,6 @@ from px4fuse.readers.text_table import refuse_foreign_format
 # Number of bytes that are read to detect the format of a file
 _FORMAT_DETECTION_BYTES = 100
 ULOG_MAGIC = b"\x55\x4c\x6f\x67\x01\x12\x35"
-# Advice for text files that users give instead of a flight log
-_ADVICE_BY_TEXT_SUFFIX = {
-    (".csv", ".tsv", ".jsonl"): (
-        "table",
-        "If the table contains positions, use px4fuse compare LOG --position {name}.",
-    ),
-    (".tum", ".g2o"): ("trajectory or pose graph", "Use px4fuse evaluate or px4fuse loop {name}."),
-}
 
 
 def read_log(path: str | Path, *, system: int | None = None) -> Flight:
@@ -50,11 +42,17 @@ def read_log(path: str | Path, *, system: int | None = None) -> Flight:
 
         return read_ulog(name, read_log_bytes(path))
     refuse_foreign_format(path, first_bytes, LogError)
-    for suffixes, (file_kind, advice) in _ADVICE_BY_TEXT_SUFFIX.items():
-        if path.suffix.lower() in suffixes and first_bytes.isascii():
-            raise LogError(
-                f"{name}: the file is a {file_kind}, not a flight log", advice.format(name=name)
-            )
+    text_suffix = path.suffix.lower() if first_bytes.isascii() else ""
+    if text_suffix in (".csv", ".tsv", ".jsonl"):
+        raise LogError(
+            f"{name}: the file is a table, not a flight log",
+            f"If the table contains positions, use px4fuse compare LOG --position {name}.",
+        )
+    if text_suffix in (".tum", ".g2o"):
+        raise LogError(
+            f"{name}: the file is a trajectory or pose graph, not a flight log",
+            f"Use px4fuse evaluate or px4fuse loop {name}.",
+        )
     from px4fuse.readers.mavlink import read_mavlink  # noqa: PLC0415
 
     return read_mavlink(name, read_log_bytes(path), system)

@@ -100,25 +100,24 @@ def classify_invalid_positions(samples: pd.DataFrame, columns: list[str]) -> "pd
         )
         reason_by_row.iloc[valid_rows[is_far_from_median]] = "far"
         valid_rows = valid_rows[~is_far_from_median]
+    if len(valid_rows) < 2:
+        return reason_by_row
+    valid_times_s = time_s[valid_rows]
     is_repeated = np.all(np.diff(values[valid_rows], axis=0) == 0.0, axis=1)
     run_starts = np.flatnonzero(np.append(True, ~is_repeated))
+    run_ends = np.append(run_starts[1:], len(valid_rows))
     # Longest likely sequence of equal positions if the source repeats positions at random
-    repeated_position_fraction = (
-        np.clip(np.mean(is_repeated), 1e-6, 1.0 - 1e-6) if len(is_repeated) else 0.5
+    repeated_fraction = np.clip(np.mean(is_repeated), 1e-6, 1.0 - 1e-6)
+    max_random_run_length = np.log(len(valid_rows) / MAX_FALSE_FROZEN_PROBABILITY) / -np.log(
+        repeated_fraction
     )
-    max_random_run_length = np.log(
-        max(len(valid_rows), 1) / MAX_FALSE_FROZEN_PROBABILITY
-    ) / -np.log(repeated_position_fraction)
-    frozen_rows = [
-        valid_rows[run_start + 1 : run_end]
-        for run_start, run_end in zip(run_starts, [*run_starts[1:], len(valid_rows)], strict=True)
-        if run_end - run_start >= max(MIN_FROZEN_POSITION_COUNT, max_random_run_length)
-        and np.ptp(time_s[valid_rows[run_start:run_end]]) >= MIN_FROZEN_S
-    ]
-    if frozen_rows and len(rows := np.concatenate(frozen_rows)) < MAX_FROZEN_FRACTION * len(
-        valid_rows
-    ):
-        reason_by_row.iloc[rows] = "held"
+    run_lengths = run_ends - run_starts
+    is_frozen_run = (run_lengths >= max(MIN_FROZEN_POSITION_COUNT, max_random_run_length)) & (
+        valid_times_s[run_ends - 1] - valid_times_s[run_starts] >= MIN_FROZEN_S
+    )
+    is_frozen = np.append(False, is_repeated) & np.repeat(is_frozen_run, run_lengths)
+    if np.mean(is_frozen) < MAX_FROZEN_FRACTION:
+        reason_by_row.iloc[valid_rows[is_frozen]] = "held"
     return reason_by_row
 
 
@@ -130,10 +129,10 @@ def estimate_rounding_step(values: Array) -> float:
     # The quotients may overflow to infinity or NaN. The values are then not rounded
     with np.errstate(over="ignore", invalid="ignore"):
         step_counts = differences / differences.min()
-        is_multiple_of_step = (
-            np.abs(step_counts - np.rint(step_counts)) < MAX_DIFFERENCE_FROM_INTEGER
-        )
-    return float(differences.min()) if is_multiple_of_step.all() else 0.0
+        rounding_errors = np.abs(step_counts - np.rint(step_counts))
+    return (
+        float(differences.min()) if (rounding_errors < MAX_DIFFERENCE_FROM_INTEGER).all() else 0.0
+    )
 
 
 def interpolate_inside(time_s: pd.Index | Array, values: "pd.Series[float]") -> Array:

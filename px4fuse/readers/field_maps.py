@@ -28,6 +28,8 @@ class Layout:
     optional_columns: Mapping[str, str] = field(default_factory=dict)
     # Factor from the message field to the unit of each column; 1 if absent
     scale: Mapping[str, float] = field(default_factory=dict)
+    # True if a value is valid until the next sample
+    is_step_function: bool = False
 
 
 def expand_layouts(toml_tables: Mapping[str, Any]) -> dict[str, Layout]:

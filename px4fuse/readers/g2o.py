@@ -1,32 +1,28 @@
 """Reader and writer of pose graphs in the g2o text format (SE2 and SE3)."""
 
 import re
+from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
 
-from px4fuse.core.arrays import Array, IntArray
+from px4fuse.core.arrays import Array, BoolArray, IntArray
 from px4fuse.core.reading import display_name, read_bytes_limited
 from px4fuse.errors import TrajectoryError
-from px4fuse.readers.text_table import TextTableRows, decode_text, make_line_error, quote
+from px4fuse.readers.text_table import decode_text, is_number, quote
 from px4fuse.readers.trajectory import MAX_COORDINATE_M, UNIT_NORM_TOLERANCE
 from px4fuse.trajectory.graph.initialisation import compute_initial_poses
 from px4fuse.trajectory.graph.model import INITIAL_POSES_FROM_FILE, PoseGraph
 
 MAX_FILE_BYTES = 500_000_000
-# Number of vertex ids and number of values in a g2o line, by its first word
-_ID_AND_VALUE_COUNTS_BY_TAG = {
-    "VERTEX_SE2": (1, 3),
-    "VERTEX_SE3:QUAT": (1, 7),
-    "EDGE_SE2": (2, 3 + 6),
-    "EDGE_SE3:QUAT": (2, 7 + 21),
-}
+_TAGS = ("VERTEX_SE2", "VERTEX_SE3:QUAT", "EDGE_SE2", "EDGE_SE3:QUAT")
 # Ignored lines begin with these words: parameters and laser scans
 _SKIPPED_TAGS = ("PARAMS", "ROBOTLASER", "RAWLASER", "FLASER", "RLASER")
 _FORMAT_REMEDY = (
     "Give poses as VERTEX_SE2 or VERTEX_SE3:QUAT, and edges as EDGE_SE2 or EDGE_SE3:QUAT. Remove "
     "all other lines."
 )
+_LINE_REMEDY = "Correct or remove this line."
 _VERTEX_ID_PATTERN = re.compile("[+-]?[0-9]{1,19}")
 # Maximum vertex id: GTSAM writes 64-bit symbols, such as 6989586621679009792 for a0
 _MAX_VERTEX_ID = 2**63 - 1
@@ -55,38 +51,98 @@ def read_g2o(path: str | Path) -> PoseGraph:
     return parse_g2o(text, name)
 
 
+@dataclass(frozen=True)
+class _TaggedLines:
+    """Lines of a g2o file that begin with the same tag, such as EDGE_SE2."""
+
+    file_name: str
+    # Line number and text of each line
+    lines: list[tuple[int, str]]
+
+    def raise_where(self, is_invalid: BoolArray, fault: str, remedy: str = _LINE_REMEDY) -> None:
+        """Raise TrajectoryError for the first invalid line, if any."""
+        for row in np.argwhere(is_invalid)[:1, 0].tolist():
+            raise _make_line_error(self.file_name, self.lines[row][0], fault, remedy)
+
+    def parse(self, id_count: int, value_count: int) -> tuple[IntArray, Array]:
+        """Return the vertex ids, shape (n, id_count), and the other values of all lines.
+
+        Raises
+        ------
+        TrajectoryError
+            A line has the wrong number of columns, or a value is not valid.
+        """
+        texts = [text for _, text in self.lines]
+        columns = [("tag", "U1"), ("ids", "U80", (id_count,)), ("values", "f8", (value_count,))]
+        try:
+            table = np.loadtxt(texts, dtype=columns, ndmin=1)
+        except ValueError:
+            column_count = 1 + id_count + value_count
+            invalid_rows = (
+                row
+                for row, cells in enumerate(map(str.split, texts))
+                if len(cells) != column_count or not all(map(is_number, cells[1 + id_count :]))
+            )
+            line_number, text = self.lines[next(invalid_rows, 0)]
+            fault = f"{quote(text)} does not have {column_count} columns with numbers"
+            raise _make_line_error(self.file_name, line_number, fault) from None
+        ids, values = table["ids"], np.ascontiguousarray(table["values"])
+        is_invalid_id = [
+            _VERTEX_ID_PATTERN.fullmatch(id_text) is None or abs(int(id_text)) > _MAX_VERTEX_ID
+            for id_text in ids.flat
+        ]
+        self.raise_where(
+            np.reshape(is_invalid_id, ids.shape),
+            "a vertex id is not a 64-bit integer",
+            "Give an integer as vertex id.",
+        )
+        self.raise_where(~np.isfinite(values), "the line contains a number that is not finite")
+        # The first three values are x, y, z (m), or x, y (m) and angle (rad)
+        self.raise_where(
+            np.abs(values[:, :3]) >= MAX_COORDINATE_M,
+            f"a position (m) or angle (rad) is outside ±{MAX_COORDINATE_M:.0e}",
+        )
+        return ids.astype(np.int64), values
+
+
+def _make_line_error(
+    name: str, line_number: int, fault: str, remedy: str = _LINE_REMEDY
+) -> TrajectoryError:
+    return TrajectoryError(f"{name}, line {line_number}: {fault}", remedy)
+
+
 def parse_g2o(text: str, name: str) -> PoseGraph:
     """Parse the text of a g2o file. ``name`` is the file name for error messages."""
-    rows_by_tag = _group_rows_by_tag(text, name)
-    is_2d = any(rows.lines for tag, rows in rows_by_tag.items() if tag.endswith("SE2"))
-    dimension, pose_type, values_per_pose = (2, "SE2", 3) if is_2d else (3, "SE3:QUAT", 7)
-    for tag, rows in rows_by_tag.items():
-        if rows.lines and not tag.endswith(pose_type):
-            raise rows.make_row_error(
-                0,
+    lines_by_tag = _group_lines_by_tag(text, name)
+    is_2d = any(tagged.lines for tag, tagged in lines_by_tag.items() if tag.endswith("SE2"))
+    dimension, pose_type, pose_value_count = (2, "SE2", 3) if is_2d else (3, "SE3:QUAT", 7)
+    for tag, tagged in lines_by_tag.items():
+        if not tag.endswith(pose_type):
+            tagged.raise_where(
+                np.ones(len(tagged.lines), bool),
                 "the file contains 2D entries (SE2) and 3D entries (SE3)",
                 "Keep only the 2D or only the 3D entries.",
             )
-    vertices = rows_by_tag[f"VERTEX_{pose_type}"]
-    edges = rows_by_tag[f"EDGE_{pose_type}"]
+    vertices, edges = lines_by_tag[f"VERTEX_{pose_type}"], lines_by_tag[f"EDGE_{pose_type}"]
     if not edges.lines:
         raise TrajectoryError(f"{name} contains no edges", _FORMAT_REMEDY)
-    edge_vertex_ids, edge_values = _parse_rows(edges, f"EDGE_{pose_type}")
-    ids = np.unique(edge_vertex_ids)
-    poses = np.zeros((len(ids), values_per_pose))
-    poses[:, 6:] = 1.0  # the identity rotation has w = 1
+    information_size = 3 * (dimension - 1)
+    information_value_count = len(np.triu_indices(information_size)[0])
+    edge_vertex_ids, edge_values = edges.parse(2, pose_value_count + information_value_count)
     if vertices.lines:
-        vertex_ids, poses = _parse_rows(vertices, f"VERTEX_{pose_type}")
-        order_by_vertex_id = np.argsort(vertex_ids[:, 0], kind="stable")
-        ids = vertex_ids[order_by_vertex_id, 0]
-        poses = _normalise_quaternions(vertices, poses)[order_by_vertex_id]
-        is_repeated = np.zeros(len(ids), bool)
-        is_repeated[order_by_vertex_id[1:]] = ids[1:] == ids[:-1]
+        vertex_ids, poses = vertices.parse(1, pose_value_count)
+        poses = _normalise_quaternions(vertices, poses)
+        ids, first_rows = np.unique(vertex_ids, return_index=True)
         vertices.raise_where(
-            is_repeated,
+            ~np.isin(np.arange(len(vertex_ids)), first_rows),
             "another line defines the vertex with this id",
             "Keep only one of the lines with this id.",
         )
+        poses = poses[first_rows]
+    else:
+        ids = np.unique(edge_vertex_ids)
+        poses = np.zeros((len(ids), pose_value_count))
+        poses[:, 6:] = 1.0  # the identity rotation has w = 1
     vertex_indices = np.minimum(np.searchsorted(ids, edge_vertex_ids), len(ids) - 1)
     edges.raise_where(
         ids[vertex_indices] != edge_vertex_ids,
@@ -104,9 +160,9 @@ def parse_g2o(text: str, name: str) -> PoseGraph:
         poses=poses,
         first_nodes=vertex_indices[:, 0],
         second_nodes=vertex_indices[:, 1],
-        measurements=_normalise_quaternions(edges, edge_values[:, :values_per_pose]),
+        measurements=_normalise_quaternions(edges, edge_values[:, :pose_value_count]),
         information=_make_information_matrices(
-            edges, edge_values[:, values_per_pose:], 3 if dimension == 2 else 6
+            edges, edge_values[:, pose_value_count:], information_size
         ),
         initial_pose_origin=INITIAL_POSES_FROM_FILE,
     )
@@ -138,20 +194,20 @@ def format_g2o(graph: PoseGraph) -> str:
     return "\n".join(lines) + "\n"
 
 
-def _group_rows_by_tag(text: str, name: str) -> dict[str, TextTableRows]:
-    rows_by_tag = {tag: TextTableRows(name) for tag in _ID_AND_VALUE_COUNTS_BY_TAG}
+def _group_lines_by_tag(text: str, name: str) -> dict[str, _TaggedLines]:
+    lines_by_tag = {tag: _TaggedLines(name, []) for tag in _TAGS}
     fixed_ids: set[str] = set()
     for line_number, raw_line in enumerate(text.split("\n"), start=1):
         line = raw_line.partition("#")[0].strip()
         if not line:
             continue
-        tag, *values = line.split(maxsplit=1)
-        if tag in rows_by_tag:
-            rows_by_tag[tag].lines.append((line_number, line))
+        tag, *values = line.split()
+        if tag in lines_by_tag:
+            lines_by_tag[tag].lines.append((line_number, line))
         elif tag == "FIX":
-            fixed_ids.update(" ".join(values).split())
+            fixed_ids.update(values)
             if len(fixed_ids) > 1:
-                raise make_line_error(
+                raise _make_line_error(
                     name,
                     line_number,
                     "the file fixes a second vertex (tag FIX), but only one can be fixed",
@@ -159,40 +215,16 @@ def _group_rows_by_tag(text: str, name: str) -> dict[str, TextTableRows]:
                 )
         elif not tag.startswith(_SKIPPED_TAGS):
             fault = f"lines with the tag {quote(tag)} are not supported"
-            raise make_line_error(name, line_number, fault, _FORMAT_REMEDY)
-    return rows_by_tag
+            raise _make_line_error(name, line_number, fault, _FORMAT_REMEDY)
+    return lines_by_tag
 
 
-def _parse_rows(rows: TextTableRows, tag: str) -> tuple[IntArray, Array]:
-    """Return the vertex ids, shape (n, 1 or 2), and the numbers of all lines."""
-    vertex_count, value_count = _ID_AND_VALUE_COUNTS_BY_TAG[tag]
-    cells, numbers = rows.parse(1 + vertex_count, value_count)
-    is_invalid_id = [
-        _VERTEX_ID_PATTERN.fullmatch(id_text) is None or abs(int(id_text)) > _MAX_VERTEX_ID
-        for id_text in cells[:, 1:].flat
-    ]
-    rows.raise_where(
-        np.reshape(is_invalid_id, (-1, vertex_count)),
-        "a vertex id is not a 64-bit integer",
-        "Give an integer as vertex id.",
-    )
-    remedy = "Correct or remove this line."
-    rows.raise_where(~np.isfinite(numbers), "the line contains a number that is not finite", remedy)
-    # The first three numbers are x, y, z (m), or x, y (m) and angle (rad)
-    rows.raise_where(
-        np.abs(numbers[:, :3]) >= MAX_COORDINATE_M,
-        f"a position (m) or angle (rad) is outside ±{MAX_COORDINATE_M:.0e}",
-        remedy,
-    )
-    return cells[:, 1:].astype(np.int64), numbers
-
-
-def _normalise_quaternions(rows: TextTableRows, poses: Array) -> Array:
+def _normalise_quaternions(lines: _TaggedLines, poses: Array) -> Array:
     if poses.shape[1] == 3:
         return poses
     with np.errstate(over="ignore"):
         quaternion_norms = np.linalg.norm(poses[:, 3:], axis=1)
-    rows.raise_where(
+    lines.raise_where(
         (quaternion_norms < 1e-6) | ~(quaternion_norms < 1e6),
         "the quaternion does not have unit length",
         "Give the unit quaternion qx qy qz qw after the position.",
@@ -202,7 +234,7 @@ def _normalise_quaternions(rows: TextTableRows, poses: Array) -> Array:
     return np.hstack([poses[:, :3], poses[:, 3:] / quaternion_norms[:, None]])
 
 
-def _make_information_matrices(edges: TextTableRows, numbers: Array, dimension: int) -> Array:
+def _make_information_matrices(edges: _TaggedLines, numbers: Array, dimension: int) -> Array:
     """Return the information matrices, shape (n, dimension, dimension).
 
     ``numbers`` contains the upper triangle of each matrix, row by row.

@@ -107,17 +107,16 @@ def read_mavlink(name: str, content: bytes, system_id: int | None = None) -> Fli
 
 
 def _read_imu(recording: Recording, remedy: str) -> TableOrUnavailable:
-    layouts_with_rows = [(layout, recording.rows(layout.topic)) for layout in messages.IMU_LAYOUTS]
     # HIGHRES_IMU is preferred, because it has SI units and µs timestamps
-    layout, rows = layouts_with_rows[0]
-    if len(rows) < 2:
-        layout, rows = max(layouts_with_rows, key=lambda layout_rows: len(layout_rows[1]))
+    layout = messages.IMU_LAYOUTS[0]
+    if len(recording.rows(layout.topic)) < 2:
+        layout = recording.find_most_frequent(messages.IMU_LAYOUTS)
+    rows = recording.rows(layout.topic)
     if len(rows) < 2:
         return Unavailable("IMU", "the recording has no HIGHRES_IMU or SCALED_IMU", remedy)
-    table = recording.frames.table(layout.topic, rows)
-    if "id" in (table.dtype.names or ()):
-        rows = rows[table["id"] == np.bincount(table["id"]).argmax()]
-    del table
+    if layout == messages.IMU_LAYOUTS[0]:
+        imu_ids = np.array(recording.frames.table(layout.topic, rows)["id"])
+        rows = rows[imu_ids == np.bincount(imu_ids).argmax()]
     imu = recording.read(layout, rows)
     imu = common.select_valid_rows(imu, imu.columns.tolist(), common.MAX_IMU_READING)
     if len(imu) < 2:
@@ -131,7 +130,7 @@ def _read_imu(recording: Recording, remedy: str) -> TableOrUnavailable:
 
 
 def _read_attitude(recording: Recording, remedy: str) -> TableOrUnavailable:
-    layout = max(messages.ATTITUDE_LAYOUTS, key=lambda layout: len(recording.rows(layout.topic)))
+    layout = recording.find_most_frequent(messages.ATTITUDE_LAYOUTS)
     attitude = common.select_rows_with_attitude(recording.read(layout))[Columns.QUATERNION]
     if len(attitude) < 2:
         names = " or ".join(layout.topic for layout in messages.ATTITUDE_LAYOUTS)
@@ -144,14 +143,11 @@ def _read_ekf2(
     recording: Recording, parameters: Mapping[str, float], autopilot: str
 ) -> Ekf2 | Unavailable:
     remedies, replay_unavailable = messages.remedies_of_autopilot(autopilot)
-    odometry_layout, local_position_layout = messages.STATE_LAYOUTS
-    odometry_count, local_position_count = (
-        len(recording.rows(layout.topic)) for layout in messages.STATE_LAYOUTS
-    )
+    layout, local_position_layout = messages.STATE_LAYOUTS
     # ODOMETRY has variances, so it is preferred unless its rate is much lower
-    layout = (
-        odometry_layout if 2 * odometry_count >= local_position_count else local_position_layout
-    )
+    local_position_count = len(recording.rows(local_position_layout.topic))
+    if 2 * len(recording.rows(layout.topic)) < local_position_count:
+        layout = local_position_layout
     message_name = layout.topic
     if len(recording.rows(message_name)) < 2:
         return Unavailable(
@@ -271,22 +267,18 @@ def _describe_log(
     damage_notes = []
     if frames.is_last_frame_incomplete:
         damage_notes.append(common.format_truncation("frame", recording.duration_s, is_in_flight))
-    firmware = f"{autopilot}, unknown version"
-    firmware_hash = "unknown"
-    vehicle_id = ""
-    version_rows = recording.rows("AUTOPILOT_VERSION")
-    if len(version_rows):
-        version = frames.table("AUTOPILOT_VERSION", version_rows[:1])[0]
+    firmware, firmware_hash, vehicle_id = f"{autopilot}, unknown version", "unknown", ""
+    for version in frames.table("AUTOPILOT_VERSION", recording.rows("AUTOPILOT_VERSION")[:1]):
         major, minor, patch, _ = int(version["flight_sw_version"]).to_bytes(4, "big")
         if major or minor or patch:
             firmware = f"{autopilot} v{major}.{minor}.{patch}"
-        hash_hex = bytes(version["flight_custom_version"][::-1]).hex()
-        firmware_hash = hash_hex if hash_hex.strip("0") else "unknown"
-        hardware_id = bytes(version["uid2"]).hex()
-        vehicle_id = hardware_id if hardware_id.strip("0") else ""
+        if version["flight_custom_version"].any():
+            firmware_hash = bytes(version["flight_custom_version"][::-1]).hex()
+        if version["uid2"].any():
+            vehicle_id = bytes(version["uid2"]).hex()
     vehicle_types = frames.table("HEARTBEAT", recording.rows("HEARTBEAT"))["type"].tolist()
     vehicle_name = VEHICLE_TYPES.get(next(iter(vehicle_types), -1), "vehicle")
-    dropped_message_counts = sorted(recording.dropped_count_by_message.items())
+    dropped_counts = dict(sorted(recording.dropped_count_by_message.items()))
     return LogInfo(
         name=frames.name,
         sha256=frames.sha256,
@@ -301,11 +293,11 @@ def _describe_log(
         notes=(
             *recording.notes,
             *replaced_parameter_notes,
-            *describe_dropped_samples(dropped_message_counts),
+            *describe_dropped_samples(dropped_counts),
         ),
         restarts=recording.restart_count,
         receive_time_reversals=recording.receive_time_reversal_count,
-        dropped=dict(dropped_message_counts),
+        dropped=dropped_counts,
         autopilot=autopilot,
         start_unix_s=_estimate_start_unix_s(recording),
         senders=senders.describe_senders(recording),
@@ -320,13 +312,10 @@ def _estimate_start_unix_s(recording: Recording) -> float | None:
     """Return the UNIX time (s) at flight time zero; None if the recording has no UNIX time."""
     if recording.time_origin_s >= MIN_UNIX_TIME_S:
         return recording.time_origin_s
-    boot_to_unix_fit = map_boot_to_unix(recording)
-    if boot_to_unix_fit is not None:
-        return float(boot_to_unix_fit.at(recording.time_origin_s))
     receive_times_us = recording.frames.receive_times_us
+    if boot_to_unix_fit := map_boot_to_unix(recording):
+        return float(boot_to_unix_fit.at(recording.time_origin_s))
     if receive_times_us is None or not recording.receipt_to_boot_fit.reading_pair_count:
         return None
-    return float(
-        receive_times_us[0] * 1e-6
-        + recording.receipt_to_boot_fit.inverse().at(recording.time_origin_s)
-    )
+    receipt_s = recording.receipt_to_boot_fit.inverse().at(recording.time_origin_s)
+    return float(receive_times_us[0] * 1e-6 + receipt_s)

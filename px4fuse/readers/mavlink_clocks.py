@@ -69,54 +69,32 @@ def fit_clock_line(x: Array, y: Array) -> ClockLine:
     The fit uses the readings with the least delay.
     """
     time_order = np.argsort(x, kind="stable")
-    x = x[time_order]
-    y = y[time_order]
-    x0 = float(x[len(x) // 2])
-    span_s = float(x[-1] - x[0])
+    x, y = x[time_order], y[time_order]
+    x0, span_s = float(x[len(x) // 2]), float(x[-1] - x[0])
     interval_count = int(np.clip(span_s / CLOCK_FIT_INTERVAL_S, 1, MAX_CLOCK_FIT_INTERVALS))
     interval_starts = np.searchsorted(x, np.linspace(x[0], x[-1], interval_count + 1)[1:-1])
     rows_by_interval = [rows for rows in np.split(np.arange(len(x)), interval_starts) if len(rows)]
-    slope = 1.0
     middle_rows = [rows[len(rows) // 2] for rows in rows_by_interval]
-    if len(middle_rows) > 1 and x[middle_rows[-1]] > x[middle_rows[0]]:
-        initial_slope = _compute_median_slope(x[middle_rows], y[middle_rows])
-        if abs(
-            initial_slope - 1.0
-        ) > MAX_RELATIVE_CLOCK_RATE_DIFFERENCE and _is_plausible_rate_ratio(initial_slope):
-            slope = initial_slope
-
-    def find_least_delays(slope: float) -> tuple[Array, list[int]]:
+    slope = _fit_clock_rate(x[middle_rows], y[middle_rows])
+    if abs(slope - 1.0) <= MAX_RELATIVE_CLOCK_RATE_DIFFERENCE:
+        slope = 1.0
+    # Fit the slope twice, because it affects the selection of messages with the least delay
+    for is_slope_final in (False, False, True):
         relative_delay_s = y - slope * (x - x0)
-        return relative_delay_s, [
-            rows[np.argmin(relative_delay_s[rows])] for rows in rows_by_interval
-        ]
-
-    relative_delay_s, least_delay_rows = find_least_delays(slope)
-    if span_s >= MIN_DRIFT_SPAN_S and len(least_delay_rows) > 1:
-        # Fit the slope twice, because it affects the selection of messages with the least delay
-        for _ in range(2):
-            corrected_slope = slope + _compute_median_slope(
-                x[least_delay_rows], relative_delay_s[least_delay_rows]
-            )
-            slope = corrected_slope if _is_plausible_rate_ratio(corrected_slope) else 1.0
-            relative_delay_s, least_delay_rows = find_least_delays(slope)
-    return ClockLine(
-        x0,
-        float(np.median(relative_delay_s[least_delay_rows])),
-        slope,
-        robust_std(relative_delay_s),
-        len(x),
-    )
+        least_delay_rows = [rows[np.argmin(relative_delay_s[rows])] for rows in rows_by_interval]
+        if not is_slope_final and span_s >= MIN_DRIFT_SPAN_S:
+            slope = _fit_clock_rate(x[least_delay_rows], relative_delay_s[least_delay_rows], slope)
+    y0 = float(np.median(relative_delay_s[least_delay_rows]))
+    return ClockLine(x0, y0, slope, robust_std(relative_delay_s), len(x))
 
 
-def _compute_median_slope(x: Array, y: Array) -> float:
-    """Return the Theil-Sen slope of y over x; not finite if all x are almost equal."""
+def _fit_clock_rate(x: Array, y: Array, added_rate: float = 0.0) -> float:
+    """Return the Theil-Sen slope of y over x plus ``added_rate``; 1 if it is not plausible."""
+    if len(x) < 2 or x[0] == x[-1]:
+        return 1.0
     with np.errstate(over="ignore", invalid="ignore"):
-        return float(theilslopes(y, x)[0])
-
-
-def _is_plausible_rate_ratio(slope: float) -> bool:
-    return 1.0 / MAX_RATIO_OF_CLOCK_RATES < slope < MAX_RATIO_OF_CLOCK_RATES
+        rate = float(theilslopes(y, x)[0]) + added_rate
+    return rate if 1.0 / MAX_RATIO_OF_CLOCK_RATES < rate < MAX_RATIO_OF_CLOCK_RATES else 1.0
 
 
 def is_running_clock(timestamps_s: Array) -> bool:
@@ -200,13 +178,9 @@ def map_clock_to_boot(
         difference_from_receipt_s <= MAX_BOOT_TIME_DIFFERENCE_S
         and reduction_by_timesync_s < MIN_REDUCTION_BY_TIMESYNC_S
     ):
-        sender_to_boot_fit = ClockLine(
-            float(timestamps_s[0]), float(timestamps_s[0]), 1.0, 0.0, len(timestamps_s)
-        )
+        same_clock = ClockLine(0.0, 0.0, 1.0, 0.0, len(timestamps_s))
         note = "the timestamps of the sender are boot times of the autopilot"
-        return ClockMapping(
-            sender_to_boot_fit, ClockMap(name, "boot clock", len(timestamps_s), 0.0, 0.0, 0.0, note)
-        )
+        return _make_clock_mapping(name, "boot clock", same_clock, timestamps_s, note)
     clock_kind = "UNIX time" if float(np.median(timestamps_s)) > MIN_UNIX_TIME_S else "clock"
     clock_name = f"{clock_kind} of {name}"
     candidate_fits = [] if timesync_fit is None else [("TIMESYNC", timesync_fit, "")]
@@ -221,9 +195,11 @@ def map_clock_to_boot(
         ):
             return _make_clock_mapping(clock_name, method, sender_to_boot_fit, timestamps_s, note)
     sender_to_boot_fit = fit_clock_line(timestamps_s, receive_times_s)
-    slope = sender_to_boot_fit.slope * receipt_to_boot_fit.slope
-    y0 = float(receipt_to_boot_fit.at(sender_to_boot_fit.y0))
-    sender_to_boot_fit = replace(sender_to_boot_fit, y0=y0, slope=slope)
+    sender_to_boot_fit = replace(
+        sender_to_boot_fit,
+        y0=float(receipt_to_boot_fit.at(sender_to_boot_fit.y0)),
+        slope=sender_to_boot_fit.slope * receipt_to_boot_fit.slope,
+    )
     note = (
         "the recording has no usable TIMESYNC or SYSTEM_TIME. All sample times are too late by the "
         "minimum delay of the link, which is unknown"

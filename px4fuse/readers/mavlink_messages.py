@@ -43,11 +43,11 @@ AUTOPILOT_MESSAGES = (
 class PositionMessageType:
     """MAVLink message with an external position for the autopilot: fields, frame and clock."""
 
+    # Name of the position source for the option --position-source
+    track_name: str
     # Name of the field definition in ``mavlink_messages.toml``
     layout_name: str
     description: str
-    # Name of the position source for the option --position-source
-    track_name: str = ""
     kind: str = "uwb"
     # Coordinate frame of the positions
     frame: str = "unknown"
@@ -83,17 +83,14 @@ class FrameConversion:
 
 _MESSAGE_TABLES = read_toml(__file__, dict[str, dict[str, Any]])
 MESSAGE_LAYOUTS = expand_layouts(_MESSAGE_TABLES["layouts"])
-assert not any(layout.optional_columns for layout in MESSAGE_LAYOUTS.values()), (
-    "mavlink_messages.toml has optional fields, which the MAVLink reader ignores"
-)
-_TYPE_BY_TRACK_NAME = msgspec.convert(_MESSAGE_TABLES["positions"], dict[str, PositionMessageType])
 CONVERSION_BY_MAV_FRAME = msgspec.convert(
     _MESSAGE_TABLES["frames"], dict[int, FrameConversion], strict=False
 )
 AUTOPILOT_NAME_BY_ID = msgspec.convert(_MESSAGE_TABLES["autopilots"], dict[int, str], strict=False)
 REASON_BY_UNUSED_MESSAGE: Mapping[str, str] = _MESSAGE_TABLES["unused"]
 POSITION_MESSAGE_TYPES = tuple(
-    replace(message, track_name=name) for name, message in _TYPE_BY_TRACK_NAME.items()
+    msgspec.convert({"track_name": name, **row}, PositionMessageType)
+    for name, row in _MESSAGE_TABLES["positions"].items()
 )
 _SCALED_IMU_LAYOUTS = (
     replace(MESSAGE_LAYOUTS["scaled_imu"], topic=f"SCALED_IMU{number}") for number in ("", "2", "3")

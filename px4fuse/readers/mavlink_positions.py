@@ -15,7 +15,6 @@ from px4fuse.flight.model import (
     PositionTrack,
     Truth,
     Unavailable,
-    reclassify_as_vio,
 )
 from px4fuse.readers import mavlink_messages as messages
 from px4fuse.readers import px4_positions
@@ -104,8 +103,9 @@ def _read_track(
     return px4_positions.make_track(
         track_name,
         samples,
-        reclassify_as_vio(source.origin, has_changing_orientation=orientation is not None),
+        source.origin,
         remedy=remedy,
+        is_odometry=orientation is not None,
         description=source.description,
         frame=frame,
         clock=clock_map.clock
@@ -129,8 +129,9 @@ def _read_gnss(
     if not len(rows):
         return None
     message_count = len(rows)
-    rows = rows[np.diff(recording.frames.table(layout.topic, rows)["time_usec"], prepend=0) > 0]
-    gnss_boot_time_s = recording.frames.table(layout.topic, rows)["time_usec"] * 1e-6
+    time_us = recording.frames.table(layout.topic, rows)["time_usec"]
+    is_new = np.diff(time_us, prepend=0) > 0
+    rows, gnss_boot_time_s = rows[is_new], time_us[is_new] * 1e-6
     receipt_boot_times_s = recording.compute_receipt_boot_times_s(rows)
     if (
         len(rows)
@@ -187,16 +188,13 @@ def find_local_origin(recording: Recording) -> GeodeticPosition | None:
     joined_positions = joined_positions[joined_positions["latitude_deg"] != 0.0]
     if joined_positions.empty:
         return None
-    position_pairs = zip(
-        joined_positions[Columns.GEODETIC].to_numpy(),
-        joined_positions[Columns.POSITION].to_numpy(),
-        strict=True,
+    latitude_deg, longitude_deg, altitude_m = joined_positions[Columns.GEODETIC].to_numpy().T
+    north_m, east_m, down_m = joined_positions[Columns.POSITION].to_numpy().T
+    origin_latitude_deg, origin_longitude_deg = unproject(
+        -north_m, -east_m, (latitude_deg, longitude_deg)
     )
-    origins = [
-        (*unproject(-north_m, -east_m, tuple(geodetic[:2])), geodetic[2] + down_m)
-        for geodetic, (north_m, east_m, down_m) in position_pairs
-    ]
-    return tuple(np.median(origins, axis=0).tolist())
+    origins = origin_latitude_deg, origin_longitude_deg, altitude_m + down_m
+    return tuple(np.median(origins, axis=1).tolist())
 
 
 def read_truth(

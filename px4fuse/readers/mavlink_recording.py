@@ -1,5 +1,6 @@
 """MAVLink recording of one vehicle, with all message times on its boot clock."""
 
+from collections.abc import Sequence
 from dataclasses import dataclass, field
 from typing import Any
 
@@ -41,6 +42,8 @@ MIN_TIMESTAMP_GROUP_FRACTION = 0.01
 MAX_TIME_OUTSIDE_FLIGHT_S = 60.0
 # Maximum fraction of bytes outside MAVLink frames in an undamaged file
 MAX_STRAY_BYTE_FRACTION = 0.002
+# Columns of ODOMETRY that are equal in all coordinate frames
+UNCONVERTED_COLUMNS = ["frame_id", "child_frame_id", "reset_counter"]
 # Minimum number of timestamps to detect a stopped clock
 MIN_STOPPED_CLOCK_TIMESTAMPS = 10
 
@@ -74,16 +77,17 @@ class Recording:
     def rows_of_all_senders(self, message: str) -> IntArray:
         """Return the indices of the analysed frames with a message, from all senders."""
         rows = self.frames.rows(message)
-        return np.asarray(
-            rows[
-                (rows >= self.analysed_frame_slice.start) & (rows < self.analysed_frame_slice.stop)
-            ]
-        )
+        first, stop = self.analysed_frame_slice.start, self.analysed_frame_slice.stop
+        return np.asarray(rows[(rows >= first) & (rows < stop)])
 
     def rows(self, message: str, address: MavlinkAddress | None = None) -> IntArray:
         """Return the indices of the frames with a message from ``address`` (default: autopilot)."""
         rows = self.rows_of_all_senders(message)
         return rows[self.frames.is_sent_by(address or self.address, rows)]
+
+    def find_most_frequent(self, layouts: Sequence[Layout]) -> Layout:
+        """Return the layout whose message the autopilot sent most often."""
+        return max(layouts, key=lambda layout: len(self.rows(layout.topic)))
 
     def read(
         self,
@@ -136,22 +140,19 @@ class Recording:
 
     def _find_rows_with_valid_time(self, name: str, boot_times_s: Array) -> IntArray:
         """Return the indices of valid and increasing boot times; count the others as dropped."""
-        time_s = boot_times_s - self.time_origin_s
-        is_inside = (time_s >= -MAX_TIME_OUTSIDE_FLIGHT_S) & (
-            time_s <= self.duration_s + MAX_TIME_OUTSIDE_FLIGHT_S
-        )
-        rows = np.flatnonzero(is_inside & (boot_times_s > 0.0))
+        middle_s = self.time_origin_s + 0.5 * self.duration_s
+        max_difference_s = 0.5 * self.duration_s + MAX_TIME_OUTSIDE_FLIGHT_S
+        is_valid = (np.abs(boot_times_s - middle_s) <= max_difference_s) & (boot_times_s > 0.0)
+        rows = np.flatnonzero(is_valid)
         time_us = np.rint(boot_times_s[rows] * 1e6).astype(np.int64)
-        # A message may be received twice, over two links
+        # A message that is received twice, over two links, does not count as dropped
         first_row_of_each_time = np.sort(np.unique(time_us, return_index=True)[1])
         increasing_time_rows = longest_increasing_run(time_us[first_row_of_each_time])
-        if (
-            dropped_count := len(boot_times_s)
-            - len(rows)
-            + len(first_row_of_each_time)
-            - len(increasing_time_rows)
-        ):
-            self.dropped_count_by_message[name] = dropped_count
+        dropped_count = np.count_nonzero(~is_valid) + (
+            len(first_row_of_each_time) - len(increasing_time_rows)
+        )
+        if dropped_count:
+            self.dropped_count_by_message[name] = int(dropped_count)
         return np.asarray(rows[first_row_of_each_time[increasing_time_rows]])
 
     def compute_receipt_boot_times_s(self, rows: IntArray) -> Array:
@@ -188,13 +189,11 @@ def _to_ned(samples: pd.DataFrame) -> pd.DataFrame:
     has_quaternion = np.linalg.norm(quaternions, axis=1) > MIN_QUATERNION_NORM
     orientation = Columns.QUATERNION + Columns.ROTATION_VARIANCE
     converted_samples = samples.copy()
-    converted_samples[Columns.STATE + Columns.POSITION_VARIANCE] = np.nan
-    converted_samples[Columns.VELOCITY_VARIANCE + orientation] = np.nan
+    converted_samples[samples.columns.difference(UNCONVERTED_COLUMNS)] = np.nan
     for frame_number, frame in CONVERSION_BY_MAV_FRAME.items():
-        is_body_frame = frame.is_body_frame
-        is_in_frame = (samples["frame_id"] == frame_number) & (not is_body_frame)
+        is_in_frame = (samples["frame_id"] == frame_number) & (not frame.is_body_frame)
         is_in_child_frame = (samples["child_frame_id"] == frame_number) & (
-            has_quaternion | (not is_body_frame)
+            has_quaternion | (not frame.is_body_frame)
         )
         if min(frame.axis_signs) > 0.0:
             converted_samples.loc[is_in_frame, orientation] = samples.loc[is_in_frame, orientation]
@@ -206,7 +205,7 @@ def _to_ned(samples: pd.DataFrame) -> pd.DataFrame:
                 samples.loc[rows, vector_columns].to_numpy()[:, frame.axis_order] * frame.axis_signs
             )
             variances = samples.loc[rows, variance_columns].to_numpy()[:, frame.axis_order]
-            if is_body_frame and rows.any():
+            if frame.is_body_frame and rows.any():
                 rotation = Rotation.from_quat(quaternions[rows], scalar_first=True).as_matrix()
                 vectors = rotate(rotation, vectors)
                 # Variances in NED: diagonal of R diag(σ²) Rᵀ with the rotation matrix R
@@ -219,29 +218,19 @@ def _to_ned(samples: pd.DataFrame) -> pd.DataFrame:
 def _read_boot_times(frames: MavlinkFrames, address: MavlinkAddress) -> tuple[IntArray, Array]:
     """Return the indices of the autopilot's frames with a boot time, and these times (s)."""
     is_from_autopilot = frames.is_sent_by(address)
-    rows_by_message = [np.zeros(0, dtype=np.intp)]
-    times_by_message_s = [np.zeros(0)]
+    times_s = np.zeros(len(frames))
     for message_id in np.unique(frames.message_ids[is_from_autopilot]).tolist():
         name = message_name(message_id)
+        rows = np.flatnonzero(is_from_autopilot & (frames.message_ids == message_id))
         if "time_boot_ms" in (wire_layout(message_id).names or ()):
-            field_name, seconds_per_unit = "time_boot_ms", 1e-3
+            times_s[rows] = frames.table(name, rows)["time_boot_ms"] * 1e-3
         elif name in BOOT_CLOCK_MESSAGES:
-            field_name, seconds_per_unit = "time_usec", 1e-6
-        else:
-            continue
-        rows = frames.rows(name)
-        rows = rows[is_from_autopilot[rows]]
-        rows_by_message.append(rows)
-        times_by_message_s.append(frames.table(name, rows)[field_name] * seconds_per_unit)
-    rows = np.concatenate(rows_by_message)
-    times_s = np.concatenate(times_by_message_s)
+            times_s[rows] = frames.table(name, rows)["time_usec"] * 1e-6
     is_boot_time = (times_s > 0.0) & (times_s < MIN_UNIX_TIME_S)
-    is_usable = is_boot_time if np.any(is_boot_time) else (times_s >= MIN_UNIX_TIME_S)
-    if is_usable.sum() >= MIN_STOPPED_CLOCK_TIMESTAMPS and not is_running_clock(times_s[is_usable]):
-        is_usable &= False
-    usable_indices = np.flatnonzero(is_usable)
-    usable_indices = usable_indices[np.argsort(rows[usable_indices])]
-    return rows[usable_indices], times_s[usable_indices]
+    rows = np.flatnonzero(is_boot_time if np.any(is_boot_time) else times_s >= MIN_UNIX_TIME_S)
+    if len(rows) >= MIN_STOPPED_CLOCK_TIMESTAMPS and not is_running_clock(times_s[rows]):
+        rows = rows[:0]
+    return rows, times_s[rows]
 
 
 def read_recording(frames: MavlinkFrames, address: MavlinkAddress) -> Recording:
@@ -251,26 +240,19 @@ def read_recording(frames: MavlinkFrames, address: MavlinkAddress) -> Recording:
     analysed_frame_slice = slice(0, len(frames))
     restart_rows = np.flatnonzero(np.diff(boot_times_s) < -MIN_BACKWARD_STEP_AT_RESTART_S) + 1
     # A single late or early packet is not a restart
-    boot_time_before_restart_s = boot_times_s[
-        np.maximum(restart_rows - 1 - RESTART_CHECK_MESSAGES, 0)
-    ]
-    boot_time_after_restart_s = boot_times_s[
-        np.minimum(restart_rows + RESTART_CHECK_MESSAGES, len(boot_times_s) - 1)
-    ]
-    restart_rows = restart_rows[
-        boot_time_after_restart_s
-        < np.minimum(boot_time_before_restart_s, boot_times_s[restart_rows - 1])
-        - MIN_BACKWARD_STEP_AT_RESTART_S
-    ]
+    earlier_rows = np.maximum(restart_rows - 1 - RESTART_CHECK_MESSAGES, 0)
+    later_rows = np.minimum(restart_rows + RESTART_CHECK_MESSAGES, len(rows) - 1)
+    boot_times_before_s = np.minimum(boot_times_s[earlier_rows], boot_times_s[restart_rows - 1])
+    is_restart = boot_times_s[later_rows] < boot_times_before_s - MIN_BACKWARD_STEP_AT_RESTART_S
+    restart_rows = restart_rows[is_restart]
     if len(restart_rows):
-        part_boundaries = [0, *restart_rows.tolist(), len(rows)]
-        longest_part_index = int(np.argmax(np.diff(part_boundaries)))
-        longest_part_rows = slice(*part_boundaries[longest_part_index : longest_part_index + 2])
-        longest_part_fraction = len(rows[longest_part_rows]) / len(rows)
-        rows, boot_times_s = rows[longest_part_rows], boot_times_s[longest_part_rows]
+        parts = np.split(np.arange(len(rows)), restart_rows)
+        longest_part = max(parts, key=len)
+        longest_part_fraction = len(longest_part) / len(rows)
+        rows, boot_times_s = rows[longest_part], boot_times_s[longest_part]
         analysed_frame_slice = slice(
-            int(rows[0]) if longest_part_index else 0,
-            int(rows[-1]) + 1 if longest_part_index < len(restart_rows) else len(frames),
+            0 if longest_part is parts[0] else int(rows[0]),
+            len(frames) if longest_part is parts[-1] else int(rows[-1]) + 1,
         )
         notes.append(
             f"number of restarts of the boot clock: {len(restart_rows)}. Only the longest part "
@@ -289,36 +271,33 @@ def read_recording(frames: MavlinkFrames, address: MavlinkAddress) -> Recording:
             receipt_to_boot_fit = fit_clock_line(boot_times_s, receive_times_s[rows]).inverse()
     elif len(rows):
         # A raw stream has no receive times. Use the last boot time before each frame
-        previous_message_index = np.searchsorted(rows, np.arange(len(frames)), side="right") - 1
-        receive_times_s = boot_times_s[np.maximum(previous_message_index, 0)]
+        message_count = np.searchsorted(rows, np.arange(len(frames)), side="right")
+        receive_times_s = boot_times_s[np.maximum(message_count - 1, 0)]
     else:
         notes.append("no message in the stream contains a time")
     receipt_reversal_count = int(np.count_nonzero(np.diff(receive_times_s) < 0.0))
-    for quantity, count in (
-        ("number of ignored MAVLink frames with unknown message type", frames.unknown_frame_count),
-        (
-            "number of damaged receive times that were interpolated",
-            frames.damaged_receive_time_count,
-        ),
-        ("number of backward jumps of the receive time", receipt_reversal_count),
-    ):
-        if count:
-            notes.append(f"{quantity}: {count}")
-    byte_count_outside_frames, byte_count = frames.byte_count_outside_frames, len(frames.content)
+    count_by_quantity = {
+        "ignored MAVLink frames with unknown message type": frames.unknown_frame_count,
+        "damaged receive times that were interpolated": frames.damaged_receive_time_count,
+        "backward jumps of the receive time": receipt_reversal_count,
+    }
+    notes += [
+        f"number of {quantity}: {count}" for quantity, count in count_by_quantity.items() if count
+    ]
+    stray_byte_count, byte_count = frames.byte_count_outside_frames, len(frames.content)
     stray_bytes_note = (
-        f"{byte_count_outside_frames:,} bytes ({byte_count_outside_frames / byte_count:.2%}) are "
-        "not part of a complete MAVLink frame"
+        f"{stray_byte_count:,} bytes ({stray_byte_count / byte_count:.2%}) are not part of a "
+        "complete MAVLink frame"
     )
     damage_notes: tuple[str, ...] = ()
     # Incomplete frames at the beginning and end of the file are not damage
-    if byte_count_outside_frames - 2 * MAX_FRAME_BYTES > MAX_STRAY_BYTE_FRACTION * byte_count:
+    if stray_byte_count - 2 * MAX_FRAME_BYTES > MAX_STRAY_BYTE_FRACTION * byte_count:
         damage_notes = (f"the file is damaged: {stray_bytes_note}",)
-    elif byte_count_outside_frames:
+    elif stray_byte_count:
         notes.append(stray_bytes_note)
-    # Without boot times, use the receive times
-    time_origin_s, end_s = (
-        boot_times_s if len(boot_times_s) else np.array([0.0, receive_times_s.max()])
-    )[[0, -1]].tolist()
+    if not len(boot_times_s):
+        boot_times_s = np.array([0.0, receive_times_s.max()])
+    time_origin_s, end_s = boot_times_s[[0, -1]].tolist()
     return Recording(
         frames,
         address,

@@ -16,7 +16,7 @@ from px4fuse.readers.mavlink_clocks import (
     is_running_clock,
     map_clock_to_boot,
 )
-from px4fuse.readers.mavlink_frames import VEHICLE_TYPES, Int64Array, MavlinkAddress, MavlinkFrames
+from px4fuse.readers.mavlink_frames import VEHICLE_TYPES, MavlinkAddress, MavlinkFrames
 from px4fuse.readers.mavlink_recording import (
     MIN_BACKWARD_STEP_AT_RESTART_S,
     Recording,
@@ -34,10 +34,10 @@ MAX_TIMESYNC_TO_POSITION_TIME_DIFFERENCE_S = 1e5
 
 
 def _read_vehicle_types(frames: MavlinkFrames) -> dict[MavlinkAddress, tuple[int, int]]:
-    rows = frames.rows("HEARTBEAT")
-    heartbeats = frames.table("HEARTBEAT", rows)
-    type_pairs = zip(heartbeats["type"].tolist(), heartbeats["autopilot"].tolist(), strict=True)
-    return dict([*zip(_read_addresses(frames, rows), type_pairs, strict=True)][::-1])
+    # The last entry of a sender in the dict is its first message
+    rows = frames.rows("HEARTBEAT")[::-1]
+    types = frames.table("HEARTBEAT", rows)[["type", "autopilot"]].tolist()
+    return dict(zip(_read_addresses(frames, rows), types, strict=True))
 
 
 def _read_addresses(frames: MavlinkFrames, rows: IntArray | slice) -> Iterator[MavlinkAddress]:
@@ -46,10 +46,10 @@ def _read_addresses(frames: MavlinkFrames, rows: IntArray | slice) -> Iterator[M
 
 def _count_frames(
     frames: MavlinkFrames, rows: IntArray | slice = slice(None)
-) -> list[tuple[MavlinkAddress, int]]:
+) -> dict[MavlinkAddress, int]:
     """Count the frames of each sender, most frames first."""
     counts = Counter(_read_addresses(frames, rows))
-    return sorted(counts.items(), key=lambda item: (-item[1], item[0]))
+    return dict(sorted(counts.items(), key=lambda item: (-item[1], item[0])))
 
 
 def _is_vehicle(vehicle_type: int, autopilot: int) -> bool:
@@ -66,41 +66,34 @@ def choose_autopilot(frames: MavlinkFrames, system_id: int | None) -> tuple[Mavl
     SettingsError
         No autopilot has the given system id.
     """
-    frame_count_by_address = dict(_count_frames(frames))
+    frame_counts = _count_frames(frames)
     vehicle_types = _read_vehicle_types(frames)
     vehicle_addresses = [
         address
-        for address in frame_count_by_address
+        for address in frame_counts
         if address in vehicle_types and _is_vehicle(*vehicle_types[address])
     ]
     rows = np.concatenate([frames.rows(message) for message in messages.AUTOPILOT_MESSAGES])
-    message_count_by_autopilot = dict(_count_frames(frames, rows))
+    addresses_with_autopilot_message = _count_frames(frames, rows)
     # A heartbeat is not sufficient, because companion computers may also send autopilot heartbeats
     candidates = (
-        [address for address in vehicle_addresses if address in message_count_by_autopilot]
-        or [address for address in message_count_by_autopilot if address not in vehicle_types]
+        [address for address in vehicle_addresses if address in addresses_with_autopilot_message]
+        or [address for address in addresses_with_autopilot_message if address not in vehicle_types]
         or vehicle_addresses
-        or [
-            address
-            for address in frame_count_by_address
-            if address[1] == messages.AUTOPILOT_COMPONENT_ID
-        ]
         # If no message is from an autopilot, assume one in each system
-        or [(address[0], messages.AUTOPILOT_COMPONENT_ID) for address in frame_count_by_address]
+        or [(system, messages.AUTOPILOT_COMPONENT_ID) for system, _ in frame_counts]
     )
     if system_id is not None:
         candidates = [
             address for address in {*vehicle_addresses, *candidates} if address[0] == system_id
         ]
         if not candidates:
-            system_ids_text = (
-                ", ".join(map(str, sorted({address[0] for address in vehicle_addresses}))) or "none"
-            )
+            system_ids = sorted({address[0] for address in vehicle_addresses})
             raise SettingsError(
                 f"{frames.name}: no autopilot has MAVLink system id {system_id}. System ids of "
-                f"autopilots in this file: {system_ids_text}."
+                f"autopilots in this file: {', '.join(map(str, system_ids)) or 'none'}."
             )
-    best_address = max(candidates, key=lambda address: frame_count_by_address.get(address, 0))
+    best_address = max(candidates, key=lambda address: frame_counts.get(address, 0))
     _, autopilot_type = vehicle_types.get(best_address, (-1, -1))
     return best_address, messages.AUTOPILOT_NAME_BY_ID.get(autopilot_type, "unknown autopilot")
 
@@ -114,10 +107,9 @@ def find_senders(recording: Recording, message: str) -> list[MavlinkAddress]:
         for address, vehicle_type in _read_vehicle_types(frames).items()
         if _is_vehicle(*vehicle_type)
     } - {autopilot_address[0]}
-    counts = _count_frames(frames, recording.rows_of_all_senders(message))
     return [
         address
-        for address, _ in counts
+        for address in _count_frames(frames, recording.rows_of_all_senders(message))
         if address != autopilot_address and address[0] not in other_vehicle_ids
     ][:MAX_SENDERS]
 
@@ -171,9 +163,11 @@ def _map_sender_clock(
         np.abs(sender_request_times_s - median_timestamp_s)
         < MAX_TIMESYNC_TO_POSITION_TIME_DIFFERENCE_S
     )
-    is_autopilot_reply &= ~np.isin(
-        autopilot_timesync["ts1"], _read_other_request_times(recording, sender)
-    )
+    # Replies to requests of other senders
+    rows = frames.rows("TIMESYNC")
+    other_timesync = frames.table("TIMESYNC", rows[~frames.is_sent_by(sender, rows)])
+    other_request_times_ns = other_timesync["ts1"][other_timesync["tc1"] == 0]
+    is_autopilot_reply &= ~np.isin(autopilot_timesync["ts1"], other_request_times_ns)
     return map_clock_to_boot(
         f"system {sender[0]}, component {sender[1]}",
         np.concatenate(timestamps_s),
@@ -184,14 +178,6 @@ def _map_sender_clock(
         boot_to_unix_fit,
         has_receive_times=frames.receive_times_us is not None,
     )
-
-
-def _read_other_request_times(recording: Recording, sender: MavlinkAddress) -> Int64Array:
-    """Return the TIMESYNC request times ``ts1`` (ns) of all senders except ``sender``."""
-    frames = recording.frames
-    rows = frames.rows("TIMESYNC")
-    timesync = frames.table("TIMESYNC", rows[~frames.is_sent_by(sender, rows)])
-    return np.asarray(timesync["ts1"][timesync["tc1"] == 0])
 
 
 def describe_clock_conversions(
@@ -228,20 +214,19 @@ def describe_senders(recording: Recording) -> tuple[Sender, ...]:
     """Describe the senders in the recording, most messages first."""
     frames = recording.frames
     vehicle_types = _read_vehicle_types(frames)
-    sender_descriptions = []
-    for address, count in _count_frames(frames)[:MAX_SENDERS]:
+    senders = []
+    for address, count in [*_count_frames(frames).items()][:MAX_SENDERS]:
         description = "component that sent no HEARTBEAT"
         if address in vehicle_types:
             vehicle_type, autopilot = vehicle_types[address]
             description = VEHICLE_TYPES.get(vehicle_type, f"vehicle of MAV_TYPE {vehicle_type}")
             if autopilot != messages.NO_AUTOPILOT:
-                description = (
-                    f"{messages.AUTOPILOT_NAME_BY_ID.get(autopilot, 'autopilot')} {description}"
-                )
+                name = messages.AUTOPILOT_NAME_BY_ID.get(autopilot, "autopilot")
+                description = f"{name} {description}"
         lost_fraction = _estimate_lost_fraction(frames, address)
         is_analysed = address == recording.address
-        sender_descriptions.append(Sender(*address, description, count, lost_fraction, is_analysed))
-    return tuple(sender_descriptions)
+        senders.append(Sender(*address, description, count, lost_fraction, is_analysed))
+    return tuple(senders)
 
 
 def _estimate_lost_fraction(frames: MavlinkFrames, address: MavlinkAddress) -> float | None:
@@ -252,12 +237,8 @@ def _estimate_lost_fraction(frames: MavlinkFrames, address: MavlinkAddress) -> f
     sequence_numbers = frames.sequence_numbers[frames.is_sent_by(address)].astype(np.int64)
     sequence_steps = np.mod(np.diff(sequence_numbers) + MAX_LATE_MESSAGES, 256) - MAX_LATE_MESSAGES
     unwrapped_sequence = np.append(0, np.cumsum(sequence_steps))
-    lost_fraction = float(
-        1.0 - len(np.unique(unwrapped_sequence)) / (np.ptp(unwrapped_sequence) + 1)
-    )
+    sent_count = np.ptp(unwrapped_sequence) + 1
+    lost_fraction = float(1.0 - len(np.unique(unwrapped_sequence)) / sent_count)
     has_sequence_numbers = len(unwrapped_sequence) == 1 or bool(unwrapped_sequence.any())
-    return (
-        lost_fraction
-        if has_sequence_numbers and lost_fraction < MAX_LOST_MESSAGE_FRACTION
-        else None
-    )
+    is_usable = has_sequence_numbers and lost_fraction < MAX_LOST_MESSAGE_FRACTION
+    return lost_fraction if is_usable else None

@@ -53,12 +53,10 @@ MAX_TAGS_IN_FILE = 100
 MIN_USABLE_ROWS = 3
 # Minimum fraction of rows with the expected pattern, such as increasing times
 MIN_MATCHING_ROW_FRACTION = 0.9
-# Minimum plausible median interval (s): 200 UWB positions per second, ±10 %
-MIN_INTERVAL_S = 0.9 / 200
-# Maximum plausible median interval (s): one UWB position every 5 s, ±10 %
-MAX_INTERVAL_S = 1.1 / 0.2
-# Plausible time units and median intervals (s) of trajectories
-TRAJECTORY_TIME_UNITS, TRAJECTORY_INTERVAL_RANGE_S = ("s", "ns"), (1e-3, 1e3)
+# Plausible time units, and minimum and maximum median interval (s): 0.2 to 200 UWB positions per
+# second, ±10 %
+UWB_TIMES = tuple(SECONDS_BY_TIME_UNIT), 0.9 / 200, 1.1 / 0.2
+TRAJECTORY_TIMES = ("s", "ns"), 1e-3, 1e3
 # Maximum median interval (s) of timestamps that are UNIX times
 MAX_UNIX_TIME_INTERVAL_S = 60.0
 # Maximum extent (m) of an indoor flight; otherwise, the positions are probably in mm
@@ -139,13 +137,14 @@ def read_position_file(
     """
     _check_options(columns, time_unit, length_unit)
     path, body_in_path = split_path_and_part(str(path))
-    table, sha256, size_bytes = _open_table(path, columns, body or body_in_path)
+    body = body or body_in_path
+    table, sha256, size_bytes = _open_table(path, columns, body)
     notes = [*table.notes]
     column_meanings = [read_column_name(name) for name in table.column_names]
     given_columns = _find_column_indices(table, columns or ())
     quaternion_columns = find_quaternion_columns(table.column_names)
     numbers, has_time_zone = _read_numbers(
-        table, column_meanings, given_columns, quaternion_columns, body or body_in_path
+        table, column_meanings, given_columns, quaternion_columns, body
     )
     row_count = len(numbers)
     time_column, axis_columns, sigma_columns, frame, time_text = _choose_columns(
@@ -164,24 +163,18 @@ def read_position_file(
         )
     times_without_position = numbers.loc[has_time & ~is_usable, time_column].to_numpy()
     numbers = numbers[is_usable]
-    file_times = numbers[time_column].to_numpy()
-    time_units, plausible_interval_range_s = (
-        (TRAJECTORY_TIME_UNITS, TRAJECTORY_INTERVAL_RANGE_S)
-        if is_trajectory
-        else (tuple(SECONDS_BY_TIME_UNIT), (MIN_INTERVAL_S, MAX_INTERVAL_S))
-    )
-    unit, unit_text = _choose_time_unit(
-        file_times,
-        column_meanings[time_column].unit,
-        time_unit,
-        time_units,
-        plausible_interval_range_s,
-    )
-    units_per_second: float = round(1.0 / SECONDS_BY_TIME_UNIT[unit])
-    if table.rate_hz is not None:
-        unit_text = f"the frame rate is {table.rate_hz:g} Hz"
-        unit, units_per_second = "frame numbers", table.rate_hz
-    times_s = file_times / units_per_second
+    time_units, min_interval_s, max_interval_s = TRAJECTORY_TIMES if is_trajectory else UWB_TIMES
+    unit, unit_text = "frame numbers", f"the frame rate is {table.rate_hz or 0:g} Hz"
+    if table.rate_hz is None:
+        unit, unit_text = _choose_time_unit(
+            numbers[time_column],
+            column_meanings[time_column].unit,
+            time_unit,
+            time_units,
+            (min_interval_s, max_interval_s),
+        )
+    units_per_second = table.rate_hz or round(1.0 / SECONDS_BY_TIME_UNIT[unit])
+    times_s = numbers[time_column].to_numpy() / units_per_second
     kept_rows = _find_increasing_rows(times_s)
     if dropped_count := len(times_s) - len(kept_rows):
         notes.append(
@@ -193,25 +186,20 @@ def read_position_file(
         and len(kept_rows) < MIN_MATCHING_ROW_FRACTION * row_count
     )
     if has_no_times or len(kept_rows) < MIN_USABLE_ROWS:
+        fault = f"contains {len(kept_rows)} usable rows, fewer than {MIN_USABLE_ROWS}"
         raise LogError(
-            "; ".join(
-                (
-                    f"{table.file_name} contains {len(kept_rows)} usable rows, fewer than "
-                    f"{MIN_USABLE_ROWS}",
-                    *notes,
-                )
-            ),
-            f"Write numbers with decimal points. Alternatively, name the columns with "
+            "; ".join((f"{table.file_name} {fault}", *notes)),
+            "Write numbers with decimal points. Alternatively, name the columns with "
             f"{COLUMNS_OPTION}.",
         )
     numbers = numbers.iloc[kept_rows].set_index(time_index(times_s[kept_rows]))
     median_interval_s = compute_median_interval_s(numbers.index)
-    if not plausible_interval_range_s[0] <= median_interval_s <= plausible_interval_range_s[1]:
+    if not min_interval_s <= median_interval_s <= max_interval_s:
         notes.append(
             f"a median interval of {median_interval_s:.3g} s is unusual: check the unit of time "
             "(--position-time-unit)"
         )
-    scale_by_column, length_unit_text = _choose_length_units(
+    metres_per_unit, length_unit_text = _choose_length_units(
         numbers,
         position_columns,
         column_meanings,
@@ -219,28 +207,26 @@ def read_position_file(
         np.inf if is_trajectory else MAX_INDOOR_EXTENT_M,
     )
     columns_m = {
-        name: np.nan if index is None else numbers[index] * scale_by_column[index]
+        name: np.nan if index is None else numbers[index] * metres_per_unit[index]
         for name, index in zip(SAMPLE_COLUMNS, (*axis_columns, *sigma_columns), strict=True)
     }
     samples = pd.DataFrame(columns_m, index=numbers.index).replace([np.inf, -np.inf], np.nan)
     invalid_reasons = classify_invalid_positions(samples, SAMPLE_COLUMNS[: len(position_columns)])
-    if is_trajectory:
-        invalid_reasons[:] = ""
-    reasons_of_invalid_rows = (
-        invalid_reasons[invalid_reasons != ""],
-        pd.Series("NaN", times_without_position / units_per_second),
-    )
-    quaternions = numbers.loc[invalid_reasons == "", quaternion_columns].to_numpy()
-    samples = samples[invalid_reasons == ""]
-    notes += _drop_invalid_sigmas(samples)
+    is_valid = (invalid_reasons == "") | is_trajectory
+    samples = samples[is_valid]
+    is_ignored_sigma = samples[SIGMA_COLUMNS] <= 0.0
+    samples[SIGMA_COLUMNS] = samples[SIGMA_COLUMNS].mask(is_ignored_sigma)
+    if ignored_count := int(is_ignored_sigma.any(axis=1).sum()):
+        notes.append(
+            "number of rows with a sigma that is ignored, because it is not positive: "
+            f"{ignored_count}"
+        )
     is_unix = (
         has_time_zone
         and MIN_VALID_UNIX_TIME_S <= float(np.median(numbers.index)) < MAX_VALID_UNIX_TIME_S
     )
     clock_kind: Literal["UNIX", "local"] = "UNIX" if is_unix else "local"
-    axes_text = (frame.upper() if frame else "x, y, z") + " without height" * (
-        len(position_columns) < 3
-    )
+    height_text = " without height" if len(position_columns) < 3 else ""
     return PositionRecording(
         name=table.file_name,
         sha256=sha256,
@@ -255,16 +241,23 @@ def read_position_file(
             else f"the separator is {SEPARATORS[table.separator]}, the header is line "
             f"{table.header_line}",
             f"time: column {time_text}, {clock_kind} clock, unit {unit} ({unit_text})",
-            f"position: columns {table.format_labels(*axis_columns)} as {axes_text}, unit "
-            f"{length_unit_text}",
+            f"position: columns {table.format_labels(*axis_columns)} as "
+            f"{frame.upper() if frame else 'x, y, z'}{height_text}, unit {length_unit_text}",
             f"sigma: columns {table.format_labels(*sigma_columns) or 'none'}",
         ),
         notes=tuple(notes),
-        metres_per_unit=scale_by_column[position_columns[0]],
-        reason_by_invalid_row=pd.concat(reasons_of_invalid_rows).sort_index(),
+        metres_per_unit=float(metres_per_unit[position_columns[0]]),
+        reason_by_invalid_row=pd.concat(
+            [
+                invalid_reasons[~is_valid],
+                pd.Series("NaN", times_without_position / units_per_second),
+            ]
+        ).sort_index(),
         format=table.format,
         row_count=row_count,
-        quaternions=quaternions if quaternion_columns else None,
+        quaternions=numbers.loc[is_valid, quaternion_columns].to_numpy()
+        if quaternion_columns
+        else None,
         rounding_step_m=max(
             estimate_rounding_step(samples[name].to_numpy()) for name in ("x_m", "y_m")
         ),
@@ -335,21 +328,12 @@ def _read_numbers(
         i for i in known_columns if column_meanings[i].kind == "time"
     ]:
         if numbers[index].isna().mean() > 0.5 and texts[index].notna().any():
-            numbers[index], has_time_zone = _read_dates(texts[index])
+            dates = texts[index].str.replace(",", ".", regex=False)
+            times = pd.to_datetime(dates, format="ISO8601", utc=True, errors="coerce")
+            numbers[index] = (times - pd.Timestamp(0, tz="UTC")).dt.total_seconds()
+            has_time_zone = bool(dates.str.contains(r"(?:Z|[+-]\d\d:?\d\d)$").mean() > 0.5)
             column_meanings[index] = replace(column_meanings[index], unit="s")
     return numbers, has_time_zone
-
-
-def _drop_invalid_sigmas(samples: pd.DataFrame) -> list[str]:
-    """Replace zero and negative σ in ``samples`` by NaN, and return a note with their number."""
-    is_not_positive = samples[SIGMA_COLUMNS] <= 0.0
-    samples[SIGMA_COLUMNS] = samples[SIGMA_COLUMNS].mask(is_not_positive)
-    count = int(is_not_positive.any(axis=1).sum())
-    return (
-        [f"number of rows with a sigma that is ignored, because it is not positive: {count}"]
-        if count
-        else []
-    )
 
 
 def _to_numbers(texts: "pd.Series[str]", *, may_have_decimal_comma: bool) -> "pd.Series[float]":
@@ -357,14 +341,6 @@ def _to_numbers(texts: "pd.Series[str]", *, may_have_decimal_comma: bool) -> "pd
     if may_have_decimal_comma and texts.str.contains(",", regex=False).mean() > 0.5:
         texts = texts.str.replace(",", ".", regex=False)
     return pd.to_numeric(texts, errors="coerce").astype(np.float64)
-
-
-def _read_dates(texts: "pd.Series[str]") -> tuple["pd.Series[float]", bool]:
-    """Convert dates (ISO 8601) to UNIX time (s). The second value: they have a time zone."""
-    texts = texts.str.replace(",", ".", regex=False)
-    dates = pd.to_datetime(texts, format="ISO8601", utc=True, errors="coerce")
-    unix_time_s = (dates - pd.Timestamp(0, tz="UTC")).dt.total_seconds()
-    return unix_time_s, bool(texts.str.contains(r"(?:Z|[+-]\d\d:?\d\d)$").mean() > 0.5)
 
 
 def _select_body(
@@ -446,12 +422,10 @@ def _choose_columns(
         )
         time_text = table.format_labels(time_column)
         for index in [*other_time_columns]:
-            has_whole_seconds = (
-                numbers[time_column] % 1.0 == 0.0
-            ).mean() > MIN_MATCHING_ROW_FRACTION
+            is_whole_second = numbers[time_column] % 1.0 == 0.0
             if (
-                has_whole_seconds
-                and column_meanings[index].unit == "ns"
+                column_meanings[index].unit == "ns"
+                and is_whole_second.mean() > MIN_MATCHING_ROW_FRACTION
                 and numbers[index].max() < 1e9
             ):
                 numbers[time_column] += numbers[index] * 1e-9
@@ -472,7 +446,7 @@ def _choose_columns(
 
 
 def _choose_time_unit(
-    times: Array,
+    times: "pd.Series[float]",
     unit_in_column_name: str,
     given_unit: str | None,
     units: Container[str],
@@ -484,14 +458,13 @@ def _choose_time_unit(
     """
     if given_unit is not None:
         return given_unit, "the unit was given with --position-time-unit"
-    median_time = float(np.median(times)) if len(times) else 0.0
+    median_time, time_steps = times.median(), times.diff()
     if (
         abs(median_time) * SECONDS_BY_TIME_UNIT.get(unit_in_column_name, np.inf)
         < MAX_VALID_UNIX_TIME_S
     ):
         return unit_in_column_name, "from the column name"
-    time_steps = np.diff(times)
-    median_step = float(np.median(time_steps[time_steps > 0])) if (time_steps > 0).any() else 0.0
+    median_step = time_steps[time_steps > 0.0].median()
     plausible_units = []
     for unit, unit_s in SECONDS_BY_TIME_UNIT.items():
         is_unix = MIN_VALID_UNIX_TIME_S <= median_time * unit_s < MAX_VALID_UNIX_TIME_S
@@ -505,12 +478,11 @@ def _choose_time_unit(
             "with --position-time-unit"
         )
     unit, *other_units = plausible_units
-    reasons = [
-        f"in this unit, the median interval is {median_step * SECONDS_BY_TIME_UNIT[unit]:.3g} s"
-    ]
+    interval_s = median_step * SECONDS_BY_TIME_UNIT[unit]
+    reason = f"in this unit, the median interval is {interval_s:.3g} s"
     if other_units:
-        reasons.append(f"if the unit is {other_units[0]}, give --position-time-unit")
-    return unit, "; ".join(reasons)
+        reason += f"; if the unit is {other_units[0]}, give --position-time-unit"
+    return unit, reason
 
 
 def _choose_length_units(
@@ -519,12 +491,12 @@ def _choose_length_units(
     column_meanings: Sequence[ColumnMeaning],
     given_unit: str | None,
     max_extent_m: float,
-) -> tuple[dict[int, float], str]:
+) -> tuple["pd.Series[float]", str]:
     """Return the factor from each column's unit to metres, and the reason for the unit.
 
     Without a unit in the column names, positions with a very large extent are in mm.
     """
-    column_name_units = {
+    named_units = {
         index: meaning.unit
         for index, meaning in enumerate(column_meanings)
         if meaning.unit in METRES_BY_LENGTH_UNIT
@@ -535,13 +507,10 @@ def _choose_length_units(
     unit = "m"
     reason = "px4fuse assumes metres, because the column names contain no unit"
     if given_unit is not None:
-        unit = given_unit
-        column_name_units = {}
+        unit, named_units = given_unit, {}
         reason = "the unit was given with --position-unit"
-    elif axis_units := [
-        column_name_units[index] for index in position_columns if index in column_name_units
-    ]:
-        unit = axis_units[0]
+    elif units := [named_units[index] for index in position_columns if index in named_units]:
+        unit = units[0]
         reason = "the column names contain the unit"
     elif max_extent_m < max_extent <= max_extent_m / METRES_BY_LENGTH_UNIT["mm"]:
         unit = "mm"
@@ -554,13 +523,13 @@ def _choose_length_units(
             "px4fuse assumes metres, because in each unit the extent is too large for an indoor "
             "flight; set another unit with --position-unit"
         )
-    unit_by_column = {
-        index: column_name_units.get(index, unit) for index in map(int, numbers.columns)
-    }
-    scale_by_column = {index: METRES_BY_LENGTH_UNIT[name] for index, name in unit_by_column.items()}
-    extent_m = max(float(extents[index]) * scale_by_column[index] for index in position_columns)
-    used_units_text = ", ".join(dict.fromkeys(unit_by_column[index] for index in position_columns))
+    column_units = pd.Series(
+        {index: named_units.get(index, unit) for index in map(int, numbers.columns)}
+    )
+    metres_per_unit = column_units.map(METRES_BY_LENGTH_UNIT)
+    extent_m = float((extents * metres_per_unit).max())
+    units_text = ", ".join(dict.fromkeys(column_units[position_columns]))
     return (
-        scale_by_column,
-        f"{used_units_text} ({reason}); 90 % of the positions are within {extent_m:.3g} m",
+        metres_per_unit,
+        f"{units_text} ({reason}); 90 % of the positions are within {extent_m:.3g} m",
     )

@@ -24,12 +24,9 @@ _UNIT_BY_WORD, _AXIS_BY_WORD = (
 _WORDS_BY_ROLE = {
     role: {*column_words.split(",")} for role, column_words in _WORD_TABLES["roles"].items()
 }
-_TIME_WORDS = (
-    _WORDS_BY_ROLE["time"]
-    | _WORDS_BY_ROLE["measured"]
-    | _WORDS_BY_ROLE["recorded"]
-    | _WORDS_BY_ROLE["context"]
-)
+_TIME_WORDS = {
+    word for role in ("time", "measured", "recorded", "context") for word in _WORDS_BY_ROLE[role]
+}
 # Kinds of time columns, in order of preference
 TIME_KINDS = ["time of measurement", "time", "time of recording"]
 # Two words without separator, such as "px" (position, x) and "xstd" (x, sigma)
@@ -75,47 +72,41 @@ def read_column_name(name: str) -> ColumnMeaning:
     """Find quantity, axis and unit in a column name."""
     snake_case_name = unicodedata.normalize("NFKC", name).replace("μ", "u")
     snake_case_name = re.sub(r"(?<=[a-z0-9])(?=[A-Z])", "_", snake_case_name).lower()
-    column_words = re.findall(r"[^\W_]+", snake_case_name)
-    unit = _UNIT_BY_WORD.get(column_words[-1], "") if column_words else ""
-    if len(column_words) == 1 and unit in SECONDS_BY_TIME_UNIT and len(column_words[0]) > 2:
-        return ColumnMeaning(
-            "time", unit=unit, time_kind="time"
-        )  # a unit alone, such as "sec", is a time
-    unit = unit if len(column_words) > 1 else ""
-    column_words = column_words[:-1] if unit else column_words
+    *column_words, last_word = re.findall(r"[^\W_]+", snake_case_name) or [""]
+    unit = _UNIT_BY_WORD.get(last_word, "")
+    if not column_words and unit in SECONDS_BY_TIME_UNIT and len(last_word) > 2:
+        # a unit alone, such as "sec", is a time
+        return ColumnMeaning("time", unit=unit, time_kind="time")
+    if not column_words or not unit:
+        column_words, unit = [*column_words, last_word], ""
     word_set = {*column_words}
-    if (
-        word_set & _WORDS_BY_ROLE["time"]
-        and word_set <= _TIME_WORDS
-        and unit not in METRES_BY_LENGTH_UNIT
-    ):
+    is_time = bool(word_set & _WORDS_BY_ROLE["time"]) and word_set <= _TIME_WORDS
+    if is_time and unit not in METRES_BY_LENGTH_UNIT:
         rank = 2 if word_set & _WORDS_BY_ROLE["recorded"] else 1
         rank = 0 if word_set & _WORDS_BY_ROLE["measured"] else rank
         return ColumnMeaning("time", unit=unit, time_kind=TIME_KINDS[rank])
-    if word_set and word_set <= _WORDS_BY_ROLE["tag"]:
+    if word_set <= _WORDS_BY_ROLE["tag"]:
         return ColumnMeaning("tag")
     sigma_and_context_words = _WORDS_BY_ROLE["sigma"] | _WORDS_BY_ROLE["context"]
     split_words: list[str] = []
     for word in column_words:
-        match = (
-            None
-            if word in sigma_and_context_words
-            else _NAME_WITHOUT_SEPARATOR_PATTERN.fullmatch(word)
-        )
-        split_words += [group for group in match.groups() if group] if match else [word]
+        match = _NAME_WITHOUT_SEPARATOR_PATTERN.fullmatch(word)
+        if match and word not in sigma_and_context_words:
+            split_words += filter(None, match.groups())
+        else:
+            split_words.append(word)
     axes = [_AXIS_BY_WORD[word] for word in split_words if word in _AXIS_BY_WORD]
     other_words = [word for word in split_words if word not in _AXIS_BY_WORD]
-    if (
-        unit in SECONDS_BY_TIME_UNIT
-        or len(axes) > 1
-        or not {*other_words} <= sigma_and_context_words
-    ):
-        return ColumnMeaning()
-    if {*other_words} & _WORDS_BY_ROLE["sigma"]:
-        return ColumnMeaning("sigma", "".join(axes), unit)
-    return (
-        ColumnMeaning("position", axes[0], unit, ".".join(other_words)) if axes else ColumnMeaning()
+    is_known = (
+        unit not in SECONDS_BY_TIME_UNIT
+        and len(axes) <= 1
+        and {*other_words} <= sigma_and_context_words
     )
+    if is_known and {*other_words} & _WORDS_BY_ROLE["sigma"]:
+        return ColumnMeaning("sigma", "".join(axes), unit)
+    if is_known and axes:
+        return ColumnMeaning("position", axes[0], unit, ".".join(other_words))
+    return ColumnMeaning()
 
 
 def find_position_columns(

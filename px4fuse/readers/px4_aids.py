@@ -5,12 +5,11 @@ Source: PX4-Autopilot ``EKF2.cpp`` (PublishInnovations, PublishAidSourceStatus),
 
 from __future__ import annotations
 
-from dataclasses import replace
+from typing import Any
 
 import numpy as np
 import pandas as pd
 
-from px4fuse.core.arrays import Array
 from px4fuse.flight.ekf2_parameters import AIDS, STATUS_FLAGS, Aid
 from px4fuse.flight.model import AidLog, StepFunctions, sample_step_function
 from px4fuse.readers import px4_topics as px4
@@ -52,29 +51,27 @@ def read_aids(topics: Topics, enabled_aids: StepFunctions) -> dict[str, AidLog]:
 
 def read_enabled_aids(topics: Topics) -> dict[str, pd.Series[float]]:
     """Return a time series for each aiding source: 1 while its fusion is enabled, otherwise 0."""
-    enabled_aids = {}
-    tables = topics.tables_of(px4.STATUS_FLAGS)
     all_aids = (*AIDS.values(), *STATUS_FLAGS.values())
     flag_names = {flag for aid in all_aids for group in aid.flags for flag in group.split(",")}
-    logged_flag_names = sorted(flag_names.intersection(*tables)) if tables else []
-    if logged_flag_names:
-        layout = Layout(px4.STATUS_FLAGS, {name: name for name in logged_flag_names})
-        flags = topics.primary_samples(layout, is_step_function=True)
-        for aid in all_aids if len(flags) else ():
-            groups = (group.split(",") for group in aid.flags)
-            group = next((group for group in groups if {*group} <= {*logged_flag_names}), None)
-            if group is not None:
-                enabled_aids[aid.name] = flags[group].max(axis=1)
-    if not logged_flag_names and topics.find_layout(px4.TOPIC_LAYOUTS["control_bits"]) is not None:
-        control_bits = topics.primary_samples(
-            px4.TOPIC_LAYOUTS["control_bits"], is_step_function=True
-        )["bits"].dropna()
-        for aid in all_aids if len(control_bits) else ():
-            if aid.status_bit is not None:
-                is_enabled = control_bits.to_numpy().astype(np.int64) >> aid.status_bit & 1
-                enabled_aids[aid.name] = pd.Series(
-                    is_enabled.astype(float), index=control_bits.index
-                )
+    layout = Layout(
+        px4.STATUS_FLAGS,
+        optional_columns={name: name for name in flag_names},
+        is_step_function=True,
+    )
+    flags = topics.primary_samples(layout)
+    enabled_aids = {}
+    for aid in all_aids if len(flags) else ():
+        groups = (group.split(",") for group in aid.flags)
+        group = next((group for group in groups if {*group} <= {*flags}), None)
+        if group is not None:
+            enabled_aids[aid.name] = flags[group].max(axis=1)
+    if not flags.columns.empty:
+        return enabled_aids
+    control_bits = topics.primary_samples(px4.TOPIC_LAYOUTS["control_bits"])["bits"].dropna()
+    for aid in all_aids if len(control_bits) else ():
+        if aid.status_bit is not None:
+            is_enabled = control_bits.astype(np.int64) & (1 << aid.status_bit) > 0
+            enabled_aids[aid.name] = is_enabled.astype(float)
     return enabled_aids
 
 
@@ -126,25 +123,30 @@ def _read_common_topics(
         field_by_column |= _assign_fields_by_axis("variance", aid, variance_fields)
         layouts.append([Layout(px4.OLD_INNOVATION_TOPIC, field_by_column)] * 2)
     for value_layout, variance_layout in layouts:
-        innovations = topics.primary_samples(value_layout)
+        innovation = topics.primary_samples(value_layout)[f"innovation_{aid.axes[0]}"]
+        variance = topics.primary_samples(variance_layout)[f"variance_{aid.axes[0]}"]
+        is_new_variance = (variance > 0.0) & variance.ne(variance.shift())
         samples = topics.primary_samples(value_layout, select_rows=_drop_repeats_and_zeros)
-        times_with_unknown_fusion_s = _find_times_with_unknown_fusion(
-            innovations[f"innovation_{aid.axes[0]}"],
-            topics.primary_samples(variance_layout)[f"variance_{aid.axes[0]}"],
-        )
         if variance_layout is not value_layout:
             # The nearest variance S is used, because PX4 logs it at other times
             variance_samples = topics.primary_samples(variance_layout).dropna()
             samples = join_nearest(samples, variance_samples, MAX_VARIANCE_TIME_DIFFERENCE_S)
-        excluded_sample_count = len(samples) - len(samples := samples.dropna())
+        samples = samples.dropna()
         if enabled_flag is not None:
             samples = samples[sample_step_function(enabled_flag, samples.index) > 0.0]
-        used_topics = tuple(dict.fromkeys((value_layout.topic, variance_layout.topic)))
         aid_log = _make_aid_log(
-            topics, used_topics, aid, samples, enabled_flag, excluded_sample_count
+            topics,
+            tuple(dict.fromkeys((value_layout.topic, variance_layout.topic))),
+            aid,
+            samples,
+            enabled_flag,
+            # EKF2 may have fused a sample that is not logged, if the innovation is 0 or S is new
+            times_with_unknown_fusion_s=np.union1d(
+                innovation.index[innovation == 0.0], variance.index[is_new_variance]
+            ),
         )
         if aid_log is not None:
-            return replace(aid_log, times_with_unknown_fusion_s=times_with_unknown_fusion_s)
+            return aid_log
     return None
 
 
@@ -153,15 +155,6 @@ def _drop_repeats_and_zeros(samples: pd.DataFrame) -> pd.DataFrame:
     finite_samples = samples.dropna()
     first_column = finite_samples.iloc[:, 0]
     return finite_samples[first_column.ne(first_column.shift()) & (first_column != 0.0)]
-
-
-def _find_times_with_unknown_fusion(innovation: pd.Series, variance: pd.Series) -> Array:
-    """Return the times (s) at which EKF2 may have fused a sample that is not logged.
-
-    At these times, the innovation is 0 or the innovation variance S is new.
-    """
-    is_new_variance = (variance > 0.0) & variance.ne(variance.shift())
-    return np.union1d(innovation.index[innovation == 0.0], variance.index[is_new_variance])
 
 
 def _assign_fields_by_axis(name: str, aid: Aid, fields: str) -> dict[str, str]:
@@ -174,7 +167,7 @@ def _make_aid_log(
     aid: Aid,
     samples: pd.DataFrame,
     enabled_flag: pd.Series[float] | None,
-    excluded_sample_count: int = 0,
+    **log_fields: Any,
 ) -> AidLog | None:
     """Return the innovations of an aiding source; None without a positive innovation variance.
 
@@ -183,7 +176,6 @@ def _make_aid_log(
     samples = samples[(samples[[f"variance_{axis}" for axis in aid.axes]] > 0.0).all(axis=1)]
     if samples.empty:
         return None
-    innovation_columns = [f"innovation_{axis}" for axis in aid.axes]
+    samples = samples.assign(**-samples[[f"innovation_{axis}" for axis in aid.axes]])
     parameters = aid.logged_parameters(topics.ekf2_parameters)
-    samples = samples.assign(**-samples[innovation_columns])
-    return AidLog(used_topics, aid.axes, samples, enabled_flag, parameters, excluded_sample_count)
+    return AidLog(used_topics, aid.axes, samples, enabled_flag, parameters, **log_fields)

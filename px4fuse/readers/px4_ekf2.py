@@ -30,7 +30,7 @@ from px4fuse.flight.model import (
 )
 from px4fuse.readers import px4_topics as px4
 from px4fuse.readers.field_maps import Layout
-from px4fuse.readers.px4_aids import MAX_VARIANCE_TIME_DIFFERENCE_S, read_aids, read_enabled_aids
+from px4fuse.readers.px4_aids import read_aids, read_enabled_aids
 from px4fuse.readers.px4_innovations import collect_innovations_by_axis
 from px4fuse.readers.ulog_topics import Topics, measurement_time_us
 
@@ -61,12 +61,14 @@ VARIANCES_NOT_LOGGED = Unavailable(
     "estimator_states (estimator_status before v1.12) is not logged or not usable",
     f"{px4.DEFAULT_PROFILE_REMEDY} Wait until EKF2 has started.",
 )
-_RESET_FIELDS: tuple[tuple[Literal["position", "velocity"], str, tuple[str, str, str]], ...] = (
-    ("position", "xy_reset_counter", ("delta_north_m", "delta_east_m", "")),
-    ("position", "z_reset_counter", ("", "", "delta_down_m")),
-    ("velocity", "vxy_reset_counter", ("delta_north_m_s", "delta_east_m_s", "")),
-    ("velocity", "vz_reset_counter", ("", "", "delta_down_m_s")),
-)
+# Reset counters in vehicle_local_position, with the reset quantity and the columns of the change
+# (north, east, down)
+_RESET_COUNTERS: dict[str, tuple[Literal["position", "velocity"], list[str]]] = {
+    "xy_reset_counter": ("position", ["delta_north_m", "delta_east_m", ""]),
+    "z_reset_counter": ("position", ["", "", "delta_down_m"]),
+    "vxy_reset_counter": ("velocity", ["delta_north_m_s", "delta_east_m_s", ""]),
+    "vz_reset_counter": ("velocity", ["", "", "delta_down_m_s"]),
+}
 
 
 def read_ekf2(topics: Topics) -> Ekf2 | Unavailable:
@@ -100,25 +102,16 @@ def read_ekf2(topics: Topics) -> Ekf2 | Unavailable:
     innovations, innovation_topics = collect_innovations_by_axis(aids, fusion_flags, vision_gate)
     if innovation_topics:
         topics.record_stream("ekf2_innovations", *innovation_topics)
-    notes = [
+    notes = tuple(
         f"{topic} has no measurement times, so the times of EKF2 innovations are publication times "
         "(up to 0.2 s late)"
         for topic in innovation_topics[:1]
         if not any("timestamp_sample" in table for table in topics.tables_of(topic))
-    ]
-    notes += [
-        f"{log.excluded_sample_count} samples of {log.topics[0]} ({', '.join(log.axes)}) were "
-        f"dropped, because {log.topics[-1]} has no variance within "
-        f"{MAX_VARIANCE_TIME_DIFFERENCE_S:g} s"
-        for log in (aids[name] for name in ("ev_pos", "ev_hgt") if name in aids)
-        if log.excluded_sample_count
-    ]
+    )
     status_flags = enabled_aids | {
         name: local_position[name] for name in VALIDITY_FLAGS if name in local_position
     }
-    failed_gnss_checks = topics.primary_samples(
-        px4.TOPIC_LAYOUTS["gnss_checks"], is_step_function=True
-    )["failed"].dropna()
+    failed_gnss_checks = topics.primary_samples(px4.TOPIC_LAYOUTS["gnss_checks"])["failed"].dropna()
     if len(failed_gnss_checks):
         status_flags["failed_checks"] = failed_gnss_checks
     step_s = _estimate_step_s(topics)
@@ -139,7 +132,7 @@ def read_ekf2(topics: Topics) -> Ekf2 | Unavailable:
         resets=read_resets(local_position),
         primary_instances=topics.primary_instances,
         gate=vision_gate,
-        notes=tuple(notes),
+        notes=notes,
         accelerometer_bias=_read_accelerometer_bias(topics, horizon_state),
         step_s=step_s,
         horizon_s=_compute_horizon_delay_s(topics, step_s),
@@ -324,19 +317,12 @@ def _read_fusion_flags(topics: Topics, enabled_aids: StepFunctions) -> TableOrUn
 def read_resets(local_samples: pd.DataFrame) -> tuple[Reset, ...]:
     """Return the resets of EKF2's position and velocity, from ``vehicle_local_position``."""
     resets = []
-    for quantity, counter_field, delta_fields in _RESET_FIELDS:
-        if counter_field not in local_samples:
-            continue
-        for row in (
-            np.flatnonzero(np.diff(local_samples[counter_field].to_numpy()) != 0) + 1
-        ).tolist():
-            delta_north, delta_east, delta_down = (
-                float(local_samples[name].iloc[row]) if name in local_samples else 0.0
-                for name in delta_fields
-            )
-            if all(np.isfinite([delta_north, delta_east, delta_down])):
-                delta = delta_north, delta_east, delta_down
-                resets.append(Reset(float(local_samples.index[row]), quantity, delta))
+    for counter, (quantity, delta_columns) in _RESET_COUNTERS.items():
+        if counter in local_samples:
+            deltas = local_samples.reindex(columns=delta_columns, fill_value=0.0)
+            is_reset = local_samples[counter].diff().fillna(0.0) != 0.0
+            for time_s, *delta in deltas[is_reset].dropna().itertuples():
+                resets.append(Reset(time_s, quantity, tuple(delta)))
     return tuple(sorted(resets, key=lambda reset: reset.time_s))
 
 
@@ -355,13 +341,14 @@ def _read_fusion_record(
     usable_state = horizon_state[np.abs(quaternion_norm - 1.0) < 0.01].copy()
     if usable_state.empty:
         return RECORD_NOT_LOGGED
+    origin = local_samples.reindex(columns=["ref_lat", "ref_alt"]).ffill().iloc[-1]
     horizontal_columns = Columns.POSITION[:2]
     altitude_m = 0.0
     # Since v1.16, EKF2 logs zeros for the horizontal position, and altitude as height
     # (ekf_helper.cpp)
     if not usable_state[horizontal_columns].to_numpy().any():
         usable_state[horizontal_columns] = np.nan
-        altitude_m = _last_finite_value(local_samples, "ref_alt", 0.0)
+        altitude_m = float(np.nan_to_num(origin["ref_alt"]))
         usable_state["down_m"] += altitude_m
     vision_delay_s = _compute_publication_delay_s(topics, VISION_TOPIC).sort_index()
     return FusionRecord(
@@ -376,7 +363,7 @@ def _read_fusion_record(
         vision_age_s=vision_delay_s[~vision_delay_s.index.duplicated()],
         magnetic_field_gauss=_read_magnetic_field(topics, step_s),
         flow=_read_optical_flow(topics, enabled_aids),
-        latitude_deg=_last_finite_value(local_samples, "ref_lat", np.nan),
+        latitude_deg=float(origin["ref_lat"]),
         altitude_m=altitude_m,
         states={name: enabled_aids[name] for name in STATUS_FLAGS if name in enabled_aids},
         height_bias_updates={
@@ -387,33 +374,20 @@ def _read_fusion_record(
     )
 
 
-def _last_finite_value(samples: pd.DataFrame, column: str, default: float) -> float:
-    finite_values = samples[column].dropna().to_numpy() if column in samples else np.zeros(0)
-    return float(finite_values[-1]) if len(finite_values) else default
-
-
 def _read_magnetic_field(topics: Topics, step_s: float) -> pd.DataFrame:
     """Read the measured magnetic field from the magnetometer topic or from EKF2's observations."""
-    magnetic_field_tables = [
+    magnetometer, observations = (
         topics.primary_samples(layout).dropna() for layout in px4.MAGNETIC_FIELD_LAYOUTS
-    ]
+    )
     # EKF2 subtracts EKF2_MAG_DELAY and half a prediction interval from the times
     delay_s = topics.ekf2_parameters.get("EKF2_MAG_DELAY", 0.0) * 1e-3 + 0.5 * step_s
-    magnetic_field_tables[1] = magnetic_field_tables[1].set_axis(
-        magnetic_field_tables[1].index + delay_s
-    )
-    complete_field_tables = [
-        field
-        for field in magnetic_field_tables
-        if len(field) > MIN_MAGNETOMETER_HZ * topics.log.duration_s
-    ]
-    tables_with_innovation = [
-        field for field in magnetic_field_tables if Columns.MAGNETIC_FIELD_INNOVATION[0] in field
-    ]
-    field = max(complete_field_tables or tables_with_innovation or magnetic_field_tables, key=len)
-    control_bits = topics.read(px4.TOPIC_LAYOUTS["control_bits"], is_step_function=True)[
-        "bits"
-    ].dropna()
+    observations = observations.set_axis(observations.index + delay_s)
+    min_count = MIN_MAGNETOMETER_HZ * topics.log.duration_s
+    candidates = [table for table in (magnetometer, observations) if len(table) > min_count]
+    if not candidates and Columns.MAGNETIC_FIELD_INNOVATION[0] in observations:
+        candidates = [observations]
+    field = max(candidates or [magnetometer, observations], key=len)
+    control_bits = topics.read(px4.TOPIC_LAYOUTS["control_bits"])["bits"].dropna()
     if field.empty or control_bits.empty:
         return pd.DataFrame()
     flags = sample_step_function(control_bits, field.index).astype(np.int64)
@@ -429,37 +403,26 @@ def _read_optical_flow(topics: Topics, enabled_aids: StepFunctions) -> pd.DataFr
     interval_s = float(flow_intervals["interval_us"].median()) * 1e-6
     if not interval_s > 0.0 or flow_noise.empty:
         return pd.DataFrame()
-    times_s = flow_velocity.index.to_numpy()
-    steps_s = np.diff(times_s)
-    used_rows = np.flatnonzero((steps_s > 0.5 * interval_s) & (steps_s <= MAX_FLOW_INTERVAL_S)) + 1
-    if FLOW.name in enabled_aids:
-        used_rows = used_rows[
-            sample_step_function(enabled_aids[FLOW.name], times_s[used_rows]) > 0.0
-        ]
-    sample_count = np.rint((times_s[used_rows] - times_s[used_rows - 1]) / interval_s)
-    previous_output_weight = ((1.0 - FLOW_FILTER_NEW_SAMPLE_WEIGHT) ** sample_count)[:, None]
-    filtered_velocity = flow_velocity[["forward_m_s", "right_m_s"]].to_numpy()
-    forward_velocity_m_s, right_velocity_m_s = (
-        (filtered_velocity[used_rows] - previous_output_weight * filtered_velocity[used_rows - 1])
-        / (1.0 - previous_output_weight)
-    ).T
-    flow_velocity = flow_velocity.iloc[used_rows]
+    steps_s = flow_velocity.index.to_series().diff()
+    sample_count = np.rint(steps_s / interval_s)
+    previous_output_weight = (1.0 - FLOW_FILTER_NEW_SAMPLE_WEIGHT) ** sample_count
+    filtered_velocity = flow_velocity[["forward_m_s", "right_m_s"]]
+    previous_part = filtered_velocity.shift().mul(previous_output_weight, axis=0)
+    flow = (filtered_velocity - previous_part).div(1.0 - previous_output_weight, axis=0)
     newest_velocity = flow_velocity[["newest_forward_m_s", "newest_right_m_s"]]
     squared_ground_distance_m2 = (newest_velocity**2).sum(axis=1) / (
         flow_velocity[["x_rad_s", "y_rad_s"]] ** 2
     ).sum(axis=1)
-    flow = pd.DataFrame(
-        {
-            "forward_m_s": forward_velocity_m_s,
-            "right_m_s": right_velocity_m_s,
-            "samples": sample_count,
-            "interval_s": interval_s,
-            "noise_m2_s2": squared_ground_distance_m2
-            * np.interp(times_s[used_rows], flow_noise.index, flow_noise["noise"]),
-        },
-        index=flow_velocity.index,
+    flow = flow.assign(
+        samples=sample_count,
+        interval_s=interval_s,
+        noise_m2_s2=squared_ground_distance_m2
+        * np.interp(flow.index, flow_noise.index, flow_noise["noise"]),
     )
-    return flow.replace(np.inf, np.nan).dropna()
+    is_used = (steps_s > 0.5 * interval_s) & (steps_s <= MAX_FLOW_INTERVAL_S)
+    if FLOW.name in enabled_aids:
+        is_used &= sample_step_function(enabled_aids[FLOW.name], flow.index) > 0.0
+    return flow[is_used].replace(np.inf, np.nan).dropna()
 
 
 def _convert_attitude_variance(quaternion: Array, variance: Array) -> Array:

@@ -30,35 +30,26 @@ def read_unlogged_fixes(
     topics: Topics, logged_fixes: pd.DataFrame, ekf2: Ekf2 | Unavailable
 ) -> pd.DataFrame:
     """Read GNSS fixes that only EKF2's topics contain (PX4 v1.16 and newer)."""
-    position_and_velocity_layouts = (
-        px4.TOPIC_LAYOUTS["fused_position"],
-        px4.TOPIC_LAYOUTS["fused_velocity"],
-    )
-    if isinstance(ekf2, Unavailable) or not all(
-        map(topics.find_layout, position_and_velocity_layouts)
-    ):
+    if isinstance(ekf2, Unavailable):
         return pd.DataFrame()
-    position, velocity = map(topics.primary_samples, position_and_velocity_layouts)
+    position, velocity, height = (
+        topics.primary_samples(px4.TOPIC_LAYOUTS[f"fused_{quantity}"])
+        for quantity in ("position", "velocity", "height")
+    )
     # A row that is neither fused nor rejected contains no new fix
     position = position[position[["fused", "rejected"]].any(axis=1)]
-    position = position.drop(columns=["fused", "rejected"])
-    fixes = position.join(velocity, how="inner").dropna()
+    fixes = position.drop(columns=["fused", "rejected"]).join(velocity, how="inner").dropna()
     # If GNSS is not the height reference, EKF2's height contains a bias estimate
-    height_layout = px4.TOPIC_LAYOUTS["fused_height"]
-    if topics.find_layout(height_layout) and topics.ekf2_parameters.get("EKF2_HGT_REF", 1.0) == 1.0:
-        fixes = fixes.join(topics.primary_samples(height_layout))
+    if topics.ekf2_parameters.get("EKF2_HGT_REF", 1.0) == 1.0:
+        fixes = fixes.join(height)
     # EKF2 shifts GNSS times by half a prediction interval (estimator_interface.cpp)
     fixes = fixes.set_axis(fixes.index + 0.5 * ekf2.step_s)
     next_row = np.clip(np.searchsorted(logged_fixes.index, fixes.index), 1, len(logged_fixes) - 1)
+    times_s, logged_times_s = fixes.index.to_numpy(), logged_fixes.index.to_numpy()
     distance_s = np.minimum(
-        *(
-            np.abs(logged_fixes.index.to_numpy()[next_row - offset] - fixes.index)
-            for offset in (0, 1)
-        )
+        np.abs(logged_times_s[next_row] - times_s), np.abs(logged_times_s[next_row - 1] - times_s)
     )
-    is_between_fixes = (fixes.index > logged_fixes.index[0]) & (
-        fixes.index < logged_fixes.index[-1]
-    )
+    is_between_fixes = (times_s > logged_times_s[0]) & (times_s < logged_times_s[-1])
     matched_fixes = fixes[distance_s <= MAX_TIME_DIFFERENCE_OF_SAME_FIX_S]
     unlogged_fixes = fixes[(distance_s > MAX_TIME_DIFFERENCE_OF_SAME_FIX_S) & is_between_fixes]
     # Before v1.16, the topic contains a local position (m), no latitude and longitude
@@ -142,10 +133,9 @@ def reconstruct_fixes(
     if rms_error_m > MAX_FIX_RECONSTRUCTION_ERROR_M:
         return empty_result
     for column in (Columns.POSITION[2], *Columns.POSITION_VARIANCE):
-        if column in fixes:
-            reconstructed_fixes[column] = np.interp(
-                reconstructed_fixes.index, logged_fix_times_s, fixes[column]
-            )
+        reconstructed_fixes[column] = np.interp(
+            reconstructed_fixes.index, logged_fix_times_s, fixes[column]
+        )
     return reconstructed_fixes, (
         f"{len(reconstructed_fixes)} GNSS fixes are not logged. They are computed as EKF2 position "
         f"plus innovation, with an RMS error of {rms_error_m:.2f} m along each axis"
@@ -157,27 +147,23 @@ def _estimate_receiver_interval(fix_times_s: Array) -> float | None:
 
     All logged intervals are multiples of this interval. Return None if the multiples are unknown.
     """
-    logged_intervals_s = np.diff(fix_times_s)[:, None]
-    multiples = logged_intervals_s / CANDIDATE_FIX_INTERVALS_S
+    logged_intervals_s = np.diff(fix_times_s)
+    multiples = np.divide.outer(logged_intervals_s, CANDIDATE_FIX_INTERVALS_S)
     deviation_from_multiple_s = np.abs(multiples - np.round(multiples)) * CANDIDATE_FIX_INTERVALS_S
     percentile_98_of_deviation_s = np.percentile(deviation_from_multiple_s, 98, axis=0)
-    possible_indices = np.flatnonzero(percentile_98_of_deviation_s <= MAX_DEVIATION_FROM_MULTIPLE_S)
-    if not len(possible_indices):
+    is_possible = percentile_98_of_deviation_s <= MAX_DEVIATION_FROM_MULTIPLE_S
+    if not np.any(is_possible):
         return None
-    longest_interval_s = CANDIDATE_FIX_INTERVALS_S[possible_indices[-1]]
+    longest_interval_s = CANDIDATE_FIX_INTERVALS_S[is_possible][-1]
     # Best fit among the candidates within 10 % of the longest possible interval
-    candidate_indices_near_longest = np.flatnonzero(
+    is_near_longest = (
         np.abs(CANDIDATE_FIX_INTERVALS_S - longest_interval_s) < 0.1 * longest_interval_s
     )
-    best_interval_s = CANDIDATE_FIX_INTERVALS_S[
-        candidate_indices_near_longest[
-            np.argmin(percentile_98_of_deviation_s[candidate_indices_near_longest])
-        ]
-    ]
-    interval_multiples = np.round(logged_intervals_s[:, 0] / best_interval_s)
+    best_index = np.argmin(np.where(is_near_longest, percentile_98_of_deviation_s, np.inf))
+    interval_multiples = np.round(logged_intervals_s / CANDIDATE_FIX_INTERVALS_S[best_index])
     is_frequent_multiple = (
         np.bincount(interval_multiples.astype(int)) >= MIN_LOGGED_INTERVALS_PER_MULTIPLE
     )
     if not np.any(is_frequent_multiple[1:] & is_frequent_multiple[:-1]):
         return None
-    return float(np.median(logged_intervals_s[:, 0] / interval_multiples))
+    return float(np.median(logged_intervals_s / interval_multiples))

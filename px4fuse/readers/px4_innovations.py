@@ -104,12 +104,14 @@ def collect_innovations_by_axis(
     innovations: Innovations = {}
     used_topics: dict[str, None] = {}
     for axis in AXIS_NAMES:
-        axis_group = "vertical" if axis == "down" else "horizontal"
-        sensor_name = (axis == "down" and source.height_sensor) or source.name
-        aid_log = aids.get(source.vertical_aid if axis == "down" else source.horizontal_aid)
+        axis_group, quantity = "horizontal", "horizontal position"
+        aid_name, sensor_name = source.horizontal_aid, source.name
+        if axis == "down":
+            axis_group, quantity = "vertical", "height"
+            aid_name, sensor_name = source.vertical_aid, source.height_sensor or source.name
+        aid_log = aids.get(aid_name)
         axis_innovations = None if aid_log is None else select_axis_innovations(aid_log, axis, gate)
         if isinstance(fusion_flags, pd.DataFrame) and not fusion_flags[axis_group].any():
-            quantity = "height" if axis == "down" else "horizontal position"
             reason = f"EKF2 never fused the {quantity} from {sensor_name} in this log"
             remedy = source.remedies[axis_group]
         elif aid_log is None or axis_innovations is None or axis_innovations.empty:

@@ -2,18 +2,16 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
 from typing import Any
 
 import numpy as np
 import pandas as pd
 from msgspec import structs
 
-from px4fuse.core.arrays import Array, IntArray
+from px4fuse.core.arrays import Array, ArrayPair, IntArray
 from px4fuse.flight.ekf2_parameters import EV_POS, GNSS_MODE_PARAMETER, GNSS_POS, fill_with_defaults
 from px4fuse.flight.model import (
     HEIGHT_ONLY_REASON,
-    NO_INVALID_ROWS,
     SENDER_CLOCK,
     ClockMap,
     Columns,
@@ -24,7 +22,6 @@ from px4fuse.flight.model import (
     Unavailable,
     describe_repeated_timestamps,
     infer_position_kind,
-    reclassify_as_vio,
     sample_rate,
     time_index,
 )
@@ -92,8 +89,10 @@ def split_tracks(
     tracks: list[PositionTrack | Unavailable],
 ) -> tuple[tuple[PositionTrack, ...], tuple[Unavailable, ...]]:
     """Separate available positions, best source first, from missing position sources."""
-    available_tracks = [track for track in tracks if isinstance(track, PositionTrack)]
-    available_tracks.sort(key=lambda track: track.origin.find_preference_rank())
+    available_tracks = sorted(
+        (track for track in tracks if isinstance(track, PositionTrack)),
+        key=lambda track: track.origin.find_preference_rank(),
+    )
     missing_tracks = (track for track in tracks if isinstance(track, Unavailable))
     return tuple(available_tracks), tuple(missing_tracks)
 
@@ -115,6 +114,7 @@ def make_track(
     *,
     needed_columns: list[str] = Columns.POSITION,
     remedy: str = "",
+    is_odometry: bool = False,
     **track_fields: Any,
 ) -> PositionTrack | Unavailable:
     """Make a position track from valid samples, or return the reason if they are too few.
@@ -125,39 +125,36 @@ def make_track(
         Positions (m) and variances (m²). A variance of 0 means "not sent" (``EKF2.cpp``).
     needed_columns : list of str
         Columns that must be finite.
+    is_odometry : bool
+        True if the orientation of the source changes, so that the source is not UWB.
     track_fields
         Other fields of :class:`~px4fuse.flight.model.PositionTrack`.
     """
     status_samples = samples[[name for name in POSITION_STATUS_COLUMNS if name in samples]]
     samples = samples.reindex(columns=Columns.POSITION + Columns.POSITION_VARIANCE)
-    is_nan = samples[Columns.POSITION].isna().to_numpy()
-    is_height_only = bool(is_nan[:, :2].all() and not is_nan[:, 2].all())
     rounding_step_m = max(
         estimate_rounding_step(samples[name].to_numpy()) for name in needed_columns[:2]
     )
-    if (
-        origin.is_gnss
-    ):  # a receiver at rest may repeat its position, so repeated positions are valid
-        samples, invalid_rows = select_valid_rows(samples, needed_columns), NO_INVALID_ROWS
+    is_number = samples[Columns.POSITION].notna().any()
+    if origin.is_gnss:  # a receiver at rest may repeat its position
+        samples = select_valid_rows(samples, needed_columns)
     else:
         invalid_reasons = classify_invalid_positions(samples, needed_columns)
-        samples, invalid_rows = (
-            samples[invalid_reasons == ""],
-            invalid_reasons[invalid_reasons != ""],
-        )
+        samples = samples[invalid_reasons == ""]
+        track_fields["invalid_reasons"] = invalid_reasons[invalid_reasons != ""]
     if len(samples) < MIN_TRACK_SAMPLES:
         fault = f"the track has only {len(samples)} finite samples, fewer than {MIN_TRACK_SAMPLES}"
-        if is_height_only:
+        if is_number.tolist() == [False, False, True]:
             fault = HEIGHT_ONLY_REASON
         return unavailable_source(name, fault, remedy)
     if origin.kind == "uwb":
-        origin = structs.replace(origin, kind=infer_position_kind(samples))
+        kind = "vio" if is_odometry else infer_position_kind(samples)
+        origin = structs.replace(origin, kind=kind)
     variance = samples[Columns.POSITION_VARIANCE]
     return PositionTrack(
         name=name,
         samples=samples.assign(**variance.where(variance > 0)),
         origin=origin,
-        invalid_reasons=invalid_rows,
         status=status_samples,
         rounding_step_m=rounding_step_m,
         **track_fields,
@@ -170,14 +167,12 @@ def _make_ulog_track(
     samples: pd.DataFrame,
     topic_names: tuple[str, ...],
     *,
-    is_odometry: bool = False,
     is_auto_candidate: bool = True,
     **track_fields: Any,
 ) -> PositionTrack | Unavailable:
     """Make a position track of a source that is defined in ``px4_topics.toml``."""
     source = px4.TRACK_SOURCES[name]
-    origin = reclassify_as_vio(source.origin, has_changing_orientation=is_odometry)
-    origin = structs.replace(origin, is_auto_candidate=is_auto_candidate)
+    origin = structs.replace(source.origin, is_auto_candidate=is_auto_candidate)
     if origin.aid is not None:
         parameters = topics.ekf2_parameters
         lever_arm_m = tuple(parameters.get(parameter, 0.0) for parameter in origin.aid.lever_arm)
@@ -260,19 +255,15 @@ def _describe_timestamp_clock(published_us: IntArray, sample_timestamps_us: IntA
 
 
 def _read_fused_observation(topics: Topics, is_odometry: bool) -> PositionTrack | Unavailable:
-    horizontal_layout, vertical_layout = (
-        px4.TOPIC_LAYOUTS["kept_horizontal"],
-        px4.TOPIC_LAYOUTS["kept_vertical"],
-    )
-    if topics.find_layout(horizontal_layout) is None:
+    horizontal, vertical = px4.TOPIC_LAYOUTS["kept_horizontal"], px4.TOPIC_LAYOUTS["kept_vertical"]
+    if topics.find_layout(horizontal) is None:
         return unavailable_source(px4.FUSED_OBSERVATION_TRACK_NAME)
-    has_height = topics.find_layout(vertical_layout) is not None
     return _make_track_from_ekf2_topics(
         topics,
         px4.FUSED_OBSERVATION_TRACK_NAME,
-        topics.primary_samples(horizontal_layout),
-        topics.primary_samples(vertical_layout) if has_height else None,
-        (horizontal_layout.topic, vertical_layout.topic)[: 1 + has_height],
+        topics.primary_samples(horizontal),
+        topics.primary_samples(vertical),
+        (horizontal.topic, vertical.topic)[: 1 + (topics.find_layout(vertical) is not None)],
         # EKF2 subtracts half a prediction interval from times (estimator_interface.cpp)
         shift_s=0.5 * configured_step_s(topics),
         is_odometry=is_odometry,
@@ -283,7 +274,7 @@ def _make_track_from_ekf2_topics(
     topics: Topics,
     name: str,
     samples: pd.DataFrame,
-    height_samples: pd.DataFrame | None,
+    height_samples: pd.DataFrame,
     topic_names: tuple[str, ...],
     *,
     shift_s: float = 0.0,
@@ -294,7 +285,7 @@ def _make_track_from_ekf2_topics(
     EKF2 subtracted EKF2_EV_DELAY from the timestamps. The delay is added again.
     """
     notes: tuple[str, ...] = ()
-    if height_samples is not None:
+    if len(height_samples):
         samples = join_nearest(
             samples, height_samples.assign(_found=True), MAX_HEIGHT_TIME_DIFFERENCE_S
         )
@@ -338,21 +329,19 @@ def _reconstruct_track(
         return unavailable_source(
             px4.RECONSTRUCTED_TRACK_NAME, "EKF2 fused no horizontal external vision position"
         )
-    down_m = positions.pop("down_m", None)
+    heights = positions.pop("down_m", pd.Series(dtype=np.float64)).to_frame("down_m")
     return _make_track_from_ekf2_topics(
         topics,
         px4.RECONSTRUCTED_TRACK_NAME,
         pd.DataFrame(positions),
-        None if down_m is None else down_m.to_frame("down_m"),
+        heights,
         ("vehicle_local_position", *ekf2.innovation_topics),
         is_odometry=is_odometry,
         clock=f"autopilot boot clock: fusion time plus {EV_POS.delay}, up to one interval late",
     )
 
 
-def project(
-    latitude_deg: Array, longitude_deg: Array, origin: GeodeticPosition
-) -> tuple[Array, Array]:
+def project(latitude_deg: Array, longitude_deg: Array, origin: GeodeticPosition) -> ArrayPair:
     """Convert latitude and longitude (degrees) to north and east (m) from the origin.
 
     Source: PX4 ``MapProjection::project``, src/lib/geo/geo.cpp (Snyder 1987, equation 25-2).
@@ -368,17 +357,13 @@ def project(
             sin_origin * sin_latitude + cos_origin * cos_latitude * cos_longitude_step, -1.0, 1.0
         )
     )
-    arc_over_sine = np.where(
-        arc_rad > 0, arc_rad / np.where(arc_rad > 0, np.sin(arc_rad), 1.0), 1.0
-    )
-    north_arc_rad = arc_over_sine * (
-        cos_origin * sin_latitude - sin_origin * cos_latitude * cos_longitude_step
-    )
-    east_arc_rad = arc_over_sine * cos_latitude * np.sin(longitude_step_rad)
-    return north_arc_rad * EARTH_RADIUS_M, east_arc_rad * EARTH_RADIUS_M
+    # arc/sin(arc) · radius, equal to the radius at the origin
+    scale_m = EARTH_RADIUS_M / np.sinc(arc_rad / np.pi)
+    north_m = scale_m * (cos_origin * sin_latitude - sin_origin * cos_latitude * cos_longitude_step)
+    return north_m, scale_m * cos_latitude * np.sin(longitude_step_rad)
 
 
-def unproject(north_m: Array, east_m: Array, origin: GeodeticPosition) -> tuple[Array, Array]:
+def unproject(north_m: Array, east_m: Array, origin: GeodeticPosition | ArrayPair) -> ArrayPair:
     """Convert north and east (m) from the origin to latitude and longitude (degrees).
 
     Source: PX4 ``MapProjection::reproject``, src/lib/geo/geo.cpp (Snyder 1987, equation 20-14).
@@ -431,29 +416,27 @@ def _read_gnss_track(topics: Topics, ekf2: Ekf2 | Unavailable) -> PositionTrack 
     layout = topics.find_layout(*px4.find_track_layouts(px4.GPS_POSITION))
     if layout is None:
         return unavailable_source(px4.GPS_POSITION)
-    fixes = topics.read_instance(layout)
-    message_count, samples_without_fix = len(fixes), fixes.iloc[:0]
-    if "fix_type" in fixes:
-        has_fix = fixes["fix_type"] >= FIX_TYPE_3D
-        fixes, samples_without_fix = fixes[has_fix], fixes[~has_fix]
+    messages = topics.read_instance(layout)
+    messages["published_s"] = (messages.pop("published_us") - topics.time_origin_us) * 1e-6
+    has_fix = messages.get("fix_type", pd.Series(FIX_TYPE_3D, messages.index)) >= FIX_TYPE_3D
+    fixes = messages[has_fix]
     if fixes.empty:
         return unavailable_source(
             px4.GPS_POSITION,
-            f"the log has {message_count} {px4.GPS_POSITION}, none with a 3D fix",
+            f"the log has {len(messages)} {px4.GPS_POSITION}, none with a 3D fix",
             NO_FIX_ACTION,
         )
     parameters = topics.ekf2_parameters
-    published_s = (fixes["published_us"].to_numpy() - topics.time_origin_us) * 1e-6
-    has_gnss_driver_times = GNSS_MODE_PARAMETER in parameters and bool(
-        np.any(published_s - fixes.index > MAX_ARRIVAL_TO_PUBLICATION_DELAY_US * 1e-6)
-    )
-    delay_ms = (
-        0.0 if has_gnss_driver_times else fill_with_defaults(parameters, GNSS_POS)[GNSS_POS.delay]
-    )
-    clock = "autopilot boot clock, measurement times from the GNSS driver"
-    if not has_gnss_driver_times:
-        fixes = fixes.set_axis(time_index(published_s - delay_ms * 1e-3))
-        clock = f"autopilot boot clock: timestamp minus {GNSS_POS.delay} ({delay_ms:g} ms)"
+    age_s = fixes["published_s"] - fixes.index
+    if GNSS_MODE_PARAMETER in parameters and (
+        age_s.max() > MAX_ARRIVAL_TO_PUBLICATION_DELAY_US * 1e-6
+    ):
+        delay_s = 0.0
+        clock = "autopilot boot clock, measurement times from the GNSS driver"
+    else:
+        delay_s = fill_with_defaults(parameters, GNSS_POS)[GNSS_POS.delay] * 1e-3
+        fixes = fixes.set_axis(time_index(fixes["published_s"].to_numpy() - delay_s))
+        clock = f"autopilot boot clock: timestamp minus {GNSS_POS.delay} ({1e3 * delay_s:g} ms)"
     unlogged_fixes = read_unlogged_fixes(topics, fixes, ekf2)
     if len(unlogged_fixes):
         fixes = pd.concat([fixes, unlogged_fixes]).sort_index()
@@ -474,7 +457,7 @@ def _read_gnss_track(topics: Topics, ekf2: Ekf2 | Unavailable) -> PositionTrack 
             f"estimator_aid_src_gnss_pos ({interpolated_count} with interpolated height)"
         )
     elif is_downsampled:
-        reconstructed_fixes, note = reconstruct_fixes(samples, ekf2, delay_ms * 1e-3)
+        reconstructed_fixes, note = reconstruct_fixes(samples, ekf2, delay_s)
         if note:
             samples = pd.concat([samples, reconstructed_fixes]).sort_index()
             notes.append(note)
@@ -482,7 +465,8 @@ def _read_gnss_track(topics: Topics, ekf2: Ekf2 | Unavailable) -> PositionTrack 
     # The lever arm of the receiver is logged since v1.17
     if {*px4.ANTENNA_COLUMNS} <= {*fixes}:
         track_fields["lever_arm_m"] = tuple(fixes[px4.ANTENNA_COLUMNS].iloc[-1].tolist())
-    track = _make_ulog_track(
+    times_without_fix_s = messages["published_s"].to_numpy()[~has_fix] - delay_s
+    return _make_ulog_track(
         topics,
         px4.GPS_POSITION,
         samples,
@@ -490,33 +474,24 @@ def _read_gnss_track(topics: Topics, ekf2: Ekf2 | Unavailable) -> PositionTrack 
         clock=clock,
         notes=tuple(notes),
         velocity=samples[Columns.VELOCITY + Columns.VELOCITY_VARIANCE],
-        assumed_delay_s=delay_ms * 1e-3,
+        assumed_delay_s=delay_s,
         is_auto_candidate=has_fused_aid(ekf2),
+        invalid_reasons=pd.Series("no fix", time_index(times_without_fix_s), dtype=object),
         **track_fields,
-    )
-    if isinstance(track, Unavailable):
-        return track
-    times_without_fix_s = (
-        samples_without_fix["published_us"].to_numpy() - topics.time_origin_us
-    ) * 1e-6 - delay_ms * 1e-3
-    return replace(
-        track, invalid_reasons=pd.Series("no fix", time_index(times_without_fix_s), dtype=object)
     )
 
 
 def _convert_gnss_fixes(fixes: pd.DataFrame, origin: GeodeticPosition | None) -> pd.DataFrame:
     """Convert GNSS fixes to positions and velocities in NED with their variances."""
-    samples = project_to_ned(fixes, origin)
-    if {"eph_m", "epv_m"} <= {*fixes}:
-        # EKF2 uses the horizontal accuracy as σ of each horizontal axis (gps_control.cpp)
-        samples["north_m2"] = samples["east_m2"] = fixes["eph_m"].to_numpy() ** 2
-        samples["down_m2"] = fixes["epv_m"].to_numpy() ** 2
-    # Add the velocity here, so that it is dropped together with a damaged position
-    velocity = fixes.reindex(columns=Columns.VELOCITY).set_axis(samples.index)
-    speed_accuracy_m_s = fixes.get("speed_accuracy_m_s", pd.Series(np.nan, fixes.index)).to_numpy()
-    samples = samples.assign(
-        **velocity, **dict.fromkeys(Columns.VELOCITY_VARIANCE, speed_accuracy_m_s**2)
+    fixes = fixes.reindex(
+        columns=[*Columns.GEODETIC, *Columns.VELOCITY, "eph_m", "epv_m", "speed_accuracy_m_s"]
     )
+    samples = project_to_ned(fixes, origin)
+    # EKF2 uses the horizontal accuracy as σ of each horizontal axis (gps_control.cpp)
+    samples[Columns.POSITION_VARIANCE] = fixes[["eph_m", "eph_m", "epv_m"]].to_numpy() ** 2
+    # Add the velocity here, so that it is dropped together with a damaged position
+    samples[Columns.VELOCITY] = fixes[Columns.VELOCITY].to_numpy()
+    samples[Columns.VELOCITY_VARIANCE] = fixes[["speed_accuracy_m_s"] * 3].to_numpy() ** 2
     return select_valid_rows(samples, Columns.POSITION)
 
 

@@ -48,7 +48,8 @@ FRAME_BY_FIELD_VALUE = msgspec.convert(
 UNUSED_TOPICS: Mapping[str, str] = _TOPIC_TABLES["unused"]
 IMU_LAYOUT, LOCAL_POSITION_LAYOUT = TOPIC_LAYOUTS["imu"], TOPIC_LAYOUTS["local_position"]
 HEIGHT_BIAS_LAYOUT_BY_AID = {
-    name: TOPIC_LAYOUTS[f"bias_of_{name}"] for name in ("baro_hgt", "gnss_hgt")
+    "baro_hgt": TOPIC_LAYOUTS["baro_bias"],
+    "gnss_hgt": replace(TOPIC_LAYOUTS["baro_bias"], topic="estimator_gnss_hgt_bias"),
 }
 # Advice if a topic of the default logging profile is not logged
 DEFAULT_PROFILE_REMEDY = "Record with SDLOG_PROFILE bit 0 (default)."
@@ -94,7 +95,8 @@ def list_topics() -> list[str]:
     layout_topics = {
         layout.topic for track in TRACK_SOURCES for layout in find_track_layouts(track)
     }
-    layout_topics |= {layout.topic for layout in TOPIC_LAYOUTS.values() if layout.topic}
+    layouts = (*TOPIC_LAYOUTS.values(), *HEIGHT_BIAS_LAYOUT_BY_AID.values())
+    layout_topics |= {layout.topic for layout in layouts if layout.topic}
     layout_topics |= {f"estimator_aid_src_{name}" for name in AIDS}
     aid_topics = {STATUS_FLAGS, *INNOVATION_TOPICS, OLD_INNOVATION_TOPIC}
     return sorted(layout_topics | UNUSED_TOPICS.keys() | aid_topics | {*STATE_VECTOR_TOPICS})

@@ -9,6 +9,7 @@ import io
 import re
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, replace
+from itertools import zip_longest
 from pathlib import Path
 
 import msgspec
@@ -105,8 +106,9 @@ def choose_body(file_name: str, body_names: Iterable[str], wanted_body: str | No
         The file does not contain the body, or contains several and none is selected.
     """
     names = [*dict.fromkeys(body_names)]
-    matches = names if wanted_body is None else [name for name in names if name == wanted_body]
-    matches = matches or [name for name in names if name.partition(":")[0] == wanted_body]
+    matches = [name for name in names if wanted_body in (None, name)] or [
+        name for name in names if name.partition(":")[0] == wanted_body
+    ]
     if len(matches) == 1:
         return matches[0]
     raise LogError(
@@ -138,26 +140,24 @@ def find_table(
     text = decode_text(content)
     if text is None:
         raise LogError(f"{file_name} is a binary file, not a text table", "Give a CSV file.")
-    notes = []
     whole_lines, _, last_line = text.rpartition("\n")
-    text = f"{whole_lines}\n"
-    if _is_complete_line(last_line, whole_lines.rpartition("\n")[2]):
-        text += f"{last_line}\n"
-    elif last_line.strip():
-        notes.append("the last line of the position file was dropped, because it is incomplete")
-    table = None if columns else _find_json_table(file_name, text)
-    text = text.replace('"', "")
-    lines = text[: text.rfind("\n", 0, MAX_HEADER_CHARS) + 1].split("\n")[:MAX_HEADER_LINES]
-    if columns is None and table is None:
-        table = _find_body_table(file_name, text, lines, body) or _find_stream_table(
-            file_name, text, lines
-        )
+    is_last_line_complete = _is_complete_line(last_line, whole_lines.rpartition("\n")[2])
+    text = f"{text if is_last_line_complete else whole_lines}\n"
+    unquoted_text = text.replace('"', "")
+    header_text = unquoted_text[: unquoted_text.rfind("\n", 0, MAX_HEADER_CHARS) + 1]
+    lines = header_text.split("\n")[:MAX_HEADER_LINES]
     wanted_names = {column.strip().casefold() for column in columns or () if not column.isdecimal()}
-    if table is None:
-        table = _find_header_table(file_name, text, lines, wanted_names)
+    table = None
+    if columns is None:
+        table = (
+            _find_json_table(file_name, text)
+            or _find_body_table(file_name, unquoted_text, lines, body)
+            or _find_stream_table(file_name, unquoted_text, lines)
+        )
+    table = table or _find_header_table(file_name, unquoted_text, lines, wanted_names)
     if table is None and not wanted_names:
-        table = _find_headerless_table(path, text, lines)
-    if table is None:
+        table = _find_headerless_table(path, unquoted_text, lines)
+    if table is None or not (columns or _has_time_and_position(table.column_names)):
         column_list = ", ".join(map(quote, sorted(wanted_names))) or "time, x, y, z"
         raise LogError(
             f"{file_name}: the first {len(lines)} lines contain no header with the columns "
@@ -172,7 +172,10 @@ def find_table(
             f"{row_width}.",
             "Write numbers with decimal points, and give each column a name.",
         )
-    return replace(table, notes=(*table.notes, *notes))
+    if last_line.strip() and not is_last_line_complete:
+        note = "the last line of the position file was dropped, because it is incomplete"
+        table = replace(table, notes=(*table.notes, note))
+    return table
 
 
 def _is_complete_line(line: str, line_before: str) -> bool:
@@ -197,16 +200,19 @@ def _find_header_table(
     for index, line in enumerate(lines):
         for separator in SEPARATORS:
             column_names = _split_line(line.strip("#% "), separator)
-            if len(column_names) <= MAX_COLUMNS and _is_header(column_names, wanted_names):
+            is_header = len(column_names) <= MAX_COLUMNS and (
+                wanted_names <= {name.casefold() for name in column_names}
+                if wanted_names
+                else _has_time_and_position(column_names)
+            )
+            if is_header:
                 rows_text = _remove_comments(text.split("\n", index + 1)[index + 1])
                 return PositionTable(file_name, "", column_names, rows_text, separator, index + 1)
     return None
 
 
-def _is_header(fields: list[str], wanted_names: set[str]) -> bool:
-    if wanted_names:
-        return wanted_names <= {name.casefold() for name in fields}
-    meanings = [read_column_name(name) for name in fields]
+def _has_time_and_position(column_names: list[str]) -> bool:
+    meanings = [read_column_name(name) for name in column_names]
     has_time = any(column.kind == "time" for column in meanings)
     return has_time and position_names.find_position_columns(meanings) is not None
 
@@ -215,47 +221,40 @@ def _find_body_table(
     file_name: str, text: str, lines: Sequence[str], wanted_body: str | None
 ) -> PositionTable | None:
     """Find the columns of one rigid body in a CSV export of Motive or Vicon Nexus."""
-    header_index = next((i for i, line in enumerate(lines[:12]) if line.startswith("Frame,")), 0)
-    rows = [_split_line(line, ",") for line in lines[: header_index + 2]]
-    is_motive = header_index >= 3 and rows[0][0] == "Format Version"
-    if header_index < 3 or not (is_motive or is_number(rows[1][0])):
+    axes_row = next((i for i, line in enumerate(lines[:12]) if line.startswith("Frame,")), 0)
+    if axes_row < 3:
         return None
-    axes, rows_text = rows[header_index], text.split("\n", header_index + 1)[header_index + 1]
-    rows = [row + [""] * (len(axes) - len(row)) for row in rows]
+    rows = [_split_line(line, ",") for line in lines[: axes_row + 2]]
+    is_motive = rows[0][0] == "Format Version"
+    if not is_motive and not is_number(rows[1][0]):
+        return None
+    # One row for each column of the file, one column for each line of the header
+    header = pd.DataFrame(zip_longest(*rows, fillvalue=""))[: len(rows[axes_row])]
+    axes, rows_text = header[axes_row], text.split("\n", axes_row + 1)[axes_row + 1]
     if is_motive:
         unit = dict(zip(rows[0][::2], rows[0][1::2], strict=False)).get("Length Units", "")
-        row_by_title = {row[1]: row for row in rows[2:header_index]}
-        body_names, body_types = (row_by_title.get(title, axes) for title in ("Name", "Type"))
-        used_body_types = {"Rigid Body"} if "Rigid Body" in body_types else {*body_types}
+        values_by_title = {header.loc[1, row]: header[row] for row in range(2, axes_row)}
+        body_names = values_by_title.get("Name", axes)
+        is_rigid_body = values_by_title.get("Type", axes) == "Rigid Body"
         # Rotations are not read, because the axes of a rigid body are not FRD
-        column_names = [
-            f"{axis}_{unit}" if group == "Position" and body_type in used_body_types else ""
-            for axis, group, body_type in zip(
-                axes, rows[header_index - 1], body_types, strict=False
-            )
-        ]
+        is_position = header[axes_row - 1] == "Position"
+        is_position &= is_rigid_body | (not is_rigid_body.any())
+        column_names = axes + f"_{unit}"
     else:
-        body_names = pd.Series(rows[2]).replace("", None).ffill().fillna("").tolist()
-        column_names = [
-            f"{axis.removeprefix('T')}_{unit}" if axis.removeprefix("T") in {*"XYZ"} else ""
-            for axis, unit in zip(axes, rows[header_index + 1], strict=False)
-        ]
+        body_names = header[2].replace("", None).ffill().fillna("")
+        axes = axes.str.removeprefix("T")
+        is_position = axes.isin([*"XYZ"])
+        column_names = axes + "_" + header[axes_row + 1]
         rows_text = re.split(r"\n[, ]*\n", rows_text.partition("\n")[2], maxsplit=1)[0] + "\n"
-    bodies_with_position = (
-        body_name for body_name, name in zip(body_names, column_names, strict=False) if name
-    )
-    chosen_body_name = choose_body(file_name, bodies_with_position, wanted_body)
-    column_names = [
-        name * (body_name == chosen_body_name)
-        for body_name, name in zip(body_names, column_names, strict=False)
-    ]
-    column_names[:2] = axes[:2] if is_motive else ["time", ""]
+    chosen_body_name = choose_body(file_name, body_names[is_position], wanted_body)
+    is_chosen = is_position & (body_names == chosen_body_name)
+    first_columns = rows[axes_row][:2] if is_motive else ["time", ""]
     return PositionTable(
         file_name,
         "OptiTrack Motive CSV export" if is_motive else "Vicon Nexus CSV export",
-        column_names,
+        [*first_columns, *column_names.where(is_chosen, "")[2:]],
         rows_text,
-        header_line=header_index + 1,
+        header_line=axes_row + 1,
         # Motive exports y up by default, or z up; the file does not state which
         frames=("eus", "enu") if is_motive else (),
         rate_hz=None if is_motive else float(rows[1][0]),
@@ -268,18 +267,17 @@ def _find_stream_table(file_name: str, text: str, lines: Sequence[str]) -> Posit
     """Find the positions in a text format of a UWB system (``formats.toml``)."""
     for stream_format in UWB_TEXT_FORMATS:
         pattern = re.compile(stream_format["row"], re.MULTILINE)
-        first_row = next((line for line in lines if pattern.match(line)), None)
-        if first_row is not None:
-            rows = pattern.findall(text)
-            uwb_range_count = len(re.findall(stream_format["ranges"], first_row))
-            notes = [f"px4fuse does not use the {uwb_range_count} UWB ranges in each line"]
-            if lost_count := text.count("\n") - len(rows):
-                notes.append(f"lines without a position: {lost_count}")
-            csv_text = "".join(f"{','.join(row)}\n" for row in rows)
-            column_names = [*pattern.groupindex]
-            return PositionTable(
-                file_name, stream_format["name"], column_names, csv_text, notes=tuple(notes)
-            )
+        if not any(map(pattern.match, lines)):
+            continue
+        rows = pattern.findall(text)
+        lost_count = text.count("\n") - len(rows)
+        return PositionTable(
+            file_name,
+            stream_format["name"],
+            [*pattern.groupindex],
+            "".join(f"{','.join(row)}\n" for row in rows),
+            notes=(f"lines without a position: {lost_count}",) if lost_count else (),
+        )
     return None
 
 
@@ -297,25 +295,19 @@ def _find_json_table(file_name: str, text: str) -> PositionTable | None:
         record for value in values for record in (value if isinstance(value, list) else [value])
     ]
     columns = pd.json_normalize(records)
-    column_paths = [
-        column_path for column_path in map(str, columns) if read_column_name(column_path).kind
-    ]
+    column_paths = [path for path in map(str, columns) if read_column_name(path).kind]
     is_pozyx = "data.coordinates.x" in column_paths
     return PositionTable(
         file_name,
         "Pozyx JSON stream" if is_pozyx else "JSON lines",
-        [
-            column_path + "_mm" * (is_pozyx and ".coordinates." in column_path)
-            for column_path in column_paths
-        ],
+        [path + "_mm" * (is_pozyx and ".coordinates." in path) for path in column_paths],
         columns[column_paths].to_csv(index=False, header=False),
     )
 
 
 def _find_headerless_table(path: Path, text: str, lines: Sequence[str]) -> PositionTable | None:
     """Find a table without header: columns time, x, y, z, or KITTI poses."""
-    plain_lines = (line.partition("#")[0] for line in lines)
-    first_row = next((line for line in plain_lines if line.strip(" \t%")), "")
+    first_row = _remove_comments("\n".join(lines)).strip().partition("\n")[0]
     for separator in SEPARATORS:
         fields = _split_line(first_row, separator)
         decimal_fields = [field.replace(",", ".") for field in fields]
@@ -350,7 +342,7 @@ def _read_kitti_table(path: Path, text: str) -> PositionTable:
 
     name, times_name = display_name(path), f"{path.stem}_times.txt"
     candidate_paths = (path.with_name(times_name), path.with_name("times.txt"))
-    times_path = next((times_path for times_path in candidate_paths if times_path.is_file()), None)
+    times_path = next(filter(Path.is_file, candidate_paths), None)
     if times_path is None:
         raise LogError(
             f"{name}: the file contains KITTI poses, which have no times",
@@ -360,14 +352,17 @@ def _read_kitti_table(path: Path, text: str) -> PositionTable:
     try:
         matrices = np.loadtxt(io.StringIO(text), ndmin=2)
         quaternions = Rotation.from_matrix(matrices.reshape(-1, 3, 4)[:, :, :3]).as_quat()
-        time_s = np.array(time_texts, dtype=float)
-        pose_rows = np.column_stack([time_s, matrices[:, 3::4], quaternions])
+        poses = np.column_stack([np.array(time_texts, float), matrices[:, 3::4], quaternions])
     except ValueError as error:
         raise LogError(
             f"{name}: the KITTI poses or the times in {display_name(times_path)} are not valid",
             "Export poses and times again.",
         ) from error
-    names = ["time_s", "x_m", "y_m", "z_m", "qx", "qy", "qz", "qw"]
-    note = f"the times are from {display_name(times_path)}"
-    csv_text = pd.DataFrame(pose_rows).to_csv(index=False, header=False)
-    return PositionTable(name, "KITTI poses", names, csv_text, frames=("edn",), notes=(note,))
+    return PositionTable(
+        name,
+        "KITTI poses",
+        ["time_s", "x_m", "y_m", "z_m", "qx", "qy", "qz", "qw"],
+        pd.DataFrame(poses).to_csv(index=False, header=False),
+        frames=("edn",),
+        notes=(f"the times are from {display_name(times_path)}",),
+    )

@@ -41,19 +41,16 @@ def _read_pose_values(message: Any) -> list[float]:
     if hasattr(message, "q"):
         return [*message.position.tolist(), *np.roll(message.q, -1).tolist()]
     pose = getattr(message, "pose", None) or getattr(message, "transform", message)
-    covariance = getattr(pose, "covariance", None)
+    variances = getattr(pose, "covariance", np.zeros(0))[::7][:3]
     pose = getattr(pose, "pose", pose)
     vectors = [
-        getattr(pose, name)
+        getattr(pose, name, None)
         for name in ("point", "position", "translation", "orientation", "rotation")
-        if hasattr(pose, name)
     ]
     values = [
         getattr(vector, axis) for vector in vectors for axis in "xyzw" if hasattr(vector, axis)
     ]
-    if covariance is not None:
-        values += np.sqrt(np.where(covariance > 0.0, covariance, np.nan)[[0, 7, 14]]).tolist()
-    return values
+    return [*values, *np.sqrt(np.where(variances > 0.0, variances, np.nan)).tolist()]
 
 
 def is_bag(path: Path) -> bool:
@@ -99,42 +96,34 @@ def read_bag(path: Path, topic: str | None) -> tuple[PositionTable, str, int]:
 
 
 def _read_topic(name: str, reader: Any, topic: str | None) -> PositionTable:
-    type_by_topic = {connection.topic: connection.msgtype for connection in reader.connections}
-    usable_topics = [
-        topic_name
-        for topic_name, message_type in type_by_topic.items()
-        if message_type in _POSITION_MESSAGE_TYPES
-    ]
-    chosen_topic = usable_topics[0] if topic is None and len(usable_topics) == 1 else topic
-    if chosen_topic not in usable_topics:
+    type_by_topic = {
+        connection.topic: connection.msgtype
+        for connection in reader.connections
+        if connection.msgtype in _POSITION_MESSAGE_TYPES
+    }
+    if topic is None and len(type_by_topic) == 1:
+        [topic] = type_by_topic
+    if topic not in type_by_topic:
         raise LogError(
             f"{name} does not contain {f'topic {topic}' if topic else 'exactly one topic'} with "
-            f"positions; topics with positions: {', '.join(usable_topics) or 'none'}",
+            f"positions; topics with positions: {', '.join(type_by_topic) or 'none'}",
             f"Give the topic as {name}:TOPIC."
-            if usable_topics
+            if type_by_topic
             else "Record the positions as PoseStamped.",
         )
-    message_type = type_by_topic[chosen_topic]
+    message_type = type_by_topic[topic]
     messages = reader.messages(
-        [connection for connection in reader.connections if connection.topic == chosen_topic]
+        [connection for connection in reader.connections if connection.topic == topic]
     )
     if message_type == _PATH_MESSAGE_TYPE:
         messages = deque(messages, maxlen=1)  # the last path repeats the poses of all others
-    lags_s, csv_rows, pose_frames = [], [], set()
-    for connection, receive_ns, raw_message in messages:
+    csv_rows, pose_frames = [], set()
+    for connection, _, raw_message in messages:
         message = reader.deserialize(raw_message, connection.msgtype)
         for stamped_message in message.poses if message_type == _PATH_MESSAGE_TYPE else [message]:
-            time_ns = _read_time_ns(stamped_message)
             pose_frames.add(getattr(stamped_message, "pose_frame", None))
-            lags_s.append((receive_ns - time_ns) * 1e-9)
-            csv_rows.append(f"{time_ns},{str(_read_pose_values(stamped_message))[1:-1]}\n")
-    notes = [f"the topic is {chosen_topic} ({message_type})"]
-    if csv_rows:
-        low_lag_s, median_lag_s, high_lag_s = np.percentile(lags_s, [2.5, 50.0, 97.5])
-        notes.append(
-            f"the timestamps in the messages are used; they were received {median_lag_s:.3f} s "
-            f"later (95 % {low_lag_s:.3f} to {high_lag_s:.3f} s)"
-        )
+            values = _read_time_ns(stamped_message), *_read_pose_values(stamped_message)
+            csv_rows.append(f"{','.join(map(str, values))}\n")
     return PositionTable(
         name,
         "ROS bag",
@@ -142,7 +131,7 @@ def _read_topic(name: str, reader: Any, topic: str | None) -> PositionTable:
         "".join(csv_rows),
         has_only_chosen_body=True,
         frames=("ned",) if pose_frames == {_FRAME_NED} else (),
-        notes=tuple(notes),
+        notes=(f"the topic is {topic} ({message_type})",),
     )
 
 

@@ -1,16 +1,12 @@
-"""Functions for text files: unsupported formats, decoding, numbers, errors with line number."""
+"""Functions for text files: unsupported formats, decoding, numbers, quotation marks."""
 
 import re
-from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
-import numpy as np
-
-from px4fuse.core.arrays import Array, BoolArray
 from px4fuse.core.reading import display_name
 from px4fuse.core.record import read_toml
-from px4fuse.errors import Px4FuseError, TrajectoryError
+from px4fuse.errors import Px4FuseError
 
 _TEXT_FORMATS = read_toml(__file__, dict[str, list[dict[str, Any]]], "formats.toml")
 # Text formats of UWB systems
@@ -63,64 +59,3 @@ def is_number(text: str) -> bool:
 def quote(text: str) -> str:
     """Put a text in quotation marks, and shorten it to 40 characters."""
     return repr(text if len(text) <= 40 else text[:37] + "...")
-
-
-def make_line_error(name: str, line_number: int, fault: str, remedy: str) -> TrajectoryError:
-    """Make an error with the file name and the line number of the fault.
-
-    >>> str(make_line_error("uwb.csv", 7, "'x' is not a number", "Correct or remove this line."))
-    "uwb.csv, line 7: 'x' is not a number. Correct or remove this line."
-    """
-    return TrajectoryError(f"{name}, line {line_number}: {fault}. {remedy}")
-
-
-@dataclass(eq=False)  # not frozen: the reader appends lines
-class TextTableRows:
-    """Rows of a text table. ``lines`` contains line number and text of each row."""
-
-    file_name: str
-    lines: list[tuple[int, str]] = field(default_factory=list)
-
-    def make_row_error(self, row: int, description: str, remedy: str) -> TrajectoryError:
-        """Make an error with the line number of a row."""
-        return make_line_error(self.file_name, self.lines[row][0], description, remedy)
-
-    def raise_where(self, is_invalid: BoolArray, description: str, remedy: str) -> None:
-        """Raise TrajectoryError for the first invalid row, if any."""
-        invalid_indices = np.argwhere(is_invalid)
-        if len(invalid_indices):
-            raise self.make_row_error(int(invalid_indices[0, 0]), description, remedy)
-
-    def parse(
-        self, text_column_count: int, number_column_count: int
-    ) -> tuple[np.ndarray[Any, np.dtype[np.str_]], Array]:
-        """Parse rows of text columns followed by number columns, separated by white space.
-
-        Return the texts and the numbers, with one row for each line.
-
-        Raises
-        ------
-        TrajectoryError
-            A row has the wrong number of columns, or a cell is not a number.
-        """
-        lines = [text for _, text in self.lines]
-        columns = [
-            ("texts", "U80", (text_column_count,)),
-            ("numbers", "f8", (number_column_count,)),
-        ]
-        try:
-            table = np.loadtxt(lines, dtype=columns, ndmin=1)
-        except ValueError as error:
-            column_count = text_column_count + number_column_count
-            invalid_rows = (
-                row
-                for row, cells in enumerate(map(str.split, lines))
-                if len(cells) != column_count or not all(map(is_number, cells[text_column_count:]))
-            )
-            row = next(invalid_rows, 0)
-            raise self.make_row_error(
-                row,
-                f"{quote(lines[row])} does not have {column_count} columns with numbers",
-                "Correct or remove this line.",
-            ) from error
-        return table["texts"], np.ascontiguousarray(table["numbers"])

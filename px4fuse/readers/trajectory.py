@@ -10,7 +10,7 @@ from pathlib import Path
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from px4fuse.core.arrays import Array, BoolArray
+from px4fuse.core.arrays import Array
 from px4fuse.core.reading import read_head
 from px4fuse.errors import LogError, TrajectoryError
 from px4fuse.readers.position_file import PositionRecording, read_position_file
@@ -154,14 +154,14 @@ def _detect_trajectory_kind(
 ) -> tuple[TrajectoryKind, str]:
     # EuRoC files are always called data.csv, so the folder name is searched
     folder = path.absolute().parent.name if path.name == "data.csv" else ""
-    searched_text_by_note = {
-        "A comment in the file states that the trajectory is ground truth.": comment_text,
-        "The file name states that the trajectory is ground truth.": path.name,
-        "The folder name states that the trajectory is ground truth.": folder,
+    searched_texts = {
+        "A comment in the file": comment_text,
+        "The file name": path.name,
+        "The folder name": folder,
     }
-    for note, text in searched_text_by_note.items():
+    for place, text in searched_texts.items():
         if _TRUTH_NAME_PATTERN.search(text):
-            return "truth", note
+            return "truth", f"{place} states that the trajectory is ground truth."
     if (
         rotation is not None
         and max(np.abs(position_m[0]).max(), rotation[0].magnitude()) < MAX_DEVIATION_FROM_IDENTITY
@@ -175,13 +175,11 @@ def _detect_frame(kind: TrajectoryKind, position_m: Array) -> tuple[Frame, str]:
         return "unknown", ""
     centred_m = position_m - position_m.mean(axis=0)
     eigenvalues, axes = np.linalg.eigh(centred_m.T @ centred_m)  # eigenvalues in ascending order
-    smallest_extent_m, second_extent_m, largest_extent_m = np.sqrt(
-        np.maximum(eigenvalues, 0.0) / len(position_m)
-    )
+    smallest_extent, second_extent, largest_extent = np.sqrt(np.maximum(eigenvalues, 0.0))
     tilt_rad = math.acos(min(1.0, abs(float(axes[1, 0]))))
     is_planar = (
-        second_extent_m > MIN_SECOND_TO_LARGEST_EXTENT_RATIO * largest_extent_m
-        and smallest_extent_m < MAX_SMALLEST_TO_SECOND_EXTENT_RATIO * second_extent_m
+        second_extent > MIN_SECOND_TO_LARGEST_EXTENT_RATIO * largest_extent
+        and smallest_extent < MAX_SMALLEST_TO_SECOND_EXTENT_RATIO * second_extent
     )
     if not is_planar or tilt_rad > MAX_TILT_RAD:
         return "unknown", ""
@@ -195,10 +193,9 @@ def _describe_gaps(time_s: Array) -> str:
     """Return a note on gaps or irregular intervals between poses; "" if there are none."""
     intervals_s = np.diff(time_s)
     median_interval_s = float(np.median(intervals_s))
-    is_regular: BoolArray = (
-        np.abs(intervals_s - median_interval_s) <= MAX_MEDIAN_INTERVAL_DEVIATION * median_interval_s
-    )
-    if is_regular.mean() < MIN_REGULAR_INTERVAL_FRACTION:
+    max_deviation_s = MAX_MEDIAN_INTERVAL_DEVIATION * median_interval_s
+    is_regular = np.abs(intervals_s - median_interval_s) <= max_deviation_s
+    if np.mean(is_regular) < MIN_REGULAR_INTERVAL_FRACTION:
         return (
             f"The pose intervals are irregular (median {median_interval_s:.3g} s, maximum "
             f"{intervals_s.max():.3g} s): the poses are key frames, or many poses are missing."

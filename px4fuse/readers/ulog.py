@@ -59,17 +59,13 @@ def read_ulog(name: str, content: bytes) -> Flight:
     altitude_m = topics.read(px4.TOPIC_LAYOUTS["barometer"])["altitude_m"]
     barometer_delay_s = topics.ekf2_parameters.get(BAROMETER.delay, 0.0) * 1e-3
     is_in_flight = common.ends_in_flight(airborne_spans_s, topics.log.duration_s)
-    dropped_message_counts = [
-        (topic, count) for (topic, _), count in sorted(topics.dropped.items())
-    ]
-    tilt_failure_flags = topics.read(px4.TOPIC_LAYOUTS["failure"], is_step_function=True)[
-        ["roll", "pitch"]
-    ]
+    dropped_counts = dict(sorted(topics.dropped.items()))
+    tilt_failure_flags = topics.read(px4.TOPIC_LAYOUTS["failure"])[["roll", "pitch"]]
     return Flight(
         log=structs.replace(
             topics.log,
-            notes=(*topics.log.notes, *describe_dropped_samples(dropped_message_counts)),
-            dropped=dict(dropped_message_counts),
+            notes=(*topics.log.notes, *describe_dropped_samples(dropped_counts)),
+            dropped=dropped_counts,
             start_unix_s=_estimate_start_unix_s(topics),
             damage=_describe_damage(topics, imu, is_in_flight),
             ends_in_flight=is_in_flight,
@@ -115,14 +111,11 @@ def _describe_damage(
 
 def _estimate_start_unix_s(topics: Topics) -> float | None:
     """Return the UNIX time (s) at flight time zero, from GNSS; None if not logged."""
-    gps_samples = topics.read(*px4.find_track_layouts(px4.GPS_POSITION))
-    if "utc_us" not in gps_samples:
-        return None
-    unix_time_s = gps_samples["utc_us"] * 1e-6
-    is_valid = unix_time_s.between(*VALID_UNIX_TIME_RANGE_S)
-    if "fix_type" in gps_samples:
-        is_valid &= gps_samples["fix_type"] >= FIX_TYPE_3D
-    return float((unix_time_s - gps_samples.index)[is_valid].median()) if is_valid.any() else None
+    fixes = topics.read(*px4.find_track_layouts(px4.GPS_POSITION))
+    fixes = fixes.reindex(columns=["utc_us", "fix_type"])
+    unix_time_s = fixes["utc_us"] * 1e-6
+    is_valid = unix_time_s.between(*VALID_UNIX_TIME_RANGE_S) & ~(fixes["fix_type"] < FIX_TYPE_3D)
+    return float((unix_time_s - fixes.index)[is_valid].median()) if is_valid.any() else None
 
 
 def _require_samples(
@@ -158,7 +151,7 @@ def _read_imu(topics: Topics) -> pd.DataFrame:
 
 
 def _read_airborne_spans(topics: Topics) -> Spans | Unavailable:
-    land_detected = topics.read(px4.TOPIC_LAYOUTS["land_detected"], is_step_function=True)
+    land_detected = topics.read(px4.TOPIC_LAYOUTS["land_detected"])
     if land_detected.empty:
         return Unavailable(
             "land detector",

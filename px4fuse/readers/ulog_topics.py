@@ -9,7 +9,7 @@ import hashlib
 import io
 import struct
 from bisect import bisect_left
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Callable, Mapping
 from contextvars import ContextVar
 from dataclasses import dataclass, field
 from functools import cache, cached_property
@@ -36,6 +36,7 @@ from px4fuse.flight.model import (
     LogInfo,
     ParameterChange,
     rows_between,
+    sample_step_function,
     time_index,
 )
 from px4fuse.readers.field_maps import MAX_FIELD_VALUE, Layout
@@ -156,8 +157,8 @@ class Topics:
     tables: Tables
     # Boot time (µs) at flight time zero
     time_origin_us: int
-    # Number of samples with an invalid timestamp, by topic and instance
-    dropped: dict[tuple[str, int], int]
+    # Number of samples with an invalid timestamp, by topic
+    dropped: dict[str, int]
     # All EKF2 parameters at take-off
     ekf2_parameters: Mapping[str, float]
     # True if the file ends within a message
@@ -180,7 +181,7 @@ class Topics:
     @cached_property
     def primary_instances(self) -> InstanceSwitches:
         """Time (s) and number of each new primary EKF2 instance (PX4's ``EKF2Selector``)."""
-        instances = self.read(TOPIC_LAYOUTS["selector"], is_step_function=True)["instance"]
+        instances = self.read(TOPIC_LAYOUTS["selector"])["instance"]
         instances = instances[instances < 255]  # 255 means that no instance is selected yet
         primary_instance_changes = instances[instances.ne(instances.shift())]
         switch_times_s = [-np.inf, *primary_instance_changes.index[1:]]
@@ -196,17 +197,13 @@ class Topics:
                 return layout
         return None
 
-    def read_instance(
-        self, layout: Layout, instance: int = 0, *, is_step_function: bool = False
-    ) -> pd.DataFrame:
+    def read_instance(self, layout: Layout, instance: int = 0) -> pd.DataFrame:
         """Read the fields of a topic instance as float64, indexed by measurement time (s).
 
         Parameters
         ----------
         instance : int
             Number of the topic instance; if not logged, the lowest number is read.
-        is_step_function : bool
-            True if a value is valid until the next sample.
 
         Returns
         -------
@@ -224,7 +221,7 @@ class Topics:
         time_us = measurement_time_us(table)
         kept_rows = longest_increasing_run(time_us)
         if len(kept_rows) < len(time_us):
-            self.dropped[layout.topic, instance] = len(time_us) - len(kept_rows)
+            self.dropped[layout.topic] = len(time_us) - len(kept_rows)
         values = np.empty((len(fields), len(kept_rows)))
         with np.errstate(invalid="ignore"):  # damaged bytes can be signalling NaNs
             for row, (column, field_name) in zip(values, fields.items(), strict=True):
@@ -233,27 +230,19 @@ class Topics:
                 row[~(np.abs(row) < MAX_FIELD_VALUE)] = np.nan  # damaged values
         index = time_index((time_us[kept_rows] - self.time_origin_us) * _MICROSECOND_S)
         samples = pd.DataFrame(values.T, index, list(fields), copy=False)
+        if layout.is_step_function:
+            return samples
         end_s = self.log.duration_s + MAX_TIME_OUTSIDE_IMU_DATA_S
-        return (
-            samples
-            if is_step_function
-            else rows_between(samples, -MAX_TIME_OUTSIDE_IMU_DATA_S, end_s)
-        )
+        return rows_between(samples, -MAX_TIME_OUTSIDE_IMU_DATA_S, end_s)
 
-    def read(self, *layouts: Layout, is_step_function: bool = False) -> pd.DataFrame:
+    def read(self, *layouts: Layout) -> pd.DataFrame:
         """Read the first topic definition whose required fields are in the log; else empty."""
         layout = self.find_layout(*layouts)
-        return (
-            _empty_frame(layouts[0])
-            if layout is None
-            else self.read_instance(layout, is_step_function=is_step_function)
-        )
+        return _empty_frame(layouts[0]) if layout is None else self.read_instance(layout)
 
     def primary_samples(
         self,
         layout: Layout,
-        *,
-        is_step_function: bool = False,
         select_rows: Callable[[pd.DataFrame], pd.DataFrame] | None = None,
     ) -> pd.DataFrame:
         """Read an EKF2 topic from the EKF2 instance that was primary at each time.
@@ -264,22 +253,13 @@ class Topics:
             return _empty_frame(layout)
         instance_numbers = self.instances(layout.topic)
         has_single_instance = self.primary_instances == NO_INSTANCE_SWITCHES
-        switch_times_s, primary_instance_numbers = (
-            np.array(values) for values in zip(*self.primary_instances, strict=True)
-        )
+        primary_number = pd.Series(dict(self.primary_instances), dtype=np.float64)
         instance_tables: list[pd.DataFrame] = []
         for number in instance_numbers[:1] if has_single_instance else instance_numbers:
-            samples = self.read_instance(layout, number, is_step_function=is_step_function)
+            samples = self.read_instance(layout, number)
             samples = samples if select_rows is None else select_rows(samples)
-            previous_switch_indices = (
-                np.searchsorted(switch_times_s, samples.index, side="right") - 1
-            )
-            instance_tables.append(
-                samples[
-                    has_single_instance
-                    | (primary_instance_numbers[previous_switch_indices] == number)
-                ]
-            )
+            is_primary = sample_step_function(primary_number, samples.index) == number
+            instance_tables.append(samples[is_primary | has_single_instance])
         joined_tables = pd.concat(instance_tables).sort_index()
         return joined_tables[~joined_tables.index.duplicated()]
 
@@ -347,11 +327,11 @@ def longest_increasing_run(time_us: NDArray[np.int64]) -> IntArray:
     return positive_time_indices[np.array(reversed_run_indices[::-1], dtype=np.intp)]
 
 
-def describe_dropped_samples(dropped_counts: Iterable[tuple[str, int]]) -> tuple[str, ...]:
+def describe_dropped_samples(dropped_counts: Mapping[str, int]) -> tuple[str, ...]:
     """Return one note per topic with the number of dropped samples."""
     return tuple(
         f"number of samples of {topic} dropped because of an invalid timestamp: {count}"
-        for topic, count in dropped_counts
+        for topic, count in dropped_counts.items()
     )
 
 
@@ -377,20 +357,17 @@ def read_topics(name: str, content: bytes) -> Topics:
             f"{name}: the ULog cannot be read ({str(error) or type(error).__name__}).",
             "Copy the .ulg from the vehicle again.",
         ) from error
-    notes: tuple[str, ...] = ()
     if not tables_for_time_span:
         raise LogError(
             f"{name}: the ULog contains no samples",
             "Copy the file again, or set SDLOG_PROFILE to 129 (default and vision topics).",
         )
+    info, notes = ulog.msg_info_dict, []
     if not tables:
-        names = sorted({topic for topic, _ in tables_for_time_span})
-        notes += (
-            "the log contains only topics that px4fuse does not use "
-            f"({join_first_names(names, 5)})",
-        )
-    if NOTE_KEY in ulog.msg_info_dict:
-        notes += (_read_printable_text(ulog.msg_info_dict, NOTE_KEY, ""),)
+        names = join_first_names(sorted({topic for topic, _ in tables_for_time_span}), 5)
+        notes.append(f"the log contains only topics that px4fuse does not use ({names})")
+    if NOTE_KEY in info:
+        notes.append(_read_printable_text(info, NOTE_KEY, ""))
     time_origin_us, data_end_us = _find_data_span_us(tables_for_time_span, name)
     logged_values, parameter_changes = _read_parameters(ulog, tables, time_origin_us)
     parameter_values, parameter_faults = replace_invalid_parameters(logged_values)
@@ -399,9 +376,9 @@ def read_topics(name: str, content: bytes) -> Topics:
         sha256=hashlib.sha256(content).hexdigest(),
         bytes=len(content),
         format="ULog",
-        firmware=_format_firmware(ulog.msg_info_dict),
-        firmware_hash=_read_printable_text(ulog.msg_info_dict, "ver_sw", "unknown"),
-        hardware=_read_printable_text(ulog.msg_info_dict, "ver_hw", "unknown"),
+        firmware=_format_firmware(info),
+        firmware_hash=_read_printable_text(info, "ver_sw", "unknown"),
+        hardware=_read_printable_text(info, "ver_hw", "unknown"),
         boot_time_s=time_origin_us * _MICROSECOND_S,
         duration_s=(data_end_us - time_origin_us) * _MICROSECOND_S,
         dropouts=tuple(
@@ -420,10 +397,10 @@ def read_topics(name: str, content: bytes) -> Topics:
         },
         notes=(*notes, *parameter_faults),
         bytes_read=content_reader.header_start_offset - content_reader.skipped_bytes,
-        autopilot=_read_printable_text(ulog.msg_info_dict, "sys_name", "PX4"),
-        vehicle=_read_printable_text(ulog.msg_info_dict, "sys_uuid", ""),
+        autopilot=_read_printable_text(info, "sys_name", "PX4"),
+        vehicle=_read_printable_text(info, "sys_uuid", ""),
         is_assessed=True
-        if ASSIGNMENT_FLAG_KEY in ulog.msg_info_dict and not ignores_assignment_flag.get()
+        if ASSIGNMENT_FLAG_KEY in info and not ignores_assignment_flag.get()
         else UNSET,
     )
     return Topics(
