@@ -400,7 +400,7 @@ def _summarise_replay(flight: Flight, replay: Ekf2Replay, spans_s: Spans) -> Ekf
         raise SettingsError(
             f"{_format_changes(replay)}: {replay.source} would never be fused in the evaluated "
             f"time. {replay.lost} samples would arrive too late, after the fusion horizon",
-            "Choose another parameter value, or add --set EKF2_DELAY_MAX=... (PX4 v1.15 and later).",
+            "Choose another value, or add --set EKF2_DELAY_MAX=... (PX4 v1.15 and later).",
         )
     # Position variance just before (1 µs) and after each update
     variance = pd.DataFrame(index=np.column_stack([update_times_s - 1e-6, update_times_s]).ravel())

@@ -210,7 +210,12 @@ def make_tuning_advice(
         for noise, setting in ((sigma_a, settings.sigma_a_m_s2), (sigma_z, settings.sigma_z_m))
     )
     if reduces_gnss_noise:
-        advice_by_label["GNSS"] = KEEP_NOISE_BECAUSE_OF_CORRELATION_ACTION.format(sensor="GNSS")
+        advice_by_label["GNSS"] = (
+            KEEP_NOISE_BECAUSE_OF_CORRELATION_ACTION.format(sensor="GNSS")
+            if isinstance(comparison.flight.truth, Unavailable)
+            else "The estimates do not contain the time-correlated error of GNSS. Compare them "
+            "with ground truth: px4fuse compare LOG."
+        )
     option_texts = [
         f" {option} {noise.value:.3g}"
         for option, noise in (("--sigma-a", sigma_a), ("--sigma-z", sigma_z))
