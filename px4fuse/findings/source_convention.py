@@ -22,6 +22,7 @@ from px4fuse.convention.texts import (
     describe_unit,
     find_axes_in_file,
     format_axes,
+    format_delay,
 )
 from px4fuse.finding import Finding
 from px4fuse.findings.cause_grouping import RESET_TIME_KEY, WRONG_CONVENTION_KEY
@@ -195,11 +196,12 @@ def _find_position_faults(
         yield "source_unit_wrong", "unit", message, action
     late_s, clock_drift_percent = convention.late_s, 100.0 * faults.clock_drift
     if clock_drift_percent:
+        delay_text = format_delay(late_s, 2)
         message = (
             f"The clock of the position timestamps is {abs(clock_drift_percent):.1f} % too "
             f"{'fast' if clock_drift_percent > 0 else 'slow'}. In the middle of the flight the "
-            f"timestamps are {late_s:+.2f} s late. {evidence_sentence} The analysis uses corrected "
-            "timestamps."
+            f"timestamps are {delay_text or 'correct'}. {evidence_sentence} The analysis uses "
+            "corrected timestamps."
         )
         action = (
             "Take timestamps from a clock. Timestamps computed as frame number ÷ nominal rate "
@@ -208,7 +210,7 @@ def _find_position_faults(
         yield "source_time_offset_changes", "clock drift", message, action
     elif faults.late_s:
         message = (
-            f"Position timestamps are {abs(late_s):.2f} s {'late' if late_s > 0 else 'early'}. "
+            f"Position timestamps are {format_delay(late_s, 2)}. "
             f"{evidence_sentence} The analysis uses corrected timestamps."
         )
         action = (
