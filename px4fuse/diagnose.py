@@ -51,8 +51,9 @@ from px4fuse.filter.time_offset import ClockOffset
 from px4fuse.filter.tuning import HORIZONTAL
 from px4fuse.findings import find, find_aid_findings
 from px4fuse.findings.cause_grouping import WRONG_CONVENTION_KEY
+from px4fuse.findings.source_convention import detect_wrong_orientation
 from px4fuse.flight.ekf2_parameters import check_parameters
-from px4fuse.flight.model import DIAGNOSIS_WITHHELD, Flight, Unavailable
+from px4fuse.flight.model import DIAGNOSIS_WITHHELD, Flight, PositionTrack, Unavailable
 from px4fuse.loop.model import Loop
 from px4fuse.readers import read_log
 from px4fuse.request import AUTO, ComparisonRequest, LoopRequest, WhatIfRequest
@@ -380,7 +381,7 @@ def analyse_loop_closure(request: LoopRequest, progress: Progress = ignore_progr
         A file cannot be read or lacks required data, or a setting is out of range.
     """
     from px4fuse.loop.analysis import analyse  # noqa: PLC0415 - not for tune and sync
-    from px4fuse.loop.tracks import read_source  # noqa: PLC0415
+    from px4fuse.loop.tracks import find_odometry, read_source  # noqa: PLC0415
 
     for name in ("start_s", "end_s"):
         if not math.isfinite(getattr(request, name) or 0.0):
@@ -390,4 +391,10 @@ def analyse_loop_closure(request: LoopRequest, progress: Progress = ignore_progr
     source = read_source(request.source, frame=request.frame, system=system)
     if request.reference is not None:
         reference = read_source(request.reference, default="truth", system=system).trajectory
-    return analyse(source, request, reference, progress)
+    loop = analyse(source, request, reference, progress)
+    if source.flight is None or loop.kind != "vio" or loop.is_assessed:
+        return loop
+    odometry = find_odometry(source.flight)
+    assert isinstance(odometry, PositionTrack)
+    orientation_findings = tuple(detect_wrong_orientation(source.flight, odometry))
+    return structs.replace(loop, orientation_findings=orientation_findings)

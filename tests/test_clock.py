@@ -34,7 +34,9 @@ from px4fuse.comparison.estimates import (
     estimate_noises_and_clock,
     widen_for_drift,
 )
+from px4fuse.comparison.reruns import rerun_kf_with_time_offset
 from px4fuse.core.arrays import Array
+from px4fuse.diagnose import diagnose, prepare_comparison
 from px4fuse.filter import time_offset
 from px4fuse.filter.fitting import maximise_likelihood
 from px4fuse.filter.imu_motion import (
@@ -58,10 +60,19 @@ from px4fuse.flight.model import (
     POSITION_FILE_ORIGIN,
     Columns,
     Flight,
+    Truth,
     Unavailable,
 )
 from px4fuse.readers.px4_positions import make_track
-from px4fuse.report.clock import make_time_offset_advice
+from px4fuse.report.clock import (
+    TIME_OFFSET_FINDINGS,
+    make_time_offset_advice,
+    summarise_offset,
+)
+from px4fuse.request import ComparisonRequest
+from px4fuse.simulation.faults import parse_faults
+from px4fuse.simulation.flights import simulate_flight
+from px4fuse.simulation.scenario import Scenario
 
 DT = SETTINGS.dt_s
 
@@ -423,6 +434,24 @@ def test_time_offset_estimate_excludes_position_outliers() -> None:
     assert covers(found, -0.2)
     assert (found.applied_s, found.remaining_s) == (-0.2, pytest.approx(0.0, abs=0.03))
     assert make_time_offset_advice(compared, found)["Offset"].startswith("Add -0.")
+
+
+def test_time_offset_that_ground_truth_refutes_is_not_recommended() -> None:
+    """Ground truth is late too, so timestamps without the offset increase the RMSE."""
+    flight = simulate_flight(Scenario(seed=3, passes=3), parse_faults(["clock-offset=0.3"]))
+    assert isinstance(flight.truth, Truth)
+    shifted = flight.truth.samples.set_axis(flight.truth.samples.index + 0.3)
+    flight = replace(flight, truth=replace(flight.truth, samples=shifted))
+    request = ComparisonRequest(log=flight.log.name)
+    prepared = prepare_comparison(flight, request)
+    _, found = estimate_noises_and_clock(prepared)
+    assert covers(found, -0.3)
+    advice = make_time_offset_advice(prepared, found, rerun_kf_with_time_offset(prepared, found))
+    assert advice["Result"].startswith("Ground truth refutes the estimated time offset")
+    assert not advice.keys() & {"Re-run", "PX4"}
+    analysis = diagnose(request, flight=flight)
+    assert summarise_offset(analysis, analysis.findings).startswith(advice["Result"])
+    assert not {one.id for one in analysis.findings} & {*TIME_OFFSET_FINDINGS}
 
 
 def test_time_offset_jump_p_value_equals_bonferroni_t_test() -> None:

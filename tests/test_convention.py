@@ -275,7 +275,7 @@ def examples() -> Iterator[Finding]:
 
 AMBIGUOUS = Convention(
     verdict="ambiguous", x="east", y="north", z="up", log_odds=1.2, log_likelihood_gain=30.0,
-    alternatives=("x south, y west, z up, m, rotated by +12°, timestamps +0.0 s late",),
+    alternatives=("x south, y west, z up, m, rotated by +12°",),
 )  # fmt: skip
 
 
@@ -360,6 +360,16 @@ def test_late_timestamps_finding_has_maximum_likelihood_offset(estimate_s, repor
     assert f"are {reported_s:.2f} s late" in found.message
     unclear = replace(clock, is_determinable=False)
     assert refine_delay(comparison, unclear) is comparison
+
+
+@pytest.mark.parametrize(
+    ("late_s", "expected"), [(0.003, "correct"), (-0.3, "0.30 s early"), (0.3, "0.30 s late")]
+)
+def test_clock_drift_finding_states_no_zero_delay_as_late(late_s: float, expected: str) -> None:
+    drifting = Convention(verdict="determined", late_s=late_s, clock_drift=0.02)
+    comparison = replace(compared(sent(flown())), convention=drifting)
+    (found,) = source_convention.detect(comparison)
+    assert f"In the middle of the flight the timestamps are {expected}. " in found.message
 
 
 @pytest.mark.parametrize("time_constant_s", [0.7, 1.5])

@@ -225,15 +225,37 @@ def test_what_if_summary_has_horizontal_nis_and_rmse() -> None:
     assert why.unexplained_fraction == 0.25
 
 
+def test_delay_above_ekf2_delay_max_adds_a_note():
+    """EKF2 increases EKF2_DELAY_MAX to the delay at its start (VerifyParams, EKF2.cpp)."""
+    for by_delay, arrival_s, expected in (
+        (False, 0.0, "EKF2 increases EKF2_DELAY_MAX from 200 to 264 ms"),
+        (True, -np.inf, "The log does not contain the arrival times"),
+        (True, 0.0, None),
+    ):
+        rules = replace(RULES, is_horizon_largest_delay=by_delay)
+        arrivals = SimpleNamespace(arrival_s=np.full(3, arrival_s))
+        inputs = SimpleNamespace(rules=rules, received_positions=arrivals)
+        model: Any = SimpleNamespace(inputs=inputs)
+        one: Any = SimpleNamespace(
+            late=0, lost=0, settings={"EKF2_DELAY_MAX": 200.0},
+            changed_parameters={"EKF2_EV_DELAY": 264.0},
+        )  # fmt: skip
+        notes = list(_describe_replay_limits(model, one))
+        assert len(notes) == (expected is not None)
+        assert all(expected in note for note in notes)
+
+
 def test_what_if_with_late_samples_adds_a_note():
     for by_delay, remedy in ((False, ". Increase EKF2_DELAY_MAX"), (True, "")):
         rules = replace(RULES, is_horizon_largest_delay=by_delay)
-        model: Any = SimpleNamespace(inputs=SimpleNamespace(rules=rules))
+        arrivals = SimpleNamespace(arrival_s=np.zeros(3))
+        inputs = SimpleNamespace(rules=rules, received_positions=arrivals)
+        model: Any = SimpleNamespace(inputs=inputs)
         one: Any = SimpleNamespace(
             late=3,
             lost=2,
             updates=range(8),
-            settings={},
+            settings={"EKF2_DELAY_MAX": 200.0},
             changed_parameters={"EKF2_EV_DELAY": 90},
         )
         (note,) = _describe_replay_limits(model, one)
@@ -285,8 +307,11 @@ def test_what_if_delay_that_prevents_fusion_raises_error(model, monkeypatch):
         changed_parameters=changed,
     )
     monkeypatch.setattr(whatif, "replay_with_settings", lambda *_, **_more: [never])
-    with pytest.raises(SettingsError, match=r"EKF2_EV_DELAY=300: .* never be fused .* 9 samples"):
+    with pytest.raises(
+        SettingsError, match=r"EKF2_EV_DELAY=300: .* never be fused .* 9 samples"
+    ) as error:
         what_if(model, [changed])
+    assert "--set EKF2_DELAY_MAX" in error.value.remedy
 
 
 def test_what_if_above_35_percent_rejections_is_not_predictable(model):

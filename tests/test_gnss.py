@@ -394,6 +394,14 @@ def test_compare_of_real_gnss_flights_equals_reference_numbers(name, shared_logs
         assert track.compute_rate_hz() > 2.9
 
 
+@pytest.mark.reallogs
+def test_gnss_noise_advice_follows_ground_truth(shared_logs):
+    analysis = px4fuse.compare(shared_logs / "simulated" / "v1.16.1_no_uwb.ulg")
+    remedies = {one.id: one.remedy for one in find(analysis)}
+    assert remedies["kf_underconfident"].startswith("Set SIGMA_Z to 0.1")
+    assert "noise that the receiver reports (0.9 m)" in remedies["ekf2_underconfident"]
+
+
 def as_in_the_log(found: dict[str, AidResult], truth: dict[str, Any]) -> int:
     """Compare the mean NIS of aiding sources with independent values; return their number."""
     stated = {

@@ -11,10 +11,12 @@ from pyulog import ULog
 from scipy.spatial.transform import Rotation, Slerp
 from trajectory_tools import noisy_odometry, square
 
+from px4fuse.diagnose import analyse_loop_closure, prepare_comparison
 from px4fuse.errors import SettingsError, TrajectoryError
-from px4fuse.findings import find_loop_findings
-from px4fuse.flight.model import Unavailable
+from px4fuse.findings import find_loop_findings, source_convention
+from px4fuse.flight.model import Columns, Unavailable
 from px4fuse.lesson import ODOMETRY_CORNERS_M, format_loop_lines
+from px4fuse.loop import tracks
 from px4fuse.loop.analysis import analyse, analyse_flight_loop
 from px4fuse.loop.corrections import (
     CORRECTION_LABELS,
@@ -22,9 +24,10 @@ from px4fuse.loop.corrections import (
 )
 from px4fuse.loop.model import Loop, OdometryNoise
 from px4fuse.loop.tracks import LoopSource, read_source, split_path_and_part
-from px4fuse.request import GivenClosure, Landing, LoopRequest
+from px4fuse.request import ComparisonRequest, GivenClosure, Landing, LoopRequest
 from px4fuse.trajectory.evaluation import Evaluation
 from px4fuse.trajectory.model import Trajectory, TrajectoryKind
+from px4fuse.trajectory.rotation import multiply
 from px4fuse.trajectory.scores import Statistics
 
 SAMPLE = REPOSITORY / "sample_logs" / "loop_vio.ulg"
@@ -320,6 +323,22 @@ def test_loop_without_ground_truth_notes_assumed_landing_point(
     assert (finding.id, finding.severity) == ("loop_landing_assumed", "note")
     assert "px4fuse loop --landed-at" in finding.remedy
     assert find_loop_findings(analyse_loop(sample, landed_at=Landing(0.0, 0.0))) == ()
+
+
+def test_loop_states_wrong_orientation_as_compare(sample: LoopSource, monkeypatch: Any) -> None:
+    track = next(one for one in sample.flight.positions if one.orientation is not None)
+    quaternions = track.orientation[Columns.QUATERNION].to_numpy()
+    turned = track.orientation.copy()
+    turned[Columns.QUATERNION] = multiply(np.sqrt([0.5, 0.0, 0.0, 0.5]), quaternions)
+    flight = replace(sample.flight, positions=(replace(track, orientation=turned),))
+    for flown, expected in ((sample.flight, []), (flight, ["source_orientation_wrong"])):
+        source = LoopSource(sample.trajectory, flown)
+        monkeypatch.setattr(tracks, "read_source", lambda *_, one=source, **_more: one)
+        loop = analyse_loop_closure(LoopRequest(source=""))
+        found = find_loop_findings(loop)
+        assert [one.id for one in found] == expected
+    prepared = prepare_comparison(flight, ComparisonRequest(log=flight.log.name))
+    assert found[0] in list(source_convention.detect(prepared))
 
 
 @pytest.mark.parametrize("share", [1.0, 0.5])

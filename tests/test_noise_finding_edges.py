@@ -398,6 +398,17 @@ def test_inconsistent_filter_without_cause_recommends_a_check() -> None:
     assert unknown.remedy == noises.UNKNOWN_NOISE_ACTION
 
 
+def test_ground_truth_decides_if_noise_of_gnss_may_be_reduced() -> None:
+    receiver = source(samples=MOVING.samples, origin=GNSS_ORIGIN)
+    rerun = tried("kf", {"sigma_z_m": 0.2}, before=0.2)
+    for nees, is_reduced in ((0.2, True), (1.0, False)):
+        narrow = axis(kf=statement(0.2, "underconfident"), kf_truth=against_truth(nees))
+        one = analysis(axes=(narrow,), source=receiver, trials=(rerun,))
+        finding = only(noises.detect_inconsistent_variances, one)
+        assert finding.severity == "note"
+        assert finding.remedy.startswith("Set SIGMA_Z to 0.2 m" if is_reduced else "Do not reduce")
+
+
 def test_smaller_noise_that_contradicts_ground_truth_is_rejected() -> None:
     contradicted = tried("kf", {"sigma_z_m": 0.5}, before=0.2)
     contradicted = replace(contradicted, after=replace(contradicted.after, nees_mean=4.0))

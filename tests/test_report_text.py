@@ -205,8 +205,9 @@ def with_clock(found: ClockOffset | Unavailable, delay_ms: float = 0.0) -> Any:
     ekf2 = SimpleNamespace(parameters={"EKF2_DELAY_MAX": 200.0})
     settings, flight = SimpleNamespace(clock_offset_s=0.0), SimpleNamespace(log=log, ekf2=ekf2)
     return SimpleNamespace(
-        clock=found, settings=settings, flight=flight, source=source(), convention=None
-    )
+        clock=found, settings=settings, flight=flight, source=source(), convention=None,
+        select_main_trials=lambda: [],
+    )  # fmt: skip
 
 
 def test_report_omits_time_offset_page_if_not_significant() -> None:

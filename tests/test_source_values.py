@@ -16,7 +16,9 @@ from studies.expected_cases import judge, run
 from ulog_tools import make_log, odometry
 
 from px4fuse.analysis import Analysis
+from px4fuse.convention.lever_arm import LeverArm
 from px4fuse.convention.model import Convention
+from px4fuse.ekf2.model import prepare_ekf2_model, replay_with_settings
 from px4fuse.finding import Finding
 from px4fuse.findings import (
     ekf2_not_fusing,
@@ -28,7 +30,7 @@ from px4fuse.findings import (
 )
 from px4fuse.findings.cause_grouping import group_by_cause
 from px4fuse.findings.model import finding
-from px4fuse.flight.model import REPEATED_TIMESTAMPS_NOTE, ClockMap, Columns, Flight
+from px4fuse.flight.model import REPEATED_TIMESTAMPS_NOTE, ClockMap, Columns, Flight, Unavailable
 from px4fuse.readers import read_log
 from px4fuse.readers.common import classify_invalid_positions, estimate_rounding_step
 from px4fuse.readers.position_file import read_position_file
@@ -355,6 +357,44 @@ def test_estimated_lever_arm_equals_simulated_one():
     found_m = one.evidence["forward_m"], one.evidence["right_m"]
     assert found_m == pytest.approx((0.4, -0.3), abs=0.1)
     assert "Set EKF2_EV_POS_X to 0." in one.remedy
+
+
+def without_truth(analysis: Analysis, imu_x_m: float) -> Analysis:
+    ekf2 = analysis.flight.ekf2
+    ekf2 = replace(ekf2, parameters={**ekf2.parameters, "EKF2_IMU_POS_X": imu_x_m})
+    flight = replace(analysis.flight, ekf2=ekf2, truth=Unavailable("ground truth", "none", ""))
+    return replace(analysis, flight=flight)
+
+
+def test_lever_arm_estimate_from_imu_includes_imu_position() -> None:
+    """A sensor 0.4 m behind the IMU is at the vehicle's origin if EKF2_IMU_POS_X is 0.4 m."""
+    behind = mounted((-0.4, 0.0))
+    assert not [*source_values.detect_lever_arm(without_truth(behind, 0.4))]
+    (one,) = source_values.detect_lever_arm(without_truth(mounted((0.0, 0.0)), 0.4))
+    assert one.evidence["forward_m"] == pytest.approx(0.4, abs=0.1)
+    assert "Set EKF2_EV_POS_X to 0." in one.remedy
+    assert "If the position of the sensor is right, set EKF2_IMU_POS_X to " in one.remedy
+
+
+def test_wrong_imu_position_is_named_if_replay_confirms_it(monkeypatch) -> None:
+    """EKF2's replay with a wrong EKF2_IMU_POS; ground truth contains no error of the source."""
+    scenario = Scenario(seed=3, passes=3, yaw="follow")
+    flight = simulate_flight(scenario, parse_faults(()))
+    model = prepare_ekf2_model(flight)
+    wrong = replace(model.inputs, imu_offset_m=np.array([0.6, 0.0, 0.0]))
+    wrong_model = replace(model, inputs=wrong, runs=())
+    (replay,) = replay_with_settings(wrong_model, [{}])
+    wrong_model = replace(wrong_model, baseline_replay=replay)
+    analysis = replace(unexplained(compare(flight)), ekf2_model=wrong_model)
+    right = {"EKF2_IMU_POS_X": 0.0, "EKF2_IMU_POS_Y": 0.0}
+    assert "Replay of EKF2" in source_values._describe_replayed_effect(analysis, right)
+    moved = {"EKF2_EV_POS_X": 0.6, "EKF2_EV_POS_Y": 0.0}
+    assert source_values._describe_replayed_effect(analysis, moved) is None
+    monkeypatch.setattr(source_values, "estimate_lever_arm", lambda *_: LeverArm(0.6, 0.0, 0.1))
+    monkeypatch.setattr(source_values, "find_imu_position_m", lambda _: (0.6, 0.0, 0.0))
+    (one,) = source_values.detect_lever_arm(analysis)
+    assert one.message.startswith("The IMU is mounted 0.60 m from")
+    assert one.remedy.startswith("Set EKF2_IMU_POS_X to 0 m and EKF2_IMU_POS_Y to 0 m.")
 
 
 def test_source_without_lever_arm_has_no_lever_arm_report():

@@ -422,19 +422,21 @@ def _mark_explained_verdicts(
         if action.sentence.startswith("no change")
         for name in action.target.split(", ")
     }
-    filters_consistent_with_truth = {
-        verdict.filter
-        for verdict in sigma_verdicts
-        if verdict.against == "truth" and verdict.word == "consistent"
+    word_against_truth = {
+        verdict.filter: verdict.word for verdict in sigma_verdicts if verdict.against == "truth"
     }
     return tuple(
         replace(verdict, is_explained=True)
         if verdict.is_fault
         and (
             FILTER_NAMES[verdict.filter] in filters_to_keep_unchanged
-            or verdict.filter in filters_consistent_with_truth
+            or word_against_truth.get(verdict.filter) == "consistent"
             # Innovations do not contain drift, so small innovations do not prove a too large σ
-            or (may_drift and (verdict.against, verdict.word) == ("source", "underconfident"))
+            or (
+                may_drift
+                and (verdict.against, verdict.word) == ("source", "underconfident")
+                and word_against_truth.get(verdict.filter) != "underconfident"
+            )
         )
         else verdict
         for verdict in sigma_verdicts

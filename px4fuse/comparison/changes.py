@@ -74,9 +74,12 @@ def find_candidate_changes(
     is_underconfident = statistic == "nis" and summary.nis_mean < 1.0
     axis_tuning = find_axis_tuning(estimates.tuning, axis_result.axis.name)
     changes = list[Change]()
-    # Do not reduce the noise of GNSS or odometry: innovations do not show their slow errors
+    # Do not reduce the noise of GNSS or odometry: innovations do not show their slow errors, only
+    # ground truth does
     origin = comparison.source.origin
-    may_have_correlated_errors = origin.may_drift or origin.is_gnss
+    may_have_correlated_errors = (
+        origin.may_drift or origin.is_gnss
+    ) and not summary.is_underconfident_against_truth
     if axis_tuning is not None and not (is_underconfident and may_have_correlated_errors):
         changes += (
             _find_kf_noise_changes(comparison.settings, axis_tuning, is_underconfident)

@@ -72,6 +72,11 @@ class FilterSummary(Consistency, kw_only=True):
     sigma_p_after_update_m: PositiveFloat | None = None
     truth: OrUnavailable[ErrorsAgainstTruth]
 
+    @property
+    def is_underconfident_against_truth(self) -> bool:
+        nees = None if isinstance(self.truth, Unavailable) else self.truth.nees_position_mean
+        return nees is not None and classify_sigma_ratio(nees**0.5, "truth") == "underconfident"
+
 
 class UntestedFilter(Unavailable, kw_only=True):
     """Reported σ and errors of a filter, and the reason why its consistency was not tested."""

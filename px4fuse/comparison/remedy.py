@@ -14,7 +14,14 @@ from px4fuse.ekf2.replay import rows_inside
 from px4fuse.filter.signals import AISLE
 from px4fuse.filter.time_offset import MIN_OFFSET_SIGMAS, MIN_TIME_OFFSET_S, ClockOffset
 from px4fuse.filter.tuning import HORIZONTAL, NoiseEstimate
-from px4fuse.flight.ekf2_parameters import EV_POS, GNSS_POS, GNSS_VEL, PARAMETERS, Aid
+from px4fuse.flight.ekf2_parameters import (
+    EV_POS,
+    GNSS_POS,
+    GNSS_VEL,
+    KNOWN_PARAMETERS,
+    PARAMETERS,
+    Aid,
+)
 from px4fuse.flight.model import Unavailable
 
 # Tested values of EKF2_GPS_DELAY (ms)
@@ -293,6 +300,7 @@ def select_changed_settings(
 def format_settings(changes: Mapping[str, float]) -> str:
     """Format EKF2 parameters with their new values, for example "EKF2_EV_DELAY to 264 ms"."""
     parameter_texts = (
-        f"{name} to {value:.3g} {PARAMETERS[name].printed_unit}" for name, value in changes.items()
+        f"{name} to {value:.3g} {KNOWN_PARAMETERS[name].printed_unit}"
+        for name, value in changes.items()
     )
     return " and ".join(map(str.rstrip, parameter_texts))

@@ -21,9 +21,11 @@ from px4fuse.comparison.changes import (
     remove_repeated_changes,
 )
 from px4fuse.comparison.comparison import (
+    compare,
     compute_difference_statistics,
     compute_error_statistics,
     compute_kf_error_statistics,
+    run_kf,
 )
 from px4fuse.comparison.estimates import Estimates, TuningByAxis
 from px4fuse.comparison.model import (
@@ -33,6 +35,7 @@ from px4fuse.comparison.model import (
     ErrorsAgainstTruth,
     FilterName,
     FilterSummary,
+    PreparedComparison,
     UntestedFilter,
 )
 from px4fuse.comparison.projection import project, project_truth
@@ -65,6 +68,7 @@ from px4fuse.filter.signals import (
     integrate_ned_acceleration,
     weighted_sum,
 )
+from px4fuse.filter.time_offset import ClockOffset
 from px4fuse.filter.tuning import HORIZONTAL
 from px4fuse.flight.ekf2_parameters import PARAMETERS
 from px4fuse.flight.model import Columns, Unavailable
@@ -156,6 +160,20 @@ def rerun_filters(
         for tested_filter in filters
         for axis_result in comparison.axes.values()
         for trial in _rerun_with_changes(comparison, estimates, tested_filter, axis_result)
+    )
+
+
+def rerun_kf_with_time_offset(prepared: PreparedComparison, clock_offset: ClockOffset) -> Trial:
+    """Run KF along the main axis with and without a time offset, as :func:`rerun_filters` does."""
+    comparison = compare(prepared, run_kf(prepared))
+    change = {CLOCK_OFFSET_KEY: round(clock_offset.offset_s, 3)}
+    return Trial(
+        filter="kf",
+        axis=comparison.main.axis.name,
+        kinds=classify_change(comparison, None, change),
+        change=change,
+        before=_rerun_kf(comparison, {}, comparison.main, {}),
+        after=_rerun_kf(comparison, {}, comparison.main, change),
     )
 
 

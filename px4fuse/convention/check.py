@@ -31,7 +31,7 @@ from px4fuse.convention.motion import (
     replace_heading,
 )
 from px4fuse.convention.orientation import check_orientation
-from px4fuse.convention.texts import format_axes
+from px4fuse.convention.texts import format_axes, format_delay
 from px4fuse.flight.model import Columns, Ekf2, Flight, PositionTrack
 from px4fuse.trajectory.association import choose_gap_limit_s, is_bracketed
 from px4fuse.trajectory.rotation import heading
@@ -273,7 +273,8 @@ def _describe_hypothesis(hypothesis: Hypothesis) -> str:
         properties.append(
             f"rotated by {-np.degrees(hypothesis.heading_minus_quarter_turns_rad):+.0f}°"
         )
-    properties.append(f"timestamps {hypothesis.delay_s:+.1f} s late")
+    if delay_text := format_delay(hypothesis.delay_s, 1):
+        properties.append(f"timestamps {delay_text}")
     return ", ".join(properties)
 
 

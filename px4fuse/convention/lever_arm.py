@@ -30,6 +30,7 @@ MAX_RESIDUAL_SIGMAS = 3.0
 MIN_SINGULAR_VALUE_RATIO = 0.02
 MIN_COORDINATE_COUNT = 40
 LEVER_ARM_FIT_COUNT = 4
+IMU_POSITION_PARAMETERS = ("EKF2_IMU_POS_X", "EKF2_IMU_POS_Y", "EKF2_IMU_POS_Z")
 
 
 class LeverArm(NamedTuple):
@@ -44,10 +45,18 @@ class LeverArm(NamedTuple):
         return float(np.hypot(self.forward_m, self.right_m))
 
 
+def find_imu_position_m(flight: Flight) -> tuple[float, float, float]:
+    """Return the position of the IMU (m, body FRD) that EKF2 assumes."""
+    parameters = {} if isinstance(flight.ekf2, Unavailable) else flight.ekf2.parameters
+    x, y, z = (parameters.get(name, 0.0) for name in IMU_POSITION_PARAMETERS)
+    return x, y, z
+
+
 def estimate_lever_arm(flight: Flight, track: PositionTrack) -> LeverArm | None:
     """Estimate the error of the lever arm in EKF2's parameters (true minus parameter).
 
-    Return None if the error is not significant.
+    The positions are corrected by the sensor's parameters. The estimate from the IMU also contains
+    an error of EKF2_IMU_POS, with the opposite sign. Return None if the error is not significant.
     """
     lever_arm = None
     if isinstance(flight.truth, Truth):
@@ -153,8 +162,12 @@ def _fit_lever_arm_to_imu(flight: Flight, track: PositionTrack) -> LeverArm | No
         is_used &= residual_m < MAX_RESIDUAL_SIGMAS * sigma_m
         # The third parameter is the time (s) by which the timestamps are early
         time_s = time_s + fitted_parameters[2]
+    # The fit is relative to the IMU, the parameters are relative to the vehicle's origin
+    imu_position_m = find_imu_position_m(flight)
     lever_arm = LeverArm(
-        float(fitted_parameters[0]), float(fitted_parameters[1]), lever_arm_sigma_m
+        float(fitted_parameters[0]) + imu_position_m[0],
+        float(fitted_parameters[1]) + imu_position_m[1],
+        lever_arm_sigma_m,
     )
     return (
         lever_arm

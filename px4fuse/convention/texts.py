@@ -42,6 +42,17 @@ def format_axes(axes: Sequence[str], unit: str) -> str:
     return "x {}, y {}, z {}, {}".format(*axes, unit)
 
 
+def format_delay(late_s: float, decimals: int) -> str:
+    """Format a delay of timestamps with its direction; "" for a delay that rounds to zero.
+
+    >>> format_delay(0.52, 2), format_delay(-0.3, 1), format_delay(-0.04, 1)
+    ('0.52 s late', '0.3 s early', '')
+    """
+    if not round(late_s, decimals):
+        return ""
+    return f"{abs(late_s):.{decimals}f} s {'late' if late_s > 0 else 'early'}"
+
+
 def describe_axes(
     axes: AxisDirections, stated_frame: str, *, is_mirrored: bool, is_file: bool
 ) -> tuple[str, str]:

@@ -517,6 +517,8 @@ def _make_state_tracks(
     heading_rad = (
         np.arctan2(segment.body_to_ned[:, 1, 0], segment.body_to_ned[:, 0, 0]) + state[:, HEADING]
     )
+    # EKF2 publishes the position of the vehicle's origin, not of the IMU (output_predictor.cpp)
+    published_position = published_position - segment.body_to_ned @ inputs.imu_offset_m
     horizon_track = _make_track(run, state[:, VELOCITY], state[:, POSITION])
     return horizon_track.assign(heading_rad=heading_rad), _make_track(run, *published_state)
 

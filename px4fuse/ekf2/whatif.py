@@ -377,7 +377,7 @@ def _summarise_replay(flight: Flight, replay: Ekf2Replay, spans_s: Spans) -> Ekf
         raise SettingsError(
             f"{_format_changes(replay)}: {replay.source} would never be fused in the evaluated "
             f"time. {replay.lost} samples would arrive too late, after the fusion horizon",
-            "Choose another parameter value.",
+            "Choose another value, or add --set EKF2_DELAY_MAX=... (PX4 v1.15 and later).",
         )
     # Position variance just before (1 µs) and after each update
     variance = pd.DataFrame(index=np.column_stack([update_times_s - 1e-6, update_times_s]).ravel())
@@ -599,6 +599,21 @@ def _describe_replay_limits(model: Ekf2Model, replay: Ekf2Replay) -> Iterator[st
             f"While EKF2 fuses GNSS, the noise of vision positions is at least {GNSS_POS.noise} "
             f"({min_noise_m:g} m)"
         )
+    # PX4 releases with this rule have no parameter EKF2_DELAY_MAX
+    is_horizon_largest_delay = model.inputs.rules.is_horizon_largest_delay
+    delay_ms = max(replay.changed_parameters.get(aid.delay, 0.0) for aid in (EV_POS, GNSS_POS))
+    if not is_horizon_largest_delay and delay_ms > (
+        delay_max_ms := replay.settings["EKF2_DELAY_MAX"]
+    ):
+        yield (
+            f"{_format_changes(replay)}: EKF2 increases EKF2_DELAY_MAX from {delay_max_ms:g} to "
+            f"{delay_ms:g} ms when it starts, and so does the replay. Reboot PX4 after the change"
+        )
+    if delay_ms and np.isinf(model.inputs.received_positions.arrival_s).all():
+        yield (
+            "The log does not contain the arrival times of the positions, so the replay assumes "
+            "that no sample arrives too late"
+        )
     if replay.late or replay.lost:
         # Of two samples in one prediction step, EKF2 fuses only the newer
         received_count = max(len(replay.updates), replay.late) + replay.lost
@@ -607,8 +622,6 @@ def _describe_replay_limits(model: Ekf2Model, replay: Ekf2Replay) -> Iterator[st
             "would arrive late, after the fusion horizon. EKF2 would never fuse "
             f"{replay.lost} of them"
         )
-        # PX4 releases with this rule have no parameter EKF2_DELAY_MAX
-        is_horizon_largest_delay = model.inputs.rules.is_horizon_largest_delay
         yield note if is_horizon_largest_delay else f"{note}. Increase EKF2_DELAY_MAX"
 
 

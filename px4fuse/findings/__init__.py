@@ -67,7 +67,9 @@ def find(analysis: Analysis) -> tuple[Finding, ...]:
 
 def find_loop_findings(loop: Loop) -> tuple[Finding, ...]:
     """Return the findings on the loop closures of a path, most severe first."""
-    return () if loop.is_assessed else group_by_cause(loops.detect_loop_faults(loop))
+    if loop.is_assessed:
+        return ()
+    return group_by_cause([*loop.orientation_findings, *loops.detect_loop_faults(loop)])
 
 
 def find_aid_findings(aid_results: Mapping[str, AidResult], flight: Flight) -> tuple[Finding, ...]:

@@ -288,9 +288,11 @@ def _make_wrong_sigma_finding(
         severity = lower_severity(severity)
     axis_tuning = find_axis_tuning(analysis.tuning, worst_axis.axis.name)
     verdict = "underconfident" if is_underconfident else "overconfident"
-    if is_underconfident and analysis.source.origin.may_drift:
+    # Ground truth shows slow errors that innovations do not show
+    may_have_hidden_error = is_underconfident and not summary.is_underconfident_against_truth
+    if may_have_hidden_error and analysis.source.origin.may_drift:
         severity, remedy_text, cause = "note", KEEP_NOISE_BECAUSE_OF_DRIFT_ACTION, UNKNOWN_CAUSE
-    elif is_underconfident and analysis.source.origin.is_gnss:
+    elif may_have_hidden_error and analysis.source.origin.is_gnss:
         is_barometer = analysis.source.aid(worst_axis.axis.name) == BAROMETER
         remedy_text = (
             _format_action_for_excessive_noise(analysis)
@@ -321,7 +323,11 @@ def _make_wrong_sigma_finding(
         remedy_text = _find_action_for_wrong_sigma(
             analysis, filter_name, worst_axis, axis_tuning, rerun
         )
-        severity = "note" if remedy_text == KEEP_NOISE_BECAUSE_OF_TRUTH_ACTION else severity
+        is_kf_noise_of_receiver = (
+            filter_name == "kf" and is_underconfident and analysis.source.origin.is_gnss
+        )
+        if remedy_text == KEEP_NOISE_BECAUSE_OF_TRUTH_ACTION or is_kf_noise_of_receiver:
+            severity = "note"
     low, high = summary.nis_band
     return finding(
         severity,
@@ -341,13 +347,17 @@ def _make_wrong_sigma_finding(
     )
 
 
-def _format_action_for_excessive_noise(analysis: Analysis) -> str:
-    name = find_aid(analysis).noise
-    parameter_noise_m = analysis.flight.log.parameters.get(name, np.nan)
+def _find_reported_noise_m(analysis: Analysis) -> float:
     reported_variance = cut_to_segment(analysis.source.samples, analysis.segment)[
         Columns.POSITION_VARIANCE[0]
     ]
-    reported_noise_m = float(np.sqrt(reported_variance.median()))
+    return float(np.sqrt(reported_variance.median()))
+
+
+def _format_action_for_excessive_noise(analysis: Analysis) -> str:
+    name = find_aid(analysis).noise
+    parameter_noise_m = analysis.flight.log.parameters.get(name, np.nan)
+    reported_noise_m = _find_reported_noise_m(analysis)
     horizontal_tuning = find_first_tuning(analysis.tuning, HORIZONTAL)
     noise_m = max(
         reported_noise_m, (horizontal_tuning.sigma_z.value if horizontal_tuning else None) or 0.0
@@ -368,6 +378,14 @@ def _format_action_for_excessive_noise(analysis: Analysis) -> str:
 def _format_noise_minimum(analysis: Analysis) -> str:
     parameters = analysis.flight.log.parameters
     gnss_noise_m = parameters.get(GNSS_POS.noise, PARAMETERS[GNSS_POS.noise].default)
+    if (
+        analysis.source.origin.is_fused_as_gnss
+        and (reported_noise_m := _find_reported_noise_m(analysis)) >= gnss_noise_m
+    ):
+        return (
+            "Change nothing: the noise of GNSS positions in PX4 is at least the noise that the "
+            f"receiver reports ({reported_noise_m:.2g} m)."
+        )
     is_fused_with_gnss = analysis.source.origin.is_vision and has_fused_aid(analysis.flight.ekf2)
     if not is_fused_with_gnss or parameters.get(EV_POS.noise, 0.0) > gnss_noise_m:
         return ""

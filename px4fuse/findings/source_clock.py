@@ -60,8 +60,7 @@ def detect_time_offset(analysis: Analysis, time_offset: ClockOffset) -> Findings
     if (
         not time_offset.is_significant(time_offset.remaining_s)
         or find_timesync_convergence(analysis) is not None
-        or _compute_rmse_ratio(_find_trial(analysis, "kf", "time offset"))
-        > MAX_RMSE_RATIO_AFTER_CORRECTION
+        or truth_refutes_offset(find_offset_trial(analysis))
     ):
         return
     offset_s, low_s, high_s = (
@@ -80,6 +79,15 @@ def detect_time_offset(analysis: Analysis, time_offset: ClockOffset) -> Findings
         _find_offset_remedy(analysis, time_offset),
         evidence,
     )
+
+
+def find_offset_trial(analysis: Analysis) -> Trial | None:
+    return _find_trial(analysis, "kf", "time offset")
+
+
+def truth_refutes_offset(trial: Trial | None) -> bool:
+    """Return True if a corrected time offset increases KF's error against ground truth."""
+    return _compute_rmse_ratio(trial) > MAX_RMSE_RATIO_AFTER_CORRECTION
 
 
 def _find_trial(analysis: Analysis, filter_name: FilterName, kind: str) -> Trial | None:
@@ -133,6 +141,8 @@ def compute_offset_for_option_s(comparison: PreparedComparison, time_offset: Clo
 
 
 def detect_wrong_delay(analysis: Analysis, time_offset: ClockOffset) -> Findings:
+    if truth_refutes_offset(find_offset_trial(analysis)):
+        return
     source, delay_ms = analysis.source, remedy.find_logged_delay_ms(analysis)
     is_gnss = source.origin.is_fused_as_gnss
     if (

@@ -3,12 +3,13 @@
 Sources: MAVROS ``vision_pose`` (``transform_frame_enu_ned``), PX4 ``VehicleOdometry.msg``, REP 103.
 """
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 
 from msgspec.structs import replace
 
 from px4fuse.comparison.model import Comparison
 from px4fuse.convention.axes import METRES_PER_UNIT
+from px4fuse.convention.check import check_convention
 from px4fuse.convention.correction import MIN_RESIDUAL_ROTATION_DEG, ConventionFaults
 from px4fuse.convention.model import Convention, OrientationConvention
 from px4fuse.convention.texts import (
@@ -18,11 +19,12 @@ from px4fuse.convention.texts import (
     describe_unit,
     find_axes_in_file,
     format_axes,
+    format_delay,
 )
 from px4fuse.finding import Finding
 from px4fuse.findings.cause_grouping import RESET_TIME_KEY, WRONG_CONVENTION_KEY
 from px4fuse.findings.model import FINDING_CATALOGUE, Findings, make_error, make_warning
-from px4fuse.flight.model import PositionTrack, positions_phrase, source_name
+from px4fuse.flight.model import Flight, PositionTrack, positions_phrase, source_name
 
 # Groups of findings that are valid even if all positions are wrong
 POSITION_INDEPENDENT_FINDING_GROUPS = ("logging", "IMU")
@@ -36,10 +38,26 @@ def detect(analysis: Comparison) -> Findings:
     convention, faults = analysis.convention, analysis.convention_faults
     if convention is None:
         return
-    for name, kind, message, action in (
+    fault_texts = (
         *_find_orientation_faults(convention.orientation, faults, source_name(analysis.source)),
         *_find_position_faults(convention, faults, analysis.source),
-    ):
+    )
+    yield from _make_findings(convention, faults, fault_texts)
+
+
+def detect_wrong_orientation(flight: Flight, source: PositionTrack) -> Findings:
+    """Detect a wrong orientation of the position source, as :func:`detect`."""
+    convention = check_convention(flight, source)
+    if convention is not None:
+        faults = find_convention_faults(convention, flight, source.frame)
+        fault_texts = _find_orientation_faults(convention.orientation, faults, source_name(source))
+        yield from _make_findings(convention, faults, fault_texts)
+
+
+def _make_findings(
+    convention: Convention, faults: ConventionFaults, fault_texts: Iterable[ConventionFaultTexts]
+) -> Findings:
+    for name, kind, message, action in fault_texts:
         evidence: dict[str, float | str] = {
             WRONG_CONVENTION_KEY: kind,
             "log_likelihood": round(convention.log_likelihood_gain, 1),
@@ -182,17 +200,18 @@ def _find_position_faults(
         yield "source_unit_wrong", "unit", message, action
     late_s = convention.late_s
     if faults.clock_drift:
+        delay_text = format_delay(late_s, 2)
         message = (
             f"The clock of the position timestamps is {100.0 * abs(faults.clock_drift):.1f} % too "
             f"{'fast' if faults.clock_drift > 0 else 'slow'}. In the middle of the flight the "
-            f"timestamps are {late_s:+.2f} s late. {evidence_sentence} The analysis uses corrected "
-            "timestamps."
+            f"timestamps are {delay_text or 'correct'}. {evidence_sentence} The analysis uses "
+            "corrected timestamps."
         )
         action = "Take timestamps from a clock, not from frame number ÷ nominal rate."
         yield "source_time_offset_changes", "clock drift", message, action
     elif faults.late_s:
         message = (
-            f"Position timestamps are {abs(late_s):.2f} s {'late' if late_s > 0 else 'early'}. "
+            f"Position timestamps are {format_delay(late_s, 2)}. "
             f"{evidence_sentence} The analysis uses corrected timestamps."
         )
         action = (

@@ -1,6 +1,7 @@
 """Positions that are not measurements: zeros, repeated, rounded, alternating or copied values."""
 
 from collections.abc import Mapping
+from dataclasses import replace
 
 import numpy as np
 import pandas as pd
@@ -9,7 +10,11 @@ from scipy.interpolate import CubicHermiteSpline
 from px4fuse.analysis import Analysis
 from px4fuse.comparison.flight_events import compute_max_interval_s
 from px4fuse.comparison.remedy import find_aid, format_settings, is_source_fused
-from px4fuse.convention.lever_arm import estimate_lever_arm
+from px4fuse.convention.lever_arm import (
+    IMU_POSITION_PARAMETERS,
+    estimate_lever_arm,
+    find_imu_position_m,
+)
 from px4fuse.core.arrays import Array
 from px4fuse.core.text import format_metres
 from px4fuse.ekf2.model import replay_with_settings
@@ -139,15 +144,28 @@ def detect_lever_arm(analysis: Analysis) -> Findings:
     lever_arm = estimate_lever_arm(analysis.flight, source)
     if lever_arm is None:
         return
+    sigma_m, imu_position_m = lever_arm.sigma_m, find_imu_position_m(analysis.flight)
     # + 0.0 replaces -0.0 by 0.0
+    forward_m, right_m = (np.round(lever_arm[:2], 2) + 0.0).tolist()
     lever_arm_m = np.add(source.lever_arm_m[:2], lever_arm[:2]).round(2) + 0.0
     change = dict(zip(find_aid(analysis).lever_arm, lever_arm_m.tolist(), strict=False))
+    imu_arm_m = np.subtract(imu_position_m[:2], lever_arm[:2]).round(2) + 0.0
+    imu_change = dict(zip(IMU_POSITION_PARAMETERS, imu_arm_m.tolist(), strict=False))
+    sensor_text, action = f"{source_name(source)} sensor", f"Set {format_settings(change)}."
+    error_text = "the position error"
     effect_sentence = _describe_replayed_effect(analysis, change)
+    if effect_sentence is None:  # ground truth contains no such error of the positions
+        effect_sentence = _describe_replayed_effect(analysis, imu_change)
+        sensor_text, action = "IMU", f"Set {format_settings(imu_change)}."
+        error_text = "EKF2's position error"
+        forward_m, right_m = 0.0 - forward_m, 0.0 - right_m
+    elif any(imu_position_m) and not has_truth:
+        action = (
+            f"Set {format_settings(change)}. If the position of the sensor is right, set "
+            f"{format_settings(imu_change)} instead: the IMU at a wrong place has the same effect."
+        )
     if effect_sentence is None:
         return
-    forward_m, right_m = (round(part, 2) + 0.0 for part in lever_arm[:2])
-    sigma_m = lever_arm[2]
-    sensor_text, action = f"{source_name(source)} sensor", f"Set {format_settings(change)}."
     if source.alignment is not None:  # no EKF2 parameter corrects positions of a file
         sensor_text = "sensor"
         action = "Subtract this lever arm, rotated to NED by the attitude, from the positions."
@@ -155,8 +173,8 @@ def detect_lever_arm(analysis: Analysis) -> Findings:
         "source_lever_arm",
         f"The {sensor_text} is mounted {np.hypot(forward_m, right_m):.2f} m from the mounting "
         f"point that EKF2 assumes: {forward_m:+.2f} m forward, {right_m:+.2f} m right (± "
-        f"{1.96 * sigma_m:.2f} m, 95 %). When the vehicle turns, the position error changes by up "
-        f"to twice this distance. {effect_sentence}{NO_ESTIMATES_SENTENCE}",
+        f"{1.96 * sigma_m:.2f} m, 95 %). When the vehicle turns, {error_text} changes by up to "
+        f"twice this distance. {effect_sentence}{NO_ESTIMATES_SENTENCE}",
         f"{action} Measure the position of the sensor relative to the IMU.",
         {"forward_m": forward_m, "right_m": right_m, "sigma_m": sigma_m},
     )
@@ -175,8 +193,13 @@ def _describe_replayed_effect(analysis: Analysis, change: Mapping[str, float]) -
         or not is_source_fused(analysis, ekf2_model.inputs)
     ):
         return ""
-    rmses_m = []
-    for replay in (ekf2_model.baseline_replay, *replay_with_settings(ekf2_model, [change])):
+    rmses_m, changed_model = [], ekf2_model
+    if change.keys() <= {*IMU_POSITION_PARAMETERS}:
+        inputs = ekf2_model.inputs
+        imu_offset_m = np.array([*change.values(), inputs.imu_offset_m[2]])
+        inputs = replace(inputs, imu_offset_m=imu_offset_m)
+        changed_model, change = replace(ekf2_model, inputs=inputs, runs=()), {}
+    for replay in (ekf2_model.baseline_replay, *replay_with_settings(changed_model, [change])):
         replayed_track = rows_inside(replay.published_state, replay.find_evaluated_spans())
         axis_errors_m = [
             replayed_track[name]

@@ -18,6 +18,7 @@ from px4fuse.core.record import (
     Unavailable,
 )
 from px4fuse.errors import MissingDataError
+from px4fuse.finding import Finding
 from px4fuse.trajectory.evaluation import Evaluation
 from px4fuse.trajectory.graph.model import PoseGraph
 from px4fuse.trajectory.graph.solver import Solution
@@ -140,6 +141,8 @@ class Loop(Record, kw_only=True):
         Pose graph before optimisation.
     original_frame : Frame
         Frame before the conversion to z down.
+    orientation_findings : tuple of Finding
+        Faults of the logged orientation of the odometry.
     """
 
     track: str
@@ -169,6 +172,7 @@ class Loop(Record, kw_only=True):
     references: NotWritten[tuple[Trajectory, ...]] = NOT_WRITTEN
     original_frame: NotWritten[Frame] = NOT_WRITTEN
     is_assessed: NotWritten[bool] = False
+    orientation_findings: NotWritten[tuple[Finding, ...]] = ()
 
     @property
     def odometry(self) -> PathResult:

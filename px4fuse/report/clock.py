@@ -14,10 +14,16 @@ from px4fuse.comparison.remedy import (
     find_logged_delay_ms,
     format_settings,
 )
+from px4fuse.comparison.trials import Trial
 from px4fuse.convention.correction import find_convention_faults
+from px4fuse.core.text import format_metres
 from px4fuse.filter.time_offset import ClockOffset
 from px4fuse.finding import Finding
-from px4fuse.findings.source_clock import compute_offset_for_option_s
+from px4fuse.findings.source_clock import (
+    compute_offset_for_option_s,
+    find_offset_trial,
+    truth_refutes_offset,
+)
 from px4fuse.flight.model import Unavailable
 from px4fuse.report.page import Page, draw_legend_above
 from px4fuse.report.style import KF_BAND_COLOUR, TRACK_STYLES, Axes
@@ -33,7 +39,7 @@ def summarise_offset(analysis: Analysis, findings: Iterable[Finding]) -> str:
     """Summarise the time offset in one line; "" if the report has a page on the time offset."""
     if has_time_offset_page(analysis, findings):
         return ""
-    advice_by_label = make_time_offset_advice(analysis, analysis.clock)
+    advice_by_label = make_time_offset_advice(analysis, analysis.clock, find_offset_trial(analysis))
     return " ".join(
         advice_by_label[label] for label in ("Result", "Offset") if label in advice_by_label
     )
@@ -50,9 +56,14 @@ def has_time_offset_page(analysis: Analysis, findings: Iterable[Finding]) -> boo
 
 
 def make_time_offset_advice(
-    comparison: PreparedComparison, time_offset: ClockOffset | Unavailable
+    comparison: PreparedComparison,
+    time_offset: ClockOffset | Unavailable,
+    trial: Trial | None = None,
 ) -> dict[str, str]:
-    """Return texts on the time offset of the position source, by label."""
+    """Return texts on the time offset of the position source, by label.
+
+    ``trial`` is a re-run of KF with the time offset.
+    """
     if isinstance(time_offset, Unavailable):
         reason, remedy = time_offset.reason, time_offset.remedy
         return {"Offset": f"The time offset cannot be estimated: {reason}. {remedy}"}
@@ -63,6 +74,17 @@ def make_time_offset_advice(
         }
     offset_s, (low_offset_s, high_offset_s) = time_offset.offset_s, time_offset.interval_s
     offset_text = f"{offset_s:+.3f} s (95 % {low_offset_s:+.3f} to {high_offset_s:+.3f} s)"
+    if trial is not None and truth_refutes_offset(trial):
+        return {
+            "Result": (
+                "Ground truth refutes the estimated time offset. A re-run with this offset "
+                "increases KF's position RMSE from "
+                f"{format_metres(trial.before.position_rmse_m or 0.0)} to "
+                f"{format_metres(trial.after.position_rmse_m or 0.0)} m."
+            ),
+            "Offset": f"The estimate is {offset_text}.",
+            "Action": "Do not correct the timestamps. Check the timestamps of the ground truth.",
+        }
     advice_by_label = {
         "Result": "The position source has no significant time offset.",
         "Offset": f"Add {offset_text} to the timestamps of the position source.",

@@ -197,7 +197,12 @@ def make_tuning_advice(
         noise.value is not None and noise.high is not None and noise.high < setting
         for noise, setting in ((sigma_a, settings.sigma_a_m_s2), (sigma_z, settings.sigma_z_m))
     ):
-        advice_by_label["GNSS"] = KEEP_NOISE_BECAUSE_OF_CORRELATION_ACTION.format(sensor="GNSS")
+        advice_by_label["GNSS"] = (
+            KEEP_NOISE_BECAUSE_OF_CORRELATION_ACTION.format(sensor="GNSS")
+            if isinstance(comparison.flight.truth, Unavailable)
+            else "The estimates do not contain the time-correlated error of GNSS. Compare them "
+            "with ground truth: px4fuse compare LOG."
+        )
     elif sigma_a.value is not None or sigma_z.value is not None:
         options_text = "".join(
             f" {option} {noise.value:.3g}"
