@@ -15,7 +15,6 @@ from px4fuse.findings.cause_grouping import (
     group_by_cause,
 )
 from px4fuse.findings.model import FINDING_TITLES
-from px4fuse.flight.model import Unavailable
 from px4fuse.report.phrases import list_verdict_warnings
 
 

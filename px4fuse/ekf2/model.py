@@ -506,7 +506,7 @@ def _make_state_tracks(
         attitude_correction_rad = sum_attitude_corrections(
             state[:, THETA] - segment.attitude_error_rad, lag_steps, inputs.mean_step_s, horizon_s
         )
-    published_state = compute_published_state(
+    published_velocity, published_position = compute_published_state(
         segment,
         state,
         np.cumsum(reset_m, axis=0),
@@ -520,7 +520,9 @@ def _make_state_tracks(
     # EKF2 publishes the position of the vehicle's origin, not of the IMU (output_predictor.cpp)
     published_position = published_position - segment.body_to_ned @ inputs.imu_offset_m
     horizon_track = _make_track(run, state[:, VELOCITY], state[:, POSITION])
-    return horizon_track.assign(heading_rad=heading_rad), _make_track(run, *published_state)
+    return horizon_track.assign(heading_rad=heading_rad), _make_track(
+        run, published_velocity, published_position
+    )
 
 
 def compute_delayed_states(run: SegmentRun, configuration_index: int) -> Array:

@@ -10,7 +10,11 @@ from msgspec.structs import replace
 from px4fuse.comparison.model import Comparison
 from px4fuse.convention.axes import METRES_PER_UNIT
 from px4fuse.convention.check import check_convention
-from px4fuse.convention.correction import MIN_RESIDUAL_ROTATION_DEG, ConventionFaults
+from px4fuse.convention.correction import (
+    MIN_RESIDUAL_ROTATION_DEG,
+    ConventionFaults,
+    find_convention_faults,
+)
 from px4fuse.convention.model import Convention, OrientationConvention
 from px4fuse.convention.texts import (
     FRAME_AXES,
@@ -198,20 +202,18 @@ def _find_position_faults(
             f"{evidence_sentence} The analysis uses the positions in metres."
         )
         yield "source_unit_wrong", "unit", message, action
-    late_s = convention.late_s
     if faults.clock_drift:
-        delay_text = format_delay(late_s, 2)
         message = (
             f"The clock of the position timestamps is {100.0 * abs(faults.clock_drift):.1f} % too "
             f"{'fast' if faults.clock_drift > 0 else 'slow'}. In the middle of the flight the "
-            f"timestamps are {delay_text or 'correct'}. {evidence_sentence} The analysis uses "
-            "corrected timestamps."
+            f"timestamps are {format_delay(convention.late_s, 2) or 'correct'}. {evidence_sentence} "
+            "The analysis uses corrected timestamps."
         )
         action = "Take timestamps from a clock, not from frame number ÷ nominal rate."
         yield "source_time_offset_changes", "clock drift", message, action
     elif faults.late_s:
         message = (
-            f"Position timestamps are {format_delay(late_s, 2)}. "
+            f"Position timestamps are {format_delay(convention.late_s, 2)}. "
             f"{evidence_sentence} The analysis uses corrected timestamps."
         )
         action = (
