@@ -206,8 +206,8 @@ def _find_position_faults(
         message = (
             f"The clock of the position timestamps is {100.0 * abs(faults.clock_drift):.1f} % too "
             f"{'fast' if faults.clock_drift > 0 else 'slow'}. In the middle of the flight the "
-            f"timestamps are {format_delay(convention.late_s, 2) or 'correct'}. {evidence_sentence} "
-            "The analysis uses corrected timestamps."
+            f"timestamps are {format_delay(convention.late_s, 2) or 'correct'}. "
+            f"{evidence_sentence} The analysis uses corrected timestamps."
         )
         action = "Take timestamps from a clock, not from frame number ÷ nominal rate."
         yield "source_time_offset_changes", "clock drift", message, action
