@@ -121,7 +121,7 @@ def list_missing_data(flight: Flight) -> tuple[Unavailable, ...]:
 def describe_flight(flight: Flight) -> dict[str, Any]:
     """Describe log, topics, clocks and missing data of a flight (flight.json)."""
     ekf2 = flight.ekf2
-    description_fields: dict[str, Any] = {
+    description_fields = {
         "schema": {"name": SCHEMA_NAME, "version": SCHEMA_VERSION},
         "log": flight.log,
         "streams": flight.streams,
@@ -135,8 +135,7 @@ def describe_flight(flight: Flight) -> dict[str, Any]:
         "unused": flight.unused,
         "inputs": flight.inputs,
     }
-    json_description: dict[str, Any] = to_json_types(description_fields)
-    return json_description
+    return {**to_json_types(description_fields)}
 
 
 @cache
@@ -196,23 +195,14 @@ def _make_tables(flight: Flight) -> Iterator[ExportedTable]:
     if flight.log.dropouts:
         rows = ((dropout.start_s, dropout.duration_s) for dropout in flight.log.dropouts)
         yield ExportedTable("dropouts", _make_time_table(["duration_s"], rows))
-    if parameters := _collect_logged_parameters(flight):
+    ekf2_parameters = flight.ekf2.parameters if isinstance(flight.ekf2, Ekf2) else {}
+    if parameters := {**flight.log.parameters, **ekf2_parameters}:
         parameter_table = pd.DataFrame(parameters.items(), columns=["name", "value"])
         yield ExportedTable("parameters", parameter_table)
     if flight.clocks:
         clock_table = pd.DataFrame([structs.asdict(clock) for clock in flight.clocks])
         # float, because the number of distinct timestamps may be NaN
         yield ExportedTable("clocks", clock_table.astype({"distinct_stamps": np.float64}))
-
-
-def _collect_logged_parameters(flight: Flight) -> dict[str, float]:
-    logged_values = dict(flight.log.parameters)
-    if isinstance(flight.ekf2, Ekf2):
-        for record_or_aid in (flight.ekf2.record, *flight.ekf2.aids.values()):
-            logged_values |= (
-                {} if isinstance(record_or_aid, Unavailable) else record_or_aid.parameters
-            )
-    return logged_values
 
 
 def _make_ekf2_tables(flight: Flight, ekf2: Ekf2) -> Iterator[ExportedTable]:

@@ -17,14 +17,25 @@ from px4fuse.flight.model import (
     Unavailable,
 )
 from px4fuse.readers import mavlink_messages as messages
-from px4fuse.readers import px4_positions
 from px4fuse.readers.common import join_nearest, read_attitude, read_orientation
 from px4fuse.readers.field_maps import Layout
 from px4fuse.readers.mavlink_clocks import ClockMapping
 from px4fuse.readers.mavlink_frames import MavlinkAddress
 from px4fuse.readers.mavlink_recording import BOOT_CLOCK_TEXT, RECEIPT_CLOCK_TEXT, Recording
 from px4fuse.readers.mavlink_senders import find_senders
-from px4fuse.readers.px4_positions import GeodeticPosition, project_to_ned, unproject
+from px4fuse.readers.px4_positions import (
+    FIX_TYPE_3D,
+    MIN_TRACK_SAMPLES,
+    NO_FIX_ACTION,
+    GeodeticPosition,
+    convert_gnss_fixes,
+    find_motion_capture_truth,
+    make_track,
+    project_to_ned,
+    split_tracks,
+    unavailable_source,
+    unproject,
+)
 
 # Maximum median difference (s) between boot-time GNSS timestamps and receive times
 MAX_BOOT_TIME_DIFFERENCE_S = 5.0
@@ -57,13 +68,13 @@ def read_positions(
             if (track := _read_track(recording, source, sender, clocks[sender], remedy, senders))
         ]
         tracks_or_unavailable += tracks or [
-            px4_positions.unavailable_source(
+            unavailable_source(
                 message, f"the recording contains no {message} sent to the autopilot", remedy
             )
         ]
     gnss_tracks = (_read_gnss(recording, layout, delay_s) for layout in messages.GNSS_LAYOUTS)
     tracks_or_unavailable += [track for track in gnss_tracks if track]
-    return px4_positions.split_tracks(tracks_or_unavailable)
+    return split_tracks(tracks_or_unavailable)
 
 
 def _read_track(
@@ -100,7 +111,7 @@ def _read_track(
         samples[Columns.POSITION_VARIANCE + Columns.ROTATION_VARIANCE] = np.nan
     orientation = read_orientation(samples)
     clock_map = clock.description
-    return px4_positions.make_track(
+    return make_track(
         track_name,
         samples,
         source.origin,
@@ -140,22 +151,20 @@ def _read_gnss(
         # Use the receive times, because the timestamps are not boot times
         gnss_boot_time_s = receipt_boot_times_s
     fixes = recording.read(layout, rows, gnss_boot_time_s - delay_s)
-    fixes = fixes[fixes["fix_type"] >= px4_positions.FIX_TYPE_3D]
-    if len(fixes) < px4_positions.MIN_TRACK_SAMPLES:
+    fixes = fixes[fixes["fix_type"] >= FIX_TYPE_3D]
+    if len(fixes) < MIN_TRACK_SAMPLES:
         fix_count_text = "none" if fixes.empty else f"only {len(fixes)}"
-        return px4_positions.unavailable_source(
+        return unavailable_source(
             layout.topic,
             f"the recording has {message_count} {layout.topic}, {fix_count_text} with a 3D fix",
-            px4_positions.NO_FIX_ACTION,
+            NO_FIX_ACTION,
         )
-    samples = project_to_ned(fixes, find_local_origin(recording))
-    variance = fixes[["eph_m", "eph_m", "epv_m"]].set_axis(Columns.POSITION_VARIANCE, axis=1) ** 2
     is_auto_candidate = bool(
         recording.read(messages.MESSAGE_LAYOUTS["global_state"])["latitude_deg"].any()
     )
-    return px4_positions.make_track(
+    return make_track(
         layout.topic,
-        samples.join(variance),
+        convert_gnss_fixes(fixes, find_local_origin(recording)),
         structs.replace(GNSS_ORIGIN, is_auto_candidate=is_auto_candidate),
         description="GNSS position",
         frame="NED",
@@ -207,7 +216,7 @@ def read_truth(
     """
     for layout in messages.TRUTH_LAYOUTS:
         rows = recording.rows(layout.topic)
-        if len(rows) < px4_positions.MIN_TRACK_SAMPLES:
+        if len(rows) < MIN_TRACK_SAMPLES:
             continue
         samples = recording.read(layout, rows, recording.compute_receipt_boot_times_s(rows))
         samples = samples.dropna(subset=Columns.GEODETIC[:2])
@@ -221,7 +230,7 @@ def read_truth(
         origin = find_local_origin(recording) if positions and positions[0].origin.is_gnss else None
         state = project_to_ned(samples, origin).join(samples[Columns.VELOCITY])
         return Truth(layout.topic, state[Columns.STATE], read_attitude(samples))
-    mocap_truth = px4_positions.find_motion_capture_truth(positions)
+    mocap_truth = find_motion_capture_truth(positions)
     for track in positions:
         if mocap_truth and track.name == mocap_truth.name:
             recording.record_stream("truth", *track.topics, clock=track.clock)

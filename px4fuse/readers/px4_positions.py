@@ -443,7 +443,7 @@ def _read_gnss_track(topics: Topics, ekf2: Ekf2 | Unavailable) -> PositionTrack 
         interpolated_count = int(fixes["altitude_m"].isna().sum())
         # Copy fields that EKF2's topics do not contain from the previous fix
         fixes = fixes.assign(altitude_m=fixes["altitude_m"].interpolate("index")).ffill()
-    samples = _convert_gnss_fixes(fixes, _find_local_origin(topics))
+    samples = convert_gnss_fixes(fixes, _find_local_origin(topics))
     rate_hz = sample_rate(samples)
     notes, is_downsampled = list[str](), rate_hz < MAX_DOWNSAMPLED_HZ
     if is_downsampled:
@@ -481,7 +481,7 @@ def _read_gnss_track(topics: Topics, ekf2: Ekf2 | Unavailable) -> PositionTrack 
     )
 
 
-def _convert_gnss_fixes(fixes: pd.DataFrame, origin: GeodeticPosition | None) -> pd.DataFrame:
+def convert_gnss_fixes(fixes: pd.DataFrame, origin: GeodeticPosition | None) -> pd.DataFrame:
     """Convert GNSS fixes to positions and velocities in NED with their variances."""
     fixes = fixes.reindex(
         columns=[*Columns.GEODETIC, *Columns.VELOCITY, "eph_m", "epv_m", "speed_accuracy_m_s"]
