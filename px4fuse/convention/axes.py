@@ -287,6 +287,15 @@ def find_convention_candidates(
     source_mean_square = np.maximum(moments[:, 3:6, 6], 1e-12)
     imu_mean_square_m2 = moments[:, 6, 3:6]
     metres_per_unit = np.array([*METRES_PER_UNIT.values()])
+
+    def compute_residuals_m2(source_square: Array, imu_square_m2: Array, product: Array) -> Array:
+        """Return the mean squared residuals for each time offset and unit."""
+        return np.asarray(
+            metres_per_unit**2 * source_square[:, None]
+            + imu_square_m2[:, None]
+            - 2.0 * metres_per_unit * product[:, None]
+        )
+
     # If z is constant, the source measures no height, and z is the vertical axis
     has_heights = source_motion.second_differences[:, 2].any()
     hypotheses = []
@@ -296,23 +305,15 @@ def find_convention_candidates(
             continue
         correlation = moments[:, first, 0] + handedness * moments[:, second, 1]
         correlation = correlation + 1j * (moments[:, first, 1] - handedness * moments[:, second, 0])
-        # Mean squared residuals for each time offset and unit
-        horizontal_residual_m2, down_residual_m2 = (
-            metres_per_unit**2 * source_square[:, None]
-            + imu_square_m2[:, None]
-            - 2.0 * metres_per_unit * product[:, None]
-            for source_square, imu_square_m2, product in (
-                (
-                    source_mean_square[:, first] + source_mean_square[:, second],
-                    imu_mean_square_m2[:, 0] + imu_mean_square_m2[:, 1],
-                    np.abs(correlation),
-                ),
-                (
-                    source_mean_square[:, vertical],
-                    imu_mean_square_m2[:, 2],
-                    vertical_sign * moments[:, vertical, 2],
-                ),
-            )
+        horizontal_residual_m2 = compute_residuals_m2(
+            source_mean_square[:, [first, second]].sum(axis=1),
+            imu_mean_square_m2[:, :2].sum(axis=1),
+            np.abs(correlation),
+        )
+        down_residual_m2 = compute_residuals_m2(
+            source_mean_square[:, vertical],
+            imu_mean_square_m2[:, 2],
+            vertical_sign * moments[:, vertical, 2],
         )
         score = (
             np.sum(np.log(source_mean_square), axis=1)[:, None]
