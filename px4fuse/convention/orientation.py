@@ -113,10 +113,9 @@ def check_orientation(
             QUATERNION_ORDERS, QUATERNIONS_BY_FRAMES, range(4)
         )
     ]
-    candidates.sort(key=lambda candidate: -candidate.score)
-    best_candidate = candidates[0]
-    second_best_candidate = next(
-        candidate
+    best_candidate = max(candidates, key=lambda candidate: candidate.score)
+    second_best_score = max(
+        candidate.score
         for candidate in candidates
         if candidate.order_and_heading_free_frames != best_candidate.order_and_heading_free_frames
     )
@@ -126,7 +125,7 @@ def check_orientation(
         or best_candidate.heading_difference_deg > MAX_HEADING_DIFFERENCE_DEG
     ):
         orientation_convention = replace(orientation_convention, verdict="unrelated")
-    elif best_candidate.score - second_best_candidate.score < MIN_CONVENTION_SCORE_LEAD:
+    elif best_candidate.score - second_best_score < MIN_CONVENTION_SCORE_LEAD:
         orientation_convention = replace(orientation_convention, verdict="ambiguous")
     return (
         orientation_convention,
