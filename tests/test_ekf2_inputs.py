@@ -392,7 +392,7 @@ def segments(monkeypatch, **parts: Any) -> list[tuple[float, float]]:
     ekf2 = made(Ekf2, innovations={"north": fused}, primary_instances=given.primary_instances)
     record = made(FusionRecord, delayed=delayed)
     find_replay_segments(
-        made(Flight, airborne=given.airborne), imu, imu, ekf2, record, given.vision
+        made(Flight, airborne=given.airborne), imu, imu, ekf2, record, given.vision, is_gnss=False
     )
     return found
 

@@ -715,15 +715,10 @@ def _compute_variance_growth(
     The states are IMU biases and magnetic fields. EKF2 adds no process noise to a state whose
     variance exceeds the maximum.
     """
-    limit_parameter_by_noise_parameter = {"GYR_B": "GYR", "ACC_B": "ACC"}
-    if segment.magnetic_field is not None:
-        limit_parameter_by_noise_parameter |= {"MAG_E": "MAG", "MAG_B": "MAG"}
+    vector_count = 2 if segment.magnetic_field is None else 4
     noise_density, max_sigma_for_growth = (
-        np.repeat([parameters[f"EKF2_{name}_NOISE"] for name in names], 3, axis=0).T
-        for names in (
-            limit_parameter_by_noise_parameter,
-            limit_parameter_by_noise_parameter.values(),
-        )
+        np.repeat([parameters[f"EKF2_{name}_NOISE"] for name in names[:vector_count]], 3, axis=0).T
+        for names in (("GYR_B", "ACC_B", "MAG_E", "MAG_B"), ("GYR", "ACC", "MAG", "MAG"))
     )
     noise_density[:, :3] *= estimates_attitude[:, None]
     noise_density[:, 3:6] *= estimates_biases[:, None]

@@ -340,7 +340,7 @@ def find_replay_segments(
     fusion_record: FusionRecord,
     position_times_s: Array,
     *,
-    is_gnss: bool = False,
+    is_gnss: bool,
 ) -> tuple[ReplaySegment, ...]:
     """Find the parts of a flight without gaps in IMU and positions, after EKF2's first fusion."""
     innovations = ekf2.innovations["north"]

@@ -117,13 +117,11 @@ class FaultType:
     @property
     def usage(self) -> str:
         """Syntax of the values after the name of the fault, such as ``=PERCENT[,SIZE]``."""
-        required_placeholder, *optional_placeholders = [
-            f"={BOUNDS_BY_FIELD[field_name].option_or_placeholder}"
+        placeholders = [
+            BOUNDS_BY_FIELD[field_name].option_or_placeholder
             for field_name in self.value_field_names
-        ] or [""]
-        return required_placeholder + "".join(
-            f"[,{placeholder[1:]}]" for placeholder in optional_placeholders
-        )
+        ]
+        return f"={'[,'.join(placeholders)}{']' * len(placeholders[1:])}" if placeholders else ""
 
 
 FAULT_TYPES: Mapping[str, FaultType] = {

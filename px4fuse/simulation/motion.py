@@ -229,10 +229,11 @@ def plan_flight(scenario: Scenario, faults: FaultSizes, rng: np.random.Generator
     flight_plan.add_velocity_change(
         -climb_velocity_m_s, CLIMB_RAMP_DURATION_S, CLIMB_RAMP_DURATION_S / 2.0 + scenario.pause_s
     )
+    speed_m_s = 0.0 if faults.no_motion else scenario.speed_m_s
     if scenario.kind == "aisle":
-        _plan_aisle_passes(flight_plan, scenario, 0.0 if faults.no_motion else scenario.speed_m_s)
+        _plan_aisle_passes(flight_plan, scenario, speed_m_s)
     else:
-        _plan_square_laps(flight_plan, scenario, faults)
+        _plan_square_laps(flight_plan, scenario, speed_m_s, faults.open_end_m)
     flight_plan.add_velocity_change(-climb_velocity_m_s, CLIMB_RAMP_DURATION_S, climb_time_s)
     touch_down_s = flight_plan.ramp_centre_s + CLIMB_RAMP_DURATION_S / 2.0
     if touch_down_s > MAX_FLIGHT_S:
@@ -285,9 +286,7 @@ def compute_direction(heading_deg: float) -> Array:
 def _plan_aisle_passes(flight_plan: _FlightBuilder, scenario: Scenario, speed_m_s: float) -> None:
     velocity_m_s = speed_m_s * compute_direction(scenario.heading_deg)
     heading_follows_path = scenario.nose_follows_path and speed_m_s > 0.0
-    pause_s = (
-        max(scenario.pause_s, TURN_ROUND_DURATION_S) if heading_follows_path else scenario.pause_s
-    )
+    pause_s = max(scenario.pause_s, TURN_ROUND_DURATION_S * heading_follows_path)
     flight_plan.ramp_centre_s += SPEED_RAMP_DURATION_S / 2.0
     for pass_index in range(scenario.passes):
         pass_velocity_m_s = velocity_m_s if pass_index % 2 == 0 else -velocity_m_s
@@ -302,13 +301,15 @@ def _plan_aisle_passes(flight_plan: _FlightBuilder, scenario: Scenario, speed_m_
             flight_plan.add_turn(np.pi, stop_s, TURN_ROUND_DURATION_S)
 
 
-def _plan_square_laps(flight_plan: _FlightBuilder, scenario: Scenario, faults: FaultSizes) -> None:
-    speed_m_s = 0.0 if faults.no_motion else scenario.speed_m_s
-    last_side_length_m = scenario.length_m - faults.open_end_m
-    if last_side_length_m < scenario.speed_m_s * CORNER_DURATION_S:
+def _plan_square_laps(
+    flight_plan: _FlightBuilder, scenario: Scenario, speed_m_s: float, open_end_m: float
+) -> None:
+    last_side_length_m = scenario.length_m - open_end_m
+    max_open_end_m = scenario.length_m - scenario.speed_m_s * CORNER_DURATION_S
+    if open_end_m > max_open_end_m:
         raise SettingsError(
-            f"--mistake open-end={faults.open_end_m:g}: the last side is {last_side_length_m:g} m "
-            f"long. Use at most {scenario.length_m - scenario.speed_m_s * CORNER_DURATION_S:g} m."
+            f"--mistake open-end={open_end_m:g}: the last side is {last_side_length_m:g} m "
+            f"long. Use at most {max_open_end_m:g} m."
         )
     side_count = 4 * scenario.passes
     previous_velocity_m_s = np.zeros(3)
