@@ -145,8 +145,8 @@ def _find_position_faults(
     is_position_file = source.alignment is not None
     log_odds = 99.0 if convention.log_odds is None else min(convention.log_odds, 99.0)
     evidence_sentence = (
-        "This convention fits the IMU best (log likelihood ratio to the second best "
-        f"{'above ' if log_odds == 99.0 else ''}{log_odds:.0f} nats)."
+        "These axes, unit and time offset fit the IMU best (log likelihood ratio to the second "
+        f"best {'above ' if log_odds == 99.0 else ''}{log_odds:.0f} nats)."
     )
     stated_frame = source.alignment.frame.upper() if source.alignment else "NED"
     axes = find_axes_in_file(convention.axes, stated_frame)
