@@ -30,15 +30,23 @@ MAX_RESIDUAL_SIGMAS = 3.0
 MIN_SINGULAR_VALUE_RATIO = 0.02
 MIN_COORDINATE_COUNT = 40
 LEVER_ARM_FIT_COUNT = 4
+# Minimum RMS distance (m) from the middle of the path, to fit a rotation
+MIN_PATH_RADIUS_M = 0.01
 IMU_POSITION_PARAMETERS = ("EKF2_IMU_POS_X", "EKF2_IMU_POS_Y", "EKF2_IMU_POS_Z")
 
 
 class LeverArm(NamedTuple):
-    """Distances (m) of the sensor forward and right of the vehicle's origin, and their σ (m)."""
+    """Distances (m) of the sensor forward and right of the vehicle's origin, and their σ (m).
+
+    ``rotation_deg`` is the rotation of the positions (clockwise from above) that fits best together
+    with the lever arm.
+    """
 
     forward_m: float
     right_m: float
     sigma_m: float
+    rotation_deg: float = 0.0
+    rotation_sigma_deg: float = 0.0
 
     @property
     def horizontal_length_m(self) -> float:
@@ -74,27 +82,36 @@ def _fit_lever_arm_to_truth(flight: Flight, truth: Truth, track: PositionTrack) 
     if isinstance(attitude, Unavailable) or len(position_samples) < 2:
         return None
     time_s, truth_samples = position_samples.index.to_numpy(), truth.samples
-    true_positions_m = [
-        np.interp(time_s, truth_samples.index, truth_samples[name], np.nan, np.nan)
-        for name in columns
-    ]
-    error_m = position_samples.to_numpy() - np.transpose(true_positions_m)
-    # Fit a delay too, because it resembles a lever arm
-    velocity_m_s = np.gradient(np.transpose(true_positions_m), time_s, axis=0)
+    true_positions_m = np.column_stack(
+        [
+            np.interp(time_s, truth_samples.index, truth_samples[name], np.nan, np.nan)
+            for name in columns
+        ]
+    )
+    # Fit a delay and a rotation too, because they resemble a lever arm
+    velocity_m_s = np.gradient(true_positions_m, time_s, axis=0)
+    error_per_rotation_m = _rotate(true_positions_m - np.nanmean(true_positions_m, axis=0), 90.0)
+    path_radius_m = max(float(np.sqrt(np.nanmean(error_per_rotation_m**2))), MIN_PATH_RADIUS_M)
+    error_per_rotation_m /= path_radius_m
     quaternions = attitude[Columns.QUATERNION].to_numpy()
     rotation = to_matrix(interpolate(time_s, attitude.index.to_numpy(), quaternions))[:, :2, :2]
     offset_columns = np.broadcast_to(np.eye(2), rotation.shape)
-    design = np.concatenate([rotation, offset_columns, velocity_m_s[:, :, None]], axis=2)
+    motion_columns = np.stack([velocity_m_s, error_per_rotation_m], axis=2)
+    design = np.concatenate([rotation, offset_columns, motion_columns], axis=2)
     is_known = np.isfinite(velocity_m_s).all(axis=1)
-    design_rows = design[is_known].reshape(-1, 5)
-    valid_position_errors_m = error_m[is_known].ravel()
+    design_rows = design[is_known].reshape(-1, 6)
     if len(design_rows) < MIN_COORDINATE_COUNT:
         return None
-    fitted_parameters, _, rank, _ = np.linalg.lstsq(
-        design_rows, valid_position_errors_m, rcond=MIN_SINGULAR_VALUE_RATIO
-    )
-    if rank < design_rows.shape[1]:  # with a constant heading, a lever arm is a constant offset
-        return None
+    rotation_deg = 0.0
+    for _ in range(LEVER_ARM_FIT_COUNT):
+        error_m = _rotate(position_samples.to_numpy(), -rotation_deg) - true_positions_m
+        valid_position_errors_m = error_m[is_known].ravel()
+        fitted_parameters, _, rank, _ = np.linalg.lstsq(
+            design_rows, valid_position_errors_m, rcond=MIN_SINGULAR_VALUE_RATIO
+        )
+        if rank < design_rows.shape[1]:  # with a constant heading, a lever arm is an offset
+            return None
+        rotation_deg += float(np.degrees(fitted_parameters[5])) / path_radius_m
     residual_m = (valid_position_errors_m - design_rows @ fitted_parameters).reshape(-1, 2)
     # Successive errors of a source may be correlated
     variance_factor = max(map(compute_autocorrelation_time, residual_m.T))
@@ -102,11 +119,23 @@ def _fit_lever_arm_to_truth(flight: Flight, truth: Truth, track: PositionTrack) 
         np.linalg.inv(design_rows.T @ design_rows) * np.mean(residual_m**2) * variance_factor
     )
     sigma_m = float(np.sqrt(np.trace(covariance[:2, :2])))
-    lever_arm = LeverArm(float(fitted_parameters[0]), float(fitted_parameters[1]), sigma_m)
+    lever_arm = LeverArm(
+        float(fitted_parameters[0]),
+        float(fitted_parameters[1]),
+        sigma_m,
+        rotation_deg,
+        float(np.degrees(np.sqrt(covariance[5, 5]))) / path_radius_m,
+    )
     is_significant = lever_arm.horizontal_length_m > max(
         MIN_LEVER_ARM_WITH_TRUTH_M, MIN_LEVER_ARM_SIGMAS_WITH_TRUTH * sigma_m
     )
     return lever_arm if is_significant and lever_arm.horizontal_length_m < MAX_LEVER_ARM_M else None
+
+
+def _rotate(vectors: Array, angle_deg: float) -> Array:
+    """Rotate horizontal vectors (north, east), clockwise from above."""
+    cosine, sine = np.cos(np.radians(angle_deg)), np.sin(np.radians(angle_deg))
+    return np.asarray(vectors @ np.array([[cosine, sine], [-sine, cosine]]))
 
 
 def _fit_lever_arm_to_imu(flight: Flight, track: PositionTrack) -> LeverArm | None:
@@ -120,18 +149,17 @@ def _fit_lever_arm_to_imu(flight: Flight, track: PositionTrack) -> LeverArm | No
     rotation_second_differences = SourceSecondDifferences.from_positions(
         inertial_data.time_s, rotation, imu_motion.time_s
     ).second_differences.reshape(-1, 2, 2)
-    design = np.concatenate(
-        [
-            rotation_second_differences,
-            imu_motion.second_difference_derivative_m_s[:, :2, None],
-            imu_motion.table[:, :2, 1:],
-        ],
-        axis=2,
-    )
+    motion_columns = [
+        imu_motion.second_difference_derivative_m_s[:, :2, None],
+        imu_motion.table[:, :2, 1:],
+        _rotate(imu_motion.table[:, :2, 0], 90.0)[:, :, None],
+    ]
+    design = np.concatenate([rotation_second_differences, *motion_columns], axis=2)
     time_s, is_used = position_samples.index.to_numpy(), imu_motion.is_valid
+    rotation_deg = 0.0
     for _ in range(LEVER_ARM_FIT_COUNT):
         source_motion = SourceSecondDifferences.from_positions(
-            time_s, position_samples.to_numpy(), imu_motion.time_s
+            time_s, _rotate(position_samples.to_numpy(), -rotation_deg), imu_motion.time_s
         )
         is_used = is_used & source_motion.is_valid
         second_difference_error_m = source_motion.second_differences - imu_motion.table[:, :2, 0]
@@ -162,12 +190,15 @@ def _fit_lever_arm_to_imu(flight: Flight, track: PositionTrack) -> LeverArm | No
         is_used &= residual_m < MAX_RESIDUAL_SIGMAS * sigma_m
         # The third parameter is the time (s) by which the timestamps are early
         time_s = time_s + fitted_parameters[2]
+        rotation_deg += float(np.degrees(fitted_parameters[-1]))
     # The fit is relative to the IMU, the parameters are relative to the vehicle's origin
     imu_position_m = find_imu_position_m(flight)
     lever_arm = LeverArm(
         float(fitted_parameters[0]) + imu_position_m[0],
         float(fitted_parameters[1]) + imu_position_m[1],
         lever_arm_sigma_m,
+        rotation_deg,
+        float(np.degrees(np.sqrt(covariance[-1, -1]))),
     )
     return (
         lever_arm
