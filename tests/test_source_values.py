@@ -12,6 +12,7 @@ from comparisons import compare
 from conftest import shared
 from exchange import replace
 from flights import Estimator, Uwb, aisle_flight, unexplained
+from scipy.spatial.transform import Rotation
 from studies.expected_cases import judge, run
 from ulog_tools import make_log, odometry
 
@@ -334,15 +335,24 @@ def test_noise_along_one_axis_is_not_reported_as_two_senders():
     assert not [*source_values.detect_two_senders(analysis)]
 
 
-def mounted(arm_m: tuple[float, float]) -> Analysis:
-    """Return a flight whose sensor is mounted away from the IMU."""
-    flight = simulate_flight(Scenario(seed=3, kind="loop", passes=2), parse_faults(()))
+LOOP, AISLE = Scenario(seed=3, kind="loop", passes=2), Scenario(seed=3, passes=6, yaw="follow")
+
+
+def mounted(
+    arm_m: tuple[float, float], rotation_deg: float = 0.0, scenario: Scenario = LOOP
+) -> Analysis:
+    """Return a flight whose sensor is mounted away from the IMU, in a rotated frame."""
+    flight = simulate_flight(scenario, parse_faults(()))
     source, attitude = flight.positions[0], flight.truth.attitude
     time = source.samples.index.to_numpy()
     rotation = to_matrix(interpolate(time, attitude.index.to_numpy(), attitude.to_numpy()))
     samples = source.samples.copy()
     samples[Columns.POSITION] += rotation @ [*arm_m, 0.0]
+    turn = Rotation.from_euler("z", rotation_deg, degrees=True)
+    samples[Columns.POSITION] = turn.apply(samples[Columns.POSITION])
     analysis = unexplained(compare(with_track(flight, samples=samples)))
+    if rotation_deg:
+        return analysis
     return replace(analysis, convention=Convention(verdict="determined"))
 
 
@@ -356,6 +366,19 @@ def test_estimated_lever_arm_equals_simulated_one():
     (one,) = source_values.detect_lever_arm(mounted((0.4, -0.3)))
     found_m = one.evidence["forward_m"], one.evidence["right_m"]
     assert found_m == pytest.approx((0.4, -0.3), abs=0.1)
+    assert "Set EKF2_EV_POS_X to 0." in one.remedy
+
+
+@pytest.mark.parametrize(("rotation_deg", "has_truth"), [(10.0, True), (30.0, False)])
+def test_rotation_is_named_before_lever_arm(rotation_deg: float, has_truth: bool) -> None:
+    analysis = mounted((0.3, 0.0), rotation_deg, AISLE)
+    if not has_truth:
+        analysis = without_truth(analysis, 0.0)
+    (one,) = source_values.detect_lever_arm(analysis)
+    assert f"positions are rotated by {rotation_deg:+.0f}° (clockwise from above)" in one.message
+    assert one.evidence["forward_m"] == pytest.approx(0.3, abs=0.05)
+    assert one.evidence["right_m"] == pytest.approx(0.0, abs=0.05)
+    assert one.remedy.startswith(f"Rotate the positions by {-rotation_deg:+.0f}°")
     assert "Set EKF2_EV_POS_X to 0." in one.remedy
 
 

@@ -30,15 +30,23 @@ MAX_RESIDUAL_SIGMAS = 3.0
 MIN_SINGULAR_VALUE_RATIO = 0.02
 MIN_COORDINATE_COUNT = 40
 LEVER_ARM_FIT_COUNT = 4
+# Minimum RMS distance (m) from the middle of the path, to fit a rotation
+MIN_PATH_RADIUS_M = 0.01
 IMU_POSITION_PARAMETERS = ("EKF2_IMU_POS_X", "EKF2_IMU_POS_Y", "EKF2_IMU_POS_Z")
 
 
 class LeverArm(NamedTuple):
-    """Distances (m) of the sensor forward and right of the vehicle's origin, and their σ (m)."""
+    """Distances (m) of the sensor forward and right of the vehicle's origin, and their σ (m).
+
+    ``rotation_deg`` is the rotation of the positions (clockwise from above) that fits best together
+    with the lever arm.
+    """
 
     forward_m: float
     right_m: float
     sigma_m: float
+    rotation_deg: float = 0.0
+    rotation_sigma_deg: float = 0.0
 
     @property
     def horizontal_length_m(self) -> float:
@@ -80,22 +88,30 @@ def _fit_lever_arm_to_truth(flight: Flight, truth: Truth, track: PositionTrack) 
             for name in columns
         ]
     )
-    # Fit a delay too, because it resembles a lever arm
+    # Fit a delay and a rotation too, because they resemble a lever arm
     velocity_m_s = np.gradient(true_position_m, time_s, axis=0)
+    error_per_rotation_m = _rotate(true_position_m - np.nanmean(true_position_m, axis=0), 90.0)
+    path_radius_m = max(float(np.sqrt(np.nanmean(error_per_rotation_m**2))), MIN_PATH_RADIUS_M)
+    error_per_rotation_m /= path_radius_m
     quaternions = attitude[Columns.QUATERNION].to_numpy()
     rotation = to_matrix(interpolate(time_s, attitude.index.to_numpy(), quaternions))[:, :2, :2]
     offset_columns = np.broadcast_to(np.eye(2), rotation.shape)
     is_known = np.isfinite(velocity_m_s).all(axis=1)
-    design = np.concatenate([rotation, offset_columns, velocity_m_s[:, :, None]], axis=2)
+    motion_columns = np.stack([velocity_m_s, error_per_rotation_m], axis=2)
+    design = np.concatenate([rotation, offset_columns, motion_columns], axis=2)
     design_rows = design[is_known].reshape(-1, design.shape[2])
-    error_m = (position_samples.to_numpy() - true_position_m)[is_known].ravel()
-    if len(error_m) < MIN_COORDINATE_COUNT:
+    if len(design_rows) < MIN_COORDINATE_COUNT:
         return None
-    fitted_parameters, _, rank, _ = np.linalg.lstsq(
-        design_rows, error_m, rcond=MIN_SINGULAR_VALUE_RATIO
-    )
-    if rank < design.shape[2]:  # with a constant heading, a lever arm is a constant offset
-        return None
+    rotation_deg = 0.0
+    for _ in range(LEVER_ARM_FIT_COUNT):
+        error_m = _rotate(position_samples.to_numpy(), -rotation_deg) - true_position_m
+        error_m = error_m[is_known].ravel()
+        fitted_parameters, _, rank, _ = np.linalg.lstsq(
+            design_rows, error_m, rcond=MIN_SINGULAR_VALUE_RATIO
+        )
+        if rank < design.shape[2]:  # with a constant heading, a lever arm is a constant offset
+            return None
+        rotation_deg += float(np.degrees(fitted_parameters[5])) / path_radius_m
     residual_m = (error_m - design_rows @ fitted_parameters).reshape(-1, 2)
     # Successive errors of a source may be correlated
     variance_factor = max(map(compute_autocorrelation_time, residual_m.T))
@@ -105,7 +121,16 @@ def _fit_lever_arm_to_truth(flight: Flight, truth: Truth, track: PositionTrack) 
     lever_arm = _select_significant_lever_arm(
         fitted_parameters, covariance, MIN_LEVER_ARM_WITH_TRUTH_M, MIN_LEVER_ARM_SIGMAS_WITH_TRUTH
     )
-    return lever_arm if lever_arm and lever_arm.horizontal_length_m < MAX_LEVER_ARM_M else None
+    if lever_arm is None or lever_arm.horizontal_length_m >= MAX_LEVER_ARM_M:
+        return None
+    rotation_sigma_deg = float(np.degrees(np.sqrt(covariance[5, 5]))) / path_radius_m
+    return lever_arm._replace(rotation_deg=rotation_deg, rotation_sigma_deg=rotation_sigma_deg)
+
+
+def _rotate(vectors: Array, angle_deg: float) -> Array:
+    """Rotate horizontal vectors (north, east), clockwise from above."""
+    cosine, sine = np.cos(np.radians(angle_deg)), np.sin(np.radians(angle_deg))
+    return np.asarray(vectors @ np.array([[cosine, sine], [-sine, cosine]]))
 
 
 def _fit_lever_arm_to_imu(flight: Flight, track: PositionTrack) -> LeverArm | None:
@@ -119,18 +144,17 @@ def _fit_lever_arm_to_imu(flight: Flight, track: PositionTrack) -> LeverArm | No
     rotation_second_differences = SourceSecondDifferences.from_positions(
         inertial_data.time_s, rotation, imu_motion.time_s
     ).second_differences.reshape(-1, 2, 2)
-    design = np.concatenate(
-        [
-            rotation_second_differences,
-            imu_motion.second_difference_derivative_m_s[:, :2, None],
-            imu_motion.table[:, :2, 1:],
-        ],
-        axis=2,
-    )
+    motion_columns = [
+        imu_motion.second_difference_derivative_m_s[:, :2, None],
+        imu_motion.table[:, :2, 1:],
+        _rotate(imu_motion.table[:, :2, 0], 90.0)[:, :, None],
+    ]
+    design = np.concatenate([rotation_second_differences, *motion_columns], axis=2)
     time_s, is_used = position_samples.index.to_numpy(), imu_motion.is_valid
+    rotation_deg = 0.0
     for _ in range(LEVER_ARM_FIT_COUNT):
         source_motion = SourceSecondDifferences.from_positions(
-            time_s, position_samples.to_numpy(), imu_motion.time_s
+            time_s, _rotate(position_samples.to_numpy(), -rotation_deg), imu_motion.time_s
         )
         is_used = is_used & source_motion.is_valid
         error_m = source_motion.second_differences - imu_motion.table[:, :2, 0]
@@ -145,11 +169,16 @@ def _fit_lever_arm_to_imu(flight: Flight, track: PositionTrack) -> LeverArm | No
         is_used &= residual_m < MAX_RESIDUAL_SIGMAS * np.sqrt(variance_m2)
         # The third parameter is the time (s) by which the timestamps are early
         time_s = time_s + fitted_parameters[2]
+        rotation_deg += float(np.degrees(fitted_parameters[-1]))
     covariance = np.linalg.pinv(design_rows.T @ design_rows) * variance_m2 * dependent_count
     # The fit is relative to the IMU, the parameters are relative to the vehicle's origin
     fitted_parameters[:2] += find_imu_position_m(flight)[:2]
-    return _select_significant_lever_arm(
+    lever_arm = _select_significant_lever_arm(
         fitted_parameters, covariance, MIN_LEVER_ARM_M, MIN_LEVER_ARM_SIGMAS
+    )
+    rotation_sigma_deg = float(np.degrees(np.sqrt(covariance[-1, -1])))
+    return lever_arm and lever_arm._replace(
+        rotation_deg=rotation_deg, rotation_sigma_deg=rotation_sigma_deg
     )
 
 

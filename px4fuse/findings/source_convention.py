@@ -83,11 +83,17 @@ def remove_convention_effects(analysis: Comparison, findings: Sequence[Finding])
         item for item in findings if FINDING_CATALOGUE[item.id].report_class == "unusable"
     ]
     if unusable_findings:
-        cause_findings = unusable_findings
+        # A lever arm does not change the heading of the orientation
+        is_orientation_kept = {item.id for item in unusable_findings} == {"source_lever_arm"}
+        cause_findings = [
+            item
+            for item in cause_findings
+            if is_orientation_kept and item.id == "source_orientation_wrong"
+        ] + unusable_findings
         findings = [
             item
             for item in findings
-            if item in unusable_findings
+            if item in cause_findings
             or _is_effect_of_wrong_convention(item)
             or (
                 FINDING_CATALOGUE[item.id].group in POSITION_INDEPENDENT_FINDING_GROUPS

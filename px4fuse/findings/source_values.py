@@ -10,6 +10,7 @@ from scipy.interpolate import CubicHermiteSpline
 from px4fuse.analysis import Analysis
 from px4fuse.comparison.flight_events import compute_max_interval_s
 from px4fuse.comparison.remedy import find_aid, format_settings, is_source_fused
+from px4fuse.convention.correction import find_convention_faults
 from px4fuse.convention.lever_arm import (
     IMU_POSITION_PARAMETERS,
     estimate_lever_arm,
@@ -17,7 +18,7 @@ from px4fuse.convention.lever_arm import (
 )
 from px4fuse.core.arrays import Array
 from px4fuse.core.text import format_metres
-from px4fuse.ekf2.model import replay_with_settings
+from px4fuse.ekf2.model import misalign_positions, replay_with_settings
 from px4fuse.ekf2.replay import rows_inside
 from px4fuse.findings.model import Findings, find_source_texts, make_error, make_note, make_warning
 from px4fuse.findings.source_intervals import describe_errors_after_gap
@@ -28,6 +29,8 @@ from px4fuse.readers.px4_positions import NO_FIX_ACTION
 MIN_ROUNDING_STEP_M = 0.05
 # Maximum ratio of EKF2's position RMSE with the estimated lever arm to the RMSE without it
 MAX_LEVER_ARM_RMSE_RATIO = 0.7
+# Minimum rotation (°) of the positions that is reported with a lever arm, and its ratio to its σ
+MIN_ROTATION_DEG, MIN_ROTATION_SIGMAS = 5.0, 3.0
 # Minimum distance (m) between two alternating senders: smaller distances may be noise
 MIN_SENDER_DISTANCE_M = 0.1
 # Minimum ratio of the senders' distance to its scatter (1 σ): one sender reaches 2
@@ -151,11 +154,19 @@ def detect_lever_arm(analysis: Analysis) -> Findings:
     change = dict(zip(find_aid(analysis).lever_arm, lever_arm_m.tolist(), strict=False))
     imu_arm_m = np.subtract(imu_position_m[:2], lever_arm[:2]).round(2) + 0.0
     imu_change = dict(zip(IMU_POSITION_PARAMETERS, imu_arm_m.tolist(), strict=False))
+    rotation_deg = (
+        lever_arm.rotation_deg
+        + find_convention_faults(convention, analysis.flight, source.frame).rotation_deg
+    )
+    if abs(rotation_deg) < max(
+        MIN_ROTATION_DEG, MIN_ROTATION_SIGMAS * lever_arm.rotation_sigma_deg
+    ):
+        rotation_deg = 0.0
     sensor_text, action = f"{source_name(source)} sensor", f"Set {format_settings(change)}."
     error_text = "the position error"
-    effect_sentence = _describe_replayed_effect(analysis, change)
+    effect_sentence = _describe_replayed_effect(analysis, change, rotation_deg)
     if effect_sentence is None:  # ground truth contains no such error of the positions
-        effect_sentence = _describe_replayed_effect(analysis, imu_change)
+        effect_sentence = _describe_replayed_effect(analysis, imu_change, rotation_deg)
         sensor_text, action = "IMU", f"Set {format_settings(imu_change)}."
         error_text = "EKF2's position error"
         forward_m, right_m = 0.0 - forward_m, 0.0 - right_m
@@ -169,9 +180,16 @@ def detect_lever_arm(analysis: Analysis) -> Findings:
     if source.alignment is not None:  # no EKF2 parameter corrects positions of a file
         sensor_text = "sensor"
         action = "Subtract this lever arm, rotated to NED by the attitude, from the positions."
+    subject = f"The {sensor_text} is"
+    if rotation_deg:
+        subject = (
+            f"{positions_phrase(source)} are rotated by {rotation_deg:+.0f}° (clockwise from "
+            f"above), and the {sensor_text} is"
+        )
+        action = f"Rotate the positions by {-rotation_deg:+.0f}° before they are sent. {action}"
     yield make_warning(
         "source_lever_arm",
-        f"The {sensor_text} is mounted {np.hypot(forward_m, right_m):.2f} m from the mounting "
+        f"{subject} mounted {np.hypot(forward_m, right_m):.2f} m from the mounting "
         f"point that EKF2 assumes: {forward_m:+.2f} m forward, {right_m:+.2f} m right (± "
         f"{1.96 * sigma_m:.2f} m, 95 %). When the vehicle turns, {error_text} changes by up to "
         f"twice this distance. {effect_sentence}{NO_ESTIMATES_SENTENCE}",
@@ -180,10 +198,13 @@ def detect_lever_arm(analysis: Analysis) -> Findings:
     )
 
 
-def _describe_replayed_effect(analysis: Analysis, change: Mapping[str, float]) -> str | None:
+def _describe_replayed_effect(
+    analysis: Analysis, change: Mapping[str, float], rotation_deg: float = 0.0
+) -> str | None:
     """Describe EKF2's position RMSE in replays without and with a change of parameters.
 
-    Return None if the change reduces the RMSE too little.
+    Both replays use positions without their rotation. Return None if the change reduces the RMSE
+    too little.
     """
     ekf2_model, truth = analysis.ekf2_model, analysis.flight.truth
     if (
@@ -193,13 +214,18 @@ def _describe_replayed_effect(analysis: Analysis, change: Mapping[str, float]) -
         or not is_source_fused(analysis, ekf2_model.inputs)
     ):
         return ""
-    rmses_m, changed_model = [], ekf2_model
+    rmses_m, ekf2_model = [], misalign_positions(ekf2_model, -rotation_deg, 0.0)
+    changed_model = ekf2_model
     if change.keys() <= {*IMU_POSITION_PARAMETERS}:
         inputs = ekf2_model.inputs
         imu_offset_m = np.array([*change.values(), inputs.imu_offset_m[2]])
         inputs = replace(inputs, imu_offset_m=imu_offset_m)
         changed_model, change = replace(ekf2_model, inputs=inputs, runs=()), {}
-    for replay in (ekf2_model.baseline_replay, *replay_with_settings(changed_model, [change])):
+    replays = replay_with_settings(changed_model, [change])
+    baseline_replays = (
+        replay_with_settings(ekf2_model, [{}]) if rotation_deg else (ekf2_model.baseline_replay,)
+    )
+    for replay in (*baseline_replays, *replays):
         replayed_track = rows_inside(replay.published_state, replay.find_evaluated_spans())
         axis_errors_m = [
             replayed_track[name]
