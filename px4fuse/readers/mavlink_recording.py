@@ -31,6 +31,8 @@ from px4fuse.trajectory.rotation import rotate
 
 BOOT_CLOCK_TEXT = "autopilot boot clock"
 RECEIPT_CLOCK_TEXT = "autopilot boot clock, estimated from receive times"
+# Factors from latitude, longitude and altitude in MAVLink messages to degrees and m
+GEODETIC_SCALE = {"latitude_deg": 1e-7, "longitude_deg": 1e-7, "altitude_m": 1e-3}
 # Minimum backward step (s) of the boot clock at a restart
 MIN_BACKWARD_STEP_AT_RESTART_S = 5.0
 # Number of messages before and after a backward step that must confirm a restart
@@ -123,7 +125,7 @@ class Recording:
                 if element_index_text
                 else table[array_name]
             )
-            values[:, column_index] *= layout.scale.get(column, 1.0)
+            values[:, column_index] *= layout.scale.get(column, GEODETIC_SCALE.get(column, 1.0))
         del table
         values[~(np.abs(values) < MAX_FIELD_VALUE)] = np.nan
         index = time_index(boot_times_s[selected_rows] - self.time_origin_s)

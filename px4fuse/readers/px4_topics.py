@@ -41,6 +41,9 @@ class TrackSource:
 
 _TOPIC_TABLES = read_toml(__file__, dict[str, dict[str, Any]])
 TOPIC_LAYOUTS = expand_layouts(_TOPIC_TABLES["layouts"])
+TOPIC_LAYOUTS["gps_in_integers"] = replace(
+    TOPIC_LAYOUTS["gps_in_integers"], optional_columns=TOPIC_LAYOUTS["gps"].optional_columns
+)
 TRACK_SOURCES = msgspec.convert(_TOPIC_TABLES["tracks"], dict[str, TrackSource])
 FRAME_BY_FIELD_VALUE = msgspec.convert(
     _TOPIC_TABLES["frames"], dict[str, dict[int, str]], strict=False
