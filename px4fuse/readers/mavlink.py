@@ -91,7 +91,7 @@ def read_mavlink(name: str, content: bytes, system_id: int | None = None) -> Fli
     truth = read_truth(recording, positions, remedies)
     airborne_spans_s = _read_airborne_spans(recording, remedies["landed"])
     is_in_flight = common.ends_in_flight(airborne_spans_s, recording.duration_s)
-    pressure_hpa = recording.read(messages.MESSAGE_LAYOUTS["pressure"])["pressure_hpa"]
+    pressure_hpa = recording.read(messages.MESSAGE_LAYOUTS["SCALED_PRESSURE"])["pressure_hpa"]
     return Flight(
         # Last, because the description counts the samples that the readers dropped
         log=_describe_log(recording, parameters, replaced_parameter_notes, autopilot, is_in_flight),
@@ -182,7 +182,7 @@ def _read_ekf2(
     variance = samples.reindex(columns=VARIANCE_COLUMNS)
     variance = variance[(variance > 0.0).all(axis=1)]
     if variance.empty:
-        message_name = messages.MESSAGE_LAYOUTS["accuracy"].topic
+        message_name = messages.MESSAGE_LAYOUTS["ESTIMATOR_STATUS"].topic
         variance = _compute_variance_from_accuracy(recording)
         if len(variance):
             notes.append(
@@ -226,7 +226,7 @@ def _compute_variance_from_accuracy(recording: Recording) -> pd.DataFrame:
 
     PX4's horizontal accuracy is √(σ_north² + σ_east²) (``get_ekf_lpos_accuracy``).
     """
-    accuracy = recording.read(messages.MESSAGE_LAYOUTS["accuracy"])
+    accuracy = recording.read(messages.MESSAGE_LAYOUTS["ESTIMATOR_STATUS"])
     horizontal_variance_m2 = accuracy["horizontal_m"] ** 2 / 2.0
     variance = pd.concat(
         [horizontal_variance_m2, horizontal_variance_m2, accuracy["vertical_m"] ** 2], axis=1

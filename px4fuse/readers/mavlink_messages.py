@@ -45,9 +45,9 @@ class PositionMessageType:
 
     # Name of the position source for the option --position-source
     track_name: str
-    # Name of the field definition in ``mavlink_messages.toml``
-    layout_name: str
     description: str
+    # Name of the field definition in ``mavlink_messages.toml``; by default ``track_name``
+    layout_name: str = ""
     kind: str = "uwb"
     # Coordinate frame of the positions
     frame: str = "unknown"
@@ -60,7 +60,7 @@ class PositionMessageType:
 
     @property
     def layout(self) -> Layout:
-        return MESSAGE_LAYOUTS[self.layout_name]
+        return MESSAGE_LAYOUTS[self.layout_name or self.track_name]
 
     @property
     def origin(self) -> SourceOrigin:
@@ -93,20 +93,23 @@ POSITION_MESSAGE_TYPES = tuple(
     for name, row in _MESSAGE_TABLES["positions"].items()
 )
 _SCALED_IMU_LAYOUTS = (
-    replace(MESSAGE_LAYOUTS["scaled_imu"], topic=f"SCALED_IMU{number}") for number in ("", "2", "3")
+    replace(MESSAGE_LAYOUTS["SCALED_IMU"], topic=f"SCALED_IMU{number}") for number in ("", "2", "3")
 )
-IMU_LAYOUTS = (MESSAGE_LAYOUTS["highres_imu"], *_SCALED_IMU_LAYOUTS)
+IMU_LAYOUTS = (MESSAGE_LAYOUTS["HIGHRES_IMU"], *_SCALED_IMU_LAYOUTS)
 # Attitude messages; the message with most samples is used
 ATTITUDE_LAYOUTS = (
-    MESSAGE_LAYOUTS["quaternion"],
-    MESSAGE_LAYOUTS["angles"],
+    MESSAGE_LAYOUTS["ATTITUDE_QUATERNION"],
+    MESSAGE_LAYOUTS["ATTITUDE"],
     MESSAGE_LAYOUTS["attitude_of_odometry"],
 )
 # Messages with EKF2's state, in order of preference
-STATE_LAYOUTS = (MESSAGE_LAYOUTS["odometry"], MESSAGE_LAYOUTS["local_position"])
+STATE_LAYOUTS = (MESSAGE_LAYOUTS["ODOMETRY"], MESSAGE_LAYOUTS["LOCAL_POSITION_NED"])
 # Messages with ground truth of a simulation
-TRUTH_LAYOUTS = (MESSAGE_LAYOUTS["truth"], MESSAGE_LAYOUTS["sim_state"])
-GNSS_LAYOUTS = (MESSAGE_LAYOUTS["gnss"], replace(MESSAGE_LAYOUTS["gnss"], topic="GPS2_RAW"))
+TRUTH_LAYOUTS = (MESSAGE_LAYOUTS["HIL_STATE_QUATERNION"], MESSAGE_LAYOUTS["SIMSTATE"])
+GNSS_LAYOUTS = (
+    MESSAGE_LAYOUTS["GPS_RAW_INT"],
+    replace(MESSAGE_LAYOUTS["GPS_RAW_INT"], topic="GPS2_RAW"),
+)
 
 
 def remedies_of_autopilot(autopilot: str) -> tuple[Mapping[str, str], Unavailable]:
