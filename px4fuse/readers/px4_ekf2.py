@@ -377,7 +377,8 @@ def _read_fusion_record(
 def _read_magnetic_field(topics: Topics, step_s: float) -> pd.DataFrame:
     """Read the measured magnetic field from the magnetometer topic or from EKF2's observations."""
     magnetometer, observations = (
-        topics.primary_samples(layout).dropna() for layout in px4.MAGNETIC_FIELD_LAYOUTS
+        topics.primary_samples(px4.TOPIC_LAYOUTS[topic]).dropna()
+        for topic in ("vehicle_magnetometer", "estimator_aid_src_mag")
     )
     # EKF2 subtracts EKF2_MAG_DELAY and half a prediction interval from the times
     delay_s = topics.ekf2_parameters.get("EKF2_MAG_DELAY", 0.0) * 1e-3 + 0.5 * step_s

@@ -56,17 +56,12 @@ IMU_LAYOUT, LOCAL_POSITION_LAYOUT = (
 )
 HEIGHT_BIAS_LAYOUT_BY_AID = {
     "baro_hgt": TOPIC_LAYOUTS["estimator_baro_bias"],
-    "gnss_hgt": replace(TOPIC_LAYOUTS["estimator_baro_bias"], topic="estimator_gnss_hgt_bias"),
+    "gnss_hgt": TOPIC_LAYOUTS["estimator_gnss_hgt_bias"],
 }
 # Advice if a topic of the default logging profile is not logged
 DEFAULT_PROFILE_REMEDY = "Record with SDLOG_PROFILE bit 0 (default)."
 # Topics with EKF2's state vector and variances, in order of preference
 STATE_VECTOR_TOPICS = ("estimator_states", "estimator_status")  # since v1.12, v1.8 to v1.11
-# Measured magnetic field, from the magnetometer topic or EKF2's observations (since v1.14)
-MAGNETIC_FIELD_LAYOUTS = (
-    TOPIC_LAYOUTS["vehicle_magnetometer"],
-    TOPIC_LAYOUTS["estimator_aid_src_mag"],
-)
 # Number of attitude variances, by number of logged states and variances (generated/state.h)
 ATTITUDE_VARIANCE_COUNT_BY_ARRAY_LENGTHS: Mapping[tuple[int, int], int] = {
     (24, 24): 4,
@@ -106,8 +101,7 @@ def list_topics() -> list[str]:
     layout_topics = {
         layout.topic for track in TRACK_SOURCES for layout in find_track_layouts(track)
     }
-    layouts = (*TOPIC_LAYOUTS.values(), *HEIGHT_BIAS_LAYOUT_BY_AID.values())
-    layout_topics |= {layout.topic for layout in layouts if layout.topic}
+    layout_topics |= {layout.topic for layout in TOPIC_LAYOUTS.values() if layout.topic}
     layout_topics |= {f"estimator_aid_src_{name}" for name in AIDS}
     aid_topics = {STATUS_FLAGS, *INNOVATION_TOPICS, OLD_INNOVATION_TOPIC}
     return sorted(layout_topics | UNUSED_TOPICS.keys() | aid_topics | {*STATE_VECTOR_TOPICS})
