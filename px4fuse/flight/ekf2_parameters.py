@@ -102,20 +102,20 @@ class Parameter(NamedTuple):
         return f"{name} {value:g}{unit} is outside PX4's range {self.minimum:g} to {self.maximum:g}"
 
 
-PARAMETER_TABLES = read_toml(__file__, dict)
+_PARAMETER_TABLES = read_toml(__file__, dict)
 # TOML keys for lists of names, separated by blanks
 NAME_LIST_KEYS = ("axes", "lever_arm", "flags")
 # Aiding sources and other status flags of EKF2, by PX4 name
 AIDS, STATUS_FLAGS = (
     {
         name: msgspec.convert(
-            {"name": name, **PARAMETER_TABLES["groups"].get(name.partition("_")[0], {}), **row}
+            {"name": name, **_PARAMETER_TABLES["groups"].get(name.partition("_")[0], {}), **row}
             | {key: row[key].split() for key in NAME_LIST_KEYS if key in row},
             Aid,
         )
         for name, row in rows.items()
     }
-    for rows in (PARAMETER_TABLES["aids"], PARAMETER_TABLES["disturbances"])
+    for rows in (_PARAMETER_TABLES["aids"], _PARAMETER_TABLES["disturbances"])
 )
 EV_POS = AIDS["ev_pos"]
 GNSS_POS = AIDS["gnss_pos"]
@@ -126,7 +126,7 @@ FLOW = AIDS["optical_flow"]
 MAG = AIDS["mag"]
 PARAMETERS, _LOGGED_PARAMETERS = (
     msgspec.convert(
-        {name: row for names, row in PARAMETER_TABLES[table].items() for name in names.split()},
+        {name: row for names, row in _PARAMETER_TABLES[table].items() for name in names.split()},
         dict[str, Parameter],
     )
     for table in ("parameters", "logged")
@@ -141,7 +141,7 @@ EV_CTRL_YAW_MASK = 8
 # Parameter defaults up to PX4 v1.13 that differ from later releases (ekf2_params.c)
 DEFAULTS_BEFORE_V1_14: Mapping[str, float] = {EV_POS.delay: 175.0}
 # Logged parameters that px4fuse writes to its results
-PARAMETERS_IN_RESULTS: tuple[str, ...] = tuple(PARAMETER_TABLES["reported"].split())
+PARAMETERS_IN_RESULTS: tuple[str, ...] = tuple(_PARAMETER_TABLES["reported"].split())
 
 
 def fill_with_defaults(

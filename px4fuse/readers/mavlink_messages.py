@@ -83,10 +83,16 @@ class FrameConversion:
 
 _MESSAGE_TABLES = read_toml(__file__, dict[str, dict[str, Any]])
 MESSAGE_LAYOUTS = expand_layouts(_MESSAGE_TABLES["layouts"])
-CONVERSION_BY_MAV_FRAME = msgspec.convert(
-    _MESSAGE_TABLES["frames"], dict[int, FrameConversion], strict=False
-)
-AUTOPILOT_NAME_BY_ID = msgspec.convert(_MESSAGE_TABLES["autopilots"], dict[int, str], strict=False)
+CONVERSION_BY_MAV_FRAME = {
+    1: FrameConversion("NED"),
+    4: FrameConversion("NED", (1, 0, 2), (1.0, 1.0, -1.0)),  # ENU
+    8: FrameConversion("FRD", is_body_frame=True),  # MAV_FRAME_BODY_NED, in fact FRD
+    12: FrameConversion("FRD", is_body_frame=True),
+    20: FrameConversion("FRD"),
+    21: FrameConversion("FRD", axis_signs=(1.0, -1.0, -1.0)),  # FLU
+}
+# Names of MAV_AUTOPILOT
+AUTOPILOT_NAME_BY_ID = {0: "generic autopilot", 3: "ArduPilot", 12: "PX4"}
 REASON_BY_UNUSED_MESSAGE: Mapping[str, str] = _MESSAGE_TABLES["unused"]
 POSITION_MESSAGE_TYPES = tuple(
     msgspec.convert({"track_name": name, **row}, PositionMessageType)
