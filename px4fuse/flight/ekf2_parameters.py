@@ -1,11 +1,13 @@
 """Aiding sources of EKF2, and EKF2 parameters with PX4's defaults, units and ranges.
 
-The data are in ``ekf2_parameters.toml``.
+The data are in ``ekf2_parameters.toml``, ``model_parameters.csv`` and ``logged_parameters.csv``.
 """
 
+import csv
 import math
 from collections.abc import Mapping
 from dataclasses import dataclass
+from pathlib import Path
 from typing import NamedTuple
 
 import msgspec
@@ -124,15 +126,23 @@ GNSS_HGT = AIDS["gnss_hgt"]
 BAROMETER = AIDS["baro_hgt"]
 FLOW = AIDS["optical_flow"]
 MAG = AIDS["mag"]
-PARAMETERS, _LOGGED_PARAMETERS = (
-    msgspec.convert(
-        {name: row for names, row in _PARAMETER_TABLES[table].items() for name in names.split()},
-        dict[str, Parameter],
-    )
-    for table in ("parameters", "logged")
-)
+
+
+def _read_parameters(file_name: str) -> dict[str, Parameter]:
+    """Read a table of EKF2 parameters; a row contains one or more names."""
+    lines = Path(__file__).with_name(file_name).read_text("utf-8").splitlines()[1:]
+    return {
+        name: Parameter(unit, *map(float, limits))
+        for names, unit, *limits in csv.reader(lines)
+        for name in names.split()
+    }
+
+
+# Parameters of the EKF2 model. PX4 limits neither the maximum of gates nor positions: 1000 SD and
+# 100 m are limits of px4fuse
+PARAMETERS = _read_parameters("model_parameters.csv")
 # All parameters with a known unit, default and range
-KNOWN_PARAMETERS = PARAMETERS | _LOGGED_PARAMETERS
+KNOWN_PARAMETERS = PARAMETERS | _read_parameters("logged_parameters.csv")
 MAGNETIC_FIELD_NOISE_PARAMETERS = ("EKF2_MAG_E_NOISE", "EKF2_MAG_B_NOISE")
 # Value of EKF2_MAG_TYPE for "None": EKF2 does not use the magnetometer
 MAG_TYPE_NONE = 5
