@@ -1,11 +1,13 @@
 """Aiding sources of EKF2, and EKF2 parameters with PX4's defaults, units and ranges.
 
-The data are in ``ekf2_parameters.toml``.
+The data are in ``ekf2_parameters.toml``, ``model_parameters.csv`` and ``logged_parameters.csv``.
 """
 
+import csv
 import math
 from collections.abc import Mapping
 from dataclasses import dataclass
+from pathlib import Path
 from typing import NamedTuple
 
 import msgspec
@@ -102,20 +104,20 @@ class Parameter(NamedTuple):
         return f"{name} {value:g}{unit} is outside PX4's range {self.minimum:g} to {self.maximum:g}"
 
 
-PARAMETER_TABLES = read_toml(__file__, dict)
+_PARAMETER_TABLES = read_toml(__file__, dict)
 # TOML keys for lists of names, separated by blanks
 NAME_LIST_KEYS = ("axes", "lever_arm", "flags")
 # Aiding sources and other status flags of EKF2, by PX4 name
 AIDS, STATUS_FLAGS = (
     {
         name: msgspec.convert(
-            {"name": name, **PARAMETER_TABLES["groups"].get(name.partition("_")[0], {}), **row}
+            {"name": name, **_PARAMETER_TABLES["groups"].get(name.partition("_")[0], {}), **row}
             | {key: row[key].split() for key in NAME_LIST_KEYS if key in row},
             Aid,
         )
         for name, row in rows.items()
     }
-    for rows in (PARAMETER_TABLES["aids"], PARAMETER_TABLES["disturbances"])
+    for rows in (_PARAMETER_TABLES["aids"], _PARAMETER_TABLES["disturbances"])
 )
 EV_POS = AIDS["ev_pos"]
 GNSS_POS = AIDS["gnss_pos"]
@@ -124,15 +126,23 @@ GNSS_HGT = AIDS["gnss_hgt"]
 BAROMETER = AIDS["baro_hgt"]
 FLOW = AIDS["optical_flow"]
 MAG = AIDS["mag"]
-PARAMETERS, _LOGGED_PARAMETERS = (
-    msgspec.convert(
-        {name: row for names, row in PARAMETER_TABLES[table].items() for name in names.split()},
-        dict[str, Parameter],
-    )
-    for table in ("parameters", "logged")
-)
+
+
+def _read_parameters(file_name: str) -> dict[str, Parameter]:
+    """Read a table of EKF2 parameters; a row contains one or more names."""
+    lines = Path(__file__).with_name(file_name).read_text("utf-8").splitlines()[1:]
+    return {
+        name: Parameter(unit, *map(float, limits))
+        for names, unit, *limits in csv.reader(lines)
+        for name in names.split()
+    }
+
+
+# Parameters of the EKF2 model. PX4 limits neither the maximum of gates nor positions: 1000 SD and
+# 100 m are limits of px4fuse
+PARAMETERS = _read_parameters("model_parameters.csv")
 # All parameters with a known unit, default and range
-KNOWN_PARAMETERS = PARAMETERS | _LOGGED_PARAMETERS
+KNOWN_PARAMETERS = PARAMETERS | _read_parameters("logged_parameters.csv")
 MAGNETIC_FIELD_NOISE_PARAMETERS = ("EKF2_MAG_E_NOISE", "EKF2_MAG_B_NOISE")
 # Value of EKF2_MAG_TYPE for "None": EKF2 does not use the magnetometer
 MAG_TYPE_NONE = 5
@@ -141,7 +151,7 @@ EV_CTRL_YAW_MASK = 8
 # Parameter defaults up to PX4 v1.13 that differ from later releases (ekf2_params.c)
 DEFAULTS_BEFORE_V1_14: Mapping[str, float] = {EV_POS.delay: 175.0}
 # Logged parameters that px4fuse writes to its results
-PARAMETERS_IN_RESULTS: tuple[str, ...] = tuple(PARAMETER_TABLES["reported"].split())
+PARAMETERS_IN_RESULTS: tuple[str, ...] = tuple(_PARAMETER_TABLES["reported"].split())
 
 
 def fill_with_defaults(

@@ -301,14 +301,8 @@ MAX_UWB_RATE_HZ = 25.0
 MIN_LANDED_DURATION_S = 5.0
 BODY_AXES = ("forward", "right", "down")
 AXIS_NAMES: tuple[NedAxis, NedAxis, NedAxis] = ("north", "east", "down")
-SOURCE_NAMES: Mapping[PositionKind, str] = {
-    "uwb": "UWB",
-    "vio": "VIO",
-    "mocap": "MOCAP",
-    "gnss": "GNSS",
-    "unknown": "external vision",
-    "file": "position file",
-}
+# Names of position sources for users that are not the kind in capitals
+SOURCE_NAMES: Mapping[str, str] = {"unknown": "external vision", "file": "position file"}
 
 
 # dtype object: pandas reserves 1 GB of address space for the first column of strings
@@ -474,7 +468,8 @@ def infer_position_kind(samples: pd.DataFrame) -> PositionKind:
 
 def source_name(source: PositionTrack) -> str:
     """Return the name of a position source for users, such as "UWB"."""
-    return SOURCE_NAMES[source.origin.kind]
+    kind = source.origin.kind
+    return SOURCE_NAMES.get(kind, kind.upper())
 
 
 def reset_times_s(track: PositionTrack) -> Array:

@@ -17,6 +17,9 @@ from px4fuse.core.text import to_json_types
 from px4fuse.errors import MissingDataError
 from px4fuse.filter.signals import compute_ned_acceleration, imu_and_attitude
 from px4fuse.flight.model import (
+    AXIS_NAMES,
+    BODY_AXES,
+    Columns,
     DataSource,
     Ekf2,
     Flight,
@@ -29,9 +32,9 @@ SCHEMA_NAME = "px4fuse-flight"
 SCHEMA_VERSION = "1.0"
 # Placeholders in columns.csv, and the names that replace them
 NAMES_BY_PLACEHOLDER = {
-    "{axis}": ("north", "east", "down"),
-    "{body_axis}": ("forward", "right", "down"),
-    "{element}": ("w", "x", "y", "z"),
+    "{axis}": AXIS_NAMES,
+    "{body_axis}": BODY_AXES,
+    "{element}": Columns.QUATERNION,
 }
 COLUMN_DESCRIPTION_FIELDS = ["table", "column", "unit", "frame", "meaning", "source_topic", "clock"]
 # Characters that some systems do not allow in file names

@@ -33,7 +33,11 @@ class Layout:
 
 
 def expand_layouts(toml_tables: Mapping[str, Any]) -> dict[str, Layout]:
-    """Convert TOML tables to definitions with one message field per column."""
+    """Convert TOML tables to definitions with one message field per column.
+
+    By default, the topic or message is the name of the table.
+    """
+    rows = {name: {"topic": name, **row} for name, row in toml_tables.items()}
     return {
         name: replace(
             layout,
@@ -41,7 +45,7 @@ def expand_layouts(toml_tables: Mapping[str, Any]) -> dict[str, Layout]:
             optional_columns=assign_fields_to_columns(layout.optional_columns),
             scale=assign_fields_to_columns(layout.scale),
         )
-        for name, layout in msgspec.convert(toml_tables, dict[str, Layout]).items()
+        for name, layout in msgspec.convert(rows, dict[str, Layout]).items()
     }
 
 

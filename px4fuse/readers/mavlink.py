@@ -30,7 +30,12 @@ from px4fuse.readers import common
 from px4fuse.readers import mavlink_messages as messages
 from px4fuse.readers import mavlink_senders as senders
 from px4fuse.readers.mavlink_clocks import MIN_UNIX_TIME_S
-from px4fuse.readers.mavlink_frames import MESSAGE_IDS, VEHICLE_TYPES, read_frames
+from px4fuse.readers.mavlink_frames import (
+    MAX_FRAME_BYTES,
+    MESSAGE_IDS,
+    VEHICLE_TYPES,
+    read_frames,
+)
 from px4fuse.readers.mavlink_positions import (
     compute_pressure_altitude_m,
     read_positions,
@@ -46,6 +51,8 @@ from px4fuse.readers.px4_positions import barometer
 from px4fuse.readers.ulog_topics import NO_INSTANCE_SWITCHES, describe_dropped_samples
 
 VARIANCE_COLUMNS = Columns.POSITION_VARIANCE + Columns.VELOCITY_VARIANCE
+# Maximum fraction of bytes outside MAVLink frames in an undamaged file
+MAX_STRAY_BYTE_FRACTION = 0.002
 # MAV_PARAM_TYPE_REAL32; types with smaller numbers are integers
 REAL32_PARAMETER_TYPE = 9
 
@@ -84,7 +91,7 @@ def read_mavlink(name: str, content: bytes, system_id: int | None = None) -> Fli
     truth = read_truth(recording, positions, remedies)
     airborne_spans_s = _read_airborne_spans(recording, remedies["landed"])
     is_in_flight = common.ends_in_flight(airborne_spans_s, recording.duration_s)
-    pressure_hpa = recording.read(messages.MESSAGE_LAYOUTS["pressure"])["pressure_hpa"]
+    pressure_hpa = recording.read(messages.MESSAGE_LAYOUTS["SCALED_PRESSURE"])["pressure_hpa"]
     return Flight(
         # Last, because the description counts the samples that the readers dropped
         log=_describe_log(recording, parameters, replaced_parameter_notes, autopilot, is_in_flight),
@@ -175,7 +182,7 @@ def _read_ekf2(
     variance = samples.reindex(columns=VARIANCE_COLUMNS)
     variance = variance[(variance > 0.0).all(axis=1)]
     if variance.empty:
-        message_name = messages.MESSAGE_LAYOUTS["accuracy"].topic
+        message_name = messages.MESSAGE_LAYOUTS["ESTIMATOR_STATUS"].topic
         variance = _compute_variance_from_accuracy(recording)
         if len(variance):
             notes.append(
@@ -187,7 +194,7 @@ def _read_ekf2(
     unavailable_variance = Unavailable(
         "EKF2 variances",
         "the recording has no ODOMETRY with covariance and no ESTIMATOR_STATUS",
-        remedies["variance"],
+        remedies.get("variance", remedies["state"]),
     )
     return Ekf2(
         state=state,
@@ -219,7 +226,7 @@ def _compute_variance_from_accuracy(recording: Recording) -> pd.DataFrame:
 
     PX4's horizontal accuracy is √(σ_north² + σ_east²) (``get_ekf_lpos_accuracy``).
     """
-    accuracy = recording.read(messages.MESSAGE_LAYOUTS["accuracy"])
+    accuracy = recording.read(messages.MESSAGE_LAYOUTS["ESTIMATOR_STATUS"])
     horizontal_variance_m2 = accuracy["horizontal_m"] ** 2 / 2.0
     variance = pd.concat(
         [horizontal_variance_m2, horizontal_variance_m2, accuracy["vertical_m"] ** 2], axis=1
@@ -263,10 +270,28 @@ def _describe_log(
     autopilot: str,
     is_in_flight: bool,
 ) -> LogInfo:
-    frames = recording.frames
-    damage_notes = []
+    frames, notes, damage_notes = recording.frames, [*recording.notes], []
+    reversal_count = int(np.count_nonzero(np.diff(recording.receive_times_s) < 0.0))
+    count_by_quantity = {
+        "ignored MAVLink frames with unknown message type": frames.unknown_frame_count,
+        "damaged receive times that were interpolated": frames.damaged_receive_time_count,
+        "backward jumps of the receive time": reversal_count,
+    }
+    notes += [
+        f"number of {quantity}: {count}" for quantity, count in count_by_quantity.items() if count
+    ]
     if frames.is_last_frame_incomplete:
         damage_notes.append(common.format_truncation("frame", recording.duration_s, is_in_flight))
+    stray_byte_count, byte_count = frames.byte_count_outside_frames, len(frames.content)
+    stray_bytes_note = (
+        f"{stray_byte_count:,} bytes ({stray_byte_count / byte_count:.2%}) are not part of a "
+        "complete MAVLink frame"
+    )
+    # Incomplete frames at the beginning and end of the file are not damage
+    if stray_byte_count - 2 * MAX_FRAME_BYTES > MAX_STRAY_BYTE_FRACTION * byte_count:
+        damage_notes.append(f"the file is damaged: {stray_bytes_note}")
+    elif stray_byte_count:
+        notes.append(stray_bytes_note)
     firmware, firmware_hash, vehicle_id = f"{autopilot}, unknown version", "unknown", ""
     for version in frames.table("AUTOPILOT_VERSION", recording.rows("AUTOPILOT_VERSION")[:1]):
         major, minor, patch, _ = int(version["flight_sw_version"]).to_bytes(4, "big")
@@ -282,7 +307,7 @@ def _describe_log(
     return LogInfo(
         name=frames.name,
         sha256=frames.sha256,
-        bytes=len(frames.content),
+        bytes=byte_count,
         format="MAVLink stream" if frames.receive_times_us is None else "MAVLink tlog",
         firmware=firmware,
         firmware_hash=firmware_hash,
@@ -291,20 +316,20 @@ def _describe_log(
         duration_s=recording.duration_s,
         parameters=parameters,
         notes=(
-            *recording.notes,
+            *notes,
             *replaced_parameter_notes,
             *describe_dropped_samples(dropped_counts),
         ),
         restarts=recording.restart_count,
-        receive_time_reversals=recording.receive_time_reversal_count,
+        receive_time_reversals=reversal_count or None,
         dropped=dropped_counts,
         autopilot=autopilot,
         start_unix_s=_estimate_start_unix_s(recording),
         senders=senders.describe_senders(recording),
         vehicle=vehicle_id,
-        damage=(*damage_notes, *recording.damage_notes),
+        damage=tuple(damage_notes),
         ends_in_flight=is_in_flight,
-        bytes_read=len(frames.content) - frames.byte_count_outside_frames,
+        bytes_read=byte_count - stray_byte_count,
     )
 
 

@@ -45,9 +45,9 @@ class PositionMessageType:
 
     # Name of the position source for the option --position-source
     track_name: str
-    # Name of the field definition in ``mavlink_messages.toml``
-    layout_name: str
     description: str
+    # Name of the field definition in ``mavlink_messages.toml``; by default ``track_name``
+    layout_name: str = ""
     kind: str = "uwb"
     # Coordinate frame of the positions
     frame: str = "unknown"
@@ -60,7 +60,7 @@ class PositionMessageType:
 
     @property
     def layout(self) -> Layout:
-        return MESSAGE_LAYOUTS[self.layout_name]
+        return MESSAGE_LAYOUTS[self.layout_name or self.track_name]
 
     @property
     def origin(self) -> SourceOrigin:
@@ -83,30 +83,39 @@ class FrameConversion:
 
 _MESSAGE_TABLES = read_toml(__file__, dict[str, dict[str, Any]])
 MESSAGE_LAYOUTS = expand_layouts(_MESSAGE_TABLES["layouts"])
-CONVERSION_BY_MAV_FRAME = msgspec.convert(
-    _MESSAGE_TABLES["frames"], dict[int, FrameConversion], strict=False
-)
-AUTOPILOT_NAME_BY_ID = msgspec.convert(_MESSAGE_TABLES["autopilots"], dict[int, str], strict=False)
+CONVERSION_BY_MAV_FRAME = {
+    1: FrameConversion("NED"),
+    4: FrameConversion("NED", (1, 0, 2), (1.0, 1.0, -1.0)),  # ENU
+    8: FrameConversion("FRD", is_body_frame=True),  # MAV_FRAME_BODY_NED, in fact FRD
+    12: FrameConversion("FRD", is_body_frame=True),
+    20: FrameConversion("FRD"),
+    21: FrameConversion("FRD", axis_signs=(1.0, -1.0, -1.0)),  # FLU
+}
+# Names of MAV_AUTOPILOT
+AUTOPILOT_NAME_BY_ID = {0: "generic autopilot", 3: "ArduPilot", 12: "PX4"}
 REASON_BY_UNUSED_MESSAGE: Mapping[str, str] = _MESSAGE_TABLES["unused"]
 POSITION_MESSAGE_TYPES = tuple(
     msgspec.convert({"track_name": name, **row}, PositionMessageType)
     for name, row in _MESSAGE_TABLES["positions"].items()
 )
 _SCALED_IMU_LAYOUTS = (
-    replace(MESSAGE_LAYOUTS["scaled_imu"], topic=f"SCALED_IMU{number}") for number in ("", "2", "3")
+    replace(MESSAGE_LAYOUTS["SCALED_IMU"], topic=f"SCALED_IMU{number}") for number in ("", "2", "3")
 )
-IMU_LAYOUTS = (MESSAGE_LAYOUTS["highres_imu"], *_SCALED_IMU_LAYOUTS)
+IMU_LAYOUTS = (MESSAGE_LAYOUTS["HIGHRES_IMU"], *_SCALED_IMU_LAYOUTS)
 # Attitude messages; the message with most samples is used
 ATTITUDE_LAYOUTS = (
-    MESSAGE_LAYOUTS["quaternion"],
-    MESSAGE_LAYOUTS["angles"],
+    MESSAGE_LAYOUTS["ATTITUDE_QUATERNION"],
+    MESSAGE_LAYOUTS["ATTITUDE"],
     MESSAGE_LAYOUTS["attitude_of_odometry"],
 )
 # Messages with EKF2's state, in order of preference
-STATE_LAYOUTS = (MESSAGE_LAYOUTS["odometry"], MESSAGE_LAYOUTS["local_position"])
+STATE_LAYOUTS = (MESSAGE_LAYOUTS["ODOMETRY"], MESSAGE_LAYOUTS["LOCAL_POSITION_NED"])
 # Messages with ground truth of a simulation
-TRUTH_LAYOUTS = (MESSAGE_LAYOUTS["truth"], MESSAGE_LAYOUTS["sim_state"])
-GNSS_LAYOUTS = (MESSAGE_LAYOUTS["gnss"], replace(MESSAGE_LAYOUTS["gnss"], topic="GPS2_RAW"))
+TRUTH_LAYOUTS = (MESSAGE_LAYOUTS["HIL_STATE_QUATERNION"], MESSAGE_LAYOUTS["SIMSTATE"])
+GNSS_LAYOUTS = (
+    MESSAGE_LAYOUTS["GPS_RAW_INT"],
+    replace(MESSAGE_LAYOUTS["GPS_RAW_INT"], topic="GPS2_RAW"),
+)
 
 
 def remedies_of_autopilot(autopilot: str) -> tuple[Mapping[str, str], Unavailable]:

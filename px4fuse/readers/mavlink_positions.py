@@ -160,7 +160,7 @@ def _read_gnss(
             NO_FIX_ACTION,
         )
     is_auto_candidate = bool(
-        recording.read(messages.MESSAGE_LAYOUTS["global_state"])["latitude_deg"].any()
+        recording.read(messages.MESSAGE_LAYOUTS["GLOBAL_POSITION_INT"])["latitude_deg"].any()
     )
     return make_track(
         layout.topic,
@@ -186,11 +186,11 @@ def find_local_origin(recording: Recording) -> GeodeticPosition | None:
 
     It is read from GPS_GLOBAL_ORIGIN, or computed from global and local positions.
     """
-    sent_origins = recording.read(messages.MESSAGE_LAYOUTS["origin"]).dropna()
+    sent_origins = recording.read(messages.MESSAGE_LAYOUTS["GPS_GLOBAL_ORIGIN"]).dropna()
     if len(sent_origins):
         return tuple(sent_origins.iloc[-1].tolist())
     joined_positions = join_nearest(
-        recording.read(messages.MESSAGE_LAYOUTS["global_state"]),
+        recording.read(messages.MESSAGE_LAYOUTS["GLOBAL_POSITION_INT"]),
         recording.read(messages.STATE_LAYOUTS[-1])[Columns.POSITION],
         MAX_ORIGIN_TIME_DIFFERENCE_S,
     ).dropna()

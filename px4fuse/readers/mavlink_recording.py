@@ -20,7 +20,6 @@ from px4fuse.readers.mavlink_clocks import (
     is_running_clock,
 )
 from px4fuse.readers.mavlink_frames import (
-    MAX_FRAME_BYTES,
     MavlinkAddress,
     MavlinkFrames,
     message_name,
@@ -32,6 +31,8 @@ from px4fuse.trajectory.rotation import rotate
 
 BOOT_CLOCK_TEXT = "autopilot boot clock"
 RECEIPT_CLOCK_TEXT = "autopilot boot clock, estimated from receive times"
+# Factors from latitude, longitude and altitude in MAVLink messages to degrees and m
+GEODETIC_SCALE = {"latitude_deg": 1e-7, "longitude_deg": 1e-7, "altitude_m": 1e-3}
 # Minimum backward step (s) of the boot clock at a restart
 MIN_BACKWARD_STEP_AT_RESTART_S = 5.0
 # Number of messages before and after a backward step that must confirm a restart
@@ -40,8 +41,6 @@ RESTART_CHECK_MESSAGES = 20
 MIN_TIMESTAMP_GROUP_FRACTION = 0.01
 # Maximum time (s) of a valid timestamp outside the analysed time span
 MAX_TIME_OUTSIDE_FLIGHT_S = 60.0
-# Maximum fraction of bytes outside MAVLink frames in an undamaged file
-MAX_STRAY_BYTE_FRACTION = 0.002
 # Columns of ODOMETRY that are equal in all coordinate frames
 UNCONVERTED_COLUMNS = ["frame_id", "child_frame_id", "reset_counter"]
 # Minimum number of timestamps to detect a stopped clock
@@ -65,10 +64,8 @@ class Recording:
     time_origin_s: float
     duration_s: float
     notes: list[str]
-    # Sentences about unreadable parts of the file
-    damage_notes: tuple[str, ...] = ()
-    restart_count: int | None = None
-    receive_time_reversal_count: int | None = None
+    # Number of restarts of the autopilot; None without a restart
+    restart_count: int | None
     # Number of samples with an invalid timestamp, by message
     dropped_count_by_message: dict[str, int] = field(default_factory=dict)
     # Messages and clock of each kind of data, such as "imu"
@@ -128,7 +125,7 @@ class Recording:
                 if element_index_text
                 else table[array_name]
             )
-            values[:, column_index] *= layout.scale.get(column, 1.0)
+            values[:, column_index] *= layout.scale.get(column, GEODETIC_SCALE.get(column, 1.0))
         del table
         values[~(np.abs(values) < MAX_FIELD_VALUE)] = np.nan
         index = time_index(boot_times_s[selected_rows] - self.time_origin_s)
@@ -275,26 +272,6 @@ def read_recording(frames: MavlinkFrames, address: MavlinkAddress) -> Recording:
         receive_times_s = boot_times_s[np.maximum(message_count - 1, 0)]
     else:
         notes.append("no message in the stream contains a time")
-    receipt_reversal_count = int(np.count_nonzero(np.diff(receive_times_s) < 0.0))
-    count_by_quantity = {
-        "ignored MAVLink frames with unknown message type": frames.unknown_frame_count,
-        "damaged receive times that were interpolated": frames.damaged_receive_time_count,
-        "backward jumps of the receive time": receipt_reversal_count,
-    }
-    notes += [
-        f"number of {quantity}: {count}" for quantity, count in count_by_quantity.items() if count
-    ]
-    stray_byte_count, byte_count = frames.byte_count_outside_frames, len(frames.content)
-    stray_bytes_note = (
-        f"{stray_byte_count:,} bytes ({stray_byte_count / byte_count:.2%}) are not part of a "
-        "complete MAVLink frame"
-    )
-    damage_notes: tuple[str, ...] = ()
-    # Incomplete frames at the beginning and end of the file are not damage
-    if stray_byte_count - 2 * MAX_FRAME_BYTES > MAX_STRAY_BYTE_FRACTION * byte_count:
-        damage_notes = (f"the file is damaged: {stray_bytes_note}",)
-    elif stray_byte_count:
-        notes.append(stray_bytes_note)
     if not len(boot_times_s):
         boot_times_s = np.array([0.0, receive_times_s.max()])
     time_origin_s, end_s = boot_times_s[[0, -1]].tolist()
@@ -307,9 +284,7 @@ def read_recording(frames: MavlinkFrames, address: MavlinkAddress) -> Recording:
         time_origin_s,
         end_s - time_origin_s,
         notes,
-        damage_notes,
         len(restart_rows) or None,
-        receipt_reversal_count or None,
     )
 
 

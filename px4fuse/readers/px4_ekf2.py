@@ -264,7 +264,7 @@ def compute_samples_per_step(
 def _read_accelerometer_bias(
     topics: Topics, horizon_state: TableOrUnavailable
 ) -> TableOrUnavailable:
-    if len(bias := topics.primary_samples(px4.TOPIC_LAYOUTS["sensor_bias"]).dropna()):
+    if len(bias := topics.primary_samples(px4.TOPIC_LAYOUTS["estimator_sensor_bias"]).dropna()):
         return bias
     if isinstance(horizon_state, Unavailable) or horizon_state.empty:
         return BIAS_NOT_LOGGED
@@ -377,7 +377,8 @@ def _read_fusion_record(
 def _read_magnetic_field(topics: Topics, step_s: float) -> pd.DataFrame:
     """Read the measured magnetic field from the magnetometer topic or from EKF2's observations."""
     magnetometer, observations = (
-        topics.primary_samples(layout).dropna() for layout in px4.MAGNETIC_FIELD_LAYOUTS
+        topics.primary_samples(px4.TOPIC_LAYOUTS[topic]).dropna()
+        for topic in ("vehicle_magnetometer", "estimator_aid_src_mag")
     )
     # EKF2 subtracts EKF2_MAG_DELAY and half a prediction interval from the times
     delay_s = topics.ekf2_parameters.get("EKF2_MAG_DELAY", 0.0) * 1e-3 + 0.5 * step_s
@@ -397,8 +398,12 @@ def _read_magnetic_field(topics: Topics, step_s: float) -> pd.DataFrame:
 def _read_optical_flow(topics: Topics, enabled_aids: StepFunctions) -> pd.DataFrame:
     """Compute the mean optical flow between logged samples: inverse of EKF2's low-pass filter."""
     flow_velocity, flow_intervals, flow_noise = (
-        topics.primary_samples(px4.TOPIC_LAYOUTS[f"flow_{quantity}"]).dropna()
-        for quantity in ("velocity", "interval", "noise")
+        topics.primary_samples(px4.TOPIC_LAYOUTS[topic]).dropna()
+        for topic in (
+            "estimator_optical_flow_vel",
+            "vehicle_optical_flow",
+            "estimator_aid_src_optical_flow",
+        )
     )
     interval_s = float(flow_intervals["interval_us"].median()) * 1e-6
     if not interval_s > 0.0 or flow_noise.empty:

@@ -33,8 +33,8 @@ def read_unlogged_fixes(
     if isinstance(ekf2, Unavailable):
         return pd.DataFrame()
     position, velocity, height = (
-        topics.primary_samples(px4.TOPIC_LAYOUTS[f"fused_{quantity}"])
-        for quantity in ("position", "velocity", "height")
+        topics.primary_samples(px4.TOPIC_LAYOUTS[f"estimator_aid_src_gnss_{quantity}"])
+        for quantity in ("pos", "vel", "hgt")
     )
     # A row that is neither fused nor rejected contains no new fix
     position = position[position[["fused", "rejected"]].any(axis=1)]

@@ -3,11 +3,10 @@
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
 
-import msgspec
 import numpy as np
 import pandas as pd
 
-from px4fuse.flight.ekf2_parameters import BAROMETER, GNSS_POS, PARAMETER_TABLES
+from px4fuse.flight.ekf2_parameters import BAROMETER, GNSS_POS
 from px4fuse.flight.model import AXIS_NAMES, AidLog, Ekf2, NedAxis, TableOrUnavailable, Unavailable
 
 Innovations = dict[NedAxis, TableOrUnavailable]
@@ -29,9 +28,30 @@ class Ekf2PositionSource:
     height_sensor: str = ""
 
 
-VISION, GNSS = (
-    msgspec.convert(PARAMETER_TABLES["sources"][name], Ekf2PositionSource)
-    for name in ("vision", "gnss")
+VISION = Ekf2PositionSource(
+    name="external vision",
+    horizontal_aid="ev_pos",
+    vertical_aid="ev_hgt",
+    remedies={
+        # EKF2 starts fusion of vision at sample intervals below 0.2 s (ev_control.cpp)
+        "horizontal": "Send the position at 10 Hz or more (EKF2 starts fusion at intervals below "
+        "0.2 s) and set bit 0 of EKF2_EV_CTRL (bit 3 of EKF2_AID_MASK before v1.14).",
+        "vertical": "Set bit 1 of EKF2_EV_CTRL (EKF2_HGT_MODE 3 before v1.14) to fuse the height "
+        "of the source.",
+    },
+    logging_remedy="Record with SDLOG_PROFILE 129 (default and vision).",
+)
+GNSS = Ekf2PositionSource(
+    name="GNSS",
+    horizontal_aid="gnss_pos",
+    vertical_aid="gnss_hgt",
+    remedies={
+        "horizontal": "Set bit 0 of EKF2_GPS_CTRL (bit 0 of EKF2_AID_MASK before v1.14), and wait "
+        "for a fix that passes EKF2's checks.",
+        "vertical": "Set bit 1 of EKF2_GPS_CTRL (EKF2_HGT_MODE 1 before v1.14) to fuse the GNSS "
+        "height.",
+    },
+    logging_remedy="Record with SDLOG_PROFILE bit 0 (default).",
 )
 GNSS_WITH_BAROMETER_HEIGHT = replace(
     GNSS,

@@ -255,7 +255,10 @@ def _describe_timestamp_clock(published_us: IntArray, sample_timestamps_us: IntA
 
 
 def _read_fused_observation(topics: Topics, is_odometry: bool) -> PositionTrack | Unavailable:
-    horizontal, vertical = px4.TOPIC_LAYOUTS["kept_horizontal"], px4.TOPIC_LAYOUTS["kept_vertical"]
+    horizontal, vertical = (
+        px4.TOPIC_LAYOUTS["estimator_aid_src_ev_pos"],
+        px4.TOPIC_LAYOUTS["estimator_aid_src_ev_hgt"],
+    )
     if topics.find_layout(horizontal) is None:
         return unavailable_source(px4.FUSED_OBSERVATION_TRACK_NAME)
     return _make_track_from_ekf2_topics(
@@ -513,9 +516,9 @@ def read_truth(
 
     If EKF2 fused GNSS, ground truth is shifted from the simulation's origin to EKF2's origin.
     """
-    attitude = read_attitude(topics.read(px4.TOPIC_LAYOUTS["truth_attitude"]))
-    local_layout = px4.TOPIC_LAYOUTS["truth_local"]
-    global_layout = px4.TOPIC_LAYOUTS["truth_global"]
+    attitude = read_attitude(topics.read(px4.TOPIC_LAYOUTS["vehicle_attitude_groundtruth"]))
+    local_layout = px4.TOPIC_LAYOUTS["vehicle_local_position_groundtruth"]
+    global_layout = px4.TOPIC_LAYOUTS["vehicle_global_position_groundtruth"]
     logged_local_samples = topics.read(local_layout)
     local_samples = select_valid_rows(logged_local_samples, logged_local_samples.columns.tolist())
     global_positions = select_valid_rows(topics.read(global_layout), Columns.GEODETIC[:2])

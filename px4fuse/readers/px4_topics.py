@@ -41,22 +41,27 @@ class TrackSource:
 
 _TOPIC_TABLES = read_toml(__file__, dict[str, dict[str, Any]])
 TOPIC_LAYOUTS = expand_layouts(_TOPIC_TABLES["layouts"])
+TOPIC_LAYOUTS["gps_in_integers"] = replace(
+    TOPIC_LAYOUTS["gps_in_integers"],
+    optional_columns=TOPIC_LAYOUTS["vehicle_gps_position"].optional_columns,
+)
 TRACK_SOURCES = msgspec.convert(_TOPIC_TABLES["tracks"], dict[str, TrackSource])
 FRAME_BY_FIELD_VALUE = msgspec.convert(
     _TOPIC_TABLES["frames"], dict[str, dict[int, str]], strict=False
 )
 UNUSED_TOPICS: Mapping[str, str] = _TOPIC_TABLES["unused"]
-IMU_LAYOUT, LOCAL_POSITION_LAYOUT = TOPIC_LAYOUTS["imu"], TOPIC_LAYOUTS["local_position"]
+IMU_LAYOUT, LOCAL_POSITION_LAYOUT = (
+    TOPIC_LAYOUTS["sensor_combined"],
+    TOPIC_LAYOUTS["vehicle_local_position"],
+)
 HEIGHT_BIAS_LAYOUT_BY_AID = {
-    "baro_hgt": TOPIC_LAYOUTS["baro_bias"],
-    "gnss_hgt": replace(TOPIC_LAYOUTS["baro_bias"], topic="estimator_gnss_hgt_bias"),
+    "baro_hgt": TOPIC_LAYOUTS["estimator_baro_bias"],
+    "gnss_hgt": TOPIC_LAYOUTS["estimator_gnss_hgt_bias"],
 }
 # Advice if a topic of the default logging profile is not logged
 DEFAULT_PROFILE_REMEDY = "Record with SDLOG_PROFILE bit 0 (default)."
 # Topics with EKF2's state vector and variances, in order of preference
 STATE_VECTOR_TOPICS = ("estimator_states", "estimator_status")  # since v1.12, v1.8 to v1.11
-# Measured magnetic field, from the magnetometer topic or EKF2's observations (since v1.14)
-MAGNETIC_FIELD_LAYOUTS = TOPIC_LAYOUTS["magnetometer"], TOPIC_LAYOUTS["observed_field"]
 # Number of attitude variances, by number of logged states and variances (generated/state.h)
 ATTITUDE_VARIANCE_COUNT_BY_ARRAY_LENGTHS: Mapping[tuple[int, int], int] = {
     (24, 24): 4,
@@ -95,8 +100,7 @@ def list_topics() -> list[str]:
     layout_topics = {
         layout.topic for track in TRACK_SOURCES for layout in find_track_layouts(track)
     }
-    layouts = (*TOPIC_LAYOUTS.values(), *HEIGHT_BIAS_LAYOUT_BY_AID.values())
-    layout_topics |= {layout.topic for layout in layouts if layout.topic}
+    layout_topics |= {layout.topic for layout in TOPIC_LAYOUTS.values() if layout.topic}
     layout_topics |= {f"estimator_aid_src_{name}" for name in AIDS}
     aid_topics = {STATUS_FLAGS, *INNOVATION_TOPICS, OLD_INNOVATION_TOPIC}
     return sorted(layout_topics | UNUSED_TOPICS.keys() | aid_topics | {*STATE_VECTOR_TOPICS})

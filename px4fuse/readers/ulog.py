@@ -45,10 +45,12 @@ def read_ulog(name: str, content: bytes) -> Flight:
     topics = read_topics(name, content)
     remedy = "Check that the accelerometer and gyroscope were running during logging."
     imu = _require_samples(topics, _read_imu(topics), "IMU", px4.IMU_LAYOUT, remedy)
-    attitude_samples = common.select_rows_with_attitude(topics.read(px4.TOPIC_LAYOUTS["attitude"]))
+    attitude_samples = common.select_rows_with_attitude(
+        topics.read(px4.TOPIC_LAYOUTS["vehicle_attitude"])
+    )
     remedy = "Check that EKF2 was running during logging (EKF2_EN is 1)."
     attitude = _require_samples(
-        topics, attitude_samples, "attitude", px4.TOPIC_LAYOUTS["attitude"], remedy
+        topics, attitude_samples, "attitude", px4.TOPIC_LAYOUTS["vehicle_attitude"], remedy
     )
     ekf2 = read_ekf2(topics)
     positions, unavailable_positions = read_positions(topics, ekf2)
@@ -56,11 +58,13 @@ def read_ulog(name: str, content: bytes) -> Flight:
     if isinstance(truth, Truth):
         topics.record_stream("truth", truth.name)
     airborne_spans_s = _read_airborne_spans(topics)
-    altitude_m = topics.read(px4.TOPIC_LAYOUTS["barometer"])["altitude_m"]
+    altitude_m = topics.read(px4.TOPIC_LAYOUTS["vehicle_air_data"])["altitude_m"]
     barometer_delay_s = topics.ekf2_parameters.get(BAROMETER.delay, 0.0) * 1e-3
     is_in_flight = common.ends_in_flight(airborne_spans_s, topics.log.duration_s)
     dropped_counts = dict(sorted(topics.dropped.items()))
-    tilt_failure_flags = topics.read(px4.TOPIC_LAYOUTS["failure"])[["roll", "pitch"]]
+    tilt_failure_flags = topics.read(px4.TOPIC_LAYOUTS["failure_detector_status"])[
+        ["roll", "pitch"]
+    ]
     return Flight(
         log=structs.replace(
             topics.log,
@@ -151,12 +155,12 @@ def _read_imu(topics: Topics) -> pd.DataFrame:
 
 
 def _read_airborne_spans(topics: Topics) -> Spans | Unavailable:
-    land_detected = topics.read(px4.TOPIC_LAYOUTS["land_detected"])
+    land_detected = topics.read(px4.TOPIC_LAYOUTS["vehicle_land_detected"])
     if land_detected.empty:
         return Unavailable(
             "land detector",
             "vehicle_land_detected is not logged or not usable",
             f"{px4.DEFAULT_PROFILE_REMEDY} Alternatively, give the flight time (--start, --end).",
         )
-    topics.record_stream("airborne", px4.TOPIC_LAYOUTS["land_detected"].topic)
+    topics.record_stream("airborne", px4.TOPIC_LAYOUTS["vehicle_land_detected"].topic)
     return common.find_flight_spans(land_detected["landed"], topics.log.duration_s)

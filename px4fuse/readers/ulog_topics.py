@@ -181,7 +181,7 @@ class Topics:
     @cached_property
     def primary_instances(self) -> InstanceSwitches:
         """Time (s) and number of each new primary EKF2 instance (PX4's ``EKF2Selector``)."""
-        instances = self.read(TOPIC_LAYOUTS["selector"])["instance"]
+        instances = self.read(TOPIC_LAYOUTS["estimator_selector_status"])["instance"]
         instances = instances[instances < 255]  # 255 means that no instance is selected yet
         primary_instance_changes = instances[instances.ne(instances.shift())]
         switch_times_s = [-np.inf, *primary_instance_changes.index[1:]]
@@ -424,7 +424,7 @@ def _read_parameters(
         for name, value in ulog.initial_parameters.items()
         if isinstance(value, int | float)
     }
-    layout, take_off_time_us = TOPIC_LAYOUTS["land_detected"], 0
+    layout, take_off_time_us = TOPIC_LAYOUTS["vehicle_land_detected"], 0
     landed = tables.get((layout.topic, 0), {}).get(layout.columns["landed"])
     if landed is not None and not landed.all():
         take_off_time_us = int(tables[layout.topic, 0]["timestamp"][np.argmin(landed)])
