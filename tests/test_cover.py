@@ -237,7 +237,7 @@ def test_report_cover_long_text_moves_plots_to_second_page(eventful: Analysis, c
 def test_report_section_title_is_on_page_of_its_first_plot() -> None:
     sections = [Page(f"Section {number}") for number in range(4)]
     for section in sections:
-        section.add_panel("Panel", 210.0)
+        section.add_panel("Panel", 240.0)
     sheets = set_by_typst(*sections)
     assert [sheet.count("Section") for sheet in sheets] == [2, 2]
     assert [sheet.count("Panel") for sheet in sheets] == [2, 2]
