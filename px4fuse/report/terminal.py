@@ -11,6 +11,7 @@ from px4fuse.report.aids import select_aids_of_outdoor_flight, write_aids
 from px4fuse.report.difference_page import write_explanation
 from px4fuse.report.page import Page
 from px4fuse.report.phrases import (
+    VERDICT_LEGEND,
     describe_alignment,
     format_settings,
     list_verdict_warnings,
@@ -19,8 +20,8 @@ from px4fuse.report.phrases import (
 )
 
 ERROR_LEGEND = (
-    "KF-EKF2 is the RMS difference of position and velocity; RMSE is against ground truth. A "
-    "filter is consistent if its σ ratio is 0.8 to 1.25, or if its 95 % interval contains 1."
+    "KF-EKF2 is the RMS difference of position and velocity; RMSE is against ground truth. "
+    f"{VERDICT_LEGEND}"
 )
 
 
@@ -45,6 +46,7 @@ def make_comparison_page(
         return page
     if isinstance(analysis, AidingSourceAnalysis):
         write_aids(page, analysis.aids)
+        page.write_small_text(VERDICT_LEGEND)
         page.write_heading("Findings")
         write_findings(page, results.findings)
         page.write("" if results.findings else "None.")
