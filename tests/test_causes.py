@@ -1,9 +1,11 @@
 """Findings grouped by cause, their order, and notes on verdicts."""
 
+from types import SimpleNamespace
 from typing import Any
 
 import pytest
 from exchange import replace
+from page_tools import words
 
 from px4fuse.analysis import Analysis
 from px4fuse.finding import Finding
@@ -15,6 +17,8 @@ from px4fuse.findings.cause_grouping import (
     group_by_cause,
 )
 from px4fuse.findings.model import FINDING_TITLES
+from px4fuse.report import consistency, terminal
+from px4fuse.report.page import Page
 from px4fuse.report.phrases import list_verdict_warnings
 
 
@@ -88,6 +92,12 @@ def test_consistency_notes_list_innovations_that_are_correlated(sample: Analysis
     (white,) = list_verdict_warnings(sample)
     assert "Ljung-Box test, p < 0.001" in white
     assert "KF along down, lag-1 autocorrelation" in white
+
+
+def test_pages_with_nis_band_state_tolerance_of_verdict(sample: Analysis) -> None:
+    pages = [Page(), *consistency.draw_pages(sample, None)]
+    terminal._write_details(pages[0], sample, SimpleNamespace(findings=()))
+    assert all("The verdict also tolerates 25 %" in words(page) for page in pages)
 
 
 def test_consistency_notes_of_white_innovations_are_empty(sample: Analysis) -> None:

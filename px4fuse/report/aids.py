@@ -14,7 +14,7 @@ from px4fuse.report import style
 from px4fuse.report.event_marks import ON_GROUND_BAND_STYLE
 from px4fuse.report.page import Cell, Page
 from px4fuse.report.panels import draw_dots
-from px4fuse.report.phrases import format_sigma_verdict
+from px4fuse.report.phrases import VERDICT_LEGEND, format_sigma_verdict
 
 LEAD_TEXT = (
     "Each aiding source is tested with its innovations in flight: a mean NIS of 1 is expected. "
@@ -35,6 +35,7 @@ def draw_pages(analysis: Analysis | AidingSourceAnalysis, _: object) -> Iterator
     if aids:
         page = Page(f"{title} of EKF2", LEAD_TEXT)
         write_aids(page, aids)
+        page.write_small_text(VERDICT_LEGEND)
         _draw_aid_panels(page, analysis.flight, aids)
         yield page
 

@@ -29,6 +29,7 @@ from px4fuse.report import event_marks
 from px4fuse.report.page import Page, draw_legend_above, make_two_columns
 from px4fuse.report.panels import normalised_innovations
 from px4fuse.report.phrases import (
+    VERDICT_LEGEND,
     VERDICT_TABLE_HEAD,
     format_noise_estimate,
     get_statistics_by_filter,
@@ -87,6 +88,7 @@ def draw_pages(analysis: Analysis, _: object) -> Iterator[Page]:
         for name, consistency in get_statistics_by_filter(axis_result).items()
     ]
     page.add_table(column_heads, rows, right_aligned_columns=(2, 5, 6, 7, 8))
+    page.write_small_text(VERDICT_LEGEND)
     noise_rows = [
         [name, *map(format_noise_estimate, (tuning.sigma_a_two_state, tuning.sigma_z))]
         for name, tuning in analysis.tuning.items()

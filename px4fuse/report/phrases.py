@@ -39,6 +39,10 @@ if TYPE_CHECKING:
 
 # Minimum p value (Ljung-Box test) of white innovations; small, because a flight has eight tests
 MIN_WHITENESS_P_VALUE = 0.001
+VERDICT_LEGEND = (
+    "The 95 % band allows only for random scatter. The verdict also tolerates 25 %: a filter is "
+    "consistent if √(mean NIS) is 0.8 to 1.25, or if the mean NIS is inside the band."
+)
 SIGMA_ERROR_TEXTS = {"underconfident": "too large", "overconfident": "too small"}
 DIFFERENCE_FIELDS = ("position_rms_m", "velocity_rms_m_s")
 RMSE_FIELDS = ("position_rmse_m", "velocity_rmse_m_s")

@@ -8,13 +8,15 @@ from px4fuse.ekf2.steps import DifferenceExplanation
 from px4fuse.report.aids import select_aids_of_outdoor_flight, write_aids
 from px4fuse.report.page import Page
 from px4fuse.report.phrases import (
+    VERDICT_LEGEND,
     list_verdict_warnings,
     write_error_table,
     write_findings,
 )
 
 ERROR_LEGEND = (
-    "KF-EKF2 is the RMS difference of position and velocity; RMSE is against ground truth."
+    "KF-EKF2 is the RMS difference of position and velocity; RMSE is against ground truth. "
+    f"{VERDICT_LEGEND}"
 )
 
 
@@ -39,6 +41,7 @@ def make_comparison_page(
         return page
     if isinstance(analysis, AidingSourceAnalysis):
         write_aids(page, analysis.aids)
+        page.write_small_text(VERDICT_LEGEND)
         page.write_heading("Findings")
         write_findings(page, results.findings)
         page.write("" if results.findings else "None.")
