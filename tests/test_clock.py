@@ -32,7 +32,7 @@ from px4fuse.comparison import estimates
 from px4fuse.comparison.estimates import (
     MIN_ESTIMATES_BEFORE_AND_AFTER_CHANGE,
     estimate_noises_and_clock,
-    widen_for_drift,
+    widen_for_scatter,
 )
 from px4fuse.comparison.reruns import rerun_kf_with_time_offset
 from px4fuse.core.arrays import Array
@@ -48,6 +48,7 @@ from px4fuse.filter.imu_motion import (
     compute_imu_motion,
     make_segment_motion,
 )
+from px4fuse.filter.imu_oscillation import find_imu_oscillation
 from px4fuse.filter.likelihood import compute_profile_likelihood_interval
 from px4fuse.filter.marginal_likelihood import NoiseParameters
 from px4fuse.filter.signals import Segment
@@ -454,6 +455,31 @@ def test_time_offset_that_ground_truth_refutes_is_not_recommended() -> None:
     assert not {one.id for one in analysis.findings} & {*TIME_OFFSET_FINDINGS}
 
 
+def oscillating(flight: Flight) -> Flight:
+    """Add 1 m/s² at 0.4 Hz to the forward axis of the accelerometer."""
+    imu = flight.imu.copy()
+    imu[Columns.SPECIFIC_FORCE[0]] += np.sin(2.0 * np.pi * 0.4 * imu.index.to_numpy())
+    return replace(flight, imu=imu)
+
+
+def test_imu_oscillation_is_no_change_of_time_offset(monkeypatch) -> None:
+    scenario = Scenario(seed=4, ekf2=False)
+    flight = oscillating(simulate_flight(scenario, parse_faults([])))
+    prepared = prepare_comparison(flight, ComparisonRequest(log=flight.log.name))
+    assert not estimate_noises_and_clock(prepared)[1].has_changed()
+    found = find_imu_oscillation(flight, prepared.source, prepared.segment)
+    assert found == pytest.approx((0.4, 1.0), rel=0.05)
+    monkeypatch.setattr(estimates, "find_imu_oscillation", lambda *_: None)
+    assert estimate_noises_and_clock(prepared)[1].has_changed()
+
+
+@pytest.mark.parametrize("mistake", ["clock-jump=0.3", "smoothed=1", "vibration=5", "yaw=40"])
+def test_flight_without_imu_oscillation_has_none(mistake: str) -> None:
+    flight = simulate_flight(Scenario(seed=4, ekf2=False), parse_faults([mistake]))
+    prepared = prepare_comparison(flight, ComparisonRequest(log=flight.log.name))
+    assert find_imu_oscillation(prepared.flight, prepared.source, prepared.segment) is None
+
+
 def test_time_offset_jump_p_value_equals_bonferroni_t_test() -> None:
     """Compare with scipy's two-sample t for equal weights and a scatter above the stated σ."""
     offset = np.array([0.0, 0.03, -0.02, 0.01, 0.2, 0.24, 0.19, 0.22, 0.2])
@@ -517,7 +543,7 @@ def test_vision_source_with_orientation_is_treated_as_drifting(origin, drifts) -
 def test_time_offset_interval_widens_if_flight_parts_differ() -> None:
     """Offsets of parts as measured on a VIO with correct timestamps."""
     scattered = stated(-0.013, 0.019, 0.076, 0.031, 0.082, 0.107, -0.077, 0.012, -0.007, -0.024)
-    found = widen_for_drift(scattered)
+    found = widen_for_scatter(scattered, "the positions drift")
     scatter = found.sigma_s / scattered.sigma_s
     assert scatter == pytest.approx(np.std([p.offset_s for p in found.parts], ddof=1) / 0.02)
     low, high = found.interval_s
@@ -527,14 +553,20 @@ def test_time_offset_interval_widens_if_flight_parts_differ() -> None:
 
 
 def test_time_offset_interval_is_not_widened_if_parts_agree() -> None:
-    found = widen_for_drift(stated(0.01, -0.01, 0.015, -0.02, 0.0))
+    found = widen_for_scatter(stated(0.01, -0.01, 0.015, -0.02, 0.0), "the positions drift")
     assert (found.interval_s, found.sigma_s) == (pytest.approx((-0.021, 0.019)), 0.01)
 
 
 def test_time_offset_with_too_wide_interval_is_undetermined() -> None:
-    step = widen_for_drift(stated(-0.41, -0.36, 0.03, -0.04, 0.02, 0.05, -0.03, 0.0))
+    step = widen_for_scatter(
+        stated(-0.41, -0.36, 0.03, -0.04, 0.02, 0.05, -0.03, 0.0), "the positions drift"
+    )
     assert step.change_p_value < 1e-3
-    wide = widen_for_drift(replace(stated(-0.4, 0.4, -0.3, 0.3), interval_s=(-0.05, 0.05)))
+    wide = widen_for_scatter(
+        replace(stated(-0.4, 0.4, -0.3, 0.3), interval_s=(-0.05, 0.05)), "the positions drift"
+    )
     assert not wide.is_determinable
     assert "probably because the positions drift" in wide.reason
-    assert widen_for_drift(stated(0.0, 0.3)).change_p_value is None  # two parts give no scatter
+    assert (
+        widen_for_scatter(stated(0.0, 0.3), "drift").change_p_value is None
+    )  # two parts give no scatter

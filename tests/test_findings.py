@@ -127,6 +127,13 @@ def with_ekf2_bias(flight: Flight) -> Flight:
     return with_ekf2(accelerometer_bias=zero + np.array([0.2, -0.1, 0.2]))(flight)
 
 
+def with_imu_oscillation(flight: Flight) -> Flight:
+    """Add 1 m/s² at 0.5 Hz to the forward axis of the accelerometer."""
+    imu = flight.imu.copy()
+    imu[Columns.SPECIFIC_FORCE[0]] += np.sin(np.pi * imu.index.to_numpy())
+    return replace(flight, imu=imu)
+
+
 def with_invalid_position(flight: Flight) -> Flight:
     """Let EKF2 drift to the north by 1 m/s, with xy_valid 0, from 80 s on."""
     state = flight.ekf2.state.copy()
@@ -283,6 +290,8 @@ FAULTS = [
           {"excessive_tilt_spans_s": ((100.0, 104.0),)}),
     Fault("accelerometer_clipping", "warning", {"count": 30, "total_s": about(0.3, 0.01)},
           {"imu": Imu(clipped_s=(50.0, 50.295))}),
+    Fault("accelerometer_oscillation", "warning", {"frequency_hz": about(0.5, 0.02),
+          "amplitude_m_s2": about(1.0, 0.05)}, change=with_imu_oscillation),
     Fault("logger_dropouts", "warning", {"count": 2, "total_s": about(0.5, 1e-9)},
           {"dropouts": (Dropout(20.0, 0.3), Dropout(50.0, 0.2), Dropout(500.0, 9.0))}),
     Fault("imu_rate_too_low", "warning", {"rate_hz": about(20.0), "topic": "sensor_combined"},

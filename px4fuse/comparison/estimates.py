@@ -31,6 +31,7 @@ from px4fuse.filter.hypotheses import (
 )
 from px4fuse.filter.imu_motion import MAX_IMU_INTERVAL_S
 from px4fuse.filter.marginal_likelihood import NoiseParameters
+from px4fuse.filter.imu_oscillation import find_imu_oscillation
 from px4fuse.filter.signals import AISLE, Axis
 from px4fuse.filter.time_offset import (
     MAX_OFFSET_INTERVAL_HALF_WIDTH_S,
@@ -47,6 +48,11 @@ MIN_TIME_OFFSET_IMU_HZ = 1.0 / MAX_IMU_INTERVAL_S
 MIN_TELEMETRY_IMU_HZ = 200.0
 # Measured IMU rates are up to 2 % lower than the nominal rate
 MIN_IMU_RATE_RATIO = 0.98
+IMU_OSCILLATES = Unavailable(
+    "low-pass filter of the position source",
+    "the accelerometer oscillates, which resembles filtered positions",
+    "Check the mounting of the autopilot.",
+)
 TELEMETRY_IMU_MESSAGES = ("HIGHRES_IMU", "SCALED_IMU", "SCALED_IMU2", "SCALED_IMU3")
 
 # Minimum number of time offset estimates before and after a change of the time offset
@@ -187,8 +193,14 @@ def estimate_noises_and_clock(
         outlier_time_s,
         progress,
     )
-    if comparison.source.origin.may_drift and isinstance(clock_offset, ClockOffset):
-        clock_offset = widen_for_drift(clock_offset)
+    if not isinstance(clock_offset, ClockOffset):
+        return tuning, clock_offset
+    if comparison.source.origin.may_drift:
+        clock_offset = widen_for_scatter(clock_offset, "the positions drift")
+    elif clock_offset.has_changed() and find_imu_oscillation(
+        comparison.flight, comparison.source, comparison.segment
+    ):
+        clock_offset = widen_for_scatter(clock_offset, "the accelerometer oscillates")
     return tuning, clock_offset
 
 
@@ -275,6 +287,12 @@ def _fit_source_errors(
             correlated_noise,
             source_low_pass,
         )
+    oscillation = find_imu_oscillation(flight, comparison.source, comparison.segment)
+    # A low-pass filter with a short lag keeps the oscillation in the positions
+    if oscillation is not None and (
+        2.0 * np.pi * oscillation.frequency_hz * source_low_pass.lag_s < 1.0
+    ):
+        return systematic_errors, IMU_OSCILLATES, correlated_noise
     return systematic_errors, source_low_pass, correlated_noise
 
 
@@ -320,8 +338,8 @@ def explain_low_imu_rate(flight: Flight) -> Unavailable | None:
     )
 
 
-def widen_for_drift(clock_offset: ClockOffset) -> ClockOffset:
-    """Widen the 95 % interval of the time offset of odometry, because of its drift.
+def widen_for_scatter(clock_offset: ClockOffset, cause: str) -> ClockOffset:
+    """Widen the 95 % interval of the time offset, because its estimates scatter.
 
     The factor is the scatter of the time offsets of flight parts ÷ their reported σ.
     """
@@ -340,8 +358,8 @@ def widen_for_drift(clock_offset: ClockOffset) -> ClockOffset:
     reason = clock_offset.reason
     if not reason and (high_s - low_s) / 2.0 > MAX_OFFSET_INTERVAL_HALF_WIDTH_S:
         reason = (
-            "the time offset differs between parts of the flight, probably because the positions "
-            f"drift (95 % interval of the offset: {low_s:+.2f} s to {high_s:+.2f} s)"
+            f"the time offset differs between parts of the flight, probably because {cause} (95 % "
+            f"interval of the offset: {low_s:+.2f} s to {high_s:+.2f} s)"
         )
     return structs.replace(
         clock_offset,

@@ -1,4 +1,4 @@
-"""Systematic errors: timestamp jitter, noise that grows with speed, late attitude.
+"""Systematic errors: timestamp jitter, noise that grows with speed, IMU oscillation, late attitude.
 
 With ground truth also: periodic errors, a time offset that varies in flight, a scale factor error.
 """
@@ -19,6 +19,7 @@ from px4fuse.comparison.error_patterns import (
     fit_errors,
 )
 from px4fuse.core.text import format_metres, format_ratio
+from px4fuse.filter.imu_oscillation import find_imu_oscillation
 from px4fuse.filter.time_offset import ClockOffset
 from px4fuse.findings.model import (
     Findings,
@@ -27,7 +28,11 @@ from px4fuse.findings.model import (
     make_error,
     make_warning,
 )
-from px4fuse.findings.source_positions import MIN_SCALE_ERROR_TO_SIGMA_RATIO, make_scale_finding
+from px4fuse.findings.source_positions import (
+    MIN_SCALE_ERROR_TO_SIGMA_RATIO,
+    find_low_pass,
+    make_scale_finding,
+)
 from px4fuse.findings.source_stamps import detect_bursts
 from px4fuse.flight.model import positions_phrase, source_name
 
@@ -41,6 +46,7 @@ MIN_AMPLITUDE_FOR_ERROR_M = 0.2
 
 def detect(analysis: Analysis) -> Findings:
     yield from detect_attitude_delay(analysis)
+    yield from detect_imu_oscillation(analysis)
     burst_findings = [*detect_bursts(analysis)]
     yield from burst_findings
     if burst_findings or analysis.source.origin.reconstructed:
@@ -127,6 +133,22 @@ def detect_scale_error(analysis: Analysis, error_fit: ErrorFit) -> Findings:
             error_fit.scale_sigma,
             f"ground truth is accurate to ± {format_percent(1.96 * error_fit.scale_sigma, 1)}",
             f"{find_source_texts(analysis.source).scale_check}.",
+        )
+
+
+def detect_imu_oscillation(analysis: Analysis) -> Findings:
+    """Detect an oscillation of the accelerometer that the positions do not contain."""
+    if find_low_pass(analysis) is not None:  # the filter may remove the motion from the positions
+        return
+    oscillation = find_imu_oscillation(analysis.flight, analysis.source, analysis.segment)
+    if oscillation is not None:
+        yield make_warning(
+            "accelerometer_oscillation",
+            f"The accelerometer oscillates by {oscillation.amplitude_m_s2:.1f} m/s² at "
+            f"{oscillation.frequency_hz:.2f} Hz, but the positions contain no such motion. KF and "
+            "EKF2 integrate this acceleration, so their innovations oscillate.",
+            "Check the mounting of the autopilot: screws, damping and cables.",
+            oscillation._asdict(),
         )
 
 

@@ -1,0 +1,93 @@
+"""Oscillation of the accelerometer that the positions do not contain."""
+
+from typing import NamedTuple
+
+import numpy as np
+
+from px4fuse.core.arrays import compute_median_interval_s, integrate_cumulatively
+from px4fuse.filter.frame_rotation import heading_rad
+from px4fuse.filter.signals import Segment, compute_ned_acceleration, cut_to_segment
+from px4fuse.flight.model import Columns, Flight, PositionTrack, Unavailable
+
+MIN_POSITIONS = 100
+# Tested frequencies (Hz), and maximum as fraction of the position rate
+MIN_FREQUENCY_HZ, MAX_FREQUENCY_HZ, MAX_FREQUENCY_TO_RATE_RATIO = 0.1, 5.0, 0.45
+# Width of the band for the median power around a peak: ratio of its limits to the frequency
+BAND_LIMIT_RATIO = 1.33
+# Minimum power of a peak, divided by the median: flights without an oscillation are below 6
+MIN_PEAK_TO_MEDIAN_POWER = 8.0
+# Maximum power of the motion in the positions, divided by that in the accelerations
+MAX_SOURCE_TO_IMU_POWER = 0.25
+MIN_AMPLITUDE_M_S2 = 0.3
+
+
+class ImuOscillation(NamedTuple):
+    """Frequency and amplitude of an oscillation along one axis of the vehicle."""
+
+    frequency_hz: float
+    amplitude_m_s2: float
+
+
+def find_imu_oscillation(
+    flight: Flight, source: PositionTrack, segment: Segment
+) -> ImuOscillation | None:
+    """Find an oscillation of the horizontal acceleration that the positions do not contain.
+
+    Second differences of the positions are compared with those of the doubly integrated
+    acceleration, in axes that turn with the heading. Complex numbers are north + i east.
+    """
+    acceleration_m_s2, attitude = compute_ned_acceleration(flight), flight.attitude
+    samples = cut_to_segment(source.samples, segment)[Columns.POSITION[:2]].dropna()
+    if isinstance(acceleration_m_s2, Unavailable) or isinstance(attitude, Unavailable):
+        return None
+    if len(samples) < MIN_POSITIONS:
+        return None
+    source_time_s, imu_time_s = samples.index.to_numpy(), acceleration_m_s2.index.to_numpy()
+    interval_s = compute_median_interval_s(source_time_s)
+    time_s = np.arange(
+        max(source_time_s[0], imu_time_s[0]), min(source_time_s[-1], imu_time_s[-1]), interval_s
+    )
+    if len(time_s) < MIN_POSITIONS:
+        return None
+    imu_position_m = acceleration_m_s2[["north", "east"]].to_numpy()
+    for _ in range(2):
+        imu_position_m = integrate_cumulatively(imu_position_m, imu_time_s)
+    positions_m = np.stack(
+        [
+            np.interp(time_s, source_time_s, samples.to_numpy() @ [1.0, 1j]),
+            np.interp(time_s, imu_time_s, imu_position_m @ [1.0, 1j]),
+        ]
+    )
+    headings_rad = np.unwrap(heading_rad(attitude))
+    turn = np.exp(-1j * np.interp(time_s[1:-1], attitude.index.to_numpy(), headings_rad))
+    window = np.hanning(len(turn))
+    second_differences_m = np.diff(positions_m, 2, axis=1) * turn * window
+    spectra = np.fft.fft([*second_differences_m, np.diff(second_differences_m, axis=0)[0]])
+    count = len(turn) // 2
+    # Along one axis, an oscillation has equal power at positive and negative frequency
+    powers = np.abs(spectra[:, 1:count]) ** 2 + np.abs(spectra[:, :-count:-1]) ** 2
+    source_power, imu_power, error_power = (np.convolve(row, np.ones(3), "same") for row in powers)
+    frequencies_hz = np.arange(1, count) / (len(turn) * interval_s)
+    first, end = np.searchsorted(
+        frequencies_hz,
+        [MIN_FREQUENCY_HZ, min(MAX_FREQUENCY_HZ, MAX_FREQUENCY_TO_RATE_RATIO / interval_s)],
+    )
+    band_rows = np.searchsorted(
+        frequencies_hz,
+        np.outer([1.0 / BAND_LIMIT_RATIO, BAND_LIMIT_RATIO], frequencies_hz[first:end]),
+    ).T
+    medians = [np.median(error_power[low : high + 1]) for low, high in band_rows]
+    if not medians:
+        return None
+    peak = first + int(np.argmax(error_power[first:end] / medians))
+    frequency_hz = float(frequencies_hz[peak])
+    # A Hann window spreads a line over 3 bins with 1.5 times the power of the middle bin
+    amplitude_m = 2.0 * np.sqrt(imu_power[peak] / 3.0) / window.sum()
+    acceleration_per_difference = np.pi * frequency_hz / np.sin(np.pi * frequency_hz * interval_s)
+    oscillation = ImuOscillation(frequency_hz, float(amplitude_m * acceleration_per_difference**2))
+    is_oscillating = (
+        error_power[peak] > MIN_PEAK_TO_MEDIAN_POWER * medians[peak - first]
+        and source_power[peak] < MAX_SOURCE_TO_IMU_POWER * imu_power[peak]
+        and oscillation.amplitude_m_s2 > MIN_AMPLITUDE_M_S2
+    )
+    return oscillation if is_oscillating else None
