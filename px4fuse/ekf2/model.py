@@ -78,8 +78,6 @@ EVENTS_PER_BLOCK = 512
 # Fields of Agreement whose names differ from PX4's name of the aiding source
 AGREEMENT_FIELD_BY_AID_NAME = {FLOW.name: "carried_difference_m"}
 
-ListConfigurations = Callable[[ReplayInputs], Sequence[FilterConfiguration]]
-
 
 @dataclass(frozen=True)
 class Ekf2Model:
@@ -102,7 +100,9 @@ class Ekf2Model:
 
 def prepare_ekf2_model(
     flight: Flight,
-    list_later_configurations: ListConfigurations = lambda _: (),
+    list_later_configurations: Callable[
+        [ReplayInputs], Sequence[FilterConfiguration]
+    ] = lambda _: (),
     failed_agreement_by_aid: Mapping[str, Agreement] = MappingProxyType({}),
 ) -> Ekf2Model | Unavailable:
     """Prepare EKF2 replays of a flight, and replay the flight with the logged parameters.
