@@ -288,7 +288,7 @@ def rerun(
     )
     trials = rerun_filters(comparison, estimates, ekf2_model)
     if isinstance(ekf2_model, Ekf2Model):  # to free memory
-        ekf2_model = replace(ekf2_model, runs=(), event_intervals_by_delays={})
+        ekf2_model = replace(ekf2_model, runs=())
     return Reruns(ekf2_model=ekf2_model, difference_steps=explanation_by_axis, trials=trials)
 
 

@@ -2,8 +2,9 @@
 
 import numpy as np
 
+from px4fuse.ekf2.filter_recursion import FilterConfiguration
 from px4fuse.ekf2.inputs import FusionRules, ReplayInputs
-from px4fuse.ekf2.intervals import StepEvents
+from px4fuse.ekf2.intervals import EventIntervals, StepEvents, make_event_intervals
 from px4fuse.ekf2.model import Ekf2Model, prepare_ekf2_model
 from px4fuse.ekf2.replay_segments import GRAVITY_M_S2, ReplaySegment
 from px4fuse.flight.model import Flight
@@ -24,6 +25,13 @@ def opened(flight: Flight) -> Ekf2Model:
     found = prepare_ekf2_model(flight)
     assert isinstance(found, Ekf2Model), found
     return found
+
+
+def intervals_of(model: Ekf2Model) -> EventIntervals:
+    """Return the intervals of the first segment with the logged parameters."""
+    inputs = model.inputs
+    delays = FilterConfiguration(inputs.settings).compute_delays(inputs)
+    return make_event_intervals(inputs, inputs.segments[0], delays)
 
 
 def step_matrix(segment: ReplaySegment, k: int, *, trapezoid: bool = True) -> np.ndarray:

@@ -7,7 +7,7 @@ import numpy as np
 import pandas as pd
 import pytest
 from conftest import LOG
-from ekf2_tools import opened, plain_replay, step_matrix, step_noise, step_state
+from ekf2_tools import intervals_of, opened, plain_replay, step_matrix, step_noise, step_state
 from exchange import replace
 
 from px4fuse.ekf2.filter_recursion import FilterConfiguration
@@ -39,10 +39,7 @@ def vision_of(flight: Flight) -> pd.DataFrame:
 
 
 def test_ekf2_model_transition_equals_product_of_step_matrices(model: Ekf2Model) -> None:
-    segment, intervals = (
-        model.inputs.segments[0],
-        next(iter(model.event_intervals_by_delays.values()))[0],
-    )
+    segment, intervals = model.inputs.segments[0], intervals_of(model)
     transition, correction, acceleration, gyro_noise, acceleration_noise = (
         intervals.compute_transitions(slice(None))
     )
@@ -74,7 +71,7 @@ def test_ekf2_model_state_between_updates_is_imu_prediction(
 ) -> None:
     """Without attitude as a state, the nominal attitude is not corrected."""
     configuration = FilterConfiguration(model.inputs.settings, estimates_attitude=attitude)
-    (part,) = run_configurations(model.inputs, [configuration], model.event_intervals_by_delays)
+    (part,) = run_configurations(model.inputs, [configuration])
     kept = np.random.default_rng(4).normal(0.0, 0.05, part.state.shape)
     state = compute_delayed_states(replace(part, state=kept), 0)
     segment, ends = part.segment, part.events[0].end_step
@@ -92,7 +89,7 @@ def test_ekf2_model_state_between_updates_is_imu_prediction(
 
 
 def test_ekf2_model_innovations_equal_reference_filter(model: Ekf2Model) -> None:
-    events = next(iter(model.event_intervals_by_delays.values()))[0].events
+    events = intervals_of(model).events
     nu, S = plain_replay(model.inputs, model.inputs.segments[0], events[events.end_step < 3000])
     updates = model.baseline_replay.updates.iloc[: len(nu)]
     assert len(nu) > 100

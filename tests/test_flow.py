@@ -5,7 +5,7 @@ from functools import cache
 import numpy as np
 import pandas as pd
 import pytest
-from ekf2_tools import opened
+from ekf2_tools import intervals_of, opened
 from exchange import replace
 from ulog_tools import gnss_log, seconds_of, stamps, topic
 
@@ -110,7 +110,7 @@ def test_flow_velocity_averaged_for_update_equals_true_velocity(every):
     """The motion since a sample is known from the IMU, so corners cause no innovations."""
     (segment,) = model().inputs.segments
     with_flow = add_flow_samples(segment, flow_of(every=every), 3.0)
-    end = next(iter(model().event_intervals_by_delays.values()))[0].events.end_step
+    end = intervals_of(model()).events.end_step
     found = average_by_event(segment, with_flow.flow, end)
     has_sample = found.sample_count > 0.0
     assert found.sample_count.sum() == pytest.approx(len(flow_of(every=every)) * every, abs=12.0)

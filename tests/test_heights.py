@@ -311,9 +311,8 @@ def test_ekf2_model_sets_clipped_acceleration_noise_to_4_9_m_s2() -> None:
 
     def ran(one: ReplaySegment, **changed: float) -> SegmentRun:
         settings = inputs.settings | changed
-        return run_configurations(
-            replace(inputs, segments=(one,)), [FilterConfiguration(settings)], {}
-        )[0]
+        given = replace(inputs, segments=(one,))
+        return run_configurations(given, [FilterConfiguration(settings)])[0]
 
     np.testing.assert_array_equal(ran(spoilt).state, ran(segment, EKF2_ACC_NOISE=4.9).state)
     # one clipped axis of three equals a third of the steps

@@ -12,8 +12,6 @@ from px4fuse.comparison.error_patterns import (
     find_offset_variation,
     find_periodic_error,
 )
-from px4fuse.core import arrays
-from px4fuse.ekf2 import output_predictor
 from px4fuse.flight.model import rows_between, time_index
 
 
@@ -71,15 +69,6 @@ def test_injected_error_period_is_found_at_any_flight_length(count):
     assert found is not None
     assert found.period_s == pytest.approx(13.0, rel=0.01)
     assert found.amplitude_m == pytest.approx(0.3 * np.sqrt(2.0), rel=0.02)
-
-
-@pytest.mark.parametrize("lag_steps", [1, 20])
-def test_output_predictor_in_blocks_equals_stepwise_recursion(monkeypatch, lag_steps):
-    error_rad = np.random.default_rng(lag_steps).standard_normal((500, 3))
-    whole = output_predictor.sum_attitude_corrections(error_rad, lag_steps, 0.01, 0.2)
-    monkeypatch.setattr(arrays, "BLOCK_ROWS", 64)
-    in_blocks = output_predictor.sum_attitude_corrections(error_rad, lag_steps, 0.01, 0.2)
-    np.testing.assert_allclose(in_blocks, whole, atol=1e-12)
 
 
 def test_rows_between_returns_same_rows_as_loc_slice():

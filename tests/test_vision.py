@@ -445,16 +445,13 @@ def flown(
     heard = replace(vision, position_m=(-1.0 if flipped else 1.0) * vision.position_m
                     + wrong_m * noise)  # fmt: skip
 
-    def both(
-        inputs: ReplayInputs, configurations: list[FilterConfiguration], known: Any
-    ) -> list[SegmentRun]:
+    def both(inputs: ReplayInputs, configurations: list[FilterConfiguration]) -> list[SegmentRun]:
         settings = {**inputs.settings, **SETTINGS, **changed}
         given = replace(inputs, vision_positions=heard, settings=settings)
         runs.extend(
             usual_run(
                 given,
                 [FilterConfiguration(settings, disable_time_s_by_aid={"ev_pos": off_from_s})],
-                known,
             )
         )
         return runs

@@ -65,7 +65,7 @@ class BadAccelerationFlag:
                 last_row[follows_log]
             ].T
         if not (self.until_s > begin_s).any():
-            return np.zeros_like(end_s)
+            return np.zeros_like(self.until_s)
         overlap_s = np.minimum(self.until_s, end_s) - np.maximum(self.since_s, begin_s)
         return np.asarray(np.maximum(overlap_s, 0.0) / np.maximum(end_s - begin_s, 1e-9))
 

@@ -251,10 +251,11 @@ def prepare_inputs(  # noqa: PLR0911, PLR0912 (one return per reason)
         fusion_record = replace(fusion_record, latitude_deg=np.nan)
     if isinstance(innovations := ekf2.innovations["north"], Unavailable):
         return innovations
-    flow_labels = [FLOW.label] if len(fusion_record.flow) else []
-    modelled_aid_labels = [GNSS_POS.label, GNSS_VEL.label, *flow_labels] if is_gnss else []
+    flow_samples = fusion_record.flow if is_gnss else pd.DataFrame()
+    modelled_labels = [GNSS_POS.label, GNSS_VEL.label] if is_gnss else []
+    modelled_labels += [FLOW.label] if len(flow_samples) else []
     if unmodelled_aids := [
-        label for label in fusion_record.other_horizontal_aids if label not in modelled_aid_labels
+        label for label in fusion_record.other_horizontal_aids if label not in modelled_labels
     ]:
         switch_settings = ["EKF2_OF_CTRL 0", *([] if is_gnss else [f"{GNSS_POS.switch} 0"])]
         return Unavailable(
@@ -292,11 +293,10 @@ def prepare_inputs(  # noqa: PLR0911, PLR0912 (one return per reason)
     )
     if isinstance(horizon_s, Unavailable):
         if not flight.log.firmware.startswith(FIRST_RELEASE_WITH_HORIZON_TIMES):
-            return Unavailable(ANALYSIS_NAME, horizon_s.reason, horizon_s.remedy)
+            return horizon_s
         # If EKF2_EV_DELAY is at most one prediction step, EKF2 fuses without delay
         horizon_s = 0.0
     aiding_times_s = received_positions.timestamp_s
-    flow_samples = fusion_record.flow if is_gnss else fusion_record.flow.iloc[:0]
     if len(flow_samples) and FLOW.name not in omitted_aids:
         aiding_times_s = np.union1d(aiding_times_s, flow_samples.index)
     segments = find_replay_segments(

@@ -29,7 +29,7 @@ from px4fuse.ekf2.filter_recursion import (
 )
 from px4fuse.ekf2.heights import MIN_INNOVATION_GATE
 from px4fuse.ekf2.inputs import ANALYSIS_NAME, ReplayInputs, find_matching_samples, prepare_inputs
-from px4fuse.ekf2.intervals import EventIntervals, FusionDelays, make_event_intervals
+from px4fuse.ekf2.intervals import make_event_intervals
 from px4fuse.ekf2.output_predictor import compute_published_state, sum_attitude_corrections
 from px4fuse.ekf2.replay import (
     HORIZONTAL_AXES,
@@ -78,8 +78,6 @@ EVENTS_PER_BLOCK = 512
 # Fields of Agreement whose names differ from PX4's name of the aiding source
 AGREEMENT_FIELD_BY_AID_NAME = {FLOW.name: "carried_difference_m"}
 
-ListConfigurations = Callable[[ReplayInputs], Sequence[FilterConfiguration]]
-
 
 @dataclass(frozen=True)
 class Ekf2Model:
@@ -95,7 +93,6 @@ class Ekf2Model:
 
     flight: Flight
     inputs: ReplayInputs
-    event_intervals_by_delays: Mapping[FusionDelays, tuple[EventIntervals, ...]]
     baseline_replay: Ekf2Replay
     agreement: Agreement
     runs: tuple[SegmentRun, ...] = ()
@@ -103,7 +100,9 @@ class Ekf2Model:
 
 def prepare_ekf2_model(
     flight: Flight,
-    list_later_configurations: ListConfigurations = lambda _: (),
+    list_later_configurations: Callable[
+        [ReplayInputs], Sequence[FilterConfiguration]
+    ] = lambda _: (),
     failed_agreement_by_aid: Mapping[str, Agreement] = MappingProxyType({}),
 ) -> Ekf2Model | Unavailable:
     """Prepare EKF2 replays of a flight, and replay the flight with the logged parameters.
@@ -123,15 +122,12 @@ def prepare_ekf2_model(
     if inputs.aid == GNSS_POS and isinstance(flight.ekf2, Ekf2):
         flight = replace(flight, ekf2=replace_vision_by_gnss_innovations(flight.ekf2))
     baseline_configuration = FilterConfiguration(inputs.settings)
-    delays = baseline_configuration.compute_delays(inputs)
-    intervals = tuple(make_event_intervals(inputs, segment, delays) for segment in inputs.segments)
     segments = tuple(estimate_state_correlation(inputs, segment) for segment in inputs.segments)
     inputs = replace(inputs, segments=segments)
     configurations = [baseline_configuration]
     for configuration in list_later_configurations(inputs):
         configurations += [] if configuration in configurations else [configuration]
-    event_intervals_by_delays = {delays: intervals}
-    runs = run_configurations(inputs, configurations, event_intervals_by_delays)
+    runs = run_configurations(inputs, configurations)
     baseline_replay = _make_replay(inputs, runs, baseline_configuration, {})
     agreement = compare_with_log(flight, baseline_replay)
     if isinstance(agreement, Unavailable):
@@ -142,9 +138,7 @@ def prepare_ekf2_model(
             list_later_configurations,
             {**failed_agreement_by_aid, **dict.fromkeys(further_omitted_aids, agreement)},
         )
-    model = Ekf2Model(
-        flight, inputs, event_intervals_by_delays, baseline_replay, agreement, tuple(runs)
-    )
+    model = Ekf2Model(flight, inputs, baseline_replay, agreement, tuple(runs))
     if (
         max(agreement.rejected_fraction_logged, agreement.rejected_fraction_replayed)
         > MAX_REJECTED_FRACTION_FOR_COMPARISON
@@ -328,9 +322,8 @@ def misalign_positions(model: Ekf2Model, rotation_deg: float, delay_s: float) ->
         position_m=received_positions.position_m @ rotation_matrix,
         velocity_m_s=None if velocity_m_s is None else velocity_m_s @ rotation_matrix,
     )
-    intervals = {} if delay_s else model.event_intervals_by_delays
     inputs = replace(model.inputs, received_positions=received_positions)
-    return replace(model, inputs=inputs, event_intervals_by_delays=intervals, runs=())
+    return replace(model, inputs=inputs, runs=())
 
 
 def compute_delayed_tracks(
@@ -352,23 +345,20 @@ def _run_model(
         configuration in model.runs[0].configurations for configuration in configurations
     ):
         return model.runs
-    return run_configurations(model.inputs, configurations, model.event_intervals_by_delays)
+    return run_configurations(model.inputs, configurations)
 
 
 def run_configurations(
-    inputs: ReplayInputs,
-    configurations: Sequence[FilterConfiguration],
-    event_intervals_by_delays: Mapping[FusionDelays, Sequence[EventIntervals]],
+    inputs: ReplayInputs, configurations: Sequence[FilterConfiguration]
 ) -> list[SegmentRun]:
     """Run several filter configurations; return the results of each flight segment."""
     delays_by_configuration = [
         configuration.compute_delays(inputs) for configuration in configurations
     ]
-    intervals_by_delays = dict(event_intervals_by_delays)
-    for delays in set(delays_by_configuration) - intervals_by_delays.keys():
-        intervals_by_delays[delays] = [
-            make_event_intervals(inputs, segment, delays) for segment in inputs.segments
-        ]
+    intervals_by_delays = {
+        delays: [make_event_intervals(inputs, segment, delays) for segment in inputs.segments]
+        for delays in set(delays_by_configuration)
+    }
     return [
         run_segment(inputs, segment, configurations, intervals)
         for segment, *intervals in zip(

@@ -12,7 +12,7 @@ from collections.abc import Mapping
 import numpy as np
 from scipy.linalg import lapack
 
-from px4fuse.core.arrays import Array, iterate_row_blocks
+from px4fuse.core.arrays import Array
 from px4fuse.ekf2.replay_segments import (
     ACCELEROMETER_BIAS,
     GRAVITY_M_S2,
@@ -117,17 +117,10 @@ def sum_attitude_corrections(
 
 
 def _apply_recursive_filter(numerator: Array, denominator: Array, values: Array) -> Array:
-    """Apply a recursive (IIR) filter by solving banded triangular systems (LAPACK dtbtrs)."""
+    """Apply a recursive (IIR) filter by solving a banded triangular system (LAPACK dtbtrs)."""
     value_count = len(values)
-    filtered_values = np.zeros(values.shape)
+    weighted_sums = np.zeros(values.shape)
     for delay in np.flatnonzero(numerator[:value_count]).tolist():
-        filtered_values[delay:] += numerator[delay] * values[: value_count - delay]
-    for rows in iterate_row_blocks(value_count):
-        block = filtered_values[rows]
-        if rows.start:
-            for delay in (1 + np.flatnonzero(denominator[1:])).tolist():
-                earlier_output = filtered_values[rows.start - delay : rows.start][: len(block)]
-                block[:delay] -= denominator[delay] * earlier_output
-        bands = np.tile(denominator, (len(block), 1)).T
-        block[:] = lapack.dtbtrs(bands, block, uplo="L")[0]
-    return filtered_values
+        weighted_sums[delay:] += numerator[delay] * values[: value_count - delay]
+    bands = np.tile(denominator, (value_count, 1)).T
+    return np.asarray(lapack.dtbtrs(bands, weighted_sums, uplo="L")[0])

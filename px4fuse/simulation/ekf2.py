@@ -190,7 +190,7 @@ def simulate_ekf2(
         aid=aid,
         max_fusion_interval_in_gap_s=MAX_FUSION_INTERVAL_IN_GAP_S,
     )
-    model_run = run_configurations(inputs, [FilterConfiguration(settings)], {})[0]
+    model_run = run_configurations(inputs, [FilterConfiguration(settings)])[0]
     ekf2_output = _compute_output(inputs, model_run, time_us, true_quaternions)
     return make_ekf2_topics(
         inputs,
