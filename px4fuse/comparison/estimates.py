@@ -30,8 +30,8 @@ from px4fuse.filter.hypotheses import (
     fit_systematic_errors,
 )
 from px4fuse.filter.imu_motion import MAX_IMU_INTERVAL_S
-from px4fuse.filter.marginal_likelihood import NoiseParameters
 from px4fuse.filter.imu_oscillation import find_imu_oscillation
+from px4fuse.filter.marginal_likelihood import NoiseParameters
 from px4fuse.filter.signals import AISLE, Axis
 from px4fuse.filter.time_offset import (
     MAX_OFFSET_INTERVAL_HALF_WIDTH_S,
