@@ -13,12 +13,12 @@ import pytest
 from failing_jobs import run_job
 
 from px4fuse.core import workers
-from px4fuse.core.workers import MAX_MEMORY_BYTES, JobFailure, run_with_limits
+from px4fuse.core.workers import JobFailure, run_with_limits
 
 MEMORY = 1_500_000_000
 
 
-def run(jobs, processes=2, timeout_s=60.0, max_memory_bytes=MAX_MEMORY_BYTES):
+def run(jobs, processes=2, timeout_s=60.0, max_memory_bytes=None):
     outcomes = list(
         run_with_limits(
             run_job,
@@ -105,7 +105,9 @@ def test_all_jobs_fail_if_worker_cannot_import_the_function(monkeypatch):
 
 def test_closing_the_worker_pool_ends_all_processes():
     jobs = [("square", 1), ("hang", 0)]
-    with closing(run_with_limits(run_job, jobs, process_count=2, timeout_s=60)) as work:
+    with closing(
+        run_with_limits(run_job, jobs, process_count=2, timeout_s=60, max_memory_bytes=None)
+    ) as work:
         assert next(work) == (0, 1)
     assert not multiprocessing.active_children()
 
@@ -118,7 +120,7 @@ from failing_jobs import run_job
 
 if __name__ == "__main__":
     for _, result in run_with_limits(run_job, [("process", 0), ("hang", 0)], process_count=1,
-                                     timeout_s=500):
+                                     timeout_s=500, max_memory_bytes=None):
         print(result, flush=True)
 """
 
@@ -153,7 +155,7 @@ def test_worker_with_closed_pipe_ends_without_traceback():
         from px4fuse.core.workers import _run_worker
         parent, worker = Pipe()
         parent.close()
-        _run_worker(worker, len, -1)
+        _run_worker(worker, len, None)
     """
     done = subprocess.run(
         [sys.executable, "-c", script], capture_output=True, timeout=60, check=False

@@ -112,16 +112,6 @@ class SignedAxisPermutation(NamedTuple):
         ]
         return directions[0], directions[1], directions[2]
 
-    def align(self, vectors: Array) -> Array:
-        """Return the first horizontal, the second horizontal and the down component of x, y, z.
-
-        The second horizontal component is along 90° clockwise from the first.
-        """
-        aligned = vectors[
-            :, [self.first_horizontal_axis, self.second_horizontal_axis, self.vertical_axis]
-        ]
-        return np.asarray(aligned * [1.0, self.handedness, self.vertical_sign])
-
     def compute_log_prior_odds(self, quarter_turns: int) -> float:
         axes = self.compute_axis_directions(quarter_turns)
         uncommon_axes_log_odds = -2.0 if self.vertical_axis == 2 or axes[1] == "up" else -4.0
@@ -287,15 +277,6 @@ def find_convention_candidates(
     source_mean_square = np.maximum(moments[:, 3:6, 6], 1e-12)
     imu_mean_square_m2 = moments[:, 6, 3:6]
     metres_per_unit = np.array([*METRES_PER_UNIT.values()])
-
-    def compute_residuals_m2(source_square: Array, imu_square_m2: Array, product: Array) -> Array:
-        """Return the mean squared residuals for each time offset and unit."""
-        return np.asarray(
-            metres_per_unit**2 * source_square[:, None]
-            + imu_square_m2[:, None]
-            - 2.0 * metres_per_unit * product[:, None]
-        )
-
     # If z is constant, the source measures no height, and z is the vertical axis
     has_heights = source_motion.second_differences[:, 2].any()
     hypotheses = []
@@ -305,15 +286,23 @@ def find_convention_candidates(
             continue
         correlation = moments[:, first, 0] + handedness * moments[:, second, 1]
         correlation = correlation + 1j * (moments[:, first, 1] - handedness * moments[:, second, 0])
-        horizontal_residual_m2 = compute_residuals_m2(
-            source_mean_square[:, [first, second]].sum(axis=1),
-            imu_mean_square_m2[:, :2].sum(axis=1),
-            np.abs(correlation),
-        )
-        down_residual_m2 = compute_residuals_m2(
-            source_mean_square[:, vertical],
-            imu_mean_square_m2[:, 2],
-            vertical_sign * moments[:, vertical, 2],
+        # Mean squared residuals for each time offset and unit
+        horizontal_residual_m2, down_residual_m2 = (
+            metres_per_unit**2 * source_square[:, None]
+            + imu_square_m2[:, None]
+            - 2.0 * metres_per_unit * product[:, None]
+            for source_square, imu_square_m2, product in (
+                (
+                    source_mean_square[:, first] + source_mean_square[:, second],
+                    imu_mean_square_m2[:, 0] + imu_mean_square_m2[:, 1],
+                    np.abs(correlation),
+                ),
+                (
+                    source_mean_square[:, vertical],
+                    imu_mean_square_m2[:, 2],
+                    vertical_sign * moments[:, vertical, 2],
+                ),
+            )
         )
         score = (
             np.sum(np.log(source_mean_square), axis=1)[:, None]
@@ -402,13 +391,24 @@ def _evaluate_hypothesis(
         grid_index
     ] + grid_fraction * imu_motion.table[grid_index + 1]
     unconverted_second_differences = source_motion.second_differences[rows[is_used]]
-    metres_per_unit = METRES_PER_UNIT[hypothesis.unit]
-    source_second_difference_m = metres_per_unit * hypothesis.axis_permutation.align(
-        unconverted_second_differences
+    vertical_axis, vertical_sign, first_horizontal_axis, second_horizontal_axis, handedness = (
+        hypothesis.axis_permutation
     )
-    north_east_m = source_second_difference_m[:, :2] @ [1.0, 1j]
-    north_east_m *= np.exp(1j * (rotation_rad + heading_drift_rad_s * elapsed_s))
-    source_second_difference_m[:, :2] = np.column_stack([north_east_m.real, north_east_m.imag])
+    metres_per_unit = METRES_PER_UNIT[hypothesis.unit]
+    complex_rotation = metres_per_unit * np.exp(
+        1j * (rotation_rad + heading_drift_rad_s * elapsed_s)
+    )
+    complex_second_difference_m = complex_rotation * (
+        unconverted_second_differences[:, first_horizontal_axis]
+        + 1j * handedness * unconverted_second_differences[:, second_horizontal_axis]
+    )
+    source_second_difference_m = np.column_stack(
+        [
+            complex_second_difference_m.real,
+            complex_second_difference_m.imag,
+            metres_per_unit * vertical_sign * unconverted_second_differences[:, vertical_axis],
+        ]
+    )
     imu_second_difference_m = (
         imu_table_rows[..., 0] - imu_table_rows[..., 1:] @ hypothesis.parameters[4:]
     )
@@ -422,43 +422,52 @@ def _evaluate_hypothesis(
     )
     # Omit a constant axis (for example without heights) from the likelihood
     is_axis_known = unconverted_second_differences.any(axis=0)
-    log_likelihood_gain += (
-        vertical_log_likelihood * is_axis_known[hypothesis.axis_permutation.vertical_axis]
-        + np.log(metres_per_unit) * np.count_nonzero(is_axis_known)
-        - sum(
-            fit_student_distribution(column**2, 1, 1e-6)[0]
-            for column in unconverted_second_differences.T[is_axis_known]
-        )
+    log_likelihood_gain += vertical_log_likelihood * is_axis_known[vertical_axis] + np.log(
+        metres_per_unit
+    ) * np.count_nonzero(is_axis_known)
+    log_likelihood_gain -= sum(
+        fit_student_distribution(column**2, 1, 1e-6)[0]
+        for column in unconverted_second_differences.T[is_axis_known]
     )
     weight = 1.0 / (
         np.array([[sigma_m**2], [sigma_down_m**2]]) + residual_squares / STUDENT_DEGREES_OF_FREEDOM
     )
     weight *= row_interval_s / SECOND_DIFFERENCE_WINDOW_S
-    source_m, imu_m = source_second_difference_m[:, :2], imu_second_difference_m[:, :2]
     source_square_sum, source_imu_product_sum, imu_square_sum = (
-        float(np.sum(weight[0] @ products_m2))
-        for products_m2 in (source_m**2, source_m * imu_m, imu_m**2)
+        float(np.sum(weight[0] @ (first * second)[:, :2]))
+        for first, second in (
+            (source_second_difference_m, source_second_difference_m),
+            (source_second_difference_m, imu_second_difference_m),
+            (imu_second_difference_m, imu_second_difference_m),
+        )
     )
     # Without motion, axes and unit cannot be determined
     if 0.0 in (source_square_sum, source_imu_product_sum, imu_square_sum):
         return rejected_result
-    # Columns of fixed parameters are zero
     jacobian = np.zeros((len(grid_index), 3, len(PARAMETER_PRIOR_PRECISION)))
     jacobian[..., 0] = imu_motion.second_difference_derivative_m_s[grid_index]
-    jacobian[:, 0, 1] = -north_east_m.imag
-    jacobian[:, 1, 1] = north_east_m.real
-    if hypothesis.heading_from != "EKF2":
-        jacobian[..., 2] = jacobian[..., 1] * elapsed_s[:, None]
-    if hypothesis.has_clock_drift:
-        jacobian[..., 3] = jacobian[..., 0] * (time_s - mean_time_s)[:, None]
-    jacobian[..., 1] *= hypothesis.has_rotation
-    jacobian[..., 4:] = imu_table_rows[..., 1:]
-    columns = jacobian.reshape(-1, jacobian.shape[2])
-    weighted_columns = columns.T * weight[[0, 0, 1]].T.ravel()
-    parameter_step = -np.linalg.solve(
-        weighted_columns @ columns + np.diag(PARAMETER_PRIOR_PRECISION + 1e-9),
-        weighted_columns @ residual.ravel() + PARAMETER_PRIOR_PRECISION * hypothesis.parameters,
+    jacobian[:, 0, 1], jacobian[:, 1, 1] = (
+        -complex_second_difference_m.imag,
+        complex_second_difference_m.real,
     )
+    jacobian[..., 2] = jacobian[..., 1] * elapsed_s[:, None]
+    jacobian[..., 3] = jacobian[..., 0] * (time_s - mean_time_s)[:, None]
+    jacobian[..., 4:] = imu_table_rows[..., 1:]
+    uses_gyro_heading = hypothesis.heading_from != "EKF2"
+    is_parameter_estimated = np.array(
+        [True, hypothesis.has_rotation, uses_gyro_heading, hypothesis.has_clock_drift, *[True] * 3]
+    )
+    columns = jacobian[..., is_parameter_estimated].reshape(-1, is_parameter_estimated.sum())
+    weighted_design_columns = columns.T * weight[[0, 0, 1]].T.ravel()
+    normal_matrix = weighted_design_columns @ columns + np.diag(
+        PARAMETER_PRIOR_PRECISION[is_parameter_estimated] + 1e-9
+    )
+    gradient = (
+        weighted_design_columns @ residual.ravel()
+        + (PARAMETER_PRIOR_PRECISION * hypothesis.parameters)[is_parameter_estimated]
+    )
+    parameter_step = np.zeros(len(PARAMETER_PRIOR_PRECISION))
+    parameter_step[is_parameter_estimated] = -np.linalg.solve(normal_matrix, gradient)
     parameter_step[0] = np.clip(parameter_step[0], -MAX_TIME_OFFSET_STEP_S, MAX_TIME_OFFSET_STEP_S)
     scored_hypothesis = replace(
         hypothesis,
@@ -521,7 +530,8 @@ def _compute_height_log_likelihood_ratio(
     height_m = np.interp(positions.time_s - hypothesis.delay_s, time_s, barometer_height_m)
     down_m = (
         METRES_PER_UNIT[hypothesis.unit]
-        * (hypothesis.axis_permutation.align(positions.position_m)[:, 2])
+        * hypothesis.axis_permutation.vertical_sign
+        * positions.position_m[:, hypothesis.axis_permutation.vertical_axis]
     )
     # down + height is constant for a correct hypothesis
     error_m = down_m - np.median(down_m) + height_m - np.median(height_m)

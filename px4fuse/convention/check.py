@@ -188,8 +188,14 @@ def _rotate_to_gnss(
     )
     if np.count_nonzero(is_between_source_samples) < MIN_GNSS_POSITIONS:
         return hypothesis
-    aligned_positions = hypothesis.axis_permutation.align(positions.position_m)
-    source_position_m = METRES_PER_UNIT[hypothesis.unit] * aligned_positions[:, :2] @ [1.0, 1j]
+    sent_position_m = METRES_PER_UNIT[hypothesis.unit] * positions.position_m
+    axis_permutation = hypothesis.axis_permutation
+    source_position_m = (
+        sent_position_m[:, axis_permutation.first_horizontal_axis]
+        + 1j
+        * axis_permutation.handedness
+        * sent_position_m[:, axis_permutation.second_horizontal_axis]
+    )
     velocity_m_s = np.interp(time_s, source_time_s, np.gradient(source_position_m, source_time_s))
     columns = np.column_stack([np.interp(time_s, source_time_s, source_position_m), velocity_m_s])[
         is_between_source_samples

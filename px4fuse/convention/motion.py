@@ -16,9 +16,9 @@ from scipy import constants
 from scipy.ndimage import uniform_filter1d
 
 from px4fuse.convention.model import HeadingSource
-from px4fuse.core.arrays import Array, BoolArray
+from px4fuse.core.arrays import Array, BoolArray, integrate_cumulatively
 from px4fuse.ekf2.replay import is_inside_spans
-from px4fuse.filter.signals import Segment, find_imu_gaps, integrate_imu
+from px4fuse.filter.signals import Segment, find_imu_gaps
 from px4fuse.flight.model import Columns, Flight, Unavailable
 from px4fuse.trajectory.association import choose_gap_limit_s, is_bracketed
 from px4fuse.trajectory.rotation import (
@@ -150,11 +150,15 @@ def integrate_inertial_data(flight: Flight) -> InertialData | None:
     )
     if len(time_s) < 4 * SECOND_DIFFERENCE_WINDOW_S / INTEGRATION_STEP_S:
         return None
-    force_integral_m_s, rotation_rad = integrate_imu(imu, time_s)
-    specific_force_m_s2 = force_integral_m_s / INTEGRATION_STEP_S
+    columns = [*Columns.SPECIFIC_FORCE, *Columns.ANGULAR_RATE]
+    imu_integrals = (integrate_cumulatively(imu[name].to_numpy(), imu_times_s) for name in columns)
+    imu_increments = np.diff(
+        [np.interp(time_s, imu_times_s, integral) for integral in imu_integrals]
+    ).T
+    specific_force_m_s2 = imu_increments[:, :3] / INTEGRATION_STEP_S
     logged_attitude = interpolate(time_s, attitude_times_s, attitude[Columns.QUATERNION].to_numpy())
     gyro_attitude = _level_attitude(
-        _integrate_gyros(rotation_rad, logged_attitude), specific_force_m_s2
+        _integrate_gyros(imu_increments[:, 3:], logged_attitude), specific_force_m_s2
     )
     airborne_spans_s = flight.airborne
     if isinstance(airborne_spans_s, Unavailable):
@@ -247,10 +251,13 @@ def integrate_imu_motion(inertial_data: InertialData, attitude: Array) -> ImuSec
         [constants.g],
     ]
     table = np.concatenate([acceleration, body_to_ned], axis=2)
-    # Trapezoidal rule
     position_m = np.zeros((len(attitude), 3, 4))
-    displacement_m = INTEGRATION_STEP_S**2 * (np.cumsum(table, axis=0) - table / 2.0)
-    position_m[1:] = np.cumsum(displacement_m, axis=0)
+    # Trapezoidal rule, in place to limit memory
+    displacement_m = np.cumsum(table, axis=0)
+    table /= 2.0
+    displacement_m -= table
+    displacement_m *= INTEGRATION_STEP_S**2
+    np.cumsum(displacement_m, axis=0, out=position_m[1:])
     window_steps = round(SECOND_DIFFERENCE_WINDOW_S / INTEGRATION_STEP_S)
     stride = round(GRID_INTERVAL_S / INTEGRATION_STEP_S)
     second_differences = compute_second_differences(position_m, window_steps)[::stride]

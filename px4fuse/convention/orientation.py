@@ -113,9 +113,10 @@ def check_orientation(
             QUATERNION_ORDERS, QUATERNIONS_BY_FRAMES, range(4)
         )
     ]
-    best_candidate = max(candidates, key=lambda candidate: candidate.score)
-    second_best_score = max(
-        candidate.score
+    candidates.sort(key=lambda candidate: -candidate.score)
+    best_candidate = candidates[0]
+    second_best_candidate = next(
+        candidate
         for candidate in candidates
         if candidate.order_and_heading_free_frames != best_candidate.order_and_heading_free_frames
     )
@@ -125,7 +126,7 @@ def check_orientation(
         or best_candidate.heading_difference_deg > MAX_HEADING_DIFFERENCE_DEG
     ):
         orientation_convention = replace(orientation_convention, verdict="unrelated")
-    elif best_candidate.score - second_best_score < MIN_CONVENTION_SCORE_LEAD:
+    elif best_candidate.score - second_best_candidate.score < MIN_CONVENTION_SCORE_LEAD:
         orientation_convention = replace(orientation_convention, verdict="ambiguous")
     return (
         orientation_convention,

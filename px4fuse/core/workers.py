@@ -46,7 +46,7 @@ class _Worker:
     """Worker process with its current job, and the pipe for jobs and results."""
 
     def __init__(
-        self, function: Callable[[Any], Any], max_memory_bytes: int, job_index: int
+        self, function: Callable[[Any], Any], max_memory_bytes: int | None, job_index: int
     ) -> None:
         # spawn works on all systems and does not copy the memory of this process
         context = multiprocessing.get_context("spawn")
@@ -96,7 +96,7 @@ def run_with_limits(
     *,
     process_count: int | None = None,
     timeout_s: float = JOB_TIMEOUT_S,
-    max_memory_bytes: int = MAX_MEMORY_BYTES,
+    max_memory_bytes: int | None = MAX_MEMORY_BYTES,
 ) -> Generator[tuple[int, Result | JobFailure]]:
     """Call a function on every job in worker processes, with limits of time and memory.
 
@@ -110,8 +110,8 @@ def run_with_limits(
         Number of parallel processes; by default the number of cores.
     timeout_s : float
         Maximum time for one job.
-    max_memory_bytes : int
-        Maximum address space of one process on Linux.
+    max_memory_bytes : int or None
+        Maximum address space of one process on Linux; None for no limit.
 
     Yields
     ------
@@ -129,7 +129,7 @@ def poll_with_limits(
     jobs: Sequence[Job],
     process_count: int | None,
     timeout_s: float,
-    max_memory_bytes: int,
+    max_memory_bytes: int | None,
     max_wait_s: float = math.inf,
 ) -> Generator[tuple[int, Result | JobFailure] | None]:
     """Yield the results of jobs, and None if no job ends within ``max_wait_s``."""
@@ -207,7 +207,9 @@ def _receive_result(worker: _Worker) -> tuple[bool, Any]:
     return message
 
 
-def _run_worker(pipe: Connection, function: Callable[[Any], Any], max_memory_bytes: int) -> None:
+def _run_worker(
+    pipe: Connection, function: Callable[[Any], Any], max_memory_bytes: int | None
+) -> None:
     """Receive and run jobs in a worker process, until its pipe is closed."""
     # the parent process handles Ctrl-C and ends its worker processes
     signal.signal(signal.SIGINT, signal.SIG_IGN)
@@ -240,12 +242,13 @@ def _end_with_parent() -> None:
         os._exit(1)
 
 
-def _limit_memory(max_memory_bytes: int) -> None:
+def _limit_memory(max_memory_bytes: int | None) -> None:
     try:
         import resource  # noqa: PLC0415 - not on Windows
     except ImportError:
         return
     # no core dump, which would contain data of a student
     for resource_kind, limit in ((resource.RLIMIT_CORE, 0), (resource.RLIMIT_AS, max_memory_bytes)):
-        with suppress(ValueError, OSError):  # macOS rejects some limits
-            resource.setrlimit(resource_kind, (limit, limit))
+        if limit is not None:
+            with suppress(ValueError, OSError):  # macOS rejects some limits
+                resource.setrlimit(resource_kind, (limit, limit))

@@ -17,7 +17,6 @@ from itertools import product
 import numpy as np
 import pandas as pd
 from scipy.interpolate import CubicSpline
-from scipy.linalg import null_space
 from scipy.optimize import minimize_scalar
 
 from px4fuse.core.arrays import Array
@@ -326,7 +325,9 @@ def fit_time_correlation_to_truth(
     systematic_error_columns = np.column_stack(
         [np.ones_like(measurement_time_s), true_m, time_offset_columns, jump_columns]
     )
-    basis_without_systematic_errors = null_space(systematic_error_columns.T)
+    basis_without_systematic_errors = np.linalg.qr(systematic_error_columns, mode="complete")[0][
+        :, systematic_error_columns.shape[1] :
+    ]
     residuals = basis_without_systematic_errors.T @ (measured_m - true_m)
     if np.abs(residuals).max() < MAX_RESIDUAL_OF_COPIED_TRUTH_M:
         return noise_from_imu

@@ -88,7 +88,7 @@ class Jump:
 
     @property
     def size_m(self) -> float:
-        return math.hypot(*(step.value for step in self.step_m))
+        return float(np.hypot.reduce([step.value for step in self.step_m]))
 
 
 @dataclass(frozen=True)
@@ -188,10 +188,13 @@ def fit_systematic_errors(
     if jumps:
         design_matrix = replace(design_matrix, jump_times_s=[jump.time_s for jump in jumps])
         design_matrix, regression = _fit_sigma_a(design_matrix, tested_sigmas_a, is_skipped)
+    forward_bias_m_s2, right_bias_m_s2, frame_rotation_rad = map(
+        regression.estimate, (FORWARD_BIAS_COLUMN, RIGHT_BIAS_COLUMN, FRAME_ROTATION_COLUMN)
+    )
     return SystematicErrors(
-        regression.estimate(FORWARD_BIAS_COLUMN),
-        regression.estimate(RIGHT_BIAS_COLUMN),
-        regression.estimate(FRAME_ROTATION_COLUMN),
+        forward_bias_m_s2,
+        right_bias_m_s2,
+        frame_rotation_rad,
         _fit_scale(design_matrix, is_skipped),
         jumps,
         design_matrix.sigma_a_m_s2,

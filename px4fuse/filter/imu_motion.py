@@ -24,7 +24,7 @@ from px4fuse.core.arrays import (
     Array,
     IntArray,
     compute_median_interval_s,
-    cumulative_sums,
+    integrate_cumulatively,
 )
 from px4fuse.core.record import Span
 from px4fuse.filter.marginal_likelihood import (
@@ -35,7 +35,7 @@ from px4fuse.filter.marginal_likelihood import (
     subtract_smooth_path,
 )
 from px4fuse.filter.model import compute_continuous_process_noise_per_density
-from px4fuse.filter.signals import find_imu_gaps, integrate_imu
+from px4fuse.filter.signals import find_imu_gaps
 from px4fuse.flight.model import Columns, Flight, Unavailable, rows_between
 from px4fuse.trajectory.rotation import (
     conjugate,
@@ -324,29 +324,23 @@ def make_segment_motion(
     imu = rows_between(
         imu, imu_span_s[0] - 2 * INTEGRATION_STEP_S, imu_span_s[1] + 2 * INTEGRATION_STEP_S
     )
-    step_times_s = np.arange(imu.index[0], imu.index[-1], INTEGRATION_STEP_S)
-    force_integral_m_s, rotation_rad = integrate_imu(imu, step_times_s)
-    rotation_rad -= INTEGRATION_STEP_S * _estimate_large_gyro_bias(
-        step_times_s, rotation_rad, attitude
+    imu_time_s = imu.index.to_numpy()
+    step_times_s = np.arange(imu_time_s[0], imu_time_s[-1], INTEGRATION_STEP_S)
+    specific_force_integral_m_s, gyro_integral_rad = (
+        _interpolate_columns(
+            step_times_s, imu_time_s, integrate_cumulatively(imu[columns].to_numpy(), imu_time_s)
+        )
+        for columns in (Columns.SPECIFIC_FORCE, Columns.ANGULAR_RATE)
     )
-    # Integrate the gyroscopes from the logged attitude at the start
-    row = int(np.searchsorted(attitude.index, step_times_s[0]))
-    nearby_attitude = attitude.iloc[max(row - 2, 0) : row + 3]
-    start_quaternion = interpolate(
-        step_times_s[:1],
-        nearby_attitude.index.to_numpy(),
-        nearby_attitude[Columns.QUATERNION].to_numpy(),
-    )
-    attitude_quaternion = cumulative_product(
-        np.concatenate([start_quaternion, from_rotation_vector(rotation_rad)])
-    )
+    gyro_bias_rad_s = _estimate_large_gyro_bias(step_times_s, gyro_integral_rad, attitude)
+    rotation_rad = np.diff(gyro_integral_rad, axis=0) - INTEGRATION_STEP_S * gyro_bias_rad_s
+    attitude_quaternion = _integrate_gyros(step_times_s[0], rotation_rad, attitude)
     # The mean specific force of each step is rotated by the attitude in the middle of the step
+    mean_specific_force_m_s2 = np.diff(specific_force_integral_m_s, axis=0) / INTEGRATION_STEP_S
     body_to_ned = to_matrix(
         multiply(attitude_quaternion[:-1], from_rotation_vector(rotation_rad / 2.0))
     )
-    specific_force_ned_m_s2 = (
-        rotate(body_to_ned, force_integral_m_s)[:, :, None] / INTEGRATION_STEP_S
-    )
+    specific_force_ned_m_s2 = rotate(body_to_ned, mean_specific_force_m_s2)[:, :, None]
     motion_and_derivatives = np.zeros(
         (len(body_to_ned), 2, 3, len(PRIOR_SIGMAS_OF_SEGMENT_CONSTANTS))
     )
@@ -369,8 +363,12 @@ def make_segment_motion(
     return SegmentMotion(step_times_s[:-1], motion_and_derivatives)
 
 
+def _interpolate_columns(times_s: Array, known_times_s: Array, columns: Array) -> Array:
+    return np.column_stack([np.interp(times_s, known_times_s, column) for column in columns.T])
+
+
 def _estimate_large_gyro_bias(
-    step_times_s: Array, rotation_rad: Array, attitude: pd.DataFrame
+    step_times_s: Array, gyro_integral_rad: Array, attitude: pd.DataFrame
 ) -> Array:
     """Return a large gyro bias (rad/s), estimated from the logged attitude.
 
@@ -381,13 +379,8 @@ def _estimate_large_gyro_bias(
     if len(samples) < MIN_KEPT_MEASUREMENTS:
         return np.zeros(3)
     attitude_time_s, quaternions = samples.index.to_numpy(), samples.to_numpy()
-    gyro_rotation_rad = np.column_stack(
-        [
-            np.diff(np.interp(attitude_time_s, step_times_s, angle_rad))
-            for angle_rad in cumulative_sums(rotation_rad).T
-        ]
-    )
-    rotation_difference_rad = gyro_rotation_rad - to_rotation_vector(
+    gyro_angle_rad = _interpolate_columns(attitude_time_s, step_times_s, gyro_integral_rad)
+    rotation_difference_rad = np.diff(gyro_angle_rad, axis=0) - to_rotation_vector(
         multiply(conjugate(quaternions[:-1]), quaternions[1:])
     )
     bias_rad_s = np.asarray(
@@ -397,3 +390,19 @@ def _estimate_large_gyro_bias(
         MAX_PRIOR_GYRO_BIAS_RAD_S < np.abs(bias_rad_s).max() <= MAX_REMOVED_GYRO_BIAS_RAD_S
     )
     return bias_rad_s if is_bias_removed else np.zeros(3)
+
+
+def _integrate_gyros(start_s: float, rotation_rad: Array, attitude: pd.DataFrame) -> Array:
+    """Integrate rotations from the gyroscopes to attitudes, starting at the logged attitude.
+
+    The attitudes are quaternions from body to NED, w first.
+    """
+    row = int(np.searchsorted(attitude.index, start_s))
+    nearby_samples = attitude.iloc[max(row - 2, 0) : row + 3]
+    start_quaternion = interpolate(
+        np.array([start_s]),
+        nearby_samples.index.to_numpy(),
+        nearby_samples[Columns.QUATERNION].to_numpy(),
+    )
+    rotation_since_start = cumulative_product(from_rotation_vector(rotation_rad))
+    return np.vstack([start_quaternion, multiply(start_quaternion, rotation_since_start)])

@@ -11,7 +11,7 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.special import chdtri
 
-from px4fuse.core.arrays import Array, ArrayPair, BoolArray
+from px4fuse.core.arrays import Array, ArrayPair, BoolArray, IntArray
 from px4fuse.filter.model import (
     INITIAL_COVARIANCE,
     compute_process_noise_per_density,
@@ -60,45 +60,76 @@ def preintegrate(axis: Axis, settings: Settings) -> PreintegratedMotion:
     SettingsError
         ``settings.input`` is "imu" and the axis has no acceleration.
     """
-    steps = make_prediction_steps(axis, settings)
+    prediction_steps = make_prediction_steps(axis, settings)
+    last_steps, interval_index, time_from_step_to_interval_end_s = _assign_steps_to_intervals(
+        prediction_steps
+    )
+    step_times_s = prediction_steps.time_s
     process_noise_per_sigma_a_squared = settings.dt_s * np.stack(
         propagate_covariance(
-            compute_process_noise_per_density(np.diff(steps.time_s)), steps.time_to_interval_end_s
+            compute_process_noise_per_density(np.diff(step_times_s)),
+            time_from_step_to_interval_end_s,
         ),
         1,
     )
-    dp, dv = integrate_acceleration(steps, steps.acceleration_m_s2)
+    dp, dv = integrate_acceleration(prediction_steps, prediction_steps.acceleration_m_s2)
 
     def sum_by_interval(values: Array) -> Array:
-        return np.stack([np.bincount(steps.interval_index, column) for column in values.T], 1)
+        return np.stack([np.bincount(interval_index, column) for column in values.T], 1)
 
     return PreintegratedMotion(
-        interval_s=np.diff(steps.time_s[np.append(0, steps.last_steps)]),
+        interval_s=np.diff(step_times_s[np.append(0, last_steps)]),
         delta_position_m=dp,
         delta_velocity_m_s=dv,
         process_noise_per_sigma_a_squared=sum_by_interval(process_noise_per_sigma_a_squared),
         process_noise_independent_of_sigma_a=sum_by_interval(
-            process_noise_per_sigma_a_squared * steps.input_variance_m2_s4[:, None]
+            process_noise_per_sigma_a_squared * prediction_steps.input_variance_m2_s4[:, None]
         ),
-        measurement_m=axis.measurement_m[steps.measurement_index[steps.last_steps]],
-        initial_state=InitialState(float(steps.time_s[0]), float(axis.measurement_m[0])),
+        measurement_m=axis.measurement_m[prediction_steps.measurement_index[last_steps]],
+        initial_state=InitialState(float(step_times_s[0]), float(axis.measurement_m[0])),
     )
 
 
-def integrate_acceleration(steps: PredictionSteps, acceleration_m_s2: Array) -> ArrayPair:
+def integrate_acceleration(
+    prediction_steps: PredictionSteps, acceleration_m_s2: Array
+) -> ArrayPair:
     """Integrate an acceleration over the intervals between measurements: Δp (m) and Δv (m/s).
 
     ``acceleration_m_s2`` contains the acceleration in each prediction step.
     """
-    zeros = np.zeros(len(acceleration_m_s2))
-    position_and_velocity = propagate_state(zeros, zeros, acceleration_m_s2, np.diff(steps.time_s))
-    dp, dv = (
-        np.bincount(steps.interval_index, increment).astype(float)
-        for increment in propagate_state(
-            *position_and_velocity, zeros, steps.time_to_interval_end_s
-        )
+    _, interval_index, time_from_step_to_interval_end_s = _assign_steps_to_intervals(
+        prediction_steps
     )
+    zeros = np.zeros(len(time_from_step_to_interval_end_s))
+    dp, dv = propagate_state(
+        *propagate_state(zeros, zeros, acceleration_m_s2, np.diff(prediction_steps.time_s)),
+        zeros,
+        time_from_step_to_interval_end_s,
+    )
+    dp, dv = (np.bincount(interval_index, increment).astype(float) for increment in (dp, dv))
     return dp, dv
+
+
+def _assign_steps_to_intervals(
+    prediction_steps: PredictionSteps,
+) -> tuple[IntArray, IntArray, Array]:
+    """Assign each prediction step to an interval between measurements.
+
+    Returns
+    -------
+    last_steps : ndarray
+        Index of the last step of each interval.
+    interval_index : ndarray
+        Index of the interval that contains each step.
+    time_from_step_to_interval_end_s : ndarray
+        Time from the end of each step to the end of its interval.
+    """
+    last_steps = np.flatnonzero(prediction_steps.measurement_index >= 0)
+    interval_index = np.searchsorted(last_steps, np.arange(1, len(prediction_steps.time_s)))
+    time_from_step_to_interval_end_s = (
+        prediction_steps.time_s[last_steps[interval_index]] - prediction_steps.time_s[1:]
+    )
+    return last_steps, interval_index, time_from_step_to_interval_end_s
 
 
 def innovations(

@@ -177,24 +177,6 @@ def compute_ned_acceleration(flight: Flight) -> pd.DataFrame | Unavailable:
     return pd.DataFrame(acceleration, imu.index, list(AXIS_NAMES), copy=False)
 
 
-def integrate_imu(imu: pd.DataFrame, times_s: Array) -> ArrayPair:
-    """Integrate the IMU between successive times.
-
-    Return the integrals of specific force (m/s) and angular rate (rad) in the body frame.
-    """
-    imu_time_s = imu.index.to_numpy()
-    velocity_m_s, rotation_rad = (
-        np.column_stack(
-            [
-                np.diff(np.interp(times_s, imu_time_s, integral))
-                for integral in integrate_cumulatively(imu[columns].to_numpy(), imu_time_s).T
-            ]
-        )
-        for columns in (Columns.SPECIFIC_FORCE, Columns.ANGULAR_RATE)
-    )
-    return velocity_m_s, rotation_rad
-
-
 def estimate_aisle_heading(track: PositionTrack, segment: Segment) -> tuple[float, float]:
     """Return the main horizontal direction of the positions.
 

@@ -1,7 +1,6 @@
 """Prediction steps of KF: a step ends at each multiple of DT and at each measurement."""
 
-from dataclasses import dataclass, replace
-from functools import cached_property
+from dataclasses import dataclass
 
 import numpy as np
 
@@ -39,21 +38,6 @@ class PredictionSteps:
     input_variance_m2_s4: Array
     input_gap_s: float
 
-    @cached_property
-    def last_steps(self) -> IntArray:
-        """Index of the last step of each interval between measurements."""
-        return np.flatnonzero(self.measurement_index >= 0)
-
-    @cached_property
-    def interval_index(self) -> IntArray:
-        """Index of the interval between measurements that contains each step, shape (n - 1,)."""
-        return np.searchsorted(self.last_steps, np.arange(1, len(self.time_s)))
-
-    @cached_property
-    def time_to_interval_end_s(self) -> Array:
-        """Time from the end of each step to the end of its interval, shape (n - 1,)."""
-        return np.asarray(self.time_s[self.last_steps[self.interval_index]] - self.time_s[1:])
-
 
 def make_prediction_steps(
     axis: Axis, settings: Settings, initial_state: InitialState | None = None
@@ -76,10 +60,9 @@ def make_prediction_steps(
     grid_count = int(np.floor((measurement_time_s[-1] - start_s) / settings.dt_s + 1e-9)) + 1
     grid_s = start_s + settings.dt_s * np.arange(grid_count)
     # Multiples of DT that equal a measurement time are omitted, so that no step has zero length
-    nearest_index = np.rint(
-        np.interp(grid_s, measurement_time_s, np.arange(len(measurement_time_s)))
-    ).astype(int)
-    time_to_measurement_s = np.abs(measurement_time_s[nearest_index] - grid_s)
+    next_index = np.searchsorted(measurement_time_s, grid_s)
+    neighbour_indices = np.clip([next_index - 1, next_index], 0, len(measurement_time_s) - 1)
+    time_to_measurement_s = np.abs(measurement_time_s[neighbour_indices] - grid_s).min(axis=0)
     time_s = np.union1d(
         grid_s[time_to_measurement_s > MAX_EQUAL_TIME_DIFFERENCE_S], measurement_time_s
     )
@@ -87,10 +70,9 @@ def make_prediction_steps(
         time_s = np.append(start_s, time_s)
     measurement_index = np.full(len(time_s), -1, dtype=np.intp)
     measurement_index[np.searchsorted(time_s, measurement_time_s)] = np.flatnonzero(is_usable)
-    zeros = np.zeros(len(time_s) - 1)
-    steps = PredictionSteps(time_s, measurement_index, zeros, zeros, 0.0)
     if settings.input == "zero":
-        return steps
+        zeros = np.zeros(len(time_s) - 1)
+        return PredictionSteps(time_s, measurement_index, zeros, zeros, 0.0)
     if isinstance(axis.acceleration, Unavailable):
         raise SettingsError(
             f"The setting `input` is imu, but the axis {axis.name} has no IMU acceleration.",
@@ -102,15 +84,14 @@ def make_prediction_steps(
     gap_s = gap_fraction * np.diff(time_s)
     # Unlike white noise, the unknown acceleration is constant in an IMU gap of T seconds. This
     # increases the velocity variance by the factor T/DT
-    gap_in_interval_s = np.bincount(steps.interval_index, weights=gap_s)[steps.interval_index]
-    gap_variance_m2_s4 = (
-        gap_fraction
-        * np.maximum(gap_in_interval_s / settings.dt_s, 1.0)
-        * axis.acceleration.compute_rms_m_s2(axis.direction) ** 2
+    interval_index = np.searchsorted(
+        np.flatnonzero(measurement_index >= 0), np.arange(1, len(time_s))
     )
-    return replace(
-        steps,
-        acceleration_m_s2=mean_acceleration_m_s2,
-        input_variance_m2_s4=gap_variance_m2_s4,
-        input_gap_s=float(np.sum(gap_s)),
+    gap_duration_in_interval_s = np.bincount(interval_index, weights=gap_s)[interval_index]
+    gap_variance_factor = np.maximum(gap_duration_in_interval_s / settings.dt_s, 1.0)
+    gap_variance_m2_s4 = (
+        gap_fraction * gap_variance_factor * axis.acceleration.compute_rms_m_s2(axis.direction) ** 2
+    )
+    return PredictionSteps(
+        time_s, measurement_index, mean_acceleration_m_s2, gap_variance_m2_s4, float(np.sum(gap_s))
     )
