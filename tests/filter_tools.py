@@ -174,6 +174,6 @@ def score_grid(
                     axis.process_noise_independent_of_sigma_a[k], strict=True,
                 )
             )  # fmt: skip
-            (nu, s), (p, v, covariance) = update_step(p, v, covariance, z, r / weight[k])
+            (nu, s, _, _), (p, v, covariance) = update_step(p, v, covariance, z, r / weight[k])
             total += 0.5 * (np.log(s) + nu**2 / s)
     return total

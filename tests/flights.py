@@ -25,7 +25,7 @@ from px4fuse.comparison.noise_differences import (
 from px4fuse.comparison.reruns import rerun_filters
 from px4fuse.core.arrays import Array
 from px4fuse.ekf2.aids import evaluate_aids
-from px4fuse.filter.signals import Axis, Segment, integrate_ned_acceleration
+from px4fuse.filter.signals import Axis, Segment, project_acceleration
 from px4fuse.filter.tuning import HORIZONTAL, tune
 from px4fuse.flight.model import (
     AS_RECEIVED_ORIGIN,
@@ -307,12 +307,13 @@ def line(
     if acceleration is None:
         signal = unavailable("acceleration")
     else:
-        signal = integrate_ned_acceleration(
+        signal = project_acceleration(
             table(
                 np.asarray(acceleration[0], dtype=float),
                 np.outer(acceleration[1], north),
                 list(AXIS_NAMES),
             ),
+            north,
             Segment(-np.inf, np.inf, "whole flight"),
         )
     return Axis("north", north, 0.0, "", time, np.asarray(measurement_m, dtype=float), signal)

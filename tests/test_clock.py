@@ -38,19 +38,17 @@ from px4fuse.comparison.reruns import rerun_kf_with_time_offset
 from px4fuse.core.arrays import Array
 from px4fuse.diagnose import diagnose, prepare_comparison
 from px4fuse.filter import time_offset
-from px4fuse.filter.fitting import maximise_likelihood
+from px4fuse.filter.fitting import NoiseParameters
 from px4fuse.filter.imu_motion import (
     INITIAL_STATE_PRIOR_PRECISIONS,
     INTEGRATION_STEP_S,
     PRIOR_SIGMAS_OF_SEGMENT_CONSTANTS,
-    PositionsAndImuMotion,
     SegmentMotion,
     compute_imu_motion,
     make_segment_motion,
 )
 from px4fuse.filter.imu_oscillation import find_imu_oscillation
 from px4fuse.filter.likelihood import compute_profile_likelihood_interval
-from px4fuse.filter.marginal_likelihood import NoiseParameters
 from px4fuse.filter.signals import Segment
 from px4fuse.filter.time_offset import MAX_P_VALUE_OF_CHANGED_OFFSET, ClockOffset, PartOffset
 from px4fuse.flight.model import (
@@ -83,15 +81,6 @@ def estimate(flight: Flight, **options: object) -> ClockOffset | Unavailable:
     noises = NoiseParameters(SIGMA_A, SIGMA_Z)
     track = flight.positions[0]
     return time_offset.estimate_time_offset(flight, track, segment, SETTINGS, noises, **options)
-
-
-def fitted_noises(moved: PositionsAndImuMotion, offset_s: float) -> tuple[float, float]:
-    """Return SIGMA_A and SIGMA_Z that maximise the likelihood at a time offset."""
-    positions = [moved.make_positions_at_offset(offset_s)]
-    noises = maximise_likelihood(
-        positions, NoiseParameters(SIGMA_A, SIGMA_Z), moved.measurement_weights, False
-    ).noise_parameters
-    return noises.sigma_a_m_s2, noises.sigma_z_m
 
 
 def covers(found: ClockOffset, true_s: float) -> bool:
@@ -170,14 +159,13 @@ def test_integrated_constant_acceleration_equals_closed_form() -> None:
     moved = compute_imu_motion(flight, stamps, measured, directions=np.eye(3)[:2], dt_s=DT)
     assert len(moved.segment_motions) == 3
     assert moved.time_s[[0, -1]] == pytest.approx([0.75, 79.25])
-    for offset_s in (-0.3, 0.0, 0.21):
-        positions = moved.make_positions_at_offset(offset_s, estimates_scale=False)
-        way, speed = positions.delta_position_m, positions.delta_velocity_m_s
-        assert way.shape == (2, 1 + len(PRIOR_SIGMAS_OF_SEGMENT_CONSTANTS), len(moved.time_s) - 1)
-        inside = np.flatnonzero(positions.is_within_segment)
-        np.testing.assert_allclose(way[0, 0], 0.0, atol=1e-9)
-        np.testing.assert_allclose(way[1, 0, inside], 1.5 * 0.25**2 / 2.0, atol=1e-9)
-        np.testing.assert_allclose(speed[1, 0, inside], 1.5 * 0.25, atol=1e-9)
+    positions = moved.make_positions_and_increments(np.array([-0.3, 0.0, 0.21]))
+    way, speed = positions.delta_position_m, positions.delta_velocity_m_s
+    assert way.shape == (2, 3, 1 + len(PRIOR_SIGMAS_OF_SEGMENT_CONSTANTS), len(moved.time_s) - 1)
+    inside = np.flatnonzero(positions.is_within_segment)
+    np.testing.assert_allclose(way[0, :, 0], 0.0, atol=1e-9)
+    np.testing.assert_allclose(way[1, :, 0, inside], 1.5 * 0.25**2 / 2.0, atol=1e-9)
+    np.testing.assert_allclose(speed[1, :, 0, inside], 1.5 * 0.25, atol=1e-9)
     np.testing.assert_array_equal(
         np.flatnonzero(~positions.is_within_segment) + 1, moved.segment_edges[1:-1]
     )
@@ -288,10 +276,8 @@ def exact_imu() -> tuple[Flight, ClockOffset, list[tuple[Array, Array]]]:
 
 def test_time_offset_likelihood_equals_joint_normal_density(exact_imu) -> None:
     """The noises of all offsets are those that maximise the likelihood."""
-    flight, found, segments = exact_imu
-    stamps, measured = (np.concatenate(arrays) for arrays in zip(*segments, strict=True))
-    moved = compute_imu_motion(flight, stamps, measured, directions=np.eye(3), dt_s=DT)
-    noises = np.log(fitted_noises(moved, found.offset_s))
+    _, found, segments = exact_imu
+    noises = np.log([found.sigma_a_m_s2, found.sigma_z_m])
     within = [24, 60, 90]
     costs = []
     for offset in found.curve_time_offsets_s[within]:
@@ -322,12 +308,12 @@ def test_time_offset_sigma_equals_width_of_likelihood_parabola() -> None:
     assert time_offset._fit_minimum_and_sigma(grid, drop) == pytest.approx((0.123, 0.03))
     ends = 0.123 - 1.96 * 0.03, 0.123 + 1.96 * 0.03
     assert compute_profile_likelihood_interval(grid, drop) == pytest.approx(ends, abs=1e-3)
-    # an end outside the grid is the end of the grid
+    # an end outside the grid is None
     assert compute_profile_likelihood_interval(grid[18:], drop[18:]) == (
-        grid[18],
+        None,
         pytest.approx(ends[1], abs=1e-3),
     )
-    assert compute_profile_likelihood_interval(grid[:25], drop[:25])[1] == grid[24]
+    assert compute_profile_likelihood_interval(grid[:25], drop[:25])[1] is None
     # without a minimum, σ is the width of the grid
     found, sigma = time_offset._fit_minimum_and_sigma(grid, -((grid - 0.1) ** 2))
     assert found in (grid[0], grid[-1])
@@ -335,19 +321,23 @@ def test_time_offset_sigma_equals_width_of_likelihood_parabola() -> None:
 
 
 @pytest.mark.parametrize("offset_s", [0.0, -0.2, -0.21, 0.333])
-def test_time_offset_maximises_likelihood_sum_of_flight_parts(offset_s) -> None:
+def test_time_offset_maximises_likelihood_sum_of_flight_parts(monkeypatch, offset_s) -> None:
     """Use parabolas as profiles of the parts."""
     shift, sigma = np.array([-0.05, 0.025, 0.0, 0.0]), np.array([0.03, 0.02, 0.03, 0.5])
 
-    def fit_at_offset(tested_s: float, _: NoiseParameters) -> SimpleNamespace:
-        square = (tested_s - offset_s - shift) ** 2 / sigma**2
-        return SimpleNamespace(compute_segment_scores=lambda: 0.5 * square)
+    def fit_constant_errors(grid: Array, *_: object) -> SimpleNamespace:
+        square = (grid - offset_s - shift[:, None]) ** 2 / sigma[:, None] ** 2
+        return SimpleNamespace(compute_segment_scores=lambda: 0.5 * square[None])
 
+    monkeypatch.setattr(time_offset, "fit_constant_errors", fit_constant_errors)
     moved = SimpleNamespace(
-        segment_edges=np.arange(5) * 2, time_s=np.arange(8.0), fit_at_offset=fit_at_offset
+        segment_edges=np.arange(5) * 2,
+        time_s=np.arange(8.0),
+        make_position_batches=lambda grid: grid,
+        measurement_weights=None,
     )
     parts, p = time_offset._estimate_flight_part_offsets(
-        moved, offset_s, 0.0, NoiseParameters(0.1, 0.1), 1.0
+        moved, offset_s, NoiseParameters(0.1, 0.1), 1.0
     )
     # the last part has a σ above the limit
     assert [(part.start_s, part.end_s) for part in parts] == [(0.0, 1.0), (2.0, 3.0), (4.0, 5.0)]
@@ -373,9 +363,10 @@ def test_time_offset_95_percent_interval_contains_true_value() -> None:
         found = estimate(made_flight(seed, offset_s=true_s, duration_s=40.0)[0])
         inside.append(covers(found, true_s))
         normalised.append((found.offset_s - true_s) / found.sigma_s)
-        # tilt and biases do not disturb the offset
+        # tilt and biases do not disturb the offset, and the noise is recovered
         assert found.is_determinable
         assert found.offset_s == pytest.approx(true_s, abs=0.03)
+        assert found.sigma_z_m == pytest.approx(SIGMA_Z, rel=0.12)
     # 1 % in the tail of the binomial distribution
     assert sum(inside) >= binom.ppf(0.01, SEEDS, 0.95)
     assert abs(np.mean(normalised)) < 2.6 / np.sqrt(SEEDS)
@@ -519,7 +510,8 @@ def stated(
         offset_s=middle, interval_s=(middle - 0.02, middle + 0.02), sigma_s=0.01, applied_s=0.0,
         is_determinable=True, curve_time_offsets_s=curve, curve_log_likelihood_drops=curve,
         parts=parts,
-        drift_ppm=100.0, drift_sigma_ppm=50.0, change_p_value=change_p_value, count=3000,
+        drift_ppm=100.0, drift_sigma_ppm=50.0, change_p_value=change_p_value, sigma_a_m_s2=0.2,
+        sigma_z_m=0.01, count=3000,
     )  # fmt: skip
 
 

@@ -7,6 +7,7 @@ from dataclasses import replace
 from itertools import pairwise
 
 import numpy as np
+import pandas as pd
 import pytest
 from filter_tools import any_axis, any_settings
 from flights import line
@@ -45,8 +46,7 @@ def plain_replay(axis: Axis, chosen: Settings) -> tuple[list[list[float]], list[
     z_at = dict(zip(measured, axis.measurement_m.tolist(), strict=True))
     steps = steps_of(measured, chosen.dt_s)
     if chosen.input == "imu":
-        velocity = axis.acceleration.compute_velocity_change_m_s(axis.direction)
-        imu = axis.acceleration.time_s, velocity
+        imu = axis.acceleration.time_s, axis.acceleration.compute_velocity_change_m_s()
     q, r = chosen.sigma_a_m_s2**2 * chosen.dt_s, chosen.sigma_z_m**2
     x = [z_at[measured[0]], 0.0]
     P = [[0.5**2, 0.0], [0.0, 1.0**2]]
@@ -187,6 +187,14 @@ def test_kf_replay_adds_process_noise_during_imu_gap() -> None:
     at = whole.steps.index[(whole.steps.index > 4.05) & (whole.steps.index < 4.95)]
     raised = broken.steps.loc[at, "position_variance_m2"]
     assert np.all(raised > whole.steps.loc[at, "position_variance_m2"])
+
+
+def test_kf_fast_replay_equals_replay_with_filterpy(axis: Axis) -> None:
+    chosen = Settings(sigma_a_m_s2=0.7, sigma_z_m=0.2)
+    with_filterpy, fast = replay(axis, chosen), replay(axis, chosen, fast=True)
+    for name in ("steps", "updates"):
+        expected, actual = getattr(with_filterpy, name), getattr(fast, name)
+        pd.testing.assert_frame_equal(actual, expected, rtol=1e-9)
 
 
 # ---- formulas by elements against their matrices ----

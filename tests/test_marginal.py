@@ -1,10 +1,11 @@
 """The banded likelihood and the noise estimates against dense linear algebra."""
 
+from typing import Any
+
 import numpy as np
 import pytest
 from exchange import replace
 from filter_tools import TRUE, modelled, score_grid
-from findings_tools import made as part_of
 from flights import line, random_walk
 from hypothesis import given, settings
 from hypothesis import strategies as st
@@ -18,26 +19,32 @@ from px4fuse.core.arrays import Array, IntArray
 from px4fuse.filter.fitting import (
     INITIAL_OUTLIER_FRACTION,
     INITIAL_OUTLIER_SIGMA_RATIO,
-    NOISE_SEARCH_RANGES,
+    NegativeLogLikelihood,
     NoiseFit,
+    NoiseParameters,
     _compute_outlier_probability,
     compute_log_sigma_z_variance_factor,
-    compute_score,
-    make_kf_positions,
+    convert_to_positions_and_increments,
+    fit_constant_errors,
     maximise_likelihood,
+    negative_log_likelihood,
 )
-from px4fuse.filter.likelihood import MAX_LOG_LIKELIHOOD_DROP, innovations, preintegrate
+from px4fuse.filter.likelihood import (
+    MAX_LOG_LIKELIHOOD_DROP,
+    find_profile_likelihood_interval,
+    innovations,
+    preintegrate,
+)
 from px4fuse.filter.marginal_likelihood import (
-    NoiseParameters,
     PositionsAndIncrements,
     estimate_squared_errors,
-    fit_constant_errors,
+    factorise,
+    fit_positions,
     subtract_smooth_path,
 )
 from px4fuse.filter.model import compute_continuous_process_noise_per_density
 from px4fuse.filter.settings import Settings
 from px4fuse.filter.signals import Axis
-from px4fuse.filter.tuning import estimate_noise
 
 
 def matrices(elements: Array) -> Array:
@@ -60,21 +67,16 @@ def test_banded_solver_equals_dense_normal_equations(seed: int) -> None:
     length = rng.uniform(0.05, 0.6, count - 1)
     noise = rng.uniform(0.001, 0.4) * np.stack(compute_continuous_process_noise_per_density(length))
     noise[[0, 2]] += rng.choice([0.0, 0.003], count - 1)
-    weight = rng.uniform(1.0, 100.0, count)
-    unmeasured = rng.choice(np.setdiff1d(np.arange(count), [0, 1, second, second + 1]))
-    prior = 0.3, 0.5
-    precision = np.stack([weight, np.zeros(count)], 1)
-    precision[unmeasured, 0] = 0.0
-    dp, dv = rng.normal(size=(2, 3, count - 1))
-    measured = np.outer([1.0, 0.0, 0.0], rng.normal(size=count))  # only the data have positions
-    # rows of the measurements and the prior, divided by their σ
+    precision = np.stack([rng.uniform(1.0, 100.0, count), np.zeros(count)], 1)
+    precision[[0, second], 1] = 0.5, 2.0
+    precision[rng.integers(1, count), 0] = 0.0
+    widths = count, count - 1, count - 1
+    signals = measured, dp, dv = [rng.normal(size=(3, width)) for width in widths]
+    # rows of the prior and the measurements, divided by their σ
     rows = np.diag(np.sqrt(precision.ravel()))
     known = np.zeros((2 * count, 3))
     known[0::2] = np.sqrt(precision[:, :1]) * measured.T
-    starts = [0, 1, 2 * second, 2 * second + 1]
-    rows = np.vstack([rows, np.sqrt(2 * prior)[:, None] * np.eye(2 * count)[starts]])
-    known = np.vstack([known, np.zeros((4, 3))])
-    log_determinant = -np.log(precision[precision > 0.0]).sum() - 2.0 * np.log(prior).sum()
+    log_determinant = -np.log(precision[precision > 0.0]).sum()
     for leg in np.flatnonzero(joined):
         q = matrices(noise)[leg]
         white = np.linalg.inv(np.linalg.cholesky(q))
@@ -87,54 +89,40 @@ def test_banded_solver_equals_dense_normal_equations(seed: int) -> None:
     expected = np.linalg.lstsq(rows, known, rcond=None)[0]
     left, normal = known - rows @ expected, rows.T @ rows
 
-    positions = PositionsAndIncrements(
-        measurement_m=np.where(np.arange(count) == unmeasured, np.nan, measured[0])[:, None],
-        segment_starts=np.array([0, second]), interval_s=length,
-        process_noise_per_sigma_a_squared=0.0 * noise, process_noise_independent_of_sigma_a=noise,
-        initial_state_precision=prior, is_initial_state_known=True,
-        constant_prior_sigmas=np.ones(2), delta_position_m=dp[None], delta_velocity_m_s=dv[None],
-    )  # fmt: skip
-    noises = NoiseParameters(1.0, 1.0)
-    ((axes, system),) = positions.factorise_equations(noises, weight)
-    assert axes == [0]
-    state = system.solve(measured[:1], dp[:1], dv[:1]).ravel()
-    np.testing.assert_allclose(state, expected[:, 0], rtol=1e-6, atol=1e-6)
-    found = fit_constant_errors(positions, noises, weight)
-    np.testing.assert_allclose(found.gram_matrix.sum(axis=0), left.T @ left, rtol=1e-6, atol=1e-6)
+    system = factorise(length, noise, joined, precision)
+    state = system.solve(*signals).reshape(3, 2 * count)
+    np.testing.assert_allclose(state.T, expected, rtol=1e-6, atol=1e-6)
+    intervals, explained = system.whiten(*signals)
+    over_sigma = np.sqrt(precision[:, 0]) * measured
+    products = over_sigma @ over_sigma.T + intervals @ intervals.T
+    products -= explained @ explained.T
+    np.testing.assert_allclose(products, left.T @ left, rtol=1e-6, atol=1e-6)
     log_determinant += np.linalg.slogdet(normal)[1]
     assert system.log_determinant == pytest.approx(log_determinant, abs=1e-6)
-    assert system.degrees_of_freedom == count - 1
     variance = np.diag(np.linalg.inv(normal))[0::2]
     np.testing.assert_allclose(system.position_variance(), variance, rtol=1e-6)
 
 
 def test_log_determinant_of_s_grows_with_large_process_noise() -> None:
     """Q of a single step has rank one, so the term that makes it invertible is below rounding."""
-    step = np.full(19, 0.09755900000000004)
+    step, joined = np.full(19, 0.09755900000000004), np.ones(19, dtype=bool)
     unit = 0.1 * step * np.stack([step**2 / 4.0, step / 2.0, np.ones(19)])
-    positions = PositionsAndIncrements(
-        measurement_m=np.zeros((20, 1)), segment_starts=np.array([0]), interval_s=step,
-        process_noise_per_sigma_a_squared=unit, process_noise_independent_of_sigma_a=0.0 * unit,
-        initial_state_precision=(0.0, 0.0), is_initial_state_known=False,
-        constant_prior_sigmas=np.zeros(0), delta_position_m=np.zeros((1, 1, 19)),
-        delta_velocity_m_s=np.zeros((1, 1, 19)),
-    )  # fmt: skip
+    precision = np.stack([np.ones(20), np.zeros(20)], 1)
     values = [
-        fit_constant_errors(
-            positions, NoiseParameters(sigma_a, 1.0), np.ones(20)
-        ).covariance_log_determinant
-        for sigma_a in np.geomspace(1e4, 1e6, 100).tolist()
+        factorise(step, sigma_a**2 * unit, joined, precision).log_determinant
+        for sigma_a in np.geomspace(1e4, 1e6, 100)
     ]
     # ln|S| grows with the noise
     assert np.all(np.diff(values) > 0.0)
+    precision[4:, 0] = 0.0
     with pytest.raises(np.linalg.LinAlgError):
-        fit_constant_errors(positions, NoiseParameters(1.0, 1.0), np.zeros(20))
+        factorise(step, unit, np.arange(1, 20) != 3, precision)
 
 
 # --- the likelihood with constants ---
 
 START, COUNT = np.array([0, 11]), 24
-WEAK = (1e-6, 1e-4)  # prior precision of position and velocity
+WEAK = np.array([1e-6, 1e-4])  # prior precision of position and velocity
 WEIGHT = np.random.default_rng(2).uniform(0.1, 1.0, COUNT)
 SOME_NOISES = [
     NoiseParameters(0.5, 0.1), NoiseParameters(0.05, 0.1), NoiseParameters(2.0, 0.1),
@@ -143,8 +131,8 @@ SOME_NOISES = [
 ]  # fmt: skip
 
 
-def with_constants(offset: int = 0) -> PositionsAndIncrements:
-    """Two stretches of three axes with three constants, at one of three time offsets.
+def with_constants(offsets: int = 3) -> PositionsAndIncrements:
+    """Two stretches of three axes with three constants.
 
     The first two axes lack some measurements, the second its first one; the third has one only in
     its second stretch.
@@ -155,6 +143,8 @@ def with_constants(offset: int = 0) -> PositionsAndIncrements:
     measured[START] = 0.0
     measured[[4, 17], 0] = measured[[0, 7], 1] = measured[11:, 2] = np.nan
     measured[15, 2] = -500.0
+    initial = np.zeros((COUNT, 2))
+    initial[START] = WEAK
     return PositionsAndIncrements(
         measurement_m=measured, segment_starts=START, interval_s=length,
         process_noise_per_sigma_a_squared=0.1
@@ -162,11 +152,22 @@ def with_constants(offset: int = 0) -> PositionsAndIncrements:
         process_noise_independent_of_sigma_a=np.outer(
             [0.3, 0.0, 0.2], rng.choice([0.0, 0.01], COUNT - 1)
         ),
-        initial_state_precision=WEAK, is_initial_state_known=False,
-        constant_prior_sigmas=np.array([0.3, 1.0, 0.1]),
-        delta_position_m=rng.normal(0.0, 0.3, (3, 3, 4, COUNT - 1))[:, offset],
-        delta_velocity_m_s=rng.normal(0.0, 0.3, (3, 3, 4, COUNT - 1))[:, offset],
+        prior_precision=initial, constant_prior_sigmas=np.array([0.3, 1.0, 0.1]),
+        delta_position_m=rng.normal(0.0, 0.3, (3, offsets, 4, COUNT - 1)),
+        delta_velocity_m_s=rng.normal(0.0, 0.3, (3, offsets, 4, COUNT - 1)),
     )  # fmt: skip
+
+
+def arguments(
+    positions: PositionsAndIncrements, noises: NoiseParameters, weight: Array
+) -> tuple[Any, float, Array]:
+    """Return the arguments of :func:`fit_positions`."""
+    if noises.correlated_sigma_m:
+        positions = replace(positions, correlated_noise=(noises.correlated_sigma_m, noises.tau_s))
+    scaled, variance = positions.divide_sigmas_by_sigma_z(
+        1.0, noises.random_walk_m, weight / noises.sigma_z_m**2
+    )
+    return scaled, noises.sigma_a_m_s2, variance
 
 
 def stretch_normal(
@@ -175,6 +176,7 @@ def stretch_normal(
     variance: Array,
     stretch: int,
     axis: int,
+    at: int = 0,
 ) -> tuple[IntArray, Array, Array]:
     """Return measured rows, their signals (data minus mean, constants) and their covariance."""
     q = matrices(
@@ -184,12 +186,12 @@ def stretch_normal(
     rows = list(range(*(*START, COUNT)[stretch : stretch + 2]))
     # position and velocity for the signals of data and constants
     means = [np.zeros((2, 4))]
-    cross = {(0, 0): np.diag(np.reciprocal(WEAK))}  # covariance of each state with all earlier ones
+    cross = {(0, 0): np.diag(1.0 / WEAK)}  # covariance of each state with all earlier ones
     for k, row in enumerate(rows[1:], start=1):
         length = part.interval_s[row - 1]
         f = np.array([[1.0, length], [0.0, 1.0]])
         legs = part.delta_position_m, part.delta_velocity_m_s
-        means.append(f @ means[-1] + [each[axis, :, row - 1] for each in legs])
+        means.append(f @ means[-1] + [each[axis, at, :, row - 1] for each in legs])
         for j in range(k):
             cross[k, j] = f @ cross[k - 1, j]
             cross[j, k] = cross[k, j].T
@@ -215,9 +217,10 @@ def joint_normal(
     noises: NoiseParameters,
     variance: Array,
     stretch: int,
+    at: int = 0,
 ) -> tuple[Array, Array, list[tuple[IntArray, Array, Array]]]:
     """Return data and covariance (with constants) of all axes, and each axis separately."""
-    made = [stretch_normal(part, noises, variance, stretch, axis) for axis in range(3)]
+    made = [stretch_normal(part, noises, variance, stretch, axis, at) for axis in range(3)]
     signals = np.concatenate([each[1] for each in made])
     covariance = signals[:, 1:] * part.constant_prior_sigmas**2 @ signals[:, 1:].T
     return signals[:, 0], covariance + block_diag(*(each[2] for each in made)), made
@@ -225,62 +228,63 @@ def joint_normal(
 
 def test_likelihood_with_imu_biases_equals_multivariate_normal() -> None:
     """Equal at all offsets and noises, except for a constant."""
-    parts = [with_constants(offset) for offset in range(3)]
+    part = with_constants()
 
-    def dense(noises: NoiseParameters, part: PositionsAndIncrements) -> float:
+    def dense(noises: NoiseParameters, at: int) -> float:
         total, variance = 0.0, noises.sigma_z_m**2 / WEIGHT
         for stretch in range(2):
-            data, covariance, _ = joint_normal(part, noises, variance, stretch)
+            data, covariance, _ = joint_normal(part, noises, variance, stretch, at)
             total += 0.5 * data @ np.linalg.solve(covariance, data)
             total += 0.5 * np.linalg.slogdet(covariance)[1]
         return float(total)
 
-    expected = np.array([[dense(noises, part) for part in parts] for noises in SOME_NOISES])
+    expected = np.array([[dense(noises, at) for at in range(3)] for noises in SOME_NOISES])
     assert np.ptp(expected) > 1000.0
     found_values = np.array(
         [
-            [fit_constant_errors(part, noises, WEIGHT).compute_score() for part in parts]
+            fit_positions(*arguments(part, noises, WEIGHT)).compute_scores()[0]
             for noises in SOME_NOISES
         ]
     )
     np.testing.assert_allclose(
         found_values - found_values[0, 0], expected - expected[0, 0], rtol=1e-5, atol=1e-3
     )
-    # all σ multiplied by a factor, which changes only negligible priors
-    part = replace(
-        parts[0],
-        process_noise_independent_of_sigma_a=0.0 * parts[0].process_noise_independent_of_sigma_a,
+    # in units of SIGMA_Z, which changes only negligible priors
+    scaled = np.array(
+        [fit_constant_errors([part], noises, WEIGHT).compute_scores()[0] for noises in SOME_NOISES]
     )
-    for noises in SOME_NOISES:
-        multiplied = fit_constant_errors(part, noises.multiply_sigmas(0.7), WEIGHT).compute_score()
-        found = fit_constant_errors(part, noises, WEIGHT).compute_score(0.7)
-        assert found == pytest.approx(multiplied, rel=1e-5, abs=1e-3)
+    np.testing.assert_allclose(
+        scaled - scaled[0, 0], found_values - found_values[0, 0], rtol=1e-5, atol=1e-3
+    )
 
 
 @pytest.mark.parametrize("start_known", [True, False])
 def test_likelihood_ignores_segment_with_a_single_position(start_known: bool) -> None:
     part = with_constants()
     if not start_known:
-        part = replace(part, initial_state_precision=(0.0, 0.0))
+        part = replace(part, prior_precision=np.zeros((COUNT, 2)))
     without = part.measurement_m.copy()
     without[15, 2] = np.nan
     for noises in SOME_NOISES:
         both = part, replace(part, measurement_m=without)
-        one, none = (fit_constant_errors(each, noises, np.ones(COUNT)) for each in both)
-        assert one.compute_score() == pytest.approx(none.compute_score(), rel=1e-12)
-        for each, other in zip(one.estimate_constants(), none.estimate_constants(), strict=True):
-            np.testing.assert_allclose(each, other, rtol=1e-9, atol=1e-12)
+        one, none = (fit_positions(*arguments(each, noises, np.ones(COUNT))) for each in both)
+        np.testing.assert_allclose(one.compute_scores(), none.compute_scores(), rtol=1e-12)
+        np.testing.assert_allclose(
+            one.estimate_segment_constants(),
+            none.estimate_segment_constants(),
+            rtol=1e-9,
+            atol=1e-12,
+        )
 
 
 def test_fitted_imu_biases_equal_dense_least_squares() -> None:
-    part = with_constants()
+    part = with_constants(offsets=1)
     # without the third axis, which has too few measurements
     part = replace(part, measurement_m=part.measurement_m * [1.0, 1.0, np.nan])
     for noises in SOME_NOISES[:5]:
         variance, square = np.full(COUNT, noises.sigma_z_m**2), np.zeros(COUNT)
-        constants, covariances = fit_constant_errors(
-            part, noises, np.ones(COUNT)
-        ).estimate_constants()
+        arranged = arguments(part, noises, np.ones(COUNT))
+        constants = fit_positions(*arranged).estimate_segment_constants()[:, 0]
         for stretch in range(2):
             _, _, made = joint_normal(part, noises, variance, stretch)
             information, right = np.diag(part.constant_prior_sigmas**-2.0), np.zeros(3)
@@ -290,39 +294,61 @@ def test_fitted_imu_biases_equal_dense_least_squares() -> None:
                 right += by.T @ np.linalg.solve(covariance, signals[:, 0])
             found = np.linalg.solve(information, right)
             np.testing.assert_allclose(constants[stretch], found, rtol=1e-4)
-            np.testing.assert_allclose(
-                covariances[stretch], np.linalg.inv(information), rtol=1e-3, atol=1e-9
-            )
             for rows, signals, covariance in made[:2]:
                 # z - E[p | z] = R C⁻¹ left, with variance R - R C⁻¹ R
                 r = np.diag(variance[rows])
                 error = r @ np.linalg.solve(covariance, signals @ [1.0, *found])
                 square[rows] += error**2 + np.diag(r - r @ np.linalg.solve(covariance, r))
-        found_values, count = estimate_squared_errors(part, noises, np.ones(COUNT))
+        found_values, count = estimate_squared_errors(*arranged, constants)
         np.testing.assert_allclose(found_values, square, rtol=1e-4, atol=1e-9)
         np.testing.assert_array_equal(count, np.isfinite(part.measurement_m).sum(axis=1))
 
 
-def test_likelihood_is_equal_with_smooth_path_subtracted_first() -> None:
+def test_likelihood_is_equal_with_imu_motion_subtracted_first() -> None:
     part = with_constants()
-    alone = replace(
-        part,
-        constant_prior_sigmas=np.zeros(0),
-        delta_position_m=part.delta_position_m[:, :1],
-        delta_velocity_m_s=part.delta_velocity_m_s[:, :1],
-    )
-    plain, found = (
-        fit_constant_errors(each, SOME_NOISES[0], WEIGHT).compute_score()
-        for each in (alone, subtract_smooth_path(alone))
-    )
-    assert found == pytest.approx(plain, rel=1e-7)
-    # the signal of the scale is the subtracted path
-    scaled = subtract_smooth_path(part)
-    for name in ("delta_position_m", "delta_velocity_m_s"):
-        before, after = getattr(part, name), getattr(scaled, name)
-        np.testing.assert_allclose(after[:, 3], before[:, 0] - after[:, 0], atol=1e-12)
-        np.testing.assert_array_equal(after[:, 1:3], before[:, 1:3])
-        assert np.ptp(after[:, 3]) > 1.0
+    given = [arguments(each, SOME_NOISES[0], WEIGHT) for each in (part, subtract_smooth_path(part))]
+    plain, found_values = (fit_positions(*each).compute_scores()[0] for each in given)
+    assert np.ptp(plain) > 1.0
+    np.testing.assert_allclose(found_values, plain, rtol=1e-7)
+    # the signal of the scale is the path of each offset
+    scaled = fit_positions(
+        *arguments(subtract_smooth_path(part, estimates_scale=True), SOME_NOISES[0], WEIGHT)
+    ).gram_matrix
+    way, speed = part.delta_position_m[:, 1:2], part.delta_velocity_m_s[:, 1:2]
+    alone = replace(part, delta_position_m=way, delta_velocity_m_s=speed)
+    one = fit_positions(
+        *arguments(subtract_smooth_path(alone, estimates_scale=True), SOME_NOISES[0], WEIGHT)
+    ).gram_matrix
+    assert np.ptp(scaled[..., -1, -1]) > 1.0
+    np.testing.assert_allclose(scaled[:, [1]], one, rtol=1e-7, atol=1e-7)
+
+
+@pytest.mark.parametrize("which", ["filter", "constants"])
+def test_likelihood_between_grid_points_equals_exact_likelihood(which: str) -> None:
+    """Equal over four decades of the ratio and of SIGMA_Z, except for a constant."""
+    parts = [
+        convert_to_positions_and_increments(preintegrate(modelled(seed, COUNT), TRUE))
+        for seed in (1, 2)
+    ]
+    if which == "constants":
+        part = with_constants(offsets=1)
+        parts = [
+            replace(
+                part,
+                process_noise_independent_of_sigma_a=0.0
+                * part.process_noise_independent_of_sigma_a,
+            )
+        ]
+    some = np.exp(np.random.default_rng(4).uniform(-4.6, 1.0, (30, 2))).tolist()
+    direct = [negative_log_likelihood(parts, NoiseParameters(*pair), WEIGHT) for pair in some]
+    assert np.ptp(direct) > 100.0
+    # far from the maximum the weak prior of the initial state has an effect
+    for rough, error in ((False, 1e-6 if which == "filter" else 1e-4), (True, 2e-3)):
+        score = NegativeLogLikelihood(parts, WEIGHT, 0.1, rough)
+        assert score.is_interpolated
+        found_values = np.array([score(NoiseParameters(*pair)) for pair in some])
+        expected = np.array(direct) - direct[0]
+        np.testing.assert_allclose(found_values - found_values[0], expected, rtol=error, atol=1e-3)
 
 
 # --- likelihood of KF ---
@@ -352,46 +378,39 @@ def test_likelihood_by_banded_matrix_equals_kf_likelihood(interval: float | None
     weight = np.ones(len(legs.measurement_m))
     assert np.ptp(expected) > 50.0
     np.testing.assert_allclose(score_grid([legs], a, z, weight), expected, rtol=1e-9)
-    part = [make_kf_positions(axis, chosen)]
-    found_values = np.array([compute_score(part, NoiseParameters(*pair), weight) for pair in pairs])
+    part = [convert_to_positions_and_increments(legs)]
+    found_values = np.array(
+        [negative_log_likelihood(part, NoiseParameters(*pair), weight) for pair in pairs]
+    )
     np.testing.assert_allclose(
         found_values - found_values[0], expected - expected[0], rtol=1e-6, atol=2e-3
     )
     # weights have the same meaning in both
     weight = np.random.default_rng(1).uniform(0.01, 1.0, len(weight))
     grid = score_grid([legs], a, z, weight)
-    found_values = np.array([compute_score(part, NoiseParameters(*pair), weight) for pair in pairs])
+    found_values = np.array(
+        [negative_log_likelihood(part, NoiseParameters(*pair), weight) for pair in pairs]
+    )
     np.testing.assert_allclose(found_values - found_values[0], grid - grid[0], rtol=2e-3, atol=0.02)
 
 
 @pytest.mark.parametrize("slope", [0.0, 0.1, 0.8, -3.0])
-def test_profile_likelihood_interval_of_parabola_is_1_96_sigma(
-    monkeypatch: pytest.MonkeyPatch, slope: float
-) -> None:
+def test_profile_likelihood_interval_of_parabola_is_1_96_sigma(slope: float) -> None:
     """With the other parameter maximised out, σ is the marginal one."""
     sigma, other_sigma = 0.2, 0.05
 
-    def score(noises: NoiseParameters) -> float:
-        other, at = np.log([noises.sigma_a_m_s2, noises.sigma_z_m])
+    def score(at: float, other: float) -> float:
         along, across = (at - 1.0) / sigma, (other - 2.0 - slope * (at - 1.0)) / other_sigma
         return 0.5 * along**2 + 0.5 * across**2
 
-    def log_interval(bounds: tuple[float, float], variance_factor: float = 1.0) -> Array:
-        best = NoiseParameters(np.exp(2.0), np.exp(1.0))
-        fit = part_of(
-            NoiseFit, noise_parameters=best, lowest_score=0.0, score=score,
-            log_sigma_z_variance_factor=variance_factor,
-        )  # fmt: skip
-        monkeypatch.setitem(NOISE_SEARCH_RANGES, "sigma_z_m", bounds)
-        found = estimate_noise(fit, "sigma_z_m")
-        return np.log(np.array([found.low, found.high], dtype=float))
-
     reach = sigma * np.sqrt(2.0 * MAX_LOG_LIKELIHOOD_DROP)
-    ends = log_interval((np.exp(-4.0), np.exp(6.0)))
+    ends = np.log(find_profile_likelihood_interval(score, (1.0, 2.0), (np.exp(-4.0), np.exp(6.0))))
     assert ends == pytest.approx((1.0 - reach, 1.0 + reach), abs=0.01 * reach)
     bounds = np.exp(1.0 - 0.5 * reach), np.exp(1.0 + 0.5 * reach)
-    assert np.isnan(log_interval(bounds)).all()
-    wide = log_interval((np.exp(-4.0), np.exp(6.0)), 4.0)
+    assert find_profile_likelihood_interval(score, (1.0, 2.0), bounds) == (None, None)
+    wide = np.log(
+        find_profile_likelihood_interval(score, (1.0, 2.0), (np.exp(-4.0), np.exp(6.0)), 4.0)
+    )
     assert wide == pytest.approx((1.0 - 2.0 * reach, 1.0 + 2.0 * reach), abs=0.02 * reach)
 
 
@@ -421,7 +440,7 @@ def bursts(seed: int, share: float, length: int) -> Array:
 
 
 def noises_of(*axes: Axis) -> NoiseFit:
-    parts = [make_kf_positions(axis, TRUE) for axis in axes]
+    parts = [convert_to_positions_and_increments(preintegrate(axis, TRUE)) for axis in axes]
     return maximise_likelihood(
         parts, NoiseParameters(TRUE.sigma_a_m_s2, TRUE.sigma_z_m), np.ones(MANY)
     )
@@ -496,16 +515,16 @@ def test_sigma_of_noise_estimate_follows_likelihood_curvature(axes, share, width
 
 def test_noise_fit_without_outliers_uses_measurement_weights() -> None:
     weight = np.random.default_rng(1).uniform(0.2, 1.0, MANY)
-    parts = [make_kf_positions(pair(1)[0], TRUE)]
+    parts = [convert_to_positions_and_increments(preintegrate(pair(1)[0], TRUE))]
     found = maximise_likelihood(parts, NoiseParameters(0.5, 0.1), weight, fits_outliers=False)
     np.testing.assert_array_equal(found.measurement_weights, weight)
     assert not found.outlier_probability.any()
-    best = compute_score(parts, found.noise_parameters, weight)
+    best = negative_log_likelihood(parts, found.noise_parameters, weight)
     for a, z in ((1.1, 1.0), (0.9, 1.0), (1.0, 1.05), (1.0, 0.95)):
         other = NoiseParameters(
             a * found.noise_parameters.sigma_a_m_s2, z * found.noise_parameters.sigma_z_m
         )
-        assert compute_score(parts, other, weight) > best
+        assert negative_log_likelihood(parts, other, weight) > best
 
 
 def test_outlier_probability_follows_bayes_rule() -> None:

@@ -198,7 +198,12 @@ def test_larger_ekf2_acc_noise_reduces_nees_under_vibration() -> None:
     ]
     truth = analysis.main.truth["position_m"]
     error_m = delayed - np.interp(delayed.index, truth.index, truth, np.nan, np.nan)
-    variances = replayed.updates.filter(like="position_variance_").filter(regex="north|east").mean(axis=1).mean()
+    variances = (
+        replayed.updates.filter(like="position_variance_")
+        .filter(regex="north|east")
+        .mean(axis=1)
+        .mean()
+    )
     assert np.nanmean(error_m**2) / variances < 1.5**2 < tried.after.nees_mean
 
 

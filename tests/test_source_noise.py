@@ -17,8 +17,7 @@ from px4fuse.comparison.trials import makes_overconfident
 from px4fuse.diagnose import analyse_comparison
 from px4fuse.filter import correlated_noise
 from px4fuse.filter.correlated_noise import fit_time_correlation
-from px4fuse.filter.imu_motion import PositionsAndImuMotion
-from px4fuse.filter.marginal_likelihood import NoiseParameters
+from px4fuse.filter.fitting import NoiseParameters
 from px4fuse.filter.settings import Settings
 from px4fuse.finding import Finding
 from px4fuse.findings import find
@@ -282,13 +281,11 @@ def test_time_correlation_fit_tries_zero_and_given_time_offset(
 ) -> None:
     analysis, tried = analysed(MIXED), []
 
-    def none_better(
-        moved: Any, noises: Any, offsets: list[float], *_: Any
-    ) -> tuple[float, float, Any]:
+    def none_better(moved: Any, offsets: list[float], noises: Any) -> tuple[float, Any]:
         tried.append(offsets)
-        return 0.0, 0.0, noises[0]
+        return 0.0, noises[0]
 
-    monkeypatch.setattr(PositionsAndImuMotion, "search_grid", none_better)
+    monkeypatch.setattr(correlated_noise, "_search_coarse_grid", none_better)
     for offset_s in (0.0, 0.3, -0.2):
         fit_time_correlation(
             analysis.flight, (analysis.axes["north"].axis,), RIGHT, NoiseParameters(0.3, 0.1),

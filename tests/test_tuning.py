@@ -18,9 +18,11 @@ from px4fuse.filter.signals import Axis
 from px4fuse.filter.tuning import (
     HORIZONTAL,
     MIN_MEASUREMENTS,
+    SIGMA_Z_SEARCH_RANGE_M,
     AxisTuning,
     NoiseEstimate,
     tune,
+    tune_axes,
 )
 from px4fuse.flight.model import Columns, Flight, Unavailable
 from px4fuse.report.phrases import format_noise_estimate
@@ -29,10 +31,7 @@ SIGMA_A, SIGMA_Z, SEEDS = TRUE.sigma_a_m_s2, TRUE.sigma_z_m, 40
 
 
 def tuned(*axes: Axis, chosen: Settings = TRUE) -> AxisTuning:
-    """Tune one axis alone, or two axes together."""
-    name = "north" if len(axes) == 1 else HORIZONTAL
-    named = (replace(axis, name=of) for axis, of in zip(axes, ("north", "east"), strict=False))
-    return tune(tuple(named), chosen, (name,))[name]
+    return tune_axes("north", axes, chosen)
 
 
 @cache
@@ -175,7 +174,7 @@ def test_noise_interval_ends_where_profile_likelihood_drops() -> None:
 def test_tune_on_noise_free_positions_gives_sigma_z_upper_limit(sigma_a: float) -> None:
     found = tuned(modelled(3, 500, sigma_a=sigma_a, sigma_z=0.0))
     assert found.sigma_z.value is found.sigma_z.low is None
-    assert fitting.SIGMA_Z_SEARCH_RANGE_M[0] <= found.sigma_z.high < 0.003
+    assert SIGMA_Z_SEARCH_RANGE_M[0] <= found.sigma_z.high < 0.003
     assert found.sigma_a.low <= sigma_a <= found.sigma_a.high or sigma_a < 0.1
 
 
@@ -190,7 +189,7 @@ def test_noise_at_end_of_search_range_is_reported_as_bound() -> None:
 
 
 def test_tune_with_too_few_measurements_is_unavailable() -> None:
-    short = tune((replace(modelled(1, MIN_MEASUREMENTS - 1), name="down"),), TRUE)["down"]
+    short = tune_axes("down", (modelled(1, MIN_MEASUREMENTS - 1),), TRUE)
     assert isinstance(short, Unavailable)
     assert short.what == "estimate of SIGMA_A and SIGMA_Z (down)"
     assert f"only {MIN_MEASUREMENTS - 1} measurements" in short.reason

@@ -60,7 +60,7 @@ def explain_ekf2_difference(
     kf_settings = _make_comparable_settings(comparison, model.inputs, estimate_by_setting)
     changed_settings = replace(comparison.settings, **estimate_by_setting)
     kf_runs = {
-        name: replay(axis.axis, changed_settings) if estimate_by_setting else axis.replay
+        name: replay(axis.axis, changed_settings, fast=True) if estimate_by_setting else axis.replay
         for name, axis in axis_results.items()
     }
     explanations = steps.explain_difference_by_replacements(model, kf_settings, kf_runs)

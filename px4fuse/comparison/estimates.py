@@ -23,15 +23,15 @@ from px4fuse.filter.correlated_noise import (
     fit_time_correlation,
     fit_time_correlation_to_truth,
 )
+from px4fuse.filter.fitting import NoiseParameters
 from px4fuse.filter.frame_rotation import HeadingError, estimate_heading_error
 from px4fuse.filter.hypotheses import (
     OUTLIER_RETEST_DURATION_AFTER_JUMP_S,
     SystematicErrors,
     fit_systematic_errors,
 )
-from px4fuse.filter.imu_motion import MAX_IMU_INTERVAL_S
+from px4fuse.filter.imu_motion import MAX_IMU_INTERVAL_S, MotionCache
 from px4fuse.filter.imu_oscillation import find_imu_oscillation
-from px4fuse.filter.marginal_likelihood import NoiseParameters
 from px4fuse.filter.signals import AISLE, Axis
 from px4fuse.filter.time_offset import (
     MAX_OFFSET_INTERVAL_HALF_WIDTH_S,
@@ -142,6 +142,7 @@ def estimate_noises(
     comparison: PreparedComparison,
     axis_names: tuple[str, ...] | None = None,
     progress: Progress = ignore_progress,
+    motion_cache: MotionCache | None = None,
 ) -> dict[str, AxisTuning | Unavailable]:
     """Estimate measurement noise and process noise along the axes.
 
@@ -152,6 +153,8 @@ def estimate_noises(
         Axis names, or "horizontal" for north and east together; default: all.
     progress : callable
         Called with the name of each estimate.
+    motion_cache : dict, optional
+        Cache of the motion from the IMU.
     """
     flight, low_imu_rate_reason = comparison.flight, explain_low_imu_rate(comparison.flight)
     if flight.log.is_assessed:
@@ -163,6 +166,7 @@ def estimate_noises(
         lambda name: progress(f"tuning {name}"),
         flight if low_imu_rate_reason is None else replace(flight, imu=low_imu_rate_reason),
         comparison.source.origin.may_drift,
+        motion_cache,
     )
 
 
@@ -175,7 +179,8 @@ def estimate_noises_and_clock(
 
     Parameters are those of :func:`estimate_noises`.
     """
-    tuning = estimate_noises(comparison, axis_names, progress)
+    motion_cache: MotionCache = {}
+    tuning = estimate_noises(comparison, axis_names, progress, motion_cache)
     if comparison.flight.log.is_assessed:
         return tuning, DIAGNOSIS_WITHHELD
     if low_imu_rate_reason := explain_low_imu_rate(comparison.flight):
@@ -192,6 +197,7 @@ def estimate_noises_and_clock(
         noises,
         outlier_time_s,
         progress,
+        motion_cache,
     )
     if not isinstance(clock_offset, ClockOffset):
         return tuning, clock_offset

@@ -64,7 +64,7 @@ from px4fuse.filter.settings import Settings
 from px4fuse.filter.signals import (
     Acceleration,
     compute_ned_acceleration,
-    integrate_ned_acceleration,
+    project_acceleration,
     weighted_sum,
 )
 from px4fuse.filter.time_offset import ClockOffset
@@ -341,7 +341,7 @@ def _rerun_kf(
             rotated_axis = replace(axis, direction=rotated_direction)
             truth = project_truth(comparison.flight.truth, rotated_axis, comparison.segment)
     if FORWARD_BIAS_KEY in change:
-        acceleration = _remove_accelerometer_bias(comparison, change)
+        acceleration = _remove_accelerometer_bias(comparison, change, axis.direction)
         axis = replace(axis, acceleration=acceleration)
     time_s, axis_tuning = axis.measurement_time_s, find_axis_tuning(tuning, axis.name)
     is_used = np.ones(len(time_s), dtype=bool)
@@ -353,7 +353,7 @@ def _rerun_kf(
         measurement_time_s=time_s[is_used] + shift_s,
         measurement_m=axis.measurement_m[is_used],
     )
-    kf_run = replay(axis, changed_settings)
+    kf_run = replay(axis, changed_settings, fast=True)
     # With a rotated frame, positions of KF and EKF2 are not comparable
     return _summarise_run(
         kf_run.updates["innovation_m"].to_numpy(),
@@ -364,7 +364,7 @@ def _rerun_kf(
 
 
 def _remove_accelerometer_bias(
-    comparison: Comparison, change: Change
+    comparison: Comparison, change: Change, direction: Array
 ) -> Acceleration | Unavailable:
     flight, imu = comparison.flight, comparison.flight.imu
     if isinstance(imu, Unavailable):
@@ -373,7 +373,7 @@ def _remove_accelerometer_bias(
         [change[FORWARD_BIAS_KEY], change[RIGHT_BIAS_KEY], 0.0], Columns.SPECIFIC_FORCE
     )
     flight = replace(flight, imu=imu.assign(**(imu[Columns.SPECIFIC_FORCE] - accelerometer_bias)))
-    return integrate_ned_acceleration(compute_ned_acceleration(flight), comparison.segment)
+    return project_acceleration(compute_ned_acceleration(flight), direction, comparison.segment)
 
 
 def _replay_ekf2(

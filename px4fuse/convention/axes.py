@@ -55,8 +55,6 @@ MAX_HEIGHT_ERROR_M = 20.0 * BAROMETER_SIGMA_M
 MAX_REFINED_HYPOTHESES = 8
 # Maximum log-likelihood (nats) below that of the best hypothesis, to refine a hypothesis
 MAX_SCORE_BELOW_BEST_TO_REFINE = 60.0
-# EKF2's heading is preferred up to this loss in log likelihood (nats), because it refers to north
-MAX_LIKELIHOOD_LOSS_WITH_EKF2_HEADING = 20.0
 # Maximum number of second differences in one least-squares fit, to limit the computing time
 MAX_REFINEMENT_ROWS = 1200
 REFINEMENT_ITERATIONS = 7
@@ -219,10 +217,7 @@ def search_hypotheses(
     positions: SentPositions,
     imu_motion_by_heading_source: Mapping[HeadingSource, ImuSecondDifferences],
 ) -> list[Hypothesis]:
-    """Return the likely hypotheses on axes, unit and delay of the positions, best first.
-
-    EKF2's heading is preferred if it fits nearly as well as that of the gyroscopes.
-    """
+    """Return the likely hypotheses on axes, unit and delay of the positions, best first."""
     hypotheses = []
     for heading_from, imu_motion in imu_motion_by_heading_source.items():
         source_motion = positions.compute_second_differences(imu_motion)
@@ -238,95 +233,111 @@ def search_hypotheses(
                 refine_hypothesis(start_hypothesis, positions, source_motion, imu_motion)
                 for start_hypothesis in start_hypotheses
             ]
-    hypotheses = [hypothesis for hypothesis in hypotheses if hypothesis.score > -np.inf]
-    hypotheses.sort(key=lambda hypothesis: -hypothesis.score)
-    for hypothesis in hypotheses:
-        if (
-            hypothesis.heading_from == "EKF2"
-            and hypothesis.score > hypotheses[0].score - MAX_LIKELIHOOD_LOSS_WITH_EKF2_HEADING
-            and hypothesis.is_similar_to(hypotheses[0], SMALL_ROTATION_RAD)
-        ):
-            other_hypotheses = [other for other in hypotheses if other is not hypothesis]
-            return [replace(hypothesis, score=hypotheses[0].score), *other_hypotheses]
-    return hypotheses
+    return sorted(
+        (hypothesis for hypothesis in hypotheses if hypothesis.score > -np.inf),
+        key=lambda hypothesis: -hypothesis.score,
+    )
 
 
 def find_convention_candidates(
     source_motion: SourceSecondDifferences, imu_motion: ImuSecondDifferences
 ) -> list[Hypothesis]:
     """Return the likely combinations of axes, unit and time offset, most likely first."""
-    source_terms, imu_terms = (
-        np.column_stack([differences, differences**2, is_valid])
-        for differences, is_valid in (
-            (source_motion.second_differences, source_motion.is_valid),
-            (imu_motion.table[..., 0], imu_motion.is_valid),
-        )
+    source_moment_terms = np.column_stack(
+        [
+            source_motion.second_differences,
+            source_motion.second_differences**2,
+            source_motion.is_valid,
+        ]
     )
-    offset_steps = np.arange(len(source_terms) - len(imu_terms) + 1)
-    # Sums of products: x, y, z, their squares, and 1; north, east, down, their squares, and 1
-    moments = np.stack(
-        [source_terms[step : step + len(imu_terms)].T @ imu_terms for step in offset_steps]
+    imu_moment_terms = np.column_stack(
+        [imu_motion.table[..., 0], imu_motion.table[..., 0] ** 2, imu_motion.is_valid]
     )
-    has_overlap = moments[:, 6, 6] * GRID_INTERVAL_S >= MIN_OVERLAP_S
+    offset_steps = np.arange(len(source_moment_terms) - len(imu_moment_terms) + 1)
+    cross_moments = np.stack(
+        [
+            source_moment_terms[step : step + len(imu_moment_terms)].T @ imu_moment_terms
+            for step in offset_steps
+        ]
+    )
+    # cross_moments[:, 6, 6] is the number of common samples
+    has_overlap = cross_moments[:, 6, 6] * GRID_INTERVAL_S >= MIN_OVERLAP_S
     if not has_overlap.any():
         return []
     delay_s = (offset_steps[has_overlap] - offset_steps[-1] / 2.0) * GRID_INTERVAL_S
-    moments = moments[has_overlap]
-    independent_residual_count = moments[:, 6, 6] * (GRID_INTERVAL_S / SECOND_DIFFERENCE_WINDOW_S)
-    moments /= moments[:, 6:, 6:]
-    source_mean_square = np.maximum(moments[:, 3:6, 6], 1e-12)
-    imu_mean_square_m2 = moments[:, 6, 3:6]
+    cross_moments = cross_moments[has_overlap]
+    independent_residual_count = cross_moments[:, 6, 6, None, None] * (
+        GRID_INTERVAL_S / SECOND_DIFFERENCE_WINDOW_S
+    )
+    cross_moments /= cross_moments[:, 6:, 6:]
+    vertical_axis, vertical_sign, first_horizontal_axis, second_horizontal_axis, handedness = (
+        np.array(SIGNED_AXIS_PERMUTATIONS).T
+    )
+    correlation = (
+        cross_moments[:, first_horizontal_axis, 0]
+        + handedness * cross_moments[:, second_horizontal_axis, 1]
+        + 1j * cross_moments[:, first_horizontal_axis, 1]
+    )
+    correlation -= 1j * handedness * cross_moments[:, second_horizontal_axis, 0]
+    source_mean_square = np.maximum(cross_moments[:, 3:6, 6, None], 1e-12)
     metres_per_unit = np.array([*METRES_PER_UNIT.values()])
-    # If z is constant, the source measures no height, and z is the vertical axis
-    has_heights = source_motion.second_differences[:, 2].any()
+    north_mean_square_m2, east_mean_square_m2, down_mean_square_m2 = np.moveaxis(
+        cross_moments[:, 6, 3:6, None, None], 1, 0
+    )
+    horizontal_residual_m2 = (
+        metres_per_unit**2
+        * (
+            source_mean_square[:, first_horizontal_axis]
+            + source_mean_square[:, second_horizontal_axis]
+        )
+        + north_mean_square_m2
+        + east_mean_square_m2
+    )
+    horizontal_residual_m2 = (
+        horizontal_residual_m2 - 2.0 * metres_per_unit * np.abs(correlation)[..., None]
+    ) / 2.0
+    down_residual_m2 = (
+        metres_per_unit**2 * source_mean_square[:, vertical_axis] + down_mean_square_m2
+    )
+    down_residual_m2 -= (
+        2.0 * metres_per_unit * (vertical_sign * cross_moments[:, vertical_axis, 2])[..., None]
+    )
+    score = np.sum(np.log(source_mean_square), axis=1)[:, None] + 6.0 * np.log(metres_per_unit)
+    score = score - 2.0 * np.log(np.maximum(horizontal_residual_m2, MIN_HORIZONTAL_SIGMA_M**2))
+    score = (
+        0.5
+        * independent_residual_count
+        * (score - np.log(np.maximum(down_residual_m2, MIN_VERTICAL_SIGMA_M**2)))
+    )
+    rotation_rad = np.angle(correlation)
+    nearest_quarter_turns = np.round(rotation_rad / (np.pi / 2.0)).astype(int) % 4
     hypotheses = []
-    for permutation in SIGNED_AXIS_PERMUTATIONS:
-        vertical, vertical_sign, first, second, handedness = permutation
-        if vertical != 2 and not has_heights:
-            continue
-        correlation = moments[:, first, 0] + handedness * moments[:, second, 1]
-        correlation = correlation + 1j * (moments[:, first, 1] - handedness * moments[:, second, 0])
-        # Mean squared residuals for each time offset and unit
-        horizontal_residual_m2, down_residual_m2 = (
-            metres_per_unit**2 * source_square[:, None]
-            + imu_square_m2[:, None]
-            - 2.0 * metres_per_unit * product[:, None]
-            for source_square, imu_square_m2, product in (
-                (
-                    source_mean_square[:, first] + source_mean_square[:, second],
-                    imu_mean_square_m2[:, 0] + imu_mean_square_m2[:, 1],
-                    np.abs(correlation),
-                ),
-                (
-                    source_mean_square[:, vertical],
-                    imu_mean_square_m2[:, 2],
-                    vertical_sign * moments[:, vertical, 2],
-                ),
-            )
+    for quarter_turns in range(4):
+        scores_at_quarter_turn = np.where(
+            (nearest_quarter_turns == quarter_turns)[..., None], score, -np.inf
         )
-        score = (
-            np.sum(np.log(source_mean_square), axis=1)[:, None]
-            + 6.0 * np.log(metres_per_unit)
-            - 2.0 * np.log(np.maximum(horizontal_residual_m2 / 2.0, MIN_HORIZONTAL_SIGMA_M**2))
-            - np.log(np.maximum(down_residual_m2, MIN_VERTICAL_SIGMA_M**2))
-        )
-        score *= 0.5 * independent_residual_count[:, None]
-        rotation_rad = np.angle(correlation)
-        nearest_quarter_turns = np.round(rotation_rad / (np.pi / 2.0)).astype(int) % 4
-        for quarter_turns in range(4):
-            is_near = nearest_quarter_turns[:, None] == quarter_turns
-            best_offset_indices = np.argmax(np.where(is_near, score, -np.inf), axis=0)
-            for unit_index, (unit, offset) in enumerate(
-                zip(METRES_PER_UNIT, best_offset_indices, strict=True)
+        for (permutation_index, unit_index), offset_index in np.ndenumerate(
+            np.argmax(scores_at_quarter_turn, axis=0)
+        ):
+            unit_name = [*METRES_PER_UNIT][unit_index]
+            axis_permutation = SIGNED_AXIS_PERMUTATIONS[permutation_index]
+            # If z is constant, the source measures no height, and z is the vertical axis
+            if (
+                axis_permutation.vertical_axis != 2
+                and not source_motion.second_differences[:, 2].any()
             ):
-                if is_near[offset]:
-                    total_score = (
-                        score[offset, unit_index]
-                        + permutation.compute_log_prior_odds(quarter_turns)
-                        + OTHER_UNIT_LOG_PRIOR_ODDS * (unit != "m")
-                    )
-                    parameters = np.array([delay_s[offset], rotation_rad[offset], *[0.0] * 5])
-                    hypotheses.append(Hypothesis(permutation, unit, parameters, float(total_score)))
+                continue
+            total_score = (
+                scores_at_quarter_turn[offset_index, permutation_index, unit_index]
+                + axis_permutation.compute_log_prior_odds(quarter_turns)
+                + OTHER_UNIT_LOG_PRIOR_ODDS * (unit_name != "m")
+            )
+            parameters = np.array(
+                [delay_s[offset_index], rotation_rad[offset_index, permutation_index], *[0.0] * 5]
+            )
+            hypotheses.append(
+                Hypothesis(axis_permutation, unit_name, parameters, float(total_score))
+            )
     hypotheses.sort(key=lambda hypothesis: -hypothesis.score)
     return [
         hypothesis
@@ -487,15 +498,14 @@ def fit_student_distribution(
     squared_residuals: Array, dimensions: int, min_sigma: float
 ) -> tuple[float, float]:
     """Fit Student's t distribution to squared residuals; return mean log likelihood and scale."""
-    min_variance = min_sigma**2
     variance = max(
-        float(np.median(squared_residuals)) / (0.455, 1.386)[dimensions - 1], min_variance
+        float(np.median(squared_residuals)) / (0.455, 1.386)[dimensions - 1], min_sigma**2
     )
     for _ in range(5):
         weight = (STUDENT_DEGREES_OF_FREEDOM + dimensions) / (
             STUDENT_DEGREES_OF_FREEDOM + squared_residuals / variance
         )
-        variance = max(float(np.mean(weight * squared_residuals)) / dimensions, min_variance)
+        variance = max(float(np.mean(weight * squared_residuals)) / dimensions, min_sigma**2)
     mean_log1p_square = np.mean(np.log1p(squared_residuals / variance / STUDENT_DEGREES_OF_FREEDOM))
     score = -0.5 * (
         dimensions * np.log(variance)

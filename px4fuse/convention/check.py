@@ -9,6 +9,7 @@ from msgspec import structs
 from px4fuse.convention.axes import (
     MAX_TIME_OFFSET_S,
     METRES_PER_UNIT,
+    SMALL_ROTATION_RAD,
     Hypothesis,
     SentPositions,
     find_convention_candidates,
@@ -18,6 +19,7 @@ from px4fuse.convention.axes import (
 from px4fuse.convention.model import (
     Convention,
     ConventionVerdict,
+    HeadingSource,
     OrientationConvention,
 )
 from px4fuse.convention.motion import (
@@ -48,6 +50,8 @@ MIN_SOURCE_TO_IMU_DISPLACEMENT_RATIO, MAX_SOURCE_TO_IMU_DISPLACEMENT_RATIO = 0.8
 MAX_RESIDUAL_TO_NOISE_RATIO = 2.4
 # σ (m) of the second differences of the position integrated from the IMU
 IMU_SECOND_DIFFERENCE_SIGMA_M = 0.05
+# EKF2's heading is preferred up to this loss in log likelihood (nats), because it refers to north
+MAX_LIKELIHOOD_LOSS_WITH_EKF2_HEADING = 20.0
 # Minimum number of GNSS positions for a fit of the heading of the source's frame
 MIN_GNSS_POSITIONS = 30
 # Maximum RMS residual ÷ RMS extent of the GNSS positions, to use the fitted heading
@@ -95,19 +99,21 @@ def check_convention(
         name: integrate_imu_motion(inertial_data, attitude)
         for name, attitude in inertial_data.compute_attitudes().items()
     }
-    hypotheses = search_hypotheses(positions, imu_motion_by_heading_source)
+    hypotheses = _rank_convention_hypotheses(positions, imu_motion_by_heading_source)
     if not hypotheses:
         return None
-    clock_drift = _estimate_clock_drift(
+    if clock_drift := _estimate_clock_drift(
         positions, imu_motion_by_heading_source[hypotheses[0].heading_from], hypotheses[0]
-    )
-    if clock_drift:
+    ):
         positions_without_drift = positions.remove_clock_drift(clock_drift)
-        hypotheses_without_drift = search_hypotheses(
+        hypotheses_without_drift = _rank_convention_hypotheses(
             positions_without_drift, imu_motion_by_heading_source
         )
-        min_score = hypotheses[0].score + MIN_LIKELIHOOD_GAIN_FROM_CLOCK_DRIFT
-        if hypotheses_without_drift and hypotheses_without_drift[0].score > min_score:
+        if (
+            hypotheses_without_drift
+            and hypotheses_without_drift[0].score
+            > hypotheses[0].score + MIN_LIKELIHOOD_GAIN_FROM_CLOCK_DRIFT
+        ):
             hypotheses, positions = hypotheses_without_drift, positions_without_drift
         else:
             clock_drift = 0.0
@@ -142,6 +148,26 @@ def _read_positions(
     return SentPositions(
         samples.index.to_numpy(), samples.to_numpy(), max_time_offset_s, barometer_times_and_heights
     )
+
+
+def _rank_convention_hypotheses(
+    positions: SentPositions,
+    imu_motion_by_heading_source: dict[HeadingSource, ImuSecondDifferences],
+) -> list[Hypothesis]:
+    """Return the likely axes, units and delays of the positions, best first.
+
+    EKF2's heading is preferred if it fits nearly as well as that of the gyroscopes.
+    """
+    hypotheses = search_hypotheses(positions, imu_motion_by_heading_source)
+    for hypothesis in hypotheses:
+        if (
+            hypothesis.heading_from == "EKF2"
+            and hypothesis.score > hypotheses[0].score - MAX_LIKELIHOOD_LOSS_WITH_EKF2_HEADING
+            and hypothesis.is_similar_to(hypotheses[0], SMALL_ROTATION_RAD)
+        ):
+            other_hypotheses = [other for other in hypotheses if other is not hypothesis]
+            return [replace(hypothesis, score=hypotheses[0].score), *other_hypotheses]
+    return hypotheses
 
 
 def _replace_delay_by_low_pass_filter(

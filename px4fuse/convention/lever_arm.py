@@ -81,50 +81,55 @@ def _fit_lever_arm_to_truth(flight: Flight, truth: Truth, track: PositionTrack) 
         position_samples = position_samples.loc[airborne_spans_s[0][0] : airborne_spans_s[-1][1]]
     if isinstance(attitude, Unavailable) or len(position_samples) < 2:
         return None
-    time_s = position_samples.index.to_numpy()
-    true_position_m = np.column_stack(
+    time_s, truth_samples = position_samples.index.to_numpy(), truth.samples
+    true_positions_m = np.column_stack(
         [
-            np.interp(time_s, truth.samples.index, truth.samples[name], np.nan, np.nan)
+            np.interp(time_s, truth_samples.index, truth_samples[name], np.nan, np.nan)
             for name in columns
         ]
     )
     # Fit a delay and a rotation too, because they resemble a lever arm
-    velocity_m_s = np.gradient(true_position_m, time_s, axis=0)
-    error_per_rotation_m = _rotate(true_position_m - np.nanmean(true_position_m, axis=0), 90.0)
+    velocity_m_s = np.gradient(true_positions_m, time_s, axis=0)
+    error_per_rotation_m = _rotate(true_positions_m - np.nanmean(true_positions_m, axis=0), 90.0)
     path_radius_m = max(float(np.sqrt(np.nanmean(error_per_rotation_m**2))), MIN_PATH_RADIUS_M)
     error_per_rotation_m /= path_radius_m
     quaternions = attitude[Columns.QUATERNION].to_numpy()
     rotation = to_matrix(interpolate(time_s, attitude.index.to_numpy(), quaternions))[:, :2, :2]
     offset_columns = np.broadcast_to(np.eye(2), rotation.shape)
-    is_known = np.isfinite(velocity_m_s).all(axis=1)
     motion_columns = np.stack([velocity_m_s, error_per_rotation_m], axis=2)
     design = np.concatenate([rotation, offset_columns, motion_columns], axis=2)
-    design_rows = design[is_known].reshape(-1, design.shape[2])
+    is_known = np.isfinite(velocity_m_s).all(axis=1)
+    design_rows = design[is_known].reshape(-1, 6)
     if len(design_rows) < MIN_COORDINATE_COUNT:
         return None
     rotation_deg = 0.0
     for _ in range(LEVER_ARM_FIT_COUNT):
-        error_m = _rotate(position_samples.to_numpy(), -rotation_deg) - true_position_m
-        error_m = error_m[is_known].ravel()
+        error_m = _rotate(position_samples.to_numpy(), -rotation_deg) - true_positions_m
+        valid_position_errors_m = error_m[is_known].ravel()
         fitted_parameters, _, rank, _ = np.linalg.lstsq(
-            design_rows, error_m, rcond=MIN_SINGULAR_VALUE_RATIO
+            design_rows, valid_position_errors_m, rcond=MIN_SINGULAR_VALUE_RATIO
         )
-        if rank < design.shape[2]:  # with a constant heading, a lever arm is a constant offset
+        if rank < design_rows.shape[1]:  # with a constant heading, a lever arm is an offset
             return None
         rotation_deg += float(np.degrees(fitted_parameters[5])) / path_radius_m
-    residual_m = (error_m - design_rows @ fitted_parameters).reshape(-1, 2)
+    residual_m = (valid_position_errors_m - design_rows @ fitted_parameters).reshape(-1, 2)
     # Successive errors of a source may be correlated
     variance_factor = max(map(compute_autocorrelation_time, residual_m.T))
     covariance = (
         np.linalg.inv(design_rows.T @ design_rows) * np.mean(residual_m**2) * variance_factor
     )
-    lever_arm = _select_significant_lever_arm(
-        fitted_parameters, covariance, MIN_LEVER_ARM_WITH_TRUTH_M, MIN_LEVER_ARM_SIGMAS_WITH_TRUTH
+    sigma_m = float(np.sqrt(np.trace(covariance[:2, :2])))
+    lever_arm = LeverArm(
+        float(fitted_parameters[0]),
+        float(fitted_parameters[1]),
+        sigma_m,
+        rotation_deg,
+        float(np.degrees(np.sqrt(covariance[5, 5]))) / path_radius_m,
     )
-    if lever_arm is None or lever_arm.horizontal_length_m >= MAX_LEVER_ARM_M:
-        return None
-    rotation_sigma_deg = float(np.degrees(np.sqrt(covariance[5, 5]))) / path_radius_m
-    return lever_arm._replace(rotation_deg=rotation_deg, rotation_sigma_deg=rotation_sigma_deg)
+    is_significant = lever_arm.horizontal_length_m > max(
+        MIN_LEVER_ARM_WITH_TRUTH_M, MIN_LEVER_ARM_SIGMAS_WITH_TRUTH * sigma_m
+    )
+    return lever_arm if is_significant and lever_arm.horizontal_length_m < MAX_LEVER_ARM_M else None
 
 
 def _rotate(vectors: Array, angle_deg: float) -> Array:
@@ -157,36 +162,47 @@ def _fit_lever_arm_to_imu(flight: Flight, track: PositionTrack) -> LeverArm | No
             time_s, _rotate(position_samples.to_numpy(), -rotation_deg), imu_motion.time_s
         )
         is_used = is_used & source_motion.is_valid
-        error_m = source_motion.second_differences - imu_motion.table[:, :2, 0]
+        second_difference_error_m = source_motion.second_differences - imu_motion.table[:, :2, 0]
         design_rows = design[is_used].reshape(-1, design.shape[2])
+        valid_second_difference_errors_m = second_difference_error_m[is_used].ravel()
         # Second differences with common positions are not independent
-        dependent_count = 2.0 * SECOND_DIFFERENCE_WINDOW_S / GRID_INTERVAL_S
-        if len(design_rows) / dependent_count < 2 * design.shape[2]:
+        independent_difference_count = (
+            len(valid_second_difference_errors_m)
+            * GRID_INTERVAL_S
+            / (2.0 * SECOND_DIFFERENCE_WINDOW_S)
+        )
+        if independent_difference_count < 2 * design_rows.shape[1]:
             return None
-        fitted_parameters = np.linalg.lstsq(design_rows, error_m[is_used].ravel(), rcond=None)[0]
-        residual_m: Array = np.linalg.norm(error_m - design @ fitted_parameters, axis=1)
-        variance_m2 = np.mean(residual_m[is_used] ** 2) / 2.0
-        is_used &= residual_m < MAX_RESIDUAL_SIGMAS * np.sqrt(variance_m2)
+        fitted_parameters = np.linalg.lstsq(
+            design_rows, valid_second_difference_errors_m, rcond=None
+        )[0]
+        residual_m: Array = np.linalg.norm(
+            second_difference_error_m - design @ fitted_parameters, axis=1
+        )
+        sigma_m = float(np.sqrt(np.mean(residual_m[is_used] ** 2) / 2.0))
+        covariance = (
+            np.linalg.pinv(design_rows.T @ design_rows)
+            * sigma_m**2
+            * len(valid_second_difference_errors_m)
+            / independent_difference_count
+        )
+        lever_arm_sigma_m = float(np.sqrt(np.trace(covariance[:2, :2])))
+        is_used &= residual_m < MAX_RESIDUAL_SIGMAS * sigma_m
         # The third parameter is the time (s) by which the timestamps are early
         time_s = time_s + fitted_parameters[2]
         rotation_deg += float(np.degrees(fitted_parameters[-1]))
-    covariance = np.linalg.pinv(design_rows.T @ design_rows) * variance_m2 * dependent_count
     # The fit is relative to the IMU, the parameters are relative to the vehicle's origin
-    fitted_parameters[:2] += find_imu_position_m(flight)[:2]
-    lever_arm = _select_significant_lever_arm(
-        fitted_parameters, covariance, MIN_LEVER_ARM_M, MIN_LEVER_ARM_SIGMAS
+    imu_position_m = find_imu_position_m(flight)
+    lever_arm = LeverArm(
+        float(fitted_parameters[0]) + imu_position_m[0],
+        float(fitted_parameters[1]) + imu_position_m[1],
+        lever_arm_sigma_m,
+        rotation_deg,
+        float(np.degrees(np.sqrt(covariance[-1, -1]))),
     )
-    rotation_sigma_deg = float(np.degrees(np.sqrt(covariance[-1, -1])))
-    return lever_arm and lever_arm._replace(
-        rotation_deg=rotation_deg, rotation_sigma_deg=rotation_sigma_deg
+    return (
+        lever_arm
+        if lever_arm.horizontal_length_m
+        > max(MIN_LEVER_ARM_M, MIN_LEVER_ARM_SIGMAS * lever_arm_sigma_m)
+        else None
     )
-
-
-def _select_significant_lever_arm(
-    fitted_parameters: Array, covariance: Array, min_length_m: float, min_sigmas: float
-) -> LeverArm | None:
-    """Return the lever arm in the first two parameters; None if it is not significant."""
-    sigma_m = float(np.sqrt(np.trace(covariance[:2, :2])))
-    lever_arm = LeverArm(float(fitted_parameters[0]), float(fitted_parameters[1]), sigma_m)
-    is_significant = lever_arm.horizontal_length_m > max(min_length_m, min_sigmas * sigma_m)
-    return lever_arm if is_significant else None

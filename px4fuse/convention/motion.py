@@ -9,16 +9,15 @@ Subtraction of the running mean removes constant acceleration errors (tilt, bias
 """
 
 from dataclasses import dataclass, replace
-from itertools import chain, pairwise
+from itertools import pairwise
 
 import numpy as np
 from scipy import constants
-from scipy.ndimage import uniform_filter1d
 
 from px4fuse.convention.model import HeadingSource
 from px4fuse.core.arrays import Array, BoolArray, integrate_cumulatively
 from px4fuse.ekf2.replay import is_inside_spans
-from px4fuse.filter.signals import Segment, find_imu_gaps
+from px4fuse.filter.signals import find_imu_gaps
 from px4fuse.flight.model import Columns, Flight, Unavailable
 from px4fuse.trajectory.association import choose_gap_limit_s, is_bracketed
 from px4fuse.trajectory.rotation import (
@@ -164,16 +163,20 @@ def integrate_inertial_data(flight: Flight) -> InertialData | None:
     if isinstance(airborne_spans_s, Unavailable):
         airborne_spans_s = ((float(time_s[0]), float(time_s[-1])),)
     gap_rows = np.flatnonzero(find_imu_gaps(imu_times_s))
+    gap_free_spans_s = zip(
+        [-np.inf, *imu_times_s[gap_rows + 1]], [*imu_times_s[gap_rows], np.inf], strict=True
+    )
     valid_spans_s = (
-        Segment(imu_part_s[0], imu_part_s[-1], "").cut(airborne_spans_s)
-        for imu_part_s in np.split(imu_times_s, gap_rows + 1)
+        (max(flight_start_s, recorded_from_s), min(flight_end_s, recorded_until_s))
+        for recorded_from_s, recorded_until_s in gap_free_spans_s
+        for flight_start_s, flight_end_s in airborne_spans_s
     )
     return InertialData(
         time_s,
         specific_force_m_s2,
         logged_attitude,
         gyro_attitude,
-        tuple(chain.from_iterable(valid_spans_s)),
+        tuple(span for span in valid_spans_s if span[0] < span[1]),
     )
 
 
@@ -201,10 +204,11 @@ def _integrate_gyros(rotation_rad: Array, logged_attitude: Array) -> Array:
 def _level_attitude(attitude: Array, specific_force_m_s2: Array) -> Array:
     """Correct the tilt of an attitude, so that the mean specific force is vertical."""
     mean_specific_force_m_s2 = rotate(to_matrix(attitude[:-1]), specific_force_m_s2)
-    all_rows = np.ones(len(mean_specific_force_m_s2), dtype=bool)
     for _ in range(2):
         mean_specific_force_m_s2 = running_mean(
-            mean_specific_force_m_s2, all_rows, round(LEVELLING_WINDOW_S / INTEGRATION_STEP_S)
+            mean_specific_force_m_s2,
+            np.ones(len(mean_specific_force_m_s2), dtype=bool),
+            round(LEVELLING_WINDOW_S / INTEGRATION_STEP_S),
         )
     vertical = mean_specific_force_m_s2 / np.maximum(
         np.linalg.norm(mean_specific_force_m_s2, axis=1, keepdims=True), 1.0
@@ -215,13 +219,15 @@ def _level_attitude(attitude: Array, specific_force_m_s2: Array) -> Array:
 
 def running_mean(values: Array, is_valid: BoolArray, width: int) -> Array:
     """Return the centred running mean over ``width`` rows, without invalid rows."""
-    width = 2 * (width // 2) + 1
-    valid = is_valid.astype(float).reshape(-1, *[1] * (values.ndim - 1))
-    valid_mean, valid_fraction = (
-        uniform_filter1d(array, width, axis=0, mode="constant")
-        for array in (np.where(valid, values, 0.0), valid)
-    )
-    return np.asarray(valid_mean / np.maximum(valid_fraction, 1.0 / width))
+    rows = np.arange(len(values))
+    first_rows = np.clip(rows - width // 2, 0, None)
+    end_rows = np.clip(rows + width // 2 + 1, None, len(rows))
+    valid_values = np.where(is_valid[:, None], values.reshape(len(rows), -1), 0.0)
+    cumulative_sums = np.cumsum(np.column_stack([valid_values, is_valid]), axis=0)
+    cumulative_sums = np.concatenate([np.zeros_like(cumulative_sums[:1]), cumulative_sums])
+    window_sums = cumulative_sums[end_rows] - cumulative_sums[first_rows]
+    means: Array = window_sums[:, :-1] / np.maximum(window_sums[:, -1:], 1.0)
+    return means.reshape(values.shape)
 
 
 def high_pass(values: Array, is_valid: BoolArray) -> Array:

@@ -5,7 +5,6 @@ from collections.abc import Iterator
 import numpy as np
 import pandas as pd
 from numpy.typing import NDArray
-from scipy.integrate import cumulative_trapezoid
 
 Array = NDArray[np.float64]
 Array32 = NDArray[np.float32]
@@ -30,7 +29,10 @@ def compute_median_interval_s(time_s: Array) -> float:
 
 def integrate_cumulatively(values: Array, time_s: Array) -> Array:
     """Integrate values over time up to each sample (trapezoidal rule, axis 0)."""
-    return np.asarray(cumulative_trapezoid(values, time_s, axis=0, initial=0))
+    integral = np.zeros(values.shape)
+    intervals_s = np.diff(time_s).reshape(-1, *[1] * (values.ndim - 1))
+    np.cumsum((values[1:] + values[:-1]) / 2.0 * intervals_s, axis=0, out=integral[1:])
+    return integral
 
 
 def cumulative_sums(rows: Array) -> Array:

@@ -23,6 +23,7 @@ class _InputRegister:
     inputs: set[_FileIdentity] = field(default_factory=set)
     # first registered input file in each folder
     first_input_by_folder: dict[_FileIdentity, Path] = field(default_factory=dict)
+    registered_folders: set[Path] = field(default_factory=set)
 
 
 _input_register: ContextVar[_InputRegister | None] = ContextVar("register", default=None)
@@ -54,9 +55,14 @@ def add_input(path: Path) -> None:
     if input_register is None or (identity := _read_file_identity(path)) is None:
         return
     input_register.inputs.add(identity)
-    for folder in {*path.absolute().parents, *path.resolve().parents}:
-        if (folder_identity := _read_file_identity(folder)) is not None:
-            input_register.first_input_by_folder.setdefault(folder_identity, path)
+    for folder in {
+        path.absolute().parent,
+        path.resolve().parent,
+    } - input_register.registered_folders:
+        input_register.registered_folders.add(folder)
+        for parent in map(_read_file_identity, (folder, *folder.parents)):
+            if parent is not None:
+                input_register.first_input_by_folder.setdefault(parent, path)
 
 
 def check_outputs(output_paths: Iterable[Path]) -> None:
@@ -77,7 +83,12 @@ def check_output_folder(folder: Path) -> None:
             f"{folder} is a file, but the output needs a folder. Choose another name."
         )
     input_register = _input_register.get() or _InputRegister()
-    for path in (folder, *folder.glob("*"), *folder.glob("*/*")):
+    folder_entries = _list_folder(folder)
+    for path in (
+        folder,
+        *folder_entries,
+        *(child for entry in folder_entries for child in _list_folder(entry)),
+    ):
         if (identity := _read_file_identity(path)) is None:
             continue
         input_path = (
@@ -90,6 +101,10 @@ def check_output_folder(folder: Path) -> None:
                 f"the output folder {folder} contains {input_path}, an input of this command",
                 "Choose another output folder.",
             )
+
+
+def _list_folder(folder: Path) -> list[Path]:
+    return list(folder.iterdir()) if folder.is_dir() else []
 
 
 def _read_file_identity(path: Path) -> _FileIdentity | None:

@@ -188,17 +188,18 @@ def hash_files(paths: Iterable[Path]) -> dict[str, Path]:
     file_by_hash: dict[str, Path] = {}
     limit_bytes = max_log_bytes.get()
     for path in paths:
-        files = [path]
         if path.is_dir():
             files = [
-                file
-                for file in list_files_recursively(path)
-                if file.is_file() and file_size(file, LogError) <= limit_bytes
+                folder_file
+                for folder_file in list_files_recursively(path)
+                if folder_file.is_file() and file_size(folder_file, LogError) <= limit_bytes
             ]
         elif (size_bytes := file_size(path, LogError)) > limit_bytes:
             raise LogError(
                 format_size_limit(display_name(path), size_bytes, limit_bytes), LOG_SIZE_REMEDY
             )
+        else:
+            files = [path]
         for file in files:
             try:
                 with file.open("rb") as stream:

@@ -20,11 +20,15 @@ from scipy.interpolate import CubicSpline
 from scipy.optimize import minimize_scalar
 
 from px4fuse.core.arrays import Array
-from px4fuse.filter.fitting import maximise_likelihood
+from px4fuse.filter.fitting import (
+    NoiseFit,
+    NoiseParameters,
+    fit_constant_errors,
+    maximise_likelihood,
+)
 from px4fuse.filter.hypotheses import Jump, make_unit_steps
-from px4fuse.filter.imu_motion import PositionsAndImuMotion, compute_imu_motion
+from px4fuse.filter.imu_motion import MotionCache, PositionsAndImuMotion, compute_imu_motion
 from px4fuse.filter.likelihood import MAX_LOG_LIKELIHOOD_DROP
-from px4fuse.filter.marginal_likelihood import NoiseParameters
 from px4fuse.filter.settings import Settings
 from px4fuse.filter.signals import Axis, report_too_few_measurements
 from px4fuse.flight.model import Flight, Unavailable
@@ -41,7 +45,7 @@ COARSE_CORRELATED_VARIANCE_FRACTIONS = (0.12, 0.35, 0.8)
 # Tested multiples of SIGMA_A in the coarse search
 COARSE_SIGMA_A_FACTORS = (0.4, 0.9)
 # Tested factors on all σ in the coarse search
-COARSE_SIGMA_FACTORS = np.geomspace(0.7, 1.6, 12).tolist()
+COARSE_SIGMA_FACTORS = np.geomspace(0.7, 1.6, 12)
 COARSE_MEASUREMENT_COUNT = 1000
 # Minimum log-likelihood gain over white noise in the coarse search; below it, no full fit is made
 MIN_GAIN_FOR_FULL_FIT_NATS = 0.5
@@ -118,7 +122,7 @@ class TimeCorrelatedNoise:
     low_pass_gain_nats: float
 
 
-def fit_time_correlation(
+def fit_time_correlation(  # noqa: PLR0915 (two models with common data)
     flight: Flight,
     axes: tuple[Axis, ...],
     settings: Settings,
@@ -161,15 +165,46 @@ def fit_time_correlation(
     is_interval_without_gap = (
         interval_s < MAX_INTERVAL_TO_MEDIAN_INTERVAL_RATIO * np.median(interval_s[1:])
     ) & (interval_s > 0.0)
-    # An outlier also changes the next unfiltered position, so both are excluded
-    is_used_position = ~(is_outlier | (is_interval_without_gap & np.roll(is_outlier, 1)))
-    imu_motion = compute_imu_motion(
-        flight,
-        time_s[is_used_position],
-        measured_m[is_used_position],
-        directions=np.array([axis.direction for axis in axes]),
-        dt_s=settings.dt_s,
-    )
+    directions = np.array([axis.direction for axis in axes])
+    motion_cache = MotionCache()
+
+    def undo_low_pass(tau_s: float) -> tuple[PositionsAndImuMotion | Unavailable, float]:
+        """Undo a low-pass filter with time constant ``tau_s``.
+
+        Return the unfiltered positions with their IMU motion, and the change of -ln p.
+        """
+        rho = np.zeros(len(time_s))
+        if tau_s:
+            rho[is_interval_without_gap] = np.exp(-interval_s[is_interval_without_gap] / tau_s)
+        previous_position_m = np.concatenate([measured_m[:1], measured_m[:-1]])
+        unfiltered_position_m = (measured_m - rho[:, None] * previous_position_m) / (1.0 - rho)[
+            :, None
+        ]
+        # An outlier also changes the next unfiltered position, so both are excluded
+        is_used_position = ~(
+            is_outlier | (is_interval_without_gap & np.append(False, is_outlier[:-1]))
+        )
+        motion_of_unfiltered_positions = compute_imu_motion(
+            flight,
+            time_s[is_used_position],
+            unfiltered_position_m[is_used_position],
+            directions=directions,
+            dt_s=settings.dt_s,
+            motion_cache=motion_cache,
+        )
+        if isinstance(motion_of_unfiltered_positions, Unavailable):
+            return motion_of_unfiltered_positions, 0.0
+        # The first position of a segment sets the state, and is not part of the likelihood
+        is_used = np.isin(
+            time_s,
+            np.delete(
+                motion_of_unfiltered_positions.time_s,
+                motion_of_unfiltered_positions.segment_edges[:-1],
+            ),
+        )
+        return motion_of_unfiltered_positions, len(axes) * float(np.sum(np.log1p(-rho[is_used])))
+
+    imu_motion, _ = undo_low_pass(0.0)
     if isinstance(imu_motion, Unavailable):
         return imu_motion
     tested_offsets_s = sorted({0.0, clock_offset_s})
@@ -188,16 +223,8 @@ def fit_time_correlation(
     ]
     # Scores are -ln p of the positions: the lowest is the best
     (coarse_white_noise_score, _), (coarse_correlated_noise_score, correlated_start_parameters) = (
-        downsampled_motion.search_grid(
-            [
-                replace(candidate, sigma_a_m_s2=factor * candidate.sigma_a_m_s2)
-                for candidate in candidates
-                for factor in COARSE_SIGMA_A_FACTORS
-            ],
-            tested_offsets_s,
-            COARSE_SIGMA_FACTORS,
-        )[::2]
-        for candidates in ([noise_parameters], correlated_candidates)
+        _search_coarse_grid(downsampled_motion, tested_offsets_s, candidate_parameters)
+        for candidate_parameters in ([noise_parameters], correlated_candidates)
     )
     no_correlation_found = Unavailable(
         "time-correlated noise of the positions", "the position errors are not time-correlated", ""
@@ -208,47 +235,36 @@ def fit_time_correlation(
         and not is_sigma_z_small
     ):
         return source_low_pass, no_correlation_found
-
-    def fit_at_best_offset(
-        start_parameters: NoiseParameters,
-    ) -> tuple[float, NoiseParameters, float]:
-        fits = [
-            (*_fit_noises_at_offset(imu_motion, offset_s, start_parameters), offset_s)
-            for offset_s in tested_offsets_s
-        ]
-        return min(fits, key=lambda fit: fit[0])
-
-    white_noise_score, white_noise_parameters, _ = fit_at_best_offset(noise_parameters)
-    correlated_noise_score, correlated_parameters, offset_s = fit_at_best_offset(
-        correlated_start_parameters
+    (white_noise_fit, _), (correlated_noise_fit, offset_s) = (
+        min(
+            (
+                (_fit_noises_at_offset(imu_motion, offset, start_parameters), offset)
+                for offset in tested_offsets_s
+            ),
+            key=lambda fit_and_offset: fit_and_offset[0].compute_score(),
+        )
+        for start_parameters in (noise_parameters, correlated_start_parameters)
     )
+    white_noise_score = white_noise_fit.compute_score()
+    correlated_noise_score = correlated_noise_fit.compute_score()
     # A low-pass filter is fitted only if the noise is time-correlated or very small
     is_correlated = white_noise_score - correlated_noise_score >= MIN_LIKELIHOOD_GAIN_NATS
     if not (is_correlated or is_sigma_z_small):
         return source_low_pass, no_correlation_found
 
     def fit_low_pass(log_tau: float) -> tuple[float, NoiseParameters]:
-        """Undo a low-pass filter; return -ln p of the positions, and their noises."""
-        rho = np.where(is_interval_without_gap, np.exp(-interval_s / np.exp(log_tau)), 0.0)[:, None]
-        unfiltered_position_m = (measured_m - rho * np.roll(measured_m, 1, axis=0)) / (1.0 - rho)
-        is_used_position = np.isin(time_s, imu_motion.time_s)
-        positions_m = unfiltered_position_m[is_used_position]
-        segment_starts = imu_motion.segment_edges[:-1]
-        first_position_m = np.repeat(
-            positions_m[segment_starts], np.diff(imu_motion.segment_edges), axis=0
+        motion_of_unfiltered_positions, minus_log_jacobian = undo_low_pass(float(np.exp(log_tau)))
+        # The IMU motion was available for τ = 0 at the same times
+        assert not isinstance(motion_of_unfiltered_positions, Unavailable)
+        noise_fit = _fit_noises_at_offset(
+            motion_of_unfiltered_positions, 0.0, white_noise_fit.noise_parameters
         )
-        score, low_pass_parameters = _fit_noises_at_offset(
-            replace(imu_motion, measurement_m=positions_m - first_position_m),
-            0.0,
-            white_noise_parameters,
-        )
-        # The first position of a segment sets the state, and is not part of the likelihood
-        log_jacobian = np.log1p(-np.delete(rho[is_used_position], segment_starts)).sum()
-        return score + len(axes) * float(log_jacobian), low_pass_parameters
+        return noise_fit.compute_score() + minus_log_jacobian, noise_fit.noise_parameters
 
+    low_log_tau, high_log_tau = np.log(LOW_PASS_TAU_RANGE_S)
     log_tau = minimize_scalar(
         lambda log_tau: fit_low_pass(log_tau)[0],
-        bounds=np.log(LOW_PASS_TAU_RANGE_S).tolist(),
+        bounds=(low_log_tau, high_log_tau),
         options={"xatol": LOG_TAU_TOLERANCE},
     ).x
     low_pass_score, low_pass_parameters = fit_low_pass(log_tau)
@@ -264,12 +280,13 @@ def fit_time_correlation(
         )
     if not is_correlated:
         return source_low_pass, no_correlation_found
+    fitted_parameters = correlated_noise_fit.noise_parameters
     return source_low_pass, TimeCorrelatedNoise(
-        correlated_parameters.tau_s,
-        correlated_parameters.tau_s,
+        fitted_parameters.tau_s,
+        fitted_parameters.tau_s,
         np.inf,
-        correlated_parameters.correlated_sigma_m,
-        correlated_parameters.sigma_z_m,
+        fitted_parameters.correlated_sigma_m,
+        fitted_parameters.sigma_z_m,
         white_noise_score - correlated_noise_score,
         correlated_noise_score - low_pass_score + (TIME_OFFSET_PENALTY_NATS if offset_s else 0.0),
     )
@@ -331,7 +348,8 @@ def fit_time_correlation_to_truth(
     residuals = basis_without_systematic_errors.T @ (measured_m - true_m)
     if np.abs(residuals).max() < MAX_RESIDUAL_OF_COPIED_TRUTH_M:
         return noise_from_imu
-    scores_and_mean_squares = []
+    scores_and_variances = []
+    half_axis_count_and_half_residual_count = 0.5 * np.array([len(axes), len(residuals)])
     for tested_tau_s in TESTED_TAUS_S:
         correlation_matrix = (
             basis_without_systematic_errors.T
@@ -342,20 +360,22 @@ def fit_time_correlation_to_truth(
         relative_noise_variance = (
             1.0 - TESTED_CORRELATED_FRACTIONS + TESTED_CORRELATED_FRACTIONS * eigenvalues[:, None]
         )
-        # Shape (axes, fractions)
-        mean_squares = (
+        normalised_mean_squares = (
             ((eigenvectors.T @ residuals) ** 2).T @ (1.0 / relative_noise_variance) / len(residuals)
         )
-        scores = 0.5 * (
-            len(axes) * np.log(relative_noise_variance).sum(axis=0)
-            + len(residuals) * np.log(mean_squares).sum(axis=0)
-        )
-        scores_and_mean_squares.append((scores, mean_squares.mean(axis=0)))
+        scores = half_axis_count_and_half_residual_count @ [
+            np.log(relative_noise_variance).sum(axis=0),
+            np.log(normalised_mean_squares).sum(axis=0),
+        ]
+        scores_and_variances.append((scores, normalised_mean_squares.mean(axis=0)))
     # Rows are time constants, columns time-correlated fractions of the variance
-    scores, mean_squares = np.transpose(scores_and_mean_squares, (1, 0, 2))
-    tau_index, fraction_index = np.unravel_index(np.argmin(scores), scores.shape)
-    white_noise_score = 0.5 * len(residuals) * np.log(np.mean(residuals**2, axis=0)).sum()
-    likelihood_gains_nats = white_noise_score - scores.min(axis=1)
+    scores, normalised_mean_squares = np.transpose(scores_and_variances, (1, 0, 2))
+    tau_index, correlated_fraction_index = divmod(
+        int(np.argmin(scores)), len(TESTED_CORRELATED_FRACTIONS)
+    )
+    likelihood_gains_nats = half_axis_count_and_half_residual_count[1] * np.log(
+        np.mean(residuals**2, axis=0)
+    ).sum() - scores.min(axis=1)
     best_gain_nats = likelihood_gains_nats.max()
     if best_gain_nats < min_likelihood_gain_nats:
         return noise_from_imu
@@ -366,8 +386,11 @@ def fit_time_correlation_to_truth(
     tau_s = np.append(TESTED_TAUS_S, np.inf)[
         [tau_index, max(first_tau_index - 1, 0), last_tau_index + 1]
     ]
-    fraction = TESTED_CORRELATED_FRACTIONS[fraction_index]
-    sigmas_m = np.sqrt(mean_squares[tau_index, fraction_index] * np.r_[fraction, 1.0 - fraction])
+    fraction = TESTED_CORRELATED_FRACTIONS[correlated_fraction_index]
+    sigmas_m = np.sqrt(
+        normalised_mean_squares[tau_index, correlated_fraction_index]
+        * np.array([fraction, 1.0 - fraction])
+    )
     return TimeCorrelatedNoise(
         *np.r_[tau_s, sigmas_m, best_gain_nats, low_pass_likelihood_gain_nats].tolist()
     )
@@ -375,12 +398,39 @@ def fit_time_correlation_to_truth(
 
 def _fit_noises_at_offset(
     imu_motion: PositionsAndImuMotion, offset_s: float, start_parameters: NoiseParameters
-) -> tuple[float, NoiseParameters]:
-    """Return the lowest score (-ln p) for a time offset, and its noises."""
-    fit = maximise_likelihood(
+) -> NoiseFit:
+    return maximise_likelihood(
         [imu_motion.make_positions_at_offset(offset_s)],
         start_parameters,
         imu_motion.measurement_weights,
         fits_outliers=False,
     )
-    return fit.lowest_score, fit.noise_parameters
+
+
+def _search_coarse_grid(
+    imu_motion: PositionsAndImuMotion,
+    offsets_s: Sequence[float],
+    candidate_parameters: Sequence[NoiseParameters],
+) -> tuple[float, NoiseParameters]:
+    """Return the lowest score (-ln p) and its noises from a grid of time offsets and noises."""
+    scored_parameters = []
+    for positions in map(imu_motion.make_positions_at_offset, offsets_s):
+        for candidate, sigma_a_factor in product(candidate_parameters, COARSE_SIGMA_A_FACTORS):
+            noise_parameters = replace(
+                candidate, sigma_a_m_s2=sigma_a_factor * candidate.sigma_a_m_s2
+            )
+            total_scores = fit_constant_errors(
+                [positions], noise_parameters, imu_motion.measurement_weights
+            ).compute_scores(COARSE_SIGMA_FACTORS)[:, 0]
+            scored_parameters.append(
+                (
+                    float(total_scores.min()),
+                    float(COARSE_SIGMA_FACTORS[np.argmin(total_scores)]),
+                    noise_parameters,
+                )
+            )
+    lowest_score, factor, noise_parameters = min(scored_parameters, key=lambda scored: scored[0])
+    best_parameters = {
+        name: value * factor for name, value in vars(noise_parameters).items() if name != "tau_s"
+    }
+    return lowest_score, replace(noise_parameters, **best_parameters)

@@ -6,25 +6,25 @@ distribution with a larger σ (Tukey 1960), which is estimated by expectation ma
 A score is a negative log-likelihood (-ln p): lower is better.
 """
 
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, replace
+from functools import cache
+from math import floor, log
 
 import numpy as np
 from scipy.optimize import minimize
-from scipy.special import chdtri, expit
+from scipy.special import chdtri, comb, expit
 
-from px4fuse.core.arrays import Array, ArrayPair
-from px4fuse.filter.likelihood import preintegrate
+from px4fuse.core.arrays import Array
+from px4fuse.filter.likelihood import PreintegratedMotion
 from px4fuse.filter.marginal_likelihood import (
-    NoiseParameters,
+    PositionFit,
     PositionsAndIncrements,
     estimate_squared_errors,
-    fit_constant_errors,
+    fit_positions,
     subtract_smooth_path,
 )
 from px4fuse.filter.model import INITIAL_COVARIANCE
-from px4fuse.filter.settings import Settings
-from px4fuse.filter.signals import Axis
 
 # Search range (m/s²) of SIGMA_A
 SIGMA_A_SEARCH_RANGE_M_S2 = (1e-3, 30.0)
@@ -49,8 +49,39 @@ MAX_OUTLIER_PROBABILITY_CHANGE = 0.01
 UNCOMPUTABLE_SCORE = 1e6
 # Step of ln σ for numerical derivatives of the log-likelihood
 LOG_STEP_FOR_DERIVATIVES = 1e-4
+# Grid for the interpolation of the log-likelihood: number of nodes, and spacing in ln σ
+GRID_NODE_COUNT_AND_SPACING = 10, 0.25
+# Smaller, less accurate grid for the first iterations: number of nodes, and spacing in ln σ
+COARSE_GRID_NODE_COUNT_AND_SPACING = 6, 0.2
 # Number of measurements that give the initial values for a long flight
 INITIAL_FIT_MEASUREMENT_COUNT = 2000
+# Precision of a known initial position (1/m²) and velocity (s²/m²)
+KNOWN_INITIAL_STATE_PRECISION = 1e12
+
+
+@dataclass(frozen=True)
+class NoiseParameters:
+    """Noise parameters of the IMU and of the position source.
+
+    Attributes
+    ----------
+    sigma_a_m_s2 : float
+        Standard deviation of the acceleration error over one step DT.
+    sigma_z_m : float
+        Standard deviation of the white position noise.
+    random_walk_m : float
+        Random walk of the source (m/√s); 0 for none.
+    correlated_sigma_m, tau_s : float
+        Standard deviation and time constant of time-correlated noise; 0 for none.
+    """
+
+    sigma_a_m_s2: float
+    sigma_z_m: float
+    random_walk_m: float = 0.0
+    correlated_sigma_m: float = 0.0
+    tau_s: float = 0.0
+
+
 # Search range of each field of NoiseParameters, in the unit of the field
 NOISE_SEARCH_RANGES = {
     "sigma_a_m_s2": SIGMA_A_SEARCH_RANGE_M_S2,
@@ -61,72 +92,257 @@ NOISE_SEARCH_RANGES = {
 }
 
 
+class NegativeLogLikelihood:
+    """Negative log-likelihood (-ln p) of the measurements as a function of the noise parameters.
+
+    Constant terms are omitted. For white noise, -ln p is interpolated on a grid.
+
+    Parameters
+    ----------
+    axis_positions : sequence of PositionsAndIncrements
+        Positions along each axis.
+    measurement_weights : ndarray, shape (m,)
+        The variance of a measurement is SIGMA_Z² / weight.
+    sigma_z_m : float
+        Approximate SIGMA_Z.
+    is_coarse : bool
+        True for a smaller grid, which is faster but less accurate.
+    """
+
+    def __init__(
+        self,
+        axis_positions: Sequence[PositionsAndIncrements],
+        measurement_weights: Array,
+        sigma_z_m: float,
+        is_coarse: bool = False,
+    ) -> None:
+        self.axis_positions = axis_positions
+        self.measurement_weights = measurement_weights
+        self.sigma_z_m = sigma_z_m
+        self.is_interpolated = not any(
+            positions.process_noise_independent_of_sigma_a.any() for positions in axis_positions
+        )
+        self.node_count, self.node_spacing = node_count, node_spacing = (
+            COARSE_GRID_NODE_COUNT_AND_SPACING if is_coarse else GRID_NODE_COUNT_AND_SPACING
+        )
+
+        @cache
+        def fit_axes_with_sigma_ratio(log_sigma_ratio_node: int) -> list[PositionFit]:
+            sigma_a_to_sigma_z_ratio = float(np.exp(node_spacing * log_sigma_ratio_node))
+            return [
+                fit_with_sigma_ratios(
+                    [positions], [sigma_a_to_sigma_z_ratio], 0.0, measurement_weights, sigma_z_m
+                )[0]
+                for positions in axis_positions
+            ]
+
+        @cache
+        def compute_scores_with_sigma_ratio(
+            log_sigma_ratio_node: int, log_sigma_z_node: int
+        ) -> Array:
+            sigma_factors = np.exp(node_spacing * (log_sigma_z_node + np.arange(node_count)))
+            scores_by_axis = [
+                axis_fit.compute_scores(sigma_factors)[:, 0]
+                for axis_fit in fit_axes_with_sigma_ratio(log_sigma_ratio_node)
+            ]
+            return np.asarray(np.sum(scores_by_axis, axis=0))
+
+        @cache
+        def compute_scores_at_nodes(log_sigma_ratio_node: int, log_sigma_z_node: int) -> Array:
+            return np.array(
+                [
+                    compute_scores_with_sigma_ratio(log_sigma_ratio_node + node, log_sigma_z_node)
+                    for node in range(node_count)
+                ]
+            )
+
+        self._compute_scores_at_nodes = compute_scores_at_nodes
+
+    def __call__(self, noise_parameters: NoiseParameters) -> float:
+        """Return -ln p of the measurements, without the constant term with ln 2π."""
+        if (
+            noise_parameters.random_walk_m
+            or noise_parameters.correlated_sigma_m
+            or not self.is_interpolated
+        ):
+            return negative_log_likelihood(
+                self.axis_positions, noise_parameters, self.measurement_weights
+            )
+        log_sigma_z_in_node_steps = log(noise_parameters.sigma_z_m) / self.node_spacing
+        log_sigma_ratio_in_node_steps = (
+            log(noise_parameters.sigma_a_m_s2) / self.node_spacing - log_sigma_z_in_node_steps
+        )
+        grid_nodes_below_value = (self.node_count - 1) // 2
+        first_log_sigma_ratio_node = floor(log_sigma_ratio_in_node_steps) - grid_nodes_below_value
+        first_log_sigma_z_node = floor(log_sigma_z_in_node_steps) - grid_nodes_below_value
+        log_sigma_ratio_interpolation_weights = _compute_interpolation_weights(
+            log_sigma_ratio_in_node_steps - first_log_sigma_ratio_node, self.node_count
+        )
+        log_sigma_z_interpolation_weights = _compute_interpolation_weights(
+            log_sigma_z_in_node_steps - first_log_sigma_z_node, self.node_count
+        )
+        return float(
+            log_sigma_ratio_interpolation_weights
+            @ self._compute_scores_at_nodes(first_log_sigma_ratio_node, first_log_sigma_z_node)
+            @ log_sigma_z_interpolation_weights
+        )
+
+
+@cache
+def _compute_barycentric_weights(node_count: int) -> Array:
+    nodes = np.arange(node_count)
+    return np.asarray((-1.0) ** nodes * comb(node_count - 1, nodes))
+
+
+def _compute_interpolation_weights(position_in_node_steps: float, node_count: int) -> Array:
+    """Return the weights of barycentric interpolation (Berrut and Trefethen 2004)."""
+    node_distances = position_in_node_steps - np.arange(node_count)
+    if not node_distances.all():
+        return np.asarray(node_distances == 0.0, dtype=np.float64)
+    weights = _compute_barycentric_weights(node_count) / node_distances
+    return np.asarray(weights / weights.sum())
+
+
+def fit_with_sigma_ratios(
+    position_batches: Iterable[PositionsAndIncrements],
+    sigma_a_to_sigma_z_ratios: Sequence[float],
+    random_walk_to_sigma_z_ratio: float,
+    measurement_weights: Array,
+    sigma_z_m: float,
+) -> list[PositionFit]:
+    """Fit constant errors (such as biases) to positions, for each ratio SIGMA_A / SIGMA_Z (1/s²).
+
+    The batches contain the same positions with different time offsets. The result has one fit for
+    each ratio. ``random_walk_to_sigma_z_ratio`` has the unit 1/√s.
+    """
+    batches_over_sigma_z = (
+        positions.divide_sigmas_by_sigma_z(
+            sigma_z_m, random_walk_to_sigma_z_ratio, measurement_weights
+        )
+        for positions in position_batches
+    )
+    fits_by_batch = [
+        [
+            fit_positions(positions_over_sigma_z, ratio, variance_m2)
+            for ratio in sigma_a_to_sigma_z_ratios
+        ]
+        for positions_over_sigma_z, variance_m2 in batches_over_sigma_z
+    ]
+    return [
+        replace(
+            batch_fits[0],
+            gram_matrix=np.concatenate([batch_fit.gram_matrix for batch_fit in batch_fits], axis=1),
+        )
+        for batch_fits in zip(*fits_by_batch, strict=True)
+    ]
+
+
+def fit_constant_errors(
+    position_batches: Iterable[PositionsAndIncrements],
+    noise_parameters: NoiseParameters,
+    measurement_weights: Array,
+) -> PositionFit:
+    """Fit constant errors (such as biases) to positions, with given noise parameters.
+
+    The batches contain the same positions with different time offsets. The variance of a
+    measurement is SIGMA_Z² / weight.
+    """
+    sigma_z_m = noise_parameters.sigma_z_m
+    if noise_parameters.correlated_sigma_m:
+        position_batches = (
+            replace(
+                positions,
+                correlated_noise=(noise_parameters.correlated_sigma_m, noise_parameters.tau_s),
+            )
+            for positions in position_batches
+        )
+    (position_fit,) = fit_with_sigma_ratios(
+        position_batches,
+        [noise_parameters.sigma_a_m_s2 / sigma_z_m],
+        noise_parameters.random_walk_m / sigma_z_m,
+        measurement_weights,
+        sigma_z_m,
+    )
+    return position_fit.scale_sigmas(sigma_z_m)
+
+
+def negative_log_likelihood(
+    axis_positions: Sequence[PositionsAndIncrements],
+    noise_parameters: NoiseParameters,
+    measurement_weights: Array,
+) -> float:
+    """Return -ln p of the measurements of all axes, without the constant term with ln 2π."""
+    return float(
+        sum(
+            fit_constant_errors(
+                [positions], noise_parameters, measurement_weights
+            ).compute_scores()[0, 0]
+            for positions in axis_positions
+        )
+    )
+
+
 @dataclass(frozen=True)
 class NoiseFit:
     """Maximum-likelihood noise parameters, and the outliers among the measurements.
 
     Attributes
     ----------
-    axis_positions : sequence of PositionsAndIncrements
-        Positions along each axis, at equal times.
     outlier_fraction, outlier_sigma_ratio : float
         Fraction of outliers, and ratio of their σ to SIGMA_Z.
     outlier_probability : ndarray, shape (m,)
         Probability of each measurement to be an outlier.
     measurement_weights : ndarray, shape (m,)
         1 for a good measurement, smaller for an outlier.
+    score : NegativeLogLikelihood
+        -ln p as a function of the noise parameters.
     log_sigma_z_variance_factor : float
         Increase of the variance of ln SIGMA_Z by uncertain outliers; at least 1.
-    lowest_score : float
-        -ln p of the measurements with ``noise_parameters``.
     """
 
-    axis_positions: Sequence[PositionsAndIncrements]
     noise_parameters: NoiseParameters
     measurement_weights: Array
     outlier_probability: Array
+    score: NegativeLogLikelihood
     log_sigma_z_variance_factor: float
     outlier_fraction: float
     outlier_sigma_ratio: float
-    lowest_score: float
 
-    def score(self, noise_parameters: NoiseParameters) -> float:
-        """Return -ln p of the measurements, without a constant term."""
-        return compute_score(self.axis_positions, noise_parameters, self.measurement_weights)
-
-
-def compute_score(
-    axis_positions: Sequence[PositionsAndIncrements],
-    noise_parameters: NoiseParameters,
-    measurement_weights: Array,
-) -> float:
-    """Return -ln p of the measurements of all axes, without a constant term."""
-    return sum(
-        fit_constant_errors(positions, noise_parameters, measurement_weights).compute_score()
-        for positions in axis_positions
-    )
+    def compute_score(self) -> float:
+        """Return -ln p of the measurements at the maximum-likelihood noise parameters."""
+        return self.score(self.noise_parameters)
 
 
-def make_kf_positions(axis: Axis, settings: Settings) -> PositionsAndIncrements:
-    """Return the inputs of KF along one axis as inputs of :func:`fit_constant_errors`.
+def convert_to_positions_and_increments(
+    preintegrated_motion: PreintegratedMotion,
+) -> PositionsAndIncrements:
+    """Convert the inputs of KF to the inputs of :func:`fit_constant_errors`.
 
-    The first row is KF's initial state, which has no measurement.
+    The constant errors are those of the initial position and velocity.
     """
-    motion = preintegrate(axis, settings)
+    measurement_count = len(preintegrated_motion.measurement_m)
+    prior_precision = np.zeros((measurement_count + 1, 2))
+    prior_precision[0] = KNOWN_INITIAL_STATE_PRECISION
+    measured_m = np.append(
+        np.nan, preintegrated_motion.measurement_m - preintegrated_motion.initial_state.position_m
+    )[:, None]
+    dp, dv = np.zeros((2, 1, 1, 3, measurement_count))
+    dp[0, 0, 0] = preintegrated_motion.delta_position_m
+    dv[0, 0, 0] = preintegrated_motion.delta_velocity_m_s
+    # Errors of the initial position and velocity enter in the first interval only
+    dp[0, 0, 1:, 0] = (1.0, preintegrated_motion.interval_s[0])
+    dv[0, 0, 2, 0] = 1.0
     return subtract_smooth_path(
         PositionsAndIncrements(
-            measurement_m=np.append(np.nan, motion.measurement_m - motion.initial_state.position_m)[
-                :, None
-            ],
+            measurement_m=measured_m,
             segment_starts=np.array([0]),
-            interval_s=motion.interval_s,
-            process_noise_per_sigma_a_squared=motion.process_noise_per_sigma_a_squared.T,
-            process_noise_independent_of_sigma_a=motion.process_noise_independent_of_sigma_a.T,
-            initial_state_precision=(1.0 / INITIAL_COVARIANCE[0], 1.0 / INITIAL_COVARIANCE[2]),
-            is_initial_state_known=True,
-            constant_prior_sigmas=np.zeros(0),
-            delta_position_m=motion.delta_position_m[None, None],
-            delta_velocity_m_s=motion.delta_velocity_m_s[None, None],
+            interval_s=preintegrated_motion.interval_s,
+            process_noise_per_sigma_a_squared=preintegrated_motion.process_noise_per_sigma_a_squared.T,
+            process_noise_independent_of_sigma_a=preintegrated_motion.process_noise_independent_of_sigma_a.T,
+            prior_precision=prior_precision,
+            constant_prior_sigmas=np.sqrt([INITIAL_COVARIANCE[0], INITIAL_COVARIANCE[2]]),
+            delta_position_m=dp,
+            delta_velocity_m_s=dv,
         )
     )
 
@@ -173,10 +389,12 @@ def maximise_likelihood(
         outlier_sigma_ratio = first_fit.outlier_sigma_ratio
     noise_parameters = start_parameters
     for iteration in range(MAX_OUTLIER_ITERATIONS if fits_outliers else 0):
-        noise_parameters, _ = _maximise_by_gradient(
-            axis_positions,
+        likelihood = NegativeLogLikelihood(
+            axis_positions, measurement_weights, start_parameters.sigma_z_m, is_coarse=True
+        )
+        noise_parameters = _maximise_by_gradient(
+            likelihood,
             noise_parameters,
-            measurement_weights,
             MAX_COARSE_ITERATIONS if iteration else MAX_FINAL_ITERATIONS,
         )
         expected_squared_errors_m2, measured_axis_counts = _estimate_squared_errors(
@@ -227,9 +445,10 @@ def maximise_likelihood(
         noise_parameters = replace(
             noise_parameters, sigma_z_m=float(np.sqrt(limited_sigma_z_variance_m2))
         )
-    noise_parameters, lowest_score = _maximise_by_gradient(
-        axis_positions, noise_parameters, measurement_weights
+    likelihood = NegativeLogLikelihood(
+        axis_positions, measurement_weights, start_parameters.sigma_z_m, is_coarse=is_long
     )
+    noise_parameters = _maximise_by_gradient(likelihood, noise_parameters)
     log_sigma_z_variance_factor = 1.0
     if outlier_probability.any():
         expected_squared_errors_m2, measured_axis_counts = _estimate_squared_errors(
@@ -242,14 +461,13 @@ def maximise_likelihood(
             outlier_sigma_ratio,
         )
     return NoiseFit(
-        axis_positions,
         noise_parameters,
         measurement_weights,
         outlier_probability,
+        likelihood,
         log_sigma_z_variance_factor,
         outlier_fraction,
         outlier_sigma_ratio,
-        lowest_score,
     )
 
 
@@ -276,16 +494,27 @@ def _estimate_squared_errors(
     axis_positions: Sequence[PositionsAndIncrements],
     noise_parameters: NoiseParameters,
     measurement_weights: Array,
-) -> ArrayPair:
+) -> tuple[Array, Array]:
     """Return the expected squared error (m²) of each measurement, and its number of axes.
 
     The squared error is summed over the measured axes.
     """
-    squared_errors_and_axis_counts = [
-        estimate_squared_errors(positions, noise_parameters, measurement_weights)
-        for positions in axis_positions
-    ]
-    # The initial states of KF are not measurements
+    squared_errors_and_axis_counts = []
+    for positions in axis_positions:
+        constant_errors = fit_constant_errors(
+            [positions], noise_parameters, measurement_weights
+        ).estimate_segment_constants()[:, 0]
+        positions_with_random_walk, measurement_variance_m2 = positions.divide_sigmas_by_sigma_z(
+            1.0, noise_parameters.random_walk_m, measurement_weights / noise_parameters.sigma_z_m**2
+        )
+        squared_errors_and_axis_counts.append(
+            estimate_squared_errors(
+                positions_with_random_walk,
+                noise_parameters.sigma_a_m_s2,
+                measurement_variance_m2,
+                constant_errors,
+            )
+        )
     expected_squared_errors_m2, measured_axis_counts = np.sum(
         squared_errors_and_axis_counts, axis=0
     )[:, -len(measurement_weights) :]
@@ -344,33 +573,26 @@ def compute_log_sigma_z_variance_factor(
 
 
 def _maximise_by_gradient(
-    axis_positions: Sequence[PositionsAndIncrements],
+    likelihood: NegativeLogLikelihood,
     start_parameters: NoiseParameters,
-    measurement_weights: Array,
     max_steps: int = MAX_FINAL_ITERATIONS,
-) -> tuple[NoiseParameters, float]:
-    """Return the noises with the lowest score (-ln p), and this score."""
+) -> NoiseParameters:
     nonzero_parameters = {name: value for name, value in vars(start_parameters).items() if value}
     log_bounds = np.log([NOISE_SEARCH_RANGES[name] for name in nonzero_parameters])
-    measurement_count = len(measurement_weights)
+    measurement_count = len(likelihood.measurement_weights)
+
+    def score_per_measurement(log_parameters: Array) -> float:
+        # Dividing by the number of measurements gives L-BFGS-B a suitable first step
+        try:
+            return likelihood(to_noise_parameters(log_parameters)) / measurement_count
+        # After a large score, L-BFGS-B tries a shorter step
+        except np.linalg.LinAlgError:
+            return UNCOMPUTABLE_SCORE
 
     def to_noise_parameters(log_parameters: Array) -> NoiseParameters:
         return NoiseParameters(
             **dict(zip(nonzero_parameters, np.exp(log_parameters).tolist(), strict=True))
         )
-
-    def score_per_measurement(log_parameters: Array) -> float:
-        # Dividing by the number of measurements gives L-BFGS-B a suitable first step
-        try:
-            return (
-                compute_score(
-                    axis_positions, to_noise_parameters(log_parameters), measurement_weights
-                )
-                / measurement_count
-            )
-        # After a large score, L-BFGS-B tries a shorter step
-        except np.linalg.LinAlgError:
-            return UNCOMPUTABLE_SCORE
 
     search_result = minimize(
         score_per_measurement,
@@ -384,4 +606,4 @@ def _maximise_by_gradient(
             "maxiter": max_steps,
         },
     )
-    return to_noise_parameters(search_result.x), search_result.fun * measurement_count
+    return to_noise_parameters(search_result.x)

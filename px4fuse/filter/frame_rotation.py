@@ -5,7 +5,6 @@ The misalignment is estimated from orientations of the source, or from positions
 chi-square test decides if it changes in flight.
 """
 
-from dataclasses import replace
 from typing import Literal
 
 import numpy as np
@@ -15,14 +14,13 @@ from scipy.special import chdtrc
 
 from px4fuse.core.arrays import Array, compute_median_interval_s
 from px4fuse.core.record import NotNegative, Record, Share
-from px4fuse.filter.fitting import maximise_likelihood
+from px4fuse.filter.fitting import NoiseParameters, fit_constant_errors, maximise_likelihood
 from px4fuse.filter.imu_motion import (
-    HEADING_ERROR_INDEX,
     MAX_IMU_INTERVAL_S,
     MIN_SEGMENT_MEASUREMENTS,
+    MotionCache,
     compute_imu_motion,
 )
-from px4fuse.filter.marginal_likelihood import NoiseParameters, fit_constant_errors
 from px4fuse.filter.settings import Settings
 from px4fuse.filter.signals import Segment, cut_to_segment, report_too_few_measurements
 from px4fuse.flight.model import Columns, Flight, PositionTrack, Unavailable
@@ -55,6 +53,7 @@ MAX_HEADING_CHANGE_AT_CONVERGENCE_RAD = 0.01
 HEADING_SIGMA_RAD = 1.0
 # Minimum estimated scale factor of the positions, to avoid a division by zero
 MIN_FITTED_SCALE_FACTOR = 0.1
+HEADING_ERROR_INDEX = 2
 
 
 class HeadingPart(Record):
@@ -177,27 +176,33 @@ def estimate_heading_error(  # noqa: PLR0911 (one return per missing input)
 
 
 def _average_flight_parts(
-    time_s: Array, misalignment_rad: Array, sigma_rad: float
+    time_s: Array, misalignment_rad: Array, sigma_rad: Array
 ) -> tuple[HeadingPart, ...]:
-    """Average the yaw misalignment over flight parts of equal duration.
+    """Average yaw misalignment and σ (rad) over flight parts of equal duration.
 
     σ is not reduced by averaging, because errors in one part are correlated.
     """
     # At a low sample rate, parts are longer, to contain enough samples
-    part_count = min(
-        (time_s[-1] - time_s[0]) / FLIGHT_PART_DURATION_S,
-        len(time_s) / (2 * MIN_FLIGHT_PART_SAMPLES),
+    part_count = max(
+        int(
+            min(
+                (time_s[-1] - time_s[0]) / FLIGHT_PART_DURATION_S,
+                len(time_s) / (2 * MIN_FLIGHT_PART_SAMPLES),
+            )
+        ),
+        1,
     )
-    part_edges_s = np.linspace(time_s[0], time_s[-1], max(int(part_count), 1) + 1)[1:-1]
+    part_edges_s = np.linspace(time_s[0], time_s[-1], part_count + 1)[1:-1]
+    rows_by_part = np.split(np.arange(len(time_s)), np.searchsorted(time_s, part_edges_s))
     return tuple(
         HeadingPart(
-            start_s=float(time_s[rows[0]]),
-            end_s=float(time_s[rows[-1]]),
-            heading_error_deg=float(np.degrees(misalignment_rad[rows].mean())),
-            sigma_deg=float(np.degrees(sigma_rad)),
+            start_s=float(time_s[part_rows[0]]),
+            end_s=float(time_s[part_rows[-1]]),
+            heading_error_deg=float(np.degrees(misalignment_rad[part_rows].mean())),
+            sigma_deg=float(np.degrees(np.sqrt(np.mean(sigma_rad[part_rows] ** 2)))),
         )
-        for rows in np.split(np.arange(len(time_s)), np.searchsorted(time_s, part_edges_s))
-        if len(rows) >= MIN_FLIGHT_PART_SAMPLES
+        for part_rows in rows_by_part
+        if len(part_rows) >= MIN_FLIGHT_PART_SAMPLES
     )
 
 
@@ -227,12 +232,17 @@ def _compare_orientations(
     misalignment_rad = misalignment_rad[has_low_yaw_rate]
     # Robust σ from the differences of successive samples
     noise_sigma_rad = 1.4826 * np.median(np.abs(np.diff(misalignment_rad))) / np.sqrt(2.0)
-    sigma_rad = max(float(noise_sigma_rad), float(np.radians(MIN_HEADING_SIGMA_DEG)))
+    sigma_rad = np.full(len(time_s), max(float(noise_sigma_rad), np.radians(MIN_HEADING_SIGMA_DEG)))
     heading_parts = _average_flight_parts(time_s, misalignment_rad, sigma_rad)
     if len(heading_parts) < MIN_FLIGHT_PART_COUNT:
         return None
-    heading_variance_deg2 = np.var([part.heading_error_deg for part in heading_parts])
-    chi_square = len(heading_parts) * heading_variance_deg2 / np.degrees(sigma_rad) ** 2
+    heading_errors_deg = np.array(
+        [heading_part.heading_error_deg for heading_part in heading_parts]
+    )
+    chi_square = (
+        np.sum((heading_errors_deg - heading_errors_deg.mean()) ** 2)
+        / np.degrees(sigma_rad[0]) ** 2
+    )
     return combine_heading_parts(
         heading_parts, float(chdtrc(len(heading_parts) - 1, chi_square)), "orientation"
     )
@@ -254,52 +264,54 @@ def _estimate_heading_error_from_positions(
     fit_duration_s = max(
         HEADING_FIT_DURATION_S, 2 * MIN_SEGMENT_MEASUREMENTS * compute_median_interval_s(time_s)
     )
-    motion = compute_imu_motion(
-        flight,
-        time_s,
-        position_samples.to_numpy(),
-        directions=np.eye(3)[:2],
-        dt_s=dt_s,
-        heading_sigma_rad=HEADING_SIGMA_RAD,
-        max_segment_duration_s=fit_duration_s,
-    )
-    if isinstance(motion, Unavailable):
-        return structs.replace(motion, what="heading error")
-    spans_s = motion.time_s[
-        np.column_stack([motion.segment_edges[:-1], motion.segment_edges[1:] - 1])
-    ]
-    is_part_long_enough = np.ptp(spans_s, axis=1) >= MIN_HEADING_FIT_DURATION_S
-    if not is_part_long_enough.any():
-        return Unavailable(
-            "heading error",
-            "the longest part of the flight without an IMU gap is shorter than "
-            f"{MIN_HEADING_FIT_DURATION_S:g} s",
-            "Analyse a longer segment.",
-        )
+    motion_cache = MotionCache()
     misalignment_rad = 0.0
     for _ in range(MAX_HEADING_FIT_ITERATIONS):
         cosine, sine = np.cos(misalignment_rad), np.sin(misalignment_rad)
-        positions = replace(
-            motion, measurement_m=motion.measurement_m @ [[cosine, -sine], [sine, cosine]]
-        ).make_positions_at_offset(0.0)
+        motion = compute_imu_motion(
+            flight,
+            time_s,
+            position_samples.to_numpy() @ np.array([[cosine, -sine], [sine, cosine]]),
+            directions=np.eye(3)[:2],
+            dt_s=dt_s,
+            motion_cache=motion_cache,
+            heading_sigma_rad=HEADING_SIGMA_RAD,
+            max_segment_duration_s=fit_duration_s,
+        )
+        if isinstance(motion, Unavailable):
+            return structs.replace(motion, what="heading error")
+        spans_s = motion.time_s[
+            np.column_stack([motion.segment_edges[:-1], motion.segment_edges[1:] - 1])
+        ]
+        is_part_long_enough = np.ptp(spans_s, axis=1) >= MIN_HEADING_FIT_DURATION_S
+        if not is_part_long_enough.any():
+            return Unavailable(
+                "heading error",
+                "the longest part of the flight without an IMU gap is shorter than "
+                f"{MIN_HEADING_FIT_DURATION_S:g} s",
+                "Analyse a longer segment.",
+            )
+        positions = motion.make_positions_at_offset(0.0)
         # Noise of the IMU motion would bias the heading error to zero, so the smooth path is used
         for increments in (positions.delta_position_m, positions.delta_velocity_m_s):
-            north_m, east_m = increments[:, -1]
-            increments[:, HEADING_ERROR_INDEX] = -east_m, north_m
+            north_m, east_m = increments[:, :, -1]
+            increments[:, :, HEADING_ERROR_INDEX] = -east_m, north_m
         noise_parameters = maximise_likelihood(
             [positions], noise_parameters, motion.measurement_weights, fits_outliers=False
         ).noise_parameters
-        constant_errors, covariances = (
-            values[is_part_long_enough]
-            for values in fit_constant_errors(
-                positions, noise_parameters, motion.measurement_weights
-            ).estimate_constants()
+        position_fit = fit_constant_errors(
+            [positions], noise_parameters, motion.measurement_weights
         )
+        constant_errors = position_fit.estimate_segment_constants()[is_part_long_enough, 0]
+        constant_errors_covariance = np.linalg.inv(position_fit.compute_constants_information())[
+            is_part_long_enough, 0
+        ]
         # The fitted angle contains the scale factor of the positions
         position_scale = np.maximum(1.0 + constant_errors[:, -1], MIN_FITTED_SCALE_FACTOR)
         error_rad = constant_errors[:, HEADING_ERROR_INDEX] / position_scale
         heading_variance_rad2 = (
-            covariances[:, HEADING_ERROR_INDEX, HEADING_ERROR_INDEX] / position_scale**2
+            constant_errors_covariance[:, HEADING_ERROR_INDEX, HEADING_ERROR_INDEX]
+            / position_scale**2
         )
         correction_rad, weight_sum = np.average(
             error_rad, weights=1.0 / heading_variance_rad2, returned=True

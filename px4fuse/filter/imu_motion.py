@@ -13,27 +13,18 @@ motion would bias the scale (errors in variables, Fuller 1987).
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
 import pandas as pd
 from scipy import constants
+from scipy.spatial.transform import Rotation, Slerp
 
-from px4fuse.core.arrays import (
-    Array,
-    IntArray,
-    compute_median_interval_s,
-    integrate_cumulatively,
-)
+from px4fuse.core.arrays import Array, IntArray, integrate_cumulatively
 from px4fuse.core.record import Span
-from px4fuse.filter.marginal_likelihood import (
-    NoiseParameters,
-    PositionFit,
-    PositionsAndIncrements,
-    fit_constant_errors,
-    subtract_smooth_path,
-)
+from px4fuse.filter.fitting import NoiseParameters, fit_with_sigma_ratios
+from px4fuse.filter.marginal_likelihood import PositionsAndIncrements, subtract_smooth_path
 from px4fuse.filter.model import compute_continuous_process_noise_per_density
 from px4fuse.filter.signals import find_imu_gaps
 from px4fuse.flight.model import Columns, Flight, Unavailable, rows_between
@@ -41,7 +32,6 @@ from px4fuse.trajectory.rotation import (
     conjugate,
     cumulative_product,
     from_rotation_vector,
-    interpolate,
     multiply,
     rotate,
     to_matrix,
@@ -50,8 +40,6 @@ from px4fuse.trajectory.rotation import (
 
 # Prior σ (rad) of the errors of tilt and heading at the start of a segment
 HEADING_SIGMA_RAD = 0.05
-# Index of the heading error in the constant errors of a segment
-HEADING_ERROR_INDEX = 2
 # Prior σ: initial attitude (rad), gyro bias (rad/s), accelerometer bias (m/s²), scale (1)
 PRIOR_SIGMAS_OF_SEGMENT_CONSTANTS = np.repeat([HEADING_SIGMA_RAD, 0.004, 0.3, 0.1], [3, 3, 3, 1])
 # A larger gyro bias (rad/s) is subtracted before the fit: 5 σ of its prior
@@ -62,11 +50,10 @@ MAX_REMOVED_GYRO_BIAS_RAD_S = 0.4
 MAX_SEGMENT_DURATION_S = 30.0
 # Maximum tested time offset (s) between position source and IMU
 MAX_TESTED_TIME_OFFSET_S = 0.6
-# Time offsets (s) in a coarse search
-COARSE_TIME_OFFSETS_S = np.linspace(
-    -MAX_TESTED_TIME_OFFSET_S, MAX_TESTED_TIME_OFFSET_S, 25
-).tolist()
+COARSE_OFFSET_COUNT = 25
 COARSE_MEASUREMENT_COUNT = 600
+# Maximum number of array elements at once, to limit the memory
+MAX_BATCH_ELEMENTS = 2**16
 # Minimum number of position measurements in all segments together
 MIN_TOTAL_MEASUREMENTS = 30
 MIN_SEGMENT_MEASUREMENTS = 15
@@ -105,6 +92,10 @@ class SegmentMotion:
         position += elapsed_s * (velocity + (0.5 * elapsed_s) * acceleration)
         velocity += elapsed_s * acceleration
         return position, velocity
+
+
+# Motion that is already computed for segments of a flight, by start and end time (s)
+MotionCache = dict[Span, SegmentMotion]
 
 
 @dataclass(frozen=True)
@@ -161,76 +152,120 @@ class PositionsAndImuMotion:
             ),
         )
 
-    def make_positions_at_offset(
-        self, offset_s: float, *, estimates_scale: bool = True
-    ) -> PositionsAndIncrements:
-        """Return the positions, and the IMU increments Δp and Δv for one time offset.
+    def make_positions_and_increments(self, time_offsets_s: Array) -> PositionsAndIncrements:
+        """Return the positions, and for each time offset the IMU increments Δp and Δv between them.
 
-        With ``estimates_scale``, the scale factor of the positions can be estimated.
+        The scale factor of the positions cannot be estimated from the result.
         """
         interval_s = np.diff(self.time_s)
         process_noise_per_sigma_a_squared = self.dt_s * np.stack(
             compute_continuous_process_noise_per_density(interval_s)
         )
-        constant_prior_sigmas = PRIOR_SIGMAS_OF_SEGMENT_CONSTANTS.copy()
-        constant_prior_sigmas[HEADING_ERROR_INDEX] = self.heading_sigma_rad
+        prior_precision = np.zeros((len(self.time_s), 2))
+        prior_precision[self.segment_edges[:-1]] = INITIAL_STATE_PRIOR_PRECISIONS
+        column_count = 1 + len(PRIOR_SIGMAS_OF_SEGMENT_CONSTANTS)
         dp, dv = np.zeros(
-            (2, len(self.directions), 1 + len(constant_prior_sigmas), len(interval_s))
+            (2, len(self.directions), len(time_offsets_s), column_count, len(interval_s))
         )
         for begin, end, segment_motion in zip(
             self.segment_edges, self.segment_edges[1:], self.segment_motions, strict=False
         ):
             measurement_time_s = self.time_s[begin:end]
-            # Shape (axes, 1 + constants, times): the motion, then its derivatives
+            # Shape (axes, time offsets, 1 + constants, times): the motion, then its derivatives
             position, velocity = (
-                np.moveaxis(self.directions @ signal, 0, 2)
-                for signal in segment_motion.interpolate(measurement_time_s + offset_s)
+                np.moveaxis(self.directions @ signal, (2, 0, 3, 1), range(4))
+                for signal in segment_motion.interpolate(
+                    measurement_time_s + time_offsets_s[:, None]
+                )
             )
-            # The last constant is the scale factor
-            interval_rows = np.s_[:, :-1, begin : end - 1]
+            interval_rows = np.s_[:, :, :-1, begin : end - 1]
             dv[interval_rows] = np.diff(velocity)
             dp[interval_rows] = np.diff(position) - velocity[..., :-1] * np.diff(measurement_time_s)
-        positions = PositionsAndIncrements(
+        return PositionsAndIncrements(
             measurement_m=self.measurement_m,
             segment_starts=self.segment_edges[:-1],
             interval_s=interval_s,
             process_noise_per_sigma_a_squared=process_noise_per_sigma_a_squared,
             process_noise_independent_of_sigma_a=np.zeros_like(process_noise_per_sigma_a_squared),
-            initial_state_precision=INITIAL_STATE_PRIOR_PRECISIONS,
-            is_initial_state_known=False,
-            constant_prior_sigmas=constant_prior_sigmas,
+            prior_precision=prior_precision,
+            constant_prior_sigmas=np.r_[
+                PRIOR_SIGMAS_OF_SEGMENT_CONSTANTS[:2],
+                self.heading_sigma_rad,
+                PRIOR_SIGMAS_OF_SEGMENT_CONSTANTS[3:],
+            ],
             delta_position_m=dp,
             delta_velocity_m_s=dv,
         )
-        return subtract_smooth_path(positions) if estimates_scale else positions
 
-    def fit_at_offset(self, offset_s: float, noise_parameters: NoiseParameters) -> PositionFit:
-        """Fit the constant errors with given time offset and noises."""
-        return fit_constant_errors(
-            self.make_positions_at_offset(offset_s), noise_parameters, self.measurement_weights
+    def make_positions_at_offset(self, offset_s: float) -> PositionsAndIncrements:
+        """Return the positions, and the IMU increments Δp and Δv for one time offset.
+
+        The scale factor of the positions can be estimated from the result.
+        """
+        return next(self.make_position_batches(np.array([offset_s])))
+
+    def make_position_batches(
+        self, time_offsets_s: Array, *, estimates_scale: bool = True
+    ) -> Iterator[PositionsAndIncrements]:
+        """Yield positions and IMU increments for batches of time offsets.
+
+        With ``estimates_scale``, the scale factor of the positions can be estimated.
+        """
+        values_per_offset = (
+            len(self.time_s) * len(self.directions) * (1 + len(PRIOR_SIGMAS_OF_SEGMENT_CONSTANTS))
         )
+        batch_size = max(1, MAX_BATCH_ELEMENTS // values_per_offset)
+        for batch in np.split(time_offsets_s, range(batch_size, len(time_offsets_s), batch_size)):
+            positions = self.make_positions_and_increments(batch)
+            yield (
+                subtract_smooth_path(positions, estimates_scale=True)
+                if estimates_scale
+                else positions
+            )
 
-    def search_grid(
+    def search_offset(
         self,
-        candidate_parameters: Sequence[NoiseParameters],
-        time_offsets_s: Sequence[float] = COARSE_TIME_OFFSETS_S,
-        sigma_factors: Sequence[float] = (1.0,),
+        noise_parameters: NoiseParameters,
+        sigma_a_factors: Sequence[float] = (1.0,),
         *,
         estimates_scale: bool = True,
-    ) -> tuple[float, float, NoiseParameters]:
-        """Return the lowest score (-ln p), and its time offset (s) and noises.
+    ) -> tuple[float, NoiseParameters]:
+        """Return the time offset and SIGMA_A with the maximum likelihood on a coarse grid.
 
-        ``sigma_factors`` are factors on all σ of the candidates.
+        ``sigma_a_factors`` are the tested multiples of SIGMA_A.
         """
-        scored_candidates = []
-        for offset_s in time_offsets_s:
-            positions = self.make_positions_at_offset(offset_s, estimates_scale=estimates_scale)
-            for candidate in candidate_parameters:
-                position_fit = fit_constant_errors(positions, candidate, self.measurement_weights)
-                for factor in sigma_factors:
-                    score = position_fit.compute_score(factor)
-                    scored_candidates.append((score, offset_s, candidate.multiply_sigmas(factor)))
-        return min(scored_candidates, key=lambda scored: scored[0])
+        tested_offsets_s = np.linspace(
+            -MAX_TESTED_TIME_OFFSET_S, MAX_TESTED_TIME_OFFSET_S, COARSE_OFFSET_COUNT
+        )
+        sigma_z_m = noise_parameters.sigma_z_m
+        sigma_a_to_sigma_z_ratios = [
+            sigma_a_factor * noise_parameters.sigma_a_m_s2 / sigma_z_m
+            for sigma_a_factor in sigma_a_factors
+        ]
+        coarse_motion = self.downsample(COARSE_MEASUREMENT_COUNT)
+        position_batches = coarse_motion.make_position_batches(
+            tested_offsets_s, estimates_scale=estimates_scale
+        )
+        fits_by_sigma_ratio = fit_with_sigma_ratios(
+            position_batches,
+            sigma_a_to_sigma_z_ratios,
+            noise_parameters.random_walk_m / sigma_z_m,
+            coarse_motion.measurement_weights,
+            sigma_z_m,
+        )
+        minus_log_likelihood = np.stack(
+            [
+                ratio_fit.scale_sigmas(sigma_z_m).compute_scores()[0]
+                for ratio_fit in fits_by_sigma_ratio
+            ]
+        )
+        factor_index, offset_index = np.unravel_index(
+            np.argmin(minus_log_likelihood), minus_log_likelihood.shape
+        )
+        return float(tested_offsets_s[offset_index]), replace(
+            noise_parameters,
+            sigma_a_m_s2=noise_parameters.sigma_a_m_s2 * sigma_a_factors[int(factor_index)],
+        )
 
 
 def compute_imu_motion(
@@ -241,6 +276,7 @@ def compute_imu_motion(
     directions: Array,
     dt_s: float,
     measurement_weights: Array | None = None,
+    motion_cache: MotionCache | None = None,
     heading_sigma_rad: float = HEADING_SIGMA_RAD,
     max_segment_duration_s: float = MAX_SEGMENT_DURATION_S,
 ) -> PositionsAndImuMotion | Unavailable:
@@ -252,6 +288,8 @@ def compute_imu_motion(
         Positions (m) and their times.
     directions, dt_s, measurement_weights, heading_sigma_rad
         See :class:`PositionsAndImuMotion`; weights are 1 by default.
+    motion_cache : dict, optional
+        IMU motion that is already computed; new motion is added.
     max_segment_duration_s : float
         Maximum length of a segment.
     """
@@ -261,26 +299,42 @@ def compute_imu_motion(
         return imu
     if isinstance(attitude, Unavailable):
         return attitude
+    motion_cache = {} if motion_cache is None else motion_cache
+    segment_motions: list[SegmentMotion] = []
+    imu_time_s = imu.index.to_numpy()
+    attitude_time_s = attitude.index.to_numpy()
     rows_by_segment: list[IntArray] = []
-    imu_time_s, attitude_time_s = imu.index.to_numpy(), attitude.index.to_numpy()
-    imu_interval_s = compute_median_interval_s(imu_time_s) if len(imu_time_s) > 1 else np.inf
-    imu_parts_s = []
-    if imu_interval_s <= MAX_IMU_INTERVAL_S:
-        imu_parts_s = np.split(imu_time_s, np.flatnonzero(find_imu_gaps(imu_time_s)) + 1)
-    for imu_part_s in imu_parts_s:
-        begin_s = max(imu_part_s[0], attitude_time_s[0]) + MAX_TESTED_TIME_OFFSET_S
-        end_s = min(imu_part_s[-1], attitude_time_s[-1]) - MAX_TESTED_TIME_OFFSET_S
-        covered_rows = np.flatnonzero((time_s >= begin_s) & (time_s <= end_s))
-        if not len(covered_rows):
+    for begin_s, end_s in _find_covered_spans(imu_time_s, attitude_time_s):
+        rows_with_imu_data = np.flatnonzero(
+            (time_s >= begin_s + MAX_TESTED_TIME_OFFSET_S)
+            & (time_s <= end_s - MAX_TESTED_TIME_OFFSET_S)
+        )
+        if not len(rows_with_imu_data):
             continue
-        first_s, last_s = time_s[covered_rows[[0, -1]]]
-        segment_count = max(1, int(np.ceil((last_s - first_s) / max_segment_duration_s)))
-        cut_times_s = np.linspace(first_s, last_s, segment_count + 1)[1:-1]
-        rows_by_segment += [
-            rows
-            for rows in np.split(covered_rows, np.searchsorted(time_s[covered_rows], cut_times_s))
-            if len(rows) >= MIN_SEGMENT_MEASUREMENTS
-        ]
+        times_with_imu_data_s = time_s[rows_with_imu_data]
+        segment_count = max(
+            1,
+            int(
+                np.ceil(
+                    (times_with_imu_data_s[-1] - times_with_imu_data_s[0]) / max_segment_duration_s
+                )
+            ),
+        )
+        cut_times_s = np.linspace(
+            times_with_imu_data_s[0], times_with_imu_data_s[-1], segment_count + 1
+        )[1:-1]
+        for segment_rows in np.split(
+            rows_with_imu_data, np.searchsorted(times_with_imu_data_s, cut_times_s)
+        ):
+            if len(segment_rows) >= MIN_SEGMENT_MEASUREMENTS:
+                rows_by_segment.append(segment_rows)
+                imu_span_s = (
+                    time_s[segment_rows[0]] - MAX_TESTED_TIME_OFFSET_S,
+                    time_s[segment_rows[-1]] + MAX_TESTED_TIME_OFFSET_S,
+                )
+                if imu_span_s not in motion_cache:
+                    motion_cache[imu_span_s] = make_segment_motion(imu, attitude, imu_span_s)
+                segment_motions.append(motion_cache[imu_span_s])
     used_rows = np.concatenate([np.zeros(0, dtype=np.intp), *rows_by_segment])
     if len(used_rows) < MIN_TOTAL_MEASUREMENTS:
         return Unavailable(
@@ -299,72 +353,86 @@ def compute_imu_motion(
         (measured_m - first_position_m).to_numpy(),
         np.ones(len(used_rows)) if measurement_weights is None else measurement_weights[used_rows],
         segment_edges,
-        tuple(
-            make_segment_motion(
-                imu,
-                attitude,
-                (
-                    time_s[rows[0]] - MAX_TESTED_TIME_OFFSET_S,
-                    time_s[rows[-1]] + MAX_TESTED_TIME_OFFSET_S,
-                ),
-            )
-            for rows in rows_by_segment
-        ),
+        tuple(segment_motions),
         directions,
         dt_s,
-        imu_interval_s,
+        float(np.median(np.diff(imu_time_s))),
         heading_sigma_rad,
     )
+
+
+def _find_covered_spans(imu_time_s: Array, attitude_time_s: Array) -> list[Span]:
+    """Find time spans (s) without a gap in IMU or attitude; none if the IMU rate is too low."""
+    if len(imu_time_s) < 2 or np.median(np.diff(imu_time_s)) > MAX_IMU_INTERVAL_S:
+        return []
+    gap_indices = np.flatnonzero(find_imu_gaps(imu_time_s))
+    starts_s = np.maximum(imu_time_s[np.r_[0, gap_indices + 1]], attitude_time_s[0])
+    ends_s = np.minimum(imu_time_s[np.r_[gap_indices, len(imu_time_s) - 1]], attitude_time_s[-1])
+    return list(zip(starts_s.tolist(), ends_s.tolist(), strict=True))
 
 
 def make_segment_motion(
     imu: pd.DataFrame, attitude: pd.DataFrame, imu_span_s: Span
 ) -> SegmentMotion:
     """Compute the motion in NED from the IMU, and its derivatives with respect to IMU errors."""
-    imu = rows_between(
-        imu, imu_span_s[0] - 2 * INTEGRATION_STEP_S, imu_span_s[1] + 2 * INTEGRATION_STEP_S
-    )
     imu_time_s = imu.index.to_numpy()
-    step_times_s = np.arange(imu_time_s[0], imu_time_s[-1], INTEGRATION_STEP_S)
-    specific_force_integral_m_s, gyro_integral_rad = (
-        _interpolate_columns(
-            step_times_s, imu_time_s, integrate_cumulatively(imu[columns].to_numpy(), imu_time_s)
-        )
-        for columns in (Columns.SPECIFIC_FORCE, Columns.ANGULAR_RATE)
+    first_row, end_row = np.searchsorted(
+        imu_time_s,
+        [imu_span_s[0] - 2 * INTEGRATION_STEP_S, imu_span_s[1] + 2 * INTEGRATION_STEP_S],
+        side="left",
     )
-    gyro_bias_rad_s = _estimate_large_gyro_bias(step_times_s, gyro_integral_rad, attitude)
-    rotation_rad = np.diff(gyro_integral_rad, axis=0) - INTEGRATION_STEP_S * gyro_bias_rad_s
-    attitude_quaternion = _integrate_gyros(step_times_s[0], rotation_rad, attitude)
+    imu_samples = imu.iloc[first_row:end_row]
+    imu_time_s = imu_time_s[first_row:end_row]
+    imu_integral = integrate_cumulatively(
+        imu_samples[[*Columns.SPECIFIC_FORCE, *Columns.ANGULAR_RATE]].to_numpy(), imu_time_s
+    )
+    step_times_s = np.arange(imu_time_s[0], imu_time_s[-1], INTEGRATION_STEP_S)
+    imu_integrals_at_steps = np.column_stack(
+        [np.interp(step_times_s, imu_time_s, column) for column in imu_integral.T]
+    )
+    specific_force_integral_m_s = imu_integrals_at_steps[:, :3]
+    gyro_integral_rad = imu_integrals_at_steps[:, 3:]
+    gyro_integral_rad -= np.outer(
+        step_times_s, _estimate_large_gyro_bias(step_times_s, gyro_integral_rad, attitude)
+    )
+    attitude_quaternion = _integrate_gyros(step_times_s, gyro_integral_rad, attitude)
     # The mean specific force of each step is rotated by the attitude in the middle of the step
     mean_specific_force_m_s2 = np.diff(specific_force_integral_m_s, axis=0) / INTEGRATION_STEP_S
     body_to_ned = to_matrix(
-        multiply(attitude_quaternion[:-1], from_rotation_vector(rotation_rad / 2.0))
+        multiply(
+            attitude_quaternion[:-1], from_rotation_vector(np.diff(gyro_integral_rad, axis=0) / 2.0)
+        )
     )
-    specific_force_ned_m_s2 = rotate(body_to_ned, mean_specific_force_m_s2)[:, :, None]
+    specific_force_ned_m_s2 = rotate(body_to_ned, mean_specific_force_m_s2)
     motion_and_derivatives = np.zeros(
-        (len(body_to_ned), 2, 3, len(PRIOR_SIGMAS_OF_SEGMENT_CONSTANTS))
+        (len(mean_specific_force_m_s2), 2, 3, len(PRIOR_SIGMAS_OF_SEGMENT_CONSTANTS))
     )
     position, velocity = np.moveaxis(motion_and_derivatives, 1, 0)
     acceleration = np.zeros_like(velocity)
-    acceleration[:, :, :1] = specific_force_ned_m_s2
+    acceleration[:, :, 0] = specific_force_ned_m_s2
     acceleration[:, 2, 0] += constants.g
     # An attitude error θ adds θ × f to the acceleration; a gyro bias b causes θ = -∫ R b dt
     attitude_error_by_unit_gyro_bias = -INTEGRATION_STEP_S * (
         np.cumsum(body_to_ned, axis=0) - body_to_ned / 2.0
     )
-    acceleration[:, :, 1:4] = np.cross(np.eye(3)[None], specific_force_ned_m_s2, axis=1)
-    acceleration[:, :, 4:7] = np.cross(
-        attitude_error_by_unit_gyro_bias, specific_force_ned_m_s2, axis=1
-    )
+    for axis in range(3):
+        second_axis = (axis + 1) % 3
+        third_axis = (axis + 2) % 3
+        acceleration[:, second_axis, 1 + axis] = -specific_force_ned_m_s2[:, third_axis]
+        acceleration[:, third_axis, 1 + axis] = specific_force_ned_m_s2[:, second_axis]
+        acceleration[:, axis, 4:7] = (
+            attitude_error_by_unit_gyro_bias[:, second_axis]
+            * specific_force_ned_m_s2[:, [third_axis]]
+        )
+        acceleration[:, axis, 4:7] -= (
+            attitude_error_by_unit_gyro_bias[:, third_axis]
+            * specific_force_ned_m_s2[:, [second_axis]]
+        )
     acceleration[:, :, 7:10] = -body_to_ned
-    increments = INTEGRATION_STEP_S * acceleration[:-1]
-    velocity[1:] = np.cumsum(increments, axis=0)
-    position[1:] = INTEGRATION_STEP_S * np.cumsum(velocity[:-1] + increments / 2.0, axis=0)
+    np.cumsum(acceleration[:-1] * INTEGRATION_STEP_S, axis=0, out=velocity[1:])
+    mean_velocity_in_step = velocity[:-1] + acceleration[:-1] * (INTEGRATION_STEP_S / 2.0)
+    np.cumsum(mean_velocity_in_step * INTEGRATION_STEP_S, axis=0, out=position[1:])
     return SegmentMotion(step_times_s[:-1], motion_and_derivatives)
-
-
-def _interpolate_columns(times_s: Array, known_times_s: Array, columns: Array) -> Array:
-    return np.column_stack([np.interp(times_s, known_times_s, column) for column in columns.T])
 
 
 def _estimate_large_gyro_bias(
@@ -379,7 +447,9 @@ def _estimate_large_gyro_bias(
     if len(samples) < MIN_KEPT_MEASUREMENTS:
         return np.zeros(3)
     attitude_time_s, quaternions = samples.index.to_numpy(), samples.to_numpy()
-    gyro_angle_rad = _interpolate_columns(attitude_time_s, step_times_s, gyro_integral_rad)
+    gyro_angle_rad = np.column_stack(
+        [np.interp(attitude_time_s, step_times_s, column) for column in gyro_integral_rad.T]
+    )
     rotation_difference_rad = np.diff(gyro_angle_rad, axis=0) - to_rotation_vector(
         multiply(conjugate(quaternions[:-1]), quaternions[1:])
     )
@@ -392,17 +462,27 @@ def _estimate_large_gyro_bias(
     return bias_rad_s if is_bias_removed else np.zeros(3)
 
 
-def _integrate_gyros(start_s: float, rotation_rad: Array, attitude: pd.DataFrame) -> Array:
-    """Integrate rotations from the gyroscopes to attitudes, starting at the logged attitude.
+def _integrate_gyros(
+    step_times_s: Array, gyro_integral_rad: Array, attitude: pd.DataFrame
+) -> Array:
+    """Integrate the gyroscopes to attitudes, starting at the logged attitude.
 
     The attitudes are quaternions from body to NED, w first.
     """
-    row = int(np.searchsorted(attitude.index, start_s))
-    nearby_samples = attitude.iloc[max(row - 2, 0) : row + 3]
-    start_quaternion = interpolate(
-        np.array([start_s]),
-        nearby_samples.index.to_numpy(),
-        nearby_samples[Columns.QUATERNION].to_numpy(),
+    attitude_time_s = attitude.index.to_numpy()
+    nearby_rows = slice(
+        *np.clip(
+            np.searchsorted(attitude_time_s, step_times_s[0]) + np.array([-2, 3]),
+            0,
+            len(attitude_time_s),
+        )
     )
-    rotation_since_start = cumulative_product(from_rotation_vector(rotation_rad))
+    logged_quaternions = attitude.iloc[nearby_rows][Columns.QUATERNION].to_numpy(copy=True)
+    nearby_attitude_time_s = attitude_time_s[nearby_rows]
+    start_s = np.clip(step_times_s[0], nearby_attitude_time_s[0], nearby_attitude_time_s[-1])
+    slerp = Slerp(nearby_attitude_time_s, Rotation.from_quat(logged_quaternions, scalar_first=True))
+    start_quaternion = slerp(start_s).as_quat(scalar_first=True)
+    rotation_since_start = cumulative_product(
+        from_rotation_vector(np.diff(gyro_integral_rad, axis=0))
+    )
     return np.vstack([start_quaternion, multiply(start_quaternion, rotation_since_start)])

@@ -10,7 +10,10 @@ F, B, Q and H are defined in :mod:`px4fuse.filter.model`. The module
 :mod:`~px4fuse.filter.likelihood` runs KF with fewer predictions and equal results.
 """
 
+from collections.abc import Sequence
 from dataclasses import dataclass
+from itertools import chain
+from typing import Any
 
 import numpy as np
 import pandas as pd
@@ -59,50 +62,95 @@ class Replay:
     __repr__ = one_line_repr
 
 
-def replay(axis: Axis, settings: Settings, initial: InitialState | None = None) -> Replay:
+def replay(
+    axis: Axis, settings: Settings, initial: InitialState | None = None, *, fast: bool = False
+) -> Replay:
     """Run KF along one axis.
 
     Parameters
     ----------
     initial : InitialState, optional
         Default: the first measurement, with velocity zero.
+    fast : bool
+        True to compute with Python floats instead of filterpy (faster, equal results).
 
     Raises
     ------
     SettingsError
         ``settings.input`` is "imu" and the axis has no acceleration.
     """
-    from px4fuse.filter.filterpy_import import KalmanFilter  # noqa: PLC0415 - takes 0.1 s
-
     prediction_steps = make_prediction_steps(axis, settings, initial)
     initial_state = initial or InitialState(prediction_steps.time_s[0], axis.measurement_m[0])
+    run_filter = _run_with_floats if fast else _run_with_filterpy
+    states, updates = run_filter(
+        initial_state,
+        settings.sigma_z_m**2,
+        np.diff(prediction_steps.time_s).tolist(),
+        prediction_steps.acceleration_m_s2.tolist(),
+        (
+            (settings.sigma_a_m_s2**2 + prediction_steps.input_variance_m2_s4) * settings.dt_s
+        ).tolist(),
+        [
+            axis.measurement_m[index] if index >= 0 else None
+            for index in prediction_steps.measurement_index[1:]
+        ],
+    )
+    step_times_s, update_times_s = (
+        pd.Index(times_s, name="time_s")
+        for times_s in (
+            prediction_steps.time_s,
+            prediction_steps.time_s[prediction_steps.measurement_index >= 0],
+        )
+    )
+    steps = _make_table(states, step_times_s, model.STATE_COLUMNS + model.COVARIANCE_COLUMNS)
+    steps["acceleration_m_s2"] = np.append(prediction_steps.acceleration_m_s2, 0.0)
+    steps["input_variance_m2_s4"] = np.append(prediction_steps.input_variance_m2_s4, 0.0)
+    return Replay(
+        axis,
+        settings,
+        steps,
+        _make_table(updates, update_times_s, UPDATE_TABLE_COLUMNS),
+        prediction_steps.input_gap_s,
+    )
+
+
+def _make_table(rows: TableRows, index: "pd.Index[float]", columns: list[str]) -> pd.DataFrame:
+    # pandas needs twice the time for a list of tuples
+    values = np.fromiter(chain.from_iterable(rows), np.float64, len(rows) * len(columns))
+    return pd.DataFrame(values.reshape(-1, len(columns)), index, columns)
+
+
+def _run_with_filterpy(
+    initial_state: InitialState, measurement_variance: float, *inputs: Sequence[Any]
+) -> tuple[TableRows, TableRows]:
+    """Run KF with filterpy; return the rows of :attr:`Replay.steps` and :attr:`Replay.updates`.
+
+    ``inputs`` are four sequences with one value for each step: step length (s), acceleration
+    (m/s²), noise density SIGMA_A² · DT (m²/s³), and measured position (m) or None.
+    """
+    from px4fuse.filter.filterpy_import import KalmanFilter  # noqa: PLC0415 - takes 0.1 s
+
     kalman = KalmanFilter(dim_x=2, dim_z=1, dim_u=1)
     kalman.x = np.array([[initial_state.position_m], [initial_state.velocity_m_s]])
     kalman.P = model.make_symmetric_matrix(model.INITIAL_COVARIANCE)
     kalman.H = np.array([[1.0, 0.0]])
-    kalman.R = np.array([[settings.sigma_z_m**2]])
+    kalman.R = np.array([[measurement_variance]])
     kalman.inv = np.reciprocal  # S is 1 by 1
     states: TableRows = [
         (initial_state.position_m, initial_state.velocity_m_s, *model.INITIAL_COVARIANCE)
     ]
     updates: TableRows = []
-    # Inputs and matrices of each step
-    dt_s = np.diff(prediction_steps.time_s)
-    noise_density = (settings.sigma_a_m_s2**2 + prediction_steps.input_variance_m2_s4) * (
-        settings.dt_s
+    dt_s, acceleration, noise_density = (np.array(values)[:, None, None] for values in inputs[:3])
+    matrices = (
+        acceleration,
+        np.concatenate([dt_s**2 / 2.0, dt_s], axis=1),
+        model.make_transition_matrix(dt_s[:, 0, 0]),
+        noise_density
+        * model.make_symmetric_matrix(model.compute_process_noise_per_density(dt_s[:, 0, 0])),
     )
-    q_per_density = model.make_symmetric_matrix(model.compute_process_noise_per_density(dt_s))
-    for u, B, F, Q, measurement_index in zip(
-        prediction_steps.acceleration_m_s2[:, None, None],
-        np.stack([dt_s**2 / 2.0, dt_s], axis=1)[:, :, None],
-        model.make_transition_matrix(dt_s),
-        noise_density[:, None, None] * q_per_density,
-        prediction_steps.measurement_index[1:],
-        strict=True,
-    ):
+    for u, B, F, Q, measured_m in zip(*matrices, inputs[3], strict=True):
         kalman.predict(u=u, B=B, F=F, Q=Q)
-        if measurement_index >= 0:
-            measured_m = axis.measurement_m[measurement_index]
+        if measured_m is not None:
             # Without the argument H, filterpy copies the measurement (slow)
             kalman.update(measured_m, H=kalman.H)
             x, P, K = kalman.x_prior, kalman.P_prior, kalman.K
@@ -120,20 +168,34 @@ def replay(axis: Axis, settings: Settings, initial: InitialState | None = None) 
             )
         x, P = kalman.x, kalman.P
         states.append((x[0, 0], x[1, 0], P[0, 0], P[0, 1], P[1, 1]))
-    step_times_s = pd.Index(prediction_steps.time_s, name="time_s")
-    steps = pd.DataFrame(
-        np.array(states), step_times_s, model.STATE_COLUMNS + model.COVARIANCE_COLUMNS
+    return states, updates
+
+
+def _run_with_floats(
+    initial_state: InitialState, measurement_variance: float, *inputs: Sequence[Any]
+) -> tuple[TableRows, TableRows]:
+    """Run KF with Python floats, which is faster than filterpy."""
+    position, velocity, covariance = (
+        initial_state.position_m,
+        initial_state.velocity_m_s,
+        model.INITIAL_COVARIANCE,
     )
-    steps["acceleration_m_s2"] = np.append(prediction_steps.acceleration_m_s2, 0.0)
-    steps["input_variance_m2_s4"] = np.append(prediction_steps.input_variance_m2_s4, 0.0)
-    update_times_s = step_times_s[prediction_steps.measurement_index >= 0]
-    return Replay(
-        axis,
-        settings,
-        steps,
-        pd.DataFrame(np.array(updates), update_times_s, UPDATE_TABLE_COLUMNS),
-        prediction_steps.input_gap_s,
-    )
+    states: TableRows = [(position, velocity, *covariance)]
+    updates: TableRows = []
+    for dt_s, acceleration, noise_density, measured_m in zip(*inputs, strict=True):
+        position, velocity, covariance = model.predict_step(
+            position, velocity, covariance, acceleration, noise_density, dt_s
+        )
+        if measured_m is not None:
+            innovation_variance_and_gains, updated_state = model.update_step(
+                position, velocity, covariance, measured_m, measurement_variance
+            )
+            updates.append(
+                (measured_m, *innovation_variance_and_gains, position, covariance[0], covariance[2])
+            )
+            position, velocity, covariance = updated_state
+        states.append((position, velocity, *covariance))
+    return states, updates
 
 
 def _find_previous_steps(run: Replay, times_s: Array) -> tuple[IntArray, Array, BoolArray]:

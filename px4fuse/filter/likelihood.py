@@ -1,4 +1,4 @@
-"""KF with one prediction per measurement, and the likelihood on a grid.
+"""KF with one prediction per measurement, and 95 % likelihood intervals of its noises.
 
 The acceleration is first integrated between measurements, which is faster. If all σ are at least
 1e-3, the innovations equal those of :mod:`px4fuse.filter.kalman` to 1e-9.
@@ -6,14 +6,19 @@ The acceleration is first integrated between measurements, which is faster. If a
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
+from functools import cache
 
 import numpy as np
+from scipy.linalg import lapack
+from scipy.optimize import brentq, minimize_scalar
 from scipy.special import chdtri
 
 from px4fuse.core.arrays import Array, ArrayPair, BoolArray, IntArray
 from px4fuse.filter.model import (
     INITIAL_COVARIANCE,
+    SymmetricElements,
     compute_process_noise_per_density,
     propagate_covariance,
     propagate_state,
@@ -25,6 +30,12 @@ from px4fuse.filter.steps import PredictionSteps, make_prediction_steps
 
 # Log-likelihood decrease (nats) at the ends of a 95 % interval: half the 95 % point of χ²(1)
 MAX_LOG_LIKELIHOOD_DROP = float(chdtri(1, 0.05)) / 2.0
+# Initial step of ln σ in the search for an end of the 95 % interval
+INITIAL_LOG_SIGMA_SEARCH_STEP = 0.05
+# Maximum change of ln SIGMA_Z between two tested values of SIGMA_A, or vice versa
+MAX_OTHER_LOG_SIGMA_CHANGE = 1.0
+# Tolerance of ln σ in the search for the best SIGMA_Z with given SIGMA_A, or vice versa
+OTHER_LOG_SIGMA_TOLERANCE = 2e-3
 
 
 @dataclass(frozen=True)
@@ -147,37 +158,66 @@ def innovations(
     is_skipped : ndarray of bool, shape (m,), optional
         True for measurements that KF does not fuse. Their innovation is also returned.
     """
-    initial_state = preintegrated_motion.initial_state
-    position = np.asarray(initial_state.position_m)
-    velocity = np.asarray(initial_state.velocity_m_s)
-    covariance = INITIAL_COVARIANCE
-    process_noise = (
-        sigma_a_m_s2**2 * preintegrated_motion.process_noise_per_sigma_a_squared
-        + preintegrated_motion.process_noise_independent_of_sigma_a
-    )
-    measurement_count = len(preintegrated_motion.interval_s)
-    innovation_m = np.empty_like(preintegrated_motion.measurement_m)
-    innovation_variance_m2 = np.empty(measurement_count)
-    for row, (dt_s, (q00, q01, q11), measured_m, dp, dv, skips_update) in enumerate(
-        zip(
-            preintegrated_motion.interval_s.tolist(),
-            process_noise.tolist(),
-            preintegrated_motion.measurement_m,
-            preintegrated_motion.delta_position_m,
-            preintegrated_motion.delta_velocity_m_s,
-            [False] * measurement_count if is_skipped is None else is_skipped.tolist(),
-            strict=True,
-        )
+    q, r = sigma_a_m_s2 * sigma_a_m_s2, sigma_z_m * sigma_z_m
+    covariance: SymmetricElements[float] = INITIAL_COVARIANCE
+    variance_and_gains_by_measurement = []
+    for (
+        dt,
+        process_noise_per_sigma_a_squared,
+        process_noise_independent_of_sigma_a,
+        skips_update,
+    ) in zip(
+        preintegrated_motion.interval_s.tolist(),
+        preintegrated_motion.process_noise_per_sigma_a_squared.tolist(),
+        preintegrated_motion.process_noise_independent_of_sigma_a.tolist(),
+        [False] * len(preintegrated_motion.interval_s)
+        if is_skipped is None
+        else is_skipped.tolist(),
+        strict=True,
     ):
-        position, velocity = position + dt_s * velocity + dp, velocity + dv
-        p00, p01, p11 = propagate_covariance(covariance, dt_s)
-        covariance = p00 + q00, p01 + q01, p11 + q11  # P = FPFᵀ + Q
-        (innovation_m[row], innovation_variance_m2[row]), updated_state = update_step(
-            position, velocity, covariance, measured_m, sigma_z_m**2
+        p00, p01, p11 = propagate_covariance(covariance, dt)  # P = FPFᵀ + Q
+        covariance = (
+            p00
+            + q * process_noise_per_sigma_a_squared[0]
+            + process_noise_independent_of_sigma_a[0],
+            p01
+            + q * process_noise_per_sigma_a_squared[1]
+            + process_noise_independent_of_sigma_a[1],
+            p11
+            + q * process_noise_per_sigma_a_squared[2]
+            + process_noise_independent_of_sigma_a[2],
         )
-        if not skips_update:
-            position, velocity, covariance = updated_state
-    return innovation_m, innovation_variance_m2
+        (_, s, k0, k1), (_, _, updated_covariance) = update_step(0.0, 0.0, covariance, 0.0, r)
+        variance_and_gains_by_measurement.append((s, 0.0, 0.0) if skips_update else (s, k0, k1))
+        covariance = covariance if skips_update else updated_covariance
+    s, k0, k1 = np.array(variance_and_gains_by_measurement).T
+    # The predicted states solve linear equations, so LAPACK computes all of them at once
+    dt = preintegrated_motion.interval_s[1:]
+    position_gain = k0[:-1] + dt * k1[:-1]
+    measured_m = np.ascontiguousarray(preintegrated_motion.measurement_m.T)
+    right_hand_side = np.empty((*measured_m.shape, 2))
+    right_hand_side[..., 0] = preintegrated_motion.delta_position_m.T
+    right_hand_side[..., 1] = preintegrated_motion.delta_velocity_m_s.T
+    right_hand_side[..., 1:, 0] += position_gain * measured_m[..., :-1]
+    right_hand_side[..., 1:, 1] += k1[:-1] * measured_m[..., :-1]
+    initial_state = preintegrated_motion.initial_state
+    right_hand_side[..., 0, 0] += (
+        initial_state.position_m + preintegrated_motion.interval_s[0] * initial_state.velocity_m_s
+    )
+    right_hand_side[..., 0, 1] += initial_state.velocity_m_s
+    bands = np.zeros((len(s), 2, 4))
+    bands[:-1, 1, 1] = -dt
+    bands[:-1, 0, 2] = position_gain - 1.0
+    bands[:-1, 1, 2] = -1.0
+    bands[:-1, 0, 3] = k1[:-1]
+    state, _ = lapack.dtbtrs(
+        bands.reshape(-1, 4).T,
+        right_hand_side.reshape(-1, 2 * len(s)).T,
+        uplo="L",
+        diag="U",
+        overwrite_b=1,
+    )
+    return np.asarray((measured_m - state[::2].T.reshape(measured_m.shape)).T), s
 
 
 def fit_parabola_vertex(profile: Array, index: int) -> tuple[float, float]:
@@ -192,16 +232,89 @@ def fit_parabola_vertex(profile: Array, index: int) -> tuple[float, float]:
 
 def compute_profile_likelihood_interval(
     grid: Array, profile: Array, max_log_likelihood_drop: float = MAX_LOG_LIKELIHOOD_DROP
-) -> tuple[float, float]:
+) -> tuple[float | None, float | None]:
     """Return the interval of a parameter in which -ln p on a grid is close to its minimum.
 
-    By default this is the 95 % interval. An end outside the grid is replaced by the grid's end.
+    By default this is the 95 % interval. An end outside the grid is None.
     """
     score_rises = profile - profile.min()
-    first, last = np.flatnonzero(score_rises <= max_log_likelihood_drop)[[0, -1]].tolist()
-    neighbours = [first, max(first - 1, 0)], [last, min(last + 1, len(grid) - 1)]
-    low, high = (
-        float(np.interp(max_log_likelihood_drop, score_rises[indices], grid[indices]))
-        for indices in neighbours
+    first_index, last_index = np.flatnonzero(score_rises <= max_log_likelihood_drop)[[0, -1]]
+
+    def interpolate_interval_end(inside_index: int, outside_index: int) -> float | None:
+        if not 0 <= outside_index < len(grid):
+            return None
+        fraction_between_grid_values = (max_log_likelihood_drop - score_rises[inside_index]) / (
+            score_rises[outside_index] - score_rises[inside_index]
+        )
+        return float(
+            grid[inside_index]
+            + fraction_between_grid_values * (grid[outside_index] - grid[inside_index])
+        )
+
+    return interpolate_interval_end(first_index, first_index - 1), interpolate_interval_end(
+        last_index, last_index + 1
     )
-    return low, high
+
+
+def find_profile_likelihood_interval(
+    score: Callable[[float, float], float],
+    best_log_sigmas: tuple[float, float],
+    parameter_bounds: tuple[float, float],
+    variance_factor: float = 1.0,
+) -> tuple[float | None, float | None]:
+    """Return the 95 % profile-likelihood interval of a parameter; None for an unbounded end.
+
+    Parameters
+    ----------
+    score : callable
+        -ln p as a function of the logarithms of this parameter and of a second one.
+    best_log_sigmas : (float, float)
+        Natural logarithms of both parameters at the minimum.
+    parameter_bounds : (float, float)
+        Bounds of the first parameter.
+    variance_factor : float
+        Factor on the variance, for uncertainty that ``score`` omits.
+    """
+    best_score = score(*best_log_sigmas)
+    max_sqrt_log_likelihood_drop = float(np.sqrt(MAX_LOG_LIKELIHOOD_DROP * variance_factor))
+
+    def find_interval_end(direction: float, search_limit: float) -> float | None:
+        other_log_sigma = best_log_sigmas[1]
+
+        # √(decrease of the log-likelihood) is nearly linear in ln σ, so brentq needs few steps
+        @cache
+        def compute_log_likelihood_drop_excess(log_sigma_change: float) -> float:
+            nonlocal other_log_sigma
+            if log_sigma_change == 0.0:
+                return -max_sqrt_log_likelihood_drop
+            best_other_sigma_fit = minimize_scalar(
+                lambda tested_other_log_sigma: score(
+                    best_log_sigmas[0] + direction * log_sigma_change, tested_other_log_sigma
+                ),
+                bounds=(
+                    other_log_sigma - MAX_OTHER_LOG_SIGMA_CHANGE,
+                    other_log_sigma + MAX_OTHER_LOG_SIGMA_CHANGE,
+                ),
+                options={"xatol": OTHER_LOG_SIGMA_TOLERANCE},
+            )
+            other_log_sigma = float(best_other_sigma_fit.x)
+            return float(
+                np.sqrt(max(best_other_sigma_fit.fun - best_score, 0.0))
+                - max_sqrt_log_likelihood_drop
+            )
+
+        max_log_sigma_change = direction * (float(np.log(search_limit)) - best_log_sigmas[0])
+        tried_log_sigma_change = min(INITIAL_LOG_SIGMA_SEARCH_STEP, max_log_sigma_change)
+        while compute_log_likelihood_drop_excess(tried_log_sigma_change) < 0.0:
+            if tried_log_sigma_change == max_log_sigma_change:
+                return None
+            tried_log_sigma_change = min(2.0 * tried_log_sigma_change, max_log_sigma_change)
+        log_sigma_change = brentq(
+            compute_log_likelihood_drop_excess,
+            0.0,
+            tried_log_sigma_change,
+            xtol=1e-3 * tried_log_sigma_change,
+        )
+        return float(np.exp(best_log_sigmas[0] + direction * log_sigma_change))
+
+    return find_interval_end(-1.0, parameter_bounds[0]), find_interval_end(1.0, parameter_bounds[1])

@@ -10,13 +10,13 @@ The normal equations Ax = b have a banded matrix A. The likelihood equals that o
 The constants are estimated by linear regression. Its inputs are the data, and their derivatives
 with respect to each constant. The Gram matrix contains the weighted inner products of the inputs.
 
-Symbols in shapes: m measurements, a axes, s segments, c constants, k inputs.
+Symbols in shapes: m measurements, a axes, s segments, T time offsets, c constants.
 """
 
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
 from itertools import pairwise
@@ -25,49 +25,26 @@ import numpy as np
 from scipy.linalg import lapack
 
 from px4fuse.core.arrays import Array, ArrayPair, BoolArray, IntArray
-from px4fuse.filter.model import make_symmetric_matrix, make_transition_matrix
 
+UNCHANGED_SIGMAS = np.ones(1)
+# Acceleration noise and position noise of the smoother that estimates a path from the positions
+PATH_SMOOTHER_SIGMA_A_M_S2, PATH_SMOOTHER_SIGMA_Z_M = 0.5, 0.1
+# Minimum prior precision (1/m² or s²/m²) of a state that counts as known
+MIN_PRECISION_OF_KNOWN_STATE = 1e-3
 # Q can be singular, so a small variance is added to Q₀₀: its σ as a fraction of √(R + Q₀₀)
 REGULARISATION_TO_POSITION_SIGMA_RATIO = 1e-5
+# Number of inner products that are computed at once, to limit the memory
+INNER_PRODUCTS_PER_BATCH = 8
 # Minimum ratio |Q| / (Q₀₀ Q₁₁): a smaller determinant is a rounding error
 MIN_DETERMINANT_TO_VARIANCE_PRODUCT_RATIO = 1e-12
 
 
 @dataclass(frozen=True)
-class NoiseParameters:
-    """Noise parameters of the IMU and of the position source.
-
-    Attributes
-    ----------
-    sigma_a_m_s2 : float
-        Standard deviation of the acceleration error over one step DT.
-    sigma_z_m : float
-        Standard deviation of the white position noise.
-    random_walk_m : float
-        Random walk of the source (m/√s); 0 for none.
-    correlated_sigma_m, tau_s : float
-        Standard deviation and time constant of time-correlated noise; 0 for none.
-    """
-
-    sigma_a_m_s2: float
-    sigma_z_m: float
-    random_walk_m: float = 0.0
-    correlated_sigma_m: float = 0.0
-    tau_s: float = 0.0
-
-    def multiply_sigmas(self, factor: float) -> NoiseParameters:
-        """Multiply the standard deviations of all noises by a factor."""
-        multiplied = {name: factor * value for name, value in vars(self).items() if name != "tau_s"}
-        return replace(self, **multiplied)
-
-
-# Noises of the smoother that estimates a path from the positions
-PATH_SMOOTHER_NOISE = NoiseParameters(sigma_a_m_s2=0.5, sigma_z_m=0.1)
-
-
-@dataclass(frozen=True)
 class PositionsAndIncrements:
     """Positions of one source along several axes, with the IMU increments Δp and Δv between them.
+
+    Symbols in shapes: m measurements, a axes, s segments, T tested time offsets, c unknown
+    constants (biases, ...).
 
     Attributes
     ----------
@@ -81,14 +58,14 @@ class PositionsAndIncrements:
         Elements 00, 01, 11 of Q / SIGMA_A² in each interval.
     process_noise_independent_of_sigma_a : ndarray, shape (3, m - 1)
         Elements 00, 01, 11 of further process noise, for example in IMU gaps.
-    initial_state_precision : (float, float)
-        Prior precision of position (1/m²) and velocity (s²/m²) at the start of each segment.
-    is_initial_state_known : bool
-        False if this precision is only small, to prevent a singular matrix.
+    prior_precision : ndarray, shape (m, 2)
+        Prior precision of position and velocity; 0 without a prior.
     constant_prior_sigmas : ndarray, shape (c,)
         Prior σ of the unknown constants of each segment.
-    delta_position_m, delta_velocity_m_s : ndarray, shape (a, 1 + c, m - 1)
+    delta_position_m, delta_velocity_m_s : ndarray, shape (a, T, 1 + c, m - 1)
         Δp and Δv in each interval, then their derivatives with respect to each constant.
+    correlated_noise : (float, float) or None
+        Standard deviation (m) and time constant (s) of time-correlated noise.
     """
 
     measurement_m: Array
@@ -96,11 +73,11 @@ class PositionsAndIncrements:
     interval_s: Array
     process_noise_per_sigma_a_squared: Array
     process_noise_independent_of_sigma_a: Array
-    initial_state_precision: tuple[float, float]
-    is_initial_state_known: bool
+    prior_precision: Array
     constant_prior_sigmas: Array
     delta_position_m: Array
     delta_velocity_m_s: Array
+    correlated_noise: tuple[float, float] | None = None
 
     @cached_property
     def segments(self) -> list[tuple[int, int]]:
@@ -108,23 +85,20 @@ class PositionsAndIncrements:
         return list(pairwise([*self.segment_starts.tolist(), len(self.measurement_m)]))
 
     @cached_property
-    def segment_index(self) -> IntArray:
-        """Index of the segment of each measurement, shape (m,)."""
-        return np.searchsorted(self.segment_starts, np.arange(len(self.measurement_m)), "right") - 1
-
-    @cached_property
     def is_within_segment(self) -> BoolArray:
         """True for each interval whose two measurements are in the same segment, shape (m - 1,)."""
-        return np.asarray(np.diff(self.segment_index) == 0)
+        return ~np.isin(np.arange(1, len(self.measurement_m)), self.segment_starts)
 
     def first(self, count: int) -> PositionsAndIncrements:
         """Keep the first ``count`` measurements only."""
+        interval_rows = np.s_[..., : count - 1]
         return replace(
             self,
             measurement_m=self.measurement_m[:count],
             segment_starts=self.segment_starts[self.segment_starts < count],
+            prior_precision=self.prior_precision[:count],
             **{
-                name: getattr(self, name)[..., : count - 1]
+                name: getattr(self, name)[interval_rows]
                 for name in (
                     "interval_s",
                     "process_noise_per_sigma_a_squared",
@@ -135,113 +109,89 @@ class PositionsAndIncrements:
             },
         )
 
+    def divide_sigmas_by_sigma_z(
+        self, sigma_z_m: float, random_walk_to_sigma_z_ratio: float, measurement_weights: Array
+    ) -> tuple[PositionsAndIncrements, Array]:
+        """Divide all σ by SIGMA_Z; return the result and the variance of each measurement.
+
+        The variance is 1 / weight. Measurements without weight are initial states with variance 1.
+        ``random_walk_to_sigma_z_ratio`` has the unit 1/√s.
+        """
+        process_noise_independent_of_sigma_a = (
+            self.process_noise_independent_of_sigma_a / sigma_z_m**2
+        )
+        process_noise_independent_of_sigma_a[0] += self.interval_s * random_walk_to_sigma_z_ratio**2
+        weights_of_initial_states = np.ones(len(self.measurement_m) - len(measurement_weights))
+        correlated_noise = self.correlated_noise
+        if correlated_noise:
+            correlated_noise = correlated_noise[0] / sigma_z_m, correlated_noise[1]
+        positions_over_sigma_z = replace(
+            self,
+            process_noise_independent_of_sigma_a=process_noise_independent_of_sigma_a,
+            prior_precision=self.prior_precision * sigma_z_m**2,
+            correlated_noise=correlated_noise,
+        )
+        return positions_over_sigma_z, 1.0 / np.concatenate(
+            [weights_of_initial_states, measurement_weights]
+        )
+
     def factorise_equations(
-        self, noise_parameters: NoiseParameters, measurement_weights: Array
-    ) -> Iterator[tuple[list[int], BandedNormalEquations]]:
+        self, sigma_a_m_s2: float, variance_m2: Array
+    ) -> Iterator[tuple[list[int], BandedNormalEquations, int]]:
         """Factorise the normal equations of positions and velocities, for each group of axes.
 
         Axes with the same measurement times form one group, because their equations are equal.
-        Yield axis indices and equations.
-
-        Parameters
-        ----------
-        measurement_weights : ndarray
-            The variance of a measurement is SIGMA_Z² / weight. An initial state before the first
-            measurement has no weight.
-
-        Raises
-        ------
-        numpy.linalg.LinAlgError
-            A segment has too few measurements for a position and a velocity.
+        Yield axis indices, equations, and degrees of freedom of one axis.
         """
-        weights = np.ones(len(self.measurement_m))
-        weights[-len(measurement_weights) :] = measurement_weights
-        axes_by_mask: dict[bytes, list[int]] = {}
-        for axis, is_measured in enumerate(np.isfinite(self.measurement_m).T):
-            axes_by_mask.setdefault(is_measured.tobytes(), []).append(axis)
-        for axes in axes_by_mask.values():
-            is_measured = np.isfinite(self.measurement_m[:, axes[0]])
-            # A segment with fewer than two measurements does not contribute to the likelihood
-            has_too_few_measurements = (
-                np.add.reduceat(is_measured.astype(int), self.segment_starts) < 2
-            )
-            is_used = is_measured & ~has_too_few_measurements[self.segment_index]
-            precision = np.where(is_used, weights / noise_parameters.sigma_z_m**2, 0.0)
-            initial_precision = np.where(
-                has_too_few_measurements[:, None], 1.0, self.initial_state_precision
-            )
-            bands, inverse_q_factor, log_determinant = self._make_bands(
-                noise_parameters, precision, initial_precision
-            )
-            cholesky_factor, is_singular = lapack.dpbtrf(bands, lower=1)
-            if is_singular:
-                raise np.linalg.LinAlgError(
-                    "the normal equations are singular (too few positions, or large rounding "
-                    "errors)"
-                )
-            # The weak prior of an unknown initial state must not contribute to the likelihood
-            is_start_known = has_too_few_measurements | self.is_initial_state_known
-            for squares in (precision[is_used], initial_precision[is_start_known]):
-                log_determinant -= np.sum(np.log(squares))
-            yield (
-                axes,
-                BandedNormalEquations(
-                    precision,
-                    self.interval_s,
-                    inverse_q_factor,
-                    bands,
-                    cholesky_factor,
-                    log_determinant + 2.0 * float(np.sum(np.log(cholesky_factor[0]))),
-                    int(np.sum(is_used) - 2 * np.sum(~is_start_known)),
-                ),
-            )
-
-    def _make_bands(
-        self, noise_parameters: NoiseParameters, precision: Array, initial_precision: Array
-    ) -> tuple[Array, Array, float]:
-        """Return A, elements 00, 01, 11 of U in Q⁻¹ = UᵀU, and the sum of ln |Q|.
-
-        A = diag(precision) + Σ [-F I]ᵀ Q⁻¹ [-F I] over the intervals, in LAPACK's band format.
-        """
-        q00, q01, q11 = (
-            noise_parameters.sigma_a_m_s2**2 * self.process_noise_per_sigma_a_squared
+        is_measured = np.isfinite(self.measurement_m)
+        process_noise = (
+            sigma_a_m_s2**2 * self.process_noise_per_sigma_a_squared
             + self.process_noise_independent_of_sigma_a
         )
-        q00 = q00 + noise_parameters.random_walk_m**2 * self.interval_s
-        # Q of one prediction step is singular, so a small variance is added. A tiny determinant is
-        # a rounding error
-        q_determinant = q00 * q11 - q01**2
-        q_determinant[q_determinant < MIN_DETERMINANT_TO_VARIANCE_PRODUCT_RATIO * q00 * q11] = 0.0
-        q_determinant += (
-            REGULARISATION_TO_POSITION_SIGMA_RATIO**2 * (noise_parameters.sigma_z_m**2 + q00) * q11
-        )
-        log_determinant = np.sum(np.log(q_determinant[self.is_within_segment]))
-        u00, u11 = np.where(self.is_within_segment, np.sqrt([q11 / q_determinant, 1.0 / q11]), 0.0)
-        u01 = -u00 * q01 / q11
-        inverse_q = make_symmetric_matrix((u00**2, u00 * u01, u01**2 + u11**2))
-        transition = make_transition_matrix(self.interval_s)
-        # Columns of A for each measurement; the first rows belong to the same measurement
-        state_count = 3 if noise_parameters.correlated_sigma_m else 2
-        columns = np.zeros((len(precision), 2 * state_count + 1, state_count))
-        columns[:, 0, 0] = precision
-        columns[self.segment_starts, [[0], [1]], [[0], [1]]] += initial_precision.T
-        columns[1:, :2, :2] += inverse_q
-        columns[:-1, :2, :2] += np.swapaxes(transition, 1, 2) @ inverse_q @ transition
-        columns[:-1, state_count : state_count + 2, :2] = -inverse_q @ transition
-        if noise_parameters.correlated_sigma_m:
-            rho = np.exp(-self.interval_s / noise_parameters.tau_s) * self.is_within_segment
-            # Variance of a Gauss-Markov process: σ_c² at the start of a segment, then (1 - ρ²) σ_c²
-            step_variance_m2 = noise_parameters.correlated_sigma_m**2 * np.append(1.0, 1.0 - rho**2)
-            columns[:, 2, 0] = precision
-            columns[:, 2, 2] = precision + 1.0 / step_variance_m2
-            columns[:-1, 2, 2] += rho**2 / step_variance_m2[1:]
-            columns[:-1, 5, 2] = -rho / step_variance_m2[1:]
-            log_determinant += np.sum(np.log(step_variance_m2))
-        bands = np.stack(
-            [columns[:, state : state + state_count + 2, state] for state in range(state_count)],
-            axis=1,
-        ).reshape(-1, state_count + 2)
-        return bands.T, np.stack([u00, u01, u11]), float(log_determinant)
+        remaining_axes = list(range(is_measured.shape[1]))
+        while remaining_axes:
+            is_axis_measured = is_measured[:, remaining_axes[0]]
+            axes = [
+                axis
+                for axis in remaining_axes
+                if np.array_equal(is_measured[:, axis], is_axis_measured)
+            ]
+            remaining_axes = [axis for axis in remaining_axes if axis not in axes]
+            measurement_and_prior_precision = self.prior_precision.copy()
+            # A segment with fewer than two measurements does not contribute to the likelihood
+            has_too_few_measurements = (
+                np.add.reduceat(is_axis_measured.astype(int), self.segment_starts) < 2
+            )
+            is_used = is_axis_measured & ~np.repeat(
+                has_too_few_measurements, np.diff([*self.segment_starts, len(is_measured)])
+            )
+            measurement_and_prior_precision[:, 0] += np.where(is_used, 1.0 / variance_m2, 0.0)
+            measurement_and_prior_precision[self.segment_starts[has_too_few_measurements]] += 1.0
+            is_known = (measurement_and_prior_precision > 0.0) & (
+                (measurement_and_prior_precision > self.prior_precision)
+                | (self.prior_precision > MIN_PRECISION_OF_KNOWN_STATE)
+            )
+            system = factorise(
+                self.interval_s,
+                process_noise,
+                self.is_within_segment,
+                measurement_and_prior_precision,
+                self.correlated_noise,
+            )
+            # The weak prior of an unknown initial state must not contribute to the likelihood
+            log_precision_of_unknown_states = float(
+                np.sum(
+                    np.log(
+                        measurement_and_prior_precision[
+                            (measurement_and_prior_precision > 0.0) & ~is_known
+                        ]
+                    )
+                )
+            )
+            system = replace(
+                system, log_determinant=system.log_determinant + log_precision_of_unknown_states
+            )
+            yield axes, system, int(np.count_nonzero(is_known)) - 2 * len(self.segment_starts)
 
 
 @dataclass(frozen=True)
@@ -250,14 +200,14 @@ class PositionFit:
 
     Attributes
     ----------
-    gram_matrix : ndarray, shape (s, 1 + c, 1 + c)
+    gram_matrix : ndarray, shape (segments, time offsets, 1 + c, 1 + c)
         Inner products of the data and their derivatives, weighted by the inverse covariance.
     covariance_log_determinant : float
         Log determinant of the covariance of the positions.
     degrees_of_freedom : int
         Number of measured positions minus the number needed for the initial states.
     constant_prior_sigmas : ndarray, shape (c,)
-        Prior σ of the constant errors.
+        Prior σ of the c constant errors.
     """
 
     gram_matrix: Array
@@ -265,140 +215,249 @@ class PositionFit:
     degrees_of_freedom: int
     constant_prior_sigmas: Array
 
-    def estimate_constants(self) -> ArrayPair:
-        """Return the constant errors of each segment, shape (s, c), and their covariances."""
-        covariance = np.asarray(
-            np.linalg.inv(self.gram_matrix[:, 1:, 1:] + np.diag(self.constant_prior_sigmas**-2.0))
+    def scale_sigmas(self, factor: float) -> PositionFit:
+        """Return the fit with the σ of all noises multiplied by ``factor``."""
+        return replace(
+            self,
+            gram_matrix=self.gram_matrix / factor**2,
+            covariance_log_determinant=self.covariance_log_determinant
+            + 2.0 * self.degrees_of_freedom * math.log(factor),
         )
-        return -(covariance @ self.gram_matrix[:, 1:, :1])[..., 0], covariance
 
-    def compute_segment_scores(self, sigma_factor: float = 1.0) -> Array:
-        """Return -ln p of the positions in each segment, if all σ are multiplied by a factor.
+    def compute_constants_information(self) -> Array:
+        """Return information matrices of the constant errors, shape (segments, offsets, c, c)."""
+        return np.asarray(self.gram_matrix[..., 1:, 1:] + np.diag(self.constant_prior_sigmas**-2.0))
 
-        A term that is equal for all time offsets is omitted.
-        """
-        gram_matrix = self.gram_matrix / sigma_factor**2
-        prior_sigmas = self.constant_prior_sigmas
-        information = gram_matrix[:, 1:, 1:] * np.outer(prior_sigmas, prior_sigmas) + np.eye(
-            len(prior_sigmas)
-        )
-        cross_products = gram_matrix[:, 1:, :1] * prior_sigmas[:, None]
-        explained_square_sum = np.sum(
-            cross_products * np.linalg.solve(information, cross_products), axis=(1, 2)
-        )
-        cholesky_diagonal = np.diagonal(np.linalg.cholesky(information), axis1=1, axis2=2)
+    def estimate_segment_constants(self) -> Array:
+        """Return the estimated constant errors, shape (segments, time offsets, c)."""
         return np.asarray(
-            0.5 * (gram_matrix[:, 0, 0] - explained_square_sum)
-            + np.log(cholesky_diagonal).sum(axis=1)
+            -np.linalg.solve(self.compute_constants_information(), self.gram_matrix[..., 1:, :1])[
+                ..., 0
+            ]
         )
 
-    def compute_score(self, sigma_factor: float = 1.0) -> float:
-        """Return -ln p of the positions, if all σ are multiplied by a factor.
+    def compute_segment_scores(self, sigma_factors: Array = UNCHANGED_SIGMAS) -> Array:
+        """Return -ln p of the positions in each segment, shape (factors, segments, time offsets).
 
-        A constant term is omitted.
+        All σ are multiplied by each of ``sigma_factors``. A term that is equal for all time offsets
+        is omitted.
         """
-        return float(
-            self.compute_segment_scores(sigma_factor).sum()
-            + 0.5 * self.covariance_log_determinant
-            + self.degrees_of_freedom * math.log(sigma_factor)
+        gram_matrix_over_sigma_factor_squared = (
+            self.gram_matrix / sigma_factors[:, None, None, None, None] ** 2
+        )
+        prior_sigmas = self.constant_prior_sigmas
+        normalised_information_matrix = gram_matrix_over_sigma_factor_squared[
+            ..., 1:, 1:
+        ] * np.outer(prior_sigmas, prior_sigmas) + np.eye(len(prior_sigmas))
+        cross_products = gram_matrix_over_sigma_factor_squared[..., 1:, 0] * prior_sigmas
+        cholesky_factor = np.linalg.cholesky(normalised_information_matrix)
+        estimated_constants = np.linalg.solve(
+            normalised_information_matrix, cross_products[..., None]
+        )[..., 0]
+        half_log_determinant = np.log(np.diagonal(cholesky_factor, axis1=-2, axis2=-1)).sum(axis=-1)
+        square_sum = gram_matrix_over_sigma_factor_squared[..., 0, 0] - np.sum(
+            cross_products * estimated_constants, axis=-1
+        )
+        return np.asarray(0.5 * square_sum + half_log_determinant)
+
+    def compute_scores(self, sigma_factors: Array = UNCHANGED_SIGMAS) -> Array:
+        """Return -ln p of the positions, shape (factors, time offsets), without a constant term.
+
+        All σ are multiplied by each of ``sigma_factors``.
+        """
+        log_determinant_terms = (
+            0.5 * self.covariance_log_determinant + self.degrees_of_freedom * np.log(sigma_factors)
+        )
+        return np.asarray(
+            self.compute_segment_scores(sigma_factors).sum(axis=1) + log_determinant_terms[:, None]
         )
 
 
-def fit_constant_errors(
+def fit_positions(
     positions: PositionsAndIncrements,
-    noise_parameters: NoiseParameters,
-    measurement_weights: Array,
+    sigma_a_m_s2: float,
+    variance_m2: Array,
+    measured_m: Array | None = None,
 ) -> PositionFit:
-    """Fit constant errors (such as biases) to positions, with given noise parameters.
+    """Fit constant errors (such as biases) to positions, with given SIGMA_A and variances.
 
     The inputs of the fit are the data, and their derivatives with respect to each constant error.
-    The variance of a measurement is SIGMA_Z² / weight.
+    ``measured_m``, shape (axes, 1 or time offsets, inputs, measurements), contains the positions of
+    the first inputs (default: the data). The positions of the others are zero.
     """
-    input_count = positions.delta_position_m.shape[1]
-    gram_matrix = np.zeros((len(positions.segments), input_count, input_count))
-    log_determinant, degrees_of_freedom = 0.0, 0
-    for axes, system in positions.factorise_equations(noise_parameters, measurement_weights):
+    if measured_m is None:
+        measured_m = np.nan_to_num(positions.measurement_m.T)[:, None, None]
+    measured_input_count = measured_m.shape[2]
+    dp = positions.delta_position_m
+    dv = positions.delta_velocity_m_s
+    gram_matrix = np.zeros((len(positions.segment_starts), *dp.shape[1:3], dp.shape[2]))
+    log_determinant = 0.0
+    degrees_of_freedom = 0
+    for axes, system, axis_degrees_of_freedom in positions.factorise_equations(
+        sigma_a_m_s2, variance_m2
+    ):
         log_determinant += len(axes) * system.log_determinant
-        degrees_of_freedom += len(axes) * system.degrees_of_freedom
-        # Segment by segment, which is faster for long flights
-        for segment, (begin, end) in enumerate(positions.segments):
-            measured_m = np.nan_to_num(positions.measurement_m[begin:end, axes].T)
-            whitened_increments, right_hand_side = system.make_right_hand_side(
-                measured_m,
-                positions.delta_position_m[axes, :, begin : end - 1],
-                positions.delta_velocity_m_s[axes, :, begin : end - 1],
-                begin,
+        degrees_of_freedom += len(axes) * axis_degrees_of_freedom
+        # segment by segment, which limits memory
+        for index, (begin, end) in enumerate(positions.segments):
+            rows, interval_index = slice(begin, end), np.s_[axes, ..., begin : end - 1]
+            segment_measured_m = measured_m[axes, ..., rows]
+            whitened_increments, part_explained_by_states = system.select_segment(rows).whiten(
+                segment_measured_m, dp[interval_index], dv[interval_index]
             )
-            state_columns = slice(system.state_count * begin, system.state_count * end)
-            part_explained_by_states, _ = lapack.dtbtrs(
-                system.cholesky_factor[:, state_columns], right_hand_side.T, uplo="L"
+            measurements_over_sigma = np.sqrt(system.precision[rows, 0]) * segment_measured_m
+            gram_matrix[index] += _compute_gram_matrix(whitened_increments) - _compute_gram_matrix(
+                part_explained_by_states
             )
-            gram_matrix[segment] += _compute_inner_products(
-                whitened_increments
-            ) - _compute_inner_products(
-                part_explained_by_states.T.reshape(len(axes), input_count, -1)
+            gram_matrix[index, :, :measured_input_count, :measured_input_count] += (
+                _compute_gram_matrix(measurements_over_sigma)
             )
-            # Only the data have measured positions
-            gram_matrix[segment, 0, 0] += np.sum(system.precision[begin:end] * measured_m**2)
     return PositionFit(
         gram_matrix, log_determinant, degrees_of_freedom, positions.constant_prior_sigmas
     )
 
 
-def _compute_inner_products(inputs: Array) -> Array:
-    """Return the inner products of inputs, shape (..., inputs, values), summed over the axes."""
-    products = inputs @ np.swapaxes(inputs, -1, -2)
-    return np.asarray(products.sum(axis=tuple(range(products.ndim - 2))))
+def _compute_gram_matrix(whitened_inputs: Array) -> Array:
+    """Return the inner products of the inputs, summed over the axes.
+
+    ``whitened_inputs`` has the shape (axes, ..., inputs, values).
+    """
+    return np.asarray((whitened_inputs @ np.swapaxes(whitened_inputs, -1, -2)).sum(axis=0))
 
 
-def subtract_smooth_path(positions: PositionsAndIncrements) -> PositionsAndIncrements:
+def subtract_smooth_path(
+    positions: PositionsAndIncrements, *, estimates_scale: bool = False
+) -> PositionsAndIncrements:
     """Subtract a smooth path through the positions from the positions and the IMU increments.
 
-    Smaller numbers have smaller rounding errors. The path also becomes the derivative with respect
-    to the last constant error, if there are any: the scale factor error of the positions.
+    Smaller numbers have smaller rounding errors. With ``estimates_scale``, the path becomes the
+    derivative of the data with respect to the scale factor error.
     """
     measured_m = positions.measurement_m.copy()
-    dp, dv = positions.delta_position_m.copy(), positions.delta_velocity_m_s.copy()
-    for axes, system in positions.factorise_equations(
-        PATH_SMOOTHER_NOISE, np.ones(len(measured_m))
+    dp = positions.delta_position_m.copy()
+    dv = positions.delta_velocity_m_s.copy()
+    for axes, system, _ in positions.factorise_equations(
+        PATH_SMOOTHER_SIGMA_A_M_S2, np.full(len(measured_m), PATH_SMOOTHER_SIGMA_Z_M**2)
     ):
-        path = system.solve(measured_m[:, axes].T, dp[axes, 0], dv[axes, 0])
-        path[:, positions.segment_starts] = 0.0
-        path_m, path_velocity_m_s = path[..., 0], path[..., 1]
-        measured_m[:, axes] -= path_m.T
-        path_dp = np.diff(path_m) - positions.interval_s * path_velocity_m_s[:, :-1]
-        for increments, path_increments in ((dp, path_dp), (dv, np.diff(path_velocity_m_s))):
-            increments[axes, 0] -= path_increments
-            if positions.constant_prior_sigmas.size:
-                increments[axes, -1] = path_increments
+        measured_m_by_axis = np.repeat(
+            np.nan_to_num(measured_m[:, axes].T)[:, None], dp.shape[1], 1
+        )
+        smoothed_state = system.solve(measured_m_by_axis, dp[axes, :, 0], dv[axes, :, 0])
+        smoothed_state[:, :, positions.segment_starts] = 0.0
+        path_m = smoothed_state[..., 0]
+        path_velocity_m_s = smoothed_state[..., 1]
+        measured_m[:, axes] -= path_m[:, 0].T
+        path_position_increment_m = (
+            np.diff(path_m) - positions.interval_s * path_velocity_m_s[..., :-1]
+        )
+        # All time offsets have the same measured positions, so the same path is subtracted
+        for array, increment in ((dp, path_position_increment_m), (dv, np.diff(path_velocity_m_s))):
+            array[axes, :, 0] -= increment[:, :1]
+            if estimates_scale:
+                array[axes, :, -1] = increment
     return replace(positions, measurement_m=measured_m, delta_position_m=dp, delta_velocity_m_s=dv)
 
 
 def estimate_squared_errors(
     positions: PositionsAndIncrements,
-    noise_parameters: NoiseParameters,
-    measurement_weights: Array,
+    sigma_a_m_s2: float,
+    variance_m2: Array,
+    constant_errors: Array,
 ) -> ArrayPair:
     """Return the expected squared error (m²) of each measurement, and its number of measured axes.
 
     It is the squared distance to the smoothed position plus its variance, summed over the axes.
+
+    Parameters
+    ----------
+    variance_m2 : ndarray, shape (m,)
+        Variance of each measurement.
+    constant_errors : ndarray, shape (segments, c)
+        Estimated constant errors (such as biases).
     """
-    constant_errors, _ = fit_constant_errors(
-        positions, noise_parameters, measurement_weights
-    ).estimate_constants()
-    input_weights = np.insert(constant_errors, 0, 1.0, axis=1)[positions.segment_index[1:]]
+    data_and_derivative_weights = np.concatenate(
+        [np.ones((len(constant_errors), 1)), constant_errors], axis=1
+    )
+    data_and_derivative_weights_by_interval = np.repeat(
+        data_and_derivative_weights, np.diff([*positions.segment_starts, len(variance_m2)]), axis=0
+    )[1:]
     dp, dv = (
-        np.einsum("akn,nk->an", increments, input_weights)
+        np.einsum("akn,nk->an", increments[:, 0], data_and_derivative_weights_by_interval)
         for increments in (positions.delta_position_m, positions.delta_velocity_m_s)
     )
-    expected_squared_error_m2 = np.zeros(len(positions.measurement_m))
-    for axes, system in positions.factorise_equations(noise_parameters, measurement_weights):
+    expected_squared_error_m2 = np.zeros(len(variance_m2))
+    for axes, system, _ in positions.factorise_equations(sigma_a_m_s2, variance_m2):
         measured_m = positions.measurement_m[:, axes].T
-        error_m = measured_m - system.solve(measured_m, dp[axes], dv[axes])[..., 0]
-        expected_squared_error_m2 += np.nansum(
-            error_m**2 + np.where(np.isnan(error_m), np.nan, system.position_variance()), axis=0
-        )
+        error_m = measured_m - system.solve(np.nan_to_num(measured_m), dp[axes], dv[axes])[..., 0]
+        position_variance = np.where(np.isnan(error_m), np.nan, system.position_variance())
+        expected_squared_error_m2 += np.nansum(error_m**2 + position_variance, axis=0)
     return expected_squared_error_m2, np.isfinite(positions.measurement_m).sum(axis=1)
+
+
+def compute_segment_inner_products(
+    positions: PositionsAndIncrements,
+    sigma_a_m_s2: float,
+    variance_m2: Array,
+    left_positions_and_increments: Sequence[Array],
+    right_positions_m: Array,
+) -> Array:
+    """Return inner products uᵀC⁻¹v of k pairs (u, v) of inputs, shape (segments, k).
+
+    C is the covariance of the positions, given the acceleration. It includes unknown constant
+    errors (such as biases).
+
+    Parameters
+    ----------
+    variance_m2 : ndarray, shape (m,)
+        Variance of each measurement.
+    left_positions_and_increments : three ndarray
+        Positions, Δp and Δv of each u, shapes (axes, k, m) and twice (axes, k, m - 1).
+    right_positions_m : ndarray, shape (axes, k, m)
+        Positions of each v; its Δp and Δv are zero.
+    """
+    left_positions_m, *increments = left_positions_and_increments
+    increments_per_constant_error = (
+        positions.delta_position_m[:, 0, 1:],
+        positions.delta_velocity_m_s[:, 0, 1:],
+    )
+    inner_products_by_batch = []
+    for begin in range(0, right_positions_m.shape[1], INNER_PRODUCTS_PER_BATCH):
+        batch = np.s_[:, begin : begin + INNER_PRODUCTS_PER_BATCH]
+        dp, dv = (
+            np.concatenate(
+                [increment[batch], 0.0 * increment[batch], increment_per_constant_error], axis=1
+            )[:, None]
+            for increment, increment_per_constant_error in zip(
+                increments, increments_per_constant_error, strict=True
+            )
+        )
+        left_rows, right_rows, constant_error_rows = np.split(
+            np.arange(dp.shape[2]), np.array([1, 2]) * left_positions_m[batch].shape[1]
+        )
+        left_and_right_positions_m = np.concatenate(
+            [left_positions_m[batch], right_positions_m[batch]], axis=1
+        )[:, None]
+        gram_matrix = fit_positions(
+            replace(positions, delta_position_m=dp, delta_velocity_m_s=dv),
+            sigma_a_m_s2,
+            variance_m2,
+            left_and_right_positions_m,
+        ).gram_matrix[:, 0]
+        information = gram_matrix[:, constant_error_rows[:, None], constant_error_rows] + np.diag(
+            positions.constant_prior_sigmas**-2.0
+        )
+        constant_error_coefficients = np.linalg.solve(
+            information, gram_matrix[:, constant_error_rows[:, None], right_rows]
+        )
+        products_explained_by_constant_errors = np.einsum(
+            "skc,sck->sk",
+            gram_matrix[:, left_rows[:, None], constant_error_rows],
+            constant_error_coefficients,
+        )
+        inner_products_by_batch.append(
+            gram_matrix[:, left_rows, right_rows] - products_explained_by_constant_errors
+        )
+    return np.concatenate(inner_products_by_batch, axis=1)
 
 
 @dataclass(frozen=True)
@@ -407,65 +466,113 @@ class BandedNormalEquations:
 
     Attributes
     ----------
-    precision : ndarray, shape (m,)
-        Inverse variance (1/m²) of each measurement; 0 without a measurement.
+    precision : ndarray, shape (m, 2)
+        Precision of position (1/m²) and velocity (s²/m²), including the prior.
     interval_s : ndarray, shape (m - 1,)
         Time between successive measurements.
-    inverse_q_factor : ndarray, shape (3, m - 1)
-        Elements 00, 01, 11 of U in Q⁻¹ = UᵀU; zero between segments.
-    bands, cholesky_factor : ndarray, shape (2 + states, states · m)
+    inverse_q : ndarray, shape (3, m - 1)
+        Elements 00, 01, 11 of Q⁻¹; zero between segments.
+    inverse_velocity_noise_sigma : ndarray, shape (m - 1,)
+        1/√Q₁₁, with the velocity variance Q₁₁; zero between segments.
+    bands, cholesky_factor : ndarray, shape (2 + state_count, state_count · m)
         A and its Cholesky factor in LAPACK's band storage.
     log_determinant : float
         Log determinant of the covariance of the positions.
-    degrees_of_freedom : int
-        Number of measured positions minus the number needed for the initial states.
     """
 
     precision: Array
     interval_s: Array
-    inverse_q_factor: Array
+    inverse_q: Array
+    inverse_velocity_noise_sigma: Array
     bands: Array
     cholesky_factor: Array
     log_determinant: float
-    degrees_of_freedom: int
 
     @property
     def state_count(self) -> int:
         """2 (position, velocity), or 3 with time-correlated noise."""
         return len(self.bands) - 2
 
-    def solve(self, measured_m: Array, dp: Array, dv: Array) -> Array:
-        """Return the estimated states of each axis, shape (a, m, states).
+    def select_segment(self, rows: slice) -> BandedNormalEquations:
+        """Return the equations of the measurements in one segment."""
+        state_columns = slice(self.state_count * rows.start, self.state_count * rows.stop)
+        interval_rows = slice(rows.start, rows.stop - 1)
+        return replace(
+            self,
+            precision=self.precision[rows],
+            interval_s=self.interval_s[interval_rows],
+            inverse_q=self.inverse_q[:, interval_rows],
+            inverse_velocity_noise_sigma=self.inverse_velocity_noise_sigma[interval_rows],
+            bands=self.bands[:, state_columns],
+            cholesky_factor=self.cholesky_factor[:, state_columns],
+        )
+
+    def whiten(
+        self, measured_m: Array, delta_position_m: Array, delta_velocity_m_s: Array
+    ) -> ArrayPair:
+        """Return two arrays for the inner products of inputs in :func:`fit_positions`.
+
+        The first array contains Δp and Δv divided by the square root of Q. The second array
+        contains the part of each input that the states explain.
+        """
+        whitened_increments, right_hand_side = self._whiten_increments(
+            measured_m, delta_position_m, delta_velocity_m_s
+        )
+        # LAPACK solves a triangular system with unit diagonal 30 % faster
+        diagonal = self.cholesky_factor[0]
+        unit_diagonal_factor = self.cholesky_factor / diagonal
+        part_explained_by_states, _ = lapack.dtbtrs(
+            unit_diagonal_factor, right_hand_side.T, uplo="L", diag="U", overwrite_b=1
+        )
+        return whitened_increments, (part_explained_by_states.T / diagonal).reshape(
+            *delta_position_m.shape[:-1], -1
+        )
+
+    def solve(self, measured_m: Array, delta_position_m: Array, delta_velocity_m_s: Array) -> Array:
+        """Return the estimated states, shape (..., measurements, states).
 
         States: position (m), velocity (m/s), and time-correlated noise (m) if it is fitted.
         """
-        _, right_hand_side = self.make_right_hand_side(
-            np.nan_to_num(measured_m), dp[:, None], dv[:, None]
+        _, right_hand_side = self._whiten_increments(
+            measured_m, delta_position_m, delta_velocity_m_s
         )
-        state, _ = lapack.dpbtrs(self.cholesky_factor, right_hand_side.T, lower=1)
-        return np.asarray(state.T.reshape(*measured_m.shape, -1))
+        state, _ = lapack.dpbtrs(self.cholesky_factor, right_hand_side.T, lower=1, overwrite_b=1)
+        return np.asarray(state.T.reshape(*delta_position_m.shape[:-1], -1, self.state_count))
 
-    def make_right_hand_side(
-        self, measured_m: Array, dp: Array, dv: Array, begin: int = 0
+    def _whiten_increments(
+        self, measured_m: Array, delta_position_m: Array, delta_velocity_m_s: Array
     ) -> ArrayPair:
-        """Return U [Δp, Δv], and the right-hand side b of Ax = b, shape (a · k, states · m).
-
-        Shapes of the arguments: (a, m), and twice (a, k, m - 1). ``begin`` is the index of the
-        first measurement.
-        """
-        end = begin + measured_m.shape[1]
-        u00, u01, u11 = self.inverse_q_factor[:, begin : end - 1]
-        w0, w1 = whitened_increments = np.array([u00 * dp + u01 * dv, u11 * dv])
-        # Q⁻¹ [Δp, Δv]
-        g0, g1 = u00 * w0, u01 * w0 + u11 * w1
-        right_hand_side = np.zeros((*dp.shape[:2], end - begin, self.state_count))
+        """Return Δp and Δv divided by the square root of Q, and the right-hand side b of Ax = b."""
+        inverse_q00, inverse_q01, _ = self.inverse_q
+        # Elements 00 and 01 of the Cholesky factor U of Q⁻¹ = UᵀU
+        factor_00 = np.sqrt(inverse_q00)
+        factor_01 = np.divide(
+            inverse_q01, factor_00, out=np.zeros_like(inverse_q01), where=factor_00 > 0.0
+        )
+        whitened_increments = np.empty((*delta_position_m.shape, 2))
+        whitened_increments[..., 0] = factor_00 * delta_position_m + factor_01 * delta_velocity_m_s
+        whitened_increments[..., 1] = self.inverse_velocity_noise_sigma * delta_velocity_m_s
+        g0 = factor_00 * whitened_increments[..., 0]
+        g1 = (
+            factor_01 * whitened_increments[..., 0]
+            + self.inverse_velocity_noise_sigma * whitened_increments[..., 1]
+        )
+        right_hand_side = np.zeros(
+            (*delta_position_m.shape[:-1], len(self.precision), self.state_count)
+        )
         right_hand_side[..., 1:, 0] = g0
         right_hand_side[..., 1:, 1] = g1
         right_hand_side[..., :-1, 0] -= g0
-        right_hand_side[..., :-1, 1] -= self.interval_s[begin : end - 1] * g0 + g1
-        # Position and time-correlated noise are measured together
-        right_hand_side[:, 0, :, ::2] += (self.precision[begin:end] * measured_m)[..., None]
-        return whitened_increments, right_hand_side.reshape(-1, self.state_count * (end - begin))
+        g0 *= self.interval_s
+        g0 += g1
+        right_hand_side[..., :-1, 1] -= g0
+        weighted_measurements = self.precision[:, 0] * measured_m
+        right_hand_side_of_first_inputs = right_hand_side[..., : measured_m.shape[-2], :, :]
+        right_hand_side_of_first_inputs[..., 0] += weighted_measurements
+        right_hand_side_of_first_inputs[..., 2:] += weighted_measurements[..., None]
+        return whitened_increments.reshape(
+            *delta_position_m.shape[:-1], -1
+        ), right_hand_side.reshape(-1, self.state_count * len(self.precision))
 
     def position_variance(self) -> Array:
         """Return the variance (m²) of the smoothed position at each measurement.
@@ -473,13 +580,128 @@ class BandedNormalEquations:
         The information of earlier and of later measurements is added (Fraser and Potter 1969).
         """
         # The Cholesky factor of A in reverse time order contains the later measurements
-        time_reversed_factor, _ = lapack.dpbtrf(self.bands[::-1, ::-1], lower=0)
-        matrices = self.cholesky_factor, time_reversed_factor[::-1, ::-1], self.bands
+        time_reversed_bands = np.zeros_like(self.bands)
+        number_of_unknowns = self.bands.shape[1]
+        for band in range(4):
+            time_reversed_bands[band, : number_of_unknowns - band] = self.bands[
+                band, : number_of_unknowns - band
+            ][::-1]
+        time_reversed_cholesky_factor, _ = lapack.dpbtrf(
+            time_reversed_bands, lower=1, overwrite_ab=1
+        )
         # Diagonal blocks of the Cholesky factors: [[a, 0], [b, c]], and in reverse time order
         # [[d, 0], [e, f]]. In reverse order, velocity precedes position
-        (a, c), (f, d), (a00, a11) = (matrix[0].reshape(-1, 2).T for matrix in matrices)
-        b, e, a01 = (matrix[1, ::2] for matrix in matrices)
-        p00 = a**2 + e**2 + f**2 - a00
-        p01 = a * b + d * e - a01
-        p11 = b**2 + c**2 + d**2 - a11
+        (a, c) = (self.cholesky_factor[0, first_row::2] for first_row in (0, 1))
+        b = self.cholesky_factor[1, 0::2]
+        (d, f) = (time_reversed_cholesky_factor[0, first_row::2][::-1] for first_row in (0, 1))
+        e = time_reversed_cholesky_factor[1, 0::2][::-1]
+        p00 = a**2 + e**2 + f**2 - self.bands[0, 0::2]
+        p01 = a * b + d * e - self.bands[1, 0::2]
+        p11 = b**2 + c**2 + d**2 - self.bands[0, 1::2]
         return np.asarray(p11 / (p00 * p11 - p01**2))
+
+
+def factorise(
+    interval_s: Array,
+    process_noise: Array,
+    is_within_segment: BoolArray,
+    measurement_and_prior_precision: Array,
+    correlated_noise: tuple[float, float] | None = None,
+) -> BandedNormalEquations:
+    """Return the factorised normal equations Ax = b of the states at the measurements.
+
+    Parameters
+    ----------
+    interval_s : ndarray, shape (m - 1,)
+        Time between successive measurements.
+    process_noise : ndarray, shape (3, m - 1)
+        Elements 00, 01, 11 of Q of each interval.
+    is_within_segment : ndarray of bool, shape (m - 1,)
+        False for intervals between segments.
+    measurement_and_prior_precision : ndarray, shape (m, 2)
+        Precision of position (1/m²) and velocity (s²/m²), including the prior.
+        With time-correlated noise, the prior must be negligible.
+    correlated_noise : (float, float), optional
+        Standard deviation (m) and time constant (s) of time-correlated noise.
+
+    Raises
+    ------
+    numpy.linalg.LinAlgError
+        A segment has too few measurements for a position and a velocity.
+    """
+    q00, q01, q11 = process_noise
+    position_measurement_precision = measurement_and_prior_precision[:, 0]
+    regularisation_variance_m2 = REGULARISATION_TO_POSITION_SIGMA_RATIO**2 * (
+        1.0 / np.median(position_measurement_precision[position_measurement_precision > 0.0]) + q00
+    )
+    # Q of one prediction step is singular, so a small variance is added. A tiny determinant is a
+    # rounding error
+    variance_product = q00 * q11
+    raw_q_determinant = variance_product - q01**2
+    q_determinant = (
+        np.where(
+            raw_q_determinant > MIN_DETERMINANT_TO_VARIANCE_PRODUCT_RATIO * variance_product,
+            raw_q_determinant,
+            0.0,
+        )
+        + regularisation_variance_m2 * q11
+    )
+    inverse_q = np.where(
+        is_within_segment,
+        np.stack([q11, -q01, q00 + regularisation_variance_m2]) / q_determinant,
+        0.0,
+    )
+    # Elements of Q⁻¹, and element 10 of FᵀQ⁻¹
+    inverse_q00, inverse_q01, inverse_q11 = inverse_q
+    position_velocity_weight = inverse_q00 * interval_s + inverse_q01
+    # A = diag(precision) + Σ [-F I]ᵀ Q⁻¹ [-F I] over the intervals, in LAPACK's band format
+    state_count = 2 if correlated_noise is None else 3
+    band_storage = np.zeros((len(measurement_and_prior_precision), state_count, state_count + 2))
+    position_bands = band_storage[:, 0]
+    velocity_bands = band_storage[:, 1]
+    position_bands[:, 0], velocity_bands[:, 0] = measurement_and_prior_precision.T
+    position_bands[1:, 0] += inverse_q00
+    position_bands[1:, 1] = inverse_q01
+    velocity_bands[1:, 0] += inverse_q11
+    position_bands[:-1, 0] += inverse_q00
+    position_bands[:-1, 1] += position_velocity_weight
+    velocity_bands[:-1, 0] += (position_velocity_weight + inverse_q01) * interval_s + inverse_q11
+    position_bands[:-1, state_count] = -inverse_q00
+    position_bands[:-1, state_count + 1] = -inverse_q01
+    velocity_bands[:-1, state_count - 1] = -position_velocity_weight
+    velocity_bands[:-1, state_count] = -(inverse_q01 * interval_s + inverse_q11)
+    process_noise_log_determinant = np.sum(np.log(q_determinant[is_within_segment]))
+    if correlated_noise is not None:
+        correlated_sigma_m, tau_s = correlated_noise
+        rho = np.where(is_within_segment, np.exp(-interval_s / tau_s), 0.0)
+        # Variance of a Gauss-Markov process: σ_c² at the start of a segment, then (1 - ρ²) σ_c²
+        correlated_noise_step_variance_m2 = correlated_sigma_m**2 * np.append(1.0, 1.0 - rho**2)
+        correlated_noise_bands = band_storage[:, 2]
+        position_bands[:, 2] = position_measurement_precision
+        correlated_noise_bands[:, 0] = (
+            position_measurement_precision + 1.0 / correlated_noise_step_variance_m2
+        )
+        correlated_noise_bands[:-1, 0] += rho**2 / correlated_noise_step_variance_m2[1:]
+        correlated_noise_bands[:-1, state_count] = -rho / correlated_noise_step_variance_m2[1:]
+        process_noise_log_determinant += np.sum(np.log(correlated_noise_step_variance_m2))
+    bands = band_storage.reshape(-1, state_count + 2).T
+    cholesky_factor, is_singular = lapack.dpbtrf(bands, lower=1)
+    if is_singular:
+        raise np.linalg.LinAlgError(
+            "the normal equations are singular (too few positions, or large rounding errors)"
+        )
+    log_determinant = (
+        2.0 * np.sum(np.log(cholesky_factor[0]))
+        + process_noise_log_determinant
+        - np.sum(np.log(measurement_and_prior_precision[measurement_and_prior_precision > 0.0]))
+    )
+    inverse_velocity_noise_sigma = np.where(is_within_segment, 1.0 / np.sqrt(q11), 0.0)
+    return BandedNormalEquations(
+        measurement_and_prior_precision,
+        interval_s,
+        inverse_q,
+        inverse_velocity_noise_sigma,
+        bands,
+        cholesky_factor,
+        float(log_determinant),
+    )

@@ -61,20 +61,40 @@ def propagate_covariance(covariance: SymmetricElements[T], dt_s: T) -> Symmetric
     return p00 + 2.0 * dt_s * p01 + dt_s**2 * p11, p01 + dt_s * p11, p11
 
 
+def predict_step(
+    position: T,
+    velocity: T,
+    covariance: SymmetricElements[T],
+    acceleration: T,
+    noise_density: T,
+    dt_s: T,
+) -> tuple[T, T, SymmetricElements[T]]:
+    """Return the predicted position, velocity and covariance: Fx + Ba and FPFᵀ + Q.
+
+    ``noise_density`` (m²/s³) is SIGMA_A² · DT.
+    """
+    p00, p01, p11 = propagate_covariance(covariance, dt_s)
+    q00, q01, q11 = compute_process_noise_per_density(dt_s)
+    predicted_covariance = (
+        p00 + noise_density * q00,
+        p01 + noise_density * q01,
+        p11 + noise_density * q11,
+    )
+    position, velocity = propagate_state(position, velocity, acceleration, dt_s)
+    return position, velocity, predicted_covariance
+
+
 def update_step(
-    position: Array,
-    velocity: Array,
-    covariance: SymmetricElements[float],
-    measured_m: Array,
-    variance: float,
-) -> tuple[tuple[Array, float], tuple[Array, Array, SymmetricElements[float]]]:
+    position: T, velocity: T, covariance: SymmetricElements[T], measured_m: T, variance: T
+) -> tuple[tuple[T, T, T, T], tuple[T, T, SymmetricElements[T]]]:
     """Update with a measurement: ν = z - Hx, S = HPHᵀ + R, K = PHᵀS⁻¹, x = x + Kν, P = (I - KH)P.
 
-    Return ν (m) and S (m²), then the updated position, velocity and covariance.
+    Return (ν in m, S in m², position gain, velocity gain), and the updated state and covariance.
     """
     p00, p01, p11 = covariance
     nu = measured_m - position
     s = p00 + variance
-    k0, k1 = p00 / s, p01 / s
+    k0 = p00 / s
+    k1 = p01 / s
     updated_covariance = variance * k0, variance * k1, p11 - k1 * p01
-    return (nu, s), (position + k0 * nu, velocity + k1 * nu, updated_covariance)
+    return (nu, s, k0, k1), (position + k0 * nu, velocity + k1 * nu, updated_covariance)

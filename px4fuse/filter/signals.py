@@ -11,17 +11,11 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 import pandas as pd
+from numpy.typing import ArrayLike
 from scipy import constants
 from scipy.spatial.transform import Rotation, Slerp
 
-from px4fuse.core.arrays import (
-    Array,
-    ArrayPair,
-    BoolArray,
-    compute_median_interval_s,
-    integrate_cumulatively,
-    iterate_row_blocks,
-)
+from px4fuse.core.arrays import Array, BoolArray, integrate_cumulatively, iterate_row_blocks
 from px4fuse.core.record import Span, one_line_repr
 from px4fuse.errors import MissingDataError, SettingsError
 from px4fuse.flight.model import (
@@ -70,7 +64,7 @@ class Segment:
 
 @dataclass(frozen=True)
 class Acceleration:
-    """Acceleration of the vehicle, the input of KF.
+    """Acceleration along one axis, the input of KF.
 
     Attributes
     ----------
@@ -79,24 +73,30 @@ class Acceleration:
         Velocity change (NED) since the first IMU sample, without gravity.
     acceleration_products_m2_s4 : ndarray, shape (3, 3)
         Mean products of the acceleration components (NED) in the segment.
-    cumulative_gap_s : ndarray, shape (n,)
-        Total length of the IMU gaps before each time.
+    direction : ndarray, shape (3,)
+        Unit vector of the axis in NED.
+    gap_edge_time_s : ndarray, shape (k,)
+        Start and end of each IMU gap.
+    cumulative_gap_s : ndarray, shape (k,)
+        Total length of the IMU gaps before each time in ``gap_edge_time_s``.
     """
 
     time_s: Array
     acceleration_integral_m_s: Array
     acceleration_products_m2_s4: Array
+    direction: Array
+    gap_edge_time_s: Array
     cumulative_gap_s: Array
 
     __repr__ = one_line_repr
 
-    def compute_velocity_change_m_s(self, direction: Array) -> Array:
-        """Return the velocity change (m/s) along a unit vector (NED) since the first sample."""
-        return np.asarray(direction @ self.acceleration_integral_m_s)
+    def compute_velocity_change_m_s(self) -> Array:
+        """Return the velocity change (m/s) along the axis since the first sample, shape (n,)."""
+        return np.asarray(self.direction @ self.acceleration_integral_m_s)
 
-    def compute_rms_m_s2(self, direction: Array) -> float:
-        """Return the RMS acceleration (m/s²) along a unit vector (NED) in the segment."""
-        return float(np.sqrt(direction @ self.acceleration_products_m2_s4 @ direction))
+    def compute_rms_m_s2(self) -> float:
+        """Return the RMS acceleration (m/s²) along the axis in the segment."""
+        return float(np.sqrt(self.direction @ self.acceleration_products_m2_s4 @ self.direction))
 
 
 @dataclass(frozen=True)
@@ -221,7 +221,7 @@ def make_axes(
     SettingsError
         An axis has an unknown name, or the heading is not between 0 and 360.
     """
-    acceleration = integrate_ned_acceleration(compute_ned_acceleration(flight), segment)
+    acceleration = project_acceleration(compute_ned_acceleration(flight), np.zeros(3), segment)
     valid_names = (*AXIS_NAMES, AISLE)
     axis_names = tuple(dict.fromkeys(valid_names if names is None else names))
     if heading_deg is not None and not 0.0 <= heading_deg <= 360.0:
@@ -255,7 +255,9 @@ def make_axes(
                 note,
                 track_samples.index.to_numpy()[is_finite],
                 projected[is_finite],
-                acceleration,
+                acceleration
+                if isinstance(acceleration, Unavailable)
+                else replace(acceleration, direction=direction),
             )
         )
     if not axes:
@@ -266,13 +268,19 @@ def make_axes(
 def make_horizontal_axis(north_and_east: Sequence[Axis], heading_deg: float) -> Axis:
     """Combine the axes north and east to a horizontal axis with another heading."""
     north, east = north_and_east
-    cosine, sine = np.cos(np.radians(heading_deg)), np.sin(np.radians(heading_deg))
+    angle_rad = np.radians(heading_deg)
+    direction = np.cos(angle_rad) * north.direction + np.sin(angle_rad) * east.direction
+    acceleration = north.acceleration
     return replace(
         north,
         name=f"{heading_deg % 180.0:.0f}° from north",
-        direction=cosine * north.direction + sine * east.direction,
+        direction=direction,
         heading_deg=heading_deg,
-        measurement_m=cosine * north.measurement_m + sine * east.measurement_m,
+        measurement_m=np.cos(angle_rad) * north.measurement_m
+        + np.sin(angle_rad) * east.measurement_m,
+        acceleration=acceleration
+        if isinstance(acceleration, Unavailable)
+        else replace(acceleration, direction=direction),
     )
 
 
@@ -281,7 +289,7 @@ def make_downsampling_slice(time_s: Array) -> slice:
 
     The rate is then 1 to 2 times ``MAX_INDEPENDENT_ERROR_RATE_HZ``.
     """
-    interval_s = compute_median_interval_s(time_s) if len(time_s) > 1 else np.inf
+    interval_s = float(np.median(np.diff(time_s))) if len(time_s) > 1 else np.inf
     return slice(None, None, max(1, int(1.0 / (interval_s * MAX_INDEPENDENT_ERROR_RATE_HZ))))
 
 
@@ -320,26 +328,40 @@ def _choose_axis_direction(
     return np.array([np.cos(angle_rad), np.sin(angle_rad), 0.0]), axis_heading_deg, note
 
 
-def integrate_ned_acceleration(
-    acceleration: pd.DataFrame | Unavailable, segment: Segment
+def project_acceleration(
+    acceleration: pd.DataFrame | Unavailable, direction: Array, segment: Segment
 ) -> Acceleration | Unavailable:
-    """Integrate the acceleration (m/s², NED)."""
+    """Project the acceleration (m/s², NED) onto a unit vector, and integrate it."""
     if isinstance(acceleration, Unavailable):
         return acceleration
     time_s = acceleration.index.to_numpy()
-    segment_acceleration_m_s2 = cut_to_segment(acceleration, segment).to_numpy()
-    sample_count = len(segment_acceleration_m_s2)
-    if sample_count < 2:
+    segment_acceleration_m_s2 = rows_between(
+        acceleration, segment.start_s, segment.end_s
+    ).to_numpy()
+    if len(segment_acceleration_m_s2) < 2:
         return Unavailable(
             "IMU",
             "the analysed segment contains no IMU samples",
             "Use --start and --end to choose a segment with IMU samples.",
         )
+    is_gap = find_imu_gaps(time_s)
+    gap_rows = np.flatnonzero(is_gap)
+    gap_sum_s = np.cumsum(np.where(is_gap, np.diff(time_s), 0.0))
+    gap_edge_rows = np.unique([0, *gap_rows, *(gap_rows + 1), len(time_s) - 1])
     return Acceleration(
-        time_s,
-        np.transpose(integrate_cumulatively(acceleration.to_numpy(), time_s)),
-        segment_acceleration_m_s2.T @ segment_acceleration_m_s2 / sample_count,
-        np.append(0.0, np.cumsum(np.where(find_imu_gaps(time_s), np.diff(time_s), 0.0))),
+        time_s=time_s,
+        acceleration_integral_m_s=np.array(
+            [
+                integrate_cumulatively(values.to_numpy(), time_s)
+                for _, values in acceleration.items()
+            ]
+        ),
+        acceleration_products_m2_s4=segment_acceleration_m_s2.T
+        @ segment_acceleration_m_s2
+        / len(segment_acceleration_m_s2),
+        direction=direction,
+        gap_edge_time_s=time_s[gap_edge_rows],
+        cumulative_gap_s=np.append(0.0, gap_sum_s)[gap_edge_rows],
     )
 
 
@@ -350,20 +372,21 @@ def find_imu_gaps(time_s: Array) -> BoolArray:
 
 
 def compute_mean_step_acceleration(
-    acceleration: Acceleration, direction: Array, step_edges_s: Array
-) -> ArrayPair:
+    acceleration: Acceleration, step_edges_s: ArrayLike
+) -> tuple[Array, Array]:
     """Return the mean acceleration of each prediction step, and its fraction in IMU gaps.
 
     ``step_edges_s`` contains the start of the first step, and the end (s) of each step.
     """
+    step_edges_s = np.asarray(step_edges_s, dtype=np.float64)
     step_s = np.diff(step_edges_s)
-    velocity_m_s, gap_s = (
-        np.interp(step_edges_s, acceleration.time_s, values)
-        for values in (
-            acceleration.compute_velocity_change_m_s(direction),
-            acceleration.cumulative_gap_s,
-        )
-    )
+    velocity_m_s = np.zeros(len(step_edges_s))
+    for component, integral_m_s in zip(
+        acceleration.direction, acceleration.acceleration_integral_m_s, strict=True
+    ):
+        if component != 0.0:
+            velocity_m_s += component * np.interp(step_edges_s, acceleration.time_s, integral_m_s)
+    gap_s = np.interp(step_edges_s, acceleration.gap_edge_time_s, acceleration.cumulative_gap_s)
     clipped_edges_s = np.clip(step_edges_s, acceleration.time_s[0], acceleration.time_s[-1])
     fraction_outside_imu_data = 1.0 - np.diff(clipped_edges_s) / step_s
     return np.diff(velocity_m_s) / step_s, np.clip(

@@ -8,20 +8,21 @@ interval (sandwich estimate, White 1982).
 """
 
 from collections.abc import Callable
-from dataclasses import replace
 
 import numpy as np
+from msgspec import structs
 from scipy.interpolate import CubicSpline
 from scipy.special import chdtrc
 
 from px4fuse.core.arrays import Array
 from px4fuse.core.record import NOT_WRITTEN, Count, NotNegative, NotWritten, Record, Share, Span
-from px4fuse.filter.fitting import maximise_likelihood
+from px4fuse.filter.fitting import NoiseParameters, fit_constant_errors, maximise_likelihood
 from px4fuse.filter.imu_motion import (
     COARSE_MEASUREMENT_COUNT,
-    COARSE_TIME_OFFSETS_S,
+    COARSE_OFFSET_COUNT,
     HEADING_SIGMA_RAD,
     MAX_TESTED_TIME_OFFSET_S,
+    MotionCache,
     PositionsAndImuMotion,
     compute_imu_motion,
 )
@@ -30,7 +31,7 @@ from px4fuse.filter.likelihood import (
     compute_profile_likelihood_interval,
     fit_parabola_vertex,
 )
-from px4fuse.filter.marginal_likelihood import NoiseParameters, fit_constant_errors
+from px4fuse.filter.marginal_likelihood import compute_segment_inner_products
 from px4fuse.filter.settings import Settings
 from px4fuse.filter.signals import Segment, cut_to_segment, make_downsampling_slice
 from px4fuse.flight.model import Columns, Flight, PositionTrack, Unavailable
@@ -102,6 +103,8 @@ class ClockOffset(Record, kw_only=True):
     count: Count
     curve_time_offsets_s: NotWritten[Array] = NOT_WRITTEN
     curve_log_likelihood_drops: NotWritten[Array] = NOT_WRITTEN
+    sigma_a_m_s2: NotWritten[float] = NOT_WRITTEN
+    sigma_z_m: NotWritten[float] = NOT_WRITTEN
 
     @property
     def remaining_s(self) -> float:
@@ -135,6 +138,7 @@ def estimate_time_offset(
     noise_parameters: NoiseParameters,
     outlier_time_s: Array | None = None,
     progress: Callable[[str], None] = lambda _: None,
+    motion_cache: MotionCache | None = None,
 ) -> ClockOffset | Unavailable:
     """Estimate the time offset to add to the timestamps of a position source.
 
@@ -148,6 +152,8 @@ def estimate_time_offset(
         Timestamps of measurements to exclude.
     progress : callable
         Called with the name of each step of the analysis.
+    motion_cache : dict, optional
+        IMU motion that is already computed; new motion is added.
     """
     # GNSS height is omitted: it is noisier, but all axes have the same SIGMA_Z
     axis_count = 2 if track.origin.is_gnss else 3
@@ -162,13 +168,14 @@ def estimate_time_offset(
         position_samples.to_numpy(),
         directions=np.eye(3)[:axis_count],
         dt_s=settings.dt_s,
+        motion_cache=motion_cache,
         heading_sigma_rad=GNSS_HEADING_SIGMA_RAD if track.origin.is_gnss else HEADING_SIGMA_RAD,
     )
     if isinstance(imu_motion, Unavailable):
         return imu_motion
     progress("time offset")
     coarse_motion = imu_motion.downsample(COARSE_MEASUREMENT_COUNT)
-    _, offset_s, _ = coarse_motion.search_grid([noise_parameters])
+    offset_s, _ = imu_motion.search_offset(noise_parameters)
     offset_sigma_s = 0.0
     search_half_width_s = 0.1
     for motion in (coarse_motion, imu_motion):
@@ -179,56 +186,74 @@ def estimate_time_offset(
             fits_outliers=False,
         ).noise_parameters
         tested_offsets_s = _make_offset_grid(offset_s, search_half_width_s, FINE_GRID_OFFSET_COUNT)
-        scores = _score_offsets(motion, tested_offsets_s, noise_parameters)
-        offset_s, offset_sigma_s = _fit_minimum_and_sigma(tested_offsets_s, scores)
+        position_fit = fit_constant_errors(
+            motion.make_position_batches(tested_offsets_s),
+            noise_parameters,
+            motion.measurement_weights,
+        )
+        offset_s, offset_sigma_s = _fit_minimum_and_sigma(
+            tested_offsets_s, position_fit.compute_scores()[0]
+        )
         search_half_width_s = float(np.clip(3.5 * offset_sigma_s, 0.01, MAX_TESTED_TIME_OFFSET_S))
     offset_variance_factor = _simulate_variance_increase_by_imu_noise(
         imu_motion, offset_s, noise_parameters, offset_sigma_s**-2.0
     )
-    curve_time_offsets_s, profile_scores, interval_ends_s = _compute_offset_likelihood_curve(
-        imu_motion,
-        noise_parameters,
-        offset_s,
-        search_half_width_s,
-        MAX_LOG_LIKELIHOOD_DROP * offset_variance_factor,
+    curve_time_offsets_s, profile_scores, interval_low_s, interval_high_s = (
+        _compute_offset_likelihood_curve(
+            imu_motion,
+            noise_parameters,
+            offset_s,
+            search_half_width_s,
+            MAX_LOG_LIKELIHOOD_DROP * offset_variance_factor,
+        )
     )
+    has_both_interval_ends = interval_low_s is not None and interval_high_s is not None
     offset_s = _fit_minimum_and_sigma(curve_time_offsets_s, profile_scores)[0]
     # IMU samples are averages, so the timing error (half a sample interval, 1 σ) is added
     resolution_s = 0.5 * imu_motion.imu_interval_s
-    interval_low_s, interval_high_s = (
-        offset_s + sign * float(np.hypot(end_s - offset_s, 1.96 * resolution_s))
-        for sign, end_s in zip((-1.0, 1.0), interval_ends_s, strict=True)
+    interval_limits_s = (
+        curve_time_offsets_s[0] if interval_low_s is None else interval_low_s,
+        curve_time_offsets_s[-1] if interval_high_s is None else interval_high_s,
     )
-    is_determinable = (
-        _is_inside(interval_ends_s, curve_time_offsets_s)
-        and (interval_high_s - interval_low_s) / 2.0 <= MAX_OFFSET_INTERVAL_HALF_WIDTH_S
-    )
+    interval_half_widths_s = np.hypot(np.array(interval_limits_s) - offset_s, 1.96 * resolution_s)
+    interval_low_s = float(offset_s - interval_half_widths_s[0])
+    interval_high_s = float(offset_s + interval_half_widths_s[1])
+    rejection_reason = ""
+    if (
+        not has_both_interval_ends
+        or (interval_high_s - interval_low_s) / 2.0 > MAX_OFFSET_INTERVAL_HALF_WIDTH_S
+    ):
+        rejection_reason = (
+            f"all time offsets from {interval_low_s:+.2f} s to {interval_high_s:+.2f} s fit the "
+            "data almost equally well. Possible causes: the flight has little acceleration, or the "
+            "positions are noisy"
+        )
     parts: tuple[PartOffset, ...] = ()
     change_p_value = None
-    applied_offset_s = settings.clock_offset_s
-    if is_determinable:
+    if not rejection_reason:
         progress("change of the position source's time offset during the flight")
         parts, change_p_value = _estimate_flight_part_offsets(
-            imu_motion, offset_s, applied_offset_s, noise_parameters, offset_variance_factor
+            imu_motion, offset_s, noise_parameters, offset_variance_factor
         )
     drift_ppm, drift_sigma_ppm = _fit_clock_drift(parts)
+    applied_offset_s = settings.clock_offset_s
     return ClockOffset(
         offset_s=applied_offset_s + offset_s,
         interval_s=(applied_offset_s + interval_low_s, applied_offset_s + interval_high_s),
         applied_s=applied_offset_s,
         sigma_s=float(np.hypot(offset_sigma_s * np.sqrt(offset_variance_factor), resolution_s)),
-        is_determinable=is_determinable,
-        reason=""
-        if is_determinable
-        else f"all time offsets from {interval_low_s:+.2f} s to {interval_high_s:+.2f} s fit the "
-        "data almost equally well. Possible causes: the flight has little acceleration, or the "
-        "positions are noisy",
+        is_determinable=not rejection_reason,
+        reason=rejection_reason,
         curve_time_offsets_s=applied_offset_s + curve_time_offsets_s,
         curve_log_likelihood_drops=profile_scores - profile_scores.min(),
-        parts=parts,
+        parts=tuple(
+            structs.replace(part, offset_s=applied_offset_s + part.offset_s) for part in parts
+        ),
         drift_ppm=drift_ppm,
         drift_sigma_ppm=drift_sigma_ppm,
         change_p_value=change_p_value,
+        sigma_a_m_s2=noise_parameters.sigma_a_m_s2,
+        sigma_z_m=noise_parameters.sigma_z_m,
         count=len(imu_motion.time_s),
     )
 
@@ -239,45 +264,32 @@ def _compute_offset_likelihood_curve(
     offset_s: float,
     half_width_s: float,
     max_score_increase: float,
-) -> tuple[Array, Array, Span]:
+) -> tuple[Array, Array, float | None, float | None]:
     """Compute -ln p of the positions as a function of the time offset.
 
     Return tested time offsets (s), -ln p of each, and both ends (s) of an interval around the
-    minimum. An end outside the search range is the end of the tested time offsets.
+    minimum. An end outside the search range is None.
     """
     while True:
         computed_offsets_s, curve_time_offsets_s = (
             _make_offset_grid(offset_s, half_width_s, offset_count)
             for offset_count in (FINE_GRID_OFFSET_COUNT, LIKELIHOOD_CURVE_POINT_COUNT)
         )
-        profile_scores = CubicSpline(
-            computed_offsets_s, _score_offsets(motion, computed_offsets_s, noise_parameters)
-        )(curve_time_offsets_s)
-        interval_s = compute_profile_likelihood_interval(
+        computed_scores = fit_constant_errors(
+            motion.make_position_batches(computed_offsets_s),
+            noise_parameters,
+            motion.measurement_weights,
+        ).compute_scores()[0]
+        profile_scores = CubicSpline(computed_offsets_s, computed_scores)(curve_time_offsets_s)
+        interval_low_s, interval_high_s = compute_profile_likelihood_interval(
             curve_time_offsets_s, profile_scores, max_score_increase
         )
         if (
-            _is_inside(interval_s, curve_time_offsets_s)
+            None not in (interval_low_s, interval_high_s)
             or half_width_s >= 2.0 * MAX_TESTED_TIME_OFFSET_S
         ):
-            return curve_time_offsets_s, profile_scores, interval_s
+            return curve_time_offsets_s, profile_scores, interval_low_s, interval_high_s
         half_width_s *= 2.0
-
-
-def _is_inside(interval_s: Span, grid_s: Array) -> bool:
-    return bool(grid_s[0] < interval_s[0] and interval_s[1] < grid_s[-1])
-
-
-def _score_offsets(
-    motion: PositionsAndImuMotion, offsets_s: Array, noise_parameters: NoiseParameters
-) -> Array:
-    """Return -ln p of the positions for each time offset."""
-    return np.array(
-        [
-            motion.fit_at_offset(offset_s, noise_parameters).compute_score()
-            for offset_s in offsets_s.tolist()
-        ]
-    )
 
 
 def _make_offset_grid(centre_s: float, half_width_s: float, offset_count: int) -> Array:
@@ -299,8 +311,8 @@ def _simulate_variance_increase_by_imu_noise(
     Without IMU noise, the variance is 1 / ``fisher_information``. IMU noise is in the residuals and
     in the velocity, so its effect is not negligible.
     """
-    positions = imu_motion.make_positions_at_offset(offset_s)
-    is_within_segment = positions.is_within_segment
+    positions_at_offset = imu_motion.make_positions_at_offset(offset_s)
+    is_within_segment = positions_at_offset.is_within_segment
     measurement_count = len(imu_motion.time_s)
     axis_count = len(imu_motion.directions)
     interval_count_within_segments = int(np.count_nonzero(is_within_segment))
@@ -311,13 +323,13 @@ def _simulate_variance_increase_by_imu_noise(
     noise_series_count = -(-SIMULATED_GROUP_COUNT // len(first_segment_of_each_group))
 
     def draw_normal(count: int) -> Array:
-        return rng.standard_normal((count, axis_count, noise_series_count)).transpose(2, 1, 0)
+        return rng.standard_normal((count, axis_count, noise_series_count)).transpose(1, 2, 0)
 
     q00, q01, q11 = (
         noise_parameters.sigma_a_m_s2**2
-        * positions.process_noise_per_sigma_a_squared[:, is_within_segment]
+        * positions_at_offset.process_noise_per_sigma_a_squared[:, is_within_segment]
     )
-    dp, dv = np.zeros((2, noise_series_count, axis_count, measurement_count - 1))
+    dp, dv = np.zeros((2, axis_count, noise_series_count, measurement_count - 1))
     dp[..., is_within_segment] = np.sqrt(q00) * draw_normal(interval_count_within_segments)
     dv[..., is_within_segment] = np.sqrt(q11 - q01**2 / q00) * draw_normal(
         interval_count_within_segments
@@ -326,31 +338,29 @@ def _simulate_variance_increase_by_imu_noise(
     error_m = noise_parameters.sigma_z_m * draw_normal(measurement_count)
     # Velocity noise of the IMU: sum of the noise of Δv since the start of the segment
     velocity_noise = np.zeros_like(error_m)
-    for begin, end in positions.segments:
+    for begin, end in positions_at_offset.segments:
         np.cumsum(dv[..., begin : end - 1], axis=-1, out=velocity_noise[..., begin + 1 : end])
     # The random walk changes the positions, but not the velocity from the IMU
     if noise_parameters.random_walk_m:
         dp[..., is_within_segment] += (
             noise_parameters.random_walk_m
-            * np.sqrt(positions.interval_s[is_within_segment])
+            * np.sqrt(positions_at_offset.interval_s[is_within_segment])
             * draw_normal(interval_count_within_segments)
         )
-    inner_products = []
-    for index, error in enumerate(error_m):
-        positions.delta_position_m[:, 0] = dp[index]
-        positions.delta_velocity_m_s[:, 0] = dv[index]
-        scores_of_sum, scores_of_difference = (
-            fit_constant_errors(
-                replace(positions, measurement_m=0.0 * positions.measurement_m + noise.T),
-                noise_parameters,
-                imu_motion.measurement_weights,
-            ).compute_segment_scores()
-            for noise in (error + velocity_noise[index], error - velocity_noise[index])
-        )
-        # The scores are half the square sums of residual ± velocity noise
-        inner_products.append((scores_of_sum - scores_of_difference) / 2.0)
-    group_sums = np.add.reduceat(inner_products, first_segment_of_each_group, axis=1)
-    return 1.0 + float(group_sums.var(axis=0).sum()) / fisher_information
+    positions_at_offset, measurement_variance_m2 = positions_at_offset.divide_sigmas_by_sigma_z(
+        1.0,
+        noise_parameters.random_walk_m,
+        imu_motion.measurement_weights / noise_parameters.sigma_z_m**2,
+    )
+    residual_and_noise_inner_products = compute_segment_inner_products(
+        positions_at_offset,
+        noise_parameters.sigma_a_m_s2,
+        measurement_variance_m2,
+        (error_m, dp, dv),
+        velocity_noise,
+    )
+    group_sums = np.add.reduceat(residual_and_noise_inner_products, first_segment_of_each_group)
+    return 1.0 + float(group_sums.var(axis=1).sum()) / fisher_information
 
 
 def _fit_minimum_and_sigma(grid: Array, scores: Array) -> tuple[float, float]:
@@ -368,7 +378,6 @@ def _fit_minimum_and_sigma(grid: Array, scores: Array) -> tuple[float, float]:
 def _estimate_flight_part_offsets(
     imu_motion: PositionsAndImuMotion,
     offset_s: float,
-    applied_offset_s: float,
     noise_parameters: NoiseParameters,
     offset_variance_factor: float,
 ) -> tuple[tuple[PartOffset, ...], float | None]:
@@ -376,31 +385,32 @@ def _estimate_flight_part_offsets(
 
     Return also the p-value of the test; None with fewer than two offsets.
     """
-    coarse_offsets_s = offset_s + np.array(COARSE_TIME_OFFSETS_S)
+    coarse_offsets_s = offset_s + np.linspace(
+        -MAX_TESTED_TIME_OFFSET_S, MAX_TESTED_TIME_OFFSET_S, COARSE_OFFSET_COUNT
+    )
     coarse_offsets_s = coarse_offsets_s[np.abs(coarse_offsets_s) <= MAX_TESTED_TIME_OFFSET_S]
-    segment_scores_at_coarse_offsets = [
-        imu_motion.fit_at_offset(coarse_offset_s, noise_parameters).compute_segment_scores()
-        for coarse_offset_s in coarse_offsets_s.tolist()
-    ]
+    segment_scores_at_coarse_offsets = fit_constant_errors(
+        imu_motion.make_position_batches(coarse_offsets_s),
+        noise_parameters,
+        imu_motion.measurement_weights,
+    ).compute_segment_scores()[0]
     grid_offsets_s = np.linspace(
         coarse_offsets_s[0], coarse_offsets_s[-1], LIKELIHOOD_CURVE_POINT_COUNT
     )
-    spline = CubicSpline(coarse_offsets_s, segment_scores_at_coarse_offsets)
+    spline = CubicSpline(coarse_offsets_s, segment_scores_at_coarse_offsets, axis=1)
     part_offsets = []
     scores_above_minimum = []
     for begin, end, scores in zip(
         imu_motion.segment_edges,
         imu_motion.segment_edges[1:],
-        spline(grid_offsets_s).T,
+        spline(grid_offsets_s),
         strict=False,
     ):
         part_offset_s, sigma_s = _fit_minimum_and_sigma(grid_offsets_s, scores)
         sigma_s *= float(np.sqrt(offset_variance_factor))
         if sigma_s < MAX_SEGMENT_OFFSET_SIGMA_S:
             start_s, end_s = imu_motion.time_s[[begin, end - 1]].tolist()
-            part_offsets.append(
-                PartOffset(start_s, end_s, applied_offset_s + part_offset_s, sigma_s)
-            )
+            part_offsets.append(PartOffset(start_s, end_s, part_offset_s, sigma_s))
             scores_above_minimum.append(scores - scores.min())
     if len(part_offsets) < 2:
         return tuple(part_offsets), None

@@ -6,34 +6,32 @@ no states for biases and tilt, so its SIGMA_A includes them.
 
 from __future__ import annotations
 
-import math
 from collections.abc import Callable
 from dataclasses import replace
-from functools import cache
 from typing import Any
 
 import numpy as np
-from scipy.optimize import brentq, minimize_scalar
+from scipy.optimize import minimize_scalar
 
 from px4fuse.core.arrays import Array, BoolArray
 from px4fuse.core.record import NOT_WRITTEN, Count, NotNegative, NotWritten, OrUnavailable, Record
 from px4fuse.filter.consistency import Consistency, assess_innovations
 from px4fuse.filter.fitting import (
-    NOISE_SEARCH_RANGES,
     SIGMA_A_SEARCH_RANGE_M_S2,
+    SIGMA_Z_SEARCH_RANGE_M,
     NoiseFit,
+    NoiseParameters,
+    convert_to_positions_and_increments,
     estimate_outlier_probability,
-    make_kf_positions,
     maximise_likelihood,
 )
-from px4fuse.filter.imu_motion import COARSE_MEASUREMENT_COUNT, compute_imu_motion
+from px4fuse.filter.imu_motion import MotionCache, compute_imu_motion
 from px4fuse.filter.likelihood import (
-    MAX_LOG_LIKELIHOOD_DROP,
     PreintegratedMotion,
+    find_profile_likelihood_interval,
     innovations,
     preintegrate,
 )
-from px4fuse.filter.marginal_likelihood import NoiseParameters
 from px4fuse.filter.settings import Settings
 from px4fuse.filter.signals import Axis, make_downsampling_slice, report_too_few_measurements
 from px4fuse.flight.model import Flight, Unavailable
@@ -48,12 +46,6 @@ START_SIGMA_A_FACTORS = (0.1, 0.3, 1.0)
 START_RANDOM_WALK_M = 0.02
 # Estimates within this factor of an end of the search range are reported as bounds only
 SEARCH_RANGE_END_TOLERANCE_FACTOR = 1.001
-# Initial step of ln σ in the search for an end of the 95 % interval
-INITIAL_LOG_SIGMA_SEARCH_STEP = 0.05
-# Maximum change of ln SIGMA_Z between two tested values of SIGMA_A, or vice versa
-MAX_OTHER_LOG_SIGMA_CHANGE = 1.0
-# Tolerance of ln σ in the search for the best SIGMA_Z with given SIGMA_A, or vice versa
-OTHER_LOG_SIGMA_TOLERANCE = 2e-3
 
 
 class NoiseEstimate(Record):
@@ -161,6 +153,7 @@ def tune(
     progress: Callable[[str], None] = lambda _: None,
     flight: Flight | None = None,
     may_drift: bool = False,
+    motion_cache: MotionCache | None = None,
 ) -> dict[str, AxisTuning | Unavailable]:
     """Estimate SIGMA_A and SIGMA_Z of each axis, and of north and east together.
 
@@ -176,6 +169,8 @@ def tune(
         Flight with IMU data, which separate biases and tilt from noise.
     may_drift : bool
         True if the source may drift (odometry).
+    motion_cache : dict, optional
+        IMU motion that is already computed; new motion is added.
     """
     axes_by_name: dict[str, tuple[Axis, ...]] = {axis.name: (axis,) for axis in axes}
     if {"north", "east"} <= axes_by_name.keys():
@@ -185,11 +180,14 @@ def tune(
         ):
             axes_by_name[HORIZONTAL] = horizontal_axes
     tunings = {}
+    motion_cache = {} if motion_cache is None else motion_cache
     for name, group_axes in axes_by_name.items():
         if names is None or name in names:
             progress(name)
             try:
-                tunings[name] = _tune_axes(name, group_axes, settings, flight, may_drift)
+                tunings[name] = tune_axes(
+                    name, group_axes, settings, flight, may_drift, motion_cache
+                )
             except np.linalg.LinAlgError as error:
                 # Positions far from the path cause rounding errors
                 tunings[name] = Unavailable(
@@ -200,69 +198,77 @@ def tune(
     return tunings
 
 
-def _tune_axes(
+def tune_axes(
     name: str,
     axes: tuple[Axis, ...],
     settings: Settings,
-    flight: Flight | None,
-    may_drift: bool,
+    flight: Flight | None = None,
+    may_drift: bool = False,
+    motion_cache: MotionCache | None = None,
 ) -> AxisTuning | Unavailable:
     """Estimate the noises of several axes with equal measurement times.
 
     See :func:`tune` for the parameters.
     """
     analysis_name = f"estimate of SIGMA_A and SIGMA_Z ({name})"
-    motion = preintegrate(axes[0], settings)
-    measurement_time_s = axes[0].measurement_time_s[-len(motion.measurement_m) :]
-    # Noises are estimated from positions at a low rate, whose errors are independent
-    used_axes = [axis.keep_rows(make_downsampling_slice(axis.measurement_time_s)) for axis in axes]
-    axis_positions = [make_kf_positions(axis, settings) for axis in used_axes]
-    used_count = len(axis_positions[0].measurement_m) - 1
-    if used_count < MIN_MEASUREMENTS:
-        return report_too_few_measurements(analysis_name, used_count, MIN_MEASUREMENTS)
+    preintegrated_motions = [preintegrate(axis, settings) for axis in axes]
+    measurement_time_before_downsampling_s = axes[0].measurement_time_s[
+        -len(preintegrated_motions[0].measurement_m) :
+    ]
+    axes = tuple(axis.keep_rows(make_downsampling_slice(axis.measurement_time_s)) for axis in axes)
+    axis_positions = [
+        convert_to_positions_and_increments(preintegrate(axis, settings)) for axis in axes
+    ]
+    measurement_count = len(axis_positions[0].measurement_m) - 1
+    if measurement_count < MIN_MEASUREMENTS:
+        return report_too_few_measurements(analysis_name, measurement_count, MIN_MEASUREMENTS)
     current_parameters = NoiseParameters(settings.sigma_a_m_s2, settings.sigma_z_m)
-    kf_fit = maximise_likelihood(axis_positions, current_parameters, np.ones(used_count))
+    kf_fit = maximise_likelihood(axis_positions, current_parameters, np.ones(measurement_count))
     # The estimate with biases, tilt and time offset needs IMU data
-    flight_with_imu = flight if settings.input == "imu" else None
     imu_motion_fit = None
-    if flight_with_imu is not None:
-        used_time_s = used_axes[0].measurement_time_s
+    if flight is not None and settings.input == "imu":
+        measured_m = np.column_stack([axis.measurement_m for axis in axes])
         # The first measurement is KF's initial state, without a weight in KF's fit: use weight 1
-        measurement_weights = np.ones(len(used_time_s))
-        measurement_weights[-used_count:] = kf_fit.measurement_weights
+        measurement_weights = np.concatenate(
+            [np.ones(len(measured_m) - measurement_count), kf_fit.measurement_weights]
+        )
         imu_motion = compute_imu_motion(
-            flight_with_imu,
-            used_time_s,
-            np.column_stack([axis.measurement_m for axis in used_axes]),
-            directions=np.array([axis.direction for axis in used_axes]),
+            flight,
+            axes[0].measurement_time_s,
+            measured_m,
+            directions=np.array([axis.direction for axis in axes]),
             dt_s=settings.dt_s,
             measurement_weights=measurement_weights,
+            motion_cache=motion_cache,
         )
         if not isinstance(imu_motion, Unavailable):
             start_parameters = replace(
                 kf_fit.noise_parameters, random_walk_m=START_RANDOM_WALK_M if may_drift else 0.0
             )
-            coarse_motion = imu_motion.downsample(COARSE_MEASUREMENT_COUNT)
             # An approximate time offset is sufficient: it hardly changes the noises
-            _, offset_s, start_parameters = coarse_motion.search_grid(
-                [
-                    replace(start_parameters, sigma_a_m_s2=factor * start_parameters.sigma_a_m_s2)
-                    for factor in START_SIGMA_A_FACTORS
-                ],
-                estimates_scale=False,
+            offset_s, start_parameters = imu_motion.search_offset(
+                start_parameters, START_SIGMA_A_FACTORS, estimates_scale=False
             )
             imu_motion_fit = maximise_likelihood(
                 [imu_motion.make_positions_at_offset(offset_s)],
                 start_parameters,
                 imu_motion.measurement_weights,
             )
-    best_fit = imu_motion_fit or kf_fit
-    outlier_probability = kf_fit.outlier_probability
-    if len(measurement_time_s) > used_count:
-        outlier_probability = estimate_outlier_probability(
-            [make_kf_positions(axis, settings) for axis in axes], kf_fit, len(measurement_time_s)
+    best_fit = kf_fit if imu_motion_fit is None else imu_motion_fit
+    is_outlier = kf_fit.outlier_probability > 0.5
+    if len(measurement_time_before_downsampling_s) > measurement_count:
+        axis_positions_before_downsampling = [
+            convert_to_positions_and_increments(preintegrated_motion)
+            for preintegrated_motion in preintegrated_motions
+        ]
+        is_outlier = (
+            estimate_outlier_probability(
+                axis_positions_before_downsampling,
+                kf_fit,
+                len(measurement_time_before_downsampling_s),
+            )
+            > 0.5
         )
-    is_outlier = outlier_probability > 0.5
     if np.mean(is_outlier) > MAX_OUTLIER_FRACTION:
         return Unavailable(
             analysis_name,
@@ -270,12 +276,12 @@ def _tune_axes(
             "estimate SIGMA_Z",
             "Reduce the outliers of the positioning system.",
         )
-    sigma_a, sigma_z = (estimate_noise(best_fit, name) for name in ("sigma_a_m_s2", "sigma_z_m"))
+    sigma_a, sigma_z = (_estimate_noise(best_fit, noise_index) for noise_index in (0, 1))
     final_sigma_z_m = sigma_z.value or sigma_z.high or best_fit.noise_parameters.sigma_z_m
     kf_sigma_a = (
         sigma_a if imu_motion_fit is None else _estimate_kf_sigma_a(kf_fit, final_sigma_z_m)
     )
-    if imu_motion_fit is None and flight_with_imu is not None:
+    if imu_motion_fit is None and flight is not None and settings.input == "imu":
         # Without estimates of biases and tilt, KF's SIGMA_A is an upper bound of the noise
         sigma_a = NoiseEstimate(None, None, kf_sigma_a.high)
     final_parameters = NoiseParameters(
@@ -287,11 +293,11 @@ def _tune_axes(
         **sigma_a.as_fields("sigma_a_m_s2"),
         **sigma_z.as_fields("sigma_z_m"),
         **kf_sigma_a.as_fields("sigma_a_two_state_m_s2"),
-        log_likelihood_gain_per_measurement=log_likelihood_gain_nats / used_count,
-        before=_assess_kf_consistency(motion, current_parameters, is_outlier),
-        after=_assess_kf_consistency(motion, final_parameters, is_outlier),
-        outlier_time_s=measurement_time_s[is_outlier],
-        count=len(measurement_time_s),
+        log_likelihood_gain_per_measurement=log_likelihood_gain_nats / measurement_count,
+        before=_assess_kf_consistency(preintegrated_motions[0], current_parameters, is_outlier),
+        after=_assess_kf_consistency(preintegrated_motions[0], final_parameters, is_outlier),
+        outlier_time_s=measurement_time_before_downsampling_s[is_outlier],
+        count=len(measurement_time_before_downsampling_s),
         outliers=int(np.count_nonzero(is_outlier)),
         held_out=_test_noises_on_second_half(name, current_parameters, kf_fit),
         noises=best_fit.noise_parameters,
@@ -299,108 +305,57 @@ def _tune_axes(
     )
 
 
-def estimate_noise(fit: NoiseFit, name: str) -> NoiseEstimate:
-    """Return SIGMA_A or SIGMA_Z of a fit, with its 95 % profile-likelihood interval.
+def _estimate_noise(fit: NoiseFit, noise_index: int) -> NoiseEstimate:
+    """Return SIGMA_A (``noise_index`` 0) or SIGMA_Z (1) of a fit with its 95 % interval."""
+    best_parameters = fit.noise_parameters.sigma_a_m_s2, fit.noise_parameters.sigma_z_m
 
-    ``name`` is "sigma_a_m_s2" or "sigma_z_m".
-    """
-    other_name = "sigma_z_m" if name == "sigma_a_m_s2" else "sigma_a_m_s2"
-    variance_factor = fit.log_sigma_z_variance_factor if name == "sigma_z_m" else 1.0
-    best_value = getattr(fit.noise_parameters, name)
-
-    def find_end(search_limit: float) -> float | None:
-        other_log_sigma = math.log(getattr(fit.noise_parameters, other_name))
-
-        def score_with_best_other_noise(log_sigma: float) -> float:
-            nonlocal other_log_sigma
-            best_other_noise = minimize_scalar(
-                lambda tested_log_sigma: fit.score(
-                    replace(
-                        fit.noise_parameters,
-                        **{name: math.exp(log_sigma), other_name: math.exp(tested_log_sigma)},
-                    )
-                ),
-                bounds=(
-                    other_log_sigma - MAX_OTHER_LOG_SIGMA_CHANGE,
-                    other_log_sigma + MAX_OTHER_LOG_SIGMA_CHANGE,
-                ),
-                options={"xatol": OTHER_LOG_SIGMA_TOLERANCE},
-            )
-            other_log_sigma = best_other_noise.x
-            return float(best_other_noise.fun)
-
-        return find_interval_end(
-            score_with_best_other_noise,
-            (math.log(best_value), fit.lowest_score),
-            math.log(search_limit),
-            variance_factor,
+    def score(log_sigma: float, log_other_sigma: float) -> float:
+        log_parameters = (
+            (log_sigma, log_other_sigma) if noise_index == 0 else (log_other_sigma, log_sigma)
         )
+        sigma_a, sigma_z = np.exp(log_parameters).tolist()
+        return fit.score(NoiseParameters(sigma_a, sigma_z, fit.noise_parameters.random_walk_m))
 
-    low, high = map(find_end, NOISE_SEARCH_RANGES[name])
-    return _make_noise_estimate(best_value, low, high, NOISE_SEARCH_RANGES[name])
+    search_range = (SIGMA_A_SEARCH_RANGE_M_S2, SIGMA_Z_SEARCH_RANGE_M)[noise_index]
+    variance_factor = (1.0, fit.log_sigma_z_variance_factor)[noise_index]
+    return _make_noise_estimate(
+        score,
+        (np.log(best_parameters[noise_index]), np.log(best_parameters[1 - noise_index])),
+        search_range,
+        variance_factor,
+    )
 
 
 def _estimate_kf_sigma_a(fit: NoiseFit, sigma_z_m: float) -> NoiseEstimate:
-    def score(log_sigma_a: float) -> float:
-        return fit.score(NoiseParameters(math.exp(log_sigma_a), sigma_z_m))
+    def score(log_sigma_a: float, _: float = 0.0) -> float:
+        return fit.score(NoiseParameters(float(np.exp(log_sigma_a)), sigma_z_m))
 
-    log_limits = np.log(SIGMA_A_SEARCH_RANGE_M_S2).tolist()
-    best = minimize_scalar(score, bounds=log_limits, options={"xatol": 1e-3})
-    low, high = (find_interval_end(score, (best.x, best.fun), limit) for limit in log_limits)
-    return _make_noise_estimate(math.exp(best.x), low, high, SIGMA_A_SEARCH_RANGE_M_S2)
+    low_log_sigma, high_log_sigma = np.log(SIGMA_A_SEARCH_RANGE_M_S2)
+    best_log_sigma_a = float(
+        minimize_scalar(score, bounds=(low_log_sigma, high_log_sigma), options={"xatol": 1e-3}).x
+    )
+    return _make_noise_estimate(score, (best_log_sigma_a, 0.0), SIGMA_A_SEARCH_RANGE_M_S2)
 
 
 def _make_noise_estimate(
-    estimate: float, low: float | None, high: float | None, search_range: tuple[float, float]
+    score: Callable[[float, float], float],
+    best_log_sigmas: tuple[float, float],
+    search_range: tuple[float, float],
+    variance_factor: float = 1.0,
 ) -> NoiseEstimate:
+    estimate = float(np.exp(best_log_sigmas[0]))
+    interval_low, interval_high = find_profile_likelihood_interval(
+        score, best_log_sigmas, search_range, variance_factor
+    )
     is_inside = (
         search_range[0] * SEARCH_RANGE_END_TOLERANCE_FACTOR
         < estimate
         < search_range[1] / SEARCH_RANGE_END_TOLERANCE_FACTOR
     )
-    has_both_ends = low is not None and high is not None
-    return NoiseEstimate(estimate if is_inside and has_both_ends else None, low, high)
-
-
-def find_interval_end(
-    score: Callable[[float], float],
-    minimum: tuple[float, float],
-    search_limit: float,
-    variance_factor: float = 1.0,
-) -> float | None:
-    """Find one end of the 95 % likelihood interval of a noise; None if beyond the search limit.
-
-    Parameters
-    ----------
-    score : callable
-        -ln p as a function of the logarithm of the noise.
-    minimum : (float, float)
-        Logarithm of the noise with the lowest score, and this score.
-    search_limit : float
-        Limit of the logarithm of the noise, in the direction of the end.
-    variance_factor : float
-        Factor on the variance, for uncertainty that ``score`` omits.
-    """
-    best_log_sigma, best_score = minimum
-    max_sqrt_log_likelihood_drop = math.sqrt(MAX_LOG_LIKELIHOOD_DROP * variance_factor)
-
-    # √(decrease of the log-likelihood) is nearly linear in ln σ, so brentq needs few steps
-    @cache
-    def compute_log_likelihood_drop_excess(log_sigma_change: float) -> float:
-        drop = score(best_log_sigma + log_sigma_change) - best_score if log_sigma_change else 0.0
-        return math.sqrt(max(drop, 0.0)) - max_sqrt_log_likelihood_drop
-
-    max_change = search_limit - best_log_sigma
-    step = math.copysign(INITIAL_LOG_SIGMA_SEARCH_STEP, max_change)
-    tested_change = min(step, max_change, key=abs)
-    while compute_log_likelihood_drop_excess(tested_change) < 0.0:
-        if tested_change == max_change:
-            return None
-        tested_change = min(2.0 * tested_change, max_change, key=abs)
-    log_sigma_change = brentq(
-        compute_log_likelihood_drop_excess, 0.0, tested_change, xtol=1e-3 * abs(tested_change)
+    has_both_ends = interval_low is not None and interval_high is not None
+    return NoiseEstimate(
+        estimate if is_inside and has_both_ends else None, interval_low, interval_high
     )
-    return math.exp(best_log_sigma + log_sigma_change)
 
 
 def _assess_kf_consistency(
@@ -427,7 +382,7 @@ def _test_noises_on_second_half(
         )
     # One more position than measurements, because the first position is KF's initial state
     first_half_positions = [
-        positions.first(1 + first_half_count) for positions in fit.axis_positions
+        positions.first(1 + first_half_count) for positions in fit.score.axis_positions
     ]
     first_half_fit = maximise_likelihood(
         first_half_positions,
