@@ -12,7 +12,6 @@ import numpy as np
 import pytest
 from comparisons import compare
 from exchange import replace
-from findings_tools import made as part_of
 from flights import aisle_flight, unavailable, unexplained
 
 from px4fuse.analysis import Analysis
@@ -103,10 +102,14 @@ def test_innovations_after_position_step_equal_kf_replay() -> None:
     np.testing.assert_allclose([nu[:, 0], s], expected, atol=1e-9)
 
 
-def test_bias_regression_residuals_equal_kf_innovations() -> None:
+def design_matrix() -> DesignMatrix:
     analysis = flown()
     axes = tuple(analysis.axes[name].axis for name in ("north", "east"))
-    model = make_design_matrix(analysis.flight, axes, RIGHT, 0.10, 0.0)
+    return make_design_matrix(analysis.flight, axes, RIGHT, 0.27, 0.10, 0.0)
+
+
+def test_bias_regression_residuals_equal_kf_innovations() -> None:
+    model = design_matrix()
     gap = np.zeros_like(model.preintegrated_inputs.process_noise_independent_of_sigma_a)
     gap[200] = 0.5, 0.5, 1.0
     with_gap = replace(
@@ -117,35 +120,32 @@ def test_bias_regression_residuals_equal_kf_innovations() -> None:
     )
     skip = np.zeros(len(model.time_s), dtype=bool)
     for each in (model, with_gap):
-        fits, (data, columns, _) = (
-            each.fit(0.27, skip),
-            each.compute_innovations_and_design_matrix(0.27, skip),
-        )
+        fits, (data, columns, _) = each.fit(skip), each.compute_innovations_and_design_matrix(skip)
         arrays = "measurement_m", "delta_position_m", "delta_velocity_m_s"
+        residual = (data - columns @ fits.coefficients).reshape(2, -1)
+        np.testing.assert_allclose(fits.residual, residual, atol=1e-9)
         for at, column in enumerate((0, 4)):
             own = {name: getattr(each.preintegrated_inputs, name)[:, column] for name in arrays}
             nu, s = innovations(replace(each.preintegrated_inputs, **own), 0.27, 0.10)
-            np.testing.assert_allclose(data[at], nu / np.sqrt(s), atol=1e-9)
-            residual = data[at] - columns[at] @ fits.coefficients
-            np.testing.assert_allclose(fits.residual[fits.axis == at], residual, atol=1e-9)
+            np.testing.assert_allclose(data.reshape(2, -1)[at], nu / np.sqrt(s), atol=1e-9)
 
 
 def test_bias_regression_equals_lstsq_with_prior_as_data_row() -> None:
-    rng = np.random.default_rng(1)
-    columns, data = rng.normal(size=(2, 25, 2)), rng.normal(size=(2, 25))
-    skip = np.arange(25) % 5 == 0
-    model = part_of(DesignMatrix, prior_sigma=np.array([np.inf, 0.5]))
-    made = model.fit_columns_to_innovations(data, columns, 0.0, skip)
-    columns, data = columns[:, ~skip].reshape(40, 2), data[:, ~skip].ravel()
-    assert made.axis.tolist() == [0] * 20 + [1] * 20
-    rows = np.vstack([columns, [0.0, 1.0 / 0.5]])
-    expected, *_ = np.linalg.lstsq(rows, np.append(data, 0.0), rcond=None)
-    np.testing.assert_allclose(made.coefficients, expected, rtol=1e-9)
-    np.testing.assert_allclose(made.residual, data - columns @ expected)
-    np.testing.assert_allclose(made.covariance, np.linalg.inv(rows.T @ rows), rtol=1e-9)
-    assert made.residual_and_prior_square_sum == pytest.approx(
-        np.sum((np.append(data, 0.0) - rows @ expected) ** 2)
-    )
+    model = design_matrix()
+    skip = np.arange(len(model.time_s)) % 5 == 0
+    made = model.fit(skip)
+    data, columns, _ = model.compute_innovations_and_design_matrix(skip)
+    used = np.tile(~skip, 2)
+    rows = np.vstack([columns[used], np.diag(1.0 / model.prior_sigma)])
+    values = np.append(data[used], np.zeros(len(model.prior_sigma)))
+    expected, *_ = np.linalg.lstsq(rows, values, rcond=None)
+    np.testing.assert_allclose(made.coefficients, expected, rtol=1e-6, atol=1e-9)
+    np.testing.assert_allclose(made.residual.ravel(), data - columns @ expected, atol=1e-6)
+    np.testing.assert_allclose(made.covariance, np.linalg.inv(rows.T @ rows), rtol=1e-5, atol=1e-9)
+    square_sum = np.sum((values - rows @ expected) ** 2)
+    assert made.residual_and_prior_square_sum == pytest.approx(square_sum)
+    mean_squares = np.mean(made.residual[:, ~skip] ** 2, axis=1)
+    np.testing.assert_allclose(made.residual_rms_by_axis, np.sqrt(np.maximum(mean_squares, 1.0)))
     # σ is widened if the residual exceeds the assumed noise
     sigma = np.sqrt(made.covariance[0, 0])
     for spread, widened in ((3.0, 3.0), (0.5, 1.0)):

@@ -10,9 +10,8 @@ is therefore repeated with several scale factors (Deming 1943).
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, replace
-from functools import cache
 
 import numpy as np
 import pandas as pd
@@ -21,7 +20,7 @@ from scipy.linalg import cho_factor, cho_solve
 from scipy.spatial.transform import Rotation
 from scipy.special import chdtri
 
-from px4fuse.core.arrays import Array, ArrayPair, BoolArray, IntArray, integrate_cumulatively
+from px4fuse.core.arrays import Array, ArrayPair, BoolArray, integrate_cumulatively
 from px4fuse.filter.likelihood import (
     PreintegratedMotion,
     fit_parabola_vertex,
@@ -31,7 +30,7 @@ from px4fuse.filter.likelihood import (
 )
 from px4fuse.filter.settings import Settings
 from px4fuse.filter.signals import Acceleration, Axis, report_too_few_measurements
-from px4fuse.filter.steps import PredictionSteps, make_prediction_steps
+from px4fuse.filter.steps import make_prediction_steps
 from px4fuse.flight.model import Columns, Flight, Unavailable
 
 ANALYSIS_NAME = "biases, scale factor error and jumps"
@@ -44,6 +43,8 @@ MAX_SLOW_ERROR_KNOTS = 40
 # Columns of the design matrix: forward and right bias (body frame), yaw of the source frame
 FORWARD_BIAS_COLUMN, RIGHT_BIAS_COLUMN, FRAME_ROTATION_COLUMN = range(3)
 CONSTANT_ERROR_COLUMN_COUNT = 3
+# Inputs of KF for each axis: the data, and one for each constant error
+INPUTS_PER_AXIS = 1 + CONSTANT_ERROR_COLUMN_COUNT
 # Tested multiples of KF's SIGMA_A, mostly below 1: KF's SIGMA_A includes biases and tilt
 TESTED_SIGMA_A_FACTORS = np.geomspace(0.2, 2.0, 7)
 # Tested scale factors of the position source
@@ -171,23 +172,22 @@ def fit_systematic_errors(
     source_resets_s : sequence of float
         Timestamps of resets that the position source reports.
     """
-    design_matrix = make_design_matrix(flight, axes, settings, sigma_z_m, clock_offset_s)
+    design_matrix = make_design_matrix(
+        flight, axes, settings, sigma_a_m_s2, sigma_z_m, clock_offset_s
+    )
     if isinstance(design_matrix, Unavailable):
         return design_matrix
-    is_skipped = np.isin(axes[0].measurement_time_s[-len(design_matrix.time_s) :], outlier_time_s)
+    is_skipped = np.isin(design_matrix.time_s, outlier_time_s)
     if (used_count := int(np.count_nonzero(~is_skipped))) < MIN_MEASUREMENTS:
         return report_too_few_measurements(ANALYSIS_NAME, used_count, MIN_MEASUREMENTS)
-    sigma_a_grid = sigma_a_m_s2 * TESTED_SIGMA_A_FACTORS
-    sigma_a, regression = _fit_sigma_a(design_matrix, sigma_a_grid, is_skipped)
+    tested_sigmas_a = (sigma_a_m_s2 * TESTED_SIGMA_A_FACTORS).tolist()
+    design_matrix, regression = _fit_sigma_a(design_matrix, tested_sigmas_a, is_skipped)
     jumps, is_skipped = _find_jumps(
-        design_matrix, sigma_a, is_skipped, [time_s + clock_offset_s for time_s in source_resets_s]
+        design_matrix, is_skipped, [time_s + clock_offset_s for time_s in source_resets_s]
     )
     if jumps:
-        design_matrix = replace(
-            design_matrix,
-            jump_columns=make_unit_steps(design_matrix.time_s, [jump.time_s for jump in jumps]),
-        )
-        sigma_a, regression = _fit_sigma_a(design_matrix, sigma_a_grid, is_skipped)
+        design_matrix = replace(design_matrix, jump_times_s=[jump.time_s for jump in jumps])
+        design_matrix, regression = _fit_sigma_a(design_matrix, tested_sigmas_a, is_skipped)
     forward_bias_m_s2, right_bias_m_s2, frame_rotation_rad = map(
         regression.estimate, (FORWARD_BIAS_COLUMN, RIGHT_BIAS_COLUMN, FRAME_ROTATION_COLUMN)
     )
@@ -195,118 +195,91 @@ def fit_systematic_errors(
         forward_bias_m_s2,
         right_bias_m_s2,
         frame_rotation_rad,
-        _fit_scale(design_matrix, sigma_a, is_skipped),
+        _fit_scale(design_matrix, is_skipped),
         jumps,
-        sigma_a,
+        design_matrix.sigma_a_m_s2,
     )
 
 
 def _fit_sigma_a(
-    design_matrix: DesignMatrix, sigma_a_grid: Array, is_skipped: BoolArray
-) -> tuple[float, InnovationRegression]:
-    """Return the maximum-likelihood SIGMA_A on a grid, and the least squares fit with it."""
-    fit_with_sigma_a = cache(
-        lambda index: design_matrix.fit(float(sigma_a_grid[index]), is_skipped)
-    )
-    best_index = _index_of_minimum(lambda index: fit_with_sigma_a(index).score, len(sigma_a_grid))
-    return float(sigma_a_grid[best_index]), fit_with_sigma_a(best_index)
+    design_matrix: DesignMatrix, tested_sigmas_a: list[float], is_skipped: BoolArray
+) -> tuple[DesignMatrix, InnovationRegression]:
+    """Return the design matrix with the most likely SIGMA_A, and its least squares fit."""
+    candidates = [replace(design_matrix, sigma_a_m_s2=sigma_a) for sigma_a in tested_sigmas_a]
+    fits = [(candidate, candidate.fit(is_skipped)) for candidate in candidates]
+    return min(fits, key=lambda matrix_and_fit: matrix_and_fit[1].score)
 
 
-def _index_of_minimum(score: Callable[[int], float], count: int) -> int:
-    """Return the index of the only minimum of ``score(0)`` to ``score(count - 1)``."""
-    index = count // 2
-    direction = 1 if index + 1 < count and score(index + 1) < score(index) else -1
-    while 0 <= index + direction < count and score(index + direction) < score(index):
-        index += direction
-    return index
-
-
-def _fit_scale(design_matrix: DesignMatrix, sigma_a: float, is_skipped: BoolArray) -> Estimate:
+def _fit_scale(design_matrix: DesignMatrix, is_skipped: BoolArray) -> Estimate:
     """Estimate the scale factor error of the positions from fits with several scale factors."""
-    fit_with_scale = cache(
-        lambda scale_index: design_matrix.fit(
-            sigma_a, is_skipped, float(TESTED_SCALE_FACTORS[scale_index])
-        )
-    )
+    fits = [design_matrix.fit(is_skipped, scale) for scale in TESTED_SCALE_FACTORS.tolist()]
     # ln S is omitted from the score, because it would bias the scale factor to zero
-    best_scale_index = _index_of_minimum(
-        lambda scale_index: fit_with_scale(scale_index).residual_and_prior_square_sum,
-        len(TESTED_SCALE_FACTORS),
-    )
-    centre_index = int(np.clip(best_scale_index, 1, len(TESTED_SCALE_FACTORS) - 2))
-    scores_around_minimum = [
-        fit_with_scale(centre_index + grid_shift).residual_and_prior_square_sum / 2.0
-        for grid_shift in (-1, 0, 1)
-    ]
-    vertex_shift, curvature = fit_parabola_vertex(np.array(scores_around_minimum), 1)
-    grid_step = float(TESTED_SCALE_FACTORS[1] - TESTED_SCALE_FACTORS[0])
+    scores = np.array([fit.residual_and_prior_square_sum / 2.0 for fit in fits])
+    centre_index = int(np.clip(np.argmin(scores), 1, len(fits) - 2))
+    vertex_shift, curvature = fit_parabola_vertex(scores, centre_index)
     if curvature <= 0.0:
-        return Estimate(0.0, float("inf"))
+        return Estimate(0.0, math.inf)
+    grid_step = float(TESTED_SCALE_FACTORS[1] - TESTED_SCALE_FACTORS[0])
     best_scale = (
         TESTED_SCALE_FACTORS[centre_index] + float(np.clip(vertex_shift, -1.5, 1.5)) * grid_step
     )
-    scale_sigma = (
-        grid_step / np.sqrt(curvature) * max(fit_with_scale(centre_index).residual_rms, 1.0)
+    centre_fit = fits[centre_index]
+    length_factor_of_linear_rotation = math.hypot(
+        1.0, centre_fit.coefficients[FRAME_ROTATION_COLUMN]
     )
-    length_factor_of_linear_rotation = np.hypot(
-        1.0, fit_with_scale(centre_index).coefficients[FRAME_ROTATION_COLUMN]
+    return Estimate(
+        float(best_scale * length_factor_of_linear_rotation - 1.0),
+        grid_step / math.sqrt(curvature) * max(centre_fit.residual_rms, 1.0),
     )
-    return Estimate(float(best_scale * length_factor_of_linear_rotation - 1.0), float(scale_sigma))
 
 
 def _find_jumps(
-    design_matrix: DesignMatrix,
-    sigma_a: float,
-    is_skipped: BoolArray,
-    source_resets_s: Sequence[float],
+    design_matrix: DesignMatrix, is_skipped: BoolArray, source_resets_s: Sequence[float]
 ) -> tuple[tuple[Jump, ...], BoolArray]:
     """Detect lasting jumps of the positions; return them in time order, and a mask of outliers.
 
     Tested times: resets of the source, first outliers of a burst, and the most likely time.
     """
     jumps: list[Jump] = []
+    time_s = design_matrix.time_s
+    measurement_times_s = time_s[
+        MIN_MEASUREMENTS_BEFORE_AND_AFTER_JUMP:-MIN_MEASUREMENTS_BEFORE_AND_AFTER_JUMP
+    ]
+    measurement_times_s = measurement_times_s[
+        :: max(1, -(-len(measurement_times_s) // MAX_TESTED_JUMP_TIMES))
+    ]
 
     def mask_outliers_near_jump(jump_time_s: float) -> BoolArray:
         # After a reset that the source reports, its positions are valid
         if jump_time_s in source_resets_s:
             return is_skipped & ~_is_in_window(
-                design_matrix.time_s, jump_time_s, OUTLIER_RETEST_DURATION_AFTER_JUMP_S
+                time_s, jump_time_s, OUTLIER_RETEST_DURATION_AFTER_JUMP_S
             )
-        return is_skipped | _is_in_window(
-            design_matrix.time_s, jump_time_s, OUTLIER_BURST_DURATION_S
-        )
+        return is_skipped | _is_in_window(time_s, jump_time_s, OUTLIER_BURST_DURATION_S)
 
     for _ in range(MAX_JUMPS):
-        design_matrix = replace(
-            design_matrix,
-            jump_columns=make_unit_steps(design_matrix.time_s, [jump.time_s for jump in jumps]),
-        )
-        outlier_run_starts_s = design_matrix.time_s[
+        design_matrix = replace(design_matrix, jump_times_s=[jump.time_s for jump in jumps])
+        outlier_run_starts_s = time_s[
             np.flatnonzero(is_skipped & ~np.append(False, is_skipped[:-1]))
         ]
-        jump_times = [
+        candidate_times_s = [
             *source_resets_s,
-            *_find_significant_jump_times(design_matrix, sigma_a, is_skipped, outlier_run_starts_s),
-            *_find_significant_jump_times(design_matrix, sigma_a, is_skipped)[:1],
+            *_find_significant_jump_times(design_matrix, is_skipped, outlier_run_starts_s),
+            *_find_significant_jump_times(design_matrix, is_skipped, measurement_times_s)[:1],
         ]
         max_false_alarm_p = MAX_JUMP_FALSE_ALARM_P / max(len(outlier_run_starts_s), 1)
-        significant_jumps = [
-            jump
-            for time_s in jump_times
-            if (
-                jump := _test_jump(
-                    design_matrix,
-                    sigma_a,
-                    mask_outliers_near_jump(time_s),
-                    time_s,
-                    max_false_alarm_p,
-                )
+        tested_jumps = [
+            _test_jump(
+                design_matrix, mask_outliers_near_jump(jump_time_s), jump_time_s, max_false_alarm_p
             )
+            for jump_time_s in candidate_times_s
         ]
+        significant_jumps = [jump for jump in tested_jumps if jump]
         if not significant_jumps:
             break
-        best_jump = max(significant_jumps, key=lambda jump: jump.chi_square)
-        best_jump, is_skipped = _locate_jump(design_matrix, sigma_a, is_skipped, best_jump)
+        best_jump, is_skipped = _locate_jump(
+            design_matrix, is_skipped, max(significant_jumps, key=lambda jump: jump.chi_square)
+        )
         jumps.append(best_jump)
         source_resets_s = [
             reset_time_s
@@ -321,25 +294,10 @@ def _is_in_window(time_s: Array, start_s: float, duration_s: float) -> BoolArray
 
 
 def _find_significant_jump_times(
-    design_matrix: DesignMatrix,
-    sigma_a: float,
-    is_skipped: BoolArray,
-    candidate_times_s: Array | None = None,
+    design_matrix: DesignMatrix, is_skipped: BoolArray, candidate_times_s: Array
 ) -> list[float]:
-    """Return the times of significant jumps, largest χ² first.
-
-    By default, all measurement times are tested.
-    """
-    if candidate_times_s is None:
-        candidate_times_s = design_matrix.time_s[
-            MIN_MEASUREMENTS_BEFORE_AND_AFTER_JUMP:-MIN_MEASUREMENTS_BEFORE_AND_AFTER_JUMP
-        ]
-        candidate_times_s = candidate_times_s[
-            :: max(1, -(-len(candidate_times_s) // MAX_TESTED_JUMP_TIMES))
-        ]
-    if not len(candidate_times_s):
-        return []
-    chi_square = _compute_jump_chi_squares(design_matrix, sigma_a, is_skipped, candidate_times_s)
+    """Return the times of significant jumps, largest χ² first."""
+    chi_square = _compute_jump_chi_squares(design_matrix, is_skipped, candidate_times_s)
     min_chi_square = chdtri(
         design_matrix.axis_count, MAX_JUMP_FALSE_ALARM_P / len(design_matrix.time_s)
     )
@@ -351,121 +309,96 @@ def _find_significant_jump_times(
 
 
 def _compute_jump_chi_squares(
-    design_matrix: DesignMatrix, sigma_a: float, is_skipped: BoolArray, candidate_times_s: Array
+    design_matrix: DesignMatrix, is_skipped: BoolArray, candidate_times_s: Array
 ) -> Array:
     """Return χ² of a jump at each time: the decrease of the sum of squared residuals."""
-    normalised_innovations, columns, sum_of_log_variances = (
-        design_matrix.compute_innovations_and_design_matrix(sigma_a, is_skipped)
-    )
-    fit_without_jump = design_matrix.fit_columns_to_innovations(
-        normalised_innovations, columns, sum_of_log_variances, is_skipped
-    )
-    columns = columns[:, ~is_skipped]
+    fit_without_jump = design_matrix.fit(is_skipped)
+    columns_by_axis = np.split(fit_without_jump.columns, design_matrix.axis_count)
     chi_squares = np.zeros(len(candidate_times_s))
-    for batch in np.array_split(
-        np.arange(len(candidate_times_s)), -(-len(candidate_times_s) // JUMP_BATCH_SIZE)
-    ):
-        jump_step_functions = make_unit_steps(design_matrix.time_s, candidate_times_s[batch])
-        zero_increments = np.broadcast_to(0.0, jump_step_functions.shape)
-        normalised_jump_response = design_matrix.compute_normalised_innovations(
-            zero_increments, zero_increments, jump_step_functions, sigma_a, is_skipped
+    for first in range(0, len(candidate_times_s), JUMP_BATCH_SIZE):
+        batch = slice(first, first + JUMP_BATCH_SIZE)
+        jump_steps = make_unit_steps(design_matrix.time_s, candidate_times_s[batch])
+        zero_increments = np.zeros_like(jump_steps)
+        jump_response = design_matrix.compute_normalised_innovations(
+            zero_increments, zero_increments, jump_steps, is_skipped
         )[0][~is_skipped]
-        for axis_index in range(design_matrix.axis_count):
-            axis_residual = fit_without_jump.residual[fit_without_jump.axis == axis_index]
-            jump_response_along_columns = columns[axis_index].T @ normalised_jump_response
-            jump_size_information = np.sum(normalised_jump_response**2, axis=0) - np.sum(
-                jump_response_along_columns
-                * (fit_without_jump.covariance @ jump_response_along_columns),
+        for columns, residual, residual_rms in zip(
+            columns_by_axis,
+            fit_without_jump.residual,
+            fit_without_jump.residual_rms_by_axis,
+            strict=True,
+        ):
+            response_along_columns = columns[~is_skipped].T @ jump_response
+            jump_size_information = np.sum(jump_response**2, axis=0) - np.sum(
+                response_along_columns * (fit_without_jump.covariance @ response_along_columns),
                 axis=0,
             )
             chi_squares[batch] += (
-                axis_residual
-                @ normalised_jump_response
-                / fit_without_jump.compute_residual_rms_by_axis()[axis_index]
+                residual[~is_skipped] @ jump_response / residual_rms
             ) ** 2 / np.maximum(jump_size_information, 1e-9)
     return chi_squares
 
 
 def _locate_jump(
-    design_matrix: DesignMatrix, sigma_a: float, is_skipped: BoolArray, jump: Jump
+    design_matrix: DesignMatrix, is_skipped: BoolArray, jump: Jump
 ) -> tuple[Jump, BoolArray]:
     """Return a detected jump with its exact time and size (m), and a mask of outliers."""
-    is_near_jump = np.abs(design_matrix.time_s - jump.time_s) <= OUTLIER_BURST_DURATION_S
-    # Measurements near the jump may be outliers, so the first fit omits them
-    residual_squares = design_matrix.add_jump(jump.time_s)[0].compute_residual_squares(
-        sigma_a, is_skipped | is_near_jump
-    )
-    is_near_or_just_after_jump = is_near_jump | _is_in_window(
-        design_matrix.time_s, jump.time_s, OUTLIER_RETEST_DURATION_AFTER_JUMP_S
+    time_s = design_matrix.time_s
+    is_near_jump = np.abs(time_s - jump.time_s) <= OUTLIER_BURST_DURATION_S
+    is_after_jump = ~is_near_jump & _is_in_window(
+        time_s, jump.time_s, OUTLIER_RETEST_DURATION_AFTER_JUMP_S
     )
     max_residual_square = chdtri(design_matrix.axis_count, MAX_FALSE_OUTLIER_P)
-    is_skipped = np.where(
-        is_near_or_just_after_jump & ~is_near_jump,
-        residual_squares > max_residual_square,
-        is_skipped,
-    )
-    candidate_times_s = design_matrix.time_s[is_near_jump]
+
+    def test_for_outliers(jump_time_s: float) -> BoolArray:
+        # Measurements near the jump may be outliers, so the fit omits them
+        fit, _ = design_matrix.fit_with_jump(jump_time_s, is_skipped | is_near_jump)
+        return fit.compute_residual_squares() > max_residual_square
+
+    is_skipped = np.where(is_after_jump, test_for_outliers(jump.time_s), is_skipped)
+    candidate_times_s = time_s[is_near_jump]
     best_indices = np.argsort(
-        -_compute_jump_chi_squares(
-            design_matrix, sigma_a, is_skipped & ~is_near_jump, candidate_times_s
-        )
+        -_compute_jump_chi_squares(design_matrix, is_skipped & ~is_near_jump, candidate_times_s)
     )[:MAX_CANDIDATE_JUMP_TIMES]
-    outlier_mask_by_jump_time = {}
-    for jump_time_s in candidate_times_s[best_indices].tolist():
-        residual_squares = design_matrix.add_jump(jump_time_s)[0].compute_residual_squares(
-            sigma_a, is_skipped | is_near_jump
-        )
-        outlier_mask_by_jump_time[jump_time_s] = np.where(
-            is_near_jump, residual_squares > max_residual_square, is_skipped
-        )
+    outlier_mask_by_jump_time = {
+        jump_time_s: np.where(is_near_jump, test_for_outliers(jump_time_s), is_skipped)
+        for jump_time_s in candidate_times_s[best_indices].tolist()
+    }
     # With a wrong jump time, good measurements look like outliers
     best_jump_time_s = min(
         outlier_mask_by_jump_time,
         key=lambda jump_time_s: np.count_nonzero(outlier_mask_by_jump_time[jump_time_s]),
     )
     is_skipped = outlier_mask_by_jump_time[best_jump_time_s]
-    design_matrix_with_jump, jump_column_indices = design_matrix.add_jump(best_jump_time_s)
-    regression = design_matrix_with_jump.fit(sigma_a, is_skipped)
-    return replace(
-        jump,
-        time_s=best_jump_time_s,
-        step_m=tuple(regression.estimate(int(column)) for column in jump_column_indices),
-    ), is_skipped
+    regression, jump_columns = design_matrix.fit_with_jump(best_jump_time_s, is_skipped)
+    step_m = tuple(map(regression.estimate, jump_columns))
+    return replace(jump, time_s=best_jump_time_s, step_m=step_m), is_skipped
 
 
 def _test_jump(
     design_matrix: DesignMatrix,
-    sigma_a: float,
     is_skipped: BoolArray,
-    time_s: float,
+    jump_time_s: float,
     max_false_alarm_p: float,
 ) -> Jump | None:
-    """Test for a jump at ``time_s``, and return it if it is significant."""
-    design_matrix, jump_column_indices = design_matrix.add_jump(time_s)
-    count_before_jump = np.count_nonzero(~is_skipped & (design_matrix.time_s < time_s))
+    """Test for a jump, and return it if it is significant."""
+    is_after_jump = design_matrix.time_s[~is_skipped] >= jump_time_s
     if (
-        min(count_before_jump, np.count_nonzero(~is_skipped & (design_matrix.time_s >= time_s)))
+        min(np.count_nonzero(is_after_jump), np.count_nonzero(~is_after_jump))
         < MIN_MEASUREMENTS_BEFORE_AND_AFTER_JUMP
     ):
         return None
-    regression = design_matrix.fit(sigma_a, is_skipped)
-    normalised_jump_size_covariance = regression.covariance[
-        np.ix_(jump_column_indices, jump_column_indices)
-    ]
-    normalised_jump_size = (
-        regression.coefficients[jump_column_indices] / regression.compute_residual_rms_by_axis()
-    )
+    regression, jump_columns = design_matrix.fit_with_jump(jump_time_s, is_skipped)
+    normalised_jump_size = regression.coefficients[jump_columns] / regression.residual_rms_by_axis
     chi_square = float(
         normalised_jump_size
-        @ np.linalg.solve(normalised_jump_size_covariance, normalised_jump_size)
+        @ np.linalg.solve(
+            regression.covariance[np.ix_(jump_columns, jump_columns)], normalised_jump_size
+        )
     )
-    if chi_square < chdtri(len(jump_column_indices), max_false_alarm_p):
+    if chi_square < chdtri(len(jump_columns), max_false_alarm_p):
         return None
-    return Jump(
-        time_s,
-        tuple(regression.estimate(int(column)) for column in jump_column_indices),
-        chi_square,
-    )
+    return Jump(jump_time_s, tuple(map(regression.estimate, jump_columns)), chi_square)
 
 
 @dataclass(frozen=True)
@@ -474,10 +407,10 @@ class InnovationRegression:
 
     Attributes
     ----------
-    axis : ndarray of int, shape (n,)
-        Axis index of each row.
-    residual : ndarray, shape (n,)
-        Normalised innovations minus the fit.
+    columns : ndarray, shape (axes · m, k)
+        Design matrix: measurements along the first axis, then those along the next axis.
+    residual : ndarray, shape (axes, m)
+        Normalised innovations minus the fit, also of measurements that are not used.
     coefficients, covariance : ndarray, shape (k,) and (k, k)
         Estimated errors, and their covariance.
     residual_and_prior_square_sum : float
@@ -486,30 +419,33 @@ class InnovationRegression:
         Restricted negative log-likelihood of the innovations.
     residual_rms : float
         RMS of the residual; 1 if SIGMA_A and SIGMA_Z are correct.
+    residual_rms_by_axis : ndarray, shape (axes,)
+        RMS of the residual along each axis, but at least 1.
     """
 
-    axis: IntArray
+    columns: Array
     residual: Array
     coefficients: Array
     covariance: Array
     residual_and_prior_square_sum: float
     score: float
     residual_rms: float
+    residual_rms_by_axis: Array
 
-    def compute_residual_rms_by_axis(self) -> Array:
-        """Return the RMS of the normalised residual along each axis, but at least 1."""
-        mean_square = np.bincount(self.axis, self.residual**2) / np.bincount(self.axis)
-        return np.sqrt(np.maximum(mean_square, 1.0))
+    def compute_residual_squares(self) -> Array:
+        """Return the squared residual of each measurement, summed over axes.
+
+        The residuals are normalised if they are larger than expected.
+        """
+        return np.asarray(np.sum(self.residual**2, axis=0)) / max(self.residual_rms, 1.0) ** 2
 
     def estimate(self, column: int) -> Estimate:
         """Return the estimated error of one column of the design matrix, and its σ.
 
         σ is increased if the residuals are larger than expected.
         """
-        coefficient_sigma = float(np.sqrt(self.covariance[column, column])) * max(
-            self.residual_rms, 1.0
-        )
-        return Estimate(float(self.coefficients[column]), coefficient_sigma)
+        sigma = math.sqrt(self.covariance[column, column]) * max(self.residual_rms, 1.0)
+        return Estimate(float(self.coefficients[column]), sigma)
 
 
 @dataclass(frozen=True)
@@ -527,8 +463,6 @@ class DesignMatrix:
         rotation. Last columns: slow acceleration error.
     prior_sigma : ndarray, shape (k,)
         Prior σ of the coefficients, except those of jumps.
-    jump_columns : ndarray, shape (m, j)
-        Unit steps at the times of the jumps.
     """
 
     time_s: Array
@@ -536,24 +470,26 @@ class DesignMatrix:
     preintegrated_inputs: PreintegratedMotion
     prior_sigma: Array
     sigma_z_m: float
-    jump_columns: Array
+    sigma_a_m_s2: float
+    jump_times_s: Sequence[float] = ()
 
-    def add_jump(self, time_s: float) -> tuple[DesignMatrix, IntArray]:
-        """Return a design matrix with one more jump, and the jump's column index for each axis."""
-        design_matrix = replace(
-            self,
-            jump_columns=np.hstack([self.jump_columns, make_unit_steps(self.time_s, [time_s])]),
-        )
-        first_jump_column = len(self.prior_sigma)
-        jump_count = design_matrix.jump_columns.shape[1]
-        return design_matrix, first_jump_column + jump_count * (1 + np.arange(self.axis_count)) - 1
+    def fit_with_jump(
+        self, jump_time_s: float, is_skipped: BoolArray
+    ) -> tuple[InnovationRegression, list[int]]:
+        """Fit one more jump; return also the index of its column for each axis."""
+        jump_times_s = [*self.jump_times_s, jump_time_s]
+        last_column = len(self.prior_sigma) - 1
+        jump_columns = [
+            last_column + len(jump_times_s) * (1 + axis) for axis in range(self.axis_count)
+        ]
+        return replace(self, jump_times_s=jump_times_s).fit(is_skipped), jump_columns
 
     def compute_normalised_innovations(
-        self, dp: Array, dv: Array, measured_m: Array, sigma_a: float, is_skipped: BoolArray
+        self, dp: Array, dv: Array, measured_m: Array, is_skipped: BoolArray, scale: float = 1.0
     ) -> tuple[Array, float]:
         """Run KF on several inputs; return normalised innovations ν/√S, one column per input.
 
-        The second result is Σ ln S over the fused measurements.
+        The second result is Σ ln S over the fused measurements. SIGMA_A is multiplied by ``scale``.
         """
         preintegrated_inputs = replace(
             self.preintegrated_inputs,
@@ -561,137 +497,85 @@ class DesignMatrix:
             delta_velocity_m_s=dv,
             measurement_m=measured_m,
         )
-        nu, s = innovations(preintegrated_inputs, sigma_a, self.sigma_z_m, is_skipped)
-        nu /= np.sqrt(s)[:, None]
-        return nu, float(np.sum(np.log(s[~is_skipped])))
+        nu, s = innovations(
+            preintegrated_inputs, scale * self.sigma_a_m_s2, self.sigma_z_m, is_skipped
+        )
+        return nu / np.sqrt(s)[:, None], float(np.sum(np.log(s[~is_skipped])))
 
-    def fit(
-        self, sigma_a: float, is_skipped: BoolArray, scale: float = 1.0
-    ) -> InnovationRegression:
+    def fit(self, is_skipped: BoolArray, scale: float = 1.0) -> InnovationRegression:
         """Fit biases, rotation, slow error and jumps to KF's innovations by least squares.
 
         ``scale`` is a trial scale factor of the positions; the acceleration is multiplied by it.
         ``is_skipped`` is True for measurements that are not used.
         """
-        return self.fit_columns_to_innovations(
-            *self.compute_innovations_and_design_matrix(sigma_a, is_skipped, scale), is_skipped
+        innovations_of_data, columns, sum_of_log_variances = (
+            self.compute_innovations_and_design_matrix(is_skipped, scale)
         )
-
-    def fit_columns_to_innovations(
-        self,
-        innovations_by_axis: Array,
-        design_columns: Array,
-        sum_of_log_variances: float,
-        is_skipped: BoolArray,
-    ) -> InnovationRegression:
-        """Fit the columns of the design matrix to the normalised innovations by least squares.
-
-        The arguments are results of :meth:`compute_innovations_and_design_matrix`.
-        """
-        axis_indices = np.repeat(np.arange(len(innovations_by_axis)), np.count_nonzero(~is_skipped))
-        innovations_by_axis = innovations_by_axis[:, ~is_skipped].ravel()
-        design_columns = design_columns[:, ~is_skipped].reshape(len(axis_indices), -1)
-        column_count = design_columns.shape[1]
-        prior_sigma = np.append(
-            self.prior_sigma, np.full(column_count - len(self.prior_sigma), np.inf)
-        )
-        information = np.diag(prior_sigma**-2.0) + design_columns.T @ design_columns
+        is_used = np.tile(~is_skipped, self.axis_count)
+        used_innovations, used_columns = innovations_of_data[is_used], columns[is_used]
+        prior_precision = np.zeros(columns.shape[1])
+        prior_precision[: len(self.prior_sigma)] = self.prior_sigma**-2.0
+        information = np.diag(prior_precision) + used_columns.T @ used_columns
         # A small diagonal prevents a singular matrix: in hover, the rotation has no effect
-        information += 1e-12 * np.diag(np.diag(information)) + 1e-12 * np.eye(column_count)
-        right_hand_side = design_columns.T @ innovations_by_axis
+        information += 1e-12 * np.diag(np.diag(information)) + 1e-12 * np.eye(len(information))
+        right_hand_side = used_columns.T @ used_innovations
         information_factor = cho_factor(information)
-        covariance = cho_solve(information_factor, np.eye(column_count))
+        covariance = cho_solve(information_factor, np.eye(len(information)))
         coefficients = covariance @ right_hand_side
-        residual_and_prior_square_sum = float(
-            innovations_by_axis @ innovations_by_axis - coefficients @ right_hand_side
-        )
-        score = 0.5 * (residual_and_prior_square_sum + sum_of_log_variances) + float(
-            np.sum(np.log(np.diag(information_factor[0])))
-        )
-        residual_rms = float(
-            np.sqrt(
-                max(residual_and_prior_square_sum, 0.0)
-                / max(len(innovations_by_axis) - CONSTANT_ERROR_COLUMN_COUNT, 1)
-            )
-        )
-        residual = innovations_by_axis - design_columns @ coefficients
+        square_sum = float(used_innovations @ used_innovations - coefficients @ right_hand_side)
+        log_determinant = 2.0 * float(np.sum(np.log(np.diag(information_factor[0]))))
+        degrees_of_freedom = max(len(used_innovations) - CONSTANT_ERROR_COLUMN_COUNT, 1)
+        residual = (innovations_of_data - columns @ coefficients).reshape(self.axis_count, -1)
+        mean_squares = np.mean(residual[:, ~is_skipped] ** 2, axis=1)
         return InnovationRegression(
-            axis_indices,
+            columns,
             residual,
             coefficients,
             covariance,
-            residual_and_prior_square_sum,
-            score,
-            residual_rms,
+            square_sum,
+            0.5 * (square_sum + sum_of_log_variances + log_determinant),
+            math.sqrt(max(square_sum, 0.0) / degrees_of_freedom),
+            np.sqrt(np.maximum(mean_squares, 1.0)),
         )
-
-    def compute_residual_squares(self, sigma_a: float, is_skipped: BoolArray) -> Array:
-        """Return the squared normalised residual of each measurement, summed over axes.
-
-        Measurements in ``is_skipped`` are not used in the fit.
-        """
-        normalised_innovations, columns, sum_of_log_variances = (
-            self.compute_innovations_and_design_matrix(sigma_a, is_skipped)
-        )
-        regression = self.fit_columns_to_innovations(
-            normalised_innovations, columns, sum_of_log_variances, is_skipped
-        )
-        residual = normalised_innovations - columns @ regression.coefficients
-        return np.asarray(np.sum(residual**2, axis=0)) / max(regression.residual_rms, 1.0) ** 2
 
     def compute_innovations_and_design_matrix(
-        self, sigma_a: float, is_skipped: BoolArray, scale: float = 1.0
+        self, is_skipped: BoolArray, scale: float = 1.0
     ) -> tuple[Array, Array, float]:
-        """Return KF's normalised innovations ν/√S, the design matrix, and Σ ln S.
-
-        Shapes: (axes, measurements) and (axes, measurements, columns).
-        """
-        preintegrated_inputs, axis_count = self.preintegrated_inputs, self.axis_count
-        jump_count = self.jump_columns.shape[1]
-        column_count = len(self.prior_sigma)
-        normalised_innovations = np.empty((axis_count, len(is_skipped)))
-        columns = np.zeros((axis_count, len(is_skipped), column_count + axis_count * jump_count))
+        """Return KF's normalised innovations ν/√S, the design matrix, and Σ ln S."""
+        inputs, axis_count = self.preintegrated_inputs, self.axis_count
+        input_count = inputs.measurement_m.shape[1]
         # Only inputs with measured acceleration are multiplied by the scale factor
-        data_input_indices = (1 + CONSTANT_ERROR_COLUMN_COUNT) * np.arange(axis_count)
-        input_scale_factors = np.ones(preintegrated_inputs.measurement_m.shape[1])
-        input_scale_factors[
-            np.append(data_input_indices, data_input_indices + 1 + FRAME_ROTATION_COLUMN)
-        ] = scale
-        zero_increments = 0.0 * self.jump_columns
-        normalised_innovations_by_input, sum_of_log_variances = self.compute_normalised_innovations(
-            np.hstack(
-                [input_scale_factors * preintegrated_inputs.delta_position_m, zero_increments]
-            ),
-            np.hstack(
-                [input_scale_factors * preintegrated_inputs.delta_velocity_m_s, zero_increments]
-            ),
-            np.hstack([preintegrated_inputs.measurement_m, self.jump_columns]),
-            scale * sigma_a,
+        input_scale_factors = np.ones(input_count)
+        data_inputs = INPUTS_PER_AXIS * np.arange(axis_count)
+        input_scale_factors[data_inputs] = scale
+        input_scale_factors[data_inputs + 1 + FRAME_ROTATION_COLUMN] = scale
+        jump_steps = make_unit_steps(self.time_s, self.jump_times_s)
+        zero_increments = np.zeros_like(jump_steps)
+        responses, sum_of_log_variances = self.compute_normalised_innovations(
+            np.hstack([input_scale_factors * inputs.delta_position_m, zero_increments]),
+            np.hstack([input_scale_factors * inputs.delta_velocity_m_s, zero_increments]),
+            np.hstack([inputs.measurement_m, jump_steps]),
             is_skipped,
+            scale,
         )
-        *responses_by_axis, slow_error_and_jump_responses = np.split(
-            normalised_innovations_by_input,
-            (1 + CONSTANT_ERROR_COLUMN_COUNT) * np.arange(1, 1 + axis_count),
-            1,
+        *responses_by_axis, slow_error_responses, jump_responses = np.split(
+            responses, [*(data_inputs + INPUTS_PER_AXIS), input_count], axis=1
         )
-        slow_error_knot_count = slow_error_and_jump_responses.shape[1] - jump_count
-        for axis, axis_responses in enumerate(responses_by_axis):
-            normalised_innovations[axis] = axis_responses[:, 0]
-            first_slow_error_column = CONSTANT_ERROR_COLUMN_COUNT + slow_error_knot_count * axis
-            first_jump_column = column_count + jump_count * axis
-            columns[axis][:, :CONSTANT_ERROR_COLUMN_COUNT] = axis_responses[:, 1:]
-            slow_error_and_jump_columns = np.r_[
-                first_slow_error_column : first_slow_error_column + slow_error_knot_count,
-                first_jump_column : first_jump_column + jump_count,
-            ]
-            columns[axis][:, slow_error_and_jump_columns] = slow_error_and_jump_responses
-        return normalised_innovations, columns, axis_count * sum_of_log_variances
+        stacked_responses = np.vstack(responses_by_axis)
+        # Slow errors and jumps of an axis have no effect on the other axis
+        columns = [
+            stacked_responses[:, 1:],
+            np.kron(np.eye(axis_count), slow_error_responses),
+            np.kron(np.eye(axis_count), jump_responses),
+        ]
+        return stacked_responses[:, 0], np.hstack(columns), axis_count * sum_of_log_variances
 
 
 def make_design_matrix(
     flight: Flight,
     axes: tuple[Axis, ...],
     settings: Settings,
+    sigma_a_m_s2: float,
     sigma_z_m: float,
     clock_offset_s: float,
 ) -> DesignMatrix | Unavailable:
@@ -704,48 +588,53 @@ def make_design_matrix(
         return acceleration
     if isinstance(attitude, Unavailable):
         return attitude
-    if len(axes[0].measurement_time_s) <= MIN_MEASUREMENTS:
-        return report_too_few_measurements(
-            ANALYSIS_NAME, len(axes[0].measurement_time_s), MIN_MEASUREMENTS
-        )
-    time_s = axes[0].measurement_time_s + clock_offset_s
-    time_shifted_axes = [replace(axis, measurement_time_s=time_s) for axis in axes]
+    if (count := len(axes[0].measurement_time_s)) <= MIN_MEASUREMENTS:
+        return report_too_few_measurements(ANALYSIS_NAME, count, MIN_MEASUREMENTS)
     settings = replace(settings, input="imu")
+    time_shifted_axes = [
+        replace(axis, measurement_time_s=axis.measurement_time_s + clock_offset_s) for axis in axes
+    ]
     prediction_steps = make_prediction_steps(time_shifted_axes[0], settings)
-    velocity_errors_by_unit_error = _integrate_unit_errors(attitude, acceleration)
     preintegrated_motions = [preintegrate(axis, settings) for axis in time_shifted_axes]
-    position_and_velocity_increments: list[ArrayPair] = []
+    time_s = axes[0].measurement_time_s[-len(preintegrated_motions[0].measurement_m) :]
+
+    def integrate_between_measurements(velocity_error_m_s: Array, error_time_s: Array) -> ArrayPair:
+        velocity_m_s = np.interp(prediction_steps.time_s, error_time_s, velocity_error_m_s)
+        return integrate_acceleration(
+            prediction_steps, np.diff(velocity_m_s) / np.diff(prediction_steps.time_s)
+        )
+
+    # Δp (m) and Δv (m/s) between the measurements, for each input of KF
+    increments: list[ArrayPair] = []
     for axis, preintegrated_motion in zip(axes, preintegrated_motions, strict=True):
-        position_and_velocity_increments.append(
+        increments.append(
             (preintegrated_motion.delta_position_m, preintegrated_motion.delta_velocity_m_s)
         )
-        position_and_velocity_increments += [
-            _integrate_between_measurements(
-                integral @ axis.direction, input_time_s, prediction_steps
-            )
-            for input_time_s, integral in velocity_errors_by_unit_error
+        increments += [
+            integrate_between_measurements(velocity_error_m_s @ axis.direction, error_time_s)
+            for error_time_s, velocity_error_m_s in _integrate_unit_errors(attitude, acceleration)
         ]
-    time_s = axes[0].measurement_time_s[-len(preintegrated_motions[0].measurement_m) :]
-    interpolation_time_s, interpolation_weights = _make_interpolation_weights(
-        time_s[0] + clock_offset_s, time_s[-1] + clock_offset_s
-    )
-    position_and_velocity_increments += [
-        _integrate_between_measurements(
-            integrate_cumulatively(weights, interpolation_time_s),
-            interpolation_time_s,
-            prediction_steps,
+    # The slow acceleration error is linear between knots
+    slow_error_intervals = int(
+        np.clip(
+            np.ceil((time_s[-1] - time_s[0]) / SLOW_ERROR_KNOT_SPACING_S), 1, MAX_SLOW_ERROR_KNOTS
         )
-        for weights in interpolation_weights
-    ]
-    dp, dv = (
-        np.stack(arrays, axis=1) for arrays in zip(*position_and_velocity_increments, strict=True)
     )
+    slow_error_time_s = np.linspace(time_s[0], time_s[-1], 20 * slow_error_intervals + 1)
+    slow_error_time_s += clock_offset_s
+    for knot_values in np.eye(slow_error_intervals + 1):
+        slow_error = np.interp(slow_error_time_s, slow_error_time_s[::20], knot_values)
+        increments.append(
+            integrate_between_measurements(
+                integrate_cumulatively(slow_error, slow_error_time_s), slow_error_time_s
+            )
+        )
+    dp, dv = np.transpose(increments, (1, 2, 0))
     measured_m = np.zeros_like(dp)
-    for index, preintegrated_motion in enumerate(preintegrated_motions):
-        # Positions are relative to the first measurement, which is KF's initial position
-        measured_m[:, index * (1 + CONSTANT_ERROR_COLUMN_COUNT)] = (
-            preintegrated_motion.measurement_m - preintegrated_motion.initial_state.position_m
-        )
+    # Positions are relative to the first measurement, which is KF's initial position
+    measured_m[:, : INPUTS_PER_AXIS * len(axes) : INPUTS_PER_AXIS] = np.transpose(
+        [motion.measurement_m - motion.initial_state.position_m for motion in preintegrated_motions]
+    )
     preintegrated_inputs = replace(
         preintegrated_motions[0],
         delta_position_m=dp,
@@ -753,37 +642,18 @@ def make_design_matrix(
         measurement_m=measured_m,
         # One process noise for all axes: the mean
         process_noise_independent_of_sigma_a=np.mean(
-            [
-                preintegrated_motion.process_noise_independent_of_sigma_a
-                for preintegrated_motion in preintegrated_motions
-            ],
+            [motion.process_noise_independent_of_sigma_a for motion in preintegrated_motions],
             axis=0,
         ),
         initial_state=replace(preintegrated_motions[0].initial_state, position_m=0.0),
     )
-    tilt_acceleration_sigma_m_s2 = np.full(
-        len(axes) * len(interpolation_weights), TILT_PRIOR_SIGMA_RAD * constants.g
+    prior_sigma = np.full(
+        CONSTANT_ERROR_COLUMN_COUNT + len(axes) * (slow_error_intervals + 1),
+        TILT_PRIOR_SIGMA_RAD * constants.g,
     )
-    prior_sigma = np.append(
-        np.full(CONSTANT_ERROR_COLUMN_COUNT, np.inf), tilt_acceleration_sigma_m_s2
-    )
+    prior_sigma[:CONSTANT_ERROR_COLUMN_COUNT] = np.inf
     return DesignMatrix(
-        time_s,
-        len(axes),
-        preintegrated_inputs,
-        prior_sigma,
-        sigma_z_m,
-        make_unit_steps(time_s, []),
-    )
-
-
-def _integrate_between_measurements(
-    acceleration_integral_m_s: Array, time_s: Array, prediction_steps: PredictionSteps
-) -> ArrayPair:
-    """Return Δp (m) and Δv (m/s) between the measurements, from an integrated acceleration."""
-    velocity_m_s = np.interp(prediction_steps.time_s, time_s, acceleration_integral_m_s)
-    return integrate_acceleration(
-        prediction_steps, np.diff(velocity_m_s) / np.diff(prediction_steps.time_s)
+        time_s, len(axes), preintegrated_inputs, prior_sigma, sigma_z_m, sigma_a_m_s2
     )
 
 
@@ -794,40 +664,16 @@ def _integrate_unit_errors(attitude: pd.DataFrame, acceleration: Acceleration) -
     """
     body_to_ned = Rotation.from_quat(
         attitude[Columns.QUATERNION].to_numpy(copy=True), scalar_first=True
-    )
+    ).as_matrix()
     attitude_time_s = attitude.index.to_numpy()
-    velocity_errors_by_unit_bias = [
-        (
-            attitude_time_s,
-            integrate_cumulatively(body_to_ned.apply(np.eye(3)[axis]), attitude_time_s),
-        )
-        for axis in (FORWARD_BIAS_COLUMN, RIGHT_BIAS_COLUMN)
-    ]
     north, east, _ = acceleration.acceleration_integral_m_s
     return [
-        *velocity_errors_by_unit_bias,
+        *(
+            (attitude_time_s, integrate_cumulatively(body_to_ned[:, :, column], attitude_time_s))
+            for column in (FORWARD_BIAS_COLUMN, RIGHT_BIAS_COLUMN)
+        ),
         (acceleration.time_s, np.stack([-east, north, 0.0 * north]).T),
     ]
-
-
-def _make_interpolation_weights(start_s: float, end_s: float) -> ArrayPair:
-    """Return times (s), and the weight of each knot at these times, shape (knots, times).
-
-    The slow acceleration error is linear between the knots.
-    """
-    knot_count = (
-        int(
-            np.clip(np.ceil((end_s - start_s) / SLOW_ERROR_KNOT_SPACING_S), 1, MAX_SLOW_ERROR_KNOTS)
-        )
-        + 1
-    )
-    interpolation_time_s = np.linspace(start_s, end_s, 20 * (knot_count - 1) + 1)
-    return interpolation_time_s, np.array(
-        [
-            np.interp(interpolation_time_s, np.linspace(start_s, end_s, knot_count), weights)
-            for weights in np.eye(knot_count)
-        ]
-    )
 
 
 def make_unit_steps(time_s: Array, starts_s: Iterable[float]) -> Array:
