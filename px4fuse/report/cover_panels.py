@@ -198,7 +198,7 @@ def _make_flight_map(analysis: Analysis) -> FlightMap:
     heading_rad, x_name, y_name = np.pi / 2.0, "east", "north"
     if aisle_heading_deg is not None:
         heading_rad = np.deg2rad(aisle_heading_deg % 180.0)
-        x_name, y_name = analysis.main.axis.label, "left"
+        x_name, y_name = f"along {analysis.main.axis.label}", "left"
     elif analysis.source.frame == "FRD":
         x_name, y_name = "y of the position source", "x"
     cosine, sine = np.cos(heading_rad), np.sin(heading_rad)

@@ -23,6 +23,7 @@ from px4fuse.request import ComparisonRequest, Request, command_line
 # Terminal encodings with all characters of a diagnosis card
 UNICODE_ENCODINGS = ("utf-8", "utf8", "utf-16")
 LABEL_CHARACTERS = 9  # width of a label
+MIN_TABLE_WIDTH = 50  # characters; narrower terminals show no tables
 POINTS_PER_COLUMN = 6.0  # points in the PDF per character on the terminal
 STYLES_BY_COLOUR = {
     MUTED_COLOUR: "dim",
@@ -46,6 +47,11 @@ def print_blocks(
                 print_paragraph(console, _make_rich_text(block), Text(), indent=indent)
             case "labelled":
                 _show_labelled(console, block, request)
+            case "table" if console.width < MIN_TABLE_WIDTH:
+                for row in (block["head"], *block["rows"]):
+                    texts = (cell if isinstance(cell, str) else cell[0] for cell in row)
+                    row_text = Text(", ".join(filter(None, texts)))
+                    print_paragraph(console, row_text, Text(), indent=2)
             case "table":
                 console.print(_make_rich_table(**block))
             case "command":
