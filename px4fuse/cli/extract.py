@@ -1,6 +1,7 @@
 """Command ``px4fuse extract``: exports a log as tables."""
 
 import importlib.util
+import json
 from pathlib import Path
 from typing import Any
 
@@ -14,8 +15,12 @@ from px4fuse.cli.options import (
     output_option,
 )
 from px4fuse.cli.outputs import write_outputs
-from px4fuse.core.input_files import check_output_folder
+from px4fuse.core.input_files import check_output_folder, suspend_input_registration
+from px4fuse.core.reading import read_text
 from px4fuse.errors import OutputError, to_one_line
+
+# Maximum size (bytes) of the flight.json of an earlier export
+MAX_DESCRIPTION_BYTES = 50_000_000
 
 
 @click.command()
@@ -50,6 +55,7 @@ def extract(
     from px4fuse.results.contract import to_json
 
     flight = extraction.add_source_innovations(read_flight(comparison_request(log, option_values)))
+    _require_same_flight(output, flight.log.sha256)
     tables = extraction.tables(flight)
     contents = {
         output / f"{name}.{format}": extraction.to_bytes(table, format)
@@ -66,3 +72,19 @@ def extract(
     click.echo("  data_dictionary.csv, flight.json")
     for missing_part in extraction.list_missing_data(flight):
         click.echo(f"Not exported: {missing_part.what} ({missing_part.reason})")
+
+
+def _require_same_flight(folder: Path, sha256: str) -> None:
+    try:
+        with suspend_input_registration():
+            text = read_text(folder / "flight.json", OutputError, MAX_DESCRIPTION_BYTES)
+        earlier_log = json.loads(text)["log"]
+        earlier_name, earlier_sha256 = earlier_log["name"], earlier_log["sha256"]
+    # without a valid flight.json, assume that the folder contains no tables of another log
+    except (OutputError, ValueError, KeyError, TypeError):
+        return
+    if earlier_sha256 != sha256:
+        raise OutputError(
+            f"{folder} contains the tables of another log, {earlier_name}. Choose "
+            "another folder (-o)."
+        )

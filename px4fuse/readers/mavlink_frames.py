@@ -35,7 +35,7 @@ RECEIVE_TIME_BYTES = 8
 # Block size (bytes) of the search for frames, which limits the memory
 BLOCK_BYTES = 1 << 16
 # Number of frames that are decoded at once, which limits the memory
-DECODE_BATCH_SIZE = 1 << 10
+DECODE_BATCH_SIZE = 1 << 12
 # Minimum fraction of bytes in valid frames; otherwise, the file is not MAVLink
 MIN_VALID_FRAME_FRACTION = 0.01
 # Maximum difference (µs) of a valid receive time from the median, as in pymavlink
@@ -49,8 +49,12 @@ VEHICLE_TYPES = {
     for number, entry in dialect.enums["MAV_TYPE"].items()
 } | {6: "ground station", 18: "companion computer"}
 # CRC_EXTRA byte of the checksum by message id; -1 for unknown messages
-_CRC_EXTRA = np.full(1 << 16, -1, dtype=np.int16)
+_CRC_EXTRA = np.full(
+    max(1 << 16, *(number + 1 for number in dialect.mavlink_map)), -1, dtype=np.int16
+)
 _CRC_EXTRA[[*dialect.mavlink_map]] = [message.crc_extra for message in dialect.mavlink_map.values()]
+# CRC of each byte value
+_CRC_TABLE = np.array([mcrf4xx(bytes([byte]), 0) for byte in range(256)], dtype=np.uint16)
 
 
 @dataclass(frozen=True)
@@ -100,16 +104,23 @@ class MavlinkFrames:
         MAVLink 2 omits trailing zero bytes of the payload. They are added again.
         """
         layout = wire_layout(MESSAGE_IDS[message])
-        payload = np.empty((len(rows), layout.itemsize), dtype=np.uint8)
+        payload = np.zeros((len(rows), layout.itemsize), dtype=np.uint8)
         content_bytes = np.frombuffer(self.content, dtype=np.uint8)
-        byte_indices = np.arange(layout.itemsize)
-        for first in range(0, len(rows), DECODE_BATCH_SIZE):
-            batch_rows = rows[first : first + DECODE_BATCH_SIZE]
-            offsets = self.payload_offsets[batch_rows, None] + byte_indices
-            is_sent = byte_indices < self.payload_lengths[batch_rows, None]
-            payload[first : first + DECODE_BATCH_SIZE] = (
-                content_bytes.take(offsets, mode="clip") * is_sent
-            )
+        payload_starts = self.payload_offsets[rows]
+        payload_lengths = self.payload_lengths[rows]
+        for length in np.unique(payload_lengths).tolist():
+            byte_count = min(length, layout.itemsize)
+            if byte_count:
+                rows_with_length = np.flatnonzero(payload_lengths == length)
+                bytes_by_start_offset = np.lib.stride_tricks.sliding_window_view(
+                    content_bytes, byte_count
+                )
+                # Batches limit the memory, because indexing copies the payloads
+                for batch_start in range(0, len(rows_with_length), DECODE_BATCH_SIZE):
+                    batch_rows = rows_with_length[batch_start : batch_start + DECODE_BATCH_SIZE]
+                    payload[batch_rows, :byte_count] = bytes_by_start_offset[
+                        payload_starts[batch_rows]
+                    ]
         return payload.view(layout)[:, 0]
 
 
@@ -122,17 +133,17 @@ def message_name(message_id: int) -> str:
 def wire_layout(message_id: int) -> np.dtype[Any]:
     """Return the fields in the payload of a message as a structured dtype without padding."""
     message = dialect.mavlink_map[message_id]
-    # pymavlink and numpy have the same type codes, except for texts
+    # pymavlink and numpy have the same type codes
     type_codes = message.native_format.decode().removeprefix("<")
-    fields = zip(message.ordered_fieldnames, type_codes, message.array_lengths, strict=True)
-    return np.dtype(
-        [
-            (name, f"S{length or 1}")
-            if type_code == "c"
-            else (name, f"<{type_code}", (length,) if length else ())
-            for name, type_code, length in fields
-        ]
-    )
+    fields: list[Any] = []
+    for name, type_code, length in zip(
+        message.ordered_fieldnames, type_codes, message.array_lengths, strict=True
+    ):
+        if type_code == "c":
+            fields.append((name, f"S{length or 1}"))
+        else:
+            fields.append((name, f"<{type_code}", (length,)) if length else (name, f"<{type_code}"))
+    return np.dtype(fields)
 
 
 def read_frames(name: str, content: bytes) -> MavlinkFrames:
@@ -144,27 +155,32 @@ def read_frames(name: str, content: bytes) -> MavlinkFrames:
         The content is not MAVLink.
     """
     start_offsets, end_offsets, message_ids = _remove_nested_frames(_find_valid_frames(content)).T
-    frame_count, frame_byte_count = len(start_offsets), int(np.sum(end_offsets - start_offsets))
-    if not frame_count or frame_byte_count < MIN_VALID_FRAME_FRACTION * len(content):
+    receive_time_bytes = (
+        RECEIVE_TIME_BYTES
+        if len(start_offsets) and _has_receive_times(start_offsets, end_offsets)
+        else 0
+    )
+    if int(np.sum(end_offsets - start_offsets)) < MIN_VALID_FRAME_FRACTION * len(
+        content
+    ) or not len(start_offsets):
         raise LogError(
             f"{name}: the file is neither a PX4 ULog nor a MAVLink recording. It contains "
-            f"{frame_count} frames with a valid checksum in {len(content)} bytes.",
+            f"{len(start_offsets)} frames with a valid checksum in {len(content)} bytes.",
             "Give a .ulg, a .tlog or a raw MAVLink stream.",
         )
     content_bytes = np.frombuffer(content, dtype=np.uint8)
     is_version_2 = content_bytes[start_offsets] == MAGIC_BYTE_V2
     # Sequence number, system id and component id are consecutive bytes
     sequence_offsets = start_offsets + np.where(is_version_2, 4, 2)
-    receive_time_bytes, receive_times_us, damaged_receive_time_count = 0, None, 0
-    if _has_receive_times(start_offsets, end_offsets):
-        receive_time_bytes = RECEIVE_TIME_BYTES
-        receive_times_us, damaged_receive_time_count = _read_receive_times(
-            content_bytes, start_offsets, end_offsets
-        )
     unknown_frame_count, byte_count_outside_frames, is_last_frame_incomplete = (
         _count_bytes_outside_frames(
             content, start_offsets - receive_time_bytes, end_offsets, receive_time_bytes
         )
+    )
+    receive_times_us, damaged_receive_time_count = (
+        _read_receive_times(content_bytes, start_offsets, end_offsets)
+        if receive_time_bytes
+        else (None, 0)
     )
     return MavlinkFrames(
         name=name,
@@ -192,14 +208,16 @@ def _find_valid_frames(content: bytes) -> Int64Array:
     valid_frames = [np.zeros((0, 3), dtype=np.int64)]
     for block_start in range(0, len(content_bytes), BLOCK_BYTES):
         possible_frames, crc_end = _find_possible_frames(content_bytes, block_start)
-        crc = [
-            mcrf4xx(bytes([_CRC_EXTRA[message_id]]), mcrf4xx(content_view[start + 1 : end]))
-            for (start, _, message_id), end in zip(
-                possible_frames.tolist(), crc_end.tolist(), strict=True
-            )
+        byte_ranges = zip((possible_frames[:, 0] + 1).tolist(), crc_end.tolist(), strict=True)
+        crc = np.array(
+            [mcrf4xx(content_view[first_byte:end_byte]) for first_byte, end_byte in byte_ranges],
+            dtype=np.uint16,
+        )
+        crc = (crc >> 8) ^ _CRC_TABLE[
+            (crc ^ _CRC_EXTRA[possible_frames[:, 2]].astype(np.uint16)) & 0xFF
         ]
         stored_crc = content_bytes[crc_end] | content_bytes[crc_end + 1].astype(np.uint16) << 8
-        valid_frames.append(possible_frames[stored_crc == np.array(crc)])
+        valid_frames.append(possible_frames[stored_crc == crc])
     return np.concatenate(valid_frames)
 
 
@@ -207,17 +225,19 @@ def _remove_nested_frames(frames: Int64Array) -> Int64Array:
     """Remove frames inside other frames, such as in the payload of the message TUNNEL."""
     if not np.any(frames[1:, 0] < frames[:-1, 1]):
         return frames
+    start_offsets = frames[:, 0].tolist()
+    end_offsets = frames[:, 1].tolist()
     kept_rows = []
     previous_end = 0
-    all_frame_starts = {*frames[:, 0].tolist()}
-    for row, (frame_start, frame_end, _) in enumerate(frames.tolist()):
+    all_frame_starts = {*start_offsets}
+    for row, frame_start in enumerate(start_offsets):
         expected_frame_starts = previous_end, previous_end + RECEIVE_TIME_BYTES
         if frame_start >= previous_end and (
             frame_start in expected_frame_starts
             or all_frame_starts.isdisjoint(expected_frame_starts)
         ):
             kept_rows.append(row)
-            previous_end = frame_end
+            previous_end = end_offsets[row]
     return frames[kept_rows]
 
 
@@ -232,34 +252,41 @@ def _find_possible_frames(
     start_offsets = block_start + np.flatnonzero(
         (block == MAGIC_BYTE_V1) | (block == MAGIC_BYTE_V2)
     )
-    # Bytes of incomplete headers are arbitrary, because the last test excludes these frames
-    headers = content_bytes.take(
-        start_offsets[:, None] + np.arange(HEADER_BYTES_V2), mode="clip"
+    header_bytes = np.where(
+        content_bytes[start_offsets] == MAGIC_BYTE_V2, HEADER_BYTES_V2, HEADER_BYTES_V1
+    )
+    has_whole_header = start_offsets + header_bytes + CHECKSUM_BYTES <= len(content_bytes)
+    start_offsets = start_offsets[has_whole_header]
+    header_bytes = header_bytes[has_whole_header]
+    is_version_2 = header_bytes == HEADER_BYTES_V2
+    start_offsets_v2 = start_offsets[is_version_2]
+    message_ids = content_bytes[start_offsets + 5].astype(np.int64)
+    message_ids[is_version_2] = (
+        content_bytes[start_offsets_v2 + 7]
+        | content_bytes[start_offsets_v2 + 8].astype(np.int64) << 8
+    )
+    is_candidate = _CRC_EXTRA[message_ids] >= 0
+    is_candidate[is_version_2] &= (content_bytes[start_offsets_v2 + 9] == 0) & (
+        content_bytes[start_offsets_v2 + 2] <= SIGNED_FLAG
+    )
+    crc_end = start_offsets + content_bytes[start_offsets + 1] + header_bytes
+    end_offsets = crc_end + CHECKSUM_BYTES
+    end_offsets[is_version_2] += SIGNATURE_BYTES * (
+        content_bytes[start_offsets_v2 + 2] & SIGNED_FLAG
     ).astype(np.int64)
-    is_version_2 = headers[:, 0] == MAGIC_BYTE_V2
-    message_ids = np.where(is_version_2, headers[:, 7] | headers[:, 8] << 8, headers[:, 5])
-    flags = np.where(is_version_2, headers[:, 2], 0)
-    crc_end = (
-        start_offsets + np.where(is_version_2, HEADER_BYTES_V2, HEADER_BYTES_V1) + headers[:, 1]
-    )
-    end_offsets = crc_end + CHECKSUM_BYTES + SIGNATURE_BYTES * flags
-    is_candidate = (
-        (_CRC_EXTRA[message_ids] >= 0)
-        & (flags <= SIGNED_FLAG)
-        & (~is_version_2 | (headers[:, 9] == 0))
-        & (end_offsets <= len(content_bytes))
-    )
-    frames = np.stack([start_offsets, end_offsets, message_ids], axis=1)
-    return frames[is_candidate], crc_end[is_candidate]
+    is_candidate &= end_offsets <= len(content_bytes)
+    return np.stack([start_offsets, end_offsets, message_ids], axis=1)[is_candidate], crc_end[
+        is_candidate
+    ]
 
 
 def _has_receive_times(start_offsets: Int64Array, end_offsets: Int64Array) -> bool:
     """Return True if receive times precede most frames, as in a ``.tlog``."""
     gap_sizes_bytes = start_offsets[1:] - end_offsets[:-1]
-    count_with_receive_time = int(np.count_nonzero(gap_sizes_bytes == RECEIVE_TIME_BYTES))
-    count_without_receive_time = int(np.count_nonzero(gap_sizes_bytes == 0))
-    if count_with_receive_time or count_without_receive_time:
-        return count_with_receive_time > count_without_receive_time
+    frame_count_with_receive_time = int(np.count_nonzero(gap_sizes_bytes == RECEIVE_TIME_BYTES))
+    frame_count_without_receive_time = int(np.count_nonzero(gap_sizes_bytes == 0))
+    if frame_count_with_receive_time + frame_count_without_receive_time:
+        return frame_count_with_receive_time > frame_count_without_receive_time
     return bool(start_offsets[0] == RECEIVE_TIME_BYTES)
 
 
@@ -272,19 +299,24 @@ def _count_bytes_outside_frames(
     """
     unknown_frame_count = 0
     byte_count_outside_frames = 0
-    offset = 0
-    gaps = np.column_stack([np.append(0, end_offsets), np.append(start_offsets, len(content))])
-    for gap_start, gap_end in gaps[gaps[:, 0] < gaps[:, 1]].tolist():
+    bytes_after_last_frame = b""
+    gap_start_offsets = np.append(0, end_offsets)
+    gap_end_offsets = np.append(start_offsets, len(content))
+    for gap_start, gap_end in np.column_stack([gap_start_offsets, gap_end_offsets])[
+        gap_start_offsets < gap_end_offsets
+    ].tolist():
         offset = gap_start
         for frame_bytes in _measure_unknown_frames(content, gap_start, gap_end, receive_time_bytes):
             unknown_frame_count += 1
             offset += frame_bytes
         byte_count_outside_frames += gap_end - offset
-    bytes_after_last_frame = content[max(offset, end_offsets[-1]) :]
-    first_frame_byte = bytes_after_last_frame[receive_time_bytes : receive_time_bytes + 1]
-    begins_frame = first_frame_byte in (b"", bytes([MAGIC_BYTE_V1]), bytes([MAGIC_BYTE_V2]))
-    is_last_frame_incomplete = begins_frame and (
-        0 < len(bytes_after_last_frame) < receive_time_bytes + MAX_FRAME_BYTES
+        bytes_after_last_frame = content[offset:gap_end] if gap_end == len(content) else b""
+    begins_frame = {*bytes_after_last_frame[receive_time_bytes : receive_time_bytes + 1]} <= {
+        MAGIC_BYTE_V1,
+        MAGIC_BYTE_V2,
+    }
+    is_last_frame_incomplete = (
+        0 < len(bytes_after_last_frame) < receive_time_bytes + MAX_FRAME_BYTES and begins_frame
     )
     return unknown_frame_count, byte_count_outside_frames, is_last_frame_incomplete
 
@@ -318,23 +350,25 @@ def _read_receive_times(
     content_bytes: ByteArray, start_offsets: Int64Array, end_offsets: Int64Array
 ) -> tuple[Int64Array, int]:
     """Return the receive time (UNIX, µs) of each frame, and the number of damaged times."""
-    is_usable = start_offsets - np.append(0, end_offsets[:-1]) >= RECEIVE_TIME_BYTES
-    time_offsets = start_offsets[:, None] + np.arange(-RECEIVE_TIME_BYTES, 0)
+    is_usable = start_offsets >= RECEIVE_TIME_BYTES
+    is_usable[1:] &= start_offsets[1:] - end_offsets[:-1] >= RECEIVE_TIME_BYTES
+    eight_byte_windows = np.lib.stride_tricks.sliding_window_view(content_bytes, RECEIVE_TIME_BYTES)
+    unchecked_receive_times_us = np.ascontiguousarray(
+        eight_byte_windows[np.maximum(start_offsets - RECEIVE_TIME_BYTES, 0)]
+    ).view(">u8")[:, 0]
     # damaged values above the range of int64 become negative
-    receive_times_us = (
-        content_bytes.take(time_offsets, mode="clip").view(">u8")[:, 0].astype(np.int64)
-    )
+    receive_times_us = unchecked_receive_times_us.astype(np.int64)
     is_usable &= (receive_times_us >= 0) & (receive_times_us < 1 << 62)
+    median_receive_time_us = int(np.median(receive_times_us[is_usable])) if np.any(is_usable) else 0
+    is_usable &= np.abs(receive_times_us - median_receive_time_us) <= MAX_RECEIVE_TIME_DIFFERENCE_US
+    receive_times_us = np.where(is_usable, receive_times_us, 0)
     if np.any(is_usable):
-        difference_us = np.abs(receive_times_us - int(np.median(receive_times_us[is_usable])))
-        is_usable &= difference_us <= MAX_RECEIVE_TIME_DIFFERENCE_US
-    rows = np.flatnonzero(is_usable)
-    damaged_count = len(is_usable) - len(rows)
-    if not len(rows):
-        return np.zeros_like(receive_times_us), damaged_count
-    # Interpolate times relative to the first, so that float64 resolves microseconds
-    first_time_us = receive_times_us[rows[0]]
-    time_since_first_receipt_us = np.interp(
-        np.arange(len(is_usable)), rows, receive_times_us[rows] - first_time_us
-    )
-    return first_time_us + np.rint(time_since_first_receipt_us).astype(np.int64), damaged_count
+        rows = np.flatnonzero(is_usable)
+        # Interpolate times relative to the first, so that float64 resolves microseconds
+        time_since_first_receipt_us = np.interp(
+            np.arange(len(start_offsets)), rows, receive_times_us[rows] - receive_times_us[rows[0]]
+        )
+        receive_times_us = receive_times_us[rows[0]] + np.rint(time_since_first_receipt_us).astype(
+            np.int64
+        )
+    return receive_times_us, int(np.count_nonzero(~is_usable))

@@ -459,10 +459,8 @@ def _choose_time_unit(
     if given_unit is not None:
         return given_unit, "the unit was given with --position-time-unit"
     median_time, time_steps = times.median(), times.diff()
-    if (
-        abs(median_time) * SECONDS_BY_TIME_UNIT.get(unit_in_column_name, np.inf)
-        < MAX_VALID_UNIX_TIME_S
-    ):
+    unit_s = SECONDS_BY_TIME_UNIT.get(unit_in_column_name)
+    if unit_s is not None and abs(median_time) * unit_s < MAX_VALID_UNIX_TIME_S:
         return unit_in_column_name, "from the column name"
     median_step = time_steps[time_steps > 0.0].median()
     plausible_units = []
