@@ -93,8 +93,8 @@ def make_sigma_ratio_html(verdicts: Sequence[Verdict], axis: str, name: str = ""
         paths=MARKER_SVG_PATHS,
         percent=_format_svg_position,
         ticks=[
-            (_format_svg_position(map_ratio_to_axis(tick)), RATIO_AXIS_TICKS[tick])
-            for tick in LABELLED_RATIO_TICKS
+            (_format_svg_position(map_ratio_to_axis(tick)), label, tick not in LABELLED_RATIO_TICKS)
+            for tick, label in RATIO_AXIS_TICKS.items()
         ],
         limits=format_consistent_ratios(),
         names=FILTER_NAMES,
