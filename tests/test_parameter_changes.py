@@ -4,9 +4,14 @@ from comparisons import compare
 from exchange import replace
 from flights import Estimator, aisle_flight, unexplained
 
+from px4fuse.diagnose import diagnose
 from px4fuse.finding import Finding
 from px4fuse.findings import ekf2_settings, find
 from px4fuse.flight.model import Flight, ParameterChange
+from px4fuse.request import ComparisonRequest
+from px4fuse.simulation.faults import parse_faults
+from px4fuse.simulation.flights import simulate_flight
+from px4fuse.simulation.scenario import Scenario
 
 
 def with_change(flight: Flight, name: str, before: float, after: float) -> Flight:
@@ -39,3 +44,14 @@ def test_parameter_change_with_larger_later_error_is_a_warning() -> None:
     changed = found(with_change(flight, "EKF2_EV_DELAY", 0.0, 200.0))
     assert changed.severity == "warning"
     assert "EKF2's position RMSE along the main axis is 0.0" in changed.message
+
+
+def test_replay_ignores_change_of_parameter_that_it_does_not_use() -> None:
+    flight = simulate_flight(Scenario(seed=2, passes=3), parse_faults([]))
+    changed = with_change(flight, "EKF2_GPS_P_NOISE", 0.5, 0.6)
+    replays = [
+        diagnose(ComparisonRequest(log=one.log.name), flight=one).ekf2_model.baseline_replay
+        for one in (flight, changed)
+    ]
+    for replay in replays:
+        assert replay.updates["innovation_north_m"].notna().sum() > 100

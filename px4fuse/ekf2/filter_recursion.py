@@ -228,7 +228,8 @@ def run_segment(  # noqa: PLR0912, PLR0915 (one recursion, read from top to bott
         for name in inputs.settings
     }
     # A parameter change in flight does not apply to configurations that change this parameter
-    for name, value in segment.changed_parameters.items():
+    for name in segment.changed_parameters.keys() & parameters.keys():
+        value = segment.changed_parameters[name]
         parameters[name][parameters[name] == inputs.settings[name]] = value
     get_switches = attrgetter(
         "estimates_biases",
