@@ -233,7 +233,7 @@ def find_detector_modules() -> dict[str, str]:
         for name in FINDING_TITLES
         for stem, prefixes in {
             "noises": ("sigma_", "kf_", "ekf2_over", "ekf2_under"),
-            "ekf2_noise": ("ekf2_noise_",),
+            "ekf2_settings": ("ekf2_noise_",),
         }.items()
         if name.startswith(prefixes)
     }
