@@ -84,7 +84,7 @@ def detect_invalid_rows(analysis: Analysis) -> Findings:
         time_s = invalid_reasons.index[invalid_reasons == reason].to_series()
         if time_s.empty:
             continue
-        # Invalid samples form one span if no valid sample is between them
+        # Successive invalid samples form one span
         times_by_span = time_s.groupby(np.searchsorted(source.samples.index, time_s))
         spans = tuple(zip(times_by_span.min().tolist(), times_by_span.max().tolist(), strict=True))
         start_s, end_s = max(spans, key=lambda span: span[1] - span[0])
