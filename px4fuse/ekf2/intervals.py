@@ -89,7 +89,7 @@ class EventIntervals:
         state_change_by_correction, state_change_by_acceleration : ndarray, shape (E, 15)
             Change of the state by attitude correction, and by acceleration.
         gyro_noise_covariance, accelerometer_noise_covariance : ndarray, shape (E, 9, 9)
-            Process noise of each prediction step for unit noise: gyro 1 rad/s, accelerometer 1 m/s².
+            Process noise per prediction step, for 1 rad/s (gyroscope) or 1 m/s² (accelerometer).
         """
         state_derivatives, duration_s = self.state_derivatives[rows], self.duration_s[rows]
         transition = np.tile(np.eye(STATE_COUNT), (len(duration_s), 1, 1))

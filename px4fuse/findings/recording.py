@@ -1,4 +1,4 @@
-"""Faults of the log: missing data, autopilot restarts, clock jumps, an estimator other than EKF2."""
+"""Faults of the log: missing data, autopilot restarts, clock jumps, another estimator than EKF2."""
 
 import pandas as pd
 
