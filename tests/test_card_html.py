@@ -59,7 +59,7 @@ def test_sigma_ratio_html_plot_shows_ratio_and_interval() -> None:
     ]
     assert html.count('class="interval"') == 3
     assert "not evaluated: the log has no &lt;ground&gt; truth" in html
-    assert 'aria-label="KF, ● source: innovation ÷ √S: 21, overconfident. KF, ◆ ground' in html
+    assert 'aria-label="KF, ● innovation ÷ √S: 21, overconfident. KF, ◆ error ÷ σ' in html
     # only verdicts that are not consistent are bold
     assert re.findall(r'class="ratio( loud)?">([\d.]+)', html) == [
         (" loud", format_ratio(21.0)),

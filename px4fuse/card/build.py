@@ -104,8 +104,7 @@ SOURCE_FAULT_EXPLANATIONS = (
             "source_frame_misaligned",
             "source_position_jump",
         },
-        "KF and EKF2 follow the faulty positions, so innovations show little of the position "
-        "error. Ground truth shows the error.",
+        "KF and EKF2 follow the faulty positions, so innovations hardly show the position error.",
     ),
 )
 
@@ -304,22 +303,21 @@ def _describe_effect(
     if is_height_only(analysis.source):
         return "The source measures only the height, so horizontal errors are not evaluated."
     if effect.position_rmse_m:
-        span_text = horizontal_rmse_text = ""
+        span_text = ""
         if max(segment.start_s - flight.start_s, flight.end_s - segment.end_s) > MIN_GAP_S:
             span_text = f" from {segment.start_s:.1f} to {segment.end_s:.1f} s"
-        if effect.horizontal_rmse_m:
-            horizontal_rmse_text = f" (horizontal: {_format_lengths(effect.horizontal_rmse_m)})"
         is_axis_along_motion = (
             analysis.main.axis.name == AISLE
             and analysis.request is not None
             and analysis.request.heading_deg is None
         )
-        axis_text = " (direction of largest motion)" if is_axis_along_motion else ""
+        axis_text = " (axis of largest motion)" if is_axis_along_motion else ""
         sentences.append(
-            f"Position RMSE against ground truth along {analysis.main.axis.label}{axis_text}"
-            f"{span_text}: "
-            f"{_format_lengths(effect.position_rmse_m)}{horizontal_rmse_text}."
+            f"Position RMSE along {analysis.main.axis.label}{axis_text}{span_text}: "
+            f"{_format_lengths(effect.position_rmse_m)}."
         )
+        if effect.horizontal_rmse_m:
+            sentences.append(f"Horizontal RMSE: {_format_lengths(effect.horizontal_rmse_m)}.")
         sentences += [
             f"The position error of {FILTER_NAMES[verdict.filter]} is "
             f"{format_ratio(verdict.ratio)} times its reported σ."
@@ -367,7 +365,7 @@ def _describe_worst_axis(analysis: Analysis) -> list[str]:
 
 
 def _format_difference(rms_m: float) -> str:
-    return f"Position difference KF − EKF2 along the main axis: {format_metres(rms_m)} m RMS"
+    return f"RMS difference KF − EKF2 along the main axis: {format_metres(rms_m)} m"
 
 
 def _format_lengths(length_by_filter_m: Mapping[FilterName, float]) -> str:
@@ -393,7 +391,7 @@ def _format_actions(causes: Sequence[DiagnosedCause], notes: Sequence[Note]) -> 
             for action in cause.actions
             if action.commands or not action.sentence.startswith("no ")
         ]
-        label = f"Cause {number}. " if len(causes) > 1 else ""
+        label = f"Cause {number}: " if len(causes) > 1 else ""
         numbered_sentences += [f"{label}{sentence}." for sentence in sentences]
     return tuple(dict.fromkeys(numbered_sentences))[:MAX_ACTIONS]
 
@@ -543,8 +541,8 @@ def _describe_difference(effect: FlightErrors, ranked_causes: Sequence[RankedCau
     }
     if len(corrected_filters) == 2:
         return (
-            f"{difference_text}. The first fault on this card affects both KF and EKF2, so their "
-            "difference hardly shows the fault."
+            f"{difference_text}. The first fault affects KF and EKF2 equally, so their difference "
+            "hardly shows it."
         )
     rerun_difference_by_filter_m = {
         trial.filter: trial.after.difference_rms_m for trial in reversed(trials)
@@ -555,7 +553,7 @@ def _describe_difference(effect: FlightErrors, ranked_causes: Sequence[RankedCau
     )
     if rerun_difference_rms_m is None:
         return f"{difference_text}."
-    corrected_filter = "EKF2 (predicted by replay)" if is_only_ekf2_corrected else "KF"
+    corrected_filter = "EKF2 (replay)" if is_only_ekf2_corrected else "KF"
     rerun_text = f"{format_metres(rerun_difference_rms_m)} m after correcting {corrected_filter}"
     return f"{difference_text}; {rerun_text}."
 

@@ -170,7 +170,7 @@ def make_cause(
         alternatives=alternative_action_groups,
         actions=actions,
         reruns=tuple(_make_rerun(trial, trials) for trial in trials if can_show_effect(trial)),
-        after=_format_closing_sentence(analysis, useful_trials, alternative_action_groups, actions),
+        after=_format_closing_sentence(analysis, useful_trials, alternative_action_groups),
     )
 
 
@@ -393,15 +393,11 @@ def _format_closing_sentence(
     analysis: Analysis,
     useful_trials: Sequence[Trial],
     alternative_action_groups: Sequence[tuple[Action, ...]],
-    actions: Sequence[Action],
 ) -> str:
     if alternative_action_groups:
-        changes_delay_max = any("EKF2_DELAY_MAX" in action.sentence for action in actions)
         return (
             "For the next flights, correct either the sender or the delay parameter, not both. "
-            + "Either correction needs a larger EKF2_DELAY_MAX. " * changes_delay_max
-            + "--clock-offset corrects only this analysis. If timestamps are late, the delay "
-            "parameter is positive, but --clock-offset is negative."
+            "--clock-offset corrects only this analysis."
         )
     if any(trial.kinds == ("defaults",) for trial in useful_trials):
         return "KF is consistent with the default noises as well as with the estimated noises."

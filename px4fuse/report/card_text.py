@@ -34,7 +34,7 @@ TEXT_INDENT = 11  # characters of a label with blanks
 # Ticks with labels on the axis of σ ratios
 LABELLED_RATIO_TICKS = (0.1, 0.5, 1.0, 2.0, 10.0)
 SYMBOL_BY_REFERENCE = {"source": "●", "truth": "◆"}
-QUANTITY_LABELS = {"source": "● source: innovation ÷ √S", "truth": "◆ ground truth: error ÷ σ"}
+QUANTITY_LABELS = {"source": "● innovation ÷ √S", "truth": "◆ error ÷ σ (ground truth)"}
 SEVERITY_SIGNS = {
     "error": "■ ERROR",
     "warning": "▲ WARNING",
@@ -52,6 +52,8 @@ SEVERITY_STYLES = {
 ASCII_REPLACEMENTS = str.maketrans("░●◆◀▶─÷−–²³×", ":ox<>-/--23x") | str.maketrans(
     {"√": "sqrt ", "σ": "sigma", "→": "->", "°": " deg", "±": "+-", "ν": "nu", "…": "..."}
 )
+# Each sentence begins on a new line
+SENTENCE_END_PATTERN = re.compile(r"(?<=\.) (?=[A-Z])")
 ALL_FINDINGS_PLACE = "in All findings of the report"
 AIDS_CAPTION = (
     "RMS of innovation ÷ √S of each aiding source that EKF2 fused. A value below 1 means that √S "
@@ -65,7 +67,7 @@ class Paragraph(NamedTuple):
     Attributes
     ----------
     wrap_indent : str or None
-        Indent of further lines; None if the paragraph is one line, such as a command.
+        Indent of further lines and sentences; None if the paragraph is one line, such as a command.
     plot : str
         Plot on the right, omitted on a narrow terminal.
     """
@@ -78,14 +80,17 @@ class Paragraph(NamedTuple):
 
     def wrap(self, width: int) -> list[str]:
         if self.wrap_indent is not None:
-            return textwrap.wrap(
-                self.text,
-                width,
-                initial_indent=self.first_indent,
-                subsequent_indent=self.wrap_indent,
-                break_long_words=False,
-                break_on_hyphens=False,
-            )
+            lines = list[str]()
+            for sentence in SENTENCE_END_PATTERN.split(self.text):
+                lines += textwrap.wrap(
+                    sentence,
+                    width,
+                    initial_indent=self.wrap_indent if lines else self.first_indent,
+                    subsequent_indent=self.wrap_indent,
+                    break_long_words=False,
+                    break_on_hyphens=False,
+                )
+            return lines
         if not self.plot or len(self.text) + len(self.plot) <= width:
             return [self.text + self.plot]
         return [self.text.rstrip()] if self.text.strip() else []
@@ -109,7 +114,7 @@ def format_card_lines(card: Card) -> Iterator[Paragraph]:
             yield Paragraph(title, SEVERITY_STYLES[cause.severity])
         label = f"cause {number}" if len(card.causes) > 1 else "cause"
         yield from _format_labelled_lines(label, cause.why)
-        yield from _format_cause_lines(cause)
+        yield from _format_cause_lines(cause, do_this=" ".join(card.do_this))
     if card.more_causes:
         yield Paragraph(f"{card.more_causes} more causes are listed {ALL_FINDINGS_PLACE}")
     for label, text in card.facts.items():
@@ -137,12 +142,12 @@ def note_texts(card: Card) -> list[str]:
 def format_closing_lines(card: Card, *, verbose: bool = False) -> Iterator[Paragraph]:
     """Yield the last lines of a diagnosis card: commands for details, and terms."""
     actions = [action for cause in card.causes for _, action in label_alternatives(cause)]
-    sentences = [] if verbose else ["More: -v."]
-    if any(action.where == "console" for action in actions):
-        sentences.append("Console means the MAVLink Console of QGroundControl.")
+    texts = [] if verbose else ["More: -v"]
     if card.id:
-        sentences.append(f"Meaning: px4fuse explain {card.id}")
-    yield from _wrap_lines(" ".join(sentences), "", "")
+        texts.append(f"Explanation: px4fuse explain {card.id}")
+    yield from _wrap_lines("; ".join(texts), "", "")
+    if any(action.where == "console" for action in actions):
+        yield Paragraph("Console: MAVLink Console of QGroundControl")
 
 
 def with_typed_path(card: Card, path: str | None) -> Card:
@@ -260,9 +265,13 @@ def format_headline_lines(card: Card) -> Iterator[Paragraph]:
     yield Paragraph(f"{severity_and_id}: {card.headline}", SEVERITY_STYLES[card.severity])
 
 
-def _format_cause_lines(cause: DiagnosedCause) -> Iterator[Paragraph]:
+def _format_cause_lines(cause: DiagnosedCause, do_this: str) -> Iterator[Paragraph]:
     yield from _format_labelled_lines("when", format_spans(cause.spans_s))
-    actions = label_alternatives(cause)
+    actions = [
+        (prefix, action)
+        for prefix, action in label_alternatives(cause)
+        if prefix or action.commands or action.sentence[1:] not in do_this
+    ]
     labels = [f"{prefix}{format_target(action)}" for prefix, action in actions]
     label_width = max(map(len, labels), default=0) + 2
     for label, (_, action) in zip(labels, actions, strict=True):
@@ -330,8 +339,8 @@ def format_rerun_note(reruns: Sequence[Rerun]) -> str:
     if not replay_starts_s:
         return ""
     return (
-        "EKF2 (replay) is a prediction by px4fuse's model of EKF2. Its statistics exclude gaps and "
-        f"the time before {min(replay_starts_s):.0f} s, so they differ from those of the flight."
+        "EKF2 (replay): prediction by px4fuse's model of EKF2, without gaps and the first "
+        f"{min(replay_starts_s):.0f} s."
     )
 
 
@@ -350,10 +359,10 @@ def _format_percent(fraction: float) -> str:
 def _format_verdict_lines(card: Card) -> Iterator[Paragraph]:
     if not card.verdicts:
         return
-    direction_text = "" if card.effect is None else f", {card.effect.axis}"
+    direction_text = "" if card.effect is None else f" {card.effect.axis}"
     yield Paragraph("")
-    heading = "Consistency: RMS of actual error ÷ reported σ (1: consistent)"
-    yield from _wrap_lines(f"{heading}{direction_text}", "", "  ")
+    heading = f"Consistency{direction_text} (RMS of error ÷ reported σ; 1: consistent)"
+    yield from _wrap_lines(heading, "", "  ")
     legend, too_large_label = f"  ░ consistent ({format_consistent_ratios()})", "σ too large"
     yield Paragraph(
         f"{'':{AXIS_INDENT}}",
@@ -369,12 +378,12 @@ def _format_verdict_lines(card: Card) -> Iterator[Paragraph]:
 
 def _format_verdict_line(verdict: Verdict) -> Paragraph:
     filter_label = FILTER_NAMES[verdict.filter] if verdict.against == "source" else ""
-    label_text = f"  {filter_label:4} {QUANTITY_LABELS[verdict.against]:25}"
+    label_text = f"  {filter_label:4} {QUANTITY_LABELS[verdict.against]:26}"
     if verdict.ratio is None:
         verdict_text = f"{'–':>7}  not evaluated: {verdict.reason}"
         return Paragraph(verdict_text, "", label_text, " " * 41)
     verdict_word = f"({verdict.word})" if verdict.is_explained else verdict.word
-    verdict_text = f"{label_text}{format_ratio(verdict.ratio):>7}  {verdict_word}"
+    verdict_text = f"{label_text}{format_ratio(verdict.ratio):>6}  {verdict_word}"
     style = "bold" if verdict.is_fault else ""
     sigma_ratio_plot = draw_sigma_ratio(verdict.ratio, verdict.against)
     return Paragraph(f"{verdict_text:{AXIS_INDENT}}", style, plot=sigma_ratio_plot)
