@@ -4,12 +4,17 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 import pandas as pd
-from scipy.integrate import cumulative_trapezoid
 from scipy.ndimage import binary_erosion, gaussian_filter1d, median_filter
 from scipy.signal import butter, sosfiltfilt
 
 from px4fuse.comparison.projection import remove_origin_resets
-from px4fuse.core.arrays import Array, BoolArray, ComplexArray, interpolate_columns
+from px4fuse.core.arrays import (
+    Array,
+    BoolArray,
+    ComplexArray,
+    integrate_cumulatively,
+    interpolate_columns,
+)
 from px4fuse.errors import Px4FuseError
 from px4fuse.filter.signals import Segment, compute_ned_acceleration
 from px4fuse.flight.model import (
@@ -170,13 +175,11 @@ def make_imu_references(flight: Flight) -> list[SampledTrack]:
     if isinstance(acceleration, Unavailable):
         raise NoMatchError(f"the log has no acceleration in NED ({acceleration.reason})")
     time_s = acceleration.index.to_numpy()
-    velocity_m_s = cumulative_trapezoid(acceleration.to_numpy(), time_s, axis=0, initial=0)
+    velocity_m_s = integrate_cumulatively(acceleration.to_numpy(), time_s)
     grid_track = resample_to_grid(_make_gapless_track(time_s, velocity_m_s))
     if len(grid_track.time_s) * GRID_STEP_S < MIN_OVERLAP_S:
         raise NoMatchError(f"the IMU data are shorter than {MIN_OVERLAP_S:g} s")
-    position_m = cumulative_trapezoid(
-        apply_band_pass(grid_track.position_m), dx=GRID_STEP_S, axis=0, initial=0
-    )
+    position_m = integrate_cumulatively(apply_band_pass(grid_track.position_m), grid_track.time_s)
     return [
         mark_transients(
             replace(grid_track, position_m=apply_band_pass(position_m), name=IMU_REFERENCE)

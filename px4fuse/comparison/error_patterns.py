@@ -8,8 +8,8 @@ from typing import NamedTuple
 
 import numpy as np
 import pandas as pd
+from numpy.lib.stride_tricks import sliding_window_view
 from scipy.interpolate import CubicSpline
-from scipy.ndimage import median_filter, uniform_filter1d
 
 from px4fuse.comparison.model import Comparison
 from px4fuse.core.arrays import Array, integrate_cumulatively, rank_correlation
@@ -205,8 +205,11 @@ def compute_local_residuals(comparison: Comparison) -> LocalResiduals | None:
             weights[:, neighbour] *= other_elapsed_s / (other_elapsed_s - elapsed_s[:, neighbour])
     residual_to_position_sigma_ratio = np.sqrt(1.0 + np.sum(weights**2, axis=1))
     timestamp_deviation_s = time_s - interval_s * np.arange(len(time_s))
-    timestamp_delay_s = timestamp_deviation_s - median_filter(
-        timestamp_deviation_s, TIMESTAMP_MEDIAN_FILTER_LENGTH, mode="nearest"
+    padded_deviation_s = np.pad(
+        timestamp_deviation_s, TIMESTAMP_MEDIAN_FILTER_LENGTH // 2, mode="edge"
+    )
+    timestamp_delay_s = timestamp_deviation_s - np.median(
+        sliding_window_view(padded_deviation_s, TIMESTAMP_MEDIAN_FILTER_LENGTH), axis=1
     )
     half_window_rows = max(2, round(VELOCITY_HALF_WINDOW_S / interval_s))
     window_first_rows = np.clip(rows - half_window_rows, 0, None)
@@ -343,6 +346,8 @@ def fit_errors(comparison: Comparison, local_residuals: LocalResiduals) -> Error
     )
     scale_sigma = np.sqrt(np.mean(residual_m**2) / (path_mean_square_m2 * independent_error_count))
     if comparison.source.origin.may_drift:
+        from scipy.ndimage import uniform_filter1d  # noqa: PLC0415 - slow import
+
         window_length = max(1, round(DRIFT_WINDOW_S / interval_s))
 
         def remove_running_mean(values: Array) -> Array:

@@ -380,8 +380,8 @@ def _format_verdict_line(verdict: Verdict) -> Paragraph:
     filter_label = FILTER_NAMES[verdict.filter] if verdict.against == "source" else ""
     label_text = f"  {filter_label:4} {QUANTITY_LABELS[verdict.against]:26}"
     if verdict.ratio is None:
-        verdict_text = f"{'–':>7}  not evaluated: {verdict.reason}"
-        return Paragraph(verdict_text, "", label_text, " " * 41)
+        verdict_text = f"{'–':>6}  not evaluated: {verdict.reason}"
+        return Paragraph(verdict_text, "", label_text, " " * 40)
     verdict_word = f"({verdict.word})" if verdict.is_explained else verdict.word
     verdict_text = f"{label_text}{format_ratio(verdict.ratio):>6}  {verdict_word}"
     style = "bold" if verdict.is_fault else ""

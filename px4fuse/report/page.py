@@ -8,6 +8,8 @@ import re
 from collections.abc import Mapping, Sequence
 from typing import Any
 
+import numpy as np
+
 from px4fuse.core.text import with_log_name
 from px4fuse.report.style import MUTED_COLOUR, TEXT_COLOUR, Artist, Axes
 
@@ -19,12 +21,9 @@ AXES_RIGHT_MARGIN = 8.0  # points
 LEGEND_HEIGHT = 12.0  # points, of each line
 LEGEND_HANDLE_WIDTH = 30.0  # points, of the line sample with gaps
 LEGEND_CHARACTER_WIDTH = 5.0  # points, more than the mean width in DejaVu Sans of 8 points
-TICK_LABEL_GAP = 4.0  # points, between an axis and its tick labels
 TICK_SPACING = 62.0  # points, approximate minimum
-TICK_LABELS_HEIGHT = 12.0  # points
 # Height (points) below the axes with and without tick labels and axis label
 LABELLED_HEIGHT, UNLABELLED_HEIGHT = 24.5, 3.0
-GRID_STYLE: dict[str, Any] = {"colors": "#e3e3e3", "lw": 0.5, "zorder": 0.5}
 # Printed characters for which str.isprintable is False
 PRINTED_SPECIAL_CHARACTERS = "\n\N{NO-BREAK SPACE}"
 # PDF/A limits strings to 32,767 characters, so very long words are split
@@ -174,22 +173,36 @@ def to_typst_data(block: Any, log_name: str) -> Any:
             for name, value in block.items()
             if name not in ("figure", "axes")
         }
-        return fields | ({"svg": _render_figure_svg(block)} if "figure" in block else {})
+        return fields | (_render_figure(block) if "figure" in block else {})
     if isinstance(block, Sequence):
         return [to_typst_data(item, log_name) for item in block]
     return block
 
 
-def _render_figure_svg(block: Mapping[str, Any]) -> str:
+def _render_figure(block: Mapping[str, Any]) -> PageBlock:
+    """Return a figure as SVG, and its frame, ticks and axis labels, which Typst draws."""
+    fields: PageBlock = {}
     if "axes" in block:
-        _place_axes(block)
-        _draw_ticks(block["axes"])
+        frame = _place_axes(block)
+        axes = block["axes"]
+        axes.apply_aspect()  # sets the final limits of maps
+        x_ticks, x_label = _find_ticks(axes, axes.xaxis)
+        y_ticks, y_label = _find_ticks(axes, axes.yaxis)
+        fields = {
+            "frame": frame,
+            "x_ticks": x_ticks,
+            "y_ticks": y_ticks,
+            "x_label": x_label,
+            "y_label": y_label,
+        }
+        axes.set_axis_off()  # the ticks of matplotlib are slow: each consists of five artists
     buffer = io.StringIO()
     block["figure"].savefig(buffer, format="svg", metadata={"Date": None, "Creator": None})
-    return buffer.getvalue()
+    return fields | {"svg": buffer.getvalue()}
 
 
-def _place_axes(block: Mapping[str, Any]) -> None:
+def _place_axes(block: Mapping[str, Any]) -> tuple[float, float, float, float]:
+    """Set the size of a figure and its axes; return left, top, width and height (points)."""
     axes, width, height = block["axes"], block["width"], block["height"]
     left_margin, right_margin = block["margins"]
     top_margin = 14.0 if axes.get_legend() else 4.0
@@ -205,36 +218,18 @@ def _place_axes(block: Mapping[str, Any]) -> None:
             height / total_height,
         )
     )
-    axes.xaxis.set_label_coords(0.5, -TICK_LABELS_HEIGHT / height)
-    axes.yaxis.set_label_coords((10.0 - left_margin) / axes_width, 0.5)
+    return left_margin, top_margin, axes_width, height
 
 
-def _draw_ticks(axes: Axes) -> None:
-    """Draw grid and tick labels; the data and limits of the axes must not change afterwards.
-
-    The ticks of matplotlib are slow: each tick consists of five artists.
-    """
-    axes.apply_aspect()  # sets the final limits of maps
-    axes.set(xlim=axes.get_xlim(), ylim=axes.get_ylim())
-    for axis, draw_lines, get_line_transform, get_label_transform in (
-        (axes.xaxis, axes.vlines, axes.get_xaxis_transform, axes.get_xaxis_text1_transform),
-        (axes.yaxis, axes.hlines, axes.get_yaxis_transform, axes.get_yaxis_text1_transform),
-    ):
-        formatter, locations = axis.get_major_formatter(), axis.get_majorticklocs().tolist()
-        low, high = sorted(axis.get_view_interval())
-        tolerance = 1e-9 * (high - low)
-        label_by_location = {
-            location: label
-            for location, label in zip(locations, formatter.format_ticks(locations), strict=True)
-            if low - tolerance <= location <= high + tolerance
-        }
-        draw_lines([*label_by_location], 0.0, 1.0, transform=get_line_transform(), **GRID_STYLE)
-        axis.set_label_text(f"{axis.get_label_text()} {formatter.get_offset()}".strip())
-        axis.set_ticks([])
-        if axis is axes.xaxis and not axes.get_xlabel():
-            continue
-        transform, vertical_alignment, horizontal_alignment = get_label_transform(TICK_LABEL_GAP)
-        for location, label in label_by_location.items():
-            x, y = (location, 0.0) if axis is axes.xaxis else (0.0, location)
-            text = axes.text(x, y, label, transform=transform)
-            text.set(va=vertical_alignment, ha=horizontal_alignment)
+def _find_ticks(axes: Axes, axis: Any) -> tuple[list[tuple[float, str]], str]:
+    """Return the ticks of an axis (fraction of its length, label), and the axis label."""
+    formatter, locations = axis.get_major_formatter(), np.asarray(axis.get_majorticklocs())
+    labels = formatter.format_ticks(locations)
+    points = axes.transLimits.transform(axes.transScale.transform(np.stack([locations] * 2, 1)))
+    fractions = points[:, 0 if axis is axes.xaxis else 1].tolist()
+    ticks = [
+        (fraction, label)
+        for fraction, label in zip(fractions, labels, strict=True)
+        if -1e-9 <= fraction <= 1.0 + 1e-9
+    ]
+    return ticks, f"{axis.get_label_text()} {formatter.get_offset()}".strip()

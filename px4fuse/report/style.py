@@ -124,8 +124,10 @@ def decimate_series(times: Array, values: Array) -> tuple[Array, Array]:
     """Limit the points of a series; the minimum and maximum of each interval remain."""
     if len(times) <= MAX_DRAWN_POINTS:
         return times, values
-    intervals = np.array_split(np.arange(len(times)), MAX_DRAWN_POINTS // 2)
-    selected_rows = np.unique(
-        [rows[find(values[rows])] for rows in intervals for find in (np.argmin, np.argmax)]
-    )
+    bounds = np.linspace(0, len(times), MAX_DRAWN_POINTS // 2 + 1).astype(int)
+    starts, longest = bounds[:-1], int(np.diff(bounds).max())
+    # rows of each interval; shorter intervals repeat their last row
+    rows = np.minimum(starts[:, None] + np.arange(longest), bounds[1:, None] - 1)
+    extremes = [starts + find(values[rows], axis=1) for find in (np.argmin, np.argmax)]
+    selected_rows = np.unique(extremes)
     return times[selected_rows], values[selected_rows]

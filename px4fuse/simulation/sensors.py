@@ -7,11 +7,10 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.integrate import cumulative_trapezoid
 from scipy.signal import lfilter
 from scipy.spatial.transform import Rotation
 
-from px4fuse.core.arrays import Array, ArrayPair, BoolArray, IntArray
+from px4fuse.core.arrays import Array, ArrayPair, BoolArray, IntArray, integrate_cumulatively
 from px4fuse.flight.ekf2_parameters import GNSS_POS, PARAMETERS
 from px4fuse.readers.px4_positions import unproject
 from px4fuse.readers.px4_topics import GPS_POSITION
@@ -298,7 +297,7 @@ def simulate_positions(
     state = motion.compute_true_state(time_s)
     position_m = state.position_m.copy()
     speed_m_s = np.hypot(state.velocity_m_s[:, 0], state.velocity_m_s[:, 1])
-    distance_m = cumulative_trapezoid(speed_m_s, time_s, initial=0)
+    distance_m = integrate_cumulatively(speed_m_s, time_s)
     is_loop, is_outdoor = scenario.kind == "loop", scenario.kind == "outdoor"
     drift_m = simulate_vio_drift(scenario, distance_m) * is_loop
     position_m += drift_m

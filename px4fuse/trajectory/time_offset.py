@@ -7,7 +7,6 @@ from dataclasses import dataclass
 
 import numpy as np
 from msgspec import structs
-from scipy.ndimage import gaussian_filter1d, maximum_filter1d
 from scipy.optimize import minimize_scalar
 from scipy.spatial.transform import Slerp
 from scipy.special import stdtrit
@@ -185,6 +184,8 @@ def _smooth_values(
     grid_values: Array, time_s: Array, step_s: float, derivative_order: int = 0
 ) -> Array:
     """Smooth values on a time grid with a Gaussian filter, or return their smoothed derivative."""
+    from scipy.ndimage import gaussian_filter1d  # noqa: PLC0415 - slow import
+
     smoothing_sigma_samples = max(SMOOTHING_SIGMA_S, compute_median_interval_s(time_s)) / step_s
     return np.asarray(
         gaussian_filter1d(grid_values, smoothing_sigma_samples, axis=0, order=derivative_order)
@@ -215,6 +216,8 @@ def _compute_speeds(trajectory: Trajectory, step_s: float) -> tuple[list[Array],
 
 def _find_candidate_offsets_s(sparse_track: Trajectory, dense_track: Trajectory) -> list[float]:
     """Find the time offsets with correlated speeds, best first (Padfield 2012, eqs. 3 to 9)."""
+    from scipy.ndimage import maximum_filter1d  # noqa: PLC0415 - slow import
+
     step_s = _choose_grid_step_s(sparse_track, dense_track)
     shorter_duration_s = min(float(np.ptp(track.time_s)) for track in (sparse_track, dense_track))
     if shorter_duration_s < 10 * step_s:
