@@ -110,7 +110,7 @@ def solve(
         raise TrajectoryError(
             "The cost of the pose graph is not finite: a pose or a measurement is too large, or "
             "not finite",
-            "Correct this number, or remove its line.",
+            "Correct the pose or measurement, or remove its line.",
         )
     weights = np.ones(len(can_be_false))
     optimum = _minimise(graph, start_residuals, weights)
