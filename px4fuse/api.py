@@ -114,8 +114,8 @@ def compare(
         )
     if isinstance(log, Flight) and (position, system) != (None, None):
         raise SettingsError(
-            "the arguments position and system are not possible with a Flight, because "
-            "they determine how a log is read.",
+            "`position` and `system` cannot be given with a Flight object, "
+            "because they determine how a log is read.",
             "Pass the path of the log, not a Flight object.",
         )
     if isinstance(clock_offset_s, str) and clock_offset_s != request.AUTO:

@@ -127,8 +127,8 @@ def _refine_clock_offset(flight: Flight, analysis: Analysis) -> Flight | None:
         alignment,
         clock_offset_s=alignment.clock_offset_s + offset_s,
         clock_offset_sigma_s=clock_offset.sigma_s,
-        clock_reason="the offset was estimated with the IMU; EKF2's position is "
-        f"{abs(offset_s):.3f} s {'late' if offset_s < 0 else 'early'} compared with the IMU",
+        clock_reason="the time offset was estimated with the IMU; EKF2's position is "
+        f"{abs(offset_s):.3f} s {'late' if offset_s < 0 else 'early'} relative to the IMU",
     )
     file_track, *other_tracks = flight.positions
     shifted_track = replace(shift_clock(file_track, offset_s), alignment=alignment)

@@ -38,8 +38,8 @@ def run_aisle_example() -> Replay:
         measurement_m=TRUE_VELOCITY_M_S * time_s + np.array(UWB_ERRORS_M),
         acceleration=Unavailable(
             "acceleration",
-            "Example 1 of the course UAT 366 has no acceleration",
-            "No action is needed: KF assumes constant velocity.",
+            "Example 1 of the course UAT 366 contains no acceleration",
+            "No action is needed.",
         ),
     )
     return replay(axis, settings, InitialState(time_s=0.0, position_m=0.0))

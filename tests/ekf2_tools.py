@@ -13,7 +13,7 @@ from px4fuse.trajectory.rotation import skew
 EYE = np.eye(15)
 # Properties of KF in the order in which EKF2's replace them, without additional aiding sources
 REPLACED_PROPERTIES = (
-    "sample times and steps", "timestamps and delay", "measurement noise",
+    "sample times and time steps", "timestamps and delay", "measurement noise",
     "accelerometer bias state", "process noise", "attitude and gyro bias states",
     "rejections and resets", "output predictor",
 )  # fmt: skip

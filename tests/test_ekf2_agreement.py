@@ -130,7 +130,7 @@ def test_ekf2_replay_agreement_is_tested_with_logged_rejections(axis, good):
                        rejected_fraction_replayed=0.3)  # fmt: skip
     found = judge_with_logged_rejections(own_gate, logged_gate)
     assert found.good is good
-    assert found.reason.startswith("if the replay rejects the same samples as EKF2, ")
+    assert found.reason.startswith("in a replay that rejects the same samples as EKF2, ")
     assert (found.decisions_same, found.rejected_fraction_replayed) == (0.9, 0.2)
     assert found.axes == logged_gate.axes
     # above half of the positions the published position is not tested, but the correlation is

@@ -227,7 +227,7 @@ def test_what_if_without_height_sensor_reports_drift() -> None:
     (lost,) = found.whatif
     assert lost.heights == {}
     assert lost.height_rmse_to_truth_m > 2.0 * found.replayed.height_rmse_to_truth_m
-    assert ". The published height differs by at most " in found.notes[-1]
+    assert ". The replayed heights differ by at most " in found.notes[-1]
 
 
 def test_what_if_gives_no_result_after_long_height_rejection() -> None:
@@ -293,8 +293,8 @@ def test_ekf2_replay_of_heights_without_data_gives_reason() -> None:
     assert why({"baro_hgt": 1.0}) == ""
     assert "range finder in part" in why({"baro_hgt": 1.0, "rng_hgt": 0.0})
     assert "GNSS height in part" in why({"baro_hgt": 1.0, "gnss_hgt": 0.0})
-    assert "bias of the barometer" in why(dict.fromkeys(BOTH, 1.0), EKF2_HGT_REF=1.0)
-    assert "bias of the GNSS height" in why(dict.fromkeys(BOTH, 1.0), EKF2_HGT_REF=0.0)
+    assert "barometer bias" in why(dict.fromkeys(BOTH, 1.0), EKF2_HGT_REF=1.0)
+    assert "GNSS height bias" in why(dict.fromkeys(BOTH, 1.0), EKF2_HGT_REF=0.0)
     assert "height reference is neither" in why(dict.fromkeys(BOTH, 1.0), EKF2_HGT_REF=2.0)
     assert "height reference is neither" in why({})
     assert "barometer is logged at 3.3 Hz" in why({"baro_hgt": 1.0}, rows=3)

@@ -98,7 +98,7 @@ def test_python_compare_arguments_act_like_command_options(sample_log, analysis)
             {"clock_offset_s": "find"},
             "`clock_offset_s` 'find' is not a number of seconds or 'auto'",
         ),
-        ({"position": "a.csv"}, "position and system are not possible with a Flight"),
+        ({"position": "a.csv"}, "`position` and `system` cannot be given with a Flight"),
         ({"sigma_a_m_s2": -1}, "`sigma_a_m_s2` -1 is out of range"),
         ({"start_s": float("nan")}, "`start_s` nan is not a finite number."),
         ({"position_source": "gps"}, "position source gps: no such source."),

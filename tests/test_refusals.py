@@ -117,7 +117,7 @@ REFUSED = {
         "compare a.ulg --system 1",
         "a.ulg: the file is a ULog, but --system is only for MAVLink recordings",
     ),
-    "far time offset": ("evaluate l.ulg:vio s.tum --time-offset 9e5", "give --time-offset auto"),
+    "far time offset": ("evaluate l.ulg:vio s.tum --time-offset 9e5", "set --time-offset to auto"),
     "loop of no drift": ("loop l.ulg --drift 0", "--drift 0 is out of range (0.0001 to 100)"),
     # simulations, pages and invalid logs
     "simulation as PDF": ("simulate -o flight.pdf", "ending in .ulg"),
@@ -157,7 +157,7 @@ REFUSED = {
             ),
             (
                 "--sweep EKF2_EVP_NOISE=0.1:0.2:1",
-                "1 parameter values for a sweep: give a number from 2 to 200",
+                "1 is not a valid number of sweep values. Use 2 to 200.",
             ),
             (
                 "--set EKF2_EVP_NOISE=0.1 --sweep EKF2_EVP_NOISE=0.1:0.2",
@@ -220,7 +220,7 @@ REFUSED = {
     "landing, and open": ("loop s.tum --landed-at 1,2 --open", "exclude each other"),
     "open, and nothing to correct": ("loop s.tum --open --tum o.tum", "the path is not corrected"),
     "from after to": ("loop s.tum --from 50 --to 40", "Change --from or --to"),
-    "no such part": ("loop l.ulg:slam", "a flight log has no track 'slam'"),
+    "no such part": ("loop l.ulg:slam", "flight logs have no track 'slam'"),
     "part of a trajectory": ("loop s.tum:vio", "s.tum contains only one body, which has no name"),
     "frame of a flight": ("loop l.ulg --frame enu", "--frame is only for trajectory files"),
     "no PDF": ("loop s.tum -o r.txt", "r.txt: the output is a PDF"),

@@ -319,7 +319,7 @@ def test_ekf2_position_jump_at_origin_shift_is_removed(at, good):
     np.testing.assert_allclose(state[Columns.POSITION], truth_at(STATE_TIME), atol=1e-12)
     assert f"{len(at)} of horizontal position" in statement
     assert "removed" in statement
-    assert "kept" not in statement
+    assert "remain" not in statement
 
 
 @pytest.mark.parametrize("reset_s", [4.0, 10.0, 15.0])
@@ -330,7 +330,7 @@ def test_ekf2_reset_that_corrects_drift_remains_in_ekf2_state(reset_s):
     ekf2 = ekf2_of(np.outer(drift, NORTH), resets)
     state, statement = remove_origin_resets(ekf2, noisy_track(), WHOLE)
     pd.testing.assert_frame_equal(state, ekf2.state)
-    assert "kept" in statement
+    assert "remain" in statement
     assert "1 of velocity" in statement
     assert "undone" not in statement
 
@@ -345,7 +345,7 @@ def test_ekf2_height_reset_is_kept_if_position_reset_is_removed():
     np.testing.assert_allclose(state["north_m"], truth_at(STATE_TIME)[:, 0], atol=1e-12)
     np.testing.assert_array_equal(state["down_m"], ekf2.state["down_m"])
     assert "horizontal" in statement.split("EKF2 resets")[1]
-    assert "height" in statement.split("kept")[1]
+    assert "height" in statement.split("remain")[1]
 
 
 def test_height_reset_is_kept_if_source_has_no_height():
@@ -357,11 +357,13 @@ def test_height_reset_is_kept_if_source_has_no_height():
     assert "removed" in remove_origin_resets(ekf2, track, WHOLE)[1]
     state, statement = remove_origin_resets(ekf2, blind, WHOLE)
     pd.testing.assert_frame_equal(state, ekf2.state)
-    assert statement == "EKF2 resets that correct an error of EKF2 were kept: 1 of height"
+    assert (
+        statement == "EKF2 resets that correct an error of EKF2 remain in EKF2's state: 1 of height"
+    )
 
 
 @pytest.mark.parametrize(("reset_s", "said"), [
-    (0.5, ""), (1.0, ""), (1.1, "kept"), (17.9, "kept"), (18.0, "kept"),
+    (0.5, ""), (1.0, ""), (1.1, "remain"), (17.9, "remain"), (18.0, "remain"),
     (18.5, ""),
 ])  # fmt: skip
 def test_ekf2_resets_outside_evaluated_segment_are_not_removed(reset_s, said):

@@ -168,7 +168,7 @@ class TestFlownFlights:
         ("log", "said"),
         [
             ("simulated/v1.16.1_aisle_2hz_stock", "never fused the horizontal position"),
-            ("gps/v1.13.3_gps_profile1", "below the rate that EKF2 fused"),
+            ("gps/v1.13.3_gps_profile1", "but EKF2 fused more samples"),
             ("real/mengchaoheng_PX4_ulog_plottools_hist_6a8cf408_test3",
              "23 % of the IMU samples are missing"),
             ("real/vladimireganov_ROS_PX4_MOCAP_square2", "EKF2 may have fused more samples"),

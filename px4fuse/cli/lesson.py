@@ -1,16 +1,16 @@
-"""Command ``px4fuse lesson``: prints the worked examples of the lesson UAT 366, module 2."""
+"""Command ``px4fuse lesson``: prints the worked examples of the course UAT 366, module 2."""
 
 import click
 
 
 @click.group()
 def lesson() -> None:
-    """Print the worked examples of the lesson UAT 366, module 2."""
+    """Print the worked examples of the course UAT 366, module 2."""
 
 
 @lesson.command()
 def kalman() -> None:
-    """Print Example 1 of the lesson: KF with UWB positions in an aisle at 1 m/s."""
+    """Print Example 1 of the course: KF with UWB positions in an aisle at 1 m/s."""
     from px4fuse.lesson import format_kalman_lines
 
     for line in format_kalman_lines():
@@ -19,7 +19,7 @@ def kalman() -> None:
 
 @lesson.command()
 def loop() -> None:
-    """Print Example 2 of the lesson: loop closure error, distributed by distance."""
+    """Print Example 2 of the course: loop closure error, distributed by distance."""
     from px4fuse.lesson import format_loop_lines
 
     for line in format_loop_lines():

@@ -250,7 +250,7 @@ def compute_error_statistics(
     if np.isfinite(position_m).sum() < projection.MIN_COMMON_SAMPLES:
         return Unavailable(
             "error against ground truth",
-            "filter and ground truth have no common times",
+            "filter and ground truth do not overlap in time",
             "Choose a time span with ground truth.",
         )
     nees_position, nees_velocity = (

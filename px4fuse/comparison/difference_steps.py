@@ -198,8 +198,8 @@ def _describe_step_effect(step: PropertyReplacement, explanation: DifferenceExpl
     )
     if explained_fraction > 1.0:  # the contributions add up to 1, so others are negative
         return (
-            f"{change_text}. This contribution is {explained_fraction:.2g} times the mean square "
-            "difference KF - EKF2: other properties of EKF2 have the opposite effect."
+            f"{change_text}. This change contributes {explained_fraction:.2g} times the mean "
+            "square difference KF - EKF2; other contributions are negative."
         )
     return (
         f"{change_text}, and the mean square difference KF - EKF2 decreases by "
@@ -262,7 +262,7 @@ def _describe_property_differences(
         steps.PROCESS_NOISE_PROPERTY: (
             f"EKF2_ACC_NOISE {acc_noise:g} has the same effect as SIGMA_A "
             f"{acc_noise_as_sigma_a:.2g} m/s²; KF has SIGMA_A {kf_settings.sigma_a_m_s2:.2g} m/s². "
-            f"EKF2 gives the {higher_weighted_input} more weight than KF"
+            f"EKF2 gives the {higher_weighted_input} more weight than KF does"
         ),
         steps.ATTITUDE_PROPERTY: (
             "EKF2 corrects its attitude with the positions; KF uses EKF2's logged attitude"
@@ -320,6 +320,6 @@ def _describe_rmse(explanation: DifferenceExplanation) -> list[str]:
     index = int(np.argmax(mean_square_changes))
     return [
         f"Position RMSE: EKF2 {ekf2_rmse_m:.3f} m, KF {kf_rmse_m:.3f} m. KF's RMSE changes "
-        f"most with EKF2's {explanation.steps[index].name}, from {rmses_m[index]:.3f} to "
+        f"most if KF uses EKF2's {explanation.steps[index].name}: from {rmses_m[index]:.3f} to "
         f"{rmses_m[index + 1]:.3f} m."
     ]

@@ -308,7 +308,7 @@ def _explain_choice(flight: Flight, track: PositionTrack) -> str:
     if track.origin.is_fused_as_gnss:
         return "the only position source in the log, fused by EKF2"
     log_text = f" (from {track.log})" if track.log and track.log != flight.log.name else ""
-    return f"chosen automatically: positions {track.origin.path}{log_text}"
+    return f"chosen automatically; position origin: {track.origin.path}{log_text}"
 
 
 def shift_clock(track: PositionTrack, clock_offset_s: float) -> PositionTrack:

@@ -55,7 +55,7 @@ def remove_origin_resets(
     ]
     state = ekf2.state.copy() if resets_in_segment else ekf2.state
     removed = "EKF2 resets that only move the origin of EKF2's frame were removed"
-    kept = "EKF2 resets that correct an error of EKF2 were kept"
+    kept = "EKF2 resets that correct an error of EKF2 remain in EKF2's state"
     resets_by_treatment: dict[str, list[str]] = {removed: [], kept: []}
     for label, quantity, columns in (
         ("horizontal position", "position", Columns.POSITION[:2]),

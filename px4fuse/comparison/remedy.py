@@ -280,9 +280,9 @@ def make_height_noise_advice(
     if not is_fused or height_noise_m < MIN_HEIGHT_TO_HORIZONTAL_NOISE_RATIO * noise_m:
         return ""
     return (
-        f" {EV_POS.noise} is also the noise of heights, but the height noise is "
+        f" EKF2 also uses {EV_POS.noise} as the height noise, but the estimated height noise is "
         f"{height_noise_m:.2g} m. Set {EV_POS.noise_mode_parameter} to 0, and send each position "
-        f"with a variance of {height_noise_m**2:.2g} m² for z."
+        f"with a z variance of {height_noise_m**2:.2g} m²."
     )
 
 

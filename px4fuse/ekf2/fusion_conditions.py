@@ -41,25 +41,28 @@ SET_TIMESTAMP_ACTION = (
     "Set timestamp_sample to the time of measurement in microseconds since the autopilot's boot."
 )
 CLOCK_SYNCHRONISATION_ACTION = (
-    "Synchronise the clocks: UXRCE_DDS_SYNCT 1 with the uXRCE-DDS agent, or answer TIMESYNC of "
-    "MAVLink. Send microseconds."
+    "Synchronise the clocks: set UXRCE_DDS_SYNCT to 1 (uXRCE-DDS agent), or answer MAVLink "
+    "TIMESYNC messages. Send timestamps in microseconds."
 )
+TIMESTAMPS_TOO_LATE_EFFECT = "The position timestamps are later than EKF2's time."
 # Effect on EKF2 of timestamps that are not synchronised with the autopilot's clock
 EFFECT_BY_UNSYNCHRONISED_CLOCK = {
     **dict.fromkeys(
         ("another clock", "an unknown clock", "UNIX time in seconds"),
-        "For EKF2, the positions are too old or in the future.",
+        "The position timestamps are too old for EKF2, or later than EKF2's time.",
     ),
     **{
-        f"UNIX time in {unit}seconds": "For EKF2, the positions are in the future."
+        f"UNIX time in {unit}seconds": TIMESTAMPS_TOO_LATE_EFFECT
         for unit in ("nano", "micro", "milli")
     },
 }
 # Effect on EKF2 of unusable timestamps, by their clock or unit
 EFFECT_BY_UNUSABLE_TIMESTAMP = {
-    **dict.fromkeys(("0", "milliseconds", "seconds"), "For EKF2, the positions are too old."),
+    **dict.fromkeys(
+        ("0", "milliseconds", "seconds"), "The position timestamps are too old for EKF2."
+    ),
     **EFFECT_BY_UNSYNCHRONISED_CLOCK,
-    "nanoseconds": "For EKF2, the positions are in the future.",
+    "nanoseconds": TIMESTAMPS_TOO_LATE_EFFECT,
 }
 # GNSS checks in the bit order of gps_check_fail_flags: name, parameter of the limit, unit
 GNSS_CHECKS = (
@@ -91,7 +94,7 @@ NO_UNMET_CONDITION_LOGGED = UnmetCondition(
     "",
     "",
     "The log does not show why EKF2 fused no position: all logged conditions for fusion are met.",
-    "Run `ekf2 status` in the console of PX4: it prints if attitude and position are valid.",
+    "Run `ekf2 status` in the PX4 console to check attitude and position.",
 )
 
 
@@ -253,7 +256,7 @@ def _check_timestamps(positions: UnfusedPositions) -> Iterator[UnmetCondition]:
             "age",
             f"the positions are {age_s:.2f} s old at arrival",
             f"EKF2 fuses no position that is older than {positions.max_sample_age_s:.2f} s. "
-            "Possible cause: the positions arrive late, or the clock of the timestamps is behind.",
+            "Possible cause: the positions arrive late, or the sender's clock is behind PX4's.",
             action,
         )
 
@@ -358,7 +361,7 @@ def _check_gnss(positions: UnfusedPositions) -> Iterator[UnmetCondition]:
     check_texts = []
     for bit in failed_bits[:3]:
         name, parameter, unit = GNSS_CHECKS[bit]
-        check_details = [f"failed {100.0 * failed_fraction_by_bit[bit]:.0f} % of the time"]
+        check_details = [f"check failed {100.0 * failed_fraction_by_bit[bit]:.0f} % of the time"]
         if np.isfinite(limit := parameters.get(parameter, np.nan)):
             # Only positions with a fix are logged, so their median σ may be within the limit
             if bit in reported_variance_by_check_bit:

@@ -98,7 +98,7 @@ def add_heights(
                 logged_bias is None
                 or not logged_bias.index[0] - MAX_BIAS_LOG_DELAY_S < start_s < logged_bias.index[-1]
             ):
-                return f"EKF2's bias of the {AIDS[aid_name].label} is not logged"
+                return f"EKF2's estimate of the {AIDS[aid_name].label} bias is not logged"
             bias_and_variance = np.array(
                 [
                     np.interp(start_s, logged_bias.index, logged_bias[name])

@@ -305,10 +305,10 @@ def prepare_inputs(  # noqa: PLR0911, PLR0912 (one return per reason)
     if not segments:
         return Unavailable(
             ANALYSIS_NAME,
-            f"EKF2 never fused {aid.label.removesuffix(', position')} for "
-            f"{MIN_SEGMENT_DURATION_S:g} s without a gap in the position source or the IMU",
-            "Record without dropouts (faster SD card, fewer topics) and with a steady position "
-            "source.",
+            "between the gaps of the position source and the IMU, EKF2 fused "
+            f"{aid.label.removesuffix(', position')} for less than {MIN_SEGMENT_DURATION_S:g} s",
+            "Record without dropouts (faster SD card, fewer topics) and send positions at a "
+            "constant rate.",
         )
     if len(flow_samples):
         flow_gate = fusion_record.parameters.get(FLOW.gate, FLOW.default_gate)
@@ -438,7 +438,7 @@ def read_gnss(
     if track.compute_rate_hz() < MAX_DOWNSAMPLED_HZ:
         return Unavailable(
             ANALYSIS_NAME,
-            f"GNSS is logged at {track.compute_rate_hz():.1f} Hz, below the rate that EKF2 fused",
+            f"GNSS is logged at {track.compute_rate_hz():.1f} Hz, but EKF2 fused more samples",
             "Set bit 1 of SDLOG_PROFILE to log all GNSS fixes.",
         )
     parameters = fusion_record.parameters

@@ -217,8 +217,8 @@ def replay_with_settings(
             reasons |= dict.fromkeys(reasons.keys() & parameter_names, reason)
     if inputs.rules.is_horizon_largest_delay:
         reasons["EKF2_DELAY_MAX"] = (
-            f"{model.flight.log.firmware} has no such parameter. The largest EKF2 delay parameter "
-            "sets the delay of the fusion horizon"
+            f"{model.flight.log.firmware} has no EKF2_DELAY_MAX: the largest sensor delay "
+            "parameter sets the delay of the fusion horizon"
         )
     if inputs.received_positions.uses_sender_timestamps:
         reasons[GNSS_POS.delay] = "EKF2 uses measurement times that the GNSS driver reports"

@@ -600,11 +600,11 @@ def judge_with_logged_rejections(
             f"the correlation {min_correlation:.4f} of replayed and logged innovations is below "
             f"the minimum of {MIN_CORRELATION_IF_MOSTLY_REJECTED:g}"
         )
-    reason = f"if the replay rejects the same samples as EKF2, {reason}"
+    reason = f"in a replay that rejects the same samples as EKF2, {reason}"
     if is_mostly_rejected and not is_in_agreement:
         reason = (
             f"{reason}. EKF2 rejected {rejected_fraction:.0%} of the positions and relied on the "
-            "IMU. The frame of the source is probably wrong"
+            "IMU. The frame of the position source is probably wrong"
         )
     return replace(
         agreement_with_rejections,

@@ -47,7 +47,7 @@ NO_TRUTH_OVERLAP = Unavailable(
     "Record ground truth during the whole flight.",
 )
 # Names of the properties in which KF and EKF2 differ
-SAMPLE_TIMES_PROPERTY = "sample times and steps"
+SAMPLE_TIMES_PROPERTY = "sample times and time steps"
 TIMESTAMPS_PROPERTY = "timestamps and delay"
 MEASUREMENT_NOISE_PROPERTY = "measurement noise"
 ACCELEROMETER_BIAS_PROPERTY = "accelerometer bias state"
@@ -189,7 +189,7 @@ def explain_difference_by_replacements(
         return Unavailable(
             DIFFERENCE_ANALYSIS_NAME,
             "KF and the EKF2 replay do not overlap in time",
-            "Analyse a segment in which EKF2 fused the source (--start, --end).",
+            "Analyse a segment in which EKF2 fused the position source (--start, --end).",
         )
     state_span_s = float(state_times_s[0]), float(state_times_s[-1])
     directions = {name: run.axis.direction for name, run in kf_runs.items()}

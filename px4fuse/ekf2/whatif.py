@@ -49,7 +49,7 @@ HEADING_LOGGED_NOTE = (
     "All replays use the logged EKF2 heading, because the log does not contain all fused "
     "magnetometer samples"
 )
-HEIGHT_REPLAYED_NOTE = "Height is replayed with the logged height sensors"
+HEIGHT_REPLAYED_NOTE = "The replays estimate the height from the logged height sensors"
 HEIGHT_LOGGED_NOTE = "All replays use the logged EKF2 height"
 HEADING_NOT_REPLAYED = Unavailable(
     "heading error",
@@ -265,8 +265,8 @@ def _describe_heading_and_height(model: Ekf2Model) -> tuple[str, str]:
     heading_note = HEADING_LOGGED_NOTE
     if heading_difference_deg is not None:
         heading_note = (
-            "Heading is replayed with the magnetometer. With the logged parameters, the replayed "
-            f"heading differs from the logged heading by {heading_difference_deg:.1f}° RMS"
+            "With the logged parameters, the heading replayed with the magnetometer differs from "
+            f"the logged heading by {heading_difference_deg:.1f}° RMS"
         )
     is_height_logged = bool(model.inputs.reason_for_logged_height)
     return heading_note, HEIGHT_LOGGED_NOTE if is_height_logged else HEIGHT_REPLAYED_NOTE
@@ -295,7 +295,7 @@ def make_sweep_values(
         raise SettingsError(f"{name}={low:g}:{high:g}: give the smaller parameter value first.")
     if not 2 <= count <= MAX_SWEEP_VALUES:
         raise SettingsError(
-            f"{count} parameter values for a sweep: give a number from 2 to {MAX_SWEEP_VALUES}."
+            f"{count} is not a valid number of sweep values. Use 2 to {MAX_SWEEP_VALUES}."
         )
     sweep = np.geomspace(low, high, count) if low > 0 else np.linspace(low, high, count)
     sweep[[0, -1]] = low, high
@@ -375,8 +375,8 @@ def _summarise_replay(flight: Flight, replay: Ekf2Replay, spans_s: Spans) -> Ekf
     update_times_s = updates["fused_at_s"].to_numpy()
     if evaluated_updates.empty:
         raise SettingsError(
-            f"{_format_changes(replay)}: {replay.source} would never be fused in the evaluated "
-            f"time. {replay.lost} samples would arrive too late, after the fusion horizon",
+            f"{_format_changes(replay)}: the replay fuses no sample of {replay.source} in the "
+            f"evaluated time, because {replay.lost} samples are older than the fusion horizon",
             "Choose another value, or add --set EKF2_DELAY_MAX=... (PX4 v1.15 and later).",
         )
     # Position variance just before (1 µs) and after each update
@@ -577,13 +577,12 @@ def _describe_deviation(
     horizontal_aids = {*list_modelled_aids(model.inputs)} - {MAG.name} - height_aids
     largest_distance_time_s = position_difference_m.index[horizontal_distance_m.argmax()]
     note = (
-        f"Without {aids_text}, the published position differs from the replay with all aiding "
-        f"sources by at most {horizontal_distance_m.max():.3g} m "
-        f"(at {largest_distance_time_s:.1f} s). At the end, the difference is "
-        f"{horizontal_distance_m[-1]:.3g} m"
+        f"Without {aids_text}, the replayed position differs from the replay with all aiding "
+        f"sources by at most {horizontal_distance_m.max():.3g} m (at "
+        f"{largest_distance_time_s:.1f} s), and by {horizontal_distance_m[-1]:.3g} m at the end"
     )
     if height_aids & {*disable_time_s_by_aid}:
-        note = f"{note}. The published height differs by at most {height_difference_m.max():.3g} m"
+        note = f"{note}. The replayed heights differ by at most {height_difference_m.max():.3g} m"
     if horizontal_aids <= disable_time_s_by_aid.keys():
         note = (
             f"{note}. The replay then uses only the IMU. EKF2 stops publishing a position "

@@ -235,5 +235,5 @@ def _with_fault_headline(card: Card, fault_descriptions: Sequence[Mapping[str, A
         card,
         severity="warning",
         headline=capitalise_first(fault_text),
-        do_this=("None of the automatic checks finds this fault. Compare the plots.",),
+        do_this=("px4fuse does not detect this fault. Look for its effect in the plots.",),
     )

@@ -1,5 +1,5 @@
 // Step-by-step view: KF's prediction to a measurement and its update, as 2σ ellipses in the phase plane
-// and as the equations of the lesson UAT 366, module 2, with numbers.
+// and as the equations of the course UAT 366, module 2, with numbers.
 const Step = (() => {
   const CORNERS = 120;
 

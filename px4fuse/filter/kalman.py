@@ -1,4 +1,4 @@
-"""KF: the two-state Kalman filter of the lesson UAT 366, module 2, computed with filterpy.
+"""KF: the two-state Kalman filter of the course UAT 366, module 2, computed with filterpy.
 
 State x = [position, velocity] along one axis; the input u is the acceleration::
 

@@ -5,7 +5,7 @@ State x = [position, velocity]; input a, the mean acceleration of the step::
     F = [[1, dt], [0, 1]]    B = [dt²/2, dt]    H = [1, 0]    R = SIGMA_Z²
     Q(dt) = SIGMA_A² · DT · [[dt³/4, dt²/2], [dt²/2, dt]]
 
-With dt = DT, Q equals that of the lesson UAT 366, module 2. The velocity noise per second does not
+With dt = DT, Q equals that of the course UAT 366, module 2. The velocity noise per second does not
 depend on dt.
 
 The functions accept floats and arrays. A covariance is a tuple of its elements 00, 01, 11.
@@ -18,7 +18,7 @@ from px4fuse.trajectory.rotation import build_matrix
 
 STATE_COLUMNS = ["position_m", "velocity_m_s"]
 COVARIANCE_COLUMNS = ["position_variance_m2", "covariance_m2_s", "velocity_variance_m2_s2"]
-# Initial standard deviations in the lesson UAT 366, module 2: P₀ = diag(0.5², 1.0²)
+# Initial standard deviations in the course UAT 366, module 2: P₀ = diag(0.5², 1.0²)
 INITIAL_POSITION_SIGMA_M = 0.5
 INITIAL_VELOCITY_SIGMA_M_S = 1.0
 INITIAL_COVARIANCE = (INITIAL_POSITION_SIGMA_M**2, 0.0, INITIAL_VELOCITY_SIGMA_M_S**2)

@@ -112,7 +112,7 @@ def find_source_origin(kind: str, path: str) -> SourceOrigin:
 
 
 REPEATED_TIMESTAMPS_NOTE = (
-    "most timestamps of the sender are repeated, so its clock is not converted"
+    "most timestamps of the sender are repeated, so they are not converted to boot time"
 )
 # Clock name for timestamps of an external sender
 SENDER_CLOCK = "sender timestamps"

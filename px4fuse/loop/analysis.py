@@ -104,7 +104,7 @@ def analyse(
     )
     notes = [*z_down_trajectory.notes, variance_note]
     if isinstance(final_pose_in_truth, str):
-        notes.append(f"the ground truth does not contain the landing place: {final_pose_in_truth}")
+        notes.append(f"the landing place is not known from ground truth: {final_pose_in_truth}")
     pose_graph_corrections, tested_closures = solve_pose_graphs(
         path, node_indices, graph, gate_closures(graph, closures_and_final_poses), progress
     )
@@ -213,7 +213,7 @@ def _choose_key_frames(path: Trajectory, key_frame_spacing_m: float) -> tuple[In
         raise TrajectoryError(
             f"{path.name}: the path of {distance_m[-1]:.2f} m is too short for key frames every "
             f"{key_frame_spacing_m:g} m",
-            "Change the time span (--from, --to) or the distance of key frames (--key-frames).",
+            "Change the time span (--from, --to) or the key frame spacing (--key-frames).",
         )
     return key_frame_indices, np.interp(path.time_s, path.time_s[key_frame_indices], distance_m)
 
@@ -282,9 +282,9 @@ def analyse_flight_loop(
             if any(take_off_s < limit_s < landing_s for limit_s in analysed_span_s):
                 return Unavailable(
                     "loop closure",
-                    "the analysed time span begins or ends in flight, so it is not a loop",
-                    "Analyse the whole flight (without --start and --end), or give two times at "
-                    "one place with px4fuse loop --closure.",
+                    "the analysed time span begins or ends in flight, so the path is not a loop",
+                    "Analyse the whole flight (without --start and --end), or give a loop "
+                    "closure with px4fuse loop --closure.",
                 )
     odometry = find_odometry(flight)
     try:
@@ -310,8 +310,7 @@ def analyse_flight_loop(
         return Unavailable(
             "loop closure",
             f"the odometry has an extent of {extent_m:.1f} m and ends "
-            f"{end_to_start_distance_m:.1f} m from its start, so it is not a loop",
-            "Fly back to the take-off place, or give two times at one place with px4fuse loop "
-            "--closure.",
+            f"{end_to_start_distance_m:.1f} m from its start, so the path is not a loop",
+            "Fly back to the take-off place, or give a loop closure with px4fuse loop --closure.",
         )
     return analyse(LoopSource(trajectory, flight), progress=progress)

@@ -90,8 +90,8 @@ def compute_odometry_variances(
             MIN_REPORTED_TO_DEFAULT_VARIANCE_RATIO * translation_variance_m2,
         )
         variance_texts.append(
-            "the odometry's position variance between two graph nodes is the increase of the "
-            "logged position variance"
+            "the position variance of each odometry edge is the increase of the logged position "
+            "variance between the two nodes"
         )
     elif path.position_variance_m2 is not None:
         variance_texts.append("the logged position variances do not grow, so they are not used")
@@ -218,8 +218,8 @@ def build_pose_graph(
 # Labels of the corrected paths, by their key in results.json
 CORRECTION_LABELS: Mapping[CorrectionName, str] = {
     "uncorrected": "uncorrected",
-    "by_distance_plain": "positions corrected in proportion to distance",
-    "by_distance": "positions and headings corrected in proportion to distance",
+    "by_distance_plain": "positions corrected in proportion to distance flown",
+    "by_distance": "positions and headings corrected in proportion to distance flown",
     "pose_graph_gated": "pose graph with loop closures that pass the gate",
     "pose_graph_gnc": ROBUST_SOLUTION_LABEL,
 }
@@ -240,9 +240,7 @@ def distribute_closure_error_by_distance(
     """
     for closure in closures:
         if closure.source == LANDING_CLOSURE_SOURCE and not closure.accepted:
-            closure_error_vector_m = _explain_gate_rejection(
-                "distribution of the closure error along the path", closure
-            )
+            closure_error_vector_m = _explain_gate_rejection("path correction by distance", closure)
     if isinstance(closure_error_vector_m, Unavailable):
         return {"by_distance_plain": closure_error_vector_m, "by_distance": closure_error_vector_m}
     position_m = distribute_by_distance(path.position_m, closure_error_vector_m, distance_m)
@@ -317,7 +315,7 @@ def solve_pose_graphs(
         graph = Unavailable(
             "pose graph",
             "the path has no loop closure",
-            "Give two times at one place with --closure.",
+            "Give a loop closure with --closure.",
         )
     if isinstance(graph, Unavailable):
         return {"pose_graph_gated": graph, "pose_graph_gnc": graph}, ()

@@ -129,13 +129,13 @@ def assume_landing_at_takeoff(path: Trajectory) -> TrueFinalPose:
         odometry_heading_change_deg is not None
         and abs(odometry_heading_change_deg) <= MAX_HEADING_CHANGE_ASSUMED_ZERO_DEG
     )
-    heading_text = "the initial heading" if is_same_heading else "an unknown heading"
     return TrueFinalPose(
         displacement_m=split_by_axis(path.frame, np.zeros(3)),
         heading_change_deg=0.0 if is_same_heading else None,
         sigma_m=0.10,
         sigma_heading_deg=5.0 if is_same_heading else None,
-        source=f"assumption: the vehicle landed at the take-off place with {heading_text}",
+        source="assumption: the vehicle landed at the take-off place"
+        + " with the initial heading" * is_same_heading,
         assumed=True,
     )
 

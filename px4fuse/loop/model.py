@@ -105,7 +105,7 @@ class Closure(Record, kw_only=True):
 
     def __str__(self) -> str:
         if self.source == LANDING_CLOSURE_SOURCE:
-            return "the loop closure of take-off and landing"
+            return "the loop closure between take-off and landing"
         return f"the loop closure between {self.time_1_s:.12g} s and {self.time_2_s:.12g} s"
 
 

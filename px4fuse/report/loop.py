@@ -33,7 +33,7 @@ from px4fuse.trajectory.scores import RmseInterval, Statistics
 
 LEAD_TEXT = (
     "The closure error is the distance between the end of the odometry and the true end. It is "
-    "distributed along the path in proportion to the distance from the start (lesson UAT 366, "
+    "distributed along the path in proportion to the distance from the start (course UAT 366, "
     "module 2, Example 2), or by pose graph optimisation. px4fuse first tests each closure, "
     "because a false closure would deform the whole path."
 )

@@ -85,10 +85,10 @@ NUMBER_HELP = (
 ACCEPTED_ANSWER_BY_FIELD = {
     **dict.fromkeys(("verdict_kf", "verdict_ekf2"), f"one of {', '.join(VERDICTS)}"),
     **dict.fromkeys(("kind", "unit", "parameter", "value_unit", "panel"), "a text in quotes"),
-    "when": '"whole flight", or "" with times in from_s and until_s',
+    "when": '"whole flight", or "" if you give the times in from_s and until_s',
     "ekf2_did": "a list of texts, each in quotes",
     "choices": "a letter from a to e in quotes",
-    "log_sha256": "the SHA-256 of the log, as in the form that px4fuse answers LOG writes",
+    "log_sha256": "the SHA-256 of the log, as in the form from `px4fuse answers LOG`",
 }
 # Answer to a question about KF: a number, a list of KF updates, or None if left blank
 NumericAnswer = Number | Annotated[tuple[Number, ...], Meta(max_length=200)] | None
@@ -230,8 +230,8 @@ class FormQuestion(Record):
             "nis": f"NIS in update {update}",
             "prediction": f"position sigma of KF (m) {number_text} s after update {update}, "
             "without further updates",
-            "gate": f"update numbers {update} to {update + GATE_QUESTION_FURTHER_UPDATES} with an "
-            f"innovation outside ±{number_text} sqrt(S); KF rejects no measurement",
+            "gate": f"numbers of the updates {update} to {update + GATE_QUESTION_FURTHER_UPDATES} "
+            f"whose innovation is outside ±{number_text} sqrt(S); KF rejects no measurement",
         }[self.kind]
         return f"{quantity}; with SIGMA_A {self.sigma_a_m_s2:g} and SIGMA_Z {self.sigma_z_m:g}"
 
@@ -377,7 +377,11 @@ def check_answers(answers: Answers) -> None:
 def _require_allowed_answer(field_name: str, answer: str, allowed_answers: Iterable[str]) -> None:
     if answer not in allowed_answers:
         choices_text = _join_quoted(allowed_answers)
-        fault = f"not one of {choices_text}" if choices_text else "not allowed: leave it empty"
+        fault = (
+            f"not one of {choices_text}"
+            if choices_text
+            else "not allowed here: leave the field empty"
+        )
         raise ValueError(f"{field_name} {answer!r} is {fault}")
 
 

@@ -22,7 +22,7 @@ RANGE_BY_FIELD_PATTERN = {
     r"(^|_)(ratio|factor)($|_)": (-MAX_ABSOLUTE_RATIO, MAX_ABSOLUTE_RATIO),
     r"_m$": (-MAX_ABSOLUTE_LENGTH_M, MAX_ABSOLUTE_LENGTH_M),
 }
-CHECK_LOG_REMEDY = "Check the logged data from which this number is computed."
+CHECK_LOG_REMEDY = "Check the logged data."
 T = TypeVar("T", bound=msgspec.Struct)
 
 
@@ -56,9 +56,7 @@ def drop_invalid_numbers(results: T) -> T:
     try:
         checked_results: T = _check_value(results, None, "", reasons)
     except _OutOfBoundsError as error:
-        raise ResultsError(
-            f"a number that the results require is not valid: {error}", CHECK_LOG_REMEDY
-        ) from error
+        raise ResultsError(f"a required result is not valid: {error}", CHECK_LOG_REMEDY) from error
     if hasattr(checked_results, "missing"):
         unavailable_numbers = (
             Unavailable(reason.partition(" ")[0], reason, CHECK_LOG_REMEDY) for reason in reasons

@@ -93,7 +93,8 @@ def simulate(scenario: Scenario, faults: FaultSizes = NO_FAULTS) -> Simulation:
     for topic in topics:
         if len(topic.fields["timestamp"]) < 2:
             raise SettingsError(
-                f"With these injected faults {topic.name} contains no messages. Reduce the faults."
+                f"With these injected faults, {topic.name} contains no messages. Inject fewer or "
+                "smaller faults."
             )
     if scenario.ekf2:
         ekf2_topics = ekf2.simulate_ekf2(

@@ -304,12 +304,10 @@ def _plan_aisle_passes(flight_plan: _FlightBuilder, scenario: Scenario, speed_m_
 def _plan_square_laps(
     flight_plan: _FlightBuilder, scenario: Scenario, speed_m_s: float, open_end_m: float
 ) -> None:
-    last_side_length_m = scenario.length_m - open_end_m
     max_open_end_m = scenario.length_m - scenario.speed_m_s * CORNER_DURATION_S
     if open_end_m > max_open_end_m:
         raise SettingsError(
-            f"--mistake open-end={open_end_m:g}: the last side is {last_side_length_m:g} m "
-            f"long. Use at most {max_open_end_m:g} m."
+            f"--mistake open-end={open_end_m:g} is too large. Use at most {max_open_end_m:g} m."
         )
     side_count = 4 * scenario.passes
     previous_velocity_m_s = np.zeros(3)
@@ -321,7 +319,7 @@ def _plan_square_laps(
             flight_plan.add_turn(
                 np.pi / 2.0, flight_plan.ramp_centre_s - CORNER_DURATION_S / 2.0, CORNER_DURATION_S
             )
-        side_length_m = last_side_length_m if side_index == side_count - 1 else scenario.length_m
+        side_length_m = scenario.length_m - open_end_m * (side_index == side_count - 1)
         flight_plan.add_velocity_change(
             velocity_m_s - previous_velocity_m_s,
             ramp_duration_s,

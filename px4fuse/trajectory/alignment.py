@@ -90,7 +90,7 @@ def fit_alignment(
     if len(estimate_m) < MIN_POSES:
         raise TrajectoryError(
             f"{len(estimate_m)} poses match in time; an alignment needs at least {MIN_POSES}",
-            "Check that both trajectories are of the same flight, or give `time_offset_s` auto.",
+            "Check that both trajectories are of the same flight, or set `time_offset_s` to auto.",
         )
     if kind == "none":
         return Transform((1.0, 0.0, 0.0, 0.0), (0.0, 0.0, 0.0), 1.0, 0)
@@ -164,7 +164,7 @@ def _require_sufficient_motion(
         max_extent_m = float(np.linalg.norm(reference_extents_m))
         max_residual_ratio = MAX_RESIDUAL_RATIO_FOR_YAW
         motion_text = "horizontal motion"
-        remedy = "Choose `alignment` none: the trajectories are then compared without alignment."
+        remedy = "Set `alignment` to none to compare the trajectories without alignment."
     else:
         # motion along a line does not determine the rotation around the line
         max_extent_m, extent_m, _ = np.minimum(
@@ -172,7 +172,7 @@ def _require_sufficient_motion(
         )
         max_residual_ratio = MAX_RESIDUAL_RATIO_FOR_ROTATION
         motion_text = "motion perpendicular to the main direction of flight"
-        remedy = "Use `alignment` yaw or none."
+        remedy = "Set `alignment` to yaw or none."
     residual_m = compute_rms_length_m(residuals_m)
     if (
         extent_m < max(MIN_EXTENT_M, MIN_EXTENT_RATIO_FOR_ROTATION * max_extent_m)

@@ -104,8 +104,8 @@ def associate(
             f"needed. With the time offset {time_offset_s:.12g} s, the estimate is from "
             f"{time_s[0]:.3f} to {time_s[-1]:.3f} s; the reference {reference.name} is from "
             f"{reference_start_s:.3f} to {reference_end_s:.3f} s.",
-            "Check that both trajectories are of the same flight. If clocks differ, give "
-            "`time_offset_s` auto.",
+            "Check that both trajectories are of the same flight. If the clocks differ, "
+            "set `time_offset_s` to auto.",
         )
     is_outside = (time_s < reference_start_s - max_time_outside_reference_s) | (
         time_s > reference_end_s + max_time_outside_reference_s

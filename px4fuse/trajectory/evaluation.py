@@ -352,14 +352,14 @@ def choose_alignment(estimate: Trajectory, reference: Trajectory) -> tuple[Align
     """Choose the alignment by the sources of the trajectories, and return the reason."""
     has_same_frame = estimate.frame == reference.frame != "unknown"
     if estimate.kind == "truth" and (has_same_frame or reference.kind == "truth"):
-        return "none", "No alignment is applied, because the estimate is ground truth."
+        return "none", "No alignment is applied, because the evaluated trajectory is ground truth."
     frames_text = f"{estimate.frame} and {reference.frame}"
     has_common_vertical = estimate.frame == reference.frame == "ENU" or (
         estimate.frame in _Z_DOWN_FRAMES and reference.frame in _Z_DOWN_FRAMES
     )
     if has_common_vertical and estimate.kind not in _KINDS_WITHOUT_KNOWN_VERTICAL:
         return "yaw", (
-            "Yaw and position are aligned (4 degrees of freedom): z is vertical in both frames "
+            "Yaw and translation are aligned (4 degrees of freedom): z is vertical in both frames "
             f"({frames_text}), so a tilt counts as an error."
         )
     scale, scale_reason = 1.0, ""
@@ -368,7 +368,7 @@ def choose_alignment(estimate: Trajectory, reference: Trajectory) -> tuple[Align
     except TrajectoryError:
         if has_common_vertical:
             return "yaw", (
-                "Yaw and position are aligned (4 degrees of freedom): motion along a line does "
+                "Yaw and translation are aligned (4 degrees of freedom): motion along a line does "
                 f"not determine all angles, but z is vertical in both frames ({frames_text})."
             )
     if abs(scale - 1.0) > MAX_SCALE_ERROR:
@@ -386,13 +386,13 @@ def choose_alignment(estimate: Trajectory, reference: Trajectory) -> tuple[Align
             frame_reason = f"the vertical direction of {track.name} is unknown, because {cause}"
             if scale_reason:
                 return "sim3", (
-                    "Rotation, position and scale are aligned (7 degrees of freedom): "
+                    "Rotation, translation and scale are aligned (7 degrees of freedom): "
                     f"{frame_reason}, and {scale_reason}."
                 )
             break
     else:
         frame_reason = f"the frames {frames_text} have no common vertical direction"
-    return "se3", f"Rotation and position are aligned (6 degrees of freedom): {frame_reason}."
+    return "se3", f"Rotation and translation are aligned (6 degrees of freedom): {frame_reason}."
 
 
 def _choose_time_offset(
@@ -408,7 +408,7 @@ def _choose_time_offset(
     clock_offset_s = compute_clock_offset_s(estimate, reference)
     added_offset_s = clock_offset_s or 0.0
     match_text = (
-        f"Poses are matched by {'UNIX time' if clock_offset_s else 'unchanged timestamps'}."
+        f"Poses are matched by {'UNIX time' if clock_offset_s else 'the timestamps in the files'}."
     )
     estimated_offset = estimate_time_offset(estimate, reference)
     start_s, end_s = estimate.time_s[[0, -1]] + added_offset_s
@@ -485,8 +485,8 @@ def _find_comparison_warnings(
         )
     if association.coverage_reference < MIN_EVALUATED_FRACTION:
         yield (
-            f"The estimate covers only {association.coverage_reference:.0%} of the time of the "
-            "reference."
+            f"The estimate covers only {association.coverage_reference:.0%} of the reference's "
+            "duration."
         )
     if has_jumps:  # a jump changes the fitted scale
         return
@@ -556,9 +556,9 @@ def _move_to_reference_body(
     )
     return corrected_estimate, (
         f"The orientations differ by a constant {np.degrees(body_rotation.magnitude()):.1f}°: the "
-        "estimate has other body axes than the reference, for example those of a camera. The "
-        f"origin of the estimate is displaced by {lever_arm_text} of the reference body. Both "
-        "differences are removed before the errors are computed.",
+        "estimate and the reference have different body axes. In "
+        f"the body axes of the reference, the estimate's origin is displaced by {lever_arm_text}. "
+        "Both differences are removed before the errors are computed.",
     )
 
 

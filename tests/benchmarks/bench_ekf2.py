@@ -139,7 +139,8 @@ def agreement_page(models: dict[str, Ekf2Model], left: dict[str, float]) -> str:
     """Return the table of agreement for the documentation, of some typical flights."""
     lines = [
         "| flight | innovations in the log | correlation of innovations | S replayed ÷ S logged | "
-        "rejected samples | position difference replay - log | difference KF - EKF2 | height |",
+        "rejected samples | position difference replay - log | difference KF - EKF2 | "
+        "source of the height |",
         "|---|---|---|---|---|---|---|---|",
     ]
     for name, model in models.items():
@@ -150,12 +151,12 @@ def agreement_page(models: dict[str, Ekf2Model], left: dict[str, float]) -> str:
         cells = (
             name, f"{a.samples} innovations",
             ", ".join(f"{x.innovation_correlation:.4f} {axis}" for axis, x in axes),
-            f"S ratio {min(x.s_ratio_p5 for x in statistics):.3f} to "
+            f"S replayed ÷ S logged {min(x.s_ratio_p5 for x in statistics):.3f} to "
             f"{max(x.s_ratio_p95 for x in statistics):.3f}",
-            f"replay {100.0 * a.rejected_fraction_replayed:.1f} %, "
-            f"log {100.0 * a.rejected_fraction_logged:.1f} %",
+            f"rejected in replay {100.0 * a.rejected_fraction_replayed:.1f} %, "
+            f"in flight {100.0 * a.rejected_fraction_logged:.1f} %",
             ", ".join(f"{x.position_rms_difference_m:.3f} m {axis}" for axis, x in axes),
-            f"{100.0 * left[name]:.1f} % unexplained", height_cell(a),
+            f"{100.0 * left[name]:.1f} % of KF - EKF2 unexplained", height_cell(a),
         )  # fmt: skip
         lines.append(f"| {' | '.join(cells)} |")
     return "\n".join(lines)
@@ -165,10 +166,10 @@ def height_cell(agreement: Agreement) -> str:
     """Return the table cell of a flight with replayed heights."""
     heights = [*agreement.gnss_hgt.values(), *agreement.baro_hgt.values()]
     if not heights or agreement.doubtful:
-        return "taken from the log"
+        return "height from the log"
     gnss, barometer = (axis.innovation_correlation for axis in heights)
     return (
-        f"correlation {gnss:.4f} (GNSS), {barometer:.4f} (barometer); "
+        f"height replayed: correlation {gnss:.4f} (GNSS), {barometer:.4f} (barometer); "
         f"difference {heights[0].position_rms_difference_m:.3f} m RMS"
     )
 

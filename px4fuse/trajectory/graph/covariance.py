@@ -67,7 +67,7 @@ def gate_edges(graph: model.PoseGraph, edge_indices: Sequence[int] | IntArray) -
         raise TrajectoryError(
             f"The closures cannot be tested, because no odometry edge connects vertices "
             f"{graph.ids[pose_index]} and {graph.ids[pose_index + 1]}",
-            "Add an odometry edge between these vertices.",
+            "Add an odometry edge between the two named vertices.",
         )
     poses = lie.accumulate_poses(model.get_odometry_steps(graph, connecting_edges))
     # The covariances are sums in the axes of the first pose
@@ -136,8 +136,9 @@ def _compute_covariances(graph: model.PoseGraph, odometry_edges: IntArray) -> Ar
     if not np.all(is_full_rank):
         edge_index = odometry_edges[int(np.argmin(is_full_rank))]
         raise TrajectoryError(
-            f"The odometry edge from vertex {graph.ids[graph.first_nodes[edge_index]]} to "
-            f"{graph.ids[graph.second_nodes[edge_index]]} has no information in one direction",
+            "The information matrix of the odometry edge from vertex "
+            f"{graph.ids[graph.first_nodes[edge_index]]} to "
+            f"{graph.ids[graph.second_nodes[edge_index]]} is singular",
             "Give each edge an information matrix of full rank.",
         )
     covariance = np.linalg.inv(scaled_information) / (scale[:, :, None] * scale[:, None, :])

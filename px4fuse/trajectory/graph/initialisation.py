@@ -36,7 +36,7 @@ def _compute_chordal_poses(graph: PoseGraph) -> PoseGraph:
     """Compute initial rotations, then initial positions, by linear least squares."""
     dimension = graph.dimension
     rotation_information = np.trace(graph.information[:, dimension:, dimension:], axis1=1, axis2=2)
-    model.require_connected(graph, rotation_information > 0.0, "edges with rotation information")
+    model.require_connected(graph, rotation_information > 0.0, "edges that measure a rotation")
     measured_rotation = lie.rotation_matrix(graph.measurements)
     eye = np.broadcast_to(np.eye(dimension), measured_rotation.shape)
     # Linear least squares for matrices R_i: minimise the weighted sum of |Zᵀ R_iᵀ - R_jᵀ|²

@@ -18,7 +18,7 @@ from px4fuse.trajectory.graph.normal_equations import NormalEquations
 # Directions with smaller eigenvalues of the information matrix (unit diagonal) are not measured
 MIN_EIGENVALUE_OF_OBSERVED_DIRECTION = 1e-9
 INITIAL_POSES_FROM_FILE = "vertices in the g2o file"
-INITIAL_POSES_FROM_ODOMETRY = "composition of the odometry edges"
+INITIAL_POSES_FROM_ODOMETRY = "chained odometry edges"
 INITIAL_POSES_FROM_CHORDAL = "chordal initialisation"
 
 
@@ -143,7 +143,7 @@ def require_connected(graph: PoseGraph, is_used: BoolArray, edges_name: str) -> 
         raise TrajectoryError(
             f"The pose graph has {component_count} disconnected parts: vertex "
             f"{other_vertex} is not connected to vertex {graph.ids[0]} by {edges_name}.",
-            "Add an edge between the parts, or optimise each part separately.",
+            "Connect the parts of the pose graph, or optimise each part separately.",
         )
 
 

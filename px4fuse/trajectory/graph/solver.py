@@ -108,9 +108,9 @@ def solve(
     cost_initial = 0.5 * float(np.sum(start_residuals.chi2))
     if not np.isfinite(cost_initial):
         raise TrajectoryError(
-            "The cost of the pose graph is not finite: a pose or a measurement is not finite or "
-            "too large",
-            "Correct the number, or remove its VERTEX or EDGE line.",
+            "The cost of the pose graph is not finite: a pose or a measurement is too large, or "
+            "not finite",
+            "Correct the pose or measurement, or remove its line.",
         )
     weights = np.ones(len(can_be_false))
     optimum = _minimise(graph, start_residuals, weights)
