@@ -9,9 +9,8 @@ Sources: PX4-Autopilot ``EKF/ekf_helper.cpp`` (updateAidSourceStatus),
 
 import numpy as np
 import pandas as pd
-from scipy.integrate import cumulative_trapezoid
 
-from px4fuse.core.arrays import Array, BoolArray
+from px4fuse.core.arrays import Array, BoolArray, integrate_cumulatively
 from px4fuse.ekf2.bias import POSITION_BIAS_NOISE_M_PER_SQRT_S
 from px4fuse.ekf2.replay_segments import INNOVATION_TIME_CONSTANT_S
 from px4fuse.flight.ekf2_parameters import BAROMETER
@@ -94,7 +93,7 @@ def _combine_barometer_samples(
     row_times_s = logged_barometer_updates.index.to_numpy()
     velocity_down_m_s = ekf2.state["down_m_s"]
     velocity_times_s = velocity_down_m_s.index.to_numpy()
-    displacement_m = cumulative_trapezoid(velocity_down_m_s.to_numpy(), velocity_times_s, initial=0)
+    displacement_m = integrate_cumulatively(velocity_down_m_s.to_numpy(), velocity_times_s)
     zero_bias_update = {"bias_m": 0.0, "bias_m2": 0.0, "innovation_m": np.nan, "variance_m2": 1.0}
     barometer_bias_updates = fusion_record.height_bias_updates.get(
         BAROMETER.name, pd.DataFrame(zero_bias_update, index=row_times_s[:1])
