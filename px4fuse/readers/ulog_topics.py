@@ -282,7 +282,7 @@ class Topics:
     def primary_samples(
         self,
         layout: Layout,
-        select_rows: Callable[[pd.DataFrame], pd.DataFrame] | None = None,
+        select_rows: Callable[[pd.DataFrame], pd.DataFrame] = lambda samples: samples,
     ) -> pd.DataFrame:
         """Read an EKF2 topic from the EKF2 instance that was primary at each time.
 
@@ -290,15 +290,14 @@ class Topics:
         """
         if self.find_layout(layout) is None:
             return _empty_frame(layout)
-        instance_numbers = self.instances(layout.topic)
-        has_single_instance = self.primary_instances == NO_INSTANCE_SWITCHES
+        if self.primary_instances == NO_INSTANCE_SWITCHES:
+            return select_rows(self.read_instance(layout))
         primary_number = pd.Series(dict(self.primary_instances), dtype=np.float64)
         instance_tables: list[pd.DataFrame] = []
-        for number in instance_numbers[:1] if has_single_instance else instance_numbers:
-            samples = self.read_instance(layout, number)
-            samples = samples if select_rows is None else select_rows(samples)
+        for number in self.instances(layout.topic):
+            samples = select_rows(self.read_instance(layout, number))
             is_primary = sample_step_function(primary_number, samples.index) == number
-            instance_tables.append(samples[is_primary | has_single_instance])
+            instance_tables.append(samples[is_primary])
         joined_tables = pd.concat(instance_tables).sort_index()
         return joined_tables[~joined_tables.index.duplicated()]
 
