@@ -21,7 +21,7 @@ from px4fuse.convention.motion import (
     ImuSecondDifferences,
     SourceSecondDifferences,
 )
-from px4fuse.core.arrays import Array, IntArray
+from px4fuse.core.arrays import Array, ArrayPair, IntArray
 
 # Maximum tested time offset (s) of the positions
 MAX_TIME_OFFSET_S = 10.0
@@ -57,7 +57,9 @@ MAX_REFINED_HYPOTHESES = 8
 MAX_SCORE_BELOW_BEST_TO_REFINE = 60.0
 # Maximum number of second differences in one least-squares fit, to limit the computing time
 MAX_REFINEMENT_ROWS = 1200
-REFINEMENT_ITERATIONS = 7
+MAX_REFINEMENT_ITERATIONS = 7
+# The refinement stops at a smaller change of the score (nats): a parameter moves by 0.14 σ at most
+MIN_SCORE_CHANGE = 0.01
 # Maximum change (s) of the time offset in one Gauss-Newton iteration
 MAX_TIME_OFFSET_STEP_S = 0.15
 # Prior precision (σ⁻²) of Hypothesis.parameters: gyroscope heading drift (0.05 °/s), accelerometer
@@ -357,12 +359,16 @@ def refine_hypothesis(
     rows = rows[:: max(1, len(rows) // MAX_REFINEMENT_ROWS)]
     best_hypothesis = replace(initial_hypothesis, score=-np.inf)
     parameters = initial_hypothesis.parameters
-    for _ in range(REFINEMENT_ITERATIONS):
+    previous_score = -np.inf
+    for _ in range(MAX_REFINEMENT_ITERATIONS):
         hypothesis, parameter_step = _evaluate_hypothesis(
             replace(initial_hypothesis, parameters=parameters), rows, source_motion, imu_motion
         )
         if hypothesis.score > best_hypothesis.score:
             best_hypothesis = hypothesis
+        if abs(hypothesis.score - previous_score) < MIN_SCORE_CHANGE:
+            break
+        previous_score = hypothesis.score
         parameters = parameters + parameter_step
     return replace(
         best_hypothesis,
@@ -425,24 +431,20 @@ def _evaluate_hypothesis(
     )
     residual = source_second_difference_m - imu_second_difference_m
     residual_squares = np.stack([np.sum(residual[:, :2] ** 2, axis=1), residual[:, 2] ** 2])
-    log_likelihood_gain, sigma_m = fit_student_distribution(
-        residual_squares[0], 2, MIN_HORIZONTAL_SIGMA_M
-    )
-    vertical_log_likelihood, sigma_down_m = fit_student_distribution(
-        residual_squares[1], 1, MIN_VERTICAL_SIGMA_M
+    log_likelihoods, variances = _fit_student_distributions(
+        np.concatenate([residual_squares, unconverted_second_differences.T**2]),
+        np.array([2, 1, 1, 1, 1]),
+        np.array([MIN_HORIZONTAL_SIGMA_M, MIN_VERTICAL_SIGMA_M, 1e-6, 1e-6, 1e-6]) ** 2,
     )
     # Omit a constant axis (for example without heights) from the likelihood
     is_axis_known = unconverted_second_differences.any(axis=0)
-    log_likelihood_gain += vertical_log_likelihood * is_axis_known[vertical_axis] + np.log(
-        metres_per_unit
-    ) * np.count_nonzero(is_axis_known)
-    log_likelihood_gain -= sum(
-        fit_student_distribution(column**2, 1, 1e-6)[0]
-        for column in unconverted_second_differences.T[is_axis_known]
+    log_likelihood_gain = (
+        log_likelihoods[0]
+        + log_likelihoods[1] * is_axis_known[vertical_axis]
+        + np.log(metres_per_unit) * np.count_nonzero(is_axis_known)
+        - np.sum(log_likelihoods[2:], where=is_axis_known)
     )
-    weight = 1.0 / (
-        np.array([[sigma_m**2], [sigma_down_m**2]]) + residual_squares / STUDENT_DEGREES_OF_FREEDOM
-    )
+    weight = 1.0 / (variances[:2, None] + residual_squares / STUDENT_DEGREES_OF_FREEDOM)
     weight *= row_interval_s / SECOND_DIFFERENCE_WINDOW_S
     source_square_sum, source_imu_product_sum, imu_square_sum = (
         float(np.sum(weight[0] @ (first * second)[:, :2]))
@@ -488,30 +490,29 @@ def _evaluate_hypothesis(
         ),
         min_source_to_imu_displacement_ratio=source_imu_product_sum / imu_square_sum,
         max_source_to_imu_displacement_ratio=source_square_sum / source_imu_product_sum,
-        residual_sigma_m=sigma_m,
+        residual_sigma_m=float(np.sqrt(variances[0])),
         independent_residual_count=independent_residual_count,
     )
     return scored_hypothesis, parameter_step
 
 
-def fit_student_distribution(
-    squared_residuals: Array, dimensions: int, min_sigma: float
-) -> tuple[float, float]:
-    """Fit Student's t distribution to squared residuals; return mean log likelihood and scale."""
-    variance = max(
-        float(np.median(squared_residuals)) / (0.455, 1.386)[dimensions - 1], min_sigma**2
-    )
+def _fit_student_distributions(
+    squared_residuals: Array, dimensions: IntArray, min_variances: Array
+) -> ArrayPair:
+    """Fit Student's t distribution to each row; return mean log likelihoods and variances."""
+    medians = np.median(squared_residuals, axis=1)
+    variances = np.maximum(medians / np.where(dimensions == 1, 0.455, 1.386), min_variances)
+    degrees_of_freedom = STUDENT_DEGREES_OF_FREEDOM + dimensions
     for _ in range(5):
-        weight = (STUDENT_DEGREES_OF_FREEDOM + dimensions) / (
-            STUDENT_DEGREES_OF_FREEDOM + squared_residuals / variance
-        )
-        variance = max(float(np.mean(weight * squared_residuals)) / dimensions, min_sigma**2)
-    mean_log1p_square = np.mean(np.log1p(squared_residuals / variance / STUDENT_DEGREES_OF_FREEDOM))
-    score = -0.5 * (
-        dimensions * np.log(variance)
-        + (STUDENT_DEGREES_OF_FREEDOM + dimensions) * mean_log1p_square
+        denominators = STUDENT_DEGREES_OF_FREEDOM + squared_residuals / variances[:, None]
+        weighted_means = np.mean(squared_residuals / denominators, axis=1)
+        variances = np.maximum(degrees_of_freedom * weighted_means / dimensions, min_variances)
+    normalised_squares = squared_residuals / variances[:, None] / STUDENT_DEGREES_OF_FREEDOM
+    mean_log1p_squares = np.mean(np.log1p(normalised_squares), axis=1)
+    return (
+        -0.5 * (dimensions * np.log(variances) + degrees_of_freedom * mean_log1p_squares),
+        variances,
     )
-    return float(score), float(np.sqrt(variance))
 
 
 def _compute_total_log_odds(hypothesis: Hypothesis, positions: SentPositions) -> float:

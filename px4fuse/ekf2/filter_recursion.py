@@ -99,6 +99,8 @@ VELOCITY_AND_POSITION = slice(3, 9)
 # Columns in measurements of velocity and position (six columns, NED)
 VELOCITY_COLUMNS, DOWN_COLUMN = slice(0, 3), 2
 HORIZONTAL_POSITION_COLUMNS = slice(3, 5)
+# First columns of velocity, horizontal position and height
+FIRST_COLUMNS = [0, 3, 5]
 
 
 @dataclass(frozen=True)
@@ -173,8 +175,8 @@ class SegmentRun:
 
     Attributes
     ----------
-    events : tuple of recarray
-        Fusions of each configuration, see :data:`~px4fuse.ekf2.intervals.EVENT_DTYPE`.
+    intervals : tuple of EventIntervals
+        Intervals between the fusions of each configuration.
     innovation, innovation_variance, noise : ndarray, shape (events, filters, 6)
         ν (measurement minus state), S and R of velocity (m/s) and position (m), NED.
     rejected, fused, reset : ndarray of bool, shape (events, filters)
@@ -195,7 +197,7 @@ class SegmentRun:
 
     segment: ReplaySegment
     configurations: tuple[FilterConfiguration, ...]
-    events: tuple[StepEvents, ...]
+    intervals: tuple[EventIntervals, ...]
     innovation: Array
     innovation_variance: Array32
     noise: Array32
@@ -209,6 +211,11 @@ class SegmentRun:
     magnetometer_updates: Array
     height_filter: HeightFilter | None = None
     vision_filter: VisionFilter | None = None
+
+    @property
+    def events(self) -> list[StepEvents]:
+        """Fusions of each configuration, see :data:`~px4fuse.ekf2.intervals.EVENT_DTYPE`."""
+        return [interval_arrays.events for interval_arrays in self.intervals]
 
 
 def run_segment(  # noqa: PLR0912, PLR0915 (one recursion, read from top to bottom)
@@ -401,24 +408,28 @@ def run_segment(  # noqa: PLR0912, PLR0915 (one recursion, read from top to bott
                 state_change_by_acceleration
                 + estimates_attitude[:, None] * state_change_by_correction
             )
-            gyro_process_noise = gyro_variance * gyro_noise_covariance
+            process_noise = (
+                gyro_variance * gyro_noise_covariance
+                + acceleration_variance[event_batch, :, None, None] * accelerometer_noise_covariance
+            )
         phi = transition[index_in_batch]
         bad_acceleration_fraction = bad_acceleration_flag.compute_bad_acceleration_fraction(
             event_time_s[event - 1] if event else start_s, event_time_s[event]
-        )
-        acceleration_variance[event] += bad_acceleration_fraction * (
-            BAD_ACCELERATION_NOISE_M_S2**2 - acceleration_variance[event]
         )
         # Prediction: x = Φx + u, P = ΦPΦ' + Q
         x[:, :STATE_COUNT] = (phi @ x[:, :STATE_COUNT, None])[:, :, 0]
         x[:, :STATE_COUNT] += state_change[index_in_batch]
         P[:, :STATE_COUNT] = phi @ P[:, :STATE_COUNT]
         P[:, :, :STATE_COUNT] = P[:, :, :STATE_COUNT] @ np.swapaxes(phi, 1, 2)
-        P[:, :MOTION_STATE_COUNT, :MOTION_STATE_COUNT] += (
-            gyro_process_noise[index_in_batch]
-            + acceleration_variance[event, :, None, None]
-            * accelerometer_noise_covariance[index_in_batch]
-        )
+        motion_covariance = P[:, :MOTION_STATE_COUNT, :MOTION_STATE_COUNT]
+        motion_covariance += process_noise[index_in_batch]
+        if bad_acceleration_fraction.any():
+            variance_increase = bad_acceleration_fraction * (
+                BAD_ACCELERATION_NOISE_M_S2**2 - acceleration_variance[event]
+            )
+            motion_covariance += (
+                variance_increase[:, None, None] * accelerometer_noise_covariance[index_in_batch]
+            )
         is_bias_constant = bad_acceleration_flag.until_s > event_time_s[event]
         bias_before_fusion = x[:, ACCELEROMETER_BIAS].copy()
         bias_covariance = P[:, ACCELEROMETER_BIAS, ACCELEROMETER_BIAS].copy()
@@ -453,12 +464,15 @@ def run_segment(  # noqa: PLR0912, PLR0915 (one recursion, read from top to bott
                 is_outside_gate[is_clipped, DOWN_COLUMN] = False
             innovations[event] = nu
             variances[event] = S
-            is_velocity_fused = can_fuse_velocity[event] & ~(
-                is_outside_gate[:, VELOCITY_COLUMNS].any(axis=1) & has_gate
-            )
-            is_outside_gate = is_outside_gate[:, HORIZONTAL_POSITION_COLUMNS].any(axis=1)
+            is_velocity_outside, is_position_outside, _ = np.logical_or.reduceat(
+                is_outside_gate, FIRST_COLUMNS, axis=1
+            ).T
             is_rejected[event], is_fused[event], is_reset[event], is_velocity_fused = (
-                fusion_decisions.decide_fusion(event, is_outside_gate, is_velocity_fused)
+                fusion_decisions.decide_fusion(
+                    event,
+                    is_position_outside,
+                    can_fuse_velocity[event] & ~(is_velocity_outside & has_gate),
+                )
             )
             if inputs.aid == GNSS_POS:
                 if not has_magnetometer:
@@ -535,7 +549,7 @@ def run_segment(  # noqa: PLR0912, PLR0915 (one recursion, read from top to bott
     return SegmentRun(
         segment,
         tuple(configurations),
-        tuple(interval_arrays.events for interval_arrays in intervals),
+        tuple(intervals),
         innovations,
         variances,
         measurement_variance.astype(np.float32),
@@ -561,9 +575,10 @@ def _stack_by_filter(tuples_by_filter: Sequence[tuple[Array, ...]]) -> list[Arra
 
 def _update_jointly(x: Array, P: Array, innovation: Array, R: Array) -> ArrayPair:
     """Fuse all measurements together: K = PH'(HPH' + R)⁻¹, x = x + Kν, P = P - KHP."""
-    HP = np.take(P, STATES_FUSED_IN_ONE_UPDATE, axis=1)
-    S = np.take(HP, STATES_FUSED_IN_ONE_UPDATE, axis=2)
-    S.reshape(len(x), -1)[:, :: len(STATES_FUSED_IN_ONE_UPDATE) + 1] += R
+    HP = P.take(STATES_FUSED_IN_ONE_UPDATE, axis=1)
+    S = HP.take(STATES_FUSED_IN_ONE_UPDATE, axis=2)
+    S_diagonal = _get_state_variances(S)
+    S_diagonal += R
     K = np.swapaxes(HP, 1, 2) @ np.linalg.inv(S)
     x = x + (K @ innovation[:, :, None])[:, :, 0]
     P = P - K @ HP

@@ -16,7 +16,7 @@ import pandas as pd
 from msgspec import structs
 from scipy.spatial.transform import Rotation
 
-from px4fuse.core.arrays import Array, BoolArray, IntArray
+from px4fuse.core.arrays import Array, ArrayPair, BoolArray, IntArray, cumulative_sums
 from px4fuse.core.record import Span
 from px4fuse.ekf2.filter_recursion import (
     HEADING,
@@ -345,20 +345,31 @@ def _run_model(
         configuration in model.runs[0].configurations for configuration in configurations
     ):
         return model.runs
-    return run_configurations(model.inputs, configurations)
+    return run_configurations(model.inputs, configurations, model.runs)
 
 
 def run_configurations(
-    inputs: ReplayInputs, configurations: Sequence[FilterConfiguration]
+    inputs: ReplayInputs,
+    configurations: Sequence[FilterConfiguration],
+    earlier_runs: Sequence[SegmentRun] = (),
 ) -> list[SegmentRun]:
-    """Run several filter configurations; return the results of each flight segment."""
+    """Run several filter configurations; return the results of each flight segment.
+
+    ``earlier_runs`` are results for the same inputs; their intervals between fusions are reused.
+    """
     delays_by_configuration = [
         configuration.compute_delays(inputs) for configuration in configurations
     ]
     intervals_by_delays = {
-        delays: [make_event_intervals(inputs, segment, delays) for segment in inputs.segments]
-        for delays in set(delays_by_configuration)
+        configuration.compute_delays(inputs): [run.intervals[index] for run in earlier_runs]
+        for index, configuration in enumerate(
+            earlier_runs[0].configurations if earlier_runs else ()
+        )
     }
+    for delays in set(delays_by_configuration) - intervals_by_delays.keys():
+        intervals_by_delays[delays] = [
+            make_event_intervals(inputs, segment, delays) for segment in inputs.segments
+        ]
     return [
         run_segment(inputs, segment, configurations, intervals)
         for segment, *intervals in zip(
@@ -520,56 +531,53 @@ def compute_delayed_states(run: SegmentRun, configuration_index: int) -> Array:
 
     The state has the shape (n + 1, 15) or more.
     """
-    event_steps = run.events[configuration_index].end_step
     event_states = run.state[:, configuration_index]
+    event_steps = run.events[configuration_index].end_step
     step_count = len(run.segment.step_s)
-    interval_index = np.searchsorted(event_steps, np.arange(step_count), side="right")
+    # First prediction step of the interval after each event, and end of the last interval
+    first_steps = np.concatenate([[0], event_steps, [step_count]])
     states = np.empty((step_count + 1, event_states.shape[1]))
     states[0] = event_states[0]
-    for first_event in range(0, len(event_steps) + 1, EVENTS_PER_BLOCK):
-        steps = slice(
-            *np.searchsorted(interval_index, [first_event, first_event + EVENTS_PER_BLOCK])
-        )
-        states[1:][steps] = _propagate_states(
-            run, configuration_index, interval_index[steps], steps
+    for first_event in range(0, len(event_states), EVENTS_PER_BLOCK):
+        block_first_steps = first_steps[first_event : first_event + EVENTS_PER_BLOCK + 1]
+        states[1:][block_first_steps[0] : block_first_steps[-1]] = _propagate_states(
+            run, configuration_index, event_states[first_event:], block_first_steps
         )
     states[event_steps] = event_states[1:]
     return states
 
 
 def _propagate_states(
-    run: SegmentRun, configuration_index: int, interval_index: IntArray, steps: slice
+    run: SegmentRun, configuration_index: int, event_states: Array, first_steps: IntArray
 ) -> Array:
-    """Predict the state with the IMU from the last fusion to each prediction step."""
+    """Predict the state with the IMU from each fusion to the steps before the next fusion."""
     segment, configuration = run.segment, run.configurations[configuration_index]
-    start_state: Array = run.state[interval_index, configuration_index]
-    state, body_to_ned = start_state.copy(), segment.body_to_ned[1:][steps]
-    step_s = segment.step_s[steps, None]
-    interval_first_step = np.searchsorted(interval_index, interval_index)
-    is_first_step = (interval_first_step == np.arange(len(interval_first_step)))[:, None]
+    interval_lengths = np.diff(first_steps)
+    event_states = event_states[: len(interval_lengths)]
+    state = np.repeat(event_states, interval_lengths, axis=0)
+    steps = slice(first_steps[0], first_steps[-1])
+    body_to_ned, step_s = segment.body_to_ned[1:][steps], segment.step_s[steps, None]
 
-    def sum_since_event(increments: Array) -> Array:
-        cumulative_sum = np.cumsum(increments, axis=0)
-        return np.asarray(cumulative_sum - (cumulative_sum - increments)[interval_first_step])
-
-    def get_state_before_step(rows: slice) -> Array:
-        previous_state = np.concatenate([state[:1, rows], state[:-1, rows]])
-        return np.where(is_first_step, start_state[:, rows], previous_state)
+    def integrate(rows: slice, increments: Array) -> ArrayPair:
+        """Return states before and after each step."""
+        sums = cumulative_sums(increments)
+        sums_at_events = sums[first_steps[:-1] - first_steps[0]]
+        offsets = np.repeat(event_states[:, rows] - sums_at_events, interval_lengths, axis=0)
+        return sums[:-1] + offsets, sums[1:] + offsets
 
     # Prediction of attitude error, velocity and position, see intervals.py
     rotation_increments_rad = -rotate(body_to_ned, state[:, GYRO_BIAS]) * step_s
     if configuration.estimates_attitude:
         rotation_increments_rad -= segment.attitude_correction_rad[steps]
-    state[:, THETA] += sum_since_event(rotation_increments_rad)
+    attitude_error_before_rad, state[:, THETA] = integrate(THETA, rotation_increments_rad)
     specific_force_ned_m_s2 = rotate(body_to_ned, segment.specific_force_m_s2[steps])
     acceleration = (
-        np.cross(get_state_before_step(THETA), specific_force_ned_m_s2)
+        np.cross(attitude_error_before_rad, specific_force_ned_m_s2)
         + specific_force_ned_m_s2
         + GRAVITY_M_S2
     )
     acceleration -= rotate(body_to_ned, state[:, ACCELEROMETER_BIAS])
-    state[:, VELOCITY] += sum_since_event(acceleration * step_s)
-    state[:, POSITION] += sum_since_event(
-        0.5 * step_s * (get_state_before_step(VELOCITY) + state[:, VELOCITY])
-    )
+    velocity_before_m_s, state[:, VELOCITY] = integrate(VELOCITY, acceleration * step_s)
+    mean_velocity_m_s = 0.5 * (velocity_before_m_s + state[:, VELOCITY])
+    state[:, POSITION] = integrate(POSITION, mean_velocity_m_s * step_s)[1]
     return state

@@ -124,13 +124,15 @@ def _read_common_topics(
         layouts.append([Layout(px4.OLD_INNOVATION_TOPIC, field_by_column)] * 2)
     for value_layout, variance_layout in layouts:
         innovation = topics.primary_samples(value_layout)[f"innovation_{aid.axes[0]}"]
-        variance = topics.primary_samples(variance_layout)[f"variance_{aid.axes[0]}"]
+        variance_samples = topics.primary_samples(variance_layout)
+        variance = variance_samples[f"variance_{aid.axes[0]}"]
         is_new_variance = (variance > 0.0) & variance.ne(variance.shift())
         samples = topics.primary_samples(value_layout, select_rows=_drop_repeats_and_zeros)
         if variance_layout is not value_layout:
             # The nearest variance S is used, because PX4 logs it at other times
-            variance_samples = topics.primary_samples(variance_layout).dropna()
-            samples = join_nearest(samples, variance_samples, MAX_VARIANCE_TIME_DIFFERENCE_S)
+            samples = join_nearest(
+                samples, variance_samples.dropna(), MAX_VARIANCE_TIME_DIFFERENCE_S
+            )
         samples = samples.dropna()
         if enabled_flag is not None:
             samples = samples[sample_step_function(enabled_flag, samples.index) > 0.0]
