@@ -183,17 +183,17 @@ def evaluate(
         or an RPE delta is not above zero.
     """
     return evaluation.evaluate(
-        _read_trajectory(estimate), _read_trajectory(reference, default="truth"), **options
+        _read_trajectory(estimate), _read_trajectory(reference, default_track="truth"), **options
     )
 
 
 def _read_trajectory(
-    source: Pathlike | Trajectory, default: Literal["truth"] | None = None
+    source: Pathlike | Trajectory, default_track: Literal["truth"] | None = None
 ) -> Trajectory:
-    """Read a trajectory; ``default`` is the track of a flight log."""
+    """Read a trajectory; ``default_track`` is for a flight log."""
     if isinstance(source, Trajectory):
         return source
-    return read_source(str(source), default=default).trajectory
+    return read_source(str(source), default_track=default_track).trajectory
 
 
 def close_loop(
@@ -249,7 +249,9 @@ def close_loop(
         loop_source = LoopSource(source, None)
     else:
         loop_source = read_source(str(source), frame=frame)
-    reference_track = None if reference is None else _read_trajectory(reference, default="truth")
+    reference_track = (
+        None if reference is None else _read_trajectory(reference, default_track="truth")
+    )
     return analyse(loop_source, request.LoopRequest(**request_fields), reference_track, progress)
 
 
