@@ -373,10 +373,11 @@ def _make_rerun(trial: Trial, trials: Sequence[Trial]) -> Rerun:
 
 
 def _format_trial_label(trial: Trial, trials: Sequence[Trial]) -> str:
-    kind, label = trial.kinds[0], "KF" if trial.filter == "kf" else "EKF2 (replay)"
+    kind, is_ekf2 = trial.kinds[0], trial.filter == "ekf2"
+    label = FILTER_NAMES[trial.filter] + (" (replay)" if is_ekf2 else "")
     if OUTLIERS_KEY in trial.change:
         return f"{label} without {trial.change[OUTLIERS_KEY]:.0f} outliers"
-    if trial.filter == "kf":
+    if not is_ekf2:
         options_text = " ".join(
             f"{COMPARISON_OPTIONS[name]} {value:g}"
             for name, value in trial.change.items()

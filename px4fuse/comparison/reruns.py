@@ -186,7 +186,9 @@ def list_rerun_configurations(
     return [
         FilterConfiguration({**logged_parameters, **change})
         for axis_result in comparison.axes.values()
-        for change, _ in _find_changes_to_test(comparison, estimates, ekf2_inputs, axis_result)
+        for change, _ in _find_changes_to_test(
+            comparison, estimates, "ekf2", ekf2_inputs, axis_result
+        )
         if change.keys() <= logged_parameters.keys()
     ]
 
@@ -199,11 +201,12 @@ def is_inconsistent(summary: FilterSummary | UntestedFilter) -> TypeGuard[Filter
 def _find_changes_to_test(
     comparison: Comparison,
     estimates: Estimates,
+    filter_name: FilterName,
     ekf2_inputs: ReplayInputs | None,
     axis_result: AxisComparison,
 ) -> list[tuple[Change, tuple[Statistic, ...]]]:
     """Return the changes to test along an axis, and the statistics that each change may correct."""
-    summary = axis_result.filters["kf" if ekf2_inputs is None else "ekf2"]
+    summary = axis_result.filters[filter_name]
     if not isinstance(summary, FilterSummary) or (
         ekf2_inputs is not None and axis_result.axis.name == "down"
     ):
@@ -214,14 +217,14 @@ def _find_changes_to_test(
     }
     candidates = {
         statistic: find_candidate_changes(
-            comparison, estimates, ekf2_inputs, axis_result, statistic
+            comparison, estimates, filter_name, ekf2_inputs, axis_result, statistic
         )
         for statistic in CONSISTENCY_STATISTICS
         if has_discrepancy[statistic]
     }
     changes = remove_repeated_changes(chain.from_iterable(candidates.values()))
     if axis_result is comparison.main:
-        changes = find_main_axis_changes(comparison, estimates, ekf2_inputs)
+        changes = find_main_axis_changes(comparison, estimates, filter_name, ekf2_inputs)
     return [
         (change, tuple(statistic for statistic in candidates if change in candidates[statistic]))
         for change in changes
@@ -234,7 +237,9 @@ def _rerun_with_changes(
     tested_filter: _Filter,
     axis_result: AxisComparison,
 ) -> list[Trial]:
-    changes = _find_changes_to_test(comparison, estimates, tested_filter.ekf2_inputs, axis_result)
+    changes = _find_changes_to_test(
+        comparison, estimates, tested_filter.name, tested_filter.ekf2_inputs, axis_result
+    )
     if not changes:
         return []
     original_statistics, is_logged = _find_statistics_without_change(tested_filter, axis_result)

@@ -399,7 +399,7 @@ def _has_default_noises(
     analysis: Analysis, filter_name: FilterName, result: AxisComparison
 ) -> bool:
     """Return True if a filter uses default noise settings: px4fuse's (KF) or PX4's (EKF2)."""
-    if filter_name == "kf":
+    if filter_name != "ekf2":
         settings, defaults = analysis.settings, Settings()
         return all(
             getattr(settings, name) == getattr(defaults, name) for name in (SIGMA_Z, SIGMA_A)
