@@ -34,7 +34,7 @@ def predicted(result: AxisComparison, times: Array) -> Array:
     run, chosen = result.replay, result.replay.settings
     edges, q = run.steps.index.to_numpy(), chosen.sigma_a_m_s2**2 * chosen.dt_s
     last = np.searchsorted(edges, times, side="right") - 1
-    steps = run.steps.drop(columns="input_variance_m2_s4").to_numpy()
+    steps = run.steps.drop(columns="imu_gap_variance_m2_s4").to_numpy()
     (p, v, pp, pv, vv, a), d = steps[last].T, times - edges[last]
     position, speed = p + v * d + a * d * d / 2, v + a * d
     return np.array([position, speed, pp + 2 * d * pv + d * d * vv + q * d**3 / 4, vv + q * d])

@@ -146,11 +146,11 @@ def test_kf_variance_between_steps_is_predicted_from_previous(dt: float, gap: bo
             ahead = at - edges[k]
             P = model.make_symmetric_matrix(step[COVARIANCE_COLUMNS])
             F = np.array([[1.0, ahead], [0.0, 1.0]])
-            q = (0.7**2 + step["input_variance_m2_s4"]) * dt
+            q = (0.7**2 + step["imu_gap_variance_m2_s4"]) * dt
             Q = q * np.array([[ahead**3 / 4.0, ahead**2 / 2.0], [ahead**2 / 2.0, ahead]])
             expected = np.diag(F @ P @ F.T + Q)
             np.testing.assert_allclose([position[k], velocity[k]], expected, rtol=1e-12)
-    assert bool((run.steps["input_variance_m2_s4"] > 0.0).any()) == gap
+    assert bool((run.steps["imu_gap_variance_m2_s4"] > 0.0).any()) == gap
 
 
 @settings(max_examples=30)
