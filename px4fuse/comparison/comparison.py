@@ -22,10 +22,8 @@ from px4fuse.comparison.model import (
 from px4fuse.core.arrays import Array
 from px4fuse.filter.consistency import (
     DEFAULT_GATE,
-    Consistency,
     HorizontalNis,
     assess_horizontal_nis,
-    assess_innovations,
 )
 from px4fuse.filter.kalman import Replay, predict_state, predict_variance, replay
 from px4fuse.filter.model import STATE_COLUMNS
@@ -153,7 +151,7 @@ def _summarise_filter(
     truth: ErrorsAgainstTruth | Unavailable,
     gate: float,
 ) -> FilterSummary | UntestedFilter:
-    sigmas: dict[str, Any] = {
+    fields: dict[str, Any] = {
         name: float(np.sqrt(values.median())) if len(values) else None
         for name, values in (
             ("sigma_p_median_m", _drop_missing_values(variance, "position_variance_m2")),
@@ -161,16 +159,16 @@ def _summarise_filter(
             ("sigma_p_before_update_m", _drop_missing_values(innovations, "prior_variance_m2")),
             ("sigma_p_after_update_m", _drop_missing_values(innovations, "posterior_variance_m2")),
         )
-    }
-    consistency: Consistency | Unavailable
+    } | {"truth": truth}
+    summary: FilterSummary | Unavailable
     if isinstance(innovations, Unavailable):
-        consistency = innovations
+        summary = innovations
     else:
         innovation_m, variance_m2 = innovations[INNOVATION_COLUMNS].to_numpy().T
-        consistency = assess_innovations(innovation_m, variance_m2, gate)
-    if isinstance(consistency, Unavailable):
-        return UntestedFilter(**structs.asdict(consistency), **sigmas, truth=truth)
-    return FilterSummary(**structs.asdict(consistency), **sigmas, truth=truth)
+        summary = FilterSummary.from_innovations(innovation_m, variance_m2, gate, **fields)
+    if isinstance(summary, Unavailable):
+        return UntestedFilter(**structs.asdict(summary), **fields)
+    return summary
 
 
 def _drop_missing_values(table: TableOrUnavailable, column: str) -> pd.Series:

@@ -22,7 +22,7 @@ from px4fuse.comparison.trials import (
     find_trial,
 )
 from px4fuse.core.text import format_factor, format_metres, format_ratio
-from px4fuse.filter.consistency import Consistency, assess_innovations
+from px4fuse.filter.consistency import Consistency
 from px4fuse.filter.tuning import HORIZONTAL, AxisTuning
 from px4fuse.finding import Finding
 from px4fuse.findings.cause_grouping import CAUSE_KEY, REPORTED_VARIANCE_USED_BY_EKF2_CAUSE
@@ -289,7 +289,7 @@ def _assess_span(analysis: Analysis, start_s: float, end_s: float) -> SpanConsis
     if isinstance(innovations, Unavailable):
         return SpanConsistency(innovations, rmse_m)
     samples = innovations[(innovations.index >= start_s) & (innovations.index < end_s)]
-    consistency = assess_innovations(
+    consistency = Consistency.from_innovations(
         samples["innovation_m"].to_numpy(), samples["innovation_variance_m2"].to_numpy(), math.inf
     )
     return SpanConsistency(consistency, rmse_m)
