@@ -22,6 +22,9 @@ from px4fuse.request import ComparisonRequest
 class Analysis(Comparison, Estimates, Reruns):
     """Comparison of KF and EKF2 on one flight, with parameter estimates, filter re-runs and faults.
 
+    The fields of :class:`Comparison`, :class:`Estimates` and :class:`Reruns` are also fields of
+    this class.
+
     Attributes
     ----------
     events : Events

@@ -1,19 +1,30 @@
 """Diagnosis of one flight, from a request (files and settings) to the faults.
 
-1. read: log → Flight
-2. prepare: position source, time span and axes
-3. filter: run KF along each axis
-4. compare: KF, EKF2 and ground truth
-5. estimate: noise σ, time offset, frame misalignment, biases
-6. rerun: replay EKF2, explain KF - EKF2, re-run both filters with one change at a time
-7. analyse the rest of the flight: loop closure, EKF2's other aiding sources, events
-8. find: faults of the flight, with their causes
+:func:`diagnose` calls:
+
+1. read_flight: log → Flight
+2. prepare_comparison: position source, time span, axes and time offset
+3. compare: run KF along each axis; compare KF, EKF2 and ground truth
+4. diagnose_comparison, which calls:
+
+   a. estimate: noise σ, time offset, frame misalignment, biases
+   b. rerun: replay EKF2, explain KF - EKF2, re-run both filters with one change at a time
+   c. collect_events, evaluate_aids, analyse_flight_loop: events, EKF2's other aiding sources,
+      loop closure error
+   d. find: faults of the flight, with their causes
+
+If EKF2's positions, from which the time offset of a position file was estimated, are late, steps 2
+to 4 are repeated with the time offset from the IMU (_align_file_to_imu).
+
+Other commands: :func:`diagnose_or_check_aids` also analyses flights without positions,
+:func:`run_what_if` is ``px4fuse whatif``, and :func:`analyse_loop_closure` is ``px4fuse loop``.
+Between the steps, release_free_memory limits the peak memory.
 """
 
 import math
-from dataclasses import replace
+from dataclasses import MISSING, fields, replace
 from pathlib import Path
-from typing import TypeVar
+from typing import Any, TypeVar
 
 from msgspec import structs
 
@@ -65,8 +76,6 @@ def diagnose(
     request: ComparisonRequest,
     progress: Progress = ignore_progress,
     flight: Flight | None = None,
-    *,
-    keep_positions_as_sent: bool = False,
 ) -> Analysis:
     """Read a flight, compare KF with EKF2, and find faults.
 
@@ -77,8 +86,6 @@ def diagnose(
         Called with the name of each step of the computation.
     flight : Flight, optional
         Flight that was already read from the files of the request.
-    keep_positions_as_sent : bool
-        True to skip the check and correction of axes, unit and timestamps of the positions.
 
     Raises
     ------
@@ -86,28 +93,20 @@ def diagnose(
         A file cannot be read, the flight lacks required data, or a setting is out of range.
     """
     flight = flight or read_flight(request, progress)
-    analysis = _diagnose_flight(
-        request, progress, flight, keep_positions_as_sent=keep_positions_as_sent
-    )
-    if refined_flight := _refine_clock_offset(flight, analysis):
-        analysis = _diagnose_flight(
-            request, progress, refined_flight, keep_positions_as_sent=keep_positions_as_sent
-        )
+    analysis = _diagnose_flight(request, progress, flight)
+    if aligned_flight := _align_file_to_imu(flight, analysis):
+        analysis = _diagnose_flight(request, progress, aligned_flight)
     return analysis
 
 
-def _diagnose_flight(
-    request: ComparisonRequest, progress: Progress, flight: Flight, *, keep_positions_as_sent: bool
-) -> Analysis:
-    prepared_comparison = prepare_comparison(
-        flight, request, progress, keep_positions_as_sent=keep_positions_as_sent
-    )
+def _diagnose_flight(request: ComparisonRequest, progress: Progress, flight: Flight) -> Analysis:
+    prepared_comparison = prepare_comparison(flight, request, progress)
     progress("running KF")
     comparison = compare(prepared_comparison)
     return replace(analyse_comparison(comparison, progress), request=request)
 
 
-def _refine_clock_offset(flight: Flight, analysis: Analysis) -> Flight | None:
+def _align_file_to_imu(flight: Flight, analysis: Analysis) -> Flight | None:
     """Replace the clock offset of a position file by the estimate from the IMU.
 
     The first estimate is from EKF2's positions, which may be late. Return None if nothing changes.
@@ -130,6 +129,7 @@ def _refine_clock_offset(flight: Flight, analysis: Analysis) -> Flight | None:
         clock_reason="the offset was estimated with the IMU; EKF2's position is "
         f"{abs(offset_s):.3f} s {'late' if offset_s < 0 else 'early'} compared with the IMU",
     )
+    # align_position_file adds the position file as first track
     file_track, *other_tracks = flight.positions
     shifted_track = replace(shift_clock(file_track, offset_s), alignment=alignment)
     return replace(flight, positions=(shifted_track, *other_tracks))
@@ -141,20 +141,20 @@ def analyse_comparison(comparison: Comparison, progress: Progress = ignore_progr
     If students must find the faults, only the comparison is returned.
     """
     if comparison.flight.log.is_assessed:
+        withheld_fields: dict[str, Any] = {
+            field.name: DIAGNOSIS_WITHHELD
+            for field in fields(Analysis)
+            if field.default is MISSING and field.name not in vars(comparison)
+        }
         return Analysis(
-            **vars(comparison),
-            tuning={HORIZONTAL: DIAGNOSIS_WITHHELD},
-            clock=DIAGNOSIS_WITHHELD,
-            heading=DIAGNOSIS_WITHHELD,
-            systematic_errors=DIAGNOSIS_WITHHELD,
-            source_low_pass=DIAGNOSIS_WITHHELD,
-            time_correlated_noise=DIAGNOSIS_WITHHELD,
-            ekf2_model=DIAGNOSIS_WITHHELD,
-            difference_steps=dict.fromkeys(comparison.axes, DIAGNOSIS_WITHHELD),
-            trials=(),
-            events=collect_events(comparison),
-            aids=DIAGNOSIS_WITHHELD,
-            loop=DIAGNOSIS_WITHHELD,
+            **vars(comparison)
+            | withheld_fields
+            | {
+                "tuning": {HORIZONTAL: DIAGNOSIS_WITHHELD},
+                "difference_steps": dict.fromkeys(comparison.axes, DIAGNOSIS_WITHHELD),
+                "trials": (),
+                "events": collect_events(comparison),
+            }
         )
     estimates = estimate(comparison, progress)
     release_free_memory()
@@ -233,16 +233,12 @@ def prepare_comparison(
     flight: Flight,
     request: ComparisonRequest,
     progress: Progress = ignore_progress,
-    *,
-    keep_positions_as_sent: bool = False,
 ) -> PreparedComparison:
     """Choose position source, time span, axes and time offset of a comparison.
 
     For arguments and errors see :func:`diagnose`.
     """
-    prepared_comparison = prepare_comparison_inputs(
-        flight, request, keep_positions_as_sent=keep_positions_as_sent
-    )
+    prepared_comparison = prepare_comparison_inputs(flight, request)
     # read_flight has already corrected the time offset of a position file
     if request.clock_offset_s != AUTO or request.position is not None:
         return prepared_comparison
@@ -265,7 +261,7 @@ def prepare_comparison(
             notes.append(f"the timestamps were shifted by {applied_s:+.3f} s")
         return replace(prepared_comparison, notes=tuple(notes))
     request = structs.replace(request, clock_offset_s=clock_offset.offset_s)
-    return prepare_comparison_inputs(flight, request, keep_positions_as_sent=keep_positions_as_sent)
+    return prepare_comparison_inputs(flight, request)
 
 
 def rerun(
@@ -283,13 +279,13 @@ def rerun(
         ],
     )
     release_free_memory()
-    explanation_by_axis = explain_ekf2_difference(
+    difference_steps = explain_ekf2_difference(
         comparison, ekf2_model, estimates.clock, estimated_settings
     )
     trials = rerun_filters(comparison, estimates, ekf2_model)
-    if isinstance(ekf2_model, Ekf2Model):  # to free memory
+    if isinstance(ekf2_model, Ekf2Model):  # the runs need much memory
         ekf2_model = replace(ekf2_model, runs=())
-    return Reruns(ekf2_model=ekf2_model, difference_steps=explanation_by_axis, trials=trials)
+    return Reruns(ekf2_model=ekf2_model, difference_steps=difference_steps, trials=trials)
 
 
 def diagnose_or_check_aids(
@@ -390,7 +386,7 @@ def analyse_loop_closure(request: LoopRequest, progress: Progress = ignore_progr
     system, reference = request.system, None
     source = read_source(request.source, frame=request.frame, system=system)
     if request.reference is not None:
-        reference = read_source(request.reference, default="truth", system=system).trajectory
+        reference = read_source(request.reference, default_track="truth", system=system).trajectory
     loop = analyse(source, request, reference, progress)
     if source.flight is None or loop.kind != "vio" or loop.is_assessed:
         return loop
