@@ -162,7 +162,7 @@ def detect_unavailable_data(analysis: Analysis) -> Findings:
                 kf_summary.remedy,
                 {"count": len(result.replay.updates)},
             )
-            return
+            return  # one finding for all axes
 
 
 def detect_source_not_logged(analysis: PreparedComparison) -> Findings:

@@ -633,7 +633,9 @@ class Ekf2:
     step_s: float = EKF2_STEP_S
     # Delay (s) of the fusion horizon: EKF2 fuses measurements at this age
     horizon_s: float | Unavailable = HORIZON_NOT_LOGGED
+    # Data at the fusion horizon for the replay of EKF2
     record: FusionRecord | Unavailable = RECORD_NOT_LOGGED
+    # Innovations of each aiding source, by PX4's name
     aids: Mapping[str, AidLog] = field(default_factory=dict)
     # Status flags of EKF2, 1 while set; ``failed_checks`` is the bit mask gps_check_fail_flags
     states: StepFunctions = field(default_factory=dict)
