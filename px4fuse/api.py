@@ -266,11 +266,11 @@ def write_report(analysis: Analysis, path: Pathlike) -> Path:
         A file cannot be written, or the analysis is not from :func:`px4fuse.compare`.
     """
     from px4fuse.report.pdf import render_pdf  # noqa: PLC0415 - slow import
-    from px4fuse.results.build import results  # noqa: PLC0415
+    from px4fuse.results.build import make_comparison_results  # noqa: PLC0415
     from px4fuse.results.contract import to_json  # noqa: PLC0415
 
     report_path = _require_suffix(path, ".pdf")
-    serialisable_results = results(_require_request(analysis), analysis)
+    serialisable_results = make_comparison_results(_require_request(analysis), analysis)
     results_json = to_json(serialisable_results)
     pdf = render_pdf(analysis, serialisable_results, results_json)
     write_output_files({report_path: pdf, report_path.with_suffix(".json"): results_json.encode()})

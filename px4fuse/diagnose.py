@@ -103,7 +103,7 @@ def _diagnose_flight(request: ComparisonRequest, progress: Progress, flight: Fli
     prepared_comparison = prepare_comparison(flight, request, progress)
     progress("running KF")
     comparison = compare(prepared_comparison)
-    return replace(analyse_comparison(comparison, progress), request=request)
+    return replace(diagnose_comparison(comparison, progress), request=request)
 
 
 def _align_file_to_imu(flight: Flight, analysis: Analysis) -> Flight | None:
@@ -135,7 +135,7 @@ def _align_file_to_imu(flight: Flight, analysis: Analysis) -> Flight | None:
     return replace(flight, positions=(shifted_track, *other_tracks))
 
 
-def analyse_comparison(comparison: Comparison, progress: Progress = ignore_progress) -> Analysis:
+def diagnose_comparison(comparison: Comparison, progress: Progress = ignore_progress) -> Analysis:
     """Estimate errors, re-run KF and EKF2, and find faults and their causes.
 
     If students must find the faults, only the comparison is returned.

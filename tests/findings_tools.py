@@ -116,7 +116,7 @@ def analysis(
     """Make an analysis; fields that are not given are Unavailable."""
     if isinstance(ekf2, dict):
         usual_ekf2 = {
-            "states": {},
+            "status_flags": {},
             "parameters": {},
             "aids": {},
             "record": NONE,

@@ -21,7 +21,7 @@ from px4fuse.card.build import (
 from px4fuse.card.causes import _find_action_target, make_cause, rank_causes
 from px4fuse.card.model import Action, Note
 from px4fuse.comparison.trials import RunStatistics, Trial, classify_improvement
-from px4fuse.diagnose import analyse_comparison
+from px4fuse.diagnose import diagnose_comparison
 from px4fuse.errors import LogError
 from px4fuse.filter.settings import Settings
 from px4fuse.finding import Finding
@@ -222,7 +222,7 @@ def test_owner_of_delay_action_is_named_device(remedy: str, target: str) -> None
 
 def test_diagnosis_explains_differing_nis_and_nees_verdicts() -> None:
     flight = simulate_flight(Scenario(seed=8), parse_faults(("ekf2-delay=0.25",)))
-    explained = analyse_comparison(compare(flight, Settings()))
+    explained = diagnose_comparison(compare(flight, Settings()))
     card = build_card(explained, REQUEST)
     assert (card.id, card.causes[0].reruns[0].improves) == (
         "ekf2_ev_delay_wrong",

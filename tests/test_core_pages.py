@@ -18,7 +18,7 @@ from px4fuse.report import cover, event_marks, flight
 from px4fuse.report.page import Page
 from px4fuse.report.style import apply_report_style
 from px4fuse.request import ComparisonRequest
-from px4fuse.results.build import results
+from px4fuse.results.build import make_comparison_results
 from px4fuse.results.contract import ComparisonResults
 from px4fuse.results.model import Student
 
@@ -27,7 +27,7 @@ def document(
     comparison: Comparison, findings: tuple[Finding, ...] = ()
 ) -> tuple[Analysis, ComparisonResults]:
     analysis = unexplained(comparison)
-    made = results(ComparisonRequest(log="aisle.ulg"), analysis, Student("Ada"))
+    made = make_comparison_results(ComparisonRequest(log="aisle.ulg"), analysis, Student("Ada"))
     return analysis, structs.replace(made, findings=findings)
 
 

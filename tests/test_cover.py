@@ -21,7 +21,7 @@ from px4fuse.report import cover, cover_panels
 from px4fuse.report.page import Page
 from px4fuse.report.style import apply_report_style
 from px4fuse.request import ComparisonRequest
-from px4fuse.results.build import results
+from px4fuse.results.build import make_comparison_results
 
 
 def page_of(card: Card) -> Page:
@@ -35,7 +35,7 @@ def text_of(card: Card) -> str:
 
 
 def drawn(analysis: Analysis) -> Page:
-    made = results(ComparisonRequest(log="aisle.ulg"), analysis)
+    made = make_comparison_results(ComparisonRequest(log="aisle.ulg"), analysis)
     with apply_report_style():
         (page,) = cover.draw_pages(analysis, made)
     return page

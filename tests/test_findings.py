@@ -139,7 +139,7 @@ def with_invalid_position(flight: Flight) -> Flight:
     state = flight.ekf2.state.copy()
     state["north_m"] += np.clip(state.index - 80.0, 0.0, None)
     valid = pd.Series([1.0, 0.0], index=[0.0, 80.0])
-    return with_ekf2(state=state, states={"xy_valid": valid})(flight)
+    return with_ekf2(state=state, status_flags={"xy_valid": valid})(flight)
 
 
 def as_odometry(flight: Flight) -> Flight:

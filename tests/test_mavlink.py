@@ -47,7 +47,7 @@ from pandas.testing import assert_frame_equal
 from scipy.spatial.transform import Rotation
 from time_limit import time_limit
 
-from px4fuse.diagnose import analyse_comparison
+from px4fuse.diagnose import diagnose_comparison
 from px4fuse.errors import LogError, MissingDataError
 from px4fuse.flight.model import (
     AS_RECEIVED_ORIGIN,
@@ -443,7 +443,7 @@ def test_ardupilot_messages_contain_no_px4_advice(read, missing_messages):
     if flight.positions:
         texts += [
             f"{f.message} {f.remedy}"
-            for f in analyse_comparison(compare(flight)).findings
+            for f in diagnose_comparison(compare(flight)).findings
             if f.id != "not_px4"
         ]
     else:

@@ -27,7 +27,7 @@ from px4fuse.comparison.trials import (
     find_cause_trial,
     find_trials,
 )
-from px4fuse.diagnose import analyse_comparison
+from px4fuse.diagnose import diagnose_comparison
 from px4fuse.ekf2.model import replay_with_settings
 from px4fuse.ekf2.whatif import HEADING_LOGGED_NOTE, what_if
 from px4fuse.errors import SettingsError
@@ -49,7 +49,7 @@ OUTDOOR = make_scenario("outdoor", seed=5)
 @cache
 def flown(*texts: str) -> Analysis:
     flight = simulate_flight(OUTDOOR, parse_faults(texts))
-    return analyse_comparison(compare(flight, Settings(0.27, 0.4)))
+    return diagnose_comparison(compare(flight, Settings(0.27, 0.4)))
 
 
 def roots(analysis: Analysis) -> list[str]:

@@ -21,7 +21,7 @@ from px4fuse.comparison.trials import (
     find_trial,
     has_effect,
 )
-from px4fuse.diagnose import analyse_comparison
+from px4fuse.diagnose import diagnose_comparison
 from px4fuse.ekf2.whatif import what_if
 from px4fuse.filter.settings import Settings
 from px4fuse.filter.tuning import AxisTuning, NoiseEstimate
@@ -42,7 +42,7 @@ LOOP = Scenario(kind="loop", passes=1, length_m=8.0, vio_rate_hz=10.0)
 
 @cache
 def flown(scenario: Scenario, settings: Settings, *mistakes: str) -> Analysis:
-    return analyse_comparison(
+    return diagnose_comparison(
         compare(simulate_flight(scenario, parse_faults(mistakes)), settings, axes=AXES)
     )
 

@@ -27,7 +27,7 @@ from px4fuse.comparison.trials import (
     find_trials,
 )
 from px4fuse.comparison.trials import RIGHT_BIAS_KEY as TO_RIGHT
-from px4fuse.diagnose import analyse_comparison
+from px4fuse.diagnose import diagnose_comparison
 from px4fuse.ekf2.filter_recursion import FilterConfiguration
 from px4fuse.ekf2.model import add_position_noise, misalign_positions, replay_with_settings
 from px4fuse.ekf2.whatif import what_if
@@ -45,7 +45,7 @@ LATE = "clock-offset=0.25"
 @cache
 def flown(*mistakes: str, sigma_a=0.27, sigma_z=0.10, passes=4) -> Analysis:
     flight = simulate_flight(Scenario(seed=5, passes=passes), parse_faults(mistakes))
-    return analyse_comparison(
+    return diagnose_comparison(
         compare(flight, Settings(sigma_a, sigma_z), axes=("aisle", "north", "east"))
     )
 
@@ -119,7 +119,7 @@ def test_filter_rerun_for_vibration_increases_ekf2_acc_noise() -> None:
 def test_ekf2_is_rerun_with_time_offset_that_kf_already_uses() -> None:
     bare = flown("clock-offset=-0.19")
     offset_s = cause(bare, "kf", "nees").change[CLOCK_OFFSET_KEY]
-    analysis = analyse_comparison(compare(bare.flight, replace(RIGHT, clock_offset_s=offset_s)))
+    analysis = diagnose_comparison(compare(bare.flight, replace(RIGHT, clock_offset_s=offset_s)))
     assert {row.filter for row in analysis.trials if row.discrepancies} == {"ekf2"}
     again, before = cause(analysis, "ekf2", "nees"), cause(bare, "ekf2", "nees")
     assert again.change == pytest.approx(before.change, abs=0.01)

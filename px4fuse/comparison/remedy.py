@@ -297,7 +297,7 @@ def select_changed_settings(
     }
 
 
-def format_settings(changes: Mapping[str, float]) -> str:
+def format_changes(changes: Mapping[str, float]) -> str:
     """Format EKF2 parameters with their new values, for example "EKF2_EV_DELAY to 264 ms"."""
     parameter_texts = (
         f"{name} to {value:.3g} {KNOWN_PARAMETERS[name].printed_unit}"

@@ -20,7 +20,7 @@ from px4fuse.comparison.comparison import compare
 from px4fuse.comparison.preparation import prepare_comparison_inputs
 from px4fuse.core.record import Record, read_toml
 from px4fuse.core.text import capitalise_first
-from px4fuse.diagnose import analyse_comparison
+from px4fuse.diagnose import diagnose_comparison
 from px4fuse.explore.data import make_flight_data
 from px4fuse.explore.packing import ArrayEncoder
 from px4fuse.explore.page import make_data_elements, make_page_html
@@ -193,7 +193,7 @@ def _simulate_flight_data(
     request = ComparisonRequest(log=flight.log.name, sigma_a_m_s2=SIGMA_A_M_S2, sigma_z_m=SIGMA_Z_M)
     # without the automatic correction of axes and timestamps, which would hide the injected fault
     prepared = prepare_comparison_inputs(flight, request, keep_positions_as_sent=True)
-    analysis = replace(analyse_comparison(compare(prepared)), request=request)
+    analysis = replace(diagnose_comparison(compare(prepared)), request=request)
     fault_descriptions = [_describe_fault(*pair, analysis.findings) for pair in faults_and_sizes]
     card = _with_fault_headline(build_card(analysis, request), fault_descriptions)
     answer_key = {

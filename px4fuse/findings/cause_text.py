@@ -5,7 +5,7 @@ from collections.abc import Mapping
 from px4fuse.analysis import Analysis
 from px4fuse.comparison import changes, trials
 from px4fuse.comparison.model import FilterName
-from px4fuse.comparison.remedy import find_aid, format_settings, select_changed_settings
+from px4fuse.comparison.remedy import find_aid, format_changes, select_changed_settings
 from px4fuse.comparison.trials import (
     Statistic,
     Trial,
@@ -98,7 +98,7 @@ def format_action(analysis: Analysis, change: Mapping[str, float]) -> str:
         )
     if parameters := {name: change[name] for name in change if name in PARAMETERS}:
         parameters = select_changed_settings(parameters, _find_used_settings(analysis))
-        actions.append(f"Set {format_settings(parameters)}.")
+        actions.append(f"Set {format_changes(parameters)}.")
     if kf_settings := {name: change[name] for name in changes.KF_NOISE_SETTINGS & change.keys()}:
         actions.append(format_kf_settings(kf_settings))
     return " ".join(actions)

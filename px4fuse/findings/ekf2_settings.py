@@ -10,7 +10,7 @@ from px4fuse.comparison.model import AxisComparison
 from px4fuse.comparison.remedy import (
     find_aid,
     find_used_noise_m,
-    format_settings,
+    format_changes,
     make_height_noise_advice,
     select_changed_settings,
 )
@@ -100,7 +100,7 @@ def detect_wrong_noise(analysis: Analysis) -> Findings:
         f"{title}{effect_text}. {name} is {used_noise_m:.3g} m; the maximum-likelihood estimate is "
         f"{estimated_noise_m:.3g} m{interval_text}. {reason}"
     )
-    action = f"Set {format_settings(select_changed_settings(trial.change, inputs.settings))}."
+    action = f"Set {format_changes(select_changed_settings(trial.change, inputs.settings))}."
     if uses_reported_sigma:
         mode_text = f" ({aid.noise_mode_parameter} 0)" if aid.noise_mode_parameter else ""
         message += (

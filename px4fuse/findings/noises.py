@@ -13,7 +13,7 @@ from px4fuse.comparison.changes import MIN_RERUN_SIGMA_Z_M, SIGMA_A, SIGMA_Z, fi
 from px4fuse.comparison.estimates import find_first_tuning
 from px4fuse.comparison.model import FILTER_NAMES, AxisComparison, FilterName, FilterSummary
 from px4fuse.comparison.projection import EKF2_MIN_NOISE_M
-from px4fuse.comparison.remedy import find_aid, format_settings, make_noise_change
+from px4fuse.comparison.remedy import find_aid, format_changes, make_noise_change
 from px4fuse.comparison.reruns import is_inconsistent
 from px4fuse.comparison.trials import (
     Trial,
@@ -456,7 +456,7 @@ def _find_sigma_action_without_replay(
     if not changes:
         return UNEXPLAINED_SIGMA_ACTION
     return (
-        f"Set {format_settings(changes)}. EKF2 used a measurement noise of {used_noise_m:.2g} m. "
+        f"Set {format_changes(changes)}. EKF2 used a measurement noise of {used_noise_m:.2g} m. "
         "Fly again to test the change, because EKF2 cannot be replayed."
     )
 

@@ -129,7 +129,7 @@ def _find_offset_remedy(analysis: Analysis, time_offset: ClockOffset) -> str:
     position_age_ms = (remedy.find_logged_delay_ms(analysis) or 0.0) - 1e3 * time_offset.remaining_s
     action = format_sender_action(analysis.source, time_offset.remaining_s)
     if delay_max_change := remedy.find_delay_max_change(analysis, position_age_ms):
-        action += f", and set {remedy.format_settings(delay_max_change)}"
+        action += f", and set {remedy.format_changes(delay_max_change)}"
     return f"{action}."
 
 
@@ -203,7 +203,7 @@ def detect_wrong_gnss_delay(analysis: Analysis) -> Findings:
         f"{GNSS_POS.delay} is {delay_ms:g} ms, but GNSS positions and velocities are "
         f"{estimated_delay_ms:.0f} ms late (± {1.96 * sigma_ms:.0f} ms, 95 %, compared with "
         "vision). EKF2's track leads or lags the motion.",
-        f"Set {remedy.format_settings(change)}." if change else CHECK_RECEIVER_ACTION,
+        f"Set {remedy.format_changes(change)}." if change else CHECK_RECEIVER_ACTION,
         {"ekf2_gps_delay_ms": delay_ms, "estimate_ms": estimated_delay_ms, "sigma_ms": sigma_ms},
     )
 
@@ -215,6 +215,4 @@ def _find_delay_remedy(analysis: Analysis, parameter: str, action_if_not_confirm
     ratio = _compute_rmse_ratio(trial)
     if math.isnan(ratio) and trial.before.nis_mean and trial.after.nis_mean:
         ratio = trial.after.nis_mean / trial.before.nis_mean
-    return (
-        f"Set {remedy.format_settings(trial.change)}." if ratio < 1.0 else action_if_not_confirmed
-    )
+    return f"Set {remedy.format_changes(trial.change)}." if ratio < 1.0 else action_if_not_confirmed

@@ -5,7 +5,7 @@ import math
 import numpy as np
 
 from px4fuse.analysis import Analysis
-from px4fuse.comparison.remedy import find_aid, format_settings
+from px4fuse.comparison.remedy import find_aid, format_changes
 from px4fuse.core.text import lowercase_first_letter
 from px4fuse.filter.frame_rotation import HeadingError
 from px4fuse.finding import Finding
@@ -138,7 +138,7 @@ def _explain_gnss_heading_error(analysis: Analysis) -> tuple[str, str]:
     """Return the possible cause of a wrong heading in a flight with GNSS, and the action."""
     if (trial := find_confirmed_noise_trial(analysis)) is not None:
         cause = f"a wrong {find_aid(analysis).noise}, with which GNSS affects EKF2's heading"
-        return cause, f"Set {format_settings(trial.change)}. Then check the heading again."
+        return cause, f"Set {format_changes(trial.change)}. Then check the heading again."
     advice = magnetometer_advice(analysis.flight)
     cause = "a magnetometer near currents or steel" if advice else "a wrong heading source of EKF2"
     return cause, f"{advice} {CHECK_GNSS_DELAY_ACTION}".lstrip()

@@ -556,7 +556,7 @@ class FusionRecord:
     # Logged updates of EKF2's height bias estimators, by aiding source
     height_bias_updates: Mapping[str, pd.DataFrame] = field(default_factory=dict)
     # Status flags of EKF2 by PX4 name; 1 while set
-    states: StepFunctions = field(default_factory=dict)
+    status_flags: StepFunctions = field(default_factory=dict)
 
     __repr__ = one_line_repr
 
@@ -566,7 +566,7 @@ class FusionRecord:
 
     def was_flag_set(self, flag: str, times_s: Array) -> BoolArray:
         """Return True for each time at which the status flag of EKF2 was set."""
-        step_function = self.states.get(flag)
+        step_function = self.status_flags.get(flag)
         return (
             np.zeros(len(times_s), bool)
             if step_function is None
@@ -638,7 +638,7 @@ class Ekf2:
     # Innovations of each aiding source, by PX4's name
     aids: Mapping[str, AidLog] = field(default_factory=dict)
     # Status flags of EKF2, 1 while set; ``failed_checks`` is the bit mask gps_check_fail_flags
-    states: StepFunctions = field(default_factory=dict)
+    status_flags: StepFunctions = field(default_factory=dict)
     # All EKF2 parameters at take-off, in PX4 units
     parameters: Mapping[str, float] = field(default_factory=dict)
     parameter_changes: tuple[ParameterChange, ...] = ()

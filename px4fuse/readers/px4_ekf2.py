@@ -133,7 +133,7 @@ def read_ekf2(topics: Topics) -> Ekf2 | Unavailable:
             topics, horizon_state, local_position, aid_enabled_flags, step_s
         ),
         aids=aids,
-        states=status_flags,
+        status_flags=status_flags,
         parameters=topics.ekf2_parameters,
         parameter_changes=topics.parameter_changes,
     )
@@ -372,7 +372,7 @@ def _read_fusion_record(
         flow=_read_optical_flow(topics, enabled_aids),
         latitude_deg=float(origin["ref_lat"]),
         altitude_m=altitude_m,
-        states={name: enabled_aids[name] for name in STATUS_FLAGS if name in enabled_aids},
+        status_flags={name: enabled_aids[name] for name in STATUS_FLAGS if name in enabled_aids},
         height_bias_updates={
             name: topics.primary_samples(layout).dropna()
             for name, layout in px4.HEIGHT_BIAS_LAYOUT_BY_AID.items()

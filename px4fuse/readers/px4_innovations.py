@@ -75,20 +75,24 @@ def has_fused_aid(ekf2: Ekf2 | Unavailable, aid: str = GNSS_POS.name) -> bool:
         if aid_log.enabled is not None:
             return True
     # a valid global position shows that EKF2 fused GNSS
-    if aid != GNSS_POS.name or "tilt_align" in ekf2.states or "xy_global" not in ekf2.states:
+    if (
+        aid != GNSS_POS.name
+        or "tilt_align" in ekf2.status_flags
+        or "xy_global" not in ekf2.status_flags
+    ):
         return False
-    return bool(ekf2.states["xy_global"].any())
+    return bool(ekf2.status_flags["xy_global"].any())
 
 
 def replace_vision_by_gnss_innovations(ekf2: Ekf2, source: Ekf2PositionSource = GNSS) -> Ekf2:
     """Return the EKF2 data with innovations of GNSS instead of external vision."""
     enabled_flags = {
-        group: ekf2.states[name]
+        group: ekf2.status_flags[name]
         for group, name in (
             ("horizontal", source.horizontal_aid),
             ("vertical", source.vertical_aid),
         )
-        if name in ekf2.states
+        if name in ekf2.status_flags
     }
     fusion_flags: TableOrUnavailable = Unavailable(
         "EKF2 fusion flags",

@@ -12,7 +12,7 @@ from px4fuse.comparison.remedy import (
     find_aid,
     find_delay_max_change,
     find_logged_delay_ms,
-    format_settings,
+    format_changes,
 )
 from px4fuse.comparison.trials import Trial
 from px4fuse.convention.correction import find_convention_faults
@@ -145,7 +145,7 @@ def _format_delay_advice(
         "ms), or correct the sender's clock."
     )
     if delay_max_change := find_delay_max_change(comparison, fitted_delay_ms):
-        text += f" For either correction, set {format_settings(delay_max_change)}."
+        text += f" For either correction, set {format_changes(delay_max_change)}."
     return text
 
 

@@ -30,7 +30,7 @@ from px4fuse.trajectory.evaluation import Evaluation
 from px4fuse.trajectory.graph.solver import Graph
 
 
-def results(
+def make_comparison_results(
     request: ComparisonRequest, analysis: Analysis, student: Student = NO_STUDENT
 ) -> contract.ComparisonResults:
     """Convert an analysis by KF and EKF2 to the results of ``px4fuse compare``.
@@ -57,14 +57,14 @@ def results(
     return drop_invalid_numbers(contract.ComparisonResults(**fields))
 
 
-def make_compare_results(
+def make_comparison_or_aids_results(
     request: ComparisonRequest,
     outcome: Analysis | AidingSourceAnalysis,
     student: Student = NO_STUDENT,
 ) -> contract.ComparisonResults | contract.AidsResults:
     """Return the results of ``px4fuse compare`` for a flight with or without positions."""
     if isinstance(outcome, Analysis):
-        return results(request, outcome, student)
+        return make_comparison_results(request, outcome, student)
     return drop_invalid_numbers(
         contract.AidsResults(
             **_make_common_fields(contract.AIDING_SOURCES_SCHEMA_NAME, request, outcome.flight),

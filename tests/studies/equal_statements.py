@@ -92,7 +92,7 @@ def flight_outputs(request: ComparisonRequest, flight: Flight | None = None) -> 
     if not isinstance(analysis, Analysis):
         return {}
     outputs: Outputs = {
-        "json": to_json_dict(build.results(request, analysis)),
+        "json": to_json_dict(build.make_comparison_results(request, analysis)),
         "parameters": {n: v for n, v in flight.log.parameters.items() if n in PARAMETERS},
     }
     comparison = prepare_comparison(flight, request)

@@ -145,7 +145,7 @@ def replayed_m(model: Ekf2Model, change: dict[str, float]) -> tuple[float, float
 
 def follow(analysis: Analysis, request: ComparisonRequest) -> list[Fix]:
     """Return the fixes of one analysed flight with their effect."""
-    outputs = {"json": to_json_dict(build.results(request, analysis))}
+    outputs = {"json": to_json_dict(build.make_comparison_results(request, analysis))}
     actions: dict[tuple[str, tuple[tuple[str, Any], ...]], list[str]] = {}
     for kind, change, place in proposed(outputs):
         actions.setdefault((kind, tuple(sorted(change.items()))), []).append(place)
