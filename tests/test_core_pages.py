@@ -74,7 +74,7 @@ def test_event_symbols_in_plots_are_labelled_by_event_type(eventful: Analysis) -
 def test_zoomed_plot_shows_updates_in_middle_of_flight() -> None:
     comparison = compare(aisle_flight(duration_s=120.0))
     start, end = flight.find_zoom_span(comparison.main)
-    updates = comparison.main.replay.updates.index
+    updates = comparison.main.kf_run.updates.index
     assert ((updates >= start) & (updates <= end)).sum() >= flight.ZOOM_UPDATE_COUNT
     assert end - start < 4.0
     assert abs((start + end) / 2.0 - 60.0) < 12.5

@@ -205,7 +205,7 @@ def test_cover_map_title_states_farthest_distance_outside_map() -> None:
 
 def test_innovations_beyond_plot_scale_are_drawn_as_triangles(eventful: Analysis) -> None:
     plot = cover_panels._make_innovation_plot(eventful.main)
-    updates = eventful.main.replay.updates
+    updates = eventful.main.kf_run.updates
     normalised = updates["innovation_m"] / np.sqrt(updates["innovation_variance_m2"])
     largest = float(normalised.abs().max())
     assert largest > cover_panels.MAX_DRAWN_SIGMAS

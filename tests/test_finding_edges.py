@@ -589,7 +589,7 @@ EDGES = [
         (
             imu.detect_imu_gaps,
             analysis(
-                axes=(axis(replay=SimpleNamespace(input_gap_s=gap_s)),),
+                axes=(axis(kf_run=SimpleNamespace(input_gap_s=gap_s)),),
                 flight={"imu": at_rate(rate_hz)},
             ),
             expected,

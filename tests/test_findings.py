@@ -572,7 +572,7 @@ def test_fault_detection_on_very_short_flight_does_not_raise(
     if isinstance(imu := fault.flight.get("imu"), Imu):
         short["imu"] = replace(imu, gap_s=None)
     comparison = compare(fault.fly(**short), Settings(**fault.settings))
-    few = len(next(iter(comparison.axes.values())).replay.updates) < MIN_INNOVATIONS
+    few = len(next(iter(comparison.axes.values())).kf_run.updates) < MIN_INNOVATIONS
     assert ("too_few_innovations" in ids(found(comparison))) == few
 
 

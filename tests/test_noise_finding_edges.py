@@ -228,7 +228,7 @@ def following(gain: float, *, growth: float = 0.05, **parts: Any) -> Any:
     both = pd.concat([after, pd.Series(7.0, index=index[:-1] + 0.1)]).sort_index()
     replay = SimpleNamespace(updates=updates, steps=both.to_frame("position_variance_m2"))
     slow = {"verdict": "overconfident", "lag1_autocorrelation": 0.31, **parts}
-    return axis(kf=statement(4.0, **slow), replay=replay)
+    return axis(kf=statement(4.0, **slow), kf_run=replay)
 
 
 @pytest.mark.parametrize(
@@ -238,7 +238,7 @@ def following(gain: float, *, growth: float = 0.05, **parts: Any) -> Any:
         (following(0.1, lag1_autocorrelation=0.3), "error"),
         (following(0.1, lag1_autocorrelation=0.29), None),
         (following(0.1, verdict="consistent"), None),
-        (axis(kf=NONE, replay=SimpleNamespace(updates=None)), None),
+        (axis(kf=NONE, kf_run=SimpleNamespace(updates=None)), None),
     ],
 )  # fmt: skip
 def test_near_zero_q_with_white_innovations_is_not_reported(one: Any, expected: str | None) -> None:

@@ -41,7 +41,7 @@ def explain_again(analysis: Analysis, settings: Settings, **choices: Any) -> Dif
 def test_position_difference_on_report_page_is_kf_minus_ekf2(sample: Analysis) -> None:
     explanation = of(sample)
     result = next(r for r in sample.axes.values() if r.axis.name == "aisle")
-    position, speed = predict_state(result.replay, explanation.times_s)
+    position, speed = predict_state(result.kf_run, explanation.times_s)
     logged = result.ekf2_state.loc[explanation.times_s]
     difference = position - logged["position_m"].to_numpy()
     np.testing.assert_allclose(explanation.kf_minus_ekf2_m, difference, atol=1e-9)

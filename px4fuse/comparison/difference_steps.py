@@ -17,7 +17,7 @@ from px4fuse.ekf2.inputs import ReplayInputs
 from px4fuse.ekf2.model import Ekf2Model
 from px4fuse.ekf2.replay import is_inside_spans
 from px4fuse.ekf2.steps import DifferenceExplanation, DifferenceOutsideReplay, PropertyReplacement
-from px4fuse.filter.kalman import Replay, predict_state, replay
+from px4fuse.filter.kalman import KfRun, predict_state, run_kf
 from px4fuse.filter.settings import Settings
 from px4fuse.filter.signals import AISLE
 from px4fuse.filter.time_offset import ClockOffset
@@ -60,7 +60,7 @@ def explain_ekf2_difference(
     kf_settings = _make_comparable_settings(comparison, model.inputs, estimate_by_setting)
     changed_settings = replace(comparison.settings, **estimate_by_setting)
     kf_runs = {
-        name: replay(axis.axis, changed_settings, fast=True) if estimate_by_setting else axis.replay
+        name: run_kf(axis.axis, changed_settings, fast=True) if estimate_by_setting else axis.kf_run
         for name, axis in axis_results.items()
     }
     explanations = steps.explain_difference_by_replacements(model, kf_settings, kf_runs)
@@ -125,7 +125,7 @@ def _make_comparable_settings(
 
 
 def _compare_outside_replay(
-    axis_result: AxisComparison, kf_run: Replay, spans_s: Spans
+    axis_result: AxisComparison, kf_run: KfRun, spans_s: Spans
 ) -> DifferenceOutsideReplay | None:
     if isinstance(axis_result.ekf2_state, Unavailable):
         return None

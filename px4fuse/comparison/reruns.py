@@ -59,7 +59,7 @@ from px4fuse.ekf2.inputs import ReplayInputs
 from px4fuse.ekf2.model import Ekf2Model, misalign_positions, replay_with_settings
 from px4fuse.ekf2.replay import HORIZONTAL_AXES, Ekf2Replay, rows_inside
 from px4fuse.ekf2.steps import DifferenceExplanation
-from px4fuse.filter.kalman import replay
+from px4fuse.filter.kalman import run_kf
 from px4fuse.filter.settings import Settings
 from px4fuse.filter.signals import (
     Acceleration,
@@ -290,7 +290,7 @@ def _find_statistics_without_change(
         innovations["innovation_m"].to_numpy(),
         innovations["innovation_variance_m2"].to_numpy(),
         compute_error_statistics(logged_state, axis_result.ekf2_variance, axis_result.truth),
-        compute_difference_statistics(axis_result.replay, logged_state),
+        compute_difference_statistics(axis_result.kf_run, logged_state),
         float((rejected_flags > 0.0).mean()) if len(rejected_flags) else None,
     )
     is_replay_similar = all(
@@ -358,7 +358,7 @@ def _rerun_kf(
         measurement_time_s=time_s[is_used] + shift_s,
         measurement_m=axis.measurement_m[is_used],
     )
-    kf_run = replay(axis, changed_settings, fast=True)
+    kf_run = run_kf(axis, changed_settings, fast=True)
     # With a rotated frame, positions of KF and EKF2 are not comparable
     return _summarise_run(
         kf_run.updates["innovation_m"].to_numpy(),
@@ -442,6 +442,6 @@ def _summarise_replay(
         weighted_sum(updates, [f"innovation_{name}_m" for name in HORIZONTAL_AXES], cosines),
         innovation_variance_m2,
         compute_error_statistics(published_track, variance_by_time, axis_result.truth),
-        compute_difference_statistics(axis_result.replay, track_compared_with_kf),
+        compute_difference_statistics(axis_result.kf_run, track_compared_with_kf),
         float((updates["rejected"] > 0.0).mean()) if len(updates) else None,
     )

@@ -25,7 +25,7 @@ from px4fuse.filter.settings import InitialState, Settings
 from px4fuse.filter.signals import Axis
 from px4fuse.filter.steps import PredictionSteps, make_prediction_steps
 
-# Columns of ``Replay.updates``
+# Columns of ``KfRun.updates``
 UPDATE_TABLE_COLUMNS = [
     "measurement_m",
     "innovation_m",
@@ -41,7 +41,7 @@ NO_UPDATE = (math.nan,) * len(UPDATE_TABLE_COLUMNS)
 
 
 @dataclass(frozen=True)
-class Replay:
+class KfRun:
     """Results of KF along one axis.
 
     Attributes
@@ -64,9 +64,9 @@ class Replay:
     __repr__ = one_line_repr
 
 
-def replay(
+def run_kf(
     axis: Axis, settings: Settings, initial: InitialState | None = None, *, fast: bool = False
-) -> Replay:
+) -> KfRun:
     """Run KF along one axis.
 
     Parameters
@@ -104,7 +104,7 @@ def replay(
     steps["acceleration_m_s2"] = np.append(prediction_steps.acceleration_m_s2, 0.0)
     steps["imu_gap_variance_m2_s4"] = np.append(prediction_steps.imu_gap_variance_m2_s4, 0.0)
     is_update = prediction_steps.measurement_index >= 0
-    return Replay(
+    return KfRun(
         axis,
         settings,
         steps,
@@ -196,7 +196,7 @@ def _run_with_floats(
         yield (position, velocity, *covariance, *update)
 
 
-def _find_previous_steps(run: Replay, times_s: Array) -> tuple[IntArray, Array, BoolArray]:
+def _find_previous_steps(run: KfRun, times_s: Array) -> tuple[IntArray, Array, BoolArray]:
     """Find for each time the last step of KF before it.
 
     Return its index, the time (s) since this step, and True for times outside KF's time span.
@@ -212,7 +212,7 @@ def _find_previous_steps(run: Replay, times_s: Array) -> tuple[IntArray, Array, 
     )
 
 
-def predict_state(run: Replay, times_s: Array) -> Array:
+def predict_state(run: KfRun, times_s: Array) -> Array:
     """Predict position (m) and velocity (m/s) at each time from KF's last step before it.
 
     Interpolation would use later measurements. Times outside the time span of KF give NaN.
@@ -226,7 +226,7 @@ def predict_state(run: Replay, times_s: Array) -> Array:
     return np.where(is_outside, np.nan, state)
 
 
-def predict_variance(run: Replay, times_s: Array) -> Array:
+def predict_variance(run: KfRun, times_s: Array) -> Array:
     """Return the variances (m², m²/s²) of position and velocity from :func:`predict_state`."""
     step_index, elapsed_s, is_outside = _find_previous_steps(run, times_s)
     p00, p01, p11 = run.steps[model.COVARIANCE_COLUMNS].to_numpy()[step_index].T

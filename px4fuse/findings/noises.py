@@ -222,7 +222,7 @@ def find_setting_deviation(
 def detect_process_noise_near_zero(analysis: Analysis) -> Findings:
     """Detect a SIGMA_A so small that KF ignores new positions."""
     for result in sorted(analysis.axes.values(), key=lambda result: result is not analysis.main):
-        updates, summary = result.replay.updates, result.filters["kf"]
+        updates, summary = result.kf_run.updates, result.filters["kf"]
         # Without motion, a small SIGMA_A is correct
         if (
             isinstance(summary, Unavailable)

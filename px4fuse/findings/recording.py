@@ -160,7 +160,7 @@ def detect_unavailable_data(analysis: Analysis) -> Findings:
                 "too_few_innovations",
                 f"The consistency of KF is not tested: {kf_summary.reason}.",
                 kf_summary.remedy,
-                {"count": len(result.replay.updates)},
+                {"count": len(result.kf_run.updates)},
             )
             return  # one finding for all axes
 

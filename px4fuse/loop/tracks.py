@@ -102,7 +102,7 @@ def _make_kf_trajectory(flight: Flight) -> Trajectory:
     kf_comparison = compare(prepared_comparison)
     columns = zip(Columns.POSITION, kf_comparison.axes.values(), strict=True)
     position_samples = pd.DataFrame(
-        {name: axis.replay.steps["position_m"] for name, axis in columns}
+        {name: axis.kf_run.steps["position_m"] for name, axis in columns}
     )
     settings = kf_comparison.settings
     note = (

@@ -11,7 +11,7 @@ from px4fuse.comparison.estimates import estimate_noises_and_clock
 from px4fuse.comparison.model import AxisComparison, Comparison, FilterName, FilterSummary
 from px4fuse.comparison.preparation import prepare_comparison_inputs
 from px4fuse.core.record import Record, read_toml
-from px4fuse.filter.kalman import replay
+from px4fuse.filter.kalman import run_kf
 from px4fuse.filter.model import (
     COVARIANCE_COLUMNS,
     compute_process_noise_per_density,
@@ -233,11 +233,11 @@ def compute_numeric_answer(
 ) -> float | tuple[float, ...] | None:
     """Run KF to compute the right answer to a question; None with too few measurements."""
     settings = Settings(question.sigma_a_m_s2, question.sigma_z_m)
-    kf_replay = replay(axis_comparison.axis, settings)
-    updates = kf_replay.updates.iloc[question.update_number - 1 :]
+    kf_run = run_kf(axis_comparison.axis, settings)
+    updates = kf_run.updates.iloc[question.update_number - 1 :]
     if updates.empty:
         return None
-    covariance = kf_replay.steps.loc[updates.index[0], COVARIANCE_COLUMNS]
+    covariance = kf_run.steps.loc[updates.index[0], COVARIANCE_COLUMNS]
     nis = updates["innovation_m"] ** 2 / updates["innovation_variance_m2"]
     match question.kind:
         case "gate":
