@@ -386,7 +386,7 @@ PRECONDITIONS: list[tuple[str, Callable[[Comparison, Finding], bool]]] = [
         lambda made, one: made.source.orientation is not None or "send the orient" in one.remedy,
     ),
     ("--position-yaw|--position-frame", lambda made, _: made.source.alignment is not None),
-    ("TIMESYNC", lambda made, _: made.source.origin.path == "as received"),
+    ("TIMESYNC", lambda made, _: made.source.origin.route == "as received"),
 ]
 # Findings about a log that the SD card damaged
 CORRUPT_LOG = ("log_damaged", "imu_samples_missing")

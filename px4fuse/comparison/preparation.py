@@ -119,7 +119,7 @@ def _correct_convention(
     flight: Flight, source: PositionTrack, settings: Settings, *, is_checked: bool
 ) -> tuple[Flight, PositionTrack, Settings, Convention | None]:
     """Check and correct axes, unit, clock and orientation of the positions, unless in NED."""
-    is_in_ned = source.origin.is_gnss or source.origin.path == ALIGNED_BY_EKF2_ORIGIN.path
+    is_in_ned = source.origin.is_gnss or source.origin.route == ALIGNED_BY_EKF2_ORIGIN.route
     convention = check_convention(flight, source) if is_checked and not is_in_ned else None
     # A time offset from the user replaces the detected one
     if convention is not None and settings.clock_offset_s:
@@ -317,7 +317,7 @@ def _explain_choice(flight: Flight, track: PositionTrack) -> str:
     if track.origin.is_fused_as_gnss:
         return "the only position source in the log, fused by EKF2"
     log_text = f" (from {track.log})" if track.log and track.log != flight.log.name else ""
-    return f"chosen automatically: positions {track.origin.path}{log_text}"
+    return f"chosen automatically: positions {track.origin.route}{log_text}"
 
 
 def shift_clock(track: PositionTrack, clock_offset_s: float) -> PositionTrack:

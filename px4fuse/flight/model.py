@@ -46,7 +46,7 @@ class SourceOrigin(Record):
     # Kind of the sensor, inferred from the data
     kind: PositionKind
     # Logged data that contain the positions, for example "as received" by the autopilot
-    path: PositionRoute
+    route: PositionRoute
     # EKF2's aiding source for these positions; None if EKF2 never fuses them
     aid: Aid | None
     # True if px4fuse may select the source by default
@@ -60,12 +60,12 @@ class SourceOrigin(Record):
     @property
     def reconstructed(self) -> bool:
         """True if the positions are reconstructed from EKF2's logged data."""
-        return self.path in ("kept by EKF2", "rebuilt from innovations")
+        return self.route in ("kept by EKF2", "rebuilt from innovations")
 
     @property
     def has_all_samples(self) -> bool:
         """True if all positions of the sender are available."""
-        return self.path in ("given file", "as received")
+        return self.route in ("given file", "as received")
 
     @property
     def is_vision(self) -> bool:
@@ -82,7 +82,9 @@ class SourceOrigin(Record):
 
     def find_preference_rank(self) -> int:
         """Return the rank of the source. px4fuse prefers the source with the smallest rank."""
-        return [(origin.aid, origin.path) for origin in SOURCE_ORIGINS].index((self.aid, self.path))
+        return [(origin.aid, origin.route) for origin in SOURCE_ORIGINS].index(
+            (self.aid, self.route)
+        )
 
 
 POSITION_FILE_ORIGIN = SourceOrigin("file", "given file", EV_POS)
@@ -104,11 +106,11 @@ SOURCE_ORIGINS = (
 )
 
 
-def find_source_origin(kind: str, path: str) -> SourceOrigin:
+def find_source_origin(kind: str, route: str) -> SourceOrigin:
     for origin in SOURCE_ORIGINS:
-        if (origin.kind, origin.path) == (kind, path):
+        if (origin.kind, origin.route) == (kind, route):
             return origin
-    raise ValueError(f"no position source has the kind {kind!r} and the path {path!r}")
+    raise ValueError(f"no position source has the kind {kind!r} and the route {route!r}")
 
 
 REPEATED_TIMESTAMPS_NOTE = (
@@ -424,21 +426,17 @@ class PositionTrack:
 
     def description_fields(self) -> dict[str, Any]:
         """Return the fields that describe the position source in results.json."""
-        names = (
-            "name",
-            "kind",
-            "path",
-            "description",
-            "frame",
-            "clock",
-            "reconstructed",
-            "topics",
-            "log",
-            "alignment",
-        )
         return {
-            name: getattr(self.origin if hasattr(self.origin, name) else self, name)
-            for name in names
+            "name": self.name,
+            "kind": self.origin.kind,
+            "path": self.origin.route,
+            "description": self.description,
+            "frame": self.frame,
+            "clock": self.clock,
+            "reconstructed": self.origin.reconstructed,
+            "topics": self.topics,
+            "log": self.log,
+            "alignment": self.alignment,
         }
 
     def compute_rate_hz(self) -> float:

@@ -190,7 +190,7 @@ def _make_flight_fields(
             AvailableTrack(
                 each.name,
                 each.origin.kind,
-                each.origin.path,
+                each.origin.route,
                 len(each.samples),
                 each.compute_rate_hz(),
             )
