@@ -39,7 +39,7 @@ from px4fuse.comparison.estimates import (
     Estimates,
     Progress,
     estimate,
-    estimate_noises_and_clock,
+    estimate_noises_and_time_offset,
     ignore_progress,
 )
 from px4fuse.comparison.flight_events import collect_events
@@ -47,7 +47,7 @@ from px4fuse.comparison.model import Comparison, PreparedComparison
 from px4fuse.comparison.preparation import (
     explain_missing_source,
     prepare_comparison_inputs,
-    shift_clock,
+    shift_timestamps,
 )
 from px4fuse.comparison.remedy import estimate_ekf2_parameters
 from px4fuse.comparison.reruns import Reruns, list_rerun_configurations, rerun_filters
@@ -58,7 +58,7 @@ from px4fuse.ekf2.model import Ekf2Model, prepare_ekf2_model
 from px4fuse.ekf2.whatif import make_sweep_values, what_if
 from px4fuse.errors import MissingDataError, SettingsError
 from px4fuse.filter.signals import AISLE
-from px4fuse.filter.time_offset import ClockOffset
+from px4fuse.filter.time_offset import SourceTimeOffset
 from px4fuse.filter.tuning import HORIZONTAL
 from px4fuse.findings import find, find_aid_findings
 from px4fuse.findings.cause_grouping import WRONG_CONVENTION_KEY
@@ -111,27 +111,27 @@ def _align_file_to_imu(flight: Flight, analysis: Analysis) -> Flight | None:
 
     The first estimate is from EKF2's positions, which may be late. Return None if nothing changes.
     """
-    alignment, clock_offset = analysis.source.alignment, analysis.clock
+    alignment, time_offset = analysis.source.alignment, analysis.time_offset
     if (
         alignment is None
         or alignment.clock_offset_sigma_s is None
         or alignment.reference != "EKF2 position"
-        or not isinstance(clock_offset, ClockOffset)
+        or not isinstance(time_offset, SourceTimeOffset)
         or all(finding.id != "source_time_offset" for finding in analysis.findings)
         or any(WRONG_CONVENTION_KEY in finding.evidence for finding in analysis.findings)
     ):
         return None
-    offset_s = clock_offset.offset_s
+    offset_s = time_offset.offset_s
     alignment = structs.replace(
         alignment,
         clock_offset_s=alignment.clock_offset_s + offset_s,
-        clock_offset_sigma_s=clock_offset.sigma_s,
+        clock_offset_sigma_s=time_offset.sigma_s,
         clock_reason="the offset was estimated with the IMU; EKF2's position is "
         f"{abs(offset_s):.3f} s {'late' if offset_s < 0 else 'early'} compared with the IMU",
     )
     # align_position_file adds the position file as first track
     file_track, *other_tracks = flight.positions
-    shifted_track = replace(shift_clock(file_track, offset_s), alignment=alignment)
+    shifted_track = replace(shift_timestamps(file_track, offset_s), alignment=alignment)
     return replace(flight, positions=(shifted_track, *other_tracks))
 
 
@@ -158,7 +158,7 @@ def diagnose_comparison(comparison: Comparison, progress: Progress = ignore_prog
         )
     estimates = estimate(comparison, progress)
     release_free_memory()
-    comparison = refine_delay(comparison, estimates.clock)
+    comparison = refine_delay(comparison, estimates.time_offset)
     reruns = rerun(comparison, estimates, progress)
     release_free_memory()
     progress("measuring the loop closure error")
@@ -176,16 +176,16 @@ def diagnose_comparison(comparison: Comparison, progress: Progress = ignore_prog
     return replace(analysis, findings=find(analysis))
 
 
-def refine_delay(comparison: Comparison, clock_offset: ClockOffset | Unavailable) -> Comparison:
-    """Replace the detected delay of the positions by the more precise ``clock_offset``."""
+def refine_delay(comparison: Comparison, time_offset: SourceTimeOffset | Unavailable) -> Comparison:
+    """Replace the detected delay of the positions by the more precise ``time_offset``."""
     if (
         comparison.convention is None
-        or isinstance(clock_offset, Unavailable)
-        or not clock_offset.is_determinable
+        or isinstance(time_offset, Unavailable)
+        or not time_offset.is_determinable
     ):
         return comparison
     # The delay is the negative time offset
-    refined_convention = structs.replace(comparison.convention, late_s=-clock_offset.offset_s)
+    refined_convention = structs.replace(comparison.convention, late_s=-time_offset.offset_s)
     refined_comparison = replace(comparison, convention=refined_convention)
     # Keep the first estimate if the refined delay is too small to be a fault
     is_delay_a_fault = (
@@ -242,25 +242,25 @@ def prepare_comparison(
     # read_flight has already corrected the time offset of a position file
     if request.clock_offset_s != AUTO or request.position is not None:
         return prepared_comparison
-    _, clock_offset = estimate_noises_and_clock(prepared_comparison, progress)
-    if isinstance(clock_offset, Unavailable) or not clock_offset.is_determinable:
+    _, time_offset = estimate_noises_and_time_offset(prepared_comparison, progress)
+    if isinstance(time_offset, Unavailable) or not time_offset.is_determinable:
         raise MissingDataError(
             f"{flight.log.name}: the time offset cannot be estimated from this flight "
-            f"({clock_offset.reason}).",
+            f"({time_offset.reason}).",
             "State the offset (--clock-offset SECONDS), or omit --clock-offset.",
         )
-    if not clock_offset.is_significant(clock_offset.remaining_s):
-        applied_s = clock_offset.applied_s
-        low_s, high_s = (limit_s - applied_s for limit_s in clock_offset.interval_s)
+    if not time_offset.is_significant(time_offset.remaining_s):
+        applied_s = time_offset.applied_s
+        low_s, high_s = (limit_s - applied_s for limit_s in time_offset.interval_s)
         notes = [
             *prepared_comparison.notes,
-            f"--clock-offset auto: the time offset {clock_offset.remaining_s:+.3f} s (95 % "
+            f"--clock-offset auto: the time offset {time_offset.remaining_s:+.3f} s (95 % "
             f"{low_s:+.3f} to {high_s:+.3f} s) is not significant and not applied",
         ]
         if applied_s:
             notes.append(f"the timestamps were shifted by {applied_s:+.3f} s")
         return replace(prepared_comparison, notes=tuple(notes))
-    request = structs.replace(request, clock_offset_s=clock_offset.offset_s)
+    request = structs.replace(request, clock_offset_s=time_offset.offset_s)
     return prepare_comparison_inputs(flight, request)
 
 
@@ -280,7 +280,7 @@ def rerun(
     )
     release_free_memory()
     difference_steps = explain_ekf2_difference(
-        comparison, ekf2_model, estimates.clock, estimated_settings
+        comparison, ekf2_model, estimates.time_offset, estimated_settings
     )
     trials = rerun_filters(comparison, estimates, ekf2_model)
     if isinstance(ekf2_model, Ekf2Model):  # the runs need much memory
@@ -351,8 +351,8 @@ def run_what_if(
         comparison_request = structs.replace(comparison_request, axes=("north", "east", AISLE))
         prepared_comparison = prepare_comparison_inputs(flight, comparison_request)
         comparison = compare(prepared_comparison)
-        tuning, clock_offset = estimate_noises_and_clock(comparison, progress)
-        changes = estimate_ekf2_parameters(comparison, ekf2_model, tuning, clock_offset)
+        tuning, time_offset = estimate_noises_and_time_offset(comparison, progress)
+        changes = estimate_ekf2_parameters(comparison, ekf2_model, tuning, time_offset)
     parameter_sets = [changes] if changes or request.without else []
     parameter_sets += [changes | values for values in swept_settings]
     progress("replaying EKF2 with other parameters")

@@ -18,7 +18,7 @@ from px4fuse.filter.consistency import Consistency
 from px4fuse.filter.hypotheses import Estimate, Jump, SystematicErrors
 from px4fuse.filter.settings import Settings
 from px4fuse.filter.signals import Segment, cut_to_segment
-from px4fuse.filter.time_offset import ClockOffset, PartOffset
+from px4fuse.filter.time_offset import PartOffset, SourceTimeOffset
 from px4fuse.filter.tuning import HORIZONTAL, AxisTuning, NoiseEstimate
 from px4fuse.finding import Finding
 from px4fuse.flight.ekf2_parameters import PARAMETERS
@@ -134,7 +134,7 @@ def analysis(
     flown = {**usual_flight, **(flight or {})}
     usual = dict.fromkeys(
         (
-            "clock",
+            "time_offset",
             "ekf2_model",
             "loop",
             "heading",
@@ -266,7 +266,7 @@ def tuned(
 
 def late(
     remaining_s: float, sigma_s: float = 0.001, applied_s: float = 0.0, **parts: Any
-) -> ClockOffset:
+) -> SourceTimeOffset:
     offset_s = applied_s + remaining_s
     halves = tuple(PartOffset(0.0, 1.0, at, 0.1) for at in (offset_s - 0.2, offset_s + 0.2))
     usual = {
@@ -274,7 +274,11 @@ def late(
         "change_p_value": None, "parts": halves,
     }  # fmt: skip
     return made(
-        ClockOffset, offset_s=offset_s, applied_s=applied_s, sigma_s=sigma_s, **{**usual, **parts}
+        SourceTimeOffset,
+        offset_s=offset_s,
+        applied_s=applied_s,
+        sigma_s=sigma_s,
+        **{**usual, **parts},
     )
 
 

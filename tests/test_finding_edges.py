@@ -335,7 +335,7 @@ def test_error_above_sigma_finding_prefers_the_main_axis() -> None:
     assert finding.remedy.startswith(time_offset_check)
     check = finding.remedy
     assert check.endswith(f"{SOURCE_TEXTS['uwb'].slow_error_check}.")
-    known = only(hidden_errors.detect, analysis(axes=(axis(), hiding()), clock=late(0.0)))
+    known = only(hidden_errors.detect, analysis(axes=(axis(), hiding()), time_offset=late(0.0)))
     assert known.remedy.startswith("Check the time offset of the positions (px4fuse sync LOG). ")
     # the error is EKF2's own only if the RMSE of KF is below 0.7 of it
     for kf_rmse_m, remedy in (
@@ -648,7 +648,7 @@ def at_multiples(multiples: list[int], base_s: float = 0.125, **parts: Any) -> A
 
 
 def low_pass(gain: float, lag_s: float, **parts: Any) -> Any:
-    usual = {"source_low_pass": SourceLowPass(0.5, lag_s, gain, 0.1), "clock": late(0.0)}
+    usual = {"source_low_pass": SourceLowPass(0.5, lag_s, gain, 0.1), "time_offset": late(0.0)}
     return analysis(**{**usual, **parts})
 
 
@@ -680,7 +680,11 @@ def jumping(*sizes: Any, **parts: Any) -> Any:
 
 def scaled(value: float, sigma: float = 0.01, imu_hz: float = 49.1, **parts: Any) -> Any:
     found = made(SystematicErrors, scale=Estimate(value, sigma), jumps=())
-    usual = {"systematic_errors": found, "flight": {"imu": at_rate(imu_hz)}, "clock": late(0.0)}
+    usual = {
+        "systematic_errors": found,
+        "flight": {"imu": at_rate(imu_hz)},
+        "time_offset": late(0.0),
+    }
     return analysis(**{**usual, **parts})
 
 
@@ -695,7 +699,7 @@ def stating(reported: float, noise: float, interval: Any = None, **parts: Any) -
 
 def delayed(delay_ms: float | None, clock: Any, **parts: Any) -> Any:
     flown = {} if delay_ms is None else {"EKF2_EV_DELAY": delay_ms}
-    return analysis(log=log(parameters=flown), clock=clock, **parts)
+    return analysis(log=log(parameters=flown), time_offset=clock, **parts)
 
 
 BIAS, JUMPS, SCALE = (
@@ -711,7 +715,7 @@ ARRIVALS, DOWNSAMPLED, CLOCK = (
 
 
 def wrong_delay(one: Any) -> Any:
-    return source_clock.detect_wrong_delay(one, one.clock)
+    return source_clock.detect_wrong_delay(one, one.time_offset)
 
 
 STATED = source_positions.detect_wrong_variance
@@ -798,7 +802,7 @@ SOURCE_EDGES = [
     (SCALE, scaled(0.5, imu_hz=48.9), None),
     (SCALE, scaled(0.5, source=source(origin=GNSS_ORIGIN)), None),
     # without an estimated time offset the timestamps may be late
-    *((which, of(clock=clock), expected)
+    *((which, of(time_offset=clock), expected)
       for which, of in ((SCALE, partial(scaled, 0.5)),
                         (source_positions.detect_low_pass, partial(low_pass, 99.0, 1.0)))
       for clock, expected in ((NONE, None), (late(0.0, is_determinable=False), "error"))),
@@ -821,13 +825,13 @@ SOURCE_EDGES = [
     (STATED, stating(3.0, 1.0, source_low_pass=NONE), None),
     (STATED, stating(np.nan, 1.0), None),
     (source_positions.detect, stating(3.0, 1.0, **ODOMETRY), None),
-    *((CLOCK, analysis(clock=late(sign * offset_s, sigma_s)), expected)
+    *((CLOCK, analysis(time_offset=late(sign * offset_s, sigma_s)), expected)
       for sign in (1.0, -1.0)
       for offset_s, sigma_s, expected in (
           (0.03, 0.001, None), (0.031, 0.001, "warning"), (0.1, 0.001, "warning"),
           (0.101, 0.001, "error"), (0.0625, 0.0208, "warning"), (0.0625, 0.0209, None))),
-    *((CLOCK, analysis(**{"clock": late(0.2), **parts}), None) for parts in (
-        {"clock": late(0.2, is_determinable=False)}, REBUILT, {"ekf2": ages(20, 20)},
+    *((CLOCK, analysis(**{"time_offset": late(0.2), **parts}), None) for parts in (
+        {"time_offset": late(0.2, is_determinable=False)}, REBUILT, {"ekf2": ages(20, 20)},
         {"source_low_pass": SourceLowPass(0.5, 0.2, 99.0, 0.1)})),
     *((wrong_delay, delayed(delay_ms, late(0.0, sigma_s)), expected)
       for delay_ms, sigma_s, expected in (
@@ -1001,7 +1005,7 @@ APPLIED = Settings(sigma_a_m_s2=1.0, sigma_z_m=1.0, clock_offset_s=-0.05)
 
 
 def test_time_offset_action_includes_the_offset_already_applied() -> None:
-    one = analysis(clock=late(-0.1, applied_s=-0.05), settings=APPLIED)
+    one = analysis(time_offset=late(-0.1, applied_s=-0.05), settings=APPLIED)
     finding = only(source_clock.detect, one)
     assert finding.title == "Position timestamps are 0.10 s late"
     assert "0.100 s (95 % 0.080 to 0.110 s)" in finding.message
@@ -1009,18 +1013,18 @@ def test_time_offset_action_includes_the_offset_already_applied() -> None:
     assert finding.remedy == "Subtract 0.100 s from the timestamp of each position."
     expected = {"offset_s": -0.15, "interval_low_s": -0.16, "interval_high_s": -0.13}
     assert finding.evidence == pytest.approx(expected)
-    early = only(source_clock.detect, analysis(clock=late(0.1)))
+    early = only(source_clock.detect, analysis(time_offset=late(0.1)))
     assert early.title == "Position timestamps are 0.10 s early"
     assert "0.100 s (95 % 0.090 to 0.120 s)" in early.message
     assert early.remedy.startswith("Add 0.100 s to ")
     placed = source(alignment=SimpleNamespace(clock_offset_s=2.0))
-    finding = only(source_clock.detect, analysis(clock=late(0.1), source=placed))
+    finding = only(source_clock.detect, analysis(time_offset=late(0.1), source=placed))
     assert "--clock-offset 2.100." in finding.remedy
 
 
 @pytest.mark.parametrize(("p", "there"), [(0.005, False), (0.0049, True), (None, False)])
 def test_significant_change_of_time_offset_is_reported(p: float | None, there: bool) -> None:
-    found = only(source_clock.detect, analysis(clock=late(0.1, change_p_value=p)))
+    found = only(source_clock.detect, analysis(time_offset=late(0.1, change_p_value=p)))
     assert found.id == ("source_time_offset_changes" if there else "source_time_offset")
     if there:
         assert "from -0.10 s to +0.30 s" in found.title
@@ -1030,7 +1034,7 @@ def test_significant_change_of_time_offset_is_reported(p: float | None, there: b
 @pytest.mark.parametrize(("after_m", "there"), [(1.005, True), (1.0051, False), (0.5, True)])
 def test_time_offset_correction_that_increases_rmse_is_rejected(after_m, there) -> None:
     shifted = rerun("kf", "time offset", {"clock_offset_s": 0.123}, after_m)
-    one = analysis(clock=late(0.12345), trials=(shifted,))
+    one = analysis(time_offset=late(0.12345), trials=(shifted,))
     assert severity(source_clock.detect, one) == ("error" if there else None)
 
 
@@ -1110,7 +1114,7 @@ def test_ekf2_delay_is_recommended_only_if_its_rerun_improves(after_m: float, re
 def test_gnss_time_offset_report_names_receiver_delay_parameter() -> None:
     parameters = {"EKF2_GPS_DELAY": 110.0}
     one = analysis(
-        clock=late(-0.05), source=source(origin=GNSS_ORIGIN), log=log(parameters=parameters)
+        time_offset=late(-0.05), source=source(origin=GNSS_ORIGIN), log=log(parameters=parameters)
     )
     finding = only(source_clock.detect, one)
     assert finding.message.endswith(" EKF2_GPS_DELAY is 110 ms; the estimate is 160 ms.")

@@ -126,7 +126,7 @@ def test_recorded_flight_with_known_fault_reports_this_fault(shared_logs, name):
         # equal measurement noise: a step without effect is not listed
         assert "measurement noise" not in by_name
     if flown.offset_s is not None:
-        clock = analysis.clock
+        clock = analysis.time_offset
         assert clock.is_determinable
         assert clock.offset_s == pytest.approx(flown.offset_s, abs=0.05)
         low, high = clock.interval_s
@@ -224,8 +224,8 @@ def test_recorded_flights_give_listed_findings_and_severities(
         assert found["ekf2_gps_delay_wrong"].evidence["estimate_ms"] == pytest.approx(110.0, abs=15)
         # vision with a wrong unit or time offset is no reference for GNSS
         wrong_unit = replace(analysis.convention, unit="cm", verdict="determined")
-        late = replace(analysis.clock, offset_s=-0.2)
-        for wrong in replace(analysis, convention=wrong_unit), replace(analysis, clock=late):
+        late = replace(analysis.time_offset, offset_s=-0.2)
+        for wrong in replace(analysis, convention=wrong_unit), replace(analysis, time_offset=late):
             assert "ekf2_gps_delay_wrong" not in {item.id for item in source_clock.detect(wrong)}
     if name == "eg1_evp20":
         assert "EKF2_EVP_NOISE to 0.1 m" in found["ekf2_underconfident"].remedy

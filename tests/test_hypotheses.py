@@ -334,7 +334,7 @@ def test_hypothesis_findings_require_imu_or_reported_variance(mistake, change) -
 
 def test_bias_estimate_without_noise_estimate_is_unavailable() -> None:
     tuned = flown("jump=1,40s")
-    fit, low_pass, correlated_noise = _fit_source_errors(tuned, {}, tuned.clock)
+    fit, low_pass, correlated_noise = _fit_source_errors(tuned, {}, tuned.time_offset)
     assert isinstance(fit, Unavailable)
     assert isinstance(low_pass, Unavailable)
     untuned = replace(

@@ -108,7 +108,7 @@ def test_vio_drift_is_reported_before_its_consequences(seed, mistakes) -> None:
         assert "set EKF2_EVP_NOISE" not in finding.remedy
         assert "--sigma-z" not in finding.remedy
     estimated = estimate_ekf2_parameters(
-        analysis, analysis.ekf2_model, analysis.tuning, analysis.clock
+        analysis, analysis.ekf2_model, analysis.tuning, analysis.time_offset
     )
     flown_with = analysis.ekf2_model.inputs.settings["EKF2_EVP_NOISE"]
     assert estimated.get("EKF2_EVP_NOISE", flown_with) >= flown_with
@@ -163,10 +163,10 @@ def test_rerun_with_fewest_changed_settings_is_recommended() -> None:
 def offset(analysis: Analysis, offset_s: float) -> Analysis:
     """Make the analysis with another estimated time offset, and its re-runs."""
     clock = replace(
-        analysis.clock, offset_s=offset_s, interval_s=(offset_s - 0.01, offset_s + 0.01),
+        analysis.time_offset, offset_s=offset_s, interval_s=(offset_s - 0.01, offset_s + 0.01),
         sigma_s=0.005, is_determinable=True, change_p_value=None,
     )  # fmt: skip
-    changed = replace(analysis, clock=clock)
+    changed = replace(analysis, time_offset=clock)
     trials = rerun_filters(changed, changed, changed.ekf2_model)
     return replace(changed, trials=trials)
 
@@ -175,7 +175,7 @@ def test_recommended_ekf2_noise_and_delay_equal_estimates(sample: Analysis) -> N
     model, comparison = sample.ekf2_model, sample
 
     def estimated(analysis: Analysis) -> dict[str, float]:
-        return estimate_ekf2_parameters(comparison, model, analysis.tuning, analysis.clock)
+        return estimate_ekf2_parameters(comparison, model, analysis.tuning, analysis.time_offset)
 
     assert estimated(sample) == {}  # 0.1 m is within the interval
     settings = {**model.inputs.settings, "EKF2_EVP_NOISE": 0.3}
@@ -196,7 +196,7 @@ def test_recommended_ekf2_noise_and_delay_equal_estimates(sample: Analysis) -> N
         offset(sample, 0.2)
     )  # early: EKF2_EV_DELAY is already 0
     other = replace(comparison, source=replace(comparison.source, name="another"))
-    assert estimate_ekf2_parameters(other, model, sample.tuning, sample.clock) == {}
+    assert estimate_ekf2_parameters(other, model, sample.tuning, sample.time_offset) == {}
 
 
 def test_ekf2_noise_advice_with_logged_variance_sets_noise_mode(sample: Analysis) -> None:
@@ -263,12 +263,12 @@ def test_gnss_delay_after_clock_offset_is_fault_of_ekf2(sample: Analysis) -> Non
     analysis = replace(
         offset(sample, -0.15), source=source, flight=replace(sample.flight, log=log), trials=()
     )
-    clock = replace(analysis.clock, applied_s=-0.15)
+    clock = replace(analysis.time_offset, applied_s=-0.15)
     (finding,) = source_clock.detect_wrong_delay(analysis, clock)
     assert finding.id == "ekf2_gps_delay_wrong"
     assert not list(source_clock.detect_time_offset(analysis, clock))
     # without --clock-offset, source_time_offset reports the same fault
-    assert not list(source_clock.detect_wrong_delay(analysis, analysis.clock))
+    assert not list(source_clock.detect_wrong_delay(analysis, analysis.time_offset))
 
 
 def test_sender_without_timesync_answers_it_before_shifting() -> None:

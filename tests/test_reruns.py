@@ -15,10 +15,10 @@ from px4fuse.comparison.reruns import (
     rerun_filters,
 )
 from px4fuse.comparison.trials import (
-    CLOCK_OFFSET_KEY,
     FORWARD_BIAS_KEY,
     OUTLIERS_KEY,
     ROTATION_KEY,
+    TIME_OFFSET_KEY,
     RunStatistics,
     Trial,
     brings_inside_limits,
@@ -68,11 +68,11 @@ def test_filter_reruns_of_consistent_flight_report_no_cause() -> None:
         ("nlos=7%", {}, "ekf2", "nis", {OUTLIERS_KEY: (25, 4)}),
         ("nlos=7%", {"sigma_z": 0.05}, "kf", "nis",
          {OUTLIERS_KEY: (25, 4), "sigma_z_m": (0.1, 0.01)}),
-        (LATE, {}, "kf", "nees", {CLOCK_OFFSET_KEY: (-0.25, 0.06)}),
+        (LATE, {}, "kf", "nees", {TIME_OFFSET_KEY: (-0.25, 0.06)}),
         (LATE, {}, "ekf2", "nees",
          {"EKF2_EV_DELAY": (250, 60), "EKF2_DELAY_MAX": (300, 0)}),
         # no parameter of EKF2 shifts positions to an earlier time than their timestamp
-        ("clock-offset=-0.19", {}, "ekf2", "nees", {CLOCK_OFFSET_KEY: (0.19, 0.06)}),
+        ("clock-offset=-0.19", {}, "ekf2", "nees", {TIME_OFFSET_KEY: (0.19, 0.06)}),
         ("accel-bias=0.5", {}, "kf", "nis",
          {FORWARD_BIAS_KEY: (0.5, 0.03), TO_RIGHT: (-0.04, 0.03)}),
         ("yaw=20", {}, "kf", "nees", {ROTATION_KEY: (-20, 4)}),
@@ -118,7 +118,7 @@ def test_filter_rerun_for_vibration_increases_ekf2_acc_noise() -> None:
 
 def test_ekf2_is_rerun_with_time_offset_that_kf_already_uses() -> None:
     bare = flown("clock-offset=-0.19")
-    offset_s = cause(bare, "kf", "nees").change[CLOCK_OFFSET_KEY]
+    offset_s = cause(bare, "kf", "nees").change[TIME_OFFSET_KEY]
     analysis = diagnose_comparison(compare(bare.flight, replace(RIGHT, clock_offset_s=offset_s)))
     assert {row.filter for row in analysis.trials if row.discrepancies} == {"ekf2"}
     again, before = cause(analysis, "ekf2", "nees"), cause(bare, "ekf2", "nees")
@@ -231,9 +231,9 @@ def test_cause_explains_50_to_150_percent_of_log_mean_nis() -> None:
     assert (
         find_cause_trial([part, whole], "kf", "aisle") is whole
     )  # a change into the band precedes a larger share
-    both = one({CLOCK_OFFSET_KEY: 0.1, "sigma_z_m": 1.0}, 1.0, into=True)
+    both = one({TIME_OFFSET_KEY: 0.1, "sigma_z_m": 1.0}, 1.0, into=True)
     assert find_cause_trial([both, whole], "kf", "aisle") is whole  # fewer changes precede
-    fault = one({CLOCK_OFFSET_KEY: 0.1}, 0.9, into=True)
+    fault = one({TIME_OFFSET_KEY: 0.1}, 0.9, into=True)
     assert (
         find_cause_trial([whole, fault], "kf", "aisle") is fault
     )  # sensor faults precede settings

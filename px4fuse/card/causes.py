@@ -12,8 +12,8 @@ from px4fuse.comparison.changes import SIGMA_A, SIGMA_Z
 from px4fuse.comparison.model import FILTER_NAMES, FilterName
 from px4fuse.comparison.remedy import make_delay_change, select_changed_settings
 from px4fuse.comparison.trials import (
-    CLOCK_OFFSET_KEY,
     OUTLIERS_KEY,
+    TIME_OFFSET_KEY,
     Trial,
     becomes_consistent,
     classify_improvement,
@@ -230,9 +230,9 @@ def _make_actions(
             defaults_trial = trial_by_filter_and_kind.get(("kf", "defaults"))
             default_settings = defaults_trial.change if defaults_trial and kind == "noises" else {}
             # --clock-offset replaces the offset from the alignment, so it must include that offset
-            if CLOCK_OFFSET_KEY in change and (alignment := analysis.source.alignment):
-                total_s = change[CLOCK_OFFSET_KEY] + alignment.clock_offset_s
-                change[CLOCK_OFFSET_KEY] = round(total_s, 3)
+            if TIME_OFFSET_KEY in change and (alignment := analysis.source.alignment):
+                total_s = change[TIME_OFFSET_KEY] + alignment.clock_offset_s
+                change[TIME_OFFSET_KEY] = round(total_s, 3)
             actions.append(make_rerun_action(request, change, default_settings))
     # First correct the vehicle, then KF
     actions.sort(key=lambda action: action.target == "KF")
@@ -261,7 +261,7 @@ def _make_sender_actions(
     finding, source, model = ranked_cause.finding, analysis.source, analysis.ekf2_model
     # users cannot shift the timestamps of a GNSS receiver
     if offset_trial and not (source.origin.is_gnss and finding.remedy):
-        shift_s = offset_trial.change[CLOCK_OFFSET_KEY]
+        shift_s = offset_trial.change[TIME_OFFSET_KEY]
         if offset_trial.filter == "kf":
             shift_s -= analysis.settings.clock_offset_s
         return [Action("sender", lowercase_first_letter(format_sender_action(source, shift_s)))]

@@ -80,7 +80,7 @@ def prepare_comparison_inputs(
     source, source_reason = choose_source(flight, request.position_source)
     if source_kind := request.source_kind:
         source = replace(source, origin=structs.replace(source.origin, kind=source_kind))
-    source = shift_clock(source, settings.clock_offset_s)
+    source = shift_timestamps(source, settings.clock_offset_s)
     flight, source, settings, convention = _correct_convention(
         flight, source, settings, is_checked=not (keep_positions_as_sent or flight.log.is_assessed)
     )
@@ -320,7 +320,7 @@ def _explain_choice(flight: Flight, track: PositionTrack) -> str:
     return f"chosen automatically: positions {track.origin.route}{log_text}"
 
 
-def shift_clock(track: PositionTrack, clock_offset_s: float) -> PositionTrack:
+def shift_timestamps(track: PositionTrack, clock_offset_s: float) -> PositionTrack:
     """Add a time offset (s) to all timestamps of a position track."""
     if clock_offset_s == 0.0:
         return track

@@ -40,13 +40,13 @@ from px4fuse.comparison.model import (
 from px4fuse.comparison.projection import project, project_truth
 from px4fuse.comparison.remedy import is_source_fused
 from px4fuse.comparison.trials import (
-    CLOCK_OFFSET_KEY,
     CONSISTENCY_STATISTICS,
     FORWARD_BIAS_KEY,
     MIN_REPORTED_NEES,
     OUTLIERS_KEY,
     RIGHT_BIAS_KEY,
     ROTATION_KEY,
+    TIME_OFFSET_KEY,
     Change,
     RunStatistics,
     Statistic,
@@ -67,7 +67,7 @@ from px4fuse.filter.signals import (
     project_acceleration,
     weighted_sum,
 )
-from px4fuse.filter.time_offset import ClockOffset
+from px4fuse.filter.time_offset import SourceTimeOffset
 from px4fuse.filter.tuning import HORIZONTAL
 from px4fuse.flight.ekf2_parameters import PARAMETERS
 from px4fuse.flight.model import Columns, Spans, Unavailable
@@ -162,10 +162,10 @@ def rerun_filters(
     )
 
 
-def rerun_kf_with_time_offset(prepared: PreparedComparison, clock_offset: ClockOffset) -> Trial:
+def rerun_kf_with_time_offset(prepared: PreparedComparison, time_offset: SourceTimeOffset) -> Trial:
     """Run KF along the main axis with and without a time offset, as :func:`rerun_filters` does."""
     comparison = compare(prepared)
-    change = {CLOCK_OFFSET_KEY: round(clock_offset.offset_s, 3)}
+    change = {TIME_OFFSET_KEY: round(time_offset.offset_s, 3)}
     return Trial(
         filter="kf",
         axis=comparison.main.axis.name,
@@ -388,14 +388,14 @@ def _replay_ekf2(
         return model.baseline_replay
     changed_parameters = {name: value for name, value in change.items() if name in PARAMETERS}
     model_with_moved_positions = misalign_positions(
-        model, change.get(ROTATION_KEY, 0.0), change.get(CLOCK_OFFSET_KEY, 0.0)
+        model, change.get(ROTATION_KEY, 0.0), change.get(TIME_OFFSET_KEY, 0.0)
     )
     excluded_times_s, axis_tuning = None, find_axis_tuning(tuning, HORIZONTAL)
     if OUTLIERS_KEY in change and axis_tuning is not None:
         excluded_times_s = axis_tuning.outlier_time_s - comparison.settings.clock_offset_s
         if comparison.source.origin.is_fused_as_gnss:
             excluded_times_s += 1e-3 * model.inputs.settings[model.inputs.aid.delay]
-        excluded_times_s += change.get(CLOCK_OFFSET_KEY, 0.0)
+        excluded_times_s += change.get(TIME_OFFSET_KEY, 0.0)
     (replay,) = replay_with_settings(
         model_with_moved_positions, [changed_parameters], excluded_times_s
     )

@@ -16,7 +16,7 @@ CONSISTENCY_STATISTICS: tuple[Statistic, Statistic] = ("nees", "nis")
 # Changed KF settings, EKF2 parameters or data, by name
 Change = Mapping[str, float]
 # Corrected data: timestamps (s), clockwise rotation (°), number of outliers, accelerometer bias
-CLOCK_OFFSET_KEY, ROTATION_KEY, OUTLIERS_KEY = "clock_offset_s", "turned_deg", "outliers_left_out"
+TIME_OFFSET_KEY, ROTATION_KEY, OUTLIERS_KEY = "clock_offset_s", "turned_deg", "outliers_left_out"
 FORWARD_BIAS_KEY, RIGHT_BIAS_KEY = "bias_forward_m_s2", "bias_right_m_s2"
 Improvement = Literal["position and σ", "position", "σ only", "nothing"]
 # Minimum mean NEES of a reported position error: flights without a fault are below 3
@@ -29,7 +29,7 @@ POSSIBLE_CAUSE_FRACTION_TOLERANCE = 0.5
 ONLY_CAUSE_FRACTION_TOLERANCE = 0.25
 # Two changes are combined if each explains 10 % to 190 % of ln(mean NIS or NEES)
 COMBINED_CHANGE_FRACTION_TOLERANCE = 0.9
-SENSOR_CORRECTION_KEYS = frozenset((OUTLIERS_KEY, CLOCK_OFFSET_KEY, ROTATION_KEY, FORWARD_BIAS_KEY))
+SENSOR_CORRECTION_KEYS = frozenset((OUTLIERS_KEY, TIME_OFFSET_KEY, ROTATION_KEY, FORWARD_BIAS_KEY))
 # Changes that have an effect only together with another change
 SECONDARY_CHANGE_KEYS = frozenset(("EKF2_DELAY_MAX", EV_POS.noise_mode_parameter, RIGHT_BIAS_KEY))
 # A re-run has an effect if it changes a σ ratio by at least this factor

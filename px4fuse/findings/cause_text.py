@@ -31,7 +31,7 @@ def classify_cause(analysis: Analysis, cause: Trial | None) -> str:
     aid = find_aid(analysis)
     kind_by_change = {
         trials.OUTLIERS_KEY: kinds.OUTLIER_CAUSE,
-        trials.CLOCK_OFFSET_KEY: kinds.CLOCK_CAUSE,
+        trials.TIME_OFFSET_KEY: kinds.CLOCK_CAUSE,
         aid.delay: kinds.CLOCK_CAUSE,
         trials.ROTATION_KEY: kinds.MISALIGNED_FRAME_CAUSE,
         trials.FORWARD_BIAS_KEY: kinds.ACCELEROMETER_CAUSE,
@@ -92,10 +92,8 @@ def format_action(analysis: Analysis, change: Mapping[str, float]) -> str:
         if analysis.source.origin.is_gnss:
             action = magnetometer_advice(analysis.flight) or "Check the heading source of EKF2."
         actions.append(action)
-    if trials.CLOCK_OFFSET_KEY in change:
-        actions.append(
-            f"{format_timestamp_action(change[trials.CLOCK_OFFSET_KEY])} before sending."
-        )
+    if trials.TIME_OFFSET_KEY in change:
+        actions.append(f"{format_timestamp_action(change[trials.TIME_OFFSET_KEY])} before sending.")
     if parameters := {name: change[name] for name in change if name in PARAMETERS}:
         parameters = select_changed_settings(parameters, _find_used_settings(analysis))
         actions.append(f"Set {format_changes(parameters)}.")
@@ -138,7 +136,7 @@ def _format_one_change(analysis: Analysis, cause: Trial, name: str) -> str:
     match name:
         case trials.OUTLIERS_KEY:
             return f"{value:.0f} outlier{'s' if value > 1 else ''} removed"
-        case trials.CLOCK_OFFSET_KEY:
+        case trials.TIME_OFFSET_KEY:
             offset_s = value - (settings.clock_offset_s if cause.filter == "kf" else 0.0)
             late_or_early = "late" if offset_s < 0 else "early"
             return f"timestamps corrected ({abs(offset_s):.2g} s {late_or_early})"

@@ -161,10 +161,10 @@ def make_hidden_error_finding(
         remedy = EKF2_HEIGHT_REMEDY if worst_axis == "down" else EKF2_REMEDY
     else:
         remedy = "Check the time offset of the positions (px4fuse sync LOG)."
-        if isinstance(analysis.clock, Unavailable):
+        if isinstance(analysis.time_offset, Unavailable):
             remedy = (
                 "A time offset of the positions is possible, but this log cannot show it: "
-                f"{analysis.clock.reason}. {analysis.clock.remedy}"
+                f"{analysis.time_offset.reason}. {analysis.time_offset.remedy}"
             )
         remedy += f" {find_source_texts(analysis.source).slow_error_check}."
     return finding(

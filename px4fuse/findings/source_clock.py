@@ -6,7 +6,7 @@ from px4fuse.analysis import Analysis
 from px4fuse.comparison import remedy
 from px4fuse.comparison.model import FilterName, PreparedComparison
 from px4fuse.comparison.trials import Trial
-from px4fuse.filter.time_offset import ClockOffset
+from px4fuse.filter.time_offset import SourceTimeOffset
 from px4fuse.findings.cause_text import format_sender_action
 from px4fuse.findings.model import Findings, finding, make_error, make_warning
 from px4fuse.findings.source_positions import find_low_pass
@@ -23,9 +23,9 @@ CHECK_RECEIVER_ACTION = f"Check the delay of the GNSS receiver ({GNSS_POS.delay}
 
 
 def detect(analysis: Analysis) -> Findings:
-    time_offset = analysis.clock
+    time_offset = analysis.time_offset
     if (
-        isinstance(time_offset, ClockOffset)
+        isinstance(time_offset, SourceTimeOffset)
         and time_offset.is_determinable
         and not analysis.source.origin.reconstructed
     ):
@@ -34,7 +34,7 @@ def detect(analysis: Analysis) -> Findings:
     yield from detect_wrong_gnss_delay(analysis)
 
 
-def detect_time_offset(analysis: Analysis, time_offset: ClockOffset) -> Findings:
+def detect_time_offset(analysis: Analysis, time_offset: SourceTimeOffset) -> Findings:
     if find_low_pass(analysis) is not None:  # a low-pass filter delays positions, not timestamps
         return
     low_s, high_s = time_offset.interval_s
@@ -111,7 +111,7 @@ def _find_receiver_delay_parameter(analysis: Analysis) -> str | None:
     return None
 
 
-def _format_assumed_delay(analysis: Analysis, time_offset: ClockOffset) -> str:
+def _format_assumed_delay(analysis: Analysis, time_offset: SourceTimeOffset) -> str:
     delay_parameter = _find_receiver_delay_parameter(analysis)
     if delay_parameter is None:
         return ""
@@ -120,7 +120,7 @@ def _format_assumed_delay(analysis: Analysis, time_offset: ClockOffset) -> str:
     return f" {delay_parameter} is {delay_ms:g} ms; the estimate is {estimated_delay_ms:.0f} ms."
 
 
-def _find_offset_remedy(analysis: Analysis, time_offset: ClockOffset) -> str:
+def _find_offset_remedy(analysis: Analysis, time_offset: SourceTimeOffset) -> str:
     if delay_parameter := _find_receiver_delay_parameter(analysis):
         return f"Check the delay of the GNSS receiver ({delay_parameter})."
     if analysis.source.alignment is not None:
@@ -133,14 +133,16 @@ def _find_offset_remedy(analysis: Analysis, time_offset: ClockOffset) -> str:
     return f"{action}."
 
 
-def compute_offset_for_option_s(comparison: PreparedComparison, time_offset: ClockOffset) -> float:
+def compute_offset_for_option_s(
+    comparison: PreparedComparison, time_offset: SourceTimeOffset
+) -> float:
     """Return the value (s) of ``--clock-offset`` that corrects a time offset."""
     # --clock-offset replaces the offset from the alignment, so it must include that offset
     alignment = comparison.source.alignment
     return time_offset.offset_s + (0.0 if alignment is None else alignment.clock_offset_s)
 
 
-def detect_wrong_delay(analysis: Analysis, time_offset: ClockOffset) -> Findings:
+def detect_wrong_delay(analysis: Analysis, time_offset: SourceTimeOffset) -> Findings:
     if truth_refutes_offset(find_offset_trial(analysis)):
         return
     source, delay_ms = analysis.source, remedy.find_logged_delay_ms(analysis)
@@ -193,7 +195,7 @@ def detect_wrong_gnss_delay(analysis: Analysis) -> Findings:
     ekf2_model = analysis.ekf2_model
     if isinstance(ekf2_model, Unavailable) or not ekf2_model.agreement.good:
         return
-    estimate = remedy.estimate_gnss_delay_ms(analysis, ekf2_model, analysis.clock)
+    estimate = remedy.estimate_gnss_delay_ms(analysis, ekf2_model, analysis.time_offset)
     if estimate is None:
         return
     delay_ms, (estimated_delay_ms, sigma_ms) = ekf2_model.inputs.settings[GNSS_POS.delay], estimate

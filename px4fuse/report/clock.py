@@ -17,7 +17,7 @@ from px4fuse.comparison.remedy import (
 from px4fuse.comparison.trials import Trial
 from px4fuse.convention.correction import find_convention_faults
 from px4fuse.core.text import format_metres
-from px4fuse.filter.time_offset import ClockOffset
+from px4fuse.filter.time_offset import SourceTimeOffset
 from px4fuse.finding import Finding
 from px4fuse.findings.source_clock import (
     compute_offset_for_option_s,
@@ -39,7 +39,9 @@ def summarise_offset(analysis: Analysis, findings: Iterable[Finding]) -> str:
     """Summarise the time offset in one line; "" if the report has a page on the time offset."""
     if has_time_offset_page(analysis, findings):
         return ""
-    advice_by_label = make_time_offset_advice(analysis, analysis.clock, find_offset_trial(analysis))
+    advice_by_label = make_time_offset_advice(
+        analysis, analysis.time_offset, find_offset_trial(analysis)
+    )
     return " ".join(
         advice_by_label[label] for label in ("Result", "Offset") if label in advice_by_label
     )
@@ -47,7 +49,7 @@ def summarise_offset(analysis: Analysis, findings: Iterable[Finding]) -> str:
 
 def has_time_offset_page(analysis: Analysis, findings: Iterable[Finding]) -> bool:
     """Return True if the time offset is wrong, changes, or cannot be estimated."""
-    time_offset = analysis.clock
+    time_offset = analysis.time_offset
     if isinstance(time_offset, Unavailable):
         return False
     return not time_offset.is_determinable or any(
@@ -57,7 +59,7 @@ def has_time_offset_page(analysis: Analysis, findings: Iterable[Finding]) -> boo
 
 def make_time_offset_advice(
     comparison: PreparedComparison,
-    time_offset: ClockOffset | Unavailable,
+    time_offset: SourceTimeOffset | Unavailable,
     trial: Trial | None = None,
 ) -> dict[str, str]:
     """Return texts on the time offset of the position source, by label.
@@ -129,7 +131,7 @@ def make_time_offset_advice(
 
 
 def _format_delay_advice(
-    comparison: PreparedComparison, time_offset: ClockOffset, logged_delay_ms: float
+    comparison: PreparedComparison, time_offset: SourceTimeOffset, logged_delay_ms: float
 ) -> str:
     delay_parameter = find_aid(comparison).delay
     fitted_delay_ms = estimate_differing_delay_ms(comparison, time_offset, logged_delay_ms)
@@ -151,7 +153,7 @@ def _format_delay_advice(
 
 def draw_pages(analysis: Analysis, results: ComparisonResults) -> Iterator[Page]:
     """Draw the page on a wrong or unknown time offset of the position source."""
-    time_offset = analysis.clock
+    time_offset = analysis.time_offset
     if isinstance(time_offset, Unavailable) or not has_time_offset_page(analysis, results.findings):
         return
     page = Page(
@@ -171,7 +173,7 @@ def draw_pages(analysis: Analysis, results: ComparisonResults) -> Iterator[Page]
     yield page
 
 
-def _draw_likelihood(axes: Axes, time_offset: ClockOffset) -> None:
+def _draw_likelihood(axes: Axes, time_offset: SourceTimeOffset) -> None:
     """Draw the log-likelihood of the positions over the time offset."""
     low_s, high_s = time_offset.interval_s
     offsets_s, drops = time_offset.curve_time_offsets_s, time_offset.curve_log_likelihood_drops

@@ -9,7 +9,7 @@ import msgspec
 from px4fuse.analysis import AidingSourceAnalysis, Analysis, WhatIfAnalysis
 from px4fuse.card.build import build_aids_card, build_card
 from px4fuse.comparison.model import PreparedComparison
-from px4fuse.filter.time_offset import ClockOffset
+from px4fuse.filter.time_offset import SourceTimeOffset
 from px4fuse.filter.tuning import AxisTuning
 from px4fuse.findings import find_loop_findings
 from px4fuse.flight.model import Flight, Unavailable
@@ -48,6 +48,7 @@ def make_comparison_results(
     fields = _make_flight_fields(contract.COMPARISON_SCHEMA_NAME, request, analysis) | {
         "aids": {} if isinstance(analysis.aids, Unavailable) else dict(analysis.aids),
         "card": card,
+        "clock": analysis.time_offset,
         "student": student,
     }
     # the other fields of the results are copied from the analysis
@@ -93,7 +94,7 @@ def make_tuning_results(
 def make_sync_results(
     request: ComparisonRequest,
     comparison: PreparedComparison,
-    time_offset: ClockOffset | Unavailable,
+    time_offset: SourceTimeOffset | Unavailable,
 ) -> contract.SyncResults:
     return drop_invalid_numbers(
         contract.SyncResults(

@@ -31,7 +31,7 @@ from px4fuse.ekf2.steps import DifferenceExplanation
 from px4fuse.ekf2.whatif import Ekf2Statistics
 from px4fuse.filter.consistency import HorizontalNis
 from px4fuse.filter.frame_rotation import HeadingError
-from px4fuse.filter.time_offset import ClockOffset
+from px4fuse.filter.time_offset import SourceTimeOffset
 from px4fuse.filter.tuning import AxisTuning
 from px4fuse.finding import Finding
 from px4fuse.flight.model import (
@@ -218,7 +218,7 @@ class ComparisonResults(_FlightResults):
     axes: Annotated[dict[AxisName, AxisComparison], Meta(min_length=1)]
     horizontal: dict[FilterName, HorizontalNis]
     tuning: dict[str, OrUnavailable[AxisTuning]]
-    clock: OrUnavailable[ClockOffset]
+    clock: OrUnavailable[SourceTimeOffset]
     heading: OrUnavailable[HeadingError]
     ekf2_replay: OrUnavailable[Ekf2Replay]
     difference_steps: dict[str, OrUnavailable[DifferenceExplanation]]
@@ -258,7 +258,7 @@ class TuningResults(_FlightResults):
 class SyncResults(_FlightResults):
     """Results of ``px4fuse sync``: time offset of the position source."""
 
-    clock: OrUnavailable[ClockOffset]
+    clock: OrUnavailable[SourceTimeOffset]
     provenance: Provenance
 
 
