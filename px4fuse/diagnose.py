@@ -152,7 +152,7 @@ def diagnose_comparison(comparison: Comparison, progress: Progress = ignore_prog
             | {
                 "tuning": {HORIZONTAL: DIAGNOSIS_WITHHELD},
                 "difference_steps": dict.fromkeys(comparison.axes, DIAGNOSIS_WITHHELD),
-                "trials": (),
+                "reruns": (),
                 "events": collect_events(comparison),
             }
         )
@@ -282,10 +282,10 @@ def rerun(
     difference_steps = explain_ekf2_difference(
         comparison, ekf2_model, estimates.time_offset, estimated_settings
     )
-    trials = rerun_filters(comparison, estimates, ekf2_model)
+    reruns = rerun_filters(comparison, estimates, ekf2_model)
     if isinstance(ekf2_model, Ekf2Model):  # the runs need much memory
         ekf2_model = replace(ekf2_model, runs=())
-    return Reruns(ekf2_model=ekf2_model, difference_steps=difference_steps, trials=trials)
+    return Reruns(ekf2_model=ekf2_model, difference_steps=difference_steps, reruns=reruns)
 
 
 def diagnose_or_check_aids(

@@ -12,7 +12,7 @@ from exchange import replace
 
 from px4fuse.analysis import Analysis
 from px4fuse.comparison.model import FILTER_NAMES, ErrorsAgainstTruth, FilterSummary, UntestedFilter
-from px4fuse.comparison.trials import RunStatistics, Trial
+from px4fuse.comparison.rerun_effects import Rerun, RunStatistics
 from px4fuse.convention.correction import find_convention_faults
 from px4fuse.filter.consistency import Consistency
 from px4fuse.filter.hypotheses import Estimate, Jump, SystematicErrors
@@ -154,8 +154,8 @@ def analysis(
         ),
         main=next(iter(axes), axis()), input_axes=tuple(each.axis for each in axes),
         segment=SEGMENT, settings=settings, notes=notes, missing=missing,
-        **{"tuning": {}, "difference_steps": {}, "trials": (), **usual, **parts},
-        select_main_trials=lambda: [t for t in parts.get("trials", ()) if t.kinds],
+        **{"tuning": {}, "difference_steps": {}, "reruns": (), **usual, **parts},
+        select_main_reruns=lambda: [t for t in parts.get("reruns", ()) if t.kinds],
     )  # fmt: skip
 
 
@@ -185,10 +185,10 @@ def _with_truth(one: Any, truth: Any) -> Any:
 def tried(
     owner: Any, change: dict[str, float], axis: str = "north", of: Any = "nis",
     before: float = 9.0, explained_fraction: float = 1.0,
-) -> Trial:  # fmt: skip
+) -> Rerun:  # fmt: skip
     """Make a re-run whose change explains a fraction of the logarithm of a statistic."""
     key, after = f"{of}_mean", before ** (1.0 - explained_fraction)
-    return Trial(
+    return Rerun(
         filter=owner, axis=axis, kinds=(), change=change, discrepancies=(of,),
         before=RunStatistics(innovations=100, **{key: before}),
         after=RunStatistics(innovations=100, **{key: after}),

@@ -355,7 +355,7 @@ def unexplained(comparison: Comparison, tuning: TuningByAxis | None = None) -> A
     )  # fmt: skip
     trials = rerun_filters(comparison, estimates, missing)
     return Analysis(
-        **parts, **vars(estimates), ekf2_model=missing, difference_steps={}, trials=trials,
+        **parts, **vars(estimates), ekf2_model=missing, difference_steps={}, reruns=trials,
         events=collect_events(comparison), aids=evaluate_aids(comparison.flight),
         loop=missing,
     )  # fmt: skip

@@ -37,7 +37,7 @@ from findings_tools import (
 from flights import given_placement
 
 from px4fuse.comparison.flight_events import find_source_gaps
-from px4fuse.comparison.trials import RunStatistics, Trial
+from px4fuse.comparison.rerun_effects import Rerun, RunStatistics
 from px4fuse.filter.correlated_noise import SourceLowPass, TimeCorrelatedNoise
 from px4fuse.filter.frame_rotation import HeadingError, HeadingPart
 from px4fuse.filter.frame_rotation import combine_heading_parts as together
@@ -299,13 +299,13 @@ def test_rejection_action_requires_rerun_with_half_of_rejections() -> None:
         (0.09, True, "Set EKF2_EVP_NOISE to 0.1 m."), (0.1, True, CHECK_FIRST),
         (0.09, False, CHECK_FIRST),
     ):  # fmt: skip
-        trial = Trial(
+        trial = Rerun(
             filter="ekf2", axis="north", kinds=("noise",), change={"EKF2_EVP_NOISE": 0.1},
             before=RunStatistics(nis_mean=9.0, rejected_fraction=0.2),
             after=RunStatistics(nis_mean=1.0 if improves else 8.0, rejected_fraction=after),
         )  # fmt: skip
         one = analysis(ekf2={"gate": 5.0}, axes=(axis("north", ekf2_innovations=frame),),
-                       trials=(trial,))  # fmt: skip
+                       reruns=(trial,))  # fmt: skip
         assert only(ekf2_settings.detect_rejections, one).remedy == action
 
 
@@ -539,7 +539,7 @@ def test_heading_error_report_names_wrong_gnss_noise(degrees, noise_is_wrong) ->
     trial = tried("ekf2", {"EKF2_GPS_P_NOISE": 0.4})
     one = analysis(
         heading=heading_error(*degrees, p=0.0), source=source(origin=GNSS_ORIGIN),
-        trials=(replace(trial, kinds=("noise",)),) if noise_is_wrong else (),
+        reruns=(replace(trial, kinds=("noise",)),) if noise_is_wrong else (),
     )  # fmt: skip
     finding = only(source_frame.detect, one)
     text = f"{finding.message} {finding.remedy}"
@@ -1034,14 +1034,14 @@ def test_significant_change_of_time_offset_is_reported(p: float | None, there: b
 @pytest.mark.parametrize(("after_m", "there"), [(1.005, True), (1.0051, False), (0.5, True)])
 def test_time_offset_correction_that_increases_rmse_is_rejected(after_m, there) -> None:
     shifted = rerun("kf", "time offset", {"clock_offset_s": 0.123}, after_m)
-    one = analysis(time_offset=late(0.12345), trials=(shifted,))
+    one = analysis(time_offset=late(0.12345), reruns=(shifted,))
     assert severity(source_clock.detect, one) == ("error" if there else None)
 
 
-def rerun(owner: Any, kind: str, change: dict[str, float], after_m: float) -> Trial:
+def rerun(owner: Any, kind: str, change: dict[str, float], after_m: float) -> Rerun:
     """Make a re-run that changes the position RMSE from 1 m."""
     before, after = RunStatistics(position_rmse_m=1.0), RunStatistics(position_rmse_m=after_m)
-    return Trial(
+    return Rerun(
         filter=owner, axis="north", kinds=(kind,), change=change, before=before, after=after
     )
 
@@ -1107,7 +1107,7 @@ def test_recommended_ekf2_delay_stays_in_px4_range(
 )
 def test_ekf2_delay_is_recommended_only_if_its_rerun_improves(after_m: float, remedy: str) -> None:
     trials = (rerun("ekf2", "delay", {"EKF2_EV_DELAY": 120.0}, after_m),)
-    finding = only(wrong_delay, delayed(0.0, late(-0.12), trials=trials))
+    finding = only(wrong_delay, delayed(0.0, late(-0.12), reruns=trials))
     assert finding.remedy == remedy
 
 

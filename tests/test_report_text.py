@@ -208,7 +208,7 @@ def with_clock(found: SourceTimeOffset | Unavailable, delay_ms: float = 0.0) -> 
     settings, flight = SimpleNamespace(clock_offset_s=0.0), SimpleNamespace(log=log, ekf2=ekf2)
     return SimpleNamespace(
         time_offset=found, settings=settings, flight=flight, source=source(), convention=None,
-        select_main_trials=lambda: [],
+        select_main_reruns=lambda: [],
     )  # fmt: skip
 
 

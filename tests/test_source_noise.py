@@ -13,7 +13,7 @@ from exchange import replace
 from scipy.interpolate import CubicSpline
 
 from px4fuse.analysis import Analysis
-from px4fuse.comparison.trials import makes_overconfident
+from px4fuse.comparison.rerun_effects import makes_overconfident
 from px4fuse.diagnose import diagnose_comparison
 from px4fuse.filter import correlated_noise
 from px4fuse.filter.correlated_noise import fit_time_correlation
@@ -174,7 +174,7 @@ def test_smaller_noise_is_advised_only_if_ground_truth_agrees(
     analysis = analysed(model, truth_for=sigma_z_m)
     tried = [
         each
-        for each in analysis.trials
+        for each in analysis.reruns
         if "sigma_z_m" in each.change and "nis" in each.discrepancies
     ]
     assert {each.axis for each in tried} == {"north", "east"}

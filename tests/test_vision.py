@@ -604,5 +604,5 @@ def test_difference_steps_of_gnss_flight_include_vision_step() -> None:
     analysis = diagnose_comparison(compare(flown(), Settings(0.27, 0.4)))
     # the noise of vision does not lead to a remedy for GNSS noise
     assert analysis.source.name == "vehicle_visual_odometry"
-    assert {trial.filter for trial in analysis.trials} == {"kf"}
+    assert {trial.filter for trial in analysis.reruns} == {"kf"}
     assert not [item for item in find(analysis) if "EKF2_GPS_P_NOISE" in item.remedy]

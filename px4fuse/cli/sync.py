@@ -34,12 +34,12 @@ def sync(log: Path, json_path: Path | None, **option_values: Any) -> None:
         flight = read_flight(request, show_progress)
         comparison = prepare_comparison(flight, request, show_progress)
         _, time_offset = estimate_noises_and_time_offset(comparison, show_progress)
-        trial = None
+        rerun = None
         if not isinstance(time_offset, Unavailable) and time_offset.is_significant(
             time_offset.remaining_s
         ):
-            trial = rerun_kf_with_time_offset(comparison, time_offset)
-    advice = make_time_offset_advice(comparison, time_offset, trial)
+            rerun = rerun_kf_with_time_offset(comparison, time_offset)
+    advice = make_time_offset_advice(comparison, time_offset, rerun)
     if isinstance(time_offset, Unavailable) or not time_offset.is_determinable:
         log_name = comparison.flight.log.name
         remedy = time_offset.remedy if isinstance(time_offset, Unavailable) else advice["Action"]

@@ -14,7 +14,7 @@ from px4fuse.comparison.remedy import (
     make_estimated_delay_change,
     make_estimated_noise_change,
 )
-from px4fuse.comparison.trials import (
+from px4fuse.comparison.rerun_effects import (
     CONSISTENCY_STATISTICS,
     FORWARD_BIAS_KEY,
     OUTLIERS_KEY,

@@ -39,7 +39,7 @@ from px4fuse.comparison.model import (
 )
 from px4fuse.comparison.projection import project, project_truth
 from px4fuse.comparison.remedy import is_source_fused
-from px4fuse.comparison.trials import (
+from px4fuse.comparison.rerun_effects import (
     CONSISTENCY_STATISTICS,
     FORWARD_BIAS_KEY,
     MIN_REPORTED_NEES,
@@ -48,9 +48,9 @@ from px4fuse.comparison.trials import (
     ROTATION_KEY,
     TIME_OFFSET_KEY,
     Change,
+    Rerun,
     RunStatistics,
     Statistic,
-    Trial,
     find_partial_corrections,
 )
 from px4fuse.core.arrays import Array
@@ -112,13 +112,13 @@ class Reruns:
         Replay of EKF2 with the logged parameters.
     difference_steps : mapping from axis name to DifferenceExplanation or Unavailable
         Causes of the difference KF - EKF2.
-    trials : tuple of Trial
+    reruns : tuple of Rerun
         Re-runs along the main axis, and along each axis with an inconsistent filter.
     """
 
     ekf2_model: Ekf2Model | Unavailable
     difference_steps: Mapping[str, DifferenceExplanation | Unavailable]
-    trials: tuple[Trial, ...]
+    reruns: tuple[Rerun, ...]
 
 
 class _Filter(NamedTuple):
@@ -133,7 +133,7 @@ class _Filter(NamedTuple):
 
 def rerun_filters(
     comparison: Comparison, estimates: Estimates, model: Ekf2Model | Unavailable
-) -> tuple[Trial, ...]:
+) -> tuple[Rerun, ...]:
     """Re-run KF and EKF2 along each axis with each change that may make them consistent.
 
     EKF2 is re-run only if its replay agrees with the log.
@@ -155,18 +155,18 @@ def rerun_filters(
         evaluated_spans_s = model.baseline_replay.find_evaluated_spans()
         filters.append(_Filter("ekf2", rerun_ekf2, model.inputs, evaluated_spans_s))
     return tuple(
-        trial
+        rerun
         for tested_filter in filters
         for axis_result in comparison.axes.values()
-        for trial in _rerun_with_changes(comparison, estimates, tested_filter, axis_result)
+        for rerun in _rerun_with_changes(comparison, estimates, tested_filter, axis_result)
     )
 
 
-def rerun_kf_with_time_offset(prepared: PreparedComparison, time_offset: SourceTimeOffset) -> Trial:
+def rerun_kf_with_time_offset(prepared: PreparedComparison, time_offset: SourceTimeOffset) -> Rerun:
     """Run KF along the main axis with and without a time offset, as :func:`rerun_filters` does."""
     comparison = compare(prepared)
     change = {TIME_OFFSET_KEY: round(time_offset.offset_s, 3)}
-    return Trial(
+    return Rerun(
         filter="kf",
         axis=comparison.main.axis.name,
         kinds=classify_change(comparison, None, change),
@@ -236,7 +236,7 @@ def _rerun_with_changes(
     estimates: Estimates,
     tested_filter: _Filter,
     axis_result: AxisComparison,
-) -> list[Trial]:
+) -> list[Rerun]:
     changes = _find_changes_to_test(
         comparison, estimates, tested_filter.name, tested_filter.ekf2_inputs, axis_result
     )
@@ -245,9 +245,9 @@ def _rerun_with_changes(
     original_statistics, is_logged = _find_statistics_without_change(tested_filter, axis_result)
     spans_s = tested_filter.evaluated_spans_s
 
-    def make_trial(change: Change, discrepancies: Iterable[Statistic]) -> Trial:
+    def make_rerun(change: Change, discrepancies: Iterable[Statistic]) -> Rerun:
         changed_statistics = tested_filter.rerun(axis_result, change)
-        return Trial(
+        return Rerun(
             filter=tested_filter.name,
             axis=axis_result.axis.name,
             kinds=classify_change(comparison, tested_filter.ekf2_inputs, change),
@@ -263,14 +263,14 @@ def _rerun_with_changes(
             from_s=None if spans_s is None else spans_s[0][0],
         )
 
-    trials = [make_trial(change, discrepancies) for change, discrepancies in changes]
+    reruns = [make_rerun(change, discrepancies) for change, discrepancies in changes]
     for statistic in CONSISTENCY_STATISTICS:
-        helpful_trials = find_partial_corrections(trials, statistic)
-        trials += [
-            make_trial({**helpful_trials[0].change, **other_trial.change}, (statistic,))
-            for other_trial in helpful_trials[1:]
+        helpful_reruns = find_partial_corrections(reruns, statistic)
+        reruns += [
+            make_rerun({**helpful_reruns[0].change, **other_rerun.change}, (statistic,))
+            for other_rerun in helpful_reruns[1:]
         ]
-    return trials
+    return reruns
 
 
 def _find_statistics_without_change(

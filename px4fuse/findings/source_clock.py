@@ -5,7 +5,7 @@ import math
 from px4fuse.analysis import Analysis
 from px4fuse.comparison import remedy
 from px4fuse.comparison.model import FilterName, PreparedComparison
-from px4fuse.comparison.trials import Trial
+from px4fuse.comparison.rerun_effects import Rerun
 from px4fuse.filter.time_offset import SourceTimeOffset
 from px4fuse.findings.cause_text import format_sender_action
 from px4fuse.findings.model import Findings, finding, make_error, make_warning
@@ -60,7 +60,7 @@ def detect_time_offset(analysis: Analysis, time_offset: SourceTimeOffset) -> Fin
     if (
         not time_offset.is_significant(time_offset.remaining_s)
         or find_timesync_convergence(analysis) is not None
-        or truth_refutes_offset(find_offset_trial(analysis))
+        or truth_refutes_offset(find_offset_rerun(analysis))
     ):
         return
     offset_s, low_s, high_s = (
@@ -81,27 +81,27 @@ def detect_time_offset(analysis: Analysis, time_offset: SourceTimeOffset) -> Fin
     )
 
 
-def find_offset_trial(analysis: Analysis) -> Trial | None:
-    return _find_trial(analysis, "kf", "time offset")
+def find_offset_rerun(analysis: Analysis) -> Rerun | None:
+    return _find_rerun(analysis, "kf", "time offset")
 
 
-def truth_refutes_offset(trial: Trial | None) -> bool:
+def truth_refutes_offset(rerun: Rerun | None) -> bool:
     """Return True if a corrected time offset increases KF's error against ground truth."""
-    return _compute_rmse_ratio(trial) > MAX_RMSE_RATIO_AFTER_CORRECTION
+    return _compute_rmse_ratio(rerun) > MAX_RMSE_RATIO_AFTER_CORRECTION
 
 
-def _find_trial(analysis: Analysis, filter_name: FilterName, kind: str) -> Trial | None:
-    for trial in analysis.select_main_trials():
-        if (trial.filter, trial.kinds) == (filter_name, (kind,)):
-            return trial
+def _find_rerun(analysis: Analysis, filter_name: FilterName, kind: str) -> Rerun | None:
+    for rerun in analysis.select_main_reruns():
+        if (rerun.filter, rerun.kinds) == (filter_name, (kind,)):
+            return rerun
     return None
 
 
-def _compute_rmse_ratio(trial: Trial | None) -> float:
+def _compute_rmse_ratio(rerun: Rerun | None) -> float:
     """Return position RMSE with a change / position RMSE without it; NaN if unknown."""
-    if trial is None or not trial.before.position_rmse_m or trial.after.position_rmse_m is None:
+    if rerun is None or not rerun.before.position_rmse_m or rerun.after.position_rmse_m is None:
         return math.nan
-    return trial.after.position_rmse_m / trial.before.position_rmse_m
+    return rerun.after.position_rmse_m / rerun.before.position_rmse_m
 
 
 def _find_receiver_delay_parameter(analysis: Analysis) -> str | None:
@@ -143,7 +143,7 @@ def compute_offset_for_option_s(
 
 
 def detect_wrong_delay(analysis: Analysis, time_offset: SourceTimeOffset) -> Findings:
-    if truth_refutes_offset(find_offset_trial(analysis)):
+    if truth_refutes_offset(find_offset_rerun(analysis)):
         return
     source, delay_ms = analysis.source, remedy.find_logged_delay_ms(analysis)
     is_gnss = source.origin.is_fused_as_gnss
@@ -211,10 +211,10 @@ def detect_wrong_gnss_delay(analysis: Analysis) -> Findings:
 
 
 def _find_delay_remedy(analysis: Analysis, parameter: str, action_if_not_confirmed: str) -> str:
-    trial = _find_trial(analysis, "ekf2", "delay")
-    if trial is None:
+    rerun = _find_rerun(analysis, "ekf2", "delay")
+    if rerun is None:
         return f"Check {parameter}."
-    ratio = _compute_rmse_ratio(trial)
-    if math.isnan(ratio) and trial.before.nis_mean and trial.after.nis_mean:
-        ratio = trial.after.nis_mean / trial.before.nis_mean
-    return f"Set {remedy.format_changes(trial.change)}." if ratio < 1.0 else action_if_not_confirmed
+    ratio = _compute_rmse_ratio(rerun)
+    if math.isnan(ratio) and rerun.before.nis_mean and rerun.after.nis_mean:
+        ratio = rerun.after.nis_mean / rerun.before.nis_mean
+    return f"Set {remedy.format_changes(rerun.change)}." if ratio < 1.0 else action_if_not_confirmed

@@ -14,14 +14,14 @@ from px4fuse.comparison.remedy import (
     find_logged_delay_ms,
     format_changes,
 )
-from px4fuse.comparison.trials import Trial
+from px4fuse.comparison.rerun_effects import Rerun
 from px4fuse.convention.correction import find_convention_faults
 from px4fuse.core.text import format_metres
 from px4fuse.filter.time_offset import SourceTimeOffset
 from px4fuse.finding import Finding
 from px4fuse.findings.source_clock import (
     compute_offset_for_option_s,
-    find_offset_trial,
+    find_offset_rerun,
     truth_refutes_offset,
 )
 from px4fuse.flight.model import Unavailable
@@ -40,7 +40,7 @@ def summarise_offset(analysis: Analysis, findings: Iterable[Finding]) -> str:
     if has_time_offset_page(analysis, findings):
         return ""
     advice_by_label = make_time_offset_advice(
-        analysis, analysis.time_offset, find_offset_trial(analysis)
+        analysis, analysis.time_offset, find_offset_rerun(analysis)
     )
     return " ".join(
         advice_by_label[label] for label in ("Result", "Offset") if label in advice_by_label
@@ -60,11 +60,11 @@ def has_time_offset_page(analysis: Analysis, findings: Iterable[Finding]) -> boo
 def make_time_offset_advice(
     comparison: PreparedComparison,
     time_offset: SourceTimeOffset | Unavailable,
-    trial: Trial | None = None,
+    rerun: Rerun | None = None,
 ) -> dict[str, str]:
     """Return texts on the time offset of the position source, by label.
 
-    ``trial`` is a re-run of KF with the time offset.
+    ``rerun`` is a re-run of KF with the time offset.
     """
     if isinstance(time_offset, Unavailable):
         reason, remedy = time_offset.reason, time_offset.remedy
@@ -76,13 +76,13 @@ def make_time_offset_advice(
         }
     offset_s, (low_offset_s, high_offset_s) = time_offset.offset_s, time_offset.interval_s
     offset_text = f"{offset_s:+.3f} s (95 % {low_offset_s:+.3f} to {high_offset_s:+.3f} s)"
-    if trial is not None and truth_refutes_offset(trial):
+    if rerun is not None and truth_refutes_offset(rerun):
         return {
             "Result": (
                 "Ground truth refutes the estimated time offset. A re-run with this offset "
                 "increases KF's position RMSE from "
-                f"{format_metres(trial.before.position_rmse_m or 0.0)} to "
-                f"{format_metres(trial.after.position_rmse_m or 0.0)} m."
+                f"{format_metres(rerun.before.position_rmse_m or 0.0)} to "
+                f"{format_metres(rerun.after.position_rmse_m or 0.0)} m."
             ),
             "Offset": f"The estimate is {offset_text}.",
             "Action": "Do not correct the timestamps. Check the timestamps of the ground truth.",

@@ -50,6 +50,7 @@ def make_comparison_results(
         "card": card,
         "clock": analysis.time_offset,
         "student": student,
+        "trials": analysis.reruns,
     }
     # the other fields of the results are copied from the analysis
     for name in contract.ComparisonResults.__struct_fields__:

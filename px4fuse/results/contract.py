@@ -13,7 +13,7 @@ from msgspec import Meta
 
 from px4fuse.card.model import Card
 from px4fuse.comparison.model import AxisComparison, FilterName
-from px4fuse.comparison.trials import Trial
+from px4fuse.comparison.rerun_effects import Rerun
 from px4fuse.convention.model import Convention
 from px4fuse.core.record import (
     Count,
@@ -207,7 +207,7 @@ class ComparisonResults(_FlightResults):
         Replay of EKF2, and its agreement with the logged EKF2.
     difference_steps : mapping of axis name to DifferenceExplanation
         Re-runs of KF that explain the difference KF - EKF2.
-    trials : tuple of Trial
+    trials : tuple of Rerun
         Re-runs of KF and EKF2, each with one change of a setting or of the data.
     card : Card
         Summary of the diagnosis.
@@ -222,7 +222,7 @@ class ComparisonResults(_FlightResults):
     heading: OrUnavailable[HeadingError]
     ekf2_replay: OrUnavailable[Ekf2Replay]
     difference_steps: dict[str, OrUnavailable[DifferenceExplanation]]
-    trials: tuple[Trial, ...]
+    trials: tuple[Rerun, ...]
     aids: dict[str, AidResult]
     loop: OrUnavailable[Loop]
     card: Card
