@@ -66,8 +66,9 @@ def compare(prepared_comparison: PreparedComparison) -> Comparison:
         for name, tables in innovations.items()
         if (nis := _assess_horizontal_innovations(tables))
     }
-    prepared_comparison = replace(prepared_comparison, notes=notes)
-    return Comparison(**vars(prepared_comparison), axes=axes, horizontal=horizontal_nis)
+    return Comparison(
+        **vars(prepared_comparison) | {"notes": notes}, axes=axes, horizontal=horizontal_nis
+    )
 
 
 def _compare_axis(

@@ -200,7 +200,6 @@ class VisionFilter:
         )
         S = predicted_variance + R
         (
-            has_fusion_restarted,
             is_outside_gate,
             is_fused,
             is_restarting,
@@ -220,7 +219,7 @@ class VisionFilter:
             is_fused,
             is_position_reset,
         )
-        is_evaluated = has_sample & ~has_fusion_restarted | is_position_reset
+        is_evaluated = is_fused | is_outside_gate | is_position_reset
         self.update_records[event, sample_index] = np.where(is_evaluated, update_record, np.nan)
         K = (np.linalg.inv(HPH + R[:, :, None] * np.eye(2)) @ HP).transpose(0, 2, 1)
         K *= is_fused[:, None, None]
@@ -268,12 +267,12 @@ class VisionFilter:
         has_fusion_restarted = (fusion_time_s - self.last_sample_s > MAX_SAMPLE_GAP_S) | (
             is_gnss_off != self.was_gnss_off
         )
-        is_outside_gate = is_innovation_large & self.has_gate & ~has_fusion_restarted
+        is_tested = has_sample & ~has_fusion_restarted
+        is_outside_gate = is_tested & is_innovation_large & self.has_gate
         is_rejection_timed_out = is_outside_gate & (
             fusion_time_s - self.last_attempt_s > MAX_REJECTION_DURATION_S
         )
         is_restarting = has_sample & (has_fusion_restarted | is_rejection_timed_out)
-        is_fused = has_sample & ~is_outside_gate & ~has_fusion_restarted
         is_position_reset = is_restarting & (
             is_gnss_off
             | (
@@ -281,13 +280,7 @@ class VisionFilter:
                 & (fusion_time_s - last_gnss_fusion_s > MAX_REJECTION_DURATION_S)
             )
         )
-        return (
-            has_fusion_restarted,
-            is_outside_gate,
-            is_fused,
-            is_restarting,
-            is_position_reset,
-        )
+        return is_outside_gate, is_tested & ~is_outside_gate, is_restarting, is_position_reset
 
 
 def set_states(
