@@ -40,7 +40,7 @@ from test_source_values import examples as value_examples  # noqa: E402
 
 import px4fuse  # noqa: E402
 from px4fuse.analysis import Analysis  # noqa: E402
-from px4fuse.diagnose import analyse_comparison  # noqa: E402
+from px4fuse.diagnose import diagnose_comparison  # noqa: E402
 from px4fuse.ekf2.aids import evaluate_aids  # noqa: E402
 from px4fuse.filter.frame_rotation import HeadingPart, combine_heading_parts  # noqa: E402
 from px4fuse.filter.settings import Settings  # noqa: E402
@@ -141,7 +141,7 @@ def collect_examples() -> dict[str, ExampleFlight]:
 
     for name, (faults, settings) in FAULTS_AND_SETTINGS_BY_ID.items():
         flight = simulate_flight(Scenario(passes=4, seed=2), parse_faults(faults))
-        analysis = analyse_comparison(compare(flight, Settings(**settings)))
+        analysis = diagnose_comparison(compare(flight, Settings(**settings)))
         command = " ".join(["px4fuse simulate", *(f"--mistake {fault}" for fault in faults)])
         options = [f"--{key[:7].replace('_', '-')} {value:g}" for key, value in settings.items()]
         settings_text = f", analysed with `compare {' '.join(options)}`" if options else ""
@@ -156,7 +156,7 @@ def collect_examples() -> dict[str, ExampleFlight]:
         flight = simulate_flight(Scenario(passes=4, seed=2, ekf2=False))
         truth = flight.truth.samples[Columns.POSITION].dropna()
         true_position_m = CubicSpline(truth.index.to_numpy(), truth.to_numpy())
-        analysis = analyse_comparison(
+        analysis = diagnose_comparison(
             compare(laid_over(flight, true_position_m, model, 10.0, 2), Settings())
         )
         findings = [finding for finding in find(analysis) if finding.id.startswith("source_")]

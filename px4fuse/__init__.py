@@ -23,7 +23,7 @@ _MODULE_BY_NAME = {
     "find": "findings",
     "read_log": "readers",
     "read_trajectory": "readers.trajectory",
-    "replay": "filter.kalman",
+    "run_kf": "filter.kalman",
     "table": "api",
     "what_if": "api",
     "write_page": "api",
@@ -44,7 +44,7 @@ if _typing.TYPE_CHECKING:
     from px4fuse.batch.run import run_batch as run_batch
     from px4fuse.core.record import Unavailable as Unavailable
     from px4fuse.errors import Px4FuseError as Px4FuseError
-    from px4fuse.filter.kalman import replay as replay
+    from px4fuse.filter.kalman import run_kf as run_kf
     from px4fuse.filter.settings import Settings as Settings
     from px4fuse.findings import find as find
     from px4fuse.readers import read_log as read_log

@@ -6,8 +6,8 @@ from dataclasses import dataclass, field
 from px4fuse.comparison.estimates import Estimates
 from px4fuse.comparison.flight_events import Events
 from px4fuse.comparison.model import AxisComparison, Comparison
+from px4fuse.comparison.rerun_effects import Rerun
 from px4fuse.comparison.reruns import Reruns
-from px4fuse.comparison.trials import Trial
 from px4fuse.core.record import display_html, one_line_repr
 from px4fuse.ekf2.aids import AidResult
 from px4fuse.ekf2.replay import Ekf2Replay
@@ -21,6 +21,9 @@ from px4fuse.request import ComparisonRequest
 @dataclass(frozen=True, repr=False, kw_only=True)
 class Analysis(Comparison, Estimates, Reruns):
     """Comparison of KF and EKF2 on one flight, with parameter estimates, filter re-runs and faults.
+
+    The fields of :class:`Comparison`, :class:`Estimates` and :class:`Reruns` are also fields of
+    this class.
 
     Attributes
     ----------
@@ -51,10 +54,10 @@ class Analysis(Comparison, Estimates, Reruns):
         model = self.ekf2_model
         return model if isinstance(model, Unavailable) else model.baseline_replay
 
-    def select_main_trials(self) -> list[Trial]:
+    def select_main_reruns(self) -> list[Rerun]:
         """Return the re-runs along the main axis that are compared with the original results."""
         main_axis = self.main.axis.name
-        return [trial for trial in self.trials if trial.axis == main_axis and trial.is_logged]
+        return [rerun for rerun in self.reruns if rerun.axis == main_axis and rerun.is_logged]
 
     def select_secondary_axes(self) -> list[AxisComparison]:
         """Return the comparisons along all axes except the main axis."""

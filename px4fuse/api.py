@@ -183,17 +183,17 @@ def evaluate(
         or an RPE delta is not above zero.
     """
     return evaluation.evaluate(
-        _read_trajectory(estimate), _read_trajectory(reference, default="truth"), **options
+        _read_trajectory(estimate), _read_trajectory(reference, default_track="truth"), **options
     )
 
 
 def _read_trajectory(
-    source: Pathlike | Trajectory, default: Literal["truth"] | None = None
+    source: Pathlike | Trajectory, default_track: Literal["truth"] | None = None
 ) -> Trajectory:
-    """Read a trajectory; ``default`` is the track of a flight log."""
+    """Read a trajectory; ``default_track`` is for a flight log."""
     if isinstance(source, Trajectory):
         return source
-    return read_source(str(source), default=default).trajectory
+    return read_source(str(source), default_track=default_track).trajectory
 
 
 def close_loop(
@@ -249,7 +249,9 @@ def close_loop(
         loop_source = LoopSource(source, None)
     else:
         loop_source = read_source(str(source), frame=frame)
-    reference_track = None if reference is None else _read_trajectory(reference, default="truth")
+    reference_track = (
+        None if reference is None else _read_trajectory(reference, default_track="truth")
+    )
     return analyse(loop_source, request.LoopRequest(**request_fields), reference_track, progress)
 
 
@@ -264,11 +266,11 @@ def write_report(analysis: Analysis, path: Pathlike) -> Path:
         A file cannot be written, or the analysis is not from :func:`px4fuse.compare`.
     """
     from px4fuse.report.pdf import render_pdf  # noqa: PLC0415 - slow import
-    from px4fuse.results.build import results  # noqa: PLC0415
+    from px4fuse.results.build import make_comparison_results  # noqa: PLC0415
     from px4fuse.results.contract import to_json  # noqa: PLC0415
 
     report_path = _require_suffix(path, ".pdf")
-    serialisable_results = results(_require_request(analysis), analysis)
+    serialisable_results = make_comparison_results(_require_request(analysis), analysis)
     results_json = to_json(serialisable_results)
     pdf = render_pdf(analysis, serialisable_results, results_json)
     write_output_files({report_path: pdf, report_path.with_suffix(".json"): results_json.encode()})

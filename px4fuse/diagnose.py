@@ -1,19 +1,30 @@
 """Diagnosis of one flight, from a request (files and settings) to the faults.
 
-1. read: log → Flight
-2. prepare: position source, time span and axes
-3. filter: run KF along each axis
-4. compare: KF, EKF2 and ground truth
-5. estimate: noise σ, time offset, frame misalignment, biases
-6. rerun: replay EKF2, explain KF - EKF2, re-run both filters with one change at a time
-7. analyse the rest of the flight: loop closure, EKF2's other aiding sources, events
-8. find: faults of the flight, with their causes
+:func:`diagnose` calls:
+
+1. read_flight: log → Flight
+2. prepare_comparison: position source, time span, axes and time offset
+3. compare: run KF along each axis; compare KF, EKF2 and ground truth
+4. diagnose_comparison, which calls:
+
+   a. estimate: noise σ, time offset, frame misalignment, biases
+   b. rerun: replay EKF2, explain KF - EKF2, re-run both filters with one change at a time
+   c. collect_events, evaluate_aids, analyse_flight_loop: events, EKF2's other aiding sources,
+      loop closure error
+   d. find: faults of the flight, with their causes
+
+If EKF2's positions, from which the time offset of a position file was estimated, are late, steps 2
+to 4 are repeated with the time offset from the IMU (_align_file_to_imu).
+
+Other commands: :func:`diagnose_or_check_aids` also analyses flights without positions,
+:func:`run_what_if` is ``px4fuse whatif``, and :func:`analyse_loop_closure` is ``px4fuse loop``.
+Between the steps, release_free_memory limits the peak memory.
 """
 
 import math
-from dataclasses import replace
+from dataclasses import MISSING, fields, replace
 from pathlib import Path
-from typing import TypeVar
+from typing import Any, TypeVar
 
 from msgspec import structs
 
@@ -28,7 +39,7 @@ from px4fuse.comparison.estimates import (
     Estimates,
     Progress,
     estimate,
-    estimate_noises_and_clock,
+    estimate_noises_and_time_offset,
     ignore_progress,
 )
 from px4fuse.comparison.flight_events import collect_events
@@ -36,7 +47,7 @@ from px4fuse.comparison.model import Comparison, PreparedComparison
 from px4fuse.comparison.preparation import (
     explain_missing_source,
     prepare_comparison_inputs,
-    shift_clock,
+    shift_timestamps,
 )
 from px4fuse.comparison.remedy import estimate_ekf2_parameters
 from px4fuse.comparison.reruns import Reruns, list_rerun_configurations, rerun_filters
@@ -47,7 +58,7 @@ from px4fuse.ekf2.model import Ekf2Model, prepare_ekf2_model
 from px4fuse.ekf2.whatif import make_sweep_values, what_if
 from px4fuse.errors import MissingDataError, SettingsError
 from px4fuse.filter.signals import AISLE
-from px4fuse.filter.time_offset import ClockOffset
+from px4fuse.filter.time_offset import SourceTimeOffset
 from px4fuse.filter.tuning import HORIZONTAL
 from px4fuse.findings import find, find_aid_findings
 from px4fuse.findings.cause_grouping import WRONG_CONVENTION_KEY
@@ -65,8 +76,6 @@ def diagnose(
     request: ComparisonRequest,
     progress: Progress = ignore_progress,
     flight: Flight | None = None,
-    *,
-    keep_positions_as_sent: bool = False,
 ) -> Analysis:
     """Read a flight, compare KF with EKF2, and find faults.
 
@@ -77,8 +86,6 @@ def diagnose(
         Called with the name of each step of the computation.
     flight : Flight, optional
         Flight that was already read from the files of the request.
-    keep_positions_as_sent : bool
-        True to skip the check and correction of axes, unit and timestamps of the positions.
 
     Raises
     ------
@@ -86,79 +93,72 @@ def diagnose(
         A file cannot be read, the flight lacks required data, or a setting is out of range.
     """
     flight = flight or read_flight(request, progress)
-    analysis = _diagnose_flight(
-        request, progress, flight, keep_positions_as_sent=keep_positions_as_sent
-    )
-    if refined_flight := _refine_clock_offset(flight, analysis):
-        analysis = _diagnose_flight(
-            request, progress, refined_flight, keep_positions_as_sent=keep_positions_as_sent
-        )
+    analysis = _diagnose_flight(request, progress, flight)
+    if aligned_flight := _align_file_to_imu(flight, analysis):
+        analysis = _diagnose_flight(request, progress, aligned_flight)
     return analysis
 
 
-def _diagnose_flight(
-    request: ComparisonRequest, progress: Progress, flight: Flight, *, keep_positions_as_sent: bool
-) -> Analysis:
-    prepared_comparison = prepare_comparison(
-        flight, request, progress, keep_positions_as_sent=keep_positions_as_sent
-    )
+def _diagnose_flight(request: ComparisonRequest, progress: Progress, flight: Flight) -> Analysis:
+    prepared_comparison = prepare_comparison(flight, request, progress)
     progress("running KF")
     comparison = compare(prepared_comparison)
-    return replace(analyse_comparison(comparison, progress), request=request)
+    return replace(diagnose_comparison(comparison, progress), request=request)
 
 
-def _refine_clock_offset(flight: Flight, analysis: Analysis) -> Flight | None:
+def _align_file_to_imu(flight: Flight, analysis: Analysis) -> Flight | None:
     """Replace the clock offset of a position file by the estimate from the IMU.
 
     The first estimate is from EKF2's positions, which may be late. Return None if nothing changes.
     """
-    alignment, clock_offset = analysis.source.alignment, analysis.clock
+    alignment, time_offset = analysis.source.alignment, analysis.time_offset
     if (
         alignment is None
         or alignment.clock_offset_sigma_s is None
         or alignment.reference != "EKF2 position"
-        or not isinstance(clock_offset, ClockOffset)
+        or not isinstance(time_offset, SourceTimeOffset)
         or all(finding.id != "source_time_offset" for finding in analysis.findings)
         or any(WRONG_CONVENTION_KEY in finding.evidence for finding in analysis.findings)
     ):
         return None
-    offset_s = clock_offset.offset_s
+    offset_s = time_offset.offset_s
     alignment = structs.replace(
         alignment,
         clock_offset_s=alignment.clock_offset_s + offset_s,
-        clock_offset_sigma_s=clock_offset.sigma_s,
+        clock_offset_sigma_s=time_offset.sigma_s,
         clock_reason="the time offset was estimated with the IMU; EKF2's position is "
         f"{abs(offset_s):.3f} s {'late' if offset_s < 0 else 'early'} relative to the IMU",
     )
+    # align_position_file adds the position file as first track
     file_track, *other_tracks = flight.positions
-    shifted_track = replace(shift_clock(file_track, offset_s), alignment=alignment)
+    shifted_track = replace(shift_timestamps(file_track, offset_s), alignment=alignment)
     return replace(flight, positions=(shifted_track, *other_tracks))
 
 
-def analyse_comparison(comparison: Comparison, progress: Progress = ignore_progress) -> Analysis:
+def diagnose_comparison(comparison: Comparison, progress: Progress = ignore_progress) -> Analysis:
     """Estimate errors, re-run KF and EKF2, and find faults and their causes.
 
     If students must find the faults, only the comparison is returned.
     """
     if comparison.flight.log.is_assessed:
+        withheld_fields: dict[str, Any] = {
+            field.name: DIAGNOSIS_WITHHELD
+            for field in fields(Analysis)
+            if field.default is MISSING and field.name not in vars(comparison)
+        }
         return Analysis(
-            **vars(comparison),
-            tuning={HORIZONTAL: DIAGNOSIS_WITHHELD},
-            clock=DIAGNOSIS_WITHHELD,
-            heading=DIAGNOSIS_WITHHELD,
-            systematic_errors=DIAGNOSIS_WITHHELD,
-            source_low_pass=DIAGNOSIS_WITHHELD,
-            time_correlated_noise=DIAGNOSIS_WITHHELD,
-            ekf2_model=DIAGNOSIS_WITHHELD,
-            difference_steps=dict.fromkeys(comparison.axes, DIAGNOSIS_WITHHELD),
-            trials=(),
-            events=collect_events(comparison),
-            aids=DIAGNOSIS_WITHHELD,
-            loop=DIAGNOSIS_WITHHELD,
+            **vars(comparison)
+            | withheld_fields
+            | {
+                "tuning": {HORIZONTAL: DIAGNOSIS_WITHHELD},
+                "difference_steps": dict.fromkeys(comparison.axes, DIAGNOSIS_WITHHELD),
+                "reruns": (),
+                "events": collect_events(comparison),
+            }
         )
     estimates = estimate(comparison, progress)
     release_free_memory()
-    comparison = refine_delay(comparison, estimates.clock)
+    comparison = refine_delay(comparison, estimates.time_offset)
     reruns = rerun(comparison, estimates, progress)
     release_free_memory()
     progress("measuring the loop closure error")
@@ -176,16 +176,16 @@ def analyse_comparison(comparison: Comparison, progress: Progress = ignore_progr
     return replace(analysis, findings=find(analysis))
 
 
-def refine_delay(comparison: Comparison, clock_offset: ClockOffset | Unavailable) -> Comparison:
-    """Replace the detected delay of the positions by the more precise ``clock_offset``."""
+def refine_delay(comparison: Comparison, time_offset: SourceTimeOffset | Unavailable) -> Comparison:
+    """Replace the detected delay of the positions by the more precise ``time_offset``."""
     if (
         comparison.convention is None
-        or isinstance(clock_offset, Unavailable)
-        or not clock_offset.is_determinable
+        or isinstance(time_offset, Unavailable)
+        or not time_offset.is_determinable
     ):
         return comparison
     # The delay is the negative time offset
-    refined_convention = structs.replace(comparison.convention, late_s=-clock_offset.offset_s)
+    refined_convention = structs.replace(comparison.convention, late_s=-time_offset.offset_s)
     refined_comparison = replace(comparison, convention=refined_convention)
     # Keep the first estimate if the refined delay is too small to be a fault
     is_delay_a_fault = (
@@ -233,39 +233,35 @@ def prepare_comparison(
     flight: Flight,
     request: ComparisonRequest,
     progress: Progress = ignore_progress,
-    *,
-    keep_positions_as_sent: bool = False,
 ) -> PreparedComparison:
     """Choose position source, time span, axes and time offset of a comparison.
 
     For arguments and errors see :func:`diagnose`.
     """
-    prepared_comparison = prepare_comparison_inputs(
-        flight, request, keep_positions_as_sent=keep_positions_as_sent
-    )
+    prepared_comparison = prepare_comparison_inputs(flight, request)
     # read_flight has already corrected the time offset of a position file
     if request.clock_offset_s != AUTO or request.position is not None:
         return prepared_comparison
-    _, clock_offset = estimate_noises_and_clock(prepared_comparison, progress)
-    if isinstance(clock_offset, Unavailable) or not clock_offset.is_determinable:
+    _, time_offset = estimate_noises_and_time_offset(prepared_comparison, progress)
+    if isinstance(time_offset, Unavailable) or not time_offset.is_determinable:
         raise MissingDataError(
             f"{flight.log.name}: the time offset cannot be estimated from this flight "
-            f"({clock_offset.reason}).",
+            f"({time_offset.reason}).",
             "State the offset (--clock-offset SECONDS), or omit --clock-offset.",
         )
-    if not clock_offset.is_significant(clock_offset.remaining_s):
-        applied_s = clock_offset.applied_s
-        low_s, high_s = (limit_s - applied_s for limit_s in clock_offset.interval_s)
+    if not time_offset.is_significant(time_offset.remaining_s):
+        applied_s = time_offset.applied_s
+        low_s, high_s = (limit_s - applied_s for limit_s in time_offset.interval_s)
         notes = [
             *prepared_comparison.notes,
-            f"--clock-offset auto: the time offset {clock_offset.remaining_s:+.3f} s (95 % "
+            f"--clock-offset auto: the time offset {time_offset.remaining_s:+.3f} s (95 % "
             f"{low_s:+.3f} to {high_s:+.3f} s) is not significant and not applied",
         ]
         if applied_s:
             notes.append(f"the timestamps were shifted by {applied_s:+.3f} s")
         return replace(prepared_comparison, notes=tuple(notes))
-    request = structs.replace(request, clock_offset_s=clock_offset.offset_s)
-    return prepare_comparison_inputs(flight, request, keep_positions_as_sent=keep_positions_as_sent)
+    request = structs.replace(request, clock_offset_s=time_offset.offset_s)
+    return prepare_comparison_inputs(flight, request)
 
 
 def rerun(
@@ -283,13 +279,13 @@ def rerun(
         ],
     )
     release_free_memory()
-    explanation_by_axis = explain_ekf2_difference(
-        comparison, ekf2_model, estimates.clock, estimated_settings
+    difference_steps = explain_ekf2_difference(
+        comparison, ekf2_model, estimates.time_offset, estimated_settings
     )
-    trials = rerun_filters(comparison, estimates, ekf2_model)
-    if isinstance(ekf2_model, Ekf2Model):  # to free memory
+    reruns = rerun_filters(comparison, estimates, ekf2_model)
+    if isinstance(ekf2_model, Ekf2Model):  # the runs need much memory
         ekf2_model = replace(ekf2_model, runs=())
-    return Reruns(ekf2_model=ekf2_model, difference_steps=explanation_by_axis, trials=trials)
+    return Reruns(ekf2_model=ekf2_model, difference_steps=difference_steps, reruns=reruns)
 
 
 def diagnose_or_check_aids(
@@ -355,8 +351,8 @@ def run_what_if(
         comparison_request = structs.replace(comparison_request, axes=("north", "east", AISLE))
         prepared_comparison = prepare_comparison_inputs(flight, comparison_request)
         comparison = compare(prepared_comparison)
-        tuning, clock_offset = estimate_noises_and_clock(comparison, progress)
-        changes = estimate_ekf2_parameters(comparison, ekf2_model, tuning, clock_offset)
+        tuning, time_offset = estimate_noises_and_time_offset(comparison, progress)
+        changes = estimate_ekf2_parameters(comparison, ekf2_model, tuning, time_offset)
     parameter_sets = [changes] if changes or request.without else []
     parameter_sets += [changes | values for values in swept_settings]
     progress("replaying EKF2 with other parameters")
@@ -390,7 +386,7 @@ def analyse_loop_closure(request: LoopRequest, progress: Progress = ignore_progr
     system, reference = request.system, None
     source = read_source(request.source, frame=request.frame, system=system)
     if request.reference is not None:
-        reference = read_source(request.reference, default="truth", system=system).trajectory
+        reference = read_source(request.reference, default_track="truth", system=system).trajectory
     loop = analyse(source, request, reference, progress)
     if source.flight is None or loop.kind != "vio" or loop.is_assessed:
         return loop

@@ -7,7 +7,7 @@ from collections.abc import Iterator
 
 import numpy as np
 
-from px4fuse.filter.kalman import Replay, replay
+from px4fuse.filter.kalman import KfRun, run_kf
 from px4fuse.filter.settings import InitialState, Settings
 from px4fuse.filter.signals import Axis
 from px4fuse.flight.model import Unavailable
@@ -23,7 +23,7 @@ UWB_ERRORS_M = (0.08, -0.12, 0.05, 0.10, -0.06, -0.09)
 ODOMETRY_CORNERS_M = ((0.0, 0.0), (20.3, 0.2), (20.6, 20.4), (0.8, 20.9), (1.2, 0.8))
 
 
-def run_aisle_example() -> Replay:
+def run_aisle_example() -> KfRun:
     """Run KF on Example 1: UWB positions every 0.5 s along an aisle at 1 m/s."""
     settings = Settings(sigma_a_m_s2=0.5, sigma_z_m=0.10, dt_s=0.1, input="zero")
     time_s = settings.dt_s * np.arange(
@@ -42,7 +42,7 @@ def run_aisle_example() -> Replay:
             "No action is needed.",
         ),
     )
-    return replay(axis, settings, InitialState(time_s=0.0, position_m=0.0))
+    return run_kf(axis, settings, InitialState(time_s=0.0, position_m=0.0))
 
 
 def format_kalman_lines() -> Iterator[str]:

@@ -4,10 +4,10 @@ from px4fuse.card.model import (
     Action,
     AnalysisDescription,
     Card,
+    CardRerun,
     DiagnosedCause,
     FlightErrors,
     Note,
-    Rerun,
     Verdict,
 )
 
@@ -59,14 +59,14 @@ SMALL_SIGMA_A = Card(
                 Action("EKF2", "no change: the reported σ is consistent"),
             ),
             reruns=(
-                Rerun(
+                CardRerun(
                     label="KF, --sigma-a 0.363",
                     position_rmse_m=(2.11, 0.060),
                     source_ratio=(21.0, 0.94),
                     truth_ratio=(128.0, 0.90),
                     improves="position and σ",
                 ),
-                Rerun(
+                CardRerun(
                     label="KF, default 0.5",
                     position_rmse_m=(2.11, 0.062),
                     source_ratio=(21.0, 0.92),

@@ -273,13 +273,9 @@ def _diagnose_cached(
     request: ComparisonRequest,
     progress: Progress = ignore_progress,
     flight: Flight | None = None,
-    *,
-    keep_positions_as_sent: bool = False,
 ) -> Analysis:
-    if keep_positions_as_sent or (
-        flight is not None and flight is not _cache.get(_flight_key(request))
-    ):
-        return _diagnose(request, progress, flight, keep_positions_as_sent=keep_positions_as_sent)
+    if flight is not None and flight is not _cache.get(_flight_key(request)):
+        return _diagnose(request, progress, flight)
     return _cached(_cache_key(request, "analysis"), lambda: _diagnose(request, progress, flight))
 
 

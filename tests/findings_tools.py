@@ -12,13 +12,13 @@ from exchange import replace
 
 from px4fuse.analysis import Analysis
 from px4fuse.comparison.model import FILTER_NAMES, ErrorsAgainstTruth, FilterSummary, UntestedFilter
-from px4fuse.comparison.trials import RunStatistics, Trial
+from px4fuse.comparison.rerun_effects import Rerun, RunStatistics
 from px4fuse.convention.correction import find_convention_faults
 from px4fuse.filter.consistency import Consistency
 from px4fuse.filter.hypotheses import Estimate, Jump, SystematicErrors
 from px4fuse.filter.settings import Settings
 from px4fuse.filter.signals import Segment, cut_to_segment
-from px4fuse.filter.time_offset import ClockOffset, PartOffset
+from px4fuse.filter.time_offset import PartOffset, SourceTimeOffset
 from px4fuse.filter.tuning import HORIZONTAL, AxisTuning, NoiseEstimate
 from px4fuse.finding import Finding
 from px4fuse.flight.ekf2_parameters import PARAMETERS
@@ -116,7 +116,7 @@ def analysis(
     """Make an analysis; fields that are not given are Unavailable."""
     if isinstance(ekf2, dict):
         usual_ekf2 = {
-            "states": {},
+            "status_flags": {},
             "parameters": {},
             "aids": {},
             "record": NONE,
@@ -134,7 +134,7 @@ def analysis(
     flown = {**usual_flight, **(flight or {})}
     usual = dict.fromkeys(
         (
-            "clock",
+            "time_offset",
             "ekf2_model",
             "loop",
             "heading",
@@ -154,8 +154,8 @@ def analysis(
         ),
         main=next(iter(axes), axis()), input_axes=tuple(each.axis for each in axes),
         segment=SEGMENT, settings=settings, notes=notes, missing=missing,
-        **{"tuning": {}, "difference_steps": {}, "trials": (), **usual, **parts},
-        select_main_trials=lambda: [t for t in parts.get("trials", ()) if t.kinds],
+        **{"tuning": {}, "difference_steps": {}, "reruns": (), **usual, **parts},
+        select_main_reruns=lambda: [t for t in parts.get("reruns", ()) if t.kinds],
     )  # fmt: skip
 
 
@@ -185,10 +185,10 @@ def _with_truth(one: Any, truth: Any) -> Any:
 def tried(
     owner: Any, change: dict[str, float], axis: str = "north", of: Any = "nis",
     before: float = 9.0, explained_fraction: float = 1.0,
-) -> Trial:  # fmt: skip
+) -> Rerun:  # fmt: skip
     """Make a re-run whose change explains a fraction of the logarithm of a statistic."""
     key, after = f"{of}_mean", before ** (1.0 - explained_fraction)
-    return Trial(
+    return Rerun(
         filter=owner, axis=axis, kinds=(), change=change, discrepancies=(of,),
         before=RunStatistics(innovations=100, **{key: before}),
         after=RunStatistics(innovations=100, **{key: after}),
@@ -266,7 +266,7 @@ def tuned(
 
 def late(
     remaining_s: float, sigma_s: float = 0.001, applied_s: float = 0.0, **parts: Any
-) -> ClockOffset:
+) -> SourceTimeOffset:
     offset_s = applied_s + remaining_s
     halves = tuple(PartOffset(0.0, 1.0, at, 0.1) for at in (offset_s - 0.2, offset_s + 0.2))
     usual = {
@@ -274,7 +274,11 @@ def late(
         "change_p_value": None, "parts": halves,
     }  # fmt: skip
     return made(
-        ClockOffset, offset_s=offset_s, applied_s=applied_s, sigma_s=sigma_s, **{**usual, **parts}
+        SourceTimeOffset,
+        offset_s=offset_s,
+        applied_s=applied_s,
+        sigma_s=sigma_s,
+        **{**usual, **parts},
     )
 
 

@@ -348,14 +348,14 @@ def unexplained(comparison: Comparison, tuning: TuningByAxis | None = None) -> A
     parts = {part.name: getattr(comparison, part.name) for part in fields(Comparison)}
     missing = unavailable("estimates")
     estimates = Estimates(
-        tuning=tuning or {}, clock=missing, heading=missing, systematic_errors=missing,
+        tuning=tuning or {}, time_offset=missing, heading=missing, systematic_errors=missing,
         source_low_pass=missing, time_correlated_noise=missing,
         axis_tunings=tune_perpendicular_axes(comparison),
         noisy_part=find_noisy_flight_part(comparison, (tuning or {}).get(HORIZONTAL)),
     )  # fmt: skip
     trials = rerun_filters(comparison, estimates, missing)
     return Analysis(
-        **parts, **vars(estimates), ekf2_model=missing, difference_steps={}, trials=trials,
+        **parts, **vars(estimates), ekf2_model=missing, difference_steps={}, reruns=trials,
         events=collect_events(comparison), aids=evaluate_aids(comparison.flight),
         loop=missing,
     )  # fmt: skip

@@ -320,7 +320,7 @@ def test_compare_of_log_without_take_off_raises_an_error(tmp_path: Path) -> None
 
 def aids_only(**ekf2: Any) -> Any:
     """Make a flight without positions."""
-    usual = {"primary_instances": ((0.5, 0),), "states": {}, "fusion_flags": NONE}
+    usual = {"primary_instances": ((0.5, 0),), "status_flags": {}, "fusion_flags": NONE}
     return SimpleNamespace(
         ekf2=made(Ekf2, **{**usual, **ekf2}), airborne=((5.0, 50.0),), log=log(), missing=()
     )
@@ -336,7 +336,7 @@ def test_aiding_source_report_lists_ekf2_instance_changes() -> None:
 
 def test_missing_heading_alignment_without_positions_is_reported() -> None:
     states = {"tilt_align": pd.Series([1.0], [0.0]), "yaw_align": pd.Series([0.0], [0.0])}
-    (finding,) = find_aid_findings({}, aids_only(states=states))
+    (finding,) = find_aid_findings({}, aids_only(status_flags=states))
     assert finding.id == "ekf2_not_aligned"
     assert "heading" in finding.title
     assert finding.remedy.startswith("Calibrate the magnetometer")
@@ -352,7 +352,7 @@ def test_gnss_without_fix_is_reported() -> None:
 
 
 def test_alignment_action_names_ev_yaw_bit_without_orientation() -> None:
-    flight = aids_only(states={"yaw_align": pd.Series([0.0], [0.0])})
+    flight = aids_only(status_flags={"yaw_align": pd.Series([0.0], [0.0])})
     flight.log = log(parameters={"EKF2_EV_CTRL": 9, "EKF2_MAG_TYPE": 5})
     (finding,) = ekf2_state.detect_missing_alignment(flight, SEGMENT, source())
     assert "EKF2_EV_CTRL bit 3 is set, but the orientation is missing" in finding.remedy

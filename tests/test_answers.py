@@ -13,7 +13,7 @@ from pypdf import PdfReader
 
 from px4fuse.classroom.assignment.truth import compute_numeric_answer
 from px4fuse.errors import SettingsError
-from px4fuse.filter.kalman import replay
+from px4fuse.filter.kalman import run_kf
 from px4fuse.filter.settings import Settings
 from px4fuse.results.answer_form import (
     FAULT_KINDS,
@@ -106,7 +106,7 @@ def test_answer_form_questions_differ_for_each_log() -> None:
     assert kinds == {"gain", "variance", "innovation", "nis", "prediction", "gate"}
     main = compare(aisle_flight(duration_s=60.0)).main
     for quantity in next(iter(drawn)):
-        run = replay(main.axis, Settings(quantity.sigma_a_m_s2, quantity.sigma_z_m))
+        run = run_kf(main.axis, Settings(quantity.sigma_a_m_s2, quantity.sigma_z_m))
         row = run.updates.iloc[quantity.update_number - 1]
         s, p = row["innovation_variance_m2"], row["prior_position_variance_m2"]
         by_hand = {
@@ -124,7 +124,7 @@ def test_right_answer_for_predicted_sigma_equals_closed_form() -> None:
         q for n in range(99) for q in select_questions(f"{n:064x}") if q.kind == "prediction"
     )
     settings = Settings(quantity.sigma_a_m_s2, quantity.sigma_z_m)
-    run = replay(main.axis, settings)
+    run = run_kf(main.axis, settings)
     at = run.updates.index[quantity.update_number - 1]
     p0, p1, p2 = run.steps.loc[at, ["position_variance_m2", "covariance_m2_s",
                                     "velocity_variance_m2_s2"]]  # fmt: skip

@@ -34,7 +34,7 @@ from px4fuse.classroom.assignment.random_assignment import (
     derive_hmac_key,
 )
 from px4fuse.classroom.assignment.roster import Person
-from px4fuse.diagnose import analyse_comparison
+from px4fuse.diagnose import diagnose_comparison
 from px4fuse.errors import OutputError, SettingsError
 from px4fuse.findings import find_loop_findings
 from px4fuse.loop.analysis import analyse
@@ -219,7 +219,7 @@ def test_each_fault_in_assignment_log_is_detected_by_analysis(
     if kind == "loop":
         found = find_loop_findings(analyse(LoopSource(trajectory_of(flight, "vio"), flight)))
     else:
-        found = analyse_comparison(compare(flight, axes=("north", "east"))).findings
+        found = diagnose_comparison(compare(flight, axes=("north", "east"))).findings
     drawn = assign_random_flight(SECRET, CLASS[number].student_id, kind, count)
     wanted = {FINDINGS[choice.name] for choice in choices_of(drawn)}
     assert len(wanted) == count

@@ -26,7 +26,7 @@ from px4fuse.flight.model import Flight, Unavailable
 from px4fuse.info.inventory import list_log_contents
 from px4fuse.readers import ULOG_MAGIC, read_log
 from px4fuse.request import ComparisonRequest
-from px4fuse.results.build import make_compare_results
+from px4fuse.results.build import make_comparison_or_aids_results
 from px4fuse.results.contract import to_json
 
 
@@ -424,7 +424,7 @@ def test_compare_of_log_with_damaged_values_gives_finite_results(tmp_path, damag
     log = make_log("v1.16", 20.0)
     damage(log)
     request = ComparisonRequest(log=str(log.write(tmp_path / "made.ulg")))
-    results = make_compare_results(request, diagnose_or_check_aids(request))
+    results = make_comparison_or_aids_results(request, diagnose_or_check_aids(request))
     assert not re.search(r"\b(nan|inf)\b|e\+[23]\d", to_json(results))
     if damage is truth_impossible:
         reason = "vehicle_local_position_groundtruth has no finite sample"

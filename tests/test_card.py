@@ -20,8 +20,8 @@ from px4fuse.card.build import (
 )
 from px4fuse.card.causes import _find_action_target, make_cause, rank_causes
 from px4fuse.card.model import Action, Note
-from px4fuse.comparison.trials import RunStatistics, Trial, classify_improvement
-from px4fuse.diagnose import analyse_comparison
+from px4fuse.comparison.rerun_effects import Rerun, RunStatistics, classify_improvement
+from px4fuse.diagnose import diagnose_comparison
 from px4fuse.errors import LogError
 from px4fuse.filter.settings import Settings
 from px4fuse.finding import Finding
@@ -58,18 +58,18 @@ CORRECTED = outcome(1.0, 1.1, 0.1)
 
 def trial(
     kind: str, after: RunStatistics, before: RunStatistics = FLOWN, owner: Any = "kf"
-) -> Trial:
+) -> Rerun:
     change = CHANGES[kind]
-    return Trial(
+    return Rerun(
         filter=owner, axis="aisle", kinds=(kind,), change=change, before=before, after=after
     )
 
 
-def analysis(*trials: Trial) -> Any:
+def analysis(*trials: Rerun) -> Any:
     source = SimpleNamespace(origin=AS_RECEIVED_ORIGIN, alignment=None, clock_map=None)
     model = SimpleNamespace(inputs=SimpleNamespace(settings={"EKF2_ACC_NOISE": 0.35}))
     return SimpleNamespace(
-        select_main_trials=lambda: trials,
+        select_main_reruns=lambda: trials,
         settings=Settings(),
         source=source,
         tuning={},
@@ -144,7 +144,7 @@ def test_cause_action_sets_parameter_of_rerun_with_better_sigma() -> None:
         assert action.commands == commands
         assert action.sentence == ("EKF2_ACC_NOISE 0.35 → 0.7 m/s²" if trials else "Check.")
     fails = trial("process noise", FLOWN, owner="ekf2")
-    assert rank_causes(analysis(fails), [vibration])[0].trials == ()
+    assert rank_causes(analysis(fails), [vibration])[0].reruns == ()
 
 
 def test_diagnosis_merges_equal_actions_for_kf_and_ekf2() -> None:
@@ -222,7 +222,7 @@ def test_owner_of_delay_action_is_named_device(remedy: str, target: str) -> None
 
 def test_diagnosis_explains_differing_nis_and_nees_verdicts() -> None:
     flight = simulate_flight(Scenario(seed=8), parse_faults(("ekf2-delay=0.25",)))
-    explained = analyse_comparison(compare(flight, Settings()))
+    explained = diagnose_comparison(compare(flight, Settings()))
     card = build_card(explained, REQUEST)
     assert (card.id, card.causes[0].reruns[0].improves) == (
         "ekf2_ev_delay_wrong",

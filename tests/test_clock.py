@@ -31,7 +31,7 @@ from scipy.stats import binom, chi2, ttest_ind
 from px4fuse.comparison import estimates
 from px4fuse.comparison.estimates import (
     MIN_ESTIMATES_BEFORE_AND_AFTER_CHANGE,
-    estimate_noises_and_clock,
+    estimate_noises_and_time_offset,
     widen_for_scatter,
 )
 from px4fuse.comparison.reruns import rerun_kf_with_time_offset
@@ -50,7 +50,7 @@ from px4fuse.filter.imu_motion import (
 from px4fuse.filter.imu_oscillation import find_imu_oscillation
 from px4fuse.filter.likelihood import compute_profile_likelihood_interval
 from px4fuse.filter.signals import Segment
-from px4fuse.filter.time_offset import MAX_P_VALUE_OF_CHANGED_OFFSET, ClockOffset, PartOffset
+from px4fuse.filter.time_offset import MAX_P_VALUE_OF_CHANGED_OFFSET, PartOffset, SourceTimeOffset
 from px4fuse.flight.model import (
     ALIGNED_BY_EKF2_ORIGIN,
     GNSS_ORIGIN,
@@ -76,14 +76,14 @@ from px4fuse.simulation.scenario import Scenario
 DT = SETTINGS.dt_s
 
 
-def estimate(flight: Flight, **options: object) -> ClockOffset | Unavailable:
+def estimate(flight: Flight, **options: object) -> SourceTimeOffset | Unavailable:
     segment = Segment(-np.inf, np.inf, "all of it")
     noises = NoiseParameters(SIGMA_A, SIGMA_Z)
     track = flight.positions[0]
     return time_offset.estimate_time_offset(flight, track, segment, SETTINGS, noises, **options)
 
 
-def covers(found: ClockOffset, true_s: float) -> bool:
+def covers(found: SourceTimeOffset, true_s: float) -> bool:
     return found.interval_s[0] <= true_s <= found.interval_s[1]
 
 
@@ -244,7 +244,7 @@ class JointNormal:
 
 
 @pytest.fixture(scope="module")
-def exact_imu() -> tuple[Flight, ClockOffset, list[tuple[Array, Array]]]:
+def exact_imu() -> tuple[Flight, SourceTimeOffset, list[tuple[Array, Array]]]:
     """Return 50 s with an ideal IMU and wind that it does not measure, and its segments."""
     flight, _ = made_flight(duration_s=50.0, offset_s=0.07)
     time = np.arange(0.0, 50.005, 1.0 / IMU_HZ)
@@ -416,13 +416,13 @@ def test_constant_time_offset_is_not_reported_as_drift(hole_s: float) -> None:
 def test_time_offset_estimate_excludes_position_outliers() -> None:
     flight, outlier = made_flight(8, offset_s=-0.2, outliers=12)
     inside = flight.positions[0].samples.index.to_numpy()[outlier]
-    tuning, found = estimate_noises_and_clock(compare(flight, SETTINGS))
+    tuning, found = estimate_noises_and_time_offset(compare(flight, SETTINGS))
     hits = np.isin(tuning["horizontal"].outlier_time_s, inside)
     assert np.mean(hits) > 0.9
     assert np.sum(hits) > 0.9 * len(inside)
     assert found.offset_s == pytest.approx(-0.2, abs=0.03)
     compared = compare(flight, replace(SETTINGS, clock_offset_s=-0.2))
-    _, found = estimate_noises_and_clock(compared)
+    _, found = estimate_noises_and_time_offset(compared)
     assert covers(found, -0.2)
     assert (found.applied_s, found.remaining_s) == (-0.2, pytest.approx(0.0, abs=0.03))
     assert make_time_offset_advice(compared, found)["Offset"].startswith("Add -0.")
@@ -436,7 +436,7 @@ def test_time_offset_that_ground_truth_refutes_is_not_recommended() -> None:
     flight = replace(flight, truth=replace(flight.truth, samples=shifted))
     request = ComparisonRequest(log=flight.log.name)
     prepared = prepare_comparison(flight, request)
-    _, found = estimate_noises_and_clock(prepared)
+    _, found = estimate_noises_and_time_offset(prepared)
     assert covers(found, -0.3)
     advice = make_time_offset_advice(prepared, found, rerun_kf_with_time_offset(prepared, found))
     assert advice["Result"].startswith("Ground truth refutes the estimated time offset")
@@ -457,13 +457,13 @@ def test_imu_oscillation_is_no_change_of_time_offset(monkeypatch) -> None:
     scenario = Scenario(seed=4, ekf2=False)
     flight = oscillating(simulate_flight(scenario, parse_faults([])))
     prepared = prepare_comparison(flight, ComparisonRequest(log=flight.log.name))
-    assert not estimate_noises_and_clock(prepared)[1].has_changed()
+    assert not estimate_noises_and_time_offset(prepared)[1].has_changed()
     found = find_imu_oscillation(flight, prepared.source, prepared.segment)
     assert found is not None
     assert found.frequency_hz == pytest.approx(0.4, rel=0.02)
     assert found.amplitude_m_s2 == pytest.approx(1.0, rel=0.2)
     monkeypatch.setattr(estimates, "find_imu_oscillation", lambda *_: None)
-    assert estimate_noises_and_clock(prepared)[1].has_changed()
+    assert estimate_noises_and_time_offset(prepared)[1].has_changed()
 
 
 @pytest.mark.parametrize("mistake", ["clock-jump=0.3", "smoothed=1", "vibration=5", "yaw=40"])
@@ -502,13 +502,13 @@ def test_time_offset_jump_p_value_equals_bonferroni_t_test() -> None:
 
 def stated(
     *offsets: float, sigma_s: float = 0.02, change_p_value: float | None = 1e-7
-) -> ClockOffset:
+) -> SourceTimeOffset:
     parts = tuple(
         PartOffset(30.0 * i, 30.0 * (i + 1), each, sigma_s) for i, each in enumerate(offsets)
     )
     middle = float(np.mean(offsets))
     curve = np.array([0.0])
-    return ClockOffset(
+    return SourceTimeOffset(
         offset_s=middle, interval_s=(middle - 0.02, middle + 0.02), sigma_s=0.01, applied_s=0.0,
         is_determinable=True, curve_time_offsets_s=curve, curve_log_likelihood_drops=curve,
         parts=parts,

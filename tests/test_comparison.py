@@ -31,10 +31,10 @@ def predicted(result: AxisComparison, times: Array) -> Array:
 
     x = Fx + Ba, P = FPFᵀ + Q.
     """
-    run, chosen = result.replay, result.replay.settings
+    run, chosen = result.kf_run, result.kf_run.settings
     edges, q = run.steps.index.to_numpy(), chosen.sigma_a_m_s2**2 * chosen.dt_s
     last = np.searchsorted(edges, times, side="right") - 1
-    steps = run.steps.drop(columns="input_variance_m2_s4").to_numpy()
+    steps = run.steps.drop(columns="imu_gap_variance_m2_s4").to_numpy()
     (p, v, pp, pv, vv, a), d = steps[last].T, times - edges[last]
     position, speed = p + v * d + a * d * d / 2, v + a * d
     return np.array([position, speed, pp + 2 * d * pv + d * d * vv + q * d**3 / 4, vv + q * d])
@@ -42,7 +42,7 @@ def predicted(result: AxisComparison, times: Array) -> Array:
 
 def ekf2_times_within(result: AxisComparison) -> Array:
     """Return EKF2's sample times within the KF replay."""
-    first, last = result.replay.steps.index[[0, -1]]
+    first, last = result.kf_run.steps.index[[0, -1]]
     times = result.ekf2_state.index.to_numpy()
     return times[(times >= first) & (times <= last)]
 
@@ -64,7 +64,7 @@ class TestSample:
             assert ekf2.count == len(logged)
             assert ekf2.nis_mean == pytest.approx(logged["test_ratio"].mean() * 5.0**2, rel=1e-4)
             assert ekf2.innovation_std_m == pytest.approx(logged["innovation_m"].std())
-            ours = sample[name].replay.updates
+            ours = sample[name].kf_run.updates
             nis = ours["innovation_m"] ** 2 / ours["innovation_variance_m2"]
             assert kf.nis_mean == pytest.approx(nis.mean(), rel=1e-12)
 
@@ -190,7 +190,7 @@ class TestSimulatedFlight:
 
     def test_compare_applies_noise_settings_and_time_range(self, made: Comparison) -> None:
         chosen = Settings(sigma_z_m=0.3, clock_offset_s=0.05)
-        run = compare(made.flight, chosen, start_s=20.0, end_s=50.0).main.replay
+        run = compare(made.flight, chosen, start_s=20.0, end_s=50.0).main.kf_run
         assert run.settings == chosen
         assert run.steps.index[0] == pytest.approx(20.05)
         assert run.steps.index[-1] <= 50.0

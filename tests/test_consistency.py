@@ -11,7 +11,6 @@ from px4fuse.core.text import format_count
 from px4fuse.filter.consistency import (
     Consistency,
     assess_horizontal_nis,
-    assess_innovations,
     compute_nis_band,
 )
 from px4fuse.flight.model import Unavailable
@@ -25,7 +24,7 @@ def white(seed: int, count: int = 200) -> NDArray[np.float64]:
 
 
 def assessed(nu: NDArray[np.float64], s: float | NDArray[np.float64] = 1.0) -> Consistency:
-    return assess_innovations(nu, np.broadcast_to(s, nu.shape).astype(float))
+    return Consistency.from_innovations(nu, np.broadcast_to(s, nu.shape).astype(float))
 
 
 def test_nis_band_contains_95_percent_of_chi_square_values() -> None:
@@ -88,7 +87,7 @@ def test_innovation_statistics_equal_direct_computation() -> None:
 
 def test_fraction_of_innovations_outside_gate_depends_on_gate() -> None:
     nu = np.repeat([0.5, 2.5, 4.0, 6.0], 5)
-    result = assess_innovations(nu, np.ones(20), gate=3.0)
+    result = Consistency.from_innovations(nu, np.ones(20), gate=3.0)
     assert (result.fraction_outside_two_sigma, result.fraction_outside_gate) == (0.75, 0.5)
     assert assessed(nu).fraction_outside_gate == 0.25
 
@@ -97,17 +96,17 @@ def test_nis_statistics_ignore_nan_and_zero_variance() -> None:
     nu, s = white(1, 50), np.ones(50)
     nu[3], s[7], s[9] = np.nan, 0.0, np.nan
     kept = np.delete(np.arange(50), [3, 7, 9])
-    assert assess_innovations(nu, s) == assessed(nu[kept])
+    assert Consistency.from_innovations(nu, s) == assessed(nu[kept])
 
 
 def test_nis_verdict_of_few_or_equal_innovations_is_unavailable() -> None:
     for count in (0, 1, 9):
-        result = assess_innovations(white(1, count), np.ones(count))
+        result = Consistency.from_innovations(white(1, count), np.ones(count))
         assert isinstance(result, Unavailable)
         assert f"only {format_count(count, 'innovation')} (at least 10" in result.reason
     assert assessed(white(1, 14)).ljung_box_lags == 2
     for value in (0.0, -0.5):
-        result = assess_innovations(np.full(50, value), np.ones(50))
+        result = Consistency.from_innovations(np.full(50, value), np.ones(50))
         assert isinstance(result, Unavailable)
         assert "same value" in result.reason
 

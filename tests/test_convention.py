@@ -20,7 +20,7 @@ from px4fuse.convention.check import check_convention
 from px4fuse.convention.correction import ConventionFaults, find_convention_faults
 from px4fuse.convention.model import AxisDirections, Convention, OrientationConvention
 from px4fuse.diagnose import prepare_comparison, refine_delay
-from px4fuse.filter.time_offset import ClockOffset
+from px4fuse.filter.time_offset import SourceTimeOffset
 from px4fuse.finding import Finding
 from px4fuse.findings import source_convention
 from px4fuse.findings.cause_grouping import WRONG_CONVENTION_KEY
@@ -351,7 +351,7 @@ def test_positions_in_frd_frame_have_no_yaw_fault():
 def test_late_timestamps_finding_has_maximum_likelihood_offset(estimate_s, reported_s):
     late = Convention(verdict="determined", late_s=0.52)
     comparison = replace(compared(sent(flown())), convention=late)
-    clock = ClockOffset(
+    clock = SourceTimeOffset(
         offset_s=estimate_s, interval_s=(estimate_s - 0.01, estimate_s + 0.01), sigma_s=0.005,
         applied_s=-0.52, is_determinable=True, parts=(), count=100,
     )  # fmt: skip

@@ -18,7 +18,7 @@ from px4fuse.report import cover, event_marks, flight
 from px4fuse.report.page import Page
 from px4fuse.report.style import apply_report_style
 from px4fuse.request import ComparisonRequest
-from px4fuse.results.build import results
+from px4fuse.results.build import make_comparison_results
 from px4fuse.results.contract import ComparisonResults
 from px4fuse.results.model import Student
 
@@ -27,7 +27,7 @@ def document(
     comparison: Comparison, findings: tuple[Finding, ...] = ()
 ) -> tuple[Analysis, ComparisonResults]:
     analysis = unexplained(comparison)
-    made = results(ComparisonRequest(log="aisle.ulg"), analysis, Student("Ada"))
+    made = make_comparison_results(ComparisonRequest(log="aisle.ulg"), analysis, Student("Ada"))
     return analysis, structs.replace(made, findings=findings)
 
 
@@ -74,7 +74,7 @@ def test_event_symbols_in_plots_are_labelled_by_event_type(eventful: Analysis) -
 def test_zoomed_plot_shows_updates_in_middle_of_flight() -> None:
     comparison = compare(aisle_flight(duration_s=120.0))
     start, end = flight.find_zoom_span(comparison.main)
-    updates = comparison.main.replay.updates.index
+    updates = comparison.main.kf_run.updates.index
     assert ((updates >= start) & (updates <= end)).sum() >= flight.ZOOM_UPDATE_COUNT
     assert end - start < 4.0
     assert abs((start + end) / 2.0 - 60.0) < 12.5

@@ -21,7 +21,7 @@ from px4fuse.report import cover, cover_panels
 from px4fuse.report.page import Page
 from px4fuse.report.style import apply_report_style
 from px4fuse.request import ComparisonRequest
-from px4fuse.results.build import results
+from px4fuse.results.build import make_comparison_results
 
 
 def page_of(card: Card) -> Page:
@@ -35,7 +35,7 @@ def text_of(card: Card) -> str:
 
 
 def drawn(analysis: Analysis) -> Page:
-    made = results(ComparisonRequest(log="aisle.ulg"), analysis)
+    made = make_comparison_results(ComparisonRequest(log="aisle.ulg"), analysis)
     with apply_report_style():
         (page,) = cover.draw_pages(analysis, made)
     return page
@@ -198,7 +198,7 @@ def test_cover_map_title_states_farthest_distance_outside_map() -> None:
 
 def test_innovations_beyond_plot_scale_are_drawn_as_triangles(eventful: Analysis) -> None:
     plot = cover_panels._make_innovation_plot(eventful.main)
-    updates = eventful.main.replay.updates
+    updates = eventful.main.kf_run.updates
     normalised = updates["innovation_m"] / np.sqrt(updates["innovation_variance_m2"])
     largest = float(normalised.abs().max())
     assert largest > cover_panels.MAX_DRAWN_SIGMAS

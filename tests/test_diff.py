@@ -15,10 +15,10 @@ from px4fuse.batch.measures import (
     ComparedNumber,
     collect_compared_numbers,
 )
-from px4fuse.diagnose import analyse_comparison
+from px4fuse.diagnose import diagnose_comparison
 from px4fuse.ekf2.aids import AidAxisStatistics, AidResult
 from px4fuse.request import ComparisonRequest
-from px4fuse.results.build import results
+from px4fuse.results.build import make_comparison_results
 from px4fuse.results.contract import ChangeResults, ComparisonResults, to_json
 from px4fuse.results.reading import read_results
 from px4fuse.simulation.faults import parse_faults
@@ -61,7 +61,7 @@ def flown(seed: int, *mistakes: str, **scenario) -> InputResults:
     request = ComparisonRequest(
         log="f.ulg", sigma_a_m_s2=RIGHT.sigma_a_m_s2, sigma_z_m=RIGHT.sigma_z_m
     )
-    found = results(request, analyse_comparison(compare(flight, RIGHT)))
+    found = make_comparison_results(request, diagnose_comparison(compare(flight, RIGHT)))
     return as_input(read_results(to_json(found).encode()))
 
 

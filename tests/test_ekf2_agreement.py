@@ -211,7 +211,7 @@ def compared(
     ekf2 = made(
         Ekf2,
         aids={},
-        states={},
+        status_flags={},
         innovations=innovations,
         innovation_topics=AID,
         state=state[:states],
@@ -253,6 +253,9 @@ def test_ekf2_innovations_of_only_one_axis_are_not_used():
     frame = pd.DataFrame({"innovation_m": [0.1], "innovation_variance_m2": 0.1, "rejected": 0.0})
     for other in (NONE, frame.assign(rejected=np.nan)):
         ekf2 = made(
-            Ekf2, states={}, innovations={"north": frame, "east": other}, innovation_topics=AID
+            Ekf2,
+            status_flags={},
+            innovations={"north": frame, "east": other},
+            innovation_topics=AID,
         )
         assert logged_innovations(ekf2).empty

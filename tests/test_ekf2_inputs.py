@@ -133,7 +133,7 @@ def flown(monkeypatch: pytest.MonkeyPatch) -> Callable[..., Any]:
         )  # fmt: skip
         ekf2 = made(
             Ekf2, record=record, innovations={"north": pd.DataFrame({"rejected": []})},
-            horizon_s=horizon_s, step_s=0.01, fusion_flags=fusing, aids={}, states={},
+            horizon_s=horizon_s, step_s=0.01, fusion_flags=fusing, aids={}, status_flags={},
         )  # fmt: skip
         imu = pd.DataFrame(index=np.delete(interval_s * np.arange(1000), without))
         return prepare_inputs(
@@ -210,7 +210,7 @@ def test_vision_positions_in_frd_are_rotated_with_variance():
         ({"EKF2_AID_MASK": 8.0}, 0.0, False),
     ):  # fmt: skip
         ages = pd.Series([0.05, 0.15], index=[time[0], time[-1]])
-        record = made(FusionRecord, parameters=parameters, vision_age_s=ages, states={})
+        record = made(FusionRecord, parameters=parameters, vision_age_s=ages, status_flags={})
         ekf2 = made(
             Ekf2, fusion_flags=pd.DataFrame({"yaw": [0.0, yaw]}), innovations={"north": NONE},
             record=record, horizon_s=0.1, innovation_topics=AID,
@@ -242,10 +242,11 @@ def test_logged_rejections_are_matched_by_measurement_time():
         Reset(float(shown[4]), "position", (0.0, 1.0, 0.0)),
         Reset(float(shown[5]) + 0.1, "position", (0.0, 1.0, 0.0)),  # this sample was fused
     )
-    record = made(FusionRecord, parameters={"EKF2_EV_DELAY": 50.0}, states={})
+    record = made(FusionRecord, parameters={"EKF2_EV_DELAY": 50.0}, status_flags={})
     parts = {
         "innovations": {"north": logged}, "horizon_s": 0.1, "step_s": 0.01, "resets": resets,
-        "innovation_topics": AID, "aids": {"ev_pos": made(AidLog, samples=logged)}, "states": {},
+        "innovation_topics": AID, "aids": {"ev_pos": made(AidLog, samples=logged)},
+        "status_flags": {},
     }  # fmt: skip
 
     def decisions(**other: Any) -> Any:
@@ -275,10 +276,10 @@ def test_logged_fusion_is_derived_from_time_of_last_fusion():
         Ekf2, innovations={"north": logged}, horizon_s=0.1, step_s=0.0, innovation_topics=AID,
         resets=(Reset(1.52, "position", (1.0, 0.0, 0.0)),),
         aids={"ev_pos": made(AidLog, samples=logged)},
-        states={"ev_pos": pd.Series([1.0], index=[0.0])},
+        status_flags={"ev_pos": pd.Series([1.0], index=[0.0])},
     )  # fmt: skip
     for states, resets_at in (({DEAD_RECKONING_FLAG: steps}, 13), ({}, 14)):
-        record = made(FusionRecord, parameters={}, states=states)
+        record = made(FusionRecord, parameters={}, status_flags=states)
         rejected, reset = _read_logged_decisions(ekf2, record, taken, taken - 1.0)
         assert rejected[2] == 0.0
         known = 13 if states else 11
@@ -340,7 +341,7 @@ def turning(states: np.ndarray) -> tuple[pd.DataFrame, pd.DataFrame, Ekf2, Fusio
     })  # fmt: skip
     delayed["attitude_down_rad2"] = states
     state = pd.DataFrame(7.0, index=time, columns=Columns.STATE).assign(down_m=time)
-    record = made(FusionRecord, delayed=delayed, parameters={}, states={})
+    record = made(FusionRecord, delayed=delayed, parameters={}, status_flags={})
     return imu, attitude, made(Ekf2, state=state), record
 
 

@@ -38,7 +38,7 @@ from px4fuse.ekf2.whatif import (
     what_if,
 )
 from px4fuse.errors import SettingsError
-from px4fuse.filter.kalman import Replay
+from px4fuse.filter.kalman import KfRun
 from px4fuse.filter.settings import Settings
 from px4fuse.filter.signals import Axis
 from px4fuse.flight.ekf2_parameters import GNSS_POS
@@ -105,7 +105,7 @@ def test_contributions_to_kf_ekf2_difference_add_up_to_total(model):
 def test_kf_ekf2_difference_without_common_time_is_unavailable(model):
     axis, steps = made(Axis, direction=np.eye(3)[0]), pd.DataFrame(index=[1e4, 1e4 + 1.0])
     result = explain_difference_by_replacements(
-        model, Settings(), {"north": made(Replay, axis=axis, steps=steps)}
+        model, Settings(), {"north": made(KfRun, axis=axis, steps=steps)}
     )
     assert isinstance(result, Unavailable)
     assert "do not overlap" in result.reason

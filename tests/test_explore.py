@@ -199,7 +199,7 @@ def test_explore_page_step_view_shows_one_measurement_at_a_time(
     page: Browser, explored: tuple[Path, Analysis]
 ) -> None:
     result = explored[1].main
-    updates, steps = result.replay.updates, result.replay.steps
+    updates, steps = result.kf_run.updates, result.kf_run.steps
     open_view(page, "step")
     first = page.ask("document.getElementById('now').textContent")
     measurement_text = f"Measurement 1 of {len(updates)}, at {updates.index[0]:.3f} s"

@@ -1,4 +1,4 @@
-"""KF of the explore page in a browser, compared with px4fuse.replay."""
+"""KF of the explore page in a browser, compared with px4fuse.run_kf."""
 
 from __future__ import annotations
 
@@ -17,10 +17,10 @@ from explore_tools import ask
 from flights import Imu, Uwb, aisle_flight
 
 from px4fuse.comparison.model import Comparison
-from px4fuse.comparison.preparation import shift_clock
+from px4fuse.comparison.preparation import shift_timestamps
 from px4fuse.explore.data import OFFSET_SLIDER_HALF_RANGE_S, make_kf_inputs, undo_time_offset
 from px4fuse.explore.packing import KF_INPUT_STEPS_PER_UNIT, ArrayEncoder
-from px4fuse.filter.kalman import Replay, predict_state, replay
+from px4fuse.filter.kalman import KfRun, predict_state, run_kf
 from px4fuse.filter.settings import Settings
 from px4fuse.filter.signals import make_axes
 from px4fuse.readers import read_log
@@ -80,15 +80,15 @@ def in_browser(
     return list(ask(engine, SCRIPT % {name: json.dumps(one) for name, one in values.items()}))
 
 
-def in_python(comparison: Comparison, at: int, settings: Settings) -> Replay:
+def in_python(comparison: Comparison, at: int, settings: Settings) -> KfRun:
     """Run KF in Python with the segment and the aisle of the comparison."""
-    track = shift_clock(undo_time_offset(comparison), settings.clock_offset_s)
+    track = shift_timestamps(undo_time_offset(comparison), settings.clock_offset_s)
     original = list(comparison.axes.values())[at].axis
     axis = make_axes(
         comparison.flight, track, comparison.segment, names=(original.name,),
         heading_deg=original.heading_deg if original.name == "aisle" else None,
     )[0]  # fmt: skip
-    return replay(axis, settings)
+    return run_kf(axis, settings)
 
 
 def some_settings(rng: np.random.Generator, imu: bool) -> Settings:

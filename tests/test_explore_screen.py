@@ -220,7 +220,7 @@ def test_explore_page_ellipse_shows_covariance_of_each_step(
         "const {p, v} = Step.ellipse(one);"
         "return [one.p, one.v, Array.from(p), Array.from(v)]; })], []); })",
     )
-    done = explored[1].main.replay
+    done = explored[1].main.kf_run
     steps, updates = done.steps, done.updates
     columns = ["position_variance_m2", "covariance_m2_s", "velocity_variance_m2_s2"]
     assert len(shown) == len(updates)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import ast
 import os
 import re
 import shutil
@@ -11,10 +12,14 @@ import textwrap
 from collections.abc import Callable
 from pathlib import Path
 
+import click
+import msgspec
 import pytest
+from click.testing import CliRunner
 from conftest import REPOSITORY as ROOT
 
 from px4fuse.batch.changes import SETTING_PATHS_BY_LABEL
+from px4fuse.cli import options
 from px4fuse.filter.settings import SETTING_RANGES, Settings
 from px4fuse.request import ComparisonRequest
 from px4fuse.results.contract import ChosenSettings
@@ -164,7 +169,7 @@ def test_extension_guide_names_only_existing_files() -> None:
     for path, names in {
         "tests/test_findings.py": ["FAULTS"],
         "tests/test_options.py": ["CHANGED"],
-        "findings/model.py": ["class CatalogueEntry"],
+        "findings/source_values.py": ["def detect_rounding"],
         "cli/options.py": [],
         "filter/settings.py": ["class Settings", "SETTING_RANGES"],
         "results/contract.py": ["class ChosenSettings"],
@@ -185,3 +190,30 @@ def test_each_kf_setting_has_option_range_and_result_field() -> None:
     assert set(SETTING_RANGES) == {
         name for name in names if isinstance(getattr(Settings(), name), float)
     }
+
+
+def test_request_option_without_unit_or_with_bool_is_number_or_flag(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    class Request(msgspec.Struct):
+        gate_factor: float = 1.0
+        robust: bool = False
+
+    names = {"gate_factor": "--gate-factor", "robust": "--robust"}
+    monkeypatch.setattr(options, "OPTION_NAMES", {Request: names})
+
+    @click.command()
+    @options.request_option(Request, "gate_factor", "Factor on the gate.")
+    @options.request_option(Request, "robust", "Reject outliers.")
+    def fuse(**values: float | bool) -> None:
+        click.echo(values)
+
+    def run(*arguments: str) -> object:
+        result = CliRunner().invoke(fuse, arguments)
+        assert result.exit_code == 0, result.output
+        return ast.literal_eval(result.output)
+
+    assert run() == {"gate_factor": 1.0, "robust": False}
+    assert run("--gate-factor", "2", "--robust") == {"gate_factor": 2.0, "robust": True}
+    with pytest.raises(AssertionError, match=r"'two' is not a number\. Give for example 1"):
+        run("--gate-factor", "two")

@@ -253,9 +253,9 @@ def test_kf_example_in_python_guide_equals_kf_of_compare(
     north = compare(sample_flight, Settings(), axes=("north",), start_s=0.0)["north"]
     # both filters have settled, and the vehicle is airborne
     inside = (time > 5.0) & (time < 125.0)
-    kf_state = predict_state(north.replay, time[inside])
+    kf_state = predict_state(north.kf_run, time[inside])
     step_m = np.abs(kf_state[1]).max() * 0.1  # m; motion within the 0.1 s of rounding
     assert np.abs(position[inside] - kf_state[0]).max() < 2.0 * step_m
     assert np.sqrt(np.mean((velocity[inside] - kf_state[1]) ** 2)) < 0.1
-    settled = north.replay.updates["gain_position"].loc[20.0:120.0].median()
+    settled = north.kf_run.updates["gain_position"].loc[20.0:120.0].median()
     assert np.median(gain[inside]) == pytest.approx(settled, rel=0.1)

@@ -37,7 +37,7 @@ from findings_tools import (
 from flights import given_placement
 
 from px4fuse.comparison.flight_events import find_source_gaps
-from px4fuse.comparison.trials import RunStatistics, Trial
+from px4fuse.comparison.rerun_effects import Rerun, RunStatistics
 from px4fuse.filter.correlated_noise import SourceLowPass, TimeCorrelatedNoise
 from px4fuse.filter.frame_rotation import HeadingError, HeadingPart
 from px4fuse.filter.frame_rotation import combine_heading_parts as together
@@ -299,13 +299,13 @@ def test_rejection_action_requires_rerun_with_half_of_rejections() -> None:
         (0.09, True, "Set EKF2_EVP_NOISE to 0.1 m."), (0.1, True, CHECK_FIRST),
         (0.09, False, CHECK_FIRST),
     ):  # fmt: skip
-        trial = Trial(
+        trial = Rerun(
             filter="ekf2", axis="north", kinds=("noise",), change={"EKF2_EVP_NOISE": 0.1},
             before=RunStatistics(nis_mean=9.0, rejected_fraction=0.2),
             after=RunStatistics(nis_mean=1.0 if improves else 8.0, rejected_fraction=after),
         )  # fmt: skip
         one = analysis(ekf2={"gate": 5.0}, axes=(axis("north", ekf2_innovations=frame),),
-                       trials=(trial,))  # fmt: skip
+                       reruns=(trial,))  # fmt: skip
         assert only(ekf2_settings.detect_rejections, one).remedy == action
 
 
@@ -335,7 +335,7 @@ def test_error_above_sigma_finding_prefers_the_main_axis() -> None:
     assert finding.remedy.startswith(time_offset_check)
     check = finding.remedy
     assert check.endswith(f"{SOURCE_TEXTS['uwb'].slow_error_check}.")
-    known = only(hidden_errors.detect, analysis(axes=(axis(), hiding()), clock=late(0.0)))
+    known = only(hidden_errors.detect, analysis(axes=(axis(), hiding()), time_offset=late(0.0)))
     assert known.remedy.startswith("Check the time offset of the positions (px4fuse sync LOG). ")
     # the error is EKF2's own only if the RMSE of KF is below 0.7 of it
     for kf_rmse_m, remedy in (
@@ -539,7 +539,7 @@ def test_heading_error_report_names_wrong_gnss_noise(degrees, noise_is_wrong) ->
     trial = tried("ekf2", {"EKF2_GPS_P_NOISE": 0.4})
     one = analysis(
         heading=heading_error(*degrees, p=0.0), source=source(origin=GNSS_ORIGIN),
-        trials=(replace(trial, kinds=("noise",)),) if noise_is_wrong else (),
+        reruns=(replace(trial, kinds=("noise",)),) if noise_is_wrong else (),
     )  # fmt: skip
     finding = only(source_frame.detect, one)
     text = f"{finding.message} {finding.remedy}"
@@ -589,7 +589,7 @@ EDGES = [
         (
             imu.detect_imu_gaps,
             analysis(
-                axes=(axis(replay=SimpleNamespace(input_gap_s=gap_s)),),
+                axes=(axis(kf_run=SimpleNamespace(input_gap_s=gap_s)),),
                 flight={"imu": at_rate(rate_hz)},
             ),
             expected,
@@ -648,7 +648,7 @@ def at_multiples(multiples: list[int], base_s: float = 0.125, **parts: Any) -> A
 
 
 def low_pass(gain: float, lag_s: float, **parts: Any) -> Any:
-    usual = {"source_low_pass": SourceLowPass(0.5, lag_s, gain, 0.1), "clock": late(0.0)}
+    usual = {"source_low_pass": SourceLowPass(0.5, lag_s, gain, 0.1), "time_offset": late(0.0)}
     return analysis(**{**usual, **parts})
 
 
@@ -680,7 +680,11 @@ def jumping(*sizes: Any, **parts: Any) -> Any:
 
 def scaled(value: float, sigma: float = 0.01, imu_hz: float = 49.1, **parts: Any) -> Any:
     found = made(SystematicErrors, scale=Estimate(value, sigma), jumps=())
-    usual = {"systematic_errors": found, "flight": {"imu": at_rate(imu_hz)}, "clock": late(0.0)}
+    usual = {
+        "systematic_errors": found,
+        "flight": {"imu": at_rate(imu_hz)},
+        "time_offset": late(0.0),
+    }
     return analysis(**{**usual, **parts})
 
 
@@ -695,7 +699,7 @@ def stating(reported: float, noise: float, interval: Any = None, **parts: Any) -
 
 def delayed(delay_ms: float | None, clock: Any, **parts: Any) -> Any:
     flown = {} if delay_ms is None else {"EKF2_EV_DELAY": delay_ms}
-    return analysis(log=log(parameters=flown), clock=clock, **parts)
+    return analysis(log=log(parameters=flown), time_offset=clock, **parts)
 
 
 BIAS, JUMPS, SCALE = (
@@ -711,7 +715,7 @@ ARRIVALS, DOWNSAMPLED, CLOCK = (
 
 
 def wrong_delay(one: Any) -> Any:
-    return source_clock.detect_wrong_delay(one, one.clock)
+    return source_clock.detect_wrong_delay(one, one.time_offset)
 
 
 STATED = source_positions.detect_wrong_variance
@@ -798,7 +802,7 @@ SOURCE_EDGES = [
     (SCALE, scaled(0.5, imu_hz=48.9), None),
     (SCALE, scaled(0.5, source=source(origin=GNSS_ORIGIN)), None),
     # without an estimated time offset the timestamps may be late
-    *((which, of(clock=clock), expected)
+    *((which, of(time_offset=clock), expected)
       for which, of in ((SCALE, partial(scaled, 0.5)),
                         (source_positions.detect_low_pass, partial(low_pass, 99.0, 1.0)))
       for clock, expected in ((NONE, None), (late(0.0, is_determinable=False), "error"))),
@@ -821,13 +825,13 @@ SOURCE_EDGES = [
     (STATED, stating(3.0, 1.0, source_low_pass=NONE), None),
     (STATED, stating(np.nan, 1.0), None),
     (source_positions.detect, stating(3.0, 1.0, **ODOMETRY), None),
-    *((CLOCK, analysis(clock=late(sign * offset_s, sigma_s)), expected)
+    *((CLOCK, analysis(time_offset=late(sign * offset_s, sigma_s)), expected)
       for sign in (1.0, -1.0)
       for offset_s, sigma_s, expected in (
           (0.03, 0.001, None), (0.031, 0.001, "warning"), (0.1, 0.001, "warning"),
           (0.101, 0.001, "error"), (0.0625, 0.0208, "warning"), (0.0625, 0.0209, None))),
-    *((CLOCK, analysis(**{"clock": late(0.2), **parts}), None) for parts in (
-        {"clock": late(0.2, is_determinable=False)}, REBUILT, {"ekf2": ages(20, 20)},
+    *((CLOCK, analysis(**{"time_offset": late(0.2), **parts}), None) for parts in (
+        {"time_offset": late(0.2, is_determinable=False)}, REBUILT, {"ekf2": ages(20, 20)},
         {"source_low_pass": SourceLowPass(0.5, 0.2, 99.0, 0.1)})),
     *((wrong_delay, delayed(delay_ms, late(0.0, sigma_s)), expected)
       for delay_ms, sigma_s, expected in (
@@ -1001,7 +1005,7 @@ APPLIED = Settings(sigma_a_m_s2=1.0, sigma_z_m=1.0, clock_offset_s=-0.05)
 
 
 def test_time_offset_action_includes_the_offset_already_applied() -> None:
-    one = analysis(clock=late(-0.1, applied_s=-0.05), settings=APPLIED)
+    one = analysis(time_offset=late(-0.1, applied_s=-0.05), settings=APPLIED)
     finding = only(source_clock.detect, one)
     assert finding.title == "Position timestamps are 0.10 s late"
     assert "0.100 s (95 % 0.080 to 0.110 s)" in finding.message
@@ -1009,18 +1013,18 @@ def test_time_offset_action_includes_the_offset_already_applied() -> None:
     assert finding.remedy == "Subtract 0.100 s from the timestamp of each position."
     expected = {"offset_s": -0.15, "interval_low_s": -0.16, "interval_high_s": -0.13}
     assert finding.evidence == pytest.approx(expected)
-    early = only(source_clock.detect, analysis(clock=late(0.1)))
+    early = only(source_clock.detect, analysis(time_offset=late(0.1)))
     assert early.title == "Position timestamps are 0.10 s early"
     assert "0.100 s (95 % 0.090 to 0.120 s)" in early.message
     assert early.remedy.startswith("Add 0.100 s to ")
     placed = source(alignment=SimpleNamespace(clock_offset_s=2.0))
-    finding = only(source_clock.detect, analysis(clock=late(0.1), source=placed))
+    finding = only(source_clock.detect, analysis(time_offset=late(0.1), source=placed))
     assert "--clock-offset 2.100." in finding.remedy
 
 
 @pytest.mark.parametrize(("p", "there"), [(0.005, False), (0.0049, True), (None, False)])
 def test_significant_change_of_time_offset_is_reported(p: float | None, there: bool) -> None:
-    found = only(source_clock.detect, analysis(clock=late(0.1, change_p_value=p)))
+    found = only(source_clock.detect, analysis(time_offset=late(0.1, change_p_value=p)))
     assert found.id == ("source_time_offset_changes" if there else "source_time_offset")
     if there:
         assert "from -0.10 s to +0.30 s" in found.title
@@ -1030,14 +1034,14 @@ def test_significant_change_of_time_offset_is_reported(p: float | None, there: b
 @pytest.mark.parametrize(("after_m", "there"), [(1.005, True), (1.0051, False), (0.5, True)])
 def test_time_offset_correction_that_increases_rmse_is_rejected(after_m, there) -> None:
     shifted = rerun("kf", "time offset", {"clock_offset_s": 0.123}, after_m)
-    one = analysis(clock=late(0.12345), trials=(shifted,))
+    one = analysis(time_offset=late(0.12345), reruns=(shifted,))
     assert severity(source_clock.detect, one) == ("error" if there else None)
 
 
-def rerun(owner: Any, kind: str, change: dict[str, float], after_m: float) -> Trial:
+def rerun(owner: Any, kind: str, change: dict[str, float], after_m: float) -> Rerun:
     """Make a re-run that changes the position RMSE from 1 m."""
     before, after = RunStatistics(position_rmse_m=1.0), RunStatistics(position_rmse_m=after_m)
-    return Trial(
+    return Rerun(
         filter=owner, axis="north", kinds=(kind,), change=change, before=before, after=after
     )
 
@@ -1103,14 +1107,14 @@ def test_recommended_ekf2_delay_stays_in_px4_range(
 )
 def test_ekf2_delay_is_recommended_only_if_its_rerun_improves(after_m: float, remedy: str) -> None:
     trials = (rerun("ekf2", "delay", {"EKF2_EV_DELAY": 120.0}, after_m),)
-    finding = only(wrong_delay, delayed(0.0, late(-0.12), trials=trials))
+    finding = only(wrong_delay, delayed(0.0, late(-0.12), reruns=trials))
     assert finding.remedy == remedy
 
 
 def test_gnss_time_offset_report_names_receiver_delay_parameter() -> None:
     parameters = {"EKF2_GPS_DELAY": 110.0}
     one = analysis(
-        clock=late(-0.05), source=source(origin=GNSS_ORIGIN), log=log(parameters=parameters)
+        time_offset=late(-0.05), source=source(origin=GNSS_ORIGIN), log=log(parameters=parameters)
     )
     finding = only(source_clock.detect, one)
     assert finding.message.endswith(" EKF2_GPS_DELAY is 110 ms; the estimate is 160 ms.")

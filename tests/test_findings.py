@@ -139,7 +139,7 @@ def with_invalid_position(flight: Flight) -> Flight:
     state = flight.ekf2.state.copy()
     state["north_m"] += np.clip(state.index - 80.0, 0.0, None)
     valid = pd.Series([1.0, 0.0], index=[0.0, 80.0])
-    return with_ekf2(state=state, states={"xy_valid": valid})(flight)
+    return with_ekf2(state=state, status_flags={"xy_valid": valid})(flight)
 
 
 def as_odometry(flight: Flight) -> Flight:
@@ -386,7 +386,7 @@ PRECONDITIONS: list[tuple[str, Callable[[Comparison, Finding], bool]]] = [
         lambda made, one: made.source.orientation is not None or "send the orient" in one.remedy,
     ),
     ("--position-yaw|--position-frame", lambda made, _: made.source.alignment is not None),
-    ("TIMESYNC", lambda made, _: made.source.origin.path == "as received"),
+    ("TIMESYNC", lambda made, _: made.source.origin.route == "as received"),
 ]
 # Findings about a log that the SD card damaged
 CORRUPT_LOG = ("log_damaged", "imu_samples_missing")
@@ -572,7 +572,7 @@ def test_fault_detection_on_very_short_flight_does_not_raise(
     if isinstance(imu := fault.flight.get("imu"), Imu):
         short["imu"] = replace(imu, gap_s=None)
     comparison = compare(fault.fly(**short), Settings(**fault.settings))
-    few = len(next(iter(comparison.axes.values())).replay.updates) < MIN_INNOVATIONS
+    few = len(next(iter(comparison.axes.values())).kf_run.updates) < MIN_INNOVATIONS
     assert ("too_few_innovations" in ids(found(comparison))) == few
 
 

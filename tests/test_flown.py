@@ -12,7 +12,7 @@ from flights import with_noises
 
 from px4fuse.card.build import build_card
 from px4fuse.comparison.model import FILTER_NAMES
-from px4fuse.diagnose import analyse_comparison
+from px4fuse.diagnose import diagnose_comparison
 from px4fuse.filter.time_offset import MAX_P_VALUE_OF_CHANGED_OFFSET
 from px4fuse.findings import find, source_clock
 from px4fuse.readers import read_log
@@ -99,7 +99,7 @@ FLIGHTS = {
 @pytest.mark.parametrize("name", FLIGHTS)
 def test_recorded_flight_with_known_fault_reports_this_fault(shared_logs, name):
     log = shared_logs / "simulated" / f"{name}.ulg"
-    analysis, flown = analyse_comparison(compare(read_log(log))), FLIGHTS[name]
+    analysis, flown = diagnose_comparison(compare(read_log(log))), FLIGHTS[name]
     found = find(analysis)
     for wanted, severity, evidence, remedy in flown.findings:
         (first, *_) = [
@@ -126,7 +126,7 @@ def test_recorded_flight_with_known_fault_reports_this_fault(shared_logs, name):
         # equal measurement noise: a step without effect is not listed
         assert "measurement noise" not in by_name
     if flown.offset_s is not None:
-        clock = analysis.clock
+        clock = analysis.time_offset
         assert clock.is_determinable
         assert clock.offset_s == pytest.approx(flown.offset_s, abs=0.05)
         low, high = clock.interval_s
@@ -156,7 +156,7 @@ def test_recorded_flight_with_known_fault_reports_this_fault(shared_logs, name):
 @pytest.mark.parametrize("name", [name for name, flown in FLIGHTS.items() if flown.reruns])
 def test_diagnosis_of_faulty_flight_shows_filter_reruns(shared_logs, name):
     log = shared_logs / "simulated" / f"{name}.ulg"
-    analysis, flown = analyse_comparison(compare(read_log(log))), FLIGHTS[name]
+    analysis, flown = diagnose_comparison(compare(read_log(log))), FLIGHTS[name]
     cause = build_card(analysis, ComparisonRequest(log=log.name)).causes[0]
     assert flown.reruns == tuple(
         (rerun.label, rerun.position_rmse_m, rerun.source_ratio) for rerun in cause.reruns
@@ -210,7 +210,7 @@ def test_ekf2_on_motion_capture_flights_is_underconfident(shared_logs, name, fac
 def test_recorded_flights_give_listed_findings_and_severities(
     shared_logs: Path, name: str, expected: dict[str, str]
 ) -> None:
-    analysis = analyse_comparison(compare(read_log(shared_logs / f"flown/{name}.ulg")))
+    analysis = diagnose_comparison(compare(read_log(shared_logs / f"flown/{name}.ulg")))
     found = {item.id: item for item in find(analysis)}
     severities = {name: item.severity for name, item in found.items()}
     assert severities | expected == severities
@@ -224,8 +224,8 @@ def test_recorded_flights_give_listed_findings_and_severities(
         assert found["ekf2_gps_delay_wrong"].evidence["estimate_ms"] == pytest.approx(110.0, abs=15)
         # vision with a wrong unit or time offset is no reference for GNSS
         wrong_unit = replace(analysis.convention, unit="cm", verdict="determined")
-        late = replace(analysis.clock, offset_s=-0.2)
-        for wrong in replace(analysis, convention=wrong_unit), replace(analysis, clock=late):
+        late = replace(analysis.time_offset, offset_s=-0.2)
+        for wrong in replace(analysis, convention=wrong_unit), replace(analysis, time_offset=late):
             assert "ekf2_gps_delay_wrong" not in {item.id for item in source_clock.detect(wrong)}
     if name == "eg1_evp20":
         assert "EKF2_EVP_NOISE to 0.1 m" in found["ekf2_underconfident"].remedy

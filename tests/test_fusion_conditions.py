@@ -29,7 +29,7 @@ def attempt(
     rate_hz: float = 10.0, ekf2: Any = None, aid: Any = EV_POS, **parts: Any
 ) -> UnfusedPositions:
     parameters = parts.pop("parameters", V114)
-    usual = {"states": {}, "aids": {}, "record": NONE, "horizon_s": 0.2}
+    usual = {"status_flags": {}, "aids": {}, "record": NONE, "horizon_s": 0.2}
     track = source(rate_hz=rate_hz, **parts)
     return UnfusedPositions(made(Ekf2, **{**usual, **(ekf2 or {})}), track, aid, parameters, SPAN_S)
 
@@ -85,9 +85,9 @@ def clock(name: str) -> ClockMap:
         (attempt(**with_quality(20.0, *[90.0] * 9)), None, ()),
         (attempt(4.0), "interval", ("come at 4 Hz", "0.2 s")),
         (attempt(4.0, parameters={"EKF2_AID_MASK": 8.0}), None, ()),
-        (attempt(ekf2={"states": {"tilt_align": on(0.0)}}), "alignment", ("tilt",)),
-        (attempt(ekf2={"states": {"yaw_align": on(0.0)}}), "alignment", ("EKF2_MAG_TYPE",)),
-        (attempt(ekf2={"states": {"yaw_align": on(0.0)}}, frame="FRD"), None, ()),
+        (attempt(ekf2={"status_flags": {"tilt_align": on(0.0)}}), "alignment", ("tilt",)),
+        (attempt(ekf2={"status_flags": {"yaw_align": on(0.0)}}), "alignment", ("EKF2_MAG_TYPE",)),
+        (attempt(ekf2={"status_flags": {"yaw_align": on(0.0)}}, frame="FRD"), None, ()),
         (attempt(ekf2=rejecting(0.8)), "gate", ("rejects 78 %", "EKF2_EVP_GATE only if")),
         (attempt(ekf2=rejecting(0.4)), None, ()),
         (gnss(), None, ()),
@@ -97,8 +97,8 @@ def clock(name: str) -> ClockMap:
          ("3D fix (check failed 100 %", "median 5.00 m, limit EKF2_REQ_EPH 3 m")),
         # EKF2_GPS_CHECK without the bit of this check
         (gnss(0b10, parameters={**V114, "EKF2_GPS_CHECK": 0b10}), None, ()),
-        (gnss(states={"gnss_fault": on(1.0)}), "fault", ("EKF2_GPS_MODE",)),
-        (gnss(states={"yaw_align": on(0.0)}), "alignment", ("heading",)),
+        (gnss(status_flags={"gnss_fault": on(1.0)}), "fault", ("EKF2_GPS_MODE",)),
+        (gnss(status_flags={"yaw_align": on(0.0)}), "alignment", ("heading",)),
     ],
 )  # fmt: skip
 def test_unmet_ekf2_fusion_condition_is_reported_with_value(
@@ -141,7 +141,7 @@ def test_position_that_ekf2_declares_invalid_is_reported(
 ) -> None:
     valid = pd.Series([1.0, 0.0], index=[0.0, valid_until_s])
     state = positions(np.arange(0.0, 120.0), 2e6)
-    one = unfused(ekf2={"states": {"xy_valid": valid}, "state": state, "fusion_flags": NONE},
+    one = unfused(ekf2={"status_flags": {"xy_valid": valid}, "state": state, "fusion_flags": NONE},
                   flight={"truth": NONE})  # fmt: skip
     assert named(ekf2_not_fusing.detect, one) == (
         {"ekf2_position_invalid": expected} if expected else {}
@@ -177,10 +177,10 @@ def test_unmet_ekf2_fusion_condition_is_found_in_real_log(
 
 
 def test_gnss_is_fused_if_flags_are_missing_and_xy_global_is_set() -> None:
-    ekf2 = made(Ekf2, aids={}, states={"xy_global": on(1.0)})
+    ekf2 = made(Ekf2, aids={}, status_flags={"xy_global": on(1.0)})
     assert has_fused_aid(ekf2)
     assert not has_fused_aid(ekf2, "baro_hgt")
-    assert not has_fused_aid(made(Ekf2, aids={}, states={"xy_global": on(0.0)}))
+    assert not has_fused_aid(made(Ekf2, aids={}, status_flags={"xy_global": on(0.0)}))
     # flags without an aiding source mean that EKF2 did not fuse it
     flags = {"xy_global": on(1.0), "tilt_align": on(1.0)}
-    assert not has_fused_aid(made(Ekf2, aids={}, states=flags))
+    assert not has_fused_aid(made(Ekf2, aids={}, status_flags=flags))

@@ -371,7 +371,7 @@ def test_compare_of_real_gnss_flights_equals_reference_numbers(name, shared_logs
     # age of a fix beyond the delay parameter
     parameters = analysis.flight.log.parameters
     age_ms = injected["simulated_sensors"].get("GPS_LAT_MS", 0.0)
-    low_s, high_s = analysis.clock.interval_s  # type: ignore[union-attr]
+    low_s, high_s = analysis.time_offset.interval_s  # type: ignore[union-attr]
     left_s = 1e-3 * (parameters["EKF2_GPS_DELAY"] - age_ms)
     assert low_s - STAMP_S <= left_s <= high_s + STAMP_S
     findings = find(analysis)

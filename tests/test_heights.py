@@ -400,7 +400,7 @@ def test_barometer_samples_missing_in_log_are_reconstructed(every: int, has_filt
         FusionRecord,
         height_bias_updates={"baro_hgt": bias},
         stores_bias_increments=False,
-        states={},
+        status_flags={},
     )
     state = pd.DataFrame({"down_m_s": 0.0}, time_s)
     log = made(AidLog, samples=rows if has_filter else rows.drop(columns="filtered_down"))

@@ -23,7 +23,7 @@ from px4fuse.filter.hypotheses import (
     fit_systematic_errors,
     make_design_matrix,
 )
-from px4fuse.filter.kalman import replay
+from px4fuse.filter.kalman import run_kf
 from px4fuse.filter.likelihood import innovations, preintegrate
 from px4fuse.filter.settings import Settings
 from px4fuse.finding import Finding
@@ -92,7 +92,7 @@ def test_innovations_after_position_step_equal_kf_replay() -> None:
     nu, s = innovations(both, RIGHT.sigma_a_m_s2, RIGHT.sigma_z_m, none)
     for column, added in zip(nu.T, (0.0, step), strict=True):
         moved = replace(north, measurement_m=north.measurement_m + added)
-        updates = replay(moved, RIGHT).updates
+        updates = run_kf(moved, RIGHT).updates
         np.testing.assert_allclose(column, updates["innovation_m"], atol=1e-9)
         np.testing.assert_allclose(s, updates["innovation_variance_m2"], rtol=1e-9)
     # skipped measurements
@@ -334,7 +334,7 @@ def test_hypothesis_findings_require_imu_or_reported_variance(mistake, change) -
 
 def test_bias_estimate_without_noise_estimate_is_unavailable() -> None:
     tuned = flown("jump=1,40s")
-    fit, low_pass, correlated_noise = _fit_source_errors(tuned, {}, tuned.clock)
+    fit, low_pass, correlated_noise = _fit_source_errors(tuned, {}, tuned.time_offset)
     assert isinstance(fit, Unavailable)
     assert isinstance(low_pass, Unavailable)
     untuned = replace(

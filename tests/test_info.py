@@ -15,7 +15,7 @@ from ulog_tools import Log, load, make_log, odometry, stamps, take, topic
 
 from px4fuse.cli import cli
 from px4fuse.comparison.preparation import choose_source
-from px4fuse.diagnose import analyse_comparison
+from px4fuse.diagnose import diagnose_comparison
 from px4fuse.errors import Px4FuseError
 from px4fuse.flight.model import GNSS_ORIGIN, Dropout, Flight, Sender, Unavailable
 from px4fuse.info.inventory import (
@@ -184,7 +184,7 @@ def test_info_on_damaged_log_reports_the_damage_first(tmp_path, sample_log):
     assert any("damaged" in note for note in inventory.notes)
     assert "link" in remedies(inventory)[0]
     (named,) = [
-        f for f in analyse_comparison(compare(read_log(path))).findings if f.id == "log_damaged"
+        f for f in diagnose_comparison(compare(read_log(path))).findings if f.id == "log_damaged"
     ]
     assert not any("SD card" in remedy for remedy in (*remedies(inventory), named.remedy))
     ulog = bytearray(sample_log.read_bytes())

@@ -16,7 +16,7 @@ from hypothesis import strategies as st
 
 from px4fuse.errors import SettingsError
 from px4fuse.filter import model
-from px4fuse.filter.kalman import UPDATE_TABLE_COLUMNS, predict_state, predict_variance, replay
+from px4fuse.filter.kalman import UPDATE_TABLE_COLUMNS, predict_state, predict_variance, run_kf
 from px4fuse.filter.model import COVARIANCE_COLUMNS, STATE_COLUMNS
 from px4fuse.filter.settings import InitialState, Settings
 from px4fuse.filter.signals import Axis
@@ -84,7 +84,7 @@ def axis() -> Axis:
 @settings(max_examples=60)
 @given(axis=any_axis(), chosen=any_settings)
 def test_kf_replay_of_any_axis_equals_textbook_recursion(axis: Axis, chosen: Settings) -> None:
-    run = replay(axis, chosen)
+    run = run_kf(axis, chosen)
     states, updates = plain_replay(axis, chosen)
     np.testing.assert_allclose(run.steps[STATE], states, rtol=1e-9, atol=1e-9)
     np.testing.assert_allclose(run.updates[UPDATE_TABLE_COLUMNS], updates, rtol=1e-9, atol=1e-9)
@@ -99,15 +99,15 @@ def test_kf_settings_out_of_range_are_rejected(name: str) -> None:
 
 def test_kf_replay_with_imu_input_but_no_imu_is_rejected() -> None:
     with pytest.raises(SettingsError, match="`input` is imu, but the axis"):
-        replay(line([0.0, 0.2, 0.4], [0.0, 0.0, 0.0]), Settings(input="imu"))
+        run_kf(line([0.0, 0.2, 0.4], [0.0, 0.0, 0.0]), Settings(input="imu"))
 
 
 def test_kf_replay_starts_at_first_measurement(axis: Axis) -> None:
-    run = replay(axis, Settings())
+    run = run_kf(axis, Settings())
     assert run.steps.index[0] == axis.measurement_time_s[0]
     assert run.steps[STATE].iloc[0].tolist() == [axis.measurement_m[0], 0.0, 0.25, 0.0, 1.0]
     assert run.updates.index.tolist() == axis.measurement_time_s[1:].tolist()
-    run = replay(axis, Settings(), InitialState(1.9, -1.0, 0.5))
+    run = run_kf(axis, Settings(), InitialState(1.9, -1.0, 0.5))
     assert run.steps[STATE].iloc[0].tolist() == [-1.0, 0.5, 0.25, 0.0, 1.0]
     assert run.steps.index[0] == 1.9
     assert run.updates.index.tolist() == axis.measurement_time_s.tolist()
@@ -115,7 +115,7 @@ def test_kf_replay_starts_at_first_measurement(axis: Axis) -> None:
 
 def test_kf_state_between_steps_is_predicted_from_previous_step(axis: Axis) -> None:
     """At a step the state is that of the step, between two predicted, outside NaN."""
-    run = replay(axis, Settings())
+    run = run_kf(axis, Settings())
     edges = run.steps.index.to_numpy()
     np.testing.assert_array_equal(np.transpose(predict_state(run, edges)), run.steps[STATE[:2]])
     step = run.steps.iloc[30]
@@ -136,7 +136,7 @@ def test_kf_variance_between_steps_is_predicted_from_previous(dt: float, gap: bo
     imu = np.arange(0.0, 5.0, 0.02)
     imu = imu[(imu < 1.0) | (imu > 2.5)] if gap else imu
     chosen = Settings(sigma_a_m_s2=0.7, sigma_z_m=0.2, dt_s=dt)
-    run = replay(line(time, np.sin(time), (imu, 2.0 * np.cos(imu))), chosen)
+    run = run_kf(line(time, np.sin(time), (imu, 2.0 * np.cos(imu))), chosen)
     edges = run.steps.index.to_numpy()
     for share in (0.0, 0.3, 0.9):
         times = edges[:-1] + share * np.diff(edges)
@@ -146,11 +146,11 @@ def test_kf_variance_between_steps_is_predicted_from_previous(dt: float, gap: bo
             ahead = at - edges[k]
             P = model.make_symmetric_matrix(step[COVARIANCE_COLUMNS])
             F = np.array([[1.0, ahead], [0.0, 1.0]])
-            q = (0.7**2 + step["input_variance_m2_s4"]) * dt
+            q = (0.7**2 + step["imu_gap_variance_m2_s4"]) * dt
             Q = q * np.array([[ahead**3 / 4.0, ahead**2 / 2.0], [ahead**2 / 2.0, ahead]])
             expected = np.diag(F @ P @ F.T + Q)
             np.testing.assert_allclose([position[k], velocity[k]], expected, rtol=1e-12)
-    assert bool((run.steps["input_variance_m2_s4"] > 0.0).any()) == gap
+    assert bool((run.steps["imu_gap_variance_m2_s4"] > 0.0).any()) == gap
 
 
 @settings(max_examples=30)
@@ -163,7 +163,7 @@ def test_kf_state_does_not_depend_on_later_measurements(axis, chosen, data) -> N
     other = replace(axis, measurement_m=measured)
     times = np.append(np.linspace(axis.measurement_time_s[0], arrival - 1e-9, 50), arrival)
 
-    before, after = (np.array(predict_state(replay(one, chosen), times)) for one in (axis, other))
+    before, after = (np.array(predict_state(run_kf(one, chosen), times)) for one in (axis, other))
     np.testing.assert_array_equal(before[:, :-1], after[:, :-1])
     assert abs(after[0, -1] - before[0, -1]) > 0.0
 
@@ -174,9 +174,9 @@ def test_kf_replay_adds_process_noise_during_imu_gap() -> None:
     value = 2.0 * np.sin(imu)
     outside_gap = (imu <= 4.0) | (imu >= 5.0)
     chosen = Settings()
-    whole = replay(line(time, 0.0 * time, (imu, value)), chosen)
+    whole = run_kf(line(time, 0.0 * time, (imu, value)), chosen)
     broken_axis = line(time, 0.0 * time, (imu[outside_gap], value[outside_gap]))
-    broken = replay(broken_axis, chosen)
+    broken = run_kf(broken_axis, chosen)
     assert whole.input_gap_s == 0.0
     assert broken.input_gap_s == pytest.approx(1.0, abs=1e-6)
     mean_square = np.mean(value[outside_gap] ** 2)
@@ -191,7 +191,7 @@ def test_kf_replay_adds_process_noise_during_imu_gap() -> None:
 
 def test_kf_fast_replay_equals_replay_with_filterpy(axis: Axis) -> None:
     chosen = Settings(sigma_a_m_s2=0.7, sigma_z_m=0.2)
-    with_filterpy, fast = replay(axis, chosen), replay(axis, chosen, fast=True)
+    with_filterpy, fast = run_kf(axis, chosen), run_kf(axis, chosen, fast=True)
     for name in ("steps", "updates"):
         expected, actual = getattr(with_filterpy, name), getattr(fast, name)
         pd.testing.assert_frame_equal(actual, expected, rtol=1e-9)

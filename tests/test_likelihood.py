@@ -9,7 +9,7 @@ from hypothesis import given, settings
 from numpy.typing import NDArray
 from scipy.stats import norm
 
-from px4fuse.filter.kalman import replay
+from px4fuse.filter.kalman import run_kf
 from px4fuse.filter.likelihood import (
     fit_parabola_vertex,
     innovations,
@@ -26,7 +26,7 @@ ZERO = Settings(sigma_a_m_s2=0.5, input="zero")
 
 def replayed(axis: Axis, chosen: Settings) -> NDArray[np.float64]:
     """ν and S of the KF replay, shape (2, m)."""
-    return replay(axis, chosen).updates[["innovation_m", "innovation_variance_m2"]].to_numpy().T
+    return run_kf(axis, chosen).updates[["innovation_m", "innovation_variance_m2"]].to_numpy().T
 
 
 def walk(seed: int = 3, *, sigma_z: float = 0.1, count: int = 4000) -> Axis:
@@ -59,7 +59,7 @@ def test_fast_kf_innovations_with_imu_gap_equal_kf_replay() -> None:
     imu = imu[(imu < 4.0) | (imu > 5.3)]
     time = 0.37 * np.arange(30)
     axis = line(time, np.sin(time), (imu, -np.sin(imu)))
-    assert replay(axis, Settings()).input_gap_s > 1.0
+    assert run_kf(axis, Settings()).input_gap_s > 1.0
     found = innovations(preintegrate(axis, Settings()), 0.5, 0.1)
     np.testing.assert_allclose(found, replayed(axis, Settings()), rtol=1e-9, atol=1e-9)
 

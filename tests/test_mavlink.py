@@ -47,7 +47,7 @@ from pandas.testing import assert_frame_equal
 from scipy.spatial.transform import Rotation
 from time_limit import time_limit
 
-from px4fuse.diagnose import analyse_comparison
+from px4fuse.diagnose import diagnose_comparison
 from px4fuse.errors import LogError, MissingDataError
 from px4fuse.flight.model import (
     AS_RECEIVED_ORIGIN,
@@ -113,7 +113,7 @@ def test_read_mavlink_returns_the_simulated_motion_and_imu(read):
     assert flight.streams["ekf2_state"].topics == ("ODOMETRY",)
     [track] = flight.positions
     assert track.name == "VISION_POSITION_ESTIMATE"
-    assert (track.origin.path, track.frame) == (AS_RECEIVED_ORIGIN.path, "NED")
+    assert (track.origin.route, track.frame) == (AS_RECEIVED_ORIGIN.route, "NED")
     variance = track.samples[Columns.POSITION_VARIANCE]
     assert_allclose(variance, np.tile(POSE_VARIANCE, (200, 1)), rtol=1e-6)
 
@@ -267,7 +267,7 @@ def test_mavlink_odometry_estimator_type_selects_source_name(read, estimator, na
         assert "no ODOMETRY sent to the autopilot" in reason(flight, "position source ODOMETRY")
         return
     [track] = flight.positions
-    assert (track.name, track.origin.path, track.topics) == (name, origin.path, ("ODOMETRY",))
+    assert (track.name, track.origin.route, track.topics) == (name, origin.route, ("ODOMETRY",))
     assert len(track.samples) == 200
     assert len(flight.ekf2.state) == 800
     given = track.samples[Columns.POSITION_VARIANCE]
@@ -443,7 +443,7 @@ def test_ardupilot_messages_contain_no_px4_advice(read, missing_messages):
     if flight.positions:
         texts += [
             f"{f.message} {f.remedy}"
-            for f in analyse_comparison(compare(flight)).findings
+            for f in diagnose_comparison(compare(flight)).findings
             if f.id != "not_px4"
         ]
     else:

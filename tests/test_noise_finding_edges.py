@@ -30,7 +30,7 @@ from findings_tools import (
     tuned,
 )
 
-from px4fuse.comparison.trials import RunStatistics, Trial
+from px4fuse.comparison.rerun_effects import Rerun, RunStatistics
 from px4fuse.convention.model import Convention, OrientationConvention
 from px4fuse.filter.settings import Settings
 from px4fuse.filter.tuning import NoiseEstimate
@@ -51,10 +51,10 @@ RIGHT = NoiseEstimate(1.0, 0.9, 1.1)
 
 def trial(
     change: dict[str, float], after: float = 1.0, owner: Any = "kf", kind: str = "noises"
-) -> Trial:
+) -> Rerun:
     """Make a re-run that changes the mean NIS from 16 to ``after``."""
     before, after_change = RunStatistics(nis_mean=16.0), RunStatistics(nis_mean=after)
-    return Trial(
+    return Rerun(
         filter=owner, axis="north", kinds=(kind,), change=change, before=before, after=after_change
     )
 
@@ -121,7 +121,7 @@ SIGMA_A_TO_0_1, BOTH = {"sigma_a_m_s2": 0.1}, {"sigma_a_m_s2": 0.1, "sigma_z_m":
 def test_action_for_wrong_noise_uses_values_of_best_rerun(trials: Any, expected: Any) -> None:
     fitted = tuned(NoiseEstimate(0.5, 0.45, 0.55), NoiseEstimate(0.1, 0.09, 0.11))
     cause, other = noises.detect_wrong_settings(
-        analysis(source=MOVING, tuning=fitted, trials=trials)
+        analysis(source=MOVING, tuning=fitted, reruns=trials)
     )
     assert [(one.id, one.severity, one.remedy) for one in (cause, other)] == expected
     assert (cause.caused_by, other.caused_by) == (None, cause.id)
@@ -143,7 +143,7 @@ def test_noise_finding_severity_depends_on_rerun_improvement(
     rerun = replace(trial(SIGMA_A_TO_0_1), before=as_flown, after=as_flown)
     fitted = tuned(None, NoiseEstimate(0.1, 0.09, 0.11))
     finding = only(
-        noises.detect_wrong_settings, analysis(source=MOVING, tuning=fitted, trials=(rerun,))
+        noises.detect_wrong_settings, analysis(source=MOVING, tuning=fitted, reruns=(rerun,))
     )
     assert (finding.severity, finding.remedy) == expected
 
@@ -228,7 +228,7 @@ def following(gain: float, *, growth: float = 0.05, **parts: Any) -> Any:
     both = pd.concat([after, pd.Series(7.0, index=index[:-1] + 0.1)]).sort_index()
     replay = SimpleNamespace(updates=updates, steps=both.to_frame("position_variance_m2"))
     slow = {"verdict": "overconfident", "lag1_autocorrelation": 0.31, **parts}
-    return axis(kf=statement(4.0, **slow), replay=replay)
+    return axis(kf=statement(4.0, **slow), kf_run=replay)
 
 
 @pytest.mark.parametrize(
@@ -238,7 +238,7 @@ def following(gain: float, *, growth: float = 0.05, **parts: Any) -> Any:
         (following(0.1, lag1_autocorrelation=0.3), "error"),
         (following(0.1, lag1_autocorrelation=0.29), None),
         (following(0.1, verdict="consistent"), None),
-        (axis(kf=NONE, replay=SimpleNamespace(updates=None)), None),
+        (axis(kf=NONE, kf_run=SimpleNamespace(updates=None)), None),
     ],
 )  # fmt: skip
 def test_near_zero_q_with_white_innovations_is_not_reported(one: Any, expected: str | None) -> None:
@@ -254,7 +254,7 @@ def test_finding_on_near_zero_sigma_a_states_kf_response_time() -> None:
     assert "decreases to 0.05, so KF needs 5 s" in finding.message
     assert finding.evidence["response_s"] == pytest.approx(5.0)
     one = analysis(axes=(following(0.05),), tuning=tuned(None, NoiseEstimate(2.3456, 2.0, 3.0)),
-                   trials=(trial({"sigma_a_m_s2": 2.35}),))  # fmt: skip
+                   reruns=(trial({"sigma_a_m_s2": 2.35}),))  # fmt: skip
     finding = only(noises.detect_process_noise_near_zero, one)
     assert finding.title == "SIGMA_A is 2.3 times too small: KF ignores new positions"
     assert finding.remedy == "Set SIGMA_A to 2.35 m/s² (--sigma-a 2.35)."
@@ -369,7 +369,7 @@ def test_action_for_inconsistent_filter_corrects_its_cause(owner, change, kind, 
     causes = (tried(owner, {"sigma_z_m": 7.0}, explained_fraction=0.4), tried(owner, change),
               tried(owner, {"sigma_z_m": 7.0}, explained_fraction=1.6))  # fmt: skip
     one = axis("north", **{owner: statement(9.0, "overconfident")})
-    finding = only(noises.detect_inconsistent_variances, analysis(axes=(one,), trials=causes))
+    finding = only(noises.detect_inconsistent_variances, analysis(axes=(one,), reruns=causes))
     assert finding.remedy.endswith(action)
     assert finding.evidence["cause"] == kind
 
@@ -380,7 +380,7 @@ def test_filter_rerun_without_improvement_is_not_recommended() -> None:
         (1.0, "Set SIGMA_Z to 2 m (--sigma-z 2)."),
         (9.0, noises.UNEXPLAINED_SIGMA_ACTION),
     ):
-        one = analysis(axes=(kf(9.0),), tuning=tuned(), trials=(
+        one = analysis(axes=(kf(9.0),), tuning=tuned(), reruns=(
             tried("kf", change), trial(change, after), trial(change, 9.0, "ekf2")))  # fmt: skip
         assert only(noises.detect_inconsistent_variances, one).remedy == action
 
@@ -388,7 +388,7 @@ def test_filter_rerun_without_improvement_is_not_recommended() -> None:
 def test_inconsistent_filter_without_cause_recommends_a_check() -> None:
     causes = (tried("kf", {"sigma_z_m": 7.0}, explained_fraction=0.4),
               tried("kf", {"sigma_z_m": 2.0}, "east"))  # fmt: skip
-    one = analysis(axes=(kf(9.0),), trials=causes, tuning=tuned())
+    one = analysis(axes=(kf(9.0),), reruns=causes, tuning=tuned())
     finding = only(noises.detect_inconsistent_variances, one)
     assert (finding.evidence["cause"], finding.remedy) == (
         "elsewhere",
@@ -403,7 +403,7 @@ def test_ground_truth_decides_if_noise_of_gnss_may_be_reduced() -> None:
     rerun = tried("kf", {"sigma_z_m": 0.2}, before=0.2)
     for nees, is_reduced in ((0.2, True), (1.0, False)):
         narrow = axis(kf=statement(0.2, "underconfident"), kf_truth=against_truth(nees))
-        one = analysis(axes=(narrow,), source=receiver, trials=(rerun,))
+        one = analysis(axes=(narrow,), source=receiver, reruns=(rerun,))
         finding = only(noises.detect_inconsistent_variances, one)
         assert finding.severity == "note"
         assert finding.remedy.startswith("Set SIGMA_Z to 0.2 m" if is_reduced else "Do not reduce")
@@ -412,7 +412,7 @@ def test_ground_truth_decides_if_noise_of_gnss_may_be_reduced() -> None:
 def test_smaller_noise_that_contradicts_ground_truth_is_rejected() -> None:
     contradicted = tried("kf", {"sigma_z_m": 0.5}, before=0.2)
     contradicted = replace(contradicted, after=replace(contradicted.after, nees_mean=4.0))
-    one = analysis(axes=(kf(0.2),), trials=(contradicted,))
+    one = analysis(axes=(kf(0.2),), reruns=(contradicted,))
     finding = only(noises.detect_inconsistent_variances, one)
     assert (finding.remedy, finding.severity) == (noises.KEEP_NOISE_BECAUSE_OF_TRUTH_ACTION, "note")
     assert finding.evidence["cause"] == "elsewhere"
@@ -476,7 +476,7 @@ def test_title_of_wrong_default_noise_names_the_position_sensor(
     estimate_m = 4.0 * flown_m if flown_m == PARAMETERS[aid.noise].default else 0.1
     outcome = RunStatistics(nis_mean=16.0 if estimate_m > flown_m else 0.1)
     change = {aid.noise: estimate_m}
-    rerun = Trial(filter="ekf2", axis="north", kinds=("noise",), change=change, before=outcome,
+    rerun = Rerun(filter="ekf2", axis="north", kinds=("noise",), change=change, before=outcome,
                   after=RunStatistics(nis_mean=1.0))  # fmt: skip
     settings = {aid.noise: flown_m, "EKF2_EV_NOISE_MD": 0.0}
     received = SimpleNamespace(variance_m2=np.zeros((9, 3)))
@@ -485,7 +485,7 @@ def test_title_of_wrong_default_noise_names_the_position_sensor(
     result = axis("north", rejected_fraction=rejected)
     origin = GNSS_ORIGIN if kind == "gnss" else AS_RECEIVED_ORIGIN
     one = analysis(
-        axes=(result,), trials=(rerun,), ekf2_model=model, source=source(origin=origin),
+        axes=(result,), reruns=(rerun,), ekf2_model=model, source=source(origin=origin),
         settings=Settings(1.0, flown_m),
     )  # fmt: skip
     finding = only(detect_wrong_noise, one)
@@ -502,7 +502,7 @@ def test_title_of_wrong_default_noise_names_the_position_sensor(
     worse = replace(rerun, after=RunStatistics(nis_mean=2.0))
     other = replace(rerun, kinds=("process noise",))
     for trials in ((worse,), (other,), ()):
-        assert not [*detect_wrong_noise(analysis(axes=(result,), trials=trials, ekf2_model=model))]
+        assert not [*detect_wrong_noise(analysis(axes=(result,), reruns=trials, ekf2_model=model))]
 
 
 # ---------------------------------------------------------------- the loop and the drift
@@ -631,7 +631,7 @@ def test_changed_setting_text_contains_old_and_new_value(
 
 def test_unconfirmed_noise_that_the_user_set_is_compared_with_default() -> None:
     request = SimpleNamespace(sigma_z_m=0.3, sigma_a_m_s2=None)
-    one = analysis(request=request, trials=())
+    one = analysis(request=request, reruns=())
     default_text = "To test the default value, run again without --sigma-z."
     assert noises.format_setting_action(one, "sigma_z_m") == default_text
     assert noises.format_setting_action(one, "sigma_a_m_s2").startswith("Do not change")

@@ -20,14 +20,14 @@ from msgspec import structs
 from px4fuse.analysis import Analysis
 from px4fuse.comparison.projection import project as project_state
 from px4fuse.comparison.remedy import find_aid
-from px4fuse.comparison.trials import (
+from px4fuse.comparison.rerun_effects import (
     ROTATION_KEY,
     brings_inside_limits,
     compute_explained_fraction,
-    find_cause_trial,
-    find_trials,
+    find_cause_rerun,
+    find_reruns,
 )
-from px4fuse.diagnose import analyse_comparison
+from px4fuse.diagnose import diagnose_comparison
 from px4fuse.ekf2.model import replay_with_settings
 from px4fuse.ekf2.whatif import HEADING_LOGGED_NOTE, what_if
 from px4fuse.errors import SettingsError
@@ -49,7 +49,7 @@ OUTDOOR = make_scenario("outdoor", seed=5)
 @cache
 def flown(*texts: str) -> Analysis:
     flight = simulate_flight(OUTDOOR, parse_faults(texts))
-    return analyse_comparison(compare(flight, Settings(0.27, 0.4)))
+    return diagnose_comparison(compare(flight, Settings(0.27, 0.4)))
 
 
 def roots(analysis: Analysis) -> list[str]:
@@ -176,7 +176,7 @@ def test_correction_of_outdoor_fault_makes_ekf2_consistent(
     mistake: str, of: Any, name: str, value: float, within: float
 ) -> None:
     analysis = flown(mistake)
-    found = find_cause_trial(analysis.trials, "ekf2", "aisle", of)
+    found = find_cause_rerun(analysis.reruns, "ekf2", "aisle", of)
     assert found.change[name] == pytest.approx(value, abs=within)
     assert brings_inside_limits(found, of)
 
@@ -184,11 +184,11 @@ def test_correction_of_outdoor_fault_makes_ekf2_consistent(
 def test_larger_ekf2_acc_noise_reduces_nees_under_vibration() -> None:
     """EKF2_ACC_NOISE corrects the filter, but the output predictor still integrates vibration."""
     analysis = flown("vibration=1")
-    (tried,) = find_trials(analysis.trials, "ekf2", "aisle", "nees")
+    (tried,) = find_reruns(analysis.reruns, "ekf2", "aisle", "nees")
     assert tried.change == {"EKF2_ACC_NOISE": 1.0}
     assert brings_inside_limits(tried, "nees")
     assert compute_explained_fraction(tried, "nees") == pytest.approx(0.34, abs=0.05)
-    assert find_cause_trial(analysis.trials, "ekf2", "aisle", "nees") is None
+    assert find_cause_rerun(analysis.reruns, "ekf2", "aisle", "nees") is None
     before, after = tried.before.position_rmse_m, tried.after.position_rmse_m
     assert after == pytest.approx(0.8 * before, rel=0.05)
     # at the fusion horizon σ covers the error with this noise

@@ -111,7 +111,7 @@ def test_practice_flight_without_fault_is_consistent(seed: int) -> None:
 
 def _sigmas(result: AxisComparison) -> Any:
     """Return |ν|/√S of KF."""
-    rows = result.replay.updates
+    rows = result.kf_run.updates
     return np.abs(rows["innovation_m"]) / np.sqrt(rows["innovation_variance_m2"])
 
 
@@ -122,16 +122,16 @@ def test_practice_flight_with_nlos_or_jump_has_large_innovations(level: int, see
     assert 0.01 < max(far) < 0.2
     assert all(np.median(_sigmas(found.axes[name])) < 1.0 for name in ("north", "east"))
     jumped = compared(flown(hidden("jump"), level, seed)).main
-    rows = jumped.replay.updates
+    rows = jumped.kf_run.updates
     far = np.flatnonzero(_sigmas(jumped) > 4.0)
     assert len(far) >= 1
     assert far[-1] - far[0] < 25  # one burst
     assert len(set(np.sign(rows["innovation_m"].iloc[far[:2]]))) == 1
     with_gap = compared(flown(hidden("dropout"), level, seed)).main
-    intervals_s = np.diff(with_gap.replay.updates.index)
+    intervals_s = np.diff(with_gap.kf_run.updates.index)
     assert intervals_s.max() > 4.0
-    start = with_gap.replay.updates.index[intervals_s.argmax()]
-    sigma = np.sqrt(with_gap.replay.steps["position_variance_m2"])
+    start = with_gap.kf_run.updates.index[intervals_s.argmax()]
+    sigma = np.sqrt(with_gap.kf_run.steps["position_variance_m2"])
     assert sigma.loc[start : start + intervals_s.max() - 0.01].max() > 2.0 * sigma.median()
 
 

@@ -82,7 +82,7 @@ def delay_boot(log, by_us):
 @pytest.mark.parametrize("generation", GENERATIONS)
 def test_read_ulog_of_each_px4_release_reads_external_vision(read, generation):
     (track, *_) = read(make_log(generation)).positions
-    assert (track.name, track.origin.path) == ("vehicle_visual_odometry", AS_RECEIVED_ORIGIN.path)
+    assert (track.name, track.origin.route) == ("vehicle_visual_odometry", AS_RECEIVED_ORIGIN.route)
     assert_equals_external_vision(track)
     assert track.frame == ("unknown" if generation == "v1.9" else "NED")
     assert track.compute_rate_hz() == pytest.approx(5.0)
@@ -419,8 +419,8 @@ def test_position_sources_are_listed_in_order_of_preference(read):
     log.add(odometry("vehicle_mocap_odometry", 10.0, 16), gps_topic())
     log.add(odometry("estimator_visual_odometry_aligned", 10.0, 12))
     flight = read(log)
-    assert [(track.name, track.origin.path) for track in flight.positions] == [
-        (name, origin.path) for name, origin in PREFERRED
+    assert [(track.name, track.origin.route) for track in flight.positions] == [
+        (name, origin.route) for name, origin in PREFERRED
     ]
     reason = choose_source(flight)[1]
     assert "--position-source" not in reason
@@ -459,7 +459,10 @@ def test_reader_adds_ev_delay_to_times_of_ekf2_vision_samples(read, delay_ms):
     for name in ("estimator_aid_src_ev_pos", "estimator_aid_src_ev_hgt"):
         log[name]["timestamp_sample"] -= np.uint64((delay_ms * 1e-3 + HALF_PERIOD_S) * 1e6)
     track, _ = choose_source(read(log))
-    assert (track.name, track.origin.path) == ("estimator_aid_src_ev_pos", KEPT_BY_EKF2_ORIGIN.path)
+    assert (track.name, track.origin.route) == (
+        "estimator_aid_src_ev_pos",
+        KEPT_BY_EKF2_ORIGIN.route,
+    )
     assert_equals_external_vision(track)
 
 
@@ -489,9 +492,9 @@ def test_position_reconstructed_from_innovation_equals_measured(read, generation
     if generation == "v1.12":
         log.drop("estimator_visual_odometry_aligned")
     track, _ = choose_source(read(log))
-    assert (track.name, track.origin.path) == (
+    assert (track.name, track.origin.route) == (
         "ekf2_state_plus_innovation",
-        REBUILT_FROM_INNOVATIONS_ORIGIN.path,
+        REBUILT_FROM_INNOVATIONS_ORIGIN.route,
     )
     expected = position(times(track.samples)) + ev_error(times(track.samples))
     np.testing.assert_allclose(track.samples[Columns.POSITION], expected, atol=1e-5)
@@ -593,7 +596,7 @@ def test_read_log_of_simulation_returns_simulated_uwb_samples(shared_logs, name)
     assert track.name == ("estimator_aid_src_ev_pos" if kept else "vehicle_visual_odometry")
 
     axes = (
-        slice(0, 2) if track.origin.path == KEPT_BY_EKF2_ORIGIN.path else slice(0, 3)
+        slice(0, 2) if track.origin.route == KEPT_BY_EKF2_ORIGIN.route else slice(0, 3)
     )  # EKF2's observations contain no height in these logs
     sent_z = np.array([sample["z"] for sample in sent["uwb"]])[:, axes]
     sent_s = np.array([sample["t_px4_us"] for sample in sent["uwb"]]) * 1e-6
@@ -616,7 +619,7 @@ def test_read_log_of_simulation_returns_simulated_uwb_samples(shared_logs, name)
     else:
         assert np.median(late) == pytest.approx(config["latency_ms"] * 1e-3, abs=0.02)
     inside = (sent_s > sent_s[match[0]]) & (sent_s < sent_s[match[-1]])
-    if track.origin.path == AS_RECEIVED_ORIGIN.path and not config["dropouts"]:
+    if track.origin.route == AS_RECEIVED_ORIGIN.route and not config["dropouts"]:
         assert len(read_s) >= 0.98 * np.count_nonzero(inside)
 
 

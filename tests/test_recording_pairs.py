@@ -5,8 +5,8 @@ from comparisons import compare
 from exchange import replace
 from flights import Imu, aisle_flight
 
-from px4fuse.comparison.estimates import estimate_noises_and_clock
-from px4fuse.filter.time_offset import ClockOffset
+from px4fuse.comparison.estimates import estimate_noises_and_time_offset
+from px4fuse.filter.time_offset import SourceTimeOffset
 from px4fuse.flight.model import DataSource, Unavailable
 
 
@@ -21,9 +21,9 @@ def test_time_offset_with_low_imu_rate_is_unavailable(topic, imu_hz, needed) -> 
     """Telemetry samples of a faster IMU are single values, not means over the interval."""
     flight = aisle_flight(duration_s=40.0, imu=Imu(rate_hz=imu_hz))
     flight = replace(flight, streams={"imu": DataSource((topic,), "boot clock", flight.log.name)})
-    _, found = estimate_noises_and_clock(compare(flight, axes=("north", "east")))
+    _, found = estimate_noises_and_time_offset(compare(flight, axes=("north", "east")))
     if needed is None:
-        assert isinstance(found, ClockOffset)
+        assert isinstance(found, SourceTimeOffset)
         return
     assert isinstance(found, Unavailable)
     assert f"{imu_hz:g} Hz" in found.reason

@@ -13,15 +13,15 @@ from px4fuse.analysis import Analysis
 from px4fuse.comparison import remedy as remedies
 from px4fuse.comparison.model import Comparison
 from px4fuse.comparison.remedy import estimate_ekf2_parameters, find_used_noise_m
-from px4fuse.comparison.reruns import rerun_filters
-from px4fuse.comparison.trials import (
+from px4fuse.comparison.rerun_effects import (
+    Rerun,
     RunStatistics,
-    Trial,
     classify_improvement,
-    find_trial,
+    find_rerun,
     has_effect,
 )
-from px4fuse.diagnose import analyse_comparison
+from px4fuse.comparison.reruns import rerun_filters
+from px4fuse.diagnose import diagnose_comparison
 from px4fuse.ekf2.whatif import what_if
 from px4fuse.filter.settings import Settings
 from px4fuse.filter.tuning import AxisTuning, NoiseEstimate
@@ -42,7 +42,7 @@ LOOP = Scenario(kind="loop", passes=1, length_m=8.0, vio_rate_hz=10.0)
 
 @cache
 def flown(scenario: Scenario, settings: Settings, *mistakes: str) -> Analysis:
-    return analyse_comparison(
+    return diagnose_comparison(
         compare(simulate_flight(scenario, parse_faults(mistakes)), settings, axes=AXES)
     )
 
@@ -108,15 +108,15 @@ def test_vio_drift_is_reported_before_its_consequences(seed, mistakes) -> None:
         assert "set EKF2_EVP_NOISE" not in finding.remedy
         assert "--sigma-z" not in finding.remedy
     estimated = estimate_ekf2_parameters(
-        analysis, analysis.ekf2_model, analysis.tuning, analysis.clock
+        analysis, analysis.ekf2_model, analysis.tuning, analysis.time_offset
     )
     flown_with = analysis.ekf2_model.inputs.settings["EKF2_EVP_NOISE"]
     assert estimated.get("EKF2_EVP_NOISE", flown_with) >= flown_with
 
 
-def trial(after: RunStatistics, change: str = "sigma_z_m", kind: str = "noises") -> Trial:
+def trial(after: RunStatistics, change: str = "sigma_z_m", kind: str = "noises") -> Rerun:
     before = RunStatistics(nis_mean=16.0, nees_mean=9.0, position_rmse_m=0.5)
-    return Trial(
+    return Rerun(
         filter="kf", axis="aisle", kinds=(kind,), change={change: 1.0}, before=before, after=after
     )
 
@@ -150,11 +150,11 @@ def test_rerun_with_fewest_changed_settings_is_recommended() -> None:
     pair = replace(trial(right), change={"sigma_z_m": 1.0, "sigma_a_m_s2": 1.0})
     alone, bias = trial(near), trial(right, "bias_forward_m_s2", "bias")
     trials = (pair, alone, bias)
-    assert find_trial(trials, "kf", "noises") is alone
-    assert find_trial(trials, "kf", "noises", "sigma_a_m_s2") is pair
-    assert find_trial((pair, trial(near)), "ekf2", "noises") is None
+    assert find_rerun(trials, "kf", "noises") is alone
+    assert find_rerun(trials, "kf", "noises", "sigma_a_m_s2") is pair
+    assert find_rerun((pair, trial(near)), "ekf2", "noises") is None
     unchanged = replace(alone, after=alone.before)
-    assert find_trial((unchanged,), "kf", "noises") is None
+    assert find_rerun((unchanged,), "kf", "noises") is None
 
 
 # ---------------------------------------------------------------- EKF2
@@ -163,19 +163,19 @@ def test_rerun_with_fewest_changed_settings_is_recommended() -> None:
 def offset(analysis: Analysis, offset_s: float) -> Analysis:
     """Make the analysis with another estimated time offset, and its re-runs."""
     clock = replace(
-        analysis.clock, offset_s=offset_s, interval_s=(offset_s - 0.01, offset_s + 0.01),
+        analysis.time_offset, offset_s=offset_s, interval_s=(offset_s - 0.01, offset_s + 0.01),
         sigma_s=0.005, is_determinable=True, change_p_value=None,
     )  # fmt: skip
-    changed = replace(analysis, clock=clock)
+    changed = replace(analysis, time_offset=clock)
     trials = rerun_filters(changed, changed, changed.ekf2_model)
-    return replace(changed, trials=trials)
+    return replace(changed, reruns=trials)
 
 
 def test_recommended_ekf2_noise_and_delay_equal_estimates(sample: Analysis) -> None:
     model, comparison = sample.ekf2_model, sample
 
     def estimated(analysis: Analysis) -> dict[str, float]:
-        return estimate_ekf2_parameters(comparison, model, analysis.tuning, analysis.clock)
+        return estimate_ekf2_parameters(comparison, model, analysis.tuning, analysis.time_offset)
 
     assert estimated(sample) == {}  # 0.1 m is within the interval
     settings = {**model.inputs.settings, "EKF2_EVP_NOISE": 0.3}
@@ -196,7 +196,7 @@ def test_recommended_ekf2_noise_and_delay_equal_estimates(sample: Analysis) -> N
         offset(sample, 0.2)
     )  # early: EKF2_EV_DELAY is already 0
     other = replace(comparison, source=replace(comparison.source, name="another"))
-    assert estimate_ekf2_parameters(other, model, sample.tuning, sample.clock) == {}
+    assert estimate_ekf2_parameters(other, model, sample.tuning, sample.time_offset) == {}
 
 
 def test_ekf2_noise_advice_with_logged_variance_sets_noise_mode(sample: Analysis) -> None:
@@ -228,7 +228,7 @@ def test_ekf2_delay_with_worse_replay_is_not_recommended(sample: Analysis) -> No
     """The timestamps of the sample are correct; a replay with 150 ms is worse."""
     late = offset(sample, -0.15)
     assert not list(source_clock.detect(late))  # ground truth contradicts --clock-offset
-    unrefuted = replace(late, trials=tuple(one for one in late.trials if one.filter == "ekf2"))
+    unrefuted = replace(late, reruns=tuple(one for one in late.reruns if one.filter == "ekf2"))
     finding = only("ekf2_ev_delay_wrong", unrefuted)
     assert finding.remedy == "Correct the position timestamps before sending."
 
@@ -261,14 +261,14 @@ def test_gnss_delay_after_clock_offset_is_fault_of_ekf2(sample: Analysis) -> Non
     log = replace(sample.flight.log, parameters={"EKF2_GPS_DELAY": 0.0})
     source = replace(sample.source, origin=GNSS_ORIGIN)
     analysis = replace(
-        offset(sample, -0.15), source=source, flight=replace(sample.flight, log=log), trials=()
+        offset(sample, -0.15), source=source, flight=replace(sample.flight, log=log), reruns=()
     )
-    clock = replace(analysis.clock, applied_s=-0.15)
+    clock = replace(analysis.time_offset, applied_s=-0.15)
     (finding,) = source_clock.detect_wrong_delay(analysis, clock)
     assert finding.id == "ekf2_gps_delay_wrong"
     assert not list(source_clock.detect_time_offset(analysis, clock))
     # without --clock-offset, source_time_offset reports the same fault
-    assert not list(source_clock.detect_wrong_delay(analysis, analysis.clock))
+    assert not list(source_clock.detect_wrong_delay(analysis, analysis.time_offset))
 
 
 def test_sender_without_timesync_answers_it_before_shifting() -> None:

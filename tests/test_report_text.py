@@ -17,7 +17,7 @@ from matplotlib import font_manager
 from page_tools import set_by_typst
 
 from px4fuse.analysis import Analysis
-from px4fuse.filter.time_offset import ClockOffset, PartOffset
+from px4fuse.filter.time_offset import PartOffset, SourceTimeOffset
 from px4fuse.finding import Finding
 from px4fuse.flight.model import Unavailable
 from px4fuse.report import clock, fonts, notes, typesetting
@@ -186,11 +186,11 @@ def test_typst_template_cannot_read_files(code: str, monkeypatch: pytest.MonkeyP
         compile_pdf({"fonts": [fonts.FONT]})
 
 
-def offset(**changes: Any) -> ClockOffset:
+def offset(**changes: Any) -> SourceTimeOffset:
     curve = np.linspace(-0.1, 0.1, 21)
     parts = tuple(PartOffset(10.0 * i, 10.0 * i + 9.0, 0.06 * (i - 1), 0.02) for i in range(3))
     return replace(
-        ClockOffset(
+        SourceTimeOffset(
             applied_s=0.0, offset_s=0.005, interval_s=(-0.02, 0.03), sigma_s=0.012,
             is_determinable=True,
             curve_time_offsets_s=curve, curve_log_likelihood_drops=curve**2 * 1e3, parts=parts,
@@ -202,13 +202,13 @@ def offset(**changes: Any) -> ClockOffset:
     )  # fmt: skip
 
 
-def with_clock(found: ClockOffset | Unavailable, delay_ms: float = 0.0) -> Any:
+def with_clock(found: SourceTimeOffset | Unavailable, delay_ms: float = 0.0) -> Any:
     log = SimpleNamespace(name="x.ulg", parameters={"EKF2_EV_DELAY": delay_ms})
     ekf2 = SimpleNamespace(parameters={"EKF2_DELAY_MAX": 200.0})
     settings, flight = SimpleNamespace(clock_offset_s=0.0), SimpleNamespace(log=log, ekf2=ekf2)
     return SimpleNamespace(
-        clock=found, settings=settings, flight=flight, source=source(), convention=None,
-        select_main_trials=lambda: [],
+        time_offset=found, settings=settings, flight=flight, source=source(), convention=None,
+        select_main_reruns=lambda: [],
     )  # fmt: skip
 
 
@@ -262,5 +262,5 @@ def test_report_on_time_offset_reports_estimate_and_action(
     changes: dict[str, Any], delay_ms: float, expected: dict[str, str]
 ) -> None:
     analysis = with_clock(offset(**changes), delay_ms)
-    advice = clock.make_time_offset_advice(analysis, analysis.clock)
+    advice = clock.make_time_offset_advice(analysis, analysis.time_offset)
     assert all(text in advice[label] for label, text in expected.items()), advice

@@ -10,24 +10,24 @@ from comparisons import compare
 from exchange import replace
 
 from px4fuse.analysis import Analysis
+from px4fuse.comparison.rerun_effects import (
+    FORWARD_BIAS_KEY,
+    OUTLIERS_KEY,
+    ROTATION_KEY,
+    TIME_OFFSET_KEY,
+    Rerun,
+    RunStatistics,
+    brings_inside_limits,
+    compute_explained_fraction,
+    find_cause_rerun,
+    find_reruns,
+)
+from px4fuse.comparison.rerun_effects import RIGHT_BIAS_KEY as TO_RIGHT
 from px4fuse.comparison.reruns import (
     list_rerun_configurations,
     rerun_filters,
 )
-from px4fuse.comparison.trials import (
-    CLOCK_OFFSET_KEY,
-    FORWARD_BIAS_KEY,
-    OUTLIERS_KEY,
-    ROTATION_KEY,
-    RunStatistics,
-    Trial,
-    brings_inside_limits,
-    compute_explained_fraction,
-    find_cause_trial,
-    find_trials,
-)
-from px4fuse.comparison.trials import RIGHT_BIAS_KEY as TO_RIGHT
-from px4fuse.diagnose import analyse_comparison
+from px4fuse.diagnose import diagnose_comparison
 from px4fuse.ekf2.filter_recursion import FilterConfiguration
 from px4fuse.ekf2.model import add_position_noise, misalign_positions, replay_with_settings
 from px4fuse.ekf2.whatif import what_if
@@ -45,17 +45,17 @@ LATE = "clock-offset=0.25"
 @cache
 def flown(*mistakes: str, sigma_a=0.27, sigma_z=0.10, passes=4) -> Analysis:
     flight = simulate_flight(Scenario(seed=5, passes=passes), parse_faults(mistakes))
-    return analyse_comparison(
+    return diagnose_comparison(
         compare(flight, Settings(sigma_a, sigma_z), axes=("aisle", "north", "east"))
     )
 
 
-def cause(analysis: Analysis, owner: Any, of: Any = "nis") -> Trial:
-    return find_cause_trial(analysis.trials, owner, "aisle", of)
+def cause(analysis: Analysis, owner: Any, of: Any = "nis") -> Rerun:
+    return find_cause_rerun(analysis.reruns, owner, "aisle", of)
 
 
 def test_filter_reruns_of_consistent_flight_report_no_cause() -> None:
-    assert not any(trial.discrepancies for trial in flown().trials)
+    assert not any(trial.discrepancies for trial in flown().reruns)
 
 
 @pytest.mark.parametrize(
@@ -68,11 +68,11 @@ def test_filter_reruns_of_consistent_flight_report_no_cause() -> None:
         ("nlos=7%", {}, "ekf2", "nis", {OUTLIERS_KEY: (25, 4)}),
         ("nlos=7%", {"sigma_z": 0.05}, "kf", "nis",
          {OUTLIERS_KEY: (25, 4), "sigma_z_m": (0.1, 0.01)}),
-        (LATE, {}, "kf", "nees", {CLOCK_OFFSET_KEY: (-0.25, 0.06)}),
+        (LATE, {}, "kf", "nees", {TIME_OFFSET_KEY: (-0.25, 0.06)}),
         (LATE, {}, "ekf2", "nees",
          {"EKF2_EV_DELAY": (250, 60), "EKF2_DELAY_MAX": (300, 0)}),
         # no parameter of EKF2 shifts positions to an earlier time than their timestamp
-        ("clock-offset=-0.19", {}, "ekf2", "nees", {CLOCK_OFFSET_KEY: (0.19, 0.06)}),
+        ("clock-offset=-0.19", {}, "ekf2", "nees", {TIME_OFFSET_KEY: (0.19, 0.06)}),
         ("accel-bias=0.5", {}, "kf", "nis",
          {FORWARD_BIAS_KEY: (0.5, 0.03), TO_RIGHT: (-0.04, 0.03)}),
         ("yaw=20", {}, "kf", "nees", {ROTATION_KEY: (-20, 4)}),
@@ -113,14 +113,14 @@ def test_filter_rerun_for_vibration_increases_ekf2_acc_noise() -> None:
     found = cause(analysis, "ekf2", "nis")
     assert found.change == {"EKF2_ACC_NOISE": 1.0}  # PX4's maximum
     assert compute_explained_fraction(found, "nis") > 0.5
-    assert not any("EKF2_ACC_NOISE" in row.change for row in flown("nlos=7%").trials)
+    assert not any("EKF2_ACC_NOISE" in row.change for row in flown("nlos=7%").reruns)
 
 
 def test_ekf2_is_rerun_with_time_offset_that_kf_already_uses() -> None:
     bare = flown("clock-offset=-0.19")
-    offset_s = cause(bare, "kf", "nees").change[CLOCK_OFFSET_KEY]
-    analysis = analyse_comparison(compare(bare.flight, replace(RIGHT, clock_offset_s=offset_s)))
-    assert {row.filter for row in analysis.trials if row.discrepancies} == {"ekf2"}
+    offset_s = cause(bare, "kf", "nees").change[TIME_OFFSET_KEY]
+    analysis = diagnose_comparison(compare(bare.flight, replace(RIGHT, clock_offset_s=offset_s)))
+    assert {row.filter for row in analysis.reruns if row.discrepancies} == {"ekf2"}
     again, before = cause(analysis, "ekf2", "nees"), cause(bare, "ekf2", "nees")
     assert again.change == pytest.approx(before.change, abs=0.01)
     assert again.after.nees_mean == pytest.approx(before.after.nees_mean, rel=0.05)
@@ -131,7 +131,7 @@ def test_ekf2_is_rerun_with_time_offset_that_kf_already_uses() -> None:
 )
 def test_kf_rerun_equals_compare_with_the_changed_setting(analysis, of) -> None:
     analysis = analysis()
-    found = find_cause_trial(analysis.trials, "kf", "north", of)
+    found = find_cause_rerun(analysis.reruns, "kf", "north", of)
     again = compare(analysis.flight, replace(analysis.settings, **found.change))
 
     def statistic(of_comparison: Any) -> float:
@@ -149,7 +149,7 @@ def test_kf_rerun_equals_compare_with_the_changed_setting(analysis, of) -> None:
 
 def test_ekf2_rerun_equals_what_if_with_the_same_parameters() -> None:
     analysis = flown("ekf2-noise=0.03")
-    found = [find_cause_trial(analysis.trials, "ekf2", axis) for axis in ("north", "east")]
+    found = [find_cause_rerun(analysis.reruns, "ekf2", axis) for axis in ("north", "east")]
     model, change = analysis.ekf2_model, found[0].change  # type: ignore[union-attr]
     replays = what_if(replace(model, runs=()), [change])  # a copy without cached replays
     for one, axis in zip(found, ("north", "east"), strict=True):
@@ -192,7 +192,7 @@ def test_rerun_gives_kf_ekf2_difference_with_and_without_change() -> None:
 def test_rerun_with_time_offset_shifts_times_of_outliers() -> None:
     analysis = flown("clock-offset=-0.19", "nlos=7%")
     count = cause(analysis, "ekf2").change[OUTLIERS_KEY]
-    rows = [one for one in analysis.trials if one.filter == "ekf2" and one.axis == "aisle"]
+    rows = [one for one in analysis.reruns if one.filter == "ekf2" and one.axis == "aisle"]
     alone = next(one for one in rows if one.change == {OUTLIERS_KEY: count})
     assert brings_inside_limits(alone, "nis")
     model, out = analysis.ekf2_model, analysis.tuning["horizontal"]
@@ -213,41 +213,41 @@ def test_ekf2_is_rerun_with_px4_default_of_each_changed_noise() -> None:
     inputs = replace(analysis.ekf2_model.inputs, settings=settings)
     model = replace(analysis.ekf2_model, inputs=inputs)
     rows = rerun_filters(analysis, analysis, model)
-    tried = [one.change for one in find_trials(rows, "ekf2", "aisle")]
+    tried = [one.change for one in find_reruns(rows, "ekf2", "aisle")]
     assert tried[1:] == [{"EKF2_ACC_NOISE": 0.35}, {"EKF2_GYR_NOISE": 0.015}]
 
 
 def test_cause_explains_50_to_150_percent_of_log_mean_nis() -> None:
-    def one(change: Any, explains: float, *, into: bool = False) -> Trial:
+    def one(change: Any, explains: float, *, into: bool = False) -> Rerun:
         after = RunStatistics(innovations=10 if into else 10**6, nis_mean=9.0 ** (1.0 - explains))
-        return Trial(
+        return Rerun(
             filter="kf", axis="aisle", kinds=(), change=change, discrepancies=("nis",),
             before=RunStatistics(nis_mean=9.0), after=after,
         )  # fmt: skip
 
     for explains in (0.49, 1.51, -1.0):
-        assert find_cause_trial([one({"sigma_z_m": 1.0}, explains)], "kf", "aisle") is None
+        assert find_cause_rerun([one({"sigma_z_m": 1.0}, explains)], "kf", "aisle") is None
     part, whole = one({"sigma_a_m_s2": 0.1}, 0.99), one({"sigma_z_m": 1.0}, 0.9, into=True)
     assert (
-        find_cause_trial([part, whole], "kf", "aisle") is whole
+        find_cause_rerun([part, whole], "kf", "aisle") is whole
     )  # a change into the band precedes a larger share
-    both = one({CLOCK_OFFSET_KEY: 0.1, "sigma_z_m": 1.0}, 1.0, into=True)
-    assert find_cause_trial([both, whole], "kf", "aisle") is whole  # fewer changes precede
-    fault = one({CLOCK_OFFSET_KEY: 0.1}, 0.9, into=True)
+    both = one({TIME_OFFSET_KEY: 0.1, "sigma_z_m": 1.0}, 1.0, into=True)
+    assert find_cause_rerun([both, whole], "kf", "aisle") is whole  # fewer changes precede
+    fault = one({TIME_OFFSET_KEY: 0.1}, 0.9, into=True)
     assert (
-        find_cause_trial([whole, fault], "kf", "aisle") is fault
+        find_cause_rerun([whole, fault], "kf", "aisle") is fault
     )  # sensor faults precede settings
     nearly, far = (
         one({FORWARD_BIAS_KEY: 0.3, TO_RIGHT: 0.1}, 0.8),
         one({FORWARD_BIAS_KEY: 0.3, TO_RIGHT: 0.1}, 0.7),
     )
     assert (
-        find_cause_trial([whole, nearly], "kf", "aisle") is nearly
+        find_cause_rerun([whole, nearly], "kf", "aisle") is nearly
     )  # both bias components are one change
-    assert find_cause_trial([whole, far], "kf", "aisle") is whole
+    assert find_cause_rerun([whole, far], "kf", "aisle") is whole
     assert (
-        find_cause_trial([whole], "ekf2", "aisle")
-        is find_cause_trial([whole], "kf", "north")
+        find_cause_rerun([whole], "ekf2", "aisle")
+        is find_cause_rerun([whole], "kf", "north")
         is None
     )
 

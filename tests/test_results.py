@@ -12,7 +12,7 @@ from results_tools import EXAMPLE, LOOP, changed_results, decode_results
 
 import px4fuse
 from px4fuse.comparison.model import UntestedFilter
-from px4fuse.diagnose import analyse_comparison
+from px4fuse.diagnose import diagnose_comparison
 from px4fuse.errors import ResultsError
 from px4fuse.flight.model import Flight
 from px4fuse.report.pdf import render_pdf
@@ -25,8 +25,8 @@ from px4fuse.results.reading import read_results
 
 def document(flight: Flight, explained: bool = True, **options: object):
     comparison = compare(flight, **options)
-    analysis = analyse_comparison(comparison) if explained else unexplained(comparison)
-    return analysis, build.results(ComparisonRequest(log=flight.log.name), analysis)
+    analysis = diagnose_comparison(comparison) if explained else unexplained(comparison)
+    return analysis, build.make_comparison_results(ComparisonRequest(log=flight.log.name), analysis)
 
 
 SCHEMA = schema()

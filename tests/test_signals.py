@@ -13,7 +13,7 @@ from hypothesis import strategies as st
 from scipy.integrate import trapezoid
 from scipy.spatial.transform import Rotation
 
-from px4fuse.comparison.preparation import choose_segment, shift_clock
+from px4fuse.comparison.preparation import choose_segment, shift_timestamps
 from px4fuse.comparison.projection import remove_origin_resets
 from px4fuse.errors import MissingDataError, SettingsError
 from px4fuse.filter.signals import (
@@ -217,7 +217,7 @@ def test_positions_and_imu_are_projected_on_requested_heading():
 
 def test_clock_shift_changes_only_timestamps():
     track, _ = line_track(30.0)
-    moved = shift_clock(track, -0.1)
+    moved = shift_timestamps(track, -0.1)
     np.testing.assert_allclose(moved.samples.index, track.samples.index - 0.1, atol=1e-12)
     np.testing.assert_array_equal(moved.samples, track.samples)
     kept = {name: getattr(track, name) for name in ("samples", "invalid_reasons", "status")}

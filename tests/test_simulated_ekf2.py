@@ -8,7 +8,7 @@ from exchange import replace
 from flights import unexplained
 from scipy.spatial.transform import Rotation
 
-from px4fuse.diagnose import analyse_comparison
+from px4fuse.diagnose import diagnose_comparison
 from px4fuse.ekf2.inputs import SIMULATED_EKF2_NOTE
 from px4fuse.ekf2.model import prepare_ekf2_model
 from px4fuse.ekf2.replay import Agreement
@@ -215,7 +215,7 @@ def test_simulated_ekf2_holds_position_if_fusion_is_disabled(clean):
     assert rmse(flight, 10.0, 50.0) > 2.0 > 10.0 * rmse(clean, 10.0, 50.0)
     (finding,) = (
         item
-        for item in analyse_comparison(compare(flight, RIGHT)).findings
+        for item in diagnose_comparison(compare(flight, RIGHT)).findings
         if item.id == "ekf2_not_fusing"
     )
     assert "EKF2_EV_CTRL" in finding.message

@@ -13,8 +13,8 @@ from exchange import replace
 from scipy.interpolate import CubicSpline
 
 from px4fuse.analysis import Analysis
-from px4fuse.comparison.trials import makes_overconfident
-from px4fuse.diagnose import analyse_comparison
+from px4fuse.comparison.rerun_effects import makes_overconfident
+from px4fuse.diagnose import diagnose_comparison
 from px4fuse.filter import correlated_noise
 from px4fuse.filter.correlated_noise import fit_time_correlation
 from px4fuse.filter.fitting import NoiseParameters
@@ -60,7 +60,7 @@ def analysed(
         flight = replace(flight, truth=Unavailable("truth", "", ""))
     else:
         chosen = Settings(0.27, truth_for)
-    return analyse_comparison(compare(flight, chosen, axes=("north", "east")))
+    return diagnose_comparison(compare(flight, chosen, axes=("north", "east")))
 
 
 def root_findings(analysis: Analysis) -> dict[str, Finding]:
@@ -174,7 +174,7 @@ def test_smaller_noise_is_advised_only_if_ground_truth_agrees(
     analysis = analysed(model, truth_for=sigma_z_m)
     tried = [
         each
-        for each in analysis.trials
+        for each in analysis.reruns
         if "sigma_z_m" in each.change and "nis" in each.discrepancies
     ]
     assert {each.axis for each in tried} == {"north", "east"}
@@ -251,7 +251,7 @@ def test_sitl_flight_with_added_error_reports_only_this_error(
     flight = read_log(log)
     flight = errors.laid_over(flight, errors.truth_of(log, flight), model, 5.0, seed)
     assert set(
-        root_findings(analyse_comparison(compare(flight, RIGHT, axes=("north", "east"))))
+        root_findings(diagnose_comparison(compare(flight, RIGHT, axes=("north", "east"))))
     ) == {finding}
 
 

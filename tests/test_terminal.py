@@ -28,7 +28,7 @@ from px4fuse.report.page import Page
 from px4fuse.report.screen import print_paragraph, shorten_commands
 from px4fuse.report.terminal import make_comparison_page
 from px4fuse.request import ComparisonRequest, PositionFile, command_line, format_settings_suffix
-from px4fuse.results.build import results
+from px4fuse.results.build import make_comparison_results
 from px4fuse.results.contract import ComparisonResults, to_json
 from px4fuse.results.model import Student
 from px4fuse.simulation import flights
@@ -70,7 +70,7 @@ def document(sample_log: Path) -> tuple[Analysis, ComparisonResults]:
     """Analysis and results of the sample flight with a setting that causes a finding."""
     request = ComparisonRequest(log=str(sample_log), sigma_z_m=0.3)
     analysis = analyse(request)
-    return analysis, results(request, analysis)
+    return analysis, make_comparison_results(request, analysis)
 
 
 def test_terminal_summary_wraps_without_cutting_text(document, monkeypatch) -> None:
@@ -208,7 +208,7 @@ def made(document, sample_log: Path, tmp_path, monkeypatch) -> ComparisonResults
     """Results of the sample flight; the working folder is empty."""
     monkeypatch.chdir(tmp_path)
     request = ComparisonRequest(log=str(sample_log))
-    return results(request, document[0])
+    return make_comparison_results(request, document[0])
 
 
 def reported(made: ComparisonResults, **changes: object) -> str:

@@ -17,7 +17,7 @@ from comparisons import compare
 from ekf2_tools import opened, step_matrix, step_noise, step_state
 from exchange import replace
 
-from px4fuse.diagnose import analyse_comparison, run_what_if
+from px4fuse.diagnose import diagnose_comparison, run_what_if
 from px4fuse.ekf2 import steps
 from px4fuse.ekf2.filter_recursion import FilterConfiguration, SegmentRun, run_segment
 from px4fuse.ekf2.inputs import ReceivedPositions, ReplayInputs
@@ -601,8 +601,8 @@ def test_difference_steps_of_gnss_flight_include_vision_step() -> None:
         assert why.unexplained_fraction < 0.05
         moved_m = {step.name: step.position_moved_m for step in why.steps}
         assert min(moved_m[steps.GNSS_VELOCITY_PROPERTY], moved_m[steps.VISION_PROPERTY]) > 0.05
-    analysis = analyse_comparison(compare(flown(), Settings(0.27, 0.4)))
+    analysis = diagnose_comparison(compare(flown(), Settings(0.27, 0.4)))
     # the noise of vision does not lead to a remedy for GNSS noise
     assert analysis.source.name == "vehicle_visual_odometry"
-    assert {trial.filter for trial in analysis.trials} == {"kf"}
+    assert {trial.filter for trial in analysis.reruns} == {"kf"}
     assert not [item for item in find(analysis) if "EKF2_GPS_P_NOISE" in item.remedy]

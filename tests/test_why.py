@@ -35,13 +35,15 @@ def of(analysis: Analysis, name: str = "aisle") -> DifferenceExplanation:
 def explain_again(analysis: Analysis, settings: Settings, **choices: Any) -> DifferenceExplanation:
     """Explain the difference along the aisle with other settings."""
     comparison = compare(analysis.flight, settings, axes=("aisle",), **choices)
-    return explain_ekf2_difference(comparison, analysis.ekf2_model, analysis.clock, {})["aisle"]
+    return explain_ekf2_difference(comparison, analysis.ekf2_model, analysis.time_offset, {})[
+        "aisle"
+    ]
 
 
 def test_position_difference_on_report_page_is_kf_minus_ekf2(sample: Analysis) -> None:
     explanation = of(sample)
     result = next(r for r in sample.axes.values() if r.axis.name == "aisle")
-    position, speed = predict_state(result.replay, explanation.times_s)
+    position, speed = predict_state(result.kf_run, explanation.times_s)
     logged = result.ekf2_state.loc[explanation.times_s]
     difference = position - logged["position_m"].to_numpy()
     np.testing.assert_allclose(explanation.kf_minus_ekf2_m, difference, atol=1e-9)
@@ -83,10 +85,10 @@ def test_kf_ekf2_difference_uses_only_evaluated_segment(sample: Analysis) -> Non
 
 def test_kf_ekf2_difference_without_replay_gives_reason(sample: Analysis) -> None:
     down = compare(sample.flight, axes=("down",))
-    found = explain_ekf2_difference(down, sample.ekf2_model, sample.clock, {})["down"]
+    found = explain_ekf2_difference(down, sample.ekf2_model, sample.time_offset, {})["down"]
     assert "horizontal" in found.reason
     none = Unavailable("EKF2 replay", "no IMU", "Record it.")
-    for name, explanation in explain_ekf2_difference(sample, none, sample.clock, {}).items():
+    for name, explanation in explain_ekf2_difference(sample, none, sample.time_offset, {}).items():
         assert name != "down"
         assert (explanation.reason, explanation.remedy) == ("no IMU", "Record it.")
 
@@ -104,7 +106,7 @@ def test_report_without_ekf2_replay_omits_difference_page(sample: Analysis) -> N
         agreement=agreement,
         baseline_replay=replace(model.baseline_replay, agreement=agreement),
     )
-    explanation = explain_ekf2_difference(sample, doubtful, sample.clock, {})
+    explanation = explain_ekf2_difference(sample, doubtful, sample.time_offset, {})
     parted = replace(sample, ekf2_model=doubtful, difference_steps=explanation)
     absent = Unavailable("EKF2 replay", "no IMU", "Record it.")
     without = replace(
@@ -144,9 +146,9 @@ def test_kf_ekf2_difference_text_begins_with_wrong_kf_setting(sample: Analysis) 
     comparison = compare(sample.flight, Settings(sigma_a_m_s2=0.001), axes=("aisle",))
     corrected = find_corrected_noise_settings(comparison, sample.tuning)
     assert corrected == {"sigma_a_m_s2": pytest.approx(0.363, abs=0.01)}
-    explained = explain_ekf2_difference(comparison, sample.ekf2_model, sample.clock, corrected)[
-        "aisle"
-    ]
+    explained = explain_ekf2_difference(
+        comparison, sample.ekf2_model, sample.time_offset, corrected
+    )["aisle"]
     assert explained.corrected == corrected
     assert explained.position_mean_square_m2 < 0.01
     assert "--sigma-a 0.363" in explained.sentences[0]

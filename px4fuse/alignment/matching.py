@@ -75,7 +75,7 @@ class Match:
         Fit with the yaw from the user.
     estimated_yaw_fit : TrackFit
         Fit with estimated yaw.
-    is_rotated : bool
+    is_given_yaw_wrong : bool
         True if the yaw from the user is wrong.
     """
 
@@ -84,12 +84,12 @@ class Match:
     rms_m_by_frame: dict[str, float]
     fit: TrackFit
     estimated_yaw_fit: TrackFit
-    is_rotated: bool
+    is_given_yaw_wrong: bool
 
     @property
     def time_offset_fit(self) -> TrackFit:
-        """Fit that gives the time offset."""
-        return self.estimated_yaw_fit if self.is_rotated else self.fit
+        """Fit with the estimated yaw if that of the user is wrong, which falsifies the offset."""
+        return self.estimated_yaw_fit if self.is_given_yaw_wrong else self.fit
 
     @property
     def residuals_text(self) -> str:
@@ -164,12 +164,12 @@ def _find_best_match(references: list[SampledTrack], problem: AlignmentProblem) 
         fit = estimated_yaw_fit = fits[best_frame]
         if yaw_rad is not None:
             estimated_yaw_fit = _fit_file_in_frame(problem, reference, best_frame, None)
-        is_rotated = is_reliable_fit(estimated_yaw_fit, reference_name) and (
+        is_given_yaw_wrong = is_reliable_fit(estimated_yaw_fit, reference_name) and (
             fit.concordance < MIN_CONCORDANCE_TO_ACCEPT_MATCH[reference_name]
             or needs_rotation(fit.horizontal_rms_m, estimated_yaw_fit, reference_name)
         )
         matches.append(
-            Match(reference, best_frame, rms_m_by_frame, fit, estimated_yaw_fit, is_rotated)
+            Match(reference, best_frame, rms_m_by_frame, fit, estimated_yaw_fit, is_given_yaw_wrong)
         )
     return min(matches, key=lambda match: match.time_offset_fit.residual_rms_m)
 
@@ -223,7 +223,7 @@ def _require_unique_match(match: Match) -> None:
             raise NoMatchError(
                 "the frame of the position file cannot be estimated, because several frames have "
                 f"similar residuals against the {reference_name} ({match.residuals_text})",
-                f"Give `frame`{' or `yaw_deg` auto' if match.is_rotated else ''}",
+                f"Give `frame`{' or `yaw_deg` auto' if match.is_given_yaw_wrong else ''}",
             )
 
 

@@ -334,7 +334,7 @@ def _compare_with_ekf2(
 def _describe_frame_conflict(match: Match, distance_to_ekf2_m: Array | None, yaw_rad: float) -> str:
     reference_name = match.reference.name
     fit = match.estimated_yaw_fit
-    is_rotated = match.is_rotated
+    is_rotated = match.is_given_yaw_wrong
     shift_text, shift_m = "", 0.0
     if distance_to_ekf2_m is not None:
         residual_m = compute_clipped_rms_m(distance_to_ekf2_m) / np.sqrt(2.0)

@@ -12,7 +12,7 @@ from px4fuse.diagnose import diagnose_or_check_aids
 from px4fuse.errors import LogError, ResultsError
 from px4fuse.filter.settings import Settings
 from px4fuse.request import ComparisonRequest
-from px4fuse.results.build import make_compare_results
+from px4fuse.results.build import make_comparison_or_aids_results
 from px4fuse.results.contract import AidsResults, ComparisonResults, to_json
 from px4fuse.results.reading import MAX_RESULTS_BYTES, read_results
 from px4fuse.verification.pdf_input import MAX_PDF_BYTES, read_attached_results
@@ -94,7 +94,7 @@ def _analyse_log(
         )
     analysis = diagnose_or_check_aids(request, progress)
     # to_json rounds all numbers, as in a report
-    results_json = to_json(make_compare_results(request, analysis))
+    results_json = to_json(make_comparison_or_aids_results(request, analysis))
     results = read_results(results_json.encode())
     assert isinstance(results, Results)
     return InputResults(display_name(path), "log", results)

@@ -83,7 +83,7 @@ def _compare_log(job: Job, path: Path, sha256: str) -> LogOutcome:
     # slow imports, which only the worker processes need
     from px4fuse.analysis import AidingSourceAnalysis  # noqa: PLC0415
     from px4fuse.diagnose import diagnose_or_check_aids, read_flight  # noqa: PLC0415
-    from px4fuse.results.build import make_log_record, results  # noqa: PLC0415
+    from px4fuse.results.build import make_comparison_results, make_log_record  # noqa: PLC0415
     from px4fuse.results.contract import to_json  # noqa: PLC0415
 
     request = msgspec.structs.replace(job.request, log=str(path))
@@ -100,7 +100,7 @@ def _compare_log(job: Job, path: Path, sha256: str) -> LogOutcome:
             return LogOutcome(
                 sha256, (row | make_failure_row(missing_data, STATUS_NOT_COMPARED, path.name),)
             )
-        comparison_results = results(request, analysis)
+        comparison_results = make_comparison_results(request, analysis)
         results_json, report_pdf = to_json(comparison_results), b""
         if job.writes_report:
             from px4fuse.report.pdf import render_pdf  # noqa: PLC0415

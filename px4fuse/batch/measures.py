@@ -10,7 +10,7 @@ from px4fuse.batch.rows import find_value, read_rows
 from px4fuse.comparison.model import FILTER_NAMES
 from px4fuse.filter.frame_rotation import HeadingError
 from px4fuse.filter.signals import AISLE
-from px4fuse.filter.time_offset import ClockOffset
+from px4fuse.filter.time_offset import SourceTimeOffset
 from px4fuse.flight.ekf2_parameters import AIDS
 from px4fuse.results.contract import AidsResults, ComparisonResults, ConfidenceInterval
 
@@ -56,7 +56,7 @@ def collect_compared_numbers(results: ComparisonResults | AidsResults) -> dict[s
             record_path, _, field_name = path.rpartition(".")
             record, first_key = find_value(results, record_path), keys[0] if keys else ""
             value = getattr(record, field_name, None)
-            is_undetermined = isinstance(record, ClockOffset) and not record.is_determinable
+            is_undetermined = isinstance(record, SourceTimeOffset) and not record.is_determinable
             is_undetermined |= isinstance(record, HeadingError) and record.drifts
             is_duplicate = pattern.startswith("aids.") and first_key in aids_of_position_source
             if pattern == "axes.*.rejected_fraction":

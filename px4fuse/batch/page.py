@@ -30,7 +30,11 @@ from px4fuse.report.card_html import SIGMA_RATIO_AXIS
 from px4fuse.report.card_text import SEVERITY_SIGNS, SYMBOL_BY_REFERENCE, format_consistent_ratios
 
 # Columns of σ ratios from innovations (source) and from errors against ground truth (truth)
-SIGMA_RATIO_COLUMNS = ("kf_source", "kf_truth", "ekf2_source", "ekf2_truth")
+SIGMA_RATIO_COLUMNS = tuple(
+    f"{filter_name}_{reference}"
+    for filter_name in FILTER_NAMES
+    for reference in SYMBOL_BY_REFERENCE
+)
 SEVERITIES = list(SEVERITY_SIGNS)
 FILE_LINKS = (("Report (PDF)", "report"), ("Results (JSON)", "results"))
 # Columns with one value per axis
@@ -233,27 +237,34 @@ def summarise_logs(table: pd.DataFrame) -> list[LogSummary]:
 
 
 def _summarise_log(rows: Sequence[Mapping[str, Any]]) -> LogSummary:
-    """Combine the table rows of one log, one per axis, into one summary."""
-    log: dict[str, Any] = {}
+    """Combine the table rows of one log, one per axis, into one summary.
+
+    The summary contains the values of the preferred axis, and values that combine all axes.
+    """
+    summary: dict[str, Any] = {}
+    # The values of a preferred axis replace those of the axes before it
     for row in sorted(
         rows, key=lambda row: AXES_BY_PREFERENCE.index(row.get("axis", "aisle")), reverse=True
     ):
-        log |= row
+        summary |= row
     is_done = any(row["status"] == STATUS_DONE for row in rows)
     reasons_and_remedies = ((row.get("reason", ""), row.get("remedy", "")) for row in rows)
     status = STATUS_DONE if is_done else rows[0]["status"]
     status_text = status if status == STATUS_NOT_COMPARED else "refused"
-    log |= {
+    remedy = "" if "headline" in summary else summary.get("remedy", "")
+    verdicts = summary.get("verdicts", "").split(FINDING_SEPARATOR)
+    summary |= {
         "status": status,
         "missing_results": tuple(dict.fromkeys(pair for pair in reasons_and_remedies if any(pair))),
         "axes": [row for row in rows if "axis" in row],
-        "findings": [id_ for id_ in log.get("findings", "").split(FINDING_SEPARATOR) if id_],
-        "severity": log.get("severity", "refused"),
-        "headline": log.get("headline", f"{status_text}: {log.get('reason', '')}"),
-        "action": log.get("action") or log.get("remedy", "") * ("headline" not in log),
-        "verdict_texts": (log.get("verdicts", "").split(FINDING_SEPARATOR) + [""] * 4)[:4],
+        "findings": [id_ for id_ in summary.get("findings", "").split(FINDING_SEPARATOR) if id_],
+        "severity": summary.get("severity", "refused"),
+        "headline": summary.get("headline", f"{status_text}: {summary.get('reason', '')}"),
+        "action": summary.get("action") or remedy,
+        # A log without results has no verdicts
+        "verdict_texts": [*verdicts, *[""] * len(SIGMA_RATIO_COLUMNS)][: len(SIGMA_RATIO_COLUMNS)],
     }
-    return log | {"tags": _make_log_tags(log)}
+    return summary | {"tags": _make_log_tags(summary)}
 
 
 def _make_log_tags(log: LogSummary) -> dict[str, str]:

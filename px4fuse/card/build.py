@@ -40,7 +40,7 @@ from px4fuse.comparison.model import (
     select_north_and_east,
 )
 from px4fuse.comparison.remedy import find_aid
-from px4fuse.comparison.trials import classify_improvement
+from px4fuse.comparison.rerun_effects import classify_improvement
 from px4fuse.core.reading import display_name, file_size, read_head
 from px4fuse.core.text import (
     capitalise_first,
@@ -533,11 +533,11 @@ def _describe_difference(effect: FlightErrors, ranked_causes: Sequence[RankedCau
     if effect.difference_rms_m is None or not ranked_causes:
         return ""
     difference_text = _format_difference(effect.difference_rms_m)
-    trials = ranked_causes[0].trials
+    reruns = ranked_causes[0].reruns
     corrected_filters = {
-        trial.filter
-        for trial in trials
-        if "position" in classify_improvement(trial) or not can_show_effect(trial)
+        rerun.filter
+        for rerun in reruns
+        if "position" in classify_improvement(rerun) or not can_show_effect(rerun)
     }
     if len(corrected_filters) == 2:
         return (
@@ -545,7 +545,7 @@ def _describe_difference(effect: FlightErrors, ranked_causes: Sequence[RankedCau
             "hardly shows it."
         )
     rerun_difference_by_filter_m = {
-        trial.filter: trial.after.difference_rms_m for trial in reversed(trials)
+        rerun.filter: rerun.after.difference_rms_m for rerun in reversed(reruns)
     }
     is_only_ekf2_corrected = {"ekf2"} in (corrected_filters, rerun_difference_by_filter_m.keys())
     rerun_difference_rms_m = rerun_difference_by_filter_m.get(

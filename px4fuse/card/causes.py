@@ -7,14 +7,14 @@ from typing import Any, NamedTuple
 from msgspec import structs
 
 from px4fuse.analysis import Analysis
-from px4fuse.card.model import Action, ActionTarget, DiagnosedCause, Rerun, Verdict
+from px4fuse.card.model import Action, ActionTarget, CardRerun, DiagnosedCause, Verdict
 from px4fuse.comparison.changes import SIGMA_A, SIGMA_Z
 from px4fuse.comparison.model import FILTER_NAMES, FilterName
 from px4fuse.comparison.remedy import make_delay_change, select_changed_settings
-from px4fuse.comparison.trials import (
-    CLOCK_OFFSET_KEY,
+from px4fuse.comparison.rerun_effects import (
     OUTLIERS_KEY,
-    Trial,
+    TIME_OFFSET_KEY,
+    Rerun,
     becomes_consistent,
     classify_improvement,
     compare_sigma_ratios,
@@ -71,7 +71,7 @@ class RankedCause(NamedTuple):
     finding: Finding
     rank: int
     log_sigma_ratio_reduction: float
-    trials: tuple[Trial, ...]
+    reruns: tuple[Rerun, ...]
 
 
 def rank_causes(analysis: Analysis, cause_findings: Sequence[Finding]) -> list[RankedCause]:
@@ -80,16 +80,16 @@ def rank_causes(analysis: Analysis, cause_findings: Sequence[Finding]) -> list[R
     for finding in cause_findings:
         if finding.severity == "note":
             continue
-        trials = find_trials_of_finding(analysis.select_main_trials(), finding)
+        reruns = find_reruns_of_finding(analysis.select_main_reruns(), finding)
         if FINDING_CATALOGUE[finding.id].verdict == "repeated":
-            trials = tuple(filter(may_improve_filter, trials))
-        elif trials and not any(
-            has_effect(trial) or not can_show_effect(trial) for trial in trials
+            reruns = tuple(filter(may_improve_filter, reruns))
+        elif reruns and not any(
+            has_effect(rerun) or not can_show_effect(rerun) for rerun in reruns
         ):
             continue
-        log_sigma_ratio_reduction = sum(map(compute_sigma_ratio_improvement, trials))
-        rank = _find_cause_rank(finding, trials)
-        ranked_causes.append(RankedCause(finding, rank, log_sigma_ratio_reduction, trials))
+        log_sigma_ratio_reduction = sum(map(compute_sigma_ratio_improvement, reruns))
+        rank = _find_cause_rank(finding, reruns)
+        ranked_causes.append(RankedCause(finding, rank, log_sigma_ratio_reduction, reruns))
     fault_causes = [
         cause
         for cause in ranked_causes
@@ -111,46 +111,46 @@ def _is_setting_fault(finding: Finding) -> bool:
     return bool(rerun_kinds) and rerun_kinds <= SETTING_CHANGE_KINDS
 
 
-def _find_cause_rank(finding: Finding, trials: Iterable[Trial]) -> int:
+def _find_cause_rank(finding: Finding, reruns: Iterable[Rerun]) -> int:
     if (
         FINDING_CATALOGUE[finding.id].verdict == "meaningless"
         or WRONG_CONVENTION_KEY in finding.evidence
     ):
         return 0
-    if _is_setting_fault(finding) and any(map(remains_overconfident, trials)):
+    if _is_setting_fault(finding) and any(map(remains_overconfident, reruns)):
         return 3
-    if any(becomes_consistent(trial) for trial in trials):
+    if any(becomes_consistent(rerun) for rerun in reruns):
         return 1
-    if any(halves_discrepancy(trial) for trial in trials):
+    if any(halves_discrepancy(rerun) for rerun in reruns):
         return 2
     return 3 if finding.severity == "error" else 4
 
 
-def find_trials_of_finding(trials: Iterable[Trial], finding: Finding) -> tuple[Trial, ...]:
+def find_reruns_of_finding(reruns: Iterable[Rerun], finding: Finding) -> tuple[Rerun, ...]:
     """Return the best re-run of each filter and kind of change that tests a finding."""
     tested_change_kinds = FINDING_CATALOGUE[finding.id].rerun_kinds
     tested_change_kinds |= {"defaults"} if "noises" in tested_change_kinds else set()
-    best_trial_by_filter_and_kind: dict[tuple[FilterName, str], Trial] = {}
-    for trial in trials:
-        if len(trial.kinds) == 1 and trial.kinds[0] in tested_change_kinds:
-            key = trial.filter, trial.kinds[0]
-            best_trial_by_filter_and_kind[key] = min(
-                trial, best_trial_by_filter_and_kind.get(key, trial), key=compute_preference_key
+    best_rerun_by_filter_and_kind: dict[tuple[FilterName, str], Rerun] = {}
+    for rerun in reruns:
+        if len(rerun.kinds) == 1 and rerun.kinds[0] in tested_change_kinds:
+            key = rerun.filter, rerun.kinds[0]
+            best_rerun_by_filter_and_kind[key] = min(
+                rerun, best_rerun_by_filter_and_kind.get(key, rerun), key=compute_preference_key
             )
-    return tuple(best_trial_by_filter_and_kind.values())
+    return tuple(best_rerun_by_filter_and_kind.values())
 
 
-def can_show_effect(trial: Trial) -> bool:
+def can_show_effect(rerun: Rerun) -> bool:
     """Return False if only ground truth could show the effect of a re-run, but is not logged."""
-    has_truth = trial.before.position_rmse_m is not None
+    has_truth = rerun.before.position_rmse_m is not None
     return (
-        has_truth or CHANGE_KINDS_VISIBLE_ONLY_IN_TRUTH.isdisjoint(trial.kinds) or has_effect(trial)
+        has_truth or CHANGE_KINDS_VISIBLE_ONLY_IN_TRUTH.isdisjoint(rerun.kinds) or has_effect(rerun)
     )
 
 
-def may_improve_filter(trial: Trial) -> bool:
+def may_improve_filter(rerun: Rerun) -> bool:
     """Return True if a re-run improves the filter, or if the log cannot show its effect."""
-    return classify_improvement(trial) != "nothing" or not can_show_effect(trial)
+    return classify_improvement(rerun) != "nothing" or not can_show_effect(rerun)
 
 
 def make_cause(
@@ -160,17 +160,17 @@ def make_cause(
     request: ComparisonRequest,
 ) -> DiagnosedCause:
     """Describe a fault, with actions for position source, KF and EKF2."""
-    finding, trials = ranked_cause.finding, ranked_cause.trials
-    useful_trials = [trial for trial in trials if may_improve_filter(trial)]
+    finding, reruns = ranked_cause.finding, ranked_cause.reruns
+    useful_reruns = [rerun for rerun in reruns if may_improve_filter(rerun)]
     alternative_action_groups, actions = _make_actions(
-        analysis, ranked_cause, useful_trials, sigma_verdicts, request
+        analysis, ranked_cause, useful_reruns, sigma_verdicts, request
     )
     return structs.replace(
         make_cause_without_reruns(finding),
         alternatives=alternative_action_groups,
         actions=actions,
-        reruns=tuple(_make_rerun(trial, trials) for trial in trials if can_show_effect(trial)),
-        after=_format_closing_sentence(analysis, useful_trials, alternative_action_groups),
+        reruns=tuple(_make_card_rerun(rerun, reruns) for rerun in reruns if can_show_effect(rerun)),
+        after=_format_closing_sentence(analysis, useful_reruns, alternative_action_groups),
     )
 
 
@@ -189,7 +189,7 @@ def make_cause_without_reruns(finding: Finding) -> DiagnosedCause:
 def _make_actions(
     analysis: Analysis,
     ranked_cause: RankedCause,
-    useful_trials: Sequence[Trial],
+    useful_reruns: Sequence[Rerun],
     sigma_verdicts: Sequence[Verdict],
     request: ComparisonRequest,
 ) -> tuple[tuple[tuple[Action, ...], ...], tuple[Action, ...]]:
@@ -198,41 +198,41 @@ def _make_actions(
     The user takes all actions of one group, and all further actions.
     """
     finding = ranked_cause.finding
-    trial_by_filter_and_kind = {(trial.filter, trial.kinds[0]): trial for trial in useful_trials}
-    delay_trial = trial_by_filter_and_kind.get(("ekf2", "delay"))
-    offset_trial = trial_by_filter_and_kind.get(
+    rerun_by_filter_and_kind = {(rerun.filter, rerun.kinds[0]): rerun for rerun in useful_reruns}
+    delay_rerun = rerun_by_filter_and_kind.get(("ekf2", "delay"))
+    offset_rerun = rerun_by_filter_and_kind.get(
         ("ekf2", "time offset")
-    ) or trial_by_filter_and_kind.get(("kf", "time offset"))
-    actions = _make_sender_actions(analysis, ranked_cause, offset_trial, request)
+    ) or rerun_by_filter_and_kind.get(("kf", "time offset"))
+    actions = _make_sender_actions(analysis, ranked_cause, offset_rerun, request)
     alternative_action_groups: tuple[tuple[Action, ...], ...] = ()
-    if delay_trial:
+    if delay_rerun:
         # Separate actions for parameters that the time shift also changes (EKF2_DELAY_MAX)
-        offset_setting_names = offset_trial.change.keys() if offset_trial else ()
+        offset_setting_names = offset_rerun.change.keys() if offset_rerun else ()
         delay_parameter_values = {
             name: value
-            for name, value in delay_trial.change.items()
+            for name, value in delay_rerun.change.items()
             if name not in offset_setting_names
         }
         delay_action = make_parameter_action(analysis, delay_parameter_values)
-        if offset_trial:
+        if offset_rerun:
             actions, alternative_action_groups = [], (tuple(actions), (delay_action,))
         else:
             actions = [delay_action]
-    elif not offset_trial and _is_setting_fault(finding) and ranked_cause.trials:
+    elif not offset_rerun and _is_setting_fault(finding) and ranked_cause.reruns:
         actions = []
-    for (filter_name, kind), trial in trial_by_filter_and_kind.items():
-        change = dict(trial.change)
+    for (filter_name, kind), rerun in rerun_by_filter_and_kind.items():
+        change = dict(rerun.change)
         if filter_name == "ekf2":
             change = {name: value for name, value in change.items() if name in PARAMETERS}
             if change and kind != "delay":
                 actions.append(make_parameter_action(analysis, change))
         elif kind != "defaults" and change.keys() <= COMPARISON_OPTIONS.keys():
-            defaults_trial = trial_by_filter_and_kind.get(("kf", "defaults"))
-            default_settings = defaults_trial.change if defaults_trial and kind == "noises" else {}
+            defaults_rerun = rerun_by_filter_and_kind.get(("kf", "defaults"))
+            default_settings = defaults_rerun.change if defaults_rerun and kind == "noises" else {}
             # --clock-offset replaces the offset from the alignment, so it must include that offset
-            if CLOCK_OFFSET_KEY in change and (alignment := analysis.source.alignment):
-                total_s = change[CLOCK_OFFSET_KEY] + alignment.clock_offset_s
-                change[CLOCK_OFFSET_KEY] = round(total_s, 3)
+            if TIME_OFFSET_KEY in change and (alignment := analysis.source.alignment):
+                total_s = change[TIME_OFFSET_KEY] + alignment.clock_offset_s
+                change[TIME_OFFSET_KEY] = round(total_s, 3)
             actions.append(make_rerun_action(request, change, default_settings))
     # First correct the vehicle, then KF
     actions.sort(key=lambda action: action.target == "KF")
@@ -254,20 +254,20 @@ def _make_actions(
 def _make_sender_actions(
     analysis: Analysis,
     ranked_cause: RankedCause,
-    offset_trial: Trial | None,
+    offset_rerun: Rerun | None,
     request: ComparisonRequest,
 ) -> list[Action]:
     """Return the action on the position source, or on the delay of GNSS in EKF2."""
     finding, source, model = ranked_cause.finding, analysis.source, analysis.ekf2_model
     # users cannot shift the timestamps of a GNSS receiver
-    if offset_trial and not (source.origin.is_gnss and finding.remedy):
-        shift_s = offset_trial.change[CLOCK_OFFSET_KEY]
-        if offset_trial.filter == "kf":
+    if offset_rerun and not (source.origin.is_gnss and finding.remedy):
+        shift_s = offset_rerun.change[TIME_OFFSET_KEY]
+        if offset_rerun.filter == "kf":
             shift_s -= analysis.settings.clock_offset_s
         return [Action("sender", lowercase_first_letter(format_sender_action(source, shift_s)))]
     if (
         finding.id == "ekf2_gps_delay_wrong"
-        and not ranked_cause.trials  # estimated by re-runs of the finding itself
+        and not ranked_cause.reruns  # estimated by re-runs of the finding itself
         and not isinstance(model, Unavailable)
     ):
         delay_change = make_delay_change(model.inputs, float(finding.evidence["estimate_ms"]))
@@ -354,44 +354,45 @@ def make_parameter_action(analysis: Analysis, change: Mapping[str, float]) -> Ac
     return Action("EKF2", ", ".join(change_texts), tuple(commands), "console")
 
 
-def _make_rerun(trial: Trial, trials: Sequence[Trial]) -> Rerun:
-    before, after = trial.before, trial.after
+def _make_card_rerun(rerun: Rerun, reruns: Sequence[Rerun]) -> CardRerun:
+    before, after = rerun.before, rerun.after
     values_before_and_after: dict[str, Any] = {
-        f"{reference}_ratio": tuple(ratios) for reference, *ratios in compare_sigma_ratios(trial)
+        f"{reference}_ratio": tuple(ratios) for reference, *ratios in compare_sigma_ratios(rerun)
     }
     values_before_and_after["position_rmse_m"] = before.position_rmse_m, after.position_rmse_m
     rejected_fractions = before.rejected_fraction, after.rejected_fraction
     if max(fraction or 0.0 for fraction in rejected_fractions) >= MIN_REJECTED_FRACTION_TO_SHOW:
         values_before_and_after["rejected_fraction"] = rejected_fractions
-    return Rerun(
-        label=_format_trial_label(trial, trials),
-        is_prediction=trial.filter == "ekf2",
-        from_s=trial.from_s,
-        improves=classify_improvement(trial),
+    return CardRerun(
+        label=_format_rerun_label(rerun, reruns),
+        is_prediction=rerun.filter == "ekf2",
+        from_s=rerun.from_s,
+        improves=classify_improvement(rerun),
         **{name: pair for name, pair in values_before_and_after.items() if None not in pair},
     )
 
 
-def _format_trial_label(trial: Trial, trials: Sequence[Trial]) -> str:
-    kind, label = trial.kinds[0], "KF" if trial.filter == "kf" else "EKF2 (replay)"
-    if OUTLIERS_KEY in trial.change:
-        return f"{label} without {trial.change[OUTLIERS_KEY]:.0f} outliers"
-    if trial.filter == "kf":
+def _format_rerun_label(rerun: Rerun, reruns: Sequence[Rerun]) -> str:
+    kind, is_ekf2 = rerun.kinds[0], rerun.filter == "ekf2"
+    label = FILTER_NAMES[rerun.filter] + (" (replay)" if is_ekf2 else "")
+    if OUTLIERS_KEY in rerun.change:
+        return f"{label} without {rerun.change[OUTLIERS_KEY]:.0f} outliers"
+    if not is_ekf2:
         options_text = " ".join(
             f"{COMPARISON_OPTIONS[name]} {value:g}"
-            for name, value in trial.change.items()
+            for name, value in rerun.change.items()
             if name in (SIGMA_A, SIGMA_Z)
         )
         prefix = "default " if kind == "defaults" else ""
         return f"{label}, {prefix}{options_text}" if options_text else label
-    if sum(other_trial.filter == "ekf2" for other_trial in trials) < 2:
+    if sum(other_rerun.filter == "ekf2" for other_rerun in reruns) < 2:
         return label
     return f"{label}, {'sender' if kind == 'time offset' else 'parameters'}"
 
 
 def _format_closing_sentence(
     analysis: Analysis,
-    useful_trials: Sequence[Trial],
+    useful_reruns: Sequence[Rerun],
     alternative_action_groups: Sequence[tuple[Action, ...]],
 ) -> str:
     if alternative_action_groups:
@@ -399,19 +400,19 @@ def _format_closing_sentence(
             "For the next flights, correct either the sender or the delay parameter, not both. "
             "--clock-offset corrects only this analysis."
         )
-    if any(trial.kinds == ("defaults",) for trial in useful_trials):
+    if any(rerun.kinds == ("defaults",) for rerun in useful_reruns):
         return "KF is consistent with the default noises as well as with the estimated noises."
     tuning = analysis.tuning.get(HORIZONTAL)
-    for trial in useful_trials:
-        if trial.kinds == ("noise",) and isinstance(tuning, AxisTuning):
-            default_noise_m = analysis.flight.log.find_default_value(next(iter(trial.change)))
+    for rerun in useful_reruns:
+        if rerun.kinds == ("noise",) and isinstance(tuning, AxisTuning):
+            default_noise_m = analysis.flight.log.find_default_value(next(iter(rerun.change)))
             if (tuning.sigma_z.low or 0.0) <= default_noise_m <= (tuning.sigma_z.high or 0.0):
                 return (
                     f"PX4's default of {default_noise_m:g} m is inside the 95 % interval of the "
                     "estimate, so the default is as good as the estimate."
                 )
     sigma_ratios_against_truth = [
-        math.sqrt(trial.after.nees_mean) for trial in useful_trials if trial.after.nees_mean
+        math.sqrt(rerun.after.nees_mean) for rerun in useful_reruns if rerun.after.nees_mean
     ]
     if (
         sigma_ratios_against_truth

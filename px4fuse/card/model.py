@@ -7,7 +7,7 @@ from typing import Annotated, Literal
 from msgspec import Meta
 
 from px4fuse.comparison.model import FilterName
-from px4fuse.comparison.trials import Improvement
+from px4fuse.comparison.rerun_effects import Improvement
 from px4fuse.core.record import Count, NotNegative, PositiveFloat, Record, Share, Span
 from px4fuse.filter.consistency import Reference
 
@@ -113,7 +113,7 @@ class Action(Record):
     where: Literal["shell", "console", ""] = ""
 
 
-class Rerun(Record, kw_only=True):
+class CardRerun(Record, kw_only=True):
     """Statistics of KF or EKF2 before and after one change of a setting or of the data.
 
     Attributes
@@ -153,7 +153,7 @@ class DiagnosedCause(Record, kw_only=True):
         Groups of actions; one group is necessary.
     actions : tuple of Action
         Further necessary actions.
-    reruns : tuple of Rerun
+    reruns : tuple of CardRerun
         Runs of KF and replays of EKF2 without the fault.
     after : str
         Closing sentence, for example on an error that remains after the actions.
@@ -166,7 +166,7 @@ class DiagnosedCause(Record, kw_only=True):
     spans_s: tuple[Span, ...] = ()
     alternatives: tuple[tuple[Action, ...], ...] = ()
     actions: tuple[Action, ...] = ()
-    reruns: tuple[Rerun, ...] = ()
+    reruns: tuple[CardRerun, ...] = ()
     after: str = ""
 
 

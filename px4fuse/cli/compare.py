@@ -53,7 +53,7 @@ def compare(
     from px4fuse.core.memory import release_free_memory
     from px4fuse.diagnose import diagnose_or_check_aids
     from px4fuse.report.terminal import make_card_page, make_comparison_page
-    from px4fuse.results.build import make_compare_results
+    from px4fuse.results.build import make_comparison_or_aids_results
 
     student = options.read_student(option_values, log)
     request = options.comparison_request(log, option_values)
@@ -62,7 +62,7 @@ def compare(
     try:
         with outputs.progress(json_path) as show_progress:
             outcome = diagnose_or_check_aids(request, show_progress)
-            results = make_compare_results(request, outcome, student)
+            results = make_comparison_or_aids_results(request, outcome, student)
             # keep the peak memory low: the next step imports the report modules
             release_free_memory()
             contents = outputs.make_result_files(

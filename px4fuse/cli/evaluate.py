@@ -68,9 +68,9 @@ _evaluation_option = partial(options.request_option, EvaluationRequest)
     "Time (s) to add to the timestamps of the estimate; auto estimates it from the motion.  "
     "[default: auto if the two trajectories do not overlap in time, else 0]",
 )
-@options.flag_option(
-    "--consecutive",
-    help="Compute the RPE over consecutive, non-overlapping pairs of poses instead of all pairs.",
+@_evaluation_option(
+    "consecutive",
+    "Compute the RPE over consecutive, non-overlapping pairs of poses instead of all pairs.",
 )
 @options.system_option
 @options.max_size_option
@@ -109,7 +109,9 @@ def evaluate(
     with outputs.progress(json_path) as show_progress:
         show_progress("reading")
         estimate_source = read_source(request.estimate, system=request.system)
-        reference_source = read_source(request.reference, default="truth", system=request.system)
+        reference_source = read_source(
+            request.reference, default_track="truth", system=request.system
+        )
         show_progress("computing errors")
         evaluation = evaluate_trajectory(
             estimate_source.trajectory,

@@ -236,6 +236,8 @@ def request_option(
 ) -> OptionDecorator:
     """Make the option for a field of ``request_type``, with its type, unit and default.
 
+    The unit follows from the suffix of the name; an option for a bool is a flag.
+
     RANGE in ``help_text`` is replaced by the range of the KF setting. ``example`` is a valid value
     for the error message. ``details`` are arguments of ``click.option``.
     """
@@ -243,12 +245,13 @@ def request_option(
     types = (field.type, *get_args(field.type))
     literal_types = [each for each in types if get_origin(each) is Literal]
     if float in types:
-        unit = next(unit for suffix, unit in UNIT_BY_SUFFIX.items() if name.endswith(suffix))
+        units = (unit for suffix, unit in UNIT_BY_SUFFIX.items() if name.endswith(suffix))
         details["type"] = NumberWithUnit(
-            unit, field.default or example, accepts_auto=bool(literal_types)
+            next(units, ""), field.default or example, accepts_auto=bool(literal_types)
         )
     elif literal_types:
         details["type"] = Choice(get_args(literal_types[0]))
+    details["is_flag"] = field.type is bool
     if field.default:
         details["default"] = field.default
     if name in SETTING_RANGES:

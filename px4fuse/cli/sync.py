@@ -20,7 +20,7 @@ def sync(log: Path, json_path: Path | None, **option_values: Any) -> None:
     from the IMU and the positions (EKF2's attitude is not used). LOG is a PX4 ULog or a MAVLink
     recording.
     """
-    from px4fuse.comparison.estimates import estimate_noises_and_clock
+    from px4fuse.comparison.estimates import estimate_noises_and_time_offset
     from px4fuse.comparison.reruns import rerun_kf_with_time_offset
     from px4fuse.diagnose import prepare_comparison, read_flight
     from px4fuse.errors import MissingDataError
@@ -33,13 +33,13 @@ def sync(log: Path, json_path: Path | None, **option_values: Any) -> None:
     with progress(json_path) as show_progress:
         flight = read_flight(request, show_progress)
         comparison = prepare_comparison(flight, request, show_progress)
-        _, time_offset = estimate_noises_and_clock(comparison, show_progress)
-        trial = None
+        _, time_offset = estimate_noises_and_time_offset(comparison, show_progress)
+        rerun = None
         if not isinstance(time_offset, Unavailable) and time_offset.is_significant(
             time_offset.remaining_s
         ):
-            trial = rerun_kf_with_time_offset(comparison, time_offset)
-    advice = make_time_offset_advice(comparison, time_offset, trial)
+            rerun = rerun_kf_with_time_offset(comparison, time_offset)
+    advice = make_time_offset_advice(comparison, time_offset, rerun)
     if isinstance(time_offset, Unavailable) or not time_offset.is_determinable:
         log_name = comparison.flight.log.name
         remedy = time_offset.remedy if isinstance(time_offset, Unavailable) else advice["Action"]

@@ -1,6 +1,6 @@
 """Changes of noises, delays or data that may make KF or EKF2 consistent.
 
-In all functions, ``ekf2_inputs`` is None if KF is re-run.
+In all functions, ``ekf2_inputs`` is None if the filter is not EKF2.
 """
 
 from collections.abc import Iterable
@@ -8,20 +8,20 @@ from collections.abc import Iterable
 import numpy as np
 
 from px4fuse.comparison.estimates import Estimates, TuningByAxis, find_first_tuning
-from px4fuse.comparison.model import AxisComparison, Comparison, FilterSummary
+from px4fuse.comparison.model import AxisComparison, Comparison, FilterName, FilterSummary
 from px4fuse.comparison.remedy import (
     make_delay_max_change,
     make_estimated_delay_change,
     make_estimated_noise_change,
 )
-from px4fuse.comparison.trials import (
-    CLOCK_OFFSET_KEY,
+from px4fuse.comparison.rerun_effects import (
     CONSISTENCY_STATISTICS,
     FORWARD_BIAS_KEY,
     OUTLIERS_KEY,
     RIGHT_BIAS_KEY,
     ROTATION_KEY,
     SECONDARY_CHANGE_KEYS,
+    TIME_OFFSET_KEY,
     Change,
     Statistic,
 )
@@ -40,7 +40,7 @@ KIND_BY_CHANGE_NAME = {
     SIGMA_A: "noises",
     SIGMA_Z: "noises",
     OUTLIERS_KEY: "outliers",
-    CLOCK_OFFSET_KEY: "time offset",
+    TIME_OFFSET_KEY: "time offset",
     ROTATION_KEY: "rotation",
     FORWARD_BIAS_KEY: "bias",
     RIGHT_BIAS_KEY: "bias",
@@ -64,12 +64,13 @@ MIN_MISALIGNMENT_SIGMAS = 3.0
 def find_candidate_changes(
     comparison: Comparison,
     estimates: Estimates,
+    filter_name: FilterName,
     ekf2_inputs: ReplayInputs | None,
     axis_result: AxisComparison,
     statistic: Statistic,
 ) -> list[Change]:
     """Return the changes of settings or data that may correct the mean NIS or NEES of a filter."""
-    summary = axis_result.filters["kf" if ekf2_inputs is None else "ekf2"]
+    summary = axis_result.filters[filter_name]
     assert isinstance(summary, FilterSummary)  # an UntestedFilter has no mean NIS or NEES
     is_underconfident = statistic == "nis" and summary.nis_mean < 1.0
     axis_tuning = find_axis_tuning(estimates.tuning, axis_result.axis.name)
@@ -89,7 +90,7 @@ def find_candidate_changes(
     if axis_tuning is not None and not is_underconfident and len(axis_tuning.outlier_time_s):
         changes.append({OUTLIERS_KEY: float(len(axis_tuning.outlier_time_s))})
     delay_change = ekf2_inputs and make_estimated_delay_change(
-        comparison, ekf2_inputs, estimates.clock
+        comparison, ekf2_inputs, estimates.time_offset
     )
     changes += [delay_change] if delay_change else _find_offset_changes(estimates, ekf2_inputs)
     if axis_result.axis.name == "down":
@@ -108,14 +109,17 @@ def find_candidate_changes(
 
 
 def find_main_axis_changes(
-    comparison: Comparison, estimates: Estimates, ekf2_inputs: ReplayInputs | None
+    comparison: Comparison,
+    estimates: Estimates,
+    filter_name: FilterName,
+    ekf2_inputs: ReplayInputs | None,
 ) -> list[Change]:
     """Return the changes of settings or data for re-runs along the main axis."""
     changes = remove_repeated_changes(
         change
         for statistic in CONSISTENCY_STATISTICS[::-1]
         for change in find_candidate_changes(
-            comparison, estimates, ekf2_inputs, comparison.main, statistic
+            comparison, estimates, filter_name, ekf2_inputs, comparison.main, statistic
         )
     )
     if ekf2_inputs is not None:
@@ -132,6 +136,7 @@ def find_main_axis_changes(
 
 
 def remove_repeated_changes(changes: Iterable[Change]) -> list[Change]:
+    """Return equal changes only once, at the place of the first."""
     return list({frozenset(change.items()): change for change in changes}.values())
 
 
@@ -167,18 +172,18 @@ def find_axis_tuning(tuning: TuningByAxis, axis: str) -> AxisTuning | None:
 
 def _find_offset_changes(estimates: Estimates, ekf2_inputs: ReplayInputs | None) -> list[Change]:
     """Return the change that corrects the time offset, if the time offset is significant."""
-    clock_offset = estimates.clock
+    time_offset = estimates.time_offset
     if (
-        isinstance(clock_offset, Unavailable)
-        or not clock_offset.is_determinable
-        or not clock_offset.is_significant(
-            clock_offset.offset_s if ekf2_inputs else clock_offset.remaining_s
+        isinstance(time_offset, Unavailable)
+        or not time_offset.is_determinable
+        or not time_offset.is_significant(
+            time_offset.offset_s if ekf2_inputs else time_offset.remaining_s
         )
     ):
         return []
-    change = {CLOCK_OFFSET_KEY: round(clock_offset.offset_s, 3)}
+    change = {TIME_OFFSET_KEY: round(time_offset.offset_s, 3)}
     if ekf2_inputs is not None:
-        position_age_ms = ekf2_inputs.settings[ekf2_inputs.aid.delay] - 1e3 * clock_offset.offset_s
+        position_age_ms = ekf2_inputs.settings[ekf2_inputs.aid.delay] - 1e3 * time_offset.offset_s
         change |= make_delay_max_change(ekf2_inputs.settings, position_age_ms)
     return [change]
 

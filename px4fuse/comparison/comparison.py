@@ -22,12 +22,10 @@ from px4fuse.comparison.model import (
 from px4fuse.core.arrays import Array
 from px4fuse.filter.consistency import (
     DEFAULT_GATE,
-    Consistency,
     HorizontalNis,
     assess_horizontal_nis,
-    assess_innovations,
 )
-from px4fuse.filter.kalman import Replay, predict_state, predict_variance, replay
+from px4fuse.filter.kalman import KfRun, predict_state, predict_variance, run_kf
 from px4fuse.filter.model import STATE_COLUMNS
 from px4fuse.filter.signals import Axis, Segment
 from px4fuse.flight.model import (
@@ -60,7 +58,7 @@ def compare(prepared_comparison: PreparedComparison) -> Comparison:
     }
     horizontal_axes = [axes[name] for name in ("north", "east") if name in axes]
     innovations: dict[FilterName, list[TableOrUnavailable]] = {
-        "kf": [axis.replay.updates for axis in horizontal_axes],
+        "kf": [axis.kf_run.updates for axis in horizontal_axes],
         "ekf2": [axis.ekf2_innovations for axis in horizontal_axes],
     }
     horizontal_nis = {
@@ -68,15 +66,16 @@ def compare(prepared_comparison: PreparedComparison) -> Comparison:
         for name, tables in innovations.items()
         if (nis := _assess_horizontal_innovations(tables))
     }
-    prepared_comparison = replace(prepared_comparison, notes=notes)
-    return Comparison(**vars(prepared_comparison), axes=axes, horizontal=horizontal_nis)
+    return Comparison(
+        **vars(prepared_comparison) | {"notes": notes}, axes=axes, horizontal=horizontal_nis
+    )
 
 
 def _compare_axis(
     prepared_comparison: PreparedComparison, ekf2: Ekf2 | Unavailable, axis: Axis
 ) -> AxisComparison:
     segment, flight = prepared_comparison.segment, prepared_comparison.flight
-    kf_run = replay(axis, prepared_comparison.settings)
+    kf_run = run_kf(axis, prepared_comparison.settings)
     tracks = project_tracks(ekf2, flight.truth, axis, segment)
     ekf2_state, ekf2_variance, truth = tracks.values()
     ekf2_errors = compute_error_statistics(ekf2_state, ekf2_variance, truth)
@@ -124,7 +123,7 @@ def _compare_axis(
         difference=compute_difference_statistics(kf_run, ekf2_state),
         rejected_fraction=float(rejected_flags.mean()) if len(rejected_flags) else None,
         axis=axis,
-        replay=kf_run,
+        kf_run=kf_run,
         ekf2_innovations=innovations,
         **tracks,
         whole_flight_tracks=tracks
@@ -153,7 +152,7 @@ def _summarise_filter(
     truth: ErrorsAgainstTruth | Unavailable,
     gate: float,
 ) -> FilterSummary | UntestedFilter:
-    sigmas: dict[str, Any] = {
+    fields: dict[str, Any] = {
         name: float(np.sqrt(values.median())) if len(values) else None
         for name, values in (
             ("sigma_p_median_m", _drop_missing_values(variance, "position_variance_m2")),
@@ -161,16 +160,16 @@ def _summarise_filter(
             ("sigma_p_before_update_m", _drop_missing_values(innovations, "prior_variance_m2")),
             ("sigma_p_after_update_m", _drop_missing_values(innovations, "posterior_variance_m2")),
         )
-    }
-    consistency: Consistency | Unavailable
+    } | {"truth": truth}
+    summary: FilterSummary | Unavailable
     if isinstance(innovations, Unavailable):
-        consistency = innovations
+        summary = innovations
     else:
         innovation_m, variance_m2 = innovations[INNOVATION_COLUMNS].to_numpy().T
-        consistency = assess_innovations(innovation_m, variance_m2, gate)
-    if isinstance(consistency, Unavailable):
-        return UntestedFilter(**structs.asdict(consistency), **sigmas, truth=truth)
-    return FilterSummary(**structs.asdict(consistency), **sigmas, truth=truth)
+        summary = FilterSummary.from_innovations(innovation_m, variance_m2, gate, **fields)
+    if isinstance(summary, Unavailable):
+        return UntestedFilter(**structs.asdict(summary), **fields)
+    return summary
 
 
 def _drop_missing_values(table: TableOrUnavailable, column: str) -> pd.Series:
@@ -178,7 +177,7 @@ def _drop_missing_values(table: TableOrUnavailable, column: str) -> pd.Series:
 
 
 def compute_difference_statistics(
-    kf_run: Replay, ekf2_state: TableOrUnavailable
+    kf_run: KfRun, ekf2_state: TableOrUnavailable
 ) -> Difference | Unavailable:
     """Compute the difference KF - EKF2 along one axis at EKF2's sample times."""
     if isinstance(ekf2_state, Unavailable):
@@ -210,21 +209,21 @@ def _compute_rmse(error: Array) -> float:
 
 
 def compute_kf_error_statistics(
-    kf_run: Replay, truth: TableOrUnavailable, ekf2_state: TableOrUnavailable
+    kf_run: KfRun, truth: TableOrUnavailable, ekf2_state: TableOrUnavailable
 ) -> ErrorsAgainstTruth | Unavailable:
     """Compute the errors of KF against ground truth along one axis."""
     return compute_error_statistics(*_compute_kf_track(kf_run, ekf2_state), truth)
 
 
 def _compute_kf_track(
-    kf_run: Replay, ekf2_state: TableOrUnavailable
+    kf_run: KfRun, ekf2_state: TableOrUnavailable
 ) -> tuple[pd.DataFrame, pd.DataFrame]:
     """Return state and variances of KF at EKF2's sample times, if EKF2 is logged."""
     output_times_s = (kf_run.steps if isinstance(ekf2_state, Unavailable) else ekf2_state).index
     return sample_kf_run(kf_run, output_times_s.to_numpy())
 
 
-def sample_kf_run(kf_run: Replay, times_s: Array) -> tuple[pd.DataFrame, pd.DataFrame]:
+def sample_kf_run(kf_run: KfRun, times_s: Array) -> tuple[pd.DataFrame, pd.DataFrame]:
     """Return state and variances of KF at ``times_s`` (s)."""
     state, variance = (
         pd.DataFrame(
@@ -308,7 +307,7 @@ def compute_position_errors(
         return axis_result.truth
     state, variance = axis_result.ekf2_state, axis_result.ekf2_variance
     if filter_name == "kf":
-        state, variance = _compute_kf_track(axis_result.replay, state)
+        state, variance = _compute_kf_track(axis_result.kf_run, state)
     if isinstance(state, Unavailable):
         return state
     time_s = state.index.to_numpy()

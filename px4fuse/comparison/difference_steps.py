@@ -17,10 +17,10 @@ from px4fuse.ekf2.inputs import ReplayInputs
 from px4fuse.ekf2.model import Ekf2Model
 from px4fuse.ekf2.replay import is_inside_spans
 from px4fuse.ekf2.steps import DifferenceExplanation, DifferenceOutsideReplay, PropertyReplacement
-from px4fuse.filter.kalman import Replay, predict_state, replay
+from px4fuse.filter.kalman import KfRun, predict_state, run_kf
 from px4fuse.filter.settings import Settings
 from px4fuse.filter.signals import AISLE
-from px4fuse.filter.time_offset import ClockOffset
+from px4fuse.filter.time_offset import SourceTimeOffset
 from px4fuse.filter.tuning import HORIZONTAL
 from px4fuse.flight.model import Spans, Unavailable
 from px4fuse.request import COMPARISON_OPTIONS
@@ -42,7 +42,7 @@ MIN_OUTSIDE_TO_INSIDE_REPLAY_RATIO = 3.0
 def explain_ekf2_difference(
     comparison: Comparison,
     model: Ekf2Model | Unavailable,
-    clock_offset: ClockOffset | Unavailable,
+    time_offset: SourceTimeOffset | Unavailable,
     estimate_by_setting: Mapping[str, Any],
 ) -> dict[str, DifferenceExplanation | Unavailable]:
     """Explain the difference between KF and EKF2 along each horizontal axis.
@@ -60,14 +60,14 @@ def explain_ekf2_difference(
     kf_settings = _make_comparable_settings(comparison, model.inputs, estimate_by_setting)
     changed_settings = replace(comparison.settings, **estimate_by_setting)
     kf_runs = {
-        name: replay(axis.axis, changed_settings, fast=True) if estimate_by_setting else axis.replay
+        name: run_kf(axis.axis, changed_settings, fast=True) if estimate_by_setting else axis.kf_run
         for name, axis in axis_results.items()
     }
     explanations = steps.explain_difference_by_replacements(model, kf_settings, kf_runs)
     if isinstance(explanations, Unavailable):
         return dict.fromkeys(axis_results, explanations)
     reasons = _describe_property_differences(
-        replace(comparison, settings=changed_settings), model, clock_offset
+        replace(comparison, settings=changed_settings), model, time_offset
     )
     explanation_by_axis: dict[str, DifferenceExplanation | Unavailable] = {}
     for name, by_steps in explanations.items():
@@ -125,7 +125,7 @@ def _make_comparable_settings(
 
 
 def _compare_outside_replay(
-    axis_result: AxisComparison, kf_run: Replay, spans_s: Spans
+    axis_result: AxisComparison, kf_run: KfRun, spans_s: Spans
 ) -> DifferenceOutsideReplay | None:
     if isinstance(axis_result.ekf2_state, Unavailable):
         return None
@@ -220,7 +220,7 @@ def _describe_rejections(explanation: DifferenceExplanation) -> str:
 
 
 def _describe_property_differences(
-    comparison: Comparison, model: Ekf2Model, clock_offset: ClockOffset | Unavailable
+    comparison: Comparison, model: Ekf2Model, time_offset: SourceTimeOffset | Unavailable
 ) -> dict[str, str]:
     kf_settings, inputs, source = comparison.settings, model.inputs, comparison.source
     parameters, aid, ekf2_source = inputs.settings, inputs.aid, inputs.received_positions.source
@@ -237,10 +237,10 @@ def _describe_property_differences(
         f"EKF2 assumes that positions are {parameters[aid.delay]:g} ms old ({aid.delay}), KF "
         f"assumes {position_age_ms:.0f} ms"
     )
-    if isinstance(clock_offset, ClockOffset) and clock_offset.is_determinable:
+    if isinstance(time_offset, SourceTimeOffset) and time_offset.is_determinable:
         age_ms, low_ms, high_ms = (
             1e3 * (source.assumed_delay_s - offset_s)
-            for offset_s in (clock_offset.offset_s, *clock_offset.interval_s[::-1])
+            for offset_s in (time_offset.offset_s, *time_offset.interval_s[::-1])
         )
         delay_text += (
             f". The maximum-likelihood estimate is {age_ms:.0f} ms (95 % {low_ms:.0f} to "

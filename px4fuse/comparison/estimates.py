@@ -36,7 +36,7 @@ from px4fuse.filter.signals import AISLE, Axis
 from px4fuse.filter.time_offset import (
     MAX_OFFSET_INTERVAL_HALF_WIDTH_S,
     MIN_TIME_OFFSET_CHANGE_S,
-    ClockOffset,
+    SourceTimeOffset,
     estimate_time_offset,
 )
 from px4fuse.filter.tuning import HORIZONTAL, AxisTuning, NoiseEstimate, tune
@@ -73,7 +73,7 @@ class Estimates:
     ----------
     tuning : mapping from axis name, or "horizontal", to AxisTuning or Unavailable
         Measurement noise and process noise.
-    clock : ClockOffset or Unavailable
+    time_offset : SourceTimeOffset or Unavailable
         Time offset between position source and IMU.
     heading : HeadingError or Unavailable
         Yaw misalignment of the position frame.
@@ -84,7 +84,7 @@ class Estimates:
     """
 
     tuning: TuningByAxis
-    clock: ClockOffset | Unavailable
+    time_offset: SourceTimeOffset | Unavailable
     heading: HeadingError | Unavailable
     systematic_errors: SystematicErrors | Unavailable
     source_low_pass: SourceLowPass | Unavailable
@@ -113,14 +113,14 @@ def value_or_bound(noise: NoiseEstimate, fallback: float) -> float:
 def estimate(comparison: Comparison, progress: Progress = ignore_progress) -> Estimates:
     """Estimate noises, time offset, yaw misalignment and systematic errors of a position source."""
     has_north_and_east = {"north", "east"} <= {axis.name for axis in comparison.input_axes}
-    tuning, clock_offset = estimate_noises_and_clock(
+    tuning, time_offset = estimate_noises_and_time_offset(
         comparison, progress, REPORTED_AXES if has_north_and_east else None
     )
     systematic_errors, source_low_pass, correlated_noise = _fit_source_errors(
-        comparison, tuning, clock_offset
+        comparison, tuning, time_offset
     )
     progress("heading")
-    heading_error = estimate_frame_rotation(comparison, tuning, clock_offset)
+    heading_error = estimate_frame_rotation(comparison, tuning, time_offset)
     axis_tunings, noisy_part = tuple[AxisTuning, ...](), None
     if comparison.source.orientation is None:  # no odometry
         if not comparison.source.origin.is_gnss:
@@ -128,7 +128,7 @@ def estimate(comparison: Comparison, progress: Progress = ignore_progress) -> Es
         noisy_part = find_noisy_flight_part(comparison, tuning.get(HORIZONTAL))
     return Estimates(
         tuning=tuning,
-        clock=clock_offset,
+        time_offset=time_offset,
         heading=heading_error,
         systematic_errors=systematic_errors,
         source_low_pass=source_low_pass,
@@ -170,11 +170,11 @@ def estimate_noises(
     )
 
 
-def estimate_noises_and_clock(
+def estimate_noises_and_time_offset(
     comparison: PreparedComparison,
     progress: Progress = ignore_progress,
     axis_names: tuple[str, ...] | None = (HORIZONTAL,),
-) -> tuple[TuningByAxis, ClockOffset | Unavailable]:
+) -> tuple[TuningByAxis, SourceTimeOffset | Unavailable]:
     """Estimate measurement noise, process noise, and the time offset between positions and IMU.
 
     Parameters are those of :func:`estimate_noises`.
@@ -189,7 +189,7 @@ def estimate_noises_and_clock(
     noises = NoiseParameters(settings.sigma_a_m_s2, settings.sigma_z_m)
     if axis_tuning := find_first_tuning(tuning, HORIZONTAL, *tuning):
         noises, outlier_time_s = axis_tuning.noises, axis_tuning.outlier_time_s
-    clock_offset = estimate_time_offset(
+    time_offset = estimate_time_offset(
         comparison.flight,
         comparison.source,
         comparison.segment,
@@ -199,29 +199,29 @@ def estimate_noises_and_clock(
         progress,
         motion_cache,
     )
-    if not isinstance(clock_offset, ClockOffset):
-        return tuning, clock_offset
+    if not isinstance(time_offset, SourceTimeOffset):
+        return tuning, time_offset
     if comparison.source.origin.may_drift:
-        clock_offset = widen_for_scatter(clock_offset, "the positions drift")
-    elif clock_offset.has_changed() and find_imu_oscillation(
+        time_offset = widen_for_scatter(time_offset, "the positions drift")
+    elif time_offset.has_changed() and find_imu_oscillation(
         comparison.flight, comparison.source, comparison.segment
     ):
-        clock_offset = widen_for_scatter(clock_offset, "the accelerometer oscillates")
-    return tuning, clock_offset
+        time_offset = widen_for_scatter(time_offset, "the accelerometer oscillates")
+    return tuning, time_offset
 
 
 def estimate_frame_rotation(
     comparison: Comparison,
     tuning: TuningByAxis,
-    clock_offset: ClockOffset | Unavailable,
+    time_offset: SourceTimeOffset | Unavailable,
 ) -> HeadingError | Unavailable:
     """Estimate the yaw misalignment of the position frame."""
     sigma_z_m = comparison.settings.sigma_z_m
     if axis_tuning := find_first_tuning(tuning, HORIZONTAL):
         sigma_z_m = value_or_bound(axis_tuning.sigma_z, sigma_z_m)
     offset_s = 0.0
-    if isinstance(clock_offset, ClockOffset) and clock_offset.is_determinable:
-        offset_s = clock_offset.remaining_s
+    if isinstance(time_offset, SourceTimeOffset) and time_offset.is_determinable:
+        offset_s = time_offset.remaining_s
     return estimate_heading_error(
         comparison.flight,
         comparison.source,
@@ -233,7 +233,7 @@ def estimate_frame_rotation(
 
 
 def _fit_source_errors(
-    comparison: Comparison, tuning: TuningByAxis, clock_offset: ClockOffset | Unavailable
+    comparison: Comparison, tuning: TuningByAxis, time_offset: SourceTimeOffset | Unavailable
 ) -> tuple[
     SystematicErrors | Unavailable,
     SourceLowPass | Unavailable,
@@ -246,11 +246,11 @@ def _fit_source_errors(
     flight, settings, (axes, axis_tuning) = comparison.flight, comparison.settings, axes_and_tuning
     offset_s = 0.0
     if (
-        isinstance(clock_offset, ClockOffset)
-        and clock_offset.is_determinable
-        and abs(clock_offset.remaining_s) > clock_offset.significance_limit_s
+        isinstance(time_offset, SourceTimeOffset)
+        and time_offset.is_determinable
+        and abs(time_offset.remaining_s) > time_offset.significance_limit_s
     ):
-        offset_s = clock_offset.remaining_s
+        offset_s = time_offset.remaining_s
     systematic_errors = fit_systematic_errors(
         flight,
         axes,
@@ -344,33 +344,33 @@ def explain_low_imu_rate(flight: Flight) -> Unavailable | None:
     )
 
 
-def widen_for_scatter(clock_offset: ClockOffset, cause: str) -> ClockOffset:
+def widen_for_scatter(time_offset: SourceTimeOffset, cause: str) -> SourceTimeOffset:
     """Widen the 95 % interval of the time offset, because its estimates scatter.
 
     The factor is the scatter of the time offsets of flight parts ÷ their reported σ.
     """
-    offsets_s = np.array([part.offset_s for part in clock_offset.parts])
-    weights = np.array([part.sigma_s**-2.0 for part in clock_offset.parts])
+    offsets_s = np.array([part.offset_s for part in time_offset.parts])
+    weights = np.array([part.sigma_s**-2.0 for part in time_offset.parts])
     if len(offsets_s) <= MIN_ESTIMATES_BEFORE_AND_AFTER_CHANGE:
         return structs.replace(
-            clock_offset, change_p_value=None, drift_ppm=None, drift_sigma_ppm=None
+            time_offset, change_p_value=None, drift_ppm=None, drift_sigma_ppm=None
         )
     variance_factor = _compute_weighted_square_sum(offsets_s, weights) / (len(offsets_s) - 1)
     widening_factor = max(1.0, variance_factor) ** 0.5
     low_s, high_s = (
-        clock_offset.offset_s + widening_factor * (limit_s - clock_offset.offset_s)
-        for limit_s in clock_offset.interval_s
+        time_offset.offset_s + widening_factor * (limit_s - time_offset.offset_s)
+        for limit_s in time_offset.interval_s
     )
-    reason = clock_offset.reason
+    reason = time_offset.reason
     if not reason and (high_s - low_s) / 2.0 > MAX_OFFSET_INTERVAL_HALF_WIDTH_S:
         reason = (
             f"the time offset differs between parts of the flight, probably because {cause} (95 % "
             f"interval of the offset: {low_s:+.2f} s to {high_s:+.2f} s)"
         )
     return structs.replace(
-        clock_offset,
+        time_offset,
         interval_s=(low_s, high_s),
-        sigma_s=clock_offset.sigma_s * widening_factor,
+        sigma_s=time_offset.sigma_s * widening_factor,
         is_determinable=not reason,
         reason=reason,
         drift_ppm=None,

@@ -25,7 +25,7 @@ from px4fuse.core.record import (
 )
 from px4fuse.errors import MissingDataError, suggest_name
 from px4fuse.filter.consistency import Consistency, HorizontalNis, classify_sigma_ratio
-from px4fuse.filter.kalman import Replay
+from px4fuse.filter.kalman import KfRun
 from px4fuse.filter.settings import Settings
 from px4fuse.filter.signals import AISLE, Axis, Segment, cut_to_segment
 from px4fuse.flight.model import Flight, PositionTrack, TableOrUnavailable
@@ -142,7 +142,7 @@ class AxisComparison(Record, kw_only=True):
     difference: OrUnavailable[Difference]
     rejected_fraction: Share | None = None
     axis: NotWritten[Axis] = NOT_WRITTEN
-    replay: NotWritten[Replay] = NOT_WRITTEN
+    kf_run: NotWritten[KfRun] = NOT_WRITTEN
     ekf2_state: NotWritten[TableOrUnavailable] = NOT_WRITTEN
     ekf2_variance: NotWritten[TableOrUnavailable] = NOT_WRITTEN
     ekf2_innovations: NotWritten[TableOrUnavailable] = NOT_WRITTEN

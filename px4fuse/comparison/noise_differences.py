@@ -61,7 +61,7 @@ def _find_heading_of_largest_noise(north_and_east: Sequence[AxisComparison]) -> 
     Slow errors cancel in the changes of KF's innovation between two samples. The correlation
     of these changes is sin(π/2 · mean(sign(north) · sign(east))) (Blomqvist 1950).
     """
-    innovations_m = [axis.replay.updates["innovation_m"] for axis in north_and_east]
+    innovations_m = [axis.kf_run.updates["innovation_m"] for axis in north_and_east]
     changes_m = pd.concat(innovations_m, axis="columns", join="inner").diff().dropna().to_numpy()
     changes_m = changes_m[::2]  # neighbouring changes share an innovation
     if len(changes_m) < MIN_PART_MEASUREMENTS:

@@ -10,11 +10,19 @@ from px4fuse.comparison.model import PreparedComparison
 from px4fuse.comparison.projection import find_observation_variance
 from px4fuse.convention.check import check_convention
 from px4fuse.convention.correction import convert_to_px4_convention, find_convention_faults
+from px4fuse.convention.model import Convention
 from px4fuse.core.text import capitalise_first
 from px4fuse.ekf2.fusion_conditions import constant_coordinates
 from px4fuse.errors import MissingDataError, SettingsError, suggest_name
-from px4fuse.filter.settings import SETTING_RANGES, requested_settings
-from px4fuse.filter.signals import AISLE, MIN_MEASUREMENTS, Segment, cut_to_segment, make_axes
+from px4fuse.filter.settings import SETTING_RANGES, Settings, requested_settings
+from px4fuse.filter.signals import (
+    AISLE,
+    MIN_MEASUREMENTS,
+    Axis,
+    Segment,
+    cut_to_segment,
+    make_axes,
+)
 from px4fuse.flight.ekf2_parameters import BAROMETER, GNSS_POS, PARAMETERS
 from px4fuse.flight.model import (
     ALIGNED_BY_EKF2_ORIGIN,
@@ -54,7 +62,8 @@ def prepare_comparison_inputs(
 ) -> PreparedComparison:
     """Choose position source, segment and axes of a flight for the comparison of KF with EKF2.
 
-    ``keep_positions_as_sent`` skips the check and correction of axes, unit and clock.
+    ``keep_positions_as_sent`` skips the check and correction of axes, unit and clock, for lists of
+    the log's contents and for exercises in which students must find such faults.
 
     Raises
     ------
@@ -68,47 +77,28 @@ def prepare_comparison_inputs(
         if isinstance(value, float) and not math.isfinite(value):
             raise SettingsError(f"`{name}` {value:g} is not a finite number.")
     settings = requested_settings(request)
-    source_track, source_reason = choose_source(flight, request.position_source)
+    source, source_reason = choose_source(flight, request.position_source)
     if source_kind := request.source_kind:
-        source_track = replace(
-            source_track, origin=structs.replace(source_track.origin, kind=source_kind)
-        )
-    source_track = shift_clock(source_track, settings.clock_offset_s)
-    is_in_ned = (
-        source_track.origin.is_gnss or source_track.origin.path == ALIGNED_BY_EKF2_ORIGIN.path
+        source = replace(source, origin=structs.replace(source.origin, kind=source_kind))
+    source = shift_timestamps(source, settings.clock_offset_s)
+    flight, source, settings, convention = _correct_convention(
+        flight, source, settings, is_checked=not (keep_positions_as_sent or flight.log.is_assessed)
     )
-    skips_convention_check = keep_positions_as_sent or is_in_ned or flight.log.is_assessed
-    convention = None if skips_convention_check else check_convention(flight, source_track)
-    # A time offset from the user replaces the detected one
-    if convention is not None and settings.clock_offset_s:
-        convention = structs.replace(convention, late_s=0.0)
-    late_s = find_convention_faults(convention, flight, source_track.frame).late_s
-    offset_range = SETTING_RANGES["clock_offset_s"]
-    clock_offset_s = np.clip(settings.clock_offset_s - late_s, offset_range.low, offset_range.high)
-    settings = replace(settings, clock_offset_s=float(clock_offset_s))
-    flight, source_track = convert_to_px4_convention(flight, source_track, convention)
-    source_track = _subtract_lever_arm(source_track, flight)
-    source_track = _shift_vision_to_ekf2_origin(source_track, flight)
-    source_track = _use_barometer_height(source_track, flight, request.height)
-    flight = select_source_innovations(flight, source_track)
-    missing_data, is_gnss = flight.missing, source_track.origin.is_fused_as_gnss
-    segment = choose_segment(flight, source_track, request.start_s, request.end_s)
-    has_no_height = is_gnss or "z" in constant_coordinates(source_track)
+    source = _subtract_lever_arm(source, flight)
+    source = _shift_vision_to_ekf2_origin(source, flight)
+    source = _use_barometer_height(source, flight, request.height)
+    flight = select_source_innovations(flight, source)
+    segment = choose_segment(flight, source, request.start_s, request.end_s)
+    is_gnss = source.origin.is_fused_as_gnss
+    has_no_height = is_gnss or "z" in constant_coordinates(source)
     axis_names = request.axes or (HORIZONTAL_AXES if has_no_height else None)
-    compared_axes = make_axes(
-        flight, source_track, segment, names=axis_names, heading_deg=request.heading_deg
-    )
-    if isinstance(flight.truth, Truth) and flight.truth.name == source_track.name:
+    axes = make_axes(flight, source, segment, names=axis_names, heading_deg=request.heading_deg)
+    if isinstance(flight.truth, Truth) and flight.truth.name == source.name:
         flight = replace(flight, truth=NO_SEPARATE_TRUTH)
-    notes = (*flight.log.notes, *source_track.notes)
     if is_gnss and request.sigma_z_m is None:
-        default_noise_m = PARAMETERS[GNSS_POS.noise].default
-        noise_variance_m2 = find_observation_variance(
-            flight, source_track, compared_axes[0], segment, default_noise_m
-        )
-        if (sigma_z_m := noise_variance_m2**0.5) >= SETTING_RANGES["sigma_z_m"].low:
-            settings = replace(settings, sigma_z_m=float(f"{sigma_z_m:.3g}"))
-    acceleration = compared_axes[0].acceleration
+        settings = _use_gnss_noise_of_ekf2(settings, flight, source, axes[0], segment)
+    notes, missing_data = (*flight.log.notes, *source.notes), flight.missing
+    acceleration = axes[0].acceleration
     if settings.input == "imu" and isinstance(acceleration, Unavailable):
         if request.input == "imu":
             raise SettingsError(
@@ -121,16 +111,35 @@ def prepare_comparison_inputs(
         )
         missing_data += () if acceleration in missing_data else (acceleration,)
     return PreparedComparison(
-        flight,
-        source_track,
-        source_reason,
-        segment,
-        settings,
-        compared_axes,
-        notes,
-        missing_data,
-        convention,
+        flight, source, source_reason, segment, settings, axes, notes, missing_data, convention
     )
+
+
+def _correct_convention(
+    flight: Flight, source: PositionTrack, settings: Settings, *, is_checked: bool
+) -> tuple[Flight, PositionTrack, Settings, Convention | None]:
+    """Check and correct axes, unit, clock and orientation of the positions, unless in NED."""
+    is_in_ned = source.origin.is_gnss or source.origin.route == ALIGNED_BY_EKF2_ORIGIN.route
+    convention = check_convention(flight, source) if is_checked and not is_in_ned else None
+    # A time offset from the user replaces the detected one
+    if convention is not None and settings.clock_offset_s:
+        convention = structs.replace(convention, late_s=0.0)
+    late_s = find_convention_faults(convention, flight, source.frame).late_s
+    offset_range = SETTING_RANGES["clock_offset_s"]
+    clock_offset_s = np.clip(settings.clock_offset_s - late_s, offset_range.low, offset_range.high)
+    settings = replace(settings, clock_offset_s=float(clock_offset_s))
+    return *convert_to_px4_convention(flight, source, convention), settings, convention
+
+
+def _use_gnss_noise_of_ekf2(
+    settings: Settings, flight: Flight, source: PositionTrack, axis: Axis, segment: Segment
+) -> Settings:
+    """Set SIGMA_Z to √R of EKF2's GNSS fusion."""
+    default_noise_m = PARAMETERS[GNSS_POS.noise].default
+    variance_m2 = find_observation_variance(flight, source, axis, segment, default_noise_m)
+    if (sigma_z_m := variance_m2**0.5) >= SETTING_RANGES["sigma_z_m"].low:
+        settings = replace(settings, sigma_z_m=float(f"{sigma_z_m:.3g}"))
+    return settings
 
 
 def select_source_innovations(flight: Flight, track: PositionTrack) -> Flight:
@@ -308,10 +317,10 @@ def _explain_choice(flight: Flight, track: PositionTrack) -> str:
     if track.origin.is_fused_as_gnss:
         return "the only position source in the log, fused by EKF2"
     log_text = f" (from {track.log})" if track.log and track.log != flight.log.name else ""
-    return f"chosen automatically; position origin: {track.origin.path}{log_text}"
+    return f"chosen automatically; position origin: {track.origin.route}{log_text}"
 
 
-def shift_clock(track: PositionTrack, clock_offset_s: float) -> PositionTrack:
+def shift_timestamps(track: PositionTrack, clock_offset_s: float) -> PositionTrack:
     """Add a time offset (s) to all timestamps of a position track."""
     if clock_offset_s == 0.0:
         return track

@@ -12,7 +12,7 @@ from px4fuse.ekf2.inputs import ReplayInputs
 from px4fuse.ekf2.model import Ekf2Model, replay_with_settings
 from px4fuse.ekf2.replay import rows_inside
 from px4fuse.filter.signals import AISLE
-from px4fuse.filter.time_offset import MIN_OFFSET_SIGMAS, MIN_TIME_OFFSET_S, ClockOffset
+from px4fuse.filter.time_offset import MIN_OFFSET_SIGMAS, MIN_TIME_OFFSET_S, SourceTimeOffset
 from px4fuse.filter.tuning import HORIZONTAL, NoiseEstimate
 from px4fuse.flight.ekf2_parameters import (
     EV_POS,
@@ -37,7 +37,7 @@ MIN_HEIGHT_TO_HORIZONTAL_NOISE_RATIO = 2.0
 
 
 def estimate_gnss_delay_ms(
-    comparison: Comparison, model: Ekf2Model, clock_offset: ClockOffset | Unavailable
+    comparison: Comparison, model: Ekf2Model, time_offset: SourceTimeOffset | Unavailable
 ) -> tuple[float, float] | None:
     """Estimate the GNSS delay and its σ (ms) by replays of EKF2 with values of EKF2_GPS_DELAY.
 
@@ -49,7 +49,7 @@ def estimate_gnss_delay_ms(
         vision is None
         or comparison.source.name != vision.source
         or comparison.convention_faults
-        or _find_differing_delay_ms(comparison, clock_offset, model.inputs.settings[EV_POS.delay])
+        or _find_differing_delay_ms(comparison, time_offset, model.inputs.settings[EV_POS.delay])
         is not None
         or received_positions.velocity_m_s is None
         or received_positions.uses_sender_timestamps
@@ -85,7 +85,7 @@ def estimate_ekf2_parameters(
     comparison: Comparison,
     model: Ekf2Model,
     tuning: TuningByAxis,
-    clock_offset: ClockOffset | Unavailable,
+    time_offset: SourceTimeOffset | Unavailable,
 ) -> dict[str, float]:
     """Return the maximum-likelihood values of those EKF2 noises and delays that are wrong.
 
@@ -95,7 +95,7 @@ def estimate_ekf2_parameters(
     inputs, origin, min_vision_noise_m = model.inputs, comparison.source.origin, 0.0
     vision = inputs.vision_positions
     if vision is not None and comparison.source.name == vision.source:
-        if (gnss_delay := estimate_gnss_delay_ms(comparison, model, clock_offset)) is not None:
+        if (gnss_delay := estimate_gnss_delay_ms(comparison, model, time_offset)) is not None:
             changes |= make_delay_change(inputs, gnss_delay[0])
         # While EKF2 fuses GNSS, it increases the noise of vision at least to that of GNSS
         min_vision_noise_m = inputs.settings[GNSS_POS.noise]
@@ -111,7 +111,7 @@ def estimate_ekf2_parameters(
         and max(noise_m, used_noise_m) > min_vision_noise_m
     ):
         changes |= make_estimated_noise_change(inputs, axis_tuning.sigma_z, noise_m)
-    return changes | make_estimated_delay_change(comparison, inputs, clock_offset)
+    return changes | make_estimated_delay_change(comparison, inputs, time_offset)
 
 
 def is_source_fused(comparison: Comparison, ekf2_inputs: ReplayInputs) -> bool:
@@ -121,31 +121,31 @@ def is_source_fused(comparison: Comparison, ekf2_inputs: ReplayInputs) -> bool:
 
 
 def make_estimated_delay_change(
-    comparison: Comparison, ekf2_inputs: ReplayInputs, clock_offset: ClockOffset | Unavailable
+    comparison: Comparison, ekf2_inputs: ReplayInputs, time_offset: SourceTimeOffset | Unavailable
 ) -> dict[str, float]:
     estimated_delay_ms = _find_differing_delay_ms(
-        comparison, clock_offset, ekf2_inputs.settings[ekf2_inputs.aid.delay]
+        comparison, time_offset, ekf2_inputs.settings[ekf2_inputs.aid.delay]
     )
     return {} if estimated_delay_ms is None else make_delay_change(ekf2_inputs, estimated_delay_ms)
 
 
 def _find_differing_delay_ms(
-    comparison: Comparison, clock_offset: ClockOffset | Unavailable, logged_delay_ms: float
+    comparison: Comparison, time_offset: SourceTimeOffset | Unavailable, logged_delay_ms: float
 ) -> float | None:
-    if isinstance(clock_offset, Unavailable) or not clock_offset.is_determinable:
+    if isinstance(time_offset, Unavailable) or not time_offset.is_determinable:
         return None
-    return estimate_differing_delay_ms(comparison, clock_offset, logged_delay_ms)
+    return estimate_differing_delay_ms(comparison, time_offset, logged_delay_ms)
 
 
 def estimate_differing_delay_ms(
-    comparison: PreparedComparison, clock_offset: ClockOffset, logged_delay_ms: float
+    comparison: PreparedComparison, time_offset: SourceTimeOffset, logged_delay_ms: float
 ) -> float | None:
     """Return the estimated delay (ms) of the positions if it differs from the logged delay.
 
     A time offset from the user (--clock-offset) is kept if it is within the 95 % interval.
     """
-    offset_s, applied_s = clock_offset.offset_s, clock_offset.applied_s
-    low_s, high_s = clock_offset.interval_s
+    offset_s, applied_s = time_offset.offset_s, time_offset.applied_s
+    low_s, high_s = time_offset.interval_s
     if (
         applied_s
         and low_s <= applied_s <= high_s
@@ -153,7 +153,7 @@ def estimate_differing_delay_ms(
     ):
         offset_s = applied_s
     estimated_delay_ms = 1e3 * (comparison.source.assumed_delay_s - offset_s)
-    is_significant = clock_offset.is_significant(1e-3 * (logged_delay_ms - estimated_delay_ms))
+    is_significant = time_offset.is_significant(1e-3 * (logged_delay_ms - estimated_delay_ms))
     return estimated_delay_ms if is_significant else None
 
 
@@ -297,7 +297,7 @@ def select_changed_settings(
     }
 
 
-def format_settings(changes: Mapping[str, float]) -> str:
+def format_changes(changes: Mapping[str, float]) -> str:
     """Format EKF2 parameters with their new values, for example "EKF2_EV_DELAY to 264 ms"."""
     parameter_texts = (
         f"{name} to {value:.3g} {KNOWN_PARAMETERS[name].printed_unit}"

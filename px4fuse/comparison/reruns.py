@@ -39,18 +39,18 @@ from px4fuse.comparison.model import (
 )
 from px4fuse.comparison.projection import project, project_truth
 from px4fuse.comparison.remedy import is_source_fused
-from px4fuse.comparison.trials import (
-    CLOCK_OFFSET_KEY,
+from px4fuse.comparison.rerun_effects import (
     CONSISTENCY_STATISTICS,
     FORWARD_BIAS_KEY,
     MIN_REPORTED_NEES,
     OUTLIERS_KEY,
     RIGHT_BIAS_KEY,
     ROTATION_KEY,
+    TIME_OFFSET_KEY,
     Change,
+    Rerun,
     RunStatistics,
     Statistic,
-    Trial,
     find_partial_corrections,
 )
 from px4fuse.core.arrays import Array
@@ -59,7 +59,7 @@ from px4fuse.ekf2.inputs import ReplayInputs
 from px4fuse.ekf2.model import Ekf2Model, misalign_positions, replay_with_settings
 from px4fuse.ekf2.replay import HORIZONTAL_AXES, Ekf2Replay, rows_inside
 from px4fuse.ekf2.steps import DifferenceExplanation
-from px4fuse.filter.kalman import replay
+from px4fuse.filter.kalman import run_kf
 from px4fuse.filter.settings import Settings
 from px4fuse.filter.signals import (
     Acceleration,
@@ -67,7 +67,7 @@ from px4fuse.filter.signals import (
     project_acceleration,
     weighted_sum,
 )
-from px4fuse.filter.time_offset import ClockOffset
+from px4fuse.filter.time_offset import SourceTimeOffset
 from px4fuse.filter.tuning import HORIZONTAL
 from px4fuse.flight.ekf2_parameters import PARAMETERS
 from px4fuse.flight.model import Columns, Spans, Unavailable
@@ -112,13 +112,13 @@ class Reruns:
         Replay of EKF2 with the logged parameters.
     difference_steps : mapping from axis name to DifferenceExplanation or Unavailable
         Causes of the difference KF - EKF2.
-    trials : tuple of Trial
+    reruns : tuple of Rerun
         Re-runs along the main axis, and along each axis with an inconsistent filter.
     """
 
     ekf2_model: Ekf2Model | Unavailable
     difference_steps: Mapping[str, DifferenceExplanation | Unavailable]
-    trials: tuple[Trial, ...]
+    reruns: tuple[Rerun, ...]
 
 
 class _Filter(NamedTuple):
@@ -133,7 +133,7 @@ class _Filter(NamedTuple):
 
 def rerun_filters(
     comparison: Comparison, estimates: Estimates, model: Ekf2Model | Unavailable
-) -> tuple[Trial, ...]:
+) -> tuple[Rerun, ...]:
     """Re-run KF and EKF2 along each axis with each change that may make them consistent.
 
     EKF2 is re-run only if its replay agrees with the log.
@@ -155,18 +155,18 @@ def rerun_filters(
         evaluated_spans_s = model.baseline_replay.find_evaluated_spans()
         filters.append(_Filter("ekf2", rerun_ekf2, model.inputs, evaluated_spans_s))
     return tuple(
-        trial
+        rerun
         for tested_filter in filters
         for axis_result in comparison.axes.values()
-        for trial in _rerun_with_changes(comparison, estimates, tested_filter, axis_result)
+        for rerun in _rerun_with_changes(comparison, estimates, tested_filter, axis_result)
     )
 
 
-def rerun_kf_with_time_offset(prepared: PreparedComparison, clock_offset: ClockOffset) -> Trial:
+def rerun_kf_with_time_offset(prepared: PreparedComparison, time_offset: SourceTimeOffset) -> Rerun:
     """Run KF along the main axis with and without a time offset, as :func:`rerun_filters` does."""
     comparison = compare(prepared)
-    change = {CLOCK_OFFSET_KEY: round(clock_offset.offset_s, 3)}
-    return Trial(
+    change = {TIME_OFFSET_KEY: round(time_offset.offset_s, 3)}
+    return Rerun(
         filter="kf",
         axis=comparison.main.axis.name,
         kinds=classify_change(comparison, None, change),
@@ -186,7 +186,9 @@ def list_rerun_configurations(
     return [
         FilterConfiguration({**logged_parameters, **change})
         for axis_result in comparison.axes.values()
-        for change, _ in _find_changes_to_test(comparison, estimates, ekf2_inputs, axis_result)
+        for change, _ in _find_changes_to_test(
+            comparison, estimates, "ekf2", ekf2_inputs, axis_result
+        )
         if change.keys() <= logged_parameters.keys()
     ]
 
@@ -199,11 +201,12 @@ def is_inconsistent(summary: FilterSummary | UntestedFilter) -> TypeGuard[Filter
 def _find_changes_to_test(
     comparison: Comparison,
     estimates: Estimates,
+    filter_name: FilterName,
     ekf2_inputs: ReplayInputs | None,
     axis_result: AxisComparison,
 ) -> list[tuple[Change, tuple[Statistic, ...]]]:
     """Return the changes to test along an axis, and the statistics that each change may correct."""
-    summary = axis_result.filters["kf" if ekf2_inputs is None else "ekf2"]
+    summary = axis_result.filters[filter_name]
     if not isinstance(summary, FilterSummary) or (
         ekf2_inputs is not None and axis_result.axis.name == "down"
     ):
@@ -214,14 +217,14 @@ def _find_changes_to_test(
     }
     candidates = {
         statistic: find_candidate_changes(
-            comparison, estimates, ekf2_inputs, axis_result, statistic
+            comparison, estimates, filter_name, ekf2_inputs, axis_result, statistic
         )
         for statistic in CONSISTENCY_STATISTICS
         if has_discrepancy[statistic]
     }
     changes = remove_repeated_changes(chain.from_iterable(candidates.values()))
     if axis_result is comparison.main:
-        changes = find_main_axis_changes(comparison, estimates, ekf2_inputs)
+        changes = find_main_axis_changes(comparison, estimates, filter_name, ekf2_inputs)
     return [
         (change, tuple(statistic for statistic in candidates if change in candidates[statistic]))
         for change in changes
@@ -233,16 +236,18 @@ def _rerun_with_changes(
     estimates: Estimates,
     tested_filter: _Filter,
     axis_result: AxisComparison,
-) -> list[Trial]:
-    changes = _find_changes_to_test(comparison, estimates, tested_filter.ekf2_inputs, axis_result)
+) -> list[Rerun]:
+    changes = _find_changes_to_test(
+        comparison, estimates, tested_filter.name, tested_filter.ekf2_inputs, axis_result
+    )
     if not changes:
         return []
     original_statistics, is_logged = _find_statistics_without_change(tested_filter, axis_result)
     spans_s = tested_filter.evaluated_spans_s
 
-    def make_trial(change: Change, discrepancies: Iterable[Statistic]) -> Trial:
+    def make_rerun(change: Change, discrepancies: Iterable[Statistic]) -> Rerun:
         changed_statistics = tested_filter.rerun(axis_result, change)
-        return Trial(
+        return Rerun(
             filter=tested_filter.name,
             axis=axis_result.axis.name,
             kinds=classify_change(comparison, tested_filter.ekf2_inputs, change),
@@ -258,14 +263,14 @@ def _rerun_with_changes(
             from_s=None if spans_s is None else spans_s[0][0],
         )
 
-    trials = [make_trial(change, discrepancies) for change, discrepancies in changes]
+    reruns = [make_rerun(change, discrepancies) for change, discrepancies in changes]
     for statistic in CONSISTENCY_STATISTICS:
-        helpful_trials = find_partial_corrections(trials, statistic)
-        trials += [
-            make_trial({**helpful_trials[0].change, **other_trial.change}, (statistic,))
-            for other_trial in helpful_trials[1:]
+        helpful_reruns = find_partial_corrections(reruns, statistic)
+        reruns += [
+            make_rerun({**helpful_reruns[0].change, **other_rerun.change}, (statistic,))
+            for other_rerun in helpful_reruns[1:]
         ]
-    return trials
+    return reruns
 
 
 def _find_statistics_without_change(
@@ -285,7 +290,7 @@ def _find_statistics_without_change(
         innovations["innovation_m"].to_numpy(),
         innovations["innovation_variance_m2"].to_numpy(),
         compute_error_statistics(logged_state, axis_result.ekf2_variance, axis_result.truth),
-        compute_difference_statistics(axis_result.replay, logged_state),
+        compute_difference_statistics(axis_result.kf_run, logged_state),
         float((rejected_flags > 0.0).mean()) if len(rejected_flags) else None,
     )
     is_replay_similar = all(
@@ -353,7 +358,7 @@ def _rerun_kf(
         measurement_time_s=time_s[is_used] + shift_s,
         measurement_m=axis.measurement_m[is_used],
     )
-    kf_run = replay(axis, changed_settings, fast=True)
+    kf_run = run_kf(axis, changed_settings, fast=True)
     # With a rotated frame, positions of KF and EKF2 are not comparable
     return _summarise_run(
         kf_run.updates["innovation_m"].to_numpy(),
@@ -383,14 +388,14 @@ def _replay_ekf2(
         return model.baseline_replay
     changed_parameters = {name: value for name, value in change.items() if name in PARAMETERS}
     model_with_moved_positions = misalign_positions(
-        model, change.get(ROTATION_KEY, 0.0), change.get(CLOCK_OFFSET_KEY, 0.0)
+        model, change.get(ROTATION_KEY, 0.0), change.get(TIME_OFFSET_KEY, 0.0)
     )
     excluded_times_s, axis_tuning = None, find_axis_tuning(tuning, HORIZONTAL)
     if OUTLIERS_KEY in change and axis_tuning is not None:
         excluded_times_s = axis_tuning.outlier_time_s - comparison.settings.clock_offset_s
         if comparison.source.origin.is_fused_as_gnss:
             excluded_times_s += 1e-3 * model.inputs.settings[model.inputs.aid.delay]
-        excluded_times_s += change.get(CLOCK_OFFSET_KEY, 0.0)
+        excluded_times_s += change.get(TIME_OFFSET_KEY, 0.0)
     (replay,) = replay_with_settings(
         model_with_moved_positions, [changed_parameters], excluded_times_s
     )
@@ -437,6 +442,6 @@ def _summarise_replay(
         weighted_sum(updates, [f"innovation_{name}_m" for name in HORIZONTAL_AXES], cosines),
         innovation_variance_m2,
         compute_error_statistics(published_track, variance_by_time, axis_result.truth),
-        compute_difference_statistics(axis_result.replay, track_compared_with_kf),
+        compute_difference_statistics(axis_result.kf_run, track_compared_with_kf),
         float((updates["rejected"] > 0.0).mean()) if len(updates) else None,
     )

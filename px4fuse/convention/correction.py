@@ -165,7 +165,7 @@ def convert_to_px4_convention(
 ) -> tuple[Flight, PositionTrack]:
     """Convert a position source to PX4's axes (NED), unit (m) and boot clock.
 
-    If EKF2 fused the wrong positions, the attitude from the gyroscopes replaces EKF2's attitude.
+    If EKF2 fused the wrong positions, its attitude is also replaced.
     """
     faults = find_convention_faults(convention, flight, track.frame)
     if convention is None or not faults:
@@ -190,18 +190,27 @@ def convert_to_px4_convention(
         orientation = orientation.set_axis(_correct_times(orientation.index, faults))
         orientation[Columns.QUATERNION] = convert_to_attitude(quaternion, convention.orientation)
     track = replace(track, samples=samples, orientation=orientation, origin=origin)
+    return _replace_attitude(flight, convention, faults), track
+
+
+def _replace_attitude(flight: Flight, convention: Convention, faults: ConventionFaults) -> Flight:
+    """Replace an attitude that EKF2 computed with wrong positions by that from the gyroscopes.
+
+    The detected rotation and x direction are relative to the heading of this attitude. If the axes
+    of the positions are not corrected, their x axis is north, so the attitude is rotated to it.
+    """
     inertial_data = integrate_inertial_data(flight) if faults.affects_ekf2 else None
     if inertial_data is None:
-        return flight, track
+        return flight
     attitude = inertial_data.compute_attitudes()[convention.heading_from]
-    # If the axes are correct, rotate the attitude instead of the positions
     if not faults.has_wrong_axes and not faults.rotation_deg:
+        # CLOCKWISE_DIRECTIONS are 90° from each other
         heading_change_deg = convention.rotation_deg - 90.0 * CLOCKWISE_DIRECTIONS.index(
             convention.x
         )
         attitude = replace_heading(attitude, heading(attitude) + np.radians(heading_change_deg))
     attitude_table = pd.DataFrame(attitude, time_index(inertial_data.time_s), Columns.QUATERNION)
-    return replace(flight, attitude=attitude_table), track
+    return replace(flight, attitude=attitude_table)
 
 
 def _make_matrix_to_ned_metres(convention: Convention, faults: ConventionFaults) -> Array:

@@ -14,7 +14,7 @@ import pandas as pd
 from px4fuse.core.arrays import Array, BoolArray, compute_median_interval_s
 from px4fuse.core.record import Correlation, Count, NotNegative, PositiveFloat, Record, Share, Span
 from px4fuse.ekf2.heights import GNSS_HEIGHT_NOISE_FACTOR
-from px4fuse.filter.consistency import assess_innovations, classify_mean_nis, compute_nis_band
+from px4fuse.filter.consistency import Consistency, classify_mean_nis, compute_nis_band
 from px4fuse.flight.ekf2_parameters import AIDS, Aid
 from px4fuse.flight.model import AidLog, Flight, Unavailable, longest_flight, sample_step_function
 
@@ -214,7 +214,7 @@ def _evaluate_aid(aid: Aid, aid_log: AidLog, start_s: float, end_s: float) -> Ai
     )
     axes = {}
     for axis_index, axis in enumerate(aid_log.axes):
-        consistency = assess_innovations(
+        consistency = Consistency.from_innovations(
             innovation[is_evaluated, axis_index],
             innovation_variance[is_evaluated, axis_index],
             gate,

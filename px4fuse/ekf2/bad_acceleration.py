@@ -88,14 +88,20 @@ class BadAccelerationFlag:
         for sample_number, sample in enumerate((*previous_barometer, *barometer), start=1):
             latest_barometer = np.where(np.isnan(sample), latest_barometer, sample)
             if sample_number >= len(previous_barometer):
-                is_acceleration_bad |= _indicates_falling(latest_barometer, previous_gnss)
-        is_acceleration_bad |= _indicates_falling(latest_barometer, gnss)
+                is_acceleration_bad |= _has_large_height_innovations(
+                    latest_barometer, previous_gnss
+                )
+        is_acceleration_bad |= _has_large_height_innovations(latest_barometer, gnss)
         is_acceleration_bad &= ~self.uses_logged_flag
         self.since_s = np.where(is_acceleration_bad & (self.until_s < time_s), time_s, self.since_s)
         self.until_s = np.where(is_acceleration_bad, time_s + self.flag_duration_s, self.until_s)
 
 
-def _indicates_falling(barometer_innovation: Array, gnss_innovation: Array) -> BoolArray:
+def _has_large_height_innovations(barometer_innovation: Array, gnss_innovation: Array) -> BoolArray:
+    """Return True if both height innovations are large: EKF2 then assumes that it is falling.
+
+    The innovations are normalised (√S) and positive upwards (PX4: ``vert_innov_test``).
+    """
     larger_innovation = np.maximum(barometer_innovation, gnss_innovation)
     smaller_innovation = np.minimum(barometer_innovation, gnss_innovation)
     return np.asarray(

@@ -135,7 +135,7 @@ class UnfusedPositions:
 
     def compute_status_bit_fraction(self, field_name: str, bit: int = 0) -> float:
         """Return the fraction of the unfused time with a set status bit; NaN if not logged."""
-        state_changes = self.ekf2.states.get(field_name)
+        state_changes = self.ekf2.status_flags.get(field_name)
         if state_changes is None:
             return float("nan")
         state_values = sample_step_function(state_changes, np.linspace(*self.unfused_span_s, 200))

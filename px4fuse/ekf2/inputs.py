@@ -530,7 +530,7 @@ def read_vision(
         *logged_decisions,
         track.name,
         reset_times_s=reset_times_s(track),
-        is_every_reset_logged=DEAD_RECKONING_FLAG in fusion_record.states,
+        is_every_reset_logged=DEAD_RECKONING_FLAG in fusion_record.status_flags,
     )
 
 
@@ -636,8 +636,8 @@ def _find_dead_reckoning_spans(ekf2: Ekf2, fusion_record: FusionRecord) -> Array
 
     The start is the last fusion of vision, the end is the next fusion or reset.
     """
-    dead_reckoning_flag = fusion_record.states.get(DEAD_RECKONING_FLAG)
-    vision_enabled_flag = ekf2.states.get(EV_POS.name)
+    dead_reckoning_flag = fusion_record.status_flags.get(DEAD_RECKONING_FLAG)
+    vision_enabled_flag = ekf2.status_flags.get(EV_POS.name)
     if dead_reckoning_flag is None or vision_enabled_flag is None:
         return np.zeros((0, 2))
     spans_s = np.array(find_flight_spans(dead_reckoning_flag == 0.0, np.inf)).reshape(-1, 2)

@@ -586,7 +586,7 @@ def _make_segment(
         initial_state_correlation=np.eye(15),
         is_acceleration_bad=(
             fusion_record.was_flag_set(BAD_ACCELERATION_FLAG, step_times_s)
-            if BAD_ACCELERATION_FLAG in fusion_record.states
+            if BAD_ACCELERATION_FLAG in fusion_record.status_flags
             else None
         ),
     )

@@ -34,7 +34,7 @@ from px4fuse.ekf2.replay import (
     is_inside_spans,
     rows_inside,
 )
-from px4fuse.filter.kalman import Replay, predict_state
+from px4fuse.filter.kalman import KfRun, predict_state
 from px4fuse.filter.settings import Settings
 from px4fuse.filter.signals import Segment
 from px4fuse.flight.ekf2_parameters import EV_POS, FLOW, GNSS_POS, GNSS_VEL, MAG
@@ -156,7 +156,7 @@ class DifferenceExplanation(Record, kw_only=True):
 
 
 def explain_difference_by_replacements(
-    model: Ekf2Model, settings: Settings | None = None, kf_runs: Mapping[str, Replay] | None = None
+    model: Ekf2Model, settings: Settings | None = None, kf_runs: Mapping[str, KfRun] | None = None
 ) -> dict[str, DifferenceExplanation] | Unavailable:
     """Explain the difference KF - EKF2 along each axis by replacing properties of KF.
 
@@ -164,7 +164,7 @@ def explain_difference_by_replacements(
     ----------
     settings : Settings, optional
         Settings of KF, with the time offset of the position source.
-    kf_runs : mapping from axis name to Replay, optional
+    kf_runs : mapping from axis name to KfRun, optional
         Results of KF by horizontal axis; default: north and east.
     """
     if not model.agreement.good:

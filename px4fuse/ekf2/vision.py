@@ -98,7 +98,7 @@ class VisionFilter:
     Attributes
     ----------
     update_records : ndarray, shape (events, k, 7, filters)
-        Rows of :func:`~px4fuse.ekf2.replay_segments.make_update_table` for each sample.
+        Rows of :func:`~px4fekf2.replay_segments.make_update_table` for each sample.
     position_reset_m : ndarray, shape (events, filters, 2)
         Change of the position by resets, north and east.
     last_fusion_s : ndarray, shape (filters,)
@@ -173,6 +173,10 @@ class VisionFilter:
         P: Array,
         last_gnss_fusion_s: Array,
     ) -> ArrayPair:
+        """Fuse one sample per filter; return x (filters, states) and P (filters, states, states).
+
+        Sources: ``ev_pos_control.cpp``, functions controlEvPosFusion and updateEvPosFusion.
+        """
         age_s, fusion_time_s, R_m2 = (
             array[sample_index, event] for array in (self.age_s, self.fusion_time_s, self.R_m2)
         )
@@ -195,23 +199,17 @@ class VisionFilter:
             is_bias_updated[:, None],
         )
         S = predicted_variance + R
-        has_fusion_restarted = (time_since_sample_s > MAX_SAMPLE_GAP_S) | (
-            is_gnss_off != self.was_gnss_off
-        )
-        is_outside_gate = (
-            (nu * nu > self.gate_squared * S).any(axis=1) & self.has_gate & ~has_fusion_restarted
-        )
-        is_rejection_timed_out = is_outside_gate & (
-            fusion_time_s - self.last_attempt_s > MAX_REJECTION_DURATION_S
-        )
-        is_restarting = has_sample & (has_fusion_restarted | is_rejection_timed_out)
-        is_fused = has_sample & ~is_outside_gate & ~has_fusion_restarted
-        is_position_reset = is_restarting & (
-            is_gnss_off
-            | (
-                is_rejection_timed_out
-                & (fusion_time_s - last_gnss_fusion_s > MAX_REJECTION_DURATION_S)
-            )
+        (
+            is_outside_gate,
+            is_fused,
+            is_restarting,
+            is_position_reset,
+        ) = self._choose_use(
+            event,
+            has_sample,
+            np.any(nu * nu > self.gate_squared * S, axis=1),
+            fusion_time_s,
+            last_gnss_fusion_s,
         )
         # If EKF2 resets its position to a sample, it logs innovation 0
         update_record = (
@@ -221,7 +219,7 @@ class VisionFilter:
             is_fused,
             is_position_reset,
         )
-        is_evaluated = has_sample & ~has_fusion_restarted | is_position_reset
+        is_evaluated = is_fused | is_outside_gate | is_position_reset
         self.update_records[event, sample_index] = np.where(is_evaluated, update_record, np.nan)
         K = (np.linalg.inv(HPH + R[:, :, None] * np.eye(2)) @ HP).transpose(0, 2, 1)
         K *= is_fused[:, None, None]
@@ -239,6 +237,7 @@ class VisionFilter:
             np.where(is_gnss_off[:, None], R_m2, R),
         )
         self.position_reset_m[event] += position_reset_m
+        # Vision then agrees with the position from GNSS
         is_bias_initialised = is_restarting & ~is_position_reset
         is_bias_cleared = is_position_reset & is_gnss_off
         self.bias.bias_m[is_bias_initialised] = -position_innovation_m[is_bias_initialised]
@@ -250,6 +249,38 @@ class VisionFilter:
         )
         self.was_gnss_off = np.where(has_sample, is_gnss_off, self.was_gnss_off)
         return x, P
+
+    def _choose_use(
+        self,
+        event: int,
+        has_sample: BoolArray,
+        is_innovation_large: BoolArray,
+        fusion_time_s: Array,
+        last_gnss_fusion_s: Array,
+    ) -> tuple[BoolArray, ...]:
+        """Choose fusion, rejection or restart for one sample per filter, as masks (filters,).
+
+        A restart resets the position or, with GNSS, the vision bias to the sample. EKF2 restarts
+        the fusion after a gap of vision, a change of GNSS fusion, and too many rejections.
+        """
+        is_gnss_off = self.is_gnss_off[event]
+        has_fusion_restarted = (fusion_time_s - self.last_sample_s > MAX_SAMPLE_GAP_S) | (
+            is_gnss_off != self.was_gnss_off
+        )
+        is_tested = has_sample & ~has_fusion_restarted
+        is_outside_gate = is_tested & is_innovation_large & self.has_gate
+        is_rejection_timed_out = is_outside_gate & (
+            fusion_time_s - self.last_attempt_s > MAX_REJECTION_DURATION_S
+        )
+        is_restarting = has_sample & (has_fusion_restarted | is_rejection_timed_out)
+        is_position_reset = is_restarting & (
+            is_gnss_off
+            | (
+                is_rejection_timed_out
+                & (fusion_time_s - last_gnss_fusion_s > MAX_REJECTION_DURATION_S)
+            )
+        )
+        return is_outside_gate, is_tested & ~is_outside_gate, is_restarting, is_position_reset
 
 
 def set_states(

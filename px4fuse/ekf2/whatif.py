@@ -227,13 +227,13 @@ def what_if(
     spans_s = model.baseline_replay.find_evaluated_spans()
     if disable_time_s_by_aid:
         first_disable_time_s = min(disable_time_s_by_aid.values())
-        # Later segments start from logged states, to which the disabled source contributed
         replay_end_s = spans_s[-1][1]
         spans_after_disabling = [
             (max(start, first_disable_time_s), end)
             for start, end in spans_s
             if end - first_disable_time_s > MIN_EVALUATED_DURATION_S
         ]
+        # Later segments start from logged states, to which the disabled source contributed
         spans_s = tuple(spans_after_disabling[:1])
         if not spans_s:
             raise SettingsError(
@@ -541,6 +541,7 @@ def _compute_heading_error_deg(
     flight: Flight, replay: Ekf2Replay, headings_rad: pd.Series, spans_s: Spans
 ) -> float | Unavailable:
     """Return the mean (°) of ``headings_rad`` minus true heading."""
+    # A replay with vision only uses EKF2's logged heading
     if GNSS_POS.noise not in replay.settings:
         return HEADING_NOT_REPLAYED
     true_attitude = None if isinstance(flight.truth, Unavailable) else flight.truth.attitude

@@ -12,14 +12,14 @@ from scipy import stats
 
 from px4fuse.analysis import Analysis
 from px4fuse.comparison.model import AxisComparison, Comparison
-from px4fuse.comparison.preparation import shift_clock
+from px4fuse.comparison.preparation import shift_timestamps
 from px4fuse.comparison.remedy import find_aid
 from px4fuse.explore.packing import DRAWN_VALUE_STEPS_PER_UNIT, ArrayEncoder
 from px4fuse.filter.consistency import CONFIDENCE_LEVEL
 from px4fuse.filter.model import INITIAL_COVARIANCE
 from px4fuse.filter.settings import SETTING_RANGES
 from px4fuse.filter.signals import AISLE, Acceleration, Axis, find_imu_gaps, weighted_sum
-from px4fuse.filter.time_offset import ClockOffset
+from px4fuse.filter.time_offset import SourceTimeOffset
 from px4fuse.filter.tuning import HORIZONTAL, AxisTuning
 from px4fuse.flight.ekf2_parameters import PARAMETERS
 from px4fuse.flight.model import Columns, PositionTrack, Unavailable
@@ -81,13 +81,13 @@ def make_kf_inputs(comparison: Comparison, encoder: ArrayEncoder) -> PageData:
 
 def undo_time_offset(comparison: Comparison) -> PositionTrack:
     """Return the positions with their original timestamps."""
-    return shift_clock(comparison.source, -comparison.settings.clock_offset_s)
+    return shift_timestamps(comparison.source, -comparison.settings.clock_offset_s)
 
 
 def _find_estimated_offset(analysis: Analysis) -> float | None:
     """Return the maximum-likelihood estimate of the time offset (s), or None."""
-    estimate = analysis.clock
-    if isinstance(estimate, ClockOffset) and estimate.is_determinable:
+    estimate = analysis.time_offset
+    if isinstance(estimate, SourceTimeOffset) and estimate.is_determinable:
         return analysis.settings.clock_offset_s + estimate.remaining_s
     return None
 

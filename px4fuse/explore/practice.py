@@ -8,7 +8,7 @@ import json
 import re
 import zlib
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
@@ -16,9 +16,11 @@ from msgspec import structs
 
 from px4fuse.card.build import build_card
 from px4fuse.card.model import Card
+from px4fuse.comparison.comparison import compare
+from px4fuse.comparison.preparation import prepare_comparison_inputs
 from px4fuse.core.record import Record, read_toml
 from px4fuse.core.text import capitalise_first
-from px4fuse.diagnose import diagnose
+from px4fuse.diagnose import diagnose_comparison
 from px4fuse.explore.data import make_flight_data
 from px4fuse.explore.packing import ArrayEncoder
 from px4fuse.explore.page import make_data_elements, make_page_html
@@ -190,7 +192,8 @@ def _simulate_flight_data(
     flight = flights.to_flight(simulation, f"flight {flight_index + 1}")
     request = ComparisonRequest(log=flight.log.name, sigma_a_m_s2=SIGMA_A_M_S2, sigma_z_m=SIGMA_Z_M)
     # without the automatic correction of axes and timestamps, which would hide the injected fault
-    analysis = diagnose(request, flight=flight, keep_positions_as_sent=True)
+    prepared = prepare_comparison_inputs(flight, request, keep_positions_as_sent=True)
+    analysis = replace(diagnose_comparison(compare(prepared)), request=request)
     fault_descriptions = [_describe_fault(*pair, analysis.findings) for pair in faults_and_sizes]
     card = _with_fault_headline(build_card(analysis, request), fault_descriptions)
     answer_key = {

@@ -5,7 +5,7 @@ Navigation, section 5.4; Ljung and Box (1978), Biometrika 65(2).
 """
 
 from collections.abc import Mapping
-from typing import Any, Literal
+from typing import Any, Literal, Self
 
 import numpy as np
 from scipy.special import chdtrc, gammaincinv, stdtr
@@ -93,6 +93,59 @@ class Consistency(NisVerdict, kw_only=True):
     ljung_box_p: Share
     ljung_box_lags: Count
 
+    @classmethod
+    def from_innovations(
+        cls,
+        innovation_m: Array,
+        innovation_variance_m2: Array,
+        gate: float = DEFAULT_GATE,
+        **other_fields: Any,
+    ) -> Self | Unavailable:
+        """Test innovations against the innovation variances: NIS, bias, whiteness.
+
+        ``gate`` is the innovation gate in √S. At least ten finite innovations are needed.
+        ``other_fields`` are the fields of a subclass.
+        """
+        is_usable = np.isfinite(innovation_m) & (innovation_variance_m2 > 0)
+        nu_m = innovation_m[is_usable]
+        variance_m2 = innovation_variance_m2[is_usable]
+        innovation_count = len(nu_m)
+        if innovation_count < MIN_INNOVATIONS:
+            return Unavailable(
+                "consistency test",
+                f"the filter has only {format_count(innovation_count, 'innovation')} "
+                f"(at least {MIN_INNOVATIONS} are needed)",
+                "Analyse a longer segment, or log the source at a higher rate.",
+            )
+        if np.ptp(nu_m) == 0.0:
+            return Unavailable(
+                "consistency test",
+                "all innovations have the same value",
+                "Check the position source; then analyse a longer segment.",
+            )
+        normalised_innovation = nu_m / np.sqrt(variance_m2)
+        std_m = float(np.std(nu_m, ddof=1))
+        mean_t_statistic = float(np.sqrt(innovation_count) * np.mean(nu_m) / std_m)
+        lag_count = min(MAX_LJUNG_BOX_LAG_COUNT, innovation_count // 5)
+        autocorrelations = compute_autocorrelation(normalised_innovation, lag_count)
+        ljung_box_terms = autocorrelations**2 / (innovation_count - np.arange(1, lag_count + 1))
+        return cls(
+            **_compute_nis_verdict_fields(normalised_innovation**2),
+            innovation_mean_m=float(np.mean(nu_m)),
+            innovation_std_m=std_m,
+            sqrt_s_median_m=float(np.median(np.sqrt(variance_m2))),
+            fraction_outside_two_sigma=float(np.mean(np.abs(normalised_innovation) > 2.0)),
+            fraction_outside_gate=float(np.mean(np.abs(normalised_innovation) > gate)),
+            bias_t=mean_t_statistic,
+            bias_p=float(2.0 * stdtr(innovation_count - 1, -abs(mean_t_statistic))),
+            lag1_autocorrelation=float(autocorrelations[0]),
+            ljung_box_p=float(
+                chdtrc(lag_count, innovation_count * (innovation_count + 2) * ljung_box_terms.sum())
+            ),
+            ljung_box_lags=lag_count,
+            **other_fields,
+        )
+
 
 class HorizontalNis(NisVerdict, kw_only=True):
     """NIS of north and east together (two degrees of freedom), divided by two.
@@ -161,53 +214,6 @@ def compute_autocorrelation(values: Array, lag_count: int) -> Array:
     square_sum = float(np.dot(values, values))
     return np.array(
         [np.dot(values[:-lag], values[lag:]) / square_sum for lag in range(1, lag_count + 1)]
-    )
-
-
-def assess_innovations(
-    innovation_m: Array, innovation_variance_m2: Array, gate: float = DEFAULT_GATE
-) -> Consistency | Unavailable:
-    """Test innovations against the innovation variances: NIS, bias, whiteness.
-
-    ``gate`` is the innovation gate in √S. At least ten finite innovations are needed.
-    """
-    is_usable = np.isfinite(innovation_m) & (innovation_variance_m2 > 0)
-    nu_m = innovation_m[is_usable]
-    variance_m2 = innovation_variance_m2[is_usable]
-    innovation_count = len(nu_m)
-    if innovation_count < MIN_INNOVATIONS:
-        return Unavailable(
-            "consistency test",
-            f"the filter has only {format_count(innovation_count, 'innovation')} "
-            f"(at least {MIN_INNOVATIONS} are needed)",
-            "Analyse a longer segment, or log the source at a higher rate.",
-        )
-    if np.ptp(nu_m) == 0.0:
-        return Unavailable(
-            "consistency test",
-            "all innovations have the same value",
-            "Check the position source; then analyse a longer segment.",
-        )
-    normalised_innovation = nu_m / np.sqrt(variance_m2)
-    std_m = float(np.std(nu_m, ddof=1))
-    mean_t_statistic = float(np.sqrt(innovation_count) * np.mean(nu_m) / std_m)
-    lag_count = min(MAX_LJUNG_BOX_LAG_COUNT, innovation_count // 5)
-    autocorrelations = compute_autocorrelation(normalised_innovation, lag_count)
-    ljung_box_terms = autocorrelations**2 / (innovation_count - np.arange(1, lag_count + 1))
-    return Consistency(
-        **_compute_nis_verdict_fields(normalised_innovation**2),
-        innovation_mean_m=float(np.mean(nu_m)),
-        innovation_std_m=std_m,
-        sqrt_s_median_m=float(np.median(np.sqrt(variance_m2))),
-        fraction_outside_two_sigma=float(np.mean(np.abs(normalised_innovation) > 2.0)),
-        fraction_outside_gate=float(np.mean(np.abs(normalised_innovation) > gate)),
-        bias_t=mean_t_statistic,
-        bias_p=float(2.0 * stdtr(innovation_count - 1, -abs(mean_t_statistic))),
-        lag1_autocorrelation=float(autocorrelations[0]),
-        ljung_box_p=float(
-            chdtrc(lag_count, innovation_count * (innovation_count + 2) * ljung_box_terms.sum())
-        ),
-        ljung_box_lags=lag_count,
     )
 
 

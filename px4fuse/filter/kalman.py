@@ -10,10 +10,10 @@ F, B, Q and H are defined in :mod:`px4fuse.filter.model`. The module
 :mod:`~px4fuse.filter.likelihood` runs KF with fewer predictions and equal results.
 """
 
-from collections.abc import Sequence
+import math
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from itertools import chain
-from typing import Any
 
 import numpy as np
 import pandas as pd
@@ -23,10 +23,9 @@ from px4fuse.core.record import one_line_repr
 from px4fuse.filter import model
 from px4fuse.filter.settings import InitialState, Settings
 from px4fuse.filter.signals import Axis
-from px4fuse.filter.steps import make_prediction_steps
+from px4fuse.filter.steps import PredictionSteps, make_prediction_steps
 
-TableRows = list[tuple[float, ...]]
-# Columns of ``Replay.updates``
+# Columns of ``KfRun.updates``
 UPDATE_TABLE_COLUMNS = [
     "measurement_m",
     "innovation_m",
@@ -37,16 +36,19 @@ UPDATE_TABLE_COLUMNS = [
     "prior_position_variance_m2",
     "prior_velocity_variance_m2_s2",
 ]
+STATE_TABLE_COLUMNS = model.STATE_COLUMNS + model.COVARIANCE_COLUMNS
+NO_UPDATE = (math.nan,) * len(UPDATE_TABLE_COLUMNS)
 
 
 @dataclass(frozen=True)
-class Replay:
+class KfRun:
     """Results of KF along one axis.
 
     Attributes
     ----------
     steps : DataFrame, shape (n, 7)
-        State and covariance after each step.
+        State and covariance after each step, and acceleration and its variance in IMU gaps in the
+        next step.
     updates : DataFrame, shape (m, 8)
         Innovation, innovation variance, gains and predicted state at each measurement.
     input_gap_s : float
@@ -62,9 +64,9 @@ class Replay:
     __repr__ = one_line_repr
 
 
-def replay(
+def run_kf(
     axis: Axis, settings: Settings, initial: InitialState | None = None, *, fast: bool = False
-) -> Replay:
+) -> KfRun:
     """Run KF along one axis.
 
     Parameters
@@ -72,7 +74,8 @@ def replay(
     initial : InitialState, optional
         Default: the first measurement, with velocity zero.
     fast : bool
-        True to compute with Python floats instead of filterpy (faster, equal results).
+        True to compute with Python floats, for many re-runs (faster, equal results). By default,
+        KF is computed with filterpy, as in the lesson.
 
     Raises
     ------
@@ -80,53 +83,46 @@ def replay(
         ``settings.input`` is "imu" and the axis has no acceleration.
     """
     prediction_steps = make_prediction_steps(axis, settings, initial)
+    # By default, the first measurement is the initial state
     initial_state = initial or InitialState(prediction_steps.time_s[0], axis.measurement_m[0])
     run_filter = _run_with_floats if fast else _run_with_filterpy
-    states, updates = run_filter(
-        initial_state,
-        settings.sigma_z_m**2,
-        np.diff(prediction_steps.time_s).tolist(),
-        prediction_steps.acceleration_m_s2.tolist(),
-        (
-            (settings.sigma_a_m_s2**2 + prediction_steps.input_variance_m2_s4) * settings.dt_s
-        ).tolist(),
-        [
-            axis.measurement_m[index] if index >= 0 else None
-            for index in prediction_steps.measurement_index[1:]
-        ],
+    measurements_m = [
+        axis.measurement_m[index] if index >= 0 else None
+        for index in prediction_steps.measurement_index[1:]  # 0 is the initial state
+    ]
+    position_m, velocity_m_s = initial_state.position_m, initial_state.velocity_m_s
+    first_row = (position_m, velocity_m_s, *model.INITIAL_COVARIANCE, *NO_UPDATE)
+    rows = run_filter(settings, initial_state, prediction_steps, measurements_m)
+    time_s, column_count = prediction_steps.time_s, len(STATE_TABLE_COLUMNS + UPDATE_TABLE_COLUMNS)
+    # pandas needs twice the time for a list of tuples
+    values = np.fromiter(
+        chain(first_row, chain.from_iterable(rows)), np.float64, len(time_s) * column_count
     )
-    step_times_s, update_times_s = (
-        pd.Index(times_s, name="time_s")
-        for times_s in (
-            prediction_steps.time_s,
-            prediction_steps.time_s[prediction_steps.measurement_index >= 0],
-        )
-    )
-    steps = _make_table(states, step_times_s, model.STATE_COLUMNS + model.COVARIANCE_COLUMNS)
+    states, updates = np.split(values.reshape(-1, column_count), [len(STATE_TABLE_COLUMNS)], axis=1)
+    steps = pd.DataFrame(states, pd.Index(time_s, name="time_s"), STATE_TABLE_COLUMNS)
+    # No step follows the last state
     steps["acceleration_m_s2"] = np.append(prediction_steps.acceleration_m_s2, 0.0)
-    steps["input_variance_m2_s4"] = np.append(prediction_steps.input_variance_m2_s4, 0.0)
-    return Replay(
+    steps["imu_gap_variance_m2_s4"] = np.append(prediction_steps.imu_gap_variance_m2_s4, 0.0)
+    is_update = prediction_steps.measurement_index >= 0
+    return KfRun(
         axis,
         settings,
         steps,
-        _make_table(updates, update_times_s, UPDATE_TABLE_COLUMNS),
+        pd.DataFrame(updates[is_update], steps.index[is_update], UPDATE_TABLE_COLUMNS),
         prediction_steps.input_gap_s,
     )
 
 
-def _make_table(rows: TableRows, index: "pd.Index[float]", columns: list[str]) -> pd.DataFrame:
-    # pandas needs twice the time for a list of tuples
-    values = np.fromiter(chain.from_iterable(rows), np.float64, len(rows) * len(columns))
-    return pd.DataFrame(values.reshape(-1, len(columns)), index, columns)
-
-
 def _run_with_filterpy(
-    initial_state: InitialState, measurement_variance: float, *inputs: Sequence[Any]
-) -> tuple[TableRows, TableRows]:
-    """Run KF with filterpy; return the rows of :attr:`Replay.steps` and :attr:`Replay.updates`.
+    settings: Settings,
+    initial_state: InitialState,
+    prediction_steps: PredictionSteps,
+    measurements_m: Sequence[float | None],
+) -> Iterator[tuple[float, ...]]:
+    """Run KF with filterpy; yield the state and the update after each step.
 
-    ``inputs`` are four sequences with one value for each step: step length (s), acceleration
-    (m/s²), noise density SIGMA_A² · DT (m²/s³), and measured position (m) or None.
+    The values are the columns STATE_TABLE_COLUMNS and UPDATE_TABLE_COLUMNS. ``measurements_m`` is
+    the measured position at the end of each step, or None.
     """
     from px4fuse.filter.filterpy_import import KalmanFilter  # noqa: PLC0415 - takes 0.1 s
 
@@ -134,71 +130,73 @@ def _run_with_filterpy(
     kalman.x = np.array([[initial_state.position_m], [initial_state.velocity_m_s]])
     kalman.P = model.make_symmetric_matrix(model.INITIAL_COVARIANCE)
     kalman.H = np.array([[1.0, 0.0]])
-    kalman.R = np.array([[measurement_variance]])
+    kalman.R = np.array([[settings.sigma_z_m**2]])
     kalman.inv = np.reciprocal  # S is 1 by 1
-    states: TableRows = [
-        (initial_state.position_m, initial_state.velocity_m_s, *model.INITIAL_COVARIANCE)
-    ]
-    updates: TableRows = []
-    dt_s, acceleration, noise_density = (np.array(values)[:, None, None] for values in inputs[:3])
+    dt_s = np.diff(prediction_steps.time_s)
+    noise_density = prediction_steps.compute_noise_density(settings)
     matrices = (
-        acceleration,
-        np.concatenate([dt_s**2 / 2.0, dt_s], axis=1),
-        model.make_transition_matrix(dt_s[:, 0, 0]),
-        noise_density
-        * model.make_symmetric_matrix(model.compute_process_noise_per_density(dt_s[:, 0, 0])),
+        prediction_steps.acceleration_m_s2[:, None, None],
+        np.stack([dt_s**2 / 2.0, dt_s], axis=1)[:, :, None],
+        model.make_transition_matrix(dt_s),
+        noise_density[:, None, None]
+        * model.make_symmetric_matrix(model.compute_process_noise_per_density(dt_s)),
     )
-    for u, B, F, Q, measured_m in zip(*matrices, inputs[3], strict=True):
+    for u, B, F, Q, measured_m in zip(*matrices, measurements_m, strict=True):
         kalman.predict(u=u, B=B, F=F, Q=Q)
+        update = NO_UPDATE
         if measured_m is not None:
             # Without the argument H, filterpy copies the measurement (slow)
             kalman.update(measured_m, H=kalman.H)
             x, P, K = kalman.x_prior, kalman.P_prior, kalman.K
-            updates.append(
-                (
-                    measured_m,
-                    kalman.y[0, 0],
-                    kalman.S[0, 0],
-                    K[0, 0],
-                    K[1, 0],
-                    x[0, 0],
-                    P[0, 0],
-                    P[1, 1],
-                )
+            update = (
+                measured_m,
+                kalman.y[0, 0],
+                kalman.S[0, 0],
+                K[0, 0],
+                K[1, 0],
+                x[0, 0],
+                P[0, 0],
+                P[1, 1],
             )
         x, P = kalman.x, kalman.P
-        states.append((x[0, 0], x[1, 0], P[0, 0], P[0, 1], P[1, 1]))
-    return states, updates
+        yield (x[0, 0], x[1, 0], P[0, 0], P[0, 1], P[1, 1], *update)
 
 
 def _run_with_floats(
-    initial_state: InitialState, measurement_variance: float, *inputs: Sequence[Any]
-) -> tuple[TableRows, TableRows]:
-    """Run KF with Python floats, which is faster than filterpy."""
+    settings: Settings,
+    initial_state: InitialState,
+    prediction_steps: PredictionSteps,
+    measurements_m: Sequence[float | None],
+) -> Iterator[tuple[float, ...]]:
+    """Run KF with Python floats. Arguments and results are those of _run_with_filterpy."""
     position, velocity, covariance = (
         initial_state.position_m,
         initial_state.velocity_m_s,
         model.INITIAL_COVARIANCE,
     )
-    states: TableRows = [(position, velocity, *covariance)]
-    updates: TableRows = []
-    for dt_s, acceleration, noise_density, measured_m in zip(*inputs, strict=True):
+    arrays = (
+        np.diff(prediction_steps.time_s),
+        prediction_steps.acceleration_m_s2,
+        prediction_steps.compute_noise_density(settings),
+    )
+    for dt_s, acceleration, noise_density, measured_m in zip(
+        *(values.tolist() for values in arrays), measurements_m, strict=True
+    ):
         position, velocity, covariance = model.predict_step(
             position, velocity, covariance, acceleration, noise_density, dt_s
         )
+        update = NO_UPDATE
         if measured_m is not None:
-            innovation_variance_and_gains, updated_state = model.update_step(
-                position, velocity, covariance, measured_m, measurement_variance
+            # ν, S and gains
+            innovation_and_gains, updated_state = model.update_step(
+                position, velocity, covariance, measured_m, settings.sigma_z_m**2
             )
-            updates.append(
-                (measured_m, *innovation_variance_and_gains, position, covariance[0], covariance[2])
-            )
+            update = measured_m, *innovation_and_gains, position, covariance[0], covariance[2]
             position, velocity, covariance = updated_state
-        states.append((position, velocity, *covariance))
-    return states, updates
+        yield (position, velocity, *covariance, *update)
 
 
-def _find_previous_steps(run: Replay, times_s: Array) -> tuple[IntArray, Array, BoolArray]:
+def _find_previous_steps(run: KfRun, times_s: Array) -> tuple[IntArray, Array, BoolArray]:
     """Find for each time the last step of KF before it.
 
     Return its index, the time (s) since this step, and True for times outside KF's time span.
@@ -214,7 +212,7 @@ def _find_previous_steps(run: Replay, times_s: Array) -> tuple[IntArray, Array, 
     )
 
 
-def predict_state(run: Replay, times_s: Array) -> Array:
+def predict_state(run: KfRun, times_s: Array) -> Array:
     """Predict position (m) and velocity (m/s) at each time from KF's last step before it.
 
     Interpolation would use later measurements. Times outside the time span of KF give NaN.
@@ -228,11 +226,11 @@ def predict_state(run: Replay, times_s: Array) -> Array:
     return np.where(is_outside, np.nan, state)
 
 
-def predict_variance(run: Replay, times_s: Array) -> Array:
+def predict_variance(run: KfRun, times_s: Array) -> Array:
     """Return the variances (m², m²/s²) of position and velocity from :func:`predict_state`."""
     step_index, elapsed_s, is_outside = _find_previous_steps(run, times_s)
     p00, p01, p11 = run.steps[model.COVARIANCE_COLUMNS].to_numpy()[step_index].T
-    imu_gap_variance_m2_s4 = run.steps["input_variance_m2_s4"].to_numpy()[step_index]
+    imu_gap_variance_m2_s4 = run.steps["imu_gap_variance_m2_s4"].to_numpy()[step_index]
     noise_density = (run.settings.sigma_a_m_s2**2 + imu_gap_variance_m2_s4) * run.settings.dt_s
     position_variance_m2, _, velocity_variance_m2_s2 = model.propagate_covariance(
         (p00, p01, p11), elapsed_s

@@ -94,7 +94,7 @@ def preintegrate(axis: Axis, settings: Settings) -> PreintegratedMotion:
         delta_velocity_m_s=dv,
         process_noise_per_sigma_a_squared=sum_by_interval(process_noise_per_sigma_a_squared),
         process_noise_independent_of_sigma_a=sum_by_interval(
-            process_noise_per_sigma_a_squared * prediction_steps.input_variance_m2_s4[:, None]
+            process_noise_per_sigma_a_squared * prediction_steps.imu_gap_variance_m2_s4[:, None]
         ),
         measurement_m=axis.measurement_m[prediction_steps.measurement_index[last_steps]],
         initial_state=InitialState(float(step_times_s[0]), float(axis.measurement_m[0])),

@@ -71,7 +71,7 @@ def predict_step(
 ) -> tuple[T, T, SymmetricElements[T]]:
     """Return the predicted position, velocity and covariance: Fx + Ba and FPFᵀ + Q.
 
-    ``noise_density`` (m²/s³) is SIGMA_A² · DT.
+    ``noise_density`` (m²/s³) is (SIGMA_A² + acceleration variance in IMU gaps) · DT.
     """
     p00, p01, p11 = propagate_covariance(covariance, dt_s)
     q00, q01, q11 = compute_process_noise_per_density(dt_s)

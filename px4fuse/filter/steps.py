@@ -26,7 +26,7 @@ class PredictionSteps:
         Index of the measurement at each time, or -1.
     acceleration_m_s2 : ndarray, shape (n - 1,)
         Mean acceleration over each step.
-    input_variance_m2_s4 : ndarray, shape (n - 1,)
+    imu_gap_variance_m2_s4 : ndarray, shape (n - 1,)
         Additional acceleration variance in gaps of the IMU.
     input_gap_s : float
         Time without IMU data.
@@ -35,8 +35,12 @@ class PredictionSteps:
     time_s: Array
     measurement_index: IntArray
     acceleration_m_s2: Array
-    input_variance_m2_s4: Array
+    imu_gap_variance_m2_s4: Array
     input_gap_s: float
+
+    def compute_noise_density(self, settings: Settings) -> Array:
+        """Return the acceleration noise density (m²/s³) of each step."""
+        return (settings.sigma_a_m_s2**2 + self.imu_gap_variance_m2_s4) * settings.dt_s
 
 
 def make_prediction_steps(
@@ -87,9 +91,13 @@ def make_prediction_steps(
     )
     gap_duration_in_interval_s = np.bincount(interval_index, weights=gap_s)[interval_index]
     gap_variance_factor = np.maximum(gap_duration_in_interval_s / settings.dt_s, 1.0)
-    gap_variance_m2_s4 = (
+    imu_gap_variance_m2_s4 = (
         gap_fraction * gap_variance_factor * axis.acceleration.compute_rms_m_s2() ** 2
     )
     return PredictionSteps(
-        time_s, measurement_index, mean_acceleration_m_s2, gap_variance_m2_s4, float(np.sum(gap_s))
+        time_s,
+        measurement_index,
+        mean_acceleration_m_s2,
+        imu_gap_variance_m2_s4,
+        float(np.sum(gap_s)),
     )

@@ -67,7 +67,7 @@ class PartOffset(Record):
     sigma_s: NotNegative
 
 
-class ClockOffset(Record, kw_only=True):
+class SourceTimeOffset(Record, kw_only=True):
     """Time offset to add to the logged timestamps of the position source.
 
     Attributes
@@ -139,7 +139,7 @@ def estimate_time_offset(
     outlier_time_s: Array | None = None,
     progress: Callable[[str], None] = lambda _: None,
     motion_cache: MotionCache | None = None,
-) -> ClockOffset | Unavailable:
+) -> SourceTimeOffset | Unavailable:
     """Estimate the time offset to add to the timestamps of a position source.
 
     Parameters
@@ -237,7 +237,7 @@ def estimate_time_offset(
         )
     drift_ppm, drift_sigma_ppm = _fit_clock_drift(parts)
     applied_offset_s = settings.clock_offset_s
-    return ClockOffset(
+    return SourceTimeOffset(
         offset_s=applied_offset_s + offset_s,
         interval_s=(applied_offset_s + interval_low_s, applied_offset_s + interval_high_s),
         applied_s=applied_offset_s,

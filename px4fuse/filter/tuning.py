@@ -15,7 +15,7 @@ from scipy.optimize import minimize_scalar
 
 from px4fuse.core.arrays import Array, BoolArray
 from px4fuse.core.record import NOT_WRITTEN, Count, NotNegative, NotWritten, OrUnavailable, Record
-from px4fuse.filter.consistency import Consistency, assess_innovations
+from px4fuse.filter.consistency import Consistency
 from px4fuse.filter.fitting import (
     SIGMA_A_SEARCH_RANGE_M_S2,
     SIGMA_Z_SEARCH_RANGE_M,
@@ -366,7 +366,7 @@ def _assess_kf_consistency(
     nu, s = innovations(
         preintegrated_motion, noise_parameters.sigma_a_m_s2, noise_parameters.sigma_z_m, is_outlier
     )
-    return assess_innovations(nu[~is_outlier], s[~is_outlier])
+    return Consistency.from_innovations(nu[~is_outlier], s[~is_outlier])
 
 
 def _test_noises_on_second_half(

@@ -3,12 +3,12 @@
 from collections.abc import Mapping
 
 from px4fuse.analysis import Analysis
-from px4fuse.comparison import changes, trials
+from px4fuse.comparison import changes, rerun_effects
 from px4fuse.comparison.model import FilterName
-from px4fuse.comparison.remedy import find_aid, format_settings, select_changed_settings
-from px4fuse.comparison.trials import (
+from px4fuse.comparison.remedy import find_aid, format_changes, select_changed_settings
+from px4fuse.comparison.rerun_effects import (
+    Rerun,
     Statistic,
-    Trial,
     brings_inside_limits,
     can_show_improvement,
     classify_improvement,
@@ -24,17 +24,17 @@ from px4fuse.flight.model import PositionTrack, Unavailable
 from px4fuse.request import COMPARISON_OPTIONS
 
 
-def classify_cause(analysis: Analysis, cause: Trial | None) -> str:
+def classify_cause(analysis: Analysis, cause: Rerun | None) -> str:
     """Return the kind of fault that a re-run corrects, such as "measurement noise"."""
     if cause is None:
         return kinds.UNKNOWN_CAUSE
     aid = find_aid(analysis)
     kind_by_change = {
-        trials.OUTLIERS_KEY: kinds.OUTLIER_CAUSE,
-        trials.CLOCK_OFFSET_KEY: kinds.CLOCK_CAUSE,
+        rerun_effects.OUTLIERS_KEY: kinds.OUTLIER_CAUSE,
+        rerun_effects.TIME_OFFSET_KEY: kinds.CLOCK_CAUSE,
         aid.delay: kinds.CLOCK_CAUSE,
-        trials.ROTATION_KEY: kinds.MISALIGNED_FRAME_CAUSE,
-        trials.FORWARD_BIAS_KEY: kinds.ACCELEROMETER_CAUSE,
+        rerun_effects.ROTATION_KEY: kinds.MISALIGNED_FRAME_CAUSE,
+        rerun_effects.FORWARD_BIAS_KEY: kinds.ACCELEROMETER_CAUSE,
         changes.SIGMA_Z: kinds.MEASUREMENT_NOISE_CAUSE,
         aid.noise: kinds.MEASUREMENT_NOISE_CAUSE,
         aid.gate: kinds.WRONG_GATE_CAUSE,
@@ -45,20 +45,20 @@ def classify_cause(analysis: Analysis, cause: Trial | None) -> str:
     return kinds.PROCESS_NOISE_CAUSE
 
 
-def rerun_refutes_cause(analysis: Analysis, filter_name: FilterName, cause: Trial) -> bool:
+def rerun_refutes_cause(analysis: Analysis, filter_name: FilterName, cause: Rerun) -> bool:
     """Return True if a change improves neither σ nor RMSE in a re-run along the main axis."""
     return any(
-        (trial.filter, trial.change) == (filter_name, cause.change)
-        and can_show_improvement(trial)
-        and classify_improvement(trial) == "nothing"
-        for trial in analysis.select_main_trials()
+        (rerun.filter, rerun.change) == (filter_name, cause.change)
+        and can_show_improvement(rerun)
+        and classify_improvement(rerun) == "nothing"
+        for rerun in analysis.select_main_reruns()
     )
 
 
-def format_change(analysis: Analysis, cause: Trial) -> str:
+def format_change(analysis: Analysis, cause: Rerun) -> str:
     """Format the changes of a re-run: "SIGMA_Z 0.1 m instead of 0.05 m"."""
     changed = select_changed_settings(cause.change, _find_used_settings(analysis))
-    names = changed.keys() - trials.SECONDARY_CHANGE_KEYS or changed
+    names = changed.keys() - rerun_effects.SECONDARY_CHANGE_KEYS or changed
     texts = (_format_one_change(analysis, cause, name) for name in changed if name in names)
     return " and ".join(texts)
 
@@ -68,7 +68,7 @@ def _find_used_settings(analysis: Analysis) -> Mapping[str, float]:
     return {} if isinstance(ekf2_model, Unavailable) else ekf2_model.inputs.settings
 
 
-def describe_explained_part(cause: Trial, statistic: Statistic) -> str:
+def describe_explained_part(cause: Rerun, statistic: Statistic) -> str:
     """Describe the part of a wrong mean NIS, mean NEES or difference that a change explains."""
     if makes_overconfident(cause, statistic):
         return "σ too small against ground truth"
@@ -82,23 +82,23 @@ def describe_explained_part(cause: Trial, statistic: Statistic) -> str:
 
 def format_action(analysis: Analysis, change: Mapping[str, float]) -> str:
     actions = []
-    if change.get(trials.OUTLIERS_KEY):
+    if change.get(rerun_effects.OUTLIERS_KEY):
         actions.append(find_source_texts(analysis.source).outlier_action)
-    if trials.FORWARD_BIAS_KEY in change:
+    if rerun_effects.FORWARD_BIAS_KEY in change:
         actions.append("Calibrate the accelerometer and the level horizon.")
-    if rotation_deg := change.get(trials.ROTATION_KEY):
+    if rotation_deg := change.get(rerun_effects.ROTATION_KEY):
         action = f"Rotate the positions by {rotation_deg:+.0f}° before they are sent."
         # GNSS refers to true north, so a rotation of its positions is a heading error of EKF2
         if analysis.source.origin.is_gnss:
             action = magnetometer_advice(analysis.flight) or "Check the heading source of EKF2."
         actions.append(action)
-    if trials.CLOCK_OFFSET_KEY in change:
+    if rerun_effects.TIME_OFFSET_KEY in change:
         actions.append(
-            f"{format_timestamp_action(change[trials.CLOCK_OFFSET_KEY])} before sending."
+            f"{format_timestamp_action(change[rerun_effects.TIME_OFFSET_KEY])} before sending."
         )
     if parameters := {name: change[name] for name in change if name in PARAMETERS}:
         parameters = select_changed_settings(parameters, _find_used_settings(analysis))
-        actions.append(f"Set {format_settings(parameters)}.")
+        actions.append(f"Set {format_changes(parameters)}.")
     if kf_settings := {name: change[name] for name in changes.KF_NOISE_SETTINGS & change.keys()}:
         actions.append(format_kf_settings(kf_settings))
     return " ".join(actions)
@@ -133,22 +133,22 @@ def format_kf_settings(settings: Mapping[str, float]) -> str:
     return f"Set {' and '.join(setting_texts)}."
 
 
-def _format_one_change(analysis: Analysis, cause: Trial, name: str) -> str:
+def _format_one_change(analysis: Analysis, cause: Rerun, name: str) -> str:
     value, settings = cause.change[name], analysis.settings
     match name:
-        case trials.OUTLIERS_KEY:
+        case rerun_effects.OUTLIERS_KEY:
             return f"{value:.0f} outlier{'s' if value > 1 else ''} removed"
-        case trials.CLOCK_OFFSET_KEY:
+        case rerun_effects.TIME_OFFSET_KEY:
             offset_s = value - (settings.clock_offset_s if cause.filter == "kf" else 0.0)
             late_or_early = "late" if offset_s < 0 else "early"
             return f"timestamps corrected ({abs(offset_s):.2g} s {late_or_early})"
-        case trials.FORWARD_BIAS_KEY:
-            right_bias_m_s2 = cause.change[trials.RIGHT_BIAS_KEY]
+        case rerun_effects.FORWARD_BIAS_KEY:
+            right_bias_m_s2 = cause.change[rerun_effects.RIGHT_BIAS_KEY]
             return (
                 f"accelerometer bias removed ({value:+.2f} m/s² forward, {right_bias_m_s2:+.2f} "
                 "m/s² right)"
             )
-        case trials.ROTATION_KEY:
+        case rerun_effects.ROTATION_KEY:
             is_drifting = isinstance(analysis.heading, HeadingError) and analysis.heading.drifts
             angle_text = f"{value:+.0f}°{' on average' if is_drifting else ''}"
             return (

@@ -123,7 +123,7 @@ def _find_received_source(analysis: PreparedComparison) -> PositionTrack | None:
 
 
 def _detect_invalid_position(analysis: Comparison, ekf2: Ekf2) -> Findings:
-    is_valid = ekf2.states.get("xy_valid")
+    is_valid = ekf2.status_flags.get("xy_valid")
     if is_valid is None or is_valid.empty:
         return
     invalid_fraction = 1.0 - compute_flag_fraction(is_valid, analysis.segment)

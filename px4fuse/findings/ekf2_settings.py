@@ -10,19 +10,19 @@ from px4fuse.comparison.model import AxisComparison
 from px4fuse.comparison.remedy import (
     find_aid,
     find_used_noise_m,
-    format_settings,
+    format_changes,
     make_height_noise_advice,
     select_changed_settings,
 )
-from px4fuse.comparison.trials import (
-    Trial,
+from px4fuse.comparison.rerun_effects import (
+    Rerun,
     becomes_consistent,
     classify_improvement,
     compute_preference_key,
-    find_trial,
+    find_rerun,
 )
 from px4fuse.core.text import format_factor, format_metres, format_ratio
-from px4fuse.filter.consistency import Consistency, assess_innovations
+from px4fuse.filter.consistency import Consistency
 from px4fuse.filter.tuning import HORIZONTAL, AxisTuning
 from px4fuse.finding import Finding
 from px4fuse.findings.cause_grouping import CAUSE_KEY, REPORTED_VARIANCE_USED_BY_EKF2_CAUSE
@@ -59,12 +59,12 @@ def detect(analysis: Analysis) -> Findings:
 
 def detect_wrong_noise(analysis: Analysis) -> Findings:
     """Detect a wrong noise parameter of EKF2, confirmed by a replay."""
-    trial, aid = find_confirmed_noise_trial(analysis), find_aid(analysis)
-    if trial is None:
+    rerun, aid = find_confirmed_noise_rerun(analysis), find_aid(analysis)
+    if rerun is None:
         return
     assert not isinstance(analysis.ekf2_model, Unavailable)
     inputs = analysis.ekf2_model.inputs
-    used_noise_m, estimated_noise_m = find_used_noise_m(inputs), trial.change[aid.noise]
+    used_noise_m, estimated_noise_m = find_used_noise_m(inputs), rerun.change[aid.noise]
     # EKF2 uses the larger of reported σ and noise parameter
     parameter_noise_m = inputs.settings[aid.noise]
     uses_reported_sigma = used_noise_m > parameter_noise_m
@@ -100,7 +100,7 @@ def detect_wrong_noise(analysis: Analysis) -> Findings:
         f"{title}{effect_text}. {name} is {used_noise_m:.3g} m; the maximum-likelihood estimate is "
         f"{estimated_noise_m:.3g} m{interval_text}. {reason}"
     )
-    action = f"Set {format_settings(select_changed_settings(trial.change, inputs.settings))}."
+    action = f"Set {format_changes(select_changed_settings(rerun.change, inputs.settings))}."
     if uses_reported_sigma:
         mode_text = f" ({aid.noise_mode_parameter} 0)" if aid.noise_mode_parameter else ""
         message += (
@@ -124,11 +124,11 @@ def detect_wrong_noise(analysis: Analysis) -> Findings:
     )
 
 
-def find_confirmed_noise_trial(analysis: Analysis) -> Trial | None:
+def find_confirmed_noise_rerun(analysis: Analysis) -> Rerun | None:
     """Return a re-run in which another EKF2 measurement noise makes EKF2 consistent, or None."""
-    trial = find_trial(analysis.select_main_trials(), "ekf2", "noise", find_aid(analysis).noise)
-    is_confirmed = trial is not None and becomes_consistent(trial, "source")
-    return trial if is_confirmed else None
+    rerun = find_rerun(analysis.select_main_reruns(), "ekf2", "noise", find_aid(analysis).noise)
+    is_confirmed = rerun is not None and becomes_consistent(rerun, "source")
+    return rerun if is_confirmed else None
 
 
 def detect_rejections(analysis: Analysis) -> Findings:
@@ -189,24 +189,24 @@ def _find_rejections(analysis: Analysis) -> Findings:
 
 def _find_rejection_remedy(analysis: Analysis, result: AxisComparison) -> str:
     aid = find_aid(analysis, result.axis.name)
-    helpful_trials = [
-        trial for trial in analysis.select_main_trials() if _prevents_rejections(trial)
+    helpful_reruns = [
+        rerun for rerun in analysis.select_main_reruns() if _prevents_rejections(rerun)
     ]
-    if helpful_trials and result is analysis.main:
-        return format_action(analysis, min(helpful_trials, key=compute_preference_key).change)
+    if helpful_reruns and result is analysis.main:
+        return format_action(analysis, min(helpful_reruns, key=compute_preference_key).change)
     return (
         f"{find_source_texts(analysis.source).data_link_check}. Then check {aid.delay} and "
         f"{aid.noise}. Increase {aid.gate} only if no fault is found."
     )
 
 
-def _prevents_rejections(trial: Trial) -> bool:
-    before, after = trial.before.rejected_fraction, trial.after.rejected_fraction
+def _prevents_rejections(rerun: Rerun) -> bool:
+    before, after = rerun.before.rejected_fraction, rerun.after.rejected_fraction
     return (
         before is not None
         and after is not None
-        and len(trial.kinds) == 1
-        and classify_improvement(trial) != "nothing"
+        and len(rerun.kinds) == 1
+        and classify_improvement(rerun) != "nothing"
         and after < MAX_REJECTED_AFTER_TO_BEFORE_RATIO * before
     )
 
@@ -289,7 +289,7 @@ def _assess_span(analysis: Analysis, start_s: float, end_s: float) -> SpanConsis
     if isinstance(innovations, Unavailable):
         return SpanConsistency(innovations, rmse_m)
     samples = innovations[(innovations.index >= start_s) & (innovations.index < end_s)]
-    consistency = assess_innovations(
+    consistency = Consistency.from_innovations(
         samples["innovation_m"].to_numpy(), samples["innovation_variance_m2"].to_numpy(), math.inf
     )
     return SpanConsistency(consistency, rmse_m)

@@ -195,10 +195,10 @@ def detect_missing_alignment(
         quantities.append(("yaw_align", "heading", "tilt and heading are", heading_action))
     alignment_end_s = segment.start_s
     for flag, quantity, required_text, action in quantities:
-        if flag not in ekf2.states:
+        if flag not in ekf2.status_flags:
             continue
-        spans = find_spans_with_value(0.0, ekf2.states[flag], segment)
-        unaligned_fraction = 1.0 - compute_flag_fraction(ekf2.states[flag], segment)
+        spans = find_spans_with_value(0.0, ekf2.status_flags[flag], segment)
+        unaligned_fraction = 1.0 - compute_flag_fraction(ekf2.status_flags[flag], segment)
         if (
             unaligned_fraction > MAX_UNALIGNED_FRACTION
             and spans[-1][1] > alignment_end_s + MAX_HEADING_ALIGNMENT_DELAY_S

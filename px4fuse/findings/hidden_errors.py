@@ -18,8 +18,8 @@ from px4fuse.comparison.model import (
     FilterName,
     select_north_and_east,
 )
+from px4fuse.comparison.rerun_effects import Rerun, find_cause_rerun
 from px4fuse.comparison.reruns import ErrorAboveSigma, find_error_above_sigma
-from px4fuse.comparison.trials import Trial, find_cause_trial
 from px4fuse.core.text import capitalise_first, format_metres, format_ratio
 from px4fuse.errors import TrajectoryError
 from px4fuse.filter.tuning import HORIZONTAL, AxisTuning
@@ -112,7 +112,7 @@ def make_hidden_error_finding(
     error_by_filter = {entry[0]: entry[1:] for entry in reversed(errors_not_in_innovations)}
     evidence: dict[str, float | str] = {"axis": worst_axis, "filter": worst_filter}
     ratio_texts, sentences = dict[str, str](), list[str]()
-    trial_by_filter = dict[FilterName, Trial]()
+    rerun_by_filter = dict[FilterName, Rerun]()
     for filter_name, label in FILTER_NAMES.items():
         if filter_name not in error_by_filter:
             continue
@@ -124,18 +124,18 @@ def make_hidden_error_finding(
             f"{filter_name}_position_rmse_m": error.rmse_m,
             f"{filter_name}_sigma_p_m": error.reported_sigma_m,
         }
-        cause = find_cause_trial(analysis.trials, filter_name, axis, "nees")
+        cause = find_cause_rerun(analysis.reruns, filter_name, axis, "nees")
         if cause is not None and not rerun_refutes_cause(analysis, filter_name, cause):
-            trial_by_filter[filter_name] = cause
+            rerun_by_filter[filter_name] = cause
         ratio_texts[label] = f"{label} error {format_ratio(error.nees**0.5)} times the reported σ"
         sentences.append(
             f"{label}: position RMSE {format_metres(error.rmse_m)} m along "
             f"{analysis.axes[axis].axis.label}, reported σ "
             f"{format_metres(error.reported_sigma_m)} m."
         )
-    cause = trial_by_filter.get(worst_filter) or next(iter(trial_by_filter.values()), None)
+    cause = rerun_by_filter.get(worst_filter) or next(iter(rerun_by_filter.values()), None)
     evidence[CAUSE_KEY] = classify_cause(analysis, cause)
-    alignment_rmse = None if trial_by_filter else _compute_alignment_rmse(analysis, worst_filter)
+    alignment_rmse = None if rerun_by_filter else _compute_alignment_rmse(analysis, worst_filter)
     is_misaligned = False
     if alignment_rmse is not None:
         evidence |= {
@@ -144,7 +144,7 @@ def make_hidden_error_finding(
         }
         if is_misaligned := alignment_rmse.is_misaligned:
             sentences.append(f"The position frame is misaligned: {alignment_rmse}.")
-    if analysis.source.origin.may_drift and not trial_by_filter and not is_misaligned:
+    if analysis.source.origin.may_drift and not rerun_by_filter and not is_misaligned:
         return _make_drift_finding(
             analysis, alignment_rmse, worst_error, evidence, tuple(ratio_texts)
         )
@@ -161,10 +161,10 @@ def make_hidden_error_finding(
         remedy = EKF2_HEIGHT_REMEDY if worst_axis == "down" else EKF2_REMEDY
     else:
         remedy = "Check the time offset of the positions (px4fuse sync LOG)."
-        if isinstance(analysis.clock, Unavailable):
+        if isinstance(analysis.time_offset, Unavailable):
             remedy = (
                 "A time offset of the positions is possible, but this log cannot show it: "
-                f"{analysis.clock.reason}. {analysis.clock.remedy}"
+                f"{analysis.time_offset.reason}. {analysis.time_offset.remedy}"
             )
         remedy += f" {find_source_texts(analysis.source).slow_error_check}."
     return finding(

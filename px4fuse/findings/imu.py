@@ -171,7 +171,7 @@ def detect_clipping(analysis: Analysis) -> Findings:
 
 
 def detect_imu_gaps(analysis: Analysis) -> Findings:
-    gap_s, imu, log = analysis.main.replay.input_gap_s, analysis.flight.imu, analysis.flight.log
+    gap_s, imu, log = analysis.main.kf_run.input_gap_s, analysis.flight.imu, analysis.flight.log
     interval_s, spans = 0.0, tuple[Span, ...]()
     if isinstance(imu, pd.DataFrame):
         interval_s, spans = 1.0 / sample_rate(imu), _find_gap_spans(imu, analysis.segment)

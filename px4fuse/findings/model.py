@@ -18,22 +18,7 @@ from px4fuse.flight.model import Flight, PositionKind, PositionTrack
 
 
 class CatalogueEntry(Record):
-    """Title and meaning of a finding, and its relation to other findings.
-
-    Attributes
-    ----------
-    group : str
-        One of :data:`FINDING_GROUPS`.
-    report_class : str
-        Class that determines the order of the findings, for example "unusable" or "noise".
-    verdict : str
-        "meaningless": the verdicts on KF and EKF2 are not valid. "repeated": the finding states a
-        verdict.
-    rerun_kinds : frozenset of str
-        Kinds of re-runs that confirm the finding.
-    status_if_convention_wrong : str
-        "effect" or "withdrawn" if axes, unit or clock of the positions are wrong; empty: unchanged.
-    """
+    """Title and meaning of a finding, and its relation to other findings (``catalogue.toml``)."""
 
     title: str
     meaning: str

@@ -13,16 +13,16 @@ from px4fuse.comparison.changes import MIN_RERUN_SIGMA_Z_M, SIGMA_A, SIGMA_Z, fi
 from px4fuse.comparison.estimates import find_first_tuning
 from px4fuse.comparison.model import FILTER_NAMES, AxisComparison, FilterName, FilterSummary
 from px4fuse.comparison.projection import EKF2_MIN_NOISE_M
-from px4fuse.comparison.remedy import find_aid, format_settings, make_noise_change
-from px4fuse.comparison.reruns import is_inconsistent
-from px4fuse.comparison.trials import (
-    Trial,
+from px4fuse.comparison.remedy import find_aid, format_changes, make_noise_change
+from px4fuse.comparison.rerun_effects import (
+    Rerun,
     can_show_improvement,
-    find_cause_trial,
-    find_trial,
-    find_trials,
+    find_cause_rerun,
+    find_rerun,
+    find_reruns,
     makes_overconfident,
 )
+from px4fuse.comparison.reruns import is_inconsistent
 from px4fuse.core.text import format_factor, format_number, format_ratio
 from px4fuse.filter.settings import SETTING_RANGES, Settings
 from px4fuse.filter.signals import cut_to_segment
@@ -183,11 +183,11 @@ def format_estimate(name: str, setting: float, noise: NoiseEstimate) -> str:
 
 def format_setting_action(analysis: Analysis, name: str) -> str:
     """Return the change that a re-run confirmed, or the reason to change nothing."""
-    if trial := find_trial(analysis.select_main_trials(), "kf", "noises", name):
-        return format_kf_settings(trial.change)
+    if rerun := find_rerun(analysis.select_main_reruns(), "kf", "noises", name):
+        return format_kf_settings(rerun.change)
     if any(
-        trial.filter == "kf" and trial.change.keys() == {name} and can_show_improvement(trial)
-        for trial in analysis.select_main_trials()
+        rerun.filter == "kf" and rerun.change.keys() == {name} and can_show_improvement(rerun)
+        for rerun in analysis.select_main_reruns()
     ):
         return NO_IMPROVEMENT_ACTION
     if getattr(analysis.request, name, None) is not None:
@@ -222,7 +222,7 @@ def find_setting_deviation(
 def detect_process_noise_near_zero(analysis: Analysis) -> Findings:
     """Detect a SIGMA_A so small that KF ignores new positions."""
     for result in sorted(analysis.axes.values(), key=lambda result: result is not analysis.main):
-        updates, summary = result.replay.updates, result.filters["kf"]
+        updates, summary = result.kf_run.updates, result.filters["kf"]
         # Without motion, a small SIGMA_A is correct
         if (
             isinstance(summary, Unavailable)
@@ -318,7 +318,7 @@ def _make_wrong_sigma_finding(
     ):
         remedy_text, cause = KEEP_NOISE_BECAUSE_OF_TRUTH_ACTION, UNKNOWN_CAUSE
     else:
-        rerun = find_cause_trial(analysis.trials, filter_name, worst_axis.axis.name)
+        rerun = find_cause_rerun(analysis.reruns, filter_name, worst_axis.axis.name)
         cause = classify_cause(analysis, rerun)
         remedy_text = _find_action_for_wrong_sigma(
             analysis, filter_name, worst_axis, axis_tuning, rerun
@@ -399,7 +399,7 @@ def _has_default_noises(
     analysis: Analysis, filter_name: FilterName, result: AxisComparison
 ) -> bool:
     """Return True if a filter uses default noise settings: px4fuse's (KF) or PX4's (EKF2)."""
-    if filter_name == "kf":
+    if filter_name != "ekf2":
         settings, defaults = analysis.settings, Settings()
         return all(
             getattr(settings, name) == getattr(defaults, name) for name in (SIGMA_Z, SIGMA_A)
@@ -418,11 +418,11 @@ def _find_action_for_wrong_sigma(
     filter_name: FilterName,
     result: AxisComparison,
     axis_tuning: AxisTuning | None,
-    cause: Trial | None,
+    cause: Rerun | None,
 ) -> str:
     if cause is not None and not rerun_refutes_cause(analysis, filter_name, cause):
         return format_action(analysis, cause.change)
-    reruns = find_trials(analysis.trials, filter_name, result.axis.name)
+    reruns = find_reruns(analysis.reruns, filter_name, result.axis.name)
     if any(makes_overconfident(rerun, "nis") for rerun in reruns):
         return KEEP_NOISE_BECAUSE_OF_TRUTH_ACTION
     if axis_tuning is None:
@@ -456,7 +456,7 @@ def _find_sigma_action_without_replay(
     if not changes:
         return UNEXPLAINED_SIGMA_ACTION
     return (
-        f"Set {format_settings(changes)}. EKF2 used a measurement noise of {used_noise_m:.2g} m. "
+        f"Set {format_changes(changes)}. EKF2 used a measurement noise of {used_noise_m:.2g} m. "
         "Fly again to test the change, because EKF2 cannot be replayed."
     )
 

@@ -160,9 +160,9 @@ def detect_unavailable_data(analysis: Analysis) -> Findings:
                 "too_few_innovations",
                 f"The consistency of KF is not tested: {kf_summary.reason}.",
                 kf_summary.remedy,
-                {"count": len(result.replay.updates)},
+                {"count": len(result.kf_run.updates)},
             )
-            return
+            return  # one finding for all axes
 
 
 def detect_source_not_logged(analysis: PreparedComparison) -> Findings:

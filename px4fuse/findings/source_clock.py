@@ -5,8 +5,8 @@ import math
 from px4fuse.analysis import Analysis
 from px4fuse.comparison import remedy
 from px4fuse.comparison.model import FilterName, PreparedComparison
-from px4fuse.comparison.trials import Trial
-from px4fuse.filter.time_offset import ClockOffset
+from px4fuse.comparison.rerun_effects import Rerun
+from px4fuse.filter.time_offset import SourceTimeOffset
 from px4fuse.findings.cause_text import format_sender_action
 from px4fuse.findings.model import Findings, finding, make_error, make_warning
 from px4fuse.findings.source_positions import find_low_pass
@@ -23,9 +23,9 @@ CHECK_RECEIVER_ACTION = f"Check the delay of the GNSS receiver ({GNSS_POS.delay}
 
 
 def detect(analysis: Analysis) -> Findings:
-    time_offset = analysis.clock
+    time_offset = analysis.time_offset
     if (
-        isinstance(time_offset, ClockOffset)
+        isinstance(time_offset, SourceTimeOffset)
         and time_offset.is_determinable
         and not analysis.source.origin.reconstructed
     ):
@@ -34,7 +34,7 @@ def detect(analysis: Analysis) -> Findings:
     yield from detect_wrong_gnss_delay(analysis)
 
 
-def detect_time_offset(analysis: Analysis, time_offset: ClockOffset) -> Findings:
+def detect_time_offset(analysis: Analysis, time_offset: SourceTimeOffset) -> Findings:
     if find_low_pass(analysis) is not None:  # a low-pass filter delays positions, not timestamps
         return
     low_s, high_s = time_offset.interval_s
@@ -60,7 +60,7 @@ def detect_time_offset(analysis: Analysis, time_offset: ClockOffset) -> Findings
     if (
         not time_offset.is_significant(time_offset.remaining_s)
         or find_timesync_convergence(analysis) is not None
-        or truth_refutes_offset(find_offset_trial(analysis))
+        or truth_refutes_offset(find_offset_rerun(analysis))
     ):
         return
     offset_s, low_s, high_s = (
@@ -81,27 +81,27 @@ def detect_time_offset(analysis: Analysis, time_offset: ClockOffset) -> Findings
     )
 
 
-def find_offset_trial(analysis: Analysis) -> Trial | None:
-    return _find_trial(analysis, "kf", "time offset")
+def find_offset_rerun(analysis: Analysis) -> Rerun | None:
+    return _find_rerun(analysis, "kf", "time offset")
 
 
-def truth_refutes_offset(trial: Trial | None) -> bool:
+def truth_refutes_offset(rerun: Rerun | None) -> bool:
     """Return True if a corrected time offset increases KF's error against ground truth."""
-    return _compute_rmse_ratio(trial) > MAX_RMSE_RATIO_AFTER_CORRECTION
+    return _compute_rmse_ratio(rerun) > MAX_RMSE_RATIO_AFTER_CORRECTION
 
 
-def _find_trial(analysis: Analysis, filter_name: FilterName, kind: str) -> Trial | None:
-    for trial in analysis.select_main_trials():
-        if (trial.filter, trial.kinds) == (filter_name, (kind,)):
-            return trial
+def _find_rerun(analysis: Analysis, filter_name: FilterName, kind: str) -> Rerun | None:
+    for rerun in analysis.select_main_reruns():
+        if (rerun.filter, rerun.kinds) == (filter_name, (kind,)):
+            return rerun
     return None
 
 
-def _compute_rmse_ratio(trial: Trial | None) -> float:
+def _compute_rmse_ratio(rerun: Rerun | None) -> float:
     """Return position RMSE with a change / position RMSE without it; NaN if unknown."""
-    if trial is None or not trial.before.position_rmse_m or trial.after.position_rmse_m is None:
+    if rerun is None or not rerun.before.position_rmse_m or rerun.after.position_rmse_m is None:
         return math.nan
-    return trial.after.position_rmse_m / trial.before.position_rmse_m
+    return rerun.after.position_rmse_m / rerun.before.position_rmse_m
 
 
 def _find_receiver_delay_parameter(analysis: Analysis) -> str | None:
@@ -111,7 +111,7 @@ def _find_receiver_delay_parameter(analysis: Analysis) -> str | None:
     return None
 
 
-def _format_assumed_delay(analysis: Analysis, time_offset: ClockOffset) -> str:
+def _format_assumed_delay(analysis: Analysis, time_offset: SourceTimeOffset) -> str:
     delay_parameter = _find_receiver_delay_parameter(analysis)
     if delay_parameter is None:
         return ""
@@ -120,7 +120,7 @@ def _format_assumed_delay(analysis: Analysis, time_offset: ClockOffset) -> str:
     return f" {delay_parameter} is {delay_ms:g} ms; the estimate is {estimated_delay_ms:.0f} ms."
 
 
-def _find_offset_remedy(analysis: Analysis, time_offset: ClockOffset) -> str:
+def _find_offset_remedy(analysis: Analysis, time_offset: SourceTimeOffset) -> str:
     if delay_parameter := _find_receiver_delay_parameter(analysis):
         return f"Check the delay of the GNSS receiver ({delay_parameter})."
     if analysis.source.alignment is not None:
@@ -129,19 +129,21 @@ def _find_offset_remedy(analysis: Analysis, time_offset: ClockOffset) -> str:
     position_age_ms = (remedy.find_logged_delay_ms(analysis) or 0.0) - 1e3 * time_offset.remaining_s
     action = format_sender_action(analysis.source, time_offset.remaining_s)
     if delay_max_change := remedy.find_delay_max_change(analysis, position_age_ms):
-        action += f", and set {remedy.format_settings(delay_max_change)}"
+        action += f", and set {remedy.format_changes(delay_max_change)}"
     return f"{action}."
 
 
-def compute_offset_for_option_s(comparison: PreparedComparison, time_offset: ClockOffset) -> float:
+def compute_offset_for_option_s(
+    comparison: PreparedComparison, time_offset: SourceTimeOffset
+) -> float:
     """Return the value (s) of ``--clock-offset`` that corrects a time offset."""
     # --clock-offset replaces the offset from the alignment, so it must include that offset
     alignment = comparison.source.alignment
     return time_offset.offset_s + (0.0 if alignment is None else alignment.clock_offset_s)
 
 
-def detect_wrong_delay(analysis: Analysis, time_offset: ClockOffset) -> Findings:
-    if truth_refutes_offset(find_offset_trial(analysis)):
+def detect_wrong_delay(analysis: Analysis, time_offset: SourceTimeOffset) -> Findings:
+    if truth_refutes_offset(find_offset_rerun(analysis)):
         return
     source, delay_ms = analysis.source, remedy.find_logged_delay_ms(analysis)
     is_gnss = source.origin.is_fused_as_gnss
@@ -193,7 +195,7 @@ def detect_wrong_gnss_delay(analysis: Analysis) -> Findings:
     ekf2_model = analysis.ekf2_model
     if isinstance(ekf2_model, Unavailable) or not ekf2_model.agreement.good:
         return
-    estimate = remedy.estimate_gnss_delay_ms(analysis, ekf2_model, analysis.clock)
+    estimate = remedy.estimate_gnss_delay_ms(analysis, ekf2_model, analysis.time_offset)
     if estimate is None:
         return
     delay_ms, (estimated_delay_ms, sigma_ms) = ekf2_model.inputs.settings[GNSS_POS.delay], estimate
@@ -203,18 +205,16 @@ def detect_wrong_gnss_delay(analysis: Analysis) -> Findings:
         f"{GNSS_POS.delay} is {delay_ms:g} ms, but GNSS positions and velocities are "
         f"{estimated_delay_ms:.0f} ms late (± {1.96 * sigma_ms:.0f} ms, 95 %, compared with "
         "vision). EKF2's track leads or lags the motion.",
-        f"Set {remedy.format_settings(change)}." if change else CHECK_RECEIVER_ACTION,
+        f"Set {remedy.format_changes(change)}." if change else CHECK_RECEIVER_ACTION,
         {"ekf2_gps_delay_ms": delay_ms, "estimate_ms": estimated_delay_ms, "sigma_ms": sigma_ms},
     )
 
 
 def _find_delay_remedy(analysis: Analysis, parameter: str, action_if_not_confirmed: str) -> str:
-    trial = _find_trial(analysis, "ekf2", "delay")
-    if trial is None:
+    rerun = _find_rerun(analysis, "ekf2", "delay")
+    if rerun is None:
         return f"Check {parameter}."
-    ratio = _compute_rmse_ratio(trial)
-    if math.isnan(ratio) and trial.before.nis_mean and trial.after.nis_mean:
-        ratio = trial.after.nis_mean / trial.before.nis_mean
-    return (
-        f"Set {remedy.format_settings(trial.change)}." if ratio < 1.0 else action_if_not_confirmed
-    )
+    ratio = _compute_rmse_ratio(rerun)
+    if math.isnan(ratio) and rerun.before.nis_mean and rerun.after.nis_mean:
+        ratio = rerun.after.nis_mean / rerun.before.nis_mean
+    return f"Set {remedy.format_changes(rerun.change)}." if ratio < 1.0 else action_if_not_confirmed

@@ -5,12 +5,12 @@ import math
 import numpy as np
 
 from px4fuse.analysis import Analysis
-from px4fuse.comparison.remedy import find_aid, format_settings
+from px4fuse.comparison.remedy import find_aid, format_changes
 from px4fuse.core.text import lowercase_first_letter
 from px4fuse.filter.frame_rotation import HeadingError
 from px4fuse.finding import Finding
 from px4fuse.findings.ekf2_not_fusing import FUSED_FRACTION_FOR_ERROR
-from px4fuse.findings.ekf2_settings import find_confirmed_noise_trial
+from px4fuse.findings.ekf2_settings import find_confirmed_noise_rerun
 from px4fuse.findings.model import (
     Findings,
     compute_flag_fraction,
@@ -136,9 +136,9 @@ def detect_misalignment(analysis: Analysis, heading_error: HeadingError) -> Find
 
 def _explain_gnss_heading_error(analysis: Analysis) -> tuple[str, str]:
     """Return the possible cause of a wrong heading in a flight with GNSS, and the action."""
-    if (trial := find_confirmed_noise_trial(analysis)) is not None:
+    if (rerun := find_confirmed_noise_rerun(analysis)) is not None:
         cause = f"a wrong {find_aid(analysis).noise}, with which GNSS affects EKF2's heading"
-        return cause, f"Set {format_settings(trial.change)}. Then check the heading again."
+        return cause, f"Set {format_changes(rerun.change)}. Then check the heading again."
     advice = magnetometer_advice(analysis.flight)
     cause = "a magnetometer near currents or steel" if advice else "a wrong heading source of EKF2"
     return cause, f"{advice} {CHECK_GNSS_DELAY_ACTION}".lstrip()

@@ -191,8 +191,8 @@ def describe_errors_after_gap(analysis: Analysis, gap_span_s: Span) -> str:
             ekf2_text += f" (σ {format_metres(variance_m2**0.5)} m)"
         ekf2_text += ", "
     times_s = np.array([start_s, end_s - TIME_BEFORE_UPDATE_S])
-    kf_error_m = abs(predict_state(result.replay, times_s)[0][1] - reference_m)
-    kf_sigma_m = predict_variance(result.replay, times_s)[0][1] ** 0.5
+    kf_error_m = abs(predict_state(result.kf_run, times_s)[0][1] - reference_m)
+    kf_sigma_m = predict_variance(result.kf_run, times_s)[0][1] ** 0.5
     return (
         f"{aiding_sentence} {quantity} along {axis.label}: {ekf2_text}KF "
         f"{format_metres(kf_error_m)} m (σ {format_metres(kf_sigma_m)} m)."

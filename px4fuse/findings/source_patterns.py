@@ -20,7 +20,7 @@ from px4fuse.comparison.error_patterns import (
 )
 from px4fuse.core.text import format_metres, format_ratio
 from px4fuse.filter.imu_oscillation import find_imu_oscillation
-from px4fuse.filter.time_offset import ClockOffset
+from px4fuse.filter.time_offset import SourceTimeOffset
 from px4fuse.findings.model import (
     Findings,
     find_source_texts,
@@ -106,8 +106,8 @@ def detect_periodic_errors_and_offset_changes(analysis: Analysis, error_fit: Err
             periodic_error._asdict(),
         )
         return
-    clock, offset_change = analysis.clock, find_offset_variation(error_fit)
-    if isinstance(clock, ClockOffset) and clock.has_changed():
+    clock, offset_change = analysis.time_offset, find_offset_variation(error_fit)
+    if isinstance(clock, SourceTimeOffset) and clock.has_changed():
         return  # source_clock.py reports a change of the time offset
     if offset_change is not None:
         yield make_error(

@@ -18,7 +18,7 @@ from px4fuse.filter.hypotheses import (
     OUTLIER_BURST_DURATION_S,
     OUTLIER_RETEST_DURATION_AFTER_JUMP_S,
 )
-from px4fuse.filter.time_offset import ClockOffset
+from px4fuse.filter.time_offset import SourceTimeOffset
 from px4fuse.filter.tuning import HORIZONTAL, AxisTuning
 from px4fuse.finding import Finding, Severity
 from px4fuse.findings.cause_grouping import (
@@ -157,11 +157,11 @@ def find_low_pass(analysis: Analysis) -> SourceLowPass | None:
     return low_pass
 
 
-def _find_valid_time_offset(analysis: Analysis) -> ClockOffset | None:
+def _find_valid_time_offset(analysis: Analysis) -> SourceTimeOffset | None:
     """Return the time offset, unless timestamps are arrival times."""
-    if isinstance(analysis.clock, Unavailable) or any(detect_arrival_timestamps(analysis)):
+    if isinstance(analysis.time_offset, Unavailable) or any(detect_arrival_timestamps(analysis)):
         return None
-    return analysis.clock
+    return analysis.time_offset
 
 
 def detect_low_pass(analysis: Analysis) -> Findings:

@@ -9,7 +9,7 @@ from scipy.interpolate import CubicHermiteSpline
 
 from px4fuse.analysis import Analysis
 from px4fuse.comparison.flight_events import compute_max_interval_s
-from px4fuse.comparison.remedy import find_aid, format_settings, is_source_fused
+from px4fuse.comparison.remedy import find_aid, format_changes, is_source_fused
 from px4fuse.convention.correction import find_convention_faults
 from px4fuse.convention.lever_arm import (
     IMU_POSITION_PARAMETERS,
@@ -162,18 +162,18 @@ def detect_lever_arm(analysis: Analysis) -> Findings:
         MIN_ROTATION_DEG, MIN_ROTATION_SIGMAS * lever_arm.rotation_sigma_deg
     ):
         rotation_deg = 0.0
-    sensor_text, action = f"{source_name(source)} sensor", f"Set {format_settings(change)}."
+    sensor_text, action = f"{source_name(source)} sensor", f"Set {format_changes(change)}."
     error_text = "the position error"
     effect_sentence = _describe_replayed_effect(analysis, change, rotation_deg)
     if effect_sentence is None:  # ground truth contains no such error of the positions
         effect_sentence = _describe_replayed_effect(analysis, imu_change, rotation_deg)
-        sensor_text, action = "IMU", f"Set {format_settings(imu_change)}."
+        sensor_text, action = "IMU", f"Set {format_changes(imu_change)}."
         error_text = "EKF2's position error"
         forward_m, right_m = 0.0 - forward_m, 0.0 - right_m
     elif any(imu_position_m) and not has_truth:
         action = (
-            f"Set {format_settings(change)}. If the position of the sensor is right, set "
-            f"{format_settings(imu_change)} instead: the IMU at a wrong place has the same effect."
+            f"Set {format_changes(change)}. If the position of the sensor is right, set "
+            f"{format_changes(imu_change)} instead: the IMU at a wrong place has the same effect."
         )
     if effect_sentence is None:
         return

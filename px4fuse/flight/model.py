@@ -46,7 +46,7 @@ class SourceOrigin(Record):
     # Kind of the sensor, inferred from the data
     kind: PositionKind
     # Logged data that contain the positions, for example "as received" by the autopilot
-    path: PositionRoute
+    route: PositionRoute
     # EKF2's aiding source for these positions; None if EKF2 never fuses them
     aid: Aid | None
     # True if px4fuse may select the source by default
@@ -60,12 +60,12 @@ class SourceOrigin(Record):
     @property
     def reconstructed(self) -> bool:
         """True if the positions are reconstructed from EKF2's logged data."""
-        return self.path in ("kept by EKF2", "rebuilt from innovations")
+        return self.route in ("kept by EKF2", "rebuilt from innovations")
 
     @property
     def has_all_samples(self) -> bool:
         """True if all positions of the sender are available."""
-        return self.path in ("given file", "as received")
+        return self.route in ("given file", "as received")
 
     @property
     def is_vision(self) -> bool:
@@ -82,7 +82,9 @@ class SourceOrigin(Record):
 
     def find_preference_rank(self) -> int:
         """Return the rank of the source. px4fuse prefers the source with the smallest rank."""
-        return [(origin.aid, origin.path) for origin in SOURCE_ORIGINS].index((self.aid, self.path))
+        return [(origin.aid, origin.route) for origin in SOURCE_ORIGINS].index(
+            (self.aid, self.route)
+        )
 
 
 POSITION_FILE_ORIGIN = SourceOrigin("file", "given file", EV_POS)
@@ -104,11 +106,11 @@ SOURCE_ORIGINS = (
 )
 
 
-def find_source_origin(kind: str, path: str) -> SourceOrigin:
+def find_source_origin(kind: str, route: str) -> SourceOrigin:
     for origin in SOURCE_ORIGINS:
-        if (origin.kind, origin.path) == (kind, path):
+        if (origin.kind, origin.route) == (kind, route):
             return origin
-    raise ValueError(f"no position source has the kind {kind!r} and the path {path!r}")
+    raise ValueError(f"no position source has the kind {kind!r} and the route {route!r}")
 
 
 REPEATED_TIMESTAMPS_NOTE = (
@@ -424,21 +426,17 @@ class PositionTrack:
 
     def description_fields(self) -> dict[str, Any]:
         """Return the fields that describe the position source in results.json."""
-        names = (
-            "name",
-            "kind",
-            "path",
-            "description",
-            "frame",
-            "clock",
-            "reconstructed",
-            "topics",
-            "log",
-            "alignment",
-        )
         return {
-            name: getattr(self.origin if hasattr(self.origin, name) else self, name)
-            for name in names
+            "name": self.name,
+            "kind": self.origin.kind,
+            "path": self.origin.route,
+            "description": self.description,
+            "frame": self.frame,
+            "clock": self.clock,
+            "reconstructed": self.origin.reconstructed,
+            "topics": self.topics,
+            "log": self.log,
+            "alignment": self.alignment,
         }
 
     def compute_rate_hz(self) -> float:
@@ -556,7 +554,7 @@ class FusionRecord:
     # Logged updates of EKF2's height bias estimators, by aiding source
     height_bias_updates: Mapping[str, pd.DataFrame] = field(default_factory=dict)
     # Status flags of EKF2 by PX4 name; 1 while set
-    states: StepFunctions = field(default_factory=dict)
+    status_flags: StepFunctions = field(default_factory=dict)
 
     __repr__ = one_line_repr
 
@@ -566,7 +564,7 @@ class FusionRecord:
 
     def was_flag_set(self, flag: str, times_s: Array) -> BoolArray:
         """Return True for each time at which the status flag of EKF2 was set."""
-        step_function = self.states.get(flag)
+        step_function = self.status_flags.get(flag)
         return (
             np.zeros(len(times_s), bool)
             if step_function is None
@@ -633,10 +631,12 @@ class Ekf2:
     step_s: float = EKF2_STEP_S
     # Delay (s) of the fusion horizon: EKF2 fuses measurements at this age
     horizon_s: float | Unavailable = HORIZON_NOT_LOGGED
+    # Data at the fusion horizon for the replay of EKF2
     record: FusionRecord | Unavailable = RECORD_NOT_LOGGED
+    # Innovations of each aiding source, by PX4's name
     aids: Mapping[str, AidLog] = field(default_factory=dict)
     # Status flags of EKF2, 1 while set; ``failed_checks`` is the bit mask gps_check_fail_flags
-    states: StepFunctions = field(default_factory=dict)
+    status_flags: StepFunctions = field(default_factory=dict)
     # All EKF2 parameters at take-off, in PX4 units
     parameters: Mapping[str, float] = field(default_factory=dict)
     parameter_changes: tuple[ParameterChange, ...] = ()

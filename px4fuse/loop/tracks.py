@@ -102,7 +102,7 @@ def _make_kf_trajectory(flight: Flight) -> Trajectory:
     kf_comparison = compare(prepared_comparison)
     columns = zip(Columns.POSITION, kf_comparison.axes.values(), strict=True)
     position_samples = pd.DataFrame(
-        {name: axis.replay.steps["position_m"] for name, axis in columns}
+        {name: axis.kf_run.steps["position_m"] for name, axis in columns}
     )
     settings = kf_comparison.settings
     note = (
@@ -196,7 +196,7 @@ def is_g2o(path: Path) -> bool:
 def read_source(
     argument: str,
     *,
-    default: TrackName | None = None,
+    default_track: TrackName | None = None,
     frame: Frame | None = None,
     system: int | None = None,
 ) -> LoopSource:
@@ -206,7 +206,7 @@ def read_source(
     ----------
     argument : str
         ``FILE``, ``LOG:TRACK``, ``TABLE:BODY`` or ``BAG:TOPIC``.
-    default : {"vio", "ekf2", "kf", "truth"}, optional
+    default_track : {"vio", "ekf2", "kf", "truth"}, optional
         Default track of a flight log.
     frame : Frame, optional
         Frame of a trajectory file.
@@ -243,7 +243,7 @@ def read_source(
             f"{display_name(path)}: flight logs have no track {track_name!r}",
             f"Use one of {', '.join(TRACK_NAMES)}.",
         )
-    chosen_track_name = track_name or default
+    chosen_track_name = track_name or default_track
     odometry = find_odometry(flight)
     if chosen_track_name is None and isinstance(odometry, Unavailable):
         if isinstance(flight.ekf2, Unavailable):

@@ -115,13 +115,13 @@ def read_mavlink(name: str, content: bytes, system_id: int | None = None) -> Fli
 
 def _read_imu(recording: Recording, remedy: str) -> TableOrUnavailable:
     # HIGHRES_IMU is preferred, because it has SI units and µs timestamps
-    layout = messages.IMU_LAYOUTS[0]
+    layout = messages.HIGHRES_IMU_LAYOUT
     if len(recording.rows(layout.topic)) < 2:
         layout = recording.find_most_frequent(messages.IMU_LAYOUTS)
     rows = recording.rows(layout.topic)
     if len(rows) < 2:
         return Unavailable("IMU", "the recording has no HIGHRES_IMU or SCALED_IMU", remedy)
-    if layout == messages.IMU_LAYOUTS[0]:
+    if layout == messages.HIGHRES_IMU_LAYOUT:
         imu_ids = np.array(recording.frames.table(layout.topic, rows)["id"])
         rows = rows[imu_ids == np.bincount(imu_ids).argmax()]
     imu = recording.read(layout, rows)
@@ -150,11 +150,11 @@ def _read_ekf2(
     recording: Recording, parameters: Mapping[str, float], autopilot: str
 ) -> Ekf2 | Unavailable:
     remedies, replay_unavailable = messages.remedies_of_autopilot(autopilot)
-    layout, local_position_layout = messages.STATE_LAYOUTS
+    layout = messages.ODOMETRY_LAYOUT
     # ODOMETRY has variances, so it is preferred unless its rate is much lower
-    local_position_count = len(recording.rows(local_position_layout.topic))
+    local_position_count = len(recording.rows(messages.LOCAL_POSITION_LAYOUT.topic))
     if 2 * len(recording.rows(layout.topic)) < local_position_count:
-        layout = local_position_layout
+        layout = messages.LOCAL_POSITION_LAYOUT
     message_name = layout.topic
     if len(recording.rows(message_name)) < 2:
         return Unavailable(

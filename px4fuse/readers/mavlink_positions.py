@@ -191,7 +191,7 @@ def find_local_origin(recording: Recording) -> GeodeticPosition | None:
         return tuple(sent_origins.iloc[-1].tolist())
     joined_positions = join_nearest(
         recording.read(messages.MESSAGE_LAYOUTS["GLOBAL_POSITION_INT"]),
-        recording.read(messages.STATE_LAYOUTS[-1])[Columns.POSITION],
+        recording.read(messages.LOCAL_POSITION_LAYOUT)[Columns.POSITION],
         MAX_ORIGIN_TIME_DIFFERENCE_S,
     ).dropna()
     joined_positions = joined_positions[joined_positions["latitude_deg"] != 0.0]

@@ -95,10 +95,10 @@ def read_ekf2(topics: Topics) -> Ekf2 | Unavailable:
             "Start the recording after EKF2 has started.",
         )
     topics.record_stream("ekf2_state", px4.LOCAL_POSITION_LAYOUT.topic)
-    enabled_aids = read_enabled_aids(topics)
-    fusion_flags = _read_fusion_flags(topics, enabled_aids)
+    aid_enabled_flags = read_enabled_aids(topics)
+    fusion_flags = _read_fusion_flags(topics, aid_enabled_flags)
     vision_gate = fill_with_defaults(parameters)[EV_POS.gate]
-    aids = read_aids(topics, enabled_aids)
+    aids = read_aids(topics, aid_enabled_flags)
     innovations, innovation_topics = collect_innovations_by_axis(aids, fusion_flags, vision_gate)
     if innovation_topics:
         topics.record_stream("ekf2_innovations", *innovation_topics)
@@ -108,24 +108,17 @@ def read_ekf2(topics: Topics) -> Ekf2 | Unavailable:
         for topic in innovation_topics[:1]
         if not any("timestamp_sample" in table for table in topics.tables_of(topic))
     )
-    status_flags = enabled_aids | {
+    status_flags = aid_enabled_flags | {
         name: local_position[name] for name in VALIDITY_FLAGS if name in local_position
     }
     failed_gnss_checks = topics.primary_samples(px4.TOPIC_LAYOUTS["gnss_checks"])["failed"].dropna()
     if len(failed_gnss_checks):
         status_flags["failed_checks"] = failed_gnss_checks
     step_s = _estimate_step_s(topics)
-    horizon_state = variance = _read_horizon_state(topics, step_s)
-    if isinstance(horizon_state, pd.DataFrame):
-        variance = horizon_state[Columns.POSITION_VARIANCE + Columns.VELOCITY_VARIANCE]
-        variance = variance[(variance > 0.0).all(axis=1)]
-        if variance.empty:
-            variance = VARIANCES_NOT_LOGGED
-        else:
-            topics.record_stream("ekf2_variance", _find_state_vector(topics)[0])
+    horizon_state = _read_horizon_state(topics, step_s)
     return Ekf2(
         state=state,
-        variance=variance,
+        variance=_select_variance(topics, horizon_state),
         innovations=innovations,
         innovation_topics=innovation_topics,
         fusion_flags=fusion_flags,
@@ -136,12 +129,26 @@ def read_ekf2(topics: Topics) -> Ekf2 | Unavailable:
         accelerometer_bias=_read_accelerometer_bias(topics, horizon_state),
         step_s=step_s,
         horizon_s=_compute_horizon_delay_s(topics, step_s),
-        record=_read_fusion_record(topics, horizon_state, local_position, enabled_aids, step_s),
+        record=_read_fusion_record(
+            topics, horizon_state, local_position, aid_enabled_flags, step_s
+        ),
         aids=aids,
-        states=status_flags,
+        status_flags=status_flags,
         parameters=topics.ekf2_parameters,
         parameter_changes=topics.parameter_changes,
     )
+
+
+def _select_variance(topics: Topics, horizon_state: TableOrUnavailable) -> TableOrUnavailable:
+    """Return the variances of position and velocity, which are logged at the fusion horizon."""
+    if isinstance(horizon_state, Unavailable):
+        return horizon_state
+    variance = horizon_state[Columns.POSITION_VARIANCE + Columns.VELOCITY_VARIANCE]
+    variance = variance[(variance > 0.0).all(axis=1)]
+    if variance.empty:
+        return VARIANCES_NOT_LOGGED
+    topics.record_stream("ekf2_variance", _find_state_vector(topics)[0])
+    return variance
 
 
 def _find_state_vector(topics: Topics) -> tuple[str, int]:
@@ -365,7 +372,7 @@ def _read_fusion_record(
         flow=_read_optical_flow(topics, enabled_aids),
         latitude_deg=float(origin["ref_lat"]),
         altitude_m=altitude_m,
-        states={name: enabled_aids[name] for name in STATUS_FLAGS if name in enabled_aids},
+        status_flags={name: enabled_aids[name] for name in STATUS_FLAGS if name in enabled_aids},
         height_bias_updates={
             name: topics.primary_samples(layout).dropna()
             for name, layout in px4.HEIGHT_BIAS_LAYOUT_BY_AID.items()

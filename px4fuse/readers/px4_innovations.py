@@ -75,20 +75,24 @@ def has_fused_aid(ekf2: Ekf2 | Unavailable, aid: str = GNSS_POS.name) -> bool:
         if aid_log.enabled is not None:
             return True
     # a valid global position shows that EKF2 fused GNSS
-    if aid != GNSS_POS.name or "tilt_align" in ekf2.states or "xy_global" not in ekf2.states:
+    if (
+        aid != GNSS_POS.name
+        or "tilt_align" in ekf2.status_flags
+        or "xy_global" not in ekf2.status_flags
+    ):
         return False
-    return bool(ekf2.states["xy_global"].any())
+    return bool(ekf2.status_flags["xy_global"].any())
 
 
 def replace_vision_by_gnss_innovations(ekf2: Ekf2, source: Ekf2PositionSource = GNSS) -> Ekf2:
     """Return the EKF2 data with innovations of GNSS instead of external vision."""
     enabled_flags = {
-        group: ekf2.states[name]
+        group: ekf2.status_flags[name]
         for group, name in (
             ("horizontal", source.horizontal_aid),
             ("vertical", source.vertical_aid),
         )
-        if name in ekf2.states
+        if name in ekf2.status_flags
     }
     fusion_flags: TableOrUnavailable = Unavailable(
         "EKF2 fusion flags",
@@ -119,7 +123,7 @@ def collect_innovations_by_axis(
 ) -> tuple[Innovations, tuple[str, ...]]:
     """Return the innovations along each axis, and the topics that contain them.
 
-    ``gate`` (√S) is the innovation gate, for logs without rejection flags.
+    ``gate`` is the innovation gate, a multiple of √S, for logs without rejection flags.
     """
     innovations: Innovations = {}
     used_topics: dict[str, None] = {}
@@ -131,6 +135,7 @@ def collect_innovations_by_axis(
             aid_name, sensor_name = source.vertical_aid, source.height_sensor or source.name
         aid_log = aids.get(aid_name)
         axis_innovations = None if aid_log is None else select_axis_innovations(aid_log, axis, gate)
+        remedy = source.logging_remedy
         if isinstance(fusion_flags, pd.DataFrame) and not fusion_flags[axis_group].any():
             reason = f"EKF2 never fused the {quantity} from {sensor_name} in this log"
             remedy = source.remedies[axis_group]
@@ -141,11 +146,10 @@ def collect_innovations_by_axis(
                 f"estimator_aid_src_{source.vertical_aid}, estimator_innovations or "
                 "ekf2_innovations"
             )
-            remedy = source.logging_remedy
         else:
             innovations[axis] = axis_innovations
             used_topics |= dict.fromkeys(aid_log.topics)
-            continue
+            continue  # the innovations are available
         innovations[axis] = Unavailable(f"EKF2 innovations, {axis}", reason, remedy)
     return innovations, tuple(used_topics)
 
@@ -153,7 +157,8 @@ def collect_innovations_by_axis(
 def select_axis_innovations(log: AidLog, axis: NedAxis, gate: float) -> pd.DataFrame:
     """Return the innovations along one axis, with the flags "fused" and "rejected".
 
-    ``gate`` (√S) is the innovation gate. EKF2 rejects a sample along all its axes together.
+    ``gate`` is the innovation gate, a multiple of √S. EKF2 rejects a sample along all
+    its axes together.
     """
     samples = log.samples
     nis_by_axis = {

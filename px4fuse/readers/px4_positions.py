@@ -545,7 +545,7 @@ def read_truth(
 
 
 def find_motion_capture_truth(positions: tuple[PositionTrack, ...]) -> Truth | None:
-    """Return motion capture as ground truth, or None if EKF2 may have fused it.
+    """Return motion capture as ground truth, unless it is the only position source for KF.
 
     Motion capture in FRD is not used, because its north direction is unknown.
     """

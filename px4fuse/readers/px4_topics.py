@@ -22,7 +22,7 @@ class TrackSource:
 
     # Kind of the source, such as "uwb"
     kind: str
-    path: str
+    route: str
     description: str
     # Advice if the positions of this source are not logged
     remedy: str
@@ -35,7 +35,7 @@ class TrackSource:
 
     @property
     def origin(self) -> SourceOrigin:
-        origin = find_source_origin(self.kind, self.path)
+        origin = find_source_origin(self.kind, self.route)
         return origin if self.fused else structs.replace(origin, aid=None)
 
 

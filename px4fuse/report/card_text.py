@@ -16,8 +16,8 @@ from px4fuse.card.model import (
     Action,
     AidConsistency,
     Card,
+    CardRerun,
     DiagnosedCause,
-    Rerun,
     Verdict,
     map_ratio_to_axis,
 )
@@ -304,7 +304,7 @@ def _format_action_lines(label: str, label_width: int, action: Action) -> Iterat
         label_text = indent
 
 
-def _format_rerun_table(reruns: Sequence[Rerun]) -> Iterator[Paragraph]:
+def _format_rerun_table(reruns: Sequence[CardRerun]) -> Iterator[Paragraph]:
     rows = make_rerun_rows(reruns)
     widths = [max(map(len, column)) for column in zip(*rows, strict=True)]
     for row in rows:
@@ -313,7 +313,7 @@ def _format_rerun_table(reruns: Sequence[Rerun]) -> Iterator[Paragraph]:
     yield from _wrap_lines(format_rerun_note(reruns), "  ", "  ")
 
 
-def make_rerun_rows(reruns: Sequence[Rerun]) -> list[list[str]]:
+def make_rerun_rows(reruns: Sequence[CardRerun]) -> list[list[str]]:
     """Return the table (first row: headings) of re-runs with changed settings."""
     rows = [
         {
@@ -332,7 +332,7 @@ def make_rerun_rows(reruns: Sequence[Rerun]) -> list[list[str]]:
     return [headings, *([row[head] for head in headings] for row in rows)]
 
 
-def format_rerun_note(reruns: Sequence[Rerun]) -> str:
+def format_rerun_note(reruns: Sequence[CardRerun]) -> str:
     replay_starts_s = [
         rerun.from_s for rerun in reruns if rerun.is_prediction and rerun.from_s is not None
     ]

@@ -12,16 +12,16 @@ from px4fuse.comparison.remedy import (
     find_aid,
     find_delay_max_change,
     find_logged_delay_ms,
-    format_settings,
+    format_changes,
 )
-from px4fuse.comparison.trials import Trial
+from px4fuse.comparison.rerun_effects import Rerun
 from px4fuse.convention.correction import find_convention_faults
 from px4fuse.core.text import format_metres
-from px4fuse.filter.time_offset import ClockOffset
+from px4fuse.filter.time_offset import SourceTimeOffset
 from px4fuse.finding import Finding
 from px4fuse.findings.source_clock import (
     compute_offset_for_option_s,
-    find_offset_trial,
+    find_offset_rerun,
     truth_refutes_offset,
 )
 from px4fuse.flight.model import Unavailable
@@ -39,7 +39,9 @@ def summarise_offset(analysis: Analysis, findings: Iterable[Finding]) -> str:
     """Summarise the time offset in one line; "" if the report has a page on the time offset."""
     if has_time_offset_page(analysis, findings):
         return ""
-    advice_by_label = make_time_offset_advice(analysis, analysis.clock, find_offset_trial(analysis))
+    advice_by_label = make_time_offset_advice(
+        analysis, analysis.time_offset, find_offset_rerun(analysis)
+    )
     return " ".join(
         advice_by_label[label] for label in ("Result", "Offset") if label in advice_by_label
     )
@@ -47,7 +49,7 @@ def summarise_offset(analysis: Analysis, findings: Iterable[Finding]) -> str:
 
 def has_time_offset_page(analysis: Analysis, findings: Iterable[Finding]) -> bool:
     """Return True if the time offset is wrong, changes, or cannot be estimated."""
-    time_offset = analysis.clock
+    time_offset = analysis.time_offset
     if isinstance(time_offset, Unavailable):
         return False
     return not time_offset.is_determinable or any(
@@ -57,12 +59,12 @@ def has_time_offset_page(analysis: Analysis, findings: Iterable[Finding]) -> boo
 
 def make_time_offset_advice(
     comparison: PreparedComparison,
-    time_offset: ClockOffset | Unavailable,
-    trial: Trial | None = None,
+    time_offset: SourceTimeOffset | Unavailable,
+    rerun: Rerun | None = None,
 ) -> dict[str, str]:
     """Return texts on the time offset of the position source, by label.
 
-    ``trial`` is a re-run of KF with the time offset.
+    ``rerun`` is a re-run of KF with the time offset.
     """
     if isinstance(time_offset, Unavailable):
         reason, remedy = time_offset.reason, time_offset.remedy
@@ -74,13 +76,13 @@ def make_time_offset_advice(
         }
     offset_s, (low_offset_s, high_offset_s) = time_offset.offset_s, time_offset.interval_s
     offset_text = f"{offset_s:+.3f} s (95 % {low_offset_s:+.3f} to {high_offset_s:+.3f} s)"
-    if trial is not None and truth_refutes_offset(trial):
+    if rerun is not None and truth_refutes_offset(rerun):
         return {
             "Result": (
                 "Ground truth refutes the estimated time offset. A re-run with this offset "
                 "increases KF's position RMSE from "
-                f"{format_metres(trial.before.position_rmse_m or 0.0)} to "
-                f"{format_metres(trial.after.position_rmse_m or 0.0)} m."
+                f"{format_metres(rerun.before.position_rmse_m or 0.0)} to "
+                f"{format_metres(rerun.after.position_rmse_m or 0.0)} m."
             ),
             "Offset": f"The estimate is {offset_text}.",
             "Action": "Do not correct the timestamps. Check the timestamps of the ground truth.",
@@ -129,7 +131,7 @@ def make_time_offset_advice(
 
 
 def _format_delay_advice(
-    comparison: PreparedComparison, time_offset: ClockOffset, logged_delay_ms: float
+    comparison: PreparedComparison, time_offset: SourceTimeOffset, logged_delay_ms: float
 ) -> str:
     delay_parameter = find_aid(comparison).delay
     fitted_delay_ms = estimate_differing_delay_ms(comparison, time_offset, logged_delay_ms)
@@ -145,13 +147,13 @@ def _format_delay_advice(
         "ms), or correct the sender's clock."
     )
     if delay_max_change := find_delay_max_change(comparison, fitted_delay_ms):
-        text += f" For either correction, set {format_settings(delay_max_change)}."
+        text += f" For either correction, set {format_changes(delay_max_change)}."
     return text
 
 
 def draw_pages(analysis: Analysis, results: ComparisonResults) -> Iterator[Page]:
     """Draw the page on a wrong or unknown time offset of the position source."""
-    time_offset = analysis.clock
+    time_offset = analysis.time_offset
     if isinstance(time_offset, Unavailable) or not has_time_offset_page(analysis, results.findings):
         return
     page = Page(
@@ -171,7 +173,7 @@ def draw_pages(analysis: Analysis, results: ComparisonResults) -> Iterator[Page]
     yield page
 
 
-def _draw_likelihood(axes: Axes, time_offset: ClockOffset) -> None:
+def _draw_likelihood(axes: Axes, time_offset: SourceTimeOffset) -> None:
     """Draw the log-likelihood of the positions over the time offset."""
     low_s, high_s = time_offset.interval_s
     offsets_s, drops = time_offset.curve_time_offsets_s, time_offset.curve_log_likelihood_drops

@@ -11,9 +11,9 @@ import pandas as pd
 
 from px4fuse.analysis import Analysis
 from px4fuse.comparison.model import FILTER_NAMES, AxisComparison
-from px4fuse.comparison.trials import (
+from px4fuse.comparison.rerun_effects import (
     CONSISTENCY_STATISTICS,
-    find_trials,
+    find_reruns,
 )
 from px4fuse.core.text import format_number, format_p_value
 from px4fuse.filter.consistency import (
@@ -105,11 +105,11 @@ def _write_causes(page: Page, analysis: Analysis) -> None:
     axis, rows = analysis.main.axis, []
     for filter_name, statistic in product(FILTER_NAMES, CONSISTENCY_STATISTICS):
         label, exponent = ("mean NIS", 1.0) if statistic == "nis" else ("√NEES", 0.5)
-        for trial in find_trials(analysis.trials, filter_name, axis.name, statistic):
-            cells = [FILTER_NAMES[filter_name], format_change(analysis, trial), label]
-            for outcome in (trial.before, trial.after):
+        for rerun in find_reruns(analysis.reruns, filter_name, axis.name, statistic):
+            cells = [FILTER_NAMES[filter_name], format_change(analysis, rerun), label]
+            for outcome in (rerun.before, rerun.after):
                 cells.append(format_number((outcome.value(statistic) or 0.0) ** exponent, 2))
-            rows.append([*cells, describe_explained_part(trial, statistic)])
+            rows.append([*cells, describe_explained_part(rerun, statistic)])
     if not rows:
         return
     page.write_heading(f"Tested causes of inconsistent filters along {axis.label}")

@@ -118,7 +118,7 @@ def _make_error_plots(analysis: Analysis, card: Card) -> list[TimePlot]:
             plots.append((title, rmse_m, errors["error_m"], {label: errors["sigma_m"]}))
     if not plots and isinstance(result.ekf2_state, pd.DataFrame):
         time_s = result.ekf2_state.index.to_numpy()
-        state, variance = sample_kf_run(result.replay, time_s)
+        state, variance = sample_kf_run(result.kf_run, time_s)
         difference_m = state["position_m"] - result.ekf2_state["position_m"]
         sigmas_m = {
             name: pd.Series(interpolate_sigma(time_s, table, "position_variance_m2"), time_s)
@@ -217,7 +217,7 @@ def _select_map_tracks(analysis: Analysis) -> dict[str, Array]:
 
     tracks = {"positions": cut_to_flight(analysis.source.samples)}
     if len(results) == 2:
-        tracks["KF"] = np.array([result.replay.steps["position_m"] for result in results])
+        tracks["KF"] = np.array([result.kf_run.steps["position_m"] for result in results])
     if isinstance(flight.ekf2, Ekf2):
         tracks["EKF2"] = cut_to_flight(flight.ekf2.state)
     if isinstance(flight.truth, Truth):

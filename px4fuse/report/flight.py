@@ -48,7 +48,7 @@ def _draw_enlarged_sigma_plot(page: Page, result: AxisComparison) -> None:
     start_s, end_s = zoom_span_s = find_zoom_span(result)
     title = f"σ of position (m), {end_s - start_s:.1f} s of the flight"
     axes = page.add_panel(title, ENLARGED_PLOT_HEIGHT, caption=_describe_sigma_at_updates(result))
-    updates, steps = result.replay.updates, result.replay.steps
+    updates, steps = result.kf_run.updates, result.kf_run.steps
     variances_m2 = pd.concat([updates["prior_position_variance_m2"], steps["position_variance_m2"]])
     # A stable sort keeps the prior variance before the posterior variance
     variances_m2 = variances_m2.sort_index(kind="stable").loc[start_s:end_s]
@@ -69,7 +69,7 @@ def _draw_enlarged_sigma_plot(page: Page, result: AxisComparison) -> None:
 
 def find_zoom_span(result: AxisComparison) -> Span:
     """Return the start and end (s) of a few updates in the middle of the flight."""
-    update_times_s = result.replay.updates.index.to_numpy()
+    update_times_s = result.kf_run.updates.index.to_numpy()
     centre_times_s = update_times_s
     if isinstance(result.ekf2_innovations, pd.DataFrame) and len(result.ekf2_innovations):
         centre_times_s = result.ekf2_innovations.index.to_numpy()
@@ -81,7 +81,7 @@ def find_zoom_span(result: AxisComparison) -> Span:
 def _describe_sigma_at_updates(result: AxisComparison) -> str:
     sentences = [
         "The line is σ of KF, which grows in each prediction (SIGMA_A "
-        f"{result.replay.settings.sigma_a_m_s2:g} m/s²)."
+        f"{result.kf_run.settings.sigma_a_m_s2:g} m/s²)."
     ]
     for name, filter_summary in get_statistics_by_filter(result).items():
         before_m = filter_summary.sigma_p_before_update_m

@@ -126,8 +126,8 @@ def draw_tracks(axes: Axes, result: AxisComparison, quantity: QuantityColumns) -
     if quantity is POSITION_QUANTITY:
         measurements = pd.Series(result.axis.measurement_m, result.axis.measurement_time_s)
         draw_curve(axes, measurements, **style.MEASUREMENT_STYLE)
-    kf_values = result.replay.steps[quantity.column]
-    draw_sigma_band(axes, kf_values, np.sqrt(result.replay.steps[quantity.variance_column]))
+    kf_values = result.kf_run.steps[quantity.column]
+    draw_sigma_band(axes, kf_values, np.sqrt(result.kf_run.steps[quantity.variance_column]))
     drawn_series = [kf_values]
     for name, track in _list_ekf2_and_truth_tracks(result).items():
         values = track[quantity.column]
@@ -166,7 +166,7 @@ def _find_innovation_limit_m(result: AxisComparison) -> float:
 
 
 def _collect_innovation_tables(result: AxisComparison) -> dict[str, pd.DataFrame]:
-    return select_available_tables(KF=result.replay.updates, EKF2=result.ekf2_innovations)
+    return select_available_tables(KF=result.kf_run.updates, EKF2=result.ekf2_innovations)
 
 
 def normalised_innovations(result: AxisComparison) -> dict[str, pd.Series[float]]:
@@ -192,7 +192,7 @@ def draw_dots(
 def draw_innovations(axes: Axes, result: AxisComparison) -> None:
     """Draw the innovations of KF and EKF2 with ±2√S."""
     plot_limit_m, ekf2_innovations = _find_innovation_limit_m(result), result.ekf2_innovations
-    updates, kf_innovations = result.replay.updates, result.replay.updates["innovation_m"]
+    updates, kf_innovations = result.kf_run.updates, result.kf_run.updates["innovation_m"]
     draw_sigma_band(axes, 0.0 * kf_innovations, np.sqrt(updates["innovation_variance_m2"]))
     style.draw_zero_line(axes)
     innovations_and_styles = [(kf_innovations, INNOVATION_STYLES["KF"])]
@@ -251,7 +251,7 @@ def _format_fraction_outside(result: AxisComparison) -> str:
 
 
 def _draw_sigma(axes: Axes, result: AxisComparison, quantity: QuantityColumns) -> None:
-    variance_tables = select_available_tables(KF=result.replay.steps, EKF2=result.ekf2_variance)
+    variance_tables = select_available_tables(KF=result.kf_run.steps, EKF2=result.ekf2_variance)
     for name, table in variance_tables.items():
         draw_curve(axes, np.sqrt(table[quantity.variance_column]), **TRACK_STYLES[name])
     set_log_scale(axes)

@@ -15,7 +15,7 @@ from px4fuse.comparison.model import (
     PreparedComparison,
     UntestedFilter,
 )
-from px4fuse.comparison.remedy import format_settings as format_parameters
+from px4fuse.comparison.remedy import format_changes as format_parameters
 from px4fuse.comparison.remedy import (
     make_height_noise_advice,
     make_noise_change,

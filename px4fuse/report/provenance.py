@@ -55,7 +55,7 @@ def _describe_log(flight: Flight, source: PositionTrack | None) -> Iterator[tupl
     if source is not None:
         yield (
             "position source",
-            f"{source.name} ({source.origin.kind}, {source.origin.path}) from "
+            f"{source.name} ({source.origin.kind}, {source.origin.route}) from "
             f"{', '.join(source.topics)}; clock: {source.clock}",
         )
     other_source_texts = (

@@ -9,7 +9,7 @@ import msgspec
 from px4fuse.analysis import AidingSourceAnalysis, Analysis, WhatIfAnalysis
 from px4fuse.card.build import build_aids_card, build_card
 from px4fuse.comparison.model import PreparedComparison
-from px4fuse.filter.time_offset import ClockOffset
+from px4fuse.filter.time_offset import SourceTimeOffset
 from px4fuse.filter.tuning import AxisTuning
 from px4fuse.findings import find_loop_findings
 from px4fuse.flight.model import Flight, Unavailable
@@ -30,7 +30,7 @@ from px4fuse.trajectory.evaluation import Evaluation
 from px4fuse.trajectory.graph.solver import Graph
 
 
-def results(
+def make_comparison_results(
     request: ComparisonRequest, analysis: Analysis, student: Student = NO_STUDENT
 ) -> contract.ComparisonResults:
     """Convert an analysis by KF and EKF2 to the results of ``px4fuse compare``.
@@ -48,7 +48,9 @@ def results(
     fields = _make_flight_fields(contract.COMPARISON_SCHEMA_NAME, request, analysis) | {
         "aids": {} if isinstance(analysis.aids, Unavailable) else dict(analysis.aids),
         "card": card,
+        "clock": analysis.time_offset,
         "student": student,
+        "trials": analysis.reruns,
     }
     # the other fields of the results are copied from the analysis
     for name in contract.ComparisonResults.__struct_fields__:
@@ -57,14 +59,14 @@ def results(
     return drop_invalid_numbers(contract.ComparisonResults(**fields))
 
 
-def make_compare_results(
+def make_comparison_or_aids_results(
     request: ComparisonRequest,
     outcome: Analysis | AidingSourceAnalysis,
     student: Student = NO_STUDENT,
 ) -> contract.ComparisonResults | contract.AidsResults:
     """Return the results of ``px4fuse compare`` for a flight with or without positions."""
     if isinstance(outcome, Analysis):
-        return results(request, outcome, student)
+        return make_comparison_results(request, outcome, student)
     return drop_invalid_numbers(
         contract.AidsResults(
             **_make_common_fields(contract.AIDING_SOURCES_SCHEMA_NAME, request, outcome.flight),
@@ -93,7 +95,7 @@ def make_tuning_results(
 def make_sync_results(
     request: ComparisonRequest,
     comparison: PreparedComparison,
-    time_offset: ClockOffset | Unavailable,
+    time_offset: SourceTimeOffset | Unavailable,
 ) -> contract.SyncResults:
     return drop_invalid_numbers(
         contract.SyncResults(
@@ -190,7 +192,7 @@ def _make_flight_fields(
             AvailableTrack(
                 each.name,
                 each.origin.kind,
-                each.origin.path,
+                each.origin.route,
                 len(each.samples),
                 each.compute_rate_hz(),
             )

@@ -13,7 +13,7 @@ from msgspec import Meta
 
 from px4fuse.card.model import Card
 from px4fuse.comparison.model import AxisComparison, FilterName
-from px4fuse.comparison.trials import Trial
+from px4fuse.comparison.rerun_effects import Rerun
 from px4fuse.convention.model import Convention
 from px4fuse.core.record import (
     Count,
@@ -31,7 +31,7 @@ from px4fuse.ekf2.steps import DifferenceExplanation
 from px4fuse.ekf2.whatif import Ekf2Statistics
 from px4fuse.filter.consistency import HorizontalNis
 from px4fuse.filter.frame_rotation import HeadingError
-from px4fuse.filter.time_offset import ClockOffset
+from px4fuse.filter.time_offset import SourceTimeOffset
 from px4fuse.filter.tuning import AxisTuning
 from px4fuse.finding import Finding
 from px4fuse.flight.model import (
@@ -207,7 +207,7 @@ class ComparisonResults(_FlightResults):
         Replay of EKF2, and its agreement with the logged EKF2.
     difference_steps : mapping of axis name to DifferenceExplanation
         Re-runs of KF that explain the difference KF - EKF2.
-    trials : tuple of Trial
+    trials : tuple of Rerun
         Re-runs of KF and EKF2, each with one change of a setting or of the data.
     card : Card
         Summary of the diagnosis.
@@ -218,11 +218,11 @@ class ComparisonResults(_FlightResults):
     axes: Annotated[dict[AxisName, AxisComparison], Meta(min_length=1)]
     horizontal: dict[FilterName, HorizontalNis]
     tuning: dict[str, OrUnavailable[AxisTuning]]
-    clock: OrUnavailable[ClockOffset]
+    clock: OrUnavailable[SourceTimeOffset]
     heading: OrUnavailable[HeadingError]
     ekf2_replay: OrUnavailable[Ekf2Replay]
     difference_steps: dict[str, OrUnavailable[DifferenceExplanation]]
-    trials: tuple[Trial, ...]
+    trials: tuple[Rerun, ...]
     aids: dict[str, AidResult]
     loop: OrUnavailable[Loop]
     card: Card
@@ -258,7 +258,7 @@ class TuningResults(_FlightResults):
 class SyncResults(_FlightResults):
     """Results of ``px4fuse sync``: time offset of the position source."""
 
-    clock: OrUnavailable[ClockOffset]
+    clock: OrUnavailable[SourceTimeOffset]
     provenance: Provenance
 
 

@@ -158,7 +158,7 @@ def _repeat_comparison(
     submitted_results: ComparisonResults, link_input_file: _LinkInputFile
 ) -> tuple[object, ReportedResults]:
     from px4fuse.diagnose import diagnose  # noqa: PLC0415
-    from px4fuse.results.build import results  # noqa: PLC0415
+    from px4fuse.results.build import make_comparison_results  # noqa: PLC0415
 
     recorded_request = submitted_results.request
     if recorded_request.dt_s < MIN_DT_S:
@@ -174,7 +174,7 @@ def _repeat_comparison(
         link_path = link_input_file(position.path, hash_by_role.get("position"), "--position")
         request = replace(request, position=replace(position, path=link_path))
     analysis = diagnose(request)
-    return analysis, results(recorded_request, analysis, submitted_results.student)
+    return analysis, make_comparison_results(recorded_request, analysis, submitted_results.student)
 
 
 def _repeat_loop_closure(

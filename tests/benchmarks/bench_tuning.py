@@ -23,14 +23,14 @@ def main() -> None:
     import filter_tools
     from comparisons import compare
 
-    from px4fuse.comparison.estimates import estimate_noises_and_clock
-    from px4fuse.filter.kalman import replay
+    from px4fuse.comparison.estimates import estimate_noises_and_time_offset
+    from px4fuse.filter.kalman import run_kf
     from px4fuse.filter.settings import Settings
     from px4fuse.filter.tuning import HORIZONTAL, tune
     from px4fuse.readers import read_log
 
     axis = compare(read_log(LOG), axes=("north",)).input_axes[0]
-    single = seconds(lambda: replay(axis, Settings()), RUNS)
+    single = seconds(lambda: run_kf(axis, Settings()), RUNS)
     print(f"KF replay {single:.2f} s")
     filter_tools.IMU_HZ, settings = 250.0, filter_tools.SETTINGS
     flight, _ = filter_tools.made_flight(1, duration_s=600.0, offset_s=-0.1)
@@ -40,7 +40,7 @@ def main() -> None:
             lambda names=names: tune(compared.input_axes, settings, names, flight=flight)
         )
         print(f"tune, {names[0] if names else 'all axes'}, 600 s: {took:.1f} s (aim 5 s)")
-    took = seconds(lambda: estimate_noises_and_clock(compared))
+    took = seconds(lambda: estimate_noises_and_time_offset(compared))
     print(f"horizontal and clock offset, 600 s: {took:.1f} s (aim 2.5 s)")
 
 

@@ -42,7 +42,7 @@ from px4fuse.classroom.assignment.truth import (
 from px4fuse.classroom.grading.form_points import compute_form_points
 from px4fuse.diagnose import analyse_loop_closure, diagnose
 from px4fuse.filter.frame_rotation import HeadingError
-from px4fuse.filter.time_offset import ClockOffset
+from px4fuse.filter.time_offset import SourceTimeOffset
 from px4fuse.filter.tuning import HORIZONTAL, AxisTuning
 from px4fuse.loop.model import Loop
 from px4fuse.readers.ulog_topics import ignores_assignment_flag
@@ -76,9 +76,9 @@ def sizes(analysis: Analysis) -> dict[str, InjectedFault]:
         "ekf2-gate": parameters.get("EKF2_EVP_GATE"),
         "ekf2-off": None, "clock-jump": None, "imu-rate": rate_hz, "nlos": 100.0 * rejected,
     }  # fmt: skip
-    if isinstance(analysis.clock, ClockOffset):
-        values["clock-offset"] = -analysis.clock.offset_s
-        values["clock-jump"] = -analysis.clock.parts[0].offset_s
+    if isinstance(analysis.time_offset, SourceTimeOffset):
+        values["clock-offset"] = -analysis.time_offset.offset_s
+        values["clock-jump"] = -analysis.time_offset.parts[0].offset_s
     if isinstance(analysis.heading, HeadingError):
         values["yaw"] = math.remainder(analysis.heading.misalignment_deg, 360.0)
     tuning = analysis.tuning.get(HORIZONTAL)

@@ -219,7 +219,7 @@ def _explain(flight: Flight, condition: Condition) -> Analysis:
     trials = rerun_filters(comparison, estimates, model)
     return Analysis(
         **vars(comparison), **vars(estimates), ekf2_model=model, difference_steps={},
-        trials=trials, events=collect_events(comparison),
+        reruns=trials, events=collect_events(comparison),
         aids=evaluate_aids(flight), loop=analyse_flight_loop(flight),
     )  # fmt: skip
 

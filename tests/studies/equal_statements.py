@@ -27,7 +27,7 @@ from typing import Any, NamedTuple
 from px4fuse.analysis import Analysis
 from px4fuse.cli.options import comparison_request
 from px4fuse.cli.tune import tune as tune_command
-from px4fuse.comparison.estimates import estimate_noises, estimate_noises_and_clock
+from px4fuse.comparison.estimates import estimate_noises, estimate_noises_and_time_offset
 from px4fuse.comparison.reruns import rerun_kf_with_time_offset
 from px4fuse.diagnose import (
     diagnose_or_check_aids,
@@ -36,7 +36,7 @@ from px4fuse.diagnose import (
     run_what_if,
 )
 from px4fuse.errors import Px4FuseError
-from px4fuse.filter.time_offset import ClockOffset
+from px4fuse.filter.time_offset import SourceTimeOffset
 from px4fuse.flight.ekf2_parameters import PARAMETERS
 from px4fuse.flight.model import Flight
 from px4fuse.report import clock, phrases
@@ -92,15 +92,15 @@ def flight_outputs(request: ComparisonRequest, flight: Flight | None = None) -> 
     if not isinstance(analysis, Analysis):
         return {}
     outputs: Outputs = {
-        "json": to_json_dict(build.results(request, analysis)),
+        "json": to_json_dict(build.make_comparison_results(request, analysis)),
         "parameters": {n: v for n, v in flight.log.parameters.items() if n in PARAMETERS},
     }
     comparison = prepare_comparison(flight, request)
     noises = estimate_noises(comparison)
     outputs["tune"] = phrases.make_tuning_advice(comparison, noises)
     outputs["tune_json"] = to_json_dict(build.make_tuning_results(request, comparison, noises))
-    _, offset = estimate_noises_and_clock(comparison)
-    is_late = isinstance(offset, ClockOffset) and offset.is_significant(offset.remaining_s)
+    _, offset = estimate_noises_and_time_offset(comparison)
+    is_late = isinstance(offset, SourceTimeOffset) and offset.is_significant(offset.remaining_s)
     trial = rerun_kf_with_time_offset(comparison, offset) if is_late else None
     outputs["sync"] = clock.make_time_offset_advice(comparison, offset, trial)
     outputs["sync_json"] = to_json_dict(build.make_sync_results(request, comparison, offset))

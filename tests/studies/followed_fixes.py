@@ -35,6 +35,7 @@ from msgspec import structs
 from px4fuse.analysis import Analysis
 from px4fuse.comparison.comparison import compare
 from px4fuse.comparison.model import Comparison, ErrorsAgainstTruth, PreparedComparison
+from px4fuse.comparison.preparation import prepare_comparison_inputs
 from px4fuse.diagnose import diagnose, prepare_comparison, read_flight
 from px4fuse.ekf2.model import Ekf2Model, misalign_positions, prepare_ekf2_model
 from px4fuse.ekf2.whatif import what_if
@@ -144,7 +145,7 @@ def replayed_m(model: Ekf2Model, change: dict[str, float]) -> tuple[float, float
 
 def follow(analysis: Analysis, request: ComparisonRequest) -> list[Fix]:
     """Return the fixes of one analysed flight with their effect."""
-    outputs = {"json": to_json_dict(build.results(request, analysis))}
+    outputs = {"json": to_json_dict(build.make_comparison_results(request, analysis))}
     actions: dict[tuple[str, tuple[tuple[str, Any], ...]], list[str]] = {}
     for kind, change, place in proposed(outputs):
         actions.setdefault((kind, tuple(sorted(change.items()))), []).append(place)
@@ -181,7 +182,7 @@ def follow(analysis: Analysis, request: ComparisonRequest) -> list[Fix]:
     if faults:
         try:
             sent = compare_with_kf(
-                prepare_comparison(
+                prepare_comparison_inputs(
                     read_flight(request) if request.position else flight,
                     request,
                     keep_positions_as_sent=True,

@@ -60,7 +60,7 @@ from px4fuse.readers.position_file import read_position_file  # noqa: E402
 from px4fuse.readers.trajectory import read_trajectory  # noqa: E402
 from px4fuse.request import ComparisonRequest  # noqa: E402
 from px4fuse.results import answer_form  # noqa: E402
-from px4fuse.results.build import make_compare_results  # noqa: E402
+from px4fuse.results.build import make_comparison_or_aids_results  # noqa: E402
 from px4fuse.results.contract import to_json  # noqa: E402
 from px4fuse.results.reading import read_results  # noqa: E402
 from px4fuse.trajectory.graph.solver import analyse_graph  # noqa: E402
@@ -281,7 +281,7 @@ def _flights() -> list[bytes]:
 def _compared(path: Path) -> object:
     """Run ``compare`` without drawing: findings and results of a log."""
     request = ComparisonRequest(log=str(path))
-    return to_json(make_compare_results(request, diagnose_or_check_aids(request)))
+    return to_json(make_comparison_or_aids_results(request, diagnose_or_check_aids(request)))
 
 
 LOG = str(REPOSITORY / "sample_logs/aisle_uwb.ulg")

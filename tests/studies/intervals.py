@@ -18,8 +18,12 @@ import numpy as np
 from comparisons import compare
 from detector_rates import DEFAULT, SCENARIOS, clean
 
-from px4fuse.comparison.estimates import estimate_noises_and_clock
-from px4fuse.filter.time_offset import MAX_P_VALUE_OF_CHANGED_OFFSET, MIN_TIME_OFFSET_S, ClockOffset
+from px4fuse.comparison.estimates import estimate_noises_and_time_offset
+from px4fuse.filter.time_offset import (
+    MAX_P_VALUE_OF_CHANGED_OFFSET,
+    MIN_TIME_OFFSET_S,
+    SourceTimeOffset,
+)
 from px4fuse.filter.tuning import HORIZONTAL, AxisTuning, NoiseEstimate
 from px4fuse.simulation.faults import parse_faults
 from px4fuse.simulation.flights import simulate_flight
@@ -40,9 +44,9 @@ def measured(job: Job) -> tuple[float, ...] | None:
     flown = replace(clean(scenario).flight(seed), ekf2=False, truth=False)
     flight = simulate_flight(flown, parse_faults((mistake,) if mistake else ()))
     comparison = compare(flight, axes=("north", "east"))
-    tuning, clock = estimate_noises_and_clock(comparison)
+    tuning, clock = estimate_noises_and_time_offset(comparison)
     tuned = tuning[HORIZONTAL]
-    if not isinstance(tuned, AxisTuning) or not isinstance(clock, ClockOffset):
+    if not isinstance(tuned, AxisTuning) or not isinstance(clock, SourceTimeOffset):
         return None
     low, high = clock.interval_s
     false = abs(clock.offset_s) > max(clock.significance_limit_s, MIN_TIME_OFFSET_S)

@@ -35,7 +35,7 @@ from comparisons import compare
 from numpy.typing import NDArray
 from scipy.interpolate import CubicSpline
 
-from px4fuse.diagnose import analyse_comparison
+from px4fuse.diagnose import diagnose_comparison
 from px4fuse.filter.settings import Settings
 from px4fuse.findings import find
 from px4fuse.flight.model import Columns, Flight, Unavailable
@@ -199,7 +199,7 @@ def told(job: tuple[str, str, float, int], *, truth: bool = True) -> tuple[str, 
     flight = laid_over(flight, known, model_of(name), rate_hz, seed, sigma_z_m)
     if not truth:
         flight = replace(flight, truth=Unavailable("truth", "left out", "Not in this study."))
-    analysis = analyse_comparison(
+    analysis = diagnose_comparison(
         compare(flight, Settings(0.27, sigma_z_m), axes=("north", "east"))
     )
     return name, tuple(

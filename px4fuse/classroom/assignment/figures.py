@@ -133,16 +133,17 @@ def _plot_figures(comparisons: Mapping[str, Comparison]) -> bytes:
     png_buffer = BytesIO()
     with style.apply_report_style():
         figure = Figure(figsize=(17.0, 3.6 * len(comparisons)), layout="constrained")
-        rows = figure.subplots(len(comparisons), 4, squeeze=False)
+        rows = figure.subplots(len(comparisons), len(FILTER_NAMES) + 2, squeeze=False)
         for (title, comparison), axes in zip(comparisons.items(), rows, strict=True):
+            innovation_axes, *error_axes, map_axes = axes
             result = comparison.main.with_whole_flight_tracks()
-            axes[0].set_title(f"{title}: innovations along the aisle and ±2√S (m)")
-            panels.draw_innovations(axes[0], result)
-            for axis, filter_name in zip(axes[1:3], FILTER_NAMES, strict=True):
+            innovation_axes.set_title(f"{title}: innovations along the aisle and ±2√S (m)")
+            panels.draw_innovations(innovation_axes, result)
+            for axis, filter_name in zip(error_axes, FILTER_NAMES, strict=True):
                 _draw_errors(axis, result, filter_name)
-            for axis in axes[:3]:
+            for axis in axes[:-1]:
                 axis.set_xlabel(style.TIME_LABEL)
-            _draw_map(axes[3], comparison)
+            _draw_map(map_axes, comparison)
         figure.savefig(png_buffer, format="png", dpi=90, metadata={"Software": None})
     return png_buffer.getvalue()
 

@@ -7,11 +7,11 @@ from typing import Any
 import numpy as np
 
 from px4fuse.comparison.comparison import compare
-from px4fuse.comparison.estimates import estimate_noises_and_clock
+from px4fuse.comparison.estimates import estimate_noises_and_time_offset
 from px4fuse.comparison.model import AxisComparison, Comparison, FilterName, FilterSummary
 from px4fuse.comparison.preparation import prepare_comparison_inputs
 from px4fuse.core.record import Record, read_toml
-from px4fuse.filter.kalman import replay
+from px4fuse.filter.kalman import run_kf
 from px4fuse.filter.model import (
     COVARIANCE_COLUMNS,
     compute_process_noise_per_density,
@@ -19,7 +19,7 @@ from px4fuse.filter.model import (
     make_transition_matrix,
 )
 from px4fuse.filter.settings import Settings
-from px4fuse.filter.time_offset import ClockOffset
+from px4fuse.filter.time_offset import SourceTimeOffset
 from px4fuse.flight.model import Ekf2, Unavailable
 from px4fuse.loop.analysis import analyse
 from px4fuse.loop.tracks import LoopSource, trajectory_of
@@ -164,8 +164,8 @@ def _make_injected_fault(
     low, high = size - tolerance, size + tolerance
     if name == "clock-offset":
         # the estimated correction has the opposite sign of the time offset
-        _, time_offset = estimate_noises_and_clock(comparison)
-        if isinstance(time_offset, ClockOffset) and time_offset.is_determinable:
+        _, time_offset = estimate_noises_and_time_offset(comparison)
+        if isinstance(time_offset, SourceTimeOffset) and time_offset.is_determinable:
             low, high = min(low, -time_offset.interval_s[1]), max(high, -time_offset.interval_s[0])
     fault_start_s = fault_end_s = None
     match name:
@@ -233,11 +233,11 @@ def compute_numeric_answer(
 ) -> float | tuple[float, ...] | None:
     """Run KF to compute the right answer to a question; None with too few measurements."""
     settings = Settings(question.sigma_a_m_s2, question.sigma_z_m)
-    kf_replay = replay(axis_comparison.axis, settings)
-    updates = kf_replay.updates.iloc[question.update_number - 1 :]
+    kf_run = run_kf(axis_comparison.axis, settings)
+    updates = kf_run.updates.iloc[question.update_number - 1 :]
     if updates.empty:
         return None
-    covariance = kf_replay.steps.loc[updates.index[0], COVARIANCE_COLUMNS]
+    covariance = kf_run.steps.loc[updates.index[0], COVARIANCE_COLUMNS]
     nis = updates["innovation_m"] ** 2 / updates["innovation_variance_m2"]
     match question.kind:
         case "gate":

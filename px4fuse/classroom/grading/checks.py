@@ -18,7 +18,7 @@ from px4fuse.comparison.model import ErrorsAgainstTruth
 from px4fuse.core.record import Share
 from px4fuse.core.text import capitalise_first, format_factor, format_length, one_line
 from px4fuse.filter.consistency import HorizontalNis
-from px4fuse.filter.time_offset import ClockOffset
+from px4fuse.filter.time_offset import SourceTimeOffset
 from px4fuse.filter.tuning import HORIZONTAL
 from px4fuse.loop.model import CorrectionName, Loop, PathResult
 from px4fuse.results.answer_form import Answers, check_answers
@@ -420,13 +420,13 @@ class TimeOffsetItem(RubricItem, frozen=True, tag="clock"):
 
     def score(self, scoring_input: ScoringInput) -> ScoreAndReason:
         clock = scoring_input.comparison.clock
-        if not isinstance(clock, ClockOffset) or not clock.is_determinable:
+        if not isinstance(clock, SourceTimeOffset) or not clock.is_determinable:
             reason_text = format_reason(clock.reason or "")
             statement = f"The time offset cannot be estimated from your flight{reason_text}."
             # a student cannot change the motion in an assigned log
             if scoring_input.right_answers is not None:
                 return 1.0, statement
-            return self.undeterminable if isinstance(clock, ClockOffset) else 0.0, statement
+            return self.undeterminable if isinstance(clock, SourceTimeOffset) else 0.0, statement
         (low, high), applied_offset_s = clock.interval_s, clock.applied_s
         statement = (
             f"Your time offset is {applied_offset_s:.3f} s. The estimated time offset is {low:.3f} "

@@ -16,7 +16,7 @@ CONSISTENCY_STATISTICS: tuple[Statistic, Statistic] = ("nees", "nis")
 # Changed KF settings, EKF2 parameters or data, by name
 Change = Mapping[str, float]
 # Corrected data: timestamps (s), clockwise rotation (°), number of outliers, accelerometer bias
-CLOCK_OFFSET_KEY, ROTATION_KEY, OUTLIERS_KEY = "clock_offset_s", "turned_deg", "outliers_left_out"
+TIME_OFFSET_KEY, ROTATION_KEY, OUTLIERS_KEY = "clock_offset_s", "turned_deg", "outliers_left_out"
 FORWARD_BIAS_KEY, RIGHT_BIAS_KEY = "bias_forward_m_s2", "bias_right_m_s2"
 Improvement = Literal["position and σ", "position", "σ only", "nothing"]
 # Minimum mean NEES of a reported position error: flights without a fault are below 3
@@ -29,7 +29,7 @@ POSSIBLE_CAUSE_FRACTION_TOLERANCE = 0.5
 ONLY_CAUSE_FRACTION_TOLERANCE = 0.25
 # Two changes are combined if each explains 10 % to 190 % of ln(mean NIS or NEES)
 COMBINED_CHANGE_FRACTION_TOLERANCE = 0.9
-SENSOR_CORRECTION_KEYS = frozenset((OUTLIERS_KEY, CLOCK_OFFSET_KEY, ROTATION_KEY, FORWARD_BIAS_KEY))
+SENSOR_CORRECTION_KEYS = frozenset((OUTLIERS_KEY, TIME_OFFSET_KEY, ROTATION_KEY, FORWARD_BIAS_KEY))
 # Changes that have an effect only together with another change
 SECONDARY_CHANGE_KEYS = frozenset(("EKF2_DELAY_MAX", EV_POS.noise_mode_parameter, RIGHT_BIAS_KEY))
 # A re-run has an effect if it changes a σ ratio by at least this factor
@@ -60,7 +60,7 @@ class RunStatistics(Record, kw_only=True):
         }[statistic]
 
 
-class Trial(Record, kw_only=True):
+class Rerun(Record, kw_only=True):
     """Re-run of one filter with changed settings or data, and the effect along one axis.
 
     Attributes
@@ -95,13 +95,13 @@ class Trial(Record, kw_only=True):
         return not SENSOR_CORRECTION_KEYS.isdisjoint(self.change)
 
 
-def compute_explained_fraction(trial: Trial, statistic: Statistic) -> float:
+def compute_explained_fraction(rerun: Rerun, statistic: Statistic) -> float:
     """Return the fraction of ln(mean NIS) or ln(mean NEES) that a change removes.
 
     For "difference": fraction of the mean square difference KF - EKF2. Above 1, the change is too
     large.
     """
-    before, after = trial.before.value(statistic), trial.after.value(statistic)
+    before, after = rerun.before.value(statistic), rerun.after.value(statistic)
     if not before or not after:
         return 0.0
     if statistic == "difference":
@@ -109,78 +109,78 @@ def compute_explained_fraction(trial: Trial, statistic: Statistic) -> float:
     return 1.0 - float(np.log(after) / np.log(before))
 
 
-def _compute_explained_fraction_error(trial: Trial, statistic: Statistic) -> float:
-    return abs(compute_explained_fraction(trial, statistic) - 1.0)
+def _compute_explained_fraction_error(rerun: Rerun, statistic: Statistic) -> float:
+    return abs(compute_explained_fraction(rerun, statistic) - 1.0)
 
 
-def brings_inside_limits(trial: Trial, statistic: Statistic) -> bool:
+def brings_inside_limits(rerun: Rerun, statistic: Statistic) -> bool:
     """Return True if the change brings the mean NIS or mean NEES inside its limits."""
     low, high = 0.0, MIN_REPORTED_NEES
     if statistic == "nis":
-        low, high = compute_nis_band(trial.after.innovations)
-    return low <= (trial.after.value(statistic) or np.nan) <= high
+        low, high = compute_nis_band(rerun.after.innovations)
+    return low <= (rerun.after.value(statistic) or np.nan) <= high
 
 
-def makes_overconfident(trial: Trial, statistic: Statistic) -> bool:
+def makes_overconfident(rerun: Rerun, statistic: Statistic) -> bool:
     """Return True if the change makes an underconfident filter overconfident."""
-    if statistic != "nis" or (trial.before.nis_mean or 1.0) >= 1.0:
+    if statistic != "nis" or (rerun.before.nis_mean or 1.0) >= 1.0:
         return False
     min_nees = MIN_REPORTED_NEES
-    if (trial.before.nees_mean or 0.0) > 1.0:
+    if (rerun.before.nees_mean or 0.0) > 1.0:
         min_nees = MIN_OVERCONFIDENT_NEES_AFTER_CHANGE
-    return (trial.after.nees_mean or 0.0) >= min_nees
+    return (rerun.after.nees_mean or 0.0) >= min_nees
 
 
-def find_trials(
-    trials: Iterable[Trial], filter_name: FilterName, axis: str, statistic: Statistic = "nis"
-) -> list[Trial]:
+def find_reruns(
+    reruns: Iterable[Rerun], filter_name: FilterName, axis: str, statistic: Statistic = "nis"
+) -> list[Rerun]:
     """Return the re-runs of a filter along an axis that may correct the mean NIS or mean NEES."""
     return [
-        trial
-        for trial in trials
-        if (trial.filter, trial.axis) == (filter_name, axis) and statistic in trial.discrepancies
+        rerun
+        for rerun in reruns
+        if (rerun.filter, rerun.axis) == (filter_name, axis) and statistic in rerun.discrepancies
     ]
 
 
-def find_cause_trial(
-    trials: Iterable[Trial], filter_name: FilterName, axis: str, statistic: Statistic = "nis"
-) -> Trial | None:
+def find_cause_rerun(
+    reruns: Iterable[Rerun], filter_name: FilterName, axis: str, statistic: Statistic = "nis"
+) -> Rerun | None:
     """Return the re-run that best brings the mean NIS or mean NEES inside its limits.
 
     A corrected sensor fault is preferred to a changed setting.
     """
 
-    def rank(trial: Trial) -> tuple[bool, int, bool, float]:
-        explained_fraction_error = _compute_explained_fraction_error(trial, statistic)
+    def rank(rerun: Rerun) -> tuple[bool, int, bool, float]:
+        explained_fraction_error = _compute_explained_fraction_error(rerun, statistic)
         is_complete = (
-            trial.corrects_sensor and explained_fraction_error <= ONLY_CAUSE_FRACTION_TOLERANCE
+            rerun.corrects_sensor and explained_fraction_error <= ONLY_CAUSE_FRACTION_TOLERANCE
         )
         return (
-            not (is_complete or brings_inside_limits(trial, statistic)),
-            len(trial.change.keys() - SECONDARY_CHANGE_KEYS),
-            not trial.corrects_sensor,
+            not (is_complete or brings_inside_limits(rerun, statistic)),
+            len(rerun.change.keys() - SECONDARY_CHANGE_KEYS),
+            not rerun.corrects_sensor,
             explained_fraction_error,
         )
 
     causes = (
-        trial
-        for trial in find_trials(trials, filter_name, axis, statistic)
-        if _compute_explained_fraction_error(trial, statistic) <= POSSIBLE_CAUSE_FRACTION_TOLERANCE
-        and not makes_overconfident(trial, statistic)
+        rerun
+        for rerun in find_reruns(reruns, filter_name, axis, statistic)
+        if _compute_explained_fraction_error(rerun, statistic) <= POSSIBLE_CAUSE_FRACTION_TOLERANCE
+        and not makes_overconfident(rerun, statistic)
     )
     return min(causes, key=rank, default=None)
 
 
-def find_partial_corrections(trials: Iterable[Trial], statistic: Statistic) -> list[Trial]:
+def find_partial_corrections(reruns: Iterable[Rerun], statistic: Statistic) -> list[Rerun]:
     """Return the re-runs that correct a statistic only partly, best first."""
     candidates = [
-        trial
-        for trial in trials
-        if statistic in trial.discrepancies
-        and _compute_explained_fraction_error(trial, statistic) < COMBINED_CHANGE_FRACTION_TOLERANCE
+        rerun
+        for rerun in reruns
+        if statistic in rerun.discrepancies
+        and _compute_explained_fraction_error(rerun, statistic) < COMBINED_CHANGE_FRACTION_TOLERANCE
     ]
-    candidates.sort(key=lambda trial: _compute_explained_fraction_error(trial, statistic))
-    return [] if any(brings_inside_limits(trial, statistic) for trial in candidates) else candidates
+    candidates.sort(key=lambda rerun: _compute_explained_fraction_error(rerun, statistic))
+    return [] if any(brings_inside_limits(rerun, statistic) for rerun in candidates) else candidates
 
 
 def compute_sigma_ratio_deviation(statistics: RunStatistics) -> float:
@@ -191,16 +191,16 @@ def compute_sigma_ratio_deviation(statistics: RunStatistics) -> float:
     return sum(abs(math.log(ratio)) for ratio in compute_sigma_ratios(statistics).values())
 
 
-def compute_preference_key(trial: Trial) -> tuple[bool, int, float]:
+def compute_preference_key(rerun: Rerun) -> tuple[bool, int, float]:
     """Return a key to sort re-runs, best first.
 
     In the best re-run, few changes make the filter consistent.
     """
-    is_made_consistent = becomes_consistent(trial)
+    is_made_consistent = becomes_consistent(rerun)
     return (
         not is_made_consistent,
-        len(trial.change) if is_made_consistent else 0,
-        compute_sigma_ratio_deviation(trial.after),
+        len(rerun.change) if is_made_consistent else 0,
+        compute_sigma_ratio_deviation(rerun.after),
     )
 
 
@@ -213,36 +213,36 @@ def compute_sigma_ratios(statistics: RunStatistics) -> dict[Reference, float]:
     return {name: math.sqrt(value) for name, value in squared_ratios.items() if value}
 
 
-def compute_sigma_ratio_improvement(trial: Trial) -> float:
-    return compute_sigma_ratio_deviation(trial.before) - compute_sigma_ratio_deviation(trial.after)
+def compute_sigma_ratio_improvement(rerun: Rerun) -> float:
+    return compute_sigma_ratio_deviation(rerun.before) - compute_sigma_ratio_deviation(rerun.after)
 
 
-def compare_sigma_ratios(trial: Trial) -> list[tuple[Reference, float, float]]:
+def compare_sigma_ratios(rerun: Rerun) -> list[tuple[Reference, float, float]]:
     """Return reference ("source" or "truth"), and σ ratios before and after the change."""
-    before, after = compute_sigma_ratios(trial.before), compute_sigma_ratios(trial.after)
+    before, after = compute_sigma_ratios(rerun.before), compute_sigma_ratios(rerun.after)
     return [(name, before[name], after[name]) for name in before.keys() & after.keys()]
 
 
-def becomes_consistent(trial: Trial, tested_reference: Reference | None = None) -> bool:
+def becomes_consistent(rerun: Rerun, tested_reference: Reference | None = None) -> bool:
     """Return True if a re-run makes an inconsistent filter consistent, against any reference."""
     return any(
         tested_reference in (None, reference)
         and classify_sigma_ratio(ratio_before, reference) != "consistent"
         and classify_sigma_ratio(ratio_after, reference) == "consistent"
-        for reference, ratio_before, ratio_after in compare_sigma_ratios(trial)
+        for reference, ratio_before, ratio_after in compare_sigma_ratios(rerun)
     )
 
 
-def halves_discrepancy(trial: Trial) -> bool:
+def halves_discrepancy(rerun: Rerun) -> bool:
     """Return True if a re-run halves |ln(σ ratio)| of an inconsistent filter."""
     return any(
         classify_sigma_ratio(ratio_before, reference) != "consistent"
         and abs(math.log(ratio_after)) <= 0.5 * abs(math.log(ratio_before))
-        for reference, ratio_before, ratio_after in compare_sigma_ratios(trial)
+        for reference, ratio_before, ratio_after in compare_sigma_ratios(rerun)
     )
 
 
-def remains_overconfident(trial: Trial) -> bool:
+def remains_overconfident(rerun: Rerun) -> bool:
     """Return True if a filter is overconfident against ground truth before and after a re-run."""
     return any(
         reference == "truth"
@@ -250,34 +250,34 @@ def remains_overconfident(trial: Trial) -> bool:
         == classify_sigma_ratio(ratio_after, reference)
         == "overconfident"
         and math.log(ratio_after) > MAX_REMAINING_OVERCONFIDENCE_FRACTION * math.log(ratio_before)
-        for reference, ratio_before, ratio_after in compare_sigma_ratios(trial)
+        for reference, ratio_before, ratio_after in compare_sigma_ratios(rerun)
     )
 
 
-def find_trial(
-    trials: Iterable[Trial], filter_name: FilterName, kind: str, name: str = ""
-) -> Trial | None:
+def find_rerun(
+    reruns: Iterable[Rerun], filter_name: FilterName, kind: str, name: str = ""
+) -> Rerun | None:
     """Return the re-run with one kind of change that improves a filter most, or None.
 
     ``name`` limits the search to one setting or EKF2 parameter.
     """
     return min(
         (
-            trial
-            for trial in trials
-            if trial.filter == filter_name
-            and trial.kinds == (kind,)
-            and (not name or name in trial.change)
-            and classify_improvement(trial) != "nothing"
+            rerun
+            for rerun in reruns
+            if rerun.filter == filter_name
+            and rerun.kinds == (kind,)
+            and (not name or name in rerun.change)
+            and classify_improvement(rerun) != "nothing"
         ),
         key=compute_preference_key,
         default=None,
     )
 
 
-def has_effect(trial: Trial) -> bool:
+def has_effect(rerun: Rerun) -> bool:
     """Return True if a re-run changes a σ ratio by 10 % or the position RMSE by 5 %."""
-    rmse_before_m, rmse_after_m = trial.before.position_rmse_m, trial.after.position_rmse_m
+    rmse_before_m, rmse_after_m = rerun.before.position_rmse_m, rerun.after.position_rmse_m
     if (
         rmse_before_m
         and rmse_after_m
@@ -286,36 +286,36 @@ def has_effect(trial: Trial) -> bool:
         return True
     return any(
         max(after / before, before / after) > MIN_SIGMA_RATIO_CHANGE_FACTOR
-        for _, before, after in compare_sigma_ratios(trial)
+        for _, before, after in compare_sigma_ratios(rerun)
     )
 
 
-def can_show_improvement(trial: Trial) -> bool:
+def can_show_improvement(rerun: Rerun) -> bool:
     """Return True if an improvement would be visible in the statistics.
 
     This requires ground truth, or a filter that is inconsistent before the change.
     """
-    return trial.before.position_rmse_m is not None or any(
+    return rerun.before.position_rmse_m is not None or any(
         classify_sigma_ratio(ratio_before, reference) != "consistent"
-        for reference, ratio_before, _ in compare_sigma_ratios(trial)
+        for reference, ratio_before, _ in compare_sigma_ratios(rerun)
     )
 
 
-def classify_improvement(trial: Trial) -> Improvement:
+def classify_improvement(rerun: Rerun) -> Improvement:
     """Return the quantities that a re-run improves: position, σ, both or nothing.
 
     The position improves if its RMSE decreases by at least 20 %.
     """
-    rmse_before_m, rmse_after_m = trial.before.position_rmse_m, trial.after.position_rmse_m
+    rmse_before_m, rmse_after_m = rerun.before.position_rmse_m, rerun.after.position_rmse_m
     is_position_better = bool(
         rmse_before_m
         and rmse_after_m is not None
         and rmse_after_m <= (1.0 - MIN_RMSE_REDUCTION) * rmse_before_m
     )
-    is_sigma_better = (becomes_consistent(trial) or halves_discrepancy(trial)) and all(
+    is_sigma_better = (becomes_consistent(rerun) or halves_discrepancy(rerun)) and all(
         abs(math.log(ratio_after)) <= abs(math.log(ratio_before))
         or classify_sigma_ratio(ratio_after, reference) == "consistent"
-        for reference, ratio_before, ratio_after in compare_sigma_ratios(trial)
+        for reference, ratio_before, ratio_after in compare_sigma_ratios(rerun)
     )
     if is_position_better:
         return "position and σ" if is_sigma_better else "position"
