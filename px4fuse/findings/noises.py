@@ -51,13 +51,14 @@ MIN_KF_TIME_CONSTANT_S = 2.5
 # Factor that widens the 95 % interval of ln(noise): the widened interval excludes 0.3 % of the
 # correct noise settings
 INTERVAL_WIDENING_FACTOR = 1.5
-# KF lags if the lag-1 autocorrelation of its innovations exceeds this value (white noise: <= 0.2)
+# KF lags if the lag-1 autocorrelation of its innovations exceeds this value (white noise: at most
+# 0.2)
 MIN_LAG1_AUTOCORRELATION = 0.3
 
 MIN_SIGMA_FACTOR_FOR_ERROR = 2.0
 # Maximum ratio of noises that count as equal: a median of 100 values has a standard error of 12 %
 MAX_RATIO_OF_EQUAL_NOISES = 1.25
-# The finding states that EKF2 uses the reported variance if √R ÷ EKF2_EVP_NOISE exceeds this ratio
+# px4fuse assumes that EKF2 uses the reported variance if √R ÷ EKF2_EVP_NOISE exceeds this ratio
 MIN_USED_TO_PARAMETER_NOISE_RATIO = 1.25
 UNEXPLAINED_SIGMA_ACTION = (
     "No re-run with changed settings or data corrects σ. Check the IMU (rate, gaps, vibration)."

@@ -32,7 +32,7 @@ from px4fuse.flight.model import Columns, positions_phrase, source_name
 MIN_WHITE_TO_CORRELATED_SIGMA_RATIO = 0.3
 # Minimum log likelihood ratio (nats): 1 of 400 flights without a fault exceeds it
 MIN_CORRELATED_NOISE_LOG_LIKELIHOOD_RATIO_NATS = 5.0
-# Minimum time-correlated error (m, 1 σ): timestamp errors and motion alone cause some mm
+# Minimum time-correlated error (m, 1 σ): timestamp errors and motion alone cause a few mm
 MIN_CORRELATED_NOISE_SIGMA_M = 0.005
 # Minimum fraction of repeated positions for a warning
 MIN_REPEATED_FRACTION = 0.05

@@ -40,7 +40,8 @@ from px4fuse.flight.model import positions_phrase, source_name
 MIN_SCALE_ERROR_AGAINST_TRUTH = 0.08
 # Minimum jitter (s) for severity "error"; it causes a position error of 3 cm at 1 m/s
 MIN_JITTER_FOR_ERROR_S = 0.03
-# Minimum amplitude (m) of a periodic error for severity "error": twice the noise of good UWB
+# Minimum amplitude (m) of a periodic error for severity "error": twice the noise of a good UWB
+# system
 MIN_AMPLITUDE_FOR_ERROR_M = 0.2
 
 

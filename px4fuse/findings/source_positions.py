@@ -68,7 +68,7 @@ MAX_ESTIMATED_LAG_TO_DELAY_RATIO = 4.0
 MIN_LAG_S = 0.05
 # Minimum filter lag (s) for severity "error"; it causes a position error of 10 cm at 1 m/s
 MIN_LAG_FOR_ERROR_S = 0.10
-# Minimum position jump (m) for a warning: twice the noise of good UWB (0.1 m)
+# Minimum position jump (m) for a warning: twice the noise of a good UWB system (0.1 m)
 MIN_JUMP_M = 0.2
 # Minimum ratio of a position jump to the σ of time-correlated noise, for a warning
 MIN_JUMP_SIGMAS = 5.0
@@ -99,7 +99,7 @@ RESET_TIME_TOLERANCE_S = 1e-4
 EV_CTRL_HORIZONTAL_MASK, EV_CTRL_HEIGHT_MASK = 1, 2
 # Maximum time (s) between a jump and the increment of reset_counter: two intervals at 2 Hz
 MAX_JUMP_TO_RESET_COUNTER_TIME_S = 1.0
-# Minimum position jump (m), for severity "error": five times the noise of good UWB (0.1 m)
+# Minimum position jump (m) for severity "error": five times the noise of a good UWB system (0.1 m)
 MIN_JUMP_FOR_ERROR_M = 0.5
 # Minimum scale factor error (ratio minus 1) for a warning: flights without a fault reach 0.11
 MIN_SCALE_ERROR_FOR_WARNING = 0.12

@@ -43,12 +43,14 @@ MIN_SENDER_DISTANCE_M = 0.1
 # Minimum ratio: distance between the positions of two senders ÷ scatter (1 σ) of this distance; one
 # sender reaches 2
 MIN_SENDER_DISTANCE_SIGMAS = 4.0
-# Window length (samples); short, because after a lost sample even samples become odd
+# Window length (samples): it is short, because a lost sample exchanges the senders of even and odd
+# samples
 WINDOW_SAMPLES = 16
 MIN_WINDOWS_FOR_TWO_SENDERS = 10
 # Positions are copies if their median distance (m) from EKF2's position is below this limit
 MAX_DISTANCE_OF_COPY_M = 0.01
-# Limit (m) for copies that EKF2 fused: all fused positions are near EKF2's position
+# Positions that EKF2 fused are copies if their median distance (m) from EKF2's position is below
+# this limit: all fused positions are near EKF2's position
 MAX_DISTANCE_OF_FUSED_COPY_M = 0.001
 # Minimum speed (m/s) for the comparison with EKF2's position: at rest, any source may agree
 MIN_SPEED_FOR_COPY_TEST_M_S = 0.2
