@@ -53,7 +53,7 @@ from px4fuse.findings.model import (  # noqa: E402
     FINDING_TITLES,
     load_examples,
 )
-from px4fuse.flight.model import Columns  # noqa: E402
+from px4fuse.flight.model import AidLog, Columns  # noqa: E402
 from px4fuse.report.panels import INNOVATIONS_PANEL, POSITION_PANEL, POSITION_SIGMA_PANEL  # noqa: E402
 from px4fuse.simulation.faults import parse_faults  # noqa: E402
 from px4fuse.simulation.flights import simulate_flight  # noqa: E402
@@ -131,6 +131,16 @@ def simulate_late_timestamps() -> list[Finding]:
     return [finding for finding in find(unexplained(compare(flight))) if finding.id in faults]
 
 
+def rename_axes(log: AidLog, **names: str) -> AidLog:
+    """Give the axes of simulated innovations the names of a sensor; omit the other axes."""
+    columns = {
+        f"{quantity}_{old}": f"{quantity}_{new}"
+        for old, new in names.items()
+        for quantity in ("innovation", "variance", "noise", "ratio")
+    }
+    return replace(log, axes=tuple(names.values()), samples=log.samples.rename(columns=columns))
+
+
 def collect_examples() -> dict[str, ExampleFlight]:
     """Return an example of each finding, by finding id."""
     example_by_id: dict[str, ExampleFlight] = {}
@@ -162,7 +172,7 @@ def collect_examples() -> dict[str, ExampleFlight]:
         findings = [finding for finding in find(analysis) if finding.id.startswith("source_")]
         add_examples(
             findings,
-            "a simulated flight with position errors of `tests/studies/source_errors.py`",
+            "a simulated flight with position errors from `tests/studies/source_errors.py`",
             analysis,
         )
     for options, drift_option in (
@@ -175,7 +185,9 @@ def collect_examples() -> dict[str, ExampleFlight]:
         add_examples(
             find_loop_findings(px4fuse.close_loop(**loop_options)), f"the result of `{command}`"
         )
-    add_examples(convention_examples(), "a simulated loop flight with changed positions")
+    add_examples(
+        convention_examples(), "a simulated loop flight with artificial faults of the positions"
+    )
     add_examples(value_examples(), "a simulated test flight")
     _, odometry = laps(3, 5, OdometryNoise())
     wrong_closure = GivenClosure(20.0, 21.5 + LAP_S, 0.05)
@@ -200,13 +212,16 @@ def collect_examples() -> dict[str, ExampleFlight]:
     log_with_outage = replace(log_with_outage, samples=outage_free(log_with_outage, 20.0, 41.0))
     log_with_innovation_change = aid_log()
     log_with_innovation_change.samples.loc[35.0:, "innovation_east"] -= 0.7
-    aids = {"gnss_pos": log_with_outage, "baro_hgt": aid_log(sigma=1.5), "mag": aid_log(mean=-0.4),
-            "mag_heading": log_with_innovation_change}  # fmt: skip
+    aids = {"gnss_pos": log_with_outage, "baro_hgt": aid_log(sigma=1.5),
+            "mag": rename_axes(aid_log(mean=-0.4), north="x", east="y"),
+            "mag_heading": rename_axes(log_with_innovation_change, east="yaw")}  # fmt: skip
     aid_results = evaluate_aids(replace(flight, ekf2=replace(flight.ekf2, aids=aids)))
     add_examples(
         find_aid_findings(aid_results, flight), "simulated innovations of the aiding sources"
     )
-    add_examples(simulate_late_timestamps(), "a simulated flight with changed timestamps")
+    add_examples(
+        simulate_late_timestamps(), "a simulated flight with artificial faults of the timestamps"
+    )
     for fault in FAULTS:
         if fault.id in example_by_id:
             continue
@@ -294,7 +309,7 @@ def format_page(name: str, example: ExampleFlight | None, folder: Path) -> Itera
     if effects:
         yield "Possible consequences of the finding: " + format_finding_links(effects) + ".\n"
     if entry.report_class == "recording":
-        yield "This finding is about the recording. It is listed before findings about noises.\n"
+        yield "Findings about the recording are listed before findings about noise settings.\n"
     if example is not None:
         finding = example.finding
         yield f"## Example\n\nSeverity: *{finding.severity}*. Example from {example.flight}:\n"
@@ -315,8 +330,8 @@ def format_page(name: str, example: ExampleFlight | None, folder: Path) -> Itera
     rows = list(format_threshold_rows(module_name))
     if rows:
         yield "## Thresholds\n"
-        yield f"The file `px4fuse/findings/{module_name}.py` contains these thresholds."
-        yield "Some of them belong to other findings.\n"
+        yield f"The file `px4fuse/findings/{module_name}.py` defines these thresholds."
+        yield "Other findings also use some of these thresholds.\n"
         yield "| name | value | meaning |\n|---|---|---|"
         yield "\n".join(rows) + "\n"
 

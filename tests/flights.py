@@ -213,7 +213,7 @@ def table(time_s: Array, values: ArrayLike, columns: list[str]) -> pd.DataFrame:
 
 def unavailable(what: str) -> Unavailable:
     """Return Unavailable for a part that the log does not contain."""
-    return Unavailable(what, f"no topic for {what}", f"Log {what}.")
+    return Unavailable(what, f"no {what} topic is logged", f"Log {what}.")
 
 
 def _track(rng: np.random.Generator, time: Array, uwb: Uwb, path) -> PositionTrack:

@@ -271,7 +271,8 @@ class TestRobustness:
         reset = Reset(60.0, "position", (5.0, -3.0, 0.0))
         comparison = compare(aisle_flight(ekf2=Estimator(resets=(reset,))))
         assert any(
-            "frame were removed: 1 of horizontal position" in note for note in comparison.notes
+            "EKF2 resets (1 of horizontal position) are removed" in note
+            for note in comparison.notes
         )
         for result, same in zip(comparison.axes.values(), made.axes.values(), strict=True):
             assert asdict(result.difference) == pytest.approx(asdict(same.difference))

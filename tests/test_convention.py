@@ -275,7 +275,7 @@ def examples() -> Iterator[Finding]:
 
 AMBIGUOUS = Convention(
     verdict="ambiguous", x="east", y="north", z="up", log_odds=1.2, log_likelihood_gain=30.0,
-    alternatives=("x south, y west, z up, m, rotated by +12°",),
+    alternatives=("x south, y west, z up (metres), rotated by +12°",),
 )  # fmt: skip
 
 
@@ -406,7 +406,8 @@ def test_ambiguous_position_axes_report_lists_possible_axes():
 @pytest.mark.parametrize(("axes", "message", "remedy"), [
     (("north", "east", "up"), "x and y are exchanged: x is east, y north, z down",
      "north = y, east = x, down = z"),
-    (("west", "north", "down"), "NWU read as ENU: x is north, y west, z up", "frame nwu."),
+    (("west", "north", "down"), "NWU positions read as ENU: x is north, y west, z up",
+     "frame nwu."),
 ])  # fmt: skip
 def test_position_file_in_wrong_frame_report_names_true_frame(axes, message, remedy):
     """The axes are those of positions that were converted from ENU."""

@@ -129,10 +129,7 @@ def test_split_cause_groups_puts_effect_into_group_of_its_cause() -> None:
 NO_GAP = SimpleNamespace(gaps=())
 
 
-def test_ekf2_resets_outside_evaluated_segment_are_ignored(
-    monkeypatch: pytest.MonkeyPatch,
-) -> None:
-    monkeypatch.setattr(ekf2_state, "remove_origin_resets", lambda *_: (None, "resets undone"))
+def test_ekf2_resets_outside_evaluated_segment_are_ignored() -> None:
     switches = tuple((time, 1) for time in (-np.inf, 10.0, 10.5, 110.0, 110.1))
     resets = (
         Reset(10.0, "position", (9.0, 0.0, 0.0)), Reset(10.5, "position", (3.0, 0.0, -4.0)),
@@ -160,9 +157,8 @@ def test_ekf2_resets_outside_evaluated_segment_are_ignored(
     ],
 )
 def test_ekf2_height_reset_at_take_off_is_not_reported(
-    reset: Reset, gaps: Any, expected: Any, monkeypatch: pytest.MonkeyPatch
+    reset: Reset, gaps: Any, expected: Any
 ) -> None:
-    monkeypatch.setattr(ekf2_state, "remove_origin_resets", lambda *_: (None, "resets kept"))
     one = analysis(ekf2={"primary_instances": (), "resets": (reset,)},
                    flight={"airborne": ((20.0, 90.0),)},
                    events=SimpleNamespace(gaps=gaps))  # fmt: skip
@@ -935,11 +931,11 @@ def test_scale_and_variance_titles_state_direction_of_the_error() -> None:
     for signed, word in ((0.2, "long"), (-0.2, "short")):
         finding = only(source_positions.detect_scale_error, scaled(signed))
         assert finding.title == f"UWB distances are 20 % too {word}"
-        assert "± 2 % (95 %)" in finding.message
+        assert "(± 2 %, 95 %)" in finding.message
     for reported, word in ((2.0, "large"), (0.5, "small")):
         finding = only(source_positions.detect_wrong_variance, stating(reported, 1.0))
         assert finding.title == f"The variance that UWB reports is 4 times too {word}"
-        assert ("do not show time-correlated errors" in finding.message) is (word == "large")
+        assert ("time-correlated errors" in finding.message) is (word == "large")
 
 
 @pytest.mark.parametrize(("error_m", "expected"), [(1.41, "error"), (1.42, None)])
@@ -975,7 +971,7 @@ def test_position_outlier_size_is_distance_to_ground_truth() -> None:
     truth = pd.DataFrame({"position_m": 0.0 * time}, index=time)
     for known, north_m, reference in (
         (truth, 3.0, "ground truth"),
-        (NONE, 2.0, "the neighbouring positions"),
+        (NONE, 2.0, "the previous and next positions"),
     ):
         axes = tuple(axis(name, truth=known) for name in ("north", "east"))
         axes[0].axis.measurement_m = np.ones(120)

@@ -301,8 +301,9 @@ FAULTS = [
     Fault("acceleration_not_logged", "warning", flight={"imu": None}),
     Fault("acceleration_not_logged", "warning", flight={"attitude_hz": None}),
     Fault("log_damaged", "warning", {"ends_in_flight": 0.0},
-          {"damage": ("128 bytes do not form complete messages",)}),
-    Fault("samples_out_of_order", "note", {"notes": 2}, change=with_log(dropped={"x": 2, "y": 1})),
+          {"damage": ("128 bytes are not part of a complete MAVLink frame",)}),
+    Fault("samples_out_of_order", "note", {"notes": 2},
+          change=with_log(dropped={"vehicle_imu": 2, "vehicle_attitude": 1})),
     Fault("too_few_innovations", "warning", {"count": 7}, {"duration_s": 1.5}),
     Fault("source_timestamp_jitter", "warning", {"jitter_s": about(0.0287, 0.01)},
           {"uwb": Uwb(rate_hz=10.0, sigma_m=0.01)}, change=with_errors(no_errors, jitter_s)),
@@ -466,7 +467,7 @@ def test_positions_missing_for_part_of_flight_are_reported_first(
     # EKF2 fused its own source besides the file
     assert (first.id, first.severity) == (finding, "warning" if file else "error")
     assert f"in flight at {at_s} s, " in first.title
-    assert "position error at the end of this time is " in first.message
+    assert "EKF2's position error at " in first.message
     assert first.evidence["error_m"] == pytest.approx(error_m, rel=0.05)
     assert ("dead reckoning" in first.message) == (file is None)
 

@@ -293,7 +293,7 @@ def test_inconsistent_filter_report_combines_north_and_east() -> None:
     assert found[1].title == "KF is overconfident along east: σ is 1.73 times too small"
     main = analysis(axes=(kf(2.0), kf(3.0, "east")))
     assert only(noises.detect_inconsistent_variances, main).evidence["axis"] == "north"
-    assert "The mean NIS of this horizontal axis is 3, expected 0.80 to 1.20" in found[1].message
+    assert "The mean NIS is 3, expected 0.80 to 1.20" in found[1].message
     assert group_by_cause(found) == found
 
 
@@ -347,7 +347,7 @@ def test_ekf2_noise_within_25_percent_of_default_is_default(flown, used_m, defau
         ("kf", {"sigma_a_m_s2": 0.3, "sigma_z_m": 2.0}, "measurement noise",
          "Set SIGMA_A to 0.3 m/s² (--sigma-a 0.3) and SIGMA_Z to 2 m (--sigma-z 2)."),
         ("kf", {"outliers_left_out": 9.0}, "outliers",
-         "Give the tag line of sight to the anchors, or remove outliers before sending."),
+         "Ensure line of sight from tag to anchors, or remove outliers before sending."),
         ("kf", {"outliers_left_out": 9.0, "sigma_z_m": 2.0}, "outliers",
          "before sending. Set SIGMA_Z to 2 m (--sigma-z 2)."),
         ("kf", {"clock_offset_s": -0.25}, "clock",

@@ -54,8 +54,8 @@ def remove_origin_resets(
         reset for reset in ekf2.resets if segment.start_s < reset.time_s <= segment.end_s
     ]
     state = ekf2.state.copy() if resets_in_segment else ekf2.state
-    removed = "EKF2 resets that only move the origin of EKF2's frame were removed"
-    kept = "EKF2 resets that correct an error of EKF2 remain in EKF2's state"
+    removed = "removed from EKF2's track: they only move the origin of EKF2's frame"
+    kept = "kept: they correct an error of EKF2"
     resets_by_treatment: dict[str, list[str]] = {removed: [], kept: []}
     for label, quantity, columns in (
         ("horizontal position", "position", Columns.POSITION[:2]),
@@ -83,11 +83,11 @@ def remove_origin_resets(
                 state[columns], treatment = closest_state, removed
         resets_by_treatment[treatment].append(f"{len(resets)} of {label}")
     statements = (
-        f"{treatment}: {', '.join(texts)}"
+        f"EKF2 resets ({', '.join(texts)}) are {treatment}"
         for treatment, texts in resets_by_treatment.items()
         if texts
     )
-    return state, "; ".join(statements)
+    return state, ". ".join(statements)
 
 
 def _make_states_without_resets(

@@ -38,8 +38,8 @@ def find_axes_in_file(axes: AxisDirections, frame: str) -> AxisDirections:
     return x, y, z
 
 
-def format_axes(axes: Sequence[str], unit: str) -> str:
-    return "x {}, y {}, z {}, {}".format(*axes, unit)
+def format_axes(axes: Sequence[str], unit: Unit) -> str:
+    return "x {}, y {}, z {} ({})".format(*axes, UNIT_NAMES[unit])
 
 
 def format_delay(late_s: float, decimals: int) -> str:
@@ -59,13 +59,13 @@ def describe_axes(
     """Describe wrong axes of a position source or file, and the action.
 
     >>> describe_axes(("east", "north", "up"), "NED", is_mirrored=False, is_file=True)
-    ('ENU read as NED: x is east, y north, z up', 'Run again with --position-frame enu.')
+    ('ENU positions read as NED: x is east, y north, z up', 'Run again with --position-frame enu.')
     """
     x, y, z = axes
     frame_name = next((frame for frame in FRAME_AXES if FRAME_AXES[frame] == axes), "")
     title = f"The axes are not {stated_frame}"
     if frame_name:
-        title = f"{frame_name} {'read' if is_file else 'sent'} as {stated_frame}"
+        title = f"{frame_name} positions {'read' if is_file else 'sent'} as {stated_frame}"
     elif z == "up" and is_mirrored:
         title = "z points up"
     elif axes == ("east", "north", "down"):

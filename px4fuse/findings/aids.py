@@ -18,13 +18,14 @@ from px4fuse.flight.ekf2_parameters import AIDS, BAROMETER, MAG
 from px4fuse.flight.model import BAD_ACCELERATION_FLAG, Unavailable
 
 AIDS_TESTED_BY_REPLAY = ("ev_pos", "ev_hgt")
-# A barometer gap that begins within this time (s) after take-off is normal: ground effect
+# A pause of barometer fusion is normal up to this time (s) after take-off (ground effect)
 GROUND_EFFECT_DURATION_S = 10.0
-# Minimum ratio of the height error in a barometer gap to the height RMSE outside
+# Minimum ratio of the height error in a pause of barometer fusion to the height RMSE outside the
+# pause
 MIN_GAP_ERROR_TO_HEIGHT_RMSE_RATIO = 3.0
 # Aiding sources whose vertical innovations EKF2 tests to flag a bad vertical acceleration
 AIDS_OF_VERTICAL_ACCELERATION_TEST = ("gnss_vel", "gnss_hgt", "baro_hgt")
-# Maximum fraction of the time with a bad vertical acceleration for a note instead of a warning
+# Severity "note" if the vertical acceleration is bad for at most this fraction of the time
 MAX_BAD_ACCELERATION_FRACTION_FOR_NOTE = 0.3
 # Action for each sensor that EKF2 does not fuse, by PX4 parameter
 ACTION_BY_SWITCH = {
@@ -68,7 +69,7 @@ def detect_bad_acceleration(analysis: Analysis, aids: Mapping[str, AidResult]) -
         if name in aids and aids[name].verdict == "overconfident"
     }
     cause = "Normal noise can set the flag fs_bad_acc_vertical for some seconds."
-    remedy = "If the flag stays set, check the IMU for vibration and clipping."
+    remedy = "If fs_bad_acc_vertical stays set, check the IMU for vibration and clipping."
     if too_small_noises:
         parameters_text = " and ".join(sorted(too_small_noises))
         cause = f"The measurement noise is set too small: {parameters_text}."
@@ -155,11 +156,12 @@ def _make_innovation_change_finding(name: str, aid: AidResult) -> Finding:
     innovation_sigma = aid.axes[axis].s_sqrt_median
     return make_warning(
         "aid_innovation_shift",
-        f"{_format_aid_label(aid)}: the mean {axis} innovation shifts by "
+        f"The mean {axis} innovation of {_format_aid_label(aid)} shifts by "
         f"{format_number(abs(mean_change) * innovation_sigma, 2)} {aid.unit} at {time_s:.0f} s. "
-        f"This is {abs(mean_change):.1f} times √S ({format_number(innovation_sigma, 2)} "
+        f"The shift is {abs(mean_change):.1f} times √S ({format_number(innovation_sigma, 2)} "
         f"{aid.unit}).",
-        f"Check what was switched, moved or passed near the sensor at {time_s:.0f} s.",
+        "Check which device near the sensor was switched on, switched off or moved at "
+        f"{time_s:.0f} s.",
         {"aid": name, "axis": axis, "time_s": time_s, "moved": mean_change},
         ((time_s, time_s + INNOVATION_MEAN_WINDOW_S),),
     )
@@ -168,7 +170,7 @@ def _make_innovation_change_finding(name: str, aid: AidResult) -> Finding:
 def _make_overconfident_finding(name: str, aid: AidResult, sensor_cause: str) -> Finding:
     # Innovations alone do not distinguish noise from a wrong delay, so no noise value is proposed
     noise_parameter, noise_text = AIDS[name].noise, ""
-    action = "correct the accuracy that the sensor reports"
+    action = "let the sensor report its true noise (σ)"
     if noise_parameter:
         action = f"increase {noise_parameter}"
     if aid.noise is not None:
@@ -196,10 +198,9 @@ def _make_innovation_bias_finding(name: str, aid: AidResult) -> Finding:
     )
     return make_note(
         "aid_innovation_bias",
-        f"{_format_aid_label(aid)}: the mean {axis} innovation is "
+        f"The mean {axis} innovation of {_format_aid_label(aid)} is "
         f"{format_number(worst_axis.innovation_mean)} {aid.unit}, expected 0 (√S "
-        f"{format_number(worst_axis.s_sqrt_median)} {aid.unit}). The sensor contradicts another "
-        "sensor.",
+        f"{format_number(worst_axis.s_sqrt_median)} {aid.unit}).",
         "Calibrate the sensor. Noise settings do not correct a bias.",
         {
             "aid": name,

@@ -9,7 +9,6 @@ from scipy import constants
 from px4fuse.analysis import Analysis
 from px4fuse.comparison.flight_events import find_airborne_spans
 from px4fuse.comparison.model import ErrorsAgainstTruth
-from px4fuse.comparison.projection import remove_origin_resets
 from px4fuse.core.record import Span
 from px4fuse.core.text import format_metres
 from px4fuse.filter.signals import Segment, cut_to_segment
@@ -43,7 +42,7 @@ BIAS_LIMIT_PARAMETERS = (
     ("EKF2_ABL_LIM", "m/s²", "accelerometer", Columns.ACCELEROMETER_BIAS),
     ("EKF2_GYR_B_LIM", "rad/s", "gyroscope", Columns.GYRO_BIAS),
 )
-# Minimum ratio of a bias to its limit parameter, for a bias at its limit
+# A bias is at its limit if bias ÷ limit parameter is at least this ratio
 MIN_BIAS_TO_LIMIT_RATIO = 0.98
 # Minimum fraction of the flight with a bias at its limit, for a finding
 MIN_TIME_AT_LIMIT_FRACTION = 0.5
@@ -56,17 +55,17 @@ MAX_RATE_STD_AT_REST, MAX_FORCE_STD_AT_REST = 0.04, 1.5
 MAX_RATE_CHANGE_AT_REST_RAD_S = 0.01
 # Minimum gyroscope bias (rad/s) for a finding: the heading turns by 90° in 30 s
 MIN_GYRO_BIAS_RAD_S = 0.05
-# Minimum difference (m/s²) of specific force at rest and gravity that the message states
+# Minimum |specific force at rest - gravity| (m/s²) that the finding states
 MIN_GRAVITY_ERROR_M_S2 = 0.3
 # Maximum fraction of the flight without tilt or yaw alignment
 MAX_UNALIGNED_FRACTION = 0.02
-# Maximum normal time (s) from tilt alignment to heading alignment
+# Maximum time (s) from tilt alignment to heading alignment without a finding
 MAX_HEADING_ALIGNMENT_DELAY_S = 5.0
-# Time (s) after take-off with normal height resets
+# Height resets up to this time (s) after take-off are normal
 TAKE_OFF_DURATION_S = 10.0
 # Maximum time (s) from the end of a position gap to the EKF2 reset that it causes
 MAX_RESET_DELAY_S = 5.0
-# Maximum delay (s) of the normal reset at the start of fusion, because flags are logged at 1 Hz
+# A reset up to this time (s) after the start of fusion is normal: flags are logged at 1 Hz
 MAX_FUSION_START_TO_RESET_S = 1.0
 
 
@@ -125,8 +124,8 @@ def _detect_bias_at_limit(
             if abs(force_m_s2 - constants.g) > MIN_GRAVITY_ERROR_M_S2:
                 message += (
                     f" At rest before take-off the accelerometer measures {force_m_s2:.2f} m/s² "
-                    f"instead of {constants.g:.2f} (bias down: {constants.g - force_m_s2:+.2f} "
-                    "m/s²)."
+                    f"instead of {constants.g:.2f} (bias {constants.g - force_m_s2:+.2f} m/s² "
+                    "down)."
                 )
         yield make_error(
             "ekf2_bias_at_limit",
@@ -263,13 +262,11 @@ def detect_resets(analysis: Analysis, ekf2: Ekf2) -> Findings:
         )
         largest_reset = max(resets, key=lambda reset: math.hypot(*reset.delta))
         largest_m, time_s = math.hypot(*largest_reset.delta), largest_reset.time_s
-        _, treatment = remove_origin_resets(ekf2, analysis.source, analysis.segment)
         yield finding(
             "warning" if horizontal_resets else "note",
             "ekf2_resets",
             f"EKF2 reset its {'horizontal position' if horizontal_resets else 'height'} "
-            f"{format_count(len(resets))} (largest reset: {largest_m:.2f} m at {time_s:.1f} s)."
-            f"{f' Treatment in the comparison: {treatment}.' if treatment else ''}",
+            f"{format_count(len(resets))} (largest reset: {largest_m:.2f} m at {time_s:.1f} s).",
             f"Run px4fuse explore LOG and compare position and innovation at {time_s:.1f} s.",
             {
                 "count": len(resets),

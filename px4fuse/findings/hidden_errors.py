@@ -40,7 +40,7 @@ from px4fuse.trajectory.alignment import fit_alignment
 
 # Minimum mean NEES, for severity "error": an RMS position error of 4 times the reported σ
 MIN_NEES_FOR_ERROR = 16.0
-# Maximum ratio of position RMSEs, KF to EKF2, for a fault of EKF2 alone
+# Only EKF2 has a fault if KF's position RMSE ÷ EKF2's position RMSE is below this ratio
 MAX_KF_TO_EKF2_RMSE_RATIO = 0.7
 # The position frame is misaligned if alignment reduces the position RMSE to less than this fraction
 MAX_ALIGNED_RMSE_RATIO = 0.5
@@ -260,8 +260,8 @@ def make_possible_drift_finding(analysis: Analysis) -> Finding:
     horizontal_tuning = analysis.tuning.get(HORIZONTAL)
     evidence: dict[str, float | str] = {"source": analysis.source.name}
     message = (
-        f"{sensor_name} may drift: its messages contain a heading, like those of odometry. "
-        "Filters follow the source, so innovations do not show the drift."
+        f"{sensor_name} may drift: messages with a heading are usually odometry. "
+        "KF and EKF2 follow the drift, so innovations do not show the drift."
     )
     if isinstance(horizontal_tuning, AxisTuning) and (
         noise_m := horizontal_tuning.sigma_z.value or horizontal_tuning.sigma_z.high
@@ -277,7 +277,7 @@ def make_possible_drift_finding(analysis: Analysis) -> Finding:
         )
     loop_text = "" if loop is None else "from the loop closure error (px4fuse loop LOG) or "
     action = (
-        f"Measure the drift {loop_text}with ground truth (ATT_POS_MOCAP). For motion capture, run "
-        "again with --source-kind mocap."
+        f"Measure the drift {loop_text}with ground truth (ATT_POS_MOCAP). If the source is "
+        "motion capture, run again with --source-kind mocap."
     )
     return make_note("source_may_drift", message, action, evidence)

@@ -22,7 +22,7 @@ from px4fuse.flight.model import Columns, Ekf2, Flight, sample_rate
 # Maximum specific force (m/s²) of real sensors: 35 g, because the largest range is 32 g
 MAX_PLAUSIBLE_SPECIFIC_FORCE_M_S2 = 343.0
 MIN_IMPLAUSIBLE_FORCE_SAMPLES = 3
-# Minimum accelerometer bias (m/s²), for severity "error": a position error of 0.15 m after 1 s
+# Minimum accelerometer bias (m/s²) for severity "error"; it causes an error of 0.15 m in 1 s
 MIN_BIAS_FOR_ERROR_M_S2 = 0.3
 # Tilt error (°) that has the same effect as an accelerometer bias of 1 m/s²
 TILT_DEG_PER_M_S2 = float(np.degrees(1.0 / 9.80665))
@@ -67,7 +67,8 @@ def detect_impossible_acceleration(analysis: Analysis) -> Findings:
         f"The accelerometer values are impossible: up to {max_force_m_s2:,.0f} m/s², first at "
         f"{start_s:.1f} s. Sensors of autopilots measure at most 32 g (314 m/s²). The simulator "
         "has diverged, or the log is damaged.",
-        f"Analyse only the time before these values (--end {max(start_s - 1.0, 0.0):.1f}).",
+        "Analyse only the time before the impossible values "
+        f"(--end {max(start_s - 1.0, 0.0):.1f}).",
         {"max_m_s2": max_force_m_s2, "count": len(times_s), "at_s": start_s},
         ((start_s, times_s[-1]),),
     )
@@ -110,9 +111,9 @@ def detect_accelerometer_bias(analysis: Analysis) -> Findings:
         error_m_s2 = (estimate_mean_acceleration_error(down.axis) if down else None) or 0.0
         bias_m_s2 = abs(error_m_s2)
         message = (
-            f"The accelerometer is biased by {error_m_s2:+.2f} m/s² down, compared with the heights"
-            f" of the source. A scale factor of {1.0 - error_m_s2 / constants.g:.3f} has the same "
-            "effect."
+            f"The accelerometer is biased by {error_m_s2:+.2f} m/s² down. The estimate is from "
+            "the heights of the position source. An accelerometer scale factor of "
+            f"{1.0 - error_m_s2 / constants.g:.3f} has the same effect."
         )
     if bias_m_s2 >= MIN_BIAS_M_S2:
         yield finding(
@@ -141,7 +142,8 @@ def detect_tumbling(analysis: Analysis) -> Findings:
             "attitude_failure",
             f"Roll or pitch exceeded PX4's failure-detector limits (FD_FAIL_R, FD_FAIL_P) at "
             f"{start_s:.1f} s. Later data do not represent normal flight.",
-            f"Analyse only the time before (--end {max(start_s - 1.0, 0.0):.1f}).",
+            "Analyse only the time before the excessive tilt "
+            f"(--end {max(start_s - 1.0, 0.0):.1f}).",
             {"total_s": sum(end - start for start, end in spans)},
             spans,
         )

@@ -54,9 +54,9 @@ def detect_inconsistent_closures(loop: Loop) -> Findings:
         elif weight < MIN_GNC_WEIGHT and not are_most_closures_rejected:
             yield make_warning(
                 "loop_closure_inconsistent",
-                f"{closure!s} contradicts the other loop closures, so robust optimisation rejects "
-                "it. Odometry drift alone could explain the closure error.",
-                "Remove this loop closure, or use the path of the robust optimisation (GNC).",
+                f"{closure!s} contradicts the other loop closures, so robust "
+                "optimisation rejects it.",
+                "Remove the rejected loop closure, or use the path from robust optimisation (GNC).",
                 _make_closure_evidence(closure) | {"gnc_weight": weight},
             )
 
@@ -69,7 +69,7 @@ def detect_wrong_loop_assumptions(loop: Loop) -> Findings:
             "loop_on_absolute_positions",
             "This track consists of absolute positions, which do not drift. The closure error is "
             "position noise, so a correction makes the path worse.",
-            "Use odometry for loop closures: send visual-inertial odometry to PX4 as ODOMETRY.",
+            "Loop closures need odometry: send visual-inertial odometry to PX4 as ODOMETRY.",
             evidence,
         )
     if evidence and loop.is_end_assumed:
@@ -77,8 +77,8 @@ def detect_wrong_loop_assumptions(loop: Loop) -> Findings:
             "loop_landing_assumed",
             "The landing place is unknown, so px4fuse assumes the take-off place. The loop closure "
             "error contains the distance between both places.",
-            "Measure the landing place and state it: px4fuse loop --landed-at FORWARD,RIGHT (m, "
-            "along and to the right of the nose at take-off).",
+            "Measure the landing place. Run px4fuse loop --landed-at FORWARD,RIGHT (m, forward and "
+            "right of the vehicle at take-off).",
             evidence,
         )
 

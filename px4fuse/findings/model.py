@@ -33,6 +33,9 @@ class CatalogueEntry(Record):
 FINDING_CATALOGUE: Mapping[str, CatalogueEntry] = read_toml(
     __file__, dict[str, CatalogueEntry], "catalogue.toml"
 )
+NO_ESTIMATES_SENTENCE = (
+    "px4fuse does not estimate noise, time offset or frame from these positions."
+)
 FINDING_GROUPS = ("position source", "time", "IMU", "tuning", "EKF2", "loops", "logging")
 FINDING_TITLES: Mapping[str, str] = {name: entry.title for name, entry in FINDING_CATALOGUE.items()}
 

@@ -43,30 +43,31 @@ from px4fuse.flight.model import Columns, Unavailable, sample_rate
 from px4fuse.readers.px4_innovations import has_fused_aid
 from px4fuse.request import COMPARISON_OPTIONS
 
-# Minimum factor between a noise setting and its estimate, for a warning
+# Warning if a noise setting is at least this factor too small or too large
 MIN_SETTING_TO_ESTIMATE_FACTOR = 1.5
 MIN_NOISE_FACTOR_FOR_ERROR = 4.0
-# KF ignores new positions if its time constant exceeds this value (s)
+# KF hardly reacts to new positions if its time constant exceeds this value (s)
 MIN_KF_TIME_CONSTANT_S = 2.5
-# Factor on the 95 % interval of ln(noise): 0.3 % of the correct noise settings are outside
+# Factor that widens the 95 % interval of ln(noise): the widened interval excludes 0.3 % of the
+# correct noise settings
 INTERVAL_WIDENING_FACTOR = 1.5
-# KF lags if the lag-1 autocorrelation of its innovations exceeds this value (white noise: 0.2)
+# KF lags if the lag-1 autocorrelation of its innovations exceeds this value (white noise: at most
+# 0.2)
 MIN_LAG1_AUTOCORRELATION = 0.3
 
 MIN_SIGMA_FACTOR_FOR_ERROR = 2.0
-# Maximum ratio of equal noises: the median of 100 values has a standard error of 12 %
+# Maximum ratio of noises that count as equal: a median of 100 values has a standard error of 12 %
 MAX_RATIO_OF_EQUAL_NOISES = 1.25
-# EKF2 uses the reported variance if √R exceeds EKF2_EVP_NOISE by more than this factor
+# px4fuse assumes that EKF2 uses the reported variance if √R ÷ EKF2_EVP_NOISE exceeds this ratio
 MIN_USED_TO_PARAMETER_NOISE_RATIO = 1.25
 UNEXPLAINED_SIGMA_ACTION = (
-    "No tested change of noise, time offset, frame or outliers explains the wrong σ. Check the "
-    "IMU (rate, gaps, vibration)."
+    "No re-run with changed settings or data corrects σ. Check the IMU (rate, gaps, vibration)."
 )
 UNKNOWN_NOISE_ACTION = "The noise could not be estimated; px4fuse tune LOG states the reason."
 NO_IMPROVEMENT_ACTION = (
     "Change nothing: a re-run with the estimated noise improves neither KF's position nor its σ."
 )
-AXIS_GROUPS = {"horizontal": ("north", "east", "aisle"), "vertical": ("down",)}
+AXIS_GROUPS = (("north", "east", "aisle"), ("down",))
 KEEP_NOISE_BECAUSE_OF_DRIFT_ACTION = (
     "Do not reduce noise settings: innovations do not show the drift of the source."
 )
@@ -256,7 +257,7 @@ def detect_inconsistent_variances(analysis: Analysis) -> Findings:
     for filter_name in FILTER_NAMES:
         for is_underconfident in (True, False):
             first_finding_id = None
-            for axis_group, axes in AXIS_GROUPS.items():
+            for axes in AXIS_GROUPS:
                 inconsistent_axes = [
                     (analysis.axes[name], summary)
                     for name in axes
@@ -266,7 +267,7 @@ def detect_inconsistent_variances(analysis: Analysis) -> Findings:
                 ]
                 if inconsistent_axes:
                     sigma_finding = _make_wrong_sigma_finding(
-                        analysis, filter_name, axis_group, inconsistent_axes
+                        analysis, filter_name, inconsistent_axes
                     )
                     yield structs.replace(sigma_finding, caused_by=first_finding_id)
                     first_finding_id = sigma_finding.id
@@ -275,7 +276,6 @@ def detect_inconsistent_variances(analysis: Analysis) -> Findings:
 def _make_wrong_sigma_finding(
     analysis: Analysis,
     filter_name: FilterName,
-    axis_group: str,
     inconsistent_axes: list[tuple[AxisComparison, FilterSummary]],
 ) -> Finding:
     worst_axis, summary = max(
@@ -334,7 +334,7 @@ def _make_wrong_sigma_finding(
         f"{filter_name}_{verdict}",
         f"{FILTER_NAMES[filter_name]} is {verdict} along {worst_axis.axis.label}: σ is "
         f"{format_ratio(sigma_error_factor)} times too "
-        f"{'large' if is_underconfident else 'small'}. The mean NIS of this {axis_group} axis is "
+        f"{'large' if is_underconfident else 'small'}. The mean NIS is "
         f"{format_number(summary.nis_mean)}, expected {low:.2f} to {high:.2f}.",
         remedy_text,
         {

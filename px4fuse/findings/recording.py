@@ -55,7 +55,7 @@ def detect_lost_data(flight: Flight) -> Findings:
             lost_bytes, damage_text = log.bytes - log.bytes_read, "the log is damaged"
             if log.bytes and lost_bytes:
                 lost_percent_text = format_number(100.0 * lost_bytes / log.bytes, 2)
-                damage_text += f": {lost_percent_text} % of its bytes cannot be read"
+                damage_text += f": px4fuse cannot read {lost_percent_text} % of its bytes"
             message = " ".join(f"{_capitalise_note(note)}." for note in (damage_text, *log.damage))
             action = "Copy the log again. If this does not help, replace the SD card."
             if log.format.startswith("MAVLink"):
@@ -67,14 +67,11 @@ def detect_lost_data(flight: Flight) -> Findings:
             {"lost_bytes": log.bytes - log.bytes_read, "ends_in_flight": float(log.ends_in_flight)},
         )
     for topic, count in list(log.dropped.items())[:1]:
-        other_topics_sentence = ""
-        if len(log.dropped) > 1:
-            other_topics_sentence = f" Other topics with wrong timestamps: {len(log.dropped) - 1}."
         yield make_note(
             "samples_out_of_order",
-            f"{count} samples of {topic} have wrong timestamps: zero, or earlier than the sample "
-            f"before. px4fuse ignores these samples.{other_topics_sentence} Possible cause: a "
-            "clock was set back, or messages arrived in another order.",
+            f"{count} samples of the topic {topic} have wrong timestamps: zero, or earlier than "
+            "the previous timestamp. Possible cause: a clock was set back, or messages arrived in "
+            "another order.",
             "Synchronise the clock of the sending computer before take-off (TIMESYNC).",
             {"notes": len(log.dropped)},
         )
@@ -117,8 +114,7 @@ def detect_other_estimators(analysis: Analysis) -> Findings:
     if log.autopilot != "PX4":
         yield make_note(
             "not_px4",
-            f"This log is from {log.autopilot}, not PX4. {log.autopilot} lacks the PX4 parameters "
-            "of the report.",
+            f"This log is from {log.autopilot}, not PX4, so the report contains no PX4 parameters.",
             f'In this report, "EKF2" means the estimator of {log.autopilot}.',
             {"autopilot": log.autopilot},
         )
@@ -143,14 +139,13 @@ def detect_unavailable_data(analysis: Analysis) -> Findings:
     """Detect a missing EKF2 state, a missing acceleration, and too few innovations."""
     ekf2, acceleration = analysis.flight.ekf2, analysis.input_axes[0].acceleration
     if isinstance(ekf2, Unavailable):
-        reason = capitalise_first(ekf2.reason)
-        message = f"The log contains no EKF2 state. {reason}. The report contains KF only."
+        message = f"The log contains no EKF2 state: {ekf2.reason}. The report contains KF only."
         yield make_warning("ekf2_not_logged", message, ekf2.remedy)
     if isinstance(acceleration, Unavailable):
         yield make_warning(
             "acceleration_not_logged",
-            "The acceleration is missing, so KF assumes constant velocity. Missing "
-            f"{acceleration.what}: {acceleration.reason}.",
+            "The acceleration is missing, so KF assumes constant velocity. Reason: "
+            f"{acceleration.reason}.",
             acceleration.remedy,
         )
     for result in analysis.axes.values():

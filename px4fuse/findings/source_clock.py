@@ -14,7 +14,7 @@ from px4fuse.findings.source_stamps import find_timesync_convergence
 from px4fuse.flight.ekf2_parameters import GNSS_POS, RECEIVER_DELAY_PARAMETERS
 from px4fuse.flight.model import Unavailable
 
-# Minimum time offset (s), for severity "error": a position error of 0.1 m at 1 m/s
+# Minimum time offset (s) for severity "error"; it causes a position error of 0.1 m at 1 m/s
 MIN_OFFSET_FOR_ERROR_S = 0.10
 # Maximum ratio of KF's position RMSE with corrected timestamps to the RMSE without correction
 MAX_RMSE_RATIO_AFTER_CORRECTION = 1.005
@@ -52,7 +52,7 @@ def detect_time_offset(analysis: Analysis, time_offset: SourceTimeOffset) -> Fin
             "corrects the whole flight. Possible cause: PX4 uses arrival times until 500 TIMESYNC "
             "answers have synchronised the clocks.",
             "Let the clocks synchronise for one minute before take-off. Analyse only the time "
-            "before or after the change (--start, --end).",
+            "before or after the change of the time offset (--start, --end).",
             {**evidence, "change_p_value": time_offset.change_p_value},
         )
         return

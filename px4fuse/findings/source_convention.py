@@ -27,7 +27,13 @@ from px4fuse.convention.texts import (
 )
 from px4fuse.finding import Finding
 from px4fuse.findings.cause_grouping import RESET_TIME_KEY, WRONG_CONVENTION_KEY
-from px4fuse.findings.model import FINDING_CATALOGUE, Findings, make_error, make_warning
+from px4fuse.findings.model import (
+    FINDING_CATALOGUE,
+    NO_ESTIMATES_SENTENCE,
+    Findings,
+    make_error,
+    make_warning,
+)
 from px4fuse.flight.model import Flight, PositionTrack, positions_phrase, source_name
 
 # Groups of findings that are valid even if all positions are wrong
@@ -151,8 +157,9 @@ def _find_position_faults(
     is_position_file = source.alignment is not None
     log_odds = 99.0 if convention.log_odds is None else min(convention.log_odds, 99.0)
     evidence_sentence = (
-        "These axes, unit and time offset fit the IMU best (log likelihood ratio to the second "
-        f"best {'above ' if log_odds == 99.0 else ''}{log_odds:.0f} nats)."
+        "Of all tested axes, units and time offsets, the corrected ones fit the IMU best (log "
+        f"likelihood ratio to the second best {'above ' if log_odds == 99.0 else ''}"
+        f"{log_odds:.0f} nats)."
     )
     stated_frame = source.alignment.frame.upper() if source.alignment else "NED"
     axes = find_axes_in_file(convention.axes, stated_frame)
@@ -168,7 +175,8 @@ def _find_position_faults(
         if faults.is_north_unknown and orientation and axes not in FRAME_AXES.values():
             axes = FRAME_AXES.get(orientation.frames[-3:], axes)
             frame_sentence = (
-                "EKF2 took its heading from this source, so nothing shows the direction of north."
+                "EKF2 took its heading from the position source, so the direction of north is "
+                "unknown."
             )
         fault_text, action = describe_axes(
             axes, stated_frame, is_mirrored=convention.is_mirrored, is_file=is_position_file
@@ -204,8 +212,8 @@ def _find_position_faults(
         )
         distance_ratio = convention.scale / METRES_PER_UNIT[convention.unit]
         message = (
-            f"{fault_text}. Distances are {distance_ratio:.3g} times those of the IMU. "
-            f"{evidence_sentence} The analysis uses the positions in metres."
+            f"{fault_text}. Distances between positions are {distance_ratio:.3g} times those "
+            f"computed from the IMU. {evidence_sentence} The analysis uses the positions in metres."
         )
         yield "source_unit_wrong", "unit", message, action
     if faults.clock_drift:
@@ -232,9 +240,9 @@ def _find_position_faults(
     if faults.is_ambiguous:
         axes_text = format_axes(convention.axes, convention.unit)
         message = (
-            f"The axes of the {positions_text} are not NED. The motion fits several conventions: "
-            f"{'; or '.join((axes_text, *convention.alternatives[:3]))}. px4fuse estimates nothing "
-            "from the positions."
+            f"The axes of the {positions_text} are not NED. Several combinations of axes and unit "
+            f"fit the motion: {'; or '.join((axes_text, *convention.alternatives[:3]))}. "
+            f"{NO_ESTIMATES_SENTENCE}"
         )
         action = "Fly a square with climb and descent, or state the frame (--position-frame)."
         yield "source_convention_ambiguous", "ambiguous", message, action
@@ -273,9 +281,9 @@ def _find_orientation_faults(
             describe_quaternion_conversion(orientation.frames),
         ),
         "heading": (
-            f"The heading of the orientation of {source} differs by "
+            f"The heading that {source} sends differs by "
             f"{orientation.heading_error_deg or 0.0:+.0f}° (clockwise from above) from the heading "
-            "that its positions and the IMU show",
+            "estimated from positions and IMU",
             "Define the rigid body with x forward. An error of 90° is often an unconverted ENU "
             "heading.",
         ),

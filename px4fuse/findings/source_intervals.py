@@ -37,17 +37,18 @@ MIN_LOST_POSITION_FRACTION = 0.02
 MIN_INTERVAL_COUNT = 50
 # Minimum fraction of missing positions to report downsampling: a radio link loses fewer
 MIN_MISSING_FRACTION_FOR_DOWNSAMPLING = 0.25
-# Minimum fraction of intervals that have one of two lengths (n or n + 1 source periods)
+# Minimum fraction of intervals with the two most frequent lengths (n and n + 1 source periods)
 MIN_FRACTION_OF_BOTH_INTERVAL_LENGTHS = 0.85
 # Minimum fraction of the rarer interval length
 MIN_FRACTION_OF_RARER_INTERVAL_LENGTH = 0.1
-# Maximum RMS deviation of intervals from multiples of the period (jitter: 0.03, random: 0.29)
+# Maximum RMS deviation of intervals from multiples of the source period, in source periods:
+# intervals with jitter have 0.03, random intervals 0.29
 MAX_ROUNDING_RMS_ERROR = 0.06
-# Tested source periods: median interval ÷ 1, 2, ... up to this number
+# Largest n in the tested source periods: median interval ÷ 1, 2, ..., n
 MAX_PERIODS_IN_MEDIAN_INTERVAL = 4
 # Minimum gap (s) at take-off or landing: the land detector is seconds late
 MIN_GAP_AT_START_OR_END_S = 3.0
-# KF's predicted state is read this time (s) before the update
+# Time (s) before an update at which KF's predicted state is read
 TIME_BEFORE_UPDATE_S = 1e-6
 
 
@@ -86,7 +87,7 @@ def detect_source_gaps(analysis: Analysis) -> Findings:
         else:
             message = (
                 f"{positions_phrase(source)} are missing in the log for {duration_text}, but EKF2 "
-                "fused them. KF has no measurement in this time."
+                "fused them. KF has no measurement in the gap."
             )
             action = _find_action_for_unlogged_positions(analysis, start_s, end_s)
         yield make_warning(
@@ -102,8 +103,9 @@ def _find_action_for_unlogged_positions(analysis: Analysis, start_s: float, end_
     for track in analysis.flight.positions:
         if track.origin.aid == analysis.source.origin.aid and len(track.samples[start_s:end_s]) > 2:
             return f"Run again with --position-source {track.name}, which contains these positions."
-    faster_card = "Use a faster SD card, or log" if analysis.flight.log.dropouts else "Log"
-    return f"{faster_card} fewer topics (SDLOG_PROFILE)."
+    if analysis.flight.log.dropouts:
+        return "Use a faster SD card, or log fewer topics (SDLOG_PROFILE)."
+    return "Log fewer topics (SDLOG_PROFILE)."
 
 
 def _make_stop_or_begin_finding(analysis: Analysis, span_s: Span, fused_aids: list[Aid]) -> Finding:
@@ -111,16 +113,16 @@ def _make_stop_or_begin_finding(analysis: Analysis, span_s: Span, fused_aids: li
     duration_s, effect_sentence, action = end_s - start_s, "", ""
     if end_s == analysis.segment.whole_flight.end_s:
         finding_id, event, event_s = "source_stops", "stop", start_s
-        before_or_after, flight_edge = "after", "before the end"
+        before_or_after, flight_edge = "after", "before the end of the flight"
     else:
         finding_id, event, event_s = "source_begins", "begin", end_s
-        before_or_after, flight_edge = "before", "after the start"
+        before_or_after, flight_edge = "before", "after the start of the flight"
         action = "" if source.alignment else " Take off only when positions arrive."
     ekf2_errors_at_end = _find_ekf2_errors_at_end(analysis, span_s)
     for name, quantity in (("error_m", "position error"), ("sigma_m", "reported σ")):
         if name in ekf2_errors_at_end and not effect_sentence:
             effect_sentence = (
-                f" EKF2's {quantity} at the end of this time is "
+                f" EKF2's {quantity} at {end_s:.1f} s is "
                 f"{format_metres(ekf2_errors_at_end[name])} m."
             )
     has_aids = _has_aiding_sources(analysis.flight.ekf2)
@@ -134,7 +136,8 @@ def _make_stop_or_begin_finding(analysis: Analysis, span_s: Span, fused_aids: li
         finding_id,
         f"{positions_phrase(source)} {event} in flight at {event_s:.1f} s, {duration_s:.1f} s "
         f"{flight_edge}.{aiding_sentence}{effect_sentence}",
-        f"{find_source_texts(source).data_link_check} {before_or_after} {event_s:.1f} s.{action}",
+        f"{find_source_texts(source).data_link_check} for the time {before_or_after} "
+        f"{event_s:.1f} s.{action}",
         {"at_s": event_s, "duration_s": duration_s, **ekf2_errors_at_end},
         (span_s,),
     )
@@ -168,7 +171,7 @@ def describe_errors_after_gap(analysis: Analysis, gap_span_s: Span) -> str:
     result, (start_s, end_s) = analysis.main, gap_span_s
     axis, ekf2, ekf2_state = result.axis, analysis.flight.ekf2, result.ekf2_state
     reference_m = float(axis.measurement_m[np.searchsorted(axis.measurement_time_s, end_s)])
-    quantity = "Distance to the first position after the gap"
+    quantity = "Distance of the estimate from the first position after the gap"
     if isinstance(result.truth, pd.DataFrame):
         true_m = result.truth["position_m"]
         reference_m = float(np.interp(end_s, true_m.index, true_m))

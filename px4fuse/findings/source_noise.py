@@ -28,11 +28,11 @@ from px4fuse.findings.source_positions import (
 )
 from px4fuse.flight.model import Columns, positions_phrase, source_name
 
-# Minimum ratio of white noise σ to time-correlated noise σ, for a separate fault
+# White noise is a separate fault if its σ ÷ σ of the time-correlated noise exceeds this ratio
 MIN_WHITE_TO_CORRELATED_SIGMA_RATIO = 0.3
 # Minimum log likelihood ratio (nats): 1 of 400 flights without a fault exceeds it
 MIN_CORRELATED_NOISE_LOG_LIKELIHOOD_RATIO_NATS = 5.0
-# Minimum time-correlated error (m, 1 σ): errors of timestamps and motion cause some mm
+# Minimum time-correlated error (m, 1 σ): timestamp errors and motion alone cause a few mm
 MIN_CORRELATED_NOISE_SIGMA_M = 0.005
 # Minimum fraction of repeated positions for a warning
 MIN_REPEATED_FRACTION = 0.05
@@ -42,7 +42,7 @@ MIN_REPEATED_POSITION_COUNT = 10
 MIN_AXIS_NOISE_RATIO = 1.5
 # Minimum ratio of the noise in one flight part to the noise in the rest, for a warning
 MIN_NOISY_PART_SIGMA_RATIO = 2.0
-# Minimum noise ratio of one flight part to the rest, without outliers, for a warning
+# Minimum ratio of the noise in one flight part to the noise in the rest, after removal of outliers
 MIN_NOISY_PART_SIGMA_RATIO_WITHOUT_OUTLIERS = 1.5
 MIN_NOISY_PART_SIGMA_RATIO_FOR_ERROR = 4.0
 
@@ -166,8 +166,9 @@ def detect_noise_variation(analysis: Analysis) -> Findings:
         f"{source_name(analysis.source)} noise is {noise_ratio:.1f} times larger from "
         f"{start_s:.0f} to {end_s:.0f} s. Single outliers are not the cause. No single SIGMA_Z "
         "fits the whole flight.",
-        f"{find_source_texts(analysis.source).data_link_check} in that time. Let the source send a "
-        "variance with each position, or analyse this time separately (--start, --end).",
+        f"{find_source_texts(analysis.source).data_link_check} for the time from {start_s:.0f} to "
+        f"{end_s:.0f} s. Send a variance with each position, or analyse the noisy part separately "
+        "(--start, --end).",
         {"ratio": noise_ratio, "first_s": start_s, "until_s": end_s},
         ((start_s, end_s),),
     )

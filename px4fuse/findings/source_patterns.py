@@ -38,9 +38,10 @@ from px4fuse.flight.model import positions_phrase, source_name
 
 # Minimum scale factor error (ratio minus 1) against ground truth: 0.8 m in 10 m
 MIN_SCALE_ERROR_AGAINST_TRUTH = 0.08
-# Minimum jitter (s), for severity "error": a position error of 3 cm at 1 m/s
+# Minimum jitter (s) for severity "error"; it causes a position error of 3 cm at 1 m/s
 MIN_JITTER_FOR_ERROR_S = 0.03
-# Minimum amplitude (m) of a periodic error, for severity "error": twice the noise of good UWB
+# Minimum amplitude (m) of a periodic error for severity "error": twice the noise of a good UWB
+# system
 MIN_AMPLITUDE_FOR_ERROR_M = 0.2
 
 
@@ -69,7 +70,7 @@ def detect_jitter_and_speed_noise(analysis: Analysis, local_residuals: LocalResi
             "source_timestamp_jitter",
             f"The timestamps of the {positions_phrase(analysis.source)} jitter by "
             f"{1e3 * jitter_s:.0f} ms (1 σ). The positions are measured at a constant interval. At "
-            f"1 m/s the jitter is a position error of {format_metres(jitter_s)} m.",
+            f"1 m/s the jitter causes a position error of {format_metres(jitter_s)} m.",
             "Send the time of measurement with each position, not the time of processing, sending "
             "or receiving.",
             {"jitter_s": jitter_s},
@@ -81,8 +82,8 @@ def detect_jitter_and_speed_noise(analysis: Analysis, local_residuals: LocalResi
             f"{source_name(analysis.source)} noise grows with speed: "
             f"{format_metres(speed_noise.slow_m)} m at {speed_noise.slow_m_s:.1f} m/s and "
             f"{format_metres(speed_noise.fast_m)} m at {speed_noise.fast_m_s:.1f} m/s (1 σ). The "
-            "noise also grows across the motion, so time offset and jitter are not the cause. "
-            "No single measurement noise fits the whole flight.",
+            "noise perpendicular to the motion also grows, so time offset and jitter are not the "
+            "cause. No single measurement noise fits the whole flight.",
             "Send a variance that grows with speed (EKF2_EV_NOISE_MD 0). Shorten the exposure or "
             "ranging time.",
             speed_noise._asdict(),
@@ -102,7 +103,7 @@ def detect_periodic_errors_and_offset_changes(analysis: Analysis, error_fit: Err
             f"s. This sinusoid explains {format_percent(min(periodic_error.fraction, 1.0))} of the "
             "slow errors against ground truth. Innovations hardly show this error.",
             f"{find_source_texts(analysis.source).slow_error_check}. Look for a process with this "
-            "period, such as a rotating part or a control loop.",
+            "period, such as a rotating antenna or a control loop.",
             periodic_error._asdict(),
         )
         return
@@ -131,7 +132,7 @@ def detect_scale_error(analysis: Analysis, error_fit: ErrorFit) -> Findings:
             analysis.source,
             error_fit.scale,
             error_fit.scale_sigma,
-            f"ground truth is accurate to ± {format_percent(1.96 * error_fit.scale_sigma, 1)}",
+            f"ground truth (± {format_percent(1.96 * error_fit.scale_sigma, 1)}, 95 %)",
             f"{find_source_texts(analysis.source).scale_check}.",
         )
 

@@ -29,6 +29,7 @@ from px4fuse.findings.cause_grouping import (
 )
 from px4fuse.findings.imu import MIN_IMU_RATE_HZ, is_rate_too_low
 from px4fuse.findings.model import (
+    NO_ESTIMATES_SENTENCE,
     Findings,
     find_source_texts,
     finding,
@@ -56,17 +57,18 @@ from px4fuse.flight.model import (
 MIN_MOTION_RANGE_M = 0.5
 # Minimum extent of motion, in σ of the noise: noise alone has 3.29 σ, 25 % is margin
 MIN_MOTION_RANGE_TO_NOISE_RATIO = 1.25 * 3.29
-# Minimum log likelihood ratio (nats) of low-pass filtered to white noise; unfiltered: 0 to 2
+# Minimum log likelihood ratio (nats) of the low-pass model to the white-noise model; unfiltered
+# positions reach 2
 MIN_LOW_PASS_LOG_LIKELIHOOD_RATIO_NATS = 6.0
-# Minimum log likelihood ratio (nats) of low-pass filtered to time-correlated noise
+# Minimum log likelihood ratio (nats) of the low-pass model to the model of time-correlated noise
 MIN_LOW_PASS_TO_CORRELATED_NOISE_NATS = 1.0
-# Maximum ratio of the lag from the noise correlation to the measured delay (upper 95 % limit)
+# Maximum ratio: lag estimated from the noise correlation ÷ measured delay (upper 95 % limit)
 MAX_ESTIMATED_LAG_TO_DELAY_RATIO = 4.0
-# Minimum filter lag (s) for a warning: a position error of 5 cm at 1 m/s
+# Minimum filter lag (s) for a warning; it causes a position error of 5 cm at 1 m/s
 MIN_LAG_S = 0.05
-# Minimum filter lag (s) for severity "error": a position error of 10 cm at 1 m/s
+# Minimum filter lag (s) for severity "error"; it causes a position error of 10 cm at 1 m/s
 MIN_LAG_FOR_ERROR_S = 0.10
-# Minimum position jump (m) for a warning: twice the noise of good UWB (0.1 m)
+# Minimum position jump (m) for a warning: twice the noise of a good UWB system (0.1 m)
 MIN_JUMP_M = 0.2
 # Minimum ratio of a position jump to the σ of time-correlated noise, for a warning
 MIN_JUMP_SIGMAS = 5.0
@@ -75,29 +77,29 @@ MIN_JUMPS_WITH_RESET_COUNTER = 2
 # Minimum number of jumps without a change of reset_counter to report repeated jumps
 MIN_JUMPS_WITHOUT_RESET_COUNTER = 3
 MIN_JUMP_WITHOUT_RESET_COUNTER_M = 0.1
-# Minimum ratio of a jump without a change of reset_counter to the median of position changes
+# Minimum ratio: jump without a change of reset_counter ÷ median position change
 MIN_JUMP_TO_MEDIAN_CHANGE_RATIO = 8.0
-# Number of position changes in the median with which a jump is compared
+# Number of position changes whose median is the reference for a jump
 JUMP_WINDOW_SAMPLES = 61
 MIN_POSITIONS_FOR_JUMPS = 100
 # Minimum time (s) and number of positions that a jump lasts: outliers go back to the track earlier
 MIN_JUMP_DURATION_S, MIN_JUMP_DURATION_SAMPLES = 0.6, 9
-# Maximum difference between a jump and the shift of the medians, as fraction of the jump
+# Maximum difference between a jump and the change of the median position, as fraction of the jump
 MAX_MEDIAN_SHIFT_DEVIATION_FRACTION = 0.5
-# Maximum ratio of the interval before a jump to the median interval: long intervals contain motion
+# Maximum ratio: interval before a jump ÷ median interval; the vehicle moves in longer intervals
 MAX_JUMP_TO_MEDIAN_INTERVAL_RATIO = 1.5
-# Minimum fraction of jumps opposite to the previous jump, for two alternating positions
+# Positions alternate if at least this fraction of the jumps reverses the previous jump
 MIN_OPPOSITE_JUMP_FRACTION = 0.7
 # Maximum time (s) from a position jump to the reset of EKF2 that the jump causes
 MAX_JUMP_TO_RESET_TIME_S = 5.0
 MAX_LISTED_JUMPS = 8
-# Maximum rounding difference (s) between the times of a position and its reset_counter
+# Maximum rounding difference (s) between the timestamps of a position and of its reset_counter
 RESET_TIME_TOLERANCE_S = 1e-4
 # Bit masks of EKF2_EV_CTRL: EKF2 fuses the horizontal position (bit 0) or the height (bit 1)
 EV_CTRL_HORIZONTAL_MASK, EV_CTRL_HEIGHT_MASK = 1, 2
 # Maximum time (s) between a jump and the increment of reset_counter: two intervals at 2 Hz
 MAX_JUMP_TO_RESET_COUNTER_TIME_S = 1.0
-# Minimum position jump (m), for severity "error": five times the noise of good UWB (0.1 m)
+# Minimum position jump (m) for severity "error": five times the noise of a good UWB system (0.1 m)
 MIN_JUMP_FOR_ERROR_M = 0.5
 # Minimum scale factor error (ratio minus 1) for a warning: flights without a fault reach 0.11
 MIN_SCALE_ERROR_FOR_WARNING = 0.12
@@ -112,7 +114,7 @@ MIN_OUTLIER_FRACTION_FOR_ERROR = 0.02
 MIN_OUTLIERS = 3
 # Minimum fraction of positions with logged innovations, to state the number of rejected outliers
 MIN_LOGGED_POSITION_FRACTION = 0.75
-# Minimum factor between reported and estimated position variance for a warning
+# Warning if the reported position variance is at least this factor too small or too large
 MIN_REPORTED_VARIANCE_FACTOR = 2.0
 MIN_REPORTED_VARIANCE_FACTOR_FOR_ERROR = 3.0
 
@@ -236,7 +238,7 @@ def detect_constant_coordinates(analysis: Analysis) -> Findings:
     values_m = dict(zip("xyz", source.samples[Columns.POSITION].median().tolist(), strict=True))
     finding_id, make_finding = "source_coordinate_constant", make_error
     mask_of_constant, mask_of_measured = EV_CTRL_HORIZONTAL_MASK, EV_CTRL_HEIGHT_MASK
-    consequence = "px4fuse estimates nothing from these positions."
+    consequence = NO_ESTIMATES_SENTENCE
     if coordinates == ["z"]:
         finding_id, make_finding = "source_height_constant", make_warning
         mask_of_constant, mask_of_measured = mask_of_measured, mask_of_constant
@@ -387,7 +389,7 @@ def detect_scale_error(analysis: Analysis) -> Findings:
             analysis.source,
             scale_error,
             sigma,
-            f"the IMU is accurate to ± {format_percent(1.96 * sigma)}",
+            f"the IMU (± {format_percent(1.96 * sigma)}, 95 %)",
             "Measure a known distance with the source. "
             f"{find_source_texts(analysis.source).scale_check}. If the distance is right, "
             "calibrate the accelerometers.",
@@ -395,14 +397,14 @@ def detect_scale_error(analysis: Analysis) -> Findings:
 
 
 def make_scale_finding(
-    source: PositionTrack, scale_error: float, sigma: float, accuracy_text: str, action: str
+    source: PositionTrack, scale_error: float, sigma: float, reference: str, action: str
 ) -> Finding:
-    """Make the finding on a scale factor error; ``accuracy_text`` names the reference."""
+    """Make the finding on a scale factor error; ``reference`` includes its accuracy."""
     return finding(
         "error" if abs(scale_error) >= MIN_SCALE_ERROR_FOR_SEVERITY_ERROR else "warning",
         "source_scale_error",
         f"{source_name(source)} distances are {format_percent(abs(scale_error))} too "
-        f"{'long' if scale_error > 0.0 else 'short'}. The comparison with {accuracy_text} (95 %). "
+        f"{'long' if scale_error > 0.0 else 'short'}. The estimate is from {reference}. "
         "Innovations do not show a scale factor error.",
         action,
         {"scale": 1.0 + scale_error, "sigma": sigma},
@@ -448,7 +450,7 @@ def detect_outliers(analysis: Analysis) -> Findings:
 def compute_outlier_sizes_m(analysis: Analysis, outlier_time_s: Array) -> tuple[Array, str]:
     """Return the horizontal distances (m) of outliers from a reference, and its name.
 
-    The reference is ground truth or, without it, the neighbouring positions.
+    The reference is ground truth or, without it, the previous and next positions.
     """
     axes = select_north_and_east(analysis) or [analysis.main]
     has_truth = all(isinstance(result.truth, pd.DataFrame) for result in axes)
@@ -465,7 +467,7 @@ def compute_outlier_sizes_m(analysis: Analysis, outlier_time_s: Array) -> tuple[
         squared_distances_m2 += (
             np.interp(outlier_time_s, time_s, measured_m) - expected_position_m
         ) ** 2
-    reference = "ground truth" if has_truth else "the neighbouring positions"
+    reference = "ground truth" if has_truth else "the previous and next positions"
     return np.sqrt(squared_distances_m2), reference
 
 
@@ -516,7 +518,7 @@ def detect_wrong_variance(analysis: Analysis) -> Findings:
     size_word, correlation_note = "small" if variance_ratio < 1.0 else "large", ""
     if variance_ratio > 1.0 and rmse_m is None:
         correlation_note = (
-            " The reported σ may be correct: innovations do not show time-correlated errors."
+            " The reported σ may include time-correlated errors, which innovations do not show."
         )
     severity: Severity = (
         "error" if error_factor >= MIN_REPORTED_VARIANCE_FACTOR_FOR_ERROR else "warning"
@@ -577,9 +579,9 @@ def detect_little_motion(analysis: Analysis) -> Findings:
     if has_little_motion(analysis):
         yield make_warning(
             "no_motion",
-            f"The vehicle moved only {extent_m:.2f} m horizontally. Velocity, heading and time "
-            "offset cannot be estimated from positions of this range (5th to 95th percentile).",
-            "Fly several passes of 5 m or more, with clear starts and stops.",
+            f"The vehicle moved only {extent_m:.2f} m horizontally (5th to 95th percentile). This "
+            "motion is too small to estimate velocity, heading and time offset.",
+            "Fly several passes back and forth over 5 m or more, with clear starts and stops.",
             {"range_m": extent_m}
             | ({CAUSE_KEY: VEHICLE_ON_GROUND_CAUSE} if analysis.flight.airborne == () else {}),
         )

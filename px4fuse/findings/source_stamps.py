@@ -28,25 +28,25 @@ from px4fuse.flight.model import (
     positions_phrase,
 )
 
-# Maximum normal jitter (s) of receive times: a position error of 1 cm at 1 m/s
+# Maximum jitter (s) of receive times without a finding; it causes a position error of 1 cm at 1 m/s
 MAX_RECEIPT_JITTER_S = 0.010
-# Maximum time (s) from an arrival timestamp to the publication by PX4
+# Maximum time (s) from the arrival timestamp of a position to its publication by PX4
 MAX_ARRIVAL_TO_PUBLICATION_DELAY_S = 0.001
-# Minimum latency (s) for a warning: a position error of 2 cm at 1 m/s
+# Minimum latency (s) for a warning; it causes a position error of 2 cm at 1 m/s
 MIN_LATENCY_S = 0.02
-# Minimum latency (s), for severity "error": a position error of 10 cm at 1 m/s
+# Minimum latency (s) for severity "error"; it causes a position error of 10 cm at 1 m/s
 MIN_LATENCY_FOR_ERROR_S = 0.10
 # Minimum rank correlation of latency with time, for a latency that grows in flight
 MIN_LATENCY_CORRELATION = 0.8
 # Minimum fraction of positions that EKF2 drops because of their latency, for a finding
 MIN_DROPPED_POSITION_FRACTION = 0.02
 MIN_POSITIONS_BEFORE_AND_AFTER_TIMESYNC = 10
-# Minimum fraction of arrival times before the convergence of TIMESYNC, and of measurement times
-# after
+# Minimum fraction of the timestamps that are arrival times before TIMESYNC converges, and
+# measurement times afterwards
 MIN_FRACTION_OF_TIMESTAMP_KIND = 0.95
 # Minimum mean number of positions in a burst (positions that arrive together)
 MIN_BURST_POSITIONS = 2.5
-# Minimum number of bursts: a few pauses are gaps in the position source
+# Minimum number of bursts; fewer pauses count as gaps in the position source
 MIN_BURST_COUNT = 20
 MAX_BURST_TO_PAUSE_DURATION_RATIO = 0.3
 ANSWER_TIMESYNC_ACTION = (
@@ -68,7 +68,7 @@ def detect(analysis: Analysis) -> Findings:
         yield from detect_constant_timestamps(positions_text, clock_map, clock_map.distinct_stamps)
     elif clock_map.method in METHODS_WITHOUT_MEASUREMENT_TIMES:
         kf_times_sentence = (
-            "KF uses the timestamps of the messages, converted to boot time by the "
+            "KF uses the message timestamps; their offset to boot time is from the "
             f"{clock_map.method}."
         )
         if clock_map.method == "arrival time":
@@ -187,8 +187,8 @@ def detect_arrival_timestamps(analysis: Analysis) -> Findings:
             "TIMESYNC converged (PX4 needs 500 answers). Later timestamps are times of "
             f"measurement, {latency_s:.3f} s before arrival. One time offset cannot correct the "
             "whole flight.",
-            "Let the clocks synchronise for one minute before take-off. Analyse only the later "
-            f"time (--start {math.ceil(convergence_time_s)}).",
+            "Let the clocks synchronise for one minute before take-off. Analyse only the time "
+            f"after the synchronisation (--start {math.ceil(convergence_time_s)}).",
             {"until_s": convergence_time_s, "latency_s": latency_s},
             ((float(position_age_s.index[0]), convergence_time_s),),
         )

@@ -20,7 +20,14 @@ from px4fuse.core.arrays import Array
 from px4fuse.core.text import format_metres
 from px4fuse.ekf2.model import misalign_positions, replay_with_settings
 from px4fuse.ekf2.replay import rows_inside
-from px4fuse.findings.model import Findings, find_source_texts, make_error, make_note, make_warning
+from px4fuse.findings.model import (
+    NO_ESTIMATES_SENTENCE,
+    Findings,
+    find_source_texts,
+    make_error,
+    make_note,
+    make_warning,
+)
 from px4fuse.findings.source_intervals import describe_errors_after_gap
 from px4fuse.flight.model import Columns, Ekf2, Truth, Unavailable, positions_phrase, source_name
 from px4fuse.readers.px4_positions import NO_FIX_ACTION
@@ -29,24 +36,26 @@ from px4fuse.readers.px4_positions import NO_FIX_ACTION
 MIN_ROUNDING_STEP_M = 0.05
 # Maximum ratio of EKF2's position RMSE with the estimated lever arm to the RMSE without it
 MAX_LEVER_ARM_RMSE_RATIO = 0.7
-# Minimum rotation (°) of the positions that is reported with a lever arm, and its ratio to its σ
+# Minimum rotation (°) of the positions, and minimum rotation ÷ σ, that a lever-arm finding states
 MIN_ROTATION_DEG, MIN_ROTATION_SIGMAS = 5.0, 3.0
-# Minimum distance (m) between two alternating senders: smaller distances may be noise
+# Minimum distance (m) between the positions of two alternating senders: less may be noise
 MIN_SENDER_DISTANCE_M = 0.1
-# Minimum ratio of the senders' distance to its scatter (1 σ): one sender reaches 2
+# Minimum ratio: distance between the positions of two senders ÷ scatter (1 σ) of this distance; one
+# sender reaches 2
 MIN_SENDER_DISTANCE_SIGMAS = 4.0
-# Window length (samples), short because a lost sample exchanges odd and even samples
+# Window length (samples): it is short, because a lost sample exchanges the senders of even and odd
+# samples
 WINDOW_SAMPLES = 16
 MIN_WINDOWS_FOR_TWO_SENDERS = 10
-# Maximum median distance (m) of copied positions from EKF2's position
+# Positions are copies if their median distance (m) from EKF2's position is below this limit
 MAX_DISTANCE_OF_COPY_M = 0.01
-# Smaller limit (m) for fused positions, which are always near EKF2's position
+# Positions that EKF2 fused are copies if their median distance (m) from EKF2's position is below
+# this limit: all fused positions are near EKF2's position
 MAX_DISTANCE_OF_FUSED_COPY_M = 0.001
 # Minimum speed (m/s) for the comparison with EKF2's position: at rest, any source may agree
 MIN_SPEED_FOR_COPY_TEST_M_S = 0.2
 # Tested delays (s) between EKF2's position and a source that sends it back
 TESTED_COPY_DELAYS_S = np.arange(0.0, 0.305, 0.005)
-NO_ESTIMATES_SENTENCE = "px4fuse estimates nothing from these positions."
 # Finding id, fault and action for each reason of an invalid position
 INVALID_POSITION_TEXTS: Mapping[str, tuple[str, str, str]] = {
     "zero": (
@@ -56,7 +65,7 @@ INVALID_POSITION_TEXTS: Mapping[str, tuple[str, str, str]] = {
     ),
     "held": (
         "source_position_held",
-        "repeat the last position: the source has lost tracking",
+        "are repetitions of the last position: the source lost tracking",
         "Stop sending, or send NaN, while tracking is lost.",
     ),
     "far": (
@@ -172,8 +181,8 @@ def detect_lever_arm(analysis: Analysis) -> Findings:
         forward_m, right_m = 0.0 - forward_m, 0.0 - right_m
     elif any(imu_position_m) and not has_truth:
         action = (
-            f"Set {format_changes(change)}. If the position of the sensor is right, set "
-            f"{format_changes(imu_change)} instead: the IMU at a wrong place has the same effect."
+            f"Set {format_changes(change)}. If the parameters of the sensor position are right, "
+            f"set {format_changes(imu_change)} instead: a wrong IMU position has the same effect."
         )
     if effect_sentence is None:
         return
@@ -266,9 +275,9 @@ def detect_two_senders(analysis: Analysis) -> Findings:
     )
     yield make_error(
         "source_two_senders",
-        f"Two systems alternately send positions that differ by {distance_m:.2f} m. Without the "
-        f"motion of the vehicle, successive {positions_phrase(analysis.source)} ({rate_hz:.3g} Hz "
-        f"in total) differ by {distance_texts}. {NO_ESTIMATES_SENTENCE}",
+        f"Two systems alternately send positions that differ by {distance_m:.2f} m. After "
+        f"subtraction of the vehicle's motion, successive {positions_phrase(analysis.source)} "
+        f"({rate_hz:.3g} Hz in total) differ by {distance_texts}. {NO_ESTIMATES_SENTENCE}",
         "Send the positions of one system only: stop the second node, bridge or MAVROS plugin.",
         {"distance_m": distance_m, "rate_hz": rate_hz},
     )
