@@ -20,12 +20,11 @@ from px4fuse.readers.field_maps import Layout, expand_layouts
 class TrackSource:
     """Description of a position source: kind, coordinate frame, topics and logging advice."""
 
-    # Kind of the source, such as "uwb"
-    kind: str
     path: str
     description: str
     # Advice if the positions of this source are not logged
     remedy: str
+    kind: str = "uwb"
     # False if EKF2 never fuses these positions
     fused: bool = True
     # Coordinate frame of the positions; if "unknown", the topic may contain it
