@@ -88,8 +88,8 @@ OUTLIER_EXPLANATION = (
     "affect EKF2's position."
 )
 UNEXPLAINED_DIFFERENCE_TEXT = (
-    "For KF or EKF2, innovations and errors against ground truth result in different ratios of "
-    "actual to reported σ. No re-run explains the difference."
+    "For KF or EKF2, the σ ratio from innovations differs from the σ ratio from errors against "
+    "ground truth. No re-run explains the difference."
 )
 # Reasons why faults of the source increase errors, but hardly change innovations
 SOURCE_FAULT_EXPLANATIONS = (
@@ -419,7 +419,7 @@ def _mark_explained_verdicts(
         name
         for cause in causes
         for action in cause.actions
-        if action.sentence.startswith("no change")
+        if action.sentence.startswith("keep the settings")
         for name in action.target.split(", ")
     }
     word_against_truth = {
