@@ -104,8 +104,8 @@ SOURCE_FAULT_EXPLANATIONS = (
             "source_frame_misaligned",
             "source_position_jump",
         },
-        "KF and EKF2 follow the faulty positions, so innovations show little of the position "
-        "error. Ground truth shows the error.",
+        "KF and EKF2 follow the faulty positions, so only ground truth shows most of the "
+        "position error.",
     ),
 )
 
@@ -520,8 +520,8 @@ def _explain_differing_verdicts(
         )
     if "source_noise_time_correlated" in finding_ids:
         return (
-            "KF and EKF2 follow position errors that change slowly. Innovations do not show slow "
-            "errors; only ground truth does."
+            "KF and EKF2 follow position errors that change slowly. Only ground truth shows slow "
+            "errors."
         )
     explanation = UNEXPLAINED_DIFFERENCE_TEXT
     if "ekf2_heading_error" in finding_ids:

@@ -401,7 +401,7 @@ def _format_closing_sentence(
         changes_delay_max = any("EKF2_DELAY_MAX" in action.sentence for action in actions)
         return (
             "For the next flights, correct either the sender or the delay parameter, not both. "
-            + "A correction of sender or parameter needs a larger EKF2_DELAY_MAX. "
+            + "Correcting the sender or the delay parameter needs a larger EKF2_DELAY_MAX. "
             * changes_delay_max
             + "--clock-offset corrects only this analysis. If timestamps are late, the delay "
             "parameter is positive, but --clock-offset is negative."

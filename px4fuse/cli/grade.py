@@ -41,7 +41,7 @@ from px4fuse.errors import OutputError, SettingsError
 @input_option(
     "--key", "FILE.json", "Answer key of the class, written by px4fuse simulate --assignment."
 )
-@output_option("DIR", "Output folder for the points and the feedback.")
+@output_option("DIR", "Output folder for the students' points and feedback.")
 @click.option("--title", help="Title of the class page.  [default: the rubric's title]")
 @input_option(
     "--roster", "FILE.csv", "Class list with all students.  [default: the students in --key]"

@@ -79,7 +79,7 @@ _loop_option = partial(options.request_option, LoopRequest)
     type=parse_closure,
     metavar="T1,T2[,SIGMA]",
     multiple=True,
-    help="Loop closure: the vehicle was at the same place at times T1 and T2 (s). SIGMA (m): "
+    help="Loop closure: same place at times T1 and T2 (s). SIGMA (m): "
     "σ of the distance between both positions. Repeatable.  [default SIGMA: 0.1 m]",
 )
 @options.flag_option(
@@ -103,7 +103,7 @@ _loop_option = partial(options.request_option, LoopRequest)
     "--reference",
     type=options.InputPath(str),
     metavar="FILE|LOG:TRACK",
-    help="Reference trajectory (for example from SLAM) for the ATE and RPE of each path, in "
+    help="Reference trajectory for the ATE and RPE of each path, in "
     "addition to the ground truth of the log.",
 )
 @_loop_option(

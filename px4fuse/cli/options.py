@@ -347,7 +347,7 @@ filter_options = _combine_options(
     ),
     _comparison_option(
         "source_kind",
-        "Kind of the position source; vio drifts, the other kinds do not.  [default: vio if "
+        "Kind of the position source; vio may drift.  [default: vio if "
         "the orientation in the messages changes, otherwise by message type]",
     ),
     _comparison_option(

@@ -147,12 +147,12 @@ def parse_g2o(text: str, name: str) -> PoseGraph:
     edges.raise_where(
         ids[vertex_indices] != edge_vertex_ids,
         "the edge refers to a vertex that is not in the file",
-        "Add the line of the missing vertex, or remove all VERTEX lines.",
+        "Add the VERTEX line of the missing vertex, or remove all VERTEX lines.",
     )
     edges.raise_where(
         edge_vertex_ids[:, 0] == edge_vertex_ids[:, 1],
         "the edge connects a vertex to itself",
-        "Remove the edge.",
+        "Remove the invalid edge.",
     )
     graph = PoseGraph(
         dimension=dimension,
@@ -247,7 +247,7 @@ def _make_information_matrices(edges: _TaggedLines, numbers: Array, dimension: i
     edges.raise_where(
         is_too_small | (magnitudes > _MAX_INFORMATION_ELEMENT),
         "an element of the information matrix is too large or too close to 0",
-        f"Each element must be 0, or have a magnitude of {_MIN_INFORMATION_ELEMENT:g} to "
+        f"Each matrix element must be 0, or have a magnitude of {_MIN_INFORMATION_ELEMENT:g} to "
         f"{_MAX_INFORMATION_ELEMENT:g}.",
     )
     eigenvalues = np.linalg.eigvalsh(matrices)

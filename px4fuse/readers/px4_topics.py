@@ -44,6 +44,9 @@ TOPIC_LAYOUTS["gps_in_integers"] = replace(
     TOPIC_LAYOUTS["gps_in_integers"],
     optional_columns=TOPIC_LAYOUTS["vehicle_gps_position"].optional_columns,
 )
+TOPIC_LAYOUTS["estimator_gnss_hgt_bias"] = replace(
+    TOPIC_LAYOUTS["estimator_baro_bias"], topic="estimator_gnss_hgt_bias"
+)
 TRACK_SOURCES = msgspec.convert(_TOPIC_TABLES["tracks"], dict[str, TrackSource])
 FRAME_BY_FIELD_VALUE = msgspec.convert(
     _TOPIC_TABLES["frames"], dict[str, dict[int, str]], strict=False

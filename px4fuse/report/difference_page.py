@@ -35,7 +35,7 @@ def draw_pages(analysis: Analysis, _: object) -> Iterator[Page]:
         "Difference between KF and EKF2, setting by setting",
         "px4fuse replays KF and replaces its settings and equations by those of EKF2, one after "
         "another. Each bar is the reduction of the mean square difference KF - EKF2 by one "
-        "replacement; a negative bar is an increase.",
+        "replacement.",
     )
     spans_text = ", ".join(f"{start:.0f} to {end:.0f} s" for start, end in explanation.spans_s)
     page.write_heading(f"{name}, {spans_text}")

@@ -158,11 +158,9 @@ def write_loop(page: Page, loop: Loop) -> None:
         rows.append([path.name, correction_text, *ate_texts])
     page.add_table(head, rows)
     page.write_small_text(
-        "ATE: position RMSE after alignment, with its 95 % interval (block bootstrap) if the "
-        "flight is long enough."
+        "ATE: position RMSE after alignment, with its 95 % interval (block bootstrap)."
         if reference_names
-        else "The error of the path is unknown without ground truth or reference trajectory. Add a "
-        "reference trajectory with --reference FILE."
+        else "The error of the path is unknown. Add a reference trajectory with --reference FILE."
     )
 
 

@@ -12,7 +12,7 @@ TUNING_HEAD = (
     "SIGMA_Z (m)\nestimate (95 %)",
     "log-likelihood\ngain (nats per\nmeasurement)",
     "log-likelihood\ngain, 2nd half\nof the data",
-    "lag-1 auto-\ncorrelation:\nchosen, estimate",
+    "autocorrelation\n(lag 1) before\nand after tuning",
 )
 TUNING_NOTE = (
     "The gain on the 2nd half of the data is that of SIGMA_A and SIGMA_Z estimated on the 1st half."

@@ -268,7 +268,7 @@ def _read_attachment(reader: pypdf.PdfReader) -> bytes:
     if not file_specifications and not streams:
         raise ResultsError(
             f"No {RESULTS_NAME} is attached to this PDF. It is not a px4fuse report, or was "
-            "printed to PDF, which removes attachments. Hand in the original file."
+            "printed to PDF. Hand in the original file."
         )
     if len(file_specifications) != 1 or len(streams) != 1:
         raise ResultsError(

@@ -34,8 +34,7 @@ def flag_page_differences(verification: Verification) -> Iterator[str]:
     if verification.pages:
         yield (
             "The PDF differs from the report that px4fuse recomputed from the log. "
-            f"{capitalise_first(verification.pages[0].sentence)}. Read the "
-            "recomputed report."
+            f"{capitalise_first(verification.pages[0].sentence)}."
         )
 
 
