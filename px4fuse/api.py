@@ -80,7 +80,7 @@ def compare(
     heading_deg : float, optional
         Heading of the axis "aisle", clockwise from north; default: main direction of the track.
     start_s, end_s : float, optional
-        Analysed time span, in seconds after the first data; default: take-off and landing.
+        Analysed time span, in seconds after the first sample; default: take-off and landing.
     position_source : str, optional
         Name of the position source for KF; default: the source closest to the raw measurement.
     source_kind : {"uwb", "vio", "mocap", "gnss"}, optional

@@ -33,7 +33,7 @@ class Finding(Record, omit_defaults=False):
     caused_by : str or None
         Id of the finding that causes this finding.
     spans_s : tuple of (float, float)
-        Start and end of each occurrence (s from the first data); empty for the whole flight.
+        Start and end of each occurrence (s from the first sample); empty for the whole flight.
     """
 
     id: Annotated[str, Meta(pattern="^[a-z0-9_]+$")]

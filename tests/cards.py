@@ -56,7 +56,7 @@ SMALL_SIGMA_A = Card(
                 Action(
                     "KF", commands=("px4fuse compare aisle_uwb.ulg --sigma-a 0.363",), where="shell"
                 ),
-                Action("EKF2", "no change: the reported σ is consistent"),
+                Action("EKF2", "keep the settings: the reported σ is consistent"),
             ),
             reruns=(
                 CardRerun(

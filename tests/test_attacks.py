@@ -215,8 +215,8 @@ KF_ACTION = {
 
 # Change of the attached results, the status of the report, and the text of pending
 FILES: dict[str, tuple[Change, str, str]] = {
-    "--position uwb.csv": (forge_position_file, "cannot verify", "Add uwb.csv to --logs."),
-    "--position with a hash": (forge_joined_file, "cannot verify", "Add uwb.csv to --logs."),
+    "--position uwb.csv": (forge_position_file, "cannot verify", "Add uwb.csv to the --logs"),
+    "--position with a hash": (forge_joined_file, "cannot verify", "Add uwb.csv to the --logs"),
     "changed printed command": (
         set_value("px4fuse compare s01.ulg --position uwb.csv", "provenance", "command"),
         "numbers differ", "",
@@ -230,7 +230,7 @@ FILES: dict[str, tuple[Change, str, str]] = {
         "read it with px4fuse",
     ),
     "libraries removed": (set_value({}, "provenance", "libraries"), "cannot verify", ASK),
-    "an unknown log": (set_value("c" * 64, "log", "sha256"), "other log", "add s01.ulg to --logs."),
+    "an unknown log": (set_value("c" * 64, "log", "sha256"), "other log", "add s01.ulg to the"),
     "log of another student": (
         set_value("b" * 64, "log", "sha256"), "other log", "assigned to student s02",
     ),

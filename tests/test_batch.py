@@ -265,7 +265,7 @@ def test_batch_stopped_by_ctrl_c_keeps_finished_results(flights, undisturbed, tm
         os.killpg(process.pid, signal.SIGINT)  # as a terminal does: the workers too
         _, said = process.communicate()
     assert process.returncode == 130
-    assert said.startswith("px4fuse: interrupted; results of finished logs are in")
+    assert said.startswith("px4fuse: interrupted; ")
     assert said.count("\n") == 1
     again = run_checked("batch", flights, "-o", tmp_path).output
     assert "3 logs: 3 done" in again
@@ -532,5 +532,5 @@ def assert_killed_scheduler_prints_one_line(address, tmp_path):
     _, said = process.communicate(timeout=120)
     assert process.returncode == 2
     assert said.startswith("px4fuse: the connection to the Dask scheduler was lost")
-    assert said.endswith("Results of finished logs are kept. Run the same command to continue.\n")
+    assert said.endswith("The results so far are kept. Run the same command to continue.\n")
     assert said.count("\n") == 1

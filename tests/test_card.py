@@ -163,10 +163,10 @@ def test_diagnosis_without_ground_truth_is_reported_as_untested() -> None:
     untested = tuple(each for each in ratios if each.against == "source")
     (ranked,) = rank_causes(analysis(), [OFFSET])
     for evaluated, reason in (
-        (ratios, "no change: the reported σ is consistent"),
+        (ratios, "keep the settings: the reported σ is consistent"),
         (
             untested,
-            "no change: only ground truth shows this fault, and the log has no ground truth",
+            "keep the settings: only ground truth shows this fault, but the log has none",
         ),
     ):
         cause = make_cause(analysis(), ranked, evaluated, REQUEST)

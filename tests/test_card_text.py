@@ -89,7 +89,7 @@ def test_diagnosis_text_has_numbered_causes_and_count_of_notes() -> None:
     assert [line.split()[1] for line in lines if line.startswith("  cause")] == ["1", "2"]
     assert lines[-2:] == [
         "note[note_2]: Text 2.",
-        "2 more notes are listed in All findings of the report",
+        '2 more notes are listed in section "All findings" of the report',
     ]
 
 

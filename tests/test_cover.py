@@ -73,12 +73,12 @@ def test_report_cover_joins_alternative_actions_by_either_or() -> None:
     console = Action("EKF2", commands=("param set EKF2_EV_DELAY 264", "reboot"), where="console")
     cause = DiagnosedCause(
         id="source_time_offset", severity="error", title="Late", why="",
-        alternatives=((sender,), (console,)), actions=(Action("KF", "no change"),),
+        alternatives=((sender,), (console,)), actions=(Action("KF", "keep the settings"),),
     )  # fmt: skip
     text = text_of(replace(SMALL_SIGMA_A, causes=(cause,)))
     assert "EITHER sender subtract 0.264 s" in text
     assert "OR EKF2 console param set EKF2_EV_DELAY 264 reboot" in text
-    assert "KF no change" in text
+    assert "KF keep the settings" in text
     assert "console: MAVLink Console of QGroundControl" in text
 
 
@@ -87,8 +87,8 @@ def test_report_cover_shows_3_notes_and_counts_the_others() -> None:
     text = text_of(replace(SMALL_SIGMA_A, notes=notes, more_causes=4))
     assert "note[note_2]: Text 2." in text
     assert "note_3" not in text
-    assert "2 more notes are listed in All findings of the report" in text
-    assert "4 more causes are listed in All findings" in text
+    assert '2 more notes are listed in section "All findings" of the report' in text
+    assert '4 more causes are listed in section "All findings"' in text
 
 
 @pytest.mark.parametrize(
@@ -193,7 +193,7 @@ def test_cover_map_title_states_farthest_distance_outside_map() -> None:
     analysis = unexplained(compare(flight))
     titles = panels_by_title(drawn(analysis))
     (title,) = (title for title in titles if title.startswith("Map"))
-    assert title.startswith("Map; largest distance outside the map: EKF2 3")
+    assert title.startswith("Map; EKF2 up to 3")
 
 
 def test_innovations_beyond_plot_scale_are_drawn_as_triangles(eventful: Analysis) -> None:

@@ -191,8 +191,8 @@ def test_submission_named_like_a_platform_export_is_flagged() -> None:
     (ada, _), _ = make_grades({name: graded_report("", 4.0)})
     assert ada.submission_time == "2026-11-20 10:00"
     assert ada.flags == (
-        "The student chose a file name that looks like the file names of a learning platform "
-        "(platform of the export: Blackboard). Check who handed in the file.",
+        "The student chose a file name that looks like a name from a learning platform. "
+        "Check who handed in the file.",
     )
 
 
@@ -338,11 +338,11 @@ def test_instructor_overrides_csv_accepts_decimal_commas(tmp_path) -> None:
 @pytest.mark.parametrize(
     ("row", "says"),
     [
-        ("1,A,abc,", "row 2: the points 'abc' are not a number of 0 or more"),
-        ("1,A,-1,", "are not a number of 0 or more"),
-        ("1,A,nan,", "are not a number of 0 or more"),
-        ("1,A,1_5,", "are not a number of 0 or more"),
-        ("1,,5,", "the points 5 have no item: write a rubric title or 'total'"),
+        ("1,A,abc,", "row 2: the points must be a number of 0 or more, not 'abc'"),
+        ("1,A,-1,", "must be a number of 0 or more"),
+        ("1,A,nan,", "must be a number of 0 or more"),
+        ("1,A,1_5,", "must be a number of 0 or more"),
+        ("1,,5,", "points without an item: write a rubric title or 'total'"),
         ("1,A,5,\n1,A,6,", "student 1 has two rows for the item A"),
     ],
 )

@@ -576,7 +576,7 @@ def test_read_gnss_recovers_unlogged_fixes_from_innovations(tmp_path):
     for name, values in every.items():
         every[name] = values[left]
     found = track_of(flight_of(log, tmp_path))
-    assert "3 GNSS fixes that were not logged are read from" in " ".join(found.notes)
+    assert "3 GNSS fixes missing in the GNSS topic are read from" in " ".join(found.notes)
     whole = whole.drop(index=whole.index[60])
     np.testing.assert_allclose(found.samples.index, whole.index, atol=1e-6)
     np.testing.assert_allclose(found.samples[Columns.POSITION], whole[Columns.POSITION], atol=0.05)

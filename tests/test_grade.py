@@ -99,7 +99,7 @@ def test_grade_report_that_exceeds_time_limit_is_not_verified(tmp_path, monkeypa
     ).reports
     assert only.status == "cannot verify"
     assert only.instructor_action.startswith("Ask the author of the report for the PDF")
-    assert any("the pages could not be compared" in flag for flag in only.flags)
+    assert any("the PDF pages could not be compared" in flag for flag in only.flags)
 
 
 @pytest.mark.usefixtures("jobs_in_process", "cached_pages")
@@ -132,7 +132,7 @@ def test_grade_verifies_original_report_and_rejects_forgeries(tmp_path) -> None:
     assert (third.verification.status, third.verification.outcome) == ("verified", "page differs")
     assert third.status == "page differs"
     assert third.points == first.points
-    assert any(f"Page {REPORT_PAGES}: the page of the new report" in flag for flag in third.flags)
+    assert any(f"Page {REPORT_PAGES}: the PDF has" in flag for flag in third.flags)
     assert first.flags == ()
     # a second run reuses all results
     again = grade([folder], Course(read_rubric(None), logs=[LOG.parent]), output, processes=2)
@@ -219,7 +219,7 @@ def test_interrupted_grade_command_prints_how_to_continue(tmp_path, monkeypatch)
     result = run("grade", "a.pdf", "-o", "out")
     assert isinstance(result.exception, Interrupted)
     assert result.exception.exit_code == 130
-    assert "results of verified reports are in out" in str(result.exception)
+    assert "out contains the results so far" in str(result.exception)
     assert "Run the same command to continue." in str(result.exception)
 
 

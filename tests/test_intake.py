@@ -124,7 +124,7 @@ def test_read_resaved_report_pdf_returns_same_results():
     (REAL[:300_000] + b"\n%%EOF\n", DAMAGED),
     (b"%PDF-1.4\nstartxref\n5\n%%EOF", DAMAGED),
     (b"%PDF-1.4\n" + bytes(pdf_input.MAX_PDF_BYTES), "larger than 25 MB"),
-    (small_report(None), "printed to PDF, which removes attachments. Hand in the original"),
+    (small_report(None), "printed to PDF. Hand in the original"),
     (
         small_report(name="../../results.json"),
         "name of the attached file is '../../results.json', not 'results.json'",
@@ -268,14 +268,14 @@ def stream_bomb(kind: bytes) -> bytes:
 
 
 @pytest.mark.parametrize(("pdf", "said"), [
-    (with_attachment(bomb(1_000_000_000)), "expands to more"),
+    (with_attachment(bomb(1_000_000_000)), "contains more data"),
     (with_attachment(bomb(8_000_000)), "larger than 5 MB"),
     (with_attachment(stream(bytes(6_000_000), b"/Type /EmbeddedFile")), "larger than 5 MB"),
-    (content_bomb(1_000_000_000), "expands to more"),
+    (content_bomb(1_000_000_000), "contains more data"),
     (content_bomb(30_000_000), "printed to PDF. Hand in the original"),
-    (raw_pdf(CATALOG, *[bomb(15_000_000, b"")] * 8), "expands to more"),
-    (stream_bomb(b"XRef"), "expands to more"),
-    (stream_bomb(b"ObjStm"), "expands to more"),
+    (raw_pdf(CATALOG, *[bomb(15_000_000, b"")] * 8), "contains more data"),
+    (stream_bomb(b"XRef"), "contains more data"),
+    (stream_bomb(b"ObjStm"), "contains more data"),
 ], ids=range(8))  # fmt: skip
 def test_read_report_pdf_compression_bomb_takes_little_memory(pdf, said):
     tracemalloc.start()

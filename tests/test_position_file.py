@@ -339,7 +339,7 @@ def test_read_position_file_sets_non_positive_sigma_to_nan(read):
     file = read(table({**PLAIN, "sigma": sigma}))
     assert_track(file)
     assert np.flatnonzero(file.samples["sigma_x_m"].isna()).tolist() == [3, 4]
-    assert_stated(file, "sigma that is ignored, because it is not positive: 2")
+    assert_stated(file, "rows with an ignored sigma (not positive): 2")
 
 
 # -- rows ------------------------------------------------------------------------------------------
@@ -388,14 +388,14 @@ def test_read_position_file_drops_backward_timestamps(read, shifts_us, dropped):
     assert_track(file, rows=np.setdiff1d(np.arange(ROWS), dropped))
     assert_stated(
         file,
-        f"dropped rows with timestamps that repeat, decrease or are after 2100: {len(dropped)}",
+        f"dropped rows (timestamp repeated, decreasing or after the year 2100): {len(dropped)}",
     )
 
 
 @pytest.mark.parametrize("name", ["tag_id", "tagid", "node"])
 def test_read_position_file_with_two_tags_requires_body(read, name):
     text = table({name: ["A1", "B2"] * (ROWS // 2), **PLAIN})
-    assert "is selected: A1, B2. Choose one" in error_message(read, text)
+    assert "is selected: A1, B2. Choose a" in error_message(read, text)
     assert_track(read(text, body="B2"), rows=slice(1, None, 2))
     assert "is selected: A1, B2" in error_message(read, text, body="C3")
     assert "only one body, which has no name" in error_message(read, table(PLAIN), body="C3")

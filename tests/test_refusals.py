@@ -231,7 +231,7 @@ REFUSED = {
         "g.g2o is a pose graph, not a trajectory",
     ),
     "graph with a bad edge": ("loop bad.g2o", "bad.g2o, line 2"),
-    "part of a graph": ("loop g.g2o:vio", "a pose graph has no track 'vio'"),
+    "part of a graph": ("loop g.g2o:vio", "which has no track 'vio'"),
     "report of a graph": ("loop g.g2o -o r.pdf", "not available for a pose graph"),
     "evaluate junk": ("evaluate s.tum junk.bin", "junk.bin: the file is neither a PX4 ULog"),
     "evaluate apart": ("evaluate s.tum l.ulg --time-offset 0", "0 poses match in time"),

@@ -122,7 +122,7 @@ CHECKED = [
     ("consistent", NORTH, {}, 0.0, "without --axis"),
     ("consistent", changed_results(**UNDERSTATED), {}, 0.0, "2.1 times too small"),
     ("consistent", changed_results(**UNDERSTATED, settings__sigma_a_m_s2=0.36), {}, 1.0,
-     "would not make KF consistent"),
+     "makes KF consistent"),
     ("clock", EXAMPLE, {}, 1.0, "estimated time offset is -0.022 to 0.060 s"),
     ("clock", changed_results(clock__applied_s=0.25), {}, 0.0, "0.250 s"),
     ("clock", UNCLEAR, {}, 0.5, "no acceleration)."),
@@ -319,7 +319,7 @@ class TestFeedback:
              ("could not be verified: one; page 3: two. Make a new report",), "Points"),
             ({"student": "=cmd|' /C calc'!A0\n<script>", "student_id": "\x1b[31m"},
              ("=cmd|' /C calc'!A0 <script>",), "\x1b"),
-            ({"items": assess_results().items, "instructor_action": "Add uwb.csv to --logs."},
+            ({"items": assess_results().items, "instructor_action": "Add uwb.csv to the --logs"},
              ("pending, not counted yet",), "--logs"),
         ],
     )  # fmt: skip

@@ -21,7 +21,7 @@ QUOTATIONS = {
 }
 # Lines that quote a phrase, by a part of the line
 EXCEPTIONS = {
-    "time timestamp stamp": "column names of position files",
+    "time,timestamp,stamp": "column names of position files",
     'stamp = "usec"': "field of a table of MAVLink messages",
     "``stamp`` the": "the same field in its docstring",
     "WANDER BIAS IMU": "names of random streams, which determine simulated flights",

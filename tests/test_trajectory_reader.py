@@ -149,7 +149,7 @@ def test_read_trajectory_reports_gaps_and_repeated_timestamps(tmp_path: Path) ->
     lines.insert(500, lines[500])
     again = read_trajectory(write(tmp_path, "\n".join(lines)))
     assert len(again) == 1000
-    assert any("that repeat, decrease or are after 2100: 1." in note for note in again.notes)
+    assert any("or after the year 2100): 1." in note for note in again.notes)
 
 
 def test_read_trajectory_drops_incomplete_last_line(tmp_path: Path) -> None:

@@ -383,7 +383,7 @@ def test_verify_detects_changed_plot_with_other_library_versions(
 ) -> None:
     verdict = foreign.verified(forged(foreign.pdf, on_page(1, PLOTS[name])))
     assert verdict.outcome == "cannot verify", verdict
-    assert "page 1: drawing operation" in verdict.reasons[0]
+    assert "page 1: PDF drawing operation" in verdict.reasons[0]
     assert any("made with matplotlib 3.99.0; this" in reason for reason in verdict.reasons)
     assert verdict.remedy.startswith("Verify the report with matplotlib 3.99.0.")
     assert verdict.redrawn_pdf == foreign.again[1]()
@@ -464,7 +464,7 @@ def test_verify_report_with_changed_page_returns_page_differs(
 DOCUMENT: dict[str, tuple[Forge, str, str]] = {
     "a page away": (
         lambda w: w.remove_page(REPORT_PAGES - 1), "page differs",
-        f"page {REPORT_PAGES}: the page of the new report is missing",
+        f"page {REPORT_PAGES}: the PDF has {REPORT_PAGES - 1} pages; the recomputed report has",
     ),
     "another title": (document_info(Title="my report"), "page differs", "document: the PDF entry"),
     "a form": (

@@ -203,5 +203,5 @@ def test_what_if_table_omits_numbers_if_not_predictable(sample_flight: Flight) -
         "'not predictable' has three possible reasons: EKF2 rejects more than 35% of the samples"
         in said
     )
-    assert "2 mm of added position noise changes the statistics much" in said
+    assert "2 mm of added position noise changes the statistics strongly" in said
     assert "closest to 1" not in said

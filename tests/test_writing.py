@@ -305,7 +305,7 @@ def test_compare_warns_if_no_font_can_print_student_name(
     fonts.find_font.cache_clear()
     (before,) = warnings
     assert (f"No installed font has the characters {name}" in before) == said
-    assert ("Install a font with them" in before) == said
+    assert ("Install a font with these" in before) == said
 
 
 @pytest.mark.usefixtures("no_drawing")

@@ -157,7 +157,7 @@ def align_position_file(
         frame_reason = "the column names of the position file contain the axis directions"
     yaw_reason = "the yaw was given with --position-yaw"
     if yaw_deg is None:
-        yaw_reason = "without --position-yaw, px4fuse assumes a yaw of 0° to EKF2's frame"
+        yaw_reason = "without --position-yaw, px4fuse does not rotate the positions"
     alignment, aligned_samples = _apply_alignment(
         flight, recording, problem, match, frame_reason, yaw_reason, clock_offset_s
     )
@@ -252,8 +252,8 @@ def _apply_alignment(
             time_offset_sigma_s = match.time_offset_fit.lag_sigma_s
             clock_offset_s = lag_s + (flight.log.boot_time_s - float(samples.index[0]))
             time_offset_reason = (
-                f"the position file was matched with the {reference_name}; a delay of the "
-                f"{reference_name} is part of the offset"
+                f"the position file was matched in time with the {reference_name}; the time offset "
+                f"includes any delay of the {reference_name}"
             )
         reference_correlation = float(
             (np.exp(-1j * yaw_rad) * match.time_offset_fit.coherence).real
@@ -365,9 +365,9 @@ def _find_warnings(match: Match, is_yaw_estimated: bool) -> Iterator[str]:
         )
     if fit.second_to_best_residual_ratio < MIN_RESIDUAL_RATIO_WITHOUT_WARNING[reference_name]:
         yield (
-            f"A time offset that differs by {fit.second_peak_lag_difference_s:+.1f} s fits nearly "
-            f"as well: the residual is {fit.second_to_best_residual_ratio:.1f} times larger. Check "
-            "the time offset, or set the time offset with --clock-offset."
+            f"A second time offset, {fit.second_peak_lag_difference_s:+.1f} s from the estimate, "
+            f"fits nearly as well (residual {fit.second_to_best_residual_ratio:.1f} times larger). "
+            "Check the time offset, or set the time offset with --clock-offset."
         )
     if is_yaw_estimated and reference_name == IMU_REFERENCE:
         yield (

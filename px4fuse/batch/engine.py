@@ -67,8 +67,7 @@ def _check_versions(client: Client) -> None:
     for name, version in client.run(metadata.version, "px4fuse", on_error="return").items():
         if version != own_version:
             raise SettingsError(
-                f"px4fuse of Dask worker {name} is {version}, that of this computer is "
-                f"{own_version}.",
+                f"Dask worker {name} has px4fuse {version}, but this computer has {own_version}.",
                 "Install the same version of px4fuse on the worker and on this computer.",
             )
 

@@ -38,7 +38,7 @@ from px4fuse.request import ComparisonRequest, command_line
 
 # Table columns with the paths of the outputs of a log, relative to the output folder
 OUTPUT_FILE_COLUMNS = ("results", "report")
-RESUME_NOTE = "Results of finished logs are kept. Run the same command to continue."
+RESUME_NOTE = "The results so far are kept. Run the same command to continue."
 
 BatchProgress = Callable[[str, int, int], None]
 
@@ -177,9 +177,7 @@ def run(
     try:
         request = ComparisonRequest(log="LOG", **settings)
     except TypeError as error:
-        raise SettingsError(
-            f"px4fuse.compare does not accept a setting ({error})", "Omit or correct the setting."
-        ) from error
+        raise SettingsError(f"px4fuse.compare does not accept a setting ({error})") from error
     if request.position is not None:
         raise SettingsError("A position file belongs to one flight. Omit `position` for many logs.")
     requested_settings(request)  # raises SettingsError if a setting is out of range

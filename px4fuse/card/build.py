@@ -88,8 +88,8 @@ OUTLIER_EXPLANATION = (
     "affect EKF2's position."
 )
 UNEXPLAINED_DIFFERENCE_TEXT = (
-    "For KF or EKF2, innovations and errors against ground truth result in different ratios of "
-    "actual to reported σ. No re-run explains the difference."
+    "For KF or EKF2, the σ ratio from innovations differs from the σ ratio from errors against "
+    "ground truth. No re-run explains the difference."
 )
 # Reasons why faults of the source increase errors, but hardly change innovations
 SOURCE_FAULT_EXPLANATIONS = (
@@ -417,7 +417,7 @@ def _mark_explained_verdicts(
         name
         for cause in causes
         for action in cause.actions
-        if action.sentence.startswith("no change")
+        if action.sentence.startswith("keep the settings")
         for name in action.target.split(", ")
     }
     word_against_truth = {
@@ -518,8 +518,8 @@ def _explain_differing_verdicts(
         )
     if "source_noise_time_correlated" in finding_ids:
         return (
-            "KF and EKF2 follow position errors that change slowly. Innovations do not show slow "
-            "errors; only ground truth does."
+            "KF and EKF2 follow position errors that change slowly. Only ground truth shows slow "
+            "errors."
         )
     explanation = UNEXPLAINED_DIFFERENCE_TEXT
     if "ekf2_heading_error" in finding_ids:

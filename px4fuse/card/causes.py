@@ -294,8 +294,8 @@ def _explain_missing_action(
             FINDING_CATALOGUE[finding.id].rerun_kinds & CHANGE_KINDS_VISIBLE_ONLY_IN_TRUTH
         )
         if needs_ground_truth and "truth" not in verdict_by_reference:
-            return "no change: only ground truth shows this fault, and the log has no ground truth"
-        return "no change: the reported σ is consistent"
+            return "keep the settings: only ground truth shows this fault, but the log has none"
+        return "keep the settings: the reported σ is consistent"
     if finding.id == "source_outliers":
         if filter_name == "kf":
             return (
@@ -303,7 +303,9 @@ def _explain_missing_action(
                 "mean NIS"
             )
         if verdict_by_reference.get("truth", "consistent") == "consistent":
-            return "no change: EKF2's gate rejects these outliers, and EKF2's σ is consistent"
+            return (
+                "keep the settings: EKF2's gate rejects these outliers, and EKF2's σ is consistent"
+            )
     fault_text = "drift of the position source" if finding.id == "source_drift" else "this fault"
     return f"no filter setting corrects {fault_text}"
 
@@ -326,7 +328,7 @@ def make_rerun_action(
 ) -> Action:
     """Return the command that runs KF with changed settings.
 
-    The default noises are offered too, if KF also improves with ``default_settings``.
+    The default noise settings are offered too, if KF also improves with ``default_settings``.
     """
     command = command_line(structs.replace(request, **change))
     default_options_text = " and ".join(
@@ -334,7 +336,7 @@ def make_rerun_action(
         for name, value in default_settings.items()
     )
     sentence = (
-        f"run again without {default_options_text}, or with the estimated noises"
+        f"run again without {default_options_text}, or with the estimated noise settings"
         if default_options_text
         else ""
     )
@@ -401,7 +403,7 @@ def _format_closing_sentence(
             "--clock-offset corrects only this analysis."
         )
     if any(rerun.kinds == ("defaults",) for rerun in useful_reruns):
-        return "KF is consistent with the default noises as well as with the estimated noises."
+        return "KF is consistent both with default and with estimated noise settings."
     tuning = analysis.tuning.get(HORIZONTAL)
     for rerun in useful_reruns:
         if rerun.kinds == ("noise",) and isinstance(tuning, AxisTuning):
@@ -409,7 +411,7 @@ def _format_closing_sentence(
             if (tuning.sigma_z.low or 0.0) <= default_noise_m <= (tuning.sigma_z.high or 0.0):
                 return (
                     f"PX4's default of {default_noise_m:g} m is inside the 95 % interval of the "
-                    "estimate, so the default is as good as the estimate."
+                    "estimate."
                 )
     sigma_ratios_against_truth = [
         math.sqrt(rerun.after.nees_mean) for rerun in useful_reruns if rerun.after.nees_mean

@@ -102,7 +102,7 @@ class Action(Record):
     target : str
         Device or filter to be changed.
     sentence : str
-        Imperative, or "no change: <reason>".
+        Imperative, or "keep the settings: <reason>".
     where : {"shell", "console", ""}
         Program for the commands: shell of the computer, or MAVLink console of the vehicle.
     """

@@ -50,7 +50,7 @@ def batch(
 
     LOGS are files, folders, globs and URLs (s3://, gs://, https://, sftp://). Writes
     fleet.html, fleet.csv, fleet.parquet and the results of each log to DIR. A second run processes
-    only new and failed logs. After Ctrl-C the results of finished logs are kept.
+    only new and failed logs. After Ctrl-C the results so far are kept.
     """
     if scheduler is not None and option_values["workers"] is not None:
         raise SettingsError("--workers applies to this computer. Omit --workers with --scheduler.")
@@ -66,7 +66,7 @@ def batch(
     except KeyboardInterrupt as interrupt:
         message = "no log was finished, and nothing was written."
         if (output / "rows").is_dir():
-            message = f"results of finished logs are in {output}. Run the same command to continue."
+            message = f"{output} contains the results so far. Run the same command to continue."
         raise outputs.Interrupted(interrupt, message) from None
     outputs.write_and_print_results(
         {}, format_summary(batch_result), written_files=batch_result.written_paths

@@ -56,7 +56,7 @@ _evaluation_option = partial(options.request_option, EvaluationRequest)
 @_evaluation_option(
     "association",
     "Reference pose for each estimated pose: interpolated to the time of the estimate, or the "
-    "nearest in time (as in evo).",
+    "nearest in time.",
 )
 @_evaluation_option(
     "max_gap_s",

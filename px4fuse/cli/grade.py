@@ -41,7 +41,7 @@ from px4fuse.errors import OutputError, SettingsError
 @input_option(
     "--key", "FILE.json", "Answer key of the class, written by px4fuse simulate --assignment."
 )
-@output_option("DIR", "Output folder for the class table and the feedback.")
+@output_option("DIR", "Output folder for the students' points and feedback.")
 @click.option("--title", help="Title of the class page.  [default: the rubric's title]")
 @input_option(
     "--roster", "FILE.csv", "Class list with all students.  [default: the students in --key]"
@@ -71,7 +71,7 @@ from px4fuse.errors import OutputError, SettingsError
     type=click.FloatRange(0.0, 10_080.0),
     metavar="MINUTES",
     default=0.0,
-    help="Delay after --due for which no points are deducted.",
+    help="Grace period after --due without deduction of points.",
 )
 @click.option(
     "--scale",
@@ -84,10 +84,10 @@ from px4fuse.errors import OutputError, SettingsError
     "--questions",
     1,
     10,
-    help="Write questions.txt: N questions for an oral check of each student, on the student's "
-    "own form and flight, with the expected answers. Requires --key.",
+    help="Write questions.txt: N questions with the expected answers, for an oral examination of "
+    "each student. Requires --key.",
 )
-@flag_option("--include-pending", help="Count points that the instructor has not confirmed yet.")
+@flag_option("--include-pending", help="Include points that the instructor has not confirmed yet.")
 @input_option(
     "--worksheet",
     "FILE.csv",
@@ -96,7 +96,7 @@ from px4fuse.errors import OutputError, SettingsError
     multiple=True,
 )
 @click.option(
-    "--column", metavar="TITLE", help="Title of the column of --worksheet for the grades."
+    "--column", metavar="TITLE", help="Title of the grade column in the --worksheet file."
 )
 @flag_option(
     "--anonymous",
@@ -180,10 +180,8 @@ def grade(
                 progress=partial(show_progress, "grading"),
             )
     except KeyboardInterrupt as interrupt:
-        interruption_note = (
-            f"results of verified reports are in {output}. Run the same command to continue."
-        )
-        raise Interrupted(interrupt, interruption_note) from None
+        note = f"{output} contains the results so far. Run the same command to continue."
+        raise Interrupted(interrupt, note) from None
     write_and_print_results({}, grading_page(outcome), written_files=outcome.written_paths)
 
 

@@ -50,7 +50,7 @@ def parse_landing(text: str) -> Landing:
 def parse_closure(text: str) -> GivenClosure:
     """Parse a loop closure: ``T1,T2`` (s) or ``T1,T2,SIGMA`` (m)."""
     return GivenClosure(
-        *_parse_numbers(text, "T1,T2 (two times in s) or T1,T2,SIGMA (σ in m)", sys.float_info.max)
+        *_parse_numbers(text, "T1,T2 (times in s) or T1,T2,SIGMA (σ in m)", sys.float_info.max)
     )
 
 
@@ -79,8 +79,8 @@ _loop_option = partial(options.request_option, LoopRequest)
     type=parse_closure,
     metavar="T1,T2[,SIGMA]",
     multiple=True,
-    help="Loop closure: the vehicle was at the same place at the times T1 and T2 (s). SIGMA (m): "
-    "σ of the distance of both places. Repeatable.  [default SIGMA: 0.1 m]",
+    help="Loop closure: same place at times T1 and T2 (s). SIGMA (m): "
+    "σ of the distance between both positions. Repeatable.  [default SIGMA: 0.1 m]",
 )
 @options.flag_option(
     "--robust",
@@ -89,13 +89,13 @@ _loop_option = partial(options.request_option, LoopRequest)
 )
 @_loop_option(
     "start_s",
-    "Start of the loop: time after the first data (s), or a timestamp of the trajectory.  "
+    "Start of the loop: time after the first sample (s), or a timestamp of the trajectory.  "
     "[default: take-off]",
     20.0,
 )
 @_loop_option(
     "end_s",
-    "End of the loop: time after the first data (s), or a timestamp of the trajectory.  "
+    "End of the loop: time after the first sample (s), or a timestamp of the trajectory.  "
     "[default: landing]",
     60.0,
 )
@@ -103,18 +103,16 @@ _loop_option = partial(options.request_option, LoopRequest)
     "--reference",
     type=options.InputPath(str),
     metavar="FILE|LOG:TRACK",
-    help="Reference trajectory (for example from SLAM) for the ATE and RPE of each path, in "
+    help="Reference trajectory for the ATE and RPE of each path, in "
     "addition to the ground truth of the log.",
 )
 @_loop_option(
     "position_drift_m",
-    "Position drift (m, 1 σ) of the odometry after 100 m. More drift reduces the weight of the "
-    "odometry.",
+    "Position drift (m, 1 σ) of the odometry after 100 m.",
 )
 @_loop_option(
     "heading_drift_deg",
-    "Heading drift (°, 1 σ) of the odometry after 100 m. More drift reduces the weight of the "
-    "odometry.",
+    "Heading drift (°, 1 σ) of the odometry after 100 m.",
 )
 @_loop_option(
     "key_frames_m",
@@ -230,7 +228,8 @@ def _solve_graph(
     path, track = split_path_and_part(str(source))
     if track is not None:
         raise SettingsError(
-            f"{display_name(source)}: a pose graph has no track {track!r}", f"Omit :{track}."
+            f"{display_name(source)}: the file is a pose graph, which has no track {track!r}",
+            f"Omit :{track}.",
         )
     for parameter in options.list_given_parameters():
         if parameter.name not in POSE_GRAPH_ARGUMENT_NAMES:

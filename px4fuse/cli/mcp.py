@@ -53,7 +53,7 @@ PARAMETERS_WITHOUT_TOOL_ARGUMENT = {
     "report_folder",
     type=click.Path(file_okay=False, path_type=Path),
     metavar="DIR",
-    help="Folder for the reports (PDF) of the tools.  [default: no file is written]",
+    help="Folder for the PDF reports of the MCP tools.  [default: no file is written]",
 )
 @options.timeout_option
 @options.memory_option

@@ -334,11 +334,13 @@ filter_options = _combine_options(
     ),
     _comparison_option(
         "start_s",
-        "Start of the analysed time span (s after the first data).  [default: take-off]",
+        "Start of the analysed time span (s after the first sample).  [default: take-off]",
         20.0,
     ),
     _comparison_option(
-        "end_s", "End of the analysed time span (s after the first data).  [default: landing]", 60.0
+        "end_s",
+        "End of the analysed time span (s after the first sample).  [default: landing]",
+        60.0,
     ),
     _comparison_option(
         "position_source",
@@ -348,8 +350,8 @@ filter_options = _combine_options(
     ),
     _comparison_option(
         "source_kind",
-        "Kind of the position source; vio drifts, the other kinds do not.  [default: from the "
-        "messages; vio if their orientation changes]",
+        "Kind of the position source; vio may drift.  [default: vio if "
+        "the orientation in the messages changes, otherwise by message type]",
     ),
     _comparison_option(
         "height",
@@ -427,7 +429,7 @@ def read_student(option_values: dict[str, Any], log: Path) -> Student:
     if answers and answers.log_sha256 != hashlib.sha256(read_log_bytes(log)).hexdigest():
         raise SettingsError(
             f"--answers {answers_path} was made for another log than {log.name}.",
-            f"Give the form of {log.name}, or make one with px4fuse answers {log.name}.",
+            f"Give the answer form of {log.name}, or run px4fuse answers {log.name}.",
         )
     name, student_id = (replace_unencodable(text or "") for text in (name, student_id))
     if not (texts := name + student_id + notes).isascii():

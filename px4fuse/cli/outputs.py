@@ -120,7 +120,7 @@ def choose_default_report_path(report_stem: str, results: Results) -> Path:
         short_stem = os.fsencode(report_stem)[:SHORTENED_NAME_BYTES].decode(errors="ignore")
         report_stem = f"{short_stem}_{hashlib.sha256(os.fsencode(report_stem)).hexdigest()[:8]}"
     path = Path("reports", f"{report_stem}.pdf")
-    kind = "a report on the same input files and student"
+    kind = "a report by the same student on the same input files"
     for target, read in (path, read_attached_results), (path.with_suffix(".json"), read_results):
         _require_replaceable_file(target, kind, partial(_is_same_report, results, read))
     return path
@@ -137,7 +137,7 @@ def check_default_page(path: Path, page: str) -> None:
     generator_tags = GENERATOR_PATTERN.findall(page)
     _require_replaceable_file(
         path,
-        "a web page of the same command and log",
+        "a web page that the same command made from the same log",
         lambda content: GENERATOR_PATTERN.findall(content.decode()) == generator_tags,
     )
 

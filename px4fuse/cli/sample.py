@@ -58,7 +58,7 @@ def sample(output: Path) -> None:
     for path, content in contents.items():
         if path.is_file() and path.read_bytes() != content:
             raise OutputError(
-                f"{path} already exists with different contents. Nothing was written. Move that "
+                f"{path} already exists with different contents. Move that "
                 "file, or choose another folder (-o)."
             )
     first_log_path = next(path for path in contents if path.suffix == ".ulg")

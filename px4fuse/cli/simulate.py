@@ -92,8 +92,8 @@ class CommandWithFaultTable(click.Command):
 @input_option(
     "--assignment",
     "ROSTER.csv",
-    "Class list (student id, name): writes one flight per student, with individual noises and "
-    "injected faults, and the answer key next to DIR.",
+    "Class list (student id, name). Writes the answer key next to DIR, and one flight per student "
+    "with individual noise levels and injected faults.",
 )
 @input_option(
     "--secret-file",
@@ -221,7 +221,7 @@ def _check_options(assignment: Path | None) -> None:
         if assignment is not None and parameter.name not in ASSIGNMENT_OPTIONS:
             raise SettingsError(
                 f"{parameter.opts[0]} is not available with --assignment, because "
-                "those flights are random",
+                "assignment flights are random",
                 f"Omit {parameter.opts[0]}.",
             )
         if assignment is None and parameter.name in ASSIGNMENT_ONLY_OPTIONS:

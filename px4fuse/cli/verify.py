@@ -24,7 +24,7 @@ ANALYSIS_TIMEOUT_S = 1800.0
 @click.argument("report", type=InputPath(), metavar="REPORT.pdf")
 @click.argument("logs", type=InputPath(), nargs=-1, metavar="[LOG ...]")
 @max_size_option
-@output_option("FILE.pdf", "PDF to write: the report, made again from the log.  [default: none]")
+@output_option("FILE.pdf", "Output PDF for the report recomputed from the log.  [default: none]")
 @json_option
 @open_option
 def verify(

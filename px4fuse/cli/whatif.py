@@ -39,7 +39,7 @@ from px4fuse.request import Sweep, WhatIfRequest
     "start_s",
     type=options.NumberWithUnit("s", 60.0),
     metavar="SECONDS",
-    help="Time (s after the first data) at which EKF2 stops fusing the aiding sources of "
+    help="Time (s after the first sample) at which EKF2 stops fusing the aiding sources of "
     "--without.  [default: 0]",
 )
 @options.system_option

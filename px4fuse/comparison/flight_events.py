@@ -19,7 +19,7 @@ MIN_GAP_IN_INTERVALS = 5.0
 
 @dataclass(frozen=True)
 class Events:
-    """Events of the whole flight; times are in seconds since the first data of the log.
+    """Events of the whole flight; times are in seconds since the first sample of the log.
 
     Attributes
     ----------

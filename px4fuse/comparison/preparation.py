@@ -337,7 +337,7 @@ def choose_segment(
 ) -> Segment:
     """Choose the time span to analyse: by default, the longest flight with positions.
 
-    ``start_s`` and ``end_s`` are limits in seconds from the first data.
+    ``start_s`` and ``end_s`` are limits in seconds from the first sample.
 
     Raises
     ------

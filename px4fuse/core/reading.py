@@ -87,7 +87,7 @@ def file_size(path: Path, error_type: type[Px4FuseError], name: str = "") -> int
     if stat.S_ISDIR(file_status.st_mode):
         raise error_type(f"{name} is a folder", "Give a file.")
     if not stat.S_ISREG(file_status.st_mode):
-        raise error_type(f"{name} is a device, pipe or socket.", "Save the data to a file first.")
+        raise error_type(f"{name} is a device, pipe or socket.", "Save the input to a file.")
     add_input(path)
     return file_status.st_size
 
@@ -155,7 +155,7 @@ def read_text(
     limit_bytes: int,
     *,
     name: str = "",
-    remedy_if_too_large: str = "Shorten the file.",
+    remedy_if_too_large: str = "Give a smaller file.",
 ) -> str:
     """Read a text file in UTF-8 or UTF-16.
 

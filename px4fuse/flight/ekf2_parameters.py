@@ -42,7 +42,7 @@ class Aid:
     # Innovation gate (√S) if the log contains no gate parameter
     default_gate: float = 5.0
     # Axes of the innovations, in the order of PX4
-    axes: tuple[str, ...] = ()
+    axes: tuple[str, ...] = ("north", "east")
     # Fields of the topic estimator_innovations, one for each axis
     fields: str = ""
     # Fields of the topic ekf2_innovations (PX4 v1.8 to v1.10)
@@ -105,14 +105,14 @@ class Parameter(NamedTuple):
 
 
 _PARAMETER_TABLES = read_toml(__file__, dict)
-# TOML keys for lists of names, separated by blanks
+# TOML keys for lists of names, separated by commas
 NAME_LIST_KEYS = ("axes", "lever_arm", "flags")
 # Aiding sources and other status flags of EKF2, by PX4 name
 AIDS, STATUS_FLAGS = (
     {
         name: msgspec.convert(
             {"name": name, **_PARAMETER_TABLES["groups"].get(name.partition("_")[0], {}), **row}
-            | {key: row[key].split() for key in NAME_LIST_KEYS if key in row},
+            | {key: row[key].split(",") for key in NAME_LIST_KEYS if key in row},
             Aid,
         )
         for name, row in rows.items()
@@ -151,7 +151,7 @@ EV_CTRL_YAW_MASK = 8
 # Parameter defaults up to PX4 v1.13 that differ from later releases (ekf2_params.c)
 DEFAULTS_BEFORE_V1_14: Mapping[str, float] = {EV_POS.delay: 175.0}
 # Logged parameters that px4fuse writes to its results
-PARAMETERS_IN_RESULTS: tuple[str, ...] = tuple(_PARAMETER_TABLES["reported"].split())
+PARAMETERS_IN_RESULTS: tuple[str, ...] = tuple(_PARAMETER_TABLES["reported"].split(","))
 
 
 def fill_with_defaults(

@@ -52,30 +52,31 @@ def expand_layouts(toml_tables: Mapping[str, Any]) -> dict[str, Layout]:
 def assign_fields_to_columns(fields: Mapping[str, Any]) -> dict[str, Any]:
     """Return the message field of each DataFrame column.
 
-    ``q[]`` stands for all elements of an array, ``covariance[0 6]`` for the elements 0 and 6.
+    An empty text stands for the column names, ``q[]`` for all elements of an array, and
+    ``covariance[0,6]`` for the elements 0 and 6.
 
     Examples
     --------
-    >>> assign_fields_to_columns({"POSITION": "x y z"})
+    >>> assign_fields_to_columns({"POSITION": "x,y,z"})
     {'north_m': 'x', 'east_m': 'y', 'down_m': 'z'}
-    >>> assign_fields_to_columns({"north_m east_m": "position[]"})
+    >>> assign_fields_to_columns({"north_m,east_m": "position[]"})
     {'north_m': 'position[0]', 'east_m': 'position[1]'}
-    >>> assign_fields_to_columns({"north_m2 east_m2": "covariance[0 6]", "w x": 1.0})
+    >>> assign_fields_to_columns({"north_m2,east_m2": "covariance[0,6]", "w,x": 1.0})
     {'north_m2': 'covariance[0]', 'east_m2': 'covariance[6]', 'w': 1.0, 'x': 1.0}
-    >>> assign_fields_to_columns({"a b": "hpos[0] vpos"})
+    >>> assign_fields_to_columns({"a,b": "hpos[0],vpos"})
     {'a': 'hpos[0]', 'b': 'vpos'}
     """
     columns: dict[str, Any] = {}
     for column_names, field_names in fields.items():
         column_list: list[str] = (
-            getattr(Columns, column_names) if column_names.isupper() else column_names.split()
+            getattr(Columns, column_names) if column_names.isupper() else column_names.split(",")
         )
         if isinstance(field_names, float):
             columns |= dict.fromkeys(column_list, field_names)
             continue
-        column_fields = field_names.split()
-        if array_match := re.fullmatch(r"([^\[]+)\[([\d ]*)\]", field_names):
-            element_indices = array_match[2].split() or range(len(column_list))
+        column_fields = (field_names or column_names).split(",")
+        if array_match := re.fullmatch(r"([^\[]+)\[([\d,]*)\]", field_names):
+            element_indices = re.findall(r"\d+", array_match[2]) or range(len(column_list))
             column_fields = [f"{array_match[1]}[{element}]" for element in element_indices]
         columns |= zip(column_list, column_fields, strict=True)
     return columns

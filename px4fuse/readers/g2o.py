@@ -22,7 +22,7 @@ _FORMAT_REMEDY = (
     "Give poses as VERTEX_SE2 or VERTEX_SE3:QUAT, and edges as EDGE_SE2 or EDGE_SE3:QUAT. Remove "
     "all other lines."
 )
-_LINE_REMEDY = "Correct or remove this line."
+_LINE_REMEDY = "Correct or remove the invalid line."
 _VERTEX_ID_PATTERN = re.compile("[+-]?[0-9]{1,19}")
 # Maximum vertex id: GTSAM writes 64-bit symbols, such as 6989586621679009792 for a0
 _MAX_VERTEX_ID = 2**63 - 1
@@ -147,12 +147,12 @@ def parse_g2o(text: str, name: str) -> PoseGraph:
     edges.raise_where(
         ids[vertex_indices] != edge_vertex_ids,
         "the edge refers to a vertex that is not in the file",
-        "Add the VERTEX line of this vertex, or remove all VERTEX lines.",
+        "Add the VERTEX line of the missing vertex, or remove all VERTEX lines.",
     )
     edges.raise_where(
         edge_vertex_ids[:, 0] == edge_vertex_ids[:, 1],
         "the edge connects a vertex to itself",
-        "Remove this edge.",
+        "Remove the invalid edge.",
     )
     graph = PoseGraph(
         dimension=dimension,
@@ -211,7 +211,7 @@ def _group_lines_by_tag(text: str, name: str) -> dict[str, _TaggedLines]:
                     name,
                     line_number,
                     "the file fixes a second vertex (tag FIX), but only one can be fixed",
-                    "Remove this line. To keep the relative pose of both vertices, add an edge.",
+                    "Fix only one vertex. To keep the relative pose of two vertices, add an edge.",
                 )
         elif not tag.startswith(_SKIPPED_TAGS):
             fault = f"lines with the tag {quote(tag)} are not supported"
@@ -246,8 +246,9 @@ def _make_information_matrices(edges: _TaggedLines, numbers: Array, dimension: i
     is_too_small = (row == column) & (magnitudes > 0.0) & (magnitudes < _MIN_INFORMATION_ELEMENT)
     edges.raise_where(
         is_too_small | (magnitudes > _MAX_INFORMATION_ELEMENT),
-        "an element of the information matrix of this edge is too large or too close to 0",
-        f"Give 0, or ±{_MIN_INFORMATION_ELEMENT:g} to ±{_MAX_INFORMATION_ELEMENT:g}.",
+        "an element of the information matrix is too large or too close to 0",
+        f"Each matrix element must be 0, or have a magnitude of {_MIN_INFORMATION_ELEMENT:g} to "
+        f"{_MAX_INFORMATION_ELEMENT:g}.",
     )
     eigenvalues = np.linalg.eigvalsh(matrices)
     edges.raise_where(

@@ -130,7 +130,7 @@ def _read_imu(recording: Recording, remedy: str) -> TableOrUnavailable:
         return Unavailable(
             "IMU",
             f"{layout.topic} contains only {len(imu)} usable samples",
-            "Check that the IMU was running while the link was recorded.",
+            "Check that the autopilot sent IMU messages during the recording.",
         )
     recording.record_stream("imu", layout.topic)
     return imu
@@ -171,13 +171,12 @@ def _read_ekf2(
     recording.record_stream("ekf2_state", message_name)
     notes = [f"the EKF2 state is from the autopilot's {message_name} messages"]
     if autopilot != "PX4":
-        notes.append(f"the results call the estimator of {autopilot} EKF2")
+        notes.append(f"in the results, EKF2 means the estimator of {autopilot}")
     if "reset_counter" in samples and (
         reset_count := np.count_nonzero(samples["reset_counter"].diff()[1:])
     ):
         notes.append(
-            f"EKF2 reset its state {reset_count} times. The state still contains these steps, "
-            "because ODOMETRY does not contain their size"
+            f"EKF2 reset its state {reset_count} times. The state contains a jump at each reset"
         )
     variance = samples.reindex(columns=VARIANCE_COLUMNS)
     variance = variance[(variance > 0.0).all(axis=1)]

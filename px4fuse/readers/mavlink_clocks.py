@@ -202,7 +202,7 @@ def map_clock_to_boot(
     )
     note = (
         "the recording has no usable TIMESYNC or SYSTEM_TIME. All sample times are too late by the "
-        "minimum delay of the link, which is unknown"
+        "unknown minimum delay of the link"
     )
     return _make_clock_mapping(clock_name, time_source, sender_to_boot_fit, timestamps_s, note)
 

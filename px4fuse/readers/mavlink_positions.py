@@ -156,7 +156,8 @@ def _read_gnss(
         fix_count_text = "none" if fixes.empty else f"only {len(fixes)}"
         return unavailable_source(
             layout.topic,
-            f"the recording has {message_count} {layout.topic}, {fix_count_text} with a 3D fix",
+            f"the recording has {message_count} {layout.topic} messages, "
+            f"{fix_count_text} with a 3D fix",
             NO_FIX_ACTION,
         )
     is_auto_candidate = bool(

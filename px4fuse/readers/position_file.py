@@ -178,7 +178,7 @@ def read_position_file(
     kept_rows = _find_increasing_rows(times_s)
     if dropped_count := len(times_s) - len(kept_rows):
         notes.append(
-            "number of dropped rows with timestamps that repeat, decrease or are after 2100: "
+            "number of dropped rows (timestamp repeated, decreasing or after the year 2100): "
             f"{dropped_count}"
         )
     has_no_times = (
@@ -217,10 +217,7 @@ def read_position_file(
     is_ignored_sigma = samples[SIGMA_COLUMNS] <= 0.0
     samples[SIGMA_COLUMNS] = samples[SIGMA_COLUMNS].mask(is_ignored_sigma)
     if ignored_count := int(is_ignored_sigma.any(axis=1).sum()):
-        notes.append(
-            "number of rows with a sigma that is ignored, because it is not positive: "
-            f"{ignored_count}"
-        )
+        notes.append(f"number of rows with an ignored sigma (not positive): {ignored_count}")
     is_unix = (
         has_time_zone
         and MIN_VALID_UNIX_TIME_S <= float(np.median(numbers.index)) < MAX_VALID_UNIX_TIME_S
@@ -467,7 +464,7 @@ def _choose_time_unit(
     for unit, unit_s in SECONDS_BY_TIME_UNIT.items():
         is_unix = MIN_VALID_UNIX_TIME_S <= median_time * unit_s < MAX_VALID_UNIX_TIME_S
         if is_unix and median_step * unit_s <= MAX_UNIX_TIME_INTERVAL_S:
-            return unit, "in this unit, the timestamps are UNIX times between 2000 and 2100"
+            return unit, "with this time unit, the timestamps are UNIX times between 2000 and 2100"
         if unit in units and interval_range_s[0] <= median_step * unit_s <= interval_range_s[1]:
             plausible_units.append(unit)
     if not plausible_units:
@@ -477,7 +474,7 @@ def _choose_time_unit(
         )
     unit, *other_units = plausible_units
     interval_s = median_step * SECONDS_BY_TIME_UNIT[unit]
-    reason = f"in this unit, the median interval is {interval_s:.3g} s"
+    reason = f"with this time unit, the median interval of the positions is {interval_s:.3g} s"
     if other_units:
         reason += f"; if the unit is {other_units[0]}, give --position-time-unit"
     return unit, reason

@@ -17,12 +17,12 @@ _UNIT_BY_WORD, _AXIS_BY_WORD = (
     {
         word: meaning
         for meaning, column_words in _WORD_TABLES[group].items()
-        for word in column_words.split()
+        for word in column_words.split(",")
     }
     for group in ("units", "axes")
 )
 _WORDS_BY_ROLE = {
-    role: {*column_words.split()} for role, column_words in _WORD_TABLES["roles"].items()
+    role: {*column_words.split(",")} for role, column_words in _WORD_TABLES["roles"].items()
 }
 _TIME_WORDS = {
     word for role in ("time", "measured", "recorded", "context") for word in _WORDS_BY_ROLE[role]

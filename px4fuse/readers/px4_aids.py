@@ -52,7 +52,7 @@ def read_aids(topics: Topics, enabled_aids: StepFunctions) -> dict[str, AidLog]:
 def read_enabled_aids(topics: Topics) -> dict[str, pd.Series[float]]:
     """Return a time series for each aiding source: 1 while its fusion is enabled, otherwise 0."""
     all_aids = (*AIDS.values(), *STATUS_FLAGS.values())
-    flag_names = {flag for aid in all_aids for group in aid.flags for flag in group.split(",")}
+    flag_names = {flag for aid in all_aids for group in aid.flags for flag in group.split("|")}
     layout = Layout(
         px4.STATUS_FLAGS,
         optional_columns={name: name for name in flag_names},
@@ -61,7 +61,7 @@ def read_enabled_aids(topics: Topics) -> dict[str, pd.Series[float]]:
     flags = topics.primary_samples(layout)
     enabled_aids = {}
     for aid in all_aids if len(flags) else ():
-        groups = (group.split(",") for group in aid.flags)
+        groups = (group.split("|") for group in aid.flags)
         group = next((group for group in groups if {*group} <= {*flags}), None)
         if group is not None:
             enabled_aids[aid.name] = flags[group].max(axis=1)
@@ -160,7 +160,7 @@ def _drop_repeats_and_zeros(samples: pd.DataFrame) -> pd.DataFrame:
 
 
 def _assign_fields_by_axis(name: str, aid: Aid, fields: str) -> dict[str, str]:
-    return assign_fields_to_columns({" ".join(f"{name}_{axis}" for axis in aid.axes): fields})
+    return assign_fields_to_columns({",".join(f"{name}_{axis}" for axis in aid.axes): fields})
 
 
 def _make_aid_log(

@@ -340,7 +340,10 @@ def _reconstruct_track(
         heights,
         ("vehicle_local_position", *ekf2.innovation_topics),
         is_odometry=is_odometry,
-        clock=f"autopilot boot clock: fusion time plus {EV_POS.delay}, up to one interval late",
+        clock=(
+            f"autopilot boot clock: fusion time plus {EV_POS.delay}, up to one position "
+            "interval late"
+        ),
     )
 
 
@@ -435,7 +438,7 @@ def _read_gnss_track(topics: Topics, ekf2: Ekf2 | Unavailable) -> PositionTrack 
         age_s.max() > MAX_ARRIVAL_TO_PUBLICATION_DELAY_US * 1e-6
     ):
         delay_s = 0.0
-        clock = "autopilot boot clock, measurement times from the GNSS driver"
+        clock = "autopilot boot clock: measurement times from the GNSS driver"
     else:
         delay_s = fill_with_defaults(parameters, GNSS_POS)[GNSS_POS.delay] * 1e-3
         fixes = fixes.set_axis(time_index(fixes["published_s"].to_numpy() - delay_s))
@@ -456,7 +459,7 @@ def _read_gnss_track(topics: Topics, ekf2: Ekf2 | Unavailable) -> PositionTrack 
         )
     if len(unlogged_fixes):
         notes.append(
-            f"{len(unlogged_fixes)} GNSS fixes that were not logged are read from "
+            f"{len(unlogged_fixes)} GNSS fixes missing in the GNSS topic are read from "
             f"estimator_aid_src_gnss_pos ({interpolated_count} with interpolated height)"
         )
     elif is_downsampled:

@@ -20,12 +20,11 @@ from px4fuse.readers.field_maps import Layout, expand_layouts
 class TrackSource:
     """Description of a position source: kind, coordinate frame, topics and logging advice."""
 
-    # Kind of the source, such as "uwb"
-    kind: str
     route: str
     description: str
     # Advice if the positions of this source are not logged
     remedy: str
+    kind: str = "uwb"
     # False if EKF2 never fuses these positions
     fused: bool = True
     # Coordinate frame of the positions; if "unknown", the topic may contain it
@@ -44,6 +43,9 @@ TOPIC_LAYOUTS = expand_layouts(_TOPIC_TABLES["layouts"])
 TOPIC_LAYOUTS["gps_in_integers"] = replace(
     TOPIC_LAYOUTS["gps_in_integers"],
     optional_columns=TOPIC_LAYOUTS["vehicle_gps_position"].optional_columns,
+)
+TOPIC_LAYOUTS["estimator_gnss_hgt_bias"] = replace(
+    TOPIC_LAYOUTS["estimator_baro_bias"], topic="estimator_gnss_hgt_bias"
 )
 TRACK_SOURCES = msgspec.convert(_TOPIC_TABLES["tracks"], dict[str, TrackSource])
 FRAME_BY_FIELD_VALUE = msgspec.convert(

@@ -113,7 +113,7 @@ def choose_body(file_name: str, body_names: Iterable[str], wanted_body: str | No
         return matches[0]
     raise LogError(
         f"none of the rigid bodies or tags in {file_name} is selected: {', '.join(names[:12])}",
-        "Choose one with --body NAME.",
+        "Choose a rigid body or tag with --body NAME.",
     )
 
 

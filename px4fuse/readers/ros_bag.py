@@ -91,7 +91,7 @@ def read_bag(path: Path, topic: str | None) -> tuple[PositionTable, str, int]:
         raise
     except Exception as error:  # rosbags raises many types for damaged bags
         raise LogError(
-            f"{name}: the ROS bag cannot be read ({error})", "Repair it with ros2 bag reindex."
+            f"{name}: the ROS bag cannot be read ({error})", "Repair the bag with ros2 bag reindex."
         ) from error
 
 

@@ -184,7 +184,7 @@ class _TolerantULogParser(ULog):  # type: ignore[misc]
 
         self.fields += count_fields(self.parse_string(data[3:]))
         if self.fields > MAX_FIELDS:
-            raise ULogException(f"the topics have more than {MAX_FIELDS:,} fields")
+            raise ULogException(f"the topics have more than {MAX_FIELDS:,} fields in total")
         return ULog._MessageAddLogged(data, header, formats)
 
 

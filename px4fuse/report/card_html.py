@@ -50,7 +50,7 @@ def make_diagnosis_card(analysis: Analysis) -> Card:
     """Return the diagnosis card: faults, causes and actions of an analysis."""
     if analysis.request is None:
         raise SettingsError(
-            "A diagnosis card needs the settings of the analysis. This analysis contains none.",
+            "The diagnosis card cannot be made: the analysis does not contain its settings.",
             "Create the analysis with px4fuse.compare.",
         )
     card = build_card(analysis, analysis.request)

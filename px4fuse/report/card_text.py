@@ -54,7 +54,7 @@ ASCII_REPLACEMENTS = str.maketrans("░●◆◀▶─÷−–²³×", ":ox<>-/-
 )
 # Each sentence begins on a new line
 SENTENCE_END_PATTERN = re.compile(r"(?<=\.) (?=[A-Z])")
-ALL_FINDINGS_PLACE = "in All findings of the report"
+ALL_FINDINGS_PLACE = 'in section "All findings" of the report'
 AIDS_CAPTION = (
     "RMS of innovation ÷ √S of each aiding source that EKF2 fused. A value below 1 means that √S "
     "is too large. For barometer, magnetometer and gravity, such a value is usual and not a fault."
@@ -317,7 +317,7 @@ def make_rerun_rows(reruns: Sequence[CardRerun]) -> list[list[str]]:
     """Return the table (first row: headings) of re-runs with changed settings."""
     rows = [
         {
-            "re-run (filter, change)": rerun.label,
+            "re-run: filter and change": rerun.label,
             "position RMSE": _format_before_after(rerun.position_rmse_m, format_metres, " m"),
             "● innovation ÷ √S": _format_before_after(rerun.source_ratio, format_ratio),
             "◆ error ÷ σ": _format_before_after(rerun.truth_ratio, format_ratio),
@@ -371,7 +371,7 @@ def _format_verdict_lines(card: Card) -> Iterator[Paragraph]:
     yield Paragraph(f"{legend:{AXIS_INDENT}}", plot=_format_tick_labels())
     if any(verdict.is_explained for verdict in card.verdicts):
         yield Paragraph(
-            "  A verdict in brackets has another reason than the settings of the filter; see below."
+            "  The cause of a verdict in brackets is not a setting of the filter; see below."
         )
     yield from map(_format_verdict_line, card.verdicts)
 

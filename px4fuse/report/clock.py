@@ -85,7 +85,7 @@ def make_time_offset_advice(
                 f"{format_metres(rerun.after.position_rmse_m or 0.0)} m."
             ),
             "Offset": f"The estimate is {offset_text}.",
-            "Action": "Do not correct the timestamps. Check the timestamps of the ground truth.",
+            "Action": "Check the timestamps of the ground truth, not of the positions.",
         }
     advice_by_label = {
         "Result": "The position source has no significant time offset.",
@@ -147,7 +147,7 @@ def _format_delay_advice(
         "ms), or correct the sender's clock."
     )
     if delay_max_change := find_delay_max_change(comparison, fitted_delay_ms):
-        text += f" For either correction, set {format_changes(delay_max_change)}."
+        text += f" With either of these two corrections, set {format_changes(delay_max_change)}."
     return text
 
 
@@ -159,16 +159,15 @@ def draw_pages(analysis: Analysis, results: ComparisonResults) -> Iterator[Page]
     page = Page(
         "Appendix: time offset of the position source",
         "Late or early timestamps hardly change the innovations, because the filter "
-        "follows the positions. px4fuse maximises the likelihood of the positions over the "
-        "time offset, together with sensor biases, attitude errors and noises. The attitude "
-        "is from the gyros, not from EKF2, because EKF2 fused the same positions.",
+        "follows the positions. px4fuse estimates the time offset by maximum likelihood, together "
+        "with sensor biases, attitude errors and noise levels.",
     )
     page.write_labelled_texts(make_time_offset_advice(analysis, time_offset))
     caption = (
-        f"Likelihood of {time_offset.count} measurements. The interval includes the IMU noise; the "
-        "curve does not, so the curve is narrower."
+        f"Likelihood of {time_offset.count} measurements. Unlike the curve, the interval "
+        "includes the IMU noise."
     )
-    title = "Log-likelihood of the positions: decrease below its maximum (nats)"
+    title = "Decrease of the log-likelihood below its maximum (nats)"
     _draw_likelihood(page.add_panel(title, CURVE_HEIGHT, caption=caption), time_offset)
     yield page
 

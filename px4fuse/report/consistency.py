@@ -95,7 +95,7 @@ def draw_pages(analysis: Analysis, _: object) -> Iterator[Page]:
         if isinstance(tuning, AxisTuning)
     ]
     if noise_rows:
-        page.write_heading("Maximum-likelihood noises of KF, with 95 % intervals")
+        page.write_heading("Maximum-likelihood SIGMA_A and SIGMA_Z, with 95 % intervals")
         page.add_table(NOISE_TABLE_HEAD, noise_rows, right_aligned_columns=(1, 2))
     _write_causes(page, analysis)
     yield page
@@ -117,8 +117,8 @@ def _write_causes(page: Page, analysis: Analysis) -> None:
     page.add_table(column_heads, rows, right_aligned_columns=(3, 4))
     page.write_small_text(
         "Each row is a re-run with one changed setting. 'explains' is the fraction of ln(mean NIS) "
-        "or ln(mean NEES) that the change removes. 'all': the filter becomes consistent. A change "
-        "that explains 50 % or more is a cause."
+        "or ln(mean NEES) that the change removes, or 'all' if the filter becomes consistent. A "
+        "change that explains 50 % or more is a cause."
     )
 
 

@@ -35,7 +35,7 @@ def draw_pages(analysis: Analysis, _: object) -> Iterator[Page]:
         "Difference between KF and EKF2, setting by setting",
         "px4fuse replays KF and replaces its settings and equations by those of EKF2, one after "
         "another. Each bar is the reduction of the mean square difference KF - EKF2 by one "
-        "replacement; a negative bar is an increase. The bars add up to 100 %.",
+        "replacement.",
     )
     spans_text = ", ".join(f"{start:.0f} to {end:.0f} s" for start, end in explanation.spans_s)
     page.write_heading(f"{name}, {spans_text}")
@@ -129,4 +129,4 @@ def _draw_contributions(
         axes.text(1.05 * percents.max(), row, text, va="center", size=8.0)
     axes.set_ylim(len(names) - 0.4, -0.6)
     axes.set_xlim(min(0.0, 1.1 * percents.min()), 1.5 * percents.max())
-    axes.set_xlabel("% of the mean square")
+    axes.set_xlabel("% of the mean square difference")

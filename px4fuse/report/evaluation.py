@@ -57,8 +57,8 @@ def _draw_maps(page: Page, evaluation: Evaluation) -> None:
     worst_index = int(np.argmax(evaluation.position_error_m))
     worst_time_s = evaluation.time_s[worst_index] - _compute_time_origin_s(evaluation)
     right_column.write_small_text(
-        f"Darker poses have a larger error; × marks the largest one, at {worst_time_s:.1f} s and "
-        f"{evaluation.distance_m[worst_index]:.1f} m."
+        f"Darker poses have a larger error; × marks the largest one, at {worst_time_s:.1f} s, "
+        f"after {evaluation.distance_m[worst_index]:.1f} m of travel."
     )
     legend_handles = axes.get_legend_handles_labels()[0]
     if is_aligned:
@@ -193,8 +193,8 @@ def describe_unaligned_rmse(evaluation: Evaluation) -> str:
     centre_m = estimate_m.mean(axis=0)
     shift_m = float(np.linalg.norm(alignment.apply(centre_m) - centre_m))
     return (
-        f"RMSE before alignment {format_metres(rmse_m)} m. The alignment corrects the frame, not "
-        f"errors: rotation {np.degrees(alignment.to_rotation().magnitude()):.1f}°, translation "
+        f"RMSE before alignment {format_metres(rmse_m)} m. Alignment: "
+        f"rotation {np.degrees(alignment.to_rotation().magnitude()):.1f}°, translation "
         f"{format_metres(shift_m)} m{scale_text}."
     )
 
@@ -210,11 +210,14 @@ def describe_rpe_growth(rpe: tuple[RelativeError, ...]) -> str:
     unit = max(rmse_by_unit, key=lambda unit: len(rmse_by_unit[unit]), default="")
     rmse_by_delta = rmse_by_unit.get(unit, {})
     if len(rmse_by_delta) < 2:
-        return f"{interval_note} Add a distance (--rpe): drift grows with distance, noise does not."
+        return (
+            f"{interval_note} Add a second distance with --rpe: drift grows with distance, noise "
+            "does not."
+        )
     smallest, largest = min(rmse_by_delta), max(rmse_by_delta)
     return (
-        f"{interval_note} From {smallest:g} to {largest:g} {unit}, the RMSE grows "
-        f"{rmse_by_delta[largest] / rmse_by_delta[smallest]:.2g} times. Expected factor: 1 for "
+        f"{interval_note} Between --rpe {smallest:g} and {largest:g} {unit}, the RMSE grows by a "
+        f"factor of {rmse_by_delta[largest] / rmse_by_delta[smallest]:.2g}. Expected factor: 1 for "
         f"independent noise, {np.sqrt(largest / smallest):.2g} for a random walk, "
         f"{largest / smallest:.3g} for a scale or heading error."
     )
@@ -229,7 +232,7 @@ def describe_method(evaluation: Evaluation) -> str:
     offset_text = f"; time offset {offset_s:+.3f} s" if offset_s else ""
     return (
         f"alignment {evaluation.alignment} ({evaluation.alignment_reason.rstrip('.')}); "
-        f"{association.poses} pose pairs, which cover {association.coverage_estimate:.0%} of the "
-        f"time of the estimate and {association.coverage_reference:.0%} of the time of the "
-        f"reference{offset_text}"
+        f"{association.poses} pose pairs cover {association.coverage_estimate:.0%} of the "
+        f"estimate's duration and {association.coverage_reference:.0%} of the reference's duration"
+        f"{offset_text}"
     )

@@ -55,8 +55,8 @@ def format_font_advice(characters: str) -> str:
     listed_characters = one_line(characters, MAX_LISTED_CHARACTERS)
     return (
         f"No installed font has the characters {listed_characters}; the report shows "
-        f"{MISSING_GLYPH_SYMBOL} instead. Install a font with them, for example Noto Sans of "
-        "their script (fonts.google.com/noto)."
+        f"{MISSING_GLYPH_SYMBOL} instead. Install a font with these characters, for "
+        "example from fonts.google.com/noto."
     )
 
 

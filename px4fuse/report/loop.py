@@ -32,10 +32,9 @@ from px4fuse.trajectory.model import AXES_OF_FRAME, format_vector
 from px4fuse.trajectory.scores import RmseInterval, Statistics
 
 LEAD_TEXT = (
-    "The closure error is the distance between the end of the odometry and the true end. It is "
-    "distributed along the path in proportion to the distance from the start (course UAT 366, "
-    "module 2, Example 2), or by pose graph optimisation. px4fuse first tests each closure, "
-    "because a false closure would deform the whole path."
+    "The closure error is the distance between the end of the odometry and the true end. "
+    "px4fuse distributes the error in proportion to the distance from the start (course UAT 366, "
+    "module 2, Example 2), or by pose graph optimisation."
 )
 MAX_LISTED_CLOSURES = 10
 ERROR_COLOUR = SEVERITY_COLOURS["error"]
@@ -159,11 +158,9 @@ def write_loop(page: Page, loop: Loop) -> None:
         rows.append([path.name, correction_text, *ate_texts])
     page.add_table(head, rows)
     page.write_small_text(
-        "ATE: position RMSE after alignment, with its 95 % interval (block bootstrap) if the "
-        "flight is long enough."
+        "ATE: position RMSE after alignment, with its 95 % interval (block bootstrap)."
         if reference_names
-        else "The error of the path is unknown without ground truth or reference trajectory. Add a "
-        "reference trajectory with --reference FILE."
+        else "The error of the path is unknown. Add a reference trajectory with --reference FILE."
     )
 
 
@@ -217,7 +214,7 @@ def _describe_closure_error(loop: Loop) -> str:
     length_m, heading_error_deg = loop.path_length_m, loop.heading_error_deg
     if error_m is None or error_components_m is None:
         if loop.is_assessed:
-            return f"error hidden in an assignment; path length {length_m:.1f} m"
+            return f"closure error not shown for an assignment; path length {length_m:.1f} m"
         return (
             f"no closure error: --open states that the path ({length_m:.1f} m) does not return to "
             "its start"
@@ -271,8 +268,8 @@ def make_pose_graph_page(solved_graph: Graph) -> Page:
             )
         elif chi2 > expected_high:
             cause_text = (
-                "χ² is too large. Possible causes: false closures, or too large information "
-                "matrices."
+                "χ² is too large. Possible causes: false closures, or information matrices "
+                "that are too large."
             )
         elif chi2 < expected_low:
             cause_text = (

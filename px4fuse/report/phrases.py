@@ -40,8 +40,8 @@ if TYPE_CHECKING:
 # Minimum p value (Ljung-Box test) of white innovations; small, because a flight has eight tests
 MIN_WHITENESS_P_VALUE = 0.001
 VERDICT_LEGEND = (
-    "The 95 % band allows only for random scatter. The verdict also tolerates 25 %: a filter is "
-    "consistent if √(mean NIS) is 0.8 to 1.25, or if the mean NIS is inside the band."
+    "A filter is consistent if √(mean NIS) is 0.8 to 1.25, or if the mean NIS is inside the 95 % "
+    "band."
 )
 SIGMA_ERROR_TEXTS = {"underconfident": "too large", "overconfident": "too small"}
 DIFFERENCE_FIELDS = ("position_rms_m", "velocity_rms_m_s")
@@ -166,7 +166,7 @@ def describe_alignment(alignment: Alignment) -> dict[str, str]:
         "frame": f"{alignment.frame} ({alignment.frame_reason})",
         "yaw": f"{yaw_text} ({alignment.yaw_reason})",
         "origin": "north {:.3f} m, east {:.3f} m, down {:.3f} m".format(*alignment.origin_m),
-        "clock": f"{clock_text} to the boot clock ({alignment.clock_reason})",
+        "clock": f"{clock_text} relative to the boot clock ({alignment.clock_reason})",
     }
     if alignment.correlation is not None:
         text_by_label["match"] = (
@@ -194,7 +194,8 @@ def make_tuning_advice(
     if origin.may_drift:
         advice_by_label["Drift"] = (
             "The position source may drift. The estimates describe the noise without the drift. Do "
-            "not set SIGMA_Z or EKF2_EVP_NOISE below the error shown by ground truth or a loop."
+            "not set SIGMA_Z or EKF2_EVP_NOISE below the error shown by ground truth or a loop "
+            "closure."
         )
     # Same restriction as the finding kf_underconfident of px4fuse compare
     elif origin.is_gnss and any(
@@ -214,12 +215,12 @@ def make_tuning_advice(
             if noise.value is not None
         )
         advice_by_label["Action"] = (
-            f"Re-run with the estimates of {axis_name}: px4fuse compare LOG{options_text}"
+            f"Re-run with the estimated noise ({axis_name}): px4fuse compare LOG{options_text}"
         )
     if sigma_z.value is None and sigma_z.low is not None:
         advice_by_label["SIGMA_Z"] = (
-            f"SIGMA_Z is at least {sigma_z.low:.2g} m. The source may not measure the position "
-            "along this axis."
+            f"The estimate of SIGMA_Z is at least {sigma_z.low:.2g} m. Possibly the source does "
+            "not measure the position along this axis."
         )
     elif sigma_z.value is None:
         bound_text = "" if sigma_z.high is None else f" (at most {sigma_z.high:.2g} m)"
@@ -269,7 +270,7 @@ def _make_vision_noise_advice(comparison: PreparedComparison, estimate: NoiseEst
     logged_noise_m = parameters.get(name, np.nan)
     if EV_POS.noise_mode_parameter in changes and reported_sigma_m > high_m:
         return (
-            f"Set {format_parameters(changes)}. EKF2 now uses the σ that the source reports: "
+            f"Set {format_parameters(changes)}. The source reported a σ of "
             f"{reported_sigma_m:.2g} m."
         )
     if low_m <= logged_noise_m <= high_m:

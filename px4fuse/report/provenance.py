@@ -27,7 +27,7 @@ def draw_pages(analysis: Analysis | AidingSourceAnalysis, results: FlightResults
         page, source = Page("Appendix: provenance"), analysis.source
         clock_texts = map(format_clock_map, flight.clocks)
         _write_section(
-            page, "Offset and drift of other clocks to the autopilot's boot clock", clock_texts
+            page, "Offset and drift of clocks relative to the autopilot's boot clock", clock_texts
         )
         if offset_text := clock.summarise_offset(analysis, results.findings):
             _write_section(page, f"Time offset between {source.name} and the IMU", [offset_text])
@@ -51,7 +51,7 @@ def draw_pages(analysis: Analysis | AidingSourceAnalysis, results: FlightResults
 def _describe_log(flight: Flight, source: PositionTrack | None) -> Iterator[tuple[str, str]]:
     log = flight.log
     yield "firmware", f"{log.firmware}, git {log.firmware_hash}"
-    yield "time zero", f"{log.boot_time_s:.6f} s after boot (first data sample)"
+    yield "time zero", f"{log.boot_time_s:.6f} s after boot (first sample)"
     if source is not None:
         yield (
             "position source",

@@ -22,7 +22,7 @@ __all__ = ["Artist", "Axes"]  # types for annotations
 # Font that is part of matplotlib
 FONT = "DejaVu Sans"
 STYLE_SHEET = Path(__file__).with_name("report.mplstyle")
-TIME_LABEL = "time since first data (s)"
+TIME_LABEL = "time since first sample (s)"
 
 KF_COLOUR = "#12407f"
 KF_BAND_COLOUR = "#d0d9e6"

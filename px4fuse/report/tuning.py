@@ -12,12 +12,10 @@ TUNING_HEAD = (
     "SIGMA_Z (m)\nestimate (95 %)",
     "log-likelihood\ngain (nats per\nmeasurement)",
     "log-likelihood\ngain, 2nd half\nof the data",
-    "lag-1 auto-\ncorrelation\nbefore, after",
+    "autocorrelation\n(lag 1) before\nand after tuning",
 )
 TUNING_NOTE = (
-    "The log-likelihood gain compares the estimates with the chosen settings. The gain on the 2nd "
-    "half of the data uses noises that are estimated on the first half. The innovations have the "
-    "lag-1 autocorrelation 'before' with the chosen settings, and 'after' with the estimates."
+    "The gain on the 2nd half of the data is that of SIGMA_A and SIGMA_Z estimated on the 1st half."
 )
 
 

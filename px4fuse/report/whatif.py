@@ -151,9 +151,9 @@ def describe_sweep(analysis: WhatIfAnalysis) -> list[str]:
             )
     if not all(summary.is_predictable for summary in analysis.whatif.whatif):
         sentences.append(
-            "'not predictable' has three possible reasons: EKF2 rejects more than "
+            "'not predictable': EKF2 rejects more than "
             f"{MAX_REJECTED_FRACTION:.0%} of the samples, {1000.0 * ADDED_POSITION_SIGMA_M:.0f} mm "
-            "of added position noise changes the statistics much, or EKF2 fuses no height for "
+            "of added position noise changes the statistics strongly, or EKF2 fuses no height for "
             f"{HEIGHT_TIMEOUT_S:g} s."
         )
     return [*sentences, *(f"{note}." for note in analysis.whatif.notes)]
@@ -174,7 +174,7 @@ def make_whatif_page(analysis: WhatIfAnalysis) -> Page:
     page.write_labelled("Replay", format_replay_agreement(whatif_result.agreement))
     if analysis.uses_estimates and not analysis.changes:
         no_change_text = (
-            "The logged position noise and delay fit this log best, so no parameter is changed. "
+            "The logged noise and delay parameters fit this log best. "
             "Test another value with --set NAME=VALUE."
         )
         page.write_labelled("Change", no_change_text)

@@ -127,7 +127,7 @@ class NamedFault(Record):
     when : str
         "whole flight", or "" if the times are given.
     from_s, until_s : float or None
-        Start and end of the fault (s since the first data).
+        Start and end of the fault (s since the first sample).
     parameter, value : str and float
         Parameter that corrects the fault, and its new value.
     panel : str

@@ -39,7 +39,7 @@ class Ekf2Output:
     Attributes
     ----------
     time_us : ndarray of int
-        Times of the rows, µs from the first data.
+        Times of the rows, µs from the first sample.
     lag_steps : int
         Number of prediction steps from the fusion horizon to the publication.
     attitude_at_fusion_horizon, states_at_fusion_horizon : ndarray

@@ -119,7 +119,7 @@ class Motion:
     duration_s: float
 
     def compute_true_state(self, time_s: Array) -> TrueState:
-        """Return the true state at times in seconds from the first data."""
+        """Return the true state at times in seconds from the first sample."""
         position, velocity, acceleration, jerk = _differentiate(
             self.velocity, time_s, (-1, 0, 1, 2)
         )
@@ -261,7 +261,7 @@ class _FlightBuilder:
     def __init__(self, climb_start_s: float, heading_deg: float) -> None:
         self.ramp_centre_s = climb_start_s + CLIMB_RAMP_DURATION_S / 2.0
         self.velocity_ramps: list[tuple[float, float, Array]] = []
-        # initial yaw: a ramp that ends before the first data
+        # initial yaw: a ramp that ends before the first sample
         self.yaw_ramps = [(-1.0, 1.0, np.radians([heading_deg]))]
 
     def add_velocity_change(

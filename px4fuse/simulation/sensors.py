@@ -19,7 +19,7 @@ from px4fuse.simulation.motion import Motion, Sines, compute_attitude, compute_d
 from px4fuse.simulation.scenario import DT_S, Scenario
 from px4fuse.simulation.ulog_writer import Topic, make_topic
 
-# Time since boot (µs) of the first data
+# Time since boot (µs) of the first sample
 FIRST_TIMESTAMP_US = 12_000_000
 # Mean latency (s) of positions from measurement to arrival in PX4
 POSITION_LATENCY_S = 0.030
@@ -29,7 +29,7 @@ POSITION_LATENCY_SIGMA_S = 0.003
 MIN_POSITION_LATENCY_S = 0.005
 # Standard deviation of the times of position measurements, as fraction of their interval
 INTERVAL_JITTER_FRACTION = 0.02
-# Time (s) from the first data to the first position
+# Time (s) from the first sample to the first position
 FIRST_POSITION_TIME_S = 0.1
 # Time (s) until TIMESYNC converges: 500 replies at 10 Hz (Timesync.cpp). PX4 then uses the
 # sender's timestamps
@@ -84,7 +84,7 @@ class SimulatedPositions:
     velocity_m_s : ndarray, shape (n, 3), or None
         Velocity measured by GNSS, NED; None for UWB and VIO.
     measurement_times_s : ndarray, shape (n,)
-        True times of measurement (s from the first data).
+        True times of measurement (s from the first sample).
     distance_m : float
         Horizontal distance flown.
     drift_m : ndarray, shape (3,)
@@ -188,7 +188,7 @@ def select_logged_imu(full_rate_topic: Topic, faults: FaultSizes, motion: Motion
 
 
 def get_time_us(topic: Topic, field: str = "timestamp") -> IntArray:
-    """Return the times of a topic in µs from the first data."""
+    """Return the times of a topic in µs from the first sample."""
     return np.asarray(topic.fields[field].astype(np.int64) - FIRST_TIMESTAMP_US)
 
 
@@ -424,7 +424,7 @@ def is_kept_at_rate(time_s: Array, rate_hz: float) -> BoolArray:
 def _simulate_position_times_us(
     faults: FaultSizes, time_s: Array, rng: np.random.Generator
 ) -> tuple[IntArray, IntArray]:
-    """Return arrival time and timestamp of each position, both in µs from the first data."""
+    """Return arrival time and timestamp of each position, both in µs from the first sample."""
     mean_latency_s = faults.clock_jump_s or POSITION_LATENCY_S
     latency_s = np.maximum(
         rng.normal(mean_latency_s, POSITION_LATENCY_SIGMA_S, len(time_s)), MIN_POSITION_LATENCY_S

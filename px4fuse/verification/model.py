@@ -39,7 +39,7 @@ class Mismatch:
 
 @dataclass(frozen=True)
 class PageDifference:
-    """Difference between a submitted PDF and the report that px4fuse draws from the log.
+    """Difference between a submitted PDF and the report that px4fuse recomputes from the log.
 
     Attributes
     ----------

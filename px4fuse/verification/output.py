@@ -46,10 +46,8 @@ def verification_page(name: str, verification: Verification, output: Path | None
     for sentence in sentences:
         page.write(sentence, indent=12.0)
     if output is not None and not verification.redrawn_pdf:
-        page.write("No report was written with -o: the analysis could not be repeated.")
+        page.write("The output file (-o) was not written: the analysis could not be repeated.")
     elif output is None and verification.pages:
-        page.write(
-            "Action: write a new report from the log with -o FILE.pdf, and read the new report."
-        )
+        page.write("Action: write the recomputed report with -o FILE.pdf, and read this report.")
     page.write(VERIFICATION_SCOPE_NOTE, colour=MUTED_COLOUR)
     return page

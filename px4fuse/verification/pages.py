@@ -1,4 +1,4 @@
-"""Comparison of a submitted PDF with the report that px4fuse draws from the log ("redrawn").
+"""Comparison of a submitted PDF with the report that px4fuse recomputes from the log ("redrawn").
 
 All objects of both files are compared pairwise. Two kinds of differences are tolerated:
 
@@ -112,7 +112,9 @@ def compare_pages(
         return differences
     reason = differences.reason.rstrip(".")
     return (
-        PageDifference(0, f"the pages could not be compared with the new report ({reason})", True),
+        PageDifference(
+            0, f"the PDF pages could not be compared with the recomputed report ({reason})", True
+        ),
     )
 
 
@@ -159,10 +161,8 @@ class _PdfComparison:
         pages = [_get_page_references(reader) for reader in (submitted_pdf, redrawn_pdf)]
         for page_number, (submitted_page, redrawn_page) in enumerate(zip_longest(*pages), start=1):
             if submitted_page is None or redrawn_page is None:
-                description = "the page of the new report is missing"
-                if redrawn_page is None:
-                    description = f"the report drawn from the log has only {len(pages[1])} pages"
-                yield PageDifference(page_number, description)
+                page_counts = f"{len(pages[0])} pages; the recomputed report has {len(pages[1])}"
+                yield PageDifference(page_number, f"the PDF has {page_counts}")
                 return
             self.fonts = resolve_reference(redrawn_page.get_object()["/Resources"].get("/Font", {}))
             yield from self._compare(submitted_page, redrawn_page, "/Page", page_number)
@@ -189,7 +189,7 @@ class _PdfComparison:
             if isinstance(submitted_value, IndirectObject):
                 if submitted_value.generation:
                     # programs that ignore generation numbers would display another object
-                    description = f"the PDF entry {key} was replaced (object generation above 0)"
+                    description = f"the PDF entry {key} was replaced by another program"
                     yield PageDifference(page_number, description, True)
                 if isinstance(redrawn_value, IndirectObject):
                     object_ids = (
@@ -204,7 +204,7 @@ class _PdfComparison:
                 resolve_reference, (submitted_value, redrawn_value)
             )
             if _pdf_type_of(submitted_value) is not _pdf_type_of(redrawn_value):
-                description = f"the type of the PDF entry {key} differs from the new report"
+                description = f"the PDF entry {key} has a wrong type"
                 yield PageDifference(page_number, description, True)
             elif isinstance(redrawn_value, DictionaryObject):
                 yield from self._compare_dictionaries(
@@ -221,7 +221,7 @@ class _PdfComparison:
             elif not self._is_same_value(submitted_value, redrawn_value):
                 texts = [one_line(str(value), 60) for value in (submitted_value, redrawn_value)]
                 description = (
-                    f"the PDF entry {key} was changed: {texts[0]!r} instead of {texts[1]!r}"
+                    f"the PDF entry {key} was changed to {texts[0]!r}; px4fuse wrote {texts[1]!r}"
                 )
                 yield PageDifference(page_number, description)
 
@@ -237,7 +237,7 @@ class _PdfComparison:
         submitted_keys = _select_compared_keys(submitted_dictionary, key)
         redrawn_keys = _select_compared_keys(redrawn_dictionary, key)
         for name in sorted(submitted_keys ^ redrawn_keys):
-            description = f"an entry {one_line(name, 40)} is missing"
+            description = f"the PDF lacks an entry {one_line(name, 40)}"
             if name in submitted_keys:
                 description = (
                     f"the PDF contains an entry {one_line(name, 40)}, which px4fuse does not write"
@@ -293,7 +293,7 @@ class _PdfComparison:
             return
         is_page_content = key == "/Contents" or stream_type == "/Pattern"
         if not is_page_content or len(submitted_data) > MAX_CONTENT_SIZE_RATIO * len(redrawn_data):
-            description = f"the content of the PDF entry {key} differs from the new report"
+            description = f"the content of the PDF entry {key} was changed"
             yield PageDifference(page_number, description)
         elif description := self._describe_operation_difference(submitted_data, redrawn_data):
             yield PageDifference(page_number, description)
@@ -319,13 +319,15 @@ class _PdfComparison:
                 continue
             if not {submitted_operator, redrawn_operator} <= _TEXT_OPERATORS:
                 operator_text = one_line(redrawn_operator, 9)
-                return f"drawing operation {number} ({operator_text}) differs from the new report"
+                return f"PDF drawing operation {number} ({operator_text}) was changed"
             texts = [self._decode_text(operands, font_name) for _, operands in operations]
             kerning = [abs(value) for value in submitted_operands if isinstance(value, float)]
             has_small_kerning = max(kerning, default=0.0) < MAX_KERNING_PER_MILLE_EM
             if texts[0] == texts[1] or not has_small_kerning or not self.is_same_text(*texts):
                 submitted_text, redrawn_text = (one_line(text, 60) for text in texts)
-                return f"the text is {submitted_text!r}; px4fuse prints {redrawn_text!r}"
+                return (
+                    f"the PDF contains the text {submitted_text!r}; px4fuse prints {redrawn_text!r}"
+                )
         return ""
 
     def _decode_text(self, operands: tuple[Operand, ...], font: str) -> str:

@@ -133,9 +133,7 @@ def open_strictly(pdf: bytes) -> pypdf.PdfReader:
 
 def _check_file(pdf: bytes) -> None:
     if len(pdf) > MAX_PDF_BYTES:
-        raise ResultsError(
-            f"the file is larger than {MAX_PDF_BYTES // 1_000_000} MB; reports are below 2 MB."
-        )
+        raise ResultsError(f"the file is larger than {MAX_PDF_BYTES // 1_000_000} MB.")
     if not pdf.startswith(b"%PDF-"):
         raise ResultsError("the file is not a PDF. Hand in the file that px4fuse wrote.")
     if b"%%EOF" not in pdf[-2048:]:
@@ -150,7 +148,7 @@ def _check_file(pdf: bytes) -> None:
         remaining_bytes -= inflated_bytes
         if inflated_bytes > MAX_CONTENT_BYTES or remaining_bytes < 0:
             raise ResultsError(
-                "a compressed part expands to more than a report can contain: the PDF is not a "
+                "a compressed part of the PDF contains more data than a report: the PDF is not a "
                 "px4fuse report, or was printed to PDF. Hand in the original file."
             )
 
@@ -270,7 +268,7 @@ def _read_attachment(reader: pypdf.PdfReader) -> bytes:
     if not file_specifications and not streams:
         raise ResultsError(
             f"No {RESULTS_NAME} is attached to this PDF. It is not a px4fuse report, or was "
-            "printed to PDF, which removes attachments. Hand in the original file."
+            "printed to PDF. Hand in the original file."
         )
     if len(file_specifications) != 1 or len(streams) != 1:
         raise ResultsError(

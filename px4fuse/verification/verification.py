@@ -38,7 +38,8 @@ INVALID_COMMAND_REASON = "the command in the report is not a command of px4fuse"
 MIN_DT_S = 0.01
 ORIGINAL_PDF_REMEDY = "Ask the author of the report for the PDF that px4fuse wrote."
 VERIFICATION_SCOPE_NOTE = (
-    "Verification confirms that the numbers follow from the log. It does not confirm the author."
+    "Verification confirms that the numbers result from the log. It does not confirm who "
+    "wrote the report."
 )
 NO_LOG_REASON = "no log was given, so the analysis could not be repeated"
 # Relative tolerance of numbers; results of four types of processors differ by at most 3e-8
@@ -133,9 +134,13 @@ def _link_input_file(
     if path is None:
         missing_file_name = one_line(name, 80) or "the file"
         reason = f"none of the given files has the SHA-256 of {file_label}"
-        raise NotRepeatableError(reason, f"Add {missing_file_name} to --logs.", missing_file_name)
+        raise NotRepeatableError(
+            reason, f"Add {missing_file_name} to the --logs folder.", missing_file_name
+        )
     if name != Path(name).name or name == ".." or "\\" in name or not name.isprintable():
-        reason = f"{INVALID_COMMAND_REASON}: a file name is a path or not printable"
+        reason = (
+            f"{INVALID_COMMAND_REASON}: a file name contains a folder or unprintable characters"
+        )
         raise NotRepeatableError(reason, ASK_AUTHOR_REMEDY)
     # a separate folder for each link, because file names may be equal
     target = Path(tempfile.mkdtemp(dir=folder), name)
@@ -235,12 +240,12 @@ def verify(
     log_file_name = one_line(log_name, 80) or "the log"
     if not path_by_sha256:
         return make_unverifiable_result(
-            NO_LOG_REASON, f"Add {log_file_name} to --logs.", log_file_name
+            NO_LOG_REASON, f"Add {log_file_name} to the --logs folder.", log_file_name
         )
     sha256 = log_sha256(results)
     if sha256 not in path_by_sha256:
         reason = f"the given files do not contain the log (SHA-256 {sha256 or 'none'})"
-        remedy = f"If you have the log, add {log_file_name} to --logs."
+        remedy = f"If you have the log, add {log_file_name} to the --logs folder."
         return Verification("other log", (reason,), False, remedy=remedy, missing=log_file_name)
     if results.student.notes.count("\n") > MAX_NOTES_LINES:
         reason = f"the student's notes have more than {MAX_NOTES_LINES} lines"
@@ -316,8 +321,8 @@ def _compare_with_new_report(
     if other_libraries:
         versions_text = one_line(", ".join(map(" ".join, sorted(other_libraries))), 300)
         reasons.append(
-            f"the report was made with {versions_text}; this computer has other versions, which "
-            "may draw other pages"
+            f"the report was made with {versions_text}; this computer has other versions, so "
+            "pages may look different"
         )
         remedy = remedy or f"Verify the report with {versions_text}."
     if status == "verified":

@@ -195,8 +195,8 @@ def _exists_with_same_content(path: Path, content: bytes) -> bool:
     if path.is_file() and path.stat().st_size == len(content) and path.read_bytes() == content:
         return True
     raise OutputError(
-        f"{path} exists with other content and was not overwritten. Repeat secret and options of "
-        "the existing files, or choose another folder (-o)."
+        f"{path} exists with other content and was not overwritten. Give the secret and the "
+        "options of the earlier command, or choose another folder (-o)."
     )
 
 
@@ -204,6 +204,6 @@ def _require_key_of_same_flights(key_file: Path, has_same_flights: bool) -> None
     if not has_same_flights:
         raise OutputError(
             f"{key_file} is the answer key of other flights and was not overwritten. Choose "
-            "another file with --answer. To add students, repeat secret, options and students of "
-            "the key."
+            "another file with --answer. To add students to this key, keep its secret, options and "
+            "students."
         )

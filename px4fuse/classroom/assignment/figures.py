@@ -26,9 +26,9 @@ MIN_SPEED_FOR_GREY_BACKGROUND_M_S = 0.2
 QUESTIONS = {
     "fault": "injected fault of the flight",
     "evidence": "plots that show the fault, and plots that do not show the fault",
-    "change": "smallest change that makes KF and EKF2 consistent",
+    "change": "smallest change after which both KF and EKF2 are consistent",
     "prediction": "effect on KF and EKF2 if SIGMA_Z and EKF2_EVP_NOISE are multiplied by 3",
-    "useless": "change that does not correct the fault, with the reason",
+    "useless": "change of data or settings that does not correct the fault, and the reason",
 }
 
 

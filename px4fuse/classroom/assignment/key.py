@@ -16,7 +16,7 @@ from px4fuse.errors import SettingsError
 MAX_KEY_BYTES = 20_000_000
 ANSWER_KEY_NOTE = (
     "For the instructor only: this file lists the injected faults of every student's flight. Do "
-    "not hand it out, and do not put it into the students' folder."
+    "not hand it out."
 )
 _Text = Annotated[str, Meta(max_length=1000)]
 _Number = Annotated[float, Meta(gt=-1e12, lt=1e12)]

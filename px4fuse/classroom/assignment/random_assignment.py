@@ -232,8 +232,7 @@ def derive_seed_from_secret(text: str, source_name: str) -> bytes:
     if len(secret) < MIN_SECRET_LENGTH:
         raise SettingsError(
             f"{source_name}: the secret has only {len(secret)} characters and can be guessed.",
-            f"Use {MIN_SECRET_LENGTH} or more characters, or omit the secret: then px4fuse "
-            "stores a random secret in the answer key.",
+            f"Use {MIN_SECRET_LENGTH} or more characters, or omit the secret.",
         )
     return derive_hmac_key(secret)
 

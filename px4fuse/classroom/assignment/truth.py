@@ -59,7 +59,7 @@ class InjectedFault(Record):
     low, high : float or None
         Smallest and largest size that is accepted as a right answer.
     from_s, until_s : float or None
-        Start and end (s since the first data); both None for the whole flight.
+        Start and end (s since the first sample); both None for the whole flight.
     """
 
     kind: str

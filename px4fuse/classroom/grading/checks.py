@@ -394,8 +394,8 @@ class ConsistencyItem(
         if all(item.score(scoring_input)[0] == 1.0 for item in tuning_items):
             points_fraction = 1.0
             advice = (
-                "SIGMA_A and SIGMA_Z agree with their estimates (95 % intervals). Other values "
-                "would not make KF consistent."
+                "SIGMA_A and SIGMA_Z agree with their estimates (95 % intervals). No change of "
+                "SIGMA_A or SIGMA_Z makes KF consistent."
             )
         return points_fraction, (
             f"The reported σ of KF is {format_factor(sigma_factor)} times too {direction}. {advice}"

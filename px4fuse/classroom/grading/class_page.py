@@ -60,7 +60,7 @@ def format_class_page(grades: Sequence[Grade], title: str, version_text: str) ->
         rows=[_make_grade_row(grade, item_titles) for grade in grades],
         filters=[("Status", [("", f"Everyone ({len(grades)})"), *options])],
         column_groups=(("items", "Points of each rubric item"),),
-        search_placeholder="search for name, id, file or flag",
+        search_placeholder="search for name, id or file",
         full_table_note="class.csv contains the table of all students.",
     )
 
@@ -85,8 +85,8 @@ def _format_statistics(grades: Sequence[Grade], count_by_tag: Mapping[str, int])
             ("Mean points", f"{statistics.fmean(totals):.1f}", maximum_text),
             ("Median points", f"{statistics.median(totals):.1f}", maximum_text),
         ]
-    pending_text = f"{format_cell_number(sum(pending_points))} points, not counted"
-    numbers.append(("Pending items", len(pending_points), pending_text))
+    points_text = f"{format_cell_number(sum(pending_points))} points"
+    numbers.append(("Pending items", len(pending_points), points_text))
     return load_template("classroom/grading/above.html").render(
         numbers=numbers, items=analyse_items(reports)
     )
@@ -127,7 +127,7 @@ def _make_grade_row(grade: Grade, item_titles: Sequence[str]) -> Row:
     # overrides.csv needs an id or a file name, which an anonymous student lacks
     points_inputs = (_make_points_inputs(grade),) if grade.student_id or grade.file_name else ()
     links = (
-        [("Report redrawn from the log (PDF)", make_relative_url(report.redrawn_report_path))]
+        [("Report recomputed from the log (PDF)", make_relative_url(report.redrawn_report_path))]
         if report
         else []
     )
@@ -163,7 +163,7 @@ def _make_grade_details(grade: Grade) -> Iterator[RowDetailsSection]:
     other_report_texts = [f"{other.submission}: {other.status}" for other in grade.other_reports]
     yield frame.make_list_section("Flags", grade.flags, is_warning=True)
     yield frame.make_list_section(
-        "Required decision of the instructor",
+        "Action of the instructor",
         [report.instructor_action] if report.instructor_action else [],
         is_warning=True,
     )
@@ -176,7 +176,7 @@ def _make_grade_details(grade: Grade) -> Iterator[RowDetailsSection]:
     yield frame.make_name_value_section(
         "Answer form", [*form_rows(report.form)] if report.form else []
     )
-    yield frame.make_prose_section("Text of the student", report.notes)
+    yield frame.make_prose_section("Student's text (--notes)", report.notes)
     yield frame.make_list_section("Other attempts", other_report_texts)
 
 
@@ -219,5 +219,5 @@ def _make_points_inputs(grade: Grade) -> RowDetailsSection:
     ]
     identity = grade.student_id or grade.file_name
     return frame.make_input_boxes_section(
-        "Points and comments of the instructor", identity, rows, rows_without_input_box
+        "Points and comments by the instructor", identity, rows, rows_without_input_box
     )

@@ -100,7 +100,7 @@ class Course:
     scale : float or None
         Maximum points on the learning platform; None for the maximum of the rubric.
     question_count : int
-        Number of questions per student for an oral check.
+        Number of questions per student for an oral examination.
     include_pending : bool
         True to count points that wait for a decision of the instructor.
     anonymous : bool
@@ -263,12 +263,13 @@ def _make_candidate(
             deducted_points = late_rule.compute_deduction(lateness_s, report.max_points)
     elif origin.is_late:
         flags.append(
-            f"{platform} marks the file as late without a time, so no points were deducted."
+            f"{platform} marks the file as late, but states no submission time, so no points were "
+            "deducted."
         )
     if origin.has_forged_platform_name:
         flags.append(
-            "The student chose a file name that looks like the file names of a learning platform "
-            f"(platform of the export: {platform or 'none'}). Check who handed in the file."
+            "The student chose a file name that looks like a name from a learning platform. "
+            "Check who handed in the file."
         )
     reported_index = class_list.find_student_index(Person(report.student_id)) if platform else None
     if reported_index is not None and student_index not in (None, reported_index):
@@ -418,11 +419,9 @@ def read_overrides(path: Path) -> OverridesByStudent:
             item_text = one_line(item_title, 40) or "(whole report)"
             problem = f"student {one_line(student, 40)} has two rows for the item {item_text}"
         elif points and (parsed_points is None or parsed_points < 0.0):
-            problem = f"the points {one_line(points, 20)!r} are not a number of 0 or more"
+            problem = f"the points must be a number of 0 or more, not {one_line(points, 20)!r}"
         elif points and not item_title:
-            problem = (
-                f"the points {one_line(points, 20)} have no item: write a rubric title or 'total'"
-            )
+            problem = "points without an item: write a rubric title or 'total'"
         if problem:
             raise SettingsError(f"{path}: row {row_number}: {problem}.")
         overrides[student][item_title] = GradeOverride(

@@ -30,11 +30,11 @@ MAX_LISTED_REPORTS = 4
 
 
 def flag_page_differences(verification: Verification) -> Iterator[str]:
-    """Yield the first difference between a PDF and the report drawn from its log, if any."""
+    """Yield the first difference between a PDF and the recomputed report, if any."""
     if verification.pages:
         yield (
-            "The PDF differs from the report that px4fuse draws from the log. "
-            f"{capitalise_first(verification.pages[0].sentence)}. Read the redrawn report."
+            "The PDF differs from the report that px4fuse recomputed from the log. "
+            f"{capitalise_first(verification.pages[0].sentence)}."
         )
 
 
@@ -120,7 +120,7 @@ def _find_equal_contents(report: GradedReport, other: GradedReport) -> Iterator[
         return
     choices = report.form.choices
     if choices == other.form.choices and sum(map(bool, choices)) >= MIN_ANSWERED_CHOICES:
-        yield "The answers about the figures equal those of {}, whose figures were different."
+        yield "The answers about the figures are the same as those of {}, but the figures differ."
     if _count_equal_numbers(report.form, other.form) >= MIN_EQUAL_NUMBERS_OF_A_COPY:
         yield (
             "The answer form contains the same numbers as the answer form of {}. It may be a copy."

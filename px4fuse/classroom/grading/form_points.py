@@ -44,7 +44,7 @@ EXCESS_SIZE_ERROR_AT_ZERO_POINTS = 0.08
 NO_BOUNDS = (-math.inf, math.inf)
 # Minimum tolerance (s) of the start and the end of an injected fault
 FAULT_TIME_TOLERANCE_S = 2.0
-# Tolerance of the start and the end of a fault, as a fraction of the time since the first data
+# Tolerance of the start and the end of a fault, as a fraction of the time since the first sample
 FAULT_TIME_TOLERANCE_FRACTION = 0.05
 # Maximum relative error of a number that the student computed, for full points
 MAX_NUMBER_ERROR_FULL_POINTS = 0.02
@@ -172,7 +172,7 @@ def describe_right_answer(fault: InjectedFault) -> str:
     texts = []
     if fault.low is not None and fault.high is not None:
         unit = next(iter(FAULT_KINDS[fault.kind].units), "")
-        texts.append(f"accepted size {fault.low:.3g} to {fault.high:.3g} {unit}".rstrip())
+        texts.append(f"accepted fault size {fault.low:.3g} to {fault.high:.3g} {unit}".rstrip())
     start_text = "" if fault.from_s is None else f"from {fault.from_s:.0f} s "
     end_text = "" if fault.until_s is None else f"until {fault.until_s:.0f} s"
     texts.append(f"{start_text}{end_text}".strip() or "whole flight")
@@ -251,7 +251,7 @@ def score_fault_kind(kind: str, named_kind: str) -> float:
 def _score_faults(matches: list[FaultMatch], right_answers: CorrectFormAnswers) -> dict[str, float]:
     """Return the mean score of all injected faults, by part of the answer form."""
     sized_fault_count = sum(fault.size is not None for fault, _, _ in matches)
-    scores = dict.fromkeys(("mistakes", "sizes", "time and panel", "correction"), 0.0)
+    scores = dict.fromkeys(("mistakes", "sizes", "fault time and panel", "correction"), 0.0)
     for fault, named_fault, score in matches:
         if named_fault is None:
             continue
@@ -259,7 +259,7 @@ def _score_faults(matches: list[FaultMatch], right_answers: CorrectFormAnswers) 
         fault_weight = (size_score if fault.kind in GUESSABLE_FAULT_KINDS else 1.0) / len(matches)
         evidence_weight = fault_weight if named_fault.kind == fault.kind else 0.5 * fault_weight
         scores["mistakes"] += score / len(matches)
-        scores["time and panel"] += score_evidence(fault, named_fault) * evidence_weight
+        scores["fault time and panel"] += score_evidence(fault, named_fault) * evidence_weight
         scores["correction"] += score_correction(fault, named_fault, right_answers) * fault_weight
         scores["sizes"] += size_score / max(sized_fault_count, 1)
     return scores

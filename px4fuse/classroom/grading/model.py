@@ -103,7 +103,7 @@ class GradedReport:
     form_part_scores : tuple of ItemScore
         Points for each part of ``form``, 100 points in total.
     redrawn_report_path : str
-        Relative path of the report (PDF) that px4fuse draws from the log.
+        Relative path of the report (PDF) that px4fuse recomputes from the log.
     """
 
     submission: str

@@ -17,7 +17,7 @@ QuestionAndAnswer = tuple[str, str]
 
 def format_questions(grades: Sequence[Grade], key: AnswerKey, count: int) -> str:
     """Format ``count`` questions and their right answers for each student with an answer form."""
-    lines = [f"Questions for an oral check: {count} per student, with the expected answers."]
+    lines = [f"Questions for an oral examination: {count} per student, with the expected answers."]
     for grade in grades:
         report = grade.counted_report
         answer = key.find_answers_by_log_sha256(report.log_sha256) if report else None

@@ -50,7 +50,7 @@ from px4fuse.core.writing import write_output_files
 from px4fuse.errors import SettingsError
 from px4fuse.html.safe import load_template
 
-# Folder of reports that px4fuse draws from the logs; safer to open than the submitted PDFs
+# Folder of reports that px4fuse recomputes from the logs; safer to open than the submitted PDFs
 REPORTS_FOLDER = "reports"
 FEEDBACK_FOLDER = "feedback"
 GRADES_FOLDER = "grades"
@@ -159,7 +159,7 @@ def _identify_student(grade: Grade) -> str:
 
 
 def _copy_redrawn_report(grade: Grade, stem: str, output: Path) -> Grade:
-    """Copy the redrawn report and the diagnosis (PDF) to the output folder."""
+    """Copy the recomputed report and the diagnosis (PDF) to the output folder."""
     report = grade.counted_report
     if report is None or not report.sha256:
         return grade
@@ -219,7 +219,7 @@ def anonymise_grade(grade: Grade, pseudonym: str) -> Grade:
             replace(report.verification, reasons=(), differences=()),
             tuple(replace(item, comment="") for item in report.items),
             instructor_action=report.instructor_action
-            and "The points are not final: the instructor has to decide.",
+            and "The points are not final: the instructor must confirm the points.",
             form=report.form,
             did_student_name_fault=report.did_student_name_fault,
             form_part_scores=report.form_part_scores,

@@ -23,7 +23,7 @@ from px4fuse.verification.verification import log_sha256, recompute_report, veri
 
 # Subfolder of the output folder for the cached results
 RECORDS_FOLDER = "records"
-# Suffix of the report that px4fuse draws from the log
+# Suffix of the report that px4fuse recomputes from the log
 REDRAWN_REPORT_SUFFIX = ".pdf"
 # Suffix of the report with the faults that px4fuse found, as feedback for the student
 DIAGNOSIS_SUFFIX = ".diagnosis.pdf"

@@ -34,7 +34,7 @@ from px4fuse.verification.verification import log_sha256, make_unverifiable_resu
 
 DEFAULT_RUBRIC_NAME = "rubric.toml"
 MAX_RUBRIC_BYTES = 1_000_000
-RUBRIC_HELP = "Write a commented example with px4fuse grade --write-rubric FILE.toml."
+RUBRIC_HELP = "Write an example rubric with px4fuse grade --write-rubric FILE.toml."
 
 # Columns of the class table with numbers from the reports: title, and path in the results
 CLASS_TABLE_NUMBERS = (
@@ -43,7 +43,7 @@ CLASS_TABLE_NUMBERS = (
     ("mean NIS of KF, north", "axes.north.filters.kf.nis_mean"),
     ("mean NIS of KF, east", "axes.east.filters.kf.nis_mean"),
     (
-        "position RMSE of KF against ground truth, aisle (m)",
+        "position RMSE of KF against ground truth, along the aisle (m)",
         "axes.aisle.filters.kf.truth.position_rmse_m",
     ),
     ("closure error (m)", "loop.closure_error_m"),
@@ -204,8 +204,8 @@ def _find_problems(
     elif verification.page_status == "differ":
         yield (
             rubric.pages,
-            "pages of your PDF differ from those that px4fuse draws from the log",
-            "Compare the pages with the report that px4fuse drew from the log.",
+            "pages of your PDF differ from the report that px4fuse recomputed",
+            "Compare the pages of the PDF with the report that px4fuse recomputed from the log.",
         )
     if not scoring_input.is_own_log:
         action = _make_other_students_log_advice(scoring_input)
@@ -213,7 +213,7 @@ def _find_problems(
     if scoring_input.has_form_of_other_log:
         yield "pending", FORM_MISMATCH_REASON, FORM_MISMATCH_ADVICE
     if scoring_input.key is not None and getattr(scoring_input.results.request, "position", None):
-        action = "Ask for the origin of the position file: the assignment has no --position."
+        action = "Ask where the position file is from: the assignment contains no position file."
         yield "pending", "", action
 
 
@@ -238,7 +238,7 @@ def grade_unreadable_file(
     rubric: Rubric, key: AnswerKey | None, reason: str, remedy: str = ""
 ) -> GradedReport:
     """Return zero points for a file that is not a report."""
-    comment = f"No points: the file is not a px4fuse report ({shorten_text(reason).rstrip('.')})."
+    comment = f"0 points: the file is not a px4fuse report ({shorten_text(reason).rstrip('.')})."
     graded_items = tuple(
         ItemScore(item.title, 0.0, item.points, comment)
         for item in rubric.items

@@ -50,9 +50,7 @@ MAX_COMPRESSION_RATIO = 100
 # Maximum length (characters) of a file name in messages
 MAX_NAME_LENGTH = 200
 
-_TOO_LARGE_REASON = (
-    f"the file is larger than {MAX_PDF_BYTES // 1_000_000} MB; reports are below 2 MB."
-)
+_TOO_LARGE_REASON = f"the file is larger than {MAX_PDF_BYTES // 1_000_000} MB."
 # General purpose bit flags of a zip entry (APPNOTE.TXT of PKWARE, 4.4.4)
 _ENCRYPTED_FLAG = 1
 _UTF8_FLAG = 0x800
@@ -283,8 +281,8 @@ def _list_folder_submissions(path: Path, notes: list[str]) -> Iterator[Submissio
         ignored_count += not is_inside
     if ignored_count:
         notes.append(
-            f"{one_line(path.name, MAX_NAME_LENGTH)}: {ignored_count} links out of the folder, "
-            "special files or unreadable folders were ignored."
+            f"{one_line(path.name, MAX_NAME_LENGTH)}: {ignored_count} links to files outside the "
+            "folder, special files or unreadable folders were ignored."
         )
 
 
