@@ -43,9 +43,9 @@ def with_quality(*values: float) -> dict[str, Any]:
 
 def gnss(failed: int = 0, accuracy_m: float = 0.4, **parts: Any) -> UnfusedPositions:
     samples = moving(10.0).assign(north_m2=accuracy_m**2, down_m2=1.0)
-    states = {"failed_checks": on(failed), **parts.pop("states", {})}
+    states = {"failed_checks": on(failed), **parts.pop("status_flags", {})}
     return attempt(
-        aid=GNSS_POS, origin=GNSS_ORIGIN, samples=samples, ekf2={"states": states}, **parts
+        aid=GNSS_POS, origin=GNSS_ORIGIN, samples=samples, ekf2={"status_flags": states}, **parts
     )
 
 

@@ -249,7 +249,7 @@ def test_advice_states_height_noise_if_it_differs_from_setting(sample: Analysis)
 
 
 def test_ekf2_delay_keeps_clock_offset_inside_interval(sample: Analysis) -> None:
-    clock = offset(sample, -0.145).clock  # the interval is ± 0.01 s
+    clock = offset(sample, -0.145).time_offset  # the interval is ± 0.01 s
     for applied_s, expected_ms in ((0.0, 145.0), (-0.15, 150.0), (-0.2, 145.0)):
         clock = replace(clock, applied_s=applied_s)
         delay_ms = remedies.estimate_differing_delay_ms(sample, clock, 0.0)

@@ -275,7 +275,7 @@ def make_height_noise_advice(
         or not comparison.source.origin.is_vision
     ):
         return ""
-    height_noise_m = down_tuning.sigma_z.value or 0.0
+    height_noise_m = down_tuning.sigma_z.value or 0.0  # None: not determined
     is_fused = ekf2.fusion_flags["vertical"].mean() > MIN_FUSED_FRACTION_OF_HEIGHTS
     if not is_fused or height_noise_m < MIN_HEIGHT_TO_HORIZONTAL_NOISE_RATIO * noise_m:
         return ""

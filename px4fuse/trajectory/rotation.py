@@ -28,8 +28,9 @@ def conjugate(q: Array) -> Array:
 
 
 def from_rotation_vector(rotation: Array) -> Array:
-    """Convert rotation vectors (rad) to quaternions."""
+    """Convert rotation vectors (rad) to quaternions (w, x, y, z)."""
     angle = np.linalg.norm(rotation, axis=-1, keepdims=True)
+    # sinc(a / 2π) = sin(a / 2) / (a / 2), also for a = 0
     return np.concatenate([np.cos(angle / 2), 0.5 * np.sinc(angle / (2 * np.pi)) * rotation], -1)
 
 
