@@ -446,14 +446,10 @@ def _evaluate_hypothesis(
     )
     weight = 1.0 / (variances[:2, None] + residual_squares / STUDENT_DEGREES_OF_FREEDOM)
     weight *= row_interval_s / SECOND_DIFFERENCE_WINDOW_S
-    source_square_sum, source_imu_product_sum, imu_square_sum = (
-        float(np.sum(weight[0] @ (first * second)[:, :2]))
-        for first, second in (
-            (source_second_difference_m, source_second_difference_m),
-            (source_second_difference_m, imu_second_difference_m),
-            (imu_second_difference_m, imu_second_difference_m),
-        )
-    )
+    horizontal_m = np.stack([source_second_difference_m, imu_second_difference_m])[..., :2]
+    (source_square_sum, source_imu_product_sum), (_, imu_square_sum) = np.einsum(
+        "n,ink,jnk->ij", weight[0], horizontal_m, horizontal_m
+    ).tolist()
     # Without motion, axes and unit cannot be determined
     if 0.0 in (source_square_sum, source_imu_product_sum, imu_square_sum):
         return rejected_result

@@ -15,7 +15,13 @@ import numpy as np
 from scipy import constants
 
 from px4fuse.convention.model import HeadingSource
-from px4fuse.core.arrays import Array, BoolArray, integrate_cumulatively
+from px4fuse.core.arrays import (
+    Array,
+    BoolArray,
+    cumulative_sums,
+    integrate_cumulatively,
+    interpolate_columns,
+)
 from px4fuse.ekf2.replay import is_inside_spans
 from px4fuse.filter.signals import find_imu_gaps
 from px4fuse.flight.model import Columns, Flight, Unavailable
@@ -99,9 +105,7 @@ class SourceSecondDifferences:
         has_near_samples = is_bracketed(
             position_times_s, time_s, choose_gap_limit_s(time_s, MIN_POSITION_GAP_S)
         )
-        interpolated_positions = np.column_stack(
-            [np.interp(position_times_s, time_s, column) for column in position.T]
-        )
+        interpolated_positions = interpolate_columns(position_times_s, time_s, position)
         is_valid = (
             has_near_samples[2 * window_steps :]
             & has_near_samples[window_steps:-window_steps]
@@ -223,9 +227,8 @@ def running_mean(values: Array, is_valid: BoolArray, width: int) -> Array:
     first_rows = np.clip(rows - width // 2, 0, None)
     end_rows = np.clip(rows + width // 2 + 1, None, len(rows))
     valid_values = np.where(is_valid[:, None], values.reshape(len(rows), -1), 0.0)
-    cumulative_sums = np.cumsum(np.column_stack([valid_values, is_valid]), axis=0)
-    cumulative_sums = np.concatenate([np.zeros_like(cumulative_sums[:1]), cumulative_sums])
-    window_sums = cumulative_sums[end_rows] - cumulative_sums[first_rows]
+    sums = cumulative_sums(np.column_stack([valid_values, is_valid]))
+    window_sums = sums[end_rows] - sums[first_rows]
     means: Array = window_sums[:, :-1] / np.maximum(window_sums[:, -1:], 1.0)
     return means.reshape(values.shape)
 

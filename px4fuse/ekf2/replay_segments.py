@@ -23,6 +23,7 @@ from px4fuse.core.arrays import (
     IntArray,
     compute_median_interval_s,
     cumulative_sums,
+    interpolate_columns,
 )
 from px4fuse.core.record import Span
 from px4fuse.flight.ekf2_parameters import PARAMETERS
@@ -813,7 +814,7 @@ def read_prediction_step_s(fusion_record: FusionRecord) -> float:
 
 def _interpolate(table: pd.DataFrame, times_s: Array) -> Array:
     """Interpolate the columns of a table, indexed by time (s)."""
-    return np.column_stack([np.interp(times_s, table.index, table[name]) for name in table])
+    return interpolate_columns(times_s, table.index.to_numpy(), table.to_numpy())
 
 
 def find_step_ends(

@@ -249,9 +249,7 @@ class Topics:
         DataFrame
             Samples with strictly increasing times.
         """
-        instance_numbers = self.instances(layout.topic)
-        instance_number = instance if instance in instance_numbers else instance_numbers[0]
-        table = self.tables[layout.topic, instance_number]
+        table = self.tables.get((layout.topic, instance)) or self.tables_of(layout.topic)[0]
         fields = {
             column: field_name
             for column, field_name in {**layout.columns, **layout.optional_columns}.items()
