@@ -92,9 +92,9 @@ def test_banded_solver_equals_dense_normal_equations(seed: int) -> None:
     system = factorise(length, noise, joined, precision)
     state = system.solve(*signals).reshape(3, 2 * count)
     np.testing.assert_allclose(state.T, expected, rtol=1e-6, atol=1e-6)
-    intervals, explained = system.whiten(*signals)
-    over_sigma = np.sqrt(precision[:, 0]) * measured
-    products = over_sigma @ over_sigma.T + intervals @ intervals.T
+    weighted = system.weight_increments(dp, dv)
+    explained = system.whiten(measured, *weighted)
+    products = precision[:, 0] * measured @ measured.T + dp @ weighted[0].T + dv @ weighted[1].T
     products -= explained @ explained.T
     np.testing.assert_allclose(products, left.T @ left, rtol=1e-6, atol=1e-6)
     log_determinant += np.linalg.slogdet(normal)[1]

@@ -212,26 +212,30 @@ def fit_with_sigma_ratios(
 ) -> list[PositionFit]:
     """Fit constant errors (such as biases) to positions, for each ratio SIGMA_A / SIGMA_Z (1/s²).
 
-    The batches contain the same positions with different time offsets. The result has one fit for
-    each ratio. ``random_walk_to_sigma_z_ratio`` has the unit 1/√s.
+    The batches contain successive segments of the flight. The result has one fit for each ratio.
+    ``random_walk_to_sigma_z_ratio`` has the unit 1/√s.
     """
-    batches_over_sigma_z = (
-        positions.divide_sigmas_by_sigma_z(
-            sigma_z_m, random_walk_to_sigma_z_ratio, measurement_weights
+    fits_by_batch = []
+    end = 0
+    for positions in position_batches:
+        begin, end = end, end + len(positions.measurement_m)
+        positions_over_sigma_z, variance_m2 = positions.divide_sigmas_by_sigma_z(
+            sigma_z_m, random_walk_to_sigma_z_ratio, measurement_weights[begin:end]
         )
-        for positions in position_batches
-    )
-    fits_by_batch = [
-        [
-            fit_positions(positions_over_sigma_z, ratio, variance_m2)
-            for ratio in sigma_a_to_sigma_z_ratios
-        ]
-        for positions_over_sigma_z, variance_m2 in batches_over_sigma_z
-    ]
+        fits_by_batch.append(
+            [
+                fit_positions(positions_over_sigma_z, ratio, variance_m2)
+                for ratio in sigma_a_to_sigma_z_ratios
+            ]
+        )
     return [
         replace(
             batch_fits[0],
-            gram_matrix=np.concatenate([batch_fit.gram_matrix for batch_fit in batch_fits], axis=1),
+            gram_matrix=np.concatenate([batch_fit.gram_matrix for batch_fit in batch_fits]),
+            covariance_log_determinant=sum(
+                batch_fit.covariance_log_determinant for batch_fit in batch_fits
+            ),
+            degrees_of_freedom=sum(batch_fit.degrees_of_freedom for batch_fit in batch_fits),
         )
         for batch_fits in zip(*fits_by_batch, strict=True)
     ]
@@ -244,8 +248,8 @@ def fit_constant_errors(
 ) -> PositionFit:
     """Fit constant errors (such as biases) to positions, with given noise parameters.
 
-    The batches contain the same positions with different time offsets. The variance of a
-    measurement is SIGMA_Z² / weight.
+    The batches contain successive segments of the flight. The variance of a measurement is
+    SIGMA_Z² / weight.
     """
     sigma_z_m = noise_parameters.sigma_z_m
     if noise_parameters.correlated_sigma_m:
