@@ -31,7 +31,7 @@ from px4fuse.filter.hypotheses import (
     fit_systematic_errors,
 )
 from px4fuse.filter.imu_motion import MAX_IMU_INTERVAL_S, MotionCache
-from px4fuse.filter.imu_oscillation import find_imu_oscillation
+from px4fuse.filter.imu_oscillation import ImuOscillation, find_imu_oscillation
 from px4fuse.filter.signals import AISLE, Axis
 from px4fuse.filter.time_offset import (
     MAX_OFFSET_INTERVAL_HALF_WIDTH_S,
@@ -81,6 +81,8 @@ class Estimates:
         Noises along two perpendicular axes, if they differ.
     noisy_part : NoisyPart or None
         Time span with larger innovations than in the rest of the flight.
+    imu_oscillation : ImuOscillation or None
+        Oscillation of the accelerometer that the positions do not contain.
     """
 
     tuning: TuningByAxis
@@ -91,6 +93,7 @@ class Estimates:
     time_correlated_noise: TimeCorrelatedNoise | Unavailable
     axis_tunings: tuple[AxisTuning, ...] = ()
     noisy_part: NoisyPart | None = None
+    imu_oscillation: ImuOscillation | None = None
 
 
 def ignore_progress(_: str) -> None:
@@ -116,8 +119,9 @@ def estimate(comparison: Comparison, progress: Progress = ignore_progress) -> Es
     tuning, clock_offset = estimate_noises_and_clock(
         comparison, progress, REPORTED_AXES if has_north_and_east else None
     )
+    imu_oscillation = _find_oscillation(comparison)
     systematic_errors, source_low_pass, correlated_noise = _fit_source_errors(
-        comparison, tuning, clock_offset
+        comparison, tuning, clock_offset, imu_oscillation
     )
     progress("heading")
     heading_error = estimate_frame_rotation(comparison, tuning, clock_offset)
@@ -135,6 +139,16 @@ def estimate(comparison: Comparison, progress: Progress = ignore_progress) -> Es
         time_correlated_noise=correlated_noise,
         axis_tunings=axis_tunings,
         noisy_part=noisy_part,
+        imu_oscillation=imu_oscillation,
+    )
+
+
+def _find_oscillation(comparison: PreparedComparison) -> ImuOscillation | None:
+    return find_imu_oscillation(
+        comparison.input_axes[0].acceleration,
+        comparison.flight.attitude,
+        comparison.source,
+        comparison.segment,
     )
 
 
@@ -203,9 +217,7 @@ def estimate_noises_and_clock(
         return tuning, clock_offset
     if comparison.source.origin.may_drift:
         clock_offset = widen_for_scatter(clock_offset, "the positions drift")
-    elif clock_offset.has_changed() and find_imu_oscillation(
-        comparison.flight, comparison.source, comparison.segment
-    ):
+    elif clock_offset.has_changed() and _find_oscillation(comparison):
         clock_offset = widen_for_scatter(clock_offset, "the accelerometer oscillates")
     return tuning, clock_offset
 
@@ -233,7 +245,10 @@ def estimate_frame_rotation(
 
 
 def _fit_source_errors(
-    comparison: Comparison, tuning: TuningByAxis, clock_offset: ClockOffset | Unavailable
+    comparison: Comparison,
+    tuning: TuningByAxis,
+    clock_offset: ClockOffset | Unavailable,
+    oscillation: ImuOscillation | None,
 ) -> tuple[
     SystematicErrors | Unavailable,
     SourceLowPass | Unavailable,
@@ -293,7 +308,6 @@ def _fit_source_errors(
             correlated_noise,
             source_low_pass,
         )
-    oscillation = find_imu_oscillation(flight, comparison.source, comparison.segment)
     # A low-pass filter with a short lag keeps the oscillation in the positions
     if oscillation is not None and (
         2.0 * np.pi * oscillation.frequency_hz * source_low_pass.lag_s < 1.0

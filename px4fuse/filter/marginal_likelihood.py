@@ -305,9 +305,9 @@ def fit_positions(
         degrees_of_freedom += len(axes) * axis_degrees_of_freedom
         # Several segments at once: one at a time is slow, all of a long flight need much memory
         for batch in np.array_split(np.arange(segment_count), min(batch_count, segment_count)):
-            edges = segment_edges[batch[0] : batch[-1] + 2].copy()
-            rows, interval_index = slice(*edges[[0, -1]]), np.s_[axes, ..., edges[0] : edges[-1] - 1]
-            edges -= edges[0]
+            begin, end = segment_edges[[batch[0], batch[-1] + 1]]
+            edges = segment_edges[batch[0] : batch[-1] + 2] - begin
+            rows, interval_index = slice(begin, end), np.s_[axes, ..., begin : end - 1]
             batch_measured_m = measured_m[axes, ..., rows]
             increments = dp[interval_index], dv[interval_index]
             batch_system = system.select_rows(rows)
@@ -543,8 +543,8 @@ class BandedNormalEquations:
         part_explained_by_states, _ = lapack.dtbtrs(
             unit_diagonal_factor, right_hand_side.T, uplo="L", diag="U", overwrite_b=1
         )
-        return (part_explained_by_states.T / diagonal).reshape(
-            *weighted_increments[0].shape[:-1], -1
+        return np.asarray(
+            (part_explained_by_states.T / diagonal).reshape(*weighted_increments[0].shape[:-1], -1)
         )
 
     def solve(self, measured_m: Array, delta_position_m: Array, delta_velocity_m_s: Array) -> Array:
