@@ -248,7 +248,7 @@ def test_outlier_burst_is_not_reported_as_position_jump() -> None:
 def test_time_offset_is_not_reported_as_low_pass_filter() -> None:
     late = flown("clock-offset=250ms", passes=6)
     assert late.source_low_pass.gain_nats == 0.0
-    _, low_pass, _ = _fit_source_errors(late, late.tuning, unavailable("clock offset"), None)
+    _, low_pass, _ = _fit_source_errors(late, late.tuning, unavailable("clock offset"), None, {})
     assert low_pass.gain_nats > 3.0
 
 
@@ -335,7 +335,7 @@ def test_hypothesis_findings_require_imu_or_reported_variance(mistake, change) -
 
 def test_bias_estimate_without_noise_estimate_is_unavailable() -> None:
     tuned = flown("jump=1,40s")
-    fit, low_pass, correlated_noise = _fit_source_errors(tuned, {}, tuned.clock, None)
+    fit, low_pass, correlated_noise = _fit_source_errors(tuned, {}, tuned.clock, None, {})
     assert isinstance(fit, Unavailable)
     assert isinstance(low_pass, Unavailable)
     untuned = replace(

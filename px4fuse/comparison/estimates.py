@@ -116,12 +116,13 @@ def value_or_bound(noise: NoiseEstimate, fallback: float) -> float:
 def estimate(comparison: Comparison, progress: Progress = ignore_progress) -> Estimates:
     """Estimate noises, time offset, yaw misalignment and systematic errors of a position source."""
     has_north_and_east = {"north", "east"} <= {axis.name for axis in comparison.input_axes}
+    motion_cache: MotionCache = {}
     tuning, clock_offset = estimate_noises_and_clock(
-        comparison, progress, REPORTED_AXES if has_north_and_east else None
+        comparison, progress, REPORTED_AXES if has_north_and_east else None, motion_cache
     )
     imu_oscillation = _find_oscillation(comparison)
     systematic_errors, source_low_pass, correlated_noise = _fit_source_errors(
-        comparison, tuning, clock_offset, imu_oscillation
+        comparison, tuning, clock_offset, imu_oscillation, motion_cache
     )
     progress("heading")
     heading_error = estimate_frame_rotation(comparison, tuning, clock_offset)
@@ -188,12 +189,13 @@ def estimate_noises_and_clock(
     comparison: PreparedComparison,
     progress: Progress = ignore_progress,
     axis_names: tuple[str, ...] | None = (HORIZONTAL,),
+    motion_cache: MotionCache | None = None,
 ) -> tuple[TuningByAxis, ClockOffset | Unavailable]:
     """Estimate measurement noise, process noise, and the time offset between positions and IMU.
 
     Parameters are those of :func:`estimate_noises`.
     """
-    motion_cache: MotionCache = {}
+    motion_cache = {} if motion_cache is None else motion_cache
     tuning = estimate_noises(comparison, axis_names, progress, motion_cache)
     if comparison.flight.log.is_assessed:
         return tuning, DIAGNOSIS_WITHHELD
@@ -249,6 +251,7 @@ def _fit_source_errors(
     tuning: TuningByAxis,
     clock_offset: ClockOffset | Unavailable,
     oscillation: ImuOscillation | None,
+    motion_cache: MotionCache,
 ) -> tuple[
     SystematicErrors | Unavailable,
     SourceLowPass | Unavailable,
@@ -292,6 +295,7 @@ def _fit_source_errors(
         outlier_time_s=excluded_times_s,
         clock_offset_s=offset_s,
         jumps=jumps,
+        motion_cache=motion_cache,
     )
     if isinstance(time_correlation_fit, Unavailable):
         return systematic_errors, time_correlation_fit, time_correlation_fit
