@@ -34,6 +34,7 @@ from px4fuse.comparison.estimates import (
     estimate_noises_and_time_offset,
     widen_for_scatter,
 )
+from px4fuse.comparison.model import PreparedComparison
 from px4fuse.comparison.reruns import rerun_kf_with_time_offset
 from px4fuse.core.arrays import Array
 from px4fuse.diagnose import diagnose, prepare_comparison
@@ -47,7 +48,7 @@ from px4fuse.filter.imu_motion import (
     compute_imu_motion,
     make_segment_motion,
 )
-from px4fuse.filter.imu_oscillation import find_imu_oscillation
+from px4fuse.filter.imu_oscillation import ImuOscillation, find_imu_oscillation
 from px4fuse.filter.likelihood import compute_profile_likelihood_interval
 from px4fuse.filter.signals import Segment
 from px4fuse.filter.time_offset import MAX_P_VALUE_OF_CHANGED_OFFSET, PartOffset, SourceTimeOffset
@@ -453,12 +454,17 @@ def oscillating(flight: Flight) -> Flight:
     return replace(flight, imu=imu)
 
 
+def find_oscillation(prepared: PreparedComparison) -> ImuOscillation | None:
+    acceleration, attitude = prepared.input_axes[0].acceleration, prepared.flight.attitude
+    return find_imu_oscillation(acceleration, attitude, prepared.source, prepared.segment)
+
+
 def test_imu_oscillation_is_no_change_of_time_offset(monkeypatch) -> None:
     scenario = Scenario(seed=4, ekf2=False)
     flight = oscillating(simulate_flight(scenario, parse_faults([])))
     prepared = prepare_comparison(flight, ComparisonRequest(log=flight.log.name))
     assert not estimate_noises_and_time_offset(prepared)[1].has_changed()
-    found = find_imu_oscillation(flight, prepared.source, prepared.segment)
+    found = find_oscillation(prepared)
     assert found is not None
     assert found.frequency_hz == pytest.approx(0.4, rel=0.02)
     assert found.amplitude_m_s2 == pytest.approx(1.0, rel=0.2)
@@ -470,7 +476,7 @@ def test_imu_oscillation_is_no_change_of_time_offset(monkeypatch) -> None:
 def test_flight_without_imu_oscillation_has_none(mistake: str) -> None:
     flight = simulate_flight(Scenario(seed=4, ekf2=False), parse_faults([mistake]))
     prepared = prepare_comparison(flight, ComparisonRequest(log=flight.log.name))
-    assert find_imu_oscillation(prepared.flight, prepared.source, prepared.segment) is None
+    assert find_oscillation(prepared) is None
 
 
 def test_time_offset_jump_p_value_equals_bonferroni_t_test() -> None:

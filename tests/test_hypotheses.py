@@ -120,7 +120,8 @@ def test_bias_regression_residuals_equal_kf_innovations() -> None:
     )
     skip = np.zeros(len(model.time_s), dtype=bool)
     for each in (model, with_gap):
-        fits, (data, columns, _) = each.fit(skip), each.compute_innovations_and_design_matrix(skip)
+        fits = each.fit(skip)
+        data, columns = each.compute_innovations_and_design_matrix(fits.gains)
         arrays = "measurement_m", "delta_position_m", "delta_velocity_m_s"
         residual = (data - columns @ fits.coefficients).reshape(2, -1)
         np.testing.assert_allclose(fits.residual, residual, atol=1e-9)
@@ -134,7 +135,7 @@ def test_bias_regression_equals_lstsq_with_prior_as_data_row() -> None:
     model = design_matrix()
     skip = np.arange(len(model.time_s)) % 5 == 0
     made = model.fit(skip)
-    data, columns, _ = model.compute_innovations_and_design_matrix(skip)
+    data, columns = model.compute_innovations_and_design_matrix(made.gains)
     used = np.tile(~skip, 2)
     rows = np.vstack([columns[used], np.diag(1.0 / model.prior_sigma)])
     values = np.append(data[used], np.zeros(len(model.prior_sigma)))
@@ -247,7 +248,7 @@ def test_outlier_burst_is_not_reported_as_position_jump() -> None:
 def test_time_offset_is_not_reported_as_low_pass_filter() -> None:
     late = flown("clock-offset=250ms", passes=6)
     assert late.source_low_pass.gain_nats == 0.0
-    _, low_pass, _ = _fit_source_errors(late, late.tuning, unavailable("clock offset"))
+    _, low_pass, _ = _fit_source_errors(late, late.tuning, unavailable("clock offset"), None, {})
     assert low_pass.gain_nats > 3.0
 
 
@@ -334,7 +335,7 @@ def test_hypothesis_findings_require_imu_or_reported_variance(mistake, change) -
 
 def test_bias_estimate_without_noise_estimate_is_unavailable() -> None:
     tuned = flown("jump=1,40s")
-    fit, low_pass, correlated_noise = _fit_source_errors(tuned, {}, tuned.time_offset)
+    fit, low_pass, correlated_noise = _fit_source_errors(tuned, {}, tuned.time_offset, None, {})
     assert isinstance(fit, Unavailable)
     assert isinstance(low_pass, Unavailable)
     untuned = replace(

@@ -27,7 +27,7 @@ from px4fuse.filter.consistency import (
 )
 from px4fuse.filter.kalman import KfRun, predict_state, predict_variance, run_kf
 from px4fuse.filter.model import STATE_COLUMNS
-from px4fuse.filter.signals import Axis, Segment
+from px4fuse.filter.signals import AISLE, Axis, Segment
 from px4fuse.flight.model import (
     RECORD_NOT_LOGGED,
     Ekf2,
@@ -52,8 +52,10 @@ def compare(prepared_comparison: PreparedComparison) -> Comparison:
         if not state.equals(ekf2.state):
             # The states at the fusion horizon still contain the resets, so they are not used
             ekf2 = replace(ekf2, state=state, aids={}, record=RECORD_NOT_LOGGED)
+    axis_names = [axis.name for axis in prepared_comparison.input_axes]
+    main_name = AISLE if AISLE in axis_names else axis_names[0]
     axes = {
-        axis.name: _compare_axis(prepared_comparison, ekf2, axis)
+        axis.name: _compare_axis(prepared_comparison, ekf2, axis, is_main=axis.name == main_name)
         for axis in prepared_comparison.input_axes
     }
     horizontal_axes = [axes[name] for name in ("north", "east") if name in axes]
@@ -72,10 +74,11 @@ def compare(prepared_comparison: PreparedComparison) -> Comparison:
 
 
 def _compare_axis(
-    prepared_comparison: PreparedComparison, ekf2: Ekf2 | Unavailable, axis: Axis
+    prepared_comparison: PreparedComparison, ekf2: Ekf2 | Unavailable, axis: Axis, *, is_main: bool
 ) -> AxisComparison:
     segment, flight = prepared_comparison.segment, prepared_comparison.flight
-    kf_run = run_kf(axis, prepared_comparison.settings)
+    # Only the main axis, which the report shows step by step, needs filterpy
+    kf_run = run_kf(axis, prepared_comparison.settings, fast=not is_main)
     tracks = project_tracks(ekf2, flight.truth, axis, segment)
     ekf2_state, ekf2_variance, truth = tracks.values()
     ekf2_errors = compute_error_statistics(ekf2_state, ekf2_variance, truth)

@@ -488,16 +488,18 @@ def find_attitude_delay(imu: pd.DataFrame, attitude: pd.DataFrame) -> float | No
     )
     angle_rad = integrate_cumulatively(imu[Columns.ANGULAR_RATE].to_numpy(), imu_time_s)
 
-    def compute_mean_square_rad2(delay_s: float) -> float:
-        delayed_angle_rad = np.array(
-            [np.interp(time_s - delay_s, imu_time_s, column) for column in angle_rad.T]
-        )
+    # The tested delays are multiples of the sampling interval
+    max_delay_rows = round(MAX_ATTITUDE_DELAY_S / ROTATION_INTERVAL_S)
+    gyro_time_s = time_s[0] + ROTATION_INTERVAL_S * np.arange(
+        -max_delay_rows, len(time_s) + max_delay_rows
+    )
+    angle_rad = np.stack([np.interp(gyro_time_s, imu_time_s, column) for column in angle_rad.T], 1)
+    gyro_rotation_rad = angle_rad[samples_per_rotation:] - angle_rad[:-samples_per_rotation]
+
+    def compute_mean_square_rad2(delay_rows: int) -> float:
+        first_row = max_delay_rows - delay_rows
         rotation_differences_rad = (
-            rotation_rad
-            - (
-                delayed_angle_rad[:, samples_per_rotation:]
-                - delayed_angle_rad[:, :-samples_per_rotation]
-            ).T
+            rotation_rad - gyro_rotation_rad[first_row : first_row + len(rotation_rad)]
         )
         # The median difference is due to the gyroscope bias
         rotation_differences_rad -= np.median(rotation_differences_rad, axis=0)
@@ -507,9 +509,12 @@ def find_attitude_delay(imu: pd.DataFrame, attitude: pd.DataFrame) -> float | No
         )
         return float(np.mean(limited_angles_rad**2))
 
-    delays_s = np.arange(-MAX_ATTITUDE_DELAY_S, MAX_ATTITUDE_DELAY_S, 2.0 * ROTATION_INTERVAL_S)
-    delay_s = float(min(delays_s, key=compute_mean_square_rad2))
+    tested_rows = range(-max_delay_rows, max_delay_rows + 1, 2)
+    coarse_index = 3 * int(np.argmin([*map(compute_mean_square_rad2, tested_rows[::3])]))
+    nearby_rows = tested_rows[max(coarse_index - 2, 0) : coarse_index + 3]
+    delay_rows = min(nearby_rows, key=compute_mean_square_rad2)
+    delay_s = ROTATION_INTERVAL_S * delay_rows
     is_delay_significant = abs(delay_s) >= MIN_ATTITUDE_DELAY_S and compute_mean_square_rad2(
-        delay_s
-    ) < MAX_REMAINING_ROTATION_DIFFERENCE_RATIO * compute_mean_square_rad2(0.0)
+        delay_rows
+    ) < MAX_REMAINING_ROTATION_DIFFERENCE_RATIO * compute_mean_square_rad2(0)
     return delay_s if is_delay_significant else None

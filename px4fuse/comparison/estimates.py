@@ -31,7 +31,7 @@ from px4fuse.filter.hypotheses import (
     fit_systematic_errors,
 )
 from px4fuse.filter.imu_motion import MAX_IMU_INTERVAL_S, MotionCache
-from px4fuse.filter.imu_oscillation import find_imu_oscillation
+from px4fuse.filter.imu_oscillation import ImuOscillation, find_imu_oscillation
 from px4fuse.filter.signals import AISLE, Axis
 from px4fuse.filter.time_offset import (
     MAX_OFFSET_INTERVAL_HALF_WIDTH_S,
@@ -81,6 +81,8 @@ class Estimates:
         Noises along two perpendicular axes, if they differ.
     noisy_part : NoisyPart or None
         Time span with larger innovations than in the rest of the flight.
+    imu_oscillation : ImuOscillation or None
+        Oscillation of the accelerometer that the positions do not contain.
     """
 
     tuning: TuningByAxis
@@ -91,6 +93,7 @@ class Estimates:
     time_correlated_noise: TimeCorrelatedNoise | Unavailable
     axis_tunings: tuple[AxisTuning, ...] = ()
     noisy_part: NoisyPart | None = None
+    imu_oscillation: ImuOscillation | None = None
 
 
 def ignore_progress(_: str) -> None:
@@ -113,11 +116,13 @@ def value_or_bound(noise: NoiseEstimate, fallback: float) -> float:
 def estimate(comparison: Comparison, progress: Progress = ignore_progress) -> Estimates:
     """Estimate noises, time offset, yaw misalignment and systematic errors of a position source."""
     has_north_and_east = {"north", "east"} <= {axis.name for axis in comparison.input_axes}
+    motion_cache: MotionCache = {}
     tuning, time_offset = estimate_noises_and_time_offset(
-        comparison, progress, REPORTED_AXES if has_north_and_east else None
+        comparison, progress, REPORTED_AXES if has_north_and_east else None, motion_cache
     )
+    imu_oscillation = _find_oscillation(comparison)
     systematic_errors, source_low_pass, correlated_noise = _fit_source_errors(
-        comparison, tuning, time_offset
+        comparison, tuning, time_offset, imu_oscillation, motion_cache
     )
     progress("heading")
     heading_error = estimate_frame_rotation(comparison, tuning, time_offset)
@@ -135,6 +140,16 @@ def estimate(comparison: Comparison, progress: Progress = ignore_progress) -> Es
         time_correlated_noise=correlated_noise,
         axis_tunings=axis_tunings,
         noisy_part=noisy_part,
+        imu_oscillation=imu_oscillation,
+    )
+
+
+def _find_oscillation(comparison: PreparedComparison) -> ImuOscillation | None:
+    return find_imu_oscillation(
+        comparison.input_axes[0].acceleration,
+        comparison.flight.attitude,
+        comparison.source,
+        comparison.segment,
     )
 
 
@@ -174,12 +189,13 @@ def estimate_noises_and_time_offset(
     comparison: PreparedComparison,
     progress: Progress = ignore_progress,
     axis_names: tuple[str, ...] | None = (HORIZONTAL,),
+    motion_cache: MotionCache | None = None,
 ) -> tuple[TuningByAxis, SourceTimeOffset | Unavailable]:
     """Estimate measurement noise, process noise, and the time offset between positions and IMU.
 
     Parameters are those of :func:`estimate_noises`.
     """
-    motion_cache: MotionCache = {}
+    motion_cache = {} if motion_cache is None else motion_cache
     tuning = estimate_noises(comparison, axis_names, progress, motion_cache)
     if comparison.flight.log.is_assessed:
         return tuning, DIAGNOSIS_WITHHELD
@@ -203,9 +219,7 @@ def estimate_noises_and_time_offset(
         return tuning, time_offset
     if comparison.source.origin.may_drift:
         time_offset = widen_for_scatter(time_offset, "the positions drift")
-    elif time_offset.has_changed() and find_imu_oscillation(
-        comparison.flight, comparison.source, comparison.segment
-    ):
+    elif time_offset.has_changed() and _find_oscillation(comparison):
         time_offset = widen_for_scatter(time_offset, "the accelerometer oscillates")
     return tuning, time_offset
 
@@ -233,7 +247,11 @@ def estimate_frame_rotation(
 
 
 def _fit_source_errors(
-    comparison: Comparison, tuning: TuningByAxis, time_offset: SourceTimeOffset | Unavailable
+    comparison: Comparison,
+    tuning: TuningByAxis,
+    time_offset: SourceTimeOffset | Unavailable,
+    oscillation: ImuOscillation | None,
+    motion_cache: MotionCache,
 ) -> tuple[
     SystematicErrors | Unavailable,
     SourceLowPass | Unavailable,
@@ -277,6 +295,7 @@ def _fit_source_errors(
         outlier_time_s=excluded_times_s,
         clock_offset_s=offset_s,
         jumps=jumps,
+        motion_cache=motion_cache,
     )
     if isinstance(time_correlation_fit, Unavailable):
         return systematic_errors, time_correlation_fit, time_correlation_fit
@@ -293,7 +312,6 @@ def _fit_source_errors(
             correlated_noise,
             source_low_pass,
         )
-    oscillation = find_imu_oscillation(flight, comparison.source, comparison.segment)
     # A low-pass filter with a short lag keeps the oscillation in the positions
     if oscillation is not None and (
         2.0 * np.pi * oscillation.frequency_hz * source_low_pass.lag_s < 1.0

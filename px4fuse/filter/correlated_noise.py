@@ -19,7 +19,7 @@ import pandas as pd
 from scipy.interpolate import CubicSpline
 from scipy.optimize import minimize_scalar
 
-from px4fuse.core.arrays import Array
+from px4fuse.core.arrays import Array, ArrayPair
 from px4fuse.filter.fitting import (
     NoiseFit,
     NoiseParameters,
@@ -131,6 +131,7 @@ def fit_time_correlation(  # noqa: PLR0915 (two models with common data)
     outlier_time_s: Array,
     clock_offset_s: float,
     jumps: Sequence[Jump] = (),
+    motion_cache: MotionCache | None = None,
 ) -> tuple[SourceLowPass, TimeCorrelatedNoise | Unavailable] | Unavailable:
     """Fit two models of correlated position errors: a low-pass filter and time-correlated noise.
 
@@ -146,6 +147,8 @@ def fit_time_correlation(  # noqa: PLR0915 (two models with common data)
         Time offset (s) estimated with white noise.
     jumps : sequence of Jump
         Jumps of the positions, which are subtracted.
+    motion_cache : dict, optional
+        IMU motion that is already computed; new motion is added.
     """
     time_s = axes[0].measurement_time_s
     if len(time_s) < MIN_MEASUREMENTS:
@@ -166,7 +169,6 @@ def fit_time_correlation(  # noqa: PLR0915 (two models with common data)
         interval_s < MAX_INTERVAL_TO_MEDIAN_INTERVAL_RATIO * np.median(interval_s[1:])
     ) & (interval_s > 0.0)
     directions = np.array([axis.direction for axis in axes])
-    motion_cache = MotionCache()
 
     def undo_low_pass(tau_s: float) -> tuple[PositionsAndImuMotion | Unavailable, float]:
         """Undo a low-pass filter with time constant ``tau_s``.
@@ -348,9 +350,12 @@ def fit_time_correlation_to_truth(
     residuals = basis_without_systematic_errors.T @ (measured_m - true_m)
     if np.abs(residuals).max() < MAX_RESIDUAL_OF_COPIED_TRUTH_M:
         return noise_from_imu
-    scores_and_variances = []
     half_axis_count_and_half_residual_count = 0.5 * np.array([len(axes), len(residuals)])
-    for tested_tau_s in TESTED_TAUS_S:
+    white_noise_score = (
+        half_axis_count_and_half_residual_count[1] * np.log(np.mean(residuals**2, axis=0)).sum()
+    )
+
+    def compute_scores_and_variances(tested_tau_s: float) -> ArrayPair:
         correlation_matrix = (
             basis_without_systematic_errors.T
             @ np.exp(-np.abs(measurement_time_s[:, None] - measurement_time_s) / tested_tau_s)
@@ -367,15 +372,21 @@ def fit_time_correlation_to_truth(
             np.log(relative_noise_variance).sum(axis=0),
             np.log(normalised_mean_squares).sum(axis=0),
         ]
-        scores_and_variances.append((scores, normalised_mean_squares.mean(axis=0)))
+        return scores, normalised_mean_squares.mean(axis=0)
+
+    # First test every fourth time constant: most flights have no time-correlated noise
+    coarse_score = min(
+        compute_scores_and_variances(tau)[0].min() for tau in TESTED_TAUS_S[::4].tolist()
+    )
+    if white_noise_score - coarse_score < min_likelihood_gain_nats / 2.0:
+        return noise_from_imu
+    scores_and_variances = [*map(compute_scores_and_variances, TESTED_TAUS_S.tolist())]
     # Rows are time constants, columns time-correlated fractions of the variance
     scores, normalised_mean_squares = np.transpose(scores_and_variances, (1, 0, 2))
     tau_index, correlated_fraction_index = divmod(
         int(np.argmin(scores)), len(TESTED_CORRELATED_FRACTIONS)
     )
-    likelihood_gains_nats = half_axis_count_and_half_residual_count[1] * np.log(
-        np.mean(residuals**2, axis=0)
-    ).sum() - scores.min(axis=1)
+    likelihood_gains_nats = white_noise_score - scores.min(axis=1)
     best_gain_nats = likelihood_gains_nats.max()
     if best_gain_nats < min_likelihood_gain_nats:
         return noise_from_imu

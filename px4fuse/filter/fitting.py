@@ -32,10 +32,10 @@ SIGMA_A_SEARCH_RANGE_M_S2 = (1e-3, 30.0)
 SIGMA_Z_SEARCH_RANGE_M = (1e-3, 10.0)
 # Maximum number of expectation maximisation iterations
 MAX_OUTLIER_ITERATIONS = 12
-# Maximum number of L-BFGS-B iterations of a complete fit
-MAX_FINAL_ITERATIONS = 50
-# Maximum number of L-BFGS-B iterations between two estimates of the outlier probabilities
-MAX_COARSE_ITERATIONS = 3
+# Maximum number of L-BFGS-B iterations of a fit
+MAX_FIT_ITERATIONS = 50
+# Number of estimates of the outlier probabilities with given noises
+OUTLIER_ITERATIONS_WITH_GIVEN_NOISES = 3
 # Minimum ratio of the outliers' σ to SIGMA_Z
 MIN_OUTLIER_SIGMA_RATIO = 3.0
 INITIAL_OUTLIER_FRACTION = 0.005
@@ -50,9 +50,9 @@ UNCOMPUTABLE_SCORE = 1e6
 # Step of ln σ for numerical derivatives of the log-likelihood
 LOG_STEP_FOR_DERIVATIVES = 1e-4
 # Grid for the interpolation of the log-likelihood: number of nodes, and spacing in ln σ
-GRID_NODE_COUNT_AND_SPACING = 10, 0.25
-# Smaller, less accurate grid for the first iterations: number of nodes, and spacing in ln σ
-COARSE_GRID_NODE_COUNT_AND_SPACING = 6, 0.2
+GRID_NODE_COUNT, GRID_NODE_SPACING = 6, 0.2
+GRID_NODES = np.arange(GRID_NODE_COUNT)
+BARYCENTRIC_WEIGHTS = (-1.0) ** GRID_NODES * comb(GRID_NODE_COUNT - 1, GRID_NODES)
 # Number of measurements that give the initial values for a long flight
 INITIAL_FIT_MEASUREMENT_COUNT = 2000
 # Precision of a known initial position (1/m²) and velocity (s²/m²)
@@ -105,8 +105,6 @@ class NegativeLogLikelihood:
         The variance of a measurement is SIGMA_Z² / weight.
     sigma_z_m : float
         Approximate SIGMA_Z.
-    is_coarse : bool
-        True for a smaller grid, which is faster but less accurate.
     """
 
     def __init__(
@@ -114,7 +112,6 @@ class NegativeLogLikelihood:
         axis_positions: Sequence[PositionsAndIncrements],
         measurement_weights: Array,
         sigma_z_m: float,
-        is_coarse: bool = False,
     ) -> None:
         self.axis_positions = axis_positions
         self.measurement_weights = measurement_weights
@@ -122,13 +119,10 @@ class NegativeLogLikelihood:
         self.is_interpolated = not any(
             positions.process_noise_independent_of_sigma_a.any() for positions in axis_positions
         )
-        self.node_count, self.node_spacing = node_count, node_spacing = (
-            COARSE_GRID_NODE_COUNT_AND_SPACING if is_coarse else GRID_NODE_COUNT_AND_SPACING
-        )
 
         @cache
         def fit_axes_with_sigma_ratio(log_sigma_ratio_node: int) -> list[PositionFit]:
-            sigma_a_to_sigma_z_ratio = float(np.exp(node_spacing * log_sigma_ratio_node))
+            sigma_a_to_sigma_z_ratio = float(np.exp(GRID_NODE_SPACING * log_sigma_ratio_node))
             return [
                 fit_with_sigma_ratios(
                     [positions], [sigma_a_to_sigma_z_ratio], 0.0, measurement_weights, sigma_z_m
@@ -140,7 +134,7 @@ class NegativeLogLikelihood:
         def compute_scores_with_sigma_ratio(
             log_sigma_ratio_node: int, log_sigma_z_node: int
         ) -> Array:
-            sigma_factors = np.exp(node_spacing * (log_sigma_z_node + np.arange(node_count)))
+            sigma_factors = np.exp(GRID_NODE_SPACING * (log_sigma_z_node + GRID_NODES))
             scores_by_axis = [
                 axis_fit.compute_scores(sigma_factors)[:, 0]
                 for axis_fit in fit_axes_with_sigma_ratio(log_sigma_ratio_node)
@@ -152,7 +146,7 @@ class NegativeLogLikelihood:
             return np.array(
                 [
                     compute_scores_with_sigma_ratio(log_sigma_ratio_node + node, log_sigma_z_node)
-                    for node in range(node_count)
+                    for node in range(GRID_NODE_COUNT)
                 ]
             )
 
@@ -168,18 +162,18 @@ class NegativeLogLikelihood:
             return negative_log_likelihood(
                 self.axis_positions, noise_parameters, self.measurement_weights
             )
-        log_sigma_z_in_node_steps = log(noise_parameters.sigma_z_m) / self.node_spacing
+        log_sigma_z_in_node_steps = log(noise_parameters.sigma_z_m) / GRID_NODE_SPACING
         log_sigma_ratio_in_node_steps = (
-            log(noise_parameters.sigma_a_m_s2) / self.node_spacing - log_sigma_z_in_node_steps
+            log(noise_parameters.sigma_a_m_s2) / GRID_NODE_SPACING - log_sigma_z_in_node_steps
         )
-        grid_nodes_below_value = (self.node_count - 1) // 2
+        grid_nodes_below_value = (GRID_NODE_COUNT - 1) // 2
         first_log_sigma_ratio_node = floor(log_sigma_ratio_in_node_steps) - grid_nodes_below_value
         first_log_sigma_z_node = floor(log_sigma_z_in_node_steps) - grid_nodes_below_value
         log_sigma_ratio_interpolation_weights = _compute_interpolation_weights(
-            log_sigma_ratio_in_node_steps - first_log_sigma_ratio_node, self.node_count
+            log_sigma_ratio_in_node_steps - first_log_sigma_ratio_node
         )
         log_sigma_z_interpolation_weights = _compute_interpolation_weights(
-            log_sigma_z_in_node_steps - first_log_sigma_z_node, self.node_count
+            log_sigma_z_in_node_steps - first_log_sigma_z_node
         )
         return float(
             log_sigma_ratio_interpolation_weights
@@ -188,18 +182,12 @@ class NegativeLogLikelihood:
         )
 
 
-@cache
-def _compute_barycentric_weights(node_count: int) -> Array:
-    nodes = np.arange(node_count)
-    return np.asarray((-1.0) ** nodes * comb(node_count - 1, nodes))
-
-
-def _compute_interpolation_weights(position_in_node_steps: float, node_count: int) -> Array:
+def _compute_interpolation_weights(position_in_node_steps: float) -> Array:
     """Return the weights of barycentric interpolation (Berrut and Trefethen 2004)."""
-    node_distances = position_in_node_steps - np.arange(node_count)
+    node_distances = position_in_node_steps - GRID_NODES
     if not node_distances.all():
         return np.asarray(node_distances == 0.0, dtype=np.float64)
-    weights = _compute_barycentric_weights(node_count) / node_distances
+    weights = BARYCENTRIC_WEIGHTS / node_distances
     return np.asarray(weights / weights.sum())
 
 
@@ -212,26 +200,30 @@ def fit_with_sigma_ratios(
 ) -> list[PositionFit]:
     """Fit constant errors (such as biases) to positions, for each ratio SIGMA_A / SIGMA_Z (1/s²).
 
-    The batches contain the same positions with different time offsets. The result has one fit for
-    each ratio. ``random_walk_to_sigma_z_ratio`` has the unit 1/√s.
+    The batches contain successive segments of the flight. The result has one fit for each ratio.
+    ``random_walk_to_sigma_z_ratio`` has the unit 1/√s.
     """
-    batches_over_sigma_z = (
-        positions.divide_sigmas_by_sigma_z(
-            sigma_z_m, random_walk_to_sigma_z_ratio, measurement_weights
+    fits_by_batch = []
+    end = 0
+    for positions in position_batches:
+        begin, end = end, end + len(positions.measurement_m)
+        positions_over_sigma_z, variance_m2 = positions.divide_sigmas_by_sigma_z(
+            sigma_z_m, random_walk_to_sigma_z_ratio, measurement_weights[begin:end]
         )
-        for positions in position_batches
-    )
-    fits_by_batch = [
-        [
-            fit_positions(positions_over_sigma_z, ratio, variance_m2)
-            for ratio in sigma_a_to_sigma_z_ratios
-        ]
-        for positions_over_sigma_z, variance_m2 in batches_over_sigma_z
-    ]
+        fits_by_batch.append(
+            [
+                fit_positions(positions_over_sigma_z, ratio, variance_m2)
+                for ratio in sigma_a_to_sigma_z_ratios
+            ]
+        )
     return [
         replace(
             batch_fits[0],
-            gram_matrix=np.concatenate([batch_fit.gram_matrix for batch_fit in batch_fits], axis=1),
+            gram_matrix=np.concatenate([batch_fit.gram_matrix for batch_fit in batch_fits]),
+            covariance_log_determinant=sum(
+                batch_fit.covariance_log_determinant for batch_fit in batch_fits
+            ),
+            degrees_of_freedom=sum(batch_fit.degrees_of_freedom for batch_fit in batch_fits),
         )
         for batch_fits in zip(*fits_by_batch, strict=True)
     ]
@@ -244,8 +236,8 @@ def fit_constant_errors(
 ) -> PositionFit:
     """Fit constant errors (such as biases) to positions, with given noise parameters.
 
-    The batches contain the same positions with different time offsets. The variance of a
-    measurement is SIGMA_Z² / weight.
+    The batches contain successive segments of the flight. The variance of a measurement is
+    SIGMA_Z² / weight.
     """
     sigma_z_m = noise_parameters.sigma_z_m
     if noise_parameters.correlated_sigma_m:
@@ -387,16 +379,11 @@ def maximise_likelihood(
         start_parameters = first_fit.noise_parameters
         outlier_fraction = first_fit.outlier_fraction
         outlier_sigma_ratio = first_fit.outlier_sigma_ratio
-    noise_parameters = start_parameters
-    for iteration in range(MAX_OUTLIER_ITERATIONS if fits_outliers else 0):
-        likelihood = NegativeLogLikelihood(
-            axis_positions, measurement_weights, start_parameters.sigma_z_m, is_coarse=True
-        )
-        noise_parameters = _maximise_by_gradient(
-            likelihood,
-            noise_parameters,
-            MAX_COARSE_ITERATIONS if iteration else MAX_FINAL_ITERATIONS,
-        )
+    likelihood = NegativeLogLikelihood(
+        axis_positions, measurement_weights, start_parameters.sigma_z_m
+    )
+    noise_parameters = _maximise_by_gradient(likelihood, start_parameters)
+    for _ in range(MAX_OUTLIER_ITERATIONS if fits_outliers else 0):
         expected_squared_errors_m2, measured_axis_counts = _estimate_squared_errors(
             axis_positions, noise_parameters, measurement_weights
         )
@@ -437,18 +424,18 @@ def maximise_likelihood(
             outlier_probability = previous_probability
             break
         measurement_weights = 1.0 - outlier_probability * (1.0 - outlier_sigma_ratio**-2.0)
+        likelihood = NegativeLogLikelihood(
+            axis_positions, measurement_weights, start_parameters.sigma_z_m
+        )
+        noise_parameters = _maximise_by_gradient(
+            likelihood,
+            replace(noise_parameters, sigma_z_m=float(np.sqrt(limited_sigma_z_variance_m2))),
+        )
         if (
             np.abs(outlier_probability - previous_probability).max()
             < MAX_OUTLIER_PROBABILITY_CHANGE
         ):
             break
-        noise_parameters = replace(
-            noise_parameters, sigma_z_m=float(np.sqrt(limited_sigma_z_variance_m2))
-        )
-    likelihood = NegativeLogLikelihood(
-        axis_positions, measurement_weights, start_parameters.sigma_z_m, is_coarse=is_long
-    )
-    noise_parameters = _maximise_by_gradient(likelihood, noise_parameters)
     log_sigma_z_variance_factor = 1.0
     if outlier_probability.any():
         expected_squared_errors_m2, measured_axis_counts = _estimate_squared_errors(
@@ -476,7 +463,7 @@ def estimate_outlier_probability(
 ) -> Array:
     """Return the probability of each measurement to be an outlier, with the noises of ``fit``."""
     outlier_probability = np.zeros(measurement_count)
-    for _ in range(MAX_COARSE_ITERATIONS):
+    for _ in range(OUTLIER_ITERATIONS_WITH_GIVEN_NOISES):
         measurement_weights = 1.0 - outlier_probability * (1.0 - fit.outlier_sigma_ratio**-2.0)
         expected_squared_errors_m2, measured_axis_counts = _estimate_squared_errors(
             axis_positions, fit.noise_parameters, measurement_weights
@@ -573,9 +560,7 @@ def compute_log_sigma_z_variance_factor(
 
 
 def _maximise_by_gradient(
-    likelihood: NegativeLogLikelihood,
-    start_parameters: NoiseParameters,
-    max_steps: int = MAX_FINAL_ITERATIONS,
+    likelihood: NegativeLogLikelihood, start_parameters: NoiseParameters
 ) -> NoiseParameters:
     nonzero_parameters = {name: value for name, value in vars(start_parameters).items() if value}
     log_bounds = np.log([NOISE_SEARCH_RANGES[name] for name in nonzero_parameters])
@@ -603,7 +588,7 @@ def _maximise_by_gradient(
             "eps": LOG_STEP_FOR_DERIVATIVES,
             "ftol": 1e-10,
             "gtol": 1e-8,
-            "maxiter": max_steps,
+            "maxiter": MAX_FIT_ITERATIONS,
         },
     )
     return to_noise_parameters(search_result.x)

@@ -10,8 +10,9 @@ is therefore repeated with several scale factors (Deming 1943).
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass, replace
+from functools import cache
 
 import numpy as np
 import pandas as pd
@@ -23,8 +24,9 @@ from scipy.special import chdtri
 from px4fuse.core.arrays import Array, ArrayPair, BoolArray, integrate_cumulatively
 from px4fuse.filter.likelihood import (
     PreintegratedMotion,
+    compute_gains,
+    compute_innovations_with_gains,
     fit_parabola_vertex,
-    innovations,
     integrate_acceleration,
     preintegrate,
 )
@@ -182,9 +184,8 @@ def fit_systematic_errors(
         return report_too_few_measurements(ANALYSIS_NAME, used_count, MIN_MEASUREMENTS)
     tested_sigmas_a = (sigma_a_m_s2 * TESTED_SIGMA_A_FACTORS).tolist()
     design_matrix, regression = _fit_sigma_a(design_matrix, tested_sigmas_a, is_skipped)
-    jumps, is_skipped = _find_jumps(
-        design_matrix, is_skipped, [time_s + clock_offset_s for time_s in source_resets_s]
-    )
+    shifted_resets_s = [time_s + clock_offset_s for time_s in source_resets_s]
+    jumps, is_skipped = _find_jumps(design_matrix, regression, is_skipped, shifted_resets_s)
     if jumps:
         design_matrix = replace(design_matrix, jump_times_s=[jump.time_s for jump in jumps])
         design_matrix, regression = _fit_sigma_a(design_matrix, tested_sigmas_a, is_skipped)
@@ -206,24 +207,39 @@ def _fit_sigma_a(
 ) -> tuple[DesignMatrix, InnovationRegression]:
     """Return the design matrix with the most likely SIGMA_A, and its least squares fit."""
     candidates = [replace(design_matrix, sigma_a_m_s2=sigma_a) for sigma_a in tested_sigmas_a]
-    fits = [(candidate, candidate.fit(is_skipped)) for candidate in candidates]
-    return min(fits, key=lambda matrix_and_fit: matrix_and_fit[1].score)
+    fit_candidate = cache(lambda index: candidates[index].fit(is_skipped))
+    best_index = _find_minimum(lambda index: fit_candidate(index).score, len(candidates))
+    return candidates[best_index], fit_candidate(best_index)
+
+
+def _find_minimum(compute_score: Callable[[int], float], count: int) -> int:
+    """Return the index with the lowest score: descend from the middle of a grid."""
+    index, best_index = -1, count // 2
+    while index != best_index:
+        index = best_index
+        neighbours = range(max(index - 1, 0), min(index + 2, count))
+        best_index = min(neighbours, key=compute_score)
+    return best_index
 
 
 def _fit_scale(design_matrix: DesignMatrix, is_skipped: BoolArray) -> Estimate:
     """Estimate the scale factor error of the positions from fits with several scale factors."""
-    fits = [design_matrix.fit(is_skipped, scale) for scale in TESTED_SCALE_FACTORS.tolist()]
-    # ln S is omitted from the score, because it would bias the scale factor to zero
-    scores = np.array([fit.residual_and_prior_square_sum / 2.0 for fit in fits])
-    centre_index = int(np.clip(np.argmin(scores), 1, len(fits) - 2))
-    vertex_shift, curvature = fit_parabola_vertex(scores, centre_index)
+    tested_scales = TESTED_SCALE_FACTORS.tolist()
+    fit_scale = cache(lambda index: design_matrix.fit(is_skipped, tested_scales[index]))
+
+    def compute_score(index: int) -> float:
+        # ln S is omitted from the score, because it would bias the scale factor to zero
+        return fit_scale(index).residual_and_prior_square_sum / 2.0
+
+    centre_index = _find_minimum(compute_score, len(tested_scales))
+    centre_index = min(max(centre_index, 1), len(tested_scales) - 2)
+    nearby_scores = np.array([compute_score(centre_index + shift) for shift in (-1, 0, 1)])
+    vertex_shift, curvature = fit_parabola_vertex(nearby_scores, 1)
     if curvature <= 0.0:
         return Estimate(0.0, math.inf)
-    grid_step = float(TESTED_SCALE_FACTORS[1] - TESTED_SCALE_FACTORS[0])
-    best_scale = (
-        TESTED_SCALE_FACTORS[centre_index] + float(np.clip(vertex_shift, -1.5, 1.5)) * grid_step
-    )
-    centre_fit = fits[centre_index]
+    grid_step = tested_scales[1] - tested_scales[0]
+    best_scale = tested_scales[centre_index] + float(np.clip(vertex_shift, -1.5, 1.5)) * grid_step
+    centre_fit = fit_scale(centre_index)
     length_factor_of_linear_rotation = math.hypot(
         1.0, centre_fit.coefficients[FRAME_ROTATION_COLUMN]
     )
@@ -234,11 +250,15 @@ def _fit_scale(design_matrix: DesignMatrix, is_skipped: BoolArray) -> Estimate:
 
 
 def _find_jumps(
-    design_matrix: DesignMatrix, is_skipped: BoolArray, source_resets_s: Sequence[float]
+    design_matrix: DesignMatrix,
+    fit: InnovationRegression,
+    is_skipped: BoolArray,
+    source_resets_s: Sequence[float],
 ) -> tuple[tuple[Jump, ...], BoolArray]:
     """Detect lasting jumps of the positions; return them in time order, and a mask of outliers.
 
     Tested times: resets of the source, first outliers of a burst, and the most likely time.
+    ``fit`` is the fit without jumps.
     """
     jumps: list[Jump] = []
     time_s = design_matrix.time_s
@@ -258,14 +278,13 @@ def _find_jumps(
         return is_skipped | _is_in_window(time_s, jump_time_s, OUTLIER_BURST_DURATION_S)
 
     for _ in range(MAX_JUMPS):
-        design_matrix = replace(design_matrix, jump_times_s=[jump.time_s for jump in jumps])
         outlier_run_starts_s = time_s[
             np.flatnonzero(is_skipped & ~np.append(False, is_skipped[:-1]))
         ]
         candidate_times_s = [
             *source_resets_s,
-            *_find_significant_jump_times(design_matrix, is_skipped, outlier_run_starts_s),
-            *_find_significant_jump_times(design_matrix, is_skipped, measurement_times_s)[:1],
+            *_find_significant_jump_times(design_matrix, fit, is_skipped, outlier_run_starts_s),
+            *_find_significant_jump_times(design_matrix, fit, is_skipped, measurement_times_s)[:1],
         ]
         max_false_alarm_p = MAX_JUMP_FALSE_ALARM_P / max(len(outlier_run_starts_s), 1)
         tested_jumps = [
@@ -281,6 +300,8 @@ def _find_jumps(
             design_matrix, is_skipped, max(significant_jumps, key=lambda jump: jump.chi_square)
         )
         jumps.append(best_jump)
+        design_matrix = replace(design_matrix, jump_times_s=[jump.time_s for jump in jumps])
+        fit = design_matrix.fit(is_skipped)
         source_resets_s = [
             reset_time_s
             for reset_time_s in source_resets_s
@@ -294,10 +315,13 @@ def _is_in_window(time_s: Array, start_s: float, duration_s: float) -> BoolArray
 
 
 def _find_significant_jump_times(
-    design_matrix: DesignMatrix, is_skipped: BoolArray, candidate_times_s: Array
+    design_matrix: DesignMatrix,
+    fit: InnovationRegression,
+    is_skipped: BoolArray,
+    candidate_times_s: Array,
 ) -> list[float]:
     """Return the times of significant jumps, largest χ² first."""
-    chi_square = _compute_jump_chi_squares(design_matrix, is_skipped, candidate_times_s)
+    chi_square = _compute_jump_chi_squares(design_matrix, fit, is_skipped, candidate_times_s)
     min_chi_square = chdtri(
         design_matrix.axis_count, MAX_JUMP_FALSE_ALARM_P / len(design_matrix.time_s)
     )
@@ -309,10 +333,12 @@ def _find_significant_jump_times(
 
 
 def _compute_jump_chi_squares(
-    design_matrix: DesignMatrix, is_skipped: BoolArray, candidate_times_s: Array
+    design_matrix: DesignMatrix,
+    fit_without_jump: InnovationRegression,
+    is_skipped: BoolArray,
+    candidate_times_s: Array,
 ) -> Array:
     """Return χ² of a jump at each time: the decrease of the sum of squared residuals."""
-    fit_without_jump = design_matrix.fit(is_skipped)
     columns_by_axis = np.split(fit_without_jump.columns, design_matrix.axis_count)
     chi_squares = np.zeros(len(candidate_times_s))
     for first in range(0, len(candidate_times_s), JUMP_BATCH_SIZE):
@@ -320,8 +346,8 @@ def _compute_jump_chi_squares(
         jump_steps = make_unit_steps(design_matrix.time_s, candidate_times_s[batch])
         zero_increments = np.zeros_like(jump_steps)
         jump_response = design_matrix.compute_normalised_innovations(
-            zero_increments, zero_increments, jump_steps, is_skipped
-        )[0][~is_skipped]
+            zero_increments, zero_increments, jump_steps, fit_without_jump.gains
+        )[~is_skipped]
         for columns, residual, residual_rms in zip(
             columns_by_axis,
             fit_without_jump.residual,
@@ -357,8 +383,11 @@ def _locate_jump(
 
     is_skipped = np.where(is_after_jump, test_for_outliers(jump.time_s), is_skipped)
     candidate_times_s = time_s[is_near_jump]
+    is_used_outlier = is_skipped & ~is_near_jump
     best_indices = np.argsort(
-        -_compute_jump_chi_squares(design_matrix, is_skipped & ~is_near_jump, candidate_times_s)
+        -_compute_jump_chi_squares(
+            design_matrix, design_matrix.fit(is_used_outlier), is_used_outlier, candidate_times_s
+        )
     )[:MAX_CANDIDATE_JUMP_TIMES]
     outlier_mask_by_jump_time = {
         jump_time_s: np.where(is_near_jump, test_for_outliers(jump_time_s), is_skipped)
@@ -421,6 +450,8 @@ class InnovationRegression:
         RMS of the residual; 1 if SIGMA_A and SIGMA_Z are correct.
     residual_rms_by_axis : ndarray, shape (axes,)
         RMS of the residual along each axis, but at least 1.
+    gains : ndarray, shape (3, m)
+        Innovation variance S (m²), position gain and velocity gain of KF.
     """
 
     columns: Array
@@ -431,6 +462,7 @@ class InnovationRegression:
     score: float
     residual_rms: float
     residual_rms_by_axis: Array
+    gains: Array
 
     def compute_residual_squares(self) -> Array:
         """Return the squared residual of each measurement, summed over axes.
@@ -485,22 +517,18 @@ class DesignMatrix:
         return replace(self, jump_times_s=jump_times_s).fit(is_skipped), jump_columns
 
     def compute_normalised_innovations(
-        self, dp: Array, dv: Array, measured_m: Array, is_skipped: BoolArray, scale: float = 1.0
-    ) -> tuple[Array, float]:
-        """Run KF on several inputs; return normalised innovations ν/√S, one column per input.
-
-        The second result is Σ ln S over the fused measurements. SIGMA_A is multiplied by ``scale``.
-        """
+        self, dp: Array, dv: Array, measured_m: Array, gains: Array
+    ) -> Array:
+        """Run KF on several inputs; return normalised innovations ν/√S, one column per input."""
         preintegrated_inputs = replace(
             self.preintegrated_inputs,
             delta_position_m=dp,
             delta_velocity_m_s=dv,
             measurement_m=measured_m,
         )
-        nu, s = innovations(
-            preintegrated_inputs, scale * self.sigma_a_m_s2, self.sigma_z_m, is_skipped
-        )
-        return nu / np.sqrt(s)[:, None], float(np.sum(np.log(s[~is_skipped])))
+        s, *state_gains = gains
+        nu = compute_innovations_with_gains(preintegrated_inputs, *state_gains)
+        return np.asarray(nu / np.sqrt(s)[:, None])
 
     def fit(self, is_skipped: BoolArray, scale: float = 1.0) -> InnovationRegression:
         """Fit biases, rotation, slow error and jumps to KF's innovations by least squares.
@@ -508,9 +536,11 @@ class DesignMatrix:
         ``scale`` is a trial scale factor of the positions; the acceleration is multiplied by it.
         ``is_skipped`` is True for measurements that are not used.
         """
-        innovations_of_data, columns, sum_of_log_variances = (
-            self.compute_innovations_and_design_matrix(is_skipped, scale)
+        gains = compute_gains(
+            self.preintegrated_inputs, scale * self.sigma_a_m_s2, self.sigma_z_m, is_skipped
         )
+        innovations_of_data, columns = self.compute_innovations_and_design_matrix(gains, scale)
+        sum_of_log_variances = self.axis_count * float(np.sum(np.log(gains[0, ~is_skipped])))
         is_used = np.tile(~is_skipped, self.axis_count)
         used_innovations, used_columns = innovations_of_data[is_used], columns[is_used]
         prior_precision = np.zeros(columns.shape[1])
@@ -536,12 +566,11 @@ class DesignMatrix:
             0.5 * (square_sum + sum_of_log_variances + log_determinant),
             math.sqrt(max(square_sum, 0.0) / degrees_of_freedom),
             np.sqrt(np.maximum(mean_squares, 1.0)),
+            gains,
         )
 
-    def compute_innovations_and_design_matrix(
-        self, is_skipped: BoolArray, scale: float = 1.0
-    ) -> tuple[Array, Array, float]:
-        """Return KF's normalised innovations ν/√S, the design matrix, and Σ ln S."""
+    def compute_innovations_and_design_matrix(self, gains: Array, scale: float = 1.0) -> ArrayPair:
+        """Return KF's normalised innovations ν/√S, and the design matrix."""
         inputs, axis_count = self.preintegrated_inputs, self.axis_count
         input_count = inputs.measurement_m.shape[1]
         # Only inputs with measured acceleration are multiplied by the scale factor
@@ -551,12 +580,11 @@ class DesignMatrix:
         input_scale_factors[data_inputs + 1 + FRAME_ROTATION_COLUMN] = scale
         jump_steps = make_unit_steps(self.time_s, self.jump_times_s)
         zero_increments = np.zeros_like(jump_steps)
-        responses, sum_of_log_variances = self.compute_normalised_innovations(
+        responses = self.compute_normalised_innovations(
             np.hstack([input_scale_factors * inputs.delta_position_m, zero_increments]),
             np.hstack([input_scale_factors * inputs.delta_velocity_m_s, zero_increments]),
             np.hstack([inputs.measurement_m, jump_steps]),
-            is_skipped,
-            scale,
+            gains,
         )
         *responses_by_axis, slow_error_responses, jump_responses = np.split(
             responses, [*(data_inputs + INPUTS_PER_AXIS), input_count], axis=1
@@ -568,7 +596,7 @@ class DesignMatrix:
             np.kron(np.eye(axis_count), slow_error_responses),
             np.kron(np.eye(axis_count), jump_responses),
         ]
-        return stacked_responses[:, 0], np.hstack(columns), axis_count * sum_of_log_variances
+        return stacked_responses[:, 0], np.hstack(columns)
 
 
 def make_design_matrix(

@@ -24,7 +24,11 @@ from scipy.spatial.transform import Rotation, Slerp
 from px4fuse.core.arrays import Array, IntArray, integrate_cumulatively
 from px4fuse.core.record import Span
 from px4fuse.filter.fitting import NoiseParameters, fit_with_sigma_ratios
-from px4fuse.filter.marginal_likelihood import PositionsAndIncrements, subtract_smooth_path
+from px4fuse.filter.marginal_likelihood import (
+    MAX_BATCH_ELEMENTS,
+    PositionsAndIncrements,
+    subtract_smooth_path,
+)
 from px4fuse.filter.model import compute_continuous_process_noise_per_density
 from px4fuse.filter.signals import find_imu_gaps
 from px4fuse.flight.model import Columns, Flight, Unavailable, rows_between
@@ -52,8 +56,6 @@ MAX_SEGMENT_DURATION_S = 30.0
 MAX_TESTED_TIME_OFFSET_S = 0.6
 COARSE_OFFSET_COUNT = 25
 COARSE_MEASUREMENT_COUNT = 600
-# Maximum number of array elements at once, to limit the memory
-MAX_BATCH_ELEMENTS = 2**16
 # Minimum number of position measurements in all segments together
 MIN_TOTAL_MEASUREMENTS = 30
 MIN_SEGMENT_MEASUREMENTS = 15
@@ -202,21 +204,32 @@ class PositionsAndImuMotion:
 
         The scale factor of the positions can be estimated from the result.
         """
-        return next(self.make_position_batches(np.array([offset_s])))
+        positions = self.make_positions_and_increments(np.array([offset_s]))
+        return subtract_smooth_path(positions, estimates_scale=True)
 
     def make_position_batches(
         self, time_offsets_s: Array, *, estimates_scale: bool = True
     ) -> Iterator[PositionsAndIncrements]:
-        """Yield positions and IMU increments for batches of time offsets.
+        """Yield positions and IMU increments for all time offsets, a few segments at once.
 
         With ``estimates_scale``, the scale factor of the positions can be estimated.
         """
-        values_per_offset = (
-            len(self.time_s) * len(self.directions) * (1 + len(PRIOR_SIGMAS_OF_SEGMENT_CONSTANTS))
+        element_count = (
+            len(time_offsets_s) * self.measurement_m.size * len(PRIOR_SIGMAS_OF_SEGMENT_CONSTANTS)
         )
-        batch_size = max(1, MAX_BATCH_ELEMENTS // values_per_offset)
-        for batch in np.split(time_offsets_s, range(batch_size, len(time_offsets_s), batch_size)):
-            positions = self.make_positions_and_increments(batch)
+        segment_count = len(self.segment_motions)
+        batch_count = min(-(-element_count // MAX_BATCH_ELEMENTS), segment_count)
+        for batch in np.array_split(np.arange(segment_count), batch_count):
+            edges = self.segment_edges[batch[0] : batch[-1] + 2]
+            rows = slice(edges[0], edges[-1])
+            batch_motion = replace(
+                self,
+                time_s=self.time_s[rows],
+                measurement_m=self.measurement_m[rows],
+                segment_edges=edges - edges[0],
+                segment_motions=self.segment_motions[batch[0] : batch[-1] + 1],
+            )
+            positions = batch_motion.make_positions_and_increments(time_offsets_s)
             yield (
                 subtract_smooth_path(positions, estimates_scale=True)
                 if estimates_scale

@@ -6,8 +6,8 @@ import numpy as np
 
 from px4fuse.core.arrays import compute_median_interval_s, integrate_cumulatively
 from px4fuse.filter.frame_rotation import heading_rad
-from px4fuse.filter.signals import Segment, compute_ned_acceleration, cut_to_segment
-from px4fuse.flight.model import Columns, Flight, PositionTrack, Unavailable
+from px4fuse.filter.signals import Acceleration, Segment, cut_to_segment
+from px4fuse.flight.model import Columns, PositionTrack, TableOrUnavailable, Unavailable
 
 MIN_POSITIONS = 100
 # Tested frequencies (Hz), and maximum as fraction of the position rate
@@ -29,29 +29,30 @@ class ImuOscillation(NamedTuple):
 
 
 def find_imu_oscillation(
-    flight: Flight, source: PositionTrack, segment: Segment
+    acceleration: Acceleration | Unavailable,
+    attitude: TableOrUnavailable,
+    source: PositionTrack,
+    segment: Segment,
 ) -> ImuOscillation | None:
     """Find an oscillation of the horizontal acceleration that the positions do not contain.
 
     Second differences of the positions are compared with those of the doubly integrated
     acceleration, in axes that turn with the heading. Complex numbers are north + i east.
     """
-    acceleration_m_s2, attitude = compute_ned_acceleration(flight), flight.attitude
     samples = cut_to_segment(source.samples, segment)[Columns.POSITION[:2]].dropna()
-    if isinstance(acceleration_m_s2, Unavailable) or isinstance(attitude, Unavailable):
+    if isinstance(acceleration, Unavailable) or isinstance(attitude, Unavailable):
         return None
     if len(samples) < MIN_POSITIONS:
         return None
-    source_time_s, imu_time_s = samples.index.to_numpy(), acceleration_m_s2.index.to_numpy()
+    source_time_s, imu_time_s = samples.index.to_numpy(), acceleration.time_s
     interval_s = compute_median_interval_s(source_time_s)
     time_s = np.arange(
         max(source_time_s[0], imu_time_s[0]), min(source_time_s[-1], imu_time_s[-1]), interval_s
     )
     if len(time_s) < MIN_POSITIONS:
         return None
-    imu_position_m = acceleration_m_s2[["north", "east"]].to_numpy()
-    for _ in range(2):
-        imu_position_m = integrate_cumulatively(imu_position_m, imu_time_s)
+    velocity_m_s = acceleration.acceleration_integral_m_s[:2].T
+    imu_position_m = integrate_cumulatively(velocity_m_s, imu_time_s)
     positions_m = np.stack(
         [
             np.interp(time_s, source_time_s, samples.to_numpy() @ [1.0, 1j]),
@@ -72,21 +73,26 @@ def find_imu_oscillation(
         frequencies_hz,
         [MIN_FREQUENCY_HZ, min(MAX_FREQUENCY_HZ, MAX_FREQUENCY_TO_RATE_RATIO / interval_s)],
     )
+    peaks = 1 + np.flatnonzero(
+        (error_power[1:-1] > error_power[:-2]) & (error_power[1:-1] > error_power[2:])
+    )
+    peaks = peaks[(peaks >= first) & (peaks < end)]
     band_rows = np.searchsorted(
         frequencies_hz,
-        np.outer([1.0 / BAND_LIMIT_RATIO, BAND_LIMIT_RATIO], frequencies_hz[first:end]),
+        np.outer([1.0 / BAND_LIMIT_RATIO, BAND_LIMIT_RATIO], frequencies_hz[peaks]),
     ).T
     medians = [np.median(error_power[low : high + 1]) for low, high in band_rows]
     if not medians:
         return None
-    peak = first + int(np.argmax(error_power[first:end] / medians))
+    peak_index = int(np.argmax(error_power[peaks] / medians))
+    peak = peaks[peak_index]
     frequency_hz = float(frequencies_hz[peak])
     # A Hann window spreads a line over 3 bins with 1.5 times the power of the middle bin
     amplitude_m = 2.0 * np.sqrt(imu_power[peak] / 3.0) / window.sum()
     acceleration_per_difference = np.pi * frequency_hz / np.sin(np.pi * frequency_hz * interval_s)
     oscillation = ImuOscillation(frequency_hz, float(amplitude_m * acceleration_per_difference**2))
     is_oscillating = (
-        error_power[peak] > MIN_PEAK_TO_MEDIAN_POWER * medians[peak - first]
+        error_power[peak] > MIN_PEAK_TO_MEDIAN_POWER * medians[peak_index]
         and source_power[peak] < MAX_SOURCE_TO_IMU_POWER * imu_power[peak]
         and oscillation.amplitude_m_s2 > MIN_AMPLITUDE_M_S2
     )

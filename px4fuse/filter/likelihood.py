@@ -158,6 +158,20 @@ def innovations(
     is_skipped : ndarray of bool, shape (m,), optional
         True for measurements that KF does not fuse. Their innovation is also returned.
     """
+    gains = compute_gains(preintegrated_motion, sigma_a_m_s2, sigma_z_m, is_skipped)
+    return compute_innovations_with_gains(preintegrated_motion, *gains[1:]), gains[0]
+
+
+def compute_gains(
+    preintegrated_motion: PreintegratedMotion,
+    sigma_a_m_s2: float,
+    sigma_z_m: float,
+    is_skipped: BoolArray | None = None,
+) -> Array:
+    """Return the innovation variance S (m²), position gain and velocity gain of each measurement.
+
+    The result has the shape (3, m). They do not depend on the measured positions.
+    """
     q, r = sigma_a_m_s2 * sigma_a_m_s2, sigma_z_m * sigma_z_m
     covariance: SymmetricElements[float] = INITIAL_COVARIANCE
     variance_and_gains_by_measurement = []
@@ -190,7 +204,13 @@ def innovations(
         (_, s, k0, k1), (_, _, updated_covariance) = update_step(0.0, 0.0, covariance, 0.0, r)
         variance_and_gains_by_measurement.append((s, 0.0, 0.0) if skips_update else (s, k0, k1))
         covariance = covariance if skips_update else updated_covariance
-    s, k0, k1 = np.array(variance_and_gains_by_measurement).T
+    return np.array(variance_and_gains_by_measurement).T
+
+
+def compute_innovations_with_gains(
+    preintegrated_motion: PreintegratedMotion, k0: Array, k1: Array
+) -> Array:
+    """Run KF with given position and velocity gains; return the innovation ν (m)."""
     # The predicted states solve linear equations, so LAPACK computes all of them at once
     dt = preintegrated_motion.interval_s[1:]
     position_gain = k0[:-1] + dt * k1[:-1]
@@ -205,19 +225,19 @@ def innovations(
         initial_state.position_m + preintegrated_motion.interval_s[0] * initial_state.velocity_m_s
     )
     right_hand_side[..., 0, 1] += initial_state.velocity_m_s
-    bands = np.zeros((len(s), 2, 4))
+    bands = np.zeros((len(k0), 2, 4))
     bands[:-1, 1, 1] = -dt
     bands[:-1, 0, 2] = position_gain - 1.0
     bands[:-1, 1, 2] = -1.0
     bands[:-1, 0, 3] = k1[:-1]
     state, _ = lapack.dtbtrs(
         bands.reshape(-1, 4).T,
-        right_hand_side.reshape(-1, 2 * len(s)).T,
+        right_hand_side.reshape(-1, 2 * len(k0)).T,
         uplo="L",
         diag="U",
         overwrite_b=1,
     )
-    return np.asarray((measured_m - state[::2].T.reshape(measured_m.shape)).T), s
+    return np.asarray((measured_m - state[::2].T.reshape(measured_m.shape)).T)
 
 
 def fit_parabola_vertex(profile: Array, index: int) -> tuple[float, float]:

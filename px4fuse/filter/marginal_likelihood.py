@@ -33,6 +33,8 @@ PATH_SMOOTHER_SIGMA_A_M_S2, PATH_SMOOTHER_SIGMA_Z_M = 0.5, 0.1
 MIN_PRECISION_OF_KNOWN_STATE = 1e-3
 # Q can be singular, so a small variance is added to Q₀₀: its σ as a fraction of √(R + Q₀₀)
 REGULARISATION_TO_POSITION_SIGMA_RATIO = 1e-5
+# Maximum number of array elements at once, to limit the memory
+MAX_BATCH_ELEMENTS = 2**16
 # Number of inner products that are computed at once, to limit the memory
 INNER_PRODUCTS_PER_BATCH = 8
 # Minimum ratio |Q| / (Q₀₀ Q₁₁): a smaller determinant is a rounding error
@@ -290,7 +292,10 @@ def fit_positions(
     measured_input_count = measured_m.shape[2]
     dp = positions.delta_position_m
     dv = positions.delta_velocity_m_s
-    gram_matrix = np.zeros((len(positions.segment_starts), *dp.shape[1:3], dp.shape[2]))
+    segment_count = len(positions.segment_starts)
+    segment_edges = np.append(positions.segment_starts, len(positions.measurement_m))
+    batch_count = -(-dp.size // MAX_BATCH_ELEMENTS)
+    gram_matrix = np.zeros((segment_count, *dp.shape[1:3], dp.shape[2]))
     log_determinant = 0.0
     degrees_of_freedom = 0
     for axes, system, axis_degrees_of_freedom in positions.factorise_equations(
@@ -298,31 +303,46 @@ def fit_positions(
     ):
         log_determinant += len(axes) * system.log_determinant
         degrees_of_freedom += len(axes) * axis_degrees_of_freedom
-        # segment by segment, which limits memory
-        for index, (begin, end) in enumerate(positions.segments):
+        # Several segments at once: one at a time is slow, all of a long flight need much memory
+        for batch in np.array_split(np.arange(segment_count), min(batch_count, segment_count)):
+            begin, end = segment_edges[[batch[0], batch[-1] + 1]]
+            edges = segment_edges[batch[0] : batch[-1] + 2] - begin
             rows, interval_index = slice(begin, end), np.s_[axes, ..., begin : end - 1]
-            segment_measured_m = measured_m[axes, ..., rows]
-            whitened_increments, part_explained_by_states = system.select_segment(rows).whiten(
-                segment_measured_m, dp[interval_index], dv[interval_index]
-            )
-            measurements_over_sigma = np.sqrt(system.precision[rows, 0]) * segment_measured_m
-            gram_matrix[index] += _compute_gram_matrix(whitened_increments) - _compute_gram_matrix(
-                part_explained_by_states
-            )
-            gram_matrix[index, :, :measured_input_count, :measured_input_count] += (
-                _compute_gram_matrix(measurements_over_sigma)
+            batch_measured_m = measured_m[axes, ..., rows]
+            increments = dp[interval_index], dv[interval_index]
+            batch_system = system.select_rows(rows)
+            weighted_increments = batch_system.weight_increments(*increments)
+            part_explained_by_states = batch_system.whiten(batch_measured_m, *weighted_increments)
+            for sign, left, right, values_per_measurement in (
+                (1.0, increments[0], weighted_increments[0], 1),
+                (1.0, increments[1], weighted_increments[1], 1),
+                (-1.0, part_explained_by_states, part_explained_by_states, system.state_count),
+            ):
+                gram_matrix[batch] += sign * _compute_inner_products(
+                    left, right, values_per_measurement * edges
+                )
+            gram_matrix[batch, :, :measured_input_count, :measured_input_count] += (
+                _compute_inner_products(
+                    system.precision[rows, 0] * batch_measured_m, batch_measured_m, edges
+                )
             )
     return PositionFit(
         gram_matrix, log_determinant, degrees_of_freedom, positions.constant_prior_sigmas
     )
 
 
-def _compute_gram_matrix(whitened_inputs: Array) -> Array:
-    """Return the inner products of the inputs, summed over the axes.
+def _compute_inner_products(left: Array, right: Array, segment_edges: IntArray) -> Array:
+    """Return the inner products of inputs in each segment, summed over the axes.
 
-    ``whitened_inputs`` has the shape (axes, ..., inputs, values).
+    ``left`` and ``right`` have the shape (axes, ..., inputs, values). ``segment_edges`` contains
+    the index of the first value of each segment, then the end of the last segment.
     """
-    return np.asarray((whitened_inputs @ np.swapaxes(whitened_inputs, -1, -2)).sum(axis=0))
+    right = np.swapaxes(right, -1, -2)
+    products = [
+        left[..., begin:end] @ right[..., begin:end, :]
+        for begin, end in pairwise(segment_edges.tolist())
+    ]
+    return np.asarray(np.sum(products, axis=1))
 
 
 def subtract_smooth_path(
@@ -472,8 +492,6 @@ class BandedNormalEquations:
         Time between successive measurements.
     inverse_q : ndarray, shape (3, m - 1)
         Elements 00, 01, 11 of Q⁻¹; zero between segments.
-    inverse_velocity_noise_sigma : ndarray, shape (m - 1,)
-        1/√Q₁₁, with the velocity variance Q₁₁; zero between segments.
     bands, cholesky_factor : ndarray, shape (2 + state_count, state_count · m)
         A and its Cholesky factor in LAPACK's band storage.
     log_determinant : float
@@ -483,7 +501,6 @@ class BandedNormalEquations:
     precision: Array
     interval_s: Array
     inverse_q: Array
-    inverse_velocity_noise_sigma: Array
     bands: Array
     cholesky_factor: Array
     log_determinant: float
@@ -493,8 +510,8 @@ class BandedNormalEquations:
         """2 (position, velocity), or 3 with time-correlated noise."""
         return len(self.bands) - 2
 
-    def select_segment(self, rows: slice) -> BandedNormalEquations:
-        """Return the equations of the measurements in one segment."""
+    def select_rows(self, rows: slice) -> BandedNormalEquations:
+        """Return the equations of the measurements in one or more segments."""
         state_columns = slice(self.state_count * rows.start, self.state_count * rows.stop)
         interval_rows = slice(rows.start, rows.stop - 1)
         return replace(
@@ -502,30 +519,32 @@ class BandedNormalEquations:
             precision=self.precision[rows],
             interval_s=self.interval_s[interval_rows],
             inverse_q=self.inverse_q[:, interval_rows],
-            inverse_velocity_noise_sigma=self.inverse_velocity_noise_sigma[interval_rows],
             bands=self.bands[:, state_columns],
             cholesky_factor=self.cholesky_factor[:, state_columns],
         )
 
-    def whiten(
-        self, measured_m: Array, delta_position_m: Array, delta_velocity_m_s: Array
-    ) -> ArrayPair:
-        """Return two arrays for the inner products of inputs in :func:`fit_positions`.
-
-        The first array contains Δp and Δv divided by the square root of Q. The second array
-        contains the part of each input that the states explain.
-        """
-        whitened_increments, right_hand_side = self._whiten_increments(
-            measured_m, delta_position_m, delta_velocity_m_s
+    def weight_increments(self, delta_position_m: Array, delta_velocity_m_s: Array) -> ArrayPair:
+        """Return Q⁻¹ [Δp, Δv] of each interval."""
+        inverse_q00, inverse_q01, inverse_q11 = self.inverse_q
+        return (
+            inverse_q00 * delta_position_m + inverse_q01 * delta_velocity_m_s,
+            inverse_q01 * delta_position_m + inverse_q11 * delta_velocity_m_s,
         )
+
+    def whiten(self, measured_m: Array, *weighted_increments: Array) -> Array:
+        """Return the part of each input that the states explain, shape (..., values).
+
+        Its inner products are weighted by the inverse covariance.
+        """
+        right_hand_side = self._make_right_hand_side(measured_m, *weighted_increments)
         # LAPACK solves a triangular system with unit diagonal 30 % faster
         diagonal = self.cholesky_factor[0]
         unit_diagonal_factor = self.cholesky_factor / diagonal
         part_explained_by_states, _ = lapack.dtbtrs(
             unit_diagonal_factor, right_hand_side.T, uplo="L", diag="U", overwrite_b=1
         )
-        return whitened_increments, (part_explained_by_states.T / diagonal).reshape(
-            *delta_position_m.shape[:-1], -1
+        return np.asarray(
+            (part_explained_by_states.T / diagonal).reshape(*weighted_increments[0].shape[:-1], -1)
         )
 
     def solve(self, measured_m: Array, delta_position_m: Array, delta_velocity_m_s: Array) -> Array:
@@ -533,46 +552,24 @@ class BandedNormalEquations:
 
         States: position (m), velocity (m/s), and time-correlated noise (m) if it is fitted.
         """
-        _, right_hand_side = self._whiten_increments(
-            measured_m, delta_position_m, delta_velocity_m_s
+        right_hand_side = self._make_right_hand_side(
+            measured_m, *self.weight_increments(delta_position_m, delta_velocity_m_s)
         )
         state, _ = lapack.dpbtrs(self.cholesky_factor, right_hand_side.T, lower=1, overwrite_b=1)
         return np.asarray(state.T.reshape(*delta_position_m.shape[:-1], -1, self.state_count))
 
-    def _whiten_increments(
-        self, measured_m: Array, delta_position_m: Array, delta_velocity_m_s: Array
-    ) -> ArrayPair:
-        """Return Δp and Δv divided by the square root of Q, and the right-hand side b of Ax = b."""
-        inverse_q00, inverse_q01, _ = self.inverse_q
-        # Elements 00 and 01 of the Cholesky factor U of Q⁻¹ = UᵀU
-        factor_00 = np.sqrt(inverse_q00)
-        factor_01 = np.divide(
-            inverse_q01, factor_00, out=np.zeros_like(inverse_q01), where=factor_00 > 0.0
-        )
-        whitened_increments = np.empty((*delta_position_m.shape, 2))
-        whitened_increments[..., 0] = factor_00 * delta_position_m + factor_01 * delta_velocity_m_s
-        whitened_increments[..., 1] = self.inverse_velocity_noise_sigma * delta_velocity_m_s
-        g0 = factor_00 * whitened_increments[..., 0]
-        g1 = (
-            factor_01 * whitened_increments[..., 0]
-            + self.inverse_velocity_noise_sigma * whitened_increments[..., 1]
-        )
-        right_hand_side = np.zeros(
-            (*delta_position_m.shape[:-1], len(self.precision), self.state_count)
-        )
+    def _make_right_hand_side(self, measured_m: Array, g0: Array, g1: Array) -> Array:
+        """Return the right-hand side b of Ax = b; ``g0`` and ``g1`` are Q⁻¹ [Δp, Δv]."""
+        right_hand_side = np.zeros((*g0.shape[:-1], len(self.precision), self.state_count))
         right_hand_side[..., 1:, 0] = g0
         right_hand_side[..., 1:, 1] = g1
         right_hand_side[..., :-1, 0] -= g0
-        g0 *= self.interval_s
-        g0 += g1
-        right_hand_side[..., :-1, 1] -= g0
+        right_hand_side[..., :-1, 1] -= self.interval_s * g0 + g1
         weighted_measurements = self.precision[:, 0] * measured_m
         right_hand_side_of_first_inputs = right_hand_side[..., : measured_m.shape[-2], :, :]
         right_hand_side_of_first_inputs[..., 0] += weighted_measurements
         right_hand_side_of_first_inputs[..., 2:] += weighted_measurements[..., None]
-        return whitened_increments.reshape(
-            *delta_position_m.shape[:-1], -1
-        ), right_hand_side.reshape(-1, self.state_count * len(self.precision))
+        return right_hand_side.reshape(-1, self.state_count * len(self.precision))
 
     def position_variance(self) -> Array:
         """Return the variance (m²) of the smoothed position at each measurement.
@@ -695,12 +692,10 @@ def factorise(
         + process_noise_log_determinant
         - np.sum(np.log(measurement_and_prior_precision[measurement_and_prior_precision > 0.0]))
     )
-    inverse_velocity_noise_sigma = np.where(is_within_segment, 1.0 / np.sqrt(q11), 0.0)
     return BandedNormalEquations(
         measurement_and_prior_precision,
         interval_s,
         inverse_q,
-        inverse_velocity_noise_sigma,
         bands,
         cholesky_factor,
         float(log_determinant),

@@ -44,6 +44,8 @@ MAX_OUTLIER_FRACTION = 0.3
 START_SIGMA_A_FACTORS = (0.1, 0.3, 1.0)
 # Initial value (m/√s) of the random walk of a source that may drift
 START_RANDOM_WALK_M = 0.02
+# Change of ln SIGMA_A between the first two values in the search for KF's SIGMA_A
+SIGMA_A_BRACKET_WIDTH = 0.1
 # Estimates within this factor of an end of the search range are reported as bounds only
 SEARCH_RANGE_END_TOLERANCE_FACTOR = 1.001
 
@@ -327,13 +329,15 @@ def _estimate_noise(fit: NoiseFit, noise_index: int) -> NoiseEstimate:
 
 
 def _estimate_kf_sigma_a(fit: NoiseFit, sigma_z_m: float) -> NoiseEstimate:
-    def score(log_sigma_a: float, _: float = 0.0) -> float:
-        return fit.score(NoiseParameters(float(np.exp(log_sigma_a)), sigma_z_m))
-
     low_log_sigma, high_log_sigma = np.log(SIGMA_A_SEARCH_RANGE_M_S2)
-    best_log_sigma_a = float(
-        minimize_scalar(score, bounds=(low_log_sigma, high_log_sigma), options={"xatol": 1e-3}).x
-    )
+
+    def score(log_sigma_a: float, _: float = 0.0) -> float:
+        sigma_a_m_s2 = float(np.exp(min(max(log_sigma_a, low_log_sigma), high_log_sigma)))
+        return fit.score(NoiseParameters(sigma_a_m_s2, sigma_z_m))
+
+    start = float(np.log(fit.noise_parameters.sigma_a_m_s2))
+    bracket = (start - SIGMA_A_BRACKET_WIDTH, start)
+    best_log_sigma_a = float(minimize_scalar(score, bracket, options={"xtol": 1e-4}).x)
     return _make_noise_estimate(score, (best_log_sigma_a, 0.0), SIGMA_A_SEARCH_RANGE_M_S2)
 
 

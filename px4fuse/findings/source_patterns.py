@@ -19,7 +19,6 @@ from px4fuse.comparison.error_patterns import (
     fit_errors,
 )
 from px4fuse.core.text import format_metres, format_ratio
-from px4fuse.filter.imu_oscillation import find_imu_oscillation
 from px4fuse.filter.time_offset import SourceTimeOffset
 from px4fuse.findings.model import (
     Findings,
@@ -141,7 +140,7 @@ def detect_imu_oscillation(analysis: Analysis) -> Findings:
     """Detect an oscillation of the accelerometer that the positions do not contain."""
     if find_low_pass(analysis) is not None:  # the filter may remove the motion from the positions
         return
-    oscillation = find_imu_oscillation(analysis.flight, analysis.source, analysis.segment)
+    oscillation = analysis.imu_oscillation
     if oscillation is not None:
         yield make_warning(
             "accelerometer_oscillation",

@@ -4,7 +4,6 @@ from collections.abc import Mapping
 from dataclasses import replace
 
 import numpy as np
-import pandas as pd
 from scipy.interpolate import CubicHermiteSpline
 
 from px4fuse.analysis import Analysis
@@ -16,7 +15,6 @@ from px4fuse.convention.lever_arm import (
     estimate_lever_arm,
     find_imu_position_m,
 )
-from px4fuse.core.arrays import Array
 from px4fuse.core.text import format_metres
 from px4fuse.ekf2.model import misalign_positions, replay_with_settings
 from px4fuse.ekf2.replay import rows_inside
@@ -56,6 +54,8 @@ MAX_DISTANCE_OF_FUSED_COPY_M = 0.001
 MIN_SPEED_FOR_COPY_TEST_M_S = 0.2
 # Tested delays (s) between EKF2's position and a source that sends it back
 TESTED_COPY_DELAYS_S = np.arange(0.0, 0.305, 0.005)
+# Number of positions with which these delays are tested
+COPY_DELAY_POSITIONS = 300
 # Finding id, fault and action for each reason of an invalid position
 INVALID_POSITION_TEXTS: Mapping[str, tuple[str, str, str]] = {
     "zero": (
@@ -291,11 +291,30 @@ def detect_copied_estimate(analysis: Analysis) -> Findings:
     samples, state = analysis.source_samples[Columns.POSITION].dropna(), ekf2.state.dropna()
     if len(samples) < WINDOW_SAMPLES or len(state) < WINDOW_SAMPLES:
         return
-    time_s, position_m = samples.index.to_numpy(), samples.to_numpy()
-    distance_m, delay_s = min(
-        (_compute_median_distance_m(position_m, time_s - delay_s, state), delay_s)
-        for delay_s in TESTED_COPY_DELAYS_S.tolist()
+    ekf2_position_spline = CubicHermiteSpline(
+        state.index, state[Columns.POSITION], state[Columns.VELOCITY]
     )
+
+    def compute_median_distance_m(delay_s: float, interval: int = 1) -> float:
+        """Return the median distance (m) of every ``interval``-th position from EKF2's position."""
+        positions = samples[::interval]
+        time_s = positions.index.to_numpy() - delay_s
+        is_moving = (
+            np.linalg.norm(ekf2_position_spline(time_s, 1), axis=1) > MIN_SPEED_FOR_COPY_TEST_M_S
+        )
+        is_inside = (time_s > state.index[0]) & (time_s < state.index[-1]) & is_moving
+        if np.count_nonzero(is_inside) < WINDOW_SAMPLES:
+            return np.inf
+        distance_m = np.linalg.norm(positions - ekf2_position_spline(time_s), axis=1)
+        return float(np.median(distance_m[is_inside]))
+
+    # Some of the positions are sufficient to find the delay
+    interval = max(1, len(samples) // COPY_DELAY_POSITIONS)
+    delay_s = min(
+        TESTED_COPY_DELAYS_S.tolist(),
+        key=lambda delay_s: compute_median_distance_m(delay_s, interval),
+    )
+    distance_m = compute_median_distance_m(delay_s)
     fusion_flags = ekf2.fusion_flags
     is_fused = isinstance(fusion_flags, Unavailable) or bool(
         (fusion_flags["horizontal"][segment.start_s : segment.end_s] > 0.0).any()
@@ -313,19 +332,3 @@ def detect_copied_estimate(analysis: Analysis) -> Findings:
         "position (MAVROS local_position) to its vision input.",
         {"delay_s": delay_s, "difference_m": distance_m},
     )
-
-
-def _compute_median_distance_m(position_m: Array, time_s: Array, ekf2_state: pd.DataFrame) -> float:
-    """Return the median distance (m) from EKF2's position at ``time_s``; infinity if unknown."""
-    state_times_s = ekf2_state.index.to_numpy()
-    ekf2_position_spline = CubicHermiteSpline(
-        state_times_s, ekf2_state[Columns.POSITION], ekf2_state[Columns.VELOCITY]
-    )
-    is_moving = (
-        np.linalg.norm(ekf2_position_spline(time_s, 1), axis=1) > MIN_SPEED_FOR_COPY_TEST_M_S
-    )
-    is_inside = (time_s > state_times_s[0]) & (time_s < state_times_s[-1]) & is_moving
-    if np.count_nonzero(is_inside) < WINDOW_SAMPLES:
-        return np.inf
-    distance_m = np.linalg.norm(position_m - ekf2_position_spline(time_s), axis=1)
-    return float(np.median(distance_m[is_inside]))
