@@ -66,9 +66,8 @@ def to_matrix(q: Array) -> Array:
 
 def rotate(matrices: Array, vectors: Array) -> Array:
     """Multiply n matrices with n vectors, one by one, shape (n, 3)."""
-    # Column by column: for float32 matrices, four times faster than np.einsum
-    x, y, z = _split_components(vectors[:, None])
-    return matrices[..., 0] * x + matrices[..., 1] * y + matrices[..., 2] * z
+    # np.einsum is slow for arrays of different types
+    return np.asarray(np.einsum("nij,nj->ni", np.asarray(matrices, dtype=np.float64), vectors))
 
 
 def skew(v: Array) -> Array:
