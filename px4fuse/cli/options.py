@@ -251,7 +251,8 @@ def request_option(
         )
     elif literal_types:
         details["type"] = Choice(get_args(literal_types[0]))
-    details["is_flag"] = field.type is bool
+    elif field.type is bool:
+        details["is_flag"] = True
     if field.default:
         details["default"] = field.default
     if name in SETTING_RANGES:
