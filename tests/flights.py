@@ -15,7 +15,7 @@ from numpy.typing import ArrayLike, NDArray
 from scipy.spatial.transform import Rotation
 
 from px4fuse.analysis import Analysis
-from px4fuse.comparison.estimates import Estimates, TuningByAxis
+from px4fuse.comparison.estimates import Estimates, TuningByAxis, find_oscillation
 from px4fuse.comparison.flight_events import collect_events
 from px4fuse.comparison.model import Comparison
 from px4fuse.comparison.noise_differences import (
@@ -352,6 +352,7 @@ def unexplained(comparison: Comparison, tuning: TuningByAxis | None = None) -> A
         source_low_pass=missing, time_correlated_noise=missing,
         axis_tunings=tune_perpendicular_axes(comparison),
         noisy_part=find_noisy_flight_part(comparison, (tuning or {}).get(HORIZONTAL)),
+        imu_oscillation=find_oscillation(comparison),
     )  # fmt: skip
     trials = rerun_filters(comparison, estimates, missing)
     return Analysis(

@@ -32,9 +32,9 @@ from px4fuse.comparison import estimates
 from px4fuse.comparison.estimates import (
     MIN_ESTIMATES_BEFORE_AND_AFTER_CHANGE,
     estimate_noises_and_time_offset,
+    find_oscillation,
     widen_for_scatter,
 )
-from px4fuse.comparison.model import PreparedComparison
 from px4fuse.comparison.reruns import rerun_kf_with_time_offset
 from px4fuse.core.arrays import Array
 from px4fuse.diagnose import diagnose, prepare_comparison
@@ -48,7 +48,6 @@ from px4fuse.filter.imu_motion import (
     compute_imu_motion,
     make_segment_motion,
 )
-from px4fuse.filter.imu_oscillation import ImuOscillation, find_imu_oscillation
 from px4fuse.filter.likelihood import compute_profile_likelihood_interval
 from px4fuse.filter.signals import Segment
 from px4fuse.filter.time_offset import MAX_P_VALUE_OF_CHANGED_OFFSET, PartOffset, SourceTimeOffset
@@ -452,11 +451,6 @@ def oscillating(flight: Flight) -> Flight:
     imu = flight.imu.copy()
     imu[Columns.SPECIFIC_FORCE[0]] += np.sin(2.0 * np.pi * 0.4 * imu.index.to_numpy())
     return replace(flight, imu=imu)
-
-
-def find_oscillation(prepared: PreparedComparison) -> ImuOscillation | None:
-    acceleration, attitude = prepared.input_axes[0].acceleration, prepared.flight.attitude
-    return find_imu_oscillation(acceleration, attitude, prepared.source, prepared.segment)
 
 
 def test_imu_oscillation_is_no_change_of_time_offset(monkeypatch) -> None:

@@ -120,7 +120,7 @@ def estimate(comparison: Comparison, progress: Progress = ignore_progress) -> Es
     tuning, time_offset = estimate_noises_and_time_offset(
         comparison, progress, REPORTED_AXES if has_north_and_east else None, motion_cache
     )
-    imu_oscillation = _find_oscillation(comparison)
+    imu_oscillation = find_oscillation(comparison)
     systematic_errors, source_low_pass, correlated_noise = _fit_source_errors(
         comparison, tuning, time_offset, imu_oscillation, motion_cache
     )
@@ -144,7 +144,8 @@ def estimate(comparison: Comparison, progress: Progress = ignore_progress) -> Es
     )
 
 
-def _find_oscillation(comparison: PreparedComparison) -> ImuOscillation | None:
+def find_oscillation(comparison: PreparedComparison) -> ImuOscillation | None:
+    """Find an oscillation of the accelerometer that the positions do not contain."""
     return find_imu_oscillation(
         comparison.input_axes[0].acceleration,
         comparison.flight.attitude,
@@ -219,7 +220,7 @@ def estimate_noises_and_time_offset(
         return tuning, time_offset
     if comparison.source.origin.may_drift:
         time_offset = widen_for_scatter(time_offset, "the positions drift")
-    elif time_offset.has_changed() and _find_oscillation(comparison):
+    elif time_offset.has_changed() and find_oscillation(comparison):
         time_offset = widen_for_scatter(time_offset, "the accelerometer oscillates")
     return tuning, time_offset
 

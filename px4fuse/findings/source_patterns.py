@@ -102,7 +102,7 @@ def detect_periodic_errors_and_offset_changes(analysis: Analysis, error_fit: Err
             f"s. This sinusoid explains {format_percent(min(periodic_error.fraction, 1.0))} of the "
             "slow errors against ground truth. Innovations hardly show this error.",
             f"{find_source_texts(analysis.source).slow_error_check}. Look for a process with this "
-            "period, such as a rotating antenna or a control loop.",
+            "period, such as a control loop.",
             periodic_error._asdict(),
         )
         return
