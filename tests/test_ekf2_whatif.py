@@ -308,7 +308,7 @@ def test_what_if_delay_that_prevents_fusion_raises_error(model, monkeypatch):
     )
     monkeypatch.setattr(whatif, "replay_with_settings", lambda *_, **_more: [never])
     with pytest.raises(
-        SettingsError, match=r"EKF2_EV_DELAY=300: .* never be fused .* 9 samples"
+        SettingsError, match=r"EKF2_EV_DELAY=300: .* fuses no sample .* 9 samples"
     ) as error:
         what_if(model, [changed])
     assert "--set EKF2_DELAY_MAX" in error.value.remedy

@@ -291,7 +291,7 @@ FAULTS = [
     Fault("accelerometer_clipping", "warning", {"count": 30, "total_s": about(0.3, 0.01)},
           {"imu": Imu(clipped_s=(50.0, 50.295))}),
     Fault("accelerometer_oscillation", "warning", {"frequency_hz": about(0.5, 0.02),
-          "amplitude_m_s2": about(1.0, 0.05)}, change=with_imu_oscillation),
+          "amplitude_m_s2": about(1.0, 0.06)}, change=with_imu_oscillation),
     Fault("logger_dropouts", "warning", {"count": 2, "total_s": about(0.5, 1e-9)},
           {"dropouts": (Dropout(20.0, 0.3), Dropout(50.0, 0.2), Dropout(500.0, 9.0))}),
     Fault("imu_rate_too_low", "warning", {"rate_hz": about(20.0), "topic": "sensor_combined"},

@@ -319,7 +319,7 @@ def test_ekf2_position_jump_at_origin_shift_is_removed(at, good):
     np.testing.assert_allclose(state[Columns.POSITION], truth_at(STATE_TIME), atol=1e-12)
     assert f"{len(at)} of horizontal position" in statement
     assert "removed" in statement
-    assert "remain" not in statement
+    assert "kept" not in statement
 
 
 @pytest.mark.parametrize("reset_s", [4.0, 10.0, 15.0])
@@ -330,7 +330,7 @@ def test_ekf2_reset_that_corrects_drift_remains_in_ekf2_state(reset_s):
     ekf2 = ekf2_of(np.outer(drift, NORTH), resets)
     state, statement = remove_origin_resets(ekf2, noisy_track(), WHOLE)
     pd.testing.assert_frame_equal(state, ekf2.state)
-    assert "remain" in statement
+    assert "kept" in statement
     assert "1 of velocity" in statement
     assert "undone" not in statement
 
@@ -361,7 +361,7 @@ def test_height_reset_is_kept_if_source_has_no_height():
 
 
 @pytest.mark.parametrize(("reset_s", "said"), [
-    (0.5, ""), (1.0, ""), (1.1, "remain"), (17.9, "remain"), (18.0, "remain"),
+    (0.5, ""), (1.0, ""), (1.1, "kept"), (17.9, "kept"), (18.0, "kept"),
     (18.5, ""),
 ])  # fmt: skip
 def test_ekf2_resets_outside_evaluated_segment_are_not_removed(reset_s, said):
