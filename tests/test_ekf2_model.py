@@ -195,7 +195,7 @@ def test_ekf2_model_without_required_topic_gives_reason(sample_flight: Flight) -
     copies = unavailable(with_copies(sample_flight))
     assert "estimator_aid_src_ev_pos is logged every 0.5" in copies
     dropped = sample_flight.imu[(sample_flight.imu.index % 8.0) > 0.1]
-    assert "between the gaps" in unavailable(replace(sample_flight, imu=dropped))
+    assert "without a gap" in unavailable(replace(sample_flight, imu=dropped))
     frame = with_vision(sample_flight, vision_of(sample_flight), frame="FRD")
     assert "without an orientation" in unavailable(frame)
     no_horizon = replace(ekf2, horizon_s=Unavailable("horizon", "not logged", "Update PX4."))

@@ -111,7 +111,7 @@ def test_rpe_growth_distinguishes_noise_from_drift(kind: str, times: float) -> N
     }[kind]
     sentence = describe_rpe_growth(evaluate_with_error(error).rpe)
     growth = re.search(
-        r"Between --rpe 1 and 10 m, the RMSE grows by a factor of ([\d.]+?)\. ", sentence
+        r"From 1 to 10 m \(--rpe\), the RPE RMSE grows by a factor of ([\d.]+?)\. ", sentence
     )
     assert float(growth[1]) == pytest.approx(times, rel=0.1)
     assert "1 for independent noise, 3.2 for a random walk, 10 for a scale" in sentence

@@ -227,7 +227,7 @@ def test_what_if_without_height_sensor_reports_drift() -> None:
     (lost,) = found.whatif
     assert lost.heights == {}
     assert lost.height_rmse_to_truth_m > 2.0 * found.replayed.height_rmse_to_truth_m
-    assert ". The replayed heights differ by at most " in found.notes[-1]
+    assert ". The heights of both replays differ by at most " in found.notes[-1]
 
 
 def test_what_if_gives_no_result_after_long_height_rejection() -> None:

@@ -609,7 +609,7 @@ FILES: dict[str, tuple[Callable[[bytes], bytes], str]] = {
     "bytes behind the end": (lambda pdf: pdf + b"\n% Eve\n", "bytes after the end of the PDF"),
     "a table at the beginning": (linearised, "second cross-reference table"),
     "a hybrid table": (hybrid, "second cross-reference table"),
-    "a later generation": (later_generation, "/Contents was replaced by another"),
+    "a later generation": (later_generation, "another program changed the PDF entry /Contents"),
     "a key twice": (
         lambda pdf: pdf.replace(b"/Tabs/S", b"/Tabs/S/Tabs/S", 1), "the PDF cannot be read",
     ),

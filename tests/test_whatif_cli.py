@@ -199,6 +199,6 @@ def test_what_if_table_omits_numbers_if_not_predictable(sample_flight: Flight) -
     assert all(NOT_PREDICTABLE_TEXT not in line[:3] for line in table)
     assert [line[1] for line in make_sweep_table(told)[1]] == [NOT_PREDICTABLE_TEXT] * 2
     said = " ".join(describe_sweep(told))
-    assert "'not predictable': EKF2 rejects more than 35% of the samples" in said
-    assert "2 mm of added position noise changes the statistics strongly" in said
+    assert "'not predictable': the replay rejects more than 35% of the samples" in said
+    assert "2 mm of added position noise changes the results strongly" in said
     assert "closest to 1" not in said

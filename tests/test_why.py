@@ -126,7 +126,7 @@ def test_report_without_ekf2_replay_omits_difference_page(sample: Analysis) -> N
     ("share", "text"),
     [
         (0.47, "decreases by 47 %."),
-        (1.4, "1.4 times the mean square difference KF - EKF2; other contributions"),
+        (1.4, "explains 1.4 times the mean square difference KF - EKF2. Other replaced"),
     ],
 )
 def test_kf_ekf2_difference_text_names_largest_contribution(sample, share, text) -> None:

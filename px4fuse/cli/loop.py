@@ -228,7 +228,7 @@ def _solve_graph(
     path, track = split_path_and_part(str(source))
     if track is not None:
         raise SettingsError(
-            f"{display_name(source)}: the file is a pose graph, which has no track {track!r}",
+            f"{display_name(source)}: a pose graph contains no trajectory {track!r}",
             f"Omit :{track}.",
         )
     for parameter in options.list_given_parameters():

@@ -196,10 +196,10 @@ def _describe_step_effect(step: PropertyReplacement, explanation: DifferenceExpl
         f"If KF uses EKF2's {step.name}, KF's position changes by up to "
         f"{step.position_moved_m:.2f} m (at {step.moved_at_s:.1f} s)"
     )
-    if explained_fraction > 1.0:  # the contributions add up to 1, so others are negative
+    if explained_fraction > 1.0:
         return (
-            f"{change_text}. This change contributes {explained_fraction:.2g} times the mean "
-            "square difference KF - EKF2; other contributions are negative."
+            f"{change_text}. This change explains {explained_fraction:.2g} times the mean square "
+            "difference KF - EKF2. Other replaced properties increase the difference."
         )
     return (
         f"{change_text}, and the mean square difference KF - EKF2 decreases by "

@@ -317,7 +317,7 @@ def _explain_choice(flight: Flight, track: PositionTrack) -> str:
     if track.origin.is_fused_as_gnss:
         return "the only position source in the log, fused by EKF2"
     log_text = f" (from {track.log})" if track.log and track.log != flight.log.name else ""
-    return f"chosen automatically; position origin: {track.origin.route}{log_text}"
+    return f"source chosen automatically; position origin: {track.origin.route}{log_text}"
 
 
 def shift_timestamps(track: PositionTrack, clock_offset_s: float) -> PositionTrack:

@@ -44,12 +44,12 @@ CLOCK_SYNCHRONISATION_ACTION = (
     "Synchronise the clocks: set UXRCE_DDS_SYNCT to 1 (uXRCE-DDS agent), or answer MAVLink "
     "TIMESYNC messages. Send timestamps in microseconds."
 )
-TIMESTAMPS_TOO_LATE_EFFECT = "The position timestamps are later than EKF2's time."
+TIMESTAMPS_TOO_LATE_EFFECT = "The position timestamps are ahead of EKF2's clock."
 # Effect on EKF2 of timestamps that are not synchronised with the autopilot's clock
 EFFECT_BY_UNSYNCHRONISED_CLOCK = {
     **dict.fromkeys(
         ("another clock", "an unknown clock", "UNIX time in seconds"),
-        "The position timestamps are too old for EKF2, or later than EKF2's time.",
+        "The position timestamps are too old for EKF2, or ahead of EKF2's clock.",
     ),
     **{
         f"UNIX time in {unit}seconds": TIMESTAMPS_TOO_LATE_EFFECT

@@ -305,8 +305,8 @@ def prepare_inputs(  # noqa: PLR0911, PLR0912 (one return per reason)
     if not segments:
         return Unavailable(
             ANALYSIS_NAME,
-            "between the gaps of the position source and the IMU, EKF2 fused "
-            f"{aid.label.removesuffix(', position')} for less than {MIN_SEGMENT_DURATION_S:g} s",
+            f"EKF2 fused {aid.label.removesuffix(', position')} for less than "
+            f"{MIN_SEGMENT_DURATION_S:g} s without a gap in position or IMU data",
             "Record without dropouts (faster SD card, fewer topics) and send positions at a "
             "constant rate.",
         )

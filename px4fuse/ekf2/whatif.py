@@ -376,7 +376,7 @@ def _summarise_replay(flight: Flight, replay: Ekf2Replay, spans_s: Spans) -> Ekf
     if evaluated_updates.empty:
         raise SettingsError(
             f"{_format_changes(replay)}: the replay fuses no sample of {replay.source} in the "
-            f"evaluated time, because {replay.lost} samples are older than the fusion horizon",
+            f"evaluated time span, because {replay.lost} samples are older than the fusion horizon",
             "Choose another value, or add --set EKF2_DELAY_MAX=... (PX4 v1.15 and later).",
         )
     # Position variance just before (1 µs) and after each update
@@ -583,11 +583,11 @@ def _describe_deviation(
         f"{largest_distance_time_s:.1f} s), and by {horizontal_distance_m[-1]:.3g} m at the end"
     )
     if height_aids & {*disable_time_s_by_aid}:
-        note = f"{note}. The replayed heights differ by at most {height_difference_m.max():.3g} m"
+        note += f". The heights of both replays differ by at most {height_difference_m.max():.3g} m"
     if horizontal_aids <= disable_time_s_by_aid.keys():
-        note = (
-            f"{note}. The replay then uses only the IMU. EKF2 stops publishing a position "
-            "after EKF2_NOAID_TOUT (5 s)"
+        note += (
+            ". The replay then uses only the IMU. EKF2 stops publishing a position after "
+            "EKF2_NOAID_TOUT (5 s)"
         )
     return note
 

@@ -240,7 +240,9 @@ def distribute_closure_error_by_distance(
     """
     for closure in closures:
         if closure.source == LANDING_CLOSURE_SOURCE and not closure.accepted:
-            closure_error_vector_m = _explain_gate_rejection("path correction by distance", closure)
+            closure_error_vector_m = _explain_gate_rejection(
+                "path correction in proportion to distance flown", closure
+            )
     if isinstance(closure_error_vector_m, Unavailable):
         return {"by_distance_plain": closure_error_vector_m, "by_distance": closure_error_vector_m}
     position_m = distribute_by_distance(path.position_m, closure_error_vector_m, distance_m)

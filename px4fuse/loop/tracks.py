@@ -240,7 +240,7 @@ def read_source(
     flight = read_log(path, system=system)
     if track_name not in (None, *TRACK_NAMES):
         raise TrajectoryError(
-            f"{display_name(path)}: flight logs have no track {track_name!r}",
+            f"{display_name(path)}: a flight log contains no trajectory {track_name!r}",
             f"Use one of {', '.join(TRACK_NAMES)}.",
         )
     chosen_track_name = track_name or default_track

@@ -50,7 +50,7 @@ def make_diagnosis_card(analysis: Analysis) -> Card:
     """Return the diagnosis card: faults, causes and actions of an analysis."""
     if analysis.request is None:
         raise SettingsError(
-            "The diagnosis card cannot be made: the analysis does not contain its settings.",
+            "The diagnosis summary cannot be made: the analysis contains no settings.",
             "Create the analysis with px4fuse.compare.",
         )
     card = build_card(analysis, analysis.request)

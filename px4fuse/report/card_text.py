@@ -144,7 +144,7 @@ def format_closing_lines(card: Card, *, verbose: bool = False) -> Iterator[Parag
     actions = [action for cause in card.causes for _, action in label_alternatives(cause)]
     texts = [] if verbose else ["More: -v"]
     if card.id:
-        texts.append(f"Explanation: px4fuse explain {card.id}")
+        texts.append(f"Explanation of the finding: px4fuse explain {card.id}")
     yield from _wrap_lines("; ".join(texts), "", "")
     if any(action.where == "console" for action in actions):
         yield Paragraph("Console: MAVLink Console of QGroundControl")
@@ -317,7 +317,7 @@ def make_rerun_rows(reruns: Sequence[CardRerun]) -> list[list[str]]:
     """Return the table (first row: headings) of re-runs with changed settings."""
     rows = [
         {
-            "re-run: filter and change": rerun.label,
+            "filter and tested change": rerun.label,
             "position RMSE": _format_before_after(rerun.position_rmse_m, format_metres, " m"),
             "● innovation ÷ √S": _format_before_after(rerun.source_ratio, format_ratio),
             "◆ error ÷ σ": _format_before_after(rerun.truth_ratio, format_ratio),
@@ -370,9 +370,7 @@ def _format_verdict_lines(card: Card) -> Iterator[Paragraph]:
     )
     yield Paragraph(f"{legend:{AXIS_INDENT}}", plot=_format_tick_labels())
     if any(verdict.is_explained for verdict in card.verdicts):
-        yield Paragraph(
-            "  The cause of a verdict in brackets is not a setting of the filter; see below."
-        )
+        yield Paragraph("  Verdicts in brackets require no change of filter settings.")
     yield from map(_format_verdict_line, card.verdicts)
 
 

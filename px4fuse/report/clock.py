@@ -147,7 +147,7 @@ def _format_delay_advice(
         "ms), or correct the sender's clock."
     )
     if delay_max_change := find_delay_max_change(comparison, fitted_delay_ms):
-        text += f" With either of these two corrections, set {format_changes(delay_max_change)}."
+        text += f" In addition to either correction, set {format_changes(delay_max_change)}."
     return text
 
 
@@ -164,8 +164,8 @@ def draw_pages(analysis: Analysis, results: ComparisonResults) -> Iterator[Page]
     )
     page.write_labelled_texts(make_time_offset_advice(analysis, time_offset))
     caption = (
-        f"Likelihood of {time_offset.count} measurements. Unlike the curve, the interval "
-        "includes the IMU noise."
+        f"Likelihood of {time_offset.count} measurements. The 95 % interval includes "
+        "the IMU noise, the curve does not."
     )
     title = "Decrease of the log-likelihood below its maximum (nats)"
     _draw_likelihood(page.add_panel(title, CURVE_HEIGHT, caption=caption), time_offset)

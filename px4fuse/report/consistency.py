@@ -116,9 +116,9 @@ def _write_causes(page: Page, analysis: Analysis) -> None:
     column_heads = ["filter", "change", "quantity", "as flown", "with change", "explains"]
     page.add_table(column_heads, rows, right_aligned_columns=(3, 4))
     page.write_small_text(
-        "Each row is a re-run with one changed setting. 'explains' is the fraction of ln(mean NIS) "
-        "or ln(mean NEES) that the change removes, or 'all' if the filter becomes consistent. A "
-        "change that explains 50 % or more is a cause."
+        "Each row is a re-run with one change. 'explains': relative reduction of ln(mean NIS) or "
+        "ln(mean NEES); 'all': the filter becomes consistent. A change that explains 50 % or more "
+        "is a cause."
     )
 
 

@@ -236,7 +236,7 @@ def _draw_map(page: Page, analysis: Analysis, flight_map: FlightMap, height: flo
     )
     title = "Map"
     if distance_m > 0.0:
-        title += f"; {name} up to {format_metres(distance_m)} m outside the map"
+        title += f"; {name} up to {format_metres(distance_m)} m outside the plotted area"
     axes = page.add_panel(title, axes_height)
     style.set_map_axes(axes, flight_map.x_name, flight_map.y_name)
     (left, bottom), (right, top) = limits

@@ -216,8 +216,8 @@ def describe_rpe_growth(rpe: tuple[RelativeError, ...]) -> str:
         )
     smallest, largest = min(rmse_by_delta), max(rmse_by_delta)
     return (
-        f"{interval_note} Between --rpe {smallest:g} and {largest:g} {unit}, the RMSE grows by a "
-        f"factor of {rmse_by_delta[largest] / rmse_by_delta[smallest]:.2g}. Expected factor: 1 for "
+        f"{interval_note} From {smallest:g} to {largest:g} {unit} (--rpe), the RPE RMSE grows "
+        f"by a factor of {rmse_by_delta[largest] / rmse_by_delta[smallest]:.2g}. Expected: 1 for "
         f"independent noise, {np.sqrt(largest / smallest):.2g} for a random walk, "
         f"{largest / smallest:.3g} for a scale or heading error."
     )

@@ -214,7 +214,7 @@ def _describe_closure_error(loop: Loop) -> str:
     length_m, heading_error_deg = loop.path_length_m, loop.heading_error_deg
     if error_m is None or error_components_m is None:
         if loop.is_assessed:
-            return f"closure error not shown for an assignment; path length {length_m:.1f} m"
+            return f"closure error hidden in student assignments; path length {length_m:.1f} m"
         return (
             f"no closure error: --open states that the path ({length_m:.1f} m) does not return to "
             "its start"

@@ -12,11 +12,9 @@ TUNING_HEAD = (
     "SIGMA_Z (m)\nestimate (95 %)",
     "log-likelihood\ngain (nats per\nmeasurement)",
     "log-likelihood\ngain, 2nd half\nof the data",
-    "autocorrelation\n(lag 1) before\nand after tuning",
+    "autocorrelation\nof innovations\n(lag 1), before\nand after tuning",
 )
-TUNING_NOTE = (
-    "The gain on the 2nd half of the data is that of SIGMA_A and SIGMA_Z estimated on the 1st half."
-)
+TUNING_NOTE = "Gain on the 2nd half: with SIGMA_A and SIGMA_Z estimated on the 1st half."
 
 
 def make_tuning_page(

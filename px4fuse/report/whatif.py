@@ -151,10 +151,10 @@ def describe_sweep(analysis: WhatIfAnalysis) -> list[str]:
             )
     if not all(summary.is_predictable for summary in analysis.whatif.whatif):
         sentences.append(
-            "'not predictable': EKF2 rejects more than "
+            "'not predictable': the replay rejects more than "
             f"{MAX_REJECTED_FRACTION:.0%} of the samples, {1000.0 * ADDED_POSITION_SIGMA_M:.0f} mm "
-            "of added position noise changes the statistics strongly, or EKF2 fuses no height for "
-            f"{HEIGHT_TIMEOUT_S:g} s."
+            "of added position noise changes the results strongly, or the replay fuses no height "
+            f"for {HEIGHT_TIMEOUT_S:g} s."
         )
     return [*sentences, *(f"{note}." for note in analysis.whatif.notes)]
 

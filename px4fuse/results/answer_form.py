@@ -230,8 +230,8 @@ class FormQuestion(Record):
             "nis": f"NIS in update {update}",
             "prediction": f"position sigma of KF (m) {number_text} s after update {update}, "
             "without further updates",
-            "gate": f"numbers of the updates {update} to {update + GATE_QUESTION_FURTHER_UPDATES} "
-            f"whose innovation is outside ±{number_text} sqrt(S); KF rejects no measurement",
+            "gate": f"update numbers ({update} to {update + GATE_QUESTION_FURTHER_UPDATES}) with "
+            f"innovations outside ±{number_text} sqrt(S), if KF rejects no measurement",
         }[self.kind]
         return f"{quantity}; with SIGMA_A {self.sigma_a_m_s2:g} and SIGMA_Z {self.sigma_z_m:g}"
 

@@ -189,7 +189,7 @@ class _PdfComparison:
             if isinstance(submitted_value, IndirectObject):
                 if submitted_value.generation:
                     # programs that ignore generation numbers would display another object
-                    description = f"the PDF entry {key} was replaced by another program"
+                    description = f"another program changed the PDF entry {key}"
                     yield PageDifference(page_number, description, True)
                 if isinstance(redrawn_value, IndirectObject):
                     object_ids = (

@@ -148,8 +148,8 @@ def _check_file(pdf: bytes) -> None:
         remaining_bytes -= inflated_bytes
         if inflated_bytes > MAX_CONTENT_BYTES or remaining_bytes < 0:
             raise ResultsError(
-                "a compressed part of the PDF contains more data than a report: the PDF is not a "
-                "px4fuse report, or was printed to PDF. Hand in the original file."
+                "the decompressed PDF is larger than any px4fuse report: it is not a px4fuse "
+                "report, or was printed to PDF. Hand in the original file."
             )
 
 

@@ -150,13 +150,15 @@ def agreement_page(models: dict[str, Ekf2Model], left: dict[str, float]) -> str:
         statistics = [statistic for _, statistic in axes]
         cells = (
             name, f"{a.samples} innovations",
-            ", ".join(f"{x.innovation_correlation:.4f} {axis}" for axis, x in axes),
+            "correlation "
+            + ", ".join(f"{x.innovation_correlation:.4f} {axis}" for axis, x in axes),
             f"S replayed ÷ S logged {min(x.s_ratio_p5 for x in statistics):.3f} to "
             f"{max(x.s_ratio_p95 for x in statistics):.3f}",
             f"rejected in replay {100.0 * a.rejected_fraction_replayed:.1f} %, "
             f"in flight {100.0 * a.rejected_fraction_logged:.1f} %",
-            ", ".join(f"{x.position_rms_difference_m:.3f} m {axis}" for axis, x in axes),
-            f"{100.0 * left[name]:.1f} % of KF - EKF2 unexplained", height_cell(a),
+            "position difference "
+            + ", ".join(f"{x.position_rms_difference_m:.3f} m {axis}" for axis, x in axes),
+            f"{100.0 * left[name]:.1f} % of the difference KF - EKF2 unexplained", height_cell(a),
         )  # fmt: skip
         lines.append(f"| {' | '.join(cells)} |")
     return "\n".join(lines)
@@ -169,8 +171,8 @@ def height_cell(agreement: Agreement) -> str:
         return "height from the log"
     gnss, barometer = (axis.innovation_correlation for axis in heights)
     return (
-        f"height replayed: correlation {gnss:.4f} (GNSS), {barometer:.4f} (barometer); "
-        f"difference {heights[0].position_rms_difference_m:.3f} m RMS"
+        f"height replayed: innovation correlation {gnss:.4f} (GNSS), {barometer:.4f} (barometer); "
+        f"height difference {heights[0].position_rms_difference_m:.3f} m RMS"
     )
 
 
