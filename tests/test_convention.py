@@ -275,7 +275,7 @@ def examples() -> Iterator[Finding]:
 
 AMBIGUOUS = Convention(
     verdict="ambiguous", x="east", y="north", z="up", log_odds=1.2, log_likelihood_gain=30.0,
-    alternatives=("x south, y west, z up (metres), rotated by +12°",),
+    alternatives=("x south, y west, z up (metres), axes rotated by +12°",),
 )  # fmt: skip
 
 

@@ -191,7 +191,7 @@ def test_submission_named_like_a_platform_export_is_flagged() -> None:
     (ada, _), _ = make_grades({name: graded_report("", 4.0)})
     assert ada.submission_time == "2026-11-20 10:00"
     assert ada.flags == (
-        "The student chose a file name that looks like a name from a learning platform. "
+        "The student's file name imitates the upload name of a learning platform. "
         "Check who handed in the file.",
     )
 
@@ -342,7 +342,7 @@ def test_instructor_overrides_csv_accepts_decimal_commas(tmp_path) -> None:
         ("1,A,-1,", "must be a number of 0 or more"),
         ("1,A,nan,", "must be a number of 0 or more"),
         ("1,A,1_5,", "must be a number of 0 or more"),
-        ("1,,5,", "points without an item: write a rubric title or 'total'"),
+        ("1,,5,", "the points have no item: write a rubric title or 'total' as item"),
         ("1,A,5,\n1,A,6,", "student 1 has two rows for the item A"),
     ],
 )

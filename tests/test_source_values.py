@@ -396,7 +396,7 @@ def test_lever_arm_estimate_from_imu_includes_imu_position() -> None:
     (one,) = source_values.detect_lever_arm(without_truth(mounted((0.0, 0.0)), 0.4))
     assert one.evidence["forward_m"] == pytest.approx(0.4, abs=0.1)
     assert "Set EKF2_EV_POS_X to 0." in one.remedy
-    assert "sensor position are right, set EKF2_IMU_POS_X to " in one.remedy
+    assert "the IMU position is wrong: set EKF2_IMU_POS_X to " in one.remedy
 
 
 def test_wrong_imu_position_is_named_if_replay_confirms_it(monkeypatch) -> None:

@@ -231,8 +231,8 @@ def test_find_submissions_ignores_links_and_special_files(tmp_path):
     found, notes = find_submissions([tmp_path / "in"])
     assert [each.name for each in found] == ["a.pdf"]
     assert notes == (
-        "in: 6 links to files outside the "
-        "folder, special files or unreadable folders were ignored.",
+        "in: 6 entries were ignored (links to files outside the folder, special files, unreadable "
+        "folders).",
     )
 
 

@@ -38,7 +38,7 @@ def format_summary(batch_result: BatchResult) -> Page:
         colour = ERROR_COLOUR if reason["status"] == STATUS_FAILED else WARNING_COLOUR
         page.write(template.format_map(reason).rstrip(), colour=colour)
     if (unlisted_count := len(reason_table) - MAX_LISTED_REASONS) > 0:
-        page.write(f"fleet.html lists {unlisted_count} more reasons why logs have no result.")
+        page.write(f"fleet.html also lists {unlisted_count} other reasons for missing results.")
     sorted_logs = sort_logs(summarise_logs(batch_result.table))
     if sorted_logs:
         rows = [_make_log_row(log) for log in sorted_logs[:MAX_LISTED_LOGS]]
@@ -109,7 +109,7 @@ def format_differences(results: ChangeResults) -> Page:
     for text in results.worse:
         page.write_labelled("Worse", styled_text(text, ERROR_COLOUR))
     if not results.worse:
-        page.write("Compared with A, B has no newly inconsistent filter and no new error finding.")
+        page.write("Compared with A, B has no additional inconsistent filter or error finding.")
     return page
 
 

@@ -88,8 +88,8 @@ OUTLIER_EXPLANATION = (
     "affect EKF2's position."
 )
 UNEXPLAINED_DIFFERENCE_TEXT = (
-    "For KF or EKF2, the σ ratio from innovations differs from the σ ratio from errors against "
-    "ground truth. No re-run explains the difference."
+    "For KF or EKF2, actual ÷ reported σ differs between innovations and ground truth. No re-run "
+    "explains the difference."
 )
 # Reasons why faults of the source increase errors, but hardly change innovations
 SOURCE_FAULT_EXPLANATIONS = (

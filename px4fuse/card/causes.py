@@ -336,7 +336,7 @@ def make_rerun_action(
         for name, value in default_settings.items()
     )
     sentence = (
-        f"run again without {default_options_text}, or with the estimated noise settings"
+        f"run again with estimated noise settings, or with defaults: without {default_options_text}"
         if default_options_text
         else ""
     )

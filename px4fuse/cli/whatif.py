@@ -39,8 +39,8 @@ from px4fuse.request import Sweep, WhatIfRequest
     "start_s",
     type=options.NumberWithUnit("s", 60.0),
     metavar="SECONDS",
-    help="Time (s after the first sample) at which EKF2 stops fusing the aiding sources of "
-    "--without.  [default: 0]",
+    help="Time (s after the first sample) at which EKF2 stops fusing the aiding sources given "
+    "with --without.  [default: 0]",
 )
 @options.system_option
 @options.max_size_option

@@ -83,7 +83,7 @@ def remove_origin_resets(
                 state[columns], treatment = closest_state, removed
         resets_by_treatment[treatment].append(f"{len(resets)} of {label}")
     statements = (
-        f"EKF2 resets ({', '.join(texts)}) are {treatment}"
+        f"Jumps by EKF2 resets ({', '.join(texts)}) are {treatment}"
         for treatment, texts in resets_by_treatment.items()
         if texts
     )

@@ -297,7 +297,7 @@ def _describe_hypothesis(hypothesis: Hypothesis) -> str:
     properties = [format_axes(hypothesis.axes, hypothesis.unit)]
     if hypothesis.has_rotation:
         properties.append(
-            f"rotated by {-np.degrees(hypothesis.heading_minus_quarter_turns_rad):+.0f}°"
+            f"axes rotated by {-np.degrees(hypothesis.heading_minus_quarter_turns_rad):+.0f}°"
         )
     if delay_text := format_delay(hypothesis.delay_s, 1):
         properties.append(f"timestamps {delay_text}")

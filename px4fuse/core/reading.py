@@ -87,7 +87,7 @@ def file_size(path: Path, error_type: type[Px4FuseError], name: str = "") -> int
     if stat.S_ISDIR(file_status.st_mode):
         raise error_type(f"{name} is a folder", "Give a file.")
     if not stat.S_ISREG(file_status.st_mode):
-        raise error_type(f"{name} is a device, pipe or socket.", "Save the input to a file.")
+        raise error_type(f"{name} is a device, pipe or socket.", "Give a regular file.")
     add_input(path)
     return file_status.st_size
 

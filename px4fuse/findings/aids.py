@@ -20,12 +20,12 @@ from px4fuse.flight.model import BAD_ACCELERATION_FLAG, Unavailable
 AIDS_TESTED_BY_REPLAY = ("ev_pos", "ev_hgt")
 # A pause of barometer fusion is normal up to this time (s) after take-off (ground effect)
 GROUND_EFFECT_DURATION_S = 10.0
-# Minimum ratio of the height error in a pause of barometer fusion to the height RMSE outside the
-# pause
+# Minimum ratio: height error while barometer fusion is paused ÷ height RMSE for the rest of the
+# flight
 MIN_GAP_ERROR_TO_HEIGHT_RMSE_RATIO = 3.0
 # Aiding sources whose vertical innovations EKF2 tests to flag a bad vertical acceleration
 AIDS_OF_VERTICAL_ACCELERATION_TEST = ("gnss_vel", "gnss_hgt", "baro_hgt")
-# Severity "note" if the vertical acceleration is bad for at most this fraction of the time
+# Severity "note" if the flag fs_bad_acc_vertical is set for at most this fraction of the time
 MAX_BAD_ACCELERATION_FRACTION_FOR_NOTE = 0.3
 # Action for each sensor that EKF2 does not fuse, by PX4 parameter
 ACTION_BY_SWITCH = {
@@ -170,7 +170,7 @@ def _make_innovation_change_finding(name: str, aid: AidResult) -> Finding:
 def _make_overconfident_finding(name: str, aid: AidResult, sensor_cause: str) -> Finding:
     # Innovations alone do not distinguish noise from a wrong delay, so no noise value is proposed
     noise_parameter, noise_text = AIDS[name].noise, ""
-    action = "let the sensor report its true noise (σ)"
+    action = "let the sensor's driver report the true noise (σ)"
     if noise_parameter:
         action = f"increase {noise_parameter}"
     if aid.noise is not None:
@@ -182,7 +182,7 @@ def _make_overconfident_finding(name: str, aid: AidResult, sensor_cause: str) ->
         f"{format_number(aid.nis_mean)} (expected 1). EKF2 rejects "
         f"{format_percent(aid.rejected_fraction)} of the samples. Possible causes: errors above "
         f"√R{noise_text}, or errors of another sensor.",
-        f"Check delay and mounting of the sensor first. Then {action}.",
+        f"First check delay and mounting of the sensor. Then {action}.",
         {
             "aid": name,
             "nis_mean": aid.nis_mean,

@@ -71,7 +71,7 @@ def _find_used_settings(analysis: Analysis) -> Mapping[str, float]:
 def describe_explained_part(cause: Rerun, statistic: Statistic) -> str:
     """Describe the part of a wrong mean NIS, mean NEES or difference that a change explains."""
     if makes_overconfident(cause, statistic):
-        return "σ becomes too small"
+        return "makes σ too small"
     if statistic != "difference" and brings_inside_limits(cause, statistic):
         return "all"
     fraction = compute_explained_fraction(cause, statistic)

@@ -35,7 +35,7 @@ from px4fuse.flight.model import (
 FUSED_FRACTION_FOR_ERROR = 0.5
 # Warning if EKF2 fuses the positions for less than this fraction of the time
 FUSED_FRACTION_FOR_WARNING = 0.98
-# Minimum mean interval (s) of positions for a late start of fusion: with jitter, some intervals
+# Minimum mean position interval (s) that may delay the start of fusion: with jitter, some intervals
 # exceed EKF2's limit of 0.2 s
 MIN_INTERVAL_FOR_LATE_START_S = 0.18
 MOTION_CAPTURE_TOPIC = "vehicle_mocap_odometry"

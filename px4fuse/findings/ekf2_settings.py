@@ -45,7 +45,8 @@ MIN_REJECTED_FRACTION_IN_MESSAGE = 0.05
 # Minimum rejected fraction for a warning: with a gate of 5 √S, a consistent filter rejects 6e-7
 REJECTED_FRACTION_FOR_WARNING = 0.01
 REJECTED_FRACTION_FOR_ERROR = 0.20
-# A change prevents rejections if rejected fraction after ÷ before the change is below this ratio
+# A changed setting prevents rejections if the rejected fraction after ÷ before the change is below
+# this ratio
 MAX_REJECTED_AFTER_TO_BEFORE_RATIO = 0.5
 # A parameter change has an effect if σ ratio or RMSE change by at least this factor
 MIN_SIGMA_RATIO_OR_RMSE_CHANGE_FACTOR = 1.5
@@ -82,7 +83,7 @@ def detect_wrong_noise(analysis: Analysis) -> Findings:
     if rejected_fraction >= MIN_REJECTED_FRACTION_IN_MESSAGE:
         effect_text = f": EKF2 rejects {format_percent(rejected_fraction)} of the positions"
         reason = f"EKF2 rejects normal {sensor_name} noise as outliers."
-    name = "EKF2's measurement noise" if uses_reported_sigma else aid.noise
+    name = "EKF2's assumed measurement noise" if uses_reported_sigma else aid.noise
     title = f"{name} is {format_factor(factor)} times too {size_word}"
     is_default_noise = used_noise_m == analysis.flight.log.find_default_value(aid.noise)
     # PX4's default suits usual sensors: if it is too small, this sensor is noisier
@@ -107,9 +108,7 @@ def detect_wrong_noise(analysis: Analysis) -> Findings:
             f" EKF2 uses the σ that {sensor_name} reports{mode_text}, because this σ is larger "
             f"than {aid.noise} ({parameter_noise_m:g} m)."
         )
-        action += (
-            f" Alternatively, let the source report a variance of {estimated_noise_m**2:.2g} m²."
-        )
+        action += f" Or let the position source report a variance of {estimated_noise_m**2:.2g} m²."
     if is_kf_noise_equal_to_ekf2:
         message += f" KF takes SIGMA_Z from {aid.noise}."
     yield finding(
@@ -243,14 +242,14 @@ def detect_parameter_changes(analysis: Analysis) -> Findings:
             has_effect |= _differ_by_min_factor(nis_before.sigma_ratio, nis_after.sigma_ratio)
             effect_sentences = (
                 f" EKF2 is {_format_verdict(nis_before)} before the parameter change and "
-                f"{_format_verdict(nis_after)} after the change (innovations along the main axis)."
+                f"{_format_verdict(nis_after)} after (innovations along the main axis of motion)."
             )
         if _differ_by_min_factor(before.rmse_m, after.rmse_m):
             has_effect = True
             effect_sentences += (
-                " EKF2's position RMSE along the main axis is "
+                " EKF2's position RMSE along the main axis of motion is "
                 f"{format_metres(before.rmse_m)} m before the parameter change and "
-                f"{format_metres(after.rmse_m)} m after the change."
+                f"{format_metres(after.rmse_m)} m after it."
             )
         action = (
             f"Analyse the flight before (--end {time_s:.1f}) and after the parameter change "

@@ -55,7 +55,7 @@ MAX_RATE_STD_AT_REST, MAX_FORCE_STD_AT_REST = 0.04, 1.5
 MAX_RATE_CHANGE_AT_REST_RAD_S = 0.01
 # Minimum gyroscope bias (rad/s) for a finding: the heading turns by 90° in 30 s
 MIN_GYRO_BIAS_RAD_S = 0.05
-# Minimum |specific force at rest - gravity| (m/s²) that the finding states
+# Minimum |specific force at rest - gravity| (m/s²) for the finding to mention this difference
 MIN_GRAVITY_ERROR_M_S2 = 0.3
 # Maximum fraction of the flight without tilt or yaw alignment
 MAX_UNALIGNED_FRACTION = 0.02

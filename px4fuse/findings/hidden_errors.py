@@ -260,7 +260,7 @@ def make_possible_drift_finding(analysis: Analysis) -> Finding:
     horizontal_tuning = analysis.tuning.get(HORIZONTAL)
     evidence: dict[str, float | str] = {"source": analysis.source.name}
     message = (
-        f"{sensor_name} may drift: messages with a heading are usually odometry. "
+        f"{sensor_name} may drift. "
         "KF and EKF2 follow the drift, so innovations do not show the drift."
     )
     if isinstance(horizontal_tuning, AxisTuning) and (

@@ -48,20 +48,21 @@ MIN_SETTING_TO_ESTIMATE_FACTOR = 1.5
 MIN_NOISE_FACTOR_FOR_ERROR = 4.0
 # KF hardly reacts to new positions if its time constant exceeds this value (s)
 MIN_KF_TIME_CONSTANT_S = 2.5
-# Factor that widens the 95 % interval of ln(noise): the widened interval excludes 0.3 % of the
-# correct noise settings
+# Factor that widens the 95 % interval of ln(noise): only 0.3 % of correct noise settings are
+# outside
 INTERVAL_WIDENING_FACTOR = 1.5
 # KF lags if the lag-1 autocorrelation of its innovations exceeds this value (white noise: at most
 # 0.2)
 MIN_LAG1_AUTOCORRELATION = 0.3
 
 MIN_SIGMA_FACTOR_FOR_ERROR = 2.0
-# Maximum ratio of noises that count as equal: a median of 100 values has a standard error of 12 %
+# Maximum ratio of two σ that count as equal: a median of 100 values has a standard error of 12 %
 MAX_RATIO_OF_EQUAL_NOISES = 1.25
-# px4fuse assumes that EKF2 uses the reported variance if √R ÷ EKF2_EVP_NOISE exceeds this ratio
+# EKF2 is assumed to use the variance in the messages if EKF2's √R ÷ EKF2_EVP_NOISE exceeds this
+# ratio
 MIN_USED_TO_PARAMETER_NOISE_RATIO = 1.25
 UNEXPLAINED_SIGMA_ACTION = (
-    "No re-run with changed settings or data corrects σ. Check the IMU (rate, gaps, vibration)."
+    "No re-run made the filter's σ consistent. Check the IMU (rate, gaps, vibration)."
 )
 UNKNOWN_NOISE_ACTION = "The noise could not be estimated; px4fuse tune LOG states the reason."
 NO_IMPROVEMENT_ACTION = (

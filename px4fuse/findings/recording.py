@@ -115,7 +115,7 @@ def detect_other_estimators(analysis: Analysis) -> Findings:
         yield make_note(
             "not_px4",
             f"This log is from {log.autopilot}, not PX4, so the report contains no PX4 parameters.",
-            f'In this report, "EKF2" means the estimator of {log.autopilot}.',
+            f'In this report, "EKF2" stands for the estimator of {log.autopilot}.',
             {"autopilot": log.autopilot},
         )
     if log.format.startswith("MAVLink"):

@@ -157,8 +157,8 @@ def _find_position_faults(
     is_position_file = source.alignment is not None
     log_odds = 99.0 if convention.log_odds is None else min(convention.log_odds, 99.0)
     evidence_sentence = (
-        "Of all tested axes, units and time offsets, the corrected ones fit the IMU best (log "
-        f"likelihood ratio to the second best {'above ' if log_odds == 99.0 else ''}"
+        "Of all tested combinations of axes, unit and time offset, the corrected one fits the IMU "
+        f"best (log likelihood ratio to the second best: {'above ' if log_odds == 99.0 else ''}"
         f"{log_odds:.0f} nats)."
     )
     stated_frame = source.alignment.frame.upper() if source.alignment else "NED"

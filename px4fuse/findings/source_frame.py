@@ -38,7 +38,7 @@ MIN_MISALIGNMENT_SIGMAS = 4.0
 MIN_HEADING_ERROR_DEG = 5.0
 # Minimum yaw misalignment (°), for severity "error": 26 % of the motion appears on the other axis
 MIN_SEVERE_HEADING_ERROR_DEG = 15.0
-# Minimum ratio of EKF2's heading drifts: drift against ground truth ÷ drift against the positions
+# Minimum ratio: EKF2's heading drift against ground truth ÷ drift against the position source
 MIN_TRUE_TO_RELATIVE_HEADING_DRIFT_RATIO = 0.5
 # Topic of the positions that EKF2 rotated into the frame of its state (EKF2.cpp)
 ALIGNED_VISION_TOPIC = "estimator_visual_odometry_aligned"
@@ -107,13 +107,11 @@ def detect_misalignment(analysis: Analysis, heading_error: HeadingError) -> Find
     finding_id, reference = "ekf2_heading_error", "EKF2's heading"
     calibration_advice = magnetometer_advice(analysis.flight)
     if analysis.source.origin.is_gnss:
-        reason = "GNSS positions refer to true north, so the rotation is EKF2's heading error."
+        reason = "GNSS positions refer to true north, so EKF2's heading is wrong by this rotation."
         _, action = _explain_gnss_heading_error(analysis)
         calibration_advice = ""
     elif analysis.source.name == ALIGNED_VISION_TOPIC:
-        reason = (
-            "EKF2 rotated the positions into its frame. The rotated positions do not fit the IMU."
-        )
+        reason = "The positions that EKF2 rotated into its own frame do not fit the IMU."
         action = "Align the positioning frame with north."
     else:
         finding_id, reference = "source_frame_misaligned", "the IMU"
@@ -139,7 +137,7 @@ def detect_misalignment(analysis: Analysis, heading_error: HeadingError) -> Find
 def _explain_gnss_heading_error(analysis: Analysis) -> tuple[str, str]:
     """Return the possible cause of a wrong heading in a flight with GNSS, and the action."""
     if (rerun := find_confirmed_noise_rerun(analysis)) is not None:
-        cause = f"a wrong {find_aid(analysis).noise}, which affects EKF2's heading"
+        cause = f"a wrong {find_aid(analysis).noise} (GNSS also corrects EKF2's heading)"
         return cause, f"Set {format_changes(rerun.change)}. Then check the heading again."
     advice = magnetometer_advice(analysis.flight)
     cause = (

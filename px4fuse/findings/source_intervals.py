@@ -37,14 +37,15 @@ MIN_LOST_POSITION_FRACTION = 0.02
 MIN_INTERVAL_COUNT = 50
 # Minimum fraction of missing positions to report downsampling: a radio link loses fewer
 MIN_MISSING_FRACTION_FOR_DOWNSAMPLING = 0.25
-# Minimum fraction of intervals with the two most frequent lengths (n and n + 1 source periods)
+# Minimum fraction of intervals that are n or n + 1 source periods long (the two most frequent
+# lengths)
 MIN_FRACTION_OF_BOTH_INTERVAL_LENGTHS = 0.85
 # Minimum fraction of the rarer interval length
 MIN_FRACTION_OF_RARER_INTERVAL_LENGTH = 0.1
-# Maximum RMS deviation of intervals from multiples of the source period, in source periods:
-# intervals with jitter have 0.03, random intervals 0.29
+# Maximum RMS deviation of intervals from multiples of the source period, in source periods: 0.03
+# for intervals with jitter, 0.29 for random intervals
 MAX_ROUNDING_RMS_ERROR = 0.06
-# Largest n in the tested source periods: median interval ÷ 1, 2, ..., n
+# Largest n for the tested source periods (median interval ÷ n)
 MAX_PERIODS_IN_MEDIAN_INTERVAL = 4
 # Minimum gap (s) at take-off or landing: the land detector is seconds late
 MIN_GAP_AT_START_OR_END_S = 3.0
@@ -171,11 +172,11 @@ def describe_errors_after_gap(analysis: Analysis, gap_span_s: Span) -> str:
     result, (start_s, end_s) = analysis.main, gap_span_s
     axis, ekf2, ekf2_state = result.axis, analysis.flight.ekf2, result.ekf2_state
     reference_m = float(axis.measurement_m[np.searchsorted(axis.measurement_time_s, end_s)])
-    quantity = "Distance of the estimate from the first position after the gap"
+    quantity = "Distance from the estimate to the first position after the gap,"
     if isinstance(result.truth, pd.DataFrame):
         true_m = result.truth["position_m"]
         reference_m = float(np.interp(end_s, true_m.index, true_m))
-        quantity = "Position error at the end of the gap"
+        quantity = "Position error at the end of the gap,"
     ekf2_text, aiding_sentence = "", "In the gap KF relies on the IMU alone."
     if isinstance(ekf2_state, pd.DataFrame) and len(
         positions_before := ekf2_state["position_m"].loc[:end_s]

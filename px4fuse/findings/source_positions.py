@@ -62,7 +62,7 @@ MIN_MOTION_RANGE_TO_NOISE_RATIO = 1.25 * 3.29
 MIN_LOW_PASS_LOG_LIKELIHOOD_RATIO_NATS = 6.0
 # Minimum log likelihood ratio (nats) of the low-pass model to the model of time-correlated noise
 MIN_LOW_PASS_TO_CORRELATED_NOISE_NATS = 1.0
-# Maximum ratio: lag estimated from the noise correlation ÷ measured delay (upper 95 % limit)
+# Maximum ratio: lag from the noise correlation ÷ upper 95 % limit of the measured delay
 MAX_ESTIMATED_LAG_TO_DELAY_RATIO = 4.0
 # Minimum filter lag (s) for a warning; it causes a position error of 5 cm at 1 m/s
 MIN_LAG_S = 0.05
@@ -79,14 +79,15 @@ MIN_JUMPS_WITHOUT_RESET_COUNTER = 3
 MIN_JUMP_WITHOUT_RESET_COUNTER_M = 0.1
 # Minimum ratio: jump without a change of reset_counter ÷ median position change
 MIN_JUMP_TO_MEDIAN_CHANGE_RATIO = 8.0
-# Number of position changes whose median is the reference for a jump
+# A jump is compared with the median of this number of position changes
 JUMP_WINDOW_SAMPLES = 61
 MIN_POSITIONS_FOR_JUMPS = 100
 # Minimum time (s) and number of positions that a jump lasts: outliers go back to the track earlier
 MIN_JUMP_DURATION_S, MIN_JUMP_DURATION_SAMPLES = 0.6, 9
-# Maximum difference between a jump and the change of the median position, as fraction of the jump
+# Maximum difference between a jump and the shift of the median position (after - before the jump),
+# as fraction of the jump
 MAX_MEDIAN_SHIFT_DEVIATION_FRACTION = 0.5
-# Maximum ratio: interval before a jump ÷ median interval; the vehicle moves in longer intervals
+# Maximum ratio: interval before a jump ÷ median interval; longer intervals contain vehicle motion
 MAX_JUMP_TO_MEDIAN_INTERVAL_RATIO = 1.5
 # Positions alternate if at least this fraction of the jumps reverses the previous jump
 MIN_OPPOSITE_JUMP_FRACTION = 0.7

@@ -41,12 +41,12 @@ MIN_LATENCY_CORRELATION = 0.8
 # Minimum fraction of positions that EKF2 drops because of their latency, for a finding
 MIN_DROPPED_POSITION_FRACTION = 0.02
 MIN_POSITIONS_BEFORE_AND_AFTER_TIMESYNC = 10
-# Minimum fraction of the timestamps that are arrival times before TIMESYNC converges, and
+# Minimum fraction of timestamps of the expected kind: arrival times until TIMESYNC converges,
 # measurement times afterwards
 MIN_FRACTION_OF_TIMESTAMP_KIND = 0.95
 # Minimum mean number of positions in a burst (positions that arrive together)
 MIN_BURST_POSITIONS = 2.5
-# Minimum number of bursts; fewer pauses count as gaps in the position source
+# Minimum number of pauses before bursts; fewer pauses count as gaps in the position source
 MIN_BURST_COUNT = 20
 MAX_BURST_TO_PAUSE_DURATION_RATIO = 0.3
 ANSWER_TIMESYNC_ACTION = (
@@ -68,8 +68,7 @@ def detect(analysis: Analysis) -> Findings:
         yield from detect_constant_timestamps(positions_text, clock_map, clock_map.distinct_stamps)
     elif clock_map.method in METHODS_WITHOUT_MEASUREMENT_TIMES:
         kf_times_sentence = (
-            "KF uses the message timestamps; their offset to boot time is from the "
-            f"{clock_map.method}."
+            f"KF uses the message timestamps, converted to boot time with the {clock_map.method}."
         )
         if clock_map.method == "arrival time":
             kf_times_sentence = "KF also uses arrival times: both tracks lag by the latency."

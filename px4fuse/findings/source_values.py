@@ -34,21 +34,20 @@ from px4fuse.readers.px4_positions import NO_FIX_ACTION
 MIN_ROUNDING_STEP_M = 0.05
 # Maximum ratio of EKF2's position RMSE with the estimated lever arm to the RMSE without it
 MAX_LEVER_ARM_RMSE_RATIO = 0.7
-# Minimum rotation (°) of the positions, and minimum rotation ÷ σ, that a lever-arm finding states
+# A lever-arm finding mentions a rotation of the positions above both limits (° and multiples of σ)
 MIN_ROTATION_DEG, MIN_ROTATION_SIGMAS = 5.0, 3.0
 # Minimum distance (m) between the positions of two alternating senders: less may be noise
 MIN_SENDER_DISTANCE_M = 0.1
-# Minimum ratio: distance between the positions of two senders ÷ scatter (1 σ) of this distance; one
-# sender reaches 2
+# Minimum ratio: distance between the positions of two senders ÷ scatter (1 σ) of this distance; the
+# positions of a single sender reach 2
 MIN_SENDER_DISTANCE_SIGMAS = 4.0
-# Window length (samples): it is short, because a lost sample exchanges the senders of even and odd
-# samples
+# Window length (samples): short, because a lost sample swaps the senders of even and odd samples
 WINDOW_SAMPLES = 16
 MIN_WINDOWS_FOR_TWO_SENDERS = 10
-# Positions are copies if their median distance (m) from EKF2's position is below this limit
+# Positions are copies of EKF2's estimate if the median distance (m) is below this limit
 MAX_DISTANCE_OF_COPY_M = 0.01
-# Positions that EKF2 fused are copies if their median distance (m) from EKF2's position is below
-# this limit: all fused positions are near EKF2's position
+# Fused positions are copies of EKF2's estimate if the median distance (m) is below this stricter
+# limit: fusion alone pulls the estimate towards the positions
 MAX_DISTANCE_OF_FUSED_COPY_M = 0.001
 # Minimum speed (m/s) for the comparison with EKF2's position: at rest, any source may agree
 MIN_SPEED_FOR_COPY_TEST_M_S = 0.2
@@ -181,8 +180,8 @@ def detect_lever_arm(analysis: Analysis) -> Findings:
         forward_m, right_m = 0.0 - forward_m, 0.0 - right_m
     elif any(imu_position_m) and not has_truth:
         action = (
-            f"Set {format_changes(change)}. If the parameters of the sensor position are right, "
-            f"set {format_changes(imu_change)} instead: a wrong IMU position has the same effect."
+            f"Set {format_changes(change)}. If the sensor position parameters are right, the "
+            f"IMU position is wrong: set {format_changes(imu_change)} instead."
         )
     if effect_sentence is None:
         return

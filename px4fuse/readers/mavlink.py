@@ -171,7 +171,7 @@ def _read_ekf2(
     recording.record_stream("ekf2_state", message_name)
     notes = [f"the EKF2 state is from the autopilot's {message_name} messages"]
     if autopilot != "PX4":
-        notes.append(f"in the results, EKF2 means the estimator of {autopilot}")
+        notes.append(f"in the results, EKF2 stands for the estimator of {autopilot}")
     if "reset_counter" in samples and (
         reset_count := np.count_nonzero(samples["reset_counter"].diff()[1:])
     ):

@@ -201,8 +201,8 @@ def map_clock_to_boot(
         slope=sender_to_boot_fit.slope * receipt_to_boot_fit.slope,
     )
     note = (
-        "the recording has no usable TIMESYNC or SYSTEM_TIME. All sample times are too late by the "
-        "unknown minimum delay of the link"
+        "the recording has no usable TIMESYNC or SYSTEM_TIME. All sample times are late by the "
+        "minimum delay of the link, which is unknown"
     )
     return _make_clock_mapping(clock_name, time_source, sender_to_boot_fit, timestamps_s, note)
 

@@ -191,8 +191,8 @@ def describe_clock_conversions(
         note = "the messages were recorded during a replay that was faster or slower than real time"
         if abs(receipt_to_boot_fit.slope - 1.0) < MAX_RELATIVE_CLOCK_RATE_DIFFERENCE:
             note = (
-                "receive times are converted to boot time by a fit to the messages with the least "
-                "delay"
+                "receive times are converted to boot time with a line fitted to the least delayed "
+                "messages"
             )
         clock_descriptions.append(
             ClockMap(

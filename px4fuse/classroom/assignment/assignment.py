@@ -204,6 +204,6 @@ def _require_key_of_same_flights(key_file: Path, has_same_flights: bool) -> None
     if not has_same_flights:
         raise OutputError(
             f"{key_file} is the answer key of other flights and was not overwritten. Choose "
-            "another file with --answer. To add students to this key, keep its secret, options and "
-            "students."
+            "another file with --answer. To add students, repeat the secret, options and students "
+            "of this key."
         )

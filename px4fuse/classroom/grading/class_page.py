@@ -163,7 +163,7 @@ def _make_grade_details(grade: Grade) -> Iterator[RowDetailsSection]:
     other_report_texts = [f"{other.submission}: {other.status}" for other in grade.other_reports]
     yield frame.make_list_section("Flags", grade.flags, is_warning=True)
     yield frame.make_list_section(
-        "Action of the instructor",
+        "Instructor's action needed",
         [report.instructor_action] if report.instructor_action else [],
         is_warning=True,
     )

@@ -268,7 +268,7 @@ def _make_candidate(
         )
     if origin.has_forged_platform_name:
         flags.append(
-            "The student chose a file name that looks like a name from a learning platform. "
+            "The student's file name imitates the upload name of a learning platform. "
             "Check who handed in the file."
         )
     reported_index = class_list.find_student_index(Person(report.student_id)) if platform else None
@@ -421,7 +421,7 @@ def read_overrides(path: Path) -> OverridesByStudent:
         elif points and (parsed_points is None or parsed_points < 0.0):
             problem = f"the points must be a number of 0 or more, not {one_line(points, 20)!r}"
         elif points and not item_title:
-            problem = "points without an item: write a rubric title or 'total'"
+            problem = "the points have no item: write a rubric title or 'total' as item"
         if problem:
             raise SettingsError(f"{path}: row {row_number}: {problem}.")
         overrides[student][item_title] = GradeOverride(

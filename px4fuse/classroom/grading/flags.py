@@ -120,7 +120,7 @@ def _find_equal_contents(report: GradedReport, other: GradedReport) -> Iterator[
         return
     choices = report.form.choices
     if choices == other.form.choices and sum(map(bool, choices)) >= MIN_ANSWERED_CHOICES:
-        yield "The answers about the figures are the same as those of {}, but the figures differ."
+        yield "The answers about the plots are the same as those of {}, but the plots differ."
     if _count_equal_numbers(report.form, other.form) >= MIN_EQUAL_NUMBERS_OF_A_COPY:
         yield (
             "The answer form contains the same numbers as the answer form of {}. It may be a copy."

@@ -43,7 +43,7 @@ CLASS_TABLE_NUMBERS = (
     ("mean NIS of KF, north", "axes.north.filters.kf.nis_mean"),
     ("mean NIS of KF, east", "axes.east.filters.kf.nis_mean"),
     (
-        "position RMSE of KF against ground truth, along the aisle (m)",
+        "position RMSE of KF against ground truth, along the main axis (m)",
         "axes.aisle.filters.kf.truth.position_rmse_m",
     ),
     ("closure error (m)", "loop.closure_error_m"),
@@ -204,7 +204,7 @@ def _find_problems(
     elif verification.page_status == "differ":
         yield (
             rubric.pages,
-            "pages of your PDF differ from the report that px4fuse recomputed",
+            "some pages of your PDF differ from the report recomputed from its log",
             "Compare the pages of the PDF with the report that px4fuse recomputed from the log.",
         )
     if not scoring_input.is_own_log:

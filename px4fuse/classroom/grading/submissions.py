@@ -281,8 +281,8 @@ def _list_folder_submissions(path: Path, notes: list[str]) -> Iterator[Submissio
         ignored_count += not is_inside
     if ignored_count:
         notes.append(
-            f"{one_line(path.name, MAX_NAME_LENGTH)}: {ignored_count} links to files outside the "
-            "folder, special files or unreadable folders were ignored."
+            f"{one_line(path.name, MAX_NAME_LENGTH)}: {ignored_count} entries were ignored (links "
+            "to files outside the folder, special files, unreadable folders)."
         )
 
 
