@@ -175,8 +175,8 @@ class SegmentRun:
 
     Attributes
     ----------
-    intervals : tuple of EventIntervals
-        Intervals between the fusions of each configuration.
+    events : tuple of recarray
+        Fusions of each configuration, see :data:`~px4fuse.ekf2.intervals.EVENT_DTYPE`.
     innovation, innovation_variance, noise : ndarray, shape (events, filters, 6)
         ν (measurement minus state), S and R of velocity (m/s) and position (m), NED.
     rejected, fused, reset : ndarray of bool, shape (events, filters)
@@ -197,7 +197,7 @@ class SegmentRun:
 
     segment: ReplaySegment
     configurations: tuple[FilterConfiguration, ...]
-    intervals: tuple[EventIntervals, ...]
+    events: tuple[StepEvents, ...]
     innovation: Array
     innovation_variance: Array32
     noise: Array32
@@ -211,11 +211,6 @@ class SegmentRun:
     magnetometer_updates: Array
     height_filter: HeightFilter | None = None
     vision_filter: VisionFilter | None = None
-
-    @property
-    def events(self) -> list[StepEvents]:
-        """Fusions of each configuration, see :data:`~px4fuse.ekf2.intervals.EVENT_DTYPE`."""
-        return [interval_arrays.events for interval_arrays in self.intervals]
 
 
 def run_segment(  # noqa: PLR0912, PLR0915 (one recursion, read from top to bottom)
@@ -549,7 +544,7 @@ def run_segment(  # noqa: PLR0912, PLR0915 (one recursion, read from top to bott
     return SegmentRun(
         segment,
         tuple(configurations),
-        tuple(intervals),
+        tuple(interval_arrays.events for interval_arrays in intervals),
         innovations,
         variances,
         measurement_variance.astype(np.float32),

@@ -345,31 +345,20 @@ def _run_model(
         configuration in model.runs[0].configurations for configuration in configurations
     ):
         return model.runs
-    return run_configurations(model.inputs, configurations, model.runs)
+    return run_configurations(model.inputs, configurations)
 
 
 def run_configurations(
-    inputs: ReplayInputs,
-    configurations: Sequence[FilterConfiguration],
-    earlier_runs: Sequence[SegmentRun] = (),
+    inputs: ReplayInputs, configurations: Sequence[FilterConfiguration]
 ) -> list[SegmentRun]:
-    """Run several filter configurations; return the results of each flight segment.
-
-    ``earlier_runs`` are results for the same inputs; their intervals between fusions are reused.
-    """
+    """Run several filter configurations; return the results of each flight segment."""
     delays_by_configuration = [
         configuration.compute_delays(inputs) for configuration in configurations
     ]
     intervals_by_delays = {
-        configuration.compute_delays(inputs): [run.intervals[index] for run in earlier_runs]
-        for index, configuration in enumerate(
-            earlier_runs[0].configurations if earlier_runs else ()
-        )
+        delays: [make_event_intervals(inputs, segment, delays) for segment in inputs.segments]
+        for delays in set(delays_by_configuration)
     }
-    for delays in set(delays_by_configuration) - intervals_by_delays.keys():
-        intervals_by_delays[delays] = [
-            make_event_intervals(inputs, segment, delays) for segment in inputs.segments
-        ]
     return [
         run_segment(inputs, segment, configurations, intervals)
         for segment, *intervals in zip(
