@@ -332,10 +332,7 @@ def compute_delayed_tracks(
     """Yield position and velocity at the fusion horizon for each filter configuration."""
     runs = _run_model(model, configurations)
     for index in map(runs[0].configurations.index, configurations):
-        states = [(run, compute_delayed_states(run, index)) for run in runs]
-        yield pd.concat(
-            [_make_track(run, state[:, VELOCITY], state[:, POSITION]) for run, state in states]
-        )
+        yield pd.concat([_make_delayed_track(run, index) for run in runs])
 
 
 def _run_model(
@@ -367,6 +364,11 @@ def run_configurations(
             strict=True,
         )
     ]
+
+
+def _make_delayed_track(run: SegmentRun, configuration_index: int) -> pd.DataFrame:
+    state = compute_delayed_states(run, configuration_index)
+    return _make_track(run, state[:, VELOCITY], state[:, POSITION])
 
 
 def _make_track(run: SegmentRun, velocity_m_s: Array, position_m: Array) -> pd.DataFrame:
