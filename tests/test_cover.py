@@ -76,7 +76,7 @@ def test_report_cover_joins_alternative_actions_by_either_or() -> None:
         alternatives=((sender,), (console,)), actions=(Action("KF", "keep the settings"),),
     )  # fmt: skip
     text = text_of(replace(SMALL_SIGMA_A, causes=(cause,)))
-    assert "EITHER sender subtract 0.264 s" in text
+    assert "option 1: sender subtract 0.264 s" in text
     assert "OR EKF2 console param set EKF2_EV_DELAY 264 reboot" in text
     assert "KF keep the settings" in text
     assert "console: MAVLink Console of QGroundControl" in text

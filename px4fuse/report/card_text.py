@@ -281,13 +281,13 @@ def _format_cause_lines(cause: DiagnosedCause, do_this: str) -> Iterator[Paragra
 
 
 def label_alternatives(cause: DiagnosedCause) -> list[tuple[str, Action]]:
-    """Return the actions of a cause with "EITHER ", "OR " or "AND " if there are alternatives."""
+    """Return the actions of a cause with "option 1: ", "also: " and so on if there are options."""
     alternatives = [
-        ("OR " if place else "EITHER ", action)
-        for place, alternative in enumerate(cause.alternatives)
+        (f"option {place}: ", action)
+        for place, alternative in enumerate(cause.alternatives, start=1)
         for action in alternative
     ]
-    return alternatives + [("AND " if alternatives else "", action) for action in cause.actions]
+    return alternatives + [("also: " if alternatives else "", action) for action in cause.actions]
 
 
 def format_target(action: Action) -> str:
@@ -322,7 +322,9 @@ def make_rerun_rows(reruns: Sequence[CardRerun]) -> list[list[str]]:
             "● innovation ÷ √S": _format_before_after(rerun.source_ratio, format_ratio),
             "◆ error ÷ σ": _format_before_after(rerun.truth_ratio, format_ratio),
             "rejected": _format_before_after(rerun.rejected_fraction, _format_percent, " %"),
-            "improves": rerun.improves,
+            "result": f"improves {rerun.improves}"
+            if rerun.improves != "nothing"
+            else "no improvement",
         }
         for rerun in reruns
     ]

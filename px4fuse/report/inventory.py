@@ -28,14 +28,15 @@ def make_log_page(inventory: Inventory, request: ComparisonRequest) -> Page:
     if sender_rows:
         sender_head = ("sender", "type", "messages", "lost")
         page.add_table(sender_head, sender_rows, right_aligned_columns=(2, 3))
-    head = ("data", "topic", "samples", "rate (Hz)", "gaps", "span (s)")
+    head = ("data", "topic", "samples", "rate", "gaps", "time span")
     page.add_table(head, [*_make_source_rows(inventory)], right_aligned_columns=(2, 3, 4, 5))
-    yes, no = ("yes", GOOD_COLOUR), ("no", SEVERITY_COLOURS["warning"])
+    possible = "possible", GOOD_COLOUR
+    impossible = "not possible", SEVERITY_COLOURS["warning"]
     rows = [
-        (yes if option.possible else no, option.name, option.reason)
+        (possible if option.possible else impossible, option.name, option.reason)
         for option in inventory.abilities
     ]
-    page.add_table(("possible", "analysis", ""), rows)
+    page.add_table(("", "analysis", "data in the log"), rows)
     if inventory.abilities[0].possible:  # comparison of KF and EKF2
         command = command_line(request, "compare", for_shell=True)
         page.add("command", text=command, label="Run")
@@ -103,8 +104,8 @@ def _make_source_rows(inventory: Inventory) -> Iterator[tuple[Cell, ...]]:
         yield (
             f"{data_type:8} (used)" if source.chosen else data_type,
             source.name,
-            "" if source.samples is None else f"{source.samples}",
-            "" if source.rate_hz is None else _format_for_narrow_column(source.rate_hz),
+            "" if source.samples is None else f"{source.samples} samples",
+            "" if source.rate_hz is None else f"{_format_for_narrow_column(source.rate_hz)} Hz",
             _format_gaps(source),
             _format_time_span(source),
         )
@@ -114,8 +115,11 @@ def _format_gaps(source: LoggedData) -> str:
     if source.gaps is None:
         return ""
     if not source.gaps.count:
-        return "0"
-    return f"{source.gaps.count} ({_format_for_narrow_column(source.gaps.longest_s)} s)"
+        return "no gap"
+    longest_gap_text = f"{_format_for_narrow_column(source.gaps.longest_s)} s"
+    if source.gaps.count == 1:
+        return f"1 gap ({longest_gap_text})"
+    return f"{source.gaps.count} gaps (up to {longest_gap_text})"
 
 
 def _format_for_narrow_column(value: float) -> str:
@@ -126,4 +130,4 @@ def _format_time_span(source: LoggedData) -> str:
     if source.start_s is None or source.end_s is None:
         return ""
     digits = 1 if source.end_s < 10 else 0
-    return f"{source.start_s:z.{digits}f} to {source.end_s:z.{digits}f}"
+    return f"{source.start_s:z.{digits}f} to {source.end_s:z.{digits}f} s"
