@@ -25,9 +25,7 @@ MAX_SQRT_MEAN_NEES = 2.0
 # Settings and flight properties that px4fuse diff compares
 SETTING_PATHS_BY_LABEL = {
     **{
-        f"{SETTING_RANGES[name].label} ({SETTING_RANGES[name].unit})"
-        if name in SETTING_RANGES
-        else name: f"settings.{name}"
+        SETTING_RANGES[name].format_label() if name in SETTING_RANGES else name: f"settings.{name}"
         for name in Settings.__dataclass_fields__
     },
     "start of the analysed time (s)": "settings.start_s",
