@@ -382,19 +382,25 @@ def _read_fusion_record(
 
 
 def _read_magnetic_field(topics: Topics, step_s: float) -> pd.DataFrame:
-    """Read the measured magnetic field from the magnetometer topic or from EKF2's observations."""
+    """Read the measured magnetic field (gauss, FRD) at the times of measurement, for the replay.
+
+    The columns are the field, EKF2's innovations if logged, and fused_3d: 1 while EKF2 fuses the
+    field as a vector. The table is empty if data are missing.
+
+    A complete log has the field of each fusion; the longer one is used. Otherwise, EKF2's filtered
+    innovations give the mean field between two logged observations, so they are preferred.
+    """
     magnetometer, observations = (
         topics.primary_samples(px4.TOPIC_LAYOUTS[topic]).dropna()
         for topic in ("vehicle_magnetometer", "estimator_aid_src_mag")
     )
-    # EKF2 subtracts EKF2_MAG_DELAY and half a prediction interval from the times
+    # EKF2 subtracts EKF2_MAG_DELAY and half a prediction interval from the times of observations
     delay_s = topics.ekf2_parameters.get("EKF2_MAG_DELAY", 0.0) * 1e-3 + 0.5 * step_s
     observations = observations.set_axis(observations.index + delay_s)
     min_count = MIN_MAGNETOMETER_HZ * topics.log.duration_s
-    candidates = [table for table in (magnetometer, observations) if len(table) > min_count]
-    if not candidates and Columns.MAGNETIC_FIELD_INNOVATION[0] in observations:
-        candidates = [observations]
-    field = max(candidates or [magnetometer, observations], key=len)
+    field = max(magnetometer, observations, key=len)
+    if len(field) <= min_count and Columns.MAGNETIC_FIELD_INNOVATION[0] in observations:
+        field = observations
     control_bits = topics.read(px4.TOPIC_LAYOUTS["control_bits"])["bits"].dropna()
     if field.empty or control_bits.empty:
         return pd.DataFrame()
