@@ -106,6 +106,7 @@ def _list_setting_changes(
 
 def _collect_parameters(results: Results) -> dict[str, float]:
     """Return the PX4 parameters in the results, rounded to the 6 digits of a float32."""
+    # The replay also contains the defaults of parameters that the log does not contain
     parameters = (find_value(results, "ekf2_replay.settings") or {}) | dict(results.log.parameters)
     return {name: float(f"{parameters[name]:.6g}") for name in sorted(parameters)}
 
