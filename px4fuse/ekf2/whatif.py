@@ -563,7 +563,10 @@ def _find_longest_gap_s(fusion_times_s: ArrayLike, spans_s: Spans) -> float:
 def _describe_deviation(
     model: Ekf2Model, replay: Ekf2Replay, disable_time_s_by_aid: Mapping[str, float], spans_s: Spans
 ) -> str:
-    """Describe the position difference between replays with and without an aiding source."""
+    """Describe the position difference between replays with and without aiding sources.
+
+    ``disable_time_s_by_aid`` contains the time (s) from which ``replay`` omits an aiding source.
+    """
     position_difference_m = rows_inside(
         replay.published_state[Columns.POSITION]
         - model.baseline_replay.published_state[Columns.POSITION],
@@ -583,11 +586,11 @@ def _describe_deviation(
         f"{largest_distance_time_s:.1f} s), and by {horizontal_distance_m[-1]:.3g} m at the end"
     )
     if height_aids & {*disable_time_s_by_aid}:
-        note = f"{note}. The replayed heights differ by at most {height_difference_m.max():.3g} m"
+        note += f". The replayed heights differ by at most {height_difference_m.max():.3g} m"
     if horizontal_aids <= disable_time_s_by_aid.keys():
-        note = (
-            f"{note}. The replay then uses only the IMU. EKF2 stops publishing a position "
-            "after EKF2_NOAID_TOUT (5 s)"
+        note += (
+            ". The replay then uses only the IMU. EKF2 stops publishing a position after "
+            "EKF2_NOAID_TOUT (5 s)"
         )
     return note
 

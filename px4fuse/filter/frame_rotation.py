@@ -125,6 +125,9 @@ def estimate_heading_error(  # noqa: PLR0911 (one return per missing input)
 ) -> HeadingError | Unavailable:
     """Estimate the misalignment in yaw between the position source's frame and the attitude.
 
+    If the source has orientations, and their heading error drifts, the estimate is from them.
+    Otherwise, it is from the positions and the IMU.
+
     Parameters
     ----------
     settings : Settings

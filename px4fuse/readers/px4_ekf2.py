@@ -244,7 +244,8 @@ def compute_samples_per_step(
 ) -> int:
     """Return the number of IMU samples in one EKF2 prediction: the rounded ratio of both intervals.
 
-    ``step_ends`` are the indices of the IMU samples at which logged predictions end.
+    Near a half-integer ratio, both neighbouring counts are possible. The count that fits
+    ``step_ends`` is then used: the indices of the IMU samples at which logged predictions end.
 
     >>> compute_samples_per_step(0.010, 0.00375), compute_samples_per_step(0.010, 0.004)
     (3, 3)
@@ -260,11 +261,11 @@ def compute_samples_per_step(
         and abs(interval_ratio + 0.5 - sample_count) < MAX_DISTANCE_FROM_HALF_INTEGER
         and len(samples_between_logged_ends)
     ):
-        is_multiple_of_larger_count, is_multiple_of_smaller_count = (
+        fits_larger_count, fits_smaller_count = (
             np.mean(samples_between_logged_ends % step_sample_count == 0.0) > 0.9
             for step_sample_count in (sample_count, sample_count - 1)
         )
-        return sample_count - int(is_multiple_of_smaller_count and not is_multiple_of_larger_count)
+        return sample_count - int(fits_smaller_count and not fits_larger_count)
     return sample_count
 
 
