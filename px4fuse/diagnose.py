@@ -8,10 +8,16 @@
 4. diagnose_comparison, which calls:
 
    a. estimate: noise σ, time offset, frame misalignment, biases
-   b. rerun: replay EKF2, explain KF - EKF2, re-run both filters with one change at a time
-   c. collect_events, evaluate_aids, analyse_flight_loop: events, EKF2's other aiding sources,
+   b. refine_delay: report the negative time offset from a as delay of the positions
+   c. rerun: replay EKF2, explain KF - EKF2, re-run both filters with one change at a time
+   d. collect_events, evaluate_aids, analyse_flight_loop: events, EKF2's other aiding sources,
       loop closure error
-   d. find: faults of the flight, with their causes
+   e. find: faults of the flight, with their causes
+
+Time offsets are added to timestamps, so they are negative for late timestamps. In SourceTimeOffset,
+offset_s = applied_s + remaining_s: total estimate, offset added in step 2, and its error. A delay
+(late_s) has the opposite sign; it is 0 in convention_faults if it is too small to be a fault.
+refine_delay changes only the reported delay: the timestamps are not shifted again.
 
 If EKF2's positions, from which the time offset of a position file was estimated, are late, steps 2
 to 4 are repeated with the time offset from the IMU (_align_file_to_imu).
@@ -109,7 +115,9 @@ def _diagnose_flight(request: ComparisonRequest, progress: Progress, flight: Fli
 def _align_file_to_imu(flight: Flight, analysis: Analysis) -> Flight | None:
     """Replace the clock offset of a position file by the estimate from the IMU.
 
-    The first estimate is from EKF2's positions, which may be late. Return None if nothing changes.
+    The first estimate is from EKF2's positions, which may be late. The IMU estimate does not depend
+    on them, so it needs no second repetition. Return None if nothing changes. Without
+    clock_offset_sigma_s, the user gave the offset.
     """
     alignment, time_offset = analysis.source.alignment, analysis.time_offset
     if (
@@ -177,7 +185,10 @@ def diagnose_comparison(comparison: Comparison, progress: Progress = ignore_prog
 
 
 def refine_delay(comparison: Comparison, time_offset: SourceTimeOffset | Unavailable) -> Comparison:
-    """Replace the detected delay of the positions by the more precise ``time_offset``."""
+    """Replace the detected delay of the positions by the more precise ``time_offset``.
+
+    Only the reported delay changes: the timestamps are not shifted again.
+    """
     if (
         comparison.convention is None
         or isinstance(time_offset, Unavailable)
@@ -187,7 +198,7 @@ def refine_delay(comparison: Comparison, time_offset: SourceTimeOffset | Unavail
     # The delay is the negative time offset
     refined_convention = structs.replace(comparison.convention, late_s=-time_offset.offset_s)
     refined_comparison = replace(comparison, convention=refined_convention)
-    # Keep the first estimate if the refined delay is too small to be a fault
+    # late_s of the faults is 0 if the delay is too small to be a fault: keep the first estimate
     is_delay_a_fault = (
         comparison.convention_faults.late_s and refined_comparison.convention_faults.late_s
     )
@@ -267,7 +278,10 @@ def prepare_comparison(
 def rerun(
     comparison: Comparison, estimates: Estimates, progress: Progress = ignore_progress
 ) -> Reruns:
-    """Explain the difference KF - EKF2, and re-run both filters with one change at a time."""
+    """Explain the difference KF - EKF2, and re-run both filters with one change at a time.
+
+    Both steps find their replays in ``ekf2_model.runs`` by equality of the parameter sets.
+    """
     progress("replaying EKF2")
     estimated_settings = find_corrected_noise_settings(comparison, estimates.tuning)
     # Replay all parameter sets at once, which is faster

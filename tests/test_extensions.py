@@ -20,7 +20,9 @@ from conftest import REPOSITORY as ROOT
 
 from px4fuse.batch.changes import SETTING_PATHS_BY_LABEL
 from px4fuse.cli import options
-from px4fuse.filter.settings import SETTING_RANGES, Settings
+from px4fuse.errors import SettingsError
+from px4fuse.filter.settings import SETTING_RANGES, Range, Settings
+from px4fuse.report.phrases import format_settings
 from px4fuse.request import ComparisonRequest
 from px4fuse.results.contract import ChosenSettings
 
@@ -190,6 +192,20 @@ def test_each_kf_setting_has_option_range_and_result_field() -> None:
     assert set(SETTING_RANGES) == {
         name for name in names if isinstance(getattr(Settings(), name), float)
     }
+
+
+def test_setting_without_unit_prints_no_dangling_blank(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setitem(SETTING_RANGES, "dt_s", Range(1.0, 5.0, "", "GATE"))
+    assert SETTING_RANGES["dt_s"].format_label() == "GATE"
+    assert "GATE 3, input imu" in format_settings(Settings(dt_s=3.0))
+    with pytest.raises(SettingsError, match=r"give 1 to 5\.$"):
+        Settings(dt_s=9.0)
+
+    @click.command()
+    @options.request_option(ComparisonRequest, "dt_s", "Gate (RANGE).")
+    def fuse(**_: float) -> None: ...
+
+    assert "Gate (1 to 5)." in CliRunner().invoke(fuse, ["--help"]).output
 
 
 def test_request_option_without_unit_or_with_bool_is_number_or_flag(

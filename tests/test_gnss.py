@@ -19,12 +19,13 @@ from ulog_tools import Log, gnss_log, position, seconds_of, stamps, take, topic
 
 import px4fuse
 from px4fuse.comparison.preparation import choose_source
+from px4fuse.core.arrays import rms
 from px4fuse.diagnose import prepare_comparison
 from px4fuse.ekf2.aids import AidResult
 from px4fuse.ekf2.inputs import _make_fusion_rules, read_gnss
 from px4fuse.ekf2.inputs import prepare_inputs as prepare_replay
 from px4fuse.ekf2.model import Ekf2Model
-from px4fuse.ekf2.replay import is_inside_spans, rms
+from px4fuse.ekf2.replay import is_inside_spans
 from px4fuse.ekf2.whatif import Ekf2Statistics, what_if
 from px4fuse.errors import MissingDataError, SettingsError
 from px4fuse.findings import find, noises

@@ -80,7 +80,8 @@ class SampledTrack:
         return self.position_m[:, 0] + 1j * self.position_m[:, 1]
 
     def at(self, time_s: Array) -> tuple[Array, BoolArray]:
-        """Interpolate the position at given times, and return a mask of times outside gaps."""
+        """Interpolate the position at given times; the mask is True between two valid samples."""
+        # 1, except for rounding errors, if both samples are valid
         is_valid = np.interp(time_s, self.time_s, self.is_valid.astype(float), 0.0, 0.0) > 0.999
         return interpolate_columns(time_s, self.time_s, self.position_m), is_valid
 

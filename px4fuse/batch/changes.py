@@ -25,9 +25,7 @@ MAX_SQRT_MEAN_NEES = 2.0
 # Settings and flight properties that px4fuse diff compares
 SETTING_PATHS_BY_LABEL = {
     **{
-        f"{SETTING_RANGES[name].label} ({SETTING_RANGES[name].unit})"
-        if name in SETTING_RANGES
-        else name: f"settings.{name}"
+        SETTING_RANGES[name].format_label() if name in SETTING_RANGES else name: f"settings.{name}"
         for name in Settings.__dataclass_fields__
     },
     "start of the analysed time (s)": "settings.start_s",
@@ -108,6 +106,7 @@ def _list_setting_changes(
 
 def _collect_parameters(results: Results) -> dict[str, float]:
     """Return the PX4 parameters in the results, rounded to the 6 digits of a float32."""
+    # The replay also contains the defaults of parameters that the log does not contain
     parameters = (find_value(results, "ekf2_replay.settings") or {}) | dict(results.log.parameters)
     return {name: float(f"{parameters[name]:.6g}") for name in sorted(parameters)}
 

@@ -274,6 +274,7 @@ def _write_table(state: _RunState, logs: Iterable[LogAddress]) -> BatchResult:
     first_log_by_hash: dict[str, LogAddress] = {}
 
     def find_rows(log: LogAddress) -> list[Row]:
+        """Return the rows of a log; of identical logs, only the first call returns results."""
         if log.address in state.failed_row_by_address:
             return [state.failed_row_by_address[log.address]]
         if log.address not in state.hash_by_address:  # batch stopped before this log

@@ -596,8 +596,7 @@ def _describe_kf_settings(
         if name == "sigma_z_m" and analysis.source.origin.is_gnss:
             default_text = f"from {find_aid(analysis).noise}"
             value_origin = default_text if chosen is None else value_origin
-        unit, label = SETTING_RANGES[name][2:]
-        setting_texts.append(f"{label} {value:g} {unit} ({value_origin})")
+        setting_texts.append(f"{SETTING_RANGES[name].format_value(value)} ({value_origin})")
         if chosen is not None and f"{chosen:g}" != default_text:
             option = f"{COMPARISON_OPTIONS[name]} {chosen:g}"
             changed_options.append(f"{option} (default {default_text})")

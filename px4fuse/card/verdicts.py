@@ -9,7 +9,7 @@ import numpy as np
 from px4fuse.card.model import Verdict
 from px4fuse.comparison.comparison import compute_normalised_errors
 from px4fuse.comparison.model import FILTER_NAMES, AxisComparison, FilterName, FilterSummary
-from px4fuse.core.arrays import Array
+from px4fuse.core.arrays import Array, rms
 from px4fuse.filter.consistency import Reference, classify_sigma_ratio, compute_sigma_ratio_interval
 from px4fuse.flight.model import Unavailable
 
@@ -51,7 +51,7 @@ def _assess_against_truth(result: AxisComparison, filter_name: FilterName) -> Ve
     if isinstance(errors, Unavailable):
         return _make_unevaluated_verdict(filter_name, "truth", errors)
     time_s, normalised_errors = errors
-    ratio = float(np.sqrt(np.mean(np.square(normalised_errors))))
+    ratio = rms(normalised_errors)
     interval = block_bootstrap_rms(time_s, normalised_errors)
     return Verdict(
         filter=filter_name,

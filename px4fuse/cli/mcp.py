@@ -95,7 +95,9 @@ def run_command(
     sender: Connection | None,
     command_words: Sequence[str],
 ) -> tuple[str, Any]:
-    """Run a command in this process; return its terminal text, and its results or None.
+    """Run a command in this process; return its terminal text, and its results (JSON) or None.
+
+    Of the results of ``compare``, only the diagnosis card is returned.
 
     Parameters
     ----------

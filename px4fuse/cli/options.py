@@ -256,7 +256,7 @@ def request_option(
     if field.default:
         details["default"] = field.default
     if name in SETTING_RANGES:
-        help_text = help_text.replace("RANGE", "{:g} to {:g} {}".format(*SETTING_RANGES[name]))
+        help_text = help_text.replace("RANGE", SETTING_RANGES[name].format_limits())
     # without a name, click derives it from the option: --position-frame gives position_frame
     parameter_names = () if request_type is PositionFile else (name,)
     return click.option(

@@ -12,7 +12,12 @@ from numpy.lib.stride_tricks import sliding_window_view
 from scipy.interpolate import CubicSpline
 
 from px4fuse.comparison.model import Comparison
-from px4fuse.core.arrays import Array, integrate_cumulatively, rank_correlation
+from px4fuse.core.arrays import (
+    Array,
+    compute_median_interval_s,
+    integrate_cumulatively,
+    rank_correlation,
+)
 from px4fuse.flight.model import Columns, Ekf2, Unavailable, rows_between
 from px4fuse.trajectory.rotation import conjugate, interpolate, multiply, to_rotation_vector
 from px4fuse.trajectory.scores import compute_autocorrelation_time
@@ -192,7 +197,7 @@ def compute_local_residuals(comparison: Comparison) -> LocalResiduals | None:
     rows = np.arange(2, len(time_s) - 2)
     neighbour_rows = rows[:, None] + NEIGHBOUR_ROW_OFFSETS
     elapsed_s = time_s[neighbour_rows] - time_s[rows, None]
-    interval_s = float(np.median(np.diff(time_s)))
+    interval_s = compute_median_interval_s(time_s)
     has_close_neighbours = np.ptp(elapsed_s, axis=1) < MAX_NEIGHBOUR_SPAN_IN_INTERVALS * interval_s
     rows, neighbour_rows, elapsed_s = (
         array[has_close_neighbours] for array in (rows, neighbour_rows, elapsed_s)
@@ -340,7 +345,7 @@ def fit_errors(comparison: Comparison, local_residuals: LocalResiduals) -> Error
     error_m = position_m - true_spline(time_s)
     parameters, residual_m = _fit_least_squares(columns, error_m)
     # The σ of the scale factor depends on the number of independent errors
-    interval_s = float(np.median(np.diff(time_s)))
+    interval_s = compute_median_interval_s(time_s)
     independent_error_count = len(time_s) / max(
         *map(compute_autocorrelation_time, residual_m.T), 1.0
     )
@@ -381,7 +386,7 @@ def _fit_least_squares(columns: Array, values: Array) -> tuple[Array, Array]:
 def find_periodic_error(fit: ErrorFit) -> PeriodicError | None:
     """Return a sinusoidal error that explains most of the slow errors, if any."""
     duration_s = fit.time_s[-1] - fit.time_s[0]
-    max_frequency_hz = min(MAX_FREQUENCY_HZ, 0.25 / float(np.median(np.diff(fit.time_s))))
+    max_frequency_hz = min(MAX_FREQUENCY_HZ, 0.25 / compute_median_interval_s(fit.time_s))
     frequency_step_hz = FREQUENCY_STEP_IN_PERIODS_PER_FLIGHT / duration_s
     rows = slice(
         round(MIN_PERIOD_COUNT / FREQUENCY_STEP_IN_PERIODS_PER_FLIGHT),

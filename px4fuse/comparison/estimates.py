@@ -16,7 +16,7 @@ from px4fuse.comparison.noise_differences import (
     find_noisy_flight_part,
     tune_perpendicular_axes,
 )
-from px4fuse.core.arrays import Array
+from px4fuse.core.arrays import Array, compute_median_interval_s
 from px4fuse.filter.correlated_noise import (
     SourceLowPass,
     TimeCorrelatedNoise,
@@ -346,7 +346,7 @@ def explain_low_imu_rate(flight: Flight) -> Unavailable | None:
     stream = flight.streams.get("imu")
     is_telemetry = stream is not None and stream.topics[0] in TELEMETRY_IMU_MESSAGES
     required_hz = MIN_TELEMETRY_IMU_HZ if is_telemetry else MIN_TIME_OFFSET_IMU_HZ
-    rate_hz = 1.0 / float(np.median(np.diff(flight.imu.index.to_numpy())))
+    rate_hz = 1.0 / compute_median_interval_s(flight.imu.index)
     if rate_hz >= MIN_IMU_RATE_RATIO * required_hz:
         return None
     rate_note = f"the IMU was logged at {rate_hz:.3g} Hz"
@@ -405,7 +405,8 @@ def _compute_weighted_square_sum(offsets_s: Array, weights: Array) -> float:
 def _compute_change_p_value(offsets_s: Array, weights: Array) -> float | None:
     """Return the p-value of the largest change of the time offset; None for a short flight.
 
-    Method: Student's t-test with Bonferroni correction.
+    Method: Student's t-test with Bonferroni correction. ``weights`` are 1/σ² of the offsets; a
+    scatter above σ enlarges the tested σ, a smaller scatter does not reduce it.
     """
     degrees_of_freedom = len(offsets_s) - 2
     split_rows = range(

@@ -136,7 +136,8 @@ def rerun_filters(
 ) -> tuple[Rerun, ...]:
     """Re-run KF and EKF2 along each axis with each change that may make them consistent.
 
-    EKF2 is re-run only if its replay agrees with the log.
+    EKF2 is re-run only if its replay agrees with the log, and only once for each change, because a
+    replay contains all axes.
     """
     filters = [_Filter("kf", partial(_rerun_kf, comparison, estimates.tuning))]
     if (

@@ -42,8 +42,10 @@ from px4fuse.trajectory.rotation import heading
 MIN_CONVENTION_LOG_ODDS = 4.0
 # Minimum log-likelihood gain (nats) over positions that do not depend on the motion
 MIN_LOG_LIKELIHOOD_GAIN = 8.0
-# Minimum gain per independent sample if only one convention fits, and if several fit
-MIN_LOG_LIKELIHOOD_GAIN_PER_SAMPLE = (0.15, 0.4)
+# Minimum gain per independent sample if only one convention fits
+MIN_LOG_LIKELIHOOD_GAIN_PER_SAMPLE = 0.15
+# Minimum gain per independent sample if several conventions fit
+MIN_LOG_LIKELIHOOD_GAIN_PER_SAMPLE_IF_AMBIGUOUS = 0.4
 # Accepted ratio of the source's displacements to those from the IMU
 MIN_SOURCE_TO_IMU_DISPLACEMENT_RATIO, MAX_SOURCE_TO_IMU_DISPLACEMENT_RATIO = 0.88, 1.12
 # A convention is doubtful if σ of its residuals is above this multiple of the expected noise
@@ -240,42 +242,31 @@ def _rotate_to_gnss(
 def _choose_convention(
     hypotheses: list[Hypothesis], positions: SentPositions, clock_drift: float
 ) -> Convention:
-    """Return the best convention and its verdict."""
+    """Return the first of ``hypotheses`` (best first) as convention, with verdict and alternatives.
+
+    The positions are rotated against the heading of their first axis. The scale is the regression
+    of displacements on those of the IMU: position noise does not bias it.
+    """
     best_hypothesis = hypotheses[0]
-    other_conventions = [
+    other_hypotheses = [
         hypothesis for hypothesis in hypotheses if not hypothesis.is_similar_to(best_hypothesis)
     ]
     # Without heights, z up and z down fit equally well
     if not positions.position_m[:, 2].any():
-        other_conventions = [
+        other_hypotheses = [
             hypothesis
-            for hypothesis in other_conventions
+            for hypothesis in other_hypotheses
             if hypothesis.axes[:2] != best_hypothesis.axes[:2]
         ]
-    log_odds = best_hypothesis.score - other_conventions[0].score if other_conventions else None
-    is_ambiguous = log_odds is not None and log_odds < MIN_CONVENTION_LOG_ODDS
-    verdict: ConventionVerdict = "ambiguous" if is_ambiguous else "determined"
-    if best_hypothesis.score < MIN_LOG_LIKELIHOOD_GAIN:
-        verdict = "not determinable"
-    elif (
-        best_hypothesis.score
-        < MIN_LOG_LIKELIHOOD_GAIN_PER_SAMPLE[is_ambiguous]
-        * best_hypothesis.independent_residual_count
-        or best_hypothesis.min_source_to_imu_displacement_ratio
-        > MAX_SOURCE_TO_IMU_DISPLACEMENT_RATIO
-        or best_hypothesis.max_source_to_imu_displacement_ratio
-        < MIN_SOURCE_TO_IMU_DISPLACEMENT_RATIO
-        or compute_residual_ratio(best_hypothesis, positions) > MAX_RESIDUAL_TO_NOISE_RATIO
-    ):
-        verdict = "doubtful"
+    log_odds = best_hypothesis.score - other_hypotheses[0].score if other_hypotheses else None
     x, y, z = best_hypothesis.axes
     likely_conventions = [
         _describe_hypothesis(hypothesis)
-        for hypothesis in other_conventions
+        for hypothesis in other_hypotheses
         if hypothesis.score > best_hypothesis.score - MIN_CONVENTION_LOG_ODDS
     ]
     return Convention(
-        verdict=verdict,
+        verdict=_judge_hypothesis(best_hypothesis, positions, bool(likely_conventions)),
         x=x,
         y=y,
         z=z,
@@ -291,6 +282,30 @@ def _choose_convention(
         log_likelihood_gain=best_hypothesis.score,
         alternatives=tuple(dict.fromkeys(likely_conventions)),
     )
+
+
+def _judge_hypothesis(
+    hypothesis: Hypothesis, positions: SentPositions, is_ambiguous: bool
+) -> ConventionVerdict:
+    """Return the first verdict that applies: not determinable, doubtful, ambiguous, determined.
+
+    ``is_ambiguous`` is True if other conventions fit nearly as well.
+    """
+    if hypothesis.score < MIN_LOG_LIKELIHOOD_GAIN:
+        return "not determinable"
+    min_gain_per_sample = (
+        MIN_LOG_LIKELIHOOD_GAIN_PER_SAMPLE_IF_AMBIGUOUS
+        if is_ambiguous
+        else MIN_LOG_LIKELIHOOD_GAIN_PER_SAMPLE
+    )
+    if (
+        hypothesis.score < min_gain_per_sample * hypothesis.independent_residual_count
+        or hypothesis.min_source_to_imu_displacement_ratio > MAX_SOURCE_TO_IMU_DISPLACEMENT_RATIO
+        or hypothesis.max_source_to_imu_displacement_ratio < MIN_SOURCE_TO_IMU_DISPLACEMENT_RATIO
+        or compute_residual_ratio(hypothesis, positions) > MAX_RESIDUAL_TO_NOISE_RATIO
+    ):
+        return "doubtful"
+    return "ambiguous" if is_ambiguous else "determined"
 
 
 def _describe_hypothesis(hypothesis: Hypothesis) -> str:

@@ -4,7 +4,7 @@ from collections.abc import Iterator
 
 import numpy as np
 import pandas as pd
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
 
 Array = NDArray[np.float64]
 Array32 = NDArray[np.float32]
@@ -22,9 +22,13 @@ def iterate_row_blocks(count: int) -> Iterator[slice]:
     return (slice(first, first + BLOCK_ROWS) for first in range(0, count, BLOCK_ROWS))
 
 
-def compute_median_interval_s(time_s: Array) -> float:
+def compute_median_interval_s(time_s: ArrayLike) -> float:
     """Return the median interval (s) between successive times."""
     return float(np.median(np.diff(time_s)))
+
+
+def rms(values: "Array | pd.Series[float]") -> float:
+    return float(np.sqrt(np.mean(values**2)))
 
 
 def integrate_cumulatively(values: Array, time_s: Array) -> Array:

@@ -262,6 +262,7 @@ def _check_timestamps(positions: UnfusedPositions) -> Iterator[UnmetCondition]:
 
 
 def _check_quality(positions: UnfusedPositions) -> Iterator[UnmetCondition]:
+    """Yield a condition if EKF2 never saw enough successive positions with EKF2_EV_QMIN."""
     min_quality, status = positions.parameters.get("EKF2_EV_QMIN", 0.0), positions.source.status
     if min_quality <= 0.0 or "quality" not in status:
         return

@@ -541,7 +541,20 @@ def compute_delayed_states(run: SegmentRun, configuration_index: int) -> Array:
 def _propagate_states(
     run: SegmentRun, configuration_index: int, event_states: Array, first_steps: IntArray
 ) -> Array:
-    """Predict the state with the IMU from each fusion to the steps before the next fusion."""
+    """Predict the state with the IMU from each fusion to the steps before the next fusion.
+
+    Parameters
+    ----------
+    event_states : ndarray, shape (intervals or more, states)
+        State at the start of each interval, after a fusion.
+    first_steps : ndarray of int, shape (intervals + 1,)
+        Index of the first step of each interval, and of the last step plus 1.
+
+    Returns
+    -------
+    ndarray, shape (steps, states)
+        State at the end of each step. The biases are constant between fusions.
+    """
     segment, configuration = run.segment, run.configurations[configuration_index]
     interval_lengths = np.diff(first_steps)
     event_states = event_states[: len(interval_lengths)]
@@ -550,7 +563,7 @@ def _propagate_states(
     body_to_ned, step_s = segment.body_to_ned[1:][steps], segment.step_s[steps, None]
 
     def integrate(rows: slice, increments: Array) -> ArrayPair:
-        """Return states before and after each step."""
+        """Return the states in ``rows`` before and after each step: event state plus increments."""
         sums = cumulative_sums(increments)
         sums_at_events = sums[first_steps[:-1] - first_steps[0]]
         offsets = np.repeat(event_states[:, rows] - sums_at_events, interval_lengths, axis=0)

@@ -9,7 +9,7 @@ import pandas as pd
 from msgspec.structs import replace
 from numpy.typing import ArrayLike
 
-from px4fuse.core.arrays import Array, BoolArray, IntArray
+from px4fuse.core.arrays import Array, BoolArray, IntArray, rms
 from px4fuse.core.record import (
     NOT_WRITTEN,
     Correlation,
@@ -504,10 +504,6 @@ def compute_rmse_to_truth(
     )
     error_m = (position_m - true_position_m)[np.isfinite(true_position_m)]
     return rms(error_m) if len(error_m) else None
-
-
-def rms(values: "Array | pd.Series[float]") -> float:
-    return float(np.sqrt(np.mean(values**2)))
 
 
 def _judge_agreement(

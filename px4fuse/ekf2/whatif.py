@@ -563,7 +563,10 @@ def _find_longest_gap_s(fusion_times_s: ArrayLike, spans_s: Spans) -> float:
 def _describe_deviation(
     model: Ekf2Model, replay: Ekf2Replay, disable_time_s_by_aid: Mapping[str, float], spans_s: Spans
 ) -> str:
-    """Describe the position difference between replays with and without an aiding source."""
+    """Describe the position difference between replays with and without aiding sources.
+
+    ``disable_time_s_by_aid`` contains the time (s) from which ``replay`` omits an aiding source.
+    """
     position_difference_m = rows_inside(
         replay.published_state[Columns.POSITION]
         - model.baseline_replay.published_state[Columns.POSITION],

@@ -19,7 +19,7 @@ import pandas as pd
 from scipy.interpolate import CubicSpline
 from scipy.optimize import minimize_scalar
 
-from px4fuse.core.arrays import Array, ArrayPair
+from px4fuse.core.arrays import Array, ArrayPair, compute_median_interval_s
 from px4fuse.filter.fitting import (
     NoiseFit,
     NoiseParameters,
@@ -271,7 +271,7 @@ def fit_time_correlation(  # noqa: PLR0915 (two models with common data)
     ).x
     low_pass_score, low_pass_parameters = fit_low_pass(log_tau)
     if low_pass_score < white_noise_score:
-        median_interval_s = float(np.median(np.diff(time_s)))
+        median_interval_s = compute_median_interval_s(time_s)
         lag1_correlation = float(np.exp(-median_interval_s / np.exp(log_tau)))
         lag_s = median_interval_s * lag1_correlation / (1.0 - lag1_correlation)
         source_low_pass = SourceLowPass(

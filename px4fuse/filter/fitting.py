@@ -562,6 +562,10 @@ def compute_log_sigma_z_variance_factor(
 def _maximise_by_gradient(
     likelihood: NegativeLogLikelihood, start_parameters: NoiseParameters
 ) -> NoiseParameters:
+    """Return the most likely noise parameters near the start parameters (L-BFGS-B in ln σ).
+
+    Parameters that are 0 remain 0.
+    """
     nonzero_parameters = {name: value for name, value in vars(start_parameters).items() if value}
     log_bounds = np.log([NOISE_SEARCH_RANGES[name] for name in nonzero_parameters])
     measurement_count = len(likelihood.measurement_weights)

@@ -12,7 +12,7 @@ import pandas as pd
 from msgspec import structs
 from scipy.special import chdtrc
 
-from px4fuse.core.arrays import Array, compute_median_interval_s
+from px4fuse.core.arrays import Array, compute_median_interval_s, rms
 from px4fuse.core.record import NotNegative, Record, Share
 from px4fuse.filter.fitting import NoiseParameters, fit_constant_errors, maximise_likelihood
 from px4fuse.filter.imu_motion import (
@@ -125,6 +125,9 @@ def estimate_heading_error(  # noqa: PLR0911 (one return per missing input)
 ) -> HeadingError | Unavailable:
     """Estimate the misalignment in yaw between the position source's frame and the attitude.
 
+    If the source has orientations, and their heading error drifts, the estimate is from them.
+    Otherwise, it is from the positions and the IMU.
+
     Parameters
     ----------
     settings : Settings
@@ -136,7 +139,7 @@ def estimate_heading_error(  # noqa: PLR0911 (one return per missing input)
     """
     if isinstance(flight.attitude, Unavailable):
         return flight.attitude
-    if (interval_s := np.median(np.diff(flight.attitude.index))) > MAX_ATTITUDE_INTERVAL_S:
+    if (interval_s := compute_median_interval_s(flight.attitude.index)) > MAX_ATTITUDE_INTERVAL_S:
         return Unavailable(
             "heading error",
             f"the attitude is logged at only {1.0 / interval_s:.1f} Hz",
@@ -151,7 +154,7 @@ def estimate_heading_error(  # noqa: PLR0911 (one return per missing input)
             return orientation_heading_error
     if isinstance(flight.imu, Unavailable):
         return flight.imu
-    if (interval_s := np.median(np.diff(flight.imu.index))) > MAX_IMU_INTERVAL_S:
+    if (interval_s := compute_median_interval_s(flight.imu.index)) > MAX_IMU_INTERVAL_S:
         return Unavailable(
             "heading error",
             f"the IMU is logged at only {1.0 / interval_s:.1f} Hz",
@@ -199,7 +202,7 @@ def _average_flight_parts(
             start_s=float(time_s[part_rows[0]]),
             end_s=float(time_s[part_rows[-1]]),
             heading_error_deg=float(np.degrees(misalignment_rad[part_rows].mean())),
-            sigma_deg=float(np.degrees(np.sqrt(np.mean(sigma_rad[part_rows] ** 2)))),
+            sigma_deg=float(np.degrees(rms(sigma_rad[part_rows]))),
         )
         for part_rows in rows_by_part
         if len(part_rows) >= MIN_FLIGHT_PART_SAMPLES

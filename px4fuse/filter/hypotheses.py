@@ -159,14 +159,16 @@ def fit_systematic_errors(
     clock_offset_s: float,
     source_resets_s: Sequence[float] = (),
 ) -> SystematicErrors | Unavailable:
-    """Estimate accelerometer biases and scale factor error, and detect jumps of the positions.
+    """Estimate biases, frame rotation and scale factor error, and detect jumps of the positions.
 
     Parameters
     ----------
     axes : tuple of Axis
         Horizontal axes with the same measurement times.
+    settings : Settings
+        Only the prediction interval DT is used.
     sigma_a_m_s2, sigma_z_m : float
-        KF's maximum-likelihood noises.
+        KF's maximum-likelihood noises. SIGMA_A is fitted again.
     outlier_time_s : ndarray
         Timestamps of measurements to exclude.
     clock_offset_s : float
@@ -174,18 +176,20 @@ def fit_systematic_errors(
     source_resets_s : sequence of float
         Timestamps of resets that the position source reports.
     """
-    design_matrix = make_design_matrix(
+    initial_design = make_design_matrix(
         flight, axes, settings, sigma_a_m_s2, sigma_z_m, clock_offset_s
     )
-    if isinstance(design_matrix, Unavailable):
-        return design_matrix
-    is_skipped = np.isin(design_matrix.time_s, outlier_time_s)
-    if (used_count := int(np.count_nonzero(~is_skipped))) < MIN_MEASUREMENTS:
+    if isinstance(initial_design, Unavailable):
+        return initial_design
+    is_outlier = np.isin(initial_design.time_s, outlier_time_s)
+    if (used_count := int(np.count_nonzero(~is_outlier))) < MIN_MEASUREMENTS:
         return report_too_few_measurements(ANALYSIS_NAME, used_count, MIN_MEASUREMENTS)
     tested_sigmas_a = (sigma_a_m_s2 * TESTED_SIGMA_A_FACTORS).tolist()
-    design_matrix, regression = _fit_sigma_a(design_matrix, tested_sigmas_a, is_skipped)
+    design_matrix, regression = _fit_sigma_a(initial_design, tested_sigmas_a, is_outlier)
     shifted_resets_s = [time_s + clock_offset_s for time_s in source_resets_s]
-    jumps, is_skipped = _find_jumps(design_matrix, regression, is_skipped, shifted_resets_s)
+    # Some outliers are measurements after a jump, and some measurements near a jump are outliers
+    jumps, is_skipped = _find_jumps(design_matrix, regression, is_outlier, shifted_resets_s)
+    # Jumps enlarge the estimated SIGMA_A
     if jumps:
         design_matrix = replace(design_matrix, jump_times_s=[jump.time_s for jump in jumps])
         design_matrix, regression = _fit_sigma_a(design_matrix, tested_sigmas_a, is_skipped)

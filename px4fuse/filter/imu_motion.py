@@ -21,7 +21,7 @@ import pandas as pd
 from scipy import constants
 from scipy.spatial.transform import Rotation, Slerp
 
-from px4fuse.core.arrays import Array, IntArray, integrate_cumulatively
+from px4fuse.core.arrays import Array, IntArray, compute_median_interval_s, integrate_cumulatively
 from px4fuse.core.record import Span
 from px4fuse.filter.fitting import NoiseParameters, fit_with_sigma_ratios
 from px4fuse.filter.marginal_likelihood import (
@@ -243,9 +243,10 @@ class PositionsAndImuMotion:
         *,
         estimates_scale: bool = True,
     ) -> tuple[float, NoiseParameters]:
-        """Return the time offset and SIGMA_A with the maximum likelihood on a coarse grid.
+        """Return the most likely time offset (s), and the noises with the most likely SIGMA_A.
 
-        ``sigma_a_factors`` are the tested multiples of SIGMA_A.
+        Both are from a coarse grid. ``sigma_a_factors`` are the tested multiples of SIGMA_A. With
+        ``estimates_scale``, the scale factor of the positions may differ from 1.
         """
         tested_offsets_s = np.linspace(
             -MAX_TESTED_TIME_OFFSET_S, MAX_TESTED_TIME_OFFSET_S, COARSE_OFFSET_COUNT
@@ -266,9 +267,10 @@ class PositionsAndImuMotion:
             coarse_motion.measurement_weights,
             sigma_z_m,
         )
-        minus_log_likelihood = np.stack(
+        # Shape (SIGMA_A factors, time offsets)
+        minus_log_likelihood = np.concatenate(
             [
-                ratio_fit.scale_sigmas(sigma_z_m).compute_scores()[0]
+                ratio_fit.scale_sigmas(sigma_z_m).compute_scores()
                 for ratio_fit in fits_by_sigma_ratio
             ]
         )
@@ -369,14 +371,14 @@ def compute_imu_motion(
         tuple(segment_motions),
         directions,
         dt_s,
-        float(np.median(np.diff(imu_time_s))),
+        compute_median_interval_s(imu_time_s),
         heading_sigma_rad,
     )
 
 
 def _find_covered_spans(imu_time_s: Array, attitude_time_s: Array) -> list[Span]:
     """Find time spans (s) without a gap in IMU or attitude; none if the IMU rate is too low."""
-    if len(imu_time_s) < 2 or np.median(np.diff(imu_time_s)) > MAX_IMU_INTERVAL_S:
+    if len(imu_time_s) < 2 or compute_median_interval_s(imu_time_s) > MAX_IMU_INTERVAL_S:
         return []
     gap_indices = np.flatnonzero(find_imu_gaps(imu_time_s))
     starts_s = np.maximum(imu_time_s[np.r_[0, gap_indices + 1]], attitude_time_s[0])

@@ -133,7 +133,7 @@ def _run_with_filterpy(
     kalman.R = np.array([[settings.sigma_z_m**2]])
     kalman.inv = np.reciprocal  # S is 1 by 1
     dt_s = np.diff(prediction_steps.time_s)
-    noise_density = prediction_steps.compute_noise_density(settings)
+    noise_density = settings.compute_noise_density(prediction_steps.imu_gap_variance_m2_s4)
     matrices = (
         prediction_steps.acceleration_m_s2[:, None, None],
         np.stack([dt_s**2 / 2.0, dt_s], axis=1)[:, :, None],
@@ -177,7 +177,7 @@ def _run_with_floats(
     arrays = (
         np.diff(prediction_steps.time_s),
         prediction_steps.acceleration_m_s2,
-        prediction_steps.compute_noise_density(settings),
+        settings.compute_noise_density(prediction_steps.imu_gap_variance_m2_s4),
     )
     for dt_s, acceleration, noise_density, measured_m in zip(
         *(values.tolist() for values in arrays), measurements_m, strict=True
@@ -231,7 +231,7 @@ def predict_variance(run: KfRun, times_s: Array) -> Array:
     step_index, elapsed_s, is_outside = _find_previous_steps(run, times_s)
     p00, p01, p11 = run.steps[model.COVARIANCE_COLUMNS].to_numpy()[step_index].T
     imu_gap_variance_m2_s4 = run.steps["imu_gap_variance_m2_s4"].to_numpy()[step_index]
-    noise_density = (run.settings.sigma_a_m_s2**2 + imu_gap_variance_m2_s4) * run.settings.dt_s
+    noise_density = run.settings.compute_noise_density(imu_gap_variance_m2_s4)
     position_variance_m2, _, velocity_variance_m2_s2 = model.propagate_covariance(
         (p00, p01, p11), elapsed_s
     )

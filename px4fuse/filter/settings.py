@@ -3,6 +3,7 @@
 from dataclasses import dataclass
 from typing import NamedTuple, get_args
 
+from px4fuse.core.arrays import Array
 from px4fuse.errors import SettingsError
 from px4fuse.request import (
     AUTO,
@@ -17,12 +18,24 @@ INPUT_NAMES: tuple[KfInputName, ...] = get_args(KfInputName)
 
 
 class Range(NamedTuple):
-    """Valid range of a numeric setting, with its unit and name."""
+    """Valid range of a numeric setting, with its unit (empty: none) and name."""
 
     low: float
     high: float
     unit: str
     label: str
+
+    def format_limits(self) -> str:
+        """Format the valid range: "0.0001 to 100 m"."""
+        return f"{self.low:g} to {self.high:g} {self.unit}".rstrip()
+
+    def format_value(self, value: float) -> str:
+        """Format a value with its name: "SIGMA_Z 0.1 m"."""
+        return f"{self.label} {value:g} {self.unit}".rstrip()
+
+    def format_label(self) -> str:
+        """Format the name with the unit: "SIGMA_Z (m)"."""
+        return f"{self.label} ({self.unit})" if self.unit else self.label
 
 
 SETTING_RANGES = {
@@ -65,16 +78,20 @@ class Settings:
     clock_offset_s: float = 0.0
 
     def __post_init__(self) -> None:
-        for name, (low, high, unit, _) in SETTING_RANGES.items():
+        for name, valid_range in SETTING_RANGES.items():
             value = getattr(self, name)
-            if not low <= value <= high:  # NaN is out of range, too
+            if not valid_range.low <= value <= valid_range.high:  # NaN is out of range, too
                 raise SettingsError(
-                    f"`{name}` {value:g} is out of range: give {low:g} to {high:g} {unit}."
+                    f"`{name}` {value:g} is out of range: give {valid_range.format_limits()}."
                 )
         if self.input not in INPUT_NAMES:
             raise SettingsError(
                 f"`input` {self.input} is not an input of KF: give {' or '.join(INPUT_NAMES)}."
             )
+
+    def compute_noise_density(self, additional_variance_m2_s4: Array) -> Array:
+        """Return the acceleration noise density (m²/s³); the additional variance is in IMU gaps."""
+        return (self.sigma_a_m_s2**2 + additional_variance_m2_s4) * self.dt_s
 
 
 def requested_settings(request: ComparisonRequest) -> Settings:

@@ -15,7 +15,13 @@ from numpy.typing import ArrayLike
 from scipy import constants
 from scipy.spatial.transform import Rotation, Slerp
 
-from px4fuse.core.arrays import Array, BoolArray, integrate_cumulatively, iterate_row_blocks
+from px4fuse.core.arrays import (
+    Array,
+    BoolArray,
+    compute_median_interval_s,
+    integrate_cumulatively,
+    iterate_row_blocks,
+)
 from px4fuse.core.record import Span, one_line_repr
 from px4fuse.errors import MissingDataError, SettingsError
 from px4fuse.flight.model import (
@@ -289,7 +295,7 @@ def make_downsampling_slice(time_s: Array) -> slice:
 
     The rate is then 1 to 2 times ``MAX_INDEPENDENT_ERROR_RATE_HZ``.
     """
-    interval_s = float(np.median(np.diff(time_s))) if len(time_s) > 1 else np.inf
+    interval_s = compute_median_interval_s(time_s) if len(time_s) > 1 else np.inf
     return slice(None, None, max(1, int(1.0 / (interval_s * MAX_INDEPENDENT_ERROR_RATE_HZ))))
 
 

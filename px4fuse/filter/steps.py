@@ -38,10 +38,6 @@ class PredictionSteps:
     imu_gap_variance_m2_s4: Array
     input_gap_s: float
 
-    def compute_noise_density(self, settings: Settings) -> Array:
-        """Return the acceleration noise density (m²/s³) of each step."""
-        return (settings.sigma_a_m_s2**2 + self.imu_gap_variance_m2_s4) * settings.dt_s
-
 
 def make_prediction_steps(
     axis: Axis, settings: Settings, initial_state: InitialState | None = None

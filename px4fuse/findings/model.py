@@ -118,7 +118,7 @@ def finding(
     evidence: Mapping[str, int | float | str] = {},
     spans_s: tuple[Span, ...] = (),
 ) -> Finding:
-    """Make a finding; its title is the first sentence of the message."""
+    """Make a finding with the id ``name``; its title is the first sentence of the message."""
     # Axis names stay lower case at the beginning of a message: "x and y are exchanged"
     if message[1:2] != " ":
         message = capitalise_first(message)

@@ -71,7 +71,7 @@ class ExportedTable:
             clock=self.stream.clock if self.stream else "",
         )
 
-    def format_rows(self) -> pd.DataFrame:
+    def select_described_columns(self) -> pd.DataFrame:
         """Return the described columns of the table, with the time (s) in the first column."""
         rows = self.data.rename_axis("time_s").reset_index()
         return rows.reindex(columns=[*self.describe_columns()["column"]])
@@ -90,7 +90,7 @@ def tables(flight: Flight) -> Mapping[str, pd.DataFrame]:
 
     Missing data have no table.
     """
-    return {table.name: table.format_rows() for table in _make_tables(flight)}
+    return {table.name: table.select_described_columns() for table in _make_tables(flight)}
 
 
 def data_dictionary(flight: Flight) -> pd.DataFrame:

@@ -6,7 +6,7 @@ import numpy as np
 from msgspec import structs
 from scipy.spatial.transform import Rotation, Slerp
 
-from px4fuse.core.arrays import Array, IntArray
+from px4fuse.core.arrays import Array, IntArray, rms
 from px4fuse.errors import Px4FuseError
 from px4fuse.flight.model import Unavailable
 from px4fuse.loop.closure import (
@@ -402,7 +402,7 @@ def score_paths(
             name=CORRECTION_LABELS[name],
             trajectory=path,
             correction_max_m=float(displacement_m.max()),
-            correction_rms_m=float(np.sqrt(np.mean(displacement_m**2))),
+            correction_rms_m=rms(displacement_m),
             scores={reference.name: evaluate_path(path, reference) for reference in references},
             solution=solution,
             **solution_fields,

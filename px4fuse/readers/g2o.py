@@ -83,6 +83,7 @@ class _TaggedLines:
                 for row, cells in enumerate(map(str.split, texts))
                 if len(cells) != column_count or not all(map(is_number, cells[1 + id_count :]))
             )
+            # If the fault is not found, the first line is reported
             line_number, text = self.lines[next(invalid_rows, 0)]
             fault = f"{quote(text)} does not have {column_count} columns with numbers"
             raise _make_line_error(self.file_name, line_number, fault) from None

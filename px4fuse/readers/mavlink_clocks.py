@@ -131,10 +131,20 @@ def map_clock_to_boot(
 ) -> ClockMapping:
     """Find the conversion of a sender's clock to the autopilot's boot clock.
 
-    TIMESYNC is preferred, then SYSTEM_TIME, then the receive times.
+    The first conversion that applies is used:
+
+    1. None if too few timestamps are distinct: the receive times are the sample times.
+    2. The timestamps are already boot times: they agree with the receive times, and TIMESYNC does
+       not improve the agreement.
+    3. TIMESYNC, then SYSTEM_TIME, if the converted timestamps agree with the receive times.
+    4. Line through the timestamps and receive times.
 
     Parameters
     ----------
+    name : str
+        Name of the sender.
+    timestamps_s, receive_times_s : ndarray, shape (n,)
+        Timestamp (sender's clock) and receive time of each message.
     receipt_to_boot_fit : ClockLine
         Conversion of receive times to the boot clock.
     sender_replies : tuple of ndarray
@@ -169,11 +179,12 @@ def map_clock_to_boot(
     timesync_fit = _fit_timesync(sender_replies, autopilot_replies)
     difference_from_receipt_s = compute_difference_from_receipt_s(timestamps_s)
     # Without TIMESYNC, a clock that started seconds later looks like the boot clock
-    reduction_by_timesync_s = 0.0
-    if timesync_fit is not None:
-        reduction_by_timesync_s = difference_from_receipt_s - compute_difference_from_receipt_s(
-            timesync_fit.at(timestamps_s)
-        )
+    reduction_by_timesync_s = (
+        0.0
+        if timesync_fit is None
+        else difference_from_receipt_s
+        - compute_difference_from_receipt_s(timesync_fit.at(timestamps_s))
+    )
     if (
         difference_from_receipt_s <= MAX_BOOT_TIME_DIFFERENCE_S
         and reduction_by_timesync_s < MIN_REDUCTION_BY_TIMESYNC_S

@@ -293,9 +293,10 @@ def _has_receive_times(start_offsets: Int64Array, end_offsets: Int64Array) -> bo
 def _count_bytes_outside_frames(
     content: bytes, start_offsets: Int64Array, end_offsets: Int64Array, receive_time_bytes: int
 ) -> tuple[int, int, bool]:
-    """Count the frames with unknown messages, and the bytes outside frames.
+    """Count the frames with unknown messages, and the bytes outside of all frames.
 
-    The third value is True if the file ends within a frame.
+    ``start_offsets`` and ``end_offsets`` are those of the frames with known messages. The third
+    value is True if the file ends within a frame.
     """
     unknown_frame_count = 0
     byte_count_outside_frames = 0
@@ -311,6 +312,7 @@ def _count_bytes_outside_frames(
             offset += frame_bytes
         byte_count_outside_frames += gap_end - offset
         bytes_after_last_frame = content[offset:gap_end] if gap_end == len(content) else b""
+    # Also True if the file ends before the first byte of the frame
     begins_frame = {*bytes_after_last_frame[receive_time_bytes : receive_time_bytes + 1]} <= {
         MAGIC_BYTE_V1,
         MAGIC_BYTE_V2,

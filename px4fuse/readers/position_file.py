@@ -389,49 +389,17 @@ def _choose_columns(
 ) -> tuple[int, _ColumnIndices, _ColumnIndices, str | None, str]:
     """Choose the columns of time, position and σ, the frame, and a text on the time column.
 
-    The time of measurement is preferred to the time of recording.
+    The time column of ``numbers`` may change, see :func:`_detect_time_column`.
     """
     if given_columns:
         time_column = given_columns[0]
         time_text = table.format_labels(time_column)
-        frame = None
-        axis_columns: _ColumnIndices = (*given_columns[1:4], None)[:3]
-        # Only the names of the given columns may define the frame
-        meanings_of_given_columns = [
-            meaning if index in axis_columns else ColumnMeaning()
-            for index, meaning in enumerate(column_meanings)
-        ]
-        frame_and_axis_columns = position_names.find_position_columns(meanings_of_given_columns)
-        if frame_and_axis_columns and {*frame_and_axis_columns[1]} == {*axis_columns}:
-            frame, axis_columns = frame_and_axis_columns
+        frame, axis_columns = _find_frame_of_given_columns(column_meanings, given_columns[1:4])
     else:
-        time_columns = [
-            index for index, column in enumerate(column_meanings) if column.kind == "time"
-        ]
-        is_mostly_empty = numbers[time_columns].fillna(0.0).eq(0.0).mean() >= 0.5
-        time_column, *other_time_columns = sorted(
-            time_columns,
-            key=lambda index: (
-                is_mostly_empty[index],
-                position_names.TIME_KINDS.index(column_meanings[index].time_kind),
-                column_meanings[index].unit == "ns",
-            ),
-        )
-        time_text = table.format_labels(time_column)
-        for index in [*other_time_columns]:
-            is_whole_second = numbers[time_column] % 1.0 == 0.0
-            if (
-                column_meanings[index].unit == "ns"
-                and is_whole_second.mean() > MIN_MATCHING_ROW_FRACTION
-                and numbers[index].max() < 1e9
-            ):
-                numbers[time_column] += numbers[index] * 1e-9
-                other_time_columns.remove(index)
-                time_text += f" plus {table.format_labels(index)}"
-        if other_time_columns:
-            unused_labels = table.format_labels(*other_time_columns)
-            time_text += f" ({column_meanings[time_column].time_kind}; not used: {unused_labels})"
-        frame, axis_columns = position_names.find_position_columns(column_meanings) or (None, ())
+        time_column, time_text = _detect_time_column(table, column_meanings, numbers)
+        frame_and_axis_columns = position_names.find_position_columns(column_meanings)
+        assert frame_and_axis_columns  # find_table returns only tables with positions
+        frame, axis_columns = frame_and_axis_columns
     if axis_columns[2] is not None and numbers[axis_columns[2]].isna().all():
         axis_columns = (*axis_columns[:2], None)
     sigma_columns = (
@@ -440,6 +408,58 @@ def _choose_columns(
         else position_names.find_sigma_columns(column_meanings, frame)
     )
     return time_column, axis_columns, sigma_columns, frame, time_text
+
+
+def _find_frame_of_given_columns(
+    column_meanings: Sequence[ColumnMeaning], position_columns: list[int]
+) -> tuple[str | None, _ColumnIndices]:
+    """Return the frame of the given columns (None: unknown), and its axes, or x, y, z as given."""
+    axis_columns = (*position_columns, None)[:3]  # two columns: without height
+    # The names of other columns must not define the frame
+    frame_and_axis_columns = position_names.find_position_columns(
+        [
+            meaning if index in position_columns else ColumnMeaning()
+            for index, meaning in enumerate(column_meanings)
+        ]
+    )
+    if frame_and_axis_columns and {*frame_and_axis_columns[1]} == {*axis_columns}:
+        return frame_and_axis_columns
+    return None, axis_columns
+
+
+def _detect_time_column(
+    table: PositionTable, column_meanings: Sequence[ColumnMeaning], numbers: pd.DataFrame
+) -> tuple[int, str]:
+    """Return the index of the time column, and its name for notes.
+
+    The time of measurement is preferred to the time of recording. If the time column contains whole
+    seconds, the nanoseconds of another column are added to it in ``numbers``.
+    """
+    time_columns = [index for index, column in enumerate(column_meanings) if column.kind == "time"]
+    is_mostly_empty = numbers[time_columns].fillna(0.0).eq(0.0).mean() >= 0.5
+    time_column, *other_time_columns = sorted(
+        time_columns,
+        key=lambda index: (
+            is_mostly_empty[index],
+            position_names.TIME_KINDS.index(column_meanings[index].time_kind),
+            column_meanings[index].unit == "ns",
+        ),
+    )
+    time_text = table.format_labels(time_column)
+    for index in [*other_time_columns]:
+        is_whole_second = numbers[time_column] % 1.0 == 0.0
+        if (
+            column_meanings[index].unit == "ns"
+            and is_whole_second.mean() > MIN_MATCHING_ROW_FRACTION
+            and numbers[index].max() < 1e9
+        ):
+            numbers[time_column] += numbers[index] * 1e-9
+            other_time_columns.remove(index)
+            time_text += f" plus {table.format_labels(index)}"
+    if other_time_columns:
+        unused_labels = table.format_labels(*other_time_columns)
+        time_text += f" ({column_meanings[time_column].time_kind}; not used: {unused_labels})"
+    return time_column, time_text
 
 
 def _choose_time_unit(

@@ -244,7 +244,8 @@ def compute_samples_per_step(
 ) -> int:
     """Return the number of IMU samples in one EKF2 prediction: the rounded ratio of both intervals.
 
-    ``step_ends`` are the indices of the IMU samples at which logged predictions end.
+    Near a half-integer ratio, both neighbouring counts are possible. The count that fits
+    ``step_ends`` is then used: the indices of the IMU samples at which logged predictions end.
 
     >>> compute_samples_per_step(0.010, 0.00375), compute_samples_per_step(0.010, 0.004)
     (3, 3)
@@ -260,11 +261,11 @@ def compute_samples_per_step(
         and abs(interval_ratio + 0.5 - sample_count) < MAX_DISTANCE_FROM_HALF_INTEGER
         and len(samples_between_logged_ends)
     ):
-        is_multiple_of_larger_count, is_multiple_of_smaller_count = (
+        fits_larger_count, fits_smaller_count = (
             np.mean(samples_between_logged_ends % step_sample_count == 0.0) > 0.9
             for step_sample_count in (sample_count, sample_count - 1)
         )
-        return sample_count - int(is_multiple_of_smaller_count and not is_multiple_of_larger_count)
+        return sample_count - int(fits_smaller_count and not fits_larger_count)
     return sample_count
 
 
@@ -382,19 +383,25 @@ def _read_fusion_record(
 
 
 def _read_magnetic_field(topics: Topics, step_s: float) -> pd.DataFrame:
-    """Read the measured magnetic field from the magnetometer topic or from EKF2's observations."""
+    """Read the measured magnetic field (gauss, FRD) at the times of measurement, for the replay.
+
+    The columns are the field, EKF2's innovations if logged, and fused_3d: 1 while EKF2 fuses the
+    field as a vector. The table is empty if data are missing.
+
+    A complete log has the field of each fusion; the longer one is used. Otherwise, EKF2's filtered
+    innovations give the mean field between two logged observations, so they are preferred.
+    """
     magnetometer, observations = (
         topics.primary_samples(px4.TOPIC_LAYOUTS[topic]).dropna()
         for topic in ("vehicle_magnetometer", "estimator_aid_src_mag")
     )
-    # EKF2 subtracts EKF2_MAG_DELAY and half a prediction interval from the times
+    # EKF2 subtracts EKF2_MAG_DELAY and half a prediction interval from the times of observations
     delay_s = topics.ekf2_parameters.get("EKF2_MAG_DELAY", 0.0) * 1e-3 + 0.5 * step_s
     observations = observations.set_axis(observations.index + delay_s)
     min_count = MIN_MAGNETOMETER_HZ * topics.log.duration_s
-    candidates = [table for table in (magnetometer, observations) if len(table) > min_count]
-    if not candidates and Columns.MAGNETIC_FIELD_INNOVATION[0] in observations:
-        candidates = [observations]
-    field = max(candidates or [magnetometer, observations], key=len)
+    field = max(magnetometer, observations, key=len)
+    if len(field) <= min_count and Columns.MAGNETIC_FIELD_INNOVATION[0] in observations:
+        field = observations
     control_bits = topics.read(px4.TOPIC_LAYOUTS["control_bits"])["bits"].dropna()
     if field.empty or control_bits.empty:
         return pd.DataFrame()

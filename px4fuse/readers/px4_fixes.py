@@ -3,7 +3,7 @@
 import numpy as np
 import pandas as pd
 
-from px4fuse.core.arrays import Array
+from px4fuse.core.arrays import Array, rms
 from px4fuse.flight.model import Columns, Ekf2, Unavailable, time_index
 from px4fuse.readers import px4_topics as px4
 from px4fuse.readers.common import interpolate_inside
@@ -129,7 +129,7 @@ def reconstruct_fixes(
     reconstructed_fixes = reconstructed_fixes[~reconstructed_fixes.index.duplicated()]
     if len(position_error) < MIN_LOGGED_FIXES or reconstructed_fixes.empty:
         return empty_result
-    rms_error_m = float(np.sqrt(np.mean(position_error.to_numpy() ** 2)))
+    rms_error_m = rms(position_error.to_numpy())
     if rms_error_m > MAX_FIX_RECONSTRUCTION_ERROR_M:
         return empty_result
     for column in (Columns.POSITION[2], *Columns.POSITION_VARIANCE):

@@ -109,11 +109,12 @@ def _draw_aid_panels(page: Page, flight: Flight, aids: Mapping[str, AidResult]) 
     )
     for name, aid in enabled_aids.items():
         axes = page.add_panel(aid.label, AID_PANEL_HEIGHT)
-        _draw_innovations(axes, flight.ekf2.aids[name], flight_span_s)
+        _draw_normalised_innovations(axes, flight.ekf2.aids[name], flight_span_s)
     axes.set_xlabel(style.TIME_LABEL)
 
 
-def _draw_innovations(axes: style.Axes, aid_log: AidLog, span_s: Span) -> None:
+def _draw_normalised_innovations(axes: style.Axes, aid_log: AidLog, span_s: Span) -> None:
+    """Draw ν/√S of an aiding source, and a grey band while its fusion was disabled."""
     samples = aid_log.samples.loc[slice(*span_s)]
     is_fused = samples["fused"] > 0.0 if "fused" in samples else pd.Series(True, samples.index)
     for axis in aid_log.axes:

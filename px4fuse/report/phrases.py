@@ -53,8 +53,7 @@ def format_settings(settings: Settings) -> str:
         f", clock offset {settings.clock_offset_s:+g} s" if settings.clock_offset_s else ""
     )
     setting_texts = (
-        f"{SETTING_RANGES[name].label} {getattr(settings, name):g} {SETTING_RANGES[name].unit}"
-        for name in KF_NUMERIC_SETTINGS
+        SETTING_RANGES[name].format_value(getattr(settings, name)) for name in KF_NUMERIC_SETTINGS
     )
     return f"{', '.join(setting_texts)}, input {settings.input}{offset_text}"
 

@@ -25,7 +25,10 @@ def compile_pdf(report: Mapping[str, Any]) -> bytes:
 
 
 def measure_free_height(blocks: Any, font_names: Sequence[str]) -> float:
-    """Return the free height (points) on the first page of a report."""
+    """Return the free height (points) on the first page of a report.
+
+    The template cover.typ measures it, and labels the value with <free>.
+    """
     report = dict.fromkeys(("title", "author", "head", "student"), "")
     data = {**report, "fonts": font_names, "blocks": blocks, "results": None}
     with _open_compiler(data) as compiler:

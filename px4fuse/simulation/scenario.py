@@ -48,13 +48,13 @@ class Bounds:
 
 def make_bounded_field(default: Any, *bounds: Any) -> Any:
     """Make a dataclass field with a default value and :class:`Bounds`."""
-    return field(default=default, metadata={"quantity": Bounds(*bounds)})
+    return field(default=default, metadata={"bounds": Bounds(*bounds)})
 
 
 def collect_field_bounds(dataclass_type: type) -> dict[str, Bounds]:
     """Return the bounds of dataclass fields that have :class:`Bounds`, by field name."""
     return {
-        dataclass_field.name: dataclass_field.metadata["quantity"]
+        dataclass_field.name: dataclass_field.metadata["bounds"]
         for dataclass_field in fields(dataclass_type)
         if dataclass_field.metadata
     }

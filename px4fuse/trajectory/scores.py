@@ -9,7 +9,7 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 from scipy.special import ndtr, stdtrit
 
-from px4fuse.core.arrays import Array, IntArray, compute_median_interval_s
+from px4fuse.core.arrays import Array, IntArray, compute_median_interval_s, rms
 from px4fuse.core.record import Count, NotNegative, OrUnavailable, Record
 from px4fuse.errors import SettingsError
 from px4fuse.flight.model import Unavailable
@@ -115,7 +115,7 @@ def compute_statistics(errors: Array) -> Statistics:
     """Compute RMSE, mean, median, standard deviation and range of errors, shape (n,)."""
     return Statistics(
         count=len(errors),
-        rmse=float(np.sqrt(np.mean(errors**2))),
+        rmse=rms(errors),
         mean=float(np.mean(errors)),
         median=float(np.median(errors)),
         std=float(np.std(errors)),

@@ -101,7 +101,10 @@ def estimate_time_offset(estimate: Trajectory, reference: Trajectory) -> TimeOff
 
 
 def _search_offset(sparse_track: Trajectory, dense_track: Trajectory) -> TimeOffset:
-    """Estimate the time offset to add to the timestamps of the trajectory with fewer poses."""
+    """Estimate the time offset to add to the timestamps of the trajectory with fewer poses.
+
+    If several offsets fit, the UNIX times decide; without them, the offset is not determinable.
+    """
     clock_offset_s = compute_clock_offset_s(sparse_track, dense_track)
     candidate_offsets_s = _find_candidate_offsets_s(sparse_track, dense_track)
     if clock_offset_s is not None:
