@@ -412,7 +412,7 @@ def _format_action(action: Action) -> str:
 def _mark_explained_verdicts(
     sigma_verdicts: Sequence[Verdict], causes: Sequence[DiagnosedCause], *, may_drift: bool
 ) -> tuple[Verdict, ...]:
-    """Mark inconsistent verdicts that require no change of filter settings."""
+    """Mark the verdicts "overconfident" and "underconfident" that no filter setting corrects."""
     filters_to_keep_unchanged = {
         name
         for cause in causes

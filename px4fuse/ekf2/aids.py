@@ -270,7 +270,7 @@ def _was_enabled(aid_log: AidLog, times_s: Array) -> BoolArray:
 
 
 def _find_largest_mean_change(time_s: Array, normalised_innovations: Array) -> Span | None:
-    """Return time (s) and size (√S) of the largest significant change of the mean innovation.
+    """Return time (s) and size (in √S) of the largest significant change of the mean innovation.
 
     Return None if no change is significant.
     """

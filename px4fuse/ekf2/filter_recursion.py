@@ -640,7 +640,7 @@ class _FusionDecisions:
         self.last_position_s, self.last_velocity_s = np.full((2, configuration_count), self.start_s)
         self.is_stopped = np.zeros(configuration_count, bool)
         self.remaining_resets = np.full(configuration_count, self.fusion_rules.max_resets)
-        # True for samples without a logged start, reset or rejection: only the gate decides
+        # True for samples without a logged start of fusion, reset or rejection: only the gate rejects
         self.only_gate_decides = (
             (self.sample_actions == FUSE).all(axis=1)
             & ~self.logged_resets
@@ -737,7 +737,7 @@ def _compute_variance_growth(
 
 
 def estimate_state_correlation(inputs: ReplayInputs, segment: ReplaySegment) -> ReplaySegment:
-    """Estimate the correlations of the initial state by a replay of the time before.
+    """Estimate the correlations of the initial state by a replay of the preceding seconds.
 
     The log contains only the variances.
     """

@@ -671,7 +671,7 @@ def factorise(
     if correlated_noise is not None:
         correlated_sigma_m, tau_s = correlated_noise
         rho = np.where(is_within_segment, np.exp(-interval_s / tau_s), 0.0)
-        # Variance of a Gauss-Markov process: σ_c² at the start of a segment, then (1 - ρ²) σ_c²
+        # Gauss-Markov process: variance σ_c² at the start of a segment, driving noise (1 - ρ²) σ_c²
         correlated_noise_step_variance_m2 = correlated_sigma_m**2 * np.append(1.0, 1.0 - rho**2)
         correlated_noise_bands = band_storage[:, 2]
         position_bands[:, 2] = position_measurement_precision

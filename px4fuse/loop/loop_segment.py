@@ -61,7 +61,7 @@ def cut_trajectory(trajectory: Trajectory, segment: Segment) -> Trajectory:
 def choose_loop_segment(
     flight: Flight | None, trajectory: Trajectory, start_s: float | None, end_s: float | None
 ) -> Segment:
-    """Return the segment of a loop; ``flight_span_s`` is given from take-off to landing.
+    """Return the time span of a loop: the given span, or from take-off to landing.
 
     Parameters
     ----------

@@ -72,7 +72,7 @@ class Recording:
     data_source_by_kind: dict[str, DataSource] = field(default_factory=dict)
 
     def rows_of_all_senders(self, message: str) -> IntArray:
-        """Return the indices of the analysed frames with a message, from all senders."""
+        """Return the indices of the MAVLink frames that contain a message, from all senders."""
         rows = self.frames.rows(message)
         first, stop = self.analysed_frame_slice.start, self.analysed_frame_slice.stop
         return np.asarray(rows[(rows >= first) & (rows < stop)])

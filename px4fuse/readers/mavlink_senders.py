@@ -34,7 +34,7 @@ MAX_TIMESYNC_TO_POSITION_TIME_DIFFERENCE_S = 1e5
 
 
 def _read_vehicle_types(frames: MavlinkFrames) -> dict[MavlinkAddress, tuple[int, int]]:
-    # The last entry of a sender in the dict is its first message
+    # In reverse order, so that the first message of a sender overwrites its later messages
     rows = frames.rows("HEARTBEAT")[::-1]
     types = frames.table("HEARTBEAT", rows)[["type", "autopilot"]].tolist()
     return dict(zip(_read_addresses(frames, rows), types, strict=True))

@@ -183,7 +183,7 @@ def to_ascii(text: str) -> str:
 
 
 def format_consistent_ratios() -> str:
-    """Format the σ ratios of a consistent filter, against source (●) and ground truth (◆).
+    """Format the limits of the σ ratios of a consistent filter: innovations ●, ground truth ◆.
 
     >>> format_consistent_ratios()
     '● 0.8 to 1.25, ◆ 0.67 to 1.5'

@@ -61,8 +61,8 @@ class FlightMap(NamedTuple):
     """Tracks seen from above with axis labels; rows of a track: m to the right, m upwards."""
 
     tracks: Mapping[str, Array]
-    x_name: str
-    y_name: str
+    x_label: str
+    y_label: str
 
 
 def write_panels(block: PageBlock, analysis: Analysis, card: Card, free_height: float) -> None:
@@ -195,16 +195,16 @@ def _make_flight_map(analysis: Analysis) -> FlightMap:
     aisle_heading_deg = next(
         (line.heading_deg for line in analysis.input_axes if line.name == AISLE), None
     )
-    heading_rad, x_name, y_name = np.pi / 2.0, "east", "north"
+    heading_rad, x_label, y_label = np.pi / 2.0, "east", "north"
     if aisle_heading_deg is not None:
         heading_rad = np.deg2rad(aisle_heading_deg % 180.0)
-        x_name, y_name = f"along {analysis.main.axis.label}", "left"
+        x_label, y_label = f"along {analysis.main.axis.label}", "left"
     elif analysis.source.frame == "FRD":
-        x_name, y_name = "y of the position source", "x"
+        x_label, y_label = "y of the position source", "x"
     cosine, sine = np.cos(heading_rad), np.sin(heading_rad)
     rotation = np.array([[cosine, sine], [sine, -cosine]])
     tracks = {name: rotation @ track for name, track in _select_map_tracks(analysis).items()}
-    return FlightMap(tracks, x_name, y_name)
+    return FlightMap(tracks, x_label, y_label)
 
 
 def _select_map_tracks(analysis: Analysis) -> dict[str, Array]:
@@ -238,7 +238,7 @@ def _draw_map(page: Page, analysis: Analysis, flight_map: FlightMap, height: flo
     if distance_m > 0.0:
         title += f"; {name} up to {format_metres(distance_m)} m outside the plotted area"
     axes = page.add_panel(title, axes_height)
-    style.set_map_axes(axes, flight_map.x_name, flight_map.y_name)
+    style.set_map_axes(axes, flight_map.x_label, flight_map.y_label)
     (left, bottom), (right, top) = limits
     axes.set(xlim=(left, right), ylim=(bottom, top))
     for name, (map_x_m, map_y_m) in tracks.items():

@@ -94,7 +94,7 @@ def _describe_sigma_at_updates(result: AxisComparison) -> str:
 
 
 def draw_other_axes(analysis: Analysis, _: object) -> Iterator[Page]:
-    """Draw position, velocity, innovations and σ along the other axes."""
+    """Draw position, velocity, innovations and σ along the axes except the main axis."""
     secondary_axes = analysis.select_secondary_axes()
     if not secondary_axes:
         return

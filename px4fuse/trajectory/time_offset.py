@@ -43,7 +43,7 @@ MAX_FITTED_POSES = 2000
 MAX_RELATIVE_MISFIT = 0.5
 # Lower limit of residual divided by extent (RMS): better fits count as equally good
 MISFIT_FLOOR = 1e-3
-# Minimum velocity (RMS) that no shift or rotation explains, as fraction of the speed (RMS)
+# Minimum ratio of the residual velocity after alignment to the speed (both RMS)
 MIN_RESIDUAL_VELOCITY_FRACTION = 0.05
 # Minimum correlation of the residual velocities of both trajectories
 MIN_RESIDUAL_VELOCITY_CORRELATION = 0.5
