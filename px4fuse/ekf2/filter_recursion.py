@@ -640,7 +640,7 @@ class _FusionDecisions:
         self.last_position_s, self.last_velocity_s = np.full((2, configuration_count), self.start_s)
         self.is_stopped = np.zeros(configuration_count, bool)
         self.remaining_resets = np.full(configuration_count, self.fusion_rules.max_resets)
-        # True for samples without a logged start of fusion, reset or rejection: only the gate rejects
+        # True for samples without a logged start of fusion, reset or rejection: the gate decides
         self.only_gate_decides = (
             (self.sample_actions == FUSE).all(axis=1)
             & ~self.logged_resets

@@ -97,7 +97,8 @@ def format_replay_agreement(agreement: Agreement) -> str:
     ]
     sentences = [
         f"{'agrees' if agreement.good else 'does not agree'} with the log ({agreement.reason})",
-        f"Agreement of replayed and logged innovations ({agreement.samples} samples): {'; '.join(axis_texts)}",
+        f"Agreement of replayed and logged innovations ({agreement.samples} samples): "
+        f"{'; '.join(axis_texts)}",
         f"Rejected samples: {agreement.rejected_fraction_replayed:.1%} in the replay, "
         f"{agreement.rejected_fraction_logged:.1%} in the log",
         *(

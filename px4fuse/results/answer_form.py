@@ -155,7 +155,7 @@ class NamedFault(Record):
         return self.size * (units[self.unit] if self.unit else next(iter(units.values())))
 
     def convert_value_to_standard_unit(self) -> float | None:
-        """Convert the value to the standard unit, which is listed first in ``form.toml`` (cm to m)."""
+        """Convert the value to the standard unit, which is the first in ``form.toml`` (cm to m)."""
         units = UNITS_BY_CORRECTION.get(self.parameter, {})
         if self.value is None or not units:
             return self.value
