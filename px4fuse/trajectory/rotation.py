@@ -78,21 +78,13 @@ def skew(v: Array) -> Array:
 
 def cumulative_product(quaternions: Array) -> Array:
     """Compute the products q_0, q_0 ⊗ q_1, q_0 ⊗ q_1 ⊗ q_2, ... of quaternions, shape (n, 4)."""
-    n = len(quaternions)
-    width = max(1, int(np.sqrt(n)))
-    rows = -(-n // width)
-    identity = np.array([1.0, 0.0, 0.0, 0.0])
-    padded_quaternions = np.concatenate([quaternions, np.tile(identity, (rows * width - n, 1))])
-    # Products in rows of √n quaternions need only about 2√n vectorised products
-    row_products = padded_quaternions.reshape(rows, width, 4).copy()
-    for column in range(1, width):
-        row_products[:, column] = multiply(row_products[:, column - 1], row_products[:, column])
-    products_of_previous_rows = np.tile(identity, (rows, 1))
-    for row in range(1, rows):
-        products_of_previous_rows[row] = multiply(
-            products_of_previous_rows[row - 1], row_products[row - 1, -1]
-        )
-    product = multiply(products_of_previous_rows[:, None, :], row_products).reshape(-1, 4)[:n]
+    if len(quaternions) < 2:
+        return quaternions
+    # Products of pairs give every second result; the others need one more product each
+    product = np.empty_like(quaternions)
+    product[0] = quaternions[0]
+    product[1::2] = cumulative_product(multiply(quaternions[:-1:2], quaternions[1::2]))
+    product[2::2] = multiply(product[1:-1:2], quaternions[2::2])
     return np.asarray(product / np.linalg.norm(product, axis=1, keepdims=True))
 
 
