@@ -19,7 +19,6 @@ from dataclasses import dataclass, replace
 import numpy as np
 import pandas as pd
 from scipy import constants
-from scipy.spatial.transform import Rotation, Slerp
 
 from px4fuse.core.arrays import Array, IntArray, integrate_cumulatively
 from px4fuse.core.record import Span
@@ -31,11 +30,12 @@ from px4fuse.filter.marginal_likelihood import (
 )
 from px4fuse.filter.model import compute_continuous_process_noise_per_density
 from px4fuse.filter.signals import find_imu_gaps
-from px4fuse.flight.model import Columns, Flight, Unavailable, rows_between
+from px4fuse.flight.model import Columns, Flight, Unavailable
 from px4fuse.trajectory.rotation import (
     conjugate,
     cumulative_product,
     from_rotation_vector,
+    interpolate,
     multiply,
     rotate,
     to_matrix,
@@ -394,21 +394,35 @@ def make_segment_motion(
         [imu_span_s[0] - 2 * INTEGRATION_STEP_S, imu_span_s[1] + 2 * INTEGRATION_STEP_S],
         side="left",
     )
-    imu_samples = imu.iloc[first_row:end_row]
     imu_time_s = imu_time_s[first_row:end_row]
-    imu_integral = integrate_cumulatively(
-        imu_samples[[*Columns.SPECIFIC_FORCE, *Columns.ANGULAR_RATE]].to_numpy(), imu_time_s
-    )
     step_times_s = np.arange(imu_time_s[0], imu_time_s[-1], INTEGRATION_STEP_S)
+    imu_integrals = (
+        integrate_cumulatively(imu[name].to_numpy()[first_row:end_row], imu_time_s)
+        for name in (*Columns.SPECIFIC_FORCE, *Columns.ANGULAR_RATE)
+    )
     imu_integrals_at_steps = np.column_stack(
-        [np.interp(step_times_s, imu_time_s, column) for column in imu_integral.T]
+        [np.interp(step_times_s, imu_time_s, integral) for integral in imu_integrals]
     )
     specific_force_integral_m_s = imu_integrals_at_steps[:, :3]
     gyro_integral_rad = imu_integrals_at_steps[:, 3:]
+    # The first attitude sample is before the first step
+    attitude_time_s = attitude.index.to_numpy()
+    first_row, end_row = np.searchsorted(attitude_time_s, step_times_s[[0, -1]], side="right")
+    attitude_samples = attitude.iloc[max(first_row - 1, 0) : end_row][Columns.QUATERNION]
+    attitude_time_s, quaternions = attitude_samples.index.to_numpy(), attitude_samples.to_numpy()
     gyro_integral_rad -= np.outer(
-        step_times_s, _estimate_large_gyro_bias(step_times_s, gyro_integral_rad, attitude)
+        step_times_s,
+        _estimate_large_gyro_bias(step_times_s, gyro_integral_rad, attitude_time_s, quaternions),
     )
-    attitude_quaternion = _integrate_gyros(step_times_s, gyro_integral_rad, attitude)
+    # The gyroscopes are integrated, starting at the logged attitude
+    attitude_quaternion = cumulative_product(
+        np.concatenate(
+            [
+                interpolate(step_times_s[:1], attitude_time_s, quaternions),
+                from_rotation_vector(np.diff(gyro_integral_rad, axis=0)),
+            ]
+        )
+    )
     # The mean specific force of each step is rotated by the attitude in the middle of the step
     mean_specific_force_m_s2 = np.diff(specific_force_integral_m_s, axis=0) / INTEGRATION_STEP_S
     body_to_ned = to_matrix(
@@ -449,17 +463,15 @@ def make_segment_motion(
 
 
 def _estimate_large_gyro_bias(
-    step_times_s: Array, gyro_integral_rad: Array, attitude: pd.DataFrame
+    step_times_s: Array, gyro_integral_rad: Array, attitude_time_s: Array, quaternions: Array
 ) -> Array:
     """Return a large gyro bias (rad/s), estimated from the logged attitude.
 
     A small bias gives zero, because a later fit estimates it. A bias above
     ``MAX_REMOVED_GYRO_BIAS_RAD_S`` gives zero, because the logged attitude is then wrong.
     """
-    samples = rows_between(attitude, step_times_s[0], step_times_s[-1])[Columns.QUATERNION]
-    if len(samples) < MIN_KEPT_MEASUREMENTS:
+    if len(quaternions) < MIN_KEPT_MEASUREMENTS:
         return np.zeros(3)
-    attitude_time_s, quaternions = samples.index.to_numpy(), samples.to_numpy()
     gyro_angle_rad = np.column_stack(
         [np.interp(attitude_time_s, step_times_s, column) for column in gyro_integral_rad.T]
     )
@@ -473,29 +485,3 @@ def _estimate_large_gyro_bias(
         MAX_PRIOR_GYRO_BIAS_RAD_S < np.abs(bias_rad_s).max() <= MAX_REMOVED_GYRO_BIAS_RAD_S
     )
     return bias_rad_s if is_bias_removed else np.zeros(3)
-
-
-def _integrate_gyros(
-    step_times_s: Array, gyro_integral_rad: Array, attitude: pd.DataFrame
-) -> Array:
-    """Integrate the gyroscopes to attitudes, starting at the logged attitude.
-
-    The attitudes are quaternions from body to NED, w first.
-    """
-    attitude_time_s = attitude.index.to_numpy()
-    nearby_rows = slice(
-        *np.clip(
-            np.searchsorted(attitude_time_s, step_times_s[0]) + np.array([-2, 3]),
-            0,
-            len(attitude_time_s),
-        )
-    )
-    logged_quaternions = attitude.iloc[nearby_rows][Columns.QUATERNION].to_numpy(copy=True)
-    nearby_attitude_time_s = attitude_time_s[nearby_rows]
-    start_s = np.clip(step_times_s[0], nearby_attitude_time_s[0], nearby_attitude_time_s[-1])
-    slerp = Slerp(nearby_attitude_time_s, Rotation.from_quat(logged_quaternions, scalar_first=True))
-    start_quaternion = slerp(start_s).as_quat(scalar_first=True)
-    rotation_since_start = cumulative_product(
-        from_rotation_vector(np.diff(gyro_integral_rad, axis=0))
-    )
-    return np.vstack([start_quaternion, multiply(start_quaternion, rotation_since_start)])
