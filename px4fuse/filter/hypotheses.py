@@ -325,9 +325,10 @@ def _find_significant_jump_times(
     min_chi_square = chdtri(
         design_matrix.axis_count, MAX_JUMP_FALSE_ALARM_P / len(design_matrix.time_s)
     )
+    # Skipped measurements give equal χ² except for rounding: the earliest time comes first
     return [
         float(candidate_times_s[index])
-        for index in np.argsort(-chi_square)
+        for index in np.argsort(-chi_square.round(6), kind="stable")
         if chi_square[index] >= min_chi_square
     ]
 

@@ -73,8 +73,8 @@ MAX_IMU_INTERVAL_S = 0.025
 class SegmentMotion:
     """Motion of one segment from the IMU, and its derivatives with respect to IMU errors.
 
-    ``motion_and_derivatives``, shape (times, 2, 3, 10), contains position and velocity along NED.
-    The last dimension is the motion, then its derivatives with respect to initial attitude error,
+    ``motion_and_derivatives``, shape (2, 3, 10, times), contains position and velocity along NED.
+    The third dimension is the motion, then its derivatives with respect to initial attitude error,
     gyro bias and accelerometer bias.
     """
 
@@ -82,15 +82,16 @@ class SegmentMotion:
     motion_and_derivatives: Array
 
     def interpolate(self, time_s: Array) -> tuple[Array, Array]:
-        """Return position and velocity at other times, each with the shape (..., 3, 10).
+        """Return position and velocity at other times, each with the shape (3, 10, ...).
 
-        The last dimension contains the motion, then its derivatives.
+        The second dimension contains the motion, then its derivatives.
         """
         last_index = len(self.time_s) - 2
         row = np.clip(np.searchsorted(self.time_s, time_s, side="right") - 1, 0, last_index)
-        elapsed_s = (time_s - self.time_s[row])[..., None, None]
-        position, velocity = np.moveaxis(self.motion_and_derivatives[row], -3, 0)
-        acceleration = (self.motion_and_derivatives[row + 1, 1] - velocity) / INTEGRATION_STEP_S
+        elapsed_s = time_s - self.time_s[row]
+        position, velocity = self.motion_and_derivatives.take(row, axis=-1)
+        next_velocity = self.motion_and_derivatives[1].take(row + 1, axis=-1)
+        acceleration = (next_velocity - velocity) / INTEGRATION_STEP_S
         position += elapsed_s * (velocity + (0.5 * elapsed_s) * acceleration)
         velocity += elapsed_s * acceleration
         return position, velocity
@@ -175,7 +176,7 @@ class PositionsAndImuMotion:
             measurement_time_s = self.time_s[begin:end]
             # Shape (axes, time offsets, 1 + constants, times): the motion, then its derivatives
             position, velocity = (
-                np.moveaxis(self.directions @ signal, (2, 0, 3, 1), range(4))
+                np.swapaxes(np.tensordot(self.directions, signal, 1), 1, 2)
                 for signal in segment_motion.interpolate(
                     measurement_time_s + time_offsets_s[:, None]
                 )
@@ -430,35 +431,33 @@ def make_segment_motion(
             attitude_quaternion[:-1], from_rotation_vector(np.diff(gyro_integral_rad, axis=0) / 2.0)
         )
     )
-    specific_force_ned_m_s2 = rotate(body_to_ned, mean_specific_force_m_s2)
+    specific_force_ned_m_s2 = rotate(body_to_ned, mean_specific_force_m_s2).T
+    body_to_ned = np.moveaxis(body_to_ned, 0, -1)
     motion_and_derivatives = np.zeros(
-        (len(mean_specific_force_m_s2), 2, 3, len(PRIOR_SIGMAS_OF_SEGMENT_CONSTANTS))
+        (2, 3, len(PRIOR_SIGMAS_OF_SEGMENT_CONSTANTS), len(mean_specific_force_m_s2))
     )
-    position, velocity = np.moveaxis(motion_and_derivatives, 1, 0)
+    position, velocity = motion_and_derivatives
     acceleration = np.zeros_like(velocity)
-    acceleration[:, :, 0] = specific_force_ned_m_s2
-    acceleration[:, 2, 0] += constants.g
+    acceleration[:, 0] = specific_force_ned_m_s2
+    acceleration[2, 0] += constants.g
     # An attitude error θ adds θ × f to the acceleration; a gyro bias b causes θ = -∫ R b dt
     attitude_error_by_unit_gyro_bias = -INTEGRATION_STEP_S * (
-        np.cumsum(body_to_ned, axis=0) - body_to_ned / 2.0
+        np.cumsum(body_to_ned, axis=-1) - body_to_ned / 2.0
     )
     for axis in range(3):
         second_axis = (axis + 1) % 3
         third_axis = (axis + 2) % 3
-        acceleration[:, second_axis, 1 + axis] = -specific_force_ned_m_s2[:, third_axis]
-        acceleration[:, third_axis, 1 + axis] = specific_force_ned_m_s2[:, second_axis]
-        acceleration[:, axis, 4:7] = (
-            attitude_error_by_unit_gyro_bias[:, second_axis]
-            * specific_force_ned_m_s2[:, [third_axis]]
+        acceleration[second_axis, 1 + axis] = -specific_force_ned_m_s2[third_axis]
+        acceleration[third_axis, 1 + axis] = specific_force_ned_m_s2[second_axis]
+        acceleration[axis, 4:7] = (
+            attitude_error_by_unit_gyro_bias[second_axis] * specific_force_ned_m_s2[third_axis]
+            - attitude_error_by_unit_gyro_bias[third_axis] * specific_force_ned_m_s2[second_axis]
         )
-        acceleration[:, axis, 4:7] -= (
-            attitude_error_by_unit_gyro_bias[:, third_axis]
-            * specific_force_ned_m_s2[:, [second_axis]]
-        )
-    acceleration[:, :, 7:10] = -body_to_ned
-    np.cumsum(acceleration[:-1] * INTEGRATION_STEP_S, axis=0, out=velocity[1:])
-    mean_velocity_in_step = velocity[:-1] + acceleration[:-1] * (INTEGRATION_STEP_S / 2.0)
-    np.cumsum(mean_velocity_in_step * INTEGRATION_STEP_S, axis=0, out=position[1:])
+    acceleration[:, 7:10] = -body_to_ned
+    velocity_increments = acceleration[..., :-1] * INTEGRATION_STEP_S
+    np.cumsum(velocity_increments, axis=-1, out=velocity[..., 1:])
+    mean_velocity_in_step = velocity[..., :-1] + velocity_increments / 2.0
+    np.cumsum(mean_velocity_in_step * INTEGRATION_STEP_S, axis=-1, out=position[..., 1:])
     return SegmentMotion(step_times_s[:-1], motion_and_derivatives)
 
 
