@@ -4,6 +4,9 @@ import numpy as np
 
 from px4fuse.core.arrays import Array, interpolate_columns
 
+# Cross-product matrices of the three unit vectors, one in each row
+FLATTENED_CROSS_PRODUCT_MATRICES = np.cross(np.eye(3), np.eye(3)[:, None]).reshape(3, 9)
+
 
 def multiply(a: Array, b: Array) -> Array:
     """Compute the product a ⊗ b of quaternions: rotation by b, then by a."""
@@ -72,8 +75,7 @@ def rotate(matrices: Array, vectors: Array) -> Array:
 
 def skew(v: Array) -> Array:
     """Return the cross-product matrices [v]× with [v]× u = v × u, shape (..., 3, 3)."""
-    x, y, z = _split_components(v)
-    return build_matrix((0.0, -z, y), (z, 0.0, -x), (-y, x, 0.0))
+    return (v @ FLATTENED_CROSS_PRODUCT_MATRICES).reshape(*v.shape, 3)
 
 
 def cumulative_product(quaternions: Array) -> Array:
