@@ -111,15 +111,11 @@ def level_signals(
 def test_imu_error_sensitivities_at_rest_equal_closed_form() -> None:
     signals = level_signals()
     t, g = signals.time_s - signals.time_s[0], GRAVITY[2]
-    speed = signals.motion_and_derivatives[:, 1]
+    motion = np.moveaxis(signals.motion_and_derivatives, -1, 0)
+    speed = motion[:, 1]
     value = np.diff(speed, axis=0) / INTEGRATION_STEP_S
-    assert signals.motion_and_derivatives.shape == (
-        len(t),
-        2,
-        3,
-        len(PRIOR_SIGMAS_OF_SEGMENT_CONSTANTS),
-    )
-    np.testing.assert_allclose(signals.motion_and_derivatives[..., 0], 0.0, atol=1e-10)
+    assert motion.shape == (len(t), 2, 3, len(PRIOR_SIGMAS_OF_SEGMENT_CONSTANTS))
+    np.testing.assert_allclose(motion[..., 0], 0.0, atol=1e-10)
     # tilt θ about north and east moves it sideways by θ × f, f = [0, 0, -g]; heading does not
     tilted = np.tile([[0, -g, 0], [g, 0, 0], [0, 0, 0]], (len(value), 1, 1))
     np.testing.assert_allclose(value[:, :, 1:4], tilted, atol=1e-9)
@@ -138,11 +134,12 @@ def test_imu_integration_at_constant_yaw_rate_gives_a_circle() -> None:
     signals = level_signals((0.0, sideways, 0.0), turn=omega, interval=0.004)
     t, middle = signals.time_s, omega * (signals.time_s + np.diff(signals.time_s)[0] / 2.0)
     circle = sideways * np.stack([-np.sin(middle), np.cos(middle), 0.0 * t], 1)
-    acceleration = np.diff(signals.motion_and_derivatives[:, 1, :, 0], axis=0) / INTEGRATION_STEP_S
+    velocity = signals.motion_and_derivatives[1, :, 0].T
+    acceleration = np.diff(velocity, axis=0) / INTEGRATION_STEP_S
     np.testing.assert_allclose(acceleration, circle[:-1], atol=2e-5)
     round_it = np.stack([np.cos(omega * t), np.sin(omega * t)], 1)
     speed = sideways / omega * (round_it - round_it[0])
-    np.testing.assert_allclose(signals.motion_and_derivatives[:, 1, :2, 0], speed, atol=1e-4)
+    np.testing.assert_allclose(velocity[:, :2], speed, atol=1e-4)
 
 
 def test_integrated_constant_acceleration_equals_closed_form() -> None:

@@ -84,8 +84,8 @@ def test_ned_acceleration_at_rest_is_zero_at_any_attitude(angles_deg):
 def test_ned_acceleration_of_rotating_body_stays_constant(axis, rate_rad_s):
     """Turning at a constant rate, the specific force is R(t)ᵀ(a − g); a must come back.
 
-    The attitude is logged ten times slower than the IMU; interpolation on the sphere is exact for
-    a constant rate.
+    The attitude is logged ten times slower than the IMU. Linear interpolation of quaternions has
+    an error of at most 2e-5 rad for 0.15 rad between two attitudes.
     """
     truth = np.array([1.0, -2.0, 0.5])
     start = Rotation.from_euler("ZYX", [30.0, 5.0, -8.0], degrees=True)
@@ -99,7 +99,7 @@ def test_ned_acceleration_of_rotating_body_stays_constant(axis, rate_rad_s):
         time, force, attitude_table(time[::10], body_to_ned(time[::10]))
     )
     assert len(acceleration) > 980
-    np.testing.assert_allclose(acceleration, np.tile(truth, (len(acceleration), 1)), atol=1e-9)
+    np.testing.assert_allclose(acceleration, np.tile(truth, (len(acceleration), 1)), atol=3e-4)
 
 
 def test_ned_acceleration_without_attitude_is_unavailable():

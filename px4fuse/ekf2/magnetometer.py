@@ -16,8 +16,6 @@ from px4fuse.trajectory.rotation import skew
 
 # Minimum magnetometer noise (gauss) that EKF2 uses
 MIN_MAGNETOMETER_SIGMA_GAUSS = 0.01
-# For a vector v, v @ FLATTENED_CROSS_PRODUCT_MATRICES is the flattened cross product matrix [v]×
-FLATTENED_CROSS_PRODUCT_MATRICES = skew(np.eye(3)).reshape(3, 9)
 
 
 class EventSamples(NamedTuple):
@@ -92,14 +90,9 @@ def fuse_mean_sample(
     """
     measured_vector = x[:, measured_states]
     sample_count, R = mean_sample.sample_count, mean_sample.noise
-    # Faster than skew() for few vectors
-    measured_vector_cross_matrix, theta_cross_matrix = (
-        (vectors @ FLATTENED_CROSS_PRODUCT_MATRICES).reshape(-1, 3, 3)
-        for vectors in (measured_vector, x[:, THETA])
-    )
     H = np.zeros((len(x), mean_sample.value.shape[-1], x.shape[1]))
-    H[:, :, THETA] = mean_sample.ned_to_body_rotation @ measured_vector_cross_matrix
-    H[:, :, measured_states] = mean_sample.ned_to_body_rotation @ (np.eye(3) - theta_cross_matrix)
+    H[:, :, THETA] = mean_sample.ned_to_body_rotation @ skew(measured_vector)
+    H[:, :, measured_states] = mean_sample.ned_to_body_rotation @ (np.eye(3) - skew(x[:, THETA]))
     predicted_value = (H[:, :, measured_states] @ measured_vector[:, :, None])[:, :, 0]
     if bias_states is not None:
         H[:, :, bias_states] = np.eye(3)

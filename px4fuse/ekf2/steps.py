@@ -173,7 +173,8 @@ def explain_difference_by_replacements(
     ekf2 = model.flight.ekf2
     assert isinstance(ekf2, Ekf2)
     configurations = make_replacement_configurations(model.inputs, settings or Settings())
-    horizon_tracks = compute_delayed_tracks(model, list(configurations.values()))
+    # The replay with rejections contains the track of the last configuration
+    horizon_tracks = compute_delayed_tracks(model, [*configurations.values()][:-1])
     baseline_replay = replay_with_logged_rejections(model)
     evaluated_spans = model.baseline_replay.find_evaluated_spans()
     state_times_s = ekf2.state.index.to_numpy()
@@ -197,7 +198,10 @@ def explain_difference_by_replacements(
     property_names = (*configurations, OUTPUT_PREDICTOR_PROPERTY)
     components_by_track = []
     # Tracks are computed one at a time, to limit the memory
-    tracks = chain(horizon_tracks, (baseline_replay.published_state, ekf2.state))
+    tracks = chain(
+        horizon_tracks,
+        (baseline_replay.delayed_state, baseline_replay.published_state, ekf2.state),
+    )
     for property_name, track in zip((*property_names, "EKF2 as logged"), tracks, strict=True):
         components_by_track.append(
             [

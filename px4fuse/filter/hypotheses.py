@@ -329,9 +329,10 @@ def _find_significant_jump_times(
     min_chi_square = chdtri(
         design_matrix.axis_count, MAX_JUMP_FALSE_ALARM_P / len(design_matrix.time_s)
     )
+    # Skipped measurements give equal χ² except for rounding: the earliest time comes first
     return [
         float(candidate_times_s[index])
-        for index in np.argsort(-chi_square)
+        for index in np.argsort(-chi_square.round(6), kind="stable")
         if chi_square[index] >= min_chi_square
     ]
 
@@ -347,24 +348,27 @@ def _compute_jump_chi_squares(
     chi_squares = np.zeros(len(candidate_times_s))
     for first in range(0, len(candidate_times_s), JUMP_BATCH_SIZE):
         batch = slice(first, first + JUMP_BATCH_SIZE)
-        jump_steps = make_unit_steps(design_matrix.time_s, candidate_times_s[batch])
+        # Jumps have no effect on earlier innovations
+        rows = slice(np.searchsorted(design_matrix.time_s, candidate_times_s[first]), None)
+        is_used = ~is_skipped[rows]
+        jump_steps = make_unit_steps(design_matrix.time_s[rows], candidate_times_s[batch])
         zero_increments = np.zeros_like(jump_steps)
         jump_response = design_matrix.compute_normalised_innovations(
-            zero_increments, zero_increments, jump_steps, fit_without_jump.gains
-        )[~is_skipped]
+            zero_increments, zero_increments, jump_steps, fit_without_jump.gains[:, rows]
+        )[is_used]
         for columns, residual, residual_rms in zip(
             columns_by_axis,
             fit_without_jump.residual,
             fit_without_jump.residual_rms_by_axis,
             strict=True,
         ):
-            response_along_columns = columns[~is_skipped].T @ jump_response
+            response_along_columns = columns[rows][is_used].T @ jump_response
             jump_size_information = np.sum(jump_response**2, axis=0) - np.sum(
                 response_along_columns * (fit_without_jump.covariance @ response_along_columns),
                 axis=0,
             )
             chi_squares[batch] += (
-                residual[~is_skipped] @ jump_response / residual_rms
+                residual[rows][is_used] @ jump_response / residual_rms
             ) ** 2 / np.maximum(jump_size_information, 1e-9)
     return chi_squares
 
@@ -526,6 +530,7 @@ class DesignMatrix:
         """Run KF on several inputs; return normalised innovations ν/√S, one column per input."""
         preintegrated_inputs = replace(
             self.preintegrated_inputs,
+            interval_s=self.preintegrated_inputs.interval_s[-len(dp) :],
             delta_position_m=dp,
             delta_velocity_m_s=dv,
             measurement_m=measured_m,

@@ -19,7 +19,6 @@ from dataclasses import dataclass, replace
 import numpy as np
 import pandas as pd
 from scipy import constants
-from scipy.spatial.transform import Rotation, Slerp
 
 from px4fuse.core.arrays import Array, IntArray, compute_median_interval_s, integrate_cumulatively
 from px4fuse.core.record import Span
@@ -31,11 +30,12 @@ from px4fuse.filter.marginal_likelihood import (
 )
 from px4fuse.filter.model import compute_continuous_process_noise_per_density
 from px4fuse.filter.signals import find_imu_gaps
-from px4fuse.flight.model import Columns, Flight, Unavailable, rows_between
+from px4fuse.flight.model import Columns, Flight, Unavailable
 from px4fuse.trajectory.rotation import (
     conjugate,
     cumulative_product,
     from_rotation_vector,
+    interpolate,
     multiply,
     rotate,
     to_matrix,
@@ -73,8 +73,8 @@ MAX_IMU_INTERVAL_S = 0.025
 class SegmentMotion:
     """Motion of one segment from the IMU, and its derivatives with respect to IMU errors.
 
-    ``motion_and_derivatives``, shape (times, 2, 3, 10), contains position and velocity along NED.
-    The last dimension is the motion, then its derivatives with respect to initial attitude error,
+    ``motion_and_derivatives``, shape (2, 3, 10, times), contains position and velocity along NED.
+    The third dimension is the motion, then its derivatives with respect to initial attitude error,
     gyro bias and accelerometer bias.
     """
 
@@ -82,15 +82,16 @@ class SegmentMotion:
     motion_and_derivatives: Array
 
     def interpolate(self, time_s: Array) -> tuple[Array, Array]:
-        """Return position and velocity at other times, each with the shape (..., 3, 10).
+        """Return position and velocity at other times, each with the shape (3, 10, ...).
 
-        The last dimension contains the motion, then its derivatives.
+        The second dimension contains the motion, then its derivatives.
         """
         last_index = len(self.time_s) - 2
         row = np.clip(np.searchsorted(self.time_s, time_s, side="right") - 1, 0, last_index)
-        elapsed_s = (time_s - self.time_s[row])[..., None, None]
-        position, velocity = np.moveaxis(self.motion_and_derivatives[row], -3, 0)
-        acceleration = (self.motion_and_derivatives[row + 1, 1] - velocity) / INTEGRATION_STEP_S
+        elapsed_s = time_s - self.time_s[row]
+        position, velocity = self.motion_and_derivatives.take(row, axis=-1)
+        next_velocity = self.motion_and_derivatives[1].take(row + 1, axis=-1)
+        acceleration = (next_velocity - velocity) / INTEGRATION_STEP_S
         position += elapsed_s * (velocity + (0.5 * elapsed_s) * acceleration)
         velocity += elapsed_s * acceleration
         return position, velocity
@@ -175,7 +176,7 @@ class PositionsAndImuMotion:
             measurement_time_s = self.time_s[begin:end]
             # Shape (axes, time offsets, 1 + constants, times): the motion, then its derivatives
             position, velocity = (
-                np.moveaxis(self.directions @ signal, (2, 0, 3, 1), range(4))
+                np.swapaxes(np.tensordot(self.directions, signal, 1), 1, 2)
                 for signal in segment_motion.interpolate(
                     measurement_time_s + time_offsets_s[:, None]
                 )
@@ -396,21 +397,35 @@ def make_segment_motion(
         [imu_span_s[0] - 2 * INTEGRATION_STEP_S, imu_span_s[1] + 2 * INTEGRATION_STEP_S],
         side="left",
     )
-    imu_samples = imu.iloc[first_row:end_row]
     imu_time_s = imu_time_s[first_row:end_row]
-    imu_integral = integrate_cumulatively(
-        imu_samples[[*Columns.SPECIFIC_FORCE, *Columns.ANGULAR_RATE]].to_numpy(), imu_time_s
-    )
     step_times_s = np.arange(imu_time_s[0], imu_time_s[-1], INTEGRATION_STEP_S)
+    imu_integrals = (
+        integrate_cumulatively(imu[name].to_numpy()[first_row:end_row], imu_time_s)
+        for name in (*Columns.SPECIFIC_FORCE, *Columns.ANGULAR_RATE)
+    )
     imu_integrals_at_steps = np.column_stack(
-        [np.interp(step_times_s, imu_time_s, column) for column in imu_integral.T]
+        [np.interp(step_times_s, imu_time_s, integral) for integral in imu_integrals]
     )
     specific_force_integral_m_s = imu_integrals_at_steps[:, :3]
     gyro_integral_rad = imu_integrals_at_steps[:, 3:]
+    # The first attitude sample is before the first step
+    attitude_time_s = attitude.index.to_numpy()
+    first_row, end_row = np.searchsorted(attitude_time_s, step_times_s[[0, -1]], side="right")
+    attitude_samples = attitude.iloc[max(first_row - 1, 0) : end_row][Columns.QUATERNION]
+    attitude_time_s, quaternions = attitude_samples.index.to_numpy(), attitude_samples.to_numpy()
     gyro_integral_rad -= np.outer(
-        step_times_s, _estimate_large_gyro_bias(step_times_s, gyro_integral_rad, attitude)
+        step_times_s,
+        _estimate_large_gyro_bias(step_times_s, gyro_integral_rad, attitude_time_s, quaternions),
     )
-    attitude_quaternion = _integrate_gyros(step_times_s, gyro_integral_rad, attitude)
+    # The gyroscopes are integrated, starting at the logged attitude
+    attitude_quaternion = cumulative_product(
+        np.concatenate(
+            [
+                interpolate(step_times_s[:1], attitude_time_s, quaternions),
+                from_rotation_vector(np.diff(gyro_integral_rad, axis=0)),
+            ]
+        )
+    )
     # The mean specific force of each step is rotated by the attitude in the middle of the step
     mean_specific_force_m_s2 = np.diff(specific_force_integral_m_s, axis=0) / INTEGRATION_STEP_S
     body_to_ned = to_matrix(
@@ -418,50 +433,46 @@ def make_segment_motion(
             attitude_quaternion[:-1], from_rotation_vector(np.diff(gyro_integral_rad, axis=0) / 2.0)
         )
     )
-    specific_force_ned_m_s2 = rotate(body_to_ned, mean_specific_force_m_s2)
+    specific_force_ned_m_s2 = rotate(body_to_ned, mean_specific_force_m_s2).T
+    body_to_ned = np.moveaxis(body_to_ned, 0, -1)
     motion_and_derivatives = np.zeros(
-        (len(mean_specific_force_m_s2), 2, 3, len(PRIOR_SIGMAS_OF_SEGMENT_CONSTANTS))
+        (2, 3, len(PRIOR_SIGMAS_OF_SEGMENT_CONSTANTS), len(mean_specific_force_m_s2))
     )
-    position, velocity = np.moveaxis(motion_and_derivatives, 1, 0)
+    position, velocity = motion_and_derivatives
     acceleration = np.zeros_like(velocity)
-    acceleration[:, :, 0] = specific_force_ned_m_s2
-    acceleration[:, 2, 0] += constants.g
+    acceleration[:, 0] = specific_force_ned_m_s2
+    acceleration[2, 0] += constants.g
     # An attitude error θ adds θ × f to the acceleration; a gyro bias b causes θ = -∫ R b dt
     attitude_error_by_unit_gyro_bias = -INTEGRATION_STEP_S * (
-        np.cumsum(body_to_ned, axis=0) - body_to_ned / 2.0
+        np.cumsum(body_to_ned, axis=-1) - body_to_ned / 2.0
     )
     for axis in range(3):
         second_axis = (axis + 1) % 3
         third_axis = (axis + 2) % 3
-        acceleration[:, second_axis, 1 + axis] = -specific_force_ned_m_s2[:, third_axis]
-        acceleration[:, third_axis, 1 + axis] = specific_force_ned_m_s2[:, second_axis]
-        acceleration[:, axis, 4:7] = (
-            attitude_error_by_unit_gyro_bias[:, second_axis]
-            * specific_force_ned_m_s2[:, [third_axis]]
+        acceleration[second_axis, 1 + axis] = -specific_force_ned_m_s2[third_axis]
+        acceleration[third_axis, 1 + axis] = specific_force_ned_m_s2[second_axis]
+        acceleration[axis, 4:7] = (
+            attitude_error_by_unit_gyro_bias[second_axis] * specific_force_ned_m_s2[third_axis]
+            - attitude_error_by_unit_gyro_bias[third_axis] * specific_force_ned_m_s2[second_axis]
         )
-        acceleration[:, axis, 4:7] -= (
-            attitude_error_by_unit_gyro_bias[:, third_axis]
-            * specific_force_ned_m_s2[:, [second_axis]]
-        )
-    acceleration[:, :, 7:10] = -body_to_ned
-    np.cumsum(acceleration[:-1] * INTEGRATION_STEP_S, axis=0, out=velocity[1:])
-    mean_velocity_in_step = velocity[:-1] + acceleration[:-1] * (INTEGRATION_STEP_S / 2.0)
-    np.cumsum(mean_velocity_in_step * INTEGRATION_STEP_S, axis=0, out=position[1:])
+    acceleration[:, 7:10] = -body_to_ned
+    velocity_increments = acceleration[..., :-1] * INTEGRATION_STEP_S
+    np.cumsum(velocity_increments, axis=-1, out=velocity[..., 1:])
+    mean_velocity_in_step = velocity[..., :-1] + velocity_increments / 2.0
+    np.cumsum(mean_velocity_in_step * INTEGRATION_STEP_S, axis=-1, out=position[..., 1:])
     return SegmentMotion(step_times_s[:-1], motion_and_derivatives)
 
 
 def _estimate_large_gyro_bias(
-    step_times_s: Array, gyro_integral_rad: Array, attitude: pd.DataFrame
+    step_times_s: Array, gyro_integral_rad: Array, attitude_time_s: Array, quaternions: Array
 ) -> Array:
     """Return a large gyro bias (rad/s), estimated from the logged attitude.
 
     A small bias gives zero, because a later fit estimates it. A bias above
     ``MAX_REMOVED_GYRO_BIAS_RAD_S`` gives zero, because the logged attitude is then wrong.
     """
-    samples = rows_between(attitude, step_times_s[0], step_times_s[-1])[Columns.QUATERNION]
-    if len(samples) < MIN_KEPT_MEASUREMENTS:
+    if len(quaternions) < MIN_KEPT_MEASUREMENTS:
         return np.zeros(3)
-    attitude_time_s, quaternions = samples.index.to_numpy(), samples.to_numpy()
     gyro_angle_rad = np.column_stack(
         [np.interp(attitude_time_s, step_times_s, column) for column in gyro_integral_rad.T]
     )
@@ -475,29 +486,3 @@ def _estimate_large_gyro_bias(
         MAX_PRIOR_GYRO_BIAS_RAD_S < np.abs(bias_rad_s).max() <= MAX_REMOVED_GYRO_BIAS_RAD_S
     )
     return bias_rad_s if is_bias_removed else np.zeros(3)
-
-
-def _integrate_gyros(
-    step_times_s: Array, gyro_integral_rad: Array, attitude: pd.DataFrame
-) -> Array:
-    """Integrate the gyroscopes to attitudes, starting at the logged attitude.
-
-    The attitudes are quaternions from body to NED, w first.
-    """
-    attitude_time_s = attitude.index.to_numpy()
-    nearby_rows = slice(
-        *np.clip(
-            np.searchsorted(attitude_time_s, step_times_s[0]) + np.array([-2, 3]),
-            0,
-            len(attitude_time_s),
-        )
-    )
-    logged_quaternions = attitude.iloc[nearby_rows][Columns.QUATERNION].to_numpy(copy=True)
-    nearby_attitude_time_s = attitude_time_s[nearby_rows]
-    start_s = np.clip(step_times_s[0], nearby_attitude_time_s[0], nearby_attitude_time_s[-1])
-    slerp = Slerp(nearby_attitude_time_s, Rotation.from_quat(logged_quaternions, scalar_first=True))
-    start_quaternion = slerp(start_s).as_quat(scalar_first=True)
-    rotation_since_start = cumulative_product(
-        from_rotation_vector(np.diff(gyro_integral_rad, axis=0))
-    )
-    return np.vstack([start_quaternion, multiply(start_quaternion, rotation_since_start)])

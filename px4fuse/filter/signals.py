@@ -13,7 +13,6 @@ import numpy as np
 import pandas as pd
 from numpy.typing import ArrayLike
 from scipy import constants
-from scipy.spatial.transform import Rotation, Slerp
 
 from px4fuse.core.arrays import (
     Array,
@@ -32,6 +31,7 @@ from px4fuse.flight.model import (
     Unavailable,
     rows_between,
 )
+from px4fuse.trajectory.rotation import interpolate, rotate, to_matrix
 
 # Name of the axis along the main horizontal direction of the flight
 AISLE = "aisle"
@@ -166,19 +166,20 @@ def imu_and_attitude(flight: Flight) -> tuple[pd.DataFrame, pd.DataFrame] | Unav
 def compute_ned_acceleration(flight: Flight) -> pd.DataFrame | Unavailable:
     """Return the acceleration in NED without gravity (m/s²) for each IMU sample.
 
-    The attitude is interpolated (slerp, Shoemake 1985), because PX4 logs it at a lower rate.
+    The attitude is interpolated, because PX4 logs it at a lower rate.
     """
     if isinstance(imu_with_attitude := imu_and_attitude(flight), Unavailable):
         return imu_with_attitude
     imu, attitude = imu_with_attitude
-    quaternions = attitude[Columns.QUATERNION].to_numpy(copy=True)
-    rotations = Rotation.from_quat(quaternions, scalar_first=True)
-    body_to_ned = Slerp(attitude.index.to_numpy(), rotations)
+    attitude_of_samples = interpolate(
+        imu.index.to_numpy(),
+        attitude.index.to_numpy(),
+        attitude[Columns.QUATERNION].to_numpy(),
+    )
     specific_force_m_s2 = imu[Columns.SPECIFIC_FORCE].to_numpy()
     acceleration = np.empty(specific_force_m_s2.shape)
     for rows in iterate_row_blocks(len(imu)):
-        rotation = body_to_ned(imu.index.to_numpy()[rows])
-        acceleration[rows] = rotation.apply(specific_force_m_s2[rows].astype(np.float64))
+        acceleration[rows] = rotate(to_matrix(attitude_of_samples[rows]), specific_force_m_s2[rows])
     acceleration[:, 2] += constants.g
     return pd.DataFrame(acceleration, imu.index, list(AXIS_NAMES), copy=False)
 

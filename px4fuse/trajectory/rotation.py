@@ -4,6 +4,9 @@ import numpy as np
 
 from px4fuse.core.arrays import Array, interpolate_columns
 
+# Cross-product matrices of the three unit vectors, one in each row
+FLATTENED_CROSS_PRODUCT_MATRICES = np.cross(np.eye(3), np.eye(3)[:, None]).reshape(3, 9)
+
 
 def multiply(a: Array, b: Array) -> Array:
     """Compute the product a ⊗ b of quaternions: rotation by b, then by a."""
@@ -72,27 +75,18 @@ def rotate(matrices: Array, vectors: Array) -> Array:
 
 def skew(v: Array) -> Array:
     """Return the cross-product matrices [v]× with [v]× u = v × u, shape (..., 3, 3)."""
-    x, y, z = _split_components(v)
-    return build_matrix((0.0, -z, y), (z, 0.0, -x), (-y, x, 0.0))
+    return (v @ FLATTENED_CROSS_PRODUCT_MATRICES).reshape(*v.shape, 3)
 
 
 def cumulative_product(quaternions: Array) -> Array:
     """Compute the products q_0, q_0 ⊗ q_1, q_0 ⊗ q_1 ⊗ q_2, ... of quaternions, shape (n, 4)."""
-    n = len(quaternions)
-    width = max(1, int(np.sqrt(n)))
-    rows = -(-n // width)
-    identity = np.array([1.0, 0.0, 0.0, 0.0])
-    padded_quaternions = np.concatenate([quaternions, np.tile(identity, (rows * width - n, 1))])
-    # Products in rows of √n quaternions need only about 2√n vectorised products
-    row_products = padded_quaternions.reshape(rows, width, 4).copy()
-    for column in range(1, width):
-        row_products[:, column] = multiply(row_products[:, column - 1], row_products[:, column])
-    products_of_previous_rows = np.tile(identity, (rows, 1))
-    for row in range(1, rows):
-        products_of_previous_rows[row] = multiply(
-            products_of_previous_rows[row - 1], row_products[row - 1, -1]
-        )
-    product = multiply(products_of_previous_rows[:, None, :], row_products).reshape(-1, 4)[:n]
+    if len(quaternions) < 2:
+        return quaternions
+    # Products of pairs give every second result; the others need one more product each
+    product = np.empty_like(quaternions)
+    product[0] = quaternions[0]
+    product[1::2] = cumulative_product(multiply(quaternions[:-1:2], quaternions[1::2]))
+    product[2::2] = multiply(product[1:-1:2], quaternions[2::2])
     return np.asarray(product / np.linalg.norm(product, axis=1, keepdims=True))
 
 
