@@ -496,7 +496,7 @@ def assert_cluster_gives_the_same_table(address, flights, undisturbed, tmp_path)
     (other / "METADATA").write_text("Metadata-Version: 2.1\nName: px4fuse\nVersion: 9.9\n")
     path = f"{tmp_path}{os.pathsep}{batch_tools.REPOSITORY}"
     with started_worker(address, tmp_path / "third", path):
-        assert "is 9.9, that of this computer" in error_line("batch", *arguments)
+        assert "has px4fuse 9.9, but this computer has" in error_line("batch", *arguments)
 
 
 def assert_failed_job_does_not_affect_others(address):

@@ -145,7 +145,7 @@ def test_sample_command_does_not_overwrite_other_file() -> None:
     Path("flights").mkdir()
     Path("flights/loop_slam.tum").write_text("mine")
     said = error_line("sample", "-o", "flights")
-    assert "loop_slam.tum already exists with different contents. Nothing was" in said
+    assert "loop_slam.tum already exists with different contents. Move that file" in said
     assert contents(Path("flights")) == {"loop_slam.tum": b"mine"}
 
 

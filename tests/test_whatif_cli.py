@@ -160,7 +160,7 @@ class TestFlownFlights:
         (cured,) = found.whatif.whatif
         assert error(cured) < 0.7 * error(found.whatif.logged)
         with pytest.raises(
-            SettingsError, match="The largest EKF2 delay parameter sets the delay of"
+            SettingsError, match="the largest sensor delay parameter sets the delay of"
         ):
             what_if(prepare_ekf2_model(found.flight), [{"EKF2_DELAY_MAX": 300.0}])
 
