@@ -37,7 +37,7 @@ from px4fuse.filter.signals import Segment, cut_to_segment, make_downsampling_sl
 from px4fuse.flight.model import Columns, Flight, PositionTrack, Unavailable
 
 # Number of time offsets near the maximum at which the likelihood is computed
-FINE_GRID_OFFSET_COUNT = 9
+FINE_GRID_OFFSET_COUNT = 11
 # Number of points of the likelihood curve in the report
 LIKELIHOOD_CURVE_POINT_COUNT = 121
 # Prior σ (rad) of EKF2's heading with GNSS: a wrong GNSS delay (0.2 s) causes an error of 5°
