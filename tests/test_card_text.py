@@ -56,7 +56,7 @@ def test_diagnosis_text_below_95_columns_has_ratios_without_plot() -> None:
     assert ratio_lines == [text for text in narrow if text in ratio_lines]
 
 
-def test_diagnosis_text_joins_alternative_actions_by_either_or() -> None:
+def test_diagnosis_text_numbers_alternative_actions() -> None:
     cause = replace(SMALL_SIGMA_A.causes[0], alternatives=((SENDER,), (DELAY,)))
     card = replace(SMALL_SIGMA_A, causes=(cause,))
     lines = text_of(card)

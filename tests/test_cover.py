@@ -68,7 +68,7 @@ def test_report_cover_prints_texts_of_the_diagnosis() -> None:
     assert [each for each in expected if each not in text] == []
 
 
-def test_report_cover_joins_alternative_actions_by_either_or() -> None:
+def test_report_cover_numbers_alternative_actions() -> None:
     sender = Action("sender", "subtract 0.264 s")
     console = Action("EKF2", commands=("param set EKF2_EV_DELAY 264", "reboot"), where="console")
     cause = DiagnosedCause(
@@ -77,8 +77,8 @@ def test_report_cover_joins_alternative_actions_by_either_or() -> None:
     )  # fmt: skip
     text = text_of(replace(SMALL_SIGMA_A, causes=(cause,)))
     assert "option 1: sender subtract 0.264 s" in text
-    assert "OR EKF2 console param set EKF2_EV_DELAY 264 reboot" in text
-    assert "KF keep the settings" in text
+    assert "option 2: EKF2 console param set EKF2_EV_DELAY 264 reboot" in text
+    assert "also: KF keep the settings" in text
     assert "console: MAVLink Console of QGroundControl" in text
 
 

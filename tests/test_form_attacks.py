@@ -176,7 +176,7 @@ def test_two_students_with_equal_plot_answers_are_flagged() -> None:
     ]
     flags = flag_equal_contents(reports)
     assert set(flags) == {"s1", "s2"}
-    assert "figures" in flags["s1"][0]
+    assert "plots" in flags["s1"][0]
 
 
 # ------------------------------------------------ students who analysed their flight

@@ -562,7 +562,7 @@ def compute_log_sigma_z_variance_factor(
 def _maximise_by_gradient(
     likelihood: NegativeLogLikelihood, start_parameters: NoiseParameters
 ) -> NoiseParameters:
-    """Return the most likely noise parameters near the start parameters (L-BFGS-B in ln σ).
+    """Return the maximum-likelihood noises near the start parameters (L-BFGS-B in ln σ).
 
     Parameters that are 0 remain 0.
     """
