@@ -19,7 +19,7 @@ from px4fuse.card.build import (
     build_unusable_log_card,
 )
 from px4fuse.card.causes import _find_action_target, make_cause, rank_causes
-from px4fuse.card.model import Action, Note
+from px4fuse.card.model import Action, DiagnosedCause, Note
 from px4fuse.comparison.rerun_effects import Rerun, RunStatistics, classify_improvement
 from px4fuse.diagnose import diagnose_comparison
 from px4fuse.errors import LogError
@@ -203,6 +203,17 @@ def test_actions_without_fault_agree_with_notes() -> None:
     expected = ("Optional: set SIGMA_A to 0.1 m/s² (--sigma-a 0.1).",)
     assert _format_actions((), (kept_noise, noise)) == expected
     assert _format_actions((), (kept_noise,)) == ("Change nothing.",)
+
+
+def test_action_that_keeps_settings_is_not_in_do_this() -> None:
+    sender = Action("sender", "Remove outliers before sending.")
+    kept = Action("EKF2", "keep the settings: EKF2's gate rejects these outliers")
+    no_option = Action("KF", "no option makes KF reject outliers")
+    cause = DiagnosedCause(
+        id="source_outliers", severity="error", title="Outliers", why="",
+        actions=(sender, kept, no_option),
+    )  # fmt: skip
+    assert _format_actions((cause,), ()) == ("Sender: remove outliers before sending.",)
 
 
 def test_changed_sigma_z_of_gnss_names_its_parameter() -> None:

@@ -129,7 +129,7 @@ def find_first_action(card: Card) -> str:
     ):
         if action.commands:
             return "\n".join(action.commands)
-        if not action.sentence.startswith("no "):
+        if action.changes_something():
             break
     return card.do_this[0] if card.do_this else ""
 

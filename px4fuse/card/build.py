@@ -389,7 +389,7 @@ def _format_actions(causes: Sequence[DiagnosedCause], notes: Sequence[Note]) -> 
         sentences += [
             _format_action(action)
             for action in cause.actions
-            if action.commands or not action.sentence.startswith("no ")
+            if action.commands or action.changes_something()
         ]
         label = f"Cause {number}: " if len(causes) > 1 else ""
         numbered_sentences += [f"{label}{sentence}." for sentence in sentences]
@@ -541,7 +541,7 @@ def _describe_difference(effect: FlightErrors, ranked_causes: Sequence[RankedCau
     }
     if len(corrected_filters) == 2:
         return (
-            f"{difference_text}. The first fault affects KF and EKF2 equally, so their difference "
+            f"{difference_text}. The first fault affects both KF and EKF2, so their difference "
             "hardly shows it."
         )
     rerun_difference_by_filter_m = {

@@ -102,7 +102,7 @@ class Action(Record):
     target : str
         Device or filter to be changed.
     sentence : str
-        Imperative, or "keep the settings: <reason>".
+        Imperative, "keep the settings: <reason>", or "no <setting or option> …".
     where : {"shell", "console", ""}
         Program for the commands: shell of the computer, or MAVLink console of the vehicle.
     """
@@ -111,6 +111,9 @@ class Action(Record):
     sentence: str = ""
     commands: tuple[str, ...] = ()
     where: Literal["shell", "console", ""] = ""
+
+    def changes_something(self) -> bool:
+        return not self.sentence.startswith(("no ", "keep the settings"))
 
 
 class CardRerun(Record, kw_only=True):
