@@ -244,7 +244,7 @@ def test_advice_states_height_noise_if_it_differs_from_setting(sample: Analysis)
     fused = replace(sample, flight=replace(sample.flight, ekf2=ekf2))
     advice = remedies.make_height_noise_advice(fused, tuning, 0.1)
     assert "but the estimated height noise is 0.6 m. " in advice
-    assert "send each position with a variance of 0.36 m² for z." in advice
+    assert "send each position with a z variance of 0.36 m²." in advice
     assert remedies.make_height_noise_advice(fused, tuning, 0.4) == ""
 
 

@@ -1,9 +1,8 @@
 """Settings of KF (noises, prediction interval, input, time offset) with valid ranges."""
 
 from dataclasses import dataclass
-from typing import NamedTuple, get_args
+from typing import TYPE_CHECKING, NamedTuple, get_args
 
-from px4fuse.core.arrays import Array
 from px4fuse.errors import SettingsError
 from px4fuse.request import (
     AUTO,
@@ -13,6 +12,9 @@ from px4fuse.request import (
     ComparisonRequest,
     KfInputName,
 )
+
+if TYPE_CHECKING:  # numpy is slow to import
+    from px4fuse.core.arrays import Array
 
 INPUT_NAMES: tuple[KfInputName, ...] = get_args(KfInputName)
 
@@ -89,7 +91,7 @@ class Settings:
                 f"`input` {self.input} is not an input of KF: give {' or '.join(INPUT_NAMES)}."
             )
 
-    def compute_noise_density(self, additional_variance_m2_s4: Array) -> Array:
+    def compute_noise_density(self, additional_variance_m2_s4: "Array") -> "Array":
         """Return the acceleration noise density (m²/s³); the additional variance is in IMU gaps."""
         return (self.sigma_a_m_s2**2 + additional_variance_m2_s4) * self.dt_s
 
