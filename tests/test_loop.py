@@ -134,7 +134,7 @@ def test_loop_command_on_lesson_example_2_equals_lesson_output() -> None:
     ]
 
 
-def test_loop_correction_by_distance_shifts_positions_linearly(sample_loop) -> None:
+def test_loop_correction_grows_linearly_with_distance_flown(sample_loop) -> None:
     plain, odometry = path(sample_loop, "by_distance_plain"), sample_loop.odometry.trajectory
     share = sample_loop.distance_m / sample_loop.distance_m[-1]
     moved = odometry.position_m - plain.trajectory.position_m

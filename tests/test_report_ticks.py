@@ -85,7 +85,7 @@ def test_frame_of_plot_is_position_of_axes() -> None:
     assert (top, top + frame_height) == pytest.approx(ends)
 
 
-def test_common_summand_of_tick_labels_is_part_of_axis_label() -> None:
+def test_common_offset_of_tick_labels_is_part_of_axis_label() -> None:
     def plot_utm_coordinates(axes: Axes) -> None:
         axes.plot(5.8e6 + np.arange(5.0), 4.7e6 + np.arange(5.0))
         set_map_axes(axes, "east", "north")

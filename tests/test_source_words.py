@@ -56,6 +56,6 @@ def test_position_source_kind_is_guessed_from_noise_and_rate(rate_hz, sigma_m, k
     assert infer_position_kind(track(rate_hz, sigma_m).samples) == kind
 
 
-def test_position_source_kind_of_few_samples_is_unknown() -> None:
+def test_source_with_few_samples_has_unknown_kind() -> None:
     samples = pd.DataFrame(np.zeros((3, 3)), [0.0, 1.0, 2.0], Columns.POSITION)
     assert infer_position_kind(samples) == "unknown"

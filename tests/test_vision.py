@@ -500,7 +500,7 @@ def test_ekf2_model_of_gnss_and_vision_agrees_with_log() -> None:
     assert model().inputs.settings["EKF2_EVP_NOISE"] == pytest.approx(0.1)
 
 
-def test_what_if_vision_noise_equals_flight_with_same_noise() -> None:
+def test_replay_with_changed_vision_noise_equals_such_a_flight() -> None:
     other = opened(flown(EKF2_EVP_NOISE=1.0))
     for one, value, then in ((model(), 1.0, other), (other, 0.1, model())):
         found, true = what_if(one, [{"EKF2_EVP_NOISE": value}]), what_if(then, [])

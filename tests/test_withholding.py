@@ -102,7 +102,7 @@ def test_grade_adds_diagnosis_to_report_on_student_assignment(
     assert to_json(again) == to_json(results)
 
 
-def test_report_on_log_with_removed_assignment_key_is_rejected(
+def test_report_on_log_without_its_assignment_key_is_rejected(
     assigned: Assigned, tmp_path: Path
 ) -> None:
     copy = tmp_path / assigned.log.name

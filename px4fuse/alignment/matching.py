@@ -44,13 +44,13 @@ class AlignmentProblem:
     Attributes
     ----------
     samples : DataFrame
-        Positions on the clock of the file.
+        Positions by time (s) of the file's clock.
     frames : tuple of str
         Possible frames of the file, such as ("enu",).
     yaw_rad : float or None
         Yaw of the file's frame relative to EKF2's frame.
     lag_s : float or None
-        Flight time (s) of the first position in the file.
+        Time (s) of the first position after the first sample of the log.
     """
 
     samples: pd.DataFrame

@@ -22,7 +22,7 @@ ProgressCallback = Callable[[str], None]
 Results = ComparisonResults | AidsResults
 # Settings that are copied from the other input if A and B are different logs
 _FILTER_SETTINGS = {*Settings.__dataclass_fields__, "axes"}
-# Settings that name input files. They are not copied between inputs that are the same log
+# Settings that name input files. They are not copied if A and B are the same log
 _INPUT_FILE_SETTINGS = {"log", "system", "position"}
 
 

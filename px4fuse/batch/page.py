@@ -142,10 +142,10 @@ def _make_log_cells(log: LogSummary) -> tuple[Cell, ...]:
     )
 
 
-def _make_ratio_cell(ratio: float | None, name: str, verdict: str) -> Cell:
+def _make_ratio_cell(ratio: float | None, column_name: str, verdict: str) -> Cell:
     if ratio is None:
         return Cell()
-    filter_name, _, reference_name = name.partition("_")
+    filter_name, _, reference_name = column_name.partition("_")
     emphasis_css_class = " loud" if verdict in ("overconfident", "underconfident") else ""
     return Cell(
         format_ratio(ratio),

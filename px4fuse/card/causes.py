@@ -52,7 +52,7 @@ ACTION_TARGET_BY_GROUP: Mapping[str, ActionTarget] = {
     "loops": "source",
     "logging": "logging",
 }
-# Exceptions from the target of the group, by finding id
+# Device to be changed, where it is not that of the finding's group
 ACTION_TARGET_BY_FINDING_ID: Mapping[str, ActionTarget] = {
     "source_drift": "source",
     "source_lever_arm": "EKF2",

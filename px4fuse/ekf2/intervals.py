@@ -81,13 +81,13 @@ class EventIntervals:
     state_derivatives: Array
 
     def compute_transitions(self, rows: slice) -> tuple[Array, ...]:
-        """Return state transition and process noise of E intervals.
+        """Return state transition and process noise of E intervals between fusions.
 
         Returns
         -------
         transition : ndarray, shape (E, 15, 15)
         state_change_by_correction, state_change_by_acceleration : ndarray, shape (E, 15)
-            Change of the state by attitude correction, and by acceleration.
+            Change of the state in an interval by EKF2's attitude correction, and by acceleration.
         gyro_noise_covariance, accelerometer_noise_covariance : ndarray, shape (E, 9, 9)
             Process noise per prediction step, for 1 rad/s (gyroscope) or 1 m/s² (accelerometer).
         """

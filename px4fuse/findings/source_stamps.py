@@ -210,7 +210,7 @@ def detect_varying_latency(analysis: Analysis) -> Findings:
     if position_age_s is None or find_timesync_convergence(analysis) is not None:
         return
     sample_count = max(MIN_POSITIONS_BEFORE_AND_AFTER_TIMESYNC, len(position_age_s) // 10)
-    start_s, end_s = (
+    start_age_s, end_age_s = (
         float(age_s.median())
         for age_s in (position_age_s.iloc[:sample_count], position_age_s.iloc[-sample_count:])
     )
@@ -228,18 +228,22 @@ def detect_varying_latency(analysis: Analysis) -> Findings:
             f"{format_percent(dropped_fraction)} in this flight."
         )
     is_any_dropped = dropped_fraction > MIN_DROPPED_POSITION_FRACTION
-    if end_s - start_s < MIN_LATENCY_FOR_ERROR_S or correlation_with_time < MIN_LATENCY_CORRELATION:
+    if (
+        end_age_s - start_age_s < MIN_LATENCY_FOR_ERROR_S
+        or correlation_with_time < MIN_LATENCY_CORRELATION
+    ):
         if not is_any_dropped or dropped_fraction >= 1.0 - MIN_DROPPED_POSITION_FRACTION:
             return
         change_verb = "varies"
-        start_s, end_s = position_age_s.quantile([0.05, 0.95]).tolist()
+        start_age_s, end_age_s = position_age_s.quantile([0.05, 0.95]).tolist()
     yield (make_error if is_any_dropped else make_warning)(
         "source_latency_varies",
         f"The latency of the {positions_phrase(analysis.source)} {change_verb} in flight from "
-        f"{start_s:.2f} s to {end_s:.2f} s (time from measurement to arrival).{late_drop_sentence}",
+        f"{start_age_s:.2f} s to {end_age_s:.2f} s (time from measurement to arrival)."
+        f"{late_drop_sentence}",
         "Find the queue that fills up: sender, bridge or link. Send fewer or smaller messages, and "
         "let the sender drop old positions.",
-        {"start_s": start_s, "end_s": end_s, "dropped_fraction": dropped_fraction},
+        {"start_s": start_age_s, "end_s": end_age_s, "dropped_fraction": dropped_fraction},
     )
 
 
@@ -249,7 +253,7 @@ def find_timesync_convergence(analysis: Analysis) -> tuple[float, float] | None:
     if position_age_s is None:
         return None
     is_arrival_time = (position_age_s.abs() < MAX_ARRIVAL_TO_PUBLICATION_DELAY_S).to_numpy()
-    # The best time of convergence has the most arrival times before and the fewest after
+    # TIMESYNC converged where most earlier and fewest later timestamps are arrival times
     converged_index = int(np.argmax(np.cumsum(np.where(is_arrival_time, 1, -1)))) + 1
     is_arrival_before, is_arrival_after = np.split(is_arrival_time, [converged_index])
     if (

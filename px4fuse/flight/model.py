@@ -303,7 +303,7 @@ MAX_UWB_RATE_HZ = 25.0
 MIN_LANDED_DURATION_S = 5.0
 BODY_AXES = ("forward", "right", "down")
 AXIS_NAMES: tuple[NedAxis, NedAxis, NedAxis] = ("north", "east", "down")
-# Names of position sources for users that are not the kind in capitals
+# Names of position sources in texts, where the name is not the kind in capitals
 SOURCE_NAMES: Mapping[str, str] = {"unknown": "external vision", "file": "position file"}
 
 

@@ -57,7 +57,7 @@ class ClockLine:
         return np.asarray(self.y0 + self.slope * (x - self.x0), dtype=np.float64)
 
     def inverse(self) -> ClockLine:
-        """Return the inverse relation, from y to x."""
+        """Return the line that converts readings of the target clock to the source clock."""
         return ClockLine(
             self.y0, self.x0, 1.0 / self.slope, self.jitter_s / self.slope, self.reading_pair_count
         )

@@ -35,7 +35,7 @@ RECEIPT_CLOCK_TEXT = "autopilot boot clock, estimated from receive times"
 GEODETIC_SCALE = {"latitude_deg": 1e-7, "longitude_deg": 1e-7, "altitude_m": 1e-3}
 # Minimum backward step (s) of the boot clock at a restart
 MIN_BACKWARD_STEP_AT_RESTART_S = 5.0
-# Number of messages before and after a backward step that must confirm a restart
+# Number of messages around a backward step of the timestamps that confirm a restart
 RESTART_CHECK_MESSAGES = 20
 # Minimum size of a valid group of timestamps, relative to the largest group
 MIN_TIMESTAMP_GROUP_FRACTION = 0.01

@@ -214,7 +214,7 @@ def _dot(a: Array, b: Array) -> Array:
 
 
 def plan_flight(scenario: Scenario, faults: FaultSizes, rng: np.random.Generator) -> Motion:
-    """Plan a flight: ground, climb, hover, aisle or square, hover, descent, ground.
+    """Plan a flight: ground, climb, hover, passes or laps, hover, descent, ground.
 
     Raises
     ------

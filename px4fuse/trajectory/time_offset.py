@@ -130,7 +130,7 @@ def _search_offset(sparse_track: Trajectory, dense_track: Trajectory) -> TimeOff
     max_misfit = MIN_SECOND_BEST_RESIDUAL_RATIO * best_fit.compute_misfit()
     fits_similar_to_best = [fit for fit in accepted_fits if fit.compute_misfit() <= max_misfit]
     if clock_offset_s is not None:
-        # Of several equally good offsets, the nearest to the UNIX time is used
+        # Of several equally good offsets, use the one nearest to the offset of the UNIX timestamps
         best_fit = min(fits_similar_to_best, key=lambda fit: abs(fit.offset_s - clock_offset_s))
     else:
         for fit in sorted(fits_similar_to_best, key=_OffsetFit.compute_misfit):

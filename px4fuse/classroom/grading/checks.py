@@ -77,7 +77,7 @@ class RubricItem(
 
 
 def compute_points_fraction(deviation_factor: float, factor_at_zero_points: float) -> float:
-    """Return the fraction of the points for a value that is wrong by ``deviation_factor``.
+    """Return the fraction of the maximum points for a value with a wrong factor.
 
     The fraction is 1 - ln(deviation_factor) / ln(factor_at_zero_points), between 0 and 1.
 

@@ -25,7 +25,7 @@ from px4fuse.results.answer_form import (
     select_questions,
 )
 
-# Fraction of the points for questions about the flight; the rest is for questions about figures
+# Fraction of the points for questions about the flight; the rest is for those about plots
 FLIGHT_QUESTIONS_POINTS_FRACTION = 0.2
 # Points deducted for each false fault
 FALSE_FAULT_DEDUCTION = 10.0

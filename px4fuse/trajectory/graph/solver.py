@@ -48,7 +48,7 @@ KEPT_CLOSURE_PROBABILITY = 0.999
 # Factor on the control parameter of graduated non-convexity (Yang 2020, section V)
 _GNC_CONTROL_FACTOR = 1.4
 _MAX_GNC_STAGES = 100
-# Maximum number of dropped closures that are restored on trial
+# Maximum number of rejected loop closures that are tried again
 _MAX_RESTORE_ATTEMPTS = 20
 _MAX_REWEIGHTING_ROUNDS = 20
 # False closures alone can cause smaller scale factors of information matrices
