@@ -12,6 +12,7 @@ Thompson 1971).
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from functools import cache
 from itertools import product
 
 import numpy as np
@@ -355,6 +356,7 @@ def fit_time_correlation_to_truth(
         half_axis_count_and_half_residual_count[1] * np.log(np.mean(residuals**2, axis=0)).sum()
     )
 
+    @cache
     def compute_scores_and_variances(tested_tau_s: float) -> ArrayPair:
         correlation_matrix = (
             basis_without_systematic_errors.T

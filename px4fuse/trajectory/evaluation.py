@@ -352,7 +352,10 @@ def choose_alignment(estimate: Trajectory, reference: Trajectory) -> tuple[Align
     """Choose the alignment by the sources of the trajectories, and return the reason."""
     has_same_frame = estimate.frame == reference.frame != "unknown"
     if estimate.kind == "truth" and (has_same_frame or reference.kind == "truth"):
-        return "none", "No alignment: the estimate is ground truth in the frame of the reference."
+        return (
+            "none",
+            "No alignment: the estimated trajectory is ground truth in the frame of the reference.",
+        )
     frames_text = f"{estimate.frame} and {reference.frame}"
     has_common_vertical = estimate.frame == reference.frame == "ENU" or (
         estimate.frame in _Z_DOWN_FRAMES and reference.frame in _Z_DOWN_FRAMES
