@@ -19,7 +19,6 @@ from px4fuse.core.record import NOT_WRITTEN, Count, NotNegative, NotWritten, Rec
 from px4fuse.filter.fitting import NoiseParameters, fit_constant_errors, maximise_likelihood
 from px4fuse.filter.imu_motion import (
     COARSE_MEASUREMENT_COUNT,
-    COARSE_OFFSET_COUNT,
     HEADING_SIGMA_RAD,
     MAX_TESTED_TIME_OFFSET_S,
     MotionCache,
@@ -36,12 +35,24 @@ from px4fuse.filter.settings import Settings
 from px4fuse.filter.signals import Segment, cut_to_segment, make_downsampling_slice
 from px4fuse.flight.model import Columns, Flight, PositionTrack, Unavailable
 
+# Half-width (s) of the tested time offsets around the result of the coarse search
+INITIAL_SEARCH_HALF_WIDTH_S = 0.1
+# Half-width of the likelihood curve ÷ σ of the time offset, and its minimum (s)
+CURVE_HALF_WIDTH_SIGMAS, MIN_CURVE_HALF_WIDTH_S = 3.5, 0.01
+# Half-width of the tested time offsets ÷ half-width of the curve, which is around their minimum
+TESTED_TO_CURVE_WIDTH_RATIO = 1.3
 # Number of time offsets near the maximum at which the likelihood is computed
 FINE_GRID_OFFSET_COUNT = 11
+# Maximum distance (s) of time offsets between which the likelihood is interpolated
+MAX_INTERPOLATED_OFFSET_STEP_S = 0.02
 # Number of points of the likelihood curve in the report
 LIKELIHOOD_CURVE_POINT_COUNT = 121
 # Prior σ (rad) of EKF2's heading with GNSS: a wrong GNSS delay (0.2 s) causes an error of 5°
 GNSS_HEADING_SIGMA_RAD = 0.2
+# Tested differences (s) between the time offsets of a flight part and of the flight
+PART_OFFSET_CHANGES_S = np.concatenate(
+    [np.linspace(-0.6, -0.3, 4), np.linspace(-0.2, 0.2, 9), np.linspace(0.3, 0.6, 4)]
+)
 # Maximum half-width (s) of the 95 % interval of an accepted time offset
 MAX_OFFSET_INTERVAL_HALF_WIDTH_S = 0.15
 # Maximum σ (s) of a segment's time offset in the test for a changed time offset
@@ -177,7 +188,7 @@ def estimate_time_offset(
     coarse_motion = imu_motion.downsample(COARSE_MEASUREMENT_COUNT)
     offset_s, _ = imu_motion.search_offset(noise_parameters)
     offset_sigma_s = 0.0
-    search_half_width_s = 0.1
+    search_half_width_s = INITIAL_SEARCH_HALF_WIDTH_S
     for motion in (coarse_motion, imu_motion):
         noise_parameters = maximise_likelihood(
             [motion.make_positions_at_offset(offset_s)],
@@ -191,10 +202,10 @@ def estimate_time_offset(
             noise_parameters,
             motion.measurement_weights,
         )
-        offset_s, offset_sigma_s = _fit_minimum_and_sigma(
-            tested_offsets_s, position_fit.compute_scores()[0]
-        )
-        search_half_width_s = float(np.clip(3.5 * offset_sigma_s, 0.01, MAX_TESTED_TIME_OFFSET_S))
+        scores = position_fit.compute_scores()[0]
+        offset_s, offset_sigma_s = _fit_minimum_and_sigma(tested_offsets_s, scores)
+        curve_half_width_s = max(CURVE_HALF_WIDTH_SIGMAS * offset_sigma_s, MIN_CURVE_HALF_WIDTH_S)
+        search_half_width_s = TESTED_TO_CURVE_WIDTH_RATIO * curve_half_width_s
     offset_variance_factor = _simulate_variance_increase_by_imu_noise(
         imu_motion, offset_s, noise_parameters, offset_sigma_s**-2.0
     )
@@ -202,8 +213,9 @@ def estimate_time_offset(
         _compute_offset_likelihood_curve(
             imu_motion,
             noise_parameters,
+            (tested_offsets_s, scores),
             offset_s,
-            search_half_width_s,
+            curve_half_width_s,
             MAX_LOG_LIKELIHOOD_DROP * offset_variance_factor,
         )
     )
@@ -261,6 +273,7 @@ def estimate_time_offset(
 def _compute_offset_likelihood_curve(
     motion: PositionsAndImuMotion,
     noise_parameters: NoiseParameters,
+    tested_offsets_and_scores: tuple[Array, Array],
     offset_s: float,
     half_width_s: float,
     max_score_increase: float,
@@ -268,19 +281,26 @@ def _compute_offset_likelihood_curve(
     """Compute -ln p of the positions as a function of the time offset.
 
     Return tested time offsets (s), -ln p of each, and both ends (s) of an interval around the
-    minimum. An end outside the search range is None.
+    minimum. An end outside the search range is None. ``tested_offsets_and_scores`` contains time
+    offsets for which -ln p is known.
     """
+    tested_offsets_s, tested_scores = tested_offsets_and_scores
     while True:
-        computed_offsets_s, curve_time_offsets_s = (
-            _make_offset_grid(offset_s, half_width_s, offset_count)
-            for offset_count in (FINE_GRID_OFFSET_COUNT, LIKELIHOOD_CURVE_POINT_COUNT)
+        curve_time_offsets_s = _make_offset_grid(
+            offset_s, half_width_s, LIKELIHOOD_CURVE_POINT_COUNT
         )
-        computed_scores = fit_constant_errors(
-            motion.make_position_batches(computed_offsets_s),
-            noise_parameters,
-            motion.measurement_weights,
-        ).compute_scores()[0]
-        profile_scores = CubicSpline(computed_offsets_s, computed_scores)(curve_time_offsets_s)
+        if (
+            curve_time_offsets_s[0] < tested_offsets_s[0]
+            or curve_time_offsets_s[-1] > tested_offsets_s[-1]
+            or tested_offsets_s[1] - tested_offsets_s[0] > MAX_INTERPOLATED_OFFSET_STEP_S
+        ):
+            tested_offsets_s = _make_offset_grid(offset_s, half_width_s, FINE_GRID_OFFSET_COUNT)
+            tested_scores = fit_constant_errors(
+                motion.make_position_batches(tested_offsets_s),
+                noise_parameters,
+                motion.measurement_weights,
+            ).compute_scores()[0]
+        profile_scores = CubicSpline(tested_offsets_s, tested_scores)(curve_time_offsets_s)
         interval_low_s, interval_high_s = compute_profile_likelihood_interval(
             curve_time_offsets_s, profile_scores, max_score_increase
         )
@@ -385,9 +405,7 @@ def _estimate_flight_part_offsets(
 
     Return also the p-value of the test; None with fewer than two offsets.
     """
-    coarse_offsets_s = offset_s + np.linspace(
-        -MAX_TESTED_TIME_OFFSET_S, MAX_TESTED_TIME_OFFSET_S, COARSE_OFFSET_COUNT
-    )
+    coarse_offsets_s = offset_s + PART_OFFSET_CHANGES_S
     coarse_offsets_s = coarse_offsets_s[np.abs(coarse_offsets_s) <= MAX_TESTED_TIME_OFFSET_S]
     segment_scores_at_coarse_offsets = fit_constant_errors(
         imu_motion.make_position_batches(coarse_offsets_s),
