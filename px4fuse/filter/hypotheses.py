@@ -344,7 +344,8 @@ def _compute_jump_chi_squares(
     candidate_times_s: Array,
 ) -> Array:
     """Return χ² of a jump at each time: the decrease of the sum of squared residuals."""
-    columns_by_axis = np.split(fit_without_jump.columns, design_matrix.axis_count)
+    _, columns = design_matrix.compute_innovations_and_design_matrix(fit_without_jump.gains)
+    columns_by_axis = np.split(columns, design_matrix.axis_count)
     chi_squares = np.zeros(len(candidate_times_s))
     for first in range(0, len(candidate_times_s), JUMP_BATCH_SIZE):
         batch = slice(first, first + JUMP_BATCH_SIZE)
@@ -444,8 +445,6 @@ class InnovationRegression:
 
     Attributes
     ----------
-    columns : ndarray, shape (axes · m, k)
-        Design matrix: measurements along the first axis, then those along the next axis.
     residual : ndarray, shape (axes, m)
         Normalised innovations minus the fit, also of measurements that are not used.
     coefficients, covariance : ndarray, shape (k,) and (k, k)
@@ -462,7 +461,6 @@ class InnovationRegression:
         Innovation variance S (m²), position gain and velocity gain of KF.
     """
 
-    columns: Array
     residual: Array
     coefficients: Array
     covariance: Array
@@ -567,7 +565,6 @@ class DesignMatrix:
         residual = (innovations_of_data - columns @ coefficients).reshape(self.axis_count, -1)
         mean_squares = np.mean(residual[:, ~is_skipped] ** 2, axis=1)
         return InnovationRegression(
-            columns,
             residual,
             coefficients,
             covariance,
@@ -579,7 +576,11 @@ class DesignMatrix:
         )
 
     def compute_innovations_and_design_matrix(self, gains: Array, scale: float = 1.0) -> ArrayPair:
-        """Return KF's normalised innovations ν/√S, and the design matrix."""
+        """Return KF's normalised innovations ν/√S, and the design matrix.
+
+        The design matrix has the shape (axes · m, k): measurements along the first axis, then those
+        along the next axis.
+        """
         inputs, axis_count = self.preintegrated_inputs, self.axis_count
         input_count = inputs.measurement_m.shape[1]
         # Only inputs with measured acceleration are multiplied by the scale factor
@@ -641,6 +642,7 @@ def make_design_matrix(
             prediction_steps, np.diff(velocity_m_s) / np.diff(prediction_steps.time_s)
         )
 
+    unit_errors = _integrate_unit_errors(attitude, acceleration)
     # Δp (m) and Δv (m/s) between the measurements, for each input of KF
     increments: list[ArrayPair] = []
     for axis, preintegrated_motion in zip(axes, preintegrated_motions, strict=True):
@@ -649,7 +651,7 @@ def make_design_matrix(
         )
         increments += [
             integrate_between_measurements(velocity_error_m_s @ axis.direction, error_time_s)
-            for error_time_s, velocity_error_m_s in _integrate_unit_errors(attitude, acceleration)
+            for error_time_s, velocity_error_m_s in unit_errors
         ]
     # The slow acceleration error is linear between knots
     slow_error_intervals = int(
