@@ -71,8 +71,10 @@ def _show_card(console: Console, block: PageBlock, request: Request | None) -> N
     else:
         lines = format_headline_lines(card)
     is_ascii_terminal = console.encoding.lower() not in UNICODE_ENCODINGS
+    # In a pipe, each sentence is one line
+    width = min(console.width, CARD_WIDTH) if console.is_terminal else console.width
     for line in lines:
-        for text in line.wrap(min(console.width, CARD_WIDTH)):
+        for text in line.wrap(width):
             console.print(
                 Text(to_ascii(text) if is_ascii_terminal else text, line.style), soft_wrap=True
             )
