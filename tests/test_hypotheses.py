@@ -299,7 +299,9 @@ def test_mean_acceleration_error_of_noise_free_axis_is_exact(error_m_s2) -> None
         measurement_m=np.interp(
             down.measurement_time_s,
             time_s,
-            integrate_cumulatively(acceleration.compute_velocity_change_m_s(), time_s),
+            integrate_cumulatively(
+                acceleration.compute_velocity_change_m_s(down.direction), time_s
+            ),
         ),
         acceleration=replace(acceleration, acceleration_integral_m_s=biased),
     )

@@ -10,6 +10,7 @@ import numpy as np
 from msgspec import structs
 from scipy.special import stdtr
 
+from px4fuse.comparison.imu_oscillation import ImuOscillation, find_imu_oscillation
 from px4fuse.comparison.model import Comparison, PreparedComparison
 from px4fuse.comparison.noise_differences import (
     NoisyPart,
@@ -31,7 +32,6 @@ from px4fuse.filter.hypotheses import (
     fit_systematic_errors,
 )
 from px4fuse.filter.imu_motion import MAX_IMU_INTERVAL_S, MotionCache
-from px4fuse.filter.imu_oscillation import ImuOscillation, find_imu_oscillation
 from px4fuse.filter.signals import AISLE, Axis
 from px4fuse.filter.time_offset import (
     MAX_OFFSET_INTERVAL_HALF_WIDTH_S,
@@ -120,7 +120,7 @@ def estimate(comparison: Comparison, progress: Progress = ignore_progress) -> Es
     tuning, time_offset = estimate_noises_and_time_offset(
         comparison, progress, REPORTED_AXES if has_north_and_east else None, motion_cache
     )
-    imu_oscillation = find_oscillation(comparison)
+    imu_oscillation = find_imu_oscillation(comparison)
     systematic_errors, source_low_pass, correlated_noise = _fit_source_errors(
         comparison, tuning, time_offset, imu_oscillation, motion_cache
     )
@@ -141,16 +141,6 @@ def estimate(comparison: Comparison, progress: Progress = ignore_progress) -> Es
         axis_tunings=axis_tunings,
         noisy_part=noisy_part,
         imu_oscillation=imu_oscillation,
-    )
-
-
-def find_oscillation(comparison: PreparedComparison) -> ImuOscillation | None:
-    """Find an oscillation of the accelerometer that the positions do not contain."""
-    return find_imu_oscillation(
-        comparison.input_axes[0].acceleration,
-        comparison.flight.attitude,
-        comparison.source,
-        comparison.segment,
     )
 
 
@@ -220,7 +210,7 @@ def estimate_noises_and_time_offset(
         return tuning, time_offset
     if comparison.source.origin.may_drift:
         time_offset = widen_for_scatter(time_offset, "the positions drift")
-    elif time_offset.has_changed() and find_oscillation(comparison):
+    elif time_offset.has_changed() and find_imu_oscillation(comparison):
         time_offset = widen_for_scatter(time_offset, "the accelerometer oscillates")
     return tuning, time_offset
 

@@ -392,21 +392,19 @@ def choose_segment(
         ]:
             chosen_start_s, chosen_end_s = clipped_span_s
             reason += "; the log covers only part of the chosen time"
-    if not chosen_start_s < chosen_end_s:
-        raise SettingsError(
-            f"{log.name}: no positions between {chosen_start_s:.6g} s and {chosen_end_s:.6g} s; "
-            f"the positions are from {source_span_s[0]:.2f} s to {source_span_s[1]:.2f} s. Change "
-            "--start or --end."
-        )
-    segment_span_s = max(chosen_start_s, available_start_s), min(chosen_end_s, available_end_s)
-    if segment_span_s[0] >= segment_span_s[1]:
-        segment_span_s = chosen_start_s, chosen_end_s
-    segment = Segment(*segment_span_s, reason, (chosen_start_s, chosen_end_s))
+    segment = Segment(
+        max(chosen_start_s, available_start_s),
+        min(chosen_end_s, available_end_s),
+        reason,
+        (chosen_start_s, chosen_end_s),
+    )
     position_count = len(cut_to_segment(track.samples, segment))
     if position_count < MIN_MEASUREMENTS:
         raise SettingsError(
-            f"{log.name}: {track.name} has only {position_count} measurements between "
-            f"{segment.start_s:.2f} s and {segment.end_s:.2f} s; at least {MIN_MEASUREMENTS} are "
-            "needed. Choose a longer segment (--start, --end)."
+            f"{log.name}: {track.name} has {position_count} positions between "
+            f"{chosen_start_s:.6g} s and {chosen_end_s:.6g} s (at least {MIN_MEASUREMENTS} are "
+            f"needed). The positions are from {source_span_s[0]:.2f} s to {source_span_s[1]:.2f} "
+            "s.",
+            "Change --start or --end.",
         )
     return segment

@@ -272,15 +272,21 @@ def find_convention_candidates(
         GRID_INTERVAL_S / SECOND_DIFFERENCE_WINDOW_S
     )
     cross_moments /= cross_moments[:, 6:, 6:]
+    # If z is constant, the source measures no height, and z is the vertical axis
+    permutations = [
+        permutation
+        for permutation in SIGNED_AXIS_PERMUTATIONS
+        if permutation.vertical_axis == 2 or source_motion.second_differences[:, 2].any()
+    ]
     vertical_axis, vertical_sign, first_horizontal_axis, second_horizontal_axis, handedness = (
-        np.array(SIGNED_AXIS_PERMUTATIONS).T
+        np.transpose(permutations)
     )
+    # Complex numbers are north + i east
+    horizontal_moments = cross_moments[:, :3, 0] + 1j * cross_moments[:, :3, 1]
     correlation = (
-        cross_moments[:, first_horizontal_axis, 0]
-        + handedness * cross_moments[:, second_horizontal_axis, 1]
-        + 1j * cross_moments[:, first_horizontal_axis, 1]
+        horizontal_moments[:, first_horizontal_axis]
+        - 1j * handedness * horizontal_moments[:, second_horizontal_axis]
     )
-    correlation -= 1j * handedness * cross_moments[:, second_horizontal_axis, 0]
     source_mean_square = np.maximum(cross_moments[:, 3:6, 6, None], 1e-12)
     metres_per_unit = np.array([*METRES_PER_UNIT.values()])
     north_mean_square_m2, east_mean_square_m2, down_mean_square_m2 = np.moveaxis(
@@ -322,13 +328,7 @@ def find_convention_candidates(
             np.argmax(scores_at_quarter_turn, axis=0)
         ):
             unit_name = [*METRES_PER_UNIT][unit_index]
-            axis_permutation = SIGNED_AXIS_PERMUTATIONS[permutation_index]
-            # If z is constant, the source measures no height, and z is the vertical axis
-            if (
-                axis_permutation.vertical_axis != 2
-                and not source_motion.second_differences[:, 2].any()
-            ):
-                continue
+            axis_permutation = permutations[permutation_index]
             total_score = (
                 scores_at_quarter_turn[offset_index, permutation_index, unit_index]
                 + axis_permutation.compute_log_prior_odds(quarter_turns)

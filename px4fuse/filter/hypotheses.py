@@ -141,7 +141,7 @@ def estimate_mean_acceleration_error(axis: Axis) -> float | None:
         or len(time_s) < MIN_MEASUREMENTS
     ):
         return None
-    velocity_m_s = acceleration.compute_velocity_change_m_s()
+    velocity_m_s = acceleration.compute_velocity_change_m_s(axis.direction)
     path_m = integrate_cumulatively(velocity_m_s, acceleration.time_s)
     residuals_m = axis.measurement_m - np.interp(time_s, acceleration.time_s, path_m)
     # the doubly integrated acceleration is too large by error · t² / 2

@@ -18,7 +18,7 @@ from itertools import chain
 import numpy as np
 import pandas as pd
 
-from px4fuse.core.arrays import Array, BoolArray, IntArray
+from px4fuse.core.arrays import Array
 from px4fuse.core.record import one_line_repr
 from px4fuse.filter import model
 from px4fuse.filter.settings import InitialState, Settings
@@ -196,48 +196,24 @@ def _run_with_floats(
         yield (position, velocity, *covariance, *update)
 
 
-def _find_previous_steps(run: KfRun, times_s: Array) -> tuple[IntArray, Array, BoolArray]:
-    """Find for each time the last step of KF before it.
-
-    Return its index, the time (s) since this step, and True for times outside KF's time span.
-    """
-    step_times_s = run.steps.index.to_numpy()
-    step_index = np.clip(
-        np.searchsorted(step_times_s, times_s, side="right") - 1, 0, len(step_times_s) - 1
-    )
-    return (
-        step_index,
-        times_s - step_times_s[step_index],
-        (times_s < step_times_s[0]) | (times_s > step_times_s[-1]),
-    )
-
-
-def predict_state(run: KfRun, times_s: Array) -> Array:
-    """Predict position (m) and velocity (m/s) at each time from KF's last step before it.
+def predict_track(run: KfRun, times_s: Array) -> pd.DataFrame:
+    """Predict state and covariance at each time from KF's last step before it.
 
     Interpolation would use later measurements. Times outside the time span of KF give NaN.
     """
-    step_index, elapsed_s, is_outside = _find_previous_steps(run, times_s)
-    position, velocity, acceleration = (
-        run.steps[column].to_numpy()[step_index]
-        for column in (*model.STATE_COLUMNS, "acceleration_m_s2")
+    step_times_s = run.steps.index.to_numpy()
+    is_inside = (times_s >= step_times_s[0]) & (times_s <= step_times_s[-1])
+    step_index = np.clip(np.searchsorted(step_times_s, times_s, side="right") - 1, 0, None)
+    position, velocity, p00, p01, p11, acceleration, imu_gap_variance_m2_s4 = run.steps.to_numpy()[
+        step_index
+    ].T
+    position, velocity, covariance = model.predict_step(
+        position,
+        velocity,
+        (p00, p01, p11),
+        acceleration,
+        run.settings.compute_noise_density(imu_gap_variance_m2_s4),
+        np.where(is_inside, times_s - step_times_s[step_index], np.nan),
     )
-    state = model.propagate_state(position, velocity, acceleration, elapsed_s)
-    return np.where(is_outside, np.nan, state)
-
-
-def predict_variance(run: KfRun, times_s: Array) -> Array:
-    """Return the variances (m², m²/s²) of position and velocity from :func:`predict_state`."""
-    step_index, elapsed_s, is_outside = _find_previous_steps(run, times_s)
-    p00, p01, p11 = run.steps[model.COVARIANCE_COLUMNS].to_numpy()[step_index].T
-    imu_gap_variance_m2_s4 = run.steps["imu_gap_variance_m2_s4"].to_numpy()[step_index]
-    noise_density = run.settings.compute_noise_density(imu_gap_variance_m2_s4)
-    position_variance_m2, _, velocity_variance_m2_s2 = model.propagate_covariance(
-        (p00, p01, p11), elapsed_s
-    )
-    q00, _, q11 = model.compute_process_noise_per_density(elapsed_s)
-    return np.where(
-        is_outside,
-        np.nan,
-        (position_variance_m2 + noise_density * q00, velocity_variance_m2_s2 + noise_density * q11),
-    )
+    track = np.transpose([position, velocity, *covariance])
+    return pd.DataFrame(track, times_s, STATE_TABLE_COLUMNS)

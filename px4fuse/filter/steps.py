@@ -78,7 +78,9 @@ def make_prediction_steps(
             f"The setting `input` is imu, but the axis {axis.name} has no IMU acceleration.",
             f"{axis.acceleration}",
         )
-    mean_acceleration_m_s2, gap_fraction = compute_mean_step_acceleration(axis.acceleration, time_s)
+    mean_acceleration_m_s2, gap_fraction = compute_mean_step_acceleration(
+        axis.acceleration, axis.direction, time_s
+    )
     gap_s = gap_fraction * np.diff(time_s)
     # Unlike white noise, the unknown acceleration is constant in an IMU gap of T seconds. This
     # increases the velocity variance by the factor T/DT
@@ -88,7 +90,7 @@ def make_prediction_steps(
     gap_duration_in_interval_s = np.bincount(interval_index, weights=gap_s)[interval_index]
     gap_variance_factor = np.maximum(gap_duration_in_interval_s / settings.dt_s, 1.0)
     imu_gap_variance_m2_s4 = (
-        gap_fraction * gap_variance_factor * axis.acceleration.compute_rms_m_s2() ** 2
+        gap_fraction * gap_variance_factor * axis.acceleration.compute_rms_m_s2(axis.direction) ** 2
     )
     return PredictionSteps(
         time_s,
