@@ -18,7 +18,7 @@ from px4fuse.errors import SettingsError
 from px4fuse.filter import model
 from px4fuse.filter.kalman import UPDATE_TABLE_COLUMNS, predict_track, run_kf
 from px4fuse.filter.model import COVARIANCE_COLUMNS, STATE_COLUMNS
-from px4fuse.filter.settings import InitialState, Settings
+from px4fuse.filter.settings import Settings
 from px4fuse.filter.signals import Axis
 
 SAME_TIME_S = 5e-7
@@ -110,10 +110,6 @@ def test_kf_replay_starts_at_first_measurement(axis: Axis) -> None:
     assert run.steps.index[0] == axis.measurement_time_s[0]
     assert run.steps[STATE].iloc[0].tolist() == [axis.measurement_m[0], 0.0, 0.25, 0.0, 1.0]
     assert run.updates.index.tolist() == axis.measurement_time_s[1:].tolist()
-    run = run_kf(axis, Settings(), InitialState(1.9, -1.0, 0.5))
-    assert run.steps[STATE].iloc[0].tolist() == [-1.0, 0.5, 0.25, 0.0, 1.0]
-    assert run.steps.index[0] == 1.9
-    assert run.updates.index.tolist() == axis.measurement_time_s.tolist()
 
 
 def test_kf_state_between_steps_is_predicted_from_previous_step(axis: Axis) -> None:

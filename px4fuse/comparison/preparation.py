@@ -124,11 +124,13 @@ def _correct_convention(
     # A time offset from the user replaces the detected one
     if convention is not None and settings.clock_offset_s:
         convention = structs.replace(convention, late_s=0.0)
-    late_s = find_convention_faults(convention, flight, source.frame).late_s
-    offset_range = SETTING_RANGES["clock_offset_s"]
-    clock_offset_s = np.clip(settings.clock_offset_s - late_s, offset_range.low, offset_range.high)
-    settings = replace(settings, clock_offset_s=float(clock_offset_s))
-    return *convert_to_px4_convention(flight, source, convention), settings, convention
+    faults = find_convention_faults(convention, flight, source.frame)
+    if convention is None or not faults:
+        return flight, source, settings, convention
+    offset_range, clock_offset_s = SETTING_RANGES["clock_offset_s"], settings.clock_offset_s
+    clock_offset_s = min(max(clock_offset_s - faults.late_s, offset_range.low), offset_range.high)
+    settings = replace(settings, clock_offset_s=clock_offset_s)
+    return *convert_to_px4_convention(flight, source, convention, faults), settings, convention
 
 
 def _use_gnss_noise_of_ekf2(

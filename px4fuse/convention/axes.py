@@ -13,6 +13,7 @@ from itertools import product
 from typing import Final, NamedTuple
 
 import numpy as np
+import pandas as pd
 
 from px4fuse.convention.model import AxisDirections, Direction, HeadingSource, Unit
 from px4fuse.convention.motion import (
@@ -128,12 +129,12 @@ SIGNED_AXIS_PERMUTATIONS = tuple(
 
 @dataclass(frozen=True)
 class SentPositions:
-    """Positions of a source as sent, and barometer heights (m) at barometer times (s)."""
+    """Positions of a source as sent, and barometer heights (column ``down_m``)."""
 
     time_s: Array
     position_m: Array
     max_time_offset_s: float
-    barometer_times_and_heights: tuple[Array, Array] | None = None
+    barometer: pd.DataFrame | None
 
     def remove_clock_drift(self, clock_drift: float) -> "SentPositions":
         return replace(self, time_s=correct_clock_drift(self.time_s, clock_drift))
@@ -523,18 +524,20 @@ def _compute_total_log_odds(hypothesis: Hypothesis, positions: SentPositions) ->
         log_odds += (
             LARGE_ROTATION_LOG_PRIOR_ODDS if is_large_rotation else SMALL_ROTATION_LOG_PRIOR_ODDS
         )
-    if positions.barometer_times_and_heights is not None:
+    if positions.barometer is not None:
         log_odds += _compute_height_log_likelihood_ratio(
-            hypothesis, positions, *positions.barometer_times_and_heights
+            hypothesis, positions, positions.barometer["down_m"]
         )
     return log_odds
 
 
 def _compute_height_log_likelihood_ratio(
-    hypothesis: Hypothesis, positions: SentPositions, time_s: Array, barometer_height_m: Array
+    hypothesis: Hypothesis, positions: SentPositions, barometer_down_m: "pd.Series[float]"
 ) -> float:
     """Return the log likelihood ratio of barometer heights to a constant height."""
-    height_m = np.interp(positions.time_s - hypothesis.delay_s, time_s, barometer_height_m)
+    height_m = -np.interp(
+        positions.time_s - hypothesis.delay_s, barometer_down_m.index, barometer_down_m
+    )
     down_m = (
         METRES_PER_UNIT[hypothesis.unit]
         * hypothesis.axis_permutation.vertical_sign

@@ -9,6 +9,7 @@ Subtraction of the running mean removes constant acceleration errors (tilt, bias
 """
 
 from dataclasses import dataclass, replace
+from functools import cached_property
 from itertools import pairwise
 
 import numpy as np
@@ -130,14 +131,16 @@ class ImuSecondDifferences:
     is_valid : ndarray of bool, shape (n,)
     table : ndarray, shape (n, 3, 4)
         Second difference, and its derivatives with respect to the accelerometer bias (FRD, m/s²).
-    second_difference_derivative_m_s : ndarray, shape (n, 3)
-        Time derivative of the second difference.
     """
 
     time_s: Array
     is_valid: BoolArray
     table: Array
-    second_difference_derivative_m_s: Array
+
+    @cached_property
+    def second_difference_derivative_m_s(self) -> Array:
+        """Time derivative of the second difference, shape (n, 3)."""
+        return np.gradient(self.table[..., 0], GRID_INTERVAL_S, axis=0)
 
 
 def integrate_inertial_data(flight: Flight) -> InertialData | None:
@@ -277,13 +280,7 @@ def integrate_imu_motion(inertial_data: InertialData, attitude: Array) -> ImuSec
         is_valid &= (time_s < end - SECOND_DIFFERENCE_WINDOW_S) | (
             time_s > start + SECOND_DIFFERENCE_WINDOW_S
         )
-    high_pass_filtered = high_pass(second_differences, is_valid)
-    return ImuSecondDifferences(
-        time_s,
-        is_valid,
-        high_pass_filtered,
-        np.gradient(high_pass_filtered[..., 0], GRID_INTERVAL_S, axis=0),
-    )
+    return ImuSecondDifferences(time_s, is_valid, high_pass(second_differences, is_valid))
 
 
 def filter_imu_motion(
@@ -294,10 +291,7 @@ def filter_imu_motion(
     table = imu_motion.table.copy()
     for row in range(1, len(table)):
         table[row] += previous_output_weight * (table[row - 1] - table[row])
-    second_difference_derivative_m_s = np.gradient(table[..., 0], GRID_INTERVAL_S, axis=0)
-    return replace(
-        imu_motion, table=table, second_difference_derivative_m_s=second_difference_derivative_m_s
-    )
+    return replace(imu_motion, table=table)
 
 
 def replace_heading(attitude: Array, heading_rad: Array) -> Array:

@@ -668,9 +668,8 @@ def make_design_matrix(
         )
     dp, dv = np.transpose(increments, (1, 2, 0))
     measured_m = np.zeros_like(dp)
-    # Positions are relative to the first measurement, which is KF's initial position
     measured_m[:, : INPUTS_PER_AXIS * len(axes) : INPUTS_PER_AXIS] = np.transpose(
-        [motion.measurement_m - motion.initial_state.position_m for motion in preintegrated_motions]
+        [motion.measurement_m for motion in preintegrated_motions]
     )
     preintegrated_inputs = replace(
         preintegrated_motions[0],
@@ -682,7 +681,6 @@ def make_design_matrix(
             [motion.process_noise_independent_of_sigma_a for motion in preintegrated_motions],
             axis=0,
         ),
-        initial_state=replace(preintegrated_motions[0].initial_state, position_m=0.0),
     )
     prior_sigma = np.full(
         CONSTANT_ERROR_COLUMN_COUNT + len(axes) * (slow_error_intervals + 1),

@@ -21,7 +21,7 @@ import pandas as pd
 from px4fuse.core.arrays import Array
 from px4fuse.core.record import one_line_repr
 from px4fuse.filter import model
-from px4fuse.filter.settings import InitialState, Settings
+from px4fuse.filter.settings import Settings
 from px4fuse.filter.signals import Axis
 from px4fuse.filter.steps import PredictionSteps, make_prediction_steps
 
@@ -64,15 +64,11 @@ class KfRun:
     __repr__ = one_line_repr
 
 
-def run_kf(
-    axis: Axis, settings: Settings, initial: InitialState | None = None, *, fast: bool = False
-) -> KfRun:
-    """Run KF along one axis.
+def run_kf(axis: Axis, settings: Settings, *, fast: bool = False) -> KfRun:
+    """Run KF along one axis. The initial position is the first measurement, the velocity is zero.
 
     Parameters
     ----------
-    initial : InitialState, optional
-        Default: the first measurement, with velocity zero.
     fast : bool
         True to compute with Python floats, for many re-runs (faster, equal results). By default,
         KF is computed with filterpy, as in the lesson.
@@ -82,17 +78,15 @@ def run_kf(
     SettingsError
         ``settings.input`` is "imu" and the axis has no acceleration.
     """
-    prediction_steps = make_prediction_steps(axis, settings, initial)
-    # By default, the first measurement is the initial state
-    initial_state = initial or InitialState(prediction_steps.time_s[0], axis.measurement_m[0])
+    prediction_steps = make_prediction_steps(axis, settings)
     run_filter = _run_with_floats if fast else _run_with_filterpy
+    position_m = axis.measurement_m.tolist()
     measurements_m = [
-        axis.measurement_m[index] if index >= 0 else None
-        for index in prediction_steps.measurement_index[1:]  # 0 is the initial state
+        position_m[index] if index >= 0 else None
+        for index in prediction_steps.measurement_index[1:].tolist()  # 0 is the initial state
     ]
-    position_m, velocity_m_s = initial_state.position_m, initial_state.velocity_m_s
-    first_row = (position_m, velocity_m_s, *model.INITIAL_COVARIANCE, *NO_UPDATE)
-    rows = run_filter(settings, initial_state, prediction_steps, measurements_m)
+    first_row = (position_m[0], 0.0, *model.INITIAL_COVARIANCE, *NO_UPDATE)
+    rows = run_filter(settings, position_m[0], prediction_steps, measurements_m)
     time_s, column_count = prediction_steps.time_s, len(STATE_TABLE_COLUMNS + UPDATE_TABLE_COLUMNS)
     # pandas needs twice the time for a list of tuples
     values = np.fromiter(
@@ -115,7 +109,7 @@ def run_kf(
 
 def _run_with_filterpy(
     settings: Settings,
-    initial_state: InitialState,
+    initial_position_m: float,
     prediction_steps: PredictionSteps,
     measurements_m: Sequence[float | None],
 ) -> Iterator[tuple[float, ...]]:
@@ -127,7 +121,7 @@ def _run_with_filterpy(
     from px4fuse.filter.filterpy_import import KalmanFilter  # noqa: PLC0415 - takes 0.1 s
 
     kalman = KalmanFilter(dim_x=2, dim_z=1, dim_u=1)
-    kalman.x = np.array([[initial_state.position_m], [initial_state.velocity_m_s]])
+    kalman.x = np.array([[initial_position_m], [0.0]])
     kalman.P = model.make_symmetric_matrix(model.INITIAL_COVARIANCE)
     kalman.H = np.array([[1.0, 0.0]])
     kalman.R = np.array([[settings.sigma_z_m**2]])
@@ -164,16 +158,12 @@ def _run_with_filterpy(
 
 def _run_with_floats(
     settings: Settings,
-    initial_state: InitialState,
+    initial_position_m: float,
     prediction_steps: PredictionSteps,
     measurements_m: Sequence[float | None],
 ) -> Iterator[tuple[float, ...]]:
     """Run KF with Python floats. Arguments and results are those of _run_with_filterpy."""
-    position, velocity, covariance = (
-        initial_state.position_m,
-        initial_state.velocity_m_s,
-        model.INITIAL_COVARIANCE,
-    )
+    position, velocity, covariance = initial_position_m, 0.0, model.INITIAL_COVARIANCE
     arrays = (
         np.diff(prediction_steps.time_s),
         prediction_steps.acceleration_m_s2,
