@@ -26,7 +26,7 @@ ODOMETRY_CORNERS_M = ((0.0, 0.0), (20.3, 0.2), (20.6, 20.4), (0.8, 20.9), (1.2, 
 def run_aisle_example() -> KfRun:
     """Run KF on Example 1: UWB positions every 0.5 s along an aisle at 1 m/s."""
     settings = Settings(sigma_a_m_s2=0.5, sigma_z_m=0.10, dt_s=0.1, input="zero")
-    time_s = settings.dt_s * np.arange(0, PREDICTION_COUNT + 1, PREDICTIONS_PER_UPDATE)
+    time_s = settings.dt_s * np.arange(0.0, PREDICTION_COUNT + 1, PREDICTIONS_PER_UPDATE)
     axis = Axis(
         name="aisle",
         direction=np.array([1.0, 0.0, 0.0]),

@@ -269,7 +269,7 @@ def interpolate_sigma(time_s: Array, variance: TableOrUnavailable, column: str) 
     if known_variance.empty:
         return np.full(len(time_s), np.nan)
     variance_at_times = np.interp(time_s, known_variance.index, known_variance, np.nan, np.nan)
-    return np.asarray(np.sqrt(np.where(variance_at_times > 0.0, variance_at_times, np.nan)))
+    return np.sqrt(np.where(variance_at_times > 0.0, variance_at_times, np.nan))
 
 
 def _compute_mean_nees(normalised_errors: Array) -> float | None:

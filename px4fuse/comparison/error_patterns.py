@@ -16,6 +16,7 @@ from px4fuse.core.arrays import (
     Array,
     compute_median_interval_s,
     integrate_cumulatively,
+    interpolate_columns,
     rank_correlation,
 )
 from px4fuse.flight.model import Columns, Ekf2, Unavailable, rows_between
@@ -498,7 +499,7 @@ def find_attitude_delay(imu: pd.DataFrame, attitude: pd.DataFrame) -> float | No
     gyro_time_s = time_s[0] + ROTATION_INTERVAL_S * np.arange(
         -max_delay_rows, len(time_s) + max_delay_rows
     )
-    angle_rad = np.stack([np.interp(gyro_time_s, imu_time_s, column) for column in angle_rad.T], 1)
+    angle_rad = interpolate_columns(gyro_time_s, imu_time_s, angle_rad)
     gyro_rotation_rad = angle_rad[samples_per_rotation:] - angle_rad[:-samples_per_rotation]
 
     def compute_mean_square_rad2(delay_rows: int) -> float:

@@ -207,7 +207,7 @@ def _subtract_lever_arm(track: PositionTrack, flight: Flight) -> PositionTrack:
         attitude.index.to_numpy(),
         attitude[Columns.QUATERNION].to_numpy(),
     )
-    lever_arm_ned_m = to_matrix(quaternions) @ np.asarray(track.lever_arm_m)
+    lever_arm_ned_m = to_matrix(quaternions) @ track.lever_arm_m
     samples = track.samples.copy()
     samples[Columns.POSITION] -= lever_arm_ned_m
     forward_m, right_m, down_m = track.lever_arm_m

@@ -322,7 +322,7 @@ def _summarise_run(
 
 
 def _rotate_direction(direction: Array, rotation_deg: float) -> Array:
-    return np.asarray(Rotation.from_euler("z", -rotation_deg, degrees=True).apply(direction))
+    return Rotation.from_euler("z", -rotation_deg, degrees=True).apply(direction)
 
 
 def _rerun_kf(

@@ -315,7 +315,7 @@ def _find_jumps(
 
 
 def _is_in_window(time_s: Array, start_s: float, duration_s: float) -> BoolArray:
-    return np.asarray((time_s >= start_s) & (time_s < start_s + duration_s))
+    return (time_s >= start_s) & (time_s < start_s + duration_s)
 
 
 def _find_significant_jump_times(

@@ -95,7 +95,7 @@ class Acceleration:
 
     def compute_velocity_change_m_s(self, direction: Array) -> Array:
         """Return the velocity change (m/s) along a unit vector since the first sample."""
-        return np.asarray(direction @ self.acceleration_integral_m_s)
+        return direction @ self.acceleration_integral_m_s
 
     def compute_rms_m_s2(self, direction: Array) -> float:
         """Return the RMS acceleration (m/s²) along a unit vector in the segment."""
