@@ -192,7 +192,7 @@ def _find_kf_noise_changes(
     for name, noise in ((SIGMA_A, axis_tuning.sigma_a_two_state), (SIGMA_Z, axis_tuning.sigma_z)):
         setting = getattr(settings, name)
         if is_underconfident:
-            estimate = noise.value or noise.high or 0.0
+            estimate = noise.value_or_bound(0.0)
             is_significant = noise.high is not None and setting > noise.high
         else:
             estimate = noise.value or 0.0

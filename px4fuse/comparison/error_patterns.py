@@ -19,8 +19,9 @@ from px4fuse.core.arrays import (
     interpolate_columns,
     rank_correlation,
 )
+from px4fuse.filter.signals import interpolate_attitude
 from px4fuse.flight.model import Columns, Ekf2, Unavailable, rows_between
-from px4fuse.trajectory.rotation import conjugate, interpolate, multiply, to_rotation_vector
+from px4fuse.trajectory.rotation import conjugate, multiply, to_rotation_vector
 from px4fuse.trajectory.scores import compute_autocorrelation_time
 
 MIN_POSITIONS = 100
@@ -488,7 +489,7 @@ def find_attitude_delay(imu: pd.DataFrame, attitude: pd.DataFrame) -> float | No
         imu, time_s[0] - 2.0 * MAX_ATTITUDE_DELAY_S, time_s[-1] + 2.0 * MAX_ATTITUDE_DELAY_S
     )
     imu_time_s = imu.index.to_numpy()
-    quaternions = interpolate(time_s, attitude_time_s, attitude[Columns.QUATERNION].to_numpy())
+    quaternions = interpolate_attitude(attitude, time_s)
     rotation_rad = to_rotation_vector(
         multiply(conjugate(quaternions[:-samples_per_rotation]), quaternions[samples_per_rotation:])
     )

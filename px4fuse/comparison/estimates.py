@@ -39,7 +39,7 @@ from px4fuse.filter.time_offset import (
     SourceTimeOffset,
     estimate_time_offset,
 )
-from px4fuse.filter.tuning import HORIZONTAL, AxisTuning, NoiseEstimate, tune
+from px4fuse.filter.tuning import HORIZONTAL, AxisTuning, tune
 from px4fuse.flight.model import DIAGNOSIS_WITHHELD, Flight, Unavailable, reset_times_s
 
 # Minimum IMU rate (Hz) to estimate a time offset
@@ -106,11 +106,6 @@ def find_first_tuning(tuning: TuningByAxis, *axis_names: str) -> AxisTuning | No
     return next(
         (axis_tuning for axis_tuning in axis_tunings if isinstance(axis_tuning, AxisTuning)), None
     )
-
-
-def value_or_bound(noise: NoiseEstimate, fallback: float) -> float:
-    """Return the estimate of a noise, else its upper bound, else ``fallback``."""
-    return noise.value or noise.high or fallback
 
 
 def estimate(comparison: Comparison, progress: Progress = ignore_progress) -> Estimates:
@@ -223,7 +218,7 @@ def estimate_frame_rotation(
     """Estimate the yaw misalignment of the position frame."""
     sigma_z_m = comparison.settings.sigma_z_m
     if axis_tuning := find_first_tuning(tuning, HORIZONTAL):
-        sigma_z_m = value_or_bound(axis_tuning.sigma_z, sigma_z_m)
+        sigma_z_m = axis_tuning.sigma_z.value_or_bound(sigma_z_m)
     offset_s = 0.0
     if isinstance(time_offset, SourceTimeOffset) and time_offset.is_determinable:
         offset_s = time_offset.remaining_s
@@ -264,8 +259,8 @@ def _fit_source_errors(
         flight,
         axes,
         settings,
-        sigma_a_m_s2=value_or_bound(axis_tuning.sigma_a_two_state, settings.sigma_a_m_s2),
-        sigma_z_m=value_or_bound(axis_tuning.sigma_z, settings.sigma_z_m),
+        sigma_a_m_s2=axis_tuning.sigma_a_two_state.value_or_bound(settings.sigma_a_m_s2),
+        sigma_z_m=axis_tuning.sigma_z.value_or_bound(settings.sigma_z_m),
         outlier_time_s=axis_tuning.outlier_time_s,
         clock_offset_s=offset_s,
         source_resets_s=reset_times_s(comparison.source).tolist(),

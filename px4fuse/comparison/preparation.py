@@ -21,6 +21,7 @@ from px4fuse.filter.signals import (
     Axis,
     Segment,
     cut_to_segment,
+    interpolate_attitude,
     make_axes,
 )
 from px4fuse.flight.ekf2_parameters import BAROMETER, GNSS_POS, PARAMETERS
@@ -46,7 +47,7 @@ from px4fuse.readers.px4_innovations import (
 from px4fuse.readers.px4_positions import NO_FIX_ACTION
 from px4fuse.readers.px4_topics import SOURCE_TRACKS
 from px4fuse.request import ComparisonRequest, HeightName
-from px4fuse.trajectory.rotation import interpolate, to_matrix
+from px4fuse.trajectory.rotation import to_matrix
 
 NO_SEPARATE_TRUTH = Unavailable(
     "ground truth",
@@ -202,11 +203,7 @@ def _subtract_lever_arm(track: PositionTrack, flight: Flight) -> PositionTrack:
     attitude = flight.attitude
     if not any(track.lever_arm_m) or isinstance(attitude, Unavailable) or track.frame != "NED":
         return track
-    quaternions = interpolate(
-        track.samples.index.to_numpy(),
-        attitude.index.to_numpy(),
-        attitude[Columns.QUATERNION].to_numpy(),
-    )
+    quaternions = interpolate_attitude(attitude, track.samples.index.to_numpy())
     lever_arm_ned_m = to_matrix(quaternions) @ track.lever_arm_m
     samples = track.samples.copy()
     samples[Columns.POSITION] -= lever_arm_ned_m
@@ -302,12 +299,11 @@ def explain_missing_source(flight: Flight) -> Unavailable:
     for item in flight.missing:
         if item.reason == HEIGHT_ONLY_REASON:
             reason = f"{item.source}: {HEIGHT_ONLY_REASON}"
-    if flight.log.damage:
-        reason = f"the file is damaged, and {reason}"
-    for item in flight.missing:
-        if item.remedy == NO_FIX_ACTION:
+        elif item.remedy == NO_FIX_ACTION:
             reason += f"; {item.source}: {item.reason}"
             remedy = f"{NO_FIX_ACTION} Or {remedy}"
+    if flight.log.damage:
+        reason = f"the file is damaged, and {reason}"
     if flight.log.autopilot != "PX4":
         reason += f"; the autopilot is {flight.log.autopilot}, so there is no EKF2"
     return Unavailable("position source", reason, capitalise_first(remedy))
@@ -389,9 +385,7 @@ def choose_segment(
         chosen_end_s = chosen_end_s if end_s is None else end_s
         reason = f"chosen with {' and '.join(given_options)}"
         clipped_span_s = max(chosen_start_s, 0.0), min(chosen_end_s, log.duration_s)
-        if (chosen_start_s, chosen_end_s) != clipped_span_s and clipped_span_s[0] < clipped_span_s[
-            1
-        ]:
+        if (chosen_start_s, chosen_end_s) != clipped_span_s:
             chosen_start_s, chosen_end_s = clipped_span_s
             reason += "; the log covers only part of the chosen time"
     segment = Segment(

@@ -24,7 +24,7 @@ from px4fuse.core.arrays import (
     interpolate_columns,
 )
 from px4fuse.ekf2.replay import is_inside_spans
-from px4fuse.filter.signals import find_imu_gaps
+from px4fuse.filter.signals import find_imu_gaps, interpolate_attitude
 from px4fuse.flight.model import Columns, Flight, Unavailable
 from px4fuse.trajectory.association import choose_gap_limit_s, is_bracketed
 from px4fuse.trajectory.rotation import (
@@ -32,7 +32,6 @@ from px4fuse.trajectory.rotation import (
     cumulative_product,
     from_rotation_vector,
     heading,
-    interpolate,
     multiply,
     rotate,
     to_matrix,
@@ -162,7 +161,7 @@ def integrate_inertial_data(flight: Flight) -> InertialData | None:
         [np.interp(time_s, imu_times_s, integral) for integral in imu_integrals]
     ).T
     specific_force_m_s2 = imu_increments[:, :3] / INTEGRATION_STEP_S
-    logged_attitude = interpolate(time_s, attitude_times_s, attitude[Columns.QUATERNION].to_numpy())
+    logged_attitude = interpolate_attitude(attitude, time_s)
     gyro_attitude = _level_attitude(
         _integrate_gyros(imu_increments[:, 3:], logged_attitude), specific_force_m_s2
     )

@@ -160,6 +160,12 @@ def imu_and_attitude(flight: Flight) -> tuple[pd.DataFrame, pd.DataFrame] | Unav
     return imu, attitude
 
 
+def interpolate_attitude(attitude: pd.DataFrame, time_s: Array) -> Array:
+    """Return the attitude quaternions (w, x, y, z) at other times (s)."""
+    quaternions = attitude[Columns.QUATERNION].to_numpy()
+    return interpolate(time_s, attitude.index.to_numpy(), quaternions)
+
+
 def compute_ned_acceleration(flight: Flight) -> pd.DataFrame | Unavailable:
     """Return the acceleration in NED without gravity (m/s²) for each IMU sample.
 
@@ -168,11 +174,7 @@ def compute_ned_acceleration(flight: Flight) -> pd.DataFrame | Unavailable:
     if isinstance(imu_with_attitude := imu_and_attitude(flight), Unavailable):
         return imu_with_attitude
     imu, attitude = imu_with_attitude
-    attitude_of_samples = interpolate(
-        imu.index.to_numpy(),
-        attitude.index.to_numpy(),
-        attitude[Columns.QUATERNION].to_numpy(),
-    )
+    attitude_of_samples = interpolate_attitude(attitude, imu.index.to_numpy())
     specific_force_m_s2 = imu[Columns.SPECIFIC_FORCE].to_numpy()
     acceleration = np.empty(specific_force_m_s2.shape)
     for rows in iterate_row_blocks(len(imu)):
@@ -315,14 +317,12 @@ def _choose_axis_direction(
     if name != AISLE:
         axis_index = AXIS_NAMES.index(name)
         return np.eye(3)[axis_index], (None if name == "down" else 90.0 * axis_index), ""
+    note = "heading chosen with --heading"
     if heading_deg is None:
-        axis_heading_deg, elongation = estimate_aisle_heading(track, segment)
+        heading_deg, elongation = estimate_aisle_heading(track, segment)
         note = f"main direction of the track (ratio of length to width: {elongation:.1f})"
-    else:
-        axis_heading_deg = heading_deg
-        note = "heading chosen with --heading"
-    angle_rad = np.radians(axis_heading_deg)
-    return np.array([np.cos(angle_rad), np.sin(angle_rad), 0.0]), axis_heading_deg, note
+    angle_rad = np.radians(heading_deg)
+    return np.array([np.cos(angle_rad), np.sin(angle_rad), 0.0]), heading_deg, note
 
 
 def integrate_ned_acceleration(
