@@ -50,7 +50,7 @@ def tune_perpendicular_axes(comparison: Comparison) -> tuple[AxisTuning, ...]:
     return tuple(
         axis_tuning
         for axis in axes
-        for axis_tuning in tune((axis,), comparison.settings, (axis.name,)).values()
+        for axis_tuning in tune((axis,), comparison.settings).values()
         if isinstance(axis_tuning, AxisTuning)
     )
 

@@ -18,7 +18,6 @@ from px4fuse.filter.settings import SETTING_RANGES, Settings, requested_settings
 from px4fuse.filter.signals import (
     AISLE,
     MIN_MEASUREMENTS,
-    Axis,
     Segment,
     cut_to_segment,
     interpolate_attitude,
@@ -97,7 +96,13 @@ def prepare_comparison_inputs(
     if isinstance(flight.truth, Truth) and flight.truth.name == source.name:
         flight = replace(flight, truth=NO_SEPARATE_TRUTH)
     if is_gnss and request.sigma_z_m is None:
-        settings = _use_gnss_noise_of_ekf2(settings, flight, source, axes[0], segment)
+        # SIGMA_Z is √R of EKF2's GNSS fusion
+        default_noise_m = PARAMETERS[GNSS_POS.noise].default
+        sigma_z_m = (
+            find_observation_variance(flight, source, axes[0], segment, default_noise_m) ** 0.5
+        )
+        if sigma_z_m >= SETTING_RANGES["sigma_z_m"].low:
+            settings = replace(settings, sigma_z_m=float(f"{sigma_z_m:.3g}"))
     notes, missing_data = (*flight.log.notes, *source.notes), flight.missing
     acceleration = axes[0].acceleration
     if settings.input == "imu" and isinstance(acceleration, Unavailable):
@@ -132,17 +137,6 @@ def _correct_convention(
     clock_offset_s = min(max(clock_offset_s - faults.late_s, offset_range.low), offset_range.high)
     settings = replace(settings, clock_offset_s=clock_offset_s)
     return *convert_to_px4_convention(flight, source, convention, faults), settings, convention
-
-
-def _use_gnss_noise_of_ekf2(
-    settings: Settings, flight: Flight, source: PositionTrack, axis: Axis, segment: Segment
-) -> Settings:
-    """Set SIGMA_Z to √R of EKF2's GNSS fusion."""
-    default_noise_m = PARAMETERS[GNSS_POS.noise].default
-    variance_m2 = find_observation_variance(flight, source, axis, segment, default_noise_m)
-    if (sigma_z_m := variance_m2**0.5) >= SETTING_RANGES["sigma_z_m"].low:
-        settings = replace(settings, sigma_z_m=float(f"{sigma_z_m:.3g}"))
-    return settings
 
 
 def select_source_innovations(flight: Flight, track: PositionTrack) -> Flight:
