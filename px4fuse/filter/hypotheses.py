@@ -713,4 +713,4 @@ def _integrate_unit_errors(attitude: pd.DataFrame, acceleration: Acceleration) -
 
 def make_unit_steps(time_s: Array, starts_s: Iterable[float]) -> Array:
     """Return steps from 0 to 1 at the times ``starts_s``, shape (times, steps)."""
-    return np.asarray(time_s[:, None] >= np.fromiter(starts_s, float)[None, :], dtype=np.float64)
+    return (time_s[:, None] >= [*starts_s]).astype(np.float64)

@@ -4,8 +4,6 @@ The acceleration is first integrated between measurements, which is faster. If a
 1e-3, the innovations equal those of :mod:`px4fuse.filter.kalman` to 1e-9.
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from dataclasses import dataclass
 from functools import cache
