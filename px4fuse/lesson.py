@@ -8,7 +8,7 @@ from collections.abc import Iterator
 import numpy as np
 
 from px4fuse.filter.kalman import KfRun, run_kf
-from px4fuse.filter.settings import InitialState, Settings
+from px4fuse.filter.settings import Settings
 from px4fuse.filter.signals import Axis
 from px4fuse.flight.model import Unavailable
 from px4fuse.loop.closure import distribute_by_distance
@@ -26,23 +26,22 @@ ODOMETRY_CORNERS_M = ((0.0, 0.0), (20.3, 0.2), (20.6, 20.4), (0.8, 20.9), (1.2, 
 def run_aisle_example() -> KfRun:
     """Run KF on Example 1: UWB positions every 0.5 s along an aisle at 1 m/s."""
     settings = Settings(sigma_a_m_s2=0.5, sigma_z_m=0.10, dt_s=0.1, input="zero")
-    time_s = settings.dt_s * np.arange(
-        PREDICTIONS_PER_UPDATE, PREDICTION_COUNT + 1, PREDICTIONS_PER_UPDATE, dtype=np.float64
-    )
+    time_s = settings.dt_s * np.arange(0.0, PREDICTION_COUNT + 1, PREDICTIONS_PER_UPDATE)
     axis = Axis(
         name="aisle",
         direction=np.array([1.0, 0.0, 0.0]),
         heading_deg=0.0,
         note="aisle of Example 1 in the course UAT 366",
         measurement_time_s=time_s,
-        measurement_m=TRUE_VELOCITY_M_S * time_s + np.array(UWB_ERRORS_M),
+        # The initial position is known
+        measurement_m=TRUE_VELOCITY_M_S * time_s + np.array([0.0, *UWB_ERRORS_M]),
         acceleration=Unavailable(
             "acceleration",
             "Example 1 of the course UAT 366 contains no acceleration",
             "No action is needed.",
         ),
     )
-    return run_kf(axis, settings, InitialState(time_s=0.0, position_m=0.0))
+    return run_kf(axis, settings)
 
 
 def format_kalman_lines() -> Iterator[str]:

@@ -161,7 +161,7 @@ def score_grid(
     q, r = np.broadcast_arrays(np.square(sigma_a_m_s2), np.square(sigma_z_m))
     total = np.zeros(q.shape)
     for axis in intervals:
-        p, v = axis.initial_state.position_m, axis.initial_state.velocity_m_s + 0.0 * q
+        p, v = 0.0 * q, 0.0 * q
         covariance = INITIAL_COVARIANCE
         for k, z in enumerate(axis.measurement_m):
             p = p + axis.interval_s[k] * v + axis.delta_position_m[k]

@@ -15,8 +15,9 @@ from numpy.typing import ArrayLike, NDArray
 from scipy.spatial.transform import Rotation
 
 from px4fuse.analysis import Analysis
-from px4fuse.comparison.estimates import Estimates, TuningByAxis, find_oscillation
+from px4fuse.comparison.estimates import Estimates, TuningByAxis
 from px4fuse.comparison.flight_events import collect_events
+from px4fuse.comparison.imu_oscillation import find_imu_oscillation
 from px4fuse.comparison.model import Comparison
 from px4fuse.comparison.noise_differences import (
     find_noisy_flight_part,
@@ -25,7 +26,7 @@ from px4fuse.comparison.noise_differences import (
 from px4fuse.comparison.reruns import rerun_filters
 from px4fuse.core.arrays import Array
 from px4fuse.ekf2.aids import evaluate_aids
-from px4fuse.filter.signals import Axis, Segment, project_acceleration
+from px4fuse.filter.signals import Axis, Segment, integrate_ned_acceleration
 from px4fuse.filter.tuning import HORIZONTAL, tune
 from px4fuse.flight.model import (
     AS_RECEIVED_ORIGIN,
@@ -307,13 +308,12 @@ def line(
     if acceleration is None:
         signal = unavailable("acceleration")
     else:
-        signal = project_acceleration(
+        signal = integrate_ned_acceleration(
             table(
                 np.asarray(acceleration[0], dtype=float),
                 np.outer(acceleration[1], north),
                 list(AXIS_NAMES),
             ),
-            north,
             Segment(-np.inf, np.inf, "whole flight"),
         )
     return Axis("north", north, 0.0, "", time, np.asarray(measurement_m, dtype=float), signal)
@@ -352,7 +352,7 @@ def unexplained(comparison: Comparison, tuning: TuningByAxis | None = None) -> A
         source_low_pass=missing, time_correlated_noise=missing,
         axis_tunings=tune_perpendicular_axes(comparison),
         noisy_part=find_noisy_flight_part(comparison, (tuning or {}).get(HORIZONTAL)),
-        imu_oscillation=find_oscillation(comparison),
+        imu_oscillation=find_imu_oscillation(comparison),
     )  # fmt: skip
     trials = rerun_filters(comparison, estimates, missing)
     return Analysis(

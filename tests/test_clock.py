@@ -32,9 +32,9 @@ from px4fuse.comparison import estimates
 from px4fuse.comparison.estimates import (
     MIN_ESTIMATES_BEFORE_AND_AFTER_CHANGE,
     estimate_noises_and_time_offset,
-    find_oscillation,
     widen_for_scatter,
 )
+from px4fuse.comparison.imu_oscillation import find_imu_oscillation
 from px4fuse.comparison.reruns import rerun_kf_with_time_offset
 from px4fuse.core.arrays import Array
 from px4fuse.diagnose import diagnose, prepare_comparison
@@ -455,7 +455,7 @@ def test_imu_oscillation_is_no_change_of_time_offset(monkeypatch) -> None:
     flight = oscillating(simulate_flight(scenario, parse_faults([])))
     prepared = prepare_comparison(flight, ComparisonRequest(log=flight.log.name))
     assert not estimate_noises_and_time_offset(prepared)[1].has_changed()
-    found = find_oscillation(prepared)
+    found = find_imu_oscillation(prepared)
     assert found is not None
     assert found.frequency_hz == pytest.approx(0.4, rel=0.02)
     assert found.amplitude_m_s2 == pytest.approx(1.0, rel=0.2)
@@ -467,7 +467,7 @@ def test_imu_oscillation_is_no_change_of_time_offset(monkeypatch) -> None:
 def test_flight_without_imu_oscillation_has_none(mistake: str) -> None:
     flight = simulate_flight(Scenario(seed=4, ekf2=False), parse_faults([mistake]))
     prepared = prepare_comparison(flight, ComparisonRequest(log=flight.log.name))
-    assert find_oscillation(prepared) is None
+    assert find_imu_oscillation(prepared) is None
 
 
 def test_time_offset_jump_p_value_equals_bonferroni_t_test() -> None:

@@ -20,7 +20,7 @@ from px4fuse.comparison.model import Comparison
 from px4fuse.comparison.preparation import shift_timestamps
 from px4fuse.explore.data import OFFSET_SLIDER_HALF_RANGE_S, make_kf_inputs, undo_time_offset
 from px4fuse.explore.packing import KF_INPUT_STEPS_PER_UNIT, ArrayEncoder
-from px4fuse.filter.kalman import KfRun, predict_state, run_kf
+from px4fuse.filter.kalman import KfRun, predict_track, run_kf
 from px4fuse.filter.settings import Settings
 from px4fuse.filter.signals import make_axes
 from px4fuse.readers import read_log
@@ -132,7 +132,7 @@ def test_javascript_kf_matches_python_replay(engine: Browser, sample_log: Path, 
         times = np.array(page["between"]["time"])
         # null in JSON means no state
         found = np.array(page["between"]["p"], dtype=float)
-        close(list(found), predict_state(run, times)[0], "p", settings)
+        close(list(found), predict_track(run, times)["position_m"].to_numpy(), "p", settings)
     assert (gaps > 0) == (name == "IMU with a gap")
 
 

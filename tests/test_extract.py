@@ -15,7 +15,7 @@ from flights import Estimator, aisle_flight
 from msgspec import structs
 from ulog_tools import make_log
 
-from px4fuse.filter.kalman import predict_state
+from px4fuse.filter.kalman import predict_track
 from px4fuse.filter.settings import Settings
 from px4fuse.filter.signals import compute_ned_acceleration
 from px4fuse.flight.model import ClockMap, Dropout, Flight, InputFile, Reset
@@ -253,7 +253,7 @@ def test_kf_example_in_python_guide_equals_kf_of_compare(
     north = compare(sample_flight, Settings(), axes=("north",), start_s=0.0)["north"]
     # both filters have settled, and the vehicle is airborne
     inside = (time > 5.0) & (time < 125.0)
-    kf_state = predict_state(north.kf_run, time[inside])
+    kf_state = predict_track(north.kf_run, time[inside]).to_numpy().T
     step_m = np.abs(kf_state[1]).max() * 0.1  # m; motion within the 0.1 s of rounding
     assert np.abs(position[inside] - kf_state[0]).max() < 2.0 * step_m
     assert np.sqrt(np.mean((velocity[inside] - kf_state[1]) ** 2)) < 0.1

@@ -81,13 +81,12 @@ def test_innovations_after_position_step_equal_kf_replay() -> None:
     step = np.where(north.measurement_time_s >= 12.0, 0.7, 0.0)
     intervals = preintegrate(north, RIGHT)
     none = np.zeros(len(intervals.measurement_m), dtype=bool)
-    measured = intervals.measurement_m - intervals.initial_state.position_m
+    measured = intervals.measurement_m
     both = replace(
         intervals,
         delta_position_m=np.outer(intervals.delta_position_m, [1.0, 1.0]),
         delta_velocity_m_s=np.outer(intervals.delta_velocity_m_s, [1.0, 1.0]),
         measurement_m=np.stack([measured, measured + step[1:]], 1),
-        initial_state=replace(intervals.initial_state, position_m=0.0),
     )
     nu, s = innovations(both, RIGHT.sigma_a_m_s2, RIGHT.sigma_z_m, none)
     for column, added in zip(nu.T, (0.0, step), strict=True):
@@ -299,7 +298,9 @@ def test_mean_acceleration_error_of_noise_free_axis_is_exact(error_m_s2) -> None
         measurement_m=np.interp(
             down.measurement_time_s,
             time_s,
-            integrate_cumulatively(acceleration.compute_velocity_change_m_s(), time_s),
+            integrate_cumulatively(
+                acceleration.compute_velocity_change_m_s(down.direction), time_s
+            ),
         ),
         acceleration=replace(acceleration, acceleration_integral_m_s=biased),
     )

@@ -16,9 +16,9 @@ from hypothesis import strategies as st
 
 from px4fuse.errors import SettingsError
 from px4fuse.filter import model
-from px4fuse.filter.kalman import UPDATE_TABLE_COLUMNS, predict_state, predict_variance, run_kf
+from px4fuse.filter.kalman import UPDATE_TABLE_COLUMNS, predict_track, run_kf
 from px4fuse.filter.model import COVARIANCE_COLUMNS, STATE_COLUMNS
-from px4fuse.filter.settings import InitialState, Settings
+from px4fuse.filter.settings import Settings
 from px4fuse.filter.signals import Axis
 
 SAME_TIME_S = 5e-7
@@ -46,7 +46,10 @@ def plain_replay(axis: Axis, chosen: Settings) -> tuple[list[list[float]], list[
     z_at = dict(zip(measured, axis.measurement_m.tolist(), strict=True))
     steps = steps_of(measured, chosen.dt_s)
     if chosen.input == "imu":
-        imu = axis.acceleration.time_s, axis.acceleration.compute_velocity_change_m_s()
+        imu = (
+            axis.acceleration.time_s,
+            axis.acceleration.compute_velocity_change_m_s(axis.direction),
+        )
     q, r = chosen.sigma_a_m_s2**2 * chosen.dt_s, chosen.sigma_z_m**2
     x = [z_at[measured[0]], 0.0]
     P = [[0.5**2, 0.0], [0.0, 1.0**2]]
@@ -107,24 +110,21 @@ def test_kf_replay_starts_at_first_measurement(axis: Axis) -> None:
     assert run.steps.index[0] == axis.measurement_time_s[0]
     assert run.steps[STATE].iloc[0].tolist() == [axis.measurement_m[0], 0.0, 0.25, 0.0, 1.0]
     assert run.updates.index.tolist() == axis.measurement_time_s[1:].tolist()
-    run = run_kf(axis, Settings(), InitialState(1.9, -1.0, 0.5))
-    assert run.steps[STATE].iloc[0].tolist() == [-1.0, 0.5, 0.25, 0.0, 1.0]
-    assert run.steps.index[0] == 1.9
-    assert run.updates.index.tolist() == axis.measurement_time_s.tolist()
 
 
 def test_kf_state_between_steps_is_predicted_from_previous_step(axis: Axis) -> None:
     """At a step the state is that of the step, between two predicted, outside NaN."""
     run = run_kf(axis, Settings())
     edges = run.steps.index.to_numpy()
-    np.testing.assert_array_equal(np.transpose(predict_state(run, edges)), run.steps[STATE[:2]])
+    np.testing.assert_array_equal(predict_track(run, edges), run.steps[STATE])
     step = run.steps.iloc[30]
-    position, velocity = predict_state(run, edges[[30]] + 0.01)
+    track = predict_track(run, edges[[30]] + 0.01)
     expected = step["position_m"] + 0.01 * step["velocity_m_s"] + 0.5 * 0.01**2 * 0.3
-    assert position[0] == pytest.approx(expected, abs=1e-12)
-    assert velocity[0] == pytest.approx(step["velocity_m_s"] + 0.01 * 0.3, abs=1e-12)
+    assert track["position_m"].item() == pytest.approx(expected, abs=1e-12)
+    expected = step["velocity_m_s"] + 0.01 * 0.3
+    assert track["velocity_m_s"].item() == pytest.approx(expected, abs=1e-12)
     around = np.array([edges[0] - 0.01, edges[0], edges[-1], edges[-1] + 0.01])
-    for part in (*predict_state(run, around), *predict_variance(run, around)):
+    for _, part in predict_track(run, around).items():
         assert np.isnan(part).tolist() == [True, False, False, True]
 
 
@@ -140,7 +140,7 @@ def test_kf_variance_between_steps_is_predicted_from_previous(dt: float, gap: bo
     edges = run.steps.index.to_numpy()
     for share in (0.0, 0.3, 0.9):
         times = edges[:-1] + share * np.diff(edges)
-        position, velocity = predict_variance(run, times)
+        track = predict_track(run, times)
         for k, at in enumerate(times):
             step = run.steps.iloc[k]
             ahead = at - edges[k]
@@ -148,8 +148,8 @@ def test_kf_variance_between_steps_is_predicted_from_previous(dt: float, gap: bo
             F = np.array([[1.0, ahead], [0.0, 1.0]])
             q = (0.7**2 + step["imu_gap_variance_m2_s4"]) * dt
             Q = q * np.array([[ahead**3 / 4.0, ahead**2 / 2.0], [ahead**2 / 2.0, ahead]])
-            expected = np.diag(F @ P @ F.T + Q)
-            np.testing.assert_allclose([position[k], velocity[k]], expected, rtol=1e-12)
+            found = model.make_symmetric_matrix(track.iloc[k][COVARIANCE_COLUMNS])
+            np.testing.assert_allclose(found, F @ P @ F.T + Q, rtol=1e-12)
     assert bool((run.steps["imu_gap_variance_m2_s4"] > 0.0).any()) == gap
 
 
@@ -163,9 +163,9 @@ def test_kf_state_does_not_depend_on_later_measurements(axis, chosen, data) -> N
     other = replace(axis, measurement_m=measured)
     times = np.append(np.linspace(axis.measurement_time_s[0], arrival - 1e-9, 50), arrival)
 
-    before, after = (np.array(predict_state(run_kf(one, chosen), times)) for one in (axis, other))
-    np.testing.assert_array_equal(before[:, :-1], after[:, :-1])
-    assert abs(after[0, -1] - before[0, -1]) > 0.0
+    before, after = (predict_track(run_kf(one, chosen), times) for one in (axis, other))
+    np.testing.assert_array_equal(before[:-1], after[:-1])
+    assert abs(after["position_m"].iloc[-1] - before["position_m"].iloc[-1]) > 0.0
 
 
 def test_kf_replay_adds_process_noise_during_imu_gap() -> None:

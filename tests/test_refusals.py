@@ -65,7 +65,7 @@ REFUSED = {
     "noise of NaN": ("compare a.ulg --sigma-z nan", "--sigma-z"),
     "endless offset": ("compare a.ulg --clock-offset inf", "--clock-offset"),
     "heading of NaN": ("compare a.ulg --heading nan", "--heading"),
-    "beyond the flight": ("compare a.ulg --start 500", "no positions between 500 s and"),
+    "beyond the flight": ("compare a.ulg --start 500", "has 0 positions between 500 s and"),
     "end before start": (
         "compare a.ulg --start 50 --end 40",
         "end (40 s) is not after the start (50 s)",

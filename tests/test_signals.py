@@ -21,8 +21,8 @@ from px4fuse.filter.signals import (
     compute_mean_step_acceleration,
     compute_ned_acceleration,
     estimate_aisle_heading,
+    integrate_ned_acceleration,
     make_axes,
-    project_acceleration,
 )
 from px4fuse.flight.model import (
     AS_RECEIVED_ORIGIN,
@@ -116,7 +116,7 @@ def test_ned_acceleration_without_attitude_is_unavailable():
 
 
 def acceleration_of(time, values):
-    return project_acceleration(table(time, np.outer(values, NORTH), AXIS_NAMES), NORTH, ALL)
+    return integrate_ned_acceleration(table(time, np.outer(values, NORTH), AXIS_NAMES), ALL)
 
 
 intervals = st.lists(st.integers(1, 50), min_size=3, max_size=40)
@@ -130,7 +130,7 @@ def test_acceleration_mean_per_step_of_linear_signal_is_exact(gaps_ms, data):
     values = np.array(data.draw(st.lists(st.floats(-20, 20), min_size=count, max_size=count)))
     ends = data.draw(st.sets(st.integers(0, len(time) - 1), min_size=2))
     at = sorted(ends)
-    mean, _ = compute_mean_step_acceleration(acceleration_of(time, values), time[at])
+    mean, _ = compute_mean_step_acceleration(acceleration_of(time, values), NORTH, time[at])
     for step, (first, last) in enumerate(pairwise(at)):
         area = trapezoid(values[first : last + 1], time[first : last + 1])
         assert mean[step] == pytest.approx(area / (time[last] - time[first]), abs=1e-9)
@@ -149,7 +149,8 @@ def test_acceleration_mean_per_step_of_linear_signal_is_exact(gaps_ms, data):
 )  # fmt: skip
 def test_imu_gap_fraction_is_fraction_of_step_without_imu_data(time, edges, gaps):
     """In a gap between equal values the mean is that value; outside the data it is zero."""
-    mean, gap = compute_mean_step_acceleration(acceleration_of(time, np.ones(len(time))), edges)
+    acceleration = acceleration_of(time, np.ones(len(time)))
+    mean, gap = compute_mean_step_acceleration(acceleration, NORTH, edges)
     np.testing.assert_allclose(gap, gaps, atol=1e-9)
     inside = np.clip(np.diff(np.clip(edges, time[0], time[-1])) / np.diff(edges), 0.0, 1.0)
     np.testing.assert_allclose(mean, inside, atol=1e-9)
@@ -158,9 +159,9 @@ def test_imu_gap_fraction_is_fraction_of_step_without_imu_data(time, edges, gaps
 def test_acceleration_rms_uses_only_the_evaluated_segment():
     time = np.arange(0.0, 10.0, 0.01)
     pushed = table(time, np.outer(np.where(time < 5.0, 100.0, 2.0), NORTH), AXIS_NAMES)
-    inside = project_acceleration(pushed, NORTH, Segment(5.0, 9.0, ""))
-    assert inside.compute_rms_m_s2() == pytest.approx(2.0)
-    assert isinstance(project_acceleration(pushed, NORTH, Segment(15.0, 19.0, "")), Unavailable)
+    inside = integrate_ned_acceleration(pushed, Segment(5.0, 9.0, ""))
+    assert inside.compute_rms_m_s2(NORTH) == pytest.approx(2.0)
+    assert isinstance(integrate_ned_acceleration(pushed, Segment(15.0, 19.0, "")), Unavailable)
 
 
 # ---- axes -------------------------------------------------------------------------------------
@@ -209,7 +210,7 @@ def test_positions_and_imu_are_projected_on_requested_heading():
     expected = 0.6 * track.samples["north_m"] + 0.8 * track.samples["east_m"]
     np.testing.assert_allclose(axis.measurement_m, expected, atol=1e-12)
     np.testing.assert_allclose(
-        axis.acceleration.compute_velocity_change_m_s(), 5.0 * time, atol=1e-11
+        axis.acceleration.compute_velocity_change_m_s(axis.direction), 5.0 * time, atol=1e-11
     )
     assert axis.heading_deg == heading
     assert "--heading" in axis.note
@@ -271,7 +272,7 @@ def test_evaluated_segment_uses_start_and_end_options():
         assert ("--start" in segment.reason) == (start_s is not None)
         assert ("--end" in segment.reason) == (end_s is not None)
     for start_s, end_s, said in (
-        (9.0, 9.0, "is not after"), (9.0, 5.0, "is not after"), (50.0, None, "no positions"),
+        (9.0, 9.0, "is not after"), (9.0, 5.0, "is not after"), (50.0, None, "0 positions"),
         (5.0, 5.3, "at least 3"), (18.5, 19.5, "at least 3"),
     ):  # fmt: skip
         with pytest.raises(SettingsError, match=said):

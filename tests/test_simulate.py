@@ -21,8 +21,8 @@ from px4fuse.filter.settings import Settings
 from px4fuse.filter.signals import (
     Segment,
     compute_mean_step_acceleration,
+    integrate_ned_acceleration,
     make_axes,
-    project_acceleration,
 )
 from px4fuse.findings import find
 from px4fuse.flight.model import Columns
@@ -170,9 +170,9 @@ def test_simulated_imu_noise_averaged_over_dt_equals_sigma_a(texts):
     error[:, 2] += 9.80665
     error -= simulation.motion.compute_true_state(time).acceleration_m_s2
     frame = pd.DataFrame(error, index=imu.index)
+    signal = integrate_ned_acceleration(frame, Segment(0.0, time[-1], ""))
     for axis in np.eye(3):
-        signal = project_acceleration(frame, axis, Segment(0.0, time[-1], ""))
-        mean, _ = compute_mean_step_acceleration(signal, np.arange(0.0, time[-1], DT_S))
+        mean, _ = compute_mean_step_acceleration(signal, axis, np.arange(0.0, time[-1], DT_S))
         expected = np.hypot(0.2, 0.5 if texts else 0.0)
         assert np.std(mean) == pytest.approx(expected, rel=0.07)
 

@@ -21,7 +21,7 @@ from px4fuse.ekf2.steps import (
     TIMESTAMPS_PROPERTY,
     DifferenceExplanation,
 )
-from px4fuse.filter.kalman import predict_state
+from px4fuse.filter.kalman import predict_track
 from px4fuse.filter.settings import Settings
 from px4fuse.flight.model import Unavailable
 from px4fuse.report.difference_page import describe_missing_explanation, draw_pages
@@ -43,7 +43,8 @@ def explain_again(analysis: Analysis, settings: Settings, **choices: Any) -> Dif
 def test_position_difference_on_report_page_is_kf_minus_ekf2(sample: Analysis) -> None:
     explanation = of(sample)
     result = next(r for r in sample.axes.values() if r.axis.name == "aisle")
-    position, speed = predict_state(result.kf_run, explanation.times_s)
+    track = predict_track(result.kf_run, explanation.times_s)
+    position, speed = track["position_m"].to_numpy(), track["velocity_m_s"].to_numpy()
     logged = result.ekf2_state.loc[explanation.times_s]
     difference = position - logged["position_m"].to_numpy()
     np.testing.assert_allclose(explanation.kf_minus_ekf2_m, difference, atol=1e-9)

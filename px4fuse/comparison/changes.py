@@ -8,7 +8,7 @@ from collections.abc import Iterable
 import numpy as np
 
 from px4fuse.comparison.estimates import Estimates, TuningByAxis, find_first_tuning
-from px4fuse.comparison.model import AxisComparison, Comparison, FilterName, FilterSummary
+from px4fuse.comparison.model import AxisComparison, Comparison, FilterSummary
 from px4fuse.comparison.remedy import (
     make_delay_max_change,
     make_estimated_delay_change,
@@ -64,13 +64,12 @@ MIN_MISALIGNMENT_SIGMAS = 3.0
 def find_candidate_changes(
     comparison: Comparison,
     estimates: Estimates,
-    filter_name: FilterName,
     ekf2_inputs: ReplayInputs | None,
     axis_result: AxisComparison,
     statistic: Statistic,
 ) -> list[Change]:
     """Return the changes of settings or data that may correct the mean NIS or NEES of a filter."""
-    summary = axis_result.filters[filter_name]
+    summary = axis_result.filters["kf" if ekf2_inputs is None else "ekf2"]
     assert isinstance(summary, FilterSummary)  # an UntestedFilter has no mean NIS or NEES
     is_underconfident = statistic == "nis" and summary.nis_mean < 1.0
     axis_tuning = find_axis_tuning(estimates.tuning, axis_result.axis.name)
@@ -109,17 +108,14 @@ def find_candidate_changes(
 
 
 def find_main_axis_changes(
-    comparison: Comparison,
-    estimates: Estimates,
-    filter_name: FilterName,
-    ekf2_inputs: ReplayInputs | None,
+    comparison: Comparison, estimates: Estimates, ekf2_inputs: ReplayInputs | None
 ) -> list[Change]:
     """Return the changes of settings or data for re-runs along the main axis."""
     changes = remove_repeated_changes(
         change
         for statistic in CONSISTENCY_STATISTICS[::-1]
         for change in find_candidate_changes(
-            comparison, estimates, filter_name, ekf2_inputs, comparison.main, statistic
+            comparison, estimates, ekf2_inputs, comparison.main, statistic
         )
     )
     if ekf2_inputs is not None:
@@ -196,7 +192,7 @@ def _find_kf_noise_changes(
     for name, noise in ((SIGMA_A, axis_tuning.sigma_a_two_state), (SIGMA_Z, axis_tuning.sigma_z)):
         setting = getattr(settings, name)
         if is_underconfident:
-            estimate = noise.value or noise.high or 0.0
+            estimate = noise.value_or_bound(0.0)
             is_significant = noise.high is not None and setting > noise.high
         else:
             estimate = noise.value or 0.0

@@ -20,12 +20,8 @@ from px4fuse.comparison.model import (
     UpdateStatistics,
 )
 from px4fuse.core.arrays import Array
-from px4fuse.filter.consistency import (
-    DEFAULT_GATE,
-    HorizontalNis,
-    assess_horizontal_nis,
-)
-from px4fuse.filter.kalman import KfRun, predict_state, predict_variance, run_kf
+from px4fuse.filter.consistency import DEFAULT_GATE, HorizontalNis, assess_horizontal_nis
+from px4fuse.filter.kalman import KfRun, predict_track, run_kf
 from px4fuse.filter.model import STATE_COLUMNS
 from px4fuse.filter.signals import AISLE, Axis, Segment
 from px4fuse.flight.model import (
@@ -185,11 +181,9 @@ def compute_difference_statistics(
     """Compute the difference KF - EKF2 along one axis at EKF2's sample times."""
     if isinstance(ekf2_state, Unavailable):
         return ekf2_state
-    kf_minus_ekf2 = (
-        np.array(predict_state(kf_run, ekf2_state.index.to_numpy()))
-        - ekf2_state[STATE_COLUMNS].to_numpy().T
-    )
-    position_m, velocity_m_s = kf_minus_ekf2[:, np.isfinite(kf_minus_ekf2).all(axis=0)]
+    kf_track = predict_track(kf_run, ekf2_state.index.to_numpy())
+    kf_minus_ekf2 = (kf_track[STATE_COLUMNS] - ekf2_state[STATE_COLUMNS]).dropna()
+    position_m, velocity_m_s = kf_minus_ekf2.to_numpy().T
     if len(position_m) < projection.MIN_COMMON_SAMPLES:
         return Unavailable(
             "difference KF - EKF2",
@@ -215,29 +209,14 @@ def compute_kf_error_statistics(
     kf_run: KfRun, truth: TableOrUnavailable, ekf2_state: TableOrUnavailable
 ) -> ErrorsAgainstTruth | Unavailable:
     """Compute the errors of KF against ground truth along one axis."""
-    return compute_error_statistics(*_compute_kf_track(kf_run, ekf2_state), truth)
+    kf_track = _predict_kf_track(kf_run, ekf2_state)
+    return compute_error_statistics(kf_track, kf_track, truth)
 
 
-def _compute_kf_track(
-    kf_run: KfRun, ekf2_state: TableOrUnavailable
-) -> tuple[pd.DataFrame, pd.DataFrame]:
-    """Return state and variances of KF at EKF2's sample times, if EKF2 is logged."""
+def _predict_kf_track(kf_run: KfRun, ekf2_state: TableOrUnavailable) -> pd.DataFrame:
+    """Return state and covariance of KF at EKF2's sample times, if EKF2 is logged."""
     output_times_s = (kf_run.steps if isinstance(ekf2_state, Unavailable) else ekf2_state).index
-    return sample_kf_run(kf_run, output_times_s.to_numpy())
-
-
-def sample_kf_run(kf_run: KfRun, times_s: Array) -> tuple[pd.DataFrame, pd.DataFrame]:
-    """Return state and variances of KF at ``times_s`` (s)."""
-    state, variance = (
-        pd.DataFrame(
-            dict(zip(columns, state_function(kf_run, times_s), strict=True)), index=times_s
-        )
-        for columns, state_function in (
-            (STATE_COLUMNS, predict_state),
-            (VARIANCE_COLUMNS, predict_variance),
-        )
-    )
-    return state, variance
+    return predict_track(kf_run, output_times_s.to_numpy())
 
 
 def compute_error_statistics(
@@ -290,7 +269,7 @@ def interpolate_sigma(time_s: Array, variance: TableOrUnavailable, column: str) 
     if known_variance.empty:
         return np.full(len(time_s), np.nan)
     variance_at_times = np.interp(time_s, known_variance.index, known_variance, np.nan, np.nan)
-    return np.asarray(np.sqrt(np.where(variance_at_times > 0.0, variance_at_times, np.nan)))
+    return np.sqrt(np.where(variance_at_times > 0.0, variance_at_times, np.nan))
 
 
 def _compute_mean_nees(normalised_errors: Array) -> float | None:
@@ -310,7 +289,7 @@ def compute_position_errors(
         return axis_result.truth
     state, variance = axis_result.ekf2_state, axis_result.ekf2_variance
     if filter_name == "kf":
-        state, variance = _compute_kf_track(axis_result.kf_run, state)
+        state = variance = _predict_kf_track(axis_result.kf_run, state)
     if isinstance(state, Unavailable):
         return state
     time_s = state.index.to_numpy()
@@ -347,9 +326,5 @@ def _assess_horizontal_innovations(
     if len(tables) < 2:
         return None
     # Use only times with innovations along both axes
-    north_innovation_m, north_variance_m2, east_innovation_m, east_variance_m2 = (
-        pd.concat(tables, axis=1, join="inner").to_numpy().T
-    )
-    return assess_horizontal_nis(
-        (north_innovation_m, north_variance_m2), (east_innovation_m, east_variance_m2)
-    )
+    common_rows = pd.concat(tables, axis=1, join="inner").to_numpy()
+    return assess_horizontal_nis(*common_rows.T.reshape(2, 2, -1))

@@ -17,7 +17,7 @@ from px4fuse.ekf2.inputs import ReplayInputs
 from px4fuse.ekf2.model import Ekf2Model
 from px4fuse.ekf2.replay import is_inside_spans
 from px4fuse.ekf2.steps import DifferenceExplanation, DifferenceOutsideReplay, PropertyReplacement
-from px4fuse.filter.kalman import KfRun, predict_state, run_kf
+from px4fuse.filter.kalman import KfRun, predict_track, run_kf
 from px4fuse.filter.settings import Settings
 from px4fuse.filter.signals import AISLE
 from px4fuse.filter.time_offset import SourceTimeOffset
@@ -131,7 +131,8 @@ def _compare_outside_replay(
         return None
     position_m = axis_result.ekf2_state["position_m"]
     position_m = position_m[~is_inside_spans(position_m.index, spans_s)]
-    difference_m = (position_m - predict_state(kf_run, position_m.index.to_numpy())[0]).abs()
+    kf_track = predict_track(kf_run, position_m.index.to_numpy())
+    difference_m = (position_m - kf_track["position_m"].to_numpy()).abs()
     if not np.isfinite(difference_m).any():
         return None
     return DifferenceOutsideReplay(float(difference_m.max()), float(difference_m.idxmax()))
@@ -150,16 +151,6 @@ def add_cause_sentences(
     step_reasons : mapping from str to str
         Text for each possible cause, for example the measurement noise.
     """
-    first, second, *_ = sorted(explanation.steps, key=lambda step: -step.position_mean_square_m2)
-    first_reason, second_reason = (
-        step_reasons[step.name]
-        + (_describe_rejections(explanation) if step.name == steps.REJECTION_PROPERTY else "")
-        for step in (first, second)
-    )
-    cause_text = (
-        f"Largest contribution to the difference KF - EKF2 along {axis_label}: {first.name}. "
-        f"{first_reason}."
-    )
     sentences = []
     if explanation.corrected:
         settings_text = " and ".join(
@@ -169,12 +160,17 @@ def add_cause_sentences(
             f"The following sentences explain a run of KF with the estimated noise "
             f"({settings_text})."
         )
-    sentences.append(f"{cause_text} {_describe_step_effect(first, explanation)}")
+    first, second, *_ = sorted(explanation.steps, key=lambda step: -step.position_mean_square_m2)
+    causes = [(f"Largest contribution to the difference KF - EKF2 along {axis_label}", first)]
     min_contribution_m2 = MIN_CONTRIBUTION_FRACTION * explanation.position_mean_square_m2
     if second.position_mean_square_m2 >= min_contribution_m2:
+        causes.append(("Second largest contribution", second))
+    for rank_text, step in causes:
+        reason = step_reasons[step.name]
+        if step.name == steps.REJECTION_PROPERTY:
+            reason += _describe_rejections(explanation)
         sentences.append(
-            f"Second largest contribution: {second.name}. {second_reason}. "
-            f"{_describe_step_effect(second, explanation)}"
+            f"{rank_text}: {step.name}. {reason}. {_describe_step_effect(step, explanation)}"
         )
     sentences += [_describe_unexplained_fractions(explanation), *_describe_rmse(explanation)]
     outside = explanation.outside

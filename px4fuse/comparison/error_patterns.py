@@ -16,10 +16,12 @@ from px4fuse.core.arrays import (
     Array,
     compute_median_interval_s,
     integrate_cumulatively,
+    interpolate_columns,
     rank_correlation,
 )
+from px4fuse.filter.signals import interpolate_attitude
 from px4fuse.flight.model import Columns, Ekf2, Unavailable, rows_between
-from px4fuse.trajectory.rotation import conjugate, interpolate, multiply, to_rotation_vector
+from px4fuse.trajectory.rotation import conjugate, multiply, to_rotation_vector
 from px4fuse.trajectory.scores import compute_autocorrelation_time
 
 MIN_POSITIONS = 100
@@ -487,7 +489,7 @@ def find_attitude_delay(imu: pd.DataFrame, attitude: pd.DataFrame) -> float | No
         imu, time_s[0] - 2.0 * MAX_ATTITUDE_DELAY_S, time_s[-1] + 2.0 * MAX_ATTITUDE_DELAY_S
     )
     imu_time_s = imu.index.to_numpy()
-    quaternions = interpolate(time_s, attitude_time_s, attitude[Columns.QUATERNION].to_numpy())
+    quaternions = interpolate_attitude(attitude, time_s)
     rotation_rad = to_rotation_vector(
         multiply(conjugate(quaternions[:-samples_per_rotation]), quaternions[samples_per_rotation:])
     )
@@ -498,7 +500,7 @@ def find_attitude_delay(imu: pd.DataFrame, attitude: pd.DataFrame) -> float | No
     gyro_time_s = time_s[0] + ROTATION_INTERVAL_S * np.arange(
         -max_delay_rows, len(time_s) + max_delay_rows
     )
-    angle_rad = np.stack([np.interp(gyro_time_s, imu_time_s, column) for column in angle_rad.T], 1)
+    angle_rad = interpolate_columns(gyro_time_s, imu_time_s, angle_rad)
     gyro_rotation_rad = angle_rad[samples_per_rotation:] - angle_rad[:-samples_per_rotation]
 
     def compute_mean_square_rad2(delay_rows: int) -> float:

@@ -10,6 +10,7 @@ import numpy as np
 from msgspec import structs
 from scipy.special import stdtr
 
+from px4fuse.comparison.imu_oscillation import ImuOscillation, find_imu_oscillation
 from px4fuse.comparison.model import Comparison, PreparedComparison
 from px4fuse.comparison.noise_differences import (
     NoisyPart,
@@ -31,7 +32,6 @@ from px4fuse.filter.hypotheses import (
     fit_systematic_errors,
 )
 from px4fuse.filter.imu_motion import MAX_IMU_INTERVAL_S, MotionCache
-from px4fuse.filter.imu_oscillation import ImuOscillation, find_imu_oscillation
 from px4fuse.filter.signals import AISLE, Axis
 from px4fuse.filter.time_offset import (
     MAX_OFFSET_INTERVAL_HALF_WIDTH_S,
@@ -39,7 +39,7 @@ from px4fuse.filter.time_offset import (
     SourceTimeOffset,
     estimate_time_offset,
 )
-from px4fuse.filter.tuning import HORIZONTAL, AxisTuning, NoiseEstimate, tune
+from px4fuse.filter.tuning import HORIZONTAL, AxisTuning, tune
 from px4fuse.flight.model import DIAGNOSIS_WITHHELD, Flight, Unavailable, reset_times_s
 
 # Minimum IMU rate (Hz) to estimate a time offset
@@ -108,11 +108,6 @@ def find_first_tuning(tuning: TuningByAxis, *axis_names: str) -> AxisTuning | No
     )
 
 
-def value_or_bound(noise: NoiseEstimate, fallback: float) -> float:
-    """Return the estimate of a noise, else its upper bound, else ``fallback``."""
-    return noise.value or noise.high or fallback
-
-
 def estimate(comparison: Comparison, progress: Progress = ignore_progress) -> Estimates:
     """Estimate noises, time offset, yaw misalignment and systematic errors of a position source."""
     has_north_and_east = {"north", "east"} <= {axis.name for axis in comparison.input_axes}
@@ -120,7 +115,7 @@ def estimate(comparison: Comparison, progress: Progress = ignore_progress) -> Es
     tuning, time_offset = estimate_noises_and_time_offset(
         comparison, progress, REPORTED_AXES if has_north_and_east else None, motion_cache
     )
-    imu_oscillation = find_oscillation(comparison)
+    imu_oscillation = find_imu_oscillation(comparison)
     systematic_errors, source_low_pass, correlated_noise = _fit_source_errors(
         comparison, tuning, time_offset, imu_oscillation, motion_cache
     )
@@ -141,16 +136,6 @@ def estimate(comparison: Comparison, progress: Progress = ignore_progress) -> Es
         axis_tunings=axis_tunings,
         noisy_part=noisy_part,
         imu_oscillation=imu_oscillation,
-    )
-
-
-def find_oscillation(comparison: PreparedComparison) -> ImuOscillation | None:
-    """Find an oscillation of the accelerometer that the positions do not contain."""
-    return find_imu_oscillation(
-        comparison.input_axes[0].acceleration,
-        comparison.flight.attitude,
-        comparison.source,
-        comparison.segment,
     )
 
 
@@ -220,7 +205,7 @@ def estimate_noises_and_time_offset(
         return tuning, time_offset
     if comparison.source.origin.may_drift:
         time_offset = widen_for_scatter(time_offset, "the positions drift")
-    elif time_offset.has_changed() and find_oscillation(comparison):
+    elif time_offset.has_changed() and find_imu_oscillation(comparison):
         time_offset = widen_for_scatter(time_offset, "the accelerometer oscillates")
     return tuning, time_offset
 
@@ -233,7 +218,7 @@ def estimate_frame_rotation(
     """Estimate the yaw misalignment of the position frame."""
     sigma_z_m = comparison.settings.sigma_z_m
     if axis_tuning := find_first_tuning(tuning, HORIZONTAL):
-        sigma_z_m = value_or_bound(axis_tuning.sigma_z, sigma_z_m)
+        sigma_z_m = axis_tuning.sigma_z.value_or_bound(sigma_z_m)
     offset_s = 0.0
     if isinstance(time_offset, SourceTimeOffset) and time_offset.is_determinable:
         offset_s = time_offset.remaining_s
@@ -274,8 +259,8 @@ def _fit_source_errors(
         flight,
         axes,
         settings,
-        sigma_a_m_s2=value_or_bound(axis_tuning.sigma_a_two_state, settings.sigma_a_m_s2),
-        sigma_z_m=value_or_bound(axis_tuning.sigma_z, settings.sigma_z_m),
+        sigma_a_m_s2=axis_tuning.sigma_a_two_state.value_or_bound(settings.sigma_a_m_s2),
+        sigma_z_m=axis_tuning.sigma_z.value_or_bound(settings.sigma_z_m),
         outlier_time_s=axis_tuning.outlier_time_s,
         clock_offset_s=offset_s,
         source_resets_s=reset_times_s(comparison.source).tolist(),

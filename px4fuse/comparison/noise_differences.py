@@ -50,7 +50,7 @@ def tune_perpendicular_axes(comparison: Comparison) -> tuple[AxisTuning, ...]:
     return tuple(
         axis_tuning
         for axis in axes
-        for axis_tuning in tune((axis,), comparison.settings, (axis.name,)).values()
+        for axis_tuning in tune((axis,), comparison.settings).values()
         if isinstance(axis_tuning, AxisTuning)
     )
 
@@ -101,7 +101,7 @@ def find_noisy_flight_part(
         ]
         magnitudes = np.abs([nu / np.sqrt(s) for nu, s in axis_innovations])
         # Division by the median removes the effect of a wrong noise setting
-        return np.asarray(magnitudes / np.median(magnitudes, axis=1, keepdims=True))
+        return magnitudes / np.median(magnitudes, axis=1, keepdims=True)
 
     scaled_innovations = compute_scaled_innovations(None)
     part_medians = np.array(

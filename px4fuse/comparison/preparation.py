@@ -18,9 +18,9 @@ from px4fuse.filter.settings import SETTING_RANGES, Settings, requested_settings
 from px4fuse.filter.signals import (
     AISLE,
     MIN_MEASUREMENTS,
-    Axis,
     Segment,
     cut_to_segment,
+    interpolate_attitude,
     make_axes,
 )
 from px4fuse.flight.ekf2_parameters import BAROMETER, GNSS_POS, PARAMETERS
@@ -46,7 +46,7 @@ from px4fuse.readers.px4_innovations import (
 from px4fuse.readers.px4_positions import NO_FIX_ACTION
 from px4fuse.readers.px4_topics import SOURCE_TRACKS
 from px4fuse.request import ComparisonRequest, HeightName
-from px4fuse.trajectory.rotation import interpolate, to_matrix
+from px4fuse.trajectory.rotation import to_matrix
 
 NO_SEPARATE_TRUTH = Unavailable(
     "ground truth",
@@ -96,7 +96,13 @@ def prepare_comparison_inputs(
     if isinstance(flight.truth, Truth) and flight.truth.name == source.name:
         flight = replace(flight, truth=NO_SEPARATE_TRUTH)
     if is_gnss and request.sigma_z_m is None:
-        settings = _use_gnss_noise_of_ekf2(settings, flight, source, axes[0], segment)
+        # SIGMA_Z is √R of EKF2's GNSS fusion
+        default_noise_m = PARAMETERS[GNSS_POS.noise].default
+        sigma_z_m = (
+            find_observation_variance(flight, source, axes[0], segment, default_noise_m) ** 0.5
+        )
+        if sigma_z_m >= SETTING_RANGES["sigma_z_m"].low:
+            settings = replace(settings, sigma_z_m=float(f"{sigma_z_m:.3g}"))
     notes, missing_data = (*flight.log.notes, *source.notes), flight.missing
     acceleration = axes[0].acceleration
     if settings.input == "imu" and isinstance(acceleration, Unavailable):
@@ -124,22 +130,13 @@ def _correct_convention(
     # A time offset from the user replaces the detected one
     if convention is not None and settings.clock_offset_s:
         convention = structs.replace(convention, late_s=0.0)
-    late_s = find_convention_faults(convention, flight, source.frame).late_s
-    offset_range = SETTING_RANGES["clock_offset_s"]
-    clock_offset_s = np.clip(settings.clock_offset_s - late_s, offset_range.low, offset_range.high)
-    settings = replace(settings, clock_offset_s=float(clock_offset_s))
-    return *convert_to_px4_convention(flight, source, convention), settings, convention
-
-
-def _use_gnss_noise_of_ekf2(
-    settings: Settings, flight: Flight, source: PositionTrack, axis: Axis, segment: Segment
-) -> Settings:
-    """Set SIGMA_Z to √R of EKF2's GNSS fusion."""
-    default_noise_m = PARAMETERS[GNSS_POS.noise].default
-    variance_m2 = find_observation_variance(flight, source, axis, segment, default_noise_m)
-    if (sigma_z_m := variance_m2**0.5) >= SETTING_RANGES["sigma_z_m"].low:
-        settings = replace(settings, sigma_z_m=float(f"{sigma_z_m:.3g}"))
-    return settings
+    faults = find_convention_faults(convention, flight, source.frame)
+    if convention is None or not faults:
+        return flight, source, settings, convention
+    offset_range, clock_offset_s = SETTING_RANGES["clock_offset_s"], settings.clock_offset_s
+    clock_offset_s = min(max(clock_offset_s - faults.late_s, offset_range.low), offset_range.high)
+    settings = replace(settings, clock_offset_s=clock_offset_s)
+    return *convert_to_px4_convention(flight, source, convention, faults), settings, convention
 
 
 def select_source_innovations(flight: Flight, track: PositionTrack) -> Flight:
@@ -200,12 +197,8 @@ def _subtract_lever_arm(track: PositionTrack, flight: Flight) -> PositionTrack:
     attitude = flight.attitude
     if not any(track.lever_arm_m) or isinstance(attitude, Unavailable) or track.frame != "NED":
         return track
-    quaternions = interpolate(
-        track.samples.index.to_numpy(),
-        attitude.index.to_numpy(),
-        attitude[Columns.QUATERNION].to_numpy(),
-    )
-    lever_arm_ned_m = to_matrix(quaternions) @ np.asarray(track.lever_arm_m)
+    quaternions = interpolate_attitude(attitude, track.samples.index.to_numpy())
+    lever_arm_ned_m = to_matrix(quaternions) @ track.lever_arm_m
     samples = track.samples.copy()
     samples[Columns.POSITION] -= lever_arm_ned_m
     forward_m, right_m, down_m = track.lever_arm_m
@@ -300,12 +293,11 @@ def explain_missing_source(flight: Flight) -> Unavailable:
     for item in flight.missing:
         if item.reason == HEIGHT_ONLY_REASON:
             reason = f"{item.source}: {HEIGHT_ONLY_REASON}"
-    if flight.log.damage:
-        reason = f"the file is damaged, and {reason}"
-    for item in flight.missing:
-        if item.remedy == NO_FIX_ACTION:
+        elif item.remedy == NO_FIX_ACTION:
             reason += f"; {item.source}: {item.reason}"
             remedy = f"{NO_FIX_ACTION} Or {remedy}"
+    if flight.log.damage:
+        reason = f"the file is damaged, and {reason}"
     if flight.log.autopilot != "PX4":
         reason += f"; the autopilot is {flight.log.autopilot}, so there is no EKF2"
     return Unavailable("position source", reason, capitalise_first(remedy))
@@ -387,26 +379,22 @@ def choose_segment(
         chosen_end_s = chosen_end_s if end_s is None else end_s
         reason = f"chosen with {' and '.join(given_options)}"
         clipped_span_s = max(chosen_start_s, 0.0), min(chosen_end_s, log.duration_s)
-        if (chosen_start_s, chosen_end_s) != clipped_span_s and clipped_span_s[0] < clipped_span_s[
-            1
-        ]:
+        if (chosen_start_s, chosen_end_s) != clipped_span_s:
             chosen_start_s, chosen_end_s = clipped_span_s
             reason += "; the log covers only part of the chosen time"
-    if not chosen_start_s < chosen_end_s:
-        raise SettingsError(
-            f"{log.name}: no positions between {chosen_start_s:.6g} s and {chosen_end_s:.6g} s; "
-            f"the positions are from {source_span_s[0]:.2f} s to {source_span_s[1]:.2f} s. Change "
-            "--start or --end."
-        )
-    segment_span_s = max(chosen_start_s, available_start_s), min(chosen_end_s, available_end_s)
-    if segment_span_s[0] >= segment_span_s[1]:
-        segment_span_s = chosen_start_s, chosen_end_s
-    segment = Segment(*segment_span_s, reason, (chosen_start_s, chosen_end_s))
+    segment = Segment(
+        max(chosen_start_s, available_start_s),
+        min(chosen_end_s, available_end_s),
+        reason,
+        (chosen_start_s, chosen_end_s),
+    )
     position_count = len(cut_to_segment(track.samples, segment))
     if position_count < MIN_MEASUREMENTS:
         raise SettingsError(
-            f"{log.name}: {track.name} has only {position_count} measurements between "
-            f"{segment.start_s:.2f} s and {segment.end_s:.2f} s; at least {MIN_MEASUREMENTS} are "
-            "needed. Choose a longer segment (--start, --end)."
+            f"{log.name}: {track.name} has {position_count} positions between "
+            f"{chosen_start_s:.6g} s and {chosen_end_s:.6g} s (at least {MIN_MEASUREMENTS} are "
+            f"needed). The positions are from {source_span_s[0]:.2f} s to {source_span_s[1]:.2f} "
+            "s.",
+            "Change --start or --end.",
         )
     return segment

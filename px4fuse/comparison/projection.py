@@ -147,25 +147,24 @@ def project_fusion_horizon_position(
 
     EKF2's variance belongs to this position, not to the published position.
     """
-    weights = dict(zip(AXIS_NAMES, axis.direction.tolist(), strict=True))
     aid = ekf2.aids.get("ev_hgt" if axis.name == "down" else "ev_pos")
     if aid is not None and f"observation_{aid.axes[0]}" in aid.samples:
         # Before an update, the position is observation - innovation, and the variance P⁻ is S - R
         samples = cut_to_segment(aid.samples, segment)
-        position, variance = (
-            sum(
-                weights[name] ** exponent
-                * (samples[f"{measured_name}_{name}"] - samples[f"{deviation_name}_{name}"])
-                for name in aid.axes
-            )
-            for exponent, measured_name, deviation_name in (
-                (1, "observation", "innovation"),
-                (2, "variance", "noise"),
-            )
+        weights = axis.direction[[AXIS_NAMES.index(name) for name in aid.axes]]
+        observation_m, innovation_m, innovation_variance_m2, noise_variance_m2 = (
+            samples[[f"{quantity}_{name}" for name in aid.axes]].to_numpy()
+            for quantity in ("observation", "innovation", "variance", "noise")
+        )
+        positions = pd.DataFrame(
+            {
+                "position_m": (observation_m - innovation_m) @ weights,
+                "position_variance_m2": (innovation_variance_m2 - noise_variance_m2) @ weights**2,
+            },
+            samples.index,
         )
         if axis.name == "down":
-            position = position + _find_altitude_offset_m(ekf2, position)
-        positions = pd.DataFrame({"position_m": position, "position_variance_m2": variance})
+            positions["position_m"] += _find_altitude_offset_m(ekf2, positions["position_m"])
         return positions[positions["position_variance_m2"] > 0.0]
     if isinstance(ekf2.record, Unavailable):
         return None

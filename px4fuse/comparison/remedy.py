@@ -49,7 +49,7 @@ def estimate_gnss_delay_ms(
         vision is None
         or comparison.source.name != vision.source
         or comparison.convention_faults
-        or _find_differing_delay_ms(comparison, time_offset, model.inputs.settings[EV_POS.delay])
+        or estimate_differing_delay_ms(comparison, time_offset, model.inputs.settings[EV_POS.delay])
         is not None
         or received_positions.velocity_m_s is None
         or received_positions.uses_sender_timestamps
@@ -123,27 +123,23 @@ def is_source_fused(comparison: Comparison, ekf2_inputs: ReplayInputs) -> bool:
 def make_estimated_delay_change(
     comparison: Comparison, ekf2_inputs: ReplayInputs, time_offset: SourceTimeOffset | Unavailable
 ) -> dict[str, float]:
-    estimated_delay_ms = _find_differing_delay_ms(
+    estimated_delay_ms = estimate_differing_delay_ms(
         comparison, time_offset, ekf2_inputs.settings[ekf2_inputs.aid.delay]
     )
     return {} if estimated_delay_ms is None else make_delay_change(ekf2_inputs, estimated_delay_ms)
 
 
-def _find_differing_delay_ms(
-    comparison: Comparison, time_offset: SourceTimeOffset | Unavailable, logged_delay_ms: float
-) -> float | None:
-    if isinstance(time_offset, Unavailable) or not time_offset.is_determinable:
-        return None
-    return estimate_differing_delay_ms(comparison, time_offset, logged_delay_ms)
-
-
 def estimate_differing_delay_ms(
-    comparison: PreparedComparison, time_offset: SourceTimeOffset, logged_delay_ms: float
+    comparison: PreparedComparison,
+    time_offset: SourceTimeOffset | Unavailable,
+    logged_delay_ms: float,
 ) -> float | None:
     """Return the estimated delay (ms) of the positions if it differs from the logged delay.
 
     A time offset from the user (--clock-offset) is kept if it is within the 95 % interval.
     """
+    if isinstance(time_offset, Unavailable) or not time_offset.is_determinable:
+        return None
     offset_s, applied_s = time_offset.offset_s, time_offset.applied_s
     low_s, high_s = time_offset.interval_s
     if (

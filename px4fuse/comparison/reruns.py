@@ -64,7 +64,7 @@ from px4fuse.filter.settings import Settings
 from px4fuse.filter.signals import (
     Acceleration,
     compute_ned_acceleration,
-    project_acceleration,
+    integrate_ned_acceleration,
     weighted_sum,
 )
 from px4fuse.filter.time_offset import SourceTimeOffset
@@ -187,9 +187,7 @@ def list_rerun_configurations(
     return [
         FilterConfiguration({**logged_parameters, **change})
         for axis_result in comparison.axes.values()
-        for change, _ in _find_changes_to_test(
-            comparison, estimates, "ekf2", ekf2_inputs, axis_result
-        )
+        for change, _ in _find_changes_to_test(comparison, estimates, ekf2_inputs, axis_result)
         if change.keys() <= logged_parameters.keys()
     ]
 
@@ -202,32 +200,32 @@ def is_inconsistent(summary: FilterSummary | UntestedFilter) -> TypeGuard[Filter
 def _find_changes_to_test(
     comparison: Comparison,
     estimates: Estimates,
-    filter_name: FilterName,
     ekf2_inputs: ReplayInputs | None,
     axis_result: AxisComparison,
 ) -> list[tuple[Change, tuple[Statistic, ...]]]:
-    """Return the changes to test along an axis, and the statistics that each change may correct."""
-    summary = axis_result.filters[filter_name]
+    """Return the changes to test along an axis, and the statistics that each change may correct.
+
+    ``ekf2_inputs`` is None for KF.
+    """
+    summary = axis_result.filters["kf" if ekf2_inputs is None else "ekf2"]
     if not isinstance(summary, FilterSummary) or (
         ekf2_inputs is not None and axis_result.axis.name == "down"
     ):
         return []  # EKF2's replay contains no vertical position
-    has_discrepancy = {
-        "nees": find_error_above_sigma(summary) is not None,
-        "nis": is_inconsistent(summary),
-    }
+    statistics: list[Statistic] = ["nees"] if find_error_above_sigma(summary) else []
+    if is_inconsistent(summary):
+        statistics.append("nis")
     candidates = {
         statistic: find_candidate_changes(
-            comparison, estimates, filter_name, ekf2_inputs, axis_result, statistic
+            comparison, estimates, ekf2_inputs, axis_result, statistic
         )
-        for statistic in CONSISTENCY_STATISTICS
-        if has_discrepancy[statistic]
+        for statistic in statistics
     }
     changes = remove_repeated_changes(chain.from_iterable(candidates.values()))
     if axis_result is comparison.main:
-        changes = find_main_axis_changes(comparison, estimates, filter_name, ekf2_inputs)
+        changes = find_main_axis_changes(comparison, estimates, ekf2_inputs)
     return [
-        (change, tuple(statistic for statistic in candidates if change in candidates[statistic]))
+        (change, tuple(statistic for statistic in statistics if change in candidates[statistic]))
         for change in changes
     ]
 
@@ -238,9 +236,7 @@ def _rerun_with_changes(
     tested_filter: _Filter,
     axis_result: AxisComparison,
 ) -> list[Rerun]:
-    changes = _find_changes_to_test(
-        comparison, estimates, tested_filter.name, tested_filter.ekf2_inputs, axis_result
-    )
+    changes = _find_changes_to_test(comparison, estimates, tested_filter.ekf2_inputs, axis_result)
     if not changes:
         return []
     original_statistics, is_logged = _find_statistics_without_change(tested_filter, axis_result)
@@ -326,7 +322,7 @@ def _summarise_run(
 
 
 def _rotate_direction(direction: Array, rotation_deg: float) -> Array:
-    return np.asarray(Rotation.from_euler("z", -rotation_deg, degrees=True).apply(direction))
+    return Rotation.from_euler("z", -rotation_deg, degrees=True).apply(direction)
 
 
 def _rerun_kf(
@@ -347,8 +343,7 @@ def _rerun_kf(
             rotated_axis = replace(axis, direction=rotated_direction)
             truth = project_truth(comparison.flight.truth, rotated_axis, comparison.segment)
     if FORWARD_BIAS_KEY in change:
-        acceleration = _remove_accelerometer_bias(comparison, change, axis.direction)
-        axis = replace(axis, acceleration=acceleration)
+        axis = replace(axis, acceleration=_remove_accelerometer_bias(comparison, change))
     time_s, axis_tuning = axis.measurement_time_s, find_axis_tuning(tuning, axis.name)
     is_used = np.ones(len(time_s), dtype=bool)
     if OUTLIERS_KEY in change and axis_tuning is not None:
@@ -370,7 +365,7 @@ def _rerun_kf(
 
 
 def _remove_accelerometer_bias(
-    comparison: Comparison, change: Change, direction: Array
+    comparison: Comparison, change: Change
 ) -> Acceleration | Unavailable:
     flight, imu = comparison.flight, comparison.flight.imu
     if isinstance(imu, Unavailable):
@@ -379,7 +374,7 @@ def _remove_accelerometer_bias(
         [change[FORWARD_BIAS_KEY], change[RIGHT_BIAS_KEY], 0.0], Columns.SPECIFIC_FORCE
     )
     flight = replace(flight, imu=imu.assign(**(imu[Columns.SPECIFIC_FORCE] - accelerometer_bias)))
-    return project_acceleration(compute_ned_acceleration(flight), direction, comparison.segment)
+    return integrate_ned_acceleration(compute_ned_acceleration(flight), comparison.segment)
 
 
 def _replay_ekf2(

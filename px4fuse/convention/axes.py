@@ -13,6 +13,7 @@ from itertools import product
 from typing import Final, NamedTuple
 
 import numpy as np
+import pandas as pd
 
 from px4fuse.convention.model import AxisDirections, Direction, HeadingSource, Unit
 from px4fuse.convention.motion import (
@@ -128,12 +129,12 @@ SIGNED_AXIS_PERMUTATIONS = tuple(
 
 @dataclass(frozen=True)
 class SentPositions:
-    """Positions of a source as sent, and barometer heights (m) at barometer times (s)."""
+    """Positions of a source as sent, and barometer heights (column ``down_m``)."""
 
     time_s: Array
     position_m: Array
     max_time_offset_s: float
-    barometer_times_and_heights: tuple[Array, Array] | None = None
+    barometer: pd.DataFrame | None
 
     def remove_clock_drift(self, clock_drift: float) -> "SentPositions":
         return replace(self, time_s=correct_clock_drift(self.time_s, clock_drift))
@@ -272,15 +273,21 @@ def find_convention_candidates(
         GRID_INTERVAL_S / SECOND_DIFFERENCE_WINDOW_S
     )
     cross_moments /= cross_moments[:, 6:, 6:]
+    # If z is constant, the source measures no height, and z is the vertical axis
+    permutations = [
+        permutation
+        for permutation in SIGNED_AXIS_PERMUTATIONS
+        if permutation.vertical_axis == 2 or source_motion.second_differences[:, 2].any()
+    ]
     vertical_axis, vertical_sign, first_horizontal_axis, second_horizontal_axis, handedness = (
-        np.array(SIGNED_AXIS_PERMUTATIONS).T
+        np.transpose(permutations)
     )
+    # Complex numbers are north + i east
+    horizontal_moments = cross_moments[:, :3, 0] + 1j * cross_moments[:, :3, 1]
     correlation = (
-        cross_moments[:, first_horizontal_axis, 0]
-        + handedness * cross_moments[:, second_horizontal_axis, 1]
-        + 1j * cross_moments[:, first_horizontal_axis, 1]
+        horizontal_moments[:, first_horizontal_axis]
+        - 1j * handedness * horizontal_moments[:, second_horizontal_axis]
     )
-    correlation -= 1j * handedness * cross_moments[:, second_horizontal_axis, 0]
     source_mean_square = np.maximum(cross_moments[:, 3:6, 6, None], 1e-12)
     metres_per_unit = np.array([*METRES_PER_UNIT.values()])
     north_mean_square_m2, east_mean_square_m2, down_mean_square_m2 = np.moveaxis(
@@ -322,13 +329,7 @@ def find_convention_candidates(
             np.argmax(scores_at_quarter_turn, axis=0)
         ):
             unit_name = [*METRES_PER_UNIT][unit_index]
-            axis_permutation = SIGNED_AXIS_PERMUTATIONS[permutation_index]
-            # If z is constant, the source measures no height, and z is the vertical axis
-            if (
-                axis_permutation.vertical_axis != 2
-                and not source_motion.second_differences[:, 2].any()
-            ):
-                continue
+            axis_permutation = permutations[permutation_index]
             total_score = (
                 scores_at_quarter_turn[offset_index, permutation_index, unit_index]
                 + axis_permutation.compute_log_prior_odds(quarter_turns)
@@ -523,18 +524,20 @@ def _compute_total_log_odds(hypothesis: Hypothesis, positions: SentPositions) ->
         log_odds += (
             LARGE_ROTATION_LOG_PRIOR_ODDS if is_large_rotation else SMALL_ROTATION_LOG_PRIOR_ODDS
         )
-    if positions.barometer_times_and_heights is not None:
+    if positions.barometer is not None:
         log_odds += _compute_height_log_likelihood_ratio(
-            hypothesis, positions, *positions.barometer_times_and_heights
+            hypothesis, positions, positions.barometer["down_m"]
         )
     return log_odds
 
 
 def _compute_height_log_likelihood_ratio(
-    hypothesis: Hypothesis, positions: SentPositions, time_s: Array, barometer_height_m: Array
+    hypothesis: Hypothesis, positions: SentPositions, barometer_down_m: "pd.Series[float]"
 ) -> float:
     """Return the log likelihood ratio of barometer heights to a constant height."""
-    height_m = np.interp(positions.time_s - hypothesis.delay_s, time_s, barometer_height_m)
+    height_m = -np.interp(
+        positions.time_s - hypothesis.delay_s, barometer_down_m.index, barometer_down_m
+    )
     down_m = (
         METRES_PER_UNIT[hypothesis.unit]
         * hypothesis.axis_permutation.vertical_sign

@@ -137,18 +137,15 @@ def _read_positions(
     flight: Flight, track: PositionTrack, max_time_offset_s: float
 ) -> SentPositions:
     """Return the positions of a source without repeated samples."""
-    samples, barometer = track.samples[Columns.POSITION], flight.barometer
+    samples = track.samples[Columns.POSITION]
     if samples["down_m"].notna().mean() < MIN_FRACTION_OF_POSITIONS_WITH_HEIGHT:
         samples = samples.assign(down_m=0.0)
     samples = samples.dropna()
     is_repeated = (samples.diff() == 0.0).all(axis=1)
     if is_repeated.mean() < MAX_REPEATED_POSITION_FRACTION:
         samples = samples[~is_repeated]
-    barometer_times_and_heights = None
-    if barometer is not None:
-        barometer_times_and_heights = barometer.index.to_numpy(), -barometer["down_m"].to_numpy()
     return SentPositions(
-        samples.index.to_numpy(), samples.to_numpy(), max_time_offset_s, barometer_times_and_heights
+        samples.index.to_numpy(), samples.to_numpy(), max_time_offset_s, flight.barometer
     )
 
 

@@ -161,15 +161,12 @@ def _find_orientation_fault(convention: Convention) -> OrientationFault:
 
 
 def convert_to_px4_convention(
-    flight: Flight, track: PositionTrack, convention: Convention | None
+    flight: Flight, track: PositionTrack, convention: Convention, faults: ConventionFaults
 ) -> tuple[Flight, PositionTrack]:
     """Convert a position source to PX4's axes (NED), unit (m) and boot clock.
 
     If EKF2 fused the wrong positions, its attitude is also replaced.
     """
-    faults = find_convention_faults(convention, flight, track.frame)
-    if convention is None or not faults:
-        return flight, track
     samples, orientation, origin = track.samples, track.orientation, track.origin
     matrix_to_ned = _make_matrix_to_ned_metres(convention, faults)
     position_m = _multiply_known_values(samples[Columns.POSITION].to_numpy(), matrix_to_ned)

@@ -12,8 +12,9 @@ from px4fuse.convention.motion import (
     integrate_inertial_data,
 )
 from px4fuse.core.arrays import Array
+from px4fuse.filter.signals import interpolate_attitude
 from px4fuse.flight.model import Columns, Flight, PositionTrack, Truth, Unavailable
-from px4fuse.trajectory.rotation import interpolate, to_matrix
+from px4fuse.trajectory.rotation import to_matrix
 from px4fuse.trajectory.scores import compute_autocorrelation_time
 
 # Minimum lever arm (m) that is reported: twice the noise of good UWB (0.1 m)
@@ -93,8 +94,7 @@ def _fit_lever_arm_to_truth(flight: Flight, truth: Truth, track: PositionTrack) 
     error_per_rotation_m = _rotate(true_positions_m - np.nanmean(true_positions_m, axis=0), 90.0)
     path_radius_m = max(float(np.sqrt(np.nanmean(error_per_rotation_m**2))), MIN_PATH_RADIUS_M)
     error_per_rotation_m /= path_radius_m
-    quaternions = attitude[Columns.QUATERNION].to_numpy()
-    rotation = to_matrix(interpolate(time_s, attitude.index.to_numpy(), quaternions))[:, :2, :2]
+    rotation = to_matrix(interpolate_attitude(attitude, time_s))[:, :2, :2]
     offset_columns = np.broadcast_to(np.eye(2), rotation.shape)
     motion_columns = np.stack([velocity_m_s, error_per_rotation_m], axis=2)
     design = np.concatenate([rotation, offset_columns, motion_columns], axis=2)
@@ -118,18 +118,24 @@ def _fit_lever_arm_to_truth(flight: Flight, truth: Truth, track: PositionTrack) 
     covariance = (
         np.linalg.inv(design_rows.T @ design_rows) * np.mean(residual_m**2) * variance_factor
     )
-    sigma_m = float(np.sqrt(np.trace(covariance[:2, :2])))
-    lever_arm = LeverArm(
-        float(fitted_parameters[0]),
-        float(fitted_parameters[1]),
-        sigma_m,
-        rotation_deg,
-        float(np.degrees(np.sqrt(covariance[5, 5]))) / path_radius_m,
-    )
+    lever_arm = _make_lever_arm(fitted_parameters, covariance, rotation_deg)
+    lever_arm = lever_arm._replace(rotation_sigma_deg=lever_arm.rotation_sigma_deg / path_radius_m)
     is_significant = lever_arm.horizontal_length_m > max(
-        MIN_LEVER_ARM_WITH_TRUTH_M, MIN_LEVER_ARM_SIGMAS_WITH_TRUTH * sigma_m
+        MIN_LEVER_ARM_WITH_TRUTH_M, MIN_LEVER_ARM_SIGMAS_WITH_TRUTH * lever_arm.sigma_m
     )
     return lever_arm if is_significant and lever_arm.horizontal_length_m < MAX_LEVER_ARM_M else None
+
+
+def _make_lever_arm(parameters: Array, covariance: Array, rotation_deg: float) -> LeverArm:
+    """Return the lever arm from the first two parameters; the last one is the rotation (rad)."""
+    forward_m, right_m = parameters[:2].tolist()
+    return LeverArm(
+        forward_m,
+        right_m,
+        float(np.sqrt(np.trace(covariance[:2, :2]))),
+        rotation_deg,
+        float(np.degrees(np.sqrt(covariance[-1, -1]))),
+    )
 
 
 def _rotate(vectors: Array, angle_deg: float) -> Array:
@@ -186,23 +192,12 @@ def _fit_lever_arm_to_imu(flight: Flight, track: PositionTrack) -> LeverArm | No
             * len(valid_second_difference_errors_m)
             / independent_difference_count
         )
-        lever_arm_sigma_m = float(np.sqrt(np.trace(covariance[:2, :2])))
         is_used &= residual_m < MAX_RESIDUAL_SIGMAS * sigma_m
         # The third parameter is the time (s) by which the timestamps are early
         time_s = time_s + fitted_parameters[2]
         rotation_deg += float(np.degrees(fitted_parameters[-1]))
     # The fit is relative to the IMU, the parameters are relative to the vehicle's origin
-    imu_position_m = find_imu_position_m(flight)
-    lever_arm = LeverArm(
-        float(fitted_parameters[0]) + imu_position_m[0],
-        float(fitted_parameters[1]) + imu_position_m[1],
-        lever_arm_sigma_m,
-        rotation_deg,
-        float(np.degrees(np.sqrt(covariance[-1, -1]))),
-    )
-    return (
-        lever_arm
-        if lever_arm.horizontal_length_m
-        > max(MIN_LEVER_ARM_M, MIN_LEVER_ARM_SIGMAS * lever_arm_sigma_m)
-        else None
-    )
+    fitted_parameters[:2] += find_imu_position_m(flight)[:2]
+    lever_arm = _make_lever_arm(fitted_parameters, covariance, rotation_deg)
+    min_length_m = max(MIN_LEVER_ARM_M, MIN_LEVER_ARM_SIGMAS * lever_arm.sigma_m)
+    return lever_arm if lever_arm.horizontal_length_m > min_length_m else None

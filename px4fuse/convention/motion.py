@@ -9,6 +9,7 @@ Subtraction of the running mean removes constant acceleration errors (tilt, bias
 """
 
 from dataclasses import dataclass, replace
+from functools import cached_property
 from itertools import pairwise
 
 import numpy as np
@@ -23,7 +24,7 @@ from px4fuse.core.arrays import (
     interpolate_columns,
 )
 from px4fuse.ekf2.replay import is_inside_spans
-from px4fuse.filter.signals import find_imu_gaps
+from px4fuse.filter.signals import find_imu_gaps, interpolate_attitude
 from px4fuse.flight.model import Columns, Flight, Unavailable
 from px4fuse.trajectory.association import choose_gap_limit_s, is_bracketed
 from px4fuse.trajectory.rotation import (
@@ -31,7 +32,6 @@ from px4fuse.trajectory.rotation import (
     cumulative_product,
     from_rotation_vector,
     heading,
-    interpolate,
     multiply,
     rotate,
     to_matrix,
@@ -130,14 +130,16 @@ class ImuSecondDifferences:
     is_valid : ndarray of bool, shape (n,)
     table : ndarray, shape (n, 3, 4)
         Second difference, and its derivatives with respect to the accelerometer bias (FRD, m/s²).
-    second_difference_derivative_m_s : ndarray, shape (n, 3)
-        Time derivative of the second difference.
     """
 
     time_s: Array
     is_valid: BoolArray
     table: Array
-    second_difference_derivative_m_s: Array
+
+    @cached_property
+    def second_difference_derivative_m_s(self) -> Array:
+        """Time derivative of the second difference, shape (n, 3)."""
+        return np.gradient(self.table[..., 0], GRID_INTERVAL_S, axis=0)
 
 
 def integrate_inertial_data(flight: Flight) -> InertialData | None:
@@ -159,7 +161,7 @@ def integrate_inertial_data(flight: Flight) -> InertialData | None:
         [np.interp(time_s, imu_times_s, integral) for integral in imu_integrals]
     ).T
     specific_force_m_s2 = imu_increments[:, :3] / INTEGRATION_STEP_S
-    logged_attitude = interpolate(time_s, attitude_times_s, attitude[Columns.QUATERNION].to_numpy())
+    logged_attitude = interpolate_attitude(attitude, time_s)
     gyro_attitude = _level_attitude(
         _integrate_gyros(imu_increments[:, 3:], logged_attitude), specific_force_m_s2
     )
@@ -277,13 +279,7 @@ def integrate_imu_motion(inertial_data: InertialData, attitude: Array) -> ImuSec
         is_valid &= (time_s < end - SECOND_DIFFERENCE_WINDOW_S) | (
             time_s > start + SECOND_DIFFERENCE_WINDOW_S
         )
-    high_pass_filtered = high_pass(second_differences, is_valid)
-    return ImuSecondDifferences(
-        time_s,
-        is_valid,
-        high_pass_filtered,
-        np.gradient(high_pass_filtered[..., 0], GRID_INTERVAL_S, axis=0),
-    )
+    return ImuSecondDifferences(time_s, is_valid, high_pass(second_differences, is_valid))
 
 
 def filter_imu_motion(
@@ -294,10 +290,7 @@ def filter_imu_motion(
     table = imu_motion.table.copy()
     for row in range(1, len(table)):
         table[row] += previous_output_weight * (table[row - 1] - table[row])
-    second_difference_derivative_m_s = np.gradient(table[..., 0], GRID_INTERVAL_S, axis=0)
-    return replace(
-        imu_motion, table=table, second_difference_derivative_m_s=second_difference_derivative_m_s
-    )
+    return replace(imu_motion, table=table)
 
 
 def replace_heading(attitude: Array, heading_rad: Array) -> Array:

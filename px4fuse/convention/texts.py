@@ -66,12 +66,6 @@ def describe_axes(
     title = f"The axes are not {stated_frame}"
     if frame_name:
         title = f"{frame_name} positions {'read' if is_file else 'sent'} as {stated_frame}"
-    elif z == "up" and is_mirrored:
-        title = "z points up"
-    elif axes == ("east", "north", "down"):
-        title = "x and y are exchanged"
-    elif y == "up":
-        title = "y points up"
     fault = f"{title}: x is {x}, y {y}, z {z}{' (left-handed frame)' if is_mirrored else ''}"
     source_axis_by_direction = dict(
         zip(append_opposites(axes), ("x", "y", "z", "-z", "-y", "-x"), strict=True)

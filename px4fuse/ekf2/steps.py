@@ -34,7 +34,8 @@ from px4fuse.ekf2.replay import (
     is_inside_spans,
     rows_inside,
 )
-from px4fuse.filter.kalman import KfRun, predict_state
+from px4fuse.filter.kalman import KfRun, predict_track
+from px4fuse.filter.model import STATE_COLUMNS
 from px4fuse.filter.settings import Settings
 from px4fuse.filter.signals import Segment
 from px4fuse.flight.ekf2_parameters import EV_POS, FLOW, GNSS_POS, GNSS_VEL, MAG
@@ -223,7 +224,9 @@ def explain_difference_by_replacements(
     for (axis, direction), axis_components in zip(
         directions.items(), np.swapaxes(components_by_track, 0, 1), strict=True
     ):
-        kf_state = predict_state(kf_runs[axis], state_times_s) if kf_runs else axis_components[0]
+        kf_state = axis_components[0]
+        if kf_runs:
+            kf_state = predict_track(kf_runs[axis], state_times_s)[STATE_COLUMNS].to_numpy().T
         explanations[axis] = _explain_difference_along_axis(
             model.flight,
             direction,

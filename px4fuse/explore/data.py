@@ -123,8 +123,8 @@ def _make_axis_inputs(axis: Axis, source_track: PositionTrack, encoder: ArrayEnc
     }
     if isinstance(axis.acceleration, Acceleration):
         axis_data |= {
-            "integral": encoder.add(axis.acceleration.compute_velocity_change_m_s()),
-            "rms": axis.acceleration.compute_rms_m_s2(),
+            "integral": encoder.add(axis.acceleration.compute_velocity_change_m_s(axis.direction)),
+            "rms": axis.acceleration.compute_rms_m_s2(axis.direction),
         }
     return axis_data
 

@@ -20,7 +20,7 @@ from px4fuse.core.record import (
     Share,
     Unavailable,
 )
-from px4fuse.core.text import format_count
+from px4fuse.filter.signals import report_too_few_measurements
 
 # Underconfident: the reported σ is too large. Overconfident: the reported σ is too small.
 SigmaVerdict = Literal["consistent", "underconfident", "overconfident"]
@@ -111,11 +111,8 @@ class Consistency(NisVerdict, kw_only=True):
         variance_m2 = innovation_variance_m2[is_usable]
         innovation_count = len(nu_m)
         if innovation_count < MIN_INNOVATIONS:
-            return Unavailable(
-                "consistency test",
-                f"the filter has only {format_count(innovation_count, 'innovation')} "
-                f"(at least {MIN_INNOVATIONS} are needed)",
-                "Analyse a longer segment, or log the source at a higher rate.",
+            return report_too_few_measurements(
+                "consistency test", innovation_count, MIN_INNOVATIONS
             )
         if np.ptp(nu_m) == 0.0:
             return Unavailable(

@@ -315,9 +315,7 @@ def convert_to_positions_and_increments(
     measurement_count = len(preintegrated_motion.measurement_m)
     prior_precision = np.zeros((measurement_count + 1, 2))
     prior_precision[0] = KNOWN_INITIAL_STATE_PRECISION
-    measured_m = np.append(
-        np.nan, preintegrated_motion.measurement_m - preintegrated_motion.initial_state.position_m
-    )[:, None]
+    measured_m = np.append(np.nan, preintegrated_motion.measurement_m)[:, None]
     dp, dv = np.zeros((2, 1, 1, 3, measurement_count))
     dp[0, 0, 0] = preintegrated_motion.delta_position_m
     dv[0, 0, 0] = preintegrated_motion.delta_velocity_m_s

@@ -141,7 +141,7 @@ def estimate_mean_acceleration_error(axis: Axis) -> float | None:
         or len(time_s) < MIN_MEASUREMENTS
     ):
         return None
-    velocity_m_s = acceleration.compute_velocity_change_m_s()
+    velocity_m_s = acceleration.compute_velocity_change_m_s(axis.direction)
     path_m = integrate_cumulatively(velocity_m_s, acceleration.time_s)
     residuals_m = axis.measurement_m - np.interp(time_s, acceleration.time_s, path_m)
     # the doubly integrated acceleration is too large by error · t² / 2
@@ -315,7 +315,7 @@ def _find_jumps(
 
 
 def _is_in_window(time_s: Array, start_s: float, duration_s: float) -> BoolArray:
-    return np.asarray((time_s >= start_s) & (time_s < start_s + duration_s))
+    return (time_s >= start_s) & (time_s < start_s + duration_s)
 
 
 def _find_significant_jump_times(
@@ -670,9 +670,8 @@ def make_design_matrix(
         )
     dp, dv = np.transpose(increments, (1, 2, 0))
     measured_m = np.zeros_like(dp)
-    # Positions are relative to the first measurement, which is KF's initial position
     measured_m[:, : INPUTS_PER_AXIS * len(axes) : INPUTS_PER_AXIS] = np.transpose(
-        [motion.measurement_m - motion.initial_state.position_m for motion in preintegrated_motions]
+        [motion.measurement_m for motion in preintegrated_motions]
     )
     preintegrated_inputs = replace(
         preintegrated_motions[0],
@@ -684,7 +683,6 @@ def make_design_matrix(
             [motion.process_noise_independent_of_sigma_a for motion in preintegrated_motions],
             axis=0,
         ),
-        initial_state=replace(preintegrated_motions[0].initial_state, position_m=0.0),
     )
     prior_sigma = np.full(
         CONSTANT_ERROR_COLUMN_COUNT + len(axes) * (slow_error_intervals + 1),
@@ -717,4 +715,4 @@ def _integrate_unit_errors(attitude: pd.DataFrame, acceleration: Acceleration) -
 
 def make_unit_steps(time_s: Array, starts_s: Iterable[float]) -> Array:
     """Return steps from 0 to 1 at the times ``starts_s``, shape (times, steps)."""
-    return np.asarray(time_s[:, None] >= np.fromiter(starts_s, float)[None, :], dtype=np.float64)
+    return (time_s[:, None] >= [*starts_s]).astype(np.float64)

@@ -20,7 +20,13 @@ import numpy as np
 import pandas as pd
 from scipy import constants
 
-from px4fuse.core.arrays import Array, IntArray, compute_median_interval_s, integrate_cumulatively
+from px4fuse.core.arrays import (
+    Array,
+    IntArray,
+    compute_median_interval_s,
+    integrate_cumulatively,
+    interpolate_columns,
+)
 from px4fuse.core.record import Span
 from px4fuse.filter.fitting import NoiseParameters, fit_with_sigma_ratios
 from px4fuse.filter.marginal_likelihood import (
@@ -473,15 +479,11 @@ def _estimate_large_gyro_bias(
     """
     if len(quaternions) < MIN_KEPT_MEASUREMENTS:
         return np.zeros(3)
-    gyro_angle_rad = np.column_stack(
-        [np.interp(attitude_time_s, step_times_s, column) for column in gyro_integral_rad.T]
-    )
+    gyro_angle_rad = interpolate_columns(attitude_time_s, step_times_s, gyro_integral_rad)
     rotation_difference_rad = np.diff(gyro_angle_rad, axis=0) - to_rotation_vector(
         multiply(conjugate(quaternions[:-1]), quaternions[1:])
     )
-    bias_rad_s = np.asarray(
-        np.median(rotation_difference_rad / np.diff(attitude_time_s)[:, None], axis=0)
-    )
+    bias_rad_s = np.median(rotation_difference_rad / np.diff(attitude_time_s)[:, None], axis=0)
     is_bias_removed = (
         MAX_PRIOR_GYRO_BIAS_RAD_S < np.abs(bias_rad_s).max() <= MAX_REMOVED_GYRO_BIAS_RAD_S
     )

@@ -18,10 +18,10 @@ from itertools import chain
 import numpy as np
 import pandas as pd
 
-from px4fuse.core.arrays import Array, BoolArray, IntArray
+from px4fuse.core.arrays import Array
 from px4fuse.core.record import one_line_repr
 from px4fuse.filter import model
-from px4fuse.filter.settings import InitialState, Settings
+from px4fuse.filter.settings import Settings
 from px4fuse.filter.signals import Axis
 from px4fuse.filter.steps import PredictionSteps, make_prediction_steps
 
@@ -64,15 +64,11 @@ class KfRun:
     __repr__ = one_line_repr
 
 
-def run_kf(
-    axis: Axis, settings: Settings, initial: InitialState | None = None, *, fast: bool = False
-) -> KfRun:
-    """Run KF along one axis.
+def run_kf(axis: Axis, settings: Settings, *, fast: bool = False) -> KfRun:
+    """Run KF along one axis. The initial position is the first measurement, the velocity is zero.
 
     Parameters
     ----------
-    initial : InitialState, optional
-        Default: the first measurement, with velocity zero.
     fast : bool
         True to compute with Python floats, for many re-runs (faster, equal results). By default,
         KF is computed with filterpy, as in the lesson.
@@ -82,17 +78,15 @@ def run_kf(
     SettingsError
         ``settings.input`` is "imu" and the axis has no acceleration.
     """
-    prediction_steps = make_prediction_steps(axis, settings, initial)
-    # By default, the first measurement is the initial state
-    initial_state = initial or InitialState(prediction_steps.time_s[0], axis.measurement_m[0])
+    prediction_steps = make_prediction_steps(axis, settings)
     run_filter = _run_with_floats if fast else _run_with_filterpy
+    position_m = axis.measurement_m.tolist()
     measurements_m = [
-        axis.measurement_m[index] if index >= 0 else None
-        for index in prediction_steps.measurement_index[1:]  # 0 is the initial state
+        position_m[index] if index >= 0 else None
+        for index in prediction_steps.measurement_index[1:].tolist()  # 0 is the initial state
     ]
-    position_m, velocity_m_s = initial_state.position_m, initial_state.velocity_m_s
-    first_row = (position_m, velocity_m_s, *model.INITIAL_COVARIANCE, *NO_UPDATE)
-    rows = run_filter(settings, initial_state, prediction_steps, measurements_m)
+    first_row = (position_m[0], 0.0, *model.INITIAL_COVARIANCE, *NO_UPDATE)
+    rows = run_filter(settings, position_m[0], prediction_steps, measurements_m)
     time_s, column_count = prediction_steps.time_s, len(STATE_TABLE_COLUMNS + UPDATE_TABLE_COLUMNS)
     # pandas needs twice the time for a list of tuples
     values = np.fromiter(
@@ -115,7 +109,7 @@ def run_kf(
 
 def _run_with_filterpy(
     settings: Settings,
-    initial_state: InitialState,
+    initial_position_m: float,
     prediction_steps: PredictionSteps,
     measurements_m: Sequence[float | None],
 ) -> Iterator[tuple[float, ...]]:
@@ -127,7 +121,7 @@ def _run_with_filterpy(
     from px4fuse.filter.filterpy_import import KalmanFilter  # noqa: PLC0415 - takes 0.1 s
 
     kalman = KalmanFilter(dim_x=2, dim_z=1, dim_u=1)
-    kalman.x = np.array([[initial_state.position_m], [initial_state.velocity_m_s]])
+    kalman.x = np.array([[initial_position_m], [0.0]])
     kalman.P = model.make_symmetric_matrix(model.INITIAL_COVARIANCE)
     kalman.H = np.array([[1.0, 0.0]])
     kalman.R = np.array([[settings.sigma_z_m**2]])
@@ -164,16 +158,12 @@ def _run_with_filterpy(
 
 def _run_with_floats(
     settings: Settings,
-    initial_state: InitialState,
+    initial_position_m: float,
     prediction_steps: PredictionSteps,
     measurements_m: Sequence[float | None],
 ) -> Iterator[tuple[float, ...]]:
     """Run KF with Python floats. Arguments and results are those of _run_with_filterpy."""
-    position, velocity, covariance = (
-        initial_state.position_m,
-        initial_state.velocity_m_s,
-        model.INITIAL_COVARIANCE,
-    )
+    position, velocity, covariance = initial_position_m, 0.0, model.INITIAL_COVARIANCE
     arrays = (
         np.diff(prediction_steps.time_s),
         prediction_steps.acceleration_m_s2,
@@ -196,48 +186,24 @@ def _run_with_floats(
         yield (position, velocity, *covariance, *update)
 
 
-def _find_previous_steps(run: KfRun, times_s: Array) -> tuple[IntArray, Array, BoolArray]:
-    """Find for each time the last step of KF before it.
-
-    Return its index, the time (s) since this step, and True for times outside KF's time span.
-    """
-    step_times_s = run.steps.index.to_numpy()
-    step_index = np.clip(
-        np.searchsorted(step_times_s, times_s, side="right") - 1, 0, len(step_times_s) - 1
-    )
-    return (
-        step_index,
-        times_s - step_times_s[step_index],
-        (times_s < step_times_s[0]) | (times_s > step_times_s[-1]),
-    )
-
-
-def predict_state(run: KfRun, times_s: Array) -> Array:
-    """Predict position (m) and velocity (m/s) at each time from KF's last step before it.
+def predict_track(run: KfRun, times_s: Array) -> pd.DataFrame:
+    """Predict state and covariance at each time from KF's last step before it.
 
     Interpolation would use later measurements. Times outside the time span of KF give NaN.
     """
-    step_index, elapsed_s, is_outside = _find_previous_steps(run, times_s)
-    position, velocity, acceleration = (
-        run.steps[column].to_numpy()[step_index]
-        for column in (*model.STATE_COLUMNS, "acceleration_m_s2")
+    step_times_s = run.steps.index.to_numpy()
+    is_inside = (times_s >= step_times_s[0]) & (times_s <= step_times_s[-1])
+    step_index = np.clip(np.searchsorted(step_times_s, times_s, side="right") - 1, 0, None)
+    position, velocity, p00, p01, p11, acceleration, imu_gap_variance_m2_s4 = run.steps.to_numpy()[
+        step_index
+    ].T
+    position, velocity, covariance = model.predict_step(
+        position,
+        velocity,
+        (p00, p01, p11),
+        acceleration,
+        run.settings.compute_noise_density(imu_gap_variance_m2_s4),
+        np.where(is_inside, times_s - step_times_s[step_index], np.nan),
     )
-    state = model.propagate_state(position, velocity, acceleration, elapsed_s)
-    return np.where(is_outside, np.nan, state)
-
-
-def predict_variance(run: KfRun, times_s: Array) -> Array:
-    """Return the variances (m², m²/s²) of position and velocity from :func:`predict_state`."""
-    step_index, elapsed_s, is_outside = _find_previous_steps(run, times_s)
-    p00, p01, p11 = run.steps[model.COVARIANCE_COLUMNS].to_numpy()[step_index].T
-    imu_gap_variance_m2_s4 = run.steps["imu_gap_variance_m2_s4"].to_numpy()[step_index]
-    noise_density = run.settings.compute_noise_density(imu_gap_variance_m2_s4)
-    position_variance_m2, _, velocity_variance_m2_s2 = model.propagate_covariance(
-        (p00, p01, p11), elapsed_s
-    )
-    q00, _, q11 = model.compute_process_noise_per_density(elapsed_s)
-    return np.where(
-        is_outside,
-        np.nan,
-        (position_variance_m2 + noise_density * q00, velocity_variance_m2_s2 + noise_density * q11),
-    )
+    track = np.transpose([position, velocity, *covariance])
+    return pd.DataFrame(track, times_s, STATE_TABLE_COLUMNS)

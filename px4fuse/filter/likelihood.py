@@ -4,8 +4,6 @@ The acceleration is first integrated between measurements, which is faster. If a
 1e-3, the innovations equal those of :mod:`px4fuse.filter.kalman` to 1e-9.
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from dataclasses import dataclass
 from functools import cache
@@ -24,7 +22,7 @@ from px4fuse.filter.model import (
     propagate_state,
     update_step,
 )
-from px4fuse.filter.settings import InitialState, Settings
+from px4fuse.filter.settings import Settings
 from px4fuse.filter.signals import Axis
 from px4fuse.filter.steps import PredictionSteps, make_prediction_steps
 
@@ -52,6 +50,8 @@ class PreintegratedMotion:
         Δp and Δv in each interval due to the acceleration.
     process_noise_per_sigma_a_squared, process_noise_independent_of_sigma_a : ndarray, shape (m, 3)
         Q / SIGMA_A² of each interval, and additional Q in IMU gaps: elements 00, 01, 11.
+    measurement_m : ndarray
+        Positions relative to the first measurement, which is KF's initial position.
     """
 
     interval_s: Array
@@ -60,7 +60,6 @@ class PreintegratedMotion:
     process_noise_per_sigma_a_squared: Array
     process_noise_independent_of_sigma_a: Array
     measurement_m: Array
-    initial_state: InitialState
 
 
 def preintegrate(axis: Axis, settings: Settings) -> PreintegratedMotion:
@@ -96,8 +95,8 @@ def preintegrate(axis: Axis, settings: Settings) -> PreintegratedMotion:
         process_noise_independent_of_sigma_a=sum_by_interval(
             process_noise_per_sigma_a_squared * prediction_steps.imu_gap_variance_m2_s4[:, None]
         ),
-        measurement_m=axis.measurement_m[prediction_steps.measurement_index[last_steps]],
-        initial_state=InitialState(float(step_times_s[0]), float(axis.measurement_m[0])),
+        measurement_m=axis.measurement_m[prediction_steps.measurement_index[last_steps]]
+        - axis.measurement_m[0],
     )
 
 
@@ -220,11 +219,6 @@ def compute_innovations_with_gains(
     right_hand_side[..., 1] = preintegrated_motion.delta_velocity_m_s.T
     right_hand_side[..., 1:, 0] += position_gain * measured_m[..., :-1]
     right_hand_side[..., 1:, 1] += k1[:-1] * measured_m[..., :-1]
-    initial_state = preintegrated_motion.initial_state
-    right_hand_side[..., 0, 0] += (
-        initial_state.position_m + preintegrated_motion.interval_s[0] * initial_state.velocity_m_s
-    )
-    right_hand_side[..., 0, 1] += initial_state.velocity_m_s
     bands = np.zeros((len(k0), 2, 4))
     bands[:-1, 1, 1] = -dt
     bands[:-1, 0, 2] = position_gain - 1.0

@@ -228,7 +228,7 @@ class PositionFit:
 
     def compute_constants_information(self) -> Array:
         """Return information matrices of the constant errors, shape (segments, offsets, c, c)."""
-        return np.asarray(self.gram_matrix[..., 1:, 1:] + np.diag(self.constant_prior_sigmas**-2.0))
+        return self.gram_matrix[..., 1:, 1:] + np.diag(self.constant_prior_sigmas**-2.0)
 
     def estimate_segment_constants(self) -> Array:
         """Return the estimated constant errors, shape (segments, time offsets, c)."""

@@ -103,12 +103,3 @@ def requested_settings(request: ComparisonRequest) -> Settings:
     if request.clock_offset_s == AUTO or request.position is not None:
         del values["clock_offset_s"]
     return Settings(**{name: value for name, value in values.items() if value is not None})
-
-
-@dataclass(frozen=True)
-class InitialState:
-    """Initial state of KF: time (s), position (m) and velocity (m/s)."""
-
-    time_s: float
-    position_m: float
-    velocity_m_s: float = 0.0

@@ -11,11 +11,11 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 import pandas as pd
-from numpy.typing import ArrayLike
 from scipy import constants
 
 from px4fuse.core.arrays import (
     Array,
+    ArrayPair,
     BoolArray,
     compute_median_interval_s,
     integrate_cumulatively,
@@ -70,17 +70,15 @@ class Segment:
 
 @dataclass(frozen=True)
 class Acceleration:
-    """Acceleration along one axis, the input of KF.
+    """Acceleration in NED without gravity; its component along an axis is the input of KF.
 
     Attributes
     ----------
     time_s : ndarray, shape (n,)
     acceleration_integral_m_s : ndarray, shape (3, n)
-        Velocity change (NED) since the first IMU sample, without gravity.
+        Velocity change since the first IMU sample.
     acceleration_products_m2_s4 : ndarray, shape (3, 3)
-        Mean products of the acceleration components (NED) in the segment.
-    direction : ndarray, shape (3,)
-        Unit vector of the axis in NED.
+        Mean products of the acceleration components in the segment.
     gap_edge_time_s : ndarray, shape (k,)
         Start and end of each IMU gap.
     cumulative_gap_s : ndarray, shape (k,)
@@ -90,19 +88,18 @@ class Acceleration:
     time_s: Array
     acceleration_integral_m_s: Array
     acceleration_products_m2_s4: Array
-    direction: Array
     gap_edge_time_s: Array
     cumulative_gap_s: Array
 
     __repr__ = one_line_repr
 
-    def compute_velocity_change_m_s(self) -> Array:
-        """Return the velocity change (m/s) along the axis since the first sample, shape (n,)."""
-        return np.asarray(self.direction @ self.acceleration_integral_m_s)
+    def compute_velocity_change_m_s(self, direction: Array) -> Array:
+        """Return the velocity change (m/s) along a unit vector since the first sample."""
+        return direction @ self.acceleration_integral_m_s
 
-    def compute_rms_m_s2(self) -> float:
-        """Return the RMS acceleration (m/s²) along the axis in the segment."""
-        return float(np.sqrt(self.direction @ self.acceleration_products_m2_s4 @ self.direction))
+    def compute_rms_m_s2(self, direction: Array) -> float:
+        """Return the RMS acceleration (m/s²) along a unit vector in the segment."""
+        return float(np.sqrt(direction @ self.acceleration_products_m2_s4 @ direction))
 
 
 @dataclass(frozen=True)
@@ -163,6 +160,12 @@ def imu_and_attitude(flight: Flight) -> tuple[pd.DataFrame, pd.DataFrame] | Unav
     return imu, attitude
 
 
+def interpolate_attitude(attitude: pd.DataFrame, time_s: Array) -> Array:
+    """Return the attitude quaternions (w, x, y, z) at other times (s)."""
+    quaternions = attitude[Columns.QUATERNION].to_numpy()
+    return interpolate(time_s, attitude.index.to_numpy(), quaternions)
+
+
 def compute_ned_acceleration(flight: Flight) -> pd.DataFrame | Unavailable:
     """Return the acceleration in NED without gravity (m/s²) for each IMU sample.
 
@@ -171,11 +174,7 @@ def compute_ned_acceleration(flight: Flight) -> pd.DataFrame | Unavailable:
     if isinstance(imu_with_attitude := imu_and_attitude(flight), Unavailable):
         return imu_with_attitude
     imu, attitude = imu_with_attitude
-    attitude_of_samples = interpolate(
-        imu.index.to_numpy(),
-        attitude.index.to_numpy(),
-        attitude[Columns.QUATERNION].to_numpy(),
-    )
+    attitude_of_samples = interpolate_attitude(attitude, imu.index.to_numpy())
     specific_force_m_s2 = imu[Columns.SPECIFIC_FORCE].to_numpy()
     acceleration = np.empty(specific_force_m_s2.shape)
     for rows in iterate_row_blocks(len(imu)):
@@ -228,7 +227,7 @@ def make_axes(
     SettingsError
         An axis has an unknown name, or the heading is not between 0 and 360.
     """
-    acceleration = project_acceleration(compute_ned_acceleration(flight), np.zeros(3), segment)
+    acceleration = integrate_ned_acceleration(compute_ned_acceleration(flight), segment)
     valid_names = (*AXIS_NAMES, AISLE)
     axis_names = tuple(dict.fromkeys(valid_names if names is None else names))
     if heading_deg is not None and not 0.0 <= heading_deg <= 360.0:
@@ -262,9 +261,7 @@ def make_axes(
                 note,
                 track_samples.index.to_numpy()[is_finite],
                 projected[is_finite],
-                acceleration
-                if isinstance(acceleration, Unavailable)
-                else replace(acceleration, direction=direction),
+                acceleration,
             )
         )
     if not axes:
@@ -276,18 +273,13 @@ def make_horizontal_axis(north_and_east: Sequence[Axis], heading_deg: float) -> 
     """Combine the axes north and east to a horizontal axis with another heading."""
     north, east = north_and_east
     angle_rad = np.radians(heading_deg)
-    direction = np.cos(angle_rad) * north.direction + np.sin(angle_rad) * east.direction
-    acceleration = north.acceleration
+    cosine, sine = np.cos(angle_rad), np.sin(angle_rad)
     return replace(
         north,
         name=f"{heading_deg % 180.0:.0f}° from north",
-        direction=direction,
+        direction=cosine * north.direction + sine * east.direction,
         heading_deg=heading_deg,
-        measurement_m=np.cos(angle_rad) * north.measurement_m
-        + np.sin(angle_rad) * east.measurement_m,
-        acceleration=acceleration
-        if isinstance(acceleration, Unavailable)
-        else replace(acceleration, direction=direction),
+        measurement_m=cosine * north.measurement_m + sine * east.measurement_m,
     )
 
 
@@ -325,20 +317,18 @@ def _choose_axis_direction(
     if name != AISLE:
         axis_index = AXIS_NAMES.index(name)
         return np.eye(3)[axis_index], (None if name == "down" else 90.0 * axis_index), ""
+    note = "heading chosen with --heading"
     if heading_deg is None:
-        axis_heading_deg, elongation = estimate_aisle_heading(track, segment)
+        heading_deg, elongation = estimate_aisle_heading(track, segment)
         note = f"main direction of the track (ratio of length to width: {elongation:.1f})"
-    else:
-        axis_heading_deg = heading_deg
-        note = "heading chosen with --heading"
-    angle_rad = np.radians(axis_heading_deg)
-    return np.array([np.cos(angle_rad), np.sin(angle_rad), 0.0]), axis_heading_deg, note
+    angle_rad = np.radians(heading_deg)
+    return np.array([np.cos(angle_rad), np.sin(angle_rad), 0.0]), heading_deg, note
 
 
-def project_acceleration(
-    acceleration: pd.DataFrame | Unavailable, direction: Array, segment: Segment
+def integrate_ned_acceleration(
+    acceleration: pd.DataFrame | Unavailable, segment: Segment
 ) -> Acceleration | Unavailable:
-    """Project the acceleration (m/s², NED) onto a unit vector, and integrate it."""
+    """Integrate the acceleration (m/s², NED) of the whole flight."""
     if isinstance(acceleration, Unavailable):
         return acceleration
     time_s = acceleration.index.to_numpy()
@@ -366,7 +356,6 @@ def project_acceleration(
         acceleration_products_m2_s4=segment_acceleration_m_s2.T
         @ segment_acceleration_m_s2
         / len(segment_acceleration_m_s2),
-        direction=direction,
         gap_edge_time_s=time_s[gap_edge_rows],
         cumulative_gap_s=np.append(0.0, gap_sum_s)[gap_edge_rows],
     )
@@ -379,17 +368,17 @@ def find_imu_gaps(time_s: Array) -> BoolArray:
 
 
 def compute_mean_step_acceleration(
-    acceleration: Acceleration, step_edges_s: ArrayLike
-) -> tuple[Array, Array]:
-    """Return the mean acceleration of each prediction step, and its fraction in IMU gaps.
+    acceleration: Acceleration, direction: Array, step_edges_s: Array
+) -> ArrayPair:
+    """Return the mean acceleration of each prediction step, and the fraction of it in IMU gaps.
 
-    ``step_edges_s`` contains the start of the first step, and the end (s) of each step.
+    ``direction`` is a unit vector in NED. ``step_edges_s`` contains the start of the first step,
+    and the end (s) of each step.
     """
-    step_edges_s = np.asarray(step_edges_s, dtype=np.float64)
     step_s = np.diff(step_edges_s)
     velocity_m_s = np.zeros(len(step_edges_s))
     for component, integral_m_s in zip(
-        acceleration.direction, acceleration.acceleration_integral_m_s, strict=True
+        direction, acceleration.acceleration_integral_m_s, strict=True
     ):
         if component != 0.0:
             velocity_m_s += component * np.interp(step_edges_s, acceleration.time_s, integral_m_s)

@@ -6,7 +6,7 @@ import numpy as np
 
 from px4fuse.core.arrays import Array, IntArray
 from px4fuse.errors import SettingsError
-from px4fuse.filter.settings import InitialState, Settings
+from px4fuse.filter.settings import Settings
 from px4fuse.filter.signals import Axis, compute_mean_step_acceleration
 from px4fuse.flight.model import Unavailable
 
@@ -39,18 +39,18 @@ class PredictionSteps:
     input_gap_s: float
 
 
-def make_prediction_steps(
-    axis: Axis, settings: Settings, initial_state: InitialState | None = None
-) -> PredictionSteps:
+def make_prediction_steps(axis: Axis, settings: Settings) -> PredictionSteps:
     """Return the prediction steps of KF along an axis.
+
+    The first measurement is the initial state.
 
     Raises
     ------
     SettingsError
         ``settings.input`` is "imu" and the axis has no acceleration, or no measurement is later
-        than the initial state.
+        than the first one.
     """
-    start_s = axis.measurement_time_s[0] if initial_state is None else initial_state.time_s
+    start_s = axis.measurement_time_s[0]
     is_usable = axis.measurement_time_s > start_s + MAX_EQUAL_TIME_DIFFERENCE_S
     measurement_time_s = axis.measurement_time_s[is_usable]
     if not len(measurement_time_s):
@@ -78,7 +78,9 @@ def make_prediction_steps(
             f"The setting `input` is imu, but the axis {axis.name} has no IMU acceleration.",
             f"{axis.acceleration}",
         )
-    mean_acceleration_m_s2, gap_fraction = compute_mean_step_acceleration(axis.acceleration, time_s)
+    mean_acceleration_m_s2, gap_fraction = compute_mean_step_acceleration(
+        axis.acceleration, axis.direction, time_s
+    )
     gap_s = gap_fraction * np.diff(time_s)
     # Unlike white noise, the unknown acceleration is constant in an IMU gap of T seconds. This
     # increases the velocity variance by the factor T/DT
@@ -88,7 +90,7 @@ def make_prediction_steps(
     gap_duration_in_interval_s = np.bincount(interval_index, weights=gap_s)[interval_index]
     gap_variance_factor = np.maximum(gap_duration_in_interval_s / settings.dt_s, 1.0)
     imu_gap_variance_m2_s4 = (
-        gap_fraction * gap_variance_factor * axis.acceleration.compute_rms_m_s2() ** 2
+        gap_fraction * gap_variance_factor * axis.acceleration.compute_rms_m_s2(axis.direction) ** 2
     )
     return PredictionSteps(
         time_s,

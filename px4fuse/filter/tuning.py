@@ -66,6 +66,10 @@ class NoiseEstimate(Record):
         low, high = interval or (0.0, None)
         return cls(value, low or None, high)
 
+    def value_or_bound(self, fallback: float) -> float:
+        """Return the estimate, else its upper bound, else ``fallback``."""
+        return self.value or self.high or fallback
+
     def as_fields(self, name: str) -> dict[str, Any]:
         """Return the estimate as two fields of :class:`AxisTuning`: value and 95 % interval.
 
@@ -279,7 +283,7 @@ def tune_axes(
             "Reduce the outliers of the positioning system.",
         )
     sigma_a, sigma_z = (_estimate_noise(best_fit, noise_index) for noise_index in (0, 1))
-    final_sigma_z_m = sigma_z.value or sigma_z.high or best_fit.noise_parameters.sigma_z_m
+    final_sigma_z_m = sigma_z.value_or_bound(best_fit.noise_parameters.sigma_z_m)
     kf_sigma_a = (
         sigma_a if imu_motion_fit is None else _estimate_kf_sigma_a(kf_fit, final_sigma_z_m)
     )
@@ -287,7 +291,7 @@ def tune_axes(
         # Without estimates of biases and tilt, KF's SIGMA_A is an upper bound of the noise
         sigma_a = NoiseEstimate(None, None, kf_sigma_a.high)
     final_parameters = NoiseParameters(
-        kf_sigma_a.value or kf_sigma_a.high or kf_fit.noise_parameters.sigma_a_m_s2, final_sigma_z_m
+        kf_sigma_a.value_or_bound(kf_fit.noise_parameters.sigma_a_m_s2), final_sigma_z_m
     )
     log_likelihood_gain_nats = kf_fit.score(current_parameters) - kf_fit.score(final_parameters)
     return AxisTuning(

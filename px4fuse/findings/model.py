@@ -119,9 +119,7 @@ def finding(
     spans_s: tuple[Span, ...] = (),
 ) -> Finding:
     """Make a finding with the id ``name``; its title is the first sentence of the message."""
-    # Axis names stay lower case at the beginning of a message: "x and y are exchanged"
-    if message[1:2] != " ":
-        message = capitalise_first(message)
+    message = capitalise_first(message)
     title = message.partition(". ")[0].removesuffix(".")
     return Finding(name, severity, message, remedy, evidence, title, spans_s=spans_s)
 

@@ -11,7 +11,7 @@ from px4fuse.core.record import Span
 from px4fuse.core.text import format_metres
 from px4fuse.ekf2.aids import MAX_TIME_WITHOUT_FUSION_S
 from px4fuse.ekf2.fusion_conditions import EV_START_INTERVAL_S
-from px4fuse.filter.kalman import predict_state, predict_variance
+from px4fuse.filter.kalman import predict_track
 from px4fuse.finding import Finding, Severity
 from px4fuse.findings.model import (
     Findings,
@@ -169,7 +169,7 @@ def _find_ekf2_errors_at_end(analysis: Analysis, span_s: Span) -> dict[str, floa
 
 def describe_errors_after_gap(analysis: Analysis, gap_span_s: Span) -> str:
     """Describe the position errors of KF and EKF2 at the end of a gap."""
-    result, (start_s, end_s) = analysis.main, gap_span_s
+    result, end_s = analysis.main, gap_span_s[1]
     axis, ekf2, ekf2_state = result.axis, analysis.flight.ekf2, result.ekf2_state
     reference_m = float(axis.measurement_m[np.searchsorted(axis.measurement_time_s, end_s)])
     quantity = "Distance from the estimate to the first position after the gap,"
@@ -194,9 +194,9 @@ def describe_errors_after_gap(analysis: Analysis, gap_span_s: Span) -> str:
             )
             ekf2_text += f" (σ {format_metres(variance_m2**0.5)} m)"
         ekf2_text += ", "
-    times_s = np.array([start_s, end_s - TIME_BEFORE_UPDATE_S])
-    kf_error_m = abs(predict_state(result.kf_run, times_s)[0][1] - reference_m)
-    kf_sigma_m = predict_variance(result.kf_run, times_s)[0][1] ** 0.5
+    kf_track = predict_track(result.kf_run, np.array([end_s - TIME_BEFORE_UPDATE_S])).iloc[0]
+    kf_error_m = abs(kf_track["position_m"] - reference_m)
+    kf_sigma_m = kf_track["position_variance_m2"] ** 0.5
     return (
         f"{aiding_sentence} {quantity} along {axis.label}: {ekf2_text}KF "
         f"{format_metres(kf_error_m)} m (σ {format_metres(kf_sigma_m)} m)."

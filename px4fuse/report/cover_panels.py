@@ -10,14 +10,11 @@ import pandas as pd
 
 from px4fuse.analysis import Analysis
 from px4fuse.card.model import Card
-from px4fuse.comparison.comparison import (
-    compute_position_errors,
-    interpolate_sigma,
-    sample_kf_run,
-)
+from px4fuse.comparison.comparison import compute_position_errors, interpolate_sigma
 from px4fuse.comparison.model import FILTER_NAMES, AxisComparison, select_north_and_east
 from px4fuse.core.arrays import Array
 from px4fuse.core.text import format_metres, format_ratio
+from px4fuse.filter.kalman import predict_track
 from px4fuse.filter.signals import AISLE, cut_to_segment
 from px4fuse.flight.model import Ekf2, Truth
 from px4fuse.report import event_marks, style
@@ -118,11 +115,11 @@ def _make_error_plots(analysis: Analysis, card: Card) -> list[TimePlot]:
             plots.append((title, rmse_m, errors["error_m"], {label: errors["sigma_m"]}))
     if not plots and isinstance(result.ekf2_state, pd.DataFrame):
         time_s = result.ekf2_state.index.to_numpy()
-        state, variance = sample_kf_run(result.kf_run, time_s)
-        difference_m = state["position_m"] - result.ekf2_state["position_m"]
+        kf_track = predict_track(result.kf_run, time_s)
+        difference_m = kf_track["position_m"] - result.ekf2_state["position_m"]
         sigmas_m = {
             name: pd.Series(interpolate_sigma(time_s, table, "position_variance_m2"), time_s)
-            for name, table in (("KF", variance), ("EKF2", result.ekf2_variance))
+            for name, table in (("KF", kf_track), ("EKF2", result.ekf2_variance))
         }
         difference_rms_m = effect.difference_rms_m if effect else None
         if difference_m.notna().any():

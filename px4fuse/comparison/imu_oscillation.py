@@ -4,10 +4,10 @@ from typing import NamedTuple
 
 import numpy as np
 
+from px4fuse.comparison.model import PreparedComparison
 from px4fuse.core.arrays import compute_median_interval_s, integrate_cumulatively
 from px4fuse.filter.frame_rotation import heading_rad
-from px4fuse.filter.signals import Acceleration, Segment, cut_to_segment
-from px4fuse.flight.model import Columns, PositionTrack, TableOrUnavailable, Unavailable
+from px4fuse.flight.model import Columns, Unavailable
 
 MIN_POSITIONS = 100
 # Tested frequencies (Hz), and maximum as fraction of the position rate
@@ -28,18 +28,14 @@ class ImuOscillation(NamedTuple):
     amplitude_m_s2: float
 
 
-def find_imu_oscillation(
-    acceleration: Acceleration | Unavailable,
-    attitude: TableOrUnavailable,
-    source: PositionTrack,
-    segment: Segment,
-) -> ImuOscillation | None:
+def find_imu_oscillation(comparison: PreparedComparison) -> ImuOscillation | None:
     """Find an oscillation of the horizontal acceleration that the positions do not contain.
 
     Second differences of the positions are compared with those of the doubly integrated
     acceleration, in axes that turn with the heading. Complex numbers are north + i east.
     """
-    samples = cut_to_segment(source.samples, segment)[Columns.POSITION[:2]].dropna()
+    acceleration, attitude = comparison.input_axes[0].acceleration, comparison.flight.attitude
+    samples = comparison.source_samples[Columns.POSITION[:2]].dropna()
     if isinstance(acceleration, Unavailable) or isinstance(attitude, Unavailable):
         return None
     if len(samples) < MIN_POSITIONS:
