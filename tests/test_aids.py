@@ -20,7 +20,7 @@ from px4fuse.errors import MissingDataError
 from px4fuse.findings import aids as aids_detector
 from px4fuse.findings import ekf2_state, find_aid_findings
 from px4fuse.findings.aids import detect_aid_faults
-from px4fuse.findings.cause_grouping import CAUSE_KEY, INNOVATION_CHANGE_CAUSE, SOURCE_SENSOR_CAUSE
+from px4fuse.findings.model import CAUSE_KEY, INNOVATION_CHANGE_CAUSE, SOURCE_SENSOR_CAUSE
 from px4fuse.flight.ekf2_parameters import AIDS
 from px4fuse.flight.model import AidLog, Ekf2, Flight, Unavailable
 from px4fuse.readers import read_log

@@ -60,9 +60,10 @@ from px4fuse.findings import (
     source_positions,
     source_stamps,
 )
-from px4fuse.findings.cause_grouping import SOURCE_GAP_CAUSE, UNKNOWN_CAUSE
 from px4fuse.findings.model import (
+    SOURCE_GAP_CAUSE,
     SOURCE_TEXTS,
+    UNKNOWN_CAUSE,
     compute_flag_fraction,
     find_spans_with_value,
     make_zero_length_spans,

@@ -35,8 +35,8 @@ from px4fuse.convention.model import Convention, OrientationConvention
 from px4fuse.filter.settings import Settings
 from px4fuse.filter.tuning import NoiseEstimate
 from px4fuse.findings import cause_text, hidden_errors, loops, noises
-from px4fuse.findings.cause_grouping import group_by_cause
 from px4fuse.findings.ekf2_settings import detect_wrong_noise
+from px4fuse.findings.model import group_by_cause
 from px4fuse.findings.noises import _has_default_noises
 from px4fuse.flight.ekf2_parameters import EV_POS, GNSS_POS, PARAMETERS
 from px4fuse.flight.model import AS_RECEIVED_ORIGIN, GNSS_ORIGIN

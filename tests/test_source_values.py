@@ -29,8 +29,7 @@ from px4fuse.findings import (
     source_stamps,
     source_values,
 )
-from px4fuse.findings.cause_grouping import group_by_cause
-from px4fuse.findings.model import finding
+from px4fuse.findings.model import finding, group_by_cause
 from px4fuse.flight.model import REPEATED_TIMESTAMPS_NOTE, ClockMap, Columns, Flight, Unavailable
 from px4fuse.readers import read_log
 from px4fuse.readers.common import classify_invalid_positions, estimate_rounding_step

@@ -28,9 +28,8 @@ from px4fuse.core.text import lowercase_first_letter, with_log_name
 from px4fuse.filter.consistency import classify_sigma_ratio
 from px4fuse.filter.tuning import HORIZONTAL, AxisTuning
 from px4fuse.finding import Finding
-from px4fuse.findings.cause_grouping import WRONG_CONVENTION_KEY
 from px4fuse.findings.cause_text import format_sender_action
-from px4fuse.findings.model import FINDING_CATALOGUE
+from px4fuse.findings.model import FINDING_CATALOGUE, WRONG_CONVENTION_KEY
 from px4fuse.flight.ekf2_parameters import PARAMETERS
 from px4fuse.flight.model import PositionTrack, Unavailable
 from px4fuse.request import COMPARISON_OPTIONS, ComparisonRequest, command_line

@@ -31,8 +31,7 @@ from px4fuse.findings import (
     source_stamps,
     source_values,
 )
-from px4fuse.findings.cause_grouping import group_by_cause
-from px4fuse.findings.model import make_warning
+from px4fuse.findings.model import group_by_cause, make_warning
 from px4fuse.flight.model import Ekf2, Flight
 from px4fuse.loop.model import Loop
 from px4fuse.readers.px4_positions import NO_FIX_ACTION

@@ -12,8 +12,16 @@ from px4fuse.core.text import format_number, format_ratio
 from px4fuse.ekf2.aids import INNOVATION_MEAN_WINDOW_S, AidResult
 from px4fuse.filter.signals import cut_to_segment
 from px4fuse.finding import Finding
-from px4fuse.findings.cause_grouping import CAUSE_KEY, INNOVATION_CHANGE_CAUSE, SOURCE_SENSOR_CAUSE
-from px4fuse.findings.model import Findings, finding, format_percent, make_note, make_warning
+from px4fuse.findings.model import (
+    CAUSE_KEY,
+    INNOVATION_CHANGE_CAUSE,
+    SOURCE_SENSOR_CAUSE,
+    Findings,
+    finding,
+    format_percent,
+    make_note,
+    make_warning,
+)
 from px4fuse.flight.ekf2_parameters import AIDS, BAROMETER, MAG
 from px4fuse.flight.model import BAD_ACCELERATION_FLAG, Unavailable
 

@@ -25,9 +25,10 @@ from px4fuse.core.text import format_factor, format_metres, format_ratio
 from px4fuse.filter.consistency import Consistency
 from px4fuse.filter.tuning import HORIZONTAL, AxisTuning
 from px4fuse.finding import Finding
-from px4fuse.findings.cause_grouping import CAUSE_KEY, REPORTED_VARIANCE_USED_BY_EKF2_CAUSE
 from px4fuse.findings.cause_text import format_action
 from px4fuse.findings.model import (
+    CAUSE_KEY,
+    REPORTED_VARIANCE_USED_BY_EKF2_CAUSE,
     Findings,
     find_source_texts,
     finding,

@@ -12,8 +12,10 @@ from px4fuse.comparison.model import ErrorsAgainstTruth
 from px4fuse.core.record import Span
 from px4fuse.core.text import format_metres
 from px4fuse.filter.signals import Segment, cut_to_segment
-from px4fuse.findings.cause_grouping import CAUSE_KEY, SOURCE_GAP_CAUSE, UNKNOWN_CAUSE
 from px4fuse.findings.model import (
+    CAUSE_KEY,
+    SOURCE_GAP_CAUSE,
+    UNKNOWN_CAUSE,
     Findings,
     compute_flag_fraction,
     find_spans_with_value,

@@ -24,10 +24,10 @@ from px4fuse.core.text import capitalise_first, format_metres, format_ratio
 from px4fuse.errors import TrajectoryError
 from px4fuse.filter.tuning import HORIZONTAL, AxisTuning
 from px4fuse.finding import Finding
-from px4fuse.findings.cause_grouping import CAUSE_KEY
 from px4fuse.findings.cause_text import classify_cause, format_action, rerun_refutes_cause
 from px4fuse.findings.loops import find_usable_loop
 from px4fuse.findings.model import (
+    CAUSE_KEY,
     Findings,
     find_source_texts,
     finding,

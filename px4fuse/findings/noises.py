@@ -28,7 +28,6 @@ from px4fuse.filter.settings import SETTING_RANGES, Settings
 from px4fuse.filter.signals import cut_to_segment
 from px4fuse.filter.tuning import HORIZONTAL, AxisTuning, NoiseEstimate
 from px4fuse.finding import SEVERITIES, Finding, Severity
-from px4fuse.findings.cause_grouping import CAUSE_KEY, MEASUREMENT_NOISE_CAUSE, UNKNOWN_CAUSE
 from px4fuse.findings.cause_text import (
     classify_cause,
     format_action,
@@ -36,7 +35,15 @@ from px4fuse.findings.cause_text import (
     rerun_refutes_cause,
 )
 from px4fuse.findings.hidden_errors import find_hidden_errors
-from px4fuse.findings.model import Findings, finding, lower_severity, make_error
+from px4fuse.findings.model import (
+    CAUSE_KEY,
+    MEASUREMENT_NOISE_CAUSE,
+    UNKNOWN_CAUSE,
+    Findings,
+    finding,
+    lower_severity,
+    make_error,
+)
 from px4fuse.findings.source_positions import has_little_motion
 from px4fuse.flight.ekf2_parameters import BAROMETER, EV_POS, GNSS_POS, PARAMETERS
 from px4fuse.flight.model import Columns, Unavailable, sample_rate

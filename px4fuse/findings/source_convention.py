@@ -26,10 +26,11 @@ from px4fuse.convention.texts import (
     format_delay,
 )
 from px4fuse.finding import Finding
-from px4fuse.findings.cause_grouping import RESET_TIME_KEY, WRONG_CONVENTION_KEY
 from px4fuse.findings.model import (
     FINDING_CATALOGUE,
     NO_ESTIMATES_SENTENCE,
+    RESET_TIME_KEY,
+    WRONG_CONVENTION_KEY,
     Findings,
     make_error,
     make_warning,

@@ -12,8 +12,8 @@ from px4fuse.comparison.model import ErrorsAgainstTruth
 from px4fuse.core.text import format_number
 from px4fuse.filter.consistency import CONSISTENT_SIGMA_RATIOS
 from px4fuse.filter.correlated_noise import TimeCorrelatedNoise
-from px4fuse.findings.cause_grouping import WHITE_TO_ASSUMED_NOISE_RATIO_KEY
 from px4fuse.findings.model import (
+    WHITE_TO_ASSUMED_NOISE_RATIO_KEY,
     Findings,
     find_source_texts,
     format_percent,

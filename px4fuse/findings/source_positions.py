@@ -21,15 +21,13 @@ from px4fuse.filter.hypotheses import (
 from px4fuse.filter.time_offset import SourceTimeOffset
 from px4fuse.filter.tuning import HORIZONTAL, AxisTuning
 from px4fuse.finding import Finding, Severity
-from px4fuse.findings.cause_grouping import (
+from px4fuse.findings.imu import MIN_IMU_RATE_HZ, is_rate_too_low
+from px4fuse.findings.model import (
     CAUSE_KEY,
+    NO_ESTIMATES_SENTENCE,
     REPORTED_VARIANCE_USED_BY_EKF2_CAUSE,
     RESET_TIME_KEY,
     VEHICLE_ON_GROUND_CAUSE,
-)
-from px4fuse.findings.imu import MIN_IMU_RATE_HZ, is_rate_too_low
-from px4fuse.findings.model import (
-    NO_ESTIMATES_SENTENCE,
     Findings,
     find_source_texts,
     finding,
