@@ -81,8 +81,6 @@ def find_aid_findings(aid_results: Mapping[str, AidResult], flight: Flight) -> t
     if isinstance(flight.ekf2, Ekf2):
         spans_s = find_airborne_spans(flight) or ((0.0, flight.log.duration_s),)
         segment = Segment(spans_s[0][0], spans_s[-1][1], "")
-        findings += ekf2_state.detect_instance_switches(
-            flight.ekf2, (segment.start_s, segment.end_s)
-        )
+        findings += ekf2_state.detect_instance_switches(flight.ekf2, segment)
         findings += ekf2_state.detect_missing_alignment(flight, segment)
     return group_by_cause(findings)

@@ -2,11 +2,10 @@
 
 from collections.abc import Mapping, Sequence
 
-import numpy as np
-
 from px4fuse.analysis import Analysis
 from px4fuse.comparison.comparison import compute_position_errors
 from px4fuse.comparison.flight_events import find_airborne_spans
+from px4fuse.core.arrays import rms
 from px4fuse.core.record import Span
 from px4fuse.core.text import format_number, format_ratio
 from px4fuse.ekf2.aids import INNOVATION_MEAN_WINDOW_S, AidResult
@@ -76,8 +75,8 @@ def detect_bad_acceleration(analysis: Analysis, aids: Mapping[str, AidResult]) -
         for name in AIDS_OF_VERTICAL_ACCELERATION_TEST
         if name in aids and aids[name].verdict == "overconfident"
     }
-    cause = "Normal noise can set the flag fs_bad_acc_vertical for some seconds."
-    remedy = "If fs_bad_acc_vertical stays set, check the IMU for vibration and clipping."
+    cause = "Normal noise can set this flag (fs_bad_acc_vertical) for some seconds."
+    remedy = "If the flag stays set, check the IMU for vibration and clipping."
     if too_small_noises:
         parameters_text = " and ".join(sorted(too_small_noises))
         cause = f"The measurement noise is set too small: {parameters_text}."
@@ -165,11 +164,9 @@ def _make_innovation_change_finding(name: str, aid: AidResult) -> Finding:
     return make_warning(
         "aid_innovation_shift",
         f"The mean {axis} innovation of {_format_aid_label(aid)} shifts by "
-        f"{format_number(abs(mean_change) * innovation_sigma, 2)} {aid.unit} at {time_s:.0f} s. "
-        f"The shift is {abs(mean_change):.1f} times √S ({format_number(innovation_sigma, 2)} "
-        f"{aid.unit}).",
-        "Check which device near the sensor was switched on, switched off or moved at "
-        f"{time_s:.0f} s.",
+        f"{format_number(abs(mean_change) * innovation_sigma, 2)} {aid.unit} at {time_s:.0f} s "
+        f"({abs(mean_change):.1f} times √S of {format_number(innovation_sigma, 2)} {aid.unit}).",
+        f"Check which device near the sensor was switched or moved at {time_s:.0f} s.",
         {"aid": name, "axis": axis, "time_s": time_s, "moved": mean_change},
         ((time_s, time_s + INNOVATION_MEAN_WINDOW_S),),
     )
@@ -177,10 +174,9 @@ def _make_innovation_change_finding(name: str, aid: AidResult) -> Finding:
 
 def _make_overconfident_finding(name: str, aid: AidResult, sensor_cause: str) -> Finding:
     # Innovations alone do not distinguish noise from a wrong delay, so no noise value is proposed
-    noise_parameter, noise_text = AIDS[name].noise, ""
-    action = "let the sensor's driver report the true noise (σ)"
-    if noise_parameter:
-        action = f"increase {noise_parameter}"
+    noise_text, action = "", "let the sensor's driver report the true noise (σ)"
+    if AIDS[name].noise:
+        action = f"increase {AIDS[name].noise}"
     if aid.noise is not None:
         noise_text = f" ({format_number(aid.noise)} {aid.unit}, from {aid.noise_from})"
     return make_warning(
@@ -220,15 +216,15 @@ def _make_innovation_bias_finding(name: str, aid: AidResult) -> Finding:
 
 
 def _find_large_height_error_m(analysis: Analysis, span_s: Span) -> float | None:
-    down_comparison = analysis.axes.get("down")
-    errors = None if down_comparison is None else compute_position_errors(down_comparison, "ekf2")
-    if errors is None or isinstance(errors, Unavailable):
+    if "down" not in analysis.axes:
+        return None
+    errors = compute_position_errors(analysis.axes["down"], "ekf2")
+    if isinstance(errors, Unavailable):
         return None
     error_m = errors["error_m"].abs()
     is_in_span = (error_m.index >= span_s[0]) & (error_m.index <= span_s[1])
-    rmse_outside_gap_m = float(np.sqrt(np.mean(error_m[~is_in_span] ** 2)))
     largest_error_m = float(error_m[is_in_span].max())
-    is_large = largest_error_m > MIN_GAP_ERROR_TO_HEIGHT_RMSE_RATIO * rmse_outside_gap_m
+    is_large = largest_error_m > MIN_GAP_ERROR_TO_HEIGHT_RMSE_RATIO * rms(error_m[~is_in_span])
     return largest_error_m if is_large else None
 
 

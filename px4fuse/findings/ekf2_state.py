@@ -9,7 +9,6 @@ from scipy import constants
 from px4fuse.analysis import Analysis
 from px4fuse.comparison.flight_events import find_airborne_spans
 from px4fuse.comparison.model import ErrorsAgainstTruth
-from px4fuse.core.record import Span
 from px4fuse.core.text import format_metres
 from px4fuse.filter.signals import Segment, cut_to_segment
 from px4fuse.findings.model import (
@@ -27,7 +26,7 @@ from px4fuse.findings.model import (
     make_warning,
     make_zero_length_spans,
 )
-from px4fuse.flight.ekf2_parameters import BAROMETER, EV_CTRL_YAW_MASK, EV_POS, MAG
+from px4fuse.flight.ekf2_parameters import BAROMETER, MAG
 from px4fuse.flight.model import (
     BODY_AXES,
     Columns,
@@ -75,9 +74,8 @@ def detect(analysis: Analysis) -> Findings:
     ekf2 = analysis.flight.ekf2
     if not isinstance(ekf2, Ekf2):
         return
-    flight_segment = analysis.segment.whole_flight
     yield from detect_resets(analysis, ekf2)
-    yield from detect_instance_switches(ekf2, (flight_segment.start_s, flight_segment.end_s))
+    yield from detect_instance_switches(ekf2, analysis.segment.whole_flight)
     median_imu_at_rest = measure_imu_at_rest(analysis.flight)
     if not isinstance(ekf2.record, Unavailable):
         bias_states = cut_to_segment(ekf2.record.delayed, analysis.segment)
@@ -224,15 +222,8 @@ def _find_heading_action(flight: Flight, source: PositionTrack | None) -> str:
     action = magnetometer_advice(flight) or f"Enable the magnetometer ({MAG.switch} 0)."
     if source is None or not source.origin.is_vision:
         return action
-    alternative = "let EKF2 fuse the yaw of the source (EKF2_EV_CTRL bit 3)"
-    if source.orientation is None:
-        alternative = "send the orientation of the source and set EKF2_EV_CTRL bit 3"
-        if int(flight.log.parameters.get(EV_POS.switch, 0)) & EV_CTRL_YAW_MASK:
-            alternative = (
-                "send the orientation of the source: EKF2_EV_CTRL bit 3 is set, but the "
-                "orientation is missing or constant"
-            )
-    return f"{action} Alternatively, {alternative}."
+    sending_text = "send the orientation of the source and " if source.orientation is None else ""
+    return f"{action} Alternatively, {sending_text}let EKF2 fuse this yaw (EKF2_EV_CTRL bit 3)."
 
 
 def detect_resets(analysis: Analysis, ekf2: Ekf2) -> Findings:
@@ -280,9 +271,11 @@ def detect_resets(analysis: Analysis, ekf2: Ekf2) -> Findings:
         )
 
 
-def detect_instance_switches(ekf2: Ekf2, span_s: Span) -> Findings:
-    """Detect changes of the primary EKF2 instance in a time span (s)."""
-    switch_times_s = [time for time, _ in ekf2.primary_instances if span_s[0] < time <= span_s[1]]
+def detect_instance_switches(ekf2: Ekf2, segment: Segment) -> Findings:
+    """Detect changes of the primary EKF2 instance in a segment."""
+    switch_times_s = [
+        time for time, _ in ekf2.primary_instances if segment.start_s < time <= segment.end_s
+    ]
     if switch_times_s:
         yield make_warning(
             "ekf2_instance_switch",
