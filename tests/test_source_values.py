@@ -117,7 +117,7 @@ def test_constant_coordinate_is_reported_and_not_fused(column, name, severity, c
     comparison = compare(replace(flight, positions=(source,)))
     (found,) = source_positions.detect_constant_coordinates(comparison)
     assert (found.id, found.severity) == (name, severity)
-    assert "is constant (1.25 m)" in found.message
+    assert "(constant: 1.25 m)" in found.message
     assert f"EKF2_EV_CTRL {'to' if control == 2 else 'at'} {control}" in found.remedy
     assert ("down" in comparison.axes) is (column != "down_m")
 

@@ -65,9 +65,8 @@ def make_frd_positions_finding(analysis: Analysis) -> Finding:
     )
     note_action = f"In this report, north is the x axis of {sensor_name}."
     if isinstance(fusion_flags, Unavailable):
-        if analysis.flight.log.writes_ulog:
-            note_action += " Give the ULog of this flight, too: it shows EKF2's frame."
         message = f"{fault} The log does not show whether EKF2 fused the yaw of {sensor_name}."
+        note_action += " Give the ULog of this flight, too: it shows EKF2's frame."
         return make_note("source_frame_frd", message, note_action)
     if (
         fusion_flags is not None
@@ -168,7 +167,7 @@ def _truth_contradicts_heading_drift(flight: Flight, heading_error: HeadingError
 
 
 def _make_heading_drift_finding(analysis: Analysis, heading_error: HeadingError) -> Finding:
-    source, log = analysis.source, analysis.flight.log
+    source = analysis.source
     first_part, last_part = heading_error.find_extreme_parts()
     error_texts = (
         f"{math.remainder(part.heading_error_deg, 360.0):+.0f}° from {part.start_s:.0f} to "
@@ -183,10 +182,9 @@ def _make_heading_drift_finding(analysis: Analysis, heading_error: HeadingError)
     possible_cause = "a magnetometer indoors" if calibration_advice else "a gyroscope bias"
     if source.orientation is not None:
         possible_cause += ", or heading drift of the odometry"
-        if not int(log.parameters.get(EV_POS.switch, 0.0)) & EV_CTRL_YAW_MASK:
-            fusing_system = "EKF2" if log.writes_ulog else "the autopilot"
-            action = f"Let {fusing_system} fuse the yaw of the source"
-            action += " (EKF2_EV_CTRL bit 3)." if log.writes_ulog else "."
+        parameters = analysis.flight.log.parameters
+        if not int(parameters.get(EV_POS.switch, 0.0)) & EV_CTRL_YAW_MASK:
+            action = "Let EKF2 fuse the yaw of the source (EKF2_EV_CTRL bit 3)."
     if source.origin.is_gnss:
         calibration_advice = ""
         possible_cause, action = _explain_gnss_heading_error(analysis)
