@@ -404,7 +404,7 @@ def _format_action(action: Action) -> str:
         return f"EKF2: {', '.join(action.commands)} ({change_text})"
     if action.where == "shell":
         options_text = action.commands[0].partition(" --")[2]
-        return f"KF: {action.sentence or 'run again with'} --{options_text}"
+        return f"KF: run again with --{options_text}"
     text = lowercase_first_letter(action.sentence.rstrip("."))
     return f"{capitalise_first(action.target)}: {text}"
 
