@@ -246,7 +246,8 @@ def detect_low_rates(flight: Flight) -> Findings:
             if log.format.startswith("MAVLink"):
                 action = (
                     f"Request {topic} at {2.0 * required_rate_hz:g} Hz "
-                    "(MAV_CMD_SET_MESSAGE_INTERVAL), or give the ULog of the flight."
+                    "(MAV_CMD_SET_MESSAGE_INTERVAL)"
+                    f"{', or give the ULog of the flight' if log.writes_ulog else ''}."
                 )
             yield make_warning(
                 "imu_rate_too_low",

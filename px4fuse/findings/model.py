@@ -252,15 +252,11 @@ def find_spans_with_value(
     value: float, step_function: pd.Series, segment: Segment
 ) -> tuple[Span, ...]:
     """Return the time spans (s) in a segment in which a step function equals ``value``."""
-    edges_s = np.clip(
-        np.append(step_function.index.to_numpy(), np.inf), segment.start_s, segment.end_s
-    )
-    edges_s[0] = segment.start_s
-    is_inside = np.diff(edges_s) > 0.0
-    has_value = np.pad(step_function.to_numpy()[is_inside] == value, 1)
-    edges_s = np.append(edges_s[:-1][is_inside], segment.end_s)
+    edges_s = np.append(step_function.index, np.inf)
+    edges_s[0] = -np.inf
+    has_value = np.pad(step_function == value, 1)
     change_times_s = edges_s[has_value[1:] != has_value[:-1]].tolist()
-    return tuple(zip(change_times_s[::2], change_times_s[1::2], strict=True))
+    return segment.cut(zip(change_times_s[::2], change_times_s[1::2], strict=True))
 
 
 def compute_flag_fraction(step_function: pd.Series, segment: Segment) -> float:

@@ -9,7 +9,7 @@ from px4fuse.comparison.remedy import find_aid, format_changes
 from px4fuse.core.text import lowercase_first_letter
 from px4fuse.filter.frame_rotation import HeadingError
 from px4fuse.finding import Finding
-from px4fuse.findings.ekf2_not_fusing import FUSED_FRACTION_FOR_ERROR
+from px4fuse.findings.ekf2_fusion import FUSED_FRACTION_FOR_ERROR
 from px4fuse.findings.ekf2_settings import find_confirmed_noise_rerun
 from px4fuse.findings.model import (
     Findings,

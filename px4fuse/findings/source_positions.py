@@ -368,7 +368,7 @@ def detect_scale_error(analysis: Analysis) -> Findings:
         isinstance(imu, Unavailable)
         or is_rate_too_low(imu, MIN_IMU_RATE_HZ)
         or analysis.source.origin.is_gnss  # GNSS has no scale factor error
-        or isinstance(analysis.flight.truth, Truth)  # with ground truth, see source_patterns.py
+        or isinstance(analysis.flight.truth, Truth)  # with ground truth, see source_errors.py
         or isinstance(systematic_errors, Unavailable)
         # A low-pass filter or time-correlated noise may resemble a scale error
         or find_low_pass(analysis) is not None
