@@ -305,8 +305,7 @@ def _explain_missing_action(
             return (
                 "keep the settings: EKF2's gate rejects these outliers, and EKF2's σ is consistent"
             )
-    fault_text = "drift of the position source" if finding.id == "source_drift" else "this fault"
-    return f"no filter setting corrects {fault_text}"
+    return "no filter setting corrects this fault"
 
 
 def _find_action_target(finding: Finding, source: PositionTrack | None = None) -> ActionTarget:

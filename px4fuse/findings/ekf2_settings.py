@@ -167,8 +167,7 @@ def _find_rejections(analysis: Analysis, gate: float) -> Findings:
                 "error" if rejected_fraction >= REJECTED_FRACTION_FOR_ERROR else "warning",
                 "ekf2_rejects_positions",
                 f"EKF2 rejects {format_percent(rejected_fraction)} of the {quantity}. Their "
-                f"innovations are outside its gate of {gate:g} √S. Possible causes: outliers, "
-                "measurement noise set too small, or late timestamps.",
+                f"innovations are outside its gate of {gate:g} √S.",
                 _find_rejection_remedy(analysis, result),
                 {
                     "rejected_fraction": rejected_fraction,

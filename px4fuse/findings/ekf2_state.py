@@ -26,7 +26,7 @@ from px4fuse.findings.model import (
     make_warning,
     make_zero_length_spans,
 )
-from px4fuse.flight.ekf2_parameters import BAROMETER, MAG
+from px4fuse.flight.ekf2_parameters import MAG
 from px4fuse.flight.model import (
     BODY_AXES,
     Columns,
@@ -129,25 +129,18 @@ def _detect_bias_at_limit(
                 )
         yield make_error(
             "ekf2_bias_at_limit",
-            message + (_describe_height_error(analysis, ekf2) if axis_index == 2 else ""),
+            message + (_describe_height_error(analysis) if axis_index == 2 else ""),
             f"Calibrate the {sensor}s at the temperature of the flight.",
             {"bias": median_bias, "limit": limit, "limited_fraction": limited_fraction},
         )
 
 
-def _describe_height_error(analysis: Analysis, ekf2: Ekf2) -> str:
-    error_text, down_comparison = "", analysis.axes.get("down")
+def _describe_height_error(analysis: Analysis) -> str:
+    down_comparison = analysis.axes.get("down")
     truth = None if down_comparison is None else down_comparison.filters["ekf2"].truth
-    if isinstance(truth, ErrorsAgainstTruth):
-        error_text = (
-            f" EKF2's height RMSE against ground truth is {format_metres(truth.position_rmse_m)} m."
-        )
-    if (barometer_log := ekf2.aids.get(BAROMETER.name)) is not None:
-        innovations = cut_to_segment(barometer_log.samples, analysis.segment)[
-            f"innovation_{barometer_log.axes[0]}"
-        ]
-        error_text += f" Barometer innovations have a mean of {abs(innovations.mean()):.1f} m."
-    return error_text
+    if not isinstance(truth, ErrorsAgainstTruth):
+        return ""
+    return f" EKF2's height RMSE against ground truth is {format_metres(truth.position_rmse_m)} m."
 
 
 def _detect_gyro_bias(bias_states: pd.DataFrame, median_imu_at_rest: pd.Series | None) -> Findings:
@@ -188,12 +181,12 @@ def detect_missing_alignment(
         and compute_flag_fraction(fusion_flags["yaw"], segment) > 0.0
     )
     tilt_action = "Keep the vehicle at rest after boot until EKF2 is ready."
-    quantities = [("tilt_align", "tilt", "tilt is", tilt_action)]
+    quantities = [("tilt_align", "tilt", tilt_action)]
     if not fuses_source_yaw:
         heading_action = _find_heading_action(flight, source)
-        quantities.append(("yaw_align", "heading", "tilt and heading are", heading_action))
+        quantities.append(("yaw_align", "heading", heading_action))
     alignment_end_s = segment.start_s
-    for flag, quantity, required_text, action in quantities:
+    for flag, quantity, action in quantities:
         if flag not in ekf2.status_flags:
             continue
         spans = find_spans_with_value(0.0, ekf2.status_flags[flag], segment)
@@ -210,7 +203,7 @@ def detect_missing_alignment(
                 "ekf2_not_aligned",
                 f"EKF2 has not aligned its {quantity}{until_text}. cs_{flag} is 0 for "
                 f"{format_percent(unaligned_fraction)} of the flight. EKF2 fuses no position "
-                f"before {required_text} aligned.",
+                "before this alignment.",
                 action,
                 {"unaligned_fraction": unaligned_fraction, "flag": flag},
                 spans,

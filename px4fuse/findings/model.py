@@ -113,23 +113,22 @@ def load_examples() -> Mapping[str, FindingExample]:
 
 
 class SourceTexts(Record):
-    """Sentences on causes and actions for one kind of position source (source_words.toml)."""
+    """Sentences on causes and actions for one kind of position source (source_words.toml).
 
-    low_pass_action: str
-    jump_causes: str
-    jump_action: str
-    outlier_causes: str
-    outlier_action: str
-    data_link_check: str
-    scale_check: str
-    slow_error_check: str
+    The defaults are the texts for an unknown kind.
+    """
+
+    low_pass_action: str = "Switch off smoothing in the positioning system and send raw positions."
+    jump_causes: str = "Possible causes: a relocalisation of the source, or a change of its origin."
+    jump_action: str = "Do not change the origin of the source in flight."
+    outlier_causes: str = "Possible causes: lost or ambiguous tracking."
+    outlier_action: str = "Remove the outliers before sending."
+    data_link_check: str = "Check the positioning system and its data link"
+    scale_check: str = "Check unit and calibration of the positioning system"
+    slow_error_check: str = "Check calibration, drift and smoothing of the positioning system"
 
 
-_TEXTS_BY_KIND = read_toml(__file__, dict[PositionKind, dict[str, str]], "source_words.toml")
-SOURCE_TEXTS: Mapping[PositionKind, SourceTexts] = {
-    kind: SourceTexts(**(_TEXTS_BY_KIND["unknown"] | words))
-    for kind, words in _TEXTS_BY_KIND.items()
-}
+SOURCE_TEXTS = read_toml(__file__, dict[PositionKind, SourceTexts], "source_words.toml")
 
 
 def find_source_texts(source: PositionTrack) -> SourceTexts:

@@ -280,7 +280,6 @@ def _make_wrong_sigma_finding(
     severity: Severity = "error" if sigma_error_factor >= MIN_SIGMA_FACTOR_FOR_ERROR else "warning"
     if _has_default_noises(analysis, filter_name, worst_axis):
         severity = lower_severity(severity)
-    axis_tuning = find_axis_tuning(analysis.tuning, worst_axis.axis.name)
     verdict = "underconfident" if is_underconfident else "overconfident"
     # Ground truth shows slow errors that innovations do not show
     may_have_hidden_error = is_underconfident and not summary.is_underconfident_against_truth
@@ -309,9 +308,7 @@ def _make_wrong_sigma_finding(
     else:
         rerun = find_cause_rerun(analysis.reruns, filter_name, worst_axis.axis.name)
         cause = classify_cause(analysis, rerun)
-        remedy_text = _find_action_for_wrong_sigma(
-            analysis, filter_name, worst_axis, axis_tuning, rerun
-        )
+        remedy_text = _find_action_for_wrong_sigma(analysis, filter_name, worst_axis, rerun)
         is_kf_noise_of_receiver = (
             filter_name == "kf" and is_underconfident and analysis.source.origin.is_gnss
         )
@@ -408,7 +405,6 @@ def _find_action_for_wrong_sigma(
     analysis: Analysis,
     filter_name: FilterName,
     result: AxisComparison,
-    axis_tuning: AxisTuning | None,
     cause: Rerun | None,
 ) -> str:
     if cause is not None and not rerun_refutes_cause(analysis, filter_name, cause):
@@ -416,6 +412,7 @@ def _find_action_for_wrong_sigma(
     reruns = find_reruns(analysis.reruns, filter_name, result.axis.name)
     if any(makes_overconfident(rerun, "nis") for rerun in reruns):
         return KEEP_NOISE_BECAUSE_OF_TRUTH_ACTION
+    axis_tuning = find_axis_tuning(analysis.tuning, result.axis.name)
     if axis_tuning is None:
         return UNKNOWN_NOISE_ACTION
     if filter_name == "ekf2" and not reruns:

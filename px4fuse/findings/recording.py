@@ -93,7 +93,7 @@ def detect_decreasing_clocks(flight: Flight) -> Findings:
             "receive_time_went_back",
             f"The recorded receive time decreased {format_count(reversals)}. Possible cause: the "
             "clock of the recording computer was set back, or the file consists of several "
-            "recordings. Timestamps in the messages are correct.",
+            "recordings.",
             "Do not synchronise the clock of the recording computer while recording.",
             {"count": reversals},
         )

@@ -134,7 +134,7 @@ def detect_time_correlated_noise(analysis: Analysis) -> Findings:
         f"Time-correlated {source_name(analysis.source)} error of {noise.slow_m:.2g} m, "
         f"correlation time {time_text}. The rest of the error is white noise of "
         f"{noise.white_m:.2g} m (1 σ). KF and EKF2 assume independent errors: both follow the "
-        "correlated error, and their σ is too small. Innovations do not show this error.",
+        "correlated error, and their σ is too small.",
         f"{find_source_texts(analysis.source).slow_error_check}.",
         evidence,
     )
@@ -209,8 +209,7 @@ def detect_noise_variation(analysis: Analysis) -> Findings:
     yield (make_error if noise_ratio >= MIN_NOISY_PART_SIGMA_RATIO_FOR_ERROR else make_warning)(
         "source_noise_varies",
         f"{source_name(analysis.source)} noise is {noise_ratio:.1f} times larger from "
-        f"{start_s:.0f} to {end_s:.0f} s. Single outliers are not the cause. No single SIGMA_Z "
-        "fits the whole flight.",
+        f"{start_s:.0f} to {end_s:.0f} s. Single outliers are not the cause.",
         f"{find_source_texts(analysis.source).data_link_check} for the time from {start_s:.0f} to "
         f"{end_s:.0f} s. Send a variance with each position, or analyse the noisy part separately "
         "(--start, --end).",
@@ -225,8 +224,8 @@ def detect_jitter_and_speed_noise(analysis: Analysis, local_residuals: LocalResi
         yield (make_error if jitter_s >= MIN_JITTER_FOR_ERROR_S else make_warning)(
             "source_timestamp_jitter",
             f"The timestamps of the {positions_phrase(analysis.source)} jitter by "
-            f"{1e3 * jitter_s:.0f} ms (1 σ). The positions are measured at a constant interval. At "
-            f"1 m/s the jitter causes a position error of {format_metres(jitter_s)} m.",
+            f"{1e3 * jitter_s:.0f} ms (1 σ). At 1 m/s this is a position error of "
+            f"{format_metres(jitter_s)} m.",
             "Send the time of measurement with each position, not the time of processing, sending "
             "or receiving.",
             {"jitter_s": jitter_s},
@@ -239,7 +238,7 @@ def detect_jitter_and_speed_noise(analysis: Analysis, local_residuals: LocalResi
             f"{format_metres(speed_noise.slow_m)} m at {speed_noise.slow_m_s:.1f} m/s and "
             f"{format_metres(speed_noise.fast_m)} m at {speed_noise.fast_m_s:.1f} m/s (1 σ). The "
             "noise perpendicular to the motion also grows, so time offset and jitter are not the "
-            "cause. No single measurement noise fits the whole flight.",
+            "cause.",
             "Send a variance that grows with speed (EKF2_EV_NOISE_MD 0). Shorten the exposure or "
             "ranging time.",
             speed_noise._asdict(),
