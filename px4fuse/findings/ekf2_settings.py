@@ -69,12 +69,11 @@ def detect_wrong_noise(analysis: Analysis) -> Findings:
     parameter_noise_m = inputs.settings[aid.noise]
     uses_reported_sigma = used_noise_m > parameter_noise_m
     ratio = estimated_noise_m / used_noise_m
-    factor, size_word, gain_size_word = ratio, "small", "large"
+    factor, size_word, reason = ratio, "small", "EKF2's gain is too large."
     if ratio < 1.0:
-        factor, size_word, gain_size_word = 1.0 / ratio, "large", "small"
+        factor, size_word, reason = 1.0 / ratio, "large", "EKF2's gain is too small."
     sensor_name = source_name(analysis.source)
     effect_text = ""
-    reason = f"EKF2's gain is too {gain_size_word}, and its reported σ is too {size_word}."
     rejected_fraction = analysis.main.rejected_fraction or 0.0
     if rejected_fraction >= MIN_REJECTED_FRACTION_IN_MESSAGE:
         effect_text = f": EKF2 rejects {format_percent(rejected_fraction)} of the positions"

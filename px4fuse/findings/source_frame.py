@@ -56,24 +56,21 @@ def detect(analysis: Analysis) -> Findings:
 
 def make_frd_positions_finding(analysis: Analysis) -> Finding:
     """Make the finding that positions are in FRD, so that their x axis is not north."""
-    ekf2 = analysis.flight.ekf2
-    fusion_flags = ekf2.fusion_flags if isinstance(ekf2, Ekf2) else None
-    sensor_name = source_name(analysis.source)
+    ekf2, sensor_name = analysis.flight.ekf2, source_name(analysis.source)
     fault = (
         f"{positions_phrase(analysis.source)} are in FRD: their x axis points "
         "along the heading at the start, not north."
     )
     note_action = f"In this report, north is the x axis of {sensor_name}."
-    if isinstance(fusion_flags, Unavailable):
-        message = f"{fault} The log does not show whether EKF2 fused the yaw of {sensor_name}."
-        note_action += " Give the ULog of this flight, too: it shows EKF2's frame."
-        return make_note("source_frame_frd", message, note_action)
-    if (
-        fusion_flags is not None
-        and compute_flag_fraction(fusion_flags["yaw"], analysis.segment) > FUSED_FRACTION_FOR_ERROR
-    ):
-        message = f"{fault} EKF2 fused the yaw of {sensor_name}, so EKF2's axes are also FRD."
-        return make_note("source_frame_frd", message, note_action)
+    if isinstance(ekf2, Ekf2):
+        if isinstance(ekf2.fusion_flags, Unavailable):
+            message = f"{fault} The log does not show whether EKF2 fused the yaw of {sensor_name}."
+            note_action += " Give the ULog of this flight, too: it shows EKF2's frame."
+            return make_note("source_frame_frd", message, note_action)
+        fused_fraction = compute_flag_fraction(ekf2.fusion_flags["yaw"], analysis.segment)
+        if fused_fraction > FUSED_FRACTION_FOR_ERROR:
+            message = f"{fault} EKF2 fused the yaw of {sensor_name}, so EKF2's axes are also FRD."
+            return make_note("source_frame_frd", message, note_action)
     action = "Send the position in NED."
     if analysis.source.orientation is not None:
         action += " Alternatively, let EKF2 fuse the yaw of the source (EKF2_EV_CTRL bit 3)."
