@@ -20,6 +20,7 @@ from px4fuse.comparison.rerun_effects import (
     compute_preference_key,
     find_rerun,
 )
+from px4fuse.core.arrays import rms
 from px4fuse.core.text import format_factor, format_metres, format_ratio
 from px4fuse.filter.consistency import Consistency
 from px4fuse.filter.tuning import HORIZONTAL, AxisTuning
@@ -271,7 +272,7 @@ def _assess_span(
     rmse_m = math.nan
     errors = compute_position_errors(analysis.main, "ekf2")
     if not isinstance(errors, Unavailable):
-        rmse_m = float((errors["error_m"].loc[start_s:end_s] ** 2).mean() ** 0.5)
+        rmse_m = rms(errors["error_m"].loc[start_s:end_s])
     innovations = analysis.main.ekf2_innovations
     if isinstance(innovations, Unavailable):
         return innovations, rmse_m
