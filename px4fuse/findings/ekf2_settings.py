@@ -122,8 +122,7 @@ def detect_wrong_noise(analysis: Analysis) -> Findings:
 def find_confirmed_noise_rerun(analysis: Analysis) -> Rerun | None:
     """Return a re-run in which another EKF2 measurement noise makes EKF2 consistent, or None."""
     rerun = find_rerun(analysis.select_main_reruns(), "ekf2", "noise", find_aid(analysis).noise)
-    is_confirmed = rerun is not None and becomes_consistent(rerun, "source")
-    return rerun if is_confirmed else None
+    return rerun if rerun is not None and becomes_consistent(rerun, "source") else None
 
 
 def detect_rejections(analysis: Analysis) -> Findings:
