@@ -46,11 +46,12 @@ from px4fuse.filter.frame_rotation import HeadingPart, combine_heading_parts  # 
 from px4fuse.filter.settings import Settings  # noqa: E402
 from px4fuse.finding import Finding  # noqa: E402
 from px4fuse.findings import find, find_aid_findings, find_loop_findings, source_frame  # noqa: E402
-from px4fuse.findings.cause_grouping import EFFECTS_BY_CAUSE, find_effect_ids  # noqa: E402
 from px4fuse.findings.model import (  # noqa: E402
+    EFFECTS_BY_CAUSE,
     FINDING_CATALOGUE,
     FINDING_GROUPS,
     FINDING_TITLES,
+    find_effect_ids,
     load_examples,
 )
 from px4fuse.flight.model import AidLog, Columns  # noqa: E402
@@ -236,7 +237,7 @@ def find_detector_modules() -> dict[str, str]:
     """Return the module name of the detector of each finding, by finding id."""
     module_by_id: dict[str, str] = {}
     for path in sorted(FINDINGS_FOLDER.glob("*.py")):
-        if path.stem in ("cause_grouping", "cause_text", "model", "__init__"):
+        if path.stem in ("cause_text", "model", "__init__"):
             continue
         tree = ast.parse(path.read_text(encoding="utf-8"))
         for node in ast.walk(tree):

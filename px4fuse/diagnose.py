@@ -67,7 +67,7 @@ from px4fuse.filter.signals import AISLE
 from px4fuse.filter.time_offset import SourceTimeOffset
 from px4fuse.filter.tuning import HORIZONTAL
 from px4fuse.findings import find, find_aid_findings
-from px4fuse.findings.cause_grouping import WRONG_CONVENTION_KEY
+from px4fuse.findings.model import WRONG_CONVENTION_KEY
 from px4fuse.findings.source_convention import detect_wrong_orientation
 from px4fuse.flight.ekf2_parameters import check_parameters
 from px4fuse.flight.model import DIAGNOSIS_WITHHELD, Flight, PositionTrack, Unavailable

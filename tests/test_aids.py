@@ -17,10 +17,9 @@ from ulog_tools import gnss_log, seconds_of, stamps
 from px4fuse.analysis import AidingSourceAnalysis, find_failed_checks
 from px4fuse.ekf2.aids import AidResult, evaluate_aids
 from px4fuse.errors import MissingDataError
-from px4fuse.findings import aids as aids_detector
-from px4fuse.findings import ekf2_state, find_aid_findings
-from px4fuse.findings.aids import detect_aid_faults
-from px4fuse.findings.cause_grouping import CAUSE_KEY, INNOVATION_CHANGE_CAUSE, SOURCE_SENSOR_CAUSE
+from px4fuse.findings import ekf2_fusion, ekf2_state, find_aid_findings
+from px4fuse.findings.ekf2_fusion import detect_aid_faults
+from px4fuse.findings.model import CAUSE_KEY, INNOVATION_CHANGE_CAUSE, SOURCE_SENSOR_CAUSE
 from px4fuse.flight.ekf2_parameters import AIDS
 from px4fuse.flight.model import AidLog, Ekf2, Flight, Unavailable
 from px4fuse.readers import read_log
@@ -219,9 +218,9 @@ def test_height_error_in_gap_below_3_times_rmse_is_not_reported(
         truth=pd.DataFrame({"position_m": 0.0}, index=time_s),
     )
     one = SimpleNamespace(axes={"down": down})
-    found = aids_detector._find_large_height_error_m(one, (20.0, 30.0))  # type: ignore[arg-type]
+    found = ekf2_fusion._find_large_height_error_m(one, (20.0, 30.0))  # type: ignore[arg-type]
     assert found == (None if expected_m is None else pytest.approx(expected_m))
-    assert aids_detector._find_large_height_error_m(SimpleNamespace(axes={}), (0.0, 1.0)) is None  # type: ignore[arg-type]
+    assert ekf2_fusion._find_large_height_error_m(SimpleNamespace(axes={}), (0.0, 1.0)) is None  # type: ignore[arg-type]
 
 
 def test_shift_of_mean_innovation_is_reported_with_its_time() -> None:
@@ -355,5 +354,5 @@ def test_alignment_action_names_ev_yaw_bit_without_orientation() -> None:
     flight = aids_only(status_flags={"yaw_align": pd.Series([0.0], [0.0])})
     flight.log = log(parameters={"EKF2_EV_CTRL": 9, "EKF2_MAG_TYPE": 5})
     (finding,) = ekf2_state.detect_missing_alignment(flight, SEGMENT, source())
-    assert "EKF2_EV_CTRL bit 3 is set, but the orientation is missing" in finding.remedy
+    assert "send the orientation of the source and let EKF2 fuse" in finding.remedy
     assert "Calibrate the magnetometer" not in finding.remedy

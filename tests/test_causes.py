@@ -9,14 +9,14 @@ from page_tools import words
 
 from px4fuse.analysis import Analysis
 from px4fuse.finding import Finding
-from px4fuse.findings.cause_grouping import (
+from px4fuse.findings.model import (
     EFFECTS_BY_CAUSE,
+    FINDING_TITLES,
     SOURCE_GAP_CAUSE,
     UNKNOWN_CAUSE,
     find_effect_ids,
     group_by_cause,
 )
-from px4fuse.findings.model import FINDING_TITLES
 from px4fuse.report import consistency, terminal
 from px4fuse.report.page import Page
 from px4fuse.report.phrases import list_verdict_warnings

@@ -23,8 +23,7 @@ from px4fuse.diagnose import prepare_comparison, refine_delay
 from px4fuse.filter.time_offset import SourceTimeOffset
 from px4fuse.finding import Finding
 from px4fuse.findings import source_convention
-from px4fuse.findings.cause_grouping import WRONG_CONVENTION_KEY
-from px4fuse.findings.model import finding
+from px4fuse.findings.model import WRONG_CONVENTION_KEY, finding
 from px4fuse.flight.model import (
     AS_RECEIVED_ORIGIN,
     GNSS_ORIGIN,

@@ -47,22 +47,23 @@ from px4fuse.filter.signals import Segment
 from px4fuse.filter.tuning import NoiseEstimate
 from px4fuse.finding import Finding, format_spans
 from px4fuse.findings import (
-    ekf2_not_fusing,
+    ekf2_fusion,
     ekf2_settings,
     ekf2_state,
     hidden_errors,
     imu,
     recording,
     source_clock,
+    source_errors,
     source_frame,
     source_intervals,
-    source_noise,
     source_positions,
     source_stamps,
 )
-from px4fuse.findings.cause_grouping import SOURCE_GAP_CAUSE, UNKNOWN_CAUSE
 from px4fuse.findings.model import (
+    SOURCE_GAP_CAUSE,
     SOURCE_TEXTS,
+    UNKNOWN_CAUSE,
     compute_flag_fraction,
     find_spans_with_value,
     make_zero_length_spans,
@@ -185,8 +186,8 @@ def test_ekf2_fusion_below_98_percent_warns_below_50_is_error(
     until_s: float, expected: dict[str, str]
 ) -> None:
     one = analysis(ekf2=with_fusion((0.0, 1.0), (until_s, 0.0)))
-    assert named(ekf2_not_fusing.detect, one) == expected
-    for finding in ekf2_not_fusing.detect(one):
+    assert named(ekf2_fusion.detect_position_fusion_faults, one) == expected
+    for finding in ekf2_fusion.detect_position_fusion_faults(one):
         assert f"fused the UWB positions only {until_s - 10.0:.0f} % of the time" in finding.title
         assert finding.spans_s == ((until_s, 110.0),)
 
@@ -253,7 +254,7 @@ UNKNOWN = "The log does not show why EKF2 fused no position"
     ],
 )
 def test_finding_on_missing_ekf2_fusion_has_reason(flight: Any, reason: str, remedy: str) -> None:
-    finding = only(ekf2_not_fusing.detect, flight)
+    finding = only(ekf2_fusion.detect_position_fusion_faults, flight)
     assert finding.severity == "error"
     assert finding.title.startswith("EKF2 never fused the UWB positions")
     assert reason in finding.message
@@ -376,8 +377,7 @@ def test_frame_is_misaligned_if_alignment_halves_position_rmse(
     assert (finding.id == "source_drift") is (drifts and not frame)
     if finding.id == "source_drift":
         assert finding.message.startswith(
-            "VIO drifts: horizontal position RMSE 0.55 m after the best alignment. Before the "
-            "alignment the RMSE is 1.00 m."
+            "VIO drifts: horizontal position RMSE 1.00 m before and 0.55 m after the best shift"
         )
     assert (finding.remedy == hidden_errors.FRAME_REMEDY) is frame
 
@@ -490,11 +490,9 @@ def test_frd_frame_finding_is_a_note_if_ekf2_fuses_source_yaw(
     assert ("Send the position in NED" in finding.remedy) is (expected == "warning")
     assert severity(source_frame.detect, analysis(source=frd)) == "warning"
     assert severity(source_frame.detect, analysis()) is None
-    for writes_ulog in (True, False):
-        one = analysis(source=frd, ekf2={"fusion_flags": NONE}, log=log(writes_ulog=writes_ulog))
-        finding = only(source_frame.detect, one)
-        assert finding.severity == "note"
-        assert ("Give the ULog" in finding.remedy) is writes_ulog
+    finding = only(source_frame.detect, analysis(source=frd, ekf2={"fusion_flags": NONE}))
+    assert finding.severity == "note"
+    assert "Give the ULog" in finding.remedy
 
 
 def heading_error(*degrees: float, sigma_deg: float = 1.0, p: float = 1.0) -> HeadingError:
@@ -515,12 +513,10 @@ def test_misaligned_frame_report_contains_rotation_to_apply() -> None:
 
 def test_heading_drift_report_contains_heading_at_start_and_end() -> None:
     drifting = heading_error(2.0, 30.0, p=0.0)
-    for writes_ulog, orientation in ((True, object()), (False, object()), (True, None)):
-        sent = source(orientation=orientation)
-        one = analysis(heading=drifting, log=log(writes_ulog=writes_ulog), source=sent)
+    for orientation in (object(), None):
+        one = analysis(heading=drifting, source=source(orientation=orientation))
         finding = only(source_frame.detect, one)
-        has_yaw_of_source = writes_ulog and orientation is not None
-        assert ("EKF2_EV_CTRL bit 3" in finding.remedy) is has_yaw_of_source
+        assert ("EKF2_EV_CTRL bit 3" in finding.remedy) is (orientation is not None)
     assert finding.title == "EKF2's heading drifts by +28° relative to the UWB positions"
     assert finding.id == "ekf2_heading_error"
     assert "+2° from 0 to 10 s and +30° from 10 to 20 s" in finding.message
@@ -563,7 +559,7 @@ def with_extent(extent_m: float) -> Any:
     return analysis(source=source(samples=samples))
 
 
-FUSED, FRAME = ekf2_not_fusing.detect, source_frame.detect
+FUSED, FRAME = ekf2_fusion.detect_position_fusion_faults, source_frame.detect
 EDGES = [
     # motion capture is an independent reference if EKF2 fuses external vision
     (FUSED, motion_capture_flight("vehicle_mocap_odometry", 0.0), "warning"),
@@ -761,11 +757,11 @@ SOURCE_EDGES = [
     *((source_positions.detect_low_pass,
        low_pass(99.0, 1.0, time_correlated_noise=slow(99.0, lag)), expected)
       for lag, expected in ((0.9, None), (1.0, "error"))),
-    *((source_noise.detect_time_correlated_noise,
+    *((source_errors.detect_time_correlated_noise,
        analysis(time_correlated_noise=slow(gain, lag)), expected)
       for gain, lag, expected in (
           (5.0, 0.9, "warning"), (4.9, 0.0, None), (99.0, 1.0, None))),
-    *((source_noise.detect_time_correlated_noise,
+    *((source_errors.detect_time_correlated_noise,
        analysis(time_correlated_noise=slow(99.0, 0.0, slow_m)), expected)
       for slow_m, expected in ((0.0049, None), (0.005, "warning"))),
     # the height of a frame that was fitted to EKF2's track contains EKF2's height error
@@ -773,12 +769,13 @@ SOURCE_EDGES = [
         axes=(hiding(name="down"),),
         source=source(alignment=replace(given_placement(), yaw_sigma_deg=sigma_deg))), expected)
       for sigma_deg, expected in ((None, "warning"), (0.1, None))),
-    *((source_noise.detect_repeated_positions, repeating(again, count), expected)
+    *((source_errors.detect_repeated_positions, repeating(again, count), expected)
       for again, count, expected in (
         (10, 200, "warning"), (9, 100, None), (10, 201, None), (30, 100, "error"),
         (29, 100, "warning"))),
-    (source_noise.detect_repeated_positions, repeating(50, 100, moved_m=0.5), None),
-    *((source_noise.detect, analysis(time_correlated_noise=slow(99.0, 0.0), **parts), None)
+    (source_errors.detect_repeated_positions, repeating(50, 100, moved_m=0.5), None),
+    *((source_errors.detect_noise_faults,
+       analysis(time_correlated_noise=slow(99.0, 0.0), **parts), None)
       for parts in (ODOMETRY, REBUILT)),
     (JUMPS, jumping(jump(0.0, 0.9), time_correlated_noise=slow(0.0, 0.0, 0.2)), None),
     (JUMPS, jumping(jump(0.0, 1.0), time_correlated_noise=slow(0.0, 0.0, 0.2)), "error"),
@@ -842,9 +839,7 @@ def test_accelerometer_bias_report_contains_95_percent_interval() -> None:
     one = analysis(systematic_errors=with_bias(0.3, 0.05, -0.4), ekf2=bias_of_ekf2(0.1, -0.2, 0.0))
     finding = only(imu.detect_accelerometer_bias, one)
     assert "tilt error of 2.9° has the same effect" in finding.message  # 0.5 of 9.80665 m/s²
-    assert (
-        "EKF2's estimate of the bias is +0.10 m/s² forward and -0.20 m/s² right." in finding.message
-    )
+    assert "EKF2 estimates +0.10 m/s² forward and -0.20 m/s² right." in finding.message
     assert finding.evidence == {"bias_m_s2": 0.5, "sigma_m_s2": 0.05}
     outside = bias_of_ekf2(9.0, 9.0, 9.0)["accelerometer_bias"].iloc[[0, 4]]
     assert (
@@ -1135,4 +1130,4 @@ def test_timestamps_in_bursts_are_reported_as_jitter(size: int, is_reported: boo
 def test_repeated_positions_of_odometry_are_reported() -> None:
     one = repeating(50, 100)
     one.source.orientation = object()
-    assert named(source_noise.detect, one) == {"source_samples_repeated": "error"}
+    assert named(source_errors.detect_noise_faults, one) == {"source_samples_repeated": "error"}

@@ -10,7 +10,7 @@ from comparisons import compare
 from findings_tools import NONE, analysis, made, moving, named, only, positions, source
 
 from px4fuse.ekf2.fusion_conditions import UnfusedPositions, find_unmet_condition
-from px4fuse.findings import ekf2_not_fusing
+from px4fuse.findings import ekf2_fusion
 from px4fuse.flight.ekf2_parameters import EV_POS, GNSS_POS
 from px4fuse.flight.model import GNSS_ORIGIN, POSITION_FILE_ORIGIN, AidLog, ClockMap, Ekf2
 from px4fuse.readers import read_log
@@ -120,17 +120,17 @@ def unfused(**parts: Any) -> Any:
 def test_not_fusing_is_absent_if_unfused_positions_are_constant() -> None:
     still = unfused(source={"samples": positions(np.arange(0.0, 120.0, 0.1), 2.0)},
                     ekf2={"parameters": {"EKF2_EV_CTRL": 2.0}})  # fmt: skip
-    assert named(ekf2_not_fusing.detect, still) == {}
+    assert named(ekf2_fusion.detect_position_fusion_faults, still) == {}
 
 
 def test_position_file_that_ekf2_never_got_is_no_fusion_fault() -> None:
     beside = unfused(
         source={"origin": POSITION_FILE_ORIGIN}, ekf2={"parameters": {"EKF2_EV_CTRL": 0.0}}
     )
-    assert named(ekf2_not_fusing.detect, beside) == {}
+    assert named(ekf2_fusion.detect_position_fusion_faults, beside) == {}
     # EKF2 received the same or another source
     beside.flight.positions = (beside.source, source())
-    assert "EKF2_EV_CTRL to 1" in only(ekf2_not_fusing.detect, beside).remedy
+    assert "EKF2_EV_CTRL to 1" in only(ekf2_fusion.detect_position_fusion_faults, beside).remedy
 
 
 @pytest.mark.parametrize(
@@ -143,10 +143,10 @@ def test_position_that_ekf2_declares_invalid_is_reported(
     state = positions(np.arange(0.0, 120.0), 2e6)
     one = unfused(ekf2={"status_flags": {"xy_valid": valid}, "state": state, "fusion_flags": NONE},
                   flight={"truth": NONE})  # fmt: skip
-    assert named(ekf2_not_fusing.detect, one) == (
+    assert named(ekf2_fusion.detect_position_fusion_faults, one) == (
         {"ekf2_position_invalid": expected} if expected else {}
     )
-    for finding in ekf2_not_fusing.detect(one):
+    for finding in ekf2_fusion.detect_position_fusion_faults(one):
         assert "1999910 m" in finding.message or "1999960 m" in finding.message
         assert finding.spans_s == ((valid_until_s, 110.0),)
 
@@ -170,7 +170,11 @@ def test_unmet_ekf2_fusion_condition_is_found_in_real_log(
 ) -> None:
     flight = read_log(shared_logs.parent / path)
     compared = compare(flight, position_source=source_name)
-    found = [one for one in ekf2_not_fusing.detect(compared) if "condition" in one.evidence]
+    found = [
+        one
+        for one in ekf2_fusion.detect_position_fusion_faults(compared)
+        if "condition" in one.evidence
+    ]
     assert len(found) == bool(texts)
     for text in texts:
         assert text in f"{found[0].message} {found[0].remedy}"

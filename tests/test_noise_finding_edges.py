@@ -35,8 +35,8 @@ from px4fuse.convention.model import Convention, OrientationConvention
 from px4fuse.filter.settings import Settings
 from px4fuse.filter.tuning import NoiseEstimate
 from px4fuse.findings import cause_text, hidden_errors, loops, noises
-from px4fuse.findings.cause_grouping import group_by_cause
 from px4fuse.findings.ekf2_settings import detect_wrong_noise
+from px4fuse.findings.model import group_by_cause
 from px4fuse.findings.noises import _has_default_noises
 from px4fuse.flight.ekf2_parameters import EV_POS, GNSS_POS, PARAMETERS
 from px4fuse.flight.model import AS_RECEIVED_ORIGIN, GNSS_ORIGIN
@@ -155,14 +155,14 @@ def test_wrong_noise_report_contains_factor_and_estimated_noise() -> None:
     assert worse.message == (
         "SIGMA_A is 10 times too large: KF follows the noise of single positions. SIGMA_A is 1 "
         "m/s²; "
-        "its maximum-likelihood estimate is 0.1 m/s² (95 % 0.09 to 0.11 m/s²). KF's covariance P "
-        "grows too much between updates, so KF's gain is too large."
+        "its maximum-likelihood estimate is 0.1 m/s² (95 % 0.09 to 0.11 m/s²). KF's gain is too "
+        "large."
     )
     small = tuned(NoiseEstimate(2.0, 1.9, 2.1), NoiseEstimate(9.0, 8.9, None))
     worse, _ = noises.detect_wrong_settings(analysis(source=MOVING, tuning=small))
     assert (
-        "too small: KF lags behind the motion. SIGMA_A is 1 m/s²; its maximum-likelihood estimate "
-        "is 9 m/s². KF's covariance P grows too little" in worse.message
+        "too small: KF follows the positions slowly. SIGMA_A is 1 m/s²; its maximum-likelihood "
+        "estimate is 9 m/s². KF's gain is too small." in worse.message
     )
     assert named(noises.detect_wrong_settings, analysis(source=MOVING)) == {}
 
@@ -465,8 +465,7 @@ def test_overconfident_ekf2_without_replay_gets_noise_advice(
          ("ekf2_noise_too_small", "error", "UWB noise is 4 times the noise setting of EKF2")),
         (0.5, "gnss", 0.44,
          ("ekf2_noise_too_small", "error",
-          "GNSS noise is 4 times the noise setting of KF and EKF2: EKF2 rejects 44 % of the "
-          "positions")),
+          "GNSS noise is 4 times the noise setting of EKF2: EKF2 rejects 44 % of the positions")),
     ],
 )  # fmt: skip
 def test_title_of_wrong_default_noise_names_the_position_sensor(

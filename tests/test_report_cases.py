@@ -39,8 +39,7 @@ def test_parameter_change_in_flight_is_replayed_and_reported(shared_logs: Path) 
     first = analysis.findings[0]
     assert first.id == "parameter_changed"
     assert (
-        "changed from 0.1 to 0.6 m at 27.0 s. EKF2 is consistent before the parameter change"
-        in first.message
+        "changed from 0.1 to 0.6 m at 27.0 s. EKF2 is consistent before the change" in first.message
     )
     assert analysis.ekf2_model.agreement.good
 

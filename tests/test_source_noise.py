@@ -21,7 +21,7 @@ from px4fuse.filter.fitting import NoiseParameters
 from px4fuse.filter.settings import Settings
 from px4fuse.finding import Finding
 from px4fuse.findings import find
-from px4fuse.findings.source_noise import detect, detect_noise_variation
+from px4fuse.findings.source_errors import detect, detect_noise_variation
 from px4fuse.flight.model import Columns, Flight, Unavailable
 from px4fuse.readers import read_log
 from px4fuse.simulation.flights import simulate_flight

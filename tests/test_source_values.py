@@ -22,15 +22,14 @@ from px4fuse.convention.model import Convention
 from px4fuse.ekf2.model import prepare_ekf2_model, replay_with_settings
 from px4fuse.finding import Finding
 from px4fuse.findings import (
-    ekf2_not_fusing,
+    ekf2_fusion,
     source_convention,
     source_intervals,
     source_positions,
     source_stamps,
     source_values,
 )
-from px4fuse.findings.cause_grouping import group_by_cause
-from px4fuse.findings.model import finding
+from px4fuse.findings.model import finding, group_by_cause
 from px4fuse.flight.model import REPEATED_TIMESTAMPS_NOTE, ClockMap, Columns, Flight, Unavailable
 from px4fuse.readers import read_log
 from px4fuse.readers.common import classify_invalid_positions, estimate_rounding_step
@@ -118,7 +117,7 @@ def test_constant_coordinate_is_reported_and_not_fused(column, name, severity, c
     comparison = compare(replace(flight, positions=(source,)))
     (found,) = source_positions.detect_constant_coordinates(comparison)
     assert (found.id, found.severity) == (name, severity)
-    assert "is constant (1.25 m)" in found.message
+    assert "(constant: 1.25 m)" in found.message
     assert f"EKF2_EV_CTRL {'to' if control == 2 else 'at'} {control}" in found.remedy
     assert ("down" in comparison.axes) is (column != "down_m")
 
@@ -197,7 +196,7 @@ def test_single_sample_without_position_gives_only_a_note():
     assert (one.id, one.severity) == ("source_without_position", "note")
 
 
-@pytest.mark.parametrize(("step_m", "words"), [(0.5, "double precision"), (0.1, "more digits")])
+@pytest.mark.parametrize(("step_m", "words"), [(0.5, "64-bit"), (0.1, "more digits")])
 def test_rounded_positions_report_recommends_more_digits(step_m, words):
     (one,) = detected(with_track(aisle_flight(), rounding_step_m=step_m))
     assert words in one.remedy
@@ -253,7 +252,7 @@ VALUE_FAULTS = {
 
 def detected(flight: Flight) -> tuple[Finding, ...]:
     analysis = unexplained(compare(flight))
-    detectors = (source_values, source_stamps, source_intervals, ekf2_not_fusing)
+    detectors = (source_values, source_stamps, source_intervals, ekf2_fusion)
     findings = [one for detector in detectors for one in detector.detect(analysis)]
     return group_by_cause(source_convention.remove_convention_effects(analysis, findings))
 

@@ -50,12 +50,10 @@ from px4fuse.core.text import (
     with_log_name,
 )
 from px4fuse.ekf2.fusion_conditions import is_height_only
-from px4fuse.ekf2.inputs import find_horizontal_reset_times_s
 from px4fuse.errors import LogError, MissingDataError
 from px4fuse.filter.consistency import classify_sigma_ratio
 from px4fuse.filter.settings import KF_NUMERIC_SETTINGS, SETTING_RANGES, Settings
 from px4fuse.filter.signals import AISLE
-from px4fuse.filter.tuning import HORIZONTAL, AxisTuning
 from px4fuse.finding import Finding
 from px4fuse.findings.model import format_count, format_percent, split_cause_groups
 from px4fuse.findings.source_positions import has_little_motion
@@ -251,9 +249,9 @@ def _summarise_errors(analysis: Analysis) -> FlightErrors:
     comparison, segment, reset_count = analysis.main, analysis.segment.whole_flight, None
     difference = comparison.difference
     if isinstance(analysis.flight.ekf2, Ekf2):
-        reset_times_s = find_horizontal_reset_times_s(analysis.flight.ekf2)
-        reset_count = int(
-            ((segment.start_s < reset_times_s) & (reset_times_s <= segment.end_s)).sum()
+        reset_count = sum(
+            segment.start_s < reset.time_s <= segment.end_s
+            for reset in analysis.flight.ekf2.find_horizontal_resets()
         )
     return FlightErrors(
         axis=describe_axis(analysis, comparison),
@@ -344,20 +342,19 @@ def _describe_effect(
 
 
 def _describe_worst_axis(analysis: Analysis) -> list[str]:
-    results = (analysis.main, *analysis.select_secondary_axes())
-    nees_axis_rmse_tuples = [
-        (truth.nees_position_mean, result, truth.position_rmse_m)
-        for result in results
-        if isinstance(truth := result.filters["ekf2"].truth, ErrorsAgainstTruth)
-        and truth.nees_position_mean
-        and not (truth.has_only_lag_errors and result is not analysis.main)
-    ]
-    nees, worst_result, rmse_m = max(
-        nees_axis_rmse_tuples, key=lambda item: item[0], default=(1.0, analysis.main, 0.0)
-    )
-    ratio = math.sqrt(nees)
+    def compute_ratio(result: AxisComparison) -> float:
+        truth = result.filters["ekf2"].truth
+        if isinstance(truth, Unavailable) or (
+            truth.has_only_lag_errors and result is not analysis.main
+        ):
+            return 0.0
+        return math.sqrt(truth.nees_position_mean or 0.0)
+
+    worst_result = max((analysis.main, *analysis.select_secondary_axes()), key=compute_ratio)
+    ratio = compute_ratio(worst_result)
     if worst_result is analysis.main or classify_sigma_ratio(ratio, "truth") != "overconfident":
         return []
+    rmse_m = _find_rmse_by_filter_m(worst_result)["ekf2"]
     return [
         f"EKF2's RMSE along {worst_result.axis.label} is {format_metres(rmse_m)} m, "
         f"{format_ratio(ratio)} times its reported σ."
@@ -404,7 +401,7 @@ def _format_action(action: Action) -> str:
         return f"EKF2: {', '.join(action.commands)} ({change_text})"
     if action.where == "shell":
         options_text = action.commands[0].partition(" --")[2]
-        return f"KF: {action.sentence or 'run again with'} --{options_text}"
+        return f"KF: run again with --{options_text}"
     text = lowercase_first_letter(action.sentence.rstrip("."))
     return f"{capitalise_first(action.target)}: {text}"
 
@@ -497,24 +494,14 @@ def _explain_differing_verdicts(
         if not finding_ids.isdisjoint(fault_ids):
             return sentence
     if corrected_filters.issuperset(filters_with_differing_ratios):
-        filter_labels = " and ".join(
-            FILTER_NAMES[filter_name] for filter_name in filters_with_differing_ratios
-        )
         return (
-            f"The first fault on this card hardly changes the innovations of {filter_labels}, but "
-            "it increases the errors against ground truth. The re-run without this fault reduces "
-            "the position error."
+            "The first fault on this card hardly changes the innovations, but it increases the "
+            "errors against ground truth. The re-run without this fault reduces the position error."
         )
-    horizontal_tuning = analysis.tuning.get(HORIZONTAL)
     if analysis.source.origin.may_drift:
-        noise_text = ""
-        if isinstance(horizontal_tuning, AxisTuning):
-            sigma_z = horizontal_tuning.sigma_z
-            noise_m = sigma_z.value or sigma_z.high
-            noise_text = f" of {format_metres(noise_m)} m" if noise_m else ""
         return (
-            f"The position noise{noise_text} is smaller than KF and EKF2 assume, so innovations "
-            "are small. Only ground truth shows the drift of the source."
+            "The position noise is smaller than KF and EKF2 assume, so innovations are small. Only "
+            "ground truth shows the drift of the source."
         )
     if "source_noise_time_correlated" in finding_ids:
         return (

@@ -26,11 +26,9 @@ from px4fuse.comparison.rerun_effects import (
 )
 from px4fuse.core.text import lowercase_first_letter, with_log_name
 from px4fuse.filter.consistency import classify_sigma_ratio
-from px4fuse.filter.tuning import HORIZONTAL, AxisTuning
 from px4fuse.finding import Finding
-from px4fuse.findings.cause_grouping import WRONG_CONVENTION_KEY
 from px4fuse.findings.cause_text import format_sender_action
-from px4fuse.findings.model import FINDING_CATALOGUE
+from px4fuse.findings.model import FINDING_CATALOGUE, WRONG_CONVENTION_KEY
 from px4fuse.flight.ekf2_parameters import PARAMETERS
 from px4fuse.flight.model import PositionTrack, Unavailable
 from px4fuse.request import COMPARISON_OPTIONS, ComparisonRequest, command_line
@@ -170,7 +168,9 @@ def make_cause(
         alternatives=alternative_action_groups,
         actions=actions,
         reruns=tuple(_make_card_rerun(rerun, reruns) for rerun in reruns if can_show_effect(rerun)),
-        after=_format_closing_sentence(analysis, useful_reruns, alternative_action_groups),
+        after=_format_closing_sentence(
+            useful_reruns, has_alternatives=bool(alternative_action_groups)
+        ),
     )
 
 
@@ -227,13 +227,12 @@ def _make_actions(
             if change and kind != "delay":
                 actions.append(make_parameter_action(analysis, change))
         elif kind != "defaults" and change.keys() <= COMPARISON_OPTIONS.keys():
-            defaults_rerun = rerun_by_filter_and_kind.get(("kf", "defaults"))
-            default_settings = defaults_rerun.change if defaults_rerun and kind == "noises" else {}
             # --clock-offset replaces the offset from the alignment, so it must include that offset
             if TIME_OFFSET_KEY in change and (alignment := analysis.source.alignment):
                 total_s = change[TIME_OFFSET_KEY] + alignment.clock_offset_s
                 change[TIME_OFFSET_KEY] = round(total_s, 3)
-            actions.append(make_rerun_action(request, change, default_settings))
+            command = command_line(structs.replace(request, **change))
+            actions.append(Action("KF", "", (command,), "shell"))
     # First correct the vehicle, then KF
     actions.sort(key=lambda action: action.target == "KF")
     action_targets = {
@@ -306,8 +305,7 @@ def _explain_missing_action(
             return (
                 "keep the settings: EKF2's gate rejects these outliers, and EKF2's σ is consistent"
             )
-    fault_text = "drift of the position source" if finding.id == "source_drift" else "this fault"
-    return f"no filter setting corrects {fault_text}"
+    return "no filter setting corrects this fault"
 
 
 def _find_action_target(finding: Finding, source: PositionTrack | None = None) -> ActionTarget:
@@ -321,26 +319,6 @@ def _find_action_target(finding: Finding, source: PositionTrack | None = None) -
         target = "EKF2"
     is_gnss_receiver = target == "sender" and source is not None and source.origin.is_gnss
     return "receiver" if is_gnss_receiver else target
-
-
-def make_rerun_action(
-    request: ComparisonRequest, change: Mapping[str, float], default_settings: Mapping[str, float]
-) -> Action:
-    """Return the command that runs KF with changed settings.
-
-    The default noise settings are offered too, if KF also improves with ``default_settings``.
-    """
-    command = command_line(structs.replace(request, **change))
-    default_options_text = " and ".join(
-        f"{COMPARISON_OPTIONS[name]} (default {value:g})"
-        for name, value in default_settings.items()
-    )
-    sentence = (
-        f"run again with estimated noise settings, or with defaults: without {default_options_text}"
-        if default_options_text
-        else ""
-    )
-    return Action("KF", sentence, (command,), "shell")
 
 
 def make_parameter_action(analysis: Analysis, change: Mapping[str, float]) -> Action:
@@ -392,27 +370,14 @@ def _format_rerun_label(rerun: Rerun, reruns: Sequence[Rerun]) -> str:
     return f"{label}, {'sender' if kind == 'time offset' else 'parameters'}"
 
 
-def _format_closing_sentence(
-    analysis: Analysis,
-    useful_reruns: Sequence[Rerun],
-    alternative_action_groups: Sequence[tuple[Action, ...]],
-) -> str:
-    if alternative_action_groups:
+def _format_closing_sentence(useful_reruns: Sequence[Rerun], *, has_alternatives: bool) -> str:
+    if has_alternatives:
         return (
             "For the next flights, correct either the sender or the delay parameter, not both. "
             "--clock-offset corrects only this analysis."
         )
     if any(rerun.kinds == ("defaults",) for rerun in useful_reruns):
         return "KF is consistent both with default and with estimated noise settings."
-    tuning = analysis.tuning.get(HORIZONTAL)
-    for rerun in useful_reruns:
-        if rerun.kinds == ("noise",) and isinstance(tuning, AxisTuning):
-            default_noise_m = analysis.flight.log.find_default_value(next(iter(rerun.change)))
-            if (tuning.sigma_z.low or 0.0) <= default_noise_m <= (tuning.sigma_z.high or 0.0):
-                return (
-                    f"PX4's default of {default_noise_m:g} m is inside the 95 % interval of the "
-                    "estimate."
-                )
     sigma_ratios_against_truth = [
         math.sqrt(rerun.after.nees_mean) for rerun in useful_reruns if rerun.after.nees_mean
     ]

@@ -12,8 +12,7 @@ from px4fuse.ekf2.aids import AidResult
 from px4fuse.filter.signals import Segment
 from px4fuse.finding import Finding
 from px4fuse.findings import (
-    aids,
-    ekf2_not_fusing,
+    ekf2_fusion,
     ekf2_settings,
     ekf2_state,
     hidden_errors,
@@ -23,23 +22,20 @@ from px4fuse.findings import (
     recording,
     source_clock,
     source_convention,
+    source_errors,
     source_frame,
     source_intervals,
-    source_noise,
-    source_patterns,
     source_positions,
     source_stamps,
     source_values,
 )
-from px4fuse.findings.cause_grouping import group_by_cause
-from px4fuse.findings.model import make_warning
+from px4fuse.findings.model import group_by_cause, make_warning
 from px4fuse.flight.model import Ekf2, Flight
 from px4fuse.loop.model import Loop
 from px4fuse.readers.px4_positions import NO_FIX_ACTION
 
 DETECTORS = (
-    aids,
-    ekf2_not_fusing,
+    ekf2_fusion,
     ekf2_settings,
     ekf2_state,
     hidden_errors,
@@ -51,8 +47,7 @@ DETECTORS = (
     source_convention,
     source_frame,
     source_intervals,
-    source_noise,
-    source_patterns,
+    source_errors,
     source_positions,
     source_stamps,
     source_values,
@@ -74,7 +69,7 @@ def find_loop_findings(loop: Loop) -> tuple[Finding, ...]:
 
 def find_aid_findings(aid_results: Mapping[str, AidResult], flight: Flight) -> tuple[Finding, ...]:
     """Return the findings on EKF2 and its aiding sources, for a flight without position source."""
-    findings = list(aids.detect_aid_faults(aid_results))
+    findings = list(ekf2_fusion.detect_aid_faults(aid_results))
     for item in flight.missing:
         if item.remedy == NO_FIX_ACTION:
             message = f"The GNSS receiver had no position: {item.reason}."
@@ -82,8 +77,6 @@ def find_aid_findings(aid_results: Mapping[str, AidResult], flight: Flight) -> t
     if isinstance(flight.ekf2, Ekf2):
         spans_s = find_airborne_spans(flight) or ((0.0, flight.log.duration_s),)
         segment = Segment(spans_s[0][0], spans_s[-1][1], "")
-        findings += ekf2_state.detect_instance_switches(
-            flight.ekf2, (segment.start_s, segment.end_s)
-        )
+        findings += ekf2_state.detect_instance_switches(flight.ekf2, segment)
         findings += ekf2_state.detect_missing_alignment(flight, segment)
     return group_by_cause(findings)

@@ -17,8 +17,19 @@ from px4fuse.comparison.rerun_effects import (
 )
 from px4fuse.filter.frame_rotation import HeadingError
 from px4fuse.filter.settings import SETTING_RANGES
-from px4fuse.findings import cause_grouping as kinds
-from px4fuse.findings.model import find_source_texts, format_percent, magnetometer_advice
+from px4fuse.findings.model import (
+    ACCELEROMETER_CAUSE,
+    CLOCK_CAUSE,
+    MEASUREMENT_NOISE_CAUSE,
+    MISALIGNED_FRAME_CAUSE,
+    OUTLIER_CAUSE,
+    PROCESS_NOISE_CAUSE,
+    UNKNOWN_CAUSE,
+    WRONG_GATE_CAUSE,
+    find_source_texts,
+    format_percent,
+    magnetometer_advice,
+)
 from px4fuse.flight.ekf2_parameters import PARAMETERS
 from px4fuse.flight.model import PositionTrack, Unavailable
 from px4fuse.request import COMPARISON_OPTIONS
@@ -27,22 +38,22 @@ from px4fuse.request import COMPARISON_OPTIONS
 def classify_cause(analysis: Analysis, cause: Rerun | None) -> str:
     """Return the kind of fault that a re-run corrects, such as "measurement noise"."""
     if cause is None:
-        return kinds.UNKNOWN_CAUSE
+        return UNKNOWN_CAUSE
     aid = find_aid(analysis)
     kind_by_change = {
-        rerun_effects.OUTLIERS_KEY: kinds.OUTLIER_CAUSE,
-        rerun_effects.TIME_OFFSET_KEY: kinds.CLOCK_CAUSE,
-        aid.delay: kinds.CLOCK_CAUSE,
-        rerun_effects.ROTATION_KEY: kinds.MISALIGNED_FRAME_CAUSE,
-        rerun_effects.FORWARD_BIAS_KEY: kinds.ACCELEROMETER_CAUSE,
-        changes.SIGMA_Z: kinds.MEASUREMENT_NOISE_CAUSE,
-        aid.noise: kinds.MEASUREMENT_NOISE_CAUSE,
-        aid.gate: kinds.WRONG_GATE_CAUSE,
+        rerun_effects.OUTLIERS_KEY: OUTLIER_CAUSE,
+        rerun_effects.TIME_OFFSET_KEY: CLOCK_CAUSE,
+        aid.delay: CLOCK_CAUSE,
+        rerun_effects.ROTATION_KEY: MISALIGNED_FRAME_CAUSE,
+        rerun_effects.FORWARD_BIAS_KEY: ACCELEROMETER_CAUSE,
+        changes.SIGMA_Z: MEASUREMENT_NOISE_CAUSE,
+        aid.noise: MEASUREMENT_NOISE_CAUSE,
+        aid.gate: WRONG_GATE_CAUSE,
     }
     for name, kind in kind_by_change.items():
         if name in cause.change:
             return kind
-    return kinds.PROCESS_NOISE_CAUSE
+    return PROCESS_NOISE_CAUSE
 
 
 def rerun_refutes_cause(analysis: Analysis, filter_name: FilterName, cause: Rerun) -> bool:

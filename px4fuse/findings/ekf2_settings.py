@@ -2,7 +2,6 @@
 
 import math
 from itertools import pairwise
-from typing import NamedTuple
 
 from px4fuse.analysis import Analysis
 from px4fuse.comparison.comparison import compute_position_errors
@@ -21,13 +20,14 @@ from px4fuse.comparison.rerun_effects import (
     compute_preference_key,
     find_rerun,
 )
+from px4fuse.core.arrays import rms
 from px4fuse.core.text import format_factor, format_metres, format_ratio
 from px4fuse.filter.consistency import Consistency
 from px4fuse.filter.tuning import HORIZONTAL, AxisTuning
-from px4fuse.finding import Finding
-from px4fuse.findings.cause_grouping import CAUSE_KEY, REPORTED_VARIANCE_USED_BY_EKF2_CAUSE
 from px4fuse.findings.cause_text import format_action
 from px4fuse.findings.model import (
+    CAUSE_KEY,
+    REPORTED_VARIANCE_USED_BY_EKF2_CAUSE,
     Findings,
     find_source_texts,
     finding,
@@ -70,15 +70,11 @@ def detect_wrong_noise(analysis: Analysis) -> Findings:
     parameter_noise_m = inputs.settings[aid.noise]
     uses_reported_sigma = used_noise_m > parameter_noise_m
     ratio = estimated_noise_m / used_noise_m
-    factor, size_word, gain_size_word = ratio, "small", "large"
+    factor, size_word, reason = ratio, "small", "EKF2's gain is too large."
     if ratio < 1.0:
-        factor, size_word, gain_size_word = 1.0 / ratio, "large", "small"
+        factor, size_word, reason = 1.0 / ratio, "large", "EKF2's gain is too small."
     sensor_name = source_name(analysis.source)
-    is_kf_noise_equal_to_ekf2 = analysis.source.origin.is_gnss and math.isclose(
-        analysis.settings.sigma_z_m, used_noise_m, rel_tol=1e-2
-    )
     effect_text = ""
-    reason = f"EKF2's gain is too {gain_size_word}, and its reported σ is too {size_word}."
     rejected_fraction = analysis.main.rejected_fraction or 0.0
     if rejected_fraction >= MIN_REJECTED_FRACTION_IN_MESSAGE:
         effect_text = f": EKF2 rejects {format_percent(rejected_fraction)} of the positions"
@@ -88,11 +84,7 @@ def detect_wrong_noise(analysis: Analysis) -> Findings:
     is_default_noise = used_noise_m == analysis.flight.log.find_default_value(aid.noise)
     # PX4's default suits usual sensors: if it is too small, this sensor is noisier
     if ratio > 1.0 and is_default_noise:
-        filter_names = "KF and EKF2" if is_kf_noise_equal_to_ekf2 else "EKF2"
-        title = (
-            f"{sensor_name} noise is {format_factor(factor)} times the noise setting of "
-            f"{filter_names}"
-        )
+        title = f"{sensor_name} noise is {format_factor(factor)} times the noise setting of EKF2"
     interval_text, horizontal_tuning = "", analysis.tuning.get(HORIZONTAL)
     if isinstance(horizontal_tuning, AxisTuning):
         low_m, high_m = horizontal_tuning.sigma_z.low, horizontal_tuning.sigma_z.high
@@ -109,7 +101,9 @@ def detect_wrong_noise(analysis: Analysis) -> Findings:
             f"than {aid.noise} ({parameter_noise_m:g} m)."
         )
         action += f" Or let the position source report a variance of {estimated_noise_m**2:.2g} m²."
-    if is_kf_noise_equal_to_ekf2:
+    if analysis.source.origin.is_gnss and math.isclose(
+        analysis.settings.sigma_z_m, used_noise_m, rel_tol=1e-2
+    ):
         message += f" KF takes SIGMA_Z from {aid.noise}."
     yield finding(
         "error" if factor >= MIN_NOISE_FACTOR_FOR_ERROR else "warning",
@@ -128,45 +122,41 @@ def detect_wrong_noise(analysis: Analysis) -> Findings:
 def find_confirmed_noise_rerun(analysis: Analysis) -> Rerun | None:
     """Return a re-run in which another EKF2 measurement noise makes EKF2 consistent, or None."""
     rerun = find_rerun(analysis.select_main_reruns(), "ekf2", "noise", find_aid(analysis).noise)
-    is_confirmed = rerun is not None and becomes_consistent(rerun, "source")
-    return rerun if is_confirmed else None
+    return rerun if rerun is not None and becomes_consistent(rerun, "source") else None
 
 
 def detect_rejections(analysis: Analysis) -> Findings:
-    rejection_findings = tuple(_find_rejections(analysis))
-    yield from _detect_small_gate(analysis, rejection_findings)
+    ekf2 = analysis.flight.ekf2
+    if not isinstance(ekf2, Ekf2):
+        return
+    rejection_findings = tuple(_find_rejections(analysis, ekf2.gate))
+    # Probability that both innovations, north and east, are inside the gate: erf(gate/√2)²
+    expected_rejected_fraction = 1.0 - math.erf(ekf2.gate / math.sqrt(2.0)) ** 2
+    # In a gate this small, a consistent filter would reject 1 % of the positions
+    if rejection_findings and expected_rejected_fraction >= REJECTED_FRACTION_FOR_WARNING:
+        aid = find_aid(analysis)
+        rejected_fraction = float(rejection_findings[0].evidence["rejected_fraction"])
+        yield finding(
+            rejection_findings[0].severity,
+            "ekf2_gate_too_small",
+            f"{aid.gate} {ekf2.gate:g} is too small: EKF2 rejects "
+            f"{format_percent(rejected_fraction)} of the positions. Without any fault, this "
+            f"gate rejects {format_percent(expected_rejected_fraction)}.",
+            f"Set {aid.gate} to {aid.default_gate:g} (PX4's default, in multiples of √S).",
+            {"gate": ekf2.gate, "rejected_by_gate": expected_rejected_fraction},
+        )
     yield from rejection_findings
 
 
-def _detect_small_gate(analysis: Analysis, rejection_findings: tuple[Finding, ...]) -> Findings:
-    """Detect a gate so small that a consistent filter would reject 1 % of the positions."""
-    ekf2 = analysis.flight.ekf2
-    if isinstance(ekf2, Ekf2) and rejection_findings:
-        # Probability that both innovations, north and east, are inside the gate: erf(gate/√2)²
-        expected_rejected_fraction = 1.0 - math.erf(ekf2.gate / math.sqrt(2.0)) ** 2
-        if expected_rejected_fraction >= REJECTED_FRACTION_FOR_WARNING:
-            aid = find_aid(analysis)
-            rejected_fraction = float(rejection_findings[0].evidence["rejected_fraction"])
-            yield finding(
-                rejection_findings[0].severity,
-                "ekf2_gate_too_small",
-                f"{aid.gate} {ekf2.gate:g} is too small: EKF2 rejects "
-                f"{format_percent(rejected_fraction)} of the positions. Without any fault, this "
-                f"gate rejects {format_percent(expected_rejected_fraction)} of the positions.",
-                f"Set {aid.gate} to {aid.default_gate:g} (PX4's default, in multiples of √S).",
-                {"gate": ekf2.gate, "rejected_by_gate": expected_rejected_fraction},
-            )
-
-
-def _find_rejections(analysis: Analysis) -> Findings:
-    ekf2, down_comparison = analysis.flight.ekf2, analysis.axes.get("down")
+def _find_rejections(analysis: Analysis, gate: float) -> Findings:
+    down_comparison = analysis.axes.get("down")
     # EKF2 rejects north and east together, so one horizontal axis is sufficient
     results = [analysis.main]
     if down_comparison is not None and down_comparison is not analysis.main:
         results.append(down_comparison)
     for result in results:
         innovations = result.ekf2_innovations
-        if isinstance(innovations, Unavailable) or isinstance(ekf2, Unavailable):
+        if isinstance(innovations, Unavailable):
             continue
         rejected_flags = innovations["rejected"].dropna()
         rejected_fraction = float(rejected_flags.mean())  # NaN without logged flags
@@ -176,8 +166,7 @@ def _find_rejections(analysis: Analysis) -> Findings:
                 "error" if rejected_fraction >= REJECTED_FRACTION_FOR_ERROR else "warning",
                 "ekf2_rejects_positions",
                 f"EKF2 rejects {format_percent(rejected_fraction)} of the {quantity}. Their "
-                f"innovations are outside its gate of {ekf2.gate:g} √S. Possible causes: outliers, "
-                "measurement noise set too small, or late timestamps.",
+                f"innovations are outside its gate of {gate:g} √S.",
                 _find_rejection_remedy(analysis, result),
                 {
                     "rejected_fraction": rejected_fraction,
@@ -212,20 +201,15 @@ def _prevents_rejections(rerun: Rerun) -> bool:
     )
 
 
-class SpanConsistency(NamedTuple):
-    """Consistency and position RMSE of EKF2 between two parameter changes, if known."""
-
-    consistency: Consistency | Unavailable
-    rmse_m: float
-
-
 def detect_parameter_changes(analysis: Analysis) -> Findings:
     """Detect changes of EKF2 parameters in flight."""
     ekf2, segment = analysis.flight.ekf2, analysis.segment
+    if not isinstance(ekf2, Ekf2):
+        return
     fusion_parameters = (find_aid(analysis).switch, AID_MASK_PARAMETER)
     changes = [
         change
-        for change in (ekf2.parameter_changes if isinstance(ekf2, Ekf2) else ())
+        for change in ekf2.parameter_changes
         if change.name in (*PARAMETERS, *fusion_parameters)
         and segment.start_s < change.time_s < segment.end_s
     ]
@@ -234,25 +218,24 @@ def detect_parameter_changes(analysis: Analysis) -> Findings:
     for (time_s, name, value_before, value_after), (before, after) in zip(
         changes, pairwise(spans), strict=True
     ):
+        (nis_before, rmse_before_m), (nis_after, rmse_after_m) = before, after
         unit = "" if name in fusion_parameters else f" {PARAMETERS[name].printed_unit}".rstrip()
         effect_sentences, has_effect = "", name in fusion_parameters
-        nis_before, nis_after = before.consistency, after.consistency
         if not isinstance(nis_before, Unavailable) and not isinstance(nis_after, Unavailable):
             has_effect |= nis_before.verdict != nis_after.verdict
             has_effect |= _differ_by_min_factor(nis_before.sigma_ratio, nis_after.sigma_ratio)
             effect_sentences = (
-                f" EKF2 is {_format_verdict(nis_before)} before the parameter change and "
-                f"{_format_verdict(nis_after)} after (innovations along the main axis of motion)."
+                f" EKF2 is {_format_verdict(nis_before)} before the change and "
+                f"{_format_verdict(nis_after)} after (innovations along the main axis)."
             )
-        if _differ_by_min_factor(before.rmse_m, after.rmse_m):
+        if _differ_by_min_factor(rmse_before_m, rmse_after_m):
             has_effect = True
             effect_sentences += (
-                " EKF2's position RMSE along the main axis of motion is "
-                f"{format_metres(before.rmse_m)} m before the parameter change and "
-                f"{format_metres(after.rmse_m)} m after it."
+                f" EKF2's position RMSE along the main axis is {format_metres(rmse_before_m)} m "
+                f"before and {format_metres(rmse_after_m)} m after the change."
             )
         action = (
-            f"Analyse the flight before (--end {time_s:.1f}) and after the parameter change "
+            f"Analyse the flight before (--end {time_s:.1f}) and after the change "
             f"(--start {time_s:.1f}) separately."
         )
         if name in fusion_parameters:
@@ -281,16 +264,19 @@ def _format_verdict(consistency: Consistency) -> str:
     return f"{consistency.verdict} (σ {factor} times too {size_word})"
 
 
-def _assess_span(analysis: Analysis, start_s: float, end_s: float) -> SpanConsistency:
+def _assess_span(
+    analysis: Analysis, start_s: float, end_s: float
+) -> tuple[Consistency | Unavailable, float]:
+    """Return consistency and position RMSE (m) of EKF2 in a time span; NaN without ground truth."""
     rmse_m = math.nan
     errors = compute_position_errors(analysis.main, "ekf2")
     if not isinstance(errors, Unavailable):
-        rmse_m = float((errors["error_m"].loc[start_s:end_s] ** 2).mean() ** 0.5)
+        rmse_m = rms(errors["error_m"].loc[start_s:end_s])
     innovations = analysis.main.ekf2_innovations
     if isinstance(innovations, Unavailable):
-        return SpanConsistency(innovations, rmse_m)
+        return innovations, rmse_m
     samples = innovations[(innovations.index >= start_s) & (innovations.index < end_s)]
     consistency = Consistency.from_innovations(
         samples["innovation_m"].to_numpy(), samples["innovation_variance_m2"].to_numpy(), math.inf
     )
-    return SpanConsistency(consistency, rmse_m)
+    return consistency, rmse_m

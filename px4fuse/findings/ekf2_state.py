@@ -9,11 +9,12 @@ from scipy import constants
 from px4fuse.analysis import Analysis
 from px4fuse.comparison.flight_events import find_airborne_spans
 from px4fuse.comparison.model import ErrorsAgainstTruth
-from px4fuse.core.record import Span
 from px4fuse.core.text import format_metres
 from px4fuse.filter.signals import Segment, cut_to_segment
-from px4fuse.findings.cause_grouping import CAUSE_KEY, SOURCE_GAP_CAUSE, UNKNOWN_CAUSE
 from px4fuse.findings.model import (
+    CAUSE_KEY,
+    SOURCE_GAP_CAUSE,
+    UNKNOWN_CAUSE,
     Findings,
     compute_flag_fraction,
     find_spans_with_value,
@@ -25,7 +26,7 @@ from px4fuse.findings.model import (
     make_warning,
     make_zero_length_spans,
 )
-from px4fuse.flight.ekf2_parameters import BAROMETER, EV_CTRL_YAW_MASK, EV_POS, MAG
+from px4fuse.flight.ekf2_parameters import MAG
 from px4fuse.flight.model import (
     BODY_AXES,
     Columns,
@@ -73,9 +74,8 @@ def detect(analysis: Analysis) -> Findings:
     ekf2 = analysis.flight.ekf2
     if not isinstance(ekf2, Ekf2):
         return
-    flight_segment = analysis.segment.whole_flight
     yield from detect_resets(analysis, ekf2)
-    yield from detect_instance_switches(ekf2, (flight_segment.start_s, flight_segment.end_s))
+    yield from detect_instance_switches(ekf2, analysis.segment.whole_flight)
     median_imu_at_rest = measure_imu_at_rest(analysis.flight)
     if not isinstance(ekf2.record, Unavailable):
         bias_states = cut_to_segment(ekf2.record.delayed, analysis.segment)
@@ -129,25 +129,18 @@ def _detect_bias_at_limit(
                 )
         yield make_error(
             "ekf2_bias_at_limit",
-            message + (_describe_height_error(analysis, ekf2) if axis_index == 2 else ""),
+            message + (_describe_height_error(analysis) if axis_index == 2 else ""),
             f"Calibrate the {sensor}s at the temperature of the flight.",
             {"bias": median_bias, "limit": limit, "limited_fraction": limited_fraction},
         )
 
 
-def _describe_height_error(analysis: Analysis, ekf2: Ekf2) -> str:
-    error_text, down_comparison = "", analysis.axes.get("down")
+def _describe_height_error(analysis: Analysis) -> str:
+    down_comparison = analysis.axes.get("down")
     truth = None if down_comparison is None else down_comparison.filters["ekf2"].truth
-    if isinstance(truth, ErrorsAgainstTruth):
-        error_text = (
-            f" EKF2's height RMSE against ground truth is {format_metres(truth.position_rmse_m)} m."
-        )
-    if (barometer_log := ekf2.aids.get(BAROMETER.name)) is not None:
-        innovations = cut_to_segment(barometer_log.samples, analysis.segment)[
-            f"innovation_{barometer_log.axes[0]}"
-        ]
-        error_text += f" Barometer innovations have a mean of {abs(innovations.mean()):.1f} m."
-    return error_text
+    if not isinstance(truth, ErrorsAgainstTruth):
+        return ""
+    return f" EKF2's height RMSE against ground truth is {format_metres(truth.position_rmse_m)} m."
 
 
 def _detect_gyro_bias(bias_states: pd.DataFrame, median_imu_at_rest: pd.Series | None) -> Findings:
@@ -188,12 +181,12 @@ def detect_missing_alignment(
         and compute_flag_fraction(fusion_flags["yaw"], segment) > 0.0
     )
     tilt_action = "Keep the vehicle at rest after boot until EKF2 is ready."
-    quantities = [("tilt_align", "tilt", "tilt is", tilt_action)]
+    quantities = [("tilt_align", "tilt", tilt_action)]
     if not fuses_source_yaw:
         heading_action = _find_heading_action(flight, source)
-        quantities.append(("yaw_align", "heading", "tilt and heading are", heading_action))
+        quantities.append(("yaw_align", "heading", heading_action))
     alignment_end_s = segment.start_s
-    for flag, quantity, required_text, action in quantities:
+    for flag, quantity, action in quantities:
         if flag not in ekf2.status_flags:
             continue
         spans = find_spans_with_value(0.0, ekf2.status_flags[flag], segment)
@@ -210,7 +203,7 @@ def detect_missing_alignment(
                 "ekf2_not_aligned",
                 f"EKF2 has not aligned its {quantity}{until_text}. cs_{flag} is 0 for "
                 f"{format_percent(unaligned_fraction)} of the flight. EKF2 fuses no position "
-                f"before {required_text} aligned.",
+                "before this alignment.",
                 action,
                 {"unaligned_fraction": unaligned_fraction, "flag": flag},
                 spans,
@@ -222,15 +215,8 @@ def _find_heading_action(flight: Flight, source: PositionTrack | None) -> str:
     action = magnetometer_advice(flight) or f"Enable the magnetometer ({MAG.switch} 0)."
     if source is None or not source.origin.is_vision:
         return action
-    alternative = "let EKF2 fuse the yaw of the source (EKF2_EV_CTRL bit 3)"
-    if source.orientation is None:
-        alternative = "send the orientation of the source and set EKF2_EV_CTRL bit 3"
-        if int(flight.log.parameters.get(EV_POS.switch, 0)) & EV_CTRL_YAW_MASK:
-            alternative = (
-                "send the orientation of the source: EKF2_EV_CTRL bit 3 is set, but the "
-                "orientation is missing or constant"
-            )
-    return f"{action} Alternatively, {alternative}."
+    sending_text = "send the orientation of the source and " if source.orientation is None else ""
+    return f"{action} Alternatively, {sending_text}let EKF2 fuse this yaw (EKF2_EV_CTRL bit 3)."
 
 
 def detect_resets(analysis: Analysis, ekf2: Ekf2) -> Findings:
@@ -278,9 +264,11 @@ def detect_resets(analysis: Analysis, ekf2: Ekf2) -> Findings:
         )
 
 
-def detect_instance_switches(ekf2: Ekf2, span_s: Span) -> Findings:
-    """Detect changes of the primary EKF2 instance in a time span (s)."""
-    switch_times_s = [time for time, _ in ekf2.primary_instances if span_s[0] < time <= span_s[1]]
+def detect_instance_switches(ekf2: Ekf2, segment: Segment) -> Findings:
+    """Detect changes of the primary EKF2 instance in a segment."""
+    switch_times_s = [
+        time for time, _ in ekf2.primary_instances if segment.start_s < time <= segment.end_s
+    ]
     if switch_times_s:
         yield make_warning(
             "ekf2_instance_switch",

@@ -24,10 +24,10 @@ from px4fuse.core.text import capitalise_first, format_metres, format_ratio
 from px4fuse.errors import TrajectoryError
 from px4fuse.filter.tuning import HORIZONTAL, AxisTuning
 from px4fuse.finding import Finding
-from px4fuse.findings.cause_grouping import CAUSE_KEY
 from px4fuse.findings.cause_text import classify_cause, format_action, rerun_refutes_cause
 from px4fuse.findings.loops import find_usable_loop
 from px4fuse.findings.model import (
+    CAUSE_KEY,
     Findings,
     find_source_texts,
     finding,
@@ -68,10 +68,6 @@ class AlignmentRmse(NamedTuple):
             f"horizontal position RMSE {format_metres(self.rmse_before_m)} m before and "
             f"{format_metres(self.rmse_after_m)} m after the best shift and rotation"
         )
-
-    @property
-    def is_misaligned(self) -> bool:
-        return self.rmse_after_m < MAX_ALIGNED_RMSE_RATIO * self.rmse_before_m
 
 
 def find_hidden_errors(comparison: Comparison) -> list[tuple[FilterName, str, ErrorAboveSigma]]:
@@ -138,11 +134,13 @@ def make_hidden_error_finding(
     alignment_rmse = None if rerun_by_filter else _compute_alignment_rmse(analysis, worst_filter)
     is_misaligned = False
     if alignment_rmse is not None:
+        before_m, after_m = alignment_rmse
         evidence |= {
-            "position_rmse_horizontal_m": alignment_rmse.rmse_before_m,
-            "position_rmse_aligned_m": alignment_rmse.rmse_after_m,
+            "position_rmse_horizontal_m": before_m,
+            "position_rmse_aligned_m": after_m,
         }
-        if is_misaligned := alignment_rmse.is_misaligned:
+        is_misaligned = after_m < MAX_ALIGNED_RMSE_RATIO * before_m
+        if is_misaligned:
             sentences.append(f"The position frame is misaligned: {alignment_rmse}.")
     if analysis.source.origin.may_drift and not rerun_by_filter and not is_misaligned:
         return _make_drift_finding(
@@ -188,17 +186,10 @@ def _make_drift_finding(
 
     ``filter_labels`` are the filters whose position error exceeds their reported σ.
     """
-    sensor_name, loop = source_name(analysis.source), find_usable_loop(analysis)
+    loop, rmse_sentence = find_usable_loop(analysis), ""
     drift_text = f"position RMSE {format_metres(worst_error.rmse_m)} m against ground truth"
-    rmse_sentence = ""
     if alignment_rmse is not None:
-        drift_text = (
-            f"horizontal position RMSE {format_metres(alignment_rmse.rmse_after_m)} m after the "
-            "best alignment"
-        )
-        rmse_sentence = (
-            f"Before the alignment the RMSE is {format_metres(alignment_rmse.rmse_before_m)} m. "
-        )
+        drift_text = str(alignment_rmse)
     if (
         loop is not None
         and not (loop.is_end_assumed or loop.is_absolute_track)
@@ -207,8 +198,7 @@ def _make_drift_finding(
     ):
         length_m = loop.path_length_m
         evidence = {**evidence, "closure_error_m": closure_error_m, "path_length_m": length_m}
-        if alignment_rmse is not None:
-            rmse_sentence = f"{capitalise_first(str(alignment_rmse))}. "
+        rmse_sentence = f"{capitalise_first(drift_text)}. "
         drift_text = (
             f"loop closure error {format_metres(closure_error_m)} m, "
             f"{format_percent(closure_error_m / length_m, 1)} of a path of {length_m:.0f} m"
@@ -216,7 +206,7 @@ def _make_drift_finding(
     aid = analysis.source.origin.aid
     return make_error(
         "source_drift",
-        f"{sensor_name} drifts: {drift_text}. {rmse_sentence}The innovations of "
+        f"{source_name(analysis.source)} drifts: {drift_text}. {rmse_sentence}The innovations of "
         f"{' and '.join(filter_labels)} do not show the drift. Do not reduce SIGMA_Z"
         f"{f' or {aid.noise}' if aid else ''}.",
         DRIFT_REMEDY if loop is None else f"{DRIFT_REMEDY} {LOOP_REMEDY}",
@@ -256,11 +246,10 @@ def _compute_alignment_rmse(
 
 
 def make_possible_drift_finding(analysis: Analysis) -> Finding:
-    sensor_name, loop = source_name(analysis.source), find_usable_loop(analysis)
-    horizontal_tuning = analysis.tuning.get(HORIZONTAL)
+    loop, horizontal_tuning = find_usable_loop(analysis), analysis.tuning.get(HORIZONTAL)
     evidence: dict[str, float | str] = {"source": analysis.source.name}
     message = (
-        f"{sensor_name} may drift. "
+        f"{source_name(analysis.source)} may drift. "
         "KF and EKF2 follow the drift, so innovations do not show the drift."
     )
     if isinstance(horizontal_tuning, AxisTuning) and (

@@ -17,7 +17,7 @@ from px4fuse.filter.signals import Segment, cut_to_segment, find_imu_gaps
 from px4fuse.finding import MIN_SPAN_S
 from px4fuse.findings.model import Findings, finding, format_percent, make_error, make_warning
 from px4fuse.findings.recording import DEFAULT_SDLOG_PROFILE, VISION_PROFILE_MASK
-from px4fuse.flight.model import Columns, Ekf2, Flight, sample_rate
+from px4fuse.flight.model import Columns, Ekf2, Flight, Unavailable, sample_rate
 
 # Maximum specific force (m/s²) of real sensors: 35 g, because the largest range is 32 g
 MAX_PLAUSIBLE_SPECIFIC_FORCE_M_S2 = 343.0
@@ -54,7 +54,7 @@ def detect(analysis: Analysis) -> Findings:
 def detect_impossible_acceleration(analysis: Analysis) -> Findings:
     """Detect accelerations that no accelerometer of an autopilot can measure."""
     imu = analysis.flight.imu
-    if not isinstance(imu, pd.DataFrame):
+    if isinstance(imu, Unavailable):
         return
     samples = cut_to_segment(imu, analysis.segment)[Columns.SPECIFIC_FORCE]
     force_m_s2 = np.linalg.norm(samples, axis=1)
@@ -67,8 +67,7 @@ def detect_impossible_acceleration(analysis: Analysis) -> Findings:
         f"The accelerometer values are impossible: up to {max_force_m_s2:,.0f} m/s², first at "
         f"{start_s:.1f} s. Sensors of autopilots measure at most 32 g (314 m/s²). The simulator "
         "has diverged, or the log is damaged.",
-        "Analyse only the time before the impossible values "
-        f"(--end {max(start_s - 1.0, 0.0):.1f}).",
+        f"Analyse only the time before these values (--end {max(start_s - 1.0, 0.0):.1f}).",
         {"max_m_s2": max_force_m_s2, "count": len(times_s), "at_s": start_s},
         ((start_s, times_s[-1]),),
     )
@@ -91,24 +90,23 @@ def detect_accelerometer_bias(analysis: Analysis) -> Findings:
             f"{bias_m_s2 * TILT_DEG_PER_M_S2:.1f}° has the same effect."
         )
         if ekf2_bias_m_s2 is not None:
-            message += (
-                f" EKF2's estimate of the bias is {ekf2_bias_m_s2[0]:+.2f} m/s² forward and "
-                f"{ekf2_bias_m_s2[1]:+.2f} m/s² right."
-            )
+            forward, right, _ = ekf2_bias_m_s2
+            message += f" EKF2 estimates {forward:+.2f} m/s² forward and {right:+.2f} m/s² right."
         sensor_text = "accelerometers and the level horizon"
     elif ekf2_bias_m_s2 is not None:
         # If the horizontal bias is not significant, test only the vertical bias
         is_horizontal_known = isinstance(systematic_errors, SystematicErrors)
         bias_m_s2 = float(np.linalg.norm(ekf2_bias_m_s2[2 * is_horizontal_known :]))
+        forward, right, down = ekf2_bias_m_s2
         message = (
-            f"EKF2 estimates an accelerometer bias of {bias_m_s2:.2f} m/s². Its components are "
-            f"{ekf2_bias_m_s2[0]:+.2f} forward, {ekf2_bias_m_s2[1]:+.2f} right and "
-            f"{ekf2_bias_m_s2[2]:+.2f} down."
+            f"EKF2 estimates an accelerometer bias of {bias_m_s2:.2f} m/s²: {forward:+.2f} "
+            f"forward, {right:+.2f} right and {down:+.2f} down."
         )
         min_bias_for_error_m_s2 = np.inf  # a bias that EKF2 estimates does not affect EKF2
     else:
-        down = analysis.axes.get("down")
-        error_m_s2 = (estimate_mean_acceleration_error(down.axis) if down else None) or 0.0
+        error_m_s2 = 0.0
+        if (result := analysis.axes.get("down")) is not None:
+            error_m_s2 = estimate_mean_acceleration_error(result.axis) or 0.0
         bias_m_s2 = abs(error_m_s2)
         message = (
             f"The accelerometer is biased by {error_m_s2:+.2f} m/s² down. The estimate is from "
@@ -142,8 +140,7 @@ def detect_tumbling(analysis: Analysis) -> Findings:
             "attitude_failure",
             f"Roll or pitch exceeded PX4's failure-detector limits (FD_FAIL_R, FD_FAIL_P) at "
             f"{start_s:.1f} s. Later data do not represent normal flight.",
-            "Analyse only the time before the excessive tilt "
-            f"(--end {max(start_s - 1.0, 0.0):.1f}).",
+            f"Analyse only the time before this tilt (--end {max(start_s - 1.0, 0.0):.1f}).",
             {"total_s": sum(end - start for start, end in spans)},
             spans,
         )
@@ -152,7 +149,7 @@ def detect_tumbling(analysis: Analysis) -> Findings:
 def detect_clipping(analysis: Analysis) -> Findings:
     """Detect accelerometer samples at the limit of the measurement range."""
     imu = analysis.flight.imu
-    if not isinstance(imu, pd.DataFrame) or "clipped" not in imu:
+    if isinstance(imu, Unavailable) or "clipped" not in imu:
         return
     imu_samples = cut_to_segment(imu, analysis.segment)
     time_s = imu_samples.index[imu_samples["clipped"] > 0.0].to_numpy()
@@ -175,7 +172,7 @@ def detect_clipping(analysis: Analysis) -> Findings:
 def detect_imu_gaps(analysis: Analysis) -> Findings:
     gap_s, imu, log = analysis.main.kf_run.input_gap_s, analysis.flight.imu, analysis.flight.log
     interval_s, spans = 0.0, tuple[Span, ...]()
-    if isinstance(imu, pd.DataFrame):
+    if not isinstance(imu, Unavailable):
         interval_s, spans = 1.0 / sample_rate(imu), _find_gap_spans(imu, analysis.segment)
     if gap_s > max(MIN_REPORTED_IMU_GAP_S, 2.0 * interval_s):
         action = ""
@@ -197,7 +194,7 @@ def detect_imu_gaps(analysis: Analysis) -> Findings:
 def detect_missing_imu_samples(analysis: Analysis) -> Findings:
     """Detect single missing IMU samples during the whole flight."""
     imu, log = analysis.flight.imu, analysis.flight.log
-    if not isinstance(imu, pd.DataFrame) or log.format.startswith("MAVLink"):
+    if isinstance(imu, Unavailable) or log.format.startswith("MAVLink"):
         return
     samples = cut_to_segment(imu, analysis.segment)
     lost_fraction = compute_lost_imu_fraction(samples.index.to_numpy()) if len(samples) > 1 else 0.0

@@ -28,7 +28,6 @@ from px4fuse.filter.settings import SETTING_RANGES, Settings
 from px4fuse.filter.signals import cut_to_segment
 from px4fuse.filter.tuning import HORIZONTAL, AxisTuning, NoiseEstimate
 from px4fuse.finding import SEVERITIES, Finding, Severity
-from px4fuse.findings.cause_grouping import CAUSE_KEY, MEASUREMENT_NOISE_CAUSE, UNKNOWN_CAUSE
 from px4fuse.findings.cause_text import (
     classify_cause,
     format_action,
@@ -36,7 +35,15 @@ from px4fuse.findings.cause_text import (
     rerun_refutes_cause,
 )
 from px4fuse.findings.hidden_errors import find_hidden_errors
-from px4fuse.findings.model import Findings, finding, lower_severity, make_error
+from px4fuse.findings.model import (
+    CAUSE_KEY,
+    MEASUREMENT_NOISE_CAUSE,
+    UNKNOWN_CAUSE,
+    Findings,
+    finding,
+    lower_severity,
+    make_error,
+)
 from px4fuse.findings.source_positions import has_little_motion
 from px4fuse.flight.ekf2_parameters import BAROMETER, EV_POS, GNSS_POS, PARAMETERS
 from px4fuse.flight.model import Columns, Unavailable, sample_rate
@@ -79,21 +86,6 @@ KEEP_NOISE_BECAUSE_OF_CORRELATION_ACTION = (
 KEEP_NOISE_BECAUSE_OF_TRUTH_ACTION = (
     "Do not reduce noise settings: ground truth shows that a smaller σ would be too small."
 )
-EFFECT_AND_REASON_BY_WRONG_SETTING = {
-    (SIGMA_Z, "small"): (
-        "KF follows the noise of single positions",
-        "KF's gain is too large.",
-    ),
-    (SIGMA_Z, "large"): ("KF follows the positions slowly", "KF's gain is too small."),
-    (SIGMA_A, "small"): (
-        "KF lags behind the motion",
-        "KF's covariance P grows too little between updates, so KF's gain is too small.",
-    ),
-    (SIGMA_A, "large"): (
-        "KF follows the noise of single positions",
-        "KF's covariance P grows too much between updates, so KF's gain is too large.",
-    ),
-}
 
 
 class SettingDeviation(NamedTuple):
@@ -138,11 +130,10 @@ def detect_wrong_settings(analysis: Analysis) -> Findings:
         ):
             continue
         setting_finding = _make_setting_finding(analysis, axis_tuning, name, deviation)
-        findings.append(
-            (SEVERITIES.index(setting_finding.severity), -deviation.factor, setting_finding)
-        )
+        rank = SEVERITIES.index(setting_finding.severity), -deviation.factor
+        findings.append((rank, setting_finding))
     cause = None
-    for *_, setting_finding in sorted(findings, key=lambda item: item[:2]):
+    for _, setting_finding in sorted(findings, key=lambda item: item[0]):
         yield structs.replace(setting_finding, caused_by=cause)
         cause = cause or setting_finding.id
 
@@ -154,16 +145,18 @@ def _make_setting_finding(
     setting = getattr(analysis.settings, name)
     noise = axis_tuning.sigma_z if name == SIGMA_Z else axis_tuning.sigma_a_two_state
     label, size_word = SETTING_RANGES[name].label, "small" if setting < estimated_noise else "large"
-    is_upper_bound = noise.value is None
-    effect, reason = EFFECT_AND_REASON_BY_WRONG_SETTING[name, size_word]
-    action = format_setting_action(analysis, name)
+    effect, gain_size_word = "KF follows the positions slowly", "small"
+    if (name == SIGMA_Z) == (size_word == "small"):
+        effect, gain_size_word = "KF follows the noise of single positions", "large"
+    action, note = format_setting_action(analysis, name), ""
     if name == SIGMA_Z and estimated_noise < MIN_RERUN_SIGMA_Z_M:
-        reason += f" Re-runs use a SIGMA_Z of at least {MIN_RERUN_SIGMA_Z_M:g} m."
+        note = f" Re-runs use a SIGMA_Z of at least {MIN_RERUN_SIGMA_Z_M:g} m."
     return finding(
         "note" if action == NO_IMPROVEMENT_ACTION else severity,
         f"{label.lower()}_too_{size_word}",
-        f"{label} is {'at least ' if is_upper_bound else ''}{format_factor(factor)} "
-        f"times too {size_word}: {effect}. {format_estimate(name, setting, noise)}. {reason}",
+        f"{label} is {'at least ' if noise.value is None else ''}{format_factor(factor)} "
+        f"times too {size_word}: {effect}. {format_estimate(name, setting, noise)}. KF's gain is "
+        f"too {gain_size_word}.{note}",
         action,
         {
             "chosen": setting,
@@ -287,7 +280,6 @@ def _make_wrong_sigma_finding(
     severity: Severity = "error" if sigma_error_factor >= MIN_SIGMA_FACTOR_FOR_ERROR else "warning"
     if _has_default_noises(analysis, filter_name, worst_axis):
         severity = lower_severity(severity)
-    axis_tuning = find_axis_tuning(analysis.tuning, worst_axis.axis.name)
     verdict = "underconfident" if is_underconfident else "overconfident"
     # Ground truth shows slow errors that innovations do not show
     may_have_hidden_error = is_underconfident and not summary.is_underconfident_against_truth
@@ -295,19 +287,14 @@ def _make_wrong_sigma_finding(
         severity, remedy_text, cause = "note", KEEP_NOISE_BECAUSE_OF_DRIFT_ACTION, UNKNOWN_CAUSE
     elif may_have_hidden_error and analysis.source.origin.is_gnss:
         is_barometer = analysis.source.aid(worst_axis.axis.name) == BAROMETER
-        remedy_text = (
-            _format_action_for_excessive_noise(analysis)
-            if filter_name == "ekf2" and not is_barometer
-            else ""
-        )
-        cause = MEASUREMENT_NOISE_CAUSE if remedy_text else UNKNOWN_CAUSE
-        action_to_keep_noise = KEEP_NOISE_BECAUSE_OF_CORRELATION_ACTION.format(
-            sensor="a barometer" if is_barometer else "GNSS"
-        )
-        severity, remedy_text = (
-            severity if remedy_text else "note",
-            remedy_text or action_to_keep_noise,
-        )
+        remedy_text, cause = "", MEASUREMENT_NOISE_CAUSE
+        if filter_name == "ekf2" and not is_barometer:
+            remedy_text = _format_action_for_excessive_noise(analysis)
+        if not remedy_text:
+            severity, cause = "note", UNKNOWN_CAUSE
+            remedy_text = KEEP_NOISE_BECAUSE_OF_CORRELATION_ACTION.format(
+                sensor="a barometer" if is_barometer else "GNSS"
+            )
     elif (
         is_underconfident
         and filter_name == "ekf2"
@@ -321,9 +308,7 @@ def _make_wrong_sigma_finding(
     else:
         rerun = find_cause_rerun(analysis.reruns, filter_name, worst_axis.axis.name)
         cause = classify_cause(analysis, rerun)
-        remedy_text = _find_action_for_wrong_sigma(
-            analysis, filter_name, worst_axis, axis_tuning, rerun
-        )
+        remedy_text = _find_action_for_wrong_sigma(analysis, filter_name, worst_axis, rerun)
         is_kf_noise_of_receiver = (
             filter_name == "kf" and is_underconfident and analysis.source.origin.is_gnss
         )
@@ -359,17 +344,15 @@ def _format_action_for_excessive_noise(analysis: Analysis) -> str:
     name = find_aid(analysis).noise
     parameter_noise_m = analysis.flight.log.parameters.get(name, np.nan)
     reported_noise_m = _find_reported_noise_m(analysis)
-    horizontal_tuning = find_first_tuning(analysis.tuning, HORIZONTAL)
-    noise_m = max(
-        reported_noise_m, (horizontal_tuning.sigma_z.value if horizontal_tuning else None) or 0.0
-    )
-    if (
-        not parameter_noise_m > MAX_RATIO_OF_EQUAL_NOISES * noise_m
-    ):  # the comparison is False for NaN
+    noise_m, noise_label = reported_noise_m, "noise that the receiver reports"
+    horizontal_tuning = analysis.tuning.get(HORIZONTAL)
+    if isinstance(horizontal_tuning, AxisTuning):
+        estimated_noise_m = horizontal_tuning.sigma_z.value or 0.0
+        if estimated_noise_m > reported_noise_m:
+            noise_m, noise_label = estimated_noise_m, "estimated noise"
+    # `not >` instead of `<=`: an unknown parameter (NaN) gives no action
+    if not parameter_noise_m > MAX_RATIO_OF_EQUAL_NOISES * noise_m:
         return ""
-    noise_label = (
-        "noise that the receiver reports" if noise_m == reported_noise_m else "estimated noise"
-    )
     return (
         f"{name} is {parameter_noise_m:g} m, but the {noise_label} is {noise_m:.2g} m. Test this "
         "smaller noise by a replay: px4fuse whatif LOG."
@@ -387,8 +370,11 @@ def _format_noise_minimum(analysis: Analysis) -> str:
             "Change nothing: the noise of GNSS positions in PX4 is at least the noise that the "
             f"receiver reports ({reported_noise_m:.2g} m)."
         )
-    is_fused_with_gnss = analysis.source.origin.is_vision and has_fused_aid(analysis.flight.ekf2)
-    if not is_fused_with_gnss or parameters.get(EV_POS.noise, 0.0) > gnss_noise_m:
+    if (
+        not analysis.source.origin.is_vision
+        or not has_fused_aid(analysis.flight.ekf2)
+        or parameters.get(EV_POS.noise, 0.0) > gnss_noise_m
+    ):
         return ""
     return (
         "Change nothing: while EKF2 also fuses GNSS, the noise of vision positions in PX4 is at "
@@ -400,10 +386,11 @@ def _has_default_noises(
     analysis: Analysis, filter_name: FilterName, result: AxisComparison
 ) -> bool:
     """Return True if a filter uses default noise settings: px4fuse's (KF) or PX4's (EKF2)."""
-    if filter_name != "ekf2":
+    if filter_name == "kf":
         settings, defaults = analysis.settings, Settings()
-        return all(
-            getattr(settings, name) == getattr(defaults, name) for name in (SIGMA_Z, SIGMA_A)
+        return (settings.sigma_z_m, settings.sigma_a_m_s2) == (
+            defaults.sigma_z_m,
+            defaults.sigma_a_m_s2,
         )
     parameter, log = find_aid(analysis, result.axis.name).noise, analysis.flight.log
     default_noise = log.find_default_value(parameter)
@@ -418,7 +405,6 @@ def _find_action_for_wrong_sigma(
     analysis: Analysis,
     filter_name: FilterName,
     result: AxisComparison,
-    axis_tuning: AxisTuning | None,
     cause: Rerun | None,
 ) -> str:
     if cause is not None and not rerun_refutes_cause(analysis, filter_name, cause):
@@ -426,6 +412,7 @@ def _find_action_for_wrong_sigma(
     reruns = find_reruns(analysis.reruns, filter_name, result.axis.name)
     if any(makes_overconfident(rerun, "nis") for rerun in reruns):
         return KEEP_NOISE_BECAUSE_OF_TRUTH_ACTION
+    axis_tuning = find_axis_tuning(analysis.tuning, result.axis.name)
     if axis_tuning is None:
         return UNKNOWN_NOISE_ACTION
     if filter_name == "ekf2" and not reruns:

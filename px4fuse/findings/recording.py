@@ -46,25 +46,24 @@ def detect_dropouts(analysis: PreparedComparison) -> Findings:
 def detect_lost_data(flight: Flight) -> Findings:
     """Detect unreadable bytes, a log that ends in flight, and wrong timestamps."""
     log = flight.log
-    if log.damage or log.ends_in_flight:
-        make_finding = make_note
-        message = f"The log ends in flight after {log.duration_s:.1f} s. The landing is missing."
-        action = "Stop logging only after landing. If the file is incomplete, copy the file again."
-        if log.damage:
-            make_finding = make_warning
-            lost_bytes, damage_text = log.bytes - log.bytes_read, "the log is damaged"
-            if log.bytes and lost_bytes:
-                lost_percent_text = format_number(100.0 * lost_bytes / log.bytes, 2)
-                damage_text += f": px4fuse cannot read {lost_percent_text} % of its bytes"
-            message = " ".join(f"{_capitalise_note(note)}." for note in (damage_text, *log.damage))
-            action = "Copy the log again. If this does not help, replace the SD card."
-            if log.format.startswith("MAVLink"):
-                action = "Record on a link without loss: by cable, or on the companion computer."
-        yield make_finding(
+    lost_bytes = log.bytes - log.bytes_read
+    evidence = {"lost_bytes": lost_bytes, "ends_in_flight": float(log.ends_in_flight)}
+    if log.damage:
+        damage_text = "the log is damaged"
+        if log.bytes and lost_bytes:
+            lost_percent_text = format_number(100.0 * lost_bytes / log.bytes, 2)
+            damage_text += f": px4fuse cannot read {lost_percent_text} % of its bytes"
+        message = " ".join(f"{_capitalise_note(note)}." for note in (damage_text, *log.damage))
+        action = "Copy the log again. If this does not help, replace the SD card."
+        if log.format.startswith("MAVLink"):
+            action = "Record on a link without loss: by cable, or on the companion computer."
+        yield make_warning("log_damaged", message, action, evidence)
+    elif log.ends_in_flight:
+        yield make_note(
             "log_damaged",
-            message,
-            action,
-            {"lost_bytes": log.bytes - log.bytes_read, "ends_in_flight": float(log.ends_in_flight)},
+            f"The log ends in flight after {log.duration_s:.1f} s. The landing is missing.",
+            "Stop logging only after landing. If the file is incomplete, copy the file again.",
+            evidence,
         )
     for topic, count in list(log.dropped.items())[:1]:
         yield make_note(
@@ -93,7 +92,7 @@ def detect_decreasing_clocks(flight: Flight) -> Findings:
             "receive_time_went_back",
             f"The recorded receive time decreased {format_count(reversals)}. Possible cause: the "
             "clock of the recording computer was set back, or the file consists of several "
-            "recordings. Timestamps in the messages are correct.",
+            "recordings.",
             "Do not synchronise the clock of the recording computer while recording.",
             {"count": reversals},
         )
@@ -115,19 +114,17 @@ def detect_other_estimators(analysis: Analysis) -> Findings:
         yield make_note(
             "not_px4",
             f"This log is from {log.autopilot}, not PX4, so the report contains no PX4 parameters.",
-            f'In this report, "EKF2" stands for the estimator of {log.autopilot}.',
+            f'In this report, "EKF2" stands for the estimator of {log.autopilot}. Ignore actions '
+            "that name PX4 parameters or the ULog.",
             {"autopilot": log.autopilot},
         )
     if log.format.startswith("MAVLink"):
         contents = "states and variances" if isinstance(ekf2.variance, pd.DataFrame) else "states"
-        action = "Give the ULog of this flight as argument LOG."
-        if not log.writes_ulog:
-            action = "The innovations are in the DataFlash log (.BIN), which px4fuse does not read."
         yield make_note(
             "innovations_need_ulog",
             f"A MAVLink recording contains the {contents} of EKF2, but no innovations. The "
             "consistency of EKF2 cannot be tested.",
-            action,
+            "Give the ULog of this flight as argument LOG.",
         )
 
 

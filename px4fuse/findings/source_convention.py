@@ -3,7 +3,7 @@
 Sources: MAVROS ``vision_pose`` (``transform_frame_enu_ned``), PX4 ``VehicleOdometry.msg``, REP 103.
 """
 
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Sequence
 
 from msgspec.structs import replace
 
@@ -15,7 +15,7 @@ from px4fuse.convention.correction import (
     ConventionFaults,
     find_convention_faults,
 )
-from px4fuse.convention.model import Convention, OrientationConvention
+from px4fuse.convention.model import Convention
 from px4fuse.convention.texts import (
     FRAME_AXES,
     describe_axes,
@@ -26,10 +26,11 @@ from px4fuse.convention.texts import (
     format_delay,
 )
 from px4fuse.finding import Finding
-from px4fuse.findings.cause_grouping import RESET_TIME_KEY, WRONG_CONVENTION_KEY
 from px4fuse.findings.model import (
     FINDING_CATALOGUE,
     NO_ESTIMATES_SENTENCE,
+    RESET_TIME_KEY,
+    WRONG_CONVENTION_KEY,
     Findings,
     make_error,
     make_warning,
@@ -40,19 +41,11 @@ from px4fuse.flight.model import Flight, PositionTrack, positions_phrase, source
 POSITION_INDEPENDENT_FINDING_GROUPS = ("logging", "IMU")
 
 
-# Finding id, kind of fault, message and action
-ConventionFaultTexts = tuple[str, str, str, str]
-
-
 def detect(analysis: Comparison) -> Findings:
     convention, faults = analysis.convention, analysis.convention_faults
-    if convention is None:
-        return
-    fault_texts = (
-        *_find_orientation_faults(convention.orientation, faults, source_name(analysis.source)),
-        *_find_position_faults(convention, faults, analysis.source),
-    )
-    yield from _make_findings(convention, faults, fault_texts)
+    if convention is not None:
+        yield from _detect_orientation_faults(convention, faults, analysis.source)
+        yield from _detect_position_faults(convention, faults, analysis.source)
 
 
 def detect_wrong_orientation(flight: Flight, source: PositionTrack) -> Findings:
@@ -60,22 +53,14 @@ def detect_wrong_orientation(flight: Flight, source: PositionTrack) -> Findings:
     convention = check_convention(flight, source)
     if convention is not None:
         faults = find_convention_faults(convention, flight, source.frame)
-        fault_texts = _find_orientation_faults(convention.orientation, faults, source_name(source))
-        yield from _make_findings(convention, faults, fault_texts)
+        yield from _detect_orientation_faults(convention, faults, source)
 
 
-def _make_findings(
-    convention: Convention, faults: ConventionFaults, fault_texts: Iterable[ConventionFaultTexts]
-) -> Findings:
-    for name, kind, message, action in fault_texts:
-        evidence: dict[str, float | str] = {
-            WRONG_CONVENTION_KEY: kind,
-            "log_likelihood": round(convention.log_likelihood_gain, 1),
-        }
-        if kind == "rotation":
-            evidence["misalignment_deg"] = faults.rotation_deg
-        make_finding = make_warning if kind in ("copied", "ambiguous") else make_error
-        yield make_finding(name, message, action, evidence)
+def _make_evidence(convention: Convention, fault: str) -> dict[str, float | str]:
+    return {
+        WRONG_CONVENTION_KEY: fault,
+        "log_likelihood": round(convention.log_likelihood_gain, 1),
+    }
 
 
 def remove_convention_effects(analysis: Comparison, findings: Sequence[Finding]) -> list[Finding]:
@@ -150,9 +135,9 @@ def _is_effect_of_wrong_convention(item: Finding) -> bool:
     return FINDING_CATALOGUE[item.id].status_if_convention_wrong == "effect"
 
 
-def _find_position_faults(
+def _detect_position_faults(
     convention: Convention, faults: ConventionFaults, source: PositionTrack
-) -> Iterator[ConventionFaultTexts]:
+) -> Findings:
     positions_text = positions_phrase(source)
     is_position_file = source.alignment is not None
     log_odds = 99.0 if convention.log_odds is None else min(convention.log_odds, 99.0)
@@ -185,8 +170,12 @@ def _find_position_faults(
             fault_text += f". The frame is also rotated clockwise by {rotation_deg:+.0f}°"
         if orientation and orientation.frames.startswith("FLU"):
             action += f" {describe_quaternion_conversion(orientation.frames)}"
-        message = f"{fault_text}. {evidence_sentence} {frame_sentence}"
-        yield "source_axes_wrong", "axes", message, action
+        yield make_error(
+            "source_axes_wrong",
+            f"{fault_text}. {evidence_sentence} {frame_sentence}",
+            action,
+            _make_evidence(convention, "axes"),
+        )
     elif rotation_deg:
         reference_text = {
             "EKF2": "EKF2's heading",
@@ -194,75 +183,84 @@ def _find_position_faults(
             "GNSS": "the GNSS positions",
         }[convention.heading_from]
         other_cause = "" if convention.heading_from == "GNSS" else f", or {reference_text} is wrong"
-        message = (
-            f"{positions_text} are rotated by {rotation_deg:+.0f}° (clockwise from above) "
-            f"relative to {reference_text}. The x axis of the source does not point north"
-            f"{other_cause}. {evidence_sentence} The analysis rotates the positions to NED."
-        )
         action = (
             "Align the frame of the source with north, or rotate positions and orientation by "
             f"{-rotation_deg:+.0f}° before sending."
         )
         if is_position_file:
             action = "Run again with --position-yaw auto."
-        yield "source_frame_misaligned", "rotation", message, action
+        yield make_error(
+            "source_frame_misaligned",
+            f"{positions_text} are rotated by {rotation_deg:+.0f}° (clockwise from above) "
+            f"relative to {reference_text}. The x axis of the source does not point north"
+            f"{other_cause}. {evidence_sentence} The analysis rotates the positions to NED.",
+            action,
+            _make_evidence(convention, "rotation") | {"misalignment_deg": rotation_deg},
+        )
     if faults.has_wrong_unit:
         fault_text, action = describe_unit(
             convention.unit, positions_text, is_file=is_position_file
         )
         distance_ratio = convention.scale / METRES_PER_UNIT[convention.unit]
-        message = (
+        yield make_error(
+            "source_unit_wrong",
             f"{fault_text}. Distances between positions are {distance_ratio:.3g} times those "
-            f"computed from the IMU. {evidence_sentence} The analysis uses the positions in metres."
+            f"computed from the IMU. {evidence_sentence} The analysis uses positions in metres.",
+            action,
+            _make_evidence(convention, "unit"),
         )
-        yield "source_unit_wrong", "unit", message, action
     if faults.clock_drift:
-        message = (
+        yield make_error(
+            "source_time_offset_changes",
             f"The clock of the position timestamps is {100.0 * abs(faults.clock_drift):.1f} % too "
             f"{'fast' if faults.clock_drift > 0 else 'slow'}. In the middle of the flight the "
             f"timestamps are {format_delay(convention.late_s, 2) or 'correct'}. "
-            f"{evidence_sentence} The analysis uses corrected timestamps."
+            f"{evidence_sentence} The analysis uses corrected timestamps.",
+            "Take timestamps from a clock, not from frame number ÷ nominal rate.",
+            _make_evidence(convention, "clock drift"),
         )
-        action = "Take timestamps from a clock, not from frame number ÷ nominal rate."
-        yield "source_time_offset_changes", "clock drift", message, action
     elif faults.late_s:
-        message = (
-            f"Position timestamps are {format_delay(convention.late_s, 2)}. "
-            f"{evidence_sentence} The analysis uses corrected timestamps."
-        )
         action = (
             "Synchronise the clocks (TIMESYNC; uXRCE-DDS: UXRCE_DDS_SYNCT 1), and send the time of "
             "measurement."
         )
         if is_position_file:
             action = "Run again with --clock-offset auto."
-        yield "source_time_offset", "time offset", message, action
+        yield make_error(
+            "source_time_offset",
+            f"Position timestamps are {format_delay(convention.late_s, 2)}. "
+            f"{evidence_sentence} The analysis uses corrected timestamps.",
+            action,
+            _make_evidence(convention, "time offset"),
+        )
     if faults.is_ambiguous:
         axes_text = format_axes(convention.axes, convention.unit)
-        message = (
+        yield make_warning(
+            "source_convention_ambiguous",
             f"The axes of the {positions_text} are not NED. Several combinations of axes and unit "
             f"fit the motion: {'; or '.join((axes_text, *convention.alternatives[:3]))}. "
-            f"{NO_ESTIMATES_SENTENCE}"
+            f"{NO_ESTIMATES_SENTENCE}",
+            "Fly a square with climb and descent, or state the frame (--position-frame).",
+            _make_evidence(convention, "ambiguous"),
         )
-        action = "Fly a square with climb and descent, or state the frame (--position-frame)."
-        yield "source_convention_ambiguous", "ambiguous", message, action
 
 
-def _find_orientation_faults(
-    orientation: OrientationConvention | None, faults: ConventionFaults, source: str
-) -> Iterator[ConventionFaultTexts]:
+def _detect_orientation_faults(
+    convention: Convention, faults: ConventionFaults, source: PositionTrack
+) -> Findings:
+    orientation = convention.orientation
     if orientation is None or not faults.orientation:
         return
+    sensor_name, evidence = source_name(source), _make_evidence(convention, faults.orientation)
     if faults.orientation == "copied":
-        message = (
-            "The orientation of the source is the autopilot's own attitude, sent back. The "
-            "median difference is below 0.15°. px4fuse ignores this orientation."
-        )
-        action = (
+        yield make_warning(
+            "source_orientation_copied",
+            "The orientation of the source is the autopilot's own attitude, sent back (median "
+            "difference below 0.15°). px4fuse ignores this orientation.",
             "Send no orientation (quaternion of NaN), and do not fuse the yaw (EKF2_EV_CTRL "
-            "without bit 3)."
+            "without bit 3).",
+            evidence,
         )
-        yield "source_orientation_copied", "copied", message, action
         return
     agreement_text = (
         "After correction, roll and pitch agree with the autopilot (median difference "
@@ -270,26 +268,27 @@ def _find_orientation_faults(
     )
     fault_text, action = {
         "order": (
-            f"The quaternion of {source} is sent in the order x, y, z, w, but PX4 reads w, x, y, "
-            f"z. {agreement_text}",
+            f"The quaternion of {sensor_name} is sent in the order x, y, z, w, but PX4 reads w, x, "
+            f"y, z. {agreement_text}",
             "Write w first (px4_msgs: q[0] is w). Eigen coeffs(), SciPy as_quat() and "
             "geometry_msgs have w last.",
         ),
         "frames": (
-            f"The orientation of {source} rotates {orientation.frames}, but PX4 expects "
+            f"The orientation of {sensor_name} rotates {orientation.frames}, but PX4 expects "
             f"FRD to NED. {agreement_text}",
             describe_quaternion_conversion(orientation.frames),
         ),
         "heading": (
-            f"The heading that {source} sends differs by "
+            f"The heading that {sensor_name} sends differs by "
             f"{orientation.heading_error_deg or 0.0:+.0f}° (clockwise from above) from the heading "
             "estimated from positions and IMU",
             "Define the rigid body with x forward. An error of 90° is often an unconverted ENU "
             "heading.",
         ),
     }[faults.orientation]
-    message = (
-        f"{fault_text}. If EKF2 fuses the yaw of this orientation, EKF2's heading becomes wrong."
+    yield make_error(
+        "source_orientation_wrong",
+        f"{fault_text}. If EKF2 fuses this yaw, EKF2's heading becomes wrong.",
+        f"{action} Until the orientation is correct, do not fuse the yaw (EKF2_EV_CTRL bit 3).",
+        evidence,
     )
-    action += " Until the orientation is correct, do not fuse the yaw (EKF2_EV_CTRL bit 3)."
-    yield "source_orientation_wrong", faults.orientation, message, action

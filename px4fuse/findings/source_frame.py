@@ -9,7 +9,7 @@ from px4fuse.comparison.remedy import find_aid, format_changes
 from px4fuse.core.text import lowercase_first_letter
 from px4fuse.filter.frame_rotation import HeadingError
 from px4fuse.finding import Finding
-from px4fuse.findings.ekf2_not_fusing import FUSED_FRACTION_FOR_ERROR
+from px4fuse.findings.ekf2_fusion import FUSED_FRACTION_FOR_ERROR
 from px4fuse.findings.ekf2_settings import find_confirmed_noise_rerun
 from px4fuse.findings.model import (
     Findings,
@@ -56,25 +56,21 @@ def detect(analysis: Analysis) -> Findings:
 
 def make_frd_positions_finding(analysis: Analysis) -> Finding:
     """Make the finding that positions are in FRD, so that their x axis is not north."""
-    ekf2 = analysis.flight.ekf2
-    fusion_flags = ekf2.fusion_flags if isinstance(ekf2, Ekf2) else None
-    sensor_name = source_name(analysis.source)
+    ekf2, sensor_name = analysis.flight.ekf2, source_name(analysis.source)
     fault = (
         f"{positions_phrase(analysis.source)} are in FRD: their x axis points "
         "along the heading at the start, not north."
     )
     note_action = f"In this report, north is the x axis of {sensor_name}."
-    if isinstance(fusion_flags, Unavailable):
-        if analysis.flight.log.writes_ulog:
+    if isinstance(ekf2, Ekf2):
+        if isinstance(ekf2.fusion_flags, Unavailable):
+            message = f"{fault} The log does not show whether EKF2 fused the yaw of {sensor_name}."
             note_action += " Give the ULog of this flight, too: it shows EKF2's frame."
-        message = f"{fault} The log does not show whether EKF2 fused the yaw of {sensor_name}."
-        return make_note("source_frame_frd", message, note_action)
-    if (
-        fusion_flags is not None
-        and compute_flag_fraction(fusion_flags["yaw"], analysis.segment) > FUSED_FRACTION_FOR_ERROR
-    ):
-        message = f"{fault} EKF2 fused the yaw of {sensor_name}, so EKF2's axes are also FRD."
-        return make_note("source_frame_frd", message, note_action)
+            return make_note("source_frame_frd", message, note_action)
+        fused_fraction = compute_flag_fraction(ekf2.fusion_flags["yaw"], analysis.segment)
+        if fused_fraction > FUSED_FRACTION_FOR_ERROR:
+            message = f"{fault} EKF2 fused the yaw of {sensor_name}, so EKF2's axes are also FRD."
+            return make_note("source_frame_frd", message, note_action)
     action = "Send the position in NED."
     if analysis.source.orientation is not None:
         action += " Alternatively, let EKF2 fuse the yaw of the source (EKF2_EV_CTRL bit 3)."
@@ -168,7 +164,7 @@ def _truth_contradicts_heading_drift(flight: Flight, heading_error: HeadingError
 
 
 def _make_heading_drift_finding(analysis: Analysis, heading_error: HeadingError) -> Finding:
-    source, log = analysis.source, analysis.flight.log
+    source = analysis.source
     first_part, last_part = heading_error.find_extreme_parts()
     error_texts = (
         f"{math.remainder(part.heading_error_deg, 360.0):+.0f}° from {part.start_s:.0f} to "
@@ -183,10 +179,9 @@ def _make_heading_drift_finding(analysis: Analysis, heading_error: HeadingError)
     possible_cause = "a magnetometer indoors" if calibration_advice else "a gyroscope bias"
     if source.orientation is not None:
         possible_cause += ", or heading drift of the odometry"
-        if not int(log.parameters.get(EV_POS.switch, 0.0)) & EV_CTRL_YAW_MASK:
-            fusing_system = "EKF2" if log.writes_ulog else "the autopilot"
-            action = f"Let {fusing_system} fuse the yaw of the source"
-            action += " (EKF2_EV_CTRL bit 3)." if log.writes_ulog else "."
+        parameters = analysis.flight.log.parameters
+        if not int(parameters.get(EV_POS.switch, 0.0)) & EV_CTRL_YAW_MASK:
+            action = "Let EKF2 fuse the yaw of the source (EKF2_EV_CTRL bit 3)."
     if source.origin.is_gnss:
         calibration_advice = ""
         possible_cause, action = _explain_gnss_heading_error(analysis)

@@ -6,6 +6,7 @@ import pandas as pd
 from px4fuse.analysis import Analysis
 from px4fuse.comparison.comparison import interpolate_sigma
 from px4fuse.comparison.flight_events import compute_max_interval_s
+from px4fuse.comparison.model import select_north_and_east
 from px4fuse.core.arrays import Array
 from px4fuse.core.record import Span
 from px4fuse.core.text import format_metres
@@ -104,9 +105,7 @@ def _find_action_for_unlogged_positions(analysis: Analysis, start_s: float, end_
     for track in analysis.flight.positions:
         if track.origin.aid == analysis.source.origin.aid and len(track.samples[start_s:end_s]) > 2:
             return f"Run again with --position-source {track.name}, which contains these positions."
-    if analysis.flight.log.dropouts:
-        return "Use a faster SD card, or log fewer topics (SDLOG_PROFILE)."
-    return "Log fewer topics (SDLOG_PROFILE)."
+    return "Use a faster SD card, or log fewer topics (SDLOG_PROFILE)."
 
 
 def _make_stop_or_begin_finding(analysis: Analysis, span_s: Span, fused_aids: list[Aid]) -> Finding:
@@ -114,19 +113,18 @@ def _make_stop_or_begin_finding(analysis: Analysis, span_s: Span, fused_aids: li
     duration_s, effect_sentence, action = end_s - start_s, "", ""
     if end_s == analysis.segment.whole_flight.end_s:
         finding_id, event, event_s = "source_stops", "stop", start_s
-        before_or_after, flight_edge = "after", "before the end of the flight"
+        before_or_after, flight_edge = "after", "before the end"
     else:
         finding_id, event, event_s = "source_begins", "begin", end_s
-        before_or_after, flight_edge = "before", "after the start of the flight"
+        before_or_after, flight_edge = "before", "after the start"
         action = "" if source.alignment else " Take off only when positions arrive."
     ekf2_errors_at_end = _find_ekf2_errors_at_end(analysis, span_s)
-    for name, quantity in (("error_m", "position error"), ("sigma_m", "reported σ")):
-        if name in ekf2_errors_at_end and not effect_sentence:
-            effect_sentence = (
-                f" EKF2's {quantity} at {end_s:.1f} s is "
-                f"{format_metres(ekf2_errors_at_end[name])} m."
-            )
-    has_aids = _has_aiding_sources(analysis.flight.ekf2)
+    for name, quantity in (("sigma_m", "reported σ"), ("error_m", "position error")):
+        if name in ekf2_errors_at_end:
+            error_text = f"{format_metres(ekf2_errors_at_end[name])} m"
+            effect_sentence = f" EKF2's {quantity} at {end_s:.1f} s is {error_text}."
+    ekf2 = analysis.flight.ekf2
+    has_aids = isinstance(ekf2, Ekf2) and bool(ekf2.aids)
     aiding_sentence = ""
     if has_aids:
         labels = [aid.label for aid in fused_aids] or ["the IMU alone (dead reckoning)"]
@@ -136,7 +134,7 @@ def _make_stop_or_begin_finding(analysis: Analysis, span_s: Span, fused_aids: li
         "error" if is_dead_reckoning else "warning",
         finding_id,
         f"{positions_phrase(source)} {event} in flight at {event_s:.1f} s, {duration_s:.1f} s "
-        f"{flight_edge}.{aiding_sentence}{effect_sentence}",
+        f"{flight_edge} of the flight.{aiding_sentence}{effect_sentence}",
         f"{find_source_texts(source).data_link_check} for the time {before_or_after} "
         f"{event_s:.1f} s.{action}",
         {"at_s": event_s, "duration_s": duration_s, **ekf2_errors_at_end},
@@ -146,8 +144,7 @@ def _make_stop_or_begin_finding(analysis: Analysis, span_s: Span, fused_aids: li
 
 def _find_ekf2_errors_at_end(analysis: Analysis, span_s: Span) -> dict[str, float]:
     """Return EKF2's horizontal position error and reported σ (m) at the end of a time span."""
-    axes = [analysis.axes[name] for name in ("north", "east") if name in analysis.axes]
-    squared_errors_m2 = []
+    axes, squared_errors_m2 = select_north_and_east(analysis), []
     for result in axes if len(axes) == 2 else [analysis.main]:
         tracks = result.with_whole_flight_tracks()
         if isinstance(tracks.ekf2_state, Unavailable):
@@ -184,7 +181,7 @@ def describe_errors_after_gap(analysis: Analysis, gap_span_s: Span) -> str:
         if other_aids := _find_fused_aids(ekf2, gap_span_s):
             labels_text = " and ".join(aid.label for aid in other_aids)
             aiding_sentence += f" EKF2 also relies on {labels_text}."
-        elif _has_aiding_sources(ekf2):
+        elif isinstance(ekf2, Ekf2) and ekf2.aids:
             aiding_sentence = "In the gap KF and EKF2 rely on the IMU alone."
         ekf2_text = f"EKF2 {format_metres(abs(positions_before.iloc[-1] - reference_m))} m"
         variance = result.ekf2_variance
@@ -201,10 +198,6 @@ def describe_errors_after_gap(analysis: Analysis, gap_span_s: Span) -> str:
         f"{aiding_sentence} {quantity} along {axis.label}: {ekf2_text}KF "
         f"{format_metres(kf_error_m)} m (σ {format_metres(kf_sigma_m)} m)."
     )
-
-
-def _has_aiding_sources(ekf2: Ekf2 | Unavailable) -> bool:
-    return isinstance(ekf2, Ekf2) and bool(ekf2.aids)
 
 
 def _find_fused_aids(ekf2: Ekf2 | Unavailable, span_s: Span) -> list[Aid]:
@@ -239,15 +232,13 @@ def detect_lost_samples(analysis: Analysis) -> Findings:
     sent_count = lost_count + len(intervals_s)
     lost_fraction = lost_count / max(sent_count, 1)
     if len(intervals_s) > 1 and lost_fraction > MIN_LOST_POSITION_FRACTION:
-        action = "Record on the companion computer or on a link without message loss."
-        if analysis.flight.log.writes_ulog:
-            action += " Or set SDLOG_PROFILE to 129: the ULog then contains the received positions."
         yield make_note(
             "source_samples_lost",
             f"The recording lacks {format_percent(lost_fraction)} of the "
             f"{positions_phrase(source)}. {lost_count} of {sent_count} positions are missing (one "
             f"per {median_interval_s:.2f} s is expected). EKF2 may have received them.",
-            action,
+            "Record on the companion computer or on a link without message loss. Or set "
+            "SDLOG_PROFILE to 129: the ULog then contains the received positions.",
             {"lost": lost_count, "lost_fraction": lost_fraction},
         )
 

@@ -21,15 +21,13 @@ from px4fuse.filter.hypotheses import (
 from px4fuse.filter.time_offset import SourceTimeOffset
 from px4fuse.filter.tuning import HORIZONTAL, AxisTuning
 from px4fuse.finding import Finding, Severity
-from px4fuse.findings.cause_grouping import (
+from px4fuse.findings.imu import MIN_IMU_RATE_HZ, is_rate_too_low
+from px4fuse.findings.model import (
     CAUSE_KEY,
+    NO_ESTIMATES_SENTENCE,
     REPORTED_VARIANCE_USED_BY_EKF2_CAUSE,
     RESET_TIME_KEY,
     VEHICLE_ON_GROUND_CAUSE,
-)
-from px4fuse.findings.imu import MIN_IMU_RATE_HZ, is_rate_too_low
-from px4fuse.findings.model import (
-    NO_ESTIMATES_SENTENCE,
     Findings,
     find_source_texts,
     finding,
@@ -229,7 +227,7 @@ def detect_jumps(analysis: Analysis) -> Findings:
 
 def detect_constant_coordinates(analysis: Analysis) -> Findings:
     """Detect coordinates that never change, so that the source does not measure them."""
-    source, fusion_parameter = analysis.source, EV_POS.switch
+    source, parameters = analysis.source, analysis.flight.log.parameters
     coordinates = constant_coordinates(source)
     is_single_coordinate = len(coordinates) == 1
     if not (is_single_coordinate or is_height_only(source)) or (
@@ -248,23 +246,20 @@ def detect_constant_coordinates(analysis: Analysis) -> Findings:
         make_finding = make_warning
         consequence = "Only the height is evaluated."
     action, coordinates_text = "", " and ".join(coordinates)
-    if fusion_parameter in analysis.flight.log.parameters:
-        value = int(analysis.flight.log.parameters[fusion_parameter])
-        setting_action = f"Leave {fusion_parameter} at {value}"
+    if EV_POS.switch in parameters:
+        value = int(parameters[EV_POS.switch])
+        setting_action = f"Leave {EV_POS.switch} at {value}"
         if value & mask_of_constant:
             new_value = value & ~mask_of_constant | mask_of_measured
-            setting_action = f"Set {fusion_parameter} to {new_value}"
+            setting_action = f"Set {EV_POS.switch} to {new_value}"
         elif coordinates == ["z"]:
             make_finding = make_note
         action = f"{setting_action}, so that EKF2 does not fuse {coordinates_text}. "
     values_text = ", ".join(f"{values_m[each]:g}" for each in coordinates)
-    subject, verb, pronoun = "coordinates", "are", "them"
-    if is_single_coordinate:
-        subject, verb, pronoun = "coordinate", "is", "it"
     yield make_finding(
         finding_id,
-        f"The {subject} {coordinates_text} of {source.name} {verb} constant ({values_text} m): the "
-        f"source does not measure {pronoun}. {consequence}",
+        f"The source {source.name} does not measure {coordinates_text} (constant: {values_text} "
+        f"m). {consequence}",
         f"{action}Send NaN for a coordinate that is not measured.",
         {f"{each}_m": value for each, value in values_m.items()},
     )
@@ -273,11 +268,9 @@ def detect_constant_coordinates(analysis: Analysis) -> Findings:
 def detect_repeated_jumps(analysis: Analysis) -> Findings:
     """Detect repeated jumps: a source corrects its drift, or alternates between two positions."""
     ekf2 = analysis.flight.ekf2
-    jumps, is_announced_by_source = _find_jumps(analysis)
-    if len(jumps) < MIN_JUMPS_WITHOUT_RESET_COUNTER and not is_announced_by_source:
+    times_s, jump_vectors_m, is_announced_by_source = _find_jumps(analysis)
+    if len(times_s) < MIN_JUMPS_WITHOUT_RESET_COUNTER and not is_announced_by_source:
         return
-    times_s = np.array([time_s for time_s, _ in jumps])
-    jump_vectors_m = np.array([step_m for _, step_m in jumps])
     jump_sizes_m = np.linalg.norm(jump_vectors_m, axis=1)
     ekf2_resets = ekf2.find_horizontal_resets() if isinstance(ekf2, Ekf2) else []
     first_reset_delays_s = [
@@ -307,12 +300,12 @@ def detect_repeated_jumps(analysis: Analysis) -> Findings:
         action = "Send the position of one point of the vehicle, for example of one tag."
     yield make_error(
         "source_relocalises",
-        f"The source jumps {len(jumps)} times, by up to {jump_sizes_m.max():.2f} m. The "
-        f"jumps are at {jump_times_text} s, about every {np.median(np.diff(times_s)):.0f} s. "
+        f"The source jumps {len(times_s)} times, by up to {jump_sizes_m.max():.2f} m. Times: "
+        f"{jump_times_text} s, about every {np.median(np.diff(times_s)):.0f} s. "
         f"{counter_sentence} {cause_sentence}{reset_sentence}",
         f"{action} Analyse the time between two jumps (--start, --end).",
         {
-            "count": len(jumps),
+            "count": len(times_s),
             "largest_m": float(jump_sizes_m.max()),
             "announced": is_announced_by_source,
         },
@@ -320,15 +313,15 @@ def detect_repeated_jumps(analysis: Analysis) -> Findings:
     )
 
 
-def _find_jumps(analysis: Analysis) -> tuple[list[tuple[float, Array]], bool]:
-    """Return time (s) and step (m) of each jump, and True if ``reset_counter`` announces them."""
+def _find_jumps(analysis: Analysis) -> tuple[Array, Array, bool]:
+    """Return times (s) and steps (m) of jumps, and True if ``reset_counter`` announces them."""
     position_m = analysis.source_samples[Columns.POSITION[:2]].dropna()
     # A position change after a repeated position contains the motion of two intervals
     position_m = position_m[(position_m.diff() != 0.0).any(axis=1)]
     time_s = position_m.index.to_numpy()
     position_changes_m = np.diff(position_m.to_numpy(), axis=0)
     if len(position_changes_m) < MIN_POSITIONS_FOR_JUMPS:
-        return [], False
+        return time_s[:0], position_changes_m[:0], False
     jump_vectors_m = position_changes_m[1:-1] - 0.5 * (
         position_changes_m[:-2] + position_changes_m[2:]
     )
@@ -341,7 +334,7 @@ def _find_jumps(analysis: Analysis) -> tuple[list[tuple[float, Array]], bool]:
     reset_rows = reset_rows[(reset_rows >= 0) & (reset_rows < len(jump_sizes_m))]
     reset_rows = reset_rows[jump_sizes_m[reset_rows] >= MIN_JUMP_M]
     if len(reset_rows) >= MIN_JUMPS_WITH_RESET_COUNTER:
-        return [(float(time_s[row + 2]), jump_vectors_m[row]) for row in reset_rows], True
+        return time_s[reset_rows + 2], jump_vectors_m[reset_rows], True
     local_median_change_m = (
         pd.Series(jump_sizes_m).rolling(JUMP_WINDOW_SAMPLES, center=True, min_periods=1).median()
     )
@@ -353,20 +346,19 @@ def _find_jumps(analysis: Analysis) -> tuple[list[tuple[float, Array]], bool]:
         intervals_s < MAX_JUMP_TO_MEDIAN_INTERVAL_RATIO * median_interval_s
     )
     window_size = max(MIN_JUMP_DURATION_SAMPLES, round(MIN_JUMP_DURATION_S / median_interval_s))
-    jumps = []
-    for row in np.flatnonzero(is_jump) + 2:  # the first position after the jump
+    for jump in np.flatnonzero(is_jump):
+        row = jump + 2  # the first position after the jump
         first_row, end_row = max(row - window_size, 0), row + window_size
         median_shift_m = (
             position_m.iloc[row:end_row].median()
             - position_m.iloc[first_row:row].median()
             - window_size * np.median(position_changes_m[first_row:end_row], axis=0)
         )
-        if (
-            np.linalg.norm(median_shift_m - jump_vectors_m[row - 2])
-            < MAX_MEDIAN_SHIFT_DEVIATION_FRACTION * jump_sizes_m[row - 2]
-        ):
-            jumps.append((float(time_s[row]), jump_vectors_m[row - 2]))
-    return jumps, False
+        is_jump[jump] = (
+            np.linalg.norm(median_shift_m - jump_vectors_m[jump])
+            < MAX_MEDIAN_SHIFT_DEVIATION_FRACTION * jump_sizes_m[jump]
+        )
+    return time_s[2:-1][is_jump], jump_vectors_m[is_jump], False
 
 
 def detect_scale_error(analysis: Analysis) -> Findings:
@@ -376,7 +368,7 @@ def detect_scale_error(analysis: Analysis) -> Findings:
         isinstance(imu, Unavailable)
         or is_rate_too_low(imu, MIN_IMU_RATE_HZ)
         or analysis.source.origin.is_gnss  # GNSS has no scale factor error
-        or isinstance(analysis.flight.truth, Truth)  # with ground truth, see source_patterns.py
+        or isinstance(analysis.flight.truth, Truth)  # with ground truth, see source_errors.py
         or isinstance(systematic_errors, Unavailable)
         # A low-pass filter or time-correlated noise may resemble a scale error
         or find_low_pass(analysis) is not None
@@ -498,11 +490,8 @@ def detect_wrong_variance(analysis: Analysis) -> Findings:
     ):
         return
     reported_variance_m2 = analysis.source_samples[Columns.POSITION_VARIANCE[:2]].dropna()
-    noise_m, low, high = (
-        axis_tuning.sigma_z.value,
-        axis_tuning.sigma_z.low,
-        axis_tuning.sigma_z.high,
-    )
+    noise = axis_tuning.sigma_z
+    noise_m, low, high = noise.value, noise.low, noise.high
     if reported_variance_m2.empty or noise_m is None or low is None or high is None:
         return
     reported_sigma_m = float(np.sqrt(reported_variance_m2.mean(axis=1)).mean())

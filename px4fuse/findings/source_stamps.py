@@ -125,9 +125,10 @@ def detect_repeated_timestamps(
 def detect_timestamp_unit(analysis: Analysis, clock_name: str) -> Findings:
     """Report timestamps in a wrong unit or from another clock."""
     ekf2, fusion_sentence = analysis.flight.ekf2, ""
-    fusion_flags = ekf2.fusion_flags if isinstance(ekf2, Ekf2) else ekf2
-    if isinstance(fusion_flags, pd.DataFrame) and not compute_flag_fraction(
-        fusion_flags["horizontal"], analysis.segment
+    if (
+        isinstance(ekf2, Ekf2)
+        and isinstance(ekf2.fusion_flags, pd.DataFrame)
+        and not compute_flag_fraction(ekf2.fusion_flags["horizontal"], analysis.segment)
     ):
         fusion_sentence = (
             f"EKF2 never fused the positions. {EFFECT_BY_UNUSABLE_TIMESTAMP[clock_name]} "
@@ -272,9 +273,13 @@ def find_timesync_convergence(analysis: Analysis) -> tuple[float, float] | None:
 def _find_position_age_s(analysis: Analysis) -> pd.Series | None:
     """Return the age (s) of each position at its publication, if logged (timestamp_sample)."""
     ekf2, source, segment = analysis.flight.ekf2, analysis.source, analysis.segment
-    fusion_record = ekf2.record if isinstance(ekf2, Ekf2) else ekf2
-    if isinstance(fusion_record, Unavailable) or source.origin.reconstructed or source.clock_map:
+    if (
+        isinstance(ekf2, Unavailable)
+        or isinstance(ekf2.record, Unavailable)
+        or source.origin.reconstructed
+        or source.clock_map
+    ):
         return None
-    position_age_s = fusion_record.vision_age_s.loc[segment.start_s : segment.end_s]
+    position_age_s = ekf2.record.vision_age_s.loc[segment.start_s : segment.end_s]
     is_long_enough = len(position_age_s) >= 2 * MIN_POSITIONS_BEFORE_AND_AFTER_TIMESYNC
     return position_age_s if is_long_enough else None

@@ -18,6 +18,7 @@ from px4fuse.convention.lever_arm import (
 from px4fuse.core.text import format_metres
 from px4fuse.ekf2.model import misalign_positions, replay_with_settings
 from px4fuse.ekf2.replay import rows_inside
+from px4fuse.finding import format_spans
 from px4fuse.findings.model import (
     NO_ESTIMATES_SENTENCE,
     Findings,
@@ -97,9 +98,6 @@ def detect_invalid_rows(analysis: Analysis) -> Findings:
         spans = tuple(zip(times_by_span.min().tolist(), times_by_span.max().tolist(), strict=True))
         start_s, end_s = max(spans, key=lambda span: span[1] - span[0])
         total_s = sum(end - start for start, end in spans)
-        times_text = f"{len(spans)} time spans between {spans[0][0]:.1f} s and {spans[-1][1]:.1f} s"
-        if len(spans) <= 3:
-            times_text = " and ".join(f"{start:.1f} s to {end:.1f} s" for start, end in spans)
         error_text, make_finding = "", make_note if reason == "NaN" else make_warning
         if end_s - start_s > compute_max_interval_s(1.0 / source.compute_rate_hz()):
             make_finding = make_warning
@@ -110,8 +108,8 @@ def detect_invalid_rows(analysis: Analysis) -> Findings:
             error_text = f" {describe_errors_after_gap(analysis, gap_span_s)}"
         yield make_finding(
             name,
-            f"{len(time_s)} {positions_phrase(source)} {fault}. Times: {times_text} ({total_s:.1f} "
-            f"s in total). KF does not use these positions.{error_text}",
+            f"{len(time_s)} {positions_phrase(source)} {fault}. Times: {format_spans(spans)} "
+            f"({total_s:.1f} s in total). KF does not use these positions.{error_text}",
             action or f"{find_source_texts(source).data_link_check} at {start_s:.1f} s.",
             {
                 "count": len(time_s),
@@ -131,10 +129,7 @@ def detect_rounding(analysis: Analysis) -> Findings:
     cause_text, action = "", "Send the positions with more digits."
     if np.log2(step_m) % 1.0 == 0.0:
         cause_text = " Possible cause: large coordinates (UTM) in 32-bit floats."
-        action += (
-            " At the sender, subtract a local origin in double precision (64 bit) before the "
-            "conversion to 32-bit float."
-        )
+        action += " Subtract a local origin before the conversion from 64-bit to 32-bit floats."
     yield make_warning(
         "source_positions_rounded",
         f"{positions_phrase(source)} are rounded to steps of {step_m:.3g} m.{cause_text} The "
@@ -179,9 +174,9 @@ def detect_lever_arm(analysis: Analysis) -> Findings:
         error_text = "EKF2's position error"
         forward_m, right_m = 0.0 - forward_m, 0.0 - right_m
     elif any(imu_position_m) and not has_truth:
-        action = (
-            f"Set {format_changes(change)}. If the sensor position parameters are right, the "
-            f"IMU position is wrong: set {format_changes(imu_change)} instead."
+        action += (
+            " If the sensor position parameters are right, the IMU position is wrong: set "
+            f"{format_changes(imu_change)} instead."
         )
     if effect_sentence is None:
         return

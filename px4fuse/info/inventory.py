@@ -23,7 +23,7 @@ from px4fuse.filter.signals import (
     cut_to_segment,
     imu_and_attitude,
 )
-from px4fuse.findings import ekf2_not_fusing, imu, recording
+from px4fuse.findings import ekf2_fusion, imu, recording
 from px4fuse.findings.model import finding_title
 from px4fuse.flight.model import (
     DIAGNOSIS_WITHHELD,
@@ -374,7 +374,7 @@ def _collect_logging_advice(
     if comparison is not None:
         findings += [
             *recording.detect_source_not_logged(comparison),
-            *ekf2_not_fusing.detect_unfused_positions(comparison),
+            *ekf2_fusion.detect_unfused_positions(comparison),
         ]
         findings += recording.detect_dropouts(comparison)
     findings += imu.detect_low_rates(flight)

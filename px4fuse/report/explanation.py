@@ -2,8 +2,13 @@
 
 from px4fuse.core.text import capitalise_first
 from px4fuse.errors import SettingsError, suggest_name
-from px4fuse.findings.cause_grouping import EFFECTS_BY_CAUSE, find_effect_ids
-from px4fuse.findings.model import FINDING_CATALOGUE, FINDING_GROUPS, load_examples
+from px4fuse.findings.model import (
+    EFFECTS_BY_CAUSE,
+    FINDING_CATALOGUE,
+    FINDING_GROUPS,
+    find_effect_ids,
+    load_examples,
+)
 from px4fuse.report.page import Page
 
 

@@ -1,22 +1,63 @@
-"""Faults of EKF2's aiding sources: not fused, σ too small, biased or shifted innovations."""
+"""Positions and aiding sources that EKF2 does not fuse, or fuses with a wrong σ or a bias.
+
+An EKF2 position that EKF2 itself declares invalid is also detected.
+"""
 
 from collections.abc import Mapping, Sequence
 
 import numpy as np
+import pandas as pd
 
 from px4fuse.analysis import Analysis
 from px4fuse.comparison.comparison import compute_position_errors
 from px4fuse.comparison.flight_events import find_airborne_spans
+from px4fuse.comparison.model import Comparison, PreparedComparison
+from px4fuse.core.arrays import rms
 from px4fuse.core.record import Span
-from px4fuse.core.text import format_number, format_ratio
+from px4fuse.core.text import format_metres, format_number, format_ratio
 from px4fuse.ekf2.aids import INNOVATION_MEAN_WINDOW_S, AidResult
+from px4fuse.ekf2.fusion_conditions import (
+    EV_START_INTERVAL_S,
+    EV_STOP_INTERVAL_S,
+    UnfusedPositions,
+    find_unmet_condition,
+    is_height_only,
+)
 from px4fuse.filter.signals import cut_to_segment
 from px4fuse.finding import Finding
-from px4fuse.findings.cause_grouping import CAUSE_KEY, INNOVATION_CHANGE_CAUSE, SOURCE_SENSOR_CAUSE
-from px4fuse.findings.model import Findings, finding, format_percent, make_note, make_warning
+from px4fuse.findings.model import (
+    CAUSE_KEY,
+    INNOVATION_CHANGE_CAUSE,
+    SOURCE_SENSOR_CAUSE,
+    Findings,
+    compute_flag_fraction,
+    find_spans_with_value,
+    finding,
+    format_percent,
+    make_note,
+    make_warning,
+)
 from px4fuse.flight.ekf2_parameters import AIDS, BAROMETER, MAG
-from px4fuse.flight.model import BAD_ACCELERATION_FLAG, Unavailable
+from px4fuse.flight.model import (
+    BAD_ACCELERATION_FLAG,
+    POSITION_FILE_ORIGIN,
+    Ekf2,
+    PositionTrack,
+    Truth,
+    Unavailable,
+    positions_phrase,
+)
 
+# Severity "error" if EKF2 fuses the positions for less than this fraction of the time
+FUSED_FRACTION_FOR_ERROR = 0.5
+# Warning if EKF2 fuses the positions for less than this fraction of the time
+FUSED_FRACTION_FOR_WARNING = 0.98
+# Minimum mean position interval (s) that may delay the start of fusion: with jitter, some intervals
+# exceed EKF2's limit of 0.2 s
+MIN_INTERVAL_FOR_LATE_START_S = 0.18
+MOTION_CAPTURE_TOPIC = "vehicle_mocap_odometry"
+# Minimum position error (m) for a finding while EKF2 declares its position invalid
+MIN_INVALID_POSITION_ERROR_M = 1.0
 AIDS_TESTED_BY_REPLAY = ("ev_pos", "ev_hgt")
 # A pause of barometer fusion is normal up to this time (s) after take-off (ground effect)
 GROUND_EFFECT_DURATION_S = 10.0
@@ -40,7 +81,7 @@ DEFAULT_ACTION = "Check mounting and power supply of the sensor."
 
 
 def detect(analysis: Analysis) -> Findings:
-    """Detect faults of EKF2's aiding sources."""
+    yield from detect_position_fusion_faults(analysis)
     if isinstance(analysis.aids, Unavailable):
         return
     aid = analysis.source.origin.aid
@@ -52,6 +93,164 @@ def detect(analysis: Analysis) -> Findings:
         analysis.aids, aid.name if aid else "", take_off_times_s, height_error_m
     )
     yield from detect_bad_acceleration(analysis, analysis.aids)
+
+
+def detect_position_fusion_faults(comparison: Comparison) -> Findings:
+    if is_height_only(comparison.source):
+        return
+    if isinstance(comparison.flight.ekf2, Ekf2):
+        yield from _detect_invalid_position(comparison, comparison.flight.ekf2)
+    yield from detect_unfused_positions(comparison)
+
+
+def detect_unfused_positions(analysis: PreparedComparison) -> Findings:
+    ekf2, source = analysis.flight.ekf2, _find_received_source(analysis)
+    if not isinstance(ekf2, Ekf2) or isinstance(ekf2.fusion_flags, Unavailable):
+        return
+    fusion_flag = ekf2.fusion_flags["horizontal"]
+    fused_fraction = compute_flag_fraction(fusion_flag, analysis.segment)
+    if fused_fraction >= FUSED_FRACTION_FOR_ERROR:
+        yield from _detect_slow_restart(analysis, fusion_flag)
+    if source is None or fused_fraction >= FUSED_FRACTION_FOR_WARNING:
+        return
+    title = f"EKF2 never fused the {positions_phrase(source)}"
+    evidence: dict[str, float | str] = {
+        "fused_fraction": fused_fraction,
+        "source_interval_s": 1.0 / source.compute_rate_hz(),
+    }
+    if source.origin.aid is None:
+        if source.name == MOTION_CAPTURE_TOPIC and not fused_fraction:
+            yield make_warning(
+                "ekf2_not_fusing",
+                f"{title}: EKF2 does not read {source.name}. This topic contains ground truth: "
+                "ATT_POS_MOCAP, or ODOMETRY of estimator type MOCAP.",
+                "To fuse these positions, send VISION_POSITION_ESTIMATE, or ODOMETRY of "
+                "estimator type VISION.",
+                evidence,
+            )
+        return
+    spans = find_spans_with_value(0.0, fusion_flag, analysis.segment)
+    longest_span_s = max(spans, key=lambda span: span[1] - span[0])
+    parameters = {**analysis.flight.log.parameters, **ekf2.parameters}
+    unmet_condition = find_unmet_condition(
+        UnfusedPositions(ekf2, source, source.origin.aid, parameters, longest_span_s)
+    )
+    condition, action = unmet_condition.condition, unmet_condition.action
+    evidence["condition"] = condition
+    if not condition and not source.origin.has_all_samples:
+        action = f"Record with SDLOG_PROFILE 129 (default and vision). {action}"
+    if fused_fraction:
+        title = (
+            f"EKF2 fused the {positions_phrase(source)} only {format_percent(fused_fraction)} of "
+            "the time"
+        )
+    if unmet_condition.fault:
+        title += f": {unmet_condition.fault}"
+    message = f"{title}. {unmet_condition.reason}"
+    if fused_fraction >= FUSED_FRACTION_FOR_ERROR:
+        message += (
+            f" For up to {longest_span_s[1] - longest_span_s[0]:.1f} s EKF2 relied on the IMU and "
+            "other aiding sources."
+        )
+        yield make_warning("ekf2_fusion_interrupted", message, action, evidence, spans)
+        return
+    is_disabled_gnss = source.origin.is_fused_as_gnss and condition == "switch"
+    yield finding(
+        "note" if is_disabled_gnss else "error",
+        "ekf2_not_fusing",
+        message,
+        action,
+        evidence,
+        spans if fused_fraction else (),
+    )
+
+
+def _find_received_source(analysis: PreparedComparison) -> PositionTrack | None:
+    """Return the positions that PX4 received, if any."""
+    if analysis.source.origin != POSITION_FILE_ORIGIN:
+        return analysis.source
+    for track in analysis.flight.positions:
+        if track.origin.is_vision and track.origin != POSITION_FILE_ORIGIN:
+            return track
+    return None
+
+
+def _detect_invalid_position(analysis: Comparison, ekf2: Ekf2) -> Findings:
+    is_valid = ekf2.status_flags.get("xy_valid")
+    if is_valid is None or is_valid.empty:
+        return
+    invalid_fraction = 1.0 - compute_flag_fraction(is_valid, analysis.segment)
+    if invalid_fraction <= 1.0 - FUSED_FRACTION_FOR_WARNING:
+        return
+    spans = find_spans_with_value(0.0, is_valid, analysis.segment)
+    distance_m = _find_largest_distance_m(analysis, ekf2, spans)
+    if distance_m < MIN_INVALID_POSITION_ERROR_M:
+        return
+    reference = "ground truth" if isinstance(analysis.flight.truth, Truth) else "position source"
+    distance_sentence = ""
+    if np.isfinite(distance_m):
+        distance_sentence = (
+            f" The invalid position is up to {format_metres(distance_m)} m from the {reference}."
+        )
+    yield finding(
+        "error" if invalid_fraction > FUSED_FRACTION_FOR_ERROR else "warning",
+        "ekf2_position_invalid",
+        f"EKF2's horizontal position is invalid {format_percent(invalid_fraction)} of the time "
+        f"(xy_valid 0), and PX4 does not use this position.{distance_sentence}",
+        "First restore the fusion of positions. Noise settings do not change the error.",
+        {"invalid_fraction": invalid_fraction, "distance_m": distance_m},
+        spans,
+    )
+
+
+def _find_largest_distance_m(analysis: Comparison, ekf2: Ekf2, spans: tuple[Span, ...]) -> float:
+    """Return EKF2's largest horizontal distance (m) from ground truth or source in time spans."""
+    truth, columns = analysis.flight.truth, ["north_m", "east_m"]
+    reference = truth.samples if isinstance(truth, Truth) else analysis.source.samples
+    ekf2_position_m = pd.concat([ekf2.state[columns].loc[start:end] for start, end in spans])
+    differences_m = [
+        ekf2_position_m[axis]
+        - np.interp(ekf2_position_m.index, reference.index, reference[axis], np.nan, np.nan)
+        for axis in columns
+    ]
+    return float(np.hypot(*differences_m).max())
+
+
+def _detect_slow_restart(analysis: PreparedComparison, fusion_flag: pd.Series) -> Findings:
+    """Detect that EKF2 resumes fusion late after a gap, because the position rate is too low."""
+    source, rate_hz = analysis.source, analysis.source.compute_rate_hz()
+    if (
+        "EKF2_EV_CTRL" not in analysis.flight.log.parameters  # PX4 before v1.14
+        or not source.origin.is_vision
+        or not source.origin.has_all_samples
+        or source.alignment
+        or 1.0 / rate_hz < MIN_INTERVAL_FOR_LATE_START_S
+    ):
+        return
+    time_s = source.samples.index.to_numpy()
+    gap_ends_s = time_s[1:][np.diff(time_s) > EV_STOP_INTERVAL_S]
+    delay_spans = []
+    for start_s, end_s in find_spans_with_value(0.0, fusion_flag, analysis.segment):
+        # Positions from the last gap end on, while EKF2 does not fuse
+        last_gap_end_s = gap_ends_s[gap_ends_s < end_s].max(initial=-np.inf)
+        unfused_times_s = time_s[(time_s >= last_gap_end_s) & (time_s < end_s)]
+        if (
+            last_gap_end_s > start_s - EV_STOP_INTERVAL_S
+            and len(unfused_times_s) > 2
+            and unfused_times_s[1] - unfused_times_s[0] >= EV_START_INTERVAL_S
+        ):
+            delay_spans.append((float(unfused_times_s[0]), end_s))
+    if delay_spans:
+        longest_delay_s = max(end - start for start, end in delay_spans)
+        yield make_note(
+            "source_rate_at_limit",
+            f"After a gap EKF2 resumed fusion {longest_delay_s:.1f} s late: "
+            f"{positions_phrase(source)} come at only {rate_hz:.1f} Hz. EKF2 (v1.14 and later) "
+            f"starts fusion when two positions arrive within {EV_START_INTERVAL_S:g} s.",
+            "Send the position at 10 Hz.",
+            {"rate_hz": rate_hz, "longest_s": longest_delay_s, "count": len(delay_spans)},
+            tuple(delay_spans),
+        )
 
 
 def detect_bad_acceleration(analysis: Analysis, aids: Mapping[str, AidResult]) -> Findings:
@@ -68,8 +267,8 @@ def detect_bad_acceleration(analysis: Analysis, aids: Mapping[str, AidResult]) -
         for name in AIDS_OF_VERTICAL_ACCELERATION_TEST
         if name in aids and aids[name].verdict == "overconfident"
     }
-    cause = "Normal noise can set the flag fs_bad_acc_vertical for some seconds."
-    remedy = "If fs_bad_acc_vertical stays set, check the IMU for vibration and clipping."
+    cause = "Normal noise can set this flag (fs_bad_acc_vertical) for some seconds."
+    remedy = "If the flag stays set, check the IMU for vibration and clipping."
     if too_small_noises:
         parameters_text = " and ".join(sorted(too_small_noises))
         cause = f"The measurement noise is set too small: {parameters_text}."
@@ -157,11 +356,9 @@ def _make_innovation_change_finding(name: str, aid: AidResult) -> Finding:
     return make_warning(
         "aid_innovation_shift",
         f"The mean {axis} innovation of {_format_aid_label(aid)} shifts by "
-        f"{format_number(abs(mean_change) * innovation_sigma, 2)} {aid.unit} at {time_s:.0f} s. "
-        f"The shift is {abs(mean_change):.1f} times √S ({format_number(innovation_sigma, 2)} "
-        f"{aid.unit}).",
-        "Check which device near the sensor was switched on, switched off or moved at "
-        f"{time_s:.0f} s.",
+        f"{format_number(abs(mean_change) * innovation_sigma, 2)} {aid.unit} at {time_s:.0f} s "
+        f"({abs(mean_change):.1f} times √S of {format_number(innovation_sigma, 2)} {aid.unit}).",
+        f"Check which device near the sensor was switched or moved at {time_s:.0f} s.",
         {"aid": name, "axis": axis, "time_s": time_s, "moved": mean_change},
         ((time_s, time_s + INNOVATION_MEAN_WINDOW_S),),
     )
@@ -169,10 +366,9 @@ def _make_innovation_change_finding(name: str, aid: AidResult) -> Finding:
 
 def _make_overconfident_finding(name: str, aid: AidResult, sensor_cause: str) -> Finding:
     # Innovations alone do not distinguish noise from a wrong delay, so no noise value is proposed
-    noise_parameter, noise_text = AIDS[name].noise, ""
-    action = "let the sensor's driver report the true noise (σ)"
-    if noise_parameter:
-        action = f"increase {noise_parameter}"
+    noise_text, action = "", "let the sensor's driver report the true noise (σ)"
+    if AIDS[name].noise:
+        action = f"increase {AIDS[name].noise}"
     if aid.noise is not None:
         noise_text = f" ({format_number(aid.noise)} {aid.unit}, from {aid.noise_from})"
     return make_warning(
@@ -212,15 +408,15 @@ def _make_innovation_bias_finding(name: str, aid: AidResult) -> Finding:
 
 
 def _find_large_height_error_m(analysis: Analysis, span_s: Span) -> float | None:
-    down_comparison = analysis.axes.get("down")
-    errors = None if down_comparison is None else compute_position_errors(down_comparison, "ekf2")
-    if errors is None or isinstance(errors, Unavailable):
+    if "down" not in analysis.axes:
+        return None
+    errors = compute_position_errors(analysis.axes["down"], "ekf2")
+    if isinstance(errors, Unavailable):
         return None
     error_m = errors["error_m"].abs()
     is_in_span = (error_m.index >= span_s[0]) & (error_m.index <= span_s[1])
-    rmse_outside_gap_m = float(np.sqrt(np.mean(error_m[~is_in_span] ** 2)))
     largest_error_m = float(error_m[is_in_span].max())
-    is_large = largest_error_m > MIN_GAP_ERROR_TO_HEIGHT_RMSE_RATIO * rmse_outside_gap_m
+    is_large = largest_error_m > MIN_GAP_ERROR_TO_HEIGHT_RMSE_RATIO * rms(error_m[~is_in_span])
     return largest_error_m if is_large else None
 
 
