@@ -155,19 +155,14 @@ def read_frames(name: str, content: bytes) -> MavlinkFrames:
         The content is not MAVLink.
     """
     start_offsets, end_offsets, message_ids = _remove_nested_frames(_find_valid_frames(content)).T
-    receive_time_bytes = (
-        RECEIVE_TIME_BYTES
-        if len(start_offsets) and _has_receive_times(start_offsets, end_offsets)
-        else 0
-    )
-    if int(np.sum(end_offsets - start_offsets)) < MIN_VALID_FRAME_FRACTION * len(
-        content
-    ) or not len(start_offsets):
+    frame_byte_count = np.sum(end_offsets - start_offsets)
+    if not frame_byte_count or frame_byte_count < MIN_VALID_FRAME_FRACTION * len(content):
         raise LogError(
             f"{name}: the file is neither a PX4 ULog nor a MAVLink recording. It contains "
             f"{len(start_offsets)} frames with a valid checksum in {len(content)} bytes.",
             "Give a .ulg, a .tlog or a raw MAVLink stream.",
         )
+    receive_time_bytes = RECEIVE_TIME_BYTES if _has_receive_times(start_offsets, end_offsets) else 0
     content_bytes = np.frombuffer(content, dtype=np.uint8)
     is_version_2 = content_bytes[start_offsets] == MAGIC_BYTE_V2
     # Sequence number, system id and component id are consecutive bytes
@@ -283,11 +278,10 @@ def _find_possible_frames(
 def _has_receive_times(start_offsets: Int64Array, end_offsets: Int64Array) -> bool:
     """Return True if receive times precede most frames, as in a ``.tlog``."""
     gap_sizes_bytes = start_offsets[1:] - end_offsets[:-1]
-    frame_count_with_receive_time = int(np.count_nonzero(gap_sizes_bytes == RECEIVE_TIME_BYTES))
-    frame_count_without_receive_time = int(np.count_nonzero(gap_sizes_bytes == 0))
-    if frame_count_with_receive_time + frame_count_without_receive_time:
-        return frame_count_with_receive_time > frame_count_without_receive_time
-    return bool(start_offsets[0] == RECEIVE_TIME_BYTES)
+    gap_sizes_bytes = gap_sizes_bytes[np.isin(gap_sizes_bytes, (0, RECEIVE_TIME_BYTES))]
+    if not len(gap_sizes_bytes):
+        gap_sizes_bytes = start_offsets[:1]
+    return bool(np.mean(gap_sizes_bytes == RECEIVE_TIME_BYTES) > 0.5)
 
 
 def _count_bytes_outside_frames(

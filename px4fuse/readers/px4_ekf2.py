@@ -30,8 +30,11 @@ from px4fuse.flight.model import (
 )
 from px4fuse.readers import px4_topics as px4
 from px4fuse.readers.field_maps import Layout
-from px4fuse.readers.px4_aids import read_aids, read_enabled_aids
-from px4fuse.readers.px4_innovations import collect_innovations_by_axis
+from px4fuse.readers.px4_innovations import (
+    collect_innovations_by_axis,
+    read_aids,
+    read_enabled_aids,
+)
 from px4fuse.readers.ulog_topics import Topics, measurement_time_us
 
 VISION_TOPIC = "vehicle_visual_odometry"
@@ -56,10 +59,11 @@ OTHER_HORIZONTAL_AIDS = (
     "aux_global_position",
     "airspeed",
 )
+STATE_REMEDY = f"{px4.DEFAULT_PROFILE_REMEDY} Wait until EKF2 has started."
 VARIANCES_NOT_LOGGED = Unavailable(
     "EKF2 variances",
     "estimator_states (estimator_status before v1.12) is not logged or not usable",
-    f"{px4.DEFAULT_PROFILE_REMEDY} Wait until EKF2 has started.",
+    STATE_REMEDY,
 )
 # Reset counters in vehicle_local_position, with the reset quantity and the columns of the change
 # (north, east, down)
@@ -83,16 +87,10 @@ def read_ekf2(topics: Topics) -> Ekf2 | Unavailable:
             "Set SYS_MC_EST_GROUP to 2 (EKF2).",
         )
     local_position = topics.read(px4.LOCAL_POSITION_LAYOUT)
-    if topics.find_layout(px4.LOCAL_POSITION_LAYOUT) is None:
-        return Unavailable(
-            "EKF2", "vehicle_local_position is not logged", px4.DEFAULT_PROFILE_REMEDY
-        )
     state = local_position[Columns.STATE].dropna()
     if state.empty:
         return Unavailable(
-            "EKF2",
-            "vehicle_local_position has no finite sample",
-            "Start the recording after EKF2 has started.",
+            "EKF2", "vehicle_local_position is not logged or not usable", STATE_REMEDY
         )
     topics.record_stream("ekf2_state", px4.LOCAL_POSITION_LAYOUT.topic)
     aid_enabled_flags = read_enabled_aids(topics)
@@ -255,7 +253,7 @@ def compute_samples_per_step(
     interval_ratio = configured_step_s / imu_interval_s
     # 1e-6 compensates rounding errors of the IMU interval
     sample_count = max(int(interval_ratio + 0.5 + 1e-6), 1)
-    samples_between_logged_ends = np.diff(np.asarray(step_ends, dtype=float))
+    samples_between_logged_ends = np.diff(np.asarray(step_ends))
     if (
         sample_count > 1
         and abs(interval_ratio + 0.5 - sample_count) < MAX_DISTANCE_FROM_HALF_INTEGER
@@ -304,20 +302,16 @@ def _compute_publication_delay_s(topics: Topics, topic: str) -> pd.Series:
 def _read_fusion_flags(topics: Topics, enabled_aids: StepFunctions) -> TableOrUnavailable:
     """Read EKF2's fusion flags of external vision: horizontal position, height and yaw."""
     aid_name_by_flag = {"horizontal": "ev_pos", "vertical": "ev_hgt", "yaw": "ev_yaw"}
-    if not {*aid_name_by_flag.values()} <= enabled_aids.keys():
-        return Unavailable(
-            "EKF2 fusion flags",
-            "estimator_status_flags and estimator_status are not logged",
-            px4.DEFAULT_PROFILE_REMEDY,
-        )
     flags = pd.DataFrame(
-        {flag: enabled_aids[aid_name] for flag, aid_name in aid_name_by_flag.items()}
+        {flag: enabled_aids.get(aid_name) for flag, aid_name in aid_name_by_flag.items()}
     ).dropna()
-    topic = px4.STATUS_FLAGS if topics.instances(px4.STATUS_FLAGS) else px4.STATUS_TOPIC
     if flags.empty:
         return Unavailable(
-            "EKF2 fusion flags", f"{topic} has no usable sample", "Record the flight again."
+            "EKF2 fusion flags",
+            "estimator_status_flags and estimator_status are not logged or not usable",
+            px4.DEFAULT_PROFILE_REMEDY,
         )
+    topic = px4.STATUS_FLAGS if topics.instances(px4.STATUS_FLAGS) else px4.STATUS_TOPIC
     topics.record_stream("ekf2_fusing", topic)
     return flags
 
