@@ -264,15 +264,12 @@ def _describe_log(
 ) -> LogInfo:
     frames, autopilot = recording.frames, recording.autopilot
     notes, damage_notes = [*recording.notes], []
-    reversal_count = int(np.count_nonzero(np.diff(recording.receive_times_s) < 0.0))
-    count_by_quantity = {
-        "ignored MAVLink frames with unknown message type": frames.unknown_frame_count,
-        "damaged receive times that were interpolated": frames.damaged_receive_time_count,
-        "backward jumps of the receive time": reversal_count,
-    }
-    notes += [
-        f"number of {quantity}: {count}" for quantity, count in count_by_quantity.items() if count
-    ]
+    reversal_count = np.count_nonzero(np.diff(recording.receive_times_s) < 0.0)
+    if frames.unknown_frame_count:
+        notes.append(
+            "number of ignored MAVLink frames with unknown message type: "
+            f"{frames.unknown_frame_count}"
+        )
     if frames.is_last_frame_incomplete:
         damage_notes.append(common.format_truncation("frame", recording.duration_s, is_in_flight))
     stray_byte_count, byte_count = frames.byte_count_outside_frames, len(frames.content)
@@ -314,7 +311,7 @@ def _describe_log(
             *describe_dropped_samples(dropped_counts),
         ),
         restarts=recording.restart_count,
-        receive_time_reversals=reversal_count or None,
+        receive_time_reversals=int(reversal_count) or None,
         dropped=dropped_counts,
         autopilot=autopilot,
         start_unix_s=_estimate_start_unix_s(recording),

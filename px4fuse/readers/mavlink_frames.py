@@ -80,7 +80,6 @@ class MavlinkFrames:
     byte_count_outside_frames: int
     # True if the file ends within a frame
     is_last_frame_incomplete: bool
-    damaged_receive_time_count: int
 
     def __len__(self) -> int:
         return len(self.start_offsets)
@@ -172,11 +171,6 @@ def read_frames(name: str, content: bytes) -> MavlinkFrames:
             content, start_offsets - receive_time_bytes, end_offsets, receive_time_bytes
         )
     )
-    receive_times_us, damaged_receive_time_count = (
-        _read_receive_times(content_bytes, start_offsets, end_offsets)
-        if receive_time_bytes
-        else (None, 0)
-    )
     return MavlinkFrames(
         name=name,
         content=content,
@@ -188,11 +182,12 @@ def read_frames(name: str, content: bytes) -> MavlinkFrames:
         sequence_numbers=content_bytes[sequence_offsets],
         payload_offsets=start_offsets + np.where(is_version_2, HEADER_BYTES_V2, HEADER_BYTES_V1),
         payload_lengths=content_bytes[start_offsets + 1],
-        receive_times_us=receive_times_us,
+        receive_times_us=_read_receive_times(content_bytes, start_offsets, end_offsets)
+        if receive_time_bytes
+        else None,
         unknown_frame_count=unknown_frame_count,
         byte_count_outside_frames=byte_count_outside_frames,
         is_last_frame_incomplete=is_last_frame_incomplete,
-        damaged_receive_time_count=damaged_receive_time_count,
     )
 
 
@@ -344,8 +339,8 @@ def _measure_unknown_frames(
 
 def _read_receive_times(
     content_bytes: ByteArray, start_offsets: Int64Array, end_offsets: Int64Array
-) -> tuple[Int64Array, int]:
-    """Return the receive time (UNIX, µs) of each frame, and the number of damaged times."""
+) -> Int64Array:
+    """Return the receive time (UNIX, µs) of each frame; damaged times are interpolated."""
     is_usable = start_offsets >= RECEIVE_TIME_BYTES
     is_usable[1:] &= start_offsets[1:] - end_offsets[:-1] >= RECEIVE_TIME_BYTES
     eight_byte_windows = np.lib.stride_tricks.sliding_window_view(content_bytes, RECEIVE_TIME_BYTES)
@@ -367,4 +362,4 @@ def _read_receive_times(
         receive_times_us = receive_times_us[rows[0]] + np.rint(time_since_first_receipt_us).astype(
             np.int64
         )
-    return receive_times_us, int(np.count_nonzero(~is_usable))
+    return receive_times_us

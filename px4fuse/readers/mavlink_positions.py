@@ -149,11 +149,9 @@ def _read_gnss(
     fixes = recording.read(layout, rows, gnss_boot_time_s - delay_s)
     fixes = fixes[fixes["fix_type"] >= FIX_TYPE_3D]
     if len(fixes) < MIN_TRACK_SAMPLES:
-        fix_count_text = "none" if fixes.empty else f"only {len(fixes)}"
         return unavailable_source(
             layout.topic,
-            f"the recording has {message_count} {layout.topic} messages, "
-            f"{fix_count_text} with a 3D fix",
+            f"the recording has {message_count} {layout.topic}, {len(fixes)} with a 3D fix",
             NO_FIX_ACTION,
         )
     is_auto_candidate = bool(

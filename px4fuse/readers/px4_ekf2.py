@@ -301,10 +301,8 @@ def _compute_publication_delay_s(topics: Topics, topic: str) -> pd.Series:
 
 def _read_fusion_flags(topics: Topics, enabled_aids: StepFunctions) -> TableOrUnavailable:
     """Read EKF2's fusion flags of external vision: horizontal position, height and yaw."""
-    aid_name_by_flag = {"horizontal": "ev_pos", "vertical": "ev_hgt", "yaw": "ev_yaw"}
-    flags = pd.DataFrame(
-        {flag: enabled_aids.get(aid_name) for flag, aid_name in aid_name_by_flag.items()}
-    ).dropna()
+    flags = pd.DataFrame(dict(enabled_aids)).reindex(columns=["ev_pos", "ev_hgt", "ev_yaw"])
+    flags = flags.set_axis(["horizontal", "vertical", "yaw"], axis=1).dropna()
     if flags.empty:
         return Unavailable(
             "EKF2 fusion flags",

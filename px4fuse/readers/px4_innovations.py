@@ -80,7 +80,7 @@ GNSS = Ekf2PositionSource(
         "vertical": "Set bit 1 of EKF2_GPS_CTRL (EKF2_HGT_MODE 1 before v1.14) to fuse the GNSS "
         "height.",
     },
-    logging_remedy="Record with SDLOG_PROFILE bit 0 (default).",
+    logging_remedy=px4.DEFAULT_PROFILE_REMEDY,
 )
 GNSS_WITH_BAROMETER_HEIGHT = replace(
     GNSS,

@@ -19,6 +19,7 @@ import pandas as pd
 
 from px4fuse.core.reading import display_name, read_text
 from px4fuse.core.record import read_toml
+from px4fuse.core.text import join_first_names
 from px4fuse.errors import LogError, Px4FuseError
 from px4fuse.readers import position_names
 from px4fuse.readers.position_names import read_column_name
@@ -75,7 +76,7 @@ class PositionTable:
             for index in columns
             if index is not None
         )
-        return ", ".join([*labels][:12]) + (", ..." if len(labels) > 12 else "")
+        return join_first_names([*labels], 12)
 
     def read_cells(self, columns: Iterable[int]) -> pd.DataFrame:
         """Return the text of the given columns, without empty rows."""
@@ -152,7 +153,8 @@ def choose_body(file_name: str, body_names: Iterable[str], wanted_body: str | No
     if len(matches) == 1:
         return matches[0]
     raise LogError(
-        f"none of the rigid bodies or tags in {file_name} is selected: {', '.join(names[:12])}",
+        f"none of the rigid bodies or tags in {file_name} is selected: "
+        f"{join_first_names(names, 12)}",
         "Choose a rigid body or tag with --body NAME.",
     )
 
