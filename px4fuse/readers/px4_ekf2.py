@@ -59,11 +59,10 @@ OTHER_HORIZONTAL_AIDS = (
     "aux_global_position",
     "airspeed",
 )
-STATE_REMEDY = f"{px4.DEFAULT_PROFILE_REMEDY} Wait until EKF2 has started."
 VARIANCES_NOT_LOGGED = Unavailable(
     "EKF2 variances",
     "estimator_states (estimator_status before v1.12) is not logged or not usable",
-    STATE_REMEDY,
+    f"{px4.DEFAULT_PROFILE_REMEDY} Wait until EKF2 has started.",
 )
 # Reset counters in vehicle_local_position, with the reset quantity and the columns of the change
 # (north, east, down)
@@ -87,10 +86,16 @@ def read_ekf2(topics: Topics) -> Ekf2 | Unavailable:
             "Set SYS_MC_EST_GROUP to 2 (EKF2).",
         )
     local_position = topics.read(px4.LOCAL_POSITION_LAYOUT)
+    if topics.find_layout(px4.LOCAL_POSITION_LAYOUT) is None:
+        return Unavailable(
+            "EKF2", "vehicle_local_position is not logged", px4.DEFAULT_PROFILE_REMEDY
+        )
     state = local_position[Columns.STATE].dropna()
     if state.empty:
         return Unavailable(
-            "EKF2", "vehicle_local_position is not logged or not usable", STATE_REMEDY
+            "EKF2",
+            "vehicle_local_position has no finite sample",
+            "Start the recording after EKF2 has started.",
         )
     topics.record_stream("ekf2_state", px4.LOCAL_POSITION_LAYOUT.topic)
     aid_enabled_flags = read_enabled_aids(topics)
