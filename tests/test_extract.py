@@ -1,4 +1,4 @@
-"""``px4fuse extract``: tables, data dictionary, flight.json, and the lesson's example on them."""
+"""``px4fuse extract``: tables, flight.json, and the lesson's example on them."""
 
 import json
 import re
@@ -27,10 +27,6 @@ from px4fuse.simulation.scenario import make_scenario
 # Example 1 of the lesson on the tables of a flight, as printed in the documentation
 PAGE = (REPOSITORY / "docs" / "python.md").read_text(encoding="utf-8")
 (LESSON,) = re.findall(r"```python\n(import numpy.*?)```", PAGE, re.DOTALL)
-
-
-UNITS = {"_m": "m", "_m2": "m^2", "_s": "s", "_m_s": "m/s", "_m_s2": "m/s^2",
-         "_m2_s2": "m^2/s^2", "_rad_s": "rad/s"}  # fmt: skip
 
 
 def extract(*arguments: object) -> str:
@@ -131,39 +127,7 @@ def test_extracted_tables_contain_orientation_from_odometry(sample_flight):
     assert not any(name.startswith("orientation") for name in extraction.tables(sample_flight))
 
 
-# ---- the dictionary ---------------------------------------------------------------------------
-
-
-def test_extract_data_dictionary_lists_exactly_written_columns(written, sample_flight):
-    dictionary = pd.read_csv(written / "data_dictionary.csv", keep_default_na=False)
-    described = list(zip(dictionary["table"], dictionary["column"], strict=True))
-    assert len(set(described)) == len(described)
-    present = [
-        (path.stem, column)
-        for path in written.glob("*.csv")
-        if path.stem != "data_dictionary"
-        for column in pd.read_csv(path, nrows=0).columns
-    ]
-    assert set(described) == set(present)
-    assert " ".join(dictionary) == "table column unit frame meaning source_topic clock"
-    assert dictionary["meaning"].ne("").all()
-    for part, stream in sample_flight.streams.items():
-        rows = dictionary[dictionary["table"] == part]
-        assert set(rows["source_topic"]) == {" ".join(stream.topics)}, part
-        assert set(rows["clock"]) == {stream.clock}
-
-
-@pytest.mark.parametrize("flight", [rich_flight(), aisle_flight(duration_s=5.0, imu=None)])
-def test_extract_data_dictionary_units_match_column_names(flight):
-    dictionary = extraction.data_dictionary(flight)
-    tables = extraction.tables(flight)
-    assert list(dict.fromkeys(dictionary["table"])) == list(tables)
-    for name, table in tables.items():
-        columns = dictionary[dictionary["table"] == name]["column"]
-        assert columns.tolist() == table.columns.tolist()
-    for row in dictionary.itertuples():
-        suffix = re.search(r"(_(rad|m2?))?(_s2?)?$", row.column)[0]
-        assert not suffix or row.unit == UNITS[suffix], row
+# ---- flight.json -----------------------------------------------------------------------------
 
 
 def test_extracted_flight_json_lists_streams_and_missing_data(written, sample_flight):
@@ -191,7 +155,7 @@ def test_extract_without_logged_topic_writes_no_table(tmp_path, dropped, lost):
     path = make_log().drop(dropped).write(tmp_path / "less.ulg")
     said = extract(path, "-o", tmp_path / "out")
     written = {file.stem for file in (tmp_path / "out").glob("*.csv")}
-    assert written == whole - lost | {"data_dictionary"}
+    assert written == whole - lost
     if dropped != "vehicle_visual_odometry":  # another track replaces this one
         assert "Not exported: " in said
 
@@ -234,7 +198,6 @@ def test_extract_to_parquet_writes_the_same_tables(tmp_path, sample_log, sample_
     for name, table in extraction.tables(sample_flight).items():
         back = pd.read_parquet(tmp_path / f"{name}.parquet")
         pd.testing.assert_frame_equal(back, table, check_exact=True)
-    assert (tmp_path / "data_dictionary.csv").exists()
 
 
 # ---- the lesson by hand -----------------------------------------------------------------------

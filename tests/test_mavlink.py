@@ -169,8 +169,8 @@ def test_mavlink_raw_imu_is_unavailable_with_reason(read):
     ))  # fmt: skip
     flight = read(recorder)
     assert isinstance(flight.imu, Unavailable)
-    assert "no HIGHRES_IMU or SCALED_IMU" in reason(flight, "IMU")
-    reason_raw = "RAW_IMU contains raw counts without a unit"
+    assert "no usable HIGHRES_IMU or SCALED_IMU" in reason(flight, "IMU")
+    reason_raw = "raw counts without a unit"
     assert [(u.name, u.count, u.reason) for u in flight.unused] == [("RAW_IMU", 2000, reason_raw)]
 
 

@@ -30,7 +30,8 @@ from mavlink_tools import (
 from px4fuse.errors import SettingsError
 from px4fuse.flight.model import Flight, sample_rate
 from px4fuse.readers import read_log
-from px4fuse.readers.mavlink_clocks import ClockLine, fit_clock_line, map_clock_to_boot
+from px4fuse.readers.mavlink_recording import ClockLine, fit_clock_line
+from px4fuse.readers.mavlink_senders import map_clock_to_boot
 
 EMPTY = np.zeros(0)
 NO_EXCHANGES = (EMPTY, EMPTY), (EMPTY, EMPTY)

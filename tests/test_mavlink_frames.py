@@ -338,7 +338,6 @@ def test_damaged_tlog_receive_times_are_interpolated(read):
         times[at] = wrong
     content = b"".join(stamp(us) + part for us, part in zip(times, parts, strict=True))
     frames = read(content)
-    assert frames.damaged_receive_time_count == 3
     assert frames.receive_times_us.tolist() == [START_US + 1000 * i for i in range(9)]
 
 

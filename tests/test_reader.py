@@ -41,7 +41,7 @@ from px4fuse.flight.model import (
     Unavailable,
 )
 from px4fuse.readers import read_log
-from px4fuse.readers.px4_aids import MAX_VARIANCE_TIME_DIFFERENCE_S
+from px4fuse.readers.px4_innovations import MAX_VARIANCE_TIME_DIFFERENCE_S
 from px4fuse.readers.px4_positions import find_motion_capture_truth
 
 HALF_PERIOD_S = 0.005  # s; half of the prediction interval, EKF2_PREDICT_US 10,000

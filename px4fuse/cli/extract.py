@@ -41,8 +41,8 @@ def extract(
 ) -> None:
     """Export a log as tables (CSV or Parquet).
 
-    Writes one table per data type, data_dictionary.csv (unit, frame, meaning, topic and clock of
-    each column) and flight.json (log information and missing data).
+    Writes one table per data type, and flight.json (log, topics, clocks and missing data). The
+    names of columns contain the units.
     """
     check_output_folder(output)
     if format == "parquet" and importlib.util.find_spec("pyarrow") is None:
@@ -61,15 +61,12 @@ def extract(
         output / f"{name}.{format}": extraction.to_bytes(table, format)
         for name, table in tables.items()
     }
-    contents[output / "data_dictionary.csv"] = extraction.to_bytes(
-        extraction.data_dictionary(flight), "csv"
-    )
     contents[output / "flight.json"] = to_json(extraction.describe_flight(flight)).encode()
     write_outputs(contents)
     click.echo(f"Wrote to {to_one_line(str(output))}:")
     for name, table in tables.items():
         click.echo(f"  {f'{name}.{format}':44} {len(table):8} rows")
-    click.echo("  data_dictionary.csv, flight.json")
+    click.echo("  flight.json")
     for missing_part in extraction.list_missing_data(flight):
         click.echo(f"Not exported: {missing_part.what} ({missing_part.reason})")
 

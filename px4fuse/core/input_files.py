@@ -7,7 +7,6 @@ import os
 from collections.abc import Iterable, Iterator
 from contextlib import contextmanager, suppress
 from contextvars import ContextVar
-from dataclasses import dataclass, field
 from pathlib import Path
 
 from px4fuse.errors import OutputError
@@ -16,60 +15,44 @@ from px4fuse.errors import OutputError
 _FileIdentity = tuple[int, int] | str
 
 
-@dataclass(eq=False)  # mutable, because input files are added later
-class _InputRegister:
-    """Input files and folders of the running command."""
-
-    inputs: set[_FileIdentity] = field(default_factory=set)
-    # first registered input file in each folder
-    first_input_by_folder: dict[_FileIdentity, Path] = field(default_factory=dict)
-    registered_folders: set[Path] = field(default_factory=set)
-
-
-_input_register: ContextVar[_InputRegister | None] = ContextVar("register", default=None)
+# Input files and folders of the running command
+_input_by_identity: ContextVar[dict[_FileIdentity | None, Path] | None] = ContextVar(
+    "input_by_identity", default=None
+)
 
 
 @contextmanager
 def protect_inputs() -> Iterator[None]:
     """Register all files that are read in this context, so that no output overwrites them."""
-    context_token = _input_register.set(_InputRegister())
+    context_token = _input_by_identity.set({})
     try:
         yield
     finally:
-        _input_register.reset(context_token)
+        _input_by_identity.reset(context_token)
 
 
 @contextmanager
 def suspend_input_registration() -> Iterator[None]:
     """Allow outputs to overwrite files that are read in this context."""
-    context_token = _input_register.set(None)
+    context_token = _input_by_identity.set(None)
     try:
         yield
     finally:
-        _input_register.reset(context_token)
+        _input_by_identity.reset(context_token)
 
 
 def add_input(path: Path) -> None:
     """Register an input file or folder, so that no output overwrites it."""
-    input_register = _input_register.get()
-    if input_register is None or (identity := _read_file_identity(path)) is None:
-        return
-    input_register.inputs.add(identity)
-    for folder in {
-        path.absolute().parent,
-        path.resolve().parent,
-    } - input_register.registered_folders:
-        input_register.registered_folders.add(folder)
-        for parent in map(_read_file_identity, (folder, *folder.parents)):
-            if parent is not None:
-                input_register.first_input_by_folder.setdefault(parent, path)
+    input_by_identity = _input_by_identity.get()
+    if input_by_identity is not None and (identity := _read_file_identity(path)) is not None:
+        input_by_identity.setdefault(identity, path)
 
 
 def check_outputs(output_paths: Iterable[Path]) -> None:
     """Raise an OutputError if an output path is an input file or folder of this command."""
-    input_register = _input_register.get() or _InputRegister()
+    input_by_identity = _input_by_identity.get() or {}
     for output_path in output_paths:
-        if _read_file_identity(output_path) in input_register.inputs:
+        if _read_file_identity(output_path) in input_by_identity:
             raise OutputError(
                 f"{output_path} is an input of this command and was not overwritten. Choose "
                 "another output name."
@@ -82,20 +65,16 @@ def check_output_folder(folder: Path) -> None:
         raise OutputError(
             f"{folder} is a file, but the output needs a folder. Choose another name."
         )
-    input_register = _input_register.get() or _InputRegister()
-    folder_entries = _list_folder(folder)
-    for path in (
-        folder,
-        *folder_entries,
-        *(child for entry in folder_entries for child in _list_folder(entry)),
-    ):
-        if (identity := _read_file_identity(path)) is None:
-            continue
-        input_path = (
-            path
-            if identity in input_register.inputs
-            else input_register.first_input_by_folder.get(identity)
-        )
+    input_by_identity = {**(_input_by_identity.get() or {})}
+    input_by_folder = {
+        input_folder: path
+        for path in input_by_identity.values()
+        for input_folder in (*path.absolute().parents, *path.resolve().parents)
+    }
+    input_by_identity |= {_read_file_identity(key): path for key, path in input_by_folder.items()}
+    entries = _list_folder(folder)
+    for path in (folder, *entries, *(child for entry in entries for child in _list_folder(entry))):
+        input_path = input_by_identity.get(_read_file_identity(path))
         if input_path is not None:
             raise OutputError(
                 f"the output folder {folder} contains {input_path}, an input of this command",

@@ -120,18 +120,6 @@ def format_p_value(p_value: float) -> str:
     return "p < 0.001" if p_value < 0.001 else f"p {format_number(p_value, 2)}"
 
 
-def format_length(length_m: float) -> str:
-    """Format a length (m) with its unit: mm, cm or m.
-
-    >>> [format_length(m) for m in (0.0041, 0.0612, 0.336, 1.42, 23.4, 250.0)]
-    ['4 mm', '6 cm', '34 cm', '1.4 m', '23 m', '250 m']
-    """
-    for limit_m, unit, scale in ((0.0095, "mm", 1e3), (0.995, "cm", 1e2)):
-        if length_m < limit_m:
-            return f"{length_m * scale:.0f} {unit}"
-    return f"{length_m:.{1 if length_m < 9.95 else 0}f} m"
-
-
 def format_ratio(ratio: float) -> str:
     """Format a σ ratio (actual σ over reported σ).
 

@@ -5,17 +5,13 @@ import os
 import secrets
 import stat
 import sys
-import time
 from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
-from typing import IO
 
 from px4fuse.core.input_files import check_outputs
 from px4fuse.errors import OutputError
 
 STANDARD_OUTPUT = Path("-")
-# Maximum time (s) to wait for a program that reads a named pipe
-PIPE_READER_TIMEOUT_S = 5.0
 # Windows does not replace a file that another program has open
 LOCKS_OPEN_FILES = sys.platform == "win32"
 # Advice to the user if an output cannot be written, by error number
@@ -75,11 +71,10 @@ def _write_output(path: Path, content: bytes) -> None:
         sys.stdout.flush()
         sys.stdout.buffer.write(content)
         sys.stdout.flush()
-    elif stat.S_ISREG(file_mode := _read_file_mode(path)):
+    elif stat.S_ISREG(_read_file_mode(path)):
         _replace_file(path.resolve(), content)
-    else:
-        with _open_pipe(path) if stat.S_ISFIFO(file_mode) else path.open("wb") as file:
-            file.write(content)
+    else:  # named pipe or device
+        path.write_bytes(content)
 
 
 def _is_standard_output(path: Path) -> bool:
@@ -112,25 +107,9 @@ def _replace_file(target: Path, content: bytes) -> None:
             target.parent.rmdir()
 
 
-def _open_pipe(path: Path) -> IO[bytes]:
-    """Open a named pipe for writing; wait at most PIPE_READER_TIMEOUT_S for a reader."""
-    deadline = time.monotonic() + PIPE_READER_TIMEOUT_S
-    while True:
-        try:
-            descriptor = os.open(path, os.O_WRONLY | os.O_NONBLOCK)
-        except OSError as error:
-            if error.errno != errno.ENXIO or time.monotonic() > deadline:
-                raise
-            time.sleep(0.05)
-        else:
-            os.set_blocking(descriptor, True)
-            return os.fdopen(descriptor, "wb")
-
-
 def _make_output_error(path: Path, error: OSError, written_files: Sequence[Path]) -> OutputError:
     output_name = "standard output" if path == STANDARD_OUTPUT else path
-    reason = "no program reads the pipe" if error.errno == errno.ENXIO else error.strerror
-    faults = [f"{output_name} cannot be written ({reason})"]
+    faults = [f"{output_name} cannot be written ({error.strerror})"]
     if written_files:
         faults.append(format_written_outputs(written_files))
     remedy = REMEDY_BY_ERRNO.get(error.errno or 0, "Choose another output name.")

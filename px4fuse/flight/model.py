@@ -107,10 +107,7 @@ SOURCE_ORIGINS = (
 
 
 def find_source_origin(kind: str, route: str) -> SourceOrigin:
-    for origin in SOURCE_ORIGINS:
-        if (origin.kind, origin.route) == (kind, route):
-            return origin
-    raise ValueError(f"no position source has the kind {kind!r} and the route {route!r}")
+    return next(origin for origin in SOURCE_ORIGINS if (origin.kind, origin.route) == (kind, route))
 
 
 REPEATED_TIMESTAMPS_NOTE = (

@@ -27,8 +27,8 @@ from px4fuse.flight.model import (
 )
 from px4fuse.readers import read_log
 from px4fuse.readers.common import select_valid_rows
+from px4fuse.readers.recording_table import decode_text
 from px4fuse.readers.ros_bag import is_bag
-from px4fuse.readers.text_table import decode_text
 from px4fuse.readers.trajectory import read_trajectory
 from px4fuse.request import SIGMA_Z_M, ComparisonRequest
 from px4fuse.trajectory.model import MIN_POSES, Frame, Trajectory, TrajectoryKind

@@ -5,7 +5,7 @@ from pathlib import Path
 from px4fuse.core.reading import display_name, read_head, read_log_bytes
 from px4fuse.errors import LogError, SettingsError
 from px4fuse.flight.model import Flight
-from px4fuse.readers.text_table import refuse_foreign_format
+from px4fuse.readers.recording_table import refuse_foreign_format
 
 # Number of bytes that are read to detect the format of a file
 _FORMAT_DETECTION_BYTES = 100

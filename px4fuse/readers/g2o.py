@@ -9,7 +9,7 @@ import numpy as np
 from px4fuse.core.arrays import Array, BoolArray, IntArray
 from px4fuse.core.reading import display_name, read_bytes_limited
 from px4fuse.errors import TrajectoryError
-from px4fuse.readers.text_table import decode_text, is_number, quote
+from px4fuse.readers.recording_table import decode_text, is_number, quote
 from px4fuse.readers.trajectory import MAX_COORDINATE_M, UNIT_NORM_TOLERANCE
 from px4fuse.trajectory.graph.initialisation import compute_initial_poses
 from px4fuse.trajectory.graph.model import INITIAL_POSES_FROM_FILE, PoseGraph

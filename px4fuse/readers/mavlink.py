@@ -17,6 +17,7 @@ from px4fuse.flight.ekf2_parameters import (
 )
 from px4fuse.flight.model import (
     AXIS_NAMES,
+    RECORD_NOT_LOGGED,
     Columns,
     Ekf2,
     Flight,
@@ -29,7 +30,6 @@ from px4fuse.flight.model import (
 from px4fuse.readers import common
 from px4fuse.readers import mavlink_messages as messages
 from px4fuse.readers import mavlink_senders as senders
-from px4fuse.readers.mavlink_clocks import MIN_UNIX_TIME_S
 from px4fuse.readers.mavlink_frames import (
     MAX_FRAME_BYTES,
     MESSAGE_IDS,
@@ -42,6 +42,7 @@ from px4fuse.readers.mavlink_positions import (
     read_truth,
 )
 from px4fuse.readers.mavlink_recording import (
+    MIN_UNIX_TIME_S,
     RECEIPT_CLOCK_TEXT,
     Recording,
     map_boot_to_unix,
@@ -73,28 +74,23 @@ def read_mavlink(name: str, content: bytes, system_id: int | None = None) -> Fli
     """
     frames = read_frames(name, content)
     address, autopilot = senders.choose_autopilot(frames, system_id)
-    recording = read_recording(frames, address)
+    recording = read_recording(frames, address, autopilot)
     clock_mappings = senders.map_sender_clocks(recording)
-    parameters, replaced_parameter_notes = replace_invalid_parameters(
-        _read_parameters(recording, autopilot)
-    )
-    remedies, _ = messages.remedies_of_autopilot(autopilot)
-    imu = _read_imu(recording, remedies["imu"])
-    attitude = _read_attitude(recording, remedies["attitude"])
-    ekf2 = _read_ekf2(recording, parameters, autopilot)
+    parameters, replaced_parameter_notes = replace_invalid_parameters(_read_parameters(recording))
+    imu = _read_imu(recording)
+    attitude = _read_attitude(recording)
+    ekf2 = _read_ekf2(recording, parameters)
     # Only PX4 has a parameter for the delay of GNSS
     delay_parameters = fill_with_defaults(parameters, GNSS_POS) if autopilot == "PX4" else {}
     gnss_delay_s = 1e-3 * delay_parameters.get(GNSS_POS.delay, 0.0)
-    positions, unavailable_positions = read_positions(
-        recording, clock_mappings, remedies["position"], gnss_delay_s
-    )
-    truth = read_truth(recording, positions, remedies)
-    airborne_spans_s = _read_airborne_spans(recording, remedies["landed"])
+    positions, unavailable_positions = read_positions(recording, clock_mappings, gnss_delay_s)
+    truth = read_truth(recording, positions)
+    airborne_spans_s = _read_airborne_spans(recording)
     is_in_flight = common.ends_in_flight(airborne_spans_s, recording.duration_s)
     pressure_hpa = recording.read(messages.MESSAGE_LAYOUTS["SCALED_PRESSURE"])["pressure_hpa"]
     return Flight(
         # Last, because the description counts the samples that the readers dropped
-        log=_describe_log(recording, parameters, replaced_parameter_notes, autopilot, is_in_flight),
+        log=_describe_log(recording, parameters, replaced_parameter_notes, is_in_flight),
         imu=imu,
         attitude=attitude,
         positions=positions,
@@ -113,60 +109,52 @@ def read_mavlink(name: str, content: bytes, system_id: int | None = None) -> Fli
     )
 
 
-def _read_imu(recording: Recording, remedy: str) -> TableOrUnavailable:
+def _read_imu(recording: Recording) -> TableOrUnavailable:
     # HIGHRES_IMU is preferred, because it has SI units and µs timestamps
     layout = messages.HIGHRES_IMU_LAYOUT
     if len(recording.rows(layout.topic)) < 2:
         layout = recording.find_most_frequent(messages.IMU_LAYOUTS)
     rows = recording.rows(layout.topic)
-    if len(rows) < 2:
-        return Unavailable("IMU", "the recording has no HIGHRES_IMU or SCALED_IMU", remedy)
     if layout == messages.HIGHRES_IMU_LAYOUT:
         imu_ids = np.array(recording.frames.table(layout.topic, rows)["id"])
-        rows = rows[imu_ids == np.bincount(imu_ids).argmax()]
+        rows = rows[np.isin(imu_ids, pd.Series(imu_ids).mode()[:1])]
     imu = recording.read(layout, rows)
     imu = common.select_valid_rows(imu, imu.columns.tolist(), common.MAX_IMU_READING)
     if len(imu) < 2:
         return Unavailable(
             "IMU",
-            f"{layout.topic} contains only {len(imu)} usable samples",
-            "Check that the autopilot sent IMU messages during the recording.",
+            "the recording contains no usable HIGHRES_IMU or SCALED_IMU",
+            recording.remedies["imu"],
         )
     recording.record_stream("imu", layout.topic)
     return imu
 
 
-def _read_attitude(recording: Recording, remedy: str) -> TableOrUnavailable:
+def _read_attitude(recording: Recording) -> TableOrUnavailable:
     layout = recording.find_most_frequent(messages.ATTITUDE_LAYOUTS)
     attitude = common.select_rows_with_attitude(recording.read(layout))[Columns.QUATERNION]
     if len(attitude) < 2:
         names = " or ".join(layout.topic for layout in messages.ATTITUDE_LAYOUTS)
-        return Unavailable("attitude", f"the recording contains no usable {names}", remedy)
+        return Unavailable(
+            "attitude", f"the recording contains no usable {names}", recording.remedies["attitude"]
+        )
     recording.record_stream("attitude", layout.topic)
     return attitude
 
 
-def _read_ekf2(
-    recording: Recording, parameters: Mapping[str, float], autopilot: str
-) -> Ekf2 | Unavailable:
-    remedies, replay_unavailable = messages.remedies_of_autopilot(autopilot)
+def _read_ekf2(recording: Recording, parameters: Mapping[str, float]) -> Ekf2 | Unavailable:
+    autopilot, remedies = recording.autopilot, recording.remedies
     layout = messages.ODOMETRY_LAYOUT
     # ODOMETRY has variances, so it is preferred unless its rate is much lower
     local_position_count = len(recording.rows(messages.LOCAL_POSITION_LAYOUT.topic))
     if 2 * len(recording.rows(layout.topic)) < local_position_count:
         layout = messages.LOCAL_POSITION_LAYOUT
     message_name = layout.topic
-    if len(recording.rows(message_name)) < 2:
-        return Unavailable(
-            "EKF2", "the autopilot sent no ODOMETRY or LOCAL_POSITION_NED", remedies["state"]
-        )
     samples = recording.read(layout)
     state = samples[Columns.STATE].dropna()
     if len(state) < 2:
         return Unavailable(
-            "EKF2",
-            f"{message_name} contains no finite EKF2 state",
-            "Start the recording after EKF2 has started.",
+            "EKF2", "the autopilot sent no usable ODOMETRY or LOCAL_POSITION_NED", remedies["state"]
         )
     recording.record_stream("ekf2_state", message_name)
     notes = [f"the EKF2 state is from the autopilot's {message_name} messages"]
@@ -216,7 +204,9 @@ def _read_ekf2(
         primary_instances=NO_INSTANCE_SWITCHES,
         gate=fill_with_defaults(parameters)[EV_POS.gate],
         notes=tuple(notes),
-        record=replay_unavailable,
+        record=messages.ARDUPILOT_REPLAY_UNAVAILABLE
+        if autopilot == "ArduPilot"
+        else RECORD_NOT_LOGGED,
     )
 
 
@@ -234,13 +224,15 @@ def _compute_variance_from_accuracy(recording: Recording) -> pd.DataFrame:
     return variance.reindex(columns=VARIANCE_COLUMNS)
 
 
-def _read_airborne_spans(recording: Recording, remedy: str) -> Spans | Unavailable:
+def _read_airborne_spans(recording: Recording) -> Spans | Unavailable:
     rows = recording.rows("EXTENDED_SYS_STATE")
     landed_states = recording.frames.table("EXTENDED_SYS_STATE", rows)["landed_state"]
     is_known = landed_states > 0
     if not np.any(is_known):
         return Unavailable(
-            "land detector", "the recording contains no usable EXTENDED_SYS_STATE", remedy
+            "land detector",
+            "the recording contains no usable EXTENDED_SYS_STATE",
+            recording.remedies["landed"],
         )
     recording.record_stream("airborne", "EXTENDED_SYS_STATE", clock=RECEIPT_CLOCK_TEXT)
     time_s = recording.compute_receipt_boot_times_s(rows[is_known]) - recording.time_origin_s
@@ -248,10 +240,12 @@ def _read_airborne_spans(recording: Recording, remedy: str) -> Spans | Unavailab
     return common.find_flight_spans(is_landed, recording.duration_s)
 
 
-def _read_parameters(recording: Recording, autopilot: str) -> dict[str, float]:
+def _read_parameters(recording: Recording) -> dict[str, float]:
     """Read the first value of each parameter. PX4 sends integers as raw bytes in a float field."""
     table = recording.frames.table("PARAM_VALUE", recording.rows("PARAM_VALUE"))
-    is_sent_as_bytes = (autopilot == "PX4") & (table["param_type"] < REAL32_PARAMETER_TYPE)
+    is_sent_as_bytes = (recording.autopilot == "PX4") & (
+        table["param_type"] < REAL32_PARAMETER_TYPE
+    )
     raw_values = np.ascontiguousarray(table["param_value"])
     values = np.where(is_sent_as_bytes, raw_values.view(np.int32), raw_values)
     value_by_name: dict[str, float] = {}
@@ -266,19 +260,16 @@ def _describe_log(
     recording: Recording,
     parameters: Mapping[str, float],
     replaced_parameter_notes: tuple[str, ...],
-    autopilot: str,
     is_in_flight: bool,
 ) -> LogInfo:
-    frames, notes, damage_notes = recording.frames, [*recording.notes], []
-    reversal_count = int(np.count_nonzero(np.diff(recording.receive_times_s) < 0.0))
-    count_by_quantity = {
-        "ignored MAVLink frames with unknown message type": frames.unknown_frame_count,
-        "damaged receive times that were interpolated": frames.damaged_receive_time_count,
-        "backward jumps of the receive time": reversal_count,
-    }
-    notes += [
-        f"number of {quantity}: {count}" for quantity, count in count_by_quantity.items() if count
-    ]
+    frames, autopilot = recording.frames, recording.autopilot
+    notes, damage_notes = [*recording.notes], []
+    reversal_count = np.count_nonzero(np.diff(recording.receive_times_s) < 0.0)
+    if frames.unknown_frame_count:
+        notes.append(
+            "number of ignored MAVLink frames with unknown message type: "
+            f"{frames.unknown_frame_count}"
+        )
     if frames.is_last_frame_incomplete:
         damage_notes.append(common.format_truncation("frame", recording.duration_s, is_in_flight))
     stray_byte_count, byte_count = frames.byte_count_outside_frames, len(frames.content)
@@ -320,7 +311,7 @@ def _describe_log(
             *describe_dropped_samples(dropped_counts),
         ),
         restarts=recording.restart_count,
-        receive_time_reversals=reversal_count or None,
+        receive_time_reversals=int(reversal_count) or None,
         dropped=dropped_counts,
         autopilot=autopilot,
         start_unix_s=_estimate_start_unix_s(recording),

@@ -80,7 +80,6 @@ class MavlinkFrames:
     byte_count_outside_frames: int
     # True if the file ends within a frame
     is_last_frame_incomplete: bool
-    damaged_receive_time_count: int
 
     def __len__(self) -> int:
         return len(self.start_offsets)
@@ -155,19 +154,14 @@ def read_frames(name: str, content: bytes) -> MavlinkFrames:
         The content is not MAVLink.
     """
     start_offsets, end_offsets, message_ids = _remove_nested_frames(_find_valid_frames(content)).T
-    receive_time_bytes = (
-        RECEIVE_TIME_BYTES
-        if len(start_offsets) and _has_receive_times(start_offsets, end_offsets)
-        else 0
-    )
-    if int(np.sum(end_offsets - start_offsets)) < MIN_VALID_FRAME_FRACTION * len(
-        content
-    ) or not len(start_offsets):
+    frame_byte_count = np.sum(end_offsets - start_offsets)
+    if not frame_byte_count or frame_byte_count < MIN_VALID_FRAME_FRACTION * len(content):
         raise LogError(
             f"{name}: the file is neither a PX4 ULog nor a MAVLink recording. It contains "
             f"{len(start_offsets)} frames with a valid checksum in {len(content)} bytes.",
             "Give a .ulg, a .tlog or a raw MAVLink stream.",
         )
+    receive_time_bytes = RECEIVE_TIME_BYTES if _has_receive_times(start_offsets, end_offsets) else 0
     content_bytes = np.frombuffer(content, dtype=np.uint8)
     is_version_2 = content_bytes[start_offsets] == MAGIC_BYTE_V2
     # Sequence number, system id and component id are consecutive bytes
@@ -176,11 +170,6 @@ def read_frames(name: str, content: bytes) -> MavlinkFrames:
         _count_bytes_outside_frames(
             content, start_offsets - receive_time_bytes, end_offsets, receive_time_bytes
         )
-    )
-    receive_times_us, damaged_receive_time_count = (
-        _read_receive_times(content_bytes, start_offsets, end_offsets)
-        if receive_time_bytes
-        else (None, 0)
     )
     return MavlinkFrames(
         name=name,
@@ -193,11 +182,12 @@ def read_frames(name: str, content: bytes) -> MavlinkFrames:
         sequence_numbers=content_bytes[sequence_offsets],
         payload_offsets=start_offsets + np.where(is_version_2, HEADER_BYTES_V2, HEADER_BYTES_V1),
         payload_lengths=content_bytes[start_offsets + 1],
-        receive_times_us=receive_times_us,
+        receive_times_us=_read_receive_times(content_bytes, start_offsets, end_offsets)
+        if receive_time_bytes
+        else None,
         unknown_frame_count=unknown_frame_count,
         byte_count_outside_frames=byte_count_outside_frames,
         is_last_frame_incomplete=is_last_frame_incomplete,
-        damaged_receive_time_count=damaged_receive_time_count,
     )
 
 
@@ -283,11 +273,10 @@ def _find_possible_frames(
 def _has_receive_times(start_offsets: Int64Array, end_offsets: Int64Array) -> bool:
     """Return True if receive times precede most frames, as in a ``.tlog``."""
     gap_sizes_bytes = start_offsets[1:] - end_offsets[:-1]
-    frame_count_with_receive_time = int(np.count_nonzero(gap_sizes_bytes == RECEIVE_TIME_BYTES))
-    frame_count_without_receive_time = int(np.count_nonzero(gap_sizes_bytes == 0))
-    if frame_count_with_receive_time + frame_count_without_receive_time:
-        return frame_count_with_receive_time > frame_count_without_receive_time
-    return bool(start_offsets[0] == RECEIVE_TIME_BYTES)
+    gap_sizes_bytes = gap_sizes_bytes[np.isin(gap_sizes_bytes, (0, RECEIVE_TIME_BYTES))]
+    if not len(gap_sizes_bytes):
+        gap_sizes_bytes = start_offsets[:1]
+    return bool(np.mean(gap_sizes_bytes == RECEIVE_TIME_BYTES) > 0.5)
 
 
 def _count_bytes_outside_frames(
@@ -350,8 +339,8 @@ def _measure_unknown_frames(
 
 def _read_receive_times(
     content_bytes: ByteArray, start_offsets: Int64Array, end_offsets: Int64Array
-) -> tuple[Int64Array, int]:
-    """Return the receive time (UNIX, µs) of each frame, and the number of damaged times."""
+) -> Int64Array:
+    """Return the receive time (UNIX, µs) of each frame; damaged times are interpolated."""
     is_usable = start_offsets >= RECEIVE_TIME_BYTES
     is_usable[1:] &= start_offsets[1:] - end_offsets[:-1] >= RECEIVE_TIME_BYTES
     eight_byte_windows = np.lib.stride_tricks.sliding_window_view(content_bytes, RECEIVE_TIME_BYTES)
@@ -373,4 +362,4 @@ def _read_receive_times(
         receive_times_us = receive_times_us[rows[0]] + np.rint(time_since_first_receipt_us).astype(
             np.int64
         )
-    return receive_times_us, int(np.count_nonzero(~is_usable))
+    return receive_times_us

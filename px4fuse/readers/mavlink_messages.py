@@ -10,7 +10,7 @@ from typing import Any
 import msgspec
 
 from px4fuse.core.record import read_toml
-from px4fuse.flight.model import RECORD_NOT_LOGGED, SourceOrigin, Unavailable, find_source_origin
+from px4fuse.flight.model import SourceOrigin, Unavailable, find_source_origin
 from px4fuse.readers.field_maps import Layout, expand_layouts
 
 AUTOPILOT_COMPONENT_ID = 1  # MAV_COMP_ID_AUTOPILOT1
@@ -93,6 +93,8 @@ CONVERSION_BY_MAV_FRAME = {
 }
 # Names of MAV_AUTOPILOT
 AUTOPILOT_NAME_BY_ID = {0: "generic autopilot", 3: "ArduPilot", 12: "PX4"}
+# Advice to the user for each kind of missing data, by autopilot
+REMEDIES: Mapping[str, Mapping[str, str]] = _MESSAGE_TABLES["remedies"]
 REASON_BY_UNUSED_MESSAGE: Mapping[str, str] = _MESSAGE_TABLES["unused"]
 POSITION_MESSAGE_TYPES = tuple(
     msgspec.convert({"track_name": name, **row}, PositionMessageType)
@@ -118,10 +120,3 @@ GNSS_LAYOUTS = (
     MESSAGE_LAYOUTS["GPS_RAW_INT"],
     replace(MESSAGE_LAYOUTS["GPS_RAW_INT"], topic="GPS2_RAW"),
 )
-
-
-def remedies_of_autopilot(autopilot: str) -> tuple[Mapping[str, str], Unavailable]:
-    """Return advice for each kind of missing data, and the reason why no replay is possible."""
-    if autopilot == "ArduPilot":
-        return _MESSAGE_TABLES["remedies"][autopilot], ARDUPILOT_REPLAY_UNAVAILABLE
-    return _MESSAGE_TABLES["remedies"]["PX4"], RECORD_NOT_LOGGED

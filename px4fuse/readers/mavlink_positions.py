@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
-
 import numpy as np
 import pandas as pd
 from msgspec import structs
@@ -19,10 +17,9 @@ from px4fuse.flight.model import (
 from px4fuse.readers import mavlink_messages as messages
 from px4fuse.readers.common import join_nearest, read_attitude, read_orientation
 from px4fuse.readers.field_maps import Layout
-from px4fuse.readers.mavlink_clocks import ClockMapping
 from px4fuse.readers.mavlink_frames import MavlinkAddress
 from px4fuse.readers.mavlink_recording import BOOT_CLOCK_TEXT, RECEIPT_CLOCK_TEXT, Recording
-from px4fuse.readers.mavlink_senders import find_senders
+from px4fuse.readers.mavlink_senders import ClockMapping, find_senders
 from px4fuse.readers.px4_positions import (
     FIX_TYPE_3D,
     MIN_TRACK_SAMPLES,
@@ -44,7 +41,7 @@ MAX_ORIGIN_TIME_DIFFERENCE_S = 0.05
 
 
 def read_positions(
-    recording: Recording, clocks: dict[MavlinkAddress, ClockMapping], remedy: str, delay_s: float
+    recording: Recording, clocks: dict[MavlinkAddress, ClockMapping], delay_s: float
 ) -> tuple[tuple[PositionTrack, ...], tuple[Unavailable, ...]]:
     """Read the external positions sent to the autopilot, and the GNSS positions.
 
@@ -52,8 +49,6 @@ def read_positions(
     ----------
     clocks : mapping from address to ClockMapping
         Conversion of each sender's clock to the autopilot's boot clock.
-    remedy : str
-        Advice to the user if no positions were recorded.
     delay_s : float
         Delay (s) from GNSS measurement to timestamp that the autopilot assumes.
     """
@@ -65,11 +60,13 @@ def read_positions(
             for sender in senders
             for source in messages.POSITION_MESSAGE_TYPES
             if source.message == message
-            if (track := _read_track(recording, source, sender, clocks[sender], remedy, senders))
+            if (track := _read_track(recording, source, sender, clocks[sender], senders))
         ]
         tracks_or_unavailable += tracks or [
             unavailable_source(
-                message, f"the recording contains no {message} sent to the autopilot", remedy
+                message,
+                f"the recording contains no {message} sent to the autopilot",
+                recording.remedies["position"],
             )
         ]
     gnss_tracks = (_read_gnss(recording, layout, delay_s) for layout in messages.GNSS_LAYOUTS)
@@ -82,7 +79,6 @@ def _read_track(
     source: messages.PositionMessageType,
     sender: MavlinkAddress,
     clock: ClockMapping,
-    remedy: str,
     senders: list[MavlinkAddress],
 ) -> PositionTrack | Unavailable | None:
     """Read the positions from one sender and message type; None without messages."""
@@ -115,7 +111,7 @@ def _read_track(
         track_name,
         samples,
         source.origin,
-        remedy=remedy,
+        remedy=recording.remedies["position"],
         is_odometry=orientation is not None,
         description=source.description,
         frame=frame,
@@ -153,11 +149,9 @@ def _read_gnss(
     fixes = recording.read(layout, rows, gnss_boot_time_s - delay_s)
     fixes = fixes[fixes["fix_type"] >= FIX_TYPE_3D]
     if len(fixes) < MIN_TRACK_SAMPLES:
-        fix_count_text = "none" if fixes.empty else f"only {len(fixes)}"
         return unavailable_source(
             layout.topic,
-            f"the recording has {message_count} {layout.topic} messages, "
-            f"{fix_count_text} with a 3D fix",
+            f"the recording has {message_count} {layout.topic}, {len(fixes)} with a 3D fix",
             NO_FIX_ACTION,
         )
     is_auto_candidate = bool(
@@ -207,9 +201,7 @@ def find_local_origin(recording: Recording) -> GeodeticPosition | None:
     return tuple(np.median(origins, axis=1).tolist())
 
 
-def read_truth(
-    recording: Recording, positions: tuple[PositionTrack, ...], remedies: Mapping[str, str]
-) -> Truth | Unavailable:
+def read_truth(recording: Recording, positions: tuple[PositionTrack, ...]) -> Truth | Unavailable:
     """Read ground truth from simulation or motion capture.
 
     Simulation ground truth has receive times, because PX4 sends no timestamp in
@@ -238,5 +230,5 @@ def read_truth(
     return mocap_truth or Unavailable(
         "ground truth",
         "the recording has neither simulation ground truth nor motion capture",
-        remedies["truth"],
+        recording.remedies["truth"],
     )

@@ -1,6 +1,12 @@
-"""MAVLink recording of one vehicle, with all message times on its boot clock."""
+"""MAVLink recording of one vehicle, with all message times on its boot clock.
 
-from collections.abc import Sequence
+The delay from timestamp to receive time is never negative and often large. A line is therefore
+fitted to the messages with the smallest delay.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Any
 
@@ -8,24 +14,23 @@ import numpy as np
 import pandas as pd
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
+from scipy.stats import theilslopes
 
 from px4fuse.core.arrays import Array, IntArray
 from px4fuse.flight.model import Columns, DataSource, time_index
 from px4fuse.readers.common import MIN_QUATERNION_NORM
 from px4fuse.readers.field_maps import MAX_FIELD_VALUE, Layout
-from px4fuse.readers.mavlink_clocks import (
-    MIN_UNIX_TIME_S,
-    ClockLine,
-    fit_clock_line,
-    is_running_clock,
-)
 from px4fuse.readers.mavlink_frames import (
     MavlinkAddress,
     MavlinkFrames,
     message_name,
     wire_layout,
 )
-from px4fuse.readers.mavlink_messages import BOOT_CLOCK_MESSAGES, CONVERSION_BY_MAV_FRAME
+from px4fuse.readers.mavlink_messages import (
+    BOOT_CLOCK_MESSAGES,
+    CONVERSION_BY_MAV_FRAME,
+    REMEDIES,
+)
 from px4fuse.readers.ulog_topics import longest_increasing_run
 from px4fuse.trajectory.rotation import rotate
 
@@ -33,6 +38,19 @@ BOOT_CLOCK_TEXT = "autopilot boot clock"
 RECEIPT_CLOCK_TEXT = "autopilot boot clock, estimated from receive times"
 # Factors from latitude, longitude and altitude in MAVLink messages to degrees and m
 GEODETIC_SCALE = {"latitude_deg": 1e-7, "longitude_deg": 1e-7, "altitude_m": 1e-3}
+# Minimum UNIX time (s), in 2001; smaller times are times since boot
+MIN_UNIX_TIME_S = 1e9
+# The clock fit uses the message with the least delay in each interval of this length (s)
+CLOCK_FIT_INTERVAL_S = 2.0
+MAX_CLOCK_FIT_INTERVALS = 200
+# Minimum time span (s) to estimate a clock drift
+MIN_DRIFT_SPAN_S = 30.0
+# Maximum relative difference of two clock rates; more shows a replay at another speed
+MAX_RELATIVE_CLOCK_RATE_DIFFERENCE = 0.01
+# Maximum ratio of two clock rates; above 1e9, for timestamps in ns that were read as s
+MAX_RATIO_OF_CLOCK_RATES = 1e12
+# Minimum fraction of distinct timestamps of a running clock
+MIN_DISTINCT_TIME_FRACTION = 0.1
 # Minimum backward step (s) of the boot clock at a restart
 MIN_BACKWARD_STEP_AT_RESTART_S = 5.0
 # Number of messages around a backward step of the timestamps that confirm a restart
@@ -47,6 +65,76 @@ UNCONVERTED_COLUMNS = ["frame_id", "child_frame_id", "reset_counter"]
 MIN_STOPPED_CLOCK_TIMESTAMPS = 10
 
 
+@dataclass(frozen=True)
+class ClockLine:
+    """Linear relation between readings x of a source clock and y of a target clock.
+
+    y = y0 + slope · (x - x0)
+
+    ``jitter_s`` is the robust standard deviation of the clock readings from the line.
+    """
+
+    x0: float
+    y0: float
+    slope: float
+    jitter_s: float
+    reading_pair_count: int
+
+    def at(self, x: Array | float) -> Array:
+        """Convert readings x of the source clock to readings y of the target clock."""
+        return np.asarray(self.y0 + self.slope * (x - self.x0))
+
+    def inverse(self) -> ClockLine:
+        """Return the line that converts readings of the target clock to the source clock."""
+        return ClockLine(
+            self.y0, self.x0, 1.0 / self.slope, self.jitter_s / self.slope, self.reading_pair_count
+        )
+
+
+def fit_clock_line(x: Array, y: Array) -> ClockLine:
+    """Fit a line to clock readings x and y (s); y is read after x, with an unknown delay.
+
+    The fit uses the readings with the least delay.
+    """
+    time_order = np.argsort(x, kind="stable")
+    x, y = x[time_order], y[time_order]
+    x0, span_s = float(x[len(x) // 2]), float(x[-1] - x[0])
+    interval_count = int(np.clip(span_s / CLOCK_FIT_INTERVAL_S, 1, MAX_CLOCK_FIT_INTERVALS))
+    interval_starts = np.searchsorted(x, np.linspace(x[0], x[-1], interval_count + 1)[1:-1])
+    rows_by_interval = [rows for rows in np.split(np.arange(len(x)), interval_starts) if len(rows)]
+    middle_rows = [rows[len(rows) // 2] for rows in rows_by_interval]
+    slope = _fit_clock_rate(x[middle_rows], y[middle_rows])
+    if abs(slope - 1.0) <= MAX_RELATIVE_CLOCK_RATE_DIFFERENCE:
+        slope = 1.0
+    # Fit the slope twice, because it affects the selection of messages with the least delay
+    for is_slope_final in (False, False, True):
+        relative_delay_s = y - slope * (x - x0)
+        least_delay_rows = [rows[np.argmin(relative_delay_s[rows])] for rows in rows_by_interval]
+        if not is_slope_final and span_s >= MIN_DRIFT_SPAN_S:
+            slope = _fit_clock_rate(x[least_delay_rows], relative_delay_s[least_delay_rows], slope)
+    y0 = float(np.median(relative_delay_s[least_delay_rows]))
+    return ClockLine(x0, y0, slope, robust_std(relative_delay_s), len(x))
+
+
+def _fit_clock_rate(x: Array, y: Array, added_rate: float = 0.0) -> float:
+    """Return the Theil-Sen slope of y over x plus ``added_rate``; 1 if it is not plausible."""
+    if len(x) < 2 or x[0] == x[-1]:
+        return 1.0
+    with np.errstate(over="ignore", invalid="ignore"):
+        rate = float(theilslopes(y, x)[0]) + added_rate
+    return rate if 1.0 / MAX_RATIO_OF_CLOCK_RATES < rate < MAX_RATIO_OF_CLOCK_RATES else 1.0
+
+
+def is_running_clock(timestamps_s: Array) -> bool:
+    """Return True if the timestamps are of a running clock: enough of them are distinct."""
+    return len(np.unique(timestamps_s)) >= max(MIN_DISTINCT_TIME_FRACTION * len(timestamps_s), 2)
+
+
+def robust_std(values: Array) -> float:
+    """Estimate the standard deviation as 1.4826 · median absolute deviation."""
+    return float(1.4826 * np.median(np.abs(values - np.median(values))))
+
+
 @dataclass(eq=False)  # not frozen: the readers add streams and counts
 class Recording:
     """MAVLink recording of one flight, with the conversion of receive times to boot times."""
@@ -54,6 +142,8 @@ class Recording:
     frames: MavlinkFrames
     # Address of the autopilot of this flight
     address: MavlinkAddress
+    # Type of the autopilot, such as "PX4"
+    autopilot: str
     # Analysed frames, between two restarts of the autopilot
     analysed_frame_slice: slice
     # Receive time of each frame (s), or the last boot time before the frame
@@ -70,6 +160,11 @@ class Recording:
     dropped_count_by_message: dict[str, int] = field(default_factory=dict)
     # Messages and clock of each kind of data, such as "imu"
     data_source_by_kind: dict[str, DataSource] = field(default_factory=dict)
+
+    @property
+    def remedies(self) -> Mapping[str, str]:
+        """Advice to the user for each kind of missing data."""
+        return REMEDIES["ArduPilot" if self.autopilot == "ArduPilot" else "PX4"]
 
     def rows_of_all_senders(self, message: str) -> IntArray:
         """Return the indices of the MAVLink frames that contain a message, from all senders."""
@@ -150,7 +245,7 @@ class Recording:
         )
         if dropped_count:
             self.dropped_count_by_message[name] = int(dropped_count)
-        return np.asarray(rows[first_row_of_each_time[increasing_time_rows]])
+        return rows[first_row_of_each_time[increasing_time_rows]]
 
     def compute_receipt_boot_times_s(self, rows: IntArray) -> Array:
         """Return receive times of frames, converted to the boot clock (s).
@@ -230,7 +325,7 @@ def _read_boot_times(frames: MavlinkFrames, address: MavlinkAddress) -> tuple[In
     return rows, times_s[rows]
 
 
-def read_recording(frames: MavlinkFrames, address: MavlinkAddress) -> Recording:
+def read_recording(frames: MavlinkFrames, address: MavlinkAddress, autopilot: str) -> Recording:
     """Return the longest part of a recording without a restart of the autopilot."""
     notes: list[str] = []
     rows, boot_times_s = _read_boot_times(frames, address)
@@ -278,6 +373,7 @@ def read_recording(frames: MavlinkFrames, address: MavlinkAddress) -> Recording:
     return Recording(
         frames,
         address,
+        autopilot,
         analysed_frame_slice,
         receive_times_s,
         receipt_to_boot_fit,

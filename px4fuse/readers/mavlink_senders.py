@@ -1,25 +1,27 @@
-"""Autopilot and position senders in a MAVLink recording, and their clocks."""
+"""Autopilot and position senders in a MAVLink recording, and their clocks.
+
+Source for TIMESYNC messages: MAVLink "Time Synchronization Protocol v2".
+"""
 
 from collections import Counter
 from collections.abc import Iterator
+from dataclasses import dataclass, replace
 
 import numpy as np
 
-from px4fuse.core.arrays import IntArray
+from px4fuse.core.arrays import Array, IntArray
 from px4fuse.errors import SettingsError
 from px4fuse.flight.model import ClockMap, Sender
 from px4fuse.readers import mavlink_messages as messages
-from px4fuse.readers.mavlink_clocks import (
-    MAX_RELATIVE_CLOCK_RATE_DIFFERENCE,
-    ClockLine,
-    ClockMapping,
-    is_running_clock,
-    map_clock_to_boot,
-)
 from px4fuse.readers.mavlink_frames import VEHICLE_TYPES, MavlinkAddress, MavlinkFrames
 from px4fuse.readers.mavlink_recording import (
+    MAX_RELATIVE_CLOCK_RATE_DIFFERENCE,
     MIN_BACKWARD_STEP_AT_RESTART_S,
+    MIN_UNIX_TIME_S,
+    ClockLine,
     Recording,
+    fit_clock_line,
+    is_running_clock,
     map_boot_to_unix,
 )
 
@@ -31,6 +33,24 @@ MAX_LOST_MESSAGE_FRACTION = 0.9
 MAX_LATE_MESSAGES = 16
 # Maximum difference (s) between TIMESYNC and position timestamps of the same clock
 MAX_TIMESYNC_TO_POSITION_TIME_DIFFERENCE_S = 1e5
+# Maximum median difference (s) between timestamps and receive times on the same clock
+MAX_BOOT_TIME_DIFFERENCE_S = 10.0
+# Minimum improvement (s) by TIMESYNC of the agreement with receive times
+MIN_REDUCTION_BY_TIMESYNC_S = 0.1
+MIN_TIMESYNC_REPLIES = 3
+# Maximum interval (s) between positions; a longer interval is a gap
+MAX_REGULAR_SAMPLE_INTERVAL_S = 1.0
+
+
+@dataclass(frozen=True)
+class ClockMapping:
+    """Conversion of a sender's timestamps to the autopilot's boot clock, with a description.
+
+    ``sender_to_boot_fit`` is None if receive times replace the timestamps.
+    """
+
+    sender_to_boot_fit: ClockLine | None
+    description: ClockMap
 
 
 def _read_vehicle_types(frames: MavlinkFrames) -> dict[MavlinkAddress, tuple[int, int]]:
@@ -178,6 +198,136 @@ def _map_sender_clock(
         boot_to_unix_fit,
         has_receive_times=frames.receive_times_us is not None,
     )
+
+
+def map_clock_to_boot(
+    name: str,
+    timestamps_s: Array,
+    receive_times_s: Array,
+    receipt_to_boot_fit: ClockLine,
+    sender_replies: tuple[Array, Array],
+    autopilot_replies: tuple[Array, Array],
+    boot_to_unix_fit: ClockLine | None,
+    *,
+    has_receive_times: bool,
+) -> ClockMapping:
+    """Find the conversion of a sender's clock to the autopilot's boot clock.
+
+    The first conversion that applies is used:
+
+    1. None if too few timestamps are distinct: the receive times are the sample times.
+    2. The timestamps are already boot times: they agree with the receive times, and TIMESYNC does
+       not improve the agreement.
+    3. TIMESYNC, then SYSTEM_TIME, if the converted timestamps agree with the receive times.
+    4. Line through the timestamps and receive times.
+
+    Parameters
+    ----------
+    name : str
+        Name of the sender.
+    timestamps_s, receive_times_s : ndarray, shape (n,)
+        Timestamp (sender's clock) and receive time of each message.
+    receipt_to_boot_fit : ClockLine
+        Conversion of receive times to the boot clock.
+    sender_replies : tuple of ndarray
+        TIMESYNC request times (s, boot clock) and reply times (s, sender's clock).
+    autopilot_replies : tuple of ndarray
+        TIMESYNC request times (s, sender's clock) and reply times (s, boot clock).
+    boot_to_unix_fit : ClockLine or None
+        Conversion of the boot clock to UNIX time.
+    has_receive_times : bool
+        True if the recording contains receive times.
+    """
+    time_source = "receive time" if has_receive_times else "message order"
+    boot_time_at_receipt_s = receipt_to_boot_fit.at(receive_times_s)
+    if not is_running_clock(timestamps_s):
+        distinct_count = len(np.unique(timestamps_s))
+        note = (
+            f"the {len(timestamps_s)} timestamps have only {distinct_count} distinct values, so "
+            f"px4fuse uses the {time_source}"
+        )
+        # Jitter of the receive time, if the sender sends at regular intervals
+        intervals_s = np.diff(receive_times_s)
+        intervals_s = intervals_s[intervals_s < MAX_REGULAR_SAMPLE_INTERVAL_S]
+        jitter_s = float(np.std(intervals_s) / np.sqrt(2.0)) if len(intervals_s) else 0.0
+        description = ClockMap(
+            name, time_source, len(timestamps_s), 0.0, 0.0, jitter_s, note, distinct_count
+        )
+        return ClockMapping(None, description)
+
+    def compute_difference_from_receipt_s(boot_time_s: Array) -> float:
+        return abs(float(np.median(boot_time_at_receipt_s - boot_time_s)))
+
+    timesync_fit = _fit_timesync(sender_replies, autopilot_replies)
+    difference_from_receipt_s = compute_difference_from_receipt_s(timestamps_s)
+    # Without TIMESYNC, a clock that started seconds later looks like the boot clock
+    reduction_by_timesync_s = (
+        0.0
+        if timesync_fit is None
+        else difference_from_receipt_s
+        - compute_difference_from_receipt_s(timesync_fit.at(timestamps_s))
+    )
+    if (
+        difference_from_receipt_s <= MAX_BOOT_TIME_DIFFERENCE_S
+        and reduction_by_timesync_s < MIN_REDUCTION_BY_TIMESYNC_S
+    ):
+        same_clock = ClockLine(0.0, 0.0, 1.0, 0.0, len(timestamps_s))
+        note = "the timestamps of the sender are boot times of the autopilot"
+        return _make_clock_mapping(name, "boot clock", same_clock, timestamps_s, note)
+    clock_kind = "UNIX time" if float(np.median(timestamps_s)) > MIN_UNIX_TIME_S else "clock"
+    clock_name = f"{clock_kind} of {name}"
+    candidate_fits = [] if timesync_fit is None else [("TIMESYNC", timesync_fit, "")]
+    if clock_kind == "UNIX time" and boot_to_unix_fit is not None:
+        unix_note = "assumption: the UNIX clocks of sender and autopilot are synchronised"
+        candidate_fits.append(("SYSTEM_TIME", boot_to_unix_fit.inverse(), unix_note))
+    for method, sender_to_boot_fit, note in candidate_fits:
+        # Converted timestamps that disagree with the receive times are from another clock
+        if (
+            compute_difference_from_receipt_s(sender_to_boot_fit.at(timestamps_s))
+            <= MAX_BOOT_TIME_DIFFERENCE_S
+        ):
+            return _make_clock_mapping(clock_name, method, sender_to_boot_fit, timestamps_s, note)
+    sender_to_boot_fit = fit_clock_line(timestamps_s, receive_times_s)
+    sender_to_boot_fit = replace(
+        sender_to_boot_fit,
+        y0=float(receipt_to_boot_fit.at(sender_to_boot_fit.y0)),
+        slope=sender_to_boot_fit.slope * receipt_to_boot_fit.slope,
+    )
+    note = (
+        "the recording has no usable TIMESYNC or SYSTEM_TIME. All sample times are late by the "
+        "minimum delay of the link, which is unknown"
+    )
+    return _make_clock_mapping(clock_name, time_source, sender_to_boot_fit, timestamps_s, note)
+
+
+def _fit_timesync(
+    sender_replies: tuple[Array, Array], autopilot_replies: tuple[Array, Array]
+) -> ClockLine | None:
+    """Fit the conversion of sender clock to boot clock by TIMESYNC, as mean of both directions."""
+    clock_fits = []
+    if len(sender_replies[0]) >= MIN_TIMESYNC_REPLIES:
+        # Inverse, because the request (boot time) is before the reply (sender time)
+        clock_fits.append(fit_clock_line(*sender_replies).inverse())
+    if len(autopilot_replies[0]) >= MIN_TIMESYNC_REPLIES:
+        clock_fits.append(fit_clock_line(*autopilot_replies))
+    if not clock_fits:
+        return None
+    x0 = clock_fits[0].x0
+    line_parameters = [(float(line.at(x0)), line.slope, line.jitter_s) for line in clock_fits]
+    y0, slope, jitter_s = np.mean(line_parameters, axis=0).tolist()
+    return ClockLine(x0, y0, slope, jitter_s, sum(line.reading_pair_count for line in clock_fits))
+
+
+def _make_clock_mapping(
+    clock: str, method: str, line: ClockLine, timestamps_s: Array, note: str
+) -> ClockMapping:
+    middle_timestamp_s = float(0.5 * (timestamps_s.min() + timestamps_s.max()))
+    offset_s = float(line.at(middle_timestamp_s)) - middle_timestamp_s
+    drift_ppm = (line.slope - 1.0) * 1e6
+    description = ClockMap(
+        clock, method, line.reading_pair_count, offset_s, drift_ppm, line.jitter_s, note
+    )
+    return ClockMapping(line, description)
 
 
 def describe_clock_conversions(

@@ -24,6 +24,7 @@ from px4fuse.readers.position_names import (
     METRES_BY_LENGTH_UNIT,
     SECONDS_BY_TIME_UNIT,
     ColumnMeaning,
+    PositionColumns,
     find_quaternion_columns,
     read_column_name,
 )
@@ -31,18 +32,16 @@ from px4fuse.readers.recording_table import (
     COLUMNS_OPTION,
     HEADERLESS_TABLE_FORMAT,
     MAX_FILE_BYTES,
+    MAX_VALID_UNIX_TIME_S,
+    MIN_VALID_UNIX_TIME_S,
     SEPARATORS,
     PositionTable,
     choose_body,
     find_table,
-)
-from px4fuse.readers.ros_bag import is_bag, read_bag
-from px4fuse.readers.text_table import (
-    MAX_VALID_UNIX_TIME_S,
-    MIN_VALID_UNIX_TIME_S,
     quote,
     refuse_foreign_format,
 )
+from px4fuse.readers.ros_bag import is_bag, read_bag
 from px4fuse.readers.ulog_topics import longest_increasing_run
 
 SIGMA_COLUMNS = ["sigma_x_m", "sigma_y_m", "sigma_z_m"]
@@ -98,10 +97,6 @@ class PositionRecording:
     quaternions: Array | None = None
 
 
-# Column indices of position or sigma along x, y, z; None if missing
-_ColumnIndices = tuple[int | None, ...]
-
-
 def read_position_file(
     path: str | Path,
     *,
@@ -141,26 +136,22 @@ def read_position_file(
     table, sha256, size_bytes = _open_table(path, columns, body)
     notes = [*table.notes]
     column_meanings = [read_column_name(name) for name in table.column_names]
-    given_columns = _find_column_indices(table, columns or ())
+    if columns:
+        column_meanings = _interpret_given_columns(table, column_meanings, columns)
     quaternion_columns = find_quaternion_columns(table.column_names)
-    numbers, has_time_zone = _read_numbers(
-        table, column_meanings, given_columns, quaternion_columns, body
-    )
+    numbers, has_time_zone = _read_numbers(table, column_meanings, quaternion_columns, body)
     row_count = len(numbers)
-    time_column, axis_columns, sigma_columns, frame, time_text = _choose_columns(
-        table, column_meanings, given_columns, numbers
-    )
+    time_column, time_text = _detect_time_column(table, column_meanings, numbers)
+    frame, axis_columns = _find_axes(column_meanings, numbers)
+    sigma_columns = position_names.find_sigma_columns(column_meanings, frame)
     position_columns = [index for index in axis_columns if index is not None]
     # pandas reads numbers such as 1e999 as infinite
     has_time = np.isfinite(numbers[time_column])
     is_usable = has_time & (numbers[position_columns].abs() < MAX_COORDINATE_IN_FILE_UNIT).all(
         axis=1
     )
-    if unusable_count := int(np.count_nonzero(~is_usable)):
-        notes.append(
-            f"number of dropped rows without valid time or position: {unusable_count}"
-            f"{table.format_first_line_number(numbers.index[~is_usable])}"
-        )
+    if unusable_count := np.count_nonzero(~is_usable):
+        notes.append(f"number of dropped rows without valid time or position: {unusable_count}")
     times_without_position = numbers.loc[has_time & ~is_usable, time_column].to_numpy()
     numbers = numbers[is_usable]
     time_units, min_interval_s, max_interval_s = TRAJECTORY_TIMES if is_trajectory else UWB_TIMES
@@ -218,12 +209,12 @@ def read_position_file(
     samples[SIGMA_COLUMNS] = samples[SIGMA_COLUMNS].mask(is_ignored_sigma)
     if ignored_count := int(is_ignored_sigma.any(axis=1).sum()):
         notes.append(f"number of rows with an ignored sigma (not positive): {ignored_count}")
-    is_unix = (
-        has_time_zone
+    clock_kind: Literal["UNIX", "local"] = (
+        "UNIX"
+        if has_time_zone
         and MIN_VALID_UNIX_TIME_S <= float(np.median(numbers.index)) < MAX_VALID_UNIX_TIME_S
+        else "local"
     )
-    clock_kind: Literal["UNIX", "local"] = "UNIX" if is_unix else "local"
-    height_text = " without height" if len(position_columns) < 3 else ""
     return PositionRecording(
         name=table.file_name,
         sha256=sha256,
@@ -239,7 +230,8 @@ def read_position_file(
             f"{table.header_line}",
             f"time: column {time_text}, {clock_kind} clock, unit {unit} ({unit_text})",
             f"position: columns {table.format_labels(*axis_columns)} as "
-            f"{frame.upper() if frame else 'x, y, z'}{height_text}, unit {length_unit_text}",
+            f"{frame.upper() if frame else 'x, y, z'}"
+            f"{' without height' * (len(position_columns) < 3)}, unit {length_unit_text}",
             f"sigma: columns {table.format_labels(*sigma_columns) or 'none'}",
         ),
         notes=tuple(notes),
@@ -304,7 +296,6 @@ def _check_options(
 def _read_numbers(
     table: PositionTable,
     column_meanings: list[ColumnMeaning],
-    given_columns: list[int],
     quaternion_columns: list[int],
     body_name: str | None,
 ) -> tuple[pd.DataFrame, bool]:
@@ -313,7 +304,7 @@ def _read_numbers(
     The second value is False for dates without time zone.
     """
     known_columns = [index for index, meaning in enumerate(column_meanings) if meaning.kind]
-    texts = table.read_cells([*given_columns, *quaternion_columns, *known_columns])
+    texts = table.read_cells([*quaternion_columns, *known_columns])
     texts = _select_body(table, texts, column_meanings, body_name)
     may_have_decimal_comma = table.separator != ","
     # DataFrame.apply returns dtype object for an empty table
@@ -321,15 +312,17 @@ def _read_numbers(
         np.float64
     )
     has_time_zone = True
-    for index in given_columns[:1] or [
-        i for i in known_columns if column_meanings[i].kind == "time"
-    ]:
-        if numbers[index].isna().mean() > 0.5 and texts[index].notna().any():
+    for index, meaning in enumerate(column_meanings):
+        if (
+            meaning.kind == "time"
+            and numbers[index].isna().mean() > 0.5
+            and texts[index].notna().any()
+        ):
             dates = texts[index].str.replace(",", ".", regex=False)
             times = pd.to_datetime(dates, format="ISO8601", utc=True, errors="coerce")
             numbers[index] = (times - pd.Timestamp(0, tz="UTC")).dt.total_seconds()
             has_time_zone = bool(dates.str.contains(r"(?:Z|[+-]\d\d:?\d\d)$").mean() > 0.5)
-            column_meanings[index] = replace(column_meanings[index], unit="s")
+            column_meanings[index] = replace(meaning, unit="s")
     return numbers, has_time_zone
 
 
@@ -381,50 +374,49 @@ def _find_column_indices(table: PositionTable, wanted_columns: tuple[str, ...]) 
     return indices
 
 
-def _choose_columns(
-    table: PositionTable,
-    column_meanings: Sequence[ColumnMeaning],
-    given_columns: list[int],
-    numbers: pd.DataFrame,
-) -> tuple[int, _ColumnIndices, _ColumnIndices, str | None, str]:
-    """Choose the columns of time, position and σ, the frame, and a text on the time column.
+def _interpret_given_columns(
+    table: PositionTable, column_meanings: Sequence[ColumnMeaning], given_names: tuple[str, ...]
+) -> list[ColumnMeaning]:
+    """Return the meanings of all columns if the user gave those of time, position and sigma.
 
-    The time column of ``numbers`` may change, see :func:`_detect_time_column`.
+    The axes are x, y, z in the given order, unless the names of the given columns state the axes.
     """
-    if given_columns:
-        time_column = given_columns[0]
-        time_text = table.format_labels(time_column)
-        frame, axis_columns = _find_frame_of_given_columns(column_meanings, given_columns[1:4])
-    else:
-        time_column, time_text = _detect_time_column(table, column_meanings, numbers)
-        frame_and_axis_columns = position_names.find_position_columns(column_meanings)
-        assert frame_and_axis_columns  # find_table returns only tables with positions
-        frame, axis_columns = frame_and_axis_columns
-    if axis_columns[2] is not None and numbers[axis_columns[2]].isna().all():
-        axis_columns = (*axis_columns[:2], None)
-    sigma_columns = (
-        (given_columns[4],) * 3
-        if len(given_columns) > 4
-        else position_names.find_sigma_columns(column_meanings, frame)
-    )
-    return time_column, axis_columns, sigma_columns, frame, time_text
-
-
-def _find_frame_of_given_columns(
-    column_meanings: Sequence[ColumnMeaning], position_columns: list[int]
-) -> tuple[str | None, _ColumnIndices]:
-    """Return the frame of the given columns (None: unknown), and its axes, or x, y, z as given."""
-    axis_columns = (*position_columns, None)[:3]  # two columns: without height
+    given_columns = _find_column_indices(table, given_names)
+    time_column, *position_columns = given_columns[:4]
+    sigma_columns = given_columns[4:]
+    kept_kinds = ("tag",) if sigma_columns else ("tag", "sigma")
+    meanings = [
+        meaning if meaning.kind in kept_kinds else ColumnMeaning() for meaning in column_meanings
+    ]
+    for index, axis in zip(position_columns, "xyz", strict=False):
+        meanings[index] = ColumnMeaning("position", axis, column_meanings[index].unit)
     # The names of other columns must not define the frame
-    frame_and_axis_columns = position_names.find_position_columns(
+    named_position = position_names.find_position_columns(
         [
             meaning if index in position_columns else ColumnMeaning()
             for index, meaning in enumerate(column_meanings)
         ]
     )
-    if frame_and_axis_columns and {*frame_and_axis_columns[1]} == {*axis_columns}:
-        return frame_and_axis_columns
-    return None, axis_columns
+    if named_position and {*named_position[1]} - {None} == {*position_columns}:
+        for index in position_columns:
+            meanings[index] = column_meanings[index]
+    for index in sigma_columns:
+        meanings[index] = ColumnMeaning("sigma", unit=column_meanings[index].unit)
+    time_unit = column_meanings[time_column].unit
+    meanings[time_column] = ColumnMeaning("time", unit=time_unit, time_kind="time")
+    return meanings
+
+
+def _find_axes(
+    column_meanings: Sequence[ColumnMeaning], numbers: pd.DataFrame
+) -> tuple[str | None, PositionColumns]:
+    """Return the frame of the position (None: unknown), and the column indices of its axes."""
+    frame_and_axis_columns = position_names.find_position_columns(column_meanings)
+    assert frame_and_axis_columns  # find_table returns only tables with positions
+    frame, (x_column, y_column, z_column) = frame_and_axis_columns
+    if z_column is not None and numbers[z_column].isna().all():
+        z_column = None
+    return frame, (x_column, y_column, z_column)
 
 
 def _detect_time_column(
@@ -532,11 +524,6 @@ def _choose_length_units(
         reason = (
             f"an extent of {max_extent:.0f} m is too large for an indoor flight; if the unit is "
             "cm, give --position-unit"
-        )
-    elif max_extent > max_extent_m:
-        reason = (
-            "px4fuse assumes metres, because in each unit the extent is too large for an indoor "
-            "flight; set another unit with --position-unit"
         )
     column_units = pd.Series(
         {index: named_units.get(index, unit) for index in map(int, numbers.columns)}

@@ -30,8 +30,11 @@ from px4fuse.flight.model import (
 )
 from px4fuse.readers import px4_topics as px4
 from px4fuse.readers.field_maps import Layout
-from px4fuse.readers.px4_aids import read_aids, read_enabled_aids
-from px4fuse.readers.px4_innovations import collect_innovations_by_axis
+from px4fuse.readers.px4_innovations import (
+    collect_innovations_by_axis,
+    read_aids,
+    read_enabled_aids,
+)
 from px4fuse.readers.ulog_topics import Topics, measurement_time_us
 
 VISION_TOPIC = "vehicle_visual_odometry"
@@ -255,7 +258,7 @@ def compute_samples_per_step(
     interval_ratio = configured_step_s / imu_interval_s
     # 1e-6 compensates rounding errors of the IMU interval
     sample_count = max(int(interval_ratio + 0.5 + 1e-6), 1)
-    samples_between_logged_ends = np.diff(np.asarray(step_ends, dtype=float))
+    samples_between_logged_ends = np.diff(np.asarray(step_ends))
     if (
         sample_count > 1
         and abs(interval_ratio + 0.5 - sample_count) < MAX_DISTANCE_FROM_HALF_INTEGER
@@ -303,21 +306,15 @@ def _compute_publication_delay_s(topics: Topics, topic: str) -> pd.Series:
 
 def _read_fusion_flags(topics: Topics, enabled_aids: StepFunctions) -> TableOrUnavailable:
     """Read EKF2's fusion flags of external vision: horizontal position, height and yaw."""
-    aid_name_by_flag = {"horizontal": "ev_pos", "vertical": "ev_hgt", "yaw": "ev_yaw"}
-    if not {*aid_name_by_flag.values()} <= enabled_aids.keys():
-        return Unavailable(
-            "EKF2 fusion flags",
-            "estimator_status_flags and estimator_status are not logged",
-            px4.DEFAULT_PROFILE_REMEDY,
-        )
-    flags = pd.DataFrame(
-        {flag: enabled_aids[aid_name] for flag, aid_name in aid_name_by_flag.items()}
-    ).dropna()
-    topic = px4.STATUS_FLAGS if topics.instances(px4.STATUS_FLAGS) else px4.STATUS_TOPIC
+    flags = pd.DataFrame(dict(enabled_aids)).reindex(columns=["ev_pos", "ev_hgt", "ev_yaw"])
+    flags = flags.set_axis(["horizontal", "vertical", "yaw"], axis=1).dropna()
     if flags.empty:
         return Unavailable(
-            "EKF2 fusion flags", f"{topic} has no usable sample", "Record the flight again."
+            "EKF2 fusion flags",
+            "estimator_status_flags and estimator_status are not logged or not usable",
+            px4.DEFAULT_PROFILE_REMEDY,
         )
+    topic = px4.STATUS_FLAGS if topics.instances(px4.STATUS_FLAGS) else px4.STATUS_TOPIC
     topics.record_stream("ekf2_fusing", topic)
     return flags
 

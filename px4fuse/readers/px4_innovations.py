@@ -1,14 +1,43 @@
-"""EKF2's innovations of external vision or GNSS along each axis."""
+"""EKF2's innovations: reader of all aiding sources in a ULog, and innovations along each axis.
+
+Source: PX4-Autopilot ``EKF2.cpp`` (PublishInnovations, PublishAidSourceStatus), v1.8 to main.
+"""
+
+from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
+from typing import Any
 
 import numpy as np
 import pandas as pd
 
-from px4fuse.flight.ekf2_parameters import BAROMETER, GNSS_POS
-from px4fuse.flight.model import AXIS_NAMES, AidLog, Ekf2, NedAxis, TableOrUnavailable, Unavailable
+from px4fuse.flight.ekf2_parameters import AIDS, BAROMETER, GNSS_POS, STATUS_FLAGS, Aid
+from px4fuse.flight.model import (
+    AXIS_NAMES,
+    AidLog,
+    Ekf2,
+    NedAxis,
+    StepFunctions,
+    TableOrUnavailable,
+    Unavailable,
+    sample_step_function,
+)
+from px4fuse.readers import px4_topics as px4
+from px4fuse.readers.common import join_nearest
+from px4fuse.readers.field_maps import Layout, assign_fields_to_columns
+from px4fuse.readers.ulog_topics import Topics
 
+# Maximum time (s) between innovation and variance S; PX4 logs them every 0.5 s by default
+MAX_VARIANCE_TIME_DIFFERENCE_S = 0.6
+# Column and PX4 field for the time of the last fusion
+LAST_FUSION_FIELD = {"last_fused_us": "time_last_fuse"}
+# Optional fields of the topics estimator_aid_src_*, by aiding source and column
+OPTIONAL_FIELDS = {
+    "baro_hgt": {"observation_down": "observation", "filtered_down": "innovation_filtered"},
+    "ev_pos": LAST_FUSION_FIELD,
+    "gnss_pos": LAST_FUSION_FIELD,
+}
 Innovations = dict[NedAxis, TableOrUnavailable]
 
 
@@ -51,7 +80,7 @@ GNSS = Ekf2PositionSource(
         "vertical": "Set bit 1 of EKF2_GPS_CTRL (EKF2_HGT_MODE 1 before v1.14) to fuse the GNSS "
         "height.",
     },
-    logging_remedy="Record with SDLOG_PROFILE bit 0 (default).",
+    logging_remedy=px4.DEFAULT_PROFILE_REMEDY,
 )
 GNSS_WITH_BAROMETER_HEIGHT = replace(
     GNSS,
@@ -180,3 +209,157 @@ def select_axis_innovations(log: AidLog, axis: NedAxis, gate: float) -> pd.DataF
     return innovations[
         (innovations["fused"] > 0.0) | (innovations["rejected"] > 0.0) | innovations["fused"].isna()
     ]
+
+
+def read_aids(topics: Topics, enabled_aids: StepFunctions) -> dict[str, AidLog]:
+    """Read the innovations of each aiding source of EKF2, by PX4 name.
+
+    Since v1.14, each aiding source has a topic ``estimator_aid_src_...``. Older topics contain all
+    aiding sources, and repeat each innovation until the next fusion.
+    """
+    log_by_aid = {}
+    for name, aid in AIDS.items():
+        enabled_flag = enabled_aids.get(name)
+        aid_log = _read_aid_topic(topics, aid, enabled_flag)
+        # Older topics contain wrong values of a source while its fusion is disabled
+        if aid_log is None and (
+            name.startswith("ev_") if enabled_flag is None else enabled_flag.any()
+        ):
+            aid_log = _read_common_topics(topics, aid, enabled_flag)
+        if aid_log is not None:
+            log_by_aid[name] = aid_log
+    return log_by_aid
+
+
+def read_enabled_aids(topics: Topics) -> dict[str, pd.Series[float]]:
+    """Return a time series for each aiding source: 1 while its fusion is enabled, otherwise 0."""
+    all_aids = (*AIDS.values(), *STATUS_FLAGS.values())
+    flag_names = {flag for aid in all_aids for group in aid.flags for flag in group.split("|")}
+    layout = Layout(
+        px4.STATUS_FLAGS,
+        optional_columns={name: name for name in flag_names},
+        is_step_function=True,
+    )
+    flags = topics.primary_samples(layout)
+    enabled_aids = {}
+    for aid in all_aids if len(flags) else ():
+        groups = (group.split("|") for group in aid.flags)
+        group = next((group for group in groups if {*group} <= {*flags}), None)
+        if group is not None:
+            enabled_aids[aid.name] = flags[group].max(axis=1)
+    if not flags.columns.empty:
+        return enabled_aids
+    control_bits = topics.primary_samples(px4.TOPIC_LAYOUTS["control_bits"])["bits"].dropna()
+    for aid in all_aids if len(control_bits) else ():
+        if aid.status_bit is not None:
+            is_enabled = control_bits.astype(np.int64) & (1 << aid.status_bit) > 0
+            enabled_aids[aid.name] = is_enabled.astype(float)
+    return enabled_aids
+
+
+def _read_aid_topic(
+    topics: Topics, aid: Aid, enabled_flag: pd.Series[float] | None
+) -> AidLog | None:
+    field_by_quantity = {
+        "innovation": "innovation",
+        "variance": "innovation_variance",
+        "noise": "observation_variance",
+        "ratio": "test_ratio",
+    }
+    if aid.name in px4.AIDS_WITH_LOCAL_POSITION_OBSERVATION:
+        field_by_quantity["observation"] = "observation"
+    columns = {"fused": "fused", "rejected": "innovation_rejected"}
+    for name, field in field_by_quantity.items():
+        columns |= _assign_fields_by_axis(name, aid, field + "[]" * (len(aid.axes) > 1))
+    layout = Layout(f"estimator_aid_src_{aid.name}", columns, OPTIONAL_FIELDS.get(aid.name, {}))
+    if topics.find_layout(layout) is None:  # return early: reading an empty table takes time
+        return None
+    samples = topics.primary_samples(layout).dropna()
+    if "last_fused_us" in samples:
+        samples["last_fused_s"] = (samples.pop("last_fused_us") - topics.time_origin_us) * 1e-6
+    if enabled_flag is not None and aid.name in px4.AIDS_ALWAYS_FUSED:
+        samples["fused"] = sample_step_function(enabled_flag, samples.index)
+    return _make_aid_log(topics, (layout.topic,), aid, samples, enabled_flag)
+
+
+def _read_common_topics(
+    topics: Topics, aid: Aid, enabled_flag: pd.Series[float] | None
+) -> AidLog | None:
+    """Read the innovations of an aiding source from a topic that contains all aiding sources."""
+    is_in_gauss = aid.name == "mag_heading" and any(
+        "cs_mag" in table for table in topics.tables_of(px4.STATUS_FLAGS)
+    )
+    layouts = []
+    if aid.fields and not is_in_gauss:
+        layouts.append(
+            [
+                Layout(topic, _assign_fields_by_axis(name, aid, aid.fields))
+                for topic, name in zip(
+                    px4.INNOVATION_TOPICS, ("innovation", "variance"), strict=True
+                )
+            ]
+        )
+    if aid.ekf2_innovations_fields:
+        field_by_column = _assign_fields_by_axis("innovation", aid, aid.ekf2_innovations_fields)
+        variance_fields = aid.ekf2_innovations_fields.replace("innov", "innov_var")
+        field_by_column |= _assign_fields_by_axis("variance", aid, variance_fields)
+        layouts.append([Layout(px4.OLD_INNOVATION_TOPIC, field_by_column)] * 2)
+    for value_layout, variance_layout in layouts:
+        innovation = topics.primary_samples(value_layout)[f"innovation_{aid.axes[0]}"]
+        variance_samples = topics.primary_samples(variance_layout)
+        variance = variance_samples[f"variance_{aid.axes[0]}"]
+        is_new_variance = (variance > 0.0) & variance.ne(variance.shift())
+        samples = topics.primary_samples(value_layout, select_rows=_drop_repeats_and_zeros)
+        if variance_layout is not value_layout:
+            # The nearest variance S is used, because PX4 logs it at other times
+            samples = join_nearest(
+                samples, variance_samples.dropna(), MAX_VARIANCE_TIME_DIFFERENCE_S
+            )
+        samples = samples.dropna()
+        if enabled_flag is not None:
+            samples = samples[sample_step_function(enabled_flag, samples.index) > 0.0]
+        aid_log = _make_aid_log(
+            topics,
+            tuple(dict.fromkeys((value_layout.topic, variance_layout.topic))),
+            aid,
+            samples,
+            enabled_flag,
+            # EKF2 may have fused a sample that is not logged, if the innovation is 0 or S is new
+            times_with_unknown_fusion_s=np.union1d(
+                innovation.index[innovation == 0.0], variance.index[is_new_variance]
+            ),
+        )
+        if aid_log is not None:
+            return aid_log
+    return None
+
+
+def _drop_repeats_and_zeros(samples: pd.DataFrame) -> pd.DataFrame:
+    """Remove repeated innovations, and the zeros that PX4 logs before the first fusion."""
+    finite_samples = samples.dropna()
+    first_column = finite_samples.iloc[:, 0]
+    return finite_samples[first_column.ne(first_column.shift()) & (first_column != 0.0)]
+
+
+def _assign_fields_by_axis(name: str, aid: Aid, fields: str) -> dict[str, str]:
+    return assign_fields_to_columns({",".join(f"{name}_{axis}" for axis in aid.axes): fields})
+
+
+def _make_aid_log(
+    topics: Topics,
+    used_topics: tuple[str, ...],
+    aid: Aid,
+    samples: pd.DataFrame,
+    enabled_flag: pd.Series[float] | None,
+    **log_fields: Any,
+) -> AidLog | None:
+    """Return the innovations of an aiding source; None without a positive innovation variance.
+
+    The sign is changed, because PX4 logs prediction minus measurement.
+    """
+    samples = samples[(samples[[f"variance_{axis}" for axis in aid.axes]] > 0.0).all(axis=1)]
+    if samples.empty:
+        return None
+    samples = samples.assign(**-samples[[f"innovation_{axis}" for axis in aid.axes]])
+    parameters = aid.logged_parameters(topics.ekf2_parameters)
+    return AidLog(used_topics, aid.axes, samples, enabled_flag, parameters, **log_fields)

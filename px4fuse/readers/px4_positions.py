@@ -38,7 +38,7 @@ from px4fuse.readers.common import (
 from px4fuse.readers.px4_ekf2 import configured_step_s
 from px4fuse.readers.px4_fixes import read_unlogged_fixes, reconstruct_fixes
 from px4fuse.readers.px4_innovations import has_fused_aid
-from px4fuse.readers.text_table import MAX_VALID_UNIX_TIME_S, MIN_VALID_UNIX_TIME_S
+from px4fuse.readers.recording_table import MAX_VALID_UNIX_TIME_S, MIN_VALID_UNIX_TIME_S
 from px4fuse.readers.ulog_topics import MAX_PUBLICATION_LAG_S, Topics
 
 MIN_TRACK_SAMPLES = 3

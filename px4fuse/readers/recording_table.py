@@ -1,4 +1,4 @@
-"""Detection of the table in a position file, and its conversion to named columns.
+"""Detection of the format of a text file, and of the table of positions in it.
 
 Supported are tables with or without header, exports of Motive and Vicon Nexus, JSON lines, KITTI
 poses, and text formats of UWB systems.
@@ -11,16 +11,18 @@ from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, replace
 from itertools import zip_longest
 from pathlib import Path
+from typing import Any
 
 import msgspec
 import numpy as np
 import pandas as pd
 
 from px4fuse.core.reading import display_name, read_text
-from px4fuse.errors import LogError
+from px4fuse.core.record import read_toml
+from px4fuse.core.text import join_first_names
+from px4fuse.errors import LogError, Px4FuseError
 from px4fuse.readers import position_names
 from px4fuse.readers.position_names import read_column_name
-from px4fuse.readers.text_table import UWB_TEXT_FORMATS, decode_text, is_number, quote
 
 # Maximum size (bytes) of a position file
 MAX_FILE_BYTES = 500_000_000
@@ -32,6 +34,17 @@ MAX_COLUMNS = 200
 COLUMNS_OPTION = "`columns` TIME,X,Y,Z"
 SEPARATORS = {";": "semicolon", "\t": "tab", ",": "comma", " ": "space"}
 HEADERLESS_TABLE_FORMAT = "table without header"
+# Valid UNIX times (s): years 2000 to 2100
+MIN_VALID_UNIX_TIME_S, MAX_VALID_UNIX_TIME_S = 946_684_800.0, 4_102_444_800.0
+# Number of characters that are searched for signs of a binary file
+_CHECKED_CHAR_COUNT = 100_000
+# Byte order marks of UTF-16, the encoding of texts from Windows shells
+_UTF_16_BYTE_ORDER_MARKS = (b"\xff\xfe", b"\xfe\xff")
+_CONTROL_CHARACTER_PATTERN = re.compile("[\x00-\x08\x0e-\x1b]")
+_NUMBER_PATTERN = re.compile(
+    r"[+-]?(?:(?:[0-9]+\.?|[0-9]*\.[0-9]+)(?:e[+-]?[0-9]+)?|nan|inf)", re.IGNORECASE
+)
+_TEXT_FORMATS = read_toml(__file__, dict[str, list[dict[str, Any]]], "formats.toml")
 _ISO_DATE = re.compile(r"\d{4}-\d\d-\d\d")
 
 
@@ -46,8 +59,8 @@ class PositionTable:
     # Text of the rows, without the header
     rows_text: str
     separator: str = ","
-    # Line number of the header, 0 without header; None for formats without lines
-    header_line: int | None = None
+    # Line number of the header; 0 for other formats
+    header_line: int = 0
     # Possible coordinate frames; empty if all are possible
     frames: tuple[str, ...] = ()
     # Frame rate, if the time column contains frame numbers
@@ -63,13 +76,7 @@ class PositionTable:
             for index in columns
             if index is not None
         )
-        return ", ".join([*labels][:12]) + (", ..." if len(labels) > 12 else "")
-
-    def format_first_line_number(self, rows: pd.Index) -> str:
-        """Return the line number of the first row as text, such as " (first: line 7)"."""
-        return (
-            "" if self.header_line is None else f" (first: line {self.header_line + 1 + rows[0]})"
-        )
+        return join_first_names([*labels], 12)
 
     def read_cells(self, columns: Iterable[int]) -> pd.DataFrame:
         """Return the text of the given columns, without empty rows."""
@@ -85,7 +92,6 @@ class PositionTable:
                 dtype=str,
                 skipinitialspace=True,
                 quoting=csv.QUOTE_NONE,
-                skip_blank_lines=False,  # so that the index gives the line number
             )
         except ValueError as error:
             raise LogError(
@@ -93,6 +99,41 @@ class PositionTable:
                 "Export the positions as CSV again.",
             ) from error
         return texts.dropna(how="all")
+
+
+def refuse_foreign_format(path: Path, first_bytes: bytes, error_type: type[Px4FuseError]) -> None:
+    """Raise an error if px4fuse does not support the file format."""
+    name = display_name(path)
+    for foreign_format in _TEXT_FORMATS["foreign"]:
+        starts = tuple(start.encode("latin-1") for start in foreign_format["starts"])
+        if first_bytes.startswith(starts):
+            remedy = foreign_format["remedy"].format(name=name)
+            raise error_type(f"{name}: the file is {foreign_format['name']}", remedy)
+
+
+def decode_text(content: bytes) -> str | None:
+    """Decode a text in UTF-8, UTF-16 or Latin-1, with line feeds as line ends; None if binary."""
+    if content.startswith(_UTF_16_BYTE_ORDER_MARKS):
+        text = content[: len(content) // 2 * 2].decode("utf-16", errors="replace")
+    else:
+        content = content.rstrip(b"\0\x1a")  # NUL at the end after a power loss, 0x1a from DOS
+        try:
+            text = content.decode("utf-8-sig")
+        except UnicodeDecodeError:
+            text = content.decode("latin-1")
+    if "\0" in text or _CONTROL_CHARACTER_PATTERN.search(text, 0, _CHECKED_CHAR_COUNT):
+        return None
+    return text.replace("\r\n", "\n").replace("\r", "\n")
+
+
+def is_number(text: str) -> bool:
+    """Return True if the text is a number, NaN or infinity."""
+    return _NUMBER_PATTERN.fullmatch(text) is not None
+
+
+def quote(text: str) -> str:
+    """Put a text in quotation marks, and shorten it to 40 characters."""
+    return repr(text if len(text) <= 40 else text[:37] + "...")
 
 
 def choose_body(file_name: str, body_names: Iterable[str], wanted_body: str | None) -> str:
@@ -112,7 +153,8 @@ def choose_body(file_name: str, body_names: Iterable[str], wanted_body: str | No
     if len(matches) == 1:
         return matches[0]
     raise LogError(
-        f"none of the rigid bodies or tags in {file_name} is selected: {', '.join(names[:12])}",
+        f"none of the rigid bodies or tags in {file_name} is selected: "
+        f"{join_first_names(names, 12)}",
         "Choose a rigid body or tag with --body NAME.",
     )
 
@@ -254,7 +296,6 @@ def _find_body_table(
         "OptiTrack Motive CSV export" if is_motive else "Vicon Nexus CSV export",
         [*first_columns, *column_names.where(is_chosen, "")[2:]],
         rows_text,
-        header_line=axes_row + 1,
         # Motive exports y up by default, or z up; the file does not state which
         frames=("eus", "enu") if is_motive else (),
         rate_hz=None if is_motive else float(rows[1][0]),
@@ -265,7 +306,7 @@ def _find_body_table(
 
 def _find_stream_table(file_name: str, text: str, lines: Sequence[str]) -> PositionTable | None:
     """Find the positions in a text format of a UWB system (``formats.toml``)."""
-    for stream_format in UWB_TEXT_FORMATS:
+    for stream_format in _TEXT_FORMATS["streams"]:
         pattern = re.compile(stream_format["row"], re.MULTILINE)
         if not any(map(pattern.match, lines)):
             continue
@@ -326,7 +367,7 @@ def _find_headerless_table(path: Path, text: str, lines: Sequence[str]) -> Posit
             note = "the file has no header: columns 1 to 4 are read as time, x, y, z"
             rows_text = _remove_comments(text)
             return PositionTable(
-                display_name(path), name, column_names, rows_text, separator, 0, notes=(note,)
+                display_name(path), name, column_names, rows_text, separator, notes=(note,)
             )
     return None
 

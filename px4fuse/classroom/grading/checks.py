@@ -16,7 +16,7 @@ from px4fuse.classroom.assignment.key import AnswerKey, CorrectAnswers
 from px4fuse.classroom.grading.form_points import FormPoints, compute_form_points
 from px4fuse.comparison.model import ErrorsAgainstTruth
 from px4fuse.core.record import Share
-from px4fuse.core.text import capitalise_first, format_factor, format_length, one_line
+from px4fuse.core.text import capitalise_first, format_factor, format_metres, one_line
 from px4fuse.filter.consistency import HorizontalNis
 from px4fuse.filter.time_offset import SourceTimeOffset
 from px4fuse.filter.tuning import HORIZONTAL
@@ -474,8 +474,8 @@ class LoopItem(RubricItem, frozen=True, tag="loop"):
         landing_distance_m = true_values.get("closure_error_m", 0.0)
         if landing_distance_m > MAX_LANDING_DISTANCE_M and not is_accepted:
             return 1.0, (
-                f"Your vehicle landed {format_length(landing_distance_m)} from the take-off place, "
-                "so it is right that no loop closure was accepted."
+                f"Your vehicle landed {format_metres(landing_distance_m)} m from the take-off "
+                "place, so it is right that no loop closure was accepted."
             )
         if not isinstance(loop, Loop) or loop.closure_error_m is None:
             unavailable = loop.true_end if isinstance(loop, Loop) else loop
@@ -494,7 +494,7 @@ class LoopItem(RubricItem, frozen=True, tag="loop"):
                 "A loop closure was accepted, and the drift of the path was "
                 f"{'' if is_corrected else 'not '}corrected."
             )
-        error_text, path_text = map(format_length, (loop.closure_error_m, loop.path_length_m))
         return points_fraction, (
-            f"Your loop closure error is {error_text} after a path of {path_text}. {comment}"
+            f"Your loop closure error is {format_metres(loop.closure_error_m)} m after a path of "
+            f"{format_metres(loop.path_length_m)} m. {comment}"
         )
