@@ -348,4 +348,4 @@ def what_if(
     ekf2_model = require_available(prepare_ekf2_model(flight), flight)
     changes = {} if changes is None else changes
     change_sets = [changes] if isinstance(changes, Mapping) else changes
-    return require_available(whatif.what_if(ekf2_model, change_sets, without), flight)
+    return require_available(whatif.what_if(ekf2_model, change_sets, without or {}), flight)

@@ -44,8 +44,8 @@ def test_metres_per_degree_use_curvature_radii_of_ekf2(latitude_deg: float) -> N
 
 
 def test_ekf2_projection_scale_without_gnss_origin_is_1() -> None:
-    assert compute_internal_to_published_ratio(record(45.0, north_m=3.0)) == (1.0, 1.0, 1.0)
-    assert compute_internal_to_published_ratio(record(np.nan)) == (1.0, 1.0, 1.0)
+    assert compute_internal_to_published_ratio(record(45.0, north_m=3.0)) == 1.0
+    assert compute_internal_to_published_ratio(record(np.nan)) == 1.0
 
 
 def test_earth_rotation_rate_matches_sidereal_day() -> None:

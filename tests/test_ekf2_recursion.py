@@ -166,7 +166,7 @@ def test_what_if_with_ekf2_delay_max_on_px4_v1_14_raises_error():
     flight = SimpleNamespace(log=log(firmware="PX4 v1.14"))
     model = made(Ekf2Model, inputs=inputs, flight=flight)
     with pytest.raises(SettingsError, match=r"PX4 v1\.14 has no EKF2_DELAY_MAX"):
-        replay_with_settings(model, [{"EKF2_DELAY_MAX": 100.0}])
+        list(replay_with_settings(model, [{"EKF2_DELAY_MAX": 100.0}]))
     assert not list(replay_with_settings(model, []))
 
 

@@ -229,7 +229,7 @@ def test_delay_above_ekf2_delay_max_adds_a_note():
     """EKF2 increases EKF2_DELAY_MAX to the delay at its start (VerifyParams, EKF2.cpp)."""
     for by_delay, arrival_s, expected in (
         (False, 0.0, "EKF2 increases EKF2_DELAY_MAX from 200 to 264 ms"),
-        (True, -np.inf, "The log does not contain the arrival times"),
+        (True, -np.inf, "Without logged arrival times"),
         (True, 0.0, None),
     ):
         rules = replace(RULES, is_horizon_largest_delay=by_delay)

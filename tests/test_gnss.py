@@ -539,7 +539,7 @@ def test_what_if_without_aiding_source_predicts_position_error(models):
 
 @pytest.mark.reallogs
 def test_what_if_with_unused_parameter_raises_settings_error(models):
-    with pytest.raises(SettingsError, match="the parameter does not affect GNSS position"):
+    with pytest.raises(SettingsError, match="the replay of this log fuses only gnss_pos"):
         what_if(models["nominal"], [{"EKF2_EVP_NOISE": 0.2}])
     own = replace(models["nominal"].inputs.received_positions, uses_sender_timestamps=True)
     model = replace(

@@ -14,13 +14,12 @@ from exchange import replace
 from findings_tools import made
 
 from px4fuse.analysis import WhatIfAnalysis
-from px4fuse.ekf2.bad_acceleration import BadAccelerationFlag
 from px4fuse.ekf2.barometer import estimate_barometer_interval_s, find_fused_barometer_samples
 from px4fuse.ekf2.filter_recursion import FilterConfiguration, SegmentRun
-from px4fuse.ekf2.heights import HeightFilter, add_heights
+from px4fuse.ekf2.heights import BadAccelerationFlag, HeightFilter, add_heights
 from px4fuse.ekf2.model import Ekf2Model, run_configurations
 from px4fuse.ekf2.replay_segments import HeightSamples, ReplaySegment
-from px4fuse.ekf2.whatif import HEIGHT_LOGGED_NOTE, HEIGHT_REPLAYED_NOTE, what_if
+from px4fuse.ekf2.whatif import HEIGHT_LOGGED_NOTE, what_if
 from px4fuse.errors import SettingsError
 from px4fuse.flight.model import AidLog, Ekf2, Flight, FusionRecord
 from px4fuse.readers import read_log
@@ -214,7 +213,7 @@ def test_what_if_baro_noise_equals_flight_with_same_baro_noise() -> None:
             assert getattr(predicted.heights["baro_hgt"], name) == pytest.approx(expected, rel=0.02)
         error_m = logged.height_rmse_to_truth_m
         assert predicted.height_rmse_to_truth_m == pytest.approx(error_m, rel=0.1)
-        assert HEIGHT_REPLAYED_NOTE in found.notes
+        assert HEIGHT_LOGGED_NOTE not in found.notes
     # with 25 times the variance the barometer corrects the height less
     tight, loose = (
         column.heights["baro_hgt"].nis_mean for column in (found.whatif[0], found.logged)
@@ -466,7 +465,7 @@ def test_what_if_with_smaller_barometer_gate_rejects_more(models: dict[str, Ekf2
     """EKF2_BARO_NOISE scales NIS; the gate rejects innovations outside it."""
 
     def heights(without: dict[str, float] | None = None, **settings: float) -> Any:
-        found = what_if(models["nominal"], [settings], without)
+        found = what_if(models["nominal"], [settings], without or {})
         return found.whatif[0], found.replayed
 
     loose, flown = heights(EKF2_BARO_NOISE=3.5)

@@ -227,7 +227,7 @@ def test_what_if_uses_logged_heading_if_mag_is_not_replayed(tmp_path: Path) -> N
     assert result.notes[0] == HEADING_LOGGED_NOTE
     errors = [one.heading_error_mean_deg for one in (result.logged, *result.whatif)]
     assert errors[1] == pytest.approx(errors[0], abs=0.1)
-    with pytest.raises(SettingsError, match="the log does not contain all magnetometer samples"):
+    with pytest.raises(SettingsError, match="the replay of this log fuses only gnss_pos"):
         what_if(model, [{"EKF2_MAG_NOISE": 0.1}])
 
 
@@ -288,7 +288,7 @@ def test_simulated_heading_error_grows_exponentially_to_its_size() -> None:
 def test_simulate_outdoor_default_is_square_of_30_m_with_gnss(tmp_path: Path) -> None:
     arguments = "simulate", "--kind", "outdoor", "-o", tmp_path / "o.ulg"
     output = run_checked(*arguments, "--speed", "3").output
-    assert "outdoor, 3 laps of a square of 30 m at 3 m/s" in output
+    assert "outdoor, square of 30 m, 3 times at 3 m/s" in output
     assert "GNSS, 0.4 m at 5 Hz" in output
     for more, expected in (
         (["--assignment", "r.csv"], "--kind outdoor"),

@@ -341,7 +341,7 @@ def test_simulate_invalid_fault_option_raises_one_line_error(text, expected):
 
 
 @pytest.mark.parametrize("changes", [
-    {"kind": "spiral"}, {"yaw": "spin"}, {"passes": 0}, {"speed_m_s": float("nan")},
+    {"passes": 0}, {"speed_m_s": float("nan")},
     {"length_m": 2.0, "speed_m_s": 4.0}, {"seed": -1},
 ])  # fmt: skip
 def test_simulation_scenario_with_invalid_value_raises_error(changes):

@@ -561,7 +561,7 @@ def test_ekf2_model_excludes_vision_that_disagrees_with_log(wrong: dict[str, Any
     assert found.inputs.vision_positions is None
     assert "ev_pos" not in list_modelled_aids(found.inputs)
     with pytest.raises(SettingsError, match="EKF2_EVP_NOISE has no effect in a replay of this log"):
-        replay_with_settings(found, [{"EKF2_EVP_NOISE": 0.3}])
+        list(replay_with_settings(found, [{"EKF2_EVP_NOISE": 0.3}]))
 
 
 def test_ekf2_model_does_not_fuse_vision_while_disabled() -> None:

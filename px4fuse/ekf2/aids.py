@@ -245,9 +245,9 @@ def _evaluate_aid(aid: Aid, aid_log: AidLog, start_s: float, end_s: float) -> Ai
         enabled_fraction=None
         if aid_log.enabled is None
         else float(np.mean(_was_enabled(aid_log, np.arange(start_s, end_s, 0.1)))),
-        fused_fraction=_compute_fraction(is_fused, is_enabled),
+        fused_fraction=float(np.mean(is_fused[is_enabled])) if is_enabled.any() else 0.0,
         fused_logged=is_fusion_logged,
-        rejected_fraction=_compute_fraction(is_rejected, is_enabled),
+        rejected_fraction=float(np.mean(is_rejected[is_enabled])) if is_enabled.any() else 0.0,
         longest_gap_s=longest_gap_s,
         resets=int(is_reset.sum()),
         gate=gate,
@@ -266,7 +266,7 @@ def _was_enabled(aid_log: AidLog, times_s: Array) -> BoolArray:
     """Return True for each time at which fusion was enabled, or may have been enabled."""
     if aid_log.enabled is None:
         return np.ones(len(times_s), bool)
-    return np.asarray(sample_step_function(aid_log.enabled, times_s) > 0.0)
+    return sample_step_function(aid_log.enabled, times_s) > 0.0
 
 
 def _find_largest_mean_change(time_s: Array, normalised_innovations: Array) -> Span | None:
@@ -299,10 +299,6 @@ def _find_largest_mean_change(time_s: Array, normalised_innovations: Array) -> S
             )
             min_mean_change = abs(mean_change)
     return largest_mean_change
-
-
-def _compute_fraction(is_in_numerator: BoolArray, is_in_denominator: BoolArray) -> float:
-    return float((is_in_numerator & is_in_denominator).sum() / max(is_in_denominator.sum(), 1))
 
 
 def _find_applied_gate(aid: Aid, aid_log: AidLog) -> float:

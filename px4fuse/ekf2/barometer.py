@@ -63,13 +63,11 @@ def _compute_bias_gain(barometer_bias_updates: pd.DataFrame) -> Array:
     posterior_to_innovation_variance_ratio = (
         barometer_bias_updates["bias_m2"] / barometer_bias_updates["variance_m2"]
     ).to_numpy()
-    return np.asarray(
-        0.5 - 0.5 * np.sqrt(np.maximum(1.0 - 4.0 * posterior_to_innovation_variance_ratio, 0.0))
-    )
+    return 0.5 - 0.5 * np.sqrt(np.maximum(1.0 - 4.0 * posterior_to_innovation_variance_ratio, 0.0))
 
 
 def find_fused_barometer_samples(
-    ekf2: Ekf2, fusion_record: FusionRecord, logged_down_m: "pd.Series[float]"
+    ekf2: Ekf2, fusion_record: FusionRecord, logged_down_m: pd.Series
 ) -> pd.DataFrame:
     """Return the barometer samples that EKF2 fused, indexed by EKF2's measurement time (s).
 
@@ -85,8 +83,8 @@ def find_fused_barometer_samples(
 
 
 def _combine_barometer_samples(
-    ekf2: Ekf2, fusion_record: FusionRecord, logged_down_m: "pd.Series[float]", interval_s: float
-) -> "pd.Series[float]":
+    ekf2: Ekf2, fusion_record: FusionRecord, logged_down_m: pd.Series, interval_s: float
+) -> pd.Series:
     logged_barometer_updates = ekf2.aids[BAROMETER.name].samples
     if "observation_down" not in logged_barometer_updates or len(logged_barometer_updates) < 2:
         return logged_down_m
@@ -128,7 +126,7 @@ def _combine_barometer_samples(
         predicted_down_m = np.interp(
             time_s, rows_outside_ground_effect.index, predicted_minus_integrated_down_m
         ) + np.interp(time_s, velocity_times_s, displacement_m)
-        return np.asarray(predicted_down_m - interpolate_bias_m(time_s))
+        return predicted_down_m - interpolate_bias_m(time_s)
 
     # Arrays: one row per interval between logged samples, one column per sample in the interval
     span_s = np.diff(row_times_s)

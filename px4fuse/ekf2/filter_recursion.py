@@ -12,17 +12,16 @@ and ``EKF/vel_pos_fusion.cpp`` (gate, fusion), ``ev_pos_control.cpp`` (noise, re
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
-from operator import attrgetter
 
 import numpy as np
 from scipy.linalg import block_diag
 
 from px4fuse.core.arrays import Array, Array32, ArrayPair, BoolArray, IntArray
-from px4fuse.ekf2.bad_acceleration import BadAccelerationFlag
 from px4fuse.ekf2.heights import (
     GNSS_HEIGHT_NOISE_FACTOR,
     MIN_INNOVATION_GATE,
     MIN_MEASUREMENT_NOISE_SIGMA,
+    BadAccelerationFlag,
     HeightFilter,
 )
 from px4fuse.ekf2.inputs import FusionRules, ReplayInputs
@@ -233,14 +232,6 @@ def run_segment(  # noqa: PLR0912, PLR0915 (one recursion, read from top to bott
     for name in segment.changed_parameters.keys() & parameters.keys():
         value = segment.changed_parameters[name]
         parameters[name][parameters[name] == inputs.settings[name]] = value
-    get_switches = attrgetter(
-        "estimates_biases",
-        "estimates_attitude",
-        "has_gate",
-        "uses_logged_decisions",
-        "uses_reported_noise",
-        "fuses_velocity",
-    )
     (
         estimates_biases,
         estimates_attitude,
@@ -248,7 +239,19 @@ def run_segment(  # noqa: PLR0912, PLR0915 (one recursion, read from top to bott
         uses_logged_decisions,
         uses_reported_noise,
         fuses_velocity,
-    ) = np.array([get_switches(configuration) for configuration in configurations]).T
+    ) = np.array(
+        [
+            (
+                one.estimates_biases,
+                one.estimates_attitude,
+                one.has_gate,
+                one.uses_logged_decisions,
+                one.uses_reported_noise,
+                one.fuses_velocity,
+            )
+            for one in configurations
+        ]
+    ).T
     # The arrays of events have the shape (events, filters, ...)
     events = np.stack([interval_arrays.events for interval_arrays in intervals], axis=1)
     event_steps = events["end_step"]
@@ -293,14 +296,16 @@ def run_segment(  # noqa: PLR0912, PLR0915 (one recursion, read from top to bott
                 mean_samples.noise[:] = R
             gate = parameters.get(aid.gate, np.full(configuration_count, samples.gate))
             sensor_means.append((mean_samples, gate, samples.state_slices))
-    uses_logged_flag = [
-        segment.height_samples is None
-        or segment.is_acceleration_bad is None
-        or configuration.can_use_logged_bad_acceleration_flag(inputs)
-        for configuration in configurations
-    ]
+    uses_logged_flag = np.array(
+        [
+            segment.height_samples is None
+            or segment.is_acceleration_bad is None
+            or configuration.can_use_logged_bad_acceleration_flag(inputs)
+            for configuration in configurations
+        ]
+    )
     bad_acceleration_flag = BadAccelerationFlag(
-        np.array(uses_logged_flag), inputs.rules.bad_acceleration_flag_duration_s, segment
+        uses_logged_flag, inputs.rules.bad_acceleration_flag_duration_s, segment
     )
     height_filter = vision_filter = None
     if segment.height_samples is not None:
@@ -350,7 +355,7 @@ def run_segment(  # noqa: PLR0912, PLR0915 (one recursion, read from top to bott
         set_states(
             x,
             P,
-            ~bad_acceleration_flag.uses_logged_flag & estimates_biases,
+            ~uses_logged_flag & estimates_biases,
             slice(ACCELEROMETER_BIAS_DOWN, ACCELEROMETER_BIAS_DOWN + 1),
             np.full((configuration_count, 1), segment.mean_bias_down_m_s2),
             np.full((configuration_count, 1), INITIAL_BIAS_SIGMA_M_S2**2),
@@ -525,7 +530,7 @@ def run_segment(  # noqa: PLR0912, PLR0915 (one recursion, read from top to bott
                 fusion_decisions.last_position_s = np.maximum(
                     fusion_decisions.last_position_s, vision_filter.last_fusion_s
                 )
-        if height_filter is not None and not all(uses_logged_flag):
+        if height_filter is not None and not uses_logged_flag.all():
             if has_sample[event] and has_velocity:
                 height_filter.update_records[event, -1, 0] = np.where(
                     can_fuse_velocity[event], nu[:, DOWN_COLUMN], np.nan
@@ -770,7 +775,7 @@ def estimate_state_correlation(inputs: ReplayInputs, segment: ReplaySegment) -> 
 def _compute_correlation(P: Array) -> Array:
     # The lower limit prevents a division by zero if a bias is not estimated
     sigma = np.sqrt(np.maximum(np.diagonal(P), MIN_STATE_VARIANCE))
-    return np.asarray(P / sigma[:, None] / sigma)
+    return P / sigma[:, None] / sigma
 
 
 def _compute_steady_state_correlation(segment: ReplaySegment) -> Array:

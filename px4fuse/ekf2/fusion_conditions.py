@@ -44,25 +44,21 @@ CLOCK_SYNCHRONISATION_ACTION = (
     "Synchronise the clocks: set UXRCE_DDS_SYNCT to 1 (uXRCE-DDS agent), or answer MAVLink "
     "TIMESYNC messages. Send timestamps in microseconds."
 )
-TIMESTAMPS_TOO_LATE_EFFECT = "The position timestamps are ahead of EKF2's clock."
-# Effect on EKF2 of timestamps that are not synchronised with the autopilot's clock
-EFFECT_BY_UNSYNCHRONISED_CLOCK = {
+TOO_OLD_EFFECT = "The position timestamps are too old for EKF2."
+AHEAD_EFFECT = "The position timestamps are ahead of EKF2's clock."
+# Effect on EKF2 of timestamps in a wrong unit
+EFFECT_BY_WRONG_UNIT = {
+    **dict.fromkeys(("0", "milliseconds", "seconds"), TOO_OLD_EFFECT),
+    "nanoseconds": AHEAD_EFFECT,
+}
+# Effect on EKF2 of unusable timestamps, by their clock or unit
+EFFECT_BY_UNUSABLE_TIMESTAMP = {
+    **EFFECT_BY_WRONG_UNIT,
+    **{f"UNIX time in {unit}seconds": AHEAD_EFFECT for unit in ("nano", "micro", "milli")},
     **dict.fromkeys(
         ("another clock", "an unknown clock", "UNIX time in seconds"),
         "The position timestamps are too old for EKF2, or ahead of EKF2's clock.",
     ),
-    **{
-        f"UNIX time in {unit}seconds": TIMESTAMPS_TOO_LATE_EFFECT
-        for unit in ("nano", "micro", "milli")
-    },
-}
-# Effect on EKF2 of unusable timestamps, by their clock or unit
-EFFECT_BY_UNUSABLE_TIMESTAMP = {
-    **dict.fromkeys(
-        ("0", "milliseconds", "seconds"), "The position timestamps are too old for EKF2."
-    ),
-    **EFFECT_BY_UNSYNCHRONISED_CLOCK,
-    "nanoseconds": TIMESTAMPS_TOO_LATE_EFFECT,
 }
 # GNSS checks in the bit order of gps_check_fail_flags: name, parameter of the limit, unit
 GNSS_CHECKS = (
@@ -193,7 +189,7 @@ def _check_position_frame(positions: UnfusedPositions) -> Iterator[UnmetConditio
         yield UnmetCondition(
             "frame",
             "the pose_frame is unknown",
-            "EKF2 (v1.14 and later) reads positions only in the frames NED (1) and FRD (2).",
+            "EKF2 (v1.14 and later) reads only the frames NED (1) and FRD (2).",
             "Send pose_frame 1 (x north, y east) or 2 (x forward at start). In MAVLink ODOMETRY, "
             "send frame_id MAV_FRAME_LOCAL_NED or MAV_FRAME_LOCAL_FRD.",
         )
@@ -217,8 +213,8 @@ def _check_position_gap(positions: UnfusedPositions) -> Iterator[UnmetCondition]
 
 def find_timestamp_action(clock_name: str) -> str:
     """Return the action for timestamps of a wrong clock or in a wrong unit."""
-    is_wrong_clock = clock_name in EFFECT_BY_UNSYNCHRONISED_CLOCK
-    return CLOCK_SYNCHRONISATION_ACTION if is_wrong_clock else SET_TIMESTAMP_ACTION
+    is_wrong_unit = clock_name in EFFECT_BY_WRONG_UNIT
+    return SET_TIMESTAMP_ACTION if is_wrong_unit else CLOCK_SYNCHRONISATION_ACTION
 
 
 def _check_timestamps(positions: UnfusedPositions) -> Iterator[UnmetCondition]:
@@ -227,7 +223,6 @@ def _check_timestamps(positions: UnfusedPositions) -> Iterator[UnmetCondition]:
         yield UnmetCondition(
             "clock",
             "the timestamps are 0" if clock == "0" else f"the timestamps are in {clock}",
-            "EKF2 expects timestamp_sample in microseconds since the autopilot's boot. "
             f"{EFFECT_BY_UNUSABLE_TIMESTAMP[clock]}",
             find_timestamp_action(clock),
         )
@@ -249,13 +244,13 @@ def _check_timestamps(positions: UnfusedPositions) -> Iterator[UnmetCondition]:
         if age_s < MAX_HORIZON_DELAY_S:
             max_delay_ms = 50.0 * np.ceil(20.0 * age_s)  # next multiple of 50 ms
             action = (
-                "Correct the clock of the positioning system if it is wrong. If the positions are "
+                "Correct a wrong clock of the positioning system. If the positions are "
                 f"late, set EKF2_DELAY_MAX to {max_delay_ms:.0f} ms (v1.15 and later)."
             )
         yield UnmetCondition(
             "age",
             f"the positions are {age_s:.2f} s old at arrival",
-            f"EKF2 fuses no position that is older than {positions.max_sample_age_s:.2f} s. "
+            f"EKF2 fuses no position older than {positions.max_sample_age_s:.2f} s. "
             "Possible cause: the positions arrive late, or the sender's clock is behind PX4's.",
             action,
         )
@@ -302,9 +297,8 @@ def _check_interval(positions: UnfusedPositions) -> Iterator[UnmetCondition]:
         yield UnmetCondition(
             "interval",
             f"the positions come at {positions.source.compute_rate_hz():.2g} Hz",
-            f"The interval between positions is {positions.interval_s:.2f} s. EKF2 (v1.14 and "
-            "later) starts to fuse external vision only when two positions come within "
-            f"{EV_START_INTERVAL_S:g} s. No parameter changes this limit.",
+            "EKF2 (v1.14 and later) starts to fuse external vision only when two positions come "
+            f"within {EV_START_INTERVAL_S:g} s. No parameter changes this limit.",
             "Send the position at 10 Hz.",
         )
 
@@ -342,7 +336,7 @@ def _check_gnss(positions: UnfusedPositions) -> Iterator[UnmetCondition]:
             "Compare GNSS with the other position source. With EKF2_GPS_MODE 1, EKF2 may reset to "
             "GNSS.",
         )
-    parameters, source = positions.parameters, positions.source
+    parameters = positions.parameters
     # Bit n of EKF2_GPS_CHECK enables check n + 1 of GNSS_CHECKS; check 0 (fix) is always enabled
     checked_mask = int(parameters.get("EKF2_GPS_CHECK", -1)) << 1 | 1
     failed_fraction_by_bit = {
@@ -355,22 +349,14 @@ def _check_gnss(positions: UnfusedPositions) -> Iterator[UnmetCondition]:
     if not failed_fraction_by_bit:
         return
     failed_bits = sorted(failed_fraction_by_bit, key=lambda bit: -failed_fraction_by_bit[bit])
-    samples = positions.select_samples(source.samples)
-    reported_variance_by_check_bit = {3: samples["north_m2"], 4: samples["down_m2"]}
-    if source.velocity is not None:
-        reported_variance_by_check_bit[5] = positions.select_samples(source.velocity)["north_m2_s2"]
     check_texts = []
     for bit in failed_bits[:3]:
         name, parameter, unit = GNSS_CHECKS[bit]
-        check_details = [f"check failed {100.0 * failed_fraction_by_bit[bit]:.0f} % of the time"]
-        if np.isfinite(limit := parameters.get(parameter, np.nan)):
-            # Only positions with a fix are logged, so their median σ may be within the limit
-            if bit in reported_variance_by_check_bit:
-                median_sigma = float(np.sqrt(reported_variance_by_check_bit[bit].median()))
-                if median_sigma > limit:
-                    check_details.append(f"median {median_sigma:.2f}{unit}")
-            check_details.append(f"limit {parameter} {limit:g}{unit}")
-        check_texts.append(f"{name} ({', '.join(check_details)})")
+        failed_percent = 100.0 * failed_fraction_by_bit[bit]
+        text = f"{name} (check failed {failed_percent:.0f} % of the time"
+        if parameter in parameters:
+            text += f", limit {parameter} {parameters[parameter]:g}{unit}"
+        check_texts.append(f"{text})")
     yield UnmetCondition(
         "checks",
         f"GNSS fails EKF2's check of the {GNSS_CHECKS[failed_bits[0]][0]}",

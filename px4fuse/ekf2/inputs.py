@@ -6,7 +6,6 @@ Sources: PX4-Autopilot ``EKF/aid_sources/external_vision/ev_pos_control.cpp`` an
 
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
-from types import MappingProxyType
 
 import numpy as np
 import pandas as pd
@@ -222,15 +221,13 @@ class ReplayInputs:
 
 
 def prepare_inputs(  # noqa: PLR0911, PLR0912 (one return per reason)
-    flight: Flight, omitted_aids: Mapping[str, str] = MappingProxyType({})
+    flight: Flight, omitted_aids: Mapping[str, str] = {}
 ) -> ReplayInputs | Unavailable:
     """Return the inputs of the EKF2 replay, or the reason why the log is insufficient.
 
     ``omitted_aids`` contains PX4's names of aiding sources to omit, with the reasons.
     """
-    imu = flight.imu
-    attitude = flight.attitude
-    ekf2 = flight.ekf2
+    imu, attitude, ekf2 = flight.imu, flight.attitude, flight.ekf2
     if isinstance(imu, Unavailable):
         return imu
     if isinstance(attitude, Unavailable):
@@ -257,12 +254,11 @@ def prepare_inputs(  # noqa: PLR0911, PLR0912 (one return per reason)
     if unmodelled_aids := [
         label for label in fusion_record.other_horizontal_aids if label not in modelled_labels
     ]:
-        switch_settings = ["EKF2_OF_CTRL 0", *([] if is_gnss else [f"{GNSS_POS.switch} 0"])]
         return Unavailable(
             ANALYSIS_NAME,
             f"EKF2 also fused {', '.join(unmodelled_aids)}, which the model does not contain",
-            f"Set {', '.join(switch_settings)} and clear bit 2 (velocity) of {EV_POS.switch} "
-            "before the next flight.",
+            "Disable this fusion before the next flight (EKF2_OF_CTRL 0, EKF2_GPS_CTRL 0, or bit 2 "
+            "(velocity) of EKF2_EV_CTRL cleared).",
         )
     if missing_imu := _explain_missing_imu(imu.index.to_numpy()):
         return missing_imu
@@ -319,12 +315,11 @@ def prepare_inputs(  # noqa: PLR0911, PLR0912 (one return per reason)
         if name not in (FLOW.name, EV_POS.name)
     )
     if is_gnss and not reason_for_logged_height:
-        segments_or_reason = add_heights(flight, ekf2, fusion_record, segments)
-        segments, reason_for_logged_height = (
-            (segments, segments_or_reason)
-            if isinstance(segments_or_reason, str)
-            else (segments_or_reason, "")
-        )
+        segments_with_heights = add_heights(flight, ekf2, fusion_record, segments)
+        if isinstance(segments_with_heights, str):
+            reason_for_logged_height = segments_with_heights
+        else:
+            segments = segments_with_heights
     other_aids = [EV_POS] if vision_positions else []
     other_aids += [MAG] if any(segment.magnetic_field for segment in segments) else []
     height_samples = segments[0].height_samples
@@ -409,17 +404,14 @@ def find_replayed_position_source(ekf2: Ekf2) -> Aid:
     return GNSS_POS if has_fused_aid(ekf2) and (has_gnss or not is_vision_used) else EV_POS
 
 
-def _find_enabled_flag_changes(ekf2: Ekf2, aid: Aid) -> "pd.Series[float] | None":
+def _find_enabled_flag_changes(ekf2: Ekf2, aid: Aid) -> pd.Series | None:
     """Return the times at which EKF2 enables (1) or disables (0) an aiding source.
 
     Return None if the source is never enabled.
     """
     aid_log = ekf2.aids.get(aid.name)
-    return (
-        aid_log.enabled
-        if aid_log and aid_log.enabled is not None and aid_log.enabled.any()
-        else None
-    )
+    enabled_changes = aid_log.enabled if aid_log else None
+    return enabled_changes if enabled_changes is not None and enabled_changes.any() else None
 
 
 def _find_gnss_track(flight: Flight) -> PositionTrack | None:
@@ -675,7 +667,7 @@ def _find_vision_track(flight: Flight) -> PositionTrack | Unavailable:
         if track.origin.is_vision and track.origin.has_all_samples:
             return track
         if track.name in VISION_REPETITION_INTERVALS_S:
-            median_interval_s = compute_median_interval_s(track.samples.index.to_numpy())
+            median_interval_s = compute_median_interval_s(track.samples.index)
             if (
                 median_interval_s < 0.9 * VISION_REPETITION_INTERVALS_S[track.name]
                 and median_interval_s <= 0.25

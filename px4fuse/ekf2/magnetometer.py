@@ -51,7 +51,7 @@ def average_by_event(
     def mean(values: Array) -> Array:
         sum_by_event = np.zeros((row_count, *values.shape[1:]))
         np.add.at(sum_by_event, event_index, values)
-        return np.asarray((sum_by_event.T / rows_by_event).T[:-1])
+        return (sum_by_event.T / rows_by_event).T[:-1]
 
     value, ned_to_body_rotation, noise_variance = map(
         mean, (sensor_samples.value, sensor_samples.ned_to_body_rotation, sensor_samples.noise)

@@ -7,8 +7,6 @@ published height. Without a magnetometer, the replay uses EKF2's published headi
 
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
-from itertools import pairwise
-from types import MappingProxyType
 from typing import Any
 
 import numpy as np
@@ -16,7 +14,14 @@ import pandas as pd
 from msgspec import structs
 from scipy.spatial.transform import Rotation
 
-from px4fuse.core.arrays import Array, ArrayPair, BoolArray, IntArray, cumulative_sums
+from px4fuse.core.arrays import (
+    Array,
+    ArrayPair,
+    BoolArray,
+    IntArray,
+    cumulative_sums,
+    select_intervals,
+)
 from px4fuse.core.record import Span
 from px4fuse.ekf2.filter_recursion import (
     HEADING,
@@ -52,15 +57,12 @@ from px4fuse.ekf2.replay_segments import (
 )
 from px4fuse.errors import SettingsError
 from px4fuse.flight.ekf2_parameters import (
-    BAROMETER,
     EV_POS,
     FLOW,
     GNSS_HGT,
     GNSS_POS,
     GNSS_VEL,
     MAG,
-    MAGNETIC_FIELD_NOISE_PARAMETERS,
-    PARAMETERS,
     check_parameters,
 )
 from px4fuse.flight.model import AXIS_NAMES, Columns, Ekf2, Flight, NedAxis, Unavailable, time_index
@@ -103,7 +105,7 @@ def prepare_ekf2_model(
     list_later_configurations: Callable[
         [ReplayInputs], Sequence[FilterConfiguration]
     ] = lambda _: (),
-    failed_agreement_by_aid: Mapping[str, Agreement] = MappingProxyType({}),
+    failed_agreement_by_aid: Mapping[str, Agreement] = {},
 ) -> Ekf2Model | Unavailable:
     """Prepare EKF2 replays of a flight, and replay the flight with the logged parameters.
 
@@ -174,9 +176,9 @@ def replay_with_settings(
     model: Ekf2Model,
     settings: Sequence[Mapping[str, float]],
     excluded_times_s: Array | None = None,
-    disable_time_s_by_aid: Mapping[str, float] | None = None,
+    disable_time_s_by_aid: Mapping[str, float] = {},
 ) -> Iterator[Ekf2Replay]:
-    """Replay EKF2 with several sets of changed parameters.
+    """Yield replays of EKF2 with several sets of changed parameters.
 
     Parameters
     ----------
@@ -194,27 +196,7 @@ def replay_with_settings(
     """
     changes = [check_parameters(change) for change in settings]
     inputs = model.inputs
-    reasons = dict.fromkeys(
-        PARAMETERS.keys() - inputs.settings.keys(),
-        f"the parameter does not affect {inputs.aid.label}, the position source of EKF2",
-    )
-    logged_height_text = (
-        f"the replay uses the logged EKF2 height ({inputs.reason_for_logged_height})"
-    )
-    if inputs.aid == GNSS_POS:
-        for parameter_names, reason in (
-            (
-                MAG.measurement_parameters.union(MAGNETIC_FIELD_NOISE_PARAMETERS),
-                "the log does not contain all magnetometer samples that EKF2 fused",
-            ),
-            (
-                BAROMETER.measurement_parameters,
-                logged_height_text
-                if inputs.reason_for_logged_height
-                else "EKF2 fused no barometer height",
-            ),
-        ):
-            reasons |= dict.fromkeys(reasons.keys() & parameter_names, reason)
+    reasons = {}
     if inputs.rules.is_horizon_largest_delay:
         reasons["EKF2_DELAY_MAX"] = (
             f"{model.flight.log.firmware} has no EKF2_DELAY_MAX: the largest sensor delay "
@@ -222,18 +204,13 @@ def replay_with_settings(
         )
     if inputs.received_positions.uses_sender_timestamps:
         reasons[GNSS_POS.delay] = "EKF2 uses measurement times that the GNSS driver reports"
-    for name in [name for change in changes for name in change if name in reasons]:
-        raise SettingsError(f"{name} has no effect in a replay of this log: {reasons[name]}.")
-    disable_time_s_by_aid = disable_time_s_by_aid or {}
-    fused_aids = list_modelled_aids(inputs) if disable_time_s_by_aid else []
-    if unknown_aids := disable_time_s_by_aid.keys() - set(fused_aids):
-        fused_aids_text = ", ".join(fused_aids)
-        if inputs.reason_for_logged_height:
-            fused_aids_text = f"{fused_aids_text}; {logged_height_text}"
-        raise SettingsError(
-            f"{min(unknown_aids)} cannot be omitted: the replay of this log fuses only "
-            f"{fused_aids_text}."
-        )
+    for name in (name for change in changes for name in change):
+        if name in reasons or name not in inputs.settings:
+            reason = reasons.get(name) or _describe_modelled_aids(inputs)
+            raise SettingsError(f"{name} has no effect in a replay of this log: {reason}.")
+    for name in disable_time_s_by_aid:
+        if name not in list_modelled_aids(inputs):
+            raise SettingsError(f"{name} cannot be omitted: {_describe_modelled_aids(inputs)}.")
     if excluded_times_s is not None:
         received_positions = inputs.received_positions
         is_excluded = _find_excluded_rows(received_positions.timestamp_s, excluded_times_s)
@@ -253,21 +230,6 @@ def replay_with_settings(
         )
         for change in changes
     ]
-    return _run_replays(model, configurations, changes, excluded_times_s)
-
-
-def _find_excluded_rows(sample_times_s: Array, excluded_times_s: Array) -> BoolArray:
-    excluded_rows = find_matching_samples(sample_times_s, excluded_times_s)
-    return np.isin(np.arange(len(sample_times_s)), excluded_rows)
-
-
-def _run_replays(
-    model: Ekf2Model,
-    configurations: Sequence[FilterConfiguration],
-    changes: Sequence[Mapping[str, float]],
-    excluded_times_s: Array | None,
-) -> Iterator[Ekf2Replay]:
-    inputs = model.inputs
     runs: Sequence[SegmentRun] = ()
     for index, (configuration, change) in enumerate(zip(configurations, changes, strict=True)):
         if index % REPLAY_BATCH_SIZE == 0:
@@ -283,6 +245,11 @@ def _run_replays(
         yield structs.replace(replay, updates=updates, agreement=model.agreement)
 
 
+def _find_excluded_rows(sample_times_s: Array, excluded_times_s: Array) -> BoolArray:
+    excluded_rows = find_matching_samples(sample_times_s, excluded_times_s)
+    return np.isin(np.arange(len(sample_times_s)), excluded_rows)
+
+
 def list_modelled_aids(inputs: ReplayInputs) -> list[str]:
     """Return PX4's names of the aiding sources that the EKF2 model fuses."""
     segment = inputs.segments[0]
@@ -295,6 +262,13 @@ def list_modelled_aids(inputs: ReplayInputs) -> list[str]:
     }
     height_aids = segment.height_samples.fused_sensors if segment.height_samples else ()
     return [*(aid.name for aid in is_fused if is_fused[aid]), *height_aids]
+
+
+def _describe_modelled_aids(inputs: ReplayInputs) -> str:
+    text = f"the replay of this log fuses only {', '.join(list_modelled_aids(inputs))}"
+    if inputs.reason_for_logged_height:
+        text += f"; it uses the logged EKF2 height ({inputs.reason_for_logged_height})"
+    return text
 
 
 def add_position_noise(model: Ekf2Model, sigma_m: float, seed: int) -> Ekf2Model:
@@ -417,12 +391,8 @@ def _make_replay(
 def _find_flow_only_spans(updates: pd.DataFrame, segment: ReplaySegment) -> list[Span]:
     """Return start and end (s) of times without a fused position, longer than RESTART_GAP_S."""
     is_used = (updates["fused"] > 0.0) | (updates["reset"] > 0.0)
-    fusion_times_s = [*updates.loc[is_used, "fused_at_s"], float(segment.time_s[-1])]
-    return [
-        (start_s, end_s)
-        for start_s, end_s in pairwise(fusion_times_s)
-        if end_s - start_s > RESTART_GAP_S
-    ]
+    fusion_times_s = np.append(updates.loc[is_used, "fused_at_s"], segment.time_s[-1])
+    return select_intervals(fusion_times_s, np.diff(fusion_times_s) > RESTART_GAP_S)
 
 
 def _collect_updates_by_aid(

@@ -44,7 +44,7 @@ from px4fuse.flight.model import (
 )
 from px4fuse.readers.px4_innovations import select_axis_innovations
 
-T = TypeVar("T", pd.DataFrame, "pd.Series[float]")
+T = TypeVar("T", pd.DataFrame, pd.Series)
 HORIZONTAL_AXES: tuple[NedAxis, NedAxis] = ("north", "east")
 # Minimum number of logged innovations for a comparison with the EKF2 replay
 MIN_COMPARED_INNOVATIONS = 20
@@ -260,9 +260,7 @@ def compare_with_log(flight: Flight, replay: Ekf2Replay) -> Agreement | Unavaila
                 f"(limit {MAX_FLOW_ONLY_DIFFERENCE_M:g} m)"
             )
     return Agreement(
-        north=agreement_by_axis["north"],
-        east=agreement_by_axis["east"],
-        **(agreement_by_aid | {aid.name: agreement_by_axis} | statistics),
+        **(agreement_by_aid | agreement_by_axis | {aid.name: agreement_by_axis} | statistics),
         doubtful=omitted_aids,
         published_rms_difference_m=math.hypot(
             *(axis.position_rms_difference_m for axis in agreement_by_axis.values())
@@ -304,19 +302,12 @@ def _compare_innovations(
             f"replayed time (at least {MIN_COMPARED_INNOVATIONS} are needed)"
         )
         return {}, {"good": False, "reason": reason}
-    axes = list_innovation_axes(replayed_innovations)
-    columns = [f"innovation_{axis}_m" for axis in axes]
-    if not all(
-        np.ptp(innovations[columns], axis=0).all()
-        for innovations in (logged_innovations, replayed_innovations)
-    ):
+    compared_innovations = (logged_innovations, replayed_innovations)
+    if not all(np.ptp(innovations[columns], axis=0).all() for innovations in compared_innovations):
         return {}, {"good": False, "reason": CONSTANT_INNOVATIONS_REASON}
-    is_rejected_in_log, is_rejected_in_replay = is_rejected = np.array(
-        [logged_innovations["rejected"] > 0.0, replayed_innovations["rejected"] > 0.0]
-    )
+    is_rejected = np.array([innovations["rejected"] > 0.0 for innovations in compared_innovations])
     agreement_by_axis: dict[str, AxisAgreement] = {
-        axis: _compare_axis(axis, logged_innovations, replayed_innovations, state_difference)
-        for axis in axes
+        axis: _compare_axis(axis, *compared_innovations, state_difference) for axis in axes
     }
     logged_fraction, replayed_fraction = is_rejected.mean(axis=1).tolist()
     is_in_agreement, reason = _judge_agreement(
@@ -326,7 +317,7 @@ def _compare_innovations(
         "samples": len(logged_innovations),
         "rejected_fraction_logged": logged_fraction,
         "rejected_fraction_replayed": replayed_fraction,
-        "decisions_same": float(np.mean(is_rejected_in_log == is_rejected_in_replay)),
+        "decisions_same": float(np.mean(np.equal(*is_rejected))),
         "good": is_in_agreement,
         "reason": reason,
     }
@@ -485,7 +476,7 @@ def interpolate_component(
 ) -> Array:
     """Interpolate the component of a vector (NED columns) along a direction."""
     component = signals.weighted_sum(vectors, columns, direction[: len(columns)])
-    return np.asarray(np.interp(times_s, vectors.index, component))
+    return np.interp(times_s, vectors.index, component)
 
 
 def compute_rmse_to_truth(
@@ -511,6 +502,7 @@ def _judge_agreement(
     rejected_fraction_logged: float,
     rejected_fraction_replayed: float,
     tolerance_factor: float = 1.0,
+    min_allowed_correlation: float = MIN_INNOVATION_CORRELATION,
 ) -> tuple[bool, str]:
     """Return True if the replay agrees with the log, and the statistics as a text."""
     variance_ratios = (axis.s_ratio_median for axis in axes.values())
@@ -526,7 +518,7 @@ def _judge_agreement(
     correlation_text = (
         f"replayed and logged innovations have a correlation of {min_correlation:.4f}"
     )
-    if min_correlation >= MIN_INNOVATION_CORRELATION:
+    if min_correlation >= min_allowed_correlation:
         difference_m = max(axis.position_rms_difference_m for axis in axes.values())
         max_difference_m = tolerance_factor * MAX_PUBLISHED_DIFFERENCE_M
         if difference_m > max_difference_m:
@@ -540,7 +532,7 @@ def _judge_agreement(
         max(rejected_fraction_logged, rejected_fraction_replayed)
         < MAX_REJECTED_FRACTION_FOR_COMPARISON
     ):
-        return False, f"{correlation_text}, below the minimum of {MIN_INNOVATION_CORRELATION:g}"
+        return False, f"{correlation_text}, below the minimum of {min_allowed_correlation:g}"
     rejected_fraction_difference = abs(rejected_fraction_replayed - rejected_fraction_logged)
     relative_nis_difference = max(
         abs(axis.nis_mean_replayed / axis.nis_mean_logged - 1.0) for axis in axes.values()
@@ -579,23 +571,10 @@ def judge_with_logged_rejections(
     """
     rejected_fraction = agreement.rejected_fraction_logged
     is_mostly_rejected = rejected_fraction > MOSTLY_REJECTED_FRACTION
-    tolerance_factor = np.inf if is_mostly_rejected else DIFFERENCE_FACTOR_WITH_MANY_REJECTIONS
-    is_in_agreement, reason = _judge_agreement(
-        agreement_with_rejections.axes, 0.0, 0.0, tolerance_factor
-    )
-    min_correlation = min(
-        axis.innovation_correlation for axis in agreement_with_rejections.axes.values()
-    )
-    if (
-        is_in_agreement
-        and is_mostly_rejected
-        and min_correlation < MIN_CORRELATION_IF_MOSTLY_REJECTED
-    ):
-        is_in_agreement = False
-        reason = (
-            f"the correlation {min_correlation:.4f} of replayed and logged innovations is below "
-            f"the minimum of {MIN_CORRELATION_IF_MOSTLY_REJECTED:g}"
-        )
+    limits = DIFFERENCE_FACTOR_WITH_MANY_REJECTIONS, MIN_INNOVATION_CORRELATION
+    if is_mostly_rejected:
+        limits = np.inf, MIN_CORRELATION_IF_MOSTLY_REJECTED
+    is_in_agreement, reason = _judge_agreement(agreement_with_rejections.axes, 0.0, 0.0, *limits)
     reason = f"in a replay that rejects the same samples as EKF2, {reason}"
     if is_mostly_rejected and not is_in_agreement:
         reason = (

@@ -188,7 +188,7 @@ class ReplaySegment:
         Logged flag for a bad vertical acceleration.
     mean_bias_down_m_s2 : float
         Mean vertical accelerometer bias.
-    internal_to_published_ratio : (float, float, float)
+    internal_to_published_ratio : float or ndarray, shape (3,)
         Ratio of EKF2's internal to its published position along each axis.
     preceding_segment : ReplaySegment or None
         Flight before the start, from which the correlations are estimated.
@@ -216,7 +216,7 @@ class ReplaySegment:
     is_acceleration_bad: BoolArray | None = None
     mean_bias_down_m_s2: float = 0.0
     flow: SensorSamples | None = None
-    internal_to_published_ratio: tuple[float, float, float] = (1.0, 1.0, 1.0)
+    internal_to_published_ratio: Array | float = 1.0
     preceding_segment: "ReplaySegment | None" = None
     changed_parameters: Mapping[str, float] = record_field(default_factory=dict)
 
@@ -393,12 +393,14 @@ def find_replay_segments(
         is_covered = (imu_times_s[1:] > state_times_s[start_row]) & (imu_times_s[:-1] < part_end_s)
         if not np.all(np.diff(imu_times_s)[is_covered] <= MIN_IMU_GAP_S):
             continue
-        changed_parameters = {
-            change.name: change.value_after
-            for change in parameter_changes
-            if change.time_s <= part_start_s
-        }
-        segment = make_segment(start_row, part_end_s)
+        segment = replace(
+            make_segment(start_row, part_end_s),
+            changed_parameters={
+                change.name: change.value_after
+                for change in parameter_changes
+                if change.time_s <= part_start_s
+            },
+        )
         preceding_start_row = int(
             np.searchsorted(
                 state_times_s,
@@ -413,7 +415,7 @@ def find_replay_segments(
             and part_end_s <= magnetic_field_end_s
         ):
             segment = _add_magnetic_field(segment, fusion_record, start_row, ekf2.step_s)
-        segments.append(replace(segment, changed_parameters=changed_parameters))
+        segments.append(segment)
     return tuple(segments)
 
 
@@ -446,13 +448,13 @@ def compute_earth_rate_rad_s(fusion_record: FusionRecord) -> Array:
     )
 
 
-def compute_internal_to_published_ratio(fusion_record: FusionRecord) -> tuple[float, float, float]:
+def compute_internal_to_published_ratio(fusion_record: FusionRecord) -> Array | float:
     """Return the ratio of EKF2's internal to its published position along north, east and down.
 
     Since PX4 v1.16, EKF2 computes positions on an ellipsoid, but publishes positions on a sphere.
     """
     if np.isnan(fusion_record.latitude_deg) or not fusion_record.stores_latitude():
-        return 1.0, 1.0, 1.0
+        return 1.0
     eccentricity_squared = ECCENTRICITY**2
     q = 1.0 - eccentricity_squared * np.sin(np.radians(fusion_record.latitude_deg)) ** 2
     # PX4 uses the exponent 2.5 for the meridian radius; the exponent of an ellipsoid is 1.5
@@ -460,8 +462,7 @@ def compute_internal_to_published_ratio(fusion_record: FusionRecord) -> tuple[fl
         EQUATORIAL_RADIUS_M * np.array([(1.0 - eccentricity_squared) / q**2.5, q**-0.5])
         + fusion_record.altitude_m
     )
-    north_to_sphere_radius_ratio, east_to_sphere_radius_ratio = (radii_m / EARTH_RADIUS_M).tolist()
-    return north_to_sphere_radius_ratio, east_to_sphere_radius_ratio, 1.0
+    return np.append(radii_m / EARTH_RADIUS_M, 1.0)
 
 
 def _find_interruption_times_s(imu: pd.DataFrame, ekf2: Ekf2) -> list[float]:

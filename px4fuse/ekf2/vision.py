@@ -158,129 +158,98 @@ class VisionFilter:
         """Fuse the vision samples of one event; return x and P.
 
         ``is_last_step`` is True for the samples that EKF2 fuses after GNSS.
-        """
-        for sample_index, has_sample in enumerate(self.has_sample[is_last_step][:, event]):
-            if has_sample.any():
-                x, P = self._fuse_sample(event, sample_index, has_sample, x, P, last_gnss_fusion_s)
-        return x, P
 
-    def _fuse_sample(
-        self,
-        event: int,
-        sample_index: int,
-        has_sample: BoolArray,
-        x: Array,
-        P: Array,
-        last_gnss_fusion_s: Array,
-    ) -> ArrayPair:
-        """Fuse one sample per filter; return x (filters, states) and P (filters, states, states).
+        A restart of the fusion resets the position or, with GNSS, the vision bias to the sample.
+        EKF2 restarts the fusion after a gap of vision, a change of GNSS fusion, and too many
+        rejections.
 
         Sources: ``ev_pos_control.cpp``, functions controlEvPosFusion and updateEvPosFusion.
         """
-        age_s, fusion_time_s, R_m2 = (
-            array[sample_index, event] for array in (self.age_s, self.fusion_time_s, self.R_m2)
-        )
         is_gnss_off = self.is_gnss_off[event]
-        HP = P[:, HORIZONTAL_POSITION] - age_s[:, None, None] * P[:, HORIZONTAL_VELOCITY]
-        HPH = HP[:, :, HORIZONTAL_POSITION] - age_s[:, None, None] * HP[:, :, HORIZONTAL_VELOCITY]
-        predicted_variance = np.diagonal(HPH, axis1=1, axis2=2)
-        position_innovation_m = (
-            self.position_m[sample_index, event]
-            - x[:, HORIZONTAL_POSITION]
-            + age_s[:, None] * x[:, HORIZONTAL_VELOCITY]
-        )
-        time_since_sample_s = fusion_time_s - self.last_sample_s
-        is_bias_updated = has_sample & ~is_gnss_off
-        nu, R = self.bias.remove_and_update_bias(
-            position_innovation_m,
-            predicted_variance,
-            R_m2,
-            np.where(is_bias_updated, time_since_sample_s, 0.0)[:, None],
-            is_bias_updated[:, None],
-        )
-        S = predicted_variance + R
-        (
-            is_outside_gate,
-            is_fused,
-            is_restarting,
-            is_position_reset,
-        ) = self._choose_use(
-            event,
-            has_sample,
-            np.any(nu * nu > self.gate_squared * S, axis=1),
-            fusion_time_s,
-            last_gnss_fusion_s,
-        )
-        # If EKF2 resets its position to a sample, it logs innovation 0
-        update_record = (
-            *np.where(is_position_reset, 0.0, nu.T),
-            *S.T,
-            is_outside_gate & ~is_position_reset,
-            is_fused,
-            is_position_reset,
-        )
-        is_evaluated = is_fused | is_outside_gate | is_position_reset
-        self.update_records[event, sample_index] = np.where(is_evaluated, update_record, np.nan)
-        K = (np.linalg.inv(HPH + R[:, :, None] * np.eye(2)) @ HP).transpose(0, 2, 1)
-        K *= is_fused[:, None, None]
-        x = x + (K @ nu[:, :, None])[:, :, 0]
-        P = P - K @ HP
-        position_reset_m = (
-            np.where(is_gnss_off[:, None], position_innovation_m, nu) * is_position_reset[:, None]
-        )
-        set_states(
-            x,
-            P,
-            is_position_reset,
-            HORIZONTAL_POSITION,
-            x[:, HORIZONTAL_POSITION] + position_reset_m,
-            np.where(is_gnss_off[:, None], R_m2, R),
-        )
-        self.position_reset_m[event] += position_reset_m
-        # Vision then agrees with the position from GNSS
-        is_bias_initialised = is_restarting & ~is_position_reset
-        is_bias_cleared = is_position_reset & is_gnss_off
-        self.bias.bias_m[is_bias_initialised] = -position_innovation_m[is_bias_initialised]
-        self.bias.bias_m[is_bias_cleared] = self.bias.variance_m2[is_bias_cleared] = 0.0
-        self.last_sample_s[has_sample] = fusion_time_s[has_sample]
-        self.last_attempt_s = np.where(is_fused | is_restarting, fusion_time_s, self.last_attempt_s)
-        self.last_fusion_s = np.where(
-            is_fused | is_position_reset, fusion_time_s, self.last_fusion_s
-        )
-        self.was_gnss_off = np.where(has_sample, is_gnss_off, self.was_gnss_off)
-        return x, P
-
-    def _choose_use(
-        self,
-        event: int,
-        has_sample: BoolArray,
-        is_innovation_large: BoolArray,
-        fusion_time_s: Array,
-        last_gnss_fusion_s: Array,
-    ) -> tuple[BoolArray, ...]:
-        """Choose fusion, rejection or restart for one sample per filter, as masks (filters,).
-
-        A restart resets the position or, with GNSS, the vision bias to the sample. EKF2 restarts
-        the fusion after a gap of vision, a change of GNSS fusion, and too many rejections.
-        """
-        is_gnss_off = self.is_gnss_off[event]
-        has_fusion_restarted = (fusion_time_s - self.last_sample_s > MAX_SAMPLE_GAP_S) | (
-            is_gnss_off != self.was_gnss_off
-        )
-        is_tested = has_sample & ~has_fusion_restarted
-        is_outside_gate = is_tested & is_innovation_large & self.has_gate
-        is_rejection_timed_out = is_outside_gate & (
-            fusion_time_s - self.last_attempt_s > MAX_REJECTION_DURATION_S
-        )
-        is_restarting = has_sample & (has_fusion_restarted | is_rejection_timed_out)
-        is_position_reset = is_restarting & (
-            is_gnss_off
-            | (
-                is_rejection_timed_out
-                & (fusion_time_s - last_gnss_fusion_s > MAX_REJECTION_DURATION_S)
+        # One sample per filter at a time
+        for sample_index, has_sample in enumerate(self.has_sample[is_last_step][:, event]):
+            if not has_sample.any():
+                continue
+            age_s, fusion_time_s, R_m2 = (
+                array[sample_index, event] for array in (self.age_s, self.fusion_time_s, self.R_m2)
             )
-        )
-        return is_outside_gate, is_tested & ~is_outside_gate, is_restarting, is_position_reset
+            HP = P[:, HORIZONTAL_POSITION] - age_s[:, None, None] * P[:, HORIZONTAL_VELOCITY]
+            HPH = (
+                HP[:, :, HORIZONTAL_POSITION] - age_s[:, None, None] * HP[:, :, HORIZONTAL_VELOCITY]
+            )
+            predicted_variance = np.diagonal(HPH, axis1=1, axis2=2)
+            position_innovation_m = (
+                self.position_m[sample_index, event]
+                - x[:, HORIZONTAL_POSITION]
+                + age_s[:, None] * x[:, HORIZONTAL_VELOCITY]
+            )
+            time_since_sample_s = fusion_time_s - self.last_sample_s
+            is_bias_updated = has_sample & ~is_gnss_off
+            nu, R = self.bias.remove_and_update_bias(
+                position_innovation_m,
+                predicted_variance,
+                R_m2,
+                np.where(is_bias_updated, time_since_sample_s, 0.0)[:, None],
+                is_bias_updated[:, None],
+            )
+            S = predicted_variance + R
+            has_fusion_restarted = (time_since_sample_s > MAX_SAMPLE_GAP_S) | (
+                is_gnss_off != self.was_gnss_off
+            )
+            is_tested = has_sample & ~has_fusion_restarted
+            is_innovation_large = np.any(nu * nu > self.gate_squared * S, axis=1)
+            is_outside_gate = is_tested & is_innovation_large & self.has_gate
+            is_fused = is_tested & ~is_outside_gate
+            is_rejection_timed_out = is_outside_gate & (
+                fusion_time_s - self.last_attempt_s > MAX_REJECTION_DURATION_S
+            )
+            is_restarting = has_sample & (has_fusion_restarted | is_rejection_timed_out)
+            is_position_reset = is_restarting & (
+                is_gnss_off
+                | (
+                    is_rejection_timed_out
+                    & (fusion_time_s - last_gnss_fusion_s > MAX_REJECTION_DURATION_S)
+                )
+            )
+            # If EKF2 resets its position to a sample, it logs innovation 0
+            update_record = (
+                *np.where(is_position_reset, 0.0, nu.T),
+                *S.T,
+                is_outside_gate & ~is_position_reset,
+                is_fused,
+                is_position_reset,
+            )
+            is_evaluated = is_fused | is_outside_gate | is_position_reset
+            self.update_records[event, sample_index] = np.where(is_evaluated, update_record, np.nan)
+            K = (np.linalg.inv(HPH + R[:, :, None] * np.eye(2)) @ HP).transpose(0, 2, 1)
+            K *= is_fused[:, None, None]
+            x = x + (K @ nu[:, :, None])[:, :, 0]
+            P = P - K @ HP
+            position_reset_m = np.where(is_gnss_off[:, None], position_innovation_m, nu)
+            position_reset_m *= is_position_reset[:, None]
+            set_states(
+                x,
+                P,
+                is_position_reset,
+                HORIZONTAL_POSITION,
+                x[:, HORIZONTAL_POSITION] + position_reset_m,
+                np.where(is_gnss_off[:, None], R_m2, R),
+            )
+            self.position_reset_m[event] += position_reset_m
+            # Vision then agrees with the position from GNSS
+            is_bias_initialised = is_restarting & ~is_position_reset
+            is_bias_cleared = is_position_reset & is_gnss_off
+            self.bias.bias_m[is_bias_initialised] = -position_innovation_m[is_bias_initialised]
+            self.bias.bias_m[is_bias_cleared] = self.bias.variance_m2[is_bias_cleared] = 0.0
+            self.last_sample_s[has_sample] = fusion_time_s[has_sample]
+            self.last_attempt_s = np.where(
+                is_fused | is_restarting, fusion_time_s, self.last_attempt_s
+            )
+            self.last_fusion_s = np.where(
+                is_fused | is_position_reset, fusion_time_s, self.last_fusion_s
+            )
+            self.was_gnss_off = np.where(has_sample, is_gnss_off, self.was_gnss_off)
+        return x, P
 
 
 def set_states(

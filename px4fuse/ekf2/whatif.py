@@ -49,7 +49,6 @@ HEADING_LOGGED_NOTE = (
     "All replays use the logged EKF2 heading, because the log does not contain all fused "
     "magnetometer samples"
 )
-HEIGHT_REPLAYED_NOTE = "The replays estimate the height from the logged height sensors"
 HEIGHT_LOGGED_NOTE = "All replays use the logged EKF2 height"
 HEADING_NOT_REPLAYED = Unavailable(
     "heading error",
@@ -202,7 +201,7 @@ class WhatIf:
 def what_if(
     model: Ekf2Model,
     settings: Sequence[Mapping[str, float]],
-    disable_time_s_by_aid: Mapping[str, float] | None = None,
+    disable_time_s_by_aid: Mapping[str, float] = {},
 ) -> WhatIf | Unavailable:
     """Replay EKF2 with other parameters and compare with the log.
 
@@ -221,7 +220,6 @@ def what_if(
     """
     if not model.agreement.good:
         return model.agreement.as_unavailable(ANALYSIS_NAME)
-    disable_time_s_by_aid = disable_time_s_by_aid or {}
     replays = replay_with_settings(model, settings, disable_time_s_by_aid=disable_time_s_by_aid)
     flight = model.flight
     spans_s = model.baseline_replay.find_evaluated_spans()
@@ -244,7 +242,10 @@ def what_if(
     summaries: list[Ekf2Statistics] = []
     notes: list[str] = []
     if settings and model.inputs.aid == GNSS_POS:
-        notes += _describe_heading_and_height(model)
+        if model.agreement.heading_rms_difference_deg is None:
+            notes.append(HEADING_LOGGED_NOTE)
+        if model.inputs.reason_for_logged_height:
+            notes.append(HEIGHT_LOGGED_NOTE)
     for replay in replays:
         summaries.append(_summarise_replay(flight, replay, spans_s))
         notes += _describe_replay_limits(model, replay)
@@ -258,18 +259,6 @@ def what_if(
         evaluated_s=spans_s,
         notes=tuple(notes),
     )
-
-
-def _describe_heading_and_height(model: Ekf2Model) -> tuple[str, str]:
-    heading_difference_deg = model.agreement.heading_rms_difference_deg
-    heading_note = HEADING_LOGGED_NOTE
-    if heading_difference_deg is not None:
-        heading_note = (
-            "With the logged parameters, the heading replayed with the magnetometer differs from "
-            f"the logged heading by {heading_difference_deg:.1f}° RMS"
-        )
-    is_height_logged = bool(model.inputs.reason_for_logged_height)
-    return heading_note, HEIGHT_LOGGED_NOTE if is_height_logged else HEIGHT_REPLAYED_NOTE
 
 
 def make_sweep_values(
@@ -312,67 +301,64 @@ def _mark_unpredictable(
 
     A replay is not predictable if repetitions with added position noise differ.
     """
-    summaries_by_replay = [[summary] for summary in summaries]
-    uncertain_replays = [
-        replay_summaries
-        for replay_summaries in summaries_by_replay
-        if replay_summaries[0].changed
-        and MIN_REJECTED_FRACTION < replay_summaries[0].rejected_fraction <= MAX_REJECTED_FRACTION
+    uncertain_summaries = [
+        summary
+        for summary in summaries
+        if summary.changed
+        and MIN_REJECTED_FRACTION < summary.rejected_fraction <= MAX_REJECTED_FRACTION
     ]
-    changes = [replay_summaries[0].changed for replay_summaries in uncertain_replays]
-    for seed in range(REPLAYS_WITH_ADDED_NOISE if changes else 0):
-        noisy_model = add_position_noise(model, ADDED_POSITION_SIGMA_M, seed)
-        replays = replay_with_settings(
-            noisy_model, changes, disable_time_s_by_aid=disable_time_s_by_aid
-        )
-        for replay_summaries, replay in zip(uncertain_replays, replays, strict=True):
-            replay_summaries.append(_summarise_replay(model.flight, replay, spans_s))
-    final_summaries = []
-    for summary, *noisy_summaries in summaries_by_replay:
-        is_predictable = (
-            all(height.is_predictable for height in summary.heights.values())
+    changes = [summary.changed for summary in uncertain_summaries]
+    summaries_by_seed = [
+        [
+            _summarise_replay(model.flight, replay, spans_s)
+            for replay in replay_with_settings(
+                add_position_noise(model, ADDED_POSITION_SIGMA_M, seed),
+                changes,
+                disable_time_s_by_aid=disable_time_s_by_aid,
+            )
+        ]
+        for seed in range(REPLAYS_WITH_ADDED_NOISE if changes else 0)
+    ]
+    sensitive_changes = [
+        repeated_summaries[0].changed
+        for repeated_summaries in zip(uncertain_summaries, *summaries_by_seed, strict=True)
+        if not _results_agree(repeated_summaries)
+    ]
+    return tuple(
+        replace(
+            summary,
+            is_predictable=all(height.is_predictable for height in summary.heights.values())
             and all(
                 other.rejected_fraction <= MAX_REJECTED_FRACTION
                 for other in summary.others.values()
             )
             and (not summary.changed or summary.rejected_fraction <= MAX_REJECTED_FRACTION)
-            and _results_agree([summary, *noisy_summaries])
+            and summary.changed not in sensitive_changes,
+            without=disable_time_s_by_aid,
         )
-        final_summaries.append(
-            replace(summary, is_predictable=is_predictable, without=disable_time_s_by_aid)
-        )
-    return tuple(final_summaries)
+        for summary in summaries
+    )
 
 
 def _results_agree(summaries: Sequence[Ekf2Statistics]) -> bool:
     """Return True if mean NIS, rejected fraction and RMSE of repeated replays hardly differ."""
-    rmse_values = [
-        rmse_m
-        for summary in summaries
-        if isinstance(rmse_m := summary.position_rmse_to_truth_m, float)
-    ]
     rejected_fractions = [summary.rejected_fraction for summary in summaries]
-    nis_by_axis = [
-        [summary.axes[axis].nis_mean for summary in summaries] for axis in HORIZONTAL_AXES
+    rmses_m = [summary.position_rmse_to_truth_m for summary in summaries]
+    values_and_max_ratios = [
+        ([summary.axes[axis].nis_mean for summary in summaries], MAX_NIS_RATIO_OF_NOISY_REPLAYS)
+        for axis in HORIZONTAL_AXES
     ]
-    return (
-        all(
-            max(axis_nis) <= MAX_NIS_RATIO_OF_NOISY_REPLAYS * min(axis_nis)
-            for axis_nis in nis_by_axis
-        )
-        and max(rejected_fractions) - min(rejected_fractions)
-        <= MAX_REJECTED_SPREAD_OF_NOISY_REPLAYS
-        and (
-            not rmse_values
-            or max(rmse_values) <= MAX_RMSE_RATIO_OF_NOISY_REPLAYS * min(rmse_values)
-        )
+    known_rmses_m = [rmse_m for rmse_m in rmses_m if isinstance(rmse_m, float)]
+    values_and_max_ratios.append((known_rmses_m or [0.0], MAX_RMSE_RATIO_OF_NOISY_REPLAYS))
+    return np.ptp(rejected_fractions) <= MAX_REJECTED_SPREAD_OF_NOISY_REPLAYS and all(
+        max(values) <= max_ratio * min(values) for values, max_ratio in values_and_max_ratios
     )
 
 
 def _summarise_replay(flight: Flight, replay: Ekf2Replay, spans_s: Spans) -> Ekf2Statistics:
     updates = replay.updates
     evaluated_updates = rows_inside(updates, spans_s)
-    update_times_s = updates["fused_at_s"].to_numpy()
+    update_times_s = updates["fused_at_s"]
     if evaluated_updates.empty:
         raise SettingsError(
             f"{_format_changes(replay)}: the replay fuses no sample of {replay.source} in the "
@@ -551,7 +537,7 @@ def _compute_heading_error_deg(
     true_headings_rad = np.interp(
         headings_rad.index, true_attitude.index, heading_rad(true_attitude), np.nan, np.nan
     )
-    error_rad = np.angle(np.exp(1j * (headings_rad.to_numpy() - true_headings_rad)))
+    error_rad = np.angle(np.exp(1j * (headings_rad - true_headings_rad)))
     return float(np.degrees(np.nanmean(error_rad)))
 
 
@@ -610,13 +596,10 @@ def _describe_replay_limits(model: Ekf2Model, replay: Ekf2Replay) -> Iterator[st
     ):
         yield (
             f"{_format_changes(replay)}: EKF2 increases EKF2_DELAY_MAX from {delay_max_ms:g} to "
-            f"{delay_ms:g} ms when it starts, and so does the replay. Reboot PX4 after the change"
+            f"{delay_ms:g} ms at its start. Reboot PX4 after the change"
         )
     if delay_ms and np.isinf(model.inputs.received_positions.arrival_s).all():
-        yield (
-            "The log does not contain the arrival times of the positions, so the replay assumes "
-            "that no sample arrives too late"
-        )
+        yield ("Without logged arrival times, the replay assumes that no position arrives too late")
     if replay.late or replay.lost:
         # Of two samples in one prediction step, EKF2 fuses only the newer
         received_count = max(len(replay.updates), replay.late) + replay.lost

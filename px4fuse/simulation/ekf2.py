@@ -328,10 +328,11 @@ def _compute_output(
     segment = model_run.segment
     lag_steps = round(inputs.horizon_s / inputs.mean_step_s)
     state = compute_delayed_states(model_run, 0)
-    resets, has_recent_position_aiding = _hold_position_without_aiding(model_run, state)
-    reset_sum_m = np.zeros((len(state), 3))
-    for step, reset_size_m in resets:
-        reset_sum_m[step:, :2] += reset_size_m
+    reset_steps, reset_sizes_m, has_recent_position_aiding = _hold_position_without_aiding(
+        model_run, state
+    )
+    reset_m = np.zeros((len(state), 3))
+    reset_m[reset_steps, :2] = reset_sizes_m
     # EKF2 corrects the newest IMU samples with the older gyro bias of the fusion horizon
     gyro_bias_rad_s = rotate(segment.body_to_ned[1:], delay_by(state[:, GYRO_BIAS], lag_steps)[1:])
     attitude_error_steps_rad = (
@@ -342,7 +343,12 @@ def _compute_output(
         state[:, THETA] - gyro_attitude_error_rad, lag_steps, inputs.mean_step_s, inputs.horizon_s
     )
     velocity_m_s, position_m = compute_published_state(
-        segment, state, reset_sum_m, attitude_error_rad, lag_steps, inputs.settings
+        segment,
+        state,
+        np.cumsum(reset_m, axis=0),
+        attitude_error_rad,
+        lag_steps,
+        inputs.settings,
     )
     return Ekf2Output(
         time_us=time_us,
@@ -354,17 +360,18 @@ def _compute_output(
         velocity_m_s=velocity_m_s,
         position_m=position_m,
         attitude=multiply(from_rotation_vector(attitude_error_rad), true_quaternions),
-        resets=tuple((step + lag_steps, reset_size_m) for step, reset_size_m in resets),
+        reset_steps=reset_steps + lag_steps,
+        reset_sizes_m=reset_sizes_m,
         has_recent_position_aiding=has_recent_position_aiding,
     )
 
 
 def _hold_position_without_aiding(
     model_run: SegmentRun, state: Array
-) -> tuple[list[tuple[int, Array]], BoolArray]:
+) -> tuple[IntArray, Array, BoolArray]:
     """Hold the position in ``state`` during times without aiding (fake_pos_control.cpp).
 
-    Return the position resets (step, size in m), and a mask of the steps with recent aiding.
+    Return step and size (m) of the position resets, and a mask of the steps with recent aiding.
     """
     events, time_s = model_run.events[0], model_run.segment.time_s
     aiding_steps = events.end_step[model_run.fused[:, 0] | model_run.reset[:, 0]]
@@ -378,14 +385,11 @@ def _hold_position_without_aiding(
     )
     state[:, HORIZONTAL_POSITION] = state[last_step_with_aiding, HORIZONTAL_POSITION]
     state[~has_recent_position_aiding, VELOCITY.start : VELOCITY.start + 2] = 0.0
-    resets = []
-    for event in np.flatnonzero(model_run.reset[:, 0]):
-        step_at_reset = int(events.end_step[event])
-        reset_size_m = model_run.innovation[event, 0, HORIZONTAL_POSITION_COLUMNS]
-        if not has_recent_position_aiding[step_at_reset - 1]:
-            reset_size_m = (
-                state[step_at_reset, HORIZONTAL_POSITION]
-                - state[step_at_reset - 1, HORIZONTAL_POSITION]
-            )
-        resets.append((step_at_reset, reset_size_m))
-    return resets, has_recent_position_aiding
+    reset_events = np.flatnonzero(model_run.reset[:, 0])
+    reset_steps = events.end_step[reset_events]
+    reset_sizes_m = np.where(
+        has_recent_position_aiding[reset_steps - 1, None],
+        model_run.innovation[reset_events, 0, HORIZONTAL_POSITION_COLUMNS],
+        state[reset_steps, HORIZONTAL_POSITION] - state[reset_steps - 1, HORIZONTAL_POSITION],
+    )
+    return reset_steps, reset_sizes_m, has_recent_position_aiding

@@ -17,7 +17,15 @@ from px4fuse.ekf2.replay_segments import POSITION
 from px4fuse.flight.ekf2_parameters import BAROMETER, GNSS_POS, GNSS_VEL, MAG, Aid
 from px4fuse.readers.px4_ekf2 import MAG_3D_FUSION_BIT
 from px4fuse.readers.px4_positions import unproject
-from px4fuse.simulation import sensors
+from px4fuse.simulation.sensors import (
+    FIRST_TIMESTAMP_US,
+    HOME_POSITION,
+    is_kept_at_rate,
+    make_attitude_topic,
+    make_timestamps,
+    split_vectors,
+    to_seconds,
+)
 from px4fuse.simulation.ulog_writer import Topic, make_topic
 
 # Rate limit (Hz) of estimator_aid_src_ev_pos on a vehicle (PX4 v1.16, logged_topics.cpp)
@@ -46,8 +54,8 @@ class Ekf2Output:
         Attitude quaternions; velocity, position and IMU biases.
     velocity_m_s, position_m, attitude : ndarray
         State that EKF2 publishes.
-    resets : tuple of (int, ndarray)
-        Step and size (m, north and east) of each reset of the published position.
+    reset_steps, reset_sizes_m : ndarray, shape (k,) and (k, 2)
+        Step and size (north and east) of each reset of the published position.
     has_recent_position_aiding : ndarray of bool
         True if an aiding source was fused in the last NO_AID_TIMEOUT_S.
     """
@@ -59,7 +67,8 @@ class Ekf2Output:
     velocity_m_s: Array
     position_m: Array
     attitude: Array
-    resets: tuple[tuple[int, Array], ...]
+    reset_steps: IntArray
+    reset_sizes_m: Array
     has_recent_position_aiding: BoolArray
 
     def make_timestamps(
@@ -72,7 +81,7 @@ class Ekf2Output:
         sample_times_us = self.time_us[steps]
         if measurement_times_s is not None:
             sample_times_us = np.rint(measurement_times_s * 1e6).astype(np.int64)
-        return sensors.make_timestamps(
+        return make_timestamps(
             sample_times_us, self.time_us[steps + self.lag_steps] - sample_times_us
         )
 
@@ -82,8 +91,8 @@ class Ekf2Output:
         """Return the indices of the messages that a logger writes with a rate limit (Hz)."""
         is_published = end_step < len(self.time_us) - self.lag_steps
         event_indices = np.flatnonzero(is_message_event & is_published)
-        times_s = sensors.to_seconds(self.time_us[end_step[event_indices]])
-        return event_indices[sensors.is_kept_at_rate(times_s, rate_hz)]
+        times_s = to_seconds(self.time_us[end_step[event_indices]])
+        return event_indices[is_kept_at_rate(times_s, rate_hz)]
 
 
 def make_ekf2_topics(
@@ -111,13 +120,12 @@ def make_ekf2_topics(
 
 def _make_local_position_topic(model_inputs: ReplayInputs, ekf2_output: Ekf2Output) -> Topic:
     logged_steps = np.flatnonzero(
-        sensors.is_kept_at_rate(sensors.to_seconds(ekf2_output.time_us), LOCAL_POSITION_LOG_RATE_HZ)
+        is_kept_at_rate(to_seconds(ekf2_output.time_us), LOCAL_POSITION_LOG_RATE_HZ)
     )
-    reset_steps = np.array([step for step, _ in ekf2_output.resets], dtype=np.intp)
-    reset_sizes_m = np.array([[0.0, 0.0], *(reset_m for _, reset_m in ekf2_output.resets)])
-    reset_count = np.searchsorted(reset_steps, logged_steps, side="right")
-    fields = sensors.make_timestamps(ekf2_output.time_us[logged_steps], PUBLICATION_DELAY_US)
-    fields |= sensors.split_vectors(
+    reset_sizes_m = np.concatenate([np.zeros((1, 2)), ekf2_output.reset_sizes_m])
+    reset_count = np.searchsorted(ekf2_output.reset_steps, logged_steps, side="right")
+    fields = make_timestamps(ekf2_output.time_us[logged_steps], PUBLICATION_DELAY_US)
+    fields |= split_vectors(
         {"": ekf2_output.position_m[logged_steps], "v": ekf2_output.velocity_m_s[logged_steps]}
     )
     has_recent_position_aiding = ekf2_output.has_recent_position_aiding[
@@ -126,7 +134,7 @@ def _make_local_position_topic(model_inputs: ReplayInputs, ekf2_output: Ekf2Outp
     fields |= {"delta_xy": reset_sizes_m[reset_count], "xy_reset_counter": reset_count % 256}
     fields |= dict.fromkeys(("xy_valid", "v_xy_valid"), has_recent_position_aiding)
     if model_inputs.aid == GNSS_POS:
-        fields |= dict(zip(("ref_lat", "ref_lon", "ref_alt"), sensors.HOME_POSITION, strict=True))
+        fields |= dict(zip(("ref_lat", "ref_lon", "ref_alt"), HOME_POSITION, strict=True))
     return make_topic("vehicle_local_position", fields)
 
 
@@ -148,7 +156,7 @@ def _make_states_topic(
     states[:, 7:9] = 0.0
     if model_inputs.aid == GNSS_POS:
         # with a global origin, v1.16 logs the altitude instead of the down position
-        states[:, 9] -= sensors.HOME_POSITION[2]
+        states[:, 9] -= HOME_POSITION[2]
     variances = np.zeros((len(logged_steps), 24), np.float32)
     variances[:, : model_run.variance.shape[2]] = model_run.variance[logged_indices + 1, 0]
     return make_topic(
@@ -183,11 +191,11 @@ def _make_position_aid_topics(
     )
     is_used = model_run.fused[logged_indices, 0] | model_run.reset[logged_indices, 0]
     last_fused_us = np.maximum.accumulate(
-        is_used * (sensors.FIRST_TIMESTAMP_US + ekf2_output.time_us[logged_steps])
+        is_used * (FIRST_TIMESTAMP_US + ekf2_output.time_us[logged_steps])
     )
     observation = north, east
     if velocity_m_s is not None:
-        observation = unproject(north, east, sensors.HOME_POSITION[:2])
+        observation = unproject(north, east, HOME_POSITION[:2])
     position_topic = _make_aid_source_topic(
         model_inputs.aid,
         model_inputs.settings,
@@ -230,7 +238,7 @@ def _make_barometer_topics(
     updates = updates[
         updates["fused_at_s"] < len(ekf2_output.time_us) - ekf2_output.lag_steps
     ].iloc[1:]
-    updates = updates[sensors.is_kept_at_rate(updates.index.to_numpy(), OTHER_AIDS_LOG_RATE_HZ)]
+    updates = updates[is_kept_at_rate(updates.index.to_numpy(), OTHER_AIDS_LOG_RATE_HZ)]
     innovation, innovation_variance, is_rejected, is_fused, step_by_update = updates.to_numpy().T
     measurement_times_s, steps = updates.index.to_numpy(), step_by_update.astype(np.intp)
     measured_down_m = height_samples.samples["down_m"][measurement_times_s].to_numpy()
@@ -239,7 +247,7 @@ def _make_barometer_topics(
             BAROMETER,
             model_inputs.settings,
             ekf2_output.make_timestamps(steps, measurement_times_s),
-            measured_down_m - sensors.HOME_POSITION[2],
+            measured_down_m - HOME_POSITION[2],
             innovation,
             innovation_variance,
             model_inputs.settings[BAROMETER.noise] ** 2,
@@ -271,14 +279,14 @@ def _make_magnetometer_topics(
     ]
     is_fused = fused_fraction[:, 0] > 0.0
     logged_attitude_steps, logged_status_steps = (
-        np.flatnonzero(sensors.is_kept_at_rate(sensors.to_seconds(time_us), rate_hz))
+        np.flatnonzero(is_kept_at_rate(to_seconds(time_us), rate_hz))
         for time_us, rate_hz in (
             (ekf2_output.time_us, attitude_rate_hz),
             (ekf2_output.time_us[: -ekf2_output.lag_steps], FLAGS_LOG_RATE_HZ),
         )
     )
     return [
-        sensors.make_attitude_topic(
+        make_attitude_topic(
             "vehicle_attitude",
             ekf2_output.time_us[logged_attitude_steps],
             PUBLICATION_DELAY_US,
@@ -341,7 +349,7 @@ def _make_flags_topic(
     time_since_attempt_s = time_s - np.maximum.accumulate(last_attempt_s)
     is_fusing = time_since_attempt_s < model_inputs.rules.stop_timeout_s
     has_changed = np.diff(is_fusing.astype(int), prepend=0) != 0
-    is_logged = has_changed | sensors.is_kept_at_rate(time_s, FLAGS_LOG_RATE_HZ)
+    is_logged = has_changed | is_kept_at_rate(time_s, FLAGS_LOG_RATE_HZ)
     logged_steps = np.flatnonzero(is_logged[: len(time_s) - ekf2_output.lag_steps])
     is_gnss = model_inputs.aid == GNSS_POS
     is_fusing = is_fusing[logged_steps]

@@ -120,9 +120,11 @@ def to_ulog(simulation: Simulation, *, is_assessed: bool = False) -> bytes:
         "sys_name": "PX4",
         "ver_hw": SIMULATION_HARDWARE,
         "ver_sw_release": PX4_RELEASE,
-        **({NOTE_KEY: SIMULATED_EKF2_NOTE} if simulation.scenario.ekf2 else {}),
-        **({ASSIGNMENT_FLAG_KEY: 1} if is_assessed else {}),
     }
+    if simulation.scenario.ekf2:
+        info[NOTE_KEY] = SIMULATED_EKF2_NOTE
+    if is_assessed:
+        info[ASSIGNMENT_FLAG_KEY] = 1
     return encode_ulog(simulation.topics, simulation.parameters, info, sensors.FIRST_TIMESTAMP_US)
 
 

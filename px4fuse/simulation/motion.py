@@ -57,7 +57,7 @@ def _sum_ramps(ramps: Sequence[tuple[float, float, Array]]) -> PPoly:
 def _differentiate(ramp_function: PPoly, time_s: Array, orders: Sequence[int]) -> list[Array]:
     """Return derivatives of a sum of ramps, shape (t, k) each; order -1 is the integral."""
     clipped_times_s = np.clip(time_s, *ramp_function.x[[0, -1]])
-    return [np.asarray(ramp_function.derivative(order)(clipped_times_s)) for order in orders]
+    return [ramp_function.derivative(order)(clipped_times_s) for order in orders]
 
 
 @dataclass(frozen=True)
@@ -273,9 +273,6 @@ class _FlightBuilder:
         )
         self.ramp_centre_s += time_to_next_ramp_s
 
-    def add_turn(self, angle_rad: float, start_s: float, duration_s: float) -> None:
-        self.yaw_ramps.append((start_s, duration_s, np.array([angle_rad])))
-
 
 def compute_direction(heading_deg: float) -> Array:
     """Return the horizontal unit vector (NED) of a heading in degrees."""
@@ -298,7 +295,7 @@ def _plan_aisle_passes(flight_plan: _FlightBuilder, scenario: Scenario, speed_m_
             -pass_velocity_m_s, SPEED_RAMP_DURATION_S, SPEED_RAMP_DURATION_S + pause_s
         )
         if heading_follows_path and pass_index < scenario.passes - 1:
-            flight_plan.add_turn(np.pi, stop_s, TURN_ROUND_DURATION_S)
+            flight_plan.yaw_ramps.append((stop_s, TURN_ROUND_DURATION_S, np.array([np.pi])))
 
 
 def _plan_square_laps(
@@ -316,9 +313,8 @@ def _plan_square_laps(
         velocity_m_s = speed_m_s * compute_direction(scenario.heading_deg + 90.0 * side_index)
         ramp_duration_s = CORNER_DURATION_S if side_index else SPEED_RAMP_DURATION_S
         if side_index and scenario.nose_follows_path and speed_m_s > 0.0:
-            flight_plan.add_turn(
-                np.pi / 2.0, flight_plan.ramp_centre_s - CORNER_DURATION_S / 2.0, CORNER_DURATION_S
-            )
+            turn_start_s = flight_plan.ramp_centre_s - CORNER_DURATION_S / 2.0
+            flight_plan.yaw_ramps.append((turn_start_s, CORNER_DURATION_S, np.array([np.pi / 2.0])))
         side_length_m = scenario.length_m - open_end_m * (side_index == side_count - 1)
         flight_plan.add_velocity_change(
             velocity_m_s - previous_velocity_m_s,

@@ -189,7 +189,7 @@ def select_logged_imu(full_rate_topic: Topic, faults: FaultSizes, motion: Motion
 
 def get_time_us(topic: Topic, field: str = "timestamp") -> IntArray:
     """Return the times of a topic in µs from the first sample."""
-    return np.asarray(topic.fields[field].astype(np.int64) - FIRST_TIMESTAMP_US)
+    return topic.fields[field].astype(np.int64) - FIRST_TIMESTAMP_US
 
 
 def measure_imu(
@@ -205,17 +205,19 @@ def measure_imu(
     The noise is that of a mean over ``samples_per_average`` samples.
     """
     truth = compute_attitude(motion.compute_true_state(time_s))
-    rng, measurements = make_random_generator(scenario, random_stream), []
-    for true_value, bias, sigma in zip(
-        (truth.specific_force_m_s2, truth.angular_rate_rad_s),
-        draw_imu_biases(scenario, faults),
-        (scenario.accelerometer_noise_m_s2, scenario.gyro_noise_rad_s),
-        strict=True,
-    ):
-        noise = 1.0 / np.sqrt(samples_per_average) * sigma * rng.standard_normal(true_value.shape)
-        measurements.append(true_value + bias + noise)
-    specific_force_m_s2, rate_rad_s = measurements
-    return specific_force_m_s2, rate_rad_s
+    rng = make_random_generator(scenario, random_stream)
+    accelerometer_bias_m_s2, gyro_bias_rad_s = draw_imu_biases(scenario, faults)
+
+    noise_factor = 1.0 / np.sqrt(samples_per_average)
+    accelerometer_noise, gyro_noise = rng.standard_normal((2, len(time_s), 3))
+    return (
+        truth.specific_force_m_s2
+        + accelerometer_bias_m_s2
+        + noise_factor * scenario.accelerometer_noise_m_s2 * accelerometer_noise,
+        truth.angular_rate_rad_s
+        + gyro_bias_rad_s
+        + noise_factor * scenario.gyro_noise_rad_s * gyro_noise,
+    )
 
 
 def simulate_logged_attitude(scenario: Scenario, faults: FaultSizes, motion: Motion) -> Topic:
@@ -234,7 +236,7 @@ def simulate_true_attitude(scenario: Scenario, motion: Motion) -> Topic:
 
 
 def to_quaternions(body_to_ned: Array) -> Array:
-    return np.asarray(Rotation.from_matrix(body_to_ned).as_quat(scalar_first=True))
+    return Rotation.from_matrix(body_to_ned).as_quat(scalar_first=True)
 
 
 def make_attitude_topic(name: str, time_us: IntArray, delay_us: int, quaternion: Array) -> Topic:
@@ -310,7 +312,14 @@ def simulate_positions(
     position_m += outlier_offset_m
     position_m += simulate_correlated_noise(scenario, faults, len(time_s), interval_s)
     if faults.smoothed_s:
-        position_m = _apply_low_pass(position_m, interval_s, faults.smoothed_s)
+        decay_factor = np.exp(-interval_s / faults.smoothed_s)
+        position_m, _ = lfilter(
+            [1.0 - decay_factor],
+            [1.0, -decay_factor],
+            position_m,
+            axis=0,
+            zi=decay_factor * position_m[:1],
+        )
     position_m *= 1.0 + faults.scale_percent / 100.0
     if faults.yaw_deg:
         position_m = Rotation.from_euler("z", faults.yaw_deg, degrees=True).apply(position_m)
@@ -330,13 +339,26 @@ def simulate_positions(
         velocity_m_s = (
             state.velocity_m_s + velocity_sigma_m_s * rng.standard_normal(state.velocity_m_s.shape)
         )[is_logged]
-        timestamp_us += round(1e6 * GNSS_DELAY_S)
-        topic = _make_gnss_topic(timestamp_us, position_m, velocity_m_s, reported_sigma_m, scenario)
+        north_m, east_m, down_m = position_m.T
+        latitude_deg, longitude_deg = unproject(north_m, east_m, HOME_POSITION[:2])
+        fields = make_timestamps(timestamp_us + round(1e6 * GNSS_DELAY_S)) | {
+            "eph": reported_sigma_m,
+            "epv": reported_sigma_m * GNSS_SIGMA_FACTORS[2],
+            "s_variance_m_s": scenario.sigma_gnss_m_s,
+            "latitude_deg": latitude_deg,
+            "longitude_deg": longitude_deg,
+            "altitude_msl_m": HOME_POSITION[2] - down_m,
+        }
+        fields |= {f"vel_{axis}_m_s": velocity_m_s[:, i] for i, axis in enumerate("ned")}
+        topic = make_topic(GPS_POSITION, fields)
     else:
-        body_to_ned = compute_attitude(state).body_to_ned[is_logged] if is_loop else None
-        topic = _make_odometry_topic(
-            arrival_times_us, timestamp_us, position_m, reported_sigma_m, body_to_ned
-        )
+        fields = make_timestamps(timestamp_us, arrival_times_us - timestamp_us) | {
+            "position": position_m,
+            "position_variance": np.full(position_m.shape, reported_sigma_m**2),
+        }
+        if is_loop:
+            fields["q"] = to_quaternions(compute_attitude(state).body_to_ned[is_logged])
+        topic = make_topic("vehicle_visual_odometry", fields)
     return SimulatedPositions(
         topic=topic,
         is_outlier=is_outlier[is_logged],
@@ -362,7 +384,7 @@ def simulate_correlated_noise(
     noise_m = rng.standard_normal((sample_count, 3)) * faults.slow_error_m
     decay_factor = np.exp(-interval_s / faults.slow_error_s)
     noise_m[1:] *= np.sqrt(1.0 - decay_factor**2)
-    return np.asarray(lfilter([1.0], [1.0, -decay_factor], noise_m, axis=0))
+    return lfilter([1.0], [1.0, -decay_factor], noise_m, axis=0)
 
 
 def simulate_vio_drift(scenario: Scenario, distance_m: Array) -> Array:
@@ -373,9 +395,7 @@ def simulate_vio_drift(scenario: Scenario, distance_m: Array) -> Array:
     unit_random_walk = np.cumsum(
         sqrt_step_lengths * rng.standard_normal((len(distance_m), 3)), axis=0
     )
-    return np.asarray(
-        distance_m[:, None] * drift_per_metre + scenario.vio_walk_m * unit_random_walk
-    )
+    return distance_m[:, None] * drift_per_metre + scenario.vio_walk_m * unit_random_walk
 
 
 def simulate_outliers(
@@ -418,7 +438,7 @@ def is_kept_at_rate(time_s: Array, rate_hz: float) -> BoolArray:
     if rate_hz <= 0.0:
         return np.ones(len(time_s), np.bool_)
     # 1e-6 prevents rounding errors at the edges of logging intervals
-    return np.asarray(np.diff(np.floor(time_s * rate_hz + 1e-6), prepend=-1.0) > 0.0)
+    return np.diff(np.floor(time_s * rate_hz + 1e-6), prepend=-1.0) > 0.0
 
 
 def _simulate_position_times_us(
@@ -438,64 +458,17 @@ def _simulate_position_times_us(
     return arrival_times_us, timestamp_us
 
 
-def _make_odometry_topic(
-    arrival_times_us: IntArray,
-    timestamp_us: IntArray,
-    position_m: Array,
-    sigma_m: float,
-    body_to_ned: Array | None,
-) -> Topic:
-    variance_m2 = np.full(position_m.shape, sigma_m**2)
-    fields = make_timestamps(timestamp_us, arrival_times_us - timestamp_us)
-    fields |= {"position": position_m, "position_variance": variance_m2}
-    if body_to_ned is not None:
-        fields["q"] = to_quaternions(body_to_ned)
-    return make_topic("vehicle_visual_odometry", fields)
-
-
-def _make_gnss_topic(
-    timestamp_us: IntArray,
-    position_m: Array,
-    velocity_m_s: Array,
-    sigma_m: float,
-    scenario: Scenario,
-) -> Topic:
-    latitude_deg, longitude_deg = unproject(position_m[:, 0], position_m[:, 1], HOME_POSITION[:2])
-    fields = make_timestamps(timestamp_us) | {
-        "eph": sigma_m,
-        "epv": sigma_m * GNSS_SIGMA_FACTORS[2],
-        "s_variance_m_s": scenario.sigma_gnss_m_s,
-        "latitude_deg": latitude_deg,
-        "longitude_deg": longitude_deg,
-        "altitude_msl_m": HOME_POSITION[2] - position_m[:, 2],
-    }
-    fields |= {f"vel_{axis}_m_s": velocity_m_s[:, i] for i, axis in enumerate("ned")}
-    return make_topic(GPS_POSITION, fields)
-
-
-def _apply_low_pass(position_m: Array, interval_s: float, time_constant_s: float) -> Array:
-    decay_factor = np.exp(-interval_s / time_constant_s)
-    filtered_position_m, _ = lfilter(
-        [1.0 - decay_factor],
-        [1.0, -decay_factor],
-        position_m,
-        axis=0,
-        zi=decay_factor * position_m[:1],
-    )
-    return np.asarray(filtered_position_m)
-
-
 def _is_outside_gap(
     time_s: Array, gap_s: float, gap_start_s: float | None, duration_s: float
 ) -> BoolArray:
     """Return a mask of times outside a gap; by default the gap is in the middle of the flight."""
     start_s = (duration_s - gap_s) / 2.0 if gap_start_s is None else gap_start_s
-    return np.asarray((time_s <= start_s) | (time_s >= start_s + gap_s))
+    return (time_s <= start_s) | (time_s >= start_s + gap_s)
 
 
 def _make_sample_times_us(motion: Motion, rate_hz: float) -> IntArray:
-    time_us = np.rint(np.arange(int(motion.duration_s * rate_hz) + 1) * (1e6 / rate_hz))
-    return np.asarray(time_us, dtype=np.int64)
+    sample_count = int(motion.duration_s * rate_hz) + 1
+    return np.asarray(np.rint(np.arange(sample_count) * (1e6 / rate_hz)), dtype=np.int64)
 
 
 def to_seconds(time_us: IntArray) -> Array:
