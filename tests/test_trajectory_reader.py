@@ -136,9 +136,15 @@ def test_read_trajectory_detects_camera_frame_by_level_motion(
     assert (got.kind, got.frame) == ("slam", frame)
 
 
-def test_read_trajectory_reports_repeated_timestamps(tmp_path: Path) -> None:
+def test_read_trajectory_reports_gaps_and_repeated_timestamps(tmp_path: Path) -> None:
     time = np.arange(1000) * 0.05
+    keep = ((time < 10) | (time > 14)) & ((time < 30) | (time > 31))
     made = Trajectory("t", "unknown", time, np.tile(POSITION_M, (20, 1)), Rotation.identity(1000))
+    notes = " ".join(read_trajectory(write(tmp_path, format_tum(made[keep]))).notes)
+    gaps = "Poses are missing for 5.1 s in 2 gaps. The longest gap begins 10.0 s after the"
+    assert gaps in notes
+    irregular = made[np.flatnonzero(np.random.default_rng(1).random(1000) < 0.2)]
+    assert "key frames" in " ".join(read_trajectory(write(tmp_path, format_tum(irregular))).notes)
     lines = format_tum(made).split("\n")
     lines.insert(500, lines[500])
     again = read_trajectory(write(tmp_path, "\n".join(lines)))

@@ -34,6 +34,15 @@ MAX_SMALLEST_TO_SECOND_EXTENT_RATIO = 1 / 3
 MIN_SECOND_TO_LARGEST_EXTENT_RATIO = 0.1
 # Maximum angle (rad) between the normal of the plane of motion and the y axis of a camera frame
 MAX_TILT_RAD = math.radians(20.0)
+# Minimum fraction of intervals near the median interval, for a regular frame rate
+MIN_REGULAR_INTERVAL_FRACTION = 0.9
+# Maximum relative difference of a regular interval from the median interval
+MAX_MEDIAN_INTERVAL_DEVIATION = 0.5
+# Minimum duration of a gap between two poses, in median intervals
+MIN_GAP_IN_MEDIAN_INTERVALS = 2.5
+# Minimum duration (s) of a gap between two poses
+MIN_POSE_GAP_S = 0.3
+
 # Words that indicate ground truth; b_w_RS_S is the gyro bias in EuRoC ground truth
 _TRUTH_NAME_PATTERN = re.compile(
     r"truth|vicon|leica|mocap|(?<![a-z])gt(?![a-z])|b_w_RS_S", re.IGNORECASE
@@ -86,11 +95,12 @@ def read_trajectory(path: str | Path, body: str | None = None) -> Trajectory:
     comment_text = "\n".join(re.findall(r"(?m)^\s*#.*", first_bytes.decode(errors="replace")))
     kind, kind_note = _detect_trajectory_kind(path, comment_text, position_m, rotation)
     frame, frame_note = _detect_frame(kind, position_m)
+    time_s = samples.index.to_numpy()
     notes = (*recording.format_detection_notes, *recording.notes)
     return Trajectory(
         name=name,
         kind=kind,
-        time_s=samples.index.to_numpy(),
+        time_s=time_s,
         position_m=position_m,
         rotation=rotation,
         frame=_FRAME_BY_RECORDING_FRAMES.get(recording.frames, frame),
@@ -99,7 +109,7 @@ def read_trajectory(path: str | Path, body: str | None = None) -> Trajectory:
         size_bytes=recording.size_bytes,
         notes=(
             *(f"{note[0].upper()}{note[1:]}." for note in notes),
-            *filter(None, (kind_note, frame_note)),
+            *filter(None, (kind_note, frame_note, _describe_gaps(time_s))),
         ),
     )
 
@@ -176,4 +186,28 @@ def _detect_frame(kind: TrajectoryKind, position_m: Array) -> tuple[Frame, str]:
     return "camera", (
         "The frame is a camera frame (x right, y down, z forward): the motion is in a plane "
         f"perpendicular to y within {math.degrees(tilt_rad):.0f}°, so y is vertical."
+    )
+
+
+def _describe_gaps(time_s: Array) -> str:
+    """Return a note on gaps or irregular intervals between poses; "" if there are none."""
+    intervals_s = np.diff(time_s)
+    median_interval_s = float(np.median(intervals_s))
+    max_deviation_s = MAX_MEDIAN_INTERVAL_DEVIATION * median_interval_s
+    is_regular = np.abs(intervals_s - median_interval_s) <= max_deviation_s
+    if np.mean(is_regular) < MIN_REGULAR_INTERVAL_FRACTION:
+        return (
+            f"The pose intervals are irregular (median {median_interval_s:.3g} s, maximum "
+            f"{intervals_s.max():.3g} s): the poses are key frames, or many poses are missing."
+        )
+    gap_indices = np.flatnonzero(
+        intervals_s > max(MIN_GAP_IN_MEDIAN_INTERVALS * median_interval_s, MIN_POSE_GAP_S)
+    )
+    if not len(gap_indices):
+        return ""
+    missing_time_s = intervals_s[gap_indices] - median_interval_s
+    longest_gap_start_s = time_s[gap_indices[np.argmax(missing_time_s)]] - time_s[0]
+    return (
+        f"Poses are missing for {missing_time_s.sum():.1f} s in {len(gap_indices)} gaps. The "
+        f"longest gap begins {longest_gap_start_s:.1f} s after the first pose."
     )
