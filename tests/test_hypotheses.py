@@ -244,6 +244,26 @@ def test_outlier_burst_is_not_reported_as_position_jump() -> None:
     assert heading == pytest.approx(30.0, abs=15.0)
 
 
+def test_reported_reset_is_tested_at_its_timestamp_with_time_offset() -> None:
+    comparison = compare(flight("jump=0.5,40s"), RIGHT, axes=("north", "east"))
+    sizes_m = []
+    for delay_s in (0.0, 0.3):
+        axes = [
+            replace(result.axis, measurement_time_s=result.axis.measurement_time_s - delay_s)
+            for result in comparison.axes.values()
+        ]
+        time_s = axes[0].measurement_time_s
+        errors = fit_systematic_errors(
+            comparison.flight, tuple(axes), RIGHT, sigma_a_m_s2=0.27, sigma_z_m=0.1,
+            outlier_time_s=np.array([]), clock_offset_s=delay_s,
+            source_resets_s=[time_s[np.searchsorted(time_s, 40.0 - delay_s)]],
+        )  # fmt: skip
+        (jump,) = errors.jumps
+        assert jump.time_s + delay_s == pytest.approx(40.1, abs=0.01)
+        sizes_m.append([size.value for size in jump.step_m])
+    assert sizes_m[1] == pytest.approx(sizes_m[0], abs=1e-6)
+
+
 def test_time_offset_is_not_reported_as_low_pass_filter() -> None:
     late = flown("clock-offset=250ms", passes=6)
     assert late.source_low_pass.gain_nats == 0.0

@@ -186,9 +186,8 @@ def fit_systematic_errors(
         return report_too_few_measurements(ANALYSIS_NAME, used_count, MIN_MEASUREMENTS)
     tested_sigmas_a = (sigma_a_m_s2 * TESTED_SIGMA_A_FACTORS).tolist()
     design_matrix, regression = _fit_sigma_a(initial_design, tested_sigmas_a, is_outlier)
-    shifted_resets_s = [time_s + clock_offset_s for time_s in source_resets_s]
     # Some outliers are measurements after a jump, and some measurements near a jump are outliers
-    jumps, is_skipped = _find_jumps(design_matrix, regression, is_outlier, shifted_resets_s)
+    jumps, is_skipped = _find_jumps(design_matrix, regression, is_outlier, source_resets_s)
     # Jumps enlarge the estimated SIGMA_A
     if jumps:
         design_matrix = replace(design_matrix, jump_times_s=[jump.time_s for jump in jumps])
