@@ -11,6 +11,7 @@ from exchange import replace
 from scipy.spatial.transform import Rotation
 
 from px4fuse.comparison.preparation import choose_segment, choose_source
+from px4fuse.core.arrays import rms
 from px4fuse.filter import frame_rotation
 from px4fuse.filter.frame_rotation import (
     MAX_DRIFT_P_VALUE,
@@ -63,6 +64,17 @@ def test_constant_heading_misalignment_is_recovered(misalignment_deg):
     assert found.sigma_deg < 3.0
 
 
+@pytest.mark.slow
+def test_heading_errors_of_ten_flights_agree_with_reported_sigma() -> None:
+    """If the tilt about east is not estimated, σ is too small (RMS 1.27)."""
+    normalised_errors = []
+    for seed in range(10):
+        flight = simulate_flight(Scenario(seed=seed, passes=4, ekf2=False, truth=False))
+        heading_error = estimate(flight, 0.10)
+        normalised_errors.append(heading_error.misalignment_deg / heading_error.sigma_deg)
+    assert 0.6 < rms(np.array(normalised_errors)) < 1.2
+
+
 def test_gyro_bias_does_not_change_estimated_heading_error():
     flight = simulated()
     imu = flight.imu.copy()
@@ -109,7 +121,7 @@ def test_heading_error_range_is_unchanged_by_position_scale():
     ):
         first, last = estimate(flown, sigma_m).find_extreme_parts()
         ranges_deg.append(first.heading_error_deg - last.heading_error_deg)
-    assert ranges_deg[1] == pytest.approx(ranges_deg[0], rel=0.1)
+    assert ranges_deg[1] == pytest.approx(ranges_deg[0], rel=0.15)
 
 
 def test_heading_misalignment_without_data_gives_reason():

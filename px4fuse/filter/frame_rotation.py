@@ -51,8 +51,9 @@ MAX_HEADING_FIT_ITERATIONS = 5
 MAX_HEADING_CHANGE_AT_CONVERGENCE_RAD = 0.01
 # Prior σ (rad) of the heading error
 HEADING_SIGMA_RAD = 1.0
-# Minimum estimated scale factor of the positions, to avoid a division by zero
+# Minimum estimated ratio of true to measured distances, to avoid a division by zero
 MIN_FITTED_SCALE_FACTOR = 0.1
+# Index of the heading error among the constant errors; the first column of increments is the motion
 HEADING_ERROR_INDEX = 2
 
 
@@ -298,7 +299,7 @@ def _estimate_heading_error_from_positions(
         # Noise of the IMU motion would bias the heading error to zero, so the smooth path is used
         for increments in (positions.delta_position_m, positions.delta_velocity_m_s):
             north_m, east_m = increments[:, :, -1]
-            increments[:, :, HEADING_ERROR_INDEX] = -east_m, north_m
+            increments[:, :, 1 + HEADING_ERROR_INDEX] = -east_m, north_m
         noise_parameters = maximise_likelihood(
             [positions], noise_parameters, motion.measurement_weights, fits_outliers=False
         ).noise_parameters
@@ -309,12 +310,12 @@ def _estimate_heading_error_from_positions(
         constant_errors_covariance = np.linalg.inv(position_fit.compute_constants_information())[
             is_part_long_enough, 0
         ]
-        # The fitted angle contains the scale factor of the positions
-        position_scale = np.maximum(1.0 + constant_errors[:, -1], MIN_FITTED_SCALE_FACTOR)
-        error_rad = constant_errors[:, HEADING_ERROR_INDEX] / position_scale
+        # The smooth path contains the scale factor of the positions, 1 / true_to_measured_scale
+        true_to_measured_scale = np.maximum(1.0 - constant_errors[:, -1], MIN_FITTED_SCALE_FACTOR)
+        error_rad = constant_errors[:, HEADING_ERROR_INDEX] / true_to_measured_scale
         heading_variance_rad2 = (
             constant_errors_covariance[:, HEADING_ERROR_INDEX, HEADING_ERROR_INDEX]
-            / position_scale**2
+            / true_to_measured_scale**2
         )
         correction_rad, weight_sum = np.average(
             error_rad, weights=1.0 / heading_variance_rad2, returned=True
