@@ -18,8 +18,13 @@ from flights import Imu, Uwb, aisle_flight
 
 from px4fuse.comparison.model import Comparison
 from px4fuse.comparison.preparation import shift_timestamps
-from px4fuse.explore.data import OFFSET_SLIDER_HALF_RANGE_S, make_kf_inputs, undo_time_offset
-from px4fuse.explore.packing import KF_INPUT_STEPS_PER_UNIT, ArrayEncoder
+from px4fuse.explore.data import (
+    KF_INPUT_STEPS_PER_UNIT,
+    OFFSET_SLIDER_HALF_RANGE_S,
+    ArrayEncoder,
+    make_kf_inputs,
+    undo_time_offset,
+)
 from px4fuse.filter.kalman import KfRun, predict_state, run_kf
 from px4fuse.filter.settings import Settings
 from px4fuse.filter.signals import make_axes

@@ -172,7 +172,7 @@ const Engine = (() => {
     return n < MIN_COMMON_SAMPLES ? null : Math.sqrt(square / n);
   }
 
-  /* Decode the arrays of px4fuse.explore.packing */
+  /* Decode the arrays of px4fuse.explore.data */
   async function unpack(text, specs) {
     const all = new Uint8Array(await inflate(text).arrayBuffer());
     let from = 0;

@@ -7,7 +7,7 @@ const Explore = (async () => {
   const arrays = await Engine.unpack(read("arrays"), JSON.parse(read("content")).packed);
   const withArrays = (_, value) => value?.array === undefined ? value : arrays[value.array];
   const { flight, ratio_axis: ratioAxis, places } = JSON.parse(read("content"), withArrays);
-  const { imu, axes, offset } = flight;
+  const { imu, axes } = flight;
 
   // ------------------------------------------------------------------ settings
   const settings = { ...flight.settings, axis: flight.main };
@@ -26,7 +26,8 @@ const Explore = (async () => {
     Object.assign(settings, changes);
     nextFrame ??= requestAnimationFrame(show);
   }
-  [$("clock-offset").min, $("clock-offset").max] = flight.limits.clock_offset_s;
+  const offsetSlider = $("clock-offset");
+  [offsetSlider.min, offsetSlider.max] = flight.limits.clock_offset_s;
   for (const [id, key] of Object.entries(SETTINGS)) {
     const slider = $(id), number = $(`${id}-value`);
     [number.min, number.max] = flight.limits[key];
@@ -35,8 +36,8 @@ const Explore = (async () => {
       if (number.reportValidity()) set({ [key]: number.valueAsNumber });
     });
   }
-  if (offset.why) {
-    $("offset-note").textContent = offset.why;
+  if (offsetSlider.min === offsetSlider.max) {
+    $("offset-note").hidden = false;
     for (const id of ["clock-offset", "clock-offset-value"]) $(id).disabled = true;
   }
   if (isText(imu)) {
@@ -66,7 +67,7 @@ const Explore = (async () => {
   /* Show the settings, their maximum-likelihood estimates and the command with these settings */
   function showSettings() {
     const [sigmaA, sigmaZ] = likelyNow(), { ekf2, note } = axisNow();
-    const likely = { "sigma-a": sigmaA, "sigma-z": sigmaZ, "clock-offset": offset.likely };
+    const likely = { "sigma-a": sigmaA, "sigma-z": sigmaZ, "clock-offset": flight.likely_offset };
     const words = [flight.command];
     for (const [id, key] of Object.entries(SETTINGS)) {
       const value = settings[key], slider = $(id);
@@ -98,7 +99,6 @@ const Explore = (async () => {
   await Bokeh.embed.embed_items({ page: JSON.parse(read("document")) }, [
     { docid: "page", roots: places, root_ids: Object.keys(places) }]);
   const model = (name) => Bokeh.documents[0].get_model_by_name(name);
-  const setSource = (name, data) => { model(`${name}-source`).data = data; };
   /* Draw columns, reduced to MAX_POINTS, in each visible plot with this source */
   function drawSource(name, columns) {
     for (const { id, dataset } of queryAll(`.plot[data-view=${view}] > div`)) {
@@ -234,18 +234,6 @@ const Explore = (async () => {
       drawSource(name, innovationRows(...columns, "square"));
     }
   }
-  function drawEvents({ ekf2 }) {
-    const { events } = flight, minWidth = (lastTime - firstTime) / 800, widen = (t) => [t, t + minWidth];
-    const spans = { "on the ground": events.ground, "gap in source": events.gap, "log dropout": events.dropout };
-    if (!isText(ekf2)) {
-      const [time = [], , , rejected] = ekf2.innovations;
-      spans["EKF2 reset"] = events.reset.map(widen);
-      spans["EKF2 rejected"] = [...time].filter((_, i) => rejected[i]).map(widen);
-    }
-    const rows = Object.entries(spans).flatMap(([row, list]) => list.map((span) => [row, ...span]));
-    const [row, left, right] = [0, 1, 2].map((column) => rows.map((cells) => cells[column]));
-    setSource("strip", { row, left, right });
-  }
   /* Add RMSE and the percentage of large innovations to the titles of the plots */
   function drawTitles({ axis, numbers: kf }) {
     const title = (name, text) => {
@@ -291,7 +279,7 @@ const Explore = (async () => {
     slider.value = measurement;
     slider.ariaValueText = text;
     $("now").textContent = `${text}, at ${time.toFixed(3)} s`;
-    if (view === "step") Step.draw(run, measurement, model("step"), setSource);
+    if (view === "step") Step.draw(run, measurement, model);
   }
 
   // ------------------------------------------------------------------ whole page
@@ -303,7 +291,6 @@ const Explore = (async () => {
     drawCard(result);
     $("span").textContent = `${timeRange.start.toFixed(1)} s to ${timeRange.end.toFixed(1)} s`;
     drawTitles(result);
-    if (view === "track") drawEvents(result.axis);
     drawReferences(result.axis);
     if (result.run === null) return;
     drawKf(result);
