@@ -20,6 +20,7 @@ from px4fuse.flight.model import Reset
 from px4fuse.report import cover, cover_panels
 from px4fuse.report.page import Page
 from px4fuse.report.style import apply_report_style
+from px4fuse.report.typesetting import measure_free_height
 from px4fuse.request import ComparisonRequest
 from px4fuse.results.build import make_comparison_results
 
@@ -99,7 +100,7 @@ def test_report_cover_shows_3_notes_and_counts_the_others() -> None:
 def test_report_cover_leaves_no_space_for_empty_text(field: str, empty: Any) -> None:
     card = replace(SMALL_SIGMA_A, reconcile="The two verdicts differ.")
     heights = [
-        cover.find_free_height(page_of(each)) for each in (card, replace(card, **{field: empty}))
+        measure_free_height(page_of(each)) for each in (card, replace(card, **{field: empty}))
     ]
     assert heights[1] > heights[0] + 8.0
 
@@ -220,7 +221,7 @@ def test_report_cover_long_text_moves_plots_to_second_page(eventful: Analysis, c
     page = page_of(replace(SMALL_SIGMA_A, causes=SMALL_SIGMA_A.causes * count))
     with apply_report_style():
         cover_panels.write_panels(
-            page.blocks[0], eventful, SMALL_SIGMA_A, cover.find_free_height(page)
+            page.blocks[0], eventful, SMALL_SIGMA_A, measure_free_height(page)
         )
     first, second = set_by_typst(page)
     assert "Innovations ÷ √S" not in first

@@ -183,7 +183,7 @@ def test_typst_code_in_student_notes_is_printed_as_text() -> None:
 def test_typst_template_cannot_read_files(code: str, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(typesetting, "read_template", lambda: f"#{code}")
     with pytest.raises(typst.TypstError):
-        compile_pdf({"fonts": [fonts.FONT]})
+        compile_pdf({})
 
 
 def offset(**changes: Any) -> SourceTimeOffset:

@@ -18,7 +18,6 @@ from px4fuse.comparison.model import FILTER_NAMES
 from px4fuse.core.text import format_ratio, one_line
 from px4fuse.filter.consistency import Reference
 from px4fuse.finding import format_spans
-from px4fuse.report import fonts
 from px4fuse.report.card_text import (
     AIDS_CAPTION,
     QUANTITY_LABELS,
@@ -32,7 +31,7 @@ from px4fuse.report.card_text import (
     note_texts,
 )
 from px4fuse.report.cover_panels import write_panels
-from px4fuse.report.page import Page, PageBlock, to_typst_data
+from px4fuse.report.page import Page, PageBlock
 from px4fuse.report.style import SEVERITY_COLOURS
 from px4fuse.report.typesetting import measure_free_height
 from px4fuse.results.contract import AidsResults, ComparisonResults
@@ -56,7 +55,7 @@ def draw_pages(analysis: Analysis | AidingSourceAnalysis, results: FlightResults
     page = Page()
     block = add_card(page, results.card)
     if isinstance(analysis, Analysis):
-        write_panels(block, analysis, results.card, find_free_height(page))
+        write_panels(block, analysis, results.card, measure_free_height(page))
     yield page
 
 
@@ -92,12 +91,6 @@ def add_card(page: Page, card: Card) -> PageBlock:
         notes=note_texts(card),
         terms=AIDS_TERMS_NOTE if card.aids else TERMS_NOTE,
         blocks=[],
-    )
-
-
-def find_free_height(page: Page) -> float:
-    return measure_free_height(
-        to_typst_data(page.blocks, ""), fonts.find_font_names(str(page.blocks))
     )
 
 

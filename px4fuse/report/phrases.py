@@ -32,7 +32,6 @@ from px4fuse.flight.ekf2_parameters import EV_POS
 from px4fuse.flight.model import Alignment, ClockMap, Columns, Unavailable
 from px4fuse.report.page import Cell, Page, styled_text
 from px4fuse.report.style import GOOD_COLOUR, MUTED_COLOUR, SEVERITY_COLOURS
-from px4fuse.results.model import Student
 
 if TYPE_CHECKING:
     from px4fuse.analysis import Analysis
@@ -275,10 +274,6 @@ def _make_vision_noise_advice(comparison: PreparedComparison, estimate: NoiseEst
     if low_m <= logged_noise_m <= high_m:
         return f"{name} {logged_noise_m:g} m is within the 95 % interval of the estimate."
     return f"Set {name} to {changes[name]:g} m (now {logged_noise_m:g} m)."
-
-
-def format_student(student: Student) -> str:
-    return ", ".join(filter(None, (student.name, student.id)))
 
 
 def write_findings(page: Page, findings: tuple[Finding, ...]) -> None:
