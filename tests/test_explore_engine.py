@@ -23,7 +23,6 @@ from px4fuse.explore.data import (
     OFFSET_SLIDER_HALF_RANGE_S,
     ArrayEncoder,
     make_kf_inputs,
-    undo_time_offset,
 )
 from px4fuse.filter.kalman import KfRun, predict_state, run_kf
 from px4fuse.filter.settings import Settings
@@ -87,7 +86,8 @@ def in_browser(
 
 def in_python(comparison: Comparison, at: int, settings: Settings) -> KfRun:
     """Run KF in Python with the segment and the aisle of the comparison."""
-    track = shift_timestamps(undo_time_offset(comparison), settings.clock_offset_s)
+    change_s = settings.clock_offset_s - comparison.settings.clock_offset_s
+    track = shift_timestamps(comparison.source, change_s)
     original = list(comparison.axes.values())[at].axis
     axis = make_axes(
         comparison.flight, track, comparison.segment, names=(original.name,),

@@ -45,9 +45,9 @@ MAX_EXACT_INTEGER = 2.0**52
 
 @dataclass
 class ArrayEncoder:
-    """Encoder of arrays; ``array_specs`` are (length, bytes per value, scale) of each array."""
+    """Encoder of arrays; ``array_specs`` are length and scale of each array."""
 
-    array_specs: list[tuple[int, int, float]] = field(default_factory=list)
+    array_specs: list[tuple[int, float]] = field(default_factory=list)
     _encoded_arrays: list[bytes] = field(default_factory=list)
 
     def add(self, values: Array, scale: float = KF_INPUT_STEPS_PER_UNIT) -> dict[str, int]:
@@ -61,13 +61,11 @@ class ArrayEncoder:
             scale /= 2.0
         integers = np.rint(values * scale).astype(np.int64)
         differences = np.diff(integers, prepend=0)
-        # store the sign in the lowest bit, so that small negative numbers need few bytes
+        # store the sign in the lowest bit, so that the high bytes of small numbers are 0
         zigzag_integers = ((differences << 1) ^ (differences >> 63)).astype("<u8")
-        byte_count = max(1, (int(zigzag_integers.max(initial=0)).bit_length() + 7) // 8)
-        self._encoded_arrays.append(
-            zigzag_integers.view(np.uint8).reshape(-1, 8)[:, :byte_count].T.tobytes()
-        )
-        self.array_specs.append((len(values), byte_count, scale))
+        # all lowest bytes, then all second bytes, and so on, which compresses well
+        self._encoded_arrays.append(zigzag_integers.view(np.uint8).reshape(-1, 8).T.tobytes())
+        self.array_specs.append((len(values), scale))
         return {"array": len(self.array_specs) - 1}
 
     def add_times(self, time_s: Array) -> dict[str, int]:
@@ -109,18 +107,14 @@ def make_flight_data(analysis: Analysis, encoder: ArrayEncoder) -> PageData:
 
 def make_kf_inputs(comparison: Comparison, encoder: ArrayEncoder) -> PageData:
     """Return the inputs of KF: positions, accelerations and initial covariance."""
-    source = undo_time_offset(comparison)
+    # positions with their original timestamps
+    source = shift_timestamps(comparison.source, -comparison.settings.clock_offset_s)
     return {
         "segment": [comparison.segment.start_s, comparison.segment.end_s],
         "start": list(INITIAL_COVARIANCE),
         "imu": _make_imu_data(comparison, encoder),
         "axes": [_make_axis_inputs(axis, source, encoder) for axis in comparison.input_axes],
     }
-
-
-def undo_time_offset(comparison: Comparison) -> PositionTrack:
-    """Return the positions with their original timestamps."""
-    return shift_timestamps(comparison.source, -comparison.settings.clock_offset_s)
 
 
 def _find_estimated_offset(analysis: Analysis) -> float | None:
@@ -192,9 +186,9 @@ def _pack_nis_bands(innovation_count: int, encoder: ArrayEncoder) -> list[dict[s
 
 def _make_ekf2_data(
     analysis: Analysis, result: AxisComparison, encoder: ArrayEncoder
-) -> PageData | str:
+) -> PageData | None:
     if isinstance(result.ekf2_state, Unavailable):
-        return result.ekf2_state.reason
+        return None
     state, summary = result.ekf2_state.dropna(), result.filters["ekf2"]
     state_columns = [state["position_m"], state["velocity_m_s"]]
     if isinstance(result.ekf2_variance, pd.DataFrame):
@@ -229,9 +223,9 @@ def _make_ekf2_data(
     return ekf2_data
 
 
-def _make_truth_data(result: AxisComparison, encoder: ArrayEncoder) -> PageData | str:
+def _make_truth_data(result: AxisComparison, encoder: ArrayEncoder) -> PageData | None:
     if isinstance(result.truth, Unavailable):
-        return result.truth.reason
+        return None
     position_m, velocity_m_s = (
         result.truth[name].dropna() for name in ("position_m", "velocity_m_s")
     )

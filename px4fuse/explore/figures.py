@@ -102,12 +102,12 @@ def select_plots(data: PageData) -> dict[str, Plot]:
 
 
 def _has_track(data: PageData, kind: str) -> bool:
-    return any(isinstance(axis[kind], dict) for axis in data["axes"])
+    return any(axis[kind] is not None for axis in data["axes"])
 
 
 def _make_plot(name: str, plot: Plot, data: PageData, shared_time_range: Range1d) -> Any:
     get_source = cache(lambda source: _make_data_source(f"{name}:{source}"))
-    plot_figure = figure(
+    plot_figure: Any = figure(
         name=name,
         height=215,
         sizing_mode="stretch_width",

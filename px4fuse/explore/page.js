@@ -40,7 +40,7 @@ const Explore = (async () => {
     $("offset-note").hidden = false;
     for (const id of ["clock-offset", "clock-offset-value"]) $(id).disabled = true;
   }
-  if (isText(imu)) {
+  if (typeof imu === "string") {
     $("input-note").textContent = imu;
     query("[name=input][value=imu]").disabled = true;
   }
@@ -80,7 +80,7 @@ const Explore = (async () => {
     for (const radio of queryAll("[name=axis], [name=input]")) radio.checked = radio.value === settings[radio.name];
     $("axis-note").textContent = note;
     $("likely").disabled = sigmaA === null;
-    $("ekf2-r").disabled = isText(ekf2) || ekf2.r === null;
+    $("ekf2-r").disabled = !ekf2?.r;
     $("command").textContent = [...words, `--input ${settings.input}`].join(" ");
   }
 
@@ -154,20 +154,20 @@ const Explore = (async () => {
   }
   /* Statistics of a KF run: innovations, difference to EKF2 and error against ground truth, at the times of EKF2's state */
   function numbers(axis, run) {
-    const kf = Engine.assess(run.updates.nu, run.updates.s) ?? {};
-    if (kf.nis !== undefined) {
+    const kf = Engine.assess(run.updates.nu, run.updates.s);
+    if (kf.count) {
       const [low, high] = axis.bands.map((limits) => limits[kf.count - 1]);
       kf.source = Math.sqrt(kf.nis);
       kf.isNisInBand = kf.nis >= low && kf.nis <= high;
     }
     let times = run.steps.time, state = run.steps;
-    if (!isText(axis.ekf2)) {
+    if (axis.ekf2) {
       const [time, p] = axis.ekf2.state;
       times = time;
       state = Engine.stateAt(run, time);
       kf.differenceRms = Engine.rmse(state.p, p);
     }
-    if (!isText(axis.truth)) {
+    if (axis.truth) {
       const expected = Engine.interp(times, ...axis.truth.p, NaN);
       kf.rmse = Engine.rmse(state.p, expected);
       kf.truth = Engine.rmse(state.p.map((x, i) => (x - expected[i]) / Math.sqrt(state.p00[i])), new Float64Array(times.length));
@@ -214,7 +214,7 @@ const Explore = (async () => {
       if (updates.step[u] === i) add(steps.time[i], updates, u++);
       add(steps.time[i], steps, i);
     }
-    const reference = !isText(truth) ? truth.p : isText(ekf2) ? [[], []] : ekf2.state.slice(0, 2);
+    const reference = truth?.p ?? ekf2?.state.slice(0, 2) ?? [[], []];
     const plus = rows.sp.map((sigma) => 2 * sigma), minus = plus.map((x) => -x);
     drawSource("kf", { ...rows, plus, minus, e: errors(rows.t, rows.p, reference) });
     drawSource("gain", { t: updates.time, k0: updates.k0, k1: updates.k1 });
@@ -223,9 +223,9 @@ const Explore = (async () => {
   }
   /* Draw EKF2 and ground truth; missing data are drawn as empty or NaN */
   function drawReferences(axis) {
-    const truth = isText(axis.truth) ? { p: [[], []], v: [[], []] } : axis.truth, [truthTime, truthP] = truth.p;
+    const truth = axis.truth ?? { p: [[], []], v: [[], []] }, [truthTime, truthP] = truth.p;
     drawSource("truth", { t: truthTime, p: truthP, v: Engine.interp(truthTime, ...truth.v, NaN) });
-    const ekf2 = isText(axis.ekf2) ? { state: [[], [], []], innovations: [] } : axis.ekf2;
+    const ekf2 = axis.ekf2 ?? { state: [[], [], []], innovations: [] };
     const [t, p, v, sp = p.map(() => NaN), sv = sp] = ekf2.state;
     drawSource("ekf2", { t, p, v, sp, sv, e: errors(t, p, truth.p) });
     const [time = [], nu = [], sigma = [], rejected] = ekf2.innovations;
@@ -240,12 +240,12 @@ const Explore = (async () => {
       const span = $(name)?.parentElement.querySelector("span");
       if (span) span.textContent = `· ${text}`;
     };
-    const ekf2 = isText(axis.ekf2) ? {} : axis.ekf2.summary;
+    const ekf2 = axis.ekf2?.summary ?? {};
     const both = (name, format) => [["KF", kf?.[name]], ["EKF2", ekf2[name]]]
       .filter(([, value]) => Number.isFinite(value)).map(([filter, value]) => `${filter} ${format(value)}`).join(", ");
     title("innovation", `innovations outside ±2√S (expected 5 %): ${both("outside", (x) => `${(100 * x).toFixed(0)} %`)}`);
-    const rms = isText(axis.truth) ? `KF − EKF2, RMS ${both("differenceRms", Card.formatMetres)}`
-      : `against ground truth, RMSE ${both("rmse", Card.formatMetres)}`;
+    const rms = axis.truth ? `against ground truth, RMSE ${both("rmse", Card.formatMetres)}`
+      : `KF − EKF2, RMS ${both("differenceRms", Card.formatMetres)}`;
     title("error", `${rms} · shaded: ±2σ reported by KF, hatched: gap in the position source`);
   }
 
