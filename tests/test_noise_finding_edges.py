@@ -41,7 +41,7 @@ from px4fuse.findings.noises import _has_default_noises
 from px4fuse.flight.ekf2_parameters import EV_POS, GNSS_POS, PARAMETERS
 from px4fuse.flight.model import AS_RECEIVED_ORIGIN, GNSS_ORIGIN
 from px4fuse.loop.model import Closure, Loop, TrueFinalPose
-from px4fuse.report.phrases import make_tuning_advice
+from px4fuse.report.tuning import make_tuning_advice
 
 MOVING = source(samples=positions(np.arange(0.0, 120.0), np.arange(120.0)))
 HOVERING = source(samples=positions(np.arange(0.0, 120.0)))
