@@ -5,12 +5,12 @@ from __future__ import annotations
 import re
 
 import pytest
-from cards import SMALL_SIGMA_A, verdicts
+from cards import SMALL_SIGMA_A
 from msgspec.structs import replace
 
 from px4fuse.card.model import Action, Card, Note
 from px4fuse.report import card_text
-from px4fuse.report.card_text import draw_sigma_ratio, to_ascii, with_typed_path
+from px4fuse.report.card_text import draw_sigma_ratio, with_typed_path
 
 SENDER = Action("sender", "subtract 0.264 s from the timestamp of each position")
 DELAY = Action("EKF2", "EKF2_EV_DELAY 0 → 264 ms", ("param set EKF2_EV_DELAY 264",), "console")
@@ -91,15 +91,6 @@ def test_diagnosis_text_has_numbered_causes_and_count_of_notes() -> None:
         "note[note_2]: Text 2.",
         '2 more notes are listed in section "All findings" of the report',
     ]
-
-
-def test_diagnosis_text_on_ascii_terminal_is_ascii() -> None:
-    four = verdicts((0.01, "underconfident"), (128.0, "overconfident"), *[(1.0, "consistent")] * 2)
-    text = "\n".join(map(to_ascii, text_of(replace(SMALL_SIGMA_A, verdicts=four))))
-    assert text.isascii()
-    assert "x error / sigma (ground truth)" in text
-    assert "2.11 -> 0.060 m" in text
-    assert "<---" in text
 
 
 def test_commands_in_diagnosis_contain_log_path_as_typed() -> None:

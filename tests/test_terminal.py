@@ -24,7 +24,6 @@ from px4fuse.diagnose import diagnose as analyse
 from px4fuse.errors import OutputError
 from px4fuse.report import card_text, screen
 from px4fuse.report.card_text import format_card_lines, with_typed_path
-from px4fuse.report.page import Page
 from px4fuse.report.screen import print_paragraph, shorten_commands
 from px4fuse.report.terminal import make_comparison_page
 from px4fuse.request import ComparisonRequest, PositionFile, command_line, format_settings_suffix
@@ -108,15 +107,6 @@ def test_terminal_paragraph_has_hanging_indent(capsys) -> None:
     print_paragraph(console, text, Text("Label"), indent=9)
     lines = ["Label    one two three four", "         five six seven"]
     assert capsys.readouterr().out.splitlines() == lines
-
-
-def test_table_on_narrow_terminal_keeps_words_whole(capsys) -> None:
-    page = Page()
-    topics = ["vehicle_visual_odometry", "estimator_aid_src_ev_pos"]
-    page.add_table(["data", "topic", "samples"], [["position", topic, "650"] for topic in topics])
-    screen.print_blocks(Console(width=40, highlight=False), page.blocks)
-    words = capsys.readouterr().out.replace(",", "").split()
-    assert [word for word in words if word in topics] == topics
 
 
 def test_text_output_modules_do_not_import_matplotlib() -> None:

@@ -48,10 +48,6 @@ SEVERITY_STYLES = {
     "note": "cyan",
     "clean": "bold green",
 }
-# Replacements of characters that ASCII terminals cannot print
-ASCII_REPLACEMENTS = str.maketrans("░●◆◀▶─÷−–²³×", ":ox<>-/--23x") | str.maketrans(
-    {"√": "sqrt ", "σ": "sigma", "→": "->", "°": " deg", "±": "+-", "ν": "nu", "…": "..."}
-)
 # Each sentence begins on a new line
 SENTENCE_END_PATTERN = re.compile(r"(?<=\.) (?=[A-Z])")
 ALL_FINDINGS_PLACE = 'in section "All findings" of the report'
@@ -173,15 +169,6 @@ def with_typed_path(card: Card, path: str) -> Card:
         return command.sub(lambda match: match[1] + quote_command([path]), element)
 
     return convert(convert_nested(to_builtins(card), replace_name), Card)
-
-
-def to_ascii(text: str) -> str:
-    """Replace characters that ASCII terminals cannot print.
-
-    >>> to_ascii("error ÷ σ 7.2 → 1.2")
-    'error / sigma 7.2 -> 1.2'
-    """
-    return text.translate(ASCII_REPLACEMENTS)
 
 
 def format_consistent_ratios() -> str:

@@ -8,15 +8,12 @@ from rich.console import Console
 from rich.table import Table
 from rich.text import Text
 
-from px4fuse.report.card_text import CARD_WIDTH, Paragraph, to_ascii
+from px4fuse.report.card_text import CARD_WIDTH, Paragraph
 from px4fuse.report.page import Cell, PageBlock
 from px4fuse.report.style import GOOD_COLOUR, MUTED_COLOUR, SEVERITY_COLOURS
 from px4fuse.request import ComparisonRequest, Request, command_line
 
-# Terminal encodings with all characters of a diagnosis card
-UNICODE_ENCODINGS = ("utf-8", "utf8", "utf-16")
 LABEL_CHARACTERS = 9  # width of a label
-MIN_TABLE_WIDTH = 50  # characters; narrower terminals show no tables
 POINTS_PER_COLUMN = 6.0  # points in the PDF per character on the terminal
 STYLES_BY_COLOUR = {
     MUTED_COLOUR: "dim",
@@ -40,11 +37,6 @@ def print_blocks(
                 print_paragraph(console, _make_rich_text(block), Text(), indent=indent)
             case "labelled":
                 _show_labelled(console, block, request)
-            case "table" if console.width < MIN_TABLE_WIDTH:
-                for row in (block["head"], *block["rows"]):
-                    texts = (cell if isinstance(cell, str) else cell[0] for cell in row)
-                    row_text = Text(", ".join(filter(None, texts)))
-                    print_paragraph(console, row_text, Text(), indent=2)
             case "table":
                 console.print(_make_rich_table(**block))
             case "command":
@@ -56,13 +48,9 @@ def print_blocks(
 
 
 def _show_card(console: Console, paragraphs: Sequence[Paragraph]) -> None:
-    is_ascii_terminal = console.encoding.lower() not in UNICODE_ENCODINGS
     for paragraph in paragraphs:
         for text in paragraph.wrap(min(console.width, CARD_WIDTH)):
-            console.print(
-                Text(to_ascii(text) if is_ascii_terminal else text, paragraph.style),
-                soft_wrap=True,
-            )
+            console.print(Text(text, paragraph.style), soft_wrap=True)
 
 
 def _show_labelled(console: Console, block: PageBlock, request: Request | None) -> None:

@@ -1,6 +1,6 @@
 """Terminal output of ``px4fuse tune``: estimated noises of KF, and advice."""
 
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 
 import numpy as np
 
@@ -56,90 +56,93 @@ def make_tuning_page(
         sentences.append(TUNING_NOTE)
     for text in sentences:
         page.write_small_text(text)
-    page.write_labelled_texts(make_tuning_advice(comparison, tunings))
+    page.write_labelled_texts(dict(list_tuning_advice(comparison, tunings)))
     return page
 
 
-def make_tuning_advice(
+def list_tuning_advice(
     comparison: PreparedComparison, tuning_by_axis: Mapping[str, AxisTuning | Unavailable]
-) -> dict[str, str]:
-    """Return advice from the noise estimates, by label such as "SIGMA_Z"."""
+) -> Iterator[tuple[str, str]]:
+    """Yield advice from the noise estimates as pairs (label, text)."""
     names = (HORIZONTAL, AISLE, *tuning_by_axis)
     tunings = [
         tuning for name in names if isinstance(tuning := tuning_by_axis.get(name), AxisTuning)
     ]
     if not tunings:
-        return {}
-    tuning, axis_name = tunings[0], tunings[0].name
+        return
+    tuning, origin, settings = tunings[0], comparison.source.origin, comparison.settings
     sigma_a, sigma_z = tuning.sigma_a_two_state, tuning.sigma_z
-    advice_by_label, origin = dict[str, str](), comparison.source.origin
-    settings = comparison.settings
+    noises = (
+        ("--sigma-a", sigma_a, settings.sigma_a_m_s2),
+        ("--sigma-z", sigma_z, settings.sigma_z_m),
+    )
+    options = [
+        f"{option} {noise.value:.3g}" for option, noise, _ in noises if noise.value is not None
+    ]
     if origin.may_drift:
-        advice_by_label["Drift"] = (
+        yield (
+            "Drift",
             "The position source may drift. The estimates describe the noise without the drift. Do "
             "not set SIGMA_Z or EKF2_EVP_NOISE below the error shown by ground truth or a loop "
-            "closure."
+            "closure.",
         )
     # Same restriction as the finding kf_underconfident of px4fuse compare
     elif origin.is_gnss and any(
         noise.value is not None and noise.high is not None and noise.high < setting
-        for noise, setting in ((sigma_a, settings.sigma_a_m_s2), (sigma_z, settings.sigma_z_m))
+        for _, noise, setting in noises
     ):
-        advice_by_label["GNSS"] = (
+        yield (
+            "GNSS",
             KEEP_NOISE_BECAUSE_OF_CORRELATION_ACTION.format(sensor="GNSS")
             if isinstance(comparison.flight.truth, Unavailable)
             else "The estimates do not contain the time-correlated error of GNSS. Compare them "
-            "with ground truth: px4fuse compare LOG."
+            "with ground truth: px4fuse compare LOG.",
         )
-    elif sigma_a.value is not None or sigma_z.value is not None:
-        options_text = "".join(
-            f" {option} {noise.value:.3g}"
-            for option, noise in (("--sigma-a", sigma_a), ("--sigma-z", sigma_z))
-            if noise.value is not None
-        )
-        advice_by_label["Action"] = (
-            f"Re-run with the estimated noise ({axis_name}): px4fuse compare LOG{options_text}"
-        )
+    elif options:
+        command = f"px4fuse compare LOG {' '.join(options)}"
+        yield "Action", f"Re-run with the estimated noise ({tuning.name}): {command}"
     if sigma_z.value is None and sigma_z.low is not None:
-        advice_by_label["SIGMA_Z"] = (
+        yield (
+            "SIGMA_Z",
             f"The estimate of SIGMA_Z is at least {sigma_z.low:.2g} m. Possibly the source does "
-            "not measure the position along this axis."
+            "not measure the position along this axis.",
         )
     elif sigma_z.value is None:
         bound_text = "" if sigma_z.high is None else f" (at most {sigma_z.high:.2g} m)"
-        advice_by_label["SIGMA_Z"] = (
+        yield (
+            "SIGMA_Z",
             f"SIGMA_Z{bound_text} cannot be estimated, because the process noise between two "
-            "logged positions is too large. Log the source at a higher rate."
+            "logged positions is too large. Log the source at a higher rate.",
         )
     elif comparison.flight.log.autopilot == "PX4" and not origin.may_drift and origin.is_vision:
-        advice_by_label["PX4"] = _make_vision_noise_advice(comparison, sigma_z)
-        advice_by_label["PX4"] += make_height_noise_advice(
-            comparison, tuning_by_axis, sigma_z.value
-        )
+        height_advice = make_height_noise_advice(comparison, tuning_by_axis, sigma_z.value)
+        yield "PX4", _make_vision_noise_advice(comparison, sigma_z) + height_advice
     if sigma_a.value is None:
-        advice_by_label["SIGMA_A"] = (
+        yield (
+            "SIGMA_A",
             "SIGMA_A cannot be estimated: the flight has too little motion, or is too short."
             if sigma_a.low is None
             else f"The estimate of SIGMA_A is at least {sigma_a.low:.2g} m/s²: logged acceleration "
-            "and positions disagree."
+            "and positions disagree.",
         )
     elif (
         tuning.biases_fitted
         and (accelerometer_noise := tuning.sigma_a.value or tuning.sigma_a.high) is not None
     ):
         bound_text = "" if tuning.sigma_a.value is not None else "at most "
-        advice_by_label["SIGMA_A"] = (
+        yield (
+            "SIGMA_A",
             f"Accelerometer noise alone is {bound_text}{accelerometer_noise:.2g} m/s². The "
             f"estimate of SIGMA_A, {sigma_a.value:.2g} m/s², also includes accelerometer bias and "
-            "tilt error, which are not states of KF."
+            "tilt error, which are not states of KF.",
         )
     if len(tuning.outlier_time_s):
-        advice_by_label["Outliers"] = (
-            f"{len(tuning.outlier_time_s)} of {tuning.count} measurements ({axis_name}) are "
+        yield (
+            "Outliers",
+            f"{len(tuning.outlier_time_s)} of {tuning.count} measurements ({tuning.name}) are "
             f"outliers, the first at {tuning.outlier_time_s[0]:.1f} s. The noise estimates exclude "
-            "them."
+            "them.",
         )
-    return advice_by_label
 
 
 def _make_vision_noise_advice(comparison: PreparedComparison, estimate: NoiseEstimate) -> str:

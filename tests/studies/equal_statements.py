@@ -97,7 +97,7 @@ def flight_outputs(request: ComparisonRequest, flight: Flight | None = None) -> 
     }
     comparison = prepare_comparison(flight, request)
     noises = estimate_noises(comparison)
-    outputs["tune"] = tuning.make_tuning_advice(comparison, noises)
+    outputs["tune"] = dict(tuning.list_tuning_advice(comparison, noises))
     outputs["tune_json"] = to_json_dict(build.make_tuning_results(request, comparison, noises))
     _, offset = estimate_noises_and_time_offset(comparison)
     is_late = isinstance(offset, SourceTimeOffset) and offset.is_significant(offset.remaining_s)
