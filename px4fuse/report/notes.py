@@ -46,29 +46,22 @@ def write_markdown(page: Page, notes: str) -> None:
     from markdown_it import MarkdownIt  # noqa: PLC0415
 
     parser = MarkdownIt("commonmark", {"html": True}).enable(["table", "strikethrough"])
-    # number of the next item of each open list; None for bullets
-    next_numbers: list[int | None] = []
+    next_numbers = list[int]()  # of the next item of each open list; not used for bullets
     level, marker, previous_type, table_rows = 0, "", "", list[list[str]]()
     for token in parser.parse(notes):
         indent = INDENT * min(level, MAX_INDENTS)
         if marker and token.type not in ("paragraph_open", "inline"):
             page.write("", indent=indent, marker=marker)  # the item does not begin with a paragraph
             marker = ""
+        level += token.nesting if token.type.startswith(("list_item", "blockquote")) else 0
         match token.type:
-            case "bullet_list_open":
-                next_numbers.append(None)
-            case "ordered_list_open":
+            case "bullet_list_open" | "ordered_list_open":
                 next_numbers.append(int(token.attrs.get("start", 1)))
             case "bullet_list_close" | "ordered_list_close":
                 next_numbers.pop()
             case "list_item_open":
-                level, number = level + 1, next_numbers[-1]
-                marker = "•" if number is None else f"{number}."
-                next_numbers[-1] = None if number is None else number + 1
-            case "blockquote_open":
-                level += 1
-            case "list_item_close" | "blockquote_close":
-                level -= 1
+                marker = f"{next_numbers[-1]}." if token.info else "•"
+                next_numbers[-1] += 1
             case "fence" | "code_block":
                 code = token.content.rstrip("\n").expandtabs(4).replace(" ", "\N{NO-BREAK SPACE}")
                 page.write(code, colour=MUTED_COLOUR, indent=indent + INDENT)
