@@ -50,7 +50,7 @@ from px4fuse.report.page import (
     UNLABELLED_HEIGHT,
     Page,
     PageBlock,
-    make_two_columns,
+    make_columns,
 )
 from px4fuse.report.panels import (
     LANDING_MARKER_STYLE,
@@ -215,7 +215,7 @@ def write_panels(block: PageBlock, analysis: Analysis, card: Card, free_height: 
         _draw_map(page, analysis, tracks, map_labels, map_height)
         _draw_plots(page, analysis, plots, plots_height - map_height)
         return
-    left_column, right_column = make_two_columns()
+    left_column, right_column = make_columns()
     _draw_map(left_column, analysis, tracks, map_labels, plots_height)
     _draw_plots(right_column, analysis, plots, plots_height)
     page.add_columns(left_column, right_column)

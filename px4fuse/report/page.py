@@ -136,10 +136,10 @@ class Page:
         self.add("columns", columns=blocks, widths=widths, gap=COLUMN_GAP)
 
 
-def make_two_columns() -> tuple[Page, Page]:
-    """Return two columns that fill the page width."""
-    width = (PAGE_WIDTH - COLUMN_GAP) / 2.0
-    return Page(width=width), Page(width=width)
+def make_columns(count: int = 2) -> list[Page]:
+    """Return columns that fill the page width."""
+    width = (PAGE_WIDTH - COLUMN_GAP * (count - 1)) / count
+    return [Page(width=width) for _ in range(count)]
 
 
 def styled_text(text: str, colour: str = TEXT_COLOUR, *, bold: bool = False) -> PageBlock:
