@@ -220,9 +220,7 @@ def test_report_cover_from_same_input_is_byte_identical(eventful: Analysis) -> N
 def test_report_cover_long_text_moves_plots_to_second_page(eventful: Analysis, count: int) -> None:
     page = page_of(replace(SMALL_SIGMA_A, causes=SMALL_SIGMA_A.causes * count))
     with apply_report_style():
-        cover.write_panels(
-            page.blocks[0], eventful, SMALL_SIGMA_A, measure_free_height(page)
-        )
+        cover.write_panels(page.blocks[0], eventful, SMALL_SIGMA_A, measure_free_height(page))
     first, second = set_by_typst(page)
     assert "Innovations ÷ √S" not in first
     assert "Innovations ÷ √S" in second
