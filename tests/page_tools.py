@@ -10,7 +10,6 @@ import numpy as np
 from matplotlib.axes import Axes
 from pypdf import PdfReader
 
-from px4fuse.report import fonts
 from px4fuse.report.page import Page, PageBlock, to_typst_data
 from px4fuse.report.style import apply_report_style
 from px4fuse.report.typesetting import compile_pdf
@@ -78,7 +77,7 @@ def pdf_of(*pages: Page) -> bytes:
         blocks = to_typst_data([block for page in pages for block in page.blocks], "log.ulg")
     report = {
         "title": "t", "author": "a", "head": "", "student": "", "results": None,
-        "fonts": [fonts.FONT], "blocks": blocks,
+        "blocks": blocks,
     }  # fmt: skip
     return compile_pdf(report)
 

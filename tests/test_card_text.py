@@ -112,4 +112,3 @@ def test_commands_in_diagnosis_contain_log_path_as_typed() -> None:
     assert typed.do_this == ("Run px4fuse tune 'my logs/aisle_uwb.ulg'.",)
     assert typed.notes[0].action == "Check it (px4fuse sync 'my logs/aisle_uwb.ulg')."
     assert typed.notes[0].text == "Text of aisle_uwb.ulg."
-    assert with_typed_path(card, None) is card

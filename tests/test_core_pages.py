@@ -14,7 +14,7 @@ from px4fuse.analysis import Analysis
 from px4fuse.comparison.model import Comparison
 from px4fuse.finding import Finding
 from px4fuse.flight.model import Dropout, Reset
-from px4fuse.report import cover, event_marks, flight
+from px4fuse.report import cover, flight, panels
 from px4fuse.report.page import Page
 from px4fuse.report.style import apply_report_style
 from px4fuse.request import ComparisonRequest
@@ -51,12 +51,12 @@ def eventful() -> Analysis:
 
 
 def test_event_symbols_in_plots_are_labelled_by_event_type(eventful: Analysis) -> None:
-    labels = [artist.get_label() for artist in event_marks.make_legend_entries(eventful)]
-    assert labels == [
-        "on the ground", "position gap", "log dropout",
-        "EKF2 rejected", "outlier", "EKF2 reset", "take-off", "landing",
-    ]  # fmt: skip
-    axes = event_marks.add_panel(Page(), eventful, "Events", 100.0)
+    legend = panels.add_legend(Page(), eventful)
+    assert legend["alt"].endswith(
+        "on the ground, position gap, log dropout, EKF2 rejected, outlier, EKF2 reset, take-off, "
+        "landing"
+    )
+    axes = panels.add_time_panel(Page(), eventful, "Events", 100.0)
     (data,) = axes.plot([6.0, 94.0], [2.0, 3.0])
     assert axes.get_xlim() == (eventful.segment.start_s, eventful.segment.end_s)
     assert axes.get_ylim() == pytest.approx((1.95, 3.05))
@@ -68,7 +68,7 @@ def test_event_symbols_in_plots_are_labelled_by_event_type(eventful: Analysis) -
     ]  # fmt: skip
     # rejected, outliers, resets, take-off, landing
     assert [len(line.get_xdata()) for line in axes.lines[2:]] == [1, 1, 1]
-    assert set(axes.lines[1].get_xdata()) <= set(event_marks.find_outlier_times(eventful))
+    assert set(axes.lines[1].get_xdata()) <= set(panels.find_outlier_times(eventful))
 
 
 def test_zoomed_plot_shows_updates_in_middle_of_flight() -> None:

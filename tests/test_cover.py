@@ -17,9 +17,10 @@ from page_tools import axes_of, every, pdf_of, set_by_typst, smallest_type
 from px4fuse.analysis import Analysis
 from px4fuse.card.model import Action, AidConsistency, Card, DiagnosedCause, Note
 from px4fuse.flight.model import Reset
-from px4fuse.report import cover, cover_panels
+from px4fuse.report import cover
 from px4fuse.report.page import Page
 from px4fuse.report.style import apply_report_style
+from px4fuse.report.typesetting import measure_free_height
 from px4fuse.request import ComparisonRequest
 from px4fuse.results.build import make_comparison_results
 
@@ -99,7 +100,7 @@ def test_report_cover_shows_3_notes_and_counts_the_others() -> None:
 def test_report_cover_leaves_no_space_for_empty_text(field: str, empty: Any) -> None:
     card = replace(SMALL_SIGMA_A, reconcile="The two verdicts differ.")
     heights = [
-        cover.find_free_height(page_of(each)) for each in (card, replace(card, **{field: empty}))
+        measure_free_height(page_of(each)) for each in (card, replace(card, **{field: empty}))
     ]
     assert heights[1] > heights[0] + 8.0
 
@@ -197,11 +198,11 @@ def test_cover_map_title_states_farthest_distance_outside_map() -> None:
 
 
 def test_innovations_beyond_plot_scale_are_drawn_as_triangles(eventful: Analysis) -> None:
-    plot = cover_panels._make_innovation_plot(eventful.main)
+    plot = cover._make_innovation_plot(eventful.main)
     updates = eventful.main.kf_run.updates
     normalised = updates["innovation_m"] / np.sqrt(updates["innovation_variance_m2"])
     largest = float(normalised.abs().max())
-    assert largest > cover_panels.MAX_DRAWN_SIGMAS
+    assert largest > cover.MAX_DRAWN_SIGMAS
     assert f"beyond ±4, largest KF {largest:.0f}" in plot.title
     axes = panels_by_title(drawn(eventful))[plot.title]
     edges = [
@@ -219,9 +220,7 @@ def test_report_cover_from_same_input_is_byte_identical(eventful: Analysis) -> N
 def test_report_cover_long_text_moves_plots_to_second_page(eventful: Analysis, count: int) -> None:
     page = page_of(replace(SMALL_SIGMA_A, causes=SMALL_SIGMA_A.causes * count))
     with apply_report_style():
-        cover_panels.write_panels(
-            page.blocks[0], eventful, SMALL_SIGMA_A, cover.find_free_height(page)
-        )
+        cover.write_panels(page.blocks[0], eventful, SMALL_SIGMA_A, measure_free_height(page))
     first, second = set_by_typst(page)
     assert "Innovations ÷ √S" not in first
     assert "Innovations ÷ √S" in second

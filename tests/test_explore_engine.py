@@ -18,8 +18,12 @@ from flights import Imu, Uwb, aisle_flight
 
 from px4fuse.comparison.model import Comparison
 from px4fuse.comparison.preparation import shift_timestamps
-from px4fuse.explore.data import OFFSET_SLIDER_HALF_RANGE_S, make_kf_inputs, undo_time_offset
-from px4fuse.explore.packing import KF_INPUT_STEPS_PER_UNIT, ArrayEncoder
+from px4fuse.explore.data import (
+    KF_INPUT_STEPS_PER_UNIT,
+    OFFSET_SLIDER_HALF_RANGE_S,
+    ArrayEncoder,
+    make_kf_inputs,
+)
 from px4fuse.filter.kalman import KfRun, predict_track, run_kf
 from px4fuse.filter.settings import Settings
 from px4fuse.filter.signals import make_axes
@@ -82,7 +86,8 @@ def in_browser(
 
 def in_python(comparison: Comparison, at: int, settings: Settings) -> KfRun:
     """Run KF in Python with the segment and the aisle of the comparison."""
-    track = shift_timestamps(undo_time_offset(comparison), settings.clock_offset_s)
+    change_s = settings.clock_offset_s - comparison.settings.clock_offset_s
+    track = shift_timestamps(comparison.source, change_s)
     original = list(comparison.axes.values())[at].axis
     axis = make_axes(
         comparison.flight, track, comparison.segment, names=(original.name,),

@@ -201,8 +201,8 @@ def test_explore_page_ekf2_curves_equal_logged_values(
         assert len(drawn[0]) > 100
         expected = np.interp(drawn[0], logged.index, logged)
         np.testing.assert_allclose(drawn[1], expected, rtol=0.0, atol=2e-6)
-    open_view(page, "track")
-    rejected = "e.model('strip-source').data.row.filter((row) => row === 'EKF2 rejected').length"
+    open_view(page, "errors")
+    rejected = "e.model('innovation:rejected-source').data.x.length"
     count = ask(page, f"Explore.then((e) => {rejected})")
     assert count == (result.ekf2_innovations["rejected"] > 0).sum()
 

@@ -35,9 +35,8 @@ from px4fuse.batch.page import format_html
 from px4fuse.cli import COMMANDS as CLI_COMMANDS
 from px4fuse.cli.mcp import make_tools, run_command
 from px4fuse.core.text import to_json_types
-from px4fuse.explore.data import make_flight_data
+from px4fuse.explore.data import ArrayEncoder, make_flight_data
 from px4fuse.explore.figures import make_document_json
-from px4fuse.explore.packing import ArrayEncoder
 from px4fuse.report import pdf
 from px4fuse.simulation.faults import FAULT_TYPES, parse_faults
 from px4fuse.simulation.flights import make_answer_key, simulate

@@ -41,7 +41,7 @@ from px4fuse.findings.noises import _has_default_noises
 from px4fuse.flight.ekf2_parameters import EV_POS, GNSS_POS, PARAMETERS
 from px4fuse.flight.model import AS_RECEIVED_ORIGIN, GNSS_ORIGIN
 from px4fuse.loop.model import Closure, Loop, TrueFinalPose
-from px4fuse.report.phrases import make_tuning_advice
+from px4fuse.report.tuning import list_tuning_advice
 
 MOVING = source(samples=positions(np.arange(0.0, 120.0), np.arange(120.0)))
 HOVERING = source(samples=positions(np.arange(0.0, 120.0)))
@@ -181,7 +181,7 @@ def test_tune_advises_no_smaller_noise_of_gnss(
     flight = analysis(
         source=source(samples=MOVING.samples, origin=origin), log=log(autopilot="ArduPilot")
     )
-    assert make_tuning_advice(flight, fitted).keys() == expected
+    assert dict(list_tuning_advice(flight, fitted)).keys() == expected
 
 
 def test_sigma_z_below_5_mm_states_smallest_rerun_value() -> None:

@@ -66,7 +66,8 @@ def test_drawn_tick_labels_are_those_of_matplotlib(plot: Callable[[Axes], None])
         expected.set_position(drawn.get_position())
         expected.figure.set_size_inches(drawn.figure.get_size_inches())
         expected.figure.draw_without_rendering()
-        for axis, ticks in ((expected.xaxis, block["x_ticks"]), (expected.yaxis, block["y_ticks"])):
+        for axis, name in ((expected.xaxis, "x_axis"), (expected.yaxis, "y_axis")):
+            ticks, _ = block[name]
             fractions, labels = zip(*read_ticks(axis), strict=True)
             assert [label for _, label in ticks] == list(labels)
             assert [fraction for fraction, _ in ticks] == pytest.approx(fractions, abs=1e-9)
@@ -92,5 +93,5 @@ def test_common_offset_of_tick_labels_is_part_of_axis_label() -> None:
 
     with apply_report_style():
         _, block = render(plot_utm_coordinates)
-    assert block["x_label"] == "east (m) +5.8e6"
-    assert block["y_label"] == "north (m) +4.7e6"
+    assert block["x_axis"][1] == "east (m) +5.8e6"
+    assert block["y_axis"][1] == "north (m) +4.7e6"

@@ -81,7 +81,7 @@ def test_terminal_summary_wraps_without_cutting_text(document, monkeypatch) -> N
             monkeypatch.setenv("COLUMNS", str(width))
         console = make_console()
         with console.capture() as captured:
-            page = make_comparison_page(*document, verbose=True)
+            page = make_comparison_page(*document, document[0].request.log, verbose=True)
             screen.print_blocks(console, page.blocks, document[0].request)
         summaries[width] = captured.get()
     whole = summaries[None]

@@ -52,6 +52,7 @@ def compare(
     from px4fuse.card.build import build_unusable_log_card
     from px4fuse.core.memory import release_free_memory
     from px4fuse.diagnose import diagnose_or_check_aids
+    from px4fuse.report.card_text import format_card_lines, format_closing_lines
     from px4fuse.report.terminal import make_card_page, make_comparison_page
     from px4fuse.results.build import make_comparison_or_aids_results
 
@@ -76,14 +77,13 @@ def compare(
     except (LogError, MissingDataError) as error:
         if not sys.stderr.isatty():  # a program reads the error: one line, no diagnosis card
             raise
-        outputs.show_page(
-            make_card_page("card", build_unusable_log_card(error, log)), uses_stderr=True
-        )
+        card = build_unusable_log_card(error, log)
+        outputs.show_page(make_card_page(format_card_lines(card)), uses_stderr=True)
         sys.exit(2)
-    page = make_comparison_page(outcome, results, verbose=verbose, quiet=quiet)
+    page = make_comparison_page(outcome, results, request.log, verbose=verbose, quiet=quiet)
     outputs.write_and_print_results(contents, page, request)
     if not quiet and STANDARD_OUTPUT not in contents:
-        outputs.show_page(make_card_page("closing", results.card, verbose=verbose))
+        outputs.show_page(make_card_page(format_closing_lines(results.card, verbose=verbose)))
     failed_verdicts = find_failed_checks(outcome) if checks else {}
     for name, verdict in failed_verdicts.items():
         click.echo(f"{name}: {verdict.replace('_', ' ')}", err=True)

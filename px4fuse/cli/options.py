@@ -421,11 +421,7 @@ def read_student(option_values: dict[str, Any], log: Path) -> Student:
     )
     notes = ""
     if notes_path is not None:
-        from px4fuse.report.notes import parse_markdown  # imported on demand, because it is slow
-
         notes = read_text(notes_path, SettingsError, MAX_NOTES_BYTES, name=f"--notes {notes_path}")
-        # report errors in the notes before the analysis
-        parse_markdown(notes, f"--notes {notes_path}")
     answers = UNSET if answers_path is None else read_answers(answers_path)
     if answers and answers.log_sha256 != hashlib.sha256(read_log_bytes(log)).hexdigest():
         raise SettingsError(

@@ -1,7 +1,13 @@
-"""Data of one flight for the interactive web page of ``px4fuse explore``."""
+"""Data of one flight for the interactive web page of ``px4fuse explore``.
 
+The arrays are encoded compactly: numbers are rounded to integers, and the bytes of their
+differences are compressed (deflate).
+"""
+
+import base64
+import zlib
 from collections.abc import Iterable
-from dataclasses import asdict
+from dataclasses import asdict, dataclass, field
 from typing import Any
 
 import msgspec
@@ -14,7 +20,7 @@ from px4fuse.analysis import Analysis
 from px4fuse.comparison.model import AxisComparison, Comparison
 from px4fuse.comparison.preparation import shift_timestamps
 from px4fuse.comparison.remedy import find_aid
-from px4fuse.explore.packing import DRAWN_VALUE_STEPS_PER_UNIT, ArrayEncoder
+from px4fuse.core.arrays import Array
 from px4fuse.filter.consistency import CONFIDENCE_LEVEL
 from px4fuse.filter.model import INITIAL_COVARIANCE
 from px4fuse.filter.settings import SETTING_RANGES
@@ -29,13 +35,52 @@ from px4fuse.request import DT_S, SIGMA_A_M_S2, ComparisonRequest, command_line
 PageData = dict[str, Any]
 # Half the range (s) of the slider for the time offset
 OFFSET_SLIDER_HALF_RANGE_S = 0.6
-OFFSET_FIXED_REASON = "You cannot change this offset: it aligns the position file with the log."
+# Rounding steps per unit (m, m/s or s) for the inputs of KF; integers compress well
+KF_INPUT_STEPS_PER_UNIT = 2.0**36
+# Rounding steps per unit for values that are only drawn or averaged
+DRAWN_VALUE_STEPS_PER_UNIT = 1e6
+# Limit of the rounded values: JavaScript represents integers exactly up to twice this limit
+MAX_EXACT_INTEGER = 2.0**52
+
+
+@dataclass
+class ArrayEncoder:
+    """Encoder of arrays; ``array_specs`` are length and scale of each array."""
+
+    array_specs: list[tuple[int, float]] = field(default_factory=list)
+    _encoded_arrays: list[bytes] = field(default_factory=list)
+
+    def add(self, values: Array, scale: float = KF_INPUT_STEPS_PER_UNIT) -> dict[str, int]:
+        """Add an array, rounded to ``scale`` steps per unit.
+
+        Return ``{"array": index}``, which replaces the array in the JSON data.
+        """
+        values = np.asarray(values, dtype=np.float64)
+        largest_value = float(np.max(np.abs(values), initial=1.0))
+        while largest_value * scale > MAX_EXACT_INTEGER:
+            scale /= 2.0
+        integers = np.rint(values * scale).astype(np.int64)
+        differences = np.diff(integers, prepend=0)
+        # store the sign in the lowest bit, so that the high bytes of small numbers are 0
+        zigzag_integers = ((differences << 1) ^ (differences >> 63)).astype("<u8")
+        # all lowest bytes, then all second bytes, and so on, which compresses well
+        self._encoded_arrays.append(zigzag_integers.view(np.uint8).reshape(-1, 8).T.tobytes())
+        self.array_specs.append((len(values), scale))
+        return {"array": len(self.array_specs) - 1}
+
+    def add_times(self, time_s: Array) -> dict[str, int]:
+        has_whole_microseconds = bool(np.all(np.abs(np.rint(time_s * 1e6) / 1e6 - time_s) < 1e-10))
+        return self.add(time_s, 1e6 if has_whole_microseconds else KF_INPUT_STEPS_PER_UNIT)
+
+    def text(self) -> str:
+        """Return all arrays, compressed, as one base64 text."""
+        return base64.b64encode(zlib.compress(b"".join(self._encoded_arrays), 9)).decode()
 
 
 def make_flight_data(analysis: Analysis, encoder: ArrayEncoder) -> PageData:
     """Return the data of one flight for JSON; ``encoder`` encodes the arrays."""
     inputs = make_kf_inputs(analysis, encoder)
-    events, request = analysis.events, analysis.request
+    request = analysis.request
     assert request is not None
     offset_s = analysis.settings.clock_offset_s
     # a position file is aligned with the log, so its offset is fixed
@@ -52,36 +97,24 @@ def make_flight_data(analysis: Analysis, encoder: ArrayEncoder) -> PageData:
             for axis_inputs, result in zip(inputs["axes"], analysis.axes.values(), strict=True)
         ],
         "likely": _collect_estimated_noises(analysis),
-        "events": {
-            "gap": events.gaps,
-            "dropout": events.dropouts,
-            "ground": events.ground_spans_s,
-            "reset": list(events.reset_times_s),
-        },
+        "likely_offset": _find_estimated_offset(analysis),
+        "gaps": analysis.events.gaps,
         "command": _make_command(request, analysis),
         "limits": limits | {"clock_offset_s": (offset_s - half_range_s, offset_s + half_range_s)},
-        "offset": {
-            "likely": _find_estimated_offset(analysis),
-            "why": OFFSET_FIXED_REASON if request.position is not None else "",
-        },
         "flown": _format_ekf2_settings(analysis),
     }
 
 
 def make_kf_inputs(comparison: Comparison, encoder: ArrayEncoder) -> PageData:
     """Return the inputs of KF: positions, accelerations and initial covariance."""
-    source = undo_time_offset(comparison)
+    # positions with their original timestamps
+    source = shift_timestamps(comparison.source, -comparison.settings.clock_offset_s)
     return {
         "segment": [comparison.segment.start_s, comparison.segment.end_s],
         "start": list(INITIAL_COVARIANCE),
         "imu": _make_imu_data(comparison, encoder),
         "axes": [_make_axis_inputs(axis, source, encoder) for axis in comparison.input_axes],
     }
-
-
-def undo_time_offset(comparison: Comparison) -> PositionTrack:
-    """Return the positions with their original timestamps."""
-    return shift_timestamps(comparison.source, -comparison.settings.clock_offset_s)
 
 
 def _find_estimated_offset(analysis: Analysis) -> float | None:
@@ -153,9 +186,9 @@ def _pack_nis_bands(innovation_count: int, encoder: ArrayEncoder) -> list[dict[s
 
 def _make_ekf2_data(
     analysis: Analysis, result: AxisComparison, encoder: ArrayEncoder
-) -> PageData | str:
+) -> PageData | None:
     if isinstance(result.ekf2_state, Unavailable):
-        return result.ekf2_state.reason
+        return None
     state, summary = result.ekf2_state.dropna(), result.filters["ekf2"]
     state_columns = [state["position_m"], state["velocity_m_s"]]
     if isinstance(result.ekf2_variance, pd.DataFrame):
@@ -190,9 +223,9 @@ def _make_ekf2_data(
     return ekf2_data
 
 
-def _make_truth_data(result: AxisComparison, encoder: ArrayEncoder) -> PageData | str:
+def _make_truth_data(result: AxisComparison, encoder: ArrayEncoder) -> PageData | None:
     if isinstance(result.truth, Unavailable):
-        return result.truth.reason
+        return None
     position_m, velocity_m_s = (
         result.truth[name].dropna() for name in ("position_m", "velocity_m_s")
     )

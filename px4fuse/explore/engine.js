@@ -38,19 +38,14 @@ const Engine = (() => {
     return { mean, gapFraction };
   }
 
-  /* Position measurements (s, m) in the analysed segment, after the correction of their time offset */
-  function measured(axis, segment, offset) {
-    const time = [], z = [];
-    for (let i = 0; i < axis.time.length; i++) {
-      const t = axis.time[i] + offset;
-      if (t >= segment[0] && t <= segment[1]) { time.push(t); z.push(axis.z[i]); }
-    }
-    return { time, z };
-  }
-
   /* Time steps of KF: grid of DT and measurement times (steps.make_prediction_steps) */
   function timeline(flight, axis, settings) {
-    const { time: all, z } = measured(axis, flight.segment, settings.clock_offset_s);
+    // measurements (s, m) in the analysed segment, after the correction of their time offset
+    const all = [], z = [], [start, end] = flight.segment;
+    for (let i = 0; i < axis.time.length; i++) {
+      const t = axis.time[i] + settings.clock_offset_s;
+      if (t >= start && t <= end) { all.push(t); z.push(axis.z[i]); }
+    }
     if (all.length < MIN_MEASUREMENTS) return null;
     const first = all[0], times = [], index = [];
     for (let i = 1; i < all.length; i++) {
@@ -149,11 +144,11 @@ const Engine = (() => {
     return { p: position, p00: variance };
   }
 
-  /* Statistics of innovations (consistency.assess_innovations); null for fewer than MIN_INNOVATIONS */
+  /* Statistics of innovations (consistency.assess_innovations); none for fewer than MIN_INNOVATIONS */
   function assess(nu, s) {
     let square = 0, outside = 0;
     const n = nu.length;
-    if (n < MIN_INNOVATIONS) return null;
+    if (n < MIN_INNOVATIONS) return {};
     for (let i = 0; i < n; i++) {
       const normalised = nu[i] / Math.sqrt(s[i]);
       square += normalised * normalised;
@@ -172,20 +167,20 @@ const Engine = (() => {
     return n < MIN_COMMON_SAMPLES ? null : Math.sqrt(square / n);
   }
 
-  /* Decode the arrays of px4fuse.explore.packing */
+  /* Decode the arrays of px4fuse.explore.data */
   async function unpack(text, specs) {
     const all = new Uint8Array(await inflate(text).arrayBuffer());
     let from = 0;
-    return specs.map(([length, planes, scale]) => {
+    return specs.map(([length, scale]) => {
       const out = new Float64Array(length);
       let sum = 0;
       for (let i = 0; i < length; i++) {
         let code = 0;
-        for (let b = planes - 1; b >= 0; b--) code = code * 256 + all[from + b * length + i];
+        for (let b = 7; b >= 0; b--) code = code * 256 + all[from + b * length + i];
         sum += code % 2 ? -(code + 1) / 2 : code / 2;
         out[i] = sum / scale;
       }
-      from += length * planes;
+      from += length * 8;
       return out;
     });
   }

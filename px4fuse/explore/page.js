@@ -7,7 +7,7 @@ const Explore = (async () => {
   const arrays = await Engine.unpack(read("arrays"), JSON.parse(read("content")).packed);
   const withArrays = (_, value) => value?.array === undefined ? value : arrays[value.array];
   const { flight, ratio_axis: ratioAxis, places } = JSON.parse(read("content"), withArrays);
-  const { imu, axes, offset } = flight;
+  const { imu, axes } = flight;
 
   // ------------------------------------------------------------------ settings
   const settings = { ...flight.settings, axis: flight.main };
@@ -26,7 +26,8 @@ const Explore = (async () => {
     Object.assign(settings, changes);
     nextFrame ??= requestAnimationFrame(show);
   }
-  [$("clock-offset").min, $("clock-offset").max] = flight.limits.clock_offset_s;
+  const offsetSlider = $("clock-offset");
+  [offsetSlider.min, offsetSlider.max] = flight.limits.clock_offset_s;
   for (const [id, key] of Object.entries(SETTINGS)) {
     const slider = $(id), number = $(`${id}-value`);
     [number.min, number.max] = flight.limits[key];
@@ -35,11 +36,11 @@ const Explore = (async () => {
       if (number.reportValidity()) set({ [key]: number.valueAsNumber });
     });
   }
-  if (offset.why) {
-    $("offset-note").textContent = offset.why;
+  if (offsetSlider.min === offsetSlider.max) {
+    $("offset-note").hidden = false;
     for (const id of ["clock-offset", "clock-offset-value"]) $(id).disabled = true;
   }
-  if (isText(imu)) {
+  if (typeof imu === "string") {
     $("input-note").textContent = imu;
     query("[name=input][value=imu]").disabled = true;
   }
@@ -66,7 +67,7 @@ const Explore = (async () => {
   /* Show the settings, their maximum-likelihood estimates and the command with these settings */
   function showSettings() {
     const [sigmaA, sigmaZ] = likelyNow(), { ekf2, note } = axisNow();
-    const likely = { "sigma-a": sigmaA, "sigma-z": sigmaZ, "clock-offset": offset.likely };
+    const likely = { "sigma-a": sigmaA, "sigma-z": sigmaZ, "clock-offset": flight.likely_offset };
     const words = [flight.command];
     for (const [id, key] of Object.entries(SETTINGS)) {
       const value = settings[key], slider = $(id);
@@ -79,7 +80,7 @@ const Explore = (async () => {
     for (const radio of queryAll("[name=axis], [name=input]")) radio.checked = radio.value === settings[radio.name];
     $("axis-note").textContent = note;
     $("likely").disabled = sigmaA === null;
-    $("ekf2-r").disabled = isText(ekf2) || ekf2.r === null;
+    $("ekf2-r").disabled = !ekf2?.r;
     $("command").textContent = [...words, `--input ${settings.input}`].join(" ");
   }
 
@@ -98,7 +99,6 @@ const Explore = (async () => {
   await Bokeh.embed.embed_items({ page: JSON.parse(read("document")) }, [
     { docid: "page", roots: places, root_ids: Object.keys(places) }]);
   const model = (name) => Bokeh.documents[0].get_model_by_name(name);
-  const setSource = (name, data) => { model(`${name}-source`).data = data; };
   /* Draw columns, reduced to MAX_POINTS, in each visible plot with this source */
   function drawSource(name, columns) {
     for (const { id, dataset } of queryAll(`.plot[data-view=${view}] > div`)) {
@@ -154,20 +154,20 @@ const Explore = (async () => {
   }
   /* Statistics of a KF run: innovations, difference to EKF2 and error against ground truth, at the times of EKF2's state */
   function numbers(axis, run) {
-    const kf = Engine.assess(run.updates.nu, run.updates.s) ?? {};
-    if (kf.nis !== undefined) {
+    const kf = Engine.assess(run.updates.nu, run.updates.s);
+    if (kf.count) {
       const [low, high] = axis.bands.map((limits) => limits[kf.count - 1]);
       kf.source = Math.sqrt(kf.nis);
       kf.isNisInBand = kf.nis >= low && kf.nis <= high;
     }
     let times = run.steps.time, state = run.steps;
-    if (!isText(axis.ekf2)) {
+    if (axis.ekf2) {
       const [time, p] = axis.ekf2.state;
       times = time;
       state = Engine.stateAt(run, time);
       kf.differenceRms = Engine.rmse(state.p, p);
     }
-    if (!isText(axis.truth)) {
+    if (axis.truth) {
       const expected = Engine.interp(times, ...axis.truth.p, NaN);
       kf.rmse = Engine.rmse(state.p, expected);
       kf.truth = Engine.rmse(state.p.map((x, i) => (x - expected[i]) / Math.sqrt(state.p00[i])), new Float64Array(times.length));
@@ -214,7 +214,7 @@ const Explore = (async () => {
       if (updates.step[u] === i) add(steps.time[i], updates, u++);
       add(steps.time[i], steps, i);
     }
-    const reference = !isText(truth) ? truth.p : isText(ekf2) ? [[], []] : ekf2.state.slice(0, 2);
+    const reference = truth?.p ?? ekf2?.state.slice(0, 2) ?? [[], []];
     const plus = rows.sp.map((sigma) => 2 * sigma), minus = plus.map((x) => -x);
     drawSource("kf", { ...rows, plus, minus, e: errors(rows.t, rows.p, reference) });
     drawSource("gain", { t: updates.time, k0: updates.k0, k1: updates.k1 });
@@ -223,9 +223,9 @@ const Explore = (async () => {
   }
   /* Draw EKF2 and ground truth; missing data are drawn as empty or NaN */
   function drawReferences(axis) {
-    const truth = isText(axis.truth) ? { p: [[], []], v: [[], []] } : axis.truth, [truthTime, truthP] = truth.p;
+    const truth = axis.truth ?? { p: [[], []], v: [[], []] }, [truthTime, truthP] = truth.p;
     drawSource("truth", { t: truthTime, p: truthP, v: Engine.interp(truthTime, ...truth.v, NaN) });
-    const ekf2 = isText(axis.ekf2) ? { state: [[], [], []], innovations: [] } : axis.ekf2;
+    const ekf2 = axis.ekf2 ?? { state: [[], [], []], innovations: [] };
     const [t, p, v, sp = p.map(() => NaN), sv = sp] = ekf2.state;
     drawSource("ekf2", { t, p, v, sp, sv, e: errors(t, p, truth.p) });
     const [time = [], nu = [], sigma = [], rejected] = ekf2.innovations;
@@ -234,30 +234,18 @@ const Explore = (async () => {
       drawSource(name, innovationRows(...columns, "square"));
     }
   }
-  function drawEvents({ ekf2 }) {
-    const { events } = flight, minWidth = (lastTime - firstTime) / 800, widen = (t) => [t, t + minWidth];
-    const spans = { "on the ground": events.ground, "gap in source": events.gap, "log dropout": events.dropout };
-    if (!isText(ekf2)) {
-      const [time = [], , , rejected] = ekf2.innovations;
-      spans["EKF2 reset"] = events.reset.map(widen);
-      spans["EKF2 rejected"] = [...time].filter((_, i) => rejected[i]).map(widen);
-    }
-    const rows = Object.entries(spans).flatMap(([row, list]) => list.map((span) => [row, ...span]));
-    const [row, left, right] = [0, 1, 2].map((column) => rows.map((cells) => cells[column]));
-    setSource("strip", { row, left, right });
-  }
   /* Add RMSE and the percentage of large innovations to the titles of the plots */
   function drawTitles({ axis, numbers: kf }) {
     const title = (name, text) => {
       const span = $(name)?.parentElement.querySelector("span");
       if (span) span.textContent = `· ${text}`;
     };
-    const ekf2 = isText(axis.ekf2) ? {} : axis.ekf2.summary;
+    const ekf2 = axis.ekf2?.summary ?? {};
     const both = (name, format) => [["KF", kf?.[name]], ["EKF2", ekf2[name]]]
       .filter(([, value]) => Number.isFinite(value)).map(([filter, value]) => `${filter} ${format(value)}`).join(", ");
     title("innovation", `innovations outside ±2√S (expected 5 %): ${both("outside", (x) => `${(100 * x).toFixed(0)} %`)}`);
-    const rms = isText(axis.truth) ? `KF − EKF2, RMS ${both("differenceRms", Card.formatMetres)}`
-      : `against ground truth, RMSE ${both("rmse", Card.formatMetres)}`;
+    const rms = axis.truth ? `against ground truth, RMSE ${both("rmse", Card.formatMetres)}`
+      : `KF − EKF2, RMS ${both("differenceRms", Card.formatMetres)}`;
     title("error", `${rms} · shaded: ±2σ reported by KF, hatched: gap in the position source`);
   }
 
@@ -291,7 +279,7 @@ const Explore = (async () => {
     slider.value = measurement;
     slider.ariaValueText = text;
     $("now").textContent = `${text}, at ${time.toFixed(3)} s`;
-    if (view === "step") Step.draw(run, measurement, model("step"), setSource);
+    if (view === "step") Step.draw(run, measurement, model);
   }
 
   // ------------------------------------------------------------------ whole page
@@ -303,7 +291,6 @@ const Explore = (async () => {
     drawCard(result);
     $("span").textContent = `${timeRange.start.toFixed(1)} s to ${timeRange.end.toFixed(1)} s`;
     drawTitles(result);
-    if (view === "track") drawEvents(result.axis);
     drawReferences(result.axis);
     if (result.run === null) return;
     drawKf(result);

@@ -6,9 +6,8 @@ from importlib.metadata import version
 from bokeh.resources import Resources
 
 from px4fuse.analysis import Analysis
-from px4fuse.explore.data import PageData, make_flight_data
-from px4fuse.explore.figures import PAGE_LAYOUT, has_truth_or_ekf2, make_document_json
-from px4fuse.explore.packing import ArrayEncoder
+from px4fuse.explore.data import ArrayEncoder, PageData, make_flight_data
+from px4fuse.explore.figures import TITLE_BY_TAB, make_document_json, select_plots
 from px4fuse.html.safe import (
     clean_values,
     compute_csp_hash,
@@ -109,9 +108,8 @@ def make_page_html(
         made_from=f"px4fuse {command} {sha256}".rstrip(),
         made_with=f"px4fuse {version('px4fuse')}",
         choices=choices,
-        tabs=PAGE_LAYOUT.tabs,
-        plots=PAGE_LAYOUT.plots,
+        tabs=TITLE_BY_TAB,
+        plots=select_plots(data),
         axis_names=[axis["name"] for axis in data["axes"]],
-        has_truth_or_ekf2=has_truth_or_ekf2(data),
         **fields,
     )

@@ -21,8 +21,7 @@ from px4fuse.comparison.preparation import prepare_comparison_inputs
 from px4fuse.core.record import Record, read_toml
 from px4fuse.core.text import capitalise_first
 from px4fuse.diagnose import diagnose_comparison
-from px4fuse.explore.data import make_flight_data
-from px4fuse.explore.packing import ArrayEncoder
+from px4fuse.explore.data import ArrayEncoder, make_flight_data
 from px4fuse.explore.page import make_data_elements, make_page_html
 from px4fuse.finding import Finding
 from px4fuse.report.card_html import make_card_html

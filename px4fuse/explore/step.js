@@ -53,12 +53,12 @@ const Step = (() => {
     ];
   }
 
-  /* Draw the ellipses before and after an update, and list its equations; `plot` is the phase plane */
-  function draw(run, measurement, plot, setSource) {
-    const [, prior, posterior] = states(run, measurement), { p, v } = posterior;
-    setSource("before", ellipse(prior));
-    setSource("now", ellipse(posterior));
-    setSource("mean", { p: [p], v: [v] });
+  /* Draw the ellipses before and after an update, and list its equations; `model` finds a part of the plot by its name */
+  function draw(run, measurement, model) {
+    const [, prior, posterior] = states(run, measurement), { p, v } = posterior, plot = model("step");
+    model("before-source").data = ellipse(prior);
+    model("now-source").data = ellipse(posterior);
+    model("mean-source").data = { p: [p], v: [v] };
     const [band, line] = ["band", "measurement"].map((name) => plot.center.find((item) => item.name === name));
     const reach = 2 * run.settings.sigma_z_m;
     [band.left, band.right] = [prior.z - reach, prior.z + reach];

@@ -9,5 +9,3 @@ const make = (tag, text = "", properties = {}) => Object.assign(document.createE
 /* Fraction of a logarithmic axis */
 const axisFraction = (ratio, [low, high]) => Math.log(ratio / low) / Math.log(high / low);
 const onClick = (id, act) => $(id).addEventListener("click", act);
-/* True for data that are missing: the page then contains the reason as a text */
-const isText = (data) => typeof data === "string";

@@ -11,9 +11,8 @@ from px4fuse.core.text import format_number
 from px4fuse.ekf2.aids import AidResult, find_flight_span
 from px4fuse.flight.model import AidLog, Flight, Unavailable, sample_step_function
 from px4fuse.report import style
-from px4fuse.report.event_marks import ON_GROUND_BAND_STYLE
 from px4fuse.report.page import Cell, Page
-from px4fuse.report.panels import draw_dots
+from px4fuse.report.panels import ON_GROUND_BAND_STYLE, draw_dots
 from px4fuse.report.phrases import VERDICT_LEGEND, format_sigma_verdict
 
 LEAD_TEXT = (

@@ -18,18 +18,7 @@ from px4fuse.errors import SettingsError
 from px4fuse.filter.consistency import CONSISTENT_SIGMA_RATIOS
 from px4fuse.finding import format_spans
 from px4fuse.html.safe import load_template, read_asset
-from px4fuse.report.card_text import (
-    LABELLED_RATIO_TICKS,
-    QUANTITY_LABELS,
-    SEVERITY_SIGNS,
-    format_consistent_ratios,
-    format_rerun_note,
-    format_target,
-    label_alternatives,
-    locate_sigma_ratio,
-    make_rerun_rows,
-    with_typed_path,
-)
+from px4fuse.report import card_text
 
 # SVG paths of the markers on the axis of σ ratios (actual σ ÷ reported σ)
 MARKER_SVG_PATHS = {
@@ -54,7 +43,7 @@ def make_diagnosis_card(analysis: Analysis) -> Card:
             "Create the analysis with px4fuse.compare.",
         )
     card = build_card(analysis, analysis.request)
-    return with_typed_path(card, analysis.request.log)
+    return card_text.with_typed_path(card, analysis.request.log)
 
 
 def make_card_html(card: Card, *, is_open: bool = False, has_apply_buttons: bool = False) -> str:
@@ -69,17 +58,13 @@ def make_card_html(card: Card, *, is_open: bool = False, has_apply_buttons: bool
     """
     return load_template("report/card.html").render(
         card=card,
+        card_text=card_text,
         open=is_open,
         apply=has_apply_buttons,
         figure=make_sigma_ratio_html(card.verdicts, card.effect.axis)
         if card.verdicts and card.effect is not None
         else "",
-        label_alternatives=label_alternatives,
-        rerun_rows=make_rerun_rows,
-        signs=SEVERITY_SIGNS,
-        target=format_target,
         format_spans=format_spans,
-        format_rerun_note=format_rerun_note,
     )
 
 
@@ -89,16 +74,14 @@ def make_sigma_ratio_html(verdicts: Sequence[Verdict], axis: str, name: str = ""
         verdicts=verdicts,
         axis=axis,
         name=name,
-        marks=locate_sigma_ratio,
+        card_text=card_text,
         paths=MARKER_SVG_PATHS,
         percent=_format_svg_position,
         ticks=[
-            (_format_svg_position(map_ratio_to_axis(tick)), label, tick not in LABELLED_RATIO_TICKS)
+            (_format_svg_position(map_ratio_to_axis(tick)), tick, label)
             for tick, label in RATIO_AXIS_TICKS.items()
         ],
-        limits=format_consistent_ratios(),
         names=FILTER_NAMES,
-        quantities=QUANTITY_LABELS,
         format_ratio=format_ratio,
     )
 

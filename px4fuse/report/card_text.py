@@ -68,14 +68,15 @@ class Paragraph(NamedTuple):
     ----------
     wrap_indent : str or None
         Indent of further lines and sentences; None if the paragraph is one line, such as a command.
+        An empty text has no lines if it is set.
     plot : str
         Plot on the right, omitted on a narrow terminal.
     """
 
     text: str
-    style: str = ""
     first_indent: str = ""
     wrap_indent: str | None = None
+    style: str = ""
     plot: str = ""
 
     def wrap(self, width: int) -> list[str]:
@@ -98,35 +99,35 @@ class Paragraph(NamedTuple):
 
 def format_card_lines(card: Card) -> Iterator[Paragraph]:
     if card.severity == "refused":
-        yield Paragraph(f"error[{card.id}]: {card.headline}", SEVERITY_STYLES["error"])
+        yield Paragraph(f"error[{card.id}]: {card.headline}", style=SEVERITY_STYLES["error"])
         for label, text in card.facts.items():
-            yield from _format_labelled_lines(label, text)
+            yield _make_labelled_paragraph(label, text)
         yield Paragraph("No file was written. Exit code 2.")
         return
     yield from _format_identity_lines(card)
-    yield from format_headline_lines(card)
-    yield from _format_labelled_lines("effect", card.effect_text)
+    yield make_headline(card)
+    yield _make_labelled_paragraph("effect", card.effect_text)
     for label, text in zip(("do this", "", ""), card.do_this, strict=False):
-        yield from _format_labelled_lines(label, text)
+        yield _make_labelled_paragraph(label, text)
     for number, cause in enumerate(card.causes, start=1):
         if number > 1:
             title = f"{cause.severity}[{cause.id}]: {cause.title}"
-            yield Paragraph(title, SEVERITY_STYLES[cause.severity])
+            yield Paragraph(title, style=SEVERITY_STYLES[cause.severity])
         label = f"cause {number}" if len(card.causes) > 1 else "cause"
-        yield from _format_labelled_lines(label, cause.why)
+        yield _make_labelled_paragraph(label, cause.why)
         yield from _format_cause_lines(cause, do_this=" ".join(card.do_this))
     if card.more_causes:
         yield Paragraph(f"{card.more_causes} more causes are listed {ALL_FINDINGS_PLACE}")
     for label, text in card.facts.items():
-        yield from _format_labelled_lines(label, text)
+        yield _make_labelled_paragraph(label, text)
     yield from _format_verdict_lines(card)
     yield from _format_aid_lines(card.aids)
     for text in (card.reconcile, card.difference):
-        yield from _wrap_lines(text, "  ", "  ")
+        yield Paragraph(text, "  ", "  ")
     if card.notes:
         yield Paragraph("")
     for text in note_texts(card):
-        yield from _wrap_lines(text, "", "  ")
+        yield Paragraph(text, "", "  ")
 
 
 def note_texts(card: Card) -> list[str]:
@@ -141,16 +142,19 @@ def note_texts(card: Card) -> list[str]:
 
 def format_closing_lines(card: Card, *, verbose: bool = False) -> Iterator[Paragraph]:
     """Yield the last lines of a diagnosis card: commands for details, and terms."""
-    actions = [action for cause in card.causes for _, action in label_alternatives(cause)]
     texts = [] if verbose else ["More: -v"]
     if card.id:
         texts.append(f"Explanation of the finding: px4fuse explain {card.id}")
-    yield from _wrap_lines("; ".join(texts), "", "")
-    if any(action.where == "console" for action in actions):
+    yield Paragraph("; ".join(texts), wrap_indent="")
+    if any(
+        action.where == "console"
+        for cause in card.causes
+        for _, action in label_alternatives(cause)
+    ):
         yield Paragraph("Console: MAVLink Console of QGroundControl")
 
 
-def with_typed_path(card: Card, path: str | None) -> Card:
+def with_typed_path(card: Card, path: str) -> Card:
     """Replace the file name of the log in all commands by the path that the user typed.
 
     >>> from px4fuse.card.model import AnalysisDescription
@@ -161,8 +165,6 @@ def with_typed_path(card: Card, path: str | None) -> Card:
     >>> with_typed_path(card, "my logs/a.ulg").causes[0].actions[0].commands
     ("px4fuse compare 'my logs/a.ulg' --sigma-z 1",)
     """
-    if path is None:
-        return card
     command = re.compile(rf"(px4fuse \w+ ){re.escape(shlex.quote(card.identity.file))}")
 
     def replace_name(element: Any) -> Any:
@@ -243,10 +245,9 @@ def _format_identity_lines(card: Card) -> Iterator[Paragraph]:
     texts = (identity.file, ", ".join(list_flight_texts(card)), student_text)
     yield Paragraph("  ".join(filter(None, texts)))
     if identity.settings:
-        yield from _wrap_lines(f"KF: {identity.settings}", "  ", "      ")
-    changed_options = (*identity.changed, *identity.parameters)
-    if changed_options:
-        yield from _wrap_lines(f"changed: {'; '.join(changed_options)}", "  ", "           ")
+        yield Paragraph(f"KF: {identity.settings}", "  ", " " * 6)
+    if changed_options := (*identity.changed, *identity.parameters):
+        yield Paragraph(f"changed: {'; '.join(changed_options)}", "  ", " " * TEXT_INDENT)
     yield Paragraph("")
 
 
@@ -258,15 +259,15 @@ def list_flight_texts(card: Card) -> list[str]:
     return [text for text in texts if text]
 
 
-def format_headline_lines(card: Card) -> Iterator[Paragraph]:
-    """Yield the first line of a diagnosis card: severity and title of the worst fault."""
+def make_headline(card: Card) -> Paragraph:
+    """Return the first line of a diagnosis card: severity and title of the worst fault."""
     label = "ok" if card.severity == "clean" else card.severity
     severity_and_id = f"{label}[{card.id}]" if card.id else label
-    yield Paragraph(f"{severity_and_id}: {card.headline}", SEVERITY_STYLES[card.severity])
+    return Paragraph(f"{severity_and_id}: {card.headline}", style=SEVERITY_STYLES[card.severity])
 
 
 def _format_cause_lines(cause: DiagnosedCause, do_this: str) -> Iterator[Paragraph]:
-    yield from _format_labelled_lines("when", format_spans(cause.spans_s))
+    yield _make_labelled_paragraph("when", format_spans(cause.spans_s))
     actions = [
         (prefix, action)
         for prefix, action in label_alternatives(cause)
@@ -277,7 +278,7 @@ def _format_cause_lines(cause: DiagnosedCause, do_this: str) -> Iterator[Paragra
     for label, (_, action) in zip(labels, actions, strict=True):
         yield from _format_action_lines(label, label_width, action)
     yield from _format_rerun_table(cause.reruns)
-    yield from _wrap_lines(cause.after, "  ", "  ")
+    yield Paragraph(cause.after, "  ", "  ")
 
 
 def label_alternatives(cause: DiagnosedCause) -> list[tuple[str, Action]]:
@@ -297,10 +298,10 @@ def format_target(action: Action) -> str:
 def _format_action_lines(label: str, label_width: int, action: Action) -> Iterator[Paragraph]:
     indent, label_text = " " * (2 + label_width), f"  {label:{label_width}}"
     if action.sentence:
-        yield from _wrap_lines(action.sentence, label_text, indent)
+        yield Paragraph(action.sentence, label_text, indent)
         label_text = indent
     for command in action.commands:
-        yield Paragraph(f"{label_text}{command}", "bold")
+        yield Paragraph(f"{label_text}{command}", style="bold")
         label_text = indent
 
 
@@ -310,7 +311,7 @@ def _format_rerun_table(reruns: Sequence[CardRerun]) -> Iterator[Paragraph]:
     for row in rows:
         cells = (f"{cell:{width}}" for cell, width in zip(row, widths, strict=True))
         yield Paragraph(f"  {'  '.join(cells)}".rstrip())
-    yield from _wrap_lines(format_rerun_note(reruns), "  ", "  ")
+    yield Paragraph(format_rerun_note(reruns), "  ", "  ")
 
 
 def make_rerun_rows(reruns: Sequence[CardRerun]) -> list[list[str]]:
@@ -364,7 +365,7 @@ def _format_verdict_lines(card: Card) -> Iterator[Paragraph]:
     direction_text = "" if card.effect is None else f" {card.effect.axis}"
     yield Paragraph("")
     heading = f"Consistency{direction_text} (RMS of error ÷ reported σ; 1: consistent)"
-    yield from _wrap_lines(heading, "", "  ")
+    yield Paragraph(heading, "", "  ")
     legend, too_large_label = f"  ░ consistent ({format_consistent_ratios()})", "σ too large"
     yield Paragraph(
         f"{'':{AXIS_INDENT}}",
@@ -381,12 +382,14 @@ def _format_verdict_line(verdict: Verdict) -> Paragraph:
     label_text = f"  {filter_label:4} {QUANTITY_LABELS[verdict.against]:26}"
     if verdict.ratio is None:
         verdict_text = f"{'–':>6}  not evaluated: {verdict.reason}"
-        return Paragraph(verdict_text, "", label_text, " " * 40)
+        return Paragraph(verdict_text, label_text, " " * 40)
     verdict_word = f"({verdict.word})" if verdict.is_explained else verdict.word
     verdict_text = f"{label_text}{format_ratio(verdict.ratio):>6}  {verdict_word}"
-    style = "bold" if verdict.is_fault else ""
-    sigma_ratio_plot = draw_sigma_ratio(verdict.ratio, verdict.against)
-    return Paragraph(f"{verdict_text:{AXIS_INDENT}}", style, plot=sigma_ratio_plot)
+    return Paragraph(
+        f"{verdict_text:{AXIS_INDENT}}",
+        style="bold" if verdict.is_fault else "",
+        plot=draw_sigma_ratio(verdict.ratio, verdict.against),
+    )
 
 
 def _format_tick_labels() -> str:
@@ -402,7 +405,7 @@ def _format_aid_lines(aid_rows: Sequence[AidConsistency]) -> Iterator[Paragraph]
     if not aid_rows:
         return
     yield Paragraph("")
-    yield from _wrap_lines(AIDS_CAPTION, "", "  ")
+    yield Paragraph(AIDS_CAPTION, "", "  ")
     indent = 31
     yield Paragraph(f"{'':{indent}}", plot=_format_tick_labels())
     for row, previous_row in zip(aid_rows, (None, *aid_rows), strict=False):
@@ -412,10 +415,5 @@ def _format_aid_lines(aid_rows: Sequence[AidConsistency]) -> Iterator[Paragraph]
         yield Paragraph(f"{label_text:{indent}}", plot=draw_sigma_ratio(row.ratio, "source"))
 
 
-def _format_labelled_lines(label: str, text: str) -> Iterator[Paragraph]:
-    yield from _wrap_lines(text, f"  {label:{TEXT_INDENT - 2}}", " " * TEXT_INDENT)
-
-
-def _wrap_lines(text: str, first_indent: str, indent: str) -> Iterator[Paragraph]:
-    if text:
-        yield Paragraph(text, "", first_indent, indent)
+def _make_labelled_paragraph(label: str, text: str) -> Paragraph:
+    return Paragraph(text, f"  {label:{TEXT_INDENT - 2}}", " " * TEXT_INDENT)

@@ -89,21 +89,21 @@ def make_time_offset_advice(
         }
     advice_by_label = {
         "Result": "The position source has no significant time offset.",
-        "Offset": f"Add {offset_text} to the timestamps of the position source.",
+        "Offset": f"The estimate is {offset_text}.",
     }
     if time_offset.is_significant(offset_s):
         late_or_early = "late" if offset_s < 0.0 else "early"
-        advice_by_label["Result"] = (
-            f"The position timestamps are {abs(offset_s):.3f} s {late_or_early}."
-        )
         suggested_offset_s = compute_offset_for_option_s(comparison, time_offset)
-        advice_by_label["Re-run"] = f"px4fuse compare LOG --clock-offset {suggested_offset_s:.3f}"
+        advice_by_label = {
+            "Result": f"The position timestamps are {abs(offset_s):.3f} s {late_or_early}.",
+            "Offset": f"Add {offset_text} to the timestamps of the position source.",
+            "Re-run": f"px4fuse compare LOG --clock-offset {suggested_offset_s:.3f}",
+        }
     elif not low_offset_s <= 0.0 <= high_offset_s:
         advice_by_label["Result"] = (
             "The time offset is too small for a correction: the limit is "
             f"{time_offset.min_significant_offset_s:.3f} s."
         )
-        advice_by_label["Offset"] = f"The estimate is {offset_text}."
     if (logged_delay_ms := find_logged_delay_ms(comparison)) is not None:
         advice_by_label["PX4"] = _format_delay_advice(comparison, time_offset, logged_delay_ms)
     if time_offset.has_changed():

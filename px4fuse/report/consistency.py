@@ -25,9 +25,8 @@ from px4fuse.filter.consistency import (
 from px4fuse.filter.tuning import AxisTuning
 from px4fuse.findings.cause_text import describe_explained_part, format_change
 from px4fuse.flight.model import Unavailable
-from px4fuse.report import event_marks
-from px4fuse.report.page import Page, draw_legend_above, make_two_columns
-from px4fuse.report.panels import normalised_innovations
+from px4fuse.report.page import Page, draw_legend_above, make_columns
+from px4fuse.report.panels import add_time_panel, normalised_innovations
 from px4fuse.report.phrases import (
     VERDICT_LEGEND,
     VERDICT_TABLE_HEAD,
@@ -65,11 +64,11 @@ def draw_pages(analysis: Analysis, _: object) -> Iterator[Page]:
         f"are normally distributed with mean 0, and are white. The plots are along {axis_text}.",
     )
     if innovations := _select_tested_innovations(result):
-        nis_axes = event_marks.add_panel(
+        nis_axes = add_time_panel(
             page, analysis, "Running mean NIS (log scale)", RUNNING_NIS_HEIGHT
         )
         _draw_running_nis(nis_axes, innovations)
-        left_column, right_column = make_two_columns()
+        left_column, right_column = make_columns()
         histogram_axes = left_column.add_panel("Distribution of ν/√S", DISTRIBUTION_HEIGHT)
         _draw_histogram(histogram_axes, innovations)
         autocorrelation_axes = right_column.add_panel("Autocorrelation", DISTRIBUTION_HEIGHT)

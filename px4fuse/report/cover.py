@@ -1,8 +1,12 @@
 """First page of a report: diagnosis card (faults, causes and actions), and plots."""
 
-from collections.abc import Iterator
-from typing import Any
+from __future__ import annotations
 
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from typing import Any, NamedTuple
+
+import numpy as np
+import pandas as pd
 from msgspec import structs
 
 from px4fuse.analysis import AidingSourceAnalysis, Analysis
@@ -14,11 +18,19 @@ from px4fuse.card.model import (
     Verdict,
     map_ratio_to_axis,
 )
-from px4fuse.comparison.model import FILTER_NAMES
-from px4fuse.core.text import format_ratio, one_line
+from px4fuse.comparison.comparison import (
+    compute_position_errors,
+    interpolate_sigma,
+)
+from px4fuse.comparison.model import FILTER_NAMES, AxisComparison, select_north_and_east
+from px4fuse.core.arrays import Array
+from px4fuse.core.text import format_metres, format_ratio, one_line
 from px4fuse.filter.consistency import Reference
+from px4fuse.filter.kalman import predict_track
+from px4fuse.filter.signals import AISLE, cut_to_segment
 from px4fuse.finding import format_spans
-from px4fuse.report import fonts
+from px4fuse.flight.model import Ekf2, Truth
+from px4fuse.report import style
 from px4fuse.report.card_text import (
     AIDS_CAPTION,
     QUANTITY_LABELS,
@@ -31,9 +43,24 @@ from px4fuse.report.card_text import (
     make_rerun_rows,
     note_texts,
 )
-from px4fuse.report.cover_panels import write_panels
-from px4fuse.report.page import Page, PageBlock, to_typst_data
-from px4fuse.report.style import SEVERITY_COLOURS
+from px4fuse.report.page import (
+    AXES_LEFT_MARGIN,
+    AXES_RIGHT_MARGIN,
+    LABELLED_HEIGHT,
+    UNLABELLED_HEIGHT,
+    Page,
+    PageBlock,
+    make_columns,
+)
+from px4fuse.report.panels import (
+    LANDING_MARKER_STYLE,
+    TAKE_OFF_MARKER_STYLE,
+    add_legend,
+    add_time_panel,
+    draw_dots,
+    normalised_innovations,
+)
+from px4fuse.report.style import SEVERITY_COLOURS, TRACK_STYLES, Axes, draw_curve
 from px4fuse.report.typesetting import measure_free_height
 from px4fuse.results.contract import AidsResults, ComparisonResults
 
@@ -49,6 +76,21 @@ AIDS_TERMS_NOTE = (
     "√S: standard deviation of an innovation as EKF2 reports it. Source: a sensor that aids EKF2."
 )
 ALL_FINDINGS_TITLE = "All findings"
+# Tracks with a larger ratio of length to width can have a map of full page width
+MIN_ELONGATED_TRACK_RATIO = 2.2
+MIN_WIDE_MAP_HEIGHT = 95.0  # points
+MAP_HEIGHT_FRACTION = 0.33  # of the height of all plots
+# With less free height (points) on the first page, the plots are on the next page
+MIN_PLOTS_HEIGHT = 190.0
+NEXT_PAGE_PLOTS_HEIGHT = 450.0  # points, of all plots on the next page
+UNUSED_PAGE_HEIGHT = 32.0  # points, for gaps, and for a second line of a title
+TITLE_HEIGHT = 18.5  # points, of a title above a plot
+MAX_DRAWN_SIGMAS = 4.0  # larger innovations ÷ √S are triangles at the edge
+MAP_MARGIN_FACTOR = 1.08  # extent of the map divided by the extent of the tracks
+# Maximum margin of the map, as fraction of the extent of the positions
+MAX_MAP_MARGIN_FRACTION = 0.25
+MIN_MAP_EXTENT_M = 0.5
+SigmaByFilter = Mapping[str, "pd.Series[float]"]
 
 
 def draw_pages(analysis: Analysis | AidingSourceAnalysis, results: FlightResults) -> Iterator[Page]:
@@ -56,7 +98,7 @@ def draw_pages(analysis: Analysis | AidingSourceAnalysis, results: FlightResults
     page = Page()
     block = add_card(page, results.card)
     if isinstance(analysis, Analysis):
-        write_panels(block, analysis, results.card, find_free_height(page))
+        write_panels(block, analysis, results.card, measure_free_height(page))
     yield page
 
 
@@ -70,7 +112,7 @@ def add_card(page: Page, card: Card) -> PageBlock:
         headline=card.headline,
         effect=card.effect_text,
         do_this=card.do_this,
-        facts=list(card.facts.items()),
+        facts=card.facts,
         reconcile=card.reconcile,
         difference=card.difference,
         more_causes=card.more_causes,
@@ -83,21 +125,12 @@ def add_card(page: Page, card: Card) -> PageBlock:
             f"grey: ratio of a consistent filter ({format_consistent_ratios()}) · ━ 95 % interval "
             "· ◀ ▶: ratio outside the axis"
         ),
-        ticks=[
-            {"fraction": map_ratio_to_axis(tick), "label": label}
-            for tick, label in RATIO_AXIS_TICKS.items()
-        ],
+        ticks=[(map_ratio_to_axis(tick), label) for tick, label in RATIO_AXIS_TICKS.items()],
         rows=[*map(_make_verdict_row, card.verdicts), *map(_make_aid_row, card.aids)],
         causes=list(map(_make_cause_fields, card.causes)),
         notes=note_texts(card),
         terms=AIDS_TERMS_NOTE if card.aids else TERMS_NOTE,
         blocks=[],
-    )
-
-
-def find_free_height(page: Page) -> float:
-    return measure_free_height(
-        to_typst_data(page.blocks, ""), fonts.find_font_names(str(page.blocks))
     )
 
 
@@ -144,7 +177,6 @@ def _make_ratio_row(
 
 
 def _make_cause_fields(cause: DiagnosedCause) -> dict[str, Any]:
-    head, *rows = make_rerun_rows(cause.reruns) or [[]]
     return {
         "title": cause.title,
         "id": cause.id,
@@ -154,6 +186,230 @@ def _make_cause_fields(cause: DiagnosedCause) -> dict[str, Any]:
             structs.asdict(action) | {"label": f"{prefix}{action.target}"}
             for prefix, action in label_alternatives(cause)
         ],
-        "reruns": {"head": head, "rows": rows},
+        "reruns": make_rerun_rows(cause.reruns),
         "after": " ".join(filter(None, (format_rerun_note(cause.reruns), cause.after))),
     }
+
+
+class TimePlot(NamedTuple):
+    """Plot over time: title, and function that draws the plot."""
+
+    title: str
+    draw: Callable[[Axes], None]
+
+
+def write_panels(block: PageBlock, analysis: Analysis, card: Card, free_height: float) -> None:
+    """Draw legend, map and plots over time on the first page."""
+    page = Page()
+    block["blocks"] = page.blocks
+    legend = add_legend(page, analysis)
+    plots = [*_make_error_plots(analysis, card), _make_innovation_plot(analysis.main)]
+    tracks, map_labels = _rotate_map_tracks(analysis)
+    plots_height = free_height - legend["height"] - UNUSED_PAGE_HEIGHT
+    if plots_height < MIN_PLOTS_HEIGHT:
+        plots_height = NEXT_PAGE_PLOTS_HEIGHT
+        page.blocks.insert(0, {"kind": "break"})
+    length_m, width_m = np.ptp(tracks["positions"], axis=1)
+    map_height = MAP_HEIGHT_FRACTION * plots_height
+    if length_m > MIN_ELONGATED_TRACK_RATIO * width_m and map_height > MIN_WIDE_MAP_HEIGHT:
+        _draw_map(page, analysis, tracks, map_labels, map_height)
+        _draw_plots(page, analysis, plots, plots_height - map_height)
+        return
+    left_column, right_column = make_columns()
+    _draw_map(left_column, analysis, tracks, map_labels, plots_height)
+    _draw_plots(right_column, analysis, plots, plots_height)
+    page.add_columns(left_column, right_column)
+
+
+def _draw_plots(
+    page: Page, analysis: Analysis, plots: Sequence[TimePlot], total_height: float
+) -> None:
+    """Draw plots over time with axes of equal height."""
+    axes_height = (total_height - LABELLED_HEIGHT + UNLABELLED_HEIGHT) / len(plots) - (
+        TITLE_HEIGHT + UNLABELLED_HEIGHT
+    )
+    for plot in plots:
+        axes = add_time_panel(
+            page,
+            analysis,
+            plot.title,
+            axes_height,
+            with_time_label=plot is plots[-1],
+        )
+        plot.draw(axes)
+
+
+def _make_error_plots(analysis: Analysis, card: Card) -> list[TimePlot]:
+    """Return plots of the position errors of KF and EKF2, or of their difference."""
+    result, effect = analysis.main.with_whole_flight_tracks(), card.effect
+    plots: list[tuple[str, float | None, pd.Series[float], SigmaByFilter]] = []
+    for filter_name, label in FILTER_NAMES.items():
+        errors = compute_position_errors(result, filter_name)
+        if isinstance(errors, pd.DataFrame) and errors["error_m"].notna().any():
+            rmse_m = effect.position_rmse_m.get(filter_name) if effect else None
+            title = f"{label} error (m): RMSE"
+            plots.append((title, rmse_m, errors["error_m"], {label: errors["sigma_m"]}))
+    if not plots and isinstance(result.ekf2_state, pd.DataFrame):
+        time_s = result.ekf2_state.index.to_numpy()
+        kf_track = predict_track(result.kf_run, time_s)
+        difference_m = kf_track["position_m"] - result.ekf2_state["position_m"]
+        sigmas_m = {
+            name: pd.Series(interpolate_sigma(time_s, table, "position_variance_m2"), time_s)
+            for name, table in (("KF", kf_track), ("EKF2", result.ekf2_variance))
+        }
+        difference_rms_m = effect.difference_rms_m if effect else None
+        if difference_m.notna().any():
+            plots.append(("KF − EKF2 (m): RMS", difference_rms_m, difference_m, sigmas_m))
+    half_range_m = 1.1 * max(
+        (_compute_error_axis_limit_m(error_m, sigmas_m) for _, _, error_m, sigmas_m in plots),
+        default=0.0,
+    )
+    return [_make_error_plot(*plot, half_range_m) for plot in plots]
+
+
+def _compute_error_axis_limit_m(error_m: pd.Series[float], sigmas_m: SigmaByFilter) -> float:
+    largest_error_m = max(float(error_m.abs().max()), 1e-3)
+    sigma_limits_m = [2.2 * sigma.median() for sigma in sigmas_m.values()]
+    # The σ band is larger than the plot if σ is much too large
+    return float(np.nanmax([largest_error_m, *np.minimum(sigma_limits_m, 3.0 * largest_error_m)]))
+
+
+def _make_error_plot(
+    title: str,
+    rms_m: float | None,
+    error_m: pd.Series[float],
+    sigmas_m: SigmaByFilter,
+    half_range_m: float,
+) -> TimePlot:
+    known_sigmas_m = {
+        name: sigma.dropna() for name, sigma in sigmas_m.items() if sigma.notna().any()
+    }
+    title += " –" if rms_m is None else f" {format_metres(rms_m)}"
+    is_difference = len(sigmas_m) > 1
+    for name, sigma in known_sigmas_m.items():
+        label = f"σ of {name}" if is_difference else "σ"
+        title += f", median {label} {format_metres(sigma.median())}"
+    line = style.line_style("black", 1.0) if is_difference else TRACK_STYLES[next(iter(sigmas_m))]
+
+    def draw(axes: Axes) -> None:
+        axes.set_ylim(-half_range_m, half_range_m)
+        for name, sigma in known_sigmas_m.items():
+            style.draw_sigma_band(axes, 0.0 * sigma, sigma, style.SIGMA_BAND_COLOURS[name])
+        style.draw_zero_line(axes)
+        draw_curve(axes, error_m, **line)
+
+    return TimePlot(title, draw)
+
+
+def _make_innovation_plot(result: AxisComparison) -> TimePlot:
+    innovations = normalised_innovations(result)
+    legend = ", ".join(f"{sign} {name}" for name, sign in zip(innovations, "●■", strict=False))
+    title = f"Innovations ÷ √S ({legend}): 95 % expected within ±2"
+    clipped_texts = [
+        f"{name} {format_ratio(ratio)}"
+        for name, values in innovations.items()
+        if (ratio := float(values.abs().max())) > MAX_DRAWN_SIGMAS
+    ]
+    if clipped_texts:
+        title += f"; ▲▼ beyond ±{MAX_DRAWN_SIGMAS:g}, largest {', '.join(clipped_texts)}"
+
+    def draw(axes: Axes) -> None:
+        axes.set(ylim=(-1.12 * MAX_DRAWN_SIGMAS, 1.12 * MAX_DRAWN_SIGMAS), yticks=(-2.0, 2.0))
+        axes.axhspan(-2.0, 2.0, color=style.CONSISTENT_BAND_COLOUR, lw=0, zorder=0.05)
+        style.draw_zero_line(axes)
+        for name in reversed(innovations):
+            draw_dots(axes, innovations[name], MAX_DRAWN_SIGMAS, style.INNOVATION_STYLES[name])
+
+    return TimePlot(title, draw)
+
+
+def _rotate_map_tracks(analysis: Analysis) -> tuple[dict[str, Array], tuple[str, str]]:
+    """Return tracks seen from above, and the labels of the x and y axis of the map.
+
+    The main flight direction is to the right; without it, north is upwards. Rows of a track: m to
+    the right, m upwards.
+    """
+    aisle_heading_deg = next(
+        (line.heading_deg for line in analysis.input_axes if line.name == AISLE), None
+    )
+    heading_rad, labels = np.pi / 2.0, ("east", "north")
+    if aisle_heading_deg is not None:
+        heading_rad = np.deg2rad(aisle_heading_deg % 180.0)
+        labels = f"along {analysis.main.axis.label}", "left"
+    elif analysis.source.frame == "FRD":
+        labels = "y of the position source", "x"
+    cosine, sine = np.cos(heading_rad), np.sin(heading_rad)
+    rotation = np.array([[cosine, sine], [sine, -cosine]])
+    return {name: rotation @ track for name, track in _select_map_tracks(analysis).items()}, labels
+
+
+def _select_map_tracks(analysis: Analysis) -> dict[str, Array]:
+    """Return positions, KF, EKF2 and ground truth; rows of a track: north (m), east (m)."""
+    flight, results = analysis.flight, select_north_and_east(analysis)
+
+    def cut_to_flight(table: pd.DataFrame) -> Array:
+        flown = cut_to_segment(table, analysis.segment.whole_flight)
+        return flown[["north_m", "east_m"]].to_numpy().T
+
+    tracks = {"positions": cut_to_flight(analysis.source.samples)}
+    if len(results) == 2:
+        tracks["KF"] = np.array([result.kf_run.steps["position_m"] for result in results])
+    if isinstance(flight.ekf2, Ekf2):
+        tracks["EKF2"] = cut_to_flight(flight.ekf2.state)
+    if isinstance(flight.truth, Truth):
+        tracks["ground truth"] = cut_to_flight(flight.truth.samples)
+    return {name: track for name, track in tracks.items() if track.size}
+
+
+def _draw_map(
+    page: Page,
+    analysis: Analysis,
+    tracks: Mapping[str, Array],
+    labels: tuple[str, str],
+    height: float,
+) -> None:
+    axes_height = height - TITLE_HEIGHT - LABELLED_HEIGHT
+    axes_width = page.width - AXES_LEFT_MARGIN - AXES_RIGHT_MARGIN
+    limits = _compute_map_limits(tracks, axes_width / axes_height)
+    distance_m, name = max(
+        (np.nanmax(np.abs(track.T - np.clip(track.T, *limits))), name)
+        for name, track in tracks.items()
+    )
+    title = "Map"
+    if distance_m > 0.0:
+        title += f"; {name} up to {format_metres(distance_m)} m outside the plotted area"
+    axes = page.add_panel(title, axes_height)
+    style.set_map_axes(axes, *labels)
+    (left, bottom), (right, top) = limits
+    axes.set(xlim=(left, right), ylim=(bottom, top))
+    for name, (map_x_m, map_y_m) in tracks.items():
+        if name == "positions":
+            axes.plot(map_x_m, map_y_m, **style.MEASUREMENT_STYLE | {"ms": 2.4})
+        else:
+            stride = max(1, len(map_x_m) // style.MAX_DRAWN_POINTS)
+            axes.plot(map_x_m[::stride], map_y_m[::stride], **TRACK_STYLES[name])
+    position_times = cut_to_segment(analysis.source.samples, analysis.segment.whole_flight).index
+    for times, marker_style in (
+        (analysis.events.take_off_times_s, TAKE_OFF_MARKER_STYLE),
+        (analysis.events.landing_times_s, LANDING_MARKER_STYLE),
+    ):
+        position_rows = position_times.get_indexer(pd.Index(times, dtype=float), method="nearest")
+        large_marker_style = marker_style | {"ms": 9.0, "mec": "white", "mew": 0.8}
+        axes.plot(*tracks["positions"][:, position_rows], **large_marker_style)
+
+
+def _compute_map_limits(tracks: Mapping[str, Array], aspect_ratio: float) -> tuple[Array, Array]:
+    """Return the lower left and the upper right corner of the map (m)."""
+    reference_points_m = np.percentile(tracks["positions"], (1.0, 99.0), axis=1).T
+    if "ground truth" in tracks:
+        reference_points_m = np.hstack([reference_points_m, tracks["ground truth"]])
+    low_m, high_m = np.nanmin(reference_points_m, axis=1), np.nanmax(reference_points_m, axis=1)
+    margin_m = MAX_MAP_MARGIN_FRACTION * (high_m - low_m)
+    # Tracks are clipped, because a diverged filter would make the flight tiny on the map
+    points_m = np.clip(np.hstack([*tracks.values()]).T, low_m - margin_m, high_m + margin_m)
+    low_m, high_m = np.nanmin(points_m, axis=0), np.nanmax(points_m, axis=0)
+    length_m, width_m = np.maximum(MAP_MARGIN_FACTOR * (high_m - low_m), MIN_MAP_EXTENT_M)
+    map_length_m = max(length_m, width_m * aspect_ratio)
+    half_size_m = 0.5 * np.array([map_length_m, map_length_m / aspect_ratio])
+    centre_m = 0.5 * (low_m + high_m)
+    return centre_m - half_size_m, centre_m + half_size_m

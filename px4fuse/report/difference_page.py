@@ -10,8 +10,8 @@ from px4fuse.ekf2.replay import Agreement
 from px4fuse.ekf2.steps import DifferenceExplanation
 from px4fuse.flight.ekf2_parameters import AIDS
 from px4fuse.flight.model import Unavailable
-from px4fuse.report import event_marks
-from px4fuse.report.page import Page, make_two_columns
+from px4fuse.report.page import Page, make_columns
+from px4fuse.report.panels import add_time_panel
 from px4fuse.report.style import (
     EKF2_COLOUR,
     KF_BAND_COLOUR,
@@ -41,7 +41,7 @@ def draw_pages(analysis: Analysis, _: object) -> Iterator[Page]:
     page.write_heading(f"{name}, {spans_text}")
     for sentence in explanation.sentences:
         page.write(sentence)
-    left_column, right_column = make_two_columns()
+    left_column, right_column = make_columns()
     _draw_contributions(
         left_column,
         "Position difference: contribution of each setting",
@@ -59,7 +59,7 @@ def draw_pages(analysis: Analysis, _: object) -> Iterator[Page]:
     page.add_columns(left_column, right_column)
     difference_m = pd.Series(explanation.kf_minus_ekf2_m, explanation.times_s)
     worst_row = int(np.argmax(np.abs(explanation.kf_minus_ekf2_m)))
-    axes = event_marks.add_panel(
+    axes = add_time_panel(
         page,
         analysis,
         "Position difference KF - EKF2 (m): total (dark) and unexplained part (light)",

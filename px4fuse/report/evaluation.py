@@ -11,7 +11,7 @@ from px4fuse.core.text import format_metres
 from px4fuse.flight.model import Unavailable
 from px4fuse.loop.analysis import MIN_UNIX_TIME_S
 from px4fuse.report import style
-from px4fuse.report.page import Page, make_two_columns
+from px4fuse.report.page import Page, make_columns
 from px4fuse.report.style import EKF2_COLOUR, KF_COLOUR, TRUTH_COLOUR, Axes
 from px4fuse.trajectory.evaluation import AbsoluteError, Evaluation
 from px4fuse.trajectory.model import AXES_OF_FRAME
@@ -37,7 +37,7 @@ def draw_pages(evaluation: Evaluation, _: object) -> Iterator[Page]:
     )
     write_evaluation(page, evaluation)
     _draw_maps(page, evaluation)
-    left_column, right_column = make_two_columns()
+    left_column, right_column = make_columns()
     _draw_ape(left_column, evaluation)
     _draw_rpe(right_column, evaluation)
     page.add_columns(left_column, right_column)
@@ -49,7 +49,7 @@ def _draw_maps(page: Page, evaluation: Evaluation) -> None:
     frame, is_aligned = evaluation.reference_track.frame, evaluation.alignment != "none"
     axis_indices = list(MAP_AXIS_INDICES.get(frame, (0, 1)))
     names = [AXES_OF_FRAME[frame][index] for index in axis_indices]
-    left_column, right_column = make_two_columns()
+    left_column, right_column = make_columns()
     title = f"{'Aligned path' if is_aligned else 'Path'} coloured by error"
     axes = right_column.add_panel(title, MAP_HEIGHT, right_margin=COLOUR_BAR_MARGIN)
     _draw_path(axes, evaluation, axis_indices)
@@ -180,8 +180,7 @@ def _make_error_rows(evaluation: Evaluation) -> list[list[str]]:
             numbers = (errors_m.mean, errors_m.median, errors_m.std, errors_m.max)
             cells = [f"{errors_m.rmse:.4f}", format_interval(error.interval_m)]
             cells += [*(f"{number:.4f}" for number in numbers), f"{errors_m.count}"]
-        rotation_text = f"{errors_deg.rmse:.2f}" if isinstance(errors_deg, Statistics) else "–"
-        rows.append([name, *cells, rotation_text])
+        rows.append([name, *cells, format_rmse(errors_deg, 2)])
     return rows
 
 
@@ -202,25 +201,30 @@ def describe_unaligned_rmse(evaluation: Evaluation) -> str:
 def describe_rpe_growth(rpe: tuple[RelativeError, ...]) -> str:
     """Describe the growth of the relative pose error (RPE) with distance or time."""
     interval_note = "RMSE with its 95 % interval."
-    rmse_by_unit: dict[str, dict[float, float]] = {}
-    for error in rpe:
-        errors_m = error.translation_m
-        if isinstance(errors_m, Statistics) and errors_m.rmse > NEGLIGIBLE_ERROR_M:
-            rmse_by_unit.setdefault(error.unit, {})[error.delta] = errors_m.rmse
-    unit = max(rmse_by_unit, key=lambda unit: len(rmse_by_unit[unit]), default="")
-    rmse_by_delta = rmse_by_unit.get(unit, {})
+    # of the first unit: distances, times and numbers of frames cannot be compared
+    rmse_by_delta = {
+        error.delta: errors_m.rmse
+        for error in rpe
+        if isinstance(errors_m := error.translation_m, Statistics)
+        and errors_m.rmse > NEGLIGIBLE_ERROR_M
+        and error.unit == rpe[0].unit
+    }
     if len(rmse_by_delta) < 2:
         return (
             f"{interval_note} Add a second distance with --rpe: drift grows with distance, noise "
             "does not."
         )
-    smallest, largest = min(rmse_by_delta), max(rmse_by_delta)
+    smallest, largest, unit = min(rmse_by_delta), max(rmse_by_delta), rpe[0].unit
     return (
         f"{interval_note} From {smallest:g} to {largest:g} {unit} (--rpe), the RPE RMSE grows "
         f"by a factor of {rmse_by_delta[largest] / rmse_by_delta[smallest]:.2g}. Expected: 1 for "
         f"independent noise, {np.sqrt(largest / smallest):.2g} for a random walk, "
         f"{largest / smallest:.3g} for a scale or heading error."
     )
+
+
+def format_rmse(statistics: Statistics | Unavailable, digits: int) -> str:
+    return f"{statistics.rmse:.{digits}f}" if isinstance(statistics, Statistics) else "–"
 
 
 def format_interval(interval: RmseInterval | Unavailable) -> str:

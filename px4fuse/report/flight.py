@@ -10,7 +10,7 @@ from px4fuse.comparison.model import AxisComparison
 from px4fuse.core.record import Span
 from px4fuse.report import panels, style
 from px4fuse.report.difference_page import describe_missing_explanation
-from px4fuse.report.page import COLUMN_GAP, PAGE_WIDTH, Page
+from px4fuse.report.page import Page, make_columns
 from px4fuse.report.phrases import get_statistics_by_filter, list_verdict_warnings
 from px4fuse.report.style import EKF2_COLOUR, TRACK_STYLES
 
@@ -99,14 +99,14 @@ def draw_other_axes(analysis: Analysis, _: object) -> Iterator[Page]:
     if not secondary_axes:
         return
     page = Page("Appendix: other axes")
-    width = (PAGE_WIDTH - COLUMN_GAP * (len(secondary_axes) - 1)) / max(len(secondary_axes), 2)
     for panel in (
         panels.POSITION_PANEL,
         panels.VELOCITY_PANEL,
         panels.INNOVATIONS_PANEL,
         panels.POSITION_SIGMA_PANEL,
     ):
-        columns = [Page(width=width) for _ in secondary_axes]
+        # a single axis fills half of the page
+        columns = make_columns(max(len(secondary_axes), 2))[: len(secondary_axes)]
         for column, result in zip(columns, secondary_axes, strict=True):
             if panel is panels.POSITION_PANEL:
                 column.write_heading(result.axis.name)

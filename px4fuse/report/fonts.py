@@ -91,14 +91,12 @@ def _font_sort_key(entry: FontEntry) -> tuple[object, ...]:
 
     PostScript fonts are last, because some PDF viewers do not display them.
     """
-    weight = entry.weight if isinstance(entry.weight, int) else 400
     return (
-        str(entry.fname).lower().endswith(".otf"),
+        entry.fname.lower().endswith(".otf"),
         not entry.name.startswith("Noto Sans"),
         "Sans" not in entry.name,
-        abs(weight - 400),
         entry.name,
-        str(entry.fname),
+        entry.fname,
         entry.index,
     )
 

@@ -2,7 +2,7 @@
 
 from collections.abc import Iterator
 
-from px4fuse.core.text import join_first_names
+from px4fuse.core.text import format_count, join_first_names
 from px4fuse.flight.model import Unavailable
 from px4fuse.info.inventory import Inventory, LoggedData
 from px4fuse.report.page import Cell, Page
@@ -98,13 +98,10 @@ def _make_source_rows(inventory: Inventory) -> Iterator[tuple[Cell, ...]]:
     for source in inventory.sources:
         data_type = source.part if source.part != previous_data_type else ""
         previous_data_type = source.part
-        if source.unavailable:
-            yield data_type, ("none", MUTED_COLOUR), "", "", "", ""
-            continue
         yield (
             f"{data_type:8} (used)" if source.chosen else data_type,
-            source.name,
-            "" if source.samples is None else f"{source.samples} samples",
+            ("none", MUTED_COLOUR) if source.unavailable else source.name,
+            "" if source.samples is None else f"{source.samples}",
             "" if source.rate_hz is None else f"{_format_for_narrow_column(source.rate_hz)} Hz",
             _format_gaps(source),
             _format_time_span(source),
@@ -116,10 +113,8 @@ def _format_gaps(source: LoggedData) -> str:
         return ""
     if not source.gaps.count:
         return "no gap"
-    longest_gap_text = f"{_format_for_narrow_column(source.gaps.longest_s)} s"
-    if source.gaps.count == 1:
-        return f"1 gap ({longest_gap_text})"
-    return f"{source.gaps.count} gaps (up to {longest_gap_text})"
+    longest_gap_text = _format_for_narrow_column(source.gaps.longest_s)
+    return f"{format_count(source.gaps.count, 'gap')} (up to {longest_gap_text} s)"
 
 
 def _format_for_narrow_column(value: float) -> str:

@@ -11,7 +11,7 @@ from px4fuse.flight.model import Unavailable
 from px4fuse.loop.analysis import MIN_UNIX_TIME_S
 from px4fuse.loop.corrections import CORRECTION_LABELS
 from px4fuse.loop.model import LANDING_CLOSURE_SOURCE, Closure, Loop
-from px4fuse.report.evaluation import describe_method, format_interval, plot_path
+from px4fuse.report.evaluation import describe_method, format_interval, format_rmse, plot_path
 from px4fuse.report.page import Cell, Page
 from px4fuse.report.phrases import write_findings
 from px4fuse.report.style import (
@@ -196,7 +196,7 @@ def write_closures_and_rpe(page: Page, loop: Loop) -> None:
             rpe_texts = [
                 _format_error(error.translation_m, error.interval_m) for error in score.rpe
             ]
-            rpe_rows.append([path.name, *rpe_texts, _format_rmse(score.ate.rotation_deg, 2)])
+            rpe_rows.append([path.name, *rpe_texts, format_rmse(score.ate.rotation_deg, 2)])
         if rpe_rows:
             page.add_table(head, rpe_rows)
         for note in notes:
@@ -239,28 +239,21 @@ def _format_closure_times(closure: Closure, loop: Loop) -> str:
 
 def _format_error(errors_m: Statistics | Unavailable, interval: RmseInterval | Unavailable) -> str:
     interval_text = format_interval(interval)
-    return _format_rmse(errors_m) + (f" ({interval_text})" if interval_text else "")
+    return format_rmse(errors_m, 3) + (f" ({interval_text})" if interval_text else "")
 
 
-def _format_rmse(statistics: Statistics | Unavailable, digits: int = 3) -> str:
-    return f"{statistics.rmse:.{digits}f}" if isinstance(statistics, Statistics) else "–"
-
-
-def make_pose_graph_page(solved_graph: Graph) -> Page:
-    """Make the terminal output of ``px4fuse loop`` for a pose graph."""
-    page, gates = Page(), solved_graph.gates
+def make_pose_graph_page(graph: Graph) -> Page:
+    """Make the terminal output of ``px4fuse loop`` for a solved pose graph."""
+    page, gates = Page(), graph.gates
     page.write_labelled(
         "Graph",
-        f"{solved_graph.name}: {solved_graph.dimension}-D, {solved_graph.poses} poses, "
-        f"{solved_graph.edges} edges; initial poses: {solved_graph.initialised}",
+        f"{graph.name}: {graph.dimension}-D, {graph.poses} poses, {graph.edges} edges; initial "
+        f"poses: {graph.initialised}",
     )
-    chi2, (expected_low, expected_high) = (
-        solved_graph.reduced_chi2,
-        solved_graph.reduced_chi2_interval,
-    )
+    chi2, (expected_low, expected_high) = graph.reduced_chi2, graph.reduced_chi2_interval
     if expected_high > 0.0:
         cause_text = ""
-        if (factor := solved_graph.information_factor) > 1.0:
+        if (factor := graph.information_factor) > 1.0:
             cause_text = (
                 f"Probable cause: all information matrices are about {format_number(factor, 2)} "
                 "times too large. Gate and robust optimisation therefore divide the information "
@@ -293,13 +286,13 @@ def make_pose_graph_page(solved_graph: Graph) -> Page:
         count_text = f"{len(gate_texts)} of {len(gates)} loop closures rejected"
         rejected_closure_lines = join_first_names(gate_texts, MAX_LISTED_CLOSURES, "\n").split("\n")
         page.write_labelled("Gate", count_text, *rejected_closure_lines)
-        if len(gates) > MAX_GNC_CLOSURES and len(solved_graph.solutions) == 1:
+        if len(gates) > MAX_GNC_CLOSURES and len(graph.solutions) == 1:
             page.write_labelled(
                 "Robust",
                 "not solved, because the graph has many loop closures. Add --robust to solve it.",
             )
     rows = []
-    for key, solution in solved_graph.solutions.items():
+    for key, solution in graph.solutions.items():
         label = SOLUTION_LABELS[key]
         if not solution.converged:
             not_converged_text = f"not converged: {label}. The cost is not at its minimum."

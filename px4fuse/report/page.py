@@ -136,10 +136,10 @@ class Page:
         self.add("columns", columns=blocks, widths=widths, gap=COLUMN_GAP)
 
 
-def make_two_columns() -> tuple[Page, Page]:
-    """Return two columns that fill the page width."""
-    width = (PAGE_WIDTH - COLUMN_GAP) / 2.0
-    return Page(width=width), Page(width=width)
+def make_columns(count: int = 2) -> list[Page]:
+    """Return columns that fill the page width."""
+    width = (PAGE_WIDTH - COLUMN_GAP * (count - 1)) / count
+    return [Page(width=width) for _ in range(count)]
 
 
 def styled_text(text: str, colour: str = TEXT_COLOUR, *, bold: bool = False) -> PageBlock:
@@ -183,18 +183,10 @@ def _render_figure(block: Mapping[str, Any]) -> PageBlock:
     """Return a figure as SVG, and its frame, ticks and axis labels, which Typst draws."""
     fields: PageBlock = {}
     if "axes" in block:
-        frame = _place_axes(block)
-        axes = block["axes"]
+        fields["frame"], axes = _place_axes(block), block["axes"]
         axes.apply_aspect()  # sets the final limits of maps
-        x_ticks, x_label = _find_ticks(axes, axes.xaxis)
-        y_ticks, y_label = _find_ticks(axes, axes.yaxis)
-        fields = {
-            "frame": frame,
-            "x_ticks": x_ticks,
-            "y_ticks": y_ticks,
-            "x_label": x_label,
-            "y_label": y_label,
-        }
+        fields["x_axis"] = _find_ticks(axes, axes.xaxis)
+        fields["y_axis"] = _find_ticks(axes, axes.yaxis)
         axes.set_axis_off()  # the ticks of matplotlib are slow: each consists of five artists
     buffer = io.StringIO()
     block["figure"].savefig(buffer, format="svg", metadata={"Date": None, "Creator": None})

@@ -1,8 +1,8 @@
-"""Plots of KF and EKF2 over time along one axis."""
+"""Plots of KF and EKF2 over time, with events: gaps, resets, rejections and outliers."""
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from functools import partial
 from typing import Any, NamedTuple
 
@@ -11,16 +11,20 @@ import pandas as pd
 
 from px4fuse.analysis import Analysis
 from px4fuse.comparison.model import AxisComparison, Difference
+from px4fuse.core.arrays import Array
 from px4fuse.filter.consistency import Consistency
+from px4fuse.filter.tuning import HORIZONTAL, AxisTuning
 from px4fuse.flight.model import Unavailable
-from px4fuse.report import event_marks, style
+from px4fuse.report import style
 from px4fuse.report.page import Page, PageBlock
 from px4fuse.report.phrases import format_sigma_verdict, get_statistics_by_filter
 from px4fuse.report.style import (
     INNOVATION_STYLES,
+    REJECTED_STYLE,
     TRACK_STYLES,
     Artist,
     Axes,
+    dot_style,
     draw_curve,
     draw_sigma_band,
     set_log_scale,
@@ -31,6 +35,95 @@ NARROW_AXES_HEIGHT = 72.0  # points
 INNOVATION_AXIS_MARGIN_FACTOR = 1.3
 # The axis shows innovations up to this multiple of the median √S
 MAX_AXIS_LIMIT_IN_SQRT_S = 5.0
+# The bands differ in shade and hatching, because reports may be printed in greyscale
+_BAND_STYLE: dict[str, Any] = {"edgecolor": "none", "lw": 0.0}
+ON_GROUND_BAND_STYLE = _BAND_STYLE | {"facecolor": "#e4e4e4"}
+DROPOUT_BAND_STYLE = _BAND_STYLE | {"facecolor": "#a8a8a8"}
+GAP_BAND_STYLE = _BAND_STYLE | {"facecolor": "#fbfbfb", "edgecolor": "#9a9a9a", "hatch": "/////"}
+RESET_MARKER_STYLE = dot_style("#8a4508", 2, 6.0, 1.2)
+OUTLIER_MARKER_STYLE = dot_style("black", "x", 3.0, 0.7)
+TAKE_OFF_MARKER_STYLE, LANDING_MARKER_STYLE = (
+    dot_style("black", "*", 6.0),
+    dot_style("black", "P", 5.0),
+)
+
+
+class EventMarkers(NamedTuple):
+    """Events of one type as markers or bands in a plot over time.
+
+    Attributes
+    ----------
+    height : float or None
+        Height of markers as fraction of the axes; None for bands.
+    """
+
+    label: str
+    event_times_or_spans_s: Sequence[Any] | Array
+    style: dict[str, Any]
+    height: float | None = None
+
+
+def _make_event_markers(
+    analysis: Analysis, rejection_times_s: Sequence[float] | Array
+) -> list[EventMarkers]:
+    events = analysis.events
+    event_markers = (
+        EventMarkers("on the ground", events.ground_spans_s, ON_GROUND_BAND_STYLE),
+        EventMarkers("position gap", events.gaps, GAP_BAND_STYLE),
+        EventMarkers("log dropout", events.dropouts, DROPOUT_BAND_STYLE),
+        EventMarkers("EKF2 rejected", rejection_times_s, REJECTED_STYLE, 0.025),
+        EventMarkers("outlier", find_outlier_times(analysis), OUTLIER_MARKER_STYLE, 0.075),
+        EventMarkers("EKF2 reset", events.reset_times_s, RESET_MARKER_STYLE, 0.92),
+        EventMarkers("take-off", events.take_off_times_s, TAKE_OFF_MARKER_STYLE, 0.0),
+        EventMarkers("landing", events.landing_times_s, LANDING_MARKER_STYLE, 0.0),
+    )
+    return [markers for markers in event_markers if len(markers.event_times_or_spans_s)]
+
+
+def add_time_panel(
+    page: Page,
+    analysis: Analysis,
+    title: str,
+    height: float,
+    *,
+    axis: str | None = None,
+    with_time_label: bool = True,
+    **options: Any,
+) -> Axes:
+    """Add a plot over time with gaps, resets, rejections and outliers."""
+    from matplotlib.collections import PolyCollection  # noqa: PLC0415
+
+    axes = page.add_panel(title, height, **options)
+    segment, x_transform = analysis.segment.whole_flight, axes.get_xaxis_transform()
+    axes.set_xlim(segment.start_s, segment.end_s)
+    if with_time_label:
+        axes.set_xlabel(style.TIME_LABEL)
+    axis_name = analysis.main.axis.name if axis is None else axis
+    rejection_times_s = analysis.events.rejection_times_s.get(axis_name, ())
+    for order, (_, times_or_spans_s, event_style, marker_height) in enumerate(
+        _make_event_markers(analysis, rejection_times_s), start=1
+    ):
+        if marker_height is None:
+            corners = [
+                [(start_s, 0.0), (start_s, 1.0), (end_s, 1.0), (end_s, 0.0)]
+                for start_s, end_s in times_or_spans_s
+            ]
+            bands = PolyCollection(
+                corners, transform=x_transform, zorder=0.1 * order, **event_style
+            )
+            axes.add_collection(bands, autolim=False)
+        else:
+            heights = pd.Series(marker_height, np.asarray(times_or_spans_s, np.float64))
+            marker_style = event_style | {"zorder": 2.6, "clip_on": marker_height > 0.0}
+            draw_curve(axes, heights, transform=x_transform, **marker_style)
+    return axes
+
+
+def find_outlier_times(analysis: Analysis) -> Array:
+    """Return the times (s) of outliers of the position source."""
+    tunings = map(analysis.tuning.get, (HORIZONTAL, analysis.main.axis.name))
+    times_s = [tuning.outlier_time_s for tuning in tunings if isinstance(tuning, AxisTuning)]
+    return np.asarray(np.unique(np.concatenate([[], *times_s])))
 
 
 class QuantityColumns(NamedTuple):
@@ -84,7 +177,7 @@ class Panel(NamedTuple):
         texts = [self.make_statistics_text(result)]
         if not is_narrow:
             texts.append(self.make_caption(result))
-        axes = event_marks.add_panel(
+        axes = add_time_panel(
             page,
             analysis,
             self.title,
@@ -101,7 +194,10 @@ def add_legend(page: Page, analysis: Analysis) -> PageBlock:
     from matplotlib.lines import Line2D  # noqa: PLC0415
     from matplotlib.patches import Patch  # noqa: PLC0415
 
-    lines: list[Artist] = [
+    all_rejection_times_s = [
+        time for times in analysis.events.rejection_times_s.values() for time in times
+    ]
+    entries: list[Artist] = [
         Line2D([], [], **style.MEASUREMENT_STYLE | {"ms": 5.0}, label="position"),
         Line2D([], [], **TRACK_STYLES["KF"], label="KF"),
         Patch(facecolor=style.KF_BAND_COLOUR, lw=0, label="±2σ reported"),
@@ -109,8 +205,16 @@ def add_legend(page: Page, analysis: Analysis) -> PageBlock:
             Line2D([], [], **TRACK_STYLES[name], label=name)
             for name in _list_ekf2_and_truth_tracks(analysis.main)
         ),
+        *(
+            Patch(**event_style, label=label)
+            if height is None
+            else Line2D([], [], **event_style, label=label)
+            for label, _, event_style, height in _make_event_markers(
+                analysis, all_rejection_times_s
+            )
+        ),
     ]
-    return page.add_legend([*lines, *event_marks.make_legend_entries(analysis)])
+    return page.add_legend(entries)
 
 
 def select_available_tables(**tables: object) -> dict[str, pd.DataFrame]:
@@ -204,7 +308,7 @@ def draw_innovations(axes: Axes, result: AxisComparison) -> None:
         innovations = ekf2_innovations["innovation_m"]
         innovations_and_styles = [
             (innovations[~is_rejected], INNOVATION_STYLES["EKF2"]),
-            (innovations[is_rejected], style.REJECTED_STYLE),
+            (innovations[is_rejected], REJECTED_STYLE),
             *innovations_and_styles,
         ]
     for values, marker_style in innovations_and_styles:

@@ -1,6 +1,5 @@
 """PDF report with the results attached."""
 
-import json
 from collections.abc import Callable, Iterator, Mapping
 from importlib import metadata
 from typing import Any
@@ -15,13 +14,11 @@ from px4fuse.report import (
     difference_page,
     evaluation,
     flight,
-    fonts,
     loop,
     notes,
     provenance,
 )
 from px4fuse.report.page import Page, replace_unprintable, to_typst_data
-from px4fuse.report.phrases import format_student
 from px4fuse.report.style import apply_report_style
 from px4fuse.report.typesetting import compile_pdf
 from px4fuse.results import contract
@@ -72,7 +69,7 @@ def render_pdf(content: Any, results: Any, results_json: str) -> bytes:
     # the log, the odometry of a loop, or the evaluated trajectory
     fields = (field for field in ("log", "track", "estimate") if hasattr(results, field))
     source = getattr(results, next(fields))
-    blocks, report_text = list[Any](), ""
+    blocks = list[Any]()
     with apply_report_style():
         # Converting each page immediately saves memory
         for page in (
@@ -80,13 +77,11 @@ def render_pdf(content: Any, results: Any, results_json: str) -> bytes:
             for draw in PAGE_FUNCTIONS_BY_RESULTS_TYPE[type(results)]
             for page in draw(content, results)
         ):
-            report_text += json.dumps(page.blocks, ensure_ascii=False, default=repr)
             blocks += to_typst_data(page.blocks, source.name)
     producer = f"px4fuse {metadata.version('px4fuse')}"
-    student = format_student(getattr(results, "student", NO_STUDENT))
+    student = getattr(results, "student", NO_STUDENT)
+    student_text = ", ".join(filter(None, (student.name, student.id)))
     release_free_memory()  # before Typst starts
-    # figures contain no names and notes, so they need no other fonts
-    all_text = title + source.name + student + report_text
     return compile_pdf(
         {
             "title": title,
@@ -94,8 +89,7 @@ def render_pdf(content: Any, results: Any, results_json: str) -> bytes:
             "head": one_line(
                 replace_unprintable(f"px4fuse · {source.name} · SHA-256 {source.sha256[:12]}"), 90
             ),
-            "student": one_line(replace_unprintable(student), 40),
-            "fonts": fonts.find_font_names(all_text),
+            "student": one_line(replace_unprintable(student_text), 40),
             "blocks": blocks,
             "results": results_json,
         }

@@ -2,37 +2,24 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
 from typing import TYPE_CHECKING
-
-import numpy as np
 
 from px4fuse.comparison.model import (
     FILTER_NAMES,
     AxisComparison,
     Comparison,
     FilterSummary,
-    PreparedComparison,
     UntestedFilter,
-)
-from px4fuse.comparison.remedy import format_changes as format_parameters
-from px4fuse.comparison.remedy import (
-    make_height_noise_advice,
-    make_noise_change,
 )
 from px4fuse.core.text import capitalise_first, format_factor, format_number
 from px4fuse.filter.consistency import Consistency
 from px4fuse.filter.settings import KF_NUMERIC_SETTINGS, SETTING_RANGES, Settings
-from px4fuse.filter.signals import AISLE
-from px4fuse.filter.tuning import HORIZONTAL, AxisTuning, NoiseEstimate
+from px4fuse.filter.tuning import NoiseEstimate
 from px4fuse.finding import Finding, format_spans
 from px4fuse.findings.model import finding_title, split_cause_groups
-from px4fuse.findings.noises import KEEP_NOISE_BECAUSE_OF_CORRELATION_ACTION
-from px4fuse.flight.ekf2_parameters import EV_POS
-from px4fuse.flight.model import Alignment, ClockMap, Columns, Unavailable
+from px4fuse.flight.model import Alignment, ClockMap, Unavailable
 from px4fuse.report.page import Cell, Page, styled_text
 from px4fuse.report.style import GOOD_COLOUR, MUTED_COLOUR, SEVERITY_COLOURS
-from px4fuse.results.model import Student
 
 if TYPE_CHECKING:
     from px4fuse.analysis import Analysis
@@ -174,111 +161,6 @@ def describe_alignment(alignment: Alignment) -> dict[str, str]:
         if alignment.residual_rms_m is not None:
             text_by_label["match"] += f", residual {alignment.residual_rms_m:.3f} m RMS per axis"
     return text_by_label
-
-
-def make_tuning_advice(
-    comparison: PreparedComparison, tuning_by_axis: Mapping[str, AxisTuning | Unavailable]
-) -> dict[str, str]:
-    """Return advice from the noise estimates, by label such as "SIGMA_Z"."""
-    names = (HORIZONTAL, AISLE, *tuning_by_axis)
-    tunings = [
-        tuning for name in names if isinstance(tuning := tuning_by_axis.get(name), AxisTuning)
-    ]
-    if not tunings:
-        return {}
-    tuning, axis_name = tunings[0], tunings[0].name
-    sigma_a, sigma_z = tuning.sigma_a_two_state, tuning.sigma_z
-    advice_by_label, origin = dict[str, str](), comparison.source.origin
-    settings = comparison.settings
-    if origin.may_drift:
-        advice_by_label["Drift"] = (
-            "The position source may drift. The estimates describe the noise without the drift. Do "
-            "not set SIGMA_Z or EKF2_EVP_NOISE below the error shown by ground truth or a loop "
-            "closure."
-        )
-    # Same restriction as the finding kf_underconfident of px4fuse compare
-    elif origin.is_gnss and any(
-        noise.value is not None and noise.high is not None and noise.high < setting
-        for noise, setting in ((sigma_a, settings.sigma_a_m_s2), (sigma_z, settings.sigma_z_m))
-    ):
-        advice_by_label["GNSS"] = (
-            KEEP_NOISE_BECAUSE_OF_CORRELATION_ACTION.format(sensor="GNSS")
-            if isinstance(comparison.flight.truth, Unavailable)
-            else "The estimates do not contain the time-correlated error of GNSS. Compare them "
-            "with ground truth: px4fuse compare LOG."
-        )
-    elif sigma_a.value is not None or sigma_z.value is not None:
-        options_text = "".join(
-            f" {option} {noise.value:.3g}"
-            for option, noise in (("--sigma-a", sigma_a), ("--sigma-z", sigma_z))
-            if noise.value is not None
-        )
-        advice_by_label["Action"] = (
-            f"Re-run with the estimated noise ({axis_name}): px4fuse compare LOG{options_text}"
-        )
-    if sigma_z.value is None and sigma_z.low is not None:
-        advice_by_label["SIGMA_Z"] = (
-            f"The estimate of SIGMA_Z is at least {sigma_z.low:.2g} m. Possibly the source does "
-            "not measure the position along this axis."
-        )
-    elif sigma_z.value is None:
-        bound_text = "" if sigma_z.high is None else f" (at most {sigma_z.high:.2g} m)"
-        advice_by_label["SIGMA_Z"] = (
-            f"SIGMA_Z{bound_text} cannot be estimated, because the process noise between two "
-            "logged positions is too large. Log the source at a higher rate."
-        )
-    elif comparison.flight.log.autopilot == "PX4" and not origin.may_drift and origin.is_vision:
-        advice_by_label["PX4"] = _make_vision_noise_advice(comparison, sigma_z)
-        advice_by_label["PX4"] += make_height_noise_advice(
-            comparison, tuning_by_axis, sigma_z.value
-        )
-    if sigma_a.value is None:
-        advice_by_label["SIGMA_A"] = (
-            "SIGMA_A cannot be estimated: the flight has too little motion, or is too short."
-            if sigma_a.low is None
-            else f"The estimate of SIGMA_A is at least {sigma_a.low:.2g} m/s²: logged acceleration "
-            "and positions disagree."
-        )
-    elif (
-        tuning.biases_fitted
-        and (accelerometer_noise := tuning.sigma_a.value or tuning.sigma_a.high) is not None
-    ):
-        bound_text = "" if tuning.sigma_a.value is not None else "at most "
-        advice_by_label["SIGMA_A"] = (
-            f"Accelerometer noise alone is {bound_text}{accelerometer_noise:.2g} m/s². The "
-            f"estimate of SIGMA_A, {sigma_a.value:.2g} m/s², also includes accelerometer bias and "
-            "tilt error, which are not states of KF."
-        )
-    if len(tuning.outlier_time_s):
-        advice_by_label["Outliers"] = (
-            f"{len(tuning.outlier_time_s)} of {tuning.count} measurements ({axis_name}) are "
-            f"outliers, the first at {tuning.outlier_time_s[0]:.1f} s. The noise estimates exclude "
-            "them."
-        )
-    return advice_by_label
-
-
-def _make_vision_noise_advice(comparison: PreparedComparison, estimate: NoiseEstimate) -> str:
-    """Return advice on the position noise of EKF2 for external vision."""
-    assert estimate.value is not None
-    name, parameters = EV_POS.noise, comparison.flight.log.parameters
-    low_m, high_m = estimate.low or 0.0, estimate.high or np.inf
-    variance_m2 = comparison.source.samples[Columns.POSITION_VARIANCE[:2]].median().mean()
-    reported_sigma_m = 0.0 if np.isnan(variance_m2) else float(np.sqrt(variance_m2))
-    changes = make_noise_change(EV_POS, parameters, reported_sigma_m, estimate.value)
-    logged_noise_m = parameters.get(name, np.nan)
-    if EV_POS.noise_mode_parameter in changes and reported_sigma_m > high_m:
-        return (
-            f"Set {format_parameters(changes)}. The source reported a σ of "
-            f"{reported_sigma_m:.2g} m."
-        )
-    if low_m <= logged_noise_m <= high_m:
-        return f"{name} {logged_noise_m:g} m is within the 95 % interval of the estimate."
-    return f"Set {name} to {changes[name]:g} m (now {logged_noise_m:g} m)."
-
-
-def format_student(student: Student) -> str:
-    return ", ".join(filter(None, (student.name, student.id)))
 
 
 def write_findings(page: Page, findings: tuple[Finding, ...]) -> None:

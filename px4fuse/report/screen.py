@@ -8,14 +8,7 @@ from rich.console import Console
 from rich.table import Table
 from rich.text import Text
 
-from px4fuse.report.card_text import (
-    CARD_WIDTH,
-    format_card_lines,
-    format_closing_lines,
-    format_headline_lines,
-    to_ascii,
-    with_typed_path,
-)
+from px4fuse.report.card_text import CARD_WIDTH, Paragraph, to_ascii
 from px4fuse.report.page import Cell, PageBlock
 from px4fuse.report.style import GOOD_COLOUR, MUTED_COLOUR, SEVERITY_COLOURS
 from px4fuse.request import ComparisonRequest, Request, command_line
@@ -58,25 +51,19 @@ def print_blocks(
                 print_line(console, block["label"], block["text"])
             case "blank":
                 console.print()
-            case "card" | "closing" | "headline":
-                _show_card(console, block, request)
+            case "card":
+                _show_card(console, block["paragraphs"])
 
 
-def _show_card(console: Console, block: PageBlock, request: Request | None) -> None:
-    card = with_typed_path(block["card"], getattr(request, "log", None))
-    if block["kind"] == "card":
-        lines = format_card_lines(card)
-    elif block["kind"] == "closing":
-        lines = format_closing_lines(card, verbose=block["verbose"])
-    else:
-        lines = format_headline_lines(card)
+def _show_card(console: Console, paragraphs: Sequence[Paragraph]) -> None:
     is_ascii_terminal = console.encoding.lower() not in UNICODE_ENCODINGS
     # In a pipe, each sentence is one line
     width = min(console.width, CARD_WIDTH) if console.is_terminal else console.width
-    for line in lines:
-        for text in line.wrap(width):
+    for paragraph in paragraphs:
+        for text in paragraph.wrap(width):
             console.print(
-                Text(to_ascii(text) if is_ascii_terminal else text, line.style), soft_wrap=True
+                Text(to_ascii(text) if is_ascii_terminal else text, paragraph.style),
+                soft_wrap=True,
             )
 
 

@@ -1,11 +1,17 @@
 """Terminal output of ``px4fuse compare``."""
 
+from collections.abc import Iterable
 from typing import Any
 
 from px4fuse.analysis import AidingSourceAnalysis, Analysis
-from px4fuse.card.model import Card
 from px4fuse.ekf2.steps import DifferenceExplanation
 from px4fuse.report.aids import select_aids_of_outdoor_flight, write_aids
+from px4fuse.report.card_text import (
+    Paragraph,
+    format_card_lines,
+    make_headline,
+    with_typed_path,
+)
 from px4fuse.report.page import Page
 from px4fuse.report.phrases import (
     VERDICT_LEGEND,
@@ -23,6 +29,7 @@ ERROR_LEGEND = (
 def make_comparison_page(
     analysis: Analysis | AidingSourceAnalysis,
     results: Any,
+    log_path: str,
     *,
     verbose: bool = False,
     quiet: bool = False,
@@ -31,12 +38,15 @@ def make_comparison_page(
 
     Parameters
     ----------
+    log_path : str
+        Path of the log as the user typed it, for commands.
     verbose : bool
         True to add settings, statistics and all findings (detected faults).
     quiet : bool
         True for the headline only.
     """
-    page = make_card_page("headline" if quiet else "card", results.card)
+    card = with_typed_path(results.card, log_path)
+    page = make_card_page([make_headline(card)] if quiet else format_card_lines(card))
     if not verbose:
         return page
     if isinstance(analysis, AidingSourceAnalysis):
@@ -72,8 +82,8 @@ def _write_details(page: Page, analysis: Analysis, results: Any) -> None:
     write_findings(page, results.findings)
 
 
-def make_card_page(card_part: str, card: Card, *, verbose: bool = False) -> Page:
-    """Make a page with a diagnosis card, or with its "headline" or "closing" lines only."""
+def make_card_page(paragraphs: Iterable[Paragraph]) -> Page:
+    """Make a page with the lines of a diagnosis card."""
     page = Page()
-    page.add(card_part, card=card, verbose=verbose)
+    page.add("card", paragraphs=list(paragraphs))
     return page

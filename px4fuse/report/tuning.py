@@ -1,10 +1,18 @@
-"""Terminal output of ``px4fuse tune``: estimated noises of KF."""
+"""Terminal output of ``px4fuse tune``: estimated noises of KF, and advice."""
+
+from collections.abc import Iterator, Mapping
+
+import numpy as np
 
 from px4fuse.comparison.model import PreparedComparison
-from px4fuse.filter.tuning import AxisTuning
-from px4fuse.flight.model import Unavailable
+from px4fuse.comparison.remedy import format_changes, make_height_noise_advice, make_noise_change
+from px4fuse.filter.signals import AISLE
+from px4fuse.filter.tuning import HORIZONTAL, AxisTuning, NoiseEstimate
+from px4fuse.findings.noises import KEEP_NOISE_BECAUSE_OF_CORRELATION_ACTION
+from px4fuse.flight.ekf2_parameters import EV_POS
+from px4fuse.flight.model import Columns, Unavailable
 from px4fuse.report.page import Page
-from px4fuse.report.phrases import format_noise_estimate, format_settings, make_tuning_advice
+from px4fuse.report.phrases import format_noise_estimate, format_settings
 
 TUNING_HEAD = (
     "axis",
@@ -18,7 +26,7 @@ TUNING_NOTE = "Gain on the 2nd half: with SIGMA_A and SIGMA_Z estimated on the 1
 
 
 def make_tuning_page(
-    comparison: PreparedComparison, tunings: dict[str, AxisTuning | Unavailable]
+    comparison: PreparedComparison, tunings: Mapping[str, AxisTuning | Unavailable]
 ) -> Page:
     """Make a page on the estimates of SIGMA_A and SIGMA_Z along each axis."""
     page, rows, sentences = Page(), [], list[str]()
@@ -48,5 +56,108 @@ def make_tuning_page(
         sentences.append(TUNING_NOTE)
     for text in sentences:
         page.write_small_text(text)
-    page.write_labelled_texts(make_tuning_advice(comparison, tunings))
+    page.write_labelled_texts(dict(list_tuning_advice(comparison, tunings)))
     return page
+
+
+def list_tuning_advice(
+    comparison: PreparedComparison, tuning_by_axis: Mapping[str, AxisTuning | Unavailable]
+) -> Iterator[tuple[str, str]]:
+    """Yield advice from the noise estimates as pairs (label, text)."""
+    names = (HORIZONTAL, AISLE, *tuning_by_axis)
+    tunings = [
+        tuning for name in names if isinstance(tuning := tuning_by_axis.get(name), AxisTuning)
+    ]
+    if not tunings:
+        return
+    tuning, origin, settings = tunings[0], comparison.source.origin, comparison.settings
+    sigma_a, sigma_z = tuning.sigma_a_two_state, tuning.sigma_z
+    noises = (
+        ("--sigma-a", sigma_a, settings.sigma_a_m_s2),
+        ("--sigma-z", sigma_z, settings.sigma_z_m),
+    )
+    options = [
+        f"{option} {noise.value:.3g}" for option, noise, _ in noises if noise.value is not None
+    ]
+    if origin.may_drift:
+        yield (
+            "Drift",
+            "The position source may drift. The estimates describe the noise without the drift. Do "
+            "not set SIGMA_Z or EKF2_EVP_NOISE below the error shown by ground truth or a loop "
+            "closure.",
+        )
+    # Same restriction as the finding kf_underconfident of px4fuse compare
+    elif origin.is_gnss and any(
+        noise.value is not None and noise.high is not None and noise.high < setting
+        for _, noise, setting in noises
+    ):
+        yield (
+            "GNSS",
+            KEEP_NOISE_BECAUSE_OF_CORRELATION_ACTION.format(sensor="GNSS")
+            if isinstance(comparison.flight.truth, Unavailable)
+            else "The estimates do not contain the time-correlated error of GNSS. Compare them "
+            "with ground truth: px4fuse compare LOG.",
+        )
+    elif options:
+        command = f"px4fuse compare LOG {' '.join(options)}"
+        yield "Action", f"Re-run with the estimated noise ({tuning.name}): {command}"
+    if sigma_z.value is None and sigma_z.low is not None:
+        yield (
+            "SIGMA_Z",
+            f"The estimate of SIGMA_Z is at least {sigma_z.low:.2g} m. Possibly the source does "
+            "not measure the position along this axis.",
+        )
+    elif sigma_z.value is None:
+        bound_text = "" if sigma_z.high is None else f" (at most {sigma_z.high:.2g} m)"
+        yield (
+            "SIGMA_Z",
+            f"SIGMA_Z{bound_text} cannot be estimated, because the process noise between two "
+            "logged positions is too large. Log the source at a higher rate.",
+        )
+    elif comparison.flight.log.autopilot == "PX4" and not origin.may_drift and origin.is_vision:
+        height_advice = make_height_noise_advice(comparison, tuning_by_axis, sigma_z.value)
+        yield "PX4", _make_vision_noise_advice(comparison, sigma_z) + height_advice
+    if sigma_a.value is None:
+        yield (
+            "SIGMA_A",
+            "SIGMA_A cannot be estimated: the flight has too little motion, or is too short."
+            if sigma_a.low is None
+            else f"The estimate of SIGMA_A is at least {sigma_a.low:.2g} m/s²: logged acceleration "
+            "and positions disagree.",
+        )
+    elif (
+        tuning.biases_fitted
+        and (accelerometer_noise := tuning.sigma_a.value or tuning.sigma_a.high) is not None
+    ):
+        bound_text = "" if tuning.sigma_a.value is not None else "at most "
+        yield (
+            "SIGMA_A",
+            f"Accelerometer noise alone is {bound_text}{accelerometer_noise:.2g} m/s². The "
+            f"estimate of SIGMA_A, {sigma_a.value:.2g} m/s², also includes accelerometer bias and "
+            "tilt error, which are not states of KF.",
+        )
+    if len(tuning.outlier_time_s):
+        yield (
+            "Outliers",
+            f"{len(tuning.outlier_time_s)} of {tuning.count} measurements ({tuning.name}) are "
+            f"outliers, the first at {tuning.outlier_time_s[0]:.1f} s. The noise estimates exclude "
+            "them.",
+        )
+
+
+def _make_vision_noise_advice(comparison: PreparedComparison, estimate: NoiseEstimate) -> str:
+    """Return advice on the position noise of EKF2 for external vision."""
+    assert estimate.value is not None
+    name, parameters = EV_POS.noise, comparison.flight.log.parameters
+    low_m, high_m = estimate.low or 0.0, estimate.high or np.inf
+    variance_m2 = comparison.source.samples[Columns.POSITION_VARIANCE[:2]].median().mean()
+    reported_sigma_m = 0.0 if np.isnan(variance_m2) else float(np.sqrt(variance_m2))
+    changes = make_noise_change(EV_POS, parameters, reported_sigma_m, estimate.value)
+    logged_noise_m = parameters.get(name, np.nan)
+    if EV_POS.noise_mode_parameter in changes and reported_sigma_m > high_m:
+        return (
+            f"Set {format_changes(changes)}. The source reported a σ of {reported_sigma_m:.2g} m."
+        )
+    if low_m <= logged_noise_m <= high_m:
+        return f"{name} {logged_noise_m:g} m is within the 95 % interval of the estimate."
+    return f"Set {name} to {changes[name]:g} m (now {logged_noise_m:g} m)."

@@ -1,7 +1,7 @@
 """Typesetting of reports as PDF with Typst."""
 
 import json
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
 from pathlib import Path
 from tempfile import TemporaryDirectory
@@ -10,6 +10,7 @@ from typing import Any
 import typst
 
 from px4fuse.report import fonts
+from px4fuse.report.page import Page, to_typst_data
 
 # PDF/A-3a for archives, PDF/UA-1 for screen readers
 PDF_STANDARDS: list[Any] = ["a-3a", "ua-1"]
@@ -24,14 +25,14 @@ def compile_pdf(report: Mapping[str, Any]) -> bytes:
     return document
 
 
-def measure_free_height(blocks: Any, font_names: Sequence[str]) -> float:
+def measure_free_height(cover: Page) -> float:
     """Return the free height (points) on the first page of a report.
 
     The template cover.typ measures it, and labels the value with <free>.
     """
     report = dict.fromkeys(("title", "author", "head", "student"), "")
-    data = {**report, "fonts": font_names, "blocks": blocks, "results": None}
-    with _open_compiler(data) as compiler:
+    blocks = to_typst_data(cover.blocks, "")
+    with _open_compiler({**report, "blocks": blocks, "results": None}) as compiler:
         return float(json.loads(compiler.query("<free>", field="value", one=True)))
 
 
@@ -42,6 +43,7 @@ def read_template() -> str:
 
 @contextmanager
 def _open_compiler(report: Mapping[str, Any]) -> Iterator[typst.Compiler]:
+    font_names = fonts.find_font_names(json.dumps(report, ensure_ascii=False))
     with TemporaryDirectory() as empty_folder:
         yield typst.Compiler(
             input=read_template().encode(),
@@ -49,9 +51,9 @@ def _open_compiler(report: Mapping[str, Any]) -> Iterator[typst.Compiler]:
             font_paths=typst.Fonts(
                 include_system_fonts=False,
                 include_embedded_fonts=False,
-                font_paths=fonts.find_font_folders(report["fonts"]),
+                font_paths=fonts.find_font_folders(font_names),
             ),
             package_path=empty_folder,
             package_cache_path=empty_folder,
-            sys_inputs={"data": json.dumps(report)},
+            sys_inputs={"data": json.dumps({**report, "fonts": font_names})},
         )

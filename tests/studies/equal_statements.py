@@ -39,7 +39,7 @@ from px4fuse.errors import Px4FuseError
 from px4fuse.filter.time_offset import SourceTimeOffset
 from px4fuse.flight.ekf2_parameters import PARAMETERS
 from px4fuse.flight.model import Flight
-from px4fuse.report import clock, phrases
+from px4fuse.report import clock, tuning
 from px4fuse.request import ComparisonRequest, WhatIfRequest
 from px4fuse.results import build
 from px4fuse.results.contract import to_json_dict
@@ -97,7 +97,7 @@ def flight_outputs(request: ComparisonRequest, flight: Flight | None = None) -> 
     }
     comparison = prepare_comparison(flight, request)
     noises = estimate_noises(comparison)
-    outputs["tune"] = phrases.make_tuning_advice(comparison, noises)
+    outputs["tune"] = dict(tuning.list_tuning_advice(comparison, noises))
     outputs["tune_json"] = to_json_dict(build.make_tuning_results(request, comparison, noises))
     _, offset = estimate_noises_and_time_offset(comparison)
     is_late = isinstance(offset, SourceTimeOffset) and offset.is_significant(offset.remaining_s)
