@@ -91,13 +91,11 @@ _loop_option = partial(options.request_option, LoopRequest)
     "start_s",
     "Start of the loop: time after the first sample (s), or a timestamp of the trajectory.  "
     "[default: take-off]",
-    20.0,
 )
 @_loop_option(
     "end_s",
     "End of the loop: time after the first sample (s), or a timestamp of the trajectory.  "
     "[default: landing]",
-    60.0,
 )
 @click.option(
     "--reference",
@@ -118,7 +116,6 @@ _loop_option = partial(options.request_option, LoopRequest)
     "key_frames_m",
     "Distance (m) between the key frames of the pose graph.  [default: 2 % of the extent of "
     "the path, 0.02 to 0.5 m]",
-    0.2,
 )
 @_loop_option("frame", "Coordinate frame of a trajectory file.  [default: detected]")
 @options.system_option

@@ -28,7 +28,6 @@ from px4fuse.errors import SettingsError
 # Names of tool arguments that differ from the parameter of the command
 TOOL_ARGUMENT_BY_PARAMETER = {
     "finding": "finding_id",
-    "parameter_texts": "parameters",
     "source": "log",
 }
 # Command parameters that the tools of the server do not offer: outputs, exit codes, student data
