@@ -202,7 +202,7 @@ REFUSED = {
     },
     "mistakes alone": ("simulate -o f.ulg --mistakes 1", "requires --assignment"),
     # trajectories and pose graphs
-    "empty trajectory": ("loop empty.tum", "px4fuse: empty.tum is empty"),
+    "empty trajectory": ("loop empty.tum", "px4fuse: empty.tum: the file is empty"),
     "text junk": ("loop junk.txt", "junk.txt: the first 3 lines contain no header"),
     "PDF": ("loop f.pdf", "f.pdf: the file is a PDF, not a flight log"),
     "no motion": ("loop still.tum", "still.tum: the path of 0.00 m"),
@@ -235,7 +235,10 @@ REFUSED = {
     "report of a graph": ("loop g.g2o -o r.pdf", "not available for a pose graph"),
     "evaluate junk": ("evaluate s.tum junk.bin", "junk.bin: the file is neither a PX4 ULog"),
     "evaluate apart": ("evaluate s.tum l.ulg --time-offset 0", "0 poses match in time"),
-    "offset of words": ("evaluate s.tum s.tum --time-offset abc", "not a number in seconds or auto."),
+    "offset of words": (
+        "evaluate s.tum s.tum --time-offset abc",
+        "not a number in seconds or auto.",
+    ),
     "RPE over nothing": ("evaluate s.tum s.tum --rpe 0m", "'0m' is not a distance"),
     "RPE over half a frame": (
         "evaluate s.tum s.tum --rpe 1.5f",

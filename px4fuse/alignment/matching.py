@@ -150,7 +150,7 @@ def _find_best_match(references: list[SampledTrack], problem: AlignmentProblem) 
     ):
         raise NoMatchError(
             f"the positions in the file change by less than {tracks.MIN_MOTION_M:g} m, too little "
-            "to match the file with the log"
+            "for a match"
         )
     matches = []
     for reference in references:

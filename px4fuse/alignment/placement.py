@@ -367,7 +367,7 @@ def _find_warnings(match: Match, is_yaw_estimated: bool) -> Iterator[str]:
         yield (
             f"A second time offset, {fit.second_peak_lag_difference_s:+.1f} s from the estimate, "
             f"fits nearly as well (residual {fit.second_to_best_residual_ratio:.1f} times larger). "
-            "Check the time offset, or set the time offset with --clock-offset."
+            "Check the time offset, or set --clock-offset."
         )
     if is_yaw_estimated and reference_name == IMU_REFERENCE:
         yield (

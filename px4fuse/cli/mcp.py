@@ -45,14 +45,14 @@ PARAMETERS_WITHOUT_TOOL_ARGUMENT = {
     metavar="DIR",
     multiple=True,
     default=(".",),
-    help="Folder whose files the tools may read, with its subfolders; repeatable.",
+    help="Folder that the tools may read, with its subfolders; repeatable.",
 )
 @click.option(
     "--out",
     "report_folder",
     type=click.Path(file_okay=False, path_type=Path),
     metavar="DIR",
-    help="Folder for the PDF reports of the MCP tools.  [default: no file is written]",
+    help="Folder for PDF reports.  [default: no file is written]",
 )
 @options.timeout_option
 @options.memory_option

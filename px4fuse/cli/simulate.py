@@ -86,7 +86,7 @@ class CommandWithFaultTable(click.Command):
 @click.command(cls=CommandWithFaultTable)
 @output_option(
     "FLIGHT.ulg|DIR",
-    "Log to write (ULog); with --assignment, the folder for the logs of the class.",
+    "Log to write (ULog); with --assignment, folder for the logs.",
     required=True,
 )
 @input_option(
@@ -98,30 +98,30 @@ class CommandWithFaultTable(click.Command):
 @input_option(
     "--secret-file",
     "FILE",
-    "File with the secret for --assignment; the same secret and student id give the same "
-    "flight.  [default: generated, and stored in the answer key]",
+    "Secret of --assignment: the same secret and student id give the same flight.  [default: "
+    "generated, and stored in the answer key]",
 )
 @click.option(
     "--mistakes",
     "fault_count",
     type=int,
     metavar="N",
-    help="Number of injected faults in each flight of --assignment.  [default: random, 0 to 2]",
+    help="Number of faults in each flight of --assignment.  [default: random, 0 to 2]",
 )
 @click.option(
     "--kind",
     type=Choice((*get_args(ScenarioKind), MIXED_KIND)),
     default=_DEFAULT_SCENARIO.kind,
-    help="Kind of flight. aisle: passes along an aisle with UWB; loop: laps of a square with "
-    "drifting VIO; outdoor: laps of a square with GNSS; mixed: with --assignment, loop for one "
-    "third of the students and aisle for the others.",
+    help="aisle: passes along an aisle with UWB; loop: laps of a square with drifting VIO; "
+    "outdoor: laps of a square with GNSS; mixed (with --assignment): loop for one third of the "
+    "students, aisle for the others.",
 )
 @click.option(
     "--seed",
     type=int,
     metavar="N",
     default=_DEFAULT_SCENARIO.seed,
-    help="Seed of the random numbers: the same N gives the same flight.",
+    help="Seed: the same N gives the same flight.",
 )
 @click.option(
     "--mistake",
@@ -135,8 +135,7 @@ class CommandWithFaultTable(click.Command):
     "answer_key_path",
     type=NonEmptyPath(),
     metavar="FILE.json",
-    help="Answer key to write: injected faults, biases, outliers and clock offset; not for "
-    "students.  [default with --assignment: DIR_answers.json]",
+    help="Answer key to write, not for students.  [default with --assignment: DIR_answers.json]",
 )
 @flag_option("--no-truth", help="Write no ground truth to the log.")
 @flag_option("--no-ekf2", help="Do not simulate EKF2, to save time.")
@@ -144,14 +143,13 @@ class CommandWithFaultTable(click.Command):
     "--passes",
     type=int,
     metavar="N",
-    help="Number of passes along the aisle, or of laps of the square.  [default: 6 passes, 1 lap; "
+    help="Number of passes of the aisle, or laps of the square.  [default: 6 passes, 1 lap; "
     "outdoors 3 laps]",
 )
 @click.option(
     "--yaw",
     type=Choice(get_args(YawMode)),
-    help="Heading of the vehicle: fixed, or follow (along the flight direction).  [default: fixed; "
-    "follow on a square]",
+    help="Heading: fixed, or follow the flight direction.  [default: fixed; follow on a square]",
 )
 @_add_scenario_options
 def simulate(

@@ -24,9 +24,7 @@ def parse_parameter(text: str) -> tuple[str, float]:
     """Parse a parameter and its value: ``NAME=VALUE``."""
     name, separator, value = text.partition("=")
     if not separator:
-        raise click.BadParameter(
-            f"{text} is not NAME=VALUE. Give for example EKF2_EVP_NOISE=0.1."
-        )
+        raise click.BadParameter(f"{text} is not NAME=VALUE. Give for example EKF2_EVP_NOISE=0.1.")
     return name, _parse_number(name, value)
 
 
@@ -51,8 +49,8 @@ def parse_sweep(text: str) -> Sweep:
     type=parse_parameter,
     metavar="NAME=VALUE",
     multiple=True,
-    help="EKF2 parameter and its value in the replay, in PX4's unit; repeatable.  [default: the "
-    "maximum-likelihood noise and delay of the position source]",
+    help="EKF2 parameter in PX4's unit; repeatable.  [default: the maximum-likelihood noise and "
+    "delay of the position source]",
 )
 @click.option(
     "--sweep",
@@ -65,16 +63,15 @@ def parse_sweep(text: str) -> Sweep:
     "--without",
     metavar="AID",
     multiple=True,
-    help="Aiding source that EKF2 does not fuse in the replay, for example gnss_pos, gnss_vel, "
-    "baro_hgt, mag or ev_pos; repeatable.",
+    help="Aiding source that EKF2 does not fuse, for example gnss_pos, gnss_vel, baro_hgt, mag or "
+    "ev_pos; repeatable.",
 )
 @click.option(
     "--from",
     "start_s",
     type=options.NumberWithUnit("s"),
     metavar="SECONDS",
-    help="Time (s after the first sample) at which EKF2 stops fusing the aiding sources given "
-    "with --without.  [default: 0]",
+    help="Time (s after the first sample) from which --without applies.  [default: 0]",
 )
 @options.system_option
 @options.max_size_option

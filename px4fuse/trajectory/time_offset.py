@@ -51,7 +51,6 @@ MIN_RESIDUAL_VELOCITY_CORRELATION = 0.5
 MAX_LAG_IN_CORRELATION_LENGTHS = 4
 # Maximum half-width (s) of the 95 % interval of a time offset
 MAX_INTERVAL_HALF_WIDTH_S = 0.5
-CONFIDENCE_LEVEL = 0.95
 
 
 class TimeOffset(Record, kw_only=True):
@@ -331,13 +330,8 @@ def _compute_interval_half_width_s(
         float(likelihood_score[k:] @ likelihood_score[:-k]) for k in range(1, lag_count + 1)
     ]
     variance_if_uncorrelated = float(likelihood_score @ likelihood_score)
-    score_variance = max(
-        variance_if_uncorrelated + 2.0 * float(lag_weights @ lagged_products),
-        variance_if_uncorrelated,
-    )
-    student_t_quantile = float(
-        stdtrit(max(pose_count / lag_count - 1.0, 1.0), 0.5 + CONFIDENCE_LEVEL / 2.0)
-    )
+    score_variance = variance_if_uncorrelated + max(2.0 * float(lag_weights @ lagged_products), 0.0)
+    student_t_quantile = float(stdtrit(max(pose_count / lag_count - 1.0, 1.0), 0.975))
     return float(student_t_quantile * np.sqrt(score_variance) / dense_square_sum)
 
 
