@@ -195,8 +195,8 @@ def _find_true_end(
     ):
         return Unavailable(
             "loop closure error",
-            f"{path.name} has poses only from {segment.start_s:.1f} s to {segment.end_s:.1f} s, "
-            "not of the whole flight",
+            f"{path.name} has poses only from {segment.start_s:.1f} to {segment.end_s:.1f} s of "
+            "the flight",
             "Choose the time span of a loop with --from and --to.",
         )
     return loop_segment.assume_landing_at_takeoff(path)
@@ -257,8 +257,8 @@ def _compute_heading_error(
     if true_end.heading_change_deg is None:
         return Unavailable(
             quantity,
-            f"the final heading differs by {heading_change_deg:+.0f}° from the initial heading, "
-            "and the true heading change is unknown",
+            f"the heading changes by {heading_change_deg:+.0f}°, and the true heading change is "
+            "unknown",
             "Give the true heading change: px4fuse loop --landed-at FORWARD,RIGHT,DEG.",
         )
     return float(np.degrees(lie.wrap(np.radians(heading_change_deg - true_end.heading_change_deg))))
@@ -279,9 +279,8 @@ def analyse_flight_loop(
             if any(take_off_s < limit_s < landing_s for limit_s in analysed_span_s):
                 return Unavailable(
                     "loop closure",
-                    "the analysed time span begins or ends in flight, so the path is not a loop",
-                    "Analyse the whole flight (without --start and --end), or give a loop "
-                    "closure with px4fuse loop --closure.",
+                    "the analysed time span begins or ends in flight",
+                    "Omit --start and --end, or give a loop closure with px4fuse loop --closure.",
                 )
     odometry = find_odometry(flight)
     try:
@@ -304,7 +303,7 @@ def analyse_flight_loop(
         return Unavailable(
             "loop closure",
             f"the odometry has an extent of {extent_m:.1f} m and ends "
-            f"{end_to_start_distance_m:.1f} m from its start, so the path is not a loop",
+            f"{end_to_start_distance_m:.1f} m from its start: no loop",
             "Fly back to the take-off place, or give a loop closure with px4fuse loop --closure.",
         )
     return analyse(LoopSource(trajectory, flight), progress=progress)

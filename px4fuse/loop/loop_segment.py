@@ -42,9 +42,8 @@ def cut_trajectory(trajectory: Trajectory, segment: Segment) -> Trajectory:
     segment_track = trajectory.cut_to_span(segment.start_s, segment.end_s)
     if len(segment_track) < MIN_POSES:
         raise TrajectoryError(
-            f"{trajectory.name} ({time_s[0]:.2f} s to {time_s[-1]:.2f} s) has {len(segment_track)} "
-            f"poses between {segment.start_s:.2f} s and {segment.end_s:.2f} s; "
-            f"{MIN_POSES} are needed"
+            f"{trajectory.name} ({time_s[0]:.2f} to {time_s[-1]:.2f} s) has {len(segment_track)} "
+            f"poses from {segment.start_s:.2f} to {segment.end_s:.2f} s; {MIN_POSES} are needed"
         )
     if segment.flight_span_s is None:
         return segment_track
@@ -107,8 +106,8 @@ def choose_loop_segment(
     limited_span_s = max(segment_start_s, track_start_s), min(segment_end_s, track_end_s)
     if not limited_span_s[0] < limited_span_s[1]:
         raise SettingsError(
-            f"The track has no poses between {segment_start_s:.12g} s and {segment_end_s:.12g} s; "
-            f"it is from {track_start_s:.2f} s to {track_end_s:.2f} s.",
+            f"The track ({track_start_s:.2f} to {track_end_s:.2f} s) has no poses between "
+            f"{segment_start_s:.12g} s and {segment_end_s:.12g} s.",
             "Change --from or --to.",
         )
     if limited_span_s != (segment_start_s, segment_end_s):

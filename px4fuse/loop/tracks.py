@@ -241,9 +241,9 @@ def read_source(
             f"Use one of {', '.join(TRACK_NAMES)}.",
         )
     chosen_track_name = track_name or default_track
-    odometry = find_odometry(flight)
-    if chosen_track_name is None and isinstance(odometry, Unavailable):
-        if isinstance(flight.ekf2, Unavailable):
-            raise MissingDataError(f"{flight.log.name}: {odometry.reason}", odometry.remedy)
-        chosen_track_name = "ekf2"
-    return LoopSource(trajectory_of(flight, chosen_track_name or "vio"), flight)
+    if chosen_track_name is None:
+        has_only_ekf2 = isinstance(find_odometry(flight), Unavailable) and not isinstance(
+            flight.ekf2, Unavailable
+        )
+        chosen_track_name = "ekf2" if has_only_ekf2 else "vio"
+    return LoopSource(trajectory_of(flight, chosen_track_name), flight)

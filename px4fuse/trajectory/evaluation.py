@@ -106,9 +106,10 @@ def find_jump_warnings(estimate: Trajectory, reference: Trajectory) -> tuple[str
         np.linalg.norm(np.diff(trajectory.position_m, axis=0), axis=1)
         for trajectory in (estimate, reference)
     )
-    step_differences_m = np.abs(steps_of_estimate_m - steps_of_reference_m)
-    min_jump_m = max(MIN_JUMP_M, MIN_JUMP_TO_MEDIAN_RATIO * np.median(step_differences_m))
-    jump_indices = np.flatnonzero(steps_of_estimate_m - steps_of_reference_m > min_jump_m)
+    step_differences_m = steps_of_estimate_m - steps_of_reference_m
+    median_difference_m = np.median(np.abs(step_differences_m))
+    min_jump_m = max(MIN_JUMP_M, MIN_JUMP_TO_MEDIAN_RATIO * median_difference_m)
+    jump_indices = np.flatnonzero(step_differences_m > min_jump_m)
     if not len(jump_indices):
         return ()
     times_s = estimate.time_s[jump_indices + 1] - estimate.time_s[0]
@@ -291,8 +292,8 @@ def evaluate(
     argument_order_warnings = []
     if estimate.kind == "truth" != reference.kind:
         argument_order_warnings.append(
-            f"{estimate.name} is ground truth, but {reference.name} is not. Check the order of the "
-            "arguments: first the estimate, then the reference."
+            f"{estimate.name} is ground truth, but {reference.name} is not. Give the estimate "
+            "first, then the reference."
         )
     distance_m = cumulative_distance(matched_reference.position_m)
     position_error_m = np.linalg.norm(
@@ -374,13 +375,13 @@ def choose_alignment(estimate: Trajectory, reference: Trajectory) -> tuple[Align
             "No alignment: the estimate is ground truth in the frame of the reference.",
         )
     frames_text = f"{estimate.frame} and {reference.frame}"
+    yaw_text = "Yaw and translation are aligned (4 degrees of freedom): "
     has_common_vertical = estimate.frame == reference.frame == "ENU" or (
         estimate.frame in _Z_DOWN_FRAMES and reference.frame in _Z_DOWN_FRAMES
     )
     if has_common_vertical and estimate.kind not in _KINDS_WITHOUT_KNOWN_VERTICAL:
         return "yaw", (
-            "Yaw and translation are aligned (4 degrees of freedom): z is vertical in both frames "
-            f"({frames_text}), so a tilt counts as an error."
+            f"{yaw_text}z is vertical in both frames ({frames_text}), so a tilt counts as an error."
         )
     scale, scale_reason = 1.0, ""
     try:
@@ -388,8 +389,8 @@ def choose_alignment(estimate: Trajectory, reference: Trajectory) -> tuple[Align
     except TrajectoryError:
         if has_common_vertical:
             return "yaw", (
-                "Yaw and translation are aligned (4 degrees of freedom): motion along a line does "
-                f"not determine all angles, but z is vertical in both frames ({frames_text})."
+                f"{yaw_text}motion along a line does not determine all angles, but z is vertical "
+                f"in both frames ({frames_text})."
             )
     if abs(scale - 1.0) > MAX_SCALE_ERROR:
         scale_reason = (
@@ -497,8 +498,8 @@ def _find_comparison_warnings(
 ) -> Iterator[str]:
     if association.coverage_estimate < MIN_EVALUATED_FRACTION:
         yield (
-            f"Only {association.coverage_estimate:.0%} of the poses of the estimate are evaluated; "
-            "the reference has no poses at the other times."
+            f"Only {association.coverage_estimate:.0%} of the estimate is evaluated; the reference "
+            "has no poses at the other times."
         )
     if association.coverage_reference < MIN_EVALUATED_FRACTION:
         yield (
@@ -512,8 +513,8 @@ def _find_comparison_warnings(
     has_motion = np.ptp(reference.position_m, axis=0).any()
     if alignment != "sim3" and has_motion and abs(scale - 1.0) > MAX_SCALE_ERROR:
         yield (
-            f"The scale factor of the estimate is {scale:.3g} instead of 1. The alignment "
-            f"{alignment} does not correct the scale."
+            f"The scale factor of the estimate is {scale:.3g} instead of 1, which the alignment "
+            f"{alignment} does not correct."
         )
 
 
@@ -544,10 +545,9 @@ def _move_to_reference_body(
         f"{value:+.2f} m along {axis}" for value, axis in zip(lever_arm_m, "xyz", strict=True)
     )
     return corrected_estimate, (
-        f"The orientations differ by a constant {np.degrees(body_rotation.magnitude()):.1f}°: the "
-        "estimate and the reference have different body axes. In "
-        f"the body axes of the reference, the estimate's origin is displaced by {lever_arm_text}. "
-        "Both differences are removed before the errors are computed.",
+        "The body axes of estimate and reference differ by a constant rotation of "
+        f"{np.degrees(body_rotation.magnitude()):.1f}°, and their origins by {lever_arm_text} in "
+        "the axes of the reference. Both differences are removed before the errors are computed.",
     )
 
 
@@ -568,7 +568,7 @@ def _rotate_to_reference_body(
     # chordal mean of rotations (Hartley 2013, section 5.3)
     rotation = (rotation_of_estimate.inv() * reference.rotation).mean()
     return replace(aligned_estimate, rotation=rotation_of_estimate * rotation), (
-        "Rotation errors exclude the estimated constant rotation between vehicle and camera axes, "
-        f"{np.degrees(rotation.magnitude()):.1f}°. Position errors include the "
-        "lever arm between vehicle and camera.",
+        "Rotation errors exclude the estimated rotation between vehicle and camera axes, "
+        f"{np.degrees(rotation.magnitude()):.1f}°. Position errors include the lever arm between "
+        "vehicle and camera.",
     )

@@ -306,8 +306,8 @@ def estimate_rmse_interval(
     if error_count < MIN_BOOTSTRAP_BLOCKS * block_length:
         return Unavailable(
             f"95 % interval of the {analysis_name} RMSE",
-            f"the errors are correlated over {block_length} of {error_count} samples, so there are "
-            f"fewer than {MIN_BOOTSTRAP_BLOCKS:.0f} independent blocks",
+            f"the errors are correlated over {block_length} of {error_count} samples: fewer than "
+            f"{MIN_BOOTSTRAP_BLOCKS:.0f} independent blocks",
             "Use a longer flight.",
         )
     circular_errors = np.append(squared_errors, squared_errors[: block_length - 1])

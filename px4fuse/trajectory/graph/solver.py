@@ -310,7 +310,7 @@ def analyse_graph(
     TrajectoryError
         The graph is not connected.
     """
-    is_closure = ~graph.find_successive_edges()
+    closure_edges = np.flatnonzero(~graph.find_successive_edges())
     progress(f"optimising: {SOLUTION_LABELS['all']}")
     solutions = {"all": solve(graph)}
     degrees_of_freedom = int(model.count_observed_directions(graph.information).sum())
@@ -324,7 +324,7 @@ def analyse_graph(
     scaled_graph, information_factor = graph, 1.0
     closure_tests: tuple[GateResult, ...] | Unavailable
     try:
-        closure_tests = tuple(gate_edges(graph, np.flatnonzero(is_closure)))
+        closure_tests = tuple(gate_edges(graph, closure_edges))
         if (
             reduced_chi2 > reduced_chi2_interval[1]
             and len(closure_tests) >= MIN_CLOSURES_FOR_SCALE_FACTOR
@@ -333,17 +333,16 @@ def analyse_graph(
             if factor >= MIN_INFORMATION_SCALE_FACTOR:
                 information_factor = factor
                 scaled_graph = replace(graph, information=graph.information / factor)
-                closure_tests = tuple(gate_edges(scaled_graph, np.flatnonzero(is_closure)))
+                closure_tests = tuple(gate_edges(scaled_graph, closure_edges))
     except TrajectoryError as error:
         closure_tests = Unavailable(
             "gate", str(error), "Give an odometry edge between all successive vertices."
         )
-    closure_count = int(np.count_nonzero(is_closure))
     if use_robust_optimisation is None:
-        use_robust_optimisation = closure_count <= MAX_GNC_CLOSURES
-    if closure_count > 1 and use_robust_optimisation:
+        use_robust_optimisation = len(closure_edges) <= MAX_GNC_CLOSURES
+    if use_robust_optimisation and len(closure_edges) > 1:
         progress(f"optimising: {ROBUST_SOLUTION_LABEL}")
-        solutions["gnc"] = solve(scaled_graph, robust=True, is_closure=is_closure)
+        solutions["gnc"] = solve(scaled_graph, robust=True)
     results = Graph(
         name=name,
         dimension=graph.dimension,
