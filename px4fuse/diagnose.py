@@ -255,8 +255,7 @@ def prepare_comparison(
     _, time_offset = estimate_noises_and_time_offset(prepared_comparison, progress)
     if isinstance(time_offset, Unavailable) or not time_offset.is_determinable:
         raise MissingDataError(
-            f"{flight.log.name}: the time offset cannot be estimated from this flight "
-            f"({time_offset.reason}).",
+            f"{flight.log.name}: the time offset cannot be estimated ({time_offset.reason}).",
             "State the offset (--clock-offset SECONDS), or omit --clock-offset.",
         )
     if not time_offset.is_significant(time_offset.remaining_s):

@@ -172,7 +172,7 @@ def fit_by_least_squares(
     if np.count_nonzero(is_used) < tracks.MIN_MATCHED_SAMPLES:
         raise NoMatchError(
             f"only {np.count_nonzero(is_used)} positions of the file overlap the "
-            f"{reference.name} in time; at least {tracks.MIN_MATCHED_SAMPLES} are needed"
+            f"{reference.name} in time; {tracks.MIN_MATCHED_SAMPLES} are needed"
         )
     reference_time_s = file_track.time_s[is_used] + peak.lag_s
     file_position_m = file_track.to_complex_m()[is_used]

@@ -55,16 +55,10 @@ def batch(
     from px4fuse.batch.terminal import format_summary
 
     gc.enable()  # otherwise the reference cycles of Dask fill the memory in a long run
-    try:
-        with outputs.progress() as show_progress:
-            batch_result = run(
-                logs, output, scheduler=scheduler, progress=show_progress, **option_values
-            )
-    except KeyboardInterrupt as interrupt:
-        message = "nothing was written."
-        if (output / "rows").is_dir():
-            message = f"{output} contains the results so far. Run the same command to continue."
-        raise outputs.Interrupted(interrupt, message) from None
+    with outputs.folder_progress(output) as show_progress:
+        batch_result = run(
+            logs, output, scheduler=scheduler, progress=show_progress, **option_values
+        )
     outputs.write_and_print_results(
         {}, format_summary(batch_result), written_files=batch_result.written_paths
     )

@@ -64,8 +64,8 @@ _evaluation_option = partial(options.request_option, EvaluationRequest)
 )
 @_evaluation_option(
     "time_offset_s",
-    "Time (s) to add to the timestamps of the estimate; auto estimates it from the motion.  "
-    "[default: auto if the two trajectories do not overlap in time, else 0]",
+    "Time (s) to add to the timestamps of the estimate; auto estimates it.  [default: auto if the "
+    "trajectories do not overlap in time, else 0]",
 )
 @_evaluation_option(
     "consecutive",
@@ -103,7 +103,7 @@ def evaluate(
         **option_values,
     )
     if request.max_gap_s is not None and request.max_gap_s <= 0.0:
-        raise SettingsError(f"--max-gap {request.max_gap_s:g} is too small. Give a time above 0 s.")
+        raise SettingsError(f"--max-gap {request.max_gap_s:g} is not above 0 s.")
     outputs.choose_report_paths(output, json_path)
     with outputs.progress(json_path) as show_progress:
         show_progress("reading")

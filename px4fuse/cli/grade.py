@@ -17,7 +17,7 @@ from px4fuse.cli.options import (
     open_option,
     output_option,
 )
-from px4fuse.cli.outputs import Interrupted, progress, write_and_print_results, write_new
+from px4fuse.cli.outputs import folder_progress, write_and_print_results, write_new
 from px4fuse.core.input_files import add_input, check_output_folder
 from px4fuse.core.reading import list_files_recursively
 from px4fuse.errors import OutputError, SettingsError
@@ -163,18 +163,14 @@ def grade(
         question_count=question_count,
         **option_values,
     )
-    try:
-        with progress() as show_progress:
-            outcome = grade_submissions(
-                submissions,
-                course,
-                output,
-                processes=process_count,
-                progress=partial(show_progress, "grading"),
-            )
-    except KeyboardInterrupt as interrupt:
-        note = f"{output} contains the results so far. Run the same command to continue."
-        raise Interrupted(interrupt, note) from None
+    with folder_progress(output) as show_progress:
+        outcome = grade_submissions(
+            submissions,
+            course,
+            output,
+            processes=process_count,
+            progress=partial(show_progress, "grading"),
+        )
     write_and_print_results({}, grading_page(outcome), written_files=outcome.written_paths)
 
 

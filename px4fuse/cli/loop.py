@@ -70,7 +70,7 @@ _loop_option = partial(options.request_option, LoopRequest)
 @options.flag_option(
     "--open",
     "is_open_path",
-    help="The vehicle did not return to the take-off place: the landing is no loop closure.",
+    help="The vehicle did not return to the take-off place.",
 )
 @click.option(
     "--closure",
@@ -83,8 +83,7 @@ _loop_option = partial(options.request_option, LoopRequest)
 )
 @options.flag_option(
     "--robust",
-    help="Run robust optimisation also for pose graphs with more than 1000 loop closures, which "
-    "takes minutes.",
+    help="Also optimise pose graphs with more than 1000 loop closures robustly (takes minutes).",
 )
 @_loop_option(
     "start_s",
@@ -219,21 +218,22 @@ def _solve_graph(
     from px4fuse.trajectory.graph.solver import analyse_graph
 
     path, track = split_path_and_part(str(source))
+    name = display_name(source)
     if track is not None:
         raise SettingsError(
-            f"{display_name(source)}: a pose graph contains no trajectory {track!r}",
+            f"{name}: a pose graph contains no trajectory {track!r}",
             f"Omit :{track}.",
         )
     for parameter in options.list_given_parameters():
         if parameter.name not in POSE_GRAPH_ARGUMENT_NAMES:
             raise SettingsError(
-                f"{display_name(source)}: {parameter.opts[-1]} is not available for a pose graph.",
+                f"{name}: {parameter.opts[-1]} is not available for a pose graph.",
                 "Use only --g2o FILE, --json FILE and --robust.",
             )
     with outputs.progress(json_path, g2o_path) as show_progress:
-        show_progress(f"reading {display_name(source)}")
+        show_progress(f"reading {name}")
         results, solved_graph = analyse_graph(
-            display_name(source), read_g2o(path), show_progress, use_robust_optimisation=robust
+            name, read_g2o(path), show_progress, use_robust_optimisation=robust
         )
     command = command_line(LoopRequest(source=str(source))) + (" --robust" if robust else "")
     contents = {} if g2o_path is None else {g2o_path: format_g2o(solved_graph).encode()}

@@ -32,8 +32,16 @@ TOOL_ARGUMENT_BY_PARAMETER = {
 }
 # Command parameters that the tools of the server do not offer: outputs, exit codes, student data
 PARAMETERS_WITHOUT_TOOL_ARGUMENT = {
-    *("output", "json_path", "tum_path", "g2o_path", "fail_on", "checks"),
-    *("student", "student_id", "notes", "answers"),
+    "output",
+    "json_path",
+    "tum_path",
+    "g2o_path",
+    "fail_on",
+    "checks",
+    "student",
+    "student_id",
+    "notes",
+    "answers",
 }
 
 

@@ -411,7 +411,7 @@ def read_student(option_values: dict[str, Any], log: Path) -> Student:
     if answers and answers.log_sha256 != hashlib.sha256(read_log_bytes(log)).hexdigest():
         raise SettingsError(
             f"--answers {answers_path} was made for another log than {log.name}.",
-            f"Give the answer form of {log.name}. To write it: px4fuse answers {log.name}.",
+            f"Write the answer form of {log.name} with px4fuse answers {log.name}.",
         )
     name, student_id = (replace_unencodable(text or "") for text in (name, student_id))
     if not (texts := name + student_id + notes).isascii():

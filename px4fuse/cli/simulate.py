@@ -92,8 +92,8 @@ class CommandWithFaultTable(click.Command):
 @input_option(
     "--assignment",
     "ROSTER.csv",
-    "Class list (student id, name). Writes the answer key next to DIR, and one flight per student "
-    "with random noise levels and faults.",
+    "Class list (student id, name): writes an answer key next to DIR, and one flight per student "
+    "with random noise and faults.",
 )
 @input_option(
     "--secret-file",
