@@ -252,8 +252,8 @@ def _apply_alignment(
             time_offset_sigma_s = match.time_offset_fit.lag_sigma_s
             clock_offset_s = lag_s + (flight.log.boot_time_s - float(samples.index[0]))
             time_offset_reason = (
-                f"the position file was matched with the {reference_name}, including any delay of "
-                f"the {reference_name}"
+                f"the position file was matched in time with the {reference_name}; the time offset "
+                f"includes any delay of the {reference_name}"
             )
         reference_correlation = float(
             (np.exp(-1j * yaw_rad) * match.time_offset_fit.coherence).real
