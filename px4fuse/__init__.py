@@ -16,18 +16,23 @@ _MODULE_BY_NAME = {
     "Settings": "filter.settings",
     "Unavailable": "core.record",
     "run_batch": "batch.run",
-    "close_loop": "api",
-    "compare": "api",
     "diff": "batch.changes",
-    "evaluate": "api",
     "find": "findings",
     "read_log": "readers",
     "read_trajectory": "readers.trajectory",
     "run_kf": "filter.kalman",
-    "table": "api",
-    "what_if": "api",
-    "write_page": "api",
-    "write_report": "api",
+    **dict.fromkeys(
+        (
+            "close_loop",
+            "compare",
+            "evaluate",
+            "table",
+            "what_if",
+            "write_page",
+            "write_report",
+        ),
+        "api",
+    ),
 }
 __all__ = list(_MODULE_BY_NAME)
 

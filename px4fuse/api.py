@@ -114,8 +114,8 @@ def compare(
         )
     if isinstance(log, Flight) and (position, system) != (None, None):
         raise SettingsError(
-            "`position` and `system` cannot be given with a Flight object, "
-            "because they determine how a log is read.",
+            "`position` and `system` cannot be given with a Flight object: they determine how a "
+            "log is read.",
             "Pass the path of the log, not a Flight object.",
         )
     if isinstance(clock_offset_s, str) and clock_offset_s != request.AUTO:
@@ -312,8 +312,7 @@ def _require_suffix(path: Pathlike, suffix: str) -> Path:
 def _require_request(analysis: Analysis) -> request.ComparisonRequest:
     if analysis.request is None:
         raise SettingsError(
-            "A report or web page needs the settings of the analysis. This analysis contains no "
-            "settings.",
+            "The analysis contains no settings, which a report or web page needs.",
             "Pass an analysis from px4fuse.compare.",
         )
     return analysis.request
@@ -346,6 +345,5 @@ def what_if(
     if changes is None and not without:
         return run_what_if(request.WhatIfRequest(log=flight.log.name), flight=flight).whatif
     ekf2_model = require_available(prepare_ekf2_model(flight), flight)
-    changes = {} if changes is None else changes
-    change_sets = [changes] if isinstance(changes, Mapping) else changes
+    change_sets = changes if isinstance(changes, Sequence) else [changes or {}]
     return require_available(whatif.what_if(ekf2_model, change_sets, without or {}), flight)

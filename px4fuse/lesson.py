@@ -31,15 +31,11 @@ def run_aisle_example() -> KfRun:
         name="aisle",
         direction=np.array([1.0, 0.0, 0.0]),
         heading_deg=0.0,
-        note="aisle of Example 1 in the course UAT 366",
+        note="Example 1",
         measurement_time_s=time_s,
         # The initial position is known
         measurement_m=TRUE_VELOCITY_M_S * time_s + np.array([0.0, *UWB_ERRORS_M]),
-        acceleration=Unavailable(
-            "acceleration",
-            "Example 1 of the course UAT 366 contains no acceleration",
-            "No action is needed.",
-        ),
+        acceleration=Unavailable("acceleration", "Example 1 contains no acceleration", ""),
     )
     return run_kf(axis, settings)
 
@@ -60,12 +56,13 @@ def format_kalman_lines() -> Iterator[str]:
 def format_loop_lines() -> Iterator[str]:
     """Yield the lines of Example 2: the loop closure error, and the five corrected corners."""
     odometry = np.array(ODOMETRY_CORNERS_M)
-    length_m = cumulative_distance(odometry)[-1]
+    distance_m = cumulative_distance(odometry)
+    length_m = distance_m[-1]
     x_error_m, y_error_m = closure_error_m = odometry[-1] - odometry[0]
     yield (
         f"loop closure error ({x_error_m:.1f}, {y_error_m:.1f}) m over {length_m:.1f} m = "
         f"{np.hypot(x_error_m, y_error_m) / length_m:.1%}"
     )
-    corrected_path = distribute_by_distance(odometry, closure_error_m)
+    corrected_path = distribute_by_distance(odometry, closure_error_m, distance_m)
     for (x, y), (x_corrected, y_corrected) in zip(odometry, corrected_path, strict=True):
         yield f"({x:5.1f}, {y:5.1f}) -> ({x_corrected:5.2f}, {y_corrected:5.2f})"

@@ -233,26 +233,21 @@ Request = ComparisonRequest | LoopRequest | WhatIfRequest
 
 # Unit of a field of a request, by the suffix of its name
 UNIT_BY_SUFFIX = {"_m_s2": "m/s²", "_m": "m", "_s": "s", "_deg": "°"}
-_POSITION_OPTIONS = {
-    "path": "--position",
-    "body": "--body",
-    "frame": "--position-frame",
-    "yaw_deg": "--position-yaw",
-    "columns": "--position-columns",
-    "time_unit": "--position-time-unit",
-    "length_unit": "--position-unit",
-}
 
 
 def _make_option_names(
-    request_type: type[msgspec.Struct], excluded_fields: Sequence[str] = (), **renamed_options: str
+    request_type: type[msgspec.Struct],
+    excluded_fields: Sequence[str] = (),
+    *,
+    prefix: str = "--",
+    **renamed_options: str,
 ) -> dict[str, str]:
     """Return the command-line option of each optional field, for example ``--max-gap``.
 
     ``renamed_options`` are exceptions from the rule ``max_gap_s`` → ``--max-gap``.
     """
     option_names = {
-        field.name: "--"
+        field.name: prefix
         + re.sub(f"({'|'.join(UNIT_BY_SUFFIX)})$", "", field.name).replace("_", "-")
         for field in msgspec.structs.fields(request_type)
         if not field.required and field.name not in excluded_fields
@@ -260,7 +255,14 @@ def _make_option_names(
     return option_names | renamed_options
 
 
-# Command-line options of the optional fields of each request class
+_POSITION_OPTIONS = _make_option_names(
+    PositionFile,
+    prefix="--position-",
+    path="--position",
+    body="--body",
+    length_unit="--position-unit",
+)
+# Command-line options of the fields of each request class
 OPTION_NAMES: Mapping[type[msgspec.Struct], Mapping[str, str]] = {
     ComparisonRequest: _make_option_names(ComparisonRequest, ["position"], axes="--axis")
     | _POSITION_OPTIONS,

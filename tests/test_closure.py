@@ -28,7 +28,7 @@ def test_loop_correction_is_error_times_fraction_of_distance(
         (x - s / cum[-1] * err[0], y - s / cum[-1] * err[1])
         for (x, y), s in zip(odom, cum, strict=True)
     ]
-    found = closure.distribute_by_distance(np.array(odom), np.array(err))
+    found = closure.distribute_by_distance(np.array(odom), np.array(err), np.array(cum))
     np.testing.assert_allclose(found, expected, rtol=0, atol=1e-9)
 
 
@@ -53,7 +53,7 @@ def test_loop_correction_removes_linear_heading_drift() -> None:
     np.testing.assert_allclose(found.position_m, position, atol=1e-9)
     assert np.max((found.rotation * rotation.inv()).magnitude()) < 1e-9
     # distributing only the position leaves the shape sheared
-    sheared = closure.distribute_by_distance(drifted, misclosure)
+    sheared = closure.distribute_by_distance(drifted, misclosure, distance)
     assert np.max(np.linalg.norm(sheared - position, axis=1)) > 0.3
 
 

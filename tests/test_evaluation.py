@@ -403,7 +403,7 @@ def test_evaluate_camera_track_removes_mounting_rotation() -> None:
                        (camera, replace(reference, rotation=None))):  # fmt: skip
         assert not evaluate(one, other).notes
     for same in (replace(camera, frame="unknown", kind="unknown"), replace(camera, frame="NED")):
-        assert "a constant 120" in evaluate(same, reference, alignment="se3").notes[0]
+        assert "a constant rotation of 120" in evaluate(same, reference, alignment="se3").notes[0]
 
 
 def test_evaluate_estimate_of_camera_pose_removes_lever_arm() -> None:

@@ -216,6 +216,9 @@ def test_interrupted_grade_command_prints_how_to_continue(tmp_path, monkeypatch)
     assert len(said) < 3000
     assert not any(line.lstrip().startswith("Points 120") for line in said.splitlines())
     monkeypatch.setattr(module, "grade", Mock(side_effect=KeyboardInterrupt))
+    assert "nothing was written" in str(run("grade", "a.pdf", "-o", "out").exception)
+    (tmp_path / "out").mkdir()
+    (tmp_path / "out" / "class.csv").touch()
     result = run("grade", "a.pdf", "-o", "out")
     assert isinstance(result.exception, Interrupted)
     assert result.exception.exit_code == 130

@@ -16,12 +16,13 @@ from px4fuse.errors import TrajectoryError
 from px4fuse.readers.g2o import parse_g2o, read_g2o
 from px4fuse.trajectory.graph import lie
 from px4fuse.trajectory.graph.covariance import gate_edges
-from px4fuse.trajectory.graph.initialisation import _compute_chordal_poses, compute_initial_poses
 from px4fuse.trajectory.graph.model import (
     INITIAL_POSES_FROM_CHORDAL,
     INITIAL_POSES_FROM_ODOMETRY,
     PoseGraph,
+    _compute_chordal_poses,
     compose_odometry,
+    compute_initial_poses,
     compute_observed_directions,
     cost,
     residuals,

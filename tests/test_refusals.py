@@ -85,17 +85,17 @@ REFUSED = {
     "slip of an option": ("compare l.ulg --sigmaz 1", "--sigma-z"),
     "metres with a unit": (
         "compare l.ulg --sigma-z 10cm",
-        "not a number in metres. Give for example 0.1.",
+        "not a number in metres. Give 0.1.",
     ),
     "seconds with a unit": (
         "tune l.ulg --start 20s",
-        "not a number in seconds. Give for example 20.",
+        "not a number in seconds. Give 20.",
     ),
-    "offset with a unit": ("sync l.ulg --clock-offset -120ms", "Give for example -0.12, or auto."),
+    "offset with a unit": ("sync l.ulg --clock-offset -120ms", "in seconds or auto. Give -0.12."),
     "negative heading": ("compare l.ulg --heading -30", "not between 0 and 360"),
     "heading of words": (
         "compare l.ulg --heading north",
-        "not a number in degrees. Give for example 30.",
+        "not a number in degrees.",
     ),
     "heading of a simulation": ("simulate -o s.ulg --heading 361", "--heading 361 is out of range"),
     "speed with a unit": (
@@ -104,7 +104,7 @@ REFUSED = {
     ),
     "drift with a unit": (
         "loop l.ulg --drift '1 m'",
-        "not a number in metres. Give for example 1.",
+        "not a number in metres. Give 1.",
     ),
     "delay with a unit": ("whatif l.ulg --set EKF2_EV_DELAY=0.1s", "in milliseconds. Give 100."),
     "system of a ULog": (
@@ -142,9 +142,9 @@ REFUSED = {
             ("--set EKF2_EVP_NOISE", "is not NAME=VALUE"),
             ("--set EKF2_EVP_NOISE=much", "'much' is not a number"),
             ("--set EKF2_EVP_GATE=4SD", "'4SD' is not a number in SD. Give 4"),
-            ("--set EKF2_EVP_NOISE=nan", "outside PX4's range"),
+            ("--set EKF2_EVP_NOISE=nan", "not a finite number"),
             ("--set EKF2_EVP_GATE=3 --set EKF2_EVP_GATE=4", "given twice"),
-            ("--sweep EKF2_EVP_NOISE=0.1", "Use NAME=LOW:HIGH"),
+            ("--sweep EKF2_EVP_NOISE=0.1", "is not NAME=LOW:HIGH"),
             (
                 "--sweep EKF2_EVP_NOISE=0.2:0.1",
                 "EKF2_EVP_NOISE=0.2:0.1: give the smaller parameter value first",
@@ -196,7 +196,7 @@ REFUSED = {
     },
     "mistakes alone": ("simulate -o f.ulg --mistakes 1", "requires --assignment"),
     # trajectories and pose graphs
-    "empty trajectory": ("loop empty.tum", "px4fuse: empty.tum is empty"),
+    "empty trajectory": ("loop empty.tum", "px4fuse: empty.tum: the file is empty"),
     "text junk": ("loop junk.txt", "junk.txt: the first 3 lines contain no header"),
     "PDF": ("loop f.pdf", "f.pdf: the file is a PDF, not a flight log"),
     "no motion": ("loop still.tum", "still.tum: the path of 0.00 m"),
@@ -229,7 +229,10 @@ REFUSED = {
     "report of a graph": ("loop g.g2o -o r.pdf", "not available for a pose graph"),
     "evaluate junk": ("evaluate s.tum junk.bin", "junk.bin: the file is neither a PX4 ULog"),
     "evaluate apart": ("evaluate s.tum l.ulg --time-offset 0", "0 poses match in time"),
-    "offset of words": ("evaluate s.tum s.tum --time-offset abc", "Give for example 0.1, or auto."),
+    "offset of words": (
+        "evaluate s.tum s.tum --time-offset abc",
+        "not a number in seconds or auto.",
+    ),
     "RPE over nothing": ("evaluate s.tum s.tum --rpe 0m", "'0m' is not a distance"),
     "RPE over half a frame": (
         "evaluate s.tum s.tum --rpe 1.5f",

@@ -150,7 +150,7 @@ def _find_best_match(references: list[SampledTrack], problem: AlignmentProblem) 
     ):
         raise NoMatchError(
             f"the positions in the file change by less than {tracks.MIN_MOTION_M:g} m, too little "
-            "to match the file with the log"
+            "for a match"
         )
     matches = []
     for reference in references:
@@ -196,8 +196,8 @@ def _require_unique_match(match: Match) -> None:
     if fit.concordance < MIN_CONCORDANCE_TO_ACCEPT_MATCH[reference_name]:
         raise NoMatchError(
             f"the position file does not match the {reference_name}: Lin's concordance correlation "
-            f"coefficient is {fit.concordance:.2f} (at least "
-            f"{MIN_CONCORDANCE_TO_ACCEPT_MATCH[reference_name]:g} is needed)"
+            f"coefficient is {fit.concordance:.2f} (limit "
+            f"{MIN_CONCORDANCE_TO_ACCEPT_MATCH[reference_name]:g})"
         )
     ambiguity_text = ""
     if fit.second_to_best_residual_ratio < MIN_SECOND_BEST_RESIDUAL_RATIO:
@@ -221,7 +221,7 @@ def _require_unique_match(match: Match) -> None:
         )
         if second_best_residual_m < MIN_SECOND_TO_BEST_FRAME_RESIDUAL_RATIO * best_residual_m:
             raise NoMatchError(
-                "the frame of the position file cannot be estimated, because several frames have "
+                "the frame of the position file cannot be estimated: several frames have "
                 f"similar residuals against the {reference_name} ({match.residuals_text})",
                 f"Give `frame`{' or `yaw_deg` auto' if match.is_given_yaw_wrong else ''}",
             )
@@ -255,10 +255,7 @@ def _fit_file_in_frame(
     grid_track = tracks.resample_to_grid(tracks.remove_spikes(file_track))
     if reference.name == IMU_REFERENCE:
         if len(grid_track.time_s) * GRID_STEP_S < tracks.MIN_OVERLAP_S:
-            raise NoMatchError(
-                f"the position file is shorter than {tracks.MIN_OVERLAP_S:g} s, too short for a "
-                "match with the IMU"
-            )
+            raise NoMatchError(f"the position file is shorter than {tracks.MIN_OVERLAP_S:g} s")
         position_m = tracks.apply_band_pass(tracks.apply_band_pass(grid_track.position_m))
         file_track = grid_track = tracks.mark_transients(replace(grid_track, position_m=position_m))
     if lag_s is None:

@@ -120,8 +120,8 @@ def align_position_file(
     samples = select_valid_rows(recording.samples, ["x_m", "y_m"])
     if len(samples) < tracks.MIN_MATCHED_SAMPLES:
         raise MissingDataError(
-            f"{recording.name} contains {len(samples)} positions; at least "
-            f"{tracks.MIN_MATCHED_SAMPLES} are needed",
+            f"{recording.name} contains {len(samples)} positions; {tracks.MIN_MATCHED_SAMPLES} are "
+            "needed",
             "Check that the position file contains the whole flight.",
         )
     start_s, end_s = samples.index[[0, -1]].tolist()
@@ -278,7 +278,7 @@ def _apply_alignment(
     ):
         warnings.append(
             "The position file does not match the EKF2 position (correlation "
-            f"{reference_correlation:.2f}). Check time offset, frame and yaw of the position file."
+            f"{reference_correlation:.2f}). Check time offset, frame and yaw."
         )
     unix_start_s = flight.log.start_unix_s
     if recording.clock_kind == "UNIX" and unix_start_s is not None and clock_offset_s is not None:
@@ -286,7 +286,7 @@ def _apply_alignment(
         if unix_time_difference_s >= MAX_UNIX_CLOCK_DIFFERENCE_S:
             warnings.append(
                 f"The UNIX times of position file and log differ by {unix_time_difference_s:.0f} "
-                "s. Check that both files are of the same flight."
+                "s. Check that both are of the same flight."
             )
     alignment = Alignment(
         frame=frame,
@@ -360,14 +360,14 @@ def _find_warnings(match: Match, is_yaw_estimated: bool) -> Iterator[str]:
     fit = match.time_offset_fit
     if fit.concordance < matching.MIN_CONCORDANCE_WITHOUT_WARNING[reference_name]:
         yield (
-            f"The match of the position file with the {reference_name} is poor: Lin's concordance "
-            f"correlation coefficient is {fit.concordance:.2f}."
+            f"The position file matches the {reference_name} poorly: Lin's concordance correlation "
+            f"coefficient is {fit.concordance:.2f}."
         )
     if fit.second_to_best_residual_ratio < MIN_RESIDUAL_RATIO_WITHOUT_WARNING[reference_name]:
         yield (
-            f"A second time offset, {fit.second_peak_lag_difference_s:+.1f} s from the estimate, "
+            f"A second time offset {fit.second_peak_lag_difference_s:+.1f} s from the estimate "
             f"fits nearly as well (residual {fit.second_to_best_residual_ratio:.1f} times larger). "
-            "Check the time offset, or set the time offset with --clock-offset."
+            "Check the time offset, or set --clock-offset."
         )
     if is_yaw_estimated and reference_name == IMU_REFERENCE:
         yield (

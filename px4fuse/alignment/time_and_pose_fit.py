@@ -172,7 +172,7 @@ def fit_by_least_squares(
     if np.count_nonzero(is_used) < tracks.MIN_MATCHED_SAMPLES:
         raise NoMatchError(
             f"only {np.count_nonzero(is_used)} positions of the file overlap the "
-            f"{reference.name} in time; at least {tracks.MIN_MATCHED_SAMPLES} are needed"
+            f"{reference.name} in time; {tracks.MIN_MATCHED_SAMPLES} are needed"
         )
     reference_time_s = file_track.time_s[is_used] + peak.lag_s
     file_position_m = file_track.to_complex_m()[is_used]
@@ -215,11 +215,13 @@ def fit_by_least_squares(
         loss="soft_l1",
         f_scale=_compute_robust_sigma(compute_residuals_m(parameters[is_fitted])),
     )
-    residuals = compute_residuals_m(solution.x)
+    residuals = solution.fun
     parameters[is_fitted] = solution.x
     origin_north_m, origin_east_m, lag_correction_s, fitted_yaw_rad = parameters.tolist()
     complex_residuals = residuals[: len(file_position_m)] + 1j * residuals[len(file_position_m) :]
-    parameter_sigma = _compute_parameter_sigma(np.asarray(solution.jac), complex_residuals)
+    parameter_sigma = _compute_parameter_sigma(
+        np.asarray(solution.jac), residuals, complex_residuals
+    )
     lag_sigma_s = float(parameter_sigma[2]) if is_lag_estimated else None
     if abs(lag_correction_s) > 0.99 * MAX_LAG_CORRECTION_S:
         lag_sigma_s = np.inf
@@ -254,17 +256,16 @@ def fit_by_least_squares(
     )
 
 
-def _compute_parameter_sigma(jacobian: Array, complex_residuals: ComplexArray) -> Array:
+def _compute_parameter_sigma(
+    jacobian: Array, residuals: Array, complex_residuals: ComplexArray
+) -> Array:
     """Return the standard deviations of the fitted parameters."""
     information = jacobian.T @ jacobian
     # The added diagonal prevents a singular matrix
     information += 1e-9 * np.diag(np.diag(information) + 1e-12)
-    residual_sigma = _compute_robust_sigma(
-        np.concatenate([complex_residuals.real, complex_residuals.imag])
-    )
     parameter_variance = (
         np.diag(np.linalg.inv(information))
-        * residual_sigma**2
+        * _compute_robust_sigma(residuals) ** 2
         * _compute_autocorrelation_factor(complex_residuals)
     )
     return np.sqrt(np.maximum(parameter_variance, 0.0))

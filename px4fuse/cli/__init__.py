@@ -17,6 +17,13 @@ from px4fuse.cli.outputs import Interrupted, describe_written_files
 from px4fuse.core.input_files import protect_inputs
 from px4fuse.core.threads import ONE_THREAD_ENVIRONMENT
 from px4fuse.errors import OutputError, Px4FuseError, SettingsError, suggest_name, to_one_line
+from px4fuse.request import (
+    COMPARISON_OPTIONS,
+    OPTION_NAMES,
+    EvaluationRequest,
+    LoopRequest,
+    replace_argument_names,
+)
 
 # Commands in the order of --help; command NAME is the function NAME in cli/NAME.py
 COMMANDS = (
@@ -52,6 +59,11 @@ TERMINATION_SIGNALS = (
 
 # Environment variables that px4fuse removes: invalid values stop the import of libraries
 IGNORED_ENVIRONMENT_VARIABLES = ("MPLBACKEND", "SOURCE_DATE_EPOCH")
+# Option of each Python argument; all other commands have options of px4fuse compare
+OPTION_NAMES_BY_COMMAND = {
+    "loop": OPTION_NAMES[LoopRequest],
+    "evaluate": OPTION_NAMES[EvaluationRequest],
+}
 # Commands that need pyarrow; other commands do not import it, which saves 70 MB of memory
 COMMANDS_WITH_PARQUET = ("batch", "extract")
 
@@ -84,7 +96,10 @@ class LazyCommandGroup(click.Group):
             with protect_inputs():
                 return super().invoke(ctx)
         except Px4FuseError as error:
-            error.args = (_replace_argument_names(str(error), ctx.invoked_subcommand or ""),)
+            option_names = OPTION_NAMES_BY_COMMAND.get(
+                ctx.invoked_subcommand or "", COMPARISON_OPTIONS
+            )
+            error.args = (replace_argument_names(str(error), option_names),)
             raise
         except BrokenPipeError as error:
             # without errno, because click handles EPIPE with exit code 1
@@ -208,19 +223,6 @@ def _redirect_closed_streams() -> None:
                 os.dup2(null_device, descriptor)
                 os.close(null_device)
             setattr(sys, name, open(descriptor, "w", encoding="utf-8"))  # noqa: SIM115, PTH123 - must stay open
-
-
-def _replace_argument_names(text: str, command: str) -> str:
-    """Replace names of Python arguments in an error text by the options of the command."""
-    from px4fuse import request
-
-    option_names = {
-        "loop": request.OPTION_NAMES[request.LoopRequest],
-        "evaluate": request.OPTION_NAMES[request.EvaluationRequest],
-    }
-    return request.replace_argument_names(
-        text, option_names.get(command, request.COMPARISON_OPTIONS)
-    )
 
 
 def _print_error(text: str) -> None:

@@ -15,23 +15,20 @@ FAIL_ON_LEVELS = ("failed", *SEVERITIES)
 
 @click.command()
 @click.argument("logs", nargs=-1, metavar="LOGS...")
-@options.output_option(
-    "DIR", "Output folder for the table and the results of each log.", required=True
-)
+@options.output_option("DIR", "Output folder.", required=True)
 @options.flag_option("--reports", help="Also write a PDF report for each log.")
 @options.timeout_option
 @options.count_option(
     "--workers",
     1,
     1024,
-    help="Number of logs that this computer processes in parallel.  [default: number of cores]",
+    help="Number of parallel processes on this computer.  [default: number of cores]",
 )
 @options.memory_option
 @click.option(
     "--scheduler",
     metavar="ADDRESS",
-    help="Address of a running Dask scheduler (tcp://host:8786) whose cluster processes the logs.  "
-    "[default: this computer]",
+    help="Address of the Dask scheduler of a cluster (tcp://host:8786).  [default: this computer]",
 )
 @options.settings_options
 @options.make_fail_on_option(
@@ -58,16 +55,10 @@ def batch(
     from px4fuse.batch.terminal import format_summary
 
     gc.enable()  # otherwise the reference cycles of Dask fill the memory in a long run
-    try:
-        with outputs.progress() as show_progress:
-            batch_result = run(
-                logs, output, scheduler=scheduler, progress=show_progress, **option_values
-            )
-    except KeyboardInterrupt as interrupt:
-        message = "no log was finished, and nothing was written."
-        if (output / "rows").is_dir():
-            message = f"{output} contains the results so far. Run the same command to continue."
-        raise outputs.Interrupted(interrupt, message) from None
+    with outputs.folder_progress(output) as show_progress:
+        batch_result = run(
+            logs, output, scheduler=scheduler, progress=show_progress, **option_values
+        )
     outputs.write_and_print_results(
         {}, format_summary(batch_result), written_files=batch_result.written_paths
     )

@@ -26,9 +26,7 @@ from px4fuse.request import format_settings_suffix
     help="Exit with code 1 if an EKF2 aiding source is overconfident, biased or not fused for a "
     "long time.",
 )
-@options.flag_option(
-    "-v", "--verbose", help="Print all findings, axes and KF settings on the terminal."
-)
+@options.flag_option("-v", "--verbose", help="Print all findings, axes and KF settings.")
 @options.flag_option("-q", "--quiet", help="Print the diagnosis on one line only.")
 @options.open_option
 def compare(

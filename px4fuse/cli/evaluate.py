@@ -45,32 +45,31 @@ _evaluation_option = partial(options.request_option, EvaluationRequest)
     type=parse_delta,
     metavar="DELTA",
     multiple=True,
-    help="Delta of the RPE: a distance (5m), a time (10s) or a number of frames (1f); repeatable.  "
-    "[default: several distances that fit the path length]",
+    help="Delta of the RPE: a distance (5m), time (10s) or number of frames (1f); repeatable.  "
+    "[default: distances and times that fit the path]",
 )
 @_evaluation_option(
     "alignment",
-    "Transform that aligns the estimate with the reference before errors are computed.  "
-    "[default: yaw for VIO, EKF2 and KF; se3 for SLAM; sim3 for monocular SLAM]",
+    "Alignment of the estimate with the reference.  [default: yaw for VIO, EKF2 and KF; se3 for "
+    "SLAM; sim3 for monocular SLAM]",
 )
 @_evaluation_option(
     "association",
-    "Reference pose for each estimated pose: interpolated to the time of the estimate, or the "
-    "nearest in time.",
+    "Reference pose for each estimated pose: interpolated, or the nearest in time.",
 )
 @_evaluation_option(
     "max_gap_s",
-    "Maximum gap in the reference for interpolation (s); with --association nearest, the "
-    "maximum time difference.  [default: from the rate of the reference; 0.01 s for nearest]",
+    "Maximum gap (s) in the reference for interpolation; for nearest, maximum time difference.  "
+    "[default: from the rate of the reference; 0.01 s for nearest]",
 )
 @_evaluation_option(
     "time_offset_s",
-    "Time (s) to add to the timestamps of the estimate; auto estimates it from the motion.  "
-    "[default: auto if the two trajectories do not overlap in time, else 0]",
+    "Time (s) to add to the timestamps of the estimate; auto estimates it.  [default: auto if the "
+    "trajectories do not overlap in time, else 0]",
 )
 @_evaluation_option(
     "consecutive",
-    "Compute the RPE over consecutive, non-overlapping pairs of poses instead of all pairs.",
+    "Compute the RPE over consecutive pairs of poses that do not overlap.",
 )
 @options.system_option
 @options.max_size_option
@@ -104,7 +103,7 @@ def evaluate(
         **option_values,
     )
     if request.max_gap_s is not None and request.max_gap_s <= 0.0:
-        raise SettingsError(f"--max-gap {request.max_gap_s:g} is too small. Give a time above 0 s.")
+        raise SettingsError(f"--max-gap {request.max_gap_s:g} is not above 0 s.")
     outputs.choose_report_paths(output, json_path)
     with outputs.progress(json_path) as show_progress:
         show_progress("reading")

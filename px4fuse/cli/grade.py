@@ -17,7 +17,7 @@ from px4fuse.cli.options import (
     open_option,
     output_option,
 )
-from px4fuse.cli.outputs import Interrupted, progress, write_and_print_results, write_new
+from px4fuse.cli.outputs import folder_progress, write_and_print_results, write_new
 from px4fuse.core.input_files import add_input, check_output_folder
 from px4fuse.core.reading import list_files_recursively
 from px4fuse.errors import OutputError, SettingsError
@@ -28,91 +28,84 @@ from px4fuse.errors import OutputError, SettingsError
 @input_option(
     "--logs",
     "DIR",
-    "Folder with the flight logs, or one log; repeatable. A report without its log is not "
-    "verified.",
+    "Folder with flight logs, or one log; repeatable. Reports without a log are not verified.",
     multiple=True,
 )
 @input_option(
     "--rubric",
     "FILE.toml",
-    "Grading rubric with the points of each item.  [default: the rubric of px4fuse]",
+    "Rubric: points of each item.  [default: the rubric of px4fuse]",
 )
 @max_size_option
-@input_option(
-    "--key", "FILE.json", "Answer key of the class, written by px4fuse simulate --assignment."
-)
-@output_option("DIR", "Output folder for the students' points and feedback.")
+@input_option("--key", "FILE.json", "Answer key from px4fuse simulate --assignment.")
+@output_option("DIR", "Output folder.")
 @click.option("--title", help="Title of the class page.  [default: the rubric's title]")
-@input_option(
-    "--roster", "FILE.csv", "Class list with all students.  [default: the students in --key]"
-)
+@input_option("--roster", "FILE.csv", "Class list.  [default: the students in --key]")
 @click.option(
     "--attempt",
     type=Choice(("latest", "best", "first")),
     default="latest",
-    help="Attempt that is graded if a student submitted several reports.",
+    help="Graded attempt of a student with several reports.",
 )
 @click.option(
     "--due",
     "due_time_text",
     metavar="TIME",
-    help="Due time of the reports: '2026-11-20 23:59' in this computer's time zone, or followed by "
-    "'+01:00' or 'Europe/Berlin'. Submission times without a zone are in the same zone.",
+    help="Due time: '2026-11-20 23:59' in this computer's time zone, or followed by '+01:00' or "
+    "'Europe/Berlin'. Submission times without a zone are in the same zone.",
 )
 @click.option(
     "--late",
     "late_rule_text",
     metavar="RULE",
-    help="Deduction for a late submission: '10%/day' or '10%/day up to 50%' of all points, for "
-    "each started day.  [default: no deduction]",
+    help="Deduction of points per started day of delay: '10%/day' or '10%/day up to 50%'.  "
+    "[default: none]",
 )
 @click.option(
     "--grace",
     type=click.FloatRange(0.0, 10_080.0),
     metavar="MINUTES",
     default=0.0,
-    help="Grace period after --due without deduction of points.",
+    help="Grace period after --due without deduction.",
 )
 @click.option(
     "--scale",
     type=click.FloatRange(0.0, min_open=True),
     metavar="POINTS",
-    help="Maximum points on the learning platform, to which the grades in --worksheet are scaled.  "
-    "[default: the points of the rubric]",
+    help="Maximum points on the learning platform, for --worksheet.  [default: the points of the "
+    "rubric]",
 )
 @count_option(
     "--questions",
     1,
     10,
-    help="Write questions.txt: N questions with the expected answers, for an oral examination of "
-    "each student. Requires --key.",
+    help="Write questions.txt: N questions and answers for an oral examination of each student. "
+    "Requires --key.",
 )
-@flag_option("--include-pending", help="Include points that the instructor has not confirmed yet.")
+@flag_option("--include-pending", help="Include points that the instructor has not confirmed.")
 @input_option(
     "--worksheet",
     "FILE.csv",
-    "Moodle grading worksheet, Canvas gradebook, or another table with student ids or names; a "
-    "copy with the grades is written. Repeatable.",
+    "Moodle grading worksheet, Canvas gradebook, or another table with student ids or names, to be "
+    "copied with the grades; repeatable.",
     multiple=True,
 )
-@click.option(
-    "--column", metavar="TITLE", help="Title of the grade column in the --worksheet file."
-)
+@click.option("--column", metavar="TITLE", help="Title of the grade column in --worksheet.")
 @flag_option(
     "--anonymous",
-    help="Show pseudonyms on the class page; names.csv lists the student of each pseudonym.",
+    help="Show pseudonyms on the class page; names.csv lists the students.",
 )
 @count_option(
     "--jobs",
     1,
     256,
-    help="Number of reports that are processed in parallel.  [default: number of cores]",
+    help="Number of parallel processes.  [default: number of cores]",
 )
 @click.option(
     "--write-rubric",
     type=NonEmptyPath(),
     metavar="FILE.toml",
-    help="Write the default rubric for editing, and exit.",
+    help="Write the default rubric, and exit.",
 )
 @open_option
 def grade(
@@ -170,18 +163,14 @@ def grade(
         question_count=question_count,
         **option_values,
     )
-    try:
-        with progress() as show_progress:
-            outcome = grade_submissions(
-                submissions,
-                course,
-                output,
-                processes=process_count,
-                progress=partial(show_progress, "grading"),
-            )
-    except KeyboardInterrupt as interrupt:
-        note = f"{output} contains the results so far. Run the same command to continue."
-        raise Interrupted(interrupt, note) from None
+    with folder_progress(output) as show_progress:
+        outcome = grade_submissions(
+            submissions,
+            course,
+            output,
+            processes=process_count,
+            progress=partial(show_progress, "grading"),
+        )
     write_and_print_results({}, grading_page(outcome), written_files=outcome.written_paths)
 
 
@@ -193,8 +182,7 @@ def _require_output_outside(output: Path, input_paths: tuple[Path, ...]) -> None
     for path in input_paths:
         if path.is_dir() and any(map(path.samefile, output_and_parents)):
             raise OutputError(
-                f"-o {output} is inside the input {path}, so the next run would read this output. "
-                "Choose another output folder."
+                f"-o {output} is inside the input {path}. Choose another output folder."
             )
         for file in list_files_recursively(path):
             add_input(file)

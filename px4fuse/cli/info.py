@@ -38,7 +38,7 @@ def _print_versions(context: click.Context, _: click.Parameter, is_requested: bo
     is_eager=True,
     expose_value=False,
     callback=_print_versions,
-    help="Print the versions of px4fuse, system and libraries for a bug report, and exit.",
+    help="Print the versions of px4fuse, system and libraries, and exit.",
 )
 @json_option
 @flight_options

@@ -63,15 +63,14 @@ _loop_option = partial(options.request_option, LoopRequest)
     "--landed-at",
     type=parse_landing,
     metavar="FORWARD,RIGHT[,DEG]",
-    help="Measured landing place relative to the take-off place: distance forward (m, along the "
-    "nose at take-off) and to the right (m), and the clockwise rotation (°) if known.  [default: "
-    "the ground truth of the log, else 0,0]",
+    help="Measured landing place relative to take-off: distances (m) forward (along the nose at "
+    "take-off) and right, and clockwise rotation (°).  [default: ground truth in the log, else "
+    "0,0]",
 )
 @options.flag_option(
     "--open",
     "is_open_path",
-    help="Do not use the landing as a loop closure, because the vehicle did not return to the "
-    "take-off place.",
+    help="The vehicle did not return to the take-off place.",
 )
 @click.option(
     "--closure",
@@ -79,32 +78,26 @@ _loop_option = partial(options.request_option, LoopRequest)
     type=parse_closure,
     metavar="T1,T2[,SIGMA]",
     multiple=True,
-    help="Loop closure: same place at times T1 and T2 (s). SIGMA (m): "
-    "σ of the distance between both positions. Repeatable.  [default SIGMA: 0.1 m]",
+    help="Loop closure: same place at times T1 and T2 (s), with σ of the distance (m); "
+    "repeatable.  [default SIGMA: 0.1 m]",
 )
 @options.flag_option(
     "--robust",
-    help="Run the robust optimisation also for a pose graph with more than 1000 loop closures, "
-    "which takes minutes.",
+    help="Also optimise pose graphs with more than 1000 loop closures robustly (takes minutes).",
 )
 @_loop_option(
     "start_s",
-    "Start of the loop: time after the first sample (s), or a timestamp of the trajectory.  "
-    "[default: take-off]",
-    20.0,
+    "Start of the loop: time (s) after the first sample, or timestamp.  [default: take-off]",
 )
 @_loop_option(
     "end_s",
-    "End of the loop: time after the first sample (s), or a timestamp of the trajectory.  "
-    "[default: landing]",
-    60.0,
+    "End of the loop: time (s) after the first sample, or timestamp.  [default: landing]",
 )
 @click.option(
     "--reference",
     type=options.InputPath(str),
     metavar="FILE|LOG:TRACK",
-    help="Reference trajectory for the ATE and RPE of each path, in "
-    "addition to the ground truth of the log.",
+    help="Reference for ATE and RPE, in addition to the ground truth of the log.",
 )
 @_loop_option(
     "position_drift_m",
@@ -116,9 +109,8 @@ _loop_option = partial(options.request_option, LoopRequest)
 )
 @_loop_option(
     "key_frames_m",
-    "Distance (m) between the key frames of the pose graph.  [default: 2 % of the extent of "
-    "the path, 0.02 to 0.5 m]",
-    0.2,
+    "Distance (m) between key frames of the pose graph.  [default: 2 % of the extent of the path, "
+    "0.02 to 0.5 m]",
 )
 @_loop_option("frame", "Coordinate frame of a trajectory file.  [default: detected]")
 @options.system_option
@@ -130,14 +122,14 @@ _loop_option = partial(options.request_option, LoopRequest)
     "tum_path",
     type=options.NonEmptyPath(),
     metavar="FILE",
-    help="Write the corrected path as a TUM file, in the frame of SOURCE.",
+    help="Corrected path to write (TUM), in the frame of SOURCE.",
 )
 @click.option(
     "--g2o",
     "g2o_path",
     type=options.NonEmptyPath(),
     metavar="FILE",
-    help="Write the optimised pose graph as a g2o file.",
+    help="Optimised pose graph to write (g2o).",
 )
 @options.show_option
 def loop(
@@ -206,8 +198,8 @@ def _format_output_files(
         best_path = loop_result.choose_best_path()
         if best_path is loop_result.odometry:
             raise MissingDataError(
-                f"--tum {display_name(tum_path)}: the path is not corrected, as no loop closure "
-                "was accepted. Give a loop closure (--closure) or the landing place (--landed-at)."
+                f"--tum {display_name(tum_path)}: the path is not corrected: no loop closure was "
+                "accepted. Give a loop closure (--closure) or the landing place (--landed-at)."
             )
         contents[tum_path] = format_tum(
             from_z_down(best_path.trajectory, loop_result.original_frame)
@@ -226,21 +218,22 @@ def _solve_graph(
     from px4fuse.trajectory.graph.solver import analyse_graph
 
     path, track = split_path_and_part(str(source))
+    name = display_name(source)
     if track is not None:
         raise SettingsError(
-            f"{display_name(source)}: a pose graph contains no trajectory {track!r}",
+            f"{name}: a pose graph contains no trajectory {track!r}",
             f"Omit :{track}.",
         )
     for parameter in options.list_given_parameters():
         if parameter.name not in POSE_GRAPH_ARGUMENT_NAMES:
             raise SettingsError(
-                f"{display_name(source)}: {parameter.opts[-1]} is not available for a pose graph.",
-                "For a pose graph, use only --g2o FILE, --json FILE and --robust.",
+                f"{name}: {parameter.opts[-1]} is not available for a pose graph.",
+                "Use only --g2o FILE, --json FILE and --robust.",
             )
     with outputs.progress(json_path, g2o_path) as show_progress:
-        show_progress(f"reading {display_name(source)}")
+        show_progress(f"reading {name}")
         results, solved_graph = analyse_graph(
-            display_name(source), read_g2o(path), show_progress, use_robust_optimisation=robust
+            name, read_g2o(path), show_progress, use_robust_optimisation=robust
         )
     command = command_line(LoopRequest(source=str(source))) + (" --robust" if robust else "")
     contents = {} if g2o_path is None else {g2o_path: format_g2o(solved_graph).encode()}

@@ -28,13 +28,20 @@ from px4fuse.errors import SettingsError
 # Names of tool arguments that differ from the parameter of the command
 TOOL_ARGUMENT_BY_PARAMETER = {
     "finding": "finding_id",
-    "parameter_texts": "parameters",
     "source": "log",
 }
 # Command parameters that the tools of the server do not offer: outputs, exit codes, student data
 PARAMETERS_WITHOUT_TOOL_ARGUMENT = {
-    *("output", "json_path", "tum_path", "g2o_path", "fail_on", "checks"),
-    *("student", "student_id", "notes", "answers"),
+    "output",
+    "json_path",
+    "tum_path",
+    "g2o_path",
+    "fail_on",
+    "checks",
+    "student",
+    "student_id",
+    "notes",
+    "answers",
 }
 
 
@@ -46,14 +53,14 @@ PARAMETERS_WITHOUT_TOOL_ARGUMENT = {
     metavar="DIR",
     multiple=True,
     default=(".",),
-    help="Folder whose files the tools may read, with its subfolders; repeatable.",
+    help="Folder that the tools may read, with its subfolders; repeatable.",
 )
 @click.option(
     "--out",
     "report_folder",
     type=click.Path(file_okay=False, path_type=Path),
     metavar="DIR",
-    help="Folder for the PDF reports of the MCP tools.  [default: no file is written]",
+    help="Folder for PDF reports.  [default: no file is written]",
 )
 @options.timeout_option
 @options.memory_option

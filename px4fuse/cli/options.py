@@ -74,16 +74,12 @@ class InputPath(NonEmptyPath):
 
 
 class NumberWithUnit(click.ParamType["float | str"]):
-    """Number in a fixed unit, as type of a command-line option.
-
-    ``example`` is a valid value for the error message. If ``accepts_auto``, the text "auto" is also
-    accepted.
-    """
+    """Number in a fixed unit, or the text "auto" if ``accepts_auto``, as type of an option."""
 
     name = "number"
 
-    def __init__(self, unit: str, example: float = 0.1, *, accepts_auto: bool = False) -> None:
-        self.unit, self.example, self.accepts_auto = unit, example, accepts_auto
+    def __init__(self, unit: str, *, accepts_auto: bool = False) -> None:
+        self.unit, self.accepts_auto = unit, accepts_auto
 
     def get_metavar(self, param: click.Parameter, ctx: click.Context | None = None) -> str:
         """Return the unit in capital letters, for --help."""
@@ -93,18 +89,17 @@ class NumberWithUnit(click.ParamType["float | str"]):
     def convert(self, value: Any, param: Any, ctx: Any) -> float | str:
         if self.accepts_auto and value == AUTO:
             return str(value)
-        unit = f" in {UNIT_NAMES[self.unit]}" if self.unit else ""
         try:
             number = float(value)
         except ValueError:
-            value_in_unit = convert_to_unit(value, self.unit)
-            example = self.example if value_in_unit is None else value_in_unit
-            self.fail(
-                f"{value!r} is not a number{unit}. Give for example {example:.12g}"
-                f"{', or auto' if self.accepts_auto else ''}.",
-                param,
-                ctx,
-            )
+            message = f"{value!r} is not a number"
+            if self.unit:
+                message += f" in {UNIT_NAMES.get(self.unit, self.unit)}"
+            if self.accepts_auto:
+                message += " or auto"
+            if (converted_number := convert_to_unit(value, self.unit)) is not None:
+                message += f". Give {converted_number:.12g}"
+            self.fail(f"{message}.", param, ctx)
         if not math.isfinite(number):
             self.fail(f"{value!r} is not a finite number.", param, ctx)
         return number
@@ -124,7 +119,7 @@ timeout_option = click.option(
     type=click.FloatRange(1.0),
     metavar="SECONDS",
     default=LOG_ANALYSIS_TIMEOUT_S,
-    help="Maximum time for one log (s); a log that takes longer fails.",
+    help="Maximum time for one log (s).",
 )
 #: Option --memory of commands that analyse logs in worker processes
 memory_option = click.option(
@@ -133,7 +128,7 @@ memory_option = click.option(
     type=click.FloatRange(1.0),
     metavar="GB",
     default=4.0,
-    help="Maximum memory for one log (GB, Linux only); a log that needs more fails.",
+    help="Maximum memory for one log (GB, Linux only).",
 )
 # not in the settings of a report: the size limit does not affect results
 max_size_option = click.option(
@@ -142,8 +137,7 @@ max_size_option = click.option(
     metavar="MB",
     expose_value=False,
     callback=_set_max_size,
-    help="Maximum size of a log (MB); a larger log is rejected.  "
-    f"[default: {max_log_bytes.get() // 1_000_000}]",
+    help=f"Maximum size of a log (MB).  [default: {max_log_bytes.get() // 1_000_000}]",
 )
 
 
@@ -212,43 +206,35 @@ open_option = _make_open_option("--open", "--show", "opened")
 show_option = _make_open_option("--show", "shown")
 #: Options for the student's name and id, notes and answer form
 student_options = _combine_options(
-    click.option("--student", metavar="NAME", help="Name of the student, printed on the report."),
-    click.option(
-        "--id", "student_id", metavar="ID", help="Id of the student, printed on the report."
-    ),
-    input_option("--notes", "FILE.md", "Notes of the student (Markdown), printed in the report."),
-    input_option(
-        "--answers",
-        "FILE.toml",
-        "Answer form from px4fuse answers, completed by the student, to add to the report.",
-    ),
+    click.option("--student", metavar="NAME", help="Name of the student for the report."),
+    click.option("--id", "student_id", metavar="ID", help="Id of the student for the report."),
+    input_option("--notes", "FILE.md", "Notes of the student for the report (Markdown)."),
+    input_option("--answers", "FILE.toml", "Completed answer form from px4fuse answers."),
 )
 system_option = click.option(
     "--system",
     type=click.IntRange(0, 255),
     metavar="ID",
-    help="MAVLink system id of the vehicle to analyse.  [default: the id with the most messages]",
+    help="MAVLink system id of the vehicle.  [default: the id with the most messages]",
 )
 
 
 def request_option(
-    request_type: type[Struct], name: str, help_text: str, example: float = 0.1, **details: Any
+    request_type: type[Struct], name: str, help_text: str, **details: Any
 ) -> OptionDecorator:
     """Make the option for a field of ``request_type``, with its type, unit and default.
 
     The unit follows from the suffix of the name; an option for a bool is a flag.
 
-    RANGE in ``help_text`` is replaced by the range of the KF setting. ``example`` is a valid value
-    for the error message. ``details`` are arguments of ``click.option``.
+    RANGE in ``help_text`` is replaced by the range of the KF setting. ``details`` are arguments of
+    ``click.option``.
     """
     field = next(field for field in structs.fields(request_type) if field.name == name)
     types = (field.type, *get_args(field.type))
     literal_types = [each for each in types if get_origin(each) is Literal]
     if float in types:
         units = (unit for suffix, unit in UNIT_BY_SUFFIX.items() if name.endswith(suffix))
-        details["type"] = NumberWithUnit(
-            next(units, ""), field.default or example, accepts_auto=bool(literal_types)
-        )
+        details["type"] = NumberWithUnit(next(units, ""), accepts_auto=bool(literal_types))
     elif literal_types:
         details["type"] = Choice(get_args(literal_types[0]))
     elif field.type is bool:
@@ -277,27 +263,26 @@ position_options = _combine_options(
         "--position",
         type=InputPath(str),
         metavar="FILE",
-        help="Recording of the positioning system (CSV or BAG:TOPIC), used instead of the "
-        "positions in LOG.",
+        help="Recording of the positioning system (CSV or BAG:TOPIC), instead of the positions in "
+        "LOG.",
     ),
     _position_option(
-        "body", "Rigid body, tag or topic to use, if the file contains several.", metavar="NAME"
+        "body", "Rigid body, tag or topic, if the file contains several.", metavar="NAME"
     ),
     _position_option(
         "frame",
-        "Coordinate frame of x, y, z in the position file.  [default: from the column names, else "
-        "the frame with the best fit to EKF2]",
+        "Frame of x, y, z in the position file.  [default: from the column names, else the best "
+        "fit to EKF2]",
     ),
     _position_option(
         "yaw_deg",
-        "Yaw angle (°, clockwise seen from above) by which the positions in the file are rotated; "
-        "auto estimates yaw and origin.  [default: 0]",
-        30.0,
+        "Yaw (°, clockwise from above) by which the positions are rotated; auto estimates yaw and "
+        "origin.  [default: 0]",
     ),
     _position_option(
         "columns",
-        "Names or numbers of the columns of the position file; SIGMA is the standard deviation of "
-        "the position.  [default: detected from the names]",
+        "Names or numbers of the columns of the position file; SIGMA: σ of the position.  "
+        "[default: detected]",
         type=lambda names: tuple(names.split(",")),
         metavar="TIME,X,Y,Z[,SIGMA]",
     ),
@@ -331,33 +316,29 @@ filter_options = _combine_options(
         "heading_deg",
         "Heading (°, clockwise from north) of the main axis.  [default: main direction of the "
         "track]",
-        30.0,
     ),
     _comparison_option(
         "start_s",
         "Start of the analysed time span (s after the first sample).  [default: take-off]",
-        20.0,
     ),
     _comparison_option(
         "end_s",
         "End of the analysed time span (s after the first sample).  [default: landing]",
-        60.0,
     ),
     _comparison_option(
         "position_source",
-        "Position source for KF, for example vehicle_gps_position; px4fuse info lists all "
-        "sources.  [default: the least processed of the logged sources]",
+        "Position source for KF; px4fuse info lists all sources.  [default: the least processed "
+        "of the logged sources]",
         metavar="NAME",
     ),
     _comparison_option(
         "source_kind",
-        "Kind of the position source; vio may drift.  [default: vio if "
-        "the orientation in the messages changes, otherwise by message type]",
+        "Kind of the position source; vio may drift.  [default: vio if the orientation in the "
+        "messages changes, otherwise by message type]",
     ),
     _comparison_option(
         "height",
-        "Height source for the down axis of a flight with GNSS.  [default: the source that EKF2 "
-        "fused, GNSS first]",
+        "Height source of a flight with GNSS.  [default: the source that EKF2 fused, GNSS first]",
     ),
 )
 #: Options for the input files and the clock offset of one flight
@@ -426,7 +407,7 @@ def read_student(option_values: dict[str, Any], log: Path) -> Student:
     if answers and answers.log_sha256 != hashlib.sha256(read_log_bytes(log)).hexdigest():
         raise SettingsError(
             f"--answers {answers_path} was made for another log than {log.name}.",
-            f"Give the answer form of {log.name}. To write it: px4fuse answers {log.name}.",
+            f"Write the answer form of {log.name} with px4fuse answers {log.name}.",
         )
     name, student_id = (replace_unencodable(text or "") for text in (name, student_id))
     if not (texts := name + student_id + notes).isascii():

@@ -105,6 +105,19 @@ def progress(*output_paths: Path | None) -> Iterator[ShowProgress]:
         yield show
 
 
+@contextmanager
+def folder_progress(folder: Path) -> Iterator[ShowProgress]:
+    """Provide the function of :func:`progress` for a run that can be continued in its folder."""
+    try:
+        with progress() as show_progress:
+            yield show_progress
+    except KeyboardInterrupt as interrupt:
+        message = "nothing was written."
+        if any(folder.glob("*")):
+            message = f"{folder} contains the results so far. Run the same command to continue."
+        raise Interrupted(interrupt, message) from None
+
+
 def choose_default_report_path(report_stem: str, results: Results) -> Path:
     """Return the path of a report if the user gives none (-o); a long name is cut.
 

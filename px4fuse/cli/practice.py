@@ -21,17 +21,16 @@ from px4fuse.cli.outputs import (
     "--seed",
     0,
     2**32 - 1,
-    help="Seed of the random numbers: the same N gives the same flights.  [default: random]",
+    help="Seed: the same N gives the same flights.  [default: random]",
 )
 @count_option(
     "--level",
     1,
     3,
     default=1,
-    help="Difficulty of the flights. 1: one large fault; 2: one smaller fault; 3: one or two "
-    "small faults.",
+    help="Difficulty. 1: one large fault; 2: one smaller fault; 3: one or two small faults.",
 )
-@count_option("--flights", 1, 20, default=10, help="Number of simulated flights on the page.")
+@count_option("--flights", 1, 20, default=10, help="Number of flights.")
 @output_option("FILE.html", "Web page to write.  [default: reports/practice_SEED.html]")
 @click.option(
     "--open/--no-open",

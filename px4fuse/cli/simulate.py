@@ -57,7 +57,7 @@ def _add_scenario_options(command: Callable[..., None]) -> Callable[..., None]:
             f"; outdoors {outdoor_default:g}" if outdoor_default else ""
         )
         help_text = f"{quantity.help_text}  [default: {default_text}]"
-        option_type = NumberWithUnit(quantity.unit, default)
+        option_type = NumberWithUnit(quantity.unit)
         command = click.option(
             quantity.option_or_placeholder, field, type=option_type, help=help_text
         )(command)
@@ -86,42 +86,42 @@ class CommandWithFaultTable(click.Command):
 @click.command(cls=CommandWithFaultTable)
 @output_option(
     "FLIGHT.ulg|DIR",
-    "Log to write (ULog); with --assignment, the folder for the logs of the class.",
+    "Log to write (ULog); with --assignment, folder for the logs.",
     required=True,
 )
 @input_option(
     "--assignment",
     "ROSTER.csv",
-    "Class list (student id, name). Writes the answer key next to DIR, and one flight per student "
-    "with individual noise levels and injected faults.",
+    "Class list (student id, name): writes an answer key next to DIR, and one flight per student "
+    "with random noise and faults.",
 )
 @input_option(
     "--secret-file",
     "FILE",
-    "File with the secret for --assignment; the same secret and student id give the same "
-    "flight.  [default: generated, and stored in the answer key]",
+    "Secret of --assignment: the same secret and student id give the same flight.  [default: "
+    "generated, and stored in the answer key]",
 )
 @click.option(
     "--mistakes",
     "fault_count",
     type=int,
     metavar="N",
-    help="Number of injected faults in each flight of --assignment.  [default: random, 0 to 2]",
+    help="Number of faults in each flight of --assignment.  [default: random, 0 to 2]",
 )
 @click.option(
     "--kind",
     type=Choice((*get_args(ScenarioKind), MIXED_KIND)),
     default=_DEFAULT_SCENARIO.kind,
-    help="Kind of flight. aisle: passes along an aisle with UWB; loop: laps of a square with "
-    "drifting VIO; outdoor: laps of a square with GNSS; mixed: with --assignment, loop for one "
-    "third of the students and aisle for the others.",
+    help="aisle: passes along an aisle with UWB; loop: laps of a square with drifting VIO; "
+    "outdoor: laps of a square with GNSS; mixed (with --assignment): loop for one third of the "
+    "students, aisle for the others.",
 )
 @click.option(
     "--seed",
     type=int,
     metavar="N",
     default=_DEFAULT_SCENARIO.seed,
-    help="Seed of the random numbers: the same N gives the same flight.",
+    help="Seed: the same N gives the same flight.",
 )
 @click.option(
     "--mistake",
@@ -135,8 +135,7 @@ class CommandWithFaultTable(click.Command):
     "answer_key_path",
     type=NonEmptyPath(),
     metavar="FILE.json",
-    help="Answer key to write: injected faults, biases, outliers and clock offset; not for "
-    "students.  [default with --assignment: DIR_answers.json]",
+    help="Answer key to write, not for students.  [default with --assignment: DIR_answers.json]",
 )
 @flag_option("--no-truth", help="Write no ground truth to the log.")
 @flag_option("--no-ekf2", help="Do not simulate EKF2, to save time.")
@@ -144,14 +143,13 @@ class CommandWithFaultTable(click.Command):
     "--passes",
     type=int,
     metavar="N",
-    help="Number of passes along the aisle, or of laps of the square.  [default: 6 passes, 1 lap; "
+    help="Number of passes of the aisle, or laps of the square.  [default: 6 passes, 1 lap; "
     "outdoors 3 laps]",
 )
 @click.option(
     "--yaw",
     type=Choice(get_args(YawMode)),
-    help="Heading of the vehicle: fixed, or follow (along the flight direction).  [default: fixed; "
-    "follow on a square]",
+    help="Heading: fixed, or follow the flight direction.  [default: fixed; follow on a square]",
 )
 @_add_scenario_options
 def simulate(
@@ -178,15 +176,12 @@ def simulate(
     With --assignment, writes one flight per student:
     px4fuse simulate --assignment roster.csv -o flights
     """
-    _check_options(assignment)
+    _check_options(assignment, kind)
     if assignment is not None:
-        secret = _read_secret(secret_file)
         _write_assignment(
-            assignment, output, answer_key_path, secret, kind, fault_count, not no_truth
+            assignment, output, answer_key_path, secret_file, kind, fault_count, not no_truth
         )
         return
-    if kind == MIXED_KIND:
-        raise SettingsError(f"--kind {MIXED_KIND} requires --assignment ROSTER.csv.")
     if output.suffix.lower() != ".ulg":
         raise OutputError(f"{output}: the output is a ULog. Give a name ending in .ulg (-o).")
     check_output_paths([output, answer_key_path])
@@ -210,53 +205,51 @@ def simulate(
     write_and_print_results(contents, terminal.summary(simulation, answer_key_path))
 
 
-def _check_options(assignment: Path | None) -> None:
+def _check_options(assignment: Path | None, kind: str) -> None:
     """Reject options that cannot be combined with --assignment, or that need it."""
-    if assignment is not None and click.get_current_context().params["kind"] == OUTDOOR_KIND:
+    if assignment is not None and kind == OUTDOOR_KIND:
         raise SettingsError(
             f"--kind {OUTDOOR_KIND} is not available with --assignment.",
             f"Use --kind aisle, loop or {MIXED_KIND}.",
         )
+    if assignment is None and kind == MIXED_KIND:
+        raise SettingsError(f"--kind {MIXED_KIND} requires --assignment ROSTER.csv.")
     for parameter in list_given_parameters():
+        option = parameter.opts[0]
         if assignment is not None and parameter.name not in ASSIGNMENT_OPTIONS:
             raise SettingsError(
-                f"{parameter.opts[0]} is not available with --assignment, because "
-                "assignment flights are random",
-                f"Omit {parameter.opts[0]}.",
+                f"{option} is not available with --assignment: assignment flights are random",
+                f"Omit {option}.",
             )
         if assignment is None and parameter.name in ASSIGNMENT_ONLY_OPTIONS:
-            raise SettingsError(f"{parameter.opts[0]} requires --assignment ROSTER.csv.")
-
-
-def _read_secret(file: Path | None) -> bytes | None:
-    from px4fuse.classroom.assignment.random_assignment import derive_seed_from_secret
-
-    if file is None:
-        return None
-    option_text = f"--secret-file {file}"
-    secret_text = read_text(
-        file,
-        SettingsError,
-        MAX_SECRET_BYTES,
-        name=option_text,
-        remedy_if_too_large="Give a file with the secret as one line of text.",
-    )
-    return derive_seed_from_secret(secret_text, option_text)
+            raise SettingsError(f"{option} requires --assignment ROSTER.csv.")
 
 
 def _write_assignment(
     roster: Path,
     folder: Path,
     answer_path: Path | None,
-    secret: bytes | None,
+    secret_file: Path | None,
     scenario_kind: Any,
     fault_count: int | None,
     with_ground_truth: bool,
 ) -> None:
     from px4fuse.classroom.assignment import assignment
+    from px4fuse.classroom.assignment.random_assignment import derive_seed_from_secret
     from px4fuse.classroom.assignment.roster import read_roster
     from px4fuse.classroom.terminal import assignment_page
 
+    secret = None
+    if secret_file is not None:
+        option_text = f"--secret-file {secret_file}"
+        secret_text = read_text(
+            secret_file,
+            SettingsError,
+            MAX_SECRET_BYTES,
+            name=option_text,
+            remedy_if_too_large="Give a file with the secret as one line of text.",
+        )
+        secret = derive_seed_from_secret(secret_text, option_text)
     students = read_roster(roster)
     answer_key_path = assignment.answer_key_path(folder, answer_path)
     check_output_paths([answer_key_path])

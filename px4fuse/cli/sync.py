@@ -44,8 +44,7 @@ def sync(log: Path, json_path: Path | None, **option_values: Any) -> None:
         log_name = comparison.flight.log.name
         remedy = time_offset.remedy if isinstance(time_offset, Unavailable) else advice["Action"]
         raise MissingDataError(
-            f"{log_name}: the time offset cannot be estimated from this flight: "
-            f"{time_offset.reason}",
+            f"{log_name}: the time offset cannot be estimated: {time_offset.reason}",
             remedy,
         )
     results = make_sync_results(request, comparison, time_offset)

@@ -24,7 +24,7 @@ ANALYSIS_TIMEOUT_S = 1800.0
 @click.argument("report", type=InputPath(), metavar="REPORT.pdf")
 @click.argument("logs", type=InputPath(), nargs=-1, metavar="[LOG ...]")
 @max_size_option
-@output_option("FILE.pdf", "Output PDF for the report recomputed from the log.  [default: none]")
+@output_option("FILE.pdf", "Report to write, recomputed from the log (PDF).  [default: none]")
 @json_option
 @open_option
 def verify(
@@ -63,7 +63,7 @@ def verify(
             ANALYSIS_TIMEOUT_S,
         )
     if isinstance(verification, JobFailure):
-        raise LogError(f"{display_name(report)}: cannot be verified: {verification.reason}")
+        raise LogError(f"{display_name(report)} cannot be verified: {verification.reason}")
     pdf_by_path = (
         {} if output is None or not verification.redrawn_pdf else {output: verification.redrawn_pdf}
     )

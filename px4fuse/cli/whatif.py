@@ -1,28 +1,60 @@
 """Command ``px4fuse whatif``: replays EKF2 with changed parameters."""
 
+import re
 from pathlib import Path
 from typing import Any
 
 import click
 
 from px4fuse.cli import options, outputs
-from px4fuse.core.units import UNIT_NAMES, convert_to_unit
 from px4fuse.errors import SettingsError
 from px4fuse.request import Sweep, WhatIfRequest
+
+_SWEEP_PATTERN = re.compile("([^=]*)=([^:]*):([^:]*)(?::([0-9]+))?")
+
+
+def _parse_number(parameter_name: str, text: str) -> Any:
+    from px4fuse.flight.ekf2_parameters import PARAMETERS
+
+    unit = PARAMETERS[parameter_name].printed_unit if parameter_name in PARAMETERS else ""
+    return options.NumberWithUnit(unit).convert(text, None, None)
+
+
+def parse_parameter(text: str) -> tuple[str, float]:
+    """Parse a parameter and its value: ``NAME=VALUE``."""
+    name, separator, value = text.partition("=")
+    if not separator:
+        raise click.BadParameter(f"{text} is not NAME=VALUE. Give for example EKF2_EVP_NOISE=0.1.")
+    return name, _parse_number(name, value)
+
+
+def parse_sweep(text: str) -> Sweep:
+    """Parse the range of a parameter: ``NAME=LOW:HIGH`` or ``NAME=LOW:HIGH:COUNT``."""
+    match = _SWEEP_PATTERN.fullmatch(text)
+    if match is None:
+        raise click.BadParameter(
+            f"{text} is not NAME=LOW:HIGH or NAME=LOW:HIGH:COUNT. Give for example "
+            "EKF2_EVP_NOISE=0.02:0.5."
+        )
+    name, *limits, count = match.groups()
+    low, high = (_parse_number(name, limit) for limit in limits)
+    return Sweep(name, low, high) if count is None else Sweep(name, low, high, int(count))
 
 
 @click.command()
 @options.log_argument
 @click.option(
     "--set",
-    "parameter_texts",
+    "parameters",
+    type=parse_parameter,
     metavar="NAME=VALUE",
     multiple=True,
-    help="EKF2 parameter and its value in the replay, in PX4's unit; repeatable.  [default: the "
-    "maximum-likelihood noise and delay of the position source]",
+    help="EKF2 parameter in PX4's unit; repeatable.  [default: the maximum-likelihood noise and "
+    "delay of the position source]",
 )
 @click.option(
     "--sweep",
+    type=parse_sweep,
     metavar="NAME=LOW:HIGH[:COUNT]",
     help="Replay EKF2 with COUNT values of one parameter, from LOW to HIGH in PX4's unit.  "
     "[default COUNT: 9]",
@@ -31,24 +63,22 @@ from px4fuse.request import Sweep, WhatIfRequest
     "--without",
     metavar="AID",
     multiple=True,
-    help="Aiding source that EKF2 does not fuse in the replay, for example gnss_pos, gnss_vel, "
-    "baro_hgt, mag or ev_pos; repeatable.",
+    help="Aiding source that EKF2 does not fuse, for example gnss_pos, gnss_vel, baro_hgt, mag or "
+    "ev_pos; repeatable.",
 )
 @click.option(
     "--from",
     "start_s",
-    type=options.NumberWithUnit("s", 60.0),
+    type=options.NumberWithUnit("s"),
     metavar="SECONDS",
-    help="Time (s after the first sample) at which EKF2 stops fusing the aiding sources given "
-    "with --without.  [default: 0]",
+    help="Time (s after the first sample) from which --without applies.  [default: 0]",
 )
 @options.system_option
 @options.max_size_option
 @options.json_option
 def whatif(
     log: Path,
-    parameter_texts: tuple[str, ...],
-    sweep: str | None,
+    parameters: tuple[tuple[str, float], ...],
     without: tuple[str, ...],
     start_s: float | None,
     json_path: Path | None,
@@ -69,10 +99,14 @@ def whatif(
 
     if start_s is not None and not without:
         raise SettingsError("--from requires --without AID.")
+    changes: dict[str, float] = {}
+    for name, value in parameters:
+        if name in changes:
+            raise SettingsError(f"--set {name} is given twice. Give each parameter once.")
+        changes[name] = value
     request = WhatIfRequest(
         log=str(log),
-        changes=_parse_parameters(parameter_texts),
-        sweep=None if sweep is None else _parse_sweep(sweep),
+        changes=changes,
         without=dict.fromkeys(without, start_s or 0.0),
         **option_values,
     )
@@ -82,46 +116,3 @@ def whatif(
     outputs.write_and_print_results(
         outputs.make_result_files(results, json_path), make_whatif_page(analysis)
     )
-
-
-def _parse_parameters(parameter_texts: tuple[str, ...]) -> dict[str, float]:
-    value_by_name: dict[str, float] = {}
-    for text in parameter_texts:
-        name, separator, value = text.partition("=")
-        if not separator:
-            raise SettingsError(
-                f"--set {text} is not NAME=VALUE. Give for example --set EKF2_EVP_NOISE=0.1."
-            )
-        if name in value_by_name:
-            raise SettingsError(f"--set {name} is given twice. Give each parameter once.")
-        value_by_name[name] = _parse_number(f"--set {text}", name, value)
-    return value_by_name
-
-
-def _parse_sweep(text: str) -> Sweep:
-    parameter_name, _, range_text = text.partition("=")
-    range_fields = range_text.split(":")
-    if len(range_fields) not in (2, 3) or (
-        len(range_fields) == 3 and not range_fields[2].isdecimal()
-    ):
-        raise SettingsError(
-            f"--sweep {text} is not valid. Use NAME=LOW:HIGH or NAME=LOW:HIGH:COUNT, for "
-            "example EKF2_EVP_NOISE=0.02:0.5."
-        )
-    low, high = (
-        _parse_number(f"--sweep {text}", parameter_name, field) for field in range_fields[:2]
-    )
-    return Sweep(parameter_name, low, high, *map(int, range_fields[2:]))
-
-
-def _parse_number(option_text: str, name: str, value: str) -> float:
-    from px4fuse.flight.ekf2_parameters import PARAMETERS
-
-    try:
-        return float(value)
-    except ValueError as error:
-        advice_text = ""
-        unit = PARAMETERS[name].printed_unit if name in PARAMETERS else ""
-        if unit and (number := convert_to_unit(value, unit)) is not None:
-            advice_text = f" in {UNIT_NAMES.get(unit, unit)}. Give {number:g}"
-        raise SettingsError(f"{option_text}: {value!r} is not a number{advice_text}.") from error

@@ -1,9 +1,10 @@
 """Loop closure error of a trajectory, and corrected paths with ATE and RPE."""
 
-from collections.abc import Callable
+from contextlib import suppress
 
 import numpy as np
 
+from px4fuse.comparison.estimates import Progress, ignore_progress
 from px4fuse.core.arrays import Array, IntArray
 from px4fuse.core.record import Span
 from px4fuse.errors import MissingDataError, SettingsError, TrajectoryError
@@ -12,10 +13,8 @@ from px4fuse.flight.model import DIAGNOSIS_WITHHELD, Flight, Unavailable
 from px4fuse.loop import loop_segment
 from px4fuse.loop.closure import choose_key_frames, compute_default_spacing_m, to_z_down
 from px4fuse.loop.corrections import (
-    ClosureAndFinalPose,
     build_pose_graph,
     distribute_closure_error_by_distance,
-    gate_closures,
     score_paths,
     solve_pose_graphs,
 )
@@ -23,7 +22,12 @@ from px4fuse.loop.model import Loop, OdometryNoise, TrueFinalPose
 from px4fuse.loop.tracks import LoopSource, find_odometry, trajectory_of
 from px4fuse.request import GivenClosure, LoopRequest
 from px4fuse.trajectory.graph import lie
-from px4fuse.trajectory.model import Trajectory, cumulative_distance, split_by_axis
+from px4fuse.trajectory.model import (
+    Trajectory,
+    compute_extent_m,
+    cumulative_distance,
+    split_by_axis,
+)
 
 # Larger times (s) in options are UNIX times
 MIN_UNIX_TIME_S = 1e6
@@ -41,7 +45,7 @@ def analyse(
     source: LoopSource,
     request: LoopRequest | None = None,
     reference: Trajectory | None = None,
-    progress: Callable[[str], None] = lambda _: None,
+    progress: Progress = ignore_progress,
 ) -> Loop:
     """Compute the loop closure error of a trajectory, and correct the path.
 
@@ -63,8 +67,7 @@ def analyse(
     noise = OdometryNoise(request.position_drift_m, request.heading_drift_deg)
     _require_in_range("position_drift_m", noise.position_m, 1e-4)
     _require_in_range("heading_drift_deg", noise.heading_deg, 1e-4)
-    trajectory = source.trajectory
-    flight = source.flight
+    trajectory, flight = source.trajectory, source.flight
     is_assessed = flight is not None and bool(flight.log.is_assessed)
     time_origin_s = float(trajectory.time_s[0]) if trajectory.unix_offset_s == 0.0 else 0.0
 
@@ -76,17 +79,19 @@ def analyse(
         for time_s in (request.start_s, request.end_s)
     )
     segment = loop_segment.choose_loop_segment(flight, trajectory, start_s, end_s)
-    truth = None if flight is None or trajectory.kind == "truth" else find_truth_trajectory(flight)
+    truth = None
+    if flight is not None and trajectory.kind != "truth":
+        with suppress(MissingDataError):
+            truth = trajectory_of(flight, "truth")
     z_down_trajectory = to_z_down(trajectory)
     path = loop_segment.cut_trajectory(z_down_trajectory, segment)
     final_pose_in_truth = None
     if truth and request.closed_loop and request.landed_at is None:
         final_pose_in_truth = loop_segment.find_final_pose_in_truth(path, truth, segment)
     true_end = _find_true_end(path, request, final_pose_in_truth, segment, is_assessed=is_assessed)
-    closures_and_final_poses: list[ClosureAndFinalPose] = []
+    closures = []
     if not isinstance(true_end, Unavailable):
-        landing_closure = GivenClosure(segment.start_s, segment.end_s, true_end.sigma_m)
-        closures_and_final_poses.append((landing_closure, true_end))
+        closures.append(GivenClosure(segment.start_s, segment.end_s, true_end.sigma_m))
     for given_closure in request.closures:
         closure = GivenClosure(
             convert_to_trajectory_time_s(given_closure.time_1_s),
@@ -94,19 +99,19 @@ def analyse(
             given_closure.sigma_m,
         )
         _require_valid_closure(closure, path)
-        closures_and_final_poses.append((closure, None))
+        closures.append(closure)
     key_frame_spacing_m = request.key_frames_m
     if key_frame_spacing_m is None:
         key_frame_spacing_m = compute_default_spacing_m(path.position_m)
     key_frame_indices, distance_m = _choose_key_frames(path, key_frame_spacing_m)
     graph, node_indices, variance_note = build_pose_graph(
-        path, key_frame_indices, closures_and_final_poses, noise
+        path, key_frame_indices, closures, true_end, noise
     )
     notes = [*z_down_trajectory.notes, variance_note]
     if isinstance(final_pose_in_truth, str):
         notes.append(f"the landing place is not known from ground truth: {final_pose_in_truth}")
     pose_graph_corrections, tested_closures = solve_pose_graphs(
-        path, node_indices, graph, gate_closures(graph, closures_and_final_poses), progress
+        path, node_indices, graph, closures, true_end, progress
     )
     displacement_m = path.position_m[-1] - path.position_m[0]
     odometry_heading_change_deg = loop_segment.compute_heading_change_deg(path)
@@ -170,7 +175,7 @@ def _find_true_end(
         if not request.closed_loop:
             raise SettingsError(
                 "`landed_at` and `closed_loop` exclude each other.",
-                "Omit `landed_at` or `closed_loop`.",
+                "Omit one of them.",
             )
         return loop_segment.convert_measured_final_pose(path, request.landed_at)
     if not request.closed_loop:
@@ -190,8 +195,8 @@ def _find_true_end(
     ):
         return Unavailable(
             "loop closure error",
-            f"{path.name} has poses only from {segment.start_s:.1f} s to {segment.end_s:.1f} s, "
-            "not of the whole flight",
+            f"{path.name} has poses only from {segment.start_s:.1f} to {segment.end_s:.1f} s of "
+            "the flight",
             "Choose the time span of a loop with --from and --to.",
         )
     return loop_segment.assume_landing_at_takeoff(path)
@@ -213,7 +218,7 @@ def _choose_key_frames(path: Trajectory, key_frame_spacing_m: float) -> tuple[In
         raise TrajectoryError(
             f"{path.name}: the path of {distance_m[-1]:.2f} m is too short for key frames every "
             f"{key_frame_spacing_m:g} m",
-            "Change the time span (--from, --to) or the key frame spacing (--key-frames).",
+            "Change the time span (--from, --to) or --key-frames.",
         )
     return key_frame_indices, np.interp(path.time_s, path.time_s[key_frame_indices], distance_m)
 
@@ -252,24 +257,16 @@ def _compute_heading_error(
     if true_end.heading_change_deg is None:
         return Unavailable(
             quantity,
-            f"the final heading differs by {heading_change_deg:+.0f}° from the initial heading, "
-            "and the true heading change is unknown",
-            "Give the true heading change as DEG: px4fuse loop --landed-at FORWARD,RIGHT,DEG.",
+            f"the heading changes by {heading_change_deg:+.0f}°, and the true heading change is "
+            "unknown",
+            "Give the true heading change: px4fuse loop --landed-at FORWARD,RIGHT,DEG.",
         )
     return float(np.degrees(lie.wrap(np.radians(heading_change_deg - true_end.heading_change_deg))))
 
 
-def find_truth_trajectory(flight: Flight) -> Trajectory | None:
-    """Return the ground truth of a flight as a trajectory, or None."""
-    try:
-        return trajectory_of(flight, "truth")
-    except MissingDataError:
-        return None
-
-
 def analyse_flight_loop(
     flight: Flight,
-    progress: Callable[[str], None] = lambda _: None,
+    progress: Progress = ignore_progress,
     analysed_span_s: Span | None = None,
 ) -> Loop | Unavailable:
     """Compute the loop closure error of the odometry of a flight.
@@ -282,9 +279,8 @@ def analyse_flight_loop(
             if any(take_off_s < limit_s < landing_s for limit_s in analysed_span_s):
                 return Unavailable(
                     "loop closure",
-                    "the analysed time span begins or ends in flight, so the path is not a loop",
-                    "Analyse the whole flight (without --start and --end), or give a loop "
-                    "closure with px4fuse loop --closure.",
+                    "the analysed time span begins or ends in flight",
+                    "Omit --start and --end, or give a loop closure with px4fuse loop --closure.",
                 )
     odometry = find_odometry(flight)
     try:
@@ -297,12 +293,9 @@ def analyse_flight_loop(
             "Send visual-inertial odometry to PX4 as MAVLink message ODOMETRY.",
         )
     segment = loop_segment.choose_loop_segment(flight, trajectory, None, None)
-    segment_position_m = trajectory.cut_to_span(segment.start_s, segment.end_s).position_m
-    extent_m = end_to_start_distance_m = 0.0
-    if len(segment_position_m):
-        displacement_m = segment_position_m[-1] - segment_position_m[0]
-        extent_m = float(np.linalg.norm(np.ptp(segment_position_m, axis=0)))
-        end_to_start_distance_m = float(np.linalg.norm(displacement_m))
+    position_m = trajectory.cut_to_span(segment.start_s, segment.end_s).position_m
+    extent_m = compute_extent_m(position_m)
+    end_to_start_distance_m = compute_extent_m(np.vstack([position_m[:1], position_m[-1:]]))
     if (
         2.0 * extent_m < MIN_FLIGHT_LOOP_PATH_M
         or end_to_start_distance_m > MAX_END_TO_START_DISTANCE_FRACTION * 2.0 * extent_m
@@ -310,7 +303,7 @@ def analyse_flight_loop(
         return Unavailable(
             "loop closure",
             f"the odometry has an extent of {extent_m:.1f} m and ends "
-            f"{end_to_start_distance_m:.1f} m from its start, so the path is not a loop",
+            f"{end_to_start_distance_m:.1f} m from its start: no loop",
             "Fly back to the take-off place, or give a loop closure with px4fuse loop --closure.",
         )
     return analyse(LoopSource(trajectory, flight), progress=progress)

@@ -7,7 +7,12 @@ from scipy.spatial.transform import Rotation
 
 from px4fuse.core.arrays import Array, IntArray, cumulative_sums
 from px4fuse.trajectory.graph import lie
-from px4fuse.trajectory.model import NED_COMPONENTS_BY_FRAME, Frame, Trajectory, cumulative_distance
+from px4fuse.trajectory.model import (
+    NED_COMPONENTS_BY_FRAME,
+    Frame,
+    Trajectory,
+    compute_extent_m,
+)
 
 DOWN_DIRECTION = np.array([0.0, 0.0, 1.0])
 # Conversion of each frame to z down: axis directions, new frame, note to the user
@@ -61,12 +66,8 @@ def _rotate(trajectory: Trajectory, matrix: Array, frame: Frame) -> Trajectory:
 
 def compute_default_spacing_m(position_m: Array) -> float:
     """Return the default key frame spacing (m)."""
-    extent_m = float(np.linalg.norm(np.ptp(position_m, axis=0)))
-    return float(
-        np.clip(
-            KEY_FRAME_SPACING_FRACTION * extent_m, MIN_KEY_FRAME_SPACING_M, MAX_KEY_FRAME_SPACING_M
-        )
-    )
+    spacing_m = KEY_FRAME_SPACING_FRACTION * compute_extent_m(position_m)
+    return float(np.clip(spacing_m, MIN_KEY_FRAME_SPACING_M, MAX_KEY_FRAME_SPACING_M))
 
 
 def choose_key_frames(position_m: Array, spacing_m: float) -> IntArray:
@@ -91,7 +92,7 @@ def choose_key_frames(position_m: Array, spacing_m: float) -> IntArray:
 
 
 def distribute_by_distance(
-    position_m: Array, closure_error_vector_m: Array, cumulative_distance_m: Array | None = None
+    position_m: Array, closure_error_vector_m: Array, cumulative_distance_m: Array
 ) -> Array:
     """Correct positions by a part of the loop closure error, in proportion to path length.
 
@@ -102,13 +103,11 @@ def distribute_by_distance(
     position_m : ndarray, shape (n, 3)
     closure_error_vector_m : ndarray, shape (3,)
         Final position minus true final position.
-    cumulative_distance_m : ndarray, shape (n,), optional
+    cumulative_distance_m : ndarray, shape (n,)
         Path length from the start to each position.
     """
-    distance_m = (
-        cumulative_distance(position_m) if cumulative_distance_m is None else cumulative_distance_m
-    )
-    return np.asarray(position_m - (distance_m / distance_m[-1])[:, None] * closure_error_vector_m)
+    distance_fraction = cumulative_distance_m / cumulative_distance_m[-1]
+    return np.asarray(position_m - distance_fraction[:, None] * closure_error_vector_m)
 
 
 def compute_heading_change_rad(rotation: Rotation) -> float:

@@ -1,11 +1,12 @@
 """Correction of odometry by loop closures: χ² test, corrected paths, ATE and RPE."""
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 
 import numpy as np
 from msgspec import structs
 from scipy.spatial.transform import Rotation, Slerp
 
+from px4fuse.comparison.estimates import Progress
 from px4fuse.core.arrays import Array, IntArray, rms
 from px4fuse.errors import Px4FuseError
 from px4fuse.flight.model import Unavailable
@@ -37,8 +38,6 @@ MIN_VARIANCE_GROWTH_RATIO = 2.0
 MIN_REPORTED_TO_DEFAULT_VARIANCE_RATIO = 1e-2
 # Fraction of the poses that counts as start or end of the path, for median variances
 FRACTION_OF_POSES_AT_EACH_END = 0.1
-# Loop closure, and the true final pose if it is the closure of take-off and landing
-ClosureAndFinalPose = tuple[GivenClosure, TrueFinalPose | None]
 
 
 def compute_odometry_variances(
@@ -90,8 +89,8 @@ def compute_odometry_variances(
             MIN_REPORTED_TO_DEFAULT_VARIANCE_RATIO * translation_variance_m2,
         )
         variance_texts.append(
-            "the position variance of each odometry edge is the increase of the logged position "
-            "variance between the two nodes"
+            "the position variance of odometry edges is the increase of the logged position "
+            "variance"
         )
     elif path.position_variance_m2 is not None:
         variance_texts.append("the logged position variances do not grow, so they are not used")
@@ -104,8 +103,8 @@ def compute_odometry_variances(
             MIN_REPORTED_TO_DEFAULT_VARIANCE_RATIO * rotation_variance_rad2,
         )
         variance_texts.append(
-            "the odometry's orientation variance between two graph nodes is the increase of the "
-            "logged orientation variance"
+            "the orientation variance of odometry edges is the increase of the logged orientation "
+            "variance"
         )
     return translation_variance_m2, rotation_variance_rad2, "; ".join(variance_texts)
 
@@ -128,10 +127,13 @@ def _compute_variance_increments(variance: Array | None, node_indices: IntArray)
 def build_pose_graph(
     path: Trajectory,
     key_frame_indices: IntArray,
-    closures_and_final_poses: Sequence[ClosureAndFinalPose],
+    closures: Sequence[GivenClosure],
+    true_end: TrueFinalPose | Unavailable,
     noise: OdometryNoise,
 ) -> tuple[PoseGraph | Unavailable, IntArray, str]:
     """Build the pose graph of a path. Its last edges are the loop closures.
+
+    If ``true_end`` is known, the first closure is between take-off and landing.
 
     Returns
     -------
@@ -152,7 +154,7 @@ def build_pose_graph(
             "",
         )
     closure_times_s = np.array(
-        [(closure.time_1_s, closure.time_2_s) for closure, _ in closures_and_final_poses]
+        [(closure.time_1_s, closure.time_2_s) for closure in closures]
     ).reshape(-1, 2)
     pose_indices = np.abs(path.time_s - closure_times_s[..., None]).argmin(axis=-1)
     node_indices = np.union1d(key_frame_indices, pose_indices).astype(np.intp)
@@ -175,29 +177,28 @@ def build_pose_graph(
     measured_translation_m = first_rotation_inverse.apply(
         node_position_m[second_nodes] - node_position_m[first_nodes]
     )
-    for edge_index, (closure, true_end) in enumerate(
-        closures_and_final_poses, start=len(step_indices)
-    ):
-        measured_translation_m[edge_index] = (
-            0.0
-            if true_end is None
-            else first_rotation_inverse[edge_index].apply(true_end.displacement_vector_m)
-        )
+    landing_edge = len(step_indices)
+    for edge_index, closure in enumerate(closures, start=landing_edge):
+        measured_translation_m[edge_index] = 0.0
         information[edge_index, range(3), range(3)] = closure.sigma_m**-2
-        if true_end is not None and true_end.heading_change_deg is not None:
+    if not isinstance(true_end, Unavailable):
+        measured_translation_m[landing_edge] = first_rotation_inverse[landing_edge].apply(
+            true_end.displacement_vector_m
+        )
+        if true_end.heading_change_deg is not None:
             odometry_heading_change_rad = compute_heading_change_rad(
-                second_node_rotation[edge_index] * node_rotation[first_nodes[edge_index]].inv()
+                second_node_rotation[landing_edge] * node_rotation[first_nodes[landing_edge]].inv()
             )
             heading_correction_rad = float(
                 lie.wrap(np.radians(true_end.heading_change_deg) - odometry_heading_change_rad)
             )
-            second_node_rotation[edge_index] = (
+            second_node_rotation[landing_edge] = (
                 Rotation.from_rotvec(heading_correction_rad * DOWN_DIRECTION)
-                * second_node_rotation[edge_index]
+                * second_node_rotation[landing_edge]
             )
-            vertical_direction = second_node_rotation[edge_index].inv().apply(DOWN_DIRECTION)
+            vertical_direction = second_node_rotation[landing_edge].inv().apply(DOWN_DIRECTION)
             heading_sigma_rad = np.radians(true_end.sigma_heading_deg or 0.0)
-            information[edge_index, 3:, 3:] = (
+            information[landing_edge, 3:, 3:] = (
                 np.outer(vertical_direction, vertical_direction) / heading_sigma_rad**2
             )
     graph = PoseGraph(
@@ -268,29 +269,22 @@ def _explain_gate_rejection(correction_name: str, closure: Closure) -> Unavailab
     )
 
 
-def gate_closures(
-    graph: PoseGraph | Unavailable, closures_and_final_poses: Sequence[ClosureAndFinalPose]
+def _gate_closures(
+    graph: PoseGraph, closures: Sequence[GivenClosure], true_end: TrueFinalPose | Unavailable
 ) -> tuple[Closure, ...]:
     """Test the loop closures against odometry with a χ² test."""
-    if isinstance(graph, Unavailable):
-        return ()
-    closure_edges = np.arange(
-        len(graph.first_nodes) - len(closures_and_final_poses), len(graph.first_nodes)
-    )
-    closures = []
-    for gate_result, (closure, true_end) in zip(
-        gate_edges(graph, closure_edges), closures_and_final_poses, strict=True
-    ):
+    edge_count = len(graph.first_nodes)
+    gate_results = gate_edges(graph, range(edge_count - len(closures), edge_count))
+    tested_closures: list[Closure] = []
+    for closure, gate_result in zip(closures, gate_results, strict=True):
         error_m = graph.poses[gate_result.second, :3] - graph.poses[gate_result.first, :3]
         source = "given"
-        if true_end is not None:
+        if not tested_closures and not isinstance(true_end, Unavailable):
             error_m = error_m - true_end.displacement_vector_m
             source = LANDING_CLOSURE_SOURCE
-        closures.append(
+        tested_closures.append(
             Closure(
-                time_1_s=closure.time_1_s,
-                time_2_s=closure.time_2_s,
-                sigma_m=closure.sigma_m,
+                **structs.asdict(closure),
                 source=source,
                 distance_m=float(np.linalg.norm(error_m)),
                 d2=gate_result.d2,
@@ -299,21 +293,23 @@ def gate_closures(
                 accepted=gate_result.accepted,
             )
         )
-    return tuple(closures)
+    return tuple(tested_closures)
 
 
 def solve_pose_graphs(
     path: Trajectory,
     node_indices: IntArray,
     graph: PoseGraph | Unavailable,
-    closures: tuple[Closure, ...],
-    progress: Callable[[str], None],
+    given_closures: Sequence[GivenClosure],
+    true_end: TrueFinalPose | Unavailable,
+    progress: Progress,
 ) -> tuple[dict[CorrectionName, CorrectionOutcome], tuple[Closure, ...]]:
-    """Optimise the pose graph with accepted closures, and robustly with all closures.
+    """Test the loop closures, and optimise the pose graph.
 
-    Return the corrected paths, and the closures with their weights from robust optimisation.
+    One optimisation uses the accepted closures. The other one is robust and uses all closures.
+    Return the corrected paths, and the closures with the results of their tests.
     """
-    if not closures and not isinstance(graph, Unavailable):
+    if not given_closures and not isinstance(graph, Unavailable):
         graph = Unavailable(
             "pose graph",
             "the path has no loop closure",
@@ -321,6 +317,7 @@ def solve_pose_graphs(
         )
     if isinstance(graph, Unavailable):
         return {"pose_graph_gated": graph, "pose_graph_gnc": graph}, ()
+    closures = _gate_closures(graph, given_closures, true_end)
     is_closure = np.arange(len(graph.first_nodes)) >= len(graph.first_nodes) - len(closures)
     is_used = ~is_closure
     is_used[is_closure] = [closure.accepted for closure in closures]
@@ -335,8 +332,7 @@ def solve_pose_graphs(
     if len(closures) < 2:
         corrections["pose_graph_gnc"] = Unavailable(
             ROBUST_SOLUTION_LABEL,
-            "Robust optimisation compares loop closures with each other, but the path has only "
-            "one loop closure. Only the χ² gate can test this loop closure.",
+            "the path has only one loop closure, which only the χ² gate can test",
             "Give more loop closures with --closure.",
         )
     else:

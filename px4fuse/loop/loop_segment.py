@@ -12,7 +12,13 @@ from px4fuse.flight.model import Flight, Unavailable
 from px4fuse.loop.closure import DOWN_DIRECTION, compute_heading_change_rad
 from px4fuse.loop.model import TrueFinalPose
 from px4fuse.request import Landing
-from px4fuse.trajectory.model import MIN_POSES, Trajectory, format_vector, split_by_axis
+from px4fuse.trajectory.model import (
+    MIN_POSES,
+    Trajectory,
+    compute_extent_m,
+    format_vector,
+    split_by_axis,
+)
 
 # Time (s) over which poses are averaged on the ground
 REST_DURATION_S = 1.0
@@ -36,9 +42,8 @@ def cut_trajectory(trajectory: Trajectory, segment: Segment) -> Trajectory:
     segment_track = trajectory.cut_to_span(segment.start_s, segment.end_s)
     if len(segment_track) < MIN_POSES:
         raise TrajectoryError(
-            f"{trajectory.name} ({time_s[0]:.2f} s to {time_s[-1]:.2f} s) has {len(segment_track)} "
-            f"poses between {segment.start_s:.2f} s and {segment.end_s:.2f} s; at least "
-            f"{MIN_POSES} are needed"
+            f"{trajectory.name} ({time_s[0]:.2f} to {time_s[-1]:.2f} s) has {len(segment_track)} "
+            f"poses from {segment.start_s:.2f} to {segment.end_s:.2f} s; {MIN_POSES} are needed"
         )
     if segment.flight_span_s is None:
         return segment_track
@@ -48,9 +53,8 @@ def cut_trajectory(trajectory: Trajectory, segment: Segment) -> Trajectory:
         poses_at_rest = trajectory.cut_to_span(rest_start_s, rest_start_s + REST_DURATION_S)
         if not len(poses_at_rest):
             continue
-        extent_m = np.linalg.norm(np.ptp(poses_at_rest.position_m, axis=0))
         # If the vehicle moves, no mean is computed
-        if extent_m <= MAX_POSITION_EXTENT_AT_REST_M:
+        if compute_extent_m(poses_at_rest.position_m) <= MAX_POSITION_EXTENT_AT_REST_M:
             position_m[index] = poses_at_rest.position_m.mean(axis=0)
             if quaternions is not None and poses_at_rest.rotation is not None:
                 quaternions[index] = poses_at_rest.rotation.mean().as_quat()
@@ -88,27 +92,26 @@ def choose_loop_segment(
     elif isinstance(flight.airborne, Unavailable) or not flight.airborne:
         reason = "the whole trajectory, because the log contains no detected take-off"
     else:
-        take_off_s, landing_s = flight.airborne[0][0], flight.airborne[-1][1]
+        take_off_s, landing_s = flight_span_s = flight.airborne[0][0], flight.airborne[-1][1]
         segment_start_s = max(segment_start_s, take_off_s)
         segment_end_s = min(segment_end_s, landing_s)
         reason = "from take-off to landing, by the land detector"
         if len(flight.airborne) > 1:
             reason = f"from the first take-off to the last of {len(flight.airborne)} landings"
-        if start_s is None and end_s is None:
-            flight_span_s = take_off_s, landing_s
     if start_s is not None or end_s is not None:
         segment_start_s = segment_start_s if start_s is None else start_s
         segment_end_s = segment_end_s if end_s is None else end_s
+        flight_span_s = None
         reason = "the time span was chosen with --from or --to"
     limited_span_s = max(segment_start_s, track_start_s), min(segment_end_s, track_end_s)
     if not limited_span_s[0] < limited_span_s[1]:
         raise SettingsError(
-            f"The track has no poses between {segment_start_s:.12g} s and {segment_end_s:.12g} s; "
-            f"it is from {track_start_s:.2f} s to {track_end_s:.2f} s.",
+            f"The track ({track_start_s:.2f} to {track_end_s:.2f} s) has no poses between "
+            f"{segment_start_s:.12g} s and {segment_end_s:.12g} s.",
             "Change --from or --to.",
         )
     if limited_span_s != (segment_start_s, segment_end_s):
-        reason = f"{reason}; times without poses are omitted"
+        reason += "; times without poses are omitted"
     return Segment(*limited_span_s, reason, flight_span_s)
 
 
@@ -182,8 +185,7 @@ def find_final_pose_in_truth(
         true_heading_change_deg = compute_heading_change_deg(true_path)
     elif path.frame != true_path.frame:
         return (
-            "the ground truth cannot be rotated to the odometry frame, because the odometry or the "
-            "ground truth has no orientation"
+            "the ground truth cannot be rotated to the odometry frame without orientations of both"
         )
     return TrueFinalPose(
         displacement_m=split_by_axis(path.frame, displacement_m),

@@ -195,9 +195,8 @@ class Loop(Record, kw_only=True):
 
     def choose_best_path(self) -> PathResult:
         """Return the most reliable of the available paths."""
-        names: tuple[CorrectionName, ...] = ("pose_graph_gated", "by_distance", "uncorrected")
         paths = self.find_paths()
-        return next(paths[name] for name in names if name in paths)
+        return paths.get("pose_graph_gated") or paths.get("by_distance") or paths["uncorrected"]
 
     @property
     def is_end_assumed(self) -> bool:

@@ -48,8 +48,7 @@ def find_odometry(flight: Flight) -> PositionTrack | Unavailable:
     return Unavailable(
         "visual-inertial odometry",
         f"the log has no external vision with orientation (position sources: {source_list_text})",
-        "Send odometry to PX4 as MAVLink message ODOMETRY, and set SDLOG_PROFILE to 129 to log the "
-        "odometry.",
+        "Send odometry to PX4 as MAVLink message ODOMETRY, and set SDLOG_PROFILE to 129.",
     )
 
 
@@ -221,15 +220,13 @@ def read_source(
         ``frame`` is given for a flight log.
     """
     path, track_name = split_path_and_part(argument)
-    file_head = b"bag" if is_bag(path) else read_head(path, _FILE_HEAD_BYTES, TrajectoryError)
-    if not file_head:
-        raise TrajectoryError(f"{display_name(path)} is empty.", "Copy or export the file again.")
     if is_g2o(path):
         raise TrajectoryError(
             f"{display_name(path)} is a pose graph, not a trajectory.",
             f"Optimise the pose graph with px4fuse loop {display_name(path)}.",
         )
-    if decode_text(file_head) is not None:  # flight logs are binary
+    # flight logs are binary
+    if is_bag(path) or decode_text(read_head(path, _FILE_HEAD_BYTES, TrajectoryError)) is not None:
         trajectory = read_trajectory(path, track_name)
         return LoopSource(trajectory if frame is None else replace(trajectory, frame=frame), None)
     if frame is not None:
@@ -244,9 +241,9 @@ def read_source(
             f"Use one of {', '.join(TRACK_NAMES)}.",
         )
     chosen_track_name = track_name or default_track
-    odometry = find_odometry(flight)
-    if chosen_track_name is None and isinstance(odometry, Unavailable):
-        if isinstance(flight.ekf2, Unavailable):
-            raise MissingDataError(f"{flight.log.name}: {odometry.reason}", odometry.remedy)
-        chosen_track_name = "ekf2"
-    return LoopSource(trajectory_of(flight, chosen_track_name or "vio"), flight)
+    if chosen_track_name is None:
+        has_only_ekf2 = isinstance(find_odometry(flight), Unavailable) and not isinstance(
+            flight.ekf2, Unavailable
+        )
+        chosen_track_name = "ekf2" if has_only_ekf2 else "vio"
+    return LoopSource(trajectory_of(flight, chosen_track_name), flight)

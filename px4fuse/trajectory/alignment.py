@@ -56,9 +56,7 @@ class Transform(Record):
 
     def apply_inverse(self, position_m: Array) -> Array:
         """Transform positions to the frame of the estimate, shape (n, 3) or (3,)."""
-        rotated_position_m: Array = (
-            self.to_rotation().inv().apply(position_m - np.array(self.translation_m))
-        )
+        rotated_position_m: Array = self.to_rotation().inv().apply(position_m - self.translation_m)
         return rotated_position_m / self.scale
 
 

@@ -100,10 +100,9 @@ def associate(
         matched_reference = _interpolate_poses(reference, time_s[pose_indices])
     if len(pose_indices) < MIN_POSES:
         raise TrajectoryError(
-            f"{estimate.name}: {len(pose_indices)} poses match in time; at least {MIN_POSES} are "
-            f"needed. With the time offset {time_offset_s:.12g} s, the estimate is from "
-            f"{time_s[0]:.3f} to {time_s[-1]:.3f} s; the reference {reference.name} is from "
-            f"{reference_start_s:.3f} to {reference_end_s:.3f} s.",
+            f"{estimate.name}: {len(pose_indices)} poses match in time; {MIN_POSES} are needed. "
+            f"Time offset {time_offset_s:.12g} s, estimate {time_s[0]:.3f} to {time_s[-1]:.3f} s, "
+            f"reference {reference.name} {reference_start_s:.3f} to {reference_end_s:.3f} s.",
             "Check that both trajectories are of the same flight. If the clocks differ, "
             "set `time_offset_s` to auto.",
         )

@@ -5,7 +5,8 @@ The absolute trajectory error (ATE) is the position error after alignment. The r
 """
 
 import re
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Iterator, Sequence
+from contextlib import suppress
 from dataclasses import replace
 from functools import partial
 from itertools import pairwise
@@ -18,7 +19,6 @@ from px4fuse.core.record import NOT_WRITTEN, NotWritten, OrUnavailable, Record
 from px4fuse.core.text import capitalise_first, format_metres
 from px4fuse.errors import TrajectoryError
 from px4fuse.flight.model import Unavailable
-from px4fuse.trajectory import scores
 from px4fuse.trajectory.alignment import (
     AlignmentKind,
     Transform,
@@ -27,8 +27,19 @@ from px4fuse.trajectory.alignment import (
     umeyama,
 )
 from px4fuse.trajectory.association import Association, AssociationMethod, associate
-from px4fuse.trajectory.model import MIN_POSES, Trajectory, cumulative_distance
-from px4fuse.trajectory.scores import RelativeError, RmseInterval, RpePairDistance, Statistics
+from px4fuse.trajectory.model import Trajectory, compute_extent_m, cumulative_distance
+from px4fuse.trajectory.scores import (
+    RelativeError,
+    RmseInterval,
+    RpePairDistance,
+    Statistics,
+    choose_default_deltas,
+    compute_relative_error,
+    compute_rotation_statistics,
+    compute_statistics,
+    estimate_rmse_interval,
+    get_rotations,
+)
 from px4fuse.trajectory.time_offset import TimeOffset, compute_clock_offset_s, estimate_time_offset
 
 # Maximum rotation (rad) of a constant orientation, above 0 because files contain rounded numbers
@@ -75,12 +86,9 @@ def find_frozen_poses(
         start_s, end_s = estimate.time_s[[start_index, end_index - 1]].tolist()
         if end_s - start_s < MIN_FREEZE_DURATION_S:
             continue
-        reference_position_m = reference.cut_to_span(
-            start_s + time_offset_s, end_s + time_offset_s
-        ).position_m
-        motion_m = 0.0
-        if len(reference_position_m):
-            motion_m = float(np.linalg.norm(np.ptp(reference_position_m, axis=0)))
+        motion_m = compute_extent_m(
+            reference.cut_to_span(start_s + time_offset_s, end_s + time_offset_s).position_m
+        )
         if motion_m > MIN_REFERENCE_MOTION_DURING_FREEZE_M:
             is_frozen[start_index + 1 : end_index] = True
             warnings.append(
@@ -98,9 +106,10 @@ def find_jump_warnings(estimate: Trajectory, reference: Trajectory) -> tuple[str
         np.linalg.norm(np.diff(trajectory.position_m, axis=0), axis=1)
         for trajectory in (estimate, reference)
     )
-    step_differences_m = np.abs(steps_of_estimate_m - steps_of_reference_m)
-    min_jump_m = max(MIN_JUMP_M, MIN_JUMP_TO_MEDIAN_RATIO * np.median(step_differences_m))
-    jump_indices = np.flatnonzero(steps_of_estimate_m - steps_of_reference_m > min_jump_m)
+    step_differences_m = steps_of_estimate_m - steps_of_reference_m
+    median_difference_m = np.median(np.abs(step_differences_m))
+    min_jump_m = max(MIN_JUMP_M, MIN_JUMP_TO_MEDIAN_RATIO * median_difference_m)
+    jump_indices = np.flatnonzero(step_differences_m > min_jump_m)
     if not len(jump_indices):
         return ()
     times_s = estimate.time_s[jump_indices + 1] - estimate.time_s[0]
@@ -109,7 +118,7 @@ def find_jump_warnings(estimate: Trajectory, reference: Trajectory) -> tuple[str
         f"{estimate.name} jumps by up to {step_differences_m[jump_indices].max():.1f} m, "
         f"{times_text} s after its start. The SLAM system probably lost track, relocalised or "
         "restarted its map. ATE and RPE contain the jumps. Evaluate the poses before and after a "
-        "jump as separate files, because one alignment does not fit both.",
+        "jump as separate files: one alignment does not fit both.",
     )
 
 
@@ -254,9 +263,20 @@ def evaluate(
     alignment_reason, is_alignment_given = "The user chose the alignment.", alignment is not None
     if alignment is None:
         alignment, alignment_reason = choose_alignment(matched_estimate, matched_reference)
-    transform, line_motion_warnings = _fit_alignment_with_warning(
-        matched_estimate, matched_reference, alignment, is_alignment_given=is_alignment_given
+    fit_positions = partial(
+        fit_alignment, matched_estimate.position_m, matched_reference.position_m, alignment
     )
+    line_motion_warnings = []
+    try:
+        transform = fit_positions()
+    except TrajectoryError as error:
+        if is_alignment_given:
+            raise
+        transform = fit_positions(requires_motion=False)
+        line_motion_warnings.append(
+            f"{capitalise_first(error.reason)}. The ATE may be too small, and rotation errors may "
+            "be wrong."
+        )
     jump_warnings = find_jump_warnings(matched_estimate, matched_reference)
     aligned_estimate, notes = _rotate_to_reference_body(
         _apply_transform(transform, matched_estimate), matched_reference
@@ -272,30 +292,30 @@ def evaluate(
     argument_order_warnings = []
     if estimate.kind == "truth" != reference.kind:
         argument_order_warnings.append(
-            f"{estimate.name} is ground truth, but {reference.name} is not. Check the order of the "
-            "arguments: first the estimate, then the reference."
+            f"{estimate.name} is ground truth, but {reference.name} is not. Give the estimate "
+            "first, then the reference."
         )
     distance_m = cumulative_distance(matched_reference.position_m)
     position_error_m = np.linalg.norm(
         aligned_estimate.position_m - matched_reference.position_m, axis=1
     )
-    position_statistics = scores.compute_statistics(position_error_m)
+    position_statistics = compute_statistics(position_error_m)
     if better_offset_s is not None:
-        evaluate_with_offset = partial(
-            evaluate,
-            estimate,
-            reference,
-            alignment=alignment if is_alignment_given else None,
-            association=association,
-            max_gap_s=max_gap_s,
-            rpe_deltas=(),
-        )
-        offset_warnings += _find_better_offset_warnings(
-            position_statistics, evaluate_with_offset, better_offset_s
-        )
-    rotations = scores.get_rotations(aligned_estimate, matched_reference, "ATE of the orientation")
+        # too few poses may match, or they do not move
+        with suppress(TrajectoryError):
+            better_evaluation = evaluate(
+                estimate,
+                reference,
+                alignment=alignment if is_alignment_given else None,
+                association=association,
+                max_gap_s=max_gap_s,
+                time_offset_s=better_offset_s,
+                rpe_deltas=(),
+            )
+            offset_warnings += _find_better_offset_warnings(position_statistics, better_evaluation)
+    rotations = get_rotations(aligned_estimate, matched_reference, "ATE of the orientation")
     if rpe_deltas is None:
-        rpe_deltas = scores.choose_default_deltas(distance_m, matched_estimate.time_s)
+        rpe_deltas = choose_default_deltas(distance_m, matched_estimate.time_s)
     return Evaluation(
         estimate_track=estimate,
         reference_track=reference,
@@ -306,15 +326,13 @@ def evaluate(
         time_offset=time_offset,
         ate=AbsoluteError(
             position_statistics,
-            scores.estimate_rmse_interval(position_error_m, "ATE"),
+            estimate_rmse_interval(position_error_m, "ATE"),
             rotations
             if isinstance(rotations, Unavailable)
-            else scores.compute_rotation_statistics(*rotations),
+            else compute_rotation_statistics(*rotations),
         ),
         rpe=tuple(
-            scores.compute_relative_error(
-                aligned_estimate, matched_reference, delta, all_pairs=all_pairs
-            )
+            compute_relative_error(aligned_estimate, matched_reference, delta, all_pairs=all_pairs)
             for delta in rpe_deltas
         ),
         time_s=matched_estimate.time_s,
@@ -354,16 +372,16 @@ def choose_alignment(estimate: Trajectory, reference: Trajectory) -> tuple[Align
     if estimate.kind == "truth" and (has_same_frame or reference.kind == "truth"):
         return (
             "none",
-            "No alignment: the estimated trajectory is ground truth in the frame of the reference.",
+            "No alignment: the estimate is ground truth in the frame of the reference.",
         )
     frames_text = f"{estimate.frame} and {reference.frame}"
+    yaw_text = "Yaw and translation are aligned (4 degrees of freedom): "
     has_common_vertical = estimate.frame == reference.frame == "ENU" or (
         estimate.frame in _Z_DOWN_FRAMES and reference.frame in _Z_DOWN_FRAMES
     )
     if has_common_vertical and estimate.kind not in _KINDS_WITHOUT_KNOWN_VERTICAL:
         return "yaw", (
-            "Yaw and translation are aligned (4 degrees of freedom): z is vertical in both frames "
-            f"({frames_text}), so a tilt counts as an error."
+            f"{yaw_text}z is vertical in both frames ({frames_text}), so a tilt counts as an error."
         )
     scale, scale_reason = 1.0, ""
     try:
@@ -371,8 +389,8 @@ def choose_alignment(estimate: Trajectory, reference: Trajectory) -> tuple[Align
     except TrajectoryError:
         if has_common_vertical:
             return "yaw", (
-                "Yaw and translation are aligned (4 degrees of freedom): motion along a line does "
-                f"not determine all angles, but z is vertical in both frames ({frames_text})."
+                f"{yaw_text}motion along a line does not determine all angles, but z is vertical "
+                f"in both frames ({frames_text})."
             )
     if abs(scale - 1.0) > MAX_SCALE_ERROR:
         scale_reason = (
@@ -433,23 +451,20 @@ def _choose_time_offset(
 
 
 def _find_better_offset_warnings(
-    statistics: Statistics, evaluate_with_offset: Callable[..., Evaluation], better_offset_s: float
-) -> list[str]:
-    """Return a warning if another time offset reduces the ATE."""
-    try:
-        better_statistics = evaluate_with_offset(time_offset_s=better_offset_s).ate.translation_m
-    except TrajectoryError:  # too few poses match, or they do not move
-        return []
+    statistics: Statistics, better_evaluation: Evaluation
+) -> Iterator[str]:
+    """Yield a warning if another time offset reduces the ATE."""
+    better_statistics = better_evaluation.ate.translation_m
     if (
-        better_statistics.rmse > MAX_ATE_RATIO_OF_BETTER_OFFSET * statistics.rmse
-        or better_statistics.count < MIN_POSE_COUNT_RATIO_OF_BETTER_OFFSET * statistics.count
+        better_statistics.rmse <= MAX_ATE_RATIO_OF_BETTER_OFFSET * statistics.rmse
+        and better_statistics.count >= MIN_POSE_COUNT_RATIO_OF_BETTER_OFFSET * statistics.count
     ):
-        return []
-    return [
-        f"With {better_offset_s:+.3f} s added to the timestamps of the estimate, the ATE decreases "
-        f"from {format_metres(statistics.rmse)} to {format_metres(better_statistics.rmse)} m. If "
-        "the clocks differ, give --time-offset auto."
-    ]
+        yield (
+            f"With {better_evaluation.time_offset.offset_s:+.3f} s added to the timestamps of the "
+            f"estimate, the ATE decreases from {format_metres(statistics.rmse)} to "
+            f"{format_metres(better_statistics.rmse)} m. If the clocks differ, give --time-offset "
+            "auto."
+        )
 
 
 def _find_mirror_warnings(
@@ -483,8 +498,8 @@ def _find_comparison_warnings(
 ) -> Iterator[str]:
     if association.coverage_estimate < MIN_EVALUATED_FRACTION:
         yield (
-            f"Only {association.coverage_estimate:.0%} of the poses of the estimate are evaluated; "
-            "the reference has no poses at the other times."
+            f"Only {association.coverage_estimate:.0%} of the estimate is evaluated; the reference "
+            "has no poses at the other times."
         )
     if association.coverage_reference < MIN_EVALUATED_FRACTION:
         yield (
@@ -498,36 +513,8 @@ def _find_comparison_warnings(
     has_motion = np.ptp(reference.position_m, axis=0).any()
     if alignment != "sim3" and has_motion and abs(scale - 1.0) > MAX_SCALE_ERROR:
         yield (
-            f"The scale factor of the estimate is {scale:.3g} instead of 1. The alignment "
-            f"{alignment} does not correct the scale."
-        )
-
-
-def _fit_alignment_with_warning(
-    estimate: Trajectory,
-    reference: Trajectory,
-    alignment: AlignmentKind,
-    *,
-    is_alignment_given: bool,
-) -> tuple[Transform, tuple[str, ...]]:
-    """Fit the alignment, and return a warning if the motion does not determine it.
-
-    Raises
-    ------
-    TrajectoryError
-        The motion does not determine the alignment that the user chose, or there are too few poses.
-    """
-    try:
-        return fit_alignment(estimate.position_m, reference.position_m, alignment), ()
-    except TrajectoryError as error:
-        if is_alignment_given or len(estimate) < MIN_POSES:
-            raise
-        transform = fit_alignment(
-            estimate.position_m, reference.position_m, alignment, requires_motion=False
-        )
-        return transform, (
-            f"{capitalise_first(error.reason)}. The ATE may be too small, and rotation errors may "
-            "be wrong.",
+            f"The scale factor of the estimate is {scale:.3g} instead of 1, which the alignment "
+            f"{alignment} does not correct."
         )
 
 
@@ -558,10 +545,9 @@ def _move_to_reference_body(
         f"{value:+.2f} m along {axis}" for value, axis in zip(lever_arm_m, "xyz", strict=True)
     )
     return corrected_estimate, (
-        f"The orientations differ by a constant {np.degrees(body_rotation.magnitude()):.1f}°: the "
-        "estimate and the reference have different body axes. In "
-        f"the body axes of the reference, the estimate's origin is displaced by {lever_arm_text}. "
-        "Both differences are removed before the errors are computed.",
+        "The body axes of estimate and reference differ by a constant rotation of "
+        f"{np.degrees(body_rotation.magnitude()):.1f}°, and their origins by {lever_arm_text} in "
+        "the axes of the reference. Both differences are removed before the errors are computed.",
     )
 
 
@@ -582,7 +568,7 @@ def _rotate_to_reference_body(
     # chordal mean of rotations (Hartley 2013, section 5.3)
     rotation = (rotation_of_estimate.inv() * reference.rotation).mean()
     return replace(aligned_estimate, rotation=rotation_of_estimate * rotation), (
-        "Rotation errors exclude the estimated constant rotation between vehicle and camera axes, "
-        f"{np.degrees(rotation.magnitude()):.1f}°. Position errors include the "
-        "lever arm between vehicle and camera.",
+        "Rotation errors exclude the estimated rotation between vehicle and camera axes, "
+        f"{np.degrees(rotation.magnitude()):.1f}°. Position errors include the lever arm between "
+        "vehicle and camera.",
     )

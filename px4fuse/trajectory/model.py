@@ -168,6 +168,11 @@ class Trajectory:
         )
 
 
+def compute_extent_m(position_m: Array) -> float:
+    """Return the diagonal (m) of the box around positions; 0 without positions."""
+    return float(np.linalg.norm(np.ptp(position_m, axis=0))) if len(position_m) else 0.0
+
+
 def cumulative_distance(position_m: Array) -> Array:
     """Return the path length (m) from the start to each position, shape (n,)."""
     return np.concatenate([[0.0], np.cumsum(np.linalg.norm(np.diff(position_m, axis=0), axis=1))])

@@ -30,7 +30,6 @@ MIN_PAIR_DISTANCE_FRACTION_OF_PATH = 1 / 200
 MAX_PAIR_DISTANCE_FRACTION = 1 / 5
 BOOTSTRAP_RESAMPLES = 2000
 BOOTSTRAP_SEED = 20120101
-CONFIDENCE_LEVEL = 0.95
 # Block length of the bootstrap, in autocorrelation times of the squared errors
 BLOCK_LENGTH_IN_CORRELATION_TIMES = 3.0
 # Lags in the sum of autocorrelations, in autocorrelation times (Sokal 1997)
@@ -173,7 +172,7 @@ def find_pose_pairs(
     SettingsError
         The distance is not positive, or the number of frames is not an integer.
     """
-    if not (np.isfinite(delta.value) and delta.value > 0.0):
+    if not 0.0 < delta.value < np.inf:
         raise SettingsError(f"RPE delta {delta}: the value must be positive.")
     pose_count = len(time_s)
     if delta.unit == "frames":
@@ -307,8 +306,8 @@ def estimate_rmse_interval(
     if error_count < MIN_BOOTSTRAP_BLOCKS * block_length:
         return Unavailable(
             f"95 % interval of the {analysis_name} RMSE",
-            f"the errors are correlated over {block_length} of {error_count} samples, so there are "
-            f"fewer than {MIN_BOOTSTRAP_BLOCKS:.0f} independent blocks",
+            f"the errors are correlated over {block_length} of {error_count} samples: fewer than "
+            f"{MIN_BOOTSTRAP_BLOCKS:.0f} independent blocks",
             "Use a longer flight.",
         )
     circular_errors = np.append(squared_errors, squared_errors[: block_length - 1])
@@ -322,7 +321,7 @@ def estimate_rmse_interval(
         0, error_count, (BOOTSTRAP_RESAMPLES, round(block_count))
     )
     resampled_means = block_means[block_starts].mean(axis=1)
-    student_t_quantile = float(stdtrit(block_count - 1.0, 0.5 + CONFIDENCE_LEVEL / 2.0))
+    student_t_quantile = float(stdtrit(block_count - 1.0, 0.975))
     tail_probability = float(ndtr(-student_t_quantile * np.sqrt(block_count / (block_count - 1.0))))
     limits = np.quantile(resampled_means, [tail_probability, 1.0 - tail_probability])
     low, high = np.sqrt(np.maximum(limits, 0.0))

@@ -51,7 +51,6 @@ MIN_RESIDUAL_VELOCITY_CORRELATION = 0.5
 MAX_LAG_IN_CORRELATION_LENGTHS = 4
 # Maximum half-width (s) of the 95 % interval of a time offset
 MAX_INTERVAL_HALF_WIDTH_S = 0.5
-CONFIDENCE_LEVEL = 0.95
 
 
 class TimeOffset(Record, kw_only=True):
@@ -118,22 +117,23 @@ def _search_offset(sparse_track: Trajectory, dense_track: Trajectory) -> TimeOff
         _refine_offset(sparse_track, dense_track, offset_s, SEARCH_HALF_WIDTH_S)
         for offset_s in candidate_offsets_s
     ]
-    accepted_fits = [
-        fit for fit in offset_fits if fit and fit.compute_misfit() <= MAX_RELATIVE_MISFIT
-    ]
+    accepted_fits = sorted(
+        (fit for fit in offset_fits if fit and fit.compute_misfit() <= MAX_RELATIVE_MISFIT),
+        key=_OffsetFit.compute_misfit,
+    )
     if not accepted_fits:
         return _make_unknown_offset(
             "at every time offset at which the speeds correlate, the positions do not match or too "
             "few poses overlap"
         )
-    best_fit = min(accepted_fits, key=_OffsetFit.compute_misfit)
+    best_fit = accepted_fits[0]
     max_misfit = MIN_SECOND_BEST_RESIDUAL_RATIO * best_fit.compute_misfit()
     fits_similar_to_best = [fit for fit in accepted_fits if fit.compute_misfit() <= max_misfit]
     if clock_offset_s is not None:
         # Of several equally good offsets, use the one nearest to the offset of the UNIX timestamps
         best_fit = min(fits_similar_to_best, key=lambda fit: abs(fit.offset_s - clock_offset_s))
     else:
-        for fit in sorted(fits_similar_to_best, key=_OffsetFit.compute_misfit):
+        for fit in fits_similar_to_best:
             offset_difference_s = abs(fit.offset_s - best_fit.offset_s)
             if offset_difference_s > MIN_CORRELATION_PEAK_DISTANCE_S:
                 return _make_unknown_offset(
@@ -158,8 +158,7 @@ def _search_offset(sparse_track: Trajectory, dense_track: Trajectory) -> TimeOff
         offset_s=best_fit.offset_s,
         interval_s=(best_fit.offset_s - half_width_s, best_fit.offset_s + half_width_s),
         is_determinable=True,
-        reason="The time offset is estimated from the correlation of speeds, and refined "
-        "to minimise the ATE "
+        reason="The time offset is estimated from correlated speeds, and minimises the ATE "
         f"({best_fit.compute_residual_rms_m():.3g} m, {len(best_fit.time_s)} poses).",
     )
 
@@ -331,13 +330,8 @@ def _compute_interval_half_width_s(
         float(likelihood_score[k:] @ likelihood_score[:-k]) for k in range(1, lag_count + 1)
     ]
     variance_if_uncorrelated = float(likelihood_score @ likelihood_score)
-    score_variance = max(
-        variance_if_uncorrelated + 2.0 * float(lag_weights @ lagged_products),
-        variance_if_uncorrelated,
-    )
-    student_t_quantile = float(
-        stdtrit(max(pose_count / lag_count - 1.0, 1.0), 0.5 + CONFIDENCE_LEVEL / 2.0)
-    )
+    score_variance = variance_if_uncorrelated + max(2.0 * float(lag_weights @ lagged_products), 0.0)
+    student_t_quantile = float(stdtrit(max(pose_count / lag_count - 1.0, 1.0), 0.975))
     return float(student_t_quantile * np.sqrt(score_variance) / dense_square_sum)
 
 

@@ -55,46 +55,39 @@ def gate_edges(graph: model.PoseGraph, edge_indices: Sequence[int] | IntArray) -
     if not len(tested_edge_indices):
         return []
     odometry_edges = model.find_odometry_edges(graph, tested_edge_indices)
-    first_nodes = graph.first_nodes[tested_edge_indices]
-    second_nodes = graph.second_nodes[tested_edge_indices]
-    first_pose_index = int(min(first_nodes.min(), second_nodes.min()))
-    connecting_edges = odometry_edges[
-        first_pose_index : int(max(first_nodes.max(), second_nodes.max()))
-    ]
+    nodes = np.stack(
+        [graph.first_nodes[tested_edge_indices], graph.second_nodes[tested_edge_indices]]
+    )
+    first_pose_index = int(nodes.min())
+    connecting_edges = odometry_edges[first_pose_index : int(nodes.max())]
     missing_edge_indices = np.flatnonzero(connecting_edges < 0)
     if len(missing_edge_indices):
         pose_index = first_pose_index + int(missing_edge_indices[0])
         raise TrajectoryError(
-            f"The closures cannot be tested, because no odometry edge connects vertices "
+            f"The closures cannot be tested: no odometry edge connects vertices "
             f"{graph.ids[pose_index]} and {graph.ids[pose_index + 1]}",
-            "Add an odometry edge between the two named vertices.",
+            "Add this edge.",
         )
     poses = lie.accumulate_poses(model.get_odometry_steps(graph, connecting_edges))
     # The covariances are sums in the axes of the first pose
     odometry_step_covariances = _propagate_covariances(
         lie.adjoint(poses[1:]), _compute_covariances(graph, connecting_edges)
     )
-    cumulative_covariance = np.concatenate(
-        [
-            np.zeros((1, *odometry_step_covariances.shape[1:])),
-            np.cumsum(odometry_step_covariances, axis=0),
-        ]
-    )
+    cumulative_covariance = np.insert(np.cumsum(odometry_step_covariances, axis=0), 0, 0.0, axis=0)
+    nodes -= first_pose_index
     odometry_chain_covariance = (
-        cumulative_covariance[np.maximum(first_nodes, second_nodes) - first_pose_index]
-        - cumulative_covariance[np.minimum(first_nodes, second_nodes) - first_pose_index]
+        cumulative_covariance[nodes.max(axis=0)] - cumulative_covariance[nodes.min(axis=0)]
     )
-    inverse_second_pose_adjoint = lie.adjoint(lie.inverse(poses[second_nodes - first_pose_index]))
-    covariance = _propagate_covariances(inverse_second_pose_adjoint, odometry_chain_covariance)
-    relative_poses = lie.relative_pose(
-        poses[first_nodes - first_pose_index], poses[second_nodes - first_pose_index]
+    first_poses, second_poses = poses[nodes]
+    covariance = _propagate_covariances(
+        lie.adjoint(lie.inverse(second_poses)), odometry_chain_covariance
     )
+    relative_poses = lie.relative_pose(first_poses, second_poses)
     residuals = lie.log(lie.relative_pose(graph.measurements[tested_edge_indices], relative_poses))
     covariance = _propagate_covariances(lie.right_jacobian_inverse(residuals), covariance)
-    edge_tests = zip(tested_edge_indices.tolist(), residuals, covariance, strict=True)
     return [
-        _test_edge(graph, edge_index, edge_residual, edge_covariance)
-        for edge_index, edge_residual, edge_covariance in edge_tests
+        _test_edge(graph, *edge_test)
+        for edge_test in zip(tested_edge_indices.tolist(), residuals, covariance, strict=True)
     ]
 
 
@@ -121,7 +114,7 @@ def _test_edge(
     ):
         raise TrajectoryError(
             f"The closure from vertex {vertices[0]} to {vertices[1]} cannot be tested: its "
-            "information matrix is zero, or differs by many orders of magnitude from the odometry",
+            "information matrix is zero, or its magnitude differs much from the odometry",
             "Give information matrices of similar magnitude.",
         )
     d2 = float(projected_residual @ np.linalg.solve(residual_covariance, projected_residual))

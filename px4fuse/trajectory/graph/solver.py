@@ -1,5 +1,6 @@
 """Pose graph optimisation by Levenberg-Marquardt, with robust rejection of false loop closures."""
 
+import sys
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
 
@@ -36,7 +37,6 @@ _MAX_DAMPING = 1e5
 _MIN_COST_DECREASE_RATIO = 1e-3
 # Relative and absolute tolerance of the cost of a pose graph
 _COST_TOLERANCE = 1e-10
-_FLOAT_EPSILON = float(np.finfo(float).eps)
 # Relative tolerance of the cost in intermediate stages of graduated non-convexity
 _GNC_STAGE_TOLERANCE = 1e-6
 _MAX_GNC_STAGE_ITERATIONS = 20
@@ -108,8 +108,7 @@ def solve(
     cost_initial = 0.5 * float(np.sum(start_residuals.chi2))
     if not np.isfinite(cost_initial):
         raise TrajectoryError(
-            "The cost of the pose graph is not finite: a pose or a measurement is too large, or "
-            "not finite",
+            "The cost of the pose graph is not finite: a pose or measurement is too large",
             "Correct the pose or measurement, or remove its line.",
         )
     weights = np.ones(len(can_be_false))
@@ -164,7 +163,7 @@ def _minimise(
                 cost_decrease = cost - float(np.sum(0.5 * weights * trial_residuals.chi2))
                 is_converged = abs(cost_decrease) < relative_cost_tolerance * cost
             is_accepted = (
-                predicted_decrease > _FLOAT_EPSILON * cost
+                predicted_decrease > sys.float_info.epsilon * cost
                 and cost_decrease > _MIN_COST_DECREASE_RATIO * predicted_decrease
             )
             if is_accepted or is_converged or damping >= _MAX_DAMPING:
@@ -189,15 +188,13 @@ def _solve_gnc(
     can_be_false: BoolArray,
 ) -> tuple[_Optimum, Array]:
     """Reject false closures by graduated non-convexity; return the optimum and the edge weights."""
-    degrees_of_freedom = model.count_observed_directions(graph.information)
-    chi2_bound = np.full(len(can_be_false), np.inf)
-    cost_if_dropped = np.zeros(len(can_be_false))
-    is_testable = can_be_false & (degrees_of_freedom > 0)
-    half_degrees_of_freedom = degrees_of_freedom[is_testable] / 2.0
-    chi2_bound[is_testable] = 2.0 * gammaincinv(half_degrees_of_freedom, GNC_INLIER_PROBABILITY)
-    cost_if_dropped[is_testable] = 2.0 * gammaincinv(
-        half_degrees_of_freedom, KEPT_CLOSURE_PROBABILITY
+    half_degrees_of_freedom = model.count_observed_directions(graph.information) / 2.0
+    chi2_bound = np.where(
+        can_be_false & (half_degrees_of_freedom > 0.0),
+        2.0 * gammaincinv(half_degrees_of_freedom, GNC_INLIER_PROBABILITY),
+        np.inf,
     )
+    cost_if_dropped = 2.0 * gammaincinv(half_degrees_of_freedom, KEPT_CLOSURE_PROBABILITY)
 
     def compute_truncated_cost(residuals: Residuals, edge_weights: Array) -> float:
         return 0.5 * float(np.sum(np.where(edge_weights > 0.0, residuals.chi2, cost_if_dropped)))
@@ -217,12 +214,9 @@ def _solve_gnc(
         trial_weights[edge_index] = 1.0
         optimum_with_closure = _minimise(graph, optimum.residuals, trial_weights)
         iteration_count += optimum_with_closure.iterations
-        if (
-            cost := compute_truncated_cost(optimum_with_closure.residuals, trial_weights)
-        ) < lowest_cost:
-            lowest_cost = cost
-            optimum = optimum_with_closure
-            weights = trial_weights
+        cost = compute_truncated_cost(optimum_with_closure.residuals, trial_weights)
+        if cost < lowest_cost:
+            lowest_cost, optimum, weights = cost, optimum_with_closure, trial_weights
     model.require_connected(graph, weights > 0.0, "the edges that remain after robust optimisation")
     return _Optimum(optimum.residuals, iteration_count, optimum.converged), weights
 
@@ -250,7 +244,7 @@ def _run_gnc(
                 graph, residuals, weights, _GNC_STAGE_TOLERANCE, _MAX_GNC_STAGE_ITERATIONS
             )
             residuals = stage_optimum.residuals
-            iteration_count = iteration_count + stage_optimum.iterations
+            iteration_count += stage_optimum.iterations
             if np.all((weights < 1e-6) | (weights > 1.0 - 1e-6)):
                 break
             control_parameter *= _GNC_CONTROL_FACTOR
@@ -258,7 +252,7 @@ def _run_gnc(
     for _ in range(_MAX_REWEIGHTING_ROUNDS):
         reweighted_optimum = _minimise(graph, residuals, weights)
         residuals = reweighted_optimum.residuals
-        iteration_count = iteration_count + reweighted_optimum.iterations
+        iteration_count += reweighted_optimum.iterations
         # each round decreases the truncated cost, so the loop ends
         new_weights = (residuals.chi2 <= chi2_bound).astype(float)
         if np.array_equal(new_weights, weights):
@@ -316,7 +310,7 @@ def analyse_graph(
     TrajectoryError
         The graph is not connected.
     """
-    is_closure = ~graph.find_successive_edges()
+    closure_edges = np.flatnonzero(~graph.find_successive_edges())
     progress(f"optimising: {SOLUTION_LABELS['all']}")
     solutions = {"all": solve(graph)}
     degrees_of_freedom = int(model.count_observed_directions(graph.information).sum())
@@ -330,7 +324,7 @@ def analyse_graph(
     scaled_graph, information_factor = graph, 1.0
     closure_tests: tuple[GateResult, ...] | Unavailable
     try:
-        closure_tests = tuple(gate_edges(graph, np.flatnonzero(is_closure)))
+        closure_tests = tuple(gate_edges(graph, closure_edges))
         if (
             reduced_chi2 > reduced_chi2_interval[1]
             and len(closure_tests) >= MIN_CLOSURES_FOR_SCALE_FACTOR
@@ -339,19 +333,16 @@ def analyse_graph(
             if factor >= MIN_INFORMATION_SCALE_FACTOR:
                 information_factor = factor
                 scaled_graph = replace(graph, information=graph.information / factor)
-                closure_tests = tuple(gate_edges(scaled_graph, np.flatnonzero(is_closure)))
+                closure_tests = tuple(gate_edges(scaled_graph, closure_edges))
     except TrajectoryError as error:
         closure_tests = Unavailable(
             "gate", str(error), "Give an odometry edge between all successive vertices."
         )
-    closure_count = int(np.count_nonzero(is_closure))
-    if closure_count > 1 and (
-        closure_count <= MAX_GNC_CLOSURES
-        if use_robust_optimisation is None
-        else use_robust_optimisation
-    ):
+    if use_robust_optimisation is None:
+        use_robust_optimisation = len(closure_edges) <= MAX_GNC_CLOSURES
+    if use_robust_optimisation and len(closure_edges) > 1:
         progress(f"optimising: {ROBUST_SOLUTION_LABEL}")
-        solutions["gnc"] = solve(scaled_graph, robust=True, is_closure=is_closure)
+        solutions["gnc"] = solve(scaled_graph, robust=True)
     results = Graph(
         name=name,
         dimension=graph.dimension,
