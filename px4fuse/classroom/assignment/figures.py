@@ -5,8 +5,8 @@ from io import BytesIO
 
 import pandas as pd
 
+from px4fuse.classroom.assignment.key import compare_simulation
 from px4fuse.classroom.assignment.random_assignment import draw_scenario_numbers
-from px4fuse.classroom.assignment.truth import compare_simulation
 from px4fuse.comparison.comparison import compute_position_errors
 from px4fuse.comparison.model import FILTER_NAMES, AxisComparison, Comparison, FilterName
 from px4fuse.core.record import Record, read_toml

@@ -4,8 +4,7 @@ import textwrap
 from collections.abc import Iterator, Sequence
 from itertools import zip_longest
 
-from px4fuse.classroom.assignment.key import AnswerKey
-from px4fuse.classroom.assignment.truth import CorrectFormAnswers
+from px4fuse.classroom.assignment.key import AnswerKey, CorrectFormAnswers
 from px4fuse.classroom.grading.form_points import describe_right_answer, find_panels_showing_fault
 from px4fuse.classroom.grading.model import Grade
 from px4fuse.core.text import one_line
