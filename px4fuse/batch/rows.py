@@ -54,16 +54,12 @@ def make_axis_rows(results: ComparisonResults) -> list[Row]:
         unavailable_filter = next(
             (summary for summary in axis.filters.values() if isinstance(summary, Unavailable)), None
         )
-        row = common_values | {
-            "axis": name,
-            "status": STATUS_NOT_COMPARED
-            if isinstance(axis.filters["kf"], Unavailable)
-            else STATUS_DONE,
-            "reason": f"{unavailable_filter.what}: {unavailable_filter.reason}"
-            if unavailable_filter
-            else "",
-            "remedy": unavailable_filter.remedy if unavailable_filter else "",
-        }
+        row = common_values | {"axis": name, "status": STATUS_DONE}
+        if isinstance(axis.filters["kf"], Unavailable):
+            row["status"] = STATUS_NOT_COMPARED
+        if unavailable_filter:
+            row["reason"] = f"{unavailable_filter.what}: {unavailable_filter.reason}"
+            row["remedy"] = unavailable_filter.remedy
         records = {
             "axis": axis,
             # north and east have one noise estimate together
@@ -143,11 +139,12 @@ def replace_name_by_path(row: Row, path: str) -> Row:
 
 
 def collect_log_values(log: Log) -> Row:
-    start_utc, record = format_utc_time(log.start_unix_s), {"log": log}
-    path_by_column = {
-        name: path for name, path in RESULT_PATH_BY_COLUMN.items() if path.startswith("log.")
-    }
-    return {name: find_value(record, path) for name, path in path_by_column.items()} | {
+    start_utc = format_utc_time(log.start_unix_s)
+    return {
+        name: find_value({"log": log}, path)
+        for name, path in RESULT_PATH_BY_COLUMN.items()
+        if path.startswith("log.")
+    } | {
         "airframe": f"{airframe:g}" if (airframe := log.parameters.get("SYS_AUTOSTART")) else "",
         "date": f"{start_utc[:19]}Z" if start_utc else "",
     }

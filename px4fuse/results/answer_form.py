@@ -32,14 +32,14 @@ EMPTY_CELL = "\u2013"
 class AllowedAnswers(Record):
     """Allowed answers to the questions of the answer form (``form.toml``)."""
 
-    behaviours: tuple[str, ...]
-    report_panels: tuple[str, ...]
+    behaviours: str
+    report_panels: str
     units: dict[str, dict[str, float]]
 
 
 _ALLOWED_ANSWERS = read_toml(__file__, AllowedAnswers, "form.toml")
-EKF2_BEHAVIOURS = _ALLOWED_ANSWERS.behaviours
-REPORT_PANELS = _ALLOWED_ANSWERS.report_panels
+EKF2_BEHAVIOURS = _ALLOWED_ANSWERS.behaviours.splitlines()
+REPORT_PANELS = _ALLOWED_ANSWERS.report_panels.splitlines()
 
 
 def _find_units(quantity: str) -> Mapping[str, float]:
@@ -304,12 +304,15 @@ def _describe_error(error: Exception, form_toml: str, form_values: dict[str, Any
     invalid_value: Any = form_values
     for name in names:
         invalid_value = invalid_value[int(name) if name.isdigit() else name]
-    label = names[0]
-    if len(names) > 1:
-        number = int(names[1]) + 1
-        if isinstance(invalid_value, dict):
-            return f"mistake {number}: {reason}"
-        label = f"{names[-1]} of mistake {number}" if label == "mistakes" else f"{label[0]}{number}"
+    field_name, *indices_and_names = names
+    number = int(indices_and_names[0]) + 1 if indices_and_names else 0
+    if number and isinstance(invalid_value, dict):
+        return f"mistake {number}: {reason}"
+    label = {
+        "mistakes": f"{names[-1]} of mistake {number}",
+        "quantities": f"q{number}",
+        "choices": f"c{number}",
+    }.get(field_name, field_name)
     accepted_values = ACCEPTED_ANSWER_BY_FIELD.get(names[0]) or ACCEPTED_ANSWER_BY_FIELD.get(
         names[-1], NUMBER_HELP
     )

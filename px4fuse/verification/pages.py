@@ -73,16 +73,9 @@ _TOKEN_PATTERN = re.compile(
 )
 _NUMBER_PATTERN = re.compile(r"[+-]?(?:\d+\.?\d*|\.\d+)")
 _ESCAPE_PATTERN = re.compile(r"\\([0-7]{1,3}|\r\n?|.)|\r\n?", re.DOTALL)
-_ESCAPED_CHARACTERS = {
-    "n": "\n",
-    "r": "\r",
-    "t": "\t",
-    "b": "\b",
-    "f": "\f",
-    "\n": "",
-    "\r": "",
-    "\r\n": "",
-}
+_ESCAPED_CHARACTERS = dict.fromkeys(("\n", "\r", "\r\n"), "") | dict(
+    zip("nrtbf", "\n\r\t\b\f", strict=True)
+)
 # PDF drawing operators with coordinates: index of the first operand that is a coordinate
 _FIRST_COORDINATE_INDEX = {"m": 0, "l": 0, "c": 0, "v": 0, "y": 0, "re": 0, "cm": 4, "Tm": 4}
 _TEXT_OPERATORS = frozenset(("Tj", "TJ"))

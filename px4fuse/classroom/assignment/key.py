@@ -52,18 +52,13 @@ MIN_RESET_M = 0.2
 # Time (s) at the start in which position resets are ignored: EKF2 resets to its first position
 INITIAL_TIME_WITHOUT_RESETS_S = 5.0
 # Faults for which a student must ("required") or may ("allowed") report a behaviour of EKF2
-EKF2_BEHAVIOUR_RULES = read_toml(__file__, dict[str, dict[str, set[str]]], "did.toml")
+EKF2_BEHAVIOUR_RULES = read_toml(__file__, dict[str, dict[str, str]], "did.toml")
 # Maximum size (bytes) of an answer key: the key of 1000 students has 2 million bytes
 MAX_KEY_BYTES = 20_000_000
 ANSWER_KEY_NOTE = (
     "For the instructor only: this file lists the injected faults of every student's flight. Do "
     "not hand it out."
 )
-_Text = Annotated[str, Meta(max_length=1000)]
-_Number = Annotated[float, Meta(gt=-1e12, lt=1e12)]
-_ShortTexts = Annotated[
-    tuple[Annotated[str, Meta(min_length=1, max_length=200)], ...], Meta(max_length=20)
-]
 
 
 class InjectedFault(Record):
@@ -149,14 +144,14 @@ class CorrectAnswers(
         Smallest size that px4fuse detects, divided by the size of the injected fault.
     """
 
-    student_id: Annotated[str, Meta(max_length=1000, pattern=r"\S")]
-    name: _Text
-    file: _Text
+    student_id: Annotated[str, Meta(pattern=r"\S")]
+    name: Annotated[str, Meta(max_length=1000)]
+    file: str
     sha256: Sha256
     scenario: dict[str, str | int | float | bool | None] = {}
-    mistakes: _ShortTexts = ()
-    true_values: dict[str, _Number] = {}
-    difficulty: _Number | None = None
+    mistakes: Annotated[tuple[str, ...], Meta(max_length=20)] = ()
+    true_values: dict[str, float] = {}
+    difficulty: float | None = None
     form: CorrectFormAnswers | None = None
 
 
@@ -172,11 +167,11 @@ class AnswerKey(msgspec.Struct, frozen=True):
     numbers.
     """
 
-    kind: _Text
+    kind: str
     answers: Annotated[tuple[CorrectAnswers, ...], Meta(min_length=1, max_length=MAX_STUDENTS)] = (
         msgspec.field(name="students")
     )
-    secret: _Text = ""
+    secret: str = ""
     schema: _AnswerKeySchema = _AnswerKeySchema()
     note: str = ANSWER_KEY_NOTE
 
@@ -306,7 +301,7 @@ def _find_ekf2_behaviours(
         [
             behaviour
             for behaviour, kinds in EKF2_BEHAVIOUR_RULES[rule].items()
-            if kinds & size_by_kind.keys()
+            if not size_by_kind.keys().isdisjoint(kinds.split())
         ]
         for rule in ("required", "allowed")
     )

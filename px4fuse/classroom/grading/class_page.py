@@ -8,7 +8,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from px4fuse.classroom.assignment.sheet import format_cell_number
+from px4fuse.classroom.assignment.roster import format_cell_number
 from px4fuse.classroom.grading.model import (
     TOTAL_TITLE,
     Grade,

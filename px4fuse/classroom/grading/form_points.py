@@ -72,7 +72,7 @@ class CorrectionRule(Record):
 
 CORRECTION_RULES = read_csv(__file__, CorrectionRule, "corrections.csv")
 POINTS_CONFIG = read_toml(__file__, dict)
-SIMILAR_FAULT_GROUPS = [set(group) for group in POINTS_CONFIG["neighbours"].values()]
+SIMILAR_FAULT_GROUPS = [set(kinds.split()) for kinds in POINTS_CONFIG["neighbours"].values()]
 FORM_PART_NAMES = tuple(POINTS_CONFIG["weights"])
 
 
@@ -111,7 +111,7 @@ def compute_form_points(answers: Answers, right_answers: CorrectFormAnswers) -> 
     if not scores["numbers"] and not is_recognised_as_fault_free:
         # verdicts can be guessed, so they give half of the points without a right number
         scores["verdicts"] *= 0.5
-    points = {name: weights[name] * score for name, score in scores.items()}
+    points = {name: max_points * scores[name] for name, max_points in weights.items()}
     if is_recognised_as_fault_free:
         points["mistakes"] = weights["mistakes"]
     elif right_answers.mistakes and all(fault.size is None for fault in right_answers.mistakes):
@@ -132,9 +132,7 @@ def compute_form_points(answers: Answers, right_answers: CorrectFormAnswers) -> 
         *_describe_wrong_answers(answers, right_answers),
     )
     parts = tuple(
-        ItemScore(name, points[name], max_points, "")
-        for name, max_points in weights.items()
-        if max_points
+        ItemScore(name, points[name], max_points, "") for name, max_points in weights.items()
     )
     return FormPoints(
         parts, feedback, {fault.kind: fault.kind in named_kinds for fault in right_answers.mistakes}
@@ -241,9 +239,8 @@ def score_fault_kind(kind: str, named_kind: str) -> float:
         return SCORE_FOR_WRONG_NOISE_PARAMETER
     if any({kind, named_kind} <= group for group in SIMILAR_FAULT_GROUPS):
         return SCORE_FOR_SIMILAR_FAULT
-    return (
-        SCORE_FOR_NAMED_CONSEQUENCE if named_kind in POINTS_CONFIG["effects"].get(kind, ()) else 0.0
-    )
+    is_consequence = named_kind in POINTS_CONFIG["effects"].get(kind, "").split()
+    return SCORE_FOR_NAMED_CONSEQUENCE if is_consequence else 0.0
 
 
 def _score_faults(matches: list[FaultMatch], right_answers: CorrectFormAnswers) -> dict[str, float]:
@@ -301,7 +298,7 @@ def score_evidence(fault: InjectedFault, named_fault: NamedFault) -> float:
 
 def find_panels_showing_fault(fault_kind: str) -> list[str]:
     return [
-        *(panel for panel, kinds in POINTS_CONFIG["shows"].items() if fault_kind in kinds),
+        *(panel for panel, kinds in POINTS_CONFIG["shows"].items() if fault_kind in kinds.split()),
         "cover",
     ]
 

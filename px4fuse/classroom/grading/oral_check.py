@@ -40,7 +40,7 @@ def ask_about_form(
         if kind not in (*true_kinds, NO_FAULT_KIND):
             yield (
                 f"You named {kind} ({FAULT_KINDS[kind].description}). Which plot would show this "
-                "fault? Does this plot in your report show the fault?",
+                "fault? Does your report show the fault in this plot?",
                 f"{kind} would be visible in {' or '.join(find_panels_showing_fault(kind))}. "
                 f"Injected fault of the flight: {', '.join(true_kinds) or 'no fault'}.",
             )

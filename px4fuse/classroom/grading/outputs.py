@@ -20,12 +20,15 @@ from pathlib import Path
 
 from px4fuse.classroom.assignment.roster import (
     ClassList,
+    Sheet,
+    format_cell_number,
     make_file_names,
     make_unique,
     normalise_text,
+    parse_decimal,
+    read_sheet,
     read_student,
 )
-from px4fuse.classroom.assignment.sheet import Sheet, format_cell_number, parse_decimal, read_sheet
 from px4fuse.classroom.grading.checks import shorten_text
 from px4fuse.classroom.grading.class_page import format_class_page
 from px4fuse.classroom.grading.entries import OVERRIDES_NAME, OVERRIDES_TEMPLATE, Course
