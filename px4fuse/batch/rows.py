@@ -70,7 +70,7 @@ def make_axis_rows(results: ComparisonResults) -> list[Row]:
             "provenance": results.provenance,
         }
         values = {name: find_value(records, path) for name, path in RESULT_PATH_BY_COLUMN.items()}
-        rows.append(values | row)
+        rows.append(clean_row(values | row))
     return rows
 
 
