@@ -12,7 +12,6 @@ from pathlib import Path
 from conftest import REPORT, blank_page
 
 from px4fuse.classroom.grading import grade as grading
-from px4fuse.classroom.grading import records
 from px4fuse.classroom.grading.model import Grade, GradedReport, ItemScore
 from px4fuse.core import workers
 from px4fuse.verification.model import Verification
@@ -41,9 +40,9 @@ def skip_verification(monkeypatch) -> list[str]:
         verified_ids.append(results.student.id)
         return VERIFIED if log_sha256(results) in logs else verify(results, pdf, logs)
 
-    monkeypatch.setattr(records, "verify", verify_by_log)
+    monkeypatch.setattr(grading, "verify", verify_by_log)
     monkeypatch.setattr(
-        records, "repeat_analysis_with_diagnosis", lambda results, _: (results, b"")
+        grading, "repeat_analysis_with_diagnosis", lambda results, _: (results, b"")
     )
     in_this_process(monkeypatch)
     return verified_ids

@@ -9,7 +9,7 @@ from px4fuse.core.record import Unavailable
 from px4fuse.loop.model import Closure, Loop, OdometryNoise, PathResult, TrueFinalPose
 from px4fuse.request import LoopRequest
 from px4fuse.results.contract import LoopResults, Results, to_json_dict
-from px4fuse.results.model import Student, provenance, schema_of
+from px4fuse.results.model import SCHEMA_VERSION, Schema, Student, provenance
 from px4fuse.results.reading import read_results
 from px4fuse.trajectory.alignment import Transform
 from px4fuse.trajectory.association import Association
@@ -45,7 +45,7 @@ def correction(rmse: float, moved_m: float) -> PathResult:
 
 LOOP = to_json_dict(
     LoopResults(
-        schema=schema_of("px4fuse-loop"),
+        schema=Schema("px4fuse-loop", SCHEMA_VERSION),
         request=LoopRequest(source="loop.ulg:vio"),
         track=Track("loop.ulg:vio", SHA256, 9, "vio", "NED", 9, 1.0, 95.0, True, ()),
         references=(),

@@ -11,7 +11,7 @@ from comparisons import compare
 from flights import aisle_flight
 from pypdf import PdfReader
 
-from px4fuse.classroom.assignment.truth import compute_numeric_answer
+from px4fuse.classroom.assignment.key import compute_numeric_answer
 from px4fuse.errors import SettingsError
 from px4fuse.filter.kalman import run_kf
 from px4fuse.filter.settings import Settings

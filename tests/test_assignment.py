@@ -23,8 +23,8 @@ from px4fuse.classroom.assignment.assignment import (
 )
 from px4fuse.classroom.assignment.key import AnswerKey, format_answer_key, read_answer_key
 from px4fuse.classroom.assignment.random_assignment import (
+    ASSIGNABLE_FAULTS,
     EASIEST_DIFFICULTY,
-    FLIGHT_RULES_BY_KIND,
     HARD_FAULTS_PROBABILITY,
     HARDEST_DIFFICULTY,
     LOOP_PROBABILITY,
@@ -55,7 +55,7 @@ FINDINGS = {
     "ekf2-gate": "ekf2_rejects_positions", "ekf2-delay": "ekf2_ev_delay_wrong",
     "ekf2-off": "ekf2_not_fusing", "open-end": "false_loop_closure",
 }  # fmt: skip
-CHOICE = {choice.name: choice for rules in FLIGHT_RULES_BY_KIND.values() for choice in rules.faults}
+CHOICE = {choice.name: choice for choice in ASSIGNABLE_FAULTS}
 
 
 def choices_of(drawn):
@@ -127,7 +127,7 @@ class TestDraw:
             found = sum(len(one.mistake_options) == count for one in flights) / 1000
             assert found == pytest.approx(share, abs=0.05)
         names = {choice.name for one in flights for choice in choices_of(one)}
-        assert names == {choice.name for choice in FLIGHT_RULES_BY_KIND[kind].faults}
+        assert names == {choice.name for choice in ASSIGNABLE_FAULTS if choice.flight_kind == kind}
 
     def test_mixed_assignment_contains_straight_and_loop_flights(self):
         mixed = [assign_random_flight(SECRET, f"s{n}", "mixed") for n in range(1000)]
@@ -148,20 +148,22 @@ class TestDraw:
             parse_faults(drawn.mistake_options)
             ratios = [EASIEST_DIFFICULTY]
             for choice, text in zip(choices_of(drawn), drawn.mistake_options, strict=True):
-                if choice.detection_limit is None:
+                if not choice.detection_limit:
                     assert text == choice.name
                     continue
                 size = float(re.search(r"=([-+]?[\d.]+)", text)[1])
                 signs[choice.name, size > 0] += 1
                 ratio = choice.detection_limit / abs(size)
                 ratios.append(1.0 / ratio if choice.is_smaller_size_easier_to_detect else ratio)
-                if choice.fault_start_range_s is not None:
+                if choice.latest_start_s:
                     at = float(text.rpartition(",")[2].removesuffix("s"))
-                    assert choice.fault_start_range_s[0] <= at <= choice.fault_start_range_s[1]
+                    assert choice.earliest_start_s <= at <= choice.latest_start_s
             assert drawn.difficulty == pytest.approx(max(ratios), abs=0.011)
             assert EASIEST_DIFFICULTY <= drawn.difficulty <= MAX_FAULT_DIFFICULTY
         both = {
-            choice.name for choice in FLIGHT_RULES_BY_KIND["aisle"].faults if choice.has_either_sign
+            choice.name
+            for choice in ASSIGNABLE_FAULTS
+            if choice.flight_kind == "aisle" and choice.has_either_sign
         }
         assert {name for name, positive in signs if not positive} == both
 
@@ -169,15 +171,13 @@ class TestDraw:
         """From the limit on, 95 % of the flights of tests/studies/rates.csv have the finding."""
         table = rates()
         table = table[~table.condition.str.contains("outdoor")]
-        for choice in (
-            choice for rules in FLIGHT_RULES_BY_KIND.values() for choice in rules.faults
-        ):
+        for choice in (choice for choice in ASSIGNABLE_FAULTS):
             plain = re.compile(rf"--mistake {choice.name}(=([\d.]+)\D*)?$")
             rows = table[(table.finding == FINDINGS[choice.name]) & (table.flights >= 10)]
             matches = ((plain.search(row.condition), row) for row in rows.itertuples())
             sizes = {float(match[2] or 0.0): row for match, row in matches if match}
             found = {size: row for size, row in sizes.items() if row.rate >= 0.95}
-            if choice.detection_limit is None:
+            if not choice.detection_limit:
                 assert list(found) == [0.0]
                 continue
             assert choice.detection_limit == (

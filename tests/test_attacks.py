@@ -28,8 +28,7 @@ from forgery import (
 )
 from results_tools import LOOP, changed_results, decode_results
 
-from px4fuse.classroom.assignment.key import AnswerKey, CorrectAnswers
-from px4fuse.classroom.assignment.truth import compute_form_answers
+from px4fuse.classroom.assignment.key import AnswerKey, CorrectAnswers, compute_form_answers
 from px4fuse.classroom.grading.model import GradedReport
 from px4fuse.classroom.grading.rubric import (
     Rubric,

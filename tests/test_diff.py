@@ -8,12 +8,13 @@ from detector_rates import RIGHT
 from exchange import replace
 from msgspec import structs
 
-from px4fuse.batch.changes import compare_numbers, list_changes
-from px4fuse.batch.inputs import InputResults
-from px4fuse.batch.measures import (
+from px4fuse.batch.changes import (
     COMPARED_NUMBER_DEFINITIONS,
     ComparedNumber,
+    InputResults,
     collect_compared_numbers,
+    compare_numbers,
+    list_changes,
 )
 from px4fuse.diagnose import diagnose_comparison
 from px4fuse.ekf2.aids import AidAxisStatistics, AidResult

@@ -15,9 +15,9 @@ from exchange import replace
 from form_guesses import SHA256, right
 from test_form_points import CLEAN, GAP, RIGHT, TRUTH
 
-from px4fuse.classroom.assignment.truth import CorrectFormAnswers, CorrectVerdict, InjectedFault
-from px4fuse.classroom.grading.flags import flag_equal_contents
+from px4fuse.classroom.assignment.key import CorrectFormAnswers, CorrectVerdict, InjectedFault
 from px4fuse.classroom.grading.form_points import compute_form_points
+from px4fuse.classroom.grading.rubric import flag_equal_contents
 from px4fuse.errors import SettingsError
 from px4fuse.results.answer_form import (
     FAULT_KINDS,

@@ -14,13 +14,13 @@ from exchange import replace
 from form_guesses import at_random, constants
 from scipy.stats import spearmanr
 
-from px4fuse.classroom.assignment.random_assignment import assign_random_flight
-from px4fuse.classroom.assignment.truth import (
+from px4fuse.classroom.assignment.key import (
     CorrectFormAnswers,
     CorrectVerdict,
     InjectedFault,
     compute_form_answers,
 )
+from px4fuse.classroom.assignment.random_assignment import assign_random_flight
 from px4fuse.classroom.grading.form_points import (
     FORM_PART_NAMES,
     POINTS_CONFIG,

@@ -8,9 +8,14 @@ import numpy as np
 import pytest
 from class_tools import grade, graded_report
 
-from px4fuse.classroom.assignment.key import AnswerKey, CorrectAnswers
-from px4fuse.classroom.assignment.truth import CorrectFormAnswers, CorrectVerdict, InjectedFault
-from px4fuse.classroom.grading.item_analysis import analyse_items
+from px4fuse.classroom.assignment.key import (
+    AnswerKey,
+    CorrectAnswers,
+    CorrectFormAnswers,
+    CorrectVerdict,
+    InjectedFault,
+)
+from px4fuse.classroom.grading.class_page import analyse_items
 from px4fuse.classroom.grading.model import ItemScore
 from px4fuse.classroom.grading.oral_check import ask_about_form, format_questions
 from px4fuse.results.answer_form import Answers, Choice, NamedFault

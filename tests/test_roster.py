@@ -9,8 +9,14 @@ from pathlib import Path
 import pytest
 from class_tools import grade
 
-from px4fuse.classroom.assignment.roster import ClassList, Person, read_people, read_roster
-from px4fuse.classroom.assignment.sheet import Sheet, read_sheet
+from px4fuse.classroom.assignment.roster import (
+    ClassList,
+    Person,
+    Sheet,
+    read_people,
+    read_roster,
+    read_sheet,
+)
 from px4fuse.classroom.grading.model import ExportOrigin
 from px4fuse.classroom.grading.outputs import fill_grades, find_grade_column
 from px4fuse.errors import SettingsError

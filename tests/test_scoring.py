@@ -17,12 +17,22 @@ from results_tools import (
     finding,
 )
 
-from px4fuse.classroom.assignment.key import AnswerKey, CorrectAnswers
-from px4fuse.classroom.assignment.truth import CorrectFormAnswers, CorrectVerdict, InjectedFault
-from px4fuse.classroom.grading.flags import flag_equal_contents, flag_settings
+from px4fuse.classroom.assignment.key import (
+    AnswerKey,
+    CorrectAnswers,
+    CorrectFormAnswers,
+    CorrectVerdict,
+    InjectedFault,
+)
 from px4fuse.classroom.grading.model import Grade, GradedReport
 from px4fuse.classroom.grading.outputs import feedback_text
-from px4fuse.classroom.grading.rubric import parse_rubric, read_rubric, score_report
+from px4fuse.classroom.grading.rubric import (
+    flag_equal_contents,
+    flag_settings,
+    parse_rubric,
+    read_rubric,
+    score_report,
+)
 from px4fuse.errors import ResultsError
 from px4fuse.findings.model import FINDING_TITLES
 from px4fuse.results.answer_form import Answers, NamedFault

@@ -14,8 +14,7 @@ from class_tools import make_report, skip_verification, write_zip
 from golden_tools import assert_matches_golden
 
 from px4fuse.classroom.assignment.key import AnswerKey, CorrectAnswers
-from px4fuse.classroom.assignment.roster import read_people
-from px4fuse.classroom.assignment.sheet import read_sheet
+from px4fuse.classroom.assignment.roster import read_people, read_sheet
 from px4fuse.classroom.grading.entries import Course, parse_due_time, parse_late_rule
 from px4fuse.classroom.grading.grade import GradeOutcome, grade
 from px4fuse.classroom.grading.model import Grade

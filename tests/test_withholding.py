@@ -17,7 +17,7 @@ from px4fuse.classroom.grading.form_points import (
     FLIGHT_QUESTIONS_POINTS_FRACTION,
     compute_form_points,
 )
-from px4fuse.classroom.grading.records import load_or_verify
+from px4fuse.classroom.grading.grade import load_or_verify
 from px4fuse.classroom.grading.rubric import read_rubric, score_report
 from px4fuse.core.reading import hash_files
 from px4fuse.flight.model import DIAGNOSIS_WITHHELD

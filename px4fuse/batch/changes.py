@@ -1,24 +1,64 @@
-"""Differences in settings, numbers and findings between two results (``px4fuse diff``)."""
+"""Differences in settings, numbers and findings between two results (``px4fuse diff``).
+
+``measures.csv`` lists the compared numbers: path in the results, label and unit. ``*`` in a path is
+any key.
+"""
 
 import math
 import shlex
-from collections.abc import Iterable, Iterator, Mapping
+from collections.abc import Callable, Iterable, Iterator, Mapping
+from dataclasses import dataclass
 from pathlib import Path
+from typing import Literal
 
-from px4fuse.batch.inputs import InputResults, ProgressCallback, Results, read_diff_inputs
-from px4fuse.batch.measures import (
-    MAX_OMITTED_DIFFERENCE,
-    MAX_OMITTED_RELATIVE_DIFFERENCE,
-    ComparedNumber,
-    collect_compared_numbers,
-)
+from msgspec.structs import replace
+
 from px4fuse.batch.rows import find_value
 from px4fuse.comparison.model import FILTER_NAMES, FilterSummary
 from px4fuse.comparison.reruns import is_inconsistent
+from px4fuse.core.reading import display_name, hash_files, read_bytes_limited, read_head
+from px4fuse.core.record import read_csv
 from px4fuse.core.text import format_factor, format_number
+from px4fuse.diagnose import diagnose_or_check_aids
+from px4fuse.errors import LogError, ResultsError
+from px4fuse.filter.frame_rotation import HeadingError
 from px4fuse.filter.settings import SETTING_RANGES, Settings
-from px4fuse.results import contract
-from px4fuse.results.model import provenance, schema_of
+from px4fuse.filter.signals import AISLE
+from px4fuse.filter.time_offset import SourceTimeOffset
+from px4fuse.flight.ekf2_parameters import AIDS
+from px4fuse.request import ComparisonRequest
+from px4fuse.results.build import make_comparison_or_aids_results, make_results
+from px4fuse.results.contract import (
+    AidsResults,
+    ChangeResults,
+    ComparisonResults,
+    ConfidenceInterval,
+    DiffInput,
+    DiffInputName,
+    NumberChange,
+    SettingChange,
+    UnsharedFinding,
+    to_json,
+)
+from px4fuse.results.reading import MAX_RESULTS_BYTES, read_results
+from px4fuse.verification.pdf_input import MAX_PDF_BYTES, read_attached_results
+
+ProgressCallback = Callable[[str], None]
+Results = ComparisonResults | AidsResults
+# Rows of measures.csv; "interval" is the field in the results that contains the 95 % interval
+COMPARED_NUMBER_DEFINITIONS = [
+    row
+    | {
+        "path": row["path"].replace("KF_OR_EKF2", name),
+        "label": row["label"].replace("KF_OR_EKF2", label),
+    }
+    for row in read_csv(__file__, dict[str, str], "measures.csv")
+    for name, label in (FILTER_NAMES.items() if "KF_OR_EKF2" in row["path"] else [("", "")])
+]
+# Maximum relative difference of two numbers that px4fuse diff does not list
+MAX_OMITTED_RELATIVE_DIFFERENCE = 0.01
+# Maximum difference of two numbers (in their unit) that px4fuse diff does not list
+MAX_OMITTED_DIFFERENCE = 0.001
 
 # Maximum √(mean NEES) of a consistent filter; wide, because errors in a flight are correlated
 MAX_SQRT_MEAN_NEES = 2.0
@@ -36,11 +76,34 @@ SETTING_PATHS_BY_LABEL = {
     "hardware": "log.hardware",
     "px4fuse": "provenance.px4fuse",
 }
+# Settings that are copied from the other input if A and B are different logs
+_FILTER_SETTINGS = {*Settings.__dataclass_fields__, "axes"}
+# Settings that name input files. They are not copied if A and B are the same log
+_INPUT_FILE_SETTINGS = {"log", "system", "position"}
+
+
+@dataclass(frozen=True)
+class InputResults:
+    """Results of one of the two inputs of ``px4fuse diff``."""
+
+    file_name: str
+    kind: Literal["log", "report", "results"]
+    results: Results
+
+
+@dataclass(frozen=True)
+class ComparedNumber:
+    """Number that ``px4fuse diff`` compares, with its 95 % interval if it is an estimate."""
+
+    label: str
+    unit: str
+    value: float
+    interval: ConfidenceInterval | None = None
 
 
 def diff(
     a: str | Path, b: str | Path, *, progress: ProgressCallback = lambda _: None
-) -> contract.ChangeResults:
+) -> ChangeResults:
     """List the settings, numbers and findings that differ between A and B.
 
     Parameters
@@ -56,33 +119,80 @@ def diff(
     LogError, MissingDataError, ResultsError
         A file cannot be read or compared, or A and B are the same file.
     """
-    return list_changes(*read_diff_inputs(Path(a), Path(b), progress))
-
-
-def list_changes(input_a: InputResults, input_b: InputResults) -> contract.ChangeResults:
-    """List the settings, numbers and findings that differ between the results of A and B."""
-    findings = tuple(_list_finding_changes(input_a.results, input_b.results))
-    return contract.ChangeResults(
-        schema=schema_of(contract.CHANGES_SCHEMA_NAME),
-        a=_describe_input(input_a),
-        b=_describe_input(input_b),
-        settings=tuple(_list_setting_changes(input_a.results, input_b.results)),
-        numbers=tuple(
-            compare_numbers(
-                collect_compared_numbers(input_a.results), collect_compared_numbers(input_b.results)
-            )
-        ),
-        findings=findings,
-        worse=tuple(_describe_worse_verdicts(input_a.results, input_b.results, findings)),
-        provenance=provenance(
-            shlex.join(["px4fuse", "diff", input_a.file_name, input_b.file_name])
-        ),
+    path_a, path_b = Path(a), Path(b)
+    given_a, given_b = map(_read_given_results, (path_a, path_b))
+    if path_a.samefile(path_b):
+        raise ResultsError(f"{display_name(path_a)}: A and B are the same file. Give two files.")
+    return list_changes(
+        given_a or _analyse_log(path_a, given_b, progress),
+        given_b or _analyse_log(path_b, given_a, progress),
     )
 
 
-def _describe_input(diff_input: InputResults) -> contract.DiffInput:
+def _read_given_results(path: Path) -> InputResults | None:
+    """Read the results in a report (PDF) or a JSON file; return None for a log."""
+    name, head = display_name(path), read_head(path, 64, LogError)
+    is_report = head.startswith(b"%PDF-")
+    if not is_report and not head.removeprefix(b"\xef\xbb\xbf").lstrip().startswith(b"{"):
+        return None
+    limit_bytes = MAX_PDF_BYTES if is_report else MAX_RESULTS_BYTES
+    remedy = "Give a report (PDF) or the results (JSON) of px4fuse compare."
+    content = read_bytes_limited(path, ResultsError, limit_bytes, remedy_if_too_large=remedy)
+    results = (read_attached_results if is_report else read_results)(content, name)
+    if not isinstance(results, Results):
+        raise ResultsError(
+            f"{name} contains results with the schema {results.schema.name}, which px4fuse diff "
+            "cannot compare. Give a log, or a report or results of px4fuse compare."
+        )
+    return InputResults(name, "report" if is_report else "results", results)
+
+
+def _analyse_log(
+    path: Path, input_with_settings: InputResults | None, progress: ProgressCallback
+) -> InputResults:
+    request = ComparisonRequest(log=str(path))
+    if input_with_settings is not None:
+        is_same_log = input_with_settings.results.log.sha256 in hash_files([path])
+        copied_setting_names = (
+            {*request.__struct_fields__} - _INPUT_FILE_SETTINGS if is_same_log else _FILTER_SETTINGS
+        )
+        given_request = input_with_settings.results.request
+        request = replace(
+            request, **{name: getattr(given_request, name) for name in copied_setting_names}
+        )
+    analysis = diagnose_or_check_aids(request, progress)
+    # to_json rounds all numbers, as in a report
+    results_json = to_json(make_comparison_or_aids_results(request, analysis))
+    results = read_results(results_json.encode())
+    assert isinstance(results, Results)
+    return InputResults(display_name(path), "log", results)
+
+
+# ------------------------------------------------------------------ differences
+
+
+def list_changes(input_a: InputResults, input_b: InputResults) -> ChangeResults:
+    """List the settings, numbers and findings that differ between the results of A and B."""
+    results_a, results_b = input_a.results, input_b.results
+    findings = (
+        *_find_unshared_findings(results_b, results_a, "B"),
+        *_find_unshared_findings(results_a, results_b, "A"),
+    )
+    return make_results(
+        ChangeResults,
+        shlex.join(["px4fuse", "diff", input_a.file_name, input_b.file_name]),
+        a=_describe_input(input_a),
+        b=_describe_input(input_b),
+        settings=tuple(_list_setting_changes(results_a, results_b)),
+        numbers=tuple(compare_numbers(*map(collect_compared_numbers, (results_a, results_b)))),
+        findings=findings,
+        worse=tuple(_describe_worse_verdicts(results_a, results_b, findings)),
+    )
+
+
+def _describe_input(diff_input: InputResults) -> DiffInput:
     log = diff_input.results.log
-    return contract.DiffInput(
+    return DiffInput(
         given=diff_input.file_name,
         kind=diff_input.kind,
         log=log.name,
@@ -91,9 +201,7 @@ def _describe_input(diff_input: InputResults) -> contract.DiffInput:
     )
 
 
-def _list_setting_changes(
-    results_a: Results, results_b: Results
-) -> Iterator[contract.SettingChange]:
+def _list_setting_changes(results_a: Results, results_b: Results) -> Iterator[SettingChange]:
     settings_a, settings_b = (
         {label: find_value(results, path) for label, path in SETTING_PATHS_BY_LABEL.items()}
         | _collect_parameters(results)
@@ -101,7 +209,7 @@ def _list_setting_changes(
     )
     for name in {**settings_a, **settings_b}:
         if (setting_a := settings_a.get(name)) != (setting_b := settings_b.get(name)):
-            yield contract.SettingChange(name, setting_a, setting_b)
+            yield SettingChange(name, setting_a, setting_b)
 
 
 def _collect_parameters(results: Results) -> dict[str, float]:
@@ -111,9 +219,52 @@ def _collect_parameters(results: Results) -> dict[str, float]:
     return {name: float(f"{parameters[name]:.6g}") for name in sorted(parameters)}
 
 
+def collect_compared_numbers(results: Results) -> dict[str, ComparedNumber]:
+    """Return the numbers that ``px4fuse diff`` compares, by path (``clock.offset_s``)."""
+    axes = {} if isinstance(results, AidsResults) else results.axes
+    # EKF2 rejects north and east together, so their rejected fractions are equal: keep only one
+    first_horizontal_axis = next((name for name in ("north", "east", AISLE) if name in axes), "")
+    # skip the aiding source of the positions: the axes contain its numbers
+    aids_of_position_source: tuple[str, ...] = ("ev_pos", "ev_hgt") if axes else ()
+    if find_value(results, "source.kind") == "gnss":
+        aids_of_position_source = ("gnss_pos",)
+    numbers_by_path: dict[str, ComparedNumber] = {}
+    for definition in COMPARED_NUMBER_DEFINITIONS:
+        pattern, interval_field = definition["path"], definition["interval"]
+        for path, keys in _find_matching_paths(results, pattern):
+            record_path, _, field_name = path.rpartition(".")
+            record, first_key = find_value(results, record_path), keys[0] if keys else ""
+            value = getattr(record, field_name, None)
+            is_undetermined = isinstance(record, SourceTimeOffset) and not record.is_determinable
+            is_undetermined |= isinstance(record, HeadingError) and record.drifts
+            is_duplicate = pattern.startswith("aids.") and first_key in aids_of_position_source
+            if pattern == "axes.*.rejected_fraction":
+                is_duplicate = first_key not in (first_horizontal_axis, "down")
+            if is_undetermined or is_duplicate or not isinstance(value, int | float):
+                continue
+            labels = (AIDS[name].label if name in AIDS else name for name in keys)
+            numbers_by_path[path] = ComparedNumber(
+                ", ".join((definition["label"], *labels)),
+                definition["unit"],
+                float(value),
+                getattr(record, interval_field) if interval_field else None,
+            )
+    return numbers_by_path
+
+
+def _find_matching_paths(results: Results, pattern: str) -> Iterator[tuple[str, tuple[str, ...]]]:
+    """Yield the paths in the results that match a pattern, with the keys that replace ``*``."""
+    parent, wildcard, pattern_end = pattern.partition(".*")
+    if not wildcard:
+        yield pattern, ()
+    for key in (find_value(results, parent) or ()) if wildcard else ():
+        for path, keys in _find_matching_paths(results, f"{parent}.{key}{pattern_end}"):
+            yield path, (key, *keys)
+
+
 def compare_numbers(
     numbers_a: Mapping[str, ComparedNumber], numbers_b: Mapping[str, ComparedNumber]
-) -> Iterator[contract.NumberChange]:
+) -> Iterator[NumberChange]:
     """Yield the numbers that differ between A and B, or that only one of them contains.
 
     Parameters
@@ -135,7 +286,7 @@ def compare_numbers(
         ):
             continue
         described_number = number_a or numbers_b[path]
-        yield contract.NumberChange(
+        yield NumberChange(
             path=path,
             label=described_number.label,
             unit=described_number.unit,
@@ -146,27 +297,20 @@ def compare_numbers(
         )
 
 
-def _list_finding_changes(
-    results_a: Results, results_b: Results
-) -> Iterator[contract.UnsharedFinding]:
-    """Yield the findings whose id and severity are only in A or only in B."""
-    comparisons: tuple[tuple[Results, Results, contract.DiffInputName], ...] = (
-        (results_b, results_a, "B"),
-        (results_a, results_b, "A"),
-    )
-    for results, other_results, only_in in comparisons:
-        other_ids_and_severities = {
-            (finding.id, finding.severity) for finding in other_results.findings
-        }
-        for finding in results.findings:
-            if (finding.id, finding.severity) not in other_ids_and_severities:
-                yield contract.UnsharedFinding(
-                    finding.id, finding.severity, finding.message, only_in
-                )
+def _find_unshared_findings(
+    results: Results, other_results: Results, only_in: DiffInputName
+) -> Iterator[UnsharedFinding]:
+    """Yield the findings whose id and severity are not in the other results."""
+    other_ids_and_severities = {
+        (finding.id, finding.severity) for finding in other_results.findings
+    }
+    for finding in results.findings:
+        if (finding.id, finding.severity) not in other_ids_and_severities:
+            yield UnsharedFinding(finding.id, finding.severity, finding.message, only_in)
 
 
 def _describe_worse_verdicts(
-    results_a: Results, results_b: Results, findings: Iterable[contract.UnsharedFinding]
+    results_a: Results, results_b: Results, findings: Iterable[UnsharedFinding]
 ) -> Iterator[str]:
     """Yield a sentence for each filter that is consistent only in A, and for each new error."""
     nis_and_nees_a, nis_and_nees_b = map(_collect_nis_and_nees, (results_a, results_b))

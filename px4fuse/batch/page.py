@@ -38,7 +38,11 @@ SIGMA_RATIO_COLUMNS = tuple(
 SEVERITIES = list(SEVERITY_SIGNS)
 FILE_LINKS = (("Report (PDF)", "report"), ("Results (JSON)", "results"))
 # Columns with one value per axis
-AXIS_COLUMNS = [name for name, path in RESULT_PATH_BY_COLUMN.items() if "{" in path]
+AXIS_COLUMNS = [
+    name
+    for name, path in RESULT_PATH_BY_COLUMN.items()
+    if path.startswith(("axis.", "tuning.", "agreement."))
+]
 # Columns with one value per log, except values in other cells of the page
 LOG_COLUMNS = (
     *("log", "log_sha256", "px4fuse", "settings", "vehicle", "firmware", "firmware_hash"),

@@ -1,37 +1,29 @@
 """Rows of the table of ``px4fuse batch``: one row per log and axis."""
 
-import csv
 import shlex
 from collections.abc import Iterable, Mapping
 from functools import reduce
-from pathlib import Path
 from typing import Any
 
 import pandas as pd
 
 from px4fuse.card.model import Card
-from px4fuse.core.record import Unavailable
+from px4fuse.core.record import Unavailable, read_csv
 from px4fuse.core.spreadsheet import neutralise_formulas
 from px4fuse.core.text import format_utc_time, replace_unencodable
 from px4fuse.ekf2.aids import AidResult
+from px4fuse.filter.tuning import HORIZONTAL
 from px4fuse.finding import Finding
 from px4fuse.request import quote_command
 from px4fuse.results.contract import ComparisonResults, Log
 
 STATUS_DONE, STATUS_NOT_COMPARED, STATUS_FAILED = "done", "not compared", "failed"
 FINDING_SEPARATOR = ";"
-# Key of the noise estimate in the results: north and east have one estimate together
-_NOISE_ESTIMATE_KEY_BY_AXIS = {"north": "horizontal", "east": "horizontal"}
 
 
-def read_rows(name: str) -> list[dict[str, str]]:
-    """Read a CSV file of the package px4fuse.batch as dicts by column title."""
-    with Path(__file__).with_name(name).open(encoding="utf-8") as file:
-        return list(csv.DictReader(file))
-
-
-_COLUMN_DEFINITIONS = read_rows("columns.csv")
-#: Path of each table column in the results, for example ``log.firmware``
+_COLUMN_DEFINITIONS = read_csv(__file__, dict[str, str], "columns.csv")
+#: Path of each table column in the results, for example ``log.firmware``. The records "axis",
+#: "tuning" and "agreement" contain the results of one axis
 RESULT_PATH_BY_COLUMN = {row["column"]: row["path"] for row in _COLUMN_DEFINITIONS}
 #: Data type of each table column; missing numbers are NA, and missing texts are empty
 COLUMN_TYPES = {row["column"]: row["type"] for row in _COLUMN_DEFINITIONS}
@@ -62,25 +54,23 @@ def make_axis_rows(results: ComparisonResults) -> list[Row]:
         unavailable_filter = next(
             (summary for summary in axis.filters.values() if isinstance(summary, Unavailable)), None
         )
-        row = common_values | {
-            "axis": name,
-            "status": STATUS_NOT_COMPARED
-            if isinstance(axis.filters["kf"], Unavailable)
-            else STATUS_DONE,
-            "reason": f"{unavailable_filter.what}: {unavailable_filter.reason}"
-            if unavailable_filter
-            else "",
-            "remedy": unavailable_filter.remedy if unavailable_filter else "",
+        row = common_values | {"axis": name, "status": STATUS_DONE}
+        if isinstance(axis.filters["kf"], Unavailable):
+            row["status"] = STATUS_NOT_COMPARED
+        if unavailable_filter:
+            row["reason"] = f"{unavailable_filter.what}: {unavailable_filter.reason}"
+            row["remedy"] = unavailable_filter.remedy
+        records = {
+            "axis": axis,
+            # north and east have one noise estimate together
+            "tuning": results.tuning.get(HORIZONTAL if name in ("north", "east") else name),
+            "agreement": find_value(results, f"ekf2_replay.agreement.{name}"),
+            "clock": results.clock if is_offset_determinable else None,
+            "source": results.source,
+            "provenance": results.provenance,
         }
-        for column, path in RESULT_PATH_BY_COLUMN.items():
-            if (
-                column not in row
-                and path
-                and (is_offset_determinable or not path.startswith("clock."))
-            ):
-                noise_estimate_key = _NOISE_ESTIMATE_KEY_BY_AXIS.get(name, name)
-                row[column] = find_value(results, path.format(axis=name, tuned=noise_estimate_key))
-        rows.append(row)
+        values = {name: find_value(records, path) for name, path in RESULT_PATH_BY_COLUMN.items()}
+        rows.append(clean_row(values | row))
     return rows
 
 
@@ -149,11 +139,12 @@ def replace_name_by_path(row: Row, path: str) -> Row:
 
 
 def collect_log_values(log: Log) -> Row:
-    start_utc, record = format_utc_time(log.start_unix_s), {"log": log}
-    path_by_column = {
-        name: path for name, path in RESULT_PATH_BY_COLUMN.items() if path.startswith("log.")
-    }
-    return {name: find_value(record, path) for name, path in path_by_column.items()} | {
+    start_utc = format_utc_time(log.start_unix_s)
+    return {
+        name: find_value({"log": log}, path)
+        for name, path in RESULT_PATH_BY_COLUMN.items()
+        if path.startswith("log.")
+    } | {
         "airframe": f"{airframe:g}" if (airframe := log.parameters.get("SYS_AUTOSTART")) else "",
         "date": f"{start_utc[:19]}Z" if start_utc else "",
     }

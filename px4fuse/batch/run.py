@@ -270,31 +270,25 @@ def _write_log(state: _RunState, log: LogAddress, outcome: LogOutcome) -> Cached
 
 def _write_table(state: _RunState, logs: Iterable[LogAddress]) -> BatchResult:
     """Write the table of the finished logs as CSV, Parquet and web page."""
-    severities: set[str] = set()
+    all_rows: list[Row] = []
     first_log_by_hash: dict[str, LogAddress] = {}
-
-    def find_rows(log: LogAddress) -> list[Row]:
-        """Return the rows of a log; of identical logs, only the first call returns results."""
-        if log.address in state.failed_row_by_address:
-            return [state.failed_row_by_address[log.address]]
-        if log.address not in state.hash_by_address:  # batch stopped before this log
-            return []
-        sha256 = state.hash_by_address[log.address]
+    for log in logs:
+        sha256 = state.hash_by_address.get(log.address, "")
         first_log = first_log_by_hash.setdefault(sha256, log)
-        if first_log is log:
-            return state.cached_rows_by_hash[sha256].rows
-        reason = f"the log is identical to {first_log.path_for_table}"
-        return [{"status": STATUS_NOT_COMPARED, "log_sha256": sha256, "reason": reason}]
-
-    def make_complete_rows() -> Iterator[Row]:
-        for log in logs:
-            common_values = {"log": log.path_for_table, "name": log.name}
-            common_values |= {"px4fuse": state.version, "settings": state.settings}
-            for row in find_rows(log):
-                severities.update(row.get("severities", ()))
-                yield replace_name_by_path(row, log.path_for_table) | common_values
-
-    table = make_table(make_complete_rows())
+        if failed_row := state.failed_row_by_address.get(log.address):
+            rows = [failed_row]
+        elif not sha256:  # batch stopped before this log
+            continue
+        elif first_log is log:
+            rows = state.cached_rows_by_hash[sha256].rows
+        else:
+            reason = f"the log is identical to {first_log.path_for_table}"
+            rows = [{"status": STATUS_NOT_COMPARED, "log_sha256": sha256, "reason": reason}]
+        common_values = {"log": log.path_for_table, "name": log.name}
+        common_values |= {"px4fuse": state.version, "settings": state.settings}
+        all_rows += (replace_name_by_path(row, log.path_for_table) | common_values for row in rows)
+    severities = {severity for row in all_rows for severity in row.get("severities", ())}
+    table = make_table(all_rows)
     page = format_html(table, state.output.resolve().name, f"px4fuse {state.version}")
     contents = {
         state.output / "fleet.parquet": table.to_parquet(index=False),

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING
 
-from px4fuse.batch.measures import MAX_OMITTED_DIFFERENCE, MAX_OMITTED_RELATIVE_DIFFERENCE
+from px4fuse.batch.changes import MAX_OMITTED_DIFFERENCE, MAX_OMITTED_RELATIVE_DIFFERENCE
 from px4fuse.batch.page import SIGMA_RATIO_COLUMNS, LogSummary, sort_logs, summarise_logs
 from px4fuse.batch.rows import STATUS_FAILED
 from px4fuse.core.text import format_count, format_number, format_ratio

@@ -129,8 +129,7 @@ def grade(
     reports. Submitted files are never executed, and are read with limits of time and memory.
     """
     from px4fuse.classroom.assignment.key import read_answer_key
-    from px4fuse.classroom.assignment.roster import read_people
-    from px4fuse.classroom.assignment.sheet import read_sheet
+    from px4fuse.classroom.assignment.roster import read_people, read_sheet
     from px4fuse.classroom.grading.entries import Course, parse_due_time, parse_late_rule
     from px4fuse.classroom.grading.grade import grade as grade_submissions
     from px4fuse.classroom.grading.rubric import read_rubric, rubric_text

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import csv
 from abc import ABCMeta
 from collections.abc import Mapping
 from functools import singledispatch
@@ -160,3 +161,9 @@ def read_toml(module_file: str, kind: type[T], name: str = "") -> T:
     """
     path = Path(module_file).with_suffix(".toml")
     return msgspec.toml.decode((path.with_name(name) if name else path).read_bytes(), type=kind)
+
+
+def read_csv(module_file: str, row_type: type[T], name: str) -> tuple[T, ...]:
+    """Read a CSV file in the folder of a module, and convert each row to the type ``row_type``."""
+    with Path(module_file).with_name(name).open(encoding="utf-8") as file:
+        return tuple(msgspec.convert(row, row_type, strict=False) for row in csv.DictReader(file))

@@ -15,7 +15,7 @@ import msgspec
 from msgspec import Meta
 
 from px4fuse.core.reading import read_text
-from px4fuse.core.record import Record, Sha256, read_toml
+from px4fuse.core.record import Record, Sha256, read_csv, read_toml
 from px4fuse.core.text import one_line
 from px4fuse.errors import SettingsError
 
@@ -29,45 +29,53 @@ NO_FAULT_KIND = "none"
 EMPTY_CELL = "\u2013"
 
 
-class FaultKind(Record, rename={"size_quantity": "in", "size_range": "range"}):
-    """Kind of fault that a student can name.
-
-    Attributes
-    ----------
-    size_quantity : str
-        Key of the allowed units in ``form.toml``, for example "m".
-    size_range : (float, float)
-        Smallest and largest allowed size, in the first allowed unit.
-    """
-
-    description: str
-    size_quantity: str = ""
-    size_range: tuple[float, float] = (-1e6, 1e6)
-
-    @property
-    def units(self) -> Mapping[str, float]:
-        """Allowed units of the fault's size, with the factor that converts to the first unit."""
-        return _UNITS_BY_QUANTITY[self.size_quantity]
-
-
 class AllowedAnswers(Record):
     """Allowed answers to the questions of the answer form (``form.toml``)."""
 
-    behaviours: tuple[str, ...]
-    report_panels: tuple[str, ...]
+    behaviours: str
+    report_panels: str
     units: dict[str, dict[str, float]]
-    fault_kinds: dict[str, FaultKind]
-    corrections: dict[str, str]
 
 
 _ALLOWED_ANSWERS = read_toml(__file__, AllowedAnswers, "form.toml")
-_UNITS_BY_QUANTITY: Mapping[str, Mapping[str, float]] = {"": {}, **_ALLOWED_ANSWERS.units}
-FAULT_KINDS = _ALLOWED_ANSWERS.fault_kinds
-EKF2_BEHAVIOURS = _ALLOWED_ANSWERS.behaviours
-REPORT_PANELS = _ALLOWED_ANSWERS.report_panels
+EKF2_BEHAVIOURS = _ALLOWED_ANSWERS.behaviours.splitlines()
+REPORT_PANELS = _ALLOWED_ANSWERS.report_panels.splitlines()
+
+
+def _find_units(quantity: str) -> Mapping[str, float]:
+    """Return the allowed units of a quantity, with the factors that convert to the first unit."""
+    return _ALLOWED_ANSWERS.units.get(quantity, {quantity: 1.0}) if quantity else {}
+
+
+class FaultKind(Record):
+    """Kind of fault that a student can name (row of ``fault_kinds.csv``).
+
+    Attributes
+    ----------
+    quantity : str
+        Quantity of the size, for example "m"; "" for a fault without size.
+    min_size, max_size : float
+        Smallest and largest allowed size, in the first allowed unit.
+    description : str
+        Name of the quantity that is the size.
+    """
+
+    kind: str
+    quantity: str
+    min_size: float
+    max_size: float
+    description: str
+
+    @property
+    def units(self) -> Mapping[str, float]:
+        return _find_units(self.quantity)
+
+
+FAULT_KINDS = {fault.kind: fault for fault in read_csv(__file__, FaultKind, "fault_kinds.csv")}
 # Allowed units for the value of each correction
 UNITS_BY_CORRECTION = {
-    name: _UNITS_BY_QUANTITY[quantity] for name, quantity in _ALLOWED_ANSWERS.corrections.items()
+    row["correction"]: _find_units(row["quantity"])
+    for row in read_csv(__file__, dict[str, str], "corrections.csv")
 }
 # Answer if the consistency of a filter cannot be evaluated
 NOT_AVAILABLE = "not available"
@@ -152,7 +160,7 @@ class NamedFault(Record):
             return None
         if self.unit == "factor" and self.kind == "scale":
             return (self.size - 1.0) * 100.0
-        return self.size * (units[self.unit] if self.unit else next(iter(units.values())))
+        return self.size * units.get(self.unit, 1.0)
 
     def convert_value_to_standard_unit(self) -> float | None:
         """Convert the value to the standard unit, which is the first in ``form.toml`` (cm to m)."""
@@ -296,12 +304,15 @@ def _describe_error(error: Exception, form_toml: str, form_values: dict[str, Any
     invalid_value: Any = form_values
     for name in names:
         invalid_value = invalid_value[int(name) if name.isdigit() else name]
-    label = names[0]
-    if len(names) > 1:
-        number = int(names[1]) + 1
-        if isinstance(invalid_value, dict):
-            return f"mistake {number}: {reason}"
-        label = f"{names[-1]} of mistake {number}" if label == "mistakes" else f"{label[0]}{number}"
+    field_name, *indices_and_names = names
+    number = int(indices_and_names[0]) + 1 if indices_and_names else 0
+    if number and isinstance(invalid_value, dict):
+        return f"mistake {number}: {reason}"
+    label = {
+        "mistakes": f"{names[-1]} of mistake {number}",
+        "quantities": f"q{number}",
+        "choices": f"c{number}",
+    }.get(field_name, field_name)
     accepted_values = ACCEPTED_ANSWER_BY_FIELD.get(names[0]) or ACCEPTED_ANSWER_BY_FIELD.get(
         names[-1], NUMBER_HELP
     )
@@ -355,22 +366,21 @@ def check_answers(answers: Answers) -> None:
         _require_allowed_answer("kind", kind, FAULT_KINDS)
         if kinds.count(kind) > 1:
             raise ValueError(f"the form names {kind!r} twice; name each kind of fault once")
-        units = FAULT_KINDS[kind].units
+        fault_kind = FAULT_KINDS[kind]
         for field_name, allowed_answers in (
             ("parameter", UNITS_BY_CORRECTION),
             ("panel", REPORT_PANELS),
-            ("unit", units),
+            ("unit", fault_kind.units),
             ("value_unit", UNITS_BY_CORRECTION.get(named_fault.parameter)),
         ):
             answer = getattr(named_fault, field_name)
             if answer and allowed_answers is not None:
                 _require_allowed_answer(f"{kind}: {field_name}", answer, allowed_answers)
-        min_size, max_size = FAULT_KINDS[kind].size_range
         size = named_fault.convert_size_to_standard_unit()
-        if size is not None and not min_size <= size <= max_size:
+        if size is not None and not fault_kind.min_size <= size <= fault_kind.max_size:
             raise ValueError(
-                f"{kind}: size {size:g} is out of range "
-                f"({min_size:g} to {max_size:g} {next(iter(units))})"
+                f"{kind}: size {size:g} is out of range ({fault_kind.min_size:g} to "
+                f"{fault_kind.max_size:g} {next(iter(fault_kind.units))})"
             )
 
 
@@ -430,8 +440,9 @@ def form_rows(answers: Answers) -> Iterator[tuple[str, str]]:
     yield "Consistency of EKF2", answers.verdict_ekf2 or EMPTY_CELL
     yield "Behaviour of EKF2", ", ".join(answers.ekf2_did) or EMPTY_CELL
     for mistake in answers.mistakes:
-        size_units = FAULT_KINDS.get(mistake.kind, FaultKind("")).units
-        value_units = UNITS_BY_CORRECTION.get(mistake.parameter, {})
+        fault_kind = FAULT_KINDS.get(mistake.kind)
+        size_units = fault_kind.units if fault_kind else ()
+        value_units = UNITS_BY_CORRECTION.get(mistake.parameter, ())
         value_text = _format_number_with_unit(mistake.value, mistake.value_unit, value_units)
         times = (("from", mistake.from_s), ("until", mistake.until_s))
         time_texts = [f"{word} {time_s:g} s" for word, time_s in times if time_s is not None]

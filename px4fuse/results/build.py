@@ -2,7 +2,7 @@
 
 from collections.abc import Mapping
 from dataclasses import asdict
-from typing import Any
+from typing import Any, TypeVar
 
 import msgspec
 
@@ -24,10 +24,36 @@ from px4fuse.request import (
 from px4fuse.results import contract
 from px4fuse.results.answer_form import EMPTY_CELL, Answers, form_rows
 from px4fuse.results.bounds import drop_invalid_numbers
-from px4fuse.results.contract import AvailableTrack, ChosenSettings, Log, PositionSource
-from px4fuse.results.model import NO_STUDENT, Student, provenance, schema_of
+from px4fuse.results.model import NO_STUDENT, SCHEMA_VERSION, Schema, Student, provenance
 from px4fuse.trajectory.evaluation import Evaluation
 from px4fuse.trajectory.graph.solver import Graph
+
+ResultsT = TypeVar("ResultsT", bound=contract.Results)
+
+
+def make_results(results_type: type[ResultsT], command: str, **fields: Any) -> ResultsT:
+    """Create results with their schema and provenance, and without invalid numbers.
+
+    Parameters
+    ----------
+    command : str
+        Command line that produces the results.
+    **fields
+        All other fields of the results.
+
+    Raises
+    ------
+    ResultsError
+        A required number is not valid.
+    """
+    schema_name = next(
+        name for name, kind in contract.RESULTS_BY_SCHEMA.items() if kind is results_type
+    )
+    return drop_invalid_numbers(
+        results_type(
+            schema=Schema(schema_name, SCHEMA_VERSION), provenance=provenance(command), **fields
+        )
+    )
 
 
 def make_comparison_results(
@@ -45,18 +71,18 @@ def make_comparison_results(
             if answer_text != EMPTY_CELL
         )
         card = msgspec.structs.replace(card, facts={"Answers": "; ".join(answer_texts)})
-    fields = _make_flight_fields(contract.COMPARISON_SCHEMA_NAME, request, analysis) | {
+    fields = _make_flight_fields(request, analysis) | {
         "aids": {} if isinstance(analysis.aids, Unavailable) else dict(analysis.aids),
         "card": card,
         "clock": analysis.time_offset,
         "student": student,
         "trials": analysis.reruns,
     }
-    # the other fields of the results are copied from the analysis
-    for name in contract.ComparisonResults.__struct_fields__:
-        if name not in fields:
-            fields[name] = getattr(analysis, name)
-    return drop_invalid_numbers(contract.ComparisonResults(**fields))
+    copied_names = (
+        {*contract.ComparisonResults.__struct_fields__} - fields.keys() - {"schema", "provenance"}
+    )
+    fields |= {name: getattr(analysis, name) for name in copied_names}
+    return make_results(contract.ComparisonResults, command_line(request), **fields)
 
 
 def make_comparison_or_aids_results(
@@ -67,15 +93,16 @@ def make_comparison_or_aids_results(
     """Return the results of ``px4fuse compare`` for a flight with or without positions."""
     if isinstance(outcome, Analysis):
         return make_comparison_results(request, outcome, student)
-    return drop_invalid_numbers(
-        contract.AidsResults(
-            **_make_common_fields(contract.AIDING_SOURCES_SCHEMA_NAME, request, outcome.flight),
-            aids=dict(outcome.aids),
-            card=build_aids_card(outcome, request.with_file_names(), (student.name, student.id)),
-            findings=outcome.findings,
-            missing=(outcome.missing_data, *outcome.flight.missing),
-            student=student,
-        )
+    return make_results(
+        contract.AidsResults,
+        command_line(request),
+        request=request.with_file_names(),
+        log=make_log_record(outcome.flight),
+        aids=dict(outcome.aids),
+        card=build_aids_card(outcome, request.with_file_names(), (student.name, student.id)),
+        findings=outcome.findings,
+        missing=(outcome.missing_data, *outcome.flight.missing),
+        student=student,
     )
 
 
@@ -84,11 +111,12 @@ def make_tuning_results(
     comparison: PreparedComparison,
     tuning_by_axis: Mapping[str, AxisTuning | Unavailable],
 ) -> contract.TuningResults:
-    return drop_invalid_numbers(
-        contract.TuningResults(
-            **_make_flight_fields("px4fuse-tuning", request, comparison, "tune"),
-            tuning=dict(tuning_by_axis),
-        )
+    fields = _make_flight_fields(request, comparison)
+    return make_results(
+        contract.TuningResults,
+        command_line(request, "tune"),
+        tuning=dict(tuning_by_axis),
+        **fields,
     )
 
 
@@ -97,115 +125,98 @@ def make_sync_results(
     comparison: PreparedComparison,
     time_offset: SourceTimeOffset | Unavailable,
 ) -> contract.SyncResults:
-    return drop_invalid_numbers(
-        contract.SyncResults(
-            **_make_flight_fields("px4fuse-sync", request, comparison, "sync"), clock=time_offset
-        )
+    fields = _make_flight_fields(request, comparison)
+    return make_results(
+        contract.SyncResults, command_line(request, "sync"), clock=time_offset, **fields
     )
 
 
 def make_whatif_results(request: WhatIfRequest, analysis: WhatIfAnalysis) -> contract.WhatIfResults:
     summaries, sweep_start_index = analysis.whatif, analysis.sweep_start_index
-    return drop_invalid_numbers(
-        contract.WhatIfResults(
-            **_make_common_fields(contract.WHATIF_SCHEMA_NAME, request, analysis.flight),
-            agreement=summaries.agreement,
-            evaluated_s=summaries.evaluated_s,
-            uses_estimates=analysis.uses_estimates,
-            logged=summaries.logged,
-            replayed=summaries.replayed,
-            whatif=summaries.whatif[0] if sweep_start_index else None,
-            sweep=summaries.whatif[sweep_start_index:],
-            notes=summaries.notes,
-        )
+    return make_results(
+        contract.WhatIfResults,
+        command_line(request),
+        request=request.with_file_names(),
+        log=make_log_record(analysis.flight),
+        agreement=summaries.agreement,
+        evaluated_s=summaries.evaluated_s,
+        uses_estimates=analysis.uses_estimates,
+        logged=summaries.logged,
+        replayed=summaries.replayed,
+        whatif=summaries.whatif[0] if sweep_start_index else None,
+        sweep=summaries.whatif[sweep_start_index:],
+        notes=summaries.notes,
     )
 
 
 def make_loop_results(request: LoopRequest, loop: Loop, student: Student) -> contract.LoopResults:
-    return drop_invalid_numbers(
-        contract.LoopResults(
-            schema=schema_of(contract.LOOP_SCHEMA_NAME),
-            request=request.with_file_names(),
-            track=loop.odometry.trajectory.describe_track(),
-            references=tuple(reference.describe_track() for reference in loop.references),
-            loop=loop,
-            findings=find_loop_findings(loop),
-            student=student,
-            provenance=provenance(command_line(request)),
-        )
+    return make_results(
+        contract.LoopResults,
+        command_line(request),
+        request=request.with_file_names(),
+        track=loop.odometry.trajectory.describe_track(),
+        references=tuple(reference.describe_track() for reference in loop.references),
+        loop=loop,
+        findings=find_loop_findings(loop),
+        student=student,
     )
 
 
 def make_evaluation_results(
     request: EvaluationRequest, evaluation: Evaluation
 ) -> contract.EvaluationResults:
-    return drop_invalid_numbers(
-        contract.EvaluationResults(
-            schema=schema_of("px4fuse-evaluation"),
-            estimate=evaluation.estimate_track.describe_track(),
-            reference=evaluation.reference_track.describe_track(),
-            provenance=provenance(command_line(request)),
-            **msgspec.structs.asdict(evaluation),
-        )
+    return make_results(
+        contract.EvaluationResults,
+        command_line(request),
+        estimate=evaluation.estimate_track.describe_track(),
+        reference=evaluation.reference_track.describe_track(),
+        **msgspec.structs.asdict(evaluation),
     )
 
 
 def make_graph_results(solved_graph: Graph, command: str) -> contract.GraphResults:
-    return drop_invalid_numbers(
-        contract.GraphResults(schema_of("px4fuse-graph"), solved_graph, provenance(command))
+    return make_results(contract.GraphResults, command, graph=solved_graph)
+
+
+def make_log_record(flight: Flight) -> contract.Log:
+    return contract.Log(
+        **msgspec.structs.asdict(flight.log), joined=flight.inputs, clocks=flight.clocks
     )
-
-
-def make_log_record(flight: Flight) -> Log:
-    return Log(**msgspec.structs.asdict(flight.log), joined=flight.inputs, clocks=flight.clocks)
-
-
-def _make_common_fields(
-    name: str,
-    request: ComparisonRequest | WhatIfRequest,
-    flight: Flight,
-    command: str | None = None,
-) -> dict[str, Any]:
-    return {
-        "schema": schema_of(name),
-        "request": request.with_file_names(),
-        "log": make_log_record(flight),
-        "provenance": provenance(command_line(request, command)),
-    }
 
 
 def _make_flight_fields(
-    name: str,
-    request: ComparisonRequest,
-    comparison: PreparedComparison,
-    command: str | None = None,
+    request: ComparisonRequest, comparison: PreparedComparison
 ) -> dict[str, Any]:
     track, segment, settings = comparison.source, comparison.segment, comparison.settings
-    origin, parameters = track.origin, comparison.flight.log.parameters
-    file_clock_offset_s = 0.0 if track.alignment is None else track.alignment.clock_offset_s
-    source = PositionSource(
-        **track.description_fields(),
-        ekf2_parameters={} if origin.aid is None else origin.aid.logged_parameters(parameters),
-        reason=comparison.source_reason,
-        rate_hz=track.compute_rate_hz(),
-        available=tuple(
-            AvailableTrack(
-                each.name,
-                each.origin.kind,
-                each.origin.route,
-                len(each.samples),
-                each.compute_rate_hz(),
-            )
-            for each in comparison.flight.positions
-        ),
-        missing=tuple(part for part in comparison.missing if part.source),
+    origin, flight = track.origin, comparison.flight
+    available_tracks = (
+        contract.AvailableTrack(
+            each.name,
+            each.origin.kind,
+            each.origin.route,
+            len(each.samples),
+            each.compute_rate_hz(),
+        )
+        for each in flight.positions
     )
-    kf_settings: dict[str, Any] = asdict(settings) | {
-        "clock_offset_s": settings.clock_offset_s + file_clock_offset_s
-    }
-    return _make_common_fields(name, request, comparison.flight, command) | {
-        "source": source,
-        "settings": ChosenSettings(
+    kf_settings: dict[str, Any] = asdict(settings)
+    kf_settings["clock_offset_s"] += (
+        0.0 if track.alignment is None else track.alignment.clock_offset_s
+    )
+    return {
+        "request": request.with_file_names(),
+        "log": make_log_record(flight),
+        "source": contract.PositionSource(
+            **track.description_fields(),
+            ekf2_parameters={}
+            if origin.aid is None
+            else origin.aid.logged_parameters(flight.log.parameters),
+            reason=comparison.source_reason,
+            rate_hz=track.compute_rate_hz(),
+            available=tuple(available_tracks),
+            missing=tuple(part for part in comparison.missing if part.source),
+        ),
+        "settings": contract.ChosenSettings(
             **kf_settings,
             start_s=segment.start_s,
             end_s=segment.end_s,

@@ -49,11 +49,6 @@ from px4fuse.trajectory.evaluation import Evaluation
 from px4fuse.trajectory.graph.solver import Graph
 from px4fuse.trajectory.model import Track
 
-COMPARISON_SCHEMA_NAME = "px4fuse-results"
-LOOP_SCHEMA_NAME = "px4fuse-loop"
-WHATIF_SCHEMA_NAME = "px4fuse-whatif"
-AIDING_SOURCES_SCHEMA_NAME = "px4fuse-aids"
-CHANGES_SCHEMA_NAME = "px4fuse-changes"
 # Maximum number of significant digits of a number in the results
 SIGNIFICANT_DIGITS = 10
 
@@ -352,15 +347,15 @@ Results = (
 )
 # Type of the results, by name of the JSON schema
 RESULTS_BY_SCHEMA: dict[str, type[Results]] = {
-    COMPARISON_SCHEMA_NAME: ComparisonResults,
-    LOOP_SCHEMA_NAME: LoopResults,
-    AIDING_SOURCES_SCHEMA_NAME: AidsResults,
+    "px4fuse-results": ComparisonResults,
+    "px4fuse-loop": LoopResults,
+    "px4fuse-aids": AidsResults,
     "px4fuse-tuning": TuningResults,
     "px4fuse-sync": SyncResults,
     "px4fuse-graph": GraphResults,
     "px4fuse-evaluation": EvaluationResults,
-    WHATIF_SCHEMA_NAME: WhatIfResults,
-    CHANGES_SCHEMA_NAME: ChangeResults,
+    "px4fuse-whatif": WhatIfResults,
+    "px4fuse-changes": ChangeResults,
 }
 
 

@@ -57,10 +57,6 @@ class Provenance(Record):
     command: str
 
 
-def schema_of(name: str) -> Schema:
-    return Schema(name, SCHEMA_VERSION)
-
-
 def provenance(command: str) -> Provenance:
     return Provenance(
         px4fuse=metadata.version("px4fuse"),

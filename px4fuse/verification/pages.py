@@ -73,16 +73,9 @@ _TOKEN_PATTERN = re.compile(
 )
 _NUMBER_PATTERN = re.compile(r"[+-]?(?:\d+\.?\d*|\.\d+)")
 _ESCAPE_PATTERN = re.compile(r"\\([0-7]{1,3}|\r\n?|.)|\r\n?", re.DOTALL)
-_ESCAPED_CHARACTERS = {
-    "n": "\n",
-    "r": "\r",
-    "t": "\t",
-    "b": "\b",
-    "f": "\f",
-    "\n": "",
-    "\r": "",
-    "\r\n": "",
-}
+_ESCAPED_CHARACTERS = dict.fromkeys(("\n", "\r", "\r\n"), "") | dict(
+    zip("nrtbf", "\n\r\t\b\f", strict=True)
+)
 # PDF drawing operators with coordinates: index of the first operand that is a coordinate
 _FIRST_COORDINATE_INDEX = {"m": 0, "l": 0, "c": 0, "v": 0, "y": 0, "re": 0, "cm": 4, "Tm": 4}
 _TEXT_OPERATORS = frozenset(("Tj", "TJ"))
@@ -93,6 +86,10 @@ TextComparison = Callable[[str, str], bool]
 # Operand of a PDF drawing operation: number, string, or another token (name or bracket)
 Operand = float | bytes | str
 Operation = tuple[str, tuple[Operand, ...]]
+# Value in the submitted PDF, value in the redrawn PDF, and their key
+_ValuePair = tuple[Any, Any, str]
+# Description of a difference, and True for added or missing PDF objects
+_Difference = tuple[str, bool]
 
 
 def compare_pages(
@@ -147,8 +144,8 @@ class _PdfComparison:
     is_same_text: TextComparison
     # compared pairs: number and generation in the submitted PDF, number in the redrawn PDF
     compared_objects: set[tuple[int, int, int]] = field(default_factory=set)
-    # pairs of "/Parent" entries of pages, which are compared after all pages
-    parent_entry_pairs: list[tuple[Any, Any, str]] = field(default_factory=list)
+    # pairs of values, with their key, that are compared after all pages
+    deferred_pairs: list[_ValuePair] = field(default_factory=list)
     # fonts of the current page by name
     fonts: Mapping[str, Any] = field(default_factory=dict)
     # limited, because a malicious PDF may contain millions of values
@@ -159,38 +156,37 @@ class _PdfComparison:
     ) -> Iterator[PageDifference]:
         """Yield the differences of pages, document information and catalogue."""
         pages = [_get_page_references(reader) for reader in (submitted_pdf, redrawn_pdf)]
+        for key in ("/Info", "/Root"):
+            self.deferred_pairs.append(
+                (dict.get(submitted_pdf.trailer, key), dict.get(redrawn_pdf.trailer, key), key)
+            )
         for page_number, (submitted_page, redrawn_page) in enumerate(zip_longest(*pages), start=1):
             if submitted_page is None or redrawn_page is None:
                 page_counts = f"{len(pages[0])} pages; the recomputed report has {len(pages[1])}"
                 yield PageDifference(page_number, f"the PDF has {page_counts}")
                 return
             self.fonts = resolve_reference(redrawn_page.get_object()["/Resources"].get("/Font", {}))
-            yield from self._compare(submitted_page, redrawn_page, "/Page", page_number)
-        for key in ("/Info", "/Root"):
-            submitted_value = dict.get(submitted_pdf.trailer, key)
-            redrawn_value = dict.get(redrawn_pdf.trailer, key)
-            yield from self._compare(submitted_value, redrawn_value, key, 0)
-        for values in self.parent_entry_pairs:
-            yield from self._compare(*values, 0)
+            for difference in self._compare((submitted_page, redrawn_page, "/Page")):
+                yield PageDifference(page_number, *difference)
+        for pair in self.deferred_pairs:
+            for difference in self._compare(pair):
+                yield PageDifference(0, *difference)
         # programs for PDF 1.4 ignore /XRefStm, and could display other pages
         if "/XRefStm" in submitted_pdf.trailer:
             yield PageDifference(0, SECOND_XREF_TABLE_REASON, True)
 
-    def _compare(
-        self, submitted_value: Any, redrawn_value: Any, key: str, page_number: int
-    ) -> Iterator[PageDifference]:
+    def _compare(self, pair: _ValuePair) -> Iterator[_Difference]:
         """Yield the differences of two PDF values, including nested values."""
-        value_pairs_to_compare = [(submitted_value, redrawn_value, key)]
-        while value_pairs_to_compare:
-            submitted_value, redrawn_value, key = value_pairs_to_compare.pop()
+        pairs_to_compare = [pair]
+        while pairs_to_compare:
+            submitted_value, redrawn_value, key = pairs_to_compare.pop()
             self.value_count += 1
             if self.value_count > MAX_PDF_VALUES:
                 raise LimitReachedError(f"the PDF contains more than {MAX_PDF_VALUES} values")
             if isinstance(submitted_value, IndirectObject):
                 if submitted_value.generation:
                     # programs that ignore generation numbers would display another object
-                    description = f"another program changed the PDF entry {key}"
-                    yield PageDifference(page_number, description, True)
+                    yield f"another program changed the PDF entry {key}", True
                 if isinstance(redrawn_value, IndirectObject):
                     object_ids = (
                         submitted_value.idnum,
@@ -204,55 +200,56 @@ class _PdfComparison:
                 resolve_reference, (submitted_value, redrawn_value)
             )
             if _pdf_type_of(submitted_value) is not _pdf_type_of(redrawn_value):
-                description = f"the PDF entry {key} has a wrong type"
-                yield PageDifference(page_number, description, True)
+                yield f"the PDF entry {key} has a wrong type", True
             elif isinstance(redrawn_value, DictionaryObject):
                 yield from self._compare_dictionaries(
-                    submitted_value, redrawn_value, key, page_number, value_pairs_to_compare
+                    submitted_value, redrawn_value, key, pairs_to_compare
                 )
             elif isinstance(redrawn_value, ArrayObject):
-                lengths = len(submitted_value), len(redrawn_value)
-                if lengths[0] != lengths[1]:
-                    description = f"the PDF array {key} has {lengths[0]} elements, not {lengths[1]}"
-                    yield PageDifference(page_number, description, True)
+                if len(submitted_value) != len(redrawn_value):
+                    yield (
+                        f"the PDF array {key} has {len(submitted_value)} elements, not "
+                        f"{len(redrawn_value)}",
+                        True,
+                    )
                     continue
                 pairs = zip(*map(list.__iter__, (submitted_value, redrawn_value)), strict=True)
-                value_pairs_to_compare += [(*pair, key) for pair in pairs][::-1]
+                pairs_to_compare += [(*pair, key) for pair in pairs][::-1]
             elif not self._is_same_value(submitted_value, redrawn_value):
                 texts = [one_line(str(value), 60) for value in (submitted_value, redrawn_value)]
-                description = (
-                    f"the PDF entry {key} was changed to {texts[0]!r}; px4fuse wrote {texts[1]!r}"
+                yield (
+                    f"the PDF entry {key} was changed to {texts[0]!r}; px4fuse wrote {texts[1]!r}",
+                    False,
                 )
-                yield PageDifference(page_number, description)
 
     def _compare_dictionaries(
         self,
         submitted_dictionary: Any,
         redrawn_dictionary: DictionaryObject,
         key: str,
-        page_number: int,
-        value_pairs_to_compare: list[tuple[Any, Any, str]],
-    ) -> Iterator[PageDifference]:
-        """Yield the differences in keys and streams of two PDF dictionaries."""
+        pairs_to_compare: list[_ValuePair],
+    ) -> Iterator[_Difference]:
+        """Yield the differences in keys and streams of two PDF dictionaries.
+
+        Add the pairs of their values to ``pairs_to_compare``.
+        """
         submitted_keys = _select_compared_keys(submitted_dictionary, key)
         redrawn_keys = _select_compared_keys(redrawn_dictionary, key)
         for name in sorted(submitted_keys ^ redrawn_keys):
-            description = f"the PDF lacks an entry {one_line(name, 40)}"
             if name in submitted_keys:
-                description = (
-                    f"the PDF contains an entry {one_line(name, 40)}, which px4fuse does not write"
+                yield (
+                    f"the PDF contains an entry {one_line(name, 40)}, which px4fuse does not write",
+                    True,
                 )
-            yield PageDifference(page_number, description, True)
-        for name in sorted(submitted_keys & redrawn_keys, reverse=True):
-            pair = submitted_dictionary.raw_get(name), redrawn_dictionary.raw_get(name), name
-            if page_number and name == "/Parent":
-                self.parent_entry_pairs.append(pair)
             else:
-                value_pairs_to_compare.append(pair)
-        if isinstance(redrawn_dictionary, StreamObject):
-            yield from self._compare_streams(
-                submitted_dictionary, redrawn_dictionary, key, page_number
+                yield f"the PDF lacks an entry {one_line(name, 40)}", True
+        for name in sorted(submitted_keys & redrawn_keys, reverse=True):
+            # a page refers to all other pages by /Parent
+            (self.deferred_pairs if name == "/Parent" else pairs_to_compare).append(
+                (submitted_dictionary.raw_get(name), redrawn_dictionary.raw_get(name), name)
             )
+        if isinstance(redrawn_dictionary, StreamObject):
+            yield from self._compare_streams(submitted_dictionary, redrawn_dictionary, key)
 
     def _is_same_value(self, submitted_value: Any, redrawn_value: Any) -> bool:
         if _pdf_type_of(redrawn_value) is float:
@@ -271,19 +268,14 @@ class _PdfComparison:
         return all(map(_TYPST_VERSION_PATTERN.fullmatch, texts)) or self.is_same_text(*texts)
 
     def _compare_streams(
-        self,
-        submitted_stream: StreamObject,
-        redrawn_stream: StreamObject,
-        key: str,
-        page_number: int,
-    ) -> Iterator[PageDifference]:
+        self, submitted_stream: StreamObject, redrawn_stream: StreamObject, key: str
+    ) -> Iterator[_Difference]:
         stream_type = redrawn_stream.get("/Type")
         if stream_type == "/EmbeddedFile":  # attached results: compared in verification.py
             return
         filters = resolve_reference(submitted_stream.get("/Filter"))
         if filters not in (None, "/FlateDecode", ["/FlateDecode"]):  # pypdf does not decode JPEG
-            description = f"the compression of the PDF entry {key} is not supported"
-            yield PageDifference(page_number, description, True)
+            yield f"the compression of the PDF entry {key} is not supported", True
             return
         submitted_data, redrawn_data = submitted_stream.get_data(), redrawn_stream.get_data()
         if submitted_data == redrawn_data or (
@@ -293,10 +285,9 @@ class _PdfComparison:
             return
         is_page_content = key == "/Contents" or stream_type == "/Pattern"
         if not is_page_content or len(submitted_data) > MAX_CONTENT_SIZE_RATIO * len(redrawn_data):
-            description = f"the content of the PDF entry {key} was changed"
-            yield PageDifference(page_number, description)
+            yield f"the content of the PDF entry {key} was changed", False
         elif description := self._describe_operation_difference(submitted_data, redrawn_data):
-            yield PageDifference(page_number, description)
+            yield description, False
 
     def _describe_operation_difference(
         self, submitted_content: bytes, redrawn_content: bytes

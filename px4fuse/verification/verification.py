@@ -102,9 +102,7 @@ def recompute_report(
     """
     try:
         if tuple(results.provenance.libraries) != LIBRARIES:
-            raise NotRepeatableError(
-                "the results do not list the library versions of px4fuse", ASK_AUTHOR_REMEDY
-            )
+            raise NotRepeatableError("the results do not list the library versions of px4fuse")
         with tempfile.TemporaryDirectory(prefix="px4fuse-") as folder:
             link_input_file = partial(_link_input_file, path_by_sha256, Path(folder))
             if isinstance(results, LoopResults):
@@ -113,14 +111,14 @@ def recompute_report(
                 analysis, new_results = _repeat_comparison(results, link_input_file)
         return new_results, partial(_draw_report, analysis, new_results, results.provenance)
     except SettingsError as error:  # px4fuse cannot have made a report with invalid settings
-        return make_unverifiable_result(f"{INVALID_COMMAND_REASON}: {error}", ASK_AUTHOR_REMEDY)
+        return make_unverifiable_result(f"{INVALID_COMMAND_REASON}: {error}")
     except NotRepeatableError as error:
         return make_unverifiable_result(*error.args)
     except Px4FuseError as error:
-        return make_unverifiable_result(str(error), ASK_AUTHOR_REMEDY)
+        return make_unverifiable_result(str(error))
     except Exception as error:  # noqa: BLE001 - forged settings may fail anywhere
         reason = f"the analysis with the settings in the report failed ({type(error).__name__})"
-        return make_unverifiable_result(reason, ASK_AUTHOR_REMEDY)
+        return make_unverifiable_result(reason)
 
 
 def _link_input_file(
@@ -138,10 +136,9 @@ def _link_input_file(
             reason, f"Add {missing_file_name} to the --logs folder.", missing_file_name
         )
     if name != Path(name).name or name == ".." or "\\" in name or not name.isprintable():
-        reason = (
+        raise NotRepeatableError(
             f"{INVALID_COMMAND_REASON}: a file name contains a folder or unprintable characters"
         )
-        raise NotRepeatableError(reason, ASK_AUTHOR_REMEDY)
     # a separate folder for each link, because file names may be equal
     target = Path(tempfile.mkdtemp(dir=folder), name)
     try:
@@ -167,9 +164,7 @@ def _repeat_comparison(
 
     recorded_request = submitted_results.request
     if recorded_request.dt_s < MIN_DT_S:
-        raise NotRepeatableError(
-            f"DT is below {MIN_DT_S:g} s, so the analysis would take too long", ASK_AUTHOR_REMEDY
-        )
+        raise NotRepeatableError(f"DT is below {MIN_DT_S:g} s, so the analysis would take too long")
     hash_by_role = {file.role: file.sha256 for file in submitted_results.log.joined}
     request = replace(
         recorded_request,
@@ -249,7 +244,7 @@ def verify(
         return Verification("other log", (reason,), False, remedy=remedy, missing=log_file_name)
     if results.student.notes.count("\n") > MAX_NOTES_LINES:
         reason = f"the student's notes have more than {MAX_NOTES_LINES} lines"
-        return make_unverifiable_result(reason, ASK_AUTHOR_REMEDY)
+        return make_unverifiable_result(reason)
     recomputed_report = recompute_report(results, path_by_sha256)
     if isinstance(recomputed_report, Verification):
         return recomputed_report
@@ -257,7 +252,7 @@ def verify(
 
 
 def make_unverifiable_result(
-    reason: str, remedy: str = "", missing_input: str = ""
+    reason: str, remedy: str = ASK_AUTHOR_REMEDY, missing_input: str = ""
 ) -> Verification:
     """Return the status "cannot verify" with its reason."""
     reasons = (one_line(reason, 400),)
@@ -272,13 +267,9 @@ def _compare_with_new_report(
 ) -> Verification:
     redrawn_pdf = draw_report()
     if redrawn_pdf == pdf:
-        reason = "a new run on the log gives an identical PDF"
+        reasons = ["a new run on the log gives an identical PDF", VERIFICATION_SCOPE_NOTE]
         return Verification(
-            "verified",
-            (reason, VERIFICATION_SCOPE_NOTE),
-            True,
-            page_status="same",
-            redrawn_pdf=redrawn_pdf,
+            "verified", tuple(reasons), True, page_status="same", redrawn_pdf=redrawn_pdf
         )
     mismatches, is_same_number, value_count = compare_results(
         to_json_dict(submitted_results), to_json_dict(new_results)
@@ -308,15 +299,11 @@ def _compare_with_new_report(
         status, page_status = "cannot verify", "not compared"
     if mismatches:
         status = "numbers differ"
-    listed_sentences = [each.sentence for each in page_differences[:MAX_LISTED_PAGE_DIFFERENCES]]
-    if len(page_differences) > MAX_LISTED_PAGE_DIFFERENCES:
-        unlisted_count = len(page_differences) - MAX_LISTED_PAGE_DIFFERENCES
-        listed_sentences.append(f"{unlisted_count} further differences are not listed")
+    sentences = [each.sentence for each in page_differences[:MAX_LISTED_PAGE_DIFFERENCES]]
+    if (unlisted_count := len(page_differences) - MAX_LISTED_PAGE_DIFFERENCES) > 0:
+        sentences.append(f"{unlisted_count} further differences are not listed")
     # the decisive reason is first: some tables show only one reason
-    if status == "cannot verify":
-        reasons = listed_sentences + reasons
-    else:
-        reasons += listed_sentences
+    reasons = sentences + reasons if status == "cannot verify" else reasons + sentences
     remedy = ORIGINAL_PDF_REMEDY if is_from_other_program else ""
     if other_libraries:
         versions_text = one_line(", ".join(map(" ".join, sorted(other_libraries))), 300)

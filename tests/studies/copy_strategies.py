@@ -31,14 +31,14 @@ from msgspec.structs import replace
 
 from px4fuse.analysis import Analysis
 from px4fuse.classroom.assignment.assignment import simulate_assigned_flight
-from px4fuse.classroom.assignment.roster import Person
-from px4fuse.classroom.assignment.truth import (
+from px4fuse.classroom.assignment.key import (
     CorrectFormAnswers,
     CorrectVerdict,
     InjectedFault,
     _find_ekf2_behaviours,
     compute_numeric_answer,
 )
+from px4fuse.classroom.assignment.roster import Person
 from px4fuse.classroom.grading.form_points import compute_form_points
 from px4fuse.diagnose import analyse_loop_closure, diagnose
 from px4fuse.filter.frame_rotation import HeadingError

@@ -19,8 +19,8 @@ from msgspec.structs import replace
 
 from px4fuse.classroom.assignment.assignment import simulate_assigned_flight
 from px4fuse.classroom.assignment.figures import FIGURE_ANSWERS_BY_FAULT, QUESTIONS
+from px4fuse.classroom.assignment.key import CorrectFormAnswers, InjectedFault
 from px4fuse.classroom.assignment.roster import Person
-from px4fuse.classroom.assignment.truth import CorrectFormAnswers, InjectedFault
 from px4fuse.classroom.grading.form_points import (
     compute_form_points,
     find_accepted_corrections,

@@ -45,8 +45,11 @@ from px4fuse.classroom.assignment.key import (  # noqa: E402
     format_answer_key,
     read_answer_key,
 )
-from px4fuse.classroom.assignment.roster import read_people, read_roster  # noqa: E402
-from px4fuse.classroom.assignment.sheet import read_sheet  # noqa: E402
+from px4fuse.classroom.assignment.roster import (  # noqa: E402
+    read_people,
+    read_roster,
+    read_sheet,
+)
 from px4fuse.classroom.grading import grade as grading  # noqa: E402
 from px4fuse.classroom.grading.entries import read_overrides  # noqa: E402
 from px4fuse.classroom.grading.rubric import read_rubric, rubric_text  # noqa: E402

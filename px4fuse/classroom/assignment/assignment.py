@@ -13,6 +13,7 @@ from px4fuse.classroom.assignment.figures import draw_figures, select_choices
 from px4fuse.classroom.assignment.key import (
     AnswerKey,
     CorrectAnswers,
+    compute_form_answers,
     format_answer_key,
     read_answer_key,
 )
@@ -23,7 +24,6 @@ from px4fuse.classroom.assignment.random_assignment import (
     draw_uniform,
 )
 from px4fuse.classroom.assignment.roster import Person, normalise_text
-from px4fuse.classroom.assignment.truth import compute_form_answers
 from px4fuse.core.input_files import suspend_input_registration
 from px4fuse.core.text import to_json_types
 from px4fuse.core.writing import write_output_files

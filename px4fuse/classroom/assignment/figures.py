@@ -5,8 +5,8 @@ from io import BytesIO
 
 import pandas as pd
 
+from px4fuse.classroom.assignment.key import compare_simulation
 from px4fuse.classroom.assignment.random_assignment import draw_scenario_numbers
-from px4fuse.classroom.assignment.truth import compare_simulation
 from px4fuse.comparison.comparison import compute_position_errors
 from px4fuse.comparison.model import FILTER_NAMES, AxisComparison, Comparison, FilterName
 from px4fuse.core.record import Record, read_toml
@@ -90,12 +90,8 @@ def select_choices(draw_number: Callable[[str], float]) -> tuple[tuple[Choice, C
             options = tuple(
                 getattr(FIGURE_ANSWERS_BY_FAULT[each], field) for each in shuffled_kinds
             )
-            choices.append(
-                (
-                    Choice(f"{title}: {question}", options),
-                    (CHOICE_LETTERS[shuffled_kinds.index(kind)]),
-                )
-            )
+            letter = CHOICE_LETTERS[shuffled_kinds.index(kind)]
+            choices.append((Choice(f"{title}: {question}", options), letter))
     return tuple(choices)
 
 
@@ -120,7 +116,7 @@ def draw_figures(draw_number: Callable[[str], float]) -> bytes:
         comparisons[title] = compare_simulation(
             flights.simulate(
                 scenario,
-                parse_faults(tuple(filter(None, [FIGURE_ANSWERS_BY_FAULT[kind].mistake_option]))),
+                parse_faults(FIGURE_ANSWERS_BY_FAULT[kind].mistake_option.split()),
             )
         )
     return _plot_figures(comparisons)

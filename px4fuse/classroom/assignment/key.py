@@ -1,28 +1,128 @@
 """Answer key of an assignment: flight, injected faults and right answers of each student."""
 
+import math
+from collections.abc import Mapping
 from pathlib import Path
-from typing import Annotated, Literal
+from typing import Annotated, Any, Literal
 
 import msgspec
+import numpy as np
 from msgspec import Meta
 
 from px4fuse.classroom.assignment.roster import MAX_STUDENTS, ClassList, Person, normalise_text
-from px4fuse.classroom.assignment.truth import CorrectFormAnswers
+from px4fuse.comparison.comparison import compare
+from px4fuse.comparison.estimates import estimate_noises_and_time_offset
+from px4fuse.comparison.model import AxisComparison, Comparison, FilterName, FilterSummary
+from px4fuse.comparison.preparation import prepare_comparison_inputs
 from px4fuse.core.reading import read_text
-from px4fuse.core.record import Sha256
+from px4fuse.core.record import Record, Sha256, read_toml
 from px4fuse.errors import SettingsError
+from px4fuse.filter.kalman import run_kf
+from px4fuse.filter.model import (
+    COVARIANCE_COLUMNS,
+    compute_process_noise_per_density,
+    make_symmetric_matrix,
+    make_transition_matrix,
+)
+from px4fuse.filter.settings import Settings
+from px4fuse.filter.time_offset import SourceTimeOffset
+from px4fuse.flight.model import Ekf2, Unavailable
+from px4fuse.loop.analysis import analyse
+from px4fuse.loop.tracks import LoopSource, trajectory_of
+from px4fuse.request import SIGMA_Z_M, ComparisonRequest
+from px4fuse.results.answer_form import (
+    GATE_QUESTION_FURTHER_UPDATES,
+    Choice,
+    ChoiceLetter,
+    FormQuestion,
+    select_questions,
+)
+from px4fuse.simulation import flights
+from px4fuse.simulation.faults import FAULT_TYPES as SIMULATED_MISTAKES
+from px4fuse.simulation.sensors import TIMESYNC_CONVERGENCE_TIME_S
 
+# Maximum relative error of the size of a fault in a student's answer
+FAULT_SIZE_TOLERANCE_FRACTION = 0.15
+# Maximum deviation (m) of a student's loop closure error from the right value
+CLOSURE_TOLERANCE_M = 0.3
+# Minimum fraction of positions rejected by EKF2 for which the student must report rejections
+MIN_REJECTED_FRACTION = 0.005
+# Minimum size (m) of an EKF2 position reset that the student must report
+MIN_RESET_M = 0.2
+# Time (s) at the start in which position resets are ignored: EKF2 resets to its first position
+INITIAL_TIME_WITHOUT_RESETS_S = 5.0
+# Faults for which a student must ("required") or may ("allowed") report a behaviour of EKF2
+EKF2_BEHAVIOUR_RULES = read_toml(__file__, dict[str, dict[str, str]], "did.toml")
 # Maximum size (bytes) of an answer key: the key of 1000 students has 2 million bytes
 MAX_KEY_BYTES = 20_000_000
 ANSWER_KEY_NOTE = (
     "For the instructor only: this file lists the injected faults of every student's flight. Do "
     "not hand it out."
 )
-_Text = Annotated[str, Meta(max_length=1000)]
-_Number = Annotated[float, Meta(gt=-1e12, lt=1e12)]
-_ShortTexts = Annotated[
-    tuple[Annotated[str, Meta(min_length=1, max_length=200)], ...], Meta(max_length=20)
-]
+
+
+class InjectedFault(Record):
+    """Injected fault of a simulated flight, with the accepted range of its size.
+
+    Attributes
+    ----------
+    size : float or None
+        True size, in the first unit of the fault in ``form.toml``.
+    low, high : float or None
+        Smallest and largest size that is accepted as a right answer.
+    from_s, until_s : float or None
+        Start and end (s since the first sample); both None for the whole flight.
+    """
+
+    kind: str
+    size: float | None = None
+    low: float | None = None
+    high: float | None = None
+    from_s: float | None = None
+    until_s: float | None = None
+
+
+class CorrectVerdict(Record):
+    """Correct answer about the consistency of a filter.
+
+    Attributes
+    ----------
+    verdict : str
+        "consistent", "overconfident" or "underconfident"; "" with too few data.
+    factor : float or None
+        Factor by which the reported σ is too small or too large.
+    """
+
+    verdict: str
+    factor: float | None = None
+
+
+class CorrectFormAnswers(Record):
+    """Correct answers to the questions about one simulated flight.
+
+    Attributes
+    ----------
+    mistakes : tuple of InjectedFault
+    sigma_z_m : float
+        True noise of the position source (m, 1 σ).
+    ekf2_did : tuple of str
+        Behaviours of EKF2 that the student must report, for example "never fused".
+    ekf2_did_also : tuple of str
+        Further behaviours of EKF2 that the student may report without losing points.
+    quantities : tuple
+        Numeric answers; None if the flight is too short for a question.
+    choices : tuple
+        Multiple-choice questions about figures, each with the letter of the right answer.
+    """
+
+    mistakes: tuple[InjectedFault, ...]
+    sigma_z_m: float
+    kf: CorrectVerdict
+    ekf2: CorrectVerdict
+    ekf2_did: tuple[str, ...]
+    ekf2_did_also: tuple[str, ...]
+    quantities: tuple[float | tuple[float, ...] | None, ...]
+    choices: tuple[tuple[Choice, ChoiceLetter], ...] = ()
 
 
 class CorrectAnswers(
@@ -44,14 +144,14 @@ class CorrectAnswers(
         Smallest size that px4fuse detects, divided by the size of the injected fault.
     """
 
-    student_id: Annotated[str, Meta(max_length=1000, pattern=r"\S")]
-    name: _Text
-    file: _Text
+    student_id: Annotated[str, Meta(pattern=r"\S")]
+    name: Annotated[str, Meta(max_length=1000)]
+    file: str
     sha256: Sha256
     scenario: dict[str, str | int | float | bool | None] = {}
-    mistakes: _ShortTexts = ()
-    true_values: dict[str, _Number] = {}
-    difficulty: _Number | None = None
+    mistakes: Annotated[tuple[str, ...], Meta(max_length=20)] = ()
+    true_values: dict[str, float] = {}
+    difficulty: float | None = None
     form: CorrectFormAnswers | None = None
 
 
@@ -67,11 +167,11 @@ class AnswerKey(msgspec.Struct, frozen=True):
     numbers.
     """
 
-    kind: _Text
+    kind: str
     answers: Annotated[tuple[CorrectAnswers, ...], Meta(min_length=1, max_length=MAX_STUDENTS)] = (
         msgspec.field(name="students")
     )
-    secret: _Text = ""
+    secret: str = ""
     schema: _AnswerKeySchema = _AnswerKeySchema()
     note: str = ANSWER_KEY_NOTE
 
@@ -111,3 +211,153 @@ def read_answer_key(path: Path) -> AnswerKey:
             "Give the file that px4fuse simulate --assignment wrote.",
         ) from error
     return key
+
+
+# ------------------------------------------------------------------ right answers
+
+
+def compute_form_answers(simulation: flights.Simulation, log_sha256: str) -> CorrectFormAnswers:
+    """Compute the right answers from the simulated flight and its analysis by px4fuse."""
+    answer_key = flights.make_answer_key(simulation)
+    comparison = compare_simulation(simulation)
+    faults = tuple(
+        _make_injected_fault(name, values, answer_key["truth"], comparison)
+        for name, values in answer_key["mistakes"].items()
+    )
+    sigma_z_m = answer_key["truth"]["sigma_z_m"]
+    return CorrectFormAnswers(
+        faults,
+        sigma_z_m,
+        _make_correct_verdict(comparison, "kf"),
+        _make_correct_verdict(comparison, "ekf2"),
+        *_find_ekf2_behaviours(comparison, faults, sigma_z_m),
+        tuple(
+            compute_numeric_answer(comparison.main, question)
+            for question in select_questions(log_sha256)
+        ),
+    )
+
+
+def compare_simulation(simulation: flights.Simulation) -> Comparison:
+    """Analyse a simulated flight with the default settings of KF."""
+    flight = flights.to_flight(simulation)
+    prepared_comparison = prepare_comparison_inputs(
+        flight,
+        ComparisonRequest(log=flight.log.name, sigma_z_m=SIGMA_Z_M),
+        # do not correct frame and clock: the student has to find these faults
+        keep_positions_as_sent=True,
+    )
+    return compare(prepared_comparison)
+
+
+def _make_injected_fault(
+    name: str, values: Mapping[str, Any], truth: Mapping[str, Any], comparison: Comparison
+) -> InjectedFault:
+    value_field_names = SIMULATED_MISTAKES[name].value_field_names
+    if not value_field_names:
+        return InjectedFault(name)
+    size = values[value_field_names[0]]
+    tolerance = FAULT_SIZE_TOLERANCE_FRACTION * abs(size)
+    if name == "open-end":
+        # the student can only measure the closure error, which includes the odometry drift
+        odometry = trajectory_of(comparison.flight, "vio")
+        closure_error_m = analyse(LoopSource(odometry, comparison.flight)).closure_error_m
+        size = closure_error_m if isinstance(closure_error_m, float) else size
+        tolerance = CLOSURE_TOLERANCE_M
+    low, high = size - tolerance, size + tolerance
+    if name == "clock-offset":
+        # the estimated correction has the opposite sign of the time offset
+        _, time_offset = estimate_noises_and_time_offset(comparison)
+        if isinstance(time_offset, SourceTimeOffset) and time_offset.is_determinable:
+            low, high = min(low, -time_offset.interval_s[1]), max(high, -time_offset.interval_s[0])
+    fault_start_s = fault_end_s = None
+    match name:
+        case "clock-jump":
+            fault_end_s = TIMESYNC_CONVERGENCE_TIME_S
+        case "open-end":
+            _, fault_start_s = truth["airborne_s"]
+        case "nlos" if truth["outlier_time_s"]:
+            fault_start_s, *_, fault_end_s = truth["outlier_time_s"] * 2
+        case "dropout" | "imu-dropout" | "jump" | "heading" | "mag":
+            fault_start_s = values[value_field_names[1]]
+            fault_end_s = fault_start_s + abs(size) if name.endswith("dropout") else None
+    return InjectedFault(name, size, low, high, fault_start_s, fault_end_s)
+
+
+def _make_correct_verdict(comparison: Comparison, filter_name: FilterName) -> CorrectVerdict:
+    filter_summary = comparison.main.filters[filter_name]
+    if not isinstance(filter_summary, FilterSummary):
+        return CorrectVerdict("")
+    factor = None if filter_summary.verdict == "consistent" else filter_summary.sigma_error_factor
+    return CorrectVerdict(filter_summary.verdict, factor)
+
+
+def _find_ekf2_behaviours(
+    comparison: Comparison, faults: tuple[InjectedFault, ...], sigma_z_m: float
+) -> tuple[tuple[str, ...], tuple[str, ...]]:
+    """Return the behaviours of EKF2 that a student must report, and those a student may report."""
+    size_by_kind = {fault.kind: fault.size or 0.0 for fault in faults}
+    required, allowed = (
+        [
+            behaviour
+            for behaviour, kinds in EKF2_BEHAVIOUR_RULES[rule].items()
+            if not size_by_kind.keys().isdisjoint(kinds.split())
+        ]
+        for rule in ("required", "allowed")
+    )
+    if size_by_kind.get("ekf2-noise", 0.0) > sigma_z_m:
+        required.append("weighted the positions too little")
+    innovations = comparison.main.ekf2_innovations
+    if (
+        not isinstance(innovations, Unavailable)
+        and (innovations["rejected"] > 0).mean() > MIN_REJECTED_FRACTION
+    ):
+        has_bad_samples = not size_by_kind.keys().isdisjoint({"nlos", "jump"})
+        required.append("rejected outliers" if has_bad_samples else "rejected good samples")
+    ekf2 = comparison.flight.ekf2
+    resets_count_from_s = comparison.segment.start_s + INITIAL_TIME_WITHOUT_RESETS_S
+    if any(
+        reset.quantity == "position"
+        and reset.time_s > resets_count_from_s
+        and math.hypot(*reset.delta[:2]) > MIN_RESET_M
+        for reset in (ekf2.resets if isinstance(ekf2, Ekf2) else ())
+    ):
+        required.append("dead-reckoned, then reset")
+    # if EKF2 never fuses positions, its other behaviours need not be reported
+    if "never fused" in required:
+        required, allowed = ["never fused"], [*required, *allowed]
+    if not required:
+        required, allowed = ["normal"], ["followed the positions", *allowed]
+    return tuple(required), tuple(each for each in dict.fromkeys(allowed) if each not in required)
+
+
+def compute_numeric_answer(
+    axis_comparison: AxisComparison, question: FormQuestion
+) -> float | tuple[float, ...] | None:
+    """Run KF to compute the right answer to a question; None with too few measurements."""
+    settings = Settings(question.sigma_a_m_s2, question.sigma_z_m)
+    kf_run = run_kf(axis_comparison.axis, settings)
+    updates = kf_run.updates.iloc[question.update_number - 1 :]
+    if updates.empty:
+        return None
+    covariance = kf_run.steps.loc[updates.index[0], COVARIANCE_COLUMNS]
+    nis = updates["innovation_m"] ** 2 / updates["innovation_variance_m2"]
+    match question.kind:
+        case "gate":
+            is_outside = (
+                nis.iloc[: GATE_QUESTION_FURTHER_UPDATES + 1] > question.question_parameter**2
+            )
+            rejected_update_numbers = np.flatnonzero(is_outside) + question.update_number
+            return tuple(rejected_update_numbers.astype(float).tolist())
+        case "prediction":
+            p, f = make_symmetric_matrix(tuple(covariance)), make_transition_matrix(settings.dt_s)
+            q = make_symmetric_matrix(compute_process_noise_per_density(settings.dt_s))
+            q *= settings.sigma_a_m_s2**2 * settings.dt_s
+            for _ in range(round(question.question_parameter / settings.dt_s)):
+                p = f @ p @ f.T + q
+            return math.sqrt(p[0, 0])
+        case "nis":
+            return float(nis.iloc[0])
+        case "variance":
+            return float(covariance.iloc[0])
+    return float(updates.iloc[0]["gain_position" if question.kind == "gain" else "innovation_m"])

@@ -16,7 +16,7 @@ from itertools import accumulate
 from typing import Any, Literal
 
 from px4fuse.classroom.assignment.roster import normalise_text
-from px4fuse.core.record import Record, read_toml
+from px4fuse.core.record import Record, read_csv, read_toml
 from px4fuse.errors import SettingsError
 from px4fuse.simulation.scenario import Scenario, ScenarioKind, make_scenario
 
@@ -41,7 +41,10 @@ HARD_FAULTS_PROBABILITY, MAX_FAULT_DIFFICULTY = 0.25, 1.5
 
 
 class AssignableFault(Record):
-    """Type of fault that can be injected into a student's simulated flight.
+    """Type of fault that can be injected into a student's flight (``assignable_faults.csv``).
+
+    IMU gaps are not assigned: in half of the flights, the analysis reports a changed time offset
+    instead.
 
     Attributes
     ----------
@@ -49,29 +52,34 @@ class AssignableFault(Record):
         Name of the fault in ``px4fuse simulate --mistake``.
     group : str
         Group of faults that mask each other; a flight has at most one of them.
-    detection_limit : float or None
-        Size (in ``unit``) that px4fuse detects in 19 of 20 flights (tests/studies/rates.csv).
+    detection_limit : float
+        Size (in ``unit``) that px4fuse detects in 19 of 20 flights (tests/studies/rates.csv); 0 for
+        a fault without size.
     has_either_sign : bool
         True if the sign of the size is random.
-    fault_start_range_s : (float, float) or None
-        Earliest and latest start (s) of the fault; None for a fault of the whole flight.
-    masked_fault_groups : tuple of str
-        Groups of faults that px4fuse cannot detect in a flight with this fault.
+    earliest_start_s, latest_start_s : float
+        Range of the start of the fault; 0 for a fault of the whole flight.
+    masked_fault_groups : str
+        Groups of faults that px4fuse cannot detect in a flight with this fault. Reasons: the
+        estimates of time offset and yaw need the IMU at full rate; outliers increase rejections and
+        NIS, and change the yaw estimate; a wrong delay is detected by rejected good samples.
     """
 
+    flight_kind: ScenarioKind
     name: str
     group: str
-    detection_limit: float | None = None
-    unit: str = ""
-    is_smaller_size_easier_to_detect: bool = False
-    has_either_sign: bool = False
-    fault_start_range_s: tuple[float, float] | None = None
-    masked_fault_groups: tuple[str, ...] = ()
+    detection_limit: float
+    unit: str
+    is_smaller_size_easier_to_detect: bool
+    has_either_sign: bool
+    earliest_start_s: float
+    latest_start_s: float
+    masked_fault_groups: str
 
     def is_detectable_with(self, other_fault: AssignableFault) -> bool:
         """Return True if neither of two faults masks the other in the same flight."""
-        is_masked = other_fault.group in (self.group, *self.masked_fault_groups)
-        return not is_masked and self.group not in other_fault.masked_fault_groups
+        is_masked = other_fault.group in (self.group, *self.masked_fault_groups.split())
+        return not is_masked and self.group not in other_fault.masked_fault_groups.split()
 
     def format_option(self, difficulty: float, sign: float, fault_start_fraction: float) -> str:
         """Return the value of the option ``px4fuse simulate --mistake`` for this fault.
@@ -85,30 +93,24 @@ class AssignableFault(Record):
         fault_start_fraction : float
             Start of the fault: 0 for the earliest start, 1 for the latest start.
         """
-        if self.detection_limit is None:
+        if not self.detection_limit:
             return self.name
         size = self.detection_limit / difficulty
         if self.is_smaller_size_easier_to_detect:
             size = self.detection_limit * difficulty
         option_value = f"{self.name}={math.copysign(float(f'{size:.3g}'), sign):g}{self.unit}"
-        if self.fault_start_range_s is None:
+        if not self.latest_start_s:
             return option_value
-        earliest_start_s, latest_start_s = self.fault_start_range_s
-        start_s = earliest_start_s + fault_start_fraction * (latest_start_s - earliest_start_s)
+        start_range_s = self.latest_start_s - self.earliest_start_s
+        start_s = self.earliest_start_s + fault_start_fraction * start_range_s
         return f"{option_value},{start_s:.0f}s"
 
 
-class FlightRules(Record):
-    """Possible faults and random parameters of one kind of simulated flight.
-
-    ``numbers`` contains (minimum, maximum, decimals) of each random field of the scenario.
-    """
-
-    faults: tuple[AssignableFault, ...]
-    numbers: dict[str, tuple[float, float, int]]
-
-
-FLIGHT_RULES_BY_KIND = read_toml(__file__, dict[ScenarioKind, FlightRules], "drawn.toml")
+ASSIGNABLE_FAULTS = read_csv(__file__, AssignableFault, "assignable_faults.csv")
+# Minimum, maximum and decimals of each random field of the scenario, by kind of flight
+SCENARIO_NUMBERS_BY_KIND = read_toml(
+    __file__, dict[ScenarioKind, dict[str, tuple[float, float, int]]], "drawn.toml"
+)
 
 
 @dataclass(frozen=True)
@@ -186,13 +188,13 @@ def assign_random_flight(
         low, high = HARDEST_DIFFICULTY, MAX_FAULT_DIFFICULTY
     faults: list[AssignableFault] = []
     difficulties, mistake_options = [], []
-    possible_faults = FLIGHT_RULES_BY_KIND[kind].faults
+    possible_faults = (fault for fault in ASSIGNABLE_FAULTS if fault.flight_kind == kind)
     for fault in sorted(possible_faults, key=lambda each: draw_number(f"order {each.name}")):
         if len(faults) == fault_count or not all(map(fault.is_detectable_with, faults)):
             continue
         faults.append(fault)
         difficulty = EASIEST_DIFFICULTY
-        if fault.detection_limit is not None:
+        if fault.detection_limit:
             difficulty = low + (high - low) * draw_number(f"size {fault.name}")
         sign = -1.0 if fault.has_either_sign and draw_number(f"sign {fault.name}") < 0.5 else 1.0
         difficulties.append(difficulty)
@@ -216,7 +218,7 @@ def draw_scenario_numbers(
     """Return random values for the numeric fields of :class:`Scenario`."""
     return {
         name: round(low + (high - low) * draw_number(name), decimals)
-        for name, (low, high, decimals) in FLIGHT_RULES_BY_KIND[kind].numbers.items()
+        for name, (low, high, decimals) in SCENARIO_NUMBERS_BY_KIND[kind].items()
     }
 
 

@@ -9,13 +9,12 @@ from dataclasses import dataclass
 from functools import cached_property
 from typing import Annotated, Any, ClassVar, Literal
 
-import msgspec
 from msgspec import Meta
 
 from px4fuse.classroom.assignment.key import AnswerKey, CorrectAnswers
 from px4fuse.classroom.grading.form_points import FormPoints, compute_form_points
 from px4fuse.comparison.model import ErrorsAgainstTruth
-from px4fuse.core.record import Share
+from px4fuse.core.record import Record, Share
 from px4fuse.core.text import capitalise_first, format_factor, format_metres, one_line
 from px4fuse.filter.consistency import HorizontalNis
 from px4fuse.filter.time_offset import SourceTimeOffset
@@ -43,9 +42,7 @@ ErrorFactorAtZeroPoints = Annotated[float, Meta(ge=1.0, le=1000.0)]
 ScoreAndReason = tuple[float, str]
 
 
-class RubricItem(
-    msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True, tag_field="check"
-):
+class RubricItem(Record, kw_only=True, tag_field="check"):
     """Item of the rubric, the instructor's list of checks.
 
     Attributes
@@ -116,9 +113,7 @@ class ScoringInput:
     @cached_property
     def right_answers(self) -> CorrectAnswers | None:
         """Right answers for the log of the report; None if the log is not in the answer key."""
-        if self.key is None:
-            return None
-        return self.key.find_answers_by_log_sha256(log_sha256(self.results))
+        return self.key.find_answers_by_log_sha256(log_sha256(self.results)) if self.key else None
 
     @cached_property
     def assigned_log_answers(self) -> CorrectAnswers | None:
@@ -207,7 +202,7 @@ def format_reason(reason: str) -> str:
 # ------------------------------------------------------------------ checks of any report
 
 
-class VerificationItem(RubricItem, frozen=True, tag="verified"):
+class VerificationItem(RubricItem, tag="verified"):
     """Check that a re-run of the analysis on the log reproduces the numbers of the report."""
 
     def score(self, scoring_input: ScoringInput) -> ScoreAndReason:
@@ -218,7 +213,7 @@ class VerificationItem(RubricItem, frozen=True, tag="verified"):
         ), f"Verification: {verification.status}{reason_text}."
 
 
-class NumberItem(RubricItem, frozen=True, tag="number"):
+class NumberItem(RubricItem, tag="number"):
     """Check that a number of the report is between ``at_least`` and ``at_most``.
 
     Outside these bounds, the points decrease linearly to zero at the value ``zero_at``.
@@ -269,7 +264,7 @@ class NumberItem(RubricItem, frozen=True, tag="number"):
         return points_fraction, f"{statement}; required: {' and '.join(limit_texts)}.{advice}"
 
 
-class AnswersItem(RubricItem, frozen=True, tag="answers"):
+class AnswersItem(RubricItem, tag="answers"):
     """Compare the student's answers with the answer key."""
 
     needs_answer_key: ClassVar[bool] = True
@@ -286,7 +281,7 @@ class AnswersItem(RubricItem, frozen=True, tag="answers"):
         return points_or_reason.fraction, f"Points of 100: {points_text}. {feedback}."
 
 
-class TextItem(RubricItem, frozen=True, tag="text"):
+class TextItem(RubricItem, tag="text"):
     """Let the instructor score the student's text about the flight (option ``--notes``)."""
 
     needs_answer_key: ClassVar[bool] = True
@@ -311,7 +306,7 @@ NOISE_SETTINGS: dict[NoiseSettingName, tuple[str, str, str]] = {
 }
 
 
-class TuningItem(RubricItem, frozen=True, tag="tuning", rename={"factor_at_zero_points": "factor"}):
+class TuningItem(RubricItem, tag="tuning", rename={"factor_at_zero_points": "factor"}):
     """Check that SIGMA_A or SIGMA_Z is within the 95 % interval of its estimate.
 
     Outside the interval, the points decrease to zero at a deviation of ``factor_at_zero_points``.
@@ -364,9 +359,7 @@ def _find_max_position_error_m(comparison: ComparisonResults) -> float:
     return max(errors_m, default=0.0)
 
 
-class ConsistencyItem(
-    RubricItem, frozen=True, tag="consistent", rename={"factor_at_zero_points": "factor"}
-):
+class ConsistencyItem(RubricItem, tag="consistent", rename={"factor_at_zero_points": "factor"}):
     """Check that KF is consistent, by the mean NIS of north and east together.
 
     The points decrease to zero if the reported σ is wrong by ``factor_at_zero_points``.
@@ -402,7 +395,7 @@ class ConsistencyItem(
         )
 
 
-class TimeOffsetItem(RubricItem, frozen=True, tag="clock"):
+class TimeOffsetItem(RubricItem, tag="clock"):
     """Check that the applied time offset of the position source agrees with the estimate.
 
     Attributes
@@ -457,7 +450,7 @@ CORRECTED_PATH_NAMES: tuple[CorrectionName, ...] = (
 )
 
 
-class LoopItem(RubricItem, frozen=True, tag="loop"):
+class LoopItem(RubricItem, tag="loop"):
     """Score the analysis of a loop.
 
     - 1/4 of the points for a loop closure error.

@@ -2,14 +2,17 @@
 
 import math
 import statistics
-from collections import Counter
+from collections import Counter, defaultdict
 from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass
 
-from px4fuse.classroom.assignment.sheet import format_cell_number
-from px4fuse.classroom.grading.item_analysis import analyse_items
+import numpy as np
+
+from px4fuse.classroom.assignment.roster import format_cell_number
 from px4fuse.classroom.grading.model import (
     TOTAL_TITLE,
     Grade,
+    GradedReport,
     GradeOverride,
     counted_reports,
     list_item_titles,
@@ -32,6 +35,8 @@ STATUS_STYLES: dict[str, tuple[str, str]] = {
 }
 STATUSES = tuple(STATUS_STYLES)
 TABLE_FILTER_TAGS = (*STATUSES, "pending", "to read", "flagged", "late", "changed by instructor")
+# Minimum number of reports for the correlation of an item with the other items
+MIN_REPORTS_FOR_CORRELATION = 5
 
 
 def format_class_page(grades: Sequence[Grade], title: str, version_text: str) -> str:
@@ -221,3 +226,55 @@ def _make_points_inputs(grade: Grade) -> RowDetailsSection:
     return frame.make_input_boxes_section(
         "Points and comments by the instructor", identity, rows, rows_without_input_box
     )
+
+
+# ------------------------------------------------------------------ statistics of rubric items
+
+
+@dataclass(frozen=True)
+class ItemStatistics:
+    """Points of all reports for one rubric item, one part of the answer form, or one fault.
+
+    Attributes
+    ----------
+    discrimination : float or None
+        Correlation between the points for this item and for all other items.
+    """
+
+    title: str
+    mean_points: float
+    max_points: float
+    discrimination: float | None
+
+
+def analyse_items(reports: Sequence[GradedReport]) -> list[ItemStatistics]:
+    """Compute points and discrimination of each rubric item, part of the answer form, and fault."""
+    item_scores, form_scores, fault_scores = (
+        defaultdict[str, list[tuple[float, float, float]]](list) for _ in range(3)
+    )
+    for report in reports:
+        if report.instructor_action:
+            continue
+        for prefix, items, scores_by_title in (
+            ("", report.items, item_scores),
+            ("Answer form: ", report.form_part_scores, form_scores),
+        ):
+            total_points = sum(item.points for item in items)
+            for item in items:
+                if not item.is_awaiting_points:
+                    scores_by_title[f"{prefix}{item.title}"].append(
+                        (item.points, item.max_points, total_points - item.points)
+                    )
+        for kind, is_named in report.did_student_name_fault.items():
+            fault_scores[f"Fault: {kind}"].append((float(is_named), 1.0, report.points))
+    statistics = []
+    for title, scores in (item_scores | form_scores | fault_scores).items():
+        points, max_points, other_points = np.transpose(scores)
+        discrimination = None
+        has_variation = np.ptp(points) > 0.0 and np.ptp(other_points) > 0.0
+        if len(scores) >= MIN_REPORTS_FOR_CORRELATION and has_variation:
+            discrimination = float(np.corrcoef(points, other_points)[0, 1])
+        statistics.append(
+            ItemStatistics(title, float(points.mean()), float(max_points.max()), discrimination)
+        )
+    return statistics

@@ -17,9 +17,16 @@ from typing import Literal, NamedTuple
 from zoneinfo import ZoneInfo, ZoneInfoNotFoundError
 
 from px4fuse.classroom.assignment.key import AnswerKey
-from px4fuse.classroom.assignment.roster import ClassList, Person, normalise_text, read_people
-from px4fuse.classroom.assignment.sheet import Sheet, format_cell_number, parse_decimal, read_sheet
-from px4fuse.classroom.grading.flags import flag_equal_contents
+from px4fuse.classroom.assignment.roster import (
+    ClassList,
+    Person,
+    Sheet,
+    format_cell_number,
+    normalise_text,
+    parse_decimal,
+    read_people,
+    read_sheet,
+)
 from px4fuse.classroom.grading.model import (
     TOTAL_TITLE,
     Grade,
@@ -29,7 +36,7 @@ from px4fuse.classroom.grading.model import (
     Submission,
     counted_reports,
 )
-from px4fuse.classroom.grading.rubric import Rubric
+from px4fuse.classroom.grading.rubric import Rubric, flag_equal_contents
 from px4fuse.core.text import clean_text, one_line
 from px4fuse.errors import SettingsError
 

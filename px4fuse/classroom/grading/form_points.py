@@ -7,13 +7,10 @@ import math
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, field
 from itertools import zip_longest
-from typing import NamedTuple
 
-import msgspec
-
-from px4fuse.classroom.assignment.truth import CorrectFormAnswers, InjectedFault
+from px4fuse.classroom.assignment.key import CorrectFormAnswers, InjectedFault
 from px4fuse.classroom.grading.model import ItemScore
-from px4fuse.core.record import read_toml
+from px4fuse.core.record import Record, read_csv, read_toml
 from px4fuse.results.answer_form import (
     CHOICE_LETTERS,
     FAULT_KINDS,
@@ -54,27 +51,28 @@ MAX_NUMBER_ERROR_HALF_POINTS = 0.10
 MAX_SIZE_ERROR_HALF_POINTS = 0.4
 
 
-class _CorrectionRule(NamedTuple):
-    """Parameter that corrects some injected faults.
+class CorrectionRule(Record):
+    """Correction of a fault that gives points (row of ``corrections.csv``).
+
+    The best correction of a fault is first.
 
     Attributes
     ----------
-    score_by_fault_kind : mapping
-        Score of an answer that names the parameter as correction, by kind of injected fault.
-    right_value_range : (float, float) or str
-        Smallest and largest right value, or the name of a computed range.
+    score : float
+        1/2 if the parameter does not correct the fault, and 1/3 if it hides the fault.
+    right_values : str
+        "LOW to HIGH", or the name of a computed range; "" if any value is right.
     """
 
     parameter: str
-    score_by_fault_kind: Mapping[str, float]
-    right_value_range: tuple[float, float] | str = NO_BOUNDS
+    fault_kind: str
+    score: float
+    right_values: str
 
 
+CORRECTION_RULES = read_csv(__file__, CorrectionRule, "corrections.csv")
 POINTS_CONFIG = read_toml(__file__, dict)
-CORRECTION_RULES = msgspec.convert(POINTS_CONFIG["corrections"], tuple[_CorrectionRule, ...])
-SIMILAR_FAULT_GROUPS = msgspec.convert(
-    [*POINTS_CONFIG["neighbours"].values()], tuple[frozenset[str], ...]
-)
+SIMILAR_FAULT_GROUPS = [set(kinds.split()) for kinds in POINTS_CONFIG["neighbours"].values()]
 FORM_PART_NAMES = tuple(POINTS_CONFIG["weights"])
 
 
@@ -113,7 +111,7 @@ def compute_form_points(answers: Answers, right_answers: CorrectFormAnswers) -> 
     if not scores["numbers"] and not is_recognised_as_fault_free:
         # verdicts can be guessed, so they give half of the points without a right number
         scores["verdicts"] *= 0.5
-    points = {name: weights[name] * score for name, score in scores.items()}
+    points = {name: max_points * scores[name] for name, max_points in weights.items()}
     if is_recognised_as_fault_free:
         points["mistakes"] = weights["mistakes"]
     elif right_answers.mistakes and all(fault.size is None for fault in right_answers.mistakes):
@@ -134,9 +132,7 @@ def compute_form_points(answers: Answers, right_answers: CorrectFormAnswers) -> 
         *_describe_wrong_answers(answers, right_answers),
     )
     parts = tuple(
-        ItemScore(name, points[name], max_points, "")
-        for name, max_points in weights.items()
-        if max_points
+        ItemScore(name, points[name], max_points, "") for name, max_points in weights.items()
     )
     return FormPoints(
         parts, feedback, {fault.kind: fault.kind in named_kinds for fault in right_answers.mistakes}
@@ -243,9 +239,8 @@ def score_fault_kind(kind: str, named_kind: str) -> float:
         return SCORE_FOR_WRONG_NOISE_PARAMETER
     if any({kind, named_kind} <= group for group in SIMILAR_FAULT_GROUPS):
         return SCORE_FOR_SIMILAR_FAULT
-    return (
-        SCORE_FOR_NAMED_CONSEQUENCE if named_kind in POINTS_CONFIG["effects"].get(kind, ()) else 0.0
-    )
+    is_consequence = named_kind in POINTS_CONFIG["effects"].get(kind, "").split()
+    return SCORE_FOR_NAMED_CONSEQUENCE if is_consequence else 0.0
 
 
 def _score_faults(matches: list[FaultMatch], right_answers: CorrectFormAnswers) -> dict[str, float]:
@@ -303,7 +298,7 @@ def score_evidence(fault: InjectedFault, named_fault: NamedFault) -> float:
 
 def find_panels_showing_fault(fault_kind: str) -> list[str]:
     return [
-        *(panel for panel, kinds in POINTS_CONFIG["shows"].items() if fault_kind in kinds),
+        *(panel for panel, kinds in POINTS_CONFIG["shows"].items() if fault_kind in kinds.split()),
         "cover",
     ]
 
@@ -344,6 +339,7 @@ def find_accepted_corrections(
     fault_start_s = fault.from_s or 0.0
     fault_end_s = fault_start_s if fault.until_s is None else fault.until_s
     range_by_name = {
+        "": NO_BOUNDS,
         "negated": (-upper_bound, -lower_bound),
         "size": (lower_bound, upper_bound),
         "late milliseconds": (1e3 * lower_bound, 1e3 * upper_bound),
@@ -355,13 +351,13 @@ def find_accepted_corrections(
     }
     accepted_corrections = []
     for rule in CORRECTION_RULES:
-        bounds = rule.right_value_range
         # EKF2_EV_DELAY cannot be negative, so it does not correct timestamps that are too early
-        is_possible = size > 0.0 or bounds != "late milliseconds"
-        if fault.kind in rule.score_by_fault_kind and is_possible:
-            bounds = range_by_name[bounds] if isinstance(bounds, str) else bounds
-            score = rule.score_by_fault_kind[fault.kind]
-            accepted_corrections.append((rule.parameter, bounds, score))
+        is_possible = size > 0.0 or rule.right_values != "late milliseconds"
+        if rule.fault_kind == fault.kind and is_possible:
+            low, high = range_by_name.get(rule.right_values) or map(
+                float, rule.right_values.split(" to ")
+            )
+            accepted_corrections.append((rule.parameter, (low, high), rule.score))
     return accepted_corrections
 
 

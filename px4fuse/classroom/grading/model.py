@@ -200,7 +200,7 @@ class Grade:
 
     @property
     def reports(self) -> tuple[GradedReport, ...]:
-        return (*([self.counted_report] if self.counted_report else []), *self.other_reports)
+        return tuple(filter(None, (self.counted_report, *self.other_reports)))
 
     @property
     def file_name(self) -> str:

@@ -4,8 +4,7 @@ import textwrap
 from collections.abc import Iterator, Sequence
 from itertools import zip_longest
 
-from px4fuse.classroom.assignment.key import AnswerKey
-from px4fuse.classroom.assignment.truth import CorrectFormAnswers
+from px4fuse.classroom.assignment.key import AnswerKey, CorrectFormAnswers
 from px4fuse.classroom.grading.form_points import describe_right_answer, find_panels_showing_fault
 from px4fuse.classroom.grading.model import Grade
 from px4fuse.core.text import one_line
@@ -41,7 +40,7 @@ def ask_about_form(
         if kind not in (*true_kinds, NO_FAULT_KIND):
             yield (
                 f"You named {kind} ({FAULT_KINDS[kind].description}). Which plot would show this "
-                "fault? Does this plot in your report show the fault?",
+                "fault? Does your report show the fault in this plot?",
                 f"{kind} would be visible in {' or '.join(find_panels_showing_fault(kind))}. "
                 f"Injected fault of the flight: {', '.join(true_kinds) or 'no fault'}.",
             )

@@ -12,21 +12,23 @@ import html
 import random
 import re
 import textwrap
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import replace
-from functools import partial
 from importlib import metadata
 from operator import attrgetter
 from pathlib import Path
 
 from px4fuse.classroom.assignment.roster import (
     ClassList,
+    Sheet,
+    format_cell_number,
     make_file_names,
     make_unique,
     normalise_text,
+    parse_decimal,
+    read_sheet,
     read_student,
 )
-from px4fuse.classroom.assignment.sheet import Sheet, format_cell_number, parse_decimal, read_sheet
 from px4fuse.classroom.grading.checks import shorten_text
 from px4fuse.classroom.grading.class_page import format_class_page
 from px4fuse.classroom.grading.entries import OVERRIDES_NAME, OVERRIDES_TEMPLATE, Course
@@ -38,18 +40,19 @@ from px4fuse.classroom.grading.model import (
     list_item_titles,
 )
 from px4fuse.classroom.grading.oral_check import format_questions
-from px4fuse.classroom.grading.records import (
-    DIAGNOSIS_SUFFIX,
-    RECORDS_FOLDER,
-    REDRAWN_REPORT_SUFFIX,
-)
 from px4fuse.core.input_files import suspend_input_registration
 from px4fuse.core.spreadsheet import neutralise_formulas
-from px4fuse.core.text import join_first_names, one_line
+from px4fuse.core.text import clean_text, join_first_names, one_line
 from px4fuse.core.writing import write_output_files
 from px4fuse.errors import SettingsError
-from px4fuse.html.safe import load_template
+from px4fuse.verification.model import Verification
 
+# Subfolder of the output folder for the cached results
+RECORDS_FOLDER = "records"
+# Suffix of the report that px4fuse recomputes from the log
+REDRAWN_REPORT_SUFFIX = ".pdf"
+# Suffix of the report with the faults that px4fuse found, as feedback for the student
+DIAGNOSIS_SUFFIX = ".diagnosis.pdf"
 # Folder of reports that px4fuse recomputes from the logs; safer to open than the submitted PDFs
 REPORTS_FOLDER = "reports"
 FEEDBACK_FOLDER = "feedback"
@@ -292,20 +295,77 @@ def _format_csv(titles: Sequence[str], rows: Iterable[Sequence[str | float | Non
 
 
 def feedback_text(grade: Grade, class_name: str = "") -> str:
-    """Format points, comments and reasons for one student as text."""
+    """Format points, comments and reasons for one student as text, without flags."""
     report = grade.counted_report
-    reasons = report.verification.reasons[:MAX_LISTED_REASONS] if report else ()
-    text = load_template("classroom/grading/feedback.j2").render(
-        grade=grade,
-        report=report,
-        class_name=class_name,
-        reasons="; ".join(filter(None, (shorten_text(reason).rstrip(".") for reason in reasons))),
-        is_total_set=TOTAL_TITLE in grade.overrides,
-        line=shorten_text,
-        number=format_cell_number,
-        wrapped=partial(textwrap.fill, width=88, break_long_words=False, break_on_hyphens=False),
-    )
-    return text.rstrip("\n") + "\n"
+    is_total_set = TOTAL_TITLE in grade.overrides
+    lines = [class_name] if class_name else []
+    if report is None:
+        lines.append("No submission.")
+    else:
+        # the computed points are not printed if the instructor has set the total
+        lines += _format_report_feedback(
+            report, bool(report.items) and (grade.total is None or not is_total_set)
+        )
+    lines.append("")
+    if grade.deducted_points:
+        lines.append(
+            f"Handed in {(grade.lateness_s or 0.0) / 3600.0:.1f} hours late: "
+            f"{format_cell_number(grade.deducted_points)} points deducted."
+        )
+    if grade.total is not None and (grade.deducted_points or is_total_set):
+        lines.append(f"Total    {_format_points(grade.total, grade.max_points)}")
+    if grade.comment:
+        lines += ["", "From your instructor:", "", grade.comment]
+    return clean_text("\n".join(lines).rstrip("\n")) + "\n"
+
+
+def _format_report_feedback(report: GradedReport, has_proposed_points: bool) -> Iterator[str]:
+    """Yield the lines about the counted report of a student."""
+    yield f"Report   {shorten_text(report.submission)}"
+    if student := ", ".join(filter(None, map(shorten_text, (report.student, report.student_id)))):
+        yield f"Student  {student}"
+    points_text = _format_points(report.points, report.max_points)
+    if report.counted_points is None:
+        points_text = f"pending, not counted yet (proposed: {points_text})"
+    if has_proposed_points:
+        yield f"Points   {points_text}"
+    yield f"\n{_wrap_text(_describe_verification(report.verification))}\n"
+    for item in report.items:
+        yield f"{_format_points(item.points, item.max_points)}  {shorten_text(item.title)}"
+        if item.comment:
+            yield textwrap.indent(_wrap_text(item.comment, 84), "    ")
+    if has_proposed_points:
+        text = (
+            "These points are a proposal; your instructor decides. Ask if you think that a point "
+            "is missing."
+        )
+        yield f"\n{_wrap_text(text)}"
+
+
+def _describe_verification(verification: Verification) -> str:
+    if verification.status == "verified":
+        return "Your report is verified: px4fuse computes the same numbers from your log."
+    statement = "Your report could not be verified"
+    if verification.status == "numbers differ":
+        statement = (
+            "The numbers in your report differ from those that px4fuse computes from the same log"
+        )
+    elif verification.status == "other log":
+        statement += ", because its log is missing"
+    reasons = (shorten_text(text).rstrip(".") for text in verification.reasons[:MAX_LISTED_REASONS])
+    advice = "Make a new report of the log that you were given, and hand in the unchanged PDF."
+    if verification.missing:
+        missing_file = shorten_text(verification.missing)
+        advice = f"Hand in {missing_file} if your instructor does not have it."
+    return f"{statement}: {'; '.join(filter(None, reasons))}. {advice}"
+
+
+def _format_points(points: float, max_points: float) -> str:
+    return f"{format_cell_number(points)} of {format_cell_number(max_points)}"
+
+
+def _wrap_text(text: str, width: int = 88) -> str:
+    return textwrap.fill(text, width, break_long_words=False, break_on_hyphens=False)
 
 
 # ------------------------------------------------------------------ platform tables
