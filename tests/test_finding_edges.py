@@ -243,7 +243,7 @@ UNKNOWN = "The log does not show why EKF2 fused no position"
         (never_fusing(age_s=-4.1), "the timestamps are 4.10 s in the future", "TIMESYNC"),
         (
             never_fusing(age_s=0.31),
-            "0.31 s old at arrival. EKF2 fuses no position that is older than 0.20 s",
+            "0.31 s old at arrival. EKF2 fuses no position older than 0.20 s",
             "EKF2_DELAY_MAX to 350 ms",
         ),
         (

@@ -76,7 +76,7 @@ def test_results_of_too_few_updates_give_reason_instead_of_zero(sample_flight):
     _, made = document(sample_flight, start_s=40.0, end_s=41.0)
     north = made.axes["north"]
     assert isinstance(north.filters["kf"], UntestedFilter)
-    assert "only 4 innovations" in north.filters["kf"].reason
+    assert "only 4 measurements" in north.filters["kf"].reason
     assert "nis_mean" not in to_json(north.filters["kf"])
     assert_valid(to_json(made))
 

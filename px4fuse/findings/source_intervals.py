@@ -105,7 +105,9 @@ def _find_action_for_unlogged_positions(analysis: Analysis, start_s: float, end_
     for track in analysis.flight.positions:
         if track.origin.aid == analysis.source.origin.aid and len(track.samples[start_s:end_s]) > 2:
             return f"Run again with --position-source {track.name}, which contains these positions."
-    return "Use a faster SD card, or log fewer topics (SDLOG_PROFILE)."
+    if analysis.flight.log.dropouts:
+        return "Use a faster SD card, or log fewer topics (SDLOG_PROFILE)."
+    return "Log fewer topics (SDLOG_PROFILE)."
 
 
 def _make_stop_or_begin_finding(analysis: Analysis, span_s: Span, fused_aids: list[Aid]) -> Finding:

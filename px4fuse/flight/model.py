@@ -107,7 +107,10 @@ SOURCE_ORIGINS = (
 
 
 def find_source_origin(kind: str, route: str) -> SourceOrigin:
-    return next(origin for origin in SOURCE_ORIGINS if (origin.kind, origin.route) == (kind, route))
+    for origin in SOURCE_ORIGINS:
+        if (origin.kind, origin.route) == (kind, route):
+            return origin
+    raise ValueError(f"no position source has the kind {kind!r} and the route {route!r}")
 
 
 REPEATED_TIMESTAMPS_NOTE = (
