@@ -209,10 +209,9 @@ def test_action_that_keeps_settings_is_not_in_do_this() -> None:
     sender = Action("sender", "Remove outliers before sending.")
     kept = Action("EKF2", "keep the settings: EKF2's gate rejects these outliers")
     no_option = Action("KF", "no option makes KF reject outliers")
-    untested = Action("KF", "do not change this setting alone")
     cause = DiagnosedCause(
         id="source_outliers", severity="error", title="Outliers", why="",
-        actions=(sender, kept, no_option, untested),
+        actions=(sender, kept, no_option),
     )  # fmt: skip
     assert _format_actions((cause,), ()) == ("Sender: remove outliers before sending.",)
 
