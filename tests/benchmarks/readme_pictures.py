@@ -64,7 +64,7 @@ PICTURES = (
     Picture("explore", "explore sample_logs/aisle_uwb.ulg"),
     Picture("lab_1", AISLE, "Position and velocity along the main axis"),
     Picture("lab_2", SMALL_Q, "Innovations and variances along"),
-    Picture("lab_3", AISLE, "position difference, "),
+    Picture("lab_3", AISLE, "Difference between KF and EKF2, setting"),
     Picture("lab_4", "loop sample_logs/loop_vio.ulg", "Loop closure", "Loop closures and RPE"),
     Picture("lab_5", EVALUATE, "Trajectory error"),
 )
