@@ -44,7 +44,7 @@ TESTED_TO_CURVE_WIDTH_RATIO = 1.3
 # Number of time offsets near the maximum at which the likelihood is computed
 FINE_GRID_OFFSET_COUNT = 11
 # Maximum distance (s) of time offsets between which the likelihood is interpolated
-MAX_INTERPOLATED_OFFSET_STEP_S = 0.02
+MAX_INTERPOLATED_OFFSET_STEP_S = 0.05
 # Number of points of the likelihood curve in the report
 LIKELIHOOD_CURVE_POINT_COUNT = 121
 # Prior σ (rad) of EKF2's heading with GNSS: a wrong GNSS delay (0.2 s) causes an error of 5°
