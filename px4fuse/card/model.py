@@ -113,7 +113,7 @@ class Action(Record):
     where: Literal["shell", "console", ""] = ""
 
     def changes_something(self) -> bool:
-        return not self.sentence.startswith(("no ", "do not ", "keep the settings"))
+        return not self.sentence.startswith(("no ", "keep the settings"))
 
 
 class CardRerun(Record, kw_only=True):
