@@ -354,5 +354,5 @@ def test_alignment_action_names_ev_yaw_bit_without_orientation() -> None:
     flight = aids_only(status_flags={"yaw_align": pd.Series([0.0], [0.0])})
     flight.log = log(parameters={"EKF2_EV_CTRL": 9, "EKF2_MAG_TYPE": 5})
     (finding,) = ekf2_state.detect_missing_alignment(flight, SEGMENT, source())
-    assert "send the orientation of the source and let EKF2 fuse" in finding.remedy
+    assert "the orientation, which is missing or constant, and let EKF2 fuse" in finding.remedy
     assert "Calibrate the magnetometer" not in finding.remedy

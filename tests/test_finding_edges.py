@@ -839,7 +839,7 @@ def test_accelerometer_bias_report_contains_95_percent_interval() -> None:
     one = analysis(systematic_errors=with_bias(0.3, 0.05, -0.4), ekf2=bias_of_ekf2(0.1, -0.2, 0.0))
     finding = only(imu.detect_accelerometer_bias, one)
     assert "tilt error of 2.9° has the same effect" in finding.message  # 0.5 of 9.80665 m/s²
-    assert "EKF2 estimates +0.10 m/s² forward and -0.20 m/s² right." in finding.message
+    assert "EKF2's bias estimate is +0.10 m/s² forward and -0.20 m/s² right." in finding.message
     assert finding.evidence == {"bias_m_s2": 0.5, "sigma_m_s2": 0.05}
     outside = bias_of_ekf2(9.0, 9.0, 9.0)["accelerometer_bias"].iloc[[0, 4]]
     assert (

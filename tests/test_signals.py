@@ -274,6 +274,7 @@ def test_evaluated_segment_uses_start_and_end_options():
     for start_s, end_s, said in (
         (9.0, 9.0, "is not after"), (9.0, 5.0, "is not after"), (50.0, None, "0 positions"),
         (5.0, 5.3, "at least 3"), (18.5, 19.5, "at least 3"),
+        (50.0, 60.0, "between 50 s and 60 s"),
     ):  # fmt: skip
         with pytest.raises(SettingsError, match=said):
             choose_segment(flight, track, start_s, end_s)

@@ -494,9 +494,11 @@ def _explain_differing_verdicts(
         if not finding_ids.isdisjoint(fault_ids):
             return sentence
     if corrected_filters.issuperset(filters_with_differing_ratios):
+        filter_labels = " and ".join(FILTER_NAMES[name] for name in filters_with_differing_ratios)
         return (
-            "The first fault on this card hardly changes the innovations, but it increases the "
-            "errors against ground truth. The re-run without this fault reduces the position error."
+            f"The first fault on this card hardly changes the innovations of {filter_labels}, but "
+            "it increases the errors against ground truth. The re-run without this fault reduces "
+            "the position error."
         )
     if analysis.source.origin.may_drift:
         return (

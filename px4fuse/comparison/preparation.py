@@ -293,7 +293,8 @@ def explain_missing_source(flight: Flight) -> Unavailable:
     for item in flight.missing:
         if item.reason == HEIGHT_ONLY_REASON:
             reason = f"{item.source}: {HEIGHT_ONLY_REASON}"
-        elif item.remedy == NO_FIX_ACTION:
+    for item in flight.missing:
+        if item.remedy == NO_FIX_ACTION:
             reason += f"; {item.source}: {item.reason}"
             remedy = f"{NO_FIX_ACTION} Or {remedy}"
     if flight.log.damage:
@@ -379,7 +380,8 @@ def choose_segment(
         chosen_end_s = chosen_end_s if end_s is None else end_s
         reason = f"chosen with {' and '.join(given_options)}"
         clipped_span_s = max(chosen_start_s, 0.0), min(chosen_end_s, log.duration_s)
-        if (chosen_start_s, chosen_end_s) != clipped_span_s:
+        is_outside_log = clipped_span_s[0] >= clipped_span_s[1]
+        if (chosen_start_s, chosen_end_s) != clipped_span_s and not is_outside_log:
             chosen_start_s, chosen_end_s = clipped_span_s
             reason += "; the log covers only part of the chosen time"
     segment = Segment(

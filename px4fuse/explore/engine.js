@@ -128,7 +128,7 @@ const Engine = (() => {
   }
 
   // Position and its variance at other ascending times, NaN outside the KF run
-  // (kalman.predict_state and predict_variance)
+  // (kalman.predict_track)
   function stateAt(run, times) {
     const { steps: s, settings } = run, { time, p, v, acceleration } = s, n = time.length;
     const position = new Float64Array(times.length).fill(NaN), variance = position.slice();

@@ -267,8 +267,8 @@ def detect_bad_acceleration(analysis: Analysis, aids: Mapping[str, AidResult]) -
         for name in AIDS_OF_VERTICAL_ACCELERATION_TEST
         if name in aids and aids[name].verdict == "overconfident"
     }
-    cause = "Normal noise can set this flag (fs_bad_acc_vertical) for some seconds."
-    remedy = "If the flag stays set, check the IMU for vibration and clipping."
+    cause = "Normal noise can set the flag fs_bad_acc_vertical for some seconds."
+    remedy = "If fs_bad_acc_vertical stays set, check the IMU for vibration and clipping."
     if too_small_noises:
         parameters_text = " and ".join(sorted(too_small_noises))
         cause = f"The measurement noise is set too small: {parameters_text}."
@@ -358,7 +358,7 @@ def _make_innovation_change_finding(name: str, aid: AidResult) -> Finding:
         f"The mean {axis} innovation of {_format_aid_label(aid)} shifts by "
         f"{format_number(abs(mean_change) * innovation_sigma, 2)} {aid.unit} at {time_s:.0f} s "
         f"({abs(mean_change):.1f} times √S of {format_number(innovation_sigma, 2)} {aid.unit}).",
-        f"Check which device near the sensor was switched or moved at {time_s:.0f} s.",
+        f"Check which device near the sensor was switched on or off, or moved, at {time_s:.0f} s.",
         {"aid": name, "axis": axis, "time_s": time_s, "moved": mean_change},
         ((time_s, time_s + INNOVATION_MEAN_WINDOW_S),),
     )

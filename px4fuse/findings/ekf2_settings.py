@@ -235,7 +235,7 @@ def detect_parameter_changes(analysis: Analysis) -> Findings:
                 f"before and {format_metres(rmse_after_m)} m after the change."
             )
         action = (
-            f"Analyse the flight before (--end {time_s:.1f}) and after the change "
+            f"Analyse the flight before (--end {time_s:.1f}) and after the parameter change "
             f"(--start {time_s:.1f}) separately."
         )
         if name in fusion_parameters:

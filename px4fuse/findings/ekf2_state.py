@@ -215,8 +215,13 @@ def _find_heading_action(flight: Flight, source: PositionTrack | None) -> str:
     action = magnetometer_advice(flight) or f"Enable the magnetometer ({MAG.switch} 0)."
     if source is None or not source.origin.is_vision:
         return action
-    sending_text = "send the orientation of the source and " if source.orientation is None else ""
-    return f"{action} Alternatively, {sending_text}let EKF2 fuse this yaw (EKF2_EV_CTRL bit 3)."
+    sending_text = ""
+    if source.orientation is None:
+        sending_text = "send the orientation, which is missing or constant, and "
+    return (
+        f"{action} Alternatively, {sending_text}let EKF2 fuse the yaw of the source (EKF2_EV_CTRL "
+        "bit 3)."
+    )
 
 
 def detect_resets(analysis: Analysis, ekf2: Ekf2) -> Findings:

@@ -67,7 +67,8 @@ def detect_impossible_acceleration(analysis: Analysis) -> Findings:
         f"The accelerometer values are impossible: up to {max_force_m_s2:,.0f} m/s², first at "
         f"{start_s:.1f} s. Sensors of autopilots measure at most 32 g (314 m/s²). The simulator "
         "has diverged, or the log is damaged.",
-        f"Analyse only the time before these values (--end {max(start_s - 1.0, 0.0):.1f}).",
+        "Analyse only the time before the impossible values "
+        f"(--end {max(start_s - 1.0, 0.0):.1f}).",
         {"max_m_s2": max_force_m_s2, "count": len(times_s), "at_s": start_s},
         ((start_s, times_s[-1]),),
     )
@@ -91,7 +92,9 @@ def detect_accelerometer_bias(analysis: Analysis) -> Findings:
         )
         if ekf2_bias_m_s2 is not None:
             forward, right, _ = ekf2_bias_m_s2
-            message += f" EKF2 estimates {forward:+.2f} m/s² forward and {right:+.2f} m/s² right."
+            message += (
+                f" EKF2's bias estimate is {forward:+.2f} m/s² forward and {right:+.2f} m/s² right."
+            )
         sensor_text = "accelerometers and the level horizon"
     elif ekf2_bias_m_s2 is not None:
         # If the horizontal bias is not significant, test only the vertical bias
@@ -140,7 +143,7 @@ def detect_tumbling(analysis: Analysis) -> Findings:
             "attitude_failure",
             f"Roll or pitch exceeded PX4's failure-detector limits (FD_FAIL_R, FD_FAIL_P) at "
             f"{start_s:.1f} s. Later data do not represent normal flight.",
-            f"Analyse only the time before this tilt (--end {max(start_s - 1.0, 0.0):.1f}).",
+            f"Analyse only the time before the large tilt (--end {max(start_s - 1.0, 0.0):.1f}).",
             {"total_s": sum(end - start for start, end in spans)},
             spans,
         )
