@@ -85,6 +85,13 @@ def test_extract_writes_innovations_of_all_axes_in_one_table(written, sample_fli
         np.testing.assert_array_equal(rows[frame.columns], frame)
 
 
+def test_extracted_imu_table_without_logged_clipping_has_its_column(sample_flight):
+    for imu in (sample_flight.imu, sample_flight.imu.drop(columns="clipped")):
+        table = extraction.tables(replace(sample_flight, imu=imu))["imu"]
+        assert table.columns.tolist() == ["time_s", *sample_flight.imu.columns]
+    assert table["clipped"].isna().all()
+
+
 def test_extract_from_gnss_flight_writes_gnss_innovations(tmp_path):
     log = tmp_path / "o.ulg"
     log.write_bytes(to_ulog(simulate(make_scenario("outdoor", passes=1, length_m=10.0))))

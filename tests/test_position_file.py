@@ -355,7 +355,7 @@ def test_read_position_file_drops_rows_without_position(read, missing):
     x[0] = x[20] = z[21] = missing
     file = read(table({**PLAIN, "x": x, "z": z}, separator=";"))
     assert_track(file, rows=np.setdiff1d(np.arange(ROWS), [0, 20, 21]))
-    assert_stated(file, "dropped rows without valid time or position: 3")
+    assert_stated(file, "dropped rows without valid time or position: 3 (first: line 2)")
 
 
 def test_read_position_file_drops_row_with_too_few_columns(read):
@@ -363,7 +363,7 @@ def test_read_position_file_drops_row_with_too_few_columns(read):
     lines[30] = UNIX_S[29] + ",1.0\n"
     file = read("".join(lines))
     assert_track(file, rows=np.setdiff1d(np.arange(ROWS), [29]))
-    assert_stated(file, "dropped rows without valid time or position: 1")
+    assert_stated(file, "dropped rows without valid time or position: 1 (first: line 31)")
 
 
 def test_read_position_file_drops_last_line_without_line_feed(read):

@@ -140,7 +140,7 @@ REFUSED = {
         for typed, said in (
             ("--set EKF2_BARO_DELAY=1", ", ".join(PARAMETERS)),
             ("--set EKF2_EVP_NOISE", "is not NAME=VALUE"),
-            ("--set EKF2_EVP_NOISE=much", "'much' is not a number"),
+            ("--set EKF2_EVP_NOISE=much", "EKF2_EVP_NOISE: 'much' is not a number"),
             ("--set EKF2_EVP_GATE=4SD", "'4SD' is not a number in SD. Give 4"),
             ("--set EKF2_EVP_NOISE=nan", "not a finite number"),
             ("--set EKF2_EVP_GATE=3 --set EKF2_EVP_GATE=4", "given twice"),

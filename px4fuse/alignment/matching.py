@@ -196,7 +196,7 @@ def _require_unique_match(match: Match) -> None:
     if fit.concordance < MIN_CONCORDANCE_TO_ACCEPT_MATCH[reference_name]:
         raise NoMatchError(
             f"the position file does not match the {reference_name}: Lin's concordance correlation "
-            f"coefficient is {fit.concordance:.2f} (limit "
+            f"coefficient is {fit.concordance:.2f} (minimum "
             f"{MIN_CONCORDANCE_TO_ACCEPT_MATCH[reference_name]:g})"
         )
     ambiguity_text = ""
@@ -255,7 +255,10 @@ def _fit_file_in_frame(
     grid_track = tracks.resample_to_grid(tracks.remove_spikes(file_track))
     if reference.name == IMU_REFERENCE:
         if len(grid_track.time_s) * GRID_STEP_S < tracks.MIN_OVERLAP_S:
-            raise NoMatchError(f"the position file is shorter than {tracks.MIN_OVERLAP_S:g} s")
+            raise NoMatchError(
+                f"the position file is shorter than {tracks.MIN_OVERLAP_S:g} s, too short for a "
+                "match with the IMU"
+            )
         position_m = tracks.apply_band_pass(tracks.apply_band_pass(grid_track.position_m))
         file_track = grid_track = tracks.mark_transients(replace(grid_track, position_m=position_m))
     if lag_s is None:

@@ -59,8 +59,8 @@ _evaluation_option = partial(options.request_option, EvaluationRequest)
 )
 @_evaluation_option(
     "max_gap_s",
-    "Maximum gap (s) in the reference for interpolation; for nearest, maximum time difference.  "
-    "[default: from the rate of the reference; 0.01 s for nearest]",
+    "Maximum gap (s) in the reference for interpolation; with --association nearest, maximum time "
+    "difference.  [default: from the rate of the reference; 0.01 s for nearest]",
 )
 @_evaluation_option(
     "time_offset_s",
@@ -69,7 +69,7 @@ _evaluation_option = partial(options.request_option, EvaluationRequest)
 )
 @_evaluation_option(
     "consecutive",
-    "Compute the RPE over consecutive pairs of poses that do not overlap.",
+    "Compute the RPE over consecutive, non-overlapping pairs of poses instead of all pairs.",
 )
 @options.system_option
 @options.max_size_option

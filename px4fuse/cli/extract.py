@@ -42,7 +42,8 @@ def extract(
     """Export a log as tables (CSV or Parquet).
 
     Writes one table per data type, and flight.json (log, topics, clocks and missing data). The
-    names of columns contain the units.
+    names of columns contain the units: north_m_s2 is in m/s², north_m2 in m². time_s is the time
+    since the first sample. Axes are north, east and down, or forward, right and down (body).
     """
     check_output_folder(output)
     if format == "parquet" and importlib.util.find_spec("pyarrow") is None:

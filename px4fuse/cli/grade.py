@@ -40,7 +40,9 @@ from px4fuse.errors import OutputError, SettingsError
 @input_option("--key", "FILE.json", "Answer key from px4fuse simulate --assignment.")
 @output_option("DIR", "Output folder.")
 @click.option("--title", help="Title of the class page.  [default: the rubric's title]")
-@input_option("--roster", "FILE.csv", "Class list.  [default: the students in --key]")
+@input_option(
+    "--roster", "FILE.csv", "Class list with all students.  [default: the students in --key]"
+)
 @click.option(
     "--attempt",
     type=Choice(("latest", "best", "first")),
@@ -58,8 +60,8 @@ from px4fuse.errors import OutputError, SettingsError
     "--late",
     "late_rule_text",
     metavar="RULE",
-    help="Deduction of points per started day of delay: '10%/day' or '10%/day up to 50%'.  "
-    "[default: none]",
+    help="Deduction per started day of delay, in % of all points: '10%/day' or "
+    "'10%/day up to 50%'.  [default: none]",
 )
 @click.option(
     "--grace",
@@ -72,8 +74,8 @@ from px4fuse.errors import OutputError, SettingsError
     "--scale",
     type=click.FloatRange(0.0, min_open=True),
     metavar="POINTS",
-    help="Maximum points on the learning platform, for --worksheet.  [default: the points of the "
-    "rubric]",
+    help="Maximum points on the learning platform, to which the grades in --worksheet are scaled.  "
+    "[default: the points of the rubric]",
 )
 @count_option(
     "--questions",
@@ -86,14 +88,14 @@ from px4fuse.errors import OutputError, SettingsError
 @input_option(
     "--worksheet",
     "FILE.csv",
-    "Moodle grading worksheet, Canvas gradebook, or another table with student ids or names, to be "
-    "copied with the grades; repeatable.",
+    "Moodle grading worksheet, Canvas gradebook, or another table with student ids or names; a "
+    "copy with the grades is written. Repeatable.",
     multiple=True,
 )
 @click.option("--column", metavar="TITLE", help="Title of the grade column in --worksheet.")
 @flag_option(
     "--anonymous",
-    help="Show pseudonyms on the class page; names.csv lists the students.",
+    help="Show pseudonyms on the class page; names.csv lists the student of each pseudonym.",
 )
 @count_option(
     "--jobs",
@@ -181,7 +183,8 @@ def _require_output_outside(output: Path, input_paths: tuple[Path, ...]) -> None
     for path in input_paths:
         if path.is_dir() and any(map(path.samefile, output_and_parents)):
             raise OutputError(
-                f"-o {output} is inside the input {path}. Choose another output folder."
+                f"-o {output} is inside the input {path}: the next run would read the output. "
+                "Choose another output folder."
             )
         for file in list_files_recursively(path):
             add_input(file)

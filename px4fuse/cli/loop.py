@@ -70,7 +70,8 @@ _loop_option = partial(options.request_option, LoopRequest)
 @options.flag_option(
     "--open",
     "is_open_path",
-    help="The vehicle did not return to the take-off place.",
+    help="Do not use the landing as a loop closure: the vehicle did not return to the take-off "
+    "place.",
 )
 @click.option(
     "--closure",
@@ -97,7 +98,8 @@ _loop_option = partial(options.request_option, LoopRequest)
     "--reference",
     type=options.InputPath(str),
     metavar="FILE|LOG:TRACK",
-    help="Reference for ATE and RPE, in addition to the ground truth of the log.",
+    help="Reference trajectory for the ATE and RPE of each path, in addition to the ground truth "
+    "of the log.",
 )
 @_loop_option(
     "position_drift_m",

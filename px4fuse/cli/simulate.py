@@ -135,7 +135,8 @@ class CommandWithFaultTable(click.Command):
     "answer_key_path",
     type=NonEmptyPath(),
     metavar="FILE.json",
-    help="Answer key to write, not for students.  [default with --assignment: DIR_answers.json]",
+    help="Answer key to write (injected faults, biases, outliers, clock offset), not for "
+    "students.  [default with --assignment: DIR_answers.json]",
 )
 @flag_option("--no-truth", help="Write no ground truth to the log.")
 @flag_option("--no-ekf2", help="Do not simulate EKF2, to save time.")

@@ -17,7 +17,10 @@ def _parse_number(parameter_name: str, text: str) -> Any:
     from px4fuse.flight.ekf2_parameters import PARAMETERS
 
     unit = PARAMETERS[parameter_name].printed_unit if parameter_name in PARAMETERS else ""
-    return options.NumberWithUnit(unit).convert(text, None, None)
+    try:
+        return options.NumberWithUnit(unit).convert(text, None, None)
+    except click.BadParameter as error:
+        raise click.BadParameter(f"{parameter_name}: {error.message}") from error
 
 
 def parse_parameter(text: str) -> tuple[str, float]:

@@ -59,6 +59,8 @@ def tables(flight: Flight) -> dict[str, pd.DataFrame]:
         for name, samples in streams.items()
         if isinstance(samples, pd.DataFrame)
     }
+    if "imu" in tables:  # NaN if not logged
+        tables["imu"] = tables["imu"].assign(clipped=lambda imu: imu.get("clipped", np.nan))
     if isinstance(ekf2, Ekf2):
         tables |= _make_ekf2_tables(ekf2)
     if not isinstance(flight.airborne, Unavailable):

@@ -151,7 +151,10 @@ def read_position_file(
         axis=1
     )
     if unusable_count := np.count_nonzero(~is_usable):
-        notes.append(f"number of dropped rows without valid time or position: {unusable_count}")
+        notes.append(
+            f"number of dropped rows without valid time or position: {unusable_count}"
+            f"{table.format_first_line_number(numbers.index[~is_usable])}"
+        )
     times_without_position = numbers.loc[has_time & ~is_usable, time_column].to_numpy()
     numbers = numbers[is_usable]
     time_units, min_interval_s, max_interval_s = TRAJECTORY_TIMES if is_trajectory else UWB_TIMES
@@ -260,7 +263,7 @@ def _open_table(
     if is_bag(path):
         return read_bag(path, body_name)
     content = read_bytes_limited(
-        path, LogError, MAX_FILE_BYTES, remedy_if_empty="Copy the position file again."
+        path, LogError, MAX_FILE_BYTES, remedy_if_empty="Copy or export the file again."
     )
     refuse_foreign_format(path, content, LogError)
     table = find_table(path, content, columns, body_name)

@@ -59,8 +59,8 @@ class PositionTable:
     # Text of the rows, without the header
     rows_text: str
     separator: str = ","
-    # Line number of the header; 0 for other formats
-    header_line: int = 0
+    # Line number of the header, 0 without header; None for formats without lines
+    header_line: int | None = None
     # Possible coordinate frames; empty if all are possible
     frames: tuple[str, ...] = ()
     # Frame rate, if the time column contains frame numbers
@@ -78,6 +78,12 @@ class PositionTable:
         )
         return join_first_names([*labels], 12)
 
+    def format_first_line_number(self, rows: pd.Index) -> str:
+        """Return the line number of the first row as text, such as " (first: line 7)"."""
+        return (
+            "" if self.header_line is None else f" (first: line {self.header_line + 1 + rows[0]})"
+        )
+
     def read_cells(self, columns: Iterable[int]) -> pd.DataFrame:
         """Return the text of the given columns, without empty rows."""
         column_indices = sorted({*columns})
@@ -92,6 +98,7 @@ class PositionTable:
                 dtype=str,
                 skipinitialspace=True,
                 quoting=csv.QUOTE_NONE,
+                skip_blank_lines=False,  # so that the index gives the line number
             )
         except ValueError as error:
             raise LogError(
@@ -296,6 +303,7 @@ def _find_body_table(
         "OptiTrack Motive CSV export" if is_motive else "Vicon Nexus CSV export",
         [*first_columns, *column_names.where(is_chosen, "")[2:]],
         rows_text,
+        header_line=axes_row + 1,
         # Motive exports y up by default, or z up; the file does not state which
         frames=("eus", "enu") if is_motive else (),
         rate_hz=None if is_motive else float(rows[1][0]),
@@ -367,7 +375,7 @@ def _find_headerless_table(path: Path, text: str, lines: Sequence[str]) -> Posit
             note = "the file has no header: columns 1 to 4 are read as time, x, y, z"
             rows_text = _remove_comments(text)
             return PositionTable(
-                display_name(path), name, column_names, rows_text, separator, notes=(note,)
+                display_name(path), name, column_names, rows_text, separator, 0, notes=(note,)
             )
     return None
 

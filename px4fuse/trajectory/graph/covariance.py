@@ -114,7 +114,7 @@ def _test_edge(
     ):
         raise TrajectoryError(
             f"The closure from vertex {vertices[0]} to {vertices[1]} cannot be tested: its "
-            "information matrix is zero, or its magnitude differs much from the odometry",
+            "information matrix is zero, or differs by many orders of magnitude from the odometry",
             "Give information matrices of similar magnitude.",
         )
     d2 = float(projected_residual @ np.linalg.solve(residual_covariance, projected_residual))
