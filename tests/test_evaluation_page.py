@@ -109,13 +109,15 @@ def test_rpe_growth_distinguishes_noise_from_drift(kind: str, times: float) -> N
         "walk": np.cumsum(rng.normal(0.0, 0.01, (n, 3)), axis=0),
         "scale": 0.05 * line(n).position_m,
     }[kind]
-    sentence = describe_rpe_growth(evaluate_with_error(error).rpe)
+    rpe = evaluate_with_error(error).rpe
+    sentence = describe_rpe_growth(rpe)
     growth = re.search(
         r"From 1 to 10 m \(--rpe\), the RPE RMSE grows by a factor of ([\d.]+?)\. ", sentence
     )
     assert float(growth[1]) == pytest.approx(times, rel=0.1)
     assert "1 for independent noise, 3.2 for a random walk, 10 for a scale" in sentence
-    assert "Add a second distance" in describe_rpe_growth(evaluate_with_error(error).rpe[:1])
+    assert describe_rpe_growth((replace(rpe[0], unit="s"), *rpe)) == sentence
+    assert "Add a second distance" in describe_rpe_growth(rpe[:1])
 
 
 # -- panels ----------------------------------------------------------------------------------------

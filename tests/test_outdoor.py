@@ -227,7 +227,7 @@ def test_what_if_uses_logged_heading_if_mag_is_not_replayed(tmp_path: Path) -> N
     assert result.notes[0] == HEADING_LOGGED_NOTE
     errors = [one.heading_error_mean_deg for one in (result.logged, *result.whatif)]
     assert errors[1] == pytest.approx(errors[0], abs=0.1)
-    with pytest.raises(SettingsError, match="the replay of this log fuses only gnss_pos"):
+    with pytest.raises(SettingsError, match="the log does not contain all magnetometer samples"):
         what_if(model, [{"EKF2_MAG_NOISE": 0.1}])
 
 

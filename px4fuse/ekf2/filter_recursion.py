@@ -242,14 +242,14 @@ def run_segment(  # noqa: PLR0912, PLR0915 (one recursion, read from top to bott
     ) = np.array(
         [
             (
-                one.estimates_biases,
-                one.estimates_attitude,
-                one.has_gate,
-                one.uses_logged_decisions,
-                one.uses_reported_noise,
-                one.fuses_velocity,
+                configuration.estimates_biases,
+                configuration.estimates_attitude,
+                configuration.has_gate,
+                configuration.uses_logged_decisions,
+                configuration.uses_reported_noise,
+                configuration.fuses_velocity,
             )
-            for one in configurations
+            for configuration in configurations
         ]
     ).T
     # The arrays of events have the shape (events, filters, ...)

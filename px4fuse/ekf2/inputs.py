@@ -257,8 +257,9 @@ def prepare_inputs(  # noqa: PLR0911, PLR0912 (one return per reason)
         return Unavailable(
             ANALYSIS_NAME,
             f"EKF2 also fused {', '.join(unmodelled_aids)}, which the model does not contain",
-            "Disable this fusion before the next flight (EKF2_OF_CTRL 0, EKF2_GPS_CTRL 0, or bit 2 "
-            "(velocity) of EKF2_EV_CTRL cleared).",
+            "Disable this fusion before the next flight (EKF2_OF_CTRL 0, "
+            f"{'' if is_gnss else 'EKF2_GPS_CTRL 0, '}"
+            "or bit 2 (velocity) of EKF2_EV_CTRL cleared).",
         )
     if missing_imu := _explain_missing_imu(imu.index.to_numpy()):
         return missing_imu

@@ -266,8 +266,10 @@ def list_modelled_aids(inputs: ReplayInputs) -> list[str]:
 
 def _describe_modelled_aids(inputs: ReplayInputs) -> str:
     text = f"the replay of this log fuses only {', '.join(list_modelled_aids(inputs))}"
+    if inputs.aid == GNSS_POS and MAG.noise not in inputs.settings:
+        text += "; the log does not contain all magnetometer samples that EKF2 fused"
     if inputs.reason_for_logged_height:
-        text += f"; it uses the logged EKF2 height ({inputs.reason_for_logged_height})"
+        text += f"; the replay uses the logged EKF2 height ({inputs.reason_for_logged_height})"
     return text
 
 

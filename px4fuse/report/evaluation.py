@@ -201,20 +201,22 @@ def describe_unaligned_rmse(evaluation: Evaluation) -> str:
 def describe_rpe_growth(rpe: tuple[RelativeError, ...]) -> str:
     """Describe the growth of the relative pose error (RPE) with distance or time."""
     interval_note = "RMSE with its 95 % interval."
-    # of the first unit: distances, times and numbers of frames cannot be compared
+    # Distances, times and numbers of frames cannot be compared: use the most frequent unit
+    units = [error.unit for error in rpe]
+    unit = max(units, key=units.count, default="")
     rmse_by_delta = {
         error.delta: errors_m.rmse
         for error in rpe
         if isinstance(errors_m := error.translation_m, Statistics)
         and errors_m.rmse > NEGLIGIBLE_ERROR_M
-        and error.unit == rpe[0].unit
+        and error.unit == unit
     }
     if len(rmse_by_delta) < 2:
         return (
             f"{interval_note} Add a second distance with --rpe: drift grows with distance, noise "
             "does not."
         )
-    smallest, largest, unit = min(rmse_by_delta), max(rmse_by_delta), rpe[0].unit
+    smallest, largest = min(rmse_by_delta), max(rmse_by_delta)
     return (
         f"{interval_note} From {smallest:g} to {largest:g} {unit} (--rpe), the RPE RMSE grows "
         f"by a factor of {rmse_by_delta[largest] / rmse_by_delta[smallest]:.2g}. Expected: 1 for "

@@ -167,7 +167,8 @@ class Scenario:
         if self.length_m < min_length_m:
             raise SettingsError(
                 f"--length {self.length_m:g} m is too short for --speed {self.speed_m_s:g} "
-                f"m/s: acceleration, braking and corners need {min_length_m:g} m."
+                f"m/s: acceleration, braking and corners need {min_length_m:g} m. Increase "
+                "--length or reduce --speed."
             )
 
     @property

@@ -28,6 +28,8 @@ def summary(simulation: Simulation, answer: Path | None) -> Page:
     page.write_labelled(
         "Position", f"{source}, {scenario.source_sigma_m:g} m at {scenario.source_rate_hz:g} Hz"
     )
+    if scenario.kind == "loop":
+        page.write_labelled("VIO drift", f"{scenario.vio_drift:.1%} of the distance flown")
     page.write_labelled(
         "IMU", f"{scenario.imu_rate_hz:g} Hz, SIGMA_A {scenario.sigma_a_m_s2:g} m/s²"
     )
