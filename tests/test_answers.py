@@ -71,6 +71,8 @@ def test_read_answer_form_returns_filled_in_values(tmp_path: Path) -> None:
         (EMPTY.replace('q1 = ""', 'q1 = "half"'), "q1 is 'half'; give a number"),
         (EMPTY.replace('kind = ""', 'kind = "yaw"').replace('size = ""', 'size = "big"'),
          "size of mistake 1 is 'big'; give a number"),
+        ("mistake = 5", "mistakes is '5'; give"),
+        ("ekf2_did = [5]", "ekf2_did is '5'; give a list of texts"),
         (EMPTY.replace('verdict_kf = ""', 'verdict_kf = "good"'),
          "verdict_kf is 'good'; give one of consistent, overconfident"),
         ("x = " + "[" * 450, "Correct the answer form"),

@@ -304,15 +304,16 @@ def _describe_error(error: Exception, form_toml: str, form_values: dict[str, Any
     invalid_value: Any = form_values
     for name in names:
         invalid_value = invalid_value[int(name) if name.isdigit() else name]
-    field_name, *indices_and_names = names
-    number = int(indices_and_names[0]) + 1 if indices_and_names else 0
-    if number and isinstance(invalid_value, dict):
-        return f"mistake {number}: {reason}"
-    label = {
-        "mistakes": f"{names[-1]} of mistake {number}",
-        "quantities": f"q{number}",
-        "choices": f"c{number}",
-    }.get(field_name, field_name)
+    label = names[0]
+    if len(names) > 1:
+        number = int(names[1]) + 1
+        if isinstance(invalid_value, dict):
+            return f"mistake {number}: {reason}"
+        label = {
+            "mistakes": f"{names[-1]} of mistake {number}",
+            "quantities": f"q{number}",
+            "choices": f"c{number}",
+        }.get(label, label)
     accepted_values = ACCEPTED_ANSWER_BY_FIELD.get(names[0]) or ACCEPTED_ANSWER_BY_FIELD.get(
         names[-1], NUMBER_HELP
     )

@@ -60,9 +60,10 @@ class AssignableFault(Record):
     earliest_start_s, latest_start_s : float
         Range of the start of the fault; 0 for a fault of the whole flight.
     masked_fault_groups : str
-        Groups of faults that px4fuse cannot detect in a flight with this fault. Reasons: the
-        estimates of time offset and yaw need the IMU at full rate; outliers increase rejections and
-        NIS, and change the yaw estimate; a wrong delay is detected by rejected good samples.
+        Groups, separated by blanks, of faults that px4fuse cannot detect in a flight with this
+        fault. Reasons: the estimates of time offset and yaw need the IMU at full rate; outliers
+        increase rejections and NIS, and change the yaw estimate; a wrong delay is detected by
+        rejected good samples.
     """
 
     flight_kind: ScenarioKind

@@ -59,7 +59,8 @@ class CorrectionRule(Record):
     Attributes
     ----------
     score : float
-        1/2 if the parameter does not correct the fault, and 1/3 if it hides the fault.
+        Fraction of the points: 1 for a correction, 1/2 if the parameter does not correct the
+        fault, and 1/3 if it hides the fault.
     right_values : str
         "LOW to HIGH", or the name of a computed range; "" if any value is right.
     """

@@ -296,6 +296,17 @@ def flag_settings(results: ReportedResults) -> Iterator[str]:
             f"The student analysed only {analysed_fraction:.0%} of the log ({settings.start_s:.1f} "
             f"to {settings.end_s:.1f} s of {log_duration_s:.1f} s). Ask the student for the reason."
         )
+    has_no_imu = any(finding.id == "acceleration_not_logged" for finding in results.findings)
+    if settings.input == "zero" and not has_no_imu:
+        yield "KF did not use the IMU (--input zero)."
+    source = results.source
+    if source.path != "as received" and any(
+        track.path == "as received" for track in source.available
+    ):
+        yield (
+            f"The position source is {source.name} ({source.path}). The log also contains the "
+            "positions as received by PX4."
+        )
 
 
 def _flag_drift(request: LoopRequest) -> Iterator[str]:
