@@ -444,7 +444,7 @@ def test_ardupilot_messages_contain_no_px4_advice(read, missing_messages):
         texts += [
             f"{f.message} {f.remedy}"
             for f in diagnose_comparison(compare(flight)).findings
-            if f.id not in ("not_px4", "innovations_need_ulog")
+            if f.id != "not_px4"
         ]
     else:
         with pytest.raises(MissingDataError) as refused:

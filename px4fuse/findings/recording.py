@@ -114,17 +114,19 @@ def detect_other_estimators(analysis: Analysis) -> Findings:
         yield make_note(
             "not_px4",
             f"This log is from {log.autopilot}, not PX4, so the report contains no PX4 parameters.",
-            f'In this report, "EKF2" stands for the estimator of {log.autopilot}. Ignore actions '
-            "that name PX4 parameters or the ULog.",
+            f'In this report, "EKF2" stands for the estimator of {log.autopilot}.',
             {"autopilot": log.autopilot},
         )
     if log.format.startswith("MAVLink"):
         contents = "states and variances" if isinstance(ekf2.variance, pd.DataFrame) else "states"
+        action = "Give the ULog of this flight as argument LOG."
+        if not log.writes_ulog:
+            action = "The innovations are in the DataFlash log (.BIN), which px4fuse does not read."
         yield make_note(
             "innovations_need_ulog",
             f"A MAVLink recording contains the {contents} of EKF2, but no innovations. The "
             "consistency of EKF2 cannot be tested.",
-            "Give the ULog of this flight as argument LOG.",
+            action,
         )
 
 
