@@ -526,6 +526,7 @@ def test_align_position_file_of_sitl_log_recovers_clock_offset(
     assert clock_error_s(alignment, true_s) < 2.0 * (alignment.clock_offset_sigma_s or 0.0)
 
 
+@pytest.mark.slow
 def test_file_aligned_with_delayed_ekf2_is_realigned_with_imu():
     faults = parse_faults(["clock-offset=-0.25", "ekf2-delay=0.001"])
     late = simulate_flight(Scenario(seed=3, passes=4), faults)

@@ -114,6 +114,7 @@ def test_ekf2_model_of_sample_flight_agrees_with_log(model: Ekf2Model) -> None:
         assert axis.nis_mean_replayed == pytest.approx(axis.nis_mean_logged, rel=0.02)
 
 
+@pytest.mark.slow
 def test_ekf2_replay_memory_does_not_grow_with_setting_count(
     model: Ekf2Model, monkeypatch: pytest.MonkeyPatch
 ) -> None:

@@ -518,6 +518,7 @@ def test_trajectory_time_offset_is_recovered_at_each_sample_rate(
     assert back.offset_s == pytest.approx(-offset_s, abs=2e-3)
 
 
+@pytest.mark.slow
 def test_trajectory_time_offset_interval_contains_true_offset() -> None:
     reference, held = flight(40.0, 100.0), 0
     random = np.random.default_rng(8)
@@ -591,6 +592,7 @@ def test_time_offset_of_shifted_public_trajectory_is_recovered(pair: tuple[str, 
 # -- intervals -------------------------------------------------------------------------------------
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("phi", [0.0, 0.9, 0.97])
 def test_rmse_confidence_interval_contains_true_rmse(phi: float) -> None:
     random = np.random.default_rng(9)

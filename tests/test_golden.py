@@ -15,6 +15,7 @@ import os
 import re
 import shlex
 import shutil
+from collections.abc import Iterable
 from contextvars import copy_context
 from pathlib import Path
 from typing import Any
@@ -141,8 +142,13 @@ def kept_pages(request: pytest.FixtureRequest, monkeypatch: pytest.MonkeyPatch) 
     return blocks
 
 
+def mark_slow(names: Iterable[str], slow_names: set[str]) -> list[Any]:
+    """Return the parameters of a test; mark those that take seconds."""
+    return [pytest.param(n, marks=pytest.mark.slow) if n in slow_names else n for n in names]
+
+
 @pytest.mark.usefixtures("cached_analyses")
-@pytest.mark.parametrize("name", COMMANDS)
+@pytest.mark.parametrize("name", mark_slow(COMMANDS, {"compare_loop"}))
 def test_command_output_matches_reference_file(
     name: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, kept_pages: list[Any]
 ) -> None:
@@ -203,7 +209,7 @@ def spread(kind: str, *mistakes: str) -> list[str]:
     ] + list(of_values(make_answer_key(made)))
 
 
-@pytest.mark.parametrize("kind", SCENARIO_KINDS)
+@pytest.mark.parametrize("kind", mark_slow(SCENARIO_KINDS, {"loop", "outdoor"}))
 def test_simulated_flight_values_match_reference_file(kind: str) -> None:
     """Flight without faults, then the lines that differ with each fault."""
     clean = spread(kind)

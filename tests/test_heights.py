@@ -200,6 +200,7 @@ def opened_once() -> Ekf2Model:
     return opened(outdoors())
 
 
+@pytest.mark.slow
 def test_what_if_baro_noise_equals_flight_with_same_baro_noise() -> None:
     model = opened_once()
     assert model.agreement.baro_hgt["down"].innovation_correlation > 0.999

@@ -326,6 +326,7 @@ def test_info_ends_without_traceback_on_each_test_log(shared_logs, monkeypatch, 
             assert any(remedy in a.remedy for a in inventory.advice), path.name
 
 
+@pytest.mark.slow
 def test_info_on_log_with_any_one_topic_removed_succeeds(sample_log, tmp_path):
     whole = load(sample_log)
     short = Log([take(t, range(0, len(t.fields["timestamp"]), 40)) for t in whole.topics])

@@ -189,6 +189,7 @@ def test_mcp_prompt_has_the_log_in_a_separate_message(tmp_path: Path, serve: Any
     connect(serve(tmp_path), talk)
 
 
+@pytest.mark.slow
 @posix
 @each_server
 def test_mcp_call_with_invalid_file_or_argument_is_an_error(tmp_path: Path, serve: Any) -> None:

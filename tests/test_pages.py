@@ -762,6 +762,7 @@ def test_pdf_comparison_ignores_rounded_last_digit(pdf: bytes) -> None:
 # -- limits --------------------------------------------------------------------------------------
 
 
+@pytest.mark.slow
 def test_pdf_comparison_beyond_time_limit_reports_difference(
     pdf: bytes, monkeypatch: pytest.MonkeyPatch
 ) -> None:

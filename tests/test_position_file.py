@@ -500,6 +500,7 @@ def check_any(read, content: bytes) -> None:
     assert all(len(line.splitlines()) == 1 for line in (*file.format_detection_notes, *file.notes))
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     "line",
     [line * 9_000 for line in (b'"', b" ", b"1 ", b"1,", b"(", b"x,", b"a1B", b"_", b"1", b"[ ")],

@@ -50,6 +50,9 @@ def flown(*mistakes: str, sigma_a=0.27, sigma_z=0.10, passes=4) -> Analysis:
     )
 
 
+SLOW = pytest.mark.slow
+
+
 def cause(analysis: Analysis, owner: Any, of: Any = "nis") -> Rerun:
     return find_cause_rerun(analysis.reruns, owner, "aisle", of)
 
@@ -62,7 +65,9 @@ def test_filter_reruns_of_consistent_flight_report_no_cause() -> None:
     ("mistake", "settings", "owner", "of", "change"),
     [
         ("", {"sigma_z": 0.03}, "kf", "nis", {"sigma_z_m": (0.1, 0.01)}),
-        ("", {"sigma_z": 0.4}, "kf", "nis", {"sigma_z_m": (0.1, 0.01)}),
+        pytest.param(
+            "", {"sigma_z": 0.4}, "kf", "nis", {"sigma_z_m": (0.1, 0.01)}, marks=SLOW
+        ),
         ("", {"sigma_a": 0.02}, "kf", "nis", {"sigma_a_m_s2": (0.27, 0.05)}),
         ("nlos=7%", {}, "kf", "nis", {OUTLIERS_KEY: (25, 4)}),
         ("nlos=7%", {}, "ekf2", "nis", {OUTLIERS_KEY: (25, 4)}),
@@ -72,14 +77,20 @@ def test_filter_reruns_of_consistent_flight_report_no_cause() -> None:
         (LATE, {}, "ekf2", "nees",
          {"EKF2_EV_DELAY": (250, 60), "EKF2_DELAY_MAX": (300, 0)}),
         # no parameter of EKF2 shifts positions to an earlier time than their timestamp
-        ("clock-offset=-0.19", {}, "ekf2", "nees", {TIME_OFFSET_KEY: (0.19, 0.06)}),
+        pytest.param(
+            "clock-offset=-0.19", {}, "ekf2", "nees", {TIME_OFFSET_KEY: (0.19, 0.06)}, marks=SLOW
+        ),
         ("accel-bias=0.5", {}, "kf", "nis",
          {FORWARD_BIAS_KEY: (0.5, 0.03), TO_RIGHT: (-0.04, 0.03)}),
         ("yaw=20", {}, "kf", "nees", {ROTATION_KEY: (-20, 4)}),
         ("yaw=20", {}, "ekf2", "nees", {ROTATION_KEY: (-20, 4)}),
         ("ekf2-noise=0.03", {}, "ekf2", "nis", {"EKF2_EVP_NOISE": (0.1, 0.01)}),
-        ("ekf2-noise=0.5", {}, "ekf2", "nis", {"EKF2_EVP_NOISE": (0.1, 0.01)}),
-        ("ekf2-gate=1", {"passes": 6}, "ekf2", "nis", {"EKF2_EVP_GATE": (5, 0)}),
+        pytest.param(
+            "ekf2-noise=0.5", {}, "ekf2", "nis", {"EKF2_EVP_NOISE": (0.1, 0.01)}, marks=SLOW
+        ),
+        pytest.param(
+            "ekf2-gate=1", {"passes": 6}, "ekf2", "nis", {"EKF2_EVP_GATE": (5, 0)}, marks=SLOW
+        ),
         ("ekf2-delay=0.175", {}, "ekf2", "nees", {"EKF2_EV_DELAY": (0, 0)}),
     ],
 )  # fmt: skip
@@ -189,6 +200,7 @@ def test_rerun_gives_kf_ekf2_difference_with_and_without_change() -> None:
     )
 
 
+@pytest.mark.slow
 def test_rerun_with_time_offset_shifts_times_of_outliers() -> None:
     analysis = flown("clock-offset=-0.19", "nlos=7%")
     count = cause(analysis, "ekf2").change[OUTLIERS_KEY]

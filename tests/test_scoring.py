@@ -274,6 +274,7 @@ class TestScore:
         made = assess_results(with_notes("", student__id="s01"), key=key(sha256="c" * 64))
         assert "log of the report is not in the answer key" in made.instructor_action
 
+    @pytest.mark.slow
     @pytest.mark.parametrize("results", [EXAMPLE, LOOP], ids=["compare", "loop"])
     def test_any_results_that_follow_the_schema_can_be_scored(self, results):
         """Extreme values and missing parts, as far as the schema allows."""

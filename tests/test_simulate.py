@@ -391,6 +391,7 @@ def nis(scenario, names=("north", "east", "down")):
     return found, compute_nis_band(len(nu))
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("errors", "off", "share"), [
     ({}, np.inf, 0.75), (IDEAL, 0.03, 0.88),
 ], ids=["usual", "ideal"])  # fmt: skip

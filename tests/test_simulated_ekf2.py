@@ -88,6 +88,7 @@ def test_simulated_ekf2_with_faults_agrees_with_replay(texts, scenario):
         assert axis.s_ratio_median == pytest.approx(1.0, abs=0.01)
 
 
+@pytest.mark.slow
 def test_simulated_ekf2_of_clean_flights_is_consistent():
     values, inside, errors, stated = [], [], [], []
     for seed in range(8):

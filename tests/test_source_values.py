@@ -388,6 +388,7 @@ def without_truth(analysis: Analysis, imu_x_m: float) -> Analysis:
     return replace(analysis, flight=flight)
 
 
+@pytest.mark.slow
 def test_lever_arm_estimate_from_imu_includes_imu_position() -> None:
     """A sensor 0.4 m behind the IMU is at the vehicle's origin if EKF2_IMU_POS_X is 0.4 m."""
     behind = mounted((-0.4, 0.0))

@@ -153,6 +153,7 @@ def points(outcome: GradeOutcome) -> dict[str, float | None]:
     return {one.student_id: one.total for one in outcome.grades}
 
 
+@pytest.mark.slow
 def test_second_grade_run_applies_changed_rubric_and_overrides(lab, monkeypatch) -> None:
     verified = skip_verification(monkeypatch)
     outcome = lab.grade()

@@ -233,6 +233,7 @@ def test_tune_separates_imu_bias_and_tilt_from_noise() -> None:
     assert found.noises.random_walk_m == 0.0
 
 
+@pytest.mark.slow
 def test_sigma_a_estimate_is_unbiased_if_vehicle_moves_little() -> None:
     """A scale signal that contains the noise would explain part of it (errors in variables)."""
     ratios = [

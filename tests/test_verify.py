@@ -145,6 +145,7 @@ def move_lines(pdf: bytes, by: float) -> bytes:
     return forged(pdf, *changes)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("which", ["aisle", "loop"])
 def test_verify_accepts_report_of_other_operating_system(
     which: str, request: pytest.FixtureRequest
@@ -608,6 +609,7 @@ def test_verify_command_prints_and_writes_the_verdict(
     assert json.loads(output)["status"] == "cannot verify"
 
 
+@pytest.mark.slow
 def test_verify_command_finds_a_renamed_log(tmp_path: Path) -> None:
     target = tmp_path / "loop.pdf"
     run_checked("loop", f"{LOOP_LOG}:ekf2", "-o", target)

@@ -88,6 +88,7 @@ def test_loop_withholds_closure_and_findings_for_assignment(
     assert (data["loop"]["closures"], data["findings"]) == ([], [])
 
 
+@pytest.mark.slow
 def test_grade_adds_diagnosis_to_report_on_student_assignment(
     assigned: Assigned, tmp_path: Path
 ) -> None:
@@ -102,6 +103,7 @@ def test_grade_adds_diagnosis_to_report_on_student_assignment(
     assert to_json(again) == to_json(results)
 
 
+@pytest.mark.slow
 def test_report_on_log_without_its_assignment_key_is_rejected(
     assigned: Assigned, tmp_path: Path
 ) -> None:
