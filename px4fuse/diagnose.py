@@ -197,11 +197,11 @@ def refine_delay(comparison: Comparison, time_offset: SourceTimeOffset | Unavail
     # The delay is the negative time offset
     refined_convention = structs.replace(comparison.convention, late_s=-time_offset.offset_s)
     refined_comparison = replace(comparison, convention=refined_convention)
-    # late_s of the faults is 0 if the delay is too small to be a fault: keep the first estimate
-    is_delay_a_fault = (
+    # late_s of the faults is 0 if the delay is too small to be a fault. Then the first estimate stays
+    is_fault_before_and_after = (
         comparison.convention_faults.late_s and refined_comparison.convention_faults.late_s
     )
-    return refined_comparison if is_delay_a_fault else comparison
+    return refined_comparison if is_fault_before_and_after else comparison
 
 
 def read_flight(request: ComparisonRequest, progress: Progress = ignore_progress) -> Flight:
@@ -259,6 +259,7 @@ def prepare_comparison(
             "State the offset (--clock-offset SECONDS), or omit --clock-offset.",
         )
     if not time_offset.is_significant(time_offset.remaining_s):
+        # Delay of the positions that prepare_comparison_inputs has already corrected
         applied_s = time_offset.applied_s
         low_s, high_s = (limit_s - applied_s for limit_s in time_offset.interval_s)
         notes = [

@@ -279,6 +279,7 @@ def flown(tmp_path: Path, mistake: str, seed: int) -> Ekf2Model:
     return opened(read_log(log))
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("mistake", "seed", "changes"), [
     ("ekf2-noise=0.02", 1, {"EKF2_EVP_NOISE": 0.1}),
     ("ekf2-noise=0.02", 2, {"EKF2_EVP_NOISE": 0.1}), ("ekf2-gate=1", 1, {"EKF2_EVP_GATE": 5.0}),

@@ -204,6 +204,7 @@ def test_simulated_ekf2_ignores_samples_with_older_timestamps():
 # --- faults in EKF2 parameters
 
 
+@pytest.mark.slow
 def test_simulated_ekf2_holds_position_if_fusion_is_disabled(clean):
     flight = flown("ekf2-off")
     assert flight.log.parameters["EKF2_EV_CTRL"] == 0.0

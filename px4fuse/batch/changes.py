@@ -76,9 +76,9 @@ SETTING_PATHS_BY_LABEL = {
     "hardware": "log.hardware",
     "px4fuse": "provenance.px4fuse",
 }
-# Settings that are copied from the other input if A and B are different logs
+# Settings that `diff A B` copies from one input to the other if the inputs are different logs
 _FILTER_SETTINGS = {*Settings.__dataclass_fields__, "axes"}
-# Settings that name input files. They are not copied if A and B are the same log
+# Settings that name input files. `diff A B` does not copy them between inputs of the same log
 _INPUT_FILE_SETTINGS = {"log", "system", "position"}
 
 

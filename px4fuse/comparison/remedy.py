@@ -145,7 +145,7 @@ def estimate_differing_delay_ms(
     if (
         applied_s
         and low_s <= applied_s <= high_s
-        and not comparison.convention_faults.late_s  # px4fuse applied this offset itself
+        and not comparison.convention_faults.late_s  # px4fuse detected and applied this offset
     ):
         offset_s = applied_s
     estimated_delay_ms = 1e3 * (comparison.source.assumed_delay_s - offset_s)

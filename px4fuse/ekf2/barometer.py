@@ -85,6 +85,11 @@ def find_fused_barometer_samples(
 def _combine_barometer_samples(
     ekf2: Ekf2, fusion_record: FusionRecord, logged_down_m: pd.Series, interval_s: float
 ) -> pd.Series:
+    """Return the barometer heights (m, down) that EKF2 fused, by time (s).
+
+    The log contains only some of them. The others follow from ``logged_down_m``, from the bias
+    updates of EKF2 and from its filtered innovation.
+    """
     logged_barometer_updates = ekf2.aids[BAROMETER.name].samples
     if "observation_down" not in logged_barometer_updates or len(logged_barometer_updates) < 2:
         return logged_down_m

@@ -305,7 +305,10 @@ def misalign_positions(model: Ekf2Model, rotation_deg: float, delay_s: float) ->
 def compute_delayed_tracks(
     model: Ekf2Model, configurations: Sequence[FilterConfiguration]
 ) -> Iterator[pd.DataFrame]:
-    """Yield position and velocity at the fusion horizon for each filter configuration."""
+    """Yield position and velocity at the fusion horizon for each filter configuration.
+
+    The fusion horizon is EKF2's delayed time. A run contains all configurations of one segment.
+    """
     runs = _run_model(model, configurations)
     for index in map(runs[0].configurations.index, configurations):
         yield pd.concat([_make_delayed_track(run, index) for run in runs])

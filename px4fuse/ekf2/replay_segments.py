@@ -543,9 +543,11 @@ def _make_segment(
         attitude_samples = rows_between(
             attitude_samples, step_times_s[0] - lead_time_s, step_times_s[-1]
         )
-        at_s = attitude_samples.index.to_numpy()
-        inverse_attitude = conjugate(interpolate(at_s, step_times_s, end_attitude))
-        return at_s, multiply(attitude_samples[Columns.QUATERNION].to_numpy(), inverse_attitude)
+        attitude_time_s = attitude_samples.index.to_numpy()
+        inverse_attitude = conjugate(interpolate(attitude_time_s, step_times_s, end_attitude))
+        return attitude_time_s, multiply(
+            attitude_samples[Columns.QUATERNION].to_numpy(), inverse_attitude
+        )
 
     # Rotation (in NED) that turns the gyro's integrated attitude into EKF2's published attitude
     rotation_to_published_attitude = interpolate(

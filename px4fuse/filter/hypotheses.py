@@ -62,7 +62,7 @@ OUTLIER_RETEST_DURATION_AFTER_JUMP_S = 6.0
 MAX_JUMP_FALSE_ALARM_P = 1e-3
 # Probability that a good measurement near a jump is classified as an outlier
 MAX_FALSE_OUTLIER_P = 1e-3
-# Maximum number of times that are tested to locate a detected jump
+# Maximum number of measurement times at which a detected jump is tested, to locate the jump
 MAX_CANDIDATE_JUMP_TIMES = 6
 MAX_JUMPS = 3
 # Minimum accelerometer bias (m/s²) that is reported: half of EKF2_ABL_LIM

@@ -62,16 +62,21 @@ def detect(analysis: Analysis) -> Findings:
 
 def detect_source_gaps(analysis: Analysis) -> Findings:
     """Detect gaps in the position source."""
-    flight, source, ekf2 = analysis.segment.whole_flight, analysis.source, analysis.flight.ekf2
+    whole_flight, source, ekf2 = (
+        analysis.segment.whole_flight,
+        analysis.source,
+        analysis.flight.ekf2,
+    )
     gaps, gaps_only_in_log = list[Span](), list[Span]()
     invalid_times_s = analysis.source.invalid_reasons.index
     for start_s, end_s in analysis.events.gaps:
         if np.any((invalid_times_s > start_s) & (invalid_times_s < end_s)):
             continue  # source_values.py reports these invalid positions
         aids = _find_fused_aids(ekf2, (start_s, end_s))
+        # A position file is not part of the log, so its gaps are real
         if source.origin.aid in aids and source.alignment is None:
             gaps_only_in_log.append((start_s, end_s))
-        elif start_s != flight.start_s and end_s != flight.end_s:
+        elif start_s != whole_flight.start_s and end_s != whole_flight.end_s:
             gaps.append((start_s, end_s))
         elif end_s - start_s > MIN_GAP_AT_START_OR_END_S:
             yield _make_stop_or_begin_finding(analysis, (start_s, end_s), aids)

@@ -426,8 +426,8 @@ def detect_outliers(analysis: Analysis) -> Findings:
         "source_outliers",
         f"{outlier_count} of {axis_tuning.count} {positions_phrase(analysis.source)} "
         f"({format_percent(outlier_fraction, 1)}) are outliers of up to "
-        f"{format_metres(outlier_sizes_m.max())} m. Their median distance to {reference} is "
-        f"{format_metres(float(np.median(outlier_sizes_m)))} m. {source_texts.outlier_causes} KF "
+        f"{format_metres(outlier_sizes_m.max())} m. Median distance of the outliers to "
+        f"{reference}: {format_metres(float(np.median(outlier_sizes_m)))} m. {source_texts.outlier_causes} KF "
         f"follows each outlier.{_format_rejected_outliers(analysis, outlier_time_s)}",
         source_texts.outlier_action,
         {

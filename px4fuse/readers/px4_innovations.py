@@ -360,6 +360,7 @@ def _make_aid_log(
     samples = samples[(samples[[f"variance_{axis}" for axis in aid.axes]] > 0.0).all(axis=1)]
     if samples.empty:
         return None
-    samples = samples.assign(**-samples[[f"innovation_{axis}" for axis in aid.axes]])
+    innovation_columns = [f"innovation_{axis}" for axis in aid.axes]
+    samples = samples.assign(**{name: -samples[name] for name in innovation_columns})
     parameters = aid.logged_parameters(topics.ekf2_parameters)
     return AidLog(used_topics, aid.axes, samples, enabled_flag, parameters, **log_fields)
