@@ -197,7 +197,7 @@ def refine_delay(comparison: Comparison, time_offset: SourceTimeOffset | Unavail
     # The delay is the negative time offset
     refined_convention = structs.replace(comparison.convention, late_s=-time_offset.offset_s)
     refined_comparison = replace(comparison, convention=refined_convention)
-    # late_s of the faults is 0 if the delay is too small to be a fault. Then the first estimate stays
+    # late_s of the faults is 0 if the delay is too small to be a fault: keep the first estimate
     is_fault_before_and_after = (
         comparison.convention_faults.late_s and refined_comparison.convention_faults.late_s
     )

@@ -149,6 +149,7 @@ def test_diff_with_larger_nis_but_same_verdict_is_not_worse(clean):
         assert list_changes(after, after).worse == ()
 
 
+@pytest.mark.slow
 def test_diff_with_additional_fault_is_reported_as_worse(clean):
     late = flown(505, "clock-offset=0.25")
     errors = {one.id for one in late.results.findings if one.severity == "error"}

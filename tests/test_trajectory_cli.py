@@ -90,6 +90,7 @@ def test_loop_command_writes_report_results_tum_and_g2o(made, found) -> None:
     assert [each["accepted"] for each in found["loop"]["closures"]] == [True, False]
 
 
+@pytest.mark.slow
 def test_loop_report_is_reproducible_and_contains_no_paths(made, tmp_path):
     folder, _ = made
     pages = "".join(page.extract_text() for page in pypdf.PdfReader(folder / "r.pdf").pages)
