@@ -428,7 +428,8 @@ def detect_outliers(analysis: Analysis) -> Findings:
         f"({format_percent(outlier_fraction, 1)}) are outliers of up to "
         f"{format_metres(outlier_sizes_m.max())} m. Median distance of the outliers to "
         f"{reference}: {format_metres(float(np.median(outlier_sizes_m)))} m. "
-        f"{source_texts.outlier_causes} KF follows each outlier.{_format_rejected_outliers(analysis, outlier_time_s)}",
+        f"{source_texts.outlier_causes} KF follows each outlier."
+        f"{_format_rejected_outliers(analysis, outlier_time_s)}",
         source_texts.outlier_action,
         {
             "count": outlier_count,
