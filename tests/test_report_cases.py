@@ -22,6 +22,7 @@ def analyse(shared_logs: Path, name: str) -> Analysis:
     ("height_10_m_off", "ekf2_bias_at_limit", ("EKF2_ABL_LIM 0.4", "8.90 m/s²", "9.62 m")),
     ("only_height_sent", "source_coordinate_constant", ("constant: 0, 0 m", "EKF2_EV_CTRL at 2")),
     ("vio_relocalises", "source_relocalises", ("jumps 5 times", "every 12 s", "1.2 s later")),
+    ("height_10_m_off", "ekf2_bias_at_limit", ("measures 8.90 m/s²", "a mean of 8.8 m")),
     ("camera_ahead_of_the_imu", "source_lever_arm", ("+0.12 m forward", "EKF2_EV_POS_X to 0.12")),
 ])  # fmt: skip
 def test_fault_of_public_bug_report_is_reported_first(

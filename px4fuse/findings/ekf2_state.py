@@ -26,7 +26,7 @@ from px4fuse.findings.model import (
     make_warning,
     make_zero_length_spans,
 )
-from px4fuse.flight.ekf2_parameters import MAG
+from px4fuse.flight.ekf2_parameters import BAROMETER, MAG
 from px4fuse.flight.model import (
     BODY_AXES,
     Columns,
@@ -129,18 +129,25 @@ def _detect_bias_at_limit(
                 )
         yield make_error(
             "ekf2_bias_at_limit",
-            message + (_describe_height_error(analysis) if axis_index == 2 else ""),
+            message + (_describe_height_error(analysis, ekf2) if axis_index == 2 else ""),
             f"Calibrate the {sensor}s at the temperature of the flight.",
             {"bias": median_bias, "limit": limit, "limited_fraction": limited_fraction},
         )
 
 
-def _describe_height_error(analysis: Analysis) -> str:
-    down_comparison = analysis.axes.get("down")
+def _describe_height_error(analysis: Analysis, ekf2: Ekf2) -> str:
+    error_text, down_comparison = "", analysis.axes.get("down")
     truth = None if down_comparison is None else down_comparison.filters["ekf2"].truth
-    if not isinstance(truth, ErrorsAgainstTruth):
-        return ""
-    return f" EKF2's height RMSE against ground truth is {format_metres(truth.position_rmse_m)} m."
+    if isinstance(truth, ErrorsAgainstTruth):
+        error_text = (
+            f" EKF2's height RMSE against ground truth is {format_metres(truth.position_rmse_m)} m."
+        )
+    if (barometer_log := ekf2.aids.get(BAROMETER.name)) is not None:
+        innovations = cut_to_segment(barometer_log.samples, analysis.segment)[
+            f"innovation_{barometer_log.axes[0]}"
+        ]
+        error_text += f" Barometer innovations have a mean of {abs(innovations.mean()):.1f} m."
+    return error_text
 
 
 def _detect_gyro_bias(bias_states: pd.DataFrame, median_imu_at_rest: pd.Series | None) -> Findings:
