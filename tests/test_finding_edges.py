@@ -976,7 +976,7 @@ def test_position_outlier_size_is_distance_to_ground_truth() -> None:
         finding = only(source_positions.detect_outliers, analysis(axes=axes, tuning=outliers))
         assert finding.evidence["max_m"] == pytest.approx(np.hypot(north_m, 4.0))
         assert finding.title.startswith("3 of 120 UWB positions (2.5 %) are outliers of up to ")
-        assert f"distance to {reference} is {north_m:.2f} m" in finding.message
+        assert f"outliers to {reference}: {north_m:.2f} m" in finding.message
 
 
 def test_outlier_finding_counts_outliers_that_ekf2_rejected() -> None:
