@@ -40,6 +40,7 @@ from px4fuse.simulation.scenario import Scenario
 
 RIGHT = Settings(0.27, 0.10)
 LATE = "clock-offset=0.25"
+SLOW = pytest.mark.slow
 
 
 @cache
@@ -48,9 +49,6 @@ def flown(*mistakes: str, sigma_a=0.27, sigma_z=0.10, passes=4) -> Analysis:
     return diagnose_comparison(
         compare(flight, Settings(sigma_a, sigma_z), axes=("aisle", "north", "east"))
     )
-
-
-SLOW = pytest.mark.slow
 
 
 def cause(analysis: Analysis, owner: Any, of: Any = "nis") -> Rerun:

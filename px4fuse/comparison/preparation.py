@@ -177,7 +177,7 @@ def choose_source(flight: Flight, name: str | None = None) -> tuple[PositionTrac
     if name is None:
         for track in flight.positions:
             if track.origin.is_auto_candidate:
-                return track, _explain_choice(flight, track)
+                return track, _explain_choice(track)
         missing_source = explain_missing_source(flight)
         raise MissingDataError(f"{flight.log.name}: {missing_source.reason}", missing_source.remedy)
     for track in flight.positions:
@@ -304,13 +304,12 @@ def explain_missing_source(flight: Flight) -> Unavailable:
     return Unavailable("position source", reason, capitalise_first(remedy))
 
 
-def _explain_choice(flight: Flight, track: PositionTrack) -> str:
+def _explain_choice(track: PositionTrack) -> str:
     if track.origin == POSITION_FILE_ORIGIN:
         return "the user gave this position file with --position"
     if track.origin.is_fused_as_gnss:
         return "the only position source in the log, fused by EKF2"
-    log_text = f" (from {track.log})" if track.log and track.log != flight.log.name else ""
-    return f"source chosen automatically; position origin: {track.origin.route}{log_text}"
+    return f"source chosen automatically; position origin: {track.origin.route}"
 
 
 def shift_timestamps(track: PositionTrack, clock_offset_s: float) -> PositionTrack:

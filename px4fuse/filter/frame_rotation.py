@@ -52,7 +52,7 @@ MAX_HEADING_CHANGE_AT_CONVERGENCE_RAD = 0.01
 # Prior σ (rad) of the heading error
 HEADING_SIGMA_RAD = 1.0
 # Minimum estimated ratio of true to measured distances, to avoid a division by zero
-MIN_FITTED_SCALE_FACTOR = 0.1
+MIN_TRUE_TO_MEASURED_SCALE = 0.1
 # Index of the heading error among the constant errors; the first column of increments is the motion
 HEADING_ERROR_INDEX = 2
 
@@ -311,7 +311,9 @@ def _estimate_heading_error_from_positions(
             is_part_long_enough, 0
         ]
         # The smooth path contains the scale factor of the positions, 1 / true_to_measured_scale
-        true_to_measured_scale = np.maximum(1.0 - constant_errors[:, -1], MIN_FITTED_SCALE_FACTOR)
+        true_to_measured_scale = np.maximum(
+            1.0 - constant_errors[:, -1], MIN_TRUE_TO_MEASURED_SCALE
+        )
         error_rad = constant_errors[:, HEADING_ERROR_INDEX] / true_to_measured_scale
         heading_variance_rad2 = (
             constant_errors_covariance[:, HEADING_ERROR_INDEX, HEADING_ERROR_INDEX]

@@ -42,7 +42,7 @@ class PredictionSteps:
 def make_prediction_steps(axis: Axis, settings: Settings) -> PredictionSteps:
     """Return the prediction steps of KF along an axis.
 
-    The first measurement is the initial state.
+    KF starts at the first measurement, which is its initial position.
 
     Raises
     ------

@@ -197,12 +197,11 @@ def estimate_time_offset(
             fits_outliers=False,
         ).noise_parameters
         tested_offsets_s = _make_offset_grid(offset_s, search_half_width_s, FINE_GRID_OFFSET_COUNT)
-        position_fit = fit_constant_errors(
+        scores = fit_constant_errors(
             motion.make_position_batches(tested_offsets_s),
             noise_parameters,
             motion.measurement_weights,
-        )
-        scores = position_fit.compute_scores()[0]
+        ).compute_scores()[0]
         offset_s, offset_sigma_s = _fit_minimum_and_sigma(tested_offsets_s, scores)
         curve_half_width_s = max(CURVE_HALF_WIDTH_SIGMAS * offset_sigma_s, MIN_CURVE_HALF_WIDTH_S)
         search_half_width_s = TESTED_TO_CURVE_WIDTH_RATIO * curve_half_width_s

@@ -53,8 +53,8 @@ class AssignableFault(Record):
     group : str
         Group of faults that mask each other; a flight has at most one of them.
     detection_limit : float
-        Size (in ``unit``) that px4fuse detects in 19 of 20 flights (tests/studies/rates.csv); 0 for
-        a fault without size.
+        Smallest size (in ``unit``) that px4fuse detects in 19 of 20 flights
+        (tests/studies/rates.csv); 0 for a fault without size.
     has_either_sign : bool
         True if the sign of the size is random.
     earliest_start_s, latest_start_s : float
