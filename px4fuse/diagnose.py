@@ -194,10 +194,11 @@ def refine_delay(comparison: Comparison, time_offset: SourceTimeOffset | Unavail
         or not time_offset.is_determinable
     ):
         return comparison
-    # The delay is the negative time offset
+    # A late source has a positive delay and a negative time offset
     refined_convention = structs.replace(comparison.convention, late_s=-time_offset.offset_s)
     refined_comparison = replace(comparison, convention=refined_convention)
-    # late_s of the faults is 0 if the delay is too small to be a fault: keep the first estimate
+    # A delay that is too small to be a fault is 0 in convention_faults. If one of the two delays is
+    # 0, the comparison with the first delay is kept
     is_fault_before_and_after = (
         comparison.convention_faults.late_s and refined_comparison.convention_faults.late_s
     )
@@ -259,7 +260,7 @@ def prepare_comparison(
             "State the offset (--clock-offset SECONDS), or omit --clock-offset.",
         )
     if not time_offset.is_significant(time_offset.remaining_s):
-        # Delay of the positions that prepare_comparison_inputs has already corrected
+        # Time offset (s) that prepare_comparison_inputs has already applied to the timestamps
         applied_s = time_offset.applied_s
         low_s, high_s = (limit_s - applied_s for limit_s in time_offset.interval_s)
         notes = [

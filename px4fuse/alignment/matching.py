@@ -17,21 +17,23 @@ from px4fuse.alignment.tracks import EKF2_REFERENCE, IMU_REFERENCE, NoMatchError
 from px4fuse.flight.model import Flight, Unavailable
 from px4fuse.trajectory.time_offset import GRID_STEP_S, MIN_SECOND_BEST_RESIDUAL_RATIO
 
-# Frames to try if the yaw is estimated; nwu equals enu with another yaw
+# Frames to try if the yaw is estimated, without nwu: it is the same as enu with another yaw
 FRAMES_FOR_ESTIMATED_YAW = ("ned", "enu")
-# Frames to try if the user gives the yaw; frames with y vertical can be ambiguous
+# Frames to try if the user gives the yaw, without frames whose y axis is vertical: the result can
+# be ambiguous
 FRAMES_FOR_GIVEN_YAW = ("ned", "enu", "nwu")
 # Maximum duration (s) of a position file, to limit the computing time
 MAX_FILE_DURATION_S = 86400.0
-# Minimum concordance correlation coefficient (Lin 1989) without a warning
+# Minimum concordance correlation coefficient (Lin 1989) of position file and reference track;
+# below it, px4fuse prints a warning
 MIN_CONCORDANCE_WITHOUT_WARNING = {EKF2_REFERENCE: 0.9, IMU_REFERENCE: 0.7}
-# Maximum standard deviation (s) of a time offset
+# Maximum standard deviation (s) of an accepted time offset
 MAX_TIME_OFFSET_SIGMA_S = 0.5
-# Minimum ratio of the residuals in the second best and the best frame, for an unambiguous result
+# The best frame is unambiguous if the residual in the second best frame is larger by this factor
 MIN_SECOND_TO_BEST_FRAME_RESIDUAL_RATIO = 1.3
-# Minimum ratio of the residuals with given and estimated yaw, for a message about a wrong yaw
+# Minimum residual with the given yaw ÷ residual with the estimated yaw, to report a wrong yaw
 MIN_GIVEN_TO_ESTIMATED_YAW_RESIDUAL_RATIO = 2.0
-# Minimum residual (m, RMS) with the given yaw, for a message about a wrong yaw
+# Minimum residual (m, RMS) with the given yaw, to report a wrong yaw
 MIN_RESIDUAL_OF_MISALIGNED_FRAME_M = 0.3
 
 
@@ -125,7 +127,7 @@ def find_match(flight: Flight, problem: AlignmentProblem) -> Match | None:
             _require_unique_match(match)
             return _refit_without_origin_resets(flight, match, problem)
         except NoMatchError as error:
-            # The IMU is not accurate enough for a check of parameters from the user
+            # All parameters are from the user. The IMU is not accurate enough to check them
             if not missing_options:
                 return None
             if error.remedy:

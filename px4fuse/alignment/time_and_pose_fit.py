@@ -11,17 +11,18 @@ from px4fuse.core.arrays import Array, ComplexArray
 from px4fuse.trajectory.correlation import autocovariance, compute_moments
 from px4fuse.trajectory.time_offset import GRID_STEP_S
 
-# Maximum correction (s) of the lag by least squares
+# Maximum change (s) of the lag from the correlation peak to the least-squares fit
 MAX_LAG_CORRECTION_S = 1.0
 # Minimum concordance correlation coefficient (Lin 1989) of an accepted match
 MIN_CONCORDANCE_TO_ACCEPT_MATCH = {EKF2_REFERENCE: 0.7, IMU_REFERENCE: 0.5}
-# Lower limit of 1 - concordance, so that few samples with equal positions are not preferred
+# Lower limit of 1 - c in the match quality -N·ln(1 - c) of N samples with concordance c. Without
+# this limit, a lag with a few samples at equal positions would be the best match
 MIN_CONCORDANCE_DEFICIT = 1e-4
-# Minimum distance (s) between the lags of two separate correlation peaks
+# Lags within this time (s) of the best lag may belong to the same correlation peak
 MIN_PEAK_DISTANCE_S = 3.0
 # Error (m) of the interpolation of positions to the time grid
 INTERPOLATION_ERROR_M = 0.05
-# Larger position residuals (m) are set to this value, because they may be outliers
+# In the RMS, larger position residuals (m) count as this value, because they may be outliers
 RESIDUAL_CLIP_LIMIT_M = 1.0
 
 
@@ -102,7 +103,7 @@ def find_correlation_peak(
     covariance = moments_by_lag.covariance
     square_sum_m2 = moments_by_lag.sum_of_squares_a + moments_by_lag.sum_of_squares_b
     has_overlap = common_sample_counts >= min_sample_count
-    # At rest, the variance is a rounding error
+    # If the vehicle is at rest in both tracks, the sum of squares is only a rounding error
     has_overlap &= square_sum_m2 > 1e-9 * np.max(square_sum_m2)
     rotated_covariance = (
         np.abs(covariance) if yaw_rad is None else (np.exp(-1j * yaw_rad) * covariance).real

@@ -38,31 +38,36 @@ from px4fuse.flight.model import Columns, Ekf2, Flight, PositionTrack
 from px4fuse.trajectory.association import choose_gap_limit_s, is_bracketed
 from px4fuse.trajectory.rotation import heading
 
-# Minimum lead (nats) of the best convention over the second best, for the verdict "determined"
+# For the verdict "determined", the log-likelihood (nats) of the best convention (axes, unit, delay)
+# must exceed that of the second best by this value
 MIN_CONVENTION_LOG_ODDS = 4.0
-# Minimum log-likelihood gain (nats) over positions that do not depend on the motion
+# If the log-likelihood (nats) of the best convention exceeds that of positions unrelated to the
+# measured motion by less than this value, the convention is not determinable
 MIN_LOG_LIKELIHOOD_GAIN = 8.0
-# Minimum gain per independent sample if only one convention fits
+# Minimum log-likelihood gain (nats) per independent residual, if only one convention fits
 MIN_LOG_LIKELIHOOD_GAIN_PER_SAMPLE = 0.15
-# Minimum gain per independent sample if several conventions fit
+# Minimum log-likelihood gain (nats) per independent residual, if several conventions fit
 MIN_LOG_LIKELIHOOD_GAIN_PER_SAMPLE_IF_AMBIGUOUS = 0.4
-# Accepted ratio of the source's displacements to those from the IMU
+# Limits of the ratio of displacements in the positions to displacements integrated from the IMU
 MIN_SOURCE_TO_IMU_DISPLACEMENT_RATIO, MAX_SOURCE_TO_IMU_DISPLACEMENT_RATIO = 0.88, 1.12
-# A convention is doubtful if σ of its residuals is above this multiple of the expected noise
+# A convention is doubtful if σ of its residuals is above this multiple of σ of the expected noise
 MAX_RESIDUAL_TO_NOISE_RATIO = 2.4
-# σ (m) of the second differences of the position integrated from the IMU
+# σ (m) of the noise in second differences of the position integrated from the IMU
 IMU_SECOND_DIFFERENCE_SIGMA_M = 0.05
-# EKF2's heading is preferred up to this loss in log likelihood (nats), because it refers to north
+# Up to this loss in log-likelihood (nats), EKF2's heading is preferred to the heading of the
+# gyroscopes, because EKF2's heading refers to north
 MAX_LIKELIHOOD_LOSS_WITH_EKF2_HEADING = 20.0
 # Minimum number of GNSS positions for a fit of the heading of the source's frame
 MIN_GNSS_POSITIONS = 30
-# Maximum RMS residual ÷ RMS extent of the GNSS positions, to use the fitted heading
+# The heading fitted to GNSS positions is used if the residual is below this fraction of the extent
+# of the GNSS positions (both RMS)
 MAX_GNSS_RESIDUAL_RATIO = 0.1
-# Minimum log-likelihood gain (nats) to correct a clock drift
+# A clock drift is corrected only if the log-likelihood increases by more than this value (nats)
 MIN_LIKELIHOOD_GAIN_FROM_CLOCK_DRIFT = 15.0
 # Tested clock drifts (rate of the clock minus 1)
 TESTED_CLOCK_DRIFTS = np.linspace(-0.05, 0.05, 21)
-# Minimum log-likelihood gain of a low-pass filter over a delay (simulated delays: below 3)
+# A low-pass filter of the source replaces the estimated delay if it increases the log-likelihood by
+# more than this value (nats). With simulated delays, the increase is below 3
 MIN_LIKELIHOOD_GAIN_FROM_LOW_PASS = 8.0
 # Limits (s) of delays that may be the effect of a low-pass filter
 MIN_LOW_PASS_DELAY_S, MAX_LOW_PASS_DELAY_S = 0.2, 5.0
@@ -318,7 +323,8 @@ def _describe_hypothesis(hypothesis: Hypothesis) -> str:
 
 def compute_residual_ratio(hypothesis: Hypothesis, positions: SentPositions) -> float:
     """Return σ of the horizontal residuals divided by σ of the noise of source and IMU."""
-    # Third differences hardly contain motion; their σ gives the σ of second differences
+    # Third differences of positions hardly contain motion: estimate the noise from third
+    # differences, and convert its σ to second differences
     third_differences = np.diff(positions.position_m, 3, axis=0)
     third_difference_sigma = 1.4826 * float(
         np.median(np.abs(third_differences - np.median(third_differences, axis=0)))
@@ -401,7 +407,7 @@ def _check_orientation(
         imu_motion.time_s < time_s[-1] - SECOND_DIFFERENCE_WINDOW_S
     )
     imu_motion = replace(imu_motion, is_valid=imu_motion.is_valid & is_covered)
-    # Correct headings (°) of the x axis for each body and world frame
+    # Headings (°) of the x axis of the positions if the source's orientation has no heading error
     correct_headings_deg = {"FLU to ENU": [90.0], "FLU to NWU": [0.0]}.get(
         convention.frames, [0.0, 90.0]
     )

@@ -35,19 +35,24 @@ QUATERNIONS_BY_FRAMES: Final[dict[BodyAndWorldFrame, tuple[Array, Array]]] = {
     "FRD to ENU": (ENU_TO_NED, IDENTITY_QUATERNION),
 }
 QUATERNION_ORDERS: tuple[QuaternionOrder, QuaternionOrder] = ("w x y z", "x y z w")
-# Maximum median difference (°) of a copy of EKF2's attitude: motion capture differs by 0.2° or more
+# If the median difference (°) from EKF2's attitude is smaller, the orientation is a copy of EKF2's
+# attitude. Orientations from motion capture differ by 0.2° or more
 MAX_DIFFERENCE_OF_ATTITUDE_COPY_DEG = 0.15
-# Tested delays (s) of a copy of EKF2's attitude
+# Tested delays (s) of an orientation that may be a copy of EKF2's attitude
 COPY_DELAYS_S = np.arange(0.0, 0.205, 0.01)
-# Maximum median tilt difference (°) from the gyroscopes, for a correct convention
+# If the median tilt difference (°) between orientation and gyroscope attitude is larger with the
+# best convention, the orientation is unrelated to the vehicle's attitude
 MAX_TILT_DIFFERENCE_DEG = 6.0
-# Maximum median heading difference (°) from the gyroscopes, for a correct convention
+# If the median heading difference (°) between orientation and gyroscope attitude is larger with
+# the best convention, the orientation is unrelated to the vehicle's attitude
 MAX_HEADING_DIFFERENCE_DEG = 12.0
-# Smaller angle differences (°) count as this value in the score, because they are noise
+# In the score of a convention, smaller median angle differences (°) count as this value, because
+# they are noise
 MIN_ANGLE_DIFFERENCE_IN_SCORE_DEG = 0.7
-# Weight of the angle differences in the score of a convention (1/s)
+# The score of a convention decreases by this factor · duration (s) · ln(median angle difference)
 SCORE_WEIGHT_PER_S = 0.5
-# Minimum lead (nats) of the best convention over the second best, for the verdict "determined"
+# For the verdict "determined", the score of the best convention must exceed that of the second best
+# by this value
 MIN_CONVENTION_SCORE_LEAD = 4.0
 MAX_ORIENTATION_COUNT = 600
 MIN_ORIENTATION_COUNT = 20

@@ -72,7 +72,7 @@ def check_output_folder(folder: Path) -> None:
         for input_folder in (*path.absolute().parents, *path.resolve().parents)
     }
     input_by_identity |= {_read_file_identity(key): path for key, path in input_by_folder.items()}
-    input_by_identity.pop(None, None)  # folders that no longer exist
+    input_by_identity.pop(None, None)  # None is the key of folders that no longer exist
     entries = _list_folder(folder)
     for path in (folder, *entries, *(child for entry in entries for child in _list_folder(entry))):
         input_path = input_by_identity.get(_read_file_identity(path))
