@@ -55,12 +55,13 @@ COMPARED_NUMBER_DEFINITIONS = [
     for row in read_csv(__file__, dict[str, str], "measures.csv")
     for name, label in (FILTER_NAMES.items() if "KF_OR_EKF2" in row["path"] else [("", "")])
 ]
-# Maximum relative difference of two numbers that px4fuse diff does not list
+# px4fuse diff lists a number only if its relative difference between A and B is larger than this
 MAX_OMITTED_RELATIVE_DIFFERENCE = 0.01
-# Maximum difference of two numbers (in their unit) that px4fuse diff does not list
+# px4fuse diff lists a number only if A and B differ by more than this (in the unit of the number)
 MAX_OMITTED_DIFFERENCE = 0.001
 
-# Maximum √(mean NEES) of a consistent filter; wide, because errors in a flight are correlated
+# Maximum √(mean NEES) of a consistent filter; the minimum is 1 ÷ maximum. The limits are wide,
+# because the errors in a flight are correlated
 MAX_SQRT_MEAN_NEES = 2.0
 # Settings and flight properties that px4fuse diff compares
 SETTING_PATHS_BY_LABEL = {
@@ -76,9 +77,10 @@ SETTING_PATHS_BY_LABEL = {
     "hardware": "log.hardware",
     "px4fuse": "provenance.px4fuse",
 }
-# Settings that `diff A B` copies from one input to the other if the inputs are different logs
+# If A and B are of different logs, `diff A B` copies only these settings from one to the other
 _FILTER_SETTINGS = {*Settings.__dataclass_fields__, "axes"}
-# Settings that name input files. `diff A B` does not copy them between inputs of the same log
+# If A and B are of the same log, `diff A B` copies all settings from one input to the other,
+# except these: they describe the input files
 _INPUT_FILE_SETTINGS = {"log", "system", "position"}
 
 
@@ -224,7 +226,7 @@ def collect_compared_numbers(results: Results) -> dict[str, ComparedNumber]:
     axes = {} if isinstance(results, AidsResults) else results.axes
     # EKF2 rejects north and east together, so their rejected fractions are equal: keep only one
     first_horizontal_axis = next((name for name in ("north", "east", AISLE) if name in axes), "")
-    # skip the aiding source of the positions: the axes contain its numbers
+    # the axes already contain the numbers of the aiding source that measured the positions
     aids_of_position_source: tuple[str, ...] = ("ev_pos", "ev_hgt") if axes else ()
     if find_value(results, "source.kind") == "gnss":
         aids_of_position_source = ("gnss_pos",)

@@ -37,13 +37,13 @@ SIGMA_RATIO_COLUMNS = tuple(
 )
 SEVERITIES = list(SEVERITY_SIGNS)
 FILE_LINKS = (("Report (PDF)", "report"), ("Results (JSON)", "results"))
-# Columns with one value per axis
+# Table columns with one value per axis
 AXIS_COLUMNS = [
     name
     for name, path in RESULT_PATH_BY_COLUMN.items()
     if path.startswith(("axis.", "tuning.", "agreement."))
 ]
-# Columns with one value per log, except values in other cells of the page
+# Table columns with one value per log that the details of a log list under "Flight"
 LOG_COLUMNS = (
     *("log", "log_sha256", "px4fuse", "settings", "vehicle", "firmware", "firmware_hash"),
     *("airframe", "hardware", "date", "duration_s", "source", "source_rate_hz", "aids"),
@@ -60,7 +60,7 @@ DROP_DOWN_LABEL_BY_TAG_PREFIX = {
     "finding": "Finding",
     "remedy": "Action",
 }
-# Axes in the order in which they give the numbers of a log
+# Order of preference: the page shows the numbers of the first of these axes that a log has
 AXES_BY_PREFERENCE = ("aisle", "north", "east", "down")
 
 #: Values of one log by name
@@ -246,7 +246,7 @@ def _summarise_log(rows: Sequence[Mapping[str, Any]]) -> LogSummary:
     The summary contains the values of the preferred axis, and values that combine all axes.
     """
     summary: dict[str, Any] = {}
-    # The values of a preferred axis replace those of the axes before it
+    # The preferred axis is last, so its values replace those of the other axes
     for row in sorted(
         rows, key=lambda row: AXES_BY_PREFERENCE.index(row.get("axis", "aisle")), reverse=True
     ):

@@ -22,8 +22,8 @@ FINDING_SEPARATOR = ";"
 
 
 _COLUMN_DEFINITIONS = read_csv(__file__, dict[str, str], "columns.csv")
-#: Path of each table column in the results, for example ``log.firmware``. The records "axis",
-#: "tuning" and "agreement" contain the results of one axis
+#: Path of each table column in the results, for example ``log.firmware``. A path that begins with
+#: "axis", "tuning" or "agreement" refers to the results of the axis of the table row
 RESULT_PATH_BY_COLUMN = {row["column"]: row["path"] for row in _COLUMN_DEFINITIONS}
 #: Data type of each table column; missing numbers are NA, and missing texts are empty
 COLUMN_TYPES = {row["column"]: row["type"] for row in _COLUMN_DEFINITIONS}

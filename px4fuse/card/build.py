@@ -67,9 +67,9 @@ from px4fuse.request import (
 )
 
 MAX_ACTIONS = 3
-# Minimum fraction of rejected positions on the card
+# The diagnosis card states the fraction of rejected positions if it is at least this value
 MIN_REPORTED_REJECTED_FRACTION = 0.01
-# Aiding sources whose √S is usually too large with PX4's default noises
+# Aiding sources for which EKF2's √S is usually too large with PX4's default noises
 USUALLY_UNDERCONFIDENT_AIDS = frozenset({"baro_hgt", "mag", "gravity"})
 SMALL_INNOVATIONS_EXPLANATION = (
     "The innovations are smaller than expected. This is not a fault here: the source may drift, "

@@ -38,9 +38,9 @@ SETTING_CHANGE_KINDS = frozenset({"noises", "noise", "gate", "process noise"})
 CHANGE_KINDS_VISIBLE_ONLY_IN_TRUTH = frozenset({"time offset", "delay", "rotation"})
 # Name endings of PX4 parameters that require a reboot (reboot_required)
 REBOOT_PARAMETER_SUFFIXES = ("_DELAY", "_DELAY_MAX", "_PREDICT_US")
-# Minimum fraction of rejected positions in the table of re-runs
+# The table of re-runs shows the fraction of rejected positions if it is at least this value
 MIN_REJECTED_FRACTION_TO_SHOW = 0.005
-# Device or filter to change, by group of findings
+# Device or filter that the user must change, by group of the finding
 ACTION_TARGET_BY_GROUP: Mapping[str, ActionTarget] = {
     "position source": "sender",
     "time": "sender",
@@ -50,7 +50,7 @@ ACTION_TARGET_BY_GROUP: Mapping[str, ActionTarget] = {
     "loops": "source",
     "logging": "logging",
 }
-# Device to be changed for findings with another device than their group
+# Findings for which the user must change another device or filter than for their group
 ACTION_TARGET_BY_FINDING_ID: Mapping[str, ActionTarget] = {
     "source_drift": "source",
     "source_lever_arm": "EKF2",
@@ -206,7 +206,8 @@ def _make_actions(
     actions = _make_sender_actions(analysis, ranked_cause, offset_rerun, request)
     alternative_action_groups: tuple[tuple[Action, ...], ...] = ()
     if delay_rerun:
-        # Separate actions for parameters that the time shift also changes (EKF2_DELAY_MAX)
+        # The user corrects either the timestamps or the delay parameter. Parameters that both
+        # corrections change (EKF2_DELAY_MAX) are a separate action
         offset_setting_names = offset_rerun.change.keys() if offset_rerun else ()
         delay_parameter_values = {
             name: value
@@ -233,7 +234,7 @@ def _make_actions(
                 change[TIME_OFFSET_KEY] = round(total_s, 3)
             command = command_line(structs.replace(request, **change))
             actions.append(Action("KF", "", (command,), "shell"))
-    # First correct the vehicle, then KF
+    # Actions on the vehicle first, actions on KF last
     actions.sort(key=lambda action: action.target == "KF")
     action_targets = {
         action.target for group in (actions, *alternative_action_groups) for action in group
@@ -266,7 +267,7 @@ def _make_sender_actions(
         return [Action("sender", lowercase_first_letter(format_sender_action(source, shift_s)))]
     if (
         finding.id == "ekf2_gps_delay_wrong"
-        and not ranked_cause.reruns  # estimated by re-runs of the finding itself
+        and not ranked_cause.reruns  # without a re-run, use the estimate in the finding
         and not isinstance(model, Unavailable)
     ):
         delay_change = make_delay_change(model.inputs, float(finding.evidence["estimate_ms"]))

@@ -57,9 +57,10 @@ TERMINATION_SIGNALS = (
     *([signal.SIGHUP] if hasattr(signal, "SIGHUP") else []),
 )
 
-# Environment variables that px4fuse removes: invalid values stop the import of libraries
+# Environment variables that px4fuse removes: with invalid values, libraries cannot be imported
 IGNORED_ENVIRONMENT_VARIABLES = ("MPLBACKEND", "SOURCE_DATE_EPOCH")
-# Option of each Python argument; all other commands have options of px4fuse compare
+# Command-line option of each Python argument, for error messages. Commands that are not listed use
+# the options of px4fuse compare
 OPTION_NAMES_BY_COMMAND = {
     "loop": OPTION_NAMES[LoopRequest],
     "evaluate": OPTION_NAMES[EvaluationRequest],
@@ -102,7 +103,7 @@ class LazyCommandGroup(click.Group):
             error.args = (replace_argument_names(str(error), option_names),)
             raise
         except BrokenPipeError as error:
-            # without errno, because click handles EPIPE with exit code 1
+            # the new error has no errno, because click would end with exit code 1 for EPIPE
             raise BrokenPipeError from error
         except KeyboardInterrupt as interrupt:  # click's own handler prints an empty line
             raise Interrupted(interrupt, describe_written_files(ctx)) from None
@@ -198,7 +199,7 @@ def _configure_libraries() -> None:
     # matplotlib warns if the home folder is read-only, which has no effect on px4fuse
     logging.getLogger("matplotlib").setLevel(logging.ERROR)
     if not set(COMMANDS_WITH_PARQUET) & set(sys.argv[1:2]):
-        # pandas then does not import pyarrow, which needs 70 MB
+        # with this entry, pandas does not import pyarrow, which needs 70 MB
         sys.modules.setdefault("pyarrow", None)  # type: ignore[arg-type]
 
 
@@ -208,7 +209,7 @@ def _flush_output(exit_code: int) -> int:
         sys.stdout.flush()
     except OSError as error:
         _discard_output()
-        if exit_code == 0:  # otherwise px4fuse has already printed an error
+        if exit_code == 0:  # with another exit code, px4fuse has already printed an error
             _print_error(f"standard output cannot be written ({error.strerror}).")
             return 2
     return exit_code
@@ -230,10 +231,10 @@ def _print_error(text: str) -> None:
 
 
 def _raise_interrupt(signal_number: int, _: object) -> None:
-    # handle a termination signal like Ctrl-C, so that temporary files are deleted
+    # end px4fuse as after Ctrl-C, so that temporary files are deleted
     raise KeyboardInterrupt(signal_number)
 
 
 def _discard_output() -> None:
-    # otherwise Python flushes the closed stream at exit and prints an error
+    # without this redirection, Python flushes the closed stream at exit and prints an error
     os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())

@@ -25,12 +25,13 @@ from px4fuse.core.reading import (
 )
 from px4fuse.errors import SettingsError
 
-# Names of tool arguments that differ from the parameter of the command
+# Arguments of MCP tools whose names differ from the parameters of the px4fuse commands
 TOOL_ARGUMENT_BY_PARAMETER = {
     "finding": "finding_id",
     "source": "log",
 }
-# Command parameters that the tools of the server do not offer: outputs, exit codes, student data
+# Parameters of px4fuse commands that the MCP tools do not have: output files, exit codes, and data
+# of students
 PARAMETERS_WITHOUT_TOOL_ARGUMENT = {
     "output",
     "json_path",
@@ -121,7 +122,7 @@ def run_command(
     """
     readable_folders.set(folders)
     max_log_bytes.set(max_bytes)
-    # only in a worker process: commands in the server process write no files
+    # a sender exists only in a worker process; commands in the server process write no files
     if report_folder and sender:
         os.chdir(report_folder)
     output, results_json_texts = io.StringIO(), list[str]()

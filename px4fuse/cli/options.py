@@ -130,7 +130,7 @@ memory_option = click.option(
     default=4.0,
     help="Maximum memory for one log (GB, Linux only).",
 )
-# not in the settings of a report: the size limit does not affect results
+# --max-size is not stored in the settings of a report, because it does not affect results
 max_size_option = click.option(
     "--max-size",
     type=click.IntRange(1),
@@ -202,7 +202,8 @@ def _make_open_option(*names: str) -> OptionDecorator:
 
 #: Option --open of commands that write a report or a page
 open_option = _make_open_option("--open", "--show", "opened")
-#: Option --show of px4fuse loop, whose --open states that the path does not return to its start
+#: Option --show of px4fuse loop. Its --open has another meaning: the path does not return to its
+#: start
 show_option = _make_open_option("--show", "shown")
 #: Options for the student's name and id, notes and answer form
 student_options = _combine_options(

@@ -45,7 +45,7 @@ TITLE_BY_TAB = {
     "gains": "Gain",
     "step": "Step by step",
 }
-# Plots over time; each has its own data sources, so the page fills visible plots only
+# Plots over time. Each plot has separate data sources: the page fills only those of visible plots
 PLOTS = {
     "innovation": Plot("errors", "Innovation ÷ √S", "x"),
     "error": Plot("errors", "Position error (m)", "e", ("kf", "ekf2")),
@@ -63,7 +63,7 @@ BOKEH_SOURCE_COLUMNS = (
     "t p v sp sv "  # t: time (s); p: position (m), v: velocity (m/s); sp, sv: their σ
     "k0 k1 "  # KF gain: k0 of position, k1 of velocity (1/s)
     "e minus plus "  # e: position error (m); minus, plus: limits (m) of its 2σ band
-    "x y marker"  # x: innovation ÷ √S; y: drawn value; marker: arrow head outside the plot
+    "x y marker"  # x: innovation ÷ √S; y: x limited to the plot; marker: arrow head if limited
 )
 KF_LINE_STYLE: BokehStyle = {"line_width": 1.6, "line_color": KF_COLOUR}
 # Style and name in the tooltip of each line, by its data source
@@ -76,7 +76,7 @@ LINE_STYLES: dict[str, tuple[BokehStyle, str]] = {
 KF_BAND_STYLE: BokehStyle = {"fill_color": KF_COLOUR, "fill_alpha": 0.25}
 # Limit (±) of innovation ÷ √S for 95 % of the innovations of a consistent filter
 CONSISTENCY_LIMIT_IN_SQRT_S = 2.0
-# Limit (±) of the plot axis of innovation ÷ √S
+# End (±) of the plot axis for innovation ÷ √S
 PLOT_LIMIT_IN_SQRT_S = 4.6
 
 

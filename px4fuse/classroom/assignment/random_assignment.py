@@ -34,9 +34,11 @@ PROBABILITY_BY_FAULT_COUNT: dict[ScenarioKind, tuple[float, ...]] = {
 }
 # Probability of a loop if the kind of flight is "mixed"
 LOOP_PROBABILITY = 1 / 3
-# Range of the difficulty: size that px4fuse detects, divided by the size of the injected fault
+# Range of the difficulty of an injected fault: smallest size that px4fuse detects ÷ injected size.
+# A fault with difficulty 1 is just detectable
 EASIEST_DIFFICULTY, HARDEST_DIFFICULTY = 0.6, 1.0
-# Probability and maximum difficulty of faults that px4fuse may not detect
+# Probability that a flight has faults with a difficulty above 1, which px4fuse may not detect; and
+# the maximum difficulty of these faults
 HARD_FAULTS_PROBABILITY, MAX_FAULT_DIFFICULTY = 0.25, 1.5
 
 
@@ -108,7 +110,7 @@ class AssignableFault(Record):
 
 
 ASSIGNABLE_FAULTS = read_csv(__file__, AssignableFault, "assignable_faults.csv")
-# Minimum, maximum and decimals of each random field of the scenario, by kind of flight
+# Minimum, maximum and number of decimals of each random field of the scenario, by kind of flight
 SCENARIO_NUMBERS_BY_KIND = read_toml(
     __file__, dict[ScenarioKind, dict[str, tuple[float, float, int]]], "drawn.toml"
 )

@@ -330,7 +330,8 @@ class TuningItem(RubricItem, tag="tuning", rename={"factor_at_zero_points": "fac
             return 0.0, f"Your report has no 95 % interval for {label}{reason_text}."
         lower_bound, upper_bound = interval
         if label == "SIGMA_Z" and scoring_input.has_finding("source_may_drift", "source_drift"):
-            # Larger values are also right: innovations do not contain the drift of the source
+            # If the source drifts, SIGMA_Z may be as large as the position error: the estimate of
+            # SIGMA_Z is from innovations, which do not contain the drift
             upper_bound = max(upper_bound, _find_max_position_error_m(comparison))
         deviation_factor = max(
             chosen_value / upper_bound if upper_bound > 0.0 else math.inf,
@@ -416,7 +417,7 @@ class TimeOffsetItem(RubricItem, tag="clock"):
         if not isinstance(clock, SourceTimeOffset) or not clock.is_determinable:
             reason_text = format_reason(clock.reason or "")
             statement = f"The time offset cannot be estimated from your flight{reason_text}."
-            # a student cannot change the motion in an assigned log
+            # the estimate needs motion, but students cannot change an assigned flight: full points
             if scoring_input.right_answers is not None:
                 return 1.0, statement
             return self.undeterminable if isinstance(clock, SourceTimeOffset) else 0.0, statement
@@ -441,7 +442,7 @@ class TimeOffsetItem(RubricItem, tag="clock"):
 # ------------------------------------------------------------------ check of a loop
 
 
-# Maximum distance (m) between take-off and landing position for which a loop closure is right
+# If the vehicle landed farther (m) from the take-off position, a loop closure would be wrong
 MAX_LANDING_DISTANCE_M = 0.5
 CORRECTED_PATH_NAMES: tuple[CorrectionName, ...] = (
     "by_distance_plain",

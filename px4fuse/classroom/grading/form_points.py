@@ -22,32 +22,34 @@ from px4fuse.results.answer_form import (
     select_questions,
 )
 
-# Fraction of the points for questions about the flight; the rest is for those about plots
+# Fraction of the points for questions about the flight; the rest is for questions about plots
 FLIGHT_QUESTIONS_POINTS_FRACTION = 0.2
 # Points deducted for each false fault
 FALSE_FAULT_DEDUCTION = 10.0
-# Number of false faults (guesses) at which the named faults give no points
+# With this number of false faults or more (guesses), right faults give no points either
 ZERO_POINTS_FALSE_FAULT_COUNT = 3
 # Score for the answer that names a fault similar to the injected fault
 SCORE_FOR_SIMILAR_FAULT = 0.4
-# Score for naming a wrong EKF2_EVP_NOISE if the reported variance is wrong: both make R wrong
+# Score for naming a wrong EKF2_EVP_NOISE if the variance reported by the position source is the
+# injected fault: both faults make R wrong
 SCORE_FOR_WRONG_NOISE_PARAMETER = 2.0 / 3.0
 # Score for naming a consequence of the injected fault, for example outliers after a jump
 SCORE_FOR_NAMED_CONSEQUENCE = 0.15
-# Kinds of injected faults that can be guessed without a measurement
+# Kinds of injected faults that a student can guess: points also depend on the stated size
 GUESSABLE_FAULT_KINDS = frozenset(("open-end",))
-# Relative size error beyond the tolerance at which a guessable fault gives no points
+# The size of a fault in GUESSABLE_FAULT_KINDS gives no points if its relative error exceeds the
+# tolerance by this value
 EXCESS_SIZE_ERROR_AT_ZERO_POINTS = 0.08
 NO_BOUNDS = (-math.inf, math.inf)
-# Minimum tolerance (s) of the start and the end of an injected fault
+# Minimum tolerance (s) of the start and the end of a fault that the student states
 FAULT_TIME_TOLERANCE_S = 2.0
-# Tolerance of the start and the end of a fault, as a fraction of the time since the first sample
+# Tolerance of the start and the end of a fault ÷ time since the first sample
 FAULT_TIME_TOLERANCE_FRACTION = 0.05
 # Maximum relative error of a number that the student computed, for full points
 MAX_NUMBER_ERROR_FULL_POINTS = 0.02
 # Maximum relative error of a number that the student computed, for half of the points
 MAX_NUMBER_ERROR_HALF_POINTS = 0.10
-# Maximum relative error of the size of an injected fault that gives half of the points
+# Maximum relative error of the stated size of an injected fault, for half of the points
 MAX_SIZE_ERROR_HALF_POINTS = 0.4
 
 
@@ -110,13 +112,13 @@ def compute_form_points(answers: Answers, right_answers: CorrectFormAnswers) -> 
     scores["numbers"] = _score_numbers(answers, right_answers)
     scores["verdicts"] = _score_verdicts(answers, right_answers)
     if not scores["numbers"] and not is_recognised_as_fault_free:
-        # verdicts can be guessed, so they give half of the points without a right number
+        # verdicts can be guessed, so they give half of the points if no computed number is right
         scores["verdicts"] *= 0.5
     points = {name: max_points * scores[name] for name, max_points in weights.items()}
     if is_recognised_as_fault_free:
         points["mistakes"] = weights["mistakes"]
     elif right_answers.mistakes and all(fault.size is None for fault in right_answers.mistakes):
-        # without fault sizes, naming the faults also gives the points for sizes
+        # no injected fault has a size: the points for sizes are given for the right fault names
         points["mistakes"] += weights["sizes"] * scores["mistakes"]
     points["mistakes"] -= FALSE_FAULT_DEDUCTION * len(false_faults)
     points["mistakes"] = max(points["mistakes"], 0.0)

@@ -249,7 +249,8 @@ def load_or_verify(
     versions_and_files = _collect_versions_and_files(
         to_json(results), path_by_sha256, assigned_hashes
     )
-    # without logs, the status is "cannot verify" instead of "other log"
+    # the report is about an assigned log that was not given to this command. Without any log,
+    # verify() returns "cannot verify" instead of "other log", which would be the student's fault
     is_log_missing = versions_and_files.get(log_sha256(results)) == "assigned"
     verification = verify(results, pdf, {} if is_log_missing else path_by_sha256)
     files = {REDRAWN_REPORT_SUFFIX: verification.redrawn_pdf} if verification.redrawn_pdf else {}
@@ -316,7 +317,7 @@ def _load_record(
         ):
             return None
         results = read_results(record.results.encode())
-    # the report is verified again if the earlier result is unreadable
+    # if the result of the earlier verification is unreadable, the report is verified again
     except (OSError, msgspec.MsgspecError, ResultsError):
         return None
     return (results, record.verification) if isinstance(results, ReportedResults) else None

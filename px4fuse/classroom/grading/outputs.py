@@ -398,7 +398,8 @@ def find_grade_column(sheet: Sheet, column_title: str) -> int:
     ]
     grade_column_index = sheet.find_column_index(GRADE_COLUMN_TITLES)
     candidate_indices = assignment_indices if grade_column_index is None else [grade_column_index]
-    # a Moodle table has one grade column, so another --column is for another table
+    # a table of Moodle (with a column "identifier") has only one grade column, so a --column that
+    # matches none of its columns refers to another table
     if column_title and (matching_indices or sheet.find_column_index(("identifier",)) is None):
         candidate_indices = matching_indices
     if len(candidate_indices) == 1:
