@@ -32,7 +32,7 @@ from px4fuse.filter.tuning import HORIZONTAL, AxisTuning
 from px4fuse.flight.ekf2_parameters import GNSS_VEL, PARAMETERS
 from px4fuse.flight.model import LogInfo, Unavailable
 
-# Minimum SIGMA_Z (m) in a re-run of KF: the noise of motion capture
+# Minimum SIGMA_Z (m) in a re-run of KF: the position noise of motion capture
 MIN_RERUN_SIGMA_Z_M = 0.005
 SIGMA_A, SIGMA_Z = "sigma_a_m_s2", "sigma_z_m"
 # Kind of change for each KF setting and each correction of the data
@@ -47,7 +47,8 @@ KIND_BY_CHANGE_NAME = {
 }
 KF_NOISE_SETTINGS = frozenset((SIGMA_A, SIGMA_Z))
 ACC_NOISE = "EKF2_ACC_NOISE"
-# Minimum ratio to test a larger EKF2_ACC_NOISE: the estimate also contains tilt errors and biases
+# EKF2 is re-run with a larger EKF2_ACC_NOISE only if the lower limit of the estimate is above this
+# multiple of the logged value: tilt errors and biases also increase the estimate
 MIN_ESTIMATED_TO_LOGGED_ACC_NOISE_RATIO = 3.0
 PARAMETERS_SET_TO_DEFAULT = (
     ACC_NOISE,
@@ -57,7 +58,7 @@ PARAMETERS_SET_TO_DEFAULT = (
     GNSS_VEL.noise,
     GNSS_VEL.gate,
 )
-# Minimum ratio of the yaw misalignment to its σ, to correct it in a re-run
+# A yaw misalignment is corrected in a re-run if it is above this multiple of its σ
 MIN_MISALIGNMENT_SIGMAS = 3.0
 
 
@@ -74,8 +75,8 @@ def find_candidate_changes(
     is_underconfident = statistic == "nis" and summary.nis_mean < 1.0
     axis_tuning = find_axis_tuning(estimates.tuning, axis_result.axis.name)
     changes = list[Change]()
-    # Do not reduce the noise of GNSS or odometry: innovations do not show their slow errors, only
-    # ground truth does
+    # Do not reduce the noise settings for GNSS or odometry: innovations do not show the slow errors
+    # of these sources, only ground truth does
     origin = comparison.source.origin
     may_have_correlated_errors = (
         origin.may_drift or origin.is_gnss
@@ -220,7 +221,7 @@ def _find_ekf2_noise_changes(
 ) -> list[Change]:
     """Return the change of EKF2's position noise to its estimate, if it differs significantly."""
     noise_m = axis_tuning.sigma_z.value
-    if noise_m is None:  # without an estimate: RMS innovation, an upper bound of the noise
+    if noise_m is None:  # no estimate: use the RMS innovation, an upper bound of the noise
         noise_m = float(np.hypot(summary.innovation_std_m, summary.innovation_mean_m))
     change = make_estimated_noise_change(ekf2_inputs, axis_tuning.sigma_z, noise_m)
     return [change] if change else []
@@ -231,7 +232,7 @@ def _find_default_changes(log: LogInfo, ekf2_inputs: ReplayInputs) -> list[Chang
     gate, logged_parameters, changes = ekf2_inputs.aid.gate, ekf2_inputs.settings, list[Change]()
     for name in (gate, *PARAMETERS_SET_TO_DEFAULT):
         default, value = log.find_default_value(name), logged_parameters.get(name, np.nan)
-        # NaN is not larger and not smaller
+        # A missing parameter is NaN. Comparisons with NaN are False, so it is not changed
         if abs(value - default) > 1e-3 * abs(default) and (name != gate or value < default):
             changes.append({name: default})
     return changes

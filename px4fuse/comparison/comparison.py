@@ -46,7 +46,8 @@ def compare(prepared_comparison: PreparedComparison) -> Comparison:
         )
         notes = (*notes, *filter(None, (note,)), *ekf2.notes)
         if not state.equals(ekf2.state):
-            # The states at the fusion horizon still contain the resets, so they are not used
+            # Only the published state is without resets. The logged states at the fusion horizon
+            # (aids, record) still contain the resets, so they are not used
             ekf2 = replace(ekf2, state=state, aids={}, record=RECORD_NOT_LOGGED)
     axis_names = [axis.name for axis in prepared_comparison.input_axes]
     main_name = AISLE if AISLE in axis_names else axis_names[0]

@@ -27,15 +27,17 @@ from px4fuse.request import COMPARISON_OPTIONS
 
 # Below this relative difference, the position RMSEs of KF and EKF2 are reported as equal
 MAX_RELATIVE_RMSE_DIFFERENCE = 0.05
-# Minimum fraction of the mean square difference that a reported second cause explains
+# The second largest contribution to the mean square position difference KF - EKF2 is reported if it
+# is at least this fraction of the difference
 MIN_CONTRIBUTION_FRACTION = 0.05
-# A KF noise is wrong if it differs from its estimate by more than this factor
+# The user's SIGMA_A or SIGMA_Z is wrong if it differs from its estimate by this factor or more
 MIN_SETTING_TO_ESTIMATE_RATIO = 4.0
-# Smaller changes of the position (m) are not reported
+# A property of EKF2 is not reported if its use in KF changes KF's position by less (m)
 MIN_POSITION_CHANGE_M = 1e-6
-# Minimum reported position difference KF - EKF2 (m) outside the replayed time
+# A position difference KF - EKF2 outside the replayed time is reported only above this value (m)
 MIN_DIFFERENCE_OUTSIDE_REPLAY_M = 0.5
-# Minimum ratio of the position difference outside the replayed time to that inside
+# A position difference KF - EKF2 outside the replayed time is reported only if it is larger by this
+# factor than the difference inside the replayed time
 MIN_OUTSIDE_TO_INSIDE_REPLAY_RATIO = 3.0
 
 

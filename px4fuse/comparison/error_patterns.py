@@ -25,33 +25,35 @@ from px4fuse.trajectory.rotation import conjugate, multiply, to_rotation_vector
 from px4fuse.trajectory.scores import compute_autocorrelation_time
 
 MIN_POSITIONS = 100
-# Rows of the four neighbours of a position, relative to its own row
+# Rows of the four neighbours of a position, relative to the row of the position
 NEIGHBOUR_ROW_OFFSETS = np.array([-2, -1, 1, 2])
-# Maximum time span of the four neighbours, in median intervals: it excludes gaps
+# Maximum time span of the four neighbours of a position ÷ median interval, to exclude gaps
 MAX_NEIGHBOUR_SPAN_IN_INTERVALS = 8.0
-# Maximum ratio of residual σ to position σ: above it, the interpolation is inaccurate
+# Maximum σ of a residual (position - interpolation) ÷ σ of a position: above this ratio, the
+# interpolation is inaccurate
 MAX_RESIDUAL_SIGMA_RATIO = 4.0
-# Number of timestamps in the running median, which removes jitter
+# Number of timestamps in the running median that gives the timestamps without jitter
 TIMESTAMP_MEDIAN_FILTER_LENGTH = 9
 VELOCITY_HALF_WINDOW_S = 0.3
-# Neighbouring residuals are correlated: this number counts as one independent residual
+# Neighbouring residuals are correlated: this number of residuals counts as one independent residual
 RESIDUAL_CORRELATION_LENGTH = 3
 # Minimum reported timestamp jitter (s, 1 σ): a position error of 8 mm at 1 m/s
 MIN_JITTER_S = 0.008
-# Accepted ratio of position residuals to those expected from jitter (timestamp residual · velocity)
+# Limits of the ratio of measured position residuals to residuals expected from jitter, which are
+# timestamp residual · velocity
 JITTER_RATIO_LIMITS = 0.6, 1.5
-# Minimum fraction of the RMS position residual that is due to jitter
+# Minimum RMS of the position residuals due to jitter ÷ RMS of all position residuals
 MIN_JITTER_PART_OF_RESIDUAL = 0.4
-# Minimum ratio of an estimate to its σ, for jitter and for noise that increases with speed
+# Jitter, and noise that increases with speed, are reported only above this multiple of their σ
 MIN_SIGNIFICANCE_SIGMAS = 6.0
 # Number of flight parts in which the correlation of noise with speed is tested
 FLIGHT_PART_COUNT = 5
-# Minimum ratio of the correlation of noise and speed to its σ (median over the flight parts)
+# Minimum correlation of noise and speed ÷ σ of the correlation (median over the flight parts)
 MIN_NOISE_SPEED_CORRELATION_SIGMAS = 1.2
-# Quantiles of the speed that limit slow flight and fast flight
+# Slow flight is below the first of these quantiles of the speed, fast flight above the second
 SLOW_SPEED_QUANTILE, FAST_SPEED_QUANTILE = 0.3, 0.7
 MIN_FAST_TO_SLOW_NOISE_RATIO = 1.6
-# Minimum extent of a path to fit scale factor and rotation: RMS distance (m) from its mean
+# Minimum extent of a path to fit scale factor and rotation: RMS distance (m) from the mean position
 MIN_RMS_DISTANCE_FROM_PATH_MEAN_M = 0.5
 # Length (s) of the running mean that removes drift from the errors of odometry
 DRIFT_WINDOW_S = 12.0
@@ -61,20 +63,24 @@ OFFSET_PART_DURATION_S = 4.0
 MIN_SPEED_FOR_OFFSET_M_S = 0.3
 # Minimum reported variation (s) of the time offset: a position error of 8 cm at 1 m/s
 MIN_OFFSET_RANGE_S = 0.08
-# Minimum ratio of slow errors (mean square) to the white-noise variance: smaller ones may be noise
+# Minimum mean square of the slow errors ÷ variance of the white noise: smaller slow errors may be
+# noise
 MIN_SLOW_TO_WHITE_NOISE_RATIO = 0.25
-# Maximum fraction of the slow errors (mean square) that remains without the varying time offset
+# A varying time offset is reported only if its removal reduces the mean square of the slow errors
+# to this fraction or less
 MAX_REMAINING_SLOW_ERROR_FRACTION = 0.2
-# Minimum fraction of the slow errors (mean square) that a reported sinusoidal error explains
+# A sinusoidal error is reported only if it explains at least this fraction of the mean square of
+# the slow errors
 MIN_PERIODIC_ERROR_FRACTION = 0.88
-# Minimum amplitude of a sinusoidal error, in σ of white noise
+# Minimum amplitude of a reported sinusoidal error ÷ σ of the white noise
 MIN_AMPLITUDE_TO_WHITE_NOISE_RATIO = 1.0
 MIN_PERIOD_COUNT = 5.0
 # Maximum tested frequency (Hz) of a sinusoidal error
 MAX_FREQUENCY_HZ = 2.0
 FREQUENCY_STEP_IN_PERIODS_PER_FLIGHT = 0.2
 MIN_BINS_PER_PERIOD = 30
-# Above this fraction of the motion at the same frequency, motion may cause the sinusoidal error
+# Maximum fraction of the mean square of the vehicle's motion at the frequency of the sinusoidal
+# error: with more motion at this frequency, the motion may cause the error
 MAX_MOTION_FRACTION_AT_ERROR_FREQUENCY = 0.1
 # Sampling interval (s) of the compared rotations
 ROTATION_INTERVAL_S = 0.01
@@ -85,11 +91,12 @@ MIN_ATTITUDE_DELAY_S = 0.04
 MAX_ROTATION_COUNT = 20_000
 # Duration (s) of each compared rotation
 ROTATION_COMPARISON_TIME_S = 0.1
-# Larger rotation differences (rad) are limited to this value: attitude resets cause them
+# Rotation differences (rad) are limited to this value, because attitude resets cause larger ones
 MAX_ROTATION_DIFFERENCE_RAD = 0.2
-# Maximum fraction of the mean square rotation difference that remains without the reported delay
+# A delay of the logged attitude is reported only if its removal reduces the mean square rotation
+# difference between attitude and gyroscopes to less than this fraction
 MAX_REMAINING_ROTATION_DIFFERENCE_RATIO = 0.5
-# Minimum speed (m/s) and noise (m) in fast flight, to report noise that increases with speed
+# In fast flight, minimum speed (m/s) and noise (m) to report noise that increases with speed
 MIN_HIGH_SPEED_M_S, MIN_NOISE_AT_HIGH_SPEED_M = 0.3, 0.02
 # σ of normal noise ÷ median of its absolute values
 SIGMA_PER_MEDIAN_ABSOLUTE_VALUE = 1.4826
@@ -272,12 +279,12 @@ def find_timestamp_jitter(errors: LocalResiduals) -> float | None:
 
 def find_speed_dependent_noise(errors: LocalResiduals) -> SpeedDependentNoise | None:
     """Return the position noise at low and at high speed, if it increases with speed."""
-    # Use EKF2's speed: a speed from the positions contains their noise
+    # Use EKF2's speed: a speed computed from the positions contains the noise of the positions
     speed_m_s = errors.ekf2_speed_m_s
     if speed_m_s is None:
         return None
     residual_norms_m = np.linalg.norm(errors.residual_m, axis=1)
-    # Test each flight part: larger noise in one part may resemble noise due to speed
+    # Also test each flight part: noise that is larger in one fast part may be unrelated to speed
     correlation_z_scores = [
         rank_correlation(residual_norms_m[part], speed_m_s[part])
         * np.sqrt(len(part) / RESIDUAL_CORRELATION_LENGTH)
@@ -299,7 +306,8 @@ def find_speed_dependent_noise(errors: LocalResiduals) -> SpeedDependentNoise | 
     direction = errors.velocity_m_s / np.maximum(source_speed_m_s, 1e-6)
     along_track_residual_m = np.abs(np.sum(errors.residual_m * direction, axis=1))
     cross_track_residual_m = np.abs(np.sum(errors.residual_m * _rotate_90(direction), axis=1))
-    # Jitter causes noise only along the track, so noise must increase in both directions
+    # If the noise increases only along the track, jitter may be the cause: report only noise that
+    # increases along and across the track
     if any(
         np.median(noise_m[is_fast]) < MIN_FAST_TO_SLOW_NOISE_RATIO * np.median(noise_m[is_slow])
         for noise_m in (along_track_residual_m, cross_track_residual_m)
@@ -346,7 +354,7 @@ def fit_errors(comparison: Comparison, local_residuals: LocalResiduals) -> Error
     )
     error_m = position_m - true_spline(time_s)
     parameters, residual_m = _fit_least_squares(columns, error_m)
-    # The σ of the scale factor depends on the number of independent errors
+    # The σ of the scale factor depends on the number of independent errors, not of all errors
     interval_s = compute_median_interval_s(time_s)
     independent_error_count = len(time_s) / max(
         *map(compute_autocorrelation_time, residual_m.T), 1.0
@@ -436,7 +444,8 @@ def find_offset_variation(fit: ErrorFit) -> OffsetVariation | None:
     moving_part_indices = np.flatnonzero(mean_square_speeds > MIN_SPEED_FOR_OFFSET_M_S**2)
     if len(moving_part_indices) < 2:
         return None
-    # First remove the best time offset of each flight part, then fit the constant parameters
+    # Remove the best time offset of each flight part from errors and columns, then fit the constant
+    # parameters
     error_per_time_offset_m_s = -fit.velocity_m_s
     inverse_square_speed_sums = np.zeros_like(square_speed_sums)
     inverse_square_speed_sums[moving_part_indices] = 1.0 / square_speed_sums[moving_part_indices]
@@ -450,7 +459,7 @@ def find_offset_variation(fit: ErrorFit) -> OffsetVariation | None:
         )
         return velocity_weighted_sums * inverse_square_speed_sums[:, None]
 
-    # The last column contains the errors
+    # Last column: the errors to be fitted by the other columns
     columns = np.concatenate([fit.columns[..., :-1], fit.residual_m[..., None]], axis=-1)
     time_offsets_by_column_s = fit_time_offsets_by_part(columns)
     columns -= (
@@ -508,7 +517,7 @@ def find_attitude_delay(imu: pd.DataFrame, attitude: pd.DataFrame) -> float | No
         rotation_differences_rad = (
             rotation_rad - gyro_rotation_rad[first_row : first_row + len(rotation_rad)]
         )
-        # The median difference is due to the gyroscope bias
+        # Remove the median difference, which is due to the gyroscope bias
         rotation_differences_rad -= np.median(rotation_differences_rad, axis=0)
         # Limit the effect of attitude resets
         limited_angles_rad = np.minimum(

@@ -10,13 +10,13 @@ from px4fuse.filter.frame_rotation import heading_rad
 from px4fuse.flight.model import Columns, Unavailable
 
 MIN_POSITIONS = 100
-# Tested frequencies (Hz), and maximum as fraction of the position rate
+# Minimum and maximum tested frequency (Hz), and maximum tested frequency ÷ rate of the positions
 MIN_FREQUENCY_HZ, MAX_FREQUENCY_HZ, MAX_FREQUENCY_TO_RATE_RATIO = 0.1, 5.0, 0.45
-# Width of the band for the median power around a peak: ratio of its limits to the frequency
+# The power of a peak at frequency f is compared with the median power from f ÷ ratio to f · ratio
 BAND_LIMIT_RATIO = 1.33
-# Minimum power of a peak, divided by the median: flights without an oscillation are below 6
+# Minimum power of a peak ÷ median power: in flights without an oscillation, the ratio is below 6
 MIN_PEAK_TO_MEDIAN_POWER = 8.0
-# Maximum power of the motion in the positions, divided by that in the accelerations
+# Maximum power of a peak in the positions ÷ power in the accelerations: a real motion is in both
 MAX_SOURCE_TO_IMU_POWER = 0.25
 MIN_AMPLITUDE_M_S2 = 0.3
 
@@ -61,7 +61,8 @@ def find_imu_oscillation(comparison: PreparedComparison) -> ImuOscillation | Non
     second_differences_m = np.diff(positions_m, 2, axis=1) * turn * window
     spectra = np.fft.fft([*second_differences_m, np.diff(second_differences_m, axis=0)[0]])
     count = len(turn) // 2
-    # Along one axis, an oscillation has equal power at positive and negative frequency
+    # The signals are complex: an oscillation along one axis has equal powers at positive and at
+    # negative frequency. Add both
     powers = np.abs(spectra[:, 1:count]) ** 2 + np.abs(spectra[:, :-count:-1]) ** 2
     source_power, imu_power, error_power = (np.convolve(row, np.ones(3), "same") for row in powers)
     frequencies_hz = np.arange(1, count) / (len(turn) * interval_s)
@@ -83,7 +84,8 @@ def find_imu_oscillation(comparison: PreparedComparison) -> ImuOscillation | Non
     peak_index = int(np.argmax(error_power[peaks] / medians))
     peak = peaks[peak_index]
     frequency_hz = float(frequencies_hz[peak])
-    # A Hann window spreads a line over 3 bins with 1.5 times the power of the middle bin
+    # The Hann window spreads an oscillation over 3 bins with 1.5 times the power of the middle bin.
+    # Both signs of the frequency together: imu_power is 3 times the power of the middle bin
     amplitude_m = 2.0 * np.sqrt(imu_power[peak] / 3.0) / window.sum()
     acceleration_per_difference = np.pi * frequency_hz / np.sin(np.pi * frequency_hz * interval_s)
     oscillation = ImuOscillation(frequency_hz, float(amplitude_m * acceleration_per_difference**2))

@@ -32,7 +32,8 @@ PROJECTED_COLUMNS: Mapping[str, tuple[list[str], int]] = {
     "position_variance_m2": (Columns.POSITION_VARIANCE, 2),
     "velocity_variance_m2_s2": (Columns.VELOCITY_VARIANCE, 2),
 }
-# Resets are removed if EKF2's median squared distance from the positions decreases to this ratio
+# Resets are removed from EKF2's track if this reduces the median squared distance between track
+# and measured positions to less than this fraction
 MAX_DISTANCE_RATIO_WITHOUT_RESETS = 0.95
 
 
@@ -97,8 +98,8 @@ def _make_states_without_resets(
     reset_m = np.array([reset.delta for reset in resets])[:, axes]
     is_after_reset = np.array([published_state.index >= reset.time_s for reset in resets]).T
     for earlier_count in range(len(resets) + 1):
-        # Add earlier resets to positions before them, subtract later resets from positions after
-        # them
+        # Express all positions in the frame between two resets: add each earlier reset to the
+        # positions before it, and subtract each later reset from the positions after it
         frame_shift_m = (~is_after_reset[:, :earlier_count]) @ reset_m[
             :earlier_count
         ] - is_after_reset[:, earlier_count:] @ reset_m[earlier_count:]
@@ -229,7 +230,7 @@ def _combine_north_and_east(
     common_times = north_innovations.index.intersection(east_innovations.index)
     north, east = north_innovations.loc[common_times], east_innovations.loc[common_times]
     cosine, sine = float(direction[0]), float(direction[1])
-    # Variances have the weights cos² and sin²; other columns are set below
+    # The weights cos² and sin² are right for variances; the other columns are replaced below
     combined_innovations = cosine * cosine * north + sine * sine * east
     combined_innovations["innovation_m"] = (
         cosine * north["innovation_m"] + sine * east["innovation_m"]

@@ -15,19 +15,25 @@ Statistic = Literal["nis", "nees", "difference"]
 CONSISTENCY_STATISTICS: tuple[Statistic, Statistic] = ("nees", "nis")
 # Changed KF settings, EKF2 parameters or data, by name
 Change = Mapping[str, float]
-# Corrected data: timestamps (s), clockwise rotation (°), number of outliers, accelerometer bias
+# Names of data corrections in a Change: time offset (s), clockwise rotation of the positions (°),
+# number of omitted outliers, and accelerometer bias (m/s²)
 TIME_OFFSET_KEY, ROTATION_KEY, OUTLIERS_KEY = "clock_offset_s", "turned_deg", "outliers_left_out"
 FORWARD_BIAS_KEY, RIGHT_BIAS_KEY = "bias_forward_m_s2", "bias_right_m_s2"
 Improvement = Literal["position and σ", "position", "σ only", "nothing"]
-# Minimum mean NEES of a reported position error: flights without a fault are below 3
+# A position error is reported only if the mean NEES is at least this value. Without a fault, the
+# mean NEES is below 3
 MIN_REPORTED_NEES = 4.0
-# A smaller noise makes a filter overconfident if the mean NEES reaches this value
+# A smaller noise setting makes a filter overconfident if it increases a mean NEES above 1 to this
+# value or more
 MIN_OVERCONFIDENT_NEES_AFTER_CHANGE = 2.0
-# A possible cause explains 50 % to 150 % of ln(mean NIS) or ln(mean NEES)
+# A change is a possible cause of a wrong σ if its re-run removes 50 % to 150 % of ln(mean NIS) or
+# ln(mean NEES). A removal of 100 % makes the filter consistent
 POSSIBLE_CAUSE_FRACTION_TOLERANCE = 0.5
-# A sensor fault is the only cause if it explains 75 % to 125 % of ln(mean NIS or NEES)
+# A sensor fault is the only cause of a wrong σ if its correction removes 75 % to 125 % of
+# ln(mean NIS) or ln(mean NEES)
 ONLY_CAUSE_FRACTION_TOLERANCE = 0.25
-# Two changes are combined if each explains 10 % to 190 % of ln(mean NIS or NEES)
+# A change is combined with another change if its re-run removes 10 % to 190 % of ln(mean NIS) or
+# ln(mean NEES)
 COMBINED_CHANGE_FRACTION_TOLERANCE = 0.9
 SENSOR_CORRECTION_KEYS = frozenset((OUTLIERS_KEY, TIME_OFFSET_KEY, ROTATION_KEY, FORWARD_BIAS_KEY))
 # Changes that have an effect only together with another change
@@ -38,7 +44,8 @@ MIN_SIGMA_RATIO_CHANGE_FACTOR = 1.10
 MIN_RMSE_CHANGE_FRACTION = 0.05
 # A re-run improves the position if it reduces the position RMSE by at least this fraction
 MIN_RMSE_REDUCTION = 0.20
-# A filter remains overconfident if more than this fraction of ln(σ ratio) remains after a re-run
+# A re-run does not correct an overconfident filter if ln(σ ratio) after the re-run is above this
+# fraction of ln(σ ratio) before
 MAX_REMAINING_OVERCONFIDENCE_FRACTION = 0.75
 
 

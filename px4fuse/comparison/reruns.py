@@ -74,7 +74,8 @@ from px4fuse.flight.model import Columns, Spans, Unavailable
 
 # Mean NIS above which innovations are too large for the reported σ
 MAX_NORMAL_NIS = 1.5
-# Maximum ratio of RMSE or σ ratio, replay to log, to compare re-runs with the log
+# Re-runs of EKF2 are compared with the log if the unchanged replay and the log differ by at most
+# this factor in RMSE and σ ratio, and otherwise with the unchanged replay
 MAX_REPLAYED_TO_LOGGED_RATIO = 1.10
 
 
@@ -309,7 +310,6 @@ def _summarise_run(
     kf_minus_ekf2: Difference | Unavailable | None,
     rejected_fraction: float | None = None,
 ) -> RunStatistics:
-    # Attributes of missing results are None
     nis = innovation_m**2 / innovation_variance_m2
     return RunStatistics(
         innovations=len(nis),
@@ -355,7 +355,7 @@ def _rerun_kf(
         measurement_m=axis.measurement_m[is_used],
     )
     kf_run = run_kf(axis, changed_settings, fast=True)
-    # With a rotated frame, positions of KF and EKF2 are not comparable
+    # If GNSS positions are rotated, KF and EKF2 have different frames: no difference KF - EKF2
     return _summarise_run(
         kf_run.updates["innovation_m"].to_numpy(),
         kf_run.updates["innovation_variance_m2"].to_numpy(),
@@ -411,7 +411,8 @@ def _summarise_replay(
     """
     evaluated_spans_s, axis = model.baseline_replay.find_evaluated_spans(), axis_result.axis
     if ROTATION_KEY in change and comparison.source.origin.is_gnss:
-        # Rotated positions rotate EKF2's frame, so the axis is rotated by the same angle
+        # The re-run rotates the GNSS positions, and with them EKF2's frame. Rotate the axis by the
+        # same angle (clockwise: a negative angle in _rotate_direction)
         axis = replace(axis, direction=_rotate_direction(axis.direction, -change[ROTATION_KEY]))
     cosines, updates = axis.direction[:2], rows_inside(ekf2_replay.updates, evaluated_spans_s)
     innovation_variance_m2, observation_variance_m2, posterior_variance_m2 = (
