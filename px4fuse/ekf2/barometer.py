@@ -20,15 +20,18 @@ from px4fuse.flight.model import GROUND_EFFECT_FLAG, Ekf2, FusionRecord
 BAROMETER_HZ = 10.0
 # Rate (Hz) at which EKF2 fuses the barometer before PX4 v1.15
 BAROMETER_HZ_BEFORE_V1_15 = 15.0
-# Maximum (interquartile range / median) of the sample intervals that are computed from the log
+# The sample interval is estimated at each bias update in the log. The median is used only if the
+# interquartile range ÷ median of the estimates is below this value
 MAX_RELATIVE_SPREAD_OF_INTERVALS = 0.1
-# Maximum time difference of equal barometer samples, as a fraction of the sample interval
+# Barometer samples from two parts of the log are the same sample if their times differ by less than
+# this fraction of the sample interval
 SAME_SAMPLE_TOLERANCE_IN_INTERVALS = 0.3
 # Maximum number of barometer samples that are reconstructed between two rows of the log
 MAX_SAMPLES_BETWEEN_LOGGED_ROWS = 30
-# Maximum weight of a logged barometer sample, which also represents missing samples
+# Maximum weight of a logged barometer sample; the weight is above 1 if neighbouring samples are
+# missing in the log
 MAX_BAROMETER_SAMPLE_WEIGHT = 4.0
-# Minimum sum of the weights of missing samples; prevents a division by zero
+# Lower limit of a sum of low-pass filter weights, to avoid a division by zero
 MIN_MISSING_WEIGHT_SUM = 1e-9
 
 
@@ -101,7 +104,7 @@ def _combine_barometer_samples(
     barometer_bias_updates = fusion_record.height_bias_updates.get(
         BAROMETER.name, pd.DataFrame(zero_bias_update, index=row_times_s[:1])
     )
-    # Innovations use the bias before an update, but the log contains the bias after it
+    # EKF2 computes innovations with the bias before an update, but logs the bias after the update
     bias_breakpoint_times_s = np.column_stack(
         [barometer_bias_updates.index, barometer_bias_updates.index + 0.5 * interval_s]
     ).ravel()
@@ -111,7 +114,7 @@ def _combine_barometer_samples(
     bias_at_breakpoints_m = np.column_stack(
         [previous_bias_m, barometer_bias_updates["bias_m"]]
     ).ravel()
-    # EKF2 reduces innovations in ground effect by a dead zone, so they are not used
+    # In ground effect, EKF2 reduces innovations by a dead zone, so these innovations are not used
     rows_outside_ground_effect = logged_barometer_updates[
         ~fusion_record.was_flag_set(GROUND_EFFECT_FLAG, row_times_s)
     ]
@@ -133,7 +136,8 @@ def _combine_barometer_samples(
         ) + np.interp(time_s, velocity_times_s, displacement_m)
         return predicted_down_m - interpolate_bias_m(time_s)
 
-    # Arrays: one row per interval between logged samples, one column per sample in the interval
+    # innovation_m: one row per interval between two logged samples, one column per sample that EKF2
+    # fused in the interval
     span_s = np.diff(row_times_s)
     sample_count = np.maximum(np.rint(span_s / interval_s), 1.0).astype(int)
     is_regular = (
@@ -143,7 +147,7 @@ def _combine_barometer_samples(
     sample_interval_by_row_s = span_s / sample_count
     sample_indices = np.arange(sample_count[is_regular].max(initial=1))
     innovation_m = np.full((len(sample_count), len(sample_indices)), np.nan)
-    # If several topics contain the same sample, the last topic in this list is used
+    # If the log contains a sample several times, the last of these three sources is used
     time_s = np.concatenate([barometer_bias_updates.index, logged_down_m.index, row_times_s])
     down_m = np.concatenate(
         [
@@ -170,7 +174,7 @@ def _combine_barometer_samples(
         np.rint(intervals_since_row[is_on_sample_grid]).astype(int) - 1,
     ] = (down_m - predict_measured_down_m(time_s))[is_on_sample_grid]
     if "filtered_down" in logged_barometer_updates:
-        # PX4 logs state minus measurement, which is the opposite sign
+        # PX4 logs the filtered innovation with the opposite sign: state minus measurement
         filtered_nu_m = -logged_barometer_updates["filtered_down"].to_numpy()
         age_in_samples = sample_count[:, None] - 1.0 - sample_indices
         is_missing = np.isnan(innovation_m) & (age_in_samples >= 0.0) & is_regular[:, None]

@@ -81,7 +81,7 @@ GNSS_VELOCITY_VARIANCE_FACTORS = np.array([1.0, 1.0, 2.25])
 GRAVITY_MAGNITUDE_M_S2 = float(GRAVITY_M_S2[2])
 # Maximum σ (m/s²) of EKF2's accelerometer bias: 0.1 g (covariance.cpp)
 MAX_BIAS_SIGMA_M_S2 = 0.1 * GRAVITY_MAGNITUDE_M_S2
-# Minimum ratio of an accelerometer bias variance to the largest of the three axes
+# Minimum variance of an accelerometer bias ÷ largest bias variance of the three axes
 # (covariance.cpp)
 MIN_RATIO_TO_LARGEST_BIAS_VARIANCE = 0.01
 # State indices of heading error and position
@@ -95,10 +95,10 @@ HEADING_AND_DOWN = slice(HEADING, POSITION_DOWN + 1, POSITION_DOWN - HEADING)
 HORIZONTAL_POSITION = slice(POSITION_NORTH, POSITION_EAST + 1)
 # State indices of velocity and position
 VELOCITY_AND_POSITION = slice(3, 9)
-# Columns in measurements of velocity and position (six columns, NED)
-VELOCITY_COLUMNS, DOWN_COLUMN = slice(0, 3), 2
+# Columns in measurements of velocity (0 to 2) and position (3 to 5), NED
+VELOCITY_COLUMNS, VELOCITY_DOWN_COLUMN = slice(0, 3), 2
 HORIZONTAL_POSITION_COLUMNS = slice(3, 5)
-# First columns of velocity, horizontal position and height
+# First column of velocity, of horizontal position and of height in the same measurements
 FIRST_COLUMNS = [0, 3, 5]
 
 
@@ -228,7 +228,7 @@ def run_segment(  # noqa: PLR0912, PLR0915 (one recursion, read from top to bott
         name: np.array([configuration.settings[name] for configuration in configurations])
         for name in inputs.settings
     }
-    # A parameter change in flight does not apply to configurations that change this parameter
+    # A parameter change in flight applies only to configurations with the logged parameter value
     for name in segment.changed_parameters.keys() & parameters.keys():
         value = segment.changed_parameters[name]
         parameters[name][parameters[name] == inputs.settings[name]] = value
@@ -252,7 +252,7 @@ def run_segment(  # noqa: PLR0912, PLR0915 (one recursion, read from top to bott
             for configuration in configurations
         ]
     ).T
-    # The arrays of events have the shape (events, filters, ...)
+    # The arrays of events have the shape (events, configurations, ...)
     events = np.stack([interval_arrays.events for interval_arrays in intervals], axis=1)
     event_steps = events["end_step"]
     event_time_s = segment.time_s[event_steps]
@@ -351,7 +351,8 @@ def run_segment(  # noqa: PLR0912, PLR0915 (one recursion, read from top to bott
         )
     x, P = _make_start_state(segment, estimates_biases, estimates_attitude)
     if bad_acceleration_flag.until_s[0] > segment.time_s[0]:
-        # The log contains no accelerometer bias while the flag is set, so the mean bias is used
+        # While EKF2 flags a bad acceleration, the log contains no accelerometer bias. Start with
+        # the mean vertical bias of the segment
         set_states(
             x,
             P,
@@ -455,13 +456,15 @@ def run_segment(  # noqa: PLR0912, PLR0915 (one recursion, read from top to bott
             nu = measured_values[event] - x[:, VELOCITY_AND_POSITION]
             S = _get_state_variances(P)[:, VELOCITY_AND_POSITION] + measurement_variance[event]
             is_outside_gate = nu * nu > gate_squared * S
-            if is_outside_gate[:, DOWN_COLUMN].any():
+            if is_outside_gate[:, VELOCITY_DOWN_COLUMN].any():
                 # With a bad vertical acceleration, EKF2 clips the vertical innovation to the gate
                 is_clipped = has_gate & (bad_acceleration_flag.until_s > event_time_s[event])
-                is_clipped &= ~is_outside_gate[:, :DOWN_COLUMN].any(axis=1)
+                is_clipped &= ~is_outside_gate[:, :VELOCITY_DOWN_COLUMN].any(axis=1)
                 limit = np.sqrt(gate_squared * S)
-                nu[is_clipped, DOWN_COLUMN] = np.clip(nu, -limit, limit)[is_clipped, DOWN_COLUMN]
-                is_outside_gate[is_clipped, DOWN_COLUMN] = False
+                nu[is_clipped, VELOCITY_DOWN_COLUMN] = np.clip(nu, -limit, limit)[
+                    is_clipped, VELOCITY_DOWN_COLUMN
+                ]
+                is_outside_gate[is_clipped, VELOCITY_DOWN_COLUMN] = False
             innovations[event] = nu
             variances[event] = S
             is_velocity_outside, is_position_outside, _ = np.logical_or.reduceat(
@@ -497,7 +500,8 @@ def run_segment(  # noqa: PLR0912, PLR0915 (one recursion, read from top to bott
             x, P = height_filter.fuse_gnss(
                 event, x, P, measured_values[event, :, 5], measurement_variance[event, :, 5]
             )
-        # With a magnetometer, only the height is set to its logged value
+        # With a magnetometer, the filter estimates the heading, and only the height is set to its
+        # logged value
         elif has_magnetometer:
             K, P = _update_to_variance(P, POSITION_DOWN, heading_and_down_variance[event, :, 1])
             x = x + K * (logged_heading_and_down[event, :, 1] - x[:, POSITION_DOWN])[:, None]
@@ -525,7 +529,7 @@ def run_segment(  # noqa: PLR0912, PLR0915 (one recursion, read from top to bott
         if vision_filter is not None:
             vision_filter.bias.bias_m = vision_filter.bias.bias_m + position_reset_m[event]
             x, P = vision_filter.fuse(event, x, P, True, fusion_decisions.last_position_s)
-            # A fusion of vision also restarts EKF2's timeout for a position reset
+            # EKF2's timeout for a position reset also starts again when EKF2 fuses vision
             if inputs.rules.resets_velocity:
                 fusion_decisions.last_position_s = np.maximum(
                     fusion_decisions.last_position_s, vision_filter.last_fusion_s
@@ -533,9 +537,9 @@ def run_segment(  # noqa: PLR0912, PLR0915 (one recursion, read from top to bott
         if height_filter is not None and not uses_logged_flag.all():
             if has_sample[event] and has_velocity:
                 height_filter.update_records[event, -1, 0] = np.where(
-                    can_fuse_velocity[event], nu[:, DOWN_COLUMN], np.nan
+                    can_fuse_velocity[event], nu[:, VELOCITY_DOWN_COLUMN], np.nan
                 )
-                height_filter.update_records[event, -1, 1] = S[:, DOWN_COLUMN]
+                height_filter.update_records[event, -1, 1] = S[:, VELOCITY_DOWN_COLUMN]
             height_filter.update_bad_acceleration_flag(event, event_time_s[event])
         if is_bias_constant.any():
             x[is_bias_constant, ACCELEROMETER_BIAS] = bias_before_fusion[is_bias_constant]
@@ -602,7 +606,7 @@ def _update_sequentially(
     ``ekf_helper.cpp``). P is updated in Joseph form.
     """
     component_count = is_fused.shape[1]
-    # Components without a measurement are NaN
+    # Components that are not fused may be NaN: replace them by 1
     nu, S, R = np.where(is_fused, np.array([nu, S, R])[:, :, :component_count], 1.0)
     fused_inverse_variance = is_fused / S
     inverse_variance_squared = fused_inverse_variance * fused_inverse_variance
@@ -645,7 +649,7 @@ class _FusionDecisions:
         self.last_position_s, self.last_velocity_s = np.full((2, configuration_count), self.start_s)
         self.is_stopped = np.zeros(configuration_count, bool)
         self.remaining_resets = np.full(configuration_count, self.fusion_rules.max_resets)
-        # True for samples without a logged start of fusion, reset or rejection: the gate decides
+        # Without a logged start of fusion, reset or rejection, only the gate decides on a sample
         self.only_gate_decides = (
             (self.sample_actions == FUSE).all(axis=1)
             & ~self.logged_resets
@@ -676,7 +680,9 @@ class _FusionDecisions:
         )
         is_rejected &= self.has_gate & may_fuse
         if self.is_every_reset_logged and not is_decision_logged:
-            # Without a logged reset after the timeout, EKF2 has fused the sample before the timeout
+            # If EKF2 had rejected this sample, its timeout would end before the next sample and
+            # reset the position. Without a logged reset at the next sample, EKF2 has fused this
+            # sample
             next_event = min(event + 1, len(self.time_s) - 1)
             is_rejected &= ~(
                 uses_logged_decisions

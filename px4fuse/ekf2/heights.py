@@ -56,11 +56,11 @@ MIN_INNOVATION_GATE = 1.0
 MIN_MEASUREMENT_NOISE_SIGMA = 0.01
 # Factor on EKF2_GPS_P_NOISE for GNSS heights (gnss_height_control.cpp)
 GNSS_HEIGHT_NOISE_FACTOR = 1.5
-# Minimum normalised height innovation (√S) of barometer or GNSS for a bad-acceleration flag
-# (vert_innov_test_lim, common.h)
+# EKF2 flags a bad acceleration if height innovations are too large: that of barometer or GNSS must
+# exceed this multiple of √S (vert_innov_test_lim, common.h)
 MIN_HEIGHT_INNOVATION_OF_ONE_SENSOR = 3.0
-# Minimum normalised height innovation (√S) of barometer and GNSS for a bad-acceleration flag
-# (vert_innov_test_min, common.h)
+# For a bad-acceleration flag, the height innovations of both barometer and GNSS must exceed this
+# multiple of √S (vert_innov_test_min, common.h)
 MIN_HEIGHT_INNOVATION_OF_BOTH_SENSORS = 1.0
 
 
@@ -280,8 +280,9 @@ class HeightFilter:
                 for end_steps in event_steps.T
             ]
         )
-        # Rows: height (m, down), age (s), time (s), dead zone (m), weight, and 1 for a sample.
-        # GNSS is the last sample of each event
+        # Quantities along the first axis: height (m, down), age (s), measurement time (s), dead
+        # zone (m), weight, and 1 for a sample or 0 for padding. Samples along the second axis: k
+        # barometer samples of each event, then its GNSS sample
         self.samples = np.pad(barometer_samples, ((0, 0), (0, 1), (0, 0), (0, 0)))
         self.samples[2, -1] = gnss_fix_times_s
         self.samples[4] = np.maximum(self.samples[4], 1.0)
@@ -303,7 +304,7 @@ class HeightFilter:
             height_samples.initial_bias_and_variance, (len(has_gate), 1)
         ).T
         self.bias = BiasEstimator(bias_m, bias_variance_m2, segment.step_s)
-        # Time of the last sample of the sensor with a bias
+        # Time (s) of the last sample of the sensor whose bias EKF2 estimates
         self.last_sample_s = np.full(len(has_gate), segment.time_s[0])
         self.update_records = np.full(
             (len(event_steps), self.barometer_sample_count + 2, 4, len(has_gate)), np.nan

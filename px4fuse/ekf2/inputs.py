@@ -65,7 +65,7 @@ VISION_REPETITION_INTERVALS_S = {
 }
 # Bit of EKF2_AID_MASK that rotates vision positions (PX4 v1.13 and earlier)
 ROTATE_VISION_BIT = 64
-# Maximum time difference (s) between a logged innovation and its sample
+# Maximum difference (s) between the logged time of an innovation and the time of its sample
 SAMPLE_MATCH_TOLERANCE_S = 0.006
 # Tolerance (s) for rounding errors between sample times and prediction times
 PREDICTION_STEP_TOLERANCE_S = 1e-4
@@ -82,9 +82,9 @@ MAX_IMU_INTERVAL_S = 0.012
 MAX_MISSING_IMU_FRACTION = 0.1
 # First PX4 release with the time of the fusion horizon in estimator_states
 FIRST_RELEASE_WITH_HORIZON_TIMES = "PX4 v1.13"
-# Stands for an unlimited number of successive position resets
+# Value of FusionRules.max_resets for an unlimited number of successive resets
 NO_RESET_LIMIT = 1_000_000
-# Maximum interval (s) between fusions of height and heading in a gap of the position source
+# Maximum time (s) between two fusions of height and heading during a gap of the position source
 MAX_FUSION_INTERVAL_IN_GAP_S = 0.25
 
 
@@ -335,7 +335,8 @@ def prepare_inputs(  # noqa: PLR0911, PLR0912 (one return per reason)
         mean_step_s=ekf2.step_s,
         horizon_s=horizon_s,
         configured_step_s=read_prediction_step_s(fusion_record),
-        # While EKF2 flags a bad acceleration, EKF2 clips vision heights, but the model cannot
+        # The model fuses vision heights only if EKF2 never flagged a bad acceleration: with the
+        # flag, EKF2 clips height innovations to the gate, but the model does not
         fuses_vision_height=not is_gnss
         and isinstance(ekf2.fusion_flags, pd.DataFrame)
         and bool(ekf2.fusion_flags["vertical"].mean() > 0.5)
@@ -442,7 +443,8 @@ def read_gnss(
         is_enabled = sample_step_function(enabled_changes, position_samples.index) > 0.0
         position_samples = position_samples[is_enabled]
         velocity_samples = velocity_samples[is_enabled]
-    # The delay is already subtracted. It is added here, because the replay subtracts it again
+    # EKF2_GPS_DELAY is already subtracted from the times of the track. It is added here, because
+    # the replay subtracts it again
     logged_delay_s = fill_with_defaults(parameters, GNSS_POS)[GNSS_POS.delay] * 1e-3
     timestamp_s = position_samples.index.to_numpy() + logged_delay_s
     # Maximum reported position noise (m) that EKF2 uses (gps_control.cpp)
@@ -510,7 +512,7 @@ def read_vision(
         position_m = rotate(rotation, position_m)
         variance_m2 = rotate(rotation**2, variance_m2)
     vision_age_s = fusion_record.vision_age_s
-    # With an unknown arrival time, no sample is late
+    # If the arrival times are unknown, no sample is treated as late
     arrival_s = np.full(len(timestamp_s), -np.inf)
     if len(vision_age_s) and "vehicle_visual_odometry" in track.topics:
         arrival_s = timestamp_s + np.interp(timestamp_s, vision_age_s.index, vision_age_s)
@@ -576,7 +578,8 @@ def _read_logged_decisions(
         np.maximum(measurement_times_s, arrival_s - horizon_s)
     )
     aid_rows = ekf2.aids[aid.name].samples
-    # EKF2 rejected all samples after its last fusion (last_fused_s) and during dead reckoning
+    # EKF2 rejected all samples from its last fusion (last_fused_s) to the time of the log row, and
+    # during dead reckoning
     last_fusion_times_s = aid_rows.reindex(columns=["last_fused_s"]).dropna()
     spans_after_last_fusion_s = np.column_stack([last_fusion_times_s, last_fusion_times_s.index])
     dead_reckoning_spans_s = (

@@ -40,8 +40,9 @@ MAX_DELAY_BEHIND_HORIZON_S = 0.1
 MIN_DELAY_OF_LATE_SAMPLE_S = 0.03
 # Actions of EKF2 on a position sample; START_FUSION resets the position to the sample
 NO_ACTION, FUSE, START_FUSION = 0, 1, 2
-# Columns of the state derivatives: by initial attitude error (0 to 2), gyro bias (3 to 5),
-# accelerometer bias (6 to 8), correction of the nominal attitude (9), acceleration (10)
+# Effects on attitude, velocity and position in an interval, by column. Derivatives with respect to
+# initial attitude error (0 to 2), gyro bias (3 to 5) and accelerometer bias (6 to 8); then changes
+# due to the correction of the nominal attitude (9) and due to the measured acceleration (10)
 DERIVATIVE_COLUMN_COUNT = 11
 ATTITUDE_CORRECTION_DERIVATIVE_COLUMN, ACCELERATION_DERIVATIVE_COLUMN = 9, 10
 
@@ -251,7 +252,8 @@ def _integrate_state_derivatives(
     Columns: see DERIVATIVE_COLUMN_COUNT.
     """
     prediction_step_counts = end_steps - start_steps
-    # Intervals are sorted by length: intervals that continue are the first rows
+    # All intervals are integrated together, step by step. Sorted by length, the intervals that have
+    # not ended are always the first rows
     longest_first_indices = np.argsort(-prediction_step_counts, kind="stable")
     start_steps_longest_first = start_steps[longest_first_indices]
     attitude_derivatives, velocity_derivatives, position_derivatives = state_derivatives = np.zeros(
@@ -269,7 +271,7 @@ def _integrate_state_derivatives(
         rows = slice(count)
         dt = segment.step_s[step][:, None, None]
         force_m_s2 = specific_force_ned_m_s2[step]
-        # Change of attitude by gyro bias, and of velocity by accelerometer bias
+        # Change of attitude per gyro bias, and of velocity per accelerometer bias, in one step
         bias_derivative_of_step = -segment.body_to_ned[1:][step] * dt
         position_derivatives[rows] += 0.5 * dt * velocity_derivatives[rows]
         velocity_derivatives[rows] += (-skew(force_m_s2) * dt) @ attitude_derivatives[rows]

@@ -74,7 +74,7 @@ MAX_HORIZON_DELAY_S = 1.0
 
 # Number of replays that are computed at once; limits the memory
 REPLAY_BATCH_SIZE = 10
-# Number of intervals whose states are computed at once; limits the memory
+# Number of intervals between fusions whose states are computed at once; limits the memory
 EVENTS_PER_BLOCK = 512
 
 # Fields of Agreement whose names differ from PX4's name of the aiding source
@@ -149,7 +149,8 @@ def prepare_ekf2_model(
         agreement_with_rejections = compare_with_log(flight, replay_with_logged_rejections(model))
         if isinstance(agreement_with_rejections, Agreement):
             agreement = judge_with_logged_rejections(agreement, agreement_with_rejections)
-    # Agreement of the omitted sources with the log, from the replay that fused them
+    # This replay omits some aiding sources. Their agreement with the log is from the earlier replay
+    # that fused them
     failed_agreement_by_field = {
         (field_name := AGREEMENT_FIELD_BY_AID_NAME.get(name, name)): getattr(
             failed_agreement, field_name
@@ -281,7 +282,7 @@ def add_position_noise(model: Ekf2Model, sigma_m: float, seed: int) -> Ekf2Model
         if samples := getattr(model.inputs, name):
             position_noise_m = rng.normal(scale=sigma_m, size=samples.position_m.shape)
             noisy_inputs[name] = replace(samples, position_m=samples.position_m + position_noise_m)
-    # Earlier results are without this noise, so they are deleted
+    # The runs are without the added noise, so they are deleted
     return replace(model, inputs=replace(model.inputs, **noisy_inputs), runs=())
 
 
@@ -442,7 +443,7 @@ def _collect_updates_by_aid(
             updates_by_aid[name] = height_filter.make_update_table(name, configuration_index, end_s)
     if inputs.received_positions.velocity_m_s is not None:
         gate = run.configurations[configuration_index].settings[GNSS_VEL.gate]
-        # The factor allows for rounding of innovations that EKF2 clipped to the gate
+        # The factor 1 + 1e-9 allows for rounding errors of innovations that are clipped to the gate
         squared_gate = (1.0 + 1e-9) * max(gate, MIN_INNOVATION_GATE) ** 2
         is_outside_gate = (nu[:, :3] ** 2 > squared_gate * S[:, :3]).any(axis=1)
         # Without GNSS heights, the table contains only the horizontal axes

@@ -60,9 +60,11 @@ MIN_INNOVATION_CORRELATION = 0.95
 MAX_INNOVATION_VARIANCE_RATIO_DEVIATION = 0.05
 # Maximum RMS difference (m) of replayed and logged position: below 0.013 m with complete logs
 MAX_PUBLISHED_DIFFERENCE_M = 0.10
-# Maximum position difference (m) with optical flow as the only horizontal source
+# Maximum position difference (m) between replay and log while EKF2 fuses only optical flow
+# horizontally
 MAX_FLOW_ONLY_DIFFERENCE_M = 0.5
-# Maximum rejected fraction for a comparison of single innovations, which depend on each rejection
+# With a larger rejected fraction, replayed and logged innovations need not correlate: one different
+# rejection changes all later innovations. Rejected fraction and mean NIS are compared instead
 MAX_REJECTED_FRACTION_FOR_COMPARISON = 0.05
 # Above this rejected fraction, EKF2's position is mostly integrated from the IMU
 MOSTLY_REJECTED_FRACTION = 0.5
@@ -361,7 +363,8 @@ def _compare_other_aids(
     for name, updates in replay.other_aid_updates.items():
         if (aid_log := ekf2.aids.get(name)) is None:
             continue
-        # The replay fuses barometer samples later than EKF2, so measurement times are compared
+        # Without logged measurement times, innovations are matched by fusion time. The replay fuses
+        # barometer samples later than EKF2, so the measurement time replaces their fusion time
         times_s = updates.index if name == BAROMETER.name else updates["fused_at_s"]
         agreement_by_axis, statistics = _compare_innovations(
             replay,
@@ -437,7 +440,7 @@ def match_updates(
     update_rows = np.searchsorted(fusion_times_s, logged_times_s + 1e-4, side="right") - 1
     age_s = logged_times_s - fusion_times_s[np.maximum(update_rows, 0)]
     is_matched = (update_rows >= 0) & (age_s <= MAX_INNOVATION_AGE_S)
-    # A row logged in the same prediction step as a fusion may contain the previous innovation
+    # A log row in the same prediction step as a fusion may still contain the previous innovation
     is_unambiguous = is_matched & (age_s >= SAME_STEP_TOLERANCE_S)
     return np.where(
         is_unambiguous if is_unambiguous.sum() > 0.5 * is_matched.sum() else is_matched,

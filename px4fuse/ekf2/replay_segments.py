@@ -63,9 +63,10 @@ MIN_TIME_SINCE_FIRST_FUSION_S = 1.0
 MIN_TIME_SINCE_TAKEOFF_S = 4.0
 # Time (s) from the start of a replay to the start of the evaluation
 REPLAY_SETTLING_S = 5.0
-# Time (s) after which magnetic field states are valid: EKF2's first fusion resets them
+# EKF2's first fusion of all magnetometer axes resets the magnetic field states. The replay uses
+# these states after this time (s)
 MAGNETIC_FIELD_SETTLING_S = 1.0
-# Flight time (s) from which the correlations of the initial state are estimated
+# Correlations of the initial state are estimated by a replay of this time (s) before a segment
 CORRELATION_ESTIMATION_TIME_S = 20.0
 # Rate (Hz) at which EKF2 fuses the magnetometer with SENS_MAG_RATE 15 (default)
 MAG_FUSION_HZ = 14.0
@@ -77,7 +78,7 @@ INNOVATION_TIME_CONSTANT_S = 0.5
 MIN_SEGMENT_DURATION_S = 10.0
 # Maximum delay (s) from a reset to its publication
 MAX_RESET_DELAY_S = 0.5
-# Maximum fraction of clipped IMU samples within 1 s in an EKF2 replay
+# The EKF2 replay is interrupted if a larger fraction of the IMU samples within 1 s is clipped
 MAX_CLIPPED_IMU_FRACTION = 0.05
 # Maximum fraction of missing IMU samples that the EKF2 replay ignores
 MAX_LOST_IMU_FRACTION = 0.02
@@ -825,7 +826,7 @@ def find_step_ends(
 ) -> IntArray:
     """Return the index of the IMU sample at the end of each prediction step of EKF2."""
     median_interval_s = float(np.median(interval_s))
-    # Few missing samples are not counted: they may be gaps of the IMU itself
+    # A small number of missing samples is ignored: the IMU itself may have gaps
     sample_counts = np.maximum(np.rint(interval_s / median_interval_s), 1.0)
     if sample_counts.mean() <= 1.0 + MAX_LOST_IMU_FRACTION:
         sample_counts[:] = 1.0

@@ -47,7 +47,7 @@ NO_TRUTH_OVERLAP = Unavailable(
     "ground truth and replay do not overlap in time",
     "Record ground truth during the whole flight.",
 )
-# Names of the properties in which KF and EKF2 differ
+# Properties in which KF and EKF2 differ
 SAMPLE_TIMES_PROPERTY = "sample times and time steps"
 TIMESTAMPS_PROPERTY = "timestamps and delay"
 MEASUREMENT_NOISE_PROPERTY = "measurement noise"
@@ -60,7 +60,7 @@ FLOW_PROPERTY = "optical flow"
 VISION_PROPERTY = "external vision"
 REJECTION_PROPERTY = "rejections and resets"
 OUTPUT_PREDICTOR_PROPERTY = "output predictor"
-# Names of the properties for additional aiding sources, by PX4's name of the source
+# Properties that add an aiding source, by PX4's name of the source
 PROPERTY_BY_ADDITIONAL_AID = {FLOW.name: FLOW_PROPERTY, EV_POS.name: VISION_PROPERTY}
 
 
@@ -174,7 +174,7 @@ def explain_difference_by_replacements(
     ekf2 = model.flight.ekf2
     assert isinstance(ekf2, Ekf2)
     configurations = make_replacement_configurations(model.inputs, settings or Settings())
-    # The replay with rejections contains the track of the last configuration
+    # The last configuration is not run here: baseline_replay contains its track
     horizon_tracks = compute_delayed_tracks(model, [*configurations.values()][:-1])
     baseline_replay = replay_with_logged_rejections(model)
     evaluated_spans = model.baseline_replay.find_evaluated_spans()
@@ -213,7 +213,8 @@ def explain_difference_by_replacements(
                 for direction in directions.values()
             ]
         )
-        # Last replay before EKF2's rejections are used
+        # Last replay that fuses every sample; the replays of the last two properties contain EKF2's
+        # rejections
         if property_name == property_names[-3]:
             replay_track_without_gate = track
     spans = Segment(*state_span_s, "").cut(evaluated_spans)
@@ -293,7 +294,7 @@ def _explain_difference_along_axis(
         spans_s=spans_s,
         longest_rejection=longest_rejection,
         times_s=times_s,
-        # Copied, because a view would keep the whole array in memory
+        # Copy the rows, because a view would keep the whole array in memory
         kf_minus_ekf2_m=differences_by_track[0, 0].copy(),
         unexplained_difference_m=differences_by_track[-2, 0].copy(),
     )

@@ -166,7 +166,7 @@ class VisionFilter:
         Sources: ``ev_pos_control.cpp``, functions controlEvPosFusion and updateEvPosFusion.
         """
         is_gnss_off = self.is_gnss_off[event]
-        # One sample per filter at a time
+        # Fuse the first sample of each configuration in this event, then the second, and so on
         for sample_index, has_sample in enumerate(self.has_sample[is_last_step][:, event]):
             if not has_sample.any():
                 continue
@@ -236,7 +236,8 @@ class VisionFilter:
                 np.where(is_gnss_off[:, None], R_m2, R),
             )
             self.position_reset_m[event] += position_reset_m
-            # Vision then agrees with the position from GNSS
+            # If the fusion of vision restarts during GNSS fusion, EKF2 sets the vision bias so that
+            # vision agrees with EKF2's position
             is_bias_initialised = is_restarting & ~is_position_reset
             is_bias_cleared = is_position_reset & is_gnss_off
             self.bias.bias_m[is_bias_initialised] = -position_innovation_m[is_bias_initialised]

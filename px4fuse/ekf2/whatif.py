@@ -38,7 +38,7 @@ from px4fuse.flight.ekf2_parameters import EV_POS, GNSS_POS, GNSS_VEL, MAG, chec
 from px4fuse.flight.model import Columns, Ekf2, Flight, NedAxis, Spans, Unavailable
 
 ANALYSIS_NAME = "EKF2 replay with other parameters"
-# Minimum fraction of logged innovations for a computation of the longest time without fusion
+# Minimum fraction of EKF2's innovations in the log to compute the longest time without fusion
 MIN_LOGGED_INNOVATION_FRACTION = 0.9
 NO_TRUTH = Unavailable(
     "RMSE against ground truth",
@@ -66,22 +66,24 @@ MIN_EVALUATED_DURATION_S = 5.0
 # Default and maximum number of parameter values in a sweep
 SWEEP_VALUE_COUNT = 9
 MAX_SWEEP_VALUES = 200
-# Position noise (m, 1 σ) that is added to test if the statistics of a replay are predictable
+# Noise (m, 1 σ) added to the positions in repeated replays. If this small noise changes the
+# statistics, the replay is not predictable
 ADDED_POSITION_SIGMA_M = 0.002
 # Number of repeated replays with added position noise
 REPLAYS_WITH_ADDED_NOISE = 4
-# Minimum rejected fraction of a replay that is repeated with added noise
+# A replay with a larger rejected fraction is repeated with added position noise
 MIN_REJECTED_FRACTION = 0.02
-# Above this rejected fraction, the statistics of a replay are unpredictable
+# Above this rejected fraction, the statistics of a replay are not predictable: they depend on the
+# rejection of single samples
 MAX_REJECTED_FRACTION = 0.35
 # EKF2 resets the height after this time (s) without height fusion (hgt_fusion_timeout_max,
 # common.h)
 HEIGHT_TIMEOUT_S = 5.0
-# Maximum ratio of largest to smallest mean NIS of repeated replays
+# Maximum ratio of largest to smallest mean NIS of replays with different added noise
 MAX_NIS_RATIO_OF_NOISY_REPLAYS = 1.10
-# Maximum difference between largest and smallest rejected fraction of repeated replays
+# Maximum difference between the rejected fractions of replays with different added noise
 MAX_REJECTED_SPREAD_OF_NOISY_REPLAYS = 0.03
-# Maximum ratio of largest to smallest position RMSE of repeated replays
+# Maximum ratio of largest to smallest position RMSE of replays with different added noise
 MAX_RMSE_RATIO_OF_NOISY_REPLAYS = 1.15
 
 
@@ -365,7 +367,7 @@ def _summarise_replay(flight: Flight, replay: Ekf2Replay, spans_s: Spans) -> Ekf
             f"evaluated time span, because {replay.lost} samples are older than the fusion horizon",
             "Choose another value, or add --set EKF2_DELAY_MAX=... (PX4 v1.15 and later).",
         )
-    # Position variance just before (1 µs) and after each update
+    # Position variance 1 µs before each update, and after the update
     variance = pd.DataFrame(index=np.column_stack([update_times_s - 1e-6, update_times_s]).ravel())
     for axis in HORIZONTAL_AXES:
         prior_variance_m2 = (
@@ -588,7 +590,8 @@ def _describe_replay_limits(model: Ekf2Model, replay: Ekf2Replay) -> Iterator[st
             f"While EKF2 fuses GNSS, the noise of vision positions is at least {GNSS_POS.noise} "
             f"({min_noise_m:g} m)"
         )
-    # PX4 releases with this rule have no parameter EKF2_DELAY_MAX
+    # If the largest delay parameter sets the fusion horizon (before PX4 v1.15), the parameter
+    # EKF2_DELAY_MAX does not exist
     is_horizon_largest_delay = model.inputs.rules.is_horizon_largest_delay
     delay_ms = max(replay.changed_parameters.get(aid.delay, 0.0) for aid in (EV_POS, GNSS_POS))
     if not is_horizon_largest_delay and delay_ms > (
@@ -601,7 +604,8 @@ def _describe_replay_limits(model: Ekf2Model, replay: Ekf2Replay) -> Iterator[st
     if delay_ms and np.isinf(model.inputs.received_positions.arrival_s).all():
         yield ("Without logged arrival times, the replay assumes that no position arrives too late")
     if replay.late or replay.lost:
-        # Of two samples in one prediction step, EKF2 fuses only the newer
+        # If two samples arrive in one prediction step, EKF2 fuses only the newer, so there may be
+        # fewer updates than late samples
         received_count = max(len(replay.updates), replay.late) + replay.lost
         note = (
             f"{_format_changes(replay)}: {replay.late + replay.lost} of {received_count} samples "
