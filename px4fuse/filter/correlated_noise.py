@@ -37,11 +37,12 @@ from px4fuse.flight.model import Flight, Unavailable
 MIN_MEASUREMENTS = 100
 # Maximum number of positions in a noise fit, from the middle of the flight
 MAX_MEASUREMENTS = 2000
-# Noise is not correlated across an interval above this multiple of the median interval
+# Noise of two positions is assumed to be independent if the interval between them is above this
+# multiple of the median interval
 MAX_INTERVAL_TO_MEDIAN_INTERVAL_RATIO = 3.0
 # Time constants (s) in the coarse search for time-correlated noise
 COARSE_TAUS_S = (0.2, 0.6, 2.0, 6.0)
-# Tested fractions of the variance SIGMA_Z² that is time-correlated, in the coarse search
+# Tested fractions of time-correlated noise in the variance SIGMA_Z², in the coarse search
 COARSE_CORRELATED_VARIANCE_FRACTIONS = (0.12, 0.35, 0.8)
 # Tested multiples of SIGMA_A in the coarse search
 COARSE_SIGMA_A_FACTORS = (0.4, 0.9)
@@ -50,11 +51,12 @@ COARSE_SIGMA_FACTORS = np.geomspace(0.7, 1.6, 12)
 COARSE_MEASUREMENT_COUNT = 1000
 # Minimum log-likelihood gain over white noise in the coarse search; below it, no full fit is made
 MIN_GAIN_FOR_FULL_FIT_NATS = 0.5
-# Below this SIGMA_Z (m), the source probably low-pass filters its positions
+# Below this estimate of SIGMA_Z (m), the source probably low-pass filters its positions
 MAX_SIGMA_Z_OF_LOW_PASS_SOURCE_M = 0.01
 # Minimum log-likelihood gain over white noise to report time-correlated noise
 MIN_LIKELIHOOD_GAIN_NATS = 2.0
-# Penalty (nats) on a fit with a time offset, because it has one more parameter (Akaike 1974)
+# Reduction (nats) of the log-likelihood of a fit that also estimates a time offset: one more
+# parameter (Akaike 1974)
 TIME_OFFSET_PENALTY_NATS = 2.0
 # Search range (s) of the time constant of a low pass
 LOW_PASS_TAU_RANGE_S = (0.02, 3.0)
@@ -72,7 +74,7 @@ MAX_TRUTH_TIME_DIFFERENCE_S = 0.1
 FLIGHT_PART_COUNT = 12
 # Tested time constants (s) in the fit to ground truth
 TESTED_TAUS_S = np.geomspace(0.3, 80.0, 17)
-# Tested fractions of the error variance that is time-correlated, in the fit to ground truth
+# Tested fractions of time-correlated errors in the error variance, in the fit to ground truth
 TESTED_CORRELATED_FRACTIONS = np.linspace(0.05, 0.999, 20)
 
 
@@ -183,7 +185,8 @@ def fit_time_correlation(  # noqa: PLR0915 (two models with common data)
         unfiltered_position_m = (measured_m - rho[:, None] * previous_position_m) / (1.0 - rho)[
             :, None
         ]
-        # An outlier also changes the next unfiltered position, so both are excluded
+        # The unfiltered position is computed from a position and the previous position. Exclude
+        # both unfiltered positions that are computed from an outlier
         is_used_position = ~(
             is_outlier | (is_interval_without_gap & np.append(False, is_outlier[:-1]))
         )
@@ -197,7 +200,7 @@ def fit_time_correlation(  # noqa: PLR0915 (two models with common data)
         )
         if isinstance(motion_of_unfiltered_positions, Unavailable):
             return motion_of_unfiltered_positions, 0.0
-        # The first position of a segment sets the state, and is not part of the likelihood
+        # The first position of a segment sets the initial state, and is not part of the likelihood
         is_used = np.isin(
             time_s,
             np.delete(
@@ -224,7 +227,7 @@ def fit_time_correlation(  # noqa: PLR0915 (two models with common data)
         )
         for fraction, tau in product(COARSE_CORRELATED_VARIANCE_FRACTIONS, COARSE_TAUS_S)
     ]
-    # Scores are -ln p of the positions: the lowest is the best
+    # Scores are -ln p of the positions, so the lowest score is the best
     (coarse_white_noise_score, _), (coarse_correlated_noise_score, correlated_start_parameters) = (
         _search_coarse_grid(downsampled_motion, tested_offsets_s, candidate_parameters)
         for candidate_parameters in ([noise_parameters], correlated_candidates)
@@ -257,7 +260,7 @@ def fit_time_correlation(  # noqa: PLR0915 (two models with common data)
 
     def fit_low_pass(log_tau: float) -> tuple[float, NoiseParameters]:
         motion_of_unfiltered_positions, minus_log_jacobian = undo_low_pass(float(np.exp(log_tau)))
-        # The IMU motion was available for τ = 0 at the same times
+        # The same positions are used for each τ. undo_low_pass(0.0) found their IMU motion
         assert not isinstance(motion_of_unfiltered_positions, Unavailable)
         noise_fit = _fit_noises_at_offset(
             motion_of_unfiltered_positions, 0.0, white_noise_fit.noise_parameters
@@ -395,7 +398,7 @@ def fit_time_correlation_to_truth(
     first_tau_index, last_tau_index = np.flatnonzero(
         likelihood_gains_nats > best_gain_nats - MAX_LOG_LIKELIHOOD_DROP
     )[[0, -1]]
-    # Each end of the 95 % interval of τ is between two tested values: return the outer value
+    # Each end of the 95 % interval of τ is between two tested values of τ: return the outer value
     tau_s = np.append(TESTED_TAUS_S, np.inf)[
         [tau_index, max(first_tau_index - 1, 0), last_tau_index + 1]
     ]

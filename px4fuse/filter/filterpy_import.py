@@ -14,7 +14,7 @@ class _LazyDistribution:
 
     def __getattr__(self, attribute: str) -> Any:
         stats = import_module("scipy.stats")
-        # filterpy calls logpdf during its import, when scipy.stats cannot be loaded
+        # filterpy calls logpdf during its import, when scipy.stats is still the stub module below
         if stats.__spec__ is None:
             return lambda *_, **__: 0.0
         return getattr(getattr(stats, self._name), attribute)

@@ -30,18 +30,19 @@ from px4fuse.filter.model import INITIAL_COVARIANCE
 SIGMA_A_SEARCH_RANGE_M_S2 = (1e-3, 30.0)
 # Search range (m) of SIGMA_Z
 SIGMA_Z_SEARCH_RANGE_M = (1e-3, 10.0)
-# Maximum number of expectation maximisation iterations
+# Maximum number of iterations of expectation maximisation, which estimates the outliers
 MAX_OUTLIER_ITERATIONS = 12
 # Maximum number of L-BFGS-B iterations of a fit
 MAX_FIT_ITERATIONS = 50
-# Number of estimates of the outlier probabilities with given noises
+# Number of iterations to estimate the outlier probabilities if the noises are given
 OUTLIER_ITERATIONS_WITH_GIVEN_NOISES = 3
 # Minimum ratio of the outliers' σ to SIGMA_Z
 MIN_OUTLIER_SIGMA_RATIO = 3.0
 INITIAL_OUTLIER_FRACTION = 0.005
 INITIAL_OUTLIER_SIGMA_RATIO = 10.0
 MAX_OUTLIER_FRACTION = 0.4
-# Maximum ratio of SIGMA_Z to its robust estimate from the median squared error
+# To detect outliers, SIGMA_Z is limited to this multiple of a robust estimate, which is from the
+# median squared error
 MAX_SIGMA_Z_TO_MEDIAN_BASED_SIGMA_Z_RATIO = 1.2
 # Convergence limit for the change of outlier probabilities
 MAX_OUTLIER_PROBABILITY_CHANGE = 0.01
@@ -53,9 +54,9 @@ LOG_STEP_FOR_DERIVATIVES = 1e-4
 GRID_NODE_COUNT, GRID_NODE_SPACING = 6, 0.2
 GRID_NODES = np.arange(GRID_NODE_COUNT)
 BARYCENTRIC_WEIGHTS = (-1.0) ** GRID_NODES * comb(GRID_NODE_COUNT - 1, GRID_NODES)
-# Number of measurements that give the initial values for a long flight
+# In a long flight, a first fit to this number of measurements gives the initial values
 INITIAL_FIT_MEASUREMENT_COUNT = 2000
-# Precision of a known initial position (1/m²) and velocity (s²/m²)
+# Precision (1 ÷ variance) of a known initial position (1/m²) and velocity (s²/m²)
 KNOWN_INITIAL_STATE_PRECISION = 1e12
 
 
@@ -385,12 +386,12 @@ def maximise_likelihood(
         expected_squared_errors_m2, measured_axis_counts = _estimate_squared_errors(
             axis_positions, noise_parameters, measurement_weights
         )
-        # Outliers increase the estimated SIGMA_Z, but hardly change the median of squared errors
+        # Outliers increase the estimated SIGMA_Z, but hardly the median of the squared errors
         robust_variance_m2 = float(
             np.median(expected_squared_errors_m2 / measured_axis_counts)
             / (chdtri(measured_axis_counts[0], 0.5) / measured_axis_counts[0])
         )
-        # No measurement is an outlier if most errors exceed the search range of SIGMA_Z
+        # If most errors exceed the search range of SIGMA_Z, no measurement is treated as an outlier
         if robust_variance_m2 > SIGMA_Z_SEARCH_RANGE_M[1] ** 2:
             break
         limited_sigma_z_variance_m2 = min(
@@ -572,7 +573,7 @@ def _maximise_by_gradient(
         # Dividing by the number of measurements gives L-BFGS-B a suitable first step
         try:
             return likelihood(to_noise_parameters(log_parameters)) / measurement_count
-        # After a large score, L-BFGS-B tries a shorter step
+        # A large score makes L-BFGS-B try a shorter step
         except np.linalg.LinAlgError:
             return UNCOMPUTABLE_SCORE
 

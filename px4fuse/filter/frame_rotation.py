@@ -51,9 +51,10 @@ MAX_HEADING_FIT_ITERATIONS = 5
 MAX_HEADING_CHANGE_AT_CONVERGENCE_RAD = 0.01
 # Prior σ (rad) of the heading error
 HEADING_SIGMA_RAD = 1.0
-# Minimum estimated ratio of true to measured distances, to avoid a division by zero
+# Lower limit of the estimated ratio of true to measured distances, which is a divisor
 MIN_TRUE_TO_MEASURED_SCALE = 0.1
-# Index of the heading error among the constant errors; the first column of increments is the motion
+# Index of the heading error in the constant errors. Its index in the IMU increments is larger by 1,
+# because index 0 is the motion itself
 HEADING_ERROR_INDEX = 2
 
 
@@ -169,7 +170,7 @@ def estimate_heading_error(  # noqa: PLR0911 (one return per missing input)
     ]
     position_samples = position_samples.set_axis(position_samples.index.to_numpy() + offset_s)
     noise_parameters = NoiseParameters(settings.sigma_a_m_s2, sigma_z_m)
-    # The mounting angle of the source is unknown, so its orientations give only yaw changes
+    # The mounting angle of the source is unknown, so its orientations show only changes of yaw
     return _estimate_heading_error_from_positions(
         flight,
         position_samples,
@@ -186,7 +187,7 @@ def _average_flight_parts(
 
     σ is not reduced by averaging, because errors in one part are correlated.
     """
-    # At a low sample rate, parts are longer, to contain enough samples
+    # At a low sample rate, the flight parts are longer, so that they contain enough samples
     part_count = max(
         int(
             min(
@@ -296,7 +297,8 @@ def _estimate_heading_error_from_positions(
                 "Analyse a longer segment.",
             )
         positions = motion.make_positions_at_offset(0.0)
-        # Noise of the IMU motion would bias the heading error to zero, so the smooth path is used
+        # Effect of a heading error: motion along the smooth path through the positions (last row),
+        # rotated by 90°. With the noisy motion from the IMU, the estimate would be too small
         for increments in (positions.delta_position_m, positions.delta_velocity_m_s):
             north_m, east_m = increments[:, :, -1]
             increments[:, :, 1 + HEADING_ERROR_INDEX] = -east_m, north_m
@@ -310,7 +312,8 @@ def _estimate_heading_error_from_positions(
         constant_errors_covariance = np.linalg.inv(position_fit.compute_constants_information())[
             is_part_long_enough, 0
         ]
-        # The smooth path contains the scale factor of the positions, 1 / true_to_measured_scale
+        # The smooth path has the scale of the measured positions, but a heading error rotates true
+        # distances: divide the fitted heading error by the ratio of true to measured distances
         true_to_measured_scale = np.maximum(
             1.0 - constant_errors[:, -1], MIN_TRUE_TO_MEASURED_SCALE
         )
@@ -329,7 +332,7 @@ def _estimate_heading_error_from_positions(
     # Variance due to drift: variance of the estimates minus their noise variance
     variance_above_noise_rad2 = max(float(np.mean(deviation_rad**2 - heading_variance_rad2)), 0.0)
     heading_drift_variance_rad2 = 0.0 if has_constant_heading else variance_above_noise_rad2
-    # Uncertain estimates are moved towards the mean heading error
+    # The larger its variance, the more the estimate of a part is moved to the mean heading error
     weight_of_part_estimate = heading_drift_variance_rad2 / (
         heading_drift_variance_rad2 + heading_variance_rad2
     )

@@ -45,18 +45,19 @@ MAX_SLOW_ERROR_KNOTS = 40
 # Columns of the design matrix: forward and right bias (body frame), yaw of the source frame
 FORWARD_BIAS_COLUMN, RIGHT_BIAS_COLUMN, FRAME_ROTATION_COLUMN = range(3)
 CONSTANT_ERROR_COLUMN_COUNT = 3
-# Inputs of KF for each axis: the data, and one for each constant error
+# Number of inputs of KF per axis: the data, and the effect of each constant error
 INPUTS_PER_AXIS = 1 + CONSTANT_ERROR_COLUMN_COUNT
-# Tested multiples of KF's SIGMA_A, mostly below 1: KF's SIGMA_A includes biases and tilt
+# Tested multiples of KF's SIGMA_A. Most are below 1, because SIGMA_A also includes errors due to
+# biases and tilt, which are estimated separately here
 TESTED_SIGMA_A_FACTORS = np.geomspace(0.2, 2.0, 7)
 # Tested scale factors of the position source
 TESTED_SCALE_FACTORS = np.linspace(0.7, 1.3, 7)
 MAX_TESTED_JUMP_TIMES = 800
 # Number of jump times that are tested at once, to limit the memory
 JUMP_BATCH_SIZE = 80
-# Positions within this time (s) after a tested jump are ignored, because they may be outliers
+# In the test for a jump, positions within this time (s) after it are ignored: they may be outliers
 OUTLIER_BURST_DURATION_S = 1.0
-# Outliers within this time (s) after a jump are tested again
+# Measurements classified as outliers within this time (s) after a jump are tested again
 OUTLIER_RETEST_DURATION_AFTER_JUMP_S = 6.0
 # Maximum false alarm probability of a jump, per flight
 MAX_JUMP_FALSE_ALARM_P = 1e-3
@@ -186,9 +187,10 @@ def fit_systematic_errors(
         return report_too_few_measurements(ANALYSIS_NAME, used_count, MIN_MEASUREMENTS)
     tested_sigmas_a = (sigma_a_m_s2 * TESTED_SIGMA_A_FACTORS).tolist()
     design_matrix, regression = _fit_sigma_a(initial_design, tested_sigmas_a, is_outlier)
-    # Some outliers are measurements after a jump, and some measurements near a jump are outliers
+    # Jumps change the mask of outliers: some outliers are good measurements after a jump, and some
+    # measurements near a jump are outliers
     jumps, is_skipped = _find_jumps(design_matrix, regression, is_outlier, source_resets_s)
-    # Jumps enlarge the estimated SIGMA_A
+    # The jumps have enlarged the estimate of SIGMA_A, so estimate SIGMA_A again
     if jumps:
         design_matrix = replace(design_matrix, jump_times_s=[jump.time_s for jump in jumps])
         design_matrix, regression = _fit_sigma_a(design_matrix, tested_sigmas_a, is_skipped)
@@ -273,7 +275,7 @@ def _find_jumps(
     ]
 
     def mask_outliers_near_jump(jump_time_s: float) -> BoolArray:
-        # After a reset that the source reports, its positions are valid
+        # Positions after a reset that the source reports are valid, even if they look like outliers
         if jump_time_s in source_resets_s:
             return is_skipped & ~_is_in_window(
                 time_s, jump_time_s, OUTLIER_RETEST_DURATION_AFTER_JUMP_S
@@ -328,7 +330,8 @@ def _find_significant_jump_times(
     min_chi_square = chdtri(
         design_matrix.axis_count, MAX_JUMP_FALSE_ALARM_P / len(design_matrix.time_s)
     )
-    # Skipped measurements give equal χ² except for rounding: the earliest time comes first
+    # If all measurements between two candidate times are skipped, both have equal χ² except for
+    # rounding errors. Rounding χ² puts the earlier time first
     return [
         float(candidate_times_s[index])
         for index in np.argsort(-chi_square.round(6), kind="stable")
@@ -582,7 +585,8 @@ class DesignMatrix:
         """
         inputs, axis_count = self.preintegrated_inputs, self.axis_count
         input_count = inputs.measurement_m.shape[1]
-        # Only inputs with measured acceleration are multiplied by the scale factor
+        # The scale factor applies to the measured motion and to its rotation, but not to the
+        # effects of accelerometer biases
         input_scale_factors = np.ones(input_count)
         data_inputs = INPUTS_PER_AXIS * np.arange(axis_count)
         input_scale_factors[data_inputs] = scale
