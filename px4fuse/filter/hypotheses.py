@@ -46,11 +46,11 @@ MAX_SLOW_ERROR_KNOTS = 40
 # source frame relative to the attitude
 FORWARD_BIAS_COLUMN, RIGHT_BIAS_COLUMN, FRAME_ROTATION_COLUMN = range(3)
 CONSTANT_ERROR_COLUMN_COUNT = 3
-# Number of inputs for which KF's innovations are computed, for each axis: the flight data, and one
-# unit error for each column above
+# Number of inputs for which KF's innovations are computed, for each axis: the flight data, and each
+# of the three constant errors with size 1
 INPUTS_PER_AXIS = 1 + CONSTANT_ERROR_COLUMN_COUNT
 # Tested values of SIGMA_A ÷ KF's SIGMA_A. Most are below 1, because KF's SIGMA_A includes biases
-# and tilt errors, which are fitted here
+# and tilt errors, which this regression estimates separately
 TESTED_SIGMA_A_FACTORS = np.geomspace(0.2, 2.0, 7)
 # Tested scale factors of the position source
 TESTED_SCALE_FACTORS = np.linspace(0.7, 1.3, 7)
@@ -189,8 +189,8 @@ def fit_systematic_errors(
         return report_too_few_measurements(ANALYSIS_NAME, used_count, MIN_MEASUREMENTS)
     tested_sigmas_a = (sigma_a_m_s2 * TESTED_SIGMA_A_FACTORS).tolist()
     design_matrix, regression = _fit_sigma_a(initial_design, tested_sigmas_a, is_outlier)
-    # The mask of outliers is corrected: it may contain correct positions after a jump, and may not
-    # contain outliers near a jump
+    # The mask of outliers is corrected: it can contain correct positions after a jump, and can lack
+    # outliers near a jump
     jumps, is_skipped = _find_jumps(design_matrix, regression, is_outlier, source_resets_s)
     # SIGMA_A is fitted again, because jumps that are not modelled enlarge its estimate
     if jumps:
@@ -406,7 +406,8 @@ def _locate_jump(
         jump_time_s: np.where(is_near_jump, test_for_outliers(jump_time_s), is_skipped)
         for jump_time_s in candidate_times_s[best_indices].tolist()
     }
-    # With a wrong jump time, correct measurements seem to be outliers: use the time with the fewest
+    # With a wrong jump time, correct measurements seem to be outliers. The best jump time has the
+    # fewest outliers
     best_jump_time_s = min(
         outlier_mask_by_jump_time,
         key=lambda jump_time_s: np.count_nonzero(outlier_mask_by_jump_time[jump_time_s]),

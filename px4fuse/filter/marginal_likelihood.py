@@ -304,7 +304,7 @@ def fit_positions(
     ):
         log_determinant += len(axes) * system.log_determinant
         degrees_of_freedom += len(axes) * axis_degrees_of_freedom
-        # Some segments at once: single segments are slow, and all segments need much memory
+        # Process some segments at once: single segments are slow, and all segments need much memory
         for batch in np.array_split(np.arange(segment_count), min(batch_count, segment_count)):
             begin, end = segment_edges[[batch[0], batch[-1] + 1]]
             edges = segment_edges[batch[0] : batch[-1] + 2] - begin

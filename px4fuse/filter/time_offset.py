@@ -40,10 +40,10 @@ INITIAL_SEARCH_HALF_WIDTH_S = 0.1
 # The likelihood curve extends from the most likely time offset by this multiple of the time
 # offset's σ to both sides, but at least by this time (s)
 CURVE_HALF_WIDTH_SIGMAS, MIN_CURVE_HALF_WIDTH_S = 3.5, 0.01
-# Width of the range of tested time offsets ÷ width of the likelihood curve. The margin is needed
-# because the curve is centred at the most likely offset, which the test changes slightly
+# Width of the range of tested time offsets ÷ width of the likelihood curve. The curve is centred at
+# the most likely offset, which is not exactly in the middle of this range
 TESTED_TO_CURVE_WIDTH_RATIO = 1.3
-# Number of time offsets near the most likely time offset for which the likelihood is computed
+# Number of tested time offsets near the most likely one, for which the likelihood is computed
 FINE_GRID_OFFSET_COUNT = 11
 # Maximum step (s) of the tested time offsets for an interpolation of the likelihood
 MAX_INTERPOLATED_OFFSET_STEP_S = 0.05
