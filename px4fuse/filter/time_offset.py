@@ -37,13 +37,13 @@ from px4fuse.flight.model import Columns, Flight, PositionTrack, Unavailable
 
 # Half-width (s) of the range of time offsets that is tested around the result of the coarse search
 INITIAL_SEARCH_HALF_WIDTH_S = 0.1
-# The likelihood curve extends from the most likely time offset by this multiple of the time
-# offset's σ to both sides, but at least by this time (s)
+# Half-width of the likelihood curve around the estimated time offset: this multiple of the
+# estimate's σ, but at least this time (s)
 CURVE_HALF_WIDTH_SIGMAS, MIN_CURVE_HALF_WIDTH_S = 3.5, 0.01
 # Width of the range of tested time offsets ÷ width of the likelihood curve. The curve is centred at
-# the most likely offset, which is not exactly in the middle of this range
+# the maximum-likelihood estimate, which is not exactly in the middle of this range
 TESTED_TO_CURVE_WIDTH_RATIO = 1.3
-# Number of tested time offsets near the most likely one, for which the likelihood is computed
+# Number of tested time offsets near the maximum of the likelihood
 FINE_GRID_OFFSET_COUNT = 11
 # Maximum step (s) of the tested time offsets for an interpolation of the likelihood
 MAX_INTERPOLATED_OFFSET_STEP_S = 0.05

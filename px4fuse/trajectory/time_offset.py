@@ -295,8 +295,8 @@ def _compute_interval_half_width_s(
     sparse_track_velocity_m_s = fit.transform.to_rotation().apply(
         fit.transform.scale * _compute_velocity(sparse_track, fit.time_s)
     )
-    # The alignment (shift, rotation, scale) is fitted together with the time offset. Velocity that a
-    # change of the alignment explains is removed, because it does not determine the time offset
+    # The alignment (shift, rotation, scale) is fitted together with the time offset. Velocity that
+    # a change of the alignment explains is removed, because it does not determine the time offset
     columns = [np.tile(axis, (pose_count, 1)) for axis in np.eye(3)]
     columns += [np.cross(axis, centred_m) for axis in np.eye(3)]
     similarity_jacobian = np.stack([*columns, centred_m], axis=-1).reshape(3 * pose_count, 7)

@@ -15,7 +15,7 @@ from scipy.sparse.linalg import splu
 from px4fuse.core.arrays import Array, ArrayPair, IntArray
 
 # The poses of a small subtree of the elimination tree are eliminated together, in one dense matrix.
-# Maximum number of unknowns of such a matrix: a larger one would contain more zeros
+# Maximum number of unknowns in this matrix: a larger matrix would contain more zeros
 _MAX_LEAF_UNKNOWNS = 96
 # Diagonal matrix elements of the first pose: so large that they fix the pose, but their squares do
 # not overflow
