@@ -59,7 +59,7 @@ MIN_CORRELATED_NOISE_SIGMA_M = 0.005
 MIN_REPEATED_FRACTION = 0.05
 MIN_REPEATED_FRACTION_FOR_ERROR = 0.3
 MIN_REPEATED_POSITION_COUNT = 10
-# Minimum ratio of the larger to the smaller position noise σ, north and east
+# Minimum ratio for a warning: larger ÷ smaller position noise (σ) of two horizontal axes
 MIN_AXIS_NOISE_RATIO = 1.5
 # Minimum ratio of the noise in one flight part to the noise in the rest, for a warning
 MIN_NOISY_PART_SIGMA_RATIO = 2.0

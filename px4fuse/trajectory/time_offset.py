@@ -43,11 +43,12 @@ MAX_FITTED_POSES = 2000
 MAX_RELATIVE_MISFIT = 0.5
 # Lower limit of residual divided by extent (RMS): better fits count as equally good
 MISFIT_FLOOR = 1e-3
-# Minimum ratio of the residual velocity after alignment to the speed (both RMS)
+# Minimum ratio: RMS of the velocity that no change of the alignment explains ÷ RMS speed
 MIN_RESIDUAL_VELOCITY_FRACTION = 0.05
-# Minimum correlation of the residual velocities of both trajectories
+# Minimum correlation, between both trajectories, of the velocity that no change of the alignment
+# explains
 MIN_RESIDUAL_VELOCITY_CORRELATION = 0.5
-# Maximum lag in the variance estimate of Newey and West (1987), in correlation lengths
+# Maximum lag in the variance estimate of Newey and West (1987) ÷ correlation length
 MAX_LAG_IN_CORRELATION_LENGTHS = 4
 # Maximum half-width (s) of the 95 % interval of a time offset
 MAX_INTERVAL_HALF_WIDTH_S = 0.5
