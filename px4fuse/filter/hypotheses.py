@@ -42,22 +42,24 @@ TILT_PRIOR_SIGMA_RAD = 0.002
 # Interval (s) between the knots of the slow acceleration error, which is piecewise linear
 SLOW_ERROR_KNOT_SPACING_S = 15.0
 MAX_SLOW_ERROR_KNOTS = 40
-# Columns of the design matrix: forward and right bias (body frame), yaw of the source frame
+# Columns of the design matrix: forward and right accelerometer bias (body frame), and yaw of the
+# source frame relative to the attitude
 FORWARD_BIAS_COLUMN, RIGHT_BIAS_COLUMN, FRAME_ROTATION_COLUMN = range(3)
 CONSTANT_ERROR_COLUMN_COUNT = 3
-# Number of inputs of KF per axis: the data, and the effect of each constant error
+# Number of inputs for which KF's innovations are computed, for each axis: the flight data, and each
+# of the three constant errors with size 1
 INPUTS_PER_AXIS = 1 + CONSTANT_ERROR_COLUMN_COUNT
-# Tested multiples of KF's SIGMA_A. Most are below 1, because SIGMA_A also includes errors due to
-# biases and tilt, which are estimated separately here
+# Tested values of SIGMA_A ÷ KF's SIGMA_A. Most are below 1, because KF's SIGMA_A includes biases
+# and tilt errors, which this regression estimates separately
 TESTED_SIGMA_A_FACTORS = np.geomspace(0.2, 2.0, 7)
 # Tested scale factors of the position source
 TESTED_SCALE_FACTORS = np.linspace(0.7, 1.3, 7)
 MAX_TESTED_JUMP_TIMES = 800
 # Number of jump times that are tested at once, to limit the memory
 JUMP_BATCH_SIZE = 80
-# In the test for a jump, positions within this time (s) after it are ignored: they may be outliers
+# Positions within this time (s) after a tested jump are ignored, because they may be outliers
 OUTLIER_BURST_DURATION_S = 1.0
-# Measurements classified as outliers within this time (s) after a jump are tested again
+# Outliers within this time (s) after a jump are tested again: they may be correct positions
 OUTLIER_RETEST_DURATION_AFTER_JUMP_S = 6.0
 # Maximum false alarm probability of a jump, per flight
 MAX_JUMP_FALSE_ALARM_P = 1e-3
@@ -187,10 +189,10 @@ def fit_systematic_errors(
         return report_too_few_measurements(ANALYSIS_NAME, used_count, MIN_MEASUREMENTS)
     tested_sigmas_a = (sigma_a_m_s2 * TESTED_SIGMA_A_FACTORS).tolist()
     design_matrix, regression = _fit_sigma_a(initial_design, tested_sigmas_a, is_outlier)
-    # Jumps change the mask of outliers: some outliers are good measurements after a jump, and some
-    # measurements near a jump are outliers
+    # The mask of outliers is corrected: it can contain correct positions after a jump, and can lack
+    # outliers near a jump
     jumps, is_skipped = _find_jumps(design_matrix, regression, is_outlier, source_resets_s)
-    # The jumps have enlarged the estimate of SIGMA_A, so estimate SIGMA_A again
+    # SIGMA_A is fitted again, because jumps that are not modelled enlarge its estimate
     if jumps:
         design_matrix = replace(design_matrix, jump_times_s=[jump.time_s for jump in jumps])
         design_matrix, regression = _fit_sigma_a(design_matrix, tested_sigmas_a, is_skipped)
@@ -233,7 +235,7 @@ def _fit_scale(design_matrix: DesignMatrix, is_skipped: BoolArray) -> Estimate:
     fit_scale = cache(lambda index: design_matrix.fit(is_skipped, tested_scales[index]))
 
     def compute_score(index: int) -> float:
-        # ln S is omitted from the score, because it would bias the scale factor to zero
+        # The term ln S of the likelihood is omitted, because it would bias the scale factor to zero
         return fit_scale(index).residual_and_prior_square_sum / 2.0
 
     centre_index = _find_minimum(compute_score, len(tested_scales))
@@ -275,7 +277,7 @@ def _find_jumps(
     ]
 
     def mask_outliers_near_jump(jump_time_s: float) -> BoolArray:
-        # Positions after a reset that the source reports are valid, even if they look like outliers
+        # Positions after a reset that the source reports are valid, even if they are in the mask
         if jump_time_s in source_resets_s:
             return is_skipped & ~_is_in_window(
                 time_s, jump_time_s, OUTLIER_RETEST_DURATION_AFTER_JUMP_S
@@ -330,8 +332,8 @@ def _find_significant_jump_times(
     min_chi_square = chdtri(
         design_matrix.axis_count, MAX_JUMP_FALSE_ALARM_P / len(design_matrix.time_s)
     )
-    # If all measurements between two candidate times are skipped, both have equal χ² except for
-    # rounding errors. Rounding χ² puts the earlier time first
+    # Jump times with only skipped measurements between them have the same χ² except for rounding.
+    # The earliest of these times comes first
     return [
         float(candidate_times_s[index])
         for index in np.argsort(-chi_square.round(6), kind="stable")
@@ -404,7 +406,8 @@ def _locate_jump(
         jump_time_s: np.where(is_near_jump, test_for_outliers(jump_time_s), is_skipped)
         for jump_time_s in candidate_times_s[best_indices].tolist()
     }
-    # With a wrong jump time, good measurements look like outliers
+    # With a wrong jump time, correct measurements seem to be outliers. The best jump time has the
+    # fewest outliers
     best_jump_time_s = min(
         outlier_mask_by_jump_time,
         key=lambda jump_time_s: np.count_nonzero(outlier_mask_by_jump_time[jump_time_s]),
@@ -555,7 +558,8 @@ class DesignMatrix:
         prior_precision = np.zeros(columns.shape[1])
         prior_precision[: len(self.prior_sigma)] = self.prior_sigma**-2.0
         information = np.diag(prior_precision) + used_columns.T @ used_columns
-        # A small diagonal prevents a singular matrix: in hover, the rotation has no effect
+        # A small diagonal prevents a singular matrix: in hover, a rotation of the source frame has
+        # no effect on the innovations
         information += 1e-12 * np.diag(np.diag(information)) + 1e-12 * np.eye(len(information))
         right_hand_side = used_columns.T @ used_innovations
         information_factor = cho_factor(information)
@@ -585,8 +589,7 @@ class DesignMatrix:
         """
         inputs, axis_count = self.preintegrated_inputs, self.axis_count
         input_count = inputs.measurement_m.shape[1]
-        # The scale factor applies to the measured motion and to its rotation, but not to the
-        # effects of accelerometer biases
+        # Only inputs with measured acceleration are multiplied by the scale factor
         input_scale_factors = np.ones(input_count)
         data_inputs = INPUTS_PER_AXIS * np.arange(axis_count)
         input_scale_factors[data_inputs] = scale

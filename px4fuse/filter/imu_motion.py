@@ -50,9 +50,10 @@ from px4fuse.trajectory.rotation import (
 
 # Prior σ (rad) of the errors of tilt and heading at the start of a segment
 HEADING_SIGMA_RAD = 0.05
-# Prior σ: initial attitude (rad), gyro bias (rad/s), accelerometer bias (m/s²), scale (1)
+# Prior σ of the constant errors of a segment: initial attitude (rad), gyro bias (rad/s) and
+# accelerometer bias (m/s²) along three axes, and position scale (1)
 PRIOR_SIGMAS_OF_SEGMENT_CONSTANTS = np.repeat([HEADING_SIGMA_RAD, 0.004, 0.3, 0.1], [3, 3, 3, 1])
-# A larger gyro bias (rad/s) is subtracted before the fit: 5 σ of its prior
+# A gyro bias above this limit (rad/s; 5 σ of the prior) is subtracted before the fit
 MAX_PRIOR_GYRO_BIAS_RAD_S = 0.02
 # Maximum gyro bias (rad/s) that EKF2 can remove from its attitude: the maximum of EKF2_GYR_B_LIM
 MAX_REMOVED_GYRO_BIAS_RAD_S = 0.4
@@ -69,7 +70,8 @@ MIN_SEGMENT_MEASUREMENTS = 15
 MIN_KEPT_MEASUREMENTS = 5
 # Interval (s) over which the IMU is averaged before integration
 INTEGRATION_STEP_S = 0.02
-# Small prior precision of initial position (1/m²) and velocity (s²/m²) against a singular matrix
+# Prior precision of the initial position (1/m²) and velocity (s²/m²) of a segment: small, but not
+# zero, so that the matrix of the normal equations is not singular
 INITIAL_STATE_PRIOR_PRECISIONS = 1e-6, 1e-4
 # Maximum median interval (s) between IMU samples
 MAX_IMU_INTERVAL_S = 0.025
@@ -180,7 +182,8 @@ class PositionsAndImuMotion:
             self.segment_edges, self.segment_edges[1:], self.segment_motions, strict=False
         ):
             measurement_time_s = self.time_s[begin:end]
-            # Shape (axes, time offsets, 1 + constants, times): the motion, then its derivatives
+            # Shape (axes, time offsets, 10, times). The third dimension is the motion from the IMU,
+            # then its derivatives with respect to the nine constant errors of attitude and IMU
             position, velocity = (
                 np.swapaxes(np.tensordot(self.directions, signal, 1), 1, 2)
                 for signal in segment_motion.interpolate(
@@ -366,7 +369,7 @@ def compute_imu_motion(
             "Analyse a longer segment.",
         )
     segment_edges = np.cumsum([0, *map(len, rows_by_segment)])
-    # Positions relative to the first one have smaller rounding errors
+    # Positions relative to the first position of a segment have smaller rounding errors
     measured_m = pd.DataFrame(measurement_m[used_rows])
     segment_index = np.repeat(np.arange(len(rows_by_segment)), np.diff(segment_edges))
     first_position_m = measured_m.groupby(segment_index).transform("first")
@@ -414,7 +417,7 @@ def make_segment_motion(
     )
     specific_force_integral_m_s = imu_integrals_at_steps[:, :3]
     gyro_integral_rad = imu_integrals_at_steps[:, 3:]
-    # The first attitude sample is before the first step
+    # The first selected attitude sample is before the first step, for interpolation at this step
     attitude_time_s = attitude.index.to_numpy()
     first_row, end_row = np.searchsorted(attitude_time_s, step_times_s[[0, -1]], side="right")
     attitude_samples = attitude.iloc[max(first_row - 1, 0) : end_row][Columns.QUATERNION]

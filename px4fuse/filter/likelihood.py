@@ -30,9 +30,10 @@ from px4fuse.filter.steps import PredictionSteps, make_prediction_steps
 MAX_LOG_LIKELIHOOD_DROP = float(chdtri(1, 0.05)) / 2.0
 # Initial step of ln σ in the search for an end of the 95 % interval
 INITIAL_LOG_SIGMA_SEARCH_STEP = 0.05
-# Maximum change of ln SIGMA_Z between two tested values of SIGMA_A, or vice versa
+# For each tested SIGMA_A, the most likely SIGMA_Z is searched, or vice versa. In this search, ln σ
+# changes at most by this value from the result for the previous tested SIGMA_A (or SIGMA_Z)
 MAX_OTHER_LOG_SIGMA_CHANGE = 1.0
-# Tolerance of ln σ in the search for the best SIGMA_Z with given SIGMA_A, or vice versa
+# Tolerance of ln σ in the search for the most likely SIGMA_Z for a given SIGMA_A, or vice versa
 OTHER_LOG_SIGMA_TOLERANCE = 2e-3
 
 

@@ -29,7 +29,8 @@ from px4fuse.core.arrays import Array, ArrayPair, BoolArray, IntArray
 UNCHANGED_SIGMAS = np.ones(1)
 # Acceleration noise and position noise of the smoother that estimates a path from the positions
 PATH_SMOOTHER_SIGMA_A_M_S2, PATH_SMOOTHER_SIGMA_Z_M = 0.5, 0.1
-# Minimum prior precision (1/m² or s²/m²) of a state that counts as known
+# A position or velocity without a measurement counts as known only if its prior precision (1/m² or
+# s²/m²) exceeds this limit
 MIN_PRECISION_OF_KNOWN_STATE = 1e-3
 # Q can be singular, so a small variance is added to Q₀₀: its σ as a fraction of √(R + Q₀₀)
 REGULARISATION_TO_POSITION_SIGMA_RATIO = 1e-5
@@ -303,7 +304,7 @@ def fit_positions(
     ):
         log_determinant += len(axes) * system.log_determinant
         degrees_of_freedom += len(axes) * axis_degrees_of_freedom
-        # Several segments at once: one at a time is slow, all of a long flight need much memory
+        # Process some segments at once: single segments are slow, and all segments need much memory
         for batch in np.array_split(np.arange(segment_count), min(batch_count, segment_count)):
             begin, end = segment_edges[[batch[0], batch[-1] + 1]]
             edges = segment_edges[batch[0] : batch[-1] + 2] - begin
@@ -370,7 +371,8 @@ def subtract_smooth_path(
         path_position_increment_m = (
             np.diff(path_m) - positions.interval_s * path_velocity_m_s[..., :-1]
         )
-        # All time offsets have the same measured positions, so the same path is subtracted
+        # The measured positions are the same for all tested time offsets. The path that is fitted
+        # with the first time offset is therefore subtracted for all of them
         for array, increment in ((dp, path_position_increment_m), (dv, np.diff(path_velocity_m_s))):
             array[axes, :, 0] -= increment[:, :1]
             if estimates_scale:
@@ -576,7 +578,8 @@ class BandedNormalEquations:
 
         The information of earlier and of later measurements is added (Fraser and Potter 1969).
         """
-        # The Cholesky factor of A in reverse time order contains the later measurements
+        # At each measurement, the Cholesky factor of A contains the information of all earlier
+        # measurements. With A in reverse time order, it contains that of all later measurements
         time_reversed_bands = np.zeros_like(self.bands)
         number_of_unknowns = self.bands.shape[1]
         for band in range(4):
@@ -586,8 +589,9 @@ class BandedNormalEquations:
         time_reversed_cholesky_factor, _ = lapack.dpbtrf(
             time_reversed_bands, lower=1, overwrite_ab=1
         )
-        # Diagonal blocks of the Cholesky factors: [[a, 0], [b, c]], and in reverse time order
-        # [[d, 0], [e, f]]. In reverse order, velocity precedes position
+        # Diagonal blocks (one for each measurement) of the Cholesky factors. In time order they are
+        # [[a, 0], [b, c]] for (position, velocity). In reverse time order they are
+        # [[d, 0], [e, f]] for (velocity, position)
         (a, c) = (self.cholesky_factor[0, first_row::2] for first_row in (0, 1))
         b = self.cholesky_factor[1, 0::2]
         (d, f) = (time_reversed_cholesky_factor[0, first_row::2][::-1] for first_row in (0, 1))
@@ -648,7 +652,7 @@ def factorise(
         np.stack([q11, -q01, q00 + regularisation_variance_m2]) / q_determinant,
         0.0,
     )
-    # Elements of Q⁻¹, and element 10 of FᵀQ⁻¹
+    # Elements of Q⁻¹, and the element of FᵀQ⁻¹ in the row of velocity and the column of position
     inverse_q00, inverse_q01, inverse_q11 = inverse_q
     position_velocity_weight = inverse_q00 * interval_s + inverse_q01
     # A = diag(precision) + Σ [-F I]ᵀ Q⁻¹ [-F I] over the intervals, in LAPACK's band format

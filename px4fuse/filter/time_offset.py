@@ -35,27 +35,30 @@ from px4fuse.filter.settings import Settings
 from px4fuse.filter.signals import Segment, cut_to_segment, make_downsampling_slice
 from px4fuse.flight.model import Columns, Flight, PositionTrack, Unavailable
 
-# Half-width (s) of the tested time offsets around the result of the coarse search
+# Half-width (s) of the range of time offsets that is tested around the result of the coarse search
 INITIAL_SEARCH_HALF_WIDTH_S = 0.1
-# Half-width of the likelihood curve ÷ σ of the time offset, and its minimum (s)
+# Half-width of the likelihood curve around the estimated time offset: this multiple of the
+# estimate's σ, but at least this time (s)
 CURVE_HALF_WIDTH_SIGMAS, MIN_CURVE_HALF_WIDTH_S = 3.5, 0.01
-# Half-width of the tested time offsets ÷ half-width of the curve, which is around their minimum
+# Width of the range of tested time offsets ÷ width of the likelihood curve. The curve is centred at
+# the maximum-likelihood estimate, which is not exactly in the middle of this range
 TESTED_TO_CURVE_WIDTH_RATIO = 1.3
-# Number of time offsets near the maximum at which the likelihood is computed
+# Number of tested time offsets near the maximum of the likelihood
 FINE_GRID_OFFSET_COUNT = 11
-# Maximum distance (s) of time offsets between which the likelihood is interpolated
+# Maximum step (s) of the tested time offsets for an interpolation of the likelihood
 MAX_INTERPOLATED_OFFSET_STEP_S = 0.05
 # Number of points of the likelihood curve in the report
 LIKELIHOOD_CURVE_POINT_COUNT = 121
 # Prior σ (rad) of EKF2's heading with GNSS: a wrong GNSS delay (0.2 s) causes an error of 5°
 GNSS_HEADING_SIGMA_RAD = 0.2
-# Tested differences (s) between the time offsets of a flight part and of the flight
+# Tested differences (s): time offset of one part of the flight minus that of the whole flight
 PART_OFFSET_CHANGES_S = np.concatenate(
     [np.linspace(-0.6, -0.3, 4), np.linspace(-0.2, 0.2, 9), np.linspace(0.3, 0.6, 4)]
 )
 # Maximum half-width (s) of the 95 % interval of an accepted time offset
 MAX_OFFSET_INTERVAL_HALF_WIDTH_S = 0.15
-# Maximum σ (s) of a segment's time offset in the test for a changed time offset
+# Flight segments with a larger σ (s) of the time offset are not used in the test for a change of
+# the time offset
 MAX_SEGMENT_OFFSET_SIGMA_S = 0.15
 # The time offset changes in flight if the p-value of a constant offset is below this limit
 MAX_P_VALUE_OF_CHANGED_OFFSET = 0.005
@@ -65,7 +68,9 @@ MIN_TIME_OFFSET_CHANGE_S = 0.10
 MIN_OFFSET_SIGMAS = 3.0
 # Minimum significant time offset (s): position error of 3 cm at 1 m/s
 MIN_TIME_OFFSET_S = 0.03
-# Simulation of IMU noise: number of groups of flight segments, and segments in each group
+# The effect of IMU noise on the time offset is simulated for groups of successive flight segments.
+# Minimum number of simulated groups (a short flight is simulated several times), and segments in
+# each group
 SIMULATED_GROUP_COUNT, SEGMENTS_PER_SIMULATED_GROUP = 96, 12
 
 
@@ -166,7 +171,7 @@ def estimate_time_offset(
     motion_cache : dict, optional
         IMU motion that is already computed; new motion is added.
     """
-    # GNSS height is omitted: it is noisier, but all axes have the same SIGMA_Z
+    # GNSS height is omitted: it is noisier than north and east, but the fit has one SIGMA_Z for all
     axis_count = 2 if track.origin.is_gnss else 3
     position_samples = cut_to_segment(track.samples, segment)[Columns.POSITION[:axis_count]]
     position_samples = position_samples.dropna(subset=Columns.POSITION[:2])

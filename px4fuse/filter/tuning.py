@@ -40,7 +40,7 @@ HORIZONTAL = "horizontal"
 NoiseInterval = tuple[NotNegative, NotNegative | None]
 MIN_MEASUREMENTS = 30
 MAX_OUTLIER_FRACTION = 0.3
-# Initial values of SIGMA_A, as multiples of KF's SIGMA_A
+# Initial values in the search for the acceleration noise: KF's SIGMA_A multiplied by these factors
 START_SIGMA_A_FACTORS = (0.1, 0.3, 1.0)
 # Initial value (m/√s) of the random walk of a source that may drift
 START_RANDOM_WALK_M = 0.02
@@ -195,7 +195,8 @@ def tune(
                     name, group_axes, settings, flight, may_drift, motion_cache
                 )
             except np.linalg.LinAlgError as error:
-                # Positions far from the path cause rounding errors
+                # Outliers far from the path cause rounding errors, which can make the matrix
+                # singular
                 tunings[name] = Unavailable(
                     f"estimate of SIGMA_A and SIGMA_Z ({name})",
                     str(error),

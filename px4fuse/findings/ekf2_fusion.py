@@ -59,16 +59,17 @@ MOTION_CAPTURE_TOPIC = "vehicle_mocap_odometry"
 # Minimum position error (m) for a finding while EKF2 declares its position invalid
 MIN_INVALID_POSITION_ERROR_M = 1.0
 AIDS_TESTED_BY_REPLAY = ("ev_pos", "ev_hgt")
-# A pause of barometer fusion is normal up to this time (s) after take-off (ground effect)
+# A pause of barometer fusion is normal if it begins within this time (s) after take-off (ground
+# effect)
 GROUND_EFFECT_DURATION_S = 10.0
-# Minimum ratio: height error while barometer fusion is paused ÷ height RMSE for the rest of the
-# flight
+# A pause of barometer fusion has a large effect if EKF2's maximum height error in the pause ÷
+# height RMSE in the rest of the flight exceeds this ratio
 MIN_GAP_ERROR_TO_HEIGHT_RMSE_RATIO = 3.0
 # Aiding sources whose vertical innovations EKF2 tests to flag a bad vertical acceleration
 AIDS_OF_VERTICAL_ACCELERATION_TEST = ("gnss_vel", "gnss_hgt", "baro_hgt")
 # Severity "note" if the flag fs_bad_acc_vertical is set for at most this fraction of the time
 MAX_BAD_ACCELERATION_FRACTION_FOR_NOTE = 0.3
-# Action for each sensor that EKF2 does not fuse, by PX4 parameter
+# Action for each sensor that EKF2 does not fuse, by the PX4 parameter that enables its fusion
 ACTION_BY_SWITCH = {
     "EKF2_BARO_CTRL": "Shield the barometer from propeller wash and light.",
     "EKF2_GPS_CTRL": "Give the antenna a free view of the sky.",
@@ -231,7 +232,7 @@ def _detect_slow_restart(analysis: PreparedComparison, fusion_flag: pd.Series) -
     gap_ends_s = time_s[1:][np.diff(time_s) > EV_STOP_INTERVAL_S]
     delay_spans = []
     for start_s, end_s in find_spans_with_value(0.0, fusion_flag, analysis.segment):
-        # Positions from the last gap end on, while EKF2 does not fuse
+        # Positions between the end of the last gap and the time at which EKF2 resumes fusion
         last_gap_end_s = gap_ends_s[gap_ends_s < end_s].max(initial=-np.inf)
         unfused_times_s = time_s[(time_s >= last_gap_end_s) & (time_s < end_s)]
         if (

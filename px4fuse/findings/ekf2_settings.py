@@ -42,13 +42,15 @@ from px4fuse.flight.model import Ekf2, Unavailable, source_name
 # Severity "error" if EKF2's noise parameter is at least this factor too small or too large
 MIN_NOISE_FACTOR_FOR_ERROR = 2.0
 MIN_REJECTED_FRACTION_IN_MESSAGE = 0.05
-# Minimum rejected fraction for a warning: with a gate of 5 √S, a consistent filter rejects 6e-7
+# Minimum fraction of rejected positions for a warning: with a gate of 5 √S, a consistent filter
+# rejects a fraction of 6e-7
 REJECTED_FRACTION_FOR_WARNING = 0.01
 REJECTED_FRACTION_FOR_ERROR = 0.20
-# A changed setting prevents rejections if the rejected fraction after ÷ before the change is below
-# this ratio
+# A re-run with a changed setting prevents rejections if it reduces the rejected fraction to less
+# than this multiple of the fraction without the change
 MAX_REJECTED_AFTER_TO_BEFORE_RATIO = 0.5
-# A parameter change has an effect if σ ratio or RMSE change by at least this factor
+# A parameter change in flight has an effect if EKF2's σ ratio or position RMSE changes by more than
+# this factor
 MIN_SIGMA_RATIO_OR_RMSE_CHANGE_FACTOR = 1.5
 
 
@@ -130,9 +132,10 @@ def detect_rejections(analysis: Analysis) -> Findings:
     if not isinstance(ekf2, Ekf2):
         return
     rejection_findings = tuple(_find_rejections(analysis, ekf2.gate))
-    # Probability that both innovations, north and east, are inside the gate: erf(gate/√2)²
+    # For a consistent filter, erf(gate/√2)² is the probability that both innovations, north and
+    # east, are inside the gate
     expected_rejected_fraction = 1.0 - math.erf(ekf2.gate / math.sqrt(2.0)) ** 2
-    # In a gate this small, a consistent filter would reject 1 % of the positions
+    # With such a small gate, even a consistent filter rejects at least 1 % of the positions
     if rejection_findings and expected_rejected_fraction >= REJECTED_FRACTION_FOR_WARNING:
         aid = find_aid(analysis)
         rejected_fraction = float(rejection_findings[0].evidence["rejected_fraction"])

@@ -40,9 +40,11 @@ from px4fuse.trajectory.alignment import fit_alignment
 
 # Minimum mean NEES, for severity "error": an RMS position error of 4 times the reported σ
 MIN_NEES_FOR_ERROR = 16.0
-# Only EKF2 has a fault if KF's position RMSE ÷ EKF2's position RMSE is below this ratio
+# If KF's position RMSE ÷ EKF2's position RMSE is below this ratio, the fault is in EKF2 and not in
+# the positions, which both filters use
 MAX_KF_TO_EKF2_RMSE_RATIO = 0.7
-# The position frame is misaligned if alignment reduces the position RMSE to less than this fraction
+# The position frame is misaligned if the best shift and rotation reduces the position RMSE to less
+# than this fraction
 MAX_ALIGNED_RMSE_RATIO = 0.5
 DRIFT_REMEDY = "In the next flight, send an absolute position (GNSS, UWB) as well."
 LOOP_REMEDY = "To correct the path of this flight by a loop closure, run px4fuse loop LOG."
@@ -76,7 +78,8 @@ def find_hidden_errors(comparison: Comparison) -> list[tuple[FilterName, str, Er
     Return (filter, axis, error) for each error, largest mean NEES first.
     """
     alignment, min_kf_rmse_by_axis = comparison.source.alignment, dict[str, float]()
-    # A frame that was fitted to EKF2's track contains EKF2's errors
+    # Positions of a file that were shifted and rotated to fit EKF2's track contain errors of EKF2.
+    # An error of KF therefore counts only above the RMS residual of this fit, and never in height
     if alignment is not None and alignment.yaw_sigma_deg is not None:
         min_kf_rmse_by_axis = dict.fromkeys(comparison.axes, alignment.residual_rms_m or 0.0)
         min_kf_rmse_by_axis["down"] = np.inf
@@ -104,7 +107,7 @@ def make_hidden_error_finding(
         errors_not_in_innovations, key=lambda entry: entry[1] != analysis.main.axis.name
     )
     worst_filter, worst_axis, worst_error = errors_not_in_innovations[0]
-    # The first error of each filter
+    # Keep the first error of each filter
     error_by_filter = {entry[0]: entry[1:] for entry in reversed(errors_not_in_innovations)}
     evidence: dict[str, float | str] = {"axis": worst_axis, "filter": worst_filter}
     ratio_texts, sentences = dict[str, str](), list[str]()

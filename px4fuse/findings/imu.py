@@ -97,7 +97,8 @@ def detect_accelerometer_bias(analysis: Analysis) -> Findings:
             )
         sensor_text = "accelerometers and the level horizon"
     elif ekf2_bias_m_s2 is not None:
-        # If the horizontal bias is not significant, test only the vertical bias
+        # A horizontal bias that was estimated from the positions is not significant: test only the
+        # vertical bias
         is_horizontal_known = isinstance(systematic_errors, SystematicErrors)
         bias_m_s2 = float(np.linalg.norm(ekf2_bias_m_s2[2 * is_horizontal_known :]))
         forward, right, down = ekf2_bias_m_s2
@@ -183,7 +184,8 @@ def detect_imu_gaps(analysis: Analysis) -> Findings:
             action = "Record on a link without message loss. "
         elif log.dropouts:
             action = "Use a faster SD card. "
-        # If the IMU has no gap, the attitude has one
+        # KF's input has a gap if IMU or attitude samples are missing. Without a gap of the IMU,
+        # attitude samples are missing
         yield make_warning(
             "imu_gap",
             f"{'IMU' if spans else 'Attitude'} samples are missing for {gap_s:.2f} s. In this gap "

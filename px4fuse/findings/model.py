@@ -30,13 +30,13 @@ class CatalogueEntry(Record):
     status_if_convention_wrong: Literal["", "effect", "withdrawn"] = ""
 
 
-# All findings by id, in the order in which findings of equal severity are listed
+# All findings by id. The report lists findings of equal severity in this order
 FINDING_CATALOGUE: Mapping[str, CatalogueEntry] = read_toml(
     __file__, dict[str, CatalogueEntry], "catalogue.toml"
 )
-# Key of the cause in Finding.evidence
+# Key in Finding.evidence: cause of the finding, one of the following values
 CAUSE_KEY = "cause"
-# Causes that a re-run of a filter confirms
+# Causes that are confirmed by a re-run of KF or EKF2
 MEASUREMENT_NOISE_CAUSE = "measurement noise"
 PROCESS_NOISE_CAUSE = "process noise"
 OUTLIER_CAUSE = "outliers"
@@ -44,13 +44,13 @@ CLOCK_CAUSE = "clock"
 MISALIGNED_FRAME_CAUSE = "frame"
 WRONG_GATE_CAUSE = "gate"
 ACCELEROMETER_CAUSE = "accelerometer"
-# No tested change of a setting corrects the filter
+# No re-run with a changed setting makes the filter consistent
 UNKNOWN_CAUSE = "elsewhere"
 # Key in Finding.evidence: σ of the white position noise ÷ assumed measurement noise
 WHITE_TO_ASSUMED_NOISE_RATIO_KEY = "white_over_assumed"
-# The sensor of the aiding source also gives KF's positions
+# The finding is about an aiding source of EKF2 from the same sensor as KF's positions
 SOURCE_SENSOR_CAUSE = "the source's sensor"
-# EKF2 uses a wrong variance that the source reports
+# The position source reports a wrong variance, and EKF2 uses this variance
 REPORTED_VARIANCE_USED_BY_EKF2_CAUSE = "EKF2's noise"
 # The mean innovation of the aiding source changes in flight
 INNOVATION_CHANGE_CAUSE = "change"
@@ -60,15 +60,17 @@ SOURCE_GAP_CAUSE = "gap"
 VEHICLE_ON_GROUND_CAUSE = "never took off"
 # Key in Finding.evidence: property with a wrong convention ("axes", "unit", "time offset", ...)
 WRONG_CONVENTION_KEY = "convention"
-# Key in Finding.evidence: time (s) of a position jump with a change of reset_counter
+# Key in Finding.evidence: time (s) at which the source changed reset_counter at a position jump
 RESET_TIME_KEY = "reset_at_s"
-# These findings cause other findings only as warning or error
+# A finding with one of these ids is the cause of other findings only if its severity is warning or
+# error, not note
 CAUSES_UNLESS_NOTE = ("ekf2_not_aligned", "parameter_changed")
-# Effects that keep their own action, because it also corrects the cause
+# A finding that another finding causes normally gets the action of that other finding. Findings
+# with these ids keep their own action, because it also corrects the cause
 EFFECTS_WITH_OWN_ACTION = ("ekf2_ev_delay_wrong",)
 
 _KF_FINDINGS = ("kf_underconfident", "kf_overconfident")
-# Ids of the effects of each cause
+# For the id of each finding that can cause others: ids of the findings that it causes, one per line
 EFFECTS_BY_CAUSE: Mapping[str, str] = read_toml(__file__, dict[str, str], "consequences.toml")
 NO_ESTIMATES_SENTENCE = (
     "px4fuse does not estimate noise, time offset or frame from these positions."
@@ -198,7 +200,8 @@ def group_by_cause(findings: Iterable[Finding]) -> tuple[Finding, ...]:
     for cause_finding, *effect_findings in sorted(groups, key=_compute_report_rank):
         findings.append(cause_finding)
         for effect in effect_findings:
-            # The action of an effect may be wrong: a larger noise setting only hides outliers
+            # A finding with a cause shows the action for the cause. Its own action may be wrong:
+            # for example, a larger noise setting only hides outliers
             keeps_action = cause_finding.severity == "note" or effect.id in EFFECTS_WITH_OWN_ACTION
             remedy = effect.remedy if keeps_action else cause_finding.remedy
             findings.append(replace(effect, remedy=remedy))
@@ -222,7 +225,8 @@ def _compute_report_rank(group: list[Finding]) -> int:
         "first",
     ):
         return -1
-    # A bad recording makes the noise estimates wrong, so its warnings precede noise errors
+    # A bad recording makes the noise estimates wrong, so warnings about the recording precede
+    # errors about noise settings
     if cause.severity == "error":
         return 2 if report_class == "noise" else 0
     return 1 if report_class == "recording" else 3

@@ -114,7 +114,7 @@ def detect_wrong_settings(analysis: Analysis) -> Findings:
     if has_little_motion(analysis):  # without motion SIGMA_A cannot be estimated
         del noise_estimates[SIGMA_A]
     may_drift = analysis.source.origin.may_drift
-    # Innovations do not show drift, so a larger setting may be correct
+    # Innovations do not show drift, so a setting above the estimate may be correct
     may_be_larger = (
         may_drift
         or analysis.source.origin.is_gnss
@@ -187,7 +187,8 @@ def format_setting_action(analysis: Analysis, name: str) -> str:
         return NO_IMPROVEMENT_ACTION
     if getattr(analysis.request, name, None) is not None:
         return f"To test the default value, run again without {COMPARISON_OPTIONS[name]}."
-    # One value of the joint estimate alone can make a consistent KF inconsistent
+    # SIGMA_A and SIGMA_Z are estimated together: setting only one of them to its estimate can make
+    # a consistent KF inconsistent
     other_label = "SIGMA_A" if name == SIGMA_Z else "SIGMA_Z"
     return (
         f"Do not change this setting alone: it is estimated together with {other_label}, and no "
@@ -218,7 +219,8 @@ def detect_process_noise_near_zero(analysis: Analysis) -> Findings:
     """Detect a SIGMA_A so small that KF ignores new positions."""
     for result in sorted(analysis.axes.values(), key=lambda result: result is not analysis.main):
         updates, summary = result.kf_run.updates, result.filters["kf"]
-        # Without motion, a small SIGMA_A is correct
+        # A small SIGMA_A is wrong only if KF is overconfident and lags: without motion, it is
+        # correct
         if (
             isinstance(summary, Unavailable)
             or summary.verdict != "overconfident"
@@ -281,7 +283,7 @@ def _make_wrong_sigma_finding(
     if _has_default_noises(analysis, filter_name, worst_axis):
         severity = lower_severity(severity)
     verdict = "underconfident" if is_underconfident else "overconfident"
-    # Ground truth shows slow errors that innovations do not show
+    # A filter with too small innovations may have slow errors, which only ground truth shows
     may_have_hidden_error = is_underconfident and not summary.is_underconfident_against_truth
     if may_have_hidden_error and analysis.source.origin.may_drift:
         severity, remedy_text, cause = "note", KEEP_NOISE_BECAUSE_OF_DRIFT_ACTION, UNKNOWN_CAUSE

@@ -50,7 +50,8 @@ from px4fuse.flight.model import Columns, positions_phrase, source_name
 
 # White noise is a separate fault if its σ ÷ σ of the time-correlated noise exceeds this ratio
 MIN_WHITE_TO_CORRELATED_SIGMA_RATIO = 0.3
-# Minimum log likelihood ratio (nats): 1 of 400 flights without a fault exceeds it
+# Minimum log likelihood ratio (nats) of time-correlated noise to white noise: 1 of 400 flights
+# without a fault exceeds it
 MIN_CORRELATED_NOISE_LOG_LIKELIHOOD_RATIO_NATS = 5.0
 # Minimum time-correlated error (m, 1 σ): timestamp errors and motion alone cause a few mm
 MIN_CORRELATED_NOISE_SIGMA_M = 0.005
@@ -58,7 +59,7 @@ MIN_CORRELATED_NOISE_SIGMA_M = 0.005
 MIN_REPEATED_FRACTION = 0.05
 MIN_REPEATED_FRACTION_FOR_ERROR = 0.3
 MIN_REPEATED_POSITION_COUNT = 10
-# Minimum ratio of the larger to the smaller position noise σ, north and east
+# Minimum ratio for a warning: larger ÷ smaller position noise (σ) of two horizontal axes
 MIN_AXIS_NOISE_RATIO = 1.5
 # Minimum ratio of the noise in one flight part to the noise in the rest, for a warning
 MIN_NOISY_PART_SIGMA_RATIO = 2.0
@@ -109,7 +110,7 @@ def detect_time_correlated_noise(analysis: Analysis) -> Findings:
         not isinstance(noise, TimeCorrelatedNoise)
         or noise.gain_nats < MIN_CORRELATED_NOISE_LOG_LIKELIHOOD_RATIO_NATS
         or noise.slow_m < MIN_CORRELATED_NOISE_SIGMA_M
-        # source_positions.py reports a low-pass filter
+        # A low-pass filter explains the correlation: source_positions.py reports it
         or noise.low_pass_gain_nats >= MIN_LOW_PASS_TO_CORRELATED_NOISE_NATS
     ):
         return
@@ -127,7 +128,8 @@ def detect_time_correlated_noise(analysis: Analysis) -> Findings:
         and noise.white_m > MIN_WHITE_TO_CORRELATED_SIGMA_RATIO * noise.slow_m
     ):
         evidence[WHITE_TO_ASSUMED_NOISE_RATIO_KEY] = noise.white_m / assumed_noise_m
-    # Time-correlated errors of GNSS are normal: if σ contains them, they are only a note
+    # Time-correlated errors are normal for GNSS: severity note, unless ground truth shows errors
+    # above the σ that a filter reports
     is_normal = analysis.source.origin.is_gnss and not _has_error_above_reported_sigma(analysis)
     yield (make_note if is_normal else make_warning)(
         "source_noise_time_correlated",
@@ -201,7 +203,8 @@ def detect_noise_variation(analysis: Analysis) -> Findings:
     if (
         noisy_part is None
         or noisy_part.sigma_ratio < MIN_NOISY_PART_SIGMA_RATIO
-        # An outlier also increases the next innovations, so the noise is tested without outliers
+        # An outlier also increases the next innovations, so the ratio is tested without outliers
+        # too
         or noisy_part.sigma_ratio_without_outliers < MIN_NOISY_PART_SIGMA_RATIO_WITHOUT_OUTLIERS
     ):
         return
@@ -294,7 +297,7 @@ def detect_scale_error(analysis: Analysis, error_fit: ErrorFit) -> Findings:
 
 def detect_imu_oscillation(analysis: Analysis) -> Findings:
     """Detect an oscillation of the accelerometer that the positions do not contain."""
-    if find_low_pass(analysis) is not None:  # the filter may remove the motion from the positions
+    if find_low_pass(analysis) is not None:  # the low-pass filter may remove the motion
         return
     oscillation = analysis.imu_oscillation
     if oscillation is not None:

@@ -38,17 +38,18 @@ MIN_LOST_POSITION_FRACTION = 0.02
 MIN_INTERVAL_COUNT = 50
 # Minimum fraction of missing positions to report downsampling: a radio link loses fewer
 MIN_MISSING_FRACTION_FOR_DOWNSAMPLING = 0.25
-# Minimum fraction of intervals that are n or n + 1 source periods long (the two most frequent
-# lengths)
+# After downsampling, most intervals between positions have one of two lengths: n or n + 1 periods
+# of the source. Minimum fraction of intervals with these lengths
 MIN_FRACTION_OF_BOTH_INTERVAL_LENGTHS = 0.85
-# Minimum fraction of the rarer interval length
+# Minimum fraction of intervals with the rarer of the two lengths n and n + 1 source periods
 MIN_FRACTION_OF_RARER_INTERVAL_LENGTH = 0.1
-# Maximum RMS deviation of intervals from multiples of the source period, in source periods: 0.03
-# for intervals with jitter, 0.29 for random intervals
+# Maximum RMS deviation of intervals from whole multiples of the source period, divided by the
+# source period. Intervals with jitter have 0.03, random intervals 0.29
 MAX_ROUNDING_RMS_ERROR = 0.06
-# Largest n for the tested source periods (median interval ÷ n)
+# The tested source periods are the median interval ÷ n; maximum of n
 MAX_PERIODS_IN_MEDIAN_INTERVAL = 4
-# Minimum gap (s) at take-off or landing: the land detector is seconds late
+# Minimum duration (s) of a gap at the start or end of the flight: take-off and landing are detected
+# some seconds late
 MIN_GAP_AT_START_OR_END_S = 3.0
 # Time (s) before an update at which KF's predicted state is read
 TIME_BEFORE_UPDATE_S = 1e-6
@@ -73,7 +74,8 @@ def detect_source_gaps(analysis: Analysis) -> Findings:
         if np.any((invalid_times_s > start_s) & (invalid_times_s < end_s)):
             continue  # source_values.py reports these invalid positions
         aids = _find_fused_aids(ekf2, (start_s, end_s))
-        # A position file is not part of the log, so its gaps are real
+        # If EKF2 fused positions during the gap, they are only missing in the log. Positions from a
+        # file (with an alignment) are not from the log: their gaps are real
         if source.origin.aid in aids and source.alignment is None:
             gaps_only_in_log.append((start_s, end_s))
         elif start_s != whole_flight.start_s and end_s != whole_flight.end_s:
@@ -253,7 +255,7 @@ def detect_lost_samples(analysis: Analysis) -> Findings:
 def detect_downsampling(analysis: Analysis) -> Findings:
     """Detect positions that were downsampled before PX4 received them."""
     source = analysis.source
-    # The timestamps must be the times at which PX4 received the positions
+    # This test is valid only if the timestamps are the times at which PX4 received the positions
     if (
         source.clock_map is not None
         or source.origin.find_preference_rank() >= ALIGNED_BY_EKF2_ORIGIN.find_preference_rank()

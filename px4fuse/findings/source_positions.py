@@ -53,14 +53,16 @@ from px4fuse.flight.model import (
 
 # Minimum extent (m) of the positions of a moving vehicle (5th to 95th percentile)
 MIN_MOTION_RANGE_M = 0.5
-# Minimum extent of motion, in σ of the noise: noise alone has 3.29 σ, 25 % is margin
+# Minimum extent of the positions (5th to 95th percentile) ÷ σ of the position noise. Without
+# motion, Gaussian noise has an extent of 3.29 σ; 25 % is margin
 MIN_MOTION_RANGE_TO_NOISE_RATIO = 1.25 * 3.29
 # Minimum log likelihood ratio (nats) of the low-pass model to the white-noise model; unfiltered
 # positions reach 2
 MIN_LOW_PASS_LOG_LIKELIHOOD_RATIO_NATS = 6.0
 # Minimum log likelihood ratio (nats) of the low-pass model to the model of time-correlated noise
 MIN_LOW_PASS_TO_CORRELATED_NOISE_NATS = 1.0
-# Maximum ratio: lag from the noise correlation ÷ upper 95 % limit of the measured delay
+# The lag of a low-pass filter is estimated from the correlation of the noise. If this lag ÷ upper
+# 95 % limit of the delay relative to the IMU exceeds this ratio, the delay is used as the lag
 MAX_ESTIMATED_LAG_TO_DELAY_RATIO = 4.0
 # Minimum filter lag (s) for a warning; it causes a position error of 5 cm at 1 m/s
 MIN_LAG_S = 0.05
@@ -145,13 +147,14 @@ def find_low_pass(analysis: Analysis) -> SourceLowPass | None:
     ):
         return None
     correlated_noise = analysis.time_correlated_noise
-    # Without a delay, correlated errors are not due to a low-pass filter
+    # Correlated errors are not due to a low-pass filter if time-correlated noise fits as well
     if (
         isinstance(correlated_noise, TimeCorrelatedNoise)
         and correlated_noise.low_pass_gain_nats < MIN_LOW_PASS_TO_CORRELATED_NOISE_NATS
     ):
         return None
-    # At a high rate, the lag from the noise correlation is inaccurate: use the measured delay
+    # At a high position rate, the lag estimated from the correlation of the noise is inaccurate:
+    # use the measured delay relative to the IMU
     lag_limit_s = -MAX_ESTIMATED_LAG_TO_DELAY_RATIO * time_offset.interval_s[0]
     if low_pass.lag_s > lag_limit_s >= MIN_LAG_S:
         return replace(low_pass, lag_s=-time_offset.offset_s)
@@ -184,12 +187,12 @@ def detect_low_pass(analysis: Analysis) -> Findings:
 def detect_jumps(analysis: Analysis) -> Findings:
     """Detect position jumps that the IMU does not measure."""
     systematic_errors = analysis.systematic_errors
-    # A change from arrival to measurement times resembles a jump
+    # Timestamps that change from arrival time to time of measurement resemble a position jump
     if isinstance(systematic_errors, Unavailable) or any(detect_arrival_timestamps(analysis)):
         return
     min_jump_m, correlated_noise = MIN_JUMP_M, analysis.time_correlated_noise
     if not isinstance(correlated_noise, Unavailable):
-        # Smaller jumps may be changes of the time-correlated noise
+        # A smaller jump may be a change of the time-correlated noise
         min_jump_m = max(min_jump_m, MIN_JUMP_SIGMAS * correlated_noise.slow_m)
     jumps = [jump for jump in systematic_errors.jumps if jump.size_m >= min_jump_m]
     if not jumps:
@@ -368,9 +371,9 @@ def detect_scale_error(analysis: Analysis) -> Findings:
         isinstance(imu, Unavailable)
         or is_rate_too_low(imu, MIN_IMU_RATE_HZ)
         or analysis.source.origin.is_gnss  # GNSS has no scale factor error
-        or isinstance(analysis.flight.truth, Truth)  # with ground truth, see source_errors.py
+        or isinstance(analysis.flight.truth, Truth)  # source_errors.py compares with ground truth
         or isinstance(systematic_errors, Unavailable)
-        # A low-pass filter or time-correlated noise may resemble a scale error
+        # The effects of a low-pass filter or of time-correlated noise resemble a scale factor error
         or find_low_pass(analysis) is not None
         or not isinstance(analysis.time_correlated_noise, Unavailable)
         or _find_valid_time_offset(analysis) is None

@@ -31,16 +31,17 @@ from px4fuse.findings.source_intervals import describe_errors_after_gap
 from px4fuse.flight.model import Columns, Ekf2, Truth, Unavailable, positions_phrase, source_name
 from px4fuse.readers.px4_positions import NO_FIX_ACTION
 
-# Minimum reported rounding step (m): errors due to smaller steps are below the noise of UWB
+# Rounding to smaller steps (m) is not reported: its errors are below the noise of UWB
 MIN_ROUNDING_STEP_M = 0.05
 # Maximum ratio of EKF2's position RMSE with the estimated lever arm to the RMSE without it
 MAX_LEVER_ARM_RMSE_RATIO = 0.7
-# A lever-arm finding mentions a rotation of the positions above both limits (° and multiples of σ)
+# The finding on a wrong lever arm also states a rotation of the positions if the angle exceeds both
+# limits: degrees, and multiples of its σ
 MIN_ROTATION_DEG, MIN_ROTATION_SIGMAS = 5.0, 3.0
 # Minimum distance (m) between the positions of two alternating senders: less may be noise
 MIN_SENDER_DISTANCE_M = 0.1
-# Minimum ratio: distance between the positions of two senders ÷ scatter (1 σ) of this distance; the
-# positions of a single sender reach 2
+# Minimum distance between the positions of two senders ÷ scatter (1 σ) of this distance. With a
+# single sender, noise causes ratios of up to 2
 MIN_SENDER_DISTANCE_SIGMAS = 4.0
 # Window length (samples): short, because a lost sample swaps the senders of even and odd samples
 WINDOW_SAMPLES = 16
@@ -50,11 +51,12 @@ MAX_DISTANCE_OF_COPY_M = 0.01
 # Fused positions are copies of EKF2's estimate if the median distance (m) is below this stricter
 # limit: fusion alone pulls the estimate towards the positions
 MAX_DISTANCE_OF_FUSED_COPY_M = 0.001
-# Minimum speed (m/s) for the comparison with EKF2's position: at rest, any source may agree
+# To find positions that are copies of EKF2's position, both are compared only above this speed
+# (m/s): at rest, a correct source agrees too
 MIN_SPEED_FOR_COPY_TEST_M_S = 0.2
-# Tested delays (s) between EKF2's position and a source that sends it back
+# Tested delays (s) of positions that are copies of EKF2's position
 TESTED_COPY_DELAYS_S = np.arange(0.0, 0.305, 0.005)
-# Number of positions with which these delays are tested
+# Approximate number of positions that are used to find this delay of copied positions
 COPY_DELAY_POSITIONS = 300
 # Finding id, fault and action for each reason of an invalid position
 INVALID_POSITION_TEXTS: Mapping[str, tuple[str, str, str]] = {
@@ -93,7 +95,7 @@ def detect_invalid_rows(analysis: Analysis) -> Findings:
         time_s = invalid_reasons.index[invalid_reasons == reason].to_series()
         if time_s.empty:
             continue
-        # Successive invalid samples form one span
+        # Invalid positions without a valid position between them form one time span
         times_by_span = time_s.groupby(np.searchsorted(source.samples.index, time_s))
         spans = tuple(zip(times_by_span.min().tolist(), times_by_span.max().tolist(), strict=True))
         start_s, end_s = max(spans, key=lambda span: span[1] - span[0])
@@ -168,7 +170,9 @@ def detect_lever_arm(analysis: Analysis) -> Findings:
     sensor_text, action = f"{source_name(source)} sensor", f"Set {format_changes(change)}."
     error_text = "the position error"
     effect_sentence = _describe_replayed_effect(analysis, change, rotation_deg)
-    if effect_sentence is None:  # ground truth contains no such error of the positions
+    # The new lever arm of the sensor hardly reduces EKF2's error against ground truth: test another
+    # position of the IMU
+    if effect_sentence is None:
         effect_sentence = _describe_replayed_effect(analysis, imu_change, rotation_deg)
         sensor_text, action = "IMU", f"Set {format_changes(imu_change)}."
         error_text = "EKF2's position error"

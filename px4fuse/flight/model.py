@@ -288,7 +288,7 @@ StepFunctions: TypeAlias = "Mapping[str, pd.Series[float]]"
 Spans = tuple[Span, ...]
 # Minimum fraction of regular sample intervals; with fewer, the samples arrive in bursts
 MIN_REGULAR_INTERVAL_FRACTION = 0.8
-# Clock conversions that do not give measurement times
+# Methods of clock conversion that do not give measurement times
 METHODS_WITHOUT_MEASUREMENT_TIMES = ("arrival time", "receive time", "message order")
 HEIGHT_ONLY_REASON = "x and y are NaN in all messages, so the source measures only the height"
 # Ratio of the median absolute second difference to the σ of white noise
@@ -324,7 +324,7 @@ class Columns:
     ANGULAR_RATE: Final = ["forward_rad_s", "right_rad_s", "down_rad_s"]
     QUATERNION: Final = ["w", "x", "y", "z"]
     ROTATION_VARIANCE: Final = ["forward_rad2", "right_rad2", "down_rad2"]
-    # EKF2's state and variances at the fusion horizon
+    # Columns of EKF2's state and variances at the fusion horizon
     GYRO_BIAS: Final = [f"gyro_bias_{axis}_rad_s" for axis in BODY_AXES]
     ACCELEROMETER_BIAS: Final = [f"accelerometer_bias_{axis}_m_s2" for axis in BODY_AXES]
     EARTH_MAGNETIC_FIELD: Final = [f"earth_field_{axis}_gauss" for axis in AXIS_NAMES]
@@ -545,7 +545,8 @@ class FusionRecord:
     vision_age_s: pd.Series
     # Measured magnetic field (body FRD). ``fused_3d`` is 0 while EKF2 fuses the heading only
     magnetic_field_gauss: pd.DataFrame = field(default_factory=pd.DataFrame)
-    # Velocity from optical flow (body FRD), computed from EKF2's low-pass filtered velocity
+    # Velocity from optical flow (body FRD) before EKF2's low-pass filter, computed from the
+    # filtered velocity that EKF2 logs
     flow: pd.DataFrame = field(default_factory=pd.DataFrame)
     # Latitude of the origin of the local NED frame
     latitude_deg: float = np.nan

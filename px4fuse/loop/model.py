@@ -24,7 +24,9 @@ from px4fuse.trajectory.graph.model import PoseGraph
 from px4fuse.trajectory.graph.solver import Solution
 from px4fuse.trajectory.model import AxisComponents, Frame, Trajectory, TrajectoryKind
 
-# Names of the corrected paths
+# Names of the uncorrected path and of the corrected paths. "by_distance" distributes the closure
+# errors of position and heading in proportion to the distance flown, "by_distance_plain" only that
+# of position
 CorrectionName = Literal[
     "uncorrected",
     "by_distance_plain",
@@ -89,7 +91,7 @@ class Closure(Record, kw_only=True):
     # Two times (s) at which the vehicle was at the same place
     time_1_s: float
     time_2_s: float
-    # σ (m) of the displacement between both times, per axis
+    # σ (m), per axis, of the assumed displacement between the positions at time_1_s and time_2_s
     sigma_m: NotNegative
     # "landing": closure of take-off and landing; "given": closure from the user
     source: str
@@ -189,7 +191,8 @@ class Loop(Record, kw_only=True):
         """Return the paths without duplicates."""
         paths = self.find_paths()
         if isinstance(self.heading_error_deg, Unavailable):
-            # Without a heading error, this path equals "by_distance_plain"
+            # Without a known heading error, "by_distance" corrects positions only, like
+            # "by_distance_plain"
             paths.pop("by_distance", None)
         return tuple(paths.values())
 

@@ -225,7 +225,7 @@ def read_source(
             f"{display_name(path)} is a pose graph, not a trajectory.",
             f"Optimise the pose graph with px4fuse loop {display_name(path)}.",
         )
-    # flight logs are binary
+    # Text files and bags contain trajectories; flight logs are binary
     if is_bag(path) or decode_text(read_head(path, _FILE_HEAD_BYTES, TrajectoryError)) is not None:
         trajectory = read_trajectory(path, track_name)
         return LoopSource(trajectory if frame is None else replace(trajectory, frame=frame), None)

@@ -10,11 +10,13 @@ from px4fuse.flight.model import Columns, Ekf2, Spans, Unavailable
 MAX_VALID_SI_VALUE = 1e9
 # Maximum absolute value (m/s², rad/s) of valid IMU data, above the range of sensors
 MAX_IMU_READING = 1e4
-# Minimum distance (m) of an invalid position 0, 0, 0 from its neighbours (3 σ of UWB)
+# A position 0, 0, 0 is invalid if its distance (m) from the previous and the next position exceeds
+# this limit (3 σ of UWB)
 MIN_INVALID_ZERO_DISTANCE_M = 0.3
-# Minimum distance (m) of a damaged position from the median position
+# A position is damaged if its distance (m) from the median position exceeds this limit and the
+# following multiple of the median distance
 MIN_DAMAGED_DISTANCE_M = 1e4
-# Minimum distance of a damaged position from the median position, in median distances
+# A damaged position is farther from the median position than this multiple of the median distance
 MIN_DAMAGED_TO_MEDIAN_DISTANCE_RATIO = 100.0
 # Minimum duration (s) of equal positions that are rejected as frozen
 MIN_FROZEN_S = 1.0
@@ -106,7 +108,7 @@ def classify_invalid_positions(samples: pd.DataFrame, columns: list[str]) -> "pd
     is_repeated = np.all(np.diff(values[valid_rows], axis=0) == 0.0, axis=1)
     run_starts = np.flatnonzero(np.append(True, ~is_repeated))
     run_ends = np.append(run_starts[1:], len(valid_rows))
-    # Longest likely sequence of equal positions if the source repeats positions at random
+    # Longest run of equal positions that is likely if the source repeats single positions at random
     repeated_fraction = np.clip(np.mean(is_repeated), 1e-6, 1.0 - 1e-6)
     max_random_run_length = np.log(len(valid_rows) / MAX_FALSE_FROZEN_PROBABILITY) / -np.log(
         repeated_fraction

@@ -86,7 +86,7 @@ class _TaggedLines:
                 for row, cells in enumerate(map(str.split, texts))
                 if len(cells) != column_count or not all(map(is_number, cells[1 + id_count :]))
             )
-            # If the fault is not found, the first line is reported
+            # If no invalid line is found, the first line is reported
             line_number, text = self.lines[next(invalid_rows, 0)]
             fault = f"{quote(text)} does not have {column_count} columns with numbers"
             raise _make_line_error(self.file_name, line_number, fault) from None
@@ -233,7 +233,7 @@ def _normalise_quaternions(lines: _TaggedLines, poses: Array) -> Array:
         "the quaternion does not have unit length",
         "Give the unit quaternion qx qy qz qw after the position.",
     )
-    # Unit quaternions keep their digits
+    # Unit quaternions are not rescaled: rounding would change their last digits
     quaternion_norms[np.abs(quaternion_norms - 1.0) <= UNIT_NORM_TOLERANCE] = 1.0
     return np.hstack([poses[:, :3], poses[:, 3:] / quaternion_norms[:, None]])
 

@@ -58,7 +58,7 @@ MAX_STRAY_BYTE_FRACTION = 0.002
 REAL32_PARAMETER_TYPE = 9
 
 
-# No warnings for damaged values; their samples are dropped
+# NumPy gives no warnings for damaged values, because samples with such values are dropped
 @np.errstate(invalid="ignore", over="ignore", divide="ignore")
 def read_mavlink(name: str, content: bytes, system_id: int | None = None) -> Flight:
     """Read a MAVLink recording: a ``.tlog``, or a raw stream of MAVLink 1 and 2.
@@ -89,7 +89,7 @@ def read_mavlink(name: str, content: bytes, system_id: int | None = None) -> Fli
     is_in_flight = common.ends_in_flight(airborne_spans_s, recording.duration_s)
     pressure_hpa = recording.read(messages.MESSAGE_LAYOUTS["SCALED_PRESSURE"])["pressure_hpa"]
     return Flight(
-        # Last, because the description counts the samples that the readers dropped
+        # Called after the readers, because the description counts the samples that they dropped
         log=_describe_log(recording, parameters, replaced_parameter_notes, is_in_flight),
         imu=imu,
         attitude=attitude,

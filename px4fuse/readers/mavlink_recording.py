@@ -45,9 +45,11 @@ CLOCK_FIT_INTERVAL_S = 2.0
 MAX_CLOCK_FIT_INTERVALS = 200
 # Minimum time span (s) to estimate a clock drift
 MIN_DRIFT_SPAN_S = 30.0
-# Maximum relative difference of two clock rates; more shows a replay at another speed
+# Maximum relative difference between the rates of two clocks. A larger difference shows that the
+# recording was made during a replay at another speed
 MAX_RELATIVE_CLOCK_RATE_DIFFERENCE = 0.01
-# Maximum ratio of two clock rates; above 1e9, for timestamps in ns that were read as s
+# Maximum ratio of the rates of two clocks. It exceeds 1e9, because timestamps in ns may have been
+# read as s
 MAX_RATIO_OF_CLOCK_RATES = 1e12
 # Minimum fraction of distinct timestamps of a running clock
 MIN_DISTINCT_TIME_FRACTION = 0.1
@@ -55,7 +57,8 @@ MIN_DISTINCT_TIME_FRACTION = 0.1
 MIN_BACKWARD_STEP_AT_RESTART_S = 5.0
 # Number of messages around a backward step of the timestamps that confirm a restart
 RESTART_CHECK_MESSAGES = 20
-# Minimum size of a valid group of timestamps, relative to the largest group
+# Timestamps without long gaps form a group. A group at the start or end of the recording is invalid
+# if it has fewer timestamps than this fraction of the largest group
 MIN_TIMESTAMP_GROUP_FRACTION = 0.01
 # Maximum time (s) of a valid timestamp outside the analysed time span
 MAX_TIME_OUTSIDE_FLIGHT_S = 60.0
@@ -106,7 +109,7 @@ def fit_clock_line(x: Array, y: Array) -> ClockLine:
     slope = _fit_clock_rate(x[middle_rows], y[middle_rows])
     if abs(slope - 1.0) <= MAX_RELATIVE_CLOCK_RATE_DIFFERENCE:
         slope = 1.0
-    # Fit the slope twice, because it affects the selection of messages with the least delay
+    # Fit the slope twice, because the slope affects which messages have the least delay
     for is_slope_final in (False, False, True):
         relative_delay_s = y - slope * (x - x0)
         least_delay_rows = [rows[np.argmin(relative_delay_s[rows])] for rows in rows_by_interval]
@@ -146,11 +149,11 @@ class Recording:
     autopilot: str
     # Analysed frames, between two restarts of the autopilot
     analysed_frame_slice: slice
-    # Receive time of each frame (s), or the last boot time before the frame
+    # Receive time (s) of each frame. Without receive times: last boot time in the stream before it
     receive_times_s: Array
     # Conversion of receive times to the boot clock
     receipt_to_boot_fit: ClockLine
-    # Boot time (s) at flight time zero
+    # Time since boot of the autopilot (s) at time zero of the flight
     time_origin_s: float
     duration_s: float
     notes: list[str]
@@ -331,7 +334,7 @@ def read_recording(frames: MavlinkFrames, address: MavlinkAddress, autopilot: st
     rows, boot_times_s = _read_boot_times(frames, address)
     analysed_frame_slice = slice(0, len(frames))
     restart_rows = np.flatnonzero(np.diff(boot_times_s) < -MIN_BACKWARD_STEP_AT_RESTART_S) + 1
-    # A single late or early packet is not a restart
+    # A backward step due to a single late or early packet is not a restart
     earlier_rows = np.maximum(restart_rows - 1 - RESTART_CHECK_MESSAGES, 0)
     later_rows = np.minimum(restart_rows + RESTART_CHECK_MESSAGES, len(rows) - 1)
     boot_times_before_s = np.minimum(boot_times_s[earlier_rows], boot_times_s[restart_rows - 1])

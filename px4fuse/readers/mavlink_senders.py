@@ -33,9 +33,11 @@ MAX_LOST_MESSAGE_FRACTION = 0.9
 MAX_LATE_MESSAGES = 16
 # Maximum difference (s) between TIMESYNC and position timestamps of the same clock
 MAX_TIMESYNC_TO_POSITION_TIME_DIFFERENCE_S = 1e5
-# Maximum median difference (s) between timestamps and receive times on the same clock
+# Timestamps are boot times of the autopilot if their median difference (s) from the receive times
+# (boot clock) is at most this limit
 MAX_BOOT_TIME_DIFFERENCE_S = 10.0
-# Minimum improvement (s) by TIMESYNC of the agreement with receive times
+# Timestamps are not boot times if a conversion by TIMESYNC reduces their median difference (s) from
+# the receive times by at least this value
 MIN_REDUCTION_BY_TIMESYNC_S = 0.1
 MIN_TIMESYNC_REPLIES = 3
 # Maximum interval (s) between positions; a longer interval is a gap
@@ -160,12 +162,14 @@ def _map_sender_clock(
     timesync = frames.table("TIMESYNC", rows)
     sender_reply_times_s = timesync["tc1"] * 1e-9
     timesync_request_times_s = timesync["ts1"] * 1e-9
-    # A TIMESYNC reply repeats the request time in ts1; requests of the autopilot have boot time
+    # TIMESYNC replies of the sender contain the time of the request in ts1. In requests of the
+    # autopilot this is its boot time, so ts1 must be near the boot time of the reply
     is_sender_reply = (sender_reply_times_s != 0.0) & (
         np.abs(timesync_request_times_s - recording.compute_receipt_boot_times_s(rows))
         <= MIN_BACKWARD_STEP_AT_RESTART_S
     )
-    # TIMESYNC requests have a small delay, because the sender reads its clock just before
+    # The clock fit also uses TIMESYNC requests of the sender: their delay is small, because the
+    # sender reads its clock just before sending
     is_timesync_request = (
         has_running_clock
         & (sender_reply_times_s == 0.0)
@@ -183,7 +187,7 @@ def _map_sender_clock(
         np.abs(sender_request_times_s - median_timestamp_s)
         < MAX_TIMESYNC_TO_POSITION_TIME_DIFFERENCE_S
     )
-    # Replies to requests of other senders
+    # Exclude the autopilot's replies to requests of other senders
     rows = frames.rows("TIMESYNC")
     other_timesync = frames.table("TIMESYNC", rows[~frames.is_sent_by(sender, rows)])
     other_request_times_ns = other_timesync["ts1"][other_timesync["tc1"] == 0]
@@ -260,7 +264,8 @@ def map_clock_to_boot(
 
     timesync_fit = _fit_timesync(sender_replies, autopilot_replies)
     difference_from_receipt_s = compute_difference_from_receipt_s(timestamps_s)
-    # Without TIMESYNC, a clock that started seconds later looks like the boot clock
+    # A sender clock that started only seconds after the autopilot resembles the boot clock. If
+    # TIMESYNC is available, it shows the difference
     reduction_by_timesync_s = (
         0.0
         if timesync_fit is None
@@ -306,7 +311,8 @@ def _fit_timesync(
     """Fit the conversion of sender clock to boot clock by TIMESYNC, as mean of both directions."""
     clock_fits = []
     if len(sender_replies[0]) >= MIN_TIMESYNC_REPLIES:
-        # Inverse, because the request (boot time) is before the reply (sender time)
+        # fit_clock_line needs the earlier reading first: the request (boot time). The inverse of
+        # its result converts sender time to boot time
         clock_fits.append(fit_clock_line(*sender_replies).inverse())
     if len(autopilot_replies[0]) >= MIN_TIMESYNC_REPLIES:
         clock_fits.append(fit_clock_line(*autopilot_replies))

@@ -20,7 +20,8 @@ CANDIDATE_FIX_INTERVALS_S = np.arange(0.05, 0.26, 0.0005)
 MAX_DEVIATION_FROM_MULTIPLE_S = 0.006
 # Minimum number of logged fixes to measure the error of the reconstruction
 MIN_LOGGED_FIXES = 10
-# Minimum number of logged intervals for each multiple of the receiver's interval
+# The receiver's interval is known if two successive multiples of it each occur at least this number
+# of times in the log
 MIN_LOGGED_INTERVALS_PER_MULTIPLE = 3
 # Maximum RMS error (m) of reconstructed fixes, compared with logged fixes
 MAX_FIX_RECONSTRUCTION_ERROR_M = 0.1

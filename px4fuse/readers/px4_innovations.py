@@ -324,7 +324,8 @@ def _read_common_topics(
             aid,
             samples,
             enabled_flag,
-            # EKF2 may have fused a sample that is not logged, if the innovation is 0 or S is new
+            # Times at which EKF2 may have fused a sample whose innovation is not logged: the logged
+            # innovation is 0, or the logged variance S has a new value
             times_with_unknown_fusion_s=np.union1d(
                 innovation.index[innovation == 0.0], variance.index[is_new_variance]
             ),

@@ -47,9 +47,10 @@ FIX_TYPE_3D = 3
 NO_FIX_ACTION = "Give the antenna a free view of the sky and wait for a fix."
 # Maximum delay (µs) from timestamp to publication, if the timestamp is the arrival time
 MAX_ARRIVAL_TO_PUBLICATION_DELAY_US = 100
-# Minimum fraction of arrival times in a log without measurement times
+# A log has no measurement times if at least this fraction of the timestamps are arrival times
 MIN_ARRIVAL_TIME_FRACTION = 0.9
-# Maximum time (s) between height and horizontal position: 2.5 cm error at 0.5 m/s
+# Maximum time (s) between a height and the horizontal position with which it is combined: an error
+# of 2.5 cm at 0.5 m/s
 MAX_HEIGHT_TIME_DIFFERENCE_S = 0.05
 # At a lower rate (Hz), the logger dropped GNSS fixes; receivers send 5 to 20 Hz
 MAX_DOWNSAMPLED_HZ = 4.0

@@ -64,12 +64,13 @@ HEIGHT_BIAS_LAYOUT_BY_AID = {
 DEFAULT_PROFILE_REMEDY = "Record with SDLOG_PROFILE bit 0 (default)."
 # Topics with EKF2's state vector and variances, in order of preference
 STATE_VECTOR_TOPICS = ("estimator_states", "estimator_status")  # since v1.12, v1.8 to v1.11
-# Number of attitude variances, by number of logged states and variances (generated/state.h)
+# Number of logged attitude variances: 4 for a quaternion, 3 for a rotation vector. The keys are the
+# numbers of logged states and of logged variances (generated/state.h)
 ATTITUDE_VARIANCE_COUNT_BY_ARRAY_LENGTHS: Mapping[tuple[int, int], int] = {
     (24, 24): 4,
     (24, 23): 3,
     (25, 24): 3,
-    (32, 28): 4,  # before v1.9: only the first 24 states are used
+    (32, 28): 4,  # PX4 before v1.9, which uses only the first 24 of the 32 states
 }
 QUATERNION_VARIANCE_COUNT = 4
 ANTENNA_COLUMNS = ["antenna_forward_m", "antenna_right_m", "antenna_down_m"]

@@ -24,13 +24,15 @@ MAX_QUATERNION_NORM_ERROR = 0.1
 MAX_COORDINATE_M = 1e9
 # Maximum deviation of a unit quaternion from norm 1 (rounding of float64)
 UNIT_NORM_TOLERANCE = 1e-15
-# Maximum fraction of invalid rows; with more, the timestamps are probably rounded
+# Maximum fraction of rows that are dropped. If more rows are dropped, the timestamps are probably
+# rounded, so that successive rows have equal times
 MAX_DROPPED_ROW_FRACTION = 0.01
-# Maximum coordinate (m) and rotation angle (rad) of a first pose that is the identity
+# Maximum coordinate (m) and rotation angle (rad) of a first pose that counts as the identity
 MAX_DEVIATION_FROM_IDENTITY = 1e-6
-# Maximum ratio of smallest to second RMS extent of a motion in a plane
+# A motion is planar if its smallest RMS extent ÷ second largest RMS extent is below this ratio
 MAX_SMALLEST_TO_SECOND_EXTENT_RATIO = 1 / 3
-# Minimum ratio of second to largest RMS extent; a straight motion has no unique plane
+# A motion has a unique plane (is not straight) if its second largest RMS extent ÷ largest RMS
+# extent exceeds this ratio
 MIN_SECOND_TO_LARGEST_EXTENT_RATIO = 0.1
 # Maximum angle (rad) between the normal of the plane of motion and the y axis of a camera frame
 MAX_TILT_RAD = math.radians(20.0)
@@ -38,7 +40,7 @@ MAX_TILT_RAD = math.radians(20.0)
 MIN_REGULAR_INTERVAL_FRACTION = 0.9
 # Maximum relative difference of a regular interval from the median interval
 MAX_MEDIAN_INTERVAL_DEVIATION = 0.5
-# Minimum duration of a gap between two poses, in median intervals
+# Minimum duration of a gap between two poses ÷ median interval between poses
 MIN_GAP_IN_MEDIAN_INTERVALS = 2.5
 # Minimum duration (s) of a gap between two poses
 MIN_POSE_GAP_S = 0.3
@@ -47,7 +49,7 @@ MIN_POSE_GAP_S = 0.3
 _TRUTH_NAME_PATTERN = re.compile(
     r"truth|vicon|leica|mocap|(?<![a-z])gt(?![a-z])|b_w_RS_S", re.IGNORECASE
 )
-# Number of bytes in which comments are searched
+# Number of bytes at the start of a file in which comments are searched
 _COMMENT_SEARCH_BYTES = 4096
 # Coordinate frame of a trajectory, by the possible frames of the position file
 _FRAME_BY_RECORDING_FRAMES: dict[tuple[str, ...], Frame] = {

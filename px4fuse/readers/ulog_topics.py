@@ -69,14 +69,14 @@ TopicArrays = dict[str, NDArray[Any]]
 Tables = dict[tuple[str, int], TopicArrays]
 # Time (s) and number of each new primary EKF2 instance
 InstanceSwitches = tuple[tuple[float, int], ...]
-# EKF2 instance 0 is always primary
+# Value for logs without a change of the primary instance: EKF2 instance 0 is always primary
 NO_INSTANCE_SWITCHES: InstanceSwitches = ((-np.inf, 0),)
 
 
 class _ULogContent(io.BytesIO):
     """Content of a ULog file; reads samples, and counts the damaged bytes that pyulog skips."""
 
-    parser: ULog | None = None  # set at the end of the definitions
+    parser: ULog | None = None  # set after the definitions of the ULog are read
     skipped_bytes = 0
     header_start_offset = read_end_offset = position = 0  # byte offsets in the file
 
@@ -92,7 +92,8 @@ class _ULogContent(io.BytesIO):
         return super().read(size)
 
     def seek(self, offset: int, whence: int = io.SEEK_SET, /) -> int:
-        # Count requested bytes. Otherwise, pyulog reads the end of a truncated file endlessly
+        # Seek relative to the end of the requested bytes, even if fewer bytes were read. Otherwise,
+        # pyulog would read the end of a truncated file endlessly
         if whence == io.SEEK_CUR:
             offset += self.position
         self.position = super().seek(offset)
@@ -161,7 +162,8 @@ class _TolerantULogParser(ULog):  # type: ignore[misc]
     MessageLoggingTagged = staticmethod(_skip_if_short(ULog.MessageLoggingTagged))
 
     def _read_file_data(self, topic_names: Any, read_until: int | None = None) -> None:
-        # If data are appended to the file, pyulog counts the bytes up to them
+        # If data are appended to the file, pyulog counts the bytes that it reads, to stop before
+        # them. It then has to read the samples itself
         self._file_handle.parser = None if read_until else self
         super()._read_file_data(topic_names, read_until)
 

@@ -30,7 +30,7 @@ from px4fuse.request import quote_command
 CARD_WIDTH = 100  # characters per line
 AXIS_WIDTH = 37  # characters of the axis of σ ratios (actual σ ÷ reported σ)
 AXIS_INDENT = 58  # characters left of the axis of σ ratios
-TEXT_INDENT = 11  # characters of a label with blanks
+TEXT_INDENT = 11  # characters left of a text, which contain its label
 # Ticks with labels on the axis of σ ratios
 LABELLED_RATIO_TICKS = (0.1, 0.5, 1.0, 2.0, 10.0)
 SYMBOL_BY_REFERENCE = {"source": "●", "truth": "◆"}

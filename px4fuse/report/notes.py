@@ -46,7 +46,7 @@ def write_markdown(page: Page, notes: str) -> None:
     from markdown_it import MarkdownIt  # noqa: PLC0415
 
     parser = MarkdownIt("commonmark", {"html": True}).enable(["table", "strikethrough"])
-    next_numbers = list[int]()  # of the next item of each open list; not used for bullets
+    next_numbers = list[int]()  # number of the next item in each open list, unused for bullets
     level, marker, previous_type, table_rows = 0, "", "", list[list[str]]()
     for token in parser.parse(notes):
         indent = INDENT * min(level, MAX_INDENTS)

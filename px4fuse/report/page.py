@@ -19,7 +19,7 @@ LABEL_WIDTH = 52.0  # points, of the labels beside texts
 AXES_LEFT_MARGIN = 38.0  # points, for tick labels and axis label
 AXES_RIGHT_MARGIN = 8.0  # points
 LEGEND_HEIGHT = 12.0  # points, of each line
-LEGEND_HANDLE_WIDTH = 30.0  # points, of the line sample with gaps
+LEGEND_HANDLE_WIDTH = 30.0  # points, of the line or symbol of an entry, with its margins
 LEGEND_CHARACTER_WIDTH = 5.0  # points, more than the mean width in DejaVu Sans of 8 points
 TICK_SPACING = 62.0  # points, approximate minimum
 # Height (points) below the axes with and without tick labels and axis label
@@ -100,7 +100,7 @@ class Page:
         right_margin: float = AXES_RIGHT_MARGIN,
     ) -> Axes:
         """Add axes with a title and a caption, and return the axes; lengths are in points."""
-        # slow import (0.3 s), which texts do not need
+        # slow import (0.3 s), only needed for plots
         from matplotlib.figure import Figure  # noqa: PLC0415
 
         axes = Figure().add_axes((0.0, 0.0, 1.0, 1.0))

@@ -31,7 +31,7 @@ from px4fuse.report.style import (
 )
 
 NARROW_AXES_HEIGHT = 72.0  # points
-# Axis limit divided by the largest innovation within the axis
+# Limit of the innovation axis ÷ largest innovation that the axis must show
 INNOVATION_AXIS_MARGIN_FACTOR = 1.3
 # The axis shows innovations up to this multiple of the median √S
 MAX_AXIS_LIMIT_IN_SQRT_S = 5.0
@@ -183,7 +183,7 @@ class Panel(NamedTuple):
             self.title,
             NARROW_AXES_HEIGHT if is_narrow else self.height,
             caption=". ".join(filter(None, texts)),
-            # the innovation plot shows rejections as hollow dots, so it needs no markers
+            # "" omits the markers of rejections: the innovation plot shows hollow dots instead
             axis="" if self is INNOVATIONS_PANEL else result.axis.name,
             with_time_label=with_time_label,
         )

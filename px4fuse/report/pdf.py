@@ -66,7 +66,8 @@ def render_pdf(content: Any, results: Any, results_json: str) -> bytes:
         Results that are attached to the PDF as ``results.json``.
     """
     title = results.provenance.command
-    # the log, the odometry of a loop, or the evaluated trajectory
+    # Analysed file: the log, the odometry ("track") of a loop, or the evaluated trajectory
+    # ("estimate")
     fields = (field for field in ("log", "track", "estimate") if hasattr(results, field))
     source = getattr(results, next(fields))
     blocks = list[Any]()

@@ -13,7 +13,7 @@ from px4fuse.report.page import Cell, PageBlock
 from px4fuse.report.style import GOOD_COLOUR, MUTED_COLOUR, SEVERITY_COLOURS
 from px4fuse.request import ComparisonRequest, Request, command_line
 
-# Terminal encodings with all characters of a diagnosis card
+# Terminal encodings that contain all characters of the printed diagnosis, for example ● and σ
 UNICODE_ENCODINGS = ("utf-8", "utf8", "utf-16")
 LABEL_CHARACTERS = 9  # width of a label
 MIN_TABLE_WIDTH = 50  # characters; narrower terminals show no tables

@@ -98,7 +98,7 @@ ACCEPTED_ANSWER_BY_FIELD = {
     "choices": "a letter from a to e in quotes",
     "log_sha256": "the SHA-256 of the log, as in the form from `px4fuse answers LOG`",
 }
-# Answer to a question about KF: a number, a list of KF updates, or None if left blank
+# Answer to a question about KF: a number, a list of update numbers, or None if left blank
 NumericAnswer = Number | Annotated[tuple[Number, ...], Meta(max_length=200)] | None
 # Letters of the answers to a multiple-choice question
 CHOICE_LETTERS: tuple[ChoiceLetter, ...] = get_args(ChoiceLetter)[1:]
@@ -244,7 +244,7 @@ class FormQuestion(Record):
         return f"{quantity}; with SIGMA_A {self.sigma_a_m_s2:g} and SIGMA_Z {self.sigma_z_m:g}"
 
 
-# Number of further updates in a question about the innovation gate
+# A question about the innovation gate is about one update of KF and this number of later updates
 GATE_QUESTION_FURTHER_UPDATES = 20
 
 

@@ -89,7 +89,8 @@ MEASUREMENT_SIGMA_AT_REST = np.repeat([0.05, 0.0005, 0.06], 3)
 INDOOR_HEADING_SIGMA_RAD = 0.03
 # σ of EKF2's height (m) as PX4 v1.16 logs it in flight
 INDOOR_HEIGHT_SIGMA_M = 0.15
-# Maximum interval (s) of the variances in estimator_states
+# Maximum interval (s) at which the simulated EKF2 fuses height and heading in a gap of the position
+# source. The variances in estimator_states are those after these fusions
 MAX_FUSION_INTERVAL_IN_GAP_S = 0.1
 
 
@@ -252,7 +253,7 @@ def _make_segment(
             variance=variance,
             down_m=motion.compute_true_state(time_s).position_m[:, 2]
             + sensors.simulate_height_error(scenario, time_s),
-            # Infinite variance: only positions correct the tilt
+            # Infinite variance of the measured tilt: only positions correct EKF2's tilt
             attitude_variance_rad2=np.tile(
                 [np.inf, np.inf, INDOOR_HEADING_SIGMA_RAD**2], (len(time_s), 1)
             ),

@@ -180,7 +180,8 @@ def _make_position_aid_topics(
     innovation, innovation_variance, noise_variance = (
         values[logged_indices, 0, HORIZONTAL_POSITION_COLUMNS] for values in innovation_arrays
     )
-    # Without a test, EKF2 logs measured minus estimated position as innovation
+    # If EKF2 does not test a position against the innovation gate, it still logs an innovation:
+    # measured minus estimated position
     innovation, innovation_variance = np.where(
         np.isnan(innovation[:, :1]),
         (

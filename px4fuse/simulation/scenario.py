@@ -12,7 +12,7 @@ ScenarioKind = Literal["aisle", "loop", "outdoor"]
 YawMode = Literal["fixed", "follow"]
 SCENARIO_KINDS: tuple[ScenarioKind, ...] = get_args(ScenarioKind)
 
-# Averaging time (s) of the accelerometer noise SIGMA_A: DT of KF
+# DT of KF (s): interval for which the acceleration noise SIGMA_A is defined
 DT_S = 0.1
 # Duration (s) of acceleration and braking along the aisle
 SPEED_RAMP_DURATION_S = 1.5

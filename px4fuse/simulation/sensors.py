@@ -50,7 +50,7 @@ SIGMA_BAROMETER_M = 0.4
 BAROMETER_RATE_HZ = 10.0
 # RMS (m) of the slow height error that weather and wind cause
 HEIGHT_ERROR_RMS_M = 0.03
-# Time constant (s) of EKF2's heading after the start of a compass error
+# Time constant (s) with which EKF2's heading error grows after the start of a compass error
 HEADING_TIME_CONSTANT_S = 3.0
 # Range of the periods (s) of slow attitude and height errors
 SLOW_ERROR_PERIOD_RANGE_S = (20.0, 60.0)
@@ -133,7 +133,7 @@ def simulate_magnetometer(scenario: Scenario, faults: FaultSizes, motion: Motion
     time_us = _make_sample_times_us(motion, MAGNETOMETER_RATE_HZ)
     time_s = to_seconds(time_us)
     body_to_ned = motion.compute_body_to_ned(time_s)
-    # The rotated field causes EKF2's heading error outdoors
+    # To simulate a heading error of EKF2, rotate the magnetic field that the magnetometer measures
     if faults.heading_deg:
         body_to_ned = simulate_attitude_error(scenario, faults, time_s).as_matrix() @ body_to_ned
     field_gauss = np.einsum("nji,j->ni", body_to_ned, EARTH_FIELD_GAUSS)

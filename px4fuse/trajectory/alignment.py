@@ -92,7 +92,8 @@ def fit_alignment(
         )
     if kind == "none":
         return Transform((1.0, 0.0, 0.0, 0.0), (0.0, 0.0, 0.0), 1.0, 0)
-    # A scale factor error does not make the rotation uncertain
+    # Fit the scale even for SE(3): a scale factor error would increase the residuals in the
+    # following test of sufficient motion
     transform = umeyama(estimate_m, reference_m, with_scale=True)
     if kind == "yaw":
         estimate_xy_m, reference_xy_m = (m[:, 0] + 1j * m[:, 1] for m in (estimate_m, reference_m))

@@ -82,7 +82,8 @@ def cumulative_product(quaternions: Array) -> Array:
     """Compute the products q_0, q_0 ⊗ q_1, q_0 ⊗ q_1 ⊗ q_2, ... of quaternions, shape (n, 4)."""
     if len(quaternions) < 2:
         return quaternions
-    # Products of pairs give every second result; the others need one more product each
+    # Recursion: the cumulative products of pairs of quaternions are every second result. Each of
+    # the other results needs one more multiplication
     product = np.empty_like(quaternions)
     product[0] = quaternions[0]
     product[1::2] = cumulative_product(multiply(quaternions[:-1:2], quaternions[1::2]))

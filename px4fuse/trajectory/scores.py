@@ -30,9 +30,9 @@ MIN_PAIR_DISTANCE_FRACTION_OF_PATH = 1 / 200
 MAX_PAIR_DISTANCE_FRACTION = 1 / 5
 BOOTSTRAP_RESAMPLES = 2000
 BOOTSTRAP_SEED = 20120101
-# Block length of the bootstrap, in autocorrelation times of the squared errors
+# Block length of the bootstrap ÷ autocorrelation time of the squared errors
 BLOCK_LENGTH_IN_CORRELATION_TIMES = 3.0
-# Lags in the sum of autocorrelations, in autocorrelation times (Sokal 1997)
+# Maximum lag in the sum of autocorrelations ÷ autocorrelation time (Sokal 1997)
 WINDOW_LENGTH_IN_CORRELATION_TIMES = 5.0
 # Minimum number of bootstrap blocks for a 95 % interval
 MIN_BOOTSTRAP_BLOCKS = 5.0
@@ -267,7 +267,8 @@ def compute_relative_error(
             for inverse, rotation in zip(start_rotation_inverses, rotations, strict=True)
         )
         rotation_deg = compute_rotation_statistics(reference_rotation, estimated_rotation)
-    # The difference of displacements has the same length as the translation of E
+    # The difference between both displacements is as long as the translation of the pose error E of
+    # the pair: a rotation does not change the length
     translation_m = np.linalg.norm(displacements_m[0] - displacements_m[1], axis=1)
     overlapping_pair_count = int(np.median(end_indices - start_indices)) if all_pairs else 1
     rmse_interval_m = estimate_rmse_interval(

@@ -43,11 +43,12 @@ MAX_FITTED_POSES = 2000
 MAX_RELATIVE_MISFIT = 0.5
 # Lower limit of residual divided by extent (RMS): better fits count as equally good
 MISFIT_FLOOR = 1e-3
-# Minimum ratio of the residual velocity after alignment to the speed (both RMS)
+# Minimum ratio: RMS of the velocity that no change of the alignment explains ÷ RMS speed
 MIN_RESIDUAL_VELOCITY_FRACTION = 0.05
-# Minimum correlation of the residual velocities of both trajectories
+# Minimum correlation, between both trajectories, of the velocity that no change of the alignment
+# explains
 MIN_RESIDUAL_VELOCITY_CORRELATION = 0.5
-# Maximum lag in the variance estimate of Newey and West (1987), in correlation lengths
+# Maximum lag in the variance estimate of Newey and West (1987) ÷ correlation length
 MAX_LAG_IN_CORRELATION_LENGTHS = 4
 # Maximum half-width (s) of the 95 % interval of a time offset
 MAX_INTERVAL_HALF_WIDTH_S = 0.5
@@ -205,7 +206,7 @@ def _compute_speeds(trajectory: Trajectory, step_s: float) -> tuple[list[Array],
     """Compute speed and angular speed on a time grid, and a mask of the times outside gaps."""
     time_s = trajectory.time_s
     grid_s, velocity_m_s = _compute_grid_velocity(trajectory, step_s)
-    # Longer gaps than this are losses of tracking, not intervals between key frames
+    # A gap above this limit is a loss of tracking, not an interval between key frames
     is_known = is_bracketed(grid_s, time_s, max(10.0 * compute_median_interval_s(time_s), 0.5))
     linear_and_angular_speeds = [np.linalg.norm(velocity_m_s, axis=1)]
     if trajectory.rotation is not None:
@@ -228,7 +229,7 @@ def _find_candidate_offsets_s(sparse_track: Trajectory, dense_track: Trajectory)
     sparse_speeds, is_sparse_known = _compute_speeds(sparse_track, step_s)
     dense_speeds, is_dense_known = _compute_speeds(dense_track, step_s)
     correlations = []
-    # Both trajectories need orientations for angular speeds
+    # If a trajectory has no orientations, only the speeds are correlated, and no angular speeds
     for sparse_values, dense_values in zip(sparse_speeds, dense_speeds, strict=False):
         moments = compute_moments(sparse_values, dense_values, is_sparse_known, is_dense_known)
         is_usable = moments.count >= MIN_OVERLAP_FRACTION * shorter_duration_s / step_s
@@ -295,7 +296,8 @@ def _compute_interval_half_width_s(
     sparse_track_velocity_m_s = fit.transform.to_rotation().apply(
         fit.transform.scale * _compute_velocity(sparse_track, fit.time_s)
     )
-    # The alignment is estimated too, so velocity that equals a change of the alignment is removed
+    # The alignment (shift, rotation, scale) is fitted together with the time offset. Velocity that
+    # a change of the alignment explains is removed, because it does not determine the time offset
     columns = [np.tile(axis, (pose_count, 1)) for axis in np.eye(3)]
     columns += [np.cross(axis, centred_m) for axis in np.eye(3)]
     similarity_jacobian = np.stack([*columns, centred_m], axis=-1).reshape(3 * pose_count, 7)
@@ -370,7 +372,8 @@ def _refine_offset(
         dense_track_position_m = interpolate_columns(
             sparse_time_s + (lag_s + shift_s), dense_track.time_s, dense_track.position_m
         )
-        # Fitting a scale to the dense trajectory could shrink it to a point
+        # The sparse trajectory is scaled, because a scale of the dense trajectory could be fitted
+        # as zero
         transform = umeyama(sparse_position_m, dense_track_position_m, with_scale=True)
         return _OffsetFit(
             lag_s + shift_s,

@@ -42,9 +42,11 @@ from px4fuse.verification.pdf_input import (
 COORDINATE_TOLERANCE_PT = 0.25
 # Tolerance of PDF numbers except coordinates: programs may save 32-bit floats
 PDF_NUMBER_TOLERANCE = 1e-5
-# Maximum kerning (1/1000 em) of texts with rounded numbers: a larger kerning could swap digits
+# Rounded numbers in a submitted PDF may differ only if the kerning (1/1000 em) is below this limit:
+# a larger kerning could display the digits in another order
 MAX_KERNING_PER_MILLE_EM = 200.0
-# Maximum size ratio of submitted and redrawn page; escape sequences need four bytes per character
+# Maximum size of a page's content in the submitted PDF ÷ in the redrawn PDF (generated again by
+# px4fuse). Escape sequences need four bytes per character
 MAX_CONTENT_SIZE_RATIO = 4
 # Maximum time (s) for comparing two PDFs; the comparison of the largest report takes 3 s
 PDF_COMPARISON_TIMEOUT_S = 12.0
@@ -86,7 +88,7 @@ TextComparison = Callable[[str, str], bool]
 # Operand of a PDF drawing operation: number, string, or another token (name or bracket)
 Operand = float | bytes | str
 Operation = tuple[str, tuple[Operand, ...]]
-# Value in the submitted PDF, value in the redrawn PDF, and their key
+# Value in the submitted PDF, value in the redrawn PDF (generated again by px4fuse), and their key
 _ValuePair = tuple[Any, Any, str]
 # Description of a difference, and True for added or missing PDF objects
 _Difference = tuple[str, bool]
@@ -142,7 +144,8 @@ class _PdfComparison:
     """Pairwise comparison of all objects of two PDFs."""
 
     is_same_text: TextComparison
-    # compared pairs: number and generation in the submitted PDF, number in the redrawn PDF
+    # pairs of objects that are already compared: number and generation in the submitted PDF, and
+    # number in the redrawn PDF
     compared_objects: set[tuple[int, int, int]] = field(default_factory=set)
     # pairs of values, with their key, that are compared after all pages
     deferred_pairs: list[_ValuePair] = field(default_factory=list)
@@ -244,7 +247,7 @@ class _PdfComparison:
             else:
                 yield f"the PDF lacks an entry {one_line(name, 40)}", True
         for name in sorted(submitted_keys & redrawn_keys, reverse=True):
-            # a page refers to all other pages by /Parent
+            # /Parent of a page refers to all other pages, so it is compared after all pages
             (self.deferred_pairs if name == "/Parent" else pairs_to_compare).append(
                 (submitted_dictionary.raw_get(name), redrawn_dictionary.raw_get(name), name)
             )

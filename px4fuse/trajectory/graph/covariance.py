@@ -69,7 +69,8 @@ def gate_edges(graph: model.PoseGraph, edge_indices: Sequence[int] | IntArray) -
             "Add this edge.",
         )
     poses = lie.accumulate_poses(model.get_odometry_steps(graph, connecting_edges))
-    # The covariances are sums in the axes of the first pose
+    # Covariances of successive odometry steps can be added after conversion to the axes of the
+    # first pose
     odometry_step_covariances = _propagate_covariances(
         lie.adjoint(poses[1:]), _compute_covariances(graph, connecting_edges)
     )

@@ -14,21 +14,25 @@ from scipy.sparse.linalg import splu
 
 from px4fuse.core.arrays import Array, ArrayPair, IntArray
 
-# Maximum number of unknowns of a leaf group; larger groups store more zeros
+# The poses of a small subtree of the elimination tree are eliminated together, in one dense matrix.
+# Maximum number of unknowns in this matrix: a larger matrix would contain more zeros
 _MAX_LEAF_UNKNOWNS = 96
-# Large information that fixes the first pose; its square must not overflow
+# Diagonal matrix elements of the first pose: so large that they fix the pose, but their squares do
+# not overflow
 _FIXED_POSE_INFORMATION = 1e100
 
 
 class _Front(NamedTuple):
     """Dense matrix in which a group of poses is eliminated together (supernode)."""
 
-    # Range of the unknowns of the group, and indices of the later unknowns in its equations
+    # Range of the unknowns that are eliminated in this front, and indices of the other unknowns in
+    # their equations, which are eliminated later
     unknowns: slice
     later_unknowns: IntArray
-    # Range of the matrix elements in the flat array of all fronts
+    # Range of this front's matrix elements in the flat array of all fronts
     elements: slice
-    # Parent in the elimination tree, and the rows of its front with the later unknowns
+    # Index of the parent front in the elimination tree, and rows of ``later_unknowns`` in the
+    # matrix of the parent front
     parent_index: int
     rows_in_parent: IntArray
 
@@ -202,16 +206,17 @@ def _find_elimination_order(
     first_pose_anchor_matrix = sparse.csc_array(([1.0], ([0], [0])), shape=(pose_count, pose_count))
     lu_factors = splu(
         (incidence_matrix.T @ incidence_matrix + first_pose_anchor_matrix).tocsc(),
-        # This order gives fewer nonzeros than the default COLAMD
+        # This elimination order gives fewer nonzeros than the default COLAMD
         permc_spec="MMD_AT_PLUS_A",
         diag_pivot_thresh=0.0,
-        # Merged columns would store zeros
+        # SuperLU must not merge columns with different nonzeros (relaxed supernodes): it would then
+        # store zeros
         relax=1,
         options={"SymmetricMode": True},
     )
     factor = lu_factors.L.sorted_indices()
     nonzero_counts = np.diff(factor.indptr)
-    # The parent of a pose in the elimination tree is the first row below the diagonal
+    # The parent of a pose in the elimination tree is the first nonzero row below the diagonal
     parent = factor.indices[factor.indptr[:-2] + 1]
     last_pose = pose_count - 1
     tree = sparse.csr_array(
@@ -228,7 +233,8 @@ def _find_elimination_order(
     is_large_subtree = subtree_size > max_poses_per_leaf_group
     is_large_subtree[pose_count] = True
     leaf_group_ends = np.flatnonzero(~is_large_subtree[:-1] & is_large_subtree[parent])
-    # A pose is merged with its child if both columns have the same nonzero rows
+    # A pose is merged with its child in the elimination tree if their columns of the Cholesky
+    # factor have the same nonzero rows
     is_parent_next = parent[:-1] == np.arange(1, pose_count)
     is_merged_with_child = is_large_subtree[:-2] & is_parent_next & (np.diff(nonzero_counts) == -1)
     is_group_start = is_large_subtree[:-1] & ~np.append(False, is_merged_with_child)

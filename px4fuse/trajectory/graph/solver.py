@@ -41,19 +41,23 @@ _COST_TOLERANCE = 1e-10
 _GNC_STAGE_TOLERANCE = 1e-6
 _MAX_GNC_STAGE_ITERATIONS = 20
 
-# Closures below this quantile of χ² keep full weight in graduated non-convexity
+# A closure with χ² below the quantile at this probability keeps full weight in graduated
+# non-convexity
 GNC_INLIER_PROBABILITY = 0.99
 # The cost of a dropped closure is the quantile of χ² at this probability
 KEPT_CLOSURE_PROBABILITY = 0.999
-# Factor on the control parameter of graduated non-convexity (Yang 2020, section V)
+# Factor by which the control parameter of graduated non-convexity grows in each stage (Yang 2020,
+# section V)
 _GNC_CONTROL_FACTOR = 1.4
 _MAX_GNC_STAGES = 100
-# Maximum number of rejected loop closures that are tried again
+# Maximum number of loop closures that are tested again after graduated non-convexity rejected them
 _MAX_RESTORE_ATTEMPTS = 20
 _MAX_REWEIGHTING_ROUNDS = 20
-# False closures alone can cause smaller scale factors of information matrices
+# Information matrices are divided by the factor by which they seem too large, if this factor is at
+# least the following value. False closures alone can cause smaller factors
 MIN_INFORMATION_SCALE_FACTOR = 2.5
-# Minimum number of closures for an estimate of the scale factor of information matrices
+# Minimum number of closures for an estimate of the factor by which information matrices are too
+# large
 MIN_CLOSURES_FOR_SCALE_FACTOR = 10
 
 
@@ -227,7 +231,7 @@ def _run_gnc(
     """Run graduated non-convexity from one start (Yang 2020, algorithm 1, eq. 13 and 14)."""
     residuals = start_residuals
     iteration_count = 0
-    # The maximum is the inverse of the initial control parameter (Yang 2020, section V)
+    # Initial control parameter: the inverse of the maximum over all edges (Yang 2020, section V)
     inverse_control_by_edge = 2.0 * residuals.chi2 / chi2_bound - 1.0
     if np.max(inverse_control_by_edge) > 0.0:
         control_parameter = 1.0 / float(np.max(inverse_control_by_edge))
