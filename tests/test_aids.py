@@ -73,7 +73,7 @@ def evaluate(log: AidLog, name: str = "gnss_pos") -> AidResult:
     (0.5, "consistent"), (0.58, "consistent"), (0.68, "overconfident"),
     (0.43, "consistent"), (0.37, "underconfident"),
 ])  # fmt: skip
-def test_aid_verdict_changes_at_sigma_ratios_of_0_8_and_1_25(sigma, verdict) -> None:
+def test_aiding_source_is_consistent_at_sigma_ratio_0_8_to_1_25(sigma, verdict) -> None:
     aid = evaluate(aid_log(sigma=sigma))
     assert aid.verdict == verdict
     assert aid.nis_mean == pytest.approx((sigma / 0.5) ** 2, rel=0.06)
@@ -159,7 +159,7 @@ def test_aiding_source_report_names_its_noise_parameter(
     assert evaluate(aid_log(own=False, **parameters), name).noise_from == ""
 
 
-def test_aid_gap_limit_is_longer_if_log_rate_is_low() -> None:
+def test_not_fused_verdict_needs_longer_gap_at_low_log_rate() -> None:
     """Rows of zeros are samples that EKF2 logged between two measurements."""
     log = aid_log(own=False, enabled=steps((0.0, 1.0)))
     decimated = replace(log, samples=log.samples.iloc[::10])
@@ -350,7 +350,7 @@ def test_gnss_without_fix_is_reported() -> None:
     assert "none with a 3D fix" in finding.message
 
 
-def test_alignment_action_names_ev_yaw_bit_without_orientation() -> None:
+def test_heading_alignment_action_advises_to_send_orientation() -> None:
     flight = aids_only(status_flags={"yaw_align": pd.Series([0.0], [0.0])})
     flight.log = log(parameters={"EKF2_EV_CTRL": 9, "EKF2_MAG_TYPE": 5})
     (finding,) = ekf2_state.detect_missing_alignment(flight, SEGMENT, source())

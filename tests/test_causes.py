@@ -94,7 +94,7 @@ def test_consistency_notes_list_innovations_that_are_correlated(sample: Analysis
     assert "KF along down, lag-1 autocorrelation" in white
 
 
-def test_pages_with_nis_band_state_tolerance_of_verdict(sample: Analysis) -> None:
+def test_each_page_with_nis_band_defines_consistent_filter(sample: Analysis) -> None:
     pages = [Page(), *consistency.draw_pages(sample, None)]
     terminal._write_details(pages[0], sample, SimpleNamespace(findings=()))
     assert all(

@@ -62,7 +62,7 @@ def test_results_attached_to_report_pdf_contain_no_file_paths(report):
     assert results["settings"]["sigma_z_m"] == 0.12
 
 
-def test_compare_report_prints_special_characters_of_student(report):
+def test_report_prints_special_characters_in_name_and_notes(report):
     pages = [page.extract_text() for page in pypdf.PdfReader(report[0] / "report.pdf").pages]
     assert "Ana $x$ Müller" in pages[0]
     assert "Costs $5 and $x^2$ or \\frac{1}{2}; bold, under, tag." in "\n".join(pages)

@@ -425,7 +425,7 @@ def test_time_offset_estimate_excludes_position_outliers() -> None:
     assert make_time_offset_advice(compared, found)["Offset"].startswith("Add -0.")
 
 
-def test_time_offset_that_ground_truth_refutes_is_not_recommended() -> None:
+def test_time_offset_refuted_by_ground_truth_is_not_recommended() -> None:
     """Ground truth is late too, so timestamps without the offset increase the RMSE."""
     flight = simulate_flight(Scenario(seed=3, passes=3), parse_faults(["clock-offset=0.3"]))
     assert isinstance(flight.truth, Truth)
@@ -450,7 +450,7 @@ def oscillating(flight: Flight) -> Flight:
     return replace(flight, imu=imu)
 
 
-def test_imu_oscillation_is_no_change_of_time_offset(monkeypatch) -> None:
+def test_imu_oscillation_is_not_taken_for_time_offset_change(monkeypatch) -> None:
     scenario = Scenario(seed=4, ekf2=False)
     flight = oscillating(simulate_flight(scenario, parse_faults([])))
     prepared = prepare_comparison(flight, ComparisonRequest(log=flight.log.name))
@@ -464,7 +464,7 @@ def test_imu_oscillation_is_no_change_of_time_offset(monkeypatch) -> None:
 
 
 @pytest.mark.parametrize("mistake", ["clock-jump=0.3", "smoothed=1", "vibration=5", "yaw=40"])
-def test_flight_without_imu_oscillation_has_none(mistake: str) -> None:
+def test_other_faults_are_not_detected_as_imu_oscillation(mistake: str) -> None:
     flight = simulate_flight(Scenario(seed=4, ekf2=False), parse_faults([mistake]))
     prepared = prepare_comparison(flight, ComparisonRequest(log=flight.log.name))
     assert find_imu_oscillation(prepared) is None

@@ -364,7 +364,7 @@ def test_late_timestamps_finding_has_maximum_likelihood_offset(estimate_s, repor
 @pytest.mark.parametrize(
     ("late_s", "expected"), [(0.003, "correct"), (-0.3, "0.30 s early"), (0.3, "0.30 s late")]
 )
-def test_clock_drift_finding_states_no_zero_delay_as_late(late_s: float, expected: str) -> None:
+def test_clock_drift_finding_states_if_timestamps_are_late(late_s: float, expected: str) -> None:
     drifting = Convention(verdict="determined", late_s=late_s, clock_drift=0.02)
     comparison = replace(compared(sent(flown())), convention=drifting)
     (found,) = source_convention.detect(comparison)
@@ -385,7 +385,7 @@ def test_low_pass_filtered_positions_are_not_reported_as_late(time_constant_s: f
     assert delayed.late_s == pytest.approx(time_constant_s, abs=0.1)
 
 
-def test_clock_offset_auto_note_states_total_time_offset():
+def test_note_on_clock_offset_auto_states_applied_time_offset():
     late = replace(flown(), positions=(sent(flown(), late_s=0.7),))
     request = ComparisonRequest(log="made", clock_offset_s="auto", axes=("north", "east"))
     prepared = prepare_comparison(late, request)
@@ -416,7 +416,7 @@ def test_position_file_in_wrong_frame_report_names_true_frame(axes, message, rem
     assert remedy in found.remedy
 
 
-def test_findings_caused_by_wrong_axes_are_marked_as_effects():
+def test_ekf2_finding_due_to_wrong_axes_names_axes_as_cause():
     comparison = compared(sent(flown(), ENU))
     roots = list(source_convention.detect(comparison))
     other = finding("error", "ekf2_rejects_positions", "EKF2 rejects 9 %. Why.", "Set a gate.")

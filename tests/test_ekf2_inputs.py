@@ -345,7 +345,7 @@ def turning(states: np.ndarray) -> tuple[pd.DataFrame, pd.DataFrame, Ekf2, Fusio
     return imu, attitude, made(Ekf2, state=state), record
 
 
-def test_ekf2_replay_inputs_equal_true_motion_in_turn():
+def test_ekf2_replay_inputs_equal_motion_of_rotating_vehicle():
     flown = turning(10.0 + 0.1 * np.arange(21))
     found = _make_segment(*flown, 5, 11.5)
     steps = 10.5 + 0.01 * np.arange(101)
@@ -434,7 +434,7 @@ def test_ekf2_replay_segments_end_at_vision_and_imu_gaps(monkeypatch):
     ("name", "suggestion"),
     [("EKF2_EVP_NOIS", "Did you mean EKF2_EVP_NOISE?"), ("EKF2_EV_CTRL", ""), ("EKF2_EV_QMIN", "")],
 )
-def test_parameter_check_suggests_only_for_typing_errors(name: str, suggestion: str) -> None:
+def test_parameter_error_suggests_name_only_if_it_is_mistyped(name: str, suggestion: str) -> None:
     with pytest.raises(SettingsError, match=f"does not contain {name}, so") as raised:
         check_parameters({name: 1.0})
     assert raised.value.remedy.startswith(f"{suggestion} Choose from".lstrip())

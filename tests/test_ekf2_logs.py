@@ -88,7 +88,7 @@ def test_ekf2_replay_disagrees_with_log_if_86_percent_rejected(shared_logs):
         ("g1_base", {}),
     ],
 )
-def test_what_if_without_set_proposes_only_the_wrong_parameter(shared_logs, name, expected):
+def test_what_if_without_set_option_proposes_wrong_parameter(shared_logs, name, expected):
     log = str(shared_logs / "flown" / f"{name}.ulg")
     found = run_what_if(WhatIfRequest(log=log)).changes
     assert found == pytest.approx(expected, abs=20.0 if "d0" in name else 0.01)

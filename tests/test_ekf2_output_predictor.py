@@ -72,7 +72,7 @@ def test_ekf2_output_predictor_equals_step_by_step_simulation(lag: int) -> None:
         assert found == pytest.approx(known, abs=1e-9)
 
 
-def test_output_predictor_attitude_sum_equals_loop_over_steps() -> None:
+def test_sum_of_attitude_corrections_equals_stepwise_sum() -> None:
     lag, horizon_s = 19, 0.2
     error = np.zeros((600, 3))
     error[100:] = 0.01, 0.0, -0.02

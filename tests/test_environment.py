@@ -43,9 +43,7 @@ def test_info_command_ignores_invalid_source_date_epoch(tmp_path) -> None:
 
 
 @pytest.mark.parametrize("columns", ["0", "00", "abc", ""])
-def test_terminal_output_with_invalid_columns_variable_succeeds(
-    monkeypatch, capsys, columns
-) -> None:
+def test_invalid_environment_variable_columns_is_ignored(monkeypatch, capsys, columns) -> None:
     monkeypatch.delenv("COLUMNS", raising=False)
     usual = run_main(monkeypatch, capsys, "info", LOG)
     monkeypatch.setenv("COLUMNS", columns)

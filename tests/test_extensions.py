@@ -184,7 +184,7 @@ def test_extension_guide_names_only_existing_files() -> None:
             assert name.split()[-1] in EXTENSIONS
 
 
-def test_each_kf_setting_has_option_range_and_result_field() -> None:
+def test_each_kf_setting_is_in_options_ranges_and_results() -> None:
     names = set(Settings.__dataclass_fields__)
     assert names <= set(ComparisonRequest.__struct_fields__)
     assert names <= set(ChosenSettings.__struct_fields__)
@@ -208,7 +208,7 @@ def test_setting_without_unit_prints_no_dangling_blank(monkeypatch: pytest.Monke
     assert "Gate (1 to 5)." in CliRunner().invoke(fuse, ["--help"]).output
 
 
-def test_request_option_without_unit_or_with_bool_is_number_or_flag(
+def test_request_options_accept_plain_numbers_and_flags(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     class Request(msgspec.Struct):

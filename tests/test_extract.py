@@ -85,7 +85,7 @@ def test_extract_writes_innovations_of_all_axes_in_one_table(written, sample_fli
         np.testing.assert_array_equal(rows[frame.columns], frame)
 
 
-def test_extracted_imu_table_without_logged_clipping_has_its_column(sample_flight):
+def test_extracted_imu_table_without_clipping_has_empty_column(sample_flight):
     for imu in (sample_flight.imu, sample_flight.imu.drop(columns="clipped")):
         table = extraction.tables(replace(sample_flight, imu=imu))["imu"]
         assert table.columns.tolist() == ["time_s", *sample_flight.imu.columns]

@@ -22,7 +22,7 @@ from px4fuse.results.answer_form import (
 )
 
 
-def test_right_answers_on_each_figure_describe_the_same_fault() -> None:
+def test_correct_answers_on_one_figure_describe_one_fault() -> None:
     for number in range(20):
         choices = select_choices(partial(draw_uniform, b"secret", f"s{number}", "aisle"))
         assert len(choices) == len(QUESTIONS) * figures.FIGURE_COUNT <= MAX_CHOICES
@@ -37,7 +37,7 @@ def test_right_answers_on_each_figure_describe_the_same_fault() -> None:
         assert len(form.encode()) < MAX_FORM_BYTES
 
 
-def test_right_multiple_choice_letters_are_equally_frequent() -> None:
+def test_each_multiple_choice_letter_is_correct_equally_often() -> None:
     draws = [partial(draw_uniform, b"secret", f"s{number}", "aisle") for number in range(200)]
     letters = [letter for random_number in draws for _, letter in select_choices(random_number)]
     for name in CHOICE_LETTERS:

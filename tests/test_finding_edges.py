@@ -118,7 +118,7 @@ def test_status_flag_has_first_logged_value_at_earlier_times() -> None:
     assert find_spans_with_value(0.0, flag, Segment(40.0, 50.0, "")) == ((40.0, 50.0),)
 
 
-def test_split_cause_groups_puts_effect_into_group_of_its_cause() -> None:
+def test_finding_is_grouped_with_the_finding_that_caused_it() -> None:
     first, other = make_finding("kf_underconfident"), make_finding("no_motion", "note")
     follows = make_finding("kf_underconfident", caused_by="kf_underconfident")
     assert split_cause_groups([first, follows, other]) == [[first, follows], [other]]
@@ -182,7 +182,7 @@ def test_log_dropouts_outside_evaluated_segment_are_ignored() -> None:
         (60.0, {"ekf2_fusion_interrupted": "warning"}), (59.9, {"ekf2_not_fusing": "error"}),
     ],
 )  # fmt: skip
-def test_ekf2_fusion_below_98_percent_warns_below_50_is_error(
+def test_ekf2_fusion_for_50_to_98_percent_of_time_is_a_warning(
     until_s: float, expected: dict[str, str]
 ) -> None:
     one = analysis(ekf2=with_fusion((0.0, 1.0), (until_s, 0.0)))
@@ -290,7 +290,7 @@ def test_severity_of_rejections_depends_on_rejected_percentage(
             assert finding.remedy.endswith(remedy)
 
 
-def test_rejection_action_requires_rerun_with_half_of_rejections() -> None:
+def test_rejection_action_sets_noise_if_rerun_halves_rejections() -> None:
     frame = rejected(20, 100)
     for after, improves, action in (
         (0.09, True, "Set EKF2_EVP_NOISE to 0.1 m."), (0.1, True, CHECK_FIRST),
@@ -315,7 +315,7 @@ CHECK_FIRST = (
 # ---------------------------------------------------------------- errors and truth
 
 
-def test_error_above_sigma_finding_prefers_the_main_axis() -> None:
+def test_report_on_error_above_reported_sigma_prefers_main_axis() -> None:
     ekf2 = axis("east", ekf2=statement(0.49), ekf2_truth=against_truth(25.0, 1.0))
     finding = only(hidden_errors.detect, analysis(axes=(axis(), hiding(name="down"), ekf2)))
     assert finding.title == (
@@ -526,7 +526,7 @@ def test_heading_drift_report_contains_heading_at_start_and_end() -> None:
 
 @pytest.mark.parametrize("noise_is_wrong", [False, True])
 @pytest.mark.parametrize("degrees", [(20.0,), (2.0, 30.0)])
-def test_heading_error_report_names_wrong_gnss_noise(degrees, noise_is_wrong) -> None:
+def test_heading_error_action_depends_on_rerun_with_gnss_noise(degrees, noise_is_wrong) -> None:
     """A re-run with another EKF2_GPS_P_NOISE makes EKF2's innovations consistent."""
     trial = tried("ekf2", {"EKF2_GPS_P_NOISE": 0.4})
     one = analysis(
@@ -854,7 +854,7 @@ def test_accelerometer_bias_report_contains_95_percent_interval() -> None:
       ["source_timestamps_constant", "source_timestamp_jitter"]),
      (clock_map(jitter_s=0.5), []), (clock_map("arrival time"), ["companion_not_synchronised"])],
 )  # fmt: skip
-def test_constant_jittery_or_unsynchronised_times_are_reported(
+def test_constant_jittery_or_unsynced_timestamps_are_reported(
     clock: Any, expected: list[str]
 ) -> None:
     assert list(named(source_stamps.detect, analysis(source=source(clock_map=clock)))) == expected
@@ -909,7 +909,7 @@ def test_position_sample_interval_is_found_despite_jitter() -> None:
         assert (found == pytest.approx(1.0)) if there else found is None
 
 
-def test_interval_above_20_samples_is_a_gap_not_lost_samples() -> None:
+def test_gap_above_5_intervals_is_not_counted_as_lost_samples() -> None:
     for longest, lost in ((5.0, [4]), (5.1, [])):  # intervals of 0.25 s
         one = at_multiples([1.0] * 20 + [longest], 0.25, clock_map=clock_map())  # type: ignore[list-item]
         assert [each.evidence["lost"] for each in source_intervals.detect_lost_samples(one)] == lost
@@ -922,7 +922,7 @@ def test_position_jump_report_contains_count_and_largest_jump() -> None:
     assert finding.spans_s == ((30.0, 30.0), (60.0, 60.0))
 
 
-def test_scale_and_variance_titles_state_direction_of_the_error() -> None:
+def test_scale_and_variance_findings_state_sign_of_error() -> None:
     for signed, word in ((0.2, "long"), (-0.2, "short")):
         finding = only(source_positions.detect_scale_error, scaled(signed))
         assert finding.title == f"UWB distances are 20 % too {word}"
@@ -1096,7 +1096,7 @@ def test_recommended_ekf2_delay_stays_in_px4_range(
         (1.0, "Correct the position timestamps before sending."),
     ],
 )
-def test_ekf2_delay_is_recommended_only_if_its_rerun_improves(after_m: float, remedy: str) -> None:
+def test_ekf2_delay_is_recommended_only_if_rerun_reduces_rmse(after_m: float, remedy: str) -> None:
     trials = (rerun("ekf2", "delay", {"EKF2_EV_DELAY": 120.0}, after_m),)
     finding = only(wrong_delay, delayed(0.0, late(-0.12), reruns=trials))
     assert finding.remedy == remedy

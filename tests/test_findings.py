@@ -500,7 +500,9 @@ def test_position_jump_is_not_reported_as_time_offset_change() -> None:
 
 
 @pytest.mark.parametrize("late_s", [0.1, -0.24])
-def test_attitude_delay_to_gyroscopes_is_reported(late_s: float, sample_flight: Flight) -> None:
+def test_delay_of_attitude_relative_to_gyro_is_reported(
+    late_s: float, sample_flight: Flight
+) -> None:
     attitude = sample_flight.attitude
     shifted = replace(sample_flight, attitude=attitude.set_axis(attitude.index + late_s))
     (finding,) = (one for one in found(compare(shifted)) if one.id == "attitude_late")
@@ -620,7 +622,7 @@ def test_explain_command_prints_meaning_and_example_of_fault(typed, monkeypatch,
         assert text in out
 
 
-def test_explain_command_states_if_detection_rate_is_unknown(monkeypatch, capsys) -> None:
+def test_explain_command_reports_unknown_detection_rate(monkeypatch, capsys) -> None:
     _, out, _ = run_main(monkeypatch, capsys, "explain", "not_px4")
     assert "detection have not been measured" in out
 

@@ -181,7 +181,7 @@ def test_answer_that_names_a_fault_of_clean_flight_has_no_points() -> None:
     assert parts(RIGHT, CLEAN)[:4] == [0.0] * 4
 
 
-def test_named_loop_fault_without_size_earns_points_for_name() -> None:
+def test_loop_fault_answered_without_size_earns_partial_points() -> None:
     landed = InjectedFault("open-end", 5.0, 4.25, 5.75, 60.0, None)
     truth = replace(CLEAN, mistakes=(landed,), quantities=())
     claim = NamedFault("open-end", None, "", "", 60.0, None, "--open", None, "", "loop")

@@ -117,13 +117,13 @@ def unfused(**parts: Any) -> Any:
     return analysis(ekf2=ekf2, source=source(**parts.pop("source", {})), **parts)
 
 
-def test_not_fusing_is_absent_if_unfused_positions_are_constant() -> None:
+def test_unfused_constant_positions_give_no_fusion_finding() -> None:
     still = unfused(source={"samples": positions(np.arange(0.0, 120.0, 0.1), 2.0)},
                     ekf2={"parameters": {"EKF2_EV_CTRL": 2.0}})  # fmt: skip
     assert named(ekf2_fusion.detect_position_fusion_faults, still) == {}
 
 
-def test_position_file_that_ekf2_never_got_is_no_fusion_fault() -> None:
+def test_position_file_not_sent_to_ekf2_is_no_fusion_fault() -> None:
     beside = unfused(
         source={"origin": POSITION_FILE_ORIGIN}, ekf2={"parameters": {"EKF2_EV_CTRL": 0.0}}
     )

@@ -310,7 +310,7 @@ def test_ground_truth_of_gnss_flight_is_relative_to_ekf2_origin(fused, tmp_path)
 @pytest.mark.parametrize(("least_m", "eph_m", "expected"), [
     (2.0, 0.3, True), (0.5, 0.45, False), (0.5, 0.9, False), (None, 0.3, False),
 ])  # fmt: skip
-def test_gnss_noise_above_receiver_sigma_should_be_decreased(
+def test_gnss_noise_above_receiver_sigma_is_reported(
     least_m, eph_m, expected, tmp_path, monkeypatch
 ):
     log = outdoors(eph_m=eph_m)
@@ -396,7 +396,7 @@ def test_compare_of_real_gnss_flights_equals_reference_numbers(name, shared_logs
 
 
 @pytest.mark.reallogs
-def test_gnss_noise_advice_follows_ground_truth(shared_logs):
+def test_smaller_gnss_noise_is_advised_if_ground_truth_agrees(shared_logs):
     analysis = px4fuse.compare(shared_logs / "simulated" / "v1.16.1_no_uwb.ulg")
     remedies = {one.id: one.remedy for one in find(analysis)}
     assert remedies["kf_underconfident"].startswith("Set SIGMA_Z to 0.1")

@@ -182,7 +182,7 @@ def test_heading_error_is_estimated_for_all_parts_of_long_flight() -> None:
     assert all(part.heading_error_deg == pytest.approx(4.0) for part in parts)
 
 
-def test_heading_drift_requires_minimum_angle_and_p_value() -> None:
+def test_heading_drift_requires_minimum_angle_and_small_p_value() -> None:
     for spread, drift_p, drifts in ((1.0, 0.0, True), (0.999, 0.0, False), (9.0, 1.0, False)):
         turns = (0.0, spread * frame_rotation.MIN_HEADING_DRIFT_DEG)
         parts = tuple(HeadingPart(float(n), n + 1.0, turn, 0.1) for n, turn in enumerate(turns))

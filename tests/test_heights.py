@@ -122,7 +122,7 @@ def test_barometer_bias_is_constant_after_height_reference_stops() -> None:
 
 
 @pytest.mark.parametrize(("down_m", "learned"), [(-2.0, True), (-2.3, False)])
-def test_barometer_bias_outside_gate_is_not_updated(down_m, learned) -> None:
+def test_barometer_bias_ignores_innovation_outside_gate(down_m, learned) -> None:
     """The gate is 3 √(0.25 + 0.25) m."""
     heights, _ = standing(sampled([10], [down_m]))
     assert (heights.bias.bias_m[0] > 0.0) == learned
@@ -201,7 +201,7 @@ def opened_once() -> Ekf2Model:
 
 
 @pytest.mark.slow
-def test_what_if_baro_noise_equals_flight_with_same_baro_noise() -> None:
+def test_what_if_with_baro_noise_equals_flight_with_this_noise() -> None:
     model = opened_once()
     assert model.agreement.baro_hgt["down"].innovation_correlation > 0.999
     assert model.agreement.baro_hgt["down"].position_rms_difference_m < 0.02

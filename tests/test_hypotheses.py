@@ -244,7 +244,7 @@ def test_outlier_burst_is_not_reported_as_position_jump() -> None:
     assert heading == pytest.approx(30.0, abs=15.0)
 
 
-def test_reported_reset_is_tested_at_its_timestamp_with_time_offset() -> None:
+def test_size_of_jump_at_reset_does_not_depend_on_time_offset() -> None:
     comparison = compare(flight("jump=0.5,40s"), RIGHT, axes=("north", "east"))
     sizes_m = []
     for delay_s in (0.0, 0.3):
@@ -349,7 +349,7 @@ def without_variances(flight: Flight) -> Flight:
         ("r-scale=0.25", without_variances),
     ],
 )
-def test_hypothesis_findings_require_imu_or_reported_variance(mistake, change) -> None:
+def test_bias_scale_and_jump_findings_require_imu_or_variance(mistake, change) -> None:
     named = set(found(analysed(change(flight(mistake))), OF_CAUSES))
     assert named <= {"source_outliers"}
 

@@ -113,7 +113,7 @@ def strict(text: str) -> dict:
     return json.loads(text, parse_constant=pytest.fail)
 
 
-def test_info_json_is_written_to_file_and_without_name_to_stdout(
+def test_info_json_is_written_to_named_file_or_stdout(
     sample_log, sample_flight, tmp_path, monkeypatch, capsys
 ):
     text, target = info(sample_log, "--json", "-"), tmp_path / "new" / "info.json"
@@ -161,7 +161,7 @@ def test_info_on_unlogged_source_advises_sdlog_profile(tmp_path, profile, wanted
 @pytest.mark.parametrize(
     ("imu_hz", "said"), [(4.0, "IMU was logged at 4.0 Hz"), (49.5, None), (100.0, None)]
 )
-def test_info_on_slow_imu_states_that_analysis_is_impossible(tmp_path, imu_hz, said):
+def test_info_reports_imu_rate_too_low_for_analysis(tmp_path, imu_hz, said):
     inventory = inventory_of(make_log(imu_hz=imu_hz), tmp_path)
     found = ability(inventory, "acceleration")
     slow = [remedy for remedy in remedies(inventory) if "sensor_combined at full rate" in remedy]

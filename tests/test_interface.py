@@ -137,7 +137,7 @@ def test_table_of_python_api_equals_numbers_of_json_results(analysis) -> None:
             assert row[column] == getattr(summary.truth if truth else summary, column)
 
 
-def test_python_table_has_nan_for_filter_without_innovations(analysis) -> None:
+def test_python_results_table_has_nan_for_missing_innovations(analysis) -> None:
     row = px4fuse.table(analysis).loc[("down", "ekf2")]
     assert row[["count", "nis_mean", "nis_low", "nis_high", "sigma_ratio"]].isna().all()
     assert row["verdict"] == ""

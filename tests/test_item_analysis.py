@@ -40,7 +40,7 @@ FORM = Answers(
 )
 
 
-def test_discrimination_is_correlation_with_other_points() -> None:
+def test_item_analysis_correlates_item_points_with_other_points() -> None:
     for index, item in enumerate(analyse_items(REPORTS)):
         others = POINTS.sum(axis=1) - POINTS[:, index]
         expected = np.corrcoef(POINTS[:, index], others)[0, 1]
@@ -48,7 +48,7 @@ def test_discrimination_is_correlation_with_other_points() -> None:
         assert (item.mean_points, item.max_points) == (POINTS[:, index].mean(), 10.0)
 
 
-def test_item_analysis_of_four_reports_omits_discrimination() -> None:
+def test_item_analysis_of_four_reports_gives_no_correlation() -> None:
     assert [item.discrimination for item in analyse_items(REPORTS[:4])] == [None] * 3
 
 
@@ -66,7 +66,7 @@ def test_item_analysis_lists_answer_form_parts_and_faults() -> None:
     assert (fault.mean_points, fault.max_points) == (0.6, 1.0)
 
 
-def test_item_analysis_excludes_items_that_await_points() -> None:
+def test_item_analysis_excludes_items_not_yet_graded() -> None:
     text = ItemScore("Text", 0.0, 20.0, "", True, True)
     reports = [replace(each, items=(*each.items, text)) for each in REPORTS]
     assert [item.title for item in analyse_items(reports)] == ["A", "B", "C"]

@@ -40,7 +40,7 @@ def peak_bytes(work: Callable[[], object]) -> int:
     return peak
 
 
-def test_memory_of_varying_offset_fit_grows_linearly_with_time():
+def test_memory_of_time_offset_fit_grows_linearly_with_duration():
     short, long = (fit_of(count, varying_offset) for count in (1000, 8000))
     peaks = [peak_bytes(lambda fit=fit: find_offset_variation(fit)) for fit in (short, long)]
     assert peaks[1] < 10.0 * peaks[0]
@@ -60,7 +60,7 @@ def test_time_offset_per_flight_part_equals_numpy_least_squares():
 
 
 @pytest.mark.parametrize("count", [900, 18_000])
-def test_injected_error_period_is_found_at_any_flight_length(count):
+def test_period_of_position_error_is_found_at_any_duration(count):
     def error_m(time_s: np.ndarray, _: np.ndarray) -> np.ndarray:
         phase = 2.0 * np.pi * time_s / 13.0
         return 0.3 * np.stack([np.sin(phase), np.cos(phase)], axis=1)
@@ -71,7 +71,7 @@ def test_injected_error_period_is_found_at_any_flight_length(count):
     assert found.amplitude_m == pytest.approx(0.3 * np.sqrt(2.0), rel=0.02)
 
 
-def test_rows_between_returns_same_rows_as_loc_slice():
+def test_fast_row_selection_equals_pandas_loc_slice():
     time_s = np.sort(np.random.default_rng(1).uniform(0.0, 9.0, 50))
     samples = pd.DataFrame({"value": np.arange(50.0)}, time_index(time_s))
     for start_s, end_s in ((time_s[3], time_s[8]), (-1.0, 4.0), (5.0, 20.0), (20.0, 30.0)):

@@ -313,7 +313,7 @@ def test_loop_drift_option_below_true_drift_is_reported() -> None:
     assert "loop_drift_too_small" in {finding.id for finding in find_loop_findings(found)}
 
 
-def test_loop_without_ground_truth_notes_assumed_landing_point(
+def test_loop_without_ground_truth_reports_assumed_landing(
     sample: LoopSource, sample_loop: Loop
 ) -> None:
     assert find_loop_findings(sample_loop) == ()  # the log contains ground truth
@@ -325,7 +325,9 @@ def test_loop_without_ground_truth_notes_assumed_landing_point(
     assert find_loop_findings(analyse_loop(sample, landed_at=Landing(0.0, 0.0))) == ()
 
 
-def test_loop_states_wrong_orientation_as_compare(sample: LoopSource, monkeypatch: Any) -> None:
+def test_loop_reports_same_orientation_fault_as_compare(
+    sample: LoopSource, monkeypatch: Any
+) -> None:
     track = next(one for one in sample.flight.positions if one.orientation is not None)
     quaternions = track.orientation[Columns.QUATERNION].to_numpy()
     turned = track.orientation.copy()
@@ -342,7 +344,7 @@ def test_loop_states_wrong_orientation_as_compare(sample: LoopSource, monkeypatc
 
 
 @pytest.mark.parametrize("share", [1.0, 0.5])
-def test_loop_of_part_of_flight_is_unavailable(sample: LoopSource, share: float) -> None:
+def test_loop_closure_for_part_of_a_flight_is_unavailable(sample: LoopSource, share: float) -> None:
     take_off_s, landing_s = sample.flight.airborne[0]
     span_s = (take_off_s, take_off_s + share * (landing_s - take_off_s))
     found = analyse_flight_loop(sample.flight, analysed_span_s=span_s)

@@ -388,7 +388,7 @@ def parameter(name: bytes, value: int | float, *, by_bytes: bool):
 
 
 @pytest.mark.parametrize(("autopilot", "by_bytes"), [(12, True), (3, False)])
-def test_integer_parameters_are_bytes_in_px4_floats_in_ardupilot(read, autopilot, by_bytes):
+def test_integer_parameters_are_decoded_for_px4_and_ardupilot(read, autopilot, by_bytes):
     recorder = record_without(Aisle(), "HEARTBEAT")
     add(recorder, 1.0, lambda t: heartbeat(2, autopilot))
     for i, (name, value) in enumerate(
@@ -668,7 +668,7 @@ def test_read_log_of_real_tlog_and_ulog_gives_equal_times(shared_logs, name):
 
 
 @pytest.mark.reallogs
-def test_read_log_of_other_mavlink_systems_succeeds(shared_logs):
+def test_read_log_of_public_mavlink_recordings_succeeds(shared_logs):
     folder = shared_logs / "mavlink"
     flight = read_log(folder / "Ian-McConachie-CU_drone_position_hold_hist_40e21c1c_mav.tlog")
     [track] = flight.positions

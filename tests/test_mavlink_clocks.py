@@ -307,7 +307,7 @@ def test_mavlink_autopilot_without_heartbeat_is_found(read, change, stamped):
         np.testing.assert_allclose(np.diff(flight.imu.index), 1.0 / aisle.imu_hz, atol=1e-5)
 
 
-def test_mavlink_stream_without_times_notes_missing_times(read):
+def test_mavlink_stream_without_times_has_note_on_missing_time(read):
     flight = read(Recorder().hear(0.0, AUTOPILOT, heartbeat()), stamped=False)
     assert flight.log.duration_s == 0.0
     assert any("no message in the stream contains a time" in note for note in flight.log.notes)

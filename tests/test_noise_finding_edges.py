@@ -84,7 +84,7 @@ def trial(
         (0.101, NoiseEstimate(0.033, 0.032, 0.034), ("warning", 3.06)),
     ],
 )  # fmt: skip
-def test_severity_of_noise_setting_depends_on_error_factor(
+def test_wrong_noise_severity_depends_on_ratio_to_estimate(
     chosen: float, estimate: NoiseEstimate, expected: Any
 ) -> None:
     off = noises.find_setting_deviation("sigma_z_m", chosen, estimate)
@@ -118,7 +118,7 @@ SIGMA_A_TO_0_1, BOTH = {"sigma_a_m_s2": 0.1}, {"sigma_a_m_s2": 0.1, "sigma_z_m":
           ("sigma_a_too_large", "note", noises.NO_IMPROVEMENT_ACTION)]),
     ],
 )  # fmt: skip
-def test_action_for_wrong_noise_uses_values_of_best_rerun(trials: Any, expected: Any) -> None:
+def test_noise_setting_of_best_filter_rerun_is_recommended(trials: Any, expected: Any) -> None:
     fitted = tuned(NoiseEstimate(0.5, 0.45, 0.55), NoiseEstimate(0.1, 0.09, 0.11))
     cause, other = noises.detect_wrong_settings(
         analysis(source=MOVING, tuning=fitted, reruns=trials)
@@ -174,7 +174,7 @@ def test_wrong_noise_report_contains_factor_and_estimated_noise() -> None:
         (AS_RECEIVED_ORIGIN, 0.2, {"Action"}),
     ],
 )  # fmt: skip
-def test_tune_advises_no_smaller_noise_of_gnss(
+def test_tune_does_not_advise_smaller_noise_for_gnss(
     origin: Any, sigma_z_m: float, expected: set[str]
 ) -> None:
     fitted = tuned(NoiseEstimate(sigma_z_m, 0.9 * sigma_z_m, 1.1 * sigma_z_m), biases_fitted=False)
@@ -184,7 +184,7 @@ def test_tune_advises_no_smaller_noise_of_gnss(
     assert dict(list_tuning_advice(flight, fitted)).keys() == expected
 
 
-def test_sigma_z_below_5_mm_states_smallest_rerun_value() -> None:
+def test_report_on_sigma_z_below_5_mm_states_limit_of_reruns() -> None:
     bounded = tuned(NoiseEstimate(None, None, 0.0021))
     finding = only(noises.detect_wrong_settings, analysis(source=MOVING, tuning=bounded))
     assert finding.remedy == UNTESTED_SIGMA_Z
@@ -245,7 +245,7 @@ def test_near_zero_q_with_white_innovations_is_not_reported(one: Any, expected: 
     assert severity(noises.detect_process_noise_near_zero, analysis(axes=(one,))) == expected
 
 
-def test_finding_on_near_zero_sigma_a_states_kf_response_time() -> None:
+def test_near_zero_sigma_a_finding_reports_kf_response_time() -> None:
     slower = following(0.01)
     slower.axis.name = "east"
     finding = only(noises.detect_process_noise_near_zero, analysis(axes=(following(0.05), slower)))
@@ -268,7 +268,7 @@ def kf(nis: float, name: str = "north", **parts: Any) -> Any:
     return axis(name, kf=statement(nis, **{"verdict": verdict, **parts}))
 
 
-def test_inconsistency_is_severity_error_at_mean_nis_4_or_more() -> None:
+def test_filter_with_mean_nis_of_4_or_0_25_is_reported_as_error() -> None:
     for nis, expected in (
         (3.99, "warning"), (4.0, "error"), (0.25, "error"), (0.251, "warning"),
     ):  # fmt: skip
@@ -385,7 +385,7 @@ def test_filter_rerun_without_improvement_is_not_recommended() -> None:
         assert only(noises.detect_inconsistent_variances, one).remedy == action
 
 
-def test_inconsistent_filter_without_cause_recommends_a_check() -> None:
+def test_inconsistency_without_known_cause_recommends_a_check() -> None:
     causes = (tried("kf", {"sigma_z_m": 7.0}, explained_fraction=0.4),
               tried("kf", {"sigma_z_m": 2.0}, "east"))  # fmt: skip
     one = analysis(axes=(kf(9.0),), reruns=causes, tuning=tuned())
@@ -468,7 +468,7 @@ def test_overconfident_ekf2_without_replay_gets_noise_advice(
           "GNSS noise is 4 times the noise setting of EKF2: EKF2 rejects 44 % of the positions")),
     ],
 )  # fmt: skip
-def test_title_of_wrong_default_noise_names_the_position_sensor(
+def test_wrong_default_noise_finding_names_position_sensor(
     flown_m: float, kind: str, rejected: float, expected: tuple[str, str, str]
 ) -> None:
     aid = GNSS_POS if kind == "gnss" else EV_POS
@@ -547,7 +547,7 @@ def closing(gap_m: float | None, length_m: float = 50.0, end: Any = NONE, **part
     return loop(closure_error_m=gap_m, path_length_m=length_m, true_end=end, **usual | parts)
 
 
-def test_possible_drift_finding_states_loop_closure_error() -> None:
+def test_finding_that_source_may_drift_states_closure_error() -> None:
     finding = only(hidden_errors.detect, analysis(source=ODOMETRY))
     assert finding.evidence == {"source": "uwb"}
     assert finding.message.endswith("innovations do not show the drift.")
@@ -566,7 +566,7 @@ def test_possible_drift_finding_states_loop_closure_error() -> None:
 
 
 @pytest.mark.parametrize("heading_error_deg", [0.0, 90.0])
-def test_loop_advice_needs_correct_source_orientation(heading_error_deg: float) -> None:
+def test_loop_command_is_advised_only_if_orientation_is_correct(heading_error_deg: float) -> None:
     orientation = OrientationConvention(
         verdict="determined", heading_error_deg=heading_error_deg, tilt_difference_deg=0.1
     )
@@ -592,9 +592,7 @@ END = TrueFinalPose(displacement_m={"forward": 0.0, "right": 0.0, "down": 0.0}, 
         (NONE, None),
     ],
 )  # fmt: skip
-def test_source_drift_title_states_closure_error_if_it_is_known(
-    loop: Any, size: str | None
-) -> None:
+def test_source_drift_finding_states_closure_error_if_known(loop: Any, size: str | None) -> None:
     one = analysis(axes=(hiding(nees=25.0),), source=ODOMETRY, loop=loop)
     finding = only(hidden_errors.detect, one)
     assert (finding.id, finding.severity) == ("source_drift", "error")
@@ -628,7 +626,7 @@ def test_changed_setting_text_contains_old_and_new_value(
     assert cause_text.format_change(one, tried(owner, change)) == expected
 
 
-def test_unconfirmed_noise_that_the_user_set_is_compared_with_default() -> None:
+def test_advice_on_untested_noise_option_is_to_try_the_default() -> None:
     request = SimpleNamespace(sigma_z_m=0.3, sigma_a_m_s2=None)
     one = analysis(request=request, reruns=())
     default_text = "To test the default value, run again without --sigma-z."

@@ -207,7 +207,7 @@ def test_larger_ekf2_acc_noise_reduces_nees_under_vibration() -> None:
     assert np.nanmean(error_m**2) / variances < 1.5**2 < tried.after.nees_mean
 
 
-def test_what_if_with_true_gnss_delay_gives_rmse_without_fault() -> None:
+def test_what_if_with_true_gnss_delay_equals_faultless_flight() -> None:
     wrong, right = (flown(*texts).ekf2_model for texts in (("ekf2-delay=0",), ()))
     result, other = what_if(wrong, [{"EKF2_GPS_DELAY": 110.0}]), what_if(right, [])
     (predicted,), true = result.whatif, other.logged

@@ -24,7 +24,7 @@ def found(flight: Flight) -> Finding:
     return finding
 
 
-def test_parameter_that_disables_fusion_causes_fusion_finding() -> None:
+def test_parameter_change_is_reported_as_cause_of_lost_fusion() -> None:
     flight = aisle_flight(ekf2=Estimator(fusing=((0.0, 1.0), (60.0, 0.0))))
     first, *others = find(unexplained(compare(with_change(flight, "EKF2_EV_CTRL", 1.0, 0.0))))
     assert (first.id, first.severity) == ("parameter_changed", "warning")

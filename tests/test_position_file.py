@@ -393,7 +393,7 @@ def test_read_position_file_drops_backward_timestamps(read, shifts_us, dropped):
 
 
 @pytest.mark.parametrize("name", ["tag_id", "tagid", "node"])
-def test_read_position_file_with_two_tags_requires_body(read, name):
+def test_read_position_file_with_two_tags_requires_body_option(read, name):
     text = table({name: ["A1", "B2"] * (ROWS // 2), **PLAIN})
     assert "is selected: A1, B2. Choose a" in error_message(read, text)
     assert_track(read(text, body="B2"), rows=slice(1, None, 2))
@@ -505,7 +505,7 @@ def check_any(read, content: bytes) -> None:
     "line",
     [line * 9_000 for line in (b'"', b" ", b"1 ", b"1,", b"(", b"x,", b"a1B", b"_", b"1", b"[ ")],
 )
-def test_position_file_of_repeated_characters_meets_time_limit(read, line):
+def test_position_file_parse_time_is_limited_for_long_lines(read, line):
     text = table(PLAIN).encode()
     line += b"1\n"
     for content in (line + text, text + line, line * 30 + text, line * 300):

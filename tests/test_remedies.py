@@ -199,7 +199,7 @@ def test_recommended_ekf2_noise_and_delay_equal_estimates(sample: Analysis) -> N
     assert estimate_ekf2_parameters(other, model, sample.tuning, sample.time_offset) == {}
 
 
-def test_ekf2_noise_advice_with_logged_variance_sets_noise_mode(sample: Analysis) -> None:
+def test_noise_below_reported_sigma_sets_ekf2_ev_noise_md(sample: Analysis) -> None:
     model = sample.ekf2_model
     assert find_used_noise_m(model.inputs) == pytest.approx(0.1)
     flown = model.inputs.aid, model.inputs.settings, find_used_noise_m(model.inputs)
@@ -233,7 +233,7 @@ def test_ekf2_delay_with_worse_replay_is_not_recommended(sample: Analysis) -> No
     assert finding.remedy == "Correct the position timestamps before sending."
 
 
-def test_advice_states_height_noise_if_it_differs_from_setting(sample: Analysis) -> None:
+def test_height_noise_is_advised_if_it_differs_from_setting(sample: Analysis) -> None:
     """The sample fuses the horizontal position only."""
     down = sample.tuning["down"]
     assert isinstance(down, AxisTuning)
@@ -248,7 +248,7 @@ def test_advice_states_height_noise_if_it_differs_from_setting(sample: Analysis)
     assert remedies.make_height_noise_advice(fused, tuning, 0.4) == ""
 
 
-def test_ekf2_delay_keeps_clock_offset_inside_interval(sample: Analysis) -> None:
+def test_clock_offset_option_inside_interval_sets_ekf2_delay(sample: Analysis) -> None:
     clock = offset(sample, -0.145).time_offset  # the interval is ± 0.01 s
     for applied_s, expected_ms in ((0.0, 145.0), (-0.15, 150.0), (-0.2, 145.0)):
         clock = replace(clock, applied_s=applied_s)
@@ -256,7 +256,7 @@ def test_ekf2_delay_keeps_clock_offset_inside_interval(sample: Analysis) -> None
         assert delay_ms == pytest.approx(expected_ms)
 
 
-def test_gnss_delay_after_clock_offset_is_fault_of_ekf2(sample: Analysis) -> None:
+def test_clock_offset_option_does_not_hide_wrong_gnss_delay(sample: Analysis) -> None:
     """--clock-offset corrects KF only."""
     log = replace(sample.flight.log, parameters={"EKF2_GPS_DELAY": 0.0})
     source = replace(sample.source, origin=GNSS_ORIGIN)
@@ -271,7 +271,7 @@ def test_gnss_delay_after_clock_offset_is_fault_of_ekf2(sample: Analysis) -> Non
     assert not list(source_clock.detect_wrong_delay(analysis, analysis.time_offset))
 
 
-def test_sender_without_timesync_answers_it_before_shifting() -> None:
+def test_time_offset_action_first_advises_answering_timesync() -> None:
     """PX4 ignores the timestamps of a sender that does not answer TIMESYNC."""
     for method, expected in ("arrival time", "Answer TIMESYNC"), ("TIMESYNC", "Subtract 0.400 s"):
         source: Any = SimpleNamespace(clock_map=SimpleNamespace(method=method))

@@ -75,7 +75,7 @@ def test_drawn_tick_labels_are_those_of_matplotlib(plot: Callable[[Axes], None])
         assert drawn.get_ylim() == expected.get_ylim()
 
 
-def test_frame_of_plot_is_position_of_axes() -> None:
+def test_frame_of_report_plot_equals_matplotlib_axes_rectangle() -> None:
     with apply_report_style():
         axes, block = render(plot_metres)
     width, height = 72.0 * axes.figure.get_size_inches()

@@ -167,7 +167,7 @@ def test_read_results_ignores_fields_of_newer_minor_version():
     ("provenance", "said"),
     [({"px4fuse": "0.2.0\n"}, "px4fuse 0.2.0."), (7, "the version that wrote the results.")],
 )
-def test_read_results_of_schema_3_names_px4fuse_version_to_use(provenance, said):
+def test_error_on_schema_3_results_names_version_that_reads_them(provenance, said):
     with pytest.raises(ResultsError, match=r"schema version 3\.0; .* reads version 4\.") as raised:
         decode_results(changed_results(schema__version="3.0", provenance=provenance))
     assert str(raised.value).endswith(f"Create the report again, or read it with {said}")

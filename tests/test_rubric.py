@@ -23,7 +23,7 @@ def test_default_rubric_contains_each_check_and_its_parameters():
 
 
 @pytest.mark.parametrize("kind", ["compare", "loop"])
-def test_default_rubric_has_60_points_and_120_more_with_key(kind):
+def test_default_rubric_has_60_points_or_180_with_answer_key(kind):
     items = [one for one in read_rubric(None).items if {one.report, one.command} <= {"any", kind}]
     assert {one.points for one in items if one.needs_answer_key} == {100.0, 20.0}
     assert [one.is_scored_by_instructor for one in items if one.needs_answer_key] == [False, True]

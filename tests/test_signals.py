@@ -375,7 +375,7 @@ def test_ekf2_resets_outside_evaluated_segment_are_not_removed(reset_s, said):
     assert bool(said) == bool(statement)
 
 
-def test_label_of_aisle_axis_is_main_axis_for_wide_track() -> None:
+def test_axis_aisle_is_called_main_axis_in_messages() -> None:
     flight = aisle_flight()
     labels = {axis.name: axis.label for axis in make_axes(flight, flight.positions[0], ALL)}
     assert (labels["north"], labels["aisle"]) == ("north", "the main axis")

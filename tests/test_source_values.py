@@ -68,7 +68,7 @@ def test_invalid_positions_are_found_with_their_reason():
     assert invalid(samples) == {"NaN": [5, 6], "held": [*range(30, 45)], "zero": [10, 20]}
 
 
-def test_randomly_repeated_positions_give_no_lost_tracking():
+def test_randomly_repeated_positions_are_not_lost_tracking():
     """One run of more than ten is expected in 700 positions with 60 % repetitions."""
     random = np.random.default_rng(3)
     rows = np.maximum.accumulate(np.where(random.random(700) < 0.6, 0, np.arange(700)))
@@ -143,7 +143,7 @@ def test_read_log_detects_unit_and_clock_of_timestamps(tmp_path, stamp, clock):
     ("another clock", "Synchronise the clocks"),
     ("milliseconds", "Set timestamp_sample to the time of measurement"),
 ])  # fmt: skip
-def test_timestamps_of_wrong_clock_have_action_for_their_cause(clock, action):
+def test_action_for_wrong_timestamps_depends_on_clock_or_unit(clock, action):
     (finding,) = source_stamps.detect_timestamp_unit(
         compare(simulate_flight(Scenario(passes=1))), clock
     )
@@ -276,7 +276,7 @@ def test_two_position_senders_report_contains_their_distance(lost):
 
 
 @pytest.mark.parametrize("is_fused", [0.0, 1.0])
-def test_finding_on_copied_ekf2_positions_states_copy_delay(is_fused):
+def test_finding_on_copied_ekf2_positions_contains_copy_delay(is_fused):
     flight = aisle_flight(ekf2=Estimator(fusing=((0.0, is_fused),)))
     first, *_ = detected(copied(flight))
     assert first.evidence["delay_s"] == pytest.approx(0.03, abs=0.01)
@@ -315,7 +315,7 @@ def test_unfused_vision_report_shows_quality_below_ekf2_ev_qmin(quality, words):
     assert words in one.remedy
 
 
-def test_two_senders_remove_or_explain_other_findings():
+def test_two_senders_finding_removes_or_explains_others():
     analysis = unexplained(compare(aisle_flight()))
     findings = [
         finding("error", name, "m.", "r.")
@@ -326,7 +326,7 @@ def test_two_senders_remove_or_explain_other_findings():
     assert left[1].caused_by == "source_two_senders"
 
 
-def test_noise_along_one_axis_is_not_reported_as_two_senders():
+def test_noise_on_one_axis_gives_no_two_senders_finding():
     flight = aisle_flight(uwb=Uwb(rate_hz=30.0, sigma_m=0.01))
     samples = flight.positions[0].samples.copy()
     samples["north_m"] += np.random.default_rng(9).normal(0.0, 0.4, len(samples))
@@ -369,7 +369,9 @@ def test_estimated_lever_arm_equals_simulated_one():
 
 
 @pytest.mark.parametrize(("rotation_deg", "has_truth"), [(10.0, True), (30.0, False)])
-def test_rotation_is_named_before_lever_arm(rotation_deg: float, has_truth: bool) -> None:
+def test_lever_arm_finding_advises_to_rotate_positions_first(
+    rotation_deg: float, has_truth: bool
+) -> None:
     analysis = mounted((0.3, 0.0), rotation_deg, AISLE)
     if not has_truth:
         analysis = without_truth(analysis, 0.0)
@@ -399,7 +401,7 @@ def test_lever_arm_estimate_from_imu_includes_imu_position() -> None:
     assert "the IMU position is wrong: set EKF2_IMU_POS_X to " in one.remedy
 
 
-def test_wrong_imu_position_is_named_if_replay_confirms_it(monkeypatch) -> None:
+def test_wrong_imu_position_is_reported_if_replay_confirms_it(monkeypatch) -> None:
     """EKF2's replay with a wrong EKF2_IMU_POS; ground truth contains no error of the source."""
     scenario = Scenario(seed=3, passes=3, yaw="follow")
     flight = simulate_flight(scenario, parse_faults(()))

@@ -273,7 +273,7 @@ def test_report_is_not_replaced_by_report_on_log_of_same_name(desk, sample_log) 
 
 
 @pytest.mark.usefixtures("no_drawing")
-def test_report_is_replaced_by_report_with_answers(desk) -> None:
+def test_compare_with_answer_form_replaces_earlier_report(desk) -> None:
     run_checked("compare", "l.ulg")
     run_checked("answers", "l.ulg")
     run_checked("compare", "l.ulg", "--answers", "l.answers.toml")

@@ -124,9 +124,7 @@ def test_read_trajectory_detects_ground_truth_by_file_name(name: str, tmp_path: 
 @pytest.mark.parametrize(("axes", "tilt_deg", "frame"), [
     ("xzy", 15.0, "camera"), ("xzy", 30.0, "unknown"), ("xyz", 0.0, "unknown"),
 ])  # fmt: skip
-def test_read_trajectory_detects_camera_frame_by_level_motion(
-    axes, tilt_deg, frame, tmp_path
-) -> None:
+def test_camera_frame_is_detected_from_horizontal_motion(axes, tilt_deg, frame, tmp_path) -> None:
     angle = np.linspace(0.0, 6.0, 200)
     level = np.column_stack((9 * np.sin(angle), 6 - 6 * np.cos(angle), 0.1 * np.sin(7 * angle)))
     position = level[:, ["xyz".index(axis) for axis in axes]]

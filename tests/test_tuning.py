@@ -62,7 +62,7 @@ def test_tune_finds_no_outliers_in_clean_data() -> None:
     assert sum(len(found.outlier_time_s) for found in many()) <= 0.001 * SEEDS * COUNT
 
 
-def test_noise_fit_started_from_first_part_equals_single_fit(
+def test_noise_fit_result_does_not_depend_on_start_values(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     """The fit that starts at the first measurements has the same result, also with outliers."""
@@ -82,7 +82,7 @@ def test_noise_fit_started_from_first_part_equals_single_fit(
     assert set(axis.measurement_time_s[outliers]) <= set(found.outlier_time_s)
 
 
-def test_tune_finds_outliers_among_positions_it_does_not_fit() -> None:
+def test_tune_finds_outliers_among_positions_not_used_in_fit() -> None:
     """Only every fourth position is used for the noises at 100 Hz."""
     axis = modelled(4, 2000)
     fast = replace(axis, measurement_time_s=0.01 * np.arange(2001.0))
@@ -270,5 +270,7 @@ def test_tune_estimates_random_walk_of_drifting_source() -> None:
         (NoiseEstimate(0.1, 0.05, None), "0.1 (0.05-?)"),
     ],
 )
-def test_tuned_noise_text_has_interval_or_bound(noise: NoiseEstimate, expected: str) -> None:
+def test_noise_estimate_is_printed_with_interval_or_bound(
+    noise: NoiseEstimate, expected: str
+) -> None:
     assert format_noise_estimate(noise) == expected

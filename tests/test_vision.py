@@ -382,7 +382,7 @@ def off_by(received: ReceivedPositions, north_m: float) -> ReceivedPositions:
     return replace(received, position_m=received.position_m + far)
 
 
-def test_position_resets_to_vision_if_gnss_and_vision_rejected() -> None:
+def test_ekf2_resets_to_vision_if_gnss_and_vision_are_rejected() -> None:
     inputs = flying(off_by(sent(sigma_m=0.05), 20.0), seconds=20.0)
     done = ran(replace(inputs, received_positions=off_by(inputs.received_positions, 40.0)))
     found = update_records(done)
@@ -500,7 +500,7 @@ def test_ekf2_model_of_gnss_and_vision_agrees_with_log() -> None:
     assert model().inputs.settings["EKF2_EVP_NOISE"] == pytest.approx(0.1)
 
 
-def test_replay_with_changed_vision_noise_equals_such_a_flight() -> None:
+def test_what_if_with_vision_noise_equals_flight_with_this_noise() -> None:
     other = opened(flown(EKF2_EVP_NOISE=1.0))
     for one, value, then in ((model(), 1.0, other), (other, 0.1, model())):
         found, true = what_if(one, [{"EKF2_EVP_NOISE": value}]), what_if(then, [])
@@ -589,7 +589,7 @@ def test_ekf2_model_with_incomplete_vision_is_unavailable() -> None:
     assert "position increments of external vision" in refused.reason
 
 
-def test_difference_steps_of_gnss_flight_include_vision_step() -> None:
+def test_kf_ekf2_difference_is_partly_explained_by_vision() -> None:
     found = steps.explain_difference_by_replacements(model())
     for why in found.values():
         names = [step.name for step in why.steps]

@@ -89,7 +89,7 @@ def test_what_if_with_unknown_aiding_source_raises_error(estimated: WhatIfAnalys
             what_if(model, [], without)
 
 
-def test_what_if_without_set_changes_no_correct_parameter(estimated: WhatIfAnalysis) -> None:
+def test_what_if_without_set_option_keeps_correct_parameters(estimated: WhatIfAnalysis) -> None:
     """The UWB noise is 0.10 m, as EKF2 assumes, and its timestamps are right."""
     assert estimated.uses_estimates
     assert not estimated.changes
@@ -121,7 +121,7 @@ def test_whatif_sweep_also_applies_parameters_of_set_option(swept: WhatIfAnalysi
     assert f"smallest at EKF2_EVP_NOISE {least.changed['EKF2_EVP_NOISE']:.3g}" in error
 
 
-def test_whatif_on_log_without_ekf2_states_raises_missing_data(sample_log: Path) -> None:
+def test_whatif_on_log_without_ekf2_states_raises_error(sample_log: Path) -> None:
     with pytest.raises(MissingDataError, match="EKF2 replay: estimator_states is not logged"):
         run_what_if(WhatIfRequest(log=str(sample_log.with_suffix(".tlog"))))
 
@@ -174,7 +174,7 @@ class TestFlownFlights:
             ("real/vladimireganov_ROS_PX4_MOCAP_square2", "EKF2 may have fused more samples"),
         ],
     )  # fmt: skip
-    def test_what_if_raises_if_replay_differs_from_logged_ekf2(
+    def test_what_if_on_log_unsuitable_for_replay_raises_error(
         self, shared_logs: Path, log: str, said: str
     ) -> None:
         with pytest.raises(MissingDataError, match=said):

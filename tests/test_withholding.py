@@ -79,7 +79,7 @@ def test_parameter_estimate_for_student_assignment_is_refused(
     assert DIAGNOSIS_WITHHELD.reason in error_line(*command.format(log=assigned.log).split())
 
 
-def test_loop_withholds_closure_and_findings_for_assignment(
+def test_loop_command_on_student_assignment_hides_diagnosis(
     assigned: Assigned, tmp_path: Path
 ) -> None:
     run_checked("loop", assigned.log, "--json", tmp_path / "loop.json")
