@@ -104,7 +104,7 @@ class Match:
 def find_match(flight: Flight, problem: AlignmentProblem) -> Match | None:
     """Match a position file with EKF2's position or, if this fails, with the IMU.
 
-    Return None if both fail, but the user gave all alignment parameters.
+    Return None if the match with EKF2 fails, but the user gave all alignment parameters.
 
     Raises
     ------

@@ -194,7 +194,7 @@ def _detect_invalid_position(analysis: Comparison, ekf2: Ekf2) -> Findings:
             f" The invalid position is up to {format_metres(distance_m)} m from the {reference}."
         )
     yield finding(
-        "error" if invalid_fraction > FUSED_FRACTION_FOR_ERROR else "warning",
+        "error" if invalid_fraction > 1.0 - FUSED_FRACTION_FOR_ERROR else "warning",
         "ekf2_position_invalid",
         f"EKF2's horizontal position is invalid {format_percent(invalid_fraction)} of the time "
         f"(xy_valid 0), and PX4 does not use this position.{distance_sentence}",
