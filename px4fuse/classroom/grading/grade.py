@@ -2,7 +2,7 @@
 
 import hashlib
 from collections.abc import Callable, Mapping, Sequence
-from contextlib import closing
+from contextlib import closing, suppress
 from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
@@ -243,12 +243,20 @@ def load_or_verify(
         The file is not a report.
     """
     sha256 = hashlib.sha256(pdf).hexdigest()
-    if loaded := _load_record(records_folder, sha256, path_by_sha256, assigned_hashes):
-        return *loaded, True
-    results = read_report(pdf, "The file")
-    versions_and_files = _collect_versions_and_files(
-        to_json(results), path_by_sha256, assigned_hashes
+    collect_versions_and_files = partial(
+        _collect_versions_and_files, path_by_sha256, assigned_hashes
     )
+    # the report is verified again if the earlier result is unreadable or has other inputs
+    with suppress(OSError, msgspec.MsgspecError, ResultsError):
+        content = (records_folder / f"{sha256}.json").read_bytes()
+        record = msgspec.json.decode(content, type=VerificationRecord)
+        loaded_results = read_results(record.results.encode())
+        if record.versions_and_files == collect_versions_and_files(record.results) and isinstance(
+            loaded_results, ReportedResults
+        ):
+            return loaded_results, record.verification, True
+    results = read_report(pdf, "The file")
+    versions_and_files = collect_versions_and_files(to_json(results))
     # without logs, the status is "cannot verify" instead of "other log"
     is_log_missing = versions_and_files.get(log_sha256(results)) == "assigned"
     verification = verify(results, pdf, {} if is_log_missing else path_by_sha256)
@@ -287,7 +295,7 @@ def repeat_analysis_with_diagnosis(
 
 
 def _collect_versions_and_files(
-    results: str, path_by_sha256: Mapping[str, Path], assigned_hashes: frozenset[str]
+    path_by_sha256: Mapping[str, Path], assigned_hashes: frozenset[str], results: str
 ) -> dict[str, str]:
     """Return the versions of libraries, and the availability of input files by SHA-256."""
     versions = provenance("")
@@ -298,25 +306,3 @@ def _collect_versions_and_files(
         else:
             versions_and_files[sha256] = "assigned" if sha256 in assigned_hashes else "missing"
     return versions_and_files
-
-
-def _load_record(
-    records_folder: Path,
-    sha256: str,
-    path_by_sha256: Mapping[str, Path],
-    assigned_hashes: frozenset[str],
-) -> tuple[ReportedResults, Verification] | None:
-    """Load the result of an earlier verification; None without a valid result."""
-    try:
-        record = msgspec.json.decode(
-            (records_folder / f"{sha256}.json").read_bytes(), type=VerificationRecord
-        )
-        if record.versions_and_files != _collect_versions_and_files(
-            record.results, path_by_sha256, assigned_hashes
-        ):
-            return None
-        results = read_results(record.results.encode())
-    # the report is verified again if the earlier result is unreadable
-    except (OSError, msgspec.MsgspecError, ResultsError):
-        return None
-    return (results, record.verification) if isinstance(results, ReportedResults) else None
