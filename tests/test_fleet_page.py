@@ -45,7 +45,7 @@ def test_batch_page_lists_missing_results_of_each_log() -> None:
     assert inside["Missing results"][2] == ["EKF2, down: no heights"]
     assert inside["Actions"][2] == ["Set it."]
     count = table.loc[table["axis"] == "down", "log"].nunique()
-    assert f'<option value="remedy:Set it.">Set it. ({count})' in text
+    assert f'<option value="Action:Set it.">Set it. ({count})' in text
 
 
 def test_batch_page_sorts_logs_by_severity_and_rmse() -> None:
@@ -166,7 +166,7 @@ def test_batch_page_sorts_filters_and_opens_rows(page: Browser) -> None:
     mark = "document.querySelector('td.k-ratio.truth svg path').getAttribute('d')"
     assert page.ask(mark) == MARKER_SVG_PATHS["above"]
     assert "flight%20" in page.ask("document.querySelector('.more a').href")
-    page.choose("#filter-1", "status:failed")
+    page.choose("#filter-1", "Status:failed")
     assert page.ask(COUNT) == "Showing 24 of 240"
     page.click("#all")
     page.click("#text")
@@ -178,14 +178,14 @@ def test_batch_page_sorts_filters_and_opens_rows(page: Browser) -> None:
 
 def test_batch_page_applies_two_filters_together(page: Browser) -> None:
     table = artificial_logs(240).drop_duplicates("log")
-    page.choose("#filter-4", "finding:ekf2_rejects_positions")
+    page.choose("#filter-4", "Finding:EKF2 rejects positions (innovation gate)")
     rejecting = table["findings"].fillna("").str.contains("ekf2_rejects_positions")
     assert page.ask(COUNT) == f"Showing {rejecting.sum()} of 240"
-    page.choose("#filter-2", f"vehicle:{VEHICLES[1]}")
+    page.choose("#filter-2", f"Vehicle:{VEHICLES[1]}")
     both = rejecting & (table["vehicle"] == VEHICLES[1])
     assert page.ask(COUNT) == f"Showing {both.sum()} of 240"
     page.click("#all")
-    page.choose("#filter-5", f"remedy:{NOT_LOGGED[1]}")
+    page.choose("#filter-5", f"Action:{NOT_LOGGED[1]}")
     assert page.ask(COUNT) == f"Showing {(table['remedy'] == NOT_LOGGED[1]).sum()} of 240"
     assert page.complaints() == []
 

@@ -1,7 +1,7 @@
 """Differences in settings, numbers and findings between two results (``px4fuse diff``).
 
 ``measures.csv`` lists the compared numbers: path in the results, label and unit. ``*`` in a path is
-any key.
+any key, and ``KF_OR_EKF2`` the results of one filter along each axis.
 """
 
 import math
@@ -49,7 +49,7 @@ Results = ComparisonResults | AidsResults
 COMPARED_NUMBER_DEFINITIONS = [
     row
     | {
-        "path": row["path"].replace("KF_OR_EKF2", name),
+        "path": row["path"].replace("KF_OR_EKF2", f"axes.*.filters.{name}"),
         "label": row["label"].replace("KF_OR_EKF2", label),
     }
     for row in read_csv(__file__, dict[str, str], "measures.csv")

@@ -94,12 +94,7 @@ def _compare_log(job: Job, path: Path, sha256: str) -> LogOutcome:
         analysis = diagnose_or_check_aids(request, flight=flight)
         if isinstance(analysis, AidingSourceAnalysis):
             row |= collect_finding_values(analysis.findings, analysis.aids)
-            missing_data = MissingDataError(
-                analysis.missing_data.reason, analysis.missing_data.remedy
-            )
-            return LogOutcome(
-                sha256, (row | make_failure_row(missing_data, STATUS_NOT_COMPARED, path.name),)
-            )
+            raise MissingDataError(analysis.missing_data.reason, analysis.missing_data.remedy)
         comparison_results = make_comparison_results(request, analysis)
         results_json, report_pdf = to_json(comparison_results), b""
         if job.writes_report:

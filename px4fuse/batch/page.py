@@ -3,6 +3,7 @@
 import math
 from collections import Counter, defaultdict
 from collections.abc import Iterable, Mapping, Sequence
+from itertools import zip_longest
 from typing import Any
 
 import pandas as pd
@@ -51,15 +52,8 @@ LOG_COLUMNS = (
 )
 # Group of columns that the page hides until the user clicks on "more columns"
 OPTIONAL_COLUMN_GROUP = "numbers"
-# Labels of the drop-down lists, by the first part of a tag such as "status:done"
-DROP_DOWN_LABEL_BY_TAG_PREFIX = {
-    "severity": "Diagnosis",
-    "status": "Status",
-    "vehicle": "Vehicle",
-    "firmware": "Firmware",
-    "finding": "Finding",
-    "remedy": "Action",
-}
+# Labels of the drop-down lists that select logs; a tag is label and value, such as "Status:done"
+DROP_DOWN_LABELS = ("Diagnosis", "Status", "Vehicle", "Firmware", "Finding", "Action")
 # Order of preference: the page shows the numbers of the first of these axes that a log has
 AXES_BY_PREFERENCE = ("aisle", "north", "east", "down")
 
@@ -130,7 +124,8 @@ def _make_log_cells(log: LogSummary) -> tuple[Cell, ...]:
         Cell(log["headline"], second_line=action, style_class=css_class),
         *(
             _make_ratio_cell(log.get(f"{name}_ratio"), name, verdict)
-            for name, verdict in zip(SIGMA_RATIO_COLUMNS, log["verdict_texts"], strict=True)
+            # a log without results has no verdicts
+            for name, verdict in zip_longest(SIGMA_RATIO_COLUMNS, log["verdicts"], fillvalue="")
         ),
         frame.make_number_cell(log.get("difference_rms_m"), format_metres),
         Cell(log.get("date", "")[:10]),
@@ -138,10 +133,9 @@ def _make_log_cells(log: LogSummary) -> tuple[Cell, ...]:
         Cell(log.get("firmware", "")),
         frame.make_number_cell(log.get("sigma_z_m"), format_number),
         frame.make_number_cell(log.get("clock_offset_s"), format_number),
-        Cell()
-        if log["status"] == STATUS_FAILED
-        else frame.make_number_cell(
-            float(len(finding_titles)), second_line=join_first_names(finding_titles, 2)
+        frame.make_number_cell(
+            None if log["status"] == STATUS_FAILED else len(finding_titles),
+            second_line=join_first_names(finding_titles, 2),
         ),
     )
 
@@ -214,13 +208,13 @@ def _format_value(value: str | float) -> str:
 
 def _make_drop_down_lists(logs: Sequence[LogSummary]) -> list[tuple[str, list[tuple[str, str]]]]:
     """Return the lists that filter logs: label, and options (tag, text), most frequent first."""
-    counts = Counter(tag_and_label for log in logs for tag_and_label in log["tags"].items())
+    counts = Counter(tag_and_value for log in logs for tag_and_value in log["tags"].items())
     drop_down_lists = []
-    for kind, list_label in DROP_DOWN_LABEL_BY_TAG_PREFIX.items():
+    for list_label in DROP_DOWN_LABELS:
         options = [
-            (tag, f"{clean_text(label, 60)} ({count})")
-            for (tag, label), count in counts.most_common()
-            if tag.startswith(f"{kind}:")
+            (tag, f"{clean_text(value, 60)} ({count})")
+            for (tag, value), count in counts.most_common()
+            if tag.startswith(f"{list_label}:")
         ]
         if options:
             drop_down_lists.append((list_label, [("", "All"), *options]))
@@ -254,31 +248,32 @@ def _summarise_log(rows: Sequence[Mapping[str, Any]]) -> LogSummary:
     is_done = any(row["status"] == STATUS_DONE for row in rows)
     reasons_and_remedies = ((row.get("reason", ""), row.get("remedy", "")) for row in rows)
     status = STATUS_DONE if is_done else rows[0]["status"]
-    status_text = status if status == STATUS_NOT_COMPARED else "refused"
-    remedy = "" if "headline" in summary else summary.get("remedy", "")
-    verdicts = summary.get("verdicts", "").split(FINDING_SEPARATOR)
+    if "headline" not in summary:
+        status_text = status if status == STATUS_NOT_COMPARED else "refused"
+        summary |= {
+            "severity": "refused",
+            "headline": f"{status_text}: {summary.get('reason', '')}",
+            "action": summary.get("remedy", ""),
+        }
     summary |= {
         "status": status,
         "missing_results": tuple(dict.fromkeys(pair for pair in reasons_and_remedies if any(pair))),
         "axes": [row for row in rows if "axis" in row],
         "findings": [id_ for id_ in summary.get("findings", "").split(FINDING_SEPARATOR) if id_],
-        "severity": summary.get("severity", "refused"),
-        "headline": summary.get("headline", f"{status_text}: {summary.get('reason', '')}"),
-        "action": summary.get("action") or remedy,
-        # A log without results has no verdicts
-        "verdict_texts": [*verdicts, *[""] * len(SIGMA_RATIO_COLUMNS)][: len(SIGMA_RATIO_COLUMNS)],
+        "verdicts": summary.get("verdicts", "").split(FINDING_SEPARATOR),
     }
     return summary | {"tags": _make_log_tags(summary)}
 
 
 def _make_log_tags(log: LogSummary) -> dict[str, str]:
-    label_by_tag = {
-        f"severity:{log['severity']}": log["severity"],
-        f"status:{log['status']}": log["status"],
+    values_by_label = {
+        "Diagnosis": [log["severity"]],
+        "Status": [log["status"]],
+        "Vehicle": [log.get("vehicle", "vehicle unknown")],
+        "Firmware": [log.get("firmware", "firmware unknown")],
+        "Finding": map(finding_title, log["findings"]),
+        "Action": [remedy or "no action" for _, remedy in log["missing_results"]],
     }
-    for name in ("vehicle", "firmware"):
-        label_by_tag[f"{name}:{log.get(name, '')}"] = log.get(name, f"{name} unknown")
-    label_by_tag |= {f"finding:{finding}": finding_title(finding) for finding in log["findings"]}
-    return label_by_tag | {
-        f"remedy:{remedy}": remedy or "no action" for _, remedy in log["missing_results"]
+    return {
+        f"{label}:{value}": value for label, values in values_by_label.items() for value in values
     }

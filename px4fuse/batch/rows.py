@@ -26,7 +26,8 @@ _COLUMN_DEFINITIONS = read_csv(__file__, dict[str, str], "columns.csv")
 #: "axis", "tuning" or "agreement" refers to the results of the axis of the table row
 RESULT_PATH_BY_COLUMN = {row["column"]: row["path"] for row in _COLUMN_DEFINITIONS}
 #: Data type of each table column; missing numbers are NA, and missing texts are empty
-COLUMN_TYPES = {row["column"]: row["type"] for row in _COLUMN_DEFINITIONS}
+COLUMN_TYPES = {row["column"]: row["type"] or "str" for row in _COLUMN_DEFINITIONS}
+TEXT_COLUMNS = [name for name, kind in COLUMN_TYPES.items() if kind == "str"]
 
 Row = dict[str, Any]
 
@@ -151,9 +152,9 @@ def collect_log_values(log: Log) -> Row:
 
 
 def make_table(rows: Iterable[Row]) -> pd.DataFrame:
-    text_columns = dict.fromkeys((name for name, kind in COLUMN_TYPES.items() if kind == "str"), "")
+    empty_texts = dict.fromkeys(TEXT_COLUMNS, "")
     return pd.DataFrame(
-        [text_columns | clean_row(row) for row in rows], columns=list(COLUMN_TYPES)
+        [empty_texts | clean_row(row) for row in rows], columns=list(COLUMN_TYPES)
     ).astype(COLUMN_TYPES)
 
 
@@ -168,12 +169,7 @@ def clean_row(row: Row) -> Row:
 
 def format_csv(table: pd.DataFrame) -> bytes:
     """Format the table as CSV; texts that a spreadsheet would run as formulas are escaped."""
-    text_columns = {
-        name: table[name].map(neutralise_formulas)
-        for name, kind in COLUMN_TYPES.items()
-        if kind == "str"
-    }
-    csv_text = table.assign(**text_columns).to_csv(
+    csv_text = table.assign(**table[TEXT_COLUMNS].map(neutralise_formulas)).to_csv(
         index=False, lineterminator="\r\n", float_format="%.10g"
     )
     return ("\ufeff" + csv_text).encode()

@@ -1,20 +1,14 @@
 """Terminal output of ``px4fuse batch`` and ``px4fuse diff``."""
 
-from __future__ import annotations
-
-from typing import TYPE_CHECKING
-
 from px4fuse.batch.changes import MAX_OMITTED_DIFFERENCE, MAX_OMITTED_RELATIVE_DIFFERENCE
 from px4fuse.batch.page import SIGMA_RATIO_COLUMNS, LogSummary, sort_logs, summarise_logs
 from px4fuse.batch.rows import STATUS_FAILED
+from px4fuse.batch.run import BatchResult
 from px4fuse.core.text import format_count, format_number, format_ratio
 from px4fuse.report.card_text import SEVERITY_SIGNS
 from px4fuse.report.page import Cell, Page, styled_text
 from px4fuse.report.style import MUTED_COLOUR, SEVERITY_COLOURS
 from px4fuse.results.contract import ChangeResults, ConfidenceInterval
-
-if TYPE_CHECKING:
-    from px4fuse.batch.run import BatchResult
 
 MAX_LISTED_REASONS = 8
 MAX_LISTED_LOGS = 40
@@ -47,7 +41,7 @@ def format_summary(batch_result: BatchResult) -> Page:
             rows,
             right_aligned_columns=(3, 4, 5, 6),
         )
-        page.write(RATIO_NOTE, colour=MUTED_COLOUR)
+        page.write_small_text(RATIO_NOTE)
     if len(sorted_logs) > MAX_LISTED_LOGS:
         page.write(f"fleet.html lists {len(sorted_logs) - MAX_LISTED_LOGS} more logs.")
     counts = logs["status"].value_counts()
@@ -89,18 +83,20 @@ def format_differences(results: ChangeResults) -> Page:
     rows = []
     for number in results.numbers:
         display_factor, unit = (100.0, "%") if number.unit == "share" else (1.0, number.unit)
-        cells = [
-            cell
-            for value, interval in ((number.a, number.a_interval), (number.b, number.b_interval))
-            for cell in (_format_value(value, display_factor), _format_interval(interval))
-        ]
-        rows.append((number.label, *cells, unit))
+        rows.append(
+            (
+                number.label,
+                _format_value(number.a, display_factor),
+                _format_interval(number.a_interval),
+                _format_value(number.b, display_factor),
+                _format_interval(number.b_interval),
+                unit,
+            )
+        )
     if rows:
         page.add_table(NUMBER_TABLE_TITLES, rows, right_aligned_columns=(1, 2, 3, 4))
     tolerance_text = f"{100.0 * MAX_OMITTED_RELATIVE_DIFFERENCE:g} % or {MAX_OMITTED_DIFFERENCE:g}"
-    page.write(
-        f"Numbers that differ by less than {tolerance_text} are not listed.", colour=MUTED_COLOUR
-    )
+    page.write_small_text(f"Numbers that differ by less than {tolerance_text} are not listed.")
     for finding in results.findings:
         styled_message = styled_text(
             f"{finding.severity}: {finding.message}", SEVERITY_COLOURS[finding.severity]

@@ -8,7 +8,7 @@ from px4fuse.classroom.grading.grade import GradeOutcome
 from px4fuse.core.text import format_count, one_line
 from px4fuse.errors import to_one_line
 from px4fuse.report.page import Page
-from px4fuse.report.style import GOOD_COLOUR, MUTED_COLOUR, SEVERITY_COLOURS
+from px4fuse.report.style import GOOD_COLOUR, SEVERITY_COLOURS
 
 
 def assignment_page(key: AnswerKey, folder: Path, key_file: Path, written_count: int) -> Page:
@@ -71,7 +71,7 @@ def grading_page(outcome: GradeOutcome) -> Page:
     for grade in outcome.grades:
         if (report := grade.counted_report) and grade.total is None:
             name = one_line(grade.display_name, 60)
-            page.write(f"{name}: {report.pending_actions}", colour=MUTED_COLOUR)
+            page.write_small_text(f"{name}: {report.pending_actions}")
     for note in outcome.notes:
-        page.write(note, colour=MUTED_COLOUR)
+        page.write_small_text(note)
     return page

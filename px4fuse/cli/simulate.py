@@ -49,18 +49,16 @@ MAX_SECRET_BYTES = 10_000
 def _add_scenario_options(command: Callable[..., None]) -> Callable[..., None]:
     """Add a command-line option for each numeric field of Scenario."""
     for field, quantity in reversed(collect_field_bounds(Scenario).items()):
-        if not quantity.help_text:
+        if not quantity.help_or_placeholder:
             continue
         default = getattr(_DEFAULT_SCENARIO, field)
         outdoor_default = DEFAULTS_BY_KIND[OUTDOOR_KIND].get(field)
         default_text = f"{default:g}" + (
             f"; outdoors {outdoor_default:g}" if outdoor_default else ""
         )
-        help_text = f"{quantity.help_text}  [default: {default_text}]"
+        help_text = f"{quantity.help_or_placeholder}  [default: {default_text}]"
         option_type = NumberWithUnit(quantity.unit)
-        command = click.option(
-            quantity.option_or_placeholder, field, type=option_type, help=help_text
-        )(command)
+        command = click.option(quantity.option, field, type=option_type, help=help_text)(command)
     return command
 
 

@@ -44,6 +44,7 @@ from px4fuse.ekf2.replay_segments import (
 )
 from px4fuse.flight.ekf2_parameters import (
     BAROMETER,
+    EV_POS,
     GNSS_POS,
     GNSS_VEL,
     MAG,
@@ -70,6 +71,12 @@ from px4fuse.trajectory.rotation import (
     to_rotation_vector,
 )
 
+# PX4 parameter values with which EKF2 fuses positions (GNSS: positions and velocities)
+FUSION_SWITCH_VALUES = {EV_POS.switch: 1, GNSS_POS.switch: 5}
+# SDLOG_PROFILE that logs the topics of external vision
+LOG_PROFILE_WITH_VISION = 129
+# SDLOG_PROFILE that does not log the topics of external vision
+LOG_PROFILE_WITHOUT_VISION = 1
 # Length (µs) of EKF2's prediction step: parameter EKF2_PREDICT_US
 PREDICTION_STEP_US = 10_000
 # Initial σ (gauss) of earth field and magnetometer bias, on each axis
@@ -99,7 +106,7 @@ def _select_fused_aids(scenario: Scenario) -> tuple[Aid, ...]:
 
 
 def make_parameters(scenario: Scenario, faults: FaultSizes) -> dict[str, int | float]:
-    """Return the values of all EKF2 parameters that the model uses, by PX4 name."""
+    """Return the values of all PX4 parameters that the log contains, by PX4 name."""
     aid = scenario.aid
     defaults = fill_with_defaults({}, *_select_fused_aids(scenario))
     delay_ms = defaults[aid.delay] if faults.ekf2_delay_s is None else 1e3 * faults.ekf2_delay_s
@@ -111,18 +118,24 @@ def make_parameters(scenario: Scenario, faults: FaultSizes) -> dict[str, int | f
             MAG.switch: int(bool(faults.heading_deg)),
             BAROMETER.noise: sensors.SIGMA_BAROMETER_M,
         }
-    return (
-        defaults
-        | aid_parameters
-        | {
-            aid.noise: faults.ekf2_noise_m or sensors.compute_reported_sigma_m(scenario, faults),
-            aid.gate: faults.ekf2_gate,
-            aid.delay: delay_ms,
-            # EKF2 discards positions with a larger delay (ms), which the fault clock-jump may cause
-            "EKF2_DELAY_MAX": max(defaults["EKF2_DELAY_MAX"], 100.0 + 1e3 * faults.clock_jump_s),
-            "EKF2_PREDICT_US": PREDICTION_STEP_US,
-        }
-    )
+    has_vision_topic = aid != GNSS_POS and not faults.no_vvo
+    return {
+        **defaults,
+        **aid_parameters,
+        aid.noise: faults.ekf2_noise_m or sensors.compute_reported_sigma_m(scenario, faults),
+        aid.gate: faults.ekf2_gate,
+        aid.delay: delay_ms,
+        # EKF2 discards positions with a larger delay (ms), which the fault clock-jump may cause
+        "EKF2_DELAY_MAX": max(defaults["EKF2_DELAY_MAX"], 100.0 + 1e3 * faults.clock_jump_s),
+        "EKF2_PREDICT_US": PREDICTION_STEP_US,
+        "EKF2_EN": int(scenario.ekf2),
+        **dict.fromkeys(FUSION_SWITCH_VALUES, 0),
+        aid.switch: 0 if faults.ekf2_off else FUSION_SWITCH_VALUES[aid.switch],
+        "EKF2_HGT_REF": 0,
+        "SDLOG_PROFILE": LOG_PROFILE_WITH_VISION
+        if has_vision_topic
+        else LOG_PROFILE_WITHOUT_VISION,
+    }
 
 
 def simulate_ekf2(
@@ -138,8 +151,8 @@ def simulate_ekf2(
 
     ``imu``, ``source`` and ``other_sensors`` contain all samples, also those that are not logged.
     """
-    aid, fused_aids = scenario.aid, _select_fused_aids(scenario)
-    segment, time_us, true_quaternions = _make_segment(scenario, faults, motion, imu)
+    aid = scenario.aid
+    segment = _make_segment(scenario, faults, motion, imu)
     logged_values = {name: float(np.float32(value)) for name, value in log_parameters.items()}
     step_s = float(np.median(segment.step_s))
     if other_sensors:
@@ -171,7 +184,7 @@ def simulate_ekf2(
                 np.concatenate([sensors.EARTH_FIELD_GAUSS, np.zeros(3)]),
                 np.full(6, MAGNETIC_FIELD_SIGMA_GAUSS**2),
             )
-    settings = fill_with_defaults(logged_values, *fused_aids)
+    settings = fill_with_defaults(logged_values, *_select_fused_aids(scenario))
     rules = GNSS_RULES if aid == GNSS_POS else VISION_RULES
     inputs = ReplayInputs(
         settings=settings,
@@ -192,11 +205,10 @@ def simulate_ekf2(
         max_fusion_interval_in_gap_s=MAX_FUSION_INTERVAL_IN_GAP_S,
     )
     model_run = run_configurations(inputs, [FilterConfiguration(settings)])[0]
-    ekf2_output = _compute_output(inputs, model_run, time_us, true_quaternions)
     return make_ekf2_topics(
         inputs,
         model_run,
-        ekf2_output,
+        _compute_output(inputs, model_run),
         scenario.attitude_rate_hz,
         aid_source_log_rate_hz=VEHICLE_AID_SOURCE_LOG_RATE_HZ if faults.no_vvo else 0.0,
     )
@@ -204,8 +216,8 @@ def simulate_ekf2(
 
 def _make_segment(
     scenario: Scenario, faults: FaultSizes, motion: Motion, imu: Topic
-) -> tuple[ReplaySegment, IntArray, Array]:
-    """Return the input of the EKF2 model, and times (µs) and true attitudes of its steps."""
+) -> ReplaySegment:
+    """Return the input of the EKF2 model."""
     time_us = sensors.get_time_us(imu)
     interval_s = np.diff(time_us) * 1e-6
     step_end_indices = find_step_ends(
@@ -216,8 +228,7 @@ def _make_segment(
         imu.fields["accelerometer_m_s2"][1:].astype(float) * interval_s[:, None],
         step_end_indices,
     )
-    step_times_us = time_us[np.concatenate([[0], step_end_indices])]
-    time_s = step_times_us * 1e-6
+    time_s = time_us[np.concatenate([[0], step_end_indices])] * 1e-6
     body_to_ned = motion.compute_body_to_ned(time_s)
     true_quaternions = sensors.to_quaternions(body_to_ned)
     integrated_attitude = cumulative_product(
@@ -239,31 +250,27 @@ def _make_segment(
     )
     variance = np.diagonal(covariance).copy()
     sigma = np.sqrt(variance)
-    return (
-        ReplaySegment(
-            time_s=time_s,
-            step_s=np.diff(time_s),
-            body_to_ned=body_to_ned,
-            attitude_correction_rad=to_rotation_vector(
-                multiply(attitude_difference[1:], conjugate(attitude_difference[:-1]))
-            ),
-            specific_force_m_s2=velocity_increment_m_s / np.diff(time_s)[:, None],
-            accelerometer_bias_m_s2=np.zeros(3),
-            state=state,
-            variance=variance,
-            down_m=motion.compute_true_state(time_s).position_m[:, 2]
-            + sensors.simulate_height_error(scenario, time_s),
-            # Infinite variance of the measured tilt: only positions correct EKF2's tilt
-            attitude_variance_rad2=np.tile(
-                [np.inf, np.inf, INDOOR_HEADING_SIGMA_RAD**2], (len(time_s), 1)
-            ),
-            down_variance_m2=np.full(len(time_s), INDOOR_HEIGHT_SIGMA_M**2),
-            attitude_error_rad=attitude_error_rad,
-            initial_state_correlation=covariance / sigma[:, None] / sigma,
-            starts_while_fusing=False,
+    return ReplaySegment(
+        time_s=time_s,
+        step_s=np.diff(time_s),
+        body_to_ned=body_to_ned,
+        attitude_correction_rad=to_rotation_vector(
+            multiply(attitude_difference[1:], conjugate(attitude_difference[:-1]))
         ),
-        step_times_us,
-        true_quaternions,
+        specific_force_m_s2=velocity_increment_m_s / np.diff(time_s)[:, None],
+        accelerometer_bias_m_s2=np.zeros(3),
+        state=state,
+        variance=variance,
+        down_m=motion.compute_true_state(time_s).position_m[:, 2]
+        + sensors.simulate_height_error(scenario, time_s),
+        # Infinite variance of the measured tilt: only positions correct EKF2's tilt
+        attitude_variance_rad2=np.tile(
+            [np.inf, np.inf, INDOOR_HEADING_SIGMA_RAD**2], (len(time_s), 1)
+        ),
+        down_variance_m2=np.full(len(time_s), INDOOR_HEIGHT_SIGMA_M**2),
+        attitude_error_rad=attitude_error_rad,
+        initial_state_correlation=covariance / sigma[:, None] / sigma,
+        starts_while_fusing=False,
     )
 
 
@@ -323,10 +330,9 @@ def _select_positions(source: sensors.SimulatedPositions) -> ReceivedPositions:
     )
 
 
-def _compute_output(
-    inputs: ReplayInputs, model_run: SegmentRun, time_us: IntArray, true_quaternions: Array
-) -> Ekf2Output:
+def _compute_output(inputs: ReplayInputs, model_run: SegmentRun) -> Ekf2Output:
     segment = model_run.segment
+    true_quaternions = sensors.to_quaternions(segment.body_to_ned)
     lag_steps = round(inputs.horizon_s / inputs.mean_step_s)
     state = compute_delayed_states(model_run, 0)
     reset_steps, reset_sizes_m, has_recent_position_aiding = _hold_position_without_aiding(
@@ -352,7 +358,7 @@ def _compute_output(
         inputs.settings,
     )
     return Ekf2Output(
-        time_us=time_us,
+        time_us=np.rint(segment.time_s * 1e6).astype(np.int64),
         lag_steps=lag_steps,
         attitude_at_fusion_horizon=multiply(
             from_rotation_vector(state[:, THETA]), true_quaternions

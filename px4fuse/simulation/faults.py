@@ -19,7 +19,7 @@ from px4fuse.simulation.scenario import (
 
 
 def _make_start_time_field() -> Any:
-    return make_bounded_field(None, 0.0, 1e4, "s", "AT")
+    return make_bounded_field(None, 0.0, 1e4, "AT")
 
 
 @dataclass(frozen=True)
@@ -30,53 +30,53 @@ class FaultSizes:
     ``ekf2_noise_m`` 0 and ``ekf2_delay_s`` None are the correct noise and delay of EKF2.
     """
 
-    clock_offset_s: float = make_bounded_field(0.0, -5.0, 5.0, "s", "SECONDS")
-    clock_drift_ppm: float = make_bounded_field(0.0, -20_000.0, 20_000.0, "ppm", "PPM")
-    clock_jump_s: float = make_bounded_field(0.0, 0.0, 5.0, "s", "SECONDS")
+    clock_offset_s: float = make_bounded_field(0.0, -5.0, 5.0, "SECONDS")
+    clock_drift_ppm: float = make_bounded_field(0.0, -20_000.0, 20_000.0, "PPM")
+    clock_jump_s: float = make_bounded_field(0.0, 0.0, 5.0, "SECONDS")
     # Fraction of outliers, as without line of sight
-    nlos_percent: float = make_bounded_field(0.0, 0.0, 50.0, "%", "PERCENT")
+    nlos_percent: float = make_bounded_field(0.0, 0.0, 50.0, "PERCENT")
     # Mean error of an outlier
-    nlos_size_m: float = make_bounded_field(2.0, 0.0, 100.0, "m", "SIZE")
+    nlos_size_m: float = make_bounded_field(2.0, 0.0, 100.0, "SIZE")
     # Length of the gap of the position source
-    dropout_s: float = make_bounded_field(0.0, 0.0, 600.0, "s", "SECONDS")
+    dropout_s: float = make_bounded_field(0.0, 0.0, 600.0, "SECONDS")
     dropout_at_s: float | None = _make_start_time_field()
     # Length of the gap of the IMU
-    imu_dropout_s: float = make_bounded_field(0.0, 0.0, 600.0, "s", "SECONDS")
+    imu_dropout_s: float = make_bounded_field(0.0, 0.0, 600.0, "SECONDS")
     imu_dropout_at_s: float | None = _make_start_time_field()
     # Reduced rate of the position source
-    decimate_hz: float = make_bounded_field(0.0, 0.1, 100.0, "Hz", "HZ")
+    decimate_hz: float = make_bounded_field(0.0, 0.1, 100.0, "HZ")
     # Ratio of reported to true position variance
-    r_scale: float = make_bounded_field(1.0, 1e-4, 1e4, "", "FACTOR")
+    r_scale: float = make_bounded_field(1.0, 1e-4, 1e4, "FACTOR")
     # Rotation of the position frame about the vertical
-    yaw_deg: float = make_bounded_field(0.0, -180.0, 180.0, "°", "DEG")
-    scale_percent: float = make_bounded_field(0.0, -50.0, 50.0, "%", "PERCENT")
+    yaw_deg: float = make_bounded_field(0.0, -180.0, 180.0, "DEG")
+    scale_percent: float = make_bounded_field(0.0, -50.0, 50.0, "PERCENT")
     # Lasting jump of the positions
-    jump_m: float = make_bounded_field(0.0, -100.0, 100.0, "m", "METRES")
+    jump_m: float = make_bounded_field(0.0, -100.0, 100.0, "METRES")
     jump_at_s: float | None = _make_start_time_field()
     # Time constant of the low-pass filter of the position source
-    smoothed_s: float = make_bounded_field(0.0, 0.0, 10.0, "s", "SECONDS")
+    smoothed_s: float = make_bounded_field(0.0, 0.0, 10.0, "SECONDS")
     # σ of the time-correlated position error
-    slow_error_m: float = make_bounded_field(0.0, 0.0, 100.0, "m", "METRES")
+    slow_error_m: float = make_bounded_field(0.0, 0.0, 100.0, "METRES")
     # Correlation time of the time-correlated position error
-    slow_error_s: float = make_bounded_field(30.0, 0.1, 1e4, "s", "TIME")
+    slow_error_s: float = make_bounded_field(30.0, 0.1, 1e4, "TIME")
     # Error of EKF2's heading
-    heading_deg: float = make_bounded_field(0.0, -180.0, 180.0, "°", "DEG")
+    heading_deg: float = make_bounded_field(0.0, -180.0, 180.0, "DEG")
     heading_at_s: float | None = _make_start_time_field()
     # Disturbance of the magnetic field
-    mag_gauss: float = make_bounded_field(0.0, -1.0, 1.0, "gauss", "GAUSS")
+    mag_gauss: float = make_bounded_field(0.0, -1.0, 1.0, "GAUSS")
     mag_at_s: float | None = _make_start_time_field()
-    accel_bias_m_s2: float = make_bounded_field(0.0, -5.0, 5.0, "m/s²", "M/S2")
-    vibration_m_s2: float = make_bounded_field(0.0, 0.0, 20.0, "m/s²", "M/S2")
-    imu_rate_hz: float = make_bounded_field(0.0, 1.0, 1000.0, "Hz", "HZ")
+    accel_bias_m_s2: float = make_bounded_field(0.0, -5.0, 5.0, "M/S2")
+    vibration_m_s2: float = make_bounded_field(0.0, 0.0, 20.0, "M/S2")
+    imu_rate_hz: float = make_bounded_field(0.0, 1.0, 1000.0, "HZ")
     # The vehicle only hovers
     no_motion: bool = False
     # Distance from start to end of the path
-    open_end_m: float = make_bounded_field(0.0, 0.0, 100.0, "m", "METRES")
+    open_end_m: float = make_bounded_field(0.0, 0.0, 100.0, "METRES")
     # The topic vehicle_visual_odometry is not logged
     no_vvo: bool = False
-    ekf2_noise_m: float = make_bounded_field(0.0, 0.01, 100.0, "m", "METRES")
-    ekf2_delay_s: float | None = make_bounded_field(None, 0.0, 0.3, "s", "SECONDS")
-    ekf2_gate: float = make_bounded_field(5.0, 1.0, 1000.0, "", "SD")
+    ekf2_noise_m: float = make_bounded_field(0.0, 0.01, 100.0, "METRES")
+    ekf2_delay_s: float | None = make_bounded_field(None, 0.0, 0.3, "SECONDS")
+    ekf2_gate: float = make_bounded_field(5.0, 1.0, 1000.0, "SD")
     # EKF2 does not fuse the positions
     ekf2_off: bool = False
 
@@ -96,8 +96,6 @@ class FaultType:
         Default size of the fault; True for a fault without a size.
     finding : str
         Result that a student is expected to find in the report.
-    changes_ekf2 : bool
-        True if the fault changes EKF2 parameters.
     field_names : tuple of str
         Fields of :class:`FaultSizes` that the fault sets; the size is the first.
     """
@@ -106,7 +104,6 @@ class FaultType:
     help: str
     finding: str
     kinds: tuple[ScenarioKind, ...] = SCENARIO_KINDS
-    changes_ekf2: bool = False
     field_names: tuple[str, ...] = ()
 
     @property
@@ -118,8 +115,7 @@ class FaultType:
     def usage(self) -> str:
         """Syntax of the values after the name of the fault, such as ``=PERCENT[,SIZE]``."""
         placeholders = [
-            BOUNDS_BY_FIELD[field_name].option_or_placeholder
-            for field_name in self.value_field_names
+            BOUNDS_BY_FIELD[field_name].help_or_placeholder for field_name in self.value_field_names
         ]
         return f"={'[,'.join(placeholders)}{']' * len(placeholders[1:])}" if placeholders else ""
 
@@ -176,7 +172,7 @@ def parse_faults(texts: Iterable[str]) -> FaultSizes:
                     f"--mistake {option_text}: {value_text!r} is not a valid value: give "
                     f"{UNIT_NAMES[bounds.unit]}, as in {name}{fault_type.usage}."
                 )
-            bounds.check(size, f"--mistake {option_text}: {bounds.option_or_placeholder}")
+            bounds.check(size, f"--mistake {option_text}: {bounds.help_or_placeholder}")
             value_by_field[field_name] = size
     return FaultSizes(**value_by_field)  # type: ignore[arg-type]
 

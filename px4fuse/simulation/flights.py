@@ -1,7 +1,7 @@
 """Simulated flights as PX4 topics, ULog or Flight, and their answer keys."""
 
 from collections.abc import Mapping
-from dataclasses import asdict, dataclass
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
@@ -9,27 +9,22 @@ import numpy as np
 from px4fuse.core.text import to_json_types
 from px4fuse.ekf2.inputs import SIMULATED_EKF2_NOTE
 from px4fuse.errors import SettingsError
-from px4fuse.flight.ekf2_parameters import EV_POS, GNSS_POS
+from px4fuse.flight.ekf2_parameters import GNSS_POS
 from px4fuse.flight.model import Flight
 from px4fuse.readers.ulog import read_ulog
 from px4fuse.readers.ulog_topics import ASSIGNMENT_FLAG_KEY, NOTE_KEY
 from px4fuse.simulation import ekf2, sensors
-from px4fuse.simulation.ekf2_topics import MAGNETOMETER_LOG_RATE_HZ
 from px4fuse.simulation.faults import FAULT_TYPES, FaultSizes, format_fault, injected_fault_names
 from px4fuse.simulation.motion import Motion, plan_flight
 from px4fuse.simulation.scenario import Scenario
 from px4fuse.simulation.ulog_writer import Topic, encode_ulog
 
 NO_FAULTS = FaultSizes()
-# PX4 parameter values with which EKF2 fuses positions (GNSS: positions and velocities)
-FUSION_SWITCH_VALUES = {EV_POS.switch: 1, GNSS_POS.switch: 5}
-# SDLOG_PROFILE that logs the topics of external vision
-LOG_PROFILE_WITH_VISION = 129
-# SDLOG_PROFILE that does not log the topics of external vision
-LOG_PROFILE_WITHOUT_VISION = 1
 # PX4 v1.16.0, whose topics are simulated, as a version number
 PX4_RELEASE = 1 << 24 | 16 << 16 | 255
 SIMULATION_HARDWARE = "px4fuse simulation"
+# Rate limit (Hz) of vehicle_magnetometer on a vehicle (PX4 v1.16, logged_topics.cpp)
+MAGNETOMETER_LOG_RATE_HZ = 2.0
 ANSWER_SCHEMA = {"name": "px4fuse-answer", "version": 1}
 
 
@@ -56,7 +51,7 @@ def simulate(scenario: Scenario, faults: FaultSizes = NO_FAULTS) -> Simulation:
     for name in injected_fault_names(faults):
         if scenario.kind not in (kinds := FAULT_TYPES[name].kinds):
             raise SettingsError(f"--mistake {name} requires --kind {' or '.join(kinds)}.")
-        if FAULT_TYPES[name].changes_ekf2 and not scenario.ekf2:
+        if name.startswith("ekf2-") and not scenario.ekf2:
             raise SettingsError(
                 f"--mistake {name} changes EKF2, which --no-ekf2 does not simulate. Omit --no-ekf2."
             )
@@ -75,7 +70,7 @@ def simulate(scenario: Scenario, faults: FaultSizes = NO_FAULTS) -> Simulation:
     )
     positions = sensors.simulate_positions(scenario, faults, motion)
     imu = sensors.simulate_imu(scenario, faults, motion)
-    parameters = _make_parameters(scenario, faults)
+    parameters = ekf2.make_parameters(scenario, faults)
     topics = [
         sensors.select_logged_imu(imu, faults, motion),
         sensors.simulate_logged_attitude(scenario, faults, motion),
@@ -133,20 +128,6 @@ def to_flight(simulation: Simulation, name: str = "simulation.ulg") -> Flight:
     return read_ulog(name, to_ulog(simulation))
 
 
-def _make_parameters(scenario: Scenario, faults: FaultSizes) -> dict[str, int | float]:
-    fusion_parameter_value = 0 if faults.ekf2_off else FUSION_SWITCH_VALUES[scenario.aid.switch]
-    return {
-        **ekf2.make_parameters(scenario, faults),
-        "EKF2_EN": int(scenario.ekf2),
-        **dict.fromkeys(FUSION_SWITCH_VALUES, 0),
-        scenario.aid.switch: fusion_parameter_value,
-        "EKF2_HGT_REF": 0,
-        "SDLOG_PROFILE": LOG_PROFILE_WITHOUT_VISION
-        if faults.no_vvo or scenario.aid == GNSS_POS
-        else LOG_PROFILE_WITH_VISION,
-    }
-
-
 def make_answer_key(simulation: Simulation) -> dict[str, Any]:
     """Return injected faults and true values of a flight for the instructor, as JSON types."""
     scenario, faults = simulation.scenario, simulation.faults
@@ -160,7 +141,7 @@ def make_answer_key(simulation: Simulation) -> dict[str, Any]:
     answer_key: dict[str, Any] = to_json_types(
         {
             "schema": ANSWER_SCHEMA,
-            "scenario": asdict(scenario),
+            "scenario": scenario,
             "mistakes": {
                 name: {
                     "typed": format_fault(name, faults),

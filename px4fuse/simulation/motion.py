@@ -203,8 +203,7 @@ def compute_attitude(state: TrueState) -> AttitudeAndImu:
         ],
         axis=1,
     )
-    specific_force_m_s2 = np.zeros_like(z)
-    specific_force_m_s2[:, 2] = -specific_thrust_m_s2[:, 0]
+    specific_force_m_s2 = specific_thrust_m_s2 * np.array([0.0, 0.0, -1.0])
     return AttitudeAndImu(np.stack([x, y, z], axis=2), rate_rad_s, specific_force_m_s2)
 
 

@@ -2,7 +2,7 @@
 
 import math
 from collections.abc import Mapping
-from dataclasses import dataclass, field, fields
+from dataclasses import dataclass, field, fields, replace
 from typing import Any, Literal, get_args
 
 from px4fuse.errors import SettingsError
@@ -17,6 +17,19 @@ DT_S = 0.1
 # Duration (s) of acceleration and braking along the aisle
 SPEED_RAMP_DURATION_S = 1.5
 CORNER_DURATION_S = 2.0
+# Units by the last part of a field name
+UNIT_BY_SUFFIX = {
+    "_m_s2": "m/s²",
+    "_m_s": "m/s",
+    "_m": "m",
+    "_s": "s",
+    "_hz": "Hz",
+    "_deg": "°",
+    "_percent": "%",
+    "_ppm": "ppm",
+    "_gauss": "gauss",
+    "": "",
+}
 # Default values that depend on the kind of flight
 DEFAULTS_BY_KIND: Mapping[ScenarioKind, Mapping[str, float]] = {
     "aisle": {},
@@ -29,14 +42,15 @@ DEFAULTS_BY_KIND: Mapping[ScenarioKind, Mapping[str, float]] = {
 class Bounds:
     """Limits and unit of a number on the command line.
 
-    ``option_or_placeholder`` is the name of an option (--speed), or a placeholder (SECONDS).
+    ``help_or_placeholder`` is the help of an option, or a placeholder (SECONDS) for a value of a
+    fault.
     """
 
     low: float
     high: float
+    help_or_placeholder: str = ""
     unit: str = ""
-    option_or_placeholder: str = ""
-    help_text: str = ""
+    option: str = ""
 
     def check(self, value: float, name: str) -> None:
         """Raise SettingsError if a value is out of range; ``name`` is its name in the message."""
@@ -51,12 +65,18 @@ def make_bounded_field(default: Any, *bounds: Any) -> Any:
 
 
 def collect_field_bounds(dataclass_type: type) -> dict[str, Bounds]:
-    """Return the bounds of dataclass fields that have :class:`Bounds`, by field name."""
-    return {
-        dataclass_field.name: dataclass_field.metadata["bounds"]
-        for dataclass_field in fields(dataclass_type)
-        if dataclass_field.metadata
-    }
+    """Return the bounds of dataclass fields that have :class:`Bounds`, by field name.
+
+    Unit and option result from the field name, for example m/s and --speed from speed_m_s.
+    """
+    bounds_by_field = {}
+    for dataclass_field in fields(dataclass_type):
+        if bounds := dataclass_field.metadata.get("bounds"):
+            name = dataclass_field.name
+            suffix = next(filter(name.endswith, UNIT_BY_SUFFIX))
+            option = f"--{name.removesuffix(suffix).replace('_', '-')}"
+            bounds_by_field[name] = replace(bounds, unit=UNIT_BY_SUFFIX[suffix], option=option)
+    return bounds_by_field
 
 
 @dataclass(frozen=True)
@@ -87,65 +107,38 @@ class Scenario:
     """
 
     kind: ScenarioKind = "aisle"
-    passes: int = make_bounded_field(6, 1, 100, "", "--passes")
+    passes: int = make_bounded_field(6, 1, 100)
     length_m: float = make_bounded_field(
-        12.0,
-        2.0,
-        1000.0,
-        "m",
-        "--length",
-        "Length of the aisle, or of each side of the square.",
+        12.0, 2.0, 1000.0, "Length of the aisle, or of each side of the square."
     )
-    speed_m_s: float = make_bounded_field(
-        1.0, 0.1, 10.0, "m/s", "--speed", "Speed on straight segments."
-    )
+    speed_m_s: float = make_bounded_field(1.0, 0.1, 10.0, "Speed on straight segments.")
     heading_deg: float = make_bounded_field(
-        30.0,
-        -360.0,
-        360.0,
-        "°",
-        "--heading",
-        "Heading of the aisle or of the first side, clockwise from north.",
+        30.0, -360.0, 360.0, "Heading of the aisle or of the first side, clockwise from north."
     )
     altitude_m: float = 1.5
     yaw: YawMode | None = None
     pause_s: float = 3.0
     wander_m: float = 0.03
-    uwb_rate_hz: float = make_bounded_field(5.0, 0.5, 100.0, "Hz", "--uwb-rate", "UWB rate.")
+    uwb_rate_hz: float = make_bounded_field(5.0, 0.5, 100.0, "UWB rate.")
     sigma_uwb_m: float = make_bounded_field(
-        0.10,
-        0.0,
-        10.0,
-        "m",
-        "--sigma-uwb",
-        "White UWB position noise (1 σ): the true measurement noise.",
+        0.10, 0.0, 10.0, "White UWB position noise (1 σ): the true measurement noise."
     )
     vio_rate_hz: float = 30.0
     sigma_vio_m: float = 0.01
     vio_drift: float = make_bounded_field(
-        0.015, 0.0, 0.5, "", "--vio-drift", "VIO drift, as a fraction of the distance flown."
+        0.015, 0.0, 0.5, "VIO drift, as a fraction of the distance flown."
     )
     vio_walk_m: float = 0.01
     gnss_rate_hz: float = 5.0
     sigma_gnss_m: float = make_bounded_field(
-        0.4, 0.0, 10.0, "m", "--sigma-gnss", "White GNSS position noise, north and east (1 σ)."
+        0.4, 0.0, 10.0, "White GNSS position noise, north and east (1 σ)."
     )
     sigma_gnss_m_s: float = 0.3
     sigma_a_m_s2: float = make_bounded_field(
-        0.2,
-        0.0,
-        20.0,
-        "m/s²",
-        "--sigma-a",
-        "True SIGMA_A: white accelerometer noise (1 σ), averaged over 0.1 s.",
+        0.2, 0.0, 20.0, "True SIGMA_A: white accelerometer noise (1 σ), averaged over 0.1 s."
     )
     accel_bias_sigma_m_s2: float = make_bounded_field(
-        0.03,
-        0.0,
-        2.0,
-        "m/s²",
-        "--accel-bias-sigma",
-        "Standard deviation of the random constant accelerometer bias.",
+        0.03, 0.0, 2.0, "Standard deviation of the random constant accelerometer bias."
     )
     gyro_bias_sigma_rad_s: float = 0.002
     gyro_noise_rad_s: float = 0.01
@@ -156,11 +149,11 @@ class Scenario:
     truth_rate_hz: float = 50.0
     truth: bool = True
     ekf2: bool = True
-    seed: int = make_bounded_field(1, 0, 2**128 - 1, "", "--seed")
+    seed: int = make_bounded_field(1, 0, 2**128 - 1)
 
     def __post_init__(self) -> None:
         for name, bounds in collect_field_bounds(Scenario).items():
-            bounds.check(getattr(self, name), bounds.option_or_placeholder)
+            bounds.check(getattr(self, name), bounds.option)
         min_length_m = self.speed_m_s * (
             SPEED_RAMP_DURATION_S if self.kind == "aisle" else CORNER_DURATION_S
         )

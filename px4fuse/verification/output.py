@@ -6,7 +6,7 @@ from pathlib import Path
 
 from px4fuse.core.text import one_line
 from px4fuse.report.page import Page
-from px4fuse.report.style import GOOD_COLOUR, MUTED_COLOUR, SEVERITY_COLOURS
+from px4fuse.report.style import GOOD_COLOUR, SEVERITY_COLOURS
 from px4fuse.verification.model import Verification
 from px4fuse.verification.verification import VERIFICATION_SCOPE_NOTE
 
@@ -49,5 +49,5 @@ def verification_page(name: str, verification: Verification, output: Path | None
         page.write("The output file (-o) was not written: the analysis could not be repeated.")
     elif output is None and verification.pages:
         page.write("Action: write the recomputed report with -o FILE.pdf, and read this report.")
-    page.write(VERIFICATION_SCOPE_NOTE, colour=MUTED_COLOUR)
+    page.write_small_text(VERIFICATION_SCOPE_NOTE)
     return page

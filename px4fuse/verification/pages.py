@@ -57,12 +57,9 @@ SECOND_XREF_TABLE_REASON = (
     "the PDF was changed after px4fuse wrote it (second cross-reference table)"
 )
 # PDF dictionary keys that are not compared, because programs that save a PDF change them
-_COMPRESSION_AND_LENGTH_KEYS = frozenset(("/Length", "/Filter"))
-_WRITER_KEYS = frozenset(("/Producer", "/CreationDate", "/ModDate"))
-_XMP_WRITER_FIELDS = re.compile(
-    r"<(pdf:Producer|xmp:(?:Create|Modify|Metadata)Date|xmpMM:(?:Document|Instance)ID"
-    r"|stEvt:(?:when|instanceID))( [^>]*)?>[^<]*</\1>"
-)
+_COMPRESSION_AND_LENGTH_KEYS = {"/Length", "/Filter"}
+_WRITER_KEYS = {"/Producer", "/CreationDate", "/ModDate"}
+_XMP_WRITER_FIELDS = re.compile(r"<(\w+:(?:Producer|\w+Date|\w+ID|when))( [^>]*)?>[^<]*</\1>")
 MAX_XMP_BYTES = 100_000
 # Typst version in the PDF; not compared, because different versions produce equal pages
 _TYPST_VERSION_PATTERN = re.compile(r"Typst \d+(\.\d+)*")
@@ -80,7 +77,7 @@ _ESCAPED_CHARACTERS = dict.fromkeys(("\n", "\r", "\r\n"), "") | dict(
 )
 # PDF drawing operators with coordinates: index of the first operand that is a coordinate
 _FIRST_COORDINATE_INDEX = {"m": 0, "l": 0, "c": 0, "v": 0, "y": 0, "re": 0, "cm": 4, "Tm": 4}
-_TEXT_OPERATORS = frozenset(("Tj", "TJ"))
+_TEXT_OPERATORS = {"Tj", "TJ"}
 # Entry of a font's ToUnicode map: glyph number and UTF-16 text, in hexadecimal digits
 _TO_UNICODE_ENTRY_PATTERN = re.compile(r"<([0-9A-Fa-f]{4})> <((?:[0-9A-Fa-f]{4})+)>\n")
 

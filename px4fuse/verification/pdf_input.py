@@ -68,7 +68,7 @@ PYPDF_LIMITS: dict[str, Any] = {
 }
 
 # Allowed compression methods (filters) of a PDF; _check_file limits their decompressed size
-_ALLOWED_FILTERS = frozenset(("/FlateDecode", "/DCTDecode"))
+_ALLOWED_FILTERS = {"/FlateDecode", "/DCTDecode"}
 
 _STREAM_START_PATTERN = re.compile(rb"(?<!end)stream *\r?\n?")
 

@@ -267,9 +267,12 @@ def _compare_with_new_report(
 ) -> Verification:
     redrawn_pdf = draw_report()
     if redrawn_pdf == pdf:
-        reasons = ["a new run on the log gives an identical PDF", VERIFICATION_SCOPE_NOTE]
         return Verification(
-            "verified", tuple(reasons), True, page_status="same", redrawn_pdf=redrawn_pdf
+            "verified",
+            ("a new run on the log gives an identical PDF", VERIFICATION_SCOPE_NOTE),
+            True,
+            page_status="same",
+            redrawn_pdf=redrawn_pdf,
         )
     mismatches, is_same_number, value_count = compare_results(
         to_json_dict(submitted_results), to_json_dict(new_results)

@@ -3,7 +3,6 @@
 import hashlib
 import secrets
 from collections.abc import Callable, Sequence
-from dataclasses import asdict
 from functools import partial
 from pathlib import Path
 
@@ -70,7 +69,7 @@ def simulate_assigned_flight(
         name=student.name,
         file=student.log_file_name,
         sha256=sha256,
-        scenario=to_json_types(asdict(assigned_flight.scenario)),
+        scenario=to_json_types(assigned_flight.scenario),
         mistakes=assigned_flight.mistake_options,
         true_values={name: float(true_values[name]) for name in TRUE_VALUE_NAMES},
         difficulty=assigned_flight.difficulty,

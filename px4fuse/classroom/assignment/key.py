@@ -38,7 +38,7 @@ from px4fuse.results.answer_form import (
     select_questions,
 )
 from px4fuse.simulation import flights
-from px4fuse.simulation.faults import FAULT_TYPES as SIMULATED_MISTAKES
+from px4fuse.simulation.faults import FAULT_TYPES
 from px4fuse.simulation.sensors import TIMESYNC_CONVERGENCE_TIME_S
 
 # Maximum relative error of the size of a fault in a student's answer
@@ -253,7 +253,7 @@ def compare_simulation(simulation: flights.Simulation) -> Comparison:
 def _make_injected_fault(
     name: str, values: Mapping[str, Any], truth: Mapping[str, Any], comparison: Comparison
 ) -> InjectedFault:
-    value_field_names = SIMULATED_MISTAKES[name].value_field_names
+    value_field_names = FAULT_TYPES[name].value_field_names
     if not value_field_names:
         return InjectedFault(name)
     size = values[value_field_names[0]]

@@ -123,10 +123,10 @@ def _make_grade_row(grade: Grade, item_titles: Sequence[str]) -> Row:
     cells = (
         Cell(grade.display_name, second_line=grade.file_name),
         Cell(grade.student_id),
-        Cell(f"{symbol} {status}", float(STATUSES.index(status)), flag_count_text, css_class),
+        Cell(f"{symbol} {status}", STATUSES.index(status), flag_count_text, css_class),
         _make_points_cell(grade),
         Cell(grade.submission_time, second_line=late_text),
-        Cell("\n".join(grade.flags), float(flag_count), "", "flags"),
+        Cell("\n".join(grade.flags), flag_count, "", "flags"),
         *(frame.make_number_cell(points_by_title.get(title)) for title in item_titles),
     )
     # overrides.csv needs an id or a file name, which an anonymous student lacks

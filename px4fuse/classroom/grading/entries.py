@@ -49,12 +49,10 @@ MAX_COMMENT_LENGTH = 10_000
 
 # Points and comment of the instructor, by student id and rubric item ("" for the whole report)
 OverridesByStudent = Mapping[str, Mapping[str, GradeOverride]]
-# Syntax of the option --late, for example "10 % / day up to 50 %"
-_LATE_RULE_PATTERN = re.compile(r"(\d+\.?\d*)\s*%\s*/\s*(day|hour)(?:\s+up to\s+(\d+\.?\d*)\s*%)?")
-# Formats of submission times in English tables of Moodle, with a 12-hour and a 24-hour clock
-_MOODLE_TIME_FORMATS = ("%A, %d %B %Y, %I:%M %p", "%A, %d %B %Y, %H:%M")
-# First letters of the German names of months, January first
-GERMAN_MONTHS = ("jan", "feb", "mär", "apr", "mai", "jun", "jul", "aug", "sep", "okt", "nov", "dez")
+# Syntax of the option --late without blanks, for example "10%/dayupto50%"
+_LATE_RULE_PATTERN = re.compile(r"(\d+\.?\d*)%/(day|hour)(?:upto(\d+\.?\d*)%)?")
+# English names of the months whose German names begin with other letters
+ENGLISH_MONTHS = {"mär": "mar", "mai": "may", "okt": "oct", "dez": "dec"}
 
 
 @dataclass(frozen=True)
@@ -412,7 +410,7 @@ def read_overrides(path: Path) -> OverridesByStudent:
         )
     overrides: dict[str, dict[str, GradeOverride]] = defaultdict(dict)
     for row_number, row in enumerate(sheet.rows, start=2):
-        if any(cell.strip() for cell in row[len(sheet.column_titles) :]):
+        if any(map(str.strip, row[len(sheet.column_titles) :])):
             raise SettingsError(
                 f"{path}: row {row_number} has more cells than the header.",
                 "Enclose a comment that contains a comma in double quotes.",
@@ -494,7 +492,7 @@ def parse_late_rule(text: str) -> LateRule:
     SettingsError
         The text is not a late rule.
     """
-    match = _LATE_RULE_PATTERN.fullmatch(text.strip())
+    match = _LATE_RULE_PATTERN.fullmatch("".join(text.split()))
     if match is None or float(match[1]) > 100.0:
         raise SettingsError(
             f"--late {text!r} is not a deduction, such as 10%/day or 10%/day up to 50%."
@@ -554,13 +552,13 @@ def parse_moodle_time(text: str) -> datetime | None:
     '2026-11-20T23:58:00'
     >>> parse_moodle_time("-")
     """
-    if german_match := re.fullmatch(r"\w+, (\d+)\. (\w+) (\d{4}), (\d+:\d\d)", text.strip()):
-        day, month, year, time_of_day = german_match.groups()
-        if (month_start := month.casefold()[:3]) in GERMAN_MONTHS:
-            text = f"{year}-{GERMAN_MONTHS.index(month_start) + 1:02}-{day:>02} {time_of_day:>05}"
     with suppress(ValueError):
         return datetime.fromisoformat(text.strip())
-    for time_format in _MOODLE_TIME_FORMATS:
-        with suppress(ValueError):
-            return datetime.strptime(text.strip(), time_format)
+    with suppress(ValueError):
+        _, day, month, year, *time_of_day = re.findall(r"[\w:]+", text)
+        month = ENGLISH_MONTHS.get(month[:3].casefold(), month[:3])
+        clock_format = "%I:%M %p" if len(time_of_day) > 1 else "%H:%M"
+        return datetime.strptime(
+            " ".join([day, month, year, *time_of_day]), f"%d %b %Y {clock_format}"
+        )
     return None

@@ -36,7 +36,7 @@ SCORE_FOR_WRONG_NOISE_PARAMETER = 2.0 / 3.0
 # Score for naming a consequence of the injected fault, for example outliers after a jump
 SCORE_FOR_NAMED_CONSEQUENCE = 0.15
 # Kinds of injected faults that a student can guess: points also depend on the stated size
-GUESSABLE_FAULT_KINDS = frozenset(("open-end",))
+GUESSABLE_FAULT_KINDS = {"open-end"}
 # The size of a fault in GUESSABLE_FAULT_KINDS gives no points if its relative error exceeds the
 # tolerance by this value
 EXCESS_SIZE_ERROR_AT_ZERO_POINTS = 0.08
@@ -60,6 +60,8 @@ class CorrectionRule(Record):
 
     Attributes
     ----------
+    fault_kinds : str
+        Faults, separated by blanks.
     score : float
         Fraction of the points: 1 for a correction, 1/2 if the parameter does not correct the
         fault, and 1/3 if it hides the fault.
@@ -68,7 +70,7 @@ class CorrectionRule(Record):
     """
 
     parameter: str
-    fault_kind: str
+    fault_kinds: str
     score: float
     right_values: str
 
@@ -120,8 +122,8 @@ def compute_form_points(answers: Answers, right_answers: CorrectFormAnswers) -> 
     elif right_answers.mistakes and all(fault.size is None for fault in right_answers.mistakes):
         # no injected fault has a size: the points for sizes are given for the right fault names
         points["mistakes"] += weights["sizes"] * scores["mistakes"]
-    points["mistakes"] -= FALSE_FAULT_DEDUCTION * len(false_faults)
-    points["mistakes"] = max(points["mistakes"], 0.0)
+    deduction = FALSE_FAULT_DEDUCTION * len(false_faults)
+    points["mistakes"] = max(points["mistakes"] - deduction, 0.0)
     if right_answers.choices:
         weights, points = (
             {name: FLIGHT_QUESTIONS_POINTS_FRACTION * value for name, value in values.items()}
@@ -356,7 +358,7 @@ def find_accepted_corrections(
     for rule in CORRECTION_RULES:
         # EKF2_EV_DELAY cannot be negative, so it does not correct timestamps that are too early
         is_possible = size > 0.0 or rule.right_values != "late milliseconds"
-        if rule.fault_kind == fault.kind and is_possible:
+        if fault.kind in rule.fault_kinds.split() and is_possible:
             low, high = range_by_name.get(rule.right_values) or map(
                 float, rule.right_values.split(" to ")
             )
@@ -366,14 +368,9 @@ def find_accepted_corrections(
 
 def _score_verdicts(answers: Answers, right_answers: CorrectFormAnswers) -> float:
     """Return the mean of three scores (0 to 1): verdict on KF, on EKF2, and behaviour of EKF2."""
-    right_verdict_count = sum(
-        answer == (right.verdict or NOT_AVAILABLE)
-        for answer, right in (
-            (answers.verdict_kf, right_answers.kf),
-            (answers.verdict_ekf2, right_answers.ekf2),
-        )
-    )
-    return (right_verdict_count + _score_ekf2_behaviour(answers, right_answers)) / 3.0
+    is_kf_right = answers.verdict_kf == (right_answers.kf.verdict or NOT_AVAILABLE)
+    is_ekf2_right = answers.verdict_ekf2 == (right_answers.ekf2.verdict or NOT_AVAILABLE)
+    return (is_kf_right + is_ekf2_right + _score_ekf2_behaviour(answers, right_answers)) / 3.0
 
 
 def _score_ekf2_behaviour(answers: Answers, right_answers: CorrectFormAnswers) -> float:

@@ -2,7 +2,7 @@
 
 import hashlib
 from collections.abc import Callable, Mapping, Sequence
-from contextlib import closing
+from contextlib import closing, suppress
 from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
@@ -243,12 +243,20 @@ def load_or_verify(
         The file is not a report.
     """
     sha256 = hashlib.sha256(pdf).hexdigest()
-    if loaded := _load_record(records_folder, sha256, path_by_sha256, assigned_hashes):
-        return *loaded, True
-    results = read_report(pdf, "The file")
-    versions_and_files = _collect_versions_and_files(
-        to_json(results), path_by_sha256, assigned_hashes
+    collect_versions_and_files = partial(
+        _collect_versions_and_files, path_by_sha256, assigned_hashes
     )
+    # the report is verified again if the earlier result is unreadable or has other inputs
+    with suppress(OSError, msgspec.MsgspecError, ResultsError):
+        content = (records_folder / f"{sha256}.json").read_bytes()
+        record = msgspec.json.decode(content, type=VerificationRecord)
+        loaded_results = read_results(record.results.encode())
+        if record.versions_and_files == collect_versions_and_files(record.results) and isinstance(
+            loaded_results, ReportedResults
+        ):
+            return loaded_results, record.verification, True
+    results = read_report(pdf, "The file")
+    versions_and_files = collect_versions_and_files(to_json(results))
     # the report is about an assigned log that was not given to this command. Without any log,
     # verify() returns "cannot verify" instead of "other log", which would be the student's fault
     is_log_missing = versions_and_files.get(log_sha256(results)) == "assigned"
@@ -288,7 +296,7 @@ def repeat_analysis_with_diagnosis(
 
 
 def _collect_versions_and_files(
-    results: str, path_by_sha256: Mapping[str, Path], assigned_hashes: frozenset[str]
+    path_by_sha256: Mapping[str, Path], assigned_hashes: frozenset[str], results: str
 ) -> dict[str, str]:
     """Return the versions of libraries, and the availability of input files by SHA-256."""
     versions = provenance("")
@@ -299,25 +307,3 @@ def _collect_versions_and_files(
         else:
             versions_and_files[sha256] = "assigned" if sha256 in assigned_hashes else "missing"
     return versions_and_files
-
-
-def _load_record(
-    records_folder: Path,
-    sha256: str,
-    path_by_sha256: Mapping[str, Path],
-    assigned_hashes: frozenset[str],
-) -> tuple[ReportedResults, Verification] | None:
-    """Load the result of an earlier verification; None without a valid result."""
-    try:
-        record = msgspec.json.decode(
-            (records_folder / f"{sha256}.json").read_bytes(), type=VerificationRecord
-        )
-        if record.versions_and_files != _collect_versions_and_files(
-            record.results, path_by_sha256, assigned_hashes
-        ):
-            return None
-        results = read_results(record.results.encode())
-    # if the result of the earlier verification is unreadable, the report is verified again
-    except (OSError, msgspec.MsgspecError, ResultsError):
-        return None
-    return (results, record.verification) if isinstance(results, ReportedResults) else None

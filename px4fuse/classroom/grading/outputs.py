@@ -197,10 +197,9 @@ def _anonymise_grades(grades: Sequence[Grade], path: Path) -> tuple[list[Grade],
     new_identities = name_by_identity.keys() - pseudonym_by_identity.keys()
     all_numbers = range(1, len(new_identities) + len(pseudonym_by_identity) + 1)
     all_pseudonyms = {f"Student {number:03}" for number in all_numbers}
-    free_pseudonyms = sorted(all_pseudonyms - {*pseudonym_by_identity.values()})
-    free_pseudonyms = free_pseudonyms[: len(new_identities)]
+    free_pseudonyms = [*(all_pseudonyms - {*pseudonym_by_identity.values()})]
     random.SystemRandom().shuffle(free_pseudonyms)
-    pseudonym_by_identity |= zip(new_identities, free_pseudonyms, strict=True)
+    pseudonym_by_identity |= zip(new_identities, free_pseudonyms, strict=False)
     rows = sorted(
         (pseudonym_by_identity[identity], identity, name)
         for identity, name in name_by_identity.items()

@@ -40,7 +40,7 @@ from px4fuse.results.contract import LoopResults, ReportedResults
 from px4fuse.verification.model import Verification
 from px4fuse.verification.verification import log_sha256, make_unverifiable_result
 
-DEFAULT_RUBRIC_NAME = "rubric.toml"
+DEFAULT_RUBRIC = Path(__file__).with_name("rubric.toml")
 MAX_RUBRIC_BYTES = 1_000_000
 RUBRIC_HELP = "Write an example rubric with px4fuse grade --write-rubric FILE.toml."
 
@@ -109,7 +109,7 @@ class Rubric(Record, kw_only=True):
 
 
 def rubric_text() -> str:
-    return Path(__file__).with_name(DEFAULT_RUBRIC_NAME).read_text("utf-8")
+    return DEFAULT_RUBRIC.read_text("utf-8")
 
 
 def read_rubric(path: Path | None) -> Rubric:
@@ -120,8 +120,7 @@ def read_rubric(path: Path | None) -> Rubric:
     SettingsError
         The file cannot be read or is not a rubric.
     """
-    if path is None:
-        return parse_rubric(rubric_text(), DEFAULT_RUBRIC_NAME)
+    path = path or DEFAULT_RUBRIC
     return parse_rubric(read_text(path, SettingsError, MAX_RUBRIC_BYTES, name=str(path)), str(path))
 
 
@@ -185,18 +184,24 @@ def score_report(
     if isinstance(form_result, str) or not scoring_input.is_own_log:
         form_result = FormPoints()
     pending_actions = [action for rule, _, action in problems if rule == "pending"]
+    flags = []
+    if verification.pages:
+        flags.append(
+            "The PDF differs from the report that px4fuse recomputed from the log. "
+            f"{capitalise_first(verification.pages[0].sentence)}."
+        )
+    flags += flag_settings(results)
+    if not scoring_input.is_own_log:
+        flags.append(_make_other_students_log_advice(scoring_input))
+    if scoring_input.has_form_of_other_log:
+        flags.append(FORM_MISMATCH_ADVICE)
     return GradedReport(
         "",
         student.name,
         student.id,
         verification,
         tuple(graded_items),
-        flags=(
-            *flag_page_differences(verification),
-            *flag_settings(results),
-            *([] if scoring_input.is_own_log else [_make_other_students_log_advice(scoring_input)]),
-            *([FORM_MISMATCH_ADVICE] if scoring_input.has_form_of_other_log else []),
-        ),
+        flags=tuple(flags),
         instructor_action="" if zero_points_reasons else " ".join(pending_actions),
         did_student_name_fault=form_result.did_student_name_fault,
         form_part_scores=form_result.parts,
@@ -270,15 +275,6 @@ def grade_unreadable_file(
 
 
 # ------------------------------------------------------------------ flags
-
-
-def flag_page_differences(verification: Verification) -> Iterator[str]:
-    """Yield the first difference between a PDF and the recomputed report, if any."""
-    if verification.pages:
-        yield (
-            "The PDF differs from the report that px4fuse recomputed from the log. "
-            f"{capitalise_first(verification.pages[0].sentence)}."
-        )
 
 
 def flag_settings(results: ReportedResults) -> Iterator[str]:
