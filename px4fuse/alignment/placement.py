@@ -12,13 +12,27 @@ import numpy as np
 import pandas as pd
 from msgspec import structs
 
-from px4fuse.alignment import matching, tracks
-from px4fuse.alignment.matching import AlignmentProblem, Match
+from px4fuse.alignment.matching import (
+    MIN_CONCORDANCE_WITHOUT_WARNING,
+    AlignmentProblem,
+    Match,
+    find_match,
+    is_reliable_fit,
+    needs_rotation,
+)
 from px4fuse.alignment.time_and_pose_fit import (
     MIN_CONCORDANCE_TO_ACCEPT_MATCH,
     compute_clipped_rms_m,
 )
-from px4fuse.alignment.tracks import EKF2_REFERENCE, IMU_REFERENCE, NoMatchError
+from px4fuse.alignment.tracks import (
+    EKF2_REFERENCE,
+    IMU_REFERENCE,
+    MIN_MATCHED_SAMPLES,
+    MIN_MOTION_M,
+    NoMatchError,
+    align_samples,
+    make_continuous_ekf2_track,
+)
 from px4fuse.convention.axes import METRES_PER_UNIT
 from px4fuse.convention.check import check_convention
 from px4fuse.convention.correction import MIN_FRAME_ROTATION_DEG
@@ -118,10 +132,9 @@ def align_position_file(
     """
     _check_options(frame, yaw_deg, clock_offset_s)
     samples = select_valid_rows(recording.samples, ["x_m", "y_m"])
-    if len(samples) < tracks.MIN_MATCHED_SAMPLES:
+    if len(samples) < MIN_MATCHED_SAMPLES:
         raise MissingDataError(
-            f"{recording.name} contains {len(samples)} positions; {tracks.MIN_MATCHED_SAMPLES} are "
-            "needed",
+            f"{recording.name} contains {len(samples)} positions; {MIN_MATCHED_SAMPLES} are needed",
             "Check that the position file contains the whole flight.",
         )
     start_s, end_s = samples.index[[0, -1]].tolist()
@@ -142,7 +155,7 @@ def align_position_file(
     frames = (frame,) if frame else recording.frames
     problem = AlignmentProblem(samples, frames, yaw_rad, lag_s)
     try:
-        match = matching.find_match(flight, problem)
+        match = find_match(flight, problem)
     except NoMatchError as error:
         if fault := _explain_mismatch(flight, problem, recording.metres_per_unit):
             raise MissingDataError(f"{recording.name}: {fault[0]}.", fault[1]) from None
@@ -258,7 +271,7 @@ def _apply_alignment(
         reference_correlation = float(
             (np.exp(-1j * yaw_rad) * match.time_offset_fit.coherence).real
         )
-    aligned_samples = tracks.align_samples(samples, frame, yaw_rad, origin_m, lag_s)
+    aligned_samples = align_samples(samples, frame, yaw_rad, origin_m, lag_s)
     ekf2_comparison = (
         None if reference_name == IMU_REFERENCE else _compare_with_ekf2(flight, aligned_samples)
     )
@@ -314,11 +327,11 @@ def _compare_with_ekf2(
     if isinstance(flight.ekf2, Unavailable):
         return None
     try:
-        ekf2_track = tracks.make_continuous_ekf2_track(flight.ekf2, aligned_samples)
+        ekf2_track = make_continuous_ekf2_track(flight.ekf2, aligned_samples)
     except NoMatchError:
         return None
     ekf2_position_m, is_known = ekf2_track.at(aligned_samples.index.to_numpy())
-    if np.count_nonzero(is_known) < tracks.MIN_MATCHED_SAMPLES:
+    if np.count_nonzero(is_known) < MIN_MATCHED_SAMPLES:
         return None
     file_position_m = aligned_samples[Columns.POSITION[:2]].to_numpy()[is_known]
     ekf2_position_m = ekf2_position_m[is_known, :2]
@@ -326,7 +339,7 @@ def _compare_with_ekf2(
     file_position_m -= file_position_m.mean(axis=0)
     ekf2_position_m -= ekf2_position_m.mean(axis=0)
     norm_product = np.linalg.norm(file_position_m) * np.linalg.norm(ekf2_position_m)
-    if norm_product == 0.0 or np.ptp(ekf2_position_m, axis=0).max() < tracks.MIN_MOTION_M:
+    if norm_product == 0.0 or np.ptp(ekf2_position_m, axis=0).max() < MIN_MOTION_M:
         return distance_to_ekf2_m, None
     return distance_to_ekf2_m, float(np.sum(file_position_m * ekf2_position_m) / norm_product)
 
@@ -338,7 +351,7 @@ def _describe_frame_conflict(match: Match, distance_to_ekf2_m: Array | None, yaw
     shift_text, shift_m = "", 0.0
     if distance_to_ekf2_m is not None:
         residual_m = compute_clipped_rms_m(distance_to_ekf2_m) / np.sqrt(2.0)
-        is_rotated = matching.is_reliable_fit(fit, reference_name) and matching.needs_rotation(
+        is_rotated = is_reliable_fit(fit, reference_name) and needs_rotation(
             residual_m, fit, reference_name
         )
         shift_m = float(np.hypot(*fit.origin_m[:2]))
@@ -358,7 +371,7 @@ def _describe_frame_conflict(match: Match, distance_to_ekf2_m: Array | None, yaw
 def _find_warnings(match: Match, is_yaw_estimated: bool) -> Iterator[str]:
     reference_name = match.reference.name
     fit = match.time_offset_fit
-    if fit.concordance < matching.MIN_CONCORDANCE_WITHOUT_WARNING[reference_name]:
+    if fit.concordance < MIN_CONCORDANCE_WITHOUT_WARNING[reference_name]:
         yield (
             f"The position file matches the {reference_name} poorly: Lin's concordance correlation "
             f"coefficient is {fit.concordance:.2f}."

@@ -5,8 +5,14 @@ from dataclasses import dataclass, replace
 import numpy as np
 from scipy.optimize import least_squares
 
-from px4fuse.alignment import tracks
-from px4fuse.alignment.tracks import EKF2_REFERENCE, IMU_REFERENCE, NoMatchError, SampledTrack
+from px4fuse.alignment.tracks import (
+    EKF2_REFERENCE,
+    IMU_REFERENCE,
+    MIN_MATCHED_SAMPLES,
+    MIN_OVERLAP_S,
+    NoMatchError,
+    SampledTrack,
+)
 from px4fuse.core.arrays import Array, ComplexArray
 from px4fuse.trajectory.correlation import autocovariance, compute_moments
 from px4fuse.trajectory.time_offset import GRID_STEP_S
@@ -90,8 +96,8 @@ def find_correlation_peak(
         np.count_nonzero(file_track.is_valid), np.count_nonzero(reference.is_valid)
     )
     min_sample_count = max(
-        tracks.MIN_MATCHED_SAMPLES,
-        min(tracks.MIN_OVERLAP_S / GRID_STEP_S, shorter_sample_count / 2),
+        MIN_MATCHED_SAMPLES,
+        min(MIN_OVERLAP_S / GRID_STEP_S, shorter_sample_count / 2),
     )
     if shorter_sample_count < min_sample_count:
         raise NoMatchError("position file and reference have too few common samples for a match")
@@ -169,10 +175,10 @@ def fit_by_least_squares(
     """
     reference_m, is_known = reference.at(file_track.time_s + peak.lag_s)
     is_used = is_known & file_track.is_valid
-    if np.count_nonzero(is_used) < tracks.MIN_MATCHED_SAMPLES:
+    if np.count_nonzero(is_used) < MIN_MATCHED_SAMPLES:
         raise NoMatchError(
             f"only {np.count_nonzero(is_used)} positions of the file overlap the "
-            f"{reference.name} in time; {tracks.MIN_MATCHED_SAMPLES} are needed"
+            f"{reference.name} in time; {MIN_MATCHED_SAMPLES} are needed"
         )
     reference_time_s = file_track.time_s[is_used] + peak.lag_s
     file_position_m = file_track.to_complex_m()[is_used]

@@ -18,14 +18,16 @@ from px4fuse.core.arrays import Array, IntArray, compute_median_interval_s
 from px4fuse.core.reading import read_bytes_limited, split_path_and_part
 from px4fuse.errors import LogError, SettingsError
 from px4fuse.flight.model import NO_INVALID_ROWS, time_index
-from px4fuse.readers import position_names
 from px4fuse.readers.common import classify_invalid_positions, estimate_rounding_step
 from px4fuse.readers.position_names import (
     METRES_BY_LENGTH_UNIT,
     SECONDS_BY_TIME_UNIT,
+    TIME_KINDS,
     ColumnMeaning,
     PositionColumns,
+    find_position_columns,
     find_quaternion_columns,
+    find_sigma_columns,
     read_column_name,
 )
 from px4fuse.readers.recording_table import (
@@ -143,7 +145,7 @@ def read_position_file(
     row_count = len(numbers)
     time_column, time_text = _detect_time_column(table, column_meanings, numbers)
     frame, axis_columns = _find_axes(column_meanings, numbers)
-    sigma_columns = position_names.find_sigma_columns(column_meanings, frame)
+    sigma_columns = find_sigma_columns(column_meanings, frame)
     position_columns = [index for index in axis_columns if index is not None]
     # pandas reads numbers such as 1e999 as infinite
     has_time = np.isfinite(numbers[time_column])
@@ -394,7 +396,7 @@ def _interpret_given_columns(
     for index, axis in zip(position_columns, "xyz", strict=False):
         meanings[index] = ColumnMeaning("position", axis, column_meanings[index].unit)
     # The names of other columns must not define the frame
-    named_position = position_names.find_position_columns(
+    named_position = find_position_columns(
         [
             meaning if index in position_columns else ColumnMeaning()
             for index, meaning in enumerate(column_meanings)
@@ -414,7 +416,7 @@ def _find_axes(
     column_meanings: Sequence[ColumnMeaning], numbers: pd.DataFrame
 ) -> tuple[str | None, PositionColumns]:
     """Return the frame of the position (None: unknown), and the column indices of its axes."""
-    frame_and_axis_columns = position_names.find_position_columns(column_meanings)
+    frame_and_axis_columns = find_position_columns(column_meanings)
     assert frame_and_axis_columns  # find_table returns only tables with positions
     frame, (x_column, y_column, z_column) = frame_and_axis_columns
     if z_column is not None and numbers[z_column].isna().all():
@@ -436,7 +438,7 @@ def _detect_time_column(
         time_columns,
         key=lambda index: (
             is_mostly_empty[index],
-            position_names.TIME_KINDS.index(column_meanings[index].time_kind),
+            TIME_KINDS.index(column_meanings[index].time_kind),
             column_meanings[index].unit == "ns",
         ),
     )

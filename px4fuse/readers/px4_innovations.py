@@ -236,7 +236,7 @@ def read_enabled_aids(topics: Topics) -> dict[str, pd.Series[float]]:
     all_aids = (*AIDS.values(), *STATUS_FLAGS.values())
     flag_names = {flag for aid in all_aids for group in aid.flags for flag in group.split("|")}
     layout = Layout(
-        px4.STATUS_FLAGS,
+        px4.STATUS_FLAGS_TOPIC,
         optional_columns={name: name for name in flag_names},
         is_step_function=True,
     )
@@ -287,7 +287,7 @@ def _read_common_topics(
 ) -> AidLog | None:
     """Read the innovations of an aiding source from a topic that contains all aiding sources."""
     is_in_gauss = aid.name == "mag_heading" and any(
-        "cs_mag" in table for table in topics.tables_of(px4.STATUS_FLAGS)
+        "cs_mag" in table for table in topics.tables_of(px4.STATUS_FLAGS_TOPIC)
     )
     layouts = []
     if aid.fields and not is_in_gauss:

@@ -25,7 +25,6 @@ from px4fuse.flight.model import (
     sample_rate,
     time_index,
 )
-from px4fuse.readers import px4_topics as px4
 from px4fuse.readers.common import (
     classify_invalid_positions,
     estimate_rounding_step,
@@ -38,6 +37,18 @@ from px4fuse.readers.common import (
 from px4fuse.readers.px4_ekf2 import configured_step_s
 from px4fuse.readers.px4_fixes import read_unlogged_fixes, reconstruct_fixes
 from px4fuse.readers.px4_innovations import has_fused_aid
+from px4fuse.readers.px4_topics import (
+    ANTENNA_COLUMNS,
+    FRAME_BY_FIELD_VALUE,
+    FUSED_OBSERVATION_TRACK_NAME,
+    GPS_POSITION,
+    LOCAL_POSITION_LAYOUT,
+    RECONSTRUCTED_TRACK_NAME,
+    SOURCE_TRACKS,
+    TOPIC_LAYOUTS,
+    TRACK_SOURCES,
+    find_track_layouts,
+)
 from px4fuse.readers.recording_table import MAX_VALID_UNIX_TIME_S, MIN_VALID_UNIX_TIME_S
 from px4fuse.readers.ulog_topics import MAX_PUBLICATION_LAG_S, Topics
 
@@ -77,7 +88,7 @@ def read_positions(
     is_odometry = isinstance(fusion_flags, pd.DataFrame) and bool((fusion_flags["yaw"] > 0).any())
     return split_tracks(
         [
-            *(_read_logged_track(topics, name) for name in px4.SOURCE_TRACKS),
+            *(_read_logged_track(topics, name) for name in SOURCE_TRACKS),
             _read_fused_observation(topics, is_odometry),
             _reconstruct_track(topics, ekf2, is_odometry),
             _read_gnss_track(topics, ekf2),
@@ -102,7 +113,7 @@ def unavailable_source(name: str, reason: str = "", remedy: str = "") -> Unavail
     return Unavailable(
         f"position source {name}",
         reason or f"{name} is not logged",
-        remedy or px4.TRACK_SOURCES[name].remedy,
+        remedy or TRACK_SOURCES[name].remedy,
         name,
     )
 
@@ -171,7 +182,7 @@ def _make_ulog_track(
     **track_fields: Any,
 ) -> PositionTrack | Unavailable:
     """Make a position track of a source that is defined in ``px4_topics.toml``."""
-    source = px4.TRACK_SOURCES[name]
+    source = TRACK_SOURCES[name]
     origin = structs.replace(source.origin, is_auto_candidate=is_auto_candidate)
     if origin.aid is not None:
         parameters = topics.ekf2_parameters
@@ -183,14 +194,14 @@ def _make_ulog_track(
 
 
 def _read_logged_track(topics: Topics, name: str) -> PositionTrack | Unavailable:
-    layout = topics.find_layout(*px4.find_track_layouts(name))
+    layout = topics.find_layout(*find_track_layouts(name))
     if layout is None:
         return unavailable_source(name)
     # EKF2's topics have one instance for each EKF2 instance
     is_ekf2 = layout.topic.startswith("estimator_")
     samples = topics.primary_samples(layout) if is_ekf2 else topics.read_instance(layout)
-    frame = px4.TRACK_SOURCES[name].frame
-    for frame_field, frame_names in px4.FRAME_BY_FIELD_VALUE.items():
+    frame = TRACK_SOURCES[name].frame
+    for frame_field, frame_names in FRAME_BY_FIELD_VALUE.items():
         if frame == "unknown" and frame_field in samples and len(samples):
             frame = frame_names.get(int(samples[frame_field].iloc[-1]), "unknown")
     if "published_us" in samples:
@@ -256,14 +267,14 @@ def _describe_timestamp_clock(published_us: IntArray, sample_timestamps_us: IntA
 
 def _read_fused_observation(topics: Topics, is_odometry: bool) -> PositionTrack | Unavailable:
     horizontal, vertical = (
-        px4.TOPIC_LAYOUTS["estimator_aid_src_ev_pos"],
-        px4.TOPIC_LAYOUTS["estimator_aid_src_ev_hgt"],
+        TOPIC_LAYOUTS["estimator_aid_src_ev_pos"],
+        TOPIC_LAYOUTS["estimator_aid_src_ev_hgt"],
     )
     if topics.find_layout(horizontal) is None:
-        return unavailable_source(px4.FUSED_OBSERVATION_TRACK_NAME)
+        return unavailable_source(FUSED_OBSERVATION_TRACK_NAME)
     return _make_track_from_ekf2_topics(
         topics,
-        px4.FUSED_OBSERVATION_TRACK_NAME,
+        FUSED_OBSERVATION_TRACK_NAME,
         topics.primary_samples(horizontal),
         topics.primary_samples(vertical),
         (horizontal.topic, vertical.topic)[: 1 + (topics.find_layout(vertical) is not None)],
@@ -321,7 +332,7 @@ def _reconstruct_track(
     The times may be late by up to one interval of the position source.
     """
     if isinstance(ekf2, Unavailable):
-        return unavailable_source(px4.RECONSTRUCTED_TRACK_NAME, "the log contains no EKF2 state")
+        return unavailable_source(RECONSTRUCTED_TRACK_NAME, "the log contains no EKF2 state")
     positions = {
         column: innovations["innovation_m"]
         + interpolate_inside(innovations.index, ekf2.state[column])
@@ -330,12 +341,12 @@ def _reconstruct_track(
     }
     if not {"north_m", "east_m"} <= positions.keys():
         return unavailable_source(
-            px4.RECONSTRUCTED_TRACK_NAME, "EKF2 fused no horizontal external vision position"
+            RECONSTRUCTED_TRACK_NAME, "EKF2 fused no horizontal external vision position"
         )
     heights = positions.pop("down_m", pd.Series(dtype=np.float64)).to_frame("down_m")
     return _make_track_from_ekf2_topics(
         topics,
-        px4.RECONSTRUCTED_TRACK_NAME,
+        RECONSTRUCTED_TRACK_NAME,
         pd.DataFrame(positions),
         heights,
         ("vehicle_local_position", *ekf2.innovation_topics),
@@ -391,9 +402,7 @@ def unproject(north_m: Array, east_m: Array, origin: GeodeticPosition | ArrayPai
 def _find_local_origin(topics: Topics) -> GeodeticPosition | None:
     """Return latitude, longitude (degrees) and altitude (m) of EKF2's origin, if logged."""
     columns = ["ref_lat", "ref_lon", "ref_alt"]
-    origin = select_valid_rows(
-        topics.read(px4.LOCAL_POSITION_LAYOUT).reindex(columns=columns), columns
-    )
+    origin = select_valid_rows(topics.read(LOCAL_POSITION_LAYOUT).reindex(columns=columns), columns)
     origin = origin[origin["ref_lat"] != 0]
     return tuple(origin.iloc[-1].tolist()) if len(origin) else None
 
@@ -419,17 +428,17 @@ def _read_gnss_track(topics: Topics, ekf2: Ekf2 | Unavailable) -> PositionTrack 
     EKF2 subtracts EKF2_GPS_DELAY from the timestamps. Since 2026, it may use the measurement times
     of the GNSS driver instead (EKF2.cpp UpdateGpsSample, estimator_interface.cpp).
     """
-    layout = topics.find_layout(*px4.find_track_layouts(px4.GPS_POSITION))
+    layout = topics.find_layout(*find_track_layouts(GPS_POSITION))
     if layout is None:
-        return unavailable_source(px4.GPS_POSITION)
+        return unavailable_source(GPS_POSITION)
     messages = topics.read_instance(layout)
     messages["published_s"] = (messages.pop("published_us") - topics.time_origin_us) * 1e-6
     has_fix = messages.get("fix_type", pd.Series(FIX_TYPE_3D, messages.index)) >= FIX_TYPE_3D
     fixes = messages[has_fix]
     if fixes.empty:
         return unavailable_source(
-            px4.GPS_POSITION,
-            f"the log has {len(messages)} {px4.GPS_POSITION}, none with a 3D fix",
+            GPS_POSITION,
+            f"the log has {len(messages)} {GPS_POSITION}, none with a 3D fix",
             NO_FIX_ACTION,
         )
     parameters = topics.ekf2_parameters
@@ -469,12 +478,12 @@ def _read_gnss_track(topics: Topics, ekf2: Ekf2 | Unavailable) -> PositionTrack 
             notes.append(note)
     track_fields: dict[str, Any] = {}
     # The lever arm of the receiver is logged since v1.17
-    if {*px4.ANTENNA_COLUMNS} <= {*fixes}:
-        track_fields["lever_arm_m"] = tuple(fixes[px4.ANTENNA_COLUMNS].iloc[-1].tolist())
+    if {*ANTENNA_COLUMNS} <= {*fixes}:
+        track_fields["lever_arm_m"] = tuple(fixes[ANTENNA_COLUMNS].iloc[-1].tolist())
     times_without_fix_s = messages["published_s"].to_numpy()[~has_fix] - delay_s
     return _make_ulog_track(
         topics,
-        px4.GPS_POSITION,
+        GPS_POSITION,
         samples,
         (layout.topic,),
         clock=clock,
@@ -519,9 +528,9 @@ def read_truth(
 
     If EKF2 fused GNSS, ground truth is shifted from the simulation's origin to EKF2's origin.
     """
-    attitude = read_attitude(topics.read(px4.TOPIC_LAYOUTS["vehicle_attitude_groundtruth"]))
-    local_layout = px4.TOPIC_LAYOUTS["vehicle_local_position_groundtruth"]
-    global_layout = px4.TOPIC_LAYOUTS["vehicle_global_position_groundtruth"]
+    attitude = read_attitude(topics.read(TOPIC_LAYOUTS["vehicle_attitude_groundtruth"]))
+    local_layout = TOPIC_LAYOUTS["vehicle_local_position_groundtruth"]
+    global_layout = TOPIC_LAYOUTS["vehicle_global_position_groundtruth"]
     logged_local_samples = topics.read(local_layout)
     local_samples = select_valid_rows(logged_local_samples, logged_local_samples.columns.tolist())
     global_positions = select_valid_rows(topics.read(global_layout), Columns.GEODETIC[:2])
@@ -540,7 +549,7 @@ def read_truth(
         return Truth(local_layout.topic, local_samples, attitude)
     mocap_truth = find_motion_capture_truth(positions)
     reason = "the log has neither simulation ground truth nor motion capture"
-    remedy = px4.TRACK_SOURCES["vehicle_mocap_odometry"].remedy
+    remedy = TRACK_SOURCES["vehicle_mocap_odometry"].remedy
     if len(logged_local_samples):
         reason = f"{local_layout.topic} has no finite sample"
         remedy = "Check the simulation that writes the ground truth."

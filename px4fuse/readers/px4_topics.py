@@ -85,7 +85,7 @@ SOURCE_TRACKS = [
 AIDS_ALWAYS_FUSED = ("gravity", "drag")
 # Aiding sources whose logged observation is a local position
 AIDS_WITH_LOCAL_POSITION_OBSERVATION = ("ev_pos", "ev_hgt")
-STATUS_FLAGS, STATUS_TOPIC = "estimator_status_flags", "estimator_status"
+STATUS_FLAGS_TOPIC, STATUS_TOPIC = "estimator_status_flags", "estimator_status"
 # Topics with innovations and innovation variances of all aiding sources (since v1.12)
 INNOVATION_TOPICS = "estimator_innovations", "estimator_innovation_variances"
 OLD_INNOVATION_TOPIC = "ekf2_innovations"
@@ -104,5 +104,5 @@ def list_topics() -> list[str]:
     }
     layout_topics |= {layout.topic for layout in TOPIC_LAYOUTS.values() if layout.topic}
     layout_topics |= {f"estimator_aid_src_{name}" for name in AIDS}
-    aid_topics = {STATUS_FLAGS, *INNOVATION_TOPICS, OLD_INNOVATION_TOPIC}
+    aid_topics = {STATUS_FLAGS_TOPIC, *INNOVATION_TOPICS, OLD_INNOVATION_TOPIC}
     return sorted(layout_topics | UNUSED_TOPICS.keys() | aid_topics | {*STATE_VECTOR_TOPICS})

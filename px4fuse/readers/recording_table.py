@@ -21,8 +21,7 @@ from px4fuse.core.reading import display_name, read_text
 from px4fuse.core.record import read_toml
 from px4fuse.core.text import join_first_names
 from px4fuse.errors import LogError, Px4FuseError
-from px4fuse.readers import position_names
-from px4fuse.readers.position_names import read_column_name
+from px4fuse.readers.position_names import find_position_columns, read_column_name
 
 # Maximum size (bytes) of a position file
 MAX_FILE_BYTES = 500_000_000
@@ -263,7 +262,7 @@ def _find_header_table(
 def _has_time_and_position(column_names: list[str]) -> bool:
     meanings = [read_column_name(name) for name in column_names]
     has_time = any(column.kind == "time" for column in meanings)
-    return has_time and position_names.find_position_columns(meanings) is not None
+    return has_time and find_position_columns(meanings) is not None
 
 
 def _find_body_table(
