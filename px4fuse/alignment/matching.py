@@ -170,13 +170,11 @@ def _find_best_match(references: list[SampledTrack], problem: AlignmentProblem) 
     matches = []
     for reference in references:
         reference_name = reference.name
-        fits = {frame: _fit_file_in_frame(problem, reference, frame, yaw_rad) for frame in frames}
-        rms_m_by_frame = {
-            frame: fits[frame].residual_rms_m
-            for frame in sorted(fits, key=lambda frame: fits[frame].residual_rms_m)
-        }
-        best_frame = next(iter(rms_m_by_frame))
-        fit = estimated_yaw_fit = fits[best_frame]
+        fits = [(frame, _fit_file_in_frame(problem, reference, frame, yaw_rad)) for frame in frames]
+        fits.sort(key=lambda frame_and_fit: frame_and_fit[1].residual_rms_m)
+        rms_m_by_frame = {frame: fit.residual_rms_m for frame, fit in fits}
+        best_frame, fit = fits[0]
+        estimated_yaw_fit = fit
         if yaw_rad is not None:
             estimated_yaw_fit = _fit_file_in_frame(problem, reference, best_frame, None)
         is_given_yaw_wrong = is_reliable_fit(estimated_yaw_fit, reference_name) and (

@@ -33,7 +33,7 @@ from px4fuse.alignment.tracks import (
     align_samples,
     make_continuous_ekf2_track,
 )
-from px4fuse.convention.axes import METRES_PER_UNIT
+from px4fuse.convention.axes import MAX_TIME_OFFSET_S, METRES_PER_UNIT
 from px4fuse.convention.check import check_convention
 from px4fuse.convention.correction import MIN_FRAME_ROTATION_DEG
 from px4fuse.convention.texts import FRAME_AXES, UNIT_NAMES, describe_axes, describe_unit
@@ -67,13 +67,11 @@ def _explain_mismatch(
     if span_s > MAX_CONVENTION_CHECK_SPAN_S:
         return None
     time_s = samples.index - samples.index[0] + (problem.lag_s or 0.0)
-    positions = samples[["x_m", "y_m", "z_m"]] / metres_per_unit
-    position_samples = pd.DataFrame(
-        positions.to_numpy(), time_index(time_s.to_numpy()), Columns.POSITION
-    )
+    positions = samples[["x_m", "y_m", "z_m"]].to_numpy() / metres_per_unit
+    position_samples = pd.DataFrame(positions, time_index(time_s.to_numpy()), Columns.POSITION)
     track = PositionTrack("", POSITION_FILE_ORIGIN, "", position_samples, "unknown", "", ())
-    time_offset_limits = {} if problem.lag_s is not None else {"max_time_offset_s": span_s}
-    convention = check_convention(flight, track, **time_offset_limits)
+    max_time_offset_s = span_s if problem.lag_s is None else MAX_TIME_OFFSET_S
+    convention = check_convention(flight, track, max_time_offset_s)
     if convention is None or convention.verdict != "determined":
         return None
     axes, faults = convention.axes, []
@@ -152,8 +150,7 @@ def align_position_file(
             "Correct or omit --clock-offset.",
         )
     yaw_rad = None if yaw_deg == "auto" else float(np.radians(yaw_deg or 0.0))
-    frames = (frame,) if frame else recording.frames
-    problem = AlignmentProblem(samples, frames, yaw_rad, lag_s)
+    problem = AlignmentProblem(samples, (frame,) if frame else recording.frames, yaw_rad, lag_s)
     try:
         match = find_match(flight, problem)
     except NoMatchError as error:
@@ -218,8 +215,10 @@ def _check_options(
     frame: str | None, yaw_deg: float | str | None, clock_offset_s: float | None
 ) -> None:
     if frame not in (None, *NED_COMPONENTS_BY_FRAME):
-        remedy = f"Use one of {', '.join(NED_COMPONENTS_BY_FRAME)}."
-        raise SettingsError(f"`frame` {frame} is not a known coordinate frame.", remedy)
+        raise SettingsError(
+            f"`frame` {frame} is not a known coordinate frame.",
+            f"Use one of {', '.join(NED_COMPONENTS_BY_FRAME)}.",
+        )
     if isinstance(yaw_deg, str) and yaw_deg != "auto":
         raise SettingsError(f"`yaw_deg` {yaw_deg} is neither a number (degrees) nor auto.")
     for name, value in (("yaw_deg", yaw_deg), ("clock_offset_s", clock_offset_s)):
@@ -301,13 +300,14 @@ def _apply_alignment(
                 f"The UNIX times of position file and log differ by {unix_time_difference_s:.0f} "
                 "s. Check that both are of the same flight."
             )
+    north_m, east_m, down_m = origin_m.tolist()
     alignment = Alignment(
         frame=frame,
         frame_reason=frame_reason,
         yaw_deg=float(np.degrees(yaw_rad)),
         yaw_sigma_deg=yaw_sigma_deg,
         yaw_reason=yaw_reason,
-        origin_m=(float(origin_m[0]), float(origin_m[1]), float(origin_m[2])),
+        origin_m=(north_m, east_m, down_m),
         clock_offset_s=float(clock_offset_s or 0.0),
         clock_offset_sigma_s=time_offset_sigma_s,
         clock_reason=time_offset_reason,

@@ -241,9 +241,9 @@ def fit_by_least_squares(
         vertical_rms_m = compute_clipped_rms_m(down_difference_m - origin_down_m)
     concordance = peak.concordance
     if np.isnan(concordance):
-        correlation_after_rotation = float((np.exp(-1j * fitted_yaw_rad) * coherence).real)
+        rotated_covariance_m2 = float((np.exp(-1j * fitted_yaw_rad) * covariance_m2).real)
         mean_of_variances_m2 = max(float(file_variance_m2 + reference_variance_m2) / 2.0, 1e-300)
-        concordance = correlation_after_rotation * sigma_product_m2 / mean_of_variances_m2
+        concordance = rotated_covariance_m2 / mean_of_variances_m2
     complex_origin_m = (
         complex(origin_north_m, origin_east_m) - np.exp(1j * fitted_yaw_rad) * centre_m
     )

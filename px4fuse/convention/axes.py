@@ -115,10 +115,11 @@ class SignedAxisPermutation(NamedTuple):
 
     def compute_log_prior_odds(self, quarter_turns: int) -> float:
         axes = self.compute_axis_directions(quarter_turns)
-        uncommon_axes_log_odds = -2.0 if self.vertical_axis == 2 or axes[1] == "up" else -4.0
-        return LOG_PRIOR_ODDS_BY_AXES.get(
-            axes, -5.0 if self.is_mirrored else uncommon_axes_log_odds
-        )
+        if axes in LOG_PRIOR_ODDS_BY_AXES:
+            return LOG_PRIOR_ODDS_BY_AXES[axes]
+        if self.is_mirrored:
+            return -5.0
+        return -2.0 if self.vertical_axis == 2 or axes[1] == "up" else -4.0
 
 
 SIGNED_AXIS_PERMUTATIONS = tuple(
