@@ -63,7 +63,7 @@ def _explain_mismatch(
 ) -> tuple[str, str] | None:
     """Return error message and advice if the IMU shows wrong axes or a wrong unit of the file."""
     samples = problem.samples
-    span_s = max(float(samples.index[-1] - samples.index[0]), flight.log.duration_s)
+    span_s = max(samples.index[-1] - samples.index[0], flight.log.duration_s)
     if span_s > MAX_CONVENTION_CHECK_SPAN_S:
         return None
     time_s = samples.index - samples.index[0] + (problem.lag_s or 0.0)
@@ -262,7 +262,7 @@ def _apply_alignment(
         if clock_offset_s is None:
             lag_s = match.time_offset_fit.lag_s
             time_offset_sigma_s = match.time_offset_fit.lag_sigma_s
-            clock_offset_s = lag_s + (flight.log.boot_time_s - float(samples.index[0]))
+            clock_offset_s = lag_s + (flight.log.boot_time_s - samples.index[0])
             time_offset_reason = (
                 f"the position file was matched in time with the {reference_name}; the time offset "
                 f"includes any delay of the {reference_name}"
@@ -354,7 +354,7 @@ def _describe_frame_conflict(match: Match, distance_to_ekf2_m: Array | None, yaw
         is_rotated = is_reliable_fit(fit, reference_name) and needs_rotation(
             residual_m, fit, reference_name
         )
-        shift_m = float(np.hypot(*fit.origin_m[:2]))
+        shift_m = np.hypot(*fit.origin_m[:2])
         shift_text = f"The position file has its origin {shift_m:.1f} m from EKF2's origin. "
     if not is_rotated:
         return ""

@@ -13,7 +13,7 @@ from px4fuse.alignment.tracks import (
     NoMatchError,
     SampledTrack,
 )
-from px4fuse.core.arrays import Array, ComplexArray
+from px4fuse.core.arrays import Array, ComplexArray, rms
 from px4fuse.trajectory.correlation import autocovariance, compute_moments
 from px4fuse.trajectory.time_offset import GRID_STEP_S
 
@@ -121,7 +121,7 @@ def find_correlation_peak(
     best_index = int(np.argmax(np.where(has_overlap, log_likelihood_gain, -np.inf)))
 
     def compute_lag_s(index: int) -> float:
-        return float(reference.time_s[0]) + (index - len(file_track.is_valid) + 1) * GRID_STEP_S
+        return reference.time_s[0] + (index - len(file_track.is_valid) + 1) * GRID_STEP_S
 
     can_be_second_peak = (
         has_overlap
@@ -135,7 +135,7 @@ def find_correlation_peak(
         near_indices = indices_from_best[: round(MIN_PEAK_DISTANCE_S / GRID_STEP_S) + 1]
         is_in_best_peak = np.logical_and.accumulate(is_high[near_indices])
         can_be_second_peak[near_indices[is_in_best_peak]] = False
-    peak = CorrelationPeak(compute_lag_s(best_index), float(concordance[best_index]))
+    peak = CorrelationPeak(compute_lag_s(best_index), concordance[best_index])
     if not can_be_second_peak.any():
         return peak
     residual_square_sum_m2 = np.maximum(square_sum_m2 - 2.0 * rotated_covariance, 0.0)
@@ -145,7 +145,7 @@ def find_correlation_peak(
     return replace(
         peak,
         second_peak_lag_difference_s=compute_lag_s(second_peak_index) - compute_lag_s(best_index),
-        second_to_best_residual_ratio=float(residual_m[second_peak_index] / residual_m[best_index]),
+        second_to_best_residual_ratio=residual_m[second_peak_index] / residual_m[best_index],
     )
 
 
@@ -187,7 +187,7 @@ def fit_by_least_squares(
     # With centred positions, the errors of yaw and origin are uncorrelated
     file_position_m = file_position_m - centre_m
     file_variance_m2, reference_variance_m2 = np.var(file_position_m), np.var(reference_position_m)
-    sigma_product_m2 = float(np.sqrt(file_variance_m2 * reference_variance_m2))
+    sigma_product_m2 = np.sqrt(file_variance_m2 * reference_variance_m2)
     covariance_m2 = np.vdot(file_position_m, reference_position_m) / len(file_position_m)
     coherence = complex(covariance_m2 / sigma_product_m2) if sigma_product_m2 > 0.0 else 0j
     reference_horizontal_position_m = reference.to_complex_m()
@@ -241,8 +241,8 @@ def fit_by_least_squares(
         vertical_rms_m = compute_clipped_rms_m(down_difference_m - origin_down_m)
     concordance = peak.concordance
     if np.isnan(concordance):
-        rotated_covariance_m2 = float((np.exp(-1j * fitted_yaw_rad) * covariance_m2).real)
-        mean_of_variances_m2 = max(float(file_variance_m2 + reference_variance_m2) / 2.0, 1e-300)
+        rotated_covariance_m2 = (np.exp(-1j * fitted_yaw_rad) * covariance_m2).real
+        mean_of_variances_m2 = max((file_variance_m2 + reference_variance_m2) / 2.0, 1e-300)
         concordance = rotated_covariance_m2 / mean_of_variances_m2
     complex_origin_m = (
         complex(origin_north_m, origin_east_m) - np.exp(1j * fitted_yaw_rad) * centre_m
@@ -257,8 +257,8 @@ def fit_by_least_squares(
         yaw_sigma_rad=float(parameter_sigma[-1]) if yaw_rad is None else None,
         origin_m=np.array([complex_origin_m.real, complex_origin_m.imag, origin_down_m]),
         coherence=coherence,
-        horizontal_rms_m=float(horizontal_rms_m),
-        residual_rms_m=float(np.sqrt(2.0 * horizontal_rms_m**2 + vertical_rms_m**2)),
+        horizontal_rms_m=horizontal_rms_m,
+        residual_rms_m=np.sqrt(2.0 * horizontal_rms_m**2 + vertical_rms_m**2),
     )
 
 
@@ -296,4 +296,4 @@ def _compute_autocorrelation_factor(residual: ComplexArray) -> float:
 
 def compute_clipped_rms_m(residual_m: Array) -> float:
     """Return the RMS (m) of residuals that are limited to RESIDUAL_CLIP_LIMIT_M."""
-    return float(np.sqrt(np.mean(np.minimum(np.abs(residual_m), RESIDUAL_CLIP_LIMIT_M) ** 2)))
+    return rms(np.minimum(np.abs(residual_m), RESIDUAL_CLIP_LIMIT_M))

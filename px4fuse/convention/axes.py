@@ -213,7 +213,7 @@ class Hypothesis:
 
 def correct_clock_drift(time_s: Array, clock_drift: float) -> Array:
     """Remove the drift of a clock (rate minus 1) from timestamps; their mean does not change."""
-    mean_time_s = float(np.mean(time_s))
+    mean_time_s = np.mean(time_s)
     return mean_time_s + (time_s - mean_time_s) / (1.0 + clock_drift)
 
 
@@ -339,9 +339,7 @@ def find_convention_candidates(
             parameters = np.array(
                 [delay_s[offset_index], rotation_rad[offset_index, permutation_index], *[0.0] * 5]
             )
-            hypotheses.append(
-                Hypothesis(axis_permutation, unit_name, parameters, float(total_score))
-            )
+            hypotheses.append(Hypothesis(axis_permutation, unit_name, parameters, total_score))
     hypotheses.sort(key=lambda hypothesis: -hypothesis.score)
     return [
         hypothesis
@@ -387,8 +385,8 @@ def _evaluate_hypothesis(
     """Compute the score of a hypothesis, and the next Gauss-Newton step of its parameters."""
     delay_s, rotation_rad, heading_drift_rad_s, clock_drift, *_ = hypothesis.parameters
     time_s = source_motion.time_s[rows]
-    row_interval_s = GRID_INTERVAL_S * float(np.median(np.diff(rows)))
-    mean_time_s = float(np.mean(time_s))
+    row_interval_s = GRID_INTERVAL_S * np.median(np.diff(rows))
+    mean_time_s = np.mean(time_s)
     measurement_time_s = time_s - delay_s - clock_drift * (time_s - mean_time_s)
     fractional_grid_index = (measurement_time_s - imu_motion.time_s[0]) / GRID_INTERVAL_S
     grid_index = np.clip(np.floor(fractional_grid_index).astype(int), 0, len(imu_motion.time_s) - 2)
@@ -398,7 +396,7 @@ def _evaluate_hypothesis(
         & imu_motion.is_valid[grid_index]
     )
     independent_residual_count = (
-        float(np.count_nonzero(is_used)) * row_interval_s / SECOND_DIFFERENCE_WINDOW_S
+        np.count_nonzero(is_used) * row_interval_s / SECOND_DIFFERENCE_WINDOW_S
     )
     rejected_result = replace(hypothesis, score=-np.inf), np.zeros(len(PARAMETER_PRIOR_PRECISION))
     if independent_residual_count * SECOND_DIFFERENCE_WINDOW_S < MIN_OVERLAP_S:
@@ -488,7 +486,7 @@ def _evaluate_hypothesis(
         ),
         min_source_to_imu_displacement_ratio=source_imu_product_sum / imu_square_sum,
         max_source_to_imu_displacement_ratio=source_square_sum / source_imu_product_sum,
-        residual_sigma_m=float(np.sqrt(variances[0])),
+        residual_sigma_m=np.sqrt(variances[0]),
         independent_residual_count=independent_residual_count,
     )
     return scored_hypothesis, parameter_step
@@ -546,9 +544,9 @@ def _compute_height_log_likelihood_ratio(
     )
     # down + height is constant for a correct hypothesis
     error_m = down_m - np.median(down_m) + height_m - np.median(height_m)
-    mean_square_error_m2 = float(np.mean(np.minimum(error_m**2, MAX_HEIGHT_ERROR_M**2)))
+    mean_square_error_m2 = np.mean(np.minimum(error_m**2, MAX_HEIGHT_ERROR_M**2))
     min_variance_m2 = BAROMETER_SIGMA_M**2
-    variance_ratio = max(float(np.var(height_m)), min_variance_m2) / max(
+    variance_ratio = max(np.var(height_m), min_variance_m2) / max(
         mean_square_error_m2, min_variance_m2
     )
     return 0.5 * INDEPENDENT_HEIGHT_ERROR_COUNT * float(np.log(variance_ratio))

@@ -313,8 +313,8 @@ def compute_residual_ratio(hypothesis: Hypothesis, positions: SentPositions) -> 
     """Return σ of the horizontal residuals divided by σ of the noise of source and IMU."""
     # Third differences hardly contain motion; their σ gives the σ of second differences
     third_differences = np.diff(positions.position_m, 3, axis=0)
-    third_difference_sigma = 1.4826 * float(
-        np.median(np.abs(third_differences - np.median(third_differences, axis=0)))
+    third_difference_sigma = 1.4826 * np.median(
+        np.abs(third_differences - np.median(third_differences, axis=0))
     )
     noise_m = (
         METRES_PER_UNIT[hypothesis.unit]

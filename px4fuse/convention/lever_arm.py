@@ -185,7 +185,7 @@ def _fit_lever_arm_to_imu(flight: Flight, track: PositionTrack) -> LeverArm | No
         residual_m: Array = np.linalg.norm(
             second_difference_error_m - design @ fitted_parameters, axis=1
         )
-        sigma_m = float(np.sqrt(np.mean(residual_m[is_used] ** 2) / 2.0))
+        sigma_m = np.sqrt(np.mean(residual_m[is_used] ** 2) / 2.0)
         covariance = (
             np.linalg.pinv(design_rows.T @ design_rows)
             * sigma_m**2

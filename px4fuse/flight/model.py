@@ -408,7 +408,7 @@ class PositionTrack:
     # Barometer height, if it replaces the height of the source
     barometer: pd.DataFrame | None = None
     # Sensor position (body FRD) that EKF2 assumes
-    lever_arm_m: tuple[float, float, float] = (0.0, 0.0, 0.0)
+    lever_arm_m: Vector = (0.0, 0.0, 0.0)
     # Sentences about interpolated, reconstructed or dropped samples
     notes: tuple[str, ...] = ()
     # Reason why a row is not a measurement, for example "NaN"
@@ -499,7 +499,7 @@ class Reset:
 
     time_s: float
     quantity: Literal["position", "velocity"]
-    delta: tuple[float, float, float]
+    delta: Vector
 
 
 EKF2_STEP_S = 0.010  # default of EKF2_PREDICT_US in s (ekf2_params.c)

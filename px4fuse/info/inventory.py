@@ -286,11 +286,12 @@ def _list_analyses(
     else:
         source, segment = comparison.source, comparison.segment
         sample_count = len(cut_to_segment(source.samples, segment))
-        used_data_text = (
+        yield AnalysisOption(
+            "compare",
+            True,
             f"KF with {sample_count} samples of position source {source.name} from "
-            f"{segment.start_s:.1f} s to {segment.end_s:.1f} s"
+            f"{segment.start_s:.1f} s to {segment.end_s:.1f} s",
         )
-        yield AnalysisOption("compare", True, used_data_text)
     low_rate_findings = () if flight.log.is_assessed else imu.detect_low_rates(flight)
     imu_fault_text = " ".join(finding.message for finding in low_rate_findings)
     if isinstance(missing_data := imu_and_attitude(flight), Unavailable):
@@ -313,7 +314,7 @@ def _list_analyses(
     if isinstance(replay_inputs, Unavailable):
         yield AnalysisOption("what-if", False, replay_inputs.reason)
     else:
-        duration_s = sum(float(np.ptp(segment.time_s)) for segment in replay_inputs.segments)
+        duration_s = sum(np.ptp(segment.time_s) for segment in replay_inputs.segments)
         replay_text = f"EKF2 replay of {duration_s:.0f} s with {replay_inputs.aid.label}"
         yield AnalysisOption("what-if", True, replay_text)
 
@@ -322,7 +323,8 @@ def _list_ekf2_and_truth_analyses(
     flight: Flight, comparison: PreparedComparison | None
 ) -> Iterator[AnalysisOption]:
     """Yield the analyses that need EKF2 data or ground truth."""
-    ekf2 = innovations = flight.ekf2
+    ekf2 = flight.ekf2
+    innovations: object = ekf2
     tracks: Mapping[str, object] = {
         "ekf2_state": ekf2,
         "ekf2_variance": ekf2,

@@ -88,7 +88,7 @@ def _make_ekf2_tables(ekf2: Ekf2) -> dict[str, pd.DataFrame]:
     resets = [(reset.time_s, reset.quantity, *reset.delta) for reset in ekf2.resets]
     instances = pd.DataFrame(ekf2.primary_instances, columns=["time_s", "instance"])
     # the first instance starts at minus infinity, but the table needs a finite time
-    first_time_s = min(float(ekf2.state.index[0]), 0.0)
+    first_time_s = min(ekf2.state.index[0], 0.0)
     ekf2_tables = {
         "resets": pd.DataFrame(
             resets, columns=["time_s", "quantity", "delta_north", "delta_east", "delta_down"]

@@ -96,7 +96,7 @@ def classify_invalid_positions(samples: pd.DataFrame, columns: list[str]) -> "pd
         distance_m = np.linalg.norm(offset_from_median_m, axis=1)
         is_far_from_median = distance_m > max(
             MIN_DAMAGED_DISTANCE_M,
-            MIN_DAMAGED_TO_MEDIAN_DISTANCE_RATIO * float(np.median(distance_m)),
+            MIN_DAMAGED_TO_MEDIAN_DISTANCE_RATIO * np.median(distance_m),
         )
         reason_by_row.iloc[valid_rows[is_far_from_median]] = "far"
         valid_rows = valid_rows[~is_far_from_median]

@@ -218,8 +218,12 @@ def _group_lines_by_tag(text: str, name: str) -> dict[str, _TaggedLines]:
                     "Fix only one vertex. To keep the relative pose of two vertices, add an edge.",
                 )
         elif not tag.startswith(_SKIPPED_TAGS):
-            fault = f"lines with the tag {quote(tag)} are not supported"
-            raise _make_line_error(name, line_number, fault, _FORMAT_REMEDY)
+            raise _make_line_error(
+                name,
+                line_number,
+                f"lines with the tag {quote(tag)} are not supported",
+                _FORMAT_REMEDY,
+            )
     return lines_by_tag
 
 

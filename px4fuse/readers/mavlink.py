@@ -32,7 +32,6 @@ from px4fuse.readers import mavlink_messages as messages
 from px4fuse.readers import mavlink_senders as senders
 from px4fuse.readers.mavlink_frames import (
     MAX_FRAME_BYTES,
-    MESSAGE_IDS,
     VEHICLE_TYPES,
     read_frames,
 )
@@ -104,7 +103,7 @@ def read_mavlink(name: str, content: bytes, system_id: int | None = None) -> Fli
         unused=tuple(
             UnusedData(name, count, reason)
             for name, reason in messages.REASON_BY_UNUSED_MESSAGE.items()
-            if (count := int(np.count_nonzero(frames.message_ids == MESSAGE_IDS[name])))
+            if (count := len(frames.rows(name)))
         ),
     )
 
@@ -144,7 +143,7 @@ def _read_attitude(recording: Recording) -> TableOrUnavailable:
 
 def _read_ekf2(recording: Recording, parameters: Mapping[str, float]) -> Ekf2 | Unavailable:
     autopilot, remedies = recording.autopilot, recording.remedies
-    layout = messages.ODOMETRY_LAYOUT
+    layout = messages.MESSAGE_LAYOUTS["ODOMETRY"]
     # ODOMETRY has variances, so it is preferred unless its rate is much lower
     local_position_count = len(recording.rows(messages.LOCAL_POSITION_LAYOUT.topic))
     if 2 * len(recording.rows(layout.topic)) < local_position_count:
@@ -236,7 +235,7 @@ def _read_airborne_spans(recording: Recording) -> Spans | Unavailable:
         )
     recording.record_stream("airborne", "EXTENDED_SYS_STATE", clock=RECEIPT_CLOCK_TEXT)
     time_s = recording.compute_receipt_boot_times_s(rows[is_known]) - recording.time_origin_s
-    is_landed = pd.Series(landed_states[is_known] == messages.ON_GROUND_STATE, index=time_s)
+    is_landed = pd.Series(landed_states[is_known] == messages.ON_GROUND_STATE, time_s)
     return common.find_flight_spans(is_landed, recording.duration_s)
 
 

@@ -13,6 +13,7 @@ from px4fuse.flight.model import (
     PositionTrack,
     Truth,
     Unavailable,
+    find_source_origin,
 )
 from px4fuse.readers import mavlink_messages as messages
 from px4fuse.readers.common import join_nearest, read_attitude, read_orientation
@@ -25,6 +26,7 @@ from px4fuse.readers.px4_positions import (
     MIN_TRACK_SAMPLES,
     NO_FIX_ACTION,
     GeodeticPosition,
+    TracksAndMissingSources,
     convert_gnss_fixes,
     find_motion_capture_truth,
     make_track,
@@ -42,7 +44,7 @@ MAX_ORIGIN_TIME_DIFFERENCE_S = 0.05
 
 def read_positions(
     recording: Recording, clocks: dict[MavlinkAddress, ClockMapping], delay_s: float
-) -> tuple[tuple[PositionTrack, ...], tuple[Unavailable, ...]]:
+) -> TracksAndMissingSources:
     """Read the external positions sent to the autopilot, and the GNSS positions.
 
     Parameters
@@ -110,7 +112,7 @@ def _read_track(
     return make_track(
         track_name,
         samples,
-        source.origin,
+        find_source_origin(source.kind, "as received"),
         remedy=recording.remedies["position"],
         is_odometry=orientation is not None,
         description=source.description,

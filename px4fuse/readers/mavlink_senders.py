@@ -9,7 +9,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from px4fuse.core.arrays import Array, IntArray
+from px4fuse.core.arrays import Array, ArrayPair, IntArray
 from px4fuse.errors import SettingsError
 from px4fuse.flight.model import ClockMap, Sender
 from px4fuse.readers import mavlink_messages as messages
@@ -154,7 +154,7 @@ def _map_sender_clock(
         rows = recording.rows(source.message, sender)
         timestamps_s.append(frames.table(source.message, rows)[source.timestamp_field] * 1e-6)
         receive_times_s.append(recording.receive_times_s[rows])
-    median_timestamp_s = float(np.median(np.concatenate(timestamps_s)))
+    median_timestamp_s = np.median(np.concatenate(timestamps_s))
     has_running_clock = is_running_clock(np.concatenate(timestamps_s))
     rows = recording.rows("TIMESYNC", sender)
     timesync = frames.table("TIMESYNC", rows)
@@ -205,8 +205,8 @@ def map_clock_to_boot(
     timestamps_s: Array,
     receive_times_s: Array,
     receipt_to_boot_fit: ClockLine,
-    sender_replies: tuple[Array, Array],
-    autopilot_replies: tuple[Array, Array],
+    sender_replies: ArrayPair,
+    autopilot_replies: ArrayPair,
     boot_to_unix_fit: ClockLine | None,
     *,
     has_receive_times: bool,
@@ -250,10 +250,12 @@ def map_clock_to_boot(
         intervals_s = np.diff(receive_times_s)
         intervals_s = intervals_s[intervals_s < MAX_REGULAR_SAMPLE_INTERVAL_S]
         jitter_s = float(np.std(intervals_s) / np.sqrt(2.0)) if len(intervals_s) else 0.0
-        description = ClockMap(
-            name, time_source, len(timestamps_s), 0.0, 0.0, jitter_s, note, distinct_count
+        return ClockMapping(
+            None,
+            ClockMap(
+                name, time_source, len(timestamps_s), 0.0, 0.0, jitter_s, note, distinct_count
+            ),
         )
-        return ClockMapping(None, description)
 
     def compute_difference_from_receipt_s(boot_time_s: Array) -> float:
         return abs(float(np.median(boot_time_at_receipt_s - boot_time_s)))
@@ -274,7 +276,7 @@ def map_clock_to_boot(
         same_clock = ClockLine(0.0, 0.0, 1.0, 0.0, len(timestamps_s))
         note = "the timestamps of the sender are boot times of the autopilot"
         return _make_clock_mapping(name, "boot clock", same_clock, timestamps_s, note)
-    clock_kind = "UNIX time" if float(np.median(timestamps_s)) > MIN_UNIX_TIME_S else "clock"
+    clock_kind = "UNIX time" if np.median(timestamps_s) > MIN_UNIX_TIME_S else "clock"
     clock_name = f"{clock_kind} of {name}"
     candidate_fits = [] if timesync_fit is None else [("TIMESYNC", timesync_fit, "")]
     if clock_kind == "UNIX time" and boot_to_unix_fit is not None:
@@ -300,9 +302,7 @@ def map_clock_to_boot(
     return _make_clock_mapping(clock_name, time_source, sender_to_boot_fit, timestamps_s, note)
 
 
-def _fit_timesync(
-    sender_replies: tuple[Array, Array], autopilot_replies: tuple[Array, Array]
-) -> ClockLine | None:
+def _fit_timesync(sender_replies: ArrayPair, autopilot_replies: ArrayPair) -> ClockLine | None:
     """Fit the conversion of sender clock to boot clock by TIMESYNC, as mean of both directions."""
     clock_fits = []
     if len(sender_replies[0]) >= MIN_TIMESYNC_REPLIES:
@@ -313,7 +313,7 @@ def _fit_timesync(
     if not clock_fits:
         return None
     x0 = clock_fits[0].x0
-    line_parameters = [(float(line.at(x0)), line.slope, line.jitter_s) for line in clock_fits]
+    line_parameters = [(line.at(x0), line.slope, line.jitter_s) for line in clock_fits]
     y0, slope, jitter_s = np.mean(line_parameters, axis=0).tolist()
     return ClockLine(x0, y0, slope, jitter_s, sum(line.reading_pair_count for line in clock_fits))
 
@@ -321,7 +321,7 @@ def _fit_timesync(
 def _make_clock_mapping(
     clock: str, method: str, line: ClockLine, timestamps_s: Array, note: str
 ) -> ClockMapping:
-    middle_timestamp_s = float(0.5 * (timestamps_s.min() + timestamps_s.max()))
+    middle_timestamp_s = 0.5 * float(timestamps_s.min() + timestamps_s.max())
     offset_s = float(line.at(middle_timestamp_s)) - middle_timestamp_s
     drift_ppm = (line.slope - 1.0) * 1e6
     description = ClockMap(
@@ -389,6 +389,6 @@ def _estimate_lost_fraction(frames: MavlinkFrames, address: MavlinkAddress) -> f
     unwrapped_sequence = np.append(0, np.cumsum(sequence_steps))
     sent_count = np.ptp(unwrapped_sequence) + 1
     lost_fraction = float(1.0 - len(np.unique(unwrapped_sequence)) / sent_count)
-    has_sequence_numbers = len(unwrapped_sequence) == 1 or bool(unwrapped_sequence.any())
+    has_sequence_numbers = len(unwrapped_sequence) == 1 or unwrapped_sequence.any()
     is_usable = has_sequence_numbers and lost_fraction < MAX_LOST_MESSAGE_FRACTION
     return lost_fraction if is_usable else None

@@ -182,9 +182,11 @@ def read_position_file(
         and len(kept_rows) < MIN_MATCHING_ROW_FRACTION * row_count
     )
     if has_no_times or len(kept_rows) < MIN_USABLE_ROWS:
-        fault = f"contains {len(kept_rows)} usable rows, fewer than {MIN_USABLE_ROWS}"
+        fault = (
+            f"{table.file_name} contains {len(kept_rows)} usable rows, fewer than {MIN_USABLE_ROWS}"
+        )
         raise LogError(
-            "; ".join((f"{table.file_name} {fault}", *notes)),
+            "; ".join((fault, *notes)),
             "Write numbers with decimal points. Alternatively, name the columns with "
             f"{COLUMNS_OPTION}.",
         )
@@ -212,12 +214,12 @@ def read_position_file(
     samples = samples[is_valid]
     is_ignored_sigma = samples[SIGMA_COLUMNS] <= 0.0
     samples[SIGMA_COLUMNS] = samples[SIGMA_COLUMNS].mask(is_ignored_sigma)
-    if ignored_count := int(is_ignored_sigma.any(axis=1).sum()):
+    if ignored_count := is_ignored_sigma.any(axis=1).sum():
         notes.append(f"number of rows with an ignored sigma (not positive): {ignored_count}")
     clock_kind: Literal["UNIX", "local"] = (
         "UNIX"
         if has_time_zone
-        and MIN_VALID_UNIX_TIME_S <= float(np.median(numbers.index)) < MAX_VALID_UNIX_TIME_S
+        and MIN_VALID_UNIX_TIME_S <= np.median(numbers.index) < MAX_VALID_UNIX_TIME_S
         else "local"
     )
     return PositionRecording(
@@ -311,9 +313,8 @@ def _read_numbers(
     known_columns = [index for index, meaning in enumerate(column_meanings) if meaning.kind]
     texts = table.read_cells([*quaternion_columns, *known_columns])
     texts = _select_body(table, texts, column_meanings, body_name)
-    may_have_decimal_comma = table.separator != ","
     # DataFrame.apply returns dtype object for an empty table
-    numbers = texts.apply(_to_numbers, may_have_decimal_comma=may_have_decimal_comma).astype(
+    numbers = texts.apply(_to_numbers, may_have_decimal_comma=table.separator != ",").astype(
         np.float64
     )
     has_time_zone = True
@@ -393,8 +394,6 @@ def _interpret_given_columns(
     meanings = [
         meaning if meaning.kind in kept_kinds else ColumnMeaning() for meaning in column_meanings
     ]
-    for index, axis in zip(position_columns, "xyz", strict=False):
-        meanings[index] = ColumnMeaning("position", axis, column_meanings[index].unit)
     # The names of other columns must not define the frame
     named_position = find_position_columns(
         [
@@ -402,9 +401,12 @@ def _interpret_given_columns(
             for index, meaning in enumerate(column_meanings)
         ]
     )
-    if named_position and {*named_position[1]} - {None} == {*position_columns}:
-        for index in position_columns:
-            meanings[index] = column_meanings[index]
+    has_axis_names = named_position and {*named_position[1]} - {None} == {*position_columns}
+    for index, axis in zip(position_columns, "xyz", strict=False):
+        meaning = column_meanings[index]
+        meanings[index] = (
+            meaning if has_axis_names else ColumnMeaning("position", axis, meaning.unit)
+        )
     for index in sigma_columns:
         meanings[index] = ColumnMeaning("sigma", unit=column_meanings[index].unit)
     time_unit = column_meanings[time_column].unit
@@ -515,7 +517,7 @@ def _choose_length_units(
     }
     # The range from 5 % to 95 % excludes outliers
     extents = numbers[position_columns].quantile(0.95) - numbers[position_columns].quantile(0.05)
-    max_extent = float(extents.max())
+    max_extent = extents.max()
     unit = "m"
     reason = "px4fuse assumes metres, because the column names contain no unit"
     if given_unit is not None:
@@ -534,7 +536,7 @@ def _choose_length_units(
         {index: named_units.get(index, unit) for index in map(int, numbers.columns)}
     )
     metres_per_unit = column_units.map(METRES_BY_LENGTH_UNIT)
-    extent_m = float((extents * metres_per_unit).max())
+    extent_m = (extents * metres_per_unit).max()
     units_text = ", ".join(dict.fromkeys(column_units[position_columns]))
     return (
         metres_per_unit,

@@ -11,7 +11,7 @@ import pandas as pd
 from numpy.typing import ArrayLike
 
 from px4fuse.core.arrays import Array, IntArray, compute_median_interval_s
-from px4fuse.flight.ekf2_parameters import AIDS, EV_POS, FLOW, STATUS_FLAGS, fill_with_defaults
+from px4fuse.flight.ekf2_parameters import AIDS, EV_POS, FLOW, fill_with_defaults
 from px4fuse.flight.model import (
     BIAS_NOT_LOGGED,
     EKF2_STEP_S,
@@ -307,9 +307,9 @@ def _compute_publication_delay_s(topics: Topics, topic: str) -> pd.Series:
     for table in topics.tables_of(topic)[:1]:
         if "timestamp_sample" in table:
             sample_times_us = measurement_time_us(table)
-            sample_time_index = time_index((sample_times_us - topics.time_origin_us) * 1e-6)
             delay_us = table["timestamp"].astype(np.int64) - sample_times_us
-            return pd.Series(delay_us * 1e-6, index=sample_time_index)
+            sample_times_s = (sample_times_us - topics.time_origin_us) * 1e-6
+            return pd.Series(delay_us * 1e-6, time_index(sample_times_s))
     return pd.Series(dtype=np.float64)
 
 
@@ -379,7 +379,7 @@ def _read_fusion_record(
         flow=_read_optical_flow(topics, enabled_aids),
         latitude_deg=float(origin["ref_lat"]),
         altitude_m=altitude_m,
-        status_flags={name: enabled_aids[name] for name in STATUS_FLAGS if name in enabled_aids},
+        status_flags=enabled_aids,
         height_bias_updates={
             name: topics.primary_samples(layout).dropna()
             for name, layout in HEIGHT_BIAS_LAYOUT_BY_AID.items()
@@ -425,7 +425,7 @@ def _read_optical_flow(topics: Topics, enabled_aids: StepFunctions) -> pd.DataFr
             "estimator_aid_src_optical_flow",
         )
     )
-    interval_s = float(flow_intervals["interval_us"].median()) * 1e-6
+    interval_s = flow_intervals["interval_us"].median() * 1e-6
     if not interval_s > 0.0 or flow_noise.empty:
         return pd.DataFrame()
     steps_s = flow_velocity.index.to_series().diff()

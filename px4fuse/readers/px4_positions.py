@@ -77,11 +77,11 @@ MAX_CLOCK_RATE_ERROR_FRACTION = 0.05
 AUTOPILOT_CLOCK_TEXT = "autopilot boot clock (PX4 converted the sender's timestamps)"
 # Latitude and longitude (degrees), optionally altitude (m)
 GeodeticPosition = tuple[float, ...]
+# Position tracks, best first, and missing position sources
+TracksAndMissingSources = tuple[tuple[PositionTrack, ...], tuple[Unavailable, ...]]
 
 
-def read_positions(
-    topics: Topics, ekf2: Ekf2 | Unavailable
-) -> tuple[tuple[PositionTrack, ...], tuple[Unavailable, ...]]:
+def read_positions(topics: Topics, ekf2: Ekf2 | Unavailable) -> TracksAndMissingSources:
     """Read the positions of all sources in a log, best source first, and the missing sources."""
     fusion_flags = ekf2.fusion_flags if isinstance(ekf2, Ekf2) else ekf2
     # If EKF2 fused the yaw of the source, the source is odometry
@@ -96,9 +96,7 @@ def read_positions(
     )
 
 
-def split_tracks(
-    tracks: list[PositionTrack | Unavailable],
-) -> tuple[tuple[PositionTrack, ...], tuple[Unavailable, ...]]:
+def split_tracks(tracks: list[PositionTrack | Unavailable]) -> TracksAndMissingSources:
     """Separate available positions, best source first, from missing position sources."""
     available_tracks = sorted(
         (track for track in tracks if isinstance(track, PositionTrack)),
@@ -185,8 +183,7 @@ def _make_ulog_track(
     source = TRACK_SOURCES[name]
     origin = structs.replace(source.origin, is_auto_candidate=is_auto_candidate)
     if origin.aid is not None:
-        parameters = topics.ekf2_parameters
-        lever_arm_m = tuple(parameters.get(parameter, 0.0) for parameter in origin.aid.lever_arm)
+        lever_arm_m = tuple(topics.ekf2_parameters.get(name, 0.0) for name in origin.aid.lever_arm)
         track_fields = {"lever_arm_m": lever_arm_m, **track_fields}
     fields = {"frame": "NED", "clock": AUTOPILOT_CLOCK_TEXT, **track_fields}
     fields |= {"description": source.description, "topics": topic_names, "log": topics.log.name}
@@ -252,12 +249,12 @@ def _describe_timestamp_clock(published_us: IntArray, sample_timestamps_us: IntA
     """Return clock and unit of timestamps, for example "UNIX time in seconds"."""
     if not sample_timestamps_us.any():
         return "0"
-    rate_ratio = float(np.ptp(published_us)) / max(float(np.ptp(sample_timestamps_us)), 1.0)
+    rate_ratio = np.ptp(published_us) / max(np.ptp(sample_timestamps_us), 1)
     for unit, unit_us in MICROSECONDS_BY_UNIT.items():
         if abs(rate_ratio / unit_us - 1.0) < MAX_CLOCK_RATE_ERROR_FRACTION:
             if (
                 MIN_VALID_UNIX_TIME_S
-                <= float(np.median(sample_timestamps_us)) * unit_us * 1e-6
+                <= np.median(sample_timestamps_us) * unit_us * 1e-6
                 < MAX_VALID_UNIX_TIME_S
             ):
                 return f"UNIX time in {unit}"
@@ -303,7 +300,7 @@ def _make_track_from_ekf2_topics(
         samples = join_nearest(
             samples, height_samples.assign(_found=True), MAX_HEIGHT_TIME_DIFFERENCE_S
         )
-        if missing_count := int(samples.pop("_found").isna().sum()):
+        if missing_count := samples.pop("_found").isna().sum():
             notes = (
                 f"{missing_count} of {len(samples)} external vision positions have no height "
                 f"within {1e3 * MAX_HEIGHT_TIME_DIFFERENCE_S:.0f} ms and are used without height",
@@ -418,8 +415,8 @@ def project_to_ned(global_positions: pd.DataFrame, origin: GeodeticPosition | No
     latitude_deg, longitude_deg, altitude_m = global_positions.to_numpy().T
     origin = origin or (latitude_deg[0], longitude_deg[0], altitude_m[0])
     north_m, east_m = project(latitude_deg, longitude_deg, origin)
-    position_columns = {"north_m": north_m, "east_m": east_m, "down_m": origin[2] - altitude_m}
-    return pd.DataFrame(position_columns, index=global_positions.index)
+    position_m = np.column_stack([north_m, east_m, origin[2] - altitude_m])
+    return pd.DataFrame(position_m, global_positions.index, Columns.POSITION)
 
 
 def _read_gnss_track(topics: Topics, ekf2: Ekf2 | Unavailable) -> PositionTrack | Unavailable:
@@ -455,7 +452,7 @@ def _read_gnss_track(topics: Topics, ekf2: Ekf2 | Unavailable) -> PositionTrack 
     unlogged_fixes = read_unlogged_fixes(topics, fixes, ekf2)
     if len(unlogged_fixes):
         fixes = pd.concat([fixes, unlogged_fixes]).sort_index()
-        interpolated_count = int(fixes["altitude_m"].isna().sum())
+        interpolated_count = fixes["altitude_m"].isna().sum()
         # Copy fields that EKF2's topics do not contain from the previous fix
         fixes = fixes.assign(altitude_m=fixes["altitude_m"].interpolate("index")).ffill()
     samples = convert_gnss_fixes(fixes, _find_local_origin(topics))
@@ -561,9 +558,9 @@ def find_motion_capture_truth(positions: tuple[PositionTrack, ...]) -> Truth | N
 
     Motion capture in FRD is not used, because its north direction is unknown.
     """
-    tracks = (track for track in positions if track.origin.kind == "mocap")
-    track = next((track for track in tracks if track.frame != "FRD"), None)
-    if track is None or not any(track.origin.is_vision for track in positions):
-        return None
-    samples = track.samples.reindex(columns=Columns.STATE)
-    return Truth(track.name, samples, read_attitude(track.orientation))
+    has_vision = any(track.origin.is_vision for track in positions)
+    for track in positions if has_vision else ():
+        if track.origin.kind == "mocap" and track.frame != "FRD":
+            samples = track.samples.reindex(columns=Columns.STATE)
+            return Truth(track.name, samples, read_attitude(track.orientation))
+    return None
