@@ -121,7 +121,7 @@ def find_correlation_peak(
     best_index = int(np.argmax(np.where(has_overlap, log_likelihood_gain, -np.inf)))
 
     def compute_lag_s(index: int) -> float:
-        return reference.time_s[0] + (index - len(file_track.is_valid) + 1) * GRID_STEP_S
+        return float(reference.time_s[0]) + (index - len(file_track.is_valid) + 1) * GRID_STEP_S
 
     can_be_second_peak = (
         has_overlap

@@ -339,7 +339,9 @@ def find_convention_candidates(
             parameters = np.array(
                 [delay_s[offset_index], rotation_rad[offset_index, permutation_index], *[0.0] * 5]
             )
-            hypotheses.append(Hypothesis(axis_permutation, unit_name, parameters, total_score))
+            hypotheses.append(
+                Hypothesis(axis_permutation, unit_name, parameters, float(total_score))
+            )
     hypotheses.sort(key=lambda hypothesis: -hypothesis.score)
     return [
         hypothesis
@@ -546,7 +548,7 @@ def _compute_height_log_likelihood_ratio(
     error_m = down_m - np.median(down_m) + height_m - np.median(height_m)
     mean_square_error_m2 = np.mean(np.minimum(error_m**2, MAX_HEIGHT_ERROR_M**2))
     min_variance_m2 = BAROMETER_SIGMA_M**2
-    variance_ratio = max(np.var(height_m), min_variance_m2) / max(
+    variance_ratio = np.maximum(np.var(height_m), min_variance_m2) / np.maximum(
         mean_square_error_m2, min_variance_m2
     )
     return 0.5 * INDEPENDENT_HEIGHT_ERROR_COUNT * float(np.log(variance_ratio))

@@ -104,7 +104,9 @@ NAME_LIST_KEYS = ("axes", "lever_arm", "flags")
 AIDS, STATUS_FLAGS = (
     {
         name: msgspec.convert(
-            {"name": name, **_PARAMETER_TABLES["groups"].get(name.partition("_")[0], {}), **row}
+            {"name": name, "flags": [f"cs_{name}"]}
+            | _PARAMETER_TABLES["groups"].get(name.partition("_")[0], {})
+            | row
             | {key: row[key].split(",") for key in NAME_LIST_KEYS if key in row},
             Aid,
         )

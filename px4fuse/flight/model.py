@@ -322,6 +322,7 @@ class Columns:
     VELOCITY_VARIANCE: Final = ["north_m2_s2", "east_m2_s2", "down_m2_s2"]
     SPECIFIC_FORCE: Final = ["forward_m_s2", "right_m_s2", "down_m_s2"]
     ANGULAR_RATE: Final = ["forward_rad_s", "right_rad_s", "down_rad_s"]
+    ANTENNA_POSITION: Final = [f"antenna_{axis}_m" for axis in BODY_AXES]
     QUATERNION: Final = ["w", "x", "y", "z"]
     ROTATION_VARIANCE: Final = ["forward_rad2", "right_rad2", "down_rad2"]
     # EKF2's state and variances at the fusion horizon

@@ -16,8 +16,7 @@ from px4fuse.flight.model import (
     find_source_origin,
 )
 from px4fuse.readers import mavlink_messages as messages
-from px4fuse.readers.common import join_nearest, read_attitude, read_orientation
-from px4fuse.readers.field_maps import Layout
+from px4fuse.readers.common import Layout, join_nearest, read_attitude, read_orientation
 from px4fuse.readers.mavlink_frames import MavlinkAddress
 from px4fuse.readers.mavlink_recording import BOOT_CLOCK_TEXT, RECEIPT_CLOCK_TEXT, Recording
 from px4fuse.readers.mavlink_senders import ClockMapping, find_senders

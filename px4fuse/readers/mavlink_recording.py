@@ -18,8 +18,7 @@ from scipy.stats import theilslopes
 
 from px4fuse.core.arrays import Array, IntArray
 from px4fuse.flight.model import Columns, DataSource, time_index
-from px4fuse.readers.common import MIN_QUATERNION_NORM
-from px4fuse.readers.field_maps import MAX_FIELD_VALUE, Layout
+from px4fuse.readers.common import MAX_FIELD_VALUE, MIN_QUATERNION_NORM, Layout
 from px4fuse.readers.mavlink_frames import (
     MavlinkAddress,
     MavlinkFrames,

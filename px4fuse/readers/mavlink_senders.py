@@ -313,7 +313,7 @@ def _fit_timesync(sender_replies: ArrayPair, autopilot_replies: ArrayPair) -> Cl
     if not clock_fits:
         return None
     x0 = clock_fits[0].x0
-    line_parameters = [(line.at(x0), line.slope, line.jitter_s) for line in clock_fits]
+    line_parameters = [(float(line.at(x0)), line.slope, line.jitter_s) for line in clock_fits]
     y0, slope, jitter_s = np.mean(line_parameters, axis=0).tolist()
     return ClockLine(x0, y0, slope, jitter_s, sum(line.reading_pair_count for line in clock_fits))
 

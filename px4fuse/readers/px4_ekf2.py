@@ -28,7 +28,7 @@ from px4fuse.flight.model import (
     sample_step_function,
     time_index,
 )
-from px4fuse.readers.field_maps import Layout
+from px4fuse.readers.common import Layout
 from px4fuse.readers.px4_innovations import (
     collect_innovations_by_axis,
     read_aids,

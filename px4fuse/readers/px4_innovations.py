@@ -24,8 +24,7 @@ from px4fuse.flight.model import (
     sample_step_function,
 )
 from px4fuse.readers import px4_topics as px4
-from px4fuse.readers.common import join_nearest
-from px4fuse.readers.field_maps import Layout, assign_fields_to_columns
+from px4fuse.readers.common import Layout, assign_fields_to_columns, join_nearest
 from px4fuse.readers.ulog_topics import Topics
 
 # Maximum time (s) between innovation and variance S; PX4 logs them every 0.5 s by default

@@ -38,7 +38,6 @@ from px4fuse.readers.px4_ekf2 import configured_step_s
 from px4fuse.readers.px4_fixes import read_unlogged_fixes, reconstruct_fixes
 from px4fuse.readers.px4_innovations import has_fused_aid
 from px4fuse.readers.px4_topics import (
-    ANTENNA_COLUMNS,
     FRAME_BY_FIELD_VALUE,
     FUSED_OBSERVATION_TRACK_NAME,
     GPS_POSITION,
@@ -249,7 +248,7 @@ def _describe_timestamp_clock(published_us: IntArray, sample_timestamps_us: IntA
     """Return clock and unit of timestamps, for example "UNIX time in seconds"."""
     if not sample_timestamps_us.any():
         return "0"
-    rate_ratio = np.ptp(published_us) / max(np.ptp(sample_timestamps_us), 1)
+    rate_ratio = np.ptp(published_us) / np.maximum(np.ptp(sample_timestamps_us), 1)
     for unit, unit_us in MICROSECONDS_BY_UNIT.items():
         if abs(rate_ratio / unit_us - 1.0) < MAX_CLOCK_RATE_ERROR_FRACTION:
             if (
@@ -475,8 +474,8 @@ def _read_gnss_track(topics: Topics, ekf2: Ekf2 | Unavailable) -> PositionTrack 
             notes.append(note)
     track_fields: dict[str, Any] = {}
     # The lever arm of the receiver is logged since v1.17
-    if {*ANTENNA_COLUMNS} <= {*fixes}:
-        track_fields["lever_arm_m"] = tuple(fixes[ANTENNA_COLUMNS].iloc[-1].tolist())
+    if {*Columns.ANTENNA_POSITION} <= {*fixes}:
+        track_fields["lever_arm_m"] = tuple(fixes[Columns.ANTENNA_POSITION].iloc[-1].tolist())
     times_without_fix_s = messages["published_s"].to_numpy()[~has_fix] - delay_s
     return _make_ulog_track(
         topics,

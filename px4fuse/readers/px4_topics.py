@@ -13,7 +13,7 @@ from msgspec import structs
 from px4fuse.core.record import read_toml
 from px4fuse.flight.ekf2_parameters import AIDS
 from px4fuse.flight.model import SourceOrigin, find_source_origin
-from px4fuse.readers.field_maps import Layout, expand_layouts
+from px4fuse.readers.common import Layout, expand_layouts
 
 
 @dataclass(frozen=True)
@@ -72,7 +72,6 @@ ATTITUDE_VARIANCE_COUNT_BY_ARRAY_LENGTHS: Mapping[tuple[int, int], int] = {
     (32, 28): 4,  # before v1.9: only the first 24 states are used
 }
 QUATERNION_VARIANCE_COUNT = 4
-ANTENNA_COLUMNS = ["antenna_forward_m", "antenna_right_m", "antenna_down_m"]
 # Values of the option --position-source
 FUSED_OBSERVATION_TRACK_NAME = "estimator_aid_src_ev_pos"
 RECONSTRUCTED_TRACK_NAME = "ekf2_state_plus_innovation"

@@ -16,7 +16,6 @@ from px4fuse.flight.model import (
     time_index,
 )
 from px4fuse.readers import common
-from px4fuse.readers.field_maps import Layout
 from px4fuse.readers.px4_ekf2 import read_ekf2
 from px4fuse.readers.px4_positions import FIX_TYPE_3D, barometer, read_positions, read_truth
 from px4fuse.readers.px4_topics import (
@@ -128,7 +127,7 @@ def _estimate_start_unix_s(topics: Topics) -> float | None:
 
 
 def _require_samples(
-    topics: Topics, samples: pd.DataFrame, name: str, layout: Layout, remedy: str
+    topics: Topics, samples: pd.DataFrame, name: str, layout: common.Layout, remedy: str
 ) -> TableOrUnavailable:
     """Return the samples of a topic, or the reason if there are fewer than two."""
     topic = layout.topic

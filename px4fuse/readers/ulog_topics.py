@@ -39,7 +39,7 @@ from px4fuse.flight.model import (
     sample_step_function,
     time_index,
 )
-from px4fuse.readers.field_maps import MAX_FIELD_VALUE, Layout
+from px4fuse.readers.common import MAX_FIELD_VALUE, Layout
 from px4fuse.readers.px4_topics import IMU_LAYOUT, TOPIC_LAYOUTS, list_topics
 
 _MICROSECOND_S = 1e-6
