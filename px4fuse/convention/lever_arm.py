@@ -120,10 +120,10 @@ def _fit_lever_arm_to_truth(flight: Flight, truth: Truth, track: PositionTrack) 
     )
     lever_arm = _make_lever_arm(fitted_parameters, covariance, rotation_deg)
     lever_arm = lever_arm._replace(rotation_sigma_deg=lever_arm.rotation_sigma_deg / path_radius_m)
-    is_significant = lever_arm.horizontal_length_m > max(
+    min_length_m = max(
         MIN_LEVER_ARM_WITH_TRUTH_M, MIN_LEVER_ARM_SIGMAS_WITH_TRUTH * lever_arm.sigma_m
     )
-    return lever_arm if is_significant and lever_arm.horizontal_length_m < MAX_LEVER_ARM_M else None
+    return lever_arm if min_length_m < lever_arm.horizontal_length_m < MAX_LEVER_ARM_M else None
 
 
 def _make_lever_arm(parameters: Array, covariance: Array, rotation_deg: float) -> LeverArm:

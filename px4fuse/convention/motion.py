@@ -155,11 +155,11 @@ def integrate_inertial_data(flight: Flight) -> InertialData | None:
     )
     if len(time_s) < 4 * SECOND_DIFFERENCE_WINDOW_S / INTEGRATION_STEP_S:
         return None
-    columns = [*Columns.SPECIFIC_FORCE, *Columns.ANGULAR_RATE]
-    imu_integrals = (integrate_cumulatively(imu[name].to_numpy(), imu_times_s) for name in columns)
-    imu_increments = np.diff(
-        [np.interp(time_s, imu_times_s, integral) for integral in imu_integrals]
-    ).T
+    imu_integrals = [
+        np.interp(time_s, imu_times_s, integrate_cumulatively(imu[name].to_numpy(), imu_times_s))
+        for name in Columns.SPECIFIC_FORCE + Columns.ANGULAR_RATE
+    ]
+    imu_increments = np.diff(imu_integrals).T
     specific_force_m_s2 = imu_increments[:, :3] / INTEGRATION_STEP_S
     logged_attitude = interpolate_attitude(attitude, time_s)
     gyro_attitude = _level_attitude(

@@ -80,8 +80,9 @@ def read_mavlink(name: str, content: bytes, system_id: int | None = None) -> Fli
     attitude = _read_attitude(recording)
     ekf2 = _read_ekf2(recording, parameters)
     # Only PX4 has a parameter for the delay of GNSS
-    delay_parameters = fill_with_defaults(parameters, GNSS_POS) if autopilot == "PX4" else {}
-    gnss_delay_s = 1e-3 * delay_parameters.get(GNSS_POS.delay, 0.0)
+    gnss_delay_s = 0.0
+    if autopilot == "PX4":
+        gnss_delay_s = 1e-3 * fill_with_defaults(parameters, GNSS_POS)[GNSS_POS.delay]
     positions, unavailable_positions = read_positions(recording, clock_mappings, gnss_delay_s)
     truth = read_truth(recording, positions)
     airborne_spans_s = _read_airborne_spans(recording)
@@ -263,7 +264,6 @@ def _describe_log(
 ) -> LogInfo:
     frames, autopilot = recording.frames, recording.autopilot
     notes, damage_notes = [*recording.notes], []
-    reversal_count = np.count_nonzero(np.diff(recording.receive_times_s) < 0.0)
     if frames.unknown_frame_count:
         notes.append(
             "number of ignored MAVLink frames with unknown message type: "
@@ -310,7 +310,7 @@ def _describe_log(
             *describe_dropped_samples(dropped_counts),
         ),
         restarts=recording.restart_count,
-        receive_time_reversals=int(reversal_count) or None,
+        receive_time_reversals=int(np.sum(np.diff(recording.receive_times_s) < 0.0)) or None,
         dropped=dropped_counts,
         autopilot=autopilot,
         start_unix_s=_estimate_start_unix_s(recording),

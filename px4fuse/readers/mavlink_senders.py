@@ -374,8 +374,9 @@ def describe_senders(recording: Recording) -> tuple[Sender, ...]:
                 name = messages.AUTOPILOT_NAME_BY_ID.get(autopilot, "autopilot")
                 description = f"{name} {description}"
         lost_fraction = _estimate_lost_fraction(frames, address)
-        is_analysed = address == recording.address
-        senders.append(Sender(*address, description, count, lost_fraction, is_analysed))
+        senders.append(
+            Sender(*address, description, count, lost_fraction, address == recording.address)
+        )
     return tuple(senders)
 
 

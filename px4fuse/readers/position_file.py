@@ -446,10 +446,9 @@ def _detect_time_column(
     )
     time_text = table.format_labels(time_column)
     for index in [*other_time_columns]:
-        is_whole_second = numbers[time_column] % 1.0 == 0.0
         if (
             column_meanings[index].unit == "ns"
-            and is_whole_second.mean() > MIN_MATCHING_ROW_FRACTION
+            and (numbers[time_column] % 1.0 == 0.0).mean() > MIN_MATCHING_ROW_FRACTION
             and numbers[index].max() < 1e9
         ):
             numbers[time_column] += numbers[index] * 1e-9

@@ -404,9 +404,9 @@ def _read_magnetic_field(topics: Topics, step_s: float) -> pd.DataFrame:
     # EKF2 subtracts EKF2_MAG_DELAY and half a prediction interval from the times of observations
     delay_s = topics.ekf2_parameters.get("EKF2_MAG_DELAY", 0.0) * 1e-3 + 0.5 * step_s
     observations = observations.set_axis(observations.index + delay_s)
-    min_count = MIN_MAGNETOMETER_HZ * topics.log.duration_s
     field = max(magnetometer, observations, key=len)
-    if len(field) <= min_count and Columns.MAGNETIC_FIELD_INNOVATION[0] in observations:
+    is_incomplete = len(field) <= MIN_MAGNETOMETER_HZ * topics.log.duration_s
+    if is_incomplete and Columns.MAGNETIC_FIELD_INNOVATION[0] in observations:
         field = observations
     control_bits = topics.read(TOPIC_LAYOUTS["control_bits"])["bits"].dropna()
     if field.empty or control_bits.empty:

@@ -128,10 +128,8 @@ def replace_vision_by_gnss_innovations(ekf2: Ekf2, source: Ekf2PositionSource = 
         GNSS.logging_remedy,
     )
     if enabled_flags:
-        columns = ["horizontal", "vertical", "yaw"]
-        fusion_flags = (
-            pd.DataFrame(enabled_flags).ffill().bfill().reindex(columns=columns, fill_value=0.0)
-        )
+        flags = pd.DataFrame(enabled_flags).ffill().bfill()
+        fusion_flags = flags.reindex(columns=["horizontal", "vertical", "yaw"], fill_value=0.0)
     gate = ekf2.parameters.get(GNSS_POS.gate, GNSS_POS.default_gate)
     innovations, topics = collect_innovations_by_axis(ekf2.aids, fusion_flags, gate, source)
     return replace(
@@ -233,10 +231,11 @@ def read_aids(topics: Topics, enabled_aids: StepFunctions) -> dict[str, AidLog]:
 def read_enabled_aids(topics: Topics) -> dict[str, pd.Series[float]]:
     """Return a time series for each aiding source: 1 while its fusion is enabled, otherwise 0."""
     all_aids = (*AIDS.values(), *STATUS_FLAGS.values())
-    flag_names = {flag for aid in all_aids for group in aid.flags for flag in group.split("|")}
     layout = Layout(
         px4.STATUS_FLAGS_TOPIC,
-        optional_columns={name: name for name in flag_names},
+        optional_columns={
+            flag: flag for aid in all_aids for group in aid.flags for flag in group.split("|")
+        },
         is_step_function=True,
     )
     flags = topics.primary_samples(layout)

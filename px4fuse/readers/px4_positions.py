@@ -156,8 +156,9 @@ def make_track(
             fault = HEIGHT_ONLY_REASON
         return unavailable_source(name, fault, remedy)
     if origin.kind == "uwb":
-        kind = "vio" if is_odometry else infer_position_kind(samples)
-        origin = structs.replace(origin, kind=kind)
+        origin = structs.replace(
+            origin, kind="vio" if is_odometry else infer_position_kind(samples)
+        )
     variance = samples[Columns.POSITION_VARIANCE]
     return PositionTrack(
         name=name,

@@ -113,8 +113,10 @@ def refuse_foreign_format(path: Path, first_bytes: bytes, error_type: type[Px4Fu
     for foreign_format in _TEXT_FORMATS["foreign"]:
         starts = tuple(start.encode("latin-1") for start in foreign_format["starts"])
         if first_bytes.startswith(starts):
-            remedy = foreign_format["remedy"].format(name=name)
-            raise error_type(f"{name}: the file is {foreign_format['name']}", remedy)
+            raise error_type(
+                f"{name}: the file is {foreign_format['name']}",
+                foreign_format["remedy"].format(name=name),
+            )
 
 
 def decode_text(content: bytes) -> str | None:
@@ -222,7 +224,7 @@ def find_table(
         )
     if last_line.strip() and not is_last_line_complete:
         note = "the last line of the position file was dropped, because it is incomplete"
-        table = replace(table, notes=(*table.notes, note))
+        return replace(table, notes=(*table.notes, note))
     return table
 
 

@@ -192,7 +192,7 @@ def _detect_frame(kind: TrajectoryKind, position_m: Array) -> tuple[Frame, str]:
 def _describe_gaps(time_s: Array) -> str:
     """Return a note on gaps or irregular intervals between poses; "" if there are none."""
     intervals_s = np.diff(time_s)
-    median_interval_s = float(np.median(intervals_s))
+    median_interval_s = np.median(intervals_s)
     max_deviation_s = MAX_MEDIAN_INTERVAL_DEVIATION * median_interval_s
     is_regular = np.abs(intervals_s - median_interval_s) <= max_deviation_s
     if np.mean(is_regular) < MIN_REGULAR_INTERVAL_FRACTION:
