@@ -176,6 +176,10 @@ class Recording:
         rows = self.rows_of_all_senders(message)
         return rows[self.frames.is_sent_by(address or self.address, rows)]
 
+    def table(self, message: str) -> NDArray[Any]:
+        """Return the fields of all messages of one type from the autopilot, in MAVLink units."""
+        return self.frames.table(message, self.rows(message))
+
     def find_most_frequent(self, layouts: Sequence[Layout]) -> Layout:
         """Return the layout whose message the autopilot sent most often."""
         return max(layouts, key=lambda layout: len(self.rows(layout.topic)))
@@ -397,7 +401,7 @@ def _remove_stray_timestamps(times_s: Array, rows: IntArray) -> IntArray:
 
 def map_boot_to_unix(recording: Recording) -> ClockLine | None:
     """Return the conversion of boot time to UNIX time; None if SYSTEM_TIME has no UNIX time."""
-    table = recording.frames.table("SYSTEM_TIME", recording.rows("SYSTEM_TIME"))
+    table = recording.table("SYSTEM_TIME")
     table = table[table["time_unix_usec"] * 1e-6 > MIN_UNIX_TIME_S]
     if not len(table):
         return None

@@ -12,8 +12,15 @@ import numpy as np
 from px4fuse.core.arrays import Array, ArrayPair, IntArray
 from px4fuse.errors import SettingsError
 from px4fuse.flight.model import ClockMap, Sender
-from px4fuse.readers import mavlink_messages as messages
 from px4fuse.readers.mavlink_frames import VEHICLE_TYPES, MavlinkAddress, MavlinkFrames
+from px4fuse.readers.mavlink_messages import (
+    AUTOPILOT_COMPONENT_ID,
+    AUTOPILOT_MESSAGES,
+    AUTOPILOT_NAME_BY_ID,
+    GROUND_STATION_TYPE,
+    NO_AUTOPILOT,
+    POSITION_MESSAGE_TYPES,
+)
 from px4fuse.readers.mavlink_recording import (
     MAX_RELATIVE_CLOCK_RATE_DIFFERENCE,
     MIN_BACKWARD_STEP_AT_RESTART_S,
@@ -73,7 +80,7 @@ def _count_frames(
 
 
 def _is_vehicle(vehicle_type: int, autopilot: int) -> bool:
-    return autopilot != messages.NO_AUTOPILOT and vehicle_type != messages.GROUND_STATION_TYPE
+    return autopilot != NO_AUTOPILOT and vehicle_type != GROUND_STATION_TYPE
 
 
 def choose_autopilot(frames: MavlinkFrames, system_id: int | None) -> tuple[MavlinkAddress, str]:
@@ -93,7 +100,7 @@ def choose_autopilot(frames: MavlinkFrames, system_id: int | None) -> tuple[Mavl
         for address in frame_counts
         if address in vehicle_types and _is_vehicle(*vehicle_types[address])
     ]
-    rows = np.concatenate([frames.rows(message) for message in messages.AUTOPILOT_MESSAGES])
+    rows = np.concatenate([frames.rows(message) for message in AUTOPILOT_MESSAGES])
     addresses_with_autopilot_message = _count_frames(frames, rows)
     # A heartbeat is not sufficient, because companion computers may also send autopilot heartbeats
     candidates = (
@@ -101,7 +108,7 @@ def choose_autopilot(frames: MavlinkFrames, system_id: int | None) -> tuple[Mavl
         or [address for address in addresses_with_autopilot_message if address not in vehicle_types]
         or vehicle_addresses
         # If no message is from an autopilot, assume one in each system
-        or [(system, messages.AUTOPILOT_COMPONENT_ID) for system, _ in frame_counts]
+        or [(system, AUTOPILOT_COMPONENT_ID) for system, _ in frame_counts]
     )
     if system_id is not None:
         candidates = [
@@ -115,7 +122,7 @@ def choose_autopilot(frames: MavlinkFrames, system_id: int | None) -> tuple[Mavl
             )
     best_address = max(candidates, key=lambda address: frame_counts.get(address, 0))
     _, autopilot_type = vehicle_types.get(best_address, (-1, -1))
-    return best_address, messages.AUTOPILOT_NAME_BY_ID.get(autopilot_type, "unknown autopilot")
+    return best_address, AUTOPILOT_NAME_BY_ID.get(autopilot_type, "unknown autopilot")
 
 
 def find_senders(recording: Recording, message: str) -> list[MavlinkAddress]:
@@ -136,7 +143,7 @@ def find_senders(recording: Recording, message: str) -> list[MavlinkAddress]:
 
 def map_sender_clocks(recording: Recording) -> dict[MavlinkAddress, ClockMapping]:
     """Return the conversion of each position sender's clock to the autopilot's boot clock."""
-    message_names = {source.message for source in messages.POSITION_MESSAGE_TYPES}
+    message_names = {source.message for source in POSITION_MESSAGE_TYPES}
     senders = {address for message in message_names for address in find_senders(recording, message)}
     boot_to_unix_fit = map_boot_to_unix(recording)
     return {
@@ -150,7 +157,7 @@ def _map_sender_clock(
     frames = recording.frames
     timestamps_s = []
     receive_times_s = []
-    for source in messages.POSITION_MESSAGE_TYPES:
+    for source in POSITION_MESSAGE_TYPES:
         rows = recording.rows(source.message, sender)
         timestamps_s.append(frames.table(source.message, rows)[source.timestamp_field] * 1e-6)
         receive_times_s.append(recording.receive_times_s[rows])
@@ -176,7 +183,7 @@ def _map_sender_clock(
     )
     timestamps_s.append(timesync_request_times_s[is_timesync_request])
     receive_times_s.append(recording.receive_times_s[rows][is_timesync_request])
-    autopilot_timesync = frames.table("TIMESYNC", recording.rows("TIMESYNC"))
+    autopilot_timesync = recording.table("TIMESYNC")
     autopilot_reply_times_s = autopilot_timesync["tc1"] * 1e-9
     sender_request_times_s = autopilot_timesync["ts1"] * 1e-9
     is_autopilot_reply = (autopilot_reply_times_s != 0.0) & (
@@ -370,8 +377,8 @@ def describe_senders(recording: Recording) -> tuple[Sender, ...]:
         if address in vehicle_types:
             vehicle_type, autopilot = vehicle_types[address]
             description = VEHICLE_TYPES.get(vehicle_type, f"vehicle of MAV_TYPE {vehicle_type}")
-            if autopilot != messages.NO_AUTOPILOT:
-                name = messages.AUTOPILOT_NAME_BY_ID.get(autopilot, "autopilot")
+            if autopilot != NO_AUTOPILOT:
+                name = AUTOPILOT_NAME_BY_ID.get(autopilot, "autopilot")
                 description = f"{name} {description}"
         lost_fraction = _estimate_lost_fraction(frames, address)
         senders.append(
