@@ -6,7 +6,7 @@ import shlex
 import unicodedata
 from collections.abc import Callable, Mapping, Sequence
 from contextlib import suppress
-from dataclasses import fields, is_dataclass
+from dataclasses import is_dataclass
 from datetime import UTC, datetime
 from decimal import Decimal
 from functools import cache
@@ -38,7 +38,7 @@ def to_json_types(value: object) -> Any:
     if isinstance(value, msgspec.Struct):
         value = msgspec.structs.asdict(value)
     elif is_dataclass(value):
-        value = {field.name: getattr(value, field.name) for field in fields(value)}
+        value = vars(value)
     if isinstance(value, Mapping):
         json_by_name = {str(name): to_json_types(child) for name, child in value.items()}
         return {name: child for name, child in json_by_name.items() if child is not None}

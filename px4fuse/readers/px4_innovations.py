@@ -159,13 +159,13 @@ def collect_innovations_by_axis(
         if axis == "down":
             axis_group, quantity = "vertical", "height"
             aid_name, sensor_name = source.vertical_aid, source.height_sensor or source.name
-        aid_log = aids.get(aid_name)
-        axis_innovations = None if aid_log is None else select_axis_innovations(aid_log, axis, gate)
         remedy = source.logging_remedy
         if isinstance(fusion_flags, pd.DataFrame) and not fusion_flags[axis_group].any():
             reason = f"EKF2 never fused the {quantity} from {sensor_name} in this log"
             remedy = source.remedies[axis_group]
-        elif aid_log is None or axis_innovations is None or axis_innovations.empty:
+        elif (aid_log := aids.get(aid_name)) is None or (
+            axis_innovations := select_axis_innovations(aid_log, axis, gate)
+        ).empty:
             reason = (
                 f"the log has no usable innovation of {sensor_name} in "
                 f"estimator_aid_src_{source.horizontal_aid}, "

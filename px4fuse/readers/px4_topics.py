@@ -103,5 +103,5 @@ def list_topics() -> list[str]:
     }
     layout_topics |= {layout.topic for layout in TOPIC_LAYOUTS.values() if layout.topic}
     layout_topics |= {f"estimator_aid_src_{name}" for name in AIDS}
-    aid_topics = {STATUS_FLAGS_TOPIC, *INNOVATION_TOPICS, OLD_INNOVATION_TOPIC}
-    return sorted(layout_topics | UNUSED_TOPICS.keys() | aid_topics | {*STATE_VECTOR_TOPICS})
+    layout_topics |= {STATUS_FLAGS_TOPIC, *INNOVATION_TOPICS, OLD_INNOVATION_TOPIC}
+    return sorted(layout_topics | UNUSED_TOPICS.keys() | {*STATE_VECTOR_TOPICS})

@@ -49,14 +49,20 @@ def read_ulog(name: str, content: bytes) -> Flight:
         The content is not a ULog, or contains no usable data.
     """
     topics = read_topics(name, content)
-    remedy = "Check that the accelerometer and gyroscope were running during logging."
-    imu = _require_samples(topics, _read_imu(topics), "IMU", IMU_LAYOUT, remedy)
-    attitude_samples = common.select_rows_with_attitude(
-        topics.read(TOPIC_LAYOUTS["vehicle_attitude"])
+    imu = _require_samples(
+        topics,
+        _read_imu(topics),
+        "IMU",
+        IMU_LAYOUT,
+        "Check that the accelerometer and gyroscope were running during logging.",
     )
-    remedy = "Check that EKF2 was running during logging (EKF2_EN is 1)."
+    attitude_layout = TOPIC_LAYOUTS["vehicle_attitude"]
     attitude = _require_samples(
-        topics, attitude_samples, "attitude", TOPIC_LAYOUTS["vehicle_attitude"], remedy
+        topics,
+        common.select_rows_with_attitude(topics.read(attitude_layout)),
+        "attitude",
+        attitude_layout,
+        "Check that EKF2 was running during logging (EKF2_EN is 1).",
     )
     ekf2 = read_ekf2(topics)
     positions, unavailable_positions = read_positions(topics, ekf2)
@@ -68,7 +74,7 @@ def read_ulog(name: str, content: bytes) -> Flight:
     barometer_delay_s = topics.ekf2_parameters.get(BAROMETER.delay, 0.0) * 1e-3
     is_in_flight = common.ends_in_flight(airborne_spans_s, topics.log.duration_s)
     dropped_counts = dict(sorted(topics.dropped.items()))
-    tilt_failure_flags = topics.read(TOPIC_LAYOUTS["failure_detector_status"])[["roll", "pitch"]]
+    tilt_failure_flags = topics.read(TOPIC_LAYOUTS["failure_detector_status"])
     return Flight(
         log=structs.replace(
             topics.log,
@@ -166,5 +172,5 @@ def _read_airborne_spans(topics: Topics) -> Spans | Unavailable:
             "vehicle_land_detected is not logged or not usable",
             f"{DEFAULT_PROFILE_REMEDY} Alternatively, give the flight time (--start, --end).",
         )
-    topics.record_stream("airborne", TOPIC_LAYOUTS["vehicle_land_detected"].topic)
+    topics.record_stream("airborne", "vehicle_land_detected")
     return common.find_flight_spans(land_detected["landed"], topics.log.duration_s)

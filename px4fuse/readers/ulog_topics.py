@@ -460,10 +460,10 @@ def _read_parameters(
         for name, value in ulog.initial_parameters.items()
         if isinstance(value, int | float)
     }
-    layout, take_off_time_us = TOPIC_LAYOUTS["vehicle_land_detected"], 0
-    landed = tables.get((layout.topic, 0), {}).get(layout.columns["landed"])
+    land_detector, take_off_time_us = tables.get(("vehicle_land_detected", 0), {}), 0
+    landed = land_detector.get("landed")
     if landed is not None and not landed.all():
-        take_off_time_us = int(tables[layout.topic, 0]["timestamp"][np.argmin(landed)])
+        take_off_time_us = int(land_detector["timestamp"][np.argmin(landed)])
     parameter_changes: list[ParameterChange] = []
     last_parameter_values = parameter_values.copy()
     for time_us, name, value in sorted(ulog.changed_parameters, key=lambda change: change[0]):
