@@ -138,8 +138,9 @@ def find_correlation_peak(
     peak = CorrelationPeak(compute_lag_s(best_index), concordance[best_index])
     if not can_be_second_peak.any():
         return peak
-    residual_square_sum_m2 = np.maximum(square_sum_m2 - 2.0 * rotated_covariance, 0.0)
-    mean_square_residual_m2 = residual_square_sum_m2 / (2.0 * np.maximum(common_sample_counts, 1.0))
+    mean_square_residual_m2 = np.maximum(square_sum_m2 - 2.0 * rotated_covariance, 0.0) / (
+        2.0 * np.maximum(common_sample_counts, 1.0)
+    )
     residual_m = np.sqrt(mean_square_residual_m2 + INTERPOLATION_ERROR_M**2)
     second_peak_index = int(np.argmin(np.where(can_be_second_peak, residual_m, np.inf)))
     return replace(

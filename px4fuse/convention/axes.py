@@ -302,23 +302,20 @@ def find_convention_candidates(
         )
         + north_mean_square_m2
         + east_mean_square_m2
-    )
-    horizontal_residual_m2 = (
-        horizontal_residual_m2 - 2.0 * metres_per_unit * np.abs(correlation)[..., None]
+        - 2.0 * metres_per_unit * np.abs(correlation)[..., None]
     ) / 2.0
     down_residual_m2 = (
-        metres_per_unit**2 * source_mean_square[:, vertical_axis] + down_mean_square_m2
+        metres_per_unit**2 * source_mean_square[:, vertical_axis]
+        + down_mean_square_m2
+        - 2.0 * metres_per_unit * (vertical_sign * cross_moments[:, vertical_axis, 2])[..., None]
     )
-    down_residual_m2 -= (
-        2.0 * metres_per_unit * (vertical_sign * cross_moments[:, vertical_axis, 2])[..., None]
+    log_likelihood_per_residual = 0.5 * (
+        np.sum(np.log(source_mean_square), axis=1)[:, None]
+        + 6.0 * np.log(metres_per_unit)
+        - 2.0 * np.log(np.maximum(horizontal_residual_m2, MIN_HORIZONTAL_SIGMA_M**2))
+        - np.log(np.maximum(down_residual_m2, MIN_VERTICAL_SIGMA_M**2))
     )
-    score = np.sum(np.log(source_mean_square), axis=1)[:, None] + 6.0 * np.log(metres_per_unit)
-    score = score - 2.0 * np.log(np.maximum(horizontal_residual_m2, MIN_HORIZONTAL_SIGMA_M**2))
-    score = (
-        0.5
-        * independent_residual_count
-        * (score - np.log(np.maximum(down_residual_m2, MIN_VERTICAL_SIGMA_M**2)))
-    )
+    score = independent_residual_count * log_likelihood_per_residual
     rotation_rad = np.angle(correlation)
     nearest_quarter_turns = np.round(rotation_rad / (np.pi / 2.0)).astype(int) % 4
     hypotheses = []
@@ -480,7 +477,7 @@ def _evaluate_hypothesis(
     parameter_step = np.zeros(len(PARAMETER_PRIOR_PRECISION))
     parameter_step[is_parameter_estimated] = -np.linalg.solve(normal_matrix, gradient)
     parameter_step[0] = np.clip(parameter_step[0], -MAX_TIME_OFFSET_STEP_S, MAX_TIME_OFFSET_STEP_S)
-    scored_hypothesis = replace(
+    return replace(
         hypothesis,
         score=float(
             independent_residual_count * log_likelihood_gain
@@ -490,8 +487,7 @@ def _evaluate_hypothesis(
         max_source_to_imu_displacement_ratio=source_square_sum / source_imu_product_sum,
         residual_sigma_m=np.sqrt(variances[0]),
         independent_residual_count=independent_residual_count,
-    )
-    return scored_hypothesis, parameter_step
+    ), parameter_step
 
 
 def _fit_student_distributions(

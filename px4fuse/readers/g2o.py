@@ -181,10 +181,9 @@ def format_g2o(graph: PoseGraph) -> str:
     pose_type = "SE2" if graph.dimension == 2 else "SE3:QUAT"
     ids = graph.ids.tolist()
     upper_triangle = np.triu_indices(graph.degrees_of_freedom)
-    id_pose_pairs = zip(ids, graph.poses.tolist(), strict=True)
     lines = [
         f"VERTEX_{pose_type} {vertex_id} {' '.join(map(repr, pose))}"
-        for vertex_id, pose in id_pose_pairs
+        for vertex_id, pose in zip(ids, graph.poses.tolist(), strict=True)
     ]
     lines.append(f"FIX {ids[0]}")
     edge_values = np.hstack(
