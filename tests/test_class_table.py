@@ -18,7 +18,7 @@ from px4fuse.classroom.grading.outputs import (
     TITLES_BEFORE_ITEMS,
     format_class_table,
 )
-from px4fuse.core.spreadsheet import MAX_CELL_LENGTH, neutralise_formulas
+from px4fuse.core.text import MAX_CELL_LENGTH, neutralise_formulas
 from px4fuse.verification.model import Verification
 
 VERIFIED = Verification("verified", (), True)

@@ -6,14 +6,32 @@ from functools import partial
 import numpy as np
 import pandas as pd
 
-from px4fuse.alignment import time_and_pose_fit, tracks
 from px4fuse.alignment.time_and_pose_fit import (
     INTERPOLATION_ERROR_M,
     MIN_CONCORDANCE_TO_ACCEPT_MATCH,
     CorrelationPeak,
     TrackFit,
+    find_correlation_peak,
+    fit_by_least_squares,
 )
-from px4fuse.alignment.tracks import EKF2_REFERENCE, IMU_REFERENCE, NoMatchError, SampledTrack
+from px4fuse.alignment.tracks import (
+    EKF2_REFERENCE,
+    IMU_REFERENCE,
+    MIN_MOTION_M,
+    MIN_OVERLAP_S,
+    NoMatchError,
+    SampledTrack,
+    align_samples,
+    apply_band_pass,
+    compute_horizontal_range_m,
+    convert_to_ned,
+    make_continuous_ekf2_track,
+    make_ekf2_references,
+    make_imu_references,
+    mark_transients,
+    remove_spikes,
+    resample_to_grid,
+)
 from px4fuse.flight.model import Flight, Unavailable
 from px4fuse.trajectory.time_offset import GRID_STEP_S, MIN_SECOND_BEST_RESIDUAL_RATIO
 
@@ -121,7 +139,7 @@ def find_match(flight: Flight, problem: AlignmentProblem) -> Match | None:
         if is_missing
     ]
     reasons = []
-    for make_references in (tracks.make_ekf2_references, tracks.make_imu_references):
+    for make_references in (make_ekf2_references, make_imu_references):
         try:
             match = _find_best_match(make_references(flight), problem)
             _require_unique_match(match)
@@ -146,24 +164,19 @@ def _find_best_match(references: list[SampledTrack], problem: AlignmentProblem) 
     frames = problem.frames or (
         FRAMES_FOR_ESTIMATED_YAW if yaw_rad is None else FRAMES_FOR_GIVEN_YAW
     )
-    if (
-        tracks.compute_horizontal_range_m(tracks.convert_to_ned(samples, frames[0]))
-        < tracks.MIN_MOTION_M
-    ):
+    if compute_horizontal_range_m(convert_to_ned(samples, frames[0])) < MIN_MOTION_M:
         raise NoMatchError(
-            f"the positions in the file change by less than {tracks.MIN_MOTION_M:g} m, too little "
+            f"the positions in the file change by less than {MIN_MOTION_M:g} m, too little "
             "for a match"
         )
     matches = []
     for reference in references:
         reference_name = reference.name
-        fits = {frame: _fit_file_in_frame(problem, reference, frame, yaw_rad) for frame in frames}
-        rms_m_by_frame = {
-            frame: fits[frame].residual_rms_m
-            for frame in sorted(fits, key=lambda frame: fits[frame].residual_rms_m)
-        }
-        best_frame = next(iter(rms_m_by_frame))
-        fit = estimated_yaw_fit = fits[best_frame]
+        fits = [(frame, _fit_file_in_frame(problem, reference, frame, yaw_rad)) for frame in frames]
+        fits.sort(key=lambda frame_and_fit: frame_and_fit[1].residual_rms_m)
+        rms_m_by_frame = {frame: fit.residual_rms_m for frame, fit in fits}
+        best_frame, fit = fits[0]
+        estimated_yaw_fit = fit
         if yaw_rad is not None:
             estimated_yaw_fit = _fit_file_in_frame(problem, reference, best_frame, None)
         is_given_yaw_wrong = is_reliable_fit(estimated_yaw_fit, reference_name) and (
@@ -234,13 +247,13 @@ def _refit_without_origin_resets(flight: Flight, match: Match, problem: Alignmen
     fit = match.time_offset_fit
     if match.reference.name == IMU_REFERENCE or isinstance(ekf2, Unavailable) or not ekf2.resets:
         return match
-    aligned_samples = tracks.align_samples(
+    aligned_samples = align_samples(
         problem.samples, match.frame, fit.yaw_rad, fit.origin_m, fit.lag_s
     )
-    ekf2_track = tracks.make_continuous_ekf2_track(ekf2, aligned_samples)
+    ekf2_track = make_continuous_ekf2_track(ekf2, aligned_samples)
     refit = partial(
-        time_and_pose_fit.fit_by_least_squares,
-        tracks.convert_to_ned(problem.samples, match.frame),
+        fit_by_least_squares,
+        convert_to_ned(problem.samples, match.frame),
         ekf2_track,
         is_lag_estimated=problem.lag_s is None,
     )
@@ -252,21 +265,21 @@ def _refit_without_origin_resets(flight: Flight, match: Match, problem: Alignmen
 def _fit_file_in_frame(
     problem: AlignmentProblem, reference: SampledTrack, frame: str, yaw_rad: float | None
 ) -> TrackFit:
-    file_track = tracks.convert_to_ned(problem.samples, frame)
+    file_track = convert_to_ned(problem.samples, frame)
     lag_s = problem.lag_s
-    grid_track = tracks.resample_to_grid(tracks.remove_spikes(file_track))
+    grid_track = resample_to_grid(remove_spikes(file_track))
     if reference.name == IMU_REFERENCE:
-        if len(grid_track.time_s) * GRID_STEP_S < tracks.MIN_OVERLAP_S:
+        if len(grid_track.time_s) * GRID_STEP_S < MIN_OVERLAP_S:
             raise NoMatchError(
-                f"the position file is shorter than {tracks.MIN_OVERLAP_S:g} s, too short for a "
+                f"the position file is shorter than {MIN_OVERLAP_S:g} s, too short for a "
                 "match with the IMU"
             )
-        position_m = tracks.apply_band_pass(tracks.apply_band_pass(grid_track.position_m))
-        file_track = grid_track = tracks.mark_transients(replace(grid_track, position_m=position_m))
+        position_m = apply_band_pass(apply_band_pass(grid_track.position_m))
+        file_track = grid_track = mark_transients(replace(grid_track, position_m=position_m))
     if lag_s is None:
-        peak = time_and_pose_fit.find_correlation_peak(grid_track, reference, yaw_rad)
+        peak = find_correlation_peak(grid_track, reference, yaw_rad)
     else:
         peak = CorrelationPeak(lag_s)
-    return time_and_pose_fit.fit_by_least_squares(
+    return fit_by_least_squares(
         file_track, reference, peak, yaw_rad, is_lag_estimated=lag_s is None
     )

@@ -12,14 +12,28 @@ import numpy as np
 import pandas as pd
 from msgspec import structs
 
-from px4fuse.alignment import matching, tracks
-from px4fuse.alignment.matching import AlignmentProblem, Match
+from px4fuse.alignment.matching import (
+    MIN_CONCORDANCE_WITHOUT_WARNING,
+    AlignmentProblem,
+    Match,
+    find_match,
+    is_reliable_fit,
+    needs_rotation,
+)
 from px4fuse.alignment.time_and_pose_fit import (
     MIN_CONCORDANCE_TO_ACCEPT_MATCH,
     compute_clipped_rms_m,
 )
-from px4fuse.alignment.tracks import EKF2_REFERENCE, IMU_REFERENCE, NoMatchError
-from px4fuse.convention.axes import METRES_PER_UNIT
+from px4fuse.alignment.tracks import (
+    EKF2_REFERENCE,
+    IMU_REFERENCE,
+    MIN_MATCHED_SAMPLES,
+    MIN_MOTION_M,
+    NoMatchError,
+    align_samples,
+    make_continuous_ekf2_track,
+)
+from px4fuse.convention.axes import MAX_TIME_OFFSET_S, METRES_PER_UNIT
 from px4fuse.convention.check import check_convention
 from px4fuse.convention.correction import MIN_FRAME_ROTATION_DEG
 from px4fuse.convention.texts import FRAME_AXES, UNIT_NAMES, describe_axes, describe_unit
@@ -49,17 +63,15 @@ def _explain_mismatch(
 ) -> tuple[str, str] | None:
     """Return error message and advice if the IMU shows wrong axes or a wrong unit of the file."""
     samples = problem.samples
-    span_s = max(float(samples.index[-1] - samples.index[0]), flight.log.duration_s)
+    span_s = max(samples.index[-1] - samples.index[0], flight.log.duration_s)
     if span_s > MAX_CONVENTION_CHECK_SPAN_S:
         return None
     time_s = samples.index - samples.index[0] + (problem.lag_s or 0.0)
-    positions = samples[["x_m", "y_m", "z_m"]] / metres_per_unit
-    position_samples = pd.DataFrame(
-        positions.to_numpy(), time_index(time_s.to_numpy()), Columns.POSITION
-    )
+    positions = samples[["x_m", "y_m", "z_m"]].to_numpy() / metres_per_unit
+    position_samples = pd.DataFrame(positions, time_index(time_s.to_numpy()), Columns.POSITION)
     track = PositionTrack("", POSITION_FILE_ORIGIN, "", position_samples, "unknown", "", ())
-    time_offset_limits = {} if problem.lag_s is not None else {"max_time_offset_s": span_s}
-    convention = check_convention(flight, track, **time_offset_limits)
+    max_time_offset_s = span_s if problem.lag_s is None else MAX_TIME_OFFSET_S
+    convention = check_convention(flight, track, max_time_offset_s)
     if convention is None or convention.verdict != "determined":
         return None
     axes, faults = convention.axes, []
@@ -118,10 +130,9 @@ def align_position_file(
     """
     _check_options(frame, yaw_deg, clock_offset_s)
     samples = select_valid_rows(recording.samples, ["x_m", "y_m"])
-    if len(samples) < tracks.MIN_MATCHED_SAMPLES:
+    if len(samples) < MIN_MATCHED_SAMPLES:
         raise MissingDataError(
-            f"{recording.name} contains {len(samples)} positions; {tracks.MIN_MATCHED_SAMPLES} are "
-            "needed",
+            f"{recording.name} contains {len(samples)} positions; {MIN_MATCHED_SAMPLES} are needed",
             "Check that the position file contains the whole flight.",
         )
     start_s, end_s = samples.index[[0, -1]].tolist()
@@ -139,10 +150,9 @@ def align_position_file(
             "Correct or omit --clock-offset.",
         )
     yaw_rad = None if yaw_deg == "auto" else float(np.radians(yaw_deg or 0.0))
-    frames = (frame,) if frame else recording.frames
-    problem = AlignmentProblem(samples, frames, yaw_rad, lag_s)
+    problem = AlignmentProblem(samples, (frame,) if frame else recording.frames, yaw_rad, lag_s)
     try:
-        match = matching.find_match(flight, problem)
+        match = find_match(flight, problem)
     except NoMatchError as error:
         if fault := _explain_mismatch(flight, problem, recording.metres_per_unit):
             raise MissingDataError(f"{recording.name}: {fault[0]}.", fault[1]) from None
@@ -205,8 +215,10 @@ def _check_options(
     frame: str | None, yaw_deg: float | str | None, clock_offset_s: float | None
 ) -> None:
     if frame not in (None, *NED_COMPONENTS_BY_FRAME):
-        remedy = f"Use one of {', '.join(NED_COMPONENTS_BY_FRAME)}."
-        raise SettingsError(f"`frame` {frame} is not a known coordinate frame.", remedy)
+        raise SettingsError(
+            f"`frame` {frame} is not a known coordinate frame.",
+            f"Use one of {', '.join(NED_COMPONENTS_BY_FRAME)}.",
+        )
     if isinstance(yaw_deg, str) and yaw_deg != "auto":
         raise SettingsError(f"`yaw_deg` {yaw_deg} is neither a number (degrees) nor auto.")
     for name, value in (("yaw_deg", yaw_deg), ("clock_offset_s", clock_offset_s)):
@@ -250,7 +262,7 @@ def _apply_alignment(
         if clock_offset_s is None:
             lag_s = match.time_offset_fit.lag_s
             time_offset_sigma_s = match.time_offset_fit.lag_sigma_s
-            clock_offset_s = lag_s + (flight.log.boot_time_s - float(samples.index[0]))
+            clock_offset_s = lag_s + (flight.log.boot_time_s - samples.index[0])
             time_offset_reason = (
                 f"the position file was matched in time with the {reference_name}; the time offset "
                 f"includes any delay of the {reference_name}"
@@ -258,7 +270,7 @@ def _apply_alignment(
         reference_correlation = float(
             (np.exp(-1j * yaw_rad) * match.time_offset_fit.coherence).real
         )
-    aligned_samples = tracks.align_samples(samples, frame, yaw_rad, origin_m, lag_s)
+    aligned_samples = align_samples(samples, frame, yaw_rad, origin_m, lag_s)
     ekf2_comparison = (
         None if reference_name == IMU_REFERENCE else _compare_with_ekf2(flight, aligned_samples)
     )
@@ -288,13 +300,14 @@ def _apply_alignment(
                 f"The UNIX times of position file and log differ by {unix_time_difference_s:.0f} "
                 "s. Check that both are of the same flight."
             )
+    north_m, east_m, down_m = origin_m.tolist()
     alignment = Alignment(
         frame=frame,
         frame_reason=frame_reason,
         yaw_deg=float(np.degrees(yaw_rad)),
         yaw_sigma_deg=yaw_sigma_deg,
         yaw_reason=yaw_reason,
-        origin_m=(float(origin_m[0]), float(origin_m[1]), float(origin_m[2])),
+        origin_m=(north_m, east_m, down_m),
         clock_offset_s=float(clock_offset_s or 0.0),
         clock_offset_sigma_s=time_offset_sigma_s,
         clock_reason=time_offset_reason,
@@ -314,11 +327,11 @@ def _compare_with_ekf2(
     if isinstance(flight.ekf2, Unavailable):
         return None
     try:
-        ekf2_track = tracks.make_continuous_ekf2_track(flight.ekf2, aligned_samples)
+        ekf2_track = make_continuous_ekf2_track(flight.ekf2, aligned_samples)
     except NoMatchError:
         return None
     ekf2_position_m, is_known = ekf2_track.at(aligned_samples.index.to_numpy())
-    if np.count_nonzero(is_known) < tracks.MIN_MATCHED_SAMPLES:
+    if np.count_nonzero(is_known) < MIN_MATCHED_SAMPLES:
         return None
     file_position_m = aligned_samples[Columns.POSITION[:2]].to_numpy()[is_known]
     ekf2_position_m = ekf2_position_m[is_known, :2]
@@ -326,7 +339,7 @@ def _compare_with_ekf2(
     file_position_m -= file_position_m.mean(axis=0)
     ekf2_position_m -= ekf2_position_m.mean(axis=0)
     norm_product = np.linalg.norm(file_position_m) * np.linalg.norm(ekf2_position_m)
-    if norm_product == 0.0 or np.ptp(ekf2_position_m, axis=0).max() < tracks.MIN_MOTION_M:
+    if norm_product == 0.0 or np.ptp(ekf2_position_m, axis=0).max() < MIN_MOTION_M:
         return distance_to_ekf2_m, None
     return distance_to_ekf2_m, float(np.sum(file_position_m * ekf2_position_m) / norm_product)
 
@@ -338,10 +351,10 @@ def _describe_frame_conflict(match: Match, distance_to_ekf2_m: Array | None, yaw
     shift_text, shift_m = "", 0.0
     if distance_to_ekf2_m is not None:
         residual_m = compute_clipped_rms_m(distance_to_ekf2_m) / np.sqrt(2.0)
-        is_rotated = matching.is_reliable_fit(fit, reference_name) and matching.needs_rotation(
+        is_rotated = is_reliable_fit(fit, reference_name) and needs_rotation(
             residual_m, fit, reference_name
         )
-        shift_m = float(np.hypot(*fit.origin_m[:2]))
+        shift_m = np.hypot(*fit.origin_m[:2])
         shift_text = f"The position file has its origin {shift_m:.1f} m from EKF2's origin. "
     if not is_rotated:
         return ""
@@ -358,7 +371,7 @@ def _describe_frame_conflict(match: Match, distance_to_ekf2_m: Array | None, yaw
 def _find_warnings(match: Match, is_yaw_estimated: bool) -> Iterator[str]:
     reference_name = match.reference.name
     fit = match.time_offset_fit
-    if fit.concordance < matching.MIN_CONCORDANCE_WITHOUT_WARNING[reference_name]:
+    if fit.concordance < MIN_CONCORDANCE_WITHOUT_WARNING[reference_name]:
         yield (
             f"The position file matches the {reference_name} poorly: Lin's concordance correlation "
             f"coefficient is {fit.concordance:.2f}."

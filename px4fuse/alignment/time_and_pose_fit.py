@@ -5,9 +5,15 @@ from dataclasses import dataclass, replace
 import numpy as np
 from scipy.optimize import least_squares
 
-from px4fuse.alignment import tracks
-from px4fuse.alignment.tracks import EKF2_REFERENCE, IMU_REFERENCE, NoMatchError, SampledTrack
-from px4fuse.core.arrays import Array, ComplexArray
+from px4fuse.alignment.tracks import (
+    EKF2_REFERENCE,
+    IMU_REFERENCE,
+    MIN_MATCHED_SAMPLES,
+    MIN_OVERLAP_S,
+    NoMatchError,
+    SampledTrack,
+)
+from px4fuse.core.arrays import Array, ComplexArray, rms
 from px4fuse.trajectory.correlation import autocovariance, compute_moments
 from px4fuse.trajectory.time_offset import GRID_STEP_S
 
@@ -91,8 +97,8 @@ def find_correlation_peak(
         np.count_nonzero(file_track.is_valid), np.count_nonzero(reference.is_valid)
     )
     min_sample_count = max(
-        tracks.MIN_MATCHED_SAMPLES,
-        min(tracks.MIN_OVERLAP_S / GRID_STEP_S, shorter_sample_count / 2),
+        MIN_MATCHED_SAMPLES,
+        min(MIN_OVERLAP_S / GRID_STEP_S, shorter_sample_count / 2),
     )
     if shorter_sample_count < min_sample_count:
         raise NoMatchError("position file and reference have too few common samples for a match")
@@ -130,17 +136,18 @@ def find_correlation_peak(
         near_indices = indices_from_best[: round(MIN_PEAK_DISTANCE_S / GRID_STEP_S) + 1]
         is_in_best_peak = np.logical_and.accumulate(is_high[near_indices])
         can_be_second_peak[near_indices[is_in_best_peak]] = False
-    peak = CorrelationPeak(compute_lag_s(best_index), float(concordance[best_index]))
+    peak = CorrelationPeak(compute_lag_s(best_index), concordance[best_index])
     if not can_be_second_peak.any():
         return peak
-    residual_square_sum_m2 = np.maximum(square_sum_m2 - 2.0 * rotated_covariance, 0.0)
-    mean_square_residual_m2 = residual_square_sum_m2 / (2.0 * np.maximum(common_sample_counts, 1.0))
+    mean_square_residual_m2 = np.maximum(square_sum_m2 - 2.0 * rotated_covariance, 0.0) / (
+        2.0 * np.maximum(common_sample_counts, 1.0)
+    )
     residual_m = np.sqrt(mean_square_residual_m2 + INTERPOLATION_ERROR_M**2)
     second_peak_index = int(np.argmin(np.where(can_be_second_peak, residual_m, np.inf)))
     return replace(
         peak,
         second_peak_lag_difference_s=compute_lag_s(second_peak_index) - compute_lag_s(best_index),
-        second_to_best_residual_ratio=float(residual_m[second_peak_index] / residual_m[best_index]),
+        second_to_best_residual_ratio=residual_m[second_peak_index] / residual_m[best_index],
     )
 
 
@@ -170,10 +177,10 @@ def fit_by_least_squares(
     """
     reference_m, is_known = reference.at(file_track.time_s + peak.lag_s)
     is_used = is_known & file_track.is_valid
-    if np.count_nonzero(is_used) < tracks.MIN_MATCHED_SAMPLES:
+    if np.count_nonzero(is_used) < MIN_MATCHED_SAMPLES:
         raise NoMatchError(
             f"only {np.count_nonzero(is_used)} positions of the file overlap the "
-            f"{reference.name} in time; {tracks.MIN_MATCHED_SAMPLES} are needed"
+            f"{reference.name} in time; {MIN_MATCHED_SAMPLES} are needed"
         )
     reference_time_s = file_track.time_s[is_used] + peak.lag_s
     file_position_m = file_track.to_complex_m()[is_used]
@@ -182,7 +189,7 @@ def fit_by_least_squares(
     # With centred positions, the errors of yaw and origin are uncorrelated
     file_position_m = file_position_m - centre_m
     file_variance_m2, reference_variance_m2 = np.var(file_position_m), np.var(reference_position_m)
-    sigma_product_m2 = float(np.sqrt(file_variance_m2 * reference_variance_m2))
+    sigma_product_m2 = np.sqrt(file_variance_m2 * reference_variance_m2)
     covariance_m2 = np.vdot(file_position_m, reference_position_m) / len(file_position_m)
     coherence = complex(covariance_m2 / sigma_product_m2) if sigma_product_m2 > 0.0 else 0j
     reference_horizontal_position_m = reference.to_complex_m()
@@ -236,9 +243,9 @@ def fit_by_least_squares(
         vertical_rms_m = compute_clipped_rms_m(down_difference_m - origin_down_m)
     concordance = peak.concordance
     if np.isnan(concordance):
-        correlation_after_rotation = float((np.exp(-1j * fitted_yaw_rad) * coherence).real)
-        mean_of_variances_m2 = max(float(file_variance_m2 + reference_variance_m2) / 2.0, 1e-300)
-        concordance = correlation_after_rotation * sigma_product_m2 / mean_of_variances_m2
+        rotated_covariance_m2 = (np.exp(-1j * fitted_yaw_rad) * covariance_m2).real
+        mean_of_variances_m2 = max((file_variance_m2 + reference_variance_m2) / 2.0, 1e-300)
+        concordance = rotated_covariance_m2 / mean_of_variances_m2
     complex_origin_m = (
         complex(origin_north_m, origin_east_m) - np.exp(1j * fitted_yaw_rad) * centre_m
     )
@@ -252,8 +259,8 @@ def fit_by_least_squares(
         yaw_sigma_rad=float(parameter_sigma[-1]) if yaw_rad is None else None,
         origin_m=np.array([complex_origin_m.real, complex_origin_m.imag, origin_down_m]),
         coherence=coherence,
-        horizontal_rms_m=float(horizontal_rms_m),
-        residual_rms_m=float(np.sqrt(2.0 * horizontal_rms_m**2 + vertical_rms_m**2)),
+        horizontal_rms_m=horizontal_rms_m,
+        residual_rms_m=np.sqrt(2.0 * horizontal_rms_m**2 + vertical_rms_m**2),
     )
 
 
@@ -291,4 +298,4 @@ def _compute_autocorrelation_factor(residual: ComplexArray) -> float:
 
 def compute_clipped_rms_m(residual_m: Array) -> float:
     """Return the RMS (m) of residuals that are limited to RESIDUAL_CLIP_LIMIT_M."""
-    return float(np.sqrt(np.mean(np.minimum(np.abs(residual_m), RESIDUAL_CLIP_LIMIT_M) ** 2)))
+    return rms(np.minimum(np.abs(residual_m), RESIDUAL_CLIP_LIMIT_M))

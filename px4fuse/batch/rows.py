@@ -9,8 +9,7 @@ import pandas as pd
 
 from px4fuse.card.model import Card
 from px4fuse.core.record import Unavailable, read_csv
-from px4fuse.core.spreadsheet import neutralise_formulas
-from px4fuse.core.text import format_utc_time, replace_unencodable
+from px4fuse.core.text import format_utc_time, neutralise_formulas, replace_unencodable
 from px4fuse.ekf2.aids import AidResult
 from px4fuse.filter.tuning import HORIZONTAL
 from px4fuse.finding import Finding

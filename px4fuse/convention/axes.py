@@ -115,10 +115,11 @@ class SignedAxisPermutation(NamedTuple):
 
     def compute_log_prior_odds(self, quarter_turns: int) -> float:
         axes = self.compute_axis_directions(quarter_turns)
-        uncommon_axes_log_odds = -2.0 if self.vertical_axis == 2 or axes[1] == "up" else -4.0
-        return LOG_PRIOR_ODDS_BY_AXES.get(
-            axes, -5.0 if self.is_mirrored else uncommon_axes_log_odds
-        )
+        if axes in LOG_PRIOR_ODDS_BY_AXES:
+            return LOG_PRIOR_ODDS_BY_AXES[axes]
+        if self.is_mirrored:
+            return -5.0
+        return -2.0 if self.vertical_axis == 2 or axes[1] == "up" else -4.0
 
 
 SIGNED_AXIS_PERMUTATIONS = tuple(
@@ -212,7 +213,7 @@ class Hypothesis:
 
 def correct_clock_drift(time_s: Array, clock_drift: float) -> Array:
     """Remove the drift of a clock (rate minus 1) from timestamps; their mean does not change."""
-    mean_time_s = float(np.mean(time_s))
+    mean_time_s = np.mean(time_s)
     return mean_time_s + (time_s - mean_time_s) / (1.0 + clock_drift)
 
 
@@ -301,23 +302,20 @@ def find_convention_candidates(
         )
         + north_mean_square_m2
         + east_mean_square_m2
-    )
-    horizontal_residual_m2 = (
-        horizontal_residual_m2 - 2.0 * metres_per_unit * np.abs(correlation)[..., None]
+        - 2.0 * metres_per_unit * np.abs(correlation)[..., None]
     ) / 2.0
     down_residual_m2 = (
-        metres_per_unit**2 * source_mean_square[:, vertical_axis] + down_mean_square_m2
+        metres_per_unit**2 * source_mean_square[:, vertical_axis]
+        + down_mean_square_m2
+        - 2.0 * metres_per_unit * (vertical_sign * cross_moments[:, vertical_axis, 2])[..., None]
     )
-    down_residual_m2 -= (
-        2.0 * metres_per_unit * (vertical_sign * cross_moments[:, vertical_axis, 2])[..., None]
+    log_likelihood_per_residual = 0.5 * (
+        np.sum(np.log(source_mean_square), axis=1)[:, None]
+        + 6.0 * np.log(metres_per_unit)
+        - 2.0 * np.log(np.maximum(horizontal_residual_m2, MIN_HORIZONTAL_SIGMA_M**2))
+        - np.log(np.maximum(down_residual_m2, MIN_VERTICAL_SIGMA_M**2))
     )
-    score = np.sum(np.log(source_mean_square), axis=1)[:, None] + 6.0 * np.log(metres_per_unit)
-    score = score - 2.0 * np.log(np.maximum(horizontal_residual_m2, MIN_HORIZONTAL_SIGMA_M**2))
-    score = (
-        0.5
-        * independent_residual_count
-        * (score - np.log(np.maximum(down_residual_m2, MIN_VERTICAL_SIGMA_M**2)))
-    )
+    score = independent_residual_count * log_likelihood_per_residual
     rotation_rad = np.angle(correlation)
     nearest_quarter_turns = np.round(rotation_rad / (np.pi / 2.0)).astype(int) % 4
     hypotheses = []
@@ -386,8 +384,8 @@ def _evaluate_hypothesis(
     """Compute the score of a hypothesis, and the next Gauss-Newton step of its parameters."""
     delay_s, rotation_rad, heading_drift_rad_s, clock_drift, *_ = hypothesis.parameters
     time_s = source_motion.time_s[rows]
-    row_interval_s = GRID_INTERVAL_S * float(np.median(np.diff(rows)))
-    mean_time_s = float(np.mean(time_s))
+    row_interval_s = GRID_INTERVAL_S * np.median(np.diff(rows))
+    mean_time_s = np.mean(time_s)
     measurement_time_s = time_s - delay_s - clock_drift * (time_s - mean_time_s)
     fractional_grid_index = (measurement_time_s - imu_motion.time_s[0]) / GRID_INTERVAL_S
     grid_index = np.clip(np.floor(fractional_grid_index).astype(int), 0, len(imu_motion.time_s) - 2)
@@ -397,7 +395,7 @@ def _evaluate_hypothesis(
         & imu_motion.is_valid[grid_index]
     )
     independent_residual_count = (
-        float(np.count_nonzero(is_used)) * row_interval_s / SECOND_DIFFERENCE_WINDOW_S
+        np.count_nonzero(is_used) * row_interval_s / SECOND_DIFFERENCE_WINDOW_S
     )
     rejected_result = replace(hypothesis, score=-np.inf), np.zeros(len(PARAMETER_PRIOR_PRECISION))
     if independent_residual_count * SECOND_DIFFERENCE_WINDOW_S < MIN_OVERLAP_S:
@@ -479,7 +477,7 @@ def _evaluate_hypothesis(
     parameter_step = np.zeros(len(PARAMETER_PRIOR_PRECISION))
     parameter_step[is_parameter_estimated] = -np.linalg.solve(normal_matrix, gradient)
     parameter_step[0] = np.clip(parameter_step[0], -MAX_TIME_OFFSET_STEP_S, MAX_TIME_OFFSET_STEP_S)
-    scored_hypothesis = replace(
+    return replace(
         hypothesis,
         score=float(
             independent_residual_count * log_likelihood_gain
@@ -487,10 +485,9 @@ def _evaluate_hypothesis(
         ),
         min_source_to_imu_displacement_ratio=source_imu_product_sum / imu_square_sum,
         max_source_to_imu_displacement_ratio=source_square_sum / source_imu_product_sum,
-        residual_sigma_m=float(np.sqrt(variances[0])),
+        residual_sigma_m=np.sqrt(variances[0]),
         independent_residual_count=independent_residual_count,
-    )
-    return scored_hypothesis, parameter_step
+    ), parameter_step
 
 
 def _fit_student_distributions(
@@ -545,9 +542,9 @@ def _compute_height_log_likelihood_ratio(
     )
     # down + height is constant for a correct hypothesis
     error_m = down_m - np.median(down_m) + height_m - np.median(height_m)
-    mean_square_error_m2 = float(np.mean(np.minimum(error_m**2, MAX_HEIGHT_ERROR_M**2)))
+    mean_square_error_m2 = np.mean(np.minimum(error_m**2, MAX_HEIGHT_ERROR_M**2))
     min_variance_m2 = BAROMETER_SIGMA_M**2
-    variance_ratio = max(float(np.var(height_m)), min_variance_m2) / max(
+    variance_ratio = np.maximum(np.var(height_m), min_variance_m2) / np.maximum(
         mean_square_error_m2, min_variance_m2
     )
     return 0.5 * INDEPENDENT_HEIGHT_ERROR_COUNT * float(np.log(variance_ratio))

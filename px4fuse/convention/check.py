@@ -189,12 +189,8 @@ def _replace_delay_by_low_pass_filter(
         positions.compute_second_differences(filtered_motion),
         filtered_motion,
     )
-    log_likelihood_gain_nats = low_pass_hypothesis.score - hypothesis.score
-    return (
-        low_pass_hypothesis
-        if log_likelihood_gain_nats > MIN_LIKELIHOOD_GAIN_FROM_LOW_PASS
-        else hypothesis
-    )
+    has_gain = low_pass_hypothesis.score > hypothesis.score + MIN_LIKELIHOOD_GAIN_FROM_LOW_PASS
+    return low_pass_hypothesis if has_gain else hypothesis
 
 
 def is_source_fused(flight: Flight) -> bool:
@@ -250,17 +246,14 @@ def _choose_convention(
     of displacements on those of the IMU: position noise does not bias it.
     """
     best_hypothesis = hypotheses[0]
-    other_hypotheses = [
-        hypothesis for hypothesis in hypotheses if not hypothesis.is_similar_to(best_hypothesis)
-    ]
     # Without heights, z up and z down fit equally well
-    if not positions.position_m[:, 2].any():
-        other_hypotheses = [
-            hypothesis
-            for hypothesis in other_hypotheses
-            if hypothesis.axes[:2] != best_hypothesis.axes[:2]
-        ]
-    log_odds = best_hypothesis.score - other_hypotheses[0].score if other_hypotheses else None
+    has_heights = positions.position_m[:, 2].any()
+    other_hypotheses = [
+        hypothesis
+        for hypothesis in hypotheses
+        if not hypothesis.is_similar_to(best_hypothesis)
+        and (has_heights or hypothesis.axes[:2] != best_hypothesis.axes[:2])
+    ]
     x, y, z = best_hypothesis.axes
     likely_conventions = [
         _describe_hypothesis(hypothesis)
@@ -280,7 +273,7 @@ def _choose_convention(
         late_s=best_hypothesis.delay_s,
         clock_drift=clock_drift,
         scale=best_hypothesis.min_source_to_imu_displacement_ratio,
-        log_odds=log_odds,
+        log_odds=best_hypothesis.score - other_hypotheses[0].score if other_hypotheses else None,
         log_likelihood_gain=best_hypothesis.score,
         alternatives=tuple(dict.fromkeys(likely_conventions)),
     )
@@ -326,8 +319,8 @@ def compute_residual_ratio(hypothesis: Hypothesis, positions: SentPositions) -> 
     # Third differences of positions hardly contain motion: estimate the noise from third
     # differences, and convert its σ to second differences
     third_differences = np.diff(positions.position_m, 3, axis=0)
-    third_difference_sigma = 1.4826 * float(
-        np.median(np.abs(third_differences - np.median(third_differences, axis=0)))
+    third_difference_sigma = 1.4826 * np.median(
+        np.abs(third_differences - np.median(third_differences, axis=0))
     )
     noise_m = (
         METRES_PER_UNIT[hypothesis.unit]
@@ -385,9 +378,10 @@ def _check_orientation(
 ) -> OrientationConvention | None:
     """Return the convention of the source's orientation, and the heading error if determinable."""
     assert track.orientation is not None
-    quaternions = track.orientation[Columns.QUATERNION].to_numpy()
     orientation_check_result = check_orientation(
-        inertial_data, track.orientation.index.to_numpy(), quaternions
+        inertial_data,
+        track.orientation.index.to_numpy(),
+        track.orientation[Columns.QUATERNION].to_numpy(),
     )
     if orientation_check_result is None:
         return None
@@ -413,16 +407,16 @@ def _check_orientation(
     )
     if best_hypothesis.axis_permutation.vertical_sign > 0:
         correct_headings_deg = [0.0]
+    axes_and_unit = best_hypothesis.axis_permutation, best_hypothesis.unit
     for hypothesis in search_hypotheses(positions, {"EKF2": imu_motion}):
-        if (hypothesis.axis_permutation, hypothesis.unit, hypothesis.has_rotation) == (
-            best_hypothesis.axis_permutation,
-            best_hypothesis.unit,
-            True,
+        if hypothesis.has_rotation and axes_and_unit == (
+            hypothesis.axis_permutation,
+            hypothesis.unit,
         ):
             x_heading_deg = float(np.degrees(hypothesis.parameters[1]))
-            heading_errors_deg = [
+            heading_errors_deg = (
                 (x_heading_deg - correct_heading_deg + 180.0) % 360.0 - 180.0
                 for correct_heading_deg in correct_headings_deg
-            ]
+            )
             return structs.replace(convention, heading_error_deg=min(heading_errors_deg, key=abs))
     return convention

@@ -90,13 +90,12 @@ def find_convention_faults(
         return ConventionFaults()
     orientation_fault = _find_orientation_fault(convention)
     if convention.verdict == "ambiguous":
-        ned_text = format_axes(FRAME_AXES["NED"], "m")
         likely_conventions = (
             format_axes(convention.axes, convention.unit),
             *convention.alternatives,
         )
         is_ned_likely = any(
-            f"{convention_text},".startswith(f"{ned_text},")
+            convention_text.startswith(format_axes(FRAME_AXES["NED"], "m"))
             for convention_text in likely_conventions
         )
         return ConventionFaults(orientation=orientation_fault, is_ambiguous=not is_ned_likely)
@@ -152,10 +151,8 @@ def _find_orientation_fault(convention: Convention) -> OrientationFault:
     if orientation.order != "w x y z":
         return "order"
     is_z_known_to_be_down = convention.verdict == "determined" and convention.z == "down"
-    expected_frames = (
-        {"FRD to NED"} if is_z_known_to_be_down else {"FRD to NED", "FLU to ENU", "FLU to NWU"}
-    )
-    if orientation.frames not in expected_frames:
+    has_z_up_frames = orientation.frames in ("FLU to ENU", "FLU to NWU")
+    if orientation.frames != "FRD to NED" and (is_z_known_to_be_down or not has_z_up_frames):
         return "frames"
     return "heading" if abs(orientation.heading_error_deg or 0.0) > MIN_HEADING_ERROR_DEG else ""
 

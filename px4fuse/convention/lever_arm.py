@@ -120,10 +120,10 @@ def _fit_lever_arm_to_truth(flight: Flight, truth: Truth, track: PositionTrack) 
     )
     lever_arm = _make_lever_arm(fitted_parameters, covariance, rotation_deg)
     lever_arm = lever_arm._replace(rotation_sigma_deg=lever_arm.rotation_sigma_deg / path_radius_m)
-    is_significant = lever_arm.horizontal_length_m > max(
+    min_length_m = max(
         MIN_LEVER_ARM_WITH_TRUTH_M, MIN_LEVER_ARM_SIGMAS_WITH_TRUTH * lever_arm.sigma_m
     )
-    return lever_arm if is_significant and lever_arm.horizontal_length_m < MAX_LEVER_ARM_M else None
+    return lever_arm if min_length_m < lever_arm.horizontal_length_m < MAX_LEVER_ARM_M else None
 
 
 def _make_lever_arm(parameters: Array, covariance: Array, rotation_deg: float) -> LeverArm:
@@ -185,7 +185,7 @@ def _fit_lever_arm_to_imu(flight: Flight, track: PositionTrack) -> LeverArm | No
         residual_m: Array = np.linalg.norm(
             second_difference_error_m - design @ fitted_parameters, axis=1
         )
-        sigma_m = float(np.sqrt(np.mean(residual_m[is_used] ** 2) / 2.0))
+        sigma_m = np.sqrt(np.mean(residual_m[is_used] ** 2) / 2.0)
         covariance = (
             np.linalg.pinv(design_rows.T @ design_rows)
             * sigma_m**2

@@ -25,7 +25,7 @@ from px4fuse.core.arrays import (
 )
 from px4fuse.ekf2.replay import is_inside_spans
 from px4fuse.filter.signals import find_imu_gaps, interpolate_attitude
-from px4fuse.flight.model import Columns, Flight, Unavailable
+from px4fuse.flight.model import Columns, Flight, Spans, Unavailable
 from px4fuse.trajectory.association import choose_gap_limit_s, is_bracketed
 from px4fuse.trajectory.rotation import (
     conjugate,
@@ -75,7 +75,7 @@ class InertialData:
     specific_force_m_s2: Array
     logged_attitude: Array
     gyro_attitude: Array
-    valid_spans_s: tuple[tuple[float, float], ...]
+    valid_spans_s: Spans
 
     def compute_attitudes(self) -> dict[HeadingSource, Array]:
         """Return the attitude quaternions at ``time_s`` by the source of their heading."""
@@ -155,11 +155,11 @@ def integrate_inertial_data(flight: Flight) -> InertialData | None:
     )
     if len(time_s) < 4 * SECOND_DIFFERENCE_WINDOW_S / INTEGRATION_STEP_S:
         return None
-    columns = [*Columns.SPECIFIC_FORCE, *Columns.ANGULAR_RATE]
-    imu_integrals = (integrate_cumulatively(imu[name].to_numpy(), imu_times_s) for name in columns)
-    imu_increments = np.diff(
-        [np.interp(time_s, imu_times_s, integral) for integral in imu_integrals]
-    ).T
+    imu_integrals = [
+        np.interp(time_s, imu_times_s, integrate_cumulatively(imu[name].to_numpy(), imu_times_s))
+        for name in Columns.SPECIFIC_FORCE + Columns.ANGULAR_RATE
+    ]
+    imu_increments = np.diff(imu_integrals).T
     specific_force_m_s2 = imu_increments[:, :3] / INTEGRATION_STEP_S
     logged_attitude = interpolate_attitude(attitude, time_s)
     gyro_attitude = _level_attitude(
@@ -167,7 +167,7 @@ def integrate_inertial_data(flight: Flight) -> InertialData | None:
     )
     airborne_spans_s = flight.airborne
     if isinstance(airborne_spans_s, Unavailable):
-        airborne_spans_s = ((float(time_s[0]), float(time_s[-1])),)
+        airborne_spans_s = ((time_s[0], time_s[-1]),)
     gap_rows = np.flatnonzero(find_imu_gaps(imu_times_s))
     gap_free_spans_s = zip(
         [-np.inf, *imu_times_s[gap_rows + 1]], [*imu_times_s[gap_rows], np.inf], strict=True

@@ -177,7 +177,7 @@ def _score_convention(
     log_angle_differences = np.log(
         np.maximum([tilt_difference_deg, heading_difference_deg], MIN_ANGLE_DIFFERENCE_IN_SCORE_DEG)
     )
-    score = -SCORE_WEIGHT_PER_S * (time_s[-1] - time_s[0]) * float(np.sum(log_angle_differences))
+    score = -SCORE_WEIGHT_PER_S * (time_s[-1] - time_s[0]) * np.sum(log_angle_differences)
     score -= 4.0 * (order != "w x y z") + 2.0 * (frames != "FRD to NED")
     score -= 2.0 * (body_quarter_turns != 0) + 1.0 * (
         abs(mean_heading_difference_rad) > np.radians(8.0)

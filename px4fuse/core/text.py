@@ -1,17 +1,30 @@
-"""Formatting of numbers and texts, and conversion of data classes for JSON."""
+"""Formatting and parsing of numbers and texts, and conversion of data classes for JSON."""
 
 import math
 import re
 import shlex
 import unicodedata
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import fields, is_dataclass
+from contextlib import suppress
+from dataclasses import is_dataclass
 from datetime import UTC, datetime
 from decimal import Decimal
 from functools import cache
 from typing import Any
 
 import msgspec
+
+from px4fuse.core.record import read_toml
+
+_UNIT_TABLES = read_toml(__file__, dict[str, dict[str, Any]], "units.toml")
+# Full name of each unit, by its symbol
+UNIT_NAMES: Mapping[str, str] = _UNIT_TABLES["names"]
+# Conversion factors to the base unit of each quantity
+_UNIT_FACTORS: Mapping[str, Mapping[str, float]] = _UNIT_TABLES["typed"]
+_NUMBER_WITH_UNIT = re.compile(r"([-+]?[\d.,]+(?:e[-+]?\d+)?)\s*(\S*)", re.IGNORECASE)
+FORMULA_START_CHARACTERS = "=+-@"
+# Maximum length (characters) of a table cell; Excel allows 32,767
+MAX_CELL_LENGTH = 32_000
 
 
 def to_json_types(value: object) -> Any:
@@ -25,7 +38,7 @@ def to_json_types(value: object) -> Any:
     if isinstance(value, msgspec.Struct):
         value = msgspec.structs.asdict(value)
     elif is_dataclass(value):
-        value = {field.name: getattr(value, field.name) for field in fields(value)}
+        value = vars(value)
     if isinstance(value, Mapping):
         json_by_name = {str(name): to_json_types(child) for name, child in value.items()}
         return {name: child for name, child in json_by_name.items() if child is not None}
@@ -191,3 +204,53 @@ def _is_safe_character(character: str) -> bool:
         or 0xFDD0 <= code_point <= 0xFDEF
         or code_point & 0xFFFE == 0xFFFE
     )
+
+
+def convert_to_unit(text: str, unit: str) -> float | None:
+    """Parse a number with or without a unit, and convert it to ``unit``.
+
+    Return None if the text is not a number, or has a unit of another quantity.
+
+    >>> convert_to_unit("10cm", "m"), convert_to_unit("0,5", "s"), convert_to_unit("10 apples", "m")
+    (0.1, 0.5, None)
+    """
+    match = _NUMBER_WITH_UNIT.fullmatch(text.strip())
+    unit = unit.lower()
+    unit_in_text = match[2].lower() or unit if match else ""
+    for factors in ({unit: 1.0}, *_UNIT_FACTORS.values()):
+        if match and {unit_in_text, unit} <= factors.keys():
+            with suppress(ValueError):  # float() rejects several decimal points
+                return float(match[1].replace(",", ".")) * (factors[unit_in_text] / factors[unit])
+    return None
+
+
+def neutralise_formulas(text: str) -> str:
+    r"""Escape text so that a spreadsheet does not execute it as a formula (OWASP, CSV injection).
+
+    >>> [neutralise_formulas(text) for text in ("=1+1", " \uff0b1", "a;=1+1", "3 - 2", "-17")]
+    ["'=1+1", "' ＋1", "a;'=1+1", '3 - 2', '-17']
+    """
+    # with some regional settings, Excel splits cells at semicolons
+    cells = (f"'{cell}" if _is_formula(cell) else cell for cell in text.split(";"))
+    safe_text = "".join(map(_replace_control_character, ";".join(cells)))
+    return safe_text if len(safe_text) <= MAX_CELL_LENGTH else safe_text[:MAX_CELL_LENGTH] + "…"
+
+
+def _is_formula(text: str) -> bool:
+    """Return True if the first visible character can begin a formula."""
+    if re.fullmatch(r"[+-][0-9]+", text):  # signed integer, for example a student id
+        return False
+    if text.startswith(("\t", "\r")):
+        return True
+    for character in text:
+        # Unicode categories Z (separators) and C (control characters) are not visible
+        if character in "\"'" or unicodedata.category(character)[0] in "ZC":
+            continue
+        return unicodedata.normalize("NFKC", character)[0] in FORMULA_START_CHARACTERS
+    return False
+
+
+def _replace_control_character(character: str) -> str:
+    if unicodedata.category(character) in ("Cc", "Cs", "Zl", "Zp"):
+        return " " if character.isspace() else "\N{REPLACEMENT CHARACTER}"
+    return character

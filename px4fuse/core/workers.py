@@ -197,9 +197,8 @@ def _receive_result(worker: _Worker) -> tuple[bool, Any]:
     except (EOFError, OSError):
         worker.process.join(5)
         phase = "a job" if worker.is_ready else "its start"
-        exit_code = worker.process.exitcode
         return False, JobFailure(
-            f"the worker process ended during {phase} (exit code {exit_code})."
+            f"the worker process ended during {phase} (exit code {worker.process.exitcode})."
         )
     # unpickling may raise any exception
     except Exception as error:  # noqa: BLE001
@@ -227,8 +226,7 @@ def _run_and_pickle(function: Callable[[Any], Any], job: Any) -> bytes:
         return pickle.dumps((True, function(job)), pickle.HIGHEST_PROTOCOL)
     except MemoryError:
         # end the process: the next job would not have enough memory
-        failure = JobFailure("the job exceeded the memory limit for one file.")
-        return pickle.dumps((False, failure))
+        return pickle.dumps((False, JobFailure("the job exceeded the memory limit for one file.")))
     except Exception as error:  # noqa: BLE001 - the failure of a job is its result
         error_prefix = "" if isinstance(error, Px4FuseError) else f"{type(error).__name__}: "
         return pickle.dumps((True, JobFailure(one_line(f"{error_prefix}{error}", 300))))

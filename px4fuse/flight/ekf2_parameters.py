@@ -53,20 +53,13 @@ class Aid:
     status_bit: int | None = None
 
     @property
-    def measurement_parameters(self) -> frozenset[str]:
-        """Names of the PX4 parameters for noise, gate and delay."""
-        return frozenset((self.noise, self.gate, self.delay, self.noise_mode_parameter))
+    def measurement_parameters(self) -> tuple[str, ...]:
+        """Names of the PX4 parameters for noise, delay and gate."""
+        return self.noise, self.delay, self.gate, self.noise_mode_parameter
 
     def logged_parameters(self, logged_values: Mapping[str, float]) -> dict[str, float]:
         """Return the logged PX4 parameters of this aiding source, such as noise and gate."""
-        names = (
-            self.noise,
-            self.delay,
-            self.gate,
-            self.noise_mode_parameter,
-            self.switch,
-            AID_MASK_PARAMETER,
-        )
+        names = (*self.measurement_parameters, self.switch, AID_MASK_PARAMETER)
         return {name: float(logged_values[name]) for name in names if name in logged_values}
 
 
@@ -111,7 +104,9 @@ NAME_LIST_KEYS = ("axes", "lever_arm", "flags")
 AIDS, STATUS_FLAGS = (
     {
         name: msgspec.convert(
-            {"name": name, **_PARAMETER_TABLES["groups"].get(name.partition("_")[0], {}), **row}
+            {"name": name, "flags": [f"cs_{name}"]}
+            | _PARAMETER_TABLES["groups"].get(name.partition("_")[0], {})
+            | row
             | {key: row[key].split(",") for key in NAME_LIST_KEYS if key in row},
             Aid,
         )

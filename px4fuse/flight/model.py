@@ -322,6 +322,7 @@ class Columns:
     VELOCITY_VARIANCE: Final = ["north_m2_s2", "east_m2_s2", "down_m2_s2"]
     SPECIFIC_FORCE: Final = ["forward_m_s2", "right_m_s2", "down_m_s2"]
     ANGULAR_RATE: Final = ["forward_rad_s", "right_rad_s", "down_rad_s"]
+    ANTENNA_POSITION: Final = [f"antenna_{axis}_m" for axis in BODY_AXES]
     QUATERNION: Final = ["w", "x", "y", "z"]
     ROTATION_VARIANCE: Final = ["forward_rad2", "right_rad2", "down_rad2"]
     # Columns of EKF2's state and variances at the fusion horizon
@@ -408,7 +409,7 @@ class PositionTrack:
     # Barometer height, if it replaces the height of the source
     barometer: pd.DataFrame | None = None
     # Sensor position (body FRD) that EKF2 assumes
-    lever_arm_m: tuple[float, float, float] = (0.0, 0.0, 0.0)
+    lever_arm_m: Vector = (0.0, 0.0, 0.0)
     # Sentences about interpolated, reconstructed or dropped samples
     notes: tuple[str, ...] = ()
     # Reason why a row is not a measurement, for example "NaN"
@@ -499,7 +500,7 @@ class Reset:
 
     time_s: float
     quantity: Literal["position", "velocity"]
-    delta: tuple[float, float, float]
+    delta: Vector
 
 
 EKF2_STEP_S = 0.010  # default of EKF2_PREDICT_US in s (ekf2_params.c)

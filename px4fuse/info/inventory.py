@@ -53,14 +53,6 @@ STREAM_LABELS = {
     "truth": "ground truth",
     "airborne": "land detector",
 }
-# Data that each analysis requires
-REQUIRED_SAMPLES_BY_ANALYSIS = {
-    "EKF2 states": "samples of EKF2's position and velocity",
-    "EKF2 variances": "samples of EKF2's position and velocity variances",
-    "EKF2 consistency": "EKF2 innovations",
-    "error": "samples of ground truth",
-}
-NO_COMPARISON = Unavailable("comparison", "the log contains no position source for KF", "")
 
 
 @dataclass(frozen=True)
@@ -223,8 +215,9 @@ def _list_logged_data(
         )
     if not flight.positions:
         yield LoggedData("position", unavailable=reason)
+    data_by_stream: dict[str, pd.DataFrame | Spans | Unavailable]
     if isinstance(ekf2, Unavailable):
-        yield LoggedData(STREAM_LABELS["ekf2_state"], unavailable=ekf2.reason)
+        data_by_stream = {"ekf2_state": ekf2}
     else:
         # use the axis with most innovations, because some axes may not be logged
         innovations = max(
@@ -233,9 +226,8 @@ def _list_logged_data(
         )
         data_by_stream = {"ekf2_state": ekf2.state, "ekf2_variance": ekf2.variance}
         data_by_stream |= {"ekf2_innovations": innovations, "ekf2_fusing": ekf2.fusion_flags}
-        yield from _list_streams(flight, data_by_stream)
-    truth_samples = truth if isinstance(truth, Unavailable) else truth.samples
-    yield from _list_streams(flight, {"truth": truth_samples, "airborne": flight.airborne})
+    data_by_stream["truth"] = truth if isinstance(truth, Unavailable) else truth.samples
+    yield from _list_streams(flight, data_by_stream | {"airborne": flight.airborne})
 
 
 def _list_streams(
@@ -294,11 +286,12 @@ def _list_analyses(
     else:
         source, segment = comparison.source, comparison.segment
         sample_count = len(cut_to_segment(source.samples, segment))
-        used_data_text = (
+        yield AnalysisOption(
+            "compare",
+            True,
             f"KF with {sample_count} samples of position source {source.name} from "
-            f"{segment.start_s:.1f} s to {segment.end_s:.1f} s"
+            f"{segment.start_s:.1f} s to {segment.end_s:.1f} s",
         )
-        yield AnalysisOption("compare", True, used_data_text)
     low_rate_findings = () if flight.log.is_assessed else imu.detect_low_rates(flight)
     imu_fault_text = " ".join(finding.message for finding in low_rate_findings)
     if isinstance(missing_data := imu_and_attitude(flight), Unavailable):
@@ -306,58 +299,58 @@ def _list_analyses(
     acceleration_text = "IMU acceleration rotated into NED by the attitude, without gravity"
     yield AnalysisOption("acceleration", not imu_fault_text, imu_fault_text or acceleration_text)
     yield from _list_ekf2_and_truth_analyses(flight, comparison)
-    results_by_aid, ekf2, rates_text = evaluate_aids(flight), flight.ekf2, ""
-    if isinstance(results_by_aid, dict) and isinstance(ekf2, Ekf2):
+    results_by_aid, ekf2 = evaluate_aids(flight), flight.ekf2
+    if isinstance(results_by_aid, Unavailable):
+        yield AnalysisOption("aids", False, results_by_aid.reason)
+    elif isinstance(ekf2, Ekf2):
         rate_texts = (
             f"{aid.label} {sample_rate(samples):.2g} Hz"
             if len(samples := ekf2.aids[name].samples) > 1
             else f"{aid.label} 1 sample"
             for name, aid in results_by_aid.items()
         )
-        rates_text = ", ".join(rate_texts)
-    yield _make_analysis_option("aids", results_by_aid, rates_text)
-    replay_inputs, replay_text = prepare_inputs(flight), ""
-    if not isinstance(replay_inputs, Unavailable):
-        replayed_duration_s = sum(
-            float(np.ptp(segment.time_s)) for segment in replay_inputs.segments
-        )
-        replay_text = f"EKF2 replay of {replayed_duration_s:.0f} s with {replay_inputs.aid.label}"
-    yield _make_analysis_option("what-if", replay_inputs, replay_text)
-
-
-def _make_analysis_option(name: str, data: object, used_data_text: str) -> AnalysisOption:
-    if isinstance(data, Unavailable):
-        return AnalysisOption(name, False, data.reason)
-    return AnalysisOption(name, True, used_data_text)
+        yield AnalysisOption("aids", True, ", ".join(rate_texts))
+    replay_inputs = prepare_inputs(flight)
+    if isinstance(replay_inputs, Unavailable):
+        yield AnalysisOption("what-if", False, replay_inputs.reason)
+    else:
+        duration_s = sum(np.ptp(segment.time_s) for segment in replay_inputs.segments)
+        replay_text = f"EKF2 replay of {duration_s:.0f} s with {replay_inputs.aid.label}"
+        yield AnalysisOption("what-if", True, replay_text)
 
 
 def _list_ekf2_and_truth_analyses(
     flight: Flight, comparison: PreparedComparison | None
 ) -> Iterator[AnalysisOption]:
     """Yield the analyses that need EKF2 data or ground truth."""
-    ekf2, truth = flight.ekf2, flight.truth
-    required_data: list[object]
-    if comparison is None:
-        required_data = [
-            data if isinstance(data, Unavailable) else NO_COMPARISON
-            for data in (ekf2, ekf2, ekf2, truth)
-        ]
-    else:
+    ekf2 = flight.ekf2
+    innovations: object = ekf2
+    tracks: Mapping[str, object] = {
+        "ekf2_state": ekf2,
+        "ekf2_variance": ekf2,
+        "truth": flight.truth,
+    }
+    if comparison is not None:
         main_axis, segment = comparison.input_axes[0], comparison.segment
-        required_data = [
-            *project_tracks(ekf2, comparison.flight.truth, main_axis, segment).values()
-        ]
-        required_data.insert(
-            2,
-            ekf2
-            if isinstance(ekf2, Unavailable)
-            else project_innovations(flight, ekf2, comparison.source, main_axis, segment),
-        )
-    for (name, sample_text), data in zip(
-        REQUIRED_SAMPLES_BY_ANALYSIS.items(), required_data, strict=True
+        tracks = project_tracks(ekf2, comparison.flight.truth, main_axis, segment)
+        if isinstance(ekf2, Ekf2):
+            innovations = project_innovations(flight, ekf2, comparison.source, main_axis, segment)
+    for name, data, sample_text in (
+        ("EKF2 states", tracks["ekf2_state"], "samples of EKF2's position and velocity"),
+        (
+            "EKF2 variances",
+            tracks["ekf2_variance"],
+            "samples of EKF2's position and velocity variances",
+        ),
+        ("EKF2 consistency", innovations, "EKF2 innovations"),
+        ("error", tracks["truth"], "samples of ground truth"),
     ):
-        count_text = f"{len(data)} {sample_text}" if isinstance(data, pd.DataFrame) else ""
-        yield _make_analysis_option(name, data, count_text)
+        if isinstance(data, pd.DataFrame):
+            yield AnalysisOption(name, True, f"{len(data)} {sample_text}")
+        elif isinstance(data, Unavailable):
+            yield AnalysisOption(name, False, data.reason)
+        else:
+            yield AnalysisOption(name, False, "the log contains no position source for KF")
 
 
 def _collect_logging_advice(

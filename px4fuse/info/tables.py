@@ -47,8 +47,9 @@ def tables(flight: Flight) -> dict[str, pd.DataFrame]:
     for name, track in _list_tracks_with_table_names(flight):
         streams[name] = track.samples
         streams[name.replace("position_", "orientation_", 1)] = track.orientation
-    ekf2, truth = flight.ekf2, flight.truth
+    ekf2, truth, parameters = flight.ekf2, flight.truth, {**flight.log.parameters}
     if isinstance(ekf2, Ekf2):
+        parameters |= ekf2.parameters
         streams["ekf2_state"] = ekf2.state
         streams["ekf2_variance"] = ekf2.variance
         streams["ekf2_fusing"] = ekf2.fusion_flags
@@ -65,11 +66,10 @@ def tables(flight: Flight) -> dict[str, pd.DataFrame]:
         tables |= _make_ekf2_tables(ekf2)
     if not isinstance(flight.airborne, Unavailable):
         tables["airborne"] = pd.DataFrame(flight.airborne, columns=["time_s", "end_s"])
-    if dropouts := flight.log.dropouts:
-        dropout_rows = [structs.astuple(dropout) for dropout in dropouts]
+    if flight.log.dropouts:
+        dropout_rows = map(structs.astuple, flight.log.dropouts)
         tables["dropouts"] = pd.DataFrame(dropout_rows, columns=["time_s", "duration_s"])
-    ekf2_parameters = ekf2.parameters if isinstance(ekf2, Ekf2) else {}
-    if parameters := {**flight.log.parameters, **ekf2_parameters}:
+    if parameters:
         tables["parameters"] = pd.DataFrame(parameters.items(), columns=["name", "value"])
     if flight.clocks:
         clock_table = pd.DataFrame([structs.asdict(clock) for clock in flight.clocks])
@@ -88,7 +88,7 @@ def _make_ekf2_tables(ekf2: Ekf2) -> dict[str, pd.DataFrame]:
     resets = [(reset.time_s, reset.quantity, *reset.delta) for reset in ekf2.resets]
     instances = pd.DataFrame(ekf2.primary_instances, columns=["time_s", "instance"])
     # The first primary EKF2 instance starts at time minus infinity, but a table needs a finite time
-    first_time_s = min(float(ekf2.state.index[0]), 0.0)
+    first_time_s = min(ekf2.state.index[0], 0.0)
     ekf2_tables = {
         "resets": pd.DataFrame(
             resets, columns=["time_s", "quantity", "delta_north", "delta_east", "delta_down"]

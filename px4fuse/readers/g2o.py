@@ -181,10 +181,9 @@ def format_g2o(graph: PoseGraph) -> str:
     pose_type = "SE2" if graph.dimension == 2 else "SE3:QUAT"
     ids = graph.ids.tolist()
     upper_triangle = np.triu_indices(graph.degrees_of_freedom)
-    id_pose_pairs = zip(ids, graph.poses.tolist(), strict=True)
     lines = [
         f"VERTEX_{pose_type} {vertex_id} {' '.join(map(repr, pose))}"
-        for vertex_id, pose in id_pose_pairs
+        for vertex_id, pose in zip(ids, graph.poses.tolist(), strict=True)
     ]
     lines.append(f"FIX {ids[0]}")
     edge_values = np.hstack(
@@ -218,8 +217,12 @@ def _group_lines_by_tag(text: str, name: str) -> dict[str, _TaggedLines]:
                     "Fix only one vertex. To keep the relative pose of two vertices, add an edge.",
                 )
         elif not tag.startswith(_SKIPPED_TAGS):
-            fault = f"lines with the tag {quote(tag)} are not supported"
-            raise _make_line_error(name, line_number, fault, _FORMAT_REMEDY)
+            raise _make_line_error(
+                name,
+                line_number,
+                f"lines with the tag {quote(tag)} are not supported",
+                _FORMAT_REMEDY,
+            )
     return lines_by_tag
 
 

@@ -28,13 +28,21 @@ from px4fuse.flight.model import (
     UnusedData,
 )
 from px4fuse.readers import common
-from px4fuse.readers import mavlink_messages as messages
 from px4fuse.readers import mavlink_senders as senders
 from px4fuse.readers.mavlink_frames import (
     MAX_FRAME_BYTES,
-    MESSAGE_IDS,
     VEHICLE_TYPES,
     read_frames,
+)
+from px4fuse.readers.mavlink_messages import (
+    ARDUPILOT_REPLAY_UNAVAILABLE,
+    ATTITUDE_LAYOUTS,
+    HIGHRES_IMU_LAYOUT,
+    IMU_LAYOUTS,
+    LOCAL_POSITION_LAYOUT,
+    MESSAGE_LAYOUTS,
+    ON_GROUND_STATE,
+    REASON_BY_UNUSED_MESSAGE,
 )
 from px4fuse.readers.mavlink_positions import (
     compute_pressure_altitude_m,
@@ -81,13 +89,14 @@ def read_mavlink(name: str, content: bytes, system_id: int | None = None) -> Fli
     attitude = _read_attitude(recording)
     ekf2 = _read_ekf2(recording, parameters)
     # Only PX4 has a parameter for the delay of GNSS
-    delay_parameters = fill_with_defaults(parameters, GNSS_POS) if autopilot == "PX4" else {}
-    gnss_delay_s = 1e-3 * delay_parameters.get(GNSS_POS.delay, 0.0)
+    gnss_delay_s = 0.0
+    if autopilot == "PX4":
+        gnss_delay_s = 1e-3 * fill_with_defaults(parameters, GNSS_POS)[GNSS_POS.delay]
     positions, unavailable_positions = read_positions(recording, clock_mappings, gnss_delay_s)
     truth = read_truth(recording, positions)
     airborne_spans_s = _read_airborne_spans(recording)
     is_in_flight = common.ends_in_flight(airborne_spans_s, recording.duration_s)
-    pressure_hpa = recording.read(messages.MESSAGE_LAYOUTS["SCALED_PRESSURE"])["pressure_hpa"]
+    pressure_hpa = recording.read(MESSAGE_LAYOUTS["SCALED_PRESSURE"])["pressure_hpa"]
     return Flight(
         # Called after the readers, because the description counts the samples that they dropped
         log=_describe_log(recording, parameters, replaced_parameter_notes, is_in_flight),
@@ -103,19 +112,19 @@ def read_mavlink(name: str, content: bytes, system_id: int | None = None) -> Fli
         clocks=senders.describe_clock_conversions(recording, clock_mappings),
         unused=tuple(
             UnusedData(name, count, reason)
-            for name, reason in messages.REASON_BY_UNUSED_MESSAGE.items()
-            if (count := int(np.count_nonzero(frames.message_ids == MESSAGE_IDS[name])))
+            for name, reason in REASON_BY_UNUSED_MESSAGE.items()
+            if (count := len(frames.rows(name)))
         ),
     )
 
 
 def _read_imu(recording: Recording) -> TableOrUnavailable:
     # HIGHRES_IMU is preferred, because it has SI units and µs timestamps
-    layout = messages.HIGHRES_IMU_LAYOUT
+    layout = HIGHRES_IMU_LAYOUT
     if len(recording.rows(layout.topic)) < 2:
-        layout = recording.find_most_frequent(messages.IMU_LAYOUTS)
+        layout = recording.find_most_frequent(IMU_LAYOUTS)
     rows = recording.rows(layout.topic)
-    if layout == messages.HIGHRES_IMU_LAYOUT:
+    if layout == HIGHRES_IMU_LAYOUT:
         imu_ids = np.array(recording.frames.table(layout.topic, rows)["id"])
         rows = rows[np.isin(imu_ids, pd.Series(imu_ids).mode()[:1])]
     imu = recording.read(layout, rows)
@@ -131,10 +140,10 @@ def _read_imu(recording: Recording) -> TableOrUnavailable:
 
 
 def _read_attitude(recording: Recording) -> TableOrUnavailable:
-    layout = recording.find_most_frequent(messages.ATTITUDE_LAYOUTS)
+    layout = recording.find_most_frequent(ATTITUDE_LAYOUTS)
     attitude = common.select_rows_with_attitude(recording.read(layout))[Columns.QUATERNION]
     if len(attitude) < 2:
-        names = " or ".join(layout.topic for layout in messages.ATTITUDE_LAYOUTS)
+        names = " or ".join(layout.topic for layout in ATTITUDE_LAYOUTS)
         return Unavailable(
             "attitude", f"the recording contains no usable {names}", recording.remedies["attitude"]
         )
@@ -144,11 +153,11 @@ def _read_attitude(recording: Recording) -> TableOrUnavailable:
 
 def _read_ekf2(recording: Recording, parameters: Mapping[str, float]) -> Ekf2 | Unavailable:
     autopilot, remedies = recording.autopilot, recording.remedies
-    layout = messages.ODOMETRY_LAYOUT
+    layout = MESSAGE_LAYOUTS["ODOMETRY"]
     # ODOMETRY has variances, so it is preferred unless its rate is much lower
-    local_position_count = len(recording.rows(messages.LOCAL_POSITION_LAYOUT.topic))
+    local_position_count = len(recording.rows(LOCAL_POSITION_LAYOUT.topic))
     if 2 * len(recording.rows(layout.topic)) < local_position_count:
-        layout = messages.LOCAL_POSITION_LAYOUT
+        layout = LOCAL_POSITION_LAYOUT
     message_name = layout.topic
     samples = recording.read(layout)
     state = samples[Columns.STATE].dropna()
@@ -169,7 +178,7 @@ def _read_ekf2(recording: Recording, parameters: Mapping[str, float]) -> Ekf2 | 
     variance = samples.reindex(columns=VARIANCE_COLUMNS)
     variance = variance[(variance > 0.0).all(axis=1)]
     if variance.empty:
-        message_name = messages.MESSAGE_LAYOUTS["ESTIMATOR_STATUS"].topic
+        message_name = MESSAGE_LAYOUTS["ESTIMATOR_STATUS"].topic
         variance = _compute_variance_from_accuracy(recording)
         if len(variance):
             notes.append(
@@ -204,9 +213,7 @@ def _read_ekf2(recording: Recording, parameters: Mapping[str, float]) -> Ekf2 | 
         primary_instances=NO_INSTANCE_SWITCHES,
         gate=fill_with_defaults(parameters)[EV_POS.gate],
         notes=tuple(notes),
-        record=messages.ARDUPILOT_REPLAY_UNAVAILABLE
-        if autopilot == "ArduPilot"
-        else RECORD_NOT_LOGGED,
+        record=ARDUPILOT_REPLAY_UNAVAILABLE if autopilot == "ArduPilot" else RECORD_NOT_LOGGED,
     )
 
 
@@ -215,7 +222,7 @@ def _compute_variance_from_accuracy(recording: Recording) -> pd.DataFrame:
 
     PX4's horizontal accuracy is √(σ_north² + σ_east²) (``get_ekf_lpos_accuracy``).
     """
-    accuracy = recording.read(messages.MESSAGE_LAYOUTS["ESTIMATOR_STATUS"])
+    accuracy = recording.read(MESSAGE_LAYOUTS["ESTIMATOR_STATUS"])
     horizontal_variance_m2 = accuracy["horizontal_m"] ** 2 / 2.0
     variance = pd.concat(
         [horizontal_variance_m2, horizontal_variance_m2, accuracy["vertical_m"] ** 2], axis=1
@@ -225,8 +232,7 @@ def _compute_variance_from_accuracy(recording: Recording) -> pd.DataFrame:
 
 
 def _read_airborne_spans(recording: Recording) -> Spans | Unavailable:
-    rows = recording.rows("EXTENDED_SYS_STATE")
-    landed_states = recording.frames.table("EXTENDED_SYS_STATE", rows)["landed_state"]
+    landed_states = recording.table("EXTENDED_SYS_STATE")["landed_state"]
     is_known = landed_states > 0
     if not np.any(is_known):
         return Unavailable(
@@ -235,14 +241,15 @@ def _read_airborne_spans(recording: Recording) -> Spans | Unavailable:
             recording.remedies["landed"],
         )
     recording.record_stream("airborne", "EXTENDED_SYS_STATE", clock=RECEIPT_CLOCK_TEXT)
-    time_s = recording.compute_receipt_boot_times_s(rows[is_known]) - recording.time_origin_s
-    is_landed = pd.Series(landed_states[is_known] == messages.ON_GROUND_STATE, index=time_s)
+    rows = recording.rows("EXTENDED_SYS_STATE")[is_known]
+    time_s = recording.compute_receipt_boot_times_s(rows) - recording.time_origin_s
+    is_landed = pd.Series(landed_states[is_known] == ON_GROUND_STATE, time_s)
     return common.find_flight_spans(is_landed, recording.duration_s)
 
 
 def _read_parameters(recording: Recording) -> dict[str, float]:
     """Read the first value of each parameter. PX4 sends integers as raw bytes in a float field."""
-    table = recording.frames.table("PARAM_VALUE", recording.rows("PARAM_VALUE"))
+    table = recording.table("PARAM_VALUE")
     is_sent_as_bytes = (recording.autopilot == "PX4") & (
         table["param_type"] < REAL32_PARAMETER_TYPE
     )
@@ -264,7 +271,6 @@ def _describe_log(
 ) -> LogInfo:
     frames, autopilot = recording.frames, recording.autopilot
     notes, damage_notes = [*recording.notes], []
-    reversal_count = np.count_nonzero(np.diff(recording.receive_times_s) < 0.0)
     if frames.unknown_frame_count:
         notes.append(
             "number of ignored MAVLink frames with unknown message type: "
@@ -283,7 +289,7 @@ def _describe_log(
     elif stray_byte_count:
         notes.append(stray_bytes_note)
     firmware, firmware_hash, vehicle_id = f"{autopilot}, unknown version", "unknown", ""
-    for version in frames.table("AUTOPILOT_VERSION", recording.rows("AUTOPILOT_VERSION")[:1]):
+    for version in recording.table("AUTOPILOT_VERSION")[:1]:
         major, minor, patch, _ = int(version["flight_sw_version"]).to_bytes(4, "big")
         if major or minor or patch:
             firmware = f"{autopilot} v{major}.{minor}.{patch}"
@@ -291,7 +297,7 @@ def _describe_log(
             firmware_hash = bytes(version["flight_custom_version"][::-1]).hex()
         if version["uid2"].any():
             vehicle_id = bytes(version["uid2"]).hex()
-    vehicle_types = frames.table("HEARTBEAT", recording.rows("HEARTBEAT"))["type"].tolist()
+    vehicle_types = recording.table("HEARTBEAT")["type"].tolist()
     vehicle_name = VEHICLE_TYPES.get(next(iter(vehicle_types), -1), "vehicle")
     dropped_counts = dict(sorted(recording.dropped_count_by_message.items()))
     return LogInfo(
@@ -311,7 +317,7 @@ def _describe_log(
             *describe_dropped_samples(dropped_counts),
         ),
         restarts=recording.restart_count,
-        receive_time_reversals=int(reversal_count) or None,
+        receive_time_reversals=int(np.sum(np.diff(recording.receive_times_s) < 0.0)) or None,
         dropped=dropped_counts,
         autopilot=autopilot,
         start_unix_s=_estimate_start_unix_s(recording),

@@ -344,11 +344,9 @@ def _read_receive_times(
     is_usable = start_offsets >= RECEIVE_TIME_BYTES
     is_usable[1:] &= start_offsets[1:] - end_offsets[:-1] >= RECEIVE_TIME_BYTES
     eight_byte_windows = np.lib.stride_tricks.sliding_window_view(content_bytes, RECEIVE_TIME_BYTES)
-    unchecked_receive_times_us = np.ascontiguousarray(
-        eight_byte_windows[np.maximum(start_offsets - RECEIVE_TIME_BYTES, 0)]
-    ).view(">u8")[:, 0]
+    time_bytes = eight_byte_windows[np.maximum(start_offsets - RECEIVE_TIME_BYTES, 0)]
     # damaged values above the range of int64 become negative
-    receive_times_us = unchecked_receive_times_us.astype(np.int64)
+    receive_times_us = np.ascontiguousarray(time_bytes).view(">u8")[:, 0].astype(np.int64)
     is_usable &= (receive_times_us >= 0) & (receive_times_us < 1 << 62)
     median_receive_time_us = int(np.median(receive_times_us[is_usable])) if np.any(is_usable) else 0
     is_usable &= np.abs(receive_times_us - median_receive_time_us) <= MAX_RECEIVE_TIME_DIFFERENCE_US

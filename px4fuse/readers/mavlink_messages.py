@@ -10,8 +10,8 @@ from typing import Any
 import msgspec
 
 from px4fuse.core.record import read_toml
-from px4fuse.flight.model import SourceOrigin, Unavailable, find_source_origin
-from px4fuse.readers.field_maps import Layout, expand_layouts
+from px4fuse.flight.model import Unavailable
+from px4fuse.readers.common import Layout, expand_layouts
 
 AUTOPILOT_COMPONENT_ID = 1  # MAV_COMP_ID_AUTOPILOT1
 NO_AUTOPILOT = 8  # MAV_AUTOPILOT_INVALID: sent by ground stations, cameras, companions
@@ -63,10 +63,6 @@ class PositionMessageType:
         return MESSAGE_LAYOUTS[self.layout_name or self.track_name]
 
     @property
-    def origin(self) -> SourceOrigin:
-        return find_source_origin(self.kind, "as received")
-
-    @property
     def message(self) -> str:
         return self.layout.topic
 
@@ -100,19 +96,16 @@ POSITION_MESSAGE_TYPES = tuple(
     msgspec.convert({"track_name": name, **row}, PositionMessageType)
     for name, row in _MESSAGE_TABLES["positions"].items()
 )
-_SCALED_IMU_LAYOUTS = (
-    replace(MESSAGE_LAYOUTS["SCALED_IMU"], topic=f"SCALED_IMU{number}") for number in ("", "2", "3")
-)
 HIGHRES_IMU_LAYOUT = MESSAGE_LAYOUTS["HIGHRES_IMU"]
-IMU_LAYOUTS = (HIGHRES_IMU_LAYOUT, *_SCALED_IMU_LAYOUTS)
+IMU_LAYOUTS = [HIGHRES_IMU_LAYOUT] + [
+    replace(MESSAGE_LAYOUTS["SCALED_IMU"], topic=f"SCALED_IMU{number}") for number in ("", "2", "3")
+]
 # Attitude messages; the message with most samples is used
 ATTITUDE_LAYOUTS = (
     MESSAGE_LAYOUTS["ATTITUDE_QUATERNION"],
     MESSAGE_LAYOUTS["ATTITUDE"],
     MESSAGE_LAYOUTS["attitude_of_odometry"],
 )
-# Messages with EKF2's state
-ODOMETRY_LAYOUT = MESSAGE_LAYOUTS["ODOMETRY"]
 LOCAL_POSITION_LAYOUT = MESSAGE_LAYOUTS["LOCAL_POSITION_NED"]
 # Messages with ground truth of a simulation
 TRUTH_LAYOUTS = (MESSAGE_LAYOUTS["HIL_STATE_QUATERNION"], MESSAGE_LAYOUTS["SIMSTATE"])

@@ -13,11 +13,19 @@ from px4fuse.flight.model import (
     PositionTrack,
     Truth,
     Unavailable,
+    find_source_origin,
 )
-from px4fuse.readers import mavlink_messages as messages
-from px4fuse.readers.common import join_nearest, read_attitude, read_orientation
-from px4fuse.readers.field_maps import Layout
+from px4fuse.readers.common import Layout, join_nearest, read_attitude, read_orientation
 from px4fuse.readers.mavlink_frames import MavlinkAddress
+from px4fuse.readers.mavlink_messages import (
+    CONVERSION_BY_MAV_FRAME,
+    GNSS_LAYOUTS,
+    LOCAL_POSITION_LAYOUT,
+    MESSAGE_LAYOUTS,
+    POSITION_MESSAGE_TYPES,
+    TRUTH_LAYOUTS,
+    PositionMessageType,
+)
 from px4fuse.readers.mavlink_recording import BOOT_CLOCK_TEXT, RECEIPT_CLOCK_TEXT, Recording
 from px4fuse.readers.mavlink_senders import ClockMapping, find_senders
 from px4fuse.readers.px4_positions import (
@@ -25,6 +33,7 @@ from px4fuse.readers.px4_positions import (
     MIN_TRACK_SAMPLES,
     NO_FIX_ACTION,
     GeodeticPosition,
+    TracksAndMissingSources,
     convert_gnss_fixes,
     find_motion_capture_truth,
     make_track,
@@ -42,7 +51,7 @@ MAX_ORIGIN_TIME_DIFFERENCE_S = 0.05
 
 def read_positions(
     recording: Recording, clocks: dict[MavlinkAddress, ClockMapping], delay_s: float
-) -> tuple[tuple[PositionTrack, ...], tuple[Unavailable, ...]]:
+) -> TracksAndMissingSources:
     """Read the external positions sent to the autopilot, and the GNSS positions.
 
     Parameters
@@ -53,12 +62,12 @@ def read_positions(
         Delay (s) from GNSS measurement to timestamp that the autopilot assumes.
     """
     tracks_or_unavailable: list[PositionTrack | Unavailable] = []
-    for message in dict.fromkeys(source.message for source in messages.POSITION_MESSAGE_TYPES):
+    for message in dict.fromkeys(source.message for source in POSITION_MESSAGE_TYPES):
         senders = find_senders(recording, message)
         tracks = [
             track
             for sender in senders
-            for source in messages.POSITION_MESSAGE_TYPES
+            for source in POSITION_MESSAGE_TYPES
             if source.message == message
             if (track := _read_track(recording, source, sender, clocks[sender], senders))
         ]
@@ -69,14 +78,14 @@ def read_positions(
                 recording.remedies["position"],
             )
         ]
-    gnss_tracks = (_read_gnss(recording, layout, delay_s) for layout in messages.GNSS_LAYOUTS)
+    gnss_tracks = (_read_gnss(recording, layout, delay_s) for layout in GNSS_LAYOUTS)
     tracks_or_unavailable += [track for track in gnss_tracks if track]
     return split_tracks(tracks_or_unavailable)
 
 
 def _read_track(
     recording: Recording,
-    source: messages.PositionMessageType,
+    source: PositionMessageType,
     sender: MavlinkAddress,
     clock: ClockMapping,
     senders: list[MavlinkAddress],
@@ -101,7 +110,7 @@ def _read_track(
     frame = source.frame
     if "frame_id" in samples and len(samples):
         # The coordinate frame of the last sample applies to all samples, as in PX4
-        frame_conversion = messages.CONVERSION_BY_MAV_FRAME.get(int(samples["frame_id"].iloc[-1]))
+        frame_conversion = CONVERSION_BY_MAV_FRAME.get(int(samples["frame_id"].iloc[-1]))
         frame = "unknown" if frame_conversion is None else frame_conversion.name
     if source.drops_covariance:
         samples[Columns.POSITION_VARIANCE + Columns.ROTATION_VARIANCE] = np.nan
@@ -110,7 +119,7 @@ def _read_track(
     return make_track(
         track_name,
         samples,
-        source.origin,
+        find_source_origin(source.kind, "as received"),
         remedy=recording.remedies["position"],
         is_odometry=orientation is not None,
         description=source.description,
@@ -155,7 +164,7 @@ def _read_gnss(
             NO_FIX_ACTION,
         )
     is_auto_candidate = bool(
-        recording.read(messages.MESSAGE_LAYOUTS["GLOBAL_POSITION_INT"])["latitude_deg"].any()
+        recording.read(MESSAGE_LAYOUTS["GLOBAL_POSITION_INT"])["latitude_deg"].any()
     )
     return make_track(
         layout.topic,
@@ -181,12 +190,12 @@ def find_local_origin(recording: Recording) -> GeodeticPosition | None:
 
     It is read from GPS_GLOBAL_ORIGIN, or computed from global and local positions.
     """
-    sent_origins = recording.read(messages.MESSAGE_LAYOUTS["GPS_GLOBAL_ORIGIN"]).dropna()
+    sent_origins = recording.read(MESSAGE_LAYOUTS["GPS_GLOBAL_ORIGIN"]).dropna()
     if len(sent_origins):
         return tuple(sent_origins.iloc[-1].tolist())
     joined_positions = join_nearest(
-        recording.read(messages.MESSAGE_LAYOUTS["GLOBAL_POSITION_INT"]),
-        recording.read(messages.LOCAL_POSITION_LAYOUT)[Columns.POSITION],
+        recording.read(MESSAGE_LAYOUTS["GLOBAL_POSITION_INT"]),
+        recording.read(LOCAL_POSITION_LAYOUT)[Columns.POSITION],
         MAX_ORIGIN_TIME_DIFFERENCE_S,
     ).dropna()
     joined_positions = joined_positions[joined_positions["latitude_deg"] != 0.0]
@@ -207,7 +216,7 @@ def read_truth(recording: Recording, positions: tuple[PositionTrack, ...]) -> Tr
     Simulation ground truth has receive times, because PX4 sends no timestamp in
     ``HIL_STATE_QUATERNION``.
     """
-    for layout in messages.TRUTH_LAYOUTS:
+    for layout in TRUTH_LAYOUTS:
         rows = recording.rows(layout.topic)
         if len(rows) < MIN_TRACK_SAMPLES:
             continue

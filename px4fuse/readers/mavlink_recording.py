@@ -18,8 +18,7 @@ from scipy.stats import theilslopes
 
 from px4fuse.core.arrays import Array, IntArray
 from px4fuse.flight.model import Columns, DataSource, time_index
-from px4fuse.readers.common import MIN_QUATERNION_NORM
-from px4fuse.readers.field_maps import MAX_FIELD_VALUE, Layout
+from px4fuse.readers.common import MAX_FIELD_VALUE, MIN_QUATERNION_NORM, Layout
 from px4fuse.readers.mavlink_frames import (
     MavlinkAddress,
     MavlinkFrames,
@@ -179,6 +178,10 @@ class Recording:
         """Return the indices of the frames with a message from ``address`` (default: autopilot)."""
         rows = self.rows_of_all_senders(message)
         return rows[self.frames.is_sent_by(address or self.address, rows)]
+
+    def table(self, message: str) -> NDArray[Any]:
+        """Return the fields of all messages of one type from the autopilot, in MAVLink units."""
+        return self.frames.table(message, self.rows(message))
 
     def find_most_frequent(self, layouts: Sequence[Layout]) -> Layout:
         """Return the layout whose message the autopilot sent most often."""
@@ -401,7 +404,7 @@ def _remove_stray_timestamps(times_s: Array, rows: IntArray) -> IntArray:
 
 def map_boot_to_unix(recording: Recording) -> ClockLine | None:
     """Return the conversion of boot time to UNIX time; None if SYSTEM_TIME has no UNIX time."""
-    table = recording.frames.table("SYSTEM_TIME", recording.rows("SYSTEM_TIME"))
+    table = recording.table("SYSTEM_TIME")
     table = table[table["time_unix_usec"] * 1e-6 > MIN_UNIX_TIME_S]
     if not len(table):
         return None

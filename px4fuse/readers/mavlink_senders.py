@@ -9,11 +9,18 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from px4fuse.core.arrays import Array, IntArray
+from px4fuse.core.arrays import Array, ArrayPair, IntArray
 from px4fuse.errors import SettingsError
 from px4fuse.flight.model import ClockMap, Sender
-from px4fuse.readers import mavlink_messages as messages
 from px4fuse.readers.mavlink_frames import VEHICLE_TYPES, MavlinkAddress, MavlinkFrames
+from px4fuse.readers.mavlink_messages import (
+    AUTOPILOT_COMPONENT_ID,
+    AUTOPILOT_MESSAGES,
+    AUTOPILOT_NAME_BY_ID,
+    GROUND_STATION_TYPE,
+    NO_AUTOPILOT,
+    POSITION_MESSAGE_TYPES,
+)
 from px4fuse.readers.mavlink_recording import (
     MAX_RELATIVE_CLOCK_RATE_DIFFERENCE,
     MIN_BACKWARD_STEP_AT_RESTART_S,
@@ -75,7 +82,7 @@ def _count_frames(
 
 
 def _is_vehicle(vehicle_type: int, autopilot: int) -> bool:
-    return autopilot != messages.NO_AUTOPILOT and vehicle_type != messages.GROUND_STATION_TYPE
+    return autopilot != NO_AUTOPILOT and vehicle_type != GROUND_STATION_TYPE
 
 
 def choose_autopilot(frames: MavlinkFrames, system_id: int | None) -> tuple[MavlinkAddress, str]:
@@ -95,7 +102,7 @@ def choose_autopilot(frames: MavlinkFrames, system_id: int | None) -> tuple[Mavl
         for address in frame_counts
         if address in vehicle_types and _is_vehicle(*vehicle_types[address])
     ]
-    rows = np.concatenate([frames.rows(message) for message in messages.AUTOPILOT_MESSAGES])
+    rows = np.concatenate([frames.rows(message) for message in AUTOPILOT_MESSAGES])
     addresses_with_autopilot_message = _count_frames(frames, rows)
     # A heartbeat is not sufficient, because companion computers may also send autopilot heartbeats
     candidates = (
@@ -103,7 +110,7 @@ def choose_autopilot(frames: MavlinkFrames, system_id: int | None) -> tuple[Mavl
         or [address for address in addresses_with_autopilot_message if address not in vehicle_types]
         or vehicle_addresses
         # If no message is from an autopilot, assume one in each system
-        or [(system, messages.AUTOPILOT_COMPONENT_ID) for system, _ in frame_counts]
+        or [(system, AUTOPILOT_COMPONENT_ID) for system, _ in frame_counts]
     )
     if system_id is not None:
         candidates = [
@@ -117,7 +124,7 @@ def choose_autopilot(frames: MavlinkFrames, system_id: int | None) -> tuple[Mavl
             )
     best_address = max(candidates, key=lambda address: frame_counts.get(address, 0))
     _, autopilot_type = vehicle_types.get(best_address, (-1, -1))
-    return best_address, messages.AUTOPILOT_NAME_BY_ID.get(autopilot_type, "unknown autopilot")
+    return best_address, AUTOPILOT_NAME_BY_ID.get(autopilot_type, "unknown autopilot")
 
 
 def find_senders(recording: Recording, message: str) -> list[MavlinkAddress]:
@@ -138,7 +145,7 @@ def find_senders(recording: Recording, message: str) -> list[MavlinkAddress]:
 
 def map_sender_clocks(recording: Recording) -> dict[MavlinkAddress, ClockMapping]:
     """Return the conversion of each position sender's clock to the autopilot's boot clock."""
-    message_names = {source.message for source in messages.POSITION_MESSAGE_TYPES}
+    message_names = {source.message for source in POSITION_MESSAGE_TYPES}
     senders = {address for message in message_names for address in find_senders(recording, message)}
     boot_to_unix_fit = map_boot_to_unix(recording)
     return {
@@ -152,11 +159,11 @@ def _map_sender_clock(
     frames = recording.frames
     timestamps_s = []
     receive_times_s = []
-    for source in messages.POSITION_MESSAGE_TYPES:
+    for source in POSITION_MESSAGE_TYPES:
         rows = recording.rows(source.message, sender)
         timestamps_s.append(frames.table(source.message, rows)[source.timestamp_field] * 1e-6)
         receive_times_s.append(recording.receive_times_s[rows])
-    median_timestamp_s = float(np.median(np.concatenate(timestamps_s)))
+    median_timestamp_s = np.median(np.concatenate(timestamps_s))
     has_running_clock = is_running_clock(np.concatenate(timestamps_s))
     rows = recording.rows("TIMESYNC", sender)
     timesync = frames.table("TIMESYNC", rows)
@@ -180,7 +187,7 @@ def _map_sender_clock(
     )
     timestamps_s.append(timesync_request_times_s[is_timesync_request])
     receive_times_s.append(recording.receive_times_s[rows][is_timesync_request])
-    autopilot_timesync = frames.table("TIMESYNC", recording.rows("TIMESYNC"))
+    autopilot_timesync = recording.table("TIMESYNC")
     autopilot_reply_times_s = autopilot_timesync["tc1"] * 1e-9
     sender_request_times_s = autopilot_timesync["ts1"] * 1e-9
     is_autopilot_reply = (autopilot_reply_times_s != 0.0) & (
@@ -209,8 +216,8 @@ def map_clock_to_boot(
     timestamps_s: Array,
     receive_times_s: Array,
     receipt_to_boot_fit: ClockLine,
-    sender_replies: tuple[Array, Array],
-    autopilot_replies: tuple[Array, Array],
+    sender_replies: ArrayPair,
+    autopilot_replies: ArrayPair,
     boot_to_unix_fit: ClockLine | None,
     *,
     has_receive_times: bool,
@@ -254,10 +261,12 @@ def map_clock_to_boot(
         intervals_s = np.diff(receive_times_s)
         intervals_s = intervals_s[intervals_s < MAX_REGULAR_SAMPLE_INTERVAL_S]
         jitter_s = float(np.std(intervals_s) / np.sqrt(2.0)) if len(intervals_s) else 0.0
-        description = ClockMap(
-            name, time_source, len(timestamps_s), 0.0, 0.0, jitter_s, note, distinct_count
+        return ClockMapping(
+            None,
+            ClockMap(
+                name, time_source, len(timestamps_s), 0.0, 0.0, jitter_s, note, distinct_count
+            ),
         )
-        return ClockMapping(None, description)
 
     def compute_difference_from_receipt_s(boot_time_s: Array) -> float:
         return abs(float(np.median(boot_time_at_receipt_s - boot_time_s)))
@@ -279,7 +288,7 @@ def map_clock_to_boot(
         same_clock = ClockLine(0.0, 0.0, 1.0, 0.0, len(timestamps_s))
         note = "the timestamps of the sender are boot times of the autopilot"
         return _make_clock_mapping(name, "boot clock", same_clock, timestamps_s, note)
-    clock_kind = "UNIX time" if float(np.median(timestamps_s)) > MIN_UNIX_TIME_S else "clock"
+    clock_kind = "UNIX time" if np.median(timestamps_s) > MIN_UNIX_TIME_S else "clock"
     clock_name = f"{clock_kind} of {name}"
     candidate_fits = [] if timesync_fit is None else [("TIMESYNC", timesync_fit, "")]
     if clock_kind == "UNIX time" and boot_to_unix_fit is not None:
@@ -305,9 +314,7 @@ def map_clock_to_boot(
     return _make_clock_mapping(clock_name, time_source, sender_to_boot_fit, timestamps_s, note)
 
 
-def _fit_timesync(
-    sender_replies: tuple[Array, Array], autopilot_replies: tuple[Array, Array]
-) -> ClockLine | None:
+def _fit_timesync(sender_replies: ArrayPair, autopilot_replies: ArrayPair) -> ClockLine | None:
     """Fit the conversion of sender clock to boot clock by TIMESYNC, as mean of both directions."""
     clock_fits = []
     if len(sender_replies[0]) >= MIN_TIMESYNC_REPLIES:
@@ -327,7 +334,7 @@ def _fit_timesync(
 def _make_clock_mapping(
     clock: str, method: str, line: ClockLine, timestamps_s: Array, note: str
 ) -> ClockMapping:
-    middle_timestamp_s = float(0.5 * (timestamps_s.min() + timestamps_s.max()))
+    middle_timestamp_s = 0.5 * float(timestamps_s.min() + timestamps_s.max())
     offset_s = float(line.at(middle_timestamp_s)) - middle_timestamp_s
     drift_ppm = (line.slope - 1.0) * 1e6
     description = ClockMap(
@@ -376,12 +383,13 @@ def describe_senders(recording: Recording) -> tuple[Sender, ...]:
         if address in vehicle_types:
             vehicle_type, autopilot = vehicle_types[address]
             description = VEHICLE_TYPES.get(vehicle_type, f"vehicle of MAV_TYPE {vehicle_type}")
-            if autopilot != messages.NO_AUTOPILOT:
-                name = messages.AUTOPILOT_NAME_BY_ID.get(autopilot, "autopilot")
+            if autopilot != NO_AUTOPILOT:
+                name = AUTOPILOT_NAME_BY_ID.get(autopilot, "autopilot")
                 description = f"{name} {description}"
         lost_fraction = _estimate_lost_fraction(frames, address)
-        is_analysed = address == recording.address
-        senders.append(Sender(*address, description, count, lost_fraction, is_analysed))
+        senders.append(
+            Sender(*address, description, count, lost_fraction, address == recording.address)
+        )
     return tuple(senders)
 
 
@@ -395,6 +403,6 @@ def _estimate_lost_fraction(frames: MavlinkFrames, address: MavlinkAddress) -> f
     unwrapped_sequence = np.append(0, np.cumsum(sequence_steps))
     sent_count = np.ptp(unwrapped_sequence) + 1
     lost_fraction = float(1.0 - len(np.unique(unwrapped_sequence)) / sent_count)
-    has_sequence_numbers = len(unwrapped_sequence) == 1 or bool(unwrapped_sequence.any())
+    has_sequence_numbers = len(unwrapped_sequence) == 1 or unwrapped_sequence.any()
     is_usable = has_sequence_numbers and lost_fraction < MAX_LOST_MESSAGE_FRACTION
     return lost_fraction if is_usable else None

@@ -18,14 +18,16 @@ from px4fuse.core.arrays import Array, IntArray, compute_median_interval_s
 from px4fuse.core.reading import read_bytes_limited, split_path_and_part
 from px4fuse.errors import LogError, SettingsError
 from px4fuse.flight.model import NO_INVALID_ROWS, time_index
-from px4fuse.readers import position_names
 from px4fuse.readers.common import classify_invalid_positions, estimate_rounding_step
 from px4fuse.readers.position_names import (
     METRES_BY_LENGTH_UNIT,
     SECONDS_BY_TIME_UNIT,
+    TIME_KINDS,
     ColumnMeaning,
     PositionColumns,
+    find_position_columns,
     find_quaternion_columns,
+    find_sigma_columns,
     read_column_name,
 )
 from px4fuse.readers.recording_table import (
@@ -143,7 +145,7 @@ def read_position_file(
     row_count = len(numbers)
     time_column, time_text = _detect_time_column(table, column_meanings, numbers)
     frame, axis_columns = _find_axes(column_meanings, numbers)
-    sigma_columns = position_names.find_sigma_columns(column_meanings, frame)
+    sigma_columns = find_sigma_columns(column_meanings, frame)
     position_columns = [index for index in axis_columns if index is not None]
     # pandas reads numbers such as 1e999 as infinite
     has_time = np.isfinite(numbers[time_column])
@@ -180,9 +182,11 @@ def read_position_file(
         and len(kept_rows) < MIN_MATCHING_ROW_FRACTION * row_count
     )
     if has_no_times or len(kept_rows) < MIN_USABLE_ROWS:
-        fault = f"contains {len(kept_rows)} usable rows, fewer than {MIN_USABLE_ROWS}"
+        fault = (
+            f"{table.file_name} contains {len(kept_rows)} usable rows, fewer than {MIN_USABLE_ROWS}"
+        )
         raise LogError(
-            "; ".join((f"{table.file_name} {fault}", *notes)),
+            "; ".join((fault, *notes)),
             "Write numbers with decimal points. Alternatively, name the columns with "
             f"{COLUMNS_OPTION}.",
         )
@@ -210,12 +214,12 @@ def read_position_file(
     samples = samples[is_valid]
     is_ignored_sigma = samples[SIGMA_COLUMNS] <= 0.0
     samples[SIGMA_COLUMNS] = samples[SIGMA_COLUMNS].mask(is_ignored_sigma)
-    if ignored_count := int(is_ignored_sigma.any(axis=1).sum()):
+    if ignored_count := is_ignored_sigma.any(axis=1).sum():
         notes.append(f"number of rows with an ignored sigma (not positive): {ignored_count}")
     clock_kind: Literal["UNIX", "local"] = (
         "UNIX"
         if has_time_zone
-        and MIN_VALID_UNIX_TIME_S <= float(np.median(numbers.index)) < MAX_VALID_UNIX_TIME_S
+        and MIN_VALID_UNIX_TIME_S <= np.median(numbers.index) < MAX_VALID_UNIX_TIME_S
         else "local"
     )
     return PositionRecording(
@@ -309,9 +313,8 @@ def _read_numbers(
     known_columns = [index for index, meaning in enumerate(column_meanings) if meaning.kind]
     texts = table.read_cells([*quaternion_columns, *known_columns])
     texts = _select_body(table, texts, column_meanings, body_name)
-    may_have_decimal_comma = table.separator != ","
     # DataFrame.apply returns dtype object for an empty table
-    numbers = texts.apply(_to_numbers, may_have_decimal_comma=may_have_decimal_comma).astype(
+    numbers = texts.apply(_to_numbers, may_have_decimal_comma=table.separator != ",").astype(
         np.float64
     )
     has_time_zone = True
@@ -391,18 +394,19 @@ def _interpret_given_columns(
     meanings = [
         meaning if meaning.kind in kept_kinds else ColumnMeaning() for meaning in column_meanings
     ]
-    for index, axis in zip(position_columns, "xyz", strict=False):
-        meanings[index] = ColumnMeaning("position", axis, column_meanings[index].unit)
     # The names of other columns must not define the frame
-    named_position = position_names.find_position_columns(
+    named_position = find_position_columns(
         [
             meaning if index in position_columns else ColumnMeaning()
             for index, meaning in enumerate(column_meanings)
         ]
     )
-    if named_position and {*named_position[1]} - {None} == {*position_columns}:
-        for index in position_columns:
-            meanings[index] = column_meanings[index]
+    has_axis_names = named_position and {*named_position[1]} - {None} == {*position_columns}
+    for index, axis in zip(position_columns, "xyz", strict=False):
+        meaning = column_meanings[index]
+        meanings[index] = (
+            meaning if has_axis_names else ColumnMeaning("position", axis, meaning.unit)
+        )
     for index in sigma_columns:
         meanings[index] = ColumnMeaning("sigma", unit=column_meanings[index].unit)
     time_unit = column_meanings[time_column].unit
@@ -414,7 +418,7 @@ def _find_axes(
     column_meanings: Sequence[ColumnMeaning], numbers: pd.DataFrame
 ) -> tuple[str | None, PositionColumns]:
     """Return the frame of the position (None: unknown), and the column indices of its axes."""
-    frame_and_axis_columns = position_names.find_position_columns(column_meanings)
+    frame_and_axis_columns = find_position_columns(column_meanings)
     assert frame_and_axis_columns  # find_table returns only tables with positions
     frame, (x_column, y_column, z_column) = frame_and_axis_columns
     if z_column is not None and numbers[z_column].isna().all():
@@ -436,16 +440,15 @@ def _detect_time_column(
         time_columns,
         key=lambda index: (
             is_mostly_empty[index],
-            position_names.TIME_KINDS.index(column_meanings[index].time_kind),
+            TIME_KINDS.index(column_meanings[index].time_kind),
             column_meanings[index].unit == "ns",
         ),
     )
     time_text = table.format_labels(time_column)
     for index in [*other_time_columns]:
-        is_whole_second = numbers[time_column] % 1.0 == 0.0
         if (
             column_meanings[index].unit == "ns"
-            and is_whole_second.mean() > MIN_MATCHING_ROW_FRACTION
+            and (numbers[time_column] % 1.0 == 0.0).mean() > MIN_MATCHING_ROW_FRACTION
             and numbers[index].max() < 1e9
         ):
             numbers[time_column] += numbers[index] * 1e-9
@@ -513,7 +516,7 @@ def _choose_length_units(
     }
     # The range from 5 % to 95 % excludes outliers
     extents = numbers[position_columns].quantile(0.95) - numbers[position_columns].quantile(0.05)
-    max_extent = float(extents.max())
+    max_extent = extents.max()
     unit = "m"
     reason = "px4fuse assumes metres, because the column names contain no unit"
     if given_unit is not None:
@@ -532,7 +535,7 @@ def _choose_length_units(
         {index: named_units.get(index, unit) for index in map(int, numbers.columns)}
     )
     metres_per_unit = column_units.map(METRES_BY_LENGTH_UNIT)
-    extent_m = float((extents * metres_per_unit).max())
+    extent_m = (extents * metres_per_unit).max()
     units_text = ", ".join(dict.fromkeys(column_units[position_columns]))
     return (
         metres_per_unit,

@@ -11,7 +11,7 @@ import pandas as pd
 from numpy.typing import ArrayLike
 
 from px4fuse.core.arrays import Array, IntArray, compute_median_interval_s
-from px4fuse.flight.ekf2_parameters import AIDS, EV_POS, FLOW, STATUS_FLAGS, fill_with_defaults
+from px4fuse.flight.ekf2_parameters import AIDS, EV_POS, FLOW, fill_with_defaults
 from px4fuse.flight.model import (
     BIAS_NOT_LOGGED,
     EKF2_STEP_S,
@@ -28,12 +28,23 @@ from px4fuse.flight.model import (
     sample_step_function,
     time_index,
 )
-from px4fuse.readers import px4_topics as px4
-from px4fuse.readers.field_maps import Layout
+from px4fuse.readers.common import Layout
 from px4fuse.readers.px4_innovations import (
     collect_innovations_by_axis,
     read_aids,
     read_enabled_aids,
+)
+from px4fuse.readers.px4_topics import (
+    ATTITUDE_VARIANCE_COUNT_BY_ARRAY_LENGTHS,
+    DEFAULT_PROFILE_REMEDY,
+    HEIGHT_BIAS_LAYOUT_BY_AID,
+    IMU_LAYOUT,
+    LOCAL_POSITION_LAYOUT,
+    QUATERNION_VARIANCE_COUNT,
+    STATE_VECTOR_TOPICS,
+    STATUS_FLAGS_TOPIC,
+    STATUS_TOPIC,
+    TOPIC_LAYOUTS,
 )
 from px4fuse.readers.ulog_topics import Topics, measurement_time_us
 
@@ -62,7 +73,7 @@ OTHER_HORIZONTAL_AIDS = (
 VARIANCES_NOT_LOGGED = Unavailable(
     "EKF2 variances",
     "estimator_states (estimator_status before v1.12) is not logged or not usable",
-    f"{px4.DEFAULT_PROFILE_REMEDY} Wait until EKF2 has started.",
+    f"{DEFAULT_PROFILE_REMEDY} Wait until EKF2 has started.",
 )
 # Reset counters in vehicle_local_position, with the reset quantity and the columns of the change
 # (north, east, down)
@@ -85,11 +96,9 @@ def read_ekf2(topics: Topics) -> Ekf2 | Unavailable:
             f"another estimator was running, because SYS_MC_EST_GROUP is {estimator_group:.0f}",
             "Set SYS_MC_EST_GROUP to 2 (EKF2).",
         )
-    local_position = topics.read(px4.LOCAL_POSITION_LAYOUT)
-    if topics.find_layout(px4.LOCAL_POSITION_LAYOUT) is None:
-        return Unavailable(
-            "EKF2", "vehicle_local_position is not logged", px4.DEFAULT_PROFILE_REMEDY
-        )
+    local_position = topics.read(LOCAL_POSITION_LAYOUT)
+    if topics.find_layout(LOCAL_POSITION_LAYOUT) is None:
+        return Unavailable("EKF2", "vehicle_local_position is not logged", DEFAULT_PROFILE_REMEDY)
     state = local_position[Columns.STATE].dropna()
     if state.empty:
         return Unavailable(
@@ -97,7 +106,7 @@ def read_ekf2(topics: Topics) -> Ekf2 | Unavailable:
             "vehicle_local_position has no finite sample",
             "Start the recording after EKF2 has started.",
         )
-    topics.record_stream("ekf2_state", px4.LOCAL_POSITION_LAYOUT.topic)
+    topics.record_stream("ekf2_state", LOCAL_POSITION_LAYOUT.topic)
     aid_enabled_flags = read_enabled_aids(topics)
     fusion_flags = _read_fusion_flags(topics, aid_enabled_flags)
     vision_gate = fill_with_defaults(parameters)[EV_POS.gate]
@@ -114,7 +123,7 @@ def read_ekf2(topics: Topics) -> Ekf2 | Unavailable:
     status_flags = aid_enabled_flags | {
         name: local_position[name] for name in VALIDITY_FLAGS if name in local_position
     }
-    failed_gnss_checks = topics.primary_samples(px4.TOPIC_LAYOUTS["gnss_checks"])["failed"].dropna()
+    failed_gnss_checks = topics.primary_samples(TOPIC_LAYOUTS["gnss_checks"])["failed"].dropna()
     if len(failed_gnss_checks):
         status_flags["failed_checks"] = failed_gnss_checks
     step_s = _estimate_step_s(topics)
@@ -159,12 +168,12 @@ def _find_state_vector(topics: Topics) -> tuple[str, int]:
 
     The topic is "" if it is not logged. The number is 0 for an unknown state vector.
     """
-    for topic in px4.STATE_VECTOR_TOPICS:
+    for topic in STATE_VECTOR_TOPICS:
         for table in topics.tables_of(topic)[:1]:
             state_count = sum(name.startswith("states[") for name in table)
             variance_count = sum(name.startswith("covariances[") for name in table)
             if variance_count:
-                return topic, px4.ATTITUDE_VARIANCE_COUNT_BY_ARRAY_LENGTHS.get(
+                return topic, ATTITUDE_VARIANCE_COUNT_BY_ARRAY_LENGTHS.get(
                     (state_count, variance_count), 0
                 )
     return "", 0
@@ -193,7 +202,7 @@ def _read_horizon_state(topics: Topics, step_s: float) -> TableOrUnavailable:
     samples = samples[(samples[variance_fields] >= 0.0).all(axis=1)]
     state = samples[state_fields].to_numpy(copy=True)
     variance = samples[variance_fields].to_numpy(copy=True)
-    if attitude_variance_count == px4.QUATERNION_VARIANCE_COUNT:
+    if attitude_variance_count == QUATERNION_VARIANCE_COUNT:
         state[:, 10:16] /= step_s
         variance = np.hstack(
             [_convert_attitude_variance(state[:, :4], variance[:, :4]), variance[:, 4:]]
@@ -211,7 +220,7 @@ def configured_step_s(topics: Topics) -> float:
 def _estimate_step_s(topics: Topics) -> float:
     """Return EKF2's actual prediction interval (s), a multiple of the IMU interval."""
     configured_interval_s = configured_step_s(topics)
-    imu_time_s = topics.read(Layout(px4.IMU_LAYOUT.topic, {"time": "timestamp"})).index.to_numpy()
+    imu_time_s = topics.read(Layout(IMU_LAYOUT.topic, {"time": "timestamp"})).index.to_numpy()
     if (
         len(imu_time_s) < 2
         or (interval_s := compute_median_interval_s(imu_time_s)) >= configured_interval_s
@@ -275,7 +284,7 @@ def compute_samples_per_step(
 def _read_accelerometer_bias(
     topics: Topics, horizon_state: TableOrUnavailable
 ) -> TableOrUnavailable:
-    if len(bias := topics.primary_samples(px4.TOPIC_LAYOUTS["estimator_sensor_bias"]).dropna()):
+    if len(bias := topics.primary_samples(TOPIC_LAYOUTS["estimator_sensor_bias"]).dropna()):
         return bias
     if isinstance(horizon_state, Unavailable) or horizon_state.empty:
         return BIAS_NOT_LOGGED
@@ -298,9 +307,9 @@ def _compute_publication_delay_s(topics: Topics, topic: str) -> pd.Series:
     for table in topics.tables_of(topic)[:1]:
         if "timestamp_sample" in table:
             sample_times_us = measurement_time_us(table)
-            sample_time_index = time_index((sample_times_us - topics.time_origin_us) * 1e-6)
             delay_us = table["timestamp"].astype(np.int64) - sample_times_us
-            return pd.Series(delay_us * 1e-6, index=sample_time_index)
+            sample_times_s = (sample_times_us - topics.time_origin_us) * 1e-6
+            return pd.Series(delay_us * 1e-6, time_index(sample_times_s))
     return pd.Series(dtype=np.float64)
 
 
@@ -312,9 +321,9 @@ def _read_fusion_flags(topics: Topics, enabled_aids: StepFunctions) -> TableOrUn
         return Unavailable(
             "EKF2 fusion flags",
             "estimator_status_flags and estimator_status are not logged or not usable",
-            px4.DEFAULT_PROFILE_REMEDY,
+            DEFAULT_PROFILE_REMEDY,
         )
-    topic = px4.STATUS_FLAGS if topics.instances(px4.STATUS_FLAGS) else px4.STATUS_TOPIC
+    topic = STATUS_FLAGS_TOPIC if topics.instances(STATUS_FLAGS_TOPIC) else STATUS_TOPIC
     topics.record_stream("ekf2_fusing", topic)
     return flags
 
@@ -340,7 +349,7 @@ def _read_fusion_record(
 ) -> FusionRecord | Unavailable:
     """Read the data for the EKF2 replay. ``local_samples`` are of ``vehicle_local_position``."""
     topic, attitude_variance_count = _find_state_vector(topics)
-    if topic != px4.STATE_VECTOR_TOPICS[0] or isinstance(horizon_state, Unavailable):
+    if topic != STATE_VECTOR_TOPICS[0] or isinstance(horizon_state, Unavailable):
         return RECORD_NOT_LOGGED
     quaternion_norm = np.linalg.norm(horizon_state[Columns.QUATERNION], axis=1)
     usable_state = horizon_state[np.abs(quaternion_norm - 1.0) < 0.01].copy()
@@ -359,7 +368,7 @@ def _read_fusion_record(
     return FusionRecord(
         parameters=topics.ekf2_parameters,
         delayed=usable_state,
-        stores_bias_increments=attitude_variance_count == px4.QUATERNION_VARIANCE_COUNT,
+        stores_bias_increments=attitude_variance_count == QUATERNION_VARIANCE_COUNT,
         other_horizontal_aids=tuple(
             AIDS[name].label.replace("external vision,", "vision")
             for name in OTHER_HORIZONTAL_AIDS
@@ -370,10 +379,10 @@ def _read_fusion_record(
         flow=_read_optical_flow(topics, enabled_aids),
         latitude_deg=float(origin["ref_lat"]),
         altitude_m=altitude_m,
-        status_flags={name: enabled_aids[name] for name in STATUS_FLAGS if name in enabled_aids},
+        status_flags=enabled_aids,
         height_bias_updates={
             name: topics.primary_samples(layout).dropna()
-            for name, layout in px4.HEIGHT_BIAS_LAYOUT_BY_AID.items()
+            for name, layout in HEIGHT_BIAS_LAYOUT_BY_AID.items()
             if topics.find_layout(layout) is not None
         },
     )
@@ -389,17 +398,17 @@ def _read_magnetic_field(topics: Topics, step_s: float) -> pd.DataFrame:
     innovations give the mean field between two logged observations, so they are preferred.
     """
     magnetometer, observations = (
-        topics.primary_samples(px4.TOPIC_LAYOUTS[topic]).dropna()
+        topics.primary_samples(TOPIC_LAYOUTS[topic]).dropna()
         for topic in ("vehicle_magnetometer", "estimator_aid_src_mag")
     )
     # EKF2 subtracts EKF2_MAG_DELAY and half a prediction interval from the times of observations
     delay_s = topics.ekf2_parameters.get("EKF2_MAG_DELAY", 0.0) * 1e-3 + 0.5 * step_s
     observations = observations.set_axis(observations.index + delay_s)
-    min_count = MIN_MAGNETOMETER_HZ * topics.log.duration_s
     field = max(magnetometer, observations, key=len)
-    if len(field) <= min_count and Columns.MAGNETIC_FIELD_INNOVATION[0] in observations:
+    is_incomplete = len(field) <= MIN_MAGNETOMETER_HZ * topics.log.duration_s
+    if is_incomplete and Columns.MAGNETIC_FIELD_INNOVATION[0] in observations:
         field = observations
-    control_bits = topics.read(px4.TOPIC_LAYOUTS["control_bits"])["bits"].dropna()
+    control_bits = topics.read(TOPIC_LAYOUTS["control_bits"])["bits"].dropna()
     if field.empty or control_bits.empty:
         return pd.DataFrame()
     flags = sample_step_function(control_bits, field.index).astype(np.int64)
@@ -409,14 +418,14 @@ def _read_magnetic_field(topics: Topics, step_s: float) -> pd.DataFrame:
 def _read_optical_flow(topics: Topics, enabled_aids: StepFunctions) -> pd.DataFrame:
     """Compute the mean optical flow between logged samples: inverse of EKF2's low-pass filter."""
     flow_velocity, flow_intervals, flow_noise = (
-        topics.primary_samples(px4.TOPIC_LAYOUTS[topic]).dropna()
+        topics.primary_samples(TOPIC_LAYOUTS[topic]).dropna()
         for topic in (
             "estimator_optical_flow_vel",
             "vehicle_optical_flow",
             "estimator_aid_src_optical_flow",
         )
     )
-    interval_s = float(flow_intervals["interval_us"].median()) * 1e-6
+    interval_s = flow_intervals["interval_us"].median() * 1e-6
     if not interval_s > 0.0 or flow_noise.empty:
         return pd.DataFrame()
     steps_s = flow_velocity.index.to_series().diff()

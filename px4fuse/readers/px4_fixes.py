@@ -47,18 +47,15 @@ def read_unlogged_fixes(
     fixes = fixes.set_axis(fixes.index + 0.5 * ekf2.step_s)
     next_row = np.clip(np.searchsorted(logged_fixes.index, fixes.index), 1, len(logged_fixes) - 1)
     times_s, logged_times_s = fixes.index.to_numpy(), logged_fixes.index.to_numpy()
-    distance_s = np.minimum(
-        np.abs(logged_times_s[next_row] - times_s), np.abs(logged_times_s[next_row - 1] - times_s)
-    )
+    distance_s = np.abs(logged_times_s[[next_row - 1, next_row]] - times_s).min(axis=0)
     is_between_fixes = (times_s > logged_times_s[0]) & (times_s < logged_times_s[-1])
-    matched_fixes = fixes[distance_s <= MAX_TIME_DIFFERENCE_OF_SAME_FIX_S]
-    unlogged_fixes = fixes[(distance_s > MAX_TIME_DIFFERENCE_OF_SAME_FIX_S) & is_between_fixes]
+    is_logged = distance_s <= MAX_TIME_DIFFERENCE_OF_SAME_FIX_S
     # Before v1.16, the topic contains a local position (m), no latitude and longitude
     is_in_degrees = (
-        matched_fixes["latitude_deg"].sub(logged_fixes["latitude_deg"].median()).abs().median()
+        fixes["latitude_deg"][is_logged].sub(logged_fixes["latitude_deg"].median()).abs().median()
         < MAX_DIFFERENCE_FROM_LOGGED_LATITUDE_DEG
     )
-    return unlogged_fixes if is_in_degrees else pd.DataFrame()
+    return fixes[~is_logged & is_between_fixes] if is_in_degrees else pd.DataFrame()
 
 
 def reconstruct_fixes(

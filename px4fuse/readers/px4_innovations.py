@@ -24,8 +24,7 @@ from px4fuse.flight.model import (
     sample_step_function,
 )
 from px4fuse.readers import px4_topics as px4
-from px4fuse.readers.common import join_nearest
-from px4fuse.readers.field_maps import Layout, assign_fields_to_columns
+from px4fuse.readers.common import Layout, assign_fields_to_columns, join_nearest
 from px4fuse.readers.ulog_topics import Topics
 
 # Maximum time (s) between innovation and variance S; PX4 logs them every 0.5 s by default
@@ -129,10 +128,8 @@ def replace_vision_by_gnss_innovations(ekf2: Ekf2, source: Ekf2PositionSource = 
         GNSS.logging_remedy,
     )
     if enabled_flags:
-        columns = ["horizontal", "vertical", "yaw"]
-        fusion_flags = (
-            pd.DataFrame(enabled_flags).ffill().bfill().reindex(columns=columns, fill_value=0.0)
-        )
+        flags = pd.DataFrame(enabled_flags).ffill().bfill()
+        fusion_flags = flags.reindex(columns=["horizontal", "vertical", "yaw"], fill_value=0.0)
     gate = ekf2.parameters.get(GNSS_POS.gate, GNSS_POS.default_gate)
     innovations, topics = collect_innovations_by_axis(ekf2.aids, fusion_flags, gate, source)
     return replace(
@@ -162,13 +159,13 @@ def collect_innovations_by_axis(
         if axis == "down":
             axis_group, quantity = "vertical", "height"
             aid_name, sensor_name = source.vertical_aid, source.height_sensor or source.name
-        aid_log = aids.get(aid_name)
-        axis_innovations = None if aid_log is None else select_axis_innovations(aid_log, axis, gate)
         remedy = source.logging_remedy
         if isinstance(fusion_flags, pd.DataFrame) and not fusion_flags[axis_group].any():
             reason = f"EKF2 never fused the {quantity} from {sensor_name} in this log"
             remedy = source.remedies[axis_group]
-        elif aid_log is None or axis_innovations is None or axis_innovations.empty:
+        elif (aid_log := aids.get(aid_name)) is None or (
+            axis_innovations := select_axis_innovations(aid_log, axis, gate)
+        ).empty:
             reason = (
                 f"the log has no usable innovation of {sensor_name} in "
                 f"estimator_aid_src_{source.horizontal_aid}, "
@@ -234,10 +231,11 @@ def read_aids(topics: Topics, enabled_aids: StepFunctions) -> dict[str, AidLog]:
 def read_enabled_aids(topics: Topics) -> dict[str, pd.Series[float]]:
     """Return a time series for each aiding source: 1 while its fusion is enabled, otherwise 0."""
     all_aids = (*AIDS.values(), *STATUS_FLAGS.values())
-    flag_names = {flag for aid in all_aids for group in aid.flags for flag in group.split("|")}
     layout = Layout(
-        px4.STATUS_FLAGS,
-        optional_columns={name: name for name in flag_names},
+        px4.STATUS_FLAGS_TOPIC,
+        optional_columns={
+            flag: flag for aid in all_aids for group in aid.flags for flag in group.split("|")
+        },
         is_step_function=True,
     )
     flags = topics.primary_samples(layout)
@@ -287,7 +285,7 @@ def _read_common_topics(
 ) -> AidLog | None:
     """Read the innovations of an aiding source from a topic that contains all aiding sources."""
     is_in_gauss = aid.name == "mag_heading" and any(
-        "cs_mag" in table for table in topics.tables_of(px4.STATUS_FLAGS)
+        "cs_mag" in table for table in topics.tables_of(px4.STATUS_FLAGS_TOPIC)
     )
     layouts = []
     if aid.fields and not is_in_gauss:

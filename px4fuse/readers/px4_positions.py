@@ -25,7 +25,6 @@ from px4fuse.flight.model import (
     sample_rate,
     time_index,
 )
-from px4fuse.readers import px4_topics as px4
 from px4fuse.readers.common import (
     classify_invalid_positions,
     estimate_rounding_step,
@@ -38,6 +37,17 @@ from px4fuse.readers.common import (
 from px4fuse.readers.px4_ekf2 import configured_step_s
 from px4fuse.readers.px4_fixes import read_unlogged_fixes, reconstruct_fixes
 from px4fuse.readers.px4_innovations import has_fused_aid
+from px4fuse.readers.px4_topics import (
+    FRAME_BY_FIELD_VALUE,
+    FUSED_OBSERVATION_TRACK_NAME,
+    GPS_POSITION,
+    LOCAL_POSITION_LAYOUT,
+    RECONSTRUCTED_TRACK_NAME,
+    SOURCE_TRACKS,
+    TOPIC_LAYOUTS,
+    TRACK_SOURCES,
+    find_track_layouts,
+)
 from px4fuse.readers.recording_table import MAX_VALID_UNIX_TIME_S, MIN_VALID_UNIX_TIME_S
 from px4fuse.readers.ulog_topics import MAX_PUBLICATION_LAG_S, Topics
 
@@ -67,18 +77,18 @@ MAX_CLOCK_RATE_ERROR_FRACTION = 0.05
 AUTOPILOT_CLOCK_TEXT = "autopilot boot clock (PX4 converted the sender's timestamps)"
 # Latitude and longitude (degrees), optionally altitude (m)
 GeodeticPosition = tuple[float, ...]
+# Position tracks, best first, and missing position sources
+TracksAndMissingSources = tuple[tuple[PositionTrack, ...], tuple[Unavailable, ...]]
 
 
-def read_positions(
-    topics: Topics, ekf2: Ekf2 | Unavailable
-) -> tuple[tuple[PositionTrack, ...], tuple[Unavailable, ...]]:
+def read_positions(topics: Topics, ekf2: Ekf2 | Unavailable) -> TracksAndMissingSources:
     """Read the positions of all sources in a log, best source first, and the missing sources."""
     fusion_flags = ekf2.fusion_flags if isinstance(ekf2, Ekf2) else ekf2
     # If EKF2 fused the yaw of the source, the source is odometry
     is_odometry = isinstance(fusion_flags, pd.DataFrame) and bool((fusion_flags["yaw"] > 0).any())
     return split_tracks(
         [
-            *(_read_logged_track(topics, name) for name in px4.SOURCE_TRACKS),
+            *(_read_logged_track(topics, name) for name in SOURCE_TRACKS),
             _read_fused_observation(topics, is_odometry),
             _reconstruct_track(topics, ekf2, is_odometry),
             _read_gnss_track(topics, ekf2),
@@ -86,9 +96,7 @@ def read_positions(
     )
 
 
-def split_tracks(
-    tracks: list[PositionTrack | Unavailable],
-) -> tuple[tuple[PositionTrack, ...], tuple[Unavailable, ...]]:
+def split_tracks(tracks: list[PositionTrack | Unavailable]) -> TracksAndMissingSources:
     """Separate available positions, best source first, from missing position sources."""
     available_tracks = sorted(
         (track for track in tracks if isinstance(track, PositionTrack)),
@@ -103,7 +111,7 @@ def unavailable_source(name: str, reason: str = "", remedy: str = "") -> Unavail
     return Unavailable(
         f"position source {name}",
         reason or f"{name} is not logged",
-        remedy or px4.TRACK_SOURCES[name].remedy,
+        remedy or TRACK_SOURCES[name].remedy,
         name,
     )
 
@@ -149,8 +157,9 @@ def make_track(
             fault = HEIGHT_ONLY_REASON
         return unavailable_source(name, fault, remedy)
     if origin.kind == "uwb":
-        kind = "vio" if is_odometry else infer_position_kind(samples)
-        origin = structs.replace(origin, kind=kind)
+        origin = structs.replace(
+            origin, kind="vio" if is_odometry else infer_position_kind(samples)
+        )
     variance = samples[Columns.POSITION_VARIANCE]
     return PositionTrack(
         name=name,
@@ -172,11 +181,10 @@ def _make_ulog_track(
     **track_fields: Any,
 ) -> PositionTrack | Unavailable:
     """Make a position track of a source that is defined in ``px4_topics.toml``."""
-    source = px4.TRACK_SOURCES[name]
+    source = TRACK_SOURCES[name]
     origin = structs.replace(source.origin, is_auto_candidate=is_auto_candidate)
     if origin.aid is not None:
-        parameters = topics.ekf2_parameters
-        lever_arm_m = tuple(parameters.get(parameter, 0.0) for parameter in origin.aid.lever_arm)
+        lever_arm_m = tuple(topics.ekf2_parameters.get(name, 0.0) for name in origin.aid.lever_arm)
         track_fields = {"lever_arm_m": lever_arm_m, **track_fields}
     fields = {"frame": "NED", "clock": AUTOPILOT_CLOCK_TEXT, **track_fields}
     fields |= {"description": source.description, "topics": topic_names, "log": topics.log.name}
@@ -184,14 +192,14 @@ def _make_ulog_track(
 
 
 def _read_logged_track(topics: Topics, name: str) -> PositionTrack | Unavailable:
-    layout = topics.find_layout(*px4.find_track_layouts(name))
+    layout = topics.find_layout(*find_track_layouts(name))
     if layout is None:
         return unavailable_source(name)
     # EKF2's topics have one instance for each EKF2 instance
     is_ekf2 = layout.topic.startswith("estimator_")
     samples = topics.primary_samples(layout) if is_ekf2 else topics.read_instance(layout)
-    frame = px4.TRACK_SOURCES[name].frame
-    for frame_field, frame_names in px4.FRAME_BY_FIELD_VALUE.items():
+    frame = TRACK_SOURCES[name].frame
+    for frame_field, frame_names in FRAME_BY_FIELD_VALUE.items():
         if frame == "unknown" and frame_field in samples and len(samples):
             frame = frame_names.get(int(samples[frame_field].iloc[-1]), "unknown")
     if "published_us" in samples:
@@ -242,12 +250,12 @@ def _describe_timestamp_clock(published_us: IntArray, sample_timestamps_us: IntA
     """Return clock and unit of timestamps, for example "UNIX time in seconds"."""
     if not sample_timestamps_us.any():
         return "0"
-    rate_ratio = float(np.ptp(published_us)) / max(float(np.ptp(sample_timestamps_us)), 1.0)
+    rate_ratio = np.ptp(published_us) / np.maximum(np.ptp(sample_timestamps_us), 1)
     for unit, unit_us in MICROSECONDS_BY_UNIT.items():
         if abs(rate_ratio / unit_us - 1.0) < MAX_CLOCK_RATE_ERROR_FRACTION:
             if (
                 MIN_VALID_UNIX_TIME_S
-                <= float(np.median(sample_timestamps_us)) * unit_us * 1e-6
+                <= np.median(sample_timestamps_us) * unit_us * 1e-6
                 < MAX_VALID_UNIX_TIME_S
             ):
                 return f"UNIX time in {unit}"
@@ -257,14 +265,14 @@ def _describe_timestamp_clock(published_us: IntArray, sample_timestamps_us: IntA
 
 def _read_fused_observation(topics: Topics, is_odometry: bool) -> PositionTrack | Unavailable:
     horizontal, vertical = (
-        px4.TOPIC_LAYOUTS["estimator_aid_src_ev_pos"],
-        px4.TOPIC_LAYOUTS["estimator_aid_src_ev_hgt"],
+        TOPIC_LAYOUTS["estimator_aid_src_ev_pos"],
+        TOPIC_LAYOUTS["estimator_aid_src_ev_hgt"],
     )
     if topics.find_layout(horizontal) is None:
-        return unavailable_source(px4.FUSED_OBSERVATION_TRACK_NAME)
+        return unavailable_source(FUSED_OBSERVATION_TRACK_NAME)
     return _make_track_from_ekf2_topics(
         topics,
-        px4.FUSED_OBSERVATION_TRACK_NAME,
+        FUSED_OBSERVATION_TRACK_NAME,
         topics.primary_samples(horizontal),
         topics.primary_samples(vertical),
         (horizontal.topic, vertical.topic)[: 1 + (topics.find_layout(vertical) is not None)],
@@ -293,7 +301,7 @@ def _make_track_from_ekf2_topics(
         samples = join_nearest(
             samples, height_samples.assign(_found=True), MAX_HEIGHT_TIME_DIFFERENCE_S
         )
-        if missing_count := int(samples.pop("_found").isna().sum()):
+        if missing_count := samples.pop("_found").isna().sum():
             notes = (
                 f"{missing_count} of {len(samples)} external vision positions have no height "
                 f"within {1e3 * MAX_HEIGHT_TIME_DIFFERENCE_S:.0f} ms and are used without height",
@@ -322,7 +330,7 @@ def _reconstruct_track(
     The times may be late by up to one interval of the position source.
     """
     if isinstance(ekf2, Unavailable):
-        return unavailable_source(px4.RECONSTRUCTED_TRACK_NAME, "the log contains no EKF2 state")
+        return unavailable_source(RECONSTRUCTED_TRACK_NAME, "the log contains no EKF2 state")
     positions = {
         column: innovations["innovation_m"]
         + interpolate_inside(innovations.index, ekf2.state[column])
@@ -331,12 +339,12 @@ def _reconstruct_track(
     }
     if not {"north_m", "east_m"} <= positions.keys():
         return unavailable_source(
-            px4.RECONSTRUCTED_TRACK_NAME, "EKF2 fused no horizontal external vision position"
+            RECONSTRUCTED_TRACK_NAME, "EKF2 fused no horizontal external vision position"
         )
     heights = positions.pop("down_m", pd.Series(dtype=np.float64)).to_frame("down_m")
     return _make_track_from_ekf2_topics(
         topics,
-        px4.RECONSTRUCTED_TRACK_NAME,
+        RECONSTRUCTED_TRACK_NAME,
         pd.DataFrame(positions),
         heights,
         ("vehicle_local_position", *ekf2.innovation_topics),
@@ -392,9 +400,7 @@ def unproject(north_m: Array, east_m: Array, origin: GeodeticPosition | ArrayPai
 def _find_local_origin(topics: Topics) -> GeodeticPosition | None:
     """Return latitude, longitude (degrees) and altitude (m) of EKF2's origin, if logged."""
     columns = ["ref_lat", "ref_lon", "ref_alt"]
-    origin = select_valid_rows(
-        topics.read(px4.LOCAL_POSITION_LAYOUT).reindex(columns=columns), columns
-    )
+    origin = select_valid_rows(topics.read(LOCAL_POSITION_LAYOUT).reindex(columns=columns), columns)
     origin = origin[origin["ref_lat"] != 0]
     return tuple(origin.iloc[-1].tolist()) if len(origin) else None
 
@@ -410,8 +416,8 @@ def project_to_ned(global_positions: pd.DataFrame, origin: GeodeticPosition | No
     latitude_deg, longitude_deg, altitude_m = global_positions.to_numpy().T
     origin = origin or (latitude_deg[0], longitude_deg[0], altitude_m[0])
     north_m, east_m = project(latitude_deg, longitude_deg, origin)
-    position_columns = {"north_m": north_m, "east_m": east_m, "down_m": origin[2] - altitude_m}
-    return pd.DataFrame(position_columns, index=global_positions.index)
+    position_m = np.column_stack([north_m, east_m, origin[2] - altitude_m])
+    return pd.DataFrame(position_m, global_positions.index, Columns.POSITION)
 
 
 def _read_gnss_track(topics: Topics, ekf2: Ekf2 | Unavailable) -> PositionTrack | Unavailable:
@@ -420,17 +426,17 @@ def _read_gnss_track(topics: Topics, ekf2: Ekf2 | Unavailable) -> PositionTrack 
     EKF2 subtracts EKF2_GPS_DELAY from the timestamps. Since 2026, it may use the measurement times
     of the GNSS driver instead (EKF2.cpp UpdateGpsSample, estimator_interface.cpp).
     """
-    layout = topics.find_layout(*px4.find_track_layouts(px4.GPS_POSITION))
+    layout = topics.find_layout(*find_track_layouts(GPS_POSITION))
     if layout is None:
-        return unavailable_source(px4.GPS_POSITION)
+        return unavailable_source(GPS_POSITION)
     messages = topics.read_instance(layout)
     messages["published_s"] = (messages.pop("published_us") - topics.time_origin_us) * 1e-6
     has_fix = messages.get("fix_type", pd.Series(FIX_TYPE_3D, messages.index)) >= FIX_TYPE_3D
     fixes = messages[has_fix]
     if fixes.empty:
         return unavailable_source(
-            px4.GPS_POSITION,
-            f"the log has {len(messages)} {px4.GPS_POSITION}, none with a 3D fix",
+            GPS_POSITION,
+            f"the log has {len(messages)} {GPS_POSITION}, none with a 3D fix",
             NO_FIX_ACTION,
         )
     parameters = topics.ekf2_parameters
@@ -447,7 +453,7 @@ def _read_gnss_track(topics: Topics, ekf2: Ekf2 | Unavailable) -> PositionTrack 
     unlogged_fixes = read_unlogged_fixes(topics, fixes, ekf2)
     if len(unlogged_fixes):
         fixes = pd.concat([fixes, unlogged_fixes]).sort_index()
-        interpolated_count = int(fixes["altitude_m"].isna().sum())
+        interpolated_count = fixes["altitude_m"].isna().sum()
         # Copy fields that EKF2's topics do not contain from the previous fix
         fixes = fixes.assign(altitude_m=fixes["altitude_m"].interpolate("index")).ffill()
     samples = convert_gnss_fixes(fixes, _find_local_origin(topics))
@@ -470,12 +476,12 @@ def _read_gnss_track(topics: Topics, ekf2: Ekf2 | Unavailable) -> PositionTrack 
             notes.append(note)
     track_fields: dict[str, Any] = {}
     # The lever arm of the receiver is logged since v1.17
-    if {*px4.ANTENNA_COLUMNS} <= {*fixes}:
-        track_fields["lever_arm_m"] = tuple(fixes[px4.ANTENNA_COLUMNS].iloc[-1].tolist())
+    if {*Columns.ANTENNA_POSITION} <= {*fixes}:
+        track_fields["lever_arm_m"] = tuple(fixes[Columns.ANTENNA_POSITION].iloc[-1].tolist())
     times_without_fix_s = messages["published_s"].to_numpy()[~has_fix] - delay_s
     return _make_ulog_track(
         topics,
-        px4.GPS_POSITION,
+        GPS_POSITION,
         samples,
         (layout.topic,),
         clock=clock,
@@ -520,9 +526,9 @@ def read_truth(
 
     If EKF2 fused GNSS, ground truth is shifted from the simulation's origin to EKF2's origin.
     """
-    attitude = read_attitude(topics.read(px4.TOPIC_LAYOUTS["vehicle_attitude_groundtruth"]))
-    local_layout = px4.TOPIC_LAYOUTS["vehicle_local_position_groundtruth"]
-    global_layout = px4.TOPIC_LAYOUTS["vehicle_global_position_groundtruth"]
+    attitude = read_attitude(topics.read(TOPIC_LAYOUTS["vehicle_attitude_groundtruth"]))
+    local_layout = TOPIC_LAYOUTS["vehicle_local_position_groundtruth"]
+    global_layout = TOPIC_LAYOUTS["vehicle_global_position_groundtruth"]
     logged_local_samples = topics.read(local_layout)
     local_samples = select_valid_rows(logged_local_samples, logged_local_samples.columns.tolist())
     global_positions = select_valid_rows(topics.read(global_layout), Columns.GEODETIC[:2])
@@ -541,7 +547,7 @@ def read_truth(
         return Truth(local_layout.topic, local_samples, attitude)
     mocap_truth = find_motion_capture_truth(positions)
     reason = "the log has neither simulation ground truth nor motion capture"
-    remedy = px4.TRACK_SOURCES["vehicle_mocap_odometry"].remedy
+    remedy = TRACK_SOURCES["vehicle_mocap_odometry"].remedy
     if len(logged_local_samples):
         reason = f"{local_layout.topic} has no finite sample"
         remedy = "Check the simulation that writes the ground truth."
@@ -553,9 +559,9 @@ def find_motion_capture_truth(positions: tuple[PositionTrack, ...]) -> Truth | N
 
     Motion capture in FRD is not used, because its north direction is unknown.
     """
-    tracks = (track for track in positions if track.origin.kind == "mocap")
-    track = next((track for track in tracks if track.frame != "FRD"), None)
-    if track is None or not any(track.origin.is_vision for track in positions):
-        return None
-    samples = track.samples.reindex(columns=Columns.STATE)
-    return Truth(track.name, samples, read_attitude(track.orientation))
+    has_vision = any(track.origin.is_vision for track in positions)
+    for track in positions if has_vision else ():
+        if track.origin.kind == "mocap" and track.frame != "FRD":
+            samples = track.samples.reindex(columns=Columns.STATE)
+            return Truth(track.name, samples, read_attitude(track.orientation))
+    return None

@@ -13,7 +13,7 @@ from msgspec import structs
 from px4fuse.core.record import read_toml
 from px4fuse.flight.ekf2_parameters import AIDS
 from px4fuse.flight.model import SourceOrigin, find_source_origin
-from px4fuse.readers.field_maps import Layout, expand_layouts
+from px4fuse.readers.common import Layout, expand_layouts
 
 
 @dataclass(frozen=True)
@@ -73,7 +73,6 @@ ATTITUDE_VARIANCE_COUNT_BY_ARRAY_LENGTHS: Mapping[tuple[int, int], int] = {
     (32, 28): 4,  # PX4 before v1.9, which uses only the first 24 of the 32 states
 }
 QUATERNION_VARIANCE_COUNT = 4
-ANTENNA_COLUMNS = ["antenna_forward_m", "antenna_right_m", "antenna_down_m"]
 # Values of the option --position-source
 FUSED_OBSERVATION_TRACK_NAME = "estimator_aid_src_ev_pos"
 RECONSTRUCTED_TRACK_NAME = "ekf2_state_plus_innovation"
@@ -86,7 +85,7 @@ SOURCE_TRACKS = [
 AIDS_ALWAYS_FUSED = ("gravity", "drag")
 # Aiding sources whose logged observation is a local position
 AIDS_WITH_LOCAL_POSITION_OBSERVATION = ("ev_pos", "ev_hgt")
-STATUS_FLAGS, STATUS_TOPIC = "estimator_status_flags", "estimator_status"
+STATUS_FLAGS_TOPIC, STATUS_TOPIC = "estimator_status_flags", "estimator_status"
 # Topics with innovations and innovation variances of all aiding sources (since v1.12)
 INNOVATION_TOPICS = "estimator_innovations", "estimator_innovation_variances"
 OLD_INNOVATION_TOPIC = "ekf2_innovations"
@@ -105,5 +104,5 @@ def list_topics() -> list[str]:
     }
     layout_topics |= {layout.topic for layout in TOPIC_LAYOUTS.values() if layout.topic}
     layout_topics |= {f"estimator_aid_src_{name}" for name in AIDS}
-    aid_topics = {STATUS_FLAGS, *INNOVATION_TOPICS, OLD_INNOVATION_TOPIC}
-    return sorted(layout_topics | UNUSED_TOPICS.keys() | aid_topics | {*STATE_VECTOR_TOPICS})
+    layout_topics |= {STATUS_FLAGS_TOPIC, *INNOVATION_TOPICS, OLD_INNOVATION_TOPIC}
+    return sorted(layout_topics | UNUSED_TOPICS.keys() | {*STATE_VECTOR_TOPICS})

@@ -21,8 +21,7 @@ from px4fuse.core.reading import display_name, read_text
 from px4fuse.core.record import read_toml
 from px4fuse.core.text import join_first_names
 from px4fuse.errors import LogError, Px4FuseError
-from px4fuse.readers import position_names
-from px4fuse.readers.position_names import read_column_name
+from px4fuse.readers.position_names import find_position_columns, read_column_name
 
 # Maximum size (bytes) of a position file
 MAX_FILE_BYTES = 500_000_000
@@ -114,8 +113,10 @@ def refuse_foreign_format(path: Path, first_bytes: bytes, error_type: type[Px4Fu
     for foreign_format in _TEXT_FORMATS["foreign"]:
         starts = tuple(start.encode("latin-1") for start in foreign_format["starts"])
         if first_bytes.startswith(starts):
-            remedy = foreign_format["remedy"].format(name=name)
-            raise error_type(f"{name}: the file is {foreign_format['name']}", remedy)
+            raise error_type(
+                f"{name}: the file is {foreign_format['name']}",
+                foreign_format["remedy"].format(name=name),
+            )
 
 
 def decode_text(content: bytes) -> str | None:
@@ -223,7 +224,7 @@ def find_table(
         )
     if last_line.strip() and not is_last_line_complete:
         note = "the last line of the position file was dropped, because it is incomplete"
-        table = replace(table, notes=(*table.notes, note))
+        return replace(table, notes=(*table.notes, note))
     return table
 
 
@@ -263,7 +264,7 @@ def _find_header_table(
 def _has_time_and_position(column_names: list[str]) -> bool:
     meanings = [read_column_name(name) for name in column_names]
     has_time = any(column.kind == "time" for column in meanings)
-    return has_time and position_names.find_position_columns(meanings) is not None
+    return has_time and find_position_columns(meanings) is not None
 
 
 def _find_body_table(

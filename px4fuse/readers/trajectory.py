@@ -178,7 +178,7 @@ def _detect_frame(kind: TrajectoryKind, position_m: Array) -> tuple[Frame, str]:
     centred_m = position_m - position_m.mean(axis=0)
     eigenvalues, axes = np.linalg.eigh(centred_m.T @ centred_m)  # eigenvalues in ascending order
     smallest_extent, second_extent, largest_extent = np.sqrt(np.maximum(eigenvalues, 0.0))
-    tilt_rad = math.acos(min(1.0, abs(float(axes[1, 0]))))
+    tilt_rad = math.acos(min(1.0, abs(axes[1, 0])))
     is_planar = (
         second_extent > MIN_SECOND_TO_LARGEST_EXTENT_RATIO * largest_extent
         and smallest_extent < MAX_SMALLEST_TO_SECOND_EXTENT_RATIO * second_extent
@@ -194,7 +194,7 @@ def _detect_frame(kind: TrajectoryKind, position_m: Array) -> tuple[Frame, str]:
 def _describe_gaps(time_s: Array) -> str:
     """Return a note on gaps or irregular intervals between poses; "" if there are none."""
     intervals_s = np.diff(time_s)
-    median_interval_s = float(np.median(intervals_s))
+    median_interval_s = np.median(intervals_s)
     max_deviation_s = MAX_MEDIAN_INTERVAL_DEVIATION * median_interval_s
     is_regular = np.abs(intervals_s - median_interval_s) <= max_deviation_s
     if np.mean(is_regular) < MIN_REGULAR_INTERVAL_FRACTION:

@@ -16,10 +16,16 @@ from px4fuse.flight.model import (
     time_index,
 )
 from px4fuse.readers import common
-from px4fuse.readers import px4_topics as px4
-from px4fuse.readers.field_maps import Layout
 from px4fuse.readers.px4_ekf2 import read_ekf2
 from px4fuse.readers.px4_positions import FIX_TYPE_3D, barometer, read_positions, read_truth
+from px4fuse.readers.px4_topics import (
+    DEFAULT_PROFILE_REMEDY,
+    GPS_POSITION,
+    IMU_LAYOUT,
+    TOPIC_LAYOUTS,
+    UNUSED_TOPICS,
+    find_track_layouts,
+)
 from px4fuse.readers.ulog_topics import (
     Topics,
     describe_dropped_samples,
@@ -43,14 +49,20 @@ def read_ulog(name: str, content: bytes) -> Flight:
         The content is not a ULog, or contains no usable data.
     """
     topics = read_topics(name, content)
-    remedy = "Check that the accelerometer and gyroscope were running during logging."
-    imu = _require_samples(topics, _read_imu(topics), "IMU", px4.IMU_LAYOUT, remedy)
-    attitude_samples = common.select_rows_with_attitude(
-        topics.read(px4.TOPIC_LAYOUTS["vehicle_attitude"])
+    imu = _require_samples(
+        topics,
+        _read_imu(topics),
+        "IMU",
+        IMU_LAYOUT,
+        "Check that the accelerometer and gyroscope were running during logging.",
     )
-    remedy = "Check that EKF2 was running during logging (EKF2_EN is 1)."
+    attitude_layout = TOPIC_LAYOUTS["vehicle_attitude"]
     attitude = _require_samples(
-        topics, attitude_samples, "attitude", px4.TOPIC_LAYOUTS["vehicle_attitude"], remedy
+        topics,
+        common.select_rows_with_attitude(topics.read(attitude_layout)),
+        "attitude",
+        attitude_layout,
+        "Check that EKF2 was running during logging (EKF2_EN is 1).",
     )
     ekf2 = read_ekf2(topics)
     positions, unavailable_positions = read_positions(topics, ekf2)
@@ -58,13 +70,11 @@ def read_ulog(name: str, content: bytes) -> Flight:
     if isinstance(truth, Truth):
         topics.record_stream("truth", truth.name)
     airborne_spans_s = _read_airborne_spans(topics)
-    altitude_m = topics.read(px4.TOPIC_LAYOUTS["vehicle_air_data"])["altitude_m"]
+    altitude_m = topics.read(TOPIC_LAYOUTS["vehicle_air_data"])["altitude_m"]
     barometer_delay_s = topics.ekf2_parameters.get(BAROMETER.delay, 0.0) * 1e-3
     is_in_flight = common.ends_in_flight(airborne_spans_s, topics.log.duration_s)
     dropped_counts = dict(sorted(topics.dropped.items()))
-    tilt_failure_flags = topics.read(px4.TOPIC_LAYOUTS["failure_detector_status"])[
-        ["roll", "pitch"]
-    ]
+    tilt_failure_flags = topics.read(TOPIC_LAYOUTS["failure_detector_status"])
     return Flight(
         log=structs.replace(
             topics.log,
@@ -88,7 +98,7 @@ def read_ulog(name: str, content: bytes) -> Flight:
         streams=topics.data_source_by_kind,
         unused=tuple(
             UnusedData(name, len(table["timestamp"]), reason)
-            for name, reason in px4.UNUSED_TOPICS.items()
+            for name, reason in UNUSED_TOPICS.items()
             for table in topics.tables_of(name)[:1]
         ),
     )
@@ -115,7 +125,7 @@ def _describe_damage(
 
 def _estimate_start_unix_s(topics: Topics) -> float | None:
     """Return the UNIX time (s) at flight time zero, from GNSS; None if not logged."""
-    fixes = topics.read(*px4.find_track_layouts(px4.GPS_POSITION))
+    fixes = topics.read(*find_track_layouts(GPS_POSITION))
     fixes = fixes.reindex(columns=["utc_us", "fix_type"])
     unix_time_s = fixes["utc_us"] * 1e-6
     is_valid = unix_time_s.between(*VALID_UNIX_TIME_RANGE_S) & ~(fixes["fix_type"] < FIX_TYPE_3D)
@@ -123,12 +133,12 @@ def _estimate_start_unix_s(topics: Topics) -> float | None:
 
 
 def _require_samples(
-    topics: Topics, samples: pd.DataFrame, name: str, layout: Layout, remedy: str
+    topics: Topics, samples: pd.DataFrame, name: str, layout: common.Layout, remedy: str
 ) -> TableOrUnavailable:
     """Return the samples of a topic, or the reason if there are fewer than two."""
     topic = layout.topic
     if topics.find_layout(layout) is None:
-        return Unavailable(name, f"{topic} is not logged", px4.DEFAULT_PROFILE_REMEDY)
+        return Unavailable(name, f"{topic} is not logged", DEFAULT_PROFILE_REMEDY)
     if len(samples) < 2:
         return Unavailable(name, f"{topic} contains only {len(samples)} usable samples", remedy)
     topics.record_stream(name.lower(), topic)
@@ -136,7 +146,7 @@ def _require_samples(
 
 
 def _read_imu(topics: Topics) -> pd.DataFrame:
-    imu = topics.read(px4.IMU_LAYOUT)
+    imu = topics.read(IMU_LAYOUT)
     # single arrays, because a copy of the whole table needs much memory
     columns = {name: values.to_numpy() for name, values in imu.items()}
     time_s, rows = imu.index.to_numpy(), np.arange(len(imu))
@@ -155,12 +165,12 @@ def _read_imu(topics: Topics) -> pd.DataFrame:
 
 
 def _read_airborne_spans(topics: Topics) -> Spans | Unavailable:
-    land_detected = topics.read(px4.TOPIC_LAYOUTS["vehicle_land_detected"])
+    land_detected = topics.read(TOPIC_LAYOUTS["vehicle_land_detected"])
     if land_detected.empty:
         return Unavailable(
             "land detector",
             "vehicle_land_detected is not logged or not usable",
-            f"{px4.DEFAULT_PROFILE_REMEDY} Alternatively, give the flight time (--start, --end).",
+            f"{DEFAULT_PROFILE_REMEDY} Alternatively, give the flight time (--start, --end).",
         )
-    topics.record_stream("airborne", px4.TOPIC_LAYOUTS["vehicle_land_detected"].topic)
+    topics.record_stream("airborne", "vehicle_land_detected")
     return common.find_flight_spans(land_detected["landed"], topics.log.duration_s)

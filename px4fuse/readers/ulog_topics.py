@@ -39,7 +39,7 @@ from px4fuse.flight.model import (
     sample_step_function,
     time_index,
 )
-from px4fuse.readers.field_maps import MAX_FIELD_VALUE, Layout
+from px4fuse.readers.common import MAX_FIELD_VALUE, Layout
 from px4fuse.readers.px4_topics import IMU_LAYOUT, TOPIC_LAYOUTS, list_topics
 
 _MICROSECOND_S = 1e-6
@@ -462,10 +462,10 @@ def _read_parameters(
         for name, value in ulog.initial_parameters.items()
         if isinstance(value, int | float)
     }
-    layout, take_off_time_us = TOPIC_LAYOUTS["vehicle_land_detected"], 0
-    landed = tables.get((layout.topic, 0), {}).get(layout.columns["landed"])
+    land_detector, take_off_time_us = tables.get(("vehicle_land_detected", 0), {}), 0
+    landed = land_detector.get("landed")
     if landed is not None and not landed.all():
-        take_off_time_us = int(tables[layout.topic, 0]["timestamp"][np.argmin(landed)])
+        take_off_time_us = int(land_detector["timestamp"][np.argmin(landed)])
     parameter_changes: list[ParameterChange] = []
     last_parameter_values = parameter_values.copy()
     for time_us, name, value in sorted(ulog.changed_parameters, key=lambda change: change[0]):

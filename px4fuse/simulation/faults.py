@@ -8,7 +8,7 @@ from dataclasses import dataclass, replace
 from typing import Any
 
 from px4fuse.core.record import read_toml
-from px4fuse.core.units import UNIT_NAMES, convert_to_unit
+from px4fuse.core.text import UNIT_NAMES, convert_to_unit
 from px4fuse.errors import SettingsError, suggest_name
 from px4fuse.simulation.scenario import (
     SCENARIO_KINDS,

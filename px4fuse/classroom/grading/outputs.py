@@ -41,8 +41,7 @@ from px4fuse.classroom.grading.model import (
 )
 from px4fuse.classroom.grading.oral_check import format_questions
 from px4fuse.core.input_files import suspend_input_registration
-from px4fuse.core.spreadsheet import neutralise_formulas
-from px4fuse.core.text import clean_text, join_first_names, one_line
+from px4fuse.core.text import clean_text, join_first_names, neutralise_formulas, one_line
 from px4fuse.core.writing import write_output_files
 from px4fuse.errors import SettingsError
 from px4fuse.verification.model import Verification
