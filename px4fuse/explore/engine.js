@@ -168,20 +168,11 @@ const Engine = (() => {
   }
 
   /* Decode the arrays of px4fuse.explore.data */
-  async function unpack(text, specs) {
-    const all = new Uint8Array(await inflate(text).arrayBuffer());
-    let from = 0;
-    return specs.map(([length, scale]) => {
-      const out = new Float64Array(length);
+  async function unpack(text) {
+    const arrays = await inflate(text).json();
+    return arrays.map(([scale, differences]) => {
       let sum = 0;
-      for (let i = 0; i < length; i++) {
-        let code = 0;
-        for (let b = 7; b >= 0; b--) code = code * 256 + all[from + b * length + i];
-        sum += code % 2 ? -(code + 1) / 2 : code / 2;
-        out[i] = sum / scale;
-      }
-      from += length * 8;
-      return out;
+      return Float64Array.from(differences, (difference) => (sum += difference) / scale);
     });
   }
 

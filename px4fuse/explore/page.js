@@ -4,7 +4,7 @@ const Explore = (async () => {
   const MAX_POINTS = 1000;
   const read = (id) => $(`${id}${Practice.suffix}`).textContent;
   // ------------------------------------------------------------------ the flight's data
-  const arrays = await Engine.unpack(read("arrays"), JSON.parse(read("content")).packed);
+  const arrays = await Engine.unpack(read("arrays"));
   const withArrays = (_, value) => value?.array === undefined ? value : arrays[value.array];
   const { flight, ratio_axis: ratioAxis, places } = JSON.parse(read("content"), withArrays);
   const { imu, axes } = flight;
