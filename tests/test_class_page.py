@@ -27,7 +27,7 @@ MARKUP = '<img src=x onerror="window.alive=1"><b>bold</b>'
 BREAKOUT = "</script ></script\n<script>window.alive=2</script><!-- \u2028 ]]> & &lt;"
 FORMULA = "=cmd|' /C calc'!A0"
 REVERSED = "\u202egnp.exe\u202c"
-TURNED = "\N{REPLACEMENT CHARACTER}gnp.exe\N{REPLACEMENT CHARACTER}"
+TURNED = "gnp.exe"
 LONG = "W" * 5000
 
 

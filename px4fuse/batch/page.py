@@ -21,11 +21,12 @@ from px4fuse.core.text import (
     format_number,
     format_ratio,
     join_first_names,
+    one_line,
 )
 from px4fuse.findings.model import finding_title
 from px4fuse.html import frame
 from px4fuse.html.frame import Cell, Column, Row, RowDetailsSection
-from px4fuse.html.safe import clean_text, load_template, make_relative_url
+from px4fuse.html.safe import load_template, make_relative_url
 from px4fuse.report.card_html import SIGMA_RATIO_AXIS
 from px4fuse.report.card_text import SEVERITY_SIGNS, SYMBOL_BY_REFERENCE, format_consistent_ratios
 
@@ -218,7 +219,7 @@ def _make_drop_down_lists(logs: Sequence[LogSummary]) -> list[tuple[str, list[tu
     drop_down_lists = []
     for kind, list_label in DROP_DOWN_LABEL_BY_TAG_PREFIX.items():
         options = [
-            (tag, f"{clean_text(label, 60)} ({count})")
+            (tag, f"{one_line(label, 60)} ({count})")
             for (tag, label), count in counts.most_common()
             if tag.startswith(f"{kind}:")
         ]
