@@ -218,7 +218,7 @@ def _redirect_closed_streams() -> None:
     """Redirect a closed standard stream (``>&-``) to the null device."""
     for name in ("stdout", "stderr"):
         if getattr(sys, name) is None:
-            setattr(sys, name, Path(os.devnull).open("w", encoding="utf-8"))
+            setattr(sys, name, Path(os.devnull).open("w", encoding="utf-8"))  # noqa: SIM115 - must stay open
 
 
 def _print_error(text: str) -> None:

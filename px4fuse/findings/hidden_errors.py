@@ -34,7 +34,7 @@ from px4fuse.findings.model import (
     make_error,
     make_note,
 )
-from px4fuse.flight.model import Unavailable, source_name
+from px4fuse.flight.model import Unavailable
 from px4fuse.trajectory.alignment import fit_alignment
 
 # Minimum mean NEES, for severity "error": an RMS position error of 4 times the reported σ
@@ -194,7 +194,7 @@ def _make_drift_finding(
     aid = analysis.source.origin.aid
     return make_error(
         "source_drift",
-        f"{source_name(analysis.source)} drifts: {drift_text}. {rmse_sentence}The innovations of "
+        f"{analysis.source.kind_name} drifts: {drift_text}. {rmse_sentence}The innovations of "
         f"{' and '.join(filter_labels)} do not show the drift. Do not reduce SIGMA_Z"
         f"{f' or {aid.noise}' if aid else ''}.",
         DRIFT_REMEDY if loop is None else f"{DRIFT_REMEDY} {LOOP_REMEDY}",
@@ -236,7 +236,7 @@ def make_possible_drift_finding(analysis: Analysis) -> Finding:
     loop, horizontal_tuning = find_usable_loop(analysis), analysis.tuning.get(HORIZONTAL)
     evidence: dict[str, float | str] = {"source": analysis.source.name}
     message = (
-        f"{source_name(analysis.source)} may drift. "
+        f"{analysis.source.kind_name} may drift. "
         "KF and EKF2 follow the drift, so innovations do not show the drift."
     )
     if isinstance(horizontal_tuning, AxisTuning) and (
