@@ -137,27 +137,18 @@ const Engine = (() => {
     return { p: position, p00: variance };
   }
 
+  const mean = (values) => values.reduce((sum, value) => sum + value, 0) / values.length;
   /* Statistics of innovations (consistency.assess_innovations); none for fewer than MIN_INNOVATIONS */
   function assess(nu, s) {
-    let square = 0, outside = 0;
-    const n = nu.length;
-    if (n < MIN_INNOVATIONS) return {};
-    for (let i = 0; i < n; i++) {
-      const normalised = nu[i] / Math.sqrt(s[i]);
-      square += normalised * normalised;
-      if (Math.abs(normalised) > 2) outside++;
-    }
-    return { count: n, nis: square / n, outside: outside / n };
+    if (nu.length < MIN_INNOVATIONS) return {};
+    const normalised = nu.map((innovation, i) => innovation / Math.sqrt(s[i]));
+    return { count: nu.length, nis: mean(normalised.map((x) => x * x)), outside: mean(normalised.map((x) => Math.abs(x) > 2)) };
   }
 
   /* Root mean square difference of two series, null for fewer than MIN_COMMON_SAMPLES */
   function rmse(values, reference) {
-    let square = 0, n = 0;
-    for (let i = 0; i < values.length; i++) {
-      const e = values[i] - reference[i];
-      if (Number.isFinite(e)) { square += e * e; n++; }
-    }
-    return n < MIN_COMMON_SAMPLES ? null : Math.sqrt(square / n);
+    const squares = Array.from(values, (value, i) => (value - reference[i]) ** 2).filter(Number.isFinite);
+    return squares.length < MIN_COMMON_SAMPLES ? null : Math.sqrt(mean(squares));
   }
 
   /* Decode the arrays of px4fuse.explore.data */
