@@ -19,7 +19,7 @@ from px4fuse.flight.model import Flight, PositionKind, PositionTrack
 
 
 class CatalogueEntry(Record):
-    """Title and meaning of a finding (``catalogue.toml``), and its classes (``classes.toml``)."""
+    """Title and meaning of a finding, and its relation to other findings (``catalogue.toml``)."""
 
     title: str
     meaning: str
@@ -30,19 +30,10 @@ class CatalogueEntry(Record):
     status_if_convention_wrong: Literal["", "effect", "withdrawn"] = ""
 
 
-def _read_catalogue() -> Mapping[str, CatalogueEntry]:
-    catalogue = read_toml(__file__, dict[str, CatalogueEntry], "catalogue.toml")
-    classes = read_toml(__file__, dict[str, dict[str, str]], "classes.toml")
-    for field, ids_by_class in classes.items():
-        for class_name, ids in ids_by_class.items():
-            for finding_id in ids.splitlines():
-                entry = catalogue[finding_id]
-                catalogue[finding_id] = replace(entry, **{field: class_name})
-    return catalogue
-
-
 # All findings by id. The report lists findings of equal severity in this order
-FINDING_CATALOGUE = _read_catalogue()
+FINDING_CATALOGUE: Mapping[str, CatalogueEntry] = read_toml(
+    __file__, dict[str, CatalogueEntry], "catalogue.toml"
+)
 # Key in Finding.evidence: cause of the finding, one of the following values
 CAUSE_KEY = "cause"
 # Causes that are confirmed by a re-run of KF or EKF2
