@@ -28,6 +28,7 @@ from px4fuse.flight.model import (
     Columns,
     Ekf2,
     FusionRecord,
+    PositionTrack,
     Unavailable,
 )
 
@@ -95,10 +96,13 @@ def source(**parts: Any) -> Any:
         "samples": moving(parts.get("rate_hz", 5.0)), "status": pd.DataFrame(), "velocity": None,
         "invalid_reasons": NO_INVALID_ROWS,
     }  # fmt: skip
-    made = {**usual, **parts}
-    rate_hz = made.pop("rate_hz")
-    return SimpleNamespace(
-        aid=lambda axis: made["origin"].aid, compute_rate_hz=lambda: rate_hz, **made
+    fields = {**usual, **parts}
+    rate_hz = fields.pop("rate_hz")
+    return made(
+        PositionTrack,
+        aid=lambda axis: fields["origin"].aid,
+        compute_rate_hz=lambda: rate_hz,
+        **fields,
     )
 
 

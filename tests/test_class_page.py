@@ -25,9 +25,10 @@ from px4fuse.verification.model import Mismatch, PageDifference, Verification
 
 MARKUP = '<img src=x onerror="window.alive=1"><b>bold</b>'
 BREAKOUT = "</script ></script\n<script>window.alive=2</script><!-- \u2028 ]]> & &lt;"
+SHOWN_BREAKOUT = BREAKOUT.replace("\u2028", "")
 FORMULA = "=cmd|' /C calc'!A0"
 REVERSED = "\u202egnp.exe\u202c"
-TURNED = "\N{REPLACEMENT CHARACTER}gnp.exe\N{REPLACEMENT CHARACTER}"
+TURNED = "gnp.exe"
 LONG = "W" * 5000
 
 
@@ -285,11 +286,11 @@ def test_grades_page_shows_markup_in_student_text_as_text(page: Browser) -> None
         "[...document.querySelector('.list > tbody > tr:nth-child(11)').querySelectorAll("
         "':scope > :nth-child(2), .file, li')].map((node) => node.textContent)"
     )
-    assert row == [BREAKOUT, FORMULA, "2 flags", "5 proposed", MARKUP, MARKUP]
+    assert row == [SHOWN_BREAKOUT, FORMULA, "2 flags", "5 proposed", MARKUP, MARKUP]
     shown = page.ask(
         "document.querySelector('.list > tbody > tr:nth-child(11)').nextSibling.textContent"
     )
-    assert shown.count(BREAKOUT) >= 4  # reason, notes, item, comment
+    assert shown.count(SHOWN_BREAKOUT) >= 4  # reason, notes, item, comment
     assert shown.count(MARKUP) >= 4  # flag, comment, pending, name
     assert LONG in page.ask("document.querySelector('.list > tbody').textContent")
     assert page.ask("document.querySelectorAll('b, svg[onload], img[onerror]').length") == 0
@@ -332,4 +333,4 @@ def test_grades_page_downloads_points_and_comments_as_csv(page: Browser) -> None
     assert page.ask(leave)
     assert rows[0] == ["id", "item", "points", "comment"]
     assert ["1007", "total", "7.5", '\'=1+1, "well"'] in rows
-    assert ["'" + FORMULA, BREAKOUT, "", MARKUP] in rows  # earlier comments are kept
+    assert ["'" + FORMULA, SHOWN_BREAKOUT, "", MARKUP] in rows  # earlier comments are kept

@@ -33,7 +33,7 @@ TRIES = 50
 TOLERANCE = 1e-9
 # Runs the engine on one flight with all settings
 SCRIPT = """(async () => {
-  const arrays = await Engine.unpack(%(text)s, %(specs)s);
+  const arrays = await Engine.unpack(%(text)s);
   const withArrays = (_, value) => value?.array === undefined ? value : arrays[value.array];
   const flight = JSON.parse(%(flight)s, withArrays);
   return %(tries)s.map(([at, settings]) => {
@@ -78,7 +78,7 @@ def in_browser(
     flight = make_kf_inputs(comparison, encoder)
     tries_for_page = [(at, asdict(settings)) for at, settings in tries]
     values = {
-        "text": encoder.text(), "specs": encoder.array_specs, "flight": json.dumps(flight),
+        "text": encoder.text(), "flight": json.dumps(flight),
         "tries": tries_for_page,
     }  # fmt: skip
     return list(ask(engine, SCRIPT % {name: json.dumps(one) for name, one in values.items()}))
@@ -162,7 +162,7 @@ def test_javascript_unpack_restores_packed_arrays(engine: Browser) -> None:
     encoder.add_times(np.array([0.1, 0.2, 123.456789]))
     unpacked = ask(
         engine,
-        f"Engine.unpack({json.dumps(encoder.text())}, {json.dumps(encoder.array_specs)})"
+        f"Engine.unpack({json.dumps(encoder.text())})"
         ".then((all) => all.map((one) => Array.from(one)))",
     )
     for back, values in zip(unpacked, arrays, strict=False):

@@ -656,13 +656,13 @@ def slow(gain: float, lag: float, slow_m: float = 0.1) -> TimeCorrelatedNoise:
     )
 
 
-def repeating(again: int, count: int, moved_m: float = 5.0) -> Any:
+def repeating(again: int, count: int, moved_m: float = 5.0, **parts: Any) -> Any:
     """Make positions of which the last `again` repeat the previous one."""
     each = np.arange(count + 1.0)
     each[-again:] = each[-again - 1]
     return analysis(
         source=source(samples=positions(np.linspace(10.0, 110.0, count + 1),
-                                        moved_m * each / each.max()))
+                                        moved_m * each / each.max()), **parts)
     )  # fmt: skip
 
 
@@ -1128,6 +1128,5 @@ def test_timestamps_in_bursts_are_reported_as_jitter(size: int, is_reported: boo
 
 
 def test_repeated_positions_of_odometry_are_reported() -> None:
-    one = repeating(50, 100)
-    one.source.orientation = object()
+    one = repeating(50, 100, orientation=object())
     assert named(source_errors.detect_noise_faults, one) == {"source_samples_repeated": "error"}

@@ -22,11 +22,12 @@ from px4fuse.core.text import (
     format_number,
     format_ratio,
     join_first_names,
+    one_line,
 )
 from px4fuse.findings.model import finding_title
 from px4fuse.html import frame
 from px4fuse.html.frame import Cell, Column, Row, RowDetailsSection
-from px4fuse.html.safe import clean_text, load_template, make_relative_url
+from px4fuse.html.safe import load_template, make_relative_url
 from px4fuse.report.card_html import SIGMA_RATIO_AXIS
 from px4fuse.report.card_text import SEVERITY_SIGNS, SYMBOL_BY_REFERENCE, format_consistent_ratios
 
@@ -212,7 +213,7 @@ def _make_drop_down_lists(logs: Sequence[LogSummary]) -> list[tuple[str, list[tu
     drop_down_lists = []
     for list_label in DROP_DOWN_LABELS:
         options = [
-            (tag, f"{clean_text(value, 60)} ({count})")
+            (tag, f"{one_line(value, 60)} ({count})")
             for (tag, value), count in counts.most_common()
             if tag.startswith(f"{list_label}:")
         ]

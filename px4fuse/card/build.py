@@ -58,7 +58,7 @@ from px4fuse.finding import Finding
 from px4fuse.findings.model import format_count, format_percent, split_cause_groups
 from px4fuse.findings.source_positions import has_little_motion
 from px4fuse.flight.ekf2_parameters import PARAMETERS
-from px4fuse.flight.model import Ekf2, LogInfo, Unavailable, source_name
+from px4fuse.flight.model import Ekf2, LogInfo, Unavailable
 from px4fuse.request import (
     COMPARISON_OPTIONS,
     ComparisonRequest,
@@ -125,7 +125,7 @@ def build_card(
         analysis.flight.log,
         request,
         student,
-        source=f"{source_name(source)} {source.compute_rate_hz():.1f} Hz",
+        source=f"{source.kind_name} {source.compute_rate_hz():.1f} Hz",
         settings=settings_text,
         changed=changed_options,
         parameters=_format_changed_parameters(analysis),
@@ -268,7 +268,7 @@ def describe_axis(analysis: Analysis, result: AxisComparison) -> str:
     direction, heading, source = f"along {result.axis.label}", result.heading_deg, analysis.source
     if result.axis.name != AISLE or heading is None:
         return direction
-    reference = f"the {source_name(source)} x axis" if source.frame == "FRD" else "north"
+    reference = f"the {source.kind_name} x axis" if source.frame == "FRD" else "north"
     return f"{direction}, {heading % 180.0:.0f}° from {reference}"
 
 

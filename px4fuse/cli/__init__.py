@@ -217,13 +217,9 @@ def _flush_output(exit_code: int) -> int:
 
 def _redirect_closed_streams() -> None:
     """Redirect a closed standard stream (``>&-``) to the null device."""
-    for descriptor, name in ((1, "stdout"), (2, "stderr")):
+    for name in ("stdout", "stderr"):
         if getattr(sys, name) is None:
-            null_device = os.open(os.devnull, os.O_WRONLY)
-            if null_device != descriptor:
-                os.dup2(null_device, descriptor)
-                os.close(null_device)
-            setattr(sys, name, open(descriptor, "w", encoding="utf-8"))  # noqa: SIM115, PTH123 - must stay open
+            setattr(sys, name, Path(os.devnull).open("w", encoding="utf-8"))  # noqa: SIM115 - must stay open
 
 
 def _print_error(text: str) -> None:

@@ -40,7 +40,7 @@ from px4fuse.filter.time_offset import (
     estimate_time_offset,
 )
 from px4fuse.filter.tuning import HORIZONTAL, AxisTuning, tune
-from px4fuse.flight.model import DIAGNOSIS_WITHHELD, Flight, Unavailable, reset_times_s
+from px4fuse.flight.model import DIAGNOSIS_WITHHELD, Flight, Unavailable
 
 # Minimum IMU rate (Hz) to estimate a time offset
 MIN_TIME_OFFSET_IMU_HZ = 1.0 / MAX_IMU_INTERVAL_S
@@ -263,7 +263,7 @@ def _fit_source_errors(
         sigma_z_m=axis_tuning.sigma_z.value_or_bound(settings.sigma_z_m),
         outlier_time_s=axis_tuning.outlier_time_s,
         clock_offset_s=offset_s,
-        source_resets_s=reset_times_s(comparison.source).tolist(),
+        source_resets_s=comparison.source.reset_times_s.tolist(),
     )
     jumps = systematic_errors.jumps if isinstance(systematic_errors, SystematicErrors) else ()
     # The exact time of a jump is unknown: exclude the measurements directly after it

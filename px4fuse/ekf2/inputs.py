@@ -44,7 +44,6 @@ from px4fuse.flight.model import (
     FusionRecord,
     PositionTrack,
     Unavailable,
-    reset_times_s,
     sample_step_function,
 )
 from px4fuse.readers.common import find_flight_spans
@@ -524,7 +523,7 @@ def read_vision(
         variance_m2,
         *logged_decisions,
         track.name,
-        reset_times_s=reset_times_s(track),
+        reset_times_s=track.reset_times_s,
         is_every_reset_logged=DEAD_RECKONING_FLAG in fusion_record.status_flags,
     )
 

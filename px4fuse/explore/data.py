@@ -1,10 +1,11 @@
 """Data of one flight for the interactive web page of ``px4fuse explore``.
 
-The arrays are encoded compactly: numbers are rounded to integers, and the bytes of their
-differences are compressed (deflate).
+The arrays are encoded compactly: numbers are rounded to integers, and their differences are
+compressed (deflate).
 """
 
 import base64
+import json
 import zlib
 from collections.abc import Iterable
 from dataclasses import asdict, dataclass, field
@@ -45,10 +46,9 @@ MAX_EXACT_INTEGER = 2.0**52
 
 @dataclass
 class ArrayEncoder:
-    """Encoder of arrays; ``array_specs`` are length and scale of each array."""
+    """Encoder of arrays: scale, and differences of successive rounded values, of each array."""
 
-    array_specs: list[tuple[int, float]] = field(default_factory=list)
-    _encoded_arrays: list[bytes] = field(default_factory=list)
+    _encoded_arrays: list[tuple[float, list[int]]] = field(default_factory=list)
 
     def add(self, values: Array, scale: float = KF_INPUT_STEPS_PER_UNIT) -> dict[str, int]:
         """Add an array, rounded to ``scale`` steps per unit.
@@ -60,21 +60,16 @@ class ArrayEncoder:
         while largest_value * scale > MAX_EXACT_INTEGER:
             scale /= 2.0
         integers = np.rint(values * scale).astype(np.int64)
-        differences = np.diff(integers, prepend=0)
-        # store the sign in the lowest bit, so that the high bytes of small numbers are 0
-        zigzag_integers = ((differences << 1) ^ (differences >> 63)).astype("<u8")
-        # all lowest bytes, then all second bytes, and so on, which compresses well
-        self._encoded_arrays.append(zigzag_integers.view(np.uint8).reshape(-1, 8).T.tobytes())
-        self.array_specs.append((len(values), scale))
-        return {"array": len(self.array_specs) - 1}
+        self._encoded_arrays.append((scale, np.diff(integers, prepend=0).tolist()))
+        return {"array": len(self._encoded_arrays) - 1}
 
     def add_times(self, time_s: Array) -> dict[str, int]:
         has_whole_microseconds = bool(np.all(np.abs(np.rint(time_s * 1e6) / 1e6 - time_s) < 1e-10))
         return self.add(time_s, 1e6 if has_whole_microseconds else KF_INPUT_STEPS_PER_UNIT)
 
     def text(self) -> str:
-        """Return all arrays, compressed, as one base64 text."""
-        return base64.b64encode(zlib.compress(b"".join(self._encoded_arrays), 9)).decode()
+        """Return all arrays as one base64 text of compressed JSON."""
+        return base64.b64encode(zlib.compress(json.dumps(self._encoded_arrays).encode())).decode()
 
 
 def make_flight_data(analysis: Analysis, encoder: ArrayEncoder) -> PageData:

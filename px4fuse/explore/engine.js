@@ -47,27 +47,20 @@ const Engine = (() => {
       if (t >= start && t <= end) { all.push(t); z.push(axis.z[i]); }
     }
     if (all.length < MIN_MEASUREMENTS) return null;
-    const first = all[0], times = [], index = [];
+    // rows [time, index of the measurement, or -1]; of several measurements at the same time, the last is used
+    const first = all[0], updates = [];
     for (let i = 1; i < all.length; i++) {
       if (all[i] <= first + SAME_TIME_S) continue;
-      if (times.length && times[times.length - 1] === all[i]) { index[index.length - 1] = i; continue; }
-      times.push(all[i]);
-      index.push(i);
+      if (updates.at(-1)?.[0] === all[i]) updates.pop();
+      updates.push([all[i], i]);
     }
-    if (!times.length) return null;
-    const m = times.length, last = times[m - 1];
-    const count = Math.floor((last - first) / settings.dt_s + 1e-9) + 1;
-    const time = new Float64Array(count + m + 1), measurement = new Int32Array(count + m + 1).fill(-1);
-    let n = 0, j = 0;
-    for (let k = 0; k < count; k++) {
-      const t = first + settings.dt_s * k;
-      while (j < m && times[j] < t) { measurement[n] = index[j]; time[n++] = times[j++]; }
-      const near = Math.min(
-        Math.abs(times[Math.min(j, m - 1)] - t), Math.abs(times[Math.max(j - 1, 0)] - t));
-      if (near > SAME_TIME_S) time[n++] = t;
-    }
-    while (j < m) { measurement[n] = index[j]; time[n++] = times[j++]; }
-    return { time: time.subarray(0, n), measurement: measurement.subarray(0, n), z, updates: m };
+    if (!updates.length) return null;
+    const count = Math.floor((updates.at(-1)[0] - first) / settings.dt_s + 1e-9) + 1;
+    const grid = Array.from({ length: count }, (_, k) => [first + settings.dt_s * k, -1]);
+    const rows = [...updates, ...grid].sort(([a], [b]) => a - b);
+    const isUpdateAt = (t, row) => row?.[1] >= 0 && Math.abs(row[0] - t) <= SAME_TIME_S;
+    const steps = rows.filter(([t, i], k) => i >= 0 || !isUpdateAt(t, rows[k - 1]) && !isUpdateAt(t, rows[k + 1]));
+    return { time: Float64Array.from(steps, ([t]) => t), measurement: steps.map(([, i]) => i), z, updates: updates.length };
   }
 
   /* Mean acceleration (m/s²) of each KF step, and its additional variance in IMU gaps */
@@ -144,44 +137,26 @@ const Engine = (() => {
     return { p: position, p00: variance };
   }
 
+  const mean = (values) => values.reduce((sum, value) => sum + value, 0) / values.length;
   /* Statistics of innovations (consistency.assess_innovations); none for fewer than MIN_INNOVATIONS */
   function assess(nu, s) {
-    let square = 0, outside = 0;
-    const n = nu.length;
-    if (n < MIN_INNOVATIONS) return {};
-    for (let i = 0; i < n; i++) {
-      const normalised = nu[i] / Math.sqrt(s[i]);
-      square += normalised * normalised;
-      if (Math.abs(normalised) > 2) outside++;
-    }
-    return { count: n, nis: square / n, outside: outside / n };
+    if (nu.length < MIN_INNOVATIONS) return {};
+    const normalised = nu.map((innovation, i) => innovation / Math.sqrt(s[i]));
+    return { count: nu.length, nis: mean(normalised.map((x) => x * x)), outside: mean(normalised.map((x) => Math.abs(x) > 2)) };
   }
 
   /* Root mean square difference of two series, null for fewer than MIN_COMMON_SAMPLES */
   function rmse(values, reference) {
-    let square = 0, n = 0;
-    for (let i = 0; i < values.length; i++) {
-      const e = values[i] - reference[i];
-      if (Number.isFinite(e)) { square += e * e; n++; }
-    }
-    return n < MIN_COMMON_SAMPLES ? null : Math.sqrt(square / n);
+    const squares = Array.from(values, (value, i) => (value - reference[i]) ** 2).filter(Number.isFinite);
+    return squares.length < MIN_COMMON_SAMPLES ? null : Math.sqrt(mean(squares));
   }
 
   /* Decode the arrays of px4fuse.explore.data */
-  async function unpack(text, specs) {
-    const all = new Uint8Array(await inflate(text).arrayBuffer());
-    let from = 0;
-    return specs.map(([length, scale]) => {
-      const out = new Float64Array(length);
+  async function unpack(text) {
+    const arrays = await inflate(text).json();
+    return arrays.map(([scale, differences]) => {
       let sum = 0;
-      for (let i = 0; i < length; i++) {
-        let code = 0;
-        for (let b = 7; b >= 0; b--) code = code * 256 + all[from + b * length + i];
-        sum += code % 2 ? -(code + 1) / 2 : code / 2;
-        out[i] = sum / scale;
-      }
-      from += length * 8;
-      return out;
+      return Float64Array.from(differences, (difference) => (sum += difference) / scale);
     });
   }
 

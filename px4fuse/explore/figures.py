@@ -97,12 +97,8 @@ def make_document_json(data: PageData) -> tuple[Any, dict[str, str]]:
 
 def select_plots(data: PageData) -> dict[str, Plot]:
     """Return all plots, without the position error if ground truth and EKF2's state are missing."""
-    has_reference = _has_track(data, "truth") or _has_track(data, "ekf2")
+    has_reference = any(axis["truth"] or axis["ekf2"] for axis in data["axes"])
     return {name: plot for name, plot in PLOTS.items() if name != "error" or has_reference}
-
-
-def _has_track(data: PageData, kind: str) -> bool:
-    return any(axis[kind] is not None for axis in data["axes"])
 
 
 def _make_plot(name: str, plot: Plot, data: PageData, shared_time_range: Range1d) -> Any:
@@ -130,13 +126,11 @@ def _make_plot(name: str, plot: Plot, data: PageData, shared_time_range: Range1d
             line_color=None,
         )
     if name == "innovation":
-        _draw_innovations(plot_figure, get_source, with_ekf2=_has_track(data, "ekf2"))
+        _draw_innovations(plot_figure, get_source)
     if name == "error":
         plot_figure.varea("t", "minus", "plus", source=get_source("kf"), **KF_BAND_STYLE)
     line_renderers: list[Any] = []
     for line in plot.lines:
-        if line in ("ekf2", "truth") and not _has_track(data, line):
-            continue
         style, label = LINE_STYLES[line]
         renderer = plot_figure.line("t", plot.column, source=get_source(line), **style)
         line_renderers.append(renderer)
@@ -158,9 +152,7 @@ def _make_plot(name: str, plot: Plot, data: PageData, shared_time_range: Range1d
     return plot_figure
 
 
-def _draw_innovations(
-    plot_figure: Any, get_source: Callable[[str], ColumnDataSource], *, with_ekf2: bool
-) -> None:
+def _draw_innovations(plot_figure: Any, get_source: Callable[[str], ColumnDataSource]) -> None:
     plot_figure.y_range = Range1d(start=-PLOT_LIMIT_IN_SQRT_S, end=PLOT_LIMIT_IN_SQRT_S)
     consistent_band = BoxAnnotation(
         bottom=-CONSISTENCY_LIMIT_IN_SQRT_S,
@@ -172,13 +164,10 @@ def _draw_innovations(
     )
     plot_figure.add_layout(consistent_band)
     dots: list[tuple[str, str, int, BokehStyle]] = [
-        ("innovations", "KF", 5, {"fill_color": KF_COLOUR, "line_color": None})
+        ("innovations", "KF", 5, {"fill_color": KF_COLOUR, "line_color": None}),
+        ("fused", "EKF2", 5, {"fill_color": EKF2_COLOUR, "line_color": None}),
+        ("rejected", "EKF2 rejected", 7, {"fill_color": None, "line_color": EKF2_COLOUR}),
     ]
-    if with_ekf2:
-        dots += [
-            ("fused", "EKF2", 5, {"fill_color": EKF2_COLOUR, "line_color": None}),
-            ("rejected", "EKF2 rejected", 7, {"fill_color": None, "line_color": EKF2_COLOUR}),
-        ]
     for source_name, label, size, style in dots:
         renderer = plot_figure.scatter(
             "t", "y", source=get_source(source_name), size=size, marker="marker", **style

@@ -4,7 +4,7 @@ const Explore = (async () => {
   const MAX_POINTS = 1000;
   const read = (id) => $(`${id}${Practice.suffix}`).textContent;
   // ------------------------------------------------------------------ the flight's data
-  const arrays = await Engine.unpack(read("arrays"), JSON.parse(read("content")).packed);
+  const arrays = await Engine.unpack(read("arrays"));
   const withArrays = (_, value) => value?.array === undefined ? value : arrays[value.array];
   const { flight, ratio_axis: ratioAxis, places } = JSON.parse(read("content"), withArrays);
   const { imu, axes } = flight;
@@ -147,11 +147,7 @@ const Explore = (async () => {
 
   // ------------------------------------------------------------------ KF run and its numbers
   // `run` and `numbers` of KF are null if the analysed segment has too few measurements
-  const result = { run: null, axis: null, numbers: null };
-  function replay() {
-    const axis = axisNow(), run = Engine.replay(flight, axis, settings);
-    Object.assign(result, { run, axis, numbers: run && numbers(axis, run) });
-  }
+  const result = {};
   /* Statistics of a KF run: innovations, difference to EKF2 and error against ground truth, at the times of EKF2's state */
   function numbers(axis, run) {
     const kf = Engine.assess(run.updates.nu, run.updates.s);
@@ -254,7 +250,7 @@ const Explore = (async () => {
   // index of the selected measurement
   let measurement = 0;
   function select(index) {
-    if (result.run === null) return;
+    if (!result.run) return;
     const times = result.run.updates.time, width = timeRange.end - timeRange.start;
     measurement = clamp(index, 0, times.length - 1);
     const time = times[measurement];
@@ -286,13 +282,14 @@ const Explore = (async () => {
   /* Run KF and draw the visible view */
   function show() {
     nextFrame = null;
-    replay();
+    const axis = axisNow(), run = Engine.replay(flight, axis, settings);
+    Object.assign(result, { run, axis, numbers: run && numbers(axis, run) });
     showSettings();
     drawCard(result);
     $("span").textContent = `${timeRange.start.toFixed(1)} s to ${timeRange.end.toFixed(1)} s`;
     drawTitles(result);
-    drawReferences(result.axis);
-    if (result.run === null) return;
+    drawReferences(axis);
+    if (!run) return;
     drawKf(result);
     drawStep(result);
   }

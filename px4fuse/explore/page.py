@@ -51,7 +51,6 @@ def make_data_elements(
     content = {
         "flight": data,
         "ratio_axis": SIGMA_RATIO_AXIS,
-        "packed": encoder.array_specs,
         "places": name_by_plot_id,
     }
     text_by_name = {

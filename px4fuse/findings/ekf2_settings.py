@@ -37,7 +37,7 @@ from px4fuse.findings.model import (
     make_zero_length_spans,
 )
 from px4fuse.flight.ekf2_parameters import AID_MASK_PARAMETER, PARAMETERS
-from px4fuse.flight.model import Ekf2, Unavailable, source_name
+from px4fuse.flight.model import Ekf2, Unavailable
 
 # Severity "error" if EKF2's noise parameter is at least this factor too small or too large
 MIN_NOISE_FACTOR_FOR_ERROR = 2.0
@@ -75,7 +75,7 @@ def detect_wrong_noise(analysis: Analysis) -> Findings:
     factor, size_word, reason = ratio, "small", "EKF2's gain is too large."
     if ratio < 1.0:
         factor, size_word, reason = 1.0 / ratio, "large", "EKF2's gain is too small."
-    sensor_name = source_name(analysis.source)
+    sensor_name = analysis.source.kind_name
     effect_text = ""
     rejected_fraction = analysis.main.rejected_fraction or 0.0
     if rejected_fraction >= MIN_REJECTED_FRACTION_IN_MESSAGE:

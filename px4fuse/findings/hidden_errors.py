@@ -5,7 +5,6 @@ the innovations stay small. Only ground truth or a loop closure shows such an er
 """
 
 from collections.abc import Mapping
-from typing import NamedTuple
 
 import numpy as np
 
@@ -35,7 +34,7 @@ from px4fuse.findings.model import (
     make_error,
     make_note,
 )
-from px4fuse.flight.model import Unavailable, source_name
+from px4fuse.flight.model import Unavailable
 from px4fuse.trajectory.alignment import fit_alignment
 
 # Minimum mean NEES, for severity "error": an RMS position error of 4 times the reported σ
@@ -57,19 +56,6 @@ EKF2_HEIGHT_REMEDY = (
     "Check EKF2's height sensors (EKF2_HGT_REF) and the accelerometer: KF has a smaller height "
     "error."
 )
-
-
-class AlignmentRmse(NamedTuple):
-    """Horizontal position RMSE (m) against ground truth, before and after alignment of a track."""
-
-    rmse_before_m: float
-    rmse_after_m: float
-
-    def __str__(self) -> str:
-        return (
-            f"horizontal position RMSE {format_metres(self.rmse_before_m)} m before and "
-            f"{format_metres(self.rmse_after_m)} m after the best shift and rotation"
-        )
 
 
 def find_hidden_errors(comparison: Comparison) -> list[tuple[FilterName, str, ErrorAboveSigma]]:
@@ -135,20 +121,23 @@ def make_hidden_error_finding(
     cause = rerun_by_filter.get(worst_filter) or next(iter(rerun_by_filter.values()), None)
     evidence[CAUSE_KEY] = classify_cause(analysis, cause)
     alignment_rmse = None if rerun_by_filter else _compute_alignment_rmse(analysis, worst_filter)
+    rmse_text = f"position RMSE {format_metres(worst_error.rmse_m)} m against ground truth"
     is_misaligned = False
     if alignment_rmse is not None:
         before_m, after_m = alignment_rmse
+        rmse_text = (
+            f"horizontal position RMSE {format_metres(before_m)} m before and "
+            f"{format_metres(after_m)} m after the best shift and rotation"
+        )
         evidence |= {
             "position_rmse_horizontal_m": before_m,
             "position_rmse_aligned_m": after_m,
         }
         is_misaligned = after_m < MAX_ALIGNED_RMSE_RATIO * before_m
         if is_misaligned:
-            sentences.append(f"The position frame is misaligned: {alignment_rmse}.")
+            sentences.append(f"The position frame is misaligned: {rmse_text}.")
     if analysis.source.origin.may_drift and not rerun_by_filter and not is_misaligned:
-        return _make_drift_finding(
-            analysis, alignment_rmse, worst_error, evidence, tuple(ratio_texts)
-        )
+        return _make_drift_finding(analysis, rmse_text, evidence, tuple(ratio_texts))
     kf_errors = analysis.axes[worst_axis].filters["kf"].truth
     if cause is not None:
         remedy = format_action(analysis, cause.change)
@@ -180,8 +169,7 @@ def make_hidden_error_finding(
 
 def _make_drift_finding(
     analysis: Analysis,
-    alignment_rmse: AlignmentRmse | None,
-    worst_error: ErrorAboveSigma,
+    rmse_text: str,
     evidence: Mapping[str, float | str],
     filter_labels: tuple[str, ...],
 ) -> Finding:
@@ -189,10 +177,7 @@ def _make_drift_finding(
 
     ``filter_labels`` are the filters whose position error exceeds their reported σ.
     """
-    loop, rmse_sentence = find_usable_loop(analysis), ""
-    drift_text = f"position RMSE {format_metres(worst_error.rmse_m)} m against ground truth"
-    if alignment_rmse is not None:
-        drift_text = str(alignment_rmse)
+    loop, drift_text, rmse_sentence = find_usable_loop(analysis), rmse_text, ""
     if (
         loop is not None
         and not (loop.is_end_assumed or loop.is_absolute_track)
@@ -201,7 +186,7 @@ def _make_drift_finding(
     ):
         length_m = loop.path_length_m
         evidence = {**evidence, "closure_error_m": closure_error_m, "path_length_m": length_m}
-        rmse_sentence = f"{capitalise_first(drift_text)}. "
+        rmse_sentence = f"{capitalise_first(rmse_text)}. "
         drift_text = (
             f"loop closure error {format_metres(closure_error_m)} m, "
             f"{format_percent(closure_error_m / length_m, 1)} of a path of {length_m:.0f} m"
@@ -209,7 +194,7 @@ def _make_drift_finding(
     aid = analysis.source.origin.aid
     return make_error(
         "source_drift",
-        f"{source_name(analysis.source)} drifts: {drift_text}. {rmse_sentence}The innovations of "
+        f"{analysis.source.kind_name} drifts: {drift_text}. {rmse_sentence}The innovations of "
         f"{' and '.join(filter_labels)} do not show the drift. Do not reduce SIGMA_Z"
         f"{f' or {aid.noise}' if aid else ''}.",
         DRIFT_REMEDY if loop is None else f"{DRIFT_REMEDY} {LOOP_REMEDY}",
@@ -219,7 +204,7 @@ def _make_drift_finding(
 
 def _compute_alignment_rmse(
     comparison: Comparison, filter_name: FilterName
-) -> AlignmentRmse | None:
+) -> tuple[float, float] | None:
     """Return the horizontal position RMSE before and after alignment (shift and yaw rotation)."""
     true_positions_m, positions_m = [], []
     for result in select_north_and_east(comparison):
@@ -240,19 +225,18 @@ def _compute_alignment_rmse(
         aligned_position_m = fit_alignment(position_m, true_position_m, "yaw").apply(position_m)
     except TrajectoryError:  # the track is too short to determine a rotation
         return None
-    return AlignmentRmse(
-        *(
-            float(np.linalg.norm(estimate_m - true_position_m)) / len(true_position_m) ** 0.5
-            for estimate_m in (position_m, aligned_position_m)
-        )
+    before_m, after_m = (
+        float(np.linalg.norm(estimate_m - true_position_m)) / len(true_position_m) ** 0.5
+        for estimate_m in (position_m, aligned_position_m)
     )
+    return before_m, after_m
 
 
 def make_possible_drift_finding(analysis: Analysis) -> Finding:
     loop, horizontal_tuning = find_usable_loop(analysis), analysis.tuning.get(HORIZONTAL)
     evidence: dict[str, float | str] = {"source": analysis.source.name}
     message = (
-        f"{source_name(analysis.source)} may drift. "
+        f"{analysis.source.kind_name} may drift. "
         "KF and EKF2 follow the drift, so innovations do not show the drift."
     )
     if isinstance(horizontal_tuning, AxisTuning) and (

@@ -7,7 +7,7 @@ from px4fuse.comparison.model import PreparedComparison
 from px4fuse.core.text import capitalise_first, format_number
 from px4fuse.ekf2.inputs import SIMULATED_EKF2_NOTE
 from px4fuse.findings.model import Findings, format_count, make_note, make_warning
-from px4fuse.flight.model import AS_RECEIVED_ORIGIN, Ekf2, Flight, Unavailable, positions_phrase
+from px4fuse.flight.model import AS_RECEIVED_ORIGIN, Ekf2, Flight, Unavailable
 
 VISION_TOPIC = "vehicle_visual_odometry"
 # SDLOG_PROFILE: default value, and mask of bit 7 for external vision (logged_topics.cpp)
@@ -174,7 +174,7 @@ def detect_source_not_logged(analysis: PreparedComparison) -> Findings:
     reason = reason_by_source.get(VISION_TOPIC, f"{VISION_TOPIC} is not in this log")
     yield make_warning(
         "source_not_logged",
-        f"The log lacks the {positions_phrase(source)} that PX4 received. Reason: {reason}. "
+        f"The log lacks the {source.positions_phrase} that PX4 received. Reason: {reason}. "
         f"px4fuse uses {source.name} ({source.description}) at {rate_hz:.1f} Hz instead.",
         f"Set SDLOG_PROFILE to {sdlog_profile | VISION_PROFILE_MASK} (bit 7: vision topics) and "
         "fly again.",

@@ -35,7 +35,7 @@ from px4fuse.findings.model import (
     make_error,
     make_warning,
 )
-from px4fuse.flight.model import Flight, PositionTrack, positions_phrase, source_name
+from px4fuse.flight.model import Flight, PositionTrack
 
 # Groups of findings that are valid even if all positions are wrong
 POSITION_INDEPENDENT_FINDING_GROUPS = ("logging", "IMU")
@@ -138,7 +138,7 @@ def _is_effect_of_wrong_convention(item: Finding) -> bool:
 def _detect_position_faults(
     convention: Convention, faults: ConventionFaults, source: PositionTrack
 ) -> Findings:
-    positions_text = positions_phrase(source)
+    positions_text = source.positions_phrase
     is_position_file = source.alignment is not None
     log_odds = 99.0 if convention.log_odds is None else min(convention.log_odds, 99.0)
     evidence_sentence = (
@@ -251,7 +251,7 @@ def _detect_orientation_faults(
     orientation = convention.orientation
     if orientation is None or not faults.orientation:
         return
-    sensor_name, evidence = source_name(source), _make_evidence(convention, faults.orientation)
+    sensor_name, evidence = source.kind_name, _make_evidence(convention, faults.orientation)
     if faults.orientation == "copied":
         yield make_warning(
             "source_orientation_copied",

@@ -46,7 +46,7 @@ from px4fuse.findings.source_positions import (
     make_scale_finding,
 )
 from px4fuse.findings.source_stamps import detect_bursts
-from px4fuse.flight.model import Columns, positions_phrase, source_name
+from px4fuse.flight.model import Columns
 
 # White noise is a separate fault if its σ ÷ σ of the time-correlated noise exceeds this ratio
 MIN_WHITE_TO_CORRELATED_SIGMA_RATIO = 0.3
@@ -133,7 +133,7 @@ def detect_time_correlated_noise(analysis: Analysis) -> Findings:
     is_normal = analysis.source.origin.is_gnss and not _has_error_above_reported_sigma(analysis)
     yield (make_note if is_normal else make_warning)(
         "source_noise_time_correlated",
-        f"Time-correlated {source_name(analysis.source)} error of {noise.slow_m:.2g} m, "
+        f"Time-correlated {analysis.source.kind_name} error of {noise.slow_m:.2g} m, "
         f"correlation time {time_text}. The rest of the error is white noise of "
         f"{noise.white_m:.2g} m (1 σ). KF and EKF2 assume independent errors: both follow the "
         "correlated error, and their σ is too small.",
@@ -162,7 +162,7 @@ def detect_repeated_positions(analysis: Analysis) -> Findings:
         return
     yield (make_error if fraction >= MIN_REPEATED_FRACTION_FOR_ERROR else make_warning)(
         "source_samples_repeated",
-        f"{count} of {len(is_repeated)} {positions_phrase(analysis.source)} repeat the previous "
+        f"{count} of {len(is_repeated)} {analysis.source.positions_phrase} repeat the previous "
         f"position ({format_percent(fraction)}). KF and EKF2 use each repetition as a measurement.",
         "Send each position once, with its time of measurement.",
         {"count": count, "share": fraction},
@@ -190,7 +190,7 @@ def detect_unequal_noise(analysis: Analysis) -> Findings:
         evidence = {f"{small_axis}_sigma_z_m": small_m, f"{large_axis}_sigma_z_m": large_m}
     yield make_warning(
         "source_noise_unequal_axes",
-        f"{source_name(analysis.source)} noise is {large_m:.2g} m along {large_axis} and "
+        f"{analysis.source.kind_name} noise is {large_m:.2g} m along {large_axis} and "
         f"{small_m:.2g} m along {small_axis}. One measurement noise (SIGMA_Z, EKF2) does not fit "
         "both axes.",
         action,
@@ -211,7 +211,7 @@ def detect_noise_variation(analysis: Analysis) -> Findings:
     noise_ratio, start_s, end_s = noisy_part.sigma_ratio, noisy_part.start_s, noisy_part.end_s
     yield (make_error if noise_ratio >= MIN_NOISY_PART_SIGMA_RATIO_FOR_ERROR else make_warning)(
         "source_noise_varies",
-        f"{source_name(analysis.source)} noise is {noise_ratio:.1f} times larger from "
+        f"{analysis.source.kind_name} noise is {noise_ratio:.1f} times larger from "
         f"{start_s:.0f} to {end_s:.0f} s. Single outliers are not the cause.",
         f"{find_source_texts(analysis.source).data_link_check} for the time from {start_s:.0f} to "
         f"{end_s:.0f} s. Send a variance with each position, or analyse the noisy part separately "
@@ -226,7 +226,7 @@ def detect_jitter_and_speed_noise(analysis: Analysis, local_residuals: LocalResi
     if jitter_s is not None and (clock_map is None or clock_map.distinct_stamps is None):
         yield (make_error if jitter_s >= MIN_JITTER_FOR_ERROR_S else make_warning)(
             "source_timestamp_jitter",
-            f"The timestamps of the {positions_phrase(analysis.source)} jitter by "
+            f"The timestamps of the {analysis.source.positions_phrase} jitter by "
             f"{1e3 * jitter_s:.0f} ms (1 σ). At 1 m/s this is a position error of "
             f"{format_metres(jitter_s)} m.",
             "Send the time of measurement with each position, not the time of processing, sending "
@@ -237,7 +237,7 @@ def detect_jitter_and_speed_noise(analysis: Analysis, local_residuals: LocalResi
     if speed_noise is not None:
         yield make_error(
             "source_noise_grows_with_speed",
-            f"{source_name(analysis.source)} noise grows with speed: "
+            f"{analysis.source.kind_name} noise grows with speed: "
             f"{format_metres(speed_noise.slow_m)} m at {speed_noise.slow_m_s:.1f} m/s and "
             f"{format_metres(speed_noise.fast_m)} m at {speed_noise.fast_m_s:.1f} m/s (1 σ). The "
             "noise perpendicular to the motion also grows, so time offset and jitter are not the "
@@ -250,7 +250,7 @@ def detect_jitter_and_speed_noise(analysis: Analysis, local_residuals: LocalResi
 
 def detect_periodic_errors_and_offset_changes(analysis: Analysis, error_fit: ErrorFit) -> Findings:
     periodic_error = find_periodic_error(error_fit)
-    positions_text = positions_phrase(analysis.source)
+    positions_text = analysis.source.positions_phrase
     if periodic_error is not None:
         yield (
             make_error if periodic_error.amplitude_m >= MIN_AMPLITUDE_FOR_ERROR_M else make_warning

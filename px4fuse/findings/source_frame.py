@@ -20,15 +20,7 @@ from px4fuse.findings.model import (
     make_warning,
 )
 from px4fuse.flight.ekf2_parameters import EV_CTRL_YAW_MASK, EV_POS
-from px4fuse.flight.model import (
-    Columns,
-    Ekf2,
-    Flight,
-    Unavailable,
-    positions_phrase,
-    rows_between,
-    source_name,
-)
+from px4fuse.flight.model import Columns, Ekf2, Flight, Unavailable, rows_between
 from px4fuse.trajectory.rotation import heading as heading_of
 from px4fuse.trajectory.rotation import interpolate
 
@@ -56,9 +48,9 @@ def detect(analysis: Analysis) -> Findings:
 
 def make_frd_positions_finding(analysis: Analysis) -> Finding:
     """Make the finding that positions are in FRD, so that their x axis is not north."""
-    ekf2, sensor_name = analysis.flight.ekf2, source_name(analysis.source)
+    ekf2, sensor_name = analysis.flight.ekf2, analysis.source.kind_name
     fault = (
-        f"{positions_phrase(analysis.source)} are in FRD: their x axis points "
+        f"{analysis.source.positions_phrase} are in FRD: their x axis points "
         "along the heading at the start, not north."
     )
     note_action = f"In this report, north is the x axis of {sensor_name}."
@@ -122,7 +114,7 @@ def detect_misalignment(analysis: Analysis, heading_error: HeadingError) -> Find
     yield finding(
         "error" if abs(rotation_deg) >= MIN_SEVERE_HEADING_ERROR_DEG else "warning",
         finding_id,
-        f"{positions_phrase(analysis.source)} are rotated by {rotation_deg:+.0f}° relative to "
+        f"{analysis.source.positions_phrase} are rotated by {rotation_deg:+.0f}° relative to "
         f"{reference}. The rotation (± {1.96 * sigma_deg:.0f}°, 95 %) is clockwise from above and "
         f"constant over the flight. {reason}",
         action,
@@ -174,7 +166,7 @@ def _make_heading_drift_finding(analysis: Analysis, heading_error: HeadingError)
     heading_change_deg = last_part.heading_error_deg - first_part.heading_error_deg
     estimation_data_text = "positions and IMU"
     if heading_error.by == "orientation":
-        estimation_data_text = f"the orientation of {source_name(source)}"
+        estimation_data_text = f"the orientation of {source.kind_name}"
     calibration_advice, action = magnetometer_advice(analysis.flight), ""
     possible_cause = "a magnetometer indoors" if calibration_advice else "a gyroscope bias"
     if source.orientation is not None:
@@ -189,7 +181,7 @@ def _make_heading_drift_finding(analysis: Analysis, heading_error: HeadingError)
         "error" if abs(heading_change_deg) >= MIN_SEVERE_HEADING_ERROR_DEG else "warning",
         "ekf2_heading_error",
         f"EKF2's heading drifts by {heading_change_deg:+.0f}° relative to the "
-        f"{positions_phrase(source)}. Its error is {' and '.join(error_texts)} (clockwise from "
+        f"{source.positions_phrase}. Its error is {' and '.join(error_texts)} (clockwise from "
         f"above, estimated from {estimation_data_text}). A constant rotation of the positions "
         f"cannot correct the drift. Possible cause: {possible_cause}.",
         " Alternatively: ".join(filter(None, (calibration_advice, action)))

@@ -23,13 +23,7 @@ from px4fuse.findings.model import (
     make_warning,
 )
 from px4fuse.flight.ekf2_parameters import AIDS, EV_POS, Aid
-from px4fuse.flight.model import (
-    ALIGNED_BY_EKF2_ORIGIN,
-    Ekf2,
-    Unavailable,
-    positions_phrase,
-    sample_step_function,
-)
+from px4fuse.flight.model import ALIGNED_BY_EKF2_ORIGIN, Ekf2, Unavailable, sample_step_function
 from px4fuse.readers.px4_ekf2 import OTHER_HORIZONTAL_AIDS
 
 # Minimum fraction of lost positions for a finding: PX4 v1.14 and later loses 0.3 %
@@ -95,7 +89,7 @@ def detect_source_gaps(analysis: Analysis) -> Findings:
             action = f"{find_source_texts(source).data_link_check} at {start_s:.1f} s."
         else:
             message = (
-                f"{positions_phrase(source)} are missing in the log for {duration_text}, but EKF2 "
+                f"{source.positions_phrase} are missing in the log for {duration_text}, but EKF2 "
                 "fused them. KF has no measurement in the gap."
             )
             action = _find_action_for_unlogged_positions(analysis, start_s, end_s)
@@ -142,7 +136,7 @@ def _make_stop_or_begin_finding(analysis: Analysis, span_s: Span, fused_aids: li
     return finding(
         "error" if is_dead_reckoning else "warning",
         finding_id,
-        f"{positions_phrase(source)} {event} in flight at {event_s:.1f} s, {duration_s:.1f} s "
+        f"{source.positions_phrase} {event} in flight at {event_s:.1f} s, {duration_s:.1f} s "
         f"{flight_edge} of the flight.{aiding_sentence}{effect_sentence}",
         f"{find_source_texts(source).data_link_check} for the time {before_or_after} "
         f"{event_s:.1f} s.{action}",
@@ -244,7 +238,7 @@ def detect_lost_samples(analysis: Analysis) -> Findings:
         yield make_note(
             "source_samples_lost",
             f"The recording lacks {format_percent(lost_fraction)} of the "
-            f"{positions_phrase(source)}. {lost_count} of {sent_count} positions are missing (one "
+            f"{source.positions_phrase}. {lost_count} of {sent_count} positions are missing (one "
             f"per {median_interval_s:.2f} s is expected). EKF2 may have received them.",
             "Record on the companion computer or on a link without message loss. Or set "
             "SDLOG_PROFILE to 129: the ULog then contains the received positions.",
@@ -283,7 +277,7 @@ def detect_downsampling(analysis: Analysis) -> Findings:
     rate_hz, source_rate_hz = 1.0 / mean_interval_s, 1.0 / period_s
     severity: Severity = "warning"
     message = (
-        f"{positions_phrase(source)} arrive at {rate_hz:.2g} Hz, downsampled from "
+        f"{source.positions_phrase} arrive at {rate_hz:.2g} Hz, downsampled from "
         f"{source_rate_hz:.2g} Hz. The intervals are whole multiples of {period_s:.3g} s, so "
         f"{format_percent(lost_fraction)} of the positions are missing."
     )

@@ -46,9 +46,6 @@ from px4fuse.flight.model import (
     Truth,
     Unavailable,
     estimate_white_noise_m,
-    positions_phrase,
-    reset_times_s,
-    source_name,
 )
 
 # Minimum extent (m) of the positions of a moving vehicle (5th to 95th percentile)
@@ -174,7 +171,7 @@ def detect_low_pass(analysis: Analysis) -> Findings:
         make_finding = make_error if low_pass.lag_s >= MIN_LAG_FOR_ERROR_S else make_warning
         yield make_finding(
             "source_low_pass_filtered",
-            f"{positions_phrase(analysis.source)} are low-pass filtered and lag by "
+            f"{analysis.source.positions_phrase} are low-pass filtered and lag by "
             f"{low_pass.lag_s:.2f} s. The correlation of successive errors is "
             f"{low_pass.correlation:.1f}; the noise before filtering is {low_pass.sigma_z_m:.2g} "
             "m. KF and EKF2 lag, and their σ is too small.",
@@ -204,7 +201,7 @@ def detect_jumps(analysis: Analysis) -> Findings:
     cause = source_texts.jump_causes
     evidence = {"count": len(jumps), "size_m": size_m, "at_s": time_s, "sigma_m": sigma_m}
     counter_time_s = min(
-        reset_times_s(analysis.source), key=lambda at_s: abs(at_s - time_s), default=np.inf
+        analysis.source.reset_times_s, key=lambda at_s: abs(at_s - time_s), default=np.inf
     )
     if abs(counter_time_s - time_s) < MAX_JUMP_TO_RESET_COUNTER_TIME_S:
         evidence[RESET_TIME_KEY] = float(counter_time_s)
@@ -217,7 +214,7 @@ def detect_jumps(analysis: Analysis) -> Findings:
     yield finding(
         "error" if size_m >= MIN_JUMP_FOR_ERROR_M else "warning",
         "source_position_jump",
-        f"{positions_phrase(analysis.source)} {jump_text} at {time_s:.1f} s and "
+        f"{analysis.source.positions_phrase} {jump_text} at {time_s:.1f} s and "
         f"{'return afterwards' if returns else 'stay there'}. The IMU does not measure this motion "
         f"(± {1.96 * sigma_m:.2f} m, 95 %). {cause} KF and EKF2 follow the jump with consistent "
         "innovations.",
@@ -331,9 +328,7 @@ def _find_jumps(analysis: Analysis) -> tuple[Array, Array, bool]:
     jump_sizes_m = np.linalg.norm(jump_vectors_m, axis=1)
     intervals_s = np.diff(time_s)[1:-1]
     median_interval_s = float(np.median(intervals_s))
-    reset_rows = (
-        np.searchsorted(time_s, reset_times_s(analysis.source) - RESET_TIME_TOLERANCE_S) - 2
-    )
+    reset_rows = np.searchsorted(time_s, analysis.source.reset_times_s - RESET_TIME_TOLERANCE_S) - 2
     reset_rows = reset_rows[(reset_rows >= 0) & (reset_rows < len(jump_sizes_m))]
     reset_rows = reset_rows[jump_sizes_m[reset_rows] >= MIN_JUMP_M]
     if len(reset_rows) >= MIN_JUMPS_WITH_RESET_COUNTER:
@@ -399,7 +394,7 @@ def make_scale_finding(
     return finding(
         "error" if abs(scale_error) >= MIN_SCALE_ERROR_FOR_SEVERITY_ERROR else "warning",
         "source_scale_error",
-        f"{source_name(source)} distances are {format_percent(abs(scale_error))} too "
+        f"{source.kind_name} distances are {format_percent(abs(scale_error))} too "
         f"{'long' if scale_error > 0.0 else 'short'}. The estimate is from {reference}. "
         "Innovations do not show a scale factor error.",
         action,
@@ -427,7 +422,7 @@ def detect_outliers(analysis: Analysis) -> Findings:
     yield finding(
         "error" if outlier_fraction >= MIN_OUTLIER_FRACTION_FOR_ERROR else "warning",
         "source_outliers",
-        f"{outlier_count} of {axis_tuning.count} {positions_phrase(analysis.source)} "
+        f"{outlier_count} of {axis_tuning.count} {analysis.source.positions_phrase} "
         f"({format_percent(outlier_fraction, 1)}) are outliers of up to "
         f"{format_metres(outlier_sizes_m.max())} m. Median distance of the outliers to "
         f"{reference}: {format_metres(float(np.median(outlier_sizes_m)))} m. "
@@ -525,7 +520,7 @@ def detect_wrong_variance(analysis: Analysis) -> Findings:
     yield finding(
         severity,
         "source_reported_variance_wrong",
-        f"The variance that {source_name(source)} reports is {format_factor(error_factor)} times "
+        f"The variance that {source.kind_name} reports is {format_factor(error_factor)} times "
         f"too {size_word}. The reported σ is {reported_sigma_m:.3g} m, the position noise "
         f"{noise_m:.3g} m (95 % {low:.3g} to {high:.3g} m). {effect}{correlation_note}",
         f"Report a variance of {noise_m**2:.2g} m² with each position.",

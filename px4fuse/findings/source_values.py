@@ -28,7 +28,7 @@ from px4fuse.findings.model import (
     make_warning,
 )
 from px4fuse.findings.source_intervals import describe_errors_after_gap
-from px4fuse.flight.model import Columns, Ekf2, Truth, Unavailable, positions_phrase, source_name
+from px4fuse.flight.model import Columns, Ekf2, Truth, Unavailable
 from px4fuse.readers.px4_positions import NO_FIX_ACTION
 
 # Rounding to smaller steps (m) is not reported: its errors are below the noise of UWB
@@ -110,7 +110,7 @@ def detect_invalid_rows(analysis: Analysis) -> Findings:
             error_text = f" {describe_errors_after_gap(analysis, gap_span_s)}"
         yield make_finding(
             name,
-            f"{len(time_s)} {positions_phrase(source)} {fault}. Times: {format_spans(spans)} "
+            f"{len(time_s)} {source.positions_phrase} {fault}. Times: {format_spans(spans)} "
             f"({total_s:.1f} s in total). KF does not use these positions.{error_text}",
             action or f"{find_source_texts(source).data_link_check} at {start_s:.1f} s.",
             {
@@ -134,7 +134,7 @@ def detect_rounding(analysis: Analysis) -> Findings:
         action += " Subtract a local origin before the conversion from 64-bit to 32-bit floats."
     yield make_warning(
         "source_positions_rounded",
-        f"{positions_phrase(source)} are rounded to steps of {step_m:.3g} m.{cause_text} The "
+        f"{source.positions_phrase} are rounded to steps of {step_m:.3g} m.{cause_text} The "
         f"rounding error is {step_m / 12.0**0.5:.2g} m (1 σ) and correlated in time. "
         f"{NO_ESTIMATES_SENTENCE}",
         action,
@@ -167,7 +167,7 @@ def detect_lever_arm(analysis: Analysis) -> Findings:
         MIN_ROTATION_DEG, MIN_ROTATION_SIGMAS * lever_arm.rotation_sigma_deg
     ):
         rotation_deg = 0.0
-    sensor_text, action = f"{source_name(source)} sensor", f"Set {format_changes(change)}."
+    sensor_text, action = f"{source.kind_name} sensor", f"Set {format_changes(change)}."
     error_text = "the position error"
     effect_sentence = _describe_replayed_effect(analysis, change, rotation_deg)
     # The new lever arm of the sensor hardly reduces EKF2's error against ground truth: test another
@@ -190,7 +190,7 @@ def detect_lever_arm(analysis: Analysis) -> Findings:
     subject = f"The {sensor_text} is"
     if rotation_deg:
         subject = (
-            f"{positions_phrase(source)} are rotated by {rotation_deg:+.0f}° (clockwise from "
+            f"{source.positions_phrase} are rotated by {rotation_deg:+.0f}° (clockwise from "
             f"above), and the {sensor_text} is"
         )
         action = f"Rotate the positions by {-rotation_deg:+.0f}° before they are sent. {action}"
@@ -274,7 +274,7 @@ def detect_two_senders(analysis: Analysis) -> Findings:
     yield make_error(
         "source_two_senders",
         f"Two systems alternately send positions that differ by {distance_m:.2f} m. After "
-        f"subtraction of the vehicle's motion, successive {positions_phrase(analysis.source)} "
+        f"subtraction of the vehicle's motion, successive {analysis.source.positions_phrase} "
         f"({rate_hz:.3g} Hz in total) differ by {distance_texts}. {NO_ESTIMATES_SENTENCE}",
         "Send the positions of one system only: stop the second node, bridge or MAVROS plugin.",
         {"distance_m": distance_m, "rate_hz": rate_hz},
@@ -323,7 +323,7 @@ def detect_copied_estimate(analysis: Analysis) -> Findings:
     is_attitude_copied = orientation is not None and orientation.verdict == "copied"
     yield make_error(
         "source_is_ekf2_estimate",
-        f"{source_name(source)} sends EKF2's own position{' and attitude' * is_attitude_copied} "
+        f"{source.kind_name} sends EKF2's own position{' and attitude' * is_attitude_copied} "
         f"back. The positions equal those that EKF2 estimated {1e3 * delay_s:.0f} ms before "
         f"(median difference {1e3 * distance_m:.1f} mm). They are not measurements.",
         "Send the position of the positioning system. Do not connect the autopilot's local "

@@ -444,6 +444,24 @@ class PositionTrack:
         """Return the sample rate (Hz) without gaps; NaN for fewer than two samples."""
         return sample_rate(self.samples)
 
+    @property
+    def kind_name(self) -> str:
+        """Name of the kind of source for users, such as "UWB"."""
+        return SOURCE_NAMES.get(self.origin.kind, self.origin.kind.upper())
+
+    @property
+    def positions_phrase(self) -> str:
+        """Name of the positions for users, such as "UWB positions"."""
+        if self.origin.kind == "file":
+            return "positions from the file"
+        return f"{self.kind_name} positions"
+
+    @property
+    def reset_times_s(self) -> Array:
+        """Times (s) at which the reset counter of the source changes."""
+        reset_counter = self.status.get("reset_counter", pd.Series(dtype=float))
+        return np.asarray(reset_counter.index[1:][np.diff(reset_counter) != 0.0], dtype=np.float64)
+
 
 def estimate_white_noise_m(position_m: Array) -> float:
     """Estimate the white noise (1 σ, m) of positions, shape (n, axes), along the noisiest axis.
@@ -463,25 +481,6 @@ def infer_position_kind(samples: pd.DataFrame) -> PositionKind:
         and sample_rate(samples) < MAX_UWB_RATE_HZ
     )
     return "uwb" if is_uwb else "unknown"
-
-
-def source_name(source: PositionTrack) -> str:
-    """Return the name of a position source for users, such as "UWB"."""
-    kind = source.origin.kind
-    return SOURCE_NAMES.get(kind, kind.upper())
-
-
-def reset_times_s(track: PositionTrack) -> Array:
-    """Return the times (s) at which the reset counter of the source changes."""
-    reset_counter = track.status.get("reset_counter", pd.Series(dtype=float))
-    return np.asarray(reset_counter.index[1:][np.diff(reset_counter) != 0.0], dtype=np.float64)
-
-
-def positions_phrase(source: PositionTrack) -> str:
-    """Return the name of the positions for users, such as "UWB positions"."""
-    if source.origin.kind == "file":
-        return "positions from the file"
-    return f"{source_name(source)} positions"
 
 
 @dataclass(frozen=True)

@@ -3,7 +3,6 @@
 import base64
 import hashlib
 import json
-import re
 from functools import cache
 from importlib.resources import files
 from pathlib import PurePosixPath
@@ -12,29 +11,21 @@ from urllib.parse import quote
 
 from jinja2 import Environment, PackageLoader, StrictUndefined, Template
 
-from px4fuse.core.text import convert_nested
+from px4fuse.core.text import clean_text, convert_nested
 
 MAX_TEXT_LENGTH = 20_000
-# Control characters, surrogates, and characters that change the text direction
-HARMFUL_CHARACTER_PATTERN = re.compile(
-    "[\0-\x08\x0b-\x1f\x7f-\x9f\ud800-\udfff\u202a-\u202e\u2066-\u2069]"
-)
-
-
-def clean_text(text: str, max_length: int = MAX_TEXT_LENGTH) -> str:
-    r"""Replace characters that could change the display of other text, and shorten the text.
-
-    >>> clean_text("a\x1b\u202eb", 10), clean_text("abcdef", 3)
-    ('a��b', 'abc…')
-    """
-    text = text if len(text) <= max_length else text[:max_length] + "…"
-    return HARMFUL_CHARACTER_PATTERN.sub("\N{REPLACEMENT CHARACTER}", text)
 
 
 def clean_values(value: Any, max_length: int = MAX_TEXT_LENGTH) -> Any:
+    r"""Clean and shorten all texts in nested dicts and lists.
+
+    >>> clean_values(["a\x1bb", "abcdef", 1.0], 3)
+    ['ab', 'abc…', 1.0]
+    """
+
     def clean_element(element: Any) -> Any:
         if isinstance(element, str):
-            return clean_text(element, max_length)
+            return clean_text(element[:max_length]) + "…" * (len(element) > max_length)
         return element.item() if hasattr(element, "item") else element
 
     return convert_nested(value, clean_element)

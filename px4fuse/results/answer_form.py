@@ -164,10 +164,9 @@ class NamedFault(Record):
 
     def convert_value_to_standard_unit(self) -> float | None:
         """Convert the value to the standard unit, which is the first in ``form.toml`` (cm to m)."""
-        units = UNITS_BY_CORRECTION.get(self.parameter, {})
-        if self.value is None or not units:
-            return self.value
-        return self.value * units.get(self.value_unit, 1.0)
+        if self.value is None:
+            return None
+        return self.value * UNITS_BY_CORRECTION.get(self.parameter, {}).get(self.value_unit, 1.0)
 
 
 class Answers(Record, kw_only=True):
