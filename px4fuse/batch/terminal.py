@@ -43,7 +43,7 @@ def format_summary(batch_result: BatchResult) -> Page:
     if sorted_logs:
         rows = [_make_log_row(log) for log in sorted_logs[:MAX_LISTED_LOGS]]
         page.add_table(
-            ("", "log", "diagnosis", "KF ●", "◆", "EKF2 ●", "◆"),
+            ("", "log", "diagnosis", "", "", "", ""),
             rows,
             right_aligned_columns=(3, 4, 5, 6),
         )
@@ -62,12 +62,15 @@ def format_summary(batch_result: BatchResult) -> Page:
 
 def _make_log_row(log: LogSummary) -> tuple[Cell, ...]:
     colour = SEVERITY_COLOURS.get(log["severity"], MUTED_COLOUR)
-    ratios = (log.get(f"{name}_ratio") for name in SIGMA_RATIO_COLUMNS)
+    ratios = [log.get(f"{name}_ratio") for name in SIGMA_RATIO_COLUMNS]
     return (
         (SEVERITY_SIGNS[log["severity"]][0], colour),
         log["name"],
         log["headline"],
-        *("–" if ratio is None else format_ratio(ratio) for ratio in ratios),
+        *(
+            f"{label} {'–' if ratio is None else format_ratio(ratio)}"
+            for label, ratio in zip(("KF ●", "◆", "EKF2 ●", "◆"), ratios, strict=True)
+        ),
     )
 
 
@@ -91,8 +94,11 @@ def format_differences(results: ChangeResults) -> Page:
         display_factor, unit = (100.0, "%") if number.unit == "share" else (1.0, number.unit)
         cells = [
             cell
-            for value, interval in ((number.a, number.a_interval), (number.b, number.b_interval))
-            for cell in (_format_value(value, display_factor), _format_interval(interval))
+            for label, value, interval in (
+                ("A", number.a, number.a_interval),
+                ("B", number.b, number.b_interval),
+            )
+            for cell in (_format_value(label, value, display_factor), _format_interval(interval))
         ]
         rows.append((number.label, *cells, unit))
     if rows:
@@ -117,8 +123,8 @@ def _format_setting(value: float | str | None) -> str:
     return f"{value:.6g}" if isinstance(value, int | float) else value or "–"
 
 
-def _format_value(value: float | None, factor: float) -> str:
-    return "" if value is None else format_number(factor * value)
+def _format_value(label: str, value: float | None, factor: float) -> str:
+    return "" if value is None else f"{label} {format_number(factor * value)}"
 
 
 def _format_interval(interval: ConfidenceInterval | None) -> str:

@@ -58,7 +58,7 @@ REQUIRED_SAMPLES_BY_ANALYSIS = {
     "EKF2 states": "samples of EKF2's position and velocity",
     "EKF2 variances": "samples of EKF2's position and velocity variances",
     "EKF2 consistency": "EKF2 innovations",
-    "error": "samples of ground truth",
+    "position error": "samples of ground truth",
 }
 NO_COMPARISON = Unavailable("comparison", "the log contains no position source for KF", "")
 
@@ -303,19 +303,19 @@ def _list_analyses(
     imu_fault_text = " ".join(finding.message for finding in low_rate_findings)
     if isinstance(missing_data := imu_and_attitude(flight), Unavailable):
         imu_fault_text = f"{missing_data.reason}; KF assumes constant velocity"
-    acceleration_text = "IMU acceleration rotated into NED by the attitude, without gravity"
+    acceleration_text = "IMU acceleration as input of KF, in NED and without gravity"
     yield AnalysisOption("acceleration", not imu_fault_text, imu_fault_text or acceleration_text)
     yield from _list_ekf2_and_truth_analyses(flight, comparison)
     results_by_aid, ekf2, rates_text = evaluate_aids(flight), flight.ekf2, ""
     if isinstance(results_by_aid, dict) and isinstance(ekf2, Ekf2):
         rate_texts = (
-            f"{aid.label} {sample_rate(samples):.2g} Hz"
+            f"{aid.label}: {sample_rate(samples):.2g} Hz"
             if len(samples := ekf2.aids[name].samples) > 1
-            else f"{aid.label} 1 sample"
+            else f"{aid.label}: 1 sample"
             for name, aid in results_by_aid.items()
         )
-        rates_text = ", ".join(rate_texts)
-    yield _make_analysis_option("aids", results_by_aid, rates_text)
+        rates_text = f"innovations of {'; '.join(rate_texts)}"
+    yield _make_analysis_option("aiding sources of EKF2", results_by_aid, rates_text)
     replay_inputs, replay_text = prepare_inputs(flight), ""
     if not isinstance(replay_inputs, Unavailable):
         replayed_duration_s = sum(
@@ -356,7 +356,7 @@ def _list_ekf2_and_truth_analyses(
     for (name, sample_text), data in zip(
         REQUIRED_SAMPLES_BY_ANALYSIS.items(), required_data, strict=True
     ):
-        count_text = f"{len(data)} {sample_text}" if isinstance(data, pd.DataFrame) else ""
+        count_text = f"from {len(data)} {sample_text}" if isinstance(data, pd.DataFrame) else ""
         yield _make_analysis_option(name, data, count_text)
 
 
