@@ -280,7 +280,11 @@ def test_severity_of_rejections_depends_on_rejected_percentage(
     level = analysis(ekf2={"gate": 5.0}, axes=axes)
     down = analysis(ekf2={"gate": 5.0}, axes=(axis("down", ekf2_innovations=rejected(count, of)),))
     for one, quantity, remedy in (
-        (level, "of the positions. Their innovations are outside its gate of 5 √S", CHECK_FIRST),
+        (
+            level,
+            "of the positions. The rejected innovations are outside EKF2's gate of 5 √S",
+            CHECK_FIRST,
+        ),
         (down, "of the heights", CHECK_FIRST),
     ):
         assert severity(ekf2_settings.detect_rejections, one) == expected
