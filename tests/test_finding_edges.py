@@ -545,7 +545,7 @@ def test_heading_error_report_names_wrong_gnss_noise(degrees, noise_is_wrong) ->
 
 def test_heading_angles_are_printed_from_minus_180_to_180_deg() -> None:
     finding = only(source_frame.detect, analysis(heading=heading_error(170.0, 230.0, p=0.0)))
-    assert "Its error is +170° from 0 to 10 s and -130° from 10 to 20 s" in finding.message
+    assert "The heading error is +170° from 0 to 10 s and -130° from 10 to 20 s" in finding.message
     finding = only(source_frame.detect, analysis(heading=heading_error(340.0)))
     assert "rotated by -20°" in finding.title
 

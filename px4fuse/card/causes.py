@@ -363,7 +363,7 @@ def _format_rerun_label(rerun: Rerun) -> str:
     change_texts = [
         f"{prefix}{COMPARISON_OPTIONS.get(name, name)} {value:g}"
         for name, value in rerun.change.items()
-        if name in PARAMETERS or name in (SIGMA_A, SIGMA_Z)
+        if name in {*PARAMETERS, SIGMA_A, SIGMA_Z}
     ]
     return ", ".join([label, *change_texts])
 

@@ -211,7 +211,7 @@ def detect_missing_imu_samples(analysis: Analysis) -> Findings:
     yield make_warning(
         "imu_samples_missing",
         f"{format_percent(lost_fraction)} of the IMU samples are missing from the log. KF "
-        "increases Q in the gaps of the IMU. EKF2 cannot be replayed with changed parameters.",
+        "increases Q in the IMU gaps. EKF2 cannot be replayed with changed parameters.",
         f"{action}.",
         {"lost_fraction": lost_fraction, "sdlog_profile": sdlog_profile},
     )

@@ -172,7 +172,7 @@ def write_closures_and_rpe(page: Page, loop: Loop) -> None:
     for closure in loop.closures:
         cells = [
             _format_closure_times(closure, loop),
-            f"error {closure.distance_m:.2f} m,",
+            f"closure error {closure.distance_m:.2f} m,",
             f"d² {closure.d2:.1f},",
             f"{closure.degrees_of_freedom} degrees of freedom,",
             f"{format_p_value(closure.p)},",
