@@ -104,7 +104,7 @@ def test_info_sample_counts_match_those_of_compare(sample_flight):
         ("EKF2 consistency", north.ekf2_innovations),
         ("position error", north.truth),
     ):
-        assert ability(inventory, name).reason.startswith(f"{len(samples)} ")
+        assert ability(inventory, name).reason.startswith(f"from {len(samples)} ")
 
 
 # ---- JSON -------------------------------------------------------------------------------------
