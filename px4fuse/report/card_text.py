@@ -286,11 +286,7 @@ def _format_cause_lines(cause: DiagnosedCause, do_this: str) -> Iterator[Paragra
     label_width = max(map(len, labels), default=0) + 2
     for label, (_, action) in zip(labels, actions, strict=True):
         yield from _format_action_lines(label, label_width, action)
-    heads, *rows = make_rerun_rows(cause.reruns) or [[]]
-    for name, *values, result in rows:
-        texts = [f"{head} {value}" for head, value in zip(heads[1:], values, strict=False) if value]
-        yield _make_labelled_paragraph("re-run", f"{name}: {', '.join([*texts, result])}")
-    yield Paragraph(format_rerun_note(cause.reruns), "  ", "  ")
+    yield from _format_rerun_table(cause.reruns)
     yield Paragraph(cause.after, "  ", "  ")
 
 
@@ -315,6 +311,21 @@ def _format_action_lines(label: str, label_width: int, action: Action) -> Iterat
     for command in action.commands:
         yield Paragraph(f"{label_text}{command}", style="bold")
         label_text = indent
+
+
+def _format_rerun_table(reruns: Sequence[CardRerun]) -> Iterator[Paragraph]:
+    rows = make_rerun_rows(reruns)
+    for row in rows[1:]:
+        # Each cell begins with the first word or symbol of its heading
+        row[1:-1] = [
+            f"{heading.removeprefix('position ').split()[0]} {cell}" if cell else ""
+            for heading, cell in zip(rows[0][1:-1], row[1:-1], strict=True)
+        ]
+    widths = [max(map(len, column)) for column in zip(*rows, strict=True)]
+    for row in rows:
+        cells = (f"{cell:{width}}" for cell, width in zip(row, widths, strict=True))
+        yield Paragraph(f"  {'  '.join(cells)}".rstrip())
+    yield Paragraph(format_rerun_note(reruns), "  ", "  ")
 
 
 def make_rerun_rows(reruns: Sequence[CardRerun]) -> list[list[str]]:
